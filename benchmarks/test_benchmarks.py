@@ -68,6 +68,7 @@ SMALLEST = {
     "sample_patches": Smallest("50", rf"nearest gather +{NUMBER} us a patch +{NUMBER} x"),
     "scale": Smallest("hours {out} 3 1", rf"the last half against the first: {NUMBER} x"),
     "start_up": Smallest("--quick --turns 1", rf"ingest +{NUMBER} s +{NUMBER} x the floor"),
+    "table_digests": Smallest("write {out}/made {out}/digests.json --quick", r"3 runs and 1 datasets .*: \d+ tables"),
     "table_model": Smallest("200", rf"{NUMBER} s for trees[\s\S]*\d predictions/s"),
     "tables": Smallest("0.01", rf"CPU: {NUMBER} times"),
     "train_step": Smallest("{dataset} 16", rf"throughput {NUMBER} x", package="torch"),

@@ -1,4 +1,4 @@
-"""Write docs/reference/{cli,columns,documents,recipe,robots}.md from the code; `make docs` runs it and a test compares."""
+"""Write docs/reference/{cli,columns,documents,findings,recipe,robots}.md from the code; `make docs` runs it and a test compares."""
 
 from __future__ import annotations
 
@@ -16,10 +16,13 @@ import click
 from tcpipe.cli import cli
 from tcpipe.cli.answers import answers
 from tcpipe.formats.contracts import DOCUMENTS
+from tcpipe.formats.finding_lines import describe_finding, format_number
 from tcpipe.formats.recipe_toml import commented_toml
 from tcpipe.formats.robot_files import shipped_profiles
 from tcpipe.planning.path_table import PIECES
+from tcpipe.tables.catalogue import Entry, catalogue_sections, read_catalogue
 from tcpipe.tables.columns import Column, TableSchema
+from tcpipe.tables.findings import Finding, Subject
 from tcpipe.tables.levels import (
     DATA_MODEL_VERSION,
     GATED_TRACK,
@@ -40,6 +43,7 @@ def pages() -> dict[str, str]:
         "cli.md": _cli(),
         "columns.md": _columns(),
         "documents.md": _documents(),
+        "findings.md": _findings(),
         "recipe.md": _recipe(),
         "robots.md": _robots(),
     }
@@ -66,7 +70,9 @@ def _documents() -> str:
 
 _FILES = """# JSON documents and answers
 
-`schemas/` has every key of each with its type, as JSON Schema: what a scheduler parses. Files have their seal beside (`document_sha256`).
+`schemas/` has every key of each with its type and meaning, as JSON Schema: what a scheduler parses. Definitions that several share are in
+`schemas/defs.schema.json`, to which the others refer by its relative name: load the folder as a whole. Files have their seal beside
+(`document_sha256`).
 
 ## Files
 """
@@ -74,6 +80,7 @@ _FILES = """# JSON documents and answers
 _ANSWERS = """## What commands print with `--json`
 
 `ingest` prints a line for each log as it ends (`ingest-log`) and one of all (`ingest-summary`); what `inspect` prints is by the key `kind`.
+`evaluate` prints the file `evaluation`, and with `--drive` the answer `evaluate-drives`.
 A command that fails prints `exit_code` and `problems`.
 """
 
@@ -127,6 +134,74 @@ def _bits(column: str, flags: type[IntFlag]) -> str:
         f"| {int(bit)} | `{str(bit.name).lower()}` | {meaning[str(bit.name)].replace('|', _BAR)} |" for bit in flags
     ]
     return f"\nBits of `{column}`, 0 = none:\n\n| bit | name | meaning |\n|---|---|---|\n" + "\n".join(rows) + "\n"
+
+
+_TROUBLESHOOTING = """# Findings: troubleshooting
+
+What tcpipe reports about logs, maps, runs and datasets. Each line of a report ends with a code in brackets, as `[no-gnss]`; search this
+page for the code, or for words such as dropout, lever arm, time offset, drift, multipath, no power.
+
+An **error** makes the labels that it affects not usable, a **warning** usable with care; a **note** changes no verdict.
+`tcpipe inspect RUN` lists all findings of a run with their remedies; `--json` gives them as data. Figures below are examples.
+"""
+
+
+def _findings() -> str:
+    """Return the catalogue of findings, section by section, each code as a heading."""
+    catalogue = read_catalogue()
+    parts = [_NOTE, _TROUBLESHOOTING]
+    for section, codes in catalogue_sections().items():
+        parts += [f"## {section}\n", *(_finding(code, catalogue[code]) for code in codes)]
+    return "\n".join(parts)
+
+
+def _finding(code: str, entry: Entry) -> str:
+    affected = f"affects {', '.join(entry.affects)}" if entry.affects else "affects no label"
+    more = [f"{entry.severity}, {entry.action}, {affected}"]
+    more += [f"quality bit `{entry.flag}`"] if entry.flag else []
+    more += ["exit code 3 of `tcpipe ingest` until it is acknowledged"] if entry.is_problem else []
+    lines = [f"### {entry.title} `[{code}]`\n", f"> {describe_finding(example_finding(code))}\n"]
+    lines += [f"Template: `{entry.template}`\n"] if entry.fields else []
+    lines += [f"*{'; '.join(more)}.*\n", f"{_sentence(entry.cause)}\n"]
+    remedies = [*([_sentence(entry.advice)] if entry.advice else [])]
+    remedies += [f"{_sentence(text)} `tcpipe inspect` prints the keys." for text in entry.remedies.values()]
+    lines += ["What to do:\n", *(f"- {text}" for text in remedies), ""] if remedies else []
+    limits = ", ".join(f"`{name}` {format_number(name, value)}" for name, value in entry.thresholds.items())
+    lines += [f"Thresholds: {limits}.\n"] if limits else []
+    lines += [f"Search words: {', '.join(entry.words)}.\n"] if entry.words else []
+    return "\n".join(lines)
+
+
+def example_finding(code: str) -> Finding:
+    """Return a finding with typical values: numbers by their suffix, names by their key."""
+    entry = read_catalogue()[code]
+    numbers = {
+        name: next((value for suffix, value in _NUMBERS.items() if name.endswith(suffix)), None)
+        for name in entry.fields
+    }
+    names = {name: _NAMES.get(name, name.replace("_", " ")) for name in entry.fields if numbers[name] is None}
+    role = next((role for role in _ROLES if code.startswith(role.split("_")[0])), "gnss")
+    known = {name: value for name, value in numbers.items() if value is not None}
+    return Finding(code, entry.severity, Subject("role", role), entry.action, (312.0, 318.0), known, names)
+
+
+_ROLES = ("imu", "power", "odometry", "pose", "velocity")
+_NUMBERS = {
+    "wanted_hz": 20.0, "at_20_hz_fraction": 0.041, "length_s": 30.0, "driven_m": 84.0, "limit_mps": 1.0,
+    "_count": 12.0, "_fraction": 0.123, "_ratio": 1.05, "_rad": 0.0524, "_hz": 9.87, "_mps2": 9.81, "_mps": 0.95, "_m2": 12.3,
+    "_std": 0.004,
+    "_volt": 25.6, "_amp": 12.3, "_watt": 123.0, "_s": 0.123, "_m": 1.23, "before": 84.1, "after": 96.2, "scale": 1.053,
+}  # fmt: skip
+_NAMES = {
+    "subject": "gnss", "topic": "/gps/fix", "topics": "/left/current, /battery/voltage", "reason": "gap", "reference": "wheel_odometry",
+    "role": "imu", "frame": "gps_link", "quantity": "current", "rail": "battery", "map": "site", "robot": "husky", "unit": "W",
+    "error": "LogError", "type": "sensor_msgs/msg/Imu", "span": "312 to 318 s",
+}  # fmt: skip
+
+
+def _sentence(text: str) -> str:
+    text = " ".join(text.split())
+    return text if text.endswith((".", "?")) else f"{text}."
 
 
 def _recipe() -> str:

@@ -24,6 +24,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable
+from typing import Any
 
 _URL = re.compile(r"(?<![a-z0-9+.-])([a-z][a-z0-9+.-]+:/{1,2})(\S+)", re.IGNORECASE)
 _CLOSING = ")]}'\",;:."
@@ -71,17 +72,21 @@ def plain_lines(lines: Iterable[str]) -> str:
 
 
 class TcpipeError(Exception):
-    """Base of everything tcpipe raises on purpose; ``problems`` holds one plain line each."""
+    """Base of everything tcpipe raises on purpose; ``problems`` holds one plain line each.
+
+    ``findings`` are those that were made before (`tcpipe.tables.findings.Finding`), which the command line prints, too.
+    """
 
     exit_code = 1
 
-    def __init__(self, *problems: str) -> None:
+    def __init__(self, *problems: str, findings: Iterable[Any] = ()) -> None:
         self.problems: tuple[str, ...] = tuple(plain_line(problem) for problem in problems)
+        self.findings = tuple(findings)
         super().__init__("\n".join(self.problems))
 
-    def __reduce__(self) -> tuple[type[TcpipeError], tuple[str, ...]]:
-        """Pickle through worker processes with every problem kept."""
-        return type(self), self.problems
+    def __reduce__(self) -> tuple[type[TcpipeError], tuple[str, ...], dict[str, tuple[Any, ...]]]:
+        """Pickle through worker processes with every problem and finding kept."""
+        return type(self), self.problems, {"findings": self.findings}
 
 
 class UsageError(TcpipeError):

@@ -80,7 +80,8 @@ def _as_promised(done: subprocess.CompletedProcess[str]) -> subprocess.Completed
     if "--json" in done.args[1:] and done.returncode in {0, 1, 3} and '"problems"' not in done.stdout[:40]:
         for text in done.stdout.splitlines() if command == "ingest" else [done.stdout]:
             said = json.loads(text)
-            cls = known.get(f"{command}-{said.get('kind')}.answer") or known.get(f"{command}.answer")
+            name = "evaluation" if command == "evaluate" else f"{command}.answer"  # it prints its file
+            cls = known.get(f"{command}-{said.get('kind')}.answer") or known.get(name)
             assert cls is not None, f"{command} --json has no contract"
             assert plain(typed(said, cls, Path(command))) == said
     return done

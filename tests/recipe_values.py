@@ -5,11 +5,10 @@ from dataclasses import fields, is_dataclass, replace
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
-from annotated_types import Ge, Le, Lt
-
 from tcpipe.recipe import Recipe
 from tcpipe.recipe.checking import kinds_of
 from tcpipe.robots.profiles import PowerSource
+from tcpipe.tables.bounds import Bounds
 
 
 def keys() -> list[str]:
@@ -63,12 +62,7 @@ def _values(kind: Any, bounds: tuple[Any, ...] = ()) -> Iterator[Any]:
         yield from _ends(kind, bounds)
 
 
-def _ends(kind: Any, bounds: tuple[Any, ...]) -> Iterator[Any]:
+def _ends(kind: Any, bounds: tuple[Bounds, ...]) -> Iterator[Any]:
     for bound in bounds:
-        match bound:
-            case Ge():
-                yield kind(bound.ge)
-            case Le():
-                yield kind(bound.le)
-            case Lt():
-                yield kind(bound.lt) - 1e-15
+        ends = (bound.ge, bound.le, None if bound.lt is None else bound.lt - 1e-15)
+        yield from (kind(end) for end in ends if end is not None)

@@ -1,26 +1,19 @@
-"""What messages suggest for the recipe, read out of their text as a person would."""
+"""What findings propose for the recipe, followed as a person would."""
 
-import re
 import tomllib
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
+from tcpipe.formats.finding_lines import recipe_lines
 from tcpipe.formats.recipe_toml import parse_recipe
 from tcpipe.recipe import Recipe
+from tcpipe.tables.findings import Finding
 
-_LINE = re.compile(r"under \[([\w.]+)\]: ")
 
-
-def suggestions_in(message: str) -> list[dict[str, Any]]:
-    """The recipe values that a message suggests, one for each alternative, by its printed lines."""
-    found = []
-    for alternative in message.split("write in the recipe ")[1:]:
-        parts = _LINE.split(alternative)[1:]
-        values: dict[str, Any] = {}
-        for table, text in zip(parts[::2], parts[1::2], strict=True):
-            values = merged(values, tomllib.loads(f"[{table}]\n{_longest_toml(text)}"))
-        found.append(values)
-    return found
+def proposed(finding: Finding, *, alternative: int = 0) -> dict[str, Any]:
+    """The recipe values that a remedy of a finding proposes, by the lines that are printed."""
+    return tomllib.loads("\n".join(recipe_lines(replace(finding, remedies=(finding.remedies[alternative],)))))
 
 
 def merged(one: Mapping[str, Any], other: Mapping[str, Any]) -> dict[str, Any]:
@@ -32,18 +25,6 @@ def merged(one: Mapping[str, Any], other: Mapping[str, Any]) -> dict[str, Any]:
     return both
 
 
-def recipe_that_follows(message: str, *, alternative: int = 0, before: Mapping[str, Any] | None = None) -> Recipe:
-    """A recipe with what a message suggests; RecipeError where it is refused."""
-    return parse_recipe(merged(before or {}, suggestions_in(message)[alternative]), where="followed")
-
-
-def _longest_toml(text: str) -> str:
-    """The longest beginning that is TOML and ends where a clause does."""
-    ends = [len(text), *(at.start() for at in reversed(list(re.finditer(r" and $|; ", text))))]
-    for end in ends:
-        try:
-            tomllib.loads(text[:end])
-        except tomllib.TOMLDecodeError:
-            continue
-        return text[:end]
-    raise AssertionError(f"no TOML: {text}")
+def recipe_that_follows(finding: Finding, *, alternative: int = 0, before: Mapping[str, Any] | None = None) -> Recipe:
+    """A recipe with what a finding proposes; RecipeError where it is refused."""
+    return parse_recipe(merged(before or {}, proposed(finding, alternative=alternative)), where="followed")

@@ -15,7 +15,7 @@ from tcpipe.pipeline.log_writer import commit_run
 from tcpipe.recipe import Recipe
 from tcpipe.store import Store, open_store
 from tcpipe.tables.bits import DropReason
-from tcpipe.tables.facts import NOTHING_FOUND, PowerSign, RunFacts
+from tcpipe.tables.facts import PowerSign, RunFacts
 from tcpipe.tables.findings import StageReport
 from tcpipe.tables.levels import (
     DATA_MODEL_VERSION,
@@ -29,6 +29,7 @@ from tcpipe.tables.levels import (
     Track,
     TrackInfo,
 )
+from tcpipe.tables.verdicts import judge
 from tcpipe.tables.wkb import line_column
 
 STANDING_WATT = 90.0
@@ -128,7 +129,7 @@ def add_run(
     ledger_m=None,
     sensors=None,
     track=None,
-    warnings=(),
+    findings=(),
     tags=None,
     includes=(),
 ):
@@ -136,7 +137,7 @@ def add_run(
     recipe = recipe or Recipe()
     robot = table.column("robot")[0].as_py() if table.num_rows else "husky"
     power = PowerSign("drawn_positive", averaged=False, includes=includes)
-    found = StageReport((), RunFacts(power=power)) if includes else NOTHING_FOUND
+    found = StageReport(tuple(findings), RunFacts(power=power) if includes else RunFacts())
     info = TrackInfo(run_id, robot, Datum(15.43, 47.07, 400.0), 20.0, "smoother", found)
     identity = recipe_id(recipe, robot)
     metres = float(np.sum(table.column("arc_length_m").to_numpy()))
@@ -155,7 +156,7 @@ def add_run(
         tags=tags or {},
         counts=Counts(table.num_rows),
         ledger_m=ledger_m,
-        warnings=warnings,
+        verdict=judge(findings),
         damage=(),
         info=info,
     )

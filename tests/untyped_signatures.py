@@ -37,7 +37,7 @@ _BY_LIBRARY = {
         formats/logs/ros_types.py:_definitions_of_directory formats/logs/ros_types.py:_plain formats/logs/writing.py:_message
         formats/logs/writing.py:_value formats/logs/writing.py:_elements formats/logs/writing.py:_place""",
     "numba": """compiled.py:kernel compiled.py:_Announce.on_start compiled.py:_Announce.on_end""",
-    "click": "cli/options.py:Place.convert cli/options.py:FloatRange.convert cli/train.py:train",
+    "click": "cli/options.py:Place.convert cli/options.py:FloatRange.convert",
 }
 UNTYPED_LIBRARIES = {key: library for library, keys in _BY_LIBRARY.items() for key in keys.split()}
 """Functions that take or return a value of a library without types (or whose types name no class for it), as ``path:function``."""

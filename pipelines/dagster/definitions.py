@@ -23,7 +23,13 @@ from typing import Any
 
 import dagster as dg
 
+from tcpipe.formats.finding_lines import format_finding, list_findings
+from tcpipe.formats.json_files import typed
+from tcpipe.pipeline.dataset.findings import is_problem
 from tcpipe.pipeline.log_sources import LogSource, find_sources
+from tcpipe.tables.catalogue import AFFECTED
+from tcpipe.tables.findings import Finding, select_findings
+from tcpipe.tables.verdicts import Verdict
 
 Answer = Mapping[str, Any]
 
@@ -82,10 +88,18 @@ def _picture(path: Path) -> dict[str, dg.MetadataValue]:
     return {"map": dg.MetadataValue.md(f"![map](data:image/png;base64,{data})")}
 
 
-def _check(name: str, problems: list[str], *, warn: bool = False, **counts: int) -> dg.AssetCheckResult:
+def _check(name: str, problems: list[str], *, warn: bool = False, **more: int | str) -> dg.AssetCheckResult:
     severity = dg.AssetCheckSeverity.WARN if warn else dg.AssetCheckSeverity.ERROR
-    metadata = {"problems": _listed(problems), **counts}
+    metadata = {"problems": _listed(problems), **more}
     return dg.AssetCheckResult(check_name=name, passed=not problems, severity=severity, metadata=metadata)
+
+
+def _judged(result: Answer) -> dg.AssetCheckResult:
+    """Return whether position, time and energy of a run are usable; the reasons are the problems, the worst first."""
+    verdict = typed(result["verdict"], Verdict, "tcpipe ingest --json")
+    lines = [*map(format_finding, verdict.reasons), *result["damage"]]
+    grades = {name: getattr(verdict, name) for name in AFFECTED}
+    return _check("usable", lines, warn=verdict.worst != "not usable", **grades)
 
 
 def _verified(path: str) -> dg.AssetCheckResult:
@@ -101,9 +115,7 @@ def _verified(path: str) -> dg.AssetCheckResult:
     kinds={"parquet"},
     check_specs=[
         dg.AssetCheckSpec("as_written", asset="run", description="Every byte is as it was written (tcpipe verify)."),
-        dg.AssetCheckSpec(
-            "nothing_doubtful", asset="run", description="Nothing is damaged, no sensor is missing or contradicted."
-        ),
+        dg.AssetCheckSpec("usable", asset="run", description="Position, time and energy are usable without care."),
     ],
 )
 def run(context: dg.AssetExecutionContext) -> dg.MaterializeResult:
@@ -130,7 +142,7 @@ def run(context: dg.AssetExecutionContext) -> dg.MaterializeResult:
         },
         check_results=[
             _verified(f"{_place('TCPIPE_STORE', 'tcpipe-store')}/runs/{result['run_id']}"),
-            _check("nothing_doubtful", [*result["damage"], *result["warnings"]], warn=True),
+            _judged(result),
         ],
     )
 
@@ -154,12 +166,9 @@ def dataset() -> dg.MaterializeResult:
     out = _place("TCPIPE_DATASET", "dataset")
     region = os.environ.get("TCPIPE_SPLIT")
     (made,) = _answers("build-dataset", out, *(["--split", region] if region else []))
-    doubtful = made["doubtful"]
-    shared = [
-        f"{part['overlapping_pairs']} patches of {part['split']} overlap one of train"
-        for part in made["audit"]
-        if part["overlapping_pairs"]
-    ]
+    doubtful, findings = made["doubtful"], typed(made["findings"], tuple[Finding, ...], "tcpipe build-dataset --json")
+    problems = [format_finding(finding) for finding in findings if is_problem(finding)]
+    shared = [format_finding(finding) for finding in select_findings(findings, "split-leakage")]
     return dg.MaterializeResult(
         metadata={
             "status": made["status"],
@@ -167,13 +176,13 @@ def dataset() -> dg.MaterializeResult:
             **{f"{name}_samples": count for name, count in made["splits"].items()},
             **({"doubtful_share": doubtful["share"]} if doubtful else {}),
             "where_every_metre_went": _ledger(made["ledger_m"]),
-            "warnings": _listed(made["warnings"]),
+            "findings": _listed(list_findings(findings)),
             "page": dg.MetadataValue.path(str(Path(out).absolute() / "report.html")),
             **_picture(Path(out) / "overview.png"),
         },
         check_results=[
             _verified(out),
-            _check("as_asked_for", made["problems"], warn=True),
+            _check("as_asked_for", problems, warn=True),
             _check("held_out", shared, warn=True),
         ],
     )

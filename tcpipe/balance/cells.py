@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.balance.correlation import Correlation, effective_size
+from tcpipe.tables.catalogue import threshold
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -20,9 +21,6 @@ SLOPE_NAMES = (
     *("below -15°", "-15° to -10°", "-10° to -5°", "-5° to -2°", "-2° to 2°"),
     *("2° to 5°", "5° to 10°", "10° to 15°", "above 15°"),
 )
-
-ENOUGH = 30.0
-"""Effective samples from which on a cell is not rare: its mean is known to 1/√30, a fifth, of its deviation."""
 
 _SPEEDS = 5
 """Ranges of speed that hold all but the fastest hundredth."""
@@ -47,9 +45,9 @@ class Cell:
 
     @property
     def rare(self) -> bool:
-        """Whether it is worth fewer than `ENOUGH` independent samples."""
+        """Whether it is worth few independent samples: with 30, its mean is known to 1/√30, a fifth, of its standard deviation."""
         known = self.effective if self.effective is not None else sum(self.samples.values())
-        return known < ENOUGH
+        return known < threshold("thin-ground", "enough_count")
 
 
 def slope_ranges(slope_rad: Floats) -> Ints:

@@ -6,9 +6,8 @@ from __future__ import annotations
 def every_contract() -> dict[str, str]:
     """Return file name → JSON Schema text, of all that has one."""
     from tcpipe.formats.contracts import contracts
-    from tcpipe.formats.json_files import schema_of
 
-    return contracts() | {f"{name}.schema.json": schema_of(cls) for name, cls in answers().items()}
+    return contracts(answers())
 
 
 def answers() -> dict[str, type]:
@@ -54,7 +53,6 @@ def answers() -> dict[str, type]:
         "build-dataset.answer": BuildResult,
         "cost-map.answer": CostMapResult,
         "diff.answer": Difference,
-        "evaluate.answer": Evaluation,
         "evaluate-drives.answer": Drives,
         "explain.answer": Explained,
         "export.answer": Exported,

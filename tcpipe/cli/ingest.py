@@ -4,25 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import click
 
-from tcpipe.cli.options import (
-    ONE_OF_SEVERAL,
-    cluster_option,
-    dry_run_option,
-    jobs_option,
-    min_age_option,
-    msgdef_option,
-    quiet_option,
-    recipe_option,
-    robot_option,
-    shard_value,
-    store_option,
-    tag_option,
-)
+from tcpipe.cli.options import dry_run_option, options_of, quiet_option
 from tcpipe.cli.output import say
+from tcpipe.pipeline.ingest_options import IngestOptions
 
 if TYPE_CHECKING:
     from tcpipe.pipeline.ingest import IngestSummary
@@ -30,53 +18,16 @@ if TYPE_CHECKING:
 
 
 @click.command(short_help="Logs to labelled 1 m segments")
-@click.argument("logs", nargs=-1, required=True, type=ONE_OF_SEVERAL, metavar="LOG...")
-@store_option
-@recipe_option
-@robot_option(
-    "Robot profile: one that `tcpipe init` lists, or of the recipe (found by message types and topic names otherwise)."
-)
-@tag_option("Free tag on the runs; repeatable.")
-@jobs_option("Logs")
-@cluster_option
-@click.option("--as-one", is_flag=True, help="All logs are parts of one drive (splits; power logged apart).")
-@msgdef_option
-@click.option(
-    "--shard",
-    metavar="I/N",
-    callback=shard_value,
-    help="Only the I-th of N shares of the logs: one for each task of an array.",
-)
-@min_age_option("0", "A log that was written to since (90, 90s, 10m, 2h, 1d) waits for another call.")
-@click.option("--retry-failed", is_flag=True, help="Try again what is known to fail.")
-@click.option("--force", is_flag=True, help="Do again what is there already, and what is known to fail.")
+@options_of(IngestOptions)
 @dry_run_option
 @click.option("--json", "as_json", is_flag=True, help="Print a JSON object for each log as it ends, and one of all.")
 @quiet_option
-def ingest(
-    logs: tuple[str, ...],
-    *,
-    store: str,
-    recipe: str | None,
-    robot: str | None,
-    tags: dict[str, str],
-    jobs: int,
-    cluster: str | None,
-    as_one: bool,
-    msgdef: str | None,
-    shard: tuple[int, int] | None,
-    min_age_s: float,
-    retry_failed: bool,
-    force: bool,
-    dry_run: bool,
-    as_json: bool,
-    quiet: bool,
-) -> int:
+def ingest(options: IngestOptions, *, dry_run: bool, as_json: bool, quiet: bool) -> int:
     """Read logs, fuse the sensors, gate, cut into 1 m segments, and label each with power, velocity, time and energy.
 
     A LOG is a .mcap, a .bag, a .db3, a ROS 2 bag directory, or a folder of such, searched downward, or the s3:// URL of
     one. What is in the store already (same content, same recipe) is left alone, and what failed for its content is not
-    tried again. A line is printed as each log ends; of several logs, warnings follow by cause.
+    tried again. A line is printed as each log ends; of several logs, findings follow by code.
 
     Exit code 3: some logs failed, are damaged, or give no segment though the robot drove, and that is news: it was not
     told before, and not accepted (tcpipe accept).
@@ -85,28 +36,28 @@ def ingest(
 
     from tcpipe.cli.output import print_json_line, progress, ruling_recipe, say_result
     from tcpipe.formats.json_files import recast
-    from tcpipe.pipeline.ingest import SummaryLine
-    from tcpipe.pipeline.ingest import ingest as run
+    from tcpipe.pipeline.ingest import SummaryLine, run_ingest
     from tcpipe.pipeline.ingest_task import LogLine
 
-    ruling, source = ruling_recipe(recipe)
+    ruling, source = ruling_recipe(cast("str | None", options.recipe))
+    options = replace(options, recipe=ruling)
     if not as_json:
         say(f"recipe: {source}")
     if dry_run:
         from tcpipe.pipeline.status import status
 
         planned = status(
-            logs,
-            store=store,
+            options.logs,
+            store=options.store,
             recipe=ruling,
-            robot=robot,
-            as_one=as_one,
-            shard=shard,
-            min_age_s=min_age_s,
-            message_definitions=Path(msgdef) if msgdef else None,
-            force=force,
-            retry_failed=retry_failed,
-            jobs=jobs,
+            robot=options.robot,
+            as_one=options.as_one,
+            shard=options.shard,
+            min_age_s=options.min_age_s,
+            message_definitions=Path(options.message_definitions) if options.message_definitions else None,
+            force=options.force,
+            retry_failed=options.retry_failed,
+            jobs=options.jobs,
             create=True,
         )
         say_result(replace(planned, history=()), as_json=as_json)
@@ -127,85 +78,68 @@ def ingest(
             if as_json:
                 print_json_line(recast(result, LogLine))
             else:
-                for line in _of_one(result, several=several):
+                for line in _of_one(result, options.store, several=several):
                     shown.result(line)
             for problem in result.problems if result.is_news else ():
                 shown.problem(problem)
 
-        summary = run(
-            logs,
-            store=store,
-            recipe=ruling,
-            robot=robot,
-            tags=tags,
-            jobs=jobs,
-            cluster=cluster,
-            force=force,
-            retry_failed=retry_failed,
-            as_one=as_one,
-            shard=shard,
-            min_age_s=min_age_s,
-            message_definitions=Path(msgdef) if msgdef else None,
-            on_found=on_found,
-            on_result=on_result,
-        )
+        summary = run_ingest(replace(options, on_found=on_found, on_result=on_result))
     if as_json:
         made = str(summary.store) if isinstance(summary.store, str) or summary.store.is_dir() else None
         print_json_line(SummaryLine(source, made, summary.exit_code, summary.results))
     else:
         if several:
-            _print_warnings(summary)
+            _print_findings(summary)
         _print_sum(summary)
     return summary.exit_code
 
 
-def _of_one(result: IngestResult, *, several: bool) -> Iterator[str]:
-    """Yield what became of a log: of one alone with its warnings, of several one line each, and what is broken."""
+def _of_one(result: IngestResult, store: Path | str, *, several: bool) -> Iterator[str]:
+    """Yield what became of a log: of one alone with its findings, of several one line each, and what is broken."""
     from tcpipe.cost.budget import in_words
+    from tcpipe.formats.finding_lines import describe_finding, format_findings, format_verdict
+    from tcpipe.tables.findings import select_problems
 
     aside = " (accepted)" if result.accepted else ""
-    warnings = result.warnings if result.status != "unchanged" else ()
-    budget = result.energy_budget if result.status != "unchanged" else None
+    is_new = result.status != "unchanged"
+    budget = result.energy_budget if is_new else None
+    problems = select_problems(result.findings)
     if result.status in ("failed", "waiting"):
         known = " (known, not tried again)" if result.known else ""
         yield f"{result.status:<10} {result.log}{aside or known}"
     else:
-        wrong = "damaged" if result.damage else "empty" if result.why_empty else ""
+        wrong = "damaged" if result.damage else "empty" if problems else ""
         known = f" ({wrong}, known)" if wrong and not result.is_news else ""
-        told = f", noise floor of E {100 * budget.total:.1f} %" if several and budget else ""
-        told += f", {len(warnings)} warning{'s' * (len(warnings) > 1)}" if several and warnings else ""
+        more = f", noise floor of E {100 * budget.total:.1f} %" if several and budget else ""
+        more += f"; {format_verdict(result.verdict)}" if several and is_new and result.verdict else ""
         yield (
             f"{result.status:<10} {result.run_id}/{result.recipe_id}: {result.segments} segments "
-            f"from {result.kept_m:.1f} of {result.distance_m:.1f} m, robot {result.robot}{told}{aside or known}"
+            f"from {result.kept_m:.1f} of {result.distance_m:.1f} m, robot {result.robot}{more}{aside or known}"
         )
-    if result.why_empty and (result.is_news or result.status != "unchanged"):
-        yield f"  {result.why_empty}"
-    if result.no_power and not several and result.status != "unchanged":
-        yield f"  {result.no_power.why}"
-        yield from (f"    {line}" for line in result.no_power.recipe.splitlines())
     if result.same_as:
         yield f"  {result.log} is the same recording as {result.same_as}: one run"
     if budget is not None and not several:
         yield f"  {in_words(budget)}"
     yield from (f"  {note}" for note in result.notes)
     yield from (f"  damage:  {line}" for line in result.damage if result.is_news or result.status == "damaged")
-    said = result.no_power.why if result.no_power else ""
-    yield from (f"  warning: {line}" for line in warnings if not several and line not in said)
+    if result.verdict is None:
+        return
+    if is_new and not several:
+        yield f"  verdict: {format_verdict(result.verdict)}"
+        where = f"tcpipe inspect {store}/runs/{result.run_id}"
+        yield from (f"  {line}" for line in format_findings(result.findings, more=where))
+    elif is_new or result.is_news:
+        yield from (f"  {describe_finding(of)} [{of.code}]" for of in problems if of.code != "log-damaged")
 
 
-def _print_warnings(summary: IngestSummary) -> None:
-    """Print a line for each cause of warnings, that of most runs first."""
-    from tcpipe.tables.facts import by_cause
+def _print_findings(summary: IngestSummary) -> None:
+    """Print the findings of several runs by code."""
+    from tcpipe.formats.finding_lines import format_groups, group_findings
 
     made = [result for result in summary.results if result.run_id and result.status != "unchanged"]
-    for line in dict.fromkeys(line for of in made if of.no_power for line in (of.no_power.recipe,) if line):
-        say("power that no topic plays or that is refused (below) is read by this recipe, where it is of the drives:")
-        for part in line.splitlines():
-            say(f"  {part}")
-    causes = by_cause((str(result.run_id), result.warnings) for result in made)
-    for told in sorted(causes, key=lambda of: -len(of)):
-        run, line = next(iter(told.items()))
-        say(f"warning: {f'{len(told)} runs' if len(told) > 1 else run}: {line}")
+    groups = group_findings((str(result.run_id), result.findings) for result in made)
+    for line in format_groups(groups, len(made), more=f"tcpipe report {summary.store}"):
+        say(line)
 
 
 def _print_sum(summary: IngestSummary) -> None:

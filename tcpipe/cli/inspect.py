@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from tcpipe.pipeline.inspected import InspectedDataset, InspectedMap
     from tcpipe.pipeline.log_inspection import InspectedLog, InspectedTopic
     from tcpipe.pipeline.table_proposal import InspectedTables
+    from tcpipe.tables.findings import Finding
 
 
 @click.command(short_help="What is in a log, map, dataset or store")
@@ -83,17 +84,21 @@ def _print_log(log: InspectedLog) -> None:
     _print_table(header, rows)
     if full:
         _print_clocks(log)
-    if log.no_power:
-        say(f"power: {log.no_power.why}")
-        for line in log.no_power.recipe.splitlines():
-            say(f"  {line}")
     if log.problems:
         say("to be decided:")
     for line in log.problems:
         say(f"  {line}")
-    for kind, lines in (("warning", log.warnings), ("damage", log.damage), ("remark", log.remarks)):
+    _print_findings(log.findings or ())
+    for kind, lines in (("damage", log.damage), ("remark", log.remarks)):
         for line in lines or ():
             say(f"{kind}: {line}")
+
+
+def _print_findings(findings: Iterable[Finding]) -> None:
+    from tcpipe.formats.finding_lines import list_findings
+
+    for line in list_findings(findings):
+        say(line)
 
 
 _READ_HEADER = ["read", "gaps", "longest gap [s]", "time", "offset [s]", "stamps"]
@@ -140,11 +145,13 @@ def _print_map(found: InspectedMap) -> None:
     if "terrain" in found.layers:
         say("")
         _print_table(["id", "class", "traversable", "share"], classes)
-    for line in found.warnings:
-        say(f"warning: {line}")
+    _print_findings(found.findings)
 
 
 def _print_dataset(found: InspectedDataset) -> None:
+    from tcpipe.formats.dataset_card import group_dataset_findings
+    from tcpipe.formats.finding_lines import format_verdict, list_mixed_groups
+
     say(
         f"{found.path}: dataset {found.name}, {found.samples} samples of {', '.join(found.robots)}, "
         f"format {found.format}, data model {found.data_model_version}"
@@ -159,8 +166,10 @@ def _print_dataset(found: InspectedDataset) -> None:
     say("")
     say(f"layers: {', '.join(found.layers)}; labels: {', '.join(found.label.columns)}")
     say(f"runs: {', '.join(run.run_id for run in found.runs)}; map: {', '.join(entry.name for entry in found.maps)}")
-    for line in found.warnings:
-        say(f"warning: {line}")
+    if found.verdict is not None:
+        say(f"verdict: {format_verdict(found.verdict)}")
+    for line in list_mixed_groups(group_dataset_findings(found.findings, found.findings_by_run, found.findings_by_map)):
+        say(line)
 
 
 def _print_store(found: InspectedStore) -> None:
@@ -168,10 +177,14 @@ def _print_store(found: InspectedStore) -> None:
     say(f"{found.path}: {runs} run{'' if runs == 1 else 's'}, maps: {', '.join(found.maps) or 'none'}")
     say("")
     rows = [
-        [run.run_id, run.recipe_id, run.robot, str(run.segments), f"{run.distance_m:.1f}", str(run.damage)]
+        [
+            *(run.run_id, run.recipe_id, run.robot, str(run.segments), f"{run.distance_m:.1f}"),
+            *(run.position, run.time, run.energy, str(run.findings), str(run.damage)),
+        ]
         for run in found.runs
     ]
-    _print_table(["run", "recipe", "robot", "segments", "metres", "damage"], rows)
+    header = ["run", "recipe", "robot", "segments", "metres", "position", "time", "energy", "findings", "damage"]
+    _print_table(header, rows)
     for run_id, version in found.outdated.items():
         say(f"of another data model ({version}): {run_id}; ingest its log again")
     for line in dict.fromkeys(found.damaged_runs.values()):
@@ -181,6 +194,8 @@ def _print_store(found: InspectedStore) -> None:
 
 
 def _print_run(found: InspectedRun) -> None:
+    from tcpipe.formats.finding_lines import format_verdict
+
     say(f"{found.run_id}: from {' + '.join(found.source.paths if found.source else ['an unknown log'])}")
     if found.tags:
         say("tags: " + ", ".join(f"{key}={value}" for key, value in sorted(found.tags.items())))
@@ -193,9 +208,10 @@ def _print_run(found: InspectedRun) -> None:
         lost = sorted(((metres, name) for name, metres in ledger.items() if metres >= 0.05), reverse=True)
         said = ", ".join(f"{metres:.1f} m {name.replace('_', ' ')}" for metres, name in lost)
         say(f"{run.distance_m:.1f} m driven: {said}" if said else "not driven")
-        for kind, lines in (("warning", run.warnings), ("damage", run.damage)):
-            for line in lines:
-                say(f"{kind}: {line}")
+        say(f"verdict: {format_verdict(run.verdict)}")
+        _print_findings(run.findings)
+        for line in run.damage:
+            say(f"damage: {line}")
 
 
 def _print_tables(found: InspectedTables) -> None:

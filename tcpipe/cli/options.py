@@ -6,15 +6,19 @@ import os
 import re
 from collections.abc import Callable, Iterable
 from contextlib import suppress
+from dataclasses import MISSING, fields
+from functools import wraps
 from math import isfinite, nan
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import click
+from click.core import ParameterSource
 from click.shell_completion import CompletionItem
 
 from tcpipe.errors import TcpipeError
 from tcpipe.formats import places
+from tcpipe.tables import options
 
 if TYPE_CHECKING:
     from tcpipe.store import Store
@@ -134,101 +138,6 @@ ONE_OF_SEVERAL = Place(str)
 """A log or raster, by pattern or address: the command looks at each for itself, and tells of all at once."""
 
 
-store_option = click.option(
-    "--store",
-    envvar="TCPIPE_STORE",
-    default="tcpipe-store",
-    type=PUBLISHED,
-    metavar="DIR|URL",
-    help="Where runs and maps are kept (or TCPIPE_STORE).",
-)
-"""``--store``, or TCPIPE_STORE, or ./tcpipe-store."""
-
-cluster_option = click.option(
-    "--cluster",
-    envvar="TCPIPE_CLUSTER",
-    metavar="ADDRESS",
-    help="Dask scheduler whose workers do it, tcp://host:port (or TCPIPE_CLUSTER); instead of --jobs.",
-)
-"""``--cluster``, or TCPIPE_CLUSTER."""
-
-recipe_option = click.option(
-    "--recipe",
-    type=INPUT_FILE,
-    metavar="FILE",
-    help="Recipe (or TCPIPE_RECIPE, or the nearest tcpipe.toml upward; else defaults).",
-)
-"""``--recipe``; without it TCPIPE_RECIPE, the nearest tcpipe.toml upward, or the defaults."""
-
-msgdef_option = click.option(
-    "--msgdef",
-    type=INPUT_DIRECTORY,
-    metavar="DIR",
-    help="Directory of package/msg/Name.msg (or .idl) files for types the log does not define.",
-)
-"""``--msgdef``: definitions of types that a log does not define."""
-
-json_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON object instead of text.")
-"""``--json``: one JSON object on stdout instead of text."""
-
-quiet_option = click.option("--quiet", "-q", is_flag=True, help="No progress on stderr.")
-"""``--quiet``: no progress on stderr."""
-
-map_option = click.option(
-    "--map",
-    "map_name",
-    metavar="NAME",
-    shell_complete=complete_maps,
-    help="Map to look at (default: the only one in the store).",
-)
-"""``--map``: the map to look at."""
-
-physics_option = click.option(
-    "--physics",
-    type=SEALED,
-    metavar="DATASET",
-    help="Dataset whose card says what turning costs the robot (default: the one that MODEL was trained on).",
-)
-"""``--physics``: whose physics costs the turns of a path."""
-
-speed_option = click.option(
-    "--speed",
-    "speed_mps",
-    type=FloatRange(0.0, 100.0, min_open=True),
-    metavar="MPS",
-    help="Commanded speed, for a model trained with --beside (default: the mean of its training).",
-)
-"""``--speed``: what speed is planned to be commanded."""
-
-model_argument = click.argument("model", type=SEALED, metavar="MODEL")
-"""``MODEL``: a trained model, here or in a bucket."""
-
-
-def robot_option(about: str = "Robot profile.") -> Option:
-    """Return ``--robot``."""
-    return click.option("--robot", metavar="NAME", shell_complete=complete_robots, help=about)
-
-
-def tag_option(about: str) -> Option:
-    """Return ``--tag``, which may be repeated."""
-    return click.option("--tag", "tags", multiple=True, metavar="K=V", callback=tag_values, help=about)
-
-
-def jobs_option(about: str) -> Option:
-    """Return ``--jobs``."""
-    return click.option("--jobs", "-j", default=1, type=click.IntRange(1, 1024), help=f"{about} side by side.")
-
-
-def min_age_option(default: str, about: str) -> Option:
-    """Return ``--min-age``."""
-    return click.option("--min-age", "min_age_s", default=default, metavar="T", callback=duration_value, help=about)
-
-
-dry_run_option = click.option(
-    "--dry-run", is_flag=True, help="Say what would be done, and what it would take; do nothing."
-)
-"""``--dry-run``: nothing is done."""
-
 _SECONDS = {"": 1.0, "s": 1.0, "m": 60.0, "h": 3600.0, "d": 86400.0}
 _MOST_SHARDS = 100_000
 
@@ -262,3 +171,128 @@ def tag_values(context: click.Context, parameter: click.Parameter, values: tuple
         if value.find("=") < 1:
             raise click.BadParameter(f"{value!r}: wanted KEY=VALUE", ctx=context, param=parameter)
     return dict(value.split("=", 1) for value in values)
+
+
+def holdout_value(context: click.Context, parameter: click.Parameter, value: str | None) -> str | None:
+    """Let pass what draws test; anything else is a usage error."""
+    if value is not None and re.fullmatch(r"block|sample|run|tag:.+", value) is None:
+        raise click.BadParameter(f"{value!r}: wanted block, sample, run, or tag:NAME", ctx=context, param=parameter)
+    return value
+
+
+KINDS: dict[str, dict[str, Any]] = {
+    "published": {"type": PUBLISHED},
+    "sealed": {"type": SEALED},
+    "input_file": {"type": INPUT_FILE},
+    "input_directory": {"type": INPUT_DIRECTORY},
+    "output_file": {"type": OUTPUT_FILE},
+    "several": {"type": ONE_OF_SEVERAL},
+    "lonlat": {"type": LonLat()},
+    "robot": {"shell_complete": complete_robots},
+    "map": {"shell_complete": complete_maps},
+    "tags": {"callback": tag_values, "multiple": True},
+    "duration": {"callback": duration_value},
+    "shard": {"callback": shard_value},
+    "holdout": {"callback": holdout_value},
+}
+"""What click has to know of a declared option, by its kind."""
+
+
+def parameter(name: str, default: Any, shown: options.Option) -> Option:
+    """Return the decorator of click for a declared option or argument."""
+    settings: dict[str, Any] = {"metavar": shown.metavar}
+    match shown.kind:
+        case options.Range(int() as least, int() as most):
+            settings["type"] = click.IntRange(least, most)
+        case options.Range(least, most, is_open):
+            settings["type"] = FloatRange(least, most, min_open=is_open)
+        case tuple(choices):
+            settings["type"] = click.Choice(choices)
+        case kind if kind:
+            settings |= KINDS[kind]
+    if shown.shown is not None or default not in (MISSING, None, ()):
+        settings["default"] = default if shown.shown is None else shown.shown
+    settings |= {"required": True} if default is MISSING else {}
+    if shown.is_argument:
+        return click.argument(name, nargs=-1 if shown.repeatable else 1, **settings)
+    settings |= {"is_flag": True} if isinstance(default, bool) else {}
+    flags = shown.flags or (f"--{name.replace('_', '-')}",)
+    multiple = settings.pop("multiple", shown.repeatable)
+    return click.option(*flags, name, help=shown.about or None, envvar=shown.envvar, multiple=multiple, **settings)
+
+
+def options_of(cls: type[Any]) -> Option:
+    """Return what gives a command the options that a dataclass declares; it takes them as one such object.
+
+    What is not given has the default of the dataclass, which may be another than the one that is shown.
+    """
+    declared = {of.name: (of.default, of.metadata["option"]) for of in fields(cls) if "option" in of.metadata}
+
+    def decorate(run: Callable[..., Any]) -> Callable[..., Any]:
+        @click.pass_context
+        @wraps(run)
+        def command(context: click.Context, /, **values: Any) -> Any:
+            own = {name: values.pop(name) for name in declared}
+            given = (name for name in own if context.get_parameter_source(name) is not ParameterSource.DEFAULT)
+            return run(cls(**{name: own[name] for name in given}), **values)
+
+        for name, (default, shown) in reversed(declared.items()):
+            command = parameter(name, default, shown)(command)
+        return command
+
+    return decorate
+
+
+store_option = parameter("store", "tcpipe-store", options.STORE)
+"""``--store``, or TCPIPE_STORE, or ./tcpipe-store."""
+
+cluster_option = parameter("cluster", None, options.CLUSTER)
+"""``--cluster``, or TCPIPE_CLUSTER."""
+
+recipe_option = parameter("recipe", None, options.RECIPE)
+"""``--recipe``; without it TCPIPE_RECIPE, the nearest tcpipe.toml upward, or the defaults."""
+
+msgdef_option = parameter("msgdef", None, options.MESSAGE_DEFINITIONS)
+"""``--msgdef``: definitions of types that a log does not define."""
+
+json_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON object instead of text.")
+"""``--json``: one JSON object on stdout instead of text."""
+
+quiet_option = click.option("--quiet", "-q", is_flag=True, help="No progress on stderr.")
+"""``--quiet``: no progress on stderr."""
+
+map_option = parameter("map_name", None, options.MAP)
+"""``--map``: the map to look at."""
+
+physics_option = parameter("physics", None, options.PHYSICS)
+"""``--physics``: whose physics costs the turns of a path."""
+
+speed_option = parameter("speed_mps", None, options.SPEED)
+"""``--speed``: what speed is planned to be commanded."""
+
+model_argument = parameter("model", MISSING, options.MODEL)
+"""``MODEL``: a trained model, here or in a bucket."""
+
+
+def robot_option(about: str = "Robot profile.") -> Option:
+    """Return ``--robot``."""
+    return click.option("--robot", metavar="NAME", shell_complete=complete_robots, help=about)
+
+
+def tag_option(about: str) -> Option:
+    """Return ``--tag``, which may be repeated."""
+    return click.option("--tag", "tags", multiple=True, metavar="K=V", callback=tag_values, help=about)
+
+
+def jobs_option(about: str) -> Option:
+    """Return ``--jobs``."""
+    return click.option("--jobs", "-j", default=1, type=click.IntRange(1, 1024), help=f"{about} side by side.")
+
+
+def min_age_option(default: str, about: str) -> Option:
+    """Return ``--min-age``."""
+    return click.option("--min-age", "min_age_s", default=default, metavar="T", callback=duration_value, help=about)
+
+
+dry_run_option = parameter("dry_run", False, options.DRY_RUN)
+"""``--dry-run``: nothing is done."""

@@ -19,12 +19,12 @@ from tcpipe.cli.options import LOG, json_option, msgdef_option, quiet_option, re
 def preflight(
     log: str, *, robot: str | None, recipe: str | None, msgdef: str | None, as_json: bool, quiet: bool
 ) -> int:
-    """Predict from LOG, a minute or more as it will be driven, what a day of such recording gives, and say what to mend before.
+    """Predict from LOG, a minute or more as it will be driven, what a day of such recording gives, and what to correct before.
 
-    Segments an hour, where the metres go, the deviations of labels, topics that are missing or too slow, clocks, and the command that
+    Segments an hour, where the metres go, the deviations of labels, the verdict, findings with their remedies, and the command that
     records what is needed. Nothing is written.
 
-    Exit codes: 0 ready; 3 something is to be mended; 1 nothing would come of it.
+    Exit codes: 0 ready; 3 there are warnings, errors or no segments; 1 ingesting it would fail.
     """
     from tcpipe.cli.output import progress, ruling_recipe, say_result
     from tcpipe.pipeline.preflight import preflight as run

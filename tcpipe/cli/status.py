@@ -43,6 +43,6 @@ def status(
         print_json(found)
         return found.exit_code
     say_lines(found)
-    for finding in found.findings:
+    for finding in found.problems:
         say(f"tcpipe: {format_finding(finding)}", err=True)
     return found.exit_code

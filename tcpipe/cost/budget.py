@@ -8,7 +8,9 @@ from dataclasses import asdict
 import numpy as np
 from numpy.typing import NDArray
 
+from tcpipe.tables.catalogue import threshold
 from tcpipe.tables.facts import EnergyBudget
+from tcpipe.tables.findings import Finding, Subject, make_finding
 
 CAUSES = ("position", "rate", "current", "voltage")
 """Displacement of both ends; what the current did between samples; noise and rounding of the current; the voltage's."""
@@ -48,6 +50,14 @@ def pooled(budgets: Iterable[EnergyBudget | None]) -> EnergyBudget | None:
     return EnergyBudget(
         count, mean_joule, **{name: float(np.sqrt(square)) / mean_joule for name, square in squares.items()}
     )
+
+
+def find_noise(budget: EnergyBudget | None, subject: Subject) -> tuple[Finding, ...]:
+    """Return the finding that the noise floor of E is high."""
+    if budget is None or budget.total < threshold("energy-noise", "max_total_fraction"):
+        return ()
+    numbers = {f"{name}_fraction": getattr(budget, name) for name in ("total", *CAUSES, "at_20_hz")}
+    return (make_finding("energy-noise", subject, **numbers),)
 
 
 def in_words(budget: EnergyBudget) -> str:

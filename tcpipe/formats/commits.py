@@ -42,6 +42,7 @@ class Failure:
     problems: tuple[str, ...]
     version: str
     """Of the program that failed."""
+    findings: tuple[Finding, ...] = field(default=(), metadata=LEFT_OUT)
 
 
 @dataclass(frozen=True, slots=True)

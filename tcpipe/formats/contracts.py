@@ -2,33 +2,56 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import pyarrow as pa
 
 from tcpipe.formats.dataset_card import DatasetCard
-from tcpipe.formats.json_files import DIALECT, schema_of, to_json
-from tcpipe.formats.recipe_toml import recipe_schema
+from tcpipe.formats.json_files import to_json
 from tcpipe.formats.run_documents import Manifest, RunJson
+from tcpipe.recipe import Recipe
+from tcpipe.recipe.checking import describe
 from tcpipe.tables.bits import name_of
 from tcpipe.tables.columns import Column, TableSchema
 from tcpipe.tables.levels import DATA_MODEL_VERSION, GATED_TRACK, LABELLED_SEGMENTS, REJECTIONS, SAMPLES, STREAMS
 
+DIALECT = "https://json-schema.org/draft/2020-12/schema"
+"""Of every schema in ``schemas/``."""
+DEFINITIONS = "defs"
+"""The schema whose definitions all documents and answers refer to."""
 DOCUMENTS = {"run": RunJson, "manifest": Manifest, "dataset": DatasetCard}
 """The JSON documents that others read, by the name of their schema."""
 
 
-def contracts() -> dict[str, str]:
-    """Return file name → JSON Schema text, for every table (one row as an object), the recipe and every document."""
+def contracts(answers: Mapping[str, type]) -> dict[str, str]:
+    """Return file name → JSON Schema text, for every table (one row as an object), the recipe, and every document and answer.
+
+    Parameters
+    ----------
+    answers : the dataclasses of what commands print and of the documents of the upper floors, by the name of their schema.
+    """
     tables = (*STREAMS.values(), GATED_TRACK, REJECTIONS, LABELLED_SEGMENTS, SAMPLES)
-    found = {f"{table.name}.schema.json": to_json(_table_schema(table)) for table in tables}
-    found["recipe.schema.json"] = to_json({"$schema": DIALECT, **recipe_schema()})
-    return found | {f"{name}.schema.json": schema_of(cls) for name, cls in DOCUMENTS.items()}
+    schemas = {table.name: _table_schema(table) for table in tables} | {"recipe": _recipe_schema()}
+    documents = {**DOCUMENTS, **answers}
+    pointers, definitions = describe(*documents.values(), file=f"{DEFINITIONS}.schema.json")
+    inner = to_json(definitions)
+    for name, pointer in zip(documents, pointers, strict=True):
+        shared = f'"{pointer["$ref"]}"' in inner
+        schemas[name] = pointer if shared else definitions.pop(pointer["$ref"].rpartition("/")[2])
+    schemas[DEFINITIONS] = {"$defs": definitions}
+    return {f"{name}.schema.json": to_json({"$schema": DIALECT, **schema}) for name, schema in schemas.items()}
+
+
+def _recipe_schema() -> dict[str, Any]:
+    """Return the schema of a recipe in one piece, as an editor loads it: a key that is not in it is refused."""
+    ((pointer,), definitions) = describe(Recipe)
+    closed = {name: {**definition, "additionalProperties": False} for name, definition in definitions.items()}
+    return {**pointer, "$defs": closed}
 
 
 def _table_schema(table: TableSchema) -> dict[str, Any]:
     return {
-        "$schema": DIALECT,
         "title": table.name,
         "description": f"{table.doc} One row.",
         "x-level": table.level,

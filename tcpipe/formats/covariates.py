@@ -16,6 +16,7 @@ from tcpipe.errors import DatasetError
 from tcpipe.formats.seals import Checksum, file_checksum
 from tcpipe.logs.mapped import stamps_ns
 from tcpipe.recipe.suggestions import recipe_key
+from tcpipe.tables.findings import Finding, Subject, make_finding
 
 TimeUnit = Literal["auto", "s", "ms", "us", "ns"]
 
@@ -35,14 +36,14 @@ class CovariateTable:
     name : the file's name.
     time_column : which of its columns tells the time.
     rows : values by column, numbers as float64 and all else as text, behind the stamps [ns].
-    warnings : what was left out or doubtful.
+    findings : rows that are left out, and columns of numbers that a few words make text.
     """
 
     name: str
     checksum: Checksum
     time_column: str
     rows: pl.DataFrame
-    warnings: tuple[str, ...]
+    findings: tuple[Finding, ...]
 
     @property
     def span(self) -> tuple[str, str]:
@@ -109,7 +110,7 @@ def read_covariates(path: Path, *, time_column: str | None = None, time_unit: Ti
     column = _time_column(path, table, time_column)
     stamps = _stamps_ns(path, table[column], time_unit)
     known = stamps.is_not_null()
-    values, warnings = _values(path, table.drop(column))
+    values, findings = _values(path, table.drop(column))
     rows = (
         pl.DataFrame([stamps.alias(_STAMP), *values])
         .filter(known)
@@ -117,7 +118,8 @@ def read_covariates(path: Path, *, time_column: str | None = None, time_unit: Ti
         .sort(_STAMP, maintain_order=True)
     )
     if lost := int((~known).sum()):
-        warnings.append(f"{path.name}: {lost} rows without a {column} are left out")
+        subject = Subject("file", path.name)
+        findings.append(make_finding("covariates-without-time", subject, names={"column": column}, row_count=lost))
     if rows.is_empty() or rows.width == 1:
         raise DatasetError(
             f"{path}: {rows.height} rows of {rows.width - 1} columns beside {column}; wanted one of each at least"
@@ -126,7 +128,7 @@ def read_covariates(path: Path, *, time_column: str | None = None, time_unit: Ti
         raise DatasetError(
             f"{path}: rows of {_in_utc(twice)} differ from one another; wanted one row a stamp: one station, one depth a file"
         )
-    return CovariateTable(path.name, file_checksum(path), column, rows, tuple(warnings))
+    return CovariateTable(path.name, file_checksum(path), column, rows, tuple(findings))
 
 
 def _in_utc(stamp_ns: int) -> str:
@@ -189,9 +191,9 @@ def _counted_ns(path: Path, column: pl.Series, unit: TimeUnit) -> pl.Series:
     return pl.Series(made).set(numbers.is_null(), None)
 
 
-def _values(path: Path, table: pl.DataFrame) -> tuple[list[pl.Series], list[str]]:
-    """Return numbers as float64 without NaN, all else as text; and a line for columns of numbers that a few words make text."""
-    made, warnings = list[pl.Series](), list[str]()
+def _values(path: Path, table: pl.DataFrame) -> tuple[list[pl.Series], list[Finding]]:
+    """Return numbers as float64 without NaN, all else as text; and findings on columns of numbers that a few words make text."""
+    made, findings = list[pl.Series](), list[Finding]()
     for column in table:
         if column.dtype.is_numeric():
             values = column.cast(pl.Float64)
@@ -200,11 +202,16 @@ def _values(path: Path, table: pl.DataFrame) -> tuple[list[pl.Series], list[str]
         text = column.cast(pl.String)
         odd = text.filter(text.cast(pl.Float64, strict=False).is_null() & text.is_not_null())
         if 0 < len(odd) < _MOSTLY * text.count():
-            warnings.append(
-                f"{path.name}: {column.name} is text, since {odd[0]!r} is no number ({len(odd)} of {text.count()} values)"
+            finding = make_finding(
+                "column-is-text",
+                Subject("column", f"{path.stem}_{column.name}"),
+                names={"file": path.name, "example": str(odd[0])},
+                odd_count=len(odd),
+                value_count=text.count(),
             )
+            findings.append(finding)
         made.append(text)
-    return made, warnings
+    return made, findings
 
 
 def _first_repeated(stamps: pl.Series) -> int | None:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import NotRequired, TypedDict
 
 from tcpipe.balance.correlation import Correlation
 from tcpipe.balance.repeats import Floor
+from tcpipe.formats.finding_lines import FindingGroup, group_findings
 from tcpipe.formats.geojson import PolygonGeometry
 from tcpipe.formats.layer_descriptions import Description
 from tcpipe.formats.maps.map_facts import MapInputs
@@ -16,7 +17,9 @@ from tcpipe.motion.removal import Group
 from tcpipe.recipe import Recipe
 from tcpipe.splits.audit import HeldOut
 from tcpipe.splits.holdouts import Holdout
-from tcpipe.tables.facts import ABSENT, LEFT_OUT, EnergyBudget, PhysicsFit
+from tcpipe.tables.facts import ABSENT, EnergyBudget, PhysicsFit
+from tcpipe.tables.findings import LEFT_OUT, Finding
+from tcpipe.tables.verdicts import Verdict, judge
 from tcpipe.terrain.classes import TerrainClass
 
 KIND = "tcpipe dataset"
@@ -82,7 +85,8 @@ class RunSource:
     segments_sha256: str | None = None
     driven_m: float | None = None
     tags: Mapping[str, str] | None = None
-    warnings: tuple[str, ...] = ()
+    findings: tuple[Finding, ...] = field(default=(), metadata=LEFT_OUT)
+    """Of its ingest."""
     energy_budget: EnergyBudget | None = None
     samples: int = 0
 
@@ -101,17 +105,8 @@ class Covariate:
 
 
 @dataclass(frozen=True, slots=True)
-class RunFinding:
-    """One cause that ingest warned of: the first run's line, the runs whose lines differ by figures and topics alone, their samples."""
-
-    example: str
-    runs: tuple[str, ...]
-    samples: int
-
-
-@dataclass(frozen=True, slots=True)
 class Doubtful:
-    """Samples that carry any quality flag: how many, their share of all (0 to 1), and by flag."""
+    """Samples that carry a quality flag which not all of them carry: how many, their share of all (0 to 1); and samples by flag."""
 
     samples: int
     share: float
@@ -160,7 +155,8 @@ class MapSource:
     """By layer, of a user's own categorical ones."""
     classes_from: str | None = None
     inputs: MapInputs | None = None
-    warnings: tuple[str, ...] = ()
+    findings: tuple[Finding, ...] = field(default=(), metadata=LEFT_OUT)
+    """Of building it."""
     registration: tuple[MapRegistration, ...] = ()
 
     @property
@@ -226,13 +222,14 @@ class Redacted:
         "to a centimetre"
     )
     cut: str = (
-        "names of logs, runs and maps; every text of warnings, problems and findings (they are counted); checksums of rasters; the "
-        "recipe's sections read, robots, power_sources and tables"
+        "names of logs, runs, maps and tables of covariates; topics, frames, files, hosts and times in findings, and their remedies; "
+        "what else the power feeds; checksums of rasters; the recipe's sections read, robots, power_sources and tables"
     )
     not_hidden: str = (
         "what the ground looks like (an aerial picture or a height model may be matched to it), when it was driven, the robot, its "
-        "power, names of classes and layers, tags and covariates as they were given, the sha256 of each log, and what name, "
-        "description and creator say"
+        "power, names of classes and layers, tags and covariates as they were given (their columns begin with the table's name), "
+        "codes, roles and the numbers of findings that the catalogue calls public, the sha256 of each log, and what name, description "
+        "and creator say"
     )
 
     def lines(self) -> tuple[str, str, str]:
@@ -282,13 +279,12 @@ class DatasetCard:
     run_tags: Mapping[str, str] | None = field(default=None, metadata=ABSENT)
     """The tags that a run had to carry; None in cards of before 0.9 and of a redacted dataset, which do not tell."""
     maps: tuple[MapSource, ...]
-    problems: tuple[str, ...] = ()
-    """What is wrong with the choice of runs."""
-    warnings: tuple[str, ...]
     doubtful: Doubtful | None = None
     """How many samples carry a quality flag; None in cards of before data model 1.2."""
-    findings: tuple[RunFinding, ...] = ()
-    """What ingest found of the runs, by cause."""
+    findings: tuple[Finding, ...] = ()
+    """Of the dataset itself: its choice of runs, sampling and splits. Runs and maps have their own."""
+    verdict: Verdict | None = None
+    """By all findings of the dataset, its maps and the runs that have samples; None in cards of before data model 3.0."""
     physics: Mapping[str, PhysicsFit] = field(default_factory=dict, metadata=LEFT_OUT)
     """By robot, what standing, drivetrain, rolling, grade and turning take on each class; without robots for which nothing fits."""
     covariates: tuple[Covariate, ...] = field(default=(), metadata=LEFT_OUT)
@@ -299,3 +295,37 @@ class DatasetCard:
     shards: tuple[Shard, ...]
     checksums: Mapping[str, Checksum]
     """By path inside the dataset."""
+
+    @property
+    def findings_by_run(self) -> dict[str, tuple[Finding, ...]]:
+        """Findings of ingest, of every run."""
+        return {run.run_id: run.findings for run in self.runs}
+
+    @property
+    def findings_by_map(self) -> dict[str, tuple[Finding, ...]]:
+        """Findings of building each map."""
+        return {source.name: source.findings for source in self.maps}
+
+
+def judge_dataset(findings: Iterable[Finding], runs: Iterable[RunSource], maps: Iterable[MapSource]) -> Verdict:
+    """Return the verdict on a dataset, with the worst finding of each code as its reasons; a run without samples changes nothing."""
+    of_runs = ((run.run_id, run.findings) for run in runs if run.samples)
+    of_maps = ((source.name, source.findings) for source in maps)
+    groups = group_findings([("", findings), *of_runs, *of_maps])
+    return judge(group.findings[0] for group in groups)
+
+
+def group_dataset_findings(
+    findings: Sequence[Finding],
+    by_run: Mapping[str, Sequence[Finding]],
+    by_map: Mapping[str, Sequence[Finding]] = {},
+) -> list[tuple[FindingGroup[str], int | None, str]]:
+    """Return all findings of a dataset grouped by code, each group with how many runs or maps there are and the word for them."""
+    own = [(finding.subject.name, [finding]) for finding in findings if finding.subject.kind != "run"]
+    of_runs = [(finding.subject.name, [finding]) for finding in findings if finding.subject.kind == "run"]
+    runs = len({*by_run, *(name for name, _ in of_runs)})
+    return [
+        *((group, None, "") for group in group_findings(own)),
+        *((group, runs, "runs") for group in group_findings([*of_runs, *by_run.items()])),
+        *((group, len(by_map), "maps") for group in group_findings(by_map.items())),
+    ]

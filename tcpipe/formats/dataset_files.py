@@ -254,6 +254,8 @@ def read_card(directory: Path, *, proved: bool = True) -> DatasetCard:
         raise DatasetError(*error.problems) from None
     if found.get("kind") != KIND:
         raise DatasetError(f"{directory / CARD}: not the card of a tcpipe dataset (kind is {found.get('kind')!r})")
+    if not _is_current(found) or "verdict" not in found:  # before data model 3.0 its findings were sentences
+        found.pop("findings", None)
     try:
         return typed(found, DatasetCard, directory / CARD)
     except (StoreError, RecipeError) as error:

@@ -4,22 +4,28 @@ from __future__ import annotations
 
 from collections.abc import Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from string import Formatter
 from typing import Generic, TypeVar
 
 import numpy as np
 
+from tcpipe.motion.remedies import StoreLoss, loss_code
 from tcpipe.recipe.suggestions import RecipeFragment
-from tcpipe.tables.catalogue import Entry, read_catalogue
+from tcpipe.tables.catalogue import AFFECTED, Entry, Severity, rank_severity, read_catalogue
 from tcpipe.tables.findings import Finding, Remedy, sort_findings
+from tcpipe.tables.verdicts import GRADES, Verdict
 
 K = TypeVar("K", bound=Hashable)
 
 _UNITS: Mapping[str, tuple[str, float]] = {
     "_mps2": (" m/s²", 1.0), "_mps": (" m/s", 1.0), "_radps": (" °/s", 180.0 / np.pi), "_rad": ("°", 180.0 / np.pi), "_hz": (" Hz", 1.0),
     "_volt": (" V", 1.0), "_amp": (" A", 1.0), "_watt": (" W", 1.0), "_joule": (" J", 1.0), "_fraction": (" %", 100.0),
-    "_bytes": (" bytes", 1.0), "_px": (" px", 1.0), "_deg": ("°", 1.0), "_m": (" m", 1.0), "_s": (" s", 1.0),
+    "_m2": (" m²", 1.0), "_bytes": (" bytes", 1.0), "_px": (" px", 1.0), "_deg": ("°", 1.0), "_m": (" m", 1.0), "_s": (" s", 1.0),
 }  # fmt: skip
 """Unit as people read it, and the factor to it, by the suffix of a number's name; the first that fits counts."""
+MOST_LINES = 8
+"""Findings that a command prints; 'tcpipe inspect' lists all."""
+_MOST_SUBJECTS = 3
 _DIGITS = 3
 _LARGEST_PLAIN = 1e6
 
@@ -56,36 +62,90 @@ def describe_title(finding: Finding) -> str:
 
 
 def describe_remedy(finding: Finding, remedy: Remedy) -> str:
-    """Return what a remedy does and the keys or the command that do it, in one line."""
+    """Return what a remedy does and the keys or the command that do it, in one line; of arrays of tables only that they follow."""
     entry = read_catalogue().get(finding.code)
     purpose = (entry.remedies.get(remedy.name) if entry else None) or remedy.name.replace("_", " ")
     what = [f"'{remedy.command}'"] if remedy.command else []
-    what += [RecipeFragment(remedy.recipe).inline()] if remedy.recipe else []
-    return f"{purpose}: {' and '.join(what)}"
+    what += ["the recipe below"] if _is_block(remedy) else [_fragment(remedy).inline()] if remedy.recipe else []
+    return f"{purpose}: {' and '.join(what)}" if what else purpose
 
 
 def format_finding(finding: Finding) -> str:
-    """Return a finding as one line: what was observed, its first remedy or the catalogue's advice, and its code."""
+    """Return a finding as one line: what was observed, its remedies or the catalogue's advice, and its code."""
     entry = read_catalogue().get(finding.code)
     advice = entry.advice if entry else ""
-    remedy = "; ".join(describe_remedy(finding, of) for of in finding.remedies) or advice
-    return f"{describe_finding(finding)}{f'; {remedy}' if remedy else ''} [{finding.code}]"
+    remedy = ". ".join(describe_remedy(finding, of) for of in finding.remedies) or advice
+    return f"{describe_finding(finding)}{f'. {remedy}' if remedy else ''}".rstrip(".") + f" [{finding.code}]"
 
 
 def recipe_lines(finding: Finding) -> list[str]:
     """Return the lines of a recipe that the finding's remedies propose, as they stand in a file."""
-    return [line for of in finding.remedies if of.recipe for line in RecipeFragment(of.recipe).toml().splitlines()]
+    return [line for of in finding.remedies if of.recipe for line in _fragment(of).toml().splitlines()]
 
 
-def format_findings(findings: Iterable[Finding], *, most: int = 8, more: str = "") -> list[str]:
-    """Return at most ``most`` lines, the worst first, then how many others there are and where (``more``) they are listed."""
+def block_lines(findings: Iterable[Finding]) -> list[str]:
+    """Return the recipes of remedies that fit in no line, each once, as they stand in a file."""
+    remedies = (of for finding in findings for of in finding.remedies if _is_block(of))
+    blocks = dict.fromkeys(_fragment(of).toml() for of in remedies)
+    return [line for block in blocks for line in block.splitlines()]
+
+
+def _is_block(remedy: Remedy) -> bool:
+    return any(not isinstance(keys, Mapping) for keys in remedy.recipe.values())
+
+
+def _fragment(remedy: Remedy) -> RecipeFragment:
+    """Return the part of a recipe without checking it: another version may have written it."""
+    return RecipeFragment(remedy.recipe, is_checked=True)
+
+
+def format_findings(findings: Iterable[Finding], *, most: int = MOST_LINES, more: str = "") -> list[str]:
+    """Return at most ``most`` findings as lines, the worst first, then how many others and notes are listed by the command ``more``."""
     ordered = sort_findings(findings)
-    shown = [of for of in ordered if of.severity != "note"][:most]
-    rest = len(ordered) - len(shown)
-    lines = [f"{of.severity}: {format_finding(of)}" for of in shown]
-    return lines + (
-        [f"and {rest} more {'finding' if rest == 1 else 'findings'}{f': {more}' if more else ''}"] if rest else []
-    )
+    found = [of for of in ordered if of.severity != "note"]
+    return _lines(found[:most]) + _count_rest(len(found) - most, len(ordered) - len(found), more)
+
+
+def list_findings(findings: Iterable[Finding]) -> list[str]:
+    """Return every finding as a line, the worst first, notes too."""
+    return _lines(sort_findings(findings))
+
+
+def _lines(findings: Iterable[Finding]) -> list[str]:
+    """Return each finding as a line, with the recipe that fits in no line below it."""
+    lines = []
+    for finding in findings:
+        lines += [f"{finding.severity}: {format_finding(finding)}", *(f"    {line}" for line in block_lines([finding]))]
+    return lines
+
+
+def _count_rest(findings: int, notes: int, more: str) -> list[str]:
+    counted = ((max(findings, 0), "more finding"), (notes, "note"))
+    rest = " and ".join(f"{count} {what}{'' if count == 1 else 's'}" for count, what in counted if count)
+    return [f"and {rest}{f': {more}' if more else ''}"] if rest else []
+
+
+def format_verdict(verdict: Verdict) -> str:
+    """Return the grades as one line, the worst first: ``energy not usable; position and time usable with care``."""
+    labels = {grade: [name for name in AFFECTED if getattr(verdict, name) == grade] for grade in reversed(GRADES)}
+    return "; ".join(f"{_join(names)} {grade}" for grade, names in labels.items() if names)
+
+
+def _join(names: Sequence[str]) -> str:
+    return " and ".join(filter(None, (", ".join(names[:-1]), names[-1])))
+
+
+def format_loss(loss: StoreLoss) -> str:
+    """Return a loss of distance as one line, with how to avoid it."""
+    runs = "1 run" if loss.runs == 1 else f"{loss.runs} runs"
+    advice = advise_on_loss(loss.reason)
+    return f"{loss.metres:>9.1f} m ({loss.share:.1%}) {loss.reason.replace('_', ' ')} in {runs}{f': {advice}' if advice else ''}"
+
+
+def advise_on_loss(reason: str) -> str:
+    """Return how to lose less distance for a reason of the breakdown; "" where nothing is to be done."""
+    entry = read_catalogue().get(loss_code(reason))
+    return entry.advice if entry else ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,6 +160,11 @@ class FindingGroup(Generic[K]):
     def findings(self) -> list[Finding]:
         """All of them, the worst first."""
         return sort_findings(finding for of in self.of.values() for finding in of)
+
+    @property
+    def severity(self) -> Severity:
+        """The worst of their severities."""
+        return min((finding.severity for of in self.of.values() for finding in of), key=rank_severity)
 
 
 def group_findings(findings: Iterable[tuple[K, Iterable[Finding]]]) -> list[FindingGroup[K]]:
@@ -117,24 +182,63 @@ def group_findings(findings: Iterable[tuple[K, Iterable[Finding]]]) -> list[Find
     return sorted(groups, key=lambda group: (order[group.code], -len(group.of)))
 
 
-def format_group(group: FindingGroup[K], total: int, what: str = "runs") -> str:
-    """Return a group as one line, with how many of ``total`` runs it concerns; of one run alone what was observed there."""
+def format_group(group: FindingGroup[K], total: int | None, what: str = "runs") -> str:
+    """Return a group as one line, with how many of ``total`` runs it concerns, if given; of one finding alone what was observed."""
     findings = group.findings
     if len(group.of) == 1 and len(findings) == 1:
-        key = next(iter(group.of))
-        return f"{key}: {format_finding(findings[0])}"
-    entry = read_catalogue().get(group.code)
-    title = entry.title if entry else group.code.replace("-", " ")
-    subjects = ", ".join(sorted({of.subject.name for of in findings})[:_DIGITS])
-    details = "; ".join(filter(None, (subjects, _format_range(entry, findings))))
-    return f"{len(group.of)} of {total} {what}: {title} ({details}) [{group.code}]"
+        key, line = next(iter(group.of)), format_finding(findings[0])
+        return line if key == findings[0].subject.name else f"{key}: {line}"
+    subjects = ", ".join(sorted({of.subject.name for of in findings})[:_MOST_SUBJECTS])
+    details = "; ".join(filter(None, (subjects, _format_range(read_catalogue().get(group.code), findings))))
+    shared = findings[0].remedies if all(of.remedies == findings[0].remedies for of in findings) else ()
+    remedy = ". ".join(describe_remedy(findings[0], of) for of in shared)
+    return format_count(group.code, len(group.of), total, what, details, remedy=remedy)
+
+
+def format_count(
+    code: str, count: int, total: int | None, what: str = "runs", details: str = "", *, remedy: str = ""
+) -> str:
+    """Return as one line that ``count`` of ``total`` runs have a finding."""
+    entry = read_catalogue().get(code)
+    title = entry.title if entry else code.replace("-", " ")
+    head = "" if total is None else f"{count} of {total} {what}: "
+    return f"{head}{title}{f' ({details})' if details else ''}{f'. {remedy}' if remedy else ''} [{code}]"
 
 
 def _format_range(entry: Entry | None, findings: Sequence[Finding]) -> str:
     """Return the range of the first number that the template names."""
-    name = next((of for of in (findings[0].numbers if entry else ()) if entry and of in entry.fields), None)
+    fields = Formatter().parse(entry.template) if entry else ()
+    name = next((name for _, name, _, _ in fields if name in findings[0].numbers), None)
     if name is None:
         return ""
     values = [of.numbers[name] for of in findings if name in of.numbers]
     low, high = format_number(name, min(values)), format_number(name, max(values))
     return low if low == high else f"{low} to {high}"
+
+
+def format_groups(
+    groups: Iterable[FindingGroup[K]], total: int | None, what: str = "runs", *, most: int = MOST_LINES, more: str = ""
+) -> list[str]:
+    """Return at most ``most`` groups as lines, the worst first, then how many others and notes are listed by the command ``more``."""
+    return format_mixed_groups([(group, total, what) for group in groups], most=most, more=more)
+
+
+def format_mixed_groups(
+    groups: Sequence[tuple[FindingGroup[K], int | None, str]], *, most: int = MOST_LINES, more: str = ""
+) -> list[str]:
+    """Return the same of groups of different things, each with the arguments of `format_group`."""
+    found = sorted((of for of in groups if of[0].severity != "note"), key=lambda of: rank_severity(of[0].severity))
+    return _group_lines(found[:most]) + _count_rest(len(found) - most, len(groups) - len(found), more)
+
+
+def list_mixed_groups(groups: Iterable[tuple[FindingGroup[K], int | None, str]]) -> list[str]:
+    """Return every group as a line, the worst first, notes too."""
+    return _group_lines(sorted(groups, key=lambda of: rank_severity(of[0].severity)))
+
+
+def _group_lines(groups: Iterable[tuple[FindingGroup[K], int | None, str]]) -> list[str]:
+    lines = []
+    for group, total, what in groups:
+        lines += [f"{group.severity}: {format_group(group, total, what)}"]
+        lines += [f"    {line}" for line in block_lines(group.findings)]
+    return lines

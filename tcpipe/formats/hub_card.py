@@ -12,6 +12,7 @@ import pyarrow as pa
 
 from tcpipe.errors import plain_line
 from tcpipe.formats.dataset_card import DatasetCard
+from tcpipe.formats.finding_lines import format_verdict
 from tcpipe.formats.json_files import Json
 
 _LICENCES = {
@@ -132,6 +133,8 @@ def _lines(card: DatasetCard, picture: str) -> Iterator[str]:
         "",
     )
     yield from ("## Splits", "", _splits_in_words(card), "")
+    if card.verdict is not None:
+        yield from ("## Verdict", "", f"Labels: {format_verdict(card.verdict)}. `dataset.json` has the findings.", "")
     if card.redaction is not None:
         yield from ("## Redacted", "", *map(_text, card.redaction.lines()), "")
     yield from (

@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -19,20 +18,16 @@ from tcpipe.formats.json_files import recast
 from tcpipe.formats.parquet import write_table
 from tcpipe.formats.place import Place
 from tcpipe.formats.run_documents import LogOrigin, Manifest, RunJson
-from tcpipe.motion.remedies import REMEDIES
 from tcpipe.tables.arrays import column_of
-from tcpipe.tables.facts import EnergyBudget, NoPower, PhysicsFit
+from tcpipe.tables.catalogue import AFFECTED
+from tcpipe.tables.facts import EnergyBudget, PhysicsFit
+from tcpipe.tables.findings import Finding, select_findings
+from tcpipe.tables.verdicts import Verdict, judge_again
 
 RUNS = "runs.parquet"
 
 _ABOUT = b"tcpipe_index"
 _VERSION = b"6"
-
-
-_DROVE_M = 5.0
-"""Who went less far was moved about, not driven."""
-_NO_SEGMENTS = re.compile(r"(?!^)no segments")
-"""Warnings that say why there are none; the line that begins so only sums up."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,7 +69,8 @@ class RunFacts:
     segments: int
     driven_m: float
     kept_m: float
-    warnings: tuple[str, ...]
+    findings: tuple[Finding, ...]
+    verdict: Verdict
     damage: tuple[str, ...]
     energy_budget: EnergyBudget | None
     segments_sha256: str
@@ -97,20 +93,13 @@ class RunFacts:
     """Where every metre went [m], by entry."""
     standing_watt: float | None = None
     """What the robot draws while it stands."""
-    no_power: NoPower | None = None
-    """Why there is no power, and what would read it."""
     physics: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     """Terms of the fit of power and their standard deviations, in SI, by ``term`` or, of one class of terrain, ``term on terrain``."""
 
     @property
-    def why_empty(self) -> str:
-        """Why there is no segment though the robot drove, the main cause in one line; "" of any other run."""
-        if self.segments or self.driven_m < _DROVE_M:
-            return ""
-        name = max(self.ledger_m, key=lambda entry: self.ledger_m[entry])
-        lost = f"{self.ledger_m[name]:.1f} m {name.replace('_', ' ')}: {REMEDIES.get(name, '')}"
-        cause = next((line for line in self.warnings if _NO_SEGMENTS.search(line)), lost)
-        return f"no segment from {self.driven_m:.1f} m driven: {cause}"
+    def is_empty(self) -> bool:
+        """Whether there is no segment though the robot drove."""
+        return bool(select_findings(self.findings, "no-segments"))
 
 
 def facts_of(manifest: Manifest, name: str, files: Mapping[str, int]) -> RunFacts:
@@ -127,7 +116,8 @@ def facts_of(manifest: Manifest, name: str, files: Mapping[str, int]) -> RunFact
         driven_m=math.fsum(manifest.ledger_m.values()),
         kept_m=manifest.ledger_m.get("kept", 0.0),
         energy_budget=None if label is None else label.energy_budget,
-        no_power=manifest.info.report.facts.no_power,
+        findings=manifest.info.report.findings,
+        verdict=judge_again(manifest.verdict, manifest.info.report.findings),
         segments_sha256=manifest.checksums[named["segments.parquet"]].sha256,
         segments_file=f"{place}/{named['segments.parquet']}",
         track_file=f"{place}/{named['track.parquet']}",
@@ -151,7 +141,8 @@ _TEXT, _TEXTS = pa.string(), pa.list_(pa.string())
 _SCHEMA = pa.schema({
     "run_id": _TEXT, "recipe_id": _TEXT, "data_model_version": _TEXT, "tcpipe_version": _TEXT, "robot": _TEXT,
     "tags": pa.map_(_TEXT, _TEXT), "segments": pa.int64(), "driven_m": pa.float64(), "kept_m": pa.float64(),
-    "warnings": _TEXTS, "damage": _TEXTS, "start_ns": pa.int64(), "end_ns": pa.int64(),
+    "findings": pa.list_(pa.struct({"code": _TEXT, "severity": _TEXT})), "damage": _TEXTS,
+    "verdict": pa.struct({"position": _TEXT, "time": _TEXT, "energy": _TEXT}), "start_ns": pa.int64(), "end_ns": pa.int64(),
     "log": pa.struct({"source": pa.struct({"paths": _TEXTS, "sha256": _TEXT, "size_bytes": pa.int64()})}),
     "superseded_by": _TEXT, "segments_file": _TEXT, "track_file": _TEXT,
 })  # fmt: skip
@@ -172,7 +163,11 @@ def _cell(row: RunFacts, name: str) -> object:
     if name == "log" and value is not None:
         source = value.source
         return {"source": {"paths": source.paths, "sha256": source.sha256, "size_bytes": source.size_bytes}}
-    return list(map(str, value)) if name == "warnings" else value
+    if name == "findings":
+        return [{"code": of.code, "severity": of.severity} for of in row.findings]
+    if name == "verdict":
+        return {label: getattr(row.verdict, label) for label in AFFECTED}
+    return value
 
 
 def _column(values: list[object], kind: pa.DataType) -> pa.Array:

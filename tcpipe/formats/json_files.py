@@ -9,7 +9,6 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from enum import Enum
-from inspect import cleandoc
 from pathlib import Path
 from threading import Lock
 from typing import Any, TypeVar
@@ -22,9 +21,6 @@ from tcpipe.formats.atomic import write_text
 T = TypeVar("T")
 Json = str | float | bool | None | Sequence["Json"] | Mapping[str, "Json"]
 """A value of a document whose form is others' (JSON-LD, CF attributes); our own documents are dataclasses."""
-
-DIALECT = "https://json-schema.org/draft/2020-12/schema"
-"""Of every schema in ``schemas/``."""
 
 _CONVERTING = Lock()
 """msgspec (0.22) ends the process where two threads meet a dataclass for the first time at once."""
@@ -166,15 +162,6 @@ def _from_text(kind: type, text: str) -> Path:
     if kind is not Path:
         raise NotImplementedError(kind)
     return Path(text)
-
-
-def schema_of(cls: type) -> str:
-    """Return the JSON Schema of a dataclass as text: of what `to_json` writes of it, and `read_as` reads."""
-    schema = msgspec.json.schema(cls, schema_hook=lambda _: {"type": "string"})
-    for of in (schema, *schema.get("$defs", {}).values()):
-        if "description" in of:  # a docstring, whose indentation Python 3.13 takes away when it compiles it
-            of["description"] = cleandoc(of["description"])
-    return to_json({"$schema": DIALECT, **schema})
 
 
 def digest(value: Any) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass
-from functools import cache, lru_cache
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ from tcpipe.formats.json_files import Json, digest, plain
 from tcpipe.formats.robot_files import shipped_profiles
 from tcpipe.formats.toml_text import parse_toml
 from tcpipe.recipe import IngestSections, Recipe, TableMapping
-from tcpipe.recipe.checking import as_toml, from_values, kinds_of, range_of
+from tcpipe.recipe.checking import as_toml, describe, from_values, kinds_of, values_in_words
 from tcpipe.robots.profiles import PowerSource, Robot
 
 FILE_NAME = "tcpipe.toml"
@@ -105,57 +105,47 @@ def recipe_id(recipe: Recipe | Mapping[str, Json], robot: str) -> str:
     return digest({"ingest": ingest_key(recipe), "robot": robot})[:8]
 
 
-@cache
-def recipe_schema() -> dict[str, Any]:
-    """Return the recipe's JSON Schema."""
-    from pydantic import TypeAdapter  # noqa: PLC0415  to describe a recipe; `tcpipe.recipe.checking` checks it
-
-    return TypeAdapter(Recipe).json_schema()
-
-
 def commented_toml(recipe: Recipe | None = None) -> str:
     """Return every key with its default and meaning as TOML; keys at their default are commented out."""
-    schema = recipe_schema()
-    return "\n".join(_toml_lines(recipe or Recipe(), schema)) + "\n"
+    return "\n".join(_toml_lines(recipe or Recipe(), describe(Recipe)[1])) + "\n"
 
 
-def _toml_lines(recipe: Recipe, schema: Mapping[str, Any]) -> Iterator[str]:
+def _toml_lines(recipe: Recipe, definitions: Mapping[str, Any]) -> Iterator[str]:
     yield "# The recipe of tcpipe. Every key is here with its default, commented out; remove the # to change one."
     yield "# Units stand in the names. Reasons: docs/explanation/rulings.md"
     default = Recipe()
     names = f"one of {', '.join(sorted(shipped_profiles().robots))}, or of [robots]"
-    yield from _key_lines(schema["properties"]["robot"], "robot", recipe.robot, default.robot, names)
+    yield from _key_lines(definitions["Recipe"]["properties"]["robot"], "robot", recipe.robot, default.robot, names)
     for section in fields(recipe):
         here = getattr(recipe, section.name)
         if not is_dataclass(here):
             continue
-        yield from _table_lines(f"[{section.name}]", here, getattr(default, section.name), schema)
+        yield from _table_lines(f"[{section.name}]", here, getattr(default, section.name), definitions)
     robots: Mapping[str, Robot | None] = recipe.robots or {"NAME": None}
     for name, robot in robots.items():
-        yield from _table_lines(f"[robots.{as_toml(name) if robot else name}]", robot, Robot(), schema)
+        yield from _table_lines(f"[robots.{as_toml(name) if robot else name}]", robot, Robot(), definitions)
     sources: Sequence[PowerSource | None] = recipe.power_sources or [None]
     for source in sources:
-        yield from _table_lines("[[power_sources]]", source, PowerSource(""), schema)
+        yield from _table_lines("[[power_sources]]", source, PowerSource(""), definitions)
     tables: Mapping[str, TableMapping | None] = recipe.tables or {"ROLE": None}
     for name, table in tables.items():
-        yield from _table_lines(f"[tables.{as_toml(name) if table else name}]", table, TableMapping(), schema)
+        yield from _table_lines(f"[tables.{as_toml(name) if table else name}]", table, TableMapping(), definitions)
 
 
-def _table_lines(head: str, here: Any, default: Any, schema: Mapping[str, Any]) -> Iterator[str]:
+def _table_lines(head: str, here: Any, default: Any, definitions: Mapping[str, Any]) -> Iterator[str]:
     """Yield a table of the recipe; one that it does not have is shown behind two #, since its keys alone would be another's."""
-    definition = schema["$defs"][type(default).__name__]
+    definition = definitions[type(default).__name__]
     told = (f"# {line}" for line in definition["description"].splitlines() if line)
     yield from ("", *told, head if here else f"## {head}")
     for name, kind in kinds_of(type(default)).items():
         value, usual = getattr(here or default, name), getattr(default, name)
-        for line in _key_lines(definition["properties"][name], name, value, usual, range_of(kind)):
+        for line in _key_lines(definition["properties"][name], name, value, usual, values_in_words(kind)):
             yield line if here else f"#{line}"
 
 
-def _key_lines(schema: Mapping[str, Any], name: str, value: Any, usual: Any, bounds: str = "") -> Iterator[str]:
+def _key_lines(schema: Mapping[str, Any], name: str, value: Any, usual: Any, choices: str) -> Iterator[str]:
     yield f"# {schema.get('description', '')}"
-    choices = schema.get("enum") or next((c["enum"] for c in schema.get("anyOf", ()) if "enum" in c), None)
-    note = f"  # one of {', '.join(map(str, choices))}" if choices else f"  # {bounds}" if bounds else ""
+    note = choices and f"  # {choices}"
     if value is None:
         yield f"# {name} ={note}"
     else:

@@ -14,6 +14,7 @@ from tcpipe.recipe import IngestSections
 from tcpipe.tables.facts import LEFT_OUT, NOTHING_FOUND, RunFacts
 from tcpipe.tables.findings import StageReport
 from tcpipe.tables.levels import TABLES_VERSION, Sensor, TrackInfo
+from tcpipe.tables.verdicts import Verdict
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,7 +108,7 @@ class Counts:
 
 @dataclass(frozen=True, slots=True)
 class Manifest:
-    """What became of a run under a recipe: the metres by ledger entry, and what every stage noticed."""
+    """What became of a run under a recipe: the metres by ledger entry, the findings of every stage (``info.report``), the verdict."""
 
     run_id: str
     recipe_id: str
@@ -120,7 +121,7 @@ class Manifest:
     tags: Mapping[str, str]
     counts: Counts
     ledger_m: Mapping[str, float]
-    warnings: tuple[str, ...]
+    verdict: Verdict
     damage: tuple[str, ...]
     info: TrackInfo
     robot_requested: str | None = None

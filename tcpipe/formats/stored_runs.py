@@ -21,6 +21,7 @@ from tcpipe.formats.recipe_toml import read_key
 from tcpipe.formats.run_documents import Manifest
 from tcpipe.formats.seals import Checksum, file_checksum, file_checksums, wrong_checksum
 from tcpipe.tables.levels import LABELLED_SEGMENTS, GatedTrack
+from tcpipe.tables.verdicts import judge_again
 
 
 @dataclass(frozen=True, slots=True)
@@ -181,9 +182,10 @@ def _find_listed(place: Place, rows: Sequence[RunFacts]) -> Callable[[str], tupl
 
 @lru_cache(maxsize=64)
 def _manifest(place: Place, name: str, state: str) -> Manifest:
-    """Return a manifest while the files of its ingestion are in this state."""
+    """Return a manifest while the files of its ingestion are in this state; judged by this version's catalogue."""
     del state
-    return read_as_at(place, name, Manifest)
+    manifest = read_as_at(place, name, Manifest)
+    return replace(manifest, verdict=judge_again(manifest.verdict, manifest.info.report.findings))
 
 
 def with_span(row: RunFacts, place: Place, manifest: Manifest) -> RunFacts:

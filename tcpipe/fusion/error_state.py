@@ -35,6 +35,7 @@ from tcpipe.fusion.trajectory import Trajectory
 from tcpipe.fusion.wrong_fixes import Explained, Spans, WrongFixes, find_wrong_fixes, inside, returned
 from tcpipe.geometry.rotation import quat_from_matrix
 from tcpipe.tables.facts import Reopening
+from tcpipe.tables.findings import Subject, make_finding
 
 _MANY_FIXES = 50
 _LEVELLING_NS = 60_000_000_000
@@ -94,7 +95,9 @@ def run_error_state(
         run.lasting_m2 = run.lasting_m2 + wrong.doubt_m2(output_ns)
     run.unseen_scale_std = _unseen_scale_std(run, measurements)
     if not np.isfinite(outputs).all():
-        raise FusionError("fusion: the estimate is not finite; look at the streams' values with tcpipe inspect --full")
+        raise FusionError(
+            "the estimate is not finite", findings=[make_finding("estimate-not-finite", Subject("run", ""))]
+        )
     return trajectory_of(run.timeline, outputs, run, output_ns)
 
 

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from tcpipe.fusion.course import course_rate
 from tcpipe.fusion.measurements import BodyVelocities, InertialMeasurements, InitialState, Measurements, Positions
 from tcpipe.fusion.process import turn_sources
-from tcpipe.fusion.signals import integral, interval_means, median_of_five, seconds
+from tcpipe.fusion.signals import integral, interval_means, is_covered, median_of_five, seconds
 from tcpipe.geometry.rotation import quat_from_rpy, rotate, rpy_from_quat
 
 Floats = NDArray[np.float64]
@@ -143,12 +143,23 @@ class _Path:
 
 
 def _yaw_rate_samples(measurements: Measurements, start_ns: int, bias: Floats) -> tuple[Floats, Floats]:
+    """Return samples of the yaw rate by the gyroscope, and through its gaps by what tells turning besides."""
     imu = measurements.imu
-    if imu is not None and imu.stamp_ns.size:
-        return seconds(imu.stamp_ns, start_ns), imu.angular_velocity_radps[:, 2:] - bias[2]
-    sources = turn_sources(measurements)
-    if not sources and (odometry := _speed_source(measurements)) is not None and measurements.gnss is not None:
-        stamp_s, rate = course_rate(measurements.gnss, odometry, start_ns)
+    other_s, other_rate = _yaw_rate_without_gyroscope(measurements, start_ns)
+    if imu is None or imu.stamp_ns.size == 0:
+        return other_s, other_rate
+    other_ns = start_ns + np.rint(other_s * 1e9).astype(np.int64)
+    missing = ~is_covered(imu.stamp_ns, other_ns, other_ns)
+    stamp_s = np.concatenate((seconds(imu.stamp_ns, start_ns), other_s[missing]))
+    rate = np.concatenate((imu.angular_velocity_radps[:, 2:] - bias[2], other_rate[missing]))
+    order = np.argsort(stamp_s, kind="stable")
+    return stamp_s[order], rate[order]
+
+
+def _yaw_rate_without_gyroscope(measurements: Measurements, start_ns: int) -> tuple[Floats, Floats]:
+    sources, odometry, gnss = turn_sources(measurements), _speed_source(measurements), measurements.gnss
+    if not sources and odometry is not None and gnss is not None and gnss.stamp_ns.size:
+        stamp_s, rate = course_rate(gnss, odometry, start_ns)
         return stamp_s, rate[:, None]
     if not sources:
         return np.empty(0), np.empty((0, 1))

@@ -13,11 +13,20 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.fusion.measurements import BodyVelocities, GroundVelocities, InertialMeasurements, Positions
+from tcpipe.fusion.measurements import (
+    IMU,
+    VISUAL,
+    WHEELS,
+    BodyVelocities,
+    GroundVelocities,
+    InertialMeasurements,
+    Positions,
+)
 from tcpipe.fusion.pose_increments import along_pose_axes, has_twist, in_child_axes, increments, orientation_rates
 from tcpipe.fusion.signals import median_period_ns, white_noise
 from tcpipe.geometry.datum import enu_from_geodetic
 from tcpipe.geometry.rotation import inverse, matrix_from_quat, normalized, product, rotate
+from tcpipe.tables.findings import Finding, Subject, make_finding
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -26,6 +35,7 @@ Mask = NDArray[np.bool_]
 Columns = Mapping[str, Floats]
 """Columns of a stream by name, null as NaN."""
 
+_IMU = Subject("role", IMU)
 _NO_TRUST = 1e6
 """Larger variances, of a kilometre or a kilometre a second, are cut to this: as little trust, and differences keep their digits."""
 _VELOCITY_FLOOR_MPS = 0.02
@@ -43,23 +53,16 @@ _FEWEST_ROWS = 20
 _SCATTERS_MORE = 3.0
 """Than is claimed: a speed by counts that come only with every other message does, a rough road does not."""
 _MEAN_S = 0.5
-_SCATTERS = (
-    "its velocity scatters from sample to sample by far more than is claimed: its mean over half a second is used"
-)
-_POSE_AXES = (
-    "its twist is along the axes of its pose's frame, not of the robot as nav_msgs/Odometry asks: it is turned by its own pose (mend it "
-    "in the driver)"
-)
 
 
 @dataclass(frozen=True, slots=True)
 class Prepared:
-    """How a stream was prepared: stamps of rows without use, rows of a repeated stamp, variances replaced; and remarks for people."""
+    """How a stream was prepared: stamps of rows without use, rows of a repeated stamp, variances replaced; and findings."""
 
     invalid_ns: Ints
     repeated: int = 0
     variances_replaced: int = 0
-    remarks: tuple[str, ...] = ()
+    findings: tuple[Finding, ...] = ()
 
 
 def find_datum(lon_deg: Floats, lat_deg: Floats, alt_m: Floats) -> tuple[float, float, float] | None:
@@ -140,23 +143,24 @@ def body_velocities(
     velocity = _matrix(columns, [f"velocity_{axis}_mps" for axis in "xyz"])
     rate = _matrix(columns, [f"angular_velocity_{axis}_radps" for axis in "xyz"])
     variance = _matrix(columns, [f"velocity_var_{axis}_m2ps2" for axis in "xyz"])
-    remarks: tuple[str, ...] = ()
+    subject = Subject("role", WHEELS if only_forward else VISUAL)
+    findings: list[Finding] = []
     quat = normalized(_matrix(columns, [f"quat_{c}" for c in "xyzw"]))
     rotation = matrix_from_quat(quat_xyzw)
     if not has_twist(_turned(rotation, velocity)[:, :1], pose):
         stamp_ns, velocity, rate = increments(stamp_ns, pose, quat)
         variance = np.full_like(velocity, np.nan)
         yaw_rate_var = np.full(stamp_ns.size, np.nan)
-        remarks = ("no twist: pose increments are used",)
+        findings.append(make_finding("pose-increments", subject))
     else:
         yaw_rate_var = columns["yaw_rate_var"]
         if along_pose_axes(stamp_ns, velocity, pose, quat):
             velocity = in_child_axes(velocity, quat)
-            remarks = (_POSE_AXES,)
+            findings.append(make_finding("twist-in-pose-frame", subject))
         rates, of_orientation = orientation_rates(stamp_ns, rate, quat)
         if of_orientation[2] or not only_forward:
             rate = rates
-            remarks += _orientation_remarks(of_orientation)
+            findings += _find_orientation_rates(of_orientation, subject)
     turned = _turned(rotation, velocity)
     measured = np.isfinite(turned[:, 0]) & ~(np.abs(turned) >= _MAX_VELOCITY_MPS).any(1)
     usable, repeated = _usable(stamp_ns, measured)
@@ -174,7 +178,7 @@ def body_velocities(
     if shown.any():
         variance = np.maximum(variance, shown[:, None])
         turned = _moving_mean(stamp_ns[usable], turned)
-        remarks += (_SCATTERS,)
+        findings.append(make_finding("velocity-scatters", subject, mean_s=_MEAN_S))
     if only_forward:
         turned[:, 1:] = np.nan
         variance[:, 1:] = np.nan
@@ -183,13 +187,12 @@ def body_velocities(
     yaw_rate_var[~np.isfinite(yaw_rate)] = np.nan
     spatial = None if only_forward or not np.isfinite(turn_rate).all() else turn_rate
     made = BodyVelocities(stamp_ns[usable], turned, variance, yaw_rate, yaw_rate_var, xyz_m, spatial)
-    return made, Prepared(stamp_ns[~measured], repeated, replaced, remarks)
+    return made, Prepared(stamp_ns[~measured], repeated, replaced, tuple(findings))
 
 
-def _orientation_remarks(of_orientation: Mask) -> tuple[str, ...]:
-    axes = " and ".join(np.array(["x", "y", "z"])[of_orientation])
-    said = f"its angular velocity about {axes} is zero or missing throughout while its orientation turns: that of the orientation is used"
-    return (said,) if axes else ()
+def _find_orientation_rates(of_orientation: Mask, subject: Subject) -> list[Finding]:
+    axes = ", ".join(np.array(["x", "y", "z"])[of_orientation])
+    return [make_finding("rate-from-orientation", subject, names={"axes": axes})] if axes else []
 
 
 def _shown_variance(stamp_ns: Ints, values: Floats, variance: Floats) -> Floats:
@@ -251,14 +254,10 @@ def inertial(
         rate, force = rate[usable], force[usable]
     norm = float(np.median(np.linalg.norm(force, axis=1))) if usable.size else 0.0
     low, high = _GRAVITY_BAND_MPS2
-    remarks = _orientation_remarks(of_orientation)
-    weighs = True
-    if usable.size and not low <= norm <= high:
-        wanted = "wanted about 9.81 (gravity included, SI units)"
-        weighs = False
-        remarks += (
-            f"median specific force is {norm:.2f} m/s², {wanted}: only the gyroscope is used, roll and pitch are weak",
-        )
+    findings = _find_orientation_rates(of_orientation, _IMU)
+    weighs = not usable.size or low <= norm <= high
+    if not weighs:
+        findings.append(make_finding("specific-force-implausible", _IMU, force_mps2=norm))
     gyro_std = max(gyro_std_radps, white_noise(rate))
     noise = np.maximum(accelerometer_std_mps2, _local_noise(stamp_ns[usable], force))
     accelerometer_std = max(accelerometer_std_mps2, white_noise(force))
@@ -275,7 +274,7 @@ def inertial(
         weighs,
         accelerometer_noise_mps2=noise,
     )
-    return made, Prepared(stamp_ns[~good], repeated, 0, remarks)
+    return made, Prepared(stamp_ns[~good], repeated, 0, tuple(findings))
 
 
 def _pieces(rows: int) -> Iterator[slice]:

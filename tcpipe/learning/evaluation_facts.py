@@ -6,14 +6,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Annotated, Literal, TypeAlias, TypedDict
 
-from annotated_types import Ge, Le
-
 from tcpipe.balance.repeats import Floor
 from tcpipe.dataset.energies import EnergyName
 from tcpipe.learning.fitting import Seed
 from tcpipe.learning.metrics import Errors
 from tcpipe.learning.model_card import Training
 from tcpipe.learning.ratios import Ratio
+from tcpipe.tables.bounds import Bounds
 from tcpipe.tables.facts import ABSENT
 
 KIND = "tcpipe evaluation"
@@ -28,7 +27,7 @@ ErrorsByClass: TypeAlias = Mapping[str, Mapping[str, Errors]]
 class EvaluateConfig:
     """How much is evaluated."""
 
-    draws: Annotated[int, Ge(1), Le(1000)] = 5
+    draws: Annotated[int, Bounds(ge=1, le=1000)] = 5
     """Draws of noise that each ablated input set is the mean of."""
     baselines: bool = True
     """Train the networks of Wei & Isler."""

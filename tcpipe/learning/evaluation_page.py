@@ -11,10 +11,10 @@ from tcpipe.learning.baselines import verdicts
 from tcpipe.learning.evaluation import EXPECTED
 from tcpipe.learning.evaluation_facts import SPLITS, ErrorsByClass, Evaluation, Leakage
 from tcpipe.learning.evaluation_figures import EvaluatedSamples, page_data, paper_pictures, sample_sections
-from tcpipe.learning.evaluation_verdict import verdict, worst_first
+from tcpipe.learning.evaluation_verdict import Statement, verdict, worst_first
 from tcpipe.learning.metrics import ALL, LEAST, QUANTITIES, UNITS, Errors
 from tcpipe.learning.wei_isler import GRASS_ONLY, OURS, PER_CLASS
-from tcpipe.report.page import Number, Section, Verdict, render_page
+from tcpipe.report.page import Number, Section, render_page
 
 FLOORS = {"label_floor": "label noise alone", "simulation_floor": "simulation's own floor"}
 """What an error can hardly be less than, and what the page calls it."""
@@ -40,12 +40,13 @@ def evaluation_page(
     lead: str,
     before: Sequence[Section] = (),
     warnings: Sequence[str] = (),
-    claimed: Sequence[Verdict] = (),
+    claimed: Sequence[Statement] = (),
 ) -> str:
     """Return the HTML page of what `evaluate` found; ``before``, ``warnings`` and what is ``claimed`` come first."""
     audits = {split: leakage_line(found.splits[split].leakage) for split in found.ordered_splits}
     drawn = sample_sections(samples, audits)
     sections = [
+        Section("Assessment", header=("", "statement"), rows=worst_first([*claimed, *verdict(found)])),
         *before,
         _baselines(found),
         *drawn,
@@ -58,7 +59,6 @@ def evaluation_page(
     return render_page(
         title=title,
         lead=lead,
-        verdict=worst_first([*claimed, *verdict(found)]),
         numbers=[
             Number(
                 f"{found.splits[name].errors[quantity][ALL].mape_percent or float('nan'):.2f} %",

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
-from annotated_types import Ge, Gt, Le
 from numpy.typing import NDArray
 
 from tcpipe.dataset import Split
@@ -20,6 +19,7 @@ from tcpipe.errors import ModelError
 from tcpipe.learning.architecture import Architecture, check_trainable
 from tcpipe.learning.checkpoint import Arrays, TrainingProgress, read_checkpoint, write_checkpoint
 from tcpipe.learning.losses import Loss, loss_factors, mean_loss
+from tcpipe.tables.bounds import Bounds
 
 if TYPE_CHECKING:
     from tcpipe.learning.network import ResNet18
@@ -30,7 +30,7 @@ logger = logging.getLogger("tcpipe")
 ModelKind = Literal["resnet18", "table", "physics"]
 """The paper's network on patches, boosted trees on features of them, or coefficients of physics."""
 
-Seed = Annotated[int, Ge(0), Le(2**32 - 1)]
+Seed = Annotated[int, Bounds(ge=0, le=2**32 - 1)]
 """What every generator of random numbers takes."""
 
 Floats = NDArray[np.float32]
@@ -56,21 +56,21 @@ class FitConfig:
 
     model: ModelKind = "resnet18"
     loss: Loss = "nrmse"
-    epochs: Annotated[int, Ge(1), Le(100_000)] = 100
+    epochs: Annotated[int, Bounds(ge=1, le=100_000)] = 100
     """At most."""
-    patience: Annotated[int, Ge(1), Le(100_000)] = 12
+    patience: Annotated[int, Bounds(ge=1, le=100_000)] = 12
     """Epochs without a better loss of the held-out fold before training stops."""
-    batch: Annotated[int, Ge(1), Le(65_536)] = 64
-    learning_rate: Annotated[float, Gt(0), Le(1)] = 1e-4
+    batch: Annotated[int, Bounds(ge=1, le=65_536)] = 64
+    learning_rate: Annotated[float, Bounds(gt=0, le=1)] = 1e-4
     seed: Seed = 0
     """Of weights, shuffles and mirrors."""
-    fold: Annotated[int, Ge(0), Le(99)] = 0
+    fold: Annotated[int, Bounds(ge=0, le=99)] = 0
     """Of train, that training is stopped by; the rest is fitted."""
     mirror: bool = True
     """Mirror every other patch across its direction of travel."""
     weights: bool = False
     """Weigh each label by its inverse variance."""
-    width: Annotated[int, Ge(16), Le(512)] = 64
+    width: Annotated[int, Bounds(ge=16, le=512)] = 64
     """Filters of the first stage, a multiple of 16."""
     label: EnergyName = "total"
     """Which energy is trained on: all that was measured, or what is above standing."""

@@ -11,10 +11,11 @@ from tcpipe.learning.evaluation_facts import Evaluation
 from tcpipe.learning.evaluation_figures import EvaluatedSamples
 from tcpipe.learning.evaluation_files import SIMULATED
 from tcpipe.learning.evaluation_page import audit_lines, evaluation_page
+from tcpipe.learning.evaluation_verdict import Statement
 from tcpipe.learning.fidelity import differences
 from tcpipe.learning.metrics import ALL, QUANTITIES, UNITS
 from tcpipe.learning.plant_floor import CLASS_AND_SLOPE
-from tcpipe.report.page import Section, Verdict
+from tcpipe.report.page import Section
 from tcpipe.simulation.paper_site import paper_parameters
 
 _QUICK = "This is a quick run: a small site, a narrow network, few epochs. It shows that everything runs; believe no figure of it."
@@ -62,7 +63,7 @@ def reproduction_page(
         ],
         warnings=[SIMULATED, *([_QUICK] if quick else [])],
         claimed=[
-            Verdict(
+            Statement(
                 kind, f"Claims {name}: {'; '.join(f'{of.says} ({of.split})' for of in claims if of.verdict == name)}."
             )
             for name, kind in _KINDS.items()

@@ -36,11 +36,12 @@ _MOST_BACK = 0.2
 _TOGETHER_NS = 5 * SECOND_NS
 _BIN_NS = SECOND_NS // 20
 _FEWEST = 3
+RECIPE = "recipe"
+"""The reason of a choice that the recipe made."""
 _MOST_UNSET = 0.5
 _MOST_STRAY = 0.01
 _MOST_REPEATED = 0.2
 _NEIGHBOURS = 11
-_COUNTED = "it counts simulated time, which runs forward"
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,8 +62,9 @@ class TopicTimes:
 class Timeline:
     """A topic's rows in the order they were measured.
 
-    ``row`` points into the topic's rows; (``epoch``, ``stamp_ns``) increases strictly. ``offset_s`` is the median of header minus log time
-    (None without headers), ``moved_s`` what was added to bring the topic to the clock of the others, by epoch.
+    ``row`` points into the topic's rows; (``epoch``, ``stamp_ns``) increases strictly. ``why`` is a reason in kebab case.
+    ``offset_s`` is the median of header minus log time (None without headers), ``moved_s`` what was added to bring the topic to the clock
+    of the others, by epoch.
     """
 
     row: Ints
@@ -83,10 +85,6 @@ class Settled:
     timelines: dict[str, Timeline]
     steps: list[ClockStep]
     simulated: SimulatedClock | None = None
-
-
-ON_SIMULATED_CLOCK = "brought to the simulation's clock"
-"""How the reason ends where a topic's log times were turned into what the simulation's clock told then."""
 
 
 def settle_clocks(topics: Mapping[str, TopicTimes], *, clock_published: bool = False) -> Settled:
@@ -120,31 +118,29 @@ def settle_clocks(topics: Mapping[str, TopicTimes], *, clock_published: bool = F
 
 
 def _simulated(name: str, times: TopicTimes, clock: SimulatedClock) -> Timeline:
-    """Return the timeline of a topic in a simulation: by its header, or by what the clock told when it was received."""
+    """Return the timeline of a topic in a simulation: by its header, or by the simulation's time when it was received."""
     known, epoch = _is_set(times), np.zeros(len(times.log_time_ns), np.int64)
     median, every = _median_offset(times, known), np.ones(len(epoch), bool)
     if times.prefer == "header" and times.header_ns is not None:
-        draft = _Draft("header", "the recipe says so", times.header_ns, known, epoch, {}, median, 0)
+        draft = _Draft("header", RECIPE, times.header_ns, known, epoch, {}, median, 0)
         return _timeline(times, draft, [0])
     told = clock.at(times.log_time_ns)
     why = _why_not_simulated(name, times, clock)
     if why is None and times.header_ns is not None:
         stamps = np.where(known, times.header_ns, told)
-        draft = _Draft("header", _COUNTED, stamps, every, epoch, {}, median, int(np.count_nonzero(~known)))
+        draft = _Draft("header", "simulated-time", stamps, every, epoch, {}, median, int(np.count_nonzero(~known)))
         return _timeline(times, draft, [0])
-    draft = _Draft("log", f"{why}; {ON_SIMULATED_CLOCK}", told, every, epoch, {}, median, 0)
+    draft = _Draft("log", str(why), told, every, epoch, {}, median, 0)
     return replace(_timeline(times, draft, [0]), moved_s=(float(np.median(told - times.log_time_ns)) / SECOND_NS,))
 
 
 def _why_not_simulated(name: str, times: TopicTimes, clock: SimulatedClock) -> str | None:
     """Return why a topic's header does not rule in a simulation, or None where it does."""
     if times.prefer == "log":
-        return "the recipe says so"
+        return RECIPE
     if name not in clock.topics:
-        return "its messages have no header stamp that counts simulated time"
-    share = _repeated_share(times)
-    repeats = f"{100 * share:.0f} % of its messages repeat the header stamp before with other content"
-    return repeats if share > _MOST_REPEATED else None
+        return "header-not-simulated"
+    return "header-repeats" if _repeated_share(times) > _MOST_REPEATED else None
 
 
 def _is_set(times: TopicTimes) -> Mask:
@@ -224,13 +220,13 @@ def _draft(times: TopicTimes, reason: str | None, epoch: Ints) -> _Draft:
         return _Draft("log", str(reason), times.log_time_ns, usable, epoch, {}, median, 0)
     offset = _offsets(times, known, epoch)
     if times.prefer == "header":
-        return _Draft("header", "the recipe says so", times.header_ns, known, epoch, offset, median, 0)
+        return _Draft("header", RECIPE, times.header_ns, known, epoch, offset, median, 0)
     expected = _expected(times, offset, epoch)
     stray = known & (np.abs(times.header_ns - expected) > FOLLOWS_NS)
     replaced = ~known | stray | _leaps(times, known & ~stray)
     stamps = np.where(replaced, expected, times.header_ns)
-    why = "its header follows the log time"
-    return _Draft("header", why, stamps, usable, epoch, offset, median, int(np.count_nonzero(replaced)))
+    count = int(np.count_nonzero(replaced))
+    return _Draft("header", "header-follows-log-time", stamps, usable, epoch, offset, median, count)
 
 
 def _expected(times: TopicTimes, offset_ns: Mapping[int, int], epoch: Ints) -> Ints:
@@ -270,17 +266,16 @@ def _why_not_header(times: TopicTimes, own_steps: Sequence[tuple[int, int]]) -> 
     """Return why a topic's log time rules, or None where its header does."""
     known = _is_set(times)
     if times.prefer == "log":
-        return "the recipe says so"
+        return RECIPE
     if times.header_ns is None or not known.any():
-        return "its messages have no header stamp" if times.header_ns is None else "none of its header stamps is set"
+        return "no-header" if times.header_ns is None else "header-unset"
     if times.prefer == "header":
         return None
-    shares = (
-        (1 - np.mean(known), _MOST_UNSET, "header stamps are unset"),
-        (_stray_share(times, known, own_steps), _MOST_STRAY, "header stamps do not follow the log time within 10 s"),
-        (_repeated_share(times), _MOST_REPEATED, "messages repeat the header stamp before with other content"),
-    )
-    return next((f"{100 * share:.0f} % of its {what}" for share, most, what in shares if share > most), None)
+    if 1 - np.mean(known) > _MOST_UNSET:
+        return "header-unset"
+    if _stray_share(times, known, own_steps) > _MOST_STRAY:
+        return "header-differs-from-log-time"
+    return "header-repeats" if _repeated_share(times) > _MOST_REPEATED else None
 
 
 def _stray_share(times: TopicTimes, known: Mask, own_steps: Sequence[tuple[int, int]]) -> float:

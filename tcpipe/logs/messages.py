@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,9 @@ from numpy.typing import NDArray
 from tcpipe.geometry.rotation import normalized
 from tcpipe.logs import roles
 from tcpipe.logs.nmea import STATUS_AND_STD_OF_QUALITY, read_gga, read_over_ground, with_date
-from tcpipe.recipe.suggestions import suggested
+from tcpipe.recipe.suggestions import suggest
+from tcpipe.tables.catalogue import threshold
+from tcpipe.tables.findings import Finding, Subject, make_finding
 
 Columns = Mapping[str, NDArray[Any]]
 Floats = NDArray[np.float64]
@@ -24,6 +27,7 @@ Ints = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
 LOG_TIME = "log_time_ns"
+GNSS, GNSS_VELOCITY = Subject("role", "gnss"), Subject("role", "gnss_velocity")
 _STAMP = ("header.stamp.sec", "header.stamp.nanosec")
 
 
@@ -41,7 +45,7 @@ class Readings:
     columns: dict[str, NDArray[Any]]
     dropped: dict[str, int] = field(default_factory=dict)
     notes: dict[str, int] = field(default_factory=dict)
-    warnings: tuple[str, ...] = ()
+    findings: tuple[Finding, ...] = ()
     own_time_ns: Ints | None = None
     """Time that the measurement itself carries (NMEA), as `header_ns`."""
 
@@ -208,17 +212,13 @@ def _read_nav_sat_fix(columns: Columns) -> Readings:
     fixed = ~np.any(list(drops.values()), axis=0)
     alt, unmeasured = _altitude(alt, fixed)
     variances[unmeasured, 2] = _NO_HEIGHT_M2
-    notes = {
-        "without_covariance": int(np.count_nonzero(np.isnan(variances[:, 0]))),
-        "without_altitude": int(np.count_nonzero(unmeasured & fixed)),
-    }
-    lost = f"{notes['without_altitude']} of {np.count_nonzero(fixed)} fixes have no altitude (NaN, or one constant): heights are relative"
-    warnings = (lost,) if notes["without_altitude"] else ()
-    return _kept(columns, _gnss(lon, lat, alt, variances, status), drops, notes=notes, warnings=warnings)
+    missing, fixes = int(np.count_nonzero(unmeasured & fixed)), int(np.count_nonzero(fixed))
+    notes = {"without_covariance": int(np.count_nonzero(np.isnan(variances[:, 0]))), "without_altitude": missing}
+    findings = (make_finding("altitude-missing", GNSS, missing_count=missing, fixes_count=fixes),) if missing else ()
+    return _kept(columns, _gnss(lon, lat, alt, variances, status), drops, notes=notes, findings=findings)
 
 
 _NO_HEIGHT_M2 = 1e6
-_FEWEST_ALTITUDES = 100
 
 
 def _altitude(alt: Floats, fixed: Mask) -> tuple[Floats, Mask]:
@@ -228,7 +228,7 @@ def _altitude(alt: Floats, fixed: Mask) -> tuple[Floats, Mask]:
     """
     unknown = ~np.isfinite(alt)
     known = alt[~unknown & fixed]
-    if known.size >= _FEWEST_ALTITUDES and np.ptp(known) == 0.0:
+    if known.size >= threshold("altitude-missing", "min_equal_count") and np.ptp(known) == 0.0:
         unknown = np.ones_like(unknown)
     return np.where(unknown, np.median(known) if known.size else 0.0, alt), unknown
 
@@ -251,11 +251,9 @@ def _read_nmea(columns: Columns) -> Readings:
         "null_island": (gga.lat_deg == 0) & (gga.lon_deg == 0),
         "outside_the_globe": _is_outside(gga.lat_deg, gga.lon_deg),
     }
-    warnings: tuple[str, ...] = ()
-    if len(gga.row) and not known.any():
-        warnings = ("its GGA sentences give no geoid separation: heights are above the geoid, not the ellipsoid",)
+    without_geoid = len(gga.row) > 0 and not known.any()
     values = _gnss(gga.lon_deg, gga.lat_deg, alt, variances, status)
-    found = _kept(of_gga, values, drops, warnings=warnings)
+    found = _kept(of_gga, values, drops)
     others = len(sentences) - len(gga.row)
     own_time_ns = with_date(gga.time_of_day_ns[found.row], found.log_time_ns)
     return Readings(
@@ -265,24 +263,21 @@ def _read_nmea(columns: Columns) -> Readings:
         found.columns,
         {**({"not_gga": others} if others else {}), **found.dropped},
         {"without_separation": int(np.count_nonzero(~known[found.row]))},
-        warnings,
+        (make_finding("geoid-separation-missing", GNSS),) if without_geoid else (),
         own_time_ns,
     )
 
 
-_APART_S = 0.25
-
-
-def apart_from_header(readings: Readings) -> tuple[str, ...]:
-    """Return a warning where the UTC of a receiver's sentences, which rules, lies further from their headers than a serial port takes."""
+def find_utc_offset(readings: Readings) -> tuple[Finding, ...]:
+    """Return the finding that the UTC of a receiver's sentences, which is used, is further from their headers than a serial port takes."""
     own_time_ns, stamps_ns = readings.own_time_ns, readings.header_ns
     if own_time_ns is None or stamps_ns is None or not (known := (own_time_ns > 0) & (stamps_ns > 0)).any():
         return ()
     apart_s = float(np.median(own_time_ns[known] - stamps_ns[known])) / 1e9
-    if abs(apart_s) <= _APART_S:
+    if abs(apart_s) <= threshold("utc-differs-from-header", "max_offset_s"):
         return ()
-    what = f"the UTC in its sentences is {apart_s:+.3f} s from their header stamps; the sentences' rules"
-    return (what + suggested("to let the headers rule", {"read.time": {"gnss": "header"}}),)
+    remedies = suggest("header", {"read.time": {"gnss": "header"}})
+    return (make_finding("utc-differs-from-header", GNSS, offset_s=apart_s, remedies=remedies),)
 
 
 def _ground_velocity(velocity: Floats, variances: Floats, status: NDArray[Any] | int = -1) -> dict[str, NDArray[Any]]:
@@ -377,10 +372,8 @@ def _read_velocity_twist(columns: Columns) -> Readings:
         "not_finite": ~np.isfinite(velocity[:, :2].sum(-1)),
         "of_the_body": np.full(len(velocity), of_body),
     }
-    warnings = (
-        ("its second axis is zero throughout: that is a velocity of the body, not over ground",) if of_body else ()
-    )
-    return _kept(columns, _ground_velocity(velocity, variances), drops, warnings=warnings)
+    findings = (make_finding("velocity-not-over-ground", GNSS_VELOCITY),) if of_body else ()
+    return _kept(columns, _ground_velocity(velocity, variances), drops, findings=findings)
 
 
 def _read_imu(columns: Columns) -> Readings:
@@ -411,8 +404,8 @@ def _read_imu(columns: Columns) -> Readings:
         "without_orientation": int(np.count_nonzero(absent)),
         "bad_quaternions": int(np.count_nonzero(bad & ~absent)),
     }
-    warnings = ("its orientation never changes: taken as absent",) if constant else ()
-    return _kept(columns, values, drops, notes=notes, warnings=warnings)
+    findings = (make_finding("orientation-constant", Subject("role", "imu")),) if constant else ()
+    return _kept(columns, values, drops, notes=notes, findings=findings)
 
 
 _POSE = ("x_m", "y_m", "z_m", "quat_x", "quat_y", "quat_z", "quat_w")
@@ -434,25 +427,21 @@ def _body_twist(columns: Columns, prefix: str, covariance: str) -> tuple[dict[st
     return values, twist
 
 
-def _read_odometry(columns: Columns) -> Readings:
+def _read_odometry(columns: Columns, role: str) -> Readings:
     values, twist = _body_twist(columns, "twist.twist", "twist.covariance")
     position = _vector(columns, "pose.pose.position")
     quat, bad = _orientation(columns, "pose.pose.orientation")
     pose = np.concatenate((position, quat), -1)
     pose[~np.isfinite(pose).all(-1)] = np.nan
     moved_m = float(np.nansum(np.linalg.norm(np.diff(position, axis=0), axis=-1)))
-    empty = not np.any(twist) and moved_m > _MOVED_M
-    warnings: tuple[str, ...] = ()
+    empty = not np.any(twist) and moved_m > threshold("twist-zero", "min_moved_m")
+    findings = (make_finding("twist-zero", Subject("role", role), moved_m=moved_m),) if empty else ()
     if empty:
-        warnings = (f"its twist is zero on every row while its pose moves {moved_m:.1f} m: only its pose is used",)
         values = {name: np.full(len(twist), np.nan) for name in values}
     values |= {name: pose[:, i] for i, name in enumerate(_POSE)}
     lost = np.asarray(np.isnan(pose).any(-1) if empty else ~np.isfinite(twist.sum(-1)))
     notes = {"bad_quaternions": int(np.count_nonzero(bad))}
-    return _kept(columns, values, {"not_finite": lost}, notes=notes, warnings=warnings)
-
-
-_MOVED_M = 0.1
+    return _kept(columns, values, {"not_finite": lost}, notes=notes, findings=findings)
 
 
 def _read_twist_stamped(columns: Columns) -> Readings:
@@ -495,7 +484,7 @@ _READERS: dict[tuple[str, str], Callable[[Columns], Readings]] = {
         (role, type_name): read
         for role in ("wheel_odometry", "visual_odometry")
         for type_name, read in (
-            (roles.ODOMETRY, _read_odometry),
+            (roles.ODOMETRY, partial(_read_odometry, role=role)),
             (roles.TWIST_STAMPED, _read_twist_stamped),
             (roles.TWIST_WITH_COVARIANCE_STAMPED, _read_twist_stamped),
         )

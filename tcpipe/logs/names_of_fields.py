@@ -10,7 +10,8 @@ from tcpipe.logs.mapped import MAPPED
 from tcpipe.logs.msg_text import BASE_TYPES, FieldTypes, MsgTextError, parse_msg
 from tcpipe.logs.roles import OVERLAY, ROLE_TYPES
 from tcpipe.logs.topics import Topic
-from tcpipe.recipe.suggestions import suggested
+from tcpipe.recipe.suggestions import suggest
+from tcpipe.tables.findings import Finding, Subject, make_finding
 
 _ANY_UNIT = re.compile(r"(?<!\s)\s*+[\[(].*|_?(deg|rad|m|mps2?|radps|volt|amp)$")
 
@@ -62,8 +63,8 @@ def fields_called(role: str, names: Sequence[str]) -> dict[str, str]:
     return found if all(field in found for field, of in MAPPED[role].items() if of.needed) else {}
 
 
-def proposed_roles(topics: Iterable[Topic], settled: Collection[str]) -> Iterator[str]:
-    """Yield one line for each message type that no role knows and whose fields are called as those of a role that nothing can play.
+def propose_roles(topics: Iterable[Topic], settled: Collection[str]) -> Iterator[Finding]:
+    """Yield a finding for each message type that no role knows and whose fields are called as those of a role that nothing can play.
 
     Parameters
     ----------
@@ -77,10 +78,9 @@ def proposed_roles(topics: Iterable[Topic], settled: Collection[str]) -> Iterato
             continue
         for topic in held:
             if found := fields_called(role, _numbers(topic)):
-                yield f"{topic.name} ({topic.type_name}) could play {role}, by what its fields are called" + suggested(
-                    "where their units and axes are right",
-                    {"read.topics": {role: [topic.name]}, "read.fields": {role: found}},
-                )
+                remedies = suggest("map", {"read.topics": {role: [topic.name]}, "read.fields": {role: found}})
+                names = {"role": role, "type": topic.type_name}
+                yield make_finding("role-proposed", Subject("topic", topic.name), names=names, remedies=remedies)
 
 
 def _numbers(topic: Topic) -> list[str]:

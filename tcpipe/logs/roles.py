@@ -2,7 +2,7 @@
 
 Rules, in this order: the recipe; topics that are other estimators' outputs play no role (fusing them again would count a sensor twice);
 the message type; how the topic is called, unless a topic covers but a small share of what a rival covers. Where two topics are left that
-no rule tells apart, nobody guesses. What is left out, and what cannot be decoded, is a warning.
+no rule tells apart, nobody guesses. Roles without a topic, topics that are left out and those that cannot be decoded are findings.
 """
 
 from __future__ import annotations
@@ -15,12 +15,14 @@ from typing import TypeVar
 
 from tcpipe.logs.coverage import LITTLE_SPAN, LITTLE_SPAN_OF_POWER, coverage, covering_little
 from tcpipe.logs.robots import find_robot
+from tcpipe.logs.role_findings import find_left_out, find_missing_roles, find_undecodable
 from tcpipe.logs.several_robots import namespaces_of_robots, which_robot
-from tcpipe.logs.topic_texts import LISTED, listing, short_list
+from tcpipe.logs.topic_texts import LISTED, list_undecodable, listing, short_list
 from tcpipe.logs.topics import Topic
 from tcpipe.power.sources import BATTERY_STATE, FLOAT_TYPES, is_corrected, quantity, rail_of
-from tcpipe.recipe.suggestions import RecipeFragment, suggested
+from tcpipe.recipe.suggestions import RecipeFragment, suggest
 from tcpipe.robots.profiles import Profiles
+from tcpipe.tables.findings import Finding, Subject, make_finding
 
 NAV_SAT_FIX = "sensor_msgs/msg/NavSatFix"
 NMEA_SENTENCE = "nmea_msgs/msg/Sentence"
@@ -70,7 +72,8 @@ class RoleAssignment:
     """Who plays what.
 
     ``left_out`` says why a topic plays no role though its type could; ``problems`` are the plain lines of what the user has to decide;
-    ``warnings`` what the run will lack; ``transforms`` are the topics that may place sensors, static ones first.
+    ``findings`` are the roles that are missing and the topics that are not used; ``transforms`` are the topics that may place
+    sensors, static ones first.
     """
 
     robot: str
@@ -79,7 +82,7 @@ class RoleAssignment:
     left_out: Mapping[str, str]
     transforms: tuple[str, ...] = ()
     problems: tuple[str, ...] = ()
-    warnings: tuple[str, ...] = ()
+    findings: tuple[Finding, ...] = ()
 
     @property
     def static_transforms(self) -> tuple[str, ...]:
@@ -99,17 +102,17 @@ class _Decisions:
     """Those whose currents tell no power, and why."""
     roles: dict[str, PlayedRole] = field(default_factory=dict)
     left_out: dict[str, str] = field(default_factory=dict)
-    passed_over: dict[str, dict[str, str]] = field(default_factory=dict)
-    """By role, why topics that hold data were not taken, though nobody asked for that."""
+    passed_over: dict[tuple[str, str], str] = field(default_factory=dict)
+    """By role and topic, the reason why one that holds data was not taken, though nobody asked for that."""
     problems: list[str] = field(default_factory=list)
     ambiguous: list[str] = field(default_factory=list)
     recipe_lines: list[str] = field(default_factory=list)
     undecided: set[str] = field(default_factory=set)
 
-    def pass_over(self, role: str, topic: Topic, why: str) -> None:
-        """Leave a candidate out."""
+    def pass_over(self, role: str, topic: Topic, why: str, reason: str) -> None:
+        """Leave a candidate out, for a reason that is one word or several in kebab case."""
         self.left_out[topic.name] = why
-        self.passed_over.setdefault(role, {})[topic.name] = f"{coverage(topic)}; {why}"
+        self.passed_over[role, topic.name] = reason
 
 
 RoleName = TypeVar("RoleName", bound=str)
@@ -180,7 +183,8 @@ def assign_roles(
         _decide_velocity(decided, velocities + _sentences(decided, listed.values(), ignored))
     elif "gnss_velocity" in decided.roles and "gnss" not in decided.roles:
         decided.problems.append(f"recipe read.topics.gnss_velocity: {_NO_FIXES}")
-    problems = decided.problems + (_without_motion(decided, list(listed.values())) or _questions(decided))
+    no_motion, proposed = _find_no_motion(decided, list(listed.values()))
+    problems = decided.problems + (no_motion or _questions(decided))
     return RoleAssignment(
         name,
         robot_why,
@@ -188,7 +192,12 @@ def assign_roles(
         decided.left_out,
         _transform_topics(listed.values(), ignored),
         tuple(problems),
-        tuple(line for line in _warnings(decided, listed.values()) if line not in problems),
+        (
+            *find_missing_roles({*decided.roles, *decided.undecided}),
+            *find_left_out(decided.passed_over),
+            *proposed,
+            *find_undecodable(listed.values(), {of for types in decided.types.values() for of in types}),
+        ),
     )
 
 
@@ -217,7 +226,9 @@ def _decide_pose(decided: _Decisions, candidates: Ranked, *, taken: bool) -> Non
         if [topic] == [of for _, of in best]:
             decided.roles["pose"] = PlayedRole("pose", (topic.name,), topic.type_name, f"{why}, and there is no GNSS")
         elif topic.type_name == ODOMETRY:
-            decided.pass_over("wheel_odometry", topic, f"{why} that it is another estimator's output, not a sensor")
+            decided.pass_over(
+                "wheel_odometry", topic, f"{why} that it is another estimator's output, not a sensor", "name"
+            )
         else:
             decided.left_out[topic.name] = f"{why} that it is another estimator's output"
 
@@ -234,16 +245,17 @@ def _decide_velocity(decided: _Decisions, candidates: Ranked) -> None:
     if len(best) == 1:
         topic = best[0][1]
         decided.left_out.pop(topic.name, None)
-        decided.passed_over.get("gnss", {}).pop(topic.name, None)
+        decided.passed_over.pop(("gnss", topic.name), None)
         why = why or ("the receiver's sentences" if topic.type_name == NMEA_SENTENCE else f"the only {topic.type_name}")
         decided.roles["gnss_velocity"] = PlayedRole("gnss_velocity", (topic.name,), topic.type_name, why)
     taken = {name for role in decided.roles.values() for name in role.topics}
-    reason = (
-        f"{best[0][1].name} fits gnss_velocity better" if len(best) == 1 else "several could" if fixes else _NO_FIXES
-    )
+    if len(best) == 1:
+        why, reason = f"{best[0][1].name} fits gnss_velocity better", "another-fits-better"
+    else:
+        why, reason = ("several could", "several-fit") if fixes else (_NO_FIXES, "no-gnss")
     for _, _, topic in candidates:
         if topic.name not in taken and topic.type_name != NMEA_SENTENCE:
-            decided.pass_over("gnss_velocity", topic, reason)
+            decided.pass_over("gnss_velocity", topic, why, reason)
 
 
 def _sentences(decided: _Decisions, topics: Iterable[Topic], ignored: Sequence[str]) -> Ranked:
@@ -351,7 +363,7 @@ def _candidates(
             decided.left_out[topic.name] = why
             usual = next(role for role, types in decided.types.items() if topic.type_name in types)
             if usual not in (*settled, "pose"):
-                decided.pass_over(usual, topic, why)
+                decided.pass_over(usual, topic, why, "message-type" if topic.type_name in decided.refusals else "name")
         elif role in settled and role != "pose":
             decided.left_out[topic.name] = settled[role].format(role=role)
         else:
@@ -498,7 +510,10 @@ def _decide(decided: _Decisions, role: str, candidates: Ranked) -> None:
     winner = " + ".join(names)
     little = f"it covers little of what {winner} covers ({coverage(topics[0])})"
     for topic in others:
-        decided.pass_over(role, topic, little if topic.name in thin else f"{winner} fits {role} better")
+        if topic.name in thin:
+            decided.pass_over(role, topic, little, "covers-little")
+        else:
+            decided.pass_over(role, topic, f"{winner} fits {role} better", "another-fits-better")
 
 
 def _best(role: str, candidates: Ranked) -> list[tuple[str, Topic]]:
@@ -545,9 +560,11 @@ def _questions(decided: _Decisions) -> list[str]:
     return [*decided.ambiguous, *how] if decided.ambiguous else []
 
 
-def _without_motion(decided: _Decisions, topics: Sequence[Topic]) -> list[str]:
+def _find_no_motion(decided: _Decisions, topics: Sequence[Topic]) -> tuple[list[str], list[Finding]]:
+    """Return what is wrong where no topic holds motion, and the finding that proposes a topic that was left out."""
     if any(role in decided.roles or role in decided.undecided for role in MOTION_ROLES):
-        return []
+        return [], []
+    findings = []
     lines = ["nothing in the log tells motion: no topic plays wheel_odometry, visual_odometry or gnss"]
     able = {of.name: _motion_role(of.type_name) for of in topics if of.message_count != 0}
     could = {name: why for name, why in decided.left_out.items() if able.get(name)}
@@ -555,37 +572,17 @@ def _without_motion(decided: _Decisions, topics: Sequence[Topic]) -> list[str]:
         reasons = "; ".join(f"{name} since {why}" for name, why in list(could.items())[:LISTED])
         readable = {of.name for of in topics if of.problem is None and not of.name.startswith(OVERLAY)}
         name = next((name for name in could if name in readable), "")
-        advice = suggested("to use one all the same", {"read.topics": {str(able[name]): [name]}}) if name else ""
-        lines.append(f"left out: {reasons}{advice}")
-    return [*lines, *_undecodable(topics), f"the log holds {listing(topics)}"]
-
-
-def _undecodable(topics: Iterable[Topic]) -> Iterable[str]:
-    """Yield one line of the topics that hold data that cannot be decoded, by the reason."""
-    by_reason: dict[str, list[Topic]] = {}
-    for topic in topics:
-        if topic.problem is not None and topic.message_count != 0:
-            by_reason.setdefault(topic.problem, []).append(topic)
-    if by_reason:
-        reasons = "; ".join(f"{short_list(topics)}: {why}" for why, topics in list(by_reason.items())[:LISTED])
-        more = f"; {len(by_reason) - LISTED} more reasons" if len(by_reason) > LISTED else ""
-        yield f"topics that hold data which cannot be decoded: {reasons}{more}"
+        lines.append(f"left out: {reasons}")
+        if name:
+            role = str(able[name])
+            names, remedies = {"role": role, "reason": "name"}, suggest("use", {"read.topics": {role: [name]}})
+            subject = Subject("topic", name)
+            findings.append(make_finding("topic-left-out", subject, severity="warning", names=names, remedies=remedies))
+    return [*lines, *list_undecodable(topics), f"the log holds {listing(topics)}"], findings
 
 
 def _motion_role(type_name: str) -> str | None:
     return next((role for role in MOTION_ROLES if type_name in ROLE_TYPES[role]), None)
-
-
-def _warnings(decided: _Decisions, topics: Iterable[Topic]) -> Iterable[str]:
-    there = decided.roles.keys() | decided.undecided
-    if "gnss" not in there and "pose" not in there:
-        yield "no topic plays gnss: the track lies in a local frame and cannot be placed on a map"
-    if "power" not in there:
-        yield "no topic plays power: there will be a track but no energy"
-    for role, passed in ((role, passed) for role, passed in decided.passed_over.items() if passed):
-        shown = ", ".join(f"{name} ({why})" for name, why in list(passed.items())[:LISTED])
-        yield f"{role}: left out: {shown}" + (f" and {len(passed) - LISTED} more" if len(passed) > LISTED else "")
-    yield from _undecodable(topics)
 
 
 def _transform_topics(topics: Iterable[Topic], ignored: Sequence[str]) -> tuple[str, ...]:

@@ -13,6 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from tcpipe.tables.catalogue import threshold
+from tcpipe.tables.findings import Finding, Subject, make_finding
+
 Ints = NDArray[np.int64]
 
 SIMULATED_NS = 10**18
@@ -24,7 +27,7 @@ _BACK_NS = 1_000_000_000
 _MOST_BACK = 0.01
 _MOST_UNSET = 0.5
 _FEWEST = 3
-_SAME_RATE = 0.02
+LOG_CLOCK = Subject("log", "clock")
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,13 +51,13 @@ class SimulatedClock:
         """Seconds of the simulation in a second of the log."""
         return float(self.clock_ns[-1] - self.clock_ns[0]) / float(self.log_time_ns[-1] - self.log_time_ns[0])
 
-    def remark(self) -> str | None:
-        """Return what a person should know, whose seconds the durations are; None where the log's own clock is the simulation's."""
-        if abs(self.rate - 1.0) < _SAME_RATE and self.log_time_ns[0] < SIMULATED_NS:
-            return None
-        told = "" if abs(self.rate - 1.0) < _SAME_RATE else f", which ran at {self.rate:.3g} of the log's rate"
-        counting = ", ".join(sorted(self.topics))
-        return f"clock: the headers of {counting} count simulated time and rule: durations are those of the simulation{told}"
+    def find_simulated_time(self) -> tuple[Finding, ...]:
+        """Return the finding that durations are those of the simulation; none where the log's own clock is the simulation's."""
+        least = threshold("simulated-time", "min_rate_difference_fraction")
+        if abs(self.rate - 1.0) < least and self.log_time_ns[0] < SIMULATED_NS:
+            return ()
+        names = {"topics": ", ".join(sorted(self.topics))}
+        return (make_finding("simulated-time", LOG_CLOCK, names=names, rate_fraction=self.rate),)
 
 
 def find_simulated_clock(stamps: Mapping[str, tuple[Ints, Ints]], *, published: bool) -> SimulatedClock | None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
 from tcpipe.logs.topics import Topic
 
@@ -33,3 +33,15 @@ def short_list(topics: Sequence[Topic]) -> str:
     """Return the topics' names, the longest lists cut."""
     shown = ", ".join(topic.name for topic in topics[:LISTED])
     return f"{shown} and {len(topics) - LISTED} more" if len(topics) > LISTED else shown
+
+
+def list_undecodable(topics: Iterable[Topic]) -> Iterator[str]:
+    """Yield one line of the topics that hold data that cannot be decoded, by the reason; none where all can be."""
+    by_reason: dict[str, list[Topic]] = {}
+    for topic in topics:
+        if topic.problem is not None and topic.message_count != 0:
+            by_reason.setdefault(topic.problem, []).append(topic)
+    if by_reason:
+        reasons = "; ".join(f"{short_list(topics)}: {why}" for why, topics in list(by_reason.items())[:LISTED])
+        more = f"; {len(by_reason) - LISTED} more reasons" if len(by_reason) > LISTED else ""
+        yield f"topics that hold data which cannot be decoded: {reasons}{more}"

@@ -4,19 +4,18 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from tcpipe.logs.messages import Readings
+from tcpipe.logs.messages import GNSS_VELOCITY, Readings
 from tcpipe.logs.placements import is_base
-from tcpipe.recipe.suggestions import suggested
+from tcpipe.recipe.suggestions import suggest
+from tcpipe.tables.findings import make_finding
 
 
 def over_ground(readings: Readings, frame: str, topic: str) -> Readings:
-    """Return a receiver's velocities, none with a warning where their frame is the body's."""
+    """Return a receiver's velocities, none with a finding where their frame is the body's: whose axes they have is not known."""
     if not is_base(frame):
         return readings
-    why = (
-        f"its frame is {frame!r}: of the body, or of the antenna over ground, nobody can tell, so it is not used"
-        + suggested("if it is east, north, up", {"read.topics": {"gnss_velocity": [topic]}})
-    )
+    remedies = suggest("use", {"read.topics": {"gnss_velocity": [topic]}})
+    found = make_finding("velocity-not-over-ground", GNSS_VELOCITY, names={"frame": frame}, remedies=remedies)
     none = slice(0, 0)
     return replace(
         readings,
@@ -24,5 +23,5 @@ def over_ground(readings: Readings, frame: str, topic: str) -> Readings:
         log_time_ns=readings.log_time_ns[none],
         header_ns=None if readings.header_ns is None else readings.header_ns[none],
         columns={name: values[none] for name, values in readings.columns.items()},
-        warnings=(*readings.warnings, why),
+        findings=(*readings.findings, found),
     )

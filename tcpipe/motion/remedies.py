@@ -1,4 +1,4 @@
-"""The largest losses of drives, and what wins the metres back, by the entry of the ledger that has them."""
+"""The largest losses of drives, by entry of the distance breakdown; the catalogue of findings says how to avoid each (``lost-...``)."""
 
 from __future__ import annotations
 
@@ -6,44 +6,36 @@ from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
-from tcpipe.recipe.suggestions import recipe_key, suggested
-from tcpipe.tables.bits import DropReason, Loss, name_of
+from tcpipe.tables.catalogue import threshold
+from tcpipe.tables.findings import Finding, Subject, make_finding
 
-_SPEED = recipe_key("gate.max_velocity_mps")
-_KEEP_SLOWER = suggested("to keep what was driven slower", {"gate": {"require_full_speed": False}})
-_PLACE, _STD = recipe_key("read.placement"), recipe_key("sample.max_position_std_m")
-
-REMEDIES: Mapping[str, str] = {
-    name_of(reason): text
-    for reason, text in {
-        DropReason.GAP: "a sensor is silent or positions too uncertain: the run's warnings and 'tcpipe inspect --full' say which and when",
-        DropReason.STANDING: "nothing: standing tells the standing power, and costs time only",
-        DropReason.STUCK: "nothing: wheels that spin in place tell no metre's cost; mind such ground when planning",
-        DropReason.TURNING_IN_PLACE: "drive wide turns instead of turning on the spot, and longer legs between them",
-        DropReason.REVERSING: "drive forwards",
-        DropReason.ACCELERATING: "hold one speed over long legs: each start, stop and commanded change costs two seconds",
-        DropReason.BELOW_LIMIT: f"command full speed; if that was its limit, state it ({_SPEED}){_KEEP_SLOWER}",
-        Loss.CURVED: "drive straighter lines: a metre whose arc is 2 % longer than its chord is no segment",
-        Loss.LEFTOVER: "drive longer steady legs: each ends with up to a metre that is no whole segment",
-        Loss.OUTSIDE_MAP: "a map that reaches two metres beyond what is driven",
-        Loss.NODATA: f"a map without holes there, or accept some ({recipe_key('sample.min_valid_fraction')})",
-        Loss.NOT_TRAVERSABLE: "look at the terrain raster and its class table: the robot drove where they say it cannot",
-        Loss.POSITION_UNCERTAIN: f"RTK corrections and the antenna's place ({_PLACE}); or accept more ({_STD})",
-        Loss.SPLIT_BUFFER: "fewer and larger regions: what lies near their borders goes to no split",
-        Loss.NO_POWER: "record the power topic over the whole drive",
-        Loss.SPLIT_EXCLUDED: "nothing: a region says so",
-        Loss.RECORDED_TWICE: "nothing: another run holds the same drive",
-    }.items()
-}  # fmt: skip
-"""By entry, in words."""
-
+KEPT = "kept"
 _MOST_LOSSES = 10
 _WORTH_M = 0.05
 
 
+def loss_code(reason: str) -> str:
+    """Return the code of the finding on metres that were lost for a reason, as ``below_limit``."""
+    return f"lost-{reason.replace('_', '-')}"
+
+
+def find_losses(breakdown_m: Mapping[str, float], subject: Subject) -> list[Finding]:
+    """Return the findings on losses of more than a twentieth of the distance [m], the largest first; none of a robot that did not move."""
+    total_m = sum(breakdown_m.values())
+    if total_m < threshold("no-segments", "min_driven_m"):
+        return []
+    least_m = threshold("lost-gap", "min_lost_fraction") * total_m
+    lost = sorted(breakdown_m.items(), key=lambda item: -item[1])
+    return [
+        make_finding(loss_code(reason), subject, lost_m=lost_m, lost_fraction=lost_m / total_m)
+        for reason, lost_m in lost
+        if reason != KEPT and lost_m > least_m
+    ]
+
+
 @dataclass(frozen=True, slots=True)
 class StoreLoss:
-    """Metres that are in no segment for one reason, and what would win them back."""
+    """Metres that are in no segment for one reason."""
 
     reason: str
     metres: float
@@ -51,12 +43,6 @@ class StoreLoss:
     """Of all metres driven [1]."""
     runs: int
     """Runs that lost metres so."""
-    remedy: str
-
-    def __str__(self) -> str:
-        """Return the loss as one line."""
-        many = "1 run" if self.runs == 1 else f"{self.runs} runs"
-        return f"{self.metres:>9.1f} m ({self.share:.1%}) {self.reason.replace('_', ' ')} in {many}: {self.remedy}"
 
 
 def losses_of(ledgers_m: Iterable[Mapping[str, float]]) -> tuple[StoreLoss, ...]:
@@ -66,8 +52,5 @@ def losses_of(ledgers_m: Iterable[Mapping[str, float]]) -> tuple[StoreLoss, ...]
         metres.update(ledger_m)
         of_runs.update(reason for reason, lost_m in ledger_m.items() if lost_m >= _WORTH_M)
     total = sum(metres.values())
-    lost = [(reason, lost_m) for reason, lost_m in metres.most_common() if reason != "kept" and of_runs[reason]]
-    return tuple(
-        StoreLoss(reason, lost_m, lost_m / total, of_runs[reason], REMEDIES.get(reason, ""))
-        for reason, lost_m in lost[:_MOST_LOSSES]
-    )
+    lost = [(reason, lost_m) for reason, lost_m in metres.most_common() if reason != KEPT and of_runs[reason]]
+    return tuple(StoreLoss(reason, lost_m, lost_m / total, of_runs[reason]) for reason, lost_m in lost[:_MOST_LOSSES])

@@ -12,10 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from tcpipe.tables.catalogue import threshold
+
 _STRETCH_M = 5.0
-_FEWEST_M = 20.0
-_APART = 0.15
-_SURE = 2.5
+_BIAS = "selection-bias"
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,19 +53,21 @@ def named_groups(tally: NDArray[np.float64], names: Sequence[str], reasons: Sequ
 
 
 def uneven(groups: Sequence[Group]) -> list[Group]:
-    """Return the groups whose share in use differs from that of all together by more than 0.15 and than chance would have it.
+    """Return the groups whose share in use differs from that of all others by more than the catalogue's ``selection-bias`` and than chance.
 
-    Groups below 20 m are too short to speak of. Chance: 2.5 standard deviations of a share over stretches of 5 m.
+    Chance: so many standard deviations of a share over stretches of 5 m.
     """
+    least_m, sigmas = threshold(_BIAS, "min_driven_m"), threshold(_BIAS, "min_sigmas")
+    apart = threshold(_BIAS, "min_difference_fraction")
     driven_m, used_m = sum(g.driven_m for g in groups), sum(g.used_m for g in groups)
     found = []
     for group in groups:
         rest_m = driven_m - group.driven_m
-        if group.driven_m < _FEWEST_M or rest_m < _FEWEST_M:
+        if min(group.driven_m, rest_m) < least_m:
             continue
         others = (used_m - group.used_m) / rest_m
         variance = used_m / driven_m * (1 - used_m / driven_m) * _STRETCH_M * (1 / group.driven_m + 1 / rest_m)
-        if abs(group.used_share - others) > max(_APART, _SURE * float(np.sqrt(variance))):
+        if abs(group.used_share - others) > max(apart, sigmas * float(np.sqrt(variance))):
             found.append(group)
     return found
 

@@ -14,10 +14,12 @@ from numpy.typing import NDArray
 from tcpipe.errors import plain_lines
 from tcpipe.formats.dataset_card import DatasetCard, MapSource, RunSource
 from tcpipe.formats.dataset_files import open_patches, read_card, read_samples, rows_in_files, sample_columns
+from tcpipe.formats.finding_lines import format_findings
 from tcpipe.formats.json_files import plain
 from tcpipe.formats.published import here
 from tcpipe.pipeline.explain import flat_recipe
 from tcpipe.splits.assignment import SPLITS
+from tcpipe.tables.findings import Finding, Subject
 
 _LABELS = ("power_watt", "velocity_mps", "duration_s", "energy_joule")
 _LABELLED = (
@@ -46,6 +48,9 @@ class Difference:
     """For every label: means, deviations and the largest gap between the two distribution functions, over all samples."""
     labels_of_train: Mapping[str, Mapping[str, float]]
     """The same over train alone."""
+    findings_gone: tuple[Finding, ...]
+    """Findings of the first, by code and subject, that the second lacks: its own, its runs' and its maps'."""
+    findings_new: tuple[Finding, ...]
     same: bool
     """Whether nothing differs."""
 
@@ -86,8 +91,16 @@ def diff(a: str | Path, b: str | Path) -> Difference:
     moved = _moved(tables[0].column("split").to_numpy()[in_a], tables[1].column("split").to_numpy()[in_b])
     train = [table.filter(pc.equal(table.column("split"), "train")) for table in tables]
     causes = tuple(_causes(*cards))
-    same = not (causes or moved or any(counts[name] for name in _CHANGES))
-    return Difference(str(a), str(b), causes, counts, moved, _shifts(tables), _shifts(train), same)
+    (ours, theirs) = (_find_all(card) for card in cards)
+    gone, new = (tuple(of[key] for key in of if key not in other) for of, other in ((ours, theirs), (theirs, ours)))
+    same = not (causes or moved or gone or new or any(counts[name] for name in _CHANGES))
+    return Difference(str(a), str(b), causes, counts, moved, _shifts(tables), _shifts(train), gone, new, same)
+
+
+def _find_all(card: DatasetCard) -> dict[tuple[str, str, Subject], Finding]:
+    """Return every finding of a dataset by its run or map, its code and its subject."""
+    every = [("", card.findings), *card.findings_by_run.items(), *card.findings_by_map.items()]
+    return {(where, of.code, of.subject): of for where, findings in every for of in findings}
 
 
 def _shifts(tables: Sequence[pa.Table]) -> dict[str, dict[str, float]]:
@@ -230,6 +243,8 @@ def _lines(found: Difference) -> Iterator[str]:
     )
     if found.moved:
         yield "splits: " + ", ".join(f"{count} from {name}" for name, count in found.moved.items())
+    for what, findings in (("gone", found.findings_gone), ("new", found.findings_new)):
+        yield from (f"{what}: {line}" for line in format_findings(findings))
     for part, shifts in (("", found.labels), (" in train", found.labels_of_train)):
         yield from (
             _shift_line(f"{name}{part}", shift) for name, shift in shifts.items() if shift.get("largest_gap", 0.0) > 0.0

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, closing, nullcontext
 from dataclasses import dataclass, field, fields, replace
 from itertools import chain
@@ -25,8 +25,10 @@ from tcpipe.formats.store_mark import gone_if_empty
 from tcpipe.formats.stored_runs import look_at_files
 from tcpipe.pipeline.begun_calls import begun_call, new_call, settled_calls
 from tcpipe.pipeline.calls import INGEST, measure_call, room_of, started
+from tcpipe.pipeline.ingest_options import IngestOptions
 from tcpipe.pipeline.ingest_run import Ingested, find_twin, ingest_one
 from tcpipe.pipeline.ingest_task import IngestResult, IngestTask, died, result_of, too_young
+from tcpipe.pipeline.log_findings import find_failure
 from tcpipe.pipeline.log_sources import (
     FoundLogs,
     LogSource,
@@ -41,8 +43,9 @@ from tcpipe.pipeline.log_writer import LogWriter, open_log
 from tcpipe.pipeline.plan import Step, plan
 from tcpipe.pipeline.problems import failure_of, is_acknowledged, problems_of
 from tcpipe.pipeline.supersession import superseded_by
-from tcpipe.recipe import Recipe
 from tcpipe.store import Store, open_store
+from tcpipe.tables.findings import select_problems
+from tcpipe.tables.options import as_function
 
 logger = logging.getLogger("tcpipe")
 
@@ -80,84 +83,37 @@ class SummaryLine:
     kind: Literal["summary"] = "summary"
 
 
-def ingest(
-    logs: Iterable[str | Path],
-    *,
-    store: str | Path = "tcpipe-store",
-    recipe: Recipe | str | Path | None = None,
-    robot: str | None = None,
-    tags: Mapping[str, str] | None = None,
-    jobs: int = 1,
-    cluster: str | None = None,
-    force: bool = False,
-    retry_failed: bool = False,
-    as_one: bool = False,
-    shard: tuple[int, int] | None = None,
-    min_age_s: float = 0.0,
-    message_definitions: Path | None = None,
-    on_found: Callable[[Mapping[str, int]], None] | None = None,
-    on_result: Callable[[IngestResult], None] | None = None,
-) -> IngestSummary:
+def run_ingest(options: IngestOptions) -> IngestSummary:
     """Ingest logs (files, ROS 2 bag directories, folders of them) into the store; what is there already is left alone.
 
-    Parameters
-    ----------
-    logs
-        ``.mcap``, ``.bag``, ``.db3``, ROS 2 bag directories, or folders searched downward; or URLs of such (``s3://…``), which are
-        read by range, or copied where they have no index.
-    recipe
-        A `Recipe`, a path to one, or None for the one that rules here (``TCPIPE_RECIPE``, nearest tcpipe.toml, defaults).
-    robot
-        Profile; None takes the recipe's, or finds it by message types.
-    jobs
-        Logs side by side, each in a process of its own.
-    cluster
-        Address of a Dask scheduler whose workers take the logs instead; they see logs and store under the same absolute paths.
-    force
-        Do again what is there already, and what is known to fail.
-    retry_failed
-        Try again what is known to fail.
-    as_one
-        All logs are parts of one drive.
-    shard
-        ``(i, n)``: only the i-th of n shares of the logs, i from 1.
-    min_age_s
-        A log that was written since so many seconds waits for another call.
-    message_definitions
-        A directory of .msg or .idl files for types that the logs do not define.
-    on_found
-        Called once with the size [byte] of every log by its name.
-    on_result
-        Called as each log ends, in the order of ending.
-
-    Raises
-    ------
-    LogError, StoreError, RecipeError, UsageError
-        When nothing can be begun; what goes wrong with one log or path stands in its result.
+    Raises `LogError`, `StoreError`, `RecipeError` or `UsageError` when nothing can be begun; what goes wrong with one log or path stands
+    in its result.
     """
     watch = started()
-    ruling = recipe_of(recipe)
-    robot = robot or ruling.robot
+    ruling, shard = recipe_of(options.recipe), options.shard
+    robot = options.robot or ruling.robot
     if robot is not None and robot not in (robots := profiles_of(ruling).robots):
         raise UsageError(f"robot {robot!r} is not known; known: {', '.join(sorted(robots))}")
-    with _place_for_stand_ins(logs := list(logs)) as staging, gone_if_empty(store):
-        found = find_sources(logs, as_one=as_one, staging=staging, tables=ruling.tables)
+    with _place_for_stand_ins(logs := list(options.logs)) as staging, gone_if_empty(options.store):
+        found = find_sources(logs, as_one=options.as_one, staging=staging, tables=ruling.tables)
         if not found.sources:
             raise (LogError if found.transient else UsageError)(*chain(*found.problems.values()) or [_NO_LOGS])
-        opened = open_store(store, create=True)
+        opened = open_store(options.store, create=True)
         log = open_log(opened)
         before, given = log.state.number, _in_full(logs)
         mine = found.sources if shard is None else in_shard(found.sources, shard)
-        if cluster is not None and message_definitions is not None:  # its workers are elsewhere
-            message_definitions = message_definitions.absolute()
-        root = opened.root.absolute() if cluster is not None and isinstance(opened.root, Path) else opened.root
-        common = (root, ruling, robot, dict(tags or {}), force, message_definitions)
-        how = (*common, definitions_key(message_definitions), retry_failed, min_age_s)
-        seen = {} if force else log.state.seen
+        root = opened.root
+        message_definitions = None if options.message_definitions is None else Path(options.message_definitions)
+        if options.cluster is not None:  # its workers are elsewhere
+            root = root.absolute() if isinstance(root, Path) else root
+            message_definitions = None if message_definitions is None else message_definitions.absolute()
+        common = (root, ruling, robot, dict(options.tags or {}), options.force, message_definitions)
+        how = (*common, definitions_key(message_definitions), options.retry_failed, options.min_age_s)
+        seen = {} if options.force else log.state.seen
         tasks = [IngestTask(remembered(source, seen.get(source.lineage, ())), *how) for source in mine]
-        if on_found:
+        if options.on_found:
             sizes = {task.source.name: sum(size for size, _ in task.source.files) for task in tasks}
-            on_found({**dict.fromkeys(map(plain_line, found.problems), 0), **sizes})
+            options.on_found({**dict.fromkeys(map(plain_line, found.problems), 0), **sizes})
         with uncollected():
             steps = plan(tasks, log.state, broken=find_broken(opened, log.state, tasks))
         results: dict[int, IngestResult] = {}
@@ -165,8 +121,8 @@ def ingest(
         def tell(ended: Iterable[tuple[int, IngestResult]]) -> IngestSummary:
             for index, result in ended:
                 results[index] = result
-                if on_result:
-                    on_result(result)
+                if options.on_result:
+                    options.on_result(result)
             return IngestSummary(opened.root, tuple(results[index] for index in sorted(results)))
 
         with uncollected():
@@ -175,13 +131,17 @@ def ingest(
         begin = (INGEST, given, (ingest_key(ruling), robot, shard))
         if work:
             with begun_call(log, *begin[:2], options=begin[2]) as call:
-                summary = tell(_results(log, work, jobs=jobs, cluster=cluster))
-                call.end = Entries(calls=(measure_call(watch, _call_of(opened, summary, given, tasks, jobs)),))
+                summary = tell(_results(log, work, jobs=options.jobs, cluster=options.cluster))
+                call.end = Entries(calls=(measure_call(watch, _call_of(opened, summary, given, tasks, options.jobs)),))
         else:
             log.commit("ended", Entries(ended=tuple(settled_calls(log.state, new_call(*begin)))))
         if log.state.number != before and log.state.runs:
             opened.write_index(log.state)
         return summary
+
+
+ingest = as_function(IngestOptions, run_ingest)
+"""`tcpipe.ingest`: its keywords are the fields of `IngestOptions`."""
 
 
 def _in_full(logs: Iterable[str | Path]) -> tuple[str, ...]:
@@ -226,12 +186,19 @@ def _results_without_work(
     """Yield the result of each path that holds no log, and of each log that is in the store, is known to fail, or has to wait."""
     parties = log.state.parties
     for index, (path, lines) in enumerate(found.problems.items(), start=-len(found.problems)):
-        yield index, IngestResult(plain_line(path), "failed", problems=lines, transient=True)
+        name = plain_line(path)
+        findings = find_failure(name, "LogError")
+        yield index, IngestResult(name, "failed", findings=findings, problems=lines, transient=True)
     for index, step in enumerate(steps):
         source, made = step.task.source, step.made
         if step.failure is not None:
             failed = IngestResult(
-                source.name, "failed", problems=step.failure.problems, sha256=source.sha256, known=True
+                source.name,
+                "failed",
+                problems=step.failure.problems,
+                findings=step.failure.findings,
+                sha256=source.sha256,
+                known=True,
             )
             yield index, replace(failed, accepted=step.standing == "quarantined")
         elif made is not None:
@@ -240,7 +207,7 @@ def _results_without_work(
                 superseded, notes = superseded_by(log.store, log.state, source, made.run_id, str(source.sha256))
                 log.commit("superseded", Entries(superseded=tuple(superseded)))
                 result = replace(result, notes=(*result.notes, *notes))
-            if result.damage or result.why_empty:
+            if select_problems(result.findings):
                 result = replace(result, known=True, accepted=is_acknowledged(problems_of(made), log.state))
             yield index, result
         elif not step.is_todo:
@@ -296,7 +263,10 @@ def _commit(log: LogWriter, ended: Sequence[tuple[int, IngestTask, Ingested]]) -
             problem = (
                 f"{result.log}: another call ingested the same recording as run {by} at the same time; run it again"
             )
-            result = IngestResult(result.log, "failed", problems=(problem,), sha256=result.sha256, transient=True)
+            findings = find_failure(result.log, "StoreError")
+            result = IngestResult(
+                result.log, "failed", findings=findings, problems=(problem,), sha256=result.sha256, transient=True
+            )
         yield index, _judged(log.state, result, of.source, before=before)
 
 
@@ -313,7 +283,7 @@ def _entries_of(log: LogWriter, task: IngestTask, of: Ingested) -> tuple[Entries
             notes += error.problems
     if result.status == "failed" and not result.transient:
         task, content = replace(task, source=replace(source, sha256=sha256)), sha256 or source.files_digest
-        failure = Failure(task.failure_key, content, source.origins, result.problems, __version__)
+        failure = Failure(task.failure_key, content, source.origins, result.problems, __version__, result.findings)
         entries = replace(entries, failed=(failure,))
     return replace(entries, seen=(source.sighting(sha256),) if new and sha256 else ()), tuple(notes)
 
@@ -323,7 +293,7 @@ def _judged(state: State, result: IngestResult, source: LogSource, *, before: St
     if result.status == "failed":
         problem = failure_of(result.sha256 or source.files_digest, source.origins)
         return replace(result, accepted=result.accepted or is_acknowledged([problem], state))
-    if not (result.damage or result.why_empty):
+    if not (select_problems(result.findings)):
         return result
     row = state.runs[str(result.run_id), str(result.recipe_id)]
     problems = problems_of(row)

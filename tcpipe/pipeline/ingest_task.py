@@ -16,10 +16,13 @@ from tcpipe.formats.index_files import RunFacts
 from tcpipe.formats.json_files import digest, recast
 from tcpipe.formats.recipe_toml import ingest_key
 from tcpipe.formats.run_documents import Manifest
+from tcpipe.pipeline.log_findings import find_failure
 from tcpipe.pipeline.log_sources import LogSource
 from tcpipe.pipeline.transience import is_transient
 from tcpipe.recipe import Recipe
-from tcpipe.tables.facts import EnergyBudget, NoPower
+from tcpipe.tables.facts import EnergyBudget
+from tcpipe.tables.findings import Finding, select_problems
+from tcpipe.tables.verdicts import Verdict
 
 R = TypeVar("R")
 
@@ -74,13 +77,12 @@ class IngestResult:
     kept_m: float = 0.0
     energy_budget: EnergyBudget | None = None
     """The noise floor of the labels' energy and its causes, as shares of their mean (`tcpipe.cost.budget`)."""
-    warnings: tuple[str, ...] = ()
+    findings: tuple[Finding, ...] = ()
+    verdict: Verdict | None = None
+    """None of a log that waits, or failed."""
     problems: tuple[str, ...] = ()
+    """Why it failed."""
     damage: tuple[str, ...] = ()
-    no_power: NoPower | None = None
-    """Why there is no power though the log may tell some, and the recipe that would read it."""
-    why_empty: str = ""
-    """Why there is no segment though the robot drove."""
     same_as: str | None = None
     """The log from which the same recording was ingested before, under another path; it is one run."""
     sha256: str | None = None
@@ -98,7 +100,8 @@ class IngestResult:
     @property
     def is_news(self) -> bool:
         """Whether something is wrong that nobody was told before, or accepted."""
-        return (self.status == "failed" or bool(self.damage or self.why_empty)) and not self.known and not self.accepted
+        is_wrong = self.status == "failed" or bool(select_problems(self.findings))
+        return is_wrong and not self.known and not self.accepted
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -111,9 +114,9 @@ class LogLine(IngestResult):
 
 def result_of(source: LogSource, status: Status, made: RunFacts, sha256: str, *, same_as: str | None) -> IngestResult:
     """Return what became of a log whose run is in the store."""
-    trouble = "damaged" if made.damage else "empty" if made.why_empty else status
+    trouble = "damaged" if made.damage else "empty" if made.is_empty else status
     about = {"log": source.name, "status": trouble if status == "done" else status, "distance_m": made.driven_m}
-    return recast(made, IngestResult, **about, same_as=same_as, sha256=sha256, why_empty=made.why_empty)
+    return recast(made, IngestResult, **about, same_as=same_as, sha256=sha256)
 
 
 def too_young(task: IngestTask, now_ns: int | None = None) -> IngestResult | None:
@@ -128,7 +131,8 @@ def too_young(task: IngestTask, now_ns: int | None = None) -> IngestResult | Non
 def died(source: LogSource) -> IngestResult:
     """Return that the process which worked on a log is gone."""
     problem = f"{source.name}: its worker process died (killed, or out of memory); run it again"
-    return IngestResult(source.name, "failed", problems=(problem,), transient=True)
+    findings = find_failure(source.name, "WorkerDied")
+    return IngestResult(source.name, "failed", findings=findings, problems=(problem,), transient=True)
 
 
 def told(task: IngestTask, act: Callable[[IngestTask], R]) -> R | IngestResult:
@@ -139,8 +143,14 @@ def told(task: IngestTask, act: Callable[[IngestTask], R]) -> R | IngestResult:
         for line in "".join(traceback.format_exception(error)).splitlines():
             logger.debug("%s: %s", task.source.name, line)
         problems, trace = _in_words(error, task.source)
-        transient = is_transient(error) or not task.source.files
-        return IngestResult(task.source.name, "failed", problems=problems, transient=transient, traceback=trace)
+        return IngestResult(
+            task.source.name,
+            "failed",
+            findings=find_failure(task.source.name, type(error).__name__),
+            problems=problems,
+            transient=is_transient(error) or not task.source.files,
+            traceback=trace,
+        )
 
 
 def _in_words(error: Exception, source: LogSource) -> tuple[tuple[str, ...], str | None]:

@@ -24,6 +24,9 @@ from tcpipe.pipeline.log_sources import remote_logs
 from tcpipe.pipeline.table_proposal import InspectedTables, proposed
 from tcpipe.recipe import Recipe
 from tcpipe.store import Store, is_store, run_at
+from tcpipe.tables.catalogue import AFFECTED
+from tcpipe.tables.findings import Finding
+from tcpipe.tables.verdicts import Grade, Verdict
 
 if TYPE_CHECKING:
     from tcpipe.pipeline.inspected import InspectedDataset, InspectedMap
@@ -55,7 +58,8 @@ class InspectedIngestion(Ingestion):
 
     counts: Counts
     ledger_m: Mapping[str, float]
-    warnings: tuple[str, ...]
+    findings: tuple[Finding, ...]
+    verdict: Verdict
     damage: tuple[str, ...]
 
 
@@ -75,9 +79,12 @@ class InspectedRun:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StoredIngestion(Ingestion):
-    """A run under one recipe: how much there is to say of it."""
+    """A run under one recipe: its grades, and how much there is to say of it."""
 
-    warnings: int
+    position: Grade
+    time: Grade
+    energy: Grade
+    findings: int
     damage: int
 
 
@@ -219,7 +226,8 @@ def _run(path: Path | str, store: Store, runs: list[RunDirectory]) -> InspectedR
                 InspectedIngestion,
                 counts=run.manifest.counts,
                 ledger_m=run.manifest.ledger_m,
-                warnings=run.manifest.warnings,
+                findings=run.manifest.info.report.findings,
+                verdict=run.manifest.verdict,
                 damage=run.manifest.damage,
             )
             for run in runs
@@ -233,14 +241,18 @@ def _store(store: Store) -> InspectedStore:
     return InspectedStore(
         path=str(store.root),
         maps=tuple(store.maps()),
-        runs=tuple(
-            recast(_ingestion(run), StoredIngestion, warnings=len(run.facts.warnings), damage=len(run.facts.damage))
-            for run in runs
-        ),
+        runs=tuple(_stored(run) for run in runs),
         outdated=outdated,
         damaged_runs={store.runs_place.where("/".join(filter(None, run))): line for run, line in found.damaged.items()},
         superseded=dict(found.superseded),
     )
+
+
+def _stored(run: RunDirectory) -> StoredIngestion:
+    facts = run.facts
+    grades = {name: getattr(facts.verdict, name) for name in AFFECTED}
+    counts = {"findings": len(facts.findings), "damage": len(facts.damage)}
+    return recast(_ingestion(run), StoredIngestion, **grades, **counts)
 
 
 def _ingestion(run: RunDirectory) -> Ingestion:

@@ -12,15 +12,17 @@ from tcpipe.formats.logs.log_file import Log
 from tcpipe.formats.robot_files import profiles_of
 from tcpipe.logs.clocks import Timeline, settle_clocks
 from tcpipe.logs.roles import RoleAssignment
-from tcpipe.logs.simulated_clock import CLOCK, SIMULATED_NS
+from tcpipe.logs.simulated_clock import CLOCK, LOG_CLOCK, SIMULATED_NS
 from tcpipe.logs.topics import Topic
+from tcpipe.pipeline.log_findings import find_damage
 from tcpipe.pipeline.log_stamps import TopicStamps
 from tcpipe.power.sources import sources_of
 from tcpipe.recipe import Recipe
 from tcpipe.robots.profiles import Profiles
 from tcpipe.stages.read_candidates import power_candidates
 from tcpipe.stages.read_roles import find_read_config, roles_by
-from tcpipe.tables.facts import ABSENT, ClockStep, NoPower
+from tcpipe.tables.facts import ABSENT, ClockStep
+from tcpipe.tables.findings import Finding, Subject, make_finding, sort_findings
 
 if TYPE_CHECKING:
     from tcpipe.formats.logs.table_log import TableLog
@@ -76,11 +78,9 @@ class InspectedLog:
     clock_epochs: int | None = field(default=None, metadata=ABSENT)
     """With everything read: stretches of the log between clock steps."""
     clock_steps: tuple[ClockStep, ...] | None = field(default=None, metadata=ABSENT)
-    no_power: NoPower | None = field(default=None, metadata=ABSENT)
-    """Why no power is read though the log may tell some, and the recipe that would read it."""
     problems: tuple[str, ...] = ()
     """What is to be decided before it can be ingested, or why it cannot be read."""
-    warnings: tuple[str, ...] | None = field(default=None, metadata=ABSENT)
+    findings: tuple[Finding, ...] | None = field(default=None, metadata=ABSENT)
     damage: tuple[str, ...] | None = field(default=None, metadata=ABSENT)
     remarks: tuple[str, ...] | None = field(default=None, metadata=ABSENT)
 
@@ -98,6 +98,14 @@ def inspect_log(log: Log | TableLog, recipe: Recipe, robot: str | None, *, full:
     topics, steps = tuple(_indexed(topic, cast) for topic in sorted(log.topics.values(), key=attrgetter("name"))), None
     if full:
         topics, steps = _read(log, topics)
+    damage = tuple(str(damage) for damage in log.damage if damage.is_loss)
+    findings = (
+        *cast.findings,
+        *power_candidates(log, cast, config),
+        *_find_simulated_time(log.topics.values()),
+        *_find_slow_power(log, cast, recipe, known),
+        *find_damage(damage, Subject("log", str(log.path))),
+    )
     starts = [topic.start_ns for topic in log.topics.values() if topic.start_ns is not None]
     ends = [topic.end_ns for topic in log.topics.values() if topic.end_ns is not None]
     return InspectedLog(
@@ -111,10 +119,9 @@ def inspect_log(log: Log | TableLog, recipe: Recipe, robot: str | None, *, full:
         topics=topics,
         clock_epochs=None if steps is None else len(steps) + 1,
         clock_steps=steps,
-        no_power=power_candidates(log, cast, config),
         problems=tuple(cast.problems),
-        warnings=(*cast.warnings, *_simulated(log.topics.values()), *_slow_power(log, cast, recipe, known)),
-        damage=tuple(str(damage) for damage in log.damage if damage.is_loss),
+        findings=tuple(sort_findings(findings)),
+        damage=damage,
         remarks=tuple(log.remarks),
     )
 
@@ -144,7 +151,7 @@ def _read(
     published = any(topic.type_name == CLOCK and topic.message_count for topic in log.topics.values())
     settled = settle_clocks(clocks, clock_published=published)
     clock = settled.simulated
-    counting = clock.topics if clock is not None and clock.remark() is not None else frozenset()
+    counting = clock.topics if clock is not None and clock.find_simulated_time() else frozenset()
     read = tuple(
         _with_stamps(topic, found[topic.name], settled.timelines.get(topic.name), simulated=topic.name in counting)
         if topic.name in found
@@ -175,8 +182,8 @@ def _with_stamps(
     )
 
 
-def _slow_power(log: Log | TableLog, cast: RoleAssignment, recipe: Recipe, known: Profiles) -> Iterable[str]:
-    """Yield a line of each power topic that comes too slowly to tell what a metre costs, with what sets its rate where that is known."""
+def _find_slow_power(log: Log | TableLog, cast: RoleAssignment, recipe: Recipe, known: Profiles) -> Iterable[Finding]:
+    """Yield a finding for each power topic that is too slow for segments, with the setting of its rate where one is known."""
     robot = known.robots[cast.robot]
     for name in cast.roles["power"].topics if "power" in cast.roles else ():
         topic = log.topics[name]
@@ -184,28 +191,23 @@ def _slow_power(log: Log | TableLog, cast: RoleAssignment, recipe: Recipe, known
             topic.type_name, name, known.power_sources, platform=robot.platform, husky_power=recipe.read.husky_power
         )
         rate_hz = _rate_hz(topic)
-        if isinstance(choices, str) or rate_hz is None or not any(of.current or of.energy for of in choices[0]):
+        if isinstance(choices, Finding) or rate_hz is None or not any(of.current or of.energy for of in choices[0]):
             continue  # a voltage alone may be slow
         averaged = {"auto": choices[0][0].averaged, "yes": True, "no": False}[recipe.read.power_averaged]
-        wanted_hz, what = wanted_rate_hz(averaged=averaged), "averaged" if averaged else "sampled"
         if is_too_slow(rate_hz, averaged=averaged):
-            speed_mps = robot.max_velocity_mps or 1.0
-            metre = f"a metre at {speed_mps:g} m/s holds {rate_hz / speed_mps:.2g} values; {wanted_hz:g} Hz are wanted"
-            setting = f"; what sets it: {choices[0][0].rate_setting}" if choices[0][0].rate_setting else ""
-            yield f"power: {name} comes at {rate_hz:g} Hz, {what}, too slowly for segments of 1 m: {metre}{setting}"
+            names = {"quantity": "current", "topic": name, "setting": choices[0][0].rate_setting}
+            wanted_hz = wanted_rate_hz(averaged=averaged)
+            subject = Subject("role", "power")
+            yield make_finding("power-too-slow", subject, names=names, rate_hz=rate_hz, wanted_hz=wanted_hz)
 
 
-def _simulated(topics: Iterable[Topic]) -> list[str]:
-    """Return what the index tells of simulated time."""
+def _find_simulated_time(topics: Iterable[Topic]) -> Iterable[Finding]:
+    """Yield the finding that the index shows simulated time: a clock topic, or a log that begins near 0."""
     listed = list(topics)
     starts_ns = [topic.start_ns for topic in listed if topic.start_ns is not None]
-    said = []
-    if starts_ns and max(starts_ns) < SIMULATED_NS:
-        said.append(f"the log's own times are simulated: they begin {min(starts_ns) / 1e9:.3f} s after 0")
-    said += [
-        f"{topic.name} publishes simulated time ({topic.type_name})" for topic in listed if topic.type_name == CLOCK
-    ]
-    return said
+    clocks = [topic.name for topic in listed if topic.type_name == CLOCK]
+    if clocks or (starts_ns and max(starts_ns) < SIMULATED_NS):
+        yield make_finding("simulated-time", LOG_CLOCK, names={"topics": ", ".join(clocks)})
 
 
 def _rate_hz(topic: Topic) -> float | None:

@@ -5,12 +5,14 @@ from __future__ import annotations
 import glob
 import logging
 import os
+import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import Literal
 
 from tcpipe.errors import MapError, StoreError, UsageError, plain_lines
+from tcpipe.formats.finding_lines import format_findings
 from tcpipe.formats.maps.building import MoreLayers, OrthoBands, build_map
 from tcpipe.formats.maps.geotiff import raster_files
 from tcpipe.formats.maps.map_facts import MapInputs, MapSummary
@@ -50,7 +52,8 @@ class AddedMap:
         head = f"{self.path} (quick look: {PurePosixPath(self.picture).name})"
         if self.status == "unchanged":
             head += ": nothing to do: it is made from the same files and options"
-        return plain_lines((head, *map_lines(self.map), *(f"warning: {text}" for text in self.map.warnings)))
+        more = f"tcpipe inspect {shlex.quote(self.path)}"
+        return plain_lines((head, *map_lines(self.map), *format_findings(self.map.findings, more=more)))
 
 
 def add_map(

@@ -9,6 +9,7 @@ from typing import Literal, TypeAlias, get_args
 
 from tcpipe import __version__
 from tcpipe.formats.commits import Call, Failure, State
+from tcpipe.formats.finding_lines import describe_finding
 from tcpipe.formats.index_files import RunFacts
 from tcpipe.formats.recipe_toml import ingest_key
 from tcpipe.pipeline.ingest_task import IngestTask, too_young
@@ -113,12 +114,13 @@ def _standing_of(made: RunFacts, state: State) -> tuple[Standing, str]:
     """Return the standing of a log that is in the store as it would be made now, and why."""
     if made.superseded_by:
         return "superseded", "a longer recording has taken its place"
-    problems = problems_of(made) if made.damage or not made.segments else ()
+    problems = problems_of(made)
     if not problems:
         return "done", ""
     if is_acknowledged(problems, state):
         return "done", f"{'damaged' if made.damage else 'empty'}, acknowledged"
-    return "empty" if made.why_empty else "partial", (made.why_empty, *made.damage)[0 if made.why_empty else 1]
+    worst = problems[0].finding
+    return "empty" if made.is_empty else "partial", made.damage[0] if made.damage else describe_finding(worst)
 
 
 def _why_pending(task: IngestTask, known: _Known) -> str:

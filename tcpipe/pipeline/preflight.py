@@ -6,7 +6,6 @@ The excerpt goes through the very stages that ingest runs, in memory: what is pr
 from __future__ import annotations
 
 import math
-import re
 import shlex
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -16,35 +15,41 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.errors import TcpipeError, plain_lines
+from tcpipe.formats.finding_lines import format_findings, format_loss, format_verdict
 from tcpipe.formats.logs.joined import opened
 from tcpipe.formats.object_storage import is_url, shown_path
 from tcpipe.formats.robot_files import profiles_of
-from tcpipe.logs.roles import OVERLAY, ROLE_TYPES
+from tcpipe.logs.roles import OVERLAY
 from tcpipe.logs.simulated_clock import CLOCK
 from tcpipe.logs.topics import Topic
-from tcpipe.motion.remedies import REMEDIES
+from tcpipe.motion.remedies import StoreLoss, losses_of
 from tcpipe.motion.vibration import LEAST_RATE_HZ
 from tcpipe.pipeline.log_inspection import InspectedLog, inspect_log
 from tcpipe.pipeline.run_stages import run_stages
 from tcpipe.recipe import ReadConfig, Recipe, Role
-from tcpipe.recipe.suggestions import recipe_key
 from tcpipe.stages.read import read_run
 from tcpipe.stages.read_roles import find_read_config, roles_by
+from tcpipe.tables.catalogue import threshold
 from tcpipe.tables.columns import integers
-from tcpipe.tables.facts import EnergyBudget, NoPower, RunFacts
+from tcpipe.tables.facts import NOTHING_FOUND, EnergyBudget, RunFacts
+from tcpipe.tables.findings import Finding, Subject, make_finding, sort_findings
 from tcpipe.tables.levels import LabelledSegments
+from tcpipe.tables.verdicts import Verdict, judge
 
 MISSING: Mapping[Role, str] = {
-    "gnss": "the track has no place on a map, and there are no samples",
-    "imu": "attitude and turning rest on the other sensors alone, and there is no vibration",
-    "wheel_odometry": "speed rests on fixes or a camera alone, and slip is not told",
-    "power": "there are segments, but no energy and no sample",
-    "command": "a commanded change of speed is not told from the terrain's, nor whether the robot was at its limit",
+    "gnss": "no-gnss",
+    "imu": "no-imu",
+    "wheel_odometry": "no-wheel-odometry",
+    "power": "no-power",
+    "command": "no-command",
 }
-"""What a log without the role lacks."""
+"""Code of the finding on a log without the role."""
 
-WANTED_HZ: Mapping[str, float] = {"gnss": 1.0, "imu": LEAST_RATE_HZ, "wheel_odometry": 10.0, "visual_odometry": 10.0}
-"""Slower topics cost precision or columns; power's rate is a matter of its source (`tcpipe.cost.quality`)."""
+WANTED_HZ: Mapping[str, float] = {
+    "imu": LEAST_RATE_HZ,
+    **{role: threshold("rate-too-low", f"{role}_hz") for role in ("gnss", "wheel_odometry", "visual_odometry")},
+}
+"""Slower topics cost precision or columns; the rate of power depends on its source (`tcpipe.cost.quality`)."""
 
 LARGE_TYPES = frozenset(
     f"sensor_msgs/msg/{name}"
@@ -57,11 +62,8 @@ LARGE_TYPES = frozenset(
 }
 """What fills disks and is of no use here."""
 
-_NEARLY = 0.9
-_OFTEN_THERE = 0.9
-_CLOCK = re.compile(r"\bstamps?\b|log time|^clock:|its clock is")
 _WORTH_SAYING = 0.05
-_SHORT_S = 45.0
+_MOST_LOSSES = 3
 _TRANSFORMS = "/tf_static"
 _WINDOW_S, _FEWEST_WINDOWS = 10.0, 3
 
@@ -128,50 +130,38 @@ class Preflight:
     promise: Promise | None
     """None where ingesting it would fail."""
     topics: tuple[RoleTopic, ...]
-    missing: Mapping[str, str]
-    """By role, what that costs."""
     problems: tuple[str, ...]
     """Why ingesting it would fail."""
-    mend: tuple[str, ...]
-    """What is too slow, absent or off, and what to do about it."""
-    costs: tuple[str, ...]
-    """Where most metres go that are no segments, and what would win them back."""
-    clock: tuple[str, ...]
-    warnings: tuple[str, ...]
-    """What else ingest would warn of."""
+    findings: tuple[Finding, ...]
+    """Of ingesting it, and what is too slow, missing or off in such recordings, the worst first."""
+    verdict: Verdict
+    losses: tuple[StoreLoss, ...]
+    """Where most metres go that are no segments."""
     record: str
     """The command that records all that may be of use; "" where the log is no recording of ROS."""
     large: Mapping[str, float | None]
     """Images and point clouds, which it leaves out, with the messages that come of each a second."""
-    no_power: NoPower | None
-    """Why no power is read though the log may tell some, and the recipe that would read it."""
     exit_code: int
-    """0 ready; 3 something is to be mended; 1 nothing would come of it."""
+    """0 ready; 3 there are warnings, errors or no segments; 1 ingesting it would fail."""
 
     def __str__(self) -> str:
         """Return it as lines."""
         said = [f"{self.log}: robot {self.robot or 'unknown'}", *(self.promise.lines() if self.promise else ())]
         said += [f"topic     {_rate(of)}" for of in self.topics]
-        for name, lines in (
-            ("fails", self.problems),
-            ("mend", self.mend),
-            ("costs", self.costs),
-            ("clock", self.clock),
-            ("warning", self.warnings),
-        ):
-            said += [f"{name:9} {line}" for line in lines]
-        if self.no_power:
-            said += [f"power     {self.no_power.why}", *(f"  {line}" for line in self.no_power.recipe.splitlines())]
+        said += [f"fails     {line}" for line in self.problems]
+        said += [f"verdict   {format_verdict(self.verdict)}"] if self.promise else []
+        said += format_findings(self.findings, more=f"tcpipe preflight {self.log} --json")
+        said += [f"loss      {format_loss(loss)}" for loss in self.losses]
         said += [f"record    {self.record}"] if self.record else []
         rates = ", ".join(name if hz is None else f"{name} at {hz:.3g} Hz" for name, hz in self.large.items())
         said += [f"large     images and point clouds, not recorded by that: {rates}"] if rates else []
-        said += ["ready: nothing is to be mended"] if self.exit_code == 0 else []
+        said += ["ready: no problems found"] if self.exit_code == 0 else []
         return plain_lines(said)
 
 
 def _rate(of: RoleTopic) -> str:
     rate = "" if of.rate_hz is None else f" at {of.rate_hz:.3g} Hz"
-    return f"{of.role}: {of.topic}{rate}" + ("" if of.wanted_hz is None else f" (wanted {of.wanted_hz:g})")
+    return f"{of.role}: {of.topic}{rate}" + ("" if of.wanted_hz is None else f" (needed {of.wanted_hz:g})")
 
 
 def preflight(
@@ -198,52 +188,45 @@ def preflight(
         large = {of.name: of.rate_hz for of in seen.topics or () if of.type in LARGE_TYPES and of.role is None}
         kept = [of.name for of in topics if of.name not in large and not of.name.startswith(OVERLAY)]
         record = record_command(topics, kept)
-        placed = bool(cast.transforms)
-        record += "" if placed or not record else f" {_TRANSFORMS}"
-        missing = dict(_missing_roles(cast.roles, read))
+        record += "" if cast.transforms or not record else f" {_TRANSFORMS}"
+        missing = tuple(find_missing(cast.roles, read))
+        labelled, problems = None, tuple[str, ...]()
         try:
             streams = read_run(found, read, robot=robot, known=profiles_of(recipe))
             labelled = run_stages(streams, recipe.ingest, run_id="preflight")[2]
         except TcpipeError as error:
-            return replace(_told(seen, None, missing, record, placed=placed, problems=error.problems), large=large)
-    return replace(_told(seen, labelled, missing, record, placed=placed, problems=()), large=large)
+            problems = error.problems
+    return _summarize(seen, labelled, missing, record=record, large=large, problems=problems)
 
 
-def _told(
+def _summarize(
     seen: InspectedLog,
     labelled: LabelledSegments | None,
-    missing: Mapping[str, str],
-    record: str,
+    missing: tuple[Finding, ...],
     *,
-    placed: bool,
+    record: str,
+    large: Mapping[str, float | None],
     problems: tuple[str, ...],
 ) -> Preflight:
-    facts = labelled.info.report.facts if labelled else RunFacts()
-    every = tuple(dict.fromkeys((*(labelled.info.report.findings if labelled else ()), *(seen.warnings or ()))))
-    clock = tuple(line for line in every if _CLOCK.search(line))
+    report = labelled.info.report if labelled else NOTHING_FOUND
     promise = _promise(labelled) if labelled else None
-    topics = tuple(_topics(facts, seen.duration_s or 0.0))
-    slow = tuple(line for line in every if line.startswith("power: ") and "too slowly" in line)
-    unplaced = () if placed else _unplaced(every)
-    mend = (*_missing(missing), *slow, *unplaced, *_mend(topics, promise, seen.duration_s or 0.0))
-    ready = promise is not None and promise.segments and not any((mend, clock, seen.damage))
+    topics = tuple(_topics(report.facts, seen.duration_s or 0.0))
+    findings = [*missing, *find_slow(topics, promise, seen.duration_s or 0.0)]
+    for more in (report.findings, seen.findings or ()):
+        made = {(of.code, of.subject) for of in findings}
+        findings += [of for of in more if (of.code, of.subject) not in made]
+    ready = promise is not None and promise.segments and all(of.severity == "note" for of in findings)
     return Preflight(
         log=seen.path,
         robot=seen.robot,
         promise=promise,
         topics=topics,
-        missing=missing,
         problems=problems,
-        mend=mend,
-        costs=tuple(_costs(labelled)) if labelled else (),
-        clock=clock,
-        warnings=(
-            *(line for line in every if line not in (*clock, *slow) and not line.startswith("no topic plays")),
-            *(seen.damage or ()),
-        ),
+        findings=tuple(sort_findings(findings)),
+        verdict=judge(findings),
+        losses=_largest_losses(promise),
         record=record,
-        large={},
-        no_power=facts.no_power or seen.no_power,
+        large=large,
         exit_code=0 if ready else 3 if promise else 1,
     )
 
@@ -286,50 +269,49 @@ def _topics(facts: RunFacts, span_s: float) -> Iterator[RoleTopic]:
             )
 
 
-def _missing_roles(played: Collection[str], read: ReadConfig) -> Iterator[tuple[str, str]]:
-    """Yield the roles that no topic plays and what that costs; nothing of one that the recipe does without, unless no sample is left."""
-    for role, what in MISSING.items():
-        without = role not in ("gnss", "power") and read.topics.get(role) == []
-        if role not in played and not without and not (role == "gnss" and "pose" in played):
-            yield role, what
+def find_missing(roles: Collection[str], read: ReadConfig) -> Iterator[Finding]:
+    """Yield a warning for each role without a topic, before it is too late to record one; none for a role that the recipe does without.
+
+    Without GNSS or power there is no sample: these are missed whatever the recipe says.
+    """
+    present = {*roles, "gnss"} if "pose" in roles else {*roles}
+    for role, code in MISSING.items():
+        is_needless = role not in ("gnss", "power") and read.topics.get(role) == []
+        if role not in present and not is_needless:
+            found = make_finding(code, Subject("role", role))
+            yield replace(found, severity="warning") if found.severity == "note" else found
 
 
-def _missing(missing: Mapping[str, str]) -> Iterator[str]:
-    for role, what in missing.items():
-        types = "" if role == "power" else f" ({' or '.join(ROLE_TYPES[role][:2])})"
-        yield f"{role}: no topic plays it: {what}; record one{types}, or name it ({recipe_key('read.topics')})"
-
-
-def _unplaced(warnings: Sequence[str]) -> Iterator[str]:
-    """Yield what records where the sensors sit, of a log without transforms."""
-    roles = dict.fromkeys(line.partition(":")[0] for line in warnings if "nothing places frame" in line)
-    if roles:
-        yield f"{', '.join(roles)}: no {_TRANSFORMS} tells where they sit: record it, or say it ({recipe_key('read.placement')})"
-
-
-def _mend(topics: Sequence[RoleTopic], promise: Promise | None, span_s: float) -> Iterator[str]:
+def find_slow(topics: Sequence[RoleTopic], promise: Promise | None, span_s: float) -> Iterator[Finding]:
+    """Yield what is too slow, too short or absent for a part of the time to record a day in this way."""
     for of in topics:
-        if of.rate_hz is not None and of.wanted_hz is not None and of.rate_hz < _NEARLY * of.wanted_hz:
-            yield f"{of.role}: {of.topic} comes at {of.rate_hz:.3g} Hz, {of.wanted_hz:g} are wanted: raise the rate of its driver"
-        if of.role != "command" and of.there < _OFTEN_THERE:
-            yield f"{of.role}: {of.topic} is there for {of.there:.0%} of the log only: look at its cable, its driver, the recorder's disk"
+        subject, names = Subject("role", of.role), {"topic": of.topic}
+        least_hz = threshold("rate-too-low", "min_rate_fraction") * (of.wanted_hz or 0.0)
+        if of.rate_hz is not None and of.wanted_hz is not None and of.rate_hz < least_hz:
+            yield make_finding("rate-too-low", subject, names=names, rate_hz=of.rate_hz, wanted_hz=of.wanted_hz)
+        if of.role != "command" and of.there < threshold("topic-incomplete", "min_present_fraction"):
+            yield make_finding("topic-incomplete", subject, names=names, present_fraction=of.there)
     budget = promise.energy_budget if promise else None
-    if budget is not None and budget.rate**2 > 0.5 * budget.total**2 and budget.at_20_hz < 0.8 * budget.total:
-        yield f"power: its rate rules the error of E: {budget.total:.1%} would be {budget.at_20_hz:.1%} at 20 Hz"
-    if promise is not None and span_s < _SHORT_S:
-        yield f"the log is {span_s:.0f} s long: record a minute as it will be driven, for a prediction that holds"
-    if promise is not None and not promise.segments:
-        lost = max(promise.ledger_m, key=lambda name: promise.ledger_m[name], default="")
-        cure = REMEDIES["gap"] if lost == "gap" else "drive straight at one speed for some metres"
-        yield f"there is no segment in it: {cure}"
+    if budget is not None and _is_ruled_by_rate(budget):
+        yield make_finding(
+            "power-rate-dominates",
+            Subject("role", "power"),
+            total_fraction=budget.total,
+            at_20_hz_fraction=budget.at_20_hz,
+        )
+    if promise is not None and span_s < threshold("log-too-short", "min_span_s"):
+        yield make_finding("log-too-short", Subject("log", "log"), length_s=span_s)
 
 
-def _costs(labelled: LabelledSegments) -> Iterator[str]:
-    total = math.fsum(labelled.ledger_m.values())
-    lost = sorted(((metres, name) for name, metres in labelled.ledger_m.items() if name != "kept"), reverse=True)
-    for metres, name in lost[:3]:
-        if total and metres > _WORTH_SAYING * total:
-            yield f"{metres / total:.0%} of the metres are {name.replace('_', ' ')}: {REMEDIES[name]}"
+def _is_ruled_by_rate(budget: EnergyBudget) -> bool:
+    least_share = threshold("power-rate-dominates", "min_variance_fraction")
+    gain = threshold("power-rate-dominates", "max_remaining_fraction")
+    return budget.rate**2 > least_share * budget.total**2 and budget.at_20_hz < gain * budget.total
+
+
+def _largest_losses(promise: Promise | None) -> tuple[StoreLoss, ...]:
+    losses = losses_of([promise.ledger_m] if promise else [])
+    return tuple(loss for loss in losses if loss.share > _WORTH_SAYING)[:_MOST_LOSSES]
 
 
 def record_command(topics: Iterable[Topic], names: Sequence[str]) -> str:

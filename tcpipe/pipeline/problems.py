@@ -15,7 +15,7 @@ from tcpipe.pipeline.begun_calls import begun_calls
 from tcpipe.pipeline.log_sources import LogSource, find_sources
 from tcpipe.pipeline.log_writer import LogWriter
 from tcpipe.store import Store, open_store
-from tcpipe.tables.findings import Finding, Subject, make_finding
+from tcpipe.tables.findings import Finding, Subject, make_finding, select_problems
 
 _MOST_CANDIDATES = 10
 
@@ -30,13 +30,8 @@ class Acknowledged:
 
 def problems_of(row: RunFacts) -> tuple[Problem, ...]:
     """Return what is wrong with a run: damage of its log, or that it has no segments."""
-    codes = [code for code, holds in (("log-damaged", row.damage), ("no-segments", row.why_empty)) if holds]
     log = row.log.source if row.log else None
-    return tuple(
-        Problem(Finding(code, "error", Subject("run", row.run_id), "kept"), log.sha256, log.paths, row.run_id)
-        for code in codes
-        if log
-    )
+    return tuple(Problem(of, log.sha256, log.paths, row.run_id) for of in select_problems(row.findings) if log)
 
 
 def failure_of(content: str, log: tuple[str, ...]) -> Problem:
@@ -67,7 +62,7 @@ def known_problems(state: State) -> Iterator[Problem]:
     for failure in state.failed.values():
         yield failure_of(failure.content, failure.log)
     for row in state.runs.values():
-        yield from problems_of(row) if row.damage or not row.segments else ()
+        yield from problems_of(row)
     yield from (call.problem for call in begun_calls(state) if call.state == "killed")
     yield from state.problems
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from tcpipe.formats.stored_runs import RunDirectory
 from tcpipe.tables.columns import floats, integers
+from tcpipe.tables.findings import Finding, Subject, make_finding
 
 _SAME_TIME_NS = 1_000_000_000
 _SAME_PLACE_M = 2.0
@@ -34,7 +35,7 @@ class Once:
 
     runs: tuple[RunDirectory, ...]
     again: Mapping[str, Mask]
-    warnings: tuple[str, ...]
+    findings: tuple[Finding, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,7 +68,7 @@ class _Way:
 
 
 def each_drive_once(runs: Sequence[RunDirectory], sha256_by_run: Mapping[str, str]) -> Once:
-    """Return the runs, by id, without second recordings, and a warning for each of those; of two, the first by id stays.
+    """Return the runs, by id, without second recordings, and a finding for each of those; of two, the first by id stays.
 
     Parameters
     ----------
@@ -82,12 +83,12 @@ def each_drive_once(runs: Sequence[RunDirectory], sha256_by_run: Mapping[str, st
         return _way(runs[index])
 
     again: dict[str, Mask] = {}
-    warnings: list[str] = []
+    findings: list[Finding] = []
     by_sha256: dict[str, str] = {}
     for index, run in enumerate(runs):
         twin = by_sha256.setdefault(sha256_by_run[run.run_id], run.run_id)
         if twin != run.run_id:
-            warnings.append(f"run {run.run_id}: the same recording as run {twin}; used once")
+            findings.append(_find_twice(run, run.facts.segments, [twin]))
             continue
         twice, others = np.zeros(run.facts.segments, np.bool_), []
         for earlier in spans.beside(index):
@@ -96,16 +97,22 @@ def each_drive_once(runs: Sequence[RunDirectory], sha256_by_run: Mapping[str, st
                 twice |= shared
                 others += [kept[earlier].run_id] if shared.any() else []
         if twice.any():
-            count = "all" if twice.all() else f"{int(twice.sum())} of"
-            warnings.append(
-                f"run {run.run_id}: {count} {len(twice)} segments lie when and where those of run {', '.join(others)} do: "
-                "the same drive; used once"
-            )
+            findings.append(_find_twice(run, int(twice.sum()), others))
         if twice.all() and len(twice):
             continue
         again[run.run_id] = twice
         kept[index] = run
-    return Once(tuple(kept.values()), again, tuple(warnings))
+    return Once(tuple(kept.values()), again, tuple(findings))
+
+
+def _find_twice(run: RunDirectory, duplicates: int, others: Sequence[str]) -> Finding:
+    return make_finding(
+        "drive-recorded-twice",
+        Subject("run", run.run_id),
+        names={"others": ", ".join(others)},
+        duplicate_count=duplicates,
+        segment_count=run.facts.segments,
+    )
 
 
 def _spans(runs: Sequence[RunDirectory]) -> _Spans:

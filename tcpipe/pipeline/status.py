@@ -14,6 +14,7 @@ from tcpipe.errors import UsageError, plain_lines
 from tcpipe.formats.atomic import scratch_directory
 from tcpipe.formats.commit_log import uncollected
 from tcpipe.formats.commits import Call, Problem
+from tcpipe.formats.finding_lines import MOST_LINES, format_count, format_loss, format_verdict, group_findings
 from tcpipe.formats.object_storage import is_url, shown_path
 from tcpipe.formats.places import local_output
 from tcpipe.formats.recipe_toml import ingest_key, recipe_of
@@ -25,9 +26,11 @@ from tcpipe.pipeline.ingest_task import IngestTask
 from tcpipe.pipeline.log_sources import definitions_key, find_sources, in_shard, remembered
 from tcpipe.pipeline.plan import STANDINGS, TROUBLE, Standing, Step, plan
 from tcpipe.pipeline.problems import incomplete_runs, waiting_of
+from tcpipe.pipeline.store_verdict import judge_runs
 from tcpipe.recipe import Recipe
 from tcpipe.store import Store, open_store
 from tcpipe.tables.findings import Finding, Subject, make_finding
+from tcpipe.tables.verdicts import Verdict
 
 _NUMBER = re.compile(r"\d[\d.,]*")
 _MOST_NAMES = 3
@@ -68,7 +71,7 @@ class Status:
     """By state and cause."""
     to_do: Estimate | None
     """What the next ingest will take; None where nothing is to do."""
-    findings: tuple[Finding, ...]
+    problems: tuple[Finding, ...]
     """Sources that cannot be read, runs that are not complete, logs that wait for too long, calls that were killed, damaged commits."""
     gone: tuple[str, ...]
     """Sources that cannot be read and that only calls before the latest ingest were given."""
@@ -77,6 +80,12 @@ class Status:
     """Calls that have begun and not ended: they run, perhaps run, or were killed and nobody accepted that."""
     history: tuple[Call, ...]
     """The latest calls, the last one first."""
+    verdict: Verdict
+    """On the runs under the ruling recipe together; of each code the worst finding is a reason."""
+    runs: int
+    """Under the ruling recipe."""
+    findings: Mapping[str, int]
+    """Of those, how many have a finding, by code: what is no note, the worst first."""
     losses: tuple[StoreLoss, ...]
     """The ten largest, over the runs under the ruling recipe."""
     exit_code: int
@@ -90,7 +99,9 @@ class Status:
         lines += [f"of earlier calls: {line}" for line in self.gone]
         lines += [f"{self.superseded_runs} superseded runs"] if self.superseded_runs else []
         lines += [f"{call.state}: {call}" for call in self.begun if call.state != "killed"]
-        lines += ["losses:", *map(str, self.losses)] if self.losses else []
+        lines += [f"verdict: {format_verdict(self.verdict)}"] if self.runs else []
+        lines += [f"  {format_count(code, count, self.runs)}" for code, count in [*self.findings.items()][:MOST_LINES]]
+        lines += ["losses:", *map(format_loss, self.losses)] if self.losses else []
         lines += ["history:"] if self.history else []
         return plain_lines([*lines, *(_told(call) for call in self.history[:_MOST_CALLS])])
 
@@ -159,6 +170,8 @@ def status(
     acknowledged = {call.name for call in begun if call.problem.key in state.acknowledged}
     missing = [make_finding("log-missing", Subject("log", path)) for path in found.problems if path in lately]
     groups, waiting = tuple(_groups(steps)), [step for step in steps if step.is_todo]
+    current = [run.facts for run in runs.finished if run.facts.ingest_key == ingest_key(ruling)]
+    by_code = group_findings((run.run_id, run.findings) for run in current)
     trouble = problems or missing or any(group.state in TROUBLE for group in groups)
     return Status(
         store=str(opened.root),
@@ -166,12 +179,15 @@ def status(
         counts=dict(sum((Counter({group.state: len(group.logs)}) for group in groups), Counter())),
         groups=groups,
         to_do=estimate(state.calls, INGEST, sum(map(_bytes, waiting)), jobs=jobs) if waiting else None,
-        findings=(*missing, *(problem.finding for problem in problems)),
+        problems=(*missing, *(problem.finding for problem in problems)),
         gone=tuple(chain(*(lines for path, lines in found.problems.items() if path not in lately))),
         superseded_runs=len(state.superseded),
         begun=tuple(call for call in begun if call.state != "killed" or call.name not in acknowledged),
         history=state.calls,
-        losses=losses_of(run.facts.ledger_m for run in runs.finished if run.facts.ingest_key == ingest_key(ruling)),
+        verdict=judge_runs(current),
+        runs=len(current),
+        findings={of.code: len(of.of) for of in by_code if of.severity != "note"},
+        losses=losses_of(run.ledger_m for run in current),
         exit_code=3 if trouble else 0,
     )
 

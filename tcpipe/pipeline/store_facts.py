@@ -8,14 +8,15 @@ from pathlib import Path
 
 from tcpipe.formats.commits import Dataset, State
 from tcpipe.formats.dataset_files import REPORT
+from tcpipe.formats.finding_lines import group_findings
 from tcpipe.formats.object_storage import is_url
 from tcpipe.formats.stored_runs import Ingestions, RunDirectory
 from tcpipe.pipeline.plan import failed_for_now
 from tcpipe.pipeline.problems import failure_of, is_acknowledged, problems_of
 from tcpipe.pipeline.prune import is_replaced
-from tcpipe.report.store_runs import FailedLog, StoredDataset, StoreFacts
+from tcpipe.pipeline.store_verdict import find_changes, judge_runs
+from tcpipe.report.store_runs import FailedLog, StoredDataset, StoreFacts, ruling_key
 from tcpipe.store import Store
-from tcpipe.tables.facts import by_cause
 
 
 def store_facts(store: Store, found: Ingestions, *, will_be: Sequence[RunDirectory] = ()) -> StoreFacts:
@@ -24,14 +25,17 @@ def store_facts(store: Store, found: Ingestions, *, will_be: Sequence[RunDirecto
     pages = {(parts[0], parts[1]) for parts in here if len(parts) == 3 and parts[2] == REPORT}
     state = found.state
     accepted = {run.run_id for run in found.finished if is_acknowledged(problems_of(run.facts), state)}
-    causes = by_cause((run.run_id, run.facts.warnings) for run in found.finished)
+    key = ruling_key(found)
+    current = [run.facts for run in found.finished if run.facts.ingest_key == key]
     return StoreFacts(
         where=str(store.root),
         found=found,
         accepted=frozenset(accepted),
         pages=frozenset(pages | {(run.run_id, run.recipe_id) for run in will_be}),
         datasets=tuple(_dataset(store, made) for made in state.datasets.values()),
-        causes=tuple(sorted(causes, key=lambda of: -len(of))),
+        verdict=judge_runs(current),
+        changes=find_changes(current),
+        groups=tuple(group_findings((run.run_id, run.findings) for run in current)),
         failed=tuple(_failed(state)),
     )
 

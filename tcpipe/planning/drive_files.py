@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 
@@ -19,7 +18,7 @@ from tcpipe.formats.published import published
 from tcpipe.planning.cost_model import CostModel
 from tcpipe.planning.drives import Against, DriveCost, drive_cost, drive_in, in_words
 from tcpipe.report.colours import DROPPED, SPLIT_COLOURS
-from tcpipe.report.page import Number, Section, Verdict, render_page
+from tcpipe.report.page import Number, Section, render_page
 from tcpipe.report.plots import Plot, new_plot
 from tcpipe.store import open_store
 from tcpipe.terrain.tiles import MapReader
@@ -105,7 +104,6 @@ def _page(values: Drives) -> str:
     return render_page(
         title="Drives, measured and predicted",
         lead=f"Model {Path(values.model).name}: sums along each drive over the metres that can be compared, with 90 % intervals.",
-        verdict=list(_verdict(values)),
         numbers=[
             Number(f"{of.off_percent:+.1f} %", f"{called} of all drives held back, predicted less measured")
             for called, of in (("time", values.duration_s), ("energy", values.energy_joule))
@@ -113,32 +111,44 @@ def _page(values: Drives) -> str:
         ],
         warnings=[line for drive in values.drives for line in in_words(drive) if line.startswith("warning: ")],
         sections=[
-            Section(
-                drive.run_id, " ".join(f"{line}." for line in in_words(drive)), plots=list(_sums_along(number, drive))
-            )
-            for number, drive in enumerate(values.drives)
+            Section("Assessment", header=("", "statement"), rows=_assess(values)),
+            *(
+                Section(
+                    drive.run_id,
+                    " ".join(f"{line}." for line in in_words(drive)),
+                    plots=list(_sums_along(number, drive)),
+                )
+                for number, drive in enumerate(values.drives)
+            ),
         ],
     )
 
 
-def _verdict(values: Drives) -> Iterator[Verdict]:
+def _assess(values: Drives) -> list[tuple[str, str]]:
+    """Return statements on the predictions, the worst first."""
+    order = ("doubtful", "thin", "do", "good")
+    return sorted(_statements(values), key=lambda statement: order.index(statement[0]))
+
+
+def _statements(values: Drives) -> Iterator[tuple[str, str]]:
     held = [drive for drive in values.drives if drive.held_back and drive.compared_m]
     if not held:
-        yield Verdict("doubtful", "Nothing is shown: no drive with metres to compare was held back from training.")
-        yield Verdict(
-            "do", "Train with a run held out (build-dataset --holdout run), or measure a drive that is in no dataset."
+        yield ("doubtful", "Nothing is shown: no drive with metres to compare was held back from training.")
+        yield (
+            "do",
+            "Train with a run held out (build-dataset --holdout run), or measure a drive that is in no dataset.",
         )
     for called, name in (("time", "duration_s"), ("energy", "energy_joule")):
         off = np.array([abs(getattr(drive, name).off_percent) for drive in held])
         if (off >= _NO_USE_PERCENT).any():
-            yield Verdict("doubtful", f"Of no use for {called}: a drive is off by {off.max():.0f} %.")
+            yield ("doubtful", f"Of no use for {called}: a drive is off by {off.max():.0f} %.")
         told = [of.held for drive in held if (of := getattr(drive, name)).held is not None]
         if told:
-            kind: Literal["good", "doubtful"] = "good" if sum(told) >= _HELD * len(told) else "doubtful"
-            yield Verdict(kind, f"90 % intervals hold the {called} of {sum(told)} of {len(told)} drives held back.")
+            kind = "good" if sum(told) >= _HELD * len(told) else "doubtful"
+            yield (kind, f"90 % intervals hold the {called} of {sum(told)} of {len(told)} drives held back.")
     if 0 < len(held) < _ENOUGH_DRIVES:
         few = "One drive tells" if len(held) == 1 else f"{len(held)} drives tell"
-        yield Verdict("thin", f"{few} little of how often 90 % intervals hold: hold back {_ENOUGH_DRIVES} or more.")
+        yield ("thin", f"{few} little of how often 90 % intervals hold: hold back {_ENOUGH_DRIVES} or more.")
 
 
 def _sums_along(number: int, drive: DriveCost) -> Iterator[Plot]:

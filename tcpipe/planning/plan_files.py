@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
-from annotated_types import Ge, Le
 from numpy.typing import NDArray
 
 from tcpipe.errors import ModelError, StoreError, UsageError, plain_lines
@@ -22,6 +21,7 @@ from tcpipe.planning.cost_model import CostModel, check_model
 from tcpipe.planning.path_files import cost_text
 from tcpipe.planning.plan import OBJECTIVES, Objective, PlanTotals, plan_path
 from tcpipe.planning.survey import Survey, new_survey, survey_from
+from tcpipe.tables.bounds import Bounds
 from tcpipe.tables.facts import LEFT_OUT
 
 VERSION = "1.1"
@@ -38,7 +38,7 @@ class PlanRequest:
     start_deg: tuple[float, float]
     goal_deg: tuple[float, float]
     objective: Objective = "energy"
-    step_m: Annotated[float, Ge(0.05), Le(1000)] = 1.0
+    step_m: Annotated[float, Bounds(ge=0.05, le=1000)] = 1.0
     allow_unseen: bool = False
     cost_map: Path | None = None
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
+from typing import Any
 
 import numpy as np
 
@@ -11,28 +12,28 @@ from tcpipe.power.sources import (
     BATTERY_STATE,
     FLOAT_TYPES,
     LARGEST_AMP,
+    REJECTED,
     Columns,
     Floats,
     HuskyPower,
     RailReadings,
+    find_rejection,
     read_rails,
+    reject_power,
     sign_by_mean,
     sources_of,
-    why_refused,
     with_sign,
 )
 from tcpipe.power.wrapped import wrap_of
-from tcpipe.recipe.suggestions import RecipeFragment, suggested
+from tcpipe.recipe.suggestions import suggest
 from tcpipe.robots.profiles import CurrentSign, PowerSource
-from tcpipe.tables.facts import NoPower
+from tcpipe.tables.catalogue import Severity, threshold
+from tcpipe.tables.findings import Finding, Remedy, Subject, make_finding
 
 _LOG_TIME = "log_time_ns"
-_OF_USUAL_VOLTAGE = (0.2, 3.0)
-"""A battery's voltage stays within these shares of its median."""
-_FEWEST_MESSAGES = 3
-_SLOWEST_S = 10.0
-_FEWEST_ROWS = 20
-"""Fewer rows say nothing against the sign of their type."""
+_POWER = Subject("role", "power")
+_ODD, _ASSUMED = "power-values-excluded", "current-sign-assumed"
+_SIGNS = ("drawn_negative", "drawn_positive")
 
 Rails = Mapping[str, list[RailReadings]]
 """By topic."""
@@ -40,19 +41,22 @@ Rails = Mapping[str, list[RailReadings]]
 
 @dataclass(frozen=True, slots=True)
 class PowerReadings:
-    """What the power topics hold: ``rails`` row by row as the messages; none where the power was refused, and ``warnings`` says why."""
+    """What the power topics hold: ``rails`` row by row as the messages; none where it was rejected, and ``findings`` hold the reason."""
 
     rails: Rails = field(default_factory=dict)
     averaged: bool = False
     averaging_unknown: bool = False
-    """Nobody knows whether it averages; ``averaged`` is what to take where the motion does not tell either."""
-    warnings: tuple[str, ...] = ()
+    """Whether it averages is not known; ``averaged`` is what to assume where the motion does not show it either."""
+    findings: tuple[Finding, ...] = ()
     current_sign: str | None = None
     """What a drawn current is counted as, and what tells it; None without power."""
     includes: tuple[str, ...] = ()
     """What the currents feed besides the drives."""
-    refusal: NoPower | None = None
-    """Why there are no rails, where there are topics."""
+
+    @property
+    def is_rejected(self) -> bool:
+        """Whether there are topics, but what they hold is not used."""
+        return any(found.code == REJECTED for found in self.findings)
 
 
 def read_power(
@@ -74,77 +78,76 @@ def read_power(
     """
     rails: dict[str, list[RailReadings]] = {}
     sources: list[PowerSource] = []
-    refused: list[str] = []
-    mended: dict[str, list[PowerSource]] = {}
-    warnings: list[str] = []
+    rejected: list[Finding] = []
+    scaled: dict[str, list[PowerSource]] = {}
+    findings: list[Finding] = []
     for topic, (type_name, columns) in topics.items():
-        if seldom := _too_seldom(topic, np.asarray(columns[_LOG_TIME], np.float64)):
-            refused += seldom
+        if too_few := _find_too_few(topic, np.asarray(columns[_LOG_TIME], np.float64)):
+            rejected += too_few
             continue
         choices = sources_of(type_name, topic, known, platform=platform, husky_power=husky_power)
-        found = choices if isinstance(choices, str) else _first_that_holds_power(topic, columns, choices, known)
-        if isinstance(found, str):
-            refused.append(found)
-            mended[topic] = [] if isinstance(choices, str) else _in_thousandths(topic, columns, choices[0], known)
+        found = [choices] if isinstance(choices, Finding) else _read_first_valid(topic, columns, choices, known)
+        if isinstance(found, list):
+            rejected += found
+            scaled[topic] = [] if isinstance(choices, Finding) else _in_thousandths(topic, columns, choices[0], known)
             continue
         sources += found.sources
-        warnings += found.warnings
-        rails[topic] = found.rails if current_sign != "auto" else found.by_type()
+        findings += found.findings
+        rails[topic] = found.rails if current_sign != "auto" else found.apply_type_signs()
     rails = _paired(rails)
-    refused = refused or _incomplete([rail for found in rails.values() for rail in found])
-    if refused:
-        lines = tuple(f"power refused: {why}; there will be no energy" for why in refused)
-        alone = len(mended) == len(topics) == 1
-        recipe = _propose_recipe(mended, alone=alone) if len(mended) == len(topics) and all(mended.values()) else ""
-        more = "; where its numbers are thousandths, write in a recipe:" if recipe else ""
-        return PowerReadings(warnings=lines, refusal=NoPower("; ".join(lines) + more, recipe))
-    rails, odd = _believable(rails)
+    rejected = rejected or _find_incomplete(rails)
+    if rejected:
+        if len(scaled) == len(topics) and all(scaled.values()):
+            rejected[0] = replace(rejected[0], remedies=_propose_sources(scaled))
+        return PowerReadings(findings=tuple(rejected))
+    rails, odd = _exclude_implausible(rails)
     log_times = {topic: np.asarray(columns[_LOG_TIME], np.float64) for topic, (_, columns) in topics.items()}
-    sign, told, told_by = _sign(rails, log_times, sources, current_sign)
+    sign, of_sign, told_by = _sign(rails, log_times, sources, current_sign)
     if sign == 0:
-        return PowerReadings(warnings=tuple(told), refusal=NoPower("; ".join(told)))
+        return PowerReadings(findings=of_sign)
     includes = tuple(dict.fromkeys(of.includes for of in sources if of.includes))
-    warnings += [*told, *odd, *(f"power: {what} are part of it" for what in includes)]
+    loads = (make_finding("power-includes-loads", _POWER, names={"loads": name}) for name in includes)
+    findings += [*of_sign, *odd, *loads]
     signed = {topic: [with_sign(rail, sign) for rail in found] for topic, found in rails.items()}
     counts = any(of.energy for of in sources)
     unknown = any(of.averaging_unknown for of in sources) and not counts
     averaged = counts or any(of.averaged for of in sources)
-    return PowerReadings(signed, averaged, unknown, tuple(dict.fromkeys(warnings)), told_by, includes)
+    return PowerReadings(signed, averaged, unknown, tuple(dict.fromkeys(findings)), told_by, includes)
 
 
 @dataclass(frozen=True, slots=True)
-class _Told:
+class _TopicRails:
     """What a topic's messages hold: a rail for each source."""
 
     sources: list[PowerSource]
     rails: list[RailReadings]
-    warnings: list[str]
+    findings: list[Finding]
 
-    def by_type(self) -> list[RailReadings]:
+    def apply_type_signs(self) -> list[RailReadings]:
         """Return the rails with the sign that their type gives a drawn current."""
         each = zip(self.rails, self.sources, strict=True)
         return [with_sign(rail, -1 if of.sign == "drawn_negative" else 1) for rail, of in each]
 
 
-def _first_that_holds_power(
+def _read_first_valid(
     topic: str, columns: Columns, choices: Sequence[list[PowerSource]], known: Sequence[PowerSource]
-) -> _Told | str:
+) -> _TopicRails | list[Finding]:
     """Return the rails of the first choice whose numbers can be power, or why there are none."""
-    why_not: list[str] = []
+    rejected: list[Finding] = []
     for sources in choices:
         found = read_rails(columns, sources, topic, known)
-        if isinstance(found, str):
-            why_not.append(found)
+        if isinstance(found, Finding):
+            rejected.append(found)
             continue
         read = [_unwrapped(rail) for rail in found]
-        rails, warnings = [rail for rail, _ in read], [line for _, lines in read for line in lines]
-        if problems := [why for rail in rails if (why := why_refused(rail, columns)) is not None]:
-            why_not.append("; ".join(problems))
+        rails, findings = [rail for rail, _ in read], [found for _, each in read for found in each]
+        if problems := [why for rail in rails if (why := find_rejection(rail, topic, columns)) is not None]:
+            rejected += problems
             continue
-        instead = " + ".join(rail.name for rail in rails)
-        warnings += [f"power: {why}; {instead} is taken instead" for why in why_not]
-        return _Told(sources, rails, warnings)
-    return "; ".join(why_not)
+        used = " + ".join(rail.name for rail in rails)
+        findings += [make_finding("power-fallback", why.subject, names={**why.names, "used": used}) for why in rejected]
+        return _TopicRails(sources, rails, findings)
+    return rejected
 
 
 def _in_thousandths(
@@ -156,34 +159,35 @@ def _in_thousandths(
             replace(of, voltage_scale=volt * of.voltage_scale, current_scale=amp * of.current_scale) for of in sources
         ]
         found = read_rails(columns, scaled, topic, known)
-        if not isinstance(found, str) and all(why_refused(rail, columns) is None for rail in found):
+        if not isinstance(found, Finding) and all(find_rejection(rail, topic, columns) is None for rail in found):
             return scaled
     return []
 
 
-def _propose_recipe(sources: Mapping[str, Sequence[PowerSource]], *, alone: bool) -> str:
+def _propose_sources(sources: Mapping[str, Sequence[PowerSource]]) -> tuple[Remedy, ...]:
     """Return the tables of a recipe for the sources of topics; of one topic alone for all of its type."""
-    rows = []
+    rows, alone = [], len(sources) == 1
     for topic, of_topic in sources.items():
         named = [of if alone and of.type not in FLOAT_TYPES else replace(of, topic=topic) for of in of_topic]
         rows += [
             {of.name: value for of in fields(each) if (value := getattr(each, of.name)) != of.default} for each in named
         ]
-    return RecipeFragment({"power_sources": rows}).toml()
+    return suggest("scale", {"power_sources": rows})
 
 
-def _unwrapped(rail: RailReadings) -> tuple[RailReadings, list[str]]:
-    """Return a rail with its counter's resets said, and with negative currents that were read as unsigned made negative again."""
+def _unwrapped(rail: RailReadings) -> tuple[RailReadings, list[Finding]]:
+    """Return a rail with negative currents that were read as unsigned made negative again, and findings on that and its counter."""
+    names = {"rail": rail.name}
     if rail.counter is not None:
         resets = int(rail.counter.resets.max(initial=0))
-        said = f"power: {rail.name}: its counter of energy was reset {resets} times; what was drawn across that is not known"
-        return rail, [said] if resets else []
+        return rail, [make_finding("counter-reset", _POWER, names=names, resets_count=resets)] if resets else []
     wraps_amp = wrap_of(rail.current_amp)
     if wraps_amp is None:
         return rail, []
     upper = rail.current_amp > wraps_amp / 2
-    said = f"power: {rail.name}: {np.count_nonzero(upper)} currents are negative ones read as unsigned: {wraps_amp:g} A less each"
-    return replace(rail, current_amp=np.where(upper, rail.current_amp - wraps_amp, rail.current_amp)), [said]
+    count = int(np.count_nonzero(upper))
+    found = make_finding("current-wrapped", _POWER, names=names, currents_count=count, wraps_amp=wraps_amp)
+    return replace(rail, current_amp=np.where(upper, rail.current_amp - wraps_amp, rail.current_amp)), [found]
 
 
 def _paired(rails: dict[str, list[RailReadings]]) -> dict[str, list[RailReadings]]:
@@ -200,93 +204,94 @@ def _paired(rails: dict[str, list[RailReadings]]) -> dict[str, list[RailReadings
     }
 
 
-def _incomplete(rails: list[RailReadings]) -> list[str]:
-    missing = []
-    for name in dict.fromkeys(rail.name for rail in rails):
-        parts = [rail for rail in rails if rail.name == name]
-        if not any(np.isfinite(part.voltage_volt).any() for part in parts):
-            missing.append(f"{name}: it carries no voltage")
-        if not any(np.isfinite(part.current_amp).any() for part in parts):
-            missing.append(f"{name}: it carries no current")
-    return missing
+def _find_incomplete(rails: Rails) -> list[Finding]:
+    """Return why rails, each of the topics that hold its parts, are no power: one without voltage, or without current."""
+    parts: dict[str, list[tuple[str, RailReadings]]] = {}
+    for topic, found in rails.items():
+        for rail in found:
+            parts.setdefault(rail.name, []).append((topic, rail))
+    return [
+        reject_power(of[0][0], f"no-{quantity}", names={"rail": name})
+        for name, of in parts.items()
+        for quantity, column in (("voltage", "voltage_volt"), ("current", "current_amp"))
+        if not any(np.isfinite(getattr(part, column)).any() for _, part in of)
+    ]
 
 
-def _too_seldom(topic: str, log_time_ns: Floats) -> list[str]:
-    """Return why a topic cannot tell what a metre costs: too few messages, or too far apart."""
-    if log_time_ns.size < _FEWEST_MESSAGES:
-        return [f"{topic}: it holds {log_time_ns.size} messages only"]
+def _find_too_few(topic: str, log_time_ns: Floats) -> list[Finding]:
+    """Return why a topic's rate is too low for the energy of a segment: too few messages, or too far apart."""
+    if log_time_ns.size < threshold(REJECTED, "min_messages_count"):
+        return [reject_power(topic, "too-few-messages", messages_count=log_time_ns.size)]
     period_s = float(np.median(np.diff(log_time_ns))) / 1e9
-    return [f"{topic}: it comes every {period_s:.0f} s only"] if period_s > _SLOWEST_S else []
+    return (
+        [reject_power(topic, "too-slow", period_s=period_s)] if period_s > threshold(REJECTED, "max_period_s") else []
+    )
 
 
-def _believable(rails: Rails) -> tuple[dict[str, list[RailReadings]], list[str]]:
-    """Return the rails with NaN for single values that no battery and no drive has (saturated, lost), and a line on each rail.
+def _exclude_implausible(rails: Rails) -> tuple[dict[str, list[RailReadings]], list[Finding]]:
+    """Return the rails with NaN for single values that no battery and no drive has (saturated, lost), and a finding for each rail.
 
-    Without current a low voltage may be true: a drive that is not switched on yet tells zeros.
+    Without current a low voltage may be true: a drive that is not switched on yet sends zeros.
     """
+    low, high = threshold(_ODD, "min_of_median"), threshold(_ODD, "max_of_median")
     kept: dict[str, list[RailReadings]] = {}
-    lines = []
+    findings = []
     for topic, found in rails.items():
         kept[topic] = []
         for rail in found:
             known = rail.voltage_volt[np.isfinite(rail.voltage_volt)]
             usual = float(np.median(known)) if known.size else np.nan
-            low_volt, high_volt = usual * _OF_USUAL_VOLTAGE[0], usual * _OF_USUAL_VOLTAGE[1]
+            low_volt, high_volt = usual * low, usual * high
             odd_volt = ((rail.voltage_volt < low_volt) & (rail.current_amp != 0.0)) | (rail.voltage_volt > high_volt)
             odd_amp = np.abs(rail.current_amp) > LARGEST_AMP
-            counts = [(odd_volt, f"voltages outside {low_volt:.0f} to {high_volt:.0f} V")]
-            counts += [(odd_amp, f"currents above {LARGEST_AMP:.0f} A")]
-            said = [f"{np.count_nonzero(odd)} {what}" for odd, what in counts if odd.any()]
-            if said:
-                lines.append(f"power: {rail.name}: {' and '.join(said)} are set aside")
+            counts: dict[str, Any] = {
+                "voltages_count": int(np.count_nonzero(odd_volt)),
+                "currents_count": int(np.count_nonzero(odd_amp)),
+            }
+            if any(counts.values()):
+                numbers = counts | {"low_volt": low_volt, "high_volt": high_volt, "high_amp": LARGEST_AMP}
+                numbers = {name: value for name, value in numbers.items() if np.isfinite(value)}
+                findings.append(make_finding(_ODD, _POWER, names={"rail": rail.name}, **numbers))
             volt, amp = np.where(odd_volt, np.nan, rail.voltage_volt), np.where(odd_amp, np.nan, rail.current_amp)
             kept[topic].append(replace(rail, voltage_volt=volt, current_amp=amp))
-    return kept, lines
+    return kept, findings
 
 
 def _sign(
     rails: Rails, log_times: Mapping[str, Floats], sources: list[PowerSource], given: CurrentSign
-) -> tuple[int, list[str], str]:
-    """Return what makes a drawn current positive (0 where the record contradicts its type), warnings, and what tells it."""
+) -> tuple[int, tuple[Finding, ...], str]:
+    """Return what makes a drawn current positive (0 where the record contradicts its type), findings, and what tells it."""
     if given != "auto":
-        return (1 if given == "drawn_positive" else -1), [], f"{given} (recipe)"
+        return (1 if given == "drawn_positive" else -1), (), f"{given} (recipe)"
     time_s, whole = _whole_current(rails, log_times)
-    sign, one_sided = sign_by_mean(whole, _weight_s(time_s))
-    share = f"{100 * abs(one_sided):.0f} % of the charge moved"
+    sign, net = sign_by_mean(whole, _weight_s(time_s))
     signs = {source.sign for source in sources}
     if "auto" not in signs:
         told, other = "drawn_positive", "drawn_negative"
         if signs == {other}:
             told, other = other, told
-        if sign >= 0 or time_s.size < _FEWEST_ROWS:
-            return 1, [], f"{told} (message type)"
-        negative = "negative" if told == "drawn_positive" else "positive"
-        why = f"power refused: the current is {negative}, {share} flows back; there will be no energy"
-        cures = {"if this robot counts drawn current so": other, "if it truly rolled downhill throughout": told}
-        return 0, [why + _sign_lines(cures)], ""
-    if sign > 0:
-        why = f"power: the current counts as positive when drawn, against the ROS convention: {share} is positive"
-        return 1, [why + _sign_lines({"to settle it": "drawn_positive"})], "drawn_positive (mean)"
+        if sign >= 0 or time_s.size < threshold(REJECTED, "min_sign_count"):
+            return 1, (), f"{told} (message type)"
+        return 0, (_find_sign(REJECTED, {"reason": "current-flows-back"}, net, other, told),), ""
+    return _sign_by_charge(sign, net, sources)
+
+
+def _sign_by_charge(sign: int, net: float, sources: Sequence[PowerSource]) -> tuple[int, tuple[Finding, ...], str]:
+    """Return what `_sign` does where the types leave the sign open: where charge flows both ways, the convention of ROS, or no power."""
     if sign < 0:
-        return -1, [], "drawn_negative (mean, as ROS has it)"
-    return _unclear(share, sources)
-
-
-def _unclear(share: str, sources: Sequence[PowerSource]) -> tuple[int, list[str], str]:
-    """Return what `_sign` does where as much flows one way as the other: ROS' convention counts where it may be meant, else it is asked."""
+        return -1, (), "drawn_negative (mean, as ROS has it)"
+    if sign > 0:
+        return 1, (_find_sign(_ASSUMED, {"sign": "drawn_positive"}, net, "drawn_positive"),), "drawn_positive (mean)"
     if any(of.sign == "auto" and of.type not in (BATTERY_STATE, *FLOAT_TYPES) for of in sources):
-        why = f"power refused: which sign a drawn current has is not known of its type, nor clear from the record (net {share})"
-        return 0, [why + _sign_lines(_EITHER)], ""
-    why = f"power: the current's sign is unclear (net {share}): taken as negative when drawn, as ROS has it"
-    return -1, [why + _sign_lines(_EITHER)], "drawn_negative (ROS)"
+        return 0, (_find_sign(REJECTED, {"reason": "sign-unknown"}, net, *_SIGNS),), ""
+    return -1, (_find_sign(_ASSUMED, {"sign": "drawn_negative"}, net, *_SIGNS),), "drawn_negative (ROS)"
 
 
-_EITHER = {f"if a drawn current is {word}": f"drawn_{word}" for word in ("negative", "positive")}
-
-
-def _sign_lines(signs: Mapping[str, str]) -> str:
-    """Return what settles the sign of currents, by what speaks for it."""
-    return "".join(suggested(purpose, {"read": {"current_sign": sign}}) for purpose, sign in signs.items())
+def _find_sign(code: str, names: Mapping[str, str], net: float, *signs: str) -> Finding:
+    """Return a finding on the sign of a drawn current: a note where nearly all charge flows one way, so that one sign is suggested."""
+    severity: Severity | None = "note" if len(signs) == 1 else None
+    remedies = [of for sign in signs for of in suggest(sign, {"read": {"current_sign": sign}})]
+    return make_finding(code, _POWER, severity=severity, names=names, remedies=remedies, net_fraction=abs(net))
 
 
 def _weight_s(time_s: Floats) -> Floats:

@@ -15,12 +15,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.power.counters import Counter, counted
-from tcpipe.recipe.suggestions import recipe_key
 from tcpipe.robots.profiles import FieldPath, PowerSource, fields_of
+from tcpipe.tables.catalogue import threshold
+from tcpipe.tables.findings import Finding, Subject, make_finding
 
 Columns = Mapping[str, NDArray[Any]]
 Floats = NDArray[np.float64]
 HuskyPower = Literal["battery", "drivers"]
+
+
+def reject_power(topic: str, reason: str, *, names: Mapping[str, str] | None = None, **numbers: Any) -> Finding:
+    """Return the finding that a topic's power is not used, for a reason in kebab case; names and numbers are the evidence."""
+    return make_finding(REJECTED, Subject("topic", topic), names={"reason": reason, **(names or {})}, **numbers)
+
+
+REJECTED = "power-rejected"
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,8 +54,8 @@ FLOAT_TYPES = ("std_msgs/msg/Float32", "std_msgs/msg/Float64")
 
 def sources_of(
     type_name: str, topic: str, known: Sequence[PowerSource], *, platform: str | None, husky_power: HuskyPower
-) -> list[list[PowerSource]] | str:
-    """Return what a topic says about power, one source a rail, then what to fall back on; or one plain line why it cannot be known.
+) -> list[list[PowerSource]] | Finding:
+    """Return what a topic's messages hold of power, one source a rail, then what to fall back on; or why it is not known.
 
     Of the tables of its type that fit, the most particular count: those of ``husky_power``, of the platform, of the topic.
     """
@@ -60,15 +69,14 @@ def sources_of(
     ]
     choices = [_most_particular([of for of in fitting if of.fallback is last]) for last in (False, True)]
     if choices := [choice for choice in choices if choice]:
-        refused = next((of.refused for of in choices[0] if of.refused), None)
-        return f"{topic}: {type_name} {refused}" if refused else choices
+        is_refused = any(of.refused for of in choices[0])
+        return reject_power(topic, "no-battery-current", names={"type": type_name}) if is_refused else choices
     if type_name in FLOAT_TYPES:
         return _float_source(type_name, topic)
-    platforms = sorted({source.platform for source in of_type if source.platform})
-    if platforms:
-        which = f"this robot's is {platform or 'not known'}; name the robot with --robot"
-        return f"{topic}: {type_name} names its currents by platform ({', '.join(platforms)}), {which}"
-    return f"{topic}: {type_name} carries no power that is known here; describe it ({recipe_key('power_sources')})"
+    names = {"type": type_name}
+    if platforms := sorted({source.platform for source in of_type if source.platform}):
+        return reject_power(topic, "robot-platform-unknown", names=names | {"platforms": ", ".join(platforms)})
+    return reject_power(topic, "message-type-unknown", names=names)
 
 
 def power_lists(type_name: str, known: Sequence[PowerSource]) -> frozenset[str]:
@@ -118,19 +126,19 @@ def is_corrected(topic: str) -> bool:
     return topic.lower().endswith(_CORRECTED)
 
 
-def _float_source(type_name: str, topic: str) -> list[list[PowerSource]] | str:
+def _float_source(type_name: str, topic: str) -> list[list[PowerSource]] | Finding:
     """Return the source of a bare number, by its topic's name."""
     what = quantity(topic)
     if what is None:
-        return f"{topic}: neither its type nor its name says whether it is a voltage or a current"
+        return reject_power(topic, "quantity-unknown", names={"type": type_name})
     voltage, current = ("data", "") if what == "voltage" else ("", "data")
     return [[PowerSource(type_name, voltage, current, sign="auto")]]
 
 
 def read_rails(
     columns: Columns, sources: Sequence[PowerSource], topic: str, known: Sequence[PowerSource] = ()
-) -> list[RailReadings] | str:
-    """Return the rails of a topic, or one plain line that says why its messages do not fit the sources.
+) -> list[RailReadings] | Finding:
+    """Return the rails of a topic, or why its messages do not fit the sources.
 
     Parameters
     ----------
@@ -140,33 +148,30 @@ def read_rails(
     known : every table, for those that would fit.
     """
     for source in sources:
-        if why := _misfit(columns, source, known):
-            return f"{topic}: {why}"
+        if found := _find_misfit(columns, source, topic, known):
+            return found
     return [_rail(columns, source, topic) for source in sources]
 
 
-def _misfit(columns: Columns, source: PowerSource, known: Sequence[PowerSource]) -> str | None:
+def _find_misfit(columns: Columns, source: PowerSource, topic: str, known: Sequence[PowerSource]) -> Finding | None:
     """Return why messages do not fit a source."""
     currents = fields_of(source.current)
     for of in [*fields_of(source.voltage), *currents, *fields_of(source.energy)]:
+        names = {"field": of.column}
         if of.column not in columns:
-            return f"its messages have no field {of.column}"
+            return reject_power(topic, "field-missing", names=names)
         width = columns[of.column].shape[1] if columns[of.column].ndim == 2 else None
         if not of.every and of.index is None and width is not None:
-            return f"{of.column} is a list; wanted {of.column}[0] for one of its values, {of.column}[] for their sum"
+            return reject_power(topic, "field-is-a-list", names=names)
         needed = of.index + 1 if of.index is not None else int(of.every)
-        if needed and (width is None or width < needed):
-            return f"{of.column} holds {width or 0} values, the robot's platform needs {needed}"
-        if of in currents and source.currents_listed not in (None, width):
-            return f"{of.column} holds {width} values, this platform's {source.currents_listed}; {_fitting(source, width, known)}"
+        listed = source.currents_listed if of in currents else None
+        if (needed and (width or 0) < needed) or listed not in (None, width):
+            others = [by for by in known if width and by.type == source.type and by.currents_listed == width]
+            if platforms := sorted({by.platform for by in others if by.platform}):
+                names["platforms"] = ", ".join(platforms)
+            counts = {"values_count": width or 0, "expected_count": listed or needed}
+            return reject_power(topic, "values-count-differs", names=names, **counts)
     return None
-
-
-def _fitting(source: PowerSource, width: int | None, known: Sequence[PowerSource]) -> str:
-    """Return which robot's message it could be, by how many currents it lists."""
-    platforms = {of.platform for of in known if of.type == source.type and of.currents_listed == width and of.platform}
-    which = f" of platform {', '.join(sorted(platforms))}" if platforms else ""
-    return f"name the robot{which} with --robot"
 
 
 def _rail(columns: Columns, source: PowerSource, topic: str) -> RailReadings:
@@ -213,49 +218,48 @@ def _values(columns: Columns, of: FieldPath) -> Floats:
     return values.sum(axis=1) if of.every else values if of.index is None else values[:, of.index]
 
 
-def why_refused(rail: RailReadings, columns: Columns) -> str | None:
+def find_rejection(rail: RailReadings, topic: str, columns: Columns) -> Finding | None:
     """Return why a rail's numbers cannot be power, with the evidence, or None where they can.
 
     Each rule needs every row to agree, or the median; a single odd row is no evidence.
     """
     voltage, current = (values[np.isfinite(values)] for values in (rail.voltage_volt, rail.current_amp))
+    volt = float(np.median(voltage)) if len(voltage) else np.nan
+    amp = float(np.median(np.abs(current))) if len(current) else np.nan
+    reason = _reason_of_voltage(voltage, volt, rail.voltage_volt, columns) or _reason_of_current(current, amp)
     if not len(voltage) and not len(current):
-        return f"{rail.name}: neither voltage nor current is a number on any of {len(rail.voltage_volt)} rows"
-    evidence = _against_voltage(voltage, current, rail.voltage_volt, columns) or _against_current(current)
-    return None if evidence is None else f"{rail.name}: {evidence}"
+        reason = "no-numbers"
+    if reason is None:
+        return None
+    evidence = {"median_volt": volt, "median_amp": amp, "rows_count": float(len(rail.voltage_volt))}
+    evidence = {name: value for name, value in evidence.items() if np.isfinite(value)}
+    return reject_power(topic, reason, names={"rail": rail.name}, **evidence)
 
 
-def _against_voltage(voltage: Floats, current: Floats, every_voltage: Floats, columns: Columns) -> str | None:
+def _reason_of_voltage(voltage: Floats, median_volt: float, every_voltage: Floats, columns: Columns) -> str | None:
     if not len(voltage):
         return None
     if not np.any(voltage):
-        still = " and the current are" if len(current) and not np.any(current) else " is"
-        return f"the voltage{still} zero on all {len(voltage)} rows"
+        return "voltage-zero"
     if _PERCENTAGE in columns:
         charge = np.asarray(columns[_PERCENTAGE], np.float64)
         if np.all(np.isclose(charge, every_voltage) | np.isclose(100 * charge, every_voltage)):
-            return f"the voltage equals the percentage of charge on all {len(charge)} rows (first {voltage[0]:g})"
-    typical_volt = float(np.median(voltage))
-    if typical_volt > LARGEST_VOLT:
-        return f"the median voltage is {typical_volt:g} V (millivolts?)"
-    if typical_volt < 1.0:
-        return f"the median voltage is {typical_volt:g} V (a share of charge, or reversed?)"
-    return None
+            return "voltage-is-charge"
+    if median_volt > LARGEST_VOLT:
+        return "voltage-in-millivolts"
+    return "voltage-too-small" if median_volt < _SMALLEST_VOLT else None
 
 
-def _against_current(current: Floats) -> str | None:
+def _reason_of_current(current: Floats, median_amp: float) -> str | None:
     if len(current) > _MIN_ROWS_TO_JUDGE and np.ptp(current) == 0:
-        return f"the current is {current[0]:g} A on all {len(current)} rows"
-    typical_amp = float(np.median(np.abs(current))) if len(current) else 0.0
-    if typical_amp > LARGEST_AMP:
-        return f"the median current is {typical_amp:g} A (milliamperes?)"
-    return None
+        return "current-constant"
+    return "current-in-milliamperes" if median_amp > LARGEST_AMP else None
 
 
-LARGEST_VOLT = 1000.0  # the median of no robot's battery: millivolts
-LARGEST_AMP = 1000.0  # no drive draws more: milliamperes, or a number that wrapped
-_MIN_ROWS_TO_JUDGE = 20  # fewer may be equal by chance, rounded as they are
-_UNAMBIGUOUS = 0.8  # of the charge moved flows one way
+LARGEST_VOLT, LARGEST_AMP = threshold(REJECTED, "max_median_volt"), threshold(REJECTED, "max_median_amp")
+_SMALLEST_VOLT = threshold(REJECTED, "min_median_volt")
+_MIN_ROWS_TO_JUDGE = threshold(REJECTED, "max_equal_count")
+_UNAMBIGUOUS = threshold(REJECTED, "min_net_fraction")  # of the charge moved flows one way
 
 
 def sign_by_mean(current_amp: Floats, weight_s: Floats) -> tuple[int, float]:

@@ -1,22 +1,24 @@
-"""Values checked by the annotations of the frozen dataclass that holds them, and made plain: one truth for TOML and Python.
+"""Values checked by the annotations of the frozen dataclass that holds them, and made plain: the same rules for TOML and Python.
 
-Known annotations: bool, int, float, str, Literal, ``X | None``, ``list[X]``, ``tuple[X, X]``, ``dict[K, V]``, another such dataclass, and
-numbers with bounds (``Annotated[float, Ge(0), Le(1)]``). A whole number becomes a float where one is wanted, and a float that is whole
-an int, as in JSON Schema; numpy's scalars and arrays become Python's; text is no number, and a truth value neither.
+msgspec checks each value and describes the annotations as JSON Schema. It stops at the first error; the walk over tables and keys here
+finds all of them. A whole number may be written as a float and a float as a whole number, as in JSON Schema; numpy's scalars and arrays
+become Python's; text is no number, and a truth value neither.
 """
 
 from __future__ import annotations
 
+import ast
+import inspect
 import json
-import math
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import MISSING, asdict, fields, is_dataclass
-from numbers import Integral, Real
-from types import NoneType, UnionType
-from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+from itertools import pairwise
+from math import isfinite
+from textwrap import dedent
+from typing import Any, TypeVar, cast, get_args, get_origin, get_type_hints
 
-from annotated_types import Ge, Gt, Le, Lt
+import msgspec
 
 from tcpipe.errors import RecipeError
 
@@ -26,9 +28,12 @@ _SHOWN_CHARACTERS = 80
 _BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
 _DECIMAL_BITS = 4096
 """Longer whole numbers Python does not write in decimal."""
+_TYPES = {
+    "number": "a number", "integer": "a whole number", "boolean": "true or false", "string": "text in quotes", "object": "a table of keys",
+}  # fmt: skip
 
 
-def settle(made: Any, section: str) -> None:
+def validate_fields(made: Any, section: str) -> None:
     """Check every field of a dataclass and keep it as a plain value; its ``__post_init__``.
 
     Parameters
@@ -42,7 +47,7 @@ def settle(made: Any, section: str) -> None:
     """
     problems: list[str] = []
     for name, kind in kinds_of(type(made)).items():
-        object.__setattr__(made, name, _settled(kind, getattr(made, name), _below(section, name), problems))
+        object.__setattr__(made, name, _checked(kind, getattr(made, name), _below(section, name), problems))
     if problems:
         raise RecipeError(*(f"recipe: {problem}" for problem in problems))
 
@@ -55,7 +60,7 @@ def from_values(cls: type[T], values: Mapping[str, Any], *, where: str) -> T:
     RecipeError : one line for every wrong or unknown key, beginning with ``where``.
     """
     problems: list[str] = []
-    made: T = _dataclass(cls, values, "", problems)
+    made: T = _checked(cls, values, "", problems)
     if problems:
         raise RecipeError(*(f"{where}: {problem}" for problem in problems))
     return made
@@ -67,24 +72,72 @@ def kinds_of(cls: type) -> dict[str, Any]:
     return {of.name: hints[of.name] for of in fields(cls)}
 
 
-def range_of(kind: Any) -> str:
-    """Return the bounds of a number in words, "" where it has none."""
-    low, high = "", ""
-    for bound in _parts(kind)[1]:
-        match bound:
-            case Ge():
-                low = f"from {_number(bound.ge)} "
-            case Gt():
-                low = f"above {_number(bound.gt)} "
-            case Le():
-                high = f"to {_number(bound.le)}"
-            case Lt():
-                high = f"to below {_number(bound.lt)}"
-    return (low + high).strip()
+def describe(*kinds: Any, file: str = "") -> tuple[list[dict[str, Any]], dict[str, dict[str, Any]]]:
+    """Return the JSON Schema of each annotation, and the definitions they refer to; docstrings describe dataclasses and their keys.
+
+    Parameters
+    ----------
+    kinds : the annotations.
+    file : that holds the definitions; "" is the file of the schema itself.
+    """
+    template, text = f"{file}#/$defs/{{name}}", {"type": "string"}
+    schemas, definitions = msgspec.json.schema_components(kinds, schema_hook=lambda _: text, ref_template=template)
+    for definition in definitions.values():
+        if "description" in definition:  # a docstring, whose indentation Python 3.13 takes away when it compiles it
+            definition["description"] = inspect.cleandoc(definition["description"])
+    for cls in _dataclasses_in(kinds, set()):
+        properties = definitions.get(cls.__name__, {}).get("properties", {})
+        for name, docstring in _key_docstrings(cls):
+            properties.get(name, {})["description"] = docstring
+    return [*schemas], definitions
 
 
-def _number(bound: Any) -> str:
-    return str(bound) if isinstance(bound, int) else f"{bound:.12g}"
+def values_in_words(kind: Any) -> str:
+    """Return the choices or the bounds of an annotation, "" where it has none."""
+    ((schema,), _) = describe(kind)
+    schema = schema.get("anyOf", [schema])[0]
+    return _in_words(schema) if "enum" in schema else _range_in_words(schema)
+
+
+def _dataclasses_in(kind: Any, found: set[type]) -> set[type]:
+    """Return those that were found, and the dataclasses that an annotation, or each of several, is made of."""
+    parts = kind if isinstance(kind, tuple) else get_args(kind)
+    if isinstance(kind, type) and is_dataclass(kind) and kind not in found:
+        found.add(kind)
+        parts = tuple(kinds_of(kind).values())
+    for part in parts:
+        _dataclasses_in(part, found)
+    return found
+
+
+def _key_docstrings(cls: type) -> Iterator[tuple[str, str]]:
+    """Yield the fields of a dataclass with the docstring that stands below each."""
+    body = cast("ast.ClassDef", ast.parse(dedent(inspect.getsource(cls))).body[0]).body
+    for of, text in pairwise(body):
+        match of, text:
+            case ast.AnnAssign(target=ast.Name(id=name)), ast.Expr(value=ast.Constant(value=str() as docstring)):
+                yield name, docstring
+
+
+def _range_in_words(schema: Mapping[str, Any]) -> str:
+    """Return the bounds of a number by its JSON Schema, "" where it has none."""
+    words = {"minimum": "from", "exclusiveMinimum": "above", "maximum": "to", "exclusiveMaximum": "to below"}
+    bounds = ((word, schema[key]) for key, word in words.items() if key in schema)
+    return " ".join(f"{word} {bound if isinstance(bound, int) else f'{bound:.12g}'}" for word, bound in bounds)
+
+
+def _in_words(schema: Mapping[str, Any]) -> str:
+    """Return what a JSON Schema asks for."""
+    match schema:
+        case {"anyOf": [first, *_]}:
+            return _in_words(first)
+        case {"enum": choices}:
+            return f"one of {', '.join(choices)}"
+        case {"prefixItems": [item, *_] as items}:
+            return f"{len(items)} values in a list, each {_in_words(item)}"
+        case {"type": "array"}:
+            return f"a list, each item {_in_words(schema.get('items', {}))}"
+    return f"{_TYPES.get(schema.get('type', ''), 'another value')} {_range_in_words(schema)}".strip()
 
 
 def as_toml(value: Any) -> str:
@@ -106,144 +159,69 @@ def _key(name: str) -> str:
     return name if _BARE_KEY.fullmatch(name) else as_toml(name)
 
 
-def _parts(kind: Any) -> tuple[Any, tuple[Any, ...], bool]:
-    """Return an annotation without bounds and None, its bounds, and whether None is a value of it."""
-    bounds: tuple[Any, ...] = ()
-    optional = False
-    while (origin := get_origin(kind)) in (Annotated, Union, UnionType):
-        if origin is Annotated:
-            kind, *more = get_args(kind)
-            bounds += tuple(more)
-        else:
-            (kind,) = (of for of in get_args(kind) if of is not NoneType)
-            optional = True
-    return kind, bounds, optional
-
-
-def _settled(kind: Any, value: Any, key: str, problems: list[str]) -> Any:
+def _checked(kind: Any, value: Any, key: str, problems: list[str]) -> Any:
     """Return the plain value of an annotation; what is wrong becomes a problem."""
-    kind, bounds, optional = _parts(kind)
-    if value is None and optional:
-        return None
+    origin, of = get_origin(kind), get_args(kind)
+    if is_dataclass(kind):
+        return _dataclass(kind, value, key, problems)
+    if origin is dict and isinstance(value, Mapping):
+        known = None if of[0] is str else get_args(of[0])
+        items = ((name, item) for name, item in value.items() if _is_known(name, known, key, problems))
+        return {name: _checked(of[1], item, _below(key, name), problems) for name, item in items}
+    if origin is list and isinstance(value, list | tuple):
+        return [_checked(of[0], item, f"{key}.{place}", problems) for place, item in enumerate(value)]
+    try:
+        return msgspec.convert(_plain(value), kind)
+    except (msgspec.ValidationError, ValueError):  # a number of thousands of digits is the latter
+        return _reject(key, value, _in_words(describe(kind)[0][0]), problems)
+
+
+def _plain(value: Any) -> Any:
+    """Return a value as msgspec takes it: whole numbers as int, which makes -0.0 a 0; no type accepts NaN, infinity and sets."""
     if hasattr(value, "tolist"):  # numpy scalars and arrays
         value = value.tolist()
-    if isinstance(kind, type) and is_dataclass(kind):
-        if isinstance(value, kind) and hasattr(kind, "__post_init__"):  # it has settled itself
-            return value
-        plain = {name: getattr(value, name) for name in kinds_of(kind)} if isinstance(value, kind) else value
-        return _dataclass(kind, plain, key, problems)
-    origin = get_origin(kind)
-    if origin is Literal:
-        wanted = None if isinstance(value, str) and value in get_args(kind) else f"one of {', '.join(get_args(kind))}"
-    elif origin in _CONTAINERS:
-        return _CONTAINERS[origin](get_args(kind), value, key, problems)
-    else:
-        plain, wanted = _PLAIN[kind](value)
-        if not (wanted := wanted or _outside(bounds, plain)):
-            return plain
-    if wanted:
-        _refuse(key, value, wanted, problems)
+    match value:
+        case float() if isfinite(value):
+            return int(value) if value.is_integer() else value
+        case str():
+            return str.__str__(value)
+        case list() | tuple():
+            return [_plain(item) for item in value]
+        case float() | set() | frozenset():
+            return object()
     return value
 
 
 def _dataclass(cls: Any, values: Any, key: str, problems: list[str]) -> Any:
+    if isinstance(values, cls):
+        if hasattr(cls, "__post_init__"):  # it has checked itself
+            return values
+        values = {of.name: getattr(values, of.name) for of in fields(cls)}
     if not isinstance(values, Mapping):
-        return _refuse(key, values, "a table of keys", problems)
-    known, before = kinds_of(cls), len(problems)
-    made = {
-        name: _settled(known[name], value, _below(key, name), problems)
-        for name, value in values.items()
-        if _is_known(name, known, key, problems)
-    }
+        return _reject(key, values, "a table of keys", problems)
+    kinds, before = kinds_of(cls), len(problems)
+    items = ((name, value) for name, value in values.items() if _is_known(name, kinds, key, problems))
+    made = {name: _checked(kinds[name], value, _below(key, name), problems) for name, value in items}
     needed = (of.name for of in fields(cls) if of.default is MISSING and of.default_factory is MISSING)
     problems += [f"{_below(key, name)} is missing" for name in needed if name not in values]
     if len(problems) > before:
         return None
     whole = cls(**made)
-    for name, wanted in whole.contradictions() if hasattr(cls, "contradictions") else ():
-        _refuse(_below(key, name), getattr(whole, name), wanted, problems)
+    for name, expected in whole.contradictions() if hasattr(cls, "contradictions") else ():
+        _reject(_below(key, name), getattr(whole, name), expected, problems)
     return whole
 
 
-def _table(kinds: tuple[Any, ...], value: Any, key: str, problems: list[str]) -> Any:
-    if not isinstance(value, Mapping):
-        return _refuse(key, value, "a table of keys", problems)
-    return {
-        name: _settled(kinds[1], item, _below(key, name), problems)
-        for name, item in value.items()
-        if kinds[0] is str or _is_known(name, get_args(kinds[0]), key, problems)
-    }
-
-
-def _list(kinds: tuple[Any, ...], value: Any, key: str, problems: list[str]) -> Any:
-    if not isinstance(value, list | tuple):
-        return _refuse(key, value, 'a list, for example ["/topic"]', problems)
-    return [_settled(kinds[0], item, f"{key}.{place}", problems) for place, item in enumerate(value)]
-
-
-def _tuple(kinds: tuple[Any, ...], value: Any, key: str, problems: list[str]) -> Any:
-    if not isinstance(value, list | tuple):
-        return _refuse(key, value, "a list of numbers, for example [0.0, 0.0, 0.0]", problems)
-    if len(value) != len(kinds):
-        return _refuse(key, value, f"{len(kinds)} values, got {len(value)}", problems)
-    each = enumerate(zip(kinds, value, strict=True))
-    return tuple(_settled(kind, item, f"{key}.{place}", problems) for place, (kind, item) in each)
-
-
-def _bool(value: Any) -> tuple[Any, str | None]:
-    return value, None if isinstance(value, bool) else "true or false"
-
-
-def _int(value: Any) -> tuple[Any, str | None]:
-    whole = isinstance(value, Integral) or (isinstance(value, float) and value.is_integer())
-    return (int(value), None) if whole and not isinstance(value, bool) else (value, "a whole number")
-
-
-def _float(value: Any) -> tuple[Any, str | None]:
-    if isinstance(value, bool) or not isinstance(value, Real):
-        return value, "a number"
-    try:
-        number = float(value) + 0.0  # -0.0 is 0.0: the same value is the same bytes
-    except OverflowError:
-        return value, "a finite number"
-    return (number, None) if math.isfinite(number) else (value, "a finite number")
-
-
-def _str(value: Any) -> tuple[Any, str | None]:
-    return (str.__str__(value), None) if isinstance(value, str) else (value, "text in quotes")
-
-
-_PLAIN: dict[Any, Callable[[Any], tuple[Any, str | None]]] = {bool: _bool, int: _int, float: _float, str: _str}
-_CONTAINERS: dict[Any, Callable[..., Any]] = {dict: _table, list: _list, tuple: _tuple}
-
-
-def _outside(bounds: tuple[Any, ...], value: Any) -> str | None:
-    """Return the bounds in words where a number is outside them."""
-    for bound in bounds:
-        match bound:
-            case Ge():
-                inside = value >= bound.ge
-            case Gt():
-                inside = value > bound.gt
-            case Le():
-                inside = value <= bound.le
-            case Lt():
-                inside = value < bound.lt
-        if not inside:
-            return range_of(Annotated[(float, *bounds)])
-    return None
-
-
 def _is_known(name: Any, known: Any, key: str, problems: list[str]) -> bool:
-    if name not in known:
+    if known is not None and name not in known:
         problems.append(f"unknown key {_below(key, name)}; known here: {', '.join(known)}")
-    return name in known
+    return known is None or name in known
 
 
-def _refuse(key: str, value: Any, wanted: str, problems: list[str]) -> None:
+def _reject(key: str, value: Any, expected: str, problems: list[str]) -> None:
     shown = repr(value) if value is None else as_toml(value)
     shown = shown if len(shown) <= _SHOWN_CHARACTERS else f"{shown[:_SHOWN_CHARACTERS]} …"
-    problems.append(f"{key} is {shown}; wanted {wanted}")
+    problems.append(f"{key} is {shown}; expected {expected}")
 
 
 def _below(above: str, name: Any) -> str:

@@ -11,37 +11,34 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
-from annotated_types import Ge, Le, Lt
-
-from tcpipe.recipe.checking import settle
+from tcpipe.recipe.checking import validate_fields
 from tcpipe.robots.profiles import PlausibleSpeed, PowerSource, Robot
+from tcpipe.tables.bounds import Bounds
 from tcpipe.tables.facts import LEFT_OUT
-
-_STRICT = {"extra": "forbid", "use_attribute_docstrings": True, "allow_inf_nan": False}
 
 Role = Literal["gnss", "gnss_velocity", "imu", "wheel_odometry", "visual_odometry", "power", "command", "pose"]
 MappedRole = Literal["gnss", "gnss_velocity", "imu", "wheel_odometry", "visual_odometry", "command", "pose"]
 """Roles whose messages can be mapped; power has tables of its own, [[power_sources]]."""
 MadeFrom = Literal["imu", "wheel_odometry", "visual_odometry"]
-Fraction = Annotated[float, Ge(0), Le(1)]
-Deviation = Annotated[float, Ge(1e-6), Le(1e3)]
+Fraction = Annotated[float, Bounds(ge=0, le=1)]
+Deviation = Annotated[float, Bounds(ge=1e-6, le=1e3)]
 """A standard deviation or noise: a millionth is lost beside what it is added to, a thousand weighs nothing."""
-Limit = Annotated[float, Ge(1e-6), Le(1e3)]
+Limit = Annotated[float, Bounds(ge=1e-6, le=1e3)]
 """A speed, rate, acceleration or radius that something is compared with: beyond, all or nothing passes."""
-Window = Annotated[float, Ge(0.01), Le(60)]
+Window = Annotated[float, Bounds(ge=0.01, le=60)]
 """Time that one motion takes [s]: less than any sensor's period, more than any manoeuvre."""
-Gap = Annotated[float, Ge(0.01), Le(3600)]
+Gap = Annotated[float, Bounds(ge=0.01, le=3600)]
 """Time without messages [s]: less than any sensor's period, more than odometry holds."""
-Widening = Annotated[float, Ge(0), Le(600)]
+Widening = Annotated[float, Bounds(ge=0, le=600)]
 """Time around an event that is dropped with it [s]."""
-ArcToChord = Annotated[float, Ge(1), Le(10)]
+ArcToChord = Annotated[float, Bounds(ge=1, le=10)]
 """Length of an arc over that of its chord: 1 is straight, 1.57 a half circle."""
-Metres = Annotated[float, Ge(-1000), Le(1000)]
-Radians = Annotated[float, Ge(-6.3), Le(6.3)]
+Metres = Annotated[float, Bounds(ge=-1000, le=1000)]
+Radians = Annotated[float, Bounds(ge=-6.3, le=6.3)]
 """An angle: one turn either way; more is mostly degrees."""
-Offset = Annotated[float, Ge(-2e9), Le(2e9)]
+Offset = Annotated[float, Bounds(ge=-2e9, le=2e9)]
 """Between two clocks [s]: from one that counts from its start to UTC, or back."""
-Scale = Annotated[float, Ge(0.01), Le(100)]
+Scale = Annotated[float, Bounds(ge=0.01, le=100)]
 """Of a measurement, to be multiplied with; further off are other units."""
 
 
@@ -49,22 +46,18 @@ Scale = Annotated[float, Ge(0.01), Le(100)]
 class Placement:
     """Where a sensor sits: base_link_from_sensor."""
 
-    __pydantic_config__ = _STRICT
-
     xyz_m: tuple[Metres, Metres, Metres] = (0.0, 0.0, 0.0)
     """Position of the sensor in base_link (x forward, y left, z up) [m]."""
     rpy_rad: tuple[Radians, Radians, Radians] = (0.0, 0.0, 0.0)
     """Rotation sensor to base_link as roll, pitch, yaw about fixed axes [rad]."""
 
     def __post_init__(self) -> None:
-        settle(self, "placement")
+        validate_fields(self, "placement")
 
 
 @dataclass(frozen=True, slots=True)
 class ReadConfig:
     """Which topics play which role, and how their numbers and stamps are to be understood."""
-
-    __pydantic_config__ = _STRICT
 
     topics: dict[Role, list[str]] = field(default_factory=dict)
     """Topics by role (gnss, gnss_velocity, imu, wheel_odometry, visual_odometry, power, command, pose), where their types do not tell."""
@@ -98,22 +91,20 @@ class ReadConfig:
     """A Husky's power: battery takes battery voltage times both driver currents (the paper's), drivers each driver's own voltage."""
 
     def __post_init__(self) -> None:
-        settle(self, "read")
+        validate_fields(self, "read")
 
 
 @dataclass(frozen=True, slots=True)
 class FuseConfig:
     """The estimator and the noise it assumes where the log does not say."""
 
-    __pydantic_config__ = _STRICT
-
     estimator: Literal["smoother", "ukf"] = "smoother"
     """smoother: error-state unscented filter and fixed-interval smoother; ukf: the paper's forward filter, 15 states."""
     engine: Literal["compiled", "filterpy"] = "compiled"
     """What runs the 15-state filter; filterpy is the slow reference."""
-    rate_hz: Annotated[float, Ge(1), Le(500)] = 20.0
+    rate_hz: Annotated[float, Bounds(ge=1, le=500)] = 20.0
     """Rate of the track (the paper: 20 Hz); no motion of a robot wants more than 500 rows a second."""
-    gate_probability: Annotated[float, Ge(0.5), Le(0.999999999)] = 0.999
+    gate_probability: Annotated[float, Bounds(ge=0.5, le=0.999999999)] = 0.999
     """Chi-square gate: a measurement less likely than this is refused and listed."""
     gnss_std_floor_m: Deviation = 0.01
     """No GNSS standard deviation is taken below this, whatever the receiver says [m]."""
@@ -137,14 +128,12 @@ class FuseConfig:
     """A power gap longer than this, and than three periods, leaves the track without power there and ends a segment [s]."""
 
     def __post_init__(self) -> None:
-        settle(self, "fuse")
+        validate_fields(self, "fuse")
 
 
 @dataclass(frozen=True, slots=True)
 class GateConfig:
     """What steady driving is; everything else is marked, never deleted."""
-
-    __pydantic_config__ = _STRICT
 
     max_acceleration_mps2: Limit = 0.3
     """Without a command topic: steadier than this [m/s²]."""
@@ -188,29 +177,25 @@ class GateConfig:
     """A stretch whose position error over one chord would exceed this is a gap [m]."""
 
     def __post_init__(self) -> None:
-        settle(self, "gate")
+        validate_fields(self, "gate")
 
 
 @dataclass(frozen=True, slots=True)
 class SegmentConfig:
     """How the track is cut."""
 
-    __pydantic_config__ = _STRICT
-
-    chord_m: Annotated[float, Ge(0.05), Le(1000)] = 1.0
+    chord_m: Annotated[float, Bounds(ge=0.05, le=1000)] = 1.0
     """d: straight-line length of a segment in the horizontal plane [m]."""
     max_arc_to_chord: ArcToChord = 1.02
     """A segment more curved than this is dropped (radius below 1.5 m for 1 m)."""
 
     def __post_init__(self) -> None:
-        settle(self, "segment")
+        validate_fields(self, "segment")
 
 
 @dataclass(frozen=True, slots=True)
 class LabelConfig:
     """How power becomes a label."""
-
-    __pydantic_config__ = _STRICT
 
     velocity: Literal["ground", "fused"] = "ground"
     """Which velocity trains: ground is chord / duration; fused the mean of the filter's forward velocity (the paper's v*)."""
@@ -222,18 +207,16 @@ class LabelConfig:
     """A segment with an end whose absolute position is less certain than this is flagged as of weak GNSS [m]."""
 
     def __post_init__(self) -> None:
-        settle(self, "label")
+        validate_fields(self, "label")
 
 
 @dataclass(frozen=True, slots=True)
 class SampleConfig:
     """How a patch is taken from a map."""
 
-    __pydantic_config__ = _STRICT
-
-    patch_m: Annotated[float, Ge(0.05), Le(100)] = 1.0
+    patch_m: Annotated[float, Bounds(ge=0.05, le=100)] = 1.0
     """Side of the patch on the ground [m]."""
-    patch_px: Annotated[int, Ge(2), Le(1024)] = 40
+    patch_px: Annotated[int, Bounds(ge=2, le=1024)] = 40
     """Side of the patch in pixels; the pitch is patch_m / patch_px whatever the map's resolution."""
     min_valid_fraction: Fraction = 1.0
     """A patch with a smaller share of valid pixels is dropped."""
@@ -241,56 +224,50 @@ class SampleConfig:
     """A sample whose absolute position is less certain than this is dropped [m]."""
 
     def __post_init__(self) -> None:
-        settle(self, "sample")
+        validate_fields(self, "sample")
 
 
 @dataclass(frozen=True, slots=True)
 class SplitConfig:
     """Who trains and who tests."""
 
-    __pydantic_config__ = _STRICT
-
     holdout: Literal["block", "sample", "run", "tag"] = "block"
     """block keeps spatial neighbours together, sample is the paper's random draw, run keeps whole runs, tag runs of one tag's value."""
     holdout_tag: str = ""
     """With the holdout tag: which tag, for example season."""
-    test_fraction: Annotated[float, Ge(0), Lt(1)] = 0.2
+    test_fraction: Annotated[float, Bounds(ge=0, lt=1)] = 0.2
     """Share of test among the samples inside the region."""
-    block_m: Annotated[float, Ge(0.1), Le(1e6)] = 10.0
+    block_m: Annotated[float, Bounds(ge=0.1, le=1e6)] = 10.0
     """Side of a spatial block [m]."""
-    buffer_m: Annotated[float, Ge(0), Le(1e6)] | None = None
+    buffer_m: Annotated[float, Bounds(ge=0, le=1e6)] | None = None
     """A footprint nearer than this to a region's border goes to no split; none takes sqrt(2) times the chord [m]."""
-    folds: Annotated[int, Ge(2), Le(100)] = 5
+    folds: Annotated[int, Bounds(ge=2, le=100)] = 5
     """Folds of spatial cross-validation among train and test: whole blocks, or whole runs (or tags) with the holdout run (or tag)."""
-    seed: Annotated[int, Ge(0), Le(2**32 - 1)] = 0
+    seed: Annotated[int, Bounds(ge=0, le=2**32 - 1)] = 0
     """Seed of the split and of the row order."""
 
     def __post_init__(self) -> None:
-        settle(self, "split")
+        validate_fields(self, "split")
 
 
 @dataclass(frozen=True, slots=True)
 class CovariateConfig:
     """How tables of weather, soil or snow are joined to the samples by time (`tcpipe build-dataset --covariates`)."""
 
-    __pydantic_config__ = _STRICT
-
     time_column: str | None = None
     """Column of the stamps; none takes the only one called time, stamp, timestamp, date or datetime, with or without a unit."""
     time_unit: Literal["auto", "s", "ms", "us", "ns"] = "auto"
     """Unit of stamps that are numbers, since 1970: auto takes the name's ending, else the one by which they are of this century."""
-    max_age_s: Annotated[float, Ge(1e-3), Le(1e9)] = 7200.0
+    max_age_s: Annotated[float, Bounds(ge=1e-3, le=1e9)] = 7200.0
     """A sample takes the last row before its start; one that is older than this is not taken [s]."""
 
     def __post_init__(self) -> None:
-        settle(self, "covariates")
+        validate_fields(self, "covariates")
 
 
 @dataclass(frozen=True, slots=True)
 class DatasetConfig:
     """What the dataset says of itself."""
-
-    __pydantic_config__ = _STRICT
 
     name: str = "terrain-cost"
     """Name in the card."""
@@ -304,14 +281,12 @@ class DatasetConfig:
     """How patches are stored in Zarr: zstd takes less room, lz4 is read two to three times as fast."""
 
     def __post_init__(self) -> None:
-        settle(self, "dataset")
+        validate_fields(self, "dataset")
 
 
 @dataclass(frozen=True, slots=True)
 class TableMapping:
     """A table of a folder of CSV, text or Parquet files: which role it plays, which of its columns are what, in which units, and when."""
-
-    __pydantic_config__ = _STRICT
 
     file: str = ""
     """Its file, from the folder that is ingested."""
@@ -347,8 +322,6 @@ class IngestSections:
 class Recipe:
     """All keys of tcpipe.toml."""
 
-    __pydantic_config__ = _STRICT
-
     robot: str | None = None
     """The robot's profile by name; none finds it by message types and topic names."""
     read: ReadConfig = field(default_factory=ReadConfig)
@@ -368,7 +341,7 @@ class Recipe:
     """The tables of a log that is a folder of CSV, text or Parquet files, by role or by any name."""
 
     def __post_init__(self) -> None:
-        settle(self, "")
+        validate_fields(self, "")
 
     @property
     def ingest(self) -> IngestSections:

@@ -20,15 +20,20 @@ Keys: TypeAlias = Mapping[str, TomlValue]
 class RecipeFragment:
     """A part of a recipe: the keys of each table by its dotted name, as ``read.time_offset_s``; an array of tables as a list of them.
 
+    ``is_checked``: this recipe, or that of the version which wrote it, has accepted it.
+
     Raises
     ------
     RecipeError : a key is unknown, or the recipe refuses its value.
     """
 
     tables: Mapping[str, Keys | Sequence[Keys]]
+    is_checked: bool = False
 
     def __post_init__(self) -> None:
         """Check it as a recipe that holds nothing else."""
+        if self.is_checked:
+            return
         values: dict[str, Any] = {}
         for name, keys in self.tables.items():
             *above, last = name.split(".")

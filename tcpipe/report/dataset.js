@@ -37,7 +37,7 @@ page.start(async () => {
       fill = Array.from(c.class, colour);
       [...new Set(c.class)].sort((a, b) => a - b).forEach((id) => legend.push([classes.get(id)?.name ?? "unknown", colour(id)]));
     } else if (name === "quality") {
-      fill = Array.from(c.quality, (q) => (q ? told.flagged : told.clean));
+      fill = Array.from(c.quality, (q) => (q & told.flags ? told.flagged : told.clean));
       legend.push(["clean", told.clean], ["carries a flag", told.flagged]);
     } else if (name === "run") {
       fill = Array.from(c.run, (r) => told.colours[r % told.colours.length]);
@@ -125,7 +125,7 @@ page.start(async () => {
       left.append(make("b", `${chosen.length} chosen`), pairs([
         ...["power", "velocity", "energy", "slope"].map((name) => [`mean ${kinds[name][0]}`, digits(mean(name), name)]),
         ["splits", by.map(([name, count]) => `${name} ${count}`).join(", ")],
-        ["flagged", `${chosen.filter((j) => c.quality[j]).length}`]]), make("p", "The first of them:"));
+        ["flagged", `${chosen.filter((j) => c.quality[j] & told.flags).length}`]]), make("p", "The first of them:"));
     }
     left.append(pairs(inWords(i)));
     if (sheets && cell.has(i)) {

@@ -9,8 +9,9 @@ import numpy as np
 import pyarrow as pa
 
 from tcpipe.errors import DatasetError
-from tcpipe.formats.dataset_card import DatasetCard, RunSource
+from tcpipe.formats.dataset_card import DatasetCard, RunSource, group_dataset_findings, judge_dataset
 from tcpipe.formats.dataset_files import read_current_card, read_samples
+from tcpipe.formats.finding_lines import format_group, group_findings
 from tcpipe.formats.json_files import Json
 from tcpipe.formats.store_mark import MARK
 from tcpipe.report.balance import balance_sections
@@ -18,12 +19,12 @@ from tcpipe.report.colours import CLASS_COLOURS, DROPPED, FAINT, KEPT, SPLIT_COL
 from tcpipe.report.dataset_map import map_plots
 from tcpipe.report.dataset_patches import PER_SHEET, patches_shown
 from tcpipe.report.dataset_samples import COLUMNS, MOST_SAMPLES, SamplesShown, first_starts_ns, samples_shown
-from tcpipe.report.dataset_verdict import verdict
 from tcpipe.report.error_budget import budget_sections
 from tcpipe.report.page import Link, Number, Section, render_page
 from tcpipe.report.physics import physics_sections
 from tcpipe.report.plots import Plot, label_histograms, new_plot, waterfall
 from tcpipe.report.quality import QUALITY_WORDS, quality_sections
+from tcpipe.report.verdict import VerdictBox, show_mixed_groups
 from tcpipe.tables.arrays import texts
 from tcpipe.tables.bits import Quality, name_of
 
@@ -48,10 +49,10 @@ def dataset_report(directory: Path, beside: Path | None = None, *, folder: str =
     return render_page(
         title=f"Dataset {card.name}",
         lead=card.description or f"{card.format} format, data model {card.data_model_version}",
-        verdict=verdict(card, lost),
+        verdict=_verdict(card),
         numbers=_numbers(card),
         links=[] if beside is None else _store_pages(beside, hrefs),
-        warnings=[*card.problems, *card.warnings],
+        warnings=lost,
         sections=[
             _map_section(shown, plots),
             *([] if patches is None else [_GALLERY]),
@@ -77,6 +78,14 @@ def dataset_report(directory: Path, beside: Path | None = None, *, folder: str =
     )
 
 
+def _verdict(card: DatasetCard) -> VerdictBox | None:
+    """Return the verdict and the findings by code; None of a dataset of before data model 3.0."""
+    if card.verdict is None:
+        return None
+    groups = group_dataset_findings(card.findings, card.findings_by_run, card.findings_by_map)
+    return show_mixed_groups(judge_dataset(card.findings, card.runs, card.maps), groups)
+
+
 _GALLERY = Section(
     "Patches",
     "Some of every split, class and slope. Travel is to the right; a click chooses the sample on the map.",
@@ -90,7 +99,7 @@ def _numbers(card: DatasetCard) -> list[Number]:
         *(Number(f"{card.splits[split]}", split) for split in SPLIT_COLOURS),
         Number(f"{len(card.runs)}", "runs"),
         Number(f"{sum(card.ledger_m.values()):.0f} m", "driven"),
-        *([] if card.doubtful is None else [Number(f"{100 * card.doubtful.share:.1f} %", "doubtful samples")]),
+        *([] if card.doubtful is None else [Number(f"{100 * card.doubtful.share:.1f} %", "flagged samples")]),
     ]
 
 
@@ -127,7 +136,14 @@ def _data(
         "unknown": FAINT,
         "clean": KEPT,
         "flagged": DROPPED,
+        "flags": _distinguishing_bits(samples),
     }
+
+
+def _distinguishing_bits(samples: pa.Table) -> int:
+    """Return the quality bits that some samples carry and others do not: a bit of all of them says nothing on a map."""
+    bits = samples.column("quality").to_numpy().astype(np.int64)
+    return int(np.bitwise_or.reduce(bits, initial=0) & ~np.bitwise_and.reduce(bits)) if len(bits) else 0
 
 
 def _run_pages(beside: Path, card: DatasetCard) -> dict[str, str]:
@@ -213,12 +229,14 @@ def _audit_section(card: DatasetCard, samples: pa.Table, shown: SamplesShown) ->
 
 
 def _finding_sections(card: DatasetCard) -> list[Section]:
-    """Return what ingest found of the runs, by cause; nothing where it found nothing."""
-    rows = [(found.example, ", ".join(found.runs), found.samples) for found in card.findings]
-    text = "One line a cause, with the figures of the first of its runs; each run's own page has them all."
-    return (
-        [Section("What ingest found of the runs", text, header=("found", "runs", "samples"), rows=rows)] if rows else []
-    )
+    """Return the findings of ingest by code; nothing where there is none."""
+    samples = {run.run_id: run.samples for run in card.runs}
+    rows = [
+        (format_group(group, len(card.runs)), ", ".join(group.of), sum(samples[run_id] for run_id in group.of))
+        for group in group_findings(card.findings_by_run.items())
+    ]
+    text = "One line a code; each run's own page has all of its findings."
+    return [Section("Findings of ingest", text, header=("finding", "runs", "samples"), rows=rows)] if rows else []
 
 
 def _removal_sections(card: DatasetCard) -> list[Section]:

@@ -12,7 +12,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib.resources import files
-from typing import Any, Literal
+from typing import Any
 from urllib.parse import quote
 
 from jinja2 import Environment, StrictUndefined
@@ -22,7 +22,7 @@ from tcpipe.errors import plain_line
 from tcpipe.formats.json_files import Json
 from tcpipe.report import plots
 from tcpipe.report.plots import Plot
-from tcpipe.tables.facts import by_cause
+from tcpipe.report.verdict import VerdictBox
 
 _UNSEEN = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\xad\u061c\u200b-\u200f\u2028-\u202e\u2060-\u206f\ufeff]")
 """Characters that cannot be seen in a page, or turn its text round: a name may hold them."""
@@ -36,14 +36,6 @@ class Number:
 
     value: str
     label: str
-
-
-@dataclass(frozen=True, slots=True)
-class Verdict:
-    """One sentence of what a reader has to know first: what is good, thin or doubtful, and what to do."""
-
-    kind: Literal["good", "thin", "doubtful", "do"]
-    text: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,9 +88,9 @@ def render_page(
     title: str,
     lead: str,
     numbers: Sequence[Number],
-    warnings: Sequence[str],
     sections: Sequence[Section],
-    verdict: Sequence[Verdict] = (),
+    verdict: VerdictBox | None = None,
+    warnings: Sequence[str] = (),
     links: Sequence[Link] = (),
     script: str = "",
     data: Json = None,
@@ -108,8 +100,8 @@ def render_page(
 
     Parameters
     ----------
-    title, lead, numbers, warnings, verdict
-        What stands at the top, in the order verdict, numbers, warnings; of warnings of one cause the first, the others folded below it.
+    title, lead, verdict, numbers, warnings
+        What stands at the top, in this order.
     sections
         In the order of the page; the table of contents is made of their titles.
     links
@@ -131,7 +123,7 @@ def render_page(
         title=title,
         lead=lead,
         numbers=numbers,
-        warnings=[list(of.values()) for of in by_cause((number, [line]) for number, line in enumerate(warnings))],
+        warnings=warnings,
         verdict=verdict,
         links=links,
         pictures="'self' file: " if reads_pictures else "",

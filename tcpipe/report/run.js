@@ -115,7 +115,7 @@ page.start(async () => {
   at("on").onclick = () => about(1, 0.5);
 
   // Segments on the map and in their own plot.
-  const flagged = Array.from(s.quality, (bits) => (bits ? told.doubted : told.kept));
+  const flagged = Array.from(s.quality, (bits) => (bits & told.flags ? told.doubted : told.kept));
   const number = (value, [, , unit, digits]) => (finite(value) ? `${value.toFixed(digits)} ${unit}` : "none");
   function coloured(key) {
     if (key === "quality") {

@@ -11,10 +11,12 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from tcpipe.errors import StoreError, TableError
+from tcpipe.formats.finding_lines import advise_on_loss
 from tcpipe.formats.json_files import Json
 from tcpipe.formats.parquet import read_table
 from tcpipe.formats.run_documents import Manifest, RunJson
 from tcpipe.formats.stored_runs import RunDirectory
+from tcpipe.motion.remedies import losses_of
 from tcpipe.report.colours import DOUBTED, FAINT, KEPT, UNUSED
 from tcpipe.report.error_budget import budget_sections
 from tcpipe.report.packed import Column, packed, shown_to
@@ -26,7 +28,7 @@ from tcpipe.report.run_map import Pictures, RunMap, run_map
 from tcpipe.report.run_plots import SPEED_ROLES, Line, lines_of, reasons_told, time_plots
 from tcpipe.report.run_sensors import sensor_sections
 from tcpipe.report.run_series import Series, Timeline, gate_spans, rail_series, speed_series, timeline_of, track_series
-from tcpipe.report.run_verdict import verdict
+from tcpipe.report.verdict import show_verdict
 from tcpipe.store import Store
 from tcpipe.tables.bits import Quality, name_of
 from tcpipe.tables.columns import floats, integers
@@ -50,7 +52,6 @@ class _Drawn:
 
     sections: tuple[Section, ...] = ()
     data: Json = None
-    missing: tuple[str, ...] = ()
 
 
 def run_report(store: Store, run: RunDirectory, of_maps: MutableMapping[str, Pictures] | None = None) -> str:
@@ -68,7 +69,7 @@ def run_report(store: Store, run: RunDirectory, of_maps: MutableMapping[str, Pic
     return render_page(
         title=f"Run {run.run_id}",
         lead=f"Robot {manifest.robot}, recipe {run.recipe_id}, {_source_line(known)}",
-        verdict=verdict(manifest, quality, drawn.missing),
+        verdict=show_verdict(manifest.verdict, manifest.info.report.findings),
         numbers=[
             Number(f"{total:.0f} m", "driven"),
             Number(f"{segments.num_rows}", "segments"),
@@ -76,20 +77,37 @@ def run_report(store: Store, run: RunDirectory, of_maps: MutableMapping[str, Pic
             Number(_mean(segments, "power_watt", "W"), "mean power w"),
             Number(_mean(segments, "velocity_mps", "m/s", digits=2), "mean velocity v"),
         ],
-        warnings=[*manifest.damage, *manifest.warnings],
         links=[Link("All runs of the store", f"../../../{_PAGE}")] if store.place.size(_PAGE) is not None else [],
         sections=[
             *drawn.sections,
-            Section("Where every metre went", "Kept and dropped add up to the odometer.", plots=[waterfall(ledger)]),
+            _losses(ledger),
             *_label_sections(segments, label.physics if label else None, manifest.robot),
             *(quality_sections(quality, "segments") if segments.num_rows else []),
             *budget_sections(run.facts.energy_budget),
             *sensor_sections(known, manifest, refused),
+            *_damage(manifest.damage),
             _provenance(run, manifest, known),
         ],
         script="run.js" if drawn.data is not None else "",
         data=drawn.data,
     )
+
+
+def _losses(ledger_m: Mapping[str, float]) -> Section:
+    """Return where the distance went, and how to lose less of it."""
+    rows = [
+        (loss.reason.replace("_", " "), f"{loss.metres:.1f}", f"{100 * loss.share:.1f} %", advise_on_loss(loss.reason))
+        for loss in losses_of([ledger_m])
+    ]
+    text = "Kept and dropped distances add up to the odometer."
+    header = ("lost to", "metres", "of all", "to lose less")
+    return Section("Where every metre went", text, header=header, rows=rows, plots=[waterfall(ledger_m)])
+
+
+def _damage(lines: Sequence[str]) -> list[Section]:
+    rows = [(line,) for line in lines]
+    text = "Where messages are lost or may be."
+    return [Section("Damage of the log", text, header=("what",), rows=rows, folded=True)] if rows else []
 
 
 def _source_line(known: RunJson | None) -> str:
@@ -114,7 +132,7 @@ def _drawn(
 ) -> _Drawn:
     """Return map and plots over time with what their script needs; what cannot be drawn is said."""
     if not track.num_rows:
-        return _Drawn(missing=("No track: nothing was recorded that could be fused.",))
+        return _Drawn((Section("The drive", "No track: the log holds nothing that could be fused."),))
     info = run.manifest.info
     timeline = timeline_of(track)
     ground = run_map(store, run, track, segments, located=info.datum is not None, of_maps=of_maps)
@@ -136,6 +154,7 @@ def _drawn(
         "starts": [str(stamp) for stamp in integers(segments, "start_ns").tolist()],
         "reasons": reasons_told(),
         "quality": [[int(bit), words] for bit, words in QUALITY_WORDS.items()],
+        "flags": _distinguishing(integers(segments, "quality")),
         "ground": list(ground.ground),
         "step_m": _STEP_M,
         "kept": KEPT,
@@ -143,12 +162,18 @@ def _drawn(
         "unused": UNUSED,
         "tall_by_wide": float(np.divide(*np.maximum(np.ptp(ground.track_xy_m, axis=0), 1.0)[::-1])),
     }
-    text = "Colour says what a metre is used for, or why it is not; a click on the track or in a plot below tells all of it."
+    text = "Colour shows what the distance is used for, or why it is not; click on the track or in a plot below for details."
+    over = " ".join([_time_text(series, lines), *lost])
     sections = (
-        Section("The drive", text, controls="run.html", plots=[ground.plot]),
-        Section("Over time", _time_text(series, lines), controls="run_time.html", plots=over_time.plots, stacked=True),
+        Section("The drive", " ".join([text, *ground.missing]), controls="run.html", plots=[ground.plot]),
+        Section("Over time", over, controls="run_time.html", plots=over_time.plots, stacked=True),
     )
-    return _Drawn(sections, data, (*ground.missing, *lost))
+    return _Drawn(sections, data)
+
+
+def _distinguishing(bits: NDArray[np.int64]) -> int:
+    """Return the quality bits that some segments carry and others do not: a bit of all of them says nothing on a map."""
+    return int(np.bitwise_or.reduce(bits, initial=0) & ~np.bitwise_and.reduce(bits)) if len(bits) else 0
 
 
 def _told_series(store: Store, run: RunDirectory, timeline: Timeline) -> tuple[list[Series], list[str]]:

@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 
 import pyarrow as pa
 
+from tcpipe.formats.finding_lines import describe_remedy
 from tcpipe.formats.run_documents import Counts, Manifest, RunJson
 from tcpipe.report.page import Section
 from tcpipe.tables.facts import ClockOffset, RunFacts
+from tcpipe.tables.findings import Finding, select_findings
 
 
 def sensor_sections(known: RunJson | None, manifest: Manifest, rejections: pa.Table) -> list[Section]:
     """Return the sections on topics, on trust, on disagreement and on clocks; ``known`` is None where the run's ``run.json`` is lost."""
     facts = manifest.info.report.facts
     topics = [] if known is None else [_topics(known, manifest.counts)]
-    return [*topics, *_trust(facts, rejections), *_disagreements(facts), *_clocks(facts)]
+    return [*topics, *_trust(facts, rejections), *_disagreements(facts), *_clocks(facts, manifest.info.report.findings)]
 
 
 def _name(role: str) -> str:
@@ -87,7 +90,7 @@ def _disagreements(facts: RunFacts) -> list[Section]:
     return [Section("Where sensors disagree with the track", text, header=header, rows=rows)]
 
 
-def _clocks(facts: RunFacts) -> list[Section]:
+def _clocks(facts: RunFacts, findings: Sequence[Finding]) -> list[Section]:
     """Return how late each sensor's stamps are; where nothing could be compared, nothing."""
     found = facts.clock_offsets
     steps = [f"{step.step_s:+.3f} s at log time {step.log_time_ns} ns" for step in facts.clock_steps]
@@ -100,7 +103,7 @@ def _clocks(facts: RunFacts) -> list[Section]:
             f"{1e3 * (each.offset_s or 0.0):+.0f} ms",
             f"{2e3 * (each.std_s or 0.0):.0f} ms",
             _drift(each),
-            _mended(each),
+            _correction(role, findings),
         )
         for role, each in sorted(offsets.items())
     ]
@@ -109,17 +112,16 @@ def _clocks(facts: RunFacts) -> list[Section]:
         text = f"How late stamps are against {_name(found.reference)}, by what the sensors say of the same motion. Nothing is corrected."
     if steps:
         text += f" The clock steps: {'; '.join(steps)}."
-    header = ("sensor", "late by", "± (2σ)", "drift", "recipe line that would correct it")
+    header = ("sensor", "late by", "± (2σ)", "drift", "correction")
     return [Section("Clocks", text.strip(), header=header, rows=rows)]
 
 
-def _mended(offset: ClockOffset) -> str:
-    if not (offset.noted or offset.drifts):
-        return ""
-    if not offset.blamed:
-        return "none: which of the two is off is not known"
-    table, _, line = offset.recipe.partition("\n")
-    return f"under {table}: {line}" if line else "none: its stamps are the recorder's already"
+def _correction(role: str, findings: Sequence[Finding]) -> str:
+    """Return what corrects a sensor's clock, as the findings on it propose."""
+    clocks = select_findings(findings, "time-offset", "clock-drift", "clocks-differ")
+    found = [finding for finding in clocks if finding.subject.name == role]
+    remedies = [describe_remedy(finding, remedy) for finding in found for remedy in finding.remedies]
+    return "; ".join(remedies) or ", ".join(finding.code.replace("-", " ") for finding in found)
 
 
 def _drift(offset: ClockOffset) -> str:

@@ -10,7 +10,7 @@ page.start(() => {
     ["run", (run) => run.run], ["start_ms", (run) => date(run.start_ms), 1], ["robot", (run) => run.robot], ["state", (run) => run.state],
     ["datasets", (run) => run.datasets.map((n) => told.datasets[n]).join(", ")], ["tags", (run) => run.tags],
     ["segments", digits("segments", 0), 1], ["driven", digits("driven", 0), 1], ["used", digits("used", 1), 1], ["floor", digits("floor", 2), 1],
-    ["warnings", digits("warnings", 0), 1],
+    ["verdict", (run) => run.verdict], ["findings", digits("findings", 0), 1],
   ];
 
   // What is shown: the rows of the filters, or those that were chosen in a plot.
@@ -22,10 +22,10 @@ page.start(() => {
     return (a < b ? -1 : a > b ? 1 : 0) * (falls ? -1 : 1);
   };
   const wanted = () => {
-    const [robot, state, dataset, cause] = ["robot", "state", "dataset", "cause"].map((id) => at(id).value);
+    const [robot, state, dataset, code] = ["robot", "state", "dataset", "code"].map((id) => at(id).value);
     const words = at("find").value.toLowerCase().split(/\s+/).filter(Boolean);
     return runs.filter((run) => (!robot || run.robot === robot) && (!state || kind(run) === state)
-      && (!cause || run.causes.includes(Number(cause))) && words.every((word) => `${run.run} ${run.tags}`.toLowerCase().includes(word))
+      && (!code || run.codes.includes(Number(code))) && words.every((word) => `${run.run} ${run.tags}`.toLowerCase().includes(word))
       && (!dataset || (dataset === "none" ? !run.datasets.length : run.datasets.includes(Number(dataset)))));
   };
   const table = document.querySelector("#s1 table");
@@ -100,11 +100,11 @@ page.start(() => {
   fillSelect(at("robot"), told.robots.map(([robot]) => robot));
   fillSelect(at("state"), [...new Set(runs.map(kind))], (state) => `${state} (${runs.filter((run) => kind(run) === state).length})`);
   fillSelect(at("dataset"), ["none", ...told.datasets.keys()], (n) => told.datasets[n] ?? n);
-  fillSelect(at("cause"), [...told.causes.keys()], (n) => told.causes[n].slice(0, 80));
-  for (const id of ["robot", "state", "dataset", "cause"]) at(id).onchange = filtered;
+  fillSelect(at("code"), [...told.codes.keys()], (n) => told.codes[n]);
+  for (const id of ["robot", "state", "dataset", "code"]) at(id).onchange = filtered;
   at("find").oninput = filtered;
   at("clear").onclick = () => {
-    for (const id of ["find", "robot", "state", "dataset", "cause"]) at(id).value = "";
+    for (const id of ["find", "robot", "state", "dataset", "code"]) at(id).value = "";
     filtered();
   };
   draw();

@@ -9,21 +9,23 @@ from collections.abc import Sequence
 import numpy as np
 
 from tcpipe.cost.held_out import PHYSICS_UNITS
+from tcpipe.formats.finding_lines import advise_on_loss, describe_finding, format_group
+from tcpipe.formats.index_files import RunFacts
 from tcpipe.formats.json_files import Json
 from tcpipe.motion.remedies import StoreLoss, losses_of
 from tcpipe.report.colours import CLASS_COLOURS
 from tcpipe.report.page import Link, Number, Section, render_page
 from tcpipe.report.plots import Plot, new_plot, waterfall
 from tcpipe.report.store_runs import FIELDS, StoredRun, StoreFacts, dataset_names, day, runs_shown
-from tcpipe.report.store_verdict import store_verdict
+from tcpipe.report.verdict import show_groups
+from tcpipe.tables.findings import select_problems
 
 MOST_ROWS = 200
 """Runs that can be read without scripts: with them, all."""
-_MOST_CAUSES = 60
 _MOST_LISTED = 500
 
 _COLUMNS = ("run", "began (UTC)", "robot", "state", "in datasets", "tags", "segments", "driven [m]", "used [%]")
-_MORE_COLUMNS = ("noise floor of E [%]", "warnings")
+_MORE_COLUMNS = ("noise floor of E [%]", "verdict", "findings")
 
 
 def store_report(store: StoreFacts) -> str:
@@ -34,14 +36,16 @@ def store_report(store: StoreFacts) -> str:
     return render_page(
         title=f"Store {store.where}",
         lead="All its runs. Sums, drift and losses are of the recipe that most runs are of, superseded runs left aside.",
-        verdict=store_verdict(store, runs, losses),
+        verdict=show_groups(store.verdict, store.groups, len(current), findings=store.changes) if current else None,
         numbers=_numbers(store, current),
-        warnings=[],
+        warnings=[]
+        if current
+        else ["No run can be used. 'tcpipe ingest LOG' adds runs; 'tcpipe preflight LOG' checks a log."],
         sections=[
             *_table(store, runs),
             *_drift(runs),
             *_losses(current, losses),
-            *_causes(store),
+            *_findings(store, current),
             *_datasets(store, runs),
             *_trouble(store, runs),
         ],
@@ -76,7 +80,7 @@ def _table(store: StoreFacts, runs: Sequence[StoredRun]) -> list[Section]:
             run.facts.robot if run.facts else "",
             run.state,
             ", ".join(names[number] for number in run.datasets),
-            *("" if cell is None else cell for cell in run.row([])[5:11]),
+            *("" if cell is None else cell for cell in run.row([])[5:12]),
         )
         for run in runs[:MOST_ROWS]
     ]
@@ -149,24 +153,25 @@ def _losses(current: Sequence[StoredRun], losses: Sequence[StoreLoss]) -> list[S
     if not ledger_m:
         return []
     rows = [
-        (loss.reason.replace("_", " "), f"{loss.metres:.0f}", f"{100 * loss.share:.1f} %", loss.runs, loss.remedy)
+        (
+            loss.reason.replace("_", " "),
+            f"{loss.metres:.0f}",
+            f"{100 * loss.share:.1f} %",
+            loss.runs,
+            advise_on_loss(loss.reason),
+        )
         for loss in losses
     ]
-    header = ("lost to", "metres", "of all", "runs", "what wins them back")
-    text = "The largest losses, and what would win them back; 'tcpipe status' says the same."
+    header = ("lost to", "metres", "of all", "runs", "to lose less")
+    text = "The largest losses, and how to lose less; 'tcpipe status' lists the same."
     return [Section("Where every metre went", text, header=header, rows=rows, plots=[waterfall(ledger_m)])]
 
 
-def _causes(store: StoreFacts) -> list[Section]:
-    if not store.causes:
-        return []
-    rows = [(next(iter(of.values())), len(of), ", ".join([*of][:3])) for of in store.causes[:_MOST_CAUSES]]
-    text = "Lines that differ by figures and topics alone are one cause, in the words of its first run."
-    if len(store.causes) > _MOST_CAUSES:
-        text += (
-            f" The {_MOST_CAUSES} of most runs, of {len(store.causes)} causes; each run's own page has all of its own."
-        )
-    return [Section("Warnings by cause", text, header=("warning", "runs", "such as"), rows=rows)]
+def _findings(store: StoreFacts, current: Sequence[StoredRun]) -> list[Section]:
+    rows = [(of.severity, format_group(of, len(current)), len(of.of), ", ".join([*of.of][:3])) for of in store.groups]
+    header = ("severity", "finding", "runs", "such as")
+    text = "Of the current runs, by code, the worst first; each run's own page has all of its own."
+    return [Section("Findings by code", text, header=header, rows=rows)] if rows else []
 
 
 def _datasets(store: StoreFacts, runs: Sequence[StoredRun]) -> list[Section]:
@@ -190,7 +195,7 @@ def _trouble(store: StoreFacts, runs: Sequence[StoredRun]) -> list[Section]:
     for run in runs:
         if run.facts is None or run.state.startswith(("damaged", "empty")):
             line = store.found.damaged.get((run.run_id, run.recipe_id), "ingest its log again")
-            rows.append((run.run_id, run.state, (*run.facts.damage, run.facts.why_empty)[0] if run.facts else line))
+            rows.append((run.run_id, run.state, _trouble_of(run.facts) if run.facts else line))
     if not rows:
         return []
     text = "'tcpipe accept' sets aside what cannot be mended."
@@ -200,6 +205,10 @@ def _trouble(store: StoreFacts, runs: Sequence[StoredRun]) -> list[Section]:
     return [Section("Failed, damaged and empty", text, header=header, rows=rows[:_MOST_LISTED], folded=len(rows) > 20)]
 
 
+def _trouble_of(facts: RunFacts) -> str:
+    return next(iter(facts.damage), "") or describe_finding(select_problems(facts.findings)[0])
+
+
 def _data(store: StoreFacts, runs: Sequence[StoredRun]) -> Json:
     terms = sorted({term for run in runs if run.facts for term in run.facts.physics if not term.startswith("standing")})
     return {
@@ -207,6 +216,6 @@ def _data(store: StoreFacts, runs: Sequence[StoredRun]) -> Json:
         "rows": [run.row(terms) for run in runs],
         "robots": [list(of) for of in _robots(runs)],
         "datasets": dataset_names(store.datasets),
-        "causes": [next(iter(of.values())) for of in store.causes[:_MOST_CAUSES]],
+        "codes": [f"{of.severity}: {of.code.replace('-', ' ')}" for of in store.groups],
         "terms": [f"{term} [{PHYSICS_UNITS.get(term.partition(' ')[0], '')}]" for term in terms],
     }

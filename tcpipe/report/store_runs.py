@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import PurePosixPath
 
+from tcpipe.formats.finding_lines import FindingGroup
 from tcpipe.formats.index_files import RunFacts
 from tcpipe.formats.json_files import Json
 from tcpipe.formats.stored_runs import Ingestions
+from tcpipe.tables.findings import Finding
+from tcpipe.tables.verdicts import Verdict
 
 GOOD = "good"
 _PAGE = "report.html"
@@ -46,14 +49,18 @@ class StoreFacts:
     pages: frozenset[tuple[str, str]]
     """Ingestions, by run and recipe, that have a page."""
     datasets: tuple[StoredDataset, ...]
-    causes: tuple[Mapping[str, str], ...]
-    """Warnings of the current runs by cause: by run the line."""
+    verdict: Verdict
+    """On the current runs together."""
+    changes: tuple[Finding, ...]
+    """What the latest of them have changed."""
+    groups: tuple[FindingGroup[str], ...]
+    """Findings of the current runs by code, the worst first."""
     failed: tuple[FailedLog, ...]
 
 
 @dataclass(frozen=True, slots=True)
 class StoredRun:
-    """A row of the page: what the index has of an ingestion, how it stands, its page, and the datasets and causes it belongs to."""
+    """A row of the page: what the index has of an ingestion, how it stands, its page, its datasets and codes of findings."""
 
     run_id: str
     recipe_id: str
@@ -61,7 +68,8 @@ class StoredRun:
     facts: RunFacts | None
     href: str
     datasets: tuple[int, ...]
-    causes: tuple[int, ...]
+    codes: tuple[int, ...]
+    """Places in `StoreFacts.groups`."""
 
     @property
     def is_current(self) -> bool:
@@ -87,7 +95,7 @@ class StoredRun:
         """Return what the page's script is told, in the order of `FIELDS`."""
         of = self.facts
         if of is None:
-            return [self.run_id, self.href, None, "", self.state, "", *[None] * 5, [], [], None, []]
+            return [self.run_id, self.href, None, "", self.state, "", *[None] * 4, "", None, [], [], None, []]
         return [
             self.run_id,
             self.href,
@@ -99,30 +107,31 @@ class StoredRun:
             round(of.driven_m, 1),
             _percent(self.used_share),
             _percent(self.floor),
-            len(of.warnings),
+            of.verdict.worst,
+            sum(finding.severity != "note" for finding in of.findings),
             list(self.datasets),
-            list(self.causes),
+            list(self.codes),
             of.standing_watt,
             [of.physics[term][0] if term in of.physics else None for term in terms],
         ]
 
 
 FIELDS = (
-    *("run", "href", "start_ms", "robot", "state", "tags", "segments", "driven", "used", "floor", "warnings"),
-    *("datasets", "causes", "standing", "terms"),
+    *("run", "href", "start_ms", "robot", "state", "tags", "segments", "driven", "used", "floor", "verdict"),
+    *("findings", "datasets", "codes", "standing", "terms"),
 )
 
 
 def runs_shown(store: StoreFacts) -> list[StoredRun]:
     """Return every ingestion, what began last first; then those without a segment, and those that cannot be read."""
-    found, ruling = store.found, _ruling(store.found)
-    members, causes = dict[tuple[str, str], list[int]](), dict[str, list[int]]()
+    found, ruling = store.found, ruling_key(store.found)
+    members, codes = dict[tuple[str, str], list[int]](), dict[str, list[int]]()
     for number, dataset in enumerate(store.datasets):
         for part in dataset.runs if dataset.there else ():
             members.setdefault(part, []).append(number)
-    for number, cause in enumerate(store.causes):
-        for run_id in cause:
-            causes.setdefault(run_id, []).append(number)
+    for number, group in enumerate(store.groups):
+        for run_id in group.of:
+            codes.setdefault(run_id, []).append(number)
     rows = [
         StoredRun(
             run_id,
@@ -131,7 +140,7 @@ def runs_shown(store: StoreFacts) -> list[StoredRun]:
             facts,
             f"runs/{run_id}/{recipe_id}/{_PAGE}" if (run_id, recipe_id) in store.pages else "",
             tuple(members.get((run_id, recipe_id), ())),
-            tuple(causes.get(run_id, ())) if facts.ingest_key == ruling else (),
+            tuple(codes.get(run_id, ())) if facts.ingest_key == ruling else (),
         )
         for (run_id, recipe_id), facts in found.rows.items()
     ]
@@ -143,7 +152,7 @@ def runs_shown(store: StoreFacts) -> list[StoredRun]:
     ]
 
 
-def _ruling(found: Ingestions) -> str | None:
+def ruling_key(found: Ingestions) -> str | None:
     """Return the key of the recipe that most runs are of; of two that the latest run is of."""
     keys = Counter(run.facts.ingest_key for run in found.finished)
     latest = {run.facts.ingest_key: max(0, run.facts.start_ns or 0) for run in found.finished}
@@ -155,7 +164,7 @@ def _state(facts: RunFacts, ruling: str | None, *, accepted: bool) -> str:
         return f"superseded by {facts.superseded_by}"
     if facts.ingest_key != ruling:
         return "of another recipe"
-    wrong = "damaged" if facts.damage else "empty" if facts.why_empty else ""
+    wrong = "damaged" if facts.damage else "empty" if facts.is_empty else ""
     return f"{wrong}{', accepted' * accepted}" if wrong else GOOD
 
 

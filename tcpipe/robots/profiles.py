@@ -7,17 +7,15 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
-from annotated_types import Ge, Gt, Le
+from tcpipe.tables.bounds import Bounds
 
-_STRICT = {"extra": "forbid", "use_attribute_docstrings": True, "allow_inf_nan": False}
-
-Size = Annotated[float, Ge(0.05), Le(100)]
+Size = Annotated[float, Bounds(ge=0.05, le=100)]
 """Of a robot [m]: from a toy's to a mining truck's."""
-Speed = Annotated[float, Ge(0.01), Le(100)]
-PlausibleSpeed = Annotated[float, Ge(2), Le(1000)]
+Speed = Annotated[float, Bounds(ge=0.01, le=100)]
+PlausibleSpeed = Annotated[float, Bounds(ge=2, le=1000)]
 """A bound that no true track reaches [m/s]: at walking pace it would refuse robots that drive."""
-Volt = Annotated[float, Ge(0.1), Le(1e4)]
-Scale = Annotated[float, Gt(0), Le(1e9)]
+Volt = Annotated[float, Bounds(ge=0.1, le=1e4)]
+Scale = Annotated[float, Bounds(gt=0, le=1e9)]
 
 GENERIC = "generic"
 """The name of a robot of which nothing is known."""
@@ -48,8 +46,6 @@ class FieldPath:
 @dataclass(frozen=True, slots=True)
 class Robot:
     """What is known of a robot before its log is opened; what is left out is not known."""
-
-    __pydantic_config__ = _STRICT
 
     width_m: Size | None = None
     """Width of its footprint, wheels or tracks included [m]."""
@@ -82,8 +78,6 @@ class PowerSource:
     ``drivers[].amps`` the sum over all of them; ``left + right - spare`` is a sum of fields.
     """
 
-    __pydantic_config__ = _STRICT
-
     type: str
     """Message type, as package/msg/Name in ROS 1 and 2 alike."""
     voltage: str = ""
@@ -98,7 +92,7 @@ class PowerSource:
     """What the current's field is multiplied by: 0.001 where it is in milliamperes."""
     energy_scale: Scale = 1.0
     """What the counter is multiplied by: 3600 where it counts watt-hours."""
-    counter_wraps: Annotated[float, Gt(0), Le(1e19)] | None = None
+    counter_wraps: Annotated[float, Bounds(gt=0, le=1e19)] | None = None
     """Where the counter begins at zero again, in its own unit; without, a counter that falls was reset."""
     rail: str = ""
     """The rail's name; none takes the topic's."""
@@ -126,9 +120,9 @@ class PowerSource:
     """Only for topics whose name ends so."""
     husky_power: Literal["battery", "drivers"] | None = None
     """Only where `read.husky_power` says so."""
-    currents_listed: Annotated[int, Ge(1), Le(1000)] | None = None
+    currents_listed: Annotated[int, Bounds(ge=1, le=1000)] | None = None
     """How many currents the message's list holds, where its definition says so; a message of another length is refused."""
-    wraps_amp: Annotated[float, Ge(1), Le(1e9)] | None = None
+    wraps_amp: Annotated[float, Bounds(ge=1, le=1e9)] | None = None
     """A current above half of this is a negative one that was read as unsigned [A]; without, the record tells."""
 
     def contradictions(self) -> Iterator[tuple[str, str]]:

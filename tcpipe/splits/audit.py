@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -57,21 +56,6 @@ def audit_leakage(
     """
     follows = _consecutive(run, start_ns, corners_xy_m.mean(axis=1), chord_m=chord_m)
     return tuple(_audit(name, split, run, follows, corners_xy_m) for name in ("test", "unseen"))
-
-
-def audit_lines(audit: Sequence[HeldOut]) -> Iterator[str]:
-    """Yield the audit as plain lines to print."""
-    for part in audit:
-        if part.samples == 0:
-            continue
-        if part.nearest_train_min_m is None or part.nearest_train_median_m is None:
-            yield f"{part.split}: {part.samples} samples; nothing trains"
-            continue
-        yield (
-            f"{part.split}: {part.samples} samples, {part.overlapping_samples} share ground with train "
-            f"({part.repeated_place_samples} of them with another run), {part.same_track_pairs} neighbours on one track; "
-            f"nearest train footprint {part.nearest_train_min_m:.2f} m, median {part.nearest_train_median_m:.2f} m"
-        )
 
 
 def _consecutive(run: Ints, start_ns: Ints, centres_xy_m: Floats, *, chord_m: float) -> Ints:

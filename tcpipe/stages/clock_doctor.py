@@ -1,4 +1,4 @@
-"""What the sensors' clocks look like: offsets between them and their drift, for the manifest, and the recipe line that corrects each."""
+"""What the sensors' clocks look like: offsets between them and their drift, and the remedy that corrects each."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ import numpy as np
 import pyarrow as pa
 
 from tcpipe.fusion.checks.clock_offsets import ClockOffsets, Pair, PowerSignal, RoleOffset, find_clock_offsets
-from tcpipe.fusion.measurements import GNSS
+from tcpipe.fusion.measurements import GNSS, IMU
 from tcpipe.power.rails import power_at
-from tcpipe.recipe.suggestions import RecipeFragment, suggested
+from tcpipe.recipe.suggestions import suggest
 from tcpipe.stages.fuse_inputs import FusionInputs
 from tcpipe.stages.fuse_sanity import longest_epoch
 from tcpipe.stages.power_rails import rails_of
 from tcpipe.stages.read_pose import recipe_role
 from tcpipe.tables.columns import floats
 from tcpipe.tables.facts import ClockFacts, ClockOffset, ClockPair
-from tcpipe.tables.findings import StageReport
+from tcpipe.tables.findings import Finding, Remedy, StageReport, Subject, make_finding
 from tcpipe.tables.levels import Streams
 
 _MAX_GAP_NS = 300_000_000
@@ -30,54 +30,63 @@ _TURNED_OVER_M = 1.0
 def clock_findings(streams: Streams, inputs: FusionInputs) -> StageReport[ClockFacts]:
     """Return the offsets between the sensors' clocks in the longest clock epoch; nothing is corrected.
 
-    The recipe lines that would correct an offset include what the recipe adds already.
+    The remedy that would correct an offset includes what the recipe adds already.
     """
     epoch = longest_epoch(inputs)
     found = find_clock_offsets(inputs.measurements[epoch], _power(streams, epoch))
-    given_s = streams.report.facts.time_offset_s
-    offsets, warnings = {}, []
-    for role, offset in found.offsets.items():
-        name = recipe_role(role, streams)
-        by_log = streams.sensors[role].time_source == "log"
-        remedy_s = round(given_s.get(name, 0.0) - offset.offset_s, 3 if offset.std_s < _FINE_S else 2)
-        tables = {"read.time": {name: "log"}} if offset.drifts else {"read.time_offset_s": {name: remedy_s}}
-        useless = _is_open(offset) or (offset.drifts and by_log)
-        offsets[role] = ClockOffset(**_told(offset), recipe="" if useless else RecipeFragment(tables).toml())
-        if offset.drifts or offset.noted:
-            purpose = "where the recorder's clock is the better one" if offset.drifts else "to correct it"
-            warnings.append(_said(found, role, offset, name) + ("" if useless else suggested(purpose, tables)))
+    offsets = {role: ClockOffset(**_told(offset)) for role, offset in found.offsets.items()}
+    findings = [
+        _find_offset(found, role, offset, streams)
+        for role, offset in found.offsets.items()
+        if offset.drifts or offset.noted
+    ]
     pairs = tuple(ClockPair(**_told(pair), determined=pair.determined) for pair in found.pairs)
     lost = found.position_offset_s or None, found.heading_offset_s or None
-    return StageReport(tuple(warnings), ClockFacts(epoch, found.reference, pairs, offsets, *lost))
+    return StageReport(tuple(findings), ClockFacts(epoch, found.reference, pairs, offsets, *lost))
 
 
-def _is_open(offset: RoleOffset) -> bool:
-    """Whether two clocks differ and nothing tells whose is off."""
-    return (offset.noted or offset.drifts) and not offset.blamed
-
-
-def _said(found: ClockOffsets, role: str, offset: RoleOffset, name: str) -> str:
-    """Return what a person should know of a clock; ``name`` is what the recipe calls the role."""
-    change_s, change_std_s = (each * found.span_s / 3600 for each in (offset.drift_s_per_h, offset.drift_std_s_per_h))
-    drift = f"over the run (± {2 * change_std_s:.2f} s, by {_means(found, role)})"
-    constant = f"(± {2 * offset.std_s:.2f} s, by {_means(found, role)})"
-    if _is_open(offset):
-        by = (
-            f"drift apart by {abs(change_s):.2f} s {drift}"
-            if offset.drifts
-            else f"differ by {abs(offset.offset_s):.2f} s {constant}"
-        )
-        cost = "; the deviations of positions count what is driven in it" if GNSS in {role, found.reference} else ""
-        return (
-            f"{name} and {found.reference}: their stamps {by}, and no two other sensors agree on which of them is off: "
-            f"nothing is corrected or advised{cost}"
+def _find_offset(found: ClockOffsets, role: str, offset: RoleOffset, streams: Streams) -> Finding:
+    """Return the finding on a clock: which is off where two others agree, else that two differ."""
+    name = recipe_role(role, streams)
+    subject, names = Subject("role", name), {"reference": found.reference, "by": _means(found, role)}
+    offset_s, offset_2std_s = offset.offset_s, 2 * offset.std_s
+    hours = found.span_s / 3600
+    drift_s, drift_2std_s = offset.drift_s_per_h * hours, 2 * offset.drift_std_s_per_h * hours
+    if not offset.blamed:
+        return make_finding(
+            "clocks-differ",
+            subject,
+            action="inflated" if GNSS in {role, found.reference} else None,
+            names=names,
+            offset_s=offset_s,
+            offset_2std_s=offset_2std_s,
+            apart_s=abs(offset_s) + (abs(drift_s) / 2 if offset.drifts else 0.0),
+            drift_s=drift_s,
+            drift_2std_s=drift_2std_s,
         )
     if offset.drifts:
-        return f"{name}: its stamps drift against {found.reference} by {change_s:+.2f} s {drift}: no constant offset corrects that"
-    return (
-        f"{name}: its stamps seem {abs(offset.offset_s):.2f} s {'late' if offset.offset_s > 0 else 'early'} against {found.reference} "
-        f"{constant}; nothing is corrected"
+        remedies = _use_log_time(role, name, streams)
+        return make_finding(
+            "clock-drift", subject, names=names, remedies=remedies, drift_s=drift_s, drift_2std_s=drift_2std_s
+        )
+    given_s = streams.report.facts.time_offset_s.get(name, 0.0)
+    correction_s = round(given_s - offset_s, 3 if offset.std_s < _FINE_S else 2)
+    is_inflated = role == IMU and bool(found.heading_offset_s)
+    return make_finding(
+        "time-offset",
+        subject,
+        severity="note" if is_inflated else None,
+        action="inflated" if is_inflated else None,
+        names=names,
+        remedies=suggest("correct", {"read.time_offset_s": {name: correction_s}}),
+        offset_s=offset_s,
+        offset_2std_s=offset_2std_s,
     )
+
+
+def _use_log_time(role: str, name: str, streams: Streams) -> tuple[Remedy, ...]:
+    by_log = streams.sensors[role].time_source == "log"
+    return () if by_log else suggest("use_log_time", {"read.time": {name: "log"}})
 
 
 def _told(each: RoleOffset | Pair) -> dict[str, Any]:
@@ -87,7 +96,7 @@ def _told(each: RoleOffset | Pair) -> dict[str, Any]:
 
 def _means(found: ClockOffsets, role: str) -> str:
     """Return by what the role was compared."""
-    return " and ".join(dict.fromkeys(p.by for p in found.pairs if p.determined and role in {p.late, p.against}))
+    return ", ".join(dict.fromkeys(p.by for p in found.pairs if p.determined and role in {p.late, p.against}))
 
 
 def with_offset_cost(track: pa.Table, clocks: ClockFacts) -> pa.Table:

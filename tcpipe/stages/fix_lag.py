@@ -10,7 +10,7 @@ from tcpipe.stages.fuse_inputs import FusionInputs
 from tcpipe.stages.fuse_mounting import moved_m
 from tcpipe.stages.fuse_stretches import Fused
 from tcpipe.tables.facts import ClockFacts, ClockOffset
-from tcpipe.tables.findings import StageReport
+from tcpipe.tables.findings import StageReport, Subject, make_finding
 from tcpipe.tables.levels import Streams
 
 
@@ -32,11 +32,15 @@ def with_lag_of_fixes(clocks: StageReport[ClockFacts], lag: tuple[float, float] 
     if lag is None or clocks.facts.position_offset_s or (known is not None and (known.noted or known.drifts)):
         return clocks
     lag_s, std_s = lag
-    line = (
-        f"gnss: its fixes lie on the path as if stamped {abs(lag_s):.2f} s {'late' if lag_s > 0 else 'early'} (± {2 * std_s:.2f} s, by "
-        "how the speed changes along it), or those of the odometry are off: nothing is corrected or advised; the deviations of positions "
-        "count what is driven in it"
+    finding = make_finding(
+        "clocks-differ",
+        Subject("role", GNSS),
+        action="inflated",
+        names={"reference": "odometry", "by": "path"},
+        offset_s=lag_s,
+        offset_2std_s=2 * std_s,
+        apart_s=abs(lag_s),
     )
-    offset = ClockOffset(lag_s, std_s, True, None, None, False, "", blamed=False)
+    offset = ClockOffset(lag_s, std_s, True, None, None, False, blamed=False)
     facts = replace(clocks.facts, offsets={**clocks.facts.offsets, GNSS: offset}, position_offset_s=abs(lag_s))
-    return StageReport((*clocks.warnings, line), facts)
+    return StageReport((*clocks.findings, finding), facts)

@@ -3,23 +3,23 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from tcpipe.errors import FusionError
 from tcpipe.recipe import FuseConfig
-from tcpipe.recipe.suggestions import recipe_key
 from tcpipe.stages.clock_doctor import clock_findings, with_offset_cost
 from tcpipe.stages.fix_lag import with_lag_on_path
 from tcpipe.stages.fuse_agreeing import fuse_agreeing
 from tcpipe.stages.fuse_audit import audit_findings
 from tcpipe.stages.fuse_columns import rejections_table
-from tcpipe.stages.fuse_findings import fuse_facts, fuse_warnings
+from tcpipe.stages.fuse_findings import fuse_facts, fuse_findings
 from tcpipe.stages.fuse_inputs import FusionInputs, prepare_inputs
 from tcpipe.stages.fuse_mounting_findings import mounting_findings
 from tcpipe.stages.fuse_sanity import sane_inputs
 from tcpipe.stages.read_pose import GNSS, pose_as_fixes, recipe_role
-from tcpipe.tables.findings import StageReport
+from tcpipe.tables.findings import Finding, StageReport, Subject, make_finding
 from tcpipe.tables.levels import TRACK, Datum, Streams, Track, TrackInfo
 
 
@@ -42,11 +42,12 @@ def fuse_run(streams: Streams, config: FuseConfig, *, run_id: str) -> Track:
     # 1. A pose made elsewhere is what the fixes are.
     #    Streams become measurements: one frame, one set of units, usable variances; sensors that cannot be right are left out.
     streams, local = pose_as_fixes(streams)
+    run = Subject("run", run_id)
     inputs, sanity = sane_inputs(prepare_inputs(streams, config), streams)
     # 2. Each stretch for itself: where it starts, filter and smoother; again where that shows other mountings, or a sensor to be alone.
-    inputs, sanity, fused = fuse_agreeing(inputs, sanity, streams, config)
+    inputs, sanity, fused = fuse_agreeing(inputs, sanity, streams, config, run=run)
     if not fused.found:
-        raise FusionError(_nothing(streams, inputs), *sanity.warnings)
+        raise FusionError("no motion to fuse", findings=(_find_nothing(streams, inputs, run), *sanity.findings))
     columns = {name: np.concatenate([part[name] for part in fused.columns]) for name in fused.columns[0]}
     if local:
         columns |= {name: np.full_like(columns[name], np.nan) for name in ("lon_deg", "lat_deg", "alt_m")}
@@ -58,9 +59,9 @@ def fuse_run(streams: Streams, config: FuseConfig, *, run_id: str) -> Track:
     table = with_offset_cost(table, clocks.facts)
     mounting, audit = mounting_findings(inputs, streams), audit_findings(fused, inputs, streams)
     found = (sanity, mounting, audit, clocks)
-    warnings = (
-        *fuse_warnings(inputs, summary, fixes=recipe_role(GNSS, streams)),
-        *(line for each in found for line in each.warnings),
+    findings = (
+        *fuse_findings(inputs, summary, run=run, fixes=recipe_role(GNSS, streams)),
+        *(finding for each in found for finding in each.findings),
     )
     facts = replace(
         streams.report.facts,
@@ -70,15 +71,12 @@ def fuse_run(streams: Streams, config: FuseConfig, *, run_id: str) -> Track:
         audit=audit.facts,
         clock_offsets=clocks.facts,
     )
-    report = StageReport(streams.report.findings + warnings, facts)
+    report = StageReport(streams.report.findings + findings, facts)
     info = TrackInfo(run_id, streams.robot, datum, config.rate_hz, config.estimator, report)
     return Track(table, rejections_table(inputs, fused.found), info)
 
 
-def _nothing(streams: Streams, inputs: FusionInputs) -> str:
-    rows = {role: table.num_rows for role, table in streams.tables.items()}
-    unusable = {role: count["invalid"] for role, count in inputs.counts.items() if count["invalid"]}
-    return (
-        f"fusion: no motion to fuse; rows by role: {rows}, unusable: {unusable}; wanted GNSS, wheel or visual odometry over "
-        f"some time: see the topics with tcpipe inspect, and name them ({recipe_key('read.topics')})"
-    )
+def _find_nothing(streams: Streams, inputs: FusionInputs, run: Subject) -> Finding:
+    rows: dict[str, Any] = {f"{role}_row_count": table.num_rows for role, table in streams.tables.items()}
+    rows |= {f"{role}_unusable_count": count["invalid"] for role, count in inputs.counts.items() if count["invalid"]}
+    return make_finding("no-motion", run, **rows)

@@ -11,26 +11,22 @@ from collections.abc import Sequence
 
 from tcpipe.errors import FusionError
 from tcpipe.fusion.checks.audit import alone_in_most, confirmations, consistent, goes_astray, undecided_in_most
-from tcpipe.fusion.checks.sensors import Refusal, fixes_refused
+from tcpipe.fusion.checks.refusals import Refusal, refuse_fixes
 from tcpipe.fusion.measurements import GNSS, IMU
 from tcpipe.recipe import FuseConfig
-from tcpipe.recipe.suggestions import recipe_key
 from tcpipe.stages.fuse_inputs import FusionInputs
 from tcpipe.stages.fuse_mounting import fuse_mounted
 from tcpipe.stages.fuse_sanity import left_out
 from tcpipe.stages.fuse_stretches import Fused, fuse_stretches
 from tcpipe.tables.facts import SensorChecks
-from tcpipe.tables.findings import StageReport
+from tcpipe.tables.findings import StageReport, Subject, make_finding
 from tcpipe.tables.levels import Streams
-
-_WHY = "in most of the way the others contradict it, and not each other (another clock, drive or unit?)"
-_WHY_ASTRAY = "with it the track moves otherwise than every sensor says, without it the track follows them"
 
 Judged = tuple[FusionInputs, StageReport[SensorChecks]]
 
 
 def fuse_agreeing(
-    inputs: FusionInputs, sanity: StageReport[SensorChecks], streams: Streams, config: FuseConfig
+    inputs: FusionInputs, sanity: StageReport[SensorChecks], streams: Streams, config: FuseConfig, *, run: Subject
 ) -> tuple[FusionInputs, StageReport[SensorChecks], Fused]:
     """Fuse each stretch; where sensors contradict each other in most of the way, again without the one that is at fault.
 
@@ -45,15 +41,12 @@ def fuse_agreeing(
     if lone or astray or undecided_in_most(fused.tallies):
         lone = _at_fault(inputs, sanity, streams, config, astray=astray) or lone
         if lone:
-            inputs, sanity = _without(lone, _WHY_ASTRAY if astray else _WHY, inputs, sanity, streams)
+            inputs, sanity = _without(lone, inputs, sanity, streams, astray=astray)
             found, fused = fuse_mounted(inputs, streams, config)
     if _is_astray(fused):
-        raise FusionError(
-            f"fusion: in {fused.astray / fused.windows:.0%} of the run the track moves otherwise than every sensor says, and trials "
-            f"do not tell which sensor errs: nothing of the run is used; look at the streams with tcpipe inspect --full, and leave out "
-            f"the sensors that err ({recipe_key('read.topics')}: an empty list for the role)",
-            *sanity.warnings,
-        )
+        astray_fraction = fused.astray / fused.windows
+        finding = make_finding("track-contradicts-sensors", run, astray_fraction=astray_fraction)
+        raise FusionError("the track contradicts every sensor", findings=(finding, *sanity.findings))
     return found, sanity, fused
 
 
@@ -62,10 +55,11 @@ def _is_astray(fused: Fused) -> bool:
 
 
 def _without(
-    roles: Sequence[str], why: str, inputs: FusionInputs, sanity: StageReport[SensorChecks], streams: Streams
+    roles: Sequence[str], inputs: FusionInputs, sanity: StageReport[SensorChecks], streams: Streams, *, astray: bool
 ) -> Judged:
+    code = "misleads-track" if astray else "contradicted-by-others"
     odometries = {name for m in inputs.measurements.values() for name in m.odometries()}.difference(roles)
-    refusals = [fixes_refused(why, odometries) if role == GNSS else Refusal(role, why) for role in roles]
+    refusals = [refuse_fixes(code, odometries) if role == GNSS else Refusal(role, code) for role in roles]
     return left_out(inputs, sanity, refusals, streams)
 
 
@@ -83,7 +77,7 @@ def _at_fault(
     agreeing: dict[str, int] = {}
     following: list[str] = []
     for role in roles:
-        rest, _ = _without([role], _WHY, inputs, sanity, streams)
+        rest, _ = _without([role], inputs, sanity, streams, astray=astray)
         if any(m.gnss is not None or m.odometries() for m in rest.measurements.values()):
             tried = fuse_stretches(rest, streams, config)
             if tried.tallies and consistent(tried.tallies):

@@ -1,23 +1,24 @@
-"""What fusing noticed: facts for the manifest and warnings for people."""
+"""What fusing noticed: facts for the manifest, and findings."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
-from tcpipe.fusion.measurements import GNSS, IMU, VISUAL, WHEELS, InitialState
+from tcpipe.fusion.measurements import GNSS, VISUAL, WHEELS, InitialState
 from tcpipe.fusion.stretches import Stretch
 from tcpipe.fusion.trajectory import Trajectory
 from tcpipe.geometry.rotation import rpy_from_quat
 from tcpipe.stages.fuse_inputs import FusionInputs
-from tcpipe.stages.fuse_sanity import without_role
-from tcpipe.tables.facts import FuseFacts, StretchFacts
+from tcpipe.stages.fuse_sanity import exclude_role
+from tcpipe.tables.catalogue import threshold
+from tcpipe.tables.facts import FuseFacts, Reopening, StretchFacts
+from tcpipe.tables.findings import Finding, Subject, make_finding
 
-_MANY_REFUSED = 0.2
-_COMMON = 0.02
-_LOCAL = "the track lies in a local frame that starts at 0, 0, 0 and cannot be placed on a map"
+_COURSE = "course over ground"
 
 
 def stretch_facts(stretch: Stretch, initial: InitialState, found: Trajectory) -> StretchFacts:
@@ -59,62 +60,79 @@ def fuse_facts(inputs: FusionInputs, stretches: Sequence[StretchFacts], *, rows:
     )
 
 
-def fuse_warnings(inputs: FusionInputs, facts: FuseFacts, *, fixes: str = GNSS) -> tuple[str, ...]:
-    """Return what a person should know before trusting the track; ``fixes`` is the role in the recipe of what tells positions."""
-    counts = {role: count for role, count in inputs.counts.items() if role not in inputs.refused}
-    found = [remark for remark in inputs.remarks if remark.split(":")[0] not in inputs.refused]
-    if inputs.datum_deg_m is None and GNSS in inputs.counts:  # a log without any fix was warned of when it was read
-        found.append(f"no GNSS position is used: {_LOCAL}")
+def fuse_findings(inputs: FusionInputs, facts: FuseFacts, *, run: Subject, fixes: str = GNSS) -> tuple[Finding, ...]:
+    """Return what was observed while fusing; ``fixes`` is the recipe's role of the positions."""
+    gnss, first_ns = Subject("role", fixes), min((stretch.start_ns for stretch in facts.stretches), default=0)
+    findings = [finding for finding in inputs.findings if finding.subject.name not in inputs.refused]
+    if inputs.datum_deg_m is None and GNSS in inputs.counts:  # a log without any fix was found when it was read
+        findings.append(make_finding("local-frame", gnss))
     elif inputs.datum_deg_m is not None:
-        found += [
-            f"clock epoch {stretch.epoch}: no 5 m of course over ground, so its initial yaw is from {stretch.heading_from}"
-            for stretch in facts.stretches
-            if stretch.heading_from != "course over ground"
+        findings += [_find_initial_yaw(of, first_ns, gnss) for of in facts.stretches if of.heading_from != _COURSE]
+    findings += _find_reopenings(facts, first_ns)
+    findings += _find_scale(inputs, facts)
+    findings += _find_rejections(facts, fixes)
+    for key, code in (("variances_replaced", "variances-replaced"), ("invalid", "values-unusable")):
+        findings += [
+            make_finding(code, Subject("role", role), row_count=count[key])
+            for role, count in inputs.counts.items()
+            if count[key] and role not in inputs.refused
         ]
-    found += _reopened(facts)
-    common = max((stretch.common_scale_std or 0.0 for stretch in facts.stretches), default=0.0)
-    if common > _COMMON:
-        what = "these fixes are too few or too coarse to tell it" if GNSS in facts.sensors else "a GNSS would tell it"
-        known = "nothing tells how long a metre of odometry is: its scale stays 1"
-        if inputs.scales:
-            known, what = (
-                "how long a metre of odometry is, these fixes tell but roughly",
-                "finer or more fixes would tell it better",
-            )
-        found.append(
-            f"{known}, and {common:.0%} are in the deviations of velocity, duration, power and energy as one error of the whole run; {what}"
-        )
-    if IMU not in facts.sensors:
-        found.append("no IMU is used: attitude is inferred from the path; roll and pitch are weak")
-    found += [
-        f"{(name := fixes if role == GNSS else role)}: {facts.rejected[role]} of {count} measurements were refused by the gate "
-        f"(rejections.parquet){without_role(name, 'if it is what errs, to leave it out')}"
-        for role, count in facts.measurements.items()
-        if facts.rejected[role] > _MANY_REFUSED * count
-    ]
-    for key, text in (
-        ("variances_replaced", "rows without a usable variance; the recipe's is used"),
-        ("invalid", "rows without a usable value"),
-    ):
-        found += [f"{role}: {count[key]} {text}" for role, count in counts.items() if count[key]]
     if facts.skipped_s:
-        found.append(f"{facts.skipped_s:.1f} s between pauses or clock steps hold too little to place a track")
-    return tuple(found)
+        findings.append(make_finding("sections-skipped", run, skipped_s=facts.skipped_s))
+    return tuple(findings)
 
 
-def _reopened(facts: FuseFacts) -> list[str]:
-    """Return by sensor how often it left the path of the others for seconds, and where most."""
-    found = []
-    every = [reopening for stretch in facts.stretches for reopening in stretch.reopenings]
-    ways = [role for role in (WHEELS, VISUAL) if role in facts.sensors]
-    doubt = f"; or {ways[0]} errs there: nothing else tells how far the robot goes" if len(ways) == 1 else ""
-    for role in sorted({reopening.role for reopening in every}):
-        mine = [reopening for reopening in every if reopening.role == role]
-        worst = max(mine, key=lambda reopening: reopening.size)
-        unit = "m" if role == GNSS else "m/s"
-        found.append(
-            f"{role}: {len(mine)} times it contradicted the other sensors for seconds, most by {worst.size:.2f} {unit} from "
-            f"{worst.start_ns} to {worst.end_ns} ns (run.json: reopenings): look there at its clock, its mounting and its surroundings"
-            f"{doubt if role == GNSS else ''}"
+def _find_initial_yaw(stretch: StretchFacts, first_ns: int, gnss: Subject) -> Finding:
+    names = {"source": stretch.heading_from}
+    return make_finding("initial-yaw-uncertain", gnss, span_s=_span_s(stretch, first_ns), names=names)
+
+
+def _find_scale(inputs: FusionInputs, facts: FuseFacts) -> list[Finding]:
+    """Return the finding that nothing shows well how long a metre of odometry is."""
+    std = max((stretch.common_scale_std or 0.0 for stretch in facts.stretches), default=0.0)
+    if std <= threshold("odometry-scale-unobservable", "min_scale_std_fraction"):
+        return []
+    role = WHEELS if WHEELS in facts.sensors or VISUAL not in facts.sensors else VISUAL
+    names = {"reason": "coarse-gnss" if GNSS in facts.sensors or inputs.scales else "no-gnss"}
+    subject = Subject("role", role)
+    return [make_finding("odometry-scale-unobservable", subject, names=names, scale_std_fraction=std)]
+
+
+def _find_rejections(facts: FuseFacts, fixes: str) -> list[Finding]:
+    most = threshold("measurements-rejected", "max_rejected_fraction")
+    findings = []
+    for role, count in facts.measurements.items():
+        rejected, name = facts.rejected[role], fixes if role == GNSS else role
+        if rejected > most * count:
+            finding = make_finding(
+                "measurements-rejected",
+                Subject("role", name),
+                remedies=exclude_role(name),
+                rejected_fraction=rejected / count,
+                rejected_count=rejected,
+                measurement_count=count,
+            )
+            findings.append(finding)
+    return findings
+
+
+def _find_reopenings(facts: FuseFacts, first_ns: int) -> list[Finding]:
+    """Return by sensor how often it contradicted the others for seconds, and where most."""
+    findings = []
+    reopenings = [reopening for stretch in facts.stretches for reopening in stretch.reopenings]
+    odometries = [role for role in (WHEELS, VISUAL) if role in facts.sensors]
+    for role in sorted({reopening.role for reopening in reopenings}):
+        of_role = [reopening for reopening in reopenings if reopening.role == role]
+        worst = max(of_role, key=lambda reopening: reopening.size)
+        subject, span_s = Subject("role", role), _span_s(worst, first_ns)
+        code, off = (
+            ("gnss-contradicts-odometry", "off_m") if role == GNSS else ("odometry-contradicts-others", "off_mps")
         )
-    return found
+        suspect = {"suspect": odometries[0]} if role == GNSS and len(odometries) == 1 else {}
+        numbers: dict[str, Any] = {off: worst.size, "event_count": len(of_role)}
+        findings.append(make_finding(code, subject, span_s=span_s, names=suspect, **numbers))
+    return findings
+
+
+def _span_s(each: StretchFacts | Reopening, first_ns: int) -> tuple[float, float]:
+    return (each.start_ns - first_ns) / 1e9, (each.end_ns - first_ns) / 1e9

@@ -20,18 +20,19 @@ from tcpipe.fusion.preparation import Prepared
 from tcpipe.recipe import FuseConfig
 from tcpipe.tables.arrays import rows_where
 from tcpipe.tables.columns import FloatColumns, integers
+from tcpipe.tables.findings import Finding, Subject, make_finding
 from tcpipe.tables.levels import Sensor, Streams
 
 
 @dataclass(slots=True)
 class FusionInputs:
-    """Measurements by epoch; datum (longitude, latitude, height) or None; by role, unusable stamps, counts and remarks; refused roles."""
+    """Measurements by epoch; datum (longitude, latitude, height) or None; by role, unusable stamps and counts; findings; refused roles."""
 
     datum_deg_m: tuple[float, float, float] | None
     measurements: dict[int, Measurements] = field(default_factory=dict)
     invalid_ns: dict[str, list[NDArray[np.int64]]] = field(default_factory=dict)
     counts: dict[str, dict[str, int]] = field(default_factory=dict)
-    remarks: list[str] = field(default_factory=list)
+    findings: list[Finding] = field(default_factory=list)
     refused: frozenset[str] = frozenset()
     arm: Arm | None = None
     """What is known of the antenna's arm where it was mended or nobody stated it."""
@@ -47,7 +48,7 @@ class FusionInputs:
         count["invalid"] += prepared.invalid_ns.size
         count["repeated"] += prepared.repeated
         count["variances_replaced"] += prepared.variances_replaced
-        self.remarks += [f"{role}: {remark}" for remark in prepared.remarks if f"{role}: {remark}" not in self.remarks]
+        self.findings += [finding for finding in prepared.findings if finding not in self.findings]
 
 
 def prepare_inputs(streams: Streams, config: FuseConfig) -> FusionInputs:
@@ -59,12 +60,13 @@ def prepare_inputs(streams: Streams, config: FuseConfig) -> FusionInputs:
         datum = preparation.find_datum(fixes["lon_deg"], fixes["lat_deg"], fixes["alt_m"])
     inputs = FusionInputs(datum)
     if config.estimator == "ukf" and tables.pop(DOPPLER, None) is not None:
-        inputs.remarks.append(f"{DOPPLER}: the forward filter (ukf) does not use it")
+        names = {"estimator": config.estimator}
+        inputs.findings.append(make_finding("unused-by-estimator", Subject("role", DOPPLER), names=names))
     for epoch in sorted({int(e) for table in tables.values() for e in pc.unique(table["epoch"]).to_pylist()}):
         parts = {role: rows_where(table, "epoch", epoch) for role, table in tables.items()}
         found = {role: _prepare(role, part, streams.sensors[role], config, inputs) for role, part in parts.items()}
-        gnss, remarks = steadied(found.get(GNSS), found.get(WHEELS) or found.get(VISUAL))
-        inputs.remarks += remarks
+        gnss, findings = steadied(found.get(GNSS), found.get(WHEELS) or found.get(VISUAL))
+        inputs.findings += findings
         inputs.measurements[epoch] = Measurements(
             gnss=gnss,
             doppler=found.get(DOPPLER),

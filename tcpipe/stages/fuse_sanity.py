@@ -1,32 +1,34 @@
-"""Measurements that are to be fused: what contradicts physics or the other sensors is left out, and the recipe line that mends it named."""
+"""Measurements that are to be fused: what contradicts physics or the other sensors is left out, with the remedy in a finding."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.fusion.checks.doppler import doubt_of_velocity
 from tcpipe.fusion.checks.odometry_scale import rescaled_odometries
-from tcpipe.fusion.checks.sensors import CommandedSpeed, Refusal, check_sensors
+from tcpipe.fusion.checks.refusals import Refusal
+from tcpipe.fusion.checks.sensors import CommandedSpeed, check_sensors
 from tcpipe.fusion.measurements import DOPPLER, GNSS, IMU, VISUAL, WHEELS, Measurements
 from tcpipe.geometry.rotation import matrix_from_quat, rpy_from_matrix
-from tcpipe.recipe.suggestions import suggested
+from tcpipe.recipe.suggestions import suggest
 from tcpipe.stages.fuse_inputs import FusionInputs
 from tcpipe.stages.read_pose import recipe_role
 from tcpipe.tables.arrays import rows_where
 from tcpipe.tables.columns import floats, integers
 from tcpipe.tables.facts import SensorChecks
-from tcpipe.tables.findings import StageReport
+from tcpipe.tables.findings import Finding, Remedy, StageReport, Subject, make_finding
 from tcpipe.tables.levels import Streams
 
 _STATED = ("recipe", "tf_static", "same frame")
 
 
 def sane_inputs(inputs: FusionInputs, streams: Streams) -> tuple[FusionInputs, StageReport[SensorChecks]]:
-    """Return the inputs without the sensors that are refused, and why, judged over the longest clock epoch."""
+    """Return the inputs without the sensors that are refused, and the findings, judged over the longest clock epoch."""
     if not inputs.measurements:
         return inputs, StageReport((), SensorChecks())
     epoch = longest_epoch(inputs)
@@ -39,27 +41,20 @@ def sane_inputs(inputs: FusionInputs, streams: Streams) -> tuple[FusionInputs, S
         inputs = replace(inputs, measurements=measured, scales=checks.scales)
     sane, found = left_out(inputs, StageReport((), checks.facts), checks.refusals, streams)
     doubt = doubt_of_velocity(sane.measurements[epoch])
-    if doubt is None:
-        return sane, found
-    sane, found = left_out(sane, found, [Refusal(DOPPLER, doubt.why)], streams)
-    if doubt.late_s is None:
-        return sane, found
-    given_s = streams.report.facts.time_offset_s.get(DOPPLER, 0.0)
-    mend = suggested("to correct its clock", {"read.time_offset_s": {DOPPLER: round(given_s - doubt.late_s, 2)}})
-    return sane, replace(found, warnings=(*found.warnings[:-1], found.warnings[-1] + mend))
+    return (sane, found) if doubt is None else left_out(sane, found, [doubt], streams)
 
 
 def left_out(
     inputs: FusionInputs, before: StageReport[SensorChecks], refusals: Sequence[Refusal], streams: Streams
 ) -> tuple[FusionInputs, StageReport[SensorChecks]]:
-    """Return the inputs without refused sensors, with why and the warnings that name the mending line."""
+    """Return the inputs without refused sensors, the findings, and the codes of these by role."""
     refused = inputs.refused | {refusal.role for refusal in refusals}
     kept = {number: _without(refused, measurements) for number, measurements in inputs.measurements.items()}
-    reasons = {**before.facts.refused, **{refusal.role: refusal.why for refusal in refusals}}
-    warnings = (*before.warnings, *(_warning(refusal, streams) for refusal in refusals))
+    codes = {**before.facts.refused, **{refusal.role: refusal.code for refusal in refusals}}
+    findings = (*before.findings, *(_find_exclusion(refusal, streams) for refusal in refusals))
     datum = None if GNSS in refused else inputs.datum_deg_m
     inputs = replace(inputs, datum_deg_m=datum, measurements=kept, refused=refused)
-    return inputs, StageReport(warnings, replace(before.facts, refused=reasons))
+    return inputs, StageReport(findings, replace(before.facts, refused=codes))
 
 
 def _without(refused: frozenset[str], m: Measurements) -> Measurements:
@@ -98,25 +93,40 @@ def _felt(streams: Streams) -> float:
     return float(np.median(np.linalg.norm(force, axis=1)))
 
 
-def _warning(refusal: Refusal, streams: Streams) -> str:
+def _find_exclusion(refusal: Refusal, streams: Streams) -> Finding:
+    """Return the finding of a sensor that is not fused; a receiver's velocity helps fixes that are fused, and no label needs it."""
     sensor, name = streams.sensors[refusal.role], recipe_role(refusal.role, streams)
-    what = f"{name}: {sensor.topic} is not fused: {refusal.why}"
     if refusal.units is not None:
-        return what + suggested("if that is so", {"read": {"imu_units": refusal.units}})
-    if refusal.instead is not None:
-        return what + without_role(recipe_role(refusal.instead, streams), f"to leave {refusal.instead} out instead")
-    if refusal.turned_by is None:
-        return what + without_role(name, "to leave it out by name")
-    turned = refusal.turned_by @ matrix_from_quat(sensor.quat_xyzw)
-    return f"{what} (its mounting: {sensor.placed_by})" + stated_placement(name, sensor.xyz_m, turned, "what would fit")
+        remedies = suggest("state_units", {"read": {"imu_units": refusal.units}})
+    elif refusal.late_s is not None:
+        given_s = streams.report.facts.time_offset_s.get(name, 0.0)
+        remedies = suggest("correct", {"read.time_offset_s": {name: round(given_s - refusal.late_s, 2)}})
+    elif refusal.turned_by is not None:
+        remedies = state_extrinsics(name, sensor.xyz_m, refusal.turned_by @ matrix_from_quat(sensor.quat_xyzw))
+    elif refusal.is_suspect_excludable:
+        remedies = exclude_role(recipe_role(refusal.names["suspect"], streams), "exclude_suspect")
+    else:
+        remedies = exclude_role(name)
+    numbers: Mapping[str, Any] = refusal.numbers
+    return make_finding(
+        refusal.code,
+        Subject("role", name),
+        action="excluded",
+        severity="note" if refusal.role == DOPPLER else None,
+        names={"topic": sensor.topic, "placed_by": sensor.placed_by, **refusal.names},
+        remedies=remedies,
+        **numbers,
+    )
 
 
-def without_role(name: str, purpose: str) -> str:
-    """Return what leaves a role out, whichever topic plays it and whoever chose that."""
-    return suggested(purpose, {"read.topics": {name: []}})
+def exclude_role(name: str, remedy: str = "exclude") -> tuple[Remedy, ...]:
+    """Return what excludes a role, whichever topic is used as it and whoever chose that."""
+    return suggest(remedy, {"read.topics": {name: []}})
 
 
-def stated_placement(name: str, xyz_m: Sequence[float], turn: NDArray[np.float64], purpose: str) -> str:
-    """Return what states a sensor's place [m] and its rotation to base_link, shape (3, 3)."""
+def state_extrinsics(name: str, xyz_m: Sequence[float], turn: NDArray[np.float64]) -> tuple[Remedy, ...]:
+    """Return what states a sensor's lever arm [m] and its rotation to base_link, shape (3, 3)."""
     place, rpy_rad = (np.round(values, digits) + 0.0 for values, digits in ((xyz_m, 3), (rpy_from_matrix(turn), 4)))
-    return suggested(purpose, {"read.placement": {name: {"xyz_m": place.tolist(), "rpy_rad": rpy_rad.tolist()}}})
+    return suggest(
+        "state_extrinsics", {"read.placement": {name: {"xyz_m": place.tolist(), "rpy_rad": rpy_rad.tolist()}}}
+    )

@@ -11,25 +11,25 @@ from tcpipe.motion.ledger import JUMP_M, unexplained_m
 from tcpipe.motion.pieces import Floats, Mask, MotionRows
 from tcpipe.motion.uncertainty import along_std_m, chord_ahead_std_m
 from tcpipe.recipe import GateConfig
-from tcpipe.recipe.suggestions import recipe_key
 from tcpipe.stages.gate_plausible import find_implausible
+from tcpipe.tables.catalogue import threshold
 from tcpipe.tables.columns import floats, integers
+from tcpipe.tables.findings import Finding, Subject, make_finding
 from tcpipe.tables.levels import TRACK, Track
 
 _DISPLACEMENTS = [c.name for c in TRACK.columns if c.name.startswith("displacement_std_")]
-_WORTH_SAYING = 0.05
 
 
 @dataclass(frozen=True, slots=True)
 class Gaps:
-    """Rows in a gap by cause, and what a person should know of them."""
+    """Rows in a gap by cause, and the findings."""
 
     without_power: Mask
     uncertain: Mask
     jumps: Mask
     contradicted: Mask
     implausible: Mask
-    warnings: tuple[str, ...]
+    findings: tuple[Finding, ...]
 
     @property
     def rows(self) -> Mask:
@@ -57,25 +57,25 @@ def find_gaps(track: Track, rows: MotionRows, *, chord_m: float, config: GateCon
     jumps = np.zeros(len(moving), dtype=np.bool_)
     steps = np.flatnonzero(off_m > config.max_relative_position_std_m)
     jumps[steps] = jumps[steps + 1] = True
-    warnings = []
-    if moving.any() and (share := without_power[moving].mean()) > _WORTH_SAYING:
-        warnings.append(f"power: there is none on {share:.0%} of the moving track, which therefore has no segments")
-    if moving.any() and (share := uncertain[moving].mean()) > _WORTH_SAYING:
-        limit = f"{config.max_relative_position_std_m} m ({recipe_key('gate.max_relative_position_std_m')})"
-        warnings.append(
-            f"on {share:.0%} of the moving track the distance over {chord_m:g} m is not known to {limit}: no segments there"
+    run, findings = Subject("run", track.info.run_id), []
+    share = float(without_power[moving].mean()) if moving.any() else 0.0
+    if share > threshold("power-gaps", "min_lost_fraction"):
+        findings.append(make_finding("power-gaps", Subject("role", "power"), lost_fraction=share))
+    share = float(uncertain[moving].mean()) if moving.any() else 0.0
+    if share > threshold("distance-uncertain", "min_lost_fraction"):
+        limit_m = config.max_relative_position_std_m
+        findings.append(
+            make_finding("distance-uncertain", run, lost_fraction=share, chord_m=chord_m, max_std_m=limit_m)
         )
     if far := int((off_m > JUMP_M).sum()):
-        at_ns = integers(track.table, "stamp_ns")[int(np.argmax(off_m))]
-        warnings.append(
-            f"the position jumps {far} times, the furthest by {off_m.max():.1f} m at {at_ns} ns, which no speed explains (a GNSS that "
-            "changed its base, datum or receiver, or an odometry that errs?): nothing is cut across, and the jump is not counted as driven"
-        )
+        stamp_ns, furthest = integers(track.table, "stamp_ns"), int(np.argmax(off_m))
+        at_s = (int(stamp_ns[furthest]) - int(stamp_ns[0])) / 1e9
+        jump_m = float(off_m.max())
+        findings.append(make_finding("position-jumps", run, span_s=(at_s, at_s), jump_m=jump_m, jump_count=far))
     audit = track.info.report.facts.audit
     contradicted = np.full(len(moving), bool(audit and audit.undecided))
-    implausible, fast_lines = find_implausible(track, rows, jumps, max_plausible_mps)
-    warnings += fast_lines
-    return Gaps(without_power, uncertain, jumps, contradicted, implausible, tuple(warnings))
+    implausible, too_fast = find_implausible(track, rows, jumps, max_plausible_mps)
+    return Gaps(without_power, uncertain, jumps, contradicted, implausible, (*findings, *too_fast))
 
 
 def _chord_std_m(track: Track, rows: MotionRows, chord_m: float, config: GateConfig) -> Floats:

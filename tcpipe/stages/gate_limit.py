@@ -66,9 +66,15 @@ def find_limits(rows: MotionRows, dropped_by: Mask, limit: SpeedLimit, config: G
     slow = (dropped_by & DropReason.BELOW_LIMIT) != 0
     if limit.limit_mps and slow[moving].sum() > threshold("driven-below-limit", "min_slow_fraction") * moving.sum():
         remedies = (*_state_limit(limit.top_mps), *_KEEP)
-        speeds = {"limit_mps": config.full_speed_fraction * limit.limit_mps, "top_mps": limit.top_mps}
-        slow_fraction = float(slow[moving].mean())
-        return (make_finding("driven-below-limit", _COMMAND, slow_fraction=slow_fraction, remedies=remedies, **speeds),)
+        finding = make_finding(
+            "driven-below-limit",
+            _COMMAND,
+            slow_fraction=float(slow[moving].mean()),
+            limit_mps=config.full_speed_fraction * limit.limit_mps,
+            top_mps=limit.top_mps,
+            remedies=remedies,
+        )
+        return (finding,)
     return limit.findings
 
 

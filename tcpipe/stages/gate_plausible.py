@@ -6,16 +6,16 @@ import numpy as np
 
 from tcpipe.errors import FusionError
 from tcpipe.motion.pieces import Mask, MotionRows
-from tcpipe.recipe.suggestions import recipe_key
 from tcpipe.tables.columns import floats
+from tcpipe.tables.findings import Finding, Subject, make_finding
 from tcpipe.tables.levels import Track
 
 _WINDOW_S = 60.0
 _DRIVES_MPS = 0.1
 
 
-def find_implausible(track: Track, rows: MotionRows, jumps: Mask, limit_mps: float) -> tuple[Mask, tuple[str, ...]]:
-    """Return the rows faster than a limit, by velocity or by the step between two rows, and the warning of them.
+def find_implausible(track: Track, rows: MotionRows, jumps: Mask, limit_mps: float) -> tuple[Mask, tuple[Finding, ...]]:
+    """Return the rows faster than a limit, by velocity or by the step between two rows, and the finding of them.
 
     Parameters
     ----------
@@ -37,18 +37,9 @@ def find_implausible(track: Track, rows: MotionRows, jumps: Mask, limit_mps: flo
     driving_mps = speed_mps[speed_mps > _DRIVES_MPS]
     window = min(driving_mps.size, rows.count(_WINDOW_S))
     faster = np.concatenate(([0], np.cumsum(driving_mps > limit_mps)))
+    run, median_mps = Subject("run", track.info.run_id), float(np.median(driving_mps))
+    numbers = {"fast_s": implausible.sum() * rows.period_s, "limit_mps": limit_mps, "median_mps": median_mps}
     if 2 * int((faster[window:] - faster[:-window]).max()) > window:
-        raise FusionError(
-            f"fusion: in most of a minute the track drives faster than {limit_mps:g} m/s (median {np.median(driving_mps):.0f} m/s over the "
-            "run): the estimate does not follow the robot, and nothing of the run is used; look at the sensors with tcpipe inspect "
-            f"--full, and leave out the one that errs ({recipe_key('read.topics')}: an empty list for its role); {_remedy()}",
-            *track.info.report.findings,
-        )
-    fast_s = implausible.sum() * rows.period_s
-    return implausible, (
-        f"for {fast_s:.1f} s the track is faster than {limit_mps:g} m/s: no segments there; {_remedy()}",
-    )
-
-
-def _remedy() -> str:
-    return f"if the robot is that fast, set {recipe_key('gate.max_plausible_mps')}"
+        finding = make_finding("track-too-fast", run, severity="error", action="rejected", **numbers)
+        raise FusionError("the track is faster than plausible", findings=(finding, *track.info.report.findings))
+    return implausible, (make_finding("track-too-fast", run, **numbers),)

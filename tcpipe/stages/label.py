@@ -15,7 +15,7 @@ from tcpipe.geometry.piecewise_linear import mean_between
 from tcpipe.power.energy import Rule, samples_inside
 from tcpipe.recipe import LabelConfig
 from tcpipe.stages.label_cost import segment_costs
-from tcpipe.stages.label_facts import label_facts, label_warnings
+from tcpipe.stages.label_facts import label_facts, label_findings
 from tcpipe.stages.label_motion import motion_columns
 from tcpipe.stages.label_physics import with_physics
 from tcpipe.stages.label_quality import clock_doubtful, motion_flags, power_flags
@@ -88,5 +88,5 @@ def label_segments(
     facts = label_facts(
         table, rails_by_epoch, joules, ledger_m, variance_j2, rule=rule, velocity=velocity, physics=physics
     )
-    info = add_findings(segments.info, label_warnings(facts), replace(segments.info.report.facts, label=facts))
+    info = add_findings(segments.info, label_findings(facts), replace(segments.info.report.facts, label=facts))
     return LabelledSegments(table, info, segments.ledger_m)

@@ -1,4 +1,4 @@
-"""What labelling noticed: the run's energy by entry, the noise floor, the count of every quality bit, and warnings."""
+"""What labelling noticed: the run's energy by entry, the noise floor, the count of every quality bit, and findings."""
 
 from __future__ import annotations
 
@@ -8,19 +8,19 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from tcpipe.cost.budget import energy_budget
+from tcpipe.cost.budget import energy_budget, find_noise
 from tcpipe.cost.quality import wanted_rate_hz
 from tcpipe.power.energy import Rule
 from tcpipe.power.rails import Rail
 from tcpipe.stages.power_rails import rail_facts
 from tcpipe.tables.arrays import numbers
 from tcpipe.tables.bits import Quality, name_of
+from tcpipe.tables.catalogue import threshold
 from tcpipe.tables.columns import floats
 from tcpipe.tables.facts import EnergyBudget, LabelFacts, PhysicsFacts
+from tcpipe.tables.findings import Finding, Subject, make_finding
 
-_MUCH_SLIP = 0.05  # of the segments
-_MUCH_STANDING = 0.5
-_FEW_WATT = 20.0
+_POWER, _WHEELS = Subject("role", "power"), Subject("role", "wheel_odometry")
 
 
 def label_facts(
@@ -77,36 +77,34 @@ def _budget(
     )
 
 
-def label_warnings(facts: LabelFacts) -> tuple[str, ...]:
-    """Return what a person should look at."""
-    warnings = []
+def label_findings(facts: LabelFacts) -> tuple[Finding, ...]:
+    """Return what was observed while labelling."""
+    findings = []
     if facts.quality["low_power_rate"] and facts.segments_without_power < facts.segments:
-        rails = [rail for each in facts.rails.values() for rail in each]
-        current, voltage = (
-            min((each.rate_hz for each in signals if each.rate_hz), default=0.0)
-            for signals in ([rail.current for rail in rails], [rail.voltage for rail in rails])
-        )
-        wanted_hz = wanted_rate_hz(averaged=facts.integration == "averaged")
-        what, rate = ("current", current) if current < wanted_hz else ("voltage", voltage)
-        warnings.append(
-            f"power: the {what} is measured at {rate:.1f} Hz only, {wanted_hz:g} Hz are wanted: energy_std_joule holds what that costs"
-        )
+        findings.append(_find_low_rate(facts))
     if facts.energy_joule is not None and facts.segments and facts.segments_without_power:
-        count = f"{facts.segments_without_power} of {facts.segments} segments"
-        warnings.append(f"{count} have no label: the power record does not reach over them")
+        lost, total = facts.segments_without_power, facts.segments
+        findings.append(make_finding("segments-without-power", _POWER, unlabelled_count=lost, segment_count=total))
     slips = facts.quality["high_slip"]
-    if slips > _MUCH_SLIP * facts.segments:
-        warnings.append(
-            f"wheel_odometry: on {slips} of {facts.segments} segments wheels and ground differ by more than 20 % of speed (high_slip): "
-            "they slip there, or what tells the speed over ground is wrong"
-        )
-    standing, driving = facts.physics.standing_watt, facts.median_power_watt
-    if standing is not None and driving is not None and standing > max(_MUCH_STANDING * driving, _FEW_WATT):
-        warnings.append(
-            f"power: {standing:.0f} W are drawn while standing, of {driving:.0f} W while driving: an offset of the current, or more "
-            "than propulsion; labels hold all of it"
-        )
-    return tuple(warnings)
+    if slips > threshold("wheels-slip", "min_segment_fraction") * facts.segments:
+        findings.append(make_finding("wheels-slip", _WHEELS, segment_fraction=slips / facts.segments))
+    idle, driving = facts.physics.standing_watt, facts.median_power_watt
+    least, few = (threshold("idle-power-high", name) for name in ("min_idle_fraction", "min_idle_watt"))
+    if idle is not None and driving is not None and idle > max(least * driving, few):
+        findings.append(make_finding("idle-power-high", _POWER, idle_watt=idle, driving_watt=driving))
+    return (*findings, *find_noise(facts.energy_budget, _POWER))
+
+
+def _find_low_rate(facts: LabelFacts) -> Finding:
+    """Return the finding that the current, or else the voltage, is measured too slowly."""
+    rails = [rail for each in facts.rails.values() for rail in each]
+    current_hz, voltage_hz = (
+        min((each.rate_hz for each in signals if each.rate_hz), default=0.0)
+        for signals in ([rail.current for rail in rails], [rail.voltage for rail in rails])
+    )
+    wanted_hz = wanted_rate_hz(averaged=facts.integration == "averaged")
+    quantity, rate_hz = ("current", current_hz) if current_hz < wanted_hz else ("voltage", voltage_hz)
+    return make_finding("power-too-slow", _POWER, names={"quantity": quantity}, rate_hz=rate_hz, wanted_hz=wanted_hz)
 
 
 def _share(part: NDArray[np.float64], whole: NDArray[np.float64]) -> NDArray[np.float64]:

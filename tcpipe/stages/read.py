@@ -8,6 +8,7 @@ import pyarrow as pa
 
 from tcpipe.errors import RoleError
 from tcpipe.logs.clocks import TopicTimes, settle_clocks
+from tcpipe.logs.role_findings import find_missing_roles
 from tcpipe.logs.roles import MOTION_ROLES
 from tcpipe.logs.simulated_clock import CLOCK
 from tcpipe.power.sources import power_lists
@@ -19,11 +20,12 @@ from tcpipe.stages.read_averaging import with_averaging
 from tcpipe.stages.read_candidates import power_candidates
 from tcpipe.stages.read_findings import read_findings
 from tcpipe.stages.read_pose import placed_pose
-from tcpipe.stages.read_repeats import repeats_warnings, without_repeats
+from tcpipe.stages.read_repeats import find_repeats, without_repeats
 from tcpipe.stages.read_roles import roles_by
 from tcpipe.stages.read_sensors import place_sensors
 from tcpipe.stages.read_sources import TopicReadings, read_sources
 from tcpipe.stages.read_tables import role_table
+from tcpipe.tables.findings import StageReport
 from tcpipe.tables.levels import Streams
 
 
@@ -45,7 +47,7 @@ def read_run(log: LogReader, config: ReadConfig, *, robot: str | None, known: Pr
     # 1. Which topic plays which role, from the topic list alone.
     assignment = roles_by(config, log.topics.values(), robot, known=known)
     if assignment.problems:
-        raise RoleError(*assignment.problems)
+        raise RoleError(*assignment.problems, findings=assignment.findings)
     # 2. Messages to SI columns; what cannot be used is counted.
     played = dict.fromkeys(topic for role in assignment.roles.values() for topic in role.topics)
     lists = {topic: power_lists(log.topics[topic].type_name, known.power_sources) for topic in played}
@@ -65,20 +67,24 @@ def read_run(log: LogReader, config: ReadConfig, *, robot: str | None, known: Pr
     streams, repeats = without_repeats(streams)
     streams, crs, of_pose = placed_pose(streams, assignment, config)
     sensors, unplaced = place_sensors(log, tables, assignment, sources, timelines, config=config)
-    power, asked = with_averaging(power, streams, config)
-    repeated = repeats_warnings(repeats, averaged=power.averaged)
+    power, assumed = with_averaging(power, streams, config)
     offset_s = {str(role): offset for role, offset in config.time_offset_s.items()}
-    no_power = power.refusal or power_candidates(log, assignment, config)
     report = read_findings(assignment, every, clocks, power=power, sensors=sensors, offset_s=offset_s)
     scale = {str(role): factor for role, factor in config.odometry_scale.items()} or None
-    facts = replace(report.facts, odometry_scale=scale, no_power=no_power)
-    first = (no_power.why,) if no_power and no_power.why not in report.findings else ()
-    report = replace(
-        report, findings=(*first, *report.findings, *unread, *unplaced, *repeated, *asked, *of_pose), facts=facts
+    findings = (
+        *report.findings,
+        *find_missing_roles({*streams, "power"} if power.is_rejected else streams.keys()),
+        *power_candidates(log, assignment, config),
+        *unread,
+        *unplaced,
+        *find_repeats(repeats),
+        *assumed,
+        *of_pose,
     )
+    report = StageReport(tuple(dict.fromkeys(findings)), replace(report.facts, odometry_scale=scale))
     if not any(role in streams for role in MOTION_ROLES):
         what = "nothing in the log tells motion: wheel_odometry, visual_odometry, gnss and pose have no usable row"
-        raise RoleError(what, *report.findings)
+        raise RoleError(what, findings=report.findings)
     return Streams(streams, sensors, assignment.robot, crs, power.averaged, report)
 
 

@@ -12,45 +12,43 @@ from numpy.typing import NDArray
 from tcpipe.power.averaging import told_averaged
 from tcpipe.power.readings import PowerReadings
 from tcpipe.recipe import ReadConfig
-from tcpipe.recipe.suggestions import suggested
+from tcpipe.recipe.suggestions import suggest
 from tcpipe.tables.arrays import rows_where
+from tcpipe.tables.catalogue import Severity, threshold
 from tcpipe.tables.columns import floats, integers
+from tcpipe.tables.findings import Finding, Subject, make_finding
 
 
 def with_averaging(
     power: PowerReadings, streams: Mapping[str, pa.Table], config: ReadConfig
-) -> tuple[PowerReadings, list[str]]:
-    """Return the power with whether its values are means over their period, and what is to be said of that."""
+) -> tuple[PowerReadings, tuple[Finding, ...]]:
+    """Return the power with whether its values are means over their period, and the finding where that is assumed."""
     counts = any(rail.counter is not None for rails in power.rails.values() for rail in rails)
     if config.power_averaged != "auto" and not counts:
-        return replace(power, averaged=config.power_averaged == "yes"), []
+        return replace(power, averaged=config.power_averaged == "yes"), ()
     if not power.averaging_unknown or "power" not in streams:
-        return power, []
+        return power, ()
     table = rows_where(streams["power"], "epoch", 0)
     rail = rows_where(table, "rail", table["rail"][0].as_py())
     power_ns, watt = _power_at_current(rail)
     period_s = float(np.median(np.diff(power_ns))) / 1e9 if len(power_ns) > 1 else np.inf
-    if period_s < _FAST_S:
-        return power, []
+    if period_s < threshold(_ASSUMED, "min_period_s"):
+        return power, ()
     motion = next((streams[role] for role in ("wheel_odometry", "visual_odometry") if role in streams), None)
     told = None if motion is None else _by_motion(power_ns, watt, rows_where(motion, "epoch", 0))
     averaged = power.averaged if told is None else told
-    how = "the mean since the one before it" if averaged else "sampled at its stamp"
-    why = (
-        "nobody knows whether its values are means over their period, nor does the motion tell"
-        if told is None
-        else "the motion tells"
-    )
-    settled = {"to settle it": "yes" if averaged else "no", "if that is wrong": "no" if averaged else "yes"}
-    lines = "".join(suggested(purpose, {"read": {"power_averaged": value}}) for purpose, value in settled.items())
-    said = f"power: {why}: each is taken as {how}{lines}"
-    return replace(power, averaged=averaged), [] if told is None and period_s < _SLOW_S else [said]
+    power = replace(power, averaged=averaged)
+    if told is None and period_s < threshold(_ASSUMED, "min_unobserved_period_s"):
+        return power, ()
+    severity: Severity | None = "warning" if told is None else None
+    names = {"value": "mean" if averaged else "sample", "evidence": "nothing" if told is None else "motion"}
+    remedies = [of for value in ("yes", "no") for of in suggest(value, {"read": {"power_averaged": value}})]
+    power_role = Subject("role", "power")
+    found = make_finding(_ASSUMED, power_role, severity=severity, names=names, remedies=remedies, period_s=period_s)
+    return power, (found,)
 
 
-_FAST_S = 0.04
-"""Of what comes as often it makes no difference."""
-_SLOW_S = 0.11
-"""Of what comes as often half a period is no question worth asking."""
+_ASSUMED = "power-averaging-assumed"
 
 
 def _power_at_current(rail: pa.Table) -> tuple[NDArray[np.int64], NDArray[np.float64]]:

@@ -1,9 +1,10 @@
-"""Bare numbers that could be the power of the drives: what they are called, their range, and the recipe that would read them as power."""
+"""Bare numbers that could be the power of the drives: their names, their range, and the recipe that would read them as power."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -11,10 +12,10 @@ from tcpipe.logs.roles import OVERLAY, RoleAssignment
 from tcpipe.logs.topics import Topic
 from tcpipe.power.sources import FLOAT_TYPES, LARGEST_AMP, LARGEST_VOLT, is_of_drives, quantity, rail_of
 from tcpipe.recipe import ReadConfig
-from tcpipe.recipe.suggestions import RecipeFragment, TomlValue
+from tcpipe.recipe.suggestions import TomlValue, suggest
 from tcpipe.stages.message_arrays import message_arrays
 from tcpipe.stages.protocols import LogReader
-from tcpipe.tables.facts import NoPower
+from tcpipe.tables.findings import Finding, Subject, make_finding
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,10 +25,7 @@ class _Candidate:
     scale: float
     """What its numbers are multiplied by, to be V or A."""
     range: tuple[float, float]
-
-    def __str__(self) -> str:
-        unit = ("m" if self.scale != 1.0 else "") + ("V" if self.what == "voltage" else "A")
-        return f"{self.topic.name} ({unit}, {self.range[0]:.4g} to {self.range[1]:.4g})"
+    """Lowest and highest [V] or [A]."""
 
     def source(self, rail: str) -> Mapping[str, TomlValue]:
         """Return the table that reads it as a part of a rail."""
@@ -35,10 +33,10 @@ class _Candidate:
         return keys | ({f"{self.what}_scale": self.scale} if self.scale != 1.0 else {})
 
 
-def power_candidates(log: LogReader, assignment: RoleAssignment, config: ReadConfig) -> NoPower | None:
-    """Return what could be power in a log of which no topic plays it; None where power is played, settled or nothing could be it."""
+def power_candidates(log: LogReader, assignment: RoleAssignment, config: ReadConfig) -> tuple[Finding, ...]:
+    """Return what could be power in a log without a power topic; nothing where the recipe names its topics or there are no such numbers."""
     if "power" in assignment.roles or "power" in config.topics:
-        return None
+        return ()
     wanted = [topic for topic in log.topics.values() if _is_wanted(topic, config)]
     tables = log.tables([topic.name for topic in wanted]) if wanted else {}
     found = []
@@ -50,18 +48,28 @@ def power_candidates(log: LogReader, assignment: RoleAssignment, config: ReadCon
         if known.size and np.any(known):
             most = LARGEST_VOLT if what == "voltage" else LARGEST_AMP
             scale = 0.001 if np.median(np.abs(known)) > most else 1.0
-            found.append(_Candidate(topic, what, scale, (float(known.min()), float(known.max()))))
+            found.append(_Candidate(topic, what, scale, (scale * float(known.min()), scale * float(known.max()))))
     if not found:
-        return None
-    why = f"no topic plays power; what could tell it: {', '.join(map(str, found))}"
+        return ()
     used = _rails(found)
-    if not used:
-        return NoPower(f"{why}; which voltage goes with which current is not clear from their names")
-    names: list[TomlValue] = list(dict.fromkeys(each.topic.name for _, each in used))
-    fragment = RecipeFragment(
-        {"read.topics": {"power": names}, "power_sources": [of.source(rail) for rail, of in used]}
+    topics: list[TomlValue] = list(dict.fromkeys(each.topic.name for _, each in used))
+    sources = [of.source(rail) for rail, of in used]
+    ranges: dict[str, Any] = {
+        f"{end}_{unit}": choose(number for of in found if of.what == what for number in of.range)
+        for what, unit in (("voltage", "volt"), ("current", "amp"))
+        if any(of.what == what for of in found)
+        for end, choose in (("low", min), ("high", max))
+    }
+    return (
+        make_finding(
+            "power-candidates",
+            Subject("role", "power"),
+            names={"topics": ", ".join(of.topic.name for of in found)},
+            remedies=suggest("use", {"read.topics": {"power": topics}, "power_sources": sources}) if used else (),
+            topics_count=len(found),
+            **ranges,
+        ),
     )
-    return NoPower(f"{why}; where these feed the drives, write in a recipe:", fragment.toml())
 
 
 def _is_wanted(topic: Topic, config: ReadConfig) -> bool:

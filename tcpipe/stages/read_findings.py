@@ -1,20 +1,24 @@
-"""What reading noticed: a warning where a person should look, and the facts of every role for the manifest."""
+"""What reading observed: findings on roles, clocks and messages, and the facts of every role for the manifest."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
-from tcpipe.logs.clocks import ON_SIMULATED_CLOCK, Settled, Timeline
+from tcpipe.logs.clocks import RECIPE, Settled, Timeline
 from tcpipe.logs.roles import RoleAssignment
+from tcpipe.logs.simulated_clock import LOG_CLOCK
 from tcpipe.power.readings import PowerReadings
 from tcpipe.stages.read_sources import TopicReadings
-from tcpipe.tables.facts import PowerSign, RobotChoice, RoleFacts, RunFacts, TopicClock, TopicFacts
-from tcpipe.tables.findings import StageReport
+from tcpipe.tables.catalogue import Severity, threshold
+from tcpipe.tables.facts import ClockStep, PowerSign, RobotChoice, RoleFacts, RunFacts, TopicClock, TopicFacts
+from tcpipe.tables.findings import Finding, StageReport, Subject, make_finding
 from tcpipe.tables.levels import Sensor
 
-_MANY_DROPPED = 0.01
+_EXPECTED = frozenset({"not_gga", "no_velocity"})
+"""Reasons why messages of a topic are of no use to a role: sentences of other kinds."""
 
 
 def read_findings(
@@ -26,17 +30,17 @@ def read_findings(
     sensors: Mapping[str, Sensor],
     offset_s: Mapping[str, float],
 ) -> StageReport[RunFacts]:
-    """Return the warnings and facts of a read log; ``offset_s`` [s] is what the recipe adds to a role's stamps."""
+    """Return the findings and facts of a read log; ``offset_s`` [s] is what the recipe adds to a role's stamps."""
     timelines, steps = clocks.timelines, clocks.steps
-    simulated = clocks.simulated.remark() if clocks.simulated else None
-    warnings = [*assignment.warnings, *([simulated] if simulated else []), *power.warnings]
+    findings = [*assignment.findings, *power.findings]
+    findings += clocks.simulated.find_simulated_time() if clocks.simulated else ()
     for source in sources:
-        warnings += _warnings(source, timelines.get(source.key))
-    warnings += [
-        f"clock: header minus log time steps by {step.step_s:+.3f} s at log time {step.log_time_ns} ns on {', '.join(step.topics)}: "
-        "a new epoch begins there, and nothing is integrated across it"
-        for step in steps
-    ]
+        findings += source.readings.findings
+        findings += _find_unused(source, timelines.get(source.key))
+        if source.key in timelines:
+            findings += _find_clock(source, timelines[source.key], is_simulated=clocks.simulated is not None)
+    start_ns = min((int(of.readings.log_time_ns[0]) for of in sources if len(of.readings.row)), default=0)
+    findings += [_find_step(step, start_ns) for step in steps]
     facts = RunFacts(
         robot=RobotChoice(assignment.robot, assignment.robot_why),
         roles={role: _role_facts(role, assignment, sources, timelines, sensors[role]) for role in sensors},
@@ -46,33 +50,38 @@ def read_findings(
         time_offset_s=offset_s,
         power=None if power.current_sign is None else PowerSign(power.current_sign, power.averaged, power.includes),
     )
-    return StageReport(tuple(dict.fromkeys(warnings)), facts)
+    return StageReport(tuple(dict.fromkeys(findings)), facts)
 
 
-def _warnings(source: TopicReadings, timeline: Timeline | None) -> Iterable[str]:
-    name = f"{source.role}: {source.topic}"
-    rows = source.messages
-    yield from (f"{name}: {text}" for text in source.readings.warnings)
+def _find_unused(source: TopicReadings, timeline: Timeline | None) -> Iterator[Finding]:
+    """Yield the finding that many messages are not used; the numbers count them by reason."""
     dropped = source.readings.dropped | (timeline.dropped if timeline is not None else {})
-    unexpected = {reason: count for reason, count in dropped.items() if reason not in {"not_gga", "no_velocity"}}
-    if sum(unexpected.values()) > _MANY_DROPPED * rows:
-        counts = ", ".join(f"{reason} {count}" for reason, count in unexpected.items())
-        lost = f"{name}: {sum(unexpected.values())} of {rows} messages are not used ({counts})"
-        nowhere = source.role == "gnss" and not len(source.readings.row)
-        yield lost + (": the track lies in a local frame and cannot be placed on a map" if nowhere else "")
-    if timeline is None:
-        return
-    simulated = timeline.why.endswith(ON_SIMULATED_CLOCK) and any(timeline.moved_s)
-    if timeline.source == "log" and (simulated or source.readings.header_ns is not None):
-        yield f"{name}: log time rules, since {timeline.why}"
-    if timeline.notes.get("stamps_replaced"):
-        count = timeline.notes["stamps_replaced"]
-        yield f"{name}: {count} header stamps are unset or wrong and were taken from the log time"
+    counts = {f"{reason}_count": count for reason, count in dropped.items() if reason not in _EXPECTED}
+    unused, messages = sum(counts.values()), source.messages
+    if unused > threshold("messages-unused", "min_unused_fraction") * messages:
+        numbers: dict[str, Any] = {"unused_fraction": unused / messages, "messages_count": messages, **counts}
+        names = {"topic": source.topic, "reasons": ", ".join(name.removesuffix("_count") for name in counts)}
+        yield make_finding("messages-unused", Subject("role", source.role), names=names, **numbers)
+
+
+def _find_clock(source: TopicReadings, timeline: Timeline, *, is_simulated: bool) -> Iterator[Finding]:
+    """Yield the findings on a topic's stamps: that log time is used, that some were replaced, that all were moved."""
+    role, names = Subject("role", source.role), {"topic": source.topic}
+    by_simulation = is_simulated and timeline.source == "log" and any(timeline.moved_s)
+    if timeline.source == "log" and (by_simulation or source.readings.header_ns is not None):
+        severity: Severity | None = "note" if timeline.why == RECIPE else None
+        yield make_finding("log-time-used", role, severity=severity, names=names | {"reason": timeline.why})
+    if count := timeline.notes.get("stamps_replaced"):
+        yield make_finding("stamps-replaced", role, names=names, stamps_count=count)
     for epoch, moved_s in enumerate(timeline.moved_s):
-        if moved_s and not simulated:
-            yield (
-                f"{name}: its clock is not the other topics': its stamps were moved by {moved_s:+.3f} s in epoch {epoch}"
-            )
+        if moved_s and not by_simulation:
+            yield make_finding("topic-clock-offset", role, names=names, moved_s=moved_s, clock_epoch=epoch)
+
+
+def _find_step(step: ClockStep, start_ns: int) -> Finding:
+    at_s = (step.log_time_ns - start_ns) / 1e9
+    names = {"topics": ", ".join(step.topics)}
+    return make_finding("clock-step", LOG_CLOCK, span_s=(at_s, at_s), names=names, step_s=step.step_s, at_s=at_s)
 
 
 def _role_facts(

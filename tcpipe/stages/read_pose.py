@@ -12,11 +12,12 @@ from tcpipe.errors import MapError, RecipeError
 from tcpipe.geometry.datum import geodetic_from_enu
 from tcpipe.logs.roles import RoleAssignment
 from tcpipe.recipe import ReadConfig
-from tcpipe.recipe.suggestions import recipe_key
 from tcpipe.tables.columns import floats
+from tcpipe.tables.findings import Finding, Subject, make_finding
 from tcpipe.tables.levels import STREAMS, Streams
 
 POSE, GNSS = "pose", "gnss"
+_ROLE = Subject("role", POSE)
 _ANYWHERE_DEG_M = (0.0, 45.0, 0.0)
 """Where a frame that is nowhere on the earth is taken to lie while its positions are fused: east, north and up stay what they are."""
 
@@ -29,8 +30,8 @@ def recipe_role(role: str, streams: Streams) -> str:
 
 def placed_pose(
     streams: Mapping[str, pa.Table], assignment: RoleAssignment, config: ReadConfig
-) -> tuple[dict[str, pa.Table], str, tuple[str, ...]]:
-    """Return the streams with the pose in longitude and latitude, the CRS of these, and what is to be said of it.
+) -> tuple[dict[str, pa.Table], str, tuple[Finding, ...]]:
+    """Return the streams with the pose in longitude and latitude, the CRS of these, and findings.
 
     Raises
     ------
@@ -38,11 +39,9 @@ def placed_pose(
     """
     if POSE not in streams:
         return dict(streams), config.gnss_crs, ()
-    (topic,) = assignment.roles[POSE].topics
-    said = f"pose: {topic} stands in for GNSS: what is said of gnss is said of it"
+    found = make_finding("pose-used-as-gnss", _ROLE, names={"topic": assignment.roles[POSE].topics[0]})
     if config.pose_crs is None:
-        where = f"it lies in a frame of its own, which no map has: segments, but no samples ({recipe_key('read.pose_crs')} places it)"
-        return dict(streams), config.gnss_crs, (f"{said}; {where}",)
+        return dict(streams), config.gnss_crs, (found, make_finding("pose-not-georeferenced", _ROLE))
     from pyproj import Transformer  # noqa: PLC0415  only where a pose is placed
 
     from tcpipe.terrain.projection import crs_text, parse_crs  # noqa: PLC0415
@@ -58,7 +57,7 @@ def placed_pose(
         floats(pose, "x_m"), floats(pose, "y_m")
     )
     columns = {name: pose[name] for name in pose.column_names} | {"lon_deg": lon, "lat_deg": lat, "alt_m": pose["z_m"]}
-    return {**streams, POSE: STREAMS[POSE].table(**columns)}, crs_text(crs.geodetic_crs.to_2d()), (said,)
+    return {**streams, POSE: STREAMS[POSE].table(**columns)}, crs_text(crs.geodetic_crs.to_2d()), (found,)
 
 
 def pose_as_fixes(streams: Streams) -> tuple[Streams, bool]:

@@ -12,7 +12,7 @@ from tcpipe.logs.messages import LOG_TIME, Readings, header_ns
 from tcpipe.logs.roles import RoleAssignment
 from tcpipe.power.counters import Counter
 from tcpipe.power.readings import PowerReadings, read_power
-from tcpipe.power.sources import RailReadings
+from tcpipe.power.sources import RailReadings, reject_power
 from tcpipe.recipe import ReadConfig
 from tcpipe.robots.profiles import Profiles
 
@@ -29,7 +29,8 @@ def power_of_topics(
     if not topics:
         return PowerReadings()
     if len(topics) < wanted:
-        return PowerReadings(warnings=("power refused: not all of its topics can be decoded; there will be no energy",))
+        lost = [topic for topic in assignment.roles["power"].topics if topic not in topics]
+        return PowerReadings(findings=tuple(reject_power(topic, "not-decoded") for topic in lost))
     return read_power(
         topics,
         known.power_sources,

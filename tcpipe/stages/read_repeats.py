@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,10 +10,10 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
-from tcpipe.cost.quality import is_too_slow, wanted_rate_hz
 from tcpipe.power.repeats import find_readings
 from tcpipe.tables.arrays import texts
 from tcpipe.tables.columns import floats, integers
+from tcpipe.tables.findings import Finding, Subject, make_finding
 from tcpipe.tables.levels import STREAMS
 
 _QUANTITIES = {"current": "current_amp", "voltage": "voltage_volt"}
@@ -78,25 +78,14 @@ def _rate_hz(at_ns: NDArray[np.int64]) -> float:
     return 1e9 / float(np.mean(step_ns[step_ns < 1.5 * np.median(step_ns)]))
 
 
-def repeats_warnings(repeats: Sequence[Repeats], *, averaged: bool) -> list[str]:
-    """Return what a person should know of repeated readings; of a current that is read too seldom, what to do.
+def find_repeats(repeats: Sequence[Repeats]) -> Iterator[Finding]:
+    """Yield the finding that messages repeat readings, by the slowest of them; labels tell whether that is too slow."""
+    if not repeats:
+        return
+    slowest = min(repeats, key=lambda of: of.reading_hz)
+    names = {of: ", ".join(dict.fromkeys(getattr(each, of) for each in repeats)) for of in ("quantity", "rail")}
+    message_hz, reading_hz = slowest.message_hz, slowest.reading_hz
+    yield make_finding("power-readings-repeated", _POWER, names=names, message_hz=message_hz, reading_hz=reading_hz)
 
-    Parameters
-    ----------
-    averaged : whether a reading is the mean since the one before it.
-    """
-    wanted_hz = wanted_rate_hz(averaged=averaged)
-    whose: dict[str, list[Repeats]] = {}
-    for each in repeats:
-        rates = f"messages at {each.message_hz:.2g} Hz repeat readings at {each.reading_hz:.2g} Hz"
-        whose.setdefault(rates, []).append(each)
-    lines = []
-    for rates, alike in whose.items():
-        slow = any(each.quantity == "current" and is_too_slow(each.reading_hz, averaged=averaged) for each in alike)
-        cure = (
-            f", too slowly for segments of 1 m ({wanted_hz:g} Hz are wanted): let the driver read the device more often"
-        )
-        rails = {quantity: [each.rail for each in alike if each.quantity == quantity] for quantity in _QUANTITIES}
-        names = "; ".join(f"{quantity} of {', '.join(of)}" for quantity, of in rails.items() if of)
-        lines.append(f"power: {rates} ({names}): only the readings are used{cure if slow else ''}")
-    return lines
+
+_POWER = Subject("role", "power")

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import replace
 from typing import cast, get_args
 
 from tcpipe.logs.mapped import topic_of
-from tcpipe.logs.names_of_fields import proposed_roles
+from tcpipe.logs.names_of_fields import propose_roles
 from tcpipe.logs.roles import RoleAssignment, assign_roles
 from tcpipe.logs.topics import Topic
 from tcpipe.recipe import ReadConfig, Recipe, Role
 from tcpipe.robots.profiles import Profiles
+from tcpipe.tables.findings import Finding, Subject, make_finding
 
 
 def find_read_config(recipe: Recipe, topics: Collection[str]) -> ReadConfig:
@@ -38,31 +39,27 @@ def roles_by(config: ReadConfig, topics: Iterable[Topic], robot: str | None, *, 
         pose_from=config.pose_from,
     )
     free = [topic for topic in topics if topic.name not in config.ignore_topics]
-    proposed = tuple(proposed_roles(free, {*assignment.roles, *config.topics}))
+    findings = (*assignment.findings, *propose_roles(free, {*assignment.roles, *config.topics}))
     if assignment.problems:
-        return replace(assignment, problems=(*assignment.problems, *proposed))
-    problems, warnings = _absent_roles(config, assignment)
-    return replace(assignment, problems=problems, warnings=(*assignment.warnings, *proposed, *warnings))
-
-
-def _absent_roles(config: ReadConfig, assignment: RoleAssignment) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return what is wrong, and what is to be said, of keys for roles that no topic of the log plays.
-
-    An offset is of one clock that was seen to be off: where it corrects nothing, another is, or the log is another's. Where a sensor sits
-    and which of its stamps rules is of the robot, and holds for logs without that sensor as well.
-    """
+        return replace(assignment, findings=findings)
+    # An offset is of one clock that was off: where it corrects nothing, the log is another's. The other keys are of the robot, and hold
+    # for logs without that sensor as well.
     there = ", ".join(assignment.roles)
-    lines = {
-        key: tuple(
-            f"recipe read.{key}.{role}: no topic of this log plays {role}, so it does nothing; roles that are there: {there}"
-            for role in given
-            if role not in assignment.roles
-        )
-        for key, given in (
-            ("time_offset_s", config.time_offset_s),
-            ("placement", config.placement),
-            ("odometry_scale", config.odometry_scale),
-            ("time", config.time),
-        )
-    }
-    return lines.pop("time_offset_s"), tuple(line for every in lines.values() for line in every)
+    problems = tuple(
+        f"recipe read.time_offset_s.{role}: no topic of this log plays {role}, so it does nothing; roles that are there: {there}"
+        for role in config.time_offset_s
+        if role not in assignment.roles
+    )
+    return replace(assignment, problems=problems, findings=(*findings, *_find_unused_keys(config, assignment)))
+
+
+def _find_unused_keys(config: ReadConfig, assignment: RoleAssignment) -> Iterator[Finding]:
+    """Yield a finding for each key of the recipe that is for a role without a topic."""
+    for key, given in (
+        ("placement", config.placement),
+        ("odometry_scale", config.odometry_scale),
+        ("time", config.time),
+    ):
+        for role in given:
+            if role not in assignment.roles:
+                yield make_finding("recipe-key-unused", Subject("role", role), names={"key": f"read.{key}.{role}"})

@@ -1,4 +1,4 @@
-"""Where each stream's sensor sits: from the recipe, from static transforms, or assumed, with a warning."""
+"""Where each stream's sensor sits: from the recipe, from static transforms, or assumed, with a finding."""
 
 from __future__ import annotations
 
@@ -13,10 +13,11 @@ from tcpipe.logs.clocks import Timeline
 from tcpipe.logs.placements import IDENTITY, Pose, Tree, base_link_from, is_base, static_tree
 from tcpipe.logs.roles import RoleAssignment
 from tcpipe.recipe import Placement, ReadConfig, Role
-from tcpipe.recipe.suggestions import suggested
+from tcpipe.recipe.suggestions import suggest
 from tcpipe.stages.message_arrays import transforms
 from tcpipe.stages.protocols import LogReader
 from tcpipe.stages.read_sources import TopicReadings
+from tcpipe.tables.findings import Finding, Subject, make_finding
 from tcpipe.tables.levels import Sensor
 
 _WITHOUT_PLACE = ("power", "command", "gnss_velocity")
@@ -31,8 +32,8 @@ def place_sensors(
     timelines: Mapping[str, Timeline],
     *,
     config: ReadConfig,
-) -> tuple[dict[str, Sensor], list[str]]:
-    """Return each role's sensor, and warnings: frames that nothing places, topics with several frames.
+) -> tuple[dict[str, Sensor], list[Finding]]:
+    """Return each role's sensor, and findings: frames that nothing places, topics with several frames.
 
     /tf is read only where /tf_static leaves a frame unplaced: it is large, and constant only in logs that lack the other.
     """
@@ -44,19 +45,18 @@ def place_sensors(
         if role not in config.placement and role not in _WITHOUT_PLACE and not is_base(frame)
     }
     tree = _tree(log, tables, assignment, open_frames)
-    sensors, warnings = {}, []
+    sensors: dict[str, Sensor] = {}
+    findings: list[Finding] = []
     for role, frame in frame_of.items():
         pose, placed_by = _place(role, frame, tree, config)
-        several = of_role[role][0].frames
+        subject, several = Subject("role", role), of_role[role][0].frames
         if role not in _WITHOUT_PLACE and len(several) > 1:
-            warnings.append(
-                f"{role}: its messages name {len(several)} frames ({', '.join(several)}); {frame!r} is taken"
-            )
+            names = {"frame": frame, "frames": ", ".join(several)}
+            findings.append(make_finding("several-frames", subject, names=names, frames_count=len(several)))
         if placed_by == "assumed":
-            warnings.append(
-                f"{role}: nothing places frame {frame!r} of {of_role[role][0].topic}, it is assumed at base_link"
-                + suggested("to place it there or elsewhere", {"read.placement": {role: asdict(Placement())}})
-            )
+            names = {"frame": frame or "an unnamed frame", "topic": of_role[role][0].topic}
+            remedies = suggest("place", {"read.placement": {role: asdict(Placement())}})
+            findings.append(make_finding("sensor-not-placed", subject, names=names, remedies=remedies))
         sensors[role] = Sensor(
             topic=" + ".join(source.topic for source in of_role[role]),
             type_name=of_role[role][0].type_name,
@@ -67,7 +67,7 @@ def place_sensors(
             placed_by=placed_by,
             time_source=timelines[of_role[role][0].key].source,
         )
-    return sensors, warnings
+    return sensors, findings
 
 
 def _frame(sources: Sequence[TopicReadings]) -> str:

@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 from tcpipe.errors import RoleError
 from tcpipe.logs.imu_units import imu_in_si
 from tcpipe.logs.mapped import MAPPED_TYPES, mapped_message
-from tcpipe.logs.messages import LOG_TIME, Readings, apart_from_header, frames, needed_fields, read_messages
+from tcpipe.logs.messages import LOG_TIME, Readings, find_utc_offset, frames, needed_fields, read_messages
 from tcpipe.logs.odometry_scale import scaled
+from tcpipe.logs.role_findings import topic_not_decoded
 from tcpipe.logs.roles import RoleAssignment
 from tcpipe.logs.topics import Topic
 from tcpipe.logs.velocity_frame import over_ground
@@ -20,6 +21,7 @@ from tcpipe.power.readings import PowerReadings
 from tcpipe.recipe import ReadConfig, Role
 from tcpipe.robots.profiles import Profiles
 from tcpipe.stages.read_power import power_of_topics, power_rows
+from tcpipe.tables.findings import Finding, Subject, make_finding
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,30 +48,31 @@ def read_sources(
     config: ReadConfig,
     *,
     known: Profiles,
-) -> tuple[list[TopicReadings], PowerReadings, list[str]]:
+) -> tuple[list[TopicReadings], PowerReadings, list[Finding]]:
     """Read the messages of every topic that plays a role; they are taken out of ``messages``, so that no log is held twice.
 
     Returns
     -------
     sources : one a topic, in the order of the roles.
     power : the rails, empty where there is no power or it was refused.
-    warnings : topics that play a role but cannot be decoded.
+    findings : topics that play a role but cannot be decoded.
 
     Raises
     ------
     RoleError : ``read.fields`` names what the messages do not hold.
     """
     played = [(cast("Role", role.name), topic) for role in assignment.roles.values() for topic in role.topics]
-    warnings: list[str] = []
+    findings: list[Finding] = []
     arrays: dict[tuple[Role, str], Mapping[str, NDArray[Any]]] = {}
     for role, topic in played:
         if topic not in messages:
-            warnings.append(f"{role}: {topic} cannot be decoded and plays no part (see the log's damage)")
+            findings.append(topic_not_decoded(topics[topic]))
             continue
         found = _fields(messages[topic], role, config)
         needed = () if role == "power" else needed_fields(_type_of(topics[topic], role, config))
         if missing := [name for name in needed if name not in found]:
-            warnings.append(f"{role}: {topic} plays no part, its messages have no field {', '.join(missing)}")
+            names = {"role": role, "fields": ", ".join(missing)}
+            findings.append(make_finding("fields-missing", Subject("topic", topic), names=names))
         else:
             arrays[role, topic] = found
     types = {topic: topics[topic].type_name for _, topic in arrays}
@@ -88,14 +91,14 @@ def read_sources(
         seen_frames = frames(columns, types[topic])
         source = TopicReadings(topic, role, types[topic], len(columns[LOG_TIME]), seen_frames, readings)
         sources.append(replace(source, readings=_as_the_recipe_says(source, config)))
-    return sources, power, warnings
+    return sources, power, findings
 
 
 def _as_the_recipe_says(source: TopicReadings, config: ReadConfig) -> Readings:
     """Return a topic's readings in the units and scale that the recipe states."""
     readings, role = source.readings, source.role
     if role == "gnss" and config.time.get(role) != "header":
-        return replace(readings, warnings=(*readings.warnings, *apart_from_header(readings)))
+        return replace(readings, findings=(*readings.findings, *find_utc_offset(readings)))
     if role == "imu":
         return imu_in_si(readings, config.imu_units)
     if role == "gnss_velocity" and role not in config.topics:

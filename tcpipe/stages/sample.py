@@ -9,11 +9,12 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from tcpipe.recipe import SampleConfig
-from tcpipe.recipe.suggestions import recipe_key
+from tcpipe.recipe.suggestions import suggest
 from tcpipe.tables.bits import Loss
 from tcpipe.tables.columns import floats, lonlat_deg
+from tcpipe.tables.findings import Finding, Subject, make_finding
 from tcpipe.tables.levels import PLACED_SEGMENTS
-from tcpipe.terrain.patches import check_scale, corners_on, footprints, patch_frames, pitch_note
+from tcpipe.terrain.patches import check_scale, corners_on, footprints, has_other_pixels, patch_frames
 from tcpipe.terrain.projection import Projection
 from tcpipe.terrain.sampling import Patches, sample_patches
 from tcpipe.terrain.tiles import MapReader, TilePool, level_for, projection_to
@@ -36,7 +37,7 @@ class Sampled:
     footprint_xy_m: NDArray[np.float64]
     footprint_lonlat_deg: NDArray[np.float64]
     lost_by: NDArray[np.uint32]
-    warnings: tuple[str, ...]
+    findings: tuple[Finding, ...]
 
 
 def sample_segments(
@@ -76,7 +77,7 @@ def sample_segments(
         footprint_xy_m=corners[kept],
         footprint_lonlat_deg=projection_to(source, "EPSG:4326").inverse(corners[kept]),
         lost_by=lost_by,
-        warnings=_warnings(source, config, projection),
+        findings=_find_in_map(source, config, projection),
     )
 
 
@@ -98,8 +99,19 @@ def metres_lost(arc_length_m: NDArray[np.float64], lost_by: NDArray[np.uint32]) 
     return {loss: float(arc_length_m[lost_by == loss].sum()) for loss in _LOSSES}
 
 
-def _warnings(source: MapReader, config: SampleConfig, projection: Projection) -> tuple[str, ...]:
-    doubt, pitch_m = projection.doubt(), config.patch_m / config.patch_px
-    datum = f"{doubt}; say which datum the GNSS is in ({recipe_key('read.gnss_crs')})" if doubt else None
-    pitch = pitch_note(pitch_m, level_for(source, pitch_m).grid.pitch_m)
-    return tuple(f"map {source.name}: {note}" for note in (datum, pitch) if note)
+def _find_in_map(source: MapReader, config: SampleConfig, projection: Projection) -> tuple[Finding, ...]:
+    """Return what is doubtful about a map whatever segments lie on it: its datum, and the size of its pixels."""
+    subject, patch_pixel_m = Subject("map", source.name), config.patch_m / config.patch_px
+    map_pixel_m = level_for(source, patch_pixel_m).grid.pitch_m
+    findings = projection.find_rough_shift(subject)
+    if not has_other_pixels(patch_pixel_m, map_pixel_m):
+        return findings
+    remedies = suggest("match", {"sample": {"patch_px": round(config.patch_m / map_pixel_m)}})
+    other = make_finding(
+        "patch-pixels-unlike-map",
+        subject,
+        remedies=remedies,
+        patch_pixel_m=patch_pixel_m,
+        map_pixel_m=map_pixel_m,
+    )
+    return (*findings, other)

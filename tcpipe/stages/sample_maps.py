@@ -61,7 +61,7 @@ def sample_on_maps(
         footprint_xy_m=np.concatenate([part.footprint_xy_m for part in parts]),
         footprint_lonlat_deg=np.concatenate([part.footprint_lonlat_deg for part in parts]),
         lost_by=lost_by,
-        warnings=tuple(dict.fromkeys(warning for part in parts for warning in part.warnings)),
+        findings=tuple(dict.fromkeys(finding for part in parts for finding in part.findings)),
     )
 
 

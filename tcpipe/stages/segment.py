@@ -14,6 +14,7 @@ from tcpipe.geometry.piecewise_linear import interpolate, mean_between
 from tcpipe.geometry.polyline import Polyline, polyline
 from tcpipe.motion.ledger import by_reason, interval_duration_s, interval_length_m, interval_reason, stretches
 from tcpipe.motion.pieces import piece_of_rows
+from tcpipe.motion.remedies import find_losses
 from tcpipe.path.cutting import Cut, cut_by_chord
 from tcpipe.recipe import SegmentConfig
 from tcpipe.tables.arrays import numbers
@@ -55,6 +56,7 @@ def segment_track(gated: GatedTrack, config: SegmentConfig) -> Segments:
     segments = pa.concat_tables(tables).combine_chunks()
     facts = SegmentFacts(segments.num_rows, len(spans), odometer_m=sum(metres.values()), ledger_s=seconds)
     findings = [] if segments.num_rows else [_find_why_none(metres, info.run_id)]
+    findings += find_losses(metres, Subject("run", info.run_id))
     return Segments(segments, add_findings(info, findings, replace(info.report.facts, segment=facts)), metres)
 
 

@@ -67,6 +67,18 @@ def read_catalogue() -> Mapping[str, Entry]:
     return {code: _make_entry(values) for code, values in tomllib.loads(_read_text()).items()}
 
 
+def catalogue_sections() -> dict[str, list[str]]:
+    """Return the codes by section, in the order of the file."""
+    sections: dict[str, list[str]] = {}
+    codes: list[str] = []
+    for line in _read_text().splitlines():
+        if line.startswith("# ---- "):
+            codes = sections.setdefault(line.strip("# -"), [])
+        elif line.startswith("[") and "." not in line:
+            codes.append(line.strip("[]"))
+    return sections
+
+
 def _make_entry(values: Mapping[str, object]) -> Entry:
     return Entry(**{name: tuple(of) if isinstance(of, list) else of for name, of in values.items()})  # type: ignore[arg-type]
 

@@ -36,7 +36,7 @@ class RobotChoice:
 
 @dataclass(frozen=True, slots=True)
 class TopicClock:
-    """Which stamp of a topic rules and why, the median of header minus log time, and what was added to its stamps by epoch [s]."""
+    """Which stamp of a topic is used and the reason, the median of header minus log time, and what was added to its stamps by epoch [s]."""
 
     source: str
     why: str
@@ -86,14 +86,6 @@ class PowerSign:
     current_sign: str
     averaged: bool
     includes: tuple[str, ...] = field(default=(), metadata=LEFT_OUT)
-
-
-@dataclass(frozen=True, slots=True)
-class NoPower:
-    """Why a run has no power though its log may tell some, and the recipe (TOML) that would read it; "" where none is known."""
-
-    why: str
-    recipe: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,7 +163,7 @@ class AxisFacts:
 
 @dataclass(frozen=True, slots=True)
 class SensorChecks:
-    """What the sensors were held against, and why those that were refused were.
+    """What the sensors were held against, and the codes of the findings on those that are not fused.
 
     ``distance_m`` are median chords over ten seconds, ``up`` is gravity in the robot's axes, ``looks_rad`` the yaw of the IMU by each
     odometry and how sure it is, ``specific_force_median`` in the unit that the IMU tells.
@@ -244,9 +236,9 @@ class ClockPair:
 
 @dataclass(frozen=True, slots=True)
 class ClockOffset:
-    """How late a sensor's stamps are (`tcpipe.fusion.checks.clock_offsets.RoleOffset`), and the recipe lines that would correct it.
+    """How late a sensor's stamps are (`tcpipe.fusion.checks.clock_offsets.RoleOffset`).
 
-    Where it is not ``blamed``, only that it and the reference differ is known, and there are no lines.
+    Where it is not ``blamed``, only that it and the reference differ is known.
     """
 
     offset_s: float | None
@@ -255,7 +247,6 @@ class ClockOffset:
     drift_s_per_h: float | None
     drift_std_s_per_h: float | None
     drifts: bool
-    recipe: str
     blamed: bool = True
 
 
@@ -427,7 +418,6 @@ class RunFacts:
     odometry_scale: Mapping[str, float] | None = field(default=None, metadata=LEFT_OUT)
     """What the recipe multiplies a role's ways and velocities with."""
     power: PowerSign | None = field(default=None, metadata=LEFT_OUT)
-    no_power: NoPower | None = field(default=None, metadata=LEFT_OUT)
     fuse: FuseFacts | None = field(default=None, metadata=LEFT_OUT)
     sensor_checks: SensorChecks | None = field(default=None, metadata=LEFT_OUT)
     mounting: MountingFacts | None = field(default=None, metadata=LEFT_OUT)

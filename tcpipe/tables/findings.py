@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
+from math import isfinite
 from typing import Any, Generic, Literal, TypeAlias, TypeVar
 
 from tcpipe.tables.catalogue import Action, Severity, rank_severity, read_catalogue
@@ -15,7 +16,8 @@ from tcpipe.tables.catalogue import Action, Severity, rank_severity, read_catalo
 F = TypeVar("F")
 
 SubjectKind: TypeAlias = Literal[
-    "role", "topic", "frame", "layer", "run", "class", "slope", "file", "log", "map", "dataset", "column", "tag", "call", "model"
+    "role", "topic", "frame", "layer", "run", "class", "slope", "file", "log", "map", "dataset", "column", "tag", "call", "model", "robot",
+    "split",
 ]  # fmt: skip
 
 LEFT_OUT: Mapping[str, tuple[object, ...]] = {"json": (None, {}, [], ())}
@@ -63,8 +65,8 @@ class Finding:
     remedies: tuple[Remedy, ...] = field(default=(), metadata=LEFT_OUT)
 
     def __hash__(self) -> int:
-        """Return a hash of what identifies a finding."""
-        return hash((self.code, self.subject))
+        """Return a hash that differs from run to run: of ten thousand runs one by code alone would collide."""
+        return hash((self.code, self.subject, self.span_s, frozenset(self.numbers.items())))
 
 
 def make_finding(
@@ -93,7 +95,7 @@ def make_finding(
     problems += [f"it has no remedy {of.name!r}" for of in remedies if of.name not in entry.remedies]
     if problems:
         raise ValueError(f"finding {code}: {'; '.join(problems)}")
-    numbers = {name: float(number) for name, number in numbers.items()}
+    numbers = {name: float(number) for name, number in numbers.items() if isfinite(number)}  # JSON has no others
     return Finding(
         code, severity or entry.severity, subject, action or entry.action, span_s, numbers, dict(names or {}), remedies
     )
@@ -113,6 +115,12 @@ def sort_findings(findings: Iterable[Finding]) -> list[Finding]:
 def select_findings(findings: Iterable[Finding], *codes: str) -> list[Finding]:
     """Return the findings of some codes, in their order."""
     return [finding for finding in findings if finding.code in codes]
+
+
+def select_problems(findings: Iterable[Finding]) -> list[Finding]:
+    """Return the findings that are a problem until somebody has acknowledged them."""
+    catalogue = read_catalogue()
+    return [finding for finding in findings if finding.code in catalogue and catalogue[finding.code].is_problem]
 
 
 @dataclass(frozen=True, slots=True)

@@ -45,3 +45,8 @@ def judge(findings: Iterable[Finding]) -> Verdict:
         for name in affected:
             grades[name] = max(grades[name], grade, key=GRADES.index)
     return Verdict(**grades, reasons=tuple(reasons))
+
+
+def judge_again(verdict: Verdict, findings: Iterable[Finding]) -> Verdict:
+    """Return a verdict that was stored; where another catalogue judged it, the verdict of this one."""
+    return verdict if verdict.catalogue == catalogue_version() else judge(findings)

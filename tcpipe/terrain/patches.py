@@ -16,11 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.errors import TableError
+from tcpipe.tables.catalogue import threshold
 from tcpipe.terrain.grid import MapGrid
 
 FloatArray = NDArray[np.float64]
 
 _MAX_SCALE_ERROR = 0.02
+_PIXELS_DIFFER = "patch-pixels-unlike-map"
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,11 +105,7 @@ def chord_px(frames: PatchFrames, grid: MapGrid, *, chord_m: FloatArray, points:
     return np.hstack([grid.px_from_xy(first), frames.along_xy * step_m * np.array([1.0, -1.0]) / grid.pitch_m])
 
 
-def pitch_note(patch_pitch_m: float, map_pitch_m: float) -> str | None:
-    """Return a plain sentence if patches ask for finer or much coarser pixels than the map's level has, else None."""
-    if 0.99 * map_pitch_m <= patch_pitch_m <= 2.02 * map_pitch_m:
-        return None
-    both = f"the patch's pitch of {1000 * patch_pitch_m:.3g} mm is {{}} than the map's of {1000 * map_pitch_m:.3g} mm"
-    if patch_pitch_m < map_pitch_m:
-        return both.format("finer") + ": patches are interpolated, not sharper"
-    return both.format("coarser") + ": fine texture is aliased"
+def has_other_pixels(patch_pixel_m: float, map_pixel_m: float) -> bool:
+    """Return whether patches ask for finer or much coarser pixels than the map's level has."""
+    least, most = threshold(_PIXELS_DIFFER, "min_ratio"), threshold(_PIXELS_DIFFER, "max_ratio")
+    return not least * map_pixel_m <= patch_pixel_m <= most * map_pixel_m

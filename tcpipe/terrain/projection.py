@@ -20,14 +20,13 @@ from pyproj.transformer import AreaOfInterest as TransformArea
 from pyproj.transformer import TransformerGroup
 
 from tcpipe.errors import MapError
+from tcpipe.tables.catalogue import threshold
+from tcpipe.tables.findings import Finding, Subject, make_finding
 
 FloatArray = NDArray[np.float64]
 
 MAX_SCALE_ERROR = 0.01
 """A CRS whose unit is further from a metre of ground than this share is not metric enough to cut patches in."""
-
-DOUBTFUL_ACCURACY_M = 0.1
-"""A transformation known no better than this deserves a warning: RTK is half of it."""
 
 _EARTH_RADIUS_M = 6_371_000.0
 
@@ -153,16 +152,19 @@ class Projection:
             ) from error
         return np.stack([np.asarray(x, np.float64), np.asarray(y, np.float64)], axis=-1)
 
-    def doubt(self) -> str | None:
-        """Return a plain sentence if the two datums differ and the shift between them is known only roughly, else None."""
+    def find_rough_shift(self, subject: Subject) -> tuple[Finding, ...]:
+        """Return the finding, if any, that the two datums differ and the shift between them is known only roughly."""
         if _share_datum(self.source, self.target):
-            return None
+            return ()
         accuracy_m = self._transformer.accuracy
-        if "ballpark" not in self._transformer.description.lower() and 0.0 <= accuracy_m <= DOUBTFUL_ACCURACY_M:
-            return None
-        known = f"only to about {accuracy_m:g} m" if accuracy_m > 0.0 else "not at all (taken as none)"
-        names = [CRS(crs.geodetic_crs).name for crs in (self.source, self.target)]
-        return f"the shift between the datums {names[0]} and {names[1]} is known {known}"
+        is_ballpark = "ballpark" in self._transformer.description.lower()
+        if not is_ballpark and 0.0 <= accuracy_m <= threshold("datum-shift-rough", "max_accuracy_m"):
+            return ()
+        source, target = (CRS(crs.geodetic_crs).name for crs in (self.source, self.target))
+        names = {"source": source, "target": target}
+        if accuracy_m <= 0.0:
+            return (make_finding("datum-shift-unknown", subject, names=names),)
+        return (make_finding("datum-shift-rough", subject, names=names, accuracy_m=accuracy_m),)
 
 
 @lru_cache(maxsize=64)

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import minimum_filter
 
+from tcpipe.tables.catalogue import threshold
 from tcpipe.terrain.tiles import MapReader, groups_by_tile, level_for, read_window
 
 FloatArray = NDArray[np.float64]
@@ -43,7 +44,6 @@ _APART_M = 0.75
 _RIDGE = 1e-12
 FOOT_M = 0.3048
 _ABOUT = 0.02
-_OFF = 0.1
 _KNOWN_SCALE = 0.03
 _EXPLAINED = 0.9
 """A scale is believed where it is known to 3 % and explains nine tenths of the track's heights."""
@@ -71,7 +71,9 @@ class HeightScale:
 
     def is_off(self) -> bool:
         """Whether map and track surely do not rise alike."""
-        return self.is_known and abs(self.value - 1.0) > max(_SIGMAS * self.std, _OFF)
+        return self.is_known and abs(self.value - 1.0) > max(
+            _SIGMAS * self.std, threshold("map-height-scale", "min_error_fraction")
+        )
 
 
 @dataclass(frozen=True, slots=True)

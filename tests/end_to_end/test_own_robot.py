@@ -77,7 +77,8 @@ def test_its_energy_is_that_of_the_same_drive_in_known_messages(drive, tmp_path)
     (known,) = ingest([log], store=tmp_path / "store", recipe=Recipe(), robot="husky").results
     (ours,) = ingest([log, battery], store=tmp_path / "store", recipe=recipe, as_one=True).results
     assert (ours.status, ours.robot) == ("done", "scout")
-    assert not [line for line in ours.warnings if "power" in line]
+    report = run_of(tmp_path / "store", ours).manifest.info.report
+    assert not [of for of in report.findings if of.subject.name == "power"]
     one, other = (segments(tmp_path / "store", result) for result in (known, ours))
     assert one.num_rows == other.num_rows > 5
     assert set(other["robot"].to_pylist()) == {"scout"}

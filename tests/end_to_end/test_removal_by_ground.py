@@ -79,6 +79,6 @@ def test_mud_that_is_only_crawled_over_is_warned_of(card):
     (mud,) = [group for group in card["removal"]["by_class"] if group["name"] == "mud"]
     assert mud["driven_m"] > 20.0
     assert mud["used_share"] < 0.1
-    assert any(
-        "depends on the class" in text and "of mud" in text and "below limit" in text for text in card["warnings"]
-    )
+    biased = [of for of in card["findings"] if of["code"] == "selection-bias"]
+    assert {"kind": "class", "name": "mud"} in [of["subject"] for of in biased]
+    assert {of["names"]["reason"] for of in biased if of["subject"]["name"] == "mud"} == {"below_limit"}

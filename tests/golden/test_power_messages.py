@@ -15,6 +15,7 @@ from tcpipe.power.sources import power_lists
 from tcpipe.recipe import Recipe
 from tcpipe.robots.profiles import PowerSource
 from tcpipe.stages.message_arrays import message_arrays
+from tcpipe.tables.findings import select_findings
 
 N = 60
 VOLT = 25.0 + 0.1 * np.arange(N) / N
@@ -70,7 +71,7 @@ def power_of(path: Path, robot: str = "generic", recipe: Recipe | None = None, *
 
 
 def watt(found: PowerReadings) -> np.ndarray:
-    assert found.rails, found.warnings
+    assert found.rails, found.findings
     return np.sum([rail.voltage_volt * rail.current_amp for rails in found.rails.values() for rail in rails], axis=0)
 
 
@@ -111,7 +112,8 @@ def test_a_unitree_go2(sign, tmp_path):
     rows = [{"power_v": v, "power_a": sign * a} for v, a in zip(VOLT, AMP, strict=True)]
     found = power_of(log_of(tmp_path / "a", "unitree_go/msg/LowState", rows))
     np.testing.assert_allclose(watt(found), VOLT * AMP, rtol=1e-6)
-    assert any("computers, sensors and payload" in line for line in found.warnings)
+    (loads,) = select_findings(found.findings, "power-includes-loads")
+    assert "computers, sensors and payload" in loads.names["loads"]
 
 
 def test_a_sign_that_neither_type_nor_record_tells_is_asked_for(tmp_path):
@@ -119,7 +121,9 @@ def test_a_sign_that_neither_type_nor_record_tells_is_asked_for(tmp_path):
     path = log_of(tmp_path / "a", "unitree_go/msg/LowState", rows)
     found = power_of(path)
     assert found.rails == {}
-    assert all(f'under [read]: current_sign = "drawn_{sign}"' in found.warnings[0] for sign in ("positive", "negative"))
+    (rejected,) = found.findings
+    assert (rejected.code, rejected.names["reason"]) == ("power-rejected", "sign-unknown")
+    assert [of.name for of in rejected.remedies] == ["drawn_negative", "drawn_positive"]
     assert power_of(path, current_sign="drawn_negative").rails
 
 
@@ -139,9 +143,9 @@ def test_a_husky_a300_tells_its_drives_or_else_its_pack(lynx, expected, tmp_path
     found = power_of(path, "husky_a300")
     np.testing.assert_allclose(watt(found), expected, rtol=1e-6)
     assert found.averaged
-    assert any("is taken instead" in line for line in found.warnings) == (lynx == 0.0)
-    assert any("computers and user ports" in line for line in found.warnings) == (lynx == 0.0)
-    assert "of platform A300" in power_of(path, "husky").warnings[0]
+    codes = {of.code for of in found.findings}
+    assert ({"power-fallback", "power-includes-loads"} <= codes) == (lynx == 0.0)
+    assert power_of(path, "husky").findings[0].names["platforms"] == "A300"
 
 
 def vesc(joule: np.ndarray, *, given_back: float = 0.0, amp: np.ndarray = AMP) -> list[dict]:
@@ -164,7 +168,8 @@ def test_a_vescs_watt_hours_are_its_power(tmp_path):
 def test_a_vesc_that_counts_nothing_tells_its_mean_current(tmp_path):
     found = power_of(log_of(tmp_path / "a", "vesc_msgs/msg/VescStateStamped", vesc(np.zeros(N))))
     np.testing.assert_allclose(watt(found), VOLT * AMP, rtol=1e-6)
-    assert any("the current is 0 A on all" in line and "taken instead" in line for line in found.warnings)
+    (fallback,) = select_findings(found.findings, "power-fallback")
+    assert fallback.names["reason"] == "current-constant"
 
 
 def test_a_counter_that_is_reset_is_said_and_tells_nothing_across_it(tmp_path):
@@ -173,7 +178,7 @@ def test_a_counter_that_is_reset_is_said_and_tells_nothing_across_it(tmp_path):
     found = power_of(log_of(tmp_path / "a", "vesc_msgs/msg/VescStateStamped", vesc(joule)))
     assert np.flatnonzero(np.isnan(watt(found))).tolist() == [0, 30]
     np.testing.assert_allclose(np.delete(watt(found), [0, 30]), 240.0, rtol=1e-6)
-    assert any("was reset 1 times" in line for line in found.warnings)
+    assert [of.numbers for of in select_findings(found.findings, "counter-reset")] == [{"resets_count": 1.0}]
 
 
 SCOUT = PowerSource("scout_msgs/msg/ScoutStatus", "battery_voltage", "actuator_states[].current", sign="auto")
@@ -184,7 +189,7 @@ def test_what_nobody_knows_of_a_scout_is_asked_and_three_lines_answer(tmp_path):
     path = log_of(tmp_path / "a", "scout_msgs/msg/ScoutStatus", rows)
     refused = power_of(path)
     assert refused.rails == {}
-    assert "flows in the motor's phases" in refused.warnings[0]
+    assert refused.findings[0].names["reason"] == "no-battery-current"
     np.testing.assert_allclose(watt(power_of(path, recipe=Recipe(power_sources=[SCOUT]))), VOLT * AMP, rtol=1e-6)
 
 
@@ -192,5 +197,5 @@ def test_a_list_named_without_its_brackets_is_asked_for(tmp_path):
     rows = a300(1.0)
     path = log_of(tmp_path / "a", "clearpath_platform_msgs/msg/Power", rows)
     mine = PowerSource("clearpath_platform_msgs/msg/Power", "measured_voltages[0]", "measured_currents")
-    said = power_of(path, recipe=Recipe(power_sources=[mine])).warnings[0]
-    assert "measured_currents is a list; wanted measured_currents[0] for one of its values" in said
+    (rejected,) = power_of(path, recipe=Recipe(power_sources=[mine])).findings
+    assert (rejected.names["reason"], rejected.names["field"]) == ("field-is-a-list", "measured_currents")

@@ -15,6 +15,7 @@ from tcpipe.formats.logs.log_file import open_log
 from tcpipe.formats.robot_files import shipped_profiles
 from tcpipe.recipe import Placement, ReadConfig
 from tcpipe.stages.read import read_run
+from tcpipe.tables.findings import select_findings
 from tcpipe.tables.levels import Streams
 
 _DRIVES = ("/left_drive/battery", "/right_drive/battery")
@@ -62,7 +63,7 @@ def test_a_real_husky_without_power() -> None:
     assert found.robot == "husky"
     rows = {role: table.num_rows for role, table in found.tables.items()}
     assert rows == {"gnss": 989, "imu": 11865, "wheel_odometry": 3952}
-    assert found.report.findings[0].startswith("no topic plays power")
+    assert select_findings(found.report.findings, "no-power")
     assert [sensor.placed_by for sensor in found.sensors.values()] == ["assumed", "recipe", "same frame"]
     assert found.sensors["gnss"].frame_id == "gps"
     # Turned by its mounting, the IMU's specific force points up.
@@ -117,9 +118,11 @@ def test_duplicates_and_backward_stamps_of_an_old_recording() -> None:
 
 def test_a_battery_that_says_nothing_and_stamps_in_whole_seconds() -> None:
     found = read(shared_data("peers/ros_amr_interop/rosbag_demo.bag"))
-    text = "\n".join(found.report.findings)
-    assert "/battery: the voltage and the current are zero on all 111 rows" in text
-    assert "/velocity: log time rules, since 98 % of its messages repeat the header stamp" in text
+    (rejected,) = select_findings(found.report.findings, "power-rejected")
+    assert (rejected.subject.name, rejected.names["reason"]) == ("/battery", "voltage-zero")
+    assert rejected.numbers == {"median_volt": 0.0, "median_amp": 0.0, "rows_count": 111.0}
+    (by_log,) = select_findings(found.report.findings, "log-time-used")
+    assert by_log.names == {"topic": "/velocity", "reason": "header-repeats"}
     assert found.tables["wheel_odometry"].num_rows == 5270
 
 

@@ -15,6 +15,7 @@ from tcpipe.learning.training import train
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.report import report
 from tcpipe.store import open_store
+from tcpipe.tables.findings import Subject, make_finding
 
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed: make test-pages")
 axe = pytest.importorskip("axe_core_python.sync_playwright", reason="axe-core-python is not installed: make test-pages")
@@ -42,9 +43,7 @@ def dataset(tmp_path_factory):
     for number, run in enumerate(("north", "south")):
         start, end = lanes((4.0 * number, 4.0 * number + 1.5, 4.0 * number - 9.0), -12.0, 12.0)
         table = segments(run, start, end, start_ns=int((number + 1) * 1e18))
-        add_run(
-            store, run, table, warnings=["gnss: its antenna is placed by nobody, and a line may be as long as this one"]
-        )
+        add_run(store, run, table, findings=[make_finding("no-command", Subject("role", "command"))])
     build_dataset(here / "dataset", store=store.root)
     return here / "dataset"
 

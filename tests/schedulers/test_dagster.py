@@ -59,8 +59,8 @@ def test_a_new_log_is_found_and_becomes_a_dataset_with_metadata_and_checks(defs,
         assert made["run"]["driven_m"].value == pytest.approx(14.5, abs=0.5)
         checks = {check.check_name: check for check in done.get_asset_check_evaluations()}
         assert checks["as_written"].passed
-        assert not checks["nothing_doubtful"].passed, "the simulated log has fixes that are none"
-        assert "no_fix" in checks["nothing_doubtful"].metadata["problems"].value
+        assert checks["usable"].passed
+        assert {checks["usable"].metadata[name].value for name in ("position", "time", "energy")} == {"usable"}
 
         built = dg.materialize(
             [defs.resolve_assets_def("dataset"), defs.resolve_assets_def("run").to_source_asset()],

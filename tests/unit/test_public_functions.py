@@ -49,7 +49,7 @@ def test_looking_at_the_package_loads_none_of_it():
 def _options(name):
     """Parameters of a command but those of its terminal, by the keyword of the function."""
     skipped = {"as_json", "quiet", "debug"}
-    return {of.name.replace("path_file", "path"): of for of in cli.commands[name].params if of.name not in skipped}
+    return {of.name: of for of in cli.commands[name].params if of.name not in skipped}
 
 
 @pytest.mark.parametrize("name", FUNCTIONS)
@@ -82,7 +82,7 @@ def test_a_function_refuses_what_its_command_refuses(name, keyword, bounds, tmp_
     monkeypatch.chdir(tmp_path)
     ends = {"plan-path": ((15.0, 47.0), (15.1, 47.0)), "evaluate": ("dataset",)}.get(name, ())
     for value in (bounds.min - (0 if bounds.min_open else 1), bounds.max + 1, float("nan"), "many"):
-        with pytest.raises(UsageError, match=rf"{FUNCTIONS[name]}: {keyword} is .*; wanted"):
+        with pytest.raises(UsageError, match=rf"{FUNCTIONS[name]}: {keyword} is .*; expected"):
             getattr(tcpipe, FUNCTIONS[name])("gone", *ends, **{keyword: value})
     for value in (bounds.max, bounds.min):
         if not (bounds.min_open and value == bounds.min):
@@ -100,7 +100,7 @@ def test_a_function_refuses_what_its_command_refuses(name, keyword, bounds, tmp_
     ],
 )
 def test_a_word_that_is_no_choice_is_refused(call):
-    with pytest.raises(UsageError, match="wanted"):
+    with pytest.raises(UsageError, match="expected"):
         call()
 
 

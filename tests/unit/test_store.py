@@ -111,12 +111,10 @@ def test_of_two_who_make_a_run_the_first_wins_and_what_replaces_it_is_a_new_numb
         def __init__(self, table: object, rejections: object = None) -> None:
             self.table, self.rejections = table, rejections
 
-    def write(warning: str, *, force: bool = False) -> object:
-        made = replace(first.manifest, warnings=(warning,), checksums={})
+    def write(line: str, *, force: bool = False) -> object:
+        made = replace(first.manifest, damage=(line,), checksums={})
         levels = {"track": _Level(None, tables["rejections"]), "gated": _Level(tables["track"])}
-        return store.write_run(
-            made, **levels, labelled=_Level(tables["segments"]), settled=lambda _: not force
-        ).warnings
+        return store.write_run(made, **levels, labelled=_Level(tables["segments"]), settled=lambda _: not force).damage
 
     assert write("mine") == ()
     assert write("mine", force=True) == ("mine",)
@@ -124,7 +122,7 @@ def test_of_two_who_make_a_run_the_first_wins_and_what_replaces_it_is_a_new_numb
     assert store.runs()[0].manifest.warnings == (), "no commit names the new one yet"
     commit_run(store, RUN)
     assert store.runs()[0].place.files() == ["manifest-1.json", "manifest-2.json"]
-    assert store.runs()[0].manifest.warnings == ("mine",)
+    assert store.runs()[0].manifest.damage == ("mine",)
 
 
 def test_tags_of_two_writers_are_both_kept(root, monkeypatch):

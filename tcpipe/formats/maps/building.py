@@ -18,6 +18,8 @@ from tcpipe.formats.maps.map_files import SHARD_PX, MapWriter
 from tcpipe.formats.maps.mosaic import Raster, open_raster
 from tcpipe.formats.maps.terrain_polygons import is_drawn, place_polygons
 from tcpipe.formats.seals import write_checksums
+from tcpipe.tables.catalogue import threshold
+from tcpipe.tables.findings import Finding, Subject, make_finding
 from tcpipe.terrain.classes import PAPER_SCHEME, ClassScheme, named_scheme, own_scheme
 from tcpipe.terrain.grid import MapGrid
 from tcpipe.terrain.layers import COLOURS, PAPER_LAYERS, Layer, categorical_layer, continuous_layer, paper_layers
@@ -235,13 +237,16 @@ def _refuse_empty(layers: Mapping[str, LayerSource]) -> None:
         raise MapError(*problems)
 
 
-def _notes(layers: Mapping[str, LayerSource], covered: Mapping[str, float]) -> tuple[str, ...]:
-    notes: list[str] = []
+def _find_all(layers: Mapping[str, LayerSource], covered: Mapping[str, float]) -> tuple[Finding, ...]:
+    findings: list[Finding] = []
+    least = threshold("layer-covers-little", "min_share_of_height_fraction") * covered["height"]
     for role, layer in layers.items():
-        notes += layer.notes()
-        if covered[role] < 0.5 * covered["height"]:
-            notes.append(f"{layer.name}: covers {covered[role]:.0%} of the map; samples need every layer")
-    return tuple(notes)
+        findings += layer.list_findings()
+        if covered[role] < least:
+            names = {"file": layer.name}
+            subject = Subject("layer", role)
+            findings.append(make_finding("layer-covers-little", subject, names=names, covered_fraction=covered[role]))
+    return tuple(findings)
 
 
 def _facts(grid: MapGrid, layers: Mapping[str, LayerSource], origin: str, inputs: MapInputs) -> MapFacts:
@@ -254,7 +259,7 @@ def _facts(grid: MapGrid, layers: Mapping[str, LayerSource], origin: str, inputs
         height_max_m=layers["height"].tally.high,
         class_share=shares.pop("terrain", {}),
         class_shares=shares,
-        warnings=_notes(layers, covered),
+        findings=_find_all(layers, covered),
         classes_from=origin,
         inputs=inputs,
     )

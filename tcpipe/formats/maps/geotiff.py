@@ -35,6 +35,7 @@ from rasterio.windows import Window
 from tcpipe.errors import MapError
 from tcpipe.formats.atomic import atomic_file
 from tcpipe.formats.maps.value_names import value_names
+from tcpipe.tables.findings import Finding, Subject, make_finding
 from tcpipe.terrain.layers import LUMA_RGB
 
 Use = Literal["metres", "grey", "red", "green", "blue", "classes", "numbers"]
@@ -114,7 +115,7 @@ class Tile:
     """What one raster file is that can play its role; `RasterTiles.read` reads it.
 
     ``affine`` is (a, b, c, d, e, f) of x = a·col + b·row + c, y = d·col + e·row + f at pixel *corners*; ``crs`` is WKT, or empty where
-    the file has none; ``warnings`` are plain sentences.
+    the file has none; ``findings`` are about its bands and tags.
     """
 
     path: Path
@@ -126,7 +127,7 @@ class Tile:
     cols: int
     kind: str
     """Type and bands, which the tiles of one layer share."""
-    warnings: tuple[str, ...]
+    findings: tuple[Finding, ...]
     names: Mapping[int, str]
     """Names of values, from the raster attribute table or the category names; empty where there are none."""
     source: Source = field(repr=False)
@@ -219,8 +220,8 @@ def read_tile(path: Path, role: str, use: Use | None = None) -> Tile:
         source = _checked(path)
         with _open_as(source) as dataset:
             _refuse_unplaced(dataset, path)
-            bands, notes = _choose_bands(dataset, path, role, use)
-            scale, more = _scaling(dataset, path, role, use, bands)
+            bands, unusual = _choose_bands(dataset, path, role, use)
+            scale, ignored = _scaling(dataset, path, role, use, bands)
             unit = (dataset.units[bands[0] - 1] or "").strip() if use == "numbers" else ""
             palette = use == "classes" and dataset.colorinterp[bands[0] - 1] == ColorInterp.palette
             colours = ", ".join(dataset.colorinterp[band - 1].name for band in bands)
@@ -233,7 +234,7 @@ def read_tile(path: Path, role: str, use: Use | None = None) -> Tile:
                 rows=dataset.height,
                 cols=dataset.width,
                 kind=f"{dataset.dtypes[bands[0] - 1]} ({colours}{', ' if unit else ''}{unit})",
-                warnings=(*notes, *more),
+                findings=(*unusual, *ignored),
                 names=value_names(_described(dataset), bands[0]) if use == "classes" else {},
                 source=source,
                 dtype=dataset.dtypes[bands[0] - 1] if use == "classes" else "float64",
@@ -376,7 +377,8 @@ def _refuse_unplaced(dataset: Any, path: Path) -> None:
         raise MapError(f"{path}: its georeference has pixels without area")
 
 
-def _choose_bands(dataset: Any, path: Path, role: str, use: Use) -> tuple[tuple[int, ...], list[str]]:
+def _choose_bands(dataset: Any, path: Path, role: str, use: Use) -> tuple[tuple[int, ...], tuple[Finding, ...]]:
+    subject, file = Subject("layer", role), {"file": path.name}
     colours = {colour: band for band, colour in reversed(list(enumerate(dataset.colorinterp, 1)))}
     plain = [band for band, colour in enumerate(dataset.colorinterp, 1) if colour != ColorInterp.alpha]
     names = ", ".join(colour.name for colour in dataset.colorinterp)
@@ -387,16 +389,12 @@ def _choose_bands(dataset: Any, path: Path, role: str, use: Use) -> tuple[tuple[
         if not palette and any(kind not in {np.dtype(np.uint8), np.dtype(np.uint16)} for kind in kinds):
             raise MapError(f"{path}: ortho is {dataset.dtypes[0]}, wanted 8-bit or 16-bit unsigned")
         if None not in rgb:
-            more = (
-                [f"{path.name}: bands beyond red, green, blue and alpha are ignored ({names})"]
-                if len(plain) > 3
-                else []
-            )
-            return tuple(band for band in rgb if band is not None), more
+            more = make_finding("ortho-bands-unused", subject, names={**file, "bands": names})
+            return tuple(band for band in rgb if band is not None), (more,) if len(plain) > 3 else ()
         if len(plain) == 1 and (palette or use == "grey"):
-            return (plain[0],), []
+            return (plain[0],), ()
         if len(plain) == 3:
-            return tuple(plain), [f"{path.name}: bands are not named by colour; taken as red, green, blue"]
+            return tuple(plain), (make_finding("ortho-colours-assumed", subject, names=file),)
         wanted = "grey or red, green, blue" if use == "grey" else "red, green, blue for --ortho-bands rgb"
         raise MapError(f"{path}: ortho has {dataset.count} bands ({names}), wanted {wanted}, and alpha at most")
     if len(plain) != 1:
@@ -410,26 +408,26 @@ def _choose_bands(dataset: Any, path: Path, role: str, use: Use) -> tuple[tuple[
         raise MapError(f"{path}: {role} is {kind}, wanted floating point or integer {wanted}")
     if use == "classes" and kind.kind not in "iu":
         raise MapError(f"{path}: {role} is {kind}, wanted integer class values")
-    return (plain[0],), []
+    return (plain[0],), ()
 
 
 def _scaling(
     dataset: Any, path: Path, role: str, use: Use, bands: tuple[int, ...]
-) -> tuple[tuple[float, float], list[str]]:
-    """Return scale and offset to metres or numbers; for other uses, a note that such tags were not applied."""
+) -> tuple[tuple[float, float], tuple[Finding, ...]]:
+    """Return scale and offset to metres or numbers; for other uses, a finding that such tags were not applied."""
     scale, offset = dataset.scales[bands[0] - 1], dataset.offsets[bands[0] - 1]
     if use == "numbers":
-        return (scale, offset), []
+        return (scale, offset), ()
     if use != "metres":
-        tagged = (scale, offset) != (1.0, 0.0)
-        return (1.0, 0.0), [
-            f"{path.name}: scale {scale:g} and offset {offset:g} are not applied to {role}"
-        ] if tagged else []
+        if (scale, offset) == (1.0, 0.0):
+            return (1.0, 0.0), ()
+        subject, file = Subject("layer", role), {"file": path.name}
+        return (1.0, 0.0), (make_finding("scale-not-applied", subject, names=file, scale=scale, offset=offset),)
     unit = (dataset.units[bands[0] - 1] or "").strip()
     if unit.lower() not in _METRES:
         raise MapError(f"{path}: height is in {unit!r}, wanted metres (or cm, mm, ft)")
     metres = _METRES[unit.lower()] if unit else _vertical_unit_m(dataset, path)
-    return (scale * metres, offset * metres), []
+    return (scale * metres, offset * metres), ()
 
 
 def _vertical_unit_m(dataset: Any, path: Path) -> float:

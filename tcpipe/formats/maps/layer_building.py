@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from tcpipe.errors import MapError
 from tcpipe.formats.maps.mosaic import Raster
+from tcpipe.tables.findings import Finding, Subject, make_finding
 from tcpipe.terrain.classes import ClassScheme
 from tcpipe.terrain.grid import MapGrid
 from tcpipe.terrain.layers import Layer, Pixels
@@ -26,6 +27,7 @@ _DEEPEST_M = -500.0
 _MEAN_FROM = 1.5
 """From so many source pixels a map pixel on, a layer is averaged instead of interpolated."""
 _LISTED = 8
+_NAMED = 3
 
 
 @dataclass(slots=True)
@@ -90,8 +92,8 @@ class LayerSource(Protocol):
     def nothing(self) -> str | None:
         """Return why it has no data, where a reason of its own is known."""
 
-    def notes(self) -> list[str]:
-        """Return what is to be said of it, as plain sentences."""
+    def list_findings(self) -> tuple[Finding, ...]:
+        """Return what was observed while it was placed and written."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,18 +137,21 @@ class RasterLayer:
         named = ", ".join(str(value) for value in list(self.scheme.id_by_value)[:_LISTED])
         return f"{self.label}: none of its values {self._unnamed()} is in the class table (which names {named}); give one with {option}"
 
-    def notes(self) -> list[str]:
-        """Return the raster's warnings, doubts of its datum, and values that are no class."""
-        notes = list(self.raster.warnings)
-        doubt = self.projection.doubt() if self.projection else None
-        if doubt:
-            notes.append(f"{self.name}: {doubt}; the map may be off by that")
-        if self.tally.unnamed:
-            notes.append(
-                f"{self.name}: values {self._unnamed()} are not in the class table; "
-                f"about {self.tally.unnamed_pixels} pixels are nodata"
-            )
-        return notes
+    def list_findings(self) -> tuple[Finding, ...]:
+        """Return the raster's findings, a datum shift that is known only roughly, and values that are no class."""
+        subject, unnamed = Subject("layer", self.layer.name), sorted(self.tally.unnamed)
+        rough = self.projection.find_rough_shift(subject) if self.projection else ()
+        if not unnamed:
+            return (*self.raster.findings, *rough)
+        values = ", ".join(map(str, unnamed[:_NAMED])) + (" …" if len(unnamed) > _NAMED else "")
+        finding = make_finding(
+            "class-values-unnamed",
+            subject,
+            names={"values": values, "file": self.name},
+            pixel_count=self.tally.unnamed_pixels,
+            value_count=len(unnamed),
+        )
+        return (*self.raster.findings, *rough, finding)
 
     def _unnamed(self) -> str:
         names = self.raster.names

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from tcpipe.formats.layer_descriptions import Description
-from tcpipe.tables.facts import LEFT_OUT
+from tcpipe.tables.findings import LEFT_OUT, Finding
 from tcpipe.terrain.classes import TerrainClass
 
 
@@ -34,7 +34,8 @@ class MapFacts:
     """Of terrain: share of each class among the pixels that have one."""
     class_shares: Mapping[str, Mapping[str, float]] = field(default_factory=dict, metadata=LEFT_OUT)
     """The same of the user's own layers."""
-    warnings: tuple[str, ...]
+    findings: tuple[Finding, ...] = field(default=(), metadata=LEFT_OUT)
+    """Maps of tcpipe 0.8 and earlier have none: they kept sentences."""
     classes_from: str
     """``file``, ``names`` of the terrain raster's values, ``store`` or ``default``."""
     inputs: MapInputs

@@ -20,6 +20,7 @@ from pyproj.exceptions import CRSError
 
 from tcpipe.errors import MapError
 from tcpipe.formats.maps.geotiff import RasterTiles, Tile, Use, raster_tiles, read_tile
+from tcpipe.tables.findings import Finding
 
 MAX_FILES = 100_000
 """Of one layer."""
@@ -32,7 +33,7 @@ _SHOWN = 4
 
 @dataclass(frozen=True, slots=True)
 class Raster:
-    """Tiles that play a role together; ``affine``, ``crs``, ``warnings`` and ``names`` as of `tcpipe.formats.maps.geotiff.Tile`."""
+    """Tiles that play a role together; ``affine``, ``crs`` and ``names`` as of `tcpipe.formats.maps.geotiff.Tile`."""
 
     label: str
     """What it is called in a message: the path, and how many more there are."""
@@ -42,7 +43,8 @@ class Raster:
     affine: tuple[float, float, float, float, float, float]
     rows: int
     cols: int
-    warnings: tuple[str, ...]
+    findings: tuple[Finding, ...]
+    """One a code, of the first tile that has it."""
     names: Mapping[int, str]
     tiles: tuple[Tile, ...]
     _corners: NDArray[np.int64] = field(repr=False)
@@ -105,7 +107,7 @@ def open_raster(paths: Sequence[Path], role: str, use: Use | None = None) -> Ite
             affine=affine,
             rows=int(corners[:, 1].max()),
             cols=int(corners[:, 3].max()),
-            warnings=tuple(_few([note for tile in tiles for note in tile.warnings])),
+            findings=tuple({of.code: of for tile in reversed(tiles) for of in reversed(tile.findings)}.values()),
             names=_joint_names(tiles),
             tiles=tuple(tiles),
             _corners=corners,

@@ -7,7 +7,7 @@ centre lies in; ground outside all polygons has no data.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -21,6 +21,8 @@ from tcpipe.errors import MapError, RegionError
 from tcpipe.formats.geojson import PolygonFeature, brief, read_polygons, shortened
 from tcpipe.formats.maps.geotiff import burn_polygons
 from tcpipe.formats.maps.layer_building import Tally
+from tcpipe.tables.catalogue import threshold
+from tcpipe.tables.findings import Finding, Subject, make_finding
 from tcpipe.terrain.classes import ClassScheme, name_key
 from tcpipe.terrain.grid import MapGrid
 from tcpipe.terrain.layers import Layer, Pixels, paper_layers
@@ -35,9 +37,7 @@ SUFFIXES = (".geojson", ".json")
 _EDGE_STEP_DEG = 0.001
 """Edges are straight in lon/lat; at this step (100 m) the projected edge is straight to 1 mm below 70° latitude."""
 
-_SEEN_OVERLAP_M2 = 1.0
-"""Polygons of different classes that overlap by more than this are said."""
-
+_TERRAIN = Subject("layer", "terrain")
 
 _LOOKED_AT = 5_000_000
 """Vertices of pairs of polygons that are held against each other to tell how they overlap."""
@@ -58,7 +58,7 @@ class PolygonLayer:
     name: str
     polygons: NDArray[np.object_]
     ids: NDArray[np.uint8]
-    warnings: tuple[str, ...]
+    findings: tuple[Finding, ...]
     _tree: shapely.STRtree = field(repr=False)
     tally: Tally = field(default_factory=Tally)
 
@@ -80,9 +80,9 @@ class PolygonLayer:
         """No reason of its own: `place_polygons` has seen that they reach the map."""
         return None
 
-    def notes(self) -> list[str]:
-        """Return what was noticed when they were placed."""
-        return list(self.warnings)
+    def list_findings(self) -> tuple[Finding, ...]:
+        """Return what was observed when they were placed."""
+        return self.findings
 
 
 def is_drawn(paths: Sequence[Path]) -> bool:
@@ -124,11 +124,9 @@ def place_polygons(
     polygons = _carried(label, np.array(flat, dtype=object), projection, bounds_m)
     on_map = ~shapely.is_empty(polygons)
     polygons, id_of_each = polygons[on_map], id_of_each[on_map]
-    doubt = projection.doubt()
-    warnings = [f"{name}: {doubt}; its polygons may be off by that"] if doubt else []
-    warnings += _overlaps(name, polygons, id_of_each, scheme)
+    findings = (*projection.find_rough_shift(_TERRAIN), *_find_overlaps(polygons, id_of_each, scheme))
     terrain = paper_layers(["terrain"], scheme.table)["terrain"]
-    return PolygonLayer(terrain, label, name, polygons, id_of_each, tuple(warnings), shapely.STRtree(polygons))
+    return PolygonLayer(terrain, label, name, polygons, id_of_each, findings, shapely.STRtree(polygons))
 
 
 def _read_all(paths: Sequence[Path]) -> tuple[list[PolygonFeature], list[str]]:
@@ -201,9 +199,10 @@ def _carried(
     )
 
 
-def _overlaps(name: str, polygons: NDArray[np.object_], ids: NDArray[np.uint8], scheme: ClassScheme) -> Iterator[str]:
-    """Say how much ground polygons of different classes share; of very many, and of very detailed ones, not all are looked at."""
-    tree, shared_m2, worst, left = shapely.STRtree(polygons), 0.0, (0.0, ""), _LOOKED_AT
+def _find_overlaps(polygons: NDArray[np.object_], ids: NDArray[np.uint8], scheme: ClassScheme) -> tuple[Finding, ...]:
+    """Return how much ground polygons of different classes share; of very many, and of very detailed ones, not all are looked at."""
+    tree, shared_m2, worst_m2, left = shapely.STRtree(polygons), 0.0, 0.0, _LOOKED_AT
+    names: dict[str, str] = {}
     vertices = shapely.get_num_coordinates(polygons)
     for first in range(0, len(polygons), _TOGETHER):
         above, below = tree.query(polygons[first : first + _TOGETHER], predicate="intersects")
@@ -215,16 +214,12 @@ def _overlaps(name: str, polygons: NDArray[np.object_], ids: NDArray[np.uint8], 
         left -= int((vertices[above] + vertices[below]).sum())
         areas_m2 = shapely.area(shapely.intersection(polygons[below], polygons[above]))
         shared_m2 += float(areas_m2.sum())
-        if areas_m2.size and areas_m2.max() > worst[0]:
+        if areas_m2.size and areas_m2.max() > worst_m2:
             at = int(np.argmax(areas_m2))
-            names = [scheme.table.name(int(ids[part[at]])) for part in (above, below)]
-            worst = float(areas_m2[at]), f"{names[0]} over {names[1]}"
+            worst_m2 = float(areas_m2[at])
+            names = {key: scheme.table.name(int(ids[part[at]])) for key, part in (("above", above), ("below", below))}
         if not looked_at.all():
-            left = 0
             break
-    if shared_m2 > _SEEN_OVERLAP_M2:
-        more = "" if left else "at least "
-        yield (
-            f"{name}: polygons of different classes overlap by {more}{shared_m2:.0f} m² (most of it {worst[1]}); "
-            "the later in the file lies on top"
-        )
+    if shared_m2 <= threshold("polygons-overlap", "min_overlap_m2"):
+        return ()
+    return (make_finding("polygons-overlap", _TERRAIN, names=names, overlap_m2=shared_m2),)

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from tcpipe.fusion.checks.gridded_motion import fix_places
 from tcpipe.fusion.checks.lags import GRID_S, Floats
+from tcpipe.fusion.checks.refusals import Refusal
 from tcpipe.fusion.measurements import GNSS, WHEELS, Positions
 
 COMMAND = "command"
@@ -94,8 +95,8 @@ def find_distances(gnss: Positions | None, twists: Mapping[str, Floats], at_ns: 
     return Distances({name: _chords_m(place, _LONG_WINDOW) for name, place in places.items()}, least_m)
 
 
-def contradictions(found: Distances, *, turning: frozenset[str]) -> dict[str, str]:
-    """Return why by sensor: of two that differ the one that fewer others agree with, or both.
+def contradictions(found: Distances, *, turning: frozenset[str]) -> dict[str, Refusal]:
+    """Return the refusals by sensor: of two that differ the one that fewer others agree with, or both.
 
     Parameters
     ----------
@@ -103,7 +104,7 @@ def contradictions(found: Distances, *, turning: frozenset[str]) -> dict[str, st
     """
     sensors = [name for name in found.chord_m if name != COMMAND]
     heard = {name: [other for other in found.chord_m if other != name and found.agree(name, other)] for name in sensors}
-    why: dict[str, str] = {}
+    refusals: dict[str, Refusal] = {}
     for slow, fast, ratio in _differing(found, sensors):
         still = ratio > 1 / _STILL
         # A command tells how fast a robot that moves is to go, not that it moves; a gyroscope that turns with it does.
@@ -111,12 +112,12 @@ def contradictions(found: Distances, *, turning: frozenset[str]) -> dict[str, st
         for_slow = len(heard[slow])
         if still and fast == WHEELS and not for_fast:
             continue  # the wheels turn, the robot stands: stuck
-        doubt = ", and nothing tells which of the two is right" if for_fast == for_slow else ""
+        undecided = for_fast == for_slow
         if for_slow <= for_fast:
-            why.setdefault(slow, _text(fast, 1 / ratio) + doubt + _radians(slow, 1 / ratio))
+            refusals.setdefault(slow, _refuse(slow, fast, 1 / ratio, undecided=undecided))
         if for_fast <= for_slow:
-            why.setdefault(fast, _text(slow, ratio) + doubt + _kilometres(ratio))
-    return why
+            refusals.setdefault(fast, _refuse(fast, slow, ratio, undecided=undecided))
+    return refusals
 
 
 def path_of_fixes(
@@ -192,16 +193,15 @@ def _differing(found: Distances, sensors: list[str]) -> Iterable[tuple[str, str,
             yield (b, a, ratio) if ratio > 1 else (a, b, 1 / ratio)
 
 
-def _text(other: str, ratio: float) -> str:
-    return f"it goes {ratio:.2g} times as far as {other}"
-
-
-def _kilometres(ratio: float) -> str:
-    return " (km/h?)" if _KMH[0] < ratio < _KMH[1] else ""
-
-
-def _radians(name: str, ratio: float) -> str:
-    return " (latitude and longitude in radians?)" if name == GNSS and _RADIANS[0] < ratio < _RADIANS[1] else ""
+def _refuse(role: str, other: str, ratio: float, *, undecided: bool) -> Refusal:
+    """Return the refusal of a sensor that goes ``ratio`` times as far as another."""
+    names = {"reference": other} | ({"suspect": other} if undecided else {})
+    numbers = {"distance_ratio": ratio}
+    if _KMH[0] < ratio < _KMH[1]:
+        return Refusal(role, "unit-suspected", {**names, "unit": "km/h"}, numbers)
+    if role == GNSS and _RADIANS[0] < ratio < _RADIANS[1]:
+        return Refusal(role, "unit-suspected", {**names, "unit": "radians"}, numbers)
+    return Refusal(role, "distance-contradicted", names, numbers)
 
 
 def _dead_reckoned(twist: Floats) -> NDArray[np.complex128]:

@@ -8,16 +8,16 @@ is not of the fixes' time; which of these two is off nobody can tell.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.fusion.checks.clock_offsets import where_it_changes
+from tcpipe.fusion.checks.frozen import refuse_frozen
 from tcpipe.fusion.checks.gridded_motion import FIXES_S, fix_velocity, on_grid, twist_on_grid
 from tcpipe.fusion.checks.lags import Floats, Lag, averaged, find_lag
+from tcpipe.fusion.checks.refusals import Refusal
 from tcpipe.fusion.checks.windows import liveliest_ns
-from tcpipe.fusion.measurements import GroundVelocities, Measurements, Positions
+from tcpipe.fusion.measurements import DOPPLER, GNSS, GroundVelocities, Measurements, Positions
 from tcpipe.fusion.signals import in_gap, integral, median_period_ns, seconds
 
 _WINDOWS_S = (4.0, 8.0, 16.0, 32.0, 64.0)
@@ -30,24 +30,16 @@ _LATE_S, _SURE, _MAX_STD_S, _MIN_EXPLAINED = 0.05, 4.0, 0.03, 0.5
 _MAX_GAP_NS = 1_000_000_000
 
 
-@dataclass(frozen=True, slots=True)
-class Doubt:
-    """Why a receiver's velocity is not fused; ``late_s`` where its stamps are off against an odometry [s]."""
-
-    why: str
-    late_s: float | None = None
-
-
-def doubt_of_velocity(m: Measurements) -> Doubt | None:
+def doubt_of_velocity(m: Measurements) -> Refusal | None:
     """Return why the receiver's velocity of a clock epoch is not to be fused; None where the fixes confirm it."""
     if m.doppler is None:
         return None
     if m.gnss is None:
-        return Doubt("no fixes of its receiver are fused, and nothing else tells its frame")
+        return Refusal(DOPPLER, "velocity-unverified")
     windows = _ways(m.gnss, m.doppler)
     if windows is None:
-        return Doubt("the fixes do not show where it goes, so nothing tells that it is east, north, up")
-    return _frame(*windows) or _lateness(m)
+        return Refusal(DOPPLER, "velocity-unverified")
+    return _frame(*windows, m.doppler.stamp_ns.size) or _lateness(m)
 
 
 def _ways(gnss: Positions, doppler: GroundVelocities) -> tuple[NDArray[np.complex128], NDArray[np.complex128]] | None:
@@ -73,7 +65,7 @@ def _ways(gnss: Positions, doppler: GroundVelocities) -> tuple[NDArray[np.comple
     return None
 
 
-def _frame(by_fixes: NDArray[np.complex128], by_velocity: NDArray[np.complex128]) -> Doubt | None:
+def _frame(by_fixes: NDArray[np.complex128], by_velocity: NDArray[np.complex128], messages: int) -> Refusal | None:
     """Return what is wrong with the directions or the size of the velocity."""
 
     def off(told: NDArray[np.complex128]) -> float:
@@ -83,17 +75,15 @@ def _frame(by_fixes: NDArray[np.complex128], by_velocity: NDArray[np.complex128]
         return None
     size = float(np.median(np.abs(by_velocity) / np.abs(by_fixes)))
     if size < _STANDS:
-        return Doubt("it is zero while the fixes move")
+        return refuse_frozen(DOPPLER, "velocity", messages)
     if off(1j * np.conj(by_velocity)) <= _OFF:
-        return Doubt("north and east are exchanged against the fixes (north, east, down?)")
+        return Refusal(DOPPLER, "velocity-frame", {"frame": "north-east-down"})
     if abs(size - 1.0) <= _OFF:
-        return Doubt("it is as fast as the fixes but goes elsewhere (a velocity of the body, or in another frame?)")
-    return Doubt(
-        f"it goes {size:.2g} times as far as the fixes, {100 * off(by_velocity):.0f} % of the way off (another unit or frame?)"
-    )
+        return Refusal(DOPPLER, "velocity-frame", {"frame": "unknown"})
+    return Refusal(DOPPLER, "distance-contradicted", {"reference": GNSS}, {"distance_ratio": size})
 
 
-def _lateness(m: Measurements) -> Doubt | None:
+def _lateness(m: Measurements) -> Refusal | None:
     """Return by how much its stamps are off: by the first odometry, or, where that tells no lag, by how the fixes go."""
     at_ns = liveliest_ns(m)
     if at_ns is None or m.doppler is None or m.gnss is None:
@@ -103,15 +93,18 @@ def _lateness(m: Measurements) -> Doubt | None:
         speed = averaged(np.linalg.norm(velocity, axis=1)[:, None], _SMOOTH_S)
         lag = find_lag(*where_it_changes(speed, averaged(_antenna(m, at_ns), _SMOOTH_S)))
         if lag is not None and _is_known(lag):
-            how = "late" if lag.offset_s > 0 else "early"
-            why = f"its stamps are {abs(lag.offset_s):.2f} s {how} against {role} (± {2 * lag.std_s:.2f} s)"
-            return Doubt(why, lag.offset_s) if _is_off(lag) else None
+            return _refuse_late("time-offset", role, lag, late_s=lag.offset_s) if _is_off(lag) else None
     seen = fix_velocity(m.gnss, at_ns)
     for axis, of_fixes in zip(averaged(velocity, FIXES_S).T, (seen.real, seen.imag), strict=True):
         lag = find_lag(axis, averaged(of_fixes[:, None], _SMOOTH_S))
         if lag is not None and _is_known(lag) and _is_off(lag):
-            return Doubt(f"its stamps and the fixes' are {abs(lag.offset_s):.2f} s apart (± {2 * lag.std_s:.2f} s)")
+            return _refuse_late("clocks-differ", GNSS, lag)
     return None
+
+
+def _refuse_late(code: str, reference: str, lag: Lag, *, late_s: float | None = None) -> Refusal:
+    numbers = {"offset_s": lag.offset_s, "offset_2std_s": 2 * lag.std_s, "apart_s": abs(lag.offset_s)}
+    return Refusal(DOPPLER, code, {"reference": reference}, numbers, late_s=late_s)
 
 
 _SMOOTH_S = 0.3

@@ -6,6 +6,7 @@ import numpy as np
 
 from tcpipe.fusion.checks.distances import Distances
 from tcpipe.fusion.checks.lags import Floats
+from tcpipe.fusion.checks.refusals import Refusal
 from tcpipe.fusion.measurements import GNSS, IMU, Measurements
 
 _FEWEST_ROWS = 20
@@ -13,25 +14,27 @@ _APART = 0.5
 _FEWEST_WINDOWS = 2
 
 
-def frozen_sensors(m: Measurements, found: Distances) -> dict[str, str]:
-    """Return why by sensor; ``found`` tells how far the others went."""
-    why = {}
+def frozen_sensors(m: Measurements, found: Distances) -> dict[str, Refusal]:
+    """Return the refusals by sensor; ``found`` tells how far the others went."""
+    refusals = {}
     if m.gnss is not None and _one_value(m.gnss.position_enu_m) and _contradicted(GNSS, found):
-        why[GNSS] = f"all of its {m.gnss.stamp_ns.size} fixes are the same place while the robot drives"
+        refusals[GNSS] = refuse_frozen(GNSS, "position", m.gnss.stamp_ns.size)
     for role, source in m.odometries().items():
         if _contradicted(role, found) and _one_value(source.velocity_mps):
-            speed = source.velocity_mps[0, 0]
-            why[role] = (
-                f"its velocity is {speed:g} m/s on all of its {source.stamp_ns.size} messages, whatever the robot does"
-            )
+            refusals[role] = refuse_frozen(role, "velocity", source.stamp_ns.size)
     if m.imu is not None and any(np.nanmax(chord, initial=0.0) > found.least_m for chord in found.chord_m.values()):
         for what, values in (
-            ("angular velocity", m.imu.angular_velocity_radps),
+            ("angular_velocity", m.imu.angular_velocity_radps),
             ("acceleration", m.imu.specific_force_mps2),
         ):
             if _one_value(values):
-                why[IMU] = f"its {what} never changes while the robot drives"
-    return why
+                refusals[IMU] = refuse_frozen(IMU, what, m.imu.stamp_ns.size)
+    return refusals
+
+
+def refuse_frozen(role: str, quantity: str, messages: int) -> Refusal:
+    """Return the refusal of a sensor that repeats one value."""
+    return Refusal(role, "frozen", {"quantity": quantity}, {"message_count": messages})
 
 
 def _one_value(values: Floats) -> bool:

@@ -7,7 +7,7 @@ disagree a third decides: the command, the camera, the course of the fixes. Moun
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -27,6 +27,7 @@ from tcpipe.fusion.checks.plausibility import (
     up_axis,
     yaw_axis,
 )
+from tcpipe.fusion.checks.refusals import Refusal, join_names, refuse_fixes
 from tcpipe.fusion.checks.windows import liveliest_ns
 from tcpipe.fusion.measurements import GNSS, IMU, VISUAL, WHEELS, InertialMeasurements, Measurements, Positions
 from tcpipe.fusion.signals import hold_last
@@ -48,29 +49,6 @@ FORWARD = np.diag([-1.0, -1.0, 1.0])
 """Turns a body's x axis round and leaves its yaw rate."""
 YAW = np.diag([1.0, -1.0, -1.0])
 """Turns a body's yaw rate round and leaves its x axis."""
-
-
-@dataclass(frozen=True, slots=True)
-class Refusal:
-    """A sensor that is not to be fused: why, and what would set it right.
-
-    ``units`` is the value of the recipe's ``imu_units``; ``turned_by`` (3, 3) turns what the mounting in use makes of the sensor into
-    base_link. Neither: nothing in the recipe does. ``instead`` is the role that may as well be what errs.
-    """
-
-    role: str
-    why: str
-    units: str | None = None
-    turned_by: Floats | None = None
-    instead: str | None = None
-
-
-def fixes_refused(why: str, odometries: Collection[str]) -> Refusal:
-    """Return the refusal of fixes that odometries contradict: a single one may as well be what errs, whoever confirms how it turns."""
-    if len(odometries) != 1:
-        return Refusal(GNSS, why)
-    (other,) = odometries
-    return Refusal(GNSS, f"{why}; or {other} errs: nothing else tells how far the robot goes", instead=other)
 
 
 @dataclass(slots=True)
@@ -108,9 +86,9 @@ def check_sensors(
     felt : median size of the specific force as the IMU told it, before its lever arm was taken out; NaN without an IMU.
     """
     checks = Checks()
-    slow = None if measurements.imu is None else _why_too_slow(measurements.imu)
+    slow = None if measurements.imu is None else _refuse_slow(measurements.imu)
     if slow is not None:
-        checks.refusals.append(Refusal(IMU, slow))
+        checks.refusals.append(slow)
         measurements = replace(measurements, imu=None)
     at_ns = liveliest_ns(measurements)
     if at_ns is None:
@@ -121,7 +99,7 @@ def check_sensors(
         twists |= {role: twists[role] / [scale.factor, 1.0] for role, scale in checks.scales.items()}
     found = find_distances(measurements.gnss, _with_command(twists, command, at_ns), at_ns)
     frozen = frozen_sensors(measurements, found)
-    checks.refusals += [Refusal(role, why) for role, why in frozen.items()]
+    checks.refusals += frozen.values()
     twists = {role: twist for role, twist in twists.items() if role not in frozen}
     gnss = None if GNSS in frozen else measurements.gnss
     turning = {role: averaged(twist, _SMOOTH_S)[:, 1] for role, twist in twists.items()}
@@ -137,16 +115,13 @@ def check_sensors(
     return checks
 
 
-def _why_too_slow(imu: InertialMeasurements) -> str | None:
-    """Return why an IMU cannot be integrated: for most of its time its samples are too far apart to tell the motion between them."""
+def _refuse_slow(imu: InertialMeasurements) -> Refusal | None:
+    """Return the refusal of an IMU whose samples are, for most of its time, too far apart to tell the motion between them."""
     step_s = np.diff(imu.stamp_ns) * 1e-9
     span_s = float(step_s.sum())
     if span_s > 0 and float(step_s[step_s < _LONGEST_IMU_STEP_S].sum()) >= _MOSTLY * span_s:
         return None
-    return (
-        f"it has {step_s.size / max(span_s, 1.0):.1f} samples a second, in most of its time too far apart to be integrated: "
-        "record it at 10 Hz or more (100 Hz is usual), without gaps"
-    )
+    return Refusal(IMU, "imu-too-slow", numbers={"rate_hz": step_s.size / max(span_s, 1.0)})
 
 
 def _far_scale(
@@ -188,8 +163,7 @@ def _check_distances(checks: Checks, found: Distances) -> None:
     far_m = {role: float(np.nanmedian(chord)) for role, chord in found.chord_m.items() if np.isfinite(chord).any()}
     checks.facts = replace(checks.facts, distance_m=far_m)
     refused = {refusal.role for refusal in checks.refusals}
-    why = contradictions(found, turning=turning)
-    checks.refusals += [Refusal(role, text) for role, text in why.items() if role not in refused]
+    checks.refusals += [of for role, of in contradictions(found, turning=turning).items() if role not in refused]
 
 
 def _turning_as_felt(
@@ -216,20 +190,16 @@ def _check_path(checks: Checks, gnss: Positions, twists: Mapping[str, Floats], a
     if GNSS in refused or not against or "alike" in told.values():
         return
     confirmed = len(against) > 1 or against[0] in checks.yaw_axis
-    doubt = "" if confirmed else ", and nothing tells which of the two is right"
-    by = " and ".join(against)
+    names = {"reference": join_names(against)}
     if "unlike" in told.values():
         if confirmed:
-            checks.refusals.append(
-                fixes_refused(f"its path is not that by {by} (another clock, drive or receiver?)", told)
-            )
-        return
-    exchanged = f"its path is the mirror image of that by {by} (latitude and longitude exchanged?)"
-    checks.refusals.append(Refusal(GNSS, exchanged + doubt))
-    if doubt:
-        checks.refusals.append(
-            Refusal(against[0], f"its yaw rate has the opposite sign of {GNSS}{doubt}", turned_by=YAW)
-        )
+            checks.refusals.append(refuse_fixes("path-unlike", told, names))
+    elif confirmed:
+        checks.refusals.append(Refusal(GNSS, "path-mirrored", names))
+    else:
+        checks.refusals.append(Refusal(GNSS, "path-mirrored", {**names, "suspect": against[0]}))
+        names = {"reference": GNSS, "suspect": GNSS}
+        checks.refusals.append(Refusal(against[0], "yaw-rate-sign", names, turned_by=YAW))
 
 
 def _check_imu(
@@ -250,10 +220,12 @@ def _check_imu(
     checks.facts = replace(checks.facts, specific_force_median=felt, up=vector(up), yaw_axis=told)
     units = _units(rate, axes, felt)
     if units is not None:
-        checks.refusals.append(Refusal(IMU, _units_text(units, axes, rate, felt), units=units))
+        checks.refusals.append(
+            Refusal(IMU, "imu-units", {"units": units}, _unit_evidence(units, axes, rate, felt), units)
+        )
         return {}
     if felt == 0.0:
-        checks.refusals.append(Refusal(IMU, "its specific force is zero throughout: it measures none"))
+        checks.refusals.append(Refusal(IMU, "imu-no-acceleration"))
     if not _IN_MPS2[0] <= felt <= _IN_MPS2[1]:
         return {}
     level = levelling(up)
@@ -264,9 +236,10 @@ def _check_imu(
     checks.facts = replace(checks.facts, looks_rad=looks_rad or None)
     looks = {role: yaw for role, (yaw, _) in looks_rad.items()}
     if up[2] < np.cos(_TILTED_RAD):
-        tilt_deg = float(np.degrees(np.arccos(up[2])))
-        why = f"gravity lies {tilt_deg:.0f}° off the robot's z axis"
-        checks.refusals.append(Refusal(IMU, why, turned_by=_upright(level, looks)))
+        tilt = {"off_rad": float(np.arccos(up[2]))}
+        checks.refusals.append(
+            Refusal(IMU, "imu-rotated", {"evidence": "gravity"}, tilt, turned_by=_upright(level, looks))
+        )
         return {}
     return _check_yaw_sign(checks, axes, looks, stated)
 
@@ -282,16 +255,14 @@ def _units(rate: Floats, axes: Mapping[str, YawAxis], felt: float) -> str | None
     return "_".join(words) or None
 
 
-def _units_text(units: str, axes: Mapping[str, YawAxis], rate: Floats, felt: float) -> str:
-    parts = []
+def _unit_evidence(units: str, axes: Mapping[str, YawAxis], rate: Floats, felt: float) -> dict[str, float]:
+    """Return what shows the units: times the gyroscope turns as fast as another sensor (degrees: 57), or its fastest; median force."""
+    evidence = {"force_median": felt} if "g" in units.split("_") else {}
     if "deg" in units and axes:
-        role, axis = next(iter(axes.items()))
-        parts.append(f"its gyroscope turns {1 / axis.scale:.0f} times as fast as {role} (degrees: 57)")
+        evidence["turn_ratio"] = 1 / next(iter(axes.values())).scale
     elif "deg" in units:
-        parts.append(f"its gyroscope tells up to {np.nanmax(np.abs(rate)):.0f}, which no robot turns in rad/s")
-    if "g" in units.split("_"):
-        parts.append(f"its specific force at rest is {felt:.2f} (in g 1, in m/s² 9.81)")
-    return " and ".join(parts)
+        evidence["rate_max"] = float(np.nanmax(np.abs(rate)))
+    return evidence
 
 
 def _upright(level: Floats, looks: Mapping[str, float]) -> Floats:
@@ -315,12 +286,10 @@ def _check_yaw_sign(
     if not blamed:
         return looks
     if others or (len(against) == 1 and stated.get(IMU, False)):
-        for role in blamed:
-            with_whom = " and ".join((IMU, *others))
-            checks.refusals.append(Refusal(role, f"its yaw rate has the opposite sign of {with_whom}", turned_by=YAW))
+        names = {"reference": join_names((IMU, *others))}
+        checks.refusals += [Refusal(role, "yaw-rate-sign", names, turned_by=YAW) for role in blamed]
         return looks
-    why = f"it is upright by gravity, but its gyroscope turns the other way round than {' and '.join(against)}"
-    checks.refusals.append(Refusal(IMU, f"{why}: gyroscope or accelerometer has the wrong sign"))
+    checks.refusals.append(Refusal(IMU, "imu-sign", {"reference": join_names(against)}))
     return {}
 
 
@@ -338,25 +307,27 @@ def _check_directions(
     against = _against_command(forward, command, at_ns)
     if against:
         for role in (role for role, backwards in against.items() if backwards):
-            _add_turned(checks, role, "it drives the other way than the command says")
+            _add_turned(checks, role, {"reference": COMMAND})
         return
-    backwards = [role for role, yaw in looks.items() if abs(yaw) > _BACKWARDS_RAD]
+    backwards = {role: yaw for role, yaw in looks.items() if abs(yaw) > _BACKWARDS_RAD}
     if backwards and len(backwards) == len(forward) and (len(forward) > 1 or not stated.get(IMU, False)):
-        why = f"by the accelerations of {' and '.join(backwards)} it looks backwards"
-        checks.refusals.append(Refusal(IMU, why, turned_by=FORWARD))
+        checks.refusals.append(_refuse_yaw(backwards, FORWARD))
         return
     for role in backwards:
-        _add_turned(checks, role, f"it drives the other way than the accelerations of {IMU} say")
+        _add_turned(checks, role, {"reference": IMU})
     same = agreement(forward[WHEELS], forward[VISUAL]) if len(forward) > 1 and not looks else None
     if same is not None and same < _OTHER_WAY:
-        _add_turned(
-            checks, VISUAL, f"it drives the other way than {WHEELS}, and nothing tells which of the two is right"
-        )
+        _add_turned(checks, VISUAL, {"reference": WHEELS, "suspect": WHEELS})
     aside = {role: yaw for role, yaw in looks.items() if _LOOKS_ELSEWHERE_RAD < abs(yaw) <= _BACKWARDS_RAD}
     if aside and len(aside) == len(looks):
-        yaw = next(iter(aside.values()))
-        why = f"by the accelerations of {' and '.join(aside)} it looks {np.degrees(yaw):.0f}° aside"
-        checks.refusals.append(Refusal(IMU, why, turned_by=nearest_mounting(_about_z(yaw))))
+        checks.refusals.append(_refuse_yaw(aside, nearest_mounting(_about_z(next(iter(aside.values()))))))
+
+
+def _refuse_yaw(looks: Mapping[str, float], turned_by: Floats) -> Refusal:
+    """Return the refusal of an IMU that looks elsewhere by the accelerations of odometries, by yaw [rad]."""
+    names = {"evidence": "acceleration", "reference": join_names(looks)}
+    numbers = {"off_rad": next(iter(looks.values()))}
+    return Refusal(IMU, "imu-rotated", names, numbers, turned_by=turned_by)
 
 
 def _against_command(
@@ -370,11 +341,11 @@ def _against_command(
     return {role: value < _OTHER_WAY for role, value in same.items() if value is not None}
 
 
-def _add_turned(checks: Checks, role: str, why: str) -> None:
+def _add_turned(checks: Checks, role: str, names: Mapping[str, str]) -> None:
     """Refuse an odometry that drives backwards, in one with a yaw rate that turns the other way."""
     before = next((refusal for refusal in checks.refusals if refusal.role == role), None)
-    if before is None or before.turned_by is None:
-        checks.refusals.append(Refusal(role, why, turned_by=FORWARD))
-        return
-    checks.refusals.remove(before)
-    checks.refusals.append(Refusal(role, f"{before.why}, and {why}", turned_by=FORWARD @ before.turned_by))
+    turned_by = FORWARD
+    if before is not None and before.turned_by is not None:
+        checks.refusals.remove(before)
+        turned_by = FORWARD @ before.turned_by
+    checks.refusals.append(Refusal(role, "drives-backwards", names, turned_by=turned_by))

@@ -13,8 +13,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.fusion.measurements import BodyVelocities, Positions
+from tcpipe.fusion.measurements import GNSS, BodyVelocities, Positions
 from tcpipe.fusion.signals import integral, seconds
+from tcpipe.tables.findings import Finding, Subject, make_finding
 
 _MIN_SPEED_MPS = 0.3
 _MAX_INTERVAL_S = 2.0
@@ -22,17 +23,21 @@ _PAIRS = 41
 _MIN_JITTER_S = 0.05
 
 
-def steadied(gnss: Positions | None, odometry: BodyVelocities | None) -> tuple[Positions | None, tuple[str, ...]]:
-    """Return the fixes with the variance of those raised whose stamps jitter against the odometry, and what to say of it."""
+def steadied(gnss: Positions | None, odometry: BodyVelocities | None) -> tuple[Positions | None, tuple[Finding, ...]]:
+    """Return the fixes with the variance of those raised whose stamps jitter against the odometry, and the finding of it."""
     if gnss is None or odometry is None:
         return gnss, ()
     jitter_s = stamp_jitter_s(gnss, odometry)
     jumpy = jitter_s > 0
     if not jumpy.any():
         return gnss, ()
-    text = f"{jumpy.mean():.0%} of the fixes lie on the path as if their stamps jittered by {np.median(jitter_s[jumpy]):.2f} s"
-    remark = f"gnss: {text} against the odometry; their variance is raised by that much driving"
-    return with_jitter(gnss, odometry, jitter_s), (remark,)
+    finding = make_finding(
+        "stamp-jitter",
+        Subject("role", GNSS),
+        jitter_fraction=float(jumpy.mean()),
+        jitter_s=float(np.median(jitter_s[jumpy])),
+    )
+    return with_jitter(gnss, odometry, jitter_s), (finding,)
 
 
 def stamp_jitter_s(gnss: Positions, odometry: BodyVelocities) -> NDArray[np.float64]:

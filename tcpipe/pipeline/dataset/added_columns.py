@@ -16,9 +16,10 @@ from numpy.typing import NDArray
 from tcpipe.errors import DatasetError
 from tcpipe.formats.dataset_card import Covariate, RunSource
 from tcpipe.recipe import CovariateConfig
-from tcpipe.recipe.suggestions import recipe_key
+from tcpipe.recipe.suggestions import suggest
 from tcpipe.robots.profiles import Robot
 from tcpipe.tables.columns import integers
+from tcpipe.tables.findings import Finding, Subject, make_finding
 from tcpipe.tables.levels import SAMPLES
 
 if TYPE_CHECKING:
@@ -36,7 +37,7 @@ class Added:
 
     table: pa.Table
     covariates: tuple[Covariate, ...]
-    warnings: tuple[str, ...]
+    findings: tuple[Finding, ...]
 
 
 def read_all_covariates(paths: Sequence[Path], config: CovariateConfig) -> tuple[CovariateTable, ...]:
@@ -76,7 +77,7 @@ def added_columns(
     ------
     DatasetError : two columns would have one name.
     """
-    table, warnings = _tags(segments.column("run_id"), runs)
+    table, findings = _tags(segments.column("run_id"), runs)
     told = list[Covariate]()
     for covariates in tables:
         found, reached = covariates.join(integers(segments, "start_ns"), max_age_s=config.max_age_s)
@@ -91,7 +92,7 @@ def added_columns(
                 without,
             )
         )
-        warnings += (*covariates.warnings, *_unreached(told[-1], segments, kept[~reached[kept]], len(kept), config))
+        findings += (*covariates.findings, *_find_missing(told[-1], int((~reached[kept]).sum()), len(kept)))
         for field in found.schema:
             table = table.append_column(field, found.column(field.name))
     names = [*SAMPLES.names(), *layers, *table.column_names]
@@ -99,38 +100,38 @@ def added_columns(
         raise DatasetError(
             f"columns {', '.join(twice)} would be there twice; rename the file of covariates, or its columns"
         )
-    return Added(table, tuple(told), tuple(warnings))
+    return Added(table, tuple(told), tuple(findings))
 
 
-def _unreached(
-    told: Covariate, segments: pa.Table, rows: NDArray[np.int64], samples: int, config: CovariateConfig
-) -> list[str]:
-    """Return a line about the samples that no row reaches, and one about the columns that lack values beyond that."""
-    said = []
-    if rows.size:
-        runs = sorted(pc.unique(segments.column("run_id").take(pa.array(rows))).to_pylist())
-        more = f" and {len(runs) - 3} more" if len(runs) > 3 else ""
-        said.append(
-            f"{told.name}: no row reaches {rows.size} of {samples} samples (run {', '.join(runs[:3])}{more}): its rows are of "
-            f"{told.first} to {told.last}, and none is taken that is older than {config.max_age_s:g} s "
-            f"({recipe_key('covariates.max_age_s')})"
-        )
-    holes = [f"{name} {count - rows.size}" for name, count in told.samples_without.items() if count > rows.size]
-    if holes:
-        said.append(f"{told.name}: samples whose row has no value: {', '.join(holes)}")
-    return said
+def _find_missing(told: Covariate, unreached: int, samples: int) -> list[Finding]:
+    """Return the finding that no row reaches some samples, and one for each column that lacks values beyond that."""
+    missing = {Subject("file", told.name): unreached}
+    missing |= {Subject("column", name): count - unreached for name, count in told.samples_without.items()}
+    return [
+        make_finding("covariates-missing", subject, missing_count=count, sample_count=samples)
+        for subject, count in missing.items()
+        if count
+    ]
 
 
-def _tags(run_ids: pa.ChunkedArray, runs: Sequence[RunSource]) -> tuple[pa.Table, list[str]]:
+def _tags(run_ids: pa.ChunkedArray, runs: Sequence[RunSource]) -> tuple[pa.Table, list[Finding]]:
     """Return a column a tag: numbers where every run that carries it has one, else text; null for runs without it."""
     tags = {run.run_id: run.tags or {} for run in runs}
     place = pc.index_in(run_ids, value_set=pa.array(list(tags), pa.string()))
-    columns, fields, warnings = list[pa.Array](), list[pa.Field](), list[str]()
+    columns, fields, findings = list[pa.Array](), list[pa.Field](), list[Finding]()
     for key in sorted({key for of in tags.values() for key in of}):
         told = [of.get(key) for of in tags.values()]
         words = sorted({text for text in told if text is not None and not _NUMBER.fullmatch(text.strip())})
-        if words and len(words) < len({text for text in told if text is not None}):
-            warnings.append(f"tag {key}: {words[0]!r} is no number, others are; its column {TAG}{key} is text")
+        different = len({text for text in told if text is not None})
+        if words and len(words) < different:
+            finding = make_finding(
+                "column-is-text",
+                Subject("tag", key),
+                names={"example": words[0]},
+                odd_count=len(words),
+                value_count=different,
+            )
+            findings.append(finding)
         values = (
             pa.array(told, pa.string())
             if words
@@ -139,8 +140,8 @@ def _tags(run_ids: pa.ChunkedArray, runs: Sequence[RunSource]) -> tuple[pa.Table
         columns.append(values.take(place))
         fields.append(pa.field(f"{TAG}{key}", values.type, metadata={"unit": "", "doc": f"tag {key} of the run"}))
     if not fields:
-        return pa.table({"run_id": run_ids}).select([]), warnings
-    return pa.table(columns, schema=pa.schema(fields)), warnings
+        return pa.table({"run_id": run_ids}).select([]), findings
+    return pa.table(columns, schema=pa.schema(fields)), findings
 
 
 def tag_of_each(run_ids: Sequence[str], runs: Sequence[RunSource], key: str) -> list[str]:
@@ -155,19 +156,17 @@ def tag_of_each(run_ids: Sequence[str], runs: Sequence[RunSource], key: str) -> 
     return [str(tags[run_id]) for run_id in run_ids]
 
 
-def narrow_patches(robots: Sequence[str], known: Mapping[str, Robot], *, patch_m: float) -> list[str]:
-    """Return a line for each robot that is wider than a patch, or of which no width is known."""
-    said = []
+def find_narrow_patches(robots: Sequence[str], known: Mapping[str, Robot], *, patch_m: float) -> list[Finding]:
+    """Return a finding for each robot that is wider than a patch, or of which no width is known."""
+    findings = []
     for robot in sorted(set(robots)):
         width_m = known[robot].width_m if robot in known else None
+        subject = Subject("robot", robot)
         if width_m is None:
-            said.append(
-                f"robot {robot}: its width is not known, so nobody can say whether patches of {patch_m:g} m hold its wheels; "
-                f"tell it (width_m of {robot}, {recipe_key('robots')})"
-            )
+            findings.append(make_finding("robot-width-unknown", subject, patch_m=patch_m))
         elif width_m > patch_m:
-            said.append(
-                f"robot {robot}: is {width_m:g} m wide, patches {patch_m:g} m: its wheels run outside of them; "
-                f"take wider ones, segments stay as long as they are ({recipe_key('sample.patch_m')})"
+            remedies = suggest("wider", {"sample": {"patch_m": width_m}})
+            findings.append(
+                make_finding("patch-narrower-than-robot", subject, remedies=remedies, width_m=width_m, patch_m=patch_m)
             )
-    return said
+    return findings

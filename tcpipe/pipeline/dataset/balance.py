@@ -13,7 +13,7 @@ from pyproj import CRS
 from shapely.geometry.base import BaseGeometry
 from shapely.geometry.polygon import orient
 
-from tcpipe.balance.cells import ENOUGH, SLOPE_EDGES_DEG, SLOPE_NAMES, Cell, count_cells, slope_ranges, speed_edges
+from tcpipe.balance.cells import SLOPE_EDGES_DEG, SLOPE_NAMES, Cell, count_cells, slope_ranges, speed_edges
 from tcpipe.balance.correlation import correlations, residuals
 from tcpipe.balance.repeats import Floor, repeatability, repeated_pairs
 from tcpipe.balance.thin_ground import (
@@ -31,6 +31,7 @@ from tcpipe.formats.geojson import Feature, FeatureCollection, PolygonGeometry
 from tcpipe.formats.maps.map_files import MapFile
 from tcpipe.splits.assignment import SPLITS
 from tcpipe.splits.regions import Regions
+from tcpipe.tables.catalogue import threshold
 from tcpipe.tables.columns import floats, integers
 from tcpipe.terrain.projection import Projection, area_of, parse_crs
 
@@ -107,7 +108,7 @@ def measure_balance(
     balance = Balance(
         slope_edges_deg=SLOPE_EDGES_DEG,
         speed_edges_mps=tuple(edges),
-        enough_effective=ENOUGH,
+        enough_effective=threshold("thin-ground", "enough_count"),
         correlation=alike,
         by_class_and_slope=tuple(rows),
         cells=tuple(_row(cell, names, edges) for cell in cells),

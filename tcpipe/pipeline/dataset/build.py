@@ -7,7 +7,8 @@ import shlex
 import shutil
 from collections.abc import Container, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 
 import pyarrow as pa
@@ -19,7 +20,7 @@ from tcpipe.formats.atomic import atomic_directory, clear_beside, write_text
 from tcpipe.formats.bucket import open_place
 from tcpipe.formats.commits import Call, Dataset, Entries
 from tcpipe.formats.croissant import croissant
-from tcpipe.formats.dataset_card import DatasetCard, Doubtful, Redacted, RunFinding
+from tcpipe.formats.dataset_card import DatasetCard, Doubtful, Redacted, group_dataset_findings
 from tcpipe.formats.dataset_files import (
     CARD,
     CLASSES,
@@ -36,6 +37,7 @@ from tcpipe.formats.dataset_files import (
     read_current_card,
     read_samples,
 )
+from tcpipe.formats.finding_lines import format_mixed_groups, format_verdict
 from tcpipe.formats.geojson import read_regions
 from tcpipe.formats.hub_card import hub_card
 from tcpipe.formats.json_files import digest, write_json
@@ -52,9 +54,10 @@ from tcpipe.pipeline.begun_calls import OpenCall, begun_call
 from tcpipe.pipeline.calls import BUILD, Estimate, estimate, measure_call, started
 from tcpipe.pipeline.dataset.added_columns import read_all_covariates
 from tcpipe.pipeline.dataset.balance import BALANCE_COLUMNS, measure_balance
+from tcpipe.pipeline.dataset.build_dataset_options import BuildDatasetOptions
 from tcpipe.pipeline.dataset.card import CARD_COLUMNS, VELOCITY_COLUMN, dataset_card, is_whole
 from tcpipe.pipeline.dataset.content import gather_content
-from tcpipe.pipeline.dataset.findings import doubt_in_words, findings_in_words
+from tcpipe.pipeline.dataset.findings import is_problem
 from tcpipe.pipeline.dataset.inputs import Inputs, choose_inputs, earlier_splits
 from tcpipe.pipeline.dataset.physics import PHYSICS_COLUMNS
 from tcpipe.pipeline.dataset.redaction import (
@@ -65,21 +68,23 @@ from tcpipe.pipeline.dataset.redaction import (
     redaction_of,
 )
 from tcpipe.pipeline.dataset.replacing import BuildOptions, find_other_options
-from tcpipe.pipeline.dataset.runs import gone_runs
+from tcpipe.pipeline.dataset.runs import CHOICE_CODES, find_gone_runs
 from tcpipe.pipeline.dataset.sampling import Workers
 from tcpipe.pipeline.dataset.segments import KEPT
-from tcpipe.pipeline.dataset.splitting import empty_splits
 from tcpipe.pipeline.dataset.writing import write_patches
 from tcpipe.pipeline.log_writer import LogWriter, open_log
 from tcpipe.recipe import Recipe
 from tcpipe.report.dataset_report import dataset_report
 from tcpipe.report.overview import class_overview, maps_overview, relief_overview, write_overview
 from tcpipe.splits.assignment import SPLITS
-from tcpipe.splits.audit import HeldOut, audit_lines
+from tcpipe.splits.audit import HeldOut
 from tcpipe.splits.regions import Regions
 from tcpipe.store import Store, open_store
 from tcpipe.tables.facts import EnergyBudget
+from tcpipe.tables.findings import LEFT_OUT, Finding
 from tcpipe.tables.levels import DATA_MODEL_VERSION, READ_VERSIONS
+from tcpipe.tables.options import as_function
+from tcpipe.tables.verdicts import Verdict
 
 logger = logging.getLogger("tcpipe")
 
@@ -96,9 +101,11 @@ class BuildResult:
     splits: Mapping[str, int]
     ledger_m: Mapping[str, float]
     audit: tuple[HeldOut, ...]
-    warnings: tuple[str, ...]
-    problems: tuple[str, ...] = ()
-    """Runs that belong in and are left out, and splits that were asked for and are empty: the dataset is not what it should be."""
+    findings: tuple[Finding, ...]
+    """Of the dataset itself: runs that belong in and are left out and splits that are empty, too."""
+    findings_by_run: Mapping[str, tuple[Finding, ...]] = field(default_factory=dict, metadata=LEFT_OUT)
+    findings_by_map: Mapping[str, tuple[Finding, ...]] = field(default_factory=dict, metadata=LEFT_OUT)
+    verdict: Verdict | None = None
     energy_budget: EnergyBudget | None = None
     exit_code: int = 0
     """3 if the dataset is not what it should be."""
@@ -106,19 +113,32 @@ class BuildResult:
     """Which recipe ruled, as a command found it."""
     doubtful: Doubtful | None = None
     """How many samples carry a quality flag."""
-    findings: tuple[RunFinding, ...] = ()
-    """What ingest found of the runs, by cause."""
     redacted: bool = False
     """Whether names and places are not told."""
     estimate: Estimate | None = None
     """What a dry run expects of the work: of all segments, as if each became a sample."""
 
     def __str__(self) -> str:
-        """Return counts, the share of doubtful samples, the audit, where the metres went and how wrong a label may be, as plain lines."""
+        """Return counts, where the metres went, how wrong a label may be, the verdict and findings, as plain lines."""
+        return plain_lines((*self._facts(), *self.problem_lines(), *self._lines(problems=False), *self._closing()))
+
+    def without_problems(self) -> str:
+        """Return the same without the lines of problems, which a command prints as errors."""
+        return plain_lines((*self._facts(), *self._lines(problems=False), *self._closing()))
+
+    def problem_lines(self) -> list[str]:
+        """Return a line for each code that makes the exit code 3."""
+        return self._lines(problems=True)
+
+    def _lines(self, *, problems: bool) -> list[str]:
+        own = [finding for finding in self.findings if is_problem(finding) == problems]
+        by_run = dict.fromkeys(self.findings_by_run, ()) if problems else self.findings_by_run
+        groups = group_dataset_findings(own, by_run, {} if problems else self.findings_by_map)
+        return format_mixed_groups(groups, more=f"tcpipe inspect {shlex.quote(self.path)}")
+
+    def _facts(self) -> list[str]:
         if self.estimate is not None:
-            return plain_lines(
-                (f"{self.path}: would be made of at most {self.estimate}", *(f"warning: {w}" for w in self.warnings))
-            )
+            return [f"{self.path}: would be made of at most {self.estimate}"]
         counts = ", ".join(f"{self.splits[name]} {name}" for name in SPLITS)
         head = f"{self.path}: {self.samples} samples ({counts})"
         if self.status == "unchanged":
@@ -128,92 +148,33 @@ class BuildResult:
         ledger = f"{sum(self.ledger_m.values()):.0f} m driven: {self.ledger_m[KEPT]:.0f} m in samples"
         ledger += "".join(f", {metres:.0f} m {name.replace('_', ' ')}" for name, metres in lost)
         floor = [] if self.energy_budget is None else [in_words(self.energy_budget)]
-        doubt = [] if self.doubtful is None else [doubt_in_words(self.doubtful, self.samples)]
-        said = [f"{kind}: {text}" for kind in ("problem", "warning") for text in getattr(self, f"{kind}s")]
-        said += findings_in_words(self.findings)
+        judged = [] if self.verdict is None else [f"verdict: {format_verdict(self.verdict)}"]
+        return [head, ledger, *floor, *judged]
+
+    def _closing(self) -> list[str]:
         publish = f"to publish it: hf upload OWNER/NAME {shlex.quote(self.path)} . --repo-type dataset"
-        told = [*Redacted().lines(), publish] if self.redacted else []
-        return plain_lines((head, *doubt, *audit_lines(self.audit), ledger, *floor, *said, *told))
+        return [*Redacted().lines(), publish] if self.redacted else []
 
 
-def build_dataset(
-    out: str | Path = "dataset",
-    *,
-    store: str | Path = "tcpipe-store",
-    split: str | Path | None = None,
-    map_name: str | Sequence[str] | None = None,
-    robot: str | None = None,
-    tags: Mapping[str, str] | None = None,
-    recipe: Recipe | str | Path | None = None,
-    jobs: int = 1,
-    cluster: str | None = None,
-    file_format: FileFormat = "zarr",
-    holdout: str | None = None,
-    seed: int | None = None,
-    keep_split: str | Path | None = None,
-    covariates: str | Path | Sequence[str | Path] = (),
-    min_runs: int | None = None,
-    redact: bool = False,
-    force: bool = False,
-    dry_run: bool = False,
-) -> BuildResult:
+def run_build_dataset(options: BuildDatasetOptions) -> BuildResult:
     """Sample a rotated patch for every segment, split by region, and write the dataset to ``out``.
 
     Runs that are not as they were written are left out; those, runs that have to be ingested again, runs of the dataset that is replaced
-    that are gone, and empty splits are the result's ``problems``.
+    that are gone, and empty splits are findings that make the exit code 3. The bytes do not depend on ``jobs`` and ``cluster``.
 
-    Parameters
-    ----------
-    out
-        Directory of the dataset: new, empty, or a dataset of the same options, which is replaced unless it is made from the same inputs;
-        or the URL of one in a bucket (``s3://…``), where nothing is replaced.
-    store
-        Where runs and maps are kept.
-    split
-        GeoJSON region (WGS84): inside is train and test, outside is unseen. None: everything is train and test.
-    map_name
-        Map to sample, or several, the first ruling where they overlap; None takes the only one in the store.
-    robot
-        Only runs of this robot; needed where the store holds several.
-    tags
-        Only runs that carry all of these tags.
-    recipe
-        A `Recipe`, a path to one, or None for the one that rules here.
-    jobs
-        Processes that sample side by side; the bytes do not depend on it.
-    cluster
-        Address of a Dask scheduler whose workers sample instead; they see the store under the same absolute path or URL.
-    file_format
-        ``zarr`` or ``parquet``.
-    holdout, seed
-        Instead of the recipe's; ``block``, ``sample``, ``run``, or ``tag:NAME``, which keeps runs of one value of the tag together.
-    keep_split
-        An earlier dataset, which may be ``out`` itself: its samples keep their split and fold, only new ones are drawn.
-    covariates
-        Tables (CSV or Parquet) whose columns are joined to the samples by time, as the recipe's section ``covariates`` says.
-    min_runs
-        Of fewer runs no dataset is built; that so many are enough also makes runs that are left out or gone mere warnings, damage aside.
-    redact
-        For the public: everything is moved by one offset that is kept nowhere, and no log, topic, path, host or user is named.
-    force
-        Replace a dataset that was made with other options: another recipe, region, map, robot, format or other tags.
-    dry_run
-        Choose the runs, look whether there is something to do, and estimate what it takes; write nothing.
-
-    Raises
-    ------
-    DatasetError, RegionError, MapError, StoreError, RecipeError, UsageError
-        Nothing is written then.
+    Raises `DatasetError`, `RegionError`, `MapError`, `StoreError`, `RecipeError` or `UsageError`; nothing is written then.
     """
-    watch, ruling = started(), _ruling(recipe, holdout=holdout, seed=seed)
+    watch, ruling = started(), _ruling(options.recipe, holdout=options.holdout, seed=options.seed)
+    out, store, tags, dry_run = options.out, options.store, options.tags or {}, options.dry_run
     place = str(out).rstrip("/") if is_url(out) else local_output(out)
-    opened = open_store(store if cluster is None or is_url(store) else Path(store).absolute())
+    opened = open_store(store if options.cluster is None or is_url(store) else Path(store).absolute())
     if isinstance(place, Path) and not dry_run:
         clear_beside(place)
     known, proved = _card_in_bucket(place) if isinstance(place, str) else _card_in_place(place)
-    regions = None if split is None else read_regions(Path(split))
-    region = None if split is None else Path(split).read_bytes()
-    robot = robot or ruling.robot
+    regions = None if options.split is None else read_regions(Path(options.split))
+    region = None if options.split is None else Path(options.split).read_bytes()
+    robot = options.robot or ruling.robot
+    covariates, map_name, keep_split = options.covariates, options.map_name, options.keep_split
     tables = (covariates,) if isinstance(covariates, str | Path) else tuple(covariates)
     earlier = None if keep_split is None else earlier_splits(keep_split)
     inputs = choose_inputs(
@@ -223,56 +184,60 @@ def build_dataset(
         robot=robot,
         tags=tags,
         region=region,
-        file_format=file_format,
+        file_format=options.file_format,
         earlier=earlier,
         covariates=read_all_covariates([Path(path) for path in tables], ruling.covariates),
     )
-    inputs = replace(inputs, digest=digest(("redacted", inputs.digest))) if redact else inputs
+    inputs = replace(inputs, digest=digest(("redacted", inputs.digest))) if options.redact else inputs
     keeps_own = keep_split is not None and _absolute(keep_split) == _absolute(place)
-    options = BuildOptions(ruling, regions, tags or {}, file_format, redact, keep_split is not None, keeps_own)
-    problems, warnings = _left_out(
+    marks = BuildOptions(ruling, regions, tags, options.file_format, options.redact, keep_split is not None, keeps_own)
+    left_out = _find_left_out(
         inputs,
         None if known is not None and known.redaction else known,
         robot=robot,
-        tags=tags or {},
-        min_runs=min_runs,
+        tags=tags,
+        min_runs=options.min_runs,
     )
-    inputs = replace(inputs, problems=problems, warnings=(*warnings, *inputs.warnings))
+    inputs = replace(inputs, findings=(*left_out, *inputs.findings))
     if proved and known is not None and known.inputs == inputs.digest and _is_all_there(place, known):
-        card, result = known, _result(place, "unchanged", known, problems)
+        card, result = known, _result(place, "unchanged", known, left_out)
     elif dry_run:
-        _refuse_other_options(place, known, options, inputs, force=force)
+        _refuse_other_options(place, known, marks, inputs, force=options.force)
         if isinstance(place, str):
             refuse_others(open_place(place), CARD)
-        return _planned(place, opened, inputs, jobs=jobs)
+        return _planned(place, opened, inputs, jobs=options.jobs)
     else:
-        _refuse_other_options(place, known, options, inputs, force=force)
+        _refuse_other_options(place, known, marks, inputs, force=options.force)
         whole = published(place, CARD) if isinstance(place, str) else atomic_directory(place.absolute())
         with begun_call(open_log(opened), BUILD, [_absolute(place)]) as call:
-            with whole as directory, _workers(directory, opened, inputs.digest, jobs=jobs, cluster=cluster) as workers:
+            at_work = partial(_workers, jobs=options.jobs, cluster=options.cluster)
+            with whole as directory, at_work(directory, opened, inputs.digest) as workers:
                 card = _build(
                     directory,
                     inputs,
                     ruling,
                     regions,
                     earlier,
-                    file_format=file_format,
+                    file_format=options.file_format,
                     workers=workers,
-                    redact=redact,
-                    tags=options.tags,
+                    redact=options.redact,
+                    tags=marks.tags,
                 )
                 _refuse_others_since(place, {known.inputs if known else None, inputs.digest})
             for entry in workers.waiting.entries():
                 workers.waiting.delete(entry.name)
-            result = _result(place, "done", card, problems)
+            result = _result(place, "done", card, left_out)
+            counts = {"runs": len(inputs.runs), "samples": result.samples}
             written = sum(of.size_bytes for of in card.checksums.values())
-            took = Call(
-                BUILD, __version__, result.exit_code, {"runs": len(inputs.runs), "samples": result.samples}, jobs
-            )
-            _end(call, measure_call(watch, replace(took, written_bytes=written)), _dataset_of(result, inputs), known)
+            took = Call(BUILD, __version__, result.exit_code, counts, options.jobs, written_bytes=written)
+            _end(call, measure_call(watch, took), _dataset_of(result, inputs), known)
     if result.status == "unchanged":
         _refer(open_log(opened), _dataset_of(result, inputs))
     return result
+
+
+build_dataset = as_function(BuildDatasetOptions, run_build_dataset)
+"""`tcpipe.build_dataset`: its keywords are the fields of `BuildDatasetOptions`."""
 
 
 def _refuse_other_options(
@@ -300,8 +265,8 @@ def _planned(place: Path | str, store: Store, inputs: Inputs, *, jobs: int) -> B
     """Return what is to be expected of a build."""
     most = sum(run.facts.segments - int(inputs.again[run.run_id].sum()) for run in inputs.runs)
     expected = estimate(store.state().calls, BUILD, most, jobs=jobs)
-    code, told = 3 if inputs.problems else 0, (inputs.warnings, inputs.problems)
-    return BuildResult(str(place), "planned", most, {}, {}, (), *told, exit_code=code, estimate=expected)
+    code = 3 if any(map(is_problem, inputs.findings)) else 0
+    return BuildResult(str(place), "planned", most, {}, {}, (), inputs.findings, exit_code=code, estimate=expected)
 
 
 def _end(opened: OpenCall, call: Call, dataset: Dataset, known: DatasetCard | None) -> None:
@@ -332,18 +297,19 @@ def _absolute(place: Path | str) -> str:
     return str(place).rstrip("/") if is_url(place) else str(Path(place).absolute())
 
 
-def _left_out(
+def _find_left_out(
     inputs: Inputs, known: DatasetCard | None, *, robot: str | None, tags: Mapping[str, str], min_runs: int | None
-) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return what is wrong with the choice of runs, and what is worth a warning; `DatasetError` where there are too few."""
+) -> tuple[Finding, ...]:
+    """Return what is wrong with the choice of runs, as notes where ``min_runs`` are enough; `DatasetError` where there are too few."""
     chosen = inputs.chosen
-    fewer = (*chosen.missing, *(() if known is None else gone_runs(known.runs, chosen, robot=robot, tags=tags)))
+    fewer = (*chosen.missing, *(() if known is None else find_gone_runs(known.runs, chosen, robot=robot, tags=tags)))
     if min_runs is None:
-        return (*chosen.damaged, *fewer), ()
+        return (*chosen.damaged, *fewer)
     if len(inputs.runs) < min_runs:
         count = f"{len(inputs.runs)} runs, wanted {min_runs} or more (--min-runs); nothing is written"
-        raise DatasetError(count, *chosen.damaged, *fewer)
-    return chosen.damaged, fewer
+        groups = group_dataset_findings((*chosen.damaged, *fewer), {run.run_id: () for run in inputs.runs})
+        raise DatasetError(count, *format_mixed_groups(groups))
+    return (*chosen.damaged, *(replace(finding, severity="note") for finding in fewer))
 
 
 def _is_all_there(place: Path | str, card: DatasetCard) -> bool:
@@ -363,8 +329,10 @@ def _card_in_bucket(url: str) -> tuple[DatasetCard | None, bool]:
     return card, card.data_model_version in READ_VERSIONS
 
 
-def _result(place: Path | str, status: str, card: DatasetCard, problems: Sequence[str]) -> BuildResult:
-    said = (*problems, *empty_splits(card))
+def _result(place: Path | str, status: str, card: DatasetCard, left_out: Sequence[Finding]) -> BuildResult:
+    """Return what became of a dataset: runs that are left out are those of now, whatever the card has of them."""
+    lasting = (finding for finding in card.findings if finding.code not in CHOICE_CODES)
+    findings = (*left_out, *lasting)
     return BuildResult(
         path=str(place),
         status=status,
@@ -372,12 +340,13 @@ def _result(place: Path | str, status: str, card: DatasetCard, problems: Sequenc
         splits={name: card.splits[name] for name in SPLITS},
         ledger_m=card.ledger_m,
         audit=card.split.audit,
-        warnings=card.warnings,
-        problems=said,
+        findings=findings,
+        findings_by_run=card.findings_by_run,
+        findings_by_map=card.findings_by_map,
+        verdict=card.verdict,
         energy_budget=card.energy_budget,
-        exit_code=3 if said else 0,
+        exit_code=3 if any(map(is_problem, findings)) else 0,
         doubtful=card.doubtful,
-        findings=card.findings,
         redacted=card.redaction is not None,
     )
 

@@ -23,13 +23,14 @@ from tcpipe.formats.dataset_card import (
     MapSource,
     Shard,
     SplitRules,
+    judge_dataset,
 )
 from tcpipe.formats.dataset_files import FileFormat
 from tcpipe.formats.json_files import recast
 from tcpipe.formats.layer_descriptions import described
 from tcpipe.formats.maps.map_files import MapFile
 from tcpipe.pipeline.dataset.content import Content
-from tcpipe.pipeline.dataset.findings import doubtful, findings_of_runs
+from tcpipe.pipeline.dataset.findings import count_flagged, find_in_samples
 from tcpipe.pipeline.dataset.inputs import Inputs
 from tcpipe.pipeline.dataset.physics import physics_by_robot
 from tcpipe.pipeline.dataset.splitting import Drawn, regions_to_json
@@ -76,7 +77,7 @@ def dataset_card(
     about, drawn, classes = recipe.dataset, content.drawn, content.sources[0].classes
     layers, has_terrain = content.spool.layers, "terrain" in content.spool.layers
     runs = tuple(replace(run, samples=_count(samples, "run_id", run.run_id)) for run in inputs.sources)
-    return DatasetCard(
+    card = DatasetCard(
         data_model_version=DATA_MODEL_VERSION,
         tcpipe_version=__version__,
         inputs=inputs.digest,
@@ -107,15 +108,14 @@ def dataset_card(
         runs=runs,
         run_tags=tags,
         maps=tuple(map(_map_source, content.sources, inputs.map_sha256, content.registrations)),
-        problems=inputs.problems,
-        warnings=content.warnings,
-        findings=findings_of_runs(runs),
         physics=physics_by_robot(samples),
         covariates=content.covariates,
         added_columns={field.name: field.metadata[b"doc"].decode() for field in content.samples.added.schema},
         shards=tuple(shards),
         checksums={},
     )
+    findings = tuple(dict.fromkeys((*content.findings, *find_in_samples(card))))
+    return replace(card, findings=findings, verdict=judge_dataset(findings, card.runs, card.maps))
 
 
 def _label(recipe: Recipe, inputs: Inputs) -> LabelColumns:
@@ -152,7 +152,7 @@ def measured(samples: pa.Table, *, has_terrain: bool) -> SampleFigures:
         "folds_of_train": _fold_counts(samples),
         "terrain": _terrain_counts(samples) if has_terrain else {},
         "label_statistics_of_train": _statistics(samples),
-        "doubtful": doubtful(samples.column("quality")),
+        "doubtful": count_flagged(samples.column("quality")),
     }
 
 

@@ -14,12 +14,12 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from tcpipe.errors import DatasetError
-from tcpipe.formats.dataset_card import Covariate, MapRegistration, Removal
+from tcpipe.formats.dataset_card import Covariate, MapRegistration, Removal, group_dataset_findings
+from tcpipe.formats.finding_lines import format_mixed_groups
 from tcpipe.formats.geoparquet import located
 from tcpipe.formats.maps.map_files import MapFile, open_map
 from tcpipe.formats.robot_files import profiles_of
-from tcpipe.pipeline.dataset.added_columns import added_columns, narrow_patches, tag_of_each
-from tcpipe.pipeline.dataset.findings import findings_in_words, findings_of_runs
+from tcpipe.pipeline.dataset.added_columns import added_columns, find_narrow_patches, tag_of_each
 from tcpipe.pipeline.dataset.inputs import Inputs
 from tcpipe.pipeline.dataset.registration import register_runs
 from tcpipe.pipeline.dataset.removal import removed_by_ground
@@ -34,6 +34,7 @@ from tcpipe.splits.regions import Regions
 from tcpipe.stages.sample import Sampled, metres_lost
 from tcpipe.tables.bits import Loss, name_of
 from tcpipe.tables.columns import floats
+from tcpipe.tables.findings import Finding
 from tcpipe.tables.levels import SAMPLES
 from tcpipe.tables.wkb import point_column
 from tcpipe.terrain.projection import area_of, parse_crs
@@ -160,7 +161,7 @@ class Content:
     covariates: tuple[Covariate, ...]
     removal: Removal
     """What of each class and slope is in samples."""
-    warnings: tuple[str, ...]
+    findings: tuple[Finding, ...]
 
 
 def gather_content(
@@ -197,9 +198,9 @@ def gather_content(
     arc_m = floats(pool.segments, "arc_length_m")[sampled.kept]
     unused_m = {Loss.SPLIT_BUFFER: arc_m[split == "buffer"].sum(), Loss.SPLIT_EXCLUDED: arc_m[split == EXCLUDED].sum()}
     registered = [register_runs(inputs.runs, source, recipe) for source in sources]
-    off = [line for _, lines in registered for line in lines]
+    shifted = [finding for _, findings in registered for finding in findings]
     in_use = sampled.kept[(split != "buffer") & (split != EXCLUDED)]
-    removal, uneven = removed_by_ground(inputs.runs, pool.segments, in_use, sources, recipe)
+    removal, biased = removed_by_ground(inputs.runs, pool.segments, in_use, sources, recipe)
     kept = np.flatnonzero(split != EXCLUDED)
     order = kept[np.argsort(ranks[sampled.kept[kept]], kind="stable")]
     covariates, rows = inputs.covariates, sampled.kept[order]
@@ -207,7 +208,7 @@ def gather_content(
         pool.segments, rows, inputs.sources, covariates, recipe.covariates, layers=tuple(spool.layers)
     )
     robots = [run.robot for run in inputs.sources]
-    narrow = narrow_patches(robots, profiles_of(recipe).robots, patch_m=recipe.sample.patch_m)
+    narrow = find_narrow_patches(robots, profiles_of(recipe).robots, patch_m=recipe.sample.patch_m)
     return Content(
         samples=SampleTable(
             pool.segments,
@@ -224,10 +225,10 @@ def gather_content(
         sources=sources,
         drawn=drawn,
         ledger_m=move_out(pool.ledger_m, {**lost_m, **unused_m}),
-        registrations=[found for found, _ in registered],
+        registrations=[of for of, _ in registered],
         covariates=added.covariates,
         removal=removal,
-        warnings=(*inputs.warnings, *pool.warnings, *off, *sampled.warnings, *narrow, *uneven, *added.warnings),
+        findings=(*inputs.findings, *pool.findings, *shifted, *sampled.findings, *narrow, *biased, *added.findings),
     )
 
 
@@ -274,7 +275,10 @@ def _why_uncertain(segments: pa.Table, lost_m: Mapping[Loss, float], inputs: Inp
         f"positions are known to {known_m:.2f} m (median standard deviation), wanted {recipe.sample.max_position_std_m:g} m: mend what "
         f"follows, or accept patches that lie so far off ({recipe_key('sample.max_position_std_m')})"
     )
-    return [how_sure, *findings_in_words(findings_of_runs(inputs.sources))]
+    return [
+        how_sure,
+        *format_mixed_groups(group_dataset_findings((), {run.run_id: run.findings for run in inputs.sources})),
+    ]
 
 
 def _covered(source: MapFile, *, alone: bool) -> str:

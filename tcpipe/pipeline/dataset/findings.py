@@ -1,53 +1,110 @@
-"""What ingest found of the runs that a dataset is made of, grouped by cause, and how many samples carry a doubt."""
+"""What a dataset's samples, splits and ground show: the findings of its card beside those of its runs and maps."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections import defaultdict
+from collections.abc import Iterator
 
 import numpy as np
 import pyarrow as pa
 
-from tcpipe.formats.dataset_card import Doubtful, RunFinding, RunSource
+from tcpipe.formats.dataset_card import DatasetCard, Doubtful
+from tcpipe.recipe.suggestions import suggest
+from tcpipe.splits.audit import HeldOut
 from tcpipe.tables.bits import Quality, name_of
-from tcpipe.tables.facts import by_cause
-
-_MOST_SHOWN = 8
-
-
-def findings_of_runs(runs: Sequence[RunSource]) -> tuple[RunFinding, ...]:
-    """Return what ingest warned of by cause; what most samples are from comes first."""
-    samples = {run.run_id: run.samples for run in runs}
-    found = (
-        RunFinding(next(iter(of.values())), tuple(of), sum(samples[run_id] for run_id in of))
-        for of in by_cause((run.run_id, run.warnings) for run in runs)
-    )
-    return tuple(sorted(found, key=lambda finding: -finding.samples))
+from tcpipe.tables.catalogue import Severity, read_catalogue, threshold
+from tcpipe.tables.findings import Finding, Remedy, Subject, make_finding
 
 
-def doubtful(quality: pa.ChunkedArray) -> Doubtful:
-    """Return how many samples carry any quality bit, and how many each; ``quality`` is their column."""
+def is_problem(finding: Finding) -> bool:
+    """Return whether a finding makes ``tcpipe build-dataset`` exit with 3."""
+    entry = read_catalogue().get(finding.code)
+    return entry is not None and entry.is_problem and finding.severity != "note"
+
+
+def count_flagged(quality: pa.ChunkedArray) -> Doubtful:
+    """Return how many samples carry a quality bit that not all of them carry, and how many each; ``quality`` is their column."""
     bits = quality.to_numpy().astype(np.int64)
     counts = {name_of(bit): int(np.count_nonzero(bits & int(bit))) for bit in Quality}
-    count = int(np.count_nonzero(bits))
+    common = int(np.bitwise_and.reduce(bits)) if len(bits) > 1 else 0
+    count = int(np.count_nonzero(bits & ~common))
     return Doubtful(count, count / max(len(bits), 1), {name: of for name, of in counts.items() if of})
 
 
-def doubt_in_words(found: Doubtful, samples: int) -> str:
-    """Return the share of doubtful samples, and of what, the most frequent first, as one line."""
-    by_bit = sorted(found.by_bit.items(), key=lambda entry: (-entry[1], entry[0]))
-    of_what = ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in by_bit)
-    return f"doubtful: {found.samples} of {samples} samples ({100 * found.share:.1f} %) carry a quality flag" + (
-        f": {of_what}" if of_what else ""
+def find_in_samples(card: DatasetCard) -> Iterator[Finding]:
+    """Yield what the samples of a dataset show: too few, flagged ones, empty splits, leakage, thin ground, no repetitions."""
+    dataset = Subject("dataset", card.name)
+    if card.samples < threshold("few-samples", "min_sample_count"):
+        yield make_finding("few-samples", dataset, sample_count=card.samples)
+    yield from _find_flagged(card, dataset)
+    yield from _find_empty_splits(card)
+    yield from (_find_leakage(part, card) for part in card.split.audit if part.overlapping_samples)
+    yield from _find_thin_ground(card)
+    if not any(card.balance.repeatability.values()):
+        yield make_finding("no-repeated-places", dataset)
+
+
+def _find_flagged(card: DatasetCard, dataset: Subject) -> Iterator[Finding]:
+    flagged = card.doubtful
+    if flagged is None or not flagged.samples:
+        return
+    by_bit = {name: count for name, count in flagged.by_bit.items() if count < card.samples} or flagged.by_bit
+    most = max(by_bit, key=lambda name: by_bit[name])
+    severity: Severity = "warning" if flagged.share > threshold("samples-flagged", "max_flagged_fraction") else "note"
+    yield make_finding(
+        "samples-flagged", dataset, severity=severity, names={"flag": most}, flagged_fraction=flagged.share
     )
 
 
-def findings_in_words(findings: Sequence[RunFinding]) -> list[str]:
-    """Return a line for each cause, the rarest cut."""
-    lines = [f"found at ingest of {_counted(finding)}: {finding.example}" for finding in findings[:_MOST_SHOWN]]
-    more = len(findings) - _MOST_SHOWN
-    return lines + ([f"found at ingest: {more} more causes, in dataset.json and report.html"] if more > 0 else [])
+def _find_empty_splits(card: DatasetCard) -> Iterator[Finding]:
+    """Yield a finding for each split that was asked for and holds no sample."""
+    rules = card.split
+    if not card.splits["train"]:
+        yield make_finding(
+            "split-empty", Subject("split", "train"), severity="error", names={"reason": "region_too_small"}
+        )
+    if not card.splits["test"] and rules.test_fraction > 0:
+        reasons = {"run": "one_run", "block": "one_block", "tag": "one_value_of_tag"}
+        remedies = (
+            *(suggest("smaller_blocks", {"split": {"block_m": rules.block_m / 2}}) if rules.holdout == "block" else ()),
+            *suggest("none", {"split": {"test_fraction": 0.0}}),
+        )
+        names = {"reason": reasons.get(rules.holdout, "too_few_samples")}
+        yield make_finding("split-empty", Subject("split", "test"), names=names, remedies=remedies)
+    if not card.splits["unseen"] and rules.region is not None:
+        yield make_finding("split-empty", Subject("split", "unseen"), names={"reason": "all_inside_region"})
 
 
-def _counted(finding: RunFinding) -> str:
-    runs = finding.runs[0] if len(finding.runs) == 1 else f"{len(finding.runs)} runs"
-    return f"{runs} ({finding.samples} sample{'' if finding.samples == 1 else 's'})"
+def _find_leakage(part: HeldOut, card: DatasetCard) -> Finding:
+    """Return the finding that samples of a held-out split share ground with train."""
+    remedies: tuple[Remedy, ...] = ()
+    if part.split == "test" and card.split.holdout == "sample":
+        remedies = suggest("block", {"split": {"holdout": "block"}})
+    elif part.split == "test":
+        remedies = (
+            *suggest("larger_blocks", {"split": {"block_m": 2 * card.split.block_m}}),
+            *suggest("run", {"split": {"holdout": "run"}}),
+        )
+    return make_finding(
+        "split-leakage",
+        Subject("split", part.split),
+        remedies=remedies,
+        overlapping_count=part.overlapping_samples,
+        sample_count=part.samples,
+    )
+
+
+def _find_thin_ground(card: DatasetCard) -> Iterator[Finding]:
+    """Yield a finding for each class of terrain with ranges of slope that hold few independent samples."""
+    is_thin = defaultdict[str, list[bool]](list)
+    for cell in card.balance.by_class_and_slope:
+        is_thin[cell["class"] or "any ground"].append(cell["rare"])
+    for name, thin in is_thin.items():
+        if any(thin):
+            yield make_finding(
+                "thin-ground",
+                Subject("class", name),
+                thin_count=sum(thin),
+                cell_count=len(thin),
+                enough_count=card.balance.enough_effective,
+            )

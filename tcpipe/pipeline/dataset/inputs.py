@@ -28,6 +28,7 @@ from tcpipe.pipeline.dataset.runs import Chosen, choose_runs
 from tcpipe.pipeline.recordings import each_drive_once
 from tcpipe.recipe import Recipe
 from tcpipe.store import Store
+from tcpipe.tables.findings import Finding
 from tcpipe.tables.levels import TABLES_VERSION
 
 if TYPE_CHECKING:
@@ -50,10 +51,9 @@ class Inputs:
     """By run: which of its segments another run has too."""
     digest: str
     chosen: Chosen
-    warnings: tuple[str, ...]
+    findings: tuple[Finding, ...]
+    """On the choice of runs."""
     covariates: tuple[CovariateTable, ...] = ()
-    problems: tuple[str, ...] = ()
-    """What is wrong with the choice of runs."""
 
 
 def choose_inputs(
@@ -102,8 +102,8 @@ def choose_inputs(
             **({} if earlier is None else {"kept_split": _table_digest(earlier)}),
         }
     )
-    warnings = (*chosen.warnings, *once.warnings)
-    return Inputs(runs, sources, names, maps, map_sha256, once.again, fingerprint, chosen, warnings, covariates)
+    findings = (*chosen.findings, *once.findings)
+    return Inputs(runs, sources, names, maps, map_sha256, once.again, fingerprint, chosen, findings, covariates)
 
 
 def _refuse_without_segments(runs: Sequence[RunDirectory]) -> None:
@@ -181,7 +181,7 @@ def choose_maps(store: Store, names: Sequence[str]) -> tuple[str, ...]:
 
 
 def run_source(run: RunDirectory, log: LogOrigin) -> RunSource:
-    """Return what the card says of a run: its log, by name and sha256, its recipe, robot, tags, metres, warnings and error budget."""
+    """Return what the card says of a run: its log, by name and sha256, its recipe, robot, tags, metres, findings and error budget."""
     named = {"run_id": run.run_id, "recipe_id": run.recipe_id, "sha256": log.sha256}
     return recast(run.facts, RunSource, logs=tuple(Path(path).name for path in log.paths), **named)
 

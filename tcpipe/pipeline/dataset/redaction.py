@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, fields, replace
 from functools import cache
 from typing import Any
@@ -15,14 +15,16 @@ from numpy.typing import NDArray
 from pyproj import Transformer
 
 from tcpipe.errors import DatasetError
-from tcpipe.formats.dataset_card import DatasetCard, MapSource, Redacted
+from tcpipe.formats.dataset_card import DatasetCard, MapSource, Redacted, judge_dataset
 from tcpipe.formats.geojson import FeatureCollection, PolygonGeometry
 from tcpipe.formats.parquet import ROWS_PER_GROUP
 from tcpipe.pipeline.dataset.content import Content, SampleTable
 from tcpipe.pipeline.dataset.inputs import Inputs
 from tcpipe.recipe import Recipe
 from tcpipe.splits.audit import HeldOut
+from tcpipe.tables.catalogue import read_catalogue
 from tcpipe.tables.columns import floats, lonlat_deg
+from tcpipe.tables.findings import Finding, Subject
 
 PLANE = "+proj=tmerc +lat_0=0 +lon_0=0 +k=1 +x_0=0 +y_0=0 +datum=WGS84 +type=crs"
 """Where a redacted dataset lies: the plane of its maps, laid down at 0° N 0° E with its grid north up."""
@@ -43,8 +45,8 @@ _MOST_SCALE = 0.005
 """Of a metre of the maps' plane to one of the ground, from 1: beyond, the maps' own pixels would tell it."""
 
 _ENDS, _AXES = ("start", "end"), ("lon", "lat")
-_NOT_COPIED = "not copied into the redacted dataset"
-_COUNT = re.compile(rf"(\d+ texts? )?{_NOT_COPIED}")
+_KEPT_SUBJECTS = ("role", "class", "layer", "slope", "split")
+"""Kinds of subjects whose names a redacted dataset has anyway."""
 
 Floats = NDArray[np.float64]
 
@@ -166,7 +168,10 @@ def redacted_content(content: Content, redaction: Redaction) -> Content:
     """Return content whose samples have the names and places that are told."""
     sampled = content.samples.sampled
     footprints = replace(redaction, gnss_crs="EPSG:4326").placed(sampled.footprint_lonlat_deg)
-    samples = replace(content.samples, sampled=replace(sampled, footprint_lonlat_deg=footprints), redaction=redaction)
+    added = content.samples.added  # the meanings of its columns name files
+    bare = pa.schema([field.with_metadata({"unit": "", "doc": ""}) for field in added.schema])
+    sampled = replace(sampled, footprint_lonlat_deg=footprints)
+    samples = replace(content.samples, sampled=sampled, added=added.cast(bare), redaction=redaction)
     return replace(content, samples=samples, registrations=[() for _ in content.registrations])
 
 
@@ -176,9 +181,22 @@ def redacted_inputs(inputs: Inputs, redaction: Redaction) -> Inputs:
     return replace(inputs, sources=runs)
 
 
-def _count(texts: Sequence[str]) -> tuple[str, ...]:
-    """Return how many texts there are instead of them: each may name topics, frames, hosts, users and places, in any form."""
-    return (f"{len(texts)} text{'' if len(texts) == 1 else 's'} {_NOT_COPIED}",) if texts else ()
+def redact_findings(findings: Iterable[Finding]) -> tuple[Finding, ...]:
+    """Return findings with what the catalogue calls public alone: other numbers and names, subjects and remedies may name anything."""
+    return tuple(map(_redact_finding, findings))
+
+
+def _redact_finding(finding: Finding) -> Finding:
+    entry, subject = read_catalogue().get(finding.code), finding.subject
+    public = entry.public if entry else ()
+    return Finding(
+        finding.code,
+        finding.severity,
+        subject if subject.kind in _KEPT_SUBJECTS else Subject(subject.kind, subject.kind),
+        finding.action,
+        numbers={name: number for name, number in finding.numbers.items() if name in public},
+        names={name: text for name, text in finding.names.items() if name in public},
+    )
 
 
 def redacted_card(card: DatasetCard, redaction: Redaction) -> DatasetCard:
@@ -186,19 +204,19 @@ def redacted_card(card: DatasetCard, redaction: Redaction) -> DatasetCard:
     region = card.split.region
     told = None if region is None else {kind: _moved(of, redaction) for kind, of in region.items()}
     bare = replace(Recipe(), **{name: getattr(card.recipe, name) for name in _KEPT_SECTIONS})
+    findings, maps = redact_findings(card.findings), tuple(_map(source, redaction) for source in card.maps)
+    runs = tuple(replace(run, findings=redact_findings(run.findings)) for run in card.runs)
     return replace(
         card,
         recipe=bare,
         run_tags=None,
         split=replace(card.split, region=told, audit=tuple(_of_ground(of, redaction.scale) for of in card.split.audit)),
-        label=replace(card.label, includes=_count(card.label.includes)),
-        runs=tuple(replace(run, warnings=_count(run.warnings)) for run in card.runs),
-        maps=tuple(_map(source, redaction) for source in card.maps),
-        problems=_count(card.problems),
-        warnings=_count(card.warnings),
-        findings=tuple(replace(finding, example=_NOT_COPIED) for finding in card.findings),
+        label=replace(card.label, includes=()),
+        runs=runs,
+        maps=maps,
+        findings=findings,
+        verdict=judge_dataset(findings, runs, maps),
         covariates=tuple(replace(of, name=f"covariates{n}") for n, of in enumerate(card.covariates, 1)),
-        added_columns=dict.fromkeys(card.added_columns, _NOT_COPIED),
         redaction=Redacted(),
     )
 
@@ -227,7 +245,7 @@ def _map(source: MapSource, redaction: Redaction) -> MapSource:
         inputs=None,
         height_min_m=None if low is None else low - redaction.height_m,
         height_max_m=None if high is None else high - redaction.height_m,
-        warnings=_count(source.warnings),
+        findings=redact_findings(source.findings),
     )
 
 
@@ -268,15 +286,12 @@ def what_is_told(card: DatasetCard, samples: pa.Table) -> Iterator[str]:
     named = [run.run_id for run in card.runs if run.logs or not re.fullmatch(r"run\d{4,}-[0-9a-f]+", run.run_id)]
     yield from (f"it is said to be redacted, but tells what the log of run {name} is called" for name in named)
     yield from _find_revealed_scale(samples)
-    yield from (f"it is said to be redacted, but tells {text!r}" for text in _texts(card) if not _COUNT.fullmatch(text))
-
-
-def _texts(card: DatasetCard) -> Iterator[str]:
-    """Yield every text of a card that is made from texts of logs, recipes and maps."""
-    yield from (*card.problems, *card.warnings, *card.label.includes, *card.added_columns.values())
-    yield from (finding.example for finding in card.findings)
-    yield from (text for run in card.runs for text in run.warnings)
-    yield from (text for source in card.maps for text in source.warnings)
+    texts = [text for text in (*card.label.includes, *card.added_columns.values()) if text]
+    yield from (f"it is said to be redacted, but tells {text!r}" for text in texts)
+    reasons = card.verdict.reasons if card.verdict else ()
+    every = (card.findings, reasons, *card.findings_by_run.values(), *card.findings_by_map.values())
+    revealing = [finding.code for findings in every for finding in findings if _redact_finding(finding) != finding]
+    yield from (f"it is said to be redacted, but a finding {code} holds more than is public" for code in revealing)
 
 
 def _find_revealed_scale(samples: pa.Table) -> Iterator[str]:

@@ -17,6 +17,7 @@ from tcpipe.motion.removal import Group, main_reason, named_groups, tally_m, une
 from tcpipe.recipe import Recipe
 from tcpipe.tables.bits import DropReason, name_of
 from tcpipe.tables.columns import floats, integers
+from tcpipe.tables.findings import Finding, Subject, SubjectKind, make_finding
 from tcpipe.terrain.point_classes import OFF_THE_MAP, classes_at
 from tcpipe.terrain.projection import Projection
 from tcpipe.terrain.tiles import projection_to
@@ -42,8 +43,8 @@ def removed_by_ground(
     used: NDArray[np.int64],
     sources: Sequence[MapFile],
     recipe: Recipe,
-) -> tuple[Removal, tuple[str, ...]]:
-    """Return where the metres of all runs went, by the class under them and the slope along them, and warnings where that is not even.
+) -> tuple[Removal, tuple[Finding, ...]]:
+    """Return where the metres of all runs went, by the class under them and the slope along them, and where that is not even.
 
     Parameters
     ----------
@@ -67,8 +68,8 @@ def removed_by_ground(
     slopes = named_groups(by_slope, _SLOPE_NAMES, _REASONS)
     classes = named_groups(by_class, names, _REASONS) if grounds else ()
     traversable = set(table.names()[table.traversable()].tolist())
-    lines = _warnings([group for group in classes if group.name in traversable], "class")
-    return Removal(classes, slopes), (*lines, *_warnings(slopes, "slope"))
+    findings = _find_bias([group for group in classes if group.name in traversable], "class")
+    return Removal(classes, slopes), (*findings, *_find_bias(slopes, "slope"))
 
 
 class _Spans:
@@ -124,11 +125,16 @@ def _classes(grounds: Sequence[_Ground], lonlat_deg: NDArray[np.float64]) -> NDA
     return found
 
 
-def _warnings(groups: Sequence[Group], what: str) -> list[str]:
+def _find_bias(groups: Sequence[Group], kind: SubjectKind) -> list[Finding]:
     driven_m, used_m = sum(group.driven_m for group in groups), sum(group.used_m for group in groups)
     return [
-        f"what is removed depends on the {what}: {group.used_share:.0%} of {group.driven_m:.0f} m of {group.name} are in samples "
-        f"(most of the rest is {main_reason(group).replace('_', ' ') or 'nothing'}), {used_m / driven_m:.0%} over all; what is left may "
-        "not be typical of it"
+        make_finding(
+            "selection-bias",
+            Subject(kind, group.name),
+            names={"reason": main_reason(group) or "none"},
+            used_fraction=group.used_share,
+            driven_m=group.driven_m,
+            overall_fraction=used_m / driven_m,
+        )
         for group in uneven(groups)
     ]

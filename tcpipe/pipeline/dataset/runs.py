@@ -18,7 +18,11 @@ from tcpipe.pipeline.unknown_robots import alike, in_words
 from tcpipe.recipe import Recipe
 from tcpipe.robots.profiles import GENERIC
 from tcpipe.store import Store
+from tcpipe.tables.findings import Finding, Remedy, Subject, make_finding
 from tcpipe.tables.levels import DATA_MODEL_VERSION
+
+CHOICE_CODES = frozenset({"run-damaged", "run-gone", "run-ingested-otherwise"})
+"""Findings on runs that belong in a dataset and are left out."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,13 +32,14 @@ class Chosen:
     runs: tuple[RunDirectory, ...]
     logs: Mapping[str, LogOrigin]
     """By run, what its run.json says of its log."""
-    missing: tuple[str, ...]
-    """A line for each reason why runs that belong in have no ingestion that could be used."""
-    damaged: tuple[str, ...]
-    """A line for each run that is not as it was written."""
+    missing: tuple[Finding, ...]
+    """On each run that belongs in and has no ingestion that could be used."""
+    damaged: tuple[Finding, ...]
+    """On each run that is not as it was written."""
     left_out: frozenset[str]
-    """The runs that those lines are about, and those that others have taken the place of."""
-    warnings: tuple[str, ...]
+    """The runs that those findings are about, and those that others have taken the place of."""
+    findings: tuple[Finding, ...]
+    """On runs that nobody expects in the dataset: unfinished and superseded ones."""
 
 
 def choose_runs(store: Store, recipe: Recipe, *, robot: str | None, tags: Mapping[str, str]) -> Chosen:
@@ -48,11 +53,10 @@ def choose_runs(store: Store, recipe: Recipe, *, robot: str | None, tags: Mappin
     for (run_id, recipe_id), line in found.damaged.items():
         if run_id not in known and _belongs(found.rows[run_id, recipe_id], robot, tags):
             damaged.setdefault(run_id, line)
-    lines = tuple(
-        f"run {run_id}: left out: {line}; ingest its log again with --force" for run_id, line in damaged.items()
-    )
     if not runs:
-        raise DatasetError(*lines)
+        raise DatasetError(
+            *(f"run {run_id}: left out: {line}; ingest its log again with --force" for run_id, line in damaged.items())
+        )
     if robot is None:
         _refuse_unlike(store, [run for run in runs if run.facts.robot == GENERIC])
     settled = {*known, *damaged}
@@ -60,16 +64,29 @@ def choose_runs(store: Store, recipe: Recipe, *, robot: str | None, tags: Mappin
     older = {name: str(of.data_model_version) for name, of in found.outdated.items() if _belongs(of, robot, tags)}
     others, older = ({name: of for name, of in each.items() if name not in settled} for each in (others, older))
     left_out = {*damaged, *others, *older}
-    total = len({run.run_id for run in runs} | left_out)
-    missing = tuple(_missing(found, others, older, total))
-    warnings = tuple(_remarks(found))
-    return Chosen(tuple(runs), logs, missing, lines, frozenset(left_out | found.superseded.keys()), warnings)
+    otherwise = {run_id: {"what": "recipe", "has": of} for run_id, of in others.items()}
+    otherwise |= {run_id: {"what": "data_model", "has": of} for run_id, of in older.items()}
+    nothing: dict[str, str] = {}
+    missing = tuple(_find_left_out(found, "run-ingested-otherwise", otherwise))
+    broken = tuple(_find_left_out(found, "run-damaged", dict.fromkeys(damaged, nothing), force=True))
+    superseded = frozenset(left_out | found.superseded.keys())
+    return Chosen(tuple(runs), logs, missing, broken, superseded, tuple(_find_expected(found)))
 
 
-def _remarks(found: Ingestions) -> Iterator[str]:
-    """Yield a line about runs that others have taken the place of."""
-    if found.superseded:
-        yield f"superseded, since their logs were completed or repaired: {_named(found.superseded)}; left out"
+def _find_expected(found: Ingestions) -> Iterator[Finding]:
+    """Yield a finding on each run that another has taken the place of."""
+    for run_id, by in found.superseded.items():
+        yield make_finding("run-superseded", Subject("run", run_id), names={"by": by})
+
+
+def _find_left_out(
+    found: Ingestions, code: str, names: Mapping[str, Mapping[str, str]], *, force: bool = False
+) -> Iterator[Finding]:
+    """Yield a finding on each run, of which ``names`` holds what the finding names, with the command that ingests their logs again."""
+    command = f"tcpipe ingest {_logs_of(found, names)}{' --force' if force else ''}" if names else ""
+    for run_id in sorted(names):
+        subject, remedy = Subject("run", run_id), Remedy("ingest", command=command)
+        yield make_finding(code, subject, names=names[run_id], remedies=[remedy])
 
 
 def _of_one_robot(store: Store, runs: list[RunDirectory], robot: str | None) -> list[RunDirectory]:
@@ -134,16 +151,6 @@ def _proved(
     return [run for run in runs if run.run_id in logs], logs, damaged
 
 
-def _missing(found: Ingestions, by_recipe: Mapping[str, str], by_version: Mapping[str, str], total: int) -> list[str]:
-    """Return a line for each reason why runs that belong in have no ingestion that could be used."""
-    return [
-        f"{len(of)} of {total} runs have no ingestion {what} (they have {', '.join(sorted(set(of.values())))}): {_named(of)}; "
-        f"ingest their logs again: tcpipe ingest {_logs_of(found, of)}"
-        for what, of in (("under this recipe", by_recipe), (f"of data model {DATA_MODEL_VERSION}", by_version))
-        if of
-    ]
-
-
 def _belongs(known: RunFacts | RunSource, robot: str | None, tags: Mapping[str, str]) -> bool:
     """Tell whether a run is of the robot and the tags that were asked for, as far as is known."""
     its_robot = robot is None or known.robot == robot
@@ -168,11 +175,10 @@ def _logs_of(found: Ingestions, run_ids: Iterable[str]) -> str:
     return "LOG..."
 
 
-def gone_runs(
+def find_gone_runs(
     before: Sequence[RunSource], chosen: Chosen, *, robot: str | None, tags: Mapping[str, str]
-) -> tuple[str, ...]:
-    """Return a line about the runs of the dataset that is replaced which the store no longer has, if any were not left out by choice."""
+) -> tuple[Finding, ...]:
+    """Return a finding on each run of the dataset that is replaced which the store no longer has, if it was not left out by choice."""
     here = {run.run_id for run in chosen.runs} | chosen.left_out
     gone = [run.run_id for run in before if run.run_id not in here and _belongs(run, robot, tags)]
-    count = f"{len(gone)} of the {len(before)} runs of the dataset that is replaced"
-    return (f"{count} are no longer in the store: {_named(gone)}",) if gone else ()
+    return tuple(make_finding("run-gone", Subject("run", run_id)) for run_id in sorted(gone))

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from tcpipe.errors import TcpipeError
 from tcpipe.execution import run_all, sound
 from tcpipe.formats.dataset_files import LayerPixels
+from tcpipe.formats.json_files import compact_json, of_json
 from tcpipe.formats.maps.map_files import MapFile, open_map
 from tcpipe.formats.place import Place
 from tcpipe.formats.published import FetchedShards
@@ -27,6 +28,7 @@ from tcpipe.recipe import SampleConfig
 from tcpipe.stages.sample import Sampled
 from tcpipe.stages.sample_maps import check_alike, sample_on_maps
 from tcpipe.tables.columns import floats
+from tcpipe.tables.findings import Finding
 from tcpipe.tables.levels import PLACED_SEGMENTS
 from tcpipe.terrain.layers import Layer, in_order, joint
 from tcpipe.terrain.sampling import Patches
@@ -221,7 +223,7 @@ def sample_all_segments(
     batches = _Batches(rows, _Batch(0, ranks, placed, maps, config, gnss_crs, spool))
     lost_by, slots = np.zeros(segments.num_rows, np.uint32), np.zeros(segments.num_rows, np.int64)
     counts, columns = [0] * len(rows), dict[str, NDArray[Any]]()
-    warnings: dict[int, tuple[str, ...]] = {}
+    findings: dict[int, tuple[Finding, ...]] = {}
     meter = Meter("sampling", segments.num_rows)
     try:
         with closing(run_all(_sample_batch, batches, jobs=workers.jobs, cluster=workers.cluster)) as outcomes:
@@ -231,7 +233,7 @@ def sample_all_segments(
                 kept = rows[batch][part.kept]
                 lost_by[rows[batch]] = part.lost_by
                 slots[kept[_in_order(ranks[kept])]] = (batch << _ROW_BITS) + np.arange(len(kept))
-                counts[batch], warnings[batch] = len(kept), part.warnings
+                counts[batch], findings[batch] = len(kept), part.findings
                 for name, values in _columns(part).items():
                     whole = columns.setdefault(name, np.zeros((len(lost_by), *values.shape[1:]), values.dtype))
                     whole[kept] = values
@@ -240,24 +242,25 @@ def sample_all_segments(
     kept = np.flatnonzero(lost_by == 0)
     for name in columns:
         columns[name] = columns[name][kept]
-    said = dict.fromkeys(warning for index in sorted(warnings) for warning in warnings[index])
+    every = dict.fromkeys(finding for index in sorted(findings) for finding in findings[index])
     placing = {name: columns.pop(name) for name in _PLACING}
-    sampled = Sampled(kept=kept, patches=Patches({}, **columns), lost_by=lost_by, warnings=tuple(said), **placing)
+    sampled = Sampled(kept=kept, patches=Patches({}, **columns), lost_by=lost_by, findings=tuple(every), **placing)
     return sampled, slots[kept], replace(spool, counts=tuple(counts))
 
 
 def _as_bytes(sampled: Sampled) -> bytes:
     arrays: dict[str, Any] = {name: getattr(sampled, name) for name in _SAMPLED} | sampled.patches.columns()
     with BytesIO() as file:
-        np.savez(file, warnings=np.array(sampled.warnings, np.str_), **arrays)
+        np.savez(file, findings=np.array(compact_json(sampled.findings)), **arrays)
         return file.getvalue()
 
 
 def _of_bytes(data: bytes) -> Sampled:
     with np.load(BytesIO(data), allow_pickle=False) as held:
         columns = dict(held)
-    warnings, rest = tuple(columns.pop("warnings").tolist()), {name: columns.pop(name) for name in _SAMPLED}
-    return Sampled(patches=Patches({}, **columns), warnings=warnings, **rest)
+    findings = of_json(columns.pop("findings").item(), tuple[Finding, ...], "findings")
+    rest = {name: columns.pop(name) for name in _SAMPLED}
+    return Sampled(patches=Patches({}, **columns), findings=findings, **rest)
 
 
 def _in_order(ranks: NDArray[np.uint64]) -> NDArray[np.intp]:

@@ -16,6 +16,7 @@ from tcpipe.formats.arrow_file import map_table, write_pieces
 from tcpipe.formats.stored_runs import RunDirectory
 from tcpipe.tables.bits import Loss, name_of
 from tcpipe.tables.columns import floats
+from tcpipe.tables.findings import Finding, Subject, make_finding
 from tcpipe.tables.levels import LABELLED_SEGMENTS
 
 KEPT = "kept"
@@ -28,7 +29,7 @@ class Pool:
 
     segments: pa.Table
     ledger_m: Mapping[str, float]
-    warnings: tuple[str, ...]
+    findings: tuple[Finding, ...]
 
 
 def pool_segments(
@@ -61,7 +62,7 @@ def pool_segments(
         Loss.OUTSIDE_MAP: math.fsum(count.no_place_m for count in counts),
         Loss.RECORDED_TWICE: math.fsum(count.again_m for count in counts),
     }
-    return Pool(segments, move_out(ledger_m, lost_m), tuple(_warnings(runs, counts)))
+    return Pool(segments, move_out(ledger_m, lost_m), tuple(_find_unusable(runs, counts)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,13 +95,12 @@ def _usable(
         yield segments if usable.all() else segments.filter(pa.array(usable))
 
 
-def _warnings(runs: Sequence[RunDirectory], counts: Sequence[_Count]) -> Iterator[str]:
-    """Yield a line for every run that lacks something everywhere."""
-    for what, name in (("power: no label", "powered"), ("GNSS: no place on a map", "located")):
-        without = [
-            run.run_id for run, count in zip(runs, counts, strict=True) if count.every and not getattr(count, name)
-        ]
-        yield from (f"run {run_id}: without {what}" for run_id in sorted(without))
+def _find_unusable(runs: Sequence[RunDirectory], counts: Sequence[_Count]) -> Iterator[Finding]:
+    """Yield a finding for every run that lacks power or positions everywhere."""
+    for run, count in zip(runs, counts, strict=True):
+        lacks = [name for name, has in (("power", count.powered), ("gnss", count.located)) if not has]
+        if count.every and lacks:
+            yield make_finding("run-without-samples", Subject("run", run.run_id), names={"lacks": " and ".join(lacks)})
 
 
 def move_out(ledger_m: Mapping[str, float], lost_m: Mapping[Loss, float]) -> dict[str, float]:

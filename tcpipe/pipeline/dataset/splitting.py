@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 from pyproj import CRS
 
 from tcpipe.errors import DatasetError
-from tcpipe.formats.dataset_card import DatasetCard, KeptSplit
+from tcpipe.formats.dataset_card import KeptSplit
 from tcpipe.formats.geojson import PolygonGeometry
 from tcpipe.recipe import Recipe
-from tcpipe.recipe.suggestions import recipe_key, suggested
+from tcpipe.recipe.suggestions import recipe_key
 from tcpipe.splits.assignment import EXCLUDED, NO_FOLD, Assignment, assign_splits
 from tcpipe.splits.audit import HeldOut, audit_leakage
 from tcpipe.splits.ranking import hash_ranks
@@ -184,23 +184,3 @@ def _nothing_inside(regions: Regions, lonlat_deg: NDArray[np.float64], split: ND
         f"the region (--split) covers none of the {len(split)} samples: they lie around {lon:.5f}, {lat:.5f} (lon, lat), "
         f"about {apart_km:.2g} km from it; draw it over the runs"
     )
-
-
-def empty_splits(card: DatasetCard) -> tuple[str, ...]:
-    """Return a line for each split of a dataset that was asked for and holds no sample, by its card."""
-    counts, rules, found = card.splits, card.split, list[str]()
-    if not counts["train"]:
-        found.append("no sample trains: too few lie inside the region; draw it larger")
-    if not counts["test"] and rules.test_fraction > 0:
-        one = {"run": "one run", "block": "one block", "tag": f"of one {rules.holdout_tag}"}.get(
-            rules.holdout, "too few samples"
-        )
-        found.append(
-            f"no sample tests: all inside samples are {one}; try --holdout sample, or lower the {recipe_key('split.block_m')}"
-            + suggested("to want none", {"split": {"test_fraction": 0.0}})
-        )
-    if not counts["unseen"] and rules.region is not None:
-        found.append(
-            "no sample is unseen: all lie inside the region (--split), or near it; draw it smaller, or give none"
-        )
-    return tuple(found)

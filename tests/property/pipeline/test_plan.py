@@ -21,11 +21,13 @@ from tcpipe.pipeline import ingest as ingest_module
 from tcpipe.pipeline.ingest import ingest
 from tcpipe.pipeline.ingest_run import Ingested
 from tcpipe.pipeline.ingest_task import IngestResult, result_of, too_young
+from tcpipe.pipeline.log_findings import find_damage
 from tcpipe.pipeline.plan import TO_DO
 from tcpipe.pipeline.problems import acknowledge
 from tcpipe.pipeline.status import status
 from tcpipe.recipe import ReadConfig, Recipe
 from tcpipe.store import Store, open_store
+from tcpipe.tables.findings import Subject, make_finding
 
 RECIPES = (Recipe(), replace(Recipe(), read=ReadConfig(ignore_topics=["/none"])))
 KINDS = ("good", "damaged", "empty", "junk", "passing")
@@ -46,7 +48,12 @@ def make_row(row, task, sha256, kind):
     key, name = ingest_key(task.recipe), f"{task.source.stem}-{sha256[:8]}"
     asked = {"robot_requested": task.robot, "message_definitions": task.definitions, "ingest_key": key}
     made = replace(row, run_id=name, recipe_id=recipe_id(task.recipe, row.robot), log=log, files={}, commit=0, **asked)
-    changes = {"damaged": {"damage": ("it was cut",)}, "empty": {"segments": 0, "driven_m": 80.0}}
+    subject = Subject("run", name)
+    empty = make_finding("no-segments", subject, names={"reason": "gap"}, driven_m=80.0, lost_m=80.0)
+    changes = {
+        "damaged": {"damage": ("it was cut",), "findings": find_damage(("it was cut",), subject)},
+        "empty": {"segments": 0, "driven_m": 80.0, "findings": (empty,)},
+    }
     return replace(made, **changes.get(kind, {}))
 
 

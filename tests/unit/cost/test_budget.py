@@ -5,7 +5,8 @@ from dataclasses import asdict
 import numpy as np
 import pytest
 
-from tcpipe.cost.budget import CAUSES, energy_budget, in_words, pooled
+from tcpipe.cost.budget import CAUSES, energy_budget, find_noise, in_words, pooled
+from tcpipe.tables.findings import Subject
 
 
 def made(rng, count):
@@ -25,6 +26,16 @@ def test_shares_of_hand_made_variances():
         "Noise floor of E 4.0 % of a segment's mean 100 J: power rate 3.0, position 2.0, current noise 1.4, voltage 1.0"
     )
     assert text.endswith("power at 20 Hz would leave 2.2 %.")
+
+
+@pytest.mark.parametrize(("watt_factor", "noisy"), [(1.0, False), (1.6, True)])
+def test_a_high_noise_floor_is_a_finding_with_its_causes(watt_factor, noisy):
+    variance = dict(zip(CAUSES, watt_factor * np.array([[4.0], [9.0], [2.0], [1.0]]) * np.ones(2), strict=True))
+    budget = energy_budget(np.array([90.0, 110.0]), {**variance, "at_20_hz": np.full(2, 5.0)})
+    found = find_noise(budget, Subject("role", "power"))
+    assert [of.code for of in found] == ["energy-noise"] * noisy
+    assert all(of.numbers["rate_fraction"] == budget.rate for of in found)
+    assert find_noise(None, Subject("role", "power")) == ()
 
 
 def test_runs_pool_as_one():

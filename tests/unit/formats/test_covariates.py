@@ -8,6 +8,7 @@ import pytest
 
 from tcpipe.errors import DatasetError
 from tcpipe.formats.covariates import read_covariates
+from tcpipe.tables.findings import Subject
 
 HOURS = [datetime(2025, 10, 14, 11, tzinfo=UTC) + timedelta(minutes=10 * k) for k in range(3)]
 NS = [int(hour.timestamp()) * 10**9 for hour in HOURS]
@@ -75,13 +76,18 @@ def test_parquet_is_as_csv(tmp_path):
 def test_numbers_among_which_is_a_word_are_text_and_said_to_be(tmp_path):
     found = table(tmp_path, f"stamp_ns,temp_c\n{NS[0]},3.5\n{NS[1]},4\n{NS[2]},frozen\n")
     assert found.rows["temp_c"].to_list() == ["3.5", "4", "frozen"]
-    assert found.warnings == ("weather.csv: temp_c is text, since 'frozen' is no number (1 of 3 values)",)
+    (finding,) = found.findings
+    assert (finding.code, finding.subject) == ("column-is-text", Subject("column", "weather_temp_c"))
+    assert finding.numbers == {"odd_count": 1, "value_count": 3}
+    assert finding.names["example"] == "frozen"
 
 
 def test_rows_without_a_stamp_are_left_out_and_counted(tmp_path):
     found = table(tmp_path, f"stamp_ns,temp_c\n{NS[0]},3.5\n,4\n{NS[0]},3.5\n")
     assert found.rows.height == 1  # a repeated row says nothing else
-    assert found.warnings == ("weather.csv: 1 rows without a stamp_ns are left out",)
+    (finding,) = found.findings
+    assert (finding.code, finding.subject) == ("covariates-without-time", Subject("file", "weather.csv"))
+    assert (finding.names, finding.numbers) == ({"column": "stamp_ns"}, {"row_count": 1})
 
 
 def test_two_rows_of_one_stamp_that_differ_are_refused(tmp_path):

@@ -10,7 +10,8 @@ from pathlib import Path
 import pytest
 
 from tcpipe.errors import StoreError
-from tcpipe.formats.json_files import read_as, schema_of, typed, write_json
+from tcpipe.formats.json_files import read_as, typed, write_json
+from tcpipe.recipe.checking import describe
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,10 +71,10 @@ def test_what_does_not_fit_is_named_by_file_and_key(tmp_path, value, line):
 
 
 def test_a_schema_names_every_key_and_its_type():
-    schema = json.loads(schema_of(Document))
-    assert schema["$schema"].endswith("2020-12/schema")
-    assert schema["$defs"]["Counts"]["properties"]["segments"] == {"type": "integer"}
-    assert schema["$defs"]["Document"]["required"] == ["counts"]
+    ((schema,), definitions) = describe(Document, file="all.json")
+    assert schema == {"$ref": "all.json#/$defs/Document"}
+    assert definitions["Counts"]["properties"]["segments"] == {"type": "integer"}
+    assert definitions["Document"]["required"] == ["counts"]
 
 
 def test_threads_that_meet_a_document_at_once_all_read_it():

@@ -50,38 +50,38 @@ def test_every_wrong_key_is_one_problem() -> None:
 
 
 WRONG = {
-    "robot = 3": "robot is 3; wanted text in quotes",
+    "robot = 3": "robot is 3; expected text in quotes",
     'read.topics.gnsss = ["/a"]': "unknown key read.topics.gnsss; known here: gnss, gnss_velocity, imu, wheel_odometry, visual_odometry",
-    'read.topics.imu = "/a"': 'read.topics.imu is "/a"; wanted a list',
-    "read.topics.imu = [1]": "read.topics.imu.0 is 1; wanted text in quotes",
-    "read.placement.imu.xyz_m = [1, 2]": "read.placement.imu.xyz_m is [1, 2]; wanted 3 values, got 2",
-    "read.placement.imu.xyz_m = [1, 2, 3, 4]": "wanted 3 values, got 4",
-    'read.placement.imu.xyz_m = [1, 2, "up"]': 'read.placement.imu.xyz_m.2 is "up"; wanted a number',
-    "read.placement.imu = 3": "read.placement.imu is 3; wanted a table of keys",
-    "read.topics = 3": "read.topics is 3; wanted a table",
-    "read.placement.imu.xyz_m = 3": "read.placement.imu.xyz_m is 3; wanted a list of numbers",
-    'read.imu_units = "kg"': 'read.imu_units is "kg"; wanted one of si, deg, g, deg_g',
-    "fuse.rate_hz = -1": "fuse.rate_hz is -1; wanted from 1 to 500",
-    "fuse.rate_hz = true": "fuse.rate_hz is true; wanted a number",
-    'fuse.rate_hz = "20"': 'fuse.rate_hz is "20"; wanted a number',
-    "fuse.rate_hz = 1e9": "fuse.rate_hz is 1000000000.0; wanted from 1 to 500",
-    "segment.chord_m = 1e300": "segment.chord_m is 1e+300; wanted from 0.05 to 1000",
-    "segment.chord_m = 1e-300": "segment.chord_m is 1e-300; wanted from 0.05 to 1000",
-    "split.test_fraction = 1.0": "split.test_fraction is 1.0; wanted from 0 to below 1",
-    "split.block_m = 1e-12": "split.block_m is 1e-12; wanted from 0.1 to 1000000",
-    "split.seed = -1": "split.seed is -1; wanted from 0 to 4294967295",
-    'fuse.estimator = "UKF"': 'fuse.estimator is "UKF"; wanted one of smoother, ukf',
-    'split.holdout = "samples"': 'split.holdout is "samples"; wanted one of block, sample, run',
-    "fuse.rate_hz = nan": "fuse.rate_hz is nan; wanted a finite number",
-    "fuse.rate_hz = [1]": "fuse.rate_hz is [1]; wanted a number",
-    "fuse.gate_probability = 1": "fuse.gate_probability is 1; wanted from 0.5 to 0.999999999",
-    "gate.full_speed_fraction = 1.2": "gate.full_speed_fraction is 1.2; wanted from 0 to 1",
-    'gate.keep_reversing = "maybe"': "wanted true or false",
-    "gate.keep_reversing = [1]": "wanted true or false",
-    "sample.patch_px = 1": "sample.patch_px is 1; wanted from 2 to 1024",
-    "split.folds = 2.5": "split.folds is 2.5; wanted a whole number",
-    'split.seed = "x"': 'split.seed is "x"; wanted a whole number',
-    "split.seed = [1]": "wanted a whole number",
+    'read.topics.imu = "/a"': 'read.topics.imu is "/a"; expected a list',
+    "read.topics.imu = [1]": "read.topics.imu.0 is 1; expected text in quotes",
+    "read.placement.imu.xyz_m = [1, 2]": "read.placement.imu.xyz_m is [1, 2]; expected 3 values",
+    "read.placement.imu.xyz_m = [1, 2, 3, 4]": "is [1, 2, 3, 4]; expected 3 values",
+    'read.placement.imu.xyz_m = [1, 2, "up"]': 'read.placement.imu.xyz_m is [1, 2, "up"]; expected 3 values in a list, each a number',
+    "read.placement.imu = 3": "read.placement.imu is 3; expected a table of keys",
+    "read.topics = 3": "read.topics is 3; expected a table",
+    "read.placement.imu.xyz_m = 3": "read.placement.imu.xyz_m is 3; expected 3 values in a list, each a number from -1000 to 1000",
+    'read.imu_units = "kg"': 'read.imu_units is "kg"; expected one of deg, deg_g, g, si',
+    "fuse.rate_hz = -1": "fuse.rate_hz is -1; expected a number from 1 to 500",
+    "fuse.rate_hz = true": "fuse.rate_hz is true; expected a number",
+    'fuse.rate_hz = "20"': 'fuse.rate_hz is "20"; expected a number',
+    "fuse.rate_hz = 1e9": "fuse.rate_hz is 1000000000.0; expected a number from 1 to 500",
+    "segment.chord_m = 1e300": "segment.chord_m is 1e+300; expected a number from 0.05 to 1000",
+    "segment.chord_m = 1e-300": "segment.chord_m is 1e-300; expected a number from 0.05 to 1000",
+    "split.test_fraction = 1.0": "split.test_fraction is 1.0; expected a number from 0 to below 1",
+    "split.block_m = 1e-12": "split.block_m is 1e-12; expected a number from 0.1 to 1000000",
+    "split.seed = -1": "split.seed is -1; expected a whole number from 0 to 4294967295",
+    'fuse.estimator = "UKF"': 'fuse.estimator is "UKF"; expected one of smoother, ukf',
+    'split.holdout = "samples"': 'split.holdout is "samples"; expected one of block, run, sample, tag',
+    "fuse.rate_hz = nan": "fuse.rate_hz is nan; expected a number from 1 to 500",
+    "fuse.rate_hz = [1]": "fuse.rate_hz is [1]; expected a number",
+    "fuse.gate_probability = 1": "fuse.gate_probability is 1; expected a number from 0.5 to 0.999999999",
+    "gate.full_speed_fraction = 1.2": "gate.full_speed_fraction is 1.2; expected a number from 0 to 1",
+    'gate.keep_reversing = "maybe"': "expected true or false",
+    "gate.keep_reversing = [1]": "expected true or false",
+    "sample.patch_px = 1": "sample.patch_px is 1; expected a whole number from 2 to 1024",
+    "split.folds = 2.5": "split.folds is 2.5; expected a whole number",
+    'split.seed = "x"': 'split.seed is "x"; expected a whole number',
+    "split.seed = [1]": "expected a whole number",
 }
 
 
@@ -129,6 +129,27 @@ def test_one_value_is_one_recipe_however_it_is_written() -> None:
     assert type(SplitConfig(folds=np.int64(3)).folds) is int  # type: ignore[arg-type]
 
 
+def test_names_of_recipes_are_those_of_0_8() -> None:
+    own = {
+        "robot": "husky",
+        "fuse": {"rate_hz": 10},
+        "read": {"topics": {"imu": ["/a"]}, "placement": {"imu": {"xyz_m": [1, 0, -0.0]}}},
+        "robots": {"r": {"width_m": 1, "voltage_range_volt": [20, 30]}},
+        "power_sources": [{"type": "a/msg/B", "voltage": "v"}],
+    }
+    names = {
+        recipe_id(recipe, "husky"): (ingest_key(recipe)[:8], read_key(recipe, "husky", definitions="x")[:8])
+        for recipe in (Recipe(), parse_recipe(own, where="r"))
+    }
+    assert names == {"87f31f5a": ("fd3f3c8a", "4ddf11ad"), "1652ca06": ("92c6ab9a", "0b4c8076")}
+
+
+@pytest.mark.parametrize("value", [{1.0, 2.0, 3.0}, (0.0, float("nan"), 0.0), (0.0, 0.0, float("inf")), b"abc", "abc"])
+def test_no_value_of_another_kind_is_a_position(value: object) -> None:
+    with pytest.raises(RecipeError, match=r"placement.xyz_m is .*; expected 3 values in a list, each a number"):
+        Placement(value)  # type: ignore[arg-type]
+
+
 def test_a_recipe_does_not_change_with_the_lists_it_was_made_of() -> None:
     topics = {"imu": ["/imu"]}
     config = ReadConfig(topics=topics)  # type: ignore[arg-type]
@@ -142,7 +163,7 @@ def test_a_recipe_does_not_change_with_the_lists_it_was_made_of() -> None:
         ("robot = ", "not valid TOML"),
         (None, "cannot be read"),
         ("robot = " + "[" * 100_000, "nested too deep"),
-        ("read.topics.imu = " + "[" * 200 + "]" * 200, "wanted text in quotes|nested too deep"),
+        ("read.topics.imu = " + "[" * 200 + "]" * 200, "expected text in quotes|nested too deep"),
         ("split.seed = " + "9" * 5000, "not valid TOML"),
         ("# " + "x" * 1_000_001, "larger than 1 MB"),
     ],

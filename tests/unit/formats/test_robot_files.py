@@ -77,17 +77,17 @@ def test_everything_that_is_wrong_with_a_robot_is_said_at_once_by_its_key():
         )
     said = [line.removeprefix("tcpipe.toml: ") for line in caught.value.problems]
     keys = [
-        "robots.mine.width_m is -1; wanted from 0.05",
+        "robots.mine.width_m is -1; expected a number from 0.05",
         "unknown key robots.mine.speed_mps",
-        "robots.yours.voltage_range_volt is [30.0, 20.0]; wanted the lower",
-        "robots.theirs is 4; wanted a table of keys",
+        "robots.yours.voltage_range_volt is [30.0, 20.0]; expected the lower",
+        "robots.theirs is 4; expected a table of keys",
         "power_sources.0.type is missing",
-        'power_sources.1.type is "Foo"; wanted package/msg/Name',
-        'power_sources.1.current is "i["; wanted fields joined by +',
+        'power_sources.1.type is "Foo"; expected package/msg/Name',
+        'power_sources.1.current is "i["; expected fields joined by +',
         "power_sources.2.current",
-        'power_sources.3.sign is "plus"; wanted one of drawn_positive',
-        'power_sources.4.energy is "e"; wanted a voltage beside it, and no current',
-        'power_sources.5.refused is "tells phases"; wanted no field beside it',
+        'power_sources.3.sign is "plus"; expected one of auto',
+        'power_sources.4.energy is "e"; expected a voltage beside it, and no current',
+        'power_sources.5.refused is "tells phases"; expected no field beside it',
     ]
     assert len(said) == len(keys)
     assert all(line.startswith(key) for line, key in zip(said, keys, strict=True)), said

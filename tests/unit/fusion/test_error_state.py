@@ -350,8 +350,9 @@ def test_an_estimate_that_is_not_finite_is_an_error():
     output = np.array([measurements.gnss.stamp_ns[100]])
     found = run_error_state(wanted, initial, output_ns=output)  # the gate refuses what compares to nothing
     assert np.isfinite(found.position_enu_m).all()
-    with pytest.raises(FusionError, match="not finite"):
+    with pytest.raises(FusionError) as error:
         run_error_state(wanted, replace(initial, position_enu_m=np.full(3, np.nan)), output_ns=output)
+    assert [of.code for of in error.value.findings] == ["estimate-not-finite"]
 
 
 def test_a_receiver_whose_clock_is_off_is_trusted_less_rather_than_refused():

@@ -69,7 +69,7 @@ def test_such_an_odometry_is_prepared_as_driving_forward_and_it_is_said():
         STAMP_NS, columns, xyz_m=(0, 0, 0), quat_xyzw=(0, 0, 0, 1), default_std_mps=0.05, only_forward=True
     )
     assert made.velocity_mps[:, 0] == pytest.approx(np.full(T.size, SPEED))
-    assert "along the axes of its pose's frame" in prepared.remarks[0]
+    assert prepared.findings[0].code == "twist-in-pose-frame"
 
 
 @pytest.mark.parametrize("silent", [0.0, np.nan])
@@ -116,7 +116,8 @@ def test_an_odometry_without_a_turn_rate_turns_with_its_orientation():
     given = {"xyz_m": (0.0, 0.0, 0.0), "quat_xyzw": (0.0, 0.0, 0.0, 1.0), "default_std_mps": 0.05, "only_forward": True}
     made, prepared = body_velocities(STAMP_NS, odometry(np.full(T.size, SPEED), yaw, np.full(T.size, np.nan)), **given)
     assert made.yaw_rate_radps[1:-1] == pytest.approx(RATE)
-    assert any("orientation is used" in remark for remark in prepared.remarks)
+    (finding,) = prepared.findings
+    assert (finding.code, finding.names) == ("rate-from-orientation", {"axes": "z"})
 
 
 def test_counts_that_come_with_every_other_message_are_averaged_and_as_uncertain_as_they_scatter():
@@ -127,11 +128,11 @@ def test_counts_that_come_with_every_other_message_are_averaged_and_as_uncertain
     assert made.velocity_mps[5:-5, 0] == pytest.approx(SPEED, rel=0.25)
     assert made.velocity_mps[5:-5, 0].mean() == pytest.approx(SPEED, rel=0.01)
     assert (made.variance_m2ps2[5:-5, 0] > 1.0).all()
-    assert any("scatters" in remark for remark in prepared.remarks)
+    assert "velocity-scatters" in {of.code for of in prepared.findings}
     noisy = SPEED + 0.05 * np.random.default_rng(1).standard_normal(T.size)
     made, prepared = body_velocities(STAMP_NS, odometry(noisy, yaw, np.full(T.size, RATE)), **given)
     assert (made.velocity_mps[:, 0] == noisy).all()
-    assert not prepared.remarks
+    assert not prepared.findings
 
 
 def test_a_twist_that_tells_no_forward_velocity_is_none_where_the_poses_move():
@@ -141,4 +142,4 @@ def test_a_twist_that_tells_no_forward_velocity_is_none_where_the_poses_move():
     given = {"xyz_m": (0.0, 0.0, 0.0), "quat_xyzw": (0.0, 0.0, 0.0, 1.0), "default_std_mps": 0.05, "only_forward": True}
     made, prepared = body_velocities(STAMP_NS, columns, **given)
     assert made.velocity_mps[:, 0] == pytest.approx(SPEED, rel=1e-3)
-    assert prepared.remarks == ("no twist: pose increments are used",)
+    assert [(of.code, of.subject.name) for of in prepared.findings] == [("pose-increments", "wheel_odometry")]

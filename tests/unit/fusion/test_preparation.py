@@ -150,7 +150,7 @@ def test_poses_become_the_velocity_of_a_circle_where_the_twist_is_empty(twist):
     found, prepared = body_velocities(
         stamps(50), columns, xyz_m=ARM, quat_xyzw=(0, 0, 0, 1), default_std_mps=0.05, only_forward=False
     )
-    assert prepared.remarks == ("no twist: pose increments are used",)
+    assert [(of.code, of.subject.name) for of in prepared.findings] == [("pose-increments", "visual_odometry")]
     chord = 2 * 2.0 * np.sin(0.025) / 0.1  # a chord is shorter than its arc
     assert found.velocity_mps == pytest.approx(np.tile([chord, 0, 0], (49, 1)), abs=1e-9)
     assert found.yaw_rate_radps == pytest.approx(np.full(49, 0.5), abs=1e-9)
@@ -170,7 +170,7 @@ def test_a_robot_that_stands_has_a_twist_of_zero():
     found, prepared = body_velocities(
         stamps(5), columns, xyz_m=ARM, quat_xyzw=(0, 0, 0, 1), default_std_mps=0.05, only_forward=True
     )
-    assert prepared.remarks == ()
+    assert prepared.findings == ()
     assert found.velocity_mps[:, 0].tolist() == [0.0] * 5
 
 
@@ -201,7 +201,7 @@ def test_imu_is_turned_by_its_mounting_orientation_too():
     assert found.angular_velocity_radps[0] == pytest.approx([0.1, 0.2, 0.3])
     assert found.quat_xyzw[0] == pytest.approx(attitude.as_quat(canonical=True))
     assert found.accelerometer_usable
-    assert prepared.remarks == ()
+    assert prepared.findings == ()
 
 
 def test_noise_is_what_the_samples_show_where_that_is_more():
@@ -247,7 +247,8 @@ def test_a_force_in_g_or_without_gravity_is_not_used(norm):
         accelerometer_std_mps2=0.1,
     )
     assert not found.accelerometer_usable
-    assert "only the gyroscope" in prepared.remarks[0]
+    (finding,) = prepared.findings
+    assert (finding.code, finding.numbers) == ("specific-force-implausible", {"force_mps2": pytest.approx(norm)})
 
 
 def test_a_receivers_velocity_has_a_deviation_always_and_a_vast_one_where_it_tells_no_climb():

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from tcpipe.logs import roles
-from tcpipe.logs.messages import apart_from_header, frames, read_messages
+from tcpipe.logs.messages import find_utc_offset, frames, read_messages
 
 S = 1_000_000_000
 N = 12
@@ -83,7 +83,9 @@ def test_a_fix_without_altitude_is_a_fix(count: int) -> None:
     assert (found.columns["alt_m"] == 400.0).all()
     without = found.columns["up_var_m2"] > 1e5
     assert without.sum() == (1 if count == 3 else count)
-    assert f"{without.sum()} of {count} fixes have no altitude" in found.warnings[0]
+    (missing,) = found.findings
+    assert missing.code == "altitude-missing"
+    assert missing.numbers == {"missing_count": without.sum(), "fixes_count": count}
     assert np.isfinite(found.columns["east_var_m2"]).all()
 
 
@@ -123,15 +125,14 @@ def test_gga_whose_clock_is_not_the_computers_warns() -> None:
         }
         found = read_messages(columns, "gnss", roles.NMEA_SENTENCE)
         assert found.own_time_ns.tolist() == [noon] * 3
-        said = apart_from_header(found)
-        assert bool(said) == warned
-        assert not warned or "-0.700 s" in said[0]
+        offsets = [of.numbers["offset_s"] for of in find_utc_offset(found)]
+        assert offsets == ([pytest.approx(-0.7)] if warned else [])
 
 
 def test_gga_without_any_separation_warns() -> None:
     found = read_messages(with_times(2, sentence=np.full(2, GGA.format(1, 1.0, ""))), "gnss", roles.NMEA_SENTENCE)
     assert found.columns["alt_m"].tolist() == [545.4, 545.4]
-    assert "above the geoid" in found.warnings[0]
+    assert [of.code for of in found.findings] == ["geoid-separation-missing"]
 
 
 def imu() -> dict[str, np.ndarray]:
@@ -155,7 +156,7 @@ def test_imu_values_variances_and_orientation() -> None:
     assert (found.columns["angular_velocity_var"] == 3.0).all()
     assert np.isnan(found.columns["linear_acceleration_var"]).all()
     np.testing.assert_allclose(found.columns["quat_z"], columns["orientation.z"], rtol=1e-14)
-    assert found.warnings == ()
+    assert found.findings == ()
 
 
 def test_an_orientation_that_is_absent_zero_or_no_unit_is_null() -> None:
@@ -175,7 +176,7 @@ def test_an_orientation_that_never_changes_is_no_orientation() -> None:
     columns = imu() | vectors("orientation", np.tile([0.0, 0.0, 0.0, 1.0], (N, 1)), "xyzw")
     found = read_messages(columns, "imu", roles.IMU)
     assert np.isnan(found.columns["quat_w"]).all()
-    assert "never changes" in found.warnings[0]
+    assert [of.code for of in found.findings] == ["orientation-constant"]
 
 
 def test_imu_rows_without_a_gyro_or_finite_numbers_are_dropped() -> None:
@@ -243,7 +244,9 @@ def test_an_empty_twist_on_a_moving_pose_is_no_standstill() -> None:
     assert np.isnan(found.columns["velocity_x_mps"]).all()
     assert np.isnan(found.columns["velocity_var_x_m2ps2"]).all()
     assert np.isfinite(found.columns["quat_w"]).all()
-    assert "0.6 m" in found.warnings[0]  # 11 steps of 5 cm, rounded
+    (zero,) = found.findings
+    assert (zero.code, zero.subject.name) == ("twist-zero", "visual_odometry")
+    assert zero.numbers["moved_m"] == pytest.approx(0.55)  # 11 steps of 5 cm
 
 
 def test_an_empty_twist_on_a_resting_pose_is_standstill() -> None:
@@ -251,7 +254,7 @@ def test_an_empty_twist_on_a_resting_pose_is_standstill() -> None:
     columns["pose.pose.position.x"][:] = 3.0
     found = read_messages(columns, "wheel_odometry", roles.ODOMETRY)
     assert (found.columns["velocity_x_mps"] == 0.0).all()
-    assert found.warnings == ()
+    assert found.findings == ()
 
 
 def test_odometry_without_numbers_is_dropped_without_pose_kept() -> None:
@@ -311,7 +314,7 @@ def test_a_twist_that_never_goes_aside_is_of_the_body() -> None:
     columns = with_times(count, **vectors("twist.linear", velocity))
     found = read_messages(columns, "gnss_velocity", roles.TWIST_STAMPED)
     assert found.dropped == {"of_the_body": count}
-    assert "of the body" in found.warnings[0]
+    assert [of.code for of in found.findings] == ["velocity-not-over-ground"]
     velocity[:, 1] = 0.1
     found = read_messages(with_times(count, **vectors("twist.linear", velocity)), "gnss_velocity", roles.TWIST_STAMPED)
     assert not found.dropped

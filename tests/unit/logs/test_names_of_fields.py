@@ -1,12 +1,11 @@
 """What a message type of somebody's own could play is told by its definition, and by nothing that is of another role."""
 
-from suggested_recipes import suggestions_in
-
 from tcpipe.formats.robot_files import shipped_profiles
-from tcpipe.logs.names_of_fields import _numbers, fields_called, proposed_roles
+from tcpipe.logs.names_of_fields import _numbers, fields_called, propose_roles
 from tcpipe.logs.topics import Topic
 from tcpipe.recipe import ReadConfig
 from tcpipe.stages.read_roles import roles_by
+from tcpipe.tables.findings import select_findings
 
 RTK = """std_msgs/Header header
 float64 latitude
@@ -39,22 +38,25 @@ def topic(
 
 
 def test_a_receiver_s_own_message_is_proposed_with_the_lines_of_the_recipe() -> None:
-    (said,) = proposed_roles([topic("/rtk", RTK)], settled=())
+    (found,) = propose_roles([topic("/rtk", RTK)], settled=())
+    assert (found.code, found.subject.name, found.names["role"]) == ("role-proposed", "/rtk", "gnss")
     fields = {name: name for name in ("latitude", "longitude", "altitude")}
-    assert suggestions_in(said) == [{"read": {"topics": {"gnss": ["/rtk"]}, "fields": {"gnss": fields}}}]
+    assert [of.recipe for of in found.remedies] == [
+        {"read.topics": {"gnss": ["/rtk"]}, "read.fields": {"gnss": fields}}
+    ]
 
 
 def test_fields_are_looked_for_in_the_messages_inside_a_message() -> None:
-    (said,) = proposed_roles([topic("/vectornav", IMU_INSIDE)], settled=())
-    fields = suggestions_in(said)[0]["read"]["fields"]["imu"]
+    (found,) = propose_roles([topic("/vectornav", IMU_INSIDE)], settled=())
+    fields = found.remedies[0].recipe["read.fields"]["imu"]
     assert fields["angular_velocity_z"] == "imu.angular_velocity.z"
     assert fields["linear_acceleration_x"] == "imu.linear_acceleration.x"
 
 
 def test_nothing_is_proposed_for_what_is_played_or_cannot_be_read_or_lacks_a_field() -> None:
-    assert not list(proposed_roles([topic("/rtk", RTK)], settled={"gnss"}))
+    assert not list(propose_roles([topic("/rtk", RTK)], settled={"gnss"}))
     fix = topic("/fix", "", "sensor_msgs/msg/NavSatFix")
-    assert not list(proposed_roles([topic("/rtk", RTK), fix], settled=()))
+    assert not list(propose_roles([topic("/rtk", RTK), fix], settled=()))
     others = [
         topic("/empty", RTK, count=0),
         topic("/lost", RTK, problem="encoded as json"),
@@ -64,7 +66,7 @@ def test_nothing_is_proposed_for_what_is_played_or_cannot_be_read_or_lacks_a_fie
         topic("/endless", f"Own inner\n{'=' * 80}\nMSG: driver/Own\nOwn inner\n"),
         topic("/tcpipe/track", RTK),
     ]
-    assert not list(proposed_roles(others, settled=()))
+    assert not list(propose_roles(others, settled=()))
 
 
 def test_a_definition_that_is_made_to_hurt_is_not_searched() -> None:
@@ -82,12 +84,13 @@ def test_a_definition_that_is_made_to_hurt_is_not_searched() -> None:
 def test_a_log_without_motion_asks_with_the_proposal_and_one_with_motion_warns_with_it() -> None:
     odom = topic("/odom", "", "nav_msgs/msg/Odometry")
     alone = roles_by(ReadConfig(), [topic("/rtk", RTK)], None, known=shipped_profiles())
-    assert alone.problems[-1].startswith("/rtk (driver/msg/Own) could play gnss")
+    assert alone.problems
     beside = roles_by(ReadConfig(), [topic("/rtk", RTK), odom], None, known=shipped_profiles())
     assert not beside.problems
-    assert beside.warnings[-1] == alone.problems[-1]
+    (proposed,) = select_findings(alone.findings, "role-proposed")
+    assert beside.findings[-1] == proposed
     ignored = roles_by(ReadConfig(ignore_topics=("/rtk",)), [topic("/rtk", RTK), odom], None, known=shipped_profiles())
-    assert not any("/rtk" in line for line in ignored.warnings)
+    assert not any(of.subject.name == "/rtk" for of in ignored.findings)
 
 
 def test_columns_are_told_with_their_units_left_off() -> None:

@@ -7,6 +7,7 @@ from tcpipe.formats.robot_files import shipped_profiles
 from tcpipe.logs import roles
 from tcpipe.logs.roles import RoleAssignment
 from tcpipe.logs.topics import Topic
+from tcpipe.tables.findings import select_findings
 
 FIX, IMU = "sensor_msgs/msg/NavSatFix", "sensor_msgs/msg/Imu"
 ODOMETRY, TWIST, STAMPED = "nav_msgs/msg/Odometry", "geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped"
@@ -32,6 +33,12 @@ def assign(*topics: tuple[str, str], chosen=None, ignored=(), robot=None) -> Rol
 def played(assignment: RoleAssignment) -> dict[str, tuple[str, ...]]:
     assert assignment.problems == ()
     return {name: role.topics for name, role in assignment.roles.items()}
+
+
+def left_out(assignment: RoleAssignment) -> list[tuple[str, str, str]]:
+    """Role, topic and reason of what is not used though it could be."""
+    found = select_findings(assignment.findings, "topic-left-out")
+    return [(of.names["role"], of.subject.name, of.names["reason"]) for of in found]
 
 
 def test_a_ros1_husky_with_everything() -> None:
@@ -64,11 +71,15 @@ def test_a_ros1_husky_with_everything() -> None:
     }
     assert found.robot == "husky"
     assert found.transforms == ("/tf_static", "/tf")
-    assert [line.split(" (")[0] for line in found.warnings] == [
-        "wheel_odometry: left out: /odometry/filtered",
-        "imu: left out: /imu/data_raw",
-        "command: left out: /joy_teleop/cmd_vel",
+    assert left_out(found) == [
+        ("wheel_odometry", "/odometry/filtered", "name"),
+        ("wheel_odometry", "/odometry/gps", "name"),
+        ("imu", "/imu/data_raw", "another-fits-better"),
+        ("imu", "/zed2/zed_node/imu/data", "another-fits-better"),
+        ("command", "/joy_teleop/cmd_vel", "another-fits-better"),
+        ("command", "/move_base/cmd_vel", "another-fits-better"),
     ]
+    assert {of.code for of in found.findings} == {"topic-left-out"}
     assert "filtered" in found.left_out["/odometry/filtered"]
     assert "gps" in found.left_out["/odometry/gps"]
     assert "/rosout" not in found.left_out
@@ -185,7 +196,7 @@ def test_the_recipe_rules_over_types_names_and_ambiguity() -> None:
     assert played(found) == {"imu": ("/b/imu",), "wheel_odometry": ("/odometry/filtered",)}
     assert found.left_out["/battery"] == "the recipe ignores it"
     assert "recipe" in found.left_out["/fix"]
-    assert len(found.warnings) == 2
+    assert {of.code for of in found.findings} == {"no-gnss", "no-power"}
 
 
 def covering(name: str, type_name: str, count: int, span_s: float) -> Topic:
@@ -199,11 +210,8 @@ def test_a_topic_that_covers_little_does_not_win_by_its_name(little: str, much: 
     found = assign_roles(topics, {})
     assert played(found) == {"wheel_odometry": (much,)}
     assert found.roles["wheel_odometry"].why == f"it covers more than {little}"
-    (said,) = [line for line in found.warnings if "left out" in line]
-    assert said == (
-        f"wheel_odometry: left out: {little} ({count} messages over {span_s:.1f} s; it covers little of what {much} covers "
-        "(658 messages over 65.7 s))"
-    )
+    assert left_out(found) == [("wheel_odometry", little, "covers-little")]
+    assert found.left_out[little] == f"it covers little of what {much} covers (658 messages over 65.7 s)"
     assert played(assign_roles(topics, {"wheel_odometry": [little]})) == {"wheel_odometry": (little,)}
 
 
@@ -226,24 +234,26 @@ def test_of_power_a_side_that_fell_silent_is_still_a_side() -> None:
     )
 
 
-def test_what_cannot_be_decoded_is_said_in_one_line_by_reason() -> None:
+def test_what_cannot_be_decoded_is_a_finding_each_and_one_line_of_the_error() -> None:
     json = [
         topic(f"/json{n}", "foxglove.Pose", problem="its messages are encoded as json; cdr and ros1 are read")
         for n in range(12)
     ]
     proto = topic("/proto", IMU, problem="its messages are encoded as protobuf; cdr and ros1 are read")
     empty = topic("/empty", IMU, 0, problem="its messages are encoded as cbor; cdr and ros1 are read")
-    for others in ([], [topic("/odom", ODOMETRY)]):
-        found = assign_roles([*json, proto, empty, *others], {})
-        (said,) = [
-            line for line in (*found.problems, *found.warnings) if line.startswith("topics that hold data which")
-        ]
-        assert (
-            "/json0, /json1, /json10, /json11, /json2, /json3, /json4, /json5 and 4 more: its messages are encoded as json"
-            in said
-        )
-        assert "/proto: its messages are encoded as protobuf" in said
-        assert "cbor" not in said
+    found = assign_roles([*json, proto, empty], {})
+    (said,) = [line for line in found.problems if line.startswith("topics that hold data which")]
+    assert (
+        "/json0, /json1, /json10, /json11, /json2, /json3, /json4, /json5 and 4 more: its messages are encoded as json"
+        in said
+    )
+    assert "/proto: its messages are encoded as protobuf" in said
+    assert "cbor" not in said
+    with_motion = assign_roles([*json, proto, empty, topic("/odom", ODOMETRY)], {})
+    assert with_motion.problems == ()
+    for each in (found, with_motion):
+        lost = {of.subject.name: of.severity for of in select_findings(each.findings, "topic-not-decoded")}
+        assert lost == {**{of.name: "note" for of in json}, "/proto": "warning"}  # of which only an IMU has a role
 
 
 def test_a_recipe_that_does_not_fit_the_log_is_an_error_with_what_there_is() -> None:
@@ -258,15 +268,20 @@ def test_a_recipe_that_does_not_fit_the_log_is_an_error_with_what_there_is() -> 
     assert "no role 'radar'" in text
 
 
+def proposals(found: RoleAssignment) -> list[dict]:
+    return [remedy.recipe for of in select_findings(found.findings, "topic-left-out") for remedy in of.remedies]
+
+
 def test_a_log_without_motion_says_so_in_three_lines_and_how_to_use_what_was_left_out() -> None:
     found = assign(("/odometry/filtered", ODOMETRY), ("/imu", IMU), ("/chatter", "std_msgs/msg/String"))
     assert len(found.problems) == 3
     assert found.problems[0].startswith("nothing in the log tells motion")
-    assert '[read.topics]: wheel_odometry = ["/odometry/filtered"]' in found.problems[1]
+    assert proposals(found) == [{"read.topics": {"wheel_odometry": ["/odometry/filtered"]}}]
     assert "/chatter (std_msgs/msg/String" in found.problems[2]
     assert len(assign(("/chatter", "std_msgs/msg/String")).problems) == 2
-    assert len(assign_roles([topic("/odom", ODOMETRY, count=0)], {}).problems) == 2, "an empty topic is no way out"
-    assert "all the same" not in assign(("/tcpipe/fix", FIX)).problems[1], "nor is what was made of another log"
+    empty = assign_roles([topic("/odom", ODOMETRY, count=0)], {})
+    assert (len(empty.problems), proposals(empty)) == (2, []), "an empty topic is no way out"
+    assert not proposals(assign(("/tcpipe/fix", FIX))), "nor is what was made of another log"
 
 
 def test_empty_and_unreadable_topics_play_nothing() -> None:
@@ -352,7 +367,9 @@ def test_a_motors_phase_currents_play_no_role_and_the_reason_is_said() -> None:
         ("/a300_0001/platform/bms/state", "sensor_msgs/msg/BatteryState"),
     )
     assert found.roles["power"].topics == ("/a300_0001/platform/bms/state",)
-    assert any("the current in the motor's phases" in line for line in found.warnings)
+    name = "/a300_0001/platform/motors/feedback"
+    assert ("power", name, "message-type") in left_out(found)
+    assert "the current in the motor's phases" in found.left_out[name]
     assert found.problems == ()
 
 
@@ -368,7 +385,7 @@ def test_a_pose_that_is_called_so_stands_in_where_there_is_no_gnss(name: str, ki
     alone = assign(WHEELS, (name, kind))
     assert played(alone) == {"wheel_odometry": ("/platform/odom",), "pose": (name,)}
     assert alone.roles["pose"].why.endswith("and there is no GNSS")
-    assert not any("gnss" in line for line in alone.warnings)
+    assert not select_findings(alone.findings, "no-gnss")
     beside = assign(WHEELS, (name, kind), ("/fix", FIX))
     assert played(beside) == {"wheel_odometry": ("/platform/odom",), "gnss": ("/fix",)}
     assert "another estimator's output" in beside.left_out[name]
@@ -452,7 +469,7 @@ def test_of_two_receivers_that_of_the_fixes_is_taken_and_without_fixes_none() ->
     assert played(assign(("/rear/fix", FIX), *topics))["gnss_velocity"] == ("/rear/fix_velocity",)
     nobody = assign(("/fix", FIX), *topics)
     assert "gnss_velocity" not in played(nobody)
-    assert any("gnss_velocity: left out" in line and "several could" in line for line in nobody.warnings)
+    assert left_out(nobody) == [("gnss_velocity", name, "several-fit") for name, _ in topics[:2]]
     alone = assign(*topics)
     assert "gnss_velocity" not in played(alone)
     assert "no topic plays gnss" in alone.left_out["/rear/fix_velocity"]

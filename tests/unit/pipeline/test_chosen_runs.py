@@ -17,6 +17,7 @@ from tcpipe.pipeline.prune import prune
 from tcpipe.pipeline.report import report
 from tcpipe.recipe import ReadConfig, Recipe
 from tcpipe.store import open_store
+from tcpipe.tables.findings import Remedy, Subject, select_findings
 from tcpipe.tables.levels import DATA_MODEL_VERSION
 
 
@@ -64,12 +65,9 @@ def make_outdated(store, *run_ids):
 def test_runs_of_another_data_model_are_named(store, tmp_path):
     make_outdated(store, "a")
     assert runs(store, tmp_path) == ["b", "c"]
-    assert open_dataset(tmp_path / "out").card.problems == (
-        (
-            f"1 of 3 runs have no ingestion of data model {DATA_MODEL_VERSION} (they have 0.9): a; "
-            "ingest their logs again: tcpipe ingest /logs/a.mcap"
-        ),
-    )
+    (left_out,) = select_findings(open_dataset(tmp_path / "out").card.findings, "run-ingested-otherwise")
+    assert (left_out.subject, left_out.names) == (Subject("run", "a"), {"what": "data_model", "has": "0.9"})
+    assert left_out.remedies == (Remedy("ingest", command="tcpipe ingest /logs/a.mcap"),)
     found = inspect(store.root, recipe=Recipe())
     assert found.outdated == {"a": "0.9"}
     with pytest.raises(

@@ -21,6 +21,7 @@ from tcpipe.pipeline.status import status
 from tcpipe.pipeline.verify import verify
 from tcpipe.recipe import Recipe
 from tcpipe.store import Store, open_store
+from tcpipe.tables.findings import select_findings
 
 LOST = {
     "the only manifest": "runs/b/*/manifest-1.json",
@@ -94,10 +95,9 @@ def test_what_a_run_lost_is_a_problem_to_every_command_until_it_is_back(place, t
     for _ in range(2):  # what the first call writes hides nothing from the next
         result = build_dataset(tmp_path / "out", store=root, recipe=Recipe(), dry_run=True)
         assert result.exit_code == 3
-        assert any(f"/{name}" in line or f": {name};" in line for line in result.problems), result.problems
-        assert not any(f"run {name}:" in line for line in result.warnings)
+        assert [of.subject.name for of in select_findings(result.findings, "run-damaged", "run-gone")] == [name]
         found = status([new], store=root, recipe=Recipe())
-        assert (found.exit_code, [of.code for of in found.findings]) == (3, ["run-incomplete"])
+        assert (found.exit_code, [of.code for of in found.problems]) == (3, ["run-incomplete"])
         assert verify(root).problems
         assert list(inspect(root, recipe=Recipe()).damaged_runs)
         assert len(Store(root).ingestions().finished) == 2
@@ -110,13 +110,21 @@ def test_what_a_run_lost_is_a_problem_to_every_command_until_it_is_back(place, t
     assert verify(root).problems == ()
 
 
+@pytest.mark.parametrize("lost", LOST)
+def test_a_copy_whose_files_have_other_times_misses_the_same(made, tmp_path, lost):
+    store = Store(shutil.copytree(made / "store", tmp_path / "store", copy_function=shutil.copyfile))
+    lose(tmp_path / "store", LOST[lost])
+    for _ in range(2):
+        assert {run_id for run_id, _ in store.ingestions().damaged} == {LOST[lost].split("/")[1]}
+
+
 def test_what_no_commit_names_is_seen_by_verify_alone_until_it_is_committed(place, tmp_path):
     files, root = place
     store, new = Store(root), tmp_path / "new.mcap"
     new.write_bytes(b"to be ingested")
     shutil.rmtree(files / "log")
     assert store.ingestions().rows == {}
-    assert status([new], store=root, recipe=Recipe(), create=True).findings == ()
+    assert status([new], store=root, recipe=Recipe(), create=True).problems == ()
     assert sum("no commit names it; ingest its log again" in line for line in verify(root).problems) == 3
     for run_id in ("a", "b", "twice"):
         commit_run(store, run_id)
@@ -146,9 +154,9 @@ def test_what_is_lost_is_made_again_from_the_log(tmp_path, lost):
     ingest([logs / "one.mcap"], store=root, recipe=Recipe(), tags={"load": "12"})
     for part in root.glob(lost):
         shutil.rmtree(part) if part.is_dir() else part.unlink()
-    (finding,) = status(store=root, recipe=Recipe()).findings
+    (finding,) = status(store=root, recipe=Recipe()).problems
     assert finding.code == "run-incomplete"
     assert ingest([logs], store=root, recipe=Recipe()).exit_code == 0
     found = status(store=root, recipe=Recipe())
-    assert (found.exit_code, found.findings, found.counts) == (0, (), {"done": 2})
+    assert (found.exit_code, found.problems, found.counts) == (0, (), {"done": 2})
     assert verify(root).problems == ()

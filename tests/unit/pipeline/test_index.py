@@ -99,7 +99,7 @@ def test_files_that_were_proved_are_proved_again_when_they_are_written_again(sto
     path.write_bytes(data[:-9] + b"x" + data[-8:])
     runs, damaged = chosen()
     assert (runs, len(hashed)) == (["a", "c"], 5)
-    assert "run b: left out" in damaged[0]
+    assert [(of.code, of.subject.name) for of in damaged] == [("run-damaged", "b")]
 
 
 def test_a_name_that_is_no_text_is_in_the_log_and_with_escapes_in_the_index(store):

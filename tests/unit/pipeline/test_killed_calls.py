@@ -91,7 +91,7 @@ def test_a_first_night_that_is_killed_is_a_problem_and_the_next_one_deals_with_i
     assert done.returncode == -9
     found = CliRunner().invoke(cli, ["status", str(tmp_path / "store"), "--json"], standalone_mode=False)
     assert found.return_value == 3
-    (finding,) = json.loads(found.stdout)["findings"]
+    (finding,) = json.loads(found.stdout)["problems"]
     assert (finding["code"], finding["names"]["command"]) == ("call-killed", "ingest")
     lines = CliRunner().invoke(cli, ["status", str(tmp_path / "store")], standalone_mode=False).stderr
     assert "was killed; To accept it: 'tcpipe acknowledge call-1' [call-killed]" in lines
@@ -201,7 +201,7 @@ def test_logs_that_nobody_takes_in_for_more_than_two_nights_are_a_problem(tmp_pa
     assert after(1).exit_code == 0
     found = after(2)
     assert (found.exit_code, found.counts) == (3, {"done": 2, "pending": 1, "growing": 1})
-    assert {(of.code, of.subject.name, of.names["state"]) for of in found.findings} == {
+    assert {(of.code, of.subject.name, of.names["state"]) for of in found.problems} == {
         ("log-waiting", str(logs / "new.mcap"), "pending"),
         ("log-waiting", str(logs / "future.mcap"), "growing"),
     }

@@ -218,7 +218,7 @@ def test_a_commit_that_is_not_as_it_was_written_is_a_problem_and_nothing_is_lost
     contents = {"a digit": whole.replace(sha256, b"0" * 8), "half": whole[:40], "[]": b"[]", "nothing": b""}
     commit.write_bytes(contents[broken]) if broken in contents else commit.unlink()
     found = status(store=store.root, recipe=Recipe(), min_age_s=0.0)
-    assert (found.exit_code, [of.code for of in found.findings]) == (
+    assert (found.exit_code, [of.code for of in found.problems]) == (
         3,
         ["commit-missing" if broken == "gone" else "commit-damaged"],
     )

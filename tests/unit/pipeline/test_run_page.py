@@ -125,7 +125,7 @@ def test_trust_refusals_clocks_and_the_noise_floor_are_on_the_page(store):
     clocks = html.split("<h2>Clocks</h2>")[1].split("<h2>")[0]
     assert all(f"<td>{role.replace('_', ' ')}</td>" in clocks for role in facts.clock_offsets.offsets)
     assert f"Noise floor of E {100 * facts.label.energy_budget.total:.1f} %" in html
-    assert "Kept and dropped add up to the odometer" in html
+    assert "Kept and dropped distances add up to the odometer" in html
 
 
 def test_where_sensors_disagree_with_the_track_is_on_the_page(store):

@@ -69,10 +69,8 @@ def test_a_drive_that_was_trained_on_is_marked_and_in_no_sum(made, tmp_path):
     page = (tmp_path / "out" / "drives.html").read_text()
     assert page.count('class="plot"') == 4  # time and energy of both
     holds = south.energy_joule.held
-    verdict = (
-        f"{'Good' if holds else 'Doubtful'}</b> 90 % intervals hold the energy of {int(holds)} of 1 drives held back"
-    )
-    assert verdict in page
+    said = f"90 % intervals hold the energy of {int(holds)} of 1 drives held back"
+    assert f'<td>{"good" if holds else "doubtful"}</td><td class="long">{said}' in page
     assert "One drive tells little of how often 90 % intervals hold: hold back 10 or more." in page
     assert "J measured" in page
     assert json.loads((tmp_path / "out" / "drives.json").read_text())["drives"][1]["run_id"] == "south"

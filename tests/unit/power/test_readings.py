@@ -8,6 +8,7 @@ from tcpipe.power import readings
 from tcpipe.power.readings import PowerReadings
 from tcpipe.power.sources import BATTERY_STATE
 from tcpipe.robots.profiles import PowerSource
+from tcpipe.tables.findings import Subject, select_findings
 
 HUSKY_STATUS = "husky_msgs/msg/HuskyStatus"
 CLEARPATH_POWER = "clearpath_platform_msgs/msg/Power"
@@ -38,8 +39,16 @@ def battery(voltage: np.ndarray, current: np.ndarray, percentage: float = np.nan
     return TIMES | {"voltage": voltage, "current": current, "percentage": np.full(N, percentage)}
 
 
+def reasons(found: PowerReadings) -> list[str]:
+    """Why power is rejected."""
+    assert found.rails == {}
+    assert found.is_rejected
+    assert {of.code for of in found.findings} == {"power-rejected"}
+    return [of.names["reason"] for of in found.findings]
+
+
 def power_watt(found: PowerReadings) -> np.ndarray:
-    assert found.rails, found.warnings
+    assert found.rails, found.findings
     return np.sum([rail.voltage_volt * rail.current_amp for rails in found.rails.values() for rail in rails], axis=0)
 
 
@@ -47,7 +56,7 @@ def test_a_huskys_propulsion_is_battery_voltage_times_both_drivers() -> None:
     found = read_power({"/status": (HUSKY_STATUS, husky_status())}, "husky")
     np.testing.assert_allclose(power_watt(found), VOLT * (2 * AMP + 1.0), rtol=1e-14)
     assert not found.averaged
-    assert found.warnings == ()
+    assert found.findings == ()
 
 
 def test_a_huskys_drivers_can_be_taken_each_by_itself() -> None:
@@ -77,21 +86,26 @@ def test_clearpath_power_by_platform(robot: str, option: str, expected: np.ndarr
     found = read_power({"/power": (CLEARPATH_POWER, columns)}, robot, husky_power=option)
     np.testing.assert_allclose(power_watt(found), expected, rtol=1e-9)
     assert found.averaged == (robot != "husky")  # a Husky's driver asks for the state of the moment
-    assert bool(found.warnings) == (robot not in ("husky", "jackal"))  # the total current feeds the computers too
-    assert [f"power: {what} are part of it" for what in found.includes] == list(found.warnings)
+    assert bool(found.findings) == (robot not in ("husky", "jackal"))  # the total current feeds the computers too
+    assert [("power-includes-loads", name) for name in found.includes] == [
+        (of.code, of.names["loads"]) for of in found.findings
+    ]
 
 
 def test_clearpath_power_that_does_not_fit_the_platform_is_refused() -> None:
     two = clearpath((VOLT,), (AMP, AMP))
-    assert "measured_currents holds 2 values" in read_power({"/p": (CLEARPATH_POWER, two)}, "husky").warnings[0]
+    (found,) = read_power({"/p": (CLEARPATH_POWER, two)}, "husky").findings
+    assert found.names == {"reason": "values-count-differs", "field": "measured_currents"}
+    assert found.numbers["values_count"] == 2
     four = clearpath((VOLT, VOLT, VOLT), (AMP, AMP, AMP, AMP))  # a Jackal's, whose second and third are no drivers'
-    assert "holds 4 values, this platform's 3" in read_power({"/p": (CLEARPATH_POWER, four)}, "husky").warnings[0]
     a300 = clearpath((VOLT,) * 13, (AMP,) * 13)
-    said = read_power({"/p": (CLEARPATH_POWER, a300)}, "husky").warnings[0]
-    assert "holds 13 values, this platform's 3; name the robot of platform A300 with --robot" in said
+    for columns, count, platforms in ((four, 4, {}), (a300, 13, {"platforms": "A300"})):
+        (found,) = read_power({"/p": (CLEARPATH_POWER, columns)}, "husky").findings
+        assert found.names == {"reason": "values-count-differs", "field": "measured_currents", **platforms}
+        assert found.numbers == {"values_count": count, "expected_count": 3}
     unknown = read_power({"/p": (CLEARPATH_POWER, two)}, "generic")
-    assert "names its currents by platform (A200, A300, D100, J100, R100, W200)" in unknown.warnings[0]
-    assert unknown.rails == {}
+    assert reasons(unknown) == ["robot-platform-unknown"]
+    assert unknown.findings[0].names["platforms"] == "A200, A300, D100, J100, R100, W200"
 
 
 @pytest.mark.parametrize(
@@ -107,13 +121,13 @@ def test_older_clearpath_status(type_name: str, fields: dict) -> None:
     assert found.averaged
 
 
-@pytest.mark.parametrize(("recorded", "said"), [(AMP, "against the ROS convention"), (-AMP, None)])
-def test_the_sign_of_a_battery_is_told_by_its_mean(recorded: np.ndarray, said: str | None) -> None:
+@pytest.mark.parametrize(("recorded", "signs"), [(AMP, ["drawn_positive"]), (-AMP, [])])
+def test_the_sign_of_a_battery_is_told_by_its_mean(recorded: np.ndarray, signs: list[str]) -> None:
     found = read_power({"/battery": (BATTERY_STATE, battery(VOLT, recorded))}, "generic")
     np.testing.assert_allclose(power_watt(found), VOLT * AMP, rtol=1e-14)
-    assert [said] == [said for warning in found.warnings if str(said) in warning] or (
-        said is None and not found.warnings
-    )
+    assert [(of.code, of.severity, of.names["sign"]) for of in found.findings] == [
+        ("current-sign-assumed", "note", sign) for sign in signs
+    ]
 
 
 def test_the_sign_is_told_by_all_rails_together() -> None:
@@ -125,35 +139,53 @@ def test_the_sign_is_told_by_all_rails_together() -> None:
 def test_an_unclear_sign_follows_ros_and_says_so_and_the_recipe_settles_it() -> None:
     balanced = battery(VOLT, np.cos(np.pi * np.arange(N)) * 4.0)
     found = read_power({"/b": (BATTERY_STATE, balanced)}, "generic")
-    assert "unclear" in found.warnings[0]
+    (assumed,) = found.findings
+    assert (assumed.code, assumed.severity, assumed.names["sign"]) == (
+        "current-sign-assumed",
+        "warning",
+        "drawn_negative",
+    )
+    assert len(assumed.remedies) == 2
     np.testing.assert_allclose(power_watt(found), -VOLT * balanced["current"])
     settled = read_power({"/b": (BATTERY_STATE, balanced)}, "generic", current_sign="drawn_positive")
     np.testing.assert_allclose(power_watt(settled), VOLT * balanced["current"])
-    assert settled.warnings == ()
+    assert settled.findings == ()
 
 
 @pytest.mark.parametrize(
-    ("columns", "evidence"),
+    ("columns", "reason", "evidence"),
     [
-        (battery(np.zeros(N), np.zeros(N), 73.0), "voltage and the current are zero on all 40 rows"),
-        (battery(np.zeros(N), AMP), "voltage is zero on all 40 rows"),
-        (battery(VOLT, np.full(N, np.nan)), "carries no current"),
-        (battery(np.full(N, np.nan), AMP), "carries no voltage"),
-        (battery(np.full(N, np.nan), np.full(N, np.nan)), "neither voltage nor current"),
-        (battery(VOLT, np.zeros(N)), "current is 0 A on all 40 rows"),
-        (battery(np.full(N, 73.0), AMP, 0.73), "equals the percentage of charge on all 40 rows (first 73)"),
-        (battery(np.full(N, 73.0), AMP, 73.0), "equals the percentage"),
-        (battery(1000 * VOLT, AMP), "millivolts?"),
-        (battery(VOLT, 1000 * AMP), "milliamperes?"),
-        (battery(np.full(N, 0.8), AMP), "a share of charge"),
-        (TIMES | {"voltage": VOLT}, "no field current"),
+        (battery(np.zeros(N), np.zeros(N), 73.0), "voltage-zero", {"median_volt": 0.0, "median_amp": 0.0}),
+        (battery(np.zeros(N), AMP), "voltage-zero", {"median_volt": 0.0, "rows_count": 40.0}),
+        (battery(VOLT, np.full(N, np.nan)), "no-current", {}),
+        (battery(np.full(N, np.nan), AMP), "no-voltage", {}),
+        (battery(np.full(N, np.nan), np.full(N, np.nan)), "no-numbers", {"rows_count": 40.0}),
+        (battery(VOLT, np.zeros(N)), "current-constant", {"median_amp": 0.0, "rows_count": 40.0}),
+        (battery(np.full(N, 73.0), AMP, 0.73), "voltage-is-charge", {"median_volt": 73.0}),
+        (battery(np.full(N, 73.0), AMP, 73.0), "voltage-is-charge", {"median_volt": 73.0}),
+        (battery(1000 * VOLT, AMP), "voltage-in-millivolts", {}),
+        (battery(VOLT, 1000 * AMP), "current-in-milliamperes", {}),
+        (battery(np.full(N, 0.8), AMP), "voltage-too-small", {"median_volt": 0.8}),
+        (TIMES | {"voltage": VOLT}, "field-missing", {}),
     ],
 )
-def test_numbers_that_cannot_be_power_are_refused_with_evidence(columns: dict, evidence: str) -> None:
+def test_numbers_that_cannot_be_power_are_refused_with_evidence(columns: dict, reason: str, evidence: dict) -> None:
     found = read_power({"/battery": (BATTERY_STATE, columns)}, "generic")
-    assert found.rails == {}
-    assert evidence in found.warnings[0]
-    assert "/battery" in found.warnings[0]
+    assert reasons(found) == [reason]
+    assert found.findings[0].subject == Subject("topic", "/battery")
+    assert evidence.items() <= found.findings[0].numbers.items()
+
+
+@pytest.mark.parametrize(
+    ("volt", "amp", "scales"), [(1000, 1, {"voltage_scale": 0.001}), (1, 1000, {"current_scale": 0.001})]
+)
+def test_thousandths_are_proposed_as_tables_of_a_recipe(volt: int, amp: int, scales: dict) -> None:
+    (found,) = read_power({"/battery": (BATTERY_STATE, battery(volt * VOLT, amp * AMP))}, "generic").findings
+    (remedy,) = found.remedies
+    (table,) = remedy.recipe["power_sources"]
+    assert scales.items() <= table.items()
+    assert table["type"] == BATTERY_STATE
+    assert "topic" not in table
 
 
 def test_voltage_and_current_on_two_topics_are_one_rail() -> None:
@@ -186,9 +218,8 @@ def test_negative_currents_come_as_unsigned_on_any_topic(robot: str, topic: str,
     assert rail.name == topic
     np.testing.assert_allclose(rail.current_amp, current, atol=1e-9)
     if robot == "generic":
-        assert any(
-            "5 currents are negative ones read as unsigned" in line for line in read_power(topics, robot).warnings
-        )
+        (wrapped,) = select_findings(read_power(topics, robot).findings, "current-wrapped")
+        assert wrapped.numbers == {"currents_count": 5.0, "wraps_amp": 65536 * step_amp}
 
 
 def test_a_large_current_that_is_no_wrap_stays_as_it_is() -> None:
@@ -199,20 +230,20 @@ def test_a_large_current_that_is_no_wrap_stays_as_it_is() -> None:
 
 
 @pytest.mark.parametrize(
-    ("log_time_s", "why"),
+    ("log_time_s", "reason", "numbers"),
     [
-        ([0.0, 95.0], "holds 2 messages only"),
-        (15.0 * np.arange(N), "comes every 15 s only"),
-        ([], "holds 0 messages only"),
+        ([0.0, 95.0], "too-few-messages", {"messages_count": 2.0}),
+        (15.0 * np.arange(N), "too-slow", {"period_s": 15.0}),
+        ([], "too-few-messages", {"messages_count": 0.0}),
     ],
 )
-def test_power_that_comes_too_seldom_is_refused(log_time_s, why: str) -> None:
+def test_power_that_comes_too_seldom_is_refused(log_time_s, reason: str, numbers: dict) -> None:
     count = len(log_time_s)
     columns = {"log_time_ns": np.asarray(log_time_s) * 1e9, "voltage": VOLT[:count], "current": AMP[:count]}
     columns["percentage"] = np.full(count, np.nan)
     found = read_power({"/b": (BATTERY_STATE, columns)}, "generic")
-    assert found.rails == {}
-    assert any(why in line for line in found.warnings)
+    assert reasons(found) == [reason]
+    assert found.findings[0].numbers == numbers
 
 
 def test_single_values_that_no_battery_has_are_set_aside() -> None:
@@ -224,7 +255,11 @@ def test_single_values_that_no_battery_has_are_set_aside() -> None:
     (rail,) = found.rails["/b"]
     assert np.flatnonzero(np.isnan(rail.voltage_volt)).tolist() == [4, 9]
     assert np.flatnonzero(np.isnan(rail.current_amp)).tolist() == [7]
-    assert "2 voltages outside 5 to 78 V and 1 currents above 1000 A are set aside" in found.warnings[-1]
+    excluded = found.findings[-1]
+    assert excluded.code == "power-values-excluded"
+    assert {name: round(value) for name, value in excluded.numbers.items()} == {
+        "voltages_count": 2, "currents_count": 1, "low_volt": 5, "high_volt": 78, "high_amp": 1000,
+    }  # fmt: skip
 
 
 @pytest.mark.parametrize("topic", [("/status", HUSKY_STATUS), ("/battery", BATTERY_STATE)])
@@ -237,7 +272,7 @@ def test_a_row_beside_a_hole_does_not_tell_the_sign(topic: tuple[str, str]) -> N
     found = read_power({topic[0]: (topic[1], {**columns, **hole, **braking})}, "husky")
     watt = power_watt(found)
     assert np.sum(watt > 0) == N - 1
-    assert not any("refused" in line for line in found.warnings)
+    assert not found.is_rejected
 
 
 def test_a_current_against_its_type_is_refused_until_the_recipe_says_how_it_counts() -> None:
@@ -245,8 +280,8 @@ def test_a_current_against_its_type_is_refused_until_the_recipe_says_how_it_coun
     columns = {**columns, **{name: -value for name, value in columns.items() if name.endswith("driver_current")}}
     topics = {"/status": (HUSKY_STATUS, columns)}
     found = read_power(topics, "husky")
-    assert found.rails == {}
-    assert 'current_sign = "drawn_negative"' in found.warnings[0]
+    assert reasons(found) == ["current-flows-back"]
+    assert found.findings[0].remedies[0].recipe == {"read": {"current_sign": "drawn_negative"}}
     told = read_power(topics, "husky", current_sign="drawn_negative")
     np.testing.assert_allclose(power_watt(told), VOLT * (2 * AMP + 1.0))
 
@@ -270,18 +305,19 @@ def test_a_type_whose_drawn_current_is_negative_needs_no_recipe_line() -> None:
     np.testing.assert_allclose(power_watt(found), VOLT * AMP)
     assert found.current_sign == "drawn_negative (message type)"
     against = readings.read_power({"/b": ("my_msgs/msg/Battery", columns | {"i": AMP})}, known)
-    assert 'current_sign = "drawn_positive"' in against.warnings[0]
+    assert against.findings[0].remedies[0].recipe == {"read": {"current_sign": "drawn_positive"}}
     told = readings.read_power(
         {"/b": ("my_msgs/msg/Battery", columns | {"i": AMP})}, known, current_sign="drawn_positive"
     )
     np.testing.assert_allclose(power_watt(told), VOLT * AMP)
 
 
-@pytest.mark.parametrize(("drawn", "factor", "flows"), [("positive", -1, "negative"), ("negative", 1, "positive")])
-def test_a_refusal_says_which_way_the_current_flows(drawn: str, factor: int, flows: str) -> None:
+@pytest.mark.parametrize(("drawn", "factor", "other"), [("positive", -1, "negative"), ("negative", 1, "positive")])
+def test_a_refusal_says_how_much_flows_back_and_which_sign_it_would_be(drawn: str, factor: int, other: str) -> None:
     topics = {"/b": ("my_msgs/msg/Battery", TIMES | {"v": VOLT, "i": factor * AMP})}
-    (line,) = readings.read_power(topics, [source(sign=f"drawn_{drawn}")]).warnings
-    assert f"power refused: the current is {flows}, 100 % of the charge moved flows back" in line
+    (found,) = readings.read_power(topics, [source(sign=f"drawn_{drawn}")]).findings
+    assert found.numbers == {"net_fraction": pytest.approx(1.0)}
+    assert [of.name for of in found.remedies] == [f"drawn_{other}", f"drawn_{drawn}"]
 
 
 @pytest.mark.parametrize(("rows", "refused"), [(19, False), (20, True)])
@@ -331,15 +367,15 @@ def test_a_jackals_drive_feedback_and_the_voltage_of_its_power_are_one_rail() ->
 
 
 @pytest.mark.parametrize(
-    ("type_name", "reason"),
+    "type_name",
     [
-        ("clearpath_motor_msgs/msg/LynxMultiFeedback", "the current in the motor's phases"),
-        ("clearpath_motor_msgs/msg/PumaMultiFeedback", "the motor's current behind the bridge"),
-        ("clearpath_platform_msgs/msg/Feedback", "without a voltage"),
-        ("scout_msgs/msg/ScoutStatus", "neither manual nor driver says"),
+        "clearpath_motor_msgs/msg/LynxMultiFeedback",
+        "clearpath_motor_msgs/msg/PumaMultiFeedback",
+        "clearpath_platform_msgs/msg/Feedback",
+        "scout_msgs/msg/ScoutStatus",
     ],
 )
-def test_currents_that_are_not_known_to_be_drawn_are_refused_with_the_reason(type_name: str, reason: str) -> None:
+def test_currents_that_are_not_known_to_be_drawn_are_refused_with_the_reason(type_name: str) -> None:
     found = read_power({"/motors": (type_name, TIMES)}, "generic")
-    assert found.rails == {}
-    assert reason in found.warnings[0]
+    assert reasons(found) == ["no-battery-current"]
+    assert found.findings[0].names["type"] == type_name

@@ -6,11 +6,11 @@ import pytest
 from tcpipe.power.sources import (
     LARGEST_AMP,
     RailReadings,
+    find_rejection,
     quantity,
     rail_of,
     read_rails,
     sign_by_mean,
-    why_refused,
     with_sign,
 )
 from tcpipe.robots.profiles import PowerSource
@@ -18,8 +18,13 @@ from tcpipe.robots.profiles import PowerSource
 VARIED = np.array([5.0, 6.0])
 
 
-def refused(volt, amp, **columns):
-    return why_refused(RailReadings("b", np.asarray(volt, float), np.asarray(amp, float)), columns)
+def rejection(volt, amp, **columns):
+    return find_rejection(RailReadings("b", np.asarray(volt, float), np.asarray(amp, float)), "/b", columns)
+
+
+def reason(volt, amp, **columns):
+    found = rejection(volt, amp, **columns)
+    return None if found is None else found.names["reason"]
 
 
 def source(**said):
@@ -30,45 +35,45 @@ def source(**said):
     ("volt", "why"),
     [
         (1000.0, None),
-        (1000.1, "millivolts"),
+        (1000.1, "voltage-in-millivolts"),
         (1.0, None),
-        (0.99, "share of charge"),
-        (-24.0, "reversed"),
-        (0.0, "zero"),
+        (0.99, "voltage-too-small"),
+        (-24.0, "voltage-too-small"),
+        (0.0, "voltage-zero"),
     ],
 )
 def test_a_voltage_is_believed_from_one_volt_to_a_thousand(volt, why):
-    found = refused([volt, volt], VARIED)
-    assert found is None if why is None else why in found
+    assert reason([volt, volt], VARIED) == why
 
 
 def test_a_voltage_of_zeros_says_whether_the_current_is_too():
-    assert "the voltage is zero on all 2 rows" in refused([0, 0], VARIED)
-    assert "the voltage and the current are zero on all 2 rows" in refused([0, 0], [0, 0])
-    assert "the voltage is zero" in refused([0, 0], [np.nan, np.nan])
-    assert refused([0, 24, 24], [5, 6, 7]) is None
+    assert reason([0, 0], VARIED) == "voltage-zero"
+    assert rejection([0, 0], VARIED).numbers == {"median_volt": 0.0, "median_amp": 5.5, "rows_count": 2.0}
+    assert rejection([0, 0], [0, 0]).numbers["median_amp"] == 0.0
+    assert rejection([0, 0], [np.nan, np.nan]).numbers == {"median_volt": 0.0, "rows_count": 2.0}
+    assert reason([0, 24, 24], [5, 6, 7]) is None
 
 
 def test_a_current_alone_and_a_voltage_alone_are_judged():
     nothing = [np.nan, np.nan]
-    assert refused([24, 25], nothing) is None
-    assert refused(nothing, VARIED) is None
-    assert "neither voltage nor current is a number on any of 2 rows" in refused(nothing, nothing)
-    assert refused([24, 25], [LARGEST_AMP, LARGEST_AMP]) is None
-    assert "milliamperes" in refused(nothing, [-LARGEST_AMP - 1, -LARGEST_AMP - 2])
+    assert reason([24, 25], nothing) is None
+    assert reason(nothing, VARIED) is None
+    assert reason(nothing, nothing) == "no-numbers"
+    assert reason([24, 25], [LARGEST_AMP, LARGEST_AMP]) is None
+    assert reason(nothing, [-LARGEST_AMP - 1, -LARGEST_AMP - 2]) == "current-in-milliamperes"
 
 
 def test_a_current_that_never_changes_is_refused_beyond_twenty_rows():
-    assert refused(np.full(20, 24.0), np.full(20, 5.0)) is None
-    assert "the current is 5 A on all 21 rows" in refused(np.full(21, 24.0), np.full(21, 5.0))
-    assert refused(np.full(21, 24.0), [5.0] * 20 + [5.1]) is None
+    assert reason(np.full(20, 24.0), np.full(20, 5.0)) is None
+    assert reason(np.full(21, 24.0), np.full(21, 5.0)) == "current-constant"
+    assert reason(np.full(21, 24.0), [5.0] * 20 + [5.1]) is None
 
 
 @pytest.mark.parametrize("factor", [1.0, 0.01])
 def test_a_voltage_that_is_the_charge_is_refused_unless_one_row_differs(factor):
     charge = np.array([90.0, 80.0, 70.0])
-    assert "percentage of charge on all 3 rows (first 90)" in refused(charge, [5, 6, 7], percentage=factor * charge)
-    assert refused(charge, [5, 6, 7], percentage=factor * np.array([90.0, 80.0, 60.0])) is None
+    assert reason(charge, [5, 6, 7], percentage=factor * charge) == "voltage-is-charge"
+    assert reason(charge, [5, 6, 7], percentage=factor * np.array([90.0, 80.0, 60.0])) is None
 
 
 def test_a_current_wraps_beyond_half_of_its_range_and_what_nothing_can_be_is_unknown():
@@ -84,12 +89,24 @@ def test_a_list_of_currents_must_reach_to_the_last_that_is_wanted_and_be_as_long
     columns = {"v": np.full(2, 24.0), "i": np.array([[1.0, 2.0, 4.0]] * 2)}
     (found,) = read_rails(columns, [source(current="i[0] + i[2]", currents_listed=3)], "/b")
     assert found.current_amp.tolist() == [5.0, 5.0]
-    assert read_rails(columns, [source(current="i[3]")], "/b") == "/b: i holds 3 values, the robot's platform needs 4"
-    assert "i holds 3 values, this platform's 4" in read_rails(
-        columns, [source(current="i[2]", currents_listed=4)], "/b"
-    )
-    assert read_rails(columns, [source(current="i[1]", voltage="v[0]")], "/b").startswith("/b: v holds 0 values")
-    assert read_rails(columns, [source(current="j")], "/b") == "/b: its messages have no field j"
+    for said, reason, field, counts in (
+        ({"current": "i[3]"}, "values-count-differs", "i", {"values_count": 3.0, "expected_count": 4.0}),
+        (
+            {"current": "i[2]", "currents_listed": 4},
+            "values-count-differs",
+            "i",
+            {"values_count": 3.0, "expected_count": 4.0},
+        ),
+        (
+            {"current": "i[1]", "voltage": "v[0]"},
+            "values-count-differs",
+            "v",
+            {"values_count": 0.0, "expected_count": 1.0},
+        ),
+        ({"current": "j"}, "field-missing", "j", {}),
+    ):
+        found = read_rails(columns, [source(**said)], "/b")
+        assert (found.names["reason"], found.names["field"], found.numbers) == (reason, field, counts)
 
 
 def test_a_sign_is_clear_where_more_than_eight_tenths_flow_one_way():

@@ -4,7 +4,6 @@ import base64
 import io
 import re
 import shutil
-from dataclasses import replace
 from html import unescape
 
 import numpy as np
@@ -23,7 +22,6 @@ from tcpipe.pipeline.verify import verify
 from tcpipe.report import dataset_samples
 from tcpipe.report.dataset_report import dataset_report
 from tcpipe.report.dataset_samples import COLUMNS, nearest_train_m, samples_shown
-from tcpipe.report.dataset_verdict import verdict
 from tcpipe.report.quality import QUALITY_WORDS
 from tcpipe.store import open_store
 from tcpipe.tables.bits import Quality
@@ -168,15 +166,6 @@ def test_few_samples_are_shown_as_well(built, count):
     assert len(unpacked(shown.json["packed"], "energy")) == count
 
 
-@pytest.mark.parametrize(
-    ("count", "kind", "words"), [(1, "thin", "Only 1 sample of 2 runs"), (300, "good", "300 samples of 2 runs")]
-)
-def test_one_sample_is_not_called_good(built, count, kind, words):
-    first = verdict(replace(open_dataset(built).card, samples=count), [])
-    (told,) = [line for line in first if words in line.text]
-    assert told.kind == kind
-
-
 def test_a_damaged_dataset_says_so_on_its_page(built, tmp_path):
     shutil.copytree(built, tmp_path / "dataset")
     (tmp_path / "dataset/overview.png").write_bytes(b"no picture")
@@ -185,7 +174,7 @@ def test_a_damaged_dataset_says_so_on_its_page(built, tmp_path):
         if file.is_file():
             file.write_bytes(b"\0" * file.stat().st_size)
     html = dataset_report(tmp_path / "dataset")
-    for words in ("Overview.png is lost or damaged", "Where to drive next cannot be shown", "No patch is shown"):
+    for words in ("overview.png is lost or damaged", "where to drive next cannot be shown", "no patch is shown"):
         assert words in html
     assert data_of(html)["patches"] is None
 

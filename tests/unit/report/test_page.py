@@ -2,12 +2,16 @@
 
 import json
 import re
+from dataclasses import replace
 from html.parser import HTMLParser
 
 import numpy as np
 
-from tcpipe.report.page import Link, Number, Section, Shaded, Verdict, render_page
+from tcpipe.report.page import Link, Number, Section, Shaded, render_page
 from tcpipe.report.plots import figures, histogram, new_plot, waterfall
+from tcpipe.report.verdict import show_verdict
+from tcpipe.tables.findings import Remedy, Subject, make_finding
+from tcpipe.tables.verdicts import judge
 
 EVIL = "</script><script>alert(1)</script>\x1b[31m\u202e$$x$$ \\(y\\) \"'&"
 """Ends a script, colours a terminal, turns its text round, reads as two formulas, leaves an attribute."""
@@ -38,13 +42,16 @@ def drawn():
     return [plot, waterfall({"kept": 60.0, "standing": 40.0})]
 
 
+evil = make_finding("no-segments", Subject("run", EVIL), names={"reason": EVIL}, driven_m=12.0, lost_m=10.0)
+
+
 def page():
     return render_page(
         title=EVIL,
         lead=EVIL,
         numbers=[Number(EVIL, EVIL)],
         warnings=[EVIL],
-        verdict=[Verdict("thin", EVIL)],
+        verdict=show_verdict(judge([evil]), [evil]),
         links=[Link(EVIL, EVIL), Link("plain", "javascript:alert(1)")],
         sections=[
             Section(EVIL, EVIL, header=(EVIL,), rows=[(EVIL,), (Link(EVIL, "a/b"),), (Shaded(EVIL, 2.0),)]),
@@ -78,14 +85,34 @@ def test_a_name_is_text_wherever_it_stands():
     assert "\\\\(" not in figures
 
 
-def test_warnings_of_one_cause_are_one_line_with_the_others_folded_below_it():
-    late = [f"/gps_{n}/fix: message {n}: 0.{n} s late" for n in range(1, 40)]
-    html = render_page(title="t", lead="", numbers=[], warnings=["no power", *late, "no power"], sections=[])
-    shown = re.search('<ul class="warnings".*', html)[0]
-    top = re.sub("<details>.*?</details>", "", shown)
-    assert re.findall("<li>(.*?)</li>", top) == ["no power", late[0]]
-    assert re.findall("<summary>([0-9]+) more", shown) == ["1", "38"]
-    assert re.findall("<li>([^<]*)", shown) == ["no power", "no power", *late]
+def test_the_verdict_has_grades_then_reasons_the_worst_first_then_folded_notes():
+    empty = make_finding(
+        "no-segments", Subject("run", "a"), names={"reason": "gap"}, driven_m=12.0, lost_m=10.0, action="rejected"
+    )
+    speeds = {"slow_fraction": 0.7, "limit_mps": 0.95, "top_mps": 0.6}
+    keep = Remedy("keep", recipe={"gate": {"require_full_speed": False}})
+    slow = make_finding("driven-below-limit", Subject("role", "command"), remedies=[keep], **speeds)
+    note = make_finding("no-command", Subject("role", "command"))
+    findings = [note, *[replace(slow, numbers={**slow.numbers, "top_mps": 0.1 * n}) for n in range(9)], empty]
+    html = render_page(title="t", lead="", numbers=[], sections=[], verdict=show_verdict(judge(findings), findings))
+    box = html.split('<section class="verdict"')[1].split("</section>")[0]
+    assert re.findall('<span class="([a-z-]+)">([a-z]+)', box) == [
+        ("not-usable", name) for name in ("position", "time", "energy")
+    ]
+    at_once = re.sub("<details>.*?</details>", "", box, flags=re.DOTALL)
+    assert re.findall('<li class="([a-z]+)">', at_once) == ["error", *["warning"] * 7]
+    assert "largest loss: gap, 10 m" in at_once
+    assert "To accept any speed: [gate] require_full_speed = false [driven-below-limit]" in at_once
+    assert re.findall("<summary>(.*?)</summary>", box) == ["2 more findings", "1 note"]
+
+
+def test_a_recipe_that_fits_in_no_line_stands_below_its_finding():
+    source = {"type": "std_msgs/msg/Float32", "topic": "/current", "current": "data", "rail": "a", "sign": "auto"}
+    remedy = Remedy("keep", recipe={"power_sources": [source]})
+    finding = make_finding("max-velocity-unknown", Subject("role", "command"), severity="warning", remedies=[remedy])
+    (line,) = show_verdict(judge([finding]), [finding]).shown
+    assert line.text.endswith("To accept any speed: the recipe below [max-velocity-unknown]")
+    assert line.recipe.startswith('[[power_sources]]\ntype = "std_msgs/msg/Float32"\n')
 
 
 def test_what_waits_joins_what_is_drawn_first_and_names_the_axis_that_it_shares():

@@ -12,7 +12,9 @@ from tcpipe.report.run_plots import time_plots
 from tcpipe.report.run_report import run_report
 from tcpipe.report.run_series import gate_spans, rail_series, speed_series, thinned, timeline_of
 from tcpipe.store import open_store
+from tcpipe.tables.bits import Quality
 from tcpipe.tables.facts import ClockStep, RunFacts
+from tcpipe.tables.findings import Subject, make_finding
 from tcpipe.tables.levels import POWER, REJECTIONS, Sensor
 
 EVIL = "</script><script>alert(1)</script>\x1b[31m\u202e\"'&"
@@ -124,9 +126,6 @@ def test_a_run_without_power_map_or_sensors_says_so(tmp_path):
     table = drive(powered=False)
     html = page_of(tmp_path, table, track=driven(table, powered=False))
     for text in (
-        "No power: no segment has w or E.",
-        "No GNSS",
-        "no camera",
         "The store has no map",
         "There is no power.",
     ):
@@ -139,23 +138,38 @@ def test_a_run_without_power_map_or_sensors_says_so(tmp_path):
     assert "Histogram of w [W]" not in html  # an empty frame that Bokeh complains of
 
 
-def test_a_run_of_which_less_than_half_is_used_is_not_called_good(tmp_path):
+def test_losses_have_their_remedy_and_no_line_praises_the_run(tmp_path):
     html = page_of(tmp_path, drive(), ledger_m={"kept": 33.0, "accelerating": 51.0})
-    said = html.split("33 of 84 m driven are used (39 %)")[0]
-    assert said.rindex("<b>Thin</b>") > said.rfind("<b>Good</b>")
+    losses = html.split("<h2>Where every metre went</h2>")[1].split("</section>")[0]
+    assert "<td>accelerating</td>" in losses
+    assert "Hold one speed over long legs" in losses
+    assert "<b>Good</b>" not in html
 
 
 def test_a_run_without_track_or_segments_is_a_page_too(tmp_path):
-    html = page_of(tmp_path, drive().slice(0, 0), ledger_m={"kept": 0.0, "gap": 12.0})
-    assert "No track: nothing was recorded that could be fused." in html
-    assert "No segment: every metre was lost" in html
-    assert "12 m gap: a sensor is silent" in html
+    empty = make_finding("no-segments", Subject("run", "run"), names={"reason": "gap"}, driven_m=12.0, lost_m=12.0)
+    html = page_of(tmp_path, drive().slice(0, 0), ledger_m={"kept": 0.0, "gap": 12.0}, findings=(empty,))
+    assert "No track: the log holds nothing that could be fused." in html
+    assert "no segments from 12 m driven; largest loss: gap, 12 m" in html
+    assert "<td>gap</td>" in html
+
+
+def test_a_bit_that_every_segment_carries_colours_none_of_them(tmp_path):
+    table = drive()
+    for number, (own, flags) in enumerate(((0, 0), (int(Quality.CURVED), int(Quality.CURVED)))):
+        bits = np.full(table.num_rows, int(Quality.NO_COMMAND))
+        bits[0] |= own
+        field = table.schema.field("quality")
+        flagged = table.set_column(table.column_names.index("quality"), field, pa.array(bits, field.type))
+        html = page_of(tmp_path / str(number), flagged, track=driven(table))
+        assert data_of(html)["flags"] == flags
 
 
 def test_names_are_text(tmp_path):
     table = drive()
     sensor = Sensor(EVIL, EVIL, EVIL, EVIL)
-    html = page_of(tmp_path, table, track=driven(table), tags={"tag": EVIL}, warnings=(EVIL,), sensors={"gnss": sensor})
+    evil = make_finding("no-segments", Subject("run", EVIL), names={"reason": EVIL}, driven_m=12.0, lost_m=10.0)
+    html = page_of(tmp_path, table, track=driven(table), tags={"tag": EVIL}, findings=(evil,), sensors={"gnss": sensor})
     assert "<script>alert" not in html
     assert html.count("&lt;script&gt;alert(1)") >= 4
     assert not re.search("[\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e]", html.split("page-figures")[0])

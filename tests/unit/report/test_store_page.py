@@ -10,16 +10,17 @@ from synthetic_store import add_run, add_world, lanes, segments
 from tcpipe.errors import StoreError, UsageError
 from tcpipe.formats.bucket import open_place
 from tcpipe.formats.commits import Call, Entries, Failure
-from tcpipe.motion.remedies import REMEDIES, losses_of
+from tcpipe.motion.remedies import losses_of
 from tcpipe.pipeline import calls
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.log_writer import open_log, supersede
 from tcpipe.pipeline.problems import acknowledge
 from tcpipe.pipeline.report import report
+from tcpipe.pipeline.store_verdict import find_changes, shift_of
 from tcpipe.pipeline.verify import verify
 from tcpipe.recipe import ReadConfig, Recipe
-from tcpipe.report.store_verdict import shift_of
 from tcpipe.store import open_store
+from tcpipe.tables.findings import Subject, make_finding
 
 EVIL = "<b>\"'&\x1b[31m\u202e</script>"
 OLD = replace(Recipe(), read=ReadConfig(ignore_topics=["/none"]))
@@ -30,6 +31,11 @@ def add(store, run_id, number, **how):
     add_run(store, run_id, table, **how)
 
 
+def driven_below_limit(slow_fraction):
+    speeds = {"slow_fraction": slow_fraction, "limit_mps": 0.95, "top_mps": 0.6}
+    return make_finding("driven-below-limit", Subject("role", "command"), **speeds)
+
+
 @pytest.fixture(scope="module")
 def store(tmp_path_factory):
     """Runs a and b in a dataset, b with an older ingestion too, c of a damaged log and in none, d superseded by a; two logs failed."""
@@ -38,8 +44,8 @@ def store(tmp_path_factory):
     add_world(store, here)
     add(store, "b", 1, recipe=OLD)
     for number, run_id in enumerate(("a", "b", "d")):
-        lines = [f"gnss: {number + 2} fixes are late"] if number < 2 else []
-        add(store, run_id, number, warnings=lines, tags={"site": EVIL})
+        found = [driven_below_limit(0.6 + 0.1 * number)] if number < 2 else []
+        add(store, run_id, number, findings=found, tags={"site": EVIL})
     supersede(store, "d", "a")
     build_dataset(here / "dataset", store=store.root)
     add(store, "c", 3, ledger_m={"kept": 20.0, "gap": 60.0, "standing": 5.0})
@@ -73,14 +79,20 @@ def test_each_run_is_there_as_its_documents_say(store):
         assert row["used"] == pytest.approx(100.0 * made.ledger_m["kept"] / sum(made.ledger_m.values()), abs=0.01)
         assert row["start_ms"] == run.table("segments").column("start_ns").to_numpy().min() // 10**6
     assert [told["datasets"][n] for row in rows for n in row["datasets"]] == ["dataset"] * 2
-    assert [row["causes"] for row in rows] == [[], [], [0], [], [0]]
+    assert [row["codes"] for row in rows] == [[], [], [0], [], [0]]
+    assert [row["verdict"] for row in rows] == [
+        "usable", "usable", "usable with care", "usable", "usable with care"
+    ]  # fmt: skip
     assert not report(store.root, runs=False)[0].changed
 
 
-def test_runs_without_power_are_counted_and_labels_are_sharp_of_those_that_have_it(store):
+def test_the_verdict_is_that_of_the_current_runs_with_findings_by_code(store):
     html = shown(store)[1]
-    assert "3 runs of which no noise floor of E is known: without power they tell v and T alone." in html
-    assert "Labels are sharp" not in html
+    box = html.split('<section class="verdict"')[1].split("</section>")[0]
+    assert '<span class="usable">position <b>usable</b></span>' in box
+    assert '<span class="usable-with-care">time <b>usable with care</b></span>' in box
+    assert "2 of 3 runs: Most of the drive was commanded below" in box
+    assert "(command; 60 % to 70 %)" in box
 
 
 def test_sums_are_of_the_ruling_recipe_without_superseded_runs(store):
@@ -93,7 +105,8 @@ def test_sums_are_of_the_ruling_recipe_without_superseded_runs(store):
     driven_m = sum(sum(made.ledger_m.values()) for made in current)
     assert f"<div><b>{driven_m:.0f} m</b><span>driven</span></div>" in html
     assert "<div><b>3</b><span>runs</span></div>" in html
-    assert "Most is to be won of gap, 60 m" in html
+    losses = html.split("<h2>Where every metre went</h2>")[1].split("</section>")[0]
+    assert losses.index("<td>gap</td>") < losses.index("<td>standing</td>")
 
 
 def test_what_failed_is_named_until_its_content_gives_a_run_or_a_person_acknowledges_it(store):
@@ -104,9 +117,9 @@ def test_what_failed_is_named_until_its_content_gives_a_run_or_a_person_acknowle
     assert "passing.mcap" in part
     assert "was cut" not in part  # the run of that content is there
     assert "b.mcap" not in part
-    assert "2 logs gave no run" in html
     acknowledge(["/logs/junk"], store=store.root)
-    assert "1 log gave no run" in shown(store)[1]
+    part = shown(store)[1].split("<h2>Failed, damaged and empty</h2>")[1].split("</section>")[0]
+    assert "<td>accepted</td>" in part
 
 
 def test_names_are_text_and_pages_are_led_to_where_they_are(store):
@@ -130,8 +143,8 @@ def test_an_empty_store_and_one_of_failed_logs_alone_have_a_page(tmp_path):
     junk = Failure("1", "1" * 64, ("/logs/junk",), ("/logs/junk: is no log",), "0")
     open_log(store).commit("failed", Entries(failed=(junk,)))
     _, html, *_ = shown(store)
-    assert "No run can be used; 1 log gave none" in html
-    assert '<td class="long">' in html
+    assert "No run can be used." in html
+    assert "junk: is no log" in html
     with pytest.raises(UsageError, match="is no dataset, run or store"):
         report(tmp_path)
 
@@ -164,17 +177,27 @@ def test_a_change_is_told_from_scatter():
     assert shift_of(scatter) is None
     assert shift_of(scatter[:11]) is None
     found = shift_of([*scatter[:15], *(scatter[15:] + 12.0)])
-    assert (found.earlier, found.latest) == (15, 5)
-    assert shift_of([*np.tile(scatter, 50), *(scatter + 12.0)]).latest == 20
+    assert (found.earlier_count, found.latest_count) == (15, 5)
+    assert shift_of([*np.tile(scatter, 50), *(scatter + 12.0)]).latest_count == 20
     assert found.after - found.before == pytest.approx(12.0, abs=1.0)
     assert shift_of([5.0] * 20) is None
     assert shift_of([5.0] * 15 + [5.2] * 5) is None  # 4 % of what it was
     assert shift_of([5.0] * 15 + [6.0] * 5) is not None
 
 
+def test_a_change_from_run_to_run_is_a_finding_of_its_robot(tmp_path):
+    store = open_store(tmp_path / "store", create=True)
+    for number in range(16):
+        add(store, f"run{number}", number, ledger_m={"kept": 20.0, "gap": 20.0 if number > 11 else 1.0})
+    (change,) = find_changes([run.facts for run in store.runs()])
+    assert (change.code, change.severity, change.names["robot"]) == ("run-to-run-change", "note", "husky")
+    assert change.numbers["before"] == pytest.approx(100 * 20 / 21)
+    assert change.numbers["after"] == pytest.approx(50.0)
+    assert "used share of the distance of husky: 95.2 % in 12 runs, 50 % in the latest 4" in shown(store)[1]
+
+
 def test_losses_add_up_over_runs():
     found = losses_of([{"kept": 50.0, "gap": 30.0, "standing": 0.01}, {"kept": 10.0, "gap": 10.0}])
     assert [(loss.reason, loss.metres, loss.runs) for loss in found] == [("gap", 40.0, 2)]
     assert found[0].share == pytest.approx(0.4, abs=1e-3)
-    assert found[0].remedy == REMEDIES["gap"]
     assert losses_of([]) == ()

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from splits_squares import squares
 
-from tcpipe.splits.audit import audit_leakage, audit_lines
+from tcpipe.splits.audit import audit_leakage
 from tcpipe.splits.neighbours import nearest_m
 
 
@@ -44,15 +44,15 @@ def test_a_gap_on_the_track_parts_neighbours():
     assert test.same_track_pairs == 0
 
 
-def test_nothing_trains_is_said():
-    lines = list(audit_lines(audit(["test", "test"], [(0, 0), (1, 0)])))
-    assert lines == ["test: 2 samples; nothing trains"]
+def test_nothing_trains():
+    test, _ = audit(["test", "test"], [(0, 0), (1, 0)])
+    assert (test.samples, test.nearest_train_min_m, test.nearest_train_median_m) == (2, None, None)
 
 
-def test_lines_name_each_held_out_split():
-    lines = list(audit_lines(audit(["train", "test", "unseen"], [(0, 0), (1, 0), (9, 0)])))
-    assert lines[0].startswith("test: 1 samples, 0 share ground with train")
-    assert "nearest train footprint 8.00 m" in lines[1]
+def test_each_held_out_split_has_its_distance_to_train():
+    test, unseen = audit(["train", "test", "unseen"], [(0, 0), (1, 0), (9, 0)])
+    assert (test.split, test.samples, test.overlapping_samples) == ("test", 1, 0)
+    assert unseen.nearest_train_min_m == pytest.approx(8.0)
 
 
 def test_a_chord_and_a_half_is_still_a_neighbour_and_another_run_is_none():

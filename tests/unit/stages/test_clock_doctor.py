@@ -1,17 +1,18 @@
 """The clock doctor on simulated drives with every fault on: offsets found as they were put in, none where there are none."""
 
-import tomllib
 from dataclasses import replace
 
 import pyarrow as pa
 import pytest
 from simulated_streams import log_of, streams_of
+from suggested_recipes import proposed
 
 from tcpipe.recipe import FuseConfig, ReadConfig
 from tcpipe.simulation import scenario
 from tcpipe.stages.clock_doctor import clock_findings, with_offset_cost
 from tcpipe.stages.fuse_inputs import prepare_inputs
 from tcpipe.tables.facts import ClockFacts
+from tcpipe.tables.findings import Subject
 
 LATE_S = {"gnss": 0.25, "wheel_odometry": 0.15, "imu": -0.10, "visual_odometry": 0.20, "power": 0.25}
 WITHIN_S = {"gnss": 0.020, "wheel_odometry": 0.020, "imu": 0.020, "visual_odometry": 0.020, "power": 0.050}
@@ -34,7 +35,7 @@ def doctor(log, config=None):
 @pytest.mark.parametrize("index", [0, 1])
 def test_clean_drives_give_no_warning(tmp_path, index, seed):
     found = doctor(drive_log(tmp_path, index, seed))
-    assert found.warnings == ()
+    assert found.findings == ()
     assert {"imu", "wheel_odometry", "visual_odometry"} <= {found.facts.reference, *found.facts.offsets}
 
 
@@ -44,23 +45,25 @@ def test_the_sensor_that_is_late_is_found_and_by_how_much(tmp_path, role, index)
     noted = {name: offset for name, offset in found.facts.offsets.items() if offset.noted}
     assert set(noted) == {role}
     assert noted[role].offset_s == pytest.approx(LATE_S[role], abs=WITHIN_S[role])
-    (warning,) = found.warnings
-    assert warning.startswith(f"{role}: ")
-    assert "[read.time_offset_s]" in warning
+    (finding,) = found.findings
+    assert (finding.code, finding.subject) == ("time-offset", Subject("role", role))
+    assert finding.numbers["offset_s"] == noted[role].offset_s
+    assert proposed(finding)["read"]["time_offset_s"] == {
+        role: pytest.approx(-LATE_S[role], abs=WITHIN_S[role] + 0.005)
+    }
 
 
-def test_the_recipe_line_corrects_it(tmp_path):
+def test_the_remedy_corrects_it(tmp_path):
     log = drive_log(tmp_path, 1, 42, "gnss", "power")
     before = doctor(log)
-    assert {warning.split(":")[0] for warning in before.warnings} == {"gnss", "power"}
-    lines: dict[str, float] = {}
-    for role in ("gnss", "power"):
-        lines |= tomllib.loads(before.facts.offsets[role].recipe)["read"]["time_offset_s"]
-    after = doctor(log, ReadConfig(time_offset_s=lines))
-    assert after.warnings == ()
-    # What is said of a corrected log holds for the log as it is: the offset in the recipe is counted in.
-    again = tomllib.loads(after.facts.offsets["gnss"].recipe)["read"]["time_offset_s"]["gnss"]
-    assert again == pytest.approx(lines["gnss"], abs=0.011)
+    assert {finding.subject.name for finding in before.findings} == {"gnss", "power"}
+    offsets_s: dict[str, float] = {}
+    for finding in before.findings:
+        offsets_s |= proposed(finding)["read"]["time_offset_s"]
+    assert doctor(log, ReadConfig(time_offset_s=offsets_s)).findings == ()
+    # What a partly corrected log proposes holds for the log as it is: the offset in the recipe is counted in.
+    (again,) = doctor(log, ReadConfig(time_offset_s={**offsets_s, "gnss": offsets_s["gnss"] / 2})).findings
+    assert proposed(again)["read"]["time_offset_s"]["gnss"] == pytest.approx(offsets_s["gnss"], abs=0.011)
 
 
 def test_a_short_drive_says_what_it_cannot_tell(tmp_path):
@@ -71,7 +74,7 @@ def test_a_short_drive_says_what_it_cannot_tell(tmp_path):
     faults = replace(drive.faults, gnss_noise=True, wheel_noise=True, imu_noise=True)
     found = doctor(log_of(tiny, replace(drive, sensors=sensors, faults=faults), tmp_path))
     assert "gnss" not in found.facts.offsets
-    assert found.warnings == ()
+    assert found.findings == ()
     assert not any(pair.determined for pair in found.facts.pairs if pair.late == "gnss")
 
 

@@ -2,18 +2,22 @@
 
 from tcpipe.stages.fix_lag import with_lag_of_fixes
 from tcpipe.tables.facts import ClockFacts, ClockOffset
-from tcpipe.tables.findings import StageReport
+from tcpipe.tables.findings import StageReport, Subject, make_finding
 
 
 def test_a_lag_that_only_the_path_tells_is_said_and_costs_what_is_driven_in_it():
-    silent = StageReport(("imu: fine",), ClockFacts(0, "imu", (), {}))
+    before = make_finding(
+        "time-offset", Subject("role", "power"), offset_s=0.1, offset_2std_s=0.02, names={"reference": "imu"}
+    )
+    silent = StageReport((before,), ClockFacts(0, "imu", (), {}))
     assert with_lag_of_fixes(silent, None) is silent
     found = with_lag_of_fixes(silent, (0.12, 0.02))
     assert found.facts.position_offset_s == 0.12
     assert found.facts.offsets["gnss"].noted
     assert not found.facts.offsets["gnss"].blamed
-    assert found.warnings[0] == "imu: fine"
-    assert "0.12 s late (± 0.04 s" in found.warnings[1]
-    told = ClockOffset(0.1, 0.01, True, None, None, False, "gnss = -0.1")
+    assert found.findings[0] == before
+    assert (found.findings[1].code, found.findings[1].subject.name) == ("clocks-differ", "gnss")
+    assert found.findings[1].numbers == {"offset_s": 0.12, "offset_2std_s": 0.04, "apart_s": 0.12}
+    told = ClockOffset(0.1, 0.01, True, None, None, False)
     by_signals = StageReport((), ClockFacts(0, "imu", (), {"gnss": told}))
     assert with_lag_of_fixes(by_signals, (0.12, 0.02)) is by_signals

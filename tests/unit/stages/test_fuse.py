@@ -14,6 +14,7 @@ from tcpipe.geometry.datum import enu_from_geodetic, geodetic_from_enu
 from tcpipe.recipe import FuseConfig
 from tcpipe.stages.fuse import fuse_run
 from tcpipe.tables.columns import floats, integers
+from tcpipe.tables.findings import Subject, make_finding
 from tcpipe.tables.levels import COMMAND, GNSS, IMU, POSE, POWER, VISUAL_ODOMETRY, WHEEL_ODOMETRY, Sensor, Streams
 
 SITE = (15.46, 47.06, 450.0)
@@ -172,8 +173,11 @@ def test_without_power_and_commands_their_columns_are_null(streams):
 
 def test_nothing_but_an_imu_is_no_motion(streams):
     only = without(streams, "gnss", "wheel_odometry", "visual_odometry")
-    with pytest.raises(FusionError, match="no motion to fuse"):
+    with pytest.raises(FusionError) as error:
         fuse_run(only, FuseConfig(), run_id="r")
+    (finding,) = error.value.findings
+    assert (finding.code, finding.subject) == ("no-motion", Subject("run", "r"))
+    assert finding.numbers["imu_row_count"] == streams.tables["imu"].num_rows
 
 
 def test_fixes_at_null_island_are_listed_as_invalid(streams):
@@ -185,7 +189,7 @@ def test_fixes_at_null_island_are_listed_as_invalid(streams):
     track = fuse_run(replace(streams, tables={**streams.tables, "gnss": broken}), FuseConfig(), run_id="r")
     assert track.rejections["reason"].to_pylist()[:3] == ["invalid"] * 3
     assert track.rejections["normalized_innovation_squared"].null_count == 3
-    assert "gnss: 3 rows without a usable value" in track.info.report.findings
+    assert make_finding("values-unusable", Subject("role", "gnss"), row_count=3) in track.info.report.findings
     assert abs(track.info.datum.lon_deg - SITE[0]) < 0.01
 
 

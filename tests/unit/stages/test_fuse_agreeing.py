@@ -11,7 +11,7 @@ from tcpipe.stages import fuse_agreeing
 from tcpipe.stages.fuse_inputs import FusionInputs
 from tcpipe.stages.fuse_stretches import Fused
 from tcpipe.tables.facts import SensorChecks
-from tcpipe.tables.findings import StageReport
+from tcpipe.tables.findings import Remedy, StageReport, Subject
 from tcpipe.tables.levels import Sensor, Streams
 
 STAMP_NS = np.arange(5, dtype=np.int64)
@@ -60,7 +60,7 @@ def fusing(monkeypatch):
 
 
 def agreed(given):
-    found, sanity, _ = fuse_agreeing.fuse_agreeing(given, NOTHING, STREAMS, FuseConfig())
+    found, sanity, _ = fuse_agreeing.fuse_agreeing(given, NOTHING, STREAMS, FuseConfig(), run=Subject("run", "r"))
     return set(found.measurements[0].sensors()), sanity
 
 
@@ -75,8 +75,9 @@ def test_one_that_is_alone_in_most_of_the_way_is_left_out(fusing):
     sensors, sanity = agreed(inputs())
     assert sensors == set(ROLES) - {"gnss"}
     assert len(tried) == 2 + len(ROLES)
-    assert "/gnss is not fused: in most of the way the others contradict it" in sanity.warnings[0]
-    assert sanity.warnings[0].endswith("[read.topics]: gnss = []")
+    (finding,) = sanity.findings
+    assert (finding.code, finding.subject.name, finding.names["topic"]) == ("contradicted-by-others", "gnss", "/gnss")
+    assert finding.remedies == (Remedy("exclude", {"read.topics": {"gnss": []}}),)
 
 
 def test_fixes_against_one_odometry_are_left_out_without_being_blamed(fusing):
@@ -85,10 +86,9 @@ def test_fixes_against_one_odometry_are_left_out_without_being_blamed(fusing):
     fusing({every: contradicted(0, alone=15, sensor="gnss")})
     sensors, sanity = agreed(inputs(visual=False))
     assert sensors == {"imu", "wheel_odometry"}
-    assert sanity.facts.refused["gnss"].endswith("; or wheel_odometry errs: nothing else tells how far the robot goes")
-    assert sanity.warnings[0].endswith(
-        "to leave wheel_odometry out instead, write in the recipe under [read.topics]: wheel_odometry = []"
-    )
+    (finding,) = sanity.findings
+    assert (finding.subject.name, finding.names["suspect"]) == ("gnss", "wheel_odometry")
+    assert finding.remedies == (Remedy("exclude_suspect", {"read.topics": {"wheel_odometry": []}}),)
 
 
 def test_the_one_without_which_the_others_agree_is_left_out(fusing):
@@ -134,7 +134,7 @@ def test_of_a_track_that_goes_astray_the_imu_is_tried_first(fusing, visual):
     fusing({roles: contradicted(0)}, lost=[roles])
     sensors, sanity = agreed(inputs(visual=visual))
     assert sensors == roles - {"imu"}
-    assert "the track moves otherwise than every sensor says" in sanity.facts.refused["imu"]
+    assert sanity.facts.refused == {"imu": "misleads-track"}
 
 
 def test_a_track_that_goes_astray_without_its_imu_too_is_mended_by_the_only_other_that_does(fusing):
@@ -150,5 +150,7 @@ def test_a_track_that_goes_astray_without_its_imu_too_is_mended_by_the_only_othe
 def test_a_track_that_goes_astray_whatever_is_left_out_is_refused(fusing):
     roles = frozenset(ROLES)
     fusing({roles: contradicted(0)}, lost=[roles, *(roles - {role} for role in roles)])
-    with pytest.raises(FusionError, match=r"in 60% of the run .* \(recipe key read.topics"):
+    with pytest.raises(FusionError) as error:
         agreed(inputs())
+    (finding,) = error.value.findings
+    assert (finding.code, finding.numbers) == ("track-contradicts-sensors", {"astray_fraction": 0.6})

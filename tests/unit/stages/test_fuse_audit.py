@@ -1,7 +1,8 @@
-"""What a person reads of the audit: one line for each sensor and thing, and why a run has no segments."""
+"""What a person reads of the audit: one finding for each sensor and thing, and why a run has no segments."""
 
 import numpy as np
-from suggested_recipes import suggestions_in
+import pytest
+from suggested_recipes import proposed
 
 from tcpipe.fusion.checks.audit import Tally
 from tcpipe.fusion.measurements import BodyVelocities, Measurements
@@ -29,30 +30,28 @@ def fused(*found, tallies=()):
 
 def test_nothing_is_said_where_nobody_disagrees():
     told = audit_findings(fused(), *NOBODY)
-    assert told.warnings == ()
+    assert told.findings == ()
     assert (told.facts.disagreements, told.facts.undecided) == ((), ())
 
 
-def test_a_line_holds_sensor_what_window_size_and_what_was_expected():
+def test_a_finding_holds_sensor_what_window_size_and_what_was_expected():
     told = audit_findings(fused(off(110, 130, 0.2), off(160, 220, 0.49), off(150, 155, 9.0, alone=True)), *NOBODY)
-    shared, lone = told.warnings
-    assert shared == (
-        "gnss: its position is off the track 2 times, 80 s in all; most from 60 to 120 s of the run by 0.49 m, "
-        "expected 0.02 m (1 sigma); deviations are raised there, and segments carry sensors_disagree"
-    )
-    assert lone.endswith(
-        "from 50 to 55 s of the run by 9 m, expected 0.02 m (1 sigma); two other sensors contradict it, so the track is believed"
-    )
+    shared, lone = told.findings
+    assert (shared.code, shared.subject.name, shared.action) == ("position-disagrees", "gnss", "inflated")
+    assert shared.numbers == {"off_m": 0.49, "expected_std_m": 0.02, "event_count": 2, "total_s": 80.0}
+    assert shared.span_s == (60.0, 120.0)
+    assert (lone.code, lone.severity, lone.action) == ("position-disagrees", "note", "kept")
+    assert (lone.numbers["off_m"], lone.span_s) == (9.0, (50.0, 55.0))
     assert len(told.facts.disagreements) == 3
 
 
 def test_a_run_that_no_third_decides_says_why_it_has_no_segments():
     told = audit_findings(fused(tallies=[Tally("wheel_odometry", "displacement", 20, 15, 0)]), *NOBODY)
     assert told.facts.undecided == ("wheel_odometry",)
-    (line,) = told.warnings
-    assert line.startswith("displacement by wheel_odometry: in most of the way the track is not what this sensor says")
-    assert "no segments" in line
-    assert suggestions_in(line) == [{"read": {"topics": {"wheel_odometry": []}}}]
+    (finding,) = told.findings
+    assert (finding.code, finding.subject.name) == ("disagreement-undecided", "wheel_odometry")
+    assert (finding.severity, finding.names) == ("error", {"quantity": "displacement"})
+    assert proposed(finding) == {"read": {"topics": {"wheel_odometry": []}}}
 
 
 def wheels_alone(speed_mps):
@@ -72,8 +71,7 @@ def test_wheels_faster_than_any_command_bear_no_segment_where_nothing_else_tells
     assert audit_findings(fused(), *wheels_alone(0.9)).facts.undecided == ()
     told = audit_findings(fused(), *wheels_alone(1.25))
     assert told.facts.undecided == ("wheel_odometry",)
-    (line,) = told.warnings
-    assert "1.25 times as fast as commanded" in line
-    scale, without = suggestions_in(line)
-    assert scale == {"read": {"odometry_scale": {"wheel_odometry": 0.8}}}
-    assert without == {"read": {"topics": {"command": []}}}
+    (finding,) = told.findings
+    assert (finding.code, finding.numbers) == ("faster-than-commanded", {"speed_ratio": pytest.approx(1.25)})
+    assert proposed(finding) == {"read": {"odometry_scale": {"wheel_odometry": 0.8}}}
+    assert proposed(finding, alternative=1) == {"read": {"topics": {"command": []}}}

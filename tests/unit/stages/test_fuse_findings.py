@@ -1,6 +1,5 @@
-"""What fusing says of a run: sums over stretches, and from where on a person is warned."""
+"""What fusing says of a run: sums over stretches, and from where on it is a finding."""
 
-import re
 from types import SimpleNamespace
 
 import numpy as np
@@ -8,9 +7,10 @@ import pytest
 
 from tcpipe.fusion.measurements import InertialMeasurements, InitialState, Measurements, Positions
 from tcpipe.fusion.stretches import Stretch
-from tcpipe.stages.fuse_findings import fuse_facts, fuse_warnings, stretch_facts
+from tcpipe.stages.fuse_findings import fuse_facts, fuse_findings, stretch_facts
 from tcpipe.stages.fuse_inputs import FusionInputs
 from tcpipe.tables.facts import Reopening, StretchFacts
+from tcpipe.tables.findings import Subject, make_finding
 
 PLACE = (15.0, 47.0, 400.0)
 ALL = ("gnss", "imu", "wheel_odometry")
@@ -22,7 +22,7 @@ def stretch(*, sensors=ALL, heading_from="course over ground", **said):
 
 
 def warned(inputs, *stretches, skipped_s=0.0):
-    return fuse_warnings(inputs, fuse_facts(inputs, stretches, rows=7, skipped_s=skipped_s))
+    return fuse_findings(inputs, fuse_facts(inputs, stretches, rows=7, skipped_s=skipped_s), run=Subject("run", "r"))
 
 
 def counts(**said):
@@ -62,66 +62,69 @@ def test_a_stretch_says_where_it_lies_and_what_it_began_with():
 
 def test_nothing_is_said_where_nothing_is_odd():
     inputs = FusionInputs(PLACE, counts={"gnss": counts(repeated=5)})
-    assert warned(inputs, stretch(measurements={"gnss": 10}, rejected={"gnss": 2})) == ()
+    assert warned(inputs, stretch(measurements={"gnss": 10}, rejected={"gnss": 1})) == ()
 
 
-@pytest.mark.parametrize(("rejected", "said"), [(2, False), (3, True)])
-def test_refusals_are_told_beyond_a_fifth(rejected, said):
-    lines = warned(FusionInputs(PLACE), stretch(measurements={"gnss": 10}, rejected={"gnss": rejected}))
-    assert any(f"gnss: {rejected} of 10 measurements were refused" in line for line in lines) == said
-    assert any("leave it out, write in the recipe under [read.topics]: gnss = []" in line for line in lines) == said
+@pytest.mark.parametrize(("rejected", "said"), [(1, False), (2, True)])
+def test_rejections_are_a_finding_beyond_a_tenth(rejected, said):
+    found = warned(FusionInputs(PLACE), stretch(measurements={"gnss": 10}, rejected={"gnss": rejected}))
+    assert [(of.code, of.subject.name) for of in found] == [("measurements-rejected", "gnss")] * said
+    for finding in found:
+        assert finding.numbers == {"rejected_fraction": 0.2, "rejected_count": 2, "measurement_count": 10}
+        assert finding.remedies[0].recipe == {"read.topics": {"gnss": []}}
 
 
-@pytest.mark.parametrize(("common", "said"), [(None, None), (0.02, None), (0.03, "3%")])
-def test_a_scale_that_nothing_tells_is_told_beyond_two_hundredths(common, said):
-    lines = warned(FusionInputs(PLACE), stretch(common_scale_std=common), stretch(common_scale_std=0.01))
-    assert [re.search(r"(\d+%)", line)[1] for line in lines] == ([] if said is None else [said])
-    assert all("these fixes are too few or too coarse to tell it" in line for line in lines)
+@pytest.mark.parametrize(("common", "said"), [(None, []), (0.02, []), (0.03, [0.03])])
+def test_a_scale_that_nothing_shows_is_a_finding_beyond_two_hundredths(common, said):
+    found = warned(FusionInputs(PLACE), stretch(common_scale_std=common), stretch(common_scale_std=0.01))
+    assert [of.numbers["scale_std_fraction"] for of in found] == said
+    assert all(of.names == {"reason": "coarse-gnss"} for of in found)
 
 
-def test_without_fixes_they_would_tell_the_scale():
-    lines = warned(FusionInputs(PLACE), stretch(common_scale_std=0.03, sensors=("imu", "wheel_odometry")))
-    assert "a GNSS would tell it" in lines[0]
+def test_without_fixes_they_would_show_the_scale():
+    (finding,) = warned(FusionInputs(PLACE), stretch(common_scale_std=0.03, sensors=("imu", "wheel_odometry")))
+    assert (finding.code, finding.subject.name) == ("odometry-scale-unobservable", "wheel_odometry")
+    assert finding.names == {"reason": "no-gnss"}
 
 
-def test_a_track_without_a_place_or_without_an_imu_is_warned_of():
-    assert warned(FusionInputs(None), stretch()) == ()  # a log without fixes was warned of when it was read
-    (line,) = warned(FusionInputs(None, counts={"gnss": counts()}), stretch())
-    assert line.startswith("no GNSS position is used: the track lies in a local frame")
-    (line,) = warned(FusionInputs(PLACE), stretch(sensors=("gnss",)))
-    assert line.startswith("no IMU is used")
+def test_a_track_without_a_place_is_a_finding():
+    assert warned(FusionInputs(None), stretch()) == ()  # a log without fixes was found when it was read
+    (finding,) = warned(FusionInputs(None, counts={"gnss": counts()}), stretch())
+    assert finding.code == "local-frame"
 
 
-def test_a_heading_that_the_course_does_not_tell_is_warned_of_where_the_track_has_a_place():
-    told = stretch(heading_from="the IMU", epoch=1)
-    (line,) = warned(FusionInputs(PLACE), stretch(), told)
-    assert line == "clock epoch 1: no 5 m of course over ground, so its initial yaw is from the IMU"
-    assert warned(FusionInputs(None), told) == ()
+def test_a_heading_that_the_course_does_not_show_is_a_finding_where_the_track_has_a_place():
+    later = stretch(heading_from="the IMU", epoch=1, start_ns=2_000_000_000, end_ns=9_000_000_000)
+    (finding,) = warned(FusionInputs(PLACE), stretch(), later)
+    assert (finding.code, finding.names) == ("initial-yaw-uncertain", {"source": "the IMU"})
+    assert finding.span_s == (2.0, 9.0)
+    assert warned(FusionInputs(None), later) == ()
 
 
 def test_rows_that_were_set_aside_are_counted_but_not_those_of_a_sensor_that_was_refused():
+    sleeps, blind = (make_finding("pose-increments", Subject("role", role)) for role in ("imu", "visual_odometry"))
     inputs = FusionInputs(
         PLACE,
         counts={"gnss": counts(variances_replaced=4), "imu": counts(invalid=2), "visual_odometry": counts(invalid=9)},
-        remarks=["imu: it sleeps", "visual_odometry: it is blind"],
+        findings=[sleeps, blind],
         refused=frozenset({"visual_odometry"}),
     )
     assert warned(inputs, stretch(), skipped_s=0.55) == (
-        "imu: it sleeps",
-        "gnss: 4 rows without a usable variance; the recipe's is used",
-        "imu: 2 rows without a usable value",
-        "0.6 s between pauses or clock steps hold too little to place a track",
+        sleeps,
+        make_finding("variances-replaced", Subject("role", "gnss"), row_count=4),
+        make_finding("values-unusable", Subject("role", "imu"), row_count=2),
+        make_finding("sections-skipped", Subject("run", "r"), skipped_s=0.55),
     )
 
 
-def test_a_sensor_that_left_the_path_is_told_once_with_its_worst():
-    worst = Reopening("gnss", 30, 40, 2.5)
-    first = stretch(reopenings=(Reopening("gnss", 10, 20, 1.0), Reopening("wheel_odometry", 1, 2, 0.4)))
-    lines = warned(FusionInputs(PLACE), first, stretch(reopenings=(worst,)))
-    assert [line.split(":")[0] for line in lines] == ["gnss", "wheel_odometry"]
-    assert "2 times it contradicted the other sensors for seconds, most by 2.50 m from 30 to 40 ns" in lines[0]
-    assert "1 times it contradicted the other sensors for seconds, most by 0.40 m/s from 1 to 2 ns" in lines[1]
-    assert lines[0].endswith("; or wheel_odometry errs there: nothing else tells how far the robot goes")
-    assert lines[1].endswith("surroundings")
+def test_a_sensor_that_left_the_path_is_one_finding_with_its_worst():
+    worst = Reopening("gnss", 30_000_000_000, 40_000_000_000, 2.5)
+    first = stretch(reopenings=(Reopening("gnss", 10, 20, 1.0), Reopening("wheel_odometry", 0, 2_000_000_000, 0.4)))
+    gnss, wheels = warned(FusionInputs(PLACE), first, stretch(reopenings=(worst,)))
+    assert (gnss.code, gnss.subject.name, gnss.span_s) == ("gnss-contradicts-odometry", "gnss", (30.0, 40.0))
+    assert gnss.numbers == {"off_m": 2.5, "event_count": 2}
+    assert gnss.names == {"suspect": "wheel_odometry"}
+    assert (wheels.code, wheels.subject.name) == ("odometry-contradicts-others", "wheel_odometry")
+    assert (wheels.numbers, wheels.span_s) == ({"off_mps": 0.4, "event_count": 1}, (0.0, 2.0))
     third = stretch(reopenings=(worst,), sensors=(*ALL, "visual_odometry"))
-    assert warned(FusionInputs(PLACE), third)[0].endswith("surroundings")
+    assert warned(FusionInputs(PLACE), third)[0].names == {}

@@ -41,4 +41,4 @@ def test_what_no_receiver_claims_is_the_recipes(streams):
 def test_the_forward_filter_says_that_it_does_not_use_it(streams):
     inputs = prepare_inputs(streams, FuseConfig(estimator="ukf"))
     assert [set(m.sensors()) for m in inputs.measurements.values()] == [{"gnss"}]
-    assert inputs.remarks == ["gnss_velocity: the forward filter (ukf) does not use it"]
+    assert [(of.code, of.subject.name) for of in inputs.findings] == [("unused-by-estimator", "gnss_velocity")]

@@ -1,12 +1,11 @@
 """When a mounting is mended, when it is left as somebody stated it, and the lines that a person can put into the recipe."""
 
-import tomllib
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from suggested_recipes import suggestions_in
+from suggested_recipes import proposed
 
 from tcpipe.fusion.checks.mounting import Arm, ArmEvidence, Tilt, TiltEvidence
 from tcpipe.fusion.measurements import BodyVelocities, InertialMeasurements, Measurements, Positions
@@ -55,9 +54,10 @@ def test_an_antenna_that_nobody_placed_is_put_where_the_turns_show_it_and_then_l
     assert fuse_mounting._mended(first, Fused(arms=[turns_that_show(TRUE, moved_m=moved_m)]), log) is None
     told = mounting_findings(first, log)
     assert told.facts.antenna_moved_m == pytest.approx(moved_m)
-    (line,) = told.warnings
-    assert "nobody states where its antenna sits" in line
-    entry = tomllib.loads(line.rsplit("under [read.placement]: ", 1)[1])["gnss"]
+    (finding,) = told.findings
+    assert (finding.code, finding.subject.name) == ("lever-arm-unknown", "gnss")
+    assert finding.numbers["forward_m"] == pytest.approx(0.4, abs=0.01)
+    entry = proposed(finding)["read"]["placement"]["gnss"]
     assert entry["xyz_m"] == pytest.approx([0.4, -0.2, 0.9], abs=0.01)
 
 
@@ -72,8 +72,9 @@ def test_a_stated_antenna_is_moved_only_where_the_turns_surely_contradict():
     for agrees in (turns_that_show(0.05 * TRUE), turns_that_show(TRUE, std_m=0.5)):
         assert fuse_mounting._mended(inputs(), Fused(arms=[agrees]), log) is None
     found = fuse_mounting._mended(inputs(), Fused(arms=[turns_that_show(TRUE)]), log)
-    (line,) = mounting_findings(found, log).warnings
-    assert line.startswith("gnss: the turns contradict that its antenna sits at (0.10, 0.00, 0.90) m (tf_static)")
+    (finding,) = mounting_findings(found, log).findings
+    assert (finding.code, finding.subject.name) == ("lever-arm-contradicted", "gnss")
+    assert finding.names == {"placed_by": "tf_static"}
 
 
 def test_while_the_imu_is_being_turned_a_stated_antenna_is_not_judged():
@@ -95,22 +96,23 @@ def test_a_tilted_imu_is_turned_and_what_is_left_added_until_nothing_is():
     assert felt == pytest.approx(np.tile(turned.apply([0.0, 0.0, 9.8]), (5, 1)), abs=0.01)
     told = mounting_findings(second, log)
     assert told.facts.imu_tilt_rad == pytest.approx((0.0, 0.08))
-    (line,) = told.warnings
-    assert "rolled by 0.0° and pitched by 4.6° against its mounting (tf_static)" in line
-    entry = tomllib.loads(line.rsplit("under [read.placement]: ", 1)[1])["imu"]
+    (finding,) = told.findings
+    assert finding.code == "imu-tilted"
+    assert finding.numbers == {"roll_rad": pytest.approx(0.0), "pitch_rad": pytest.approx(0.08)}
+    entry = proposed(finding)["read"]["placement"]["imu"]
     assert entry == {"xyz_m": [0, 0.1, 0.2], "rpy_rad": pytest.approx([0.0, 0.08, 0.0], abs=1e-4)}
 
 
 def test_nothing_mended_is_nothing_said():
     told = mounting_findings(inputs(), streams("tf_static"))
-    assert (told.warnings, told.facts) == ((), None)
+    assert (told.findings, told.facts) == ((), None)
 
 
 def test_both_are_said_where_both_were_mended():
     taken = inputs((0.2, 0.0, 0.9))
     taken.arm, taken.imu_tilt = Arm(np.array([0.1, 0, 0, 0]), np.eye(4)), Tilt(np.array([0.05, 0.0]), np.zeros(2))
     told = mounting_findings(taken, streams("recipe"))
-    assert [line.split(":")[0] for line in told.warnings] == ["gnss", "imu"]
+    assert [of.subject.name for of in told.findings] == ["gnss", "imu"]
 
 
 def test_a_scale_that_is_off_throughout_is_taken_out_and_the_recipe_line_states_it_beside_what_it_states_already():
@@ -121,8 +123,9 @@ def test_a_scale_that_is_off_throughout_is_taken_out_and_the_recipe_line_states_
     evidence = Fused(ratios=[{"wheel_odometry": np.linspace(1.29, 1.31, 21)}])
     found = fuse_mounting._mended(FusionInputs(None, {0: Measurements(wheels=wheels)}), evidence, log)
     assert found.measurements[0].wheels.velocity_mps == pytest.approx(np.ones((5, 3)))
-    told = mounting_findings(found, replace(log, findings=given))
+    told = mounting_findings(found, replace(log, report=given))
     assert told.facts.odometry_scale == {"wheel_odometry": pytest.approx(1.3)}
-    (line,) = told.warnings
-    entry = suggestions_in(line)[0]["read"]["odometry_scale"]
+    (finding,) = told.findings
+    assert (finding.code, finding.numbers["scale"]) == ("odometry-scale", pytest.approx(1.3))
+    entry = proposed(finding)["read"]["odometry_scale"]
     assert entry == {"wheel_odometry": pytest.approx(0.5 / 1.3, rel=1e-3)}

@@ -12,7 +12,7 @@ from tcpipe.stages.gate import gate_track
 from tcpipe.stages.segment import segment_track
 from tcpipe.tables.bits import DropReason
 from tcpipe.tables.facts import AuditFacts, FuseFacts, StretchFacts
-from tcpipe.tables.findings import StageReport
+from tcpipe.tables.findings import StageReport, select_findings
 
 T = np.arange(0, 60, 0.05)
 
@@ -27,6 +27,10 @@ def rows_of(gated, reason):
 
 def start_and_stop(top=0.9, rate=1.0):
     return np.clip(np.minimum(rate * (T - 5), rate * (50 - T)), 0, top)
+
+
+def codes_of(gated):
+    return [finding.code for finding in gated.info.report.findings]
 
 
 def test_a_terrain_slowdown_under_a_constant_command_is_kept():
@@ -53,7 +57,7 @@ def test_start_and_stop_without_commands():
     kept = gated.table["dropped_by"].to_numpy() == 0
     assert kept[(T > 6.5) & (T < 48.5)].all()
     assert not kept[(T < 5.9) | (T > 49.2)].any()
-    assert "no command topic" in gated.info.report.findings[0]
+    assert codes_of(gated) == ["no-command"]
 
 
 def test_a_robot_that_coasts_to_a_halt_under_a_standing_command():
@@ -71,9 +75,10 @@ def test_the_top_command_of_a_run_is_its_limit_where_most_is_driven_at_it(share,
     below = rows_of(gated, DropReason.BELOW_LIMIT)
     assert below[60 * share + 1 < T].all()
     assert below[60 * share - 1 > T].all() == (limit == 1.0)
-    said = gated.info.report.findings
-    assert any("70% of the moving track was commanded at 0.70 m/s" in line for line in said) == (limit == 0.7)
-    assert any("its top command, 0.70 m/s, was held for 30% of it" in line for line in said) == (limit == 1.0)
+    (finding,) = gated.info.report.findings
+    assert finding.code == ("limit-from-commands" if limit == 0.7 else "driven-below-limit")
+    assert finding.numbers["top_mps"] == pytest.approx(0.7)
+    assert finding.numbers.get("held_fraction", 0.7) == pytest.approx(0.7, abs=0.01)
 
 
 def test_below_the_limit_unless_it_is_unknown_or_allowed():
@@ -83,9 +88,10 @@ def test_below_the_limit_unless_it_is_unknown_or_allowed():
     assert not rows_of(gate(track, config=GateConfig(require_full_speed=False)), DropReason.BELOW_LIMIT).any()
     unknown = gate(track, limit_mps=None)
     assert not rows_of(unknown, DropReason.BELOW_LIMIT).any()
-    assert "under [gate]: max_velocity_mps = " in unknown.info.report.findings[0]
+    (finding,) = unknown.info.report.findings
+    assert (finding.code, finding.remedies[0].recipe) == ("max-velocity-unknown", {"gate": {"max_velocity_mps": 0.7}})
     assert not rows_of(gate(track, config=GateConfig(max_velocity_mps=0.7)), DropReason.BELOW_LIMIT).any()
-    assert "100% of the moving track" in gate(track).info.report.findings[0]
+    assert gate(track).info.report.findings[0].numbers["held_fraction"] == 1.0
 
 
 def test_stuck_has_its_own_reason():
@@ -109,7 +115,8 @@ def test_a_power_gap_is_a_gap_and_a_run_without_power_is_none():
     )
     assert not rows_of(gate(straight_track(np.full(len(T), 0.9))), DropReason.GAP).any()
     rare = gate(straight_track(np.full(len(T), 0.9), power_watt=np.where(T > 50, 150.0, np.nan)))
-    assert "there is none on 83% of the moving track" in rare.info.report.findings[0]
+    (finding,) = select_findings(rare.info.report.findings, "power-gaps")
+    assert finding.numbers["lost_fraction"] == pytest.approx(0.83, abs=0.01)
 
 
 def test_a_jump_is_a_gap_and_not_driven():
@@ -127,7 +134,9 @@ def test_a_jump_is_a_gap_and_not_driven():
         "contradicted": 0,
         "implausible": 0,
     }
-    assert "jumps 1 times, the furthest by 1000000.0 m" in gated.info.report.findings[0]
+    (finding,) = select_findings(gated.info.report.findings, "position-jumps")
+    assert finding.numbers == {"jump_m": pytest.approx(1e6), "jump_count": 1}
+    assert finding.span_s[0] == pytest.approx(599 * 0.05)
     segments = segment_track(gated, SegmentConfig())
     assert sum(segments.ledger_m.values()) == pytest.approx(0.9 * T[-1], rel=1e-6)
     assert segments.table.num_rows == 52
@@ -139,7 +148,8 @@ def test_relative_not_absolute_position_error_makes_a_gap():
     assert not rows_of(far_off, DropReason.GAP).any()
     unsure = gate(straight_track(speed, std_m=2.0, velocity_std_mps=0.12))
     assert rows_of(unsure, DropReason.GAP).all()
-    assert "is not known to 0.1 m (recipe key gate.max_relative_position_std_m)" in unsure.info.report.findings[0]
+    (finding,) = select_findings(unsure.info.report.findings, "distance-uncertain")
+    assert finding.numbers == {"lost_fraction": 1.0, "chord_m": 1.0, "max_std_m": 0.1}
 
 
 def test_an_error_of_scale_that_a_run_has_in_common_makes_no_gap():
@@ -184,16 +194,21 @@ def test_a_track_faster_than_plausible_bears_no_segment_there():
     spans_s = (segments.table["end_ns"].to_numpy() - segments.table["start_ns"].to_numpy()) * 1e-9
     assert (segments.table["chord_m"].to_numpy() / spans_s).max() < 2.0
     assert gated.info.report.facts.gate.gap_rows["implausible"] == pytest.approx(200, abs=3)
-    (said,) = [line for line in gated.info.report.findings if "faster than 15 m/s" in line]
-    assert said.endswith("set recipe key gate.max_plausible_mps")
+    (finding,) = select_findings(gated.info.report.findings, "track-too-fast")
+    assert (finding.severity, finding.numbers["limit_mps"]) == ("warning", 15.0)
+    assert finding.numbers["fast_s"] == pytest.approx(10.0, abs=0.2)
     assert not rows_of(gate(straight_track(speed), config=GateConfig(max_plausible_mps=50.0)), DropReason.GAP)[450]
 
 
 def test_a_run_that_is_mostly_faster_than_plausible_is_refused():
     track = straight_track(np.where(T > 20, 1873.0, 0.9))
-    with pytest.raises(FusionError, match=r"faster than 15 m/s .*recipe key read.topics.*gate.max_plausible_mps"):
+    with pytest.raises(FusionError) as error:
         gate(track)
+    (finding,) = error.value.findings
+    assert (finding.code, finding.severity, finding.action) == ("track-too-fast", "error", "rejected")
+    assert finding.numbers["limit_mps"] == 15.0
     robot = {"max_velocity_mps": 1.0, "chord_m": 1.0}
     assert gate_track(track, GateConfig(), **robot, max_plausible_mps=1e4).table.num_rows == T.size
-    with pytest.raises(FusionError, match="faster than 20 m/s"):  # the recipe's goes first
+    with pytest.raises(FusionError) as error:  # the recipe's goes first
         gate_track(track, GateConfig(max_plausible_mps=20.0), **robot, max_plausible_mps=1e4)
+    assert error.value.findings[0].numbers["limit_mps"] == 20.0

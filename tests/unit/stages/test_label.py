@@ -21,7 +21,7 @@ from tcpipe.tables.facts import (
     RunFacts,
     StretchFacts,
 )
-from tcpipe.tables.findings import StageReport
+from tcpipe.tables.findings import StageReport, select_findings
 from tcpipe.tables.levels import Sensor, Streams
 
 T = np.arange(0, 60, 0.05)
@@ -52,6 +52,10 @@ def record(period_s=0.05, *, volt=lambda t: 24 + 0 * t, amp=lambda t: 6 + 0 * t,
 
 def flagged(labelled, bit):
     return (labelled.table["quality"].to_numpy() & np.uint32(bit)) != 0
+
+
+def codes_of(labelled):
+    return [finding.code for finding in labelled.info.report.findings]
 
 
 def test_constant_power_on_a_straight_line():
@@ -143,7 +147,7 @@ def test_segments_beyond_the_record_have_null_labels_and_a_warning():
     labelled = label(straight_track(SPEED), power_streams({"drive": (stamp_ns[short], volt[short], amp[short])}))
     unknown = np.isnan(floats(labelled.table, "energy_joule"))
     assert unknown.tolist() == (integers(labelled.table, "end_ns") > stamp_ns[short][-1]).tolist()
-    assert any("have no label" in text for text in labelled.info.report.findings)
+    assert "segments-without-power" in codes_of(labelled)
 
 
 @pytest.mark.parametrize(
@@ -152,7 +156,8 @@ def test_segments_beyond_the_record_have_null_labels_and_a_warning():
 def test_low_power_rate(period_s, averaged, low):
     labelled = label(straight_track(SPEED), power_streams({"drive": record(period_s)}, averaged=averaged))
     assert flagged(labelled, Quality.LOW_POWER_RATE).all() == low
-    assert any("the current is measured at" in text for text in labelled.info.report.findings) == low
+    slow = select_findings(labelled.info.report.findings, "power-too-slow")
+    assert [of.names["quantity"] for of in slow] == ["current"] * low
 
 
 def test_voltage_out_of_range_where_it_is():
@@ -183,7 +188,7 @@ def test_slip_weak_position_curve_and_command():
     assert flagged(labelled, Quality.HIGH_SLIP)[late].all()
     assert not flagged(labelled, Quality.HIGH_SLIP)[~late][:-1].any()
     assert not flagged(labelled, Quality.NO_COMMAND).any()
-    assert sum("wheels and ground differ" in text for text in labelled.info.report.findings) == 1
+    assert codes_of(labelled).count("wheels-slip") == 1
 
     weak = label(straight_track(SPEED, std_m=0.2), power_streams({"drive": record()}))
     assert flagged(weak, Quality.WEAK_GNSS).all()

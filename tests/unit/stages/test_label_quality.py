@@ -155,7 +155,7 @@ def streams(*, epochs=1, **time_sources):
 
 
 def clocks(role, *, noted=False, drifts=False, heading_offset_s=None):
-    offset = ClockOffset(0.1, 0.01, noted, None, None, drifts, "")
+    offset = ClockOffset(0.1, 0.01, noted, None, None, drifts)
     return info(clock_offsets=ClockFacts(0, "gnss", (), {role: offset}, heading_offset_s=heading_offset_s))
 
 

@@ -18,6 +18,7 @@ from tcpipe.power.sources import RailReadings
 from tcpipe.recipe import Placement, ReadConfig
 from tcpipe.stages.read import read_run
 from tcpipe.stages.read_power import power_rows
+from tcpipe.tables.findings import select_findings
 from tcpipe.tables.levels import Streams
 
 S = 1_000_000_000
@@ -166,6 +167,10 @@ def read(topics: Mapping[str, tuple[str, pa.Table]], /, robot: str | None = None
     return read_run(MemoryLog(topics), ReadConfig(**config), robot=robot, known=shipped_profiles())
 
 
+def codes(found) -> set[str]:
+    return {of.code for of in found.report.findings}
+
+
 def test_a_whole_husky() -> None:
     found = read(husky())
     assert found.robot == "husky"
@@ -192,7 +197,7 @@ def test_a_whole_husky() -> None:
     assert found.sensors["wheel_odometry"].placed_by == "same frame"
     assert found.sensors["command"].time_source == "log"
     assert found.tables["wheel_odometry"]["velocity_var_x_m2ps2"][0].as_py() == 0.01
-    assert len(found.report.findings) == 1  # the current's sign
+    assert codes(found) == {"current-sign-assumed"}
     facts = found.report.facts
     assert facts.epochs == 1
     assert facts.roles["imu"].topics["/imu/data"].rows == 500
@@ -230,8 +235,9 @@ def test_a_latched_tf_places_what_tf_static_does_not() -> None:
     found = read(topics)
     assert found.sensors["gnss"].xyz_m == (0.0, 0.0, 2.0)
     assert found.sensors["imu"].placed_by == "assumed"
-    warning = next(text for text in found.report.findings if "imu_link" in text)
-    assert "[read.placement]: imu = {xyz_m" in warning
+    (unplaced,) = select_findings(found.report.findings, "sensor-not-placed")
+    assert (unplaced.subject.name, unplaced.names["frame"]) == ("imu", "imu_link")
+    assert "xyz_m" in unplaced.remedies[0].recipe["read.placement"]["imu"]
 
 
 def test_the_recipe_places_over_tf() -> None:
@@ -244,7 +250,7 @@ def test_the_recipe_places_over_tf() -> None:
 def test_missing_gnss_and_power_are_warnings() -> None:
     found = read({"/odom": odometry()})
     assert set(found.tables) == {"wheel_odometry"}
-    assert ["gnss" in found.report.findings[0], "power" in found.report.findings[1]] == [True, True]
+    assert codes(found) == {"no-gnss", "no-power", "no-imu"}
 
 
 def test_power_that_cannot_be_believed_is_a_warning_too() -> None:
@@ -252,7 +258,10 @@ def test_power_that_cannot_be_believed_is_a_warning_too() -> None:
     dead = ("sensor_msgs/msg/BatteryState", message_table(rows, 1.0, voltage=full(rows, 0.0), current=full(rows, 0.0)))
     found = read({"/odom": odometry(), "/battery": dead})
     assert "power" not in found.tables
-    assert any("zero on all 60 rows" in text for text in found.report.findings)
+    (rejected,) = select_findings(found.report.findings, "power-rejected")
+    assert rejected.names["reason"] == "voltage-zero"
+    assert rejected.numbers == {"median_volt": 0.0, "median_amp": 0.0, "rows_count": 60.0}
+    assert "no-power" not in codes(found)
 
 
 def test_topics_without_messages_play_no_part_even_where_the_index_cannot_tell() -> None:
@@ -281,7 +290,7 @@ def test_nmea_sentences_play_gnss_on_their_own_time() -> None:
     assert gnss["stamp_ns"].to_pylist() == stamps.tolist()
     assert set(gnss["alt_m"].to_pylist()) == {400.0}
     assert found.report.facts.roles["gnss"].topics["/nmea_sentence"].dropped == {"not_gga": 20}
-    assert not any("not used" in text for text in found.report.findings)
+    assert "messages-unused" not in codes(found)
 
 
 def test_one_topic_of_sentences_plays_two_roles_each_on_its_own_time() -> None:
@@ -300,7 +309,7 @@ def test_one_topic_of_sentences_plays_two_roles_each_on_its_own_time() -> None:
     assert velocity["up_velocity_mps"].null_count == velocity["east_var_m2ps2"].null_count == 20
     assert set(velocity["fix_status"].to_pylist()) == {2}
     assert found.sensors["gnss_velocity"].placed_by == "not needed"
-    assert not any("gnss_velocity" in line for line in found.report.findings)
+    assert not any("gnss_velocity" in (of.subject.name, *of.names.values()) for of in found.report.findings)
 
 
 @pytest.mark.parametrize(("frame", "rows"), [("gps", 50), ("base_link", 0), ("robot/base_footprint", 0)])
@@ -314,7 +323,7 @@ def test_a_receivers_twist_in_the_bodys_frame_stays_out_unless_the_recipe_names_
     topics = {"/gps/fix": fix(), "/gps/vel": ("geometry_msgs/msg/TwistWithCovarianceStamped", twist)}
     found = read(topics)
     assert (found.tables["gnss_velocity"].num_rows if rows else len(set(found.tables) - {"gnss"})) == rows
-    assert any("nobody can tell" in line for line in found.report.findings) == (not rows)
+    assert ("velocity-not-over-ground" in codes(found)) == (not rows)
     named = ReadConfig(topics={"gnss_velocity": ["/gps/vel"]})
     told = read_run(MemoryLog(topics), named, robot=None, known=shipped_profiles())
     assert told.tables["gnss_velocity"].num_rows == 50
@@ -326,9 +335,9 @@ def test_a_topic_that_cannot_be_decoded_plays_no_part() -> None:
     )
     assert "gnss" not in found.tables
     assert "power" not in found.tables  # one side alone is not the robot's power
-    text = "\n".join(found.report.findings)
-    assert "/fix cannot be decoded" in text
-    assert "power refused" in text
+    lost = [of.subject.name for of in select_findings(found.report.findings, "topic-not-decoded")]
+    assert lost == ["/fix", "/left/battery"]
+    assert {"power-rejected", "no-gnss"} <= codes(found)
 
 
 def test_a_log_whose_only_motion_is_unusable_fails_and_says_why() -> None:
@@ -337,7 +346,8 @@ def test_a_log_whose_only_motion_is_unusable_fails_and_says_why() -> None:
     with pytest.raises(RoleError) as error:
         read({"/fix": (kind, lost), "/imu/data": imu()})
     assert error.value.problems[0].startswith("nothing in the log tells motion")
-    assert "no_fix 50" in str(error.value)
+    (unused,) = select_findings(error.value.findings, "messages-unused")
+    assert unused.numbers["no_fix_count"] == 50
 
 
 def test_ambiguity_is_one_error() -> None:
@@ -352,7 +362,7 @@ def test_visual_odometry_without_twist_keeps_its_pose() -> None:
     assert table["velocity_x_mps"].null_count == table.num_rows == 500
     assert table["x_m"].null_count == 0
     assert found.sensors["visual_odometry"].frame_id == "zed_camera"
-    assert any("only its pose is used" in text for text in found.report.findings)
+    assert "twist-zero" in codes(found)
 
 
 def test_settings_of_the_recipe_reach_their_role() -> None:
@@ -401,7 +411,9 @@ def test_a_step_of_all_clocks_divides_every_table() -> None:
     for role, table in found.tables.items():
         epoch = table["epoch"].to_numpy()
         np.testing.assert_array_equal(epoch == 1, table["log_time_ns"].to_numpy() >= START + 5 * S, err_msg=role)
-    assert any("steps by +7.000 s" in text for text in found.report.findings)
+    (step,) = select_findings(found.report.findings, "clock-step")
+    assert step.numbers["step_s"] == 7.0
+    assert step.span_s == pytest.approx((5.0, 5.0), abs=0.1)
 
 
 def test_rows_of_power_that_carry_nothing_are_counted() -> None:
@@ -443,20 +455,20 @@ def test_a_counter_of_energy_is_power_by_the_stamps_that_rule(*, stepped: bool) 
     within = np.diff(epoch) == 0
     np.testing.assert_allclose((watt[1:] * np.diff(stamp_s))[within], np.diff(joule)[within], rtol=1e-5)
     assert found.power_averaged
-    assert not any("set aside" in line for line in found.report.findings)
+    assert "power-values-excluded" not in codes(found)
 
 
-@pytest.mark.parametrize(("setting", "averaged", "said"), [("auto", False, "nobody knows"), ("yes", True, None)])
+@pytest.mark.parametrize(("setting", "averaged", "severities"), [("auto", False, ["warning"]), ("yes", True, [])])
 def test_averaging_that_nobody_knows_and_no_motion_tells_is_asked(
-    *, setting: str, averaged: bool, said: str | None
+    *, setting: str, averaged: bool, severities: list[str]
 ) -> None:
     slow = message_table(11, 1.0, frame=None, power_v=full(11, 28.0), power_a=6.0 + np.cos(np.arange(11)))
     topics = {**husky(), "/lowstate": ("unitree_go/msg/LowState", slow)}
     del topics["/left/battery"], topics["/right/battery"]
     found = read(topics, power_averaged=setting)
     assert found.power_averaged == averaged
-    asked = [line for line in found.report.findings if "nobody knows whether its values are means" in line]
-    assert bool(asked) == (said is not None)
+    assumed = select_findings(found.report.findings, "power-averaging-assumed")
+    assert [of.severity for of in assumed] == severities
 
 
 def test_a_gnss_message_of_ones_own_is_read_by_the_fields_the_recipe_names():
@@ -502,10 +514,11 @@ def test_a_pose_is_placed_by_its_crs_and_stands_in_for_the_fixes():
     np.testing.assert_allclose(placed.tables["pose"]["lat_deg"].to_numpy(), lat, atol=1e-11)
     assert placed.tables["pose"]["alt_m"].to_pylist() == [640.0] * 100
     assert placed.tables["pose"]["east_var_m2"].to_pylist() == pytest.approx([0.0004] * 100)
-    assert any("/slam/pose stands in for GNSS" in line for line in placed.report.findings)
+    assert "pose-used-as-gnss" in codes(placed)
+    assert "pose-not-georeferenced" not in codes(placed)
     local = read(topics, topics={"pose": ["/slam/pose"]})
     assert local.tables["pose"]["lon_deg"].null_count == 100
-    assert any("segments, but no samples" in line for line in local.report.findings)
+    assert "pose-not-georeferenced" in codes(local)
     for crs, said in (("EPSG:4326", "not projected"), ("MTM 7", "not a coordinate reference system")):
         with pytest.raises(RecipeError, match=said):
             read(topics, topics={"pose": ["/slam/pose"]}, pose_crs=crs)

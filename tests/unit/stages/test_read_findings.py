@@ -3,13 +3,15 @@
 import numpy as np
 import pytest
 
-from tcpipe.logs.clocks import ON_SIMULATED_CLOCK, Settled, Timeline
+from tcpipe.logs.clocks import Settled, Timeline
 from tcpipe.logs.messages import Readings
 from tcpipe.logs.roles import PlayedRole, RoleAssignment
+from tcpipe.logs.simulated_clock import SimulatedClock
 from tcpipe.power.readings import PowerReadings
 from tcpipe.stages.read_findings import read_findings
 from tcpipe.stages.read_sources import TopicReadings
 from tcpipe.tables.facts import ClockStep, PowerSign
+from tcpipe.tables.findings import Subject, make_finding
 from tcpipe.tables.levels import Sensor
 
 COUNT = 200
@@ -19,7 +21,7 @@ SENSOR = Sensor("/fix", "sensor_msgs/msg/NavSatFix", "gps", "the only one", plac
 def timeline(**said):
     stamp_ns = np.arange(COUNT, dtype=np.int64) * 100_000_000
     told = {"row": np.arange(COUNT), "stamp_ns": stamp_ns, "epoch": np.zeros(COUNT, np.int16), "source": "header"}
-    return Timeline(**{**told, "why": "its stamps are good", "offset_s": 0.5, **said})
+    return Timeline(**{**told, "why": "header-follows-log-time", "offset_s": 0.5, **said})
 
 
 def source(*, role="gnss", header=True, **said):
@@ -28,10 +30,10 @@ def source(*, role="gnss", header=True, **said):
     return TopicReadings("/fix", role, SENSOR.type_name, COUNT, {}, found)
 
 
-def read(topic=None, clock=None, *, steps=(), power=None, warnings=(), timelines=None):
+def read(topic=None, clock=None, *, steps=(), power=None, findings=(), timelines=None, simulated=None):
     roles = {"gnss": PlayedRole("gnss", ("/fix",), SENSOR.type_name, "the only one")}
-    assignment = RoleAssignment("husky", "its topics", roles, {"/other": "it is slower"}, warnings=warnings)
-    clocks = Settled({"/fix": clock or timeline()} if timelines is None else timelines, list(steps))
+    assignment = RoleAssignment("husky", "its topics", roles, {"/other": "it is slower"}, findings=findings)
+    clocks = Settled({"/fix": clock or timeline()} if timelines is None else timelines, list(steps), simulated)
     return read_findings(
         assignment,
         [topic or source()],
@@ -42,9 +44,13 @@ def read(topic=None, clock=None, *, steps=(), power=None, warnings=(), timelines
     )
 
 
+def codes(report):
+    return [of.code for of in report.findings]
+
+
 def test_facts_of_a_plain_topic():
     found = read()
-    assert found.warnings == ()
+    assert found.findings == ()
     facts = found.facts
     assert (facts.robot.name, facts.left_out, facts.epochs) == ("husky", {"/other": "it is slower"}, 1)
     assert (facts.time_offset_s, facts.power) == ({"gnss": 0.25}, None)
@@ -58,55 +64,54 @@ def test_facts_of_a_plain_topic():
 
 @pytest.mark.parametrize(("lost", "said"), [(2, False), (3, True)])
 def test_unused_messages_are_told_beyond_one_in_a_hundred_whoever_dropped_them(lost, said):
-    lines = read(source(dropped={"not_gga": 150, "no_fix": lost - 1}), timeline(dropped={"repeated": 1})).warnings
-    assert (len(lines) == 1) == said
+    found = read(source(dropped={"not_gga": 150, "no_fix": lost - 1}), timeline(dropped={"repeated": 1})).findings
+    assert (len(found) == 1) == said
     if said:
-        assert lines[0] == "gnss: /fix: 3 of 200 messages are not used (no_fix 2, repeated 1)"
-
-
-def test_fixes_of_which_none_is_used_place_no_track():
-    nothing = source(dropped={"no_fix": COUNT}, row=np.arange(0))
-    assert read(nothing).warnings[0].endswith(": the track lies in a local frame and cannot be placed on a map")
-    assert "local frame" not in read(source(dropped={"no_fix": COUNT})).warnings[0]
-    for role in ("command", "imu"):
-        assert "local frame" not in read(source(role=role, dropped={"invalid": COUNT}, row=np.arange(0))).warnings[0]
+        assert (found[0].code, found[0].subject) == ("messages-unused", Subject("role", "gnss"))
+        assert found[0].names == {"topic": "/fix", "reasons": "no_fix, repeated"}
+        counts = {"no_fix_count": 2.0, "repeated_count": 1.0}
+        assert found[0].numbers == {"unused_fraction": 3 / 200, "messages_count": 200.0, **counts}
 
 
 def test_a_topic_whose_time_is_the_recorders_says_why_if_it_has_stamps():
-    by_log = timeline(source="log", why="its header stamps stand still")
-    assert read(source(), by_log).warnings == ("gnss: /fix: log time rules, since its header stamps stand still",)
-    assert read(source(header=False), by_log).warnings == ()
+    by_log = timeline(source="log", why="header-repeats")
+    (found,) = read(source(), by_log).findings
+    assert (found.code, found.severity, found.names["reason"]) == ("log-time-used", "warning", "header-repeats")
+    assert read(source(header=False), by_log).findings == ()
+    assert read(source(), timeline(source="log", why="recipe")).findings[0].severity == "note"
 
 
 def test_stamps_that_were_replaced_or_moved_are_told():
-    replaced, moved = read(source(), timeline(notes={"stamps_replaced": 4}, moved_s=(0.0, -0.5))).warnings
-    assert replaced == "gnss: /fix: 4 header stamps are unset or wrong and were taken from the log time"
-    assert moved.startswith(
-        "gnss: /fix: its clock is not the other topics': its stamps were moved by -0.500 s in epoch 1"
-    )
-    assert read(source(), timeline(notes={"stamps_replaced": 0})).warnings == ()
+    replaced, moved = read(source(), timeline(notes={"stamps_replaced": 4}, moved_s=(0.0, -0.5))).findings
+    assert (replaced.code, replaced.numbers) == ("stamps-replaced", {"stamps_count": 4.0})
+    assert (moved.code, moved.numbers) == ("topic-clock-offset", {"moved_s": -0.5, "clock_epoch": 1.0})
+    assert read(source(), timeline(notes={"stamps_replaced": 0})).findings == ()
 
 
 def test_the_years_between_a_simulation_and_the_wall_clock_are_no_delay_to_be_set():
-    why = f"it has no stamps; {ON_SIMULATED_CLOCK}"
-    (line,) = read(source(header=False), timeline(source="log", why=why, moved_s=(-1.7e9,))).warnings
-    assert line == f"gnss: /fix: log time rules, since {why}"
-    assert read(source(header=False), timeline(source="log", why=why, moved_s=(0.0,))).warnings == ()
+    stamp_ns = np.array([10**9, 10**10])
+    clock = SimulatedClock(stamp_ns, stamp_ns, frozenset({"/odom"}))
+    by_log = {"source": "log", "why": "no-header"}
+    (found,) = read(source(header=False), timeline(**by_log, moved_s=(-1.7e9,)), simulated=clock).findings
+    assert (found.code, found.names["reason"]) == ("log-time-used", "no-header")
+    assert read(source(header=False), timeline(**by_log, moved_s=(0.0,)), simulated=clock).findings == ()
 
 
 def test_a_topic_without_a_timeline_plays_no_part_but_says_what_it_lacks():
-    found = read(source(warnings=("it is odd",), dropped={"no_fix": COUNT}), timelines={})
-    assert found.warnings[0] == "gnss: /fix: it is odd"
-    assert len(found.warnings) == 2
+    odd = make_finding("geoid-separation-missing", Subject("role", "gnss"))
+    found = read(source(findings=(odd,), dropped={"no_fix": COUNT}), timelines={})
+    assert codes(found) == ["geoid-separation-missing", "messages-unused"]
     assert found.facts.roles["gnss"].topics == {}
 
 
 def test_steps_of_the_clock_divide_epochs_and_each_warning_comes_once():
-    step = ClockStep(1000, -2.5, ("/fix", "/imu"))
-    found = read(steps=[step, step], warnings=("no camera", "no camera"))
-    assert len(found.warnings) == 2
-    assert found.warnings[0] == "no camera"
-    assert "steps by -2.500 s at log time 1000 ns on /fix, /imu: a new epoch begins there" in found.warnings[1]
+    step = ClockStep(3_000_000_000, -2.5, ("/fix", "/imu"))
+    missing = make_finding("no-imu", Subject("role", "imu"))
+    found = read(steps=[step, step], findings=(missing, missing))
+    assert codes(found) == ["no-imu", "clock-step"]
+    assert found.findings[1].numbers == {"step_s": -2.5, "at_s": 3.0}
+    assert found.findings[1].span_s == (3.0, 3.0)
+    assert found.findings[1].names == {"topics": "/fix, /imu"}
     assert (found.facts.epochs, found.facts.clock_steps) == (3, (step, step))
     assert read(steps=[step]).facts.epochs == 2
 
@@ -119,11 +124,12 @@ def test_a_rate_is_that_inside_epochs_and_unknown_of_one_row():
     assert read(clock=single).facts.roles["gnss"].topics["/fix"].rate_hz is None
 
 
-POWER = PowerReadings(averaged=True, warnings=("power: odd",), current_sign="drawn", includes=("computers",))
+ODD = make_finding("power-includes-loads", Subject("role", "power"), names={"loads": "computers"})
+POWER = PowerReadings(averaged=True, findings=(ODD,), current_sign="drawn", includes=("computers",))
 
 
 def test_notes_that_count_nothing_are_left_out_and_powers_are_told():
     found = read(source(notes={"zero": 0, "set_aside": 3}), power=POWER)
     assert found.facts.roles["gnss"].topics["/fix"].notes == {"set_aside": 3}
     assert found.facts.power == PowerSign("drawn", averaged=True, includes=("computers",))
-    assert found.warnings == ("power: odd",)
+    assert found.findings == (ODD,)

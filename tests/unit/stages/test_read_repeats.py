@@ -11,7 +11,7 @@ from tcpipe.simulation.faults import Faults
 from tcpipe.simulation.scenarios import small_world
 from tcpipe.simulation.sensors import Noise, Power, Sensors, record
 from tcpipe.stages.power_rails import rails_of
-from tcpipe.stages.read_repeats import repeats_warnings, without_repeats
+from tcpipe.stages.read_repeats import find_repeats, without_repeats
 from tcpipe.tables.levels import Streams
 
 COUNT = 4000
@@ -61,8 +61,8 @@ def test_a_voltage_alone_on_its_topic_is_told_by_itself():
     rails, repeats = read({"battery": both})
     assert rates_hz(rails) == [20.0, 1.0]
     assert [each.quantity for each in repeats] == ["voltage"]
-    (line,) = repeats_warnings(repeats, averaged=False)
-    assert "too slowly" not in line
+    (found,) = find_repeats(repeats)
+    assert (found.code, found.names["quantity"]) == ("power-readings-repeated", "voltage")
 
 
 @pytest.mark.parametrize(

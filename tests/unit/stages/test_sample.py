@@ -9,6 +9,7 @@ from tcpipe.errors import TableError
 from tcpipe.recipe import SampleConfig
 from tcpipe.stages.sample import metres_lost, sample_segments
 from tcpipe.tables.bits import Loss
+from tcpipe.tables.findings import Subject
 from tcpipe.terrain.grid import MapGrid
 
 CRS = "EPSG:32633"
@@ -120,10 +121,14 @@ def test_class_names_and_maps_without_classes():
 def test_pitches_that_do_not_fit_the_map_are_said():
     segments = drive([(500_002.0, 5_199_990.0)])
     source = random_map()
-    assert "25 mm is finer than the map's of 50 mm" in sample(segments, source).warnings[0]
-    assert sample(segments, source, patch_px=20).warnings == ()
-    assert sample(segments, source, patch_px=10).warnings == ()
-    assert "aliased" in sample(segments, source, patch_px=8).warnings[0]
+    (finer,) = sample(segments, source).findings
+    assert (finer.code, finer.subject) == ("patch-pixels-unlike-map", Subject("map", source.name))
+    assert finer.numbers == {"patch_pixel_m": 0.025, "map_pixel_m": 0.05}
+    assert finer.remedies[0].recipe == {"sample": {"patch_px": 20}}
+    assert sample(segments, source, patch_px=20).findings == ()
+    assert sample(segments, source, patch_px=10).findings == ()
+    (coarser,) = sample(segments, source, patch_px=8).findings
+    assert coarser.numbers["patch_pixel_m"] > 2.0 * coarser.numbers["map_pixel_m"]
 
 
 @pytest.mark.parametrize(
@@ -142,7 +147,7 @@ def test_a_datum_shift_known_only_roughly_is_said(gnss_crs, map_crs, doubtful):
     source = ArrayMap(grid, {"height": np.zeros((200, 200), np.float32)})
     segments = segments_from(map_crs, np.array([(600_004.0, 6_099_995.0)]), np.array([90.0]), gnss_crs=gnss_crs)
     got = sample(segments, source, gnss_crs, patch_px=20)
-    assert any("datum" in note and "gnss_crs" in note for note in got.warnings) == doubtful
+    assert bool({"datum-shift-rough", "datum-shift-unknown"} & {of.code for of in got.findings}) == doubtful
     assert got.kept.tolist() == [0]
 
 

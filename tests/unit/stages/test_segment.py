@@ -9,6 +9,7 @@ from tcpipe.recipe import GateConfig, SegmentConfig
 from tcpipe.stages.gate import gate_track
 from tcpipe.stages.segment import segment_track
 from tcpipe.tables.columns import floats, integers
+from tcpipe.tables.findings import select_findings
 
 T = np.arange(0, 60, 0.05)
 
@@ -157,7 +158,16 @@ def test_mean_command_of_a_segment():
 def test_a_run_that_never_moves_says_so():
     segments = cut(straight_track(np.zeros(len(T))))
     assert segments.table.num_rows == 0
-    assert any("the robot never moved" in text for text in segments.info.report.findings)
+    (finding,) = select_findings(segments.info.report.findings, "robot-did-not-move")
+    assert finding.numbers == {"driven_m": 0.0}
+
+
+def test_a_run_without_segments_says_why_and_what_it_lost():
+    segments = cut(straight_track(np.full(len(T), -0.8), forward_mps=np.full(len(T), -0.8)))
+    (why,) = select_findings(segments.info.report.findings, "no-segments")
+    assert why.names == {"reason": "reversing"}
+    (lost,) = select_findings(segments.info.report.findings, "lost-reversing")
+    assert lost.numbers["lost_fraction"] == pytest.approx(why.numbers["lost_m"] / why.numbers["driven_m"])
 
 
 @pytest.mark.parametrize("count", [0, 1, 2])

@@ -113,7 +113,8 @@ def test_thousands_of_polygons_on_one_place_are_told_without_holding_each_agains
     features = [{"type": "Feature", "properties": {"class": 4 + n % 2}, "geometry": corners} for n in range(3000)]
     (tmp_path / "t.geojson").write_text(json.dumps({"type": "FeatureCollection", "features": features}))
     summary = build_map(tmp_path / "m.zarr", name="m", height=height, terrain=tmp_path / "t.geojson")
-    assert any("overlap by at least" in note for note in summary.warnings)
+    (overlap,) = [of for of in summary.findings if of.code == "polygons-overlap"]
+    assert overlap.numbers["overlap_m2"] > 1e6
 
 
 TABLES = {

@@ -29,7 +29,6 @@ FACTS = MapFacts(
     height_min_m=0.0,
     height_max_m=0.0,
     class_share={},
-    warnings=(),
     classes_from="default",
     inputs=MapInputs(),
 )

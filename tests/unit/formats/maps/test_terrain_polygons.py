@@ -12,6 +12,7 @@ from rasterio import Affine
 from tcpipe.errors import MapError
 from tcpipe.formats.maps.building import build_map
 from tcpipe.formats.maps.map_files import open_map
+from tcpipe.tables.findings import Subject
 
 WORLD = World("EPSG:32633", 560_000.0, 5_215_000.0, side_m=40.0)
 TO_LONLAT = pyproj.Transformer.from_crs(WORLD.crs, "EPSG:4326", always_xy=True)
@@ -80,7 +81,9 @@ def test_pixels_take_the_class_their_centre_lies_in_and_later_ones_lie_on_top(tm
     assert sorted(np.unique(wanted)) == [0, 4, 5, 7]
     np.testing.assert_array_equal(found, wanted)
     assert summary.covered["terrain"] == pytest.approx((wanted > 0).mean(), abs=1e-4)
-    assert any("overlap by 1" in note and "paved road over grass" in note for note in summary.warnings)
+    (overlap,) = [of for of in summary.findings if of.code == "polygons-overlap"]
+    assert overlap.names == {"above": "paved road", "below": "grass"}
+    assert 1.0 < overlap.numbers["overlap_m2"] < 2000.0
 
 
 def test_numbers_are_values_of_the_table_first_and_ids_else(tmp_path, height):
@@ -96,7 +99,8 @@ def test_numbers_are_values_of_the_table_first_and_ids_else(tmp_path, height):
 def test_a_national_map_says_how_well_its_datum_is_known(tmp_path, height):
     path = collection(tmp_path, feature(FIELD, **{"class": "mud"}))
     summary = build_map(tmp_path / "n.zarr", name="n", height=height, terrain=path, crs="EPSG:31256")
-    assert any(note.startswith("t.geojson: the shift between the datums WGS 84 and MGI") for note in summary.warnings)
+    shifts = {of.subject: of.names for of in summary.findings if of.code == "datum-shift-rough"}
+    assert shifts[Subject("layer", "terrain")] == {"source": "WGS 84", "target": "MGI"}
     source = open_map(tmp_path / "n.zarr")
     assert source.read("terrain", 150, 151, 150, 151).tolist() == [[5]]
 

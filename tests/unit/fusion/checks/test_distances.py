@@ -44,9 +44,14 @@ def test_of_three_the_one_that_differs_is_wrong():
 def test_of_two_the_command_decides_or_nobody():
     wrong = judged(path(TWIST), wheel_odometry=TWIST * [3.6, 1], **{COMMAND: TWIST * [1.2, 1]})
     assert list(wrong) == ["wheel_odometry"]
+    assert (wrong["wheel_odometry"].code, wrong["wheel_odometry"].names["unit"]) == ("unit-suspected", "km/h")
+    assert "suspect" not in wrong["wheel_odometry"].names
     both = judged(path(TWIST), wheel_odometry=TWIST * [3.6, 1])
     assert set(both) == {"gnss", "wheel_odometry"}
-    assert all("nothing tells" in why for why in both.values())
+    assert {role: of.names["suspect"] for role, of in both.items()} == {
+        "gnss": "wheel_odometry",
+        "wheel_odometry": "gnss",
+    }
 
 
 def test_wheels_that_turn_while_the_robot_stands_are_stuck_not_wrong():

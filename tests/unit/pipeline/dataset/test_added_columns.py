@@ -9,12 +9,13 @@ from synthetic_store import add_run, add_world, lanes, segments
 from tcpipe.dataset import open_dataset
 from tcpipe.errors import DatasetError, RecipeError
 from tcpipe.formats.dataset_files import read_card, read_samples
-from tcpipe.pipeline.dataset.added_columns import narrow_patches
+from tcpipe.pipeline.dataset.added_columns import find_narrow_patches
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.verify import verify
 from tcpipe.recipe import CovariateConfig, Recipe, SampleConfig, SplitConfig
 from tcpipe.robots.profiles import Robot
 from tcpipe.store import Store, open_store
+from tcpipe.tables.findings import Subject, select_findings
 
 START_NS = 1_760_000_000 * 10**9
 DAY_NS = 86_400 * 10**9
@@ -47,6 +48,12 @@ def weather(path, days=4):
     return path
 
 
+def missing(result):
+    """Return how many of how many samples lack the values of a table or a column."""
+    found = select_findings(result.findings, "covariates-missing")
+    return {of.subject: (of.numbers["missing_count"], of.numbers["sample_count"]) for of in found}
+
+
 @pytest.mark.parametrize("file_format", ["zarr", "parquet"])
 def test_tags_and_covariates_are_columns_of_the_samples(store, tmp_path, file_format):
     result = build(store, tmp_path / "out", covariates=weather(tmp_path / "weather.csv"), file_format=file_format)
@@ -59,7 +66,7 @@ def test_tags_and_covariates_are_columns_of_the_samples(store, tmp_path, file_fo
         assert row["tag_driver"] == (7.0 if day else None)
         assert row["weather_temp_c"] == 10.0 + day
         assert row["weather_ground"] == (None if day == 1 else "dry")
-    assert "weather.csv: samples whose row has no value: weather_ground 20" in result.warnings
+    assert missing(result) == {Subject("column", "weather_ground"): (20, 80)}
     card = read_card(tmp_path / "out")
     assert [(of.name, of.rows, of.samples_without) for of in card.covariates] == [
         ("weather.csv", 4, {"weather_temp_c": 0, "weather_ground": 20})
@@ -74,10 +81,7 @@ def test_tags_and_covariates_are_columns_of_the_samples(store, tmp_path, file_fo
 
 def test_samples_that_no_row_reaches_are_null_counted_and_said(store, tmp_path):
     result = build(store, tmp_path / "out", covariates=[weather(tmp_path / "weather.csv", days=2)])
-    told = [line for line in result.warnings if line.startswith("weather.csv: no row reaches")]
-    assert len(told) == 1
-    assert "40 of 80 samples (run c, d): its rows are of 2025-10-09T08:43:20Z to 2025-10-10T08:43:20Z" in told[0]
-    assert "older than 7200 s (recipe key covariates.max_age_s)" in told[0]
+    assert missing(result) == {Subject("file", "weather.csv"): (40, 80), Subject("column", "weather_ground"): (20, 80)}
     older = Recipe(covariates=CovariateConfig(max_age_s=3e5))
     build(store, tmp_path / "out", covariates=tmp_path / "weather.csv", recipe=older, force=True)
     assert read_samples(tmp_path / "out")["weather_temp_c"].null_count == 0
@@ -110,7 +114,8 @@ def test_a_tag_that_is_a_word_in_one_run_is_text_in_all(tmp_path, store):
     table = segments("e", *lanes(np.array([12.0]), -10.0, 10.0), start_ns=START_NS + 5 * DAY_NS)
     add_run(mine, "e", table, tags={"season": "summer", "load_kg": "heavy"})
     result = build(mine, tmp_path / "out")
-    assert "tag load_kg: 'heavy' is no number, others are; its column tag_load_kg is text" in result.warnings
+    (found,) = select_findings(result.findings, "column-is-text")
+    assert (found.subject, found.names["example"]) == (Subject("tag", "load_kg"), "heavy")
     assert set(read_samples(tmp_path / "out")["tag_load_kg"].to_pylist()) == {"0", "12.5", "2e1", "heavy"}
 
 
@@ -140,10 +145,12 @@ def test_a_holdout_wants_a_tag_that_all_runs_carry(store, tmp_path):
 
 def test_a_robot_wider_than_a_patch_or_of_unknown_width_is_named(store, tmp_path):
     known = {"husky": Robot(width_m=0.67), "warthog": Robot(width_m=1.38), "dingo": Robot()}
-    told = narrow_patches(["husky", "warthog", "dingo", "mine", "husky"], known, patch_m=1.0)
-    assert [line.split(":")[0] for line in told] == ["robot dingo", "robot mine", "robot warthog"]
-    assert "is 1.38 m wide, patches 1 m" in told[2]
-    assert narrow_patches(["warthog"], known, patch_m=1.5) == []
+    unknown, narrow = "robot-width-unknown", "patch-narrower-than-robot"
+    found = find_narrow_patches(["husky", "warthog", "dingo", "mine", "husky"], known, patch_m=1.0)
+    assert [(of.code, of.subject.name) for of in found] == [(unknown, "dingo"), (unknown, "mine"), (narrow, "warthog")]
+    assert found[2].numbers == {"width_m": 1.38, "patch_m": 1.0}
+    assert found[2].remedies[0].recipe == {"sample": {"patch_m": 1.38}}
+    assert find_narrow_patches(["warthog"], known, patch_m=1.5) == []
 
 
 def test_wider_patches_lie_around_the_same_metre(store, tmp_path):

@@ -14,6 +14,7 @@ from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.verify import verify
 from tcpipe.recipe import LabelConfig, Recipe, SplitConfig
 from tcpipe.store import Store, open_store
+from tcpipe.tables.findings import Subject, select_findings
 
 
 @pytest.fixture(scope="module")
@@ -46,6 +47,15 @@ def build(store, tmp_path, *, page=False, **keywords):
         if not page:
             patch.setattr("tcpipe.pipeline.dataset.build.dataset_report", lambda *_: "<!doctype html>")
         return build_dataset(tmp_path / "out", store=store.root, **{"recipe": Recipe(), **keywords})
+
+
+def twice(result):
+    """Return each run that was recorded twice, by which other, and how many of how many segments."""
+    found = select_findings(result.findings, "drive-recorded-twice")
+    return [
+        (of.subject.name, of.names["others"], of.numbers["duplicate_count"], of.numbers["segment_count"])
+        for of in found
+    ]
 
 
 def refused(store, tmp_path, error=DatasetError, **keywords):
@@ -98,11 +108,9 @@ def test_runs_of_another_recipe_are_left_out_and_named(store, tmp_path):
     assert "none ingested with this recipe" in refused(store, tmp_path)
     add(store)
     result = build(store, tmp_path)
-    line = result.problems[0]
-    assert line == (
-        f"1 of 2 runs have no ingestion under this recipe (they have {recipe_id(other, 'husky')}): b; "
-        "ingest their logs again: tcpipe ingest /logs/b.mcap"
-    )
+    (found,) = select_findings(result.findings, "run-ingested-otherwise")
+    assert (found.subject, found.names) == (Subject("run", "b"), {"what": "recipe", "has": recipe_id(other, "husky")})
+    assert [of.command for of in found.remedies] == ["tcpipe ingest /logs/b.mcap"]
     assert (result.samples, result.exit_code) == (20, 3)
 
 
@@ -111,7 +119,7 @@ def test_a_recording_under_two_names_counts_once(store, tmp_path):
     add(store, "copy", sha256="5ad0")
     result = build(store, tmp_path)
     assert result.samples == 20
-    assert "run copy: the same recording as run a; used once" in result.warnings
+    assert twice(result) == [("copy", "a", 20, 20)]
 
 
 def test_one_drive_recorded_twice_counts_once(store, tmp_path):
@@ -119,7 +127,7 @@ def test_one_drive_recorded_twice_counts_once(store, tmp_path):
     add(store, "b", start_ns=10**18 + 300_000_000)
     result = build(store, tmp_path)
     assert result.samples == 20
-    assert "run b: all 20 segments lie when and where those of run a do: the same drive; used once" in result.warnings
+    assert twice(result) == [("b", "a", 20, 20)]
     assert [run.run_id for run in open_dataset(tmp_path / "out").card.runs] == ["a"]
 
 
@@ -134,7 +142,8 @@ def test_a_recording_that_overlaps_another_counts_once_where_it_does(store, tmp_
     assert result.samples == 37
     assert np.diff(starts_m).min() > 0.9 * np.median(np.diff(starts_m))  # no metre of it twice
     assert result.ledger_m["recorded_twice"] == pytest.approx(20)
-    assert any("20 of " in line and "the same drive; used once" in line for line in result.warnings)
+    second, first = sorted(names, reverse=True)
+    assert twice(result) == [(second, first, 20, 30 if second == whole else 27)]
     assert sum(result.ledger_m.values()) == pytest.approx(30 + 27 + 5)
     assert verify(tmp_path / "out").problems == ()
 
@@ -144,7 +153,7 @@ def test_a_drive_that_was_recorded_in_two_pieces_is_one_and_a_short_one_after_it
     add(store, "b", x=(5.0, 7.0), start_ns=10**18 + 20 * 1_200_000_000 + 50_000_000)
     result = build(store, tmp_path)
     assert result.samples == 22
-    assert not any("the same drive" in line for line in result.warnings)
+    assert twice(result) == []
 
 
 def test_two_robots_at_one_time_and_one_robot_at_two_times_are_two_drives(store, tmp_path):
@@ -182,7 +191,8 @@ def test_no_power_is_no_sample(store, tmp_path):
     result = build(store, tmp_path, page=True)
     assert result.samples == 20
     assert result.ledger_m["no_power"] == pytest.approx(20)
-    assert "run a: without power: no label" in result.warnings
+    (found,) = select_findings(result.findings, "run-without-samples")
+    assert (found.subject, found.names) == (Subject("run", "a"), {"lacks": "power"})
     assert sum(result.ledger_m.values()) == pytest.approx(45)
 
 
@@ -305,7 +315,8 @@ def test_one_run_cannot_be_held_out_and_it_is_said(store, tmp_path):
     add(store)
     result = build(store, tmp_path, page=True, holdout="run")
     assert result.splits["test"] == 0
-    assert any("no sample tests" in problem for problem in result.problems)
+    (found,) = select_findings(result.findings, "split-empty")
+    assert (found.subject, found.names) == (Subject("split", "test"), {"reason": "one_run"})
     assert result.exit_code == 3
 
 

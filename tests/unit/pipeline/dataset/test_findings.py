@@ -1,4 +1,7 @@
-"""What ingest found reaches the dataset: by cause, with its runs and samples, and the doubtful as one number."""
+"""Findings reach the dataset: those of runs by code, its own, and one verdict; the page shows the worst first."""
+
+import re
+from dataclasses import replace
 
 import numpy as np
 import pyarrow as pa
@@ -7,51 +10,80 @@ from synthetic_store import add_run, add_world, lanes, segments
 
 from tcpipe.dataset import open_dataset
 from tcpipe.errors import DatasetError
-from tcpipe.formats.dataset_card import RunSource
+from tcpipe.formats.dataset_card import RunSource, group_dataset_findings, judge_dataset
+from tcpipe.formats.finding_lines import format_mixed_groups
 from tcpipe.pipeline.dataset.build import build_dataset
-from tcpipe.pipeline.dataset.findings import doubt_in_words, doubtful, findings_in_words, findings_of_runs
+from tcpipe.pipeline.dataset.findings import count_flagged, is_problem
+from tcpipe.pipeline.diff import diff
 from tcpipe.recipe import Recipe
 from tcpipe.store import open_store
 from tcpipe.tables.bits import Quality
+from tcpipe.tables.findings import Finding, Subject, make_finding, select_findings
 
-LATE = "gnss: its stamps seem {} s late against imu (± 0.01 s, by speed)"
-
-
-def run(run_id, samples, *warnings):
-    return RunSource(run_id, "r", "husky", (), "", warnings=warnings, samples=samples)
+ROLE = Subject("role", "command")
 
 
-def test_lines_that_differ_by_their_figures_are_one_cause():
-    runs = [run("a", 10, LATE.format("0.21"), "power: none"), run("b", 30, LATE.format("-1.3e-2")), run("c", 5)]
-    late, power = findings_of_runs(runs)
-    assert (late.example, late.runs, late.samples) == (LATE.format("0.21"), ("a", "b"), 40)
-    assert (power.runs, power.samples) == (("a",), 10)
-    assert findings_in_words((late, power)) == [
-        f"found at ingest of 2 runs (40 samples): {LATE.format('0.21')}",
-        "found at ingest of a (10 samples): power: none",
+def slow(fraction):
+    return make_finding("driven-below-limit", ROLE, slow_fraction=fraction, limit_mps=0.95, top_mps=0.5)
+
+
+def run(run_id, samples, *findings):
+    return RunSource(run_id, "r", "husky", (), "", findings=findings, samples=samples)
+
+
+def lines(*runs, own=()):
+    return format_mixed_groups(group_dataset_findings(own, {of.run_id: of.findings for of in runs}), more="inspect")
+
+
+def test_findings_of_one_code_are_one_line_with_how_many_runs_and_the_range():
+    first, more = lines(run("a", 10, slow(0.6)), run("b", 30, slow(0.9), make_finding("no-command", ROLE)), run("c", 5))
+    assert first == (
+        "warning: 2 of 3 runs: Most of the drive was commanded below the robot's maximum speed (command; 60 % to 90 %) "
+        "[driven-below-limit]"
+    )
+    assert more == "and 1 note: inspect"
+
+
+def test_the_worst_comes_first_and_at_most_eight_lines():
+    own = [
+        make_finding("split-empty", Subject("split", "train"), severity="error", names={"reason": "region_too_small"})
     ]
+    unknown = [Finding(f"code-{n}", "warning", ROLE, "kept") for n in range(12)]
+    told = lines(run("a", 1, *unknown), own=own)
+    assert told[0].startswith("error: train: no samples")
+    assert len(told) == 9
+    assert told[-1] == "and 5 more findings: inspect"
 
 
-def test_a_topic_of_another_name_is_no_other_cause():
-    lines = [f"gnss: {topic}: 53 of 2266 messages are not used" for topic in ("/a200_0000/fix", "/navsat/fix")]
-    (found,) = findings_of_runs([run("a", 1, lines[0]), run("b", 2, lines[1])])
-    assert found.samples == 3
-    assert len(findings_of_runs([run("a", 1, "power: at 1 Hz / averaged", "power: at 1 Hz or averaged")])) == 2
+def test_findings_of_the_dataset_on_runs_count_runs_that_are_left_out():
+    gone = [make_finding("run-gone", Subject("run", name)) for name in ("x", "y")]
+    assert lines(run("a", 1), own=gone)[0] == "warning: 2 of 3 runs: Run no longer in the store (x, y) [run-gone]"
+    assert lines(run("a", 1), own=gone[:1])[0] == "warning: x: no longer in the store [run-gone]"
 
 
-def test_many_causes_are_cut_and_counted():
-    lines = findings_in_words(findings_of_runs([run("a", 1, *(f"cause {'x' * n}" for n in range(1, 12)))]))
-    assert len(lines) == 9
-    assert lines[-1].startswith("found at ingest: 3 more causes")
+def test_the_verdict_is_by_runs_that_have_samples_with_one_reason_a_code():
+    bad = make_finding("no-segments", Subject("run", "b"), names={"reason": "x"}, driven_m=9.0, lost_m=9.0)
+    verdict = judge_dataset((), [run("a", 9, slow(0.6)), run("c", 9, slow(0.9)), run("b", 0, bad)], ())
+    assert (verdict.position, verdict.time, verdict.energy) == ("usable", "usable with care", "usable")
+    assert len(verdict.reasons) == 1
 
 
-def test_any_bit_makes_a_sample_doubtful_once():
+def test_a_bit_that_every_sample_carries_is_not_counted():
     both = Quality.NEAR_GAP | Quality.CURVED
-    found = doubtful(pa.chunked_array([pa.array([0, int(both), int(Quality.CURVED), 0], pa.uint16())]))
+    found = count_flagged(pa.chunked_array([pa.array([0, int(both), int(Quality.CURVED), 0], pa.uint16())]))
     assert (found.samples, found.share, found.by_bit) == (2, 0.5, {"near_gap": 1, "curved": 2})
-    assert doubt_in_words(found, 4) == "doubtful: 2 of 4 samples (50.0 %) carry a quality flag: 2 curved, 1 near gap"
-    nothing = doubtful(pa.chunked_array([pa.array([], pa.uint16())]))
+    bits = int(Quality.NO_COMMAND) + np.array([0, 0, 0, int(Quality.CURVED)])
+    found = count_flagged(pa.chunked_array([pa.array(bits, pa.uint16())]))
+    assert (found.samples, found.share, found.by_bit) == (1, 0.25, {"no_command": 4, "curved": 1})
+    nothing = count_flagged(pa.chunked_array([pa.array([], pa.uint16())]))
     assert (nothing.samples, nothing.share, nothing.by_bit) == (0, 0.0, {})
+
+
+def test_a_problem_is_one_unless_it_was_made_a_note():
+    gone = make_finding("run-gone", Subject("run", "a"))
+    assert is_problem(gone)
+    assert not is_problem(replace(gone, severity="note"))
+    assert not is_problem(slow(0.6))
 
 
 def test_where_no_position_is_sure_enough_it_is_said_how_sure_and_what_ingest_found(tmp_path):
@@ -60,14 +92,15 @@ def test_where_no_position_is_sure_enough_it_is_said_how_sure_and_what_ingest_fo
     table = segments("a", *lanes([0.0], -10.0, 10.0))
     place = table.column_names.index("position_std_m")
     table = table.set_column(place, table.schema.field(place), pa.array(np.full(table.num_rows, 0.3)))
-    add_run(store, "a", table, warnings=(LATE.format(0.4),))
+    add_run(store, "a", table, findings=(slow(0.6),))
     with pytest.raises(DatasetError) as caught:
         build_dataset(tmp_path / "out", store=store.root, recipe=Recipe())
     nothing, how_sure, found = caught.value.problems
     assert "20 m position uncertain" in nothing
     assert "known to 0.30 m" in how_sure
     assert "max_position_std_m" in how_sure
-    assert found == f"found at ingest of a (0 samples): {LATE.format(0.4)}"
+    assert found.startswith("warning: a: ")
+    assert "[driven-below-limit]" in found
 
 
 @pytest.fixture(scope="module")
@@ -78,19 +111,43 @@ def built(tmp_path_factory):
     for number, run_id in enumerate("ab"):
         table = segments(run_id, *lanes([4.0 * number], -10.0, 10.0), start_ns=number * 10**12)
         place = table.column_names.index("quality")
-        bits = np.where(np.arange(table.num_rows) < 5 * number, int(Quality.WEAK_GNSS), 0)
+        bits = np.where(np.arange(table.num_rows) < 5 * number, int(Quality.WEAK_GNSS), 0) | int(Quality.NO_COMMAND)
         table = table.set_column(place, table.schema.field(place), pa.array(bits, table.schema.field(place).type))
-        add_run(store, run_id, table, warnings=(LATE.format(0.1 * number + 0.1),))
+        add_run(store, run_id, table, findings=(slow(0.1 * number + 0.6),))
     return build_dataset(directory / "out", store=store.root, recipe=Recipe()), directory / "out"
 
 
-def test_they_stand_in_the_commands_answer_the_card_the_page_and_what_is_opened(built):
+def test_they_stand_in_the_commands_answer_the_card_and_what_is_opened(built):
     result, place = built
-    assert "doubtful: 5 of 40 samples (12.5 %) carry a quality flag: 5 weak gnss" in str(result)
-    assert f"found at ingest of 2 runs (40 samples): {LATE.format(0.1)}" in str(result)
+    assert "warning: 2 of 2 runs: Most of the drive was commanded below" in str(result)
+    assert "verdict: time usable with care; position and energy usable" in str(result)
     card = open_dataset(place).card
     assert (card.doubtful.samples, card.doubtful.share) == (5, 0.125)
-    assert [(finding.runs, finding.samples) for finding in card.findings] == [(("a", "b"), 40)]
-    page = (place / "report.html").read_text()
-    assert "12.5 %" in page
-    assert "What ingest found of the runs" in page
+    (flagged,) = select_findings(card.findings, "samples-flagged")
+    assert (flagged.severity, flagged.names) == ("warning", {"flag": "weak_gnss"})
+    assert card.findings_by_run == result.findings_by_run == {"a": (slow(0.6),), "b": (slow(0.7),)}
+    assert card.verdict == result.verdict
+
+
+def test_the_page_has_one_verdict_with_the_worst_first_and_no_praise(built):
+    page = (built[1] / "report.html").read_text()
+    box = page.split('aria-label="Verdict"')[1].split("</section>")[0]
+    assert re.findall(r"(position|time|energy) <b>([a-z ]+)</b>", box) == [
+        ("position", "usable"), ("time", "usable with care"), ("energy", "usable"),
+    ]  # fmt: skip
+    severities = re.findall(r'<li class="(error|warning|note)">', box)
+    assert severities == sorted(severities, key=["error", "warning", "note"].index)
+    assert "Good" not in box
+    assert f'"flags":{int(Quality.WEAK_GNSS)}' in page  # the bit of all samples colours nothing
+
+
+def test_a_difference_between_two_datasets_names_findings_by_code_and_subject(built, tmp_path):
+    store = open_store(tmp_path / "store", create=True)
+    add_world(store, tmp_path)
+    add_run(store, "a", segments("a", *lanes([0.0], -10.0, 10.0)), findings=(make_finding("no-command", ROLE),))
+    build_dataset(tmp_path / "out", store=store.root, recipe=Recipe())
+    found = diff(built[1], tmp_path / "out")
+    assert "driven-below-limit" in {of.code for of in found.findings_gone}
+    assert {of.subject for of in select_findings(found.findings_new, "no-command")} == {ROLE}
+    assert not select_findings((*found.findings_gone, *found.findings_new), "few-samples")
+    assert "gone: warning: command: " in str(found) or "gone: warning: " in str(found)

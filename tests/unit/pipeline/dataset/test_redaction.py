@@ -5,6 +5,7 @@ import json
 import re
 import struct
 from dataclasses import replace
+from typing import get_args
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -15,14 +16,29 @@ from written_bytes import written_bytes
 
 from tcpipe.errors import DatasetError
 from tcpipe.formats.dataset_files import read_card, read_samples
+from tcpipe.formats.json_files import to_json
 from tcpipe.pipeline.dataset.build import build_dataset
-from tcpipe.pipeline.dataset.redaction import PLANE, plane_per_chord, what_is_told
+from tcpipe.pipeline.dataset.redaction import PLANE, plane_per_chord, redact_findings, what_is_told
 from tcpipe.pipeline.verify import verify
 from tcpipe.store import open_store
+from tcpipe.tables.catalogue import read_catalogue
+from tcpipe.tables.findings import Finding, Remedy, Subject, SubjectKind, make_finding, select_findings
 
 NAMES = ("gnss_roof", "robotlab7", "imu_link_b", "anna.field", "nas03", "frame-left.07", "übung")
 """A topic without a slash, bare hosts, frames, a user, in no form that a pattern could find."""
-LEAKING = tuple(f"power: {name}: recorded on {name} by {name}" for name in NAMES)
+LEAKING = tuple(
+    Finding(
+        "topic-not-used",
+        "warning",
+        Subject(kind, name),
+        "kept",
+        span_s=(7041.5, 7042.5),
+        numbers={"longitude_deg": 15.43},
+        names={"host": name},
+        remedies=(Remedy("log_in", recipe={"read.topics": {"gnss": [name]}}, command=f"scp {name}:/log ."),),
+    )
+    for name, kind in zip(NAMES, ("topic", "log", "frame", "call", "file", "frame", "run"), strict=True)
+)
 
 
 @pytest.fixture(scope="module")
@@ -38,19 +54,24 @@ def built(tmp_path_factory):
         start, end = (np.concatenate(ends) for ends in zip(*each, strict=True))
         sha256 = hashlib.sha256(run_id.encode()).hexdigest()
         name = f"{run_id}-{sha256[:8]}"
-        told = (f"gnss: /{run_id}/fix: 3 of 9 messages are not used", *LEAKING)
+        slow = make_finding(
+            "driven-below-limit", Subject("role", "command"), slow_fraction=0.6, limit_mps=0.95, top_mps=0.5
+        )
         add_run(
             store,
             name,
             segments(name, start, end, start_ns=int(1e18 + first * 1e12)),
             sha256=sha256,
-            warnings=told,
-            includes=(LEAKING[0],),
+            findings=(Finding("topic-not-used", "note", Subject("topic", f"/{run_id}/fix"), "kept"), slow, *LEAKING),
+            includes=(NAMES[0],),
+            tags={"season": "autumn"},
         )
+    (here / "secretstation.csv").write_text("time,temp_c\n1000000000,3.5\n1000000001,\n,4\n")
     how = {
         "store": here / "store",
         "split": region_file(here / "region.geojson", box(-18, -18, 18, 0)),
         "file_format": "parquet",
+        "covariates": here / "secretstation.csv",
     }
     told = build_dataset(here / "told", **how)
     return here, told, build_dataset(here / "redacted", redact=True, **how)
@@ -151,23 +172,66 @@ def test_verify_says_that_it_is_redacted_and_finds_what_is_told_all_the_same(bui
     card, samples = read_card(here / "redacted"), read_samples(here / "redacted")
     assert list(what_is_told(card, samples)) == []
     assert len(list(what_is_told(card, read_samples(here / "told")))) == 7
-    found = list(what_is_told(replace(card, warnings=("power: gnss_roof is late",)), samples))
-    assert found == ["it is said to be redacted, but tells 'power: gnss_roof is late'"]
+    found = list(what_is_told(replace(card, findings=(*card.findings, LEAKING[0])), samples))
+    assert found == ["it is said to be redacted, but a finding topic-not-used holds more than is public"]
     assert list(what_is_told(replace(card, maps=read_card(here / "told").maps), samples))
 
 
 def test_no_text_of_a_log_is_in_anything_that_is_written(built):
     here, *_ = built
     in_told = b"".join(data for _, data in written_bytes(here / "told"))
-    for name in NAMES:
-        assert name.encode() in in_told
+    secrets = (*NAMES, "secretstation.csv", "7041.5", "log_in", "scp ")
+    for name in secrets:
+        assert name.encode() in in_told or json.dumps(name)[1:-1].encode() in in_told, name
+    in_redacted = b""
     for path, data in written_bytes(here / "redacted"):
-        assert [name for name in NAMES if name.encode() in data or json.dumps(name)[1:-1].encode() in data] == [], path
-    card = read_card(here / "redacted")
-    assert {run.warnings for run in card.runs} == {("8 texts not copied into the redacted dataset",)}
-    assert [finding.samples for finding in card.findings] == [
-        finding.samples for finding in read_card(here / "told").findings
-    ]
+        assert [name for name in secrets if name.encode() in data or json.dumps(name)[1:-1].encode() in data] == [], (
+            path
+        )
+        in_redacted += data
+    for kept in ("secretstation_temp_c", "tag_season", "autumn", "husky", "paved road", "ortho"):  # as the page lists
+        assert kept.encode() in in_redacted
+
+
+def test_a_redacted_finding_keeps_its_code_and_what_is_public(built):
+    here, *_ = built
+    told, card = read_card(here / "told"), read_card(here / "redacted")
+    for was, now in zip(told.runs, card.runs, strict=True):
+        kept = [(of.code, of.severity, of.action) for of in was.findings]
+        assert [(of.code, of.severity, of.action) for of in now.findings] == kept
+        (slow,) = select_findings(now.findings, "driven-below-limit")
+        assert slow == select_findings(was.findings, "driven-below-limit")[0]
+        assert {of.subject.name for of in select_findings(now.findings, "topic-not-used")} == {
+            *("topic", "log", "frame", "call", "file", "run")
+        }
+    grades = [[getattr(of.verdict, name) for name in ("position", "time", "energy")] for of in (told, card)]
+    assert grades[0] == grades[1]
+
+
+PRIVATE = "anna@nas03:/data/anna"
+KINDS = [kind for of in get_args(SubjectKind) for kind in (of if isinstance(of, tuple) else (of,))]
+
+
+@pytest.mark.parametrize("code", [*read_catalogue(), "code-of-another-version"])
+def test_no_field_of_a_finding_passes_unless_the_catalogue_calls_it_public(code):
+    public = read_catalogue()[code].public if code in read_catalogue() else ()
+    fields = [*(read_catalogue()[code].fields if code in read_catalogue() else ()), "other"]
+    for kind in KINDS:
+        finding = Finding(
+            code,
+            "warning",
+            Subject(kind, PRIVATE),
+            "kept",
+            (7041.5, 7042.5),
+            dict.fromkeys(fields, 7041.5),
+            {name: PRIVATE for name in fields if name not in public},
+            (Remedy("x", {"read": {"gnss_crs": PRIVATE}}, PRIVATE),),
+        )
+        (redacted,) = redact_findings([finding])
+        text = to_json(redacted)
+        assert (PRIVATE in text) == (kind in {"role", "class", "layer", "slope", "split"})
+        assert set(redacted.numbers) | set(redacted.names) <= set(public)
+        assert redact_findings([redacted]) == (redacted,)
 
 
 def test_distances_do_not_tell_the_scale_of_the_plane(built):
@@ -198,6 +262,7 @@ def test_the_line_that_publishes_it_is_printed_and_a_second_build_has_nothing_to
     assert f"to publish it: hf upload OWNER/NAME {here}/redacted . --repo-type dataset" in str(redacted)
     assert "hf upload" not in str(told)
     how = {"store": here / "store", "split": here / "region.geojson", "file_format": "parquet"}
+    how["covariates"] = here / "secretstation.csv"
     assert build_dataset(here / "redacted", redact=True, **how).status == "unchanged"
     with pytest.raises(DatasetError, match="is redacted, its samples have other names"):
         build_dataset(here / "other", keep_split=here / "redacted", **how)

@@ -10,6 +10,7 @@ from tcpipe.formats.dataset_files import read_card
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.recipe import Recipe
 from tcpipe.store import open_store
+from tcpipe.tables.findings import Subject, select_findings
 from tcpipe.tables.levels import GATED_TRACK
 
 GEOID_M = 46.3
@@ -37,6 +38,9 @@ def winding(count=3000):
     return np.stack([14.0 * np.sin(s), 13.0 * np.cos(1.5 * s)], 1)
 
 
+HEIGHTS = ("map-heights-differ", "map-height-scale")
+
+
 @pytest.fixture(scope="module")
 def built(tmp_path_factory):
     directory = tmp_path_factory.mktemp("registered")
@@ -55,10 +59,13 @@ def built(tmp_path_factory):
 
 def test_a_run_whose_ground_lies_elsewhere_on_the_map_is_a_warning(built):
     result, _ = built
-    (line,) = [line for line in result.warnings if "its ground lies" in line]
-    assert line.startswith("run off: its ground lies 1.7 m off on map site (1.5 m west and 0.8 m north, ± 0.0")
-    assert "read.gnss_crs" in line
-    assert f"warning: {line}" in str(result)
+    (shifted,) = select_findings(result.findings, "map-shifted")
+    assert (shifted.subject, shifted.names, shifted.severity) == (Subject("run", "off"), {"map": "site"}, "error")
+    sizes = [shifted.numbers[name] for name in ("shift_m", "east_m", "north_m")]
+    assert sizes == pytest.approx([1.7, -1.5, 0.8], abs=0.05)
+    assert shifted.numbers["std_m"] < 0.1
+    assert result.verdict.position == "not usable"
+    assert "error: off: its ground lies 1.7" in str(result)
 
 
 def test_the_card_keeps_every_runs_registration(built):
@@ -77,10 +84,10 @@ def test_how_the_heights_rise_and_what_they_miss_is_on_the_card(built):
     found = {entry.run_id: entry for entry in card.maps[0].registration}
     assert found["fits"].height_scale == pytest.approx(1.0, abs=0.01)
     assert found["fits"].expected_misfit_m == pytest.approx(0.1)  # the tracks claim no error of height
-    assert not any("heights" in line for line in result.warnings if line.startswith("run fits"))
+    assert not [of for of in select_findings(result.findings, *HEIGHTS) if of.subject.name == "fits"]
 
 
-@pytest.mark.parametrize(("scale", "wrong"), [(0.3048, "in feet"), (1.4, "rise by 0.71 m")])
+@pytest.mark.parametrize(("scale", "wrong"), [(0.3048, "in feet"), (1.4, "")])
 def test_a_map_that_rises_otherwise_than_the_track_is_refused_or_named(tmp_path, scale, wrong):
     store = open_store(tmp_path / "store", create=True)
     add_world(store, tmp_path)
@@ -94,7 +101,8 @@ def test_a_map_that_rises_otherwise_than_the_track_is_refused_or_named(tmp_path,
         assert not (tmp_path / "out").exists()
     else:
         found = build_dataset(tmp_path / "out", store=store.root, recipe=Recipe())
-        assert any(wrong in line for line in found.warnings)
+        (scaled,) = select_findings(found.findings, *HEIGHTS)
+        assert (scaled.code, scaled.numbers["map_rise_m"]) == ("map-height-scale", pytest.approx(0.71, abs=0.005))
 
 
 def test_ground_that_is_not_the_maps_is_a_warning(tmp_path):
@@ -109,5 +117,5 @@ def test_ground_that_is_not_the_maps_is_a_warning(tmp_path):
     start, end = lanes([0.0], -10.0, 10.0)
     add_run(store, "a", segments("a", start, end), track=track)
     found = build_dataset(tmp_path / "out", store=store.root, recipe=Recipe())
-    (line,) = [line for line in found.warnings if "m apart" in line]
-    assert "wanted 0.10 m" in line
+    (other,) = select_findings(found.findings, *HEIGHTS)
+    assert (other.code, other.numbers["expected_m"]) == ("map-heights-differ", pytest.approx(0.1, abs=0.001))

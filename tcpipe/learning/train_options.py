@@ -1,0 +1,68 @@
+"""The options of ``tcpipe train`` and `tcpipe.train`."""
+
+from __future__ import annotations
+
+from dataclasses import KW_ONLY, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from tcpipe.tables.options import SEED, Option, Range, option, required
+
+if TYPE_CHECKING:
+    from tcpipe.dataset.energies import EnergyName
+    from tcpipe.learning.fitting import ModelKind
+    from tcpipe.learning.losses import Loss
+
+
+@dataclass(frozen=True, slots=True)
+class TrainOptions:
+    """What is trained on what, and how; None of the network's own options is the default of `tcpipe.learning.fitting.FitConfig`."""
+
+    dataset: str | Path = required(Option(kind="sealed", metavar="DATASET", is_argument=True))
+    out: str | Path = option("model", Option(kind="published", metavar="[OUT]", is_argument=True))
+    """The same dataset and options are not trained again."""
+    _: KW_ONLY
+    model: ModelKind | None = option(
+        None,
+        Option(
+            "The paper's network; boosted trees on features of patches; or physics. The last two take seconds and heed --loss, --weights, "
+            "--label and --beside alone (default: a table of fewer than 20000 samples, else, and with the network's own options, the "
+            "network).",
+            kind=("resnet18", "table", "physics"),
+        ),
+    )  # fmt: skip
+    loss: Loss = option(
+        "nrmse",
+        Option(
+            "paper_eq4 is the paper's equation 4 as printed; nrmse makes both errors dimensionless.",
+            kind=("nrmse", "paper_eq4"),
+        ),
+    )
+    epochs: int | None = option(None, Option("At most.", kind=Range(1, 100_000), shown=100))
+    patience: int | None = option(
+        None, Option("Epochs without a better held-out loss.", kind=Range(1, 100_000), shown=12)
+    )
+    batch: int | None = option(None, Option("Samples in a batch.", kind=Range(1, 65_536), shown=64))
+    learning_rate: float | None = option(None, Option(kind=Range(0.0, 1.0, is_open=True), shown=1e-4))
+    fold: int | None = option(None, Option("Fold of train to stop early by.", kind=Range(0, 99), shown=0))
+    mirror: bool | None = option(
+        None, Option("Mirror every other patch across its travel.", ("--mirror/--no-mirror",), shown=True)
+    )
+    weights: bool = option(False, Option("Weigh each label by its inverse variance."))
+    width: int | None = option(
+        None,
+        Option("Filters of the first stage, a multiple of 16; 64 is ResNet-18.", kind=Range(16, 512), shown=64),
+    )
+    label: EnergyName = option(
+        "total",
+        Option(
+            "Energy to train on: all that was measured, or less what the robot draws while it stands.",
+            kind=("total", "above_standing"),
+        ),
+    )
+    beside: bool = option(
+        False,
+        Option("Tell it the turn and the commanded speed of each metre beside its patch; the paper does not."),
+    )
+    seed: int | None = option(None, Option("Of weights, shuffles and mirrors.", kind=SEED, shown=0))
+    fresh: bool = option(False, Option("Do not go on from where an earlier training was stopped."))

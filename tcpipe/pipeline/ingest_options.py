@@ -1,0 +1,58 @@
+"""The options of ``tcpipe ingest`` and `tcpipe.ingest`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import KW_ONLY, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from tcpipe.tables.options import CLUSTER, MESSAGE_DEFINITIONS, RECIPE, STORE, Option, jobs, option, required, tags
+
+if TYPE_CHECKING:
+    from tcpipe.pipeline.ingest_task import IngestResult
+    from tcpipe.recipe import Recipe
+
+
+@dataclass(frozen=True, slots=True)
+class IngestOptions:
+    """Which logs are ingested, into which store, and how."""
+
+    logs: Iterable[str | Path] = required(Option(kind="several", metavar="LOG...", repeatable=True, is_argument=True))
+    """Files, ROS 2 bag directories, folders searched downward, or URLs of such (``s3://…``), which are read by range or copied."""
+    _: KW_ONLY
+    store: str | Path = option("tcpipe-store", STORE)
+    recipe: Recipe | str | Path | None = option(None, RECIPE)
+    robot: str | None = option(
+        None,
+        Option(
+            "Robot profile: one that `tcpipe init` lists, or of the recipe (found by message types and topic names otherwise).",
+            kind="robot",
+            metavar="NAME",
+        ),
+    )
+    tags: Mapping[str, str] | None = tags("Free tag on the runs; repeatable.")
+    jobs: int = jobs("Logs")
+    cluster: str | None = option(None, CLUSTER)
+    """Its workers see logs and store under the same absolute paths."""
+    as_one: bool = option(False, Option("All logs are parts of one drive (splits; power logged apart)."))
+    message_definitions: str | Path | None = option(None, MESSAGE_DEFINITIONS)
+    shard: tuple[int, int] | None = option(
+        None, Option("Only the I-th of N shares of the logs: one for each task of an array.", (), "shard", "I/N")
+    )
+    min_age_s: float = option(
+        0.0,
+        Option(
+            "A log that was written to since (90, 90s, 10m, 2h, 1d) waits for another call.",
+            ("--min-age",),
+            "duration",
+            "T",
+            shown="0",
+        ),
+    )
+    retry_failed: bool = option(False, Option("Try again what is known to fail."))
+    force: bool = option(False, Option("Do again what is there already, and what is known to fail."))
+    on_found: Callable[[Mapping[str, int]], None] | None = None
+    """Called once with the size [byte] of every log by its name."""
+    on_result: Callable[[IngestResult], None] | None = None
+    """Called as each log ends, in the order of ending."""

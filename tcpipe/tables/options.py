@@ -1,0 +1,105 @@
+"""The options of a command, declared once: fields of a frozen dataclass that click's options and the public function are made of.
+
+The modules that declare options import neither numpy nor pyarrow, so that ``--help`` starts fast.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, fields
+from inspect import cleandoc, signature
+from typing import Any, NamedTuple, ParamSpec, TypeVar
+
+P = ParamSpec("P")
+O = TypeVar("O")
+R = TypeVar("R")
+
+
+class Range(NamedTuple):
+    """The bounds of a number; msgspec, which knows bounds too, would make ``--help`` slower."""
+
+    least: float
+    most: float
+    is_open: bool = False
+    """Whether the least is excluded."""
+
+
+@dataclass(frozen=True, slots=True)
+class Option:
+    """How the command line shows a field."""
+
+    about: str = ""
+    flags: tuple[str, ...] = ()
+    """In place of ``--`` and the field's name."""
+    kind: Range | tuple[str, ...] | str = ""
+    """Bounds of a number, the choices, or the name of one of `tcpipe.cli.options.KINDS`."""
+    metavar: str | None = None
+    shown: str | float | None = None
+    """The default as the command line shows it, where the field's own is None or another type."""
+    envvar: str | None = None
+    repeatable: bool = False
+    is_argument: bool = False
+
+
+STORE = Option("Where runs and maps are kept (or TCPIPE_STORE).", (), "published", "DIR|URL", envvar="TCPIPE_STORE")
+RECIPE = Option(
+    "Recipe (or TCPIPE_RECIPE, or the nearest tcpipe.toml upward; else defaults).", (), "input_file", "FILE"
+)
+CLUSTER = Option(
+    "Dask scheduler whose workers do it, tcp://host:port (or TCPIPE_CLUSTER); instead of --jobs.",
+    metavar="ADDRESS",
+    envvar="TCPIPE_CLUSTER",
+)
+MESSAGE_DEFINITIONS = Option(
+    "Directory of package/msg/Name.msg (or .idl) files for types the log does not define.", ("--msgdef",), "input_directory", "DIR"
+)  # fmt: skip
+MAP = Option("Map to look at (default: the only one in the store).", ("--map",), "map", "NAME")
+MODEL = Option(kind="sealed", metavar="MODEL", is_argument=True)
+PHYSICS = Option(
+    "Dataset whose card says what turning costs the robot (default: the one that MODEL was trained on).", (), "sealed", "DATASET"
+)  # fmt: skip
+SPEED = Option(
+    "Commanded speed, for a model trained with --beside (default: the mean of its training).",
+    ("--speed",),
+    Range(0.0, 100.0, is_open=True),
+    "MPS",
+)
+DRY_RUN = Option("Say what would be done, and what it would take; do nothing.")
+SEED = Range(0, 2**32 - 1)
+"""What every generator of random numbers takes."""
+
+
+def required(shown: Option) -> Any:
+    """Return a field that has to be given."""
+    return field(metadata={"option": shown})
+
+
+def option(default: object, shown: Option) -> Any:
+    """Return a field with its default."""
+    return field(default=default, metadata={"option": shown})
+
+
+def jobs(what: str) -> Any:
+    """Return the field of ``--jobs``."""
+    return option(1, Option(f"{what} side by side.", ("--jobs", "-j"), Range(1, 1024)))
+
+
+def tags(about: str) -> Any:
+    """Return the field of ``--tag``."""
+    return option(None, Option(about, ("--tag",), "tags", "K=V"))
+
+
+def as_function(options: Callable[P, O], run: Callable[[O], R]) -> Callable[P, R]:
+    """Return the public function of a command: its keywords are the fields of the options, and ``run`` does the work."""
+
+    def call(*args: P.args, **kwargs: P.kwargs) -> R:
+        return run(options(*args, **kwargs))
+
+    shown = {of.name: of.metadata.get("option", Option()).about for of in fields(options)}  # type: ignore[arg-type]
+    lines = [f"{name} : {about}" for name, about in shown.items() if about]
+    more = f"`{getattr(options, '__module__', '')}` says more of each."
+    call.__name__ = call.__qualname__ = run.__name__.removeprefix("run_")
+    call.__module__ = run.__module__
+    call.__doc__ = "\n".join([cleandoc(run.__doc__ or ""), "", "Parameters", "----------", *lines, "", more])
+    call.__signature__ = signature(options).replace(return_annotation=signature(run).return_annotation)  # type: ignore[attr-defined]
+    return call

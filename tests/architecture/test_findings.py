@@ -1,0 +1,143 @@
+"""Findings are data: each code stands in the catalogue and is made, and nothing decides on a finished sentence."""
+
+import ast
+import importlib.util
+from pathlib import Path
+
+import pytest
+
+from tcpipe.formats.finding_lines import describe_finding
+from tcpipe.tables.bits import Quality, name_of
+from tcpipe.tables.catalogue import AFFECTED, SEVERITIES, catalogue_sections, read_catalogue
+
+ROOT = Path(__file__).parents[2]
+TREES = {path.relative_to(ROOT).as_posix(): ast.parse(path.read_text()) for path in (ROOT / "tcpipe").rglob("*.py")}
+LONGEST = 100
+LINES = "tcpipe.formats.finding_lines"
+
+MAKERS = {"make_finding": 0, "threshold": 0, "select_findings": 1}
+"""Functions that take codes, and the argument from which on these stand."""
+
+PRINTERS = {
+    "tcpipe/formats/dataset_card.py",
+    "tcpipe/formats/hub_card.py",
+    "tcpipe/pipeline/dataset/build.py",
+    "tcpipe/pipeline/dataset/content.py",
+    "tcpipe/pipeline/diff.py",
+    "tcpipe/pipeline/maps.py",
+    "tcpipe/pipeline/preflight.py",
+    "tcpipe/pipeline/status.py",
+    "tcpipe/pipeline/store_facts.py",
+}
+"""Modules beside cli/ and report/ that print an answer, or group findings for a page."""
+
+
+NODES = {path: list(ast.walk(tree)) for path, tree in TREES.items()}
+TEXTS = {
+    path: {node.value for node in nodes if isinstance(node, ast.Constant) and isinstance(node.value, str)}
+    for path, nodes in NODES.items()
+}
+
+
+def calls(*names):
+    """Yield path and node of each call of a function by its plain name."""
+    for path, nodes in NODES.items():
+        for node in nodes:
+            if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id in names:
+                yield path, node
+
+
+@pytest.fixture(scope="module")
+def generate():
+    spec = importlib.util.spec_from_file_location("generate", ROOT / "docs/generate.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_every_code_that_is_named_stands_in_the_catalogue():
+    unknown = [
+        f"{path}:{node.lineno}: {argument.value}"
+        for path, node in calls(*MAKERS)
+        for argument in node.args[MAKERS[node.func.id] :][: None if node.func.id == "select_findings" else 1]
+        if isinstance(argument, ast.Constant) and argument.value not in read_catalogue()
+    ]
+    assert not unknown
+
+
+def test_every_threshold_that_is_named_stands_in_the_catalogue():
+    read = [
+        tuple(argument.value for argument in node.args if isinstance(argument, ast.Constant))
+        for _, node in calls("threshold")
+    ]
+    known = {(code, name) for code, entry in read_catalogue().items() for name in entry.thresholds}
+    assert not {pair for pair in read if len(pair) == 2 and pair not in known}
+
+
+def is_computed(code):
+    """Tell whether an f-string makes a code, as ``lost-{reason}``."""
+    joined = (node.values for nodes in NODES.values() for node in nodes if isinstance(node, ast.JoinedStr))
+    ends = [(values[0], values[-1]) for values in joined if len(values) == 2]
+    begin = (of.value for of, _ in ends if isinstance(of, ast.Constant) and of.value.endswith("-"))
+    finish = (of.value for _, of in ends if isinstance(of, ast.Constant) and of.value.startswith("-"))
+    return code.startswith(tuple(begin)) or code.endswith(tuple(finish))
+
+
+def test_every_code_of_the_catalogue_is_made_somewhere():
+    named = set().union(*TEXTS.values())
+    assert not {code for code in read_catalogue() if code not in named and not is_computed(code)}
+
+
+def test_every_remedy_of_the_catalogue_is_used():
+    named = set().union(*TEXTS.values())
+    assert not {
+        (code, name) for code, entry in read_catalogue().items() for name in entry.remedies if name not in named
+    }
+
+
+def test_entries_are_whole():
+    bits = {name_of(bit) for bit in Quality}
+    for code, entry in read_catalogue().items():
+        assert not entry.flag or entry.flag in bits, code
+        assert entry.severity in SEVERITIES, code
+        assert set(entry.affects) <= set(AFFECTED), code
+        assert entry.title, code
+        assert entry.cause, code
+    assert [code for codes in catalogue_sections().values() for code in codes] == list(read_catalogue())
+
+
+def test_every_line_is_short_with_typical_values(generate):
+    lines = {code: describe_finding(generate.example_finding(code)) for code in read_catalogue()}
+    assert not {code: line for code, line in lines.items() if len(line) > LONGEST}
+    assert not {code: line for code, line in lines.items() if "?" in line}
+
+
+def test_nothing_but_what_prints_makes_sentences():
+    importers = {
+        path
+        for path, nodes in NODES.items()
+        for node in nodes
+        if isinstance(node, ast.ImportFrom) and node.module == LINES
+    }
+    others = {path for path in importers if not path.startswith(("tcpipe/cli/", "tcpipe/report/"))}
+    assert others == PRINTERS
+
+
+def test_nothing_decides_on_a_finished_sentence():
+    """Nobody compares, splits or searches what `finding_lines` returns."""
+    makers = {
+        node.name
+        for node in NODES["tcpipe/formats/finding_lines.py"]
+        if isinstance(node, ast.FunctionDef) and node.name.startswith(("format_", "describe_", "list_"))
+    }
+
+    def is_sentence(node):
+        return isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id in makers
+
+    searches = {"startswith", "endswith", "split", "partition", "search", "match", "sub"}
+    for path, nodes in NODES.items():
+        for node in nodes if path != "tcpipe/formats/finding_lines.py" else ():
+            looked_at = [node.left, *node.comparators] if isinstance(node, ast.Compare) else []
+            if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and node.func.attr in searches:
+                looked_at = [node.func.value, *node.args]
+            assert not any(map(is_sentence, looked_at)), f"{path}:{node.lineno}"
