@@ -45,13 +45,11 @@ UNFINISHED = (
     "*.checkpoint",
     "tmp/tcpipe-*",
     "*/writing.json",
-    "*/records/begun",
-    "*/records/begun/*",
 )
-"""What a killed call may leave for the next one: temporaries, where a cost map and a training stand, and that a call had begun."""
+"""What a killed call may leave for the next one: temporaries, where a cost map and a training stand."""
 
-PASSING = ("records/calls", "records/datasets", "index")
-"""Directories of a store that hold times, inodes, and what was done by others: never twice the same."""
+PASSING = ("log", "index")
+"""Directories of a store that hold times and processes: never twice the same."""
 
 _REQUEST = "fault.request"
 _CHANGES = {"os.rename", "os.mkdir", "os.remove", "os.rmdir", "os.link", "os.symlink", "os.truncate"}

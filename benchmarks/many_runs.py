@@ -10,6 +10,7 @@ Logs and runs are copies of one short drive under other names, hashes and times,
 import hashlib
 import os
 import re
+import resource
 import sys
 import time
 from collections.abc import Callable
@@ -19,20 +20,22 @@ from typing import TypeVar
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
-from tcpipe.formats.json_files import digest, to_json
+from tcpipe.formats.commits import Entries
 from tcpipe.formats.logs.writing import write_mcap
-from tcpipe.formats.record_files import RunName, Sighting, record_name
-from tcpipe.formats.seals import file_checksum, sealed
+from tcpipe.formats.seals import file_checksum
 from tcpipe.formats.stored_runs import RunDirectory
-from tcpipe.pipeline.calls import latest_calls
 from tcpipe.pipeline.dataset.runs import Chosen, choose_runs
 from tcpipe.pipeline.ingest import ingest
 from tcpipe.pipeline.log_sources import LogSource, find_sources
+from tcpipe.pipeline.log_writer import open_log
 from tcpipe.pipeline.prune import prune
 from tcpipe.pipeline.recordings import each_drive_once
 from tcpipe.pipeline.status import status
 from tcpipe.recipe import Recipe
 from tcpipe.store import Store, open_store
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+from wheel_drives import wheel_drive
 
 T = TypeVar("T")
 
@@ -45,9 +48,6 @@ def many_runs(directory: Path, count: int) -> tuple[Path, Store]:
     logs, store = directory / f"logs-{count}", Store(directory / f"store-{count}")
     if Path(store.root).exists():
         return logs, store
-    sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
-    from wheel_drives import wheel_drive
-
     write_mcap(directory / "one.mcap", wheel_drive())
     ingest([directory / "one.mcap"], store=directory / "one", recipe=Recipe())
     (run,) = Store(directory / "one").runs()
@@ -55,12 +55,17 @@ def many_runs(directory: Path, count: int) -> tuple[Path, Store]:
     for number in range(count):
         (logs / f"drive_{number:05d}.mcap").write_bytes(b"%08d" % number)
     open_store(store.root, create=True)
-    for number, source in enumerate(find_sources([logs], as_one=False, staging=Path()).sources):
-        _copy(run, store, source, number)
+    log, sources = open_log(store), find_sources([logs], as_one=False, staging=Path()).sources
+    for start in range(0, count, 100):
+        made = [_copy(run, store, source, start + at) for at, source in enumerate(sources[start : start + 100])]
+        log.commit(
+            "ingested",
+            Entries(runs=tuple(of for each in made for of in each.runs), seen=tuple(of.seen[0] for of in made)),
+        )
     return logs, store
 
 
-def _copy(run: RunDirectory, store: Store, source: LogSource, number: int) -> None:
+def _copy(run: RunDirectory, store: Store, source: LogSource, number: int) -> Entries:
     sha256 = hashlib.sha256(str(number).encode()).hexdigest()
     run_id = f"{source.stem}-{sha256[:8]}"
     there = run.file("segments.parquet").parent
@@ -83,11 +88,7 @@ def _copy(run: RunDirectory, store: Store, source: LogSource, number: int) -> No
     names |= {f'"size_bytes": {old.size_bytes}': f'"size_bytes": {new.size_bytes}'}
     for document in (Path(run.recipe_id, "manifest-1.json"), Path("run-1.json")):
         (place.parents[1] / document).write_text(_renamed((there.parents[1] / document).read_text(), names))
-    store.remember(f"runs/{sha256}", RunName(sha256, run_id))
-    sighting = Sighting(source.origins, source.files, sha256)
-    record = Path(store.root) / "records" / source.lineage / f"{record_name(digest(sighting))}.json"
-    record.parent.mkdir(parents=True)
-    record.write_text(to_json(sealed(sighting)))
+    return Entries(runs=tuple(store.read_rows(run_id).values()), seen=(source.sighting(sha256),))
 
 
 def _renamed(text: str, names: dict[str, str]) -> str:
@@ -112,17 +113,22 @@ def main() -> None:
     directory, count = Path(sys.argv[1]), int(sys.argv[2]) if len(sys.argv) > 2 else 10_000
     directory.mkdir(parents=True, exist_ok=True)
     logs, store = timed("synthesise", lambda: many_runs(directory, count))
+    timed("read the log", store.state)
     for again in ("first", "again"):
         summary = timed(f"nothing to ingest, {again}", lambda: ingest([logs], store=store.root, recipe=Recipe()))
         assert {result.status for result in summary.results} == {"unchanged"}
         found = timed(f"status, {again}", lambda: status([logs], store=store.root, recipe=Recipe()))
         assert found.counts == {"done": count}, found.counts
-        timed(f"history, {again}", lambda: latest_calls(store))
         chosen = timed(f"choice of runs, {again}", lambda: choose_runs(store, Recipe(), robot=None, tags={}))
         assert timed(f"each drive once, {again}", lambda chosen=chosen: once(chosen)) == count
         assert not timed(
             f"prune --dry-run, {again}", lambda: prune(store=store.root, recipe=Recipe(), dry_run=True)
         ).removed
+    new = directory / f"new-{count}-{time.time_ns()}.mcap"
+    write_mcap(new, wheel_drive(seed=time.time_ns() % 2**31))
+    summary = timed("one new log", lambda: ingest([logs, new], store=store.root, recipe=Recipe()))
+    assert [result.status for result in summary.results].count("done") == 1
+    print(f"largest memory: {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024:.0f} MB")
 
 
 if __name__ == "__main__":

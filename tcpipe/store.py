@@ -4,7 +4,7 @@
 
     <root>/
       store.json, report.html                       that this is a store, and of which layout; the page of all runs
-      records/<kind>/<fact>.json                    what is remembered: logs seen, known problems, superseded runs, names, calls
+      log/<n>.json, snapshot-<n>.json.zst           commits: what every call did, and from time to time what they add up to
       maps/<name>-<n>.json                          a map: its files and their checksums
       maps/<name>/<digest>/                         <name>.zarr, and a picture of it
       runs/<run_id>/run-<n>.json                    source, robot, topics, damage; files and checksums of the streams
@@ -13,7 +13,7 @@
       runs/<run_id>/<recipe_id>/manifest-<n>.json   what became of it; files and checksums of the tables
       runs/<run_id>/<recipe_id>/<digest>/           track.parquet, segments.parquet, rejections.parquet
       spool/                                        pixels on their way into a dataset, while a cluster builds it
-      index/                                        runs.parquet, logs.parquet: what the documents say, made again at will
+      index/                                        runs.parquet: all runs as a table for other tools, made again at will
 
 Of numbered documents the highest holds. A ``<digest>`` names the content of what lies in it.
 """
@@ -23,65 +23,45 @@ from __future__ import annotations
 import logging
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path, PurePosixPath
-from typing import TypeVar
 
 import pyarrow as pa
 
 from tcpipe.errors import StoreError, TableError, UsageError
 from tcpipe.formats.atomic import clear_scratch
-from tcpipe.formats.bucket import open_place, side_by_side
+from tcpipe.formats.bucket import open_place
+from tcpipe.formats.commit_log import Stamp, put_commit, read_state
+from tcpipe.formats.commits import Entries, Kind, State
 from tcpipe.formats.geoparquet import located_segments
-from tcpipe.formats.index_files import (
-    RunFacts,
-    SeenLog,
-    as_stored,
-    facts_of,
-    known_log,
-    read_logs,
-    read_runs,
-    state_of,
-    uncollected,
-    write_logs,
-    write_runs,
-)
-from tcpipe.formats.json_files import digest, plain, to_json, typed
-from tcpipe.formats.numbered import digest_of, name_of, numbers, put_next, read_as_at, read_sealed_at
+from tcpipe.formats.index_files import RunFacts, facts_of, known_log, write_index
+from tcpipe.formats.json_files import of_json, plain, to_json, to_json_line, typed
+from tcpipe.formats.numbered import digest_of, name_of, numbers, put_next, read_as_at
 from tcpipe.formats.object_storage import is_url
 from tcpipe.formats.parquet import read_table
-from tcpipe.formats.place import DirectoryPlace, Entry, Place
+from tcpipe.formats.place import DirectoryPlace, Place
 from tcpipe.formats.places import local_output
 from tcpipe.formats.published import FetchedShards, files_here
-from tcpipe.formats.record_files import (
-    RunName,
-    Sighting,
-    Superseded,
-    in_force,
-    put_record,
-    read_record,
-    read_records,
-    record_name,
-)
-from tcpipe.formats.run_documents import Manifest, ManifestHead, MapDocument, RunJson, StreamInfo, Tags, tell_the_same
+from tcpipe.formats.run_documents import Manifest, MapDocument, RunJson, StreamInfo, Tags, tell_the_same
 from tcpipe.formats.seals import CHECKSUMS, Checksum, file_checksums, sealed
 from tcpipe.formats.store_mark import MARK, is_outdated, layout_of, mark_store
 from tcpipe.formats.stored_runs import (
     Ingestions,
-    Listed,
+    Lost,
     RunDirectory,
     below,
     local_file,
+    look_at_files,
     put_tables,
-    refuse_lost,
     told_of,
-    with_lost,
     with_span,
 )
 from tcpipe.tables.levels import (
     DATA_MODEL_VERSION,
+    EARLIER_VERSIONS,
+    READ_TABLES,
     READ_VERSIONS,
     GatedTrack,
     LabelledSegments,
@@ -91,12 +71,12 @@ from tcpipe.tables.levels import (
     with_metadata,
 )
 
-T = TypeVar("T")
-
 logger = logging.getLogger("tcpipe")
 
 _HASH_IN_NAME = re.compile(r"-([0-9a-f]{8,64})$")
 _STREAMS = "streams"
+_PROVED = "proved.json"
+"""What was compared with its manifest, and the state of the files then; may be removed at any time."""
 _BUCKETS = ("s3://", "gs://", "az://")
 _NAME_HEX = 8
 """So many digits of its log's sha256 stand in a run's name, more where two recordings of one name share them."""
@@ -177,6 +157,14 @@ class Store:
         if not put and not (after and maps.read(new) == data):  # the answer to one's own may be lost
             raise StoreError(f"map {name}: another process has written it meanwhile, and it stays; look at it first")
 
+    def state(self) -> State:
+        """Return what the log says."""
+        return read_state(self.place)
+
+    def commit(self, state: State, stamp: Stamp, kind: Kind, make: Callable[[State], Entries]) -> State:
+        """Write a commit after those of a state; see `put_commit`."""
+        return put_commit(self.place, state, stamp, kind, make)
+
     def runs(self) -> list[RunDirectory]:
         """Return every finished ingestion of this data-model version, by run and recipe, that is not superseded."""
         return list(self.ingestions().finished)
@@ -185,164 +173,88 @@ class Store:
         """Return the finished ingestions of one run."""
         return list(self.ingestions(run_id).finished)
 
-    @uncollected()
-    def ingestions(self, run_id: str | None = None) -> Ingestions:
-        """Return what there is of all runs, or of one, by one listing.
-
-        A manifest is read and proved, unless the index has what it says and its file is as it was then; of all, see `with_lost`.
-        """
-        superseded = self.superseded() if run_id is None else {}
-        known = read_runs(self.index_place) if run_id is None else {}
-        finished, others, damaged = list[RunDirectory](), dict[str, ManifestHead](), dict[tuple[str, str], str]()
-        rows = dict[tuple[str, str], RunFacts]()
-
-        def seen(of: tuple[Listed, str, int]) -> RunDirectory | ManifestHead | StoreError:
-            try:
-                return self._ingestion(*of, known.get((of[0].run_id, of[1])))
-            except StoreError as error:
-                return error
-
-        every = [(listed, *of) for listed in self._listed(run_id) for of in listed.manifests()]
-        for (listed, recipe, _), found in zip(every, side_by_side(self.root, seen, every), strict=True):
-            name, by = listed.run_id, superseded.get(listed.run_id)
-            if isinstance(found, StoreError):
-                damaged.update({} if by else {(name, recipe): found.problems[0]})
-            elif isinstance(found, ManifestHead):
-                others.update({} if by else {name: found})
+    def ingestions(self, run_id: str | None = None, *, state: State | None = None) -> Ingestions:
+        """Return what there is of all runs, or of one: what the log says, and whether the files are there in their sizes."""
+        state = self.state() if state is None else state
+        rows = {key: state.runs[key] for key in sorted(state.runs) if run_id in (None, key[0])}
+        finished, lost, outdated = list[RunDirectory](), dict[tuple[str, str], Lost](), dict[str, RunFacts]()
+        for row, gone, files_state in look_at_files(runs := self.runs_place, rows.values()):
+            if run_id is None and row.superseded_by:
+                continue
+            if gone is not None:
+                lost[row.run_id, row.recipe_id] = gone
+            elif row.data_model_version not in READ_VERSIONS:
+                outdated[row.run_id] = row
             else:
-                row = found.facts
-                rows[name, recipe] = row if row.superseded_by == by else replace(row, superseded_by=by)
-                finished += [found] if by is None else []
+                finished.append(RunDirectory(row.run_id, row.recipe_id, runs, row, files_state))
         current = {run.run_id for run in finished}
-        outdated = {name: head for name, head in others.items() if name not in current}
-        here = Ingestions(tuple(finished), outdated, damaged, superseded, rows)
-        if run_id is None:
-            here = with_lost(here, known, self.run_ids(), runs=self.runs_place, index=self.index_place)
-        return replace(here, stale=_differ({**rows, **here.lost}, known))
+        outdated = {name: row for name, row in outdated.items() if name not in current}
+        return Ingestions(state, tuple(finished), lost, outdated, rows)
 
-    def _listed(self, run_id: str | None) -> Iterator[Listed]:
-        """Yield the files of each run, perhaps without its streams: one listing."""
-        runs, found = self.runs_place, dict[str, dict[str, Entry]]()
-        for entry in runs.entries(run_id or "", but=_STREAMS):
-            name, _, rest = entry.name.partition("/")
-            found.setdefault(name, {})[rest] = entry
-        return (Listed(runs, name, files, numbers(files)) for name, files in found.items())
+    def read_rows(self, run_id: str) -> dict[str, RunFacts]:
+        """Return what lies in the directory of a run, by recipe, as a commit would have it; what is not whole is left out.
 
-    def _ingestion(self, of: Listed, recipe_id: str, number: int, row: RunFacts | None) -> RunDirectory | ManifestHead:
-        """Return an ingestion, or the head of one of another data model; `StoreError` if it is not as it was written, or a file is gone.
-
-        ``row`` is what the index has of it.
+        The highest number of each document counts, whether a commit names it or not.
         """
-        place, name = of.runs.below(f"{of.run_id}/{recipe_id}"), name_of("manifest", number)
-        state = state_of(of.files[f"{recipe_id}/{name}"])
-        refuse_lost(of, recipe_id, row)
-        if row is None or row.state != state:
-            where = place.where(name)
-            document = read_sealed_at(place, name, ours=lambda found: found.get("data_model_version") in READ_VERSIONS)
-            if document.get("data_model_version") not in READ_VERSIONS:
-                return typed(document, ManifestHead, where)
-            manifest = typed(document, Manifest, where)
-            if (manifest.run_id, manifest.recipe_id) != (of.run_id, recipe_id):
-                raise StoreError(
-                    f"{where}: is of {manifest.run_id}/{manifest.recipe_id}, but lies in {of.run_id}/{recipe_id}"
-                )
-            row = with_span(facts_of(manifest, state), place, manifest)
-        for file, wanted in row.sizes.items():
-            found = of.files.get(f"{recipe_id}/{file}")
-            if found is None or found.size_bytes != wanted:
-                how = "is gone" if found is None else f"has {found.size_bytes} bytes, wanted {wanted}"
-                raise StoreError(f"{place.where(file)}: {how}; ingest the log again")
-        above = len(f"runs/{of.run_id}/")
-        files_state = " ".join(state_of(of.files[name[above:]]) for name in (row.segments_file, row.track_file))
-        return RunDirectory(of.run_id, recipe_id, place, self._with_log(row, of), files_state)
-
-    def _with_log(self, row: RunFacts, of: Listed) -> RunFacts:
-        """Return what the index has of an ingestion with what is known of its log and tags now; None of a log that cannot be believed."""
-        last = [name_of(stem, of.numbers[stem]) for stem in ("run", "tags") if stem in of.numbers]
-        state = " ".join(state_of(of.files[name]) for name in last)
-        if row.log is not None and row.log.state == state:
-            return row
-        try:
-            known = self.run_json(row.run_id, of.numbers)
-        except StoreError:
-            known = None
-        tags = known.tags if known and len(last) > 1 else row.tags
-        return replace(row, log=known_log(known, state) if known else None, tags=tags)
+        place = self.runs_place.below(run_id)
+        sizes = {
+            of.name.removeprefix(f"{run_id}/"): of.size_bytes for of in self.runs_place.entries(run_id, but=_STREAMS)
+        }
+        last = numbers(sizes)
+        known = self.known_run(run_id, last)
+        about = {name: sizes[name] for stem in ("run", "tags") if stem in last for name in [name_of(stem, last[stem])]}
+        found = dict[str, RunFacts]()
+        for stem, number in sorted(last.items()):
+            recipe_id, _, kind = stem.partition("/")
+            with suppress(StoreError):
+                if kind == "manifest" and known is not None:
+                    document, name = name_of(stem, number), name_of(kind, number)
+                    manifest = read_as_at(place, document, Manifest)
+                    if (manifest.run_id, manifest.recipe_id) != (run_id, recipe_id):
+                        continue
+                    tables = {f"{recipe_id}/{file}": of.size_bytes for file, of in manifest.checksums.items()}
+                    if tables.items() <= sizes.items():
+                        row = facts_of(manifest, name, {document: sizes[document], **about, **tables})
+                        row = with_span(row, place.below(recipe_id), manifest)
+                        tags = known.tags if "tags" in last else manifest.tags
+                        found[recipe_id] = replace(row, log=known_log(known), tags=tags)
+        return found
 
     @property
     def index_place(self) -> Place:
-        """Where the index lies."""
+        """Where tables for other tools lie."""
         return self.place.below("index")
 
-    def keep_index(self, found: Ingestions) -> None:
-        """Write down what was found of all runs, and what was lost, where that is not what the index had."""
-        if found.stale:
-            write_runs(self.index_place, {**found.rows, **found.lost}.values())
+    def write_index(self, state: State) -> None:
+        """Write the table of all runs for other tools."""
+        write_index(self.index_place, (state.runs[key] for key in sorted(state.runs)))
 
     def prove(self, runs: Sequence[RunDirectory]) -> dict[str, str]:
         """Compare segments and tracks with what the manifests have of them; return by run what is wrong.
 
         Files that are as they were when they were compared before are not read again.
         """
-        damaged, proved = dict[str, str](), dict[tuple[str, str], RunFacts]()
+        damaged, proved = dict[str, str](), dict[str, str]()
+        with suppress(StoreError):
+            proved = of_json(self.index_place.read(_PROVED) or b"{}", dict[str, str], _PROVED)
+        new = dict[str, str]()
         for run in runs:
             try:
-                if run.files_state != run.facts.proved:
+                if run.files_state != proved.get(f"{run.run_id}/{run.recipe_id}"):
                     run.prove("segments.parquet", "track.parquet")
-                    proved[run.run_id, run.recipe_id] = replace(run.facts, proved=run.files_state)
+                    new[f"{run.run_id}/{run.recipe_id}"] = run.files_state
             except StoreError as error:
                 damaged[run.run_id] = error.problems[0]
-        if proved:
-            write_runs(self.index_place, {**read_runs(self.index_place), **proved}.values())
+        if new:
+            with suppress(StoreError):
+                self.index_place.put(_PROVED, to_json_line({**proved, **new}).encode())
         return damaged
-
-    @uncollected()
-    def seen_logs(self) -> dict[str, list[Sighting]]:
-        """Return what is remembered of all logs, by lineage; a record that the index has is not read, while its file is as it was."""
-        known = read_logs(self.index_place)
-
-        def row_of(entry: Entry) -> SeenLog | None:
-            lineage, _, name = entry.name.removesuffix(".json").rpartition("/")
-            row, state = known.get((lineage, name)), state_of(entry)
-            if row is None or row.state != state:
-                sighting = self.recall(f"{lineage}/{name}", Sighting)
-                row = None if sighting is None else SeenLog(lineage, name, state, sighting)
-            return row
-
-        found = side_by_side(self.root, row_of, self.place.below("records").entries("logs"))
-        rows = {(row.lineage, row.name): row for row in found if row is not None}
-        if _differ(rows, known):
-            write_logs(self.index_place, rows.values())
-        seen: dict[str, list[Sighting]] = {}
-        for row in rows.values():
-            seen.setdefault(row.lineage, []).append(row.sighting)
-        return seen
-
-    def superseded(self) -> dict[str, str]:
-        """Return the runs whose log was completed or repaired, and by which run."""
-        return in_force(self.records("superseded", Superseded))
-
-    def supersede(self, run_id: str, by: str | None) -> None:
-        """Remember that another run takes this one's place, or, without ``by``, that it counts again."""
-        number = sum(record.run_id == run_id for record in self.records("superseded", Superseded))
-        self.note("superseded", Superseded(run_id, by, number))
 
     def run_ids(self) -> list[str]:
         """Return the names of all runs, finished or not."""
         return self.runs_place.folders()
 
-    def claim_run(self, stem: str, sha256: str) -> str:
-        """Return the run that a recording is, by its content: the one that was named for it first, or a new one."""
-        run_id = self._free_name(stem, sha256)
-        new = self.remember(f"runs/{sha256}", RunName(sha256, run_id))
-        return run_id if new else self.run_of_content(sha256) or run_id
-
-    def run_of_content(self, sha256: str) -> str | None:
-        """Return the run that was named for a recording; None where there was none."""
-        found = self.recall(f"runs/{sha256}", RunName)
-        return None if found is None else found.run_id
-
-    def _free_name(self, stem: str, sha256: str) -> str:
+    def name_run(self, stem: str, sha256: str) -> str:
         """Return a new run's name: as much of its hash as tells it from another recording of the same name."""
         names = [f"{stem}-{sha256[:length]}" for length in range(_NAME_HEX, len(sha256), 4)]
         for name in names:
@@ -350,21 +262,6 @@ class Store:
             if known is None or known.source.sha256 == sha256:
                 return name
         return f"{stem}-{sha256}"
-
-    def run_ids_by_hash(self) -> dict[str, list[str]]:
-        """Return the names of all runs by what of their log's sha256 stands in them."""
-        found: dict[str, list[str]] = {}
-        for run_id in self.run_ids():
-            add_by_hash(found, run_id)
-        return found
-
-    def run_of(self, sha256: str, among: Mapping[str, Sequence[str]]) -> str | None:
-        """Return the run of a recording, among `run_ids_by_hash`; None where there is none."""
-        for run_id in among.get(sha256[:_NAME_HEX], ()):
-            known = self.known_run(run_id)
-            if known is not None and known.source.sha256 == sha256:
-                return run_id
-        return None
 
     def tag_run(self, run_id: str, given: Mapping[str, str]) -> bool:
         """Add tags to those of a run, under every recipe; return whether that changed any."""
@@ -402,10 +299,10 @@ class Store:
         tags = self._tags(run_id, last.get("tags", 0))
         return found if tags is None else replace(found, tags=tags)
 
-    def known_run(self, run_id: str) -> RunJson | None:
+    def known_run(self, run_id: str, last: Mapping[str, int] | None = None) -> RunJson | None:
         """Return `run_json`; None also where it is not as it was written, which is said: the run is to be made again."""
         try:
-            return self.run_json(run_id)
+            return self.run_json(run_id, last)
         except StoreError as error:
             logger.warning("%s; the run is made again when its log is ingested", error.problems[0])
             return None
@@ -418,26 +315,6 @@ class Store:
             known = put_next(place, "run", values, after=last.get("run", 0), settled=partial(tell_the_same, values))
         if last.get("tags") or not values.tags.items() <= known.tags.items():
             self.tag_run(run_id, values.tags)
-
-    def remember(self, name: str, fact: object) -> bool:
-        """Remember a fact under ``<kind>/<name>`` for good; return whether it was new."""
-        return put_record(self.place.below("records"), name, fact)
-
-    def note(self, kind: str, fact: object) -> bool:
-        """Remember a fact under a name that follows from it; return whether it was new."""
-        return self.remember(f"{kind}/{record_name(digest(fact))}", fact)
-
-    def recall(self, name: str, cls: type[T]) -> T | None:
-        """Return what is remembered under ``<kind>/<name>``, None where nothing is."""
-        return read_record(self.place.below("records"), name, cls)
-
-    def records(self, kind: str, cls: type[T]) -> list[T]:
-        """Return everything of a kind that is remembered, by name."""
-        return list(read_records(self.place.below("records"), kind, cls))
-
-    def sightings(self, lineage: str) -> list[Sighting]:
-        """Return what is remembered of a log."""
-        return self.records(lineage, Sighting)
 
     def write_streams(self, run_id: str, streams: Streams, *, key: str) -> Mapping[str, Checksum]:
         """Put L1 into the store, and return the files; ``key`` names the read settings they were made with."""
@@ -458,7 +335,7 @@ class Store:
             for role, path in self.stream_files(run_id, known).items():
                 table = read_table(path)
                 of[role] = told = typed(metadata_of(table), StreamInfo, path)
-                if told.key != key or told.data_model_version not in READ_VERSIONS:
+                if told.key != key or told.data_model_version not in READ_TABLES:
                     return None
                 tables[role] = table.replace_schema_metadata(None)
             if not tables:
@@ -492,22 +369,12 @@ class Store:
             "segments": located_segments(labelled.table, manifest.info.datum),
             "rejections": track.rejections,
         }
-        whole = next((run for run in self.recipes_of(manifest.run_id) if run.recipe_id == manifest.recipe_id), None)
-        if whole is not None and settled(whole.manifest):
-            return whole.manifest
+        whole = self.read_rows(manifest.run_id).get(manifest.recipe_id)
+        if whole is not None and settled(known := read_as_at(place, whole.manifest, Manifest)):
+            return known
         checksums = put_tables(place, {name: with_metadata(table, told) for name, table in tables.items()})
         after = numbers(place.files()).get("manifest", 0)
         return put_next(place, "manifest", replace(manifest, checksums=checksums), after=after, settled=settled)
-
-
-def _differ(rows: Mapping[tuple[str, str], object], known: Mapping[tuple[str, str], object]) -> bool:
-    """Tell whether the index has something else."""
-    return rows != known and {key: as_stored(row) for key, row in rows.items()} != known
-
-
-def add_by_hash(runs: dict[str, list[str]], run_id: str) -> None:
-    """Add a new run to `Store.run_ids_by_hash`."""
-    runs.setdefault(run_id.rpartition("-")[2][:_NAME_HEX], []).append(run_id)
 
 
 def is_named_after(run_id: str, sha256: str) -> bool:
@@ -517,18 +384,25 @@ def is_named_after(run_id: str, sha256: str) -> bool:
 
 
 def is_store(path: Path | str) -> bool:
-    """Tell whether a place is a store; `UsageError` if it is one of an earlier layout."""
+    """Return whether a place is a store; `UsageError` if it is one of an earlier data model."""
     if is_url(path) and not str(path).startswith(_BUCKETS):
         return False
     place = open_place(path)
     if place.read(MARK) is not None:  # not its size: only what is asked for with a body is refused with a reason
+        with suppress(StoreError):
+            _refuse_earlier(place, layout_of(place))
         return True
     if is_outdated(place):
         raise UsageError(
-            f"{place.where()}: is a store of an earlier data model, or of which not all was copied (it has no {MARK}); "
-            f"'tcpipe migrate {place.where()}' brings it to data model {DATA_MODEL_VERSION}"
+            f"{place.where()}: is a store of data model 1, which this version does not read, or an incomplete copy (no {MARK})"
         )
     return False
+
+
+def _refuse_earlier(place: Place, version: str | None) -> None:
+    if version in EARLIER_VERSIONS:
+        what = f"is a store of data model {version}; 'tcpipe migrate {place.where()}' brings it to data model {DATA_MODEL_VERSION}"
+        raise UsageError(f"{place.where()}: {what}")
 
 
 def run_at(path: Path | str) -> tuple[Store, list[RunDirectory]] | None:
@@ -578,6 +452,7 @@ def open_store(root: str | Path, *, create: bool = False) -> Store:
     else:
         store.place.check()
     version = layout_of(store.place)
+    _refuse_earlier(store.place, version)
     found = version is not None or is_store(root)
     if not found and not create and not isinstance(root, Path):
         raise UsageError(f"{root}: there is no store here; run 'tcpipe ingest' first, or name another with --store")

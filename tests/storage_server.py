@@ -30,6 +30,7 @@ class Fetched(list[str]):
     sent_bytes = 0
     cuts = 0
     lost = 0
+    requests = 0
 
 
 class _Server(ThreadingHTTPServer):
@@ -50,6 +51,7 @@ class _Handler(BaseHTTPRequestHandler):
         self._answer(with_body=True)
 
     def do_PUT(self) -> None:
+        self.server.fetched.requests += 1
         data = self.rfile.read(int(self.headers["Content-Length"]))
         bucket, _, name = unquote(urlsplit(self.path).path).lstrip("/").partition("/")
         path = self.server.root / bucket / name
@@ -84,6 +86,7 @@ class _Handler(BaseHTTPRequestHandler):
         self._send(200, f"<DeleteResult>{deleted}</DeleteResult>".encode())
 
     def _answer(self, *, with_body: bool) -> None:
+        self.server.fetched.requests += 1
         parts = urlsplit(self.path)
         bucket, _, name = unquote(parts.path).lstrip("/").partition("/")
         if bucket in _DENIALS:
@@ -98,7 +101,8 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _list(self, bucket: Path, query: dict[str, list[str]]) -> None:
         if bucket.is_dir():
-            self._send(200, _listing(bucket, query.get("prefix", [""])[0], query.get("delimiter", [""])[0]))
+            asked = (query.get(name, [""])[0] for name in ("prefix", "delimiter", "start-after"))
+            self._send(200, _listing(bucket, *asked))
         else:
             self._send(404, b"<Error><Code>NoSuchBucket</Code></Error>")
 
@@ -154,9 +158,9 @@ def object_store(root: Path) -> Iterator[tuple[dict[str, str], Fetched]]:
         server.server_close()
 
 
-def _listing(bucket: Path, prefix: str, delimiter: str) -> bytes:
+def _listing(bucket: Path, prefix: str, delimiter: str, after: str) -> bytes:
     names = sorted(path.relative_to(bucket).as_posix() for path in bucket.rglob("*") if path.is_file())
-    names = [name for name in names if name.startswith(prefix)]
+    names = [name for name in names if name.startswith(prefix) and name > after]
     deeper = {name for name in names if delimiter and delimiter in name[len(prefix) :]}
     contents = "".join(
         f"<Contents><Key>{escape(name)}</Key><LastModified>2020-09-13T12:26:40.000Z</LastModified>"

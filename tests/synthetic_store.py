@@ -11,6 +11,7 @@ from tcpipe import __version__
 from tcpipe.formats.maps.building import build_map
 from tcpipe.formats.recipe_toml import ingest_key, recipe_id
 from tcpipe.formats.run_documents import Counts, LogOrigin, Manifest, RunJson
+from tcpipe.pipeline.log_writer import commit_run
 from tcpipe.recipe import Recipe
 from tcpipe.store import Store, open_store
 from tcpipe.tables.bits import DropReason
@@ -165,6 +166,7 @@ def add_run(
         gated=GatedTrack(GATED_TRACK.empty() if track is None else track, info),
         labelled=LabelledSegments(table, info, ledger_m),
     )
+    commit_run(store, run_id)
 
 
 def add_world(store, directory: Path, *, name="site", layers=("ortho", "terrain")):

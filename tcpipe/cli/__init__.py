@@ -9,12 +9,13 @@ import shlex
 import signal
 import sys
 from collections.abc import Callable, Sequence
+from copy import copy
 from typing import Any, NoReturn, TypeVar
 
 import click
 
 from tcpipe import __version__
-from tcpipe.cli.accept import accept
+from tcpipe.cli.acknowledge import acknowledge
 from tcpipe.cli.add_map import add_map
 from tcpipe.cli.build_dataset import build_dataset
 from tcpipe.cli.cost_map import cost_map
@@ -94,11 +95,15 @@ def cli() -> None:
 
 
 for command in (
-    *(demo, init, inspect, preflight, ingest, status, accept, prune),
+    *(demo, init, inspect, preflight, ingest, status, acknowledge, prune),
     *(add_map, build_dataset, train, evaluate, reproduce, predict_path, cost_map, plan_path),
     *(report, overlay, export, explain, verify, migrate, diff, schemas, simulate),
 ):
     cli.add_command(_debug_option(hidden=True)(command))
+
+_accept = copy(acknowledge)
+_accept.hidden = True
+cli.add_command(_accept, "accept")  # its name before data model 3.0
 
 
 def main() -> None:

@@ -24,13 +24,13 @@ def answers() -> dict[str, type]:
     from tcpipe.pipeline.ingest_task import LogLine
     from tcpipe.pipeline.inspect import InspectedLogs, InspectedRun, InspectedStore
     from tcpipe.pipeline.inspected import InspectedDataset, InspectedMap
-    from tcpipe.pipeline.known_trouble import Accepted
     from tcpipe.pipeline.layers import ExportedLayers
     from tcpipe.pipeline.log_inspection import InspectedLog
     from tcpipe.pipeline.maps import AddedMap
     from tcpipe.pipeline.migrate import Migrated
     from tcpipe.pipeline.overlay import Overlay
     from tcpipe.pipeline.preflight import Preflight
+    from tcpipe.pipeline.problems import Acknowledged
     from tcpipe.pipeline.prune import Pruned
     from tcpipe.pipeline.status import Status
     from tcpipe.pipeline.table_proposal import InspectedTables
@@ -48,7 +48,7 @@ def answers() -> dict[str, type]:
         "path-totals": TableTotals,
         "plan": PlanFile,
         "reproduction": ReproductionSummary,
-        "accept.answer": Accepted,
+        "acknowledge.answer": Acknowledged,
         "add-map.answer": AddedMap,
         "build-dataset.answer": BuildResult,
         "cost-map.answer": CostMapResult,

@@ -191,8 +191,6 @@ def _print_store(found: InspectedStore) -> None:
         say(f"damaged: {line}")
     for run_id, by in found.superseded.items():
         say(f"superseded by {by}: {run_id}; its log was completed or repaired")
-    for run_id in found.unfinished:
-        say(f"not finished: {run_id}; it is being ingested, or its log failed")
 
 
 def _print_run(found: InspectedRun) -> None:

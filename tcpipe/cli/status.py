@@ -24,11 +24,12 @@ def status(
 
     Without LOG: of the logs and folders that the latest calls of ingest were given. Nothing of a log is read.
 
-    Exit code 3: a log failed, is damaged or gave no segment, a call was killed, a log waits for more than two nights, and nobody
-    accepted that (tcpipe accept); or a run is not as it was written, or is gone.
+    Exit code 3: a log failed, is damaged or gave no segment, a call was killed, a log waits for more than two nights, files of a run or
+    a commit are missing, and nobody acknowledged that (tcpipe acknowledge).
     """
     from tcpipe.cli.output import print_json, ruling_recipe, say_lines
     from tcpipe.errors import UsageError
+    from tcpipe.formats.finding_lines import format_finding
     from tcpipe.formats.object_storage import is_url
     from tcpipe.pipeline.status import status as run
     from tcpipe.store import is_store
@@ -42,6 +43,6 @@ def status(
         print_json(found)
         return found.exit_code
     say_lines(found)
-    for problem in found.problems:
-        say(f"tcpipe: {problem}", err=True)
+    for finding in found.problems:
+        say(f"tcpipe: {format_finding(finding)}", err=True)
     return found.exit_code

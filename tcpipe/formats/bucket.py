@@ -114,6 +114,14 @@ class BucketPlace:
         """Return the names of one part below ``prefix/``."""
         return sorted(meta["path"].rpartition("/")[2] for meta in self._in(prefix)["objects"])
 
+    def files_after(self, prefix: str, after: str) -> list[str]:
+        """Return the names of the objects in ``prefix`` that sort after a name: a request for every thousand."""
+        store, key = self._store(prefix)
+        with told(self.where(prefix), StoreError):
+            batches = list(store.list(prefix=key or None, offset="/".join(part for part in (key, after) if part)))
+        names = (meta["path"][len(key) + 1 if key else 0 :] for batch in batches for meta in batch)
+        return sorted(name for name in names if name > after and "/" not in name)
+
     def _in(self, prefix: str) -> ListResult[Sequence[ObjectMeta]]:
         store, key = self._store(prefix)
         with told(self.where(prefix), StoreError):

@@ -55,6 +55,12 @@ def describe_finding(finding: Finding) -> str:
     return entry.template.format(**{**missing, **values, **finding.names, "subject": finding.subject.name})
 
 
+def describe_title(finding: Finding) -> str:
+    """Return what its code means, in a few words."""
+    entry = read_catalogue().get(finding.code)
+    return entry.title if entry else finding.code.replace("-", " ")
+
+
 def describe_remedy(finding: Finding, remedy: Remedy) -> str:
     """Return what a remedy does and the keys or the command that do it, in one line; of arrays of tables only that they follow."""
     entry = read_catalogue().get(finding.code)

@@ -53,18 +53,12 @@ def recast(record: object, cls: Callable[..., T], **more: object) -> T:
     return cls(**(known | more))
 
 
-def is_text(value: object) -> bool:
-    """Tell whether all text in a dataclass is text, and no name of a file that is none."""
+def compact_json(value: object) -> bytes:
+    """Return the JSON of dataclasses whose numbers are finite, for `of_json`, in a tenth of the time of `to_json_line`."""
     try:
-        msgspec.json.encode(value)
-    except UnicodeEncodeError:
-        return False
-    return True
-
-
-def compact_json(value: object) -> str:
-    """Return the JSON of a dataclass for `of_json`: whose text `is_text`, and whose numbers are finite."""
-    return msgspec.json.encode(value).decode()
+        return msgspec.json.encode(value)
+    except UnicodeEncodeError:  # the name of a file is no text
+        return to_json_line(value).encode()
 
 
 def to_json(value: Any) -> str:
@@ -138,7 +132,7 @@ def typed(value: object, cls: type[T], path: Path | str) -> T:
         raise StoreError(f"{path}: is not what this version writes: {_in_words(str(error))}") from None
 
 
-def of_json(text: str, cls: type[T], path: Path | str) -> T:
+def of_json(text: str | bytes, cls: type[T], path: Path | str) -> T:
     """Return JSON text as a dataclass, or what is made of such; as `typed`."""
     try:
         with _CONVERTING:

@@ -70,6 +70,9 @@ class Place(Protocol):
     def files(self, prefix: str = "") -> list[str]:
         """Return the names of one part below ``prefix/``, sorted: the files that lie there, not those in its folders."""
 
+    def files_after(self, prefix: str, after: str) -> list[str]:
+        """Return the names of the files in ``prefix`` that sort after a name; a bucket lists no others."""
+
     def put(self, name: str, data: bytes, *, lasting: bool = True) -> None:
         """Write a file, in the place of what is there; without ``lasting`` it is not synced, and may be half there after a kill."""
 
@@ -149,6 +152,10 @@ class DirectoryPlace:
     def files(self, prefix: str = "") -> list[str]:
         """Return the names of the files in ``prefix``."""
         return [entry.name for entry in self._in(prefix) if not entry.is_dir()]
+
+    def files_after(self, prefix: str, after: str) -> list[str]:
+        """Return the names of the files in ``prefix`` that sort after a name."""
+        return [name for name in self.files(prefix) if name > after]
 
     def _in(self, prefix: str) -> list[os.DirEntry[str]]:
         with _told(self.where(prefix), "read"), suppress(FileNotFoundError, NotADirectoryError):

@@ -55,6 +55,8 @@ class RunJson:
     """The tables of what was read, by their name beside this document."""
     streams_key: str = ""
     """Names the read settings that they were made with."""
+    outline: str = field(default="", metadata=LEFT_OUT)
+    """Hash of the log's size and index, by which it is known where not all of it is at hand (ADR 86); "" where it has none."""
 
 
 def tell_the_same(one: RunJson, other: RunJson) -> bool:
@@ -126,15 +128,6 @@ class Manifest:
     message_definitions: str = ""
     checksums: Mapping[str, Checksum] = field(default_factory=dict)
     """The tables, by their name beside this document."""
-
-
-@dataclass(frozen=True, slots=True)
-class ManifestHead:
-    """What is read of a manifest of another data model."""
-
-    data_model_version: str | None = None
-    robot: str | None = None
-    tags: Mapping[str, str] | None = None
 
 
 @dataclass(frozen=True, slots=True)

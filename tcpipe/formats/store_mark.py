@@ -65,7 +65,7 @@ def gone_if_empty(place: str | Path) -> Iterator[None]:
         yield
     finally:
         if made and not any(store.glob("runs/*")) and not any(store.glob("maps/*-*.json")):
-            for own in ("records", "index"):
+            for own in ("log", "index"):
                 shutil.rmtree(store / own, ignore_errors=True)
             (store / MARK).unlink(missing_ok=True)
             for path in (store / "runs", store / "maps", *made):

@@ -2,39 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+import os
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path, PurePosixPath
 
 import pyarrow as pa
 
 from tcpipe.errors import StoreError
+from tcpipe.formats.commits import State
 from tcpipe.formats.index_files import RunFacts
-from tcpipe.formats.numbered import digest_of, name_of, numbers, read_as_at
+from tcpipe.formats.numbered import digest_of, read_as_at
 from tcpipe.formats.parquet import highest, lowest, read_table, write_table
-from tcpipe.formats.place import DirectoryPlace, Entry, Place
+from tcpipe.formats.place import DirectoryPlace, Place
 from tcpipe.formats.recipe_toml import read_key
-from tcpipe.formats.run_documents import Manifest, ManifestHead
+from tcpipe.formats.run_documents import Manifest
 from tcpipe.formats.seals import Checksum, file_checksum, file_checksums, wrong_checksum
 from tcpipe.tables.levels import LABELLED_SEGMENTS, GatedTrack
 from tcpipe.tables.verdicts import judge_again
-
-
-@dataclass(frozen=True, slots=True)
-class Listed:
-    """What lies in the directory of a run: its files by name there, and the last numbers of its documents."""
-
-    runs: Place
-    run_id: str
-    files: Mapping[str, Entry]
-    numbers: Mapping[str, int]
-
-    def manifests(self) -> list[tuple[str, int]]:
-        """Return each recipe with the number of its last manifest."""
-        parted = ((stem.partition("/"), number) for stem, number in self.numbers.items())
-        return sorted((recipe, number) for (recipe, _, stem), number in parted if stem == "manifest")
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,17 +30,26 @@ class RunDirectory:
 
     run_id: str
     recipe_id: str
-    place: Place
-    """``runs/<run_id>/<recipe_id>``."""
+    runs: Place
+    """``runs/`` of the store."""
     facts: RunFacts
-    """What the index has of it: enough to choose by."""
-    files_state: str
-    """Tells its segments and track from files that were written since."""
+    """What the log has of it: enough to choose by."""
+    files_state: str = ""
+    """Distinguishes its files from what is written under their names later."""
+
+    @property
+    def place(self) -> Place:
+        """``runs/<run_id>/<recipe_id>``."""
+        return self.runs.below(f"{self.run_id}/{self.recipe_id}")
 
     @property
     def manifest(self) -> Manifest:
         """The whole manifest, with the run's tags as they are now; `StoreError` if it is not as it was written."""
-        return replace(_manifest(self.place, self.facts.state), tags=self.facts.tags)
+        manifest = _manifest(self.place, self.facts.manifest, self.files_state)
+        if (manifest.run_id, manifest.recipe_id) != (self.run_id, self.recipe_id):
+            what = f"is of {manifest.run_id}/{manifest.recipe_id}, but lies in {self.run_id}/{self.recipe_id}"
+            raise StoreError(f"{self.place.where(self.facts.manifest)}: {what}")
+        return replace(manifest, tags=self.facts.tags)
 
     @property
     def streams_key(self) -> str:
@@ -105,78 +101,90 @@ class RunDirectory:
 
 
 @dataclass(frozen=True, slots=True)
+class Lost:
+    """A file of an ingestion that is gone, or has another size."""
+
+    where: str
+    expected_bytes: int
+    size_bytes: int | None = None
+
+    def __str__(self) -> str:
+        """Return it as one line."""
+        how = "is gone" if self.size_bytes is None else f"has {self.size_bytes} bytes, expected {self.expected_bytes}"
+        return f"{self.where}: {how}; ingest the log again"
+
+
+@dataclass(frozen=True, slots=True)
 class Ingestions:
-    """What a store, or one of its runs, holds of finished ingestions."""
+    """What a store, or one of its runs, holds of finished ingestions, by run and recipe."""
 
+    state: State
     finished: tuple[RunDirectory, ...]
-    """Those of this data-model version, by run and recipe."""
-    outdated: Mapping[str, ManifestHead]
+    """Those whose files are there and that count."""
+    lost: Mapping[tuple[str, str], Lost]
+    """Those of which a file is gone or has another size."""
+    outdated: Mapping[str, RunFacts]
     """By run, of those that are finished in other data-model versions only: the last."""
-    damaged: Mapping[tuple[str, str], str]
-    """By run and recipe ("" of the whole run): what is not as it was written, or is gone."""
-    superseded: Mapping[str, str] = field(default_factory=dict)
-    """Runs whose log was completed or repaired, which are in none of the others, and the run that took their place."""
-    rows: Mapping[tuple[str, str], RunFacts] = field(default_factory=dict)
-    """Of the index, by run and recipe: of all that are finished, those of superseded runs too."""
-    lost: Mapping[tuple[str, str], RunFacts] = field(default_factory=dict)
-    """What the index has of those that are damaged or gone: it keeps them, so that nobody takes what is left for all."""
-    unfinished: tuple[str, ...] = ()
-    """Runs without a manifest that the index does not know: on their way, of a killed call, or not copied whole."""
-    stale: bool = False
-    """Whether the index has to be written again."""
+    rows: Mapping[tuple[str, str], RunFacts]
+    """All that are there, those of superseded runs too."""
+
+    @property
+    def damaged(self) -> dict[tuple[str, str], str]:
+        """What is lost, as lines."""
+        return {key: str(lost) for key, lost in self.lost.items()}
+
+    @property
+    def superseded(self) -> dict[str, str]:
+        """Runs whose log was completed or repaired, and the run that took their place."""
+        return self.state.superseded
 
 
-def with_lost(
-    found: Ingestions, known: Mapping[tuple[str, str], RunFacts], run_ids: Iterable[str], *, runs: Place, index: Place
-) -> Ingestions:
-    """Return what there is of all runs with what the index knows and the listing lacks, as damaged.
-
-    What `prune` removes is not missed: it is superseded, or of a recipe beside another.
+def look_at_files(place: Place, rows: Iterable[RunFacts]) -> Iterator[tuple[RunFacts, Lost | None, str]]:
+    """Yield each row with the first of its files that is gone or has another size, and with the state of its files.
 
     Parameters
     ----------
-    found : what was listed.
-    known : the rows of the index, read before.
-    run_ids : the runs of which anything is there.
-    runs, index : where both lie.
+    place : ``runs/``. On disk each file is looked at; in a bucket there is one request for every thousand objects below it.
+    rows : ingestions as the log has them.
     """
-    damaged, names = dict(found.damaged), set(run_ids)
-    there = {
-        *(run.run_id for run in found.finished),
-        *(name for name, _ in damaged),
-        *found.outdated,
-        *found.superseded,
-    }
-    gone = sorted({name for name, _ in known if name not in there})
-    absent = [name for name in gone if name not in names]
-    few = f"{', '.join(absent[:3])}{f' and {len(absent) - 3} more' if len(absent) > 3 else ''}"
-    what = f"{len(absent)} run{'s are' if len(absent) > 1 else ' is'} gone that the index knows: {few}"
-    why = f"copy the store again, or ingest the logs again; if you removed them, remove {index.where()} too"
-    for name in gone:
-        bare = f"{runs.where(name)}: its manifest-<n>.json is gone; ingest the log again"
-        damaged[name, ""] = bare if name in names else f"{runs.where()}: {what}; {why}"
-    lost = {key: row for key, row in known.items() if key in damaged or key[0] in gone}
-    return replace(found, damaged=damaged, lost=lost, unfinished=tuple(sorted(names - there - set(gone))))
+    rows = list(rows)
+    find = _find_on_disk(place.root) if isinstance(place, DirectoryPlace) else _find_listed(place, rows)
+    for row in rows:
+        states, lost = list[tuple[int, int]](), None
+        for name, size_bytes in row.files.items():
+            seen = find(f"{row.run_id}/{name}")
+            if seen is None or seen[0] != size_bytes:
+                lost = Lost(place.where(f"{row.run_id}/{name}"), size_bytes, seen and seen[0])
+                break
+            states.append(seen)
+        yield row, lost, "" if lost else " ".join(f"{size}-{time}" for size, time in states)
 
 
-def refuse_lost(of: Listed, recipe_id: str, row: RunFacts | None) -> None:
-    """Raise `StoreError` where a document is gone that the index has seen, and an earlier one would hold.
+def _find_on_disk(root: Path) -> Callable[[str], tuple[int, int] | None]:
+    """Return what tells the size [byte] and modification time [ns] of a file; None where there is none."""
 
-    A copy's files may have other times: what is gone is told by numbers alone.
-    """
-    if row is None:
-        return
-    seen = f"{recipe_id}/{row.state} {'' if row.log is None else row.log.state}"
-    for stem, number in numbers(state.rsplit("-", 2)[0] for state in seen.split()).items():
-        if number > of.numbers.get(stem, 0):
-            where = of.runs.where(f"{of.run_id}/{name_of(stem, number)}")
-            raise StoreError(f"{where}: is gone; ingest the log again")
+    def find(name: str) -> tuple[int, int] | None:
+        try:
+            seen = os.stat(f"{root}/{name}")  # noqa: PTH116  of ten thousands
+        except OSError:
+            return None
+        return seen.st_size, seen.st_mtime_ns
+
+    return find
+
+
+def _find_listed(place: Place, rows: Sequence[RunFacts]) -> Callable[[str], tuple[int, int] | None]:
+    """Return the same from a listing of the run, or of all."""
+    run_ids = {row.run_id for row in rows}
+    found = place.entries(run_ids.pop() if len(run_ids) == 1 else "") if rows else []
+    return {entry.name: (entry.size_bytes, entry.modified_ns) for entry in found}.get
 
 
 @lru_cache(maxsize=64)
-def _manifest(place: Place, state: str) -> Manifest:
-    """Return the manifest whose file is in this state, which begins with its name; judged by this version's catalogue."""
-    manifest = read_as_at(place, state.rsplit("-", 2)[0], Manifest)
+def _manifest(place: Place, name: str, state: str) -> Manifest:
+    """Return a manifest while the files of its ingestion are in this state; judged by this version's catalogue."""
+    del state
+    manifest = read_as_at(place, name, Manifest)
     return replace(manifest, verdict=judge_again(manifest.verdict, manifest.info.report.findings))
 
 

@@ -1,27 +1,27 @@
-"""Calls that have begun: a record each while they run, so that one that was killed is known by what it left."""
+"""Calls that have begun: a commit when one begins and one when it ends, so that one that was killed is known."""
 
 from __future__ import annotations
 
-import os
-import socket
+import logging
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
-from dataclasses import dataclass
-from datetime import UTC, datetime
-from pathlib import Path
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from datetime import datetime
 from typing import Literal
 
 from tcpipe import __version__
 from tcpipe.errors import StoreError
+from tcpipe.formats.commits import Begun, Entries, Kind, Problem, State
 from tcpipe.formats.json_files import digest, recast
-from tcpipe.formats.record_files import Begun, Process, record_name
-from tcpipe.store import Store
+from tcpipe.pipeline.log_writer import LogWriter, is_alive
+from tcpipe.tables.findings import Remedy, Subject, make_finding
+
+logger = logging.getLogger("tcpipe")
 
 _LONGEST_S = 86_400.0
 """After so long a call of a machine that cannot be asked from here counts as killed: calls are made every night."""
-
-_BEGUN = "records/begun"
+_DIGITS = 32
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,110 +29,100 @@ class BegunCall(Begun):
     """A call that has begun and not ended."""
 
     name: str = ""
-    """Of its record."""
+    """By which it is acknowledged."""
     state: Literal["running", "perhaps running", "killed"] = "killed"
     """``perhaps`` where its process cannot be looked at from here."""
 
     def __str__(self) -> str:
         """Return it as one line."""
-        return f"{self.command} of {self.begin[:19]} UTC on {self.process.host} (process {self.process.pid})"
+        at = f" on {self.process.host} (process {self.process.pid})" if self.process else ""
+        return f"{self.command} of {self.begin[:19]} UTC{at}"
 
     @property
-    def problem(self) -> str:
-        """The line that says it was killed, as far as that is known, and what to do."""
-        known = is_alive(self.process) is False
-        how = (
-            "was killed"
-            if known
-            else f"has not ended since; whether it still runs on {self.process.host} is not known here"
-        )
-        return f"{self}: {how}; run the same command again, or 'tcpipe accept {self.name}'"
-
-    def is_done_by(self, other: Begun) -> bool:
-        """Tell whether another call does all that this one was to do."""
-        same = (self.command, self.options) == (other.command, other.options)
-        return same and all(is_below(entry, other.works_on) for entry in self.works_on)
+    def problem(self) -> Problem:
+        """That it was killed, as far as that is known."""
+        code = "call-killed" if self.process and is_alive(self.process) is False else "call-lost"
+        names = {"command": self.command, "begin": self.begin[:19]}
+        names |= {"host": self.process.host, "pid": str(self.process.pid)} if self.process else {}
+        remedy = Remedy("acknowledge", command=f"tcpipe acknowledge {self.name}")
+        return Problem(make_finding(code, Subject("call", self.name), names=names, remedies=[remedy]), self.name)
 
 
-def is_below(entry: str, folders: Sequence[str]) -> bool:
-    """Tell whether a path or URL is one of those given, or lies below one."""
-    return any(entry == folder or entry.startswith(f"{folder.rstrip('/')}/") for folder in folders)
+@dataclass(slots=True)
+class OpenCall:
+    """A call that runs: what its last commit adds, and of which kind that is."""
+
+    end: Entries = field(default_factory=Entries)
+    kind: Kind = "ended"
 
 
 @contextmanager
-def begun_call(store: Store, command: str, works_on: Sequence[str], *, options: object = None) -> Iterator[None]:
-    """Leave a record in the store until the call ends; one that is killed, or ended by a signal, leaves it for good.
+def begun_call(log: LogWriter, command: str, works_on: Sequence[str], *, options: object = None) -> Iterator[OpenCall]:
+    """Commit that a call begins, and in the end that it ended; one that is killed, or ended by a signal, has no end.
 
-    When it ends well, the records of calls that were to do the same, and do not run, go with its own. A store that cannot be written goes
-    without.
+    When it ends well, calls that were to do the same, and do not run, end with it. A store that cannot be written goes without.
 
     Parameters
     ----------
-    store : where the record lies.
+    log : writes into the log of the store.
     command : ``ingest`` or ``build-dataset``.
     works_on : logs and folders, or the dataset, in full.
-    options : what else tells its work from that of another call.
+    options : what else distinguishes its work from that of another call.
     """
-    begin = datetime.now(UTC).isoformat(timespec="milliseconds")
-    call = Begun(command, __version__, begin, this_process(), tuple(works_on), record_name(digest(options)))
-    name = f"{begin[:19].replace('-', '').replace(':', '')}-{record_name(digest(call))}"
-    done = [name]
-    with suppress(StoreError):
-        earlier = [of.name for of in begun_calls(store) if of.state != "running" and of.is_done_by(call)]
-        store.remember(f"begun/{name}", call)
+    call, opened, begun = new_call(command, works_on, options), OpenCall(), list[int]()
+    done = settled_calls(log.state, call)
     try:
-        yield
-        done += earlier
-    except BaseException as error:
-        done = done if isinstance(error, Exception) else []
+        log.commit("begun", Entries(begun=(call,)))
+        begun = [log.state.number]
+    except StoreError as error:
+        logger.info("%s", error)
+    try:
+        yield opened
+    except Exception:
+        _end(log, "ended", Entries(ended=tuple(begun)))
         raise
-    finally:
-        with suppress(StoreError):
-            for ended in done:
-                store.place.delete(f"{_BEGUN}/{ended}.json")
+    _end(log, opened.kind, replace(opened.end, ended=(*begun, *done)))
 
 
-def begun_calls(store: Store) -> list[BegunCall]:
+def _end(log: LogWriter, kind: Kind, entries: Entries) -> None:
+    try:
+        log.commit(kind, entries)
+    except StoreError as error:
+        logger.warning("%s: so the store does not know how this call ended", error.problems[0])
+
+
+def new_call(command: str, works_on: Sequence[str], options: object = None) -> Begun:
+    """Return what a commit has of a call that begins."""
+    return Begun(command, __version__, tuple(works_on), digest(options)[:_DIGITS])
+
+
+def settled_calls(state: State, call: Begun) -> list[int]:
+    """Return the numbers of the calls that do not run and whose work another call does."""
+    return [of.number for of in begun_calls(state) if of.state != "running" and _is_done_by(of, call)]
+
+
+def _is_done_by(call: Begun, other: Begun) -> bool:
+    """Return whether another call does all that this one was to do."""
+    same = (call.command, call.options) == (other.command, other.options)
+    return same and all(is_below(entry, other.works_on) for entry in call.works_on)
+
+
+def is_below(entry: str, folders: Sequence[str]) -> bool:
+    """Return whether a path or URL is one of those given, or lies below one."""
+    return any(entry == folder or entry.startswith(f"{folder.rstrip('/')}/") for folder in folders)
+
+
+def begun_calls(state: State) -> list[BegunCall]:
     """Return the calls that have begun and not ended, by when they began."""
-    names = (name.removesuffix(".json") for name in store.place.files(_BEGUN) if name.endswith(".json"))
-    found = ((name, store.recall(f"begun/{name}", Begun)) for name in names)
-    return [recast(call, BegunCall, name=name, state=_find_state(call)) for name, call in found if call is not None]
+    return [
+        recast(call, BegunCall, name=f"call-{number}", state=_find_state(call))
+        for number, call in sorted(state.begun.items())
+    ]
 
 
 def _find_state(call: Begun) -> Literal["running", "perhaps running", "killed"]:
-    alive = is_alive(call.process)
+    alive = None if call.process is None else is_alive(call.process)
     if alive is not None:
         return "running" if alive else "killed"
     age_s = time.time() - datetime.fromisoformat(call.begin).timestamp()
     return "perhaps running" if abs(age_s) < _LONGEST_S else "killed"  # abs: a clock that is far ahead
-
-
-def this_process() -> Process:
-    """Return what tells this process from any other, here and elsewhere; "" for what the system does not tell (other than Linux)."""
-    boot, machine = (_text(path) for path in ("/proc/sys/kernel/random/boot_id", "/etc/machine-id"))
-    namespace = ""
-    with suppress(OSError):
-        namespace = os.readlink("/proc/self/ns/pid")  # noqa: PTH115  no path
-    return Process(socket.gethostname(), machine, boot, namespace, os.getpid(), _read_start_time(os.getpid()))
-
-
-def is_alive(process: Process) -> bool | None:
-    """Tell whether a process lives; None where that cannot be seen from here: another machine or container, another system."""
-    here = this_process()
-    if (process.host, process.machine) != (here.host, here.machine) or not (process.boot and process.start):
-        return None
-    if process.boot != here.boot:  # of a machine without an identity only its name is known, which others may have
-        return False if here.machine else None
-    return _read_start_time(process.pid) == process.start if process.namespace == here.namespace else None
-
-
-def _read_start_time(pid: int) -> str:
-    """Return when a living process began, in ticks since the start of the machine (proc(5): stat); "" where there is none."""
-    state, *more = _text(f"/proc/{pid}/stat").rpartition(")")[2].split() or [""]
-    return "" if state in ("", "Z", "X", "x") else more[18]
-
-
-def _text(path: str) -> str:
-    with suppress(OSError):
-        return Path(path).read_text().strip()
-    return ""

@@ -1,22 +1,16 @@
-"""The history of a store: what each call of ingest and build-dataset did and took, a small record each; and estimates from it."""
+"""What calls of ingest and build-dataset did and took, and estimates from that."""
 
 from __future__ import annotations
 
 import resource
 import time
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 
-from tcpipe.errors import StoreError
 from tcpipe.execution import cluster_cpu_s
-from tcpipe.formats.json_files import digest
-from tcpipe.formats.record_files import Call, record_name
+from tcpipe.formats.commits import Call
 from tcpipe.store import Store
-
-_LATEST = 50
-"""So many calls are looked back on."""
 
 INGEST, BUILD = "ingest", "build-dataset"
 
@@ -66,26 +60,15 @@ def started() -> Stopwatch:
     return Stopwatch(time.time_ns(), time.monotonic(), _cpu_s())
 
 
-def remember_call(store: Store, watch: Stopwatch, call: Call) -> None:
-    """Remember what a call did, with what it took; a store that cannot be written goes without."""
+def measure_call(watch: Stopwatch, call: Call) -> Call:
+    """Return a call with what it took."""
     begin = datetime.fromtimestamp(watch.begin_ns / 1e9, UTC)
-    took = replace(
+    return replace(
         call,
         begin=begin.isoformat(timespec="milliseconds"),
         wall_s=round(time.monotonic() - watch.running_s, 3),
         cpu_s=round(_cpu_s() - watch.cpu_s, 3),
     )
-    with suppress(StoreError):
-        store.remember(f"calls/{begin:%Y%m%dT%H%M%S}-{record_name(digest(took))}", took)
-
-
-def latest_calls(store: Store) -> list[Call]:
-    """Return the latest calls, the last one first."""
-    here = store.place.files("records/calls")
-    names = sorted((name.removesuffix(".json") for name in here if name.endswith(".json")), reverse=True)
-    found = (store.recall(f"calls/{name}", Call) for name in names[:_LATEST])
-    # Names tell seconds alone.
-    return sorted((call for call in found if call is not None), key=lambda call: call.begin, reverse=True)
 
 
 def estimate(calls: Sequence[Call], command: str, amount: int, *, jobs: int) -> Estimate:

@@ -3,32 +3,31 @@
 from __future__ import annotations
 
 import logging
+import time
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, ExitStack, closing, nullcontext
-from dataclasses import dataclass, field, replace
-from functools import partial
+from contextlib import AbstractContextManager, closing, nullcontext
+from dataclasses import dataclass, field, fields, replace
 from itertools import chain
 from pathlib import Path
-from typing import Literal, TypeVar
+from typing import Literal
 
 from tcpipe import __version__
 from tcpipe.errors import LogError, StoreError, UsageError, plain_line
 from tcpipe.execution import run_all
 from tcpipe.formats.atomic import scratch_directory
-from tcpipe.formats.index_files import forget_runs
+from tcpipe.formats.commit_log import keep_state_here, uncollected
+from tcpipe.formats.commits import Call, Entries, Failure, Kind, State
 from tcpipe.formats.object_storage import is_presigned, is_url
 from tcpipe.formats.recipe_toml import ingest_key, recipe_of
-from tcpipe.formats.record_files import Call
 from tcpipe.formats.robot_files import profiles_of
 from tcpipe.formats.store_mark import gone_if_empty
-from tcpipe.pipeline.begun_calls import begun_call
-from tcpipe.pipeline.calls import INGEST, remember_call, room_of, started
+from tcpipe.formats.stored_runs import look_at_files
+from tcpipe.pipeline.begun_calls import begun_call, new_call, settled_calls
+from tcpipe.pipeline.calls import INGEST, measure_call, room_of, started
 from tcpipe.pipeline.ingest_options import IngestOptions
-from tcpipe.pipeline.ingest_run import as_indexed, ingest_one, made_before
-from tcpipe.pipeline.ingest_task import IngestResult, IngestTask, died, told, too_young
-from tcpipe.pipeline.known_runs import KnownRuns, known_runs
-from tcpipe.pipeline.known_trouble import Trouble, trouble_of_run
+from tcpipe.pipeline.ingest_run import Ingested, find_twin, ingest_one
+from tcpipe.pipeline.ingest_task import IngestResult, IngestTask, died, result_of, too_young
 from tcpipe.pipeline.log_findings import find_failure
 from tcpipe.pipeline.log_sources import (
     FoundLogs,
@@ -37,15 +36,21 @@ from tcpipe.pipeline.log_sources import (
     find_sources,
     in_shard,
     in_turns,
+    remembered,
     with_hashes,
 )
-from tcpipe.pipeline.supersession import remember_earlier, superseded_by
-from tcpipe.store import Store, add_by_hash, open_store
+from tcpipe.pipeline.log_writer import LogWriter, open_log
+from tcpipe.pipeline.plan import Step, plan
+from tcpipe.pipeline.problems import failure_of, is_acknowledged, problems_of
+from tcpipe.pipeline.supersession import superseded_by
+from tcpipe.store import Store, open_store
+from tcpipe.tables.findings import select_problems
 from tcpipe.tables.options import as_function
 
-R = TypeVar("R")
-
 logger = logging.getLogger("tcpipe")
+
+_TOGETHER_S = 1.0
+"""What ends within so long is one commit."""
 
 _NO_LOGS = "no logs given; wanted .mcap, .bag or .db3 files, ROS 2 bag directories, or folders of them or of tables"
 
@@ -89,19 +94,13 @@ def run_ingest(options: IngestOptions) -> IngestSummary:
     robot = options.robot or ruling.robot
     if robot is not None and robot not in (robots := profiles_of(ruling).robots):
         raise UsageError(f"robot {robot!r} is not known; known: {', '.join(sorted(robots))}")
-    with (
-        _place_for_stand_ins(logs := list(options.logs)) as staging,
-        gone_if_empty(options.store),
-        ExitStack() as until_it_ends,
-    ):
+    with _place_for_stand_ins(logs := list(options.logs)) as staging, gone_if_empty(options.store):
         found = find_sources(logs, as_one=options.as_one, staging=staging, tables=ruling.tables)
         if not found.sources:
             raise (LogError if found.transient else UsageError)(*chain(*found.problems.values()) or [_NO_LOGS])
         opened = open_store(options.store, create=True)
-        given = tuple(str(log) if is_url(log) else str(Path(log).absolute()) for log in logs if not is_presigned(log))
-        until_it_ends.enter_context(begun_call(opened, INGEST, given, options=(ingest_key(ruling), robot, shard)))
-        remember_earlier(opened)
-        known = known_runs(opened, force=options.force)
+        log = open_log(opened)
+        before, given = log.state.number, _in_full(logs)
         mine = found.sources if shard is None else in_shard(found.sources, shard)
         root = opened.root
         message_definitions = None if options.message_definitions is None else Path(options.message_definitions)
@@ -109,28 +108,57 @@ def run_ingest(options: IngestOptions) -> IngestSummary:
             root = root.absolute() if isinstance(root, Path) else root
             message_definitions = None if message_definitions is None else message_definitions.absolute()
         common = (root, ruling, robot, dict(options.tags or {}), options.force, message_definitions)
-        how = (definitions_key(message_definitions), options.retry_failed, options.min_age_s)
-        sources = with_hashes(mine, lambda lineage: known.seen.get(lineage, ()))
-        tasks = [IngestTask(source, *common, *how) for source in sources]
+        how = (*common, definitions_key(message_definitions), options.retry_failed, options.min_age_s)
+        seen = {} if options.force else log.state.seen
+        tasks = [IngestTask(remembered(source, seen.get(source.lineage, ())), *how) for source in mine]
         if options.on_found:
             sizes = {task.source.name: sum(size for size, _ in task.source.files) for task in tasks}
             options.on_found({**dict.fromkeys(map(plain_line, found.problems), 0), **sizes})
-        results = {}
-        for index, source, result in _results(opened, tasks, found, known, jobs=options.jobs, cluster=options.cluster):
-            results[index] = result
-            if options.on_result:
-                options.on_result(result)
-            if source is not None:
-                _remember(opened, tasks[index], source, result, known)
-        _keep_index(opened, known, results.values())
-        summary = IngestSummary(opened.root, tuple(results[index] for index in sorted(results)))
-        if any(result.run_id for result in summary.results):  # else no store may remain
-            remember_call(opened, watch, _call_of(opened, summary, given, tasks, options.jobs))
+        with uncollected():
+            steps = plan(tasks, log.state, broken=find_broken(opened, log.state, tasks))
+        results: dict[int, IngestResult] = {}
+
+        def tell(ended: Iterable[tuple[int, IngestResult]]) -> IngestSummary:
+            for index, result in ended:
+                results[index] = result
+                if options.on_result:
+                    options.on_result(result)
+            return IngestSummary(opened.root, tuple(results[index] for index in sorted(results)))
+
+        with uncollected():
+            summary = tell(_results_without_work(log, found, steps))
+        work = {index: step.task for index, step in enumerate(steps) if step.is_todo}
+        begin = (INGEST, given, (ingest_key(ruling), robot, shard))
+        if work:
+            with begun_call(log, *begin[:2], options=begin[2]) as call:
+                summary = tell(_results(log, work, jobs=options.jobs, cluster=options.cluster))
+                call.end = Entries(calls=(measure_call(watch, _call_of(opened, summary, given, tasks, options.jobs)),))
+        else:
+            log.commit("ended", Entries(ended=tuple(settled_calls(log.state, new_call(*begin)))))
+        if log.state.number != before and log.state.runs:
+            opened.write_index(log.state)
         return summary
 
 
 ingest = as_function(IngestOptions, run_ingest)
 """`tcpipe.ingest`: its keywords are the fields of `IngestOptions`."""
+
+
+def _in_full(logs: Iterable[str | Path]) -> tuple[str, ...]:
+    """Return logs and folders as they were given, in full; those whose URL is signed are not remembered."""
+    return tuple(str(of) if is_url(of) else str(Path(of).absolute()) for of in logs if not is_presigned(of))
+
+
+def find_broken(store: Store, state: State, tasks: Iterable[IngestTask]) -> set[tuple[str, str]]:
+    """Return the ingestions of these logs of which a file is gone.
+
+    In a bucket nobody looks, as that takes a request for every thousand files.
+    """
+    if isinstance(store.root, str):
+        return set()
+    contents = {task.source.sha256 for task in tasks} - {None}
+    rows = [row for row in state.runs.values() if row.log and row.log.source.sha256 in contents]
+    return {(row.run_id, row.recipe_id) for row, lost, _ in look_at_files(store.runs_place, rows) if lost}
 
 
 def _call_of(
@@ -152,105 +180,125 @@ def _call_of(
     )
 
 
-def _keep_index(store: Store, known: KnownRuns, results: Iterable[IngestResult]) -> None:
-    """Write the index, with what this call made."""
-    results = list(results)
-    mended = {result.run_id for result in results if result.run_id} & {run_id for run_id, _ in known.runs.lost}
-    if mended:
-        forget_runs(store.index_place, mended)
-    if not mended and all(result.status in ("unchanged", "waiting") for result in results):
-        store.keep_index(known.runs)
-    elif known.runs.rows or any(result.run_id for result in results):
-        store.keep_index(store.ingestions())
-        store.seen_logs()
-
-
-def _results(
-    store: Store, tasks: Sequence[IngestTask], found: FoundLogs, known: KnownRuns, *, jobs: int, cluster: str | None
-) -> Iterator[tuple[int, LogSource | None, IngestResult]]:
-    """Yield what became of each path that holds no log, and of each log as it ends, by its place; what needs no work is told first."""
+def _results_without_work(
+    log: LogWriter, found: FoundLogs, steps: Sequence[Step]
+) -> Iterator[tuple[int, IngestResult]]:
+    """Yield the result of each path that holds no log, and of each log that is in the store, is known to fail, or has to wait."""
+    parties = log.state.parties
     for index, (path, lines) in enumerate(found.problems.items(), start=-len(found.problems)):
         name = plain_line(path)
         findings = find_failure(name, "LogError")
-        yield index, None, IngestResult(name, "failed", findings=findings, problems=lines, transient=True)
-    runs = store.run_ids_by_hash()
-    for turn in in_turns([task.source for task in tasks]):
-        todo = []
-        for index in turn:
-            result = told(tasks[index], partial(_without_work, store=store, known=known, runs=runs))
-            if result is None:
-                todo.append(index)
-            else:
-                yield index, tasks[index].source, _judged(store, tasks[index].source, result, runs, known)
-        with closing(run_all(ingest_one, [tasks[index] for index in todo], jobs=jobs, cluster=cluster)) as outcomes:
+        yield index, IngestResult(name, "failed", findings=findings, problems=lines, transient=True)
+    for index, step in enumerate(steps):
+        source, made = step.task.source, step.made
+        if step.failure is not None:
+            failed = IngestResult(
+                source.name,
+                "failed",
+                problems=step.failure.problems,
+                findings=step.failure.findings,
+                sha256=source.sha256,
+                known=True,
+            )
+            yield index, replace(failed, accepted=step.standing == "quarantined")
+        elif made is not None:
+            result = result_of(source, "unchanged", made, str(source.sha256), same_as=find_twin(made.log, source))
+            if made.run_id in parties:
+                superseded, notes = superseded_by(log.store, log.state, source, made.run_id, str(source.sha256))
+                log.commit("superseded", Entries(superseded=tuple(superseded)))
+                result = replace(result, notes=(*result.notes, *notes))
+            if select_problems(result.findings):
+                result = replace(result, known=True, accepted=is_acknowledged(problems_of(made), log.state))
+            yield index, result
+        elif not step.is_todo:
+            yield index, too_young(step.task) or IngestResult(source.name, "waiting")
+
+
+def _results(
+    log: LogWriter, work: Mapping[int, IngestTask], *, jobs: int, cluster: str | None
+) -> Iterator[tuple[int, IngestResult]]:
+    """Yield what became of each log by its index, once that is committed; what ends within a second is one commit."""
+    indices, hashed = list(work), with_hashes([task.source for task in work.values()])
+    tasks = [replace(task, source=source) for task, source in zip(work.values(), hashed, strict=True)]
+    keep_state_here(log.store.place, log.state)
+    for turn in in_turns(hashed):
+        waiting, last_s = list[tuple[int, IngestTask, Ingested]](), 0.0
+        with closing(run_all(ingest_one, [tasks[at] for at in turn], jobs=jobs, cluster=cluster)) as outcomes:
             for outcome in outcomes:
-                task = tasks[todo[outcome.index]]
-                source, result = outcome.result or (task.source, died(task.source))
-                yield todo[outcome.index], source, _judged(store, source, result, runs, known)
+                task = tasks[at := turn[outcome.index]]
+                waiting.append((indices[at], task, outcome.result or Ingested(task.source, died(task.source))))
+                if time.monotonic() - last_s >= _TOGETHER_S:
+                    yield from _commit(log, waiting)
+                    waiting, last_s = [], time.monotonic()
+        yield from _commit(log, waiting)
 
 
-def _without_work(
-    task: IngestTask, *, store: Store, known: KnownRuns, runs: Mapping[str, Sequence[str]]
-) -> IngestResult | None:
-    """Return the result of a log that is in the store, is known to fail, or has to wait; None where there is something to do."""
-    source, sha256 = task.source, None if task.force else task.source.sha256
-    if sha256 and (made := as_indexed(task, known.made.get(sha256, ()), sha256)):
-        return made
-    run_id = store.run_of(sha256, runs) if sha256 else None
-    if run_id and (made := made_before(store, run_id, task, str(source.sha256))):
-        return made
-    again = task.force or task.retry_failed or task.failure not in known.failed
-    failed = None if again else store.recall(task.failure, Trouble)
-    if failed is not None:
-        return IngestResult(source.name, "failed", problems=failed.lines, sha256=source.sha256, known=True)
-    return too_young(task)
+def _commit(log: LogWriter, ended: Sequence[tuple[int, IngestTask, Ingested]]) -> Iterator[tuple[int, IngestResult]]:
+    """Commit what became of logs, and yield it with what the log says of it."""
+    before, entries, notes = log.state, Entries(), dict[int, tuple[str, ...]]()
+    for index, task, of in ended:
+        more, notes[index] = _entries_of(log, task, of)
+        entries = Entries(*((*getattr(entries, name.name), *getattr(more, name.name)) for name in fields(Entries)))
+    others = dict[str, str]()
+
+    def make(state: State) -> Entries:
+        """Return what is to be added; of two calls that gave one recording two names the first wins."""
+        others.clear()
+        for row in entries.runs:
+            named = state.run_of(row.log.source.sha256) if row.log else None
+            others.update({} if named in (None, row.run_id) else {row.run_id: named})
+        return replace(entries, runs=tuple(row for row in entries.runs if row.run_id not in others))
+
+    try:
+        kind: Kind = "ingested" if entries.runs else "failed" if entries.failed else "seen"
+        log.commit(kind, make)
+    except StoreError as error:
+        if entries.runs:
+            raise
+        logger.error("%s", error)  # noqa: TRY400  one line
+    keep_state_here(log.store.place, log.state)
+    for index, _, of in ended:
+        result = replace(of.result, notes=(*of.result.notes, *notes[index]))
+        if by := others.get(str(result.run_id)):
+            problem = (
+                f"{result.log}: another call ingested the same recording as run {by} at the same time; run it again"
+            )
+            findings = find_failure(result.log, "StoreError")
+            result = IngestResult(
+                result.log, "failed", findings=findings, problems=(problem,), sha256=result.sha256, transient=True
+            )
+        yield index, _judged(log.state, result, of.source, before=before)
 
 
-def _judged(
-    store: Store, source: LogSource, result: IngestResult, runs: dict[str, list[str]], known: KnownRuns
-) -> IngestResult:
-    """Return a result with what the store says of it: whether its trouble is news, and which runs it supersedes."""
-    notes = result.notes
-    if result.run_id and result.sha256 and not _is_settled(source, result, known):
-        if store.run_of(result.sha256, runs) is None:
-            add_by_hash(runs, result.run_id)
+def _entries_of(log: LogWriter, task: IngestTask, of: Ingested) -> tuple[Entries, tuple[str, ...]]:
+    """Return what a commit has of the result of a log, and what is to be said of runs that it supersedes."""
+    source, result, sha256 = of.source, of.result, of.result.sha256
+    entries, notes = Entries(runs=of.rows), list[str]()
+    new = sha256 is not None and bool(source.files) and not log.state.has_seen(source.sighting(sha256))
+    if result.run_id and sha256 and (new or result.status != "unchanged" or result.run_id in log.state.parties):
         try:
-            notes += tuple(superseded_by(store, source, result.run_id, result.sha256, runs))
+            superseded, notes = superseded_by(log.store, log.state, source, result.run_id, sha256)
+            entries = replace(entries, superseded=tuple(superseded))
         except StoreError as error:
             notes += error.problems
-    trouble = _trouble(source, result)
-    if trouble is None:
-        return result if notes == result.notes else replace(result, notes=notes)
-    told_before = result.known or (trouble.kind != "failed" and trouble.is_told(store))
-    return replace(result, notes=notes, known=told_before, accepted=trouble.is_accepted(store))
+    if result.status == "failed" and not result.transient:
+        task, content = replace(task, source=replace(source, sha256=sha256)), sha256 or source.files_digest
+        failure = Failure(task.failure_key, content, source.origins, result.problems, __version__, result.findings)
+        entries = replace(entries, failed=(failure,))
+    return replace(entries, seen=(source.sighting(sha256),) if new and sha256 else ()), tuple(notes)
 
 
-def _is_settled(source: LogSource, result: IngestResult, known: KnownRuns) -> bool:
-    """Tell whether a log is as it was, and its run has no part in what supersedes what."""
-    unchanged = result.status == "unchanged" and result.run_id not in known.parties
-    return unchanged and result.sha256 is not None and known.has_seen(source, result.sha256)
-
-
-def _trouble(source: LogSource, result: IngestResult) -> Trouble | None:
-    content = result.sha256 or source.files_digest
+def _judged(state: State, result: IngestResult, source: LogSource, *, before: State) -> IngestResult:
+    """Return a result with whether its problems were known before, and are acknowledged."""
     if result.status == "failed":
-        return Trouble(content, result.problems, source.origins, kind="failed")
-    return trouble_of_run(result.run_id, result.findings, result.damage, content=content, log=source.origins)
-
-
-def _remember(store: Store, task: IngestTask, source: LogSource, result: IngestResult, known: KnownRuns) -> None:
-    """Remember what a log holds, and what is wrong with that; where it cannot be written it is told again the next time."""
-    trouble = _trouble(source, result)
-    try:
-        if result.sha256 and source.files and not known.has_seen(source, result.sha256):
-            store.note(source.lineage, source.sighting(result.sha256))
-        if trouble is not None and trouble.kind != "failed":
-            trouble.told(store)
-        elif trouble is not None and not result.transient and not result.known:
-            task = replace(task, source=replace(source, sha256=result.sha256))
-            store.remember(task.failure, replace(trouble, version=__version__))
-    except StoreError as error:
-        logger.error("%s", error)  # noqa: TRY400  one line
+        problem = failure_of(result.sha256 or source.files_digest, source.origins)
+        return replace(result, accepted=result.accepted or is_acknowledged([problem], state))
+    if not (select_problems(result.findings)):
+        return result
+    row = state.runs[str(result.run_id), str(result.recipe_id)]
+    problems = problems_of(row)
+    told = {of.key for old in before.runs.values() if old.run_id == row.run_id for of in problems_of(old)}
+    return replace(result, known=all(of.key in told for of in problems), accepted=is_acknowledged(problems, state))
 
 
 def _place_for_stand_ins(logs: Iterable[str | Path]) -> AbstractContextManager[Path]:

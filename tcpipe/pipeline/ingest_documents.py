@@ -24,6 +24,7 @@ def run_json_of(task: IngestTask, log: AnyLog, streams: Streams, sha256: str) ->
         sensors=streams.sensors,
         message_definitions=task.definitions,
         report=streams.report,
+        outline=log.outline or "",
     )
 
 

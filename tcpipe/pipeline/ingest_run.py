@@ -3,25 +3,27 @@
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import ExitStack, suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 
 import pyarrow as pa
 
 from tcpipe import __version__
 from tcpipe.errors import LogError
-from tcpipe.formats.index_files import KnownLog, RunFacts, facts_of
+from tcpipe.formats.commit_log import read_state_here
+from tcpipe.formats.commits import State
+from tcpipe.formats.index_files import KnownLog, RunFacts
 from tcpipe.formats.lent_tables import lend_streams
 from tcpipe.formats.logs.joined import AnyLog, open_logs
 from tcpipe.formats.recipe_toml import read_key
 from tcpipe.formats.robot_files import profiles_of
 from tcpipe.formats.run_documents import Manifest, RunJson
 from tcpipe.pipeline.ingest_documents import manifest_of, run_json_of
-from tcpipe.pipeline.ingest_task import IngestResult, IngestTask, Status, result_of, told, too_young
+from tcpipe.pipeline.ingest_task import IngestResult, IngestTask, result_of, told, too_young
 from tcpipe.pipeline.log_sources import LogSource
-from tcpipe.pipeline.outlines import known_as, remember_outline
+from tcpipe.pipeline.log_writer import is_committed
 from tcpipe.pipeline.run_stages import run_stages
 from tcpipe.progress import step, working_on
 from tcpipe.store import Store
@@ -30,20 +32,29 @@ from tcpipe.tables.levels import Streams
 _M_MMAP_THRESHOLD = -3
 
 
-def ingest_one(task: IngestTask) -> tuple[LogSource, IngestResult]:
+@dataclass(frozen=True, slots=True)
+class Ingested:
+    """What became of a log: the log as it was then, and what a commit is to have of its run."""
+
+    source: LogSource
+    result: IngestResult
+    rows: tuple[RunFacts, ...] = ()
+
+
+def ingest_one(task: IngestTask) -> Ingested:
     """Ingest one run from its log as that is now; every error becomes its result, so that one log never costs the others."""
     _return_freed_memory()
     task = replace(task, source=task.source.now())
-    hashed: list[str] = []
+    hashed, rows = list[str](), list[RunFacts]()
     young = too_young(task)
     if young is not None:
-        return task.source, young
+        return Ingested(task.source, young)
     with working_on(task.source.name):
-        result = told(task, partial(_ingest, hashed=hashed))
+        result = told(task, partial(_ingest, hashed=hashed, rows=rows))
     if task.source.has_changed():
         note = "it changed while it was looked at; it is ingested when its recording has ended"
-        return task.source, IngestResult(task.source.name, "waiting", notes=(note,))
-    return task.source, replace(result, sha256=hashed[0]) if hashed else result
+        return Ingested(task.source, IngestResult(task.source.name, "waiting", notes=(note,)))
+    return Ingested(task.source, replace(result, sha256=hashed[0]) if hashed else result, tuple(rows))
 
 
 def _return_freed_memory() -> None:
@@ -55,48 +66,61 @@ def _return_freed_memory() -> None:
         library.malloc_trim(0)
 
 
-def _ingest(task: IngestTask, *, hashed: list[str]) -> IngestResult:
-    """Ingest one run; what its log hashes to is left in ``hashed``, also on failure."""
+def _ingest(task: IngestTask, *, hashed: list[str], rows: list[RunFacts]) -> IngestResult:
+    """Ingest one run; what its log hashes to is left in ``hashed``, also on failure, and what is to be committed in ``rows``."""
     store, source = Store(task.store), task.source
+    state = read_state_here(store.place)
     with ExitStack() as stack:
         opened = None if source.sha256 else _opened(task, stack)
-        sha256 = known_as(store, opened) if opened else str(source.sha256)
+        sha256 = _known_as(state, opened) if opened else str(source.sha256)
         hashed.append(sha256)
-        named = store.run_of_content(sha256)
-        before = store.known_run(named) if named else None
-        if named and before and not task.force and (made := made_before(store, named, task, sha256)):
-            return made
+        run_id = state.run_of(sha256) or store.name_run(source.stem, sha256)
+        before = store.known_run(run_id)
+        same_as = find_twin(before, source)
+        if before and not task.force and (made := _made_before(store, run_id, task)):
+            rows += () if is_committed(made, state) else _rows_of(store, state, run_id, made.recipe_id)
+            return result_of(source, "done" if rows else "unchanged", made, sha256, same_as=same_as)
         log = opened or _opened(task, stack)
         step("reading")
-        same_as = _twin(before, source)
-        streams, known = _read(store, named, before, log, task, sha256=sha256)
-        known = replace(known, tags={**_tags(store, named, before), **task.tags})
-        run_id = named or store.claim_run(source.stem, sha256)
+        streams, known = _read(store, run_id, before, log, task, sha256=sha256)
+        known = replace(known, tags={**(before.tags if before else _tags(state, run_id)), **task.tags})
         if not known.streams:
             known = replace(known, streams=store.write_streams(run_id, streams, key=known.streams_key))
         store.write_run_json(run_id, known)
-        remember_outline(store, run_id, sha256, log)  # before it is done: then nobody looks again
         streams = lend_streams(store.runs_place.below(run_id), streams, known.streams)
         _return_freed_memory()
         manifest = _fuse_and_label(store, run_id, streams, known, task)
-    return result_of(source, "done", facts_of(manifest, state=""), sha256, same_as=same_as)
+    rows += _rows_of(store, state, run_id, manifest.recipe_id)
+    (made,) = (row for row in rows if row.recipe_id == manifest.recipe_id)
+    return result_of(source, "done", made, sha256, same_as=same_as)
 
 
-def made_before(store: Store, run_id: str, task: IngestTask, sha256: str) -> IngestResult | None:
-    """Return the result of a run that is there as it would be made now, after setting its tags; None where there is none."""
-    finished = next((run.facts for run in store.recipes_of(run_id) if task.is_made_by(run.facts)), None)
-    if finished is None:
-        return None
-    status: Status = "done" if store.tag_run(run_id, task.tags) else "unchanged"
-    return result_of(task.source, status, finished, sha256, same_as=_twin(finished.log, task.source))
+def _made_before(store: Store, run_id: str, task: IngestTask) -> RunFacts | None:
+    """Return an ingestion that is there as it would be made now, after setting its tags; also one that a killed call did not commit."""
+    made = next((row for row in store.read_rows(run_id).values() if task.is_made_by(row)), None)
+    if made is not None and store.tag_run(run_id, task.tags):
+        return store.read_rows(run_id)[made.recipe_id]
+    return made
 
 
-def as_indexed(task: IngestTask, made: Sequence[RunFacts], sha256: str) -> IngestResult | None:
-    """Return the result of a run that the index has as it would be made now, tags too; None where there is something to look at."""
-    for facts in made:
-        if facts.log is not None and task.is_made_by(facts) and task.tags.items() <= facts.log.tags.items():
-            return result_of(task.source, "unchanged", facts, sha256, same_as=_twin(facts.log, task.source))
-    return None
+def _rows_of(store: Store, state: State, run_id: str, recipe_id: str) -> list[RunFacts]:
+    """Return what is to be committed of a run: the ingestion under a recipe, and those that were committed before, with the tags of now."""
+    return [row for key, row in store.read_rows(run_id).items() if key == recipe_id or (run_id, key) in state.runs]
+
+
+def _known_as(state: State, log: AnyLog) -> str:
+    """Return the hash by which the store knows a log, or is to know it (ADR 86).
+
+    That is the log's own unless the same recording was ingested from elsewhere, where more or less of it was at hand. A run with damage
+    is not taken for it: what was broken there may be whole here.
+    """
+    outline, sha256 = log.outline, log.sha256()
+    for row in state.runs.values() if outline else ():
+        other = row.log and row.log.source.sha256
+        only_index = outline in (sha256, other)  # where both are hashed as a whole, their hashes distinguish them
+        if other and row.log and row.log.outline == outline and only_index and not row.damage:
+            return other
+    return sha256
 
 
 def _opened(task: IngestTask, stack: ExitStack) -> AnyLog:
@@ -113,27 +137,25 @@ def _fuse_and_label(store: Store, run_id: str, streams: Streams, known: RunJson,
     return store.write_run(manifest, track=track, gated=gated, labelled=labelled, settled=settled)
 
 
-def _twin(known: RunJson | KnownLog | None, source: LogSource) -> str | None:
+def find_twin(known: RunJson | KnownLog | None, source: LogSource) -> str | None:
     """Return where else the same recording was ingested from, if it was."""
     return None if known is None or known.source.paths == source.origins else " + ".join(known.source.paths)
 
 
-def _tags(store: Store, run_id: str | None, known: RunJson | None) -> Mapping[str, str]:
-    """Return the tags that a run has."""
-    if known is not None or run_id is None:
-        return known.tags if known else {}
-    return next((run.facts.tags for run in store.recipes_of(run_id)), {})
+def _tags(state: State, run_id: str) -> Mapping[str, str]:
+    """Return the tags that a run has, where its run.json is lost."""
+    return next((row.tags for row in state.rows_of(run_id)), {})
 
 
 def _read(
-    store: Store, run_id: str | None, before: RunJson | None, log: AnyLog, task: IngestTask, *, sha256: str
+    store: Store, run_id: str, before: RunJson | None, log: AnyLog, task: IngestTask, *, sha256: str
 ) -> tuple[Streams, RunJson]:
     """Return L1 and what is known of its log; from the store what was made with the same read settings."""
     from tcpipe.stages.read import read_run  # noqa: PLC0415
     from tcpipe.stages.read_roles import find_read_config  # noqa: PLC0415
 
     key = f"{read_key(task.recipe, task.robot, definitions=task.definitions)}-{__version__}"
-    if run_id and before and before.message_definitions == task.definitions and not task.force:
+    if before and before.message_definitions == task.definitions and not task.force:
         cached = store.read_streams(run_id, key=key)
         if cached is not None:
             known = run_json_of(task, log, cached, sha256)

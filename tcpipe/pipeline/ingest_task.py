@@ -13,10 +13,9 @@ from typing import Literal, TypeVar
 from tcpipe import __version__
 from tcpipe.errors import TcpipeError, hide_secrets, plain_line
 from tcpipe.formats.index_files import RunFacts
-from tcpipe.formats.json_files import recast
+from tcpipe.formats.json_files import digest, recast
 from tcpipe.formats.recipe_toml import ingest_key
 from tcpipe.formats.run_documents import Manifest
-from tcpipe.pipeline.known_trouble import failure_name
 from tcpipe.pipeline.log_findings import find_failure
 from tcpipe.pipeline.log_sources import LogSource
 from tcpipe.pipeline.transience import is_transient
@@ -56,10 +55,12 @@ class IngestTask:
         return made.ingest_key == ingest_key(self.recipe) and same_version and same_robot
 
     @property
-    def failure(self) -> str:
-        """The name of the record that this fails, should it fail for what the log's content is."""
-        key, content = ingest_key(self.recipe), self.source.sha256 or self.source.files_digest
-        return failure_name(content, ingest_key=key, robot=self.robot, definitions=self.definitions)
+    def failure_key(self) -> str:
+        """What identifies a failure because of the log's content: the same content, treated in the same way, fails again."""
+        how = {"version": __version__, "ingest_key": ingest_key(self.recipe), "robot": self.robot}
+        return digest(
+            {**how, "content": self.source.sha256 or self.source.files_digest, "message_definitions": self.definitions}
+        )[:32]
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,7 +93,7 @@ class IngestResult:
     known: bool = False
     """Whether it failed before and was not tried again, or what is wrong with its run was told before."""
     accepted: bool = False
-    """Whether a person has accepted what is wrong with it (`tcpipe accept`)."""
+    """Whether a person has acknowledged what is wrong with it (`tcpipe acknowledge`)."""
     traceback: str | None = None
     """Where an internal error comes from."""
 
@@ -118,9 +119,9 @@ def result_of(source: LogSource, status: Status, made: RunFacts, sha256: str, *,
     return recast(made, IngestResult, **about, same_as=same_as, sha256=sha256)
 
 
-def too_young(task: IngestTask) -> IngestResult | None:
+def too_young(task: IngestTask, now_ns: int | None = None) -> IngestResult | None:
     """Return that a log has to wait, None where it has not."""
-    age_s = (time.time_ns() - task.source.youngest_ns) / 1e9
+    age_s = ((time.time_ns() if now_ns is None else now_ns) - task.source.youngest_ns) / 1e9
     if not task.source.files or age_s >= task.min_age_s or not task.min_age_s:
         return None
     note = f"it was written {max(age_s, 0.0):.0f} s ago; it is ingested when it is {task.min_age_s:g} s old"

@@ -19,7 +19,6 @@ from tcpipe.formats.object_storage import is_presigned, is_url, shown_path
 from tcpipe.formats.published import has_card, here_by_range
 from tcpipe.formats.run_documents import Counts, LogOrigin
 from tcpipe.formats.stored_runs import RunDirectory
-from tcpipe.pipeline.known_runs import list_runs
 from tcpipe.pipeline.log_inspection import InspectedLog, inspect_log
 from tcpipe.pipeline.log_sources import remote_logs
 from tcpipe.pipeline.table_proposal import InspectedTables, proposed
@@ -103,7 +102,6 @@ class InspectedStore:
     """By path, what is wrong."""
     superseded: Mapping[str, str]
     """Runs, and which run supersedes each."""
-    unfinished: tuple[str, ...]
 
 
 Inspected: TypeAlias = (
@@ -238,8 +236,8 @@ def _run(path: Path | str, store: Store, runs: list[RunDirectory]) -> InspectedR
 
 
 def _store(store: Store) -> InspectedStore:
-    found = list_runs(store)
-    runs, outdated = found.finished, {run_id: str(head.data_model_version) for run_id, head in found.outdated.items()}
+    found = store.ingestions()
+    runs, outdated = found.finished, {run_id: row.data_model_version for run_id, row in found.outdated.items()}
     return InspectedStore(
         path=str(store.root),
         maps=tuple(store.maps()),
@@ -247,7 +245,6 @@ def _store(store: Store) -> InspectedStore:
         outdated=outdated,
         damaged_runs={store.runs_place.where("/".join(filter(None, run))): line for run, line in found.damaged.items()},
         superseded=dict(found.superseded),
-        unfinished=found.unfinished,
     )
 
 

@@ -6,25 +6,21 @@ import hashlib
 import os
 import stat
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
 from pathlib import Path
 
 from tcpipe.errors import LogError, TcpipeError, plain_line
+from tcpipe.formats.commits import Sighting, lineage_of
 from tcpipe.formats.json_files import digest
 from tcpipe.formats.logs.joined import open_logs
 from tcpipe.formats.logs.log_file import LOG_SUFFIXES, belongs_to_a_log, find_logs, logs_below
 from tcpipe.formats.logs.rosbag2 import STORAGE_SUFFIXES, is_one_bag, storage_files
 from tcpipe.formats.logs.table_folders import Mappings, table_files, table_folders
 from tcpipe.formats.object_storage import is_url, shown_path, split_url, stand_ins
-from tcpipe.formats.record_files import Sighting, record_name
 from tcpipe.pipeline.transience import is_transient
 
 _LONGEST_STEM_BYTES = 200
-
-_UNFINISHED = ".active"
-"""Ending of a ROS 1 bag that is still recorded, or was when its recorder died."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,7 +72,7 @@ class LogSource:
 
     @property
     def lineage(self) -> str:
-        """Where the sightings of the log are remembered."""
+        """What identifies the place of the log."""
         return lineage_of(self.origins)
 
     def sighting(self, sha256: str) -> Sighting:
@@ -203,12 +199,6 @@ def in_shard(sources: Sequence[LogSource], shard: tuple[int, int]) -> list[LogSo
     return [source for source in sources if int(digest(source.place), 16) % count == index - 1]
 
 
-@lru_cache(maxsize=1 << 17)
-def lineage_of(origins: tuple[str, ...]) -> str:
-    """Return where the sightings of what lies there are remembered; a recording that is ended (``.active`` goes) lies where it did."""
-    return f"logs/{record_name(digest([origin.removesuffix(_UNFINISHED) for origin in origins]))}"
-
-
 def definitions_key(directory: Path | None) -> str:
     """Return a short hash of the definition files that the user gives; "" where none are given."""
     if directory is None:
@@ -230,14 +220,10 @@ def remote_logs(url: str, directory: Path) -> dict[Path, str]:
     }
 
 
-def with_hashes(sources: Sequence[LogSource], seen: Callable[[str], Sequence[Sighting]]) -> list[LogSource]:
-    """Return the sources with the hashes that are remembered, and computed where two of one size may be the same recording.
-
-    ``seen`` returns what is remembered of a log by its `lineage`.
-    """
-    known = [remembered(source, seen(source.lineage)) for source in sources]
-    sizes = Counter(_size(source) for source in known)
-    return [source if source.sha256 or sizes[_size(source)] == 1 else _hashed(source) for source in known]
+def with_hashes(sources: Sequence[LogSource]) -> list[LogSource]:
+    """Return the sources with their hashes where two of one size may be the same recording."""
+    sizes = Counter(_size(source) for source in sources)
+    return [source if source.sha256 or sizes[_size(source)] == 1 else _hashed(source) for source in sources]
 
 
 def in_turns(sources: Sequence[LogSource]) -> list[list[int]]:

@@ -1,44 +1,44 @@
-"""A store, a map or a dataset of an earlier data model, brought to this one, in place or to another place; and any store copied.
+"""A store or a dataset of an earlier data model, brought to this one, in place or to another place; and any store copied.
 
-Tables, maps and pixels stay as and where they are. Documents of a store of data model 1 had fixed names and were replaced; each becomes the
-first of its numbered ones, which says where its files lie (ADR 85). The mark that makes a place a store of this layout comes last. So a
-migration that was killed is gone on with by calling it again, and one that is done does nothing.
+Tables, maps and pixels stay as and where they are. Warnings of manifests and cards, which were sentences, become findings; the records of
+a store become commits. The mark of the data model is written after them. So a migration that was killed goes on when it is called again,
+and one that is done does nothing.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
-from itertools import pairwise
+from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from tcpipe.errors import StoreError, TcpipeError, UsageError, plain_lines
 from tcpipe.formats.bucket import open_place
+from tcpipe.formats.commit_log import LOG
+from tcpipe.formats.commits import Call, Dataset, Entries, Failure, Problem, Sighting, State, Superseded
 from tcpipe.formats.dataset_files import CARD, read_card
-from tcpipe.formats.json_files import to_json, typed
+from tcpipe.formats.json_files import Json, plain, to_json, typed
 from tcpipe.formats.maps.map_files import open_map
-from tcpipe.formats.numbered import name_of, read_as_at, read_sealed_at, stem_and_number
+from tcpipe.formats.numbered import read_sealed_at, stem_and_number
 from tcpipe.formats.object_storage import is_url
-from tcpipe.formats.parquet import read_table
 from tcpipe.formats.place import Place
-from tcpipe.formats.run_documents import Manifest, MapDocument, RunJson
-from tcpipe.formats.seals import CHECKSUMS, Checksums, read_sealed, sealed, write_sealed
-from tcpipe.formats.store_mark import MARK, is_outdated, mark_store
-from tcpipe.pipeline.supersession import remember_earlier
+from tcpipe.formats.run_documents import Manifest, RunJson, StoreDocument
+from tcpipe.formats.seals import read_sealed, sealed, write_sealed
+from tcpipe.formats.store_mark import MARK, is_outdated, layout_of
+from tcpipe.pipeline.log_writer import is_committed, open_log
 from tcpipe.store import Store
-from tcpipe.tables.levels import DATA_MODEL_VERSION, READ_VERSIONS, metadata_of
+from tcpipe.tables.findings import Finding, Subject, SubjectKind, make_finding
+from tcpipe.tables.levels import DATA_MODEL_VERSION, EARLIER_VERSIONS
+from tcpipe.tables.verdicts import judge
+
+T = TypeVar("T")
 
 Document = Mapping[str, Any]
 
-
-_STEPS: Mapping[str, str] = dict(pairwise(READ_VERSIONS))
-"""The version after each. Whatever came with one says nothing where it is absent, so nothing but the number changes."""
-
-_RUN, _MANIFEST = "run.json", "manifest.json"
-"""Names of documents before data model 2."""
+_RECORDS, _INDEX = "records/", "index/"
+_TOGETHER = 500
+"""So many runs are one commit."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,10 +79,18 @@ def migrate(path: Path | str, to: Path | str | None = None) -> Migrated:
 
     Raises
     ------
-    UsageError : the path is none of these, or no store and to be brought elsewhere.
+    UsageError : the path is none of these, or no store and to be brought elsewhere, or of a data model that this version does not know.
     """
     source = open_place(path)
-    if source.size(MARK) is not None or is_outdated(source):
+    if is_outdated(source):
+        raise UsageError(
+            f"{path}: is a store of data model 1, which this version does not read, or an incomplete copy (no {MARK})"
+        )
+    if (version := layout_of(source)) is not None:
+        if version not in (*EARLIER_VERSIONS, DATA_MODEL_VERSION):
+            raise UsageError(
+                f"{path}: is of data model {version}, this version knows {', '.join((*EARLIER_VERSIONS, DATA_MODEL_VERSION))}"
+            )
         return _store(source, source if to is None else open_place(to))
     if is_url(path) or to is not None:
         raise UsageError(f"{path}: is no store; only stores are brought elsewhere")
@@ -96,129 +104,181 @@ def migrate(path: Path | str, to: Path | str | None = None) -> Migrated:
 
 def _one(path: Path, document: Path) -> Migrated:
     try:
-        brought = _brought(document)
+        brought = document.suffix != ".zarr" and _bring_card(document)
+        if document.suffix == ".zarr":
+            open_map(document)
     except TcpipeError as error:
         return Migrated(str(path), (), 0, error.problems)
     return Migrated(str(path), (str(document),) if brought else (), 0 if brought else 1, ())
 
 
+def _bring_card(path: Path) -> bool:
+    """Bring a dataset's card to this data model; return False where it was."""
+    found = read_sealed(path)
+    document = _bring_document(found, str(path))
+    if document is found:
+        return False
+    write_sealed(path, document)
+    read_card(path.parent)
+    return True
+
+
 def _store(source: Place, target: Place) -> Migrated:
-    """Bring a store to this layout; ``target`` is ``source``, or where it is copied to."""
-    migrated, problems = list[str](), list[str]()
-    names = [entry.name for entry in source.entries()]
-    numbered = [name for name in names if stem_and_number(name.rpartition("/")[2]) and not name.startswith("records/")]
-    current, copied = len(numbered), 0
-    outdated = list(_outdated(source, names))
-    if target != source:
-        copied = _copy(source, target, numbered, without={name for old in outdated for name in old.replaces})
-    for old in outdated:
+    """Bring a store to this data model; ``target`` is ``source``, or where it is copied to."""
+    migrated, problems, names = list[str](), list[str](), [entry.name for entry in source.entries()]
+    documents = [name for name in names if name.startswith("runs/") and _is_document(name)]
+    copied = 0 if target == source else _copy(source, target, documents)
+    for name in documents:
+        data = None if target == source else source.read(name)
         try:
-            data = to_json(sealed(old.brought())).encode()
+            data = _bring(source, name)
         except TcpipeError as error:
             problems += error.problems
-            continue
-        if target.put_new(old.name, data):
-            migrated.append(target.where(old.name))
-        elif target != source:
-            current += 1
-        for name in old.replaces if target == source else ():
-            source.delete(name)
-    if target == source:
-        source.delete("sources.json")
-    marked = target.size(MARK) is not None
-    remember_earlier(Store(target.where()))
-    mark_store(target, found=marked)
-    return Migrated(target.where(), tuple(migrated), current, tuple(problems), copied)
+        if data is not None and target.read(name) != data:
+            target.put(name, data)
+            migrated += [target.where(name)] if layout_of(source) != DATA_MODEL_VERSION else []
+    records = [name for name in names if name.startswith(_RECORDS)]
+    if records or layout_of(target) != DATA_MODEL_VERSION:
+        problems += _write_log(Store(target.where()), source, records)
+    mark = to_json(sealed(StoreDocument(DATA_MODEL_VERSION))).encode()
+    if target.read(MARK) != mark:
+        target.put(MARK, mark)
+    for name in (name for name in names if target == source and name.startswith((_RECORDS, f"{_INDEX}logs."))):
+        source.delete(name)
+    return Migrated(target.where(), tuple(migrated), len(documents) - len(migrated), tuple(problems), copied)
 
 
-def _copy(source: Place, target: Place, documents: Sequence[str], *, without: set[str]) -> int:
-    """Copy what a store holds, its documents last, so that each finds its files; what is there already in its size is not copied again.
+def _is_document(name: str) -> bool:
+    of = stem_and_number(name.rpartition("/")[2])
+    return of is not None and of[0] in ("run", "manifest", "tags")
+
+
+def _copy(source: Place, target: Place, documents: Sequence[str]) -> int:
+    """Copy what a store holds but its documents and records, commits last; what is there already in its size is not copied again.
 
     Returns the number of files that were copied.
     """
     there = {entry.name: entry.size_bytes for entry in target.entries()}
-    apart = {*documents, *without, MARK, "sources.json", *(name for name in there if name.startswith("index/"))}
-    absent = [of for of in source.entries() if of.name not in apart and there.get(of.name) != of.size_bytes]
-    for entry in absent:
+    apart = (_RECORDS, _INDEX, MARK)
+    wanted = [of for of in source.entries() if not of.name.startswith(apart) and of.name not in set(documents)]
+    absent = [of for of in wanted if there.get(of.name) != of.size_bytes]
+    for entry in sorted(absent, key=lambda of: of.name.startswith(f"{LOG}/")):
         target.put(entry.name, source.read(entry.name) or b"")
-    return len(absent) + sum(target.put_new(name, source.read(name) or b"") for name in documents)
+    return len(absent)
 
 
-@dataclass(frozen=True, slots=True)
-class _Old:
-    """A document before data model 2, or a map that had none."""
-
-    name: str
-    """Of the document that takes its place."""
-    brought: Callable[[], object]
-    replaces: tuple[str, ...] = ()
-
-
-def _outdated(place: Place, names: Sequence[str]) -> Iterator[_Old]:
-    """Yield what a store has of an earlier data model."""
-    for name in names:
-        folder, _, last = name.rpartition("/")
-        if last == _RUN and folder.count("/") == 1 and folder.startswith("runs/"):
-            checksums = f"{folder}/streams/{CHECKSUMS}"
-            replaces = (name, *([checksums] if checksums in names else ()))
-            yield _Old(f"{folder}/{name_of('run', 1)}", partial(_run, place.below(folder)), replaces)
-        elif last == _MANIFEST and folder.count("/") == 2 and folder.startswith("runs/"):
-            yield _Old(f"{folder}/{name_of('manifest', 1)}", partial(_manifest, place.below(folder)), (name,))
-        elif last == CHECKSUMS and folder.endswith(".zarr") and folder.count("/") == 1:
-            stem = folder.removeprefix("maps/").removesuffix(".zarr")
-            yield _Old(f"maps/{name_of(stem, 1)}", partial(_map, place.below("maps"), stem))
+def _bring(place: Place, name: str) -> bytes:
+    """Return a document of a run as this data model has it; `StoreError` where it is damaged or of no data model that is known."""
+    where, kind = place.where(name), name.rpartition("/")[2].partition("-")[0]
+    found = read_sealed_at(place, name)
+    document = _bring_document(found, where) if kind == "manifest" else _bring_run(found) if kind == "run" else found
+    if document is found:
+        return place.read(name) or b""
+    typed(document, Manifest if kind == "manifest" else RunJson, where)
+    return to_json(sealed(document)).encode()
 
 
-def _run(place: Place) -> RunJson:
-    """Return what was known of a log, with its streams where they are as they were written."""
-    known = read_as_at(place, _RUN, RunJson)
-    with suppress(StoreError):
-        listed = read_as_at(place, f"streams/{CHECKSUMS}", Checksums).checksums
-        streams = {f"streams/{name}": of for name, of in listed.items()}
-        first = next(iter(sorted(streams)), None)
-        if first is not None:
-            told = metadata_of(read_table(place.local(first, streams[first]), []))
-            return replace(known, streams=streams, streams_key=str(told.get("key", "")))
-    return known
+def _bring_run(found: Document) -> Document:
+    """Return what is known of a log, with ``findings`` as ``report``."""
+    return (
+        {**_without(found, "findings"), "report": _report(found["findings"], "run", "")}
+        if "findings" in found
+        else found
+    )
 
 
-def _manifest(place: Place) -> Document:
-    found = read_sealed_at(place, _MANIFEST)
-    brought = _stepped(found, place.where(_MANIFEST))
-    typed(brought, Manifest, place.where(_MANIFEST))
-    return brought
+def _bring_document(found: Document, where: str) -> Document:
+    """Return a manifest or card of this data model; `StoreError` where it is of none that is known."""
+    version = found.get("data_model_version", "")
+    if version == DATA_MODEL_VERSION:
+        return found
+    if version not in EARLIER_VERSIONS:
+        known = ", ".join((*EARLIER_VERSIONS, DATA_MODEL_VERSION))
+        raise StoreError(f"{where}: of data model {version}, this version knows {known}; left as it is")
+    document = {**_without(found, "warnings", "problems", "findings"), "data_model_version": DATA_MODEL_VERSION}
+    if "info" in found:
+        report = _report({**found["info"]["findings"], "warnings": found["warnings"]}, "run", found["run_id"])
+        findings = report["findings"]
+        document |= {"info": {**_without(found["info"], "findings"), "report": report}}
+    else:
+        own = chain(found.get("problems", ()), found.get("warnings", ()))
+        findings = _earlier(own, "dataset", str(found.get("name", "")))
+        document |= {"findings": findings, "runs": [_with_findings(run, "run", run["run_id"]) for run in found["runs"]]}
+        document |= {"maps": [_with_findings(of, "map", of["name"]) for of in found["maps"]]}
+    return {**document, "verdict": plain(judge(typed(findings, tuple[Finding, ...], where)))}
 
 
-def _map(place: Place, name: str) -> MapDocument:
-    zarr, picture = f"{name}.zarr", f"{name}.png"
-    listed = read_as_at(place, f"{zarr}/{CHECKSUMS}", Checksums).checksums
-    checksums = {f"{zarr}/{file}": of for file, of in listed.items()}
-    for file in (f"{zarr}/{CHECKSUMS}", picture):
-        if (found := place.checksum(file)) is not None:
-            checksums[file] = found
-    return MapDocument(DATA_MODEL_VERSION, zarr, picture, checksums)
+def _without(document: Document, *names: str) -> dict[str, Any]:
+    return {name: of for name, of in document.items() if name not in names}
 
 
-def _brought(place: Path) -> bool:
-    """Bring a dataset's card to this data model and return True; False where it was, and for maps."""
-    if place.suffix == ".zarr":
-        open_map(place)
-        return False
-    read_card(place.parent)
-    found = read_sealed(place)
-    document = _stepped(found, str(place))
-    if document is not found:
-        write_sealed(place, document)
-    return document is not found
+def _report(found: Document, kind: SubjectKind, name: str) -> dict[str, Any]:
+    return {**_without(found, "warnings"), "findings": _earlier(found["warnings"], kind, name)}
 
 
-def _stepped(found: Document, where: str) -> Document:
-    """Return a document of this data model; `StoreError` where it is of none that is known."""
-    document = found
-    while (version := document.get("data_model_version", "")) != DATA_MODEL_VERSION:
-        if version not in _STEPS:
-            raise StoreError(
-                f"{where}: of data model {version}, this version knows {', '.join(READ_VERSIONS)}; left as it is"
-            )
-        document = {**document, "data_model_version": _STEPS[version]}
-    return document
+def _with_findings(found: Document, kind: SubjectKind, name: str) -> dict[str, Any]:
+    return {**_without(found, "warnings"), "findings": _earlier(found.get("warnings", ()), kind, name)}
+
+
+def _earlier(lines: Iterable[str], kind: SubjectKind, name: str) -> list[Json]:
+    return [
+        plain(make_finding("earlier-warning", Subject(kind, name), names={"text": line}))
+        for line in dict.fromkeys(lines)
+    ]
+
+
+def _write_log(store: Store, source: Place, record_names: Sequence[str]) -> list[str]:
+    """Commit the runs of a store and what its records say, and return a line for each record that cannot be read."""
+    log, records, problems = open_log(store), dict[str, list[Document]](), list[str]()
+    for name in record_names:
+        try:
+            found = read_sealed_at(source, name)
+            records.setdefault(name.split("/")[1], []).append({**found, "key": Path(name).stem})
+        except StoreError as error:
+            problems += error.problems
+    outlines = {of["run_id"]: of["outline"] for of in records.get("outlines", ())}
+    names = store.run_ids()
+    for start in range(0, len(names), _TOGETHER):
+        run_ids = names[start : start + _TOGETHER]
+        rows = [
+            row for run_id in run_ids for row in store.read_rows(run_id).values() if not is_committed(row, log.state)
+        ]
+        known = (replace(row, log=row.log and replace(row.log, outline=outlines.get(row.run_id, ""))) for row in rows)
+        log.commit("ingested", Entries(runs=tuple(known)))
+    log.commit("seen", lambda state: _entries_of(records, state))
+    store.write_index(log.state)
+    return problems
+
+
+def _entries_of(records: Mapping[str, Sequence[Document]], state: State) -> Entries:
+    """Return what records say and a state does not."""
+
+    def read(kind: str, cls: type[T]) -> list[T]:
+        return [typed(of, cls, kind) for of in records.get(kind, ())]
+
+    replaced = {(of.out, of.inputs) for of in read("replaced", Dataset)}
+    superseded = sorted(records.get("superseded", ()), key=lambda of: (of["number"], of["by"] is None))
+    failed = ({**of, "problems": of["lines"], "version": of.get("version") or ""} for of in records.get("failed", ()))
+    accepted = chain(*map(_acknowledged, records.get("accepted", ())))
+    calls = sorted(read("calls", Call), key=lambda of: of.begin)
+    return Entries(
+        seen=tuple(of for of in read("logs", Sighting) if not state.has_seen(of)),
+        failed=tuple(of for of in typed([*failed], list[Failure], "failed") if of.key not in state.failed),
+        acknowledged=tuple(of for of in accepted if of.key not in state.acknowledged),
+        superseded=() if state.supersessions else tuple(Superseded(of["run_id"], of["by"]) for of in superseded),
+        datasets=tuple(
+            of for of in read("datasets", Dataset) if (of.out, of.inputs) not in {*replaced, *state.datasets}
+        ),
+        calls=() if state.calls else tuple(calls),
+    )
+
+
+def _acknowledged(of: Document) -> Iterator[Problem]:
+    """Yield the problems of which somebody said so; that a call was killed is not carried over."""
+    name = of.get("run_id") or " + ".join(of["log"])
+    kind: SubjectKind = "run" if of.get("run_id") else "log"
+    for code in {"damaged": ("log-damaged", "no-segments"), "empty": ("no-segments",), "failed": ("log-failed",)}.get(
+        of["kind"], ()
+    ):
+        finding = Finding(code, "error", Subject(kind, name), "rejected")
+        yield Problem(finding, of["content"], tuple(of["log"]), of.get("run_id"))

@@ -13,15 +13,16 @@ from pathlib import Path
 from tcpipe import __version__
 from tcpipe.errors import DatasetError, StoreError, UsageError, plain_lines
 from tcpipe.formats.atomic import TEMPORARY_PREFIX, clear, clear_scratch, is_abandoned
+from tcpipe.formats.commits import Dataset, Entries, State
 from tcpipe.formats.dataset_files import CARD, read_card
 from tcpipe.formats.index_files import RunFacts
 from tcpipe.formats.numbered import numbers, read_sealed_at, stem_and_number
 from tcpipe.formats.place import DirectoryPlace, Entry, Place
 from tcpipe.formats.recipe_toml import ingest_key, recipe_of
-from tcpipe.formats.record_files import DatasetMade, DatasetReplaced
 from tcpipe.formats.store_mark import SPOOL
 from tcpipe.formats.stored_runs import Ingestions
 from tcpipe.pipeline.calls import in_bytes
+from tcpipe.pipeline.log_writer import LogWriter
 from tcpipe.pipeline.verify_store import strangers_in
 from tcpipe.recipe import Recipe
 from tcpipe.store import Store, open_store
@@ -70,6 +71,7 @@ def prune(
     store: str | Path = "tcpipe-store",
     recipe: Recipe | str | Path | None = None,
     keep: Sequence[str] = (),
+    forget: Sequence[str] = (),
     min_age_s: float = 86_400.0,
     dry_run: bool = False,
 ) -> Pruned:
@@ -79,6 +81,7 @@ def prune(
     ----------
     recipe : the recipe that rules: of a run that was ingested with it, what earlier calls made with others is old.
     keep : runs and recipes, by id, of which nothing goes.
+    forget : datasets, by the path where they lay, that are gone: what they refer to may go.
     min_age_s : what killed calls left is removed when it is so old; what waits for a dataset, when nothing was put there for so long.
     dry_run : say what would go, and remove nothing.
 
@@ -88,16 +91,19 @@ def prune(
     """
     ruling = recipe_of(recipe)
     opened = open_store(store)
-    found = opened.ingestions()
+    log = LogWriter(opened, opened.state())
+    _forget(log, forget, dry_run=dry_run)
+    found = opened.ingestions(state=log.state)
     unknown = set(keep) - {name for key in found.rows for name in key}
     if unknown:
         raise UsageError(f"{opened.root}: no run or recipe is called {min(unknown)}; nothing is removed")
-    referred, unread = _referred(opened)
+    referred, unread = _referred(log.state)
     removed, kept = list[Leftover](), list[Leftover]()
     for what, place, parts in (*_old_recipes(opened, found, ingest_key(ruling)), *_superseded(opened, found)):
         why = unread or _why_it_stays(place, parts, referred, keep)
         (removed if why is None else kept).append(Leftover(what, place.where(), _size(place), why))
-        if why is None and not dry_run:
+        if why is None and not dry_run:  # the commit first: nobody looks for what is about to go
+            log.commit("pruned", Entries(removed=tuple(parts)))
             _remove(place)
     left = [
         Leftover("left by a killed call", str(path), _size(DirectoryPlace(path)))
@@ -106,7 +112,7 @@ def prune(
     removed += left
     if left and not dry_run:
         clear(Path(opened.root))
-    for what, place, entries, why in (*_spooled(opened, min_age_s), *_replaced(opened, min_age_s)):
+    for what, place, entries, why in (*_spooled(opened, min_age_s), *_replaced(opened, log.state, min_age_s, unread)):
         (removed if why is None else kept).extend(
             Leftover(what, place.where(of.name), of.size_bytes, why) for of in entries
         )
@@ -116,7 +122,7 @@ def prune(
         clear_scratch()
         _remove_empty(opened, min_age_s)
     if removed and not dry_run:
-        opened.keep_index(opened.ingestions())
+        opened.write_index(log.state)
     return Pruned(str(opened.root), dry_run, tuple(removed), tuple(kept), sum(each.size_bytes for each in removed))
 
 
@@ -132,7 +138,7 @@ def _old_recipes(store: Store, found: Ingestions, key: str) -> Iterator[tuple[st
     for run_id, rows in by_run.items():
         ruling = [row for row in rows if row.ingest_key == key and row.tcpipe_version == __version__]
         for row in rows if ruling and run_id not in found.superseded else ():
-            if row.ingest_key != key and _written_ns(row) < max(map(_written_ns, ruling)):
+            if row.ingest_key != key and row.commit < max(of.commit for of in ruling):
                 yield "old recipe", store.runs_place.below(f"{run_id}/{row.recipe_id}"), [(run_id, row.recipe_id)]
 
 
@@ -155,26 +161,30 @@ def _why_it_stays(
     return None if strange is None else f"{strange} is no file of this store"
 
 
-def _referred(store: Store) -> tuple[dict[tuple[str, str], str], str | None]:
-    """Return the ingestions that datasets are made of, and why each stays; and why everything does, where a record cannot be read.
+def _forget(log: LogWriter, names: Sequence[str], *, dry_run: bool) -> None:
+    """Commit that datasets are gone; `UsageError` where none lay at a path."""
+    paths = {name: {name.rstrip("/"), str(Path(name).absolute())} for name in names}
+    gone = {name: [of for of in log.state.datasets.values() if of.out in paths[name]] for name in names}
+    if unknown := [name for name in names if not gone[name]]:
+        raise UsageError(*(f"{name}: no dataset of this store lay there; nothing is removed" for name in unknown))
+    if not dry_run:
+        log.commit("pruned", Entries(forgotten=tuple(of for each in gone.values() for of in each)))
 
-    A dataset that lies where it was no more may lie elsewhere, unless a build overwrote it.
-    """
-    found, place = dict[tuple[str, str], str](), store.place.below("records/datasets")
-    overwritten = set(store.records("replaced", DatasetReplaced))
-    for name in (name for name in place.files() if name.endswith(".json")):
-        made = store.recall(f"datasets/{name.removesuffix('.json')}", DatasetMade)
-        if made is None:
-            return {}, f"{place.where(name)} does not say what a dataset refers to; build that again, or remove it"
-        if not is_replaced(made):
-            found.update(dict.fromkeys(made.runs, f"dataset {made.out} refers to it"))
-        elif DatasetReplaced(made.out, made.inputs) not in overwritten:
-            told = f"a dataset that lay at {made.out} refers to it; remove {place.where(name)} if that is gone"
-            found.update(dict.fromkeys(made.runs, told))
+
+def _referred(state: State) -> tuple[dict[tuple[str, str], str], str | None]:
+    """Return the ingestions that datasets are made of, and why each stays; and why everything does, where a commit cannot be read."""
+    if state.problems:
+        return {}, f"{state.problems[0].log[0]} is missing or damaged: it may name what a dataset refers to"
+    found = dict[tuple[str, str], str]()
+    for made in sorted(state.datasets.values(), key=is_replaced, reverse=True):
+        told = f"dataset {made.out} refers to it"
+        if is_replaced(made):
+            told = f"a dataset that lay at {made.out} refers to it; 'tcpipe prune --forget {made.out}' if that is gone"
+        found.update(dict.fromkeys(made.runs, told))
     return found, None
 
 
-def is_replaced(made: DatasetMade) -> bool:
+def is_replaced(made: Dataset) -> bool:
     """Tell whether another dataset lies where this one was."""
     out = Path(made.out)
     try:
@@ -205,28 +215,52 @@ def _spooled(store: Store, min_age_s: float) -> Iterator[_Unnamed]:
             yield "left by a killed build", place, entries, None
 
 
-def _replaced(store: Store, min_age_s: float) -> Iterator[_Unnamed]:
-    """Yield, by run and for the maps, documents of earlier numbers and files that none of the last documents names, if they are old enough.
+def _replaced(store: Store, state: State, min_age_s: float, unread: str | None) -> Iterator[_Unnamed]:
+    """Yield, by run and for the maps, documents and files that nothing names any more, if they are old enough.
 
-    Files of one directory go together: its content is put there together. Where a document cannot be read they stay.
+    Files of one directory go together: its content is put there together. Where a document cannot be read they stay; so do ingestions
+    that are whole and that no commit names, since ingesting the log again finds them.
     """
     before_ns = time.time_ns() - int(min_age_s * 1e9)
-    for place in (store.place.below("maps"), *(store.runs_place.below(run_id) for run_id in store.run_ids())):
-        entries = place.entries()
-        last, documents = numbers(entry.name for entry in entries), set[str]()
-        named, unread = set[str](), None
-        for entry in entries:
-            if (of := stem_and_number(entry.name)) is not None:
-                documents.add(entry.name)
-                if of[1] == last[of[0]]:
-                    try:
-                        named |= {entry.name, *_named_by(place, entry.name)}
-                    except StoreError as error:
-                        unread = error.problems[0]
+    by_run: dict[str, list[RunFacts]] = {}
+    for row in state.runs.values():
+        by_run.setdefault(row.run_id, []).append(row)
+    for run_id in (None, *store.run_ids()):
+        place = store.place.below("maps") if run_id is None else store.runs_place.below(run_id)
+        entries, rows = place.entries(), by_run.get(run_id or "", [])
+        try:
+            named = set(_named_in(place, [entry.name for entry in entries], rows))
+            why = unread
+        except StoreError as error:
+            named, why = set(), error.problems[0]
+        uncommitted = _uncommitted(numbers(entry.name for entry in entries), rows) if run_id else set()
+        for recipe_id in uncommitted:
+            left = [entry for entry in entries if entry.name.startswith(f"{recipe_id}/")]
+            yield "no commit names it", place, left, "ingest its log again, or remove it"
         young = {_folder(entry.name) for entry in entries if entry.modified_ns >= before_ns}
-        content = (entry for entry in entries if entry.name in documents or _CONTENT.search(entry.name))
+        content = [of for of in entries if stem_and_number(of.name) or _CONTENT.search(of.name)]
         over = [of for of in content if of.name not in named and _folder(of.name) not in young]
-        yield "no document names it", place, over, unread
+        yield "no document names it", place, over, why
+
+
+def _uncommitted(last: Mapping[str, int], rows: Sequence[RunFacts]) -> set[str]:
+    """Return the recipes of a run with a manifest and no commit."""
+    parted = (stem.partition("/") for stem in last)
+    return {recipe for recipe, _, kind in parted if kind == "manifest"} - {row.recipe_id for row in rows}
+
+
+def _named_in(place: Place, names: Sequence[str], rows: Sequence[RunFacts]) -> Iterator[str]:
+    """Yield the files that the log names, those that their documents name, and the same of what no commit names but the last document."""
+    last, committed = numbers(names), {name for row in rows for name in row.files}
+    recipes = {row.recipe_id for row in rows}
+    for name in names:
+        of = stem_and_number(name)
+        if of is None:
+            continue
+        is_last = of[1] == last[of[0]]
+        if name in committed or (is_last and (not rows or name.partition("/")[0] not in recipes)):
+            yield from (name, *_named_by(place, name))
+    yield from committed
 
 
 def _named_by(place: Place, name: str) -> Iterator[str]:
@@ -258,11 +292,6 @@ def _remove_empty(store: Store, min_age_s: float) -> None:
         with suppress(OSError):  # it is not empty, or gone
             if not files and Path(above) != runs.root and time.time() - Path(above).stat().st_mtime >= min_age_s:
                 Path(above).rmdir()
-
-
-def _written_ns(row: RunFacts) -> int:
-    """Return when an ingestion's manifest was written [ns since 1970]."""
-    return int(row.state.rpartition("-")[2]) if row.state else 0
 
 
 def _size(place: Place) -> int:

@@ -13,7 +13,6 @@ from tcpipe.formats.place import Place
 from tcpipe.formats.published import here
 from tcpipe.formats.seals import sealed_page
 from tcpipe.formats.stored_runs import RunDirectory
-from tcpipe.pipeline.known_runs import list_runs
 from tcpipe.pipeline.store_facts import store_facts
 from tcpipe.report.dataset_patches import all_patches, folder_of
 from tcpipe.report.dataset_report import dataset_report
@@ -71,8 +70,7 @@ def report(path: Path | str, *, runs: bool = True, patches: bool = False) -> lis
 
 def _of_store(store: Store, *, runs: bool) -> list[Page]:
     """Write the store's page, first, as those of the runs lead to it, and again without the runs that cannot be read."""
-    found = list_runs(store)
-    store.keep_index(found)
+    found = store.ingestions()
     facts = store_facts(store, found, will_be=found.finished if runs else ())
     page, pages, problems = _write(store.place, store_report(facts), ()), list[Page](), list[str]()
     of_maps: dict[str, Pictures] = {}

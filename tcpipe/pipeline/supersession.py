@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import logging
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 
@@ -11,66 +10,50 @@ import numpy as np
 import pyarrow as pa
 
 from tcpipe.errors import StoreError
+from tcpipe.formats.commits import State, Superseded
 from tcpipe.formats.parquet import read_table
-from tcpipe.formats.record_files import RunName, Superseded, in_force
 from tcpipe.pipeline.log_sources import LogSource, is_there
 from tcpipe.store import Store
-
-logger = logging.getLogger("tcpipe")
 
 _CONTAINED = 0.9
 """Where so large a share of an older run's measurements is in the newer one, it is the same recording, and loses nothing."""
 
 
 def superseded_by(
-    store: Store, source: LogSource, run_id: str, sha256: str, runs: Mapping[str, Sequence[str]]
-) -> Iterator[str]:
-    """Mark the runs that a log's content supersedes; yield a line about every run that was made from the same path before.
+    store: Store, state: State, source: LogSource, run_id: str, sha256: str
+) -> tuple[list[Superseded], list[str]]:
+    """Return which runs the content of a log supersedes, and a line about every run that was made from the same path before.
 
     A run counts again when its recording is seen again, wherever that is. A log that is as it was is looked at only where its run
     has a part in that.
     """
-    records = store.records("superseded", Superseded)
-    gone = in_force(records)
+    found, notes, gone, parties = list[Superseded](), list[str](), state.superseded, state.parties
     if run_id in gone:
-        store.supersede(run_id, None)
-        yield f"run {run_id} counts again: its recording is back"
-    seen = {sighting.sha256 for sighting in store.sightings(source.lineage)}
+        found.append(Superseded(run_id, None))
+        notes.append(f"run {run_id} counts again: its recording is back")
+    seen = {sighting.sha256 for sighting in state.seen.get(source.lineage, ())}
     new = sha256 not in seen
-    parties = {party for record in records for party in (record.run_id, record.by)}
     earlier = seen - {sha256} if new or run_id in parties else ()
-    for older in sorted(filter(None, (store.run_of(of, runs) for of in earlier))):
+    for older in sorted(filter(None, map(state.run_of, earlier))):
         if older != run_id and older not in gone and (new or older in parties):
             share = _share_of(store, older, run_id)
-            elsewhere = _elsewhere(store, older, source) if share >= _CONTAINED else ""
+            elsewhere = _elsewhere(state, older, source) if share >= _CONTAINED else ""
             if share >= _CONTAINED and not elsewhere:
-                store.supersede(older, run_id)
-                yield f"run {older}, made from this path before, is superseded: this log holds what it held"
+                found.append(Superseded(older, run_id))
+                notes.append(f"run {older}, made from this path before, is superseded: this log holds what it held")
             elif new:
                 held = f"this log holds {share:.0%} of it" if share else "that was another recording"
                 why = f"its recording lies at {elsewhere}" if elsewhere else held
-                yield f"run {older}, made from this path before, stays: {why}"
+                notes.append(f"run {older}, made from this path before, stays: {why}")
+    return found, notes
 
 
-def remember_earlier(store: Store) -> None:
-    """Write down which run a recording is, and where it lay, in a store that was made before that was remembered, or lost its records."""
-    if "runs" not in store.place.folders("records"):
-        for run_id in store.run_ids():
-            with suppress(StoreError):  # told where it matters
-                if (known := store.run_json(run_id)) is not None:
-                    origin = known.source
-                    log = LogSource(tuple(map(Path, origin.paths)), (), urls=origin.paths)
-                    store.note(log.lineage, log.sighting(origin.sha256))
-                    store.remember(f"runs/{origin.sha256}", RunName(origin.sha256, run_id))
-
-
-def _elsewhere(store: Store, run_id: str, source: LogSource) -> str:
+def _elsewhere(state: State, run_id: str, source: LogSource) -> str:
     """Return where else a run's recording lies, "" where it is gone."""
-    known = store.run_json(run_id)
-    for folder in store.place.folders("records/logs"):
-        lineage = f"logs/{folder}"
-        for sighting in store.sightings(lineage) if lineage != source.lineage else ():
-            if known and sighting.sha256 == known.source.sha256 and sighting.size_and_time and is_there(sighting):
+    contents = {row.log.source.sha256 for row in state.rows_of(run_id) if row.log}
+    for lineage, sightings in state.seen.items():
+        for sighting in sightings if lineage != source.lineage else ():
+            if sighting.sha256 in contents and sighting.size_and_time and is_there(sighting):
                 return " + ".join(sighting.log)
     return ""
 

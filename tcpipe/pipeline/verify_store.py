@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import math
 import re
+import time
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -14,7 +16,9 @@ import pyarrow as pa
 
 from tcpipe.errors import StoreError, TcpipeError
 from tcpipe.formats.atomic import TEMPORARY_PREFIX, is_abandoned
-from tcpipe.formats.index_files import facts_of, state_of
+from tcpipe.formats.commit_log import LOG, commit_name, read_commit, read_snapshot, snapshot_name
+from tcpipe.formats.commits import Commit, State, fold
+from tcpipe.formats.index_files import facts_of
 from tcpipe.formats.json_files import typed
 from tcpipe.formats.maps.map_files import MapFile, open_map
 from tcpipe.formats.numbered import name_of, numbers, read_as_at, read_sealed_at, stem_and_number
@@ -27,7 +31,6 @@ from tcpipe.formats.seals import CHECKSUMS, Checksum, broken_checksums, broken_s
 from tcpipe.formats.store_mark import MARK, SPOOL
 from tcpipe.formats.stored_runs import RunDirectory
 from tcpipe.pipeline.dataset.segments import KEPT
-from tcpipe.pipeline.known_runs import list_runs
 from tcpipe.report.overview import shows_map
 from tcpipe.store import Store
 from tcpipe.tables.columns import floats, integers
@@ -54,24 +57,63 @@ def verify_store(store: Store) -> Iterator[Finding]:
     for name in place.folders():
         if name == SPOOL:
             yield f"{place.where(name)}: is of a build that goes on, or was killed; 'tcpipe prune' removes what is old"
-        elif name not in ("records", "maps", "runs", _INDEX):
+        elif name not in (LOG, "maps", "runs", _INDEX):
             yield _stranger(place, name)
-    for entry in place.entries("records"):
-        yield broken_seal_in(place.read(entry.name), place.where(entry.name)) or ("records", 1)
+    yield from _log(place.below(LOG))
     yield from _maps(store)
     yield from _runs(store)
     if isinstance(place, DirectoryPlace):
         yield from _left_behind(place.root)
 
 
+def _log(log: Place) -> Iterator[Finding]:
+    """Yield the same of every commit, and of every snapshot, which has to say what the commits to its number say."""
+    state, last, whole = State(), 0, True
+    for name in log.files():
+        number = int(name[:10]) if name[:10].isdigit() and name[10:] == ".json" else None
+        if number is None and not name.startswith("snapshot-"):
+            yield _stranger(log, name)
+        if number is None:
+            continue
+        yield from (f"{log.where(commit_name(absent))}: is missing" for absent in range(last + 1, number))
+        try:
+            commit, digest, _ = read_commit(log, number)
+        except StoreError as error:
+            yield from error.problems
+            last, whole = number, False
+            continue
+        if commit.parent != state.digest and whole and number == last + 1:
+            yield f"{log.where(name)}: does not follow the commit before"
+        whole = whole and number == last + 1
+        state, last = replace(fold([commit], state), digest=digest), number
+        yield "commits", 1
+        yield from _snapshot(log, state) if whole else ()
+
+
+def _snapshot(log: Place, state: State) -> Iterator[Finding]:
+    name = snapshot_name(state.number)
+    if log.size(name) is None:
+        return
+    try:
+        found: Commit = read_snapshot(log, name)
+    except StoreError as error:
+        yield from error.problems
+        return
+    same = fold([found]) == replace(state, digest="")
+    yield ("files", 1) if same else f"{log.where(name)}: does not say what the commits say; remove it"
+
+
 def _runs(store: Store) -> Iterator[Finding]:
-    """Yield the same of all runs, and of those that the index knows and of which a document, or all, is gone."""
-    wrong = set[str]()
+    """Yield the same of all runs, of those that the log names and of which files are gone, and of ingestions that no commit names."""
+    wrong, found = set[str](), store.ingestions()
     for run_id in store.run_ids():
         for finding in verify_run(store, run_id):
             wrong |= {run_id} if isinstance(finding, str) else set()
             yield finding
-    yield from (line for (run_id, _), line in list_runs(store).damaged.items() if run_id not in wrong)
+        for under in store.read_rows(run_id):
+            if (run_id, under) not in found.rows:
+                yield f"{store.runs_place.below(run_id).where(under)}: no commit names it; ingest its log again"
+    yield from (line for (run_id, _), line in found.damaged.items() if run_id not in wrong)
 
 
 def verify_run(store: Store, run_id: str, recipe: str | None = None) -> Iterator[Finding]:
@@ -90,7 +132,7 @@ def verify_run(store: Store, run_id: str, recipe: str | None = None) -> Iterator
     yield from _isolated(_streams(place, known))
     recipes = [name for name in folders if name != _STREAMS and numbers(place.files(name)).get("manifest")]
     for name in recipes if recipe is None else [recipe]:
-        yield from _isolated(_ingestion(place.below(name)))
+        yield from _isolated(_ingestion(store.runs_place, run_id, name))
     if not recipes:
         yield f"{place.where()}: holds no finished run; ingest its log again"
     for name in names:
@@ -216,9 +258,10 @@ def _streams(place: Place, known: RunJson | None) -> Iterator[Finding]:
         yield "rows", table.num_rows
 
 
-def _ingestion(place: Place) -> Iterator[Finding]:
+def _ingestion(runs: Place, run_id: str, recipe_name: str) -> Iterator[Finding]:
     """Compare what a run became under one recipe with its manifest."""
     yield "runs", 1
+    place = runs.below(f"{run_id}/{recipe_name}")
     last = name_of("manifest", numbers(place.files())["manifest"])
     document, where = read_sealed_at(place, last), place.where(last)
     if document["data_model_version"] not in READ_VERSIONS:
@@ -228,7 +271,6 @@ def _ingestion(place: Place) -> Iterator[Finding]:
         )
         return
     manifest, recipe = typed(document, Manifest, where), document["recipe"]
-    run_id, recipe_name = place.where().rsplit("/", 2)[1:]
     of = (ingest_key(recipe), recipe_id(recipe, manifest.robot)) if isinstance(recipe, Mapping) else None
     if of != (manifest.ingest_key, recipe_name):
         yield f"{where}: its recipe is not the one that the directory is named after"
@@ -236,8 +278,7 @@ def _ingestion(place: Place) -> Iterator[Finding]:
     yield from wrong
     yield "files", len(manifest.checksums)
     yield from _others(place, manifest)
-    state = next(state_of(entry) for entry in place.entries() if entry.name == last)
-    run = RunDirectory(run_id, recipe_name, place, facts_of(manifest, state), "")
+    run = RunDirectory(run_id, recipe_name, runs, facts_of(manifest, last, {}), str(time.time_ns()))
     yield from _tables(run, where) if not wrong else ()
 
 

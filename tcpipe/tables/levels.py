@@ -32,13 +32,19 @@ from tcpipe.tables.facts import NOTHING_FOUND, RunFacts
 from tcpipe.tables.findings import Finding, StageReport
 from tcpipe.tables.segment_columns import LINE_COLUMN, MOTION_COLUMNS, POINT_COLUMN, STANDING_COLUMNS
 
-DATA_MODEL_VERSION = "2.2"
+DATA_MODEL_VERSION = "3.0"
 """Version of every manifest and card that is written; its history stands in docs/reference/data-model.md."""
 
-READ_VERSIONS = ("1.0", "1.1", "1.2", "1.3", "1.4", "2.0", "2.1", DATA_MODEL_VERSION)
-"""Versions that are read as they are; `tcpipe migrate` brings the older ones to the last."""
+READ_VERSIONS = (DATA_MODEL_VERSION,)
+"""Versions whose documents are read as they are."""
+
+EARLIER_VERSIONS = ("2.0", "2.1", "2.2")
+"""Versions that `tcpipe migrate` brings to the current one."""
 
 TABLES_VERSION = "2.1"  # in which a table last changed
+
+READ_TABLES = ("2.0", TABLES_VERSION)
+"""Versions of tables that are read as they are."""
 
 _METADATA_KEY = b"tcpipe"
 

@@ -1,11 +1,10 @@
-"""Make ``store-1.0.tar.xz``: a site, its store and two datasets as data model 1.0 wrote them.
+"""Make ``store-2.1.tar.xz``: a site, its store and two datasets as data model 2.1 wrote them.
 
-It was run once with tcpipe 0.2.0 at commit 755ebd5, the last that wrote data model 1.0, and later with the last ones that wrote 1.4, 2.0
-(456dda6) and 2.1 (36f6e15); what it made is kept and never made again:
+It was run once with the last commits that wrote 2.0 (456dda6) and 2.1 (36f6e15); what it made is kept and never made again:
 
-    git worktree add /tmp/tcpipe-1.0 755ebd5
-    cp tests/data/make_kept_store.py /tmp/tcpipe-1.0
-    cd /tmp/tcpipe-1.0 && PYTHONPATH=. python make_kept_store.py store-1.0.tar.xz
+    git worktree add /tmp/tcpipe-2.1 36f6e15
+    cp tests/data/make_kept_store.py /tmp/tcpipe-2.1
+    cd /tmp/tcpipe-2.1 && PYTHONPATH=. python make_kept_store.py store-2.1.tar.xz
 
 A simulated drive of half a minute, its sensors slowed down, and rasters of half a metre over 26 m x 22 m keep it small. The log itself
 is left out.

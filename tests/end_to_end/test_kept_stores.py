@@ -1,10 +1,11 @@
-"""Stores and datasets of data models 1.0, 1.4, 2.0 and 2.1, kept as they were written (tests/data/make_kept_store.py)."""
+"""Stores and datasets of data models 2.0 and 2.1, kept as they were written (tests/data/make_kept_store.py)."""
 
 import json
 import re
 import shutil
 import tarfile
 from contextlib import suppress
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -15,10 +16,12 @@ from object_gateway import in_environment
 from storage_server import object_store
 
 import tcpipe
-from tcpipe.errors import DatasetError, UsageError
+from tcpipe.errors import StoreError, UsageError
+from tcpipe.formats.json_files import to_json
 from tcpipe.formats.maps.map_files import open_map
 from tcpipe.formats.place import DirectoryPlace
-from tcpipe.formats.seals import write_sealed
+from tcpipe.formats.seals import sealed, write_sealed
+from tcpipe.pipeline import migrate as migrating
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.explain import explain
 from tcpipe.pipeline.inspect import inspect
@@ -32,7 +35,7 @@ from tcpipe.tables.levels import DATA_MODEL_VERSION, SAMPLES
 DATA = Path(__file__).parents[1] / "data"
 
 
-@pytest.fixture(params=["1.0", "1.4"])
+@pytest.fixture(params=["2.0", "2.1"])
 def untouched(tmp_path, request):
     """As it was written."""
     with tarfile.open(DATA / f"store-{request.param}.tar.xz") as archive:
@@ -42,11 +45,12 @@ def untouched(tmp_path, request):
 
 @pytest.fixture(scope="module")
 def migrated(tmp_path_factory):
-    """That of 1.0, its store brought to this layout."""
+    """That of 2.0, its store and datasets brought to this data model."""
     directory = tmp_path_factory.mktemp("migrated")
-    with tarfile.open(DATA / "store-1.0.tar.xz") as archive:
+    with tarfile.open(DATA / "store-2.0.tar.xz") as archive:
         archive.extractall(directory, filter="data")
-    assert migrate(directory / "store").exit_code == 0
+    for name in ("store", "zarr", "parquet"):
+        assert migrate(directory / name).exit_code == 0
     return directory
 
 
@@ -81,45 +85,15 @@ def test_a_dataset_is_built_of_it(kept):
     assert explain(sample_id, dataset=kept / "zarr", store=kept / "store").facts.sample["sample_id"] == sample_id
 
 
-def test_columns_added_since_are_null_in_runs_and_datasets(kept):
+def test_a_column_added_since_is_null_in_datasets_of_before(kept):
     build_dataset(kept / "new", store=kept / "store", recipe=Recipe(), holdout="sample")
-    later = [column.name for column in SAMPLES.columns if column.since]
-    assert {"turn_rad", "energy_above_standing_joule"} <= set(later)
     for name in ("zarr", "parquet", "new"):
         train = tcpipe.open_dataset(kept / name)["train"]
         assert train.samples.column_names == SAMPLES.names()
-        for column in later:
-            if (name, column) == ("new", "geometry"):  # comes from the patches
-                assert set(shapely.get_type_id(shapely.from_wkb(train.column(column)))) == {shapely.GeometryType.POINT}
-            else:
-                assert np.isnan(train.column(column).astype(float)).all(), column
+        shapes = {None} if name != "new" else {shapely.GeometryType.POINT}  # comes from the patches
+        found = train.column("geometry")
+        assert (set(found) if name != "new" else set(shapely.get_type_id(shapely.from_wkb(found)))) == shapes
     assert verify(kept / "new").problems == ()
-    with pytest.raises(DatasetError, match="no sample has power_above_standing_watt: its robot hardly stood"):
-        tcpipe.open_dataset(kept / "zarr", label="above_standing")
-
-
-@pytest.mark.parametrize("version", ["2.0", "2.1"])
-def test_what_data_model_2_wrote_is_read_as_it_is(tmp_path, version):
-    with tarfile.open(DATA / f"store-{version}.tar.xz") as archive:
-        archive.extractall(tmp_path, filter="data")
-    before = contents(tmp_path)
-    found = migrate(tmp_path / "store")
-    assert (found.migrated, found.problems, found.exit_code) == ((), (), 0)
-    for name in ("store", "zarr", "parquet"):
-        assert verify(tmp_path / name).problems == ()
-    assert contents(tmp_path) == before
-    copied = [str(migrate(tmp_path / "store", tmp_path / "copy")) for _ in range(2)]
-    files = len(contents(tmp_path / "copy")) - 1  # but store.json
-    assert copied[0].endswith(
-        f"0 documents brought to data model {DATA_MODEL_VERSION}, 3 left as they are; {files} files copied"
-    )
-    assert copied[1].endswith("copy: nothing to do: 3 documents are current")
-    (run,) = open_store(tmp_path / "store").runs()
-    segments = run.segments()
-    assert segments.num_rows > 0
-    assert segments.column("geometry").null_count == (segments.num_rows if version == "2.0" else 0)
-    train = tcpipe.open_dataset(tmp_path / "zarr")["train"]
-    assert (set(train.column("geometry")) == {None}) == (version == "2.0")
 
 
 def contents(directory):
@@ -134,7 +108,10 @@ def test_a_card_is_migrated_once_and_nothing_else_changes(untouched, name):
     after = contents(untouched / name)
     assert {path.name for path in after if after[path] != before.get(path)} == {"dataset.json"}
     old, new = (json.loads(files[untouched / name / "dataset.json"]) for files in (before, after))
-    assert {key for key in new if new[key] != old[key]} == {"data_model_version", "document_sha256"}
+    changed = {key for key in {*old, *new} if new.get(key) != old.get(key)}
+    assert changed <= {
+        "data_model_version", "document_sha256", "warnings", "problems", "findings", "runs", "maps", "verdict"
+    }  # fmt: skip
     assert verify(untouched / name).problems == ()
     again = migrate(untouched / name)
     assert (again.migrated, again.exit_code) == ((), 0)
@@ -159,25 +136,79 @@ def test_a_store_is_asked_to_be_migrated_and_its_tables_stay_where_they_are(unto
     store = untouched / "store"
     before = contents(store)
     for ask in (open_store, verify, report, partial(inspect, recipe=Recipe())):
-        with pytest.raises(UsageError, match=r"is a store of an earlier data model.*tcpipe migrate"):
+        with pytest.raises(UsageError, match=r"is a store of data model 2\..*tcpipe migrate"):
             ask(store)
     assert contents(store) == before
     found = migrate(store)
-    assert (len(found.migrated), found.problems, found.exit_code) == (3, (), 0)
+    assert (len(found.migrated), found.problems, found.exit_code) == (2, (), 0)
     after = contents(store)
-    assert {path.name for path in before if path not in after} == {"run.json", "manifest.json", "checksums.json"}
-    assert {name for name in names(store, before) if not name.startswith("records/")} == {
-        "store.json", "runs/tiny-#/run-1.json", "runs/tiny-#/#/manifest-1.json", "maps/site-1.json",
+    assert not any("records" in path.parts for path in after)
+    assert {path.name for path in before if after.get(path, before[path]) != before[path]} - {"runs.parquet"} == {
+        "store.json", "run-1.json", "manifest-1.json",
     }  # fmt: skip
-    assert all(before[path] == data for path, data in after.items() if path in before)
+    assert names(store, before) - {"index/runs.parquet"} == {"log/#.json"}
     assert verify(store).problems == ()
     again = migrate(store)
     assert (again.migrated, again.exit_code) == ((), 0)
-    assert str(again).endswith("nothing to do: 3 documents are current")
+    assert str(again).endswith("nothing to do: 2 documents are current")
     assert contents(store) == after
     (run,) = Store(store).runs()
     assert run.manifest.data_model_version == DATA_MODEL_VERSION
-    assert Store(store).claim_run("another name", Store(store).run_json(run.run_id).source.sha256) == run.run_id
+    state = Store(store).state()
+    assert (len(state.seen), len(state.datasets), len(state.calls)) == (1, 2, 3)
+    assert state.run_of(run.facts.log.source.sha256) == run.run_id
+    assert run.facts.log.outline
+
+
+WARNED = ("imu: 0.1 s late", "gnss: no placement")
+
+
+def test_sentences_of_manifests_and_cards_become_findings():
+    manifest = {
+        "data_model_version": "2.1", "run_id": "a", "warnings": list(WARNED),
+        "info": {"findings": {"warnings": [], "facts": {"n": 1}}, "datum": None},
+    }  # fmt: skip
+    brought = migrating._bring_document(manifest, "manifest-1.json")
+    assert (brought["data_model_version"], brought["info"]["report"]["facts"]) == (DATA_MODEL_VERSION, {"n": 1})
+    assert [
+        (of["code"], of["subject"]["name"], of["names"]["text"]) for of in brought["info"]["report"]["findings"]
+    ] == [("earlier-warning", "a", line) for line in WARNED]
+    assert brought["verdict"]["position"] == "usable", "a note changes no verdict"
+    assert migrating._bring_document(brought, "manifest-1.json") is brought
+    card = {
+        "data_model_version": "2.2", "name": "d", "problems": [WARNED[0]], "warnings": [WARNED[1]], "findings": [{"example": "x"}],
+        "runs": [{"run_id": "a", "warnings": list(WARNED)}], "maps": [{"name": "m", "warnings": []}],
+    }  # fmt: skip
+    brought = migrating._bring_document(card, "dataset.json")
+    assert [of["names"]["text"] for of in brought["findings"]] == list(WARNED)
+    assert ([len(of["findings"]) for of in brought["runs"]], brought["maps"]) == ([2], [{"name": "m", "findings": []}])
+    with pytest.raises(
+        StoreError, match=r"of data model 4\.0, this version knows 2\.0, 2\.1, 2\.2, 3\.0; left as it is"
+    ):
+        migrating._bring_document({"data_model_version": "4.0"}, "dataset.json")
+
+
+def test_what_is_remembered_becomes_commits(untouched):
+    store, place = untouched / "store", Store(untouched / "store").place
+    trouble = {"content": "c", "lines": ["cut"], "log": ["/logs/b.bag"], "run_id": None, "kind": "failed"}
+    records = {
+        "failed/k": {**trouble, "version": "0.9.0"},
+        "accepted/a": trouble,
+        "superseded/2": {"run_id": "a", "by": None, "number": 1},
+        "superseded/1": {"run_id": "a", "by": "b", "number": 0},
+        "superseded/3": {"run_id": "c", "by": "b", "number": 0},
+        "replaced/1": {"out": "/out", "inputs": "1"},
+        "datasets/1": {"out": "/out", "inputs": "1", "runs": []},
+    }
+    for name, record in records.items():
+        place.put(f"records/{name}.json", to_json(sealed(record)).encode())
+    place.put("records/logs/x/y.json", b"damaged")
+    found = migrate(store)
+    assert (len(found.problems), found.exit_code) == (1, 3)
+    state = Store(store).state()
+    assert (list(state.failed), list(state.acknowledged)) == (["k"], ["log-failed c "])
+    assert state.superseded == {"c": "b"}
+    assert "/out" not in {out for out, _ in state.datasets}
 
 
 class _Killed(BaseException):
@@ -203,10 +234,20 @@ def test_a_migration_that_is_killed_at_any_step_is_gone_on_with(untouched, tmp_p
         with suppress(_Killed):
             migrate(half, target)
             break
-    assert steps >= 5
+    assert steps >= 4
     got = target or half
-    assert {str(path.relative_to(got)): data for path, data in contents(got).items()} == {
-        str(path.relative_to(whole)): data for path, data in contents(whole).items()
+    assert settled(got) == settled(whole)
+    rows, others = ([*Store(place).state().runs.values()] for place in (got, whole))
+    assert [replace(row, commit=0) for row in rows] == [replace(row, commit=0) for row in others]
+    assert verify(got).problems == ()
+
+
+def settled(store):
+    """What a store holds but for when and by whom it was committed."""
+    return {
+        str(path.relative_to(store)): data
+        for path, data in contents(store).items()
+        if not {"log", "index", "records"} & set(path.relative_to(store).parts)
     }
 
 
@@ -219,19 +260,15 @@ def _after(step, act):
 
 
 def test_what_is_damaged_or_not_known_is_left_and_named(untouched):
-    (manifest,) = (untouched / "store" / "runs").glob("*/*/manifest.json")
+    (manifest,) = (untouched / "store" / "runs").glob("*/*/manifest-1.json")
     text = manifest.read_text()
     manifest.write_text(text.replace('"husky"', '"jackal"', 1))
     damaged = migrate(untouched / "store")
-    assert (len(damaged.migrated), damaged.exit_code) == (2, 3)
+    assert (len(damaged.migrated), damaged.exit_code) == (1, 3)
     assert "not as it was written" in damaged.problems[0]
-    write_sealed(manifest, {**json.loads(text), "data_model_version": "3.0"})
-    newer = contents(untouched / "store")
-    assert (
-        "of data model 3.0, this version knows 1.0, 1.1, 1.2, 1.3, 1.4, 2.0, 2.1"
-        in migrate(untouched / "store").problems[0]
-    )
-    assert contents(untouched / "store") == newer
+    write_sealed(untouched / "store" / "store.json", {"data_model_version": "4.0"})
+    with pytest.raises(UsageError, match=r"is of data model 4\.0, this version knows 2\.0, 2\.1, 2\.2, 3\.0"):
+        migrate(untouched / "store")
     with pytest.raises(UsageError, match="is no store, map"):
         migrate(untouched / "site")
 
@@ -242,12 +279,12 @@ def test_a_store_is_brought_into_a_bucket(untouched, tmp_path, monkeypatch):
     with object_store(tmp_path / "served") as (environment, _):
         in_environment(monkeypatch, environment, tmp_path / "cache")
         found = migrate(untouched / "store", "s3://tests/my store")
-        assert (len(found.migrated), found.exit_code) == (3, 0)
+        assert (len(found.migrated), found.exit_code) == (2, 0)
         assert contents(untouched / "store") == before
         assert verify("s3://tests/my store").problems == ()
         assert "nothing to do" in str(migrate("s3://tests/my store"))
         migrate("s3://tests/my store", untouched / "back")
+        assert Store(untouched / "back").state() == Store("s3://tests/my store").state()
     migrate(untouched / "store")
-    assert {path.relative_to(untouched / "back"): data for path, data in contents(untouched / "back").items()} == {
-        path.relative_to(untouched / "store"): data for path, data in contents(untouched / "store").items()
-    }
+    assert settled(untouched / "back") == settled(untouched / "store")
+    assert verify(untouched / "back").problems == ()

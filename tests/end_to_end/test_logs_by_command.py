@@ -125,13 +125,14 @@ def test_a_night_with_known_trouble_is_no_red_night(tmp_path):
         "1 known to be damaged or empty; 'tcpipe accept RUN' when it has been looked at",
     ]
     (run_id,) = {path.name for path in (tmp_path / "tcpipe-store" / "runs").glob("cut-*")}
-    refused = plain_lines(tcpipe("accept", run_id, "nosuch", cwd=tmp_path), 2, most=1)
-    assert (
-        f"nosuch: no run or log with known trouble is called so in tcpipe-store; trouble is known of {junk}, {run_id}"
-        in refused
+    refused = plain_lines(tcpipe("acknowledge", run_id, "nosuch", cwd=tmp_path), 2, most=1)
+    assert f"nosuch: is no run or log with a known problem in tcpipe-store; known problems: {junk}, {run_id}" in refused
+    done = tcpipe("accept", run_id, "logs/junk.bag", cwd=tmp_path)  # the name of the command before
+    assert (done.returncode, f"acknowledged: {run_id}: " in done.stdout, "[log-damaged]" in done.stdout) == (
+        0,
+        True,
+        True,
     )
-    accepted = tcpipe("accept", run_id, "logs/junk.bag", cwd=tmp_path)
-    assert (accepted.returncode, f"accepted: {run_id} (damaged)" in accepted.stdout) == (0, True)
     retried = tcpipe("ingest", "logs", "--retry-failed", cwd=tmp_path)
     assert (retried.returncode, retried.stdout.splitlines()[-1]) == (0, "2 with accepted trouble")
 

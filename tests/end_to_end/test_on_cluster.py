@@ -36,7 +36,7 @@ build_dataset("far", store="there", cluster=sys.argv[1])
 
 def _files(directory: Path) -> dict[str, bytes]:
     """The files but for the history and the index, which hold times and inodes."""
-    files = (path for path in directory.rglob("*") if path.is_file() and path.parent.name not in ("calls", "index"))
+    files = (path for path in directory.rglob("*") if path.is_file() and path.parent.name not in ("log", "index"))
     return {str(path.relative_to(directory)): path.read_bytes() for path in files}
 
 

@@ -34,6 +34,7 @@ TEXTS = {
     "shard",
     "min_age_s",
     "keep",
+    "forget",
     "drives",
 }
 """Parameters of commands that are text and no path."""
@@ -98,6 +99,7 @@ def here(tmp_path, monkeypatch):
 
 CALLS = [
     "accept run --store gone",
+    "acknowledge run --store gone",
     "add-map site --height gone.tif",
     "add-map site --height empty",
     "add-map site --height s3://bucket/dem.tif",

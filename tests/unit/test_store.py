@@ -17,8 +17,8 @@ from synthetic_store import add_run, lanes, segments
 from tcpipe.errors import StoreError, UsageError
 from tcpipe.formats.bucket import BucketPlace
 from tcpipe.formats.place import DirectoryPlace
-from tcpipe.formats.run_documents import LogOrigin, RunJson
 from tcpipe.pipeline.inspect import inspect
+from tcpipe.pipeline.log_writer import commit_run
 from tcpipe.pipeline.verify import verify
 from tcpipe.recipe import Recipe
 from tcpipe.store import Store, open_store
@@ -46,7 +46,10 @@ def put(store: Store, length_m: float = 10.0, **how: object) -> None:
 
 
 def contents(store: Store) -> dict[str, bytes | None]:
-    return {entry.name: store.place.read(entry.name) for entry in store.place.entries()}
+    """What is there, but for when and by whom it was committed."""
+    return {
+        entry.name: store.place.read(entry.name) for entry in store.place.entries() if not entry.name.startswith("log/")
+    }
 
 
 def counted(store: Store) -> list[int]:
@@ -92,6 +95,9 @@ def test_killed_at_any_step_a_reader_finds_the_generation_before_and_the_next_ca
     assert steps > 3
     assert counted(store) == [12]
     assert contents(store) == contents(undisturbed)
+    assert [replace(row, commit=0) for row in store.state().runs.values()] == [
+        replace(row, commit=0) for row in undisturbed.state().runs.values()
+    ]
     assert verify(store.root).problems == ()
 
 
@@ -113,6 +119,8 @@ def test_of_two_who_make_a_run_the_first_wins_and_what_replaces_it_is_a_new_numb
     assert write("mine") == ()
     assert write("mine", force=True) == ("mine",)
     assert write("mine", force=True) == ("mine",)
+    assert store.runs()[0].manifest.warnings == (), "no commit names the new one yet"
+    commit_run(store, RUN)
     assert store.runs()[0].place.files() == ["manifest-1.json", "manifest-2.json"]
     assert store.runs()[0].manifest.damage == ("mine",)
 
@@ -132,23 +140,8 @@ def test_tags_of_two_writers_are_both_kept(root, monkeypatch):
     assert store.tag_run(RUN, {"weather": "wet"})
     assert not store.tag_run(RUN, {"driver": "Eva"})
     wanted = {"driver": "Eva", "weather": "wet"}
+    commit_run(store, RUN)
     assert store.run_json(RUN).tags == store.runs()[0].manifest.tags == wanted
-
-
-def test_a_recording_is_one_run_whoever_names_it_first(root, monkeypatch):
-    store = open_store(root, create=True)
-    sha256 = "abcdef01" * 8
-    free = Store._free_name
-
-    def meanwhile(self, stem, of):
-        monkeypatch.setattr(Store, "_free_name", free)
-        assert store.claim_run("copy", of) == "copy-abcdef01"
-        return free(self, stem, of)
-
-    monkeypatch.setattr(Store, "_free_name", meanwhile)
-    assert store.claim_run("drive", sha256) == "copy-abcdef01"
-    store.write_run_json("copy-abcdef01", RunJson(LogOrigin(("/drive.bag",), sha256)))
-    assert store.run_of(sha256, store.run_ids_by_hash()) == "copy-abcdef01"
 
 
 def test_what_a_copier_left_by_halves_is_named_and_not_used(tmp_path):
@@ -159,7 +152,7 @@ def test_what_a_copier_left_by_halves_is_named_and_not_used(tmp_path):
     whole = path.read_bytes()
     path.write_bytes(whole[:-10])
     assert store.runs() == []
-    assert f"track.parquet: has {len(whole) - 10} bytes, wanted {len(whole)}" in next(
+    assert f"track.parquet: has {len(whole) - 10} bytes, expected {len(whole)}" in next(
         iter(store.ingestions().damaged.values())
     )
     path.unlink()
@@ -167,9 +160,9 @@ def test_what_a_copier_left_by_halves_is_named_and_not_used(tmp_path):
     path.write_bytes(whole)
     manifest(run).unlink()
     (line,) = inspect(store.root, recipe=Recipe()).damaged_runs.values()
-    assert line.endswith(f"runs/{RUN}: has no manifest-<n>.json; ingest the log again")
+    assert line.endswith("manifest-1.json: is gone; ingest the log again")
     (store.root / "store.json").unlink()
-    with pytest.raises(UsageError, match="earlier data model, or of which not all was copied"):
+    with pytest.raises(UsageError, match="which this version does not read, or an incomplete copy"):
         open_store(store.root)
 
 
@@ -196,9 +189,9 @@ def test_what_a_killed_call_left_on_this_machine_goes_when_a_store_is_opened(tmp
 
 def test_a_store_of_a_later_layout_is_refused(tmp_path, monkeypatch):
     with monkeypatch.context() as later:
-        later.setattr("tcpipe.formats.store_mark.DATA_MODEL_VERSION", "3.0")
+        later.setattr("tcpipe.formats.store_mark.DATA_MODEL_VERSION", "4.0")
         open_store(tmp_path / "store", create=True)
-    with pytest.raises(StoreError, match=r"is of data model 3\.0, this version knows 1\.0, .*, 2\.0"):
+    with pytest.raises(StoreError, match=r"is of data model 4\.0, this version knows 3\.0"):
         open_store(tmp_path / "store")
 
 

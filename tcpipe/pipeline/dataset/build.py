@@ -8,6 +8,7 @@ import shutil
 from collections.abc import Container, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 
 import pyarrow as pa
@@ -17,6 +18,7 @@ from tcpipe.cost.budget import in_words
 from tcpipe.errors import DatasetError, RecipeError, StoreError, UsageError, plain_lines
 from tcpipe.formats.atomic import atomic_directory, clear_beside, write_text
 from tcpipe.formats.bucket import open_place
+from tcpipe.formats.commits import Call, Dataset, Entries
 from tcpipe.formats.croissant import croissant
 from tcpipe.formats.dataset_card import DatasetCard, Doubtful, Redacted, group_dataset_findings
 from tcpipe.formats.dataset_files import (
@@ -46,11 +48,10 @@ from tcpipe.formats.place import DirectoryPlace
 from tcpipe.formats.places import local_output
 from tcpipe.formats.published import has_card, here_by_range, published, refuse_others, settle
 from tcpipe.formats.recipe_toml import recipe_of
-from tcpipe.formats.record_files import Call, DatasetMade, DatasetReplaced
 from tcpipe.formats.seals import Checksum, file_checksum, file_checksums, sealed_page, write_sealed
 from tcpipe.formats.store_mark import SPOOL
-from tcpipe.pipeline.begun_calls import begun_call
-from tcpipe.pipeline.calls import BUILD, Estimate, Stopwatch, estimate, latest_calls, remember_call, started
+from tcpipe.pipeline.begun_calls import OpenCall, begun_call
+from tcpipe.pipeline.calls import BUILD, Estimate, estimate, measure_call, started
 from tcpipe.pipeline.dataset.added_columns import read_all_covariates
 from tcpipe.pipeline.dataset.balance import BALANCE_COLUMNS, measure_balance
 from tcpipe.pipeline.dataset.build_dataset_options import BuildDatasetOptions
@@ -71,6 +72,7 @@ from tcpipe.pipeline.dataset.runs import CHOICE_CODES, find_gone_runs
 from tcpipe.pipeline.dataset.sampling import Workers
 from tcpipe.pipeline.dataset.segments import KEPT
 from tcpipe.pipeline.dataset.writing import write_patches
+from tcpipe.pipeline.log_writer import LogWriter, open_log
 from tcpipe.recipe import Recipe
 from tcpipe.report.dataset_report import dataset_report
 from tcpipe.report.overview import class_overview, maps_overview, relief_overview, write_overview
@@ -207,33 +209,30 @@ def run_build_dataset(options: BuildDatasetOptions) -> BuildResult:
     else:
         _refuse_other_options(place, known, marks, inputs, force=options.force)
         whole = published(place, CARD) if isinstance(place, str) else atomic_directory(place.absolute())
-        begun = begun_call(opened, BUILD, [_absolute(place)])
-        with (
-            begun,
-            whole as directory,
-            _workers(directory, opened, inputs.digest, jobs=options.jobs, cluster=options.cluster) as workers,
-        ):
-            card = _build(
-                directory,
-                inputs,
-                ruling,
-                regions,
-                earlier,
-                file_format=options.file_format,
-                workers=workers,
-                redact=options.redact,
-                tags=marks.tags,
-            )
-            _refuse_others_since(place, {known.inputs if known else None, inputs.digest})
-        for entry in workers.waiting.entries():
-            workers.waiting.delete(entry.name)
-        result = _result(place, "done", card, left_out)
-    if not dry_run:
-        _remember(
-            opened, watch, result, inputs, options.jobs, size=sum(of.size_bytes for of in card.checksums.values())
-        )
-        if known is not None and known.inputs != inputs.digest:
-            _note(opened, "replaced", DatasetReplaced(_lasting(result), known.inputs))
+        with begun_call(open_log(opened), BUILD, [_absolute(place)]) as call:
+            at_work = partial(_workers, jobs=options.jobs, cluster=options.cluster)
+            with whole as directory, at_work(directory, opened, inputs.digest) as workers:
+                card = _build(
+                    directory,
+                    inputs,
+                    ruling,
+                    regions,
+                    earlier,
+                    file_format=options.file_format,
+                    workers=workers,
+                    redact=options.redact,
+                    tags=marks.tags,
+                )
+                _refuse_others_since(place, {known.inputs if known else None, inputs.digest})
+            for entry in workers.waiting.entries():
+                workers.waiting.delete(entry.name)
+            result = _result(place, "done", card, left_out)
+            counts = {"runs": len(inputs.runs), "samples": result.samples}
+            written = sum(of.size_bytes for of in card.checksums.values())
+            took = Call(BUILD, __version__, result.exit_code, counts, options.jobs, written_bytes=written)
+            _end(call, measure_call(watch, took), _dataset_of(result, inputs), known)
+    if result.status == "unchanged":
+        _refer(open_log(opened), _dataset_of(result, inputs))
     return result
 
 
@@ -265,27 +264,28 @@ def _refuse_others_since(place: Path | str, expected: Container[str | None]) -> 
 def _planned(place: Path | str, store: Store, inputs: Inputs, *, jobs: int) -> BuildResult:
     """Return what is to be expected of a build."""
     most = sum(run.facts.segments - int(inputs.again[run.run_id].sum()) for run in inputs.runs)
-    expected = estimate(latest_calls(store), BUILD, most, jobs=jobs)
+    expected = estimate(store.state().calls, BUILD, most, jobs=jobs)
     code = 3 if any(map(is_problem, inputs.findings)) else 0
     return BuildResult(str(place), "planned", most, {}, {}, (), inputs.findings, exit_code=code, estimate=expected)
 
 
-def _remember(store: Store, watch: Stopwatch, result: BuildResult, inputs: Inputs, jobs: int, *, size: int) -> None:
-    """Leave a record in the store of the dataset, for what it refers to stays, and one of the call."""
-    runs = tuple((run.run_id, run.recipe_id) for run in inputs.runs)
-    _note(store, "datasets", DatasetMade(_lasting(result), inputs.digest, runs))
-    counts, written = {"runs": len(inputs.runs), "samples": 0, "unchanged": 1}, 0
-    if result.status == "done":
-        counts, written = counts | {"samples": result.samples, "unchanged": 0}, size
-    call = Call(BUILD, __version__, result.exit_code, counts, jobs, written_bytes=written)
-    remember_call(store, watch, call)
+def _end(opened: OpenCall, call: Call, dataset: Dataset, known: DatasetCard | None) -> None:
+    """Let the last commit of the call say which dataset was built, for what it refers to stays, and what the call took."""
+    before = () if known is None or known.inputs == dataset.inputs else (Dataset(dataset.out, known.inputs),)
+    opened.kind, opened.end = "built", Entries(datasets=(dataset,), forgotten=before, calls=(call,))
 
 
-def _note(store: Store, kind: str, fact: DatasetMade | DatasetReplaced) -> None:
-    try:
-        store.note(kind, fact)
-    except StoreError as error:
-        logger.warning("%s; so 'tcpipe prune' does not know what this dataset refers to", error.problems[0])
+def _dataset_of(result: BuildResult, inputs: Inputs) -> Dataset:
+    return Dataset(_lasting(result), inputs.digest, tuple((run.run_id, run.recipe_id) for run in inputs.runs))
+
+
+def _refer(log: LogWriter, dataset: Dataset) -> None:
+    """Commit what a dataset refers to that was built before, where the log does not say so."""
+    if log.state.datasets.get((dataset.out, dataset.inputs)) != dataset:
+        try:
+            log.commit("built", Entries(datasets=(dataset,)))
+        except StoreError as error:
+            logger.warning("%s; so 'tcpipe prune' does not know what this dataset refers to", error.problems[0])
 
 
 def _lasting(result: BuildResult) -> str:

@@ -8,13 +8,12 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from tcpipe.errors import DatasetError, StoreError
+from tcpipe.errors import DatasetError
 from tcpipe.formats.dataset_card import RunSource
 from tcpipe.formats.index_files import RunFacts
 from tcpipe.formats.recipe_toml import ingest_key
-from tcpipe.formats.run_documents import LogOrigin, ManifestHead, RunJson
+from tcpipe.formats.run_documents import LogOrigin
 from tcpipe.formats.stored_runs import Ingestions, RunDirectory
-from tcpipe.pipeline.known_runs import list_runs
 from tcpipe.pipeline.unknown_robots import alike, in_words
 from tcpipe.recipe import Recipe
 from tcpipe.robots.profiles import GENERIC
@@ -45,54 +44,46 @@ class Chosen:
 
 def choose_runs(store: Store, recipe: Recipe, *, robot: str | None, tags: Mapping[str, str]) -> Chosen:
     """Return the runs to pool, those that carry all of the tags, each proved; two robots are never pooled unasked."""
-    found, key = list_runs(store), ingest_key(recipe)
-    store.keep_index(found)
+    found, key = store.ingestions(), ingest_key(recipe)
     mine = [run for run in found.finished if run.facts.ingest_key == key]
     if not mine:
         raise DatasetError(*_nothing_to_pool(store, found))
     runs, logs, damaged = _proved(store, _of_one_robot(store, _tagged(store, mine, tags), robot))
     known = {run.run_id for run in mine}
-    there, lost = set(store.run_ids()), {run_id: row for (run_id, _), row in found.lost.items()}
-    gone = dict[str, str]()
-    for (run_id, _), line in found.damaged.items():
-        if run_id not in known and _belongs(_known(store, run_id) or lost.get(run_id), robot, tags):
-            (damaged if run_id in there else gone).setdefault(run_id, line)
+    for (run_id, recipe_id), line in found.damaged.items():
+        if run_id not in known and _belongs(found.rows[run_id, recipe_id], robot, tags):
+            damaged.setdefault(run_id, line)
     if not runs:
         raise DatasetError(
             *(f"run {run_id}: left out: {line}; ingest its log again with --force" for run_id, line in damaged.items())
         )
     if robot is None:
         _refuse_unlike(store, [run for run in runs if run.facts.robot == GENERIC])
-    settled = {*known, *damaged, *gone}
+    settled = {*known, *damaged}
     others = {run.run_id: run.recipe_id for run in found.finished if _belongs(run.facts, robot, tags)}
     older = {name: str(of.data_model_version) for name, of in found.outdated.items() if _belongs(of, robot, tags)}
     others, older = ({name: of for name, of in each.items() if name not in settled} for each in (others, older))
-    left_out = {*damaged, *gone, *others, *older}
+    left_out = {*damaged, *others, *older}
     otherwise = {run_id: {"what": "recipe", "has": of} for run_id, of in others.items()}
     otherwise |= {run_id: {"what": "data_model", "has": of} for run_id, of in older.items()}
     nothing: dict[str, str] = {}
-    missing = (
-        *_find_left_out(store, "run-gone", dict.fromkeys(gone, nothing)),
-        *_find_left_out(store, "run-ingested-otherwise", otherwise),
-    )
-    broken = tuple(_find_left_out(store, "run-damaged", dict.fromkeys(damaged, nothing), force=True))
+    missing = tuple(_find_left_out(found, "run-ingested-otherwise", otherwise))
+    broken = tuple(_find_left_out(found, "run-damaged", dict.fromkeys(damaged, nothing), force=True))
     superseded = frozenset(left_out | found.superseded.keys())
     return Chosen(tuple(runs), logs, missing, broken, superseded, tuple(_find_expected(found)))
 
 
 def _find_expected(found: Ingestions) -> Iterator[Finding]:
-    """Yield a finding on each run that has not finished, and on each that another has taken the place of."""
-    for run_id in found.unfinished:
-        yield make_finding("run-unfinished", Subject("run", run_id))
+    """Yield a finding on each run that another has taken the place of."""
     for run_id, by in found.superseded.items():
         yield make_finding("run-superseded", Subject("run", run_id), names={"by": by})
 
 
 def _find_left_out(
-    store: Store, code: str, names: Mapping[str, Mapping[str, str]], *, force: bool = False
+    found: Ingestions, code: str, names: Mapping[str, Mapping[str, str]], *, force: bool = False
 ) -> Iterator[Finding]:
     """Yield a finding on each run, of which ``names`` holds what the finding names, with the command that ingests their logs again."""
-    command = f"tcpipe ingest {_logs_of(store, names)}{' --force' if force else ''}" if names else ""
+    command = f"tcpipe ingest {_logs_of(found, names)}{' --force' if force else ''}" if names else ""
     for run_id in sorted(names):
         subject, remedy = Subject("run", run_id), Remedy("ingest", command=command)
         yield make_finding(code, subject, names=names[run_id], remedies=[remedy])
@@ -160,20 +151,9 @@ def _proved(
     return [run for run in runs if run.run_id in logs], logs, damaged
 
 
-def _known(store: Store, run_id: str) -> RunJson | None:
-    """Return what run.json says, None where it cannot be believed."""
-    with suppress(StoreError):
-        return store.run_json(run_id)
-    return None
-
-
-def _belongs(
-    known: RunJson | RunFacts | ManifestHead | RunSource | None, robot: str | None, tags: Mapping[str, str]
-) -> bool:
+def _belongs(known: RunFacts | RunSource, robot: str | None, tags: Mapping[str, str]) -> bool:
     """Tell whether a run is of the robot and the tags that were asked for, as far as is known."""
-    if known is None:
-        return True
-    its_robot = robot is None or known.robot is None or known.robot == robot
+    its_robot = robot is None or known.robot == robot
     return its_robot and (known.tags is None or tags.items() <= known.tags.items())
 
 
@@ -183,9 +163,11 @@ def _named(run_ids: Iterable[str], most: int = 3) -> str:
     return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
 
 
-def _logs_of(store: Store, run_ids: Iterable[str]) -> str:
+def _logs_of(found: Ingestions, run_ids: Iterable[str]) -> str:
     """Return what to give to `tcpipe ingest` for the logs of runs: their folder, where they have one in common."""
-    paths = [path for run_id in run_ids if (known := _known(store, run_id)) for path in known.source.paths]
+    names = set(run_ids)
+    logs = [row.log.source for row in found.rows.values() if row.log and row.run_id in names]
+    paths = [path for log in logs for path in log.paths]
     with suppress(ValueError):  # no path, or some relative and some not
         folder = Path(os.path.commonpath(paths))
         if folder.is_absolute() and folder != Path(folder.anchor):

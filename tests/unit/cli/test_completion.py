@@ -26,9 +26,9 @@ def here(tmp_path, monkeypatch):
 
 
 def test_runs_and_maps_of_the_store_are_offered(here):
-    assert offered("accept", "--store", "field", "run") == ["run1-0123abcd", "run2-0123abcd"]
+    assert offered("acknowledge", "--store", "field", "run") == ["run1-0123abcd", "run2-0123abcd"]
     assert offered("build-dataset", "--store", "field", "--map", "") == ["site"]
-    assert offered("accept", "") == []
+    assert offered("acknowledge", "") == []
 
 
 def test_robots_and_scenarios_are_offered(here):
@@ -39,7 +39,7 @@ def test_robots_and_scenarios_are_offered(here):
 def test_what_is_broken_offers_nothing(here):
     (here / "tcpipe.toml").write_text("[nonsense\n")
     assert offered("ingest", "--robot", "") == []
-    assert offered("accept", "--store", "s3://bucket/store", "") == []
+    assert offered("acknowledge", "--store", "s3://bucket/store", "") == []
 
 
 def test_paths_are_left_to_the_shell(here):

@@ -1,7 +1,5 @@
 """A dataset of the runs that carry given tags."""
 
-import json
-import os
 import shutil
 from dataclasses import replace
 
@@ -11,10 +9,10 @@ from synthetic_store import add_run, add_world, lanes, segments
 
 from tcpipe.dataset import open_dataset
 from tcpipe.errors import DatasetError, StoreError
-from tcpipe.formats.record_files import DatasetMade
-from tcpipe.pipeline.calls import latest_calls
+from tcpipe.formats.commits import Entries
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.inspect import inspect
+from tcpipe.pipeline.log_writer import commit_run, open_log
 from tcpipe.pipeline.prune import prune
 from tcpipe.pipeline.report import report
 from tcpipe.recipe import ReadConfig, Recipe
@@ -32,6 +30,7 @@ def store(tmp_path):
     for number, (run_id, own) in enumerate(tags.items()):
         add_run(store, run_id, segments(run_id, *lanes(np.array([3.0 * number]), -10.0, 10.0)))
         store.tag_run(run_id, own)
+        commit_run(store, run_id)
     return store
 
 
@@ -57,9 +56,10 @@ def test_a_tag_that_no_run_has_is_answered_with_those_there_are(store, tmp_path)
 
 def make_outdated(store, *run_ids):
     """Have runs look as if an earlier version of tcpipe had made them."""
-    for run_id in run_ids:
-        for path in store.root.glob(f"runs/{run_id}/*/manifest-1.json"):
-            path.write_text(json.dumps({**json.loads(path.read_text()), "data_model_version": "0.9"}))
+    rows = [
+        replace(row, data_model_version="0.9", commit=0) for run_id in run_ids for row in store.state().rows_of(run_id)
+    ]
+    open_log(store).commit("ingested", Entries(runs=tuple(rows)))
 
 
 def test_runs_of_another_data_model_are_named(store, tmp_path):
@@ -69,7 +69,7 @@ def test_runs_of_another_data_model_are_named(store, tmp_path):
     assert (left_out.subject, left_out.names) == (Subject("run", "a"), {"what": "data_model", "has": "0.9"})
     assert left_out.remedies == (Remedy("ingest", command="tcpipe ingest /logs/a.mcap"),)
     found = inspect(store.root, recipe=Recipe())
-    assert (found.outdated, found.unfinished) == ({"a": "0.9"}, ())
+    assert found.outdated == {"a": "0.9"}
     with pytest.raises(
         StoreError,
         match=rf"runs/a: holds no finished run of data model {DATA_MODEL_VERSION}; ingest its log again",
@@ -92,36 +92,37 @@ def test_a_dry_run_counts_and_estimates_and_a_build_is_remembered(store, tmp_pat
     assert "at most 60 samples: about 2 s and 258 kB (by figures measured elsewhere" in str(planned)
     assert not (tmp_path / "out").exists()
     made = build_dataset(tmp_path / "out", store=store.root, recipe=Recipe())
-    (record,) = store.records("datasets", DatasetMade)
+    (record,) = store.state().datasets.values()
     assert record.out == str(tmp_path / "out")
     assert [run_id for run_id, _ in record.runs] == ["a", "b", "c"]
     assert build_dataset(tmp_path / "out", store=store.root, recipe=Recipe(), dry_run=True).status == "unchanged"
+    before = store.state()
     build_dataset(tmp_path / "out", store=store.root, recipe=Recipe())
-    assert store.records("datasets", DatasetMade) == [record]
-    counted = [call.counts for call in latest_calls(store)]
-    assert sorted(counts["unchanged"] for counts in counted) == [0, 1]
-    assert {counts["samples"] for counts in counted} == {0, made.samples}
+    assert store.state() == before, "a call with nothing to do writes nothing"
+    assert [call.counts for call in before.calls] == [{"runs": 3, "samples": made.samples}]
 
 
 def test_a_dataset_that_was_moved_before_another_was_built_in_its_place_still_holds_its_runs(store, tmp_path):
     out, old = tmp_path / "out", replace(Recipe(), read=ReadConfig(ignore_topics=["/none"]))
     add_run(store, "a", segments("a", *lanes(np.array([0.0]), -10.0, 10.0)), recipe=old)
-    for path in store.root.glob("runs/a/*/manifest-1.json"):
-        if json.loads(path.read_text())["recipe"]["read"]["ignore_topics"]:
-            os.utime(path, ns=(10**18, 10**18))
+    add_run(store, "a", segments("a", *lanes(np.array([0.0]), -10.0, 9.0)))
     build_dataset(out, store=store.root, recipe=old)
     out.rename(tmp_path / "moved")
     build_dataset(out, store=store.root, recipe=Recipe())
     (kept,) = prune(store=store.root, recipe=Recipe(), dry_run=True).kept
-    assert kept.stays.startswith(f"a dataset that lay at {out} refers to it; remove ")
+    assert kept.stays == f"a dataset that lay at {out} refers to it; 'tcpipe prune --forget {out}' if that is gone"
     shutil.rmtree(out)
     (tmp_path / "moved").rename(out)
     build_dataset(out, store=store.root, recipe=Recipe(), force=True)
     assert len(prune(store=store.root, recipe=Recipe(), dry_run=True).removed) == 1
 
 
-def test_a_dataset_of_a_store_that_cannot_be_written_says_that_it_leaves_no_record(store, tmp_path, caplog):
-    (store.root / "records").touch()
-    build_dataset(tmp_path / "out", store=store.root, recipe=Recipe())
-    assert "records is a file, wanted a directory" in caplog.text
+def test_a_dataset_of_a_store_that_cannot_be_written_says_that_it_leaves_no_commit(
+    store, tmp_path, caplog, monkeypatch
+):
+    place = type(store.place)
+    monkeypatch.setattr(place, "put_new", lambda _, name, __: (_ for _ in ()).throw(StoreError(f"{name}: read-only")))
+    for _ in range(2):
+        build_dataset(tmp_path / "out", store=store.root, recipe=Recipe())
+    assert "so the store does not know how this call ended" in caplog.text
     assert "so 'tcpipe prune' does not know what this dataset refers to" in caplog.text

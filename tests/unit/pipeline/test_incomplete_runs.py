@@ -10,14 +10,12 @@ from storage_server import object_store
 from synthetic_store import add_run, add_world, lanes, segments
 from wheel_drives import START_NS, drive_at
 
-from tcpipe.formats.index_files import read_runs
 from tcpipe.pipeline import report as reporting
-from tcpipe.pipeline.begun_calls import begun_call
 from tcpipe.pipeline.dataset import build as building
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.ingest import ingest
 from tcpipe.pipeline.inspect import inspect
-from tcpipe.pipeline.known_runs import list_runs
+from tcpipe.pipeline.log_writer import commit_run, supersede
 from tcpipe.pipeline.prune import prune
 from tcpipe.pipeline.status import status
 from tcpipe.pipeline.verify import verify
@@ -51,7 +49,7 @@ def made(tmp_path_factory):
             if more:
                 store.write_run_json(run_id, type(known)(known.source, damage=("cut",)))
     store.tag_run("twice", {"weather": "dry"})
-    store.keep_index(store.ingestions())
+    commit_run(store, "twice")
     return here
 
 
@@ -66,7 +64,6 @@ def place(request, made, tmp_path, monkeypatch):
         return
     with object_store(tmp_path / "served") as (environment, _):
         in_environment(monkeypatch, environment, tmp_path / "cache")
-        Store("s3://sets/store").keep_index(Store("s3://sets/store").ingestions())
         yield files, "s3://sets/store"
 
 
@@ -91,24 +88,24 @@ def lose(files: Path, pattern: str) -> Callable[[], None]:
 @pytest.mark.parametrize("lost", LOST)
 def test_what_a_run_lost_is_a_problem_to_every_command_until_it_is_back(place, tmp_path, lost):
     files, root = place
-    before, new = set(read_runs(Store(root).index_place)), tmp_path / "new.mcap"
+    before, new = Store(root).state(), tmp_path / "new.mcap"
     new.write_bytes(b"to be ingested")
     put_back = lose(files, LOST[lost])
     name = LOST[lost].split("/")[1]
-    for _ in range(2):  # what the first call writes into the index hides nothing from the next
+    for _ in range(2):  # what the first call writes hides nothing from the next
         result = build_dataset(tmp_path / "out", store=root, recipe=Recipe(), dry_run=True)
         assert result.exit_code == 3
         assert [of.subject.name for of in select_findings(result.findings, "run-damaged", "run-gone")] == [name]
         found = status([new], store=root, recipe=Recipe())
-        assert (found.exit_code, len(found.problems)) == (3, 1)
+        assert (found.exit_code, [of.code for of in found.problems]) == (3, ["run-incomplete"])
         assert verify(root).problems
         assert list(inspect(root, recipe=Recipe()).damaged_runs)
-        assert len(list_runs(Store(root)).finished) == 2
+        assert len(Store(root).ingestions().finished) == 2
     reporting.report(root, runs=False)
     assert "not as it was written" in (files / "report.html").read_text()
-    assert set(read_runs(Store(root).index_place)) == before
+    assert Store(root).state() == before
     put_back()
-    assert not list_runs(Store(root)).damaged
+    assert not Store(root).ingestions().damaged
     assert build_dataset(tmp_path / "out", store=root, recipe=Recipe(), dry_run=True).exit_code == 0
     assert verify(root).problems == ()
 
@@ -118,37 +115,32 @@ def test_a_copy_whose_files_have_other_times_misses_the_same(made, tmp_path, los
     store = Store(shutil.copytree(made / "store", tmp_path / "store", copy_function=shutil.copyfile))
     lose(tmp_path / "store", LOST[lost])
     for _ in range(2):
-        found = list_runs(store)
-        assert {run_id for run_id, _ in found.damaged} == {LOST[lost].split("/")[1]}
-        store.keep_index(found)
+        assert {run_id for run_id, _ in store.ingestions().damaged} == {LOST[lost].split("/")[1]}
 
 
-def test_a_run_that_a_call_is_making_is_on_its_way_and_no_problem(place, tmp_path):
+def test_what_no_commit_names_is_seen_by_verify_alone_until_it_is_committed(place, tmp_path):
     files, root = place
-    lose(files, "runs/b/*/manifest-1.json")
-    shutil.rmtree(files / "index")
-    with begun_call(Store(root), "ingest", ["/logs"]):
-        found = list_runs(Store(root))
-        assert (found.damaged, found.unfinished) == ({}, ("b",))
-        assert inspect(root, recipe=Recipe()).unfinished == ("b",)
-        result = build_dataset(tmp_path / "out", store=root, recipe=Recipe(), dry_run=True)
-        assert result.exit_code == 0
-        assert [of.subject.name for of in select_findings(result.findings, "run-unfinished")] == ["b"]
-    assert list(list_runs(Store(root)).damaged) == [("b", "")]
+    store, new = Store(root), tmp_path / "new.mcap"
+    new.write_bytes(b"to be ingested")
+    shutil.rmtree(files / "log")
+    assert store.ingestions().rows == {}
+    assert status([new], store=root, recipe=Recipe(), create=True).problems == ()
+    assert sum("no commit names it; ingest its log again" in line for line in verify(root).problems) == 3
+    for run_id in ("a", "b", "twice"):
+        commit_run(store, run_id)
+    assert len(store.ingestions().finished) == 3
+    assert verify(root).problems == ()
 
 
-def test_what_prune_and_a_person_remove_is_not_missed(place):
+def test_what_prune_removes_is_not_missed_and_what_a_person_removes_is(place):
     files, root = place
     store = Store(root)
-    store.supersede("b", "a")
-    store.keep_index(store.ingestions())
+    supersede(store, "b", "a")
     assert [each.what for each in prune(store=root, recipe=Recipe(), min_age_s=0.0).removed] != []
     assert not store.runs_place.entries("b")
-    assert not list_runs(store).damaged
+    assert not store.ingestions().damaged
     shutil.rmtree(files / "runs" / "a")
-    assert list(list_runs(store).damaged) == [("a", "")]
-    shutil.rmtree(files / "index")
-    assert not list_runs(store).damaged
+    assert [run_id for run_id, _ in store.ingestions().damaged] == ["a"]
 
 
 @pytest.mark.parametrize(
@@ -162,8 +154,8 @@ def test_what_is_lost_is_made_again_from_the_log(tmp_path, lost):
     ingest([logs / "one.mcap"], store=root, recipe=Recipe(), tags={"load": "12"})
     for part in root.glob(lost):
         shutil.rmtree(part) if part.is_dir() else part.unlink()
-    (line,) = status(store=root, recipe=Recipe()).problems
-    assert "ingest the log" in line
+    (finding,) = status(store=root, recipe=Recipe()).problems
+    assert finding.code == "run-incomplete"
     assert ingest([logs], store=root, recipe=Recipe()).exit_code == 0
     found = status(store=root, recipe=Recipe())
     assert (found.exit_code, found.problems, found.counts) == (0, (), {"done": 2})

@@ -1,4 +1,4 @@
-"""The index of a store: it says what the documents say, costs one look at each file, and is never believed against them."""
+"""Rows of runs: the log has what the documents say, and the index, for other tools, what the log has; tcpipe never reads it."""
 
 import os
 from dataclasses import replace
@@ -10,13 +10,13 @@ import pytest
 from synthetic_store import add_run, lanes, segments
 
 import tcpipe.store as stores
-from tcpipe.formats import index_files, stored_runs
-from tcpipe.formats.record_files import Sighting
+from tcpipe.errors import StoreError
+from tcpipe.formats import stored_runs
+from tcpipe.formats.commits import Entries, Sighting
 from tcpipe.pipeline.dataset.runs import choose_runs
+from tcpipe.pipeline.log_writer import commit_run, open_log, supersede
 from tcpipe.recipe import Recipe
 from tcpipe.store import Store
-
-LOG = "logs/" + "a" * 32
 
 
 @pytest.fixture
@@ -25,7 +25,7 @@ def store(tmp_path):
     for number, run_id in enumerate(("a", "b", "c")):
         table = segments(run_id, *lanes(np.array([3.0 * number]), -10.0, 10.0), start_ns=10**18 + number * 10**13)
         add_run(store, run_id, table, tags={"weather": "dry"} if number else {})
-    store.keep_index(store.ingestions())
+    store.write_index(store.state())
     return store
 
 
@@ -37,72 +37,45 @@ def read(monkeypatch):
     def heard(real):
         return lambda place, *rest, **how: (paths.append(place.where(rest[0])), real(place, *rest, **how))[1]
 
-    for module, name in ((stores, "read_sealed_at"), (stores, "read_as_at"), (stored_runs, "read_as_at")):
-        monkeypatch.setattr(module, name, heard(getattr(module, name)))
+    for module in (stores, stored_runs):
+        monkeypatch.setattr(module, "read_as_at", heard(module.read_as_at))
     stored_runs._manifest.cache_clear()
     return paths
 
 
-def test_the_index_says_what_the_documents_say(store):
-    fresh = Store(store.root).ingestions()
-    assert not fresh.stale
-    for run in fresh.finished:
+def test_the_log_says_what_the_documents_say(store):
+    for run in store.ingestions().finished:
         made = run.manifest
         assert (run.facts.robot, run.facts.tags, run.facts.segments) == (made.robot, made.tags, 20)
         assert run.facts.driven_m == pytest.approx(sum(made.ledger_m.values()))
         assert run.facts.log.source == store.run_json(run.run_id).source
         stamps = run.table("segments").column("start_ns").to_pylist()
         assert (run.facts.start_ns, run.facts.end_ns) == (min(stamps), max(stamps) + 1_200_000_000)
-    assert index_files.read_runs(store.index_place) == fresh.rows
 
 
-def test_no_document_is_read_again_until_it_is_written_again(store, read):
+def test_no_document_is_read_to_choose_runs(store, read):
     assert [run.run_id for run in store.ingestions().finished] == ["a", "b", "c"]
     assert read == []
     store.tag_run("b", {"weather": "wet"})
-    read.clear()
-    found = store.ingestions()
+    commit_run(store, "b")
     assert {path.partition("/runs/")[2][0] for path in read} == {"b"}
-    assert found.stale
-    assert found.rows["b", found.finished[1].recipe_id].tags == {"weather": "wet"}
+    assert store.ingestions().finished[1].facts.tags == {"weather": "wet"}
 
 
-@pytest.mark.parametrize("what", [b"", b"PAR1 and then nothing", None])
-def test_a_broken_index_is_made_again_and_a_wrong_one_is_not_believed(store, what):
-    path, right = store.root / "index" / "runs.parquet", store.ingestions()
-    if what is None:  # of another store, copied over
-        rows = {key: replace(row, state="1-2-3", robot="other") for key, row in right.rows.items()}
-        index_files.write_runs(store.index_place, rows.values())
-    else:
-        path.write_bytes(what)
-    found = store.ingestions()
-    assert (found.stale, found.rows) == (True, right.rows)
-    store.keep_index(found)
-    assert not store.ingestions().stale
+def test_whatever_lies_in_the_index_decides_nothing(store):
+    right = store.ingestions()
+    for path in (store.root / "index").iterdir():
+        path.write_bytes(b"PAR1 and then nothing")
+    assert store.ingestions() == right
+    assert [run.run_id for run in choose_runs(store, Recipe(), robot=None, tags={}).runs] == ["a", "b", "c"]
 
 
-def test_a_changed_byte_anywhere_in_the_index_changes_nothing(store):
-    path, right, rng = store.root / "index" / "runs.parquet", store.ingestions().rows, np.random.default_rng(0)
-    whole = path.read_bytes()
-    for at in rng.integers(0, len(whole), 40):
-        path.write_bytes(whole[:at] + bytes([whole[at] ^ (1 << int(rng.integers(8)))]) + whole[at + 1 :])
-        assert store.ingestions().rows == right, at
-
-
-def test_a_manifest_that_is_changed_under_the_index_is_told(store):
+def test_a_manifest_that_is_changed_is_found_when_it_is_read(store):
     (path,) = store.root.glob("runs/b/*/manifest-1.json")
     path.write_text(path.read_text().replace('"husky"', '"other"'))
-    found = store.ingestions()
-    assert [run.run_id for run in found.finished] == ["a", "c"]
-    assert "is not as it was written" in found.damaged["b", path.parent.name]
-
-
-def test_two_writers_lose_nothing_but_time(store):
-    ours = store.ingestions()
-    add_run(store, "d", segments("d", *lanes(np.array([20.0]), -10.0, 10.0), start_ns=2 * 10**18))
-    store.keep_index(store.ingestions())  # another process, later than our look and earlier than our writing
-    store.keep_index(replace(ours, stale=True))
-    assert [run.run_id for run in store.ingestions().finished] == ["a", "b", "c", "d"]
+    chosen = choose_runs(store, Recipe(), robot=None, tags={})
+    assert [run.run_id for run in chosen.runs] == ["a", "c"]
+    assert [(of.code, of.subject.name) for of in chosen.damaged] == [("run-damaged", "b")]
 
 
 def test_files_that_were_proved_are_proved_again_when_they_are_written_again(store, monkeypatch):
@@ -129,39 +102,30 @@ def test_files_that_were_proved_are_proved_again_when_they_are_written_again(sto
     assert [(of.code, of.subject.name) for of in damaged] == [("run-damaged", "b")]
 
 
-def test_logs_that_were_seen_are_read_once_and_damage_is_named(store, caplog):
-    sighting = Sighting(("/logs/a.mcap",), ((10, 20),), "f" * 64)
-    store.remember(f"{LOG}/one", sighting)
-    assert store.seen_logs() == {LOG: [sighting]}
-    assert [row.sighting for row in index_files.read_logs(store.index_place).values()] == [sighting]
-    path = store.root / "records" / f"{LOG}/one.json"
-    path.write_text(path.read_text().replace("f" * 64, "e" * 64))
-    assert store.seen_logs() == {}
-    assert f"{path}: is not as it was written" in caplog.text
-
-
-def test_a_name_that_is_no_text_is_in_the_index_and_is_read_from_its_document(store):
+def test_a_name_that_is_no_text_is_in_the_log_and_with_escapes_in_the_index(store):
     odd, readable = "/logs/a\udcff.mcap", "/logs/a\\udcff.mcap"
     known = store.run_json("a")
     store.write_run_json("a", replace(known, source=replace(known.source, paths=(odd,))))
-    store.remember(f"{LOG}/one", Sighting((odd,), ((10, 20),), "f" * 64))
-    for _ in range(2):
-        found = store.ingestions()
-        store.keep_index(found)
-        assert found.finished[0].facts.log.source.paths == (odd,)
-        assert store.seen_logs()[LOG][0].log == (odd,)
-        assert next(iter(index_files.read_runs(store.index_place).values())).log.source.paths == (readable,)
-    assert not found.stale
+    commit_run(store, "a")
+    log = open_log(store)
+    for number in range(70):  # so many that a snapshot is written
+        log.commit("seen", Entries(seen=(Sighting((odd,), ((number, 20),), "f" * 64),)))
+    assert log.state.snapshot
+    for state in (log.state, store.state()):
+        assert next(iter(state.runs.values())).log.source.paths == (odd,)
+        assert state.seen[odd][0].log == (odd,)
+    store.write_index(log.state)
+    assert pl.read_parquet(store.root / "index" / "runs.parquet")["log"][0]["source"]["paths"] == [readable]
 
 
 def test_a_store_that_cannot_be_written_is_read_all_the_same(store, monkeypatch):
-    monkeypatch.setattr(
-        index_files, "write_table", lambda *_: (_ for _ in ()).throw(index_files.StoreError("read-only"))
-    )
-    (store.root / "index" / "runs.parquet").unlink()
-    found = store.ingestions()
-    store.keep_index(found)
-    assert len(found.finished) == 3
+    def refused(*_, **__):
+        raise StoreError("read-only")
+
+    for verb in ("put", "put_new", "delete"):
+        monkeypatch.setattr(type(store.place), verb, refused)
+    store.write_index(store.state())
+    assert len(store.ingestions().finished) == 3
     assert len(choose_runs(store, Recipe(), robot=None, tags={}).runs) == 3
 
 
@@ -171,8 +135,8 @@ COUNTED = [("a", 20), ("b", 20)]
 
 @pytest.fixture
 def superseded(store, monkeypatch):
-    store.supersede("c", "b")
-    store.keep_index(store.ingestions())
+    supersede(store, "c", "b")
+    store.write_index(store.state())
     monkeypatch.chdir(store.root)
     return store
 

@@ -38,20 +38,3 @@ def test_a_file_that_cannot_be_opened_is_named(tmp_path, monkeypatch):
     (tmp_path / "a.mcap").write_bytes(b"a")
     (result,) = ingest([tmp_path / "a.mcap"], store=tmp_path / "store").results
     assert result.problems == (f"{tmp_path / 'a.mcap'}: /store/runs/x: Permission denied",)
-
-
-class _Killed(BaseException):
-    pass
-
-
-def test_a_log_is_known_by_its_outline_before_its_run_is_done(tmp_path, monkeypatch):
-    scenario = tiny(seconds=16.0)
-    log, store = log_of(scenario, scenario.drives[0], tmp_path / "site"), tmp_path / "store"
-
-    def killed(*_):
-        raise _Killed
-
-    monkeypatch.setattr(module, "_fuse_and_label", killed)
-    with pytest.raises(_Killed):
-        ingest([log], store=store)
-    assert len(list(store.glob("records/outlines/*/*.json"))) == 1, "who finds the run done does not look again"

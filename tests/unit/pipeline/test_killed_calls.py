@@ -18,13 +18,14 @@ from wheel_drives import START_NS, drive_at
 
 from tcpipe.cli import cli
 from tcpipe.errors import StoreError, UsageError
-from tcpipe.formats.record_files import Begun
-from tcpipe.pipeline import begun_calls as begun_module
+from tcpipe.formats.commits import Begun, Entries
 from tcpipe.pipeline import ingest as ingest_module
+from tcpipe.pipeline import log_writer
 from tcpipe.pipeline import status as status_module
-from tcpipe.pipeline.begun_calls import begun_call, begun_calls, this_process
+from tcpipe.pipeline.begun_calls import begun_call, begun_calls
 from tcpipe.pipeline.ingest import ingest
-from tcpipe.pipeline.known_trouble import accept
+from tcpipe.pipeline.log_writer import open_log, this_process
+from tcpipe.pipeline.problems import acknowledge
 from tcpipe.pipeline.status import status
 from tcpipe.pipeline.verify import verify
 from tcpipe.recipe import ReadConfig, Recipe
@@ -72,7 +73,7 @@ def kill(logs, store, monkeypatch, **how):
     with monkeypatch.context() as patch, suppress(SystemExit):
         patch.setattr(ingest_module, "_results", died)
         patch.setattr(ingest_module, "gone_if_empty", lambda _: nullcontext())
-        patch.setattr(begun_module, "this_process", lambda: replace(this_process(), start="1"))
+        patch.setattr(log_writer, "this_process", lambda: replace(this_process(), start="1"))
         ingest([logs], store=store, **{"recipe": Recipe(), **how})
 
 
@@ -90,27 +91,26 @@ def test_a_first_night_that_is_killed_is_a_problem_and_the_next_one_deals_with_i
     assert done.returncode == -9
     found = CliRunner().invoke(cli, ["status", str(tmp_path / "store"), "--json"], standalone_mode=False)
     assert found.return_value == 3
-    (line,) = json.loads(found.stdout)["problems"]
-    assert line.startswith("ingest of 20")
-    assert "was killed; run the same command again, or 'tcpipe accept " in line
+    (finding,) = json.loads(found.stdout)["problems"]
+    assert (finding["code"], finding["names"]["command"]) == ("call-killed", "ingest")
+    lines = CliRunner().invoke(cli, ["status", str(tmp_path / "store")], standalone_mode=False).stderr
+    assert "was killed. To accept it: 'tcpipe acknowledge call-1' [call-killed]" in lines
     assert json.loads(found.stdout)["counts"] == {"pending": 2}
     assert ingest([logs], store=tmp_path / "store", recipe=Recipe()).exit_code == 0
     assert (told(tmp_path / "store").exit_code, told(tmp_path / "store").begun) == (0, ())
 
 
-def test_a_call_that_runs_is_no_problem_and_one_that_ended_leaves_no_record(root, logs):
+def test_a_call_that_runs_is_no_problem_and_one_with_nothing_to_do_writes_nothing(root, logs):
     assert ingest([logs], store=root, recipe=Recipe()).exit_code == 0
     store = open_store(root)
-    before = [entry.name for entry in store.place.entries("records")]
-    assert not any("begun" in name for name in before)
-    with begun_call(store, "ingest", [str(logs)]):
+    with begun_call(open_log(store), "ingest", [str(logs)]):
         found = told(root)
         assert (found.exit_code, [call.state for call in found.begun]) == (0, ["running"])
         assert "running: ingest of 20" in str(found)
+    before = store.place.entries()
     again = ingest([logs], store=root, recipe=Recipe())
     assert [result.status for result in again.results] == ["unchanged"] * 2
-    after = [entry.name for entry in store.place.entries("records")]
-    assert len(after) == len(before) + 1, "that there was nothing to do is one call more, as ever"
+    assert store.place.entries() == before
     assert verify(root).problems == ()
 
 
@@ -119,25 +119,25 @@ def test_a_killed_call_is_told_until_the_same_work_is_done(root, logs, monkeypat
     assert told(root).exit_code == 3
     ingest([logs / "one.mcap"], store=root, recipe=Recipe())
     ingest([logs], store=root, recipe=OTHER)
-    ingest([logs], store=root, recipe=Recipe(), shard=(1, 2))
-    assert len(begun_calls(open_store(root))) == 1, "other logs, another recipe, a share: none is its work"
-    kill(logs, root, monkeypatch, shard=(1, 2))
+    ingest([logs], store=root, recipe=Recipe(), shard=(2, 2))
+    assert len(begun_calls(open_store(root).state())) == 1, "other logs, another recipe, a share: none is its work"
+    kill(logs, root, monkeypatch, shard=(2, 2), force=True)
     assert told(root).exit_code == 3
     assert ingest([logs.parent / "logs"], store=root, recipe=Recipe()).exit_code == 0
-    assert [call.works_on for call in begun_calls(open_store(root))] == [(str(logs),)], "that of the share"
-    ingest([logs.parent / "logs"], store=root, recipe=Recipe(), shard=(1, 2))
+    assert [call.works_on for call in begun_calls(open_store(root).state())] == [(str(logs),)], "that of the share"
+    ingest([logs.parent / "logs"], store=root, recipe=Recipe(), shard=(2, 2))
     assert told(root).exit_code == 0
-    kill(logs / "two.mcap", root, monkeypatch)
+    kill(logs / "two.mcap", root, monkeypatch, force=True)
     ingest([logs], store=root, recipe=Recipe())
     assert told(root).exit_code == 0, "a folder is all the logs in it"
 
 
-def test_a_killed_call_may_be_accepted_and_the_next_one_is_told_again(root, logs, monkeypatch):
+def test_a_killed_call_may_be_acknowledged_and_the_next_one_is_told_again(root, logs, monkeypatch):
     kill(logs, root, monkeypatch)
     (call,) = told(root).begun
-    with pytest.raises(UsageError, match="no run or log with known trouble is called so"):
-        accept(["nosuch"], store=root)
-    assert [trouble.kind for trouble in accept([call.name], store=root).accepted] == ["killed"]
+    with pytest.raises(UsageError, match="nosuch: is no run or log with a known problem"):
+        acknowledge(["nosuch"], store=root)
+    assert [of.finding.code for of in acknowledge([call.name], store=root).acknowledged] == ["call-killed"]
     assert (told(root).exit_code, told(root).begun) == (0, ())
     kill(logs, root, monkeypatch)
     assert told(root).exit_code == 3
@@ -146,9 +146,9 @@ def test_a_killed_call_may_be_accepted_and_the_next_one_is_told_again(root, logs
 def test_an_error_ends_a_call_and_an_interrupt_leaves_it(tmp_path):
     store = open_store(tmp_path, create=True)
     for error, left in ((StoreError("full"), 0), (KeyboardInterrupt(), 1)):
-        with suppress(StoreError, KeyboardInterrupt), begun_call(store, "ingest", ["/logs"]):
+        with suppress(StoreError, KeyboardInterrupt), begun_call(open_log(store), "ingest", ["/logs"]):
             raise error
-        assert len(begun_calls(store)) == left
+        assert len(begun_calls(store.state())) == left
 
 
 HERE = {"host": "lab", "machine": "m", "boot": "b", "namespace": "pid:[1]", "pid": os.getpid()}
@@ -173,14 +173,15 @@ HERE = {"host": "lab", "machine": "m", "boot": "b", "namespace": "pid:[1]", "pid
 )
 def test_a_call_that_runs_is_told_from_a_killed_one_as_far_as_can_be_seen(tmp_path, monkeypatch, other, age_s, state):
     here = replace(this_process(), **HERE)
-    monkeypatch.setattr(begun_module, "this_process", lambda: here)
+    monkeypatch.setattr(log_writer, "this_process", lambda: here)
     begin = (datetime.now(UTC) - timedelta(seconds=age_s)).isoformat(timespec="milliseconds")
     store = open_store(tmp_path, create=True)
-    store.remember("begun/it", Begun("ingest", "0.9", begin, replace(here, **other), ("/logs",), ""))
-    (call,) = begun_calls(store)
+    begun = Begun("ingest", "0.9", ("/logs",), "", 1, begin, replace(here, **other))
+    open_log(store).commit("begun", Entries(begun=(begun,)))
+    (call,) = begun_calls(store.state())
     assert call.state == state
-    if "host" in other and state == "killed":
-        assert "has not ended since; whether it still runs on node7 is not known here" in call.problem
+    if state == "killed":
+        assert call.problem.finding.code == ("call-lost" if "host" in other else "call-killed")
 
 
 def test_logs_that_nobody_takes_in_for_more_than_two_nights_are_a_problem(tmp_path, logs, monkeypatch):
@@ -200,18 +201,17 @@ def test_logs_that_nobody_takes_in_for_more_than_two_nights_are_a_problem(tmp_pa
     assert after(1).exit_code == 0
     found = after(2)
     assert (found.exit_code, found.counts) == (3, {"done": 2, "pending": 1, "growing": 1})
-    pending, growing = found.problems
-    assert pending.startswith(f"1 pending for more than two nights: {logs / 'new.mcap'}; run 'tcpipe ingest'")
-    assert growing.startswith(
-        f"1 growing for more than two nights: {logs / 'future.mcap'}; their modification times lie"
-    )
-    with begun_call(open_store(store), "ingest", [str(logs)]):
+    assert {(of.code, of.subject.name, of.names["state"]) for of in found.problems} == {
+        ("log-waiting", str(logs / "new.mcap"), "pending"),
+        ("log-waiting", str(logs / "future.mcap"), "growing"),
+    }
+    with begun_call(open_log(open_store(store)), "ingest", [str(logs)]):
         assert after(2).exit_code == 0, "somebody is at it"
     elsewhere = drive_at(tmp_path / "archive" / "old.mcap", seed=4)
     os.utime(elsewhere, ns=(10**18, 10**18))
     monkeypatch.setattr(status_module, "time", SimpleNamespace(time_ns=lambda: now_ns() + 9 * NIGHT_S * 10**9))
     assert told(store, elsewhere.parent).exit_code == 0, "no ingest was asked for it"
-    accept([str(logs / "new.mcap"), str(logs / "future.mcap")], store=store)
+    acknowledge([str(logs / "new.mcap"), str(logs / "future.mcap")], store=store)
     assert after(9).exit_code == 0
     os.utime(logs / "future.mcap")
     assert ingest([logs], store=store, recipe=Recipe()).exit_code == 0
@@ -227,6 +227,6 @@ def test_a_store_that_cannot_be_written_is_built_from_and_asked_as_ever(tmp_path
 
     for verb in ("put", "put_new", "delete"):
         monkeypatch.setattr(type(store.place), verb, refused)
-    with begun_call(store, "build-dataset", ["/out"]):
-        assert begun_calls(store) == []
+    with begun_call(open_log(store), "build-dataset", ["/out"]):
+        assert begun_calls(store.state()) == []
     assert told(tmp_path / "store").exit_code == 0

@@ -5,16 +5,21 @@ import os
 import shutil
 
 import pytest
+from object_gateway import in_environment
+from storage_server import object_store
 from wheel_drives import START_NS, drive_at, wheel_drive
 
 import tcpipe.pipeline.ingest_run as ingestion
 from tcpipe.errors import UsageError
 from tcpipe.formats.logs.writing import MessageStream, write_bag
 from tcpipe.formats.run_documents import LogOrigin, RunJson
-from tcpipe.pipeline import known_trouble
+from tcpipe.pipeline import ingest as ingest_module
+from tcpipe.pipeline import ingest_task
 from tcpipe.pipeline.ingest import ingest
 from tcpipe.pipeline.inspect import inspect
-from tcpipe.pipeline.known_trouble import accept
+from tcpipe.pipeline.log_writer import LogWriter
+from tcpipe.pipeline.problems import acknowledge
+from tcpipe.pipeline.status import status
 from tcpipe.pipeline.verify import verify
 from tcpipe.recipe import Recipe
 from tcpipe.store import Store
@@ -102,16 +107,6 @@ def test_a_name_used_again_and_a_log_that_lost_something_supersede_nothing(tmp_p
     assert {before, found["latest.mcap"].run_id} <= counted(tmp_path)
 
 
-def test_a_store_made_before_this_was_remembered_knows_where_its_runs_came_from(tmp_path, night):
-    whole, log = drive_at(tmp_path / "whole.mcap"), tmp_path / "logs" / "run.mcap"
-    copy_part(whole, log, 0.6)
-    half = night()[0]["run.mcap"].run_id
-    shutil.rmtree(tmp_path / "store" / "records")
-    shutil.copy(whole, log)
-    night()
-    assert half not in counted(tmp_path)
-
-
 # --- logs that are still written ------------------------------------------------------------------------------------
 
 
@@ -158,7 +153,7 @@ def test_a_failure_is_news_once_until_something_is_another(tmp_path, night, monk
     assert told(night, "junk.bag") == again
     junk.write_bytes(JUNK + b"!")
     assert [told(night, "junk.bag") for _ in range(2)] == [once, again]
-    monkeypatch.setattr(known_trouble, "__version__", "9.9.9")
+    monkeypatch.setattr(ingest_task, "__version__", "9.9.9")
     assert [told(night, "junk.bag") for _ in range(2)] == [once, again]
     (tmp_path / "tcpipe.toml").write_text("[segment]\nchord_m = 2.0\n")
     summaries = [ingest([junk], store=tmp_path / "store", recipe=tmp_path / "tcpipe.toml") for _ in range(2)]
@@ -192,39 +187,47 @@ def test_damage_is_news_once_and_accepted_trouble_is_counted_apart(tmp_path, nig
     )
     run_id = found["cut.mcap"].run_id
     with pytest.raises(UsageError) as caught:
-        accept([run_id, "nosuch", found["other.mcap"].run_id], store=tmp_path / "store")
+        acknowledge([run_id, "nosuch", found["other.mcap"].run_id], store=tmp_path / "store")
     assert [line.split(":")[0] for line in caught.value.problems] == ["nosuch", found["other.mcap"].run_id]
-    assert f"trouble is known of {junk}, {run_id}" in caught.value.problems[0]
+    assert f"known problems: {junk}, {run_id}" in caught.value.problems[0]
     assert not found["cut.mcap"].accepted
-    assert [trouble.called for trouble in accept([run_id, str(junk)], store=tmp_path / "store").accepted] == [
-        run_id,
-        str(junk),
-    ]
-    second = accept(["junk.bag"], store=tmp_path / "store")
-    assert (second.accepted, [trouble.called for trouble in second.before]) == ((), [str(junk)])
+    done = acknowledge([run_id, str(junk)], store=tmp_path / "store")
+    assert [problem.name for problem in done.acknowledged] == [run_id, str(junk)]
+    second = acknowledge(["junk.bag"], store=tmp_path / "store")
+    assert (second.acknowledged, [problem.name for problem in second.before]) == ((), [str(junk)])
     found, code = night(retry_failed=True, force=True)
     assert (code, found["cut.mcap"].accepted, found["junk.bag"].accepted) == (0, True, True)
     copy_part(tmp_path / "whole.mcap", cut, 0.5)
     assert night()[1] == 3  # that is another damage
     checked = verify(tmp_path / "store")
-    assert (checked.problems, checked.read["records"]) == ((), 17)
+    assert checked.problems == ()
+    assert checked.read["commits"] == len(list((tmp_path / "store" / "log").iterdir()))
 
 
 # --- the memory of logs ---------------------------------------------------------------------------------------------
 
 
-def test_what_is_remembered_of_a_log_is_believed_only_as_it_was_written(tmp_path, night, caplog):
+@pytest.mark.parametrize("broken", ["a digit", "half", "[]", "nothing", "gone"])
+def test_a_commit_that_is_not_as_it_was_written_is_a_problem_and_nothing_is_lost_for_good(tmp_path, night, broken):
     run_id = night()[0]["other.mcap"].run_id
-    (record,) = tmp_path.glob("store/records/logs/*/*.json")
-    whole = record.read_bytes()
+    store = Store(tmp_path / "store")
+    number = store.state().runs[run_id, next(iter(store.state().runs))[1]].commit
+    commit = tmp_path / "store" / "log" / f"{number:010}.json"
+    whole = commit.read_bytes()
     sha256 = run_id.rsplit("-", 1)[1].encode()
-    for broken in (whole.replace(sha256, b"0" * 8), whole[:40], b"[]", b""):
-        record.write_bytes(broken)
-        assert [night()[0]["other.mcap"].status for _ in range(2)] == ["unchanged", "unchanged"]
-        assert record.read_bytes() == whole
-        assert f"{record}: " in caplog.text
-        caplog.clear()
+    contents = {"a digit": whole.replace(sha256, b"0" * 8), "half": whole[:40], "[]": b"[]", "nothing": b""}
+    commit.write_bytes(contents[broken]) if broken in contents else commit.unlink()
+    found = status(store=store.root, recipe=Recipe(), min_age_s=0.0)
+    assert (found.exit_code, [of.code for of in found.problems]) == (
+        3,
+        ["commit-missing" if broken == "gone" else "commit-damaged"],
+    )
+    assert any(str(commit) in line for line in verify(store.root).problems)
+    assert [night()[0]["other.mcap"].status for _ in range(2)] == ["done", "unchanged"], "its manifest is found"
     assert counted(tmp_path) == {run_id}
+    assert status(store=store.root, recipe=Recipe(), min_age_s=0.0).exit_code == 3, "what else it held nobody knows"
+    acknowledge([str(commit)], store=store.root)
+    assert status(store=store.root, recipe=Recipe(), min_age_s=0.0).exit_code == 0
 
 
 def test_what_is_there_already_needs_no_worker_and_no_reader(tmp_path, night, monkeypatch):
@@ -240,6 +243,64 @@ def test_what_is_there_already_needs_no_worker_and_no_reader(tmp_path, night, mo
     found, code = night(jobs=8)
     assert code == 0
     assert [result.status for result in found.values()] == ["failed", "unchanged", "unchanged"]
+
+
+class _Killed(BaseException):
+    pass
+
+
+def test_after_a_kill_between_manifest_and_commit_the_run_is_found_and_not_fused_again(tmp_path, night, monkeypatch):
+    real = LogWriter.commit
+
+    def killed(self, kind, entries):
+        if kind == "ingested":
+            raise _Killed
+        real(self, kind, entries)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(LogWriter, "commit", killed)
+        with pytest.raises(_Killed):
+            night()
+    assert counted(tmp_path) == set()
+    assert any("no commit names it" in line for line in verify(tmp_path / "store").problems)
+    monkeypatch.setattr(ingestion, "_fuse_and_label", lambda *_: pytest.fail("it is fused again"))
+    assert night()[0]["other.mcap"].status == "done"
+    assert len(counted(tmp_path)) == 1
+    assert verify(tmp_path / "store").problems == ()
+
+
+def test_of_two_calls_that_ingest_one_recording_under_two_names_the_first_commit_wins(tmp_path, night, monkeypatch):
+    shutil.copy(drive_at(tmp_path / "elsewhere" / "first.mcap", seed=7), tmp_path / "logs" / "second.mcap")
+    real = ingest_module._entries_of
+
+    def meanwhile(log, task, of):
+        if of.result.log.endswith("second.mcap") and of.rows:
+            monkeypatch.setattr(ingest_module, "_entries_of", real)
+            ingest([tmp_path / "elsewhere"], store=tmp_path / "store", recipe=Recipe())
+        return real(log, task, of)
+
+    monkeypatch.setattr(ingest_module, "_entries_of", meanwhile)
+    found, code = night()
+    assert (found["second.mcap"].status, found["second.mcap"].transient, code) == ("failed", True, 3)
+    assert "another call ingested the same recording as run first-" in found["second.mcap"].problems[0]
+    found, code = night()
+    assert (found["second.mcap"].status, code) == ("unchanged", 0)
+    assert str(found["second.mcap"].run_id).startswith("first-")
+
+
+def test_a_night_with_nothing_new_asks_a_bucket_the_same_however_many_runs_there_are(tmp_path, monkeypatch):
+    (tmp_path / "served" / "tests").mkdir(parents=True)
+    counts = []
+    with object_store(tmp_path / "served") as (environment, fetched):
+        in_environment(monkeypatch, environment, tmp_path / "cache")
+        for number in range(3):
+            drive_at(tmp_path / "logs" / f"{number}.mcap", seed=number, start_ns=START_NS + number * 10**13)
+            ingest([tmp_path / "logs"], store="s3://tests/store", recipe=Recipe())
+            fetched.requests = 0
+            summary = ingest([tmp_path / "logs"], store="s3://tests/store", recipe=Recipe())
+            assert {result.status for result in summary.results} == {"unchanged"}
+            counts.append(fetched.requests - Store("s3://tests/store").state().number)
+    assert len(set(counts)) == 1, "what is beyond one request for each commit that no snapshot has"
 
 
 # --- names ----------------------------------------------------------------------------------------------------------
@@ -265,18 +326,18 @@ def test_two_recordings_of_one_name_whose_hashes_begin_alike_are_two_runs(tmp_pa
     store, names = Store(tmp_path), []
     hashes = ["abcdef01" + digit * 56 for digit in "012"] + ["abcdef01" + "0" * 55 + "9"]
     for sha256 in hashes:
-        names.append(store.claim_run("latest", sha256))
+        names.append(store.name_run("latest", sha256))
         store.write_run_json(names[-1], RunJson(LogOrigin(("/latest.bag",), sha256)))
     assert names == ["latest-abcdef01", "latest-abcdef011111", "latest-abcdef012222", "latest-abcdef010000"]
     for sha256, name in zip(hashes, names, strict=True):
-        assert store.claim_run("other", sha256) == store.run_of(sha256, store.run_ids_by_hash()) == name
+        assert store.name_run("latest", sha256) == name
 
 
 def test_a_run_json_that_is_not_as_it_was_written_costs_no_other_log_and_is_made_again(tmp_path, night):
     run_id = night(tags={"weather": "dry"})[0]["other.mcap"].run_id
     path = tmp_path / "store" / "runs" / run_id / "run-1.json"
     whole = path.read_bytes()
-    path.write_bytes(whole.replace(b'"dry"', b'"wet"'))
+    path.write_bytes(whole[:-9])
     (tmp_path / "logs" / "junk.mcap").write_bytes(JUNK)
     found, _ = night()
     assert [found[name].status for name in ("other.mcap", "junk.mcap")] == ["done", "failed"]
@@ -297,9 +358,9 @@ def test_a_part_of_a_split_recording_takes_static_transforms_from_the_part_befor
     assert taken == [0, 1]
 
 
-def test_records_that_were_lost_are_found_out_again_from_the_runs(tmp_path, night):
+def test_a_log_that_was_lost_is_written_again_from_the_runs(tmp_path, night):
     run_id = night()[0]["other.mcap"].run_id
-    shutil.rmtree(tmp_path / "store" / "records")
-    (tmp_path / "logs" / "other.mcap").rename(tmp_path / "logs" / "renamed.mcap")
-    found = night()[0]["renamed.mcap"]
-    assert (found.run_id, found.status) == (run_id, "unchanged")
+    shutil.rmtree(tmp_path / "store" / "log")
+    found = night()[0]["other.mcap"]
+    assert (found.run_id, found.status) == (run_id, "done")
+    assert counted(tmp_path) == {run_id}

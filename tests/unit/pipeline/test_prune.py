@@ -9,9 +9,10 @@ import pytest
 from synthetic_store import add_run, lanes, segments
 
 from tcpipe.errors import UsageError
+from tcpipe.formats.commits import Dataset, Entries
 from tcpipe.formats.place import DirectoryPlace
-from tcpipe.formats.record_files import DatasetMade
 from tcpipe.formats.store_mark import SPOOL
+from tcpipe.pipeline.log_writer import open_log, supersede
 from tcpipe.pipeline.prune import prune
 from tcpipe.pipeline.verify import verify
 from tcpipe.recipe import ReadConfig, Recipe
@@ -27,9 +28,7 @@ def store(tmp_path):
     for recipe in (OLD, Recipe()):
         for number, run_id in enumerate(("a", "b", "c")[: 3 if recipe is OLD else 2]):
             add_run(store, run_id, segments(run_id, *lanes(np.array([number]), -10.0, 10.0)), recipe=recipe)
-    for path in store.root.glob(f"runs/*/{old_recipe(store)}/manifest-1.json"):
-        os.utime(path, ns=(10**18, 10**18))
-    store.supersede("b", "a")
+    supersede(store, "b", "a")
     return store
 
 
@@ -66,24 +65,30 @@ def test_what_is_newer_than_the_ruling_recipe_is_not_old(store):
 
 def test_what_a_dataset_refers_to_stays_also_where_that_was_moved(store, tmp_path):
     ids = {run_id: recipe_id for run_id, recipe_id in there(store) if recipe_id == old_recipe(store)}
-    store.remember("datasets/one", DatasetMade(str(tmp_path / "moved"), "0" * 64, (("a", ids["a"]), ("b", ids["b"]))))
+    dataset = Dataset(str(tmp_path / "moved"), "0" * 64, (("a", ids["a"]), ("b", ids["b"])))
+    open_log(store).commit("built", Entries(datasets=(dataset,)))
     found = prune(store=store.root, recipe=Recipe())
     assert found.removed == ()
     assert {each.stays for each in found.kept} == {f"dataset {tmp_path / 'moved'} refers to it"}
     assert len(there(store)) == 5
+    with pytest.raises(UsageError, match="no dataset of this store lay there; nothing is removed"):
+        prune(store=store.root, recipe=Recipe(), forget=["nosuch"])
+    assert len(prune(store=store.root, recipe=Recipe(), forget=[str(tmp_path / "moved")]).removed) == 2
 
 
-def test_nothing_goes_while_a_record_of_a_dataset_cannot_be_read(store):
-    store.remember("datasets/one", DatasetMade("/nowhere", "0" * 64, ()))
-    record = store.root / "records" / "datasets" / "one.json"
-    record.write_bytes(b"")
+def test_nothing_goes_while_a_commit_cannot_be_read(store):
+    log = open_log(store)
+    log.commit("built", Entries(datasets=(Dataset("/nowhere", "0" * 64),)))
+    commit = store.root / "log" / f"{log.state.number:010}.json"
+    whole = commit.read_bytes()
+    commit.write_bytes(b"")
     found = prune(store=store.root, recipe=Recipe())
     assert found.removed == ()
     assert len(found.kept) == 2
     assert {each.stays for each in found.kept} == {
-        f"{record} does not say what a dataset refers to; build that again, or remove it"
+        f"{commit} is missing or damaged: it may name what a dataset refers to"
     }
-    record.unlink()
+    commit.write_bytes(whole)
     assert len(prune(store=store.root, recipe=Recipe()).removed) == 2
 
 

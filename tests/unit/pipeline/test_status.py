@@ -12,11 +12,12 @@ from wheel_drives import START_NS, drive_at
 from tcpipe import __version__
 from tcpipe.cli import cli
 from tcpipe.errors import UsageError
-from tcpipe.formats.record_files import Call
-from tcpipe.pipeline import calls, known_trouble
-from tcpipe.pipeline import status as status_module
+from tcpipe.formats.commits import Call, Entries
+from tcpipe.pipeline import calls, ingest_task
+from tcpipe.pipeline import plan as plan_module
 from tcpipe.pipeline.ingest import ingest
-from tcpipe.pipeline.known_trouble import accept
+from tcpipe.pipeline.log_writer import open_log
+from tcpipe.pipeline.problems import acknowledge
 from tcpipe.pipeline.status import status
 from tcpipe.recipe import ReadConfig, Recipe
 from tcpipe.store import Store
@@ -102,7 +103,7 @@ def test_a_log_that_is_gone_is_trouble_only_where_the_latest_call_was_given_it(f
     ingest([stick], store=tmp_path / "store", recipe=Recipe())
     stick.unlink()
     found = status(store=tmp_path / "store", recipe=Recipe())
-    assert (found.exit_code, len(found.problems), found.gone) == (3, 1, ())
+    assert (found.exit_code, [of.code for of in found.problems], found.gone) == (3, ["log-missing"], ())
     shutil.copytree(first_night / "logs", tmp_path / "logs", ignore=lambda *_: {"cut.mcap", "junk.bag"})
     ingest([tmp_path / "logs"], store=tmp_path / "store", recipe=Recipe())
     found = status(store=tmp_path / "store", recipe=Recipe())
@@ -118,8 +119,8 @@ def test_new_changed_growing_passing_and_accepted_logs_are_told_apart(night):
     again = {result.log: result.run_id for result in ingest([logs], store=store, recipe=Recipe()).results}
     found_run = again[str(logs / "cut.mcap")]
     assert where(night).counts == {"done": 2, "partial": 1, "failed_permanent": 1}
-    accept([str(logs / "junk.bag")], store=store)
-    accept([found_run], store=store)
+    acknowledge([str(logs / "junk.bag")], store=store)
+    acknowledge([found_run], store=store)
     drive_at(logs / "growing.mcap", seed=4)
     for name in ("new.mcap", "passing.mcap"):
         drive_at(logs / name, seed=5)
@@ -128,14 +129,14 @@ def test_new_changed_growing_passing_and_accepted_logs_are_told_apart(night):
     os.utime(logs / "whole.mcap", ns=(OLD_NS, OLD_NS + 1))
     line = f"{logs / 'passing.mcap'}: No space left on device (28)"
     call = Call("ingest", "0", 3, {"failed": 1}, failed={str(logs / "passing.mcap"): line})
-    calls.remember_call(Store(store), calls.started(), call)
+    open_log(Store(store)).commit("ended", Entries(calls=(calls.measure_call(calls.started(), call),)))
     found = where(night)
     assert found.counts == {"done": 2, "quarantined": 1, "growing": 1, "pending": 2, "failed_transient": 1}
     told = {(group.state, group.cause): group.logs for group in found.groups}
     assert told["pending", ""] == (str(logs / "new.mcap"),)
     assert told["pending", "its content is another than before"] == (str(logs / "whole.mcap"),)
     assert told["failed_transient", "No space left on device (28)"] == (str(logs / "passing.mcap"),)
-    assert told["done", "damaged, accepted"] == (str(logs / "cut.mcap"),)
+    assert told["done", "damaged, acknowledged"] == (str(logs / "cut.mcap"),)
     assert found.exit_code == 3  # the disk is full
     assert found.to_do.amount == sum((logs / f"{name}.mcap").stat().st_size for name in ("new", "passing", "whole"))
     assert found.to_do.source == "by 1 earlier call"
@@ -150,7 +151,7 @@ def test_a_run_of_another_recipe_or_superseded_is_told_so(first_night):
     assert len(group.logs) == 3
 
 
-def test_a_failure_that_was_accepted_is_tried_again_under_another_recipe_and_says_why(
+def test_a_failure_that_was_acknowledged_is_tried_again_under_another_recipe_and_says_why(
     first_night, tmp_path, monkeypatch
 ):
     logs, store = tmp_path / "logs", tmp_path / "store"
@@ -167,17 +168,17 @@ def test_a_failure_that_was_accepted_is_tried_again_under_another_recipe_and_say
     ingest([logs], store=store, recipe=Recipe())
     why = "failed under another recipe, for another robot or with other message definitions"
     assert told(other) == ("pending", f"{why}; to be tried again")
-    accept([str(logs / "junk.bag")], store=store)
+    acknowledge([str(logs / "junk.bag")], store=store)
     assert told(Recipe())[0] == "quarantined"
-    assert told(other) == ("pending", f"{why}, accepted; to be tried again")
-    assert told(Recipe(), retry_failed=True) == ("pending", "failed before, accepted; to be tried again")
+    assert told(other) == ("pending", f"{why}, acknowledged; to be tried again")
+    assert told(Recipe(), retry_failed=True) == ("pending", "failed before, acknowledged; to be tried again")
     again = ingest([logs], store=store, recipe=other)
     assert [(of.status, of.accepted) for of in again.results] == [("failed", True)]
     assert again.exit_code == 0
     assert told(other)[0] == "quarantined"
-    for module in (known_trouble, status_module):
+    for module in (ingest_task, plan_module):
         monkeypatch.setattr(module, "__version__", "9.9.9")
-    assert told(other) == ("pending", f"failed with tcpipe {__version__}, accepted; to be tried again")
+    assert told(other) == ("pending", f"failed with tcpipe {__version__}, acknowledged; to be tried again")
 
 
 def test_causes_that_differ_in_numbers_alone_are_one_line_and_else_told_as_they_are(first_night, tmp_path):
@@ -206,10 +207,10 @@ def test_a_run_whose_log_s_document_is_gone_is_named_and_asked_for_again(first_n
     found = status([first_night / "logs"], store=tmp_path / "store", recipe=Recipe())
     (group,) = [group for group in found.groups if group.state == "pending"]
     assert (group.cause, group.logs) == (
-        "its run is not as it was written",
+        "files of its run are missing",
         (str(first_night / "logs" / "whole.mcap"),),
     )
-    assert found.problems == (f"{gone}: is gone; ingest the log again",)
+    assert [(of.code, of.names["file"]) for of in found.problems] == [("run-incomplete", str(gone))]
     assert found.exit_code == 3
 
 
@@ -276,7 +277,7 @@ def test_a_drive_without_a_segment_is_news_once_and_can_be_accepted(tmp_path):
     assert "1 of 1 runs: No segments [no-segments]" in shown.output
     (run_id,) = Store(tmp_path / "store").run_ids()
     accepted = run("accept", run_id, *how[:2])
-    assert "(empty)" in accepted.output
+    assert "[no-segments]" in accepted.output
     shown = run("status", *how)
-    assert (shown.return_value, "done, empty, accepted" in shown.output) == (0, True)
+    assert (shown.return_value, "done, empty, acknowledged" in shown.output) == (0, True)
     assert run(*ingest_it).return_value == 0

@@ -15,17 +15,18 @@ from synthetic_store import WORLD, add_run, box, lanes, put_map, region_file, se
 
 from tcpipe.dataset import open_dataset
 from tcpipe.errors import DatasetError, UsageError
+from tcpipe.formats.commits import Entries, Sighting
 from tcpipe.formats.maps.map_facts import MapInputs
 from tcpipe.formats.maps.map_files import open_map
 from tcpipe.formats.numbered import read_as_at
 from tcpipe.formats.place import DirectoryPlace
-from tcpipe.formats.record_files import Sighting
 from tcpipe.formats.run_documents import MapDocument
 from tcpipe.formats.seals import broken_seal, file_checksum, seal_of, sealed_page, write_sealed
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.diff import diff
 from tcpipe.pipeline.explain import explain
 from tcpipe.pipeline.inspect import inspect
+from tcpipe.pipeline.log_writer import commit_run, open_log
 from tcpipe.pipeline.report import report
 from tcpipe.pipeline.verify import verify
 from tcpipe.recipe import Recipe, SampleConfig
@@ -76,7 +77,7 @@ def test_a_store_its_runs_and_its_map_verify(made):
 
 def dress(store):
     """Add what `ingest`, `add-map` and `report` also leave in a store."""
-    store.remember("logs/where/what", Sighting(("/logs/north.mcap",), (), "north"))
+    open_log(store).commit("seen", Entries(seen=(Sighting(("/logs/north.mcap",), (), "north"),)))
     with store.new_map("site", after=1) as path:
         shutil.copytree(store.map_path("site"), path)
         write_quick_look(path.with_suffix(".png"), quick_look(open_map(path)), seal_of(path))
@@ -90,6 +91,7 @@ def dress(store):
         )
         store.write_run_json(run.run_id, replace(store.run_json(run.run_id), streams=files, robot="husky"))
         run_document(run).with_name("run-1.json").unlink()
+        commit_run(store, run.run_id)
 
 
 def replaced(store):

@@ -7,6 +7,7 @@ from synthetic_store import add_run, add_world, lanes, segments
 from tcpipe.dataset import open_dataset
 from tcpipe.errors import DatasetError
 from tcpipe.pipeline.dataset.build import build_dataset
+from tcpipe.pipeline.log_writer import commit_run
 from tcpipe.pipeline.unknown_robots import alike
 from tcpipe.store import open_store
 from tcpipe.tables.levels import Sensor
@@ -48,6 +49,7 @@ def store(tmp_path):
         table = segments(run_id, *lanes(np.array([3.0 * number]), -10.0, 10.0), robot="generic")
         add_run(store, run_id, table, sensors=of)
     store.tag_run("b", {"robot": "other"})
+    commit_run(store, "b")
     return store
 
 

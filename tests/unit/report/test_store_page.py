@@ -9,11 +9,12 @@ from synthetic_store import add_run, add_world, lanes, segments
 
 from tcpipe.errors import StoreError, UsageError
 from tcpipe.formats.bucket import open_place
-from tcpipe.formats.record_files import Call
+from tcpipe.formats.commits import Call, Entries, Failure
 from tcpipe.motion.remedies import losses_of
 from tcpipe.pipeline import calls
 from tcpipe.pipeline.dataset.build import build_dataset
-from tcpipe.pipeline.known_trouble import Trouble, accept
+from tcpipe.pipeline.log_writer import open_log, supersede
+from tcpipe.pipeline.problems import acknowledge
 from tcpipe.pipeline.report import report
 from tcpipe.pipeline.store_verdict import find_changes, shift_of
 from tcpipe.pipeline.verify import verify
@@ -45,13 +46,14 @@ def store(tmp_path_factory):
     for number, run_id in enumerate(("a", "b", "d")):
         found = [driven_below_limit(0.6 + 0.1 * number)] if number < 2 else []
         add(store, run_id, number, findings=found, tags={"site": EVIL})
-    store.supersede("d", "a")
+    supersede(store, "d", "a")
     build_dataset(here / "dataset", store=store.root)
     add(store, "c", 3, ledger_m={"kept": 20.0, "gap": 60.0, "standing": 5.0})
-    store.remember("failed/1", Trouble("1" * 64, (f"/logs/junk: {EVIL} is no log",), ("/logs/junk",)))
-    store.remember("failed/2", Trouble("a", ("/logs/a.mcap: was cut",), ("/logs/a.mcap",)))
+    junk = Failure("1", "1" * 64, ("/logs/junk",), (f"/logs/junk: {EVIL} is no log",), "0")
+    cut = Failure("2", "a", ("/logs/a.mcap",), ("/logs/a.mcap: was cut",), "0")
     failed = {"/logs/passing.mcap": "No space left on device", "/logs/b.mcap": "No space left on device"}
-    calls.remember_call(store, calls.started(), Call("ingest", "0", 3, {"failed": 1}, failed=failed))
+    call = calls.measure_call(calls.started(), Call("ingest", "0", 3, {"failed": 1}, failed=failed))
+    open_log(store).commit("ended", Entries(failed=(junk, cut), calls=(call,)))
     return store
 
 
@@ -107,7 +109,7 @@ def test_sums_are_of_the_ruling_recipe_without_superseded_runs(store):
     assert losses.index("<td>gap</td>") < losses.index("<td>standing</td>")
 
 
-def test_what_failed_is_named_until_its_content_gives_a_run_or_a_person_accepts_it(store):
+def test_what_failed_is_named_until_its_content_gives_a_run_or_a_person_acknowledges_it(store):
     _, html, *_ = shown(store)
     part = html.split("<h2>Failed, damaged and empty</h2>")[1].split("</section>")[0]
     assert "is no log" in part
@@ -115,7 +117,7 @@ def test_what_failed_is_named_until_its_content_gives_a_run_or_a_person_accepts_
     assert "passing.mcap" in part
     assert "was cut" not in part  # the run of that content is there
     assert "b.mcap" not in part
-    accept(["/logs/junk"], store=store.root)
+    acknowledge(["/logs/junk"], store=store.root)
     part = shown(store)[1].split("<h2>Failed, damaged and empty</h2>")[1].split("</section>")[0]
     assert "<td>accepted</td>" in part
 
@@ -138,7 +140,8 @@ def test_names_are_text_and_pages_are_led_to_where_they_are(store):
 def test_an_empty_store_and_one_of_failed_logs_alone_have_a_page(tmp_path):
     store = open_store(tmp_path / "store", create=True)
     assert "No run can be used." in shown(store)[1]
-    store.remember("failed/1", Trouble("1" * 64, ("/logs/junk: is no log",), ("/logs/junk",)))
+    junk = Failure("1", "1" * 64, ("/logs/junk",), ("/logs/junk: is no log",), "0")
+    open_log(store).commit("failed", Entries(failed=(junk,)))
     _, html, *_ = shown(store)
     assert "No run can be used." in html
     assert "junk: is no log" in html

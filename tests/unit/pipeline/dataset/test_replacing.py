@@ -16,6 +16,7 @@ from tcpipe.errors import DatasetError, StoreError, UsageError
 from tcpipe.formats.dataset_files import read_card
 from tcpipe.pipeline.dataset import build as building
 from tcpipe.pipeline.dataset.build import build_dataset
+from tcpipe.pipeline.log_writer import commit_run
 from tcpipe.recipe import DatasetConfig, Recipe, SampleConfig
 from tcpipe.store import open_store
 
@@ -35,6 +36,7 @@ def made(tmp_path_factory):
     for number, weather in enumerate(("dry", "wet")):
         add_run(store, weather, segments(weather, *lanes(3.0 * number, -10.0, 10.0)), tags={"weather": weather})
         store.tag_run(weather, {"weather": weather})
+        commit_run(store, weather)
     region_file(here / "region.geojson", box(-20, -20, 2, 20))
     region_file(here / "other.geojson", box(-20, -20, 3, 20))
     (here / "soil.csv").write_text("time,moisture\n1970-01-01T00:00:00Z,0.2\n1970-01-01T00:01:00Z,0.3\n")
@@ -117,6 +119,7 @@ def test_other_runs_and_another_map_of_the_name_are_built_in_unasked(here):
     store = open_store(here / "store")
     add_run(store, "new", segments("new", *lanes(6.0, -10.0, 10.0)))
     store.tag_run("new", {"weather": "dry"})
+    commit_run(store, "new")
     assert build_dataset(here / "dataset", **usual(here)).status == "done"
     assert {run.run_id for run in read_card(here / "dataset").runs} == {"dry", "new"}
 
@@ -125,6 +128,7 @@ def test_another_robot_is_refused(here):
     store = open_store(here / "store")
     add_run(store, "big", segments("big", *lanes(6.0, -10.0, 10.0), robot="warthog"))
     store.tag_run("big", {"weather": "dry"})
+    commit_run(store, "big")
     assert refused(here, robot="warthog") == ("--robot: husky in the dataset, warthog now",)
     assert build_dataset(here / "dataset", **usual(here, robot="husky")).status == "unchanged"
 

@@ -1,0 +1,233 @@
+"""The log of a store: commits as small sealed files that are put where there is none, and snapshots of the state (ADR 105).
+
+::
+
+    log/0000000017.json                the commit of that number, never changed
+    log/snapshot-0000000064.json.zst   what all commits to that number say; may be removed at any time
+
+Readers take the newest readable snapshot and the commits after it. A commit that is missing or damaged is a problem of the state.
+"""
+
+from __future__ import annotations
+
+import gc
+import hashlib
+import logging
+import re
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, replace
+from typing import TypeAlias
+
+import pyarrow as pa
+
+from tcpipe.errors import StoreError
+from tcpipe.formats.bucket import side_by_side
+from tcpipe.formats.commits import Commit, Entries, Kind, Problem, Process, State, compact, fold
+from tcpipe.formats.json_files import compact_json, of_json, parse_json, to_json, typed
+from tcpipe.formats.place import Place
+from tcpipe.formats.seals import SEAL, proved, sealed
+from tcpipe.tables.findings import Subject, make_finding
+
+logger = logging.getLogger("tcpipe")
+
+LOG = "log"
+_COMMIT = re.compile(r"(\d{10})\.json")
+_SNAPSHOT = "snapshot-"
+_EVERY, _EVERY_BYTES = 64, 4 << 20
+"""After so many commits, or so many bytes of them, the next snapshot is written."""
+_KEPT = 2
+"""So many snapshots stay."""
+
+
+ReadCommit: TypeAlias = tuple[Commit, str, int]
+
+
+@dataclass(frozen=True, slots=True)
+class Stamp:
+    """Who commits, and when (UTC, ISO 8601)."""
+
+    who: Process
+    at: str
+
+
+@contextmanager
+def uncollected() -> Iterator[None]:
+    """Let Python's search for cycles rest: rows have none, and it would go through ten thousand of them again and again."""
+    was = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if was:
+            gc.enable()
+
+
+@uncollected()
+def read_state(store: Place) -> State:
+    """Return what the log of a store says: the newest readable snapshot, and the commits after it."""
+    log, state = store.below(LOG), State()
+    for name in reversed(_list_snapshots(log)):
+        try:
+            state = _read_snapshot(log, name)
+            break
+        except StoreError as error:
+            logger.info("%s; an earlier snapshot, or all commits, are read instead", error)
+    return refresh(store, state)
+
+
+def refresh(store: Place, state: State) -> State:
+    """Return the state after the commits that were written since."""
+    log = store.below(LOG)
+    found = {int(of[1]) for name in log.files_after("", commit_name(state.number)) if (of := _COMMIT.fullmatch(name))}
+    numbers = sorted(number for number in found if number > state.number)
+    for number, result in zip(numbers, side_by_side(log.where(), lambda n: _try(log, n), numbers), strict=True):
+        missing = [_problem("commit-missing", log, absent) for absent in range(state.number + 1, number)]
+        if missing:
+            state = replace(state, digest="", problems=(*state.problems, *missing))
+        if isinstance(result, StoreError):
+            state = replace(
+                state,
+                number=number,
+                digest="",
+                problems=(*state.problems, _problem("commit-damaged", log, number)),
+            )
+            continue
+        state = _follow(state, result, log)
+    return state
+
+
+def _try(log: Place, number: int) -> ReadCommit | StoreError:
+    try:
+        return read_commit(log, number)
+    except StoreError as error:
+        return error
+
+
+def _follow(state: State, result: ReadCommit, log: Place) -> State:
+    """Return the state after a commit; one that was written after another commit than the last is a problem."""
+    commit, digest, size_bytes = result
+    follows = commit.parent == state.digest or not state.digest
+    problems = state.problems if follows else (*state.problems, _problem("commit-damaged", log, commit.number))
+    return replace(fold([commit], state), digest=digest, tail_bytes=state.tail_bytes + size_bytes, problems=problems)
+
+
+def _problem(code: str, log: Place, number: int) -> Problem:
+    name = commit_name(number)
+    return Problem(make_finding(code, Subject("file", f"log/{name}")), f"commit {number}", (log.where(name),))
+
+
+def commit_name(number: int) -> str:
+    """Return the name of the file of a commit."""
+    return f"{number:010}.json"
+
+
+def snapshot_name(number: int) -> str:
+    """Return the name of the file of a snapshot."""
+    return f"{_SNAPSHOT}{number:010}.json.zst"
+
+
+def read_commit(log: Place, number: int) -> ReadCommit:
+    """Return a commit, its seal and its size [byte]; `StoreError` where it is gone or not as it was written."""
+    name = commit_name(number)
+    data, where = log.read(name), log.where(name)
+    if data is None:
+        raise StoreError(f"{where}: is gone")
+    document = proved(data, where)
+    commit = typed(document, Commit, where)
+    if commit.number != number:
+        raise StoreError(f"{where}: is commit {commit.number}")
+    return commit, str(document[SEAL]), len(data)
+
+
+def put_commit(store: Place, state: State, stamp: Stamp, kind: Kind, make: Callable[[State], Entries]) -> State:
+    """Write the next commit, and return the state after it, which holds what others committed meanwhile.
+
+    Parameters
+    ----------
+    make : returns what to add to a state; called again where another call was faster. Nothing is written where that is nothing.
+
+    Raises
+    ------
+    StoreError : the log cannot be read or written.
+    """
+    log = store.below(LOG)
+    while True:
+        entries, number = make(state), state.number + 1
+        if entries.is_empty:
+            return state
+        document = sealed(Commit(number, state.digest, kind, stamp.who, stamp.at, entries))
+        data = to_json(document).encode()
+        if (
+            log.put_new(commit_name(number), data) or log.read(commit_name(number)) == data
+        ):  # the answer to one's own may be lost
+            state = _follow(state, (typed(document, Commit, log.where()), str(document[SEAL]), len(data)), log)
+            return _keep_snapshot(log, state, stamp) if _is_due(state) else state
+        state = refresh(store, state)
+
+
+def _is_due(state: State) -> bool:
+    return state.number - state.snapshot >= _EVERY or state.tail_bytes >= _EVERY_BYTES
+
+
+def _keep_snapshot(log: Place, state: State, stamp: Stamp) -> State:
+    """Write a snapshot where everything before it could be read, or somebody acknowledged that it cannot; earlier ones go."""
+    if any(problem.key not in state.acknowledged for problem in state.problems):
+        return state
+    with suppress(StoreError):
+        log.put_new(snapshot_name(state.number), _encode_snapshot(state, stamp))
+        for name in _list_snapshots(log)[:-_KEPT]:
+            log.delete(name)
+    return replace(state, snapshot=state.number, tail_bytes=0)
+
+
+def _list_snapshots(log: Place) -> list[str]:
+    return [name for name in log.files_after("", _SNAPSHOT) if name.startswith(_SNAPSHOT)]
+
+
+def _encode_snapshot(state: State, stamp: Stamp) -> bytes:
+    commit = Commit(state.number, state.digest, "snapshot", stamp.who, stamp.at, compact(state))
+    text = compact_json(commit)
+    sink = pa.BufferOutputStream()
+    with pa.CompressedOutputStream(sink, "zstd") as stream:
+        stream.write(hashlib.sha256(text).hexdigest().encode() + b"\n" + text)
+    return bytes(sink.getvalue())
+
+
+def _read_snapshot(log: Place, name: str) -> State:
+    commit = read_snapshot(log, name)
+    return replace(fold([commit]), digest=commit.parent, snapshot=commit.number)
+
+
+def read_snapshot(log: Place, name: str) -> Commit:
+    """Return a snapshot as the one commit that it stands for; `StoreError` where it is not as it was written."""
+    where, data = log.where(name), log.read(name)
+    try:
+        seal, _, text = pa.input_stream(pa.py_buffer(data or b""), compression="zstd").read().partition(b"\n")
+    except OSError:
+        raise StoreError(f"{where}: is not as it was written") from None
+    if hashlib.sha256(text).hexdigest().encode() != seal:
+        raise StoreError(f"{where}: is not as it was written")
+    try:
+        return of_json(text, Commit, where)
+    except StoreError:
+        return typed(parse_json(text, where), Commit, where)
+
+
+_HERE: dict[Place, State] = {}
+"""What this process read last."""
+
+
+def read_state_here(store: Place) -> State:
+    """Return what `read_state` does; what this process has read before is not read again."""
+    known = _HERE.get(store)
+    known = known if known and known.number and store.below(LOG).size(commit_name(known.number)) else None
+    _HERE.clear()
+    _HERE[store] = state = read_state(store) if known is None else refresh(store, known)
+    return state
+
+
+def keep_state_here(store: Place, state: State) -> None:
+    """Let `read_state_here` begin at a state."""
+    _HERE.clear()
+    _HERE[store] = state

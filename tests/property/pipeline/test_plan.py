@@ -1,0 +1,137 @@
+"""What status predicts is what ingest does, whatever happened before: one plan, executed or shown."""
+
+import hashlib
+import os
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from synthetic_store import add_run, lanes, segments
+
+from tcpipe.errors import UsageError
+from tcpipe.formats.commit_log import read_state_here
+from tcpipe.formats.index_files import KnownLog, RunFacts
+from tcpipe.formats.recipe_toml import ingest_key, recipe_id
+from tcpipe.formats.run_documents import LogOrigin
+from tcpipe.pipeline import ingest as ingest_module
+from tcpipe.pipeline.ingest import ingest
+from tcpipe.pipeline.ingest_run import Ingested
+from tcpipe.pipeline.ingest_task import IngestResult, result_of, too_young
+from tcpipe.pipeline.log_findings import find_damage
+from tcpipe.pipeline.plan import TO_DO
+from tcpipe.pipeline.problems import acknowledge
+from tcpipe.pipeline.status import status
+from tcpipe.recipe import ReadConfig, Recipe
+from tcpipe.store import Store, open_store
+from tcpipe.tables.findings import Subject, make_finding
+
+RECIPES = (Recipe(), replace(Recipe(), read=ReadConfig(ignore_topics=["/none"])))
+KINDS = ("good", "damaged", "empty", "junk", "passing")
+
+
+@pytest.fixture(scope="module")
+def row(tmp_path_factory) -> RunFacts:
+    """The row of some run, of which others are made."""
+    store = open_store(tmp_path_factory.mktemp("plan") / "store", create=True)
+    add_run(store, "a", segments("a", *lanes(0.0, 0.0, 10.0)))
+    (only,) = store.state().runs.values()
+    return only
+
+
+def make_row(row, task, sha256, kind):
+    """What ingesting a log of this kind would commit."""
+    log = KnownLog(LogOrigin(task.source.origins, sha256), task.tags, {})
+    key, name = ingest_key(task.recipe), f"{task.source.stem}-{sha256[:8]}"
+    asked = {"robot_requested": task.robot, "message_definitions": task.definitions, "ingest_key": key}
+    made = replace(row, run_id=name, recipe_id=recipe_id(task.recipe, row.robot), log=log, files={}, commit=0, **asked)
+    subject = Subject("run", name)
+    empty = make_finding("no-segments", subject, names={"reason": "gap"}, driven_m=80.0, lost_m=80.0)
+    changes = {
+        "damaged": {"damage": ("it was cut",), "findings": find_damage(("it was cut",), subject)},
+        "empty": {"segments": 0, "driven_m": 80.0, "findings": (empty,)},
+    }
+    return replace(made, **changes.get(kind, {}))
+
+
+def worker(row, worked):
+    """Return what stands for `ingest_one`: the first word of a log says what becomes of it."""
+
+    def ingest_one(task):
+        task = replace(task, source=task.source.now())
+        worked.append(task.source.name)
+        if (young := too_young(task)) is not None:
+            return Ingested(task.source, young)
+        data = task.source.paths[0].read_bytes()
+        kind, sha256 = data.split()[0].decode(), hashlib.sha256(data).hexdigest()
+        if kind in ("junk", "passing"):
+            problems = (f"{task.source.name}: {kind}",)
+            result = IngestResult(task.source.name, "failed", problems=problems, transient=kind == "passing")
+            return Ingested(task.source, replace(result, sha256=sha256))
+        state = read_state_here(Store(task.store).place)
+        made = make_row(row, task, sha256, kind)
+        named = state.run_of(sha256)
+        made = made if named is None else replace(made, run_id=named)
+        same = state.runs.get((made.run_id, made.recipe_id))
+        if same is not None and not task.force and task.tags.items() <= same.tags.items():
+            return Ingested(task.source, result_of(task.source, "unchanged", same, sha256, same_as=None))
+        return Ingested(task.source, result_of(task.source, "done", made, sha256, same_as=None), (made,))
+
+    return ingest_one
+
+
+ACTIONS = st.one_of(
+    st.tuples(st.just("write"), st.integers(0, 3), st.sampled_from(KINDS), st.integers(0, 1), st.booleans()),
+    st.tuples(st.just("acknowledge"), st.integers(0, 3)),
+    st.tuples(
+        st.just("ingest"), st.sampled_from(RECIPES), st.sampled_from(({}, {"force": True}, {"retry_failed": True}))
+    ),
+)
+
+
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=60, deadline=None)
+@given(st.lists(ACTIONS, min_size=3, max_size=12))
+def test_what_status_predicts_is_what_ingest_does(row, actions):
+    with TemporaryDirectory() as directory, pytest.MonkeyPatch.context() as patch:
+        root, worked = Path(directory), list[str]()
+        logs, store = root / "logs", root / "store"
+        logs.mkdir()
+        open_store(store, create=True)
+        (store / "runs" / "keep").mkdir(parents=True)
+        patch.setattr(ingest_module, "ingest_one", worker(row, worked))
+        for action, *rest in (("write", 0, "good", 0, False), *actions, ("ingest", RECIPES[0], {})):
+            if action == "write":
+                number, kind, content, is_young = rest
+                path = logs / f"log{number}.mcap"
+                path.write_text(f"{kind} {content}")
+                os.utime(path, ns=(4 * 10**18,) * 2 if is_young else (10**18 + content,) * 2)
+            elif action == "acknowledge":
+                with suppress(UsageError):
+                    acknowledge([str(logs / f"log{rest[0]}.mcap")], store=store)
+            else:
+                recipe, how = rest
+                compare(logs, store, worked, recipe=recipe, min_age_s=60.0, **how)
+
+
+def compare(logs, store, worked, **how):
+    predicted = {
+        name: group.state for group in status([logs], store=store, create=True, **how).groups for name in group.logs
+    }
+    before, worked[:] = Store(store).state(), []
+    results = {result.log: result for result in ingest([logs], store=store, **how).results}
+    after = Store(store).state()
+    assert set(worked) == {name for name, standing in predicted.items() if standing in TO_DO}
+    for name, standing in predicted.items():
+        result = results[name]
+        if standing in ("done", "partial", "empty", "superseded"):
+            assert result.status == "unchanged"
+            assert not result.is_news
+        elif standing in ("failed_permanent", "quarantined"):
+            assert (result.status, result.known, result.accepted) == ("failed", True, standing == "quarantined")
+        elif standing == "growing":
+            assert result.status == "waiting"
+    if not worked:
+        assert after == before, "a call with nothing to do writes nothing"
