@@ -12,6 +12,7 @@ from tcpipe.dataset import open_dataset
 from tcpipe.errors import DatasetError, StoreError
 from tcpipe.formats.commits import Entries
 from tcpipe.pipeline.dataset.build import build_dataset
+from tcpipe.pipeline.dataset.findings import is_problem
 from tcpipe.pipeline.inspect import inspect
 from tcpipe.pipeline.log_writer import commit_run, open_log, supersede
 from tcpipe.pipeline.problems import acknowledge
@@ -43,6 +44,10 @@ def store(made, tmp_path, monkeypatch):
 
 def build(store, **how):
     return build_dataset(store.root.parent / "out", store=store.root, recipe=Recipe(), holdout="sample", **how)
+
+
+def problems(result):
+    return [(finding.code, finding.subject.name) for finding in result.findings if is_problem(finding)]
 
 
 def runs(store):
@@ -90,25 +95,25 @@ DAMAGE = {
 def test_a_run_that_is_not_as_it_was_written_is_named_and_left_out(store, damage):
     DAMAGE[damage](store.recipes_of("b")[0])
     result = build(store)
-    (line,) = result.problems
-    assert line.startswith(f"run b: left out: {store.root / 'runs' / 'b'}/")
-    assert "ingest its log again" in line
+    assert problems(result) == [("run-damaged", "b")]
     assert (result.exit_code, runs(store)) == (3, ["a", "c", "d"])
     again = build(store, min_runs=3)
-    assert (again.status, again.problems) == ("unchanged", (line,)), "damage is told until it is mended"
+    assert (again.status, problems(again)) == ("unchanged", [("run-damaged", "b")]), (
+        "damage is a problem until it is repaired"
+    )
 
 
 def test_a_run_that_lost_its_manifest_is_left_out_and_named(store):
     manifest(store.recipes_of("b")[0]).unlink()
     result = build(store)
     assert (result.exit_code, runs(store)) == (3, ["a", "c", "d"])
-    assert "manifest-1.json: is gone; ingest the log again" in result.problems[0]
+    assert problems(result) == [("run-damaged", "b")]
 
 
 def test_a_manifest_of_another_run_is_not_believed_though_its_seal_is_whole(store):
     ours, theirs = (store.recipes_of(name)[0] for name in "bc")
     shutil.copy(manifest(theirs), manifest(ours))
-    assert f"is of c/{ours.recipe_id}, but lies in b/{ours.recipe_id}" in build(store).problems[0]
+    assert problems(build(store)) == [("run-damaged", "b")]
 
 
 def test_damaged_runs_are_told_by_inspect_and_report(store):
@@ -142,9 +147,10 @@ def test_runs_that_have_to_be_ingested_again_are_told_each_time_unless_so_many_a
     assert (store.root.parent / "out" / "dataset.json").read_bytes() == before
     for status in ("done", "unchanged"):
         result = build(store)
-        (line,) = result.problems
-        assert line.startswith("3 of 4 runs have no ingestion under this recipe (they have ")
-        assert line.endswith("): b, c, d; ingest their logs again: tcpipe ingest /logs")
+        assert problems(result) == [("run-ingested-otherwise", run_id) for run_id in "bcd"]
+        (line,) = result.problem_lines()
+        assert line.startswith("warning: 3 of 4 runs: Run left out: ingested with another recipe")
+        assert "To ingest the logs again: 'tcpipe ingest /logs'" in line
         assert (result.status, result.exit_code) == (status, 3)
     assert build(store, min_runs=1).exit_code == 0
     assert runs(store) == ["a"]
@@ -154,9 +160,7 @@ def test_runs_that_are_gone_are_told_until_somebody_gives_them_up(store):
     build(store)
     shutil.rmtree(store.root / "runs" / "c")
     for _ in range(2):
-        (line,) = build(store).problems
-        assert line.startswith(f"run c: left out: {store.root / 'runs' / 'c'}/")
-        assert "is gone" in line
+        assert problems(build(store)) == [("run-damaged", "c")]
     acknowledge(["c"], store=store.root)
     assert build(store).exit_code == 0
     assert "c" not in {run_id for run_id, _ in store.state().runs}
@@ -165,7 +169,7 @@ def test_runs_that_are_gone_are_told_until_somebody_gives_them_up(store):
 def test_runs_of_the_dataset_before_that_the_store_no_longer_knows_are_told_once(store):
     build(store)
     remove(store, "c")
-    assert build(store).problems == ("1 of the 4 runs of the dataset that is replaced are no longer in the store: c",)
+    assert problems(build(store)) == [("run-gone", "c")]
     assert build(store).exit_code == 0
 
 
@@ -173,8 +177,8 @@ def test_a_run_that_another_has_taken_the_place_of_is_not_gone(store):
     build(store)
     supersede(store, "b", "a")
     result = build(store)
-    assert (result.problems, runs(store)) == ((), ["a", "c", "d"])
-    assert any("superseded" in line for line in result.warnings)
+    assert (problems(result), runs(store)) == ([], ["a", "c", "d"])
+    assert ("run-superseded", "b") in {(of.code, of.subject.name) for of in result.findings}
 
 
 def test_what_a_user_leaves_out_by_choice_is_no_problem(store):
@@ -188,16 +192,14 @@ def test_what_a_user_leaves_out_by_choice_is_no_problem(store):
     assert build(store, robot="husky", force=True).exit_code == 3
 
 
-@pytest.mark.parametrize(
-    ("x_m", "holdout", "said"), [(20, "sample", "no sample is unseen"), (0, "run", "no sample tests")]
-)
-def test_a_split_that_is_empty_is_told_each_time(store, tmp_path, x_m, holdout, said):
+@pytest.mark.parametrize(("x_m", "holdout", "empty"), [(20, "sample", "unseen"), (0, "run", "test")])
+def test_a_split_that_is_empty_is_told_each_time(store, tmp_path, x_m, holdout, empty):
     for run_id in "bcd":
         remove(store, run_id)
     region = region_file(tmp_path / "region.geojson", box(-20, -20, x_m, 20))
     for _ in range(2):
         result = build_dataset(tmp_path / "out", store=store.root, recipe=Recipe(), holdout=holdout, split=region)
-        assert said in result.problems[0]
+        assert problems(result) == [("split-empty", empty)]
         assert result.exit_code == 3
 
 
