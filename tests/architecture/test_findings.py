@@ -25,6 +25,7 @@ PRINTERS = {
     "tcpipe/pipeline/dataset/content.py",
     "tcpipe/pipeline/diff.py",
     "tcpipe/pipeline/maps.py",
+    "tcpipe/pipeline/plan.py",
     "tcpipe/pipeline/preflight.py",
     "tcpipe/pipeline/status.py",
     "tcpipe/pipeline/store_facts.py",
