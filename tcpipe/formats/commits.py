@@ -284,12 +284,18 @@ def _supersede(runs: dict[tuple[str, str], RunFacts], gone: dict[str, str], supe
 
 def _add_runs(runs: dict[tuple[str, str], RunFacts], gone: Mapping[str, str], commit: Commit) -> None:
     for row in commit.entries.runs:
-        by = gone.get(row.run_id)
-        is_settled = row.commit and row.superseded_by == by
-        new = row if is_settled else replace(row, superseded_by=by, commit=row.commit or commit.number)
-        runs[row.run_id, row.recipe_id] = new
+        by, key = gone.get(row.run_id), (row.run_id, row.recipe_id)
+        known = runs.get(key)
+        number = row.commit or (known.commit if known and _is_same(known, row) else commit.number)
+        is_settled = (row.commit, row.superseded_by) == (number, by)
+        runs[key] = row if is_settled else replace(row, superseded_by=by, commit=number)
     for key in commit.entries.removed:
         runs.pop(key, None)
+
+
+def _is_same(known: RunFacts, row: RunFacts) -> bool:
+    """Return whether a row is of the tables that the state knows: it may be committed again with other documents of its log."""
+    return (known.segments_sha256, known.track_file) == (row.segments_sha256, row.track_file)
 
 
 def _add_datasets(datasets: dict[tuple[str, str], Dataset], forgotten: set[tuple[str, str]], of: Entries) -> None:

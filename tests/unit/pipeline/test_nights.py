@@ -19,9 +19,10 @@ from tcpipe.pipeline.ingest import ingest
 from tcpipe.pipeline.inspect import inspect
 from tcpipe.pipeline.log_writer import LogWriter
 from tcpipe.pipeline.problems import acknowledge
+from tcpipe.pipeline.prune import prune
 from tcpipe.pipeline.status import status
 from tcpipe.pipeline.verify import verify
-from tcpipe.recipe import Recipe
+from tcpipe.recipe import LabelConfig, Recipe
 from tcpipe.store import Store
 
 JUNK = b"junk" * 100
@@ -266,6 +267,18 @@ def test_after_a_kill_between_manifest_and_commit_the_run_is_found_and_not_fused
     monkeypatch.setattr(ingestion, "_fuse_and_label", lambda *_: pytest.fail("it is fused again"))
     assert night()[0]["other.mcap"].status == "done"
     assert len(counted(tmp_path)) == 1
+    assert verify(tmp_path / "store").problems == ()
+
+
+def test_what_an_ingest_under_another_recipe_replaces_can_be_pruned(tmp_path, night):
+    night()
+    other = Recipe(label=LabelConfig(velocity="fused"))
+    ingest([tmp_path / "logs"], store=tmp_path / "store", recipe=other)
+    assert (
+        prune(store=tmp_path / "store", recipe=Recipe()).removed == ()
+    )  # the first recipe's results are the older ones
+    (old,) = prune(store=tmp_path / "store", recipe=other).removed
+    assert old.what == "old recipe"
     assert verify(tmp_path / "store").problems == ()
 
 
