@@ -128,7 +128,7 @@ CASES = (
     Case("build-dataset on a cluster", _BUILD_THERE, wants=_WORLD | _CLUSTER, url=URL),
     Case("ingest --tag", command("ingest", LOG, "--tag", "load=12", "--quiet"), (_RUN,), _LOG),
     Case("ingest --jobs 2", command("ingest", f"{INPUTS}/logs", "--jobs", "2", "--quiet"), wants=_LOG),
-    Case("accept", command("accept", CUT), (command("ingest", CUT, "--quiet"),), _LOG),
+    Case("acknowledge", command("acknowledge", CUT), (command("ingest", CUT, "--quiet"),), _LOG),
     Case("report", command("report", "tcpipe-store"), (_RUN,), _LOG),
     Case("add-map", command(*_MAP), wants=_WORLD),
     Case("add-map --force", command(*_MAP, "--force"), (command("add-map", "site", *LAYERS[:2], "-q"),), _WORLD),

@@ -30,7 +30,7 @@ def ingest(options: IngestOptions, *, dry_run: bool, as_json: bool, quiet: bool)
     tried again. A line is printed as each log ends; of several logs, findings follow by code.
 
     Exit code 3: some logs failed, are damaged, or give no segment though the robot drove, and that is news: it was not
-    told before, and not accepted (tcpipe accept).
+    told before, and not acknowledged (tcpipe acknowledge).
     """
     from dataclasses import replace
 
@@ -100,7 +100,7 @@ def _of_one(result: IngestResult, store: Path | str, *, several: bool) -> Iterat
     from tcpipe.formats.finding_lines import describe_finding, format_findings, format_verdict
     from tcpipe.tables.findings import select_problems
 
-    aside = " (accepted)" if result.accepted else ""
+    aside = " (acknowledged)" if result.acknowledged else ""
     is_new = result.status != "unchanged"
     budget = result.energy_budget if is_new else None
     problems = select_problems(result.findings)
@@ -163,13 +163,13 @@ def _print_sum(summary: IngestSummary) -> None:
 
 def _print_known(summary: IngestSummary) -> None:
     """Count what is wrong and no news."""
-    accepted = sum(result.accepted for result in summary.results)
-    known = [result for result in summary.results if result.known and not result.accepted]
+    acknowledged = sum(result.acknowledged for result in summary.results)
+    known = [result for result in summary.results if result.known and not result.acknowledged]
     failed = sum(result.status == "failed" for result in known)
     if failed:
         tried = "tries them" if failed > 1 else "tries it"
         say(f"{failed} known failure{'s' * (failed > 1)}, not tried again; --retry-failed {tried}")
     if len(known) > failed:
-        say(f"{len(known) - failed} known to be damaged or empty; 'tcpipe accept RUN' when it has been looked at")
-    if accepted:
-        say(f"{accepted} with accepted trouble")
+        say(f"{len(known) - failed} known to be damaged or empty; 'tcpipe acknowledge RUN' when it has been looked at")
+    if acknowledged:
+        say(f"{acknowledged} with acknowledged problems")

@@ -200,7 +200,7 @@ def _results_without_work(
                 sha256=source.sha256,
                 known=True,
             )
-            yield index, replace(failed, accepted=step.standing == "quarantined")
+            yield index, replace(failed, acknowledged=step.standing == "quarantined")
         elif made is not None:
             result = result_of(source, "unchanged", made, str(source.sha256), same_as=find_twin(made.log, source))
             if made.run_id in parties:
@@ -208,7 +208,7 @@ def _results_without_work(
                 log.commit("superseded", Entries(superseded=tuple(superseded)))
                 result = replace(result, notes=(*result.notes, *notes))
             if select_problems(result.findings):
-                result = replace(result, known=True, accepted=is_acknowledged(problems_of(made), log.state))
+                result = replace(result, known=True, acknowledged=is_acknowledged(problems_of(made), log.state))
             yield index, result
         elif not step.is_todo:
             yield index, too_young(step.task) or IngestResult(source.name, "waiting")
@@ -292,13 +292,13 @@ def _judged(state: State, result: IngestResult, source: LogSource, *, before: St
     """Return a result with whether its problems were known before, and are acknowledged."""
     if result.status == "failed":
         problem = failure_of(result.sha256 or source.files_digest, source.origins)
-        return replace(result, accepted=result.accepted or is_acknowledged([problem], state))
+        return replace(result, acknowledged=result.acknowledged or is_acknowledged([problem], state))
     if not (select_problems(result.findings)):
         return result
     row = state.runs[str(result.run_id), str(result.recipe_id)]
     problems = problems_of(row)
     told = {of.key for old in before.runs.values() if old.run_id == row.run_id for of in problems_of(old)}
-    return replace(result, known=all(of.key in told for of in problems), accepted=is_acknowledged(problems, state))
+    return replace(result, known=all(of.key in told for of in problems), acknowledged=is_acknowledged(problems, state))
 
 
 def _place_for_stand_ins(logs: Iterable[str | Path]) -> AbstractContextManager[Path]:

@@ -92,16 +92,16 @@ class IngestResult:
     """Whether it failed for what may pass: a full disk, a killed worker."""
     known: bool = False
     """Whether it failed before and was not tried again, or what is wrong with its run was told before."""
-    accepted: bool = False
+    acknowledged: bool = False
     """Whether a person has acknowledged what is wrong with it (`tcpipe acknowledge`)."""
     traceback: str | None = None
     """Where an internal error comes from."""
 
     @property
     def is_news(self) -> bool:
-        """Whether something is wrong that nobody was told before, or accepted."""
+        """Whether something is wrong that nobody was told before, or acknowledged."""
         is_wrong = self.status == "failed" or bool(select_problems(self.findings))
-        return is_wrong and not self.known and not self.accepted
+        return is_wrong and not self.known and not self.acknowledged
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -77,7 +77,7 @@ class Status:
     """Sources that cannot be read and that only calls before the latest ingest were given."""
     superseded_runs: int
     begun: tuple[BegunCall, ...]
-    """Calls that have begun and not ended: they run, perhaps run, or were killed and nobody accepted that."""
+    """Calls that have begun and not ended: they run, perhaps run, or were killed and nobody acknowledged that."""
     history: tuple[Call, ...]
     """The latest calls, the last one first."""
     verdict: Verdict

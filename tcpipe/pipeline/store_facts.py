@@ -24,13 +24,13 @@ def store_facts(store: Store, found: Ingestions, *, will_be: Sequence[RunDirecto
     here = (entry.name.split("/") for entry in store.runs_place.entries("", but="streams"))
     pages = {(parts[0], parts[1]) for parts in here if len(parts) == 3 and parts[2] == REPORT}
     state = found.state
-    accepted = {run.run_id for run in found.finished if is_acknowledged(problems_of(run.facts), state)}
+    known = {run.run_id for run in found.finished if is_acknowledged(problems_of(run.facts), state)}
     key = ruling_key(found)
     current = [run.facts for run in found.finished if run.facts.ingest_key == key]
     return StoreFacts(
         where=str(store.root),
         found=found,
-        accepted=frozenset(accepted),
+        acknowledged=frozenset(known),
         pages=frozenset(pages | {(run.run_id, run.recipe_id) for run in will_be}),
         datasets=tuple(_dataset(store, made) for made in state.datasets.values()),
         verdict=judge_runs(current),
@@ -58,7 +58,9 @@ def _failed(state: State) -> Iterator[FailedLog]:
         if of.content not in contents:
             names.add(name := " + ".join(of.log))
             acknowledged = is_acknowledged([failure_of(of.content, of.log)], state)
-            yield FailedLog(name, "".join(of.problems[:1]), "accepted" if acknowledged else "failed for what it holds")
+            yield FailedLog(
+                name, "".join(of.problems[:1]), "acknowledged" if acknowledged else "failed for what it holds"
+            )
     for name, why in failed_for_now(state.calls).items():
         if name not in names:
             yield FailedLog(name, why, "failed for now")

@@ -198,7 +198,7 @@ def _trouble(store: StoreFacts, runs: Sequence[StoredRun]) -> list[Section]:
             rows.append((run.run_id, run.state, _trouble_of(run.facts) if run.facts else line))
     if not rows:
         return []
-    text = "'tcpipe accept' sets aside what cannot be mended."
+    text = "'tcpipe acknowledge' marks what cannot be repaired."
     if len(rows) > _MOST_LISTED:
         text += f" The first {_MOST_LISTED} of {len(rows)}; the table above has every run."
     header = ("log or run", "is", "why")

@@ -44,8 +44,8 @@ class StoreFacts:
 
     where: str
     found: Ingestions
-    accepted: frozenset[str]
-    """Runs whose trouble a person has accepted."""
+    acknowledged: frozenset[str]
+    """Runs whose problems a person has acknowledged."""
     pages: frozenset[tuple[str, str]]
     """Ingestions, by run and recipe, that have a page."""
     datasets: tuple[StoredDataset, ...]
@@ -74,7 +74,7 @@ class StoredRun:
     @property
     def is_current(self) -> bool:
         """Tell whether it counts: it is of the ruling recipe, and nothing has taken its place."""
-        return self.state.removesuffix(", accepted") in (GOOD, "damaged", "empty")
+        return self.state.removesuffix(", acknowledged") in (GOOD, "damaged", "empty")
 
     @property
     def begin_ns(self) -> int:
@@ -136,7 +136,7 @@ def runs_shown(store: StoreFacts) -> list[StoredRun]:
         StoredRun(
             run_id,
             recipe_id,
-            _state(facts, ruling, accepted=run_id in store.accepted),
+            _state(facts, ruling, acknowledged=run_id in store.acknowledged),
             facts,
             f"runs/{run_id}/{recipe_id}/{_PAGE}" if (run_id, recipe_id) in store.pages else "",
             tuple(members.get((run_id, recipe_id), ())),
@@ -159,13 +159,13 @@ def ruling_key(found: Ingestions) -> str | None:
     return max(keys, key=lambda key: (keys[key], latest[key], key), default=None)
 
 
-def _state(facts: RunFacts, ruling: str | None, *, accepted: bool) -> str:
+def _state(facts: RunFacts, ruling: str | None, *, acknowledged: bool) -> str:
     if facts.superseded_by:
         return f"superseded by {facts.superseded_by}"
     if facts.ingest_key != ruling:
         return "of another recipe"
     wrong = "damaged" if facts.damage else "empty" if facts.is_empty else ""
-    return f"{wrong}{', accepted' * accepted}" if wrong else GOOD
+    return f"{wrong}{', acknowledged' * acknowledged}" if wrong else GOOD
 
 
 def _percent(share: float | None) -> float | None:

@@ -38,7 +38,7 @@ DATA_MODEL_VERSION = "3.0"
 READ_VERSIONS = (DATA_MODEL_VERSION,)
 """Versions whose documents are read as they are."""
 
-EARLIER_VERSIONS = ("2.0", "2.1", "2.2")
+EARLIER_VERSIONS = ("2.0", "2.1")
 """Versions that `tcpipe migrate` brings to the current one."""
 
 TABLES_VERSION = "2.1"  # in which a table last changed

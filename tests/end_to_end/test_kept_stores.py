@@ -176,7 +176,7 @@ def test_sentences_of_manifests_and_cards_become_findings():
     assert brought["verdict"]["position"] == "usable", "a note changes no verdict"
     assert migrating._bring_document(brought, "manifest-1.json") is brought
     card = {
-        "data_model_version": "2.2", "name": "d", "problems": [WARNED[0]], "warnings": [WARNED[1]], "findings": [{"example": "x"}],
+        "data_model_version": "2.1", "name": "d", "problems": [WARNED[0]], "warnings": [WARNED[1]], "findings": [{"example": "x"}],
         "runs": [{"run_id": "a", "warnings": list(WARNED)}], "maps": [{"name": "m", "warnings": []}],
     }  # fmt: skip
     brought = migrating._bring_document(card, "dataset.json")

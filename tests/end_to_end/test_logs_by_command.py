@@ -122,7 +122,7 @@ def test_a_night_with_known_trouble_is_no_red_night(tmp_path):
     assert again.stdout.splitlines()[-3:] == [
         "nothing to do: 2 of 3 logs are in tcpipe-store already",
         "1 known failure, not tried again; --retry-failed tries it",
-        "1 known to be damaged or empty; 'tcpipe accept RUN' when it has been looked at",
+        "1 known to be damaged or empty; 'tcpipe acknowledge RUN' when it has been looked at",
     ]
     (run_id,) = {path.name for path in (tmp_path / "tcpipe-store" / "runs").glob("cut-*")}
     refused = plain_lines(tcpipe("acknowledge", run_id, "nosuch", cwd=tmp_path), 2, most=1)
@@ -134,7 +134,7 @@ def test_a_night_with_known_trouble_is_no_red_night(tmp_path):
         True,
     )
     retried = tcpipe("ingest", "logs", "--retry-failed", cwd=tmp_path)
-    assert (retried.returncode, retried.stdout.splitlines()[-1]) == (0, "2 with accepted trouble")
+    assert (retried.returncode, retried.stdout.splitlines()[-1]) == (0, "2 with acknowledged problems")
 
 
 def test_each_log_is_told_as_it_ends(tmp_path):

@@ -130,7 +130,7 @@ def compare(logs, store, worked, **how):
             assert result.status == "unchanged"
             assert not result.is_news
         elif standing in ("failed_permanent", "quarantined"):
-            assert (result.status, result.known, result.accepted) == ("failed", True, standing == "quarantined")
+            assert (result.status, result.known, result.acknowledged) == ("failed", True, standing == "quarantined")
         elif standing == "growing":
             assert result.status == "waiting"
     if not worked:

@@ -94,7 +94,7 @@ def test_a_first_night_that_is_killed_is_a_problem_and_the_next_one_deals_with_i
     (finding,) = json.loads(found.stdout)["problems"]
     assert (finding["code"], finding["names"]["command"]) == ("call-killed", "ingest")
     lines = CliRunner().invoke(cli, ["status", str(tmp_path / "store")], standalone_mode=False).stderr
-    assert "was killed. To accept it: 'tcpipe acknowledge call-1' [call-killed]" in lines
+    assert "was killed. To acknowledge it: 'tcpipe acknowledge call-1' [call-killed]" in lines
     assert json.loads(found.stdout)["counts"] == {"pending": 2}
     assert ingest([logs], store=tmp_path / "store", recipe=Recipe()).exit_code == 0
     assert (told(tmp_path / "store").exit_code, told(tmp_path / "store").begun) == (0, ())

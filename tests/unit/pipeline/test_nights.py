@@ -191,13 +191,13 @@ def test_damage_is_news_once_and_accepted_trouble_is_counted_apart(tmp_path, nig
         acknowledge([run_id, "nosuch", found["other.mcap"].run_id], store=tmp_path / "store")
     assert [line.split(":")[0] for line in caught.value.problems] == ["nosuch", found["other.mcap"].run_id]
     assert f"known problems: {junk}, {run_id}" in caught.value.problems[0]
-    assert not found["cut.mcap"].accepted
+    assert not found["cut.mcap"].acknowledged
     done = acknowledge([run_id, str(junk)], store=tmp_path / "store")
     assert [problem.name for problem in done.acknowledged] == [run_id, str(junk)]
     second = acknowledge(["junk.bag"], store=tmp_path / "store")
     assert (second.acknowledged, [problem.name for problem in second.before]) == ((), [str(junk)])
     found, code = night(retry_failed=True, force=True)
-    assert (code, found["cut.mcap"].accepted, found["junk.bag"].accepted) == (0, True, True)
+    assert (code, found["cut.mcap"].acknowledged, found["junk.bag"].acknowledged) == (0, True, True)
     copy_part(tmp_path / "whole.mcap", cut, 0.5)
     assert night()[1] == 3  # that is another damage
     checked = verify(tmp_path / "store")

@@ -173,7 +173,7 @@ def test_a_failure_that_was_acknowledged_is_tried_again_under_another_recipe_and
     assert told(other) == ("pending", f"{why}, acknowledged; to be tried again")
     assert told(Recipe(), retry_failed=True) == ("pending", "failed before, acknowledged; to be tried again")
     again = ingest([logs], store=store, recipe=other)
-    assert [(of.status, of.accepted) for of in again.results] == [("failed", True)]
+    assert [(of.status, of.acknowledged) for of in again.results] == [("failed", True)]
     assert again.exit_code == 0
     assert told(other)[0] == "quarantined"
     for module in (ingest_task, plan_module):

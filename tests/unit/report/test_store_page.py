@@ -119,7 +119,7 @@ def test_what_failed_is_named_until_its_content_gives_a_run_or_a_person_acknowle
     assert "b.mcap" not in part
     acknowledge(["/logs/junk"], store=store.root)
     part = shown(store)[1].split("<h2>Failed, damaged and empty</h2>")[1].split("</section>")[0]
-    assert "<td>accepted</td>" in part
+    assert "<td>acknowledged</td>" in part
 
 
 def test_names_are_text_and_pages_are_led_to_where_they_are(store):
