@@ -7,7 +7,7 @@ the stage `read` the tables that a log on disk would give, and the stages from t
 from __future__ import annotations
 
 import traceback
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any
@@ -17,6 +17,7 @@ import pyarrow as pa
 import pyproj
 
 from tcpipe.errors import TcpipeError
+from tcpipe.formats.finding_lines import format_finding
 from tcpipe.formats.logs.writing import MessageStream
 from tcpipe.formats.robot_files import shipped_profiles
 from tcpipe.logs.messages import needed_fields
@@ -33,6 +34,7 @@ from tcpipe.stages.read import read_run
 from tcpipe.tables.arrays import numbers
 from tcpipe.tables.bits import Quality, name_of
 from tcpipe.tables.columns import floats, integers
+from tcpipe.tables.findings import Finding
 from tcpipe.tables.levels import LabelledSegments, Streams
 
 Readings = Mapping[str, Reading]
@@ -225,11 +227,27 @@ def outcome_of(drive: Drive, sensors: Sensors, fault: Fault) -> Outcome:
         read = read_run(log_of(drive, sensors, fault), recipe.read, robot="husky", known=shipped_profiles())
         _, _, labelled = run_stages(read, recipe.ingest, run_id="run")
     except TcpipeError as error:
-        return Outcome([], _nothing(), _nothing(), [], [], 0.0, true_m, float("nan"), 0.0, list(error.problems))
+        return Outcome(
+            [],
+            _nothing(),
+            _nothing(),
+            [],
+            [],
+            0.0,
+            true_m,
+            float("nan"),
+            0.0,
+            [*error.problems, *said_of(error.findings)],
+        )
     except Exception as error:  # noqa: BLE001  the campaign is to find them
         trace, said = traceback.format_exc(), [f"{type(error).__name__}: {error}"]
         return Outcome([], _nothing(), _nothing(), [], [], 0.0, true_m, float("nan"), 0.0, said, trace)
     return _compared(labelled, read, drive, fault, max_std_m=recipe.sample.max_position_std_m)
+
+
+def said_of(findings: Iterable[Finding]) -> list[str]:
+    """Return the findings as lines with their codes."""
+    return [format_finding(finding) for finding in dict.fromkeys(findings)]
 
 
 def _nothing() -> dict[str, list[float]]:
@@ -255,7 +273,7 @@ def _compared(labelled: LabelledSegments, read: Streams, drive: Drive, fault: Fa
         start_s=drive.seconds(start_ns).tolist(), error=error, claimed=claimed,
         bits=numbers(table["quality"]).tolist(), placed=placed.tolist(),
         driven_m=sum(labelled.ledger_m.values()), true_m=float(drive.truth.distance_m[-1]), wheels_m=wheels_m(read),
-        kept_m=labelled.ledger_m.get("kept", 0.0), said=list(dict.fromkeys(labelled.info.report.findings)),
+        kept_m=labelled.ledger_m.get("kept", 0.0), said=said_of(labelled.info.report.findings),
     )  # fmt: skip
 
 

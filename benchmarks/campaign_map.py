@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import rasterio
+from campaign_drives import said_of
 from rasterio import Affine
 
 from tcpipe import add_map, build_dataset, ingest, open_dataset
@@ -38,7 +39,7 @@ class MapResult:
     @property
     def failures(self) -> list[str]:
         """What is not as it should be."""
-        told = self.refused or any(re.search(r"\b(feet|foot)\b", line) for line in self.said)
+        told = self.refused or any(re.search(r"\b(feet|foot)\b|map-height-scale", line) for line in self.said)
         return [] if told or self.slope_rms_deg < 2.0 else [f"slopes {self.slope_rms_deg:.0f} deg off, feet not named"]
 
 
@@ -50,7 +51,7 @@ def map_in_feet(*, in_feet: bool = True) -> MapResult:
         store, height = Path(folder) / "store", site.rasters["height"]
         if in_feet:
             height = _write_feet(Path(folder) / "dem.tif", scenario.world)
-        said = [line for result in ingest(site.logs, store=store).results for line in result.warnings]
+        said = [line for result in ingest(site.logs, store=store).results for line in said_of(result.findings)]
         try:
             added = add_map("site", height=height, store=store)
             built = build_dataset(Path(folder) / "dataset", store=store)

@@ -129,7 +129,7 @@ def _run() -> NoReturn:
         command = error.ctx.command_path if error.ctx else "tcpipe"
         _fail([f"{error.format_message().rstrip('.')} (see {command} --help)"], error.exit_code)
     except TcpipeError as error:
-        _fail(error.problems, error.exit_code)
+        _fail([*error.problems, *_list_causes(error)], error.exit_code)
     except BrokenPipeError:
         _drop_stdout()
         sys.exit(1)
@@ -139,6 +139,15 @@ def _run() -> NoReturn:
     except Exception as error:  # noqa: BLE001  the last resort
         _fail([_unforeseen(error)], 1)
     sys.exit(code if isinstance(code, int) else 0)
+
+
+def _list_causes(error: TcpipeError) -> list[str]:
+    """Return the findings that an error carries as lines."""
+    if not error.findings:
+        return []
+    from tcpipe.formats.finding_lines import format_findings
+
+    return format_findings(error.findings)
 
 
 def _unforeseen(error: Exception) -> str:

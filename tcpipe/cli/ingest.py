@@ -122,6 +122,9 @@ def _of_one(result: IngestResult, store: Path | str, *, several: bool) -> Iterat
         yield f"  {in_words(budget)}"
     yield from (f"  {note}" for note in result.notes)
     yield from (f"  damage:  {line}" for line in result.damage if result.is_news or result.status == "damaged")
+    if result.status == "failed" and result.is_news:
+        causes = [finding for finding in result.findings if finding.code != "log-failed"]
+        yield from (f"  {line}" for line in format_findings(causes))
     if result.verdict is None:
         return
     if is_new and not several:

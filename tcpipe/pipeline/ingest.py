@@ -18,6 +18,7 @@ from tcpipe.execution import run_all
 from tcpipe.formats.atomic import scratch_directory
 from tcpipe.formats.commit_log import keep_state_here, uncollected
 from tcpipe.formats.commits import Call, Entries, Failure, Kind, State
+from tcpipe.formats.index_files import RunFacts
 from tcpipe.formats.object_storage import is_presigned, is_url
 from tcpipe.formats.recipe_toml import ingest_key, recipe_of
 from tcpipe.formats.robot_files import profiles_of
@@ -260,14 +261,22 @@ def _commit(log: LogWriter, ended: Sequence[tuple[int, IngestTask, Ingested]]) -
     for index, _, of in ended:
         result = replace(of.result, notes=(*of.result.notes, *notes[index]))
         if by := others.get(str(result.run_id)):
-            problem = (
-                f"{result.log}: another call ingested the same recording as run {by} at the same time; run it again"
-            )
-            findings = find_failure(result.log, "StoreError")
-            result = IngestResult(
-                result.log, "failed", findings=findings, problems=(problem,), sha256=result.sha256, transient=True
-            )
+            result = _settle_for(log.state.runs.get((by, str(result.recipe_id))), by, result, of.source)
         yield index, _judged(log.state, result, of.source, before=before)
+
+
+def _settle_for(made: RunFacts | None, run_id: str, result: IngestResult, source: LogSource) -> IngestResult:
+    """Return what becomes of a log whose content another call has committed as ``run_id`` meanwhile: that run, if it is of this recipe."""
+    if made is not None and made.log is not None:
+        same_as = " + ".join(made.log.source.paths)
+        return result_of(source, "unchanged", made, str(result.sha256), same_as=same_as)
+    problem = (
+        f"{result.log}: another call ingested the same log as run {run_id} at the same time; run the command again"
+    )
+    findings = find_failure(result.log, "StoreError")
+    return IngestResult(
+        result.log, "failed", findings=findings, problems=(problem,), sha256=result.sha256, transient=True
+    )
 
 
 def _entries_of(log: LogWriter, task: IngestTask, of: Ingested) -> tuple[Entries, tuple[str, ...]]:

@@ -143,10 +143,11 @@ def told(task: IngestTask, act: Callable[[IngestTask], R]) -> R | IngestResult:
         for line in "".join(traceback.format_exception(error)).splitlines():
             logger.debug("%s: %s", task.source.name, line)
         problems, trace = _in_words(error, task.source)
+        causes = error.findings if isinstance(error, TcpipeError) else ()
         return IngestResult(
             task.source.name,
             "failed",
-            findings=find_failure(task.source.name, type(error).__name__),
+            findings=(*find_failure(task.source.name, type(error).__name__), *causes),
             problems=problems,
             transient=is_transient(error) or not task.source.files,
             traceback=trace,

@@ -190,13 +190,13 @@ def preflight(
         record = record_command(topics, kept)
         record += "" if cast.transforms or not record else f" {_TRANSFORMS}"
         missing = tuple(find_missing(cast.roles, read))
-        labelled, problems = None, tuple[str, ...]()
+        labelled, problems, causes = None, tuple[str, ...](), tuple[Finding, ...]()
         try:
             streams = read_run(found, read, robot=robot, known=profiles_of(recipe))
             labelled = run_stages(streams, recipe.ingest, run_id="preflight")[2]
         except TcpipeError as error:
-            problems = error.problems
-    return _summarize(seen, labelled, missing, record=record, large=large, problems=problems)
+            problems, causes = error.problems, error.findings
+    return _summarize(seen, labelled, (*missing, *causes), record=record, large=large, problems=problems)
 
 
 def _summarize(

@@ -24,7 +24,7 @@ from stored_files import only_run, tables
 
 from tcpipe.formats.logs.writing import MessageStream, write_mcap
 from tcpipe.simulation import Faults, SimulatedSite, simulate, tiny
-from tcpipe.store import Store
+from tcpipe.store import Store, open_store
 
 _SECONDS = (32.0, 17.0, 17.0)
 
@@ -500,7 +500,7 @@ def test_two_at_once_on_one_store_do_not_harm_each_other(logs: list[Path], tmp_p
     for process in running:
         _, told = process.communicate(timeout=HANGS_S)
         assert process.returncode == 0, told
-    assert len(list(tmp_path.glob("tcpipe-store/runs/*/*/manifest-*.json"))) == 2
-    assert len(list(tmp_path.glob("tcpipe-store/records/logs/*/*.json"))) == 3
+    state = open_store(tmp_path / "tcpipe-store").state()
+    assert (len(state.runs), len(state.seen)) == (2, 3)
     assert not list(tmp_path.rglob(".tmp-*"))
     assert "nothing to do: 3 of 3" in _run("ingest", *batches[0], *batches[1], cwd=tmp_path)

@@ -1,5 +1,6 @@
 """Power that no topic plays, or that is refused: the recipe as the commands print it gives labels with energy."""
 
+import tomllib
 from dataclasses import replace
 
 import numpy as np
@@ -63,7 +64,8 @@ def test_bare_numbers_are_read_by_the_recipe_as_it_is_printed(drive, tmp_path, k
     write_mcap(log, floats_of(drive, kind))
     told = {name: run(name, log).output for name in ("inspect", "preflight")}
     told["ingest"] = run("ingest", log, "--store", tmp_path / "without").output
-    (block,) = {block_of(output) for output in told.values()}
+    block, *others = (block_of(output) for output in told.values())
+    assert all(tomllib.loads(other) == tomllib.loads(block) for other in others)
     for output in told.values():
         assert any("/bus/voltage" in line for line in output.splitlines() if line.endswith("[power-candidates]"))
     record = next(line for line in told["preflight"].splitlines() if line.startswith("record"))

@@ -119,7 +119,7 @@ def test_of_two_who_make_a_run_the_first_wins_and_what_replaces_it_is_a_new_numb
     assert write("mine") == ()
     assert write("mine", force=True) == ("mine",)
     assert write("mine", force=True) == ("mine",)
-    assert store.runs()[0].manifest.warnings == (), "no commit names the new one yet"
+    assert store.runs()[0].manifest.damage == (), "no commit names the new one yet"
     commit_run(store, RUN)
     assert store.runs()[0].place.files() == ["manifest-1.json", "manifest-2.json"]
     assert store.runs()[0].manifest.damage == ("mine",)

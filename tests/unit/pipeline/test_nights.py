@@ -294,8 +294,8 @@ def test_of_two_calls_that_ingest_one_recording_under_two_names_the_first_commit
 
     monkeypatch.setattr(ingest_module, "_entries_of", meanwhile)
     found, code = night()
-    assert (found["second.mcap"].status, found["second.mcap"].transient, code) == ("failed", True, 3)
-    assert "another call ingested the same recording as run first-" in found["second.mcap"].problems[0]
+    assert (found["second.mcap"].status, code) == ("unchanged", 0)
+    assert found["second.mcap"].same_as == str(tmp_path / "elsewhere" / "first.mcap")
     found, code = night()
     assert (found["second.mcap"].status, code) == ("unchanged", 0)
     assert str(found["second.mcap"].run_id).startswith("first-")
