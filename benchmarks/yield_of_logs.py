@@ -15,7 +15,7 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).parent))
 
 import numpy as np
-from campaign_drives import wheels_m
+from campaign_drives import said_of, wheels_m
 from campaign_figures import OF_THE_DRIVE
 
 from tcpipe.errors import TcpipeError
@@ -46,7 +46,7 @@ def ladder(path: Path, robot: str | None) -> Ladder:
             streams = read_run(log, recipe.read, robot=robot, known=shipped_profiles())
         _, _, labelled = run_stages(streams, recipe.ingest, run_id="run")
     except TcpipeError as error:
-        return Ladder((np.nan, *[0.0] * (len(HEAD) - 1)), tuple(error.problems))
+        return Ladder((np.nan, *[0.0] * (len(HEAD) - 1)), (*error.problems, *said_of(error.findings)))
     table, ledger_m = labelled.table, labelled.ledger_m
     power = np.isfinite(floats(table, "energy_joule"))
     sure = (numbers(table["quality"]).astype(np.int64) & ~int(OF_THE_DRIVE)) == 0
@@ -55,7 +55,9 @@ def ladder(path: Path, robot: str | None) -> Ladder:
     arc_m = floats(table, "arc_length_m")
     chosen = (np.ones_like(power), power, sure, sure & placed)
     steps_m = (wheels_m(streams), sum(ledger_m.values()), ledger_m.get("kept", 0.0))
-    return Ladder((*steps_m, *(float(arc_m[rows].sum()) for rows in chosen)), labelled.info.report.findings)
+    return Ladder(
+        (*steps_m, *(float(arc_m[rows].sum()) for rows in chosen)), tuple(said_of(labelled.info.report.findings))
+    )
 
 
 def main() -> None:
