@@ -10,6 +10,7 @@ from tcpipe import __version__
 from tcpipe.formats.maps.map_files import open_map
 from tcpipe.formats.recipe_toml import ingest_key, recipe_id
 from tcpipe.formats.run_documents import Counts, LogOrigin, Manifest, RunJson
+from tcpipe.pipeline.log_writer import commit_run
 from tcpipe.pipeline.maps import add_map
 from tcpipe.recipe import Recipe
 from tcpipe.simulation.scenarios import scenario
@@ -28,6 +29,7 @@ from tcpipe.tables.levels import (
     Track,
     TrackInfo,
 )
+from tcpipe.tables.verdicts import Verdict
 from tcpipe.tables.wkb import line_column
 
 RUN_ROWS = 3_300
@@ -123,7 +125,7 @@ def _add_run(store: Store, number: int, rows: int) -> None:
         tags={},
         counts=Counts(rows),
         ledger_m=ledger_m,
-        warnings=(),
+        verdict=Verdict(),
         damage=(),
         info=info,
     )
@@ -133,3 +135,4 @@ def _add_run(store: Store, number: int, rows: int) -> None:
         gated=GatedTrack(GATED_TRACK.empty(), info),
         labelled=LabelledSegments(table, info, ledger_m),
     )
+    commit_run(store, run_id)
