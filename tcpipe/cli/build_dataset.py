@@ -6,12 +6,12 @@ from typing import cast
 
 import click
 
-from tcpipe.cli.options import json_option, options_of, quiet_option
+from tcpipe.cli.options import add_options, json_option, quiet_option
 from tcpipe.pipeline.dataset.build_dataset_options import BuildDatasetOptions
 
 
 @click.command("build-dataset", short_help="Segments and map to a dataset")
-@options_of(BuildDatasetOptions)
+@add_options(BuildDatasetOptions)
 @json_option
 @quiet_option
 def build_dataset(options: BuildDatasetOptions, *, as_json: bool, quiet: bool) -> int:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import click
 
-from tcpipe.cli.options import json_option, options_of, quiet_option
+from tcpipe.cli.options import add_options, json_option, quiet_option
 from tcpipe.learning.evaluate_options import EvaluateOptions
 
 
 @click.command(short_help="Measure a model, beside the paper's tables")
-@options_of(EvaluateOptions)
+@add_options(EvaluateOptions)
 @json_option
 @quiet_option
 def evaluate(options: EvaluateOptions, *, as_json: bool, quiet: bool) -> None:

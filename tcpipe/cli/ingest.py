@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, cast
 
 import click
 
-from tcpipe.cli.options import dry_run_option, options_of, quiet_option
+from tcpipe.cli.options import add_options, dry_run_option, quiet_option
 from tcpipe.cli.output import say
 from tcpipe.pipeline.ingest_options import IngestOptions
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 @click.command(short_help="Logs to labelled 1 m segments")
-@options_of(IngestOptions)
+@add_options(IngestOptions)
 @dry_run_option
 @click.option("--json", "as_json", is_flag=True, help="Print a JSON object for each log as it ends, and one of all.")
 @quiet_option

@@ -221,7 +221,7 @@ def parameter(name: str, default: Any, shown: options.Option) -> Option:
     return click.option(*flags, name, help=shown.about or None, envvar=shown.envvar, multiple=multiple, **settings)
 
 
-def options_of(cls: type[Any]) -> Option:
+def add_options(cls: type[Any]) -> Option:
     """Return what gives a command the options that a dataclass declares; it takes them as one such object.
 
     What is not given has the default of the dataclass, which may be another than the one that is shown.
@@ -279,14 +279,9 @@ def robot_option(about: str = "Robot profile.") -> Option:
     return click.option("--robot", metavar="NAME", shell_complete=complete_robots, help=about)
 
 
-def tag_option(about: str) -> Option:
-    """Return ``--tag``, which may be repeated."""
-    return click.option("--tag", "tags", multiple=True, metavar="K=V", callback=tag_values, help=about)
-
-
 def jobs_option(about: str) -> Option:
     """Return ``--jobs``."""
-    return click.option("--jobs", "-j", default=1, type=click.IntRange(1, 1024), help=f"{about} side by side.")
+    return parameter("jobs", 1, options.jobs(about).metadata["option"])
 
 
 def min_age_option(default: str, about: str) -> Option:

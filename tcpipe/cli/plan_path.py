@@ -6,12 +6,12 @@ from dataclasses import replace
 
 import click
 
-from tcpipe.cli.options import json_option, options_of, quiet_option
+from tcpipe.cli.options import add_options, json_option, quiet_option
 from tcpipe.planning.path_options import PlanPathOptions
 
 
 @click.command("plan-path", short_help="The path of least energy, time or distance")
-@options_of(PlanPathOptions)
+@add_options(PlanPathOptions)
 @json_option
 @quiet_option
 def plan_path(options: PlanPathOptions, *, as_json: bool, quiet: bool) -> int:

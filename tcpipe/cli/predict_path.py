@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import click
 
-from tcpipe.cli.options import json_option, options_of, quiet_option
+from tcpipe.cli.options import add_options, json_option, quiet_option
 from tcpipe.planning.path_options import PredictPathOptions
 
 
 @click.command("predict-path", short_help="Time and energy of a path")
-@options_of(PredictPathOptions)
+@add_options(PredictPathOptions)
 @json_option
 @quiet_option
 def predict_path(options: PredictPathOptions, *, as_json: bool, quiet: bool) -> int:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import click
 
-from tcpipe.cli.options import json_option, options_of, quiet_option
+from tcpipe.cli.options import add_options, json_option, quiet_option
 from tcpipe.learning.train_options import TrainOptions
 
 
 @click.command(short_help="Train a model on a dataset")
-@options_of(TrainOptions)
+@add_options(TrainOptions)
 @json_option
 @quiet_option
 def train(options: TrainOptions, *, as_json: bool, quiet: bool) -> None:

@@ -202,7 +202,7 @@ class State:
     runs: Mapping[tuple[str, str], RunFacts] = field(default_factory=dict)
     """By run and recipe."""
     seen: Mapping[str, tuple[Sighting, ...]] = field(default_factory=dict)
-    """By `lineage_of` the log."""
+    """By `find_lineage` the log."""
     failed: Mapping[str, Failure] = field(default_factory=dict)
     """By key."""
     acknowledged: Mapping[str, Problem] = field(default_factory=dict)
@@ -229,20 +229,20 @@ class State:
         """Runs that another has taken the place of, or did once, and those others."""
         return {name for of in self.supersessions for name in (of.run_id, of.by) if name}
 
-    def rows_of(self, run_id: str) -> list[RunFacts]:
+    def find_rows(self, run_id: str) -> list[RunFacts]:
         """Return the ingestions of a run."""
         return [row for (name, _), row in self.runs.items() if name == run_id]
 
-    def run_of(self, sha256: str) -> str | None:
+    def find_run(self, sha256: str) -> str | None:
         """Return the run of a content; None where there is none."""
         return next((row.run_id for row in self.runs.values() if row.log and row.log.source.sha256 == sha256), None)
 
     def has_seen(self, sighting: Sighting) -> bool:
         """Return whether a log was seen as it is now."""
-        return sighting in self.seen.get(lineage_of(sighting.log), ())
+        return sighting in self.seen.get(find_lineage(sighting.log), ())
 
 
-def lineage_of(log: tuple[str, ...]) -> str:
+def find_lineage(log: tuple[str, ...]) -> str:
     """Return what identifies the place of a log; a recording that is finished (``.active`` goes) stays where it was."""
     return "\n".join(path.removesuffix(_UNFINISHED) for path in log)
 
@@ -260,7 +260,7 @@ def fold(commits: Iterable[Commit], state: State | None = None) -> State:
         _supersede(runs, gone, of.superseded)
         _add_runs(runs, gone, commit)
         for sighting in of.seen:
-            lineage = lineage_of(sighting.log)
+            lineage = find_lineage(sighting.log)
             seen[lineage] = (*(old for old in seen.get(lineage, ()) if old != sighting), sighting)
         failed.update({failure.key: failure for failure in of.failed})
         acknowledged.update({problem.key: problem for problem in of.acknowledged})

@@ -19,7 +19,7 @@ from tcpipe.splits.audit import HeldOut
 from tcpipe.splits.holdouts import Holdout
 from tcpipe.tables.facts import ABSENT, EnergyBudget, PhysicsFit
 from tcpipe.tables.findings import LEFT_OUT, Finding
-from tcpipe.tables.verdicts import Verdict, judge
+from tcpipe.tables.verdicts import Verdict, judge_by_code
 from tcpipe.terrain.classes import TerrainClass
 
 KIND = "tcpipe dataset"
@@ -309,10 +309,9 @@ class DatasetCard:
 
 def judge_dataset(findings: Iterable[Finding], runs: Iterable[RunSource], maps: Iterable[MapSource]) -> Verdict:
     """Return the verdict on a dataset, with the worst finding of each code as its reasons; a run without samples changes nothing."""
-    of_runs = ((run.run_id, run.findings) for run in runs if run.samples)
-    of_maps = ((source.name, source.findings) for source in maps)
-    groups = group_findings([("", findings), *of_runs, *of_maps])
-    return judge(group.findings[0] for group in groups)
+    of_runs = (finding for run in runs if run.samples for finding in run.findings)
+    of_maps = (finding for source in maps for finding in source.findings)
+    return judge_by_code([*findings, *of_runs, *of_maps])
 
 
 def group_dataset_findings(

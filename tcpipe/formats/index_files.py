@@ -22,7 +22,7 @@ from tcpipe.tables.arrays import column_of
 from tcpipe.tables.catalogue import AFFECTED
 from tcpipe.tables.facts import EnergyBudget, PhysicsFit
 from tcpipe.tables.findings import Finding, select_findings
-from tcpipe.tables.verdicts import Verdict, judge_again
+from tcpipe.tables.verdicts import Verdict, judge
 
 RUNS = "runs.parquet"
 
@@ -70,7 +70,6 @@ class RunFacts:
     driven_m: float
     kept_m: float
     findings: tuple[Finding, ...]
-    verdict: Verdict
     damage: tuple[str, ...]
     energy_budget: EnergyBudget | None
     segments_sha256: str
@@ -97,6 +96,11 @@ class RunFacts:
     """Terms of the fit of power and their standard deviations, in SI, by ``term`` or, of one class of terrain, ``term on terrain``."""
 
     @property
+    def verdict(self) -> Verdict:
+        """What its findings say by the catalogue of now."""
+        return judge(self.findings)
+
+    @property
     def is_empty(self) -> bool:
         """Whether there is no segment though the robot drove."""
         return bool(select_findings(self.findings, "no-segments"))
@@ -117,7 +121,6 @@ def facts_of(manifest: Manifest, name: str, files: Mapping[str, int]) -> RunFact
         kept_m=manifest.ledger_m.get("kept", 0.0),
         energy_budget=None if label is None else label.energy_budget,
         findings=manifest.info.report.findings,
-        verdict=judge_again(manifest.verdict, manifest.info.report.findings),
         segments_sha256=manifest.checksums[named["segments.parquet"]].sha256,
         segments_file=f"{place}/{named['segments.parquet']}",
         track_file=f"{place}/{named['track.parquet']}",
@@ -166,7 +169,7 @@ def _cell(row: RunFacts, name: str) -> object:
     if name == "findings":
         return [{"code": of.code, "severity": of.severity} for of in row.findings]
     if name == "verdict":
-        return {label: getattr(row.verdict, label) for label in AFFECTED}
+        return {label: getattr(value, label) for label in AFFECTED}
     return value
 
 

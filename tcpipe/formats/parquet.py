@@ -91,14 +91,6 @@ def _damage_of(where: Path | str) -> Iterator[None]:
         raise StoreError(f"{where}: not a readable Parquet file ({reason}); rebuild it") from None
 
 
-def parquet_of(data: bytes, where: str, columns: list[str]) -> pa.Table:
-    """Return columns of the table in the bytes of a Parquet file that lies at ``where``; `StoreError` names one that cannot be read."""
-    with _damage_of(where):
-        return _bounded(
-            pa.py_buffer(data), columns, use_threads=False
-        )  # threads could outlive a command that ends at once
-
-
 def read_table(path: Path, columns: list[str] | None = None) -> pa.Table:
     """Read a Parquet file with its schema metadata; `StoreError` names a file that cannot be read."""
     with _damage_of(path), pa.memory_map(str(path)) as file:
@@ -111,9 +103,7 @@ def read_row_group(path: Path, group: int, columns: list[str]) -> pa.Table:
         return _bounded(file.read_buffer(), columns, group)
 
 
-def _bounded(
-    data: pa.Buffer, columns: list[str] | None, group: int | None = None, *, use_threads: bool = True
-) -> pa.Table:
+def _bounded(data: pa.Buffer, columns: list[str] | None, group: int | None = None) -> pa.Table:
     """Return columns of a file, or of one of its row groups, once they are known to be in proportion to it; `ValueError` if not."""
     about = pq.read_metadata(pa.BufferReader(data))
     most = max(MOST_BYTES, MOST_TIMES * data.size)
@@ -130,7 +120,7 @@ def _bounded(
     ]
     source = pa.BufferReader(data)
     with pq.ParquetFile(source, metadata=about, read_dictionary=texts, page_checksum_verification=True) as file:
-        table = file.read_row_groups(groups, columns, use_threads=use_threads)
+        table = file.read_row_groups(groups, columns)
     for at, field in enumerate(table.schema):  # a text that occurs in many rows lies here once so far
         if pa.types.is_dictionary(field.type):
             size += sum(_text_bytes(chunk) for chunk in table.column(at).chunks)

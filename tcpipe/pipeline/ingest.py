@@ -42,7 +42,7 @@ from tcpipe.pipeline.log_sources import (
 )
 from tcpipe.pipeline.log_writer import LogWriter, open_log
 from tcpipe.pipeline.plan import Step, plan
-from tcpipe.pipeline.problems import failure_of, is_acknowledged, problems_of
+from tcpipe.pipeline.problems import find_problems, is_acknowledged, make_failure
 from tcpipe.pipeline.supersession import superseded_by
 from tcpipe.store import Store, open_store
 from tcpipe.tables.findings import select_problems
@@ -209,7 +209,7 @@ def _results_without_work(
                 log.commit("superseded", Entries(superseded=tuple(superseded)))
                 result = replace(result, notes=(*result.notes, *notes))
             if select_problems(result.findings):
-                result = replace(result, known=True, acknowledged=is_acknowledged(problems_of(made), log.state))
+                result = replace(result, known=True, acknowledged=is_acknowledged(find_problems(made), log.state))
             yield index, result
         elif not step.is_todo:
             yield index, too_young(step.task) or IngestResult(source.name, "waiting")
@@ -238,7 +238,7 @@ def _commit(log: LogWriter, ended: Sequence[tuple[int, IngestTask, Ingested]]) -
     """Commit what became of logs, and yield it with what the log says of it."""
     before, entries, notes = log.state, Entries(), dict[int, tuple[str, ...]]()
     for index, task, of in ended:
-        more, notes[index] = _entries_of(log, task, of)
+        more, notes[index] = _make_entries(log, task, of)
         entries = Entries(*((*getattr(entries, name.name), *getattr(more, name.name)) for name in fields(Entries)))
     others = dict[str, str]()
 
@@ -246,7 +246,7 @@ def _commit(log: LogWriter, ended: Sequence[tuple[int, IngestTask, Ingested]]) -
         """Return what is to be added; of two calls that gave one recording two names the first wins."""
         others.clear()
         for row in entries.runs:
-            named = state.run_of(row.log.source.sha256) if row.log else None
+            named = state.find_run(row.log.source.sha256) if row.log else None
             others.update({} if named in (None, row.run_id) else {row.run_id: named})
         return replace(entries, runs=tuple(row for row in entries.runs if row.run_id not in others))
 
@@ -279,7 +279,7 @@ def _settle_for(made: RunFacts | None, run_id: str, result: IngestResult, source
     )
 
 
-def _entries_of(log: LogWriter, task: IngestTask, of: Ingested) -> tuple[Entries, tuple[str, ...]]:
+def _make_entries(log: LogWriter, task: IngestTask, of: Ingested) -> tuple[Entries, tuple[str, ...]]:
     """Return what a commit has of the result of a log, and what is to be said of runs that it supersedes."""
     source, result, sha256 = of.source, of.result, of.result.sha256
     entries, notes = Entries(runs=of.rows), list[str]()
@@ -300,13 +300,13 @@ def _entries_of(log: LogWriter, task: IngestTask, of: Ingested) -> tuple[Entries
 def _judged(state: State, result: IngestResult, source: LogSource, *, before: State) -> IngestResult:
     """Return a result with whether its problems were known before, and are acknowledged."""
     if result.status == "failed":
-        problem = failure_of(result.sha256 or source.files_digest, source.origins)
+        problem = make_failure(result.sha256 or source.files_digest, source.origins)
         return replace(result, acknowledged=result.acknowledged or is_acknowledged([problem], state))
     if not (select_problems(result.findings)):
         return result
     row = state.runs[str(result.run_id), str(result.recipe_id)]
-    problems = problems_of(row)
-    told = {of.key for old in before.runs.values() if old.run_id == row.run_id for of in problems_of(old)}
+    problems = find_problems(row)
+    told = {of.key for old in before.runs.values() if old.run_id == row.run_id for of in find_problems(old)}
     return replace(result, known=all(of.key in told for of in problems), acknowledged=is_acknowledged(problems, state))
 
 

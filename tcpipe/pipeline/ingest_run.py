@@ -72,13 +72,13 @@ def _ingest(task: IngestTask, *, hashed: list[str], rows: list[RunFacts]) -> Ing
     state = read_state_here(store.place)
     with ExitStack() as stack:
         opened = None if source.sha256 else _opened(task, stack)
-        sha256 = _known_as(state, opened) if opened else str(source.sha256)
+        sha256 = _find_hash(state, opened) if opened else str(source.sha256)
         hashed.append(sha256)
-        run_id = state.run_of(sha256) or store.name_run(source.stem, sha256)
+        run_id = state.find_run(sha256) or store.name_run(source.stem, sha256)
         before = store.known_run(run_id)
         same_as = find_twin(before, source)
         if before and not task.force and (made := _made_before(store, run_id, task)):
-            rows += () if is_committed(made, state) else _rows_of(store, state, run_id, made.recipe_id)
+            rows += () if is_committed(made, state) else _read_rows(store, state, run_id, made.recipe_id)
             return result_of(source, "done" if rows else "unchanged", made, sha256, same_as=same_as)
         log = opened or _opened(task, stack)
         step("reading")
@@ -90,7 +90,7 @@ def _ingest(task: IngestTask, *, hashed: list[str], rows: list[RunFacts]) -> Ing
         streams = lend_streams(store.runs_place.below(run_id), streams, known.streams)
         _return_freed_memory()
         manifest = _fuse_and_label(store, run_id, streams, known, task)
-    rows += _rows_of(store, state, run_id, manifest.recipe_id)
+    rows += _read_rows(store, state, run_id, manifest.recipe_id)
     (made,) = (row for row in rows if row.recipe_id == manifest.recipe_id)
     return result_of(source, "done", made, sha256, same_as=same_as)
 
@@ -103,12 +103,12 @@ def _made_before(store: Store, run_id: str, task: IngestTask) -> RunFacts | None
     return made
 
 
-def _rows_of(store: Store, state: State, run_id: str, recipe_id: str) -> list[RunFacts]:
+def _read_rows(store: Store, state: State, run_id: str, recipe_id: str) -> list[RunFacts]:
     """Return what is to be committed of a run: the ingestion under a recipe, and those that were committed before, with the tags of now."""
     return [row for key, row in store.read_rows(run_id).items() if key == recipe_id or (run_id, key) in state.runs]
 
 
-def _known_as(state: State, log: AnyLog) -> str:
+def _find_hash(state: State, log: AnyLog) -> str:
     """Return the hash by which the store knows a log, or is to know it (ADR 86).
 
     That is the log's own unless the same recording was ingested from elsewhere, where more or less of it was at hand. A run with damage
@@ -144,7 +144,7 @@ def find_twin(known: RunJson | KnownLog | None, source: LogSource) -> str | None
 
 def _tags(state: State, run_id: str) -> Mapping[str, str]:
     """Return the tags that a run has, where its run.json is lost."""
-    return next((row.tags for row in state.rows_of(run_id)), {})
+    return next((row.tags for row in state.find_rows(run_id)), {})
 
 
 def _read(

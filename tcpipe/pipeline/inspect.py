@@ -250,7 +250,8 @@ def _store(store: Store) -> InspectedStore:
 
 def _stored(run: RunDirectory) -> StoredIngestion:
     facts = run.facts
-    grades = {name: getattr(facts.verdict, name) for name in AFFECTED}
+    verdict = facts.verdict
+    grades = {name: getattr(verdict, name) for name in AFFECTED}
     counts = {"findings": len(facts.findings), "damage": len(facts.damage)}
     return recast(_ingestion(run), StoredIngestion, **grades, **counts)
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from tcpipe.errors import LogError, TcpipeError, plain_line
-from tcpipe.formats.commits import Sighting, lineage_of
+from tcpipe.formats.commits import Sighting, find_lineage
 from tcpipe.formats.json_files import digest
 from tcpipe.formats.logs.joined import open_logs
 from tcpipe.formats.logs.log_file import LOG_SUFFIXES, belongs_to_a_log, find_logs, logs_below
@@ -73,7 +73,7 @@ class LogSource:
     @property
     def lineage(self) -> str:
         """What identifies the place of the log."""
-        return lineage_of(self.origins)
+        return find_lineage(self.origins)
 
     def sighting(self, sha256: str) -> Sighting:
         """Return what is remembered of the log as it is now."""

@@ -245,12 +245,12 @@ def _write_log(store: Store, source: Place, record_names: Sequence[str]) -> list
         ]
         known = (replace(row, log=row.log and replace(row.log, outline=outlines.get(row.run_id, ""))) for row in rows)
         log.commit("ingested", Entries(runs=tuple(known)))
-    log.commit("seen", lambda state: _entries_of(records, state))
+    log.commit("seen", lambda state: _convert_records(records, state))
     store.write_index(log.state)
     return problems
 
 
-def _entries_of(records: Mapping[str, Sequence[Document]], state: State) -> Entries:
+def _convert_records(records: Mapping[str, Sequence[Document]], state: State) -> Entries:
     """Return what records say and a state does not."""
 
     def read(kind: str, cls: type[T]) -> list[T]:

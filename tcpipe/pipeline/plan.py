@@ -13,7 +13,7 @@ from tcpipe.formats.finding_lines import describe_finding
 from tcpipe.formats.index_files import RunFacts
 from tcpipe.formats.recipe_toml import ingest_key
 from tcpipe.pipeline.ingest_task import IngestTask, too_young
-from tcpipe.pipeline.problems import failure_of, is_acknowledged, problems_of
+from tcpipe.pipeline.problems import find_problems, is_acknowledged, make_failure
 
 Standing: TypeAlias = Literal[
     "done", "partial", "empty", "pending", "outdated", "growing", "failed_permanent", "failed_transient", "quarantined", "superseded"
@@ -87,10 +87,10 @@ def _decide(task: IngestTask, known: _Known, now_ns: int) -> Step:
     made = known.made.get(sha256, []) if sha256 else []
     current = next((row for row in made if task.is_made_by(row)), None)
     if current is not None and task.tags.items() <= current.tags.items():
-        return Step(task, *_standing_of(current, known.state), made=current)
+        return Step(task, *_find_standing(current, known.state), made=current)
     failed = None if task.force or task.retry_failed else known.state.failed.get(task.failure_key)
     if failed is not None:
-        acknowledged = is_acknowledged([failure_of(failed.content, failed.log)], known.state)
+        acknowledged = is_acknowledged([make_failure(failed.content, failed.log)], known.state)
         cause = _without_name("".join(failed.problems[:1]), task)
         return Step(task, "quarantined" if acknowledged else "failed_permanent", cause, failure=failed)
     if too_young(task, now_ns):
@@ -110,11 +110,11 @@ def _content(task: IngestTask) -> str:
     return task.source.sha256 or task.source.files_digest
 
 
-def _standing_of(made: RunFacts, state: State) -> tuple[Standing, str]:
+def _find_standing(made: RunFacts, state: State) -> tuple[Standing, str]:
     """Return the standing of a log that is in the store as it would be made now, and why."""
     if made.superseded_by:
         return "superseded", "a longer recording has taken its place"
-    problems = problems_of(made)
+    problems = find_problems(made)
     if not problems:
         return "done", ""
     if is_acknowledged(problems, state):
@@ -127,7 +127,7 @@ def _why_pending(task: IngestTask, known: _Known) -> str:
     """Return why a log that was seen before is to be ingested; "" of a new one."""
     sha256 = task.source.sha256
     if before := known.failures.get(_content(task)):
-        acknowledged = is_acknowledged([failure_of(of.content, of.log) for of in before], known.state)
+        acknowledged = is_acknowledged([make_failure(of.content, of.log) for of in before], known.state)
         return f"{_how_it_failed(before, task)}{', acknowledged' if acknowledged else ''}; to be tried again"
     if task.force:
         return "to be done again if it is there already"

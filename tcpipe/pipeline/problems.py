@@ -8,7 +8,7 @@ from pathlib import Path
 
 from tcpipe.errors import UsageError
 from tcpipe.formats.atomic import scratch_directory
-from tcpipe.formats.commits import Entries, Problem, State, lineage_of
+from tcpipe.formats.commits import Entries, Problem, State, find_lineage
 from tcpipe.formats.index_files import RunFacts
 from tcpipe.formats.stored_runs import Ingestions
 from tcpipe.pipeline.begun_calls import begun_calls
@@ -28,13 +28,13 @@ class Acknowledged:
     before: tuple[Problem, ...]
 
 
-def problems_of(row: RunFacts) -> tuple[Problem, ...]:
+def find_problems(row: RunFacts) -> tuple[Problem, ...]:
     """Return what is wrong with a run: damage of its log, or that it has no segments."""
     log = row.log.source if row.log else None
     return tuple(Problem(of, log.sha256, log.paths, row.run_id) for of in select_problems(row.findings) if log)
 
 
-def failure_of(content: str, log: tuple[str, ...]) -> Problem:
+def make_failure(content: str, log: tuple[str, ...]) -> Problem:
     """Return the problem that a log failed because of its content."""
     return Problem(Finding("log-failed", "error", Subject("log", " + ".join(log)), "rejected"), content, log)
 
@@ -46,7 +46,7 @@ def incomplete_runs(found: Ingestions) -> Iterator[Problem]:
         yield Problem(finding, f"{run_id}/{recipe_id} {found.rows[run_id, recipe_id].commit}", run_id=run_id)
 
 
-def waiting_of(source: LogSource, state: str) -> Problem:
+def make_waiting(source: LogSource, state: str) -> Problem:
     """Return the problem that a log lies there and no call takes it in; that of other content, written since, is another."""
     finding = make_finding("log-waiting", Subject("log", source.name), names={"state": state})
     return Problem(finding, source.files_digest, source.origins)
@@ -60,9 +60,9 @@ def is_acknowledged(problems: Sequence[Problem], state: State) -> bool:
 def known_problems(state: State) -> Iterator[Problem]:
     """Yield the problems that the log of a store has: of logs and runs, of killed calls, and of commits."""
     for failure in state.failed.values():
-        yield failure_of(failure.content, failure.log)
+        yield make_failure(failure.content, failure.log)
     for row in state.runs.values():
-        yield from problems_of(row)
+        yield from find_problems(row)
     yield from (call.problem for call in begun_calls(state) if call.state == "killed")
     yield from state.problems
 
@@ -109,7 +109,7 @@ def acknowledge(names: Sequence[str], *, store: str | Path = "tcpipe-store") -> 
 
 def _named(name: str, known: Iterable[Problem], state: State) -> list[Problem]:
     paths = {name, str(Path(name).absolute()), str(Path(name).resolve())}
-    contents = {sighting.sha256 for path in paths for sighting in state.seen.get(lineage_of((path,)), ())}
+    contents = {sighting.sha256 for path in paths for sighting in state.seen.get(find_lineage((path,)), ())}
     known = list(known)
     exact = [of for of in known if of.content in contents or paths & {of.name, " + ".join(of.log), *of.log}]
     return exact or [of for of in known if name in {Path(origin).name for origin in of.log}]
@@ -117,20 +117,20 @@ def _named(name: str, known: Iterable[Problem], state: State) -> list[Problem]:
 
 def _lost(name: str, store: Store, state: State) -> list[Problem]:
     """Return the problem of a run of which files are missing: to acknowledge it is to give the run up."""
-    return list(incomplete_runs(store.ingestions(name, state=state))) if state.rows_of(name) else []
+    return list(incomplete_runs(store.ingestions(name, state=state))) if state.find_rows(name) else []
 
 
 def _waiting(name: str, state: State) -> list[Problem]:
     """Return the problem of a log by its path or URL that the store does not hold: nobody wants to be told that it waits."""
     with scratch_directory() as staging:
         sources = find_sources([name], as_one=False, staging=staging).sources
-    return [waiting_of(source, "pending") for source in sources if source.lineage not in state.seen]
+    return [make_waiting(source, "pending") for source in sources if source.lineage not in state.seen]
 
 
 def _not_one(name: str, found: Sequence[Problem], candidates: Sequence[Problem], state: State, root: object) -> str:
     if found:
         return f"{name}: {len(found)} logs have this name; give the path of one: {_listed(found)}"
-    if state.rows_of(name):
+    if state.find_rows(name):
         return f"{name}: this run has no known problem; there is nothing to acknowledge"
     listed = f"known problems: {_listed(candidates)}" if candidates else "there are no known problems"
     return f"{name}: is no run or log with a known problem in {root}; {listed}"

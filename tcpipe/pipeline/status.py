@@ -25,7 +25,7 @@ from tcpipe.pipeline.calls import INGEST, Estimate, estimate, in_time
 from tcpipe.pipeline.ingest_task import IngestTask
 from tcpipe.pipeline.log_sources import definitions_key, find_sources, in_shard, remembered
 from tcpipe.pipeline.plan import STANDINGS, TROUBLE, Standing, Step, plan
-from tcpipe.pipeline.problems import incomplete_runs, waiting_of
+from tcpipe.pipeline.problems import incomplete_runs, make_waiting
 from tcpipe.pipeline.store_verdict import judge_runs
 from tcpipe.recipe import Recipe
 from tcpipe.store import Store, open_store
@@ -207,7 +207,7 @@ def _waiting_too_long(steps: Iterable[Step]) -> Iterator[Problem]:
     before_ns = time.time_ns() - _TWO_NIGHTS_NS
     for step in steps:
         if step.standing in ("pending", "growing") and not step.has_failed and step.task.source.arrival_ns < before_ns:
-            yield waiting_of(step.task.source, step.standing)
+            yield make_waiting(step.task.source, step.standing)
 
 
 def _absolute(log: str) -> str:

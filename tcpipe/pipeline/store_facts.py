@@ -12,7 +12,7 @@ from tcpipe.formats.finding_lines import group_findings
 from tcpipe.formats.object_storage import is_url
 from tcpipe.formats.stored_runs import Ingestions, RunDirectory
 from tcpipe.pipeline.plan import failed_for_now
-from tcpipe.pipeline.problems import failure_of, is_acknowledged, problems_of
+from tcpipe.pipeline.problems import find_problems, is_acknowledged, make_failure
 from tcpipe.pipeline.prune import is_replaced
 from tcpipe.pipeline.store_verdict import find_changes, judge_runs
 from tcpipe.report.store_runs import FailedLog, StoredDataset, StoreFacts, ruling_key
@@ -24,7 +24,7 @@ def store_facts(store: Store, found: Ingestions, *, will_be: Sequence[RunDirecto
     here = (entry.name.split("/") for entry in store.runs_place.entries("", but="streams"))
     pages = {(parts[0], parts[1]) for parts in here if len(parts) == 3 and parts[2] == REPORT}
     state = found.state
-    known = {run.run_id for run in found.finished if is_acknowledged(problems_of(run.facts), state)}
+    known = {run.run_id for run in found.finished if is_acknowledged(find_problems(run.facts), state)}
     key = ruling_key(found)
     current = [run.facts for run in found.finished if run.facts.ingest_key == key]
     return StoreFacts(
@@ -57,7 +57,7 @@ def _failed(state: State) -> Iterator[FailedLog]:
     for of in sorted(last.values(), key=lambda of: of.log):
         if of.content not in contents:
             names.add(name := " + ".join(of.log))
-            acknowledged = is_acknowledged([failure_of(of.content, of.log)], state)
+            acknowledged = is_acknowledged([make_failure(of.content, of.log)], state)
             yield FailedLog(
                 name, "".join(of.problems[:1]), "acknowledged" if acknowledged else "failed for what it holds"
             )

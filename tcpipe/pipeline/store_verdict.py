@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -11,7 +11,7 @@ from tcpipe.cost.held_out import PHYSICS_UNITS
 from tcpipe.formats.index_files import RunFacts
 from tcpipe.tables.catalogue import Severity, threshold
 from tcpipe.tables.findings import Finding, Subject, make_finding
-from tcpipe.tables.verdicts import Verdict, judge
+from tcpipe.tables.verdicts import Verdict, judge_by_code
 
 _CHANGE = "run-to-run-change"
 _IN_PERCENT = 100.0
@@ -19,11 +19,7 @@ _IN_PERCENT = 100.0
 
 def judge_runs(runs: Sequence[RunFacts]) -> Verdict:
     """Return the verdict on runs together and what the latest have changed; of each code the worst finding is a reason."""
-    verdict = judge([*find_changes(runs), *(finding for run in runs for finding in run.findings)])
-    worst: dict[str, Finding] = {}
-    for finding in verdict.reasons:
-        worst.setdefault(finding.code, finding)
-    return replace(verdict, reasons=tuple(worst.values()))
+    return judge_by_code([*find_changes(runs), *(finding for run in runs for finding in run.findings)])
 
 
 def find_changes(runs: Iterable[RunFacts]) -> tuple[Finding, ...]:
@@ -38,7 +34,7 @@ def find_changes(runs: Iterable[RunFacts]) -> tuple[Finding, ...]:
 
 def _find_changes(series: Iterable[tuple[tuple[str, str, str], Sequence[float]]]) -> Iterator[Finding]:
     for (robot, measure, unit), values in series:
-        if (shift := shift_of(values)) is not None:
+        if (shift := find_shift(values)) is not None:
             severity: Severity | None = "note" if measure == _USED else None
             names = {"robot": robot, "unit": unit}
             yield make_finding(
@@ -79,7 +75,7 @@ class Shift:
     latest_count: int
 
 
-def shift_of(values: Sequence[float]) -> Shift | None:
+def find_shift(values: Sequence[float]) -> Shift | None:
     """Return how the latest values of a series differ from those before; None where they do not.
 
     The latest quarter of the values, at most 20, is compared with those before: the medians must differ by more than three robust standard

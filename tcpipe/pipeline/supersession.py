@@ -34,7 +34,7 @@ def superseded_by(
     seen = {sighting.sha256 for sighting in state.seen.get(source.lineage, ())}
     new = sha256 not in seen
     earlier = seen - {sha256} if new or run_id in parties else ()
-    for older in sorted(filter(None, map(state.run_of, earlier))):
+    for older in sorted(filter(None, map(state.find_run, earlier))):
         if older != run_id and older not in gone and (new or older in parties):
             share = _share_of(store, older, run_id)
             elsewhere = _elsewhere(state, older, source) if share >= _CONTAINED else ""
@@ -50,7 +50,7 @@ def superseded_by(
 
 def _elsewhere(state: State, run_id: str, source: LogSource) -> str:
     """Return where else a run's recording lies, "" where it is gone."""
-    contents = {row.log.source.sha256 for row in state.rows_of(run_id) if row.log}
+    contents = {row.log.source.sha256 for row in state.find_rows(run_id) if row.log}
     for lineage, sightings in state.seen.items():
         for sighting in sightings if lineage != source.lineage else ():
             if sighting.sha256 in contents and sighting.size_and_time and is_there(sighting):

@@ -195,7 +195,7 @@ def _trouble(store: StoreFacts, runs: Sequence[StoredRun]) -> list[Section]:
     for run in runs:
         if run.facts is None or run.state.startswith(("damaged", "empty")):
             line = store.found.damaged.get((run.run_id, run.recipe_id), "ingest its log again")
-            rows.append((run.run_id, run.state, _trouble_of(run.facts) if run.facts else line))
+            rows.append((run.run_id, run.state, _describe_problem(run.facts) if run.facts else line))
     if not rows:
         return []
     text = "'tcpipe acknowledge' marks what cannot be repaired."
@@ -205,7 +205,7 @@ def _trouble(store: StoreFacts, runs: Sequence[StoredRun]) -> list[Section]:
     return [Section("Failed, damaged and empty", text, header=header, rows=rows[:_MOST_LISTED], folded=len(rows) > 20)]
 
 
-def _trouble_of(facts: RunFacts) -> str:
+def _describe_problem(facts: RunFacts) -> str:
     return next(iter(facts.damage), "") or describe_finding(select_problems(facts.findings)[0])
 
 

@@ -117,10 +117,15 @@ def select_findings(findings: Iterable[Finding], *codes: str) -> list[Finding]:
     return [finding for finding in findings if finding.code in codes]
 
 
+def is_problem(finding: Finding) -> bool:
+    """Return whether a finding causes exit code 3; a note never does."""
+    entry = read_catalogue().get(finding.code)
+    return entry is not None and entry.is_problem and finding.severity != "note"
+
+
 def select_problems(findings: Iterable[Finding]) -> list[Finding]:
     """Return the findings that are a problem until somebody has acknowledged them."""
-    catalogue = read_catalogue()
-    return [finding for finding in findings if finding.code in catalogue and catalogue[finding.code].is_problem]
+    return [finding for finding in findings if is_problem(finding)]
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal, TypeAlias
 
 from tcpipe.tables.catalogue import AFFECTED, Affected, Severity, catalogue_version, read_catalogue
@@ -45,6 +45,14 @@ def judge(findings: Iterable[Finding]) -> Verdict:
         for name in affected:
             grades[name] = max(grades[name], grade, key=GRADES.index)
     return Verdict(**grades, reasons=tuple(reasons))
+
+
+def judge_by_code(findings: Iterable[Finding]) -> Verdict:
+    """Return the verdict of many runs together: of each code the worst finding alone is a reason."""
+    verdict, worst = judge(findings), dict[str, Finding]()
+    for finding in verdict.reasons:
+        worst.setdefault(finding.code, finding)
+    return replace(verdict, reasons=tuple(worst.values()))
 
 
 def judge_again(verdict: Verdict, findings: Iterable[Finding]) -> Verdict:

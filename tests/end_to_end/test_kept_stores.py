@@ -156,7 +156,7 @@ def test_a_store_is_asked_to_be_migrated_and_its_tables_stay_where_they_are(unto
     assert run.manifest.data_model_version == DATA_MODEL_VERSION
     state = Store(store).state()
     assert (len(state.seen), len(state.datasets), len(state.calls)) == (1, 2, 3)
-    assert state.run_of(run.facts.log.source.sha256) == run.run_id
+    assert state.find_run(run.facts.log.source.sha256) == run.run_id
     assert run.facts.log.outline
 
 

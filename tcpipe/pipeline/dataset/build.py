@@ -57,7 +57,6 @@ from tcpipe.pipeline.dataset.balance import BALANCE_COLUMNS, measure_balance
 from tcpipe.pipeline.dataset.build_dataset_options import BuildDatasetOptions
 from tcpipe.pipeline.dataset.card import CARD_COLUMNS, VELOCITY_COLUMN, dataset_card, is_whole
 from tcpipe.pipeline.dataset.content import gather_content
-from tcpipe.pipeline.dataset.findings import is_problem
 from tcpipe.pipeline.dataset.inputs import Inputs, choose_inputs, earlier_splits
 from tcpipe.pipeline.dataset.physics import PHYSICS_COLUMNS
 from tcpipe.pipeline.dataset.redaction import (
@@ -81,7 +80,7 @@ from tcpipe.splits.audit import HeldOut
 from tcpipe.splits.regions import Regions
 from tcpipe.store import Store, open_store
 from tcpipe.tables.facts import EnergyBudget
-from tcpipe.tables.findings import LEFT_OUT, Finding
+from tcpipe.tables.findings import LEFT_OUT, Finding, is_problem, select_problems
 from tcpipe.tables.levels import DATA_MODEL_VERSION, READ_VERSIONS
 from tcpipe.tables.options import as_function
 from tcpipe.tables.verdicts import Verdict
@@ -230,9 +229,9 @@ def run_build_dataset(options: BuildDatasetOptions) -> BuildResult:
             counts = {"runs": len(inputs.runs), "samples": result.samples}
             written = sum(of.size_bytes for of in card.checksums.values())
             took = Call(BUILD, __version__, result.exit_code, counts, options.jobs, written_bytes=written)
-            _end(call, measure_call(watch, took), _dataset_of(result, inputs), known)
+            _end(call, measure_call(watch, took), _describe_dataset(result, inputs), known)
     if result.status == "unchanged":
-        _refer(open_log(opened), _dataset_of(result, inputs))
+        _refer(open_log(opened), _describe_dataset(result, inputs))
     return result
 
 
@@ -265,7 +264,7 @@ def _planned(place: Path | str, store: Store, inputs: Inputs, *, jobs: int) -> B
     """Return what is to be expected of a build."""
     most = sum(run.facts.segments - int(inputs.again[run.run_id].sum()) for run in inputs.runs)
     expected = estimate(store.state().calls, BUILD, most, jobs=jobs)
-    code = 3 if any(map(is_problem, inputs.findings)) else 0
+    code = 3 if select_problems(inputs.findings) else 0
     return BuildResult(str(place), "planned", most, {}, {}, (), inputs.findings, exit_code=code, estimate=expected)
 
 
@@ -275,7 +274,7 @@ def _end(opened: OpenCall, call: Call, dataset: Dataset, known: DatasetCard | No
     opened.kind, opened.end = "built", Entries(datasets=(dataset,), forgotten=before, calls=(call,))
 
 
-def _dataset_of(result: BuildResult, inputs: Inputs) -> Dataset:
+def _describe_dataset(result: BuildResult, inputs: Inputs) -> Dataset:
     return Dataset(_lasting(result), inputs.digest, tuple((run.run_id, run.recipe_id) for run in inputs.runs))
 
 
@@ -345,7 +344,7 @@ def _result(place: Path | str, status: str, card: DatasetCard, left_out: Sequenc
         findings_by_map=card.findings_by_map,
         verdict=card.verdict,
         energy_budget=card.energy_budget,
-        exit_code=3 if any(map(is_problem, findings)) else 0,
+        exit_code=3 if select_problems(findings) else 0,
         doubtful=card.doubtful,
         redacted=card.redaction is not None,
     )

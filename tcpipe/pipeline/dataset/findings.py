@@ -12,14 +12,8 @@ from tcpipe.formats.dataset_card import DatasetCard, Doubtful
 from tcpipe.recipe.suggestions import suggest
 from tcpipe.splits.audit import HeldOut
 from tcpipe.tables.bits import Quality, name_of
-from tcpipe.tables.catalogue import Severity, read_catalogue, threshold
+from tcpipe.tables.catalogue import Severity, threshold
 from tcpipe.tables.findings import Finding, Remedy, Subject, make_finding
-
-
-def is_problem(finding: Finding) -> bool:
-    """Return whether a finding makes ``tcpipe build-dataset`` exit with 3."""
-    entry = read_catalogue().get(finding.code)
-    return entry is not None and entry.is_problem and finding.severity != "note"
 
 
 def count_flagged(quality: pa.ChunkedArray) -> Doubtful:

@@ -73,7 +73,7 @@ def worker(row, worked):
             return Ingested(task.source, replace(result, sha256=sha256))
         state = read_state_here(Store(task.store).place)
         made = make_row(row, task, sha256, kind)
-        named = state.run_of(sha256)
+        named = state.find_run(sha256)
         made = made if named is None else replace(made, run_id=named)
         same = state.runs.get((made.run_id, made.recipe_id))
         if same is not None and not task.force and task.tags.items() <= same.tags.items():

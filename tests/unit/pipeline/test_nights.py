@@ -284,15 +284,15 @@ def test_what_an_ingest_under_another_recipe_replaces_can_be_pruned(tmp_path, ni
 
 def test_of_two_calls_that_ingest_one_recording_under_two_names_the_first_commit_wins(tmp_path, night, monkeypatch):
     shutil.copy(drive_at(tmp_path / "elsewhere" / "first.mcap", seed=7), tmp_path / "logs" / "second.mcap")
-    real = ingest_module._entries_of
+    real = ingest_module._make_entries
 
     def meanwhile(log, task, of):
         if of.result.log.endswith("second.mcap") and of.rows:
-            monkeypatch.setattr(ingest_module, "_entries_of", real)
+            monkeypatch.setattr(ingest_module, "_make_entries", real)
             ingest([tmp_path / "elsewhere"], store=tmp_path / "store", recipe=Recipe())
         return real(log, task, of)
 
-    monkeypatch.setattr(ingest_module, "_entries_of", meanwhile)
+    monkeypatch.setattr(ingest_module, "_make_entries", meanwhile)
     found, code = night()
     assert (found["second.mcap"].status, code) == ("unchanged", 0)
     assert found["second.mcap"].same_as == str(tmp_path / "elsewhere" / "first.mcap")

@@ -12,13 +12,13 @@ from tcpipe.dataset import open_dataset
 from tcpipe.errors import DatasetError, StoreError
 from tcpipe.formats.commits import Entries
 from tcpipe.pipeline.dataset.build import build_dataset
-from tcpipe.pipeline.dataset.findings import is_problem
 from tcpipe.pipeline.inspect import inspect
 from tcpipe.pipeline.log_writer import commit_run, open_log, supersede
 from tcpipe.pipeline.problems import acknowledge
 from tcpipe.pipeline.report import report
 from tcpipe.recipe import LabelConfig, Recipe, SplitConfig
 from tcpipe.store import Store, open_store
+from tcpipe.tables.findings import is_problem
 from tcpipe.tables.levels import STREAMS, Sensor, Streams
 
 

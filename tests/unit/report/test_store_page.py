@@ -16,7 +16,7 @@ from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.log_writer import open_log, supersede
 from tcpipe.pipeline.problems import acknowledge
 from tcpipe.pipeline.report import report
-from tcpipe.pipeline.store_verdict import find_changes, shift_of
+from tcpipe.pipeline.store_verdict import find_changes, find_shift
 from tcpipe.pipeline.verify import verify
 from tcpipe.recipe import ReadConfig, Recipe
 from tcpipe.store import open_store
@@ -174,15 +174,15 @@ def test_many_runs_are_all_told_and_some_can_be_read_without_scripts(store, monk
 
 def test_a_change_is_told_from_scatter():
     scatter = np.random.default_rng(3).normal(84.0, 1.0, 20)
-    assert shift_of(scatter) is None
-    assert shift_of(scatter[:11]) is None
-    found = shift_of([*scatter[:15], *(scatter[15:] + 12.0)])
+    assert find_shift(scatter) is None
+    assert find_shift(scatter[:11]) is None
+    found = find_shift([*scatter[:15], *(scatter[15:] + 12.0)])
     assert (found.earlier_count, found.latest_count) == (15, 5)
-    assert shift_of([*np.tile(scatter, 50), *(scatter + 12.0)]).latest_count == 20
+    assert find_shift([*np.tile(scatter, 50), *(scatter + 12.0)]).latest_count == 20
     assert found.after - found.before == pytest.approx(12.0, abs=1.0)
-    assert shift_of([5.0] * 20) is None
-    assert shift_of([5.0] * 15 + [5.2] * 5) is None  # 4 % of what it was
-    assert shift_of([5.0] * 15 + [6.0] * 5) is not None
+    assert find_shift([5.0] * 20) is None
+    assert find_shift([5.0] * 15 + [5.2] * 5) is None  # 4 % of what it was
+    assert find_shift([5.0] * 15 + [6.0] * 5) is not None
 
 
 def test_a_change_from_run_to_run_is_a_finding_of_its_robot(tmp_path):

@@ -13,12 +13,12 @@ from tcpipe.errors import DatasetError
 from tcpipe.formats.dataset_card import RunSource, group_dataset_findings, judge_dataset
 from tcpipe.formats.finding_lines import format_mixed_groups
 from tcpipe.pipeline.dataset.build import build_dataset
-from tcpipe.pipeline.dataset.findings import count_flagged, is_problem
+from tcpipe.pipeline.dataset.findings import count_flagged
 from tcpipe.pipeline.diff import diff
 from tcpipe.recipe import Recipe
 from tcpipe.store import open_store
 from tcpipe.tables.bits import Quality
-from tcpipe.tables.findings import Finding, Subject, make_finding, select_findings
+from tcpipe.tables.findings import Finding, Subject, is_problem, make_finding, select_findings
 
 ROLE = Subject("role", "command")
 
