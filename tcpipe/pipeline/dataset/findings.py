@@ -72,9 +72,10 @@ def _find_empty_splits(card: DatasetCard) -> Iterator[Finding]:
 def _find_leakage(part: HeldOut, card: DatasetCard) -> Finding:
     """Return the finding that samples of a held-out split share ground with train."""
     remedies: tuple[Remedy, ...] = ()
-    if part.split == "test" and card.split.holdout == "sample":
+    holdout = card.split.holdout if part.split == "test" else ""
+    if holdout == "sample":
         remedies = suggest("block", {"split": {"holdout": "block"}})
-    elif part.split == "test":
+    elif holdout == "block":
         remedies = (
             *suggest("larger_blocks", {"split": {"block_m": 2 * card.split.block_m}}),
             *suggest("run", {"split": {"holdout": "run"}}),

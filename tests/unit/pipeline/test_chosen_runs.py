@@ -57,7 +57,9 @@ def test_a_tag_that_no_run_has_is_answered_with_those_there_are(store, tmp_path)
 def make_outdated(store, *run_ids):
     """Have runs look as if an earlier version of tcpipe had made them."""
     rows = [
-        replace(row, data_model_version="0.9", commit=0) for run_id in run_ids for row in store.state().find_rows(run_id)
+        replace(row, data_model_version="0.9", commit=0)
+        for run_id in run_ids
+        for row in store.state().find_rows(run_id)
     ]
     open_log(store).commit("ingested", Entries(runs=tuple(rows)))
 

@@ -151,3 +151,15 @@ def test_a_difference_between_two_datasets_names_findings_by_code_and_subject(bu
     assert {of.subject for of in select_findings(found.findings_new, "no-command")} == {ROLE}
     assert not select_findings((*found.findings_gone, *found.findings_new), "few-samples")
     assert "gone: warning: command: " in str(found) or "gone: warning: " in str(found)
+
+
+@pytest.mark.parametrize("holdout", ["sample", "block", "run"])
+def test_a_split_that_shares_ground_is_never_told_to_hold_out_as_it_does(tmp_path, holdout):
+    store = open_store(tmp_path / "store", create=True)
+    add_world(store, tmp_path / "rasters")
+    for number, run_id in enumerate("abc"):
+        add_run(store, run_id, segments(run_id, *lanes(0.2 * number, -10.0, 10.0), start_ns=number * 10**15))
+    built = build_dataset(tmp_path / "out", store=store.root, recipe=Recipe(), holdout=holdout)
+    found = [of for of in select_findings(built.findings, "split-leakage") if of.subject.name == "test"]
+    assert found or holdout == "block"
+    assert all(remedy.recipe != {"split": {"holdout": holdout}} for of in found for remedy in of.remedies)
