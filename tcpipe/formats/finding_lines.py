@@ -28,6 +28,8 @@ MOST_LINES = 8
 _MOST_SUBJECTS = 3
 _DIGITS = 3
 _LARGEST_PLAIN = 1e6
+_SHORT_S = 2.0
+"""Shorter spans are written with tenths of a second."""
 
 
 def format_number(name: str, value: float) -> str:
@@ -50,7 +52,9 @@ def describe_finding(finding: Finding) -> str:
         return f"{finding.subject.name}: {finding.code.replace('-', ' ')}"
     values = {name: format_number(name, number) for name, number in finding.numbers.items()}
     if finding.span_s is not None:
-        values["span"] = "{:.0f} to {:.0f} s".format(*finding.span_s)
+        begin_s, end_s = finding.span_s
+        digits = 0 if end_s - begin_s >= _SHORT_S else 1
+        values["span"] = f"{begin_s:.{digits}f} to {end_s:.{digits}f} s"
     missing = dict.fromkeys(entry.fields, "?")  # a redacted finding keeps only what is public
     return entry.template.format(**{**missing, **values, **finding.names, "subject": finding.subject.name})
 

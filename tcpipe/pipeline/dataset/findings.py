@@ -60,7 +60,7 @@ def _find_empty_splits(card: DatasetCard) -> Iterator[Finding]:
     if not card.splits["test"] and rules.test_fraction > 0:
         reasons = {"run": "one_run", "block": "one_block", "tag": "one_value_of_tag"}
         remedies = (
-            *(suggest("smaller_blocks", {"split": {"block_m": rules.block_m / 2}}) if rules.holdout == "block" else ()),
+            *(suggest("sample", {"split": {"holdout": "sample"}}) if card.splits["train"] > 1 else ()),
             *suggest("none", {"split": {"test_fraction": 0.0}}),
         )
         names = {"reason": reasons.get(rules.holdout, "too_few_samples")}

@@ -9,7 +9,7 @@ from synthetic_store import add_run, add_world, box, lanes, lonlat, region_file,
 from tcpipe.dataset import open_dataset
 from tcpipe.errors import DatasetError, MapError, RecipeError, RegionError, StoreError, UsageError
 from tcpipe.formats.dataset_card import KeptSplit
-from tcpipe.formats.recipe_toml import recipe_id
+from tcpipe.formats.recipe_toml import parse_recipe, recipe_id
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.verify import verify
 from tcpipe.recipe import LabelConfig, Recipe, SplitConfig
@@ -318,6 +318,9 @@ def test_one_run_cannot_be_held_out_and_it_is_said(store, tmp_path):
     (found,) = select_findings(result.findings, "split-empty")
     assert (found.subject, found.names) == (Subject("split", "test"), {"reason": "one_run"})
     assert result.exit_code == 3
+    for remedy in found.remedies:
+        cured = build(store, tmp_path, recipe=parse_recipe(remedy.recipe, where="remedy"), force=True)
+        assert not select_findings(cured.findings, "split-empty")
 
 
 def test_what_the_call_says_instead_of_the_recipe_is_checked_as_the_recipe_is(store, tmp_path):
