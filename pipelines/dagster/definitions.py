@@ -25,10 +25,9 @@ import dagster as dg
 
 from tcpipe.formats.finding_lines import format_finding, list_findings
 from tcpipe.formats.json_files import typed
-from tcpipe.pipeline.dataset.findings import is_problem
 from tcpipe.pipeline.log_sources import LogSource, find_sources
 from tcpipe.tables.catalogue import AFFECTED
-from tcpipe.tables.findings import Finding, select_findings
+from tcpipe.tables.findings import Finding, is_problem, select_findings
 from tcpipe.tables.verdicts import Verdict
 
 Answer = Mapping[str, Any]
