@@ -44,7 +44,6 @@ UNFINISHED = (
     ".*.partial",
     "*.checkpoint",
     "tmp/tcpipe-*",
-    "*/writing.json",
 )
 """What a killed call may leave for the next one: temporaries, where a cost map and a training stand."""
 

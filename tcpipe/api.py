@@ -125,7 +125,7 @@ def run_plan_path(options: PlanPathOptions) -> PlanResult:
     The result has the totals of each objective, and ``lonlat_deg``, the points of the path; ``str`` of it is what the command prints.
     Raises `PathError`, `ModelError`, `MapError`, `StoreError` or `UsageError` where an input cannot be used, or there is no path.
     """
-    from tcpipe.formats.published import here
+    from tcpipe.formats.bucket_directories import fetch_directory
     from tcpipe.learning.models import chosen_model
     from tcpipe.planning.inputs import chosen_map
     from tcpipe.planning.plan_files import PlanRequest, plan
@@ -135,7 +135,7 @@ def run_plan_path(options: PlanPathOptions) -> PlanResult:
     asked |= {"start_deg": options.start, "goal_deg": options.goal}
     request = from_values(PlanRequest, asked, where="plan_path")
     if options.cost_map is not None:
-        request = replace(request, cost_map=here(options.cost_map))
+        request = replace(request, cost_map=fetch_directory(options.cost_map))
     source = chosen_map(options.store, options.map_name)
     return plan(
         chosen_model(options.model, physics=options.physics, speed_mps=options.speed_mps),

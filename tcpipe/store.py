@@ -33,17 +33,17 @@ import pyarrow as pa
 from tcpipe.errors import StoreError, TableError, UsageError
 from tcpipe.formats.atomic import clear_scratch
 from tcpipe.formats.bucket import open_place
+from tcpipe.formats.bucket_directories import FetchedShards, fetch_files
 from tcpipe.formats.commit_log import Stamp, put_commit, read_state
 from tcpipe.formats.commits import Entries, Kind, State
 from tcpipe.formats.geoparquet import located_segments
 from tcpipe.formats.index_files import RunFacts, facts_of, known_log, write_index
 from tcpipe.formats.json_files import of_json, plain, to_json, to_json_line, typed
 from tcpipe.formats.numbered import digest_of, name_of, numbers, put_next, read_as_at
-from tcpipe.formats.object_storage import is_url
+from tcpipe.formats.object_storage import is_bucket, is_url
 from tcpipe.formats.parquet import read_table
 from tcpipe.formats.place import DirectoryPlace, Place
 from tcpipe.formats.places import local_output
-from tcpipe.formats.published import FetchedShards, files_here
 from tcpipe.formats.run_documents import Manifest, MapDocument, RunJson, StreamInfo, Tags, tell_the_same
 from tcpipe.formats.seals import CHECKSUMS, Checksum, file_checksums, sealed
 from tcpipe.formats.store_mark import MARK, is_outdated, layout_of, mark_store
@@ -77,7 +77,6 @@ _HASH_IN_NAME = re.compile(r"-([0-9a-f]{8,64})$")
 _STREAMS = "streams"
 _PROVED = "proved.json"
 """What was compared with its manifest, and the state of the files then; may be removed at any time."""
-_BUCKETS = ("s3://", "gs://", "az://")
 _NAME_HEX = 8
 """So many digits of its log's sha256 stand in a run's name, more where two recordings of one name share them."""
 _MAP_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
@@ -126,7 +125,7 @@ class Store:
     def map_at(self, document: MapDocument) -> tuple[Path, FetchedShards | None]:
         """Return the same of the map of a document, whatever has taken its place since."""
         place, described = self.place.below("maps"), ("/zarr.json", f"/{CHECKSUMS}")
-        root, fetched = files_here(place, document.checksums, by_range=lambda name: not name.endswith(described))
+        root, fetched = fetch_files(place, document.checksums, by_range=lambda name: not name.endswith(described))
         return root / document.zarr, fetched
 
     def map_picture(self, name: str) -> Path:
@@ -385,7 +384,7 @@ def is_named_after(run_id: str, sha256: str) -> bool:
 
 def is_store(path: Path | str) -> bool:
     """Return whether a place is a store; `UsageError` if it is one of an earlier data model."""
-    if is_url(path) and not str(path).startswith(_BUCKETS):
+    if is_url(path) and not is_bucket(path):
         return False
     place = open_place(path)
     if place.read(MARK) is not None:  # not its size: only what is asked for with a body is refused with a reason
@@ -443,7 +442,7 @@ def open_store(root: str | Path, *, create: bool = False) -> Store:
     UsageError : it is missing (unless ``create``), a file, or of an earlier layout.
     StoreError : it cannot be reached or written, or is of a data model that this version does not know.
     """
-    if is_url(root) and not str(root).rstrip("/").startswith(_BUCKETS):
+    if is_url(root) and not is_bucket(root):
         raise UsageError(f"{root}: no store can lie there; wanted a directory, s3://bucket/name, gs:// or az://")
     root = str(root).rstrip("/") if is_url(root) else local_output(root)
     store = Store(root)

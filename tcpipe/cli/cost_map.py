@@ -58,7 +58,7 @@ def cost_map(
     """Predict power, velocity, time and energy a metre along 16 courses in every cell of a map.
 
     Writes to OUT (default: cost-map) Cloud-Optimised GeoTIFFs with a band a course, the reasons where MODEL has no business, and
-    maps for Nav2. An interrupted call goes on where it was; OUT may be a URL in a bucket, where nothing is replaced.
+    maps for Nav2. An interrupted call goes on where it was; OUT may be a URL in a bucket, where each map is a generation.
     """
     from tcpipe.cli.output import progress, say_result
     from tcpipe.planning.cost_map import Cluster, make_cost_map

@@ -12,9 +12,9 @@ from tcpipe.dataset.pixels import StoredPixels, View
 from tcpipe.dataset.split import SampleColumns, Split
 from tcpipe.dataset.tensor import tensor_form
 from tcpipe.errors import DatasetError
+from tcpipe.formats.bucket_directories import fetch_directory_by_range
 from tcpipe.formats.dataset_card import DatasetCard
 from tcpipe.formats.dataset_files import is_shard, open_patches, read_current_card, read_samples, rows_in_files
-from tcpipe.formats.published import here_by_range
 from tcpipe.terrain.layers import LAYERS
 
 
@@ -71,7 +71,7 @@ def open_dataset(path: str | Path, *, layers: Sequence[str] | None = None, label
 
     """
     energy = energy_called(label)
-    directory, fetched = here_by_range(path, by_range=is_shard)
+    directory, fetched = fetch_directory_by_range(path, by_range=is_shard)
     card = read_current_card(directory)
     split = read_samples(directory, ["split"]).column("split").to_numpy()
     if len(split) != card.samples:

@@ -1,4 +1,4 @@
-"""The log of a store: commits as small sealed files that are put where there is none, and snapshots of the state (ADR 105).
+"""A log: commits as small sealed files that are put where there is none, and snapshots of the state (ADR 105, ADR 106).
 
 ::
 
@@ -79,8 +79,7 @@ def read_state(store: Place) -> State:
 def refresh(store: Place, state: State) -> State:
     """Return the state after the commits that were written since."""
     log = store.below(LOG)
-    found = {int(of[1]) for name in log.files_after("", commit_name(state.number)) if (of := _COMMIT.fullmatch(name))}
-    numbers = sorted(number for number in found if number > state.number)
+    numbers = _list_commits(log, state.number)
     for number, result in zip(numbers, side_by_side(log.where(), lambda n: _try(log, n), numbers), strict=True):
         missing = [_problem("commit-missing", log, absent) for absent in range(state.number + 1, number)]
         if missing:
@@ -95,6 +94,19 @@ def refresh(store: Place, state: State) -> State:
             continue
         state = _follow(state, result, log)
     return state
+
+
+def read_newest_commit(store: Place) -> Commit | None:
+    """Return the last commit, None where there is none; `StoreError` where it is not as it was written."""
+    log = store.below(LOG)
+    numbers = _list_commits(log, 0)
+    return read_commit(log, numbers[-1])[0] if numbers else None
+
+
+def _list_commits(log: Place, after: int) -> list[int]:
+    """Return the numbers of the commits after one, rising."""
+    found = (_COMMIT.fullmatch(name) for name in log.files_after("", commit_name(after)))
+    return sorted(int(of[1]) for of in found if of)
 
 
 def _try(log: Place, number: int) -> ReadCommit | StoreError:

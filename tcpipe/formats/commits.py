@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from datetime import datetime, timedelta
+from itertools import pairwise
 from typing import Literal, TypeAlias
 
 from tcpipe.formats.index_files import RunFacts
@@ -16,6 +17,9 @@ Kind: TypeAlias = Literal[
 
 LATEST_CALLS = 50
 """So many calls are remembered."""
+
+_KEPT_FOR = timedelta(days=7)
+"""So long a generation stays after the next one was committed: readers that began with it may finish."""
 
 _UNFINISHED = ".active"
 """Ending of a ROS 1 bag that is still recorded, or was when its recorder died."""
@@ -84,6 +88,18 @@ class Dataset:
     """The digest in its card."""
     runs: tuple[tuple[str, str], ...] = ()
     """Runs and their recipes."""
+
+
+@dataclass(frozen=True, slots=True)
+class Generation:
+    """One build of what lies at a URL: a dataset, a model, a cost map or an evaluation (ADR 106)."""
+
+    folder: str
+    """Where its files are, from the URL."""
+    card: str
+    """The name of its card in that folder."""
+    at: str
+    """When it was committed: UTC, ISO 8601."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -160,6 +176,7 @@ class Entries:
     datasets: tuple[Dataset, ...] = field(default=(), metadata=LEFT_OUT)
     forgotten: tuple[Dataset, ...] = field(default=(), metadata=LEFT_OUT)
     """Datasets that are gone: overwritten by a build, or given up by a person."""
+    generations: tuple[Generation, ...] = field(default=(), metadata=LEFT_OUT)
     removed: tuple[tuple[str, str], ...] = field(default=(), metadata=LEFT_OUT)
     """Runs and recipes that were pruned."""
     begun: tuple[Begun, ...] = field(default=(), metadata=LEFT_OUT)
@@ -175,7 +192,7 @@ class Entries:
 
 @dataclass(frozen=True, slots=True)
 class Commit:
-    """One entry of a store's log."""
+    """One entry of the log of a store, or of what is built to a URL."""
 
     number: int
     parent: str
@@ -189,7 +206,7 @@ class Commit:
 
 @dataclass(frozen=True, slots=True)
 class State:
-    """What the log of a store says."""
+    """What a log says."""
 
     number: int = 0
     """Of the last commit."""
@@ -211,6 +228,8 @@ class State:
     datasets: Mapping[tuple[str, str], Dataset] = field(default_factory=dict)
     """By place and digest."""
     forgotten: frozenset[tuple[str, str]] = frozenset()
+    generations: tuple[Generation, ...] = ()
+    """Those that are kept, the newest last."""
     begun: Mapping[int, Begun] = field(default_factory=dict)
     """Calls that have not ended, by the number of their commit."""
     calls: tuple[Call, ...] = ()
@@ -253,6 +272,7 @@ def fold(commits: Iterable[Commit], state: State | None = None) -> State:
     runs, seen, failed, acknowledged = dict(state.runs), dict(state.seen), dict(state.failed), dict(state.acknowledged)
     datasets, begun, forgotten = dict(state.datasets), dict(state.begun), set(state.forgotten)
     calls, supersessions, number = state.calls, state.supersessions, state.number
+    generations = state.generations
     gone = state.superseded
     for commit in commits:
         of, number = commit.entries, commit.number
@@ -265,12 +285,13 @@ def fold(commits: Iterable[Commit], state: State | None = None) -> State:
         failed.update({failure.key: failure for failure in of.failed})
         acknowledged.update({problem.key: problem for problem in of.acknowledged})
         _add_datasets(datasets, forgotten, of)
+        generations = _keep_generations((*generations, *of.generations))
         begun.update(_number(call, commit) for call in of.begun)
         begun = {key: call for key, call in begun.items() if key not in of.ended}
         calls = (*reversed(of.calls), *calls)[:LATEST_CALLS]
     return replace(
         state, number=number, runs=runs, seen=seen, failed=failed, acknowledged=acknowledged, supersessions=supersessions,
-        datasets=datasets, forgotten=frozenset(forgotten), begun=begun, calls=calls,
+        datasets=datasets, forgotten=frozenset(forgotten), generations=generations, begun=begun, calls=calls,
     )  # fmt: skip
 
 
@@ -307,6 +328,15 @@ def _add_datasets(datasets: dict[tuple[str, str], Dataset], forgotten: set[tuple
         datasets[dataset.out, dataset.inputs] = dataset
 
 
+def _keep_generations(generations: tuple[Generation, ...]) -> tuple[Generation, ...]:
+    """Return the newest two generations, and those that were not replaced for long when the newest was committed."""
+    times = [datetime.fromisoformat(of.at) for of in generations]
+    kept = [
+        of for of, (_, replaced) in zip(generations, pairwise(times), strict=False) if times[-1] - replaced <= _KEPT_FOR
+    ]
+    return (*kept, *generations[-1:])
+
+
 def _number(call: Begun, commit: Commit) -> tuple[int, Begun]:
     """Return a call with the number, time and process of its commit, unless a snapshot has them."""
     known = call if call.number else replace(call, number=commit.number, begin=commit.at, process=commit.who)
@@ -323,6 +353,7 @@ def compact(state: State) -> Entries:
         superseded=state.supersessions,
         datasets=tuple(state.datasets.values()),
         forgotten=tuple(Dataset(out, inputs) for out, inputs in sorted(state.forgotten)),
+        generations=state.generations,
         begun=tuple(state.begun.values()),
         calls=tuple(reversed(state.calls)),
     )

@@ -22,18 +22,18 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from tcpipe.errors import DatasetError, RecipeError, StoreError, UsageError
+from tcpipe.formats.bucket_directories import FetchedShards
 from tcpipe.formats.dataset_card import KIND, DatasetCard, Shard
 from tcpipe.formats.json_files import typed
 from tcpipe.formats.layer_descriptions import cf_attributes, layers_described
 from tcpipe.formats.parquet import column_names, parquet_bytes, read_row_group, read_table, row_count
 from tcpipe.formats.place import DirectoryPlace, Place
 from tcpipe.formats.proved_content import wrong_files
-from tcpipe.formats.published import FetchedShards
 from tcpipe.formats.seals import prove_files, read_sealed
 from tcpipe.formats.shards import DESCRIPTION, ShardedArray, decoded_chunk, open_sharded
 from tcpipe.formats.zarr_arrays import Compression, add_array, consolidate, create_group
 from tcpipe.splits.assignment import SPLITS
-from tcpipe.tables.levels import DATA_MODEL_VERSION, READ_VERSIONS
+from tcpipe.tables.levels import DATA_MODEL_VERSION, EARLIER_VERSIONS, READ_VERSIONS
 from tcpipe.tables.levels import SAMPLES as SAMPLES_SCHEMA
 from tcpipe.terrain.layers import Layer, in_order, missing
 
@@ -264,7 +264,8 @@ def read_card(directory: Path, *, proved: bool = True) -> DatasetCard:
 
 
 def _outdated(directory: Path, version: object) -> str:
-    return f"{directory}: written by data model {version}, wanted {DATA_MODEL_VERSION}; build it again"
+    remedy = "run 'tcpipe migrate' on it or build it again" if version in EARLIER_VERSIONS else "build it again"
+    return f"{directory}: written by data model {version}, wanted {DATA_MODEL_VERSION}; {remedy}"
 
 
 def _is_current(card: Mapping[str, object]) -> bool:
@@ -374,7 +375,9 @@ class PatchFiles:
             else:
                 name, group = self.groups[piece]
                 path = self.directory / name
-                table = read_row_group(path if self.fetched is None else self.fetched.whole(path), group, list(layers))
+                table = read_row_group(
+                    path if self.fetched is None else self.fetched.fetch_file(path), group, list(layers)
+                )
                 for layer in layers:
                     flat = table.column(layer).combine_chunks().flatten().to_numpy()
                     into[layer][:rows] = flat.reshape(rows, *shape[1:])

@@ -108,6 +108,11 @@ def is_url(text: str | Path) -> bool:
     return _URL.match(str(text)) is not None
 
 
+def is_bucket(text: str | Path) -> bool:
+    """Return whether a text is the URL of what lies in a bucket, which can be listed and written."""
+    return str(text).rstrip("/").startswith(("s3://", "gs://", "az://"))
+
+
 def split_url(url: str, *, one_object: bool = False) -> tuple[str, str]:
     """Return a URL as it is shown and stored, and its query: only the server of a presigned URL gets that.
 

@@ -50,7 +50,7 @@ class Fetched(Protocol):
     def read(self, path: Path, offset: int, size: int) -> bytes:
         """Return a piece of a shard that ends with its checksum."""
 
-    def expect(self, pieces: Iterable[tuple[Path, int, int]]) -> None:
+    def prefetch(self, pieces: Iterable[tuple[Path, int, int]]) -> None:
         """Have pieces (shard, offset, size) brought here, which are read soon."""
 
 
@@ -115,14 +115,14 @@ class ShardedArray:
         for shard in paths.keys() - self._indices.keys():
             with suppress(FileNotFoundError):
                 tables.append((paths[shard], *self._index_span(self.fetched.size(paths[shard]))))
-        self.fetched.expect(tables)
+        self.fetched.prefetch(tables)
         for shard, place in wanted:
             path = paths[shard]
             with suppress(FileNotFoundError, ValueError):
                 table = self._index(shard, partial(self.fetched.size, path), partial(self.fetched.read, path))
                 offset, size = (int(value) for value in table[place])
                 pieces += [(path, offset, size)] if offset != _ABSENT else []
-        self.fetched.expect(pieces)
+        self.fetched.prefetch(pieces)
 
     def _shard_and_place(self, index: Sequence[int]) -> tuple[tuple[int, ...], tuple[int, ...]]:
         per_shard = self.per_shard

@@ -12,12 +12,11 @@ from tcpipe.dataset import open_dataset
 from tcpipe.dataset.energies import ENERGIES
 from tcpipe.errors import UsageError, plain_lines
 from tcpipe.formats.atomic import clear, write_text
-from tcpipe.formats.bucket import open_place
+from tcpipe.formats.bucket_directories import fetch_directory, fetch_directory_by_range, find_newest, require_card
 from tcpipe.formats.dataset_files import is_shard, read_card
 from tcpipe.formats.json_files import digest, parse_json, read_as, read_json, typed, write_json
 from tcpipe.formats.object_storage import is_url
 from tcpipe.formats.parquet import read_table, write_table
-from tcpipe.formats.published import here, here_by_range, published
 from tcpipe.formats.seals import sealed
 from tcpipe.learning.baselines import verdicts
 from tcpipe.learning.evaluation import NETWORKS, PlantCosts, evaluate
@@ -28,6 +27,7 @@ from tcpipe.learning.evaluation_verdict import verdict
 from tcpipe.learning.metrics import ALL, QUANTITIES
 from tcpipe.learning.models import read_model_card
 from tcpipe.learning.training import dataset_checksum
+from tcpipe.pipeline.generations import write_generation
 
 SIMULATED = "The data are simulated: what can be compared with the paper is the pattern, not the figures."
 
@@ -69,7 +69,8 @@ def run_evaluation(
 ) -> EvaluationResult:
     """Evaluate a model on a dataset into the directory ``out``: new, empty, or an earlier evaluation, whose networks are used again.
 
-    It may be a URL in a bucket, where nothing is replaced. Where the same evaluation is already, only its table and page are written again.
+    It may be a URL in a bucket, where it becomes the newest generation. Where the same evaluation is already, only its table and page
+    are written again; at a URL nothing is.
 
     Raises
     ------
@@ -79,11 +80,11 @@ def run_evaluation(
     rules = config or EvaluateConfig()
     key = _key(model, dataset, rules, simulated=plant is not None)
     if is_url(out):
-        if (known := _in_bucket(str(out))) is not None and known.key == key:
-            return EvaluationResult(str(out), known)
-        with published(str(out), JSON) as made:
+        if (known := _read_at_url(str(out))) is not None and known.values.key == key:
+            return known
+        with write_generation(str(out), JSON) as made:
             result = run_evaluation(model, dataset, made, config=config, plant=plant)
-        return replace(result, path=str(out))
+        return replace(result, path=require_card(str(out), [JSON]).place.where())
     place = Path(out)
     clear(place)
     ours = {JSON, CSV, PAGE, SAMPLES, NETWORKS, "drives.json", "drives.html"}
@@ -116,18 +117,20 @@ def samples_of(place: Path, dataset: str | Path) -> EvaluatedSamples:
     return evaluated_samples(read_table(place / SAMPLES), open_dataset(dataset))
 
 
-def _in_bucket(url: str) -> Evaluation | None:
-    """Return the evaluation at a URL; None where there is none."""
-    place = open_place(url)
-    data, where = place.read(JSON), place.where(JSON)
-    return None if data is None else typed(parse_json(data, where), Evaluation, where)
+def _read_at_url(url: str) -> EvaluationResult | None:
+    """Return the newest evaluation at a URL; None where there is none."""
+    found = find_newest(url, [JSON])
+    if found is None:
+        return None
+    where = found.place.where(JSON)
+    return EvaluationResult(found.place.where(), typed(parse_json(found.data, where), Evaluation, where))
 
 
 def _key(model: str | Path, dataset: str | Path, config: EvaluateConfig, *, simulated: bool) -> str:
     """Return what tells one evaluation from another."""
     told = [
-        sealed(read_model_card(here(model))),
-        dataset_checksum(read_card(here_by_range(dataset, by_range=is_shard)[0])),
+        sealed(read_model_card(fetch_directory(model))),
+        dataset_checksum(read_card(fetch_directory_by_range(dataset, by_range=is_shard)[0])),
         asdict(config),
         simulated,
         __version__,

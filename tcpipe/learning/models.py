@@ -24,10 +24,10 @@ from numpy.typing import NDArray
 from tcpipe.dataset.beside import Beside, nothing_beside, numbers_of, with_planes
 from tcpipe.errors import ModelError, StoreError, UsageError
 from tcpipe.formats.atomic import atomic_directory, write_text
+from tcpipe.formats.bucket_directories import fetch_directory, fetch_directory_by_range
 from tcpipe.formats.dataset_files import is_shard, read_card
 from tcpipe.formats.json_files import digest, typed
 from tcpipe.formats.parquet import read_table, write_table
-from tcpipe.formats.published import here, here_by_range
 from tcpipe.formats.seals import broken_checksums, file_checksums, read_sealed, sealed, write_sealed
 from tcpipe.formats.weights import read_arrays, write_arrays
 from tcpipe.learning.architecture import check_trainable, weight_forms
@@ -237,7 +237,7 @@ def load_model(path: str | Path) -> Model:
     ------
     ModelError : there is no model, its training has not finished, a file is damaged or cut short, or it is of another schema.
     """
-    place = here(path)
+    place = fetch_directory(path)
     card = read_model_card(place)
     if problems := list(broken_checksums(place, card.checksums)):
         raise ModelError(*(f"{problem}; train the model again" for problem in problems))
@@ -273,7 +273,7 @@ def with_physics(model: Model, dataset: str | Path) -> Model:
     """Return the model with the physics of its robot that a dataset's card holds, instead of its own; `ModelError` if it holds none."""
     if model.takes_turns:
         raise UsageError(f"{model.name}: is told the turns of a path and holds what they cost; leave out --physics")
-    card = read_card(here_by_range(dataset, by_range=is_shard)[0])
+    card = read_card(fetch_directory_by_range(dataset, by_range=is_shard)[0])
     if model.robot not in card.physics:
         raise ModelError(
             f"{dataset}: its card has no physics of robot {model.robot}; there is that of {', '.join(card.physics) or 'none'}"

@@ -15,17 +15,18 @@ from tcpipe.dataset import Dataset, Split, open_dataset
 from tcpipe.dataset.beside import beside_of, inputs_of
 from tcpipe.errors import DatasetError, ModelError, StoreError, UsageError
 from tcpipe.formats.atomic import clear_beside
+from tcpipe.formats.bucket_directories import fetch_directory, fetch_directory_by_range, has_card
 from tcpipe.formats.dataset_card import DatasetCard
 from tcpipe.formats.dataset_files import is_shard, read_card
 from tcpipe.formats.json_files import digest, read_json
 from tcpipe.formats.object_storage import is_url
-from tcpipe.formats.published import has_card, here, here_by_range, published
 from tcpipe.learning.architecture import Architecture
 from tcpipe.learning.checkpoint import read_checkpoint
 from tcpipe.learning.fitting import FitConfig, Fitted, ModelKind, Spent, Task, fit, labels_of
 from tcpipe.learning.model_card import KIND, ModelCard, Seen, TrainedOn, Training, is_current
 from tcpipe.learning.model_readme import model_readme
 from tcpipe.learning.models import CARD, FILES, load_model, read_model_card, write_model
+from tcpipe.pipeline.generations import write_generation
 from tcpipe.terrain.classes import NODATA_ID, PAPER_CLASSES, ClassTable
 from tcpipe.terrain.relief import relief_m
 
@@ -94,7 +95,7 @@ class TrainResult:
 
 def model_for(dataset: str | Path) -> ModelKind:
     """Return the kind of model that a dataset of this size is best served by, and say so."""
-    count = read_card(here_by_range(dataset, by_range=is_shard)[0]).splits.get("train", 0)
+    count = read_card(fetch_directory_by_range(dataset, by_range=is_shard)[0]).splits.get("train", 0)
     kind: ModelKind = "table" if count < FEW_SAMPLES else "resnet18"
     than, other = ("fewer than", "resnet18") if kind == "table" else ("not fewer than", "table")
     logger.info(
@@ -123,7 +124,7 @@ def train(
     ----------
     dataset : what ``tcpipe build-dataset`` wrote.
     out : the folder: new, or a model and nothing else, which is replaced unless it is whole and was trained on the same with the same
-        options; or a URL in a bucket, where nothing is replaced. While training runs its state is kept beside a folder, in
+        options; or a URL in a bucket, where it becomes the newest generation. While training runs its state is kept beside a folder, in
         ``<out>.checkpoint``, and gone on from.
     config : how.
     variant : on what, where it is not the paper's network.
@@ -178,11 +179,11 @@ def train(
 
 
 def _into_bucket(dataset: str | Path, url: str, key: str, rules: FitConfig, other: Variant) -> TrainResult:
-    """Train on this machine, and put the model to a URL; what is there already is not replaced."""
-    known = read_model_card(here(url)) if has_card(url) else None
+    """Train on this machine, and put the model to a URL."""
+    known = read_model_card(fetch_directory(url)) if has_card(url) else None
     if known is not None and known.training.key == key:
         return _unchanged(url, known.training)
-    with published(url, CARD) as place:
+    with write_generation(url, CARD) as place:
         result = train(dataset, place, config=rules, variant=other)
     return replace(result, path=url)
 

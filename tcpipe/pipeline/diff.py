@@ -12,11 +12,11 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from tcpipe.errors import plain_lines
+from tcpipe.formats.bucket_directories import fetch_directory
 from tcpipe.formats.dataset_card import DatasetCard, MapSource, RunSource
 from tcpipe.formats.dataset_files import open_patches, read_card, read_samples, rows_in_files, sample_columns
 from tcpipe.formats.finding_lines import format_findings
 from tcpipe.formats.json_files import plain
-from tcpipe.formats.published import here
 from tcpipe.pipeline.explain import flat_recipe
 from tcpipe.splits.assignment import SPLITS
 from tcpipe.tables.findings import Finding, Subject
@@ -69,7 +69,7 @@ def diff(a: str | Path, b: str | Path) -> Difference:
     ----------
     a, b : their directories or URLs, the older one first.
     """
-    first, second = here(a), here(b)
+    first, second = fetch_directory(a), fetch_directory(b)
     cards = read_card(first), read_card(second)
     there = [sample_columns(directory) for directory in (first, second)]
     shared = [name for name in there[0] if name in there[1]]

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from tcpipe import __version__
 from tcpipe.errors import DatasetError, StoreError, TcpipeError, plain_lines
+from tcpipe.formats.bucket_directories import fetch_directory_by_range
 from tcpipe.formats.dataset_card import DatasetCard
 from tcpipe.formats.dataset_files import (
     SAMPLES,
@@ -30,7 +31,6 @@ from tcpipe.formats.json_files import plain
 from tcpipe.formats.maps.map_facts import MapInputs
 from tcpipe.formats.maps.map_files import MapFile, open_map
 from tcpipe.formats.parquet import ROWS_PER_GROUP, read_row_group
-from tcpipe.formats.published import here_by_range
 from tcpipe.formats.recipe_toml import read_key
 from tcpipe.formats.stored_runs import RunDirectory
 from tcpipe.pipeline.run_stages import run_stages
@@ -192,7 +192,7 @@ def explain(sample_id: str, *, dataset: str | Path = "dataset", store: str | Pat
         the sample's run.
     """
     opened = open_store(store)
-    directory, fetched = here_by_range(dataset, by_range=is_shard)
+    directory, fetched = fetch_directory_by_range(dataset, by_range=is_shard)
     card, sample = read_current_card(directory), _sample(directory, sample_id)
     run = _run(opened, directory, card, sample)
     told = run.manifest

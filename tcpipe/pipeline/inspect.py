@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING, Literal, TypeAlias
 
 from tcpipe.errors import StoreError, TcpipeError, UsageError
 from tcpipe.formats.atomic import scratch_directory
+from tcpipe.formats.bucket_directories import fetch_directory_by_range, has_card
 from tcpipe.formats.json_files import recast
 from tcpipe.formats.logs.joined import opened
 from tcpipe.formats.logs.log_file import belongs_to_a_log, logs_below
 from tcpipe.formats.logs.table_folders import table_files, table_folders
 from tcpipe.formats.object_storage import is_presigned, is_url, shown_path
-from tcpipe.formats.published import has_card, here_by_range
 from tcpipe.formats.run_documents import Counts, LogOrigin
 from tcpipe.formats.stored_runs import RunDirectory
 from tcpipe.pipeline.log_inspection import InspectedLog, inspect_log
@@ -156,7 +156,7 @@ def _at_url(url: str, ask: Callable[[Path | str], InspectedLog]) -> Inspected:
         if has_card(url):
             from tcpipe.formats.dataset_files import is_shard  # noqa: PLC0415  as above
 
-            return _dataset(here_by_range(url, by_range=is_shard)[0], url)
+            return _dataset(fetch_directory_by_range(url, by_range=is_shard)[0], url)
     with scratch_directory() as directory:
         urls = list(remote_logs(url, directory / "logs").values())
     return _logs_at(urls, url, ask)

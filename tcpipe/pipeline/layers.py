@@ -14,12 +14,12 @@ from pyproj import CRS
 from shapely.geometry.base import BaseGeometry
 
 from tcpipe.errors import UsageError, plain_lines
+from tcpipe.formats.bucket_directories import fetch_directory
 from tcpipe.formats.dataset_card import DatasetCard, MapSource
 from tcpipe.formats.dataset_files import CARD, DRIVE_NEXT, read_current_card, read_samples
 from tcpipe.formats.geojson import read_polygons
 from tcpipe.formats.geopackage import VectorLayer, write_geopackage
 from tcpipe.formats.object_storage import is_url
-from tcpipe.formats.published import here
 from tcpipe.formats.qgis_styles import VIRIDIS, classes_style, ranges_style
 from tcpipe.report.colours import SPLIT_COLOURS
 from tcpipe.store import Store, inside_store, is_store, run_at
@@ -60,7 +60,7 @@ def export_layers(source: Path | str, out: Path) -> ExportedLayers:
     if stored:
         layers = [_segments(source)]
     else:
-        directory = here(source) if is_url(source) else Path(source)
+        directory = fetch_directory(source) if is_url(source) else Path(source)
         if not (directory / CARD).is_file():
             raise UsageError(f"{source}: is no dataset, run or store; a GeoPackage is made of one of these")
         layers = list(_of_dataset(directory))

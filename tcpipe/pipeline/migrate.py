@@ -15,16 +15,18 @@ from typing import Any, TypeVar
 
 from tcpipe.errors import StoreError, TcpipeError, UsageError, plain_lines
 from tcpipe.formats.bucket import open_place
+from tcpipe.formats.bucket_directories import find_newest
 from tcpipe.formats.commit_log import LOG
 from tcpipe.formats.commits import Call, Dataset, Entries, Failure, Problem, Sighting, State, Superseded
-from tcpipe.formats.dataset_files import CARD, read_card
+from tcpipe.formats.dataset_card import DatasetCard
+from tcpipe.formats.dataset_files import CARD
 from tcpipe.formats.json_files import Json, plain, to_json, typed
 from tcpipe.formats.maps.map_files import open_map
 from tcpipe.formats.numbered import read_sealed_at, stem_and_number
 from tcpipe.formats.object_storage import is_url
 from tcpipe.formats.place import Place
 from tcpipe.formats.run_documents import Manifest, RunJson, StoreDocument
-from tcpipe.formats.seals import read_sealed, sealed, write_sealed
+from tcpipe.formats.seals import sealed
 from tcpipe.formats.store_mark import MARK, is_outdated, layout_of
 from tcpipe.pipeline.log_writer import is_committed, open_log
 from tcpipe.store import Store
@@ -74,7 +76,7 @@ def migrate(path: Path | str, to: Path | str | None = None) -> Migrated:
 
     Parameters
     ----------
-    path : the store, map (``.zarr``) or dataset; a store also by its URL.
+    path : the store, map (``.zarr``) or dataset; a store or dataset also by its URL.
     to : where a store is brought to, a directory or URL; what is there of it already is not copied again. None: where it is.
 
     Raises
@@ -92,35 +94,35 @@ def migrate(path: Path | str, to: Path | str | None = None) -> Migrated:
                 f"{path}: is of data model {version}, this version knows {', '.join((*EARLIER_VERSIONS, DATA_MODEL_VERSION))}"
             )
         return _store(source, source if to is None else open_place(to))
-    if is_url(path) or to is not None:
+    if to is not None:
         raise UsageError(f"{path}: is no store; only stores are brought elsewhere")
-    path = Path(path)
-    if (path / CARD).is_file():
-        return _one(path, path / CARD)
-    if path.resolve().suffix == ".zarr":
-        return _one(path, path)
-    raise UsageError(f"{path}: is no store, map (.zarr) or dataset; give one of these directories")
-
-
-def _one(path: Path, document: Path) -> Migrated:
     try:
-        brought = document.suffix != ".zarr" and _bring_card(document)
-        if document.suffix == ".zarr":
-            open_map(document)
+        brought = _bring_one(path)
+    except UsageError:
+        raise
     except TcpipeError as error:
         return Migrated(str(path), (), 0, error.problems)
-    return Migrated(str(path), (str(document),) if brought else (), 0 if brought else 1, ())
+    return Migrated(str(path), brought, 0 if brought else 1, ())
 
 
-def _bring_card(path: Path) -> bool:
-    """Bring a dataset's card to this data model; return False where it was."""
-    found = read_sealed(path)
-    document = _bring_document(found, str(path))
+def _bring_one(path: Path | str) -> tuple[str, ...]:
+    """Bring a dataset to this data model; return where its card is, nothing where it was current or is a map."""
+    if (dataset := find_newest(str(path), [CARD])) is not None:
+        return _bring_card(dataset.place)
+    if is_url(path) or Path(path).resolve().suffix != ".zarr":
+        raise UsageError(f"{path}: is no store, map (.zarr) or dataset; give one of these directories")
+    open_map(Path(path))
+    return ()
+
+
+def _bring_card(place: Place) -> tuple[str, ...]:
+    found, where = read_sealed_at(place, CARD), place.where(CARD)
+    document = _bring_document(found, where)
     if document is found:
-        return False
-    write_sealed(path, document)
-    read_card(path.parent)
-    return True
+        return ()
+    typed(document, DatasetCard, where)
+    place.put(CARD, to_json(sealed(document)).encode())
+    return (where,)
 
 
 def _store(source: Place, target: Place) -> Migrated:

@@ -7,10 +7,10 @@ from pathlib import Path
 
 from tcpipe.errors import StoreError, UsageError
 from tcpipe.formats.bucket import open_place
+from tcpipe.formats.bucket_directories import fetch_directory_by_range
 from tcpipe.formats.dataset_files import CARD, read_current_card
 from tcpipe.formats.object_storage import is_url
 from tcpipe.formats.place import Place
-from tcpipe.formats.published import here
 from tcpipe.formats.seals import sealed_page
 from tcpipe.formats.stored_runs import RunDirectory
 from tcpipe.pipeline.store_facts import store_facts
@@ -91,7 +91,8 @@ def _of_run(store: Store, run: RunDirectory, of_maps: dict[str, Pictures]) -> Pa
 
 def _of_dataset(path: Path | str, *, patches: bool) -> Page:
     """Write a dataset's page, and, before it, pictures of all patches, which it shows from then on."""
-    directory, place = here(path), open_place(path)
+    directory, fetched = fetch_directory_by_range(path, by_range=lambda _: False)
+    place = open_place(path) if fetched is None else fetched.place
     card = read_current_card(directory)
     folder, count = folder_of(card)
     if patches and card.samples > MOST_SAMPLES:

@@ -9,12 +9,14 @@ from pathlib import Path
 
 from tcpipe.errors import TcpipeError, UsageError, plain_lines
 from tcpipe.formats.atomic import left_beside
+from tcpipe.formats.bucket import open_place
+from tcpipe.formats.bucket_directories import fetch_unproved, find_unlisted_files
+from tcpipe.formats.commit_log import LOG
 from tcpipe.formats.dataset_files import CARD, read_card
-from tcpipe.formats.object_storage import is_url
-from tcpipe.formats.published import anew, others_beside
+from tcpipe.formats.object_storage import is_bucket, is_url
 from tcpipe.formats.seals import Checksums, broken_checksums, read_sealed_as
 from tcpipe.pipeline.verify_dataset import verify_dataset
-from tcpipe.pipeline.verify_store import verify_map, verify_run, verify_store
+from tcpipe.pipeline.verify_store import verify_log, verify_map, verify_run, verify_store
 from tcpipe.store import Store, inside_store, is_store
 from tcpipe.tables.facts import LEFT_OUT
 
@@ -59,10 +61,9 @@ def verify(path: Path | str) -> Verified:
     """
     stored = _stored(str(path)) if is_url(path) else None
     if is_url(path) and stored is None:
-        with anew(str(path).rstrip("/")) as copy:
+        with fetch_unproved(str(path).rstrip("/")) as copy:
             found = verify(copy)
-        strangers = (f"{name}: is no file of this {found.kind}" for name in others_beside(str(path)))
-        return replace(found, path=str(path), problems=(*found.problems, *strangers))
+        return replace(found, path=str(path), problems=(*found.problems, *_verify_generations(str(path), found.kind)))
     if stored is None and not Path(path).exists():
         raise UsageError(f"{path}: there is no such directory; give a {_KNOWN}")
     kind, findings = stored or _what(Path(path))
@@ -84,6 +85,13 @@ def verify(path: Path | str) -> Verified:
     return Verified(
         str(path), kind, read, tuple(dict.fromkeys(problems)), _notes(Path(path)) if kind == "dataset" else ()
     )
+
+
+def _verify_generations(url: str, kind: str) -> Iterator[str]:
+    """Yield what is wrong with the log of a URL, and files of no generation."""
+    if is_bucket(url):
+        yield from (line for line in verify_log(open_place(url).below(LOG)) if isinstance(line, str))
+    yield from (f"{name}: is no file of this {kind}" for name in find_unlisted_files(url))
 
 
 def _notes(dataset: Path) -> tuple[str, ...]:

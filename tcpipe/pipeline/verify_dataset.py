@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from tcpipe.cost.budget import pooled
 from tcpipe.errors import DatasetError, TcpipeError
+from tcpipe.formats.bucket_directories import REPORT_PATCHES
 from tcpipe.formats.dataset_card import DatasetCard
 from tcpipe.formats.dataset_files import (
     CARD,
@@ -30,7 +31,6 @@ from tcpipe.formats.dataset_files import (
 )
 from tcpipe.formats.json_files import plain
 from tcpipe.formats.parquet import read_table
-from tcpipe.formats.published import REPORT_PATCHES
 from tcpipe.formats.recipe_toml import recipe_id
 from tcpipe.formats.seals import broken_checksums, broken_seal
 from tcpipe.pipeline.dataset.card import CARD_COLUMNS, measured

@@ -16,6 +16,7 @@ import pyarrow as pa
 
 from tcpipe.errors import StoreError, TcpipeError
 from tcpipe.formats.atomic import TEMPORARY_PREFIX, is_abandoned
+from tcpipe.formats.bucket_directories import FetchedShards
 from tcpipe.formats.commit_log import LOG, commit_name, read_commit, read_snapshot, snapshot_name
 from tcpipe.formats.commits import Commit, State, fold
 from tcpipe.formats.index_files import facts_of
@@ -24,7 +25,6 @@ from tcpipe.formats.maps.map_files import MapFile, open_map
 from tcpipe.formats.numbered import name_of, numbers, read_as_at, read_sealed_at, stem_and_number
 from tcpipe.formats.parquet import read_table
 from tcpipe.formats.place import DirectoryPlace, Place
-from tcpipe.formats.published import FetchedShards
 from tcpipe.formats.recipe_toml import ingest_key, recipe_id
 from tcpipe.formats.run_documents import Manifest, MapDocument, RunJson
 from tcpipe.formats.seals import CHECKSUMS, Checksum, broken_checksums, broken_seal_in, read_checksums, wrong_checksum
@@ -59,15 +59,15 @@ def verify_store(store: Store) -> Iterator[Finding]:
             yield f"{place.where(name)}: is of a build that goes on, or was killed; 'tcpipe prune' removes what is old"
         elif name not in (LOG, "maps", "runs", _INDEX):
             yield _stranger(place, name)
-    yield from _log(place.below(LOG))
+    yield from verify_log(place.below(LOG))
     yield from _maps(store)
     yield from _runs(store)
     if isinstance(place, DirectoryPlace):
         yield from _left_behind(place.root)
 
 
-def _log(log: Place) -> Iterator[Finding]:
-    """Yield the same of every commit, and of every snapshot, which has to say what the commits to its number say."""
+def verify_log(log: Place) -> Iterator[Finding]:
+    """Yield counts and problems of every commit, and of every snapshot, which has to say what the commits to its number say."""
     state, last, whole = State(), 0, True
     for name in log.files():
         number = int(name[:10]) if name[:10].isdigit() and name[10:] == ".json" else None

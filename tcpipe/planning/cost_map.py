@@ -29,14 +29,15 @@ from numpy.typing import NDArray
 from tcpipe.errors import MapError, StoreError, TcpipeError, UsageError, plain_lines
 from tcpipe.execution import run_all, sound
 from tcpipe.formats.atomic import atomic_directory, clear_beside, exclusive, write_text
+from tcpipe.formats.bucket_directories import fetch_directory, has_card
 from tcpipe.formats.json_files import digest, read_json, write_json
 from tcpipe.formats.maps.geotiff import read_bands, write_cog
 from tcpipe.formats.maps.map_files import MapFile
 from tcpipe.formats.maps.nav2 import HIGHEST, LETHAL, write_nav2_map
 from tcpipe.formats.object_storage import is_url
-from tcpipe.formats.published import has_card, here, published
 from tcpipe.formats.qgis_styles import raster_style
 from tcpipe.formats.seals import Checksum, broken_checksums, file_checksums, read_sealed_as, write_sealed
+from tcpipe.pipeline.generations import write_generation
 from tcpipe.planning.cost_grid import BARRED, CellFrames, Cells, CostGrid, blocks, empty_grid, grid_over
 from tcpipe.planning.cost_model import CostModel, check_model
 from tcpipe.planning.courses import ANGLES_DEG, COURSES
@@ -157,8 +158,8 @@ def make_cost_map(
     Parameters
     ----------
     model, source : who predicts, and the map.
-    out : its directory: new, empty, or a cost map, which is replaced unless it is made from the same; or a URL in a bucket, where nothing
-        is replaced, and an interrupted call begins anew.
+    out : its directory: new, empty, or a cost map, which is replaced unless it is made from the same; or a URL in a bucket, where it
+        becomes the newest generation, and an interrupted call begins anew.
     step_m : side of a cell in the map's plane [m].
     origin_deg : longitude and latitude where the frame of the Nav2 maps has x = y = 0, its axes those of the map's CRS; the CRS's own
         without.
@@ -206,11 +207,11 @@ def _into_bucket(
     step: Step,
     cluster: Cluster | None,
 ) -> CostMapResult:
-    """Make it on this machine, and put it to a URL; what is there already is not replaced."""
-    known = read_cost_map_card(here(url)) if has_card(url) else None
+    """Make it on this machine, and put it to a URL."""
+    known = read_cost_map_card(fetch_directory(url)) if has_card(url) else None
     if known is not None and (known.key, known.origin_deg) == (cost_map_key(model, source, step_m), origin_deg):
         return CostMapResult(url, "unchanged", known)
-    with published(url, CARD) as place:
+    with write_generation(url, CARD) as place:
         made = make_cost_map(model, source, place, step_m=step_m, origin_deg=origin_deg, step=step, cluster=cluster)
     return replace(made, path=url)
 

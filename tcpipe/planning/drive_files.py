@@ -12,9 +12,10 @@ from tcpipe import __version__
 from tcpipe.dataset import Dataset
 from tcpipe.errors import UsageError, plain_lines
 from tcpipe.formats.atomic import clear, write_text
+from tcpipe.formats.bucket_directories import require_card
 from tcpipe.formats.json_files import write_json
 from tcpipe.formats.object_storage import is_url
-from tcpipe.formats.published import published
+from tcpipe.pipeline.generations import write_generation
 from tcpipe.planning.cost_model import CostModel
 from tcpipe.planning.drives import Against, DriveCost, drive_cost, drive_in, in_words
 from tcpipe.report.colours import DROPPED, SPLIT_COLOURS
@@ -75,9 +76,9 @@ def evaluate_drives(
     ModelError, MapError, UsageError : as `drives.drive_cost`; ``out`` is a file.
     """
     if is_url(out):
-        with published(str(out), JSON) as made:
+        with write_generation(str(out), JSON) as made:
             result = evaluate_drives(model, data, source, logs, store=store, out=made)
-        return replace(result, path=str(out))
+        return replace(result, path=require_card(str(out), [JSON]).place.where())
     place, opened = Path(out), open_store(store)
     runs = [drive_in(opened, log) for log in logs]
     clear(place)

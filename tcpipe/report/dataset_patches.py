@@ -11,10 +11,10 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from tcpipe.formats.bucket_directories import REPORT_PATCHES
 from tcpipe.formats.dataset_card import DatasetCard
 from tcpipe.formats.dataset_files import PatchFiles, open_patches, read_samples, rows_in_files
 from tcpipe.formats.json_files import Json
-from tcpipe.formats.published import REPORT_PATCHES
 from tcpipe.report.pictures import ACROSS, class_picture, picture_bytes, picture_uri, relief_picture, sheet
 from tcpipe.tables.columns import floats
 from tcpipe.terrain.layers import COLOURS

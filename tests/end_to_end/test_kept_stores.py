@@ -16,7 +16,7 @@ from object_gateway import in_environment
 from storage_server import object_store
 
 import tcpipe
-from tcpipe.errors import StoreError, UsageError
+from tcpipe.errors import DatasetError, StoreError, UsageError
 from tcpipe.formats.json_files import to_json
 from tcpipe.formats.maps.map_files import open_map
 from tcpipe.formats.place import DirectoryPlace
@@ -117,6 +117,24 @@ def test_a_card_is_migrated_once_and_nothing_else_changes(untouched, name):
     assert (again.migrated, again.exit_code) == ((), 0)
     assert "nothing to do" in str(again)
     assert contents(untouched / name) == after
+
+
+def test_a_dataset_that_0_8_wrote_into_a_bucket_is_migrated_there_and_read(untouched, monkeypatch):
+    ours = untouched / "served" / "sets" / "ds"
+    shutil.copytree(untouched / "zarr", ours)
+    with object_store(untouched / "served") as (environment, _):
+        in_environment(monkeypatch, environment, untouched / "cache")
+        with pytest.raises(DatasetError, match=r"run .tcpipe migrate. on it"):
+            tcpipe.open_dataset("s3://sets/ds")
+        assert migrate("s3://sets/ds").migrated == ("s3://sets/ds/dataset.json",)
+        assert migrate("s3://sets/ds").migrated == ()
+        migrate(untouched / "zarr")
+        assert contents(ours).keys() == {
+            ours / of.relative_to(untouched / "zarr") for of in contents(untouched / "zarr")
+        }
+        ours_read, theirs = (tcpipe.open_dataset(path)["train"] for path in ("s3://sets/ds", untouched / "zarr"))
+        assert np.array_equal(ours_read.patches, theirs.patches)
+        assert verify("s3://sets/ds").problems == ()
 
 
 def test_a_map_alone_is_current(untouched):

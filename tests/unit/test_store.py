@@ -285,4 +285,4 @@ def test_the_map_of_a_document_stays_where_it_is_when_another_takes_its_place(ro
     old = store.map_document("site")
     add("new", 1)
     for (path, fetched), text in ((store.map_at(old), b"old"), (store.map_files("site"), b"new")):
-        assert (fetched.whole(path / "tile") if fetched else path / "tile").read_bytes() == text
+        assert (fetched.fetch_file(path / "tile") if fetched else path / "tile").read_bytes() == text

@@ -18,6 +18,7 @@ from tcpipe.cost.budget import in_words
 from tcpipe.errors import DatasetError, RecipeError, StoreError, UsageError, plain_lines
 from tcpipe.formats.atomic import atomic_directory, clear_beside, write_text
 from tcpipe.formats.bucket import open_place
+from tcpipe.formats.bucket_directories import fetch_directory_by_range, find_newest
 from tcpipe.formats.commits import Call, Dataset, Entries
 from tcpipe.formats.croissant import croissant
 from tcpipe.formats.dataset_card import DatasetCard, Doubtful, Redacted, group_dataset_findings
@@ -46,7 +47,6 @@ from tcpipe.formats.object_storage import is_url
 from tcpipe.formats.parquet import ROWS_PER_GROUP, parquet_rows
 from tcpipe.formats.place import DirectoryPlace
 from tcpipe.formats.places import local_output
-from tcpipe.formats.published import has_card, here_by_range, published, refuse_others, settle
 from tcpipe.formats.recipe_toml import recipe_of
 from tcpipe.formats.seals import Checksum, file_checksum, file_checksums, sealed_page, write_sealed
 from tcpipe.formats.store_mark import SPOOL
@@ -71,6 +71,7 @@ from tcpipe.pipeline.dataset.runs import CHOICE_CODES, find_gone_runs
 from tcpipe.pipeline.dataset.sampling import Workers
 from tcpipe.pipeline.dataset.segments import KEPT
 from tcpipe.pipeline.dataset.writing import write_patches
+from tcpipe.pipeline.generations import read_generations, write_generation
 from tcpipe.pipeline.log_writer import LogWriter, open_log
 from tcpipe.recipe import Recipe
 from tcpipe.report.dataset_report import dataset_report
@@ -198,16 +199,21 @@ def run_build_dataset(options: BuildDatasetOptions) -> BuildResult:
         min_runs=options.min_runs,
     )
     inputs = replace(inputs, findings=(*left_out, *inputs.findings))
-    if proved and known is not None and known.inputs == inputs.digest and _is_all_there(place, known):
+    if (
+        proved
+        and known is not None
+        and known.inputs == inputs.digest
+        and (isinstance(place, str) or is_whole(place, known))
+    ):
         card, result = known, _result(place, "unchanged", known, left_out)
     elif dry_run:
         _refuse_other_options(place, known, marks, inputs, force=options.force)
         if isinstance(place, str):
-            refuse_others(open_place(place), CARD)
+            read_generations(open_place(place), CARD)
         return _planned(place, opened, inputs, jobs=options.jobs)
     else:
         _refuse_other_options(place, known, marks, inputs, force=options.force)
-        whole = published(place, CARD) if isinstance(place, str) else atomic_directory(place.absolute())
+        whole = write_generation(place, CARD) if isinstance(place, str) else atomic_directory(place.absolute())
         with begun_call(open_log(opened), BUILD, [_absolute(place)]) as call:
             at_work = partial(_workers, jobs=options.jobs, cluster=options.cluster)
             with whole as directory, at_work(directory, opened, inputs.digest) as workers:
@@ -243,18 +249,21 @@ def _refuse_other_options(
     place: Path | str, known: DatasetCard | None, options: BuildOptions, inputs: Inputs, *, force: bool
 ) -> None:
     """Raise `UsageError`, a line for each difference, where a dataset of other options would be replaced unasked."""
-    if known is None or known.inputs == inputs.digest or (force and isinstance(place, Path)):
+    if known is None or known.inputs == inputs.digest or force:
         return
     if others := find_other_options(known, options, inputs):
         what = "it was made with other options, and stays; give another OUT, or replace it with --force"
-        if isinstance(place, str):
-            what = "is there already; what lies in a bucket is not replaced: give another place. It was made with other options"
         raise UsageError(f"{place}: {what}", *(f"{place}: {line}" for line in others))
 
 
 def _refuse_others_since(place: Path | str, expected: Container[str | None]) -> None:
-    """Raise `StoreError` where another call has put a dataset in this place since; in a bucket the first wins anyway."""
-    if isinstance(place, Path) and (place / CARD).is_file() and read_card(place, proved=False).inputs not in expected:
+    """Raise `StoreError` where another call has put a dataset in this place since."""
+    known = None
+    if isinstance(place, str):
+        known = _card_in_bucket(place)[0]
+    elif (place / CARD).is_file():
+        known = read_card(place, proved=False)
+    if known is not None and known.inputs not in expected:
         raise StoreError(
             f"{place}: another call has built a dataset here meanwhile, which stays; run the command again"
         )
@@ -311,21 +320,14 @@ def _find_left_out(
     return (*chosen.damaged, *(replace(finding, severity="note") for finding in fewer))
 
 
-def _is_all_there(place: Path | str, card: DatasetCard) -> bool:
-    if isinstance(place, Path):
-        return is_whole(place, card)
-    sizes = {entry.name: entry.size_bytes for entry in open_place(place).entries()}
-    return all(sizes.get(name) == entry.size_bytes for name, entry in card.checksums.items())
-
-
 def _card_in_bucket(url: str) -> tuple[DatasetCard | None, bool]:
-    """Return the card of the dataset that lies at a URL, if one does, and whether it is as it was written."""
+    """Return the card of the dataset that lies at a URL, if one does, and whether all of it is there and can be read."""
     open_place(url).check()
-    if not has_card(url):
+    if find_newest(url, [CARD]) is None:
         return None, False
-    settle(url)
-    card = read_card(here_by_range(url, by_range=lambda _: True)[0])
-    return card, card.data_model_version in READ_VERSIONS
+    directory, fetched = fetch_directory_by_range(url, by_range=lambda _: True)
+    card = read_card(directory)
+    return card, fetched is not None and fetched.is_complete() and card.data_model_version in READ_VERSIONS
 
 
 def _result(place: Path | str, status: str, card: DatasetCard, left_out: Sequence[Finding]) -> BuildResult:

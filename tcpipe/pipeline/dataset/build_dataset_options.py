@@ -19,7 +19,7 @@ class BuildDatasetOptions:
     """Which runs and maps a dataset is made from, and how."""
 
     out: str | Path = option("dataset", Option(kind="published", metavar="[OUT]", is_argument=True))
-    """A directory that is new, empty or holds a dataset of the same options; or a URL in a bucket, where nothing is replaced."""
+    """A directory that is new, empty or holds a dataset of the same options; or a URL, where each build is a generation."""
     _: KW_ONLY
     split: str | Path | None = option(
         None, Option("GeoJSON region (WGS84): inside is train and test, outside is unseen.", (), "input_file", "FILE")
@@ -71,8 +71,6 @@ class BuildDatasetOptions:
     )
     force: bool = option(
         False,
-        Option(
-            "Replace a dataset that was made with other options (region, map, tags, recipe …); in a bucket nothing is replaced."
-        ),
+        Option("Replace a dataset that was made with other options (region, map, tags, recipe …)."),
     )
     dry_run: bool = option(False, DRY_RUN)

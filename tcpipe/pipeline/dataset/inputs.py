@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 
 from tcpipe import __version__
 from tcpipe.errors import DatasetError, MapError, StoreError
+from tcpipe.formats.bucket_directories import FetchedShards, fetch_directory_by_range
 from tcpipe.formats.dataset_card import RunSource
 from tcpipe.formats.dataset_files import FileFormat, is_shard, read_card, read_samples, sample_columns
 from tcpipe.formats.json_files import digest, plain, recast
-from tcpipe.formats.published import FetchedShards, here_by_range
 from tcpipe.formats.run_documents import LogOrigin, MapDocument
 from tcpipe.formats.seals import CHECKSUMS, Checksum, file_checksums, read_checksums
 from tcpipe.formats.stored_runs import RunDirectory
@@ -152,7 +152,7 @@ def _digest_of(files: Mapping[str, Checksum], below: str = "") -> str:
 
 def earlier_splits(dataset: str | Path) -> pa.Table:
     """Return ``sample_id``, ``split`` and, where there is one, ``fold`` of a dataset of any data model; `DatasetError` if it is none."""
-    directory, _ = here_by_range(dataset, by_range=is_shard)
+    directory, _ = fetch_directory_by_range(dataset, by_range=is_shard)
     if read_card(directory).redaction is not None:
         raise DatasetError(
             f"{directory}: is redacted, its samples have other names; give the dataset that is not (--keep-split)"

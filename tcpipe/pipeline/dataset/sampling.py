@@ -18,11 +18,11 @@ from numpy.typing import NDArray
 
 from tcpipe.errors import TcpipeError
 from tcpipe.execution import run_all, sound
+from tcpipe.formats.bucket_directories import FetchedShards
 from tcpipe.formats.dataset_files import LayerPixels
 from tcpipe.formats.json_files import compact_json, of_json
 from tcpipe.formats.maps.map_files import MapFile, open_map
 from tcpipe.formats.place import Place
-from tcpipe.formats.published import FetchedShards
 from tcpipe.progress import Meter
 from tcpipe.recipe import SampleConfig
 from tcpipe.stages.sample import Sampled

@@ -287,7 +287,7 @@ def test_a_folder_of_something_else_is_left_alone(model, dataset, tmp_path):
         run_evaluation(model, dataset, tmp_path, config=CONFIG)
 
 
-def test_it_goes_to_a_bucket_whole_and_is_not_replaced(evaluated, model, dataset, tmp_path, monkeypatch):
+def test_it_goes_to_a_bucket_and_another_one_is_the_next_generation(evaluated, model, dataset, tmp_path, monkeypatch):
     place, values = evaluated
     table = read_table(place / "predictions.parquet")
     monkeypatch.setattr(
@@ -297,10 +297,10 @@ def test_it_goes_to_a_bucket_whole_and_is_not_replaced(evaluated, model, dataset
     with object_store(tmp_path / "served") as (environment, _):
         in_environment(monkeypatch, environment, tmp_path / "cache")
         told = run_evaluation(model, dataset, "s3://found/by me", config=CONFIG)
-        assert str(told).endswith("open s3://found/by me/evaluation.html")
-        there = tmp_path / "served" / "found" / "by me"
+        (there,) = (tmp_path / "served" / "found" / "by me" / "generations").iterdir()
+        assert str(told).endswith(f"open s3://found/by me/generations/{there.name}/evaluation.html")
         for name in ("evaluation.json", "evaluation.csv", "evaluation.html", "predictions.parquet"):
             assert (there / name).read_bytes() == (place / name).read_bytes()
         assert run_evaluation(model, dataset, "s3://found/by me", config=CONFIG).values == told.values
-        with pytest.raises(UsageError, match="what lies in a bucket is not replaced"):
-            run_evaluation(model, dataset, "s3://found/by me", config=replace(CONFIG, seed=1))
+        other = run_evaluation(model, dataset, "s3://found/by me", config=replace(CONFIG, seed=1))
+        assert "/generations/0000000002-" in other.path

@@ -13,10 +13,10 @@ from made_models import CARD, made_model
 from storage_server import object_store
 
 from tcpipe.errors import ModelError, UsageError
-from tcpipe.formats.published import published
 from tcpipe.formats.seals import write_sealed
 from tcpipe.learning.model_readme import model_readme
 from tcpipe.learning.models import WEIGHTS, load_model
+from tcpipe.pipeline.generations import write_generation
 from tcpipe.pipeline.verify import verify
 
 pytest.importorskip("torch")
@@ -150,7 +150,7 @@ def test_a_model_in_a_bucket_is_the_one_on_disk(tmp_path, monkeypatch):
     with object_store(tmp_path / "served") as (environment, _):
         for name, value in {**environment, "TCPIPE_CACHE": str(tmp_path / "cache")}.items():
             monkeypatch.setenv(name, value)
-        with published("s3://models/a b", "model.json") as place:
+        with write_generation("s3://models/a b", "model.json") as place:
             shutil.copytree(here, place, dirs_exist_ok=True)
         there = load_model("s3://models/a b")
         assert (there.checksum, there.name) == (load_model(here).checksum, "s3://models/a b")

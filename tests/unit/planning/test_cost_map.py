@@ -22,7 +22,7 @@ from storage_server import object_store
 
 from tcpipe.errors import MapError, ModelError, UsageError
 from tcpipe.execution import Outcome
-from tcpipe.formats.published import here
+from tcpipe.formats.bucket_directories import fetch_directory
 from tcpipe.pipeline.verify import verify
 from tcpipe.planning.cost_grid import blocks, grid_over
 from tcpipe.planning.cost_map import Cluster, cost_map_key, make_cost_map, open_cost_map, read_cost_map_card
@@ -286,7 +286,7 @@ def test_the_nav2_frame_begins_at_the_robots_datum_and_nothing_is_predicted_anew
         make_cost_map(MODEL, source, out, step_m=2.0, origin_deg=lonlat[::-1])
 
 
-def test_a_cost_map_goes_to_a_bucket_whole_and_is_not_replaced(made, tmp_path, monkeypatch):
+def test_a_cost_map_goes_to_a_bucket_and_another_one_is_the_next_generation(made, tmp_path, monkeypatch):
     source, result = made
     source = replace(source, reads=Counter())
     (tmp_path / "served" / "maps").mkdir(parents=True)
@@ -294,8 +294,9 @@ def test_a_cost_map_goes_to_a_bucket_whole_and_is_not_replaced(made, tmp_path, m
         in_environment(monkeypatch, environment, tmp_path / "cache")
         told = make_cost_map(MODEL, source, "s3://maps/of a site", step_m=1.0)
         assert (told.path, told.status, told.card.checksums) == ("s3://maps/of a site", "done", result.card.checksums)
-        there = open_cost_map(here("s3://maps/of a site"), told.card)
+        there = open_cost_map(fetch_directory("s3://maps/of a site"), told.card)
         np.testing.assert_array_equal(there.power_watt, open_cost_map(Path(result.path), result.card).power_watt)
         assert make_cost_map(MODEL, source, "s3://maps/of a site", step_m=1.0).status == "unchanged"
-        with pytest.raises(UsageError, match="what lies in a bucket is not replaced"):
-            make_cost_map(MODEL, source, "s3://maps/of a site", step_m=2.0)
+        other = make_cost_map(MODEL, source, "s3://maps/of a site", step_m=2.0)
+        assert other.status == "done"
+        assert read_cost_map_card(fetch_directory("s3://maps/of a site")) == other.card

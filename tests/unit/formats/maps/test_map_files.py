@@ -14,10 +14,10 @@ from storage_server import object_store
 
 from tcpipe.errors import MapError
 from tcpipe.formats.bucket import open_place
+from tcpipe.formats.bucket_directories import fetch_files
 from tcpipe.formats.maps.building import build_map
 from tcpipe.formats.maps.map_facts import MapFacts, MapInputs
 from tcpipe.formats.maps.map_files import SHARD_PX, MapWriter, open_map
-from tcpipe.formats.published import files_here
 from tcpipe.formats.seals import file_checksums, write_checksums
 from tcpipe.terrain.classes import PAPER_SCHEME
 from tcpipe.terrain.grid import MapGrid
@@ -135,7 +135,7 @@ def test_of_a_map_in_a_bucket_the_tiles_that_are_read_are_fetched(wide, tmp_path
     checksums = {f"m.zarr/{name}": of for name, of in file_checksums(path).items()}
     with object_store(tmp_path / "served") as (environment, fetched):
         in_environment(monkeypatch, environment, tmp_path / "cache")
-        root, shards = files_here(open_place("s3://tests"), checksums, by_range=lambda name: "/c/" in name)
+        root, shards = fetch_files(open_place("s3://tests"), checksums, by_range=lambda name: "/c/" in name)
         here, there = open_map(path), open_map(root / "m.zarr", shards)
         opened, requests = fetched.sent_bytes, len(fetched)
         for layer in here.layers:  # of one tile

@@ -1,26 +1,36 @@
-"""Datasets in a bucket: put there whole, card last, never a mixture; read by range through a cache that is proved."""
+"""Datasets in a bucket: generations that appear whole, never a mixture; read by range through a cache that is proved."""
 
+import getpass
 import json
 import shutil
+import socket
+from concurrent.futures import ThreadPoolExecutor
+from datetime import datetime
 
 import numpy as np
 import obstore
 import pytest
 from storage_server import object_store
-from synthetic_store import small_store
+from synthetic_store import add_run, lanes, segments, small_store
 
 import tcpipe
 from tcpipe.errors import StoreError, UsageError
 from tcpipe.formats.bucket import open_place
-from tcpipe.formats.published import CLAIM, published
+from tcpipe.formats.bucket_directories import GENERATIONS, find_newest
+from tcpipe.formats.commit_log import Stamp, put_commit, read_state
+from tcpipe.formats.commits import Entries, Generation, State
 from tcpipe.learning.training import model_for
+from tcpipe.pipeline import generations
+from tcpipe.pipeline.dataset import build as building
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.diff import diff
 from tcpipe.pipeline.explain import explain
+from tcpipe.pipeline.generations import write_generation
 from tcpipe.pipeline.inspect import inspect
 from tcpipe.pipeline.report import report
 from tcpipe.pipeline.verify import verify
 from tcpipe.recipe import Recipe
+from tcpipe.store import open_store
 
 URL = "s3://sets/by name/ds"
 
@@ -63,13 +73,13 @@ def files(directory):
 def test_a_dataset_that_is_built_into_a_bucket_is_the_same_as_on_disk(made, bucket):
     built = build_dataset(URL, store=made / "store", recipe=Recipe())
     assert (built.status, built.path) == ("done", URL)
-    assert files(bucket[0] / "by name" / "ds") == files(made / "zarr")
+    (generation,) = folders(bucket)
+    assert files(generation) == files(made / "zarr")
+    before = files(bucket[0])
     again = build_dataset(f"{URL}/", store=made / "store", recipe=Recipe())
     assert again.status == "unchanged"
-    for dry_run in (True, False):
-        with pytest.raises(UsageError, match="is there already; what lies in a bucket is not replaced"):
-            build_dataset(URL, store=made / "store", recipe=Recipe(), seed=7, dry_run=dry_run)
-    assert files(bucket[0] / "by name" / "ds") == files(made / "zarr")
+    assert "nothing to do" in str(again)
+    assert files(bucket[0]) == before
 
 
 def test_from_a_store_in_a_bucket_the_same_dataset_is_built(made, bucket, tmp_path):
@@ -85,47 +95,157 @@ def test_what_lies_there_and_is_no_dataset_is_left_alone(made, bucket):
     assert files(bucket[0]) == {"notes.txt": b"mine"}
 
 
-def test_what_a_killed_build_left_is_completed_by_the_same_and_refused_to_another(made, bucket):
-    there = bucket[0] / "by name" / "ds"
-    there.mkdir(parents=True)
-    (there / CLAIM).write_bytes((made / "zarr" / "dataset.json").read_bytes())
-    for path in sorted((made / "zarr").rglob("*.*"))[:5]:
-        if path.is_file() and path.name != "dataset.json":
-            (there / path.relative_to(made / "zarr")).parent.mkdir(parents=True, exist_ok=True)
-            shutil.copy(path, there / path.relative_to(made / "zarr"))
-    before = files(there)
-    with pytest.raises(StoreError, match="another one writes something else there"):
+def folders(bucket, name="by name/ds"):
+    """The folders of the generations at a URL, by number."""
+    return sorted(folder for folder in (bucket[0] / name / GENERATIONS).iterdir() if files(folder))
+
+
+def test_a_second_night_builds_there_and_readers_see_it_while_an_earlier_one_finishes(made, tmp_path, bucket):
+    store = open_store(shutil.copytree(made / "store", tmp_path / "store"))
+    build_dataset(URL, store=store.root, recipe=Recipe())
+    earlier = tcpipe.open_dataset(URL)
+    add_run(store, "dry", segments("dry", *lanes(1.0, -10.0, 10.0)))
+    second = build_dataset(URL, store=store.root, recipe=Recipe())
+    assert second.status == "done"
+    build_dataset(tmp_path / "ds", store=store.root, recipe=Recipe())
+    first, newest = folders(bucket)
+    assert files(newest) == files(tmp_path / "ds")
+    assert tcpipe.open_dataset(URL).card == tcpipe.open_dataset(tmp_path / "ds").card != earlier.card
+    assert len(earlier["train"].patches) == len(earlier["train"]), "read after the second was there"
+    assert verify(URL).problems == ()
+    assert len(diff(f"{URL}/{GENERATIONS}/{first.name}", URL).causes) > 0, (
+        "the folder of a generation is a dataset itself"
+    )
+
+
+def test_what_was_made_with_other_options_is_replaced_with_force(made, bucket):
+    build_dataset(URL, store=made / "store", recipe=Recipe())
+    with pytest.raises(UsageError, match="was made with other options, and stays"):
         build_dataset(URL, store=made / "store", recipe=Recipe(), seed=7)
-    assert files(there) == before
-    with pytest.raises(UsageError, match="there is no dataset"):
-        tcpipe.open_dataset(URL)
-    assert build_dataset(URL, store=made / "store", recipe=Recipe()).status == "done"
-    assert files(there) == files(made / "zarr")
+    assert build_dataset(URL, store=made / "store", recipe=Recipe(), seed=7, force=True).status == "done"
+    assert [folder.name[:10] for folder in folders(bucket)] == ["0000000001", "0000000002"]
 
 
-def write(directory, text):
-    (directory / "c.json").write_text(text)
-    (directory / "data").write_text(text)
+def test_what_0_8_or_a_copy_put_there_is_read_and_the_next_build_is_beside_it(made, bucket):
+    put(made, bucket)
+    before = files(bucket[0] / "by name" / "ds")
+    assert build_dataset(URL, store=made / "store", recipe=Recipe()).status == "unchanged"
+    assert files(bucket[0] / "by name" / "ds") == before
+    build_dataset(URL, store=made / "store", recipe=Recipe(), seed=7, force=True)
+    now = files(bucket[0] / "by name" / "ds")
+    assert {name: now[name] for name in before} == before
+    (generation,) = folders(bucket)
+    assert tcpipe.open_dataset(URL).card.inputs == json.loads((generation / "dataset.json").read_text())["inputs"]
+    assert verify(URL).problems == ()
 
 
-def test_who_comes_second_finds_it_done_and_mixes_nothing(bucket):
-    def put_two():
-        with published("s3://sets/x", "c.json") as mine:
-            write(mine, "mine")
-            with published("s3://sets/x", "c.json") as theirs:
-                write(theirs, "theirs")
+def test_a_build_of_another_call_meanwhile_stays(made, bucket, monkeypatch):
+    draw = building.write_patches
 
-    with pytest.raises(StoreError, match="another one has written it meanwhile"):
-        put_two()
-    assert files(bucket[0] / "x") == {"c.json": b"theirs", "data": b"theirs"}
+    def while_the_first_draws(*how, **more):
+        monkeypatch.setattr(building, "write_patches", draw)
+        build_dataset(URL, store=made / "store", recipe=Recipe(), seed=7)
+        return draw(*how, **more)
+
+    monkeypatch.setattr(building, "write_patches", while_the_first_draws)
+    with pytest.raises(StoreError, match="another call has built a dataset here meanwhile, which stays"):
+        build_dataset(URL, store=made / "store", recipe=Recipe())
+    assert len(folders(bucket)) == 1
+
+
+def test_a_redacted_dataset_names_no_machine_in_its_log(made, bucket):
+    build_dataset(URL, store=made / "store", recipe=Recipe(), redact=True)
+    text = b"".join(path.read_bytes() for path in (bucket[0] / "by name" / "ds" / "log").iterdir()).decode()
+    assert "generations/0000000001-" in text
+    assert not [name for name in (socket.gethostname(), str(made), getpass.getuser()) if name in text]
+
+
+PLACE = "s3://sets/x"
+
+
+def write(text, card="c.json", more=()):
+    with write_generation(PLACE, card) as directory:
+        for name in (card, "data", *more):
+            (directory / name).write_text(text)
+
+
+def seen(card="c.json"):
+    """What a reader finds: the card and the file beside it."""
+    found = find_newest(PLACE, [card])
+    return found and (found.data.decode(), (found.place.read("data") or b"").decode())
+
+
+def test_of_two_at_once_the_second_is_the_next_generation_and_nothing_is_mixed(bucket):
+    with write_generation(PLACE, "c.json") as mine:
+        write("theirs")
+        for name in ("c.json", "data"):
+            (mine / name).write_text("mine")
+    assert [files(folder) for folder in folders(bucket, "x")] == [
+        {"c.json": text, "data": text} for text in (b"theirs", b"mine")
+    ]
+    assert seen() == ("mine", "mine")
+
+
+def test_who_is_outrun_between_its_files_and_its_commit_puts_them_again(bucket, monkeypatch):
+    commit = generations.put_commit
+
+    def outrun(*how):
+        monkeypatch.setattr(generations, "put_commit", commit)
+        write("theirs")
+        return commit(*how)
+
+    monkeypatch.setattr(generations, "put_commit", outrun)
+    write("mine", more=["more"])
+    first, second = folders(bucket, "x")
+    assert files(first) == {"c.json": b"theirs", "data": b"theirs"}, "what the slower one left of number 1 is gone"
+    assert files(second) == {"c.json": b"mine", "data": b"mine", "more": b"mine"}
+    assert len(read_state(open_place(PLACE)).generations) == 2
+
+
+def test_who_is_outrun_by_the_same_finds_it_done(bucket, monkeypatch):
+    commit = generations.put_commit
+
+    def outrun(*how):
+        monkeypatch.setattr(generations, "put_commit", commit)
+        write("same")
+        return commit(*how)
+
+    monkeypatch.setattr(generations, "put_commit", outrun)
+    write("same")
+    assert [files(folder) for folder in folders(bucket, "x")] == [{"c.json": b"same", "data": b"same"}]
+
+
+def test_what_is_there_already_is_not_put_again_unless_a_file_of_it_is_gone(bucket):
+    write("same")
+    before = files(bucket[0])
+    write("same")
+    assert files(bucket[0]) == before
+    (folders(bucket, "x")[0] / "data").unlink()
+    write("same")
+    assert seen() == ("same", "same")
+    assert len(read_state(open_place(PLACE)).generations) == 2
+
+
+def test_many_at_once_all_become_generations(bucket):
+    texts = [str(number) for number in range(6)]
+    with ThreadPoolExecutor(len(texts)) as pool:
+        list(pool.map(write, texts))
+    found = [files(folder) for folder in folders(bucket, "x")]
+    assert sorted(each["c.json"].decode() for each in found) == texts
+    assert all(each["c.json"] == each["data"] and len(each) == 2 for each in found)
+    state = read_state(open_place(PLACE))
+    assert ([of.folder for of in state.generations], state.problems) == (
+        [f"{GENERATIONS}/{folder.name}" for folder in folders(bucket, "x")], (),
+    )  # fmt: skip
 
 
 class _Killed(BaseException):
     pass
 
 
-def test_killed_at_any_request_nobody_sees_half_and_the_next_call_completes(bucket, monkeypatch):
-    place, left = bucket[0] / "x", [0]
+@pytest.mark.parametrize("next_text", ["new", "other"])
+def test_killed_at_any_request_nobody_sees_half_and_the_next_call_is_not_blocked(bucket, monkeypatch, next_text):
+    left = [10_000]
 
     def killing(act):
         def acts(*args, **how):
@@ -139,33 +259,109 @@ def test_killed_at_any_request_nobody_sees_half_and_the_next_call_completes(buck
     for name in ("put", "delete"):
         monkeypatch.setattr(obstore, name, killing(getattr(obstore, name)))
     for steps in range(100):
+        left[0] = 10_000
+        shutil.rmtree(bucket[0] / "x", ignore_errors=True)
+        write("old")
         left[0] = steps
         try:
-            with published("s3://sets/x", "c.json") as directory:
-                write(directory, "mine")
-            break
+            write("new")
+            done = True
         except _Killed:
-            assert not (place / "c.json").exists() or (place / "data").read_text() == "mine"
-        except UsageError:  # it is there already, as a caller who looks first finds
+            done = False
+        assert seen() in (("old", "old"), ("new", "new"))
+        left[0] = 10_000
+        write(next_text)
+        assert seen() == (next_text, next_text)
+        whole = {(text, text) for text in ("old", "new", next_text)}
+        assert {
+            tuple(path.read_text() for path in sorted(folder.iterdir())) for folder in folders(bucket, "x")
+        } <= whole
+        assert verify_no_strangers()
+        if done:
             break
-    assert steps >= 3
-    assert files(place) == {"c.json": b"mine", "data": b"mine"}
+    assert steps == 3, "two files and the commit"
 
 
-def test_who_comes_second_with_the_same_finds_it_done(bucket):
-    with published("s3://sets/x", "c.json") as mine:
-        write(mine, "same")
-        with published("s3://sets/x", "c.json") as theirs:
-            write(theirs, "same")
-    assert files(bucket[0] / "x") == {"c.json": b"same", "data": b"same"}
+def verify_no_strangers():
+    """Whether every folder at the URL is one that its log names."""
+    place = open_place(PLACE)
+    kept = {of.folder for of in read_state(place).generations}
+    return {f"{GENERATIONS}/{name}" for name in place.folders(GENERATIONS)} == kept
 
 
-def test_the_claim_of_a_build_that_was_killed_at_its_end_goes_with_the_next(made, bucket):
-    put(made, bucket)
-    claim = bucket[0] / "by name" / "ds" / CLAIM
-    claim.write_bytes(claim.with_name("dataset.json").read_bytes())
-    assert build_dataset(URL, store=made / "store", recipe=Recipe()).status == "unchanged"
-    assert not claim.exists()
+def test_killed_for_the_first_time_there_is_nothing_and_the_next_call_builds(bucket, monkeypatch):
+    def killed(*_):
+        raise _Killed
+
+    commit = generations.put_commit
+    monkeypatch.setattr(generations, "put_commit", killed)
+    with pytest.raises(_Killed):
+        write("killed")
+    assert seen() is None
+    monkeypatch.setattr(generations, "put_commit", commit)
+    write("new")
+    assert [files(folder)["data"] for folder in folders(bucket, "x")] == [b"new"]
+
+
+def test_generations_go_a_week_after_they_were_replaced_and_two_stay(bucket, monkeypatch):
+    days = iter((1, 2, 3, 9, 30))
+    monkeypatch.setattr(generations, "datetime", Clock(days))
+    kept = []
+    for number in range(5):
+        write(str(number))
+        kept.append([folder.name[9] for folder in folders(bucket, "x")])
+    assert kept == [["1"], ["1", "2"], ["1", "2", "3"], ["1", "2", "3", "4"], ["4", "5"]]
+
+
+class Clock:
+    """A clock that shows a day of November each time it is read."""
+
+    def __init__(self, days):
+        self.days = days
+
+    def now(self, zone):
+        return datetime(2026, 11, next(self.days), tzinfo=zone)
+
+
+def test_a_reader_asks_as_often_of_many_generations_as_of_one(bucket):
+    place, state, asked = open_place(PLACE), State(), set()
+    for number in range(1, 70):  # a snapshot is written meanwhile
+        stamp = Stamp(generations._NOBODY, "2026-11-24T00:00:00+00:00")
+        built = Generation(f"{GENERATIONS}/{number:010}-{'0' * 16}", "c.json", stamp.at)
+        state = put_commit(place, state, stamp, "built", lambda _, of=built: Entries(generations=(of,)))
+        if number in (1, 2, 69):
+            place.put(f"{built.folder}/c.json", str(number).encode())
+            before = bucket[1].requests
+            assert seen()[0] == str(number)
+            asked.add(bucket[1].requests - before)
+    assert len(asked) == 1
+
+
+def test_what_is_of_another_kind_is_left_alone(made, bucket):
+    write("a model", card="model.json")
+    with pytest.raises(UsageError, match=r"s3://sets/x: holds model.json and no c.json; it is left alone"):
+        write("mine")
+    shutil.copytree(made / "store", bucket[0] / "st")
+    with pytest.raises(UsageError, match=r"s3://sets/st: holds index and no dataset.json; it is left alone"):
+        build_dataset("s3://sets/st", store=made / "store", recipe=Recipe())
+
+
+def test_verify_names_what_is_of_no_generation_and_what_is_wrong_with_the_log(made, bucket):
+    build_dataset(URL, store=made / "store", recipe=Recipe())
+    build_dataset(URL, store=made / "store", recipe=Recipe(), seed=7, force=True)
+    there = bucket[0] / "by name" / "ds"
+    for name in ("0000000001-00000000000000ff", "0000000003-00000000000000ff"):
+        (there / GENERATIONS / name).mkdir()
+        (there / GENERATIONS / name / "data").touch()
+    left = f"{URL}/{GENERATIONS}/0000000001-00000000000000ff/data: is no file of this dataset"
+    assert verify(URL).problems == (left,), "the folder of the next number may be of a build that goes on"
+    commit = there / "log" / "0000000001.json"
+    commit.write_bytes(commit.read_bytes()[:-9])
+    (problem,) = verify(URL).problems
+    assert "log/0000000001.json" in problem
+    assert len(tcpipe.open_dataset(URL)["train"]), "readers need the last commit alone"
+    build_dataset(URL, store=made / "store", recipe=Recipe(), seed=8, force=True)
+    assert len(folders(bucket)) == 5, "what a damaged commit may name stays"
 
 
 @pytest.mark.parametrize("kind", ["zarr", "parquet"])

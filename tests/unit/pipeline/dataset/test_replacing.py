@@ -182,18 +182,21 @@ def test_what_is_no_dataset_is_left_alone_with_force_too(here, force):
         assert tree(here / "folder") == before
 
 
-def test_nothing_in_a_bucket_is_replaced_and_the_differences_are_named(here, monkeypatch):
+def test_in_a_bucket_the_differences_are_named_too_and_force_builds_the_next_generation(here, monkeypatch):
     (here / "served" / "sets").mkdir(parents=True)
     shutil.copytree(here / "dataset", here / "served" / "sets" / "ds")
     with object_store(here / "served") as (environment, _):
         in_environment(monkeypatch, environment, here / "cache")
-        for force in (False, True):
-            with pytest.raises(UsageError) as caught:
-                build_dataset("s3://sets/ds", **usual(here, map_name="yard", force=force))
-            assert "what lies in a bucket is not replaced: give another place" in caught.value.problems[0]
-            assert caught.value.problems[1:] == (f"s3://sets/ds: {OTHER['map_name'][1]}",)
+        with pytest.raises(UsageError) as caught:
+            build_dataset("s3://sets/ds", **usual(here, map_name="yard"))
+        assert "was made with other options, and stays" in caught.value.problems[0]
+        assert caught.value.problems[1:] == (f"s3://sets/ds: {OTHER['map_name'][1]}",)
         assert build_dataset("s3://sets/ds", **usual(here)).status == "unchanged"
-    assert tree(here / "served" / "sets" / "ds") == tree(here / "dataset")
+        assert tree(here / "served" / "sets" / "ds") == tree(here / "dataset")
+        assert build_dataset("s3://sets/ds", **usual(here, map_name="yard", force=True)).status == "done"
+        build_dataset(here / "dataset", **usual(here, map_name="yard", force=True))
+        (generation,) = (here / "served" / "sets" / "ds" / "generations").iterdir()
+        assert read_card(generation) == read_card(here / "dataset")
 
 
 def test_what_another_call_builds_there_meanwhile_stays(here, monkeypatch):

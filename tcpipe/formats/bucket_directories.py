@@ -1,33 +1,39 @@
-"""Directories with a sealed card (datasets, models, cost maps) in a bucket: fetched to this machine, and put there, card last (ADR 86).
+"""Directories with a sealed card (datasets, models, cost maps) in a bucket, fetched to this machine (ADR 86).
 
-The card lists every other file with its checksum. So a reader sees all of one attempt or none, what is cached is told by its content, and
-whoever else puts the same content helps.
+What is built to a URL lies in folders, one for each build; a log of commits says which is the newest (ADR 106)::
+
+    log/0000000002.json                         the commit of the second build
+    generations/0000000002-1f0c8a3be2d94c57/    its files: the number of its commit, and the digest of its card
+
+What lies at a URL without a log, as tcpipe 0.8 or a copy put it there, is read as it is.
 """
 
 from __future__ import annotations
 
-import logging
+import hashlib
 import os
+import re
 import shutil
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
+from typing import NamedTuple
 
 import google_crc32c
 
 from tcpipe.errors import StoreError, UsageError
 from tcpipe.formats.atomic import lasting_scratch, scratch_directory
 from tcpipe.formats.bucket import open_place, side_by_side
+from tcpipe.formats.commit_log import LOG, read_newest_commit, read_state
+from tcpipe.formats.commits import State
 from tcpipe.formats.content_cache import cached, is_cached
 from tcpipe.formats.json_files import parse_json, typed
-from tcpipe.formats.object_storage import is_url
+from tcpipe.formats.object_storage import is_bucket, is_url
 from tcpipe.formats.place import DirectoryPlace, Place
 from tcpipe.formats.proved_content import wrong_files
 from tcpipe.formats.seals import Checksum, Checksums, broken_checksums
-
-logger = logging.getLogger("tcpipe")
 
 CARDS = ("dataset.json", "model.json", "cost-map.json")
 """Documents that prove all files beside them."""
@@ -35,8 +41,10 @@ _UNLISTED = ("report.html",)
 """What lies beside a card that does not list it, since it is made of it."""
 REPORT_PATCHES = "report-patches"
 """Folder beside a dataset's page, of pictures that it shows: unlisted too."""
-CLAIM = "writing.json"
-"""The card of who puts a directory there, as long as that goes on."""
+GENERATIONS = "generations"
+"""Folder of the builds at a URL."""
+_DIGEST_HEX = 16
+_GENERATION = re.compile(rf"({GENERATIONS}/(\d{{10}})-[0-9a-f]{{{_DIGEST_HEX}}})/")
 _CRC_BYTES = 4
 
 
@@ -66,16 +74,21 @@ class FetchedShards:
             held.unlink(missing_ok=True)
         return data
 
-    def expect(self, pieces: Iterable[tuple[Path, int, int]]) -> None:
+    def prefetch(self, pieces: Iterable[tuple[Path, int, int]]) -> None:
         """Have pieces (shard, offset, size) cached that are read soon, fetched side by side."""
         pieces = list(pieces)
         self._prove({self._name(path) for path, *_ in pieces})
         absent = [piece for piece in pieces if not is_cached(self._key(*piece))]
         side_by_side(self.place.where(), lambda piece: self._held(*piece), absent)
 
-    def whole(self, path: Path) -> Path:
+    def fetch_file(self, path: Path) -> Path:
         """Return a cached copy of a whole file."""
         return self.place.local(self._name(path), self._checksum(path))
+
+    def is_complete(self) -> bool:
+        """Return whether each file is there, and as large as it was."""
+        sizes = {entry.name: entry.size_bytes for entry in self.place.entries()}
+        return all(sizes.get(name) == of.size_bytes for name, of in self.checksums.items())
 
     def _prove(self, names: set[str]) -> None:
         """Raise `StoreError` where a shard is not what its card says."""
@@ -102,7 +115,7 @@ class FetchedShards:
         return found
 
 
-def here(path: str | Path) -> Path:
+def fetch_directory(path: str | Path) -> Path:
     """Return a directory of this machine: the one that is named, or a copy of what a card in a bucket lists while this process runs.
 
     Raises
@@ -114,7 +127,7 @@ def here(path: str | Path) -> Path:
 
 
 @contextmanager
-def anew(url: str) -> Iterator[Path]:
+def fetch_unproved(url: str) -> Iterator[Path]:
     """Yield a copy of what a card in a bucket lists, as it lies there now: nothing is taken from the cache, and nothing proved.
 
     Raises
@@ -122,68 +135,114 @@ def anew(url: str) -> Iterator[Path]:
     UsageError : there is no card at the URL.
     StoreError : it cannot be read.
     """
-    place = open_place(url)
+    card = require_card(url)
     with scratch_directory() as held:
         root = _below(held, url)
 
         def bring(name: str) -> None:
-            if (data := place.read(name)) is not None:
+            if (data := card.place.read(name)) is not None:
                 (root / name).parent.mkdir(parents=True, exist_ok=True)
                 (root / name).write_bytes(data)
 
-        _, checksums, _ = _card_of(place, url)
-        side_by_side(url, bring, [*checksums, *CARDS, *_UNLISTED])
+        side_by_side(url, bring, [*_read_checksums(card), card.name, *_UNLISTED])
         yield root
 
 
-def here_by_range(path: str | Path, *, by_range: Callable[[str], bool]) -> tuple[Path, FetchedShards | None]:
-    """Return a directory as `here`, without the files whose names are ``by_range``, and where these are read; None on this machine."""
+def fetch_directory_by_range(path: str | Path, *, by_range: Callable[[str], bool]) -> tuple[Path, FetchedShards | None]:
+    """Return a directory as `fetch_directory`, without the files that are ``by_range``, and where these are read; None on this machine."""
     return (Path(path), None) if not is_url(path) else _mirrored(str(path).rstrip("/"), lambda name: not by_range(name))
 
 
 def has_card(url: str) -> bool:
-    """Tell whether a directory with a card lies at a URL."""
-    return _card_at(open_place(url)) is not None
+    """Return whether a directory with a card lies at a URL."""
+    return find_newest(url, CARDS) is not None
 
 
-def others_beside(url: str) -> list[str]:
-    """Return what lies at a URL and is not listed by the card there."""
+class FoundCard(NamedTuple):
+    """A card, its name, and the place of its files."""
+
+    place: Place
+    name: str
+    data: bytes
+
+
+def find_newest(url: str, cards: Sequence[str]) -> FoundCard | None:
+    """Return the card of the newest generation at a URL; None where it is none of ``cards``, or nothing was built.
+
+    The number of requests does not depend on the number of generations.
+    """
     place = open_place(url)
-    name, data = _card_at(place) or ("", b"{}")
-    listed = typed(parse_json(data, Path(place.where(name))), Checksums, Path(place.where(name))).checksums
-    names = {entry.name for entry in place.entries() if not entry.name.startswith(f"{REPORT_PATCHES}/")}
-    return [place.where(other) for other in sorted(names - {*listed, *_UNLISTED, name})]
+    commit = read_newest_commit(place) if is_bucket(url) else None
+    if commit is None or not commit.entries.generations:
+        return _find_at(place, cards)
+    newest = commit.entries.generations[-1]
+    return _find_at(place.below(newest.folder), [newest.card] if newest.card in cards else [])
 
 
-def _card_at(place: Place) -> tuple[str, bytes] | None:
-    return next(((name, data) for name in CARDS if (data := place.read(name)) is not None), None)
+def _find_at(place: Place, cards: Sequence[str]) -> FoundCard | None:
+    found = (FoundCard(place, name, data) for name in cards if (data := place.read(name)) is not None)
+    return next(found, None)
 
 
-def _card_of(place: Place, url: str) -> tuple[str, Mapping[str, Checksum], bytes]:
-    """Return the name of the card at a place, what it lists, and the card."""
-    found = _card_at(place)
+def find_unlisted_files(url: str) -> list[str]:
+    """Return what lies at a URL and is listed by no card there, but for what earlier generations and builds that go on may hold."""
+    place = open_place(url)
+    state = read_state(place)
+    cards = [card for card in (find_newest(url, CARDS), _find_at(place, CARDS)) if card is not None]
+    listed = {of.place.where(name) for of in cards for name in (*_read_checksums(of), *_UNLISTED, of.name)}
+    others = [entry.name for entry in place.entries() if place.where(entry.name) not in listed]
+    return [place.where(name) for name in others if not _may_be_there(name, state)]
+
+
+def _may_be_there(name: str, state: State) -> bool:
+    newest = state.generations[-1].folder if state.generations else None
+    found = _GENERATION.match(name)
+    is_of_others = found is not None and found[1] != newest and not is_left_over(name, state)
+    return is_of_others or f"/{REPORT_PATCHES}/" in f"/{name}" or (name.startswith(f"{LOG}/") and state.number > 0)
+
+
+def name_generation(number: int, card: bytes) -> str:
+    """Return the folder of the generation of a commit: of two calls only those that put the same card share one."""
+    return f"{GENERATIONS}/{number:010}-{hashlib.sha256(card).hexdigest()[:_DIGEST_HEX]}"
+
+
+def is_left_over(name: str, state: State) -> bool:
+    """Return whether a file is of a generation that is not kept, and that no commit to come can name; none is while a commit is damaged."""
+    found = _GENERATION.match(name)
+    if found is None or state.problems:
+        return False
+    return int(found[2]) <= state.number and found[1] not in {of.folder for of in state.generations}
+
+
+def require_card(url: str, cards: Sequence[str] = CARDS) -> FoundCard:
+    """Return what `find_newest` does; `UsageError` where there is no card."""
+    found = find_newest(url, cards)
     if found is None:
-        raise UsageError(f"{url}: there is no dataset, model or cost map here: none of {', '.join(CARDS)}")
-    name, data = found
-    where = place.where(name)
-    checksums = typed(parse_json(data, Path(where)), Checksums, Path(where)).checksums
+        raise UsageError(f"{url}: there is no dataset, model or cost map here: none of {', '.join(cards)}")
+    return found
+
+
+def _read_checksums(card: FoundCard) -> Mapping[str, Checksum]:
+    """Return the files that a card lists; `StoreError` where one of them is not beside it."""
+    where = card.place.where(card.name)
+    checksums = typed(parse_json(card.data, Path(where)), Checksums, Path(where)).checksums
     if outside := [file for file in checksums if file.startswith("/") or ".." in file.split("/")]:
         raise StoreError(f"{where}: names {outside[0]!r}, which is no file beside it")
-    return name, checksums, data
+    return checksums
 
 
 def _mirrored(url: str, wanted: Callable[[str], bool]) -> tuple[Path, FetchedShards]:
-    place = open_place(url)
-    name, checksums, data = _card_of(place, url)
-    root = _below(_kept(url, data), url)
-    (root / name).write_bytes(data)
+    card = require_card(url)
+    checksums = _read_checksums(card)
+    root = _below(_kept(url, card.data), url)
+    (root / card.name).write_bytes(card.data)
     for unlisted in _UNLISTED:
-        if (page := place.read(unlisted)) is not None:
+        if (page := card.place.read(unlisted)) is not None:
             (root / unlisted).write_bytes(page)
-    return root, _brought(place, root, checksums, wanted)
+    return root, _brought(card.place, root, checksums, wanted)
 
 
-def files_here(
+def fetch_files(
     place: Place, checksums: Mapping[str, Checksum], *, by_range: Callable[[str], bool]
 ) -> tuple[Path, FetchedShards | None]:
     """Return a directory of this machine in which files of a place lie but those that are ``by_range``, and where these are read.
@@ -234,55 +293,3 @@ def _bring(place: Place, name: str, checksum: Checksum, to: Path) -> None:
         held.unlink(missing_ok=True)
         to.unlink()
     raise StoreError(f"{place.where(name)}: is not as its card says, {checksum.sha256[:12]}…")
-
-
-@contextmanager
-def published(url: str, card: str) -> Iterator[Path]:
-    """Yield a directory; what lies in it at the end, with a card, is put to a URL: the card last, and only where there is none.
-
-    Of two that put the same there, either completes it, and a killed one is completed by the next call. Two whose contents differ are never
-    mixed: the second is refused.
-
-    Raises
-    ------
-    StoreError : another one puts something else there, something lies there already, or the place cannot be written.
-    """
-    place = open_place(url)
-    refuse_others(place, card)
-    with scratch_directory() as held:
-        directory = held / (url.rstrip("/").rpartition("/")[2])
-        directory.mkdir()
-        yield directory
-        document = (directory / card).read_bytes()
-        claim = place.read(CLAIM) if not place.put_new(CLAIM, document) else document
-        if claim != document:
-            raise StoreError(
-                f"{url}: another one writes something else there since ({CLAIM}); wait for it, or give another place; "
-                "if it was killed, remove what lies there"
-            )
-        there = place.read(card)
-        if there is None:
-            (directory / card).rename(held / card)
-            place.put_files("", directory)
-            there = document if place.put_new(card, document) else place.read(card)
-        place.delete(CLAIM)
-        if there != document:
-            raise StoreError(f"{url}: another one has written it meanwhile; what lies in a bucket is not replaced")
-
-
-def settle(url: str) -> None:
-    """Remove the claim of a killed call whose card is there."""
-    if open_place(url).size(CLAIM) is not None:
-        open_place(url).delete(CLAIM)
-
-
-def refuse_others(place: Place, card: str) -> None:
-    """Raise `UsageError` where something lies that is no directory of this card and was not left by one that was being put there."""
-    names = {entry.name for entry in place.entries()}
-    if names and not names & {card, CLAIM}:
-        raise UsageError(f"{place.where()}: holds {min(names)} and no {card}; it is left alone; give another place")
-    if card in names:
-        settle(place.where())
-        raise UsageError(
-            f"{place.where()}: is there already; what lies in a bucket is not replaced: give another place"
-        )
