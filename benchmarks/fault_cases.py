@@ -96,6 +96,7 @@ _RUN_THERE = command("ingest", LOG, *_THERE)
 _OTHER_THERE = command("ingest", LOG, "--recipe", f"{INPUTS}/other.toml", *_THERE)
 _PRUNE_THERE = ("prune", "--store", f"{URL}/store")
 _BUILD_THERE = command("build-dataset", f"{URL}/dataset", *_BUILD[1:])
+_FORCED_THERE = command("build-dataset", f"{URL}/dataset", *_BUILD[1:], "--seed", "5", "--force")
 _OTHER_RUN = command("ingest", LOG, "--recipe", f"{INPUTS}/other.toml", "-q")
 _AT_ONCE = ("--min-age", "0")
 """What a killed prune left goes with the next one where it is a day old; here it is not."""
@@ -122,6 +123,7 @@ CASES = (
     Case("ingest there beside prune", _OTHER_THERE, (_RUN_THERE,), _LOG, URL, command(*_PRUNE_THERE)),
     Case("add-map there", command(*_MAP[:-1], *_THERE), wants=_WORLD, url=URL),
     Case("build-dataset there", _BUILD_THERE, wants=_WORLD, url=URL),
+    Case("build-dataset --force there", _FORCED_THERE, (_BUILD_THERE,), _WORLD, URL),
     Case("prune there", command(*_PRUNE_THERE, *_AT_ONCE), (_OTHER_THERE, _RUN_THERE), _LOG, URL),
     Case("migrate into a bucket", command(*_MIGRATE, f"{URL}/store"), wants=_OLD, url=URL),
     Case("ingest on a cluster", _RUN_THERE, wants=_LOG | _CLUSTER, url=URL),

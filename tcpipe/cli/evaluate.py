@@ -17,7 +17,8 @@ def evaluate(options: EvaluateOptions, *, as_json: bool, quiet: bool) -> None:
 
     RMSE and MAPE of power, velocity, time and energy by terrain class; the ablation of the input layers; the baselines of Wei and
     Isler and the expected time; what the labels' own noise allows; each beside the paper's own figures. Networks that it trains are
-    kept in OUT and used again; predictions.parquet holds every prediction. OUT may be a URL in a bucket, where each evaluation is a generation.
+    kept in OUT and used again; predictions.parquet holds every prediction. OUT may be a URL in a bucket, where each evaluation is a
+    generation.
 
     With --drive: time and energy of whole drives, measured against predicted on the store's map, with intervals and figures, in
     drives.json and drives.html of OUT; DATASET, that MODEL was trained on, tells whether a drive was held back.

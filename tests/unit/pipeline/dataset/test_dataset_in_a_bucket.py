@@ -4,11 +4,8 @@ import getpass
 import json
 import shutil
 import socket
-from concurrent.futures import ThreadPoolExecutor
-from datetime import datetime
 
 import numpy as np
-import obstore
 import pytest
 from storage_server import object_store
 from synthetic_store import add_run, lanes, segments, small_store
@@ -16,16 +13,12 @@ from synthetic_store import add_run, lanes, segments, small_store
 import tcpipe
 from tcpipe.errors import StoreError, UsageError
 from tcpipe.formats.bucket import open_place
-from tcpipe.formats.bucket_directories import GENERATIONS, find_newest
-from tcpipe.formats.commit_log import Stamp, put_commit, read_state
-from tcpipe.formats.commits import Entries, Generation, State
+from tcpipe.formats.bucket_directories import GENERATIONS
 from tcpipe.learning.training import model_for
-from tcpipe.pipeline import generations
 from tcpipe.pipeline.dataset import build as building
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.diff import diff
 from tcpipe.pipeline.explain import explain
-from tcpipe.pipeline.generations import write_generation
 from tcpipe.pipeline.inspect import inspect
 from tcpipe.pipeline.report import report
 from tcpipe.pipeline.verify import verify
@@ -160,187 +153,7 @@ def test_a_redacted_dataset_names_no_machine_in_its_log(made, bucket):
     assert not [name for name in (socket.gethostname(), str(made), getpass.getuser()) if name in text]
 
 
-PLACE = "s3://sets/x"
-
-
-def write(text, card="c.json", more=()):
-    with write_generation(PLACE, card) as directory:
-        for name in (card, "data", *more):
-            (directory / name).write_text(text)
-
-
-def seen(card="c.json"):
-    """What a reader finds: the card and the file beside it."""
-    found = find_newest(PLACE, [card])
-    return found and (found.data.decode(), (found.place.read("data") or b"").decode())
-
-
-def test_of_two_at_once_the_second_is_the_next_generation_and_nothing_is_mixed(bucket):
-    with write_generation(PLACE, "c.json") as mine:
-        write("theirs")
-        for name in ("c.json", "data"):
-            (mine / name).write_text("mine")
-    assert [files(folder) for folder in folders(bucket, "x")] == [
-        {"c.json": text, "data": text} for text in (b"theirs", b"mine")
-    ]
-    assert seen() == ("mine", "mine")
-
-
-def test_who_is_outrun_between_its_files_and_its_commit_puts_them_again(bucket, monkeypatch):
-    commit = generations.put_commit
-
-    def outrun(*how):
-        monkeypatch.setattr(generations, "put_commit", commit)
-        write("theirs")
-        return commit(*how)
-
-    monkeypatch.setattr(generations, "put_commit", outrun)
-    write("mine", more=["more"])
-    first, second = folders(bucket, "x")
-    assert files(first) == {"c.json": b"theirs", "data": b"theirs"}, "what the slower one left of number 1 is gone"
-    assert files(second) == {"c.json": b"mine", "data": b"mine", "more": b"mine"}
-    assert len(read_state(open_place(PLACE)).generations) == 2
-
-
-def test_who_is_outrun_by_the_same_finds_it_done(bucket, monkeypatch):
-    commit = generations.put_commit
-
-    def outrun(*how):
-        monkeypatch.setattr(generations, "put_commit", commit)
-        write("same")
-        return commit(*how)
-
-    monkeypatch.setattr(generations, "put_commit", outrun)
-    write("same")
-    assert [files(folder) for folder in folders(bucket, "x")] == [{"c.json": b"same", "data": b"same"}]
-
-
-def test_what_is_there_already_is_not_put_again_unless_a_file_of_it_is_gone(bucket):
-    write("same")
-    before = files(bucket[0])
-    write("same")
-    assert files(bucket[0]) == before
-    (folders(bucket, "x")[0] / "data").unlink()
-    write("same")
-    assert seen() == ("same", "same")
-    assert len(read_state(open_place(PLACE)).generations) == 2
-
-
-def test_many_at_once_all_become_generations(bucket):
-    texts = [str(number) for number in range(6)]
-    with ThreadPoolExecutor(len(texts)) as pool:
-        list(pool.map(write, texts))
-    found = [files(folder) for folder in folders(bucket, "x")]
-    assert sorted(each["c.json"].decode() for each in found) == texts
-    assert all(each["c.json"] == each["data"] and len(each) == 2 for each in found)
-    state = read_state(open_place(PLACE))
-    assert ([of.folder for of in state.generations], state.problems) == (
-        [f"{GENERATIONS}/{folder.name}" for folder in folders(bucket, "x")], (),
-    )  # fmt: skip
-
-
-class _Killed(BaseException):
-    pass
-
-
-@pytest.mark.parametrize("next_text", ["new", "other"])
-def test_killed_at_any_request_nobody_sees_half_and_the_next_call_is_not_blocked(bucket, monkeypatch, next_text):
-    left = [10_000]
-
-    def killing(act):
-        def acts(*args, **how):
-            if not left[0]:
-                raise _Killed
-            left[0] -= 1
-            return act(*args, **how)
-
-        return acts
-
-    for name in ("put", "delete"):
-        monkeypatch.setattr(obstore, name, killing(getattr(obstore, name)))
-    for steps in range(100):
-        left[0] = 10_000
-        shutil.rmtree(bucket[0] / "x", ignore_errors=True)
-        write("old")
-        left[0] = steps
-        try:
-            write("new")
-            done = True
-        except _Killed:
-            done = False
-        assert seen() in (("old", "old"), ("new", "new"))
-        left[0] = 10_000
-        write(next_text)
-        assert seen() == (next_text, next_text)
-        whole = {(text, text) for text in ("old", "new", next_text)}
-        assert {
-            tuple(path.read_text() for path in sorted(folder.iterdir())) for folder in folders(bucket, "x")
-        } <= whole
-        assert verify_no_strangers()
-        if done:
-            break
-    assert steps == 3, "two files and the commit"
-
-
-def verify_no_strangers():
-    """Whether every folder at the URL is one that its log names."""
-    place = open_place(PLACE)
-    kept = {of.folder for of in read_state(place).generations}
-    return {f"{GENERATIONS}/{name}" for name in place.folders(GENERATIONS)} == kept
-
-
-def test_killed_for_the_first_time_there_is_nothing_and_the_next_call_builds(bucket, monkeypatch):
-    def killed(*_):
-        raise _Killed
-
-    commit = generations.put_commit
-    monkeypatch.setattr(generations, "put_commit", killed)
-    with pytest.raises(_Killed):
-        write("killed")
-    assert seen() is None
-    monkeypatch.setattr(generations, "put_commit", commit)
-    write("new")
-    assert [files(folder)["data"] for folder in folders(bucket, "x")] == [b"new"]
-
-
-def test_generations_go_a_week_after_they_were_replaced_and_two_stay(bucket, monkeypatch):
-    days = iter((1, 2, 3, 9, 30))
-    monkeypatch.setattr(generations, "datetime", Clock(days))
-    kept = []
-    for number in range(5):
-        write(str(number))
-        kept.append([folder.name[9] for folder in folders(bucket, "x")])
-    assert kept == [["1"], ["1", "2"], ["1", "2", "3"], ["1", "2", "3", "4"], ["4", "5"]]
-
-
-class Clock:
-    """A clock that shows a day of November each time it is read."""
-
-    def __init__(self, days):
-        self.days = days
-
-    def now(self, zone):
-        return datetime(2026, 11, next(self.days), tzinfo=zone)
-
-
-def test_a_reader_asks_as_often_of_many_generations_as_of_one(bucket):
-    place, state, asked = open_place(PLACE), State(), set()
-    for number in range(1, 70):  # a snapshot is written meanwhile
-        stamp = Stamp(generations._NOBODY, "2026-11-24T00:00:00+00:00")
-        built = Generation(f"{GENERATIONS}/{number:010}-{'0' * 16}", "c.json", stamp.at)
-        state = put_commit(place, state, stamp, "built", lambda _, of=built: Entries(generations=(of,)))
-        if number in (1, 2, 69):
-            place.put(f"{built.folder}/c.json", str(number).encode())
-            before = bucket[1].requests
-            assert seen()[0] == str(number)
-            asked.add(bucket[1].requests - before)
-    assert len(asked) == 1
-
-
-def test_what_is_of_another_kind_is_left_alone(made, bucket):
-    write("a model", card="model.json")
-    with pytest.raises(UsageError, match=r"s3://sets/x: holds model.json and no c.json; it is left alone"):
-        write("mine")
+def test_a_store_is_left_alone(made, bucket):
     shutil.copytree(made / "store", bucket[0] / "st")
     with pytest.raises(UsageError, match=r"s3://sets/st: holds index and no dataset.json; it is left alone"):
         build_dataset("s3://sets/st", store=made / "store", recipe=Recipe())
