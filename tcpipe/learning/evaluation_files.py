@@ -10,7 +10,7 @@ from pathlib import Path
 from tcpipe import __version__
 from tcpipe.dataset import open_dataset
 from tcpipe.dataset.energies import ENERGIES
-from tcpipe.errors import UsageError, plain_lines
+from tcpipe.errors import StoreError, UsageError, plain_lines
 from tcpipe.formats.atomic import clear, write_text
 from tcpipe.formats.bucket_directories import fetch_directory, fetch_directory_by_range, find_newest, require_card
 from tcpipe.formats.dataset_files import is_shard, read_card
@@ -75,6 +75,7 @@ def run_evaluation(
     Raises
     ------
     UsageError : ``out`` holds something else.
+    StoreError : the dataset or the model was replaced meanwhile.
     ModelError, DatasetError : as `evaluate`.
     """
     rules = config or EvaluateConfig()
@@ -94,6 +95,8 @@ def run_evaluation(
         raise UsageError(f"{place}: exists and is no evaluation; it is left alone; give another OUT")
     if not ((place / JSON).is_file() and (place / SAMPLES).is_file()) or read_json(place / JSON).get("key") != key:
         found, table = evaluate(model, dataset, place, rules, key=key, plant=plant)
+        if _key(model, dataset, rules, simulated=plant is not None) != key:
+            raise StoreError(f"{dataset} or {model}: another call has replaced it meanwhile; run the command again")
         write_table(table, place / SAMPLES)
         write_json(place / JSON, found)  # last: with it the evaluation is whole
     values = read_as(place / JSON, Evaluation)  # in the order of the file, as the next call will read it

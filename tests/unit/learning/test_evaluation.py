@@ -5,6 +5,7 @@ import csv
 import io
 import json
 import re
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -20,9 +21,11 @@ from synthetic_store import STANDING_WATT, small_store
 
 from tcpipe.cost.prediction_errors import centring_of
 from tcpipe.dataset import Split, open_dataset
-from tcpipe.errors import DatasetError, ModelError, UsageError
+from tcpipe.errors import DatasetError, ModelError, StoreError, UsageError
+from tcpipe.formats.dataset_files import read_card
 from tcpipe.formats.json_files import plain
 from tcpipe.formats.parquet import read_table
+from tcpipe.formats.seals import Checksum, write_sealed
 from tcpipe.learning.evaluation_facts import EvaluateConfig
 from tcpipe.learning.evaluation_files import run_evaluation
 from tcpipe.learning.fitting import FitConfig
@@ -285,6 +288,21 @@ def test_a_folder_of_something_else_is_left_alone(model, dataset, tmp_path):
     (tmp_path / "thesis.txt").write_text("important")
     with pytest.raises(UsageError, match="exists and is no evaluation"):
         run_evaluation(model, dataset, tmp_path, config=CONFIG)
+
+
+def test_a_dataset_that_is_replaced_meanwhile_is_told(evaluated, model, dataset, tmp_path, monkeypatch):
+    place, values = evaluated
+    mine = shutil.copytree(dataset, tmp_path / "dataset")
+
+    def replaced_meanwhile(*_, key, **__):
+        card = read_card(mine)
+        write_sealed(mine / "dataset.json", replace(card, checksums={**card.checksums, "more": Checksum(1, "0")}))
+        return replace(values, key=key), read_table(place / "predictions.parquet")
+
+    monkeypatch.setattr("tcpipe.learning.evaluation_files.evaluate", replaced_meanwhile)
+    with pytest.raises(StoreError, match="another call has replaced it meanwhile; run the command again"):
+        run_evaluation(model, mine, tmp_path / "evaluation", config=CONFIG)
+    assert not (tmp_path / "evaluation" / "evaluation.json").exists()
 
 
 def test_it_goes_to_a_bucket_and_another_one_is_the_next_generation(evaluated, model, dataset, tmp_path, monkeypatch):
