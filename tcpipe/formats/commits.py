@@ -285,7 +285,7 @@ def fold(commits: Iterable[Commit], state: State | None = None) -> State:
         failed.update({failure.key: failure for failure in of.failed})
         acknowledged.update({problem.key: problem for problem in of.acknowledged})
         _add_datasets(datasets, forgotten, of)
-        generations = _keep_generations((*generations, *of.generations))
+        generations = _keep_generations((*generations, *of.generations)) if of.generations else generations
         begun.update(_number(call, commit) for call in of.begun)
         begun = {key: call for key, call in begun.items() if key not in of.ended}
         calls = (*reversed(of.calls), *calls)[:LATEST_CALLS]

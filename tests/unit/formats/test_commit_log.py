@@ -20,6 +20,7 @@ from tcpipe.formats.commits import (
     Dataset,
     Entries,
     Failure,
+    Generation,
     Problem,
     Process,
     Sighting,
@@ -70,6 +71,8 @@ EVERYTHING = (
     Entries(superseded=(Superseded("c", None),)),
     Entries(datasets=(Dataset("/out", "1", (("a", "r"),)), Dataset("/out", "2"))),
     Entries(forgotten=(Dataset("/out", "1"),), calls=(Call("build-dataset", "1", 0, {"samples": 3}),)),
+    Entries(generations=(Generation("generations/0000000009-0", "model.json", "2026-11-01T00:00:00+00:00"),)),
+    Entries(generations=(Generation("generations/0000000010-1", "model.json", "2026-11-30T00:00:00+00:00"),)),
     Entries(ended=(1,), calls=(Call("ingest", "1", 3, {"failed": 1}, failed={"/logs/c.bag": "full"}),)),
 )
 
