@@ -10,7 +10,7 @@ from tcpipe.cli.options import INPUT_FILE, ONE_OF_SEVERAL, json_option, quiet_op
 from tcpipe.errors import UsageError
 
 
-@click.command("add-map", short_help="Rasters of a site into the store")
+@click.command("add-map")
 @click.argument("name")
 @click.argument("strays", nargs=-1, metavar="")
 @click.option(

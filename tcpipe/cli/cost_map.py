@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from tcpipe.planning.cost_model import CostModel
 
 
-@click.command("cost-map", short_help="Directional cost maps of a whole map")
+@click.command("cost-map")
 @model_argument
 @click.argument("out", default="cost-map", type=PUBLISHED, metavar="[OUT]")
 @map_option

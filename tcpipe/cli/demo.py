@@ -9,7 +9,7 @@ import click
 from tcpipe.cli.options import OUTPUT_DIRECTORY, SEED, quiet_option
 
 
-@click.command(short_help="See everything work on a simulated site")
+@click.command()
 @click.argument("directory", default="tcpipe-demo", type=OUTPUT_DIRECTORY, metavar="[DIR]")
 @click.option("--seed", default=1, type=SEED, help="Same seed, same site.")
 @quiet_option

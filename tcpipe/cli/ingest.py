@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from tcpipe.pipeline.ingest_task import IngestResult
 
 
-@click.command(short_help="Logs to labelled 1 m segments")
+@click.command()
 @add_options(IngestOptions)
 @dry_run_option
 @click.option("--json", "as_json", is_flag=True, help="Print a JSON object for each log as it ends, and one of all.")

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from tcpipe.tables.findings import Finding
 
 
-@click.command(short_help="What is in a log, map, dataset or store")
+@click.command()
 @click.argument("path", type=LOG, metavar="PATH")
 @click.option("--full", is_flag=True, help="Read everything: damage and gaps, not the index alone.")
 @robot_option()

@@ -10,7 +10,7 @@ from tcpipe.cli.options import add_options, json_option, quiet_option
 from tcpipe.planning.path_options import PlanPathOptions
 
 
-@click.command("plan-path", short_help="The path of least energy, time or distance")
+@click.command("plan-path")
 @add_options(PlanPathOptions)
 @json_option
 @quiet_option

@@ -7,7 +7,7 @@ import click
 from tcpipe.cli.options import OUTPUT_DIRECTORY, jobs_option, json_option, quiet_option
 
 
-@click.command(short_help="The paper's experiment, on a simulated site")
+@click.command()
 @click.argument("directory", default="tcpipe-reproduction", type=OUTPUT_DIRECTORY, metavar="[DIR]")
 @click.option("--quick", is_flag=True, help="Minutes: a small site and a narrow network, to see it run.")
 @click.option("--seeds", default=1, type=click.IntRange(1, 100), help="Trainings; claims compare their means.")

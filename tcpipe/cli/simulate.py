@@ -9,7 +9,7 @@ import click
 from tcpipe.cli.options import OUTPUT_DIRECTORY, SEED, complete_scenarios, json_option, quiet_option
 
 
-@click.command(short_help="A simulated site with its truth")
+@click.command()
 @click.argument("out", type=OUTPUT_DIRECTORY, metavar="OUT")
 @click.option(
     "--scenario",
