@@ -178,7 +178,7 @@ def _print_store(found: InspectedStore) -> None:
     say("")
     rows = [
         [
-            *(run.run_id, run.recipe_id, run.robot, str(run.segments), f"{run.distance_m:.1f}"),
+            *(run.run_id, run.recipe_id, run.robot, str(run.segments), f"{run.driven_m:.1f}"),
             *(run.position, run.time, run.energy, str(run.findings), str(run.damage)),
         ]
         for run in found.runs
@@ -204,10 +204,10 @@ def _print_run(found: InspectedRun) -> None:
     for run in found.recipes:
         ledger = run.ledger_m
         say("")
-        say(f"recipe {run.recipe_id}: {run.segments} segments of robot {run.robot}")
+        say(f"recipe {run.recipe_id}: {run.counts.segments} segments of robot {run.robot}")
         lost = sorted(((metres, name) for name, metres in ledger.items() if metres >= 0.05), reverse=True)
         said = ", ".join(f"{metres:.1f} m {name.replace('_', ' ')}" for metres, name in lost)
-        say(f"{run.distance_m:.1f} m driven: {said}" if said else "not driven")
+        say(f"{run.driven_m:.1f} m driven: {said}" if said else "not driven")
         say(f"verdict: {format_verdict(run.verdict)}")
         _print_findings(run.findings)
         for line in run.damage:
