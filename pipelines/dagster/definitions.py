@@ -166,16 +166,16 @@ def dataset() -> dg.MaterializeResult:
     out = _place("TCPIPE_DATASET", "dataset")
     region = os.environ.get("TCPIPE_SPLIT")
     (made,) = _answers("build-dataset", out, *(["--split", region] if region else []))
-    doubtful, findings = made["doubtful"], typed(made["findings"], tuple[Finding, ...], "tcpipe build-dataset --json")
+    card, findings = made["card"], typed(made["findings"], tuple[Finding, ...], "tcpipe build-dataset --json")
     problems = [format_finding(finding) for finding in findings if is_problem(finding)]
     shared = [format_finding(finding) for finding in select_findings(findings, "split-leakage")]
     return dg.MaterializeResult(
         metadata={
             "status": made["status"],
-            "samples": made["samples"],
-            **{f"{name}_samples": count for name, count in made["splits"].items()},
-            **({"doubtful_share": doubtful["share"]} if doubtful else {}),
-            "where_every_metre_went": _ledger(made["ledger_m"]),
+            "samples": card["samples"],
+            **{f"{name}_samples": count for name, count in card["splits"].items()},
+            **({"doubtful_share": card["doubtful"]["share"]} if card["doubtful"] else {}),
+            "where_every_metre_went": _ledger(card["ledger_m"]),
             "findings": _listed(list_findings(findings)),
             "page": dg.MetadataValue.path(str(Path(out).absolute() / "report.html")),
             **_picture(Path(out) / "overview.png"),

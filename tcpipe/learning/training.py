@@ -228,7 +228,7 @@ def training_task(data: Dataset, fold: int, variant: Variant) -> Task:
         folds = sorted({int(number) for number in train.column("fold")})
         named = ", ".join(map(str, folds))
         cure = f"a block holds {data.card.recipe.split.block_m:g} m of ground: drive more of it"
-        if data.card.split.holdout in ("run", "tag"):
+        if data.card.recipe.split.holdout in ("run", "tag"):
             cure = "they are of whole runs: drive once more, or build it with --holdout block"
         raise DatasetError(
             f"{data.path}: fold {fold} of train leaves {len(fitted)} samples to fit and {len(held)} held out; "

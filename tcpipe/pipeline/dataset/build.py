@@ -7,7 +7,7 @@ import shlex
 import shutil
 from collections.abc import Container, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -20,7 +20,7 @@ from tcpipe.formats.atomic import atomic_directory, clear_beside, write_text
 from tcpipe.formats.bucket import open_place
 from tcpipe.formats.commits import Call, Dataset, Entries
 from tcpipe.formats.croissant import croissant
-from tcpipe.formats.dataset_card import DatasetCard, Doubtful, Redacted, group_dataset_findings
+from tcpipe.formats.dataset_card import DatasetCard, group_dataset_findings
 from tcpipe.formats.dataset_files import (
     CARD,
     CLASSES,
@@ -76,14 +76,11 @@ from tcpipe.recipe import Recipe
 from tcpipe.report.dataset_report import dataset_report
 from tcpipe.report.overview import class_overview, maps_overview, relief_overview, write_overview
 from tcpipe.splits.assignment import SPLITS
-from tcpipe.splits.audit import HeldOut
 from tcpipe.splits.regions import Regions
 from tcpipe.store import Store, open_store
-from tcpipe.tables.facts import EnergyBudget
-from tcpipe.tables.findings import LEFT_OUT, Finding, is_problem, select_problems
+from tcpipe.tables.findings import Finding, is_problem, select_problems
 from tcpipe.tables.levels import DATA_MODEL_VERSION, READ_VERSIONS
 from tcpipe.tables.options import as_function
-from tcpipe.tables.verdicts import Verdict
 
 logger = logging.getLogger("tcpipe")
 
@@ -96,24 +93,14 @@ class BuildResult:
     """Its directory, or its URL in a bucket."""
     status: str
     """``done``, ``unchanged``, or, of a dry run, ``planned``."""
-    samples: int
-    splits: Mapping[str, int]
-    ledger_m: Mapping[str, float]
-    audit: tuple[HeldOut, ...]
     findings: tuple[Finding, ...]
     """Of the dataset itself: runs that belong in and are left out and splits that are empty, too."""
-    findings_by_run: Mapping[str, tuple[Finding, ...]] = field(default_factory=dict, metadata=LEFT_OUT)
-    findings_by_map: Mapping[str, tuple[Finding, ...]] = field(default_factory=dict, metadata=LEFT_OUT)
-    verdict: Verdict | None = None
-    energy_budget: EnergyBudget | None = None
+    card: DatasetCard | None = None
+    """None of a dry run."""
     exit_code: int = 0
     """3 if the dataset is not what it should be."""
     recipe: str = ""
     """Which recipe ruled, as a command found it."""
-    doubtful: Doubtful | None = None
-    """How many samples carry a quality flag."""
-    redacted: bool = False
-    """Whether names and places are not told."""
     estimate: Estimate | None = None
     """What a dry run expects of the work: of all segments, as if each became a sample."""
 
@@ -131,28 +118,32 @@ class BuildResult:
 
     def _lines(self, *, problems: bool) -> list[str]:
         own = [finding for finding in self.findings if is_problem(finding) == problems]
-        by_run = dict.fromkeys(self.findings_by_run, ()) if problems else self.findings_by_run
-        groups = group_dataset_findings(own, by_run, {} if problems else self.findings_by_map)
+        by_run = self.card.findings_by_run if self.card else {}
+        by_map = self.card.findings_by_map if self.card and not problems else {}
+        groups = group_dataset_findings(own, dict.fromkeys(by_run, ()) if problems else by_run, by_map)
         return format_mixed_groups(groups, more=f"tcpipe inspect {shlex.quote(self.path)}")
 
     def _facts(self) -> list[str]:
-        if self.estimate is not None:
+        card = self.card
+        if card is None:
             return [f"{self.path}: would be made of at most {self.estimate}"]
-        counts = ", ".join(f"{self.splits[name]} {name}" for name in SPLITS)
-        head = f"{self.path}: {self.samples} samples ({counts})"
+        counts = ", ".join(f"{card.splits[name]} {name}" for name in SPLITS)
+        head = f"{self.path}: {card.samples} samples ({counts})"
         if self.status == "unchanged":
             head += "; nothing to do: it is made from the same runs, map, region and recipe"
-        lost = [(name, metres) for name, metres in self.ledger_m.items() if metres >= 0.5 and name != KEPT]
+        lost = [(name, metres) for name, metres in card.ledger_m.items() if metres >= 0.5 and name != KEPT]
         lost.sort(key=lambda entry: (-entry[1], entry[0]))
-        ledger = f"{sum(self.ledger_m.values()):.0f} m driven: {self.ledger_m[KEPT]:.0f} m in samples"
+        ledger = f"{sum(card.ledger_m.values()):.0f} m driven: {card.ledger_m[KEPT]:.0f} m in samples"
         ledger += "".join(f", {metres:.0f} m {name.replace('_', ' ')}" for name, metres in lost)
-        floor = [] if self.energy_budget is None else [in_words(self.energy_budget)]
-        judged = [] if self.verdict is None else [f"verdict: {format_verdict(self.verdict)}"]
+        floor = [] if card.energy_budget is None else [in_words(card.energy_budget)]
+        judged = [] if card.verdict is None else [f"verdict: {format_verdict(card.verdict)}"]
         return [head, ledger, *floor, *judged]
 
     def _closing(self) -> list[str]:
+        if self.card is None or self.card.redaction is None:
+            return []
         publish = f"to publish it: hf upload OWNER/NAME {shlex.quote(self.path)} . --repo-type dataset"
-        return [*Redacted().lines(), publish] if self.redacted else []
+        return [*self.card.redaction.lines(), publish]
 
 
 def run_build_dataset(options: BuildDatasetOptions) -> BuildResult:
@@ -199,7 +190,7 @@ def run_build_dataset(options: BuildDatasetOptions) -> BuildResult:
     )
     inputs = replace(inputs, findings=(*left_out, *inputs.findings))
     if proved and known is not None and known.inputs == inputs.digest and _is_all_there(place, known):
-        card, result = known, _result(place, "unchanged", known, left_out)
+        result = _result(place, "unchanged", known, left_out)
     elif dry_run:
         _refuse_other_options(place, known, marks, inputs, force=options.force)
         if isinstance(place, str):
@@ -226,7 +217,7 @@ def run_build_dataset(options: BuildDatasetOptions) -> BuildResult:
             for entry in workers.waiting.entries():
                 workers.waiting.delete(entry.name)
             result = _result(place, "done", card, left_out)
-            counts = {"runs": len(inputs.runs), "samples": result.samples}
+            counts = {"runs": len(inputs.runs), "samples": card.samples}
             written = sum(of.size_bytes for of in card.checksums.values())
             took = Call(BUILD, __version__, result.exit_code, counts, options.jobs, written_bytes=written)
             _end(call, measure_call(watch, took), _describe_dataset(result, inputs), known)
@@ -265,7 +256,7 @@ def _planned(place: Path | str, store: Store, inputs: Inputs, *, jobs: int) -> B
     most = sum(run.facts.segments - int(inputs.again[run.run_id].sum()) for run in inputs.runs)
     expected = estimate(store.state().calls, BUILD, most, jobs=jobs)
     code = 3 if select_problems(inputs.findings) else 0
-    return BuildResult(str(place), "planned", most, {}, {}, (), inputs.findings, exit_code=code, estimate=expected)
+    return BuildResult(str(place), "planned", inputs.findings, exit_code=code, estimate=expected)
 
 
 def _end(opened: OpenCall, call: Call, dataset: Dataset, known: DatasetCard | None) -> None:
@@ -332,22 +323,7 @@ def _result(place: Path | str, status: str, card: DatasetCard, left_out: Sequenc
     """Return what became of a dataset: runs that are left out are those of now, whatever the card has of them."""
     lasting = (finding for finding in card.findings if finding.code not in CHOICE_CODES)
     findings = (*left_out, *lasting)
-    return BuildResult(
-        path=str(place),
-        status=status,
-        samples=card.samples,
-        splits={name: card.splits[name] for name in SPLITS},
-        ledger_m=card.ledger_m,
-        audit=card.split.audit,
-        findings=findings,
-        findings_by_run=card.findings_by_run,
-        findings_by_map=card.findings_by_map,
-        verdict=card.verdict,
-        energy_budget=card.energy_budget,
-        exit_code=3 if select_problems(findings) else 0,
-        doubtful=card.doubtful,
-        redacted=card.redaction is not None,
-    )
+    return BuildResult(str(place), status, findings, card, 3 if select_problems(findings) else 0)
 
 
 def _ruling(recipe: Recipe | str | Path | None, *, holdout: str | None, seed: int | None) -> Recipe:

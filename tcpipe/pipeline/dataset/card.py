@@ -22,7 +22,7 @@ from tcpipe.formats.dataset_card import (
     MapRegistration,
     MapSource,
     Shard,
-    SplitRules,
+    SplitResult,
     judge_dataset,
 )
 from tcpipe.formats.dataset_files import FileFormat
@@ -33,7 +33,7 @@ from tcpipe.pipeline.dataset.content import Content
 from tcpipe.pipeline.dataset.findings import count_flagged, find_in_samples
 from tcpipe.pipeline.dataset.inputs import Inputs
 from tcpipe.pipeline.dataset.physics import physics_by_robot
-from tcpipe.pipeline.dataset.splitting import Drawn, regions_to_json
+from tcpipe.pipeline.dataset.splitting import regions_to_json
 from tcpipe.recipe import Recipe
 from tcpipe.splits.assignment import SPLITS
 from tcpipe.splits.regions import Regions
@@ -101,7 +101,9 @@ def dataset_card(
         classes=classes.classes if has_terrain else (),
         label=_label(recipe, inputs),
         energy_budget=pooled(run.energy_budget for run in inputs.sources),
-        split=_split_rules(recipe, drawn, regions),
+        split=SplitResult(
+            drawn.buffer_m, None if regions is None else regions_to_json(regions), drawn.audit, drawn.kept
+        ),
         ledger_m=content.ledger_m,
         removal=content.removal,
         balance=balance,
@@ -130,12 +132,6 @@ def _formula(layer: Layer) -> str:
     if layer.kind == "categorical":
         return f"(C - 1) / ({layer.high:g} - 1)"
     return "O / 255" if layer.stack == "greys" else f"(X - {layer.low!r}) / ({layer.high!r} - {layer.low!r})"
-
-
-def _split_rules(recipe: Recipe, drawn: Drawn, regions: Regions | None) -> SplitRules:
-    rules = {**asdict(recipe.split), "buffer_m": drawn.buffer_m}
-    region = None if regions is None else regions_to_json(regions)
-    return SplitRules(**rules, region=region, audit=drawn.audit, kept=drawn.kept)
 
 
 def _map_source(source: MapFile, sha256: str, registration: tuple[MapRegistration, ...]) -> MapSource:

@@ -52,7 +52,7 @@ def _find_flagged(card: DatasetCard, dataset: Subject) -> Iterator[Finding]:
 
 def _find_empty_splits(card: DatasetCard) -> Iterator[Finding]:
     """Yield a finding for each split that was asked for and holds no sample."""
-    rules = card.split
+    rules = card.recipe.split
     if not card.splits["train"]:
         yield make_finding(
             "split-empty", Subject("split", "train"), severity="error", names={"reason": "region_too_small"}
@@ -65,19 +65,19 @@ def _find_empty_splits(card: DatasetCard) -> Iterator[Finding]:
         )
         names = {"reason": reasons.get(rules.holdout, "too_few_samples")}
         yield make_finding("split-empty", Subject("split", "test"), names=names, remedies=remedies)
-    if not card.splits["unseen"] and rules.region is not None:
+    if not card.splits["unseen"] and card.split.region is not None:
         yield make_finding("split-empty", Subject("split", "unseen"), names={"reason": "all_inside_region"})
 
 
 def _find_leakage(part: HeldOut, card: DatasetCard) -> Finding:
     """Return the finding that samples of a held-out split share ground with train."""
     remedies: tuple[Remedy, ...] = ()
-    holdout = card.split.holdout if part.split == "test" else ""
+    holdout = card.recipe.split.holdout if part.split == "test" else ""
     if holdout == "sample":
         remedies = suggest("block", {"split": {"holdout": "block"}})
     elif holdout == "block":
         remedies = (
-            *suggest("larger_blocks", {"split": {"block_m": 2 * card.split.block_m}}),
+            *suggest("larger_blocks", {"split": {"block_m": 2 * card.recipe.split.block_m}}),
             *suggest("run", {"split": {"holdout": "run"}}),
         )
     return make_finding(

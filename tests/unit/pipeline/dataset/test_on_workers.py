@@ -54,7 +54,7 @@ def made(tmp_path_factory, many_tasks):
     add_run(store, "a", segments("a", *lanes(np.linspace(-14.0, 14.0, 30), -10.0, 10.0)))
     for kind in ("zarr", "parquet"):
         built = build_dataset(directory / kind, store=store.root, recipe=Recipe(), file_format=kind)
-        assert built.samples == ROWS
+        assert built.card.samples == ROWS
     return directory
 
 
