@@ -67,7 +67,7 @@ def _print_log(log: InspectedLog) -> None:
     say(f"{log.path}: {log.container}, {(log.size_bytes or 0) / 1e6:.1f} MB{duration}")
     say(f"robot {log.robot}: {log.robot_why}")
     say("")
-    full = any(topic.messages_read is not None for topic in log.topics)
+    full = any(topic.stamps for topic in log.topics)
     header = ["topic", "type", "messages", "Hz", "role", "why", *(_READ_HEADER if full else [])]
     rows = [
         [
@@ -106,14 +106,16 @@ _READ_HEADER = ["read", "gaps", "longest gap [s]", "time", "offset [s]", "stamps
 
 def _read_cells(topic: InspectedTopic) -> list[str]:
     """Return what reading everything found of a topic, in the order of the header."""
+    if (stamps := topic.stamps) is None:
+        return [""] * len(_READ_HEADER)
     odd = {
-        "zero": topic.zero_stamps,
-        "backward": topic.backward_stamps,
+        "zero": stamps.zero_stamps,
+        "backward": stamps.backward_stamps,
         "wrong": topic.wrong_stamps,
-        "repeated": topic.repeated_stamps,
-        "duplicates": topic.duplicates,
+        "repeated": stamps.repeated_stamps,
+        "duplicates": stamps.duplicates,
     }
-    values = [topic.messages_read, topic.gaps, topic.longest_gap_s, topic.time, topic.header_minus_log_s]
+    values = [stamps.messages_read, stamps.gaps, stamps.longest_gap_s, topic.time, topic.header_minus_log_s]
     return [*map(_text, values), ", ".join(f"{count} {kind}" for kind, count in odd.items() if count)]
 
 
