@@ -55,10 +55,9 @@ from tcpipe.pipeline.calls import BUILD, Estimate, estimate, measure_call, start
 from tcpipe.pipeline.dataset.added_columns import read_all_covariates
 from tcpipe.pipeline.dataset.balance import BALANCE_COLUMNS, measure_balance
 from tcpipe.pipeline.dataset.build_dataset_options import BuildDatasetOptions
-from tcpipe.pipeline.dataset.card import CARD_COLUMNS, VELOCITY_COLUMN, dataset_card, is_whole
+from tcpipe.pipeline.dataset.card import CARD_COLUMNS, PHYSICS_COLUMNS, VELOCITY_COLUMN, dataset_card, is_whole
 from tcpipe.pipeline.dataset.content import gather_content
 from tcpipe.pipeline.dataset.inputs import Inputs, choose_inputs, earlier_splits
-from tcpipe.pipeline.dataset.physics import PHYSICS_COLUMNS
 from tcpipe.pipeline.dataset.redaction import (
     redacted_card,
     redacted_content,

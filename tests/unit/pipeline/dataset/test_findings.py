@@ -13,7 +13,7 @@ from tcpipe.errors import DatasetError
 from tcpipe.formats.dataset_card import RunSource, group_dataset_findings, judge_dataset
 from tcpipe.formats.finding_lines import format_mixed_groups
 from tcpipe.pipeline.dataset.build import build_dataset
-from tcpipe.pipeline.dataset.findings import count_flagged
+from tcpipe.pipeline.dataset.card import count_flagged
 from tcpipe.pipeline.diff import diff
 from tcpipe.recipe import Recipe
 from tcpipe.store import open_store
