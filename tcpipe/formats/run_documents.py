@@ -11,6 +11,7 @@ from dataclasses import dataclass, field, replace
 from typing import Literal
 
 from tcpipe.formats.seals import Checksum
+from tcpipe.motion.remedies import KEPT
 from tcpipe.recipe import IngestSections
 from tcpipe.tables.facts import LEFT_OUT, NOTHING_FOUND, StageFacts
 from tcpipe.tables.findings import StageReport
@@ -133,7 +134,7 @@ class Ingestion:
     @property
     def kept_m(self) -> float:
         """How much of that is in segments [m]."""
-        return self.ledger_m.get("kept", 0.0)
+        return self.ledger_m.get(KEPT, 0.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -50,13 +50,14 @@ from tcpipe.formats.published import has_card, here_by_range, published, refuse_
 from tcpipe.formats.recipe_toml import recipe_of
 from tcpipe.formats.seals import Checksum, file_checksum, file_checksums, sealed_page, write_sealed
 from tcpipe.formats.store_mark import SPOOL
+from tcpipe.motion.remedies import KEPT
 from tcpipe.pipeline.begun_calls import OpenCall, begun_call
 from tcpipe.pipeline.calls import BUILD, Estimate, estimate, measure_call, started
 from tcpipe.pipeline.dataset.added_columns import read_all_covariates
 from tcpipe.pipeline.dataset.balance import BALANCE_COLUMNS, measure_balance
 from tcpipe.pipeline.dataset.build_dataset_options import BuildDatasetOptions
 from tcpipe.pipeline.dataset.card import CARD_COLUMNS, PHYSICS_COLUMNS, VELOCITY_COLUMN, dataset_card, is_whole
-from tcpipe.pipeline.dataset.content import gather_content
+from tcpipe.pipeline.dataset.content import gather_content, write_patches
 from tcpipe.pipeline.dataset.inputs import Inputs, choose_inputs, earlier_splits
 from tcpipe.pipeline.dataset.redaction import (
     redacted_card,
@@ -68,8 +69,6 @@ from tcpipe.pipeline.dataset.redaction import (
 from tcpipe.pipeline.dataset.replacing import BuildOptions, find_other_options
 from tcpipe.pipeline.dataset.runs import CHOICE_CODES, find_gone_runs
 from tcpipe.pipeline.dataset.sampling import Workers
-from tcpipe.pipeline.dataset.segments import KEPT
-from tcpipe.pipeline.dataset.writing import write_patches
 from tcpipe.pipeline.log_writer import LogWriter, open_log
 from tcpipe.recipe import Recipe
 from tcpipe.report.dataset_report import dataset_report
