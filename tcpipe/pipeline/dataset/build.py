@@ -32,7 +32,6 @@ from tcpipe.formats.dataset_files import (
     REPORT,
     SAMPLES,
     SHARDS,
-    FileFormat,
     read_card,
     read_current_card,
     read_samples,
@@ -58,7 +57,7 @@ from tcpipe.pipeline.dataset.balance import BALANCE_COLUMNS, measure_balance
 from tcpipe.pipeline.dataset.build_dataset_options import BuildDatasetOptions
 from tcpipe.pipeline.dataset.card import CARD_COLUMNS, PHYSICS_COLUMNS, VELOCITY_COLUMN, dataset_card, is_whole
 from tcpipe.pipeline.dataset.content import gather_content, write_patches
-from tcpipe.pipeline.dataset.inputs import Inputs, choose_inputs, earlier_splits
+from tcpipe.pipeline.dataset.inputs import BuildOptions, Inputs, choose_inputs, earlier_splits
 from tcpipe.pipeline.dataset.redaction import (
     redacted_card,
     redacted_content,
@@ -66,7 +65,7 @@ from tcpipe.pipeline.dataset.redaction import (
     redacted_inputs,
     redaction_of,
 )
-from tcpipe.pipeline.dataset.replacing import BuildOptions, find_other_options
+from tcpipe.pipeline.dataset.replacing import find_other_options
 from tcpipe.pipeline.dataset.runs import CHOICE_CODES, find_gone_runs
 from tcpipe.pipeline.dataset.sampling import Workers
 from tcpipe.pipeline.log_writer import LogWriter, open_log
@@ -74,7 +73,6 @@ from tcpipe.recipe import Recipe
 from tcpipe.report.dataset_report import dataset_report
 from tcpipe.report.overview import class_overview, maps_overview, relief_overview, write_overview
 from tcpipe.splits.assignment import SPLITS
-from tcpipe.splits.regions import Regions
 from tcpipe.store import Store, open_store
 from tcpipe.tables.findings import Finding, is_problem, select_problems
 from tcpipe.tables.levels import DATA_MODEL_VERSION, READ_VERSIONS
@@ -178,7 +176,7 @@ def run_build_dataset(options: BuildDatasetOptions) -> BuildResult:
     )
     inputs = replace(inputs, digest=digest(("redacted", inputs.digest))) if options.redact else inputs
     keeps_own = keep_split is not None and _absolute(keep_split) == _absolute(place)
-    marks = BuildOptions(ruling, regions, tags, options.file_format, options.redact, keep_split is not None, keeps_own)
+    marks = BuildOptions(ruling, regions, tags, options.file_format, options.redact, earlier, keeps_own)
     left_out = _find_left_out(
         inputs,
         None if known is not None and known.redaction else known,
@@ -200,17 +198,7 @@ def run_build_dataset(options: BuildDatasetOptions) -> BuildResult:
         with begun_call(open_log(opened), BUILD, [_absolute(place)]) as call:
             at_work = partial(_workers, jobs=options.jobs, cluster=options.cluster)
             with whole as directory, at_work(directory, opened, inputs.digest) as workers:
-                card = _build(
-                    directory,
-                    inputs,
-                    ruling,
-                    regions,
-                    earlier,
-                    file_format=options.file_format,
-                    workers=workers,
-                    redact=options.redact,
-                    tags=marks.tags,
-                )
+                card = _build(directory, inputs, marks, workers)
                 _refuse_others_since(place, {known.inputs if known else None, inputs.digest})
             for entry in workers.waiting.entries():
                 workers.waiting.delete(entry.name)
@@ -384,30 +372,19 @@ def _workers(directory: Path, store: Store, inputs: str, *, jobs: int, cluster: 
         ) from None
 
 
-def _build(
-    directory: Path,
-    inputs: Inputs,
-    recipe: Recipe,
-    regions: Regions | None,
-    earlier: pa.Table | None,
-    *,
-    file_format: FileFormat,
-    workers: Workers,
-    redact: bool,
-    tags: Mapping[str, str],
-) -> DatasetCard:
+def _build(directory: Path, inputs: Inputs, options: BuildOptions, workers: Workers) -> DatasetCard:
     """Write the dataset into ``directory`` and return its card."""
-    waiting = directory / SPOOL
+    waiting, recipe = directory / SPOOL, options.recipe
     waiting.mkdir()
-    content = gather_content(waiting, inputs, recipe, regions, earlier, workers=workers)
-    redaction = redaction_of(content, inputs, recipe) if redact else None
+    content = gather_content(waiting, inputs, options, workers)
+    redaction = redaction_of(content, inputs, recipe) if options.redact else None
     if redaction is not None:
         content, inputs = redacted_content(content, redaction), redacted_inputs(inputs, redaction)
     logger.info("writing %d samples", len(content.samples))
     with parquet_rows(directory / SAMPLES, content.samples.schema) as write:
         for piece in content.samples.pieces(ROWS_PER_GROUP):
             write(piece)
-    shards = write_patches(directory, content, file_format, workers, compression=recipe.dataset.compression)
+    shards = write_patches(directory, content, options.file_format, workers, compression=recipe.dataset.compression)
     shutil.rmtree(waiting)
     _write_overviews(directory, content.sources)
     balance, drive_next = measure_balance(
@@ -416,21 +393,12 @@ def _build(
         content.sources,
         velocity_column=VELOCITY_COLUMN[recipe.label.velocity],
         chord_m=recipe.segment.chord_m,
-        regions=regions,
+        regions=options.regions,
         buffer_m=content.drawn.buffer_m,
     )
     write_json(directory / DRIVE_NEXT, drive_next if redaction is None else redacted_features(drive_next, redaction))
-    card = dataset_card(
-        read_samples(directory, (*CARD_COLUMNS, *PHYSICS_COLUMNS)),
-        recipe,
-        inputs,
-        content,
-        file_format=file_format,
-        regions=regions,
-        balance=balance,
-        shards=shards,
-        tags=tags,
-    )
+    samples = read_samples(directory, (*CARD_COLUMNS, *PHYSICS_COLUMNS))
+    card = dataset_card(samples, options, inputs, content, balance=balance, shards=shards)
     card = card if redaction is None else redacted_card(card, redaction)
     spool, schema = content.spool, content.samples.schema
     files = file_checksums(directory)

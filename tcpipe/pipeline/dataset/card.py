@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TypedDict
@@ -28,18 +28,16 @@ from tcpipe.formats.dataset_card import (
     SplitResult,
     judge_dataset,
 )
-from tcpipe.formats.dataset_files import FileFormat
 from tcpipe.formats.json_files import recast
 from tcpipe.formats.layer_descriptions import described
 from tcpipe.formats.maps.map_files import MapFile
 from tcpipe.pipeline.dataset.content import Content
-from tcpipe.pipeline.dataset.inputs import Inputs
+from tcpipe.pipeline.dataset.inputs import BuildOptions, Inputs
 from tcpipe.pipeline.dataset.splitting import regions_to_json
 from tcpipe.recipe import Recipe
 from tcpipe.recipe.suggestions import suggest
 from tcpipe.splits.assignment import SPLITS
 from tcpipe.splits.audit import HeldOut
-from tcpipe.splits.regions import Regions
 from tcpipe.tables.bits import Quality, name_of
 from tcpipe.tables.catalogue import Severity, threshold
 from tcpipe.tables.columns import floats
@@ -71,18 +69,16 @@ class SampleFigures(TypedDict):
 
 def dataset_card(
     samples: pa.Table,
-    recipe: Recipe,
+    options: BuildOptions,
     inputs: Inputs,
     content: Content,
     *,
-    file_format: FileFormat,
-    regions: Regions | None,
     balance: Balance,
     shards: Sequence[Shard],
-    tags: Mapping[str, str],
 ) -> DatasetCard:
     """Return the card without checksums; ``samples`` has the `CARD_COLUMNS` of every sample, and `physics.PHYSICS_COLUMNS`."""
-    about, drawn, classes = recipe.dataset, content.drawn, content.sources[0].classes
+    recipe, drawn, classes = options.recipe, content.drawn, content.sources[0].classes
+    about, regions = recipe.dataset, options.regions
     layers, has_terrain = content.spool.layers, "terrain" in content.spool.layers
     runs = tuple(replace(run, samples=_count(samples, "run_id", run.run_id)) for run in inputs.sources)
     card = DatasetCard(
@@ -95,7 +91,7 @@ def dataset_card(
         creator=about.creator,
         **measured(samples, has_terrain=has_terrain),
         recipe=recipe,
-        format=file_format,
+        format=options.file_format,
         patch_m=recipe.sample.patch_m,
         patch_px=recipe.sample.patch_px,
         layers={name: described(layer) for name, layer in layers.items()},
@@ -116,7 +112,7 @@ def dataset_card(
         removal=content.removal,
         balance=balance,
         runs=runs,
-        run_tags=tags,
+        run_tags=options.tags,
         maps=tuple(map(_map_source, content.sources, inputs.map_sha256, content.registrations)),
         physics=physics_by_robot(samples),
         covariates=content.covariates,

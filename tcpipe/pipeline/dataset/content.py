@@ -30,7 +30,7 @@ from tcpipe.formats.stored_runs import RunDirectory
 from tcpipe.formats.zarr_arrays import Compression
 from tcpipe.motion.remedies import KEPT
 from tcpipe.pipeline.dataset.added_columns import added_columns, find_narrow_patches, tag_of_each
-from tcpipe.pipeline.dataset.inputs import Inputs
+from tcpipe.pipeline.dataset.inputs import BuildOptions, Inputs
 from tcpipe.pipeline.dataset.registration import register_runs
 from tcpipe.pipeline.dataset.removal import removed_by_ground
 from tcpipe.pipeline.dataset.sampling import Spool, Workers, sample_all_segments
@@ -39,7 +39,6 @@ from tcpipe.recipe import Recipe
 from tcpipe.recipe.suggestions import recipe_key
 from tcpipe.splits.assignment import EXCLUDED, NO_FOLD, Assignment
 from tcpipe.splits.ranking import order_ranks
-from tcpipe.splits.regions import Regions
 from tcpipe.stages.sample import Sampled, metres_lost
 from tcpipe.tables.bits import Loss, name_of
 from tcpipe.tables.columns import floats
@@ -266,21 +265,14 @@ class Content:
     findings: tuple[Finding, ...]
 
 
-def gather_content(
-    directory: Path,
-    inputs: Inputs,
-    recipe: Recipe,
-    regions: Regions | None,
-    earlier: pa.Table | None,
-    *,
-    workers: Workers,
-) -> Content:
+def gather_content(directory: Path, inputs: Inputs, options: BuildOptions, workers: Workers) -> Content:
     """Sample, split and order; segments wait in files in ``directory``, which must be empty, pixels where ``workers`` see them.
 
     Raises
     ------
     DatasetError, MapError : nothing comes of it: no segment, none on the map, none inside the region.
     """
+    recipe = options.recipe
     pool = pool_segments(inputs.runs, directory, again=inputs.again)
     logger.info("sampling %d segments of %d runs", pool.segments.num_rows, len(inputs.runs))
     ranks = _ranks(pool.segments, seed=recipe.split.seed)
@@ -295,7 +287,9 @@ def gather_content(
             _nothing_sampled(pool.segments, lost_m, sources), *_why_uncertain(pool.segments, lost_m, inputs, recipe)
         )
     tags = _tags(pool.segments, inputs, recipe)
-    drawn = draw_splits(pool.segments, sampled, sources[0].grid, regions, recipe, earlier=earlier, tags=tags)
+    drawn = draw_splits(
+        pool.segments, sampled, sources[0].grid, options.regions, recipe, earlier=options.earlier, tags=tags
+    )
     split = drawn.assigned.split
     arc_m = floats(pool.segments, "arc_length_m")[sampled.kept]
     unused_m = {Loss.SPLIT_BUFFER: arc_m[split == "buffer"].sum(), Loss.SPLIT_EXCLUDED: arc_m[split == EXCLUDED].sum()}

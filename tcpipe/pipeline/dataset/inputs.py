@@ -27,12 +27,29 @@ from tcpipe.formats.stored_runs import RunDirectory
 from tcpipe.pipeline.dataset.runs import Chosen, choose_runs
 from tcpipe.pipeline.recordings import each_drive_once
 from tcpipe.recipe import Recipe
+from tcpipe.splits.regions import Regions
 from tcpipe.store import Store
 from tcpipe.tables.findings import Finding
 from tcpipe.tables.levels import TABLES_VERSION
 
 if TYPE_CHECKING:
     from tcpipe.formats.covariates import CovariateTable
+
+
+@dataclass(frozen=True, slots=True)
+class BuildOptions:
+    """What a user chooses for a dataset, beside its runs and what the maps and tables hold."""
+
+    recipe: Recipe
+    """The one that rules, with holdout and seed of the call."""
+    regions: Regions | None
+    tags: Mapping[str, str]
+    file_format: FileFormat
+    redact: bool
+    earlier: pa.Table | None
+    """Samples of an earlier dataset, which keep their split."""
+    keeps_own_split: bool
+    """Whether that is the dataset that is replaced, which may be asked for at any time."""
 
 
 @dataclass(frozen=True, slots=True)
