@@ -147,7 +147,7 @@ def test_maps_are_held_open_only_while_samples_are_taken(store, tmp_path, monkey
         raise MapError("a tile is damaged")
 
     monkeypatch.setattr(dataset_sampling, "_HELD_MAPS", 1)
-    assert build(store, tmp_path / "out", ("west", "east")).samples > 600
+    assert build(store, tmp_path / "out", ("west", "east")).card.samples > 600
     assert not dataset_sampling._held
     monkeypatch.setattr(dataset_sampling, "sample_on_maps", failing)
     with pytest.raises(MapError, match="a tile is damaged"):

@@ -89,7 +89,7 @@ def test_several_maps_are_listed_with_the_flag(store, tmp_path):
     assert "(site, yard)" in line
     assert "--map" in line
     assert "no map 'field'" in refused(store, tmp_path, map_name="field")
-    assert build(store, tmp_path, map_name="yard").samples == 20
+    assert build(store, tmp_path, map_name="yard").card.samples == 20
 
 
 def test_two_robots_are_not_pooled_unasked(store, tmp_path):
@@ -99,7 +99,7 @@ def test_two_robots_are_not_pooled_unasked(store, tmp_path):
     assert "husky, warthog" in line
     assert "--robot" in line
     assert "no run of robot 'jackal'" in refused(store, tmp_path, robot="jackal")
-    assert build(store, tmp_path, robot="warthog").samples == 20
+    assert build(store, tmp_path, robot="warthog").card.samples == 20
 
 
 def test_runs_of_another_recipe_are_left_out_and_named(store, tmp_path):
@@ -160,7 +160,7 @@ def test_two_robots_at_one_time_and_one_robot_at_two_times_are_two_drives(store,
     add(store, start_ns=10**18)
     add(store, "b", (5.0,), start_ns=10**18)  # elsewhere
     add(store, "c", start_ns=2 * 10**18)  # the same place, later
-    assert build(store, tmp_path).samples == 60
+    assert build(store, tmp_path).card.samples == 60
 
 
 def test_no_segments(store, tmp_path):
@@ -305,7 +305,7 @@ def test_a_dataset_that_lost_a_file_is_built_again(store, tmp_path):
 def test_holdout_and_seed_overrule_the_recipe(store, tmp_path):
     add(store)
     sample = build(store, tmp_path, holdout="sample")
-    assert (sample.splits["train"], sample.splits["test"]) == (16, 4)
+    assert (sample.card.splits["train"], sample.card.splits["test"]) == (16, 4)
     first = set(open_dataset(tmp_path / "out")["test"].samples["sample_id"].to_pylist())
     build(store, tmp_path, holdout="sample", seed=1, force=True)
     assert set(open_dataset(tmp_path / "out")["test"].samples["sample_id"].to_pylist()) != first

@@ -152,4 +152,4 @@ def test_who_ends_second_on_one_spool_is_told(store, tmp_path, monkeypatch):
     with pytest.raises(StoreError, match=r"another build of the same was first, .* run the same command again"):
         build(store.root, tmp_path / "out")
     monkeypatch.undo()
-    assert build(store.root, tmp_path / "out").samples == ROWS
+    assert build(store.root, tmp_path / "out").card.samples == ROWS
