@@ -204,7 +204,7 @@ def test_a_redacted_finding_keeps_its_code_and_what_is_public(built):
         assert {of.subject.name for of in select_findings(now.findings, "topic-not-used")} == {
             *("topic", "log", "frame", "call", "file", "run")
         }
-    grades = [[getattr(of.verdict, name) for name in ("position", "time", "energy")] for of in (told.card, card)]
+    grades = [[getattr(of.verdict, name) for name in ("position", "time", "energy")] for of in (told, card)]
     assert grades[0] == grades[1]
 
 
