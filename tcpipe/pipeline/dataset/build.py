@@ -163,20 +163,17 @@ def run_build_dataset(options: BuildDatasetOptions) -> BuildResult:
     covariates, map_name, keep_split = options.covariates, options.map_name, options.keep_split
     tables = (covariates,) if isinstance(covariates, str | Path) else tuple(covariates)
     earlier = None if keep_split is None else earlier_splits(keep_split)
+    keeps_own = keep_split is not None and _absolute(keep_split) == _absolute(place)
+    marks = BuildOptions(ruling, regions, tags, options.file_format, options.redact, earlier, keeps_own)
     inputs = choose_inputs(
         opened,
-        ruling,
+        marks,
         map_names=(map_name,) if isinstance(map_name, str) else tuple(map_name or ()),
         robot=robot,
-        tags=tags,
         region=region,
-        file_format=options.file_format,
-        earlier=earlier,
         covariates=read_all_covariates([Path(path) for path in tables], ruling.covariates),
     )
     inputs = replace(inputs, digest=digest(("redacted", inputs.digest))) if options.redact else inputs
-    keeps_own = keep_split is not None and _absolute(keep_split) == _absolute(place)
-    marks = BuildOptions(ruling, regions, tags, options.file_format, options.redact, earlier, keeps_own)
     left_out = _find_left_out(
         inputs,
         None if known is not None and known.redaction else known,

@@ -75,20 +75,17 @@ class Inputs:
 
 def choose_inputs(
     store: Store,
-    recipe: Recipe,
+    options: BuildOptions,
     *,
     map_names: Sequence[str],
     robot: str | None,
     region: bytes | None,
-    file_format: FileFormat,
-    tags: Mapping[str, str] | None = None,
-    earlier: pa.Table | None = None,
-    covariates: tuple[CovariateTable, ...] = (),
+    covariates: tuple[CovariateTable, ...],
 ) -> Inputs:
     """Return the runs of one robot ingested with this recipe and the maps, or raise `DatasetError` that lists the candidates."""
     problems = list[str]()
     try:
-        chosen = choose_runs(store, recipe, robot=robot, tags=tags or {})
+        chosen = choose_runs(store, options.recipe, robot=robot, tags=options.tags)
         _refuse_without_segments(chosen.runs)
     except DatasetError as error:
         problems += error.problems
@@ -110,13 +107,13 @@ def choose_inputs(
     fingerprint = digest(
         {
             "versions": [__version__, TABLES_VERSION],
-            "recipe": recipe,
+            "recipe": options.recipe,
             "runs": [{key: value for key, value in plain(run).items() if key != "samples"} for run in sources],
             "maps": list(zip(names, map_sha256, strict=True)),
             "region": None if region is None else region.decode("utf-8", "replace"),
-            "format": file_format,
+            "format": options.file_format,
             **({"covariates": [(of.name, of.checksum) for of in covariates]} if covariates else {}),
-            **({} if earlier is None else {"kept_split": _table_digest(earlier)}),
+            **({} if options.earlier is None else {"kept_split": _table_digest(options.earlier)}),
         }
     )
     findings = (*chosen.findings, *once.findings)
