@@ -72,6 +72,20 @@ class LonLat(click.ParamType[tuple[float, float]]):
         return lon, lat
 
 
+class RenamedOption(click.Option):
+    """An option that is also read by its earlier name, which help and errors do not show."""
+
+    def __init__(self, *declarations: Any, earlier: str, **settings: Any) -> None:
+        super().__init__(*declarations, **settings)
+        self._earlier = earlier
+
+    def add_to_parser(self, parser: Any, ctx: click.Context) -> None:
+        """Let click read both names."""
+        self.opts.append(self._earlier)
+        super().add_to_parser(parser, ctx)
+        self.opts.remove(self._earlier)
+
+
 Option: TypeAlias = Callable[[Any], Any]
 Complete: TypeAlias = Callable[[click.Context, click.Parameter, str], list[str]]
 
@@ -241,6 +255,7 @@ def parameter(name: str, default: Any, shown: options.Option) -> Option:
     settings |= {"is_flag": True} if isinstance(default, bool) else {}
     flags = shown.flags or (f"--{name.replace('_', '-')}",)
     multiple = settings.pop("multiple", shown.repeatable)
+    settings |= {"cls": RenamedOption, "earlier": shown.earlier} if shown.earlier else {}
     return click.option(*flags, name, help=shown.about or None, envvar=shown.envvar, multiple=multiple, **settings)
 
 

@@ -17,7 +17,7 @@ from tcpipe.planning.path_options import PlanPathOptions
 def plan_path(options: PlanPathOptions, *, as_json: bool, quiet: bool) -> int:
     """Find the path of least energy, time or distance between two points, over costs that depend on the direction of travel.
 
-    Exit code 3: some of the path has no cost, because --step is large.
+    Exit code 3: some of the path has no cost, because --cell-size is large.
     """
     from tcpipe.api import run_plan_path
     from tcpipe.cli.output import progress, say_result

@@ -247,7 +247,7 @@ def _with_beside(task: Task, rules: FitConfig, data: Dataset) -> Task:
     if lacking and not found and rules.model != "physics":
         raise DatasetError(
             f"{data.path}: its samples have no {' and no '.join(lacking)}; process the runs anew and build the dataset again, "
-            "or train without --beside"
+            "or train without --extra-features"
         )
     if lacking:
         logger.warning("%s: its samples have no %s: the model is not told it", data.path, " and no ".join(lacking))
@@ -338,7 +338,7 @@ def _refuse_without_deviations(task: Task, data: Dataset) -> None:
     none = [label for label, weights in zip(task.outputs, task.fit.weights.T, strict=True) if not weights.any()]
     if none:
         raise DatasetError(
-            f"{data.path}: no sample has a standard deviation of {', '.join(none)} to weigh it by; train without --weights"
+            f"{data.path}: no sample has a standard deviation of {', '.join(none)} to weigh it by; train without --inverse-variance-weights"
         )
 
 

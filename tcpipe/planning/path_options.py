@@ -50,9 +50,22 @@ class PlanPathOptions:
         Option("A cost map of this model and map; without one only what is needed is predicted.", (), "sealed", "DIR"),
     )
     step_m: float = option(
-        1.0, Option("Side of a cell; that of --cost-map rules.", ("--step",), Range(0.05, 1000.0), "METRES")
+        1.0,
+        Option(
+            "Side of a cell; that of --cost-map rules.",
+            ("--cell-size",),
+            Range(0.05, 1000.0),
+            "METRES",
+            earlier="--step",
+        ),
     )
-    allow_unseen: bool = option(False, Option("Also cross ground unlike any that the model was trained on."))
+    allow_unseen: bool = option(
+        False,
+        Option(
+            "Also cross ground unlike any that the model was trained on.",
+            ("--allow-extrapolation",), earlier="--allow-unseen",
+        ),
+    )  # fmt: skip
     physics: str | Path | None = option(None, PHYSICS)
     speed_mps: float | None = option(None, SPEED)
     store: str | Path = option("tcpipe-store", STORE)
@@ -68,7 +81,9 @@ class CostMapOptions:
     out: str = option("cost-map", Option(kind="published", metavar="[OUT]", is_argument=True))
     _: KW_ONLY
     map_name: str | None = option(None, MAP)
-    step_m: float = option(1.0, Option("Side of a cell.", ("--step",), Range(0.05, 1000.0), "METRES"))
+    step_m: float = option(
+        1.0, Option("Side of a cell.", ("--cell-size",), Range(0.05, 1000.0), "METRES", earlier="--step")
+    )
     origin_deg: tuple[float, float] | None = option(
         None,
         Option(
