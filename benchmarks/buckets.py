@@ -159,7 +159,7 @@ def ingest_camera(bucket, directory, gigabytes=1):
         f"log of {size / 1e9:.2f} GB with {images} images in chunks of their own: inspect fetched {looked / size:.3%} of it"
     )
     print(
-        f"ingest fetched {taken / size:.2%} ({taken / 1e6:.0f} MB) in {wall:.1f} s, {cpu:.1f} s CPU: {result.segments} segments"
+        f"ingest fetched {taken / size:.2%} ({taken / 1e6:.0f} MB) in {wall:.1f} s, {cpu:.1f} s CPU: {result.run.segments} segments"
     )
     print(f"local disk at most {held['bytes'] / 1e6:.0f} MB, with the run itself; memory {memory / 1e3:.0f} MB")
     assert result.status == "done", result.problems

@@ -146,7 +146,7 @@ def built(store, out):
 
 def floors_of(store, out, result, decoded):
     """Seconds that decoding, gathering and encoding take at least."""
-    path, count = store.map_path("site"), result.samples
+    path, count = store.map_path("site"), result.card.samples
     few = min(count, 50_000)
     return {
         "decode": decode_floor(path, decoded),
@@ -167,7 +167,7 @@ def measure(directory, samples):
     floor, work = sum(floors.values()), sampling + writing
     ratios = sorted((found[0] + found[1]) / sum(found[3].values()) for found in rounds)
     named = ", ".join(f"{name} {seconds:.2f} s" for name, seconds in floors.items())
-    print(f"{result.samples} samples: decode + sample + write {work:.2f} s = {work / samples * 1e6:.1f} us each")
+    print(f"{result.card.samples} samples: decode + sample + write {work:.2f} s = {work / samples * 1e6:.1f} us each")
     print(f"  floors: {named}: {work / floor:.2f} x; round by round {', '.join(f'{ratio:.2f}' for ratio in ratios)}")
     print(f"  sampling {sampling:.2f} s, writing {writing:.2f} s, all of the build {total:.2f} s")
     print(f"  tiles decoded: {sum(decoded.values())} of {len(decoded)} that samples lie on")

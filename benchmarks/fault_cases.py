@@ -139,8 +139,8 @@ CASES = (
     Case("build-dataset --format parquet", command(*_BUILD, "--format", "parquet"), wants=_WORLD),
     Case("build-dataset --jobs 2", command(*_BUILD, "--jobs", "2"), wants=_WORLD),
     Case("train", command("train", DATASET, "--epochs", "2", "--width", "16", "-q"), wants=_MODEL),
-    Case("evaluate", command("evaluate", MODEL, DATASET, "--no-baselines", "--draws", "1", "-q"), wants=_MODEL),
-    Case("cost-map", command("cost-map", MODEL, "costs", "--step", "4", *STORE, "--quiet"), wants=_MODEL),
+    Case("evaluate", command("evaluate", MODEL, DATASET, "--no-baselines", "--noise-draws", "1", "-q"), wants=_MODEL),
+    Case("cost-map", command("cost-map", MODEL, "costs", "--cell-size", "4", *STORE, "--quiet"), wants=_MODEL),
     Case(
         "predict-path",
         command("predict-path", MODEL, "--path", f"{INPUTS}/path.geojson", "--out", "pieces.csv", *STORE, "--quiet"),
@@ -148,7 +148,9 @@ CASES = (
     ),
     Case(
         "plan-path",
-        command("plan-path", MODEL, "--from", FROM, "--to", TO, "--step", "2", "--picture", "plan.png", *STORE, "-q"),
+        command(
+            "plan-path", MODEL, "--from", FROM, "--to", TO, "--cell-size", "2", "--picture", "plan.png", *STORE, "-q"
+        ),
         wants=_MODEL,
     ),
 )

@@ -105,7 +105,7 @@ def ingest_hours(directory: Path, hours: int = 20, jobs: int = 2) -> None:
     began, cpu = time.perf_counter(), cpu_s()
     summary = ingest(paths, store=store, recipe=Recipe(), jobs=jobs, on_result=ended)
     assert {result.status for result in summary.results} == {"done"}, summary.results[0].problems
-    assert len({result.run_id for result in results}) == len(paths)
+    assert len({result.run.run_id for result in results}) == len(paths)
     each, wall = np.diff(marks), time.perf_counter() - began
     middle, half = median(each), len(each) // 2
     flat = f"{each.min() / middle - 1:+.1%} to {each.max() / middle - 1:+.1%}"
@@ -119,7 +119,7 @@ def ingest_hours(directory: Path, hours: int = 20, jobs: int = 2) -> None:
     print(
         f"memory of the calling process {memory / 1e3:.0f} MB; an hour takes {room / hours / 1e6:.1f} MB of the store"
     )
-    print(f"an hour has {sum(result.segments for result in results) / hours:.0f} segments")
+    print(f"an hour has {sum(result.run.segments for result in results) / hours:.0f} segments")
 
 
 def print_memory(logs: Sequence[str]) -> None:

@@ -15,7 +15,7 @@ from tcpipe.pipeline.log_writer import commit_run
 from tcpipe.recipe import Recipe
 from tcpipe.store import Store, open_store
 from tcpipe.tables.bits import DropReason
-from tcpipe.tables.facts import PowerSign, RunFacts
+from tcpipe.tables.facts import PowerSign, StageFacts
 from tcpipe.tables.findings import StageReport
 from tcpipe.tables.levels import (
     DATA_MODEL_VERSION,
@@ -137,7 +137,7 @@ def add_run(
     recipe = recipe or Recipe()
     robot = table.column("robot")[0].as_py() if table.num_rows else "husky"
     power = PowerSign("drawn_positive", averaged=False, includes=includes)
-    found = StageReport(tuple(findings), RunFacts(power=power) if includes else RunFacts())
+    found = StageReport(tuple(findings), StageFacts(power=power) if includes else StageFacts())
     info = TrackInfo(run_id, robot, Datum(15.43, 47.07, 400.0), 20.0, "smoother", found)
     identity = recipe_id(recipe, robot)
     metres = float(np.sum(table.column("arc_length_m").to_numpy()))

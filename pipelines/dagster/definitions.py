@@ -96,7 +96,7 @@ def _check(name: str, problems: list[str], *, warn: bool = False, **more: int | 
 def _judged(result: Answer) -> dg.AssetCheckResult:
     """Return whether position, time and energy of a run are usable; the reasons are the problems, the worst first."""
     verdict = typed(result["verdict"], Verdict, "tcpipe ingest --json")
-    lines = [*map(format_finding, verdict.reasons), *result["damage"]]
+    lines = [*map(format_finding, verdict.reasons), *result["run"]["damage"]]
     grades = {name: getattr(verdict, name) for name in AFFECTED}
     return _check("usable", lines, warn=verdict.worst != "not usable", **grades)
 
@@ -127,20 +127,21 @@ def run(context: dg.AssetExecutionContext) -> dg.MaterializeResult:
     if result["status"] in ("failed", "waiting"):
         said = "\n".join([*result["problems"], *result["notes"]]) or result["status"]
         raise dg.Failure(said, allow_retries=result["transient"] or result["status"] == "waiting")
-    budget = result["energy_budget"]
+    made = result["run"]
+    budget = made["energy_budget"]
     return dg.MaterializeResult(
         metadata={
-            "run": result["run_id"],
-            "recipe": result["recipe_id"],
+            "run": made["run_id"],
+            "recipe": made["recipe_id"],
             "status": result["status"],
-            "robot": result["robot"],
-            "segments": result["segments"],
-            "driven_m": result["distance_m"],
-            "in_segments_m": result["kept_m"],
+            "robot": made["robot"],
+            "segments": made["segments"],
+            "driven_m": sum(made["ledger_m"].values()),
+            "in_segments_m": made["ledger_m"].get("kept", 0.0),
             **({"energy_floor": budget["total"]} if budget else {}),
         },
         check_results=[
-            _verified(f"{_place('TCPIPE_STORE', 'tcpipe-store')}/runs/{result['run_id']}"),
+            _verified(f"{_place('TCPIPE_STORE', 'tcpipe-store')}/runs/{made['run_id']}"),
             _judged(result),
         ],
     )
@@ -165,16 +166,16 @@ def dataset() -> dg.MaterializeResult:
     out = _place("TCPIPE_DATASET", "dataset")
     region = os.environ.get("TCPIPE_SPLIT")
     (made,) = _answers("build-dataset", out, *(["--split", region] if region else []))
-    doubtful, findings = made["doubtful"], typed(made["findings"], tuple[Finding, ...], "tcpipe build-dataset --json")
+    card, findings = made["card"], typed(made["findings"], tuple[Finding, ...], "tcpipe build-dataset --json")
     problems = [format_finding(finding) for finding in findings if is_problem(finding)]
     shared = [format_finding(finding) for finding in select_findings(findings, "split-leakage")]
     return dg.MaterializeResult(
         metadata={
             "status": made["status"],
-            "samples": made["samples"],
-            **{f"{name}_samples": count for name, count in made["splits"].items()},
-            **({"doubtful_share": doubtful["share"]} if doubtful else {}),
-            "where_every_metre_went": _ledger(made["ledger_m"]),
+            "samples": card["samples"],
+            **{f"{name}_samples": count for name, count in card["splits"].items()},
+            **({"doubtful_share": card["doubtful"]["share"]} if card["doubtful"] else {}),
+            "where_every_metre_went": _ledger(card["ledger_m"]),
             "findings": _listed(list_findings(findings)),
             "page": dg.MetadataValue.path(str(Path(out).absolute() / "report.html")),
             **_picture(Path(out) / "overview.png"),

@@ -8,40 +8,18 @@ import platform
 import shlex
 import signal
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from copy import copy
+from functools import cache
+from importlib import import_module
+from itertools import chain
 from typing import Any, NoReturn, TypeVar
 
 import click
 
 from tcpipe import __version__
-from tcpipe.cli.acknowledge import acknowledge
-from tcpipe.cli.add_map import add_map
-from tcpipe.cli.build_dataset import build_dataset
-from tcpipe.cli.cost_map import cost_map
-from tcpipe.cli.demo import demo
-from tcpipe.cli.diff import diff
-from tcpipe.cli.evaluate import evaluate
-from tcpipe.cli.explain import explain
-from tcpipe.cli.export import export
-from tcpipe.cli.ingest import ingest
-from tcpipe.cli.init import init
-from tcpipe.cli.inspect import inspect
-from tcpipe.cli.migrate import migrate
 from tcpipe.cli.output import debug_log, print_traceback, say_failure
-from tcpipe.cli.overlay import overlay
-from tcpipe.cli.plan_path import plan_path
-from tcpipe.cli.predict_path import predict_path
-from tcpipe.cli.preflight import preflight
 from tcpipe.cli.process import NOTHING_HALF, Ended, ended_in_time, prepare_process
-from tcpipe.cli.prune import prune
-from tcpipe.cli.report import report
-from tcpipe.cli.reproduce import reproduce
-from tcpipe.cli.schemas import schemas
-from tcpipe.cli.simulate import simulate
-from tcpipe.cli.status import status
-from tcpipe.cli.train import train
-from tcpipe.cli.verify import verify
 from tcpipe.errors import TcpipeError, UsageError, hide_secrets
 
 _EXTRAS = {"torch": "train", "lightgbm": "tables", "dask": "cluster", "distributed": "cluster", "dagster": "dagster"}
@@ -50,11 +28,77 @@ _EXTRAS = {"torch": "train", "lightgbm": "tables", "dask": "cluster", "distribut
 C = TypeVar("C", bound=Callable[..., Any])
 
 
-class _InOrder(click.Group):
-    """Lists commands in the order a user meets them."""
+_COMMANDS = {
+    "demo": "See everything work on a simulated site",
+    "init": "Write a commented recipe",
+    "inspect": "What is in a log, map, dataset or store",
+    "preflight": "What a minute of recording promises",
+    "ingest": "Logs to labelled 1 m segments",
+    "status": "Where every log stands",
+    "acknowledge": "Do not report known problems again",
+    "prune": "Remove what a store no longer needs",
+    "add-map": "Rasters of a site into the store",
+    "build-dataset": "Segments and map to a dataset",
+    "train": "Train a model on a dataset",
+    "evaluate": "Measure a model, beside the paper's tables",
+    "reproduce": "The paper's experiment, on a simulated site",
+    "predict-path": "Time and energy of a path",
+    "cost-map": "Directional cost maps of a whole map",
+    "plan-path": "The path of least energy, time or distance",
+    "report": "HTML page of a run, dataset or store",
+    "overlay": "A run as MCAP, to see beside its log",
+    "export": "Topics as Parquet; a dataset for QGIS",
+    "explain": "Where a sample came from; make it again",
+    "verify": "Re-read everything, compare counts and checksums",
+    "migrate": "Bring a store, map or dataset to this data model",
+    "diff": "What changed between two datasets, by cause",
+    "schemas": "The contracts as JSON Schema",
+    "simulate": "A simulated site with its truth",
+}
+"""What each command is for, in the order a user meets them; a command NAME-X is the function of that name in ``NAME_X.py`` here."""
+
+_OLD_NAMES = {"accept": "acknowledge"}
+"""Before data model 3.0."""
+
+
+class _Commands(Mapping[str, click.Command]):
+    """Commands by name; each is imported when it is asked for, so that ``--help`` and every other command start fast."""
+
+    def __getitem__(self, name: str) -> click.Command:
+        if name in _OLD_NAMES:
+            command = copy(self[_OLD_NAMES[name]])
+            command.hidden = True
+            return command
+        return _load(name, _COMMANDS[name])
+
+    def __iter__(self) -> Iterator[str]:
+        return chain(_COMMANDS, _OLD_NAMES)
+
+    def __len__(self) -> int:
+        return len(_COMMANDS) + len(_OLD_NAMES)
+
+
+@cache
+def _load(name: str, about: str) -> click.Command:
+    function = name.replace("-", "_")
+    command: click.Command = getattr(import_module(f"tcpipe.cli.{function}"), function)
+    command.short_help = about
+    return _debug_option(hidden=True)(command)
+
+
+class _Group(click.Group):
+    """Lists commands in the order a user meets them, without importing them."""
+
+    def __init__(self, *arguments: Any, **settings: Any) -> None:
+        super().__init__(*arguments, **settings)
+        self.commands = _Commands()  # type: ignore[assignment]  # nothing is added
 
     def list_commands(self, ctx: click.Context) -> list[str]:  # noqa: ARG002  click's signature
         return list(self.commands)
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:  # noqa: ARG002  click's signature
+        with formatter.section("Commands"):
+            formatter.write_dl(list(_COMMANDS.items()))
 
 
 def _begin_debugging(context: click.Context, _: click.Parameter, wanted: bool) -> None:  # noqa: FBT001  click's signature
@@ -75,7 +119,7 @@ def _debug_option(*, hidden: bool) -> Callable[[C], C]:
 
 
 @click.group(
-    cls=_InOrder,
+    cls=_Group,
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110, "show_default": True},
 )
 @click.version_option(__version__, prog_name="tcpipe")
@@ -92,18 +136,6 @@ def cli() -> None:
 
     Exit codes: 0 done; 1 failed; 2 usage; 3 done in part (each failure is named, the rest is complete).
     """  # noqa: D301  \b keeps the block's lines
-
-
-for command in (
-    *(demo, init, inspect, preflight, ingest, status, acknowledge, prune),
-    *(add_map, build_dataset, train, evaluate, reproduce, predict_path, cost_map, plan_path),
-    *(report, overlay, export, explain, verify, migrate, diff, schemas, simulate),
-):
-    cli.add_command(_debug_option(hidden=True)(command))
-
-_accept = copy(acknowledge)
-_accept.hidden = True
-cli.add_command(_accept, "accept")  # its name before data model 3.0
 
 
 def main() -> None:

@@ -7,7 +7,7 @@ import click
 from tcpipe.cli.options import complete_runs, json_option, store_option
 
 
-@click.command(short_help="Do not report known problems again")
+@click.command()
 @click.argument("names", nargs=-1, required=True, metavar="RUN|LOG|CALL...", shell_complete=complete_runs)
 @store_option
 @json_option

@@ -2,6 +2,47 @@
 
 from __future__ import annotations
 
+from importlib import import_module
+
+_ANSWERS = {
+    "model": "learning.model_card.ModelCard",
+    "cost-map": "planning.cost_map.CostMapCard",
+    "evaluation": "learning.evaluation_facts.Evaluation",
+    "path-totals": "planning.path_files.TableTotals",
+    "plan": "planning.plan_files.PlanFile",
+    "reproduction": "learning.reproduction.ReproductionSummary",
+    "acknowledge.answer": "pipeline.problems.Acknowledged",
+    "add-map.answer": "pipeline.maps.AddedMap",
+    "build-dataset.answer": "pipeline.dataset.build.BuildResult",
+    "cost-map.answer": "planning.cost_map.CostMapResult",
+    "diff.answer": "pipeline.diff.Difference",
+    "evaluate-drives.answer": "planning.drive_files.Drives",
+    "explain.answer": "pipeline.explain.Explained",
+    "export.answer": "pipeline.export.Exported",
+    "export-layers.answer": "pipeline.layers.ExportedLayers",
+    "ingest-log.answer": "pipeline.ingest_task.LogLine",
+    "ingest-summary.answer": "pipeline.ingest.SummaryLine",
+    "inspect-dataset.answer": "pipeline.inspected.InspectedDataset",
+    "inspect-log.answer": "pipeline.log_inspection.InspectedLog",
+    "inspect-logs.answer": "pipeline.inspect.InspectedLogs",
+    "inspect-map.answer": "pipeline.inspected.InspectedMap",
+    "inspect-run.answer": "pipeline.inspect.InspectedRun",
+    "inspect-store.answer": "pipeline.inspect.InspectedStore",
+    "inspect-tables.answer": "pipeline.table_proposal.InspectedTables",
+    "migrate.answer": "pipeline.migrate.Migrated",
+    "overlay.answer": "pipeline.overlay.Overlay",
+    "plan-path.answer": "planning.plan_files.PlanResult",
+    "predict-path.answer": "planning.path_files.PathResult",
+    "preflight.answer": "pipeline.preflight.Preflight",
+    "prune.answer": "pipeline.prune.Pruned",
+    "reproduce.answer": "learning.reproduction.Reproduction",
+    "simulate.answer": "simulation.SimulatedSite",
+    "status.answer": "pipeline.status.Status",
+    "train.answer": "learning.training.TrainResult",
+    "verify.answer": "pipeline.verify.Verified",
+}
+"""Where the dataclass of each contract is; of several kinds of answers one each."""
+
 
 def every_contract() -> dict[str, str]:
     """Return file name → JSON Schema text, of all that has one."""
@@ -11,70 +52,6 @@ def every_contract() -> dict[str, str]:
 
 
 def answers() -> dict[str, type]:
-    """Return the dataclass of every such answer and document, by the name of its contract; of several kinds one each."""
-    from tcpipe.learning.evaluation_facts import Evaluation
-    from tcpipe.learning.model_card import ModelCard
-    from tcpipe.learning.reproduction import Reproduction, ReproductionSummary
-    from tcpipe.learning.training import TrainResult
-    from tcpipe.pipeline.dataset.build import BuildResult
-    from tcpipe.pipeline.diff import Difference
-    from tcpipe.pipeline.explain import Explained
-    from tcpipe.pipeline.export import Exported
-    from tcpipe.pipeline.ingest import SummaryLine
-    from tcpipe.pipeline.ingest_task import LogLine
-    from tcpipe.pipeline.inspect import InspectedLogs, InspectedRun, InspectedStore
-    from tcpipe.pipeline.inspected import InspectedDataset, InspectedMap
-    from tcpipe.pipeline.layers import ExportedLayers
-    from tcpipe.pipeline.log_inspection import InspectedLog
-    from tcpipe.pipeline.maps import AddedMap
-    from tcpipe.pipeline.migrate import Migrated
-    from tcpipe.pipeline.overlay import Overlay
-    from tcpipe.pipeline.preflight import Preflight
-    from tcpipe.pipeline.problems import Acknowledged
-    from tcpipe.pipeline.prune import Pruned
-    from tcpipe.pipeline.status import Status
-    from tcpipe.pipeline.table_proposal import InspectedTables
-    from tcpipe.pipeline.verify import Verified
-    from tcpipe.planning.cost_map import CostMapCard, CostMapResult
-    from tcpipe.planning.drive_files import Drives
-    from tcpipe.planning.path_files import PathResult, TableTotals
-    from tcpipe.planning.plan_files import PlanFile, PlanResult
-    from tcpipe.simulation import SimulatedSite
-
-    return {
-        "model": ModelCard,
-        "cost-map": CostMapCard,
-        "evaluation": Evaluation,
-        "path-totals": TableTotals,
-        "plan": PlanFile,
-        "reproduction": ReproductionSummary,
-        "acknowledge.answer": Acknowledged,
-        "add-map.answer": AddedMap,
-        "build-dataset.answer": BuildResult,
-        "cost-map.answer": CostMapResult,
-        "diff.answer": Difference,
-        "evaluate-drives.answer": Drives,
-        "explain.answer": Explained,
-        "export.answer": Exported,
-        "export-layers.answer": ExportedLayers,
-        "ingest-log.answer": LogLine,
-        "ingest-summary.answer": SummaryLine,
-        "inspect-dataset.answer": InspectedDataset,
-        "inspect-log.answer": InspectedLog,
-        "inspect-logs.answer": InspectedLogs,
-        "inspect-map.answer": InspectedMap,
-        "inspect-run.answer": InspectedRun,
-        "inspect-store.answer": InspectedStore,
-        "inspect-tables.answer": InspectedTables,
-        "migrate.answer": Migrated,
-        "overlay.answer": Overlay,
-        "plan-path.answer": PlanResult,
-        "predict-path.answer": PathResult,
-        "preflight.answer": Preflight,
-        "prune.answer": Pruned,
-        "reproduce.answer": Reproduction,
-        "simulate.answer": SimulatedSite,
-        "status.answer": Status,
-        "train.answer": TrainResult,
-        "verify.answer": Verified,
-    }
+    """Return the dataclass of every such answer and document, by the name of its contract."""
+    homes = {name: f"tcpipe.{of}".rpartition(".") for name, of in _ANSWERS.items()}
+    return {name: getattr(import_module(module), cls) for name, (module, _, cls) in homes.items()}

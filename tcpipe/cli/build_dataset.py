@@ -10,7 +10,7 @@ from tcpipe.cli.options import add_options, json_option, quiet_option
 from tcpipe.pipeline.dataset.build_dataset_options import BuildDatasetOptions
 
 
-@click.command("build-dataset", short_help="Segments and map to a dataset")
+@click.command("build-dataset")
 @add_options(BuildDatasetOptions)
 @json_option
 @quiet_option

@@ -6,12 +6,12 @@ from pathlib import Path
 
 import click
 
-from tcpipe.cli.options import OUTPUT_DIRECTORY, SEED, quiet_option
+from tcpipe.cli.options import OUTPUT_DIRECTORY, quiet_option, seed_option
 
 
-@click.command(short_help="See everything work on a simulated site")
+@click.command()
 @click.argument("directory", default="tcpipe-demo", type=OUTPUT_DIRECTORY, metavar="[DIR]")
-@click.option("--seed", default=1, type=SEED, help="Same seed, same site.")
+@seed_option
 @quiet_option
 def demo(directory: str, *, seed: int, quiet: bool) -> None:
     """Simulate a small site and two drives, run the whole pipeline on them, and say what to open.

@@ -7,7 +7,7 @@ import click
 from tcpipe.cli.options import SEALED, json_option
 
 
-@click.command(short_help="What changed between two datasets, by cause")
+@click.command()
 @click.argument("a", type=SEALED, metavar="A")
 @click.argument("b", type=SEALED, metavar="B")
 @json_option

@@ -8,7 +8,7 @@ from tcpipe.cli.options import add_options, json_option, quiet_option
 from tcpipe.learning.evaluate_options import EvaluateOptions
 
 
-@click.command(short_help="Measure a model, beside the paper's tables")
+@click.command()
 @add_options(EvaluateOptions)
 @json_option
 @quiet_option

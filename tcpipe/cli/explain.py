@@ -7,7 +7,7 @@ import click
 from tcpipe.cli.options import SEALED, json_option, quiet_option, store_option
 
 
-@click.command(short_help="Where a sample came from; make it again")
+@click.command()
 @click.argument("sample_id", metavar="SAMPLE_ID")
 @click.option("--dataset", default="dataset", type=SEALED, metavar="DIR", help="The dataset that holds it.")
 @store_option

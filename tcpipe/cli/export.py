@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from tcpipe.pipeline.export import Exported
 
 
-@click.command(short_help="Topics as Parquet; a dataset for QGIS")
+@click.command()
 @click.argument("log", type=LOG, metavar="LOG|DATASET|STORE|RUN")
 @click.argument("names", nargs=-1, metavar="[TOPIC]...")
 @click.argument("out", type=OUTPUT_EXPORT, metavar="OUT")

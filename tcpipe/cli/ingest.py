@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from tcpipe.pipeline.ingest_task import IngestResult
 
 
-@click.command(short_help="Logs to labelled 1 m segments")
+@click.command()
 @add_options(IngestOptions)
 @dry_run_option
 @click.option("--json", "as_json", is_flag=True, help="Print a JSON object for each log as it ends, and one of all.")
@@ -101,35 +101,34 @@ def _of_one(result: IngestResult, store: Path | str, *, several: bool) -> Iterat
     from tcpipe.tables.findings import select_problems
 
     aside = " (acknowledged)" if result.acknowledged else ""
-    is_new = result.status != "unchanged"
-    budget = result.energy_budget if is_new else None
+    is_new, run = result.status != "unchanged", result.run
+    budget = run.energy_budget if run and is_new else None
     problems = select_problems(result.findings)
-    if result.status in ("failed", "waiting"):
+    if run is None:
         known = " (known, not tried again)" if result.known else ""
         yield f"{result.status:<10} {result.log}{aside or known}"
     else:
-        wrong = "damaged" if result.damage else "empty" if problems else ""
+        wrong = "damaged" if run.damage else "empty" if problems else ""
         known = f" ({wrong}, known)" if wrong and not result.is_news else ""
         more = f", noise floor of E {100 * budget.total:.1f} %" if several and budget else ""
         more += f"; {format_verdict(result.verdict)}" if several and is_new and result.verdict else ""
         yield (
-            f"{result.status:<10} {result.run_id}/{result.recipe_id}: {result.segments} segments "
-            f"from {result.kept_m:.1f} of {result.distance_m:.1f} m, robot {result.robot}{more}{aside or known}"
+            f"{result.status:<10} {run.run_id}/{run.recipe_id}: {run.segments} segments "
+            f"from {run.kept_m:.1f} of {run.driven_m:.1f} m, robot {run.robot}{more}{aside or known}"
         )
     if result.same_as:
         yield f"  {result.log} is the same recording as {result.same_as}: one run"
     if budget is not None and not several:
         yield f"  {in_words(budget)}"
     yield from (f"  {note}" for note in result.notes)
-    yield from (f"  damage:  {line}" for line in result.damage if result.is_news or result.status == "damaged")
     if result.status == "failed" and result.is_news:
-        causes = [finding for finding in result.findings if finding.code != "log-failed"]
-        yield from (f"  {line}" for line in format_findings(causes))
-    if result.verdict is None:
+        yield from (f"  {line}" for line in format_findings(of for of in result.causes if of.code != "log-failed"))
+    if run is None or result.verdict is None:
         return
+    yield from (f"  damage:  {line}" for line in run.damage if result.is_news or result.status == "damaged")
     if is_new and not several:
         yield f"  verdict: {format_verdict(result.verdict)}"
-        where = f"tcpipe inspect {store}/runs/{result.run_id}"
+        where = f"tcpipe inspect {store}/runs/{run.run_id}"
         yield from (f"  {line}" for line in format_findings(result.findings, more=where))
     elif is_new or result.is_news:
         yield from (f"  {describe_finding(of)} [{of.code}]" for of in problems if of.code != "log-damaged")
@@ -139,8 +138,8 @@ def _print_findings(summary: IngestSummary) -> None:
     """Print the findings of several runs by code."""
     from tcpipe.formats.finding_lines import format_groups, group_findings
 
-    made = [result for result in summary.results if result.run_id and result.status != "unchanged"]
-    groups = group_findings((str(result.run_id), result.findings) for result in made)
+    made = [result.run for result in summary.results if result.run and result.status != "unchanged"]
+    groups = group_findings((run.run_id, run.findings) for run in made)
     for line in format_groups(groups, len(made), more=f"tcpipe report {summary.store}"):
         say(line)
 

@@ -9,7 +9,7 @@ import click
 from tcpipe.cli.options import OUTPUT_DIRECTORY
 
 
-@click.command(short_help="Write a commented recipe")
+@click.command()
 @click.argument("directory", default=".", type=OUTPUT_DIRECTORY, metavar="[DIR]")
 def init(directory: str) -> None:
     """Write tcpipe.toml, the recipe: every key with its default and its meaning, commented out."""

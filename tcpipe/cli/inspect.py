@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from tcpipe.tables.findings import Finding
 
 
-@click.command(short_help="What is in a log, map, dataset or store")
+@click.command()
 @click.argument("path", type=LOG, metavar="PATH")
 @click.option("--full", is_flag=True, help="Read everything: damage and gaps, not the index alone.")
 @robot_option()
@@ -67,7 +67,7 @@ def _print_log(log: InspectedLog) -> None:
     say(f"{log.path}: {log.container}, {(log.size_bytes or 0) / 1e6:.1f} MB{duration}")
     say(f"robot {log.robot}: {log.robot_why}")
     say("")
-    full = any(topic.messages_read is not None for topic in log.topics)
+    full = any(topic.stamps for topic in log.topics)
     header = ["topic", "type", "messages", "Hz", "role", "why", *(_READ_HEADER if full else [])]
     rows = [
         [
@@ -106,14 +106,16 @@ _READ_HEADER = ["read", "gaps", "longest gap [s]", "time", "offset [s]", "stamps
 
 def _read_cells(topic: InspectedTopic) -> list[str]:
     """Return what reading everything found of a topic, in the order of the header."""
+    if (stamps := topic.stamps) is None:
+        return [""] * len(_READ_HEADER)
     odd = {
-        "zero": topic.zero_stamps,
-        "backward": topic.backward_stamps,
+        "zero": stamps.zero_stamps,
+        "backward": stamps.backward_stamps,
         "wrong": topic.wrong_stamps,
-        "repeated": topic.repeated_stamps,
-        "duplicates": topic.duplicates,
+        "repeated": stamps.repeated_stamps,
+        "duplicates": stamps.duplicates,
     }
-    values = [topic.messages_read, topic.gaps, topic.longest_gap_s, topic.time, topic.header_minus_log_s]
+    values = [stamps.messages_read, stamps.gaps, stamps.longest_gap_s, topic.time, topic.header_minus_log_s]
     return [*map(_text, values), ", ".join(f"{count} {kind}" for kind, count in odd.items() if count)]
 
 
@@ -178,7 +180,7 @@ def _print_store(found: InspectedStore) -> None:
     say("")
     rows = [
         [
-            *(run.run_id, run.recipe_id, run.robot, str(run.segments), f"{run.distance_m:.1f}"),
+            *(run.run_id, run.recipe_id, run.robot, str(run.segments), f"{run.driven_m:.1f}"),
             *(run.position, run.time, run.energy, str(run.findings), str(run.damage)),
         ]
         for run in found.runs
@@ -204,10 +206,10 @@ def _print_run(found: InspectedRun) -> None:
     for run in found.recipes:
         ledger = run.ledger_m
         say("")
-        say(f"recipe {run.recipe_id}: {run.segments} segments of robot {run.robot}")
+        say(f"recipe {run.recipe_id}: {run.counts.segments} segments of robot {run.robot}")
         lost = sorted(((metres, name) for name, metres in ledger.items() if metres >= 0.05), reverse=True)
         said = ", ".join(f"{metres:.1f} m {name.replace('_', ' ')}" for metres, name in lost)
-        say(f"{run.distance_m:.1f} m driven: {said}" if said else "not driven")
+        say(f"{run.driven_m:.1f} m driven: {said}" if said else "not driven")
         say(f"verdict: {format_verdict(run.verdict)}")
         _print_findings(run.findings)
         for line in run.damage:

@@ -7,7 +7,7 @@ import click
 from tcpipe.cli.options import PUBLISHED, SEALED, json_option
 
 
-@click.command(short_help="Bring a store, map or dataset to this data model")
+@click.command()
 @click.argument("path", type=SEALED, metavar="PATH")
 @click.argument("to", type=PUBLISHED, required=False, metavar="[TO]")
 @json_option

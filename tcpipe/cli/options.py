@@ -16,7 +16,7 @@ import click
 from click.core import ParameterSource
 from click.shell_completion import CompletionItem
 
-from tcpipe.errors import TcpipeError
+from tcpipe.errors import TcpipeError, UsageError
 from tcpipe.formats import places
 from tcpipe.tables import options
 
@@ -72,6 +72,20 @@ class LonLat(click.ParamType[tuple[float, float]]):
         return lon, lat
 
 
+class RenamedOption(click.Option):
+    """An option that is also read by its earlier name, which help and errors do not show."""
+
+    def __init__(self, *declarations: Any, earlier: str, **settings: Any) -> None:
+        super().__init__(*declarations, **settings)
+        self._earlier = earlier
+
+    def add_to_parser(self, parser: Any, ctx: click.Context) -> None:
+        """Let click read both names."""
+        self.opts.append(self._earlier)
+        super().add_to_parser(parser, ctx)
+        self.opts.remove(self._earlier)
+
+
 Option: TypeAlias = Callable[[Any], Any]
 Complete: TypeAlias = Callable[[click.Context, click.Parameter, str], list[str]]
 
@@ -117,8 +131,6 @@ complete_runs = _completing(lambda context: store.run_ids() if (store := _store(
 complete_maps = _completing(lambda context: store.maps() if (store := _store(context)) else ())
 """Offers the store's maps."""
 
-SEED = click.IntRange(0, 2**32 - 1)
-"""What every generator of random numbers takes."""
 OUTPUT_DIRECTORY = Place(places.output_directory, written=True)
 OUTPUT_FILE = Place(places.output_file, written=True)
 GEOPACKAGE = ".gpkg"
@@ -173,6 +185,29 @@ def tag_values(context: click.Context, parameter: click.Parameter, values: tuple
     return dict(value.split("=", 1) for value in values)
 
 
+def layer_values(_: click.Context, __: click.Parameter, values: tuple[str, ...]) -> dict[str, str]:
+    """Turn ``NAME=FILE`` pairs into a dict."""
+    files = _by_name("--layer", values, "the tiles of one layer are a pattern: NAME='tiles/*.tif'")
+    if bare := [layer for layer, file in files.items() if not (layer and file)]:
+        raise UsageError(f"--layer {bare[0]}: wanted NAME=FILE")
+    return files
+
+
+def class_table_values(_: click.Context, __: click.Parameter, values: tuple[str, ...]) -> dict[str, str | None]:
+    """Turn ``NAME`` and ``NAME=FILE`` into a dict, None where there is no file."""
+    tables = _by_name("--categorical", values, "wanted one class table a layer")
+    return {name: table or None for name, table in tables.items()}
+
+
+def _by_name(option: str, given: tuple[str, ...], hint: str) -> dict[str, str]:
+    found: dict[str, str] = {}
+    for name, _, file in (text.partition("=") for text in given):
+        if name in found:
+            raise UsageError(f"{option} {name}: is given twice; {hint}")
+        found[name] = file
+    return found
+
+
 def holdout_value(context: click.Context, parameter: click.Parameter, value: str | None) -> str | None:
     """Let pass what draws test; anything else is a usage error."""
     if value is not None and re.fullmatch(r"block|sample|run|tag:.+", value) is None:
@@ -191,6 +226,8 @@ KINDS: dict[str, dict[str, Any]] = {
     "robot": {"shell_complete": complete_robots},
     "map": {"shell_complete": complete_maps},
     "tags": {"callback": tag_values, "multiple": True},
+    "layers": {"callback": layer_values, "multiple": True, "type": ONE_OF_SEVERAL},
+    "class_tables": {"callback": class_table_values, "multiple": True, "type": ONE_OF_SEVERAL},
     "duration": {"callback": duration_value},
     "shard": {"callback": shard_value},
     "holdout": {"callback": holdout_value},
@@ -218,6 +255,7 @@ def parameter(name: str, default: Any, shown: options.Option) -> Option:
     settings |= {"is_flag": True} if isinstance(default, bool) else {}
     flags = shown.flags or (f"--{name.replace('_', '-')}",)
     multiple = settings.pop("multiple", shown.repeatable)
+    settings |= {"cls": RenamedOption, "earlier": shown.earlier} if shown.earlier else {}
     return click.option(*flags, name, help=shown.about or None, envvar=shown.envvar, multiple=multiple, **settings)
 
 
@@ -246,9 +284,6 @@ def add_options(cls: type[Any]) -> Option:
 store_option = parameter("store", "tcpipe-store", options.STORE)
 """``--store``, or TCPIPE_STORE, or ./tcpipe-store."""
 
-cluster_option = parameter("cluster", None, options.CLUSTER)
-"""``--cluster``, or TCPIPE_CLUSTER."""
-
 recipe_option = parameter("recipe", None, options.RECIPE)
 """``--recipe``; without it TCPIPE_RECIPE, the nearest tcpipe.toml upward, or the defaults."""
 
@@ -260,18 +295,6 @@ json_option = click.option("--json", "as_json", is_flag=True, help="Print one JS
 
 quiet_option = click.option("--quiet", "-q", is_flag=True, help="No progress on stderr.")
 """``--quiet``: no progress on stderr."""
-
-map_option = parameter("map_name", None, options.MAP)
-"""``--map``: the map to look at."""
-
-physics_option = parameter("physics", None, options.PHYSICS)
-"""``--physics``: whose physics costs the turns of a path."""
-
-speed_option = parameter("speed_mps", None, options.SPEED)
-"""``--speed``: what speed is planned to be commanded."""
-
-model_argument = parameter("model", MISSING, options.MODEL)
-"""``MODEL``: a trained model, here or in a bucket."""
 
 
 def robot_option(about: str = "Robot profile.") -> Option:
@@ -288,6 +311,9 @@ def min_age_option(default: str, about: str) -> Option:
     """Return ``--min-age``."""
     return click.option("--min-age", "min_age_s", default=default, metavar="T", callback=duration_value, help=about)
 
+
+seed_option = parameter("seed", 1, options.Option("Same seed, same site.", kind=options.SEED))
+"""``--seed`` of a simulation."""
 
 dry_run_option = parameter("dry_run", False, options.DRY_RUN)
 """``--dry-run``: nothing is done."""

@@ -9,7 +9,7 @@ import click
 from tcpipe.cli.options import OUTPUT_FILE, SEALED, json_option
 
 
-@click.command(short_help="A run as MCAP, to see beside its log")
+@click.command()
 @click.argument("run", type=SEALED, metavar="RUN")
 @click.argument("out", type=OUTPUT_FILE, metavar="OUT.mcap")
 @json_option

@@ -10,14 +10,14 @@ from tcpipe.cli.options import add_options, json_option, quiet_option
 from tcpipe.planning.path_options import PlanPathOptions
 
 
-@click.command("plan-path", short_help="The path of least energy, time or distance")
+@click.command("plan-path")
 @add_options(PlanPathOptions)
 @json_option
 @quiet_option
 def plan_path(options: PlanPathOptions, *, as_json: bool, quiet: bool) -> int:
     """Find the path of least energy, time or distance between two points, over costs that depend on the direction of travel.
 
-    Exit code 3: some of the path has no cost, because --step is large.
+    Exit code 3: some of the path has no cost, because --cell-size is large.
     """
     from tcpipe.api import run_plan_path
     from tcpipe.cli.output import progress, say_result

@@ -8,7 +8,7 @@ from tcpipe.cli.options import add_options, json_option, quiet_option
 from tcpipe.planning.path_options import PredictPathOptions
 
 
-@click.command("predict-path", short_help="Time and energy of a path")
+@click.command("predict-path")
 @add_options(PredictPathOptions)
 @json_option
 @quiet_option

@@ -9,7 +9,7 @@ import click
 from tcpipe.cli.options import LOG, json_option, msgdef_option, quiet_option, recipe_option, robot_option
 
 
-@click.command(short_help="What a minute of recording promises")
+@click.command()
 @click.argument("log", type=LOG, metavar="LOG")
 @robot_option()
 @recipe_option

@@ -7,7 +7,7 @@ import click
 from tcpipe.cli.options import complete_runs, json_option, min_age_option, recipe_option, store_option
 
 
-@click.command(short_help="Remove what a store no longer needs")
+@click.command()
 @store_option
 @recipe_option
 @click.option(

@@ -7,7 +7,7 @@ import click
 from tcpipe.cli.options import SEALED
 
 
-@click.command(short_help="HTML page of a run, dataset or store")
+@click.command()
 @click.argument("path", type=SEALED, metavar="PATH")
 @click.option(
     "--no-runs", is_flag=True, help="Of a store: its own page alone, which leads to those of the runs that are there."

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import click
 
-from tcpipe.cli.options import OUTPUT_DIRECTORY, jobs_option, json_option, quiet_option
+from tcpipe.cli.options import OUTPUT_DIRECTORY, RenamedOption, jobs_option, json_option, quiet_option
 
 
-@click.command(short_help="The paper's experiment, on a simulated site")
+@click.command()
 @click.argument("directory", default="tcpipe-reproduction", type=OUTPUT_DIRECTORY, metavar="[DIR]")
 @click.option("--quick", is_flag=True, help="Minutes: a small site and a narrow network, to see it run.")
 @click.option("--seeds", default=1, type=click.IntRange(1, 100), help="Trainings; claims compare their means.")
 @jobs_option("Logs read")
 @click.option(
-    "--hidden", default=1.0, type=click.FloatRange(0.0, 10.0), metavar="FACTOR",
+    "--hidden-variance", "hidden", cls=RenamedOption, earlier="--hidden", default=1.0, type=click.FloatRange(0.0, 10.0), metavar="FACTOR",
     help="Variance of the resistance that nothing shows, over that of the frozen site.",
 )  # fmt: skip
 @click.option(

@@ -9,7 +9,7 @@ import click
 from tcpipe.cli.options import OUTPUT_DIRECTORY
 
 
-@click.command(short_help="The contracts as JSON Schema")
+@click.command()
 @click.argument("out", type=OUTPUT_DIRECTORY, metavar="OUT")
 def schemas(out: str) -> None:
     """Write the contract of every table, document and --json answer, and of the recipe, as JSON Schema, one file each, to OUT."""

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import click
 
-from tcpipe.cli.options import OUTPUT_DIRECTORY, SEED, complete_scenarios, json_option, quiet_option
+from tcpipe.cli.options import OUTPUT_DIRECTORY, complete_scenarios, json_option, quiet_option, seed_option
 
 
-@click.command(short_help="A simulated site with its truth")
+@click.command()
 @click.argument("out", type=OUTPUT_DIRECTORY, metavar="OUT")
 @click.option(
     "--scenario",
@@ -18,7 +18,7 @@ from tcpipe.cli.options import OUTPUT_DIRECTORY, SEED, complete_scenarios, json_
     shell_complete=complete_scenarios,
     help="demo, hills12, paper, paper_quick, manoeuvres, tiny; see docs/reference/simulation.md.",
 )
-@click.option("--seed", default=1, type=SEED, help="Same seed, same site.")
+@seed_option
 @json_option
 @quiet_option
 def simulate(out: str, *, scenario: str, seed: int, as_json: bool, quiet: bool) -> None:

@@ -10,7 +10,7 @@ from tcpipe.cli.options import ONE_OF_SEVERAL, json_option, min_age_option, reci
 from tcpipe.cli.output import say
 
 
-@click.command(short_help="Where every log stands")
+@click.command()
 @click.argument("paths", nargs=-1, type=ONE_OF_SEVERAL, metavar="[STORE] [LOG...]")
 @store_option
 @recipe_option

@@ -8,7 +8,7 @@ from tcpipe.cli.options import add_options, json_option, quiet_option
 from tcpipe.learning.train_options import TrainOptions
 
 
-@click.command(short_help="Train a model on a dataset")
+@click.command()
 @add_options(TrainOptions)
 @json_option
 @quiet_option

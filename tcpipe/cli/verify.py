@@ -7,7 +7,7 @@ import click
 from tcpipe.cli.options import SEALED, json_option
 
 
-@click.command(short_help="Re-read everything, compare counts and checksums")
+@click.command()
 @click.argument("path", type=SEALED, metavar="PATH")
 @json_option
 def verify(path: str, *, as_json: bool) -> int:

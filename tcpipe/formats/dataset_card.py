@@ -16,7 +16,6 @@ from tcpipe.formats.seals import Checksum
 from tcpipe.motion.removal import Group
 from tcpipe.recipe import Recipe
 from tcpipe.splits.audit import HeldOut
-from tcpipe.splits.holdouts import Holdout
 from tcpipe.tables.facts import ABSENT, EnergyBudget, PhysicsFit
 from tcpipe.tables.findings import LEFT_OUT, Finding
 from tcpipe.tables.verdicts import Verdict, judge_by_code
@@ -55,20 +54,15 @@ class KeptSplit:
 
 
 @dataclass(frozen=True, slots=True)
-class SplitRules:
-    """How the split was drawn (the recipe's section, its buffer as it was used), and what the audit found."""
+class SplitResult:
+    """What became of the recipe's section ``split``, and what the audit found."""
 
-    holdout: Holdout
-    test_fraction: float
-    block_m: float
     buffer_m: float
-    folds: int
-    seed: int
+    """As it was used."""
     region: Mapping[str, PolygonGeometry] | None
     """By kind: train_test, unseen, exclude."""
     audit: tuple[HeldOut, ...]
     kept: KeptSplit | None = None
-    holdout_tag: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -270,7 +264,7 @@ class DatasetCard:
     classes: tuple[TerrainClass, ...]
     label: LabelColumns
     energy_budget: EnergyBudget | None = None
-    split: SplitRules
+    split: SplitResult
     ledger_m: Mapping[str, float]
     """Where every metre of the runs went [m]."""
     removal: Removal

@@ -157,10 +157,10 @@ def _reading(card: DatasetCard) -> Iterator[str]:
 
 
 def _splits_in_words(card: DatasetCard) -> str:
-    rules = card.split
+    rules = card.recipe.split
     return (
         f"`test` is drawn by {rules.holdout} ({100 * rules.test_fraction:g} % of the samples inside the region), `unseen` lies "
-        f"outside of it, `buffer` within {rules.buffer_m:.2f} m of its edge, and is in no other split; `train` has "
+        f"outside of it, `buffer` within {card.split.buffer_m:.2f} m of its edge, and is in no other split; `train` has "
         f"{len(card.folds_of_train)} folds. "
         "`dataset.json` has the audit of what overlaps."
     )

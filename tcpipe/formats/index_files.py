@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -17,7 +16,7 @@ from tcpipe.errors import StoreError
 from tcpipe.formats.json_files import recast
 from tcpipe.formats.parquet import write_table
 from tcpipe.formats.place import Place
-from tcpipe.formats.run_documents import LogOrigin, Manifest, RunJson
+from tcpipe.formats.run_documents import Ingestion, LogOrigin, Manifest, RunJson
 from tcpipe.tables.arrays import column_of
 from tcpipe.tables.catalogue import AFFECTED
 from tcpipe.tables.facts import EnergyBudget, PhysicsFit
@@ -51,26 +50,14 @@ class KnownLog:
     """Hash of the log's size and index; "" where it has none (ADR 86)."""
 
 
-@dataclass(frozen=True, slots=True)
-class RunFacts:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RunFacts(Ingestion):
     """What is asked of an ingestion when all of a store are looked at; the manifest has the rest."""
 
-    run_id: str
-    recipe_id: str
     manifest: str
     """Name of the manifest in the directory of the ingestion."""
-    data_model_version: str
-    tcpipe_version: str
-    ingest_key: str
-    robot: str
-    robot_requested: str | None
-    message_definitions: str
-    tags: Mapping[str, str]
     segments: int
-    driven_m: float
-    kept_m: float
     findings: tuple[Finding, ...]
-    damage: tuple[str, ...]
     energy_budget: EnergyBudget | None
     segments_sha256: str
     start_ns: int | None = None
@@ -88,8 +75,6 @@ class RunFacts:
     """Size [byte] of the manifest, of the documents of the log and tags, and of the tables, by their name in the directory of the run."""
     commit: int = 0
     """Number of the commit that made it visible."""
-    ledger_m: Mapping[str, float] = field(default_factory=dict)
-    """Where every metre went [m], by entry."""
     standing_watt: float | None = None
     """What the robot draws while it stands."""
     physics: Mapping[str, tuple[float, float]] = field(default_factory=dict)
@@ -117,8 +102,6 @@ def facts_of(manifest: Manifest, name: str, files: Mapping[str, int]) -> RunFact
         RunFacts,
         manifest=name,
         segments=manifest.counts.segments,
-        driven_m=math.fsum(manifest.ledger_m.values()),
-        kept_m=manifest.ledger_m.get("kept", 0.0),
         energy_budget=None if label is None else label.energy_budget,
         findings=manifest.info.report.findings,
         segments_sha256=manifest.checksums[named["segments.parquet"]].sha256,

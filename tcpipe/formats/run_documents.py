@@ -5,13 +5,15 @@ A key with a default may be missing: documents of data model 1.0 have been writt
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
 from tcpipe.formats.seals import Checksum
+from tcpipe.motion.remedies import KEPT
 from tcpipe.recipe import IngestSections
-from tcpipe.tables.facts import LEFT_OUT, NOTHING_FOUND, RunFacts
+from tcpipe.tables.facts import LEFT_OUT, NOTHING_FOUND, StageFacts
 from tcpipe.tables.findings import StageReport
 from tcpipe.tables.levels import TABLES_VERSION, Sensor, TrackInfo
 from tcpipe.tables.verdicts import Verdict
@@ -50,7 +52,7 @@ class RunJson:
     remarks: tuple[str, ...] = ()
     message_definitions: str = ""
     """Hash of the definitions that were given for types which the log does not define; "" without."""
-    report: StageReport[RunFacts] = NOTHING_FOUND
+    report: StageReport[StageFacts] = NOTHING_FOUND
     streams: Mapping[str, Checksum] = field(default_factory=dict)
     """The tables of what was read, by their name beside this document."""
     streams_key: str = ""
@@ -106,26 +108,43 @@ class Counts:
     pose_messages: int | None = field(default=None, metadata=LEFT_OUT)
 
 
-@dataclass(frozen=True, slots=True)
-class Manifest:
-    """What became of a run under a recipe: the metres by ledger entry, the findings of every stage (``info.report``), the verdict."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Ingestion:
+    """A run under one recipe: what its manifest, the log of the store and `tcpipe inspect` hold of it."""
 
     run_id: str
     recipe_id: str
     data_model_version: str
     tcpipe_version: str
     ingest_key: str
-    """Hash of the recipe's sections that rule these files."""
-    recipe: IngestSections
+    """Hash of the recipe's sections that rule its files."""
     robot: str
-    tags: Mapping[str, str]
-    counts: Counts
-    ledger_m: Mapping[str, float]
-    verdict: Verdict
-    damage: tuple[str, ...]
-    info: TrackInfo
     robot_requested: str | None = None
     message_definitions: str = ""
+    tags: Mapping[str, str]
+    ledger_m: Mapping[str, float]
+    """Where every metre went [m], by entry."""
+    damage: tuple[str, ...]
+
+    @property
+    def driven_m(self) -> float:
+        """How far it drove [m]."""
+        return math.fsum(self.ledger_m.values())
+
+    @property
+    def kept_m(self) -> float:
+        """How much of that is in segments [m]."""
+        return self.ledger_m.get(KEPT, 0.0)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Manifest(Ingestion):
+    """What became of a run under a recipe; ``info.report`` has the findings of every stage."""
+
+    recipe: IngestSections
+    counts: Counts
+    verdict: Verdict
+    info: TrackInfo
     checksums: Mapping[str, Checksum] = field(default_factory=dict)
     """The tables, by their name beside this document."""
 
@@ -138,6 +157,6 @@ class StreamInfo:
     robot: str
     gnss_crs: str
     power_averaged: bool
-    report: StageReport[RunFacts]
+    report: StageReport[StageFacts]
     sensor: Sensor
     data_model_version: str = TABLES_VERSION

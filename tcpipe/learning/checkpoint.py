@@ -48,9 +48,9 @@ def read_checkpoint(path: Path, key: str) -> tuple[TrainingProgress, dict[str, A
         progress = _progress(json.loads(arrays.pop(_STATE).tobytes()))
     except (ModelError, KeyError, TypeError, ValueError) as error:
         reason = error.problems[0].removeprefix(f"{path}: ") if isinstance(error, ModelError) else "not a checkpoint"
-        raise ModelError(f"{path}: {reason}; remove it, or start anew with --fresh") from None
+        raise ModelError(f"{path}: {reason}; remove it, or start anew with --no-resume") from None
     if progress.key != key:
-        raise ModelError(f"{path}: of another dataset or other options; remove it, or start anew with --fresh")
+        raise ModelError(f"{path}: of another dataset or other options; remove it, or start anew with --no-resume")
     parts: dict[str, dict[str, NDArray[np.generic]]] = {}
     for name, array in arrays.items():
         part, _, rest = name.partition("/")

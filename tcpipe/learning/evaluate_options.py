@@ -18,7 +18,9 @@ class EvaluateOptions:
     """Of drives the one that the model was trained on."""
     out: str | Path = option("evaluation", Option(kind="published", metavar="[OUT]", is_argument=True))
     _: KW_ONLY
-    draws: int = option(5, Option("Draws of noise for each ablated input set.", kind=Range(1, 1000)))
+    draws: int = option(
+        5, Option("Draws of noise for each ablated input set.", ("--noise-draws",), Range(1, 1000), earlier="--draws")
+    )
     baselines: bool = option(
         True,
         Option(
@@ -26,7 +28,13 @@ class EvaluateOptions:
             ("--baselines/--no-baselines",),
         ),
     )
-    retrain: bool = option(False, Option("Train a network for each input set of the ablation, too (six more)."))
+    retrain: bool = option(
+        False,
+        Option(
+            "Train a network for each input set of the ablation, too (six more).",
+            ("--retrain-ablation",), earlier="--retrain",
+        ),
+    )  # fmt: skip
     seed: int = option(0, Option("Of the noise.", kind=SEED))
     drives: Sequence[str | Path] = option(
         (),

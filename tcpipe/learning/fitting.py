@@ -256,7 +256,7 @@ def _state(trainer: Trainer, best: Arrays) -> dict[str, Arrays]:
 def _restore(trainer: Trainer, parts: dict[str, Arrays], where: str) -> None:
     """Put weights, the best ones for a look, and the optimiser's memory back."""
     if parts.keys() != {"now", "best", "optimizer"}:
-        raise ModelError(f"{where}: not a checkpoint; remove it, or start anew with --fresh")
+        raise ModelError(f"{where}: not a checkpoint; remove it, or start anew with --no-resume")
     for part in ("best", "now"):
         trainer.network.set_arrays(parts[part], where)
     trainer.remember(parts["optimizer"], where)

@@ -26,7 +26,7 @@ def leakage_of(data: Dataset, held: Split) -> Leakage | None:
         return None
     audit = next((part for part in data.card.split.audit if part.split == held.name and part.samples), None)
     sharing = None if audit is None else 100.0 * audit.overlapping_samples / audit.samples
-    return Leakage(data.card.split.holdout, within_m, 100.0 * float(near.mean()), sharing)
+    return Leakage(data.card.recipe.split.holdout, within_m, 100.0 * float(near.mean()), sharing)
 
 
 def by_blocks(model: Model, names: Mapping[int, str]) -> ErrorsByClass | None:

@@ -259,7 +259,9 @@ def at_speed(model: Model, speed_mps: float) -> Model:
     """Return the model asked for a commanded speed [m/s] instead of the usual one; `UsageError` if it knows no such speed."""
     command = next((of for of in model.card.beside if of.name == "command_mps"), None)
     if command is None:
-        raise UsageError(f"{model.name}: takes no commanded speed; leave out --speed, or train it with --beside")
+        raise UsageError(
+            f"{model.name}: takes no commanded speed; leave out --speed, or train it with --extra-features"
+        )
     low, high = command.seen
     if not low - _SPEED_MARGIN_MPS <= speed_mps <= high + _SPEED_MARGIN_MPS:
         raise UsageError(
@@ -272,7 +274,9 @@ def at_speed(model: Model, speed_mps: float) -> Model:
 def with_physics(model: Model, dataset: str | Path) -> Model:
     """Return the model with the physics of its robot that a dataset's card holds, instead of its own; `ModelError` if it holds none."""
     if model.takes_turns:
-        raise UsageError(f"{model.name}: is told the turns of a path and holds what they cost; leave out --physics")
+        raise UsageError(
+            f"{model.name}: is told the turns of a path and holds what they cost; leave out --physics-from"
+        )
     card = read_card(fetch_directory_by_range(dataset, by_range=is_shard)[0])
     if model.robot not in card.physics:
         raise ModelError(

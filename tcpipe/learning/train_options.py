@@ -25,9 +25,9 @@ class TrainOptions:
     model: ModelKind | None = option(
         None,
         Option(
-            "The paper's network; boosted trees on features of patches; or physics. The last two take seconds and heed --loss, --weights, "
-            "--label and --beside alone (default: a table of fewer than 20000 samples, else, and with the network's own options, the "
-            "network).",
+            "The paper's network; boosted trees on features of patches; or physics. The last two take seconds and heed --loss, "
+            "--inverse-variance-weights, --label and --extra-features alone (default: a table of fewer than 20000 samples, "
+            "else, and with the network's own options, the network).",
             kind=("resnet18", "table", "physics"),
         ),
     )  # fmt: skip
@@ -42,13 +42,18 @@ class TrainOptions:
     patience: int | None = option(
         None, Option("Epochs without a better held-out loss.", kind=Range(1, 100_000), shown=12)
     )
-    batch: int | None = option(None, Option("Samples in a batch.", kind=Range(1, 65_536), shown=64))
+    batch: int | None = option(
+        None, Option("Samples in a batch.", ("--batch-size",), Range(1, 65_536), shown=64, earlier="--batch")
+    )
     learning_rate: float | None = option(None, Option(kind=Range(0.0, 1.0, is_open=True), shown=1e-4))
     fold: int | None = option(None, Option("Fold of train to stop early by.", kind=Range(0, 99), shown=0))
     mirror: bool | None = option(
         None, Option("Mirror every other patch across its travel.", ("--mirror/--no-mirror",), shown=True)
     )
-    weights: bool = option(False, Option("Weigh each label by its inverse variance."))
+    weights: bool = option(
+        False,
+        Option("Weigh each label by its inverse variance.", ("--inverse-variance-weights",), earlier="--weights"),
+    )
     width: int | None = option(
         None,
         Option("Filters of the first stage, a multiple of 16; 64 is ResNet-18.", kind=Range(16, 512), shown=64),
@@ -62,7 +67,12 @@ class TrainOptions:
     )
     beside: bool = option(
         False,
-        Option("Tell it the turn and the commanded speed of each metre beside its patch; the paper does not."),
-    )
+        Option(
+            "Give the model the turn and the commanded speed of each segment besides its patch; the paper does not.",
+            ("--extra-features",), earlier="--beside",
+        ),
+    )  # fmt: skip
     seed: int | None = option(None, Option("Of weights, shuffles and mirrors.", kind=SEED, shown=0))
-    fresh: bool = option(False, Option("Do not go on from where an earlier training was stopped."))
+    fresh: bool = option(
+        False, Option("Do not go on from where an earlier training was stopped.", ("--no-resume",), earlier="--fresh")
+    )

@@ -229,7 +229,7 @@ def training_task(data: Dataset, fold: int, variant: Variant) -> Task:
         folds = sorted({int(number) for number in train.column("fold")})
         named = ", ".join(map(str, folds))
         cure = f"a block holds {data.card.recipe.split.block_m:g} m of ground: drive more of it"
-        if data.card.split.holdout in ("run", "tag"):
+        if data.card.recipe.split.holdout in ("run", "tag"):
             cure = "they are of whole runs: drive once more, or build it with --holdout block"
         raise DatasetError(
             f"{data.path}: fold {fold} of train leaves {len(fitted)} samples to fit and {len(held)} held out; "
@@ -248,7 +248,7 @@ def _with_beside(task: Task, rules: FitConfig, data: Dataset) -> Task:
     if lacking and not found and rules.model != "physics":
         raise DatasetError(
             f"{data.path}: its samples have no {' and no '.join(lacking)}; process the runs anew and build the dataset again, "
-            "or train without --beside"
+            "or train without --extra-features"
         )
     if lacking:
         logger.warning("%s: its samples have no %s: the model is not told it", data.path, " and no ".join(lacking))
@@ -339,7 +339,7 @@ def _refuse_without_deviations(task: Task, data: Dataset) -> None:
     none = [label for label, weights in zip(task.outputs, task.fit.weights.T, strict=True) if not weights.any()]
     if none:
         raise DatasetError(
-            f"{data.path}: no sample has a standard deviation of {', '.join(none)} to weigh it by; train without --weights"
+            f"{data.path}: no sample has a standard deviation of {', '.join(none)} to weigh it by; train without --inverse-variance-weights"
         )
 
 

@@ -10,6 +10,7 @@ from tcpipe.tables.catalogue import threshold
 from tcpipe.tables.findings import Finding, Subject, make_finding
 
 KEPT = "kept"
+"""The entry of metres that are in use."""
 _MOST_LOSSES = 10
 _WORTH_M = 0.05
 

@@ -8,7 +8,9 @@ from pathlib import Path
 
 from tcpipe.errors import DatasetError, UsageError
 from tcpipe.formats.atomic import clear
-from tcpipe.pipeline.dataset.build import BuildResult, build_dataset
+from tcpipe.formats.dataset_card import DatasetCard
+from tcpipe.formats.dataset_files import read_current_card
+from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.ingest import IngestSummary, ingest
 from tcpipe.pipeline.maps import add_map
 from tcpipe.pipeline.report import report
@@ -22,7 +24,7 @@ class DemoResult:
 
     directory: Path
     ingested: IngestSummary
-    built: BuildResult
+    card: DatasetCard
     pages: tuple[Path, ...]
     unchanged: bool
 
@@ -34,8 +36,8 @@ class DemoResult:
                 "",
                 f"simulated site   {here}/site          real logs, GeoTIFFs, region.geojson, and the truth behind them",
                 f"store            {here}/store         {len(self.ingested.results)} runs, 1 map",
-                f"dataset          {here}/dataset       {self.built.samples} samples: "
-                + ", ".join(f"{count} {split}" for split, count in self.built.splits.items()),
+                f"dataset          {here}/dataset       {self.card.samples} samples: "
+                + ", ".join(f"{count} {split}" for split, count in self.card.splits.items()),
                 "",
                 f"open             {self.pages[0]}",
                 *(f"                 {page}" for page in self.pages[1:]),
@@ -68,7 +70,11 @@ def run_demo(directory: Path, *, seed: int, say: Callable[[str], None]) -> DemoR
     for path in site.logs:
         say(f"$ tcpipe ingest {path}")
     ingested = ingest(site.logs, store=store_path, recipe=Recipe())
-    problems = [problem for result in ingested.results for problem in (*result.problems, *result.damage)]
+    problems = [
+        problem
+        for result in ingested.results
+        for problem in (*result.problems, *(result.run.damage if result.run else ()))
+    ]
     if problems:
         raise DatasetError(*problems)
     height, ortho, terrain, classes = (site.rasters[name] for name in ("height", "ortho", "terrain", "classes"))
@@ -85,4 +91,6 @@ def run_demo(directory: Path, *, seed: int, say: Callable[[str], None]) -> DemoR
     pages = (*report(dataset_path), *of_store)
     statuses = {added.status, built.status, *(result.status for result in ingested.results)}
     unchanged = statuses == {"unchanged"} and not any(page.changed for page in pages)
-    return DemoResult(directory, ingested, built, tuple(Path(page.path) for page in pages), unchanged)
+    return DemoResult(
+        directory, ingested, read_current_card(dataset_path), tuple(Path(page.path) for page in pages), unchanged
+    )

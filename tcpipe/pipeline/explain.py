@@ -27,11 +27,11 @@ from tcpipe.formats.dataset_files import (
     rows_in_files,
     sample_columns,
 )
-from tcpipe.formats.json_files import plain
+from tcpipe.formats.json_files import plain, recast
 from tcpipe.formats.maps.map_facts import MapInputs
 from tcpipe.formats.maps.map_files import MapFile, open_map
 from tcpipe.formats.parquet import ROWS_PER_GROUP, read_row_group
-from tcpipe.formats.recipe_toml import read_key
+from tcpipe.formats.run_documents import Ingestion, LogOrigin
 from tcpipe.formats.stored_runs import RunDirectory
 from tcpipe.pipeline.run_stages import run_stages
 from tcpipe.recipe import Recipe
@@ -52,18 +52,6 @@ Value: TypeAlias = str | int | float | bool | None
 
 Setting: TypeAlias = Value | Sequence[Value | Mapping[str, Value]] | Mapping[str, Value | Sequence[Value]]
 """Of a key of a recipe."""
-
-
-@dataclass(frozen=True, slots=True)
-class SampleLog:
-    """The log that a sample's run was read from; no path and no sha256 where run.json is gone."""
-
-    run_id: str
-    robot: str
-    paths: tuple[str, ...]
-    sha256: str | None
-    damage: tuple[str, ...]
-    tags: Mapping[str, str]
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,10 +106,9 @@ class SampleMap:
 
 @dataclass(frozen=True, slots=True)
 class Versions:
-    """By which version of the program dataset and run were made, and which one this is."""
+    """By which version of the program the dataset was made, in which data model, and which version this is."""
 
     dataset: str
-    run: str
     here: str
     data_model: str
 
@@ -134,13 +121,14 @@ class History:
     """Its row of samples.parquet by column, and which ``row`` it is."""
     labels: Mapping[str, float]
     quality: tuple[str, ...]
-    log: SampleLog
+    run: Ingestion
+    source: LogOrigin | None
+    """The log that the run was read from; None where run.json is gone."""
     messages: Mapping[str, MessageRange]
     """By role."""
     gates: tuple[NearbyGate, ...]
     refused: tuple[NearbyRefusal, ...]
     map: SampleMap
-    recipe_id: str
     recipe_differs_in: Mapping[str, Setting]
     """The recipe's keys that are not at their default."""
     versions: Versions
@@ -195,9 +183,7 @@ def explain(sample_id: str, *, dataset: str | Path = "dataset", store: str | Pat
     directory, fetched = fetch_directory_by_range(dataset, by_range=is_shard)
     card, sample = read_current_card(directory), _sample(directory, sample_id)
     run = _run(opened, directory, card, sample)
-    told = run.manifest
-    read_with = read_key(card.recipe, told.robot_requested, definitions=told.message_definitions)
-    streams = opened.read_streams(run.run_id, key=f"{read_with}-{told.tcpipe_version}")
+    streams = opened.read_streams(run.run_id, key=run.streams_key)
     source = open_map(*opened.map_files(sample.map))
     made = _made_again(sample, run, streams, source, card.recipe)
     differences = tuple(_differences(open_patches(directory, card, fetched), card, sample, made))
@@ -209,19 +195,19 @@ def explain(sample_id: str, *, dataset: str | Path = "dataset", store: str | Pat
 def _history(
     store: Store, card: DatasetCard, sample: _Sample, run: RunDirectory, *, streams: Streams | None, source: MapFile
 ) -> History:
-    window = sample.start_ns, sample.end_ns
+    window, known = (sample.start_ns, sample.end_ns), store.run_json(run.run_id)
     return History(
         sample={**sample.values, "row": sample.row},
         labels=sample.labels,
         quality=names_of(sample.quality, Quality),
-        log=_log(store, run),
+        run=recast(run.manifest, Ingestion),
+        source=known.source if known else None,
         messages={} if streams is None else dict(_messages(streams, *window)),
         gates=tuple(_gates(run, *window)),
         refused=tuple(_refused(run, *window)),
         map=_map(source, sample, card.recipe),
-        recipe_id=run.recipe_id,
         recipe_differs_in=_changed_keys(card.recipe),
-        versions=Versions(card.tcpipe_version, run.manifest.tcpipe_version, __version__, card.data_model_version),
+        versions=Versions(card.tcpipe_version, __version__, card.data_model_version),
         made_from="segments" if streams is None else "streams",
     )
 
@@ -265,18 +251,6 @@ def _run(store: Store, directory: Path, card: DatasetCard, sample: _Sample) -> R
     raise DatasetError(
         f"{store.root}: run {sample.run_id} under recipe {recipe_id}, of which {directory} is made, is not in this store; "
         "name the store it was built from with --store"
-    )
-
-
-def _log(store: Store, run: RunDirectory) -> SampleLog:
-    known = store.run_json(run.run_id)
-    return SampleLog(
-        run_id=run.run_id,
-        robot=run.manifest.robot,
-        paths=tuple(known.source.paths) if known else (),
-        sha256=known.source.sha256 if known else None,
-        damage=tuple(known.damage) if known else (),
-        tags=run.manifest.tags,
     )
 
 
@@ -436,7 +410,7 @@ _DEFAULTS = flat_recipe(Recipe())
 
 
 def _lines(sample_id: str, facts: History, differences: Sequence[str]) -> Iterator[str]:
-    sample, labels, log, ground = facts.sample, facts.labels, facts.log, facts.map
+    sample, labels, run, ground = facts.sample, facts.labels, facts.run, facts.map
     fold = "" if sample["fold"] is None else f", fold {sample['fold']}"
     yield f"{sample_id}: row {sample['row']}, split {sample['split']}{fold}"
     yield (
@@ -445,8 +419,9 @@ def _lines(sample_id: str, facts: History, differences: Sequence[str]) -> Iterat
         f"duration {labels['duration_s']:.3f} s, energy {labels['energy_joule']:.1f} J; "
         f"quality {', '.join(facts.quality) or 'clean'}"
     )
-    paths = [path if Path(path).exists() else f"{path} (not there now)" for path in log.paths]
-    yield f"log      {', '.join(paths) or 'unknown'} (sha256 {str(log.sha256)[:12]}…), run {log.run_id}, robot {log.robot}"
+    paths, sha256 = (facts.source.paths, facts.source.sha256) if facts.source else ((), "")
+    there = [path if Path(path).exists() else f"{path} (not there now)" for path in paths]
+    yield f"log      {', '.join(there) or 'unknown'} (sha256 {sha256[:12]}…), run {run.run_id}, robot {run.robot}"
     yield f"stamps   {sample['start_ns']} to {sample['end_ns']} ns"
     for role, found in facts.messages.items():
         count = found.last - found.first + 1
@@ -462,9 +437,9 @@ def _lines(sample_id: str, facts: History, differences: Sequence[str]) -> Iterat
     changed = (
         ", ".join(f"{key} = {value}" for key, value in facts.recipe_differs_in.items()) or "all keys at their defaults"
     )
-    yield f"recipe   {facts.recipe_id}: {changed}"
+    yield f"recipe   {run.recipe_id}: {changed}"
     versions = facts.versions
-    yield f"versions dataset {versions.dataset}, run {versions.run}, here {versions.here}; data model {versions.data_model}"
+    yield f"versions dataset {versions.dataset}, run {run.tcpipe_version}, here {versions.here}; data model {versions.data_model}"
     if differences:
         yield f"made again from the {facts.made_from}: it differs"
         yield from (f"  {line}" for line in differences)

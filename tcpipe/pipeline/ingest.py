@@ -177,7 +177,7 @@ def _call_of(
         logs=given,
         failed={result.log: result.problems[0] for result in summary.results if result.transient and result.problems},
         done_bytes=sum(sizes.get(result.log, 0) for result in done),
-        written_bytes=room_of(store, [result.run_id for result in done if result.run_id]),
+        written_bytes=room_of(store, [result.run.run_id for result in done if result.run]),
     )
 
 
@@ -189,7 +189,7 @@ def _results_without_work(
     for index, (path, lines) in enumerate(found.problems.items(), start=-len(found.problems)):
         name = plain_line(path)
         findings = find_failure(name, "LogError")
-        yield index, IngestResult(name, "failed", findings=findings, problems=lines, transient=True)
+        yield index, IngestResult(name, "failed", causes=findings, problems=lines, transient=True)
     for index, step in enumerate(steps):
         source, made = step.task.source, step.made
         if step.failure is not None:
@@ -197,7 +197,7 @@ def _results_without_work(
                 source.name,
                 "failed",
                 problems=step.failure.problems,
-                findings=step.failure.findings,
+                causes=step.failure.findings,
                 sha256=source.sha256,
                 known=True,
             )
@@ -260,8 +260,8 @@ def _commit(log: LogWriter, ended: Sequence[tuple[int, IngestTask, Ingested]]) -
     keep_state_here(log.store.place, log.state)
     for index, _, of in ended:
         result = replace(of.result, notes=(*of.result.notes, *notes[index]))
-        if by := others.get(str(result.run_id)):
-            result = _settle_for(log.state.runs.get((by, str(result.recipe_id))), by, result, of.source)
+        if result.run and (by := others.get(result.run.run_id)):
+            result = _settle_for(log.state.runs.get((by, result.run.recipe_id)), by, result, of.source)
         yield index, _judged(log.state, result, of.source, before=before)
 
 
@@ -275,7 +275,7 @@ def _settle_for(made: RunFacts | None, run_id: str, result: IngestResult, source
     )
     findings = find_failure(result.log, "StoreError")
     return IngestResult(
-        result.log, "failed", findings=findings, problems=(problem,), sha256=result.sha256, transient=True
+        result.log, "failed", causes=findings, problems=(problem,), sha256=result.sha256, transient=True
     )
 
 
@@ -284,9 +284,10 @@ def _make_entries(log: LogWriter, task: IngestTask, of: Ingested) -> tuple[Entri
     source, result, sha256 = of.source, of.result, of.result.sha256
     entries, notes = Entries(runs=of.rows), list[str]()
     new = sha256 is not None and bool(source.files) and not log.state.has_seen(source.sighting(sha256))
-    if result.run_id and sha256 and (new or result.status != "unchanged" or result.run_id in log.state.parties):
+    run_id = result.run.run_id if result.run else None
+    if run_id and sha256 and (new or result.status != "unchanged" or run_id in log.state.parties):
         try:
-            superseded, notes = superseded_by(log.store, log.state, source, result.run_id, sha256)
+            superseded, notes = superseded_by(log.store, log.state, source, run_id, sha256)
             entries = replace(entries, superseded=tuple(superseded))
         except StoreError as error:
             notes += error.problems
@@ -302,11 +303,10 @@ def _judged(state: State, result: IngestResult, source: LogSource, *, before: St
     if result.status == "failed":
         problem = make_failure(result.sha256 or source.files_digest, source.origins)
         return replace(result, acknowledged=result.acknowledged or is_acknowledged([problem], state))
-    if not (select_problems(result.findings)):
+    if result.run is None or not select_problems(result.findings):
         return result
-    row = state.runs[str(result.run_id), str(result.recipe_id)]
-    problems = find_problems(row)
-    told = {of.key for old in before.runs.values() if old.run_id == row.run_id for of in find_problems(old)}
+    problems = find_problems(result.run)
+    told = {of.key for old in before.find_rows(result.run.run_id) for of in find_problems(old)}
     return replace(result, known=all(of.key in told for of in problems), acknowledged=is_acknowledged(problems, state))
 
 

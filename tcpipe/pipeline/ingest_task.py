@@ -13,14 +13,13 @@ from typing import Literal, TypeVar
 from tcpipe import __version__
 from tcpipe.errors import TcpipeError, hide_secrets, plain_line
 from tcpipe.formats.index_files import RunFacts
-from tcpipe.formats.json_files import digest, recast
+from tcpipe.formats.json_files import digest
 from tcpipe.formats.recipe_toml import ingest_key
 from tcpipe.formats.run_documents import Manifest
 from tcpipe.pipeline.log_findings import find_failure
 from tcpipe.pipeline.log_sources import LogSource
 from tcpipe.pipeline.transience import is_transient
 from tcpipe.recipe import Recipe
-from tcpipe.tables.facts import EnergyBudget
 from tcpipe.tables.findings import Finding, select_problems
 from tcpipe.tables.verdicts import Verdict
 
@@ -69,20 +68,14 @@ class IngestResult:
 
     log: str
     status: Status
-    run_id: str | None = None
-    recipe_id: str | None = None
-    robot: str | None = None
-    segments: int = 0
-    distance_m: float = 0.0
-    kept_m: float = 0.0
-    energy_budget: EnergyBudget | None = None
-    """The noise floor of the labels' energy and its causes, as shares of their mean (`tcpipe.cost.budget`)."""
-    findings: tuple[Finding, ...] = ()
+    run: RunFacts | None = None
+    """What the log of the store has of its run; None of a log that waits, or failed."""
     verdict: Verdict | None = None
-    """None of a log that waits, or failed."""
+    """Of the run."""
+    causes: tuple[Finding, ...] = ()
+    """Of a log that failed: what went wrong."""
     problems: tuple[str, ...] = ()
-    """Why it failed."""
-    damage: tuple[str, ...] = ()
+    """Why it failed, as lines."""
     same_as: str | None = None
     """The log from which the same recording was ingested before, under another path; it is one run."""
     sha256: str | None = None
@@ -96,6 +89,11 @@ class IngestResult:
     """Whether a person has acknowledged what is wrong with it (`tcpipe acknowledge`)."""
     traceback: str | None = None
     """Where an internal error comes from."""
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """On the run, or on the log that failed."""
+        return self.run.findings if self.run else self.causes
 
     @property
     def is_news(self) -> bool:
@@ -114,9 +112,9 @@ class LogLine(IngestResult):
 
 def result_of(source: LogSource, status: Status, made: RunFacts, sha256: str, *, same_as: str | None) -> IngestResult:
     """Return what became of a log whose run is in the store."""
-    trouble = "damaged" if made.damage else "empty" if made.is_empty else status
-    about = {"log": source.name, "status": trouble if status == "done" else status, "distance_m": made.driven_m}
-    return recast(made, IngestResult, **about, same_as=same_as, sha256=sha256)
+    if status == "done":
+        status = "damaged" if made.damage else "empty" if made.is_empty else status
+    return IngestResult(source.name, status, made, made.verdict, same_as=same_as, sha256=sha256)
 
 
 def too_young(task: IngestTask, now_ns: int | None = None) -> IngestResult | None:
@@ -132,7 +130,7 @@ def died(source: LogSource) -> IngestResult:
     """Return that the process which worked on a log is gone."""
     problem = f"{source.name}: its worker process died (killed, or out of memory); run it again"
     findings = find_failure(source.name, "WorkerDied")
-    return IngestResult(source.name, "failed", findings=findings, problems=(problem,), transient=True)
+    return IngestResult(source.name, "failed", causes=findings, problems=(problem,), transient=True)
 
 
 def told(task: IngestTask, act: Callable[[IngestTask], R]) -> R | IngestResult:
@@ -147,7 +145,7 @@ def told(task: IngestTask, act: Callable[[IngestTask], R]) -> R | IngestResult:
         return IngestResult(
             task.source.name,
             "failed",
-            findings=(*find_failure(task.source.name, type(error).__name__), *causes),
+            causes=(*find_failure(task.source.name, type(error).__name__), *causes),
             problems=problems,
             transient=is_transient(error) or not task.source.files,
             traceback=trace,

@@ -17,7 +17,7 @@ from tcpipe.formats.logs.joined import opened
 from tcpipe.formats.logs.log_file import belongs_to_a_log, logs_below
 from tcpipe.formats.logs.table_folders import table_files, table_folders
 from tcpipe.formats.object_storage import is_presigned, is_url, shown_path
-from tcpipe.formats.run_documents import Counts, LogOrigin
+from tcpipe.formats.run_documents import Counts, Ingestion, LogOrigin
 from tcpipe.formats.stored_runs import RunDirectory
 from tcpipe.pipeline.log_inspection import InspectedLog, inspect_log
 from tcpipe.pipeline.log_sources import remote_logs
@@ -42,25 +42,12 @@ class InspectedLogs:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Ingestion:
-    """A run under one recipe."""
-
-    run_id: str
-    recipe_id: str
-    robot: str
-    segments: int
-    distance_m: float
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class InspectedIngestion(Ingestion):
     """A run under one recipe: what became of it."""
 
     counts: Counts
-    ledger_m: Mapping[str, float]
     findings: tuple[Finding, ...]
     verdict: Verdict
-    damage: tuple[str, ...]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -78,9 +65,14 @@ class InspectedRun:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class StoredIngestion(Ingestion):
+class StoredIngestion:
     """A run under one recipe: its grades, and how much there is to say of it."""
 
+    run_id: str
+    recipe_id: str
+    robot: str
+    segments: int
+    driven_m: float
     position: Grade
     time: Grade
     energy: Grade
@@ -221,16 +213,7 @@ def _run(path: Path | str, store: Store, runs: list[RunDirectory]) -> InspectedR
         tags=known.tags if known else {},
         remarks=known.remarks if known else (),
         recipes=tuple(
-            recast(
-                _ingestion(run),
-                InspectedIngestion,
-                counts=run.manifest.counts,
-                ledger_m=run.manifest.ledger_m,
-                findings=run.manifest.info.report.findings,
-                verdict=run.manifest.verdict,
-                damage=run.manifest.damage,
-            )
-            for run in runs
+            recast(run.manifest, InspectedIngestion, findings=run.manifest.info.report.findings) for run in runs
         ),
     )
 
@@ -249,18 +232,6 @@ def _store(store: Store) -> InspectedStore:
 
 
 def _stored(run: RunDirectory) -> StoredIngestion:
-    facts = run.facts
-    verdict = facts.verdict
+    facts, verdict = run.facts, run.facts.verdict
     grades = {name: getattr(verdict, name) for name in AFFECTED}
-    counts = {"findings": len(facts.findings), "damage": len(facts.damage)}
-    return recast(_ingestion(run), StoredIngestion, **grades, **counts)
-
-
-def _ingestion(run: RunDirectory) -> Ingestion:
-    return Ingestion(
-        run_id=run.run_id,
-        recipe_id=run.recipe_id,
-        robot=run.facts.robot,
-        segments=run.facts.segments,
-        distance_m=run.facts.driven_m,
-    )
+    return recast(facts, StoredIngestion, **grades, findings=len(facts.findings), damage=len(facts.damage))

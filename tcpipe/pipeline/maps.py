@@ -7,7 +7,7 @@ import logging
 import os
 import shlex
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Literal
 
@@ -21,16 +21,15 @@ from tcpipe.formats.maps.terrain_polygons import is_drawn
 from tcpipe.formats.maps.text import map_lines
 from tcpipe.formats.seals import file_checksum, seal_of
 from tcpipe.formats.store_mark import gone_if_empty
+from tcpipe.pipeline.add_map_options import AddMapOptions, Files
 from tcpipe.report.overview import quick_look, write_quick_look
 from tcpipe.store import Store, open_store
 from tcpipe.tables.levels import SAMPLES
+from tcpipe.tables.options import as_function
 from tcpipe.terrain.classes import ClassScheme
 from tcpipe.terrain.layers import wrong_name
 
 logger = logging.getLogger("tcpipe")
-
-Files = str | Path | Sequence[str | Path]
-"""A file, a pattern of files, or several of both."""
 
 _ROLES = ("height", "ortho", "terrain", "classes")
 _CLASSES = "classes"
@@ -56,65 +55,32 @@ class AddedMap:
         return plain_lines((head, *map_lines(self.map), *format_findings(self.map.findings, more=more)))
 
 
-def add_map(
-    name: str,
-    *,
-    height: Files,
-    ortho: Files | None = None,
-    terrain: Files | None = None,
-    layers: Mapping[str, Files] | None = None,
-    categorical: Mapping[str, str | Path | None] | None = None,
-    ortho_bands: OrthoBands = "grey",
-    classes: str | Path | None = None,
-    crs: str | None = None,
-    store: str | Path = "tcpipe-store",
-    force: bool = False,
-) -> AddedMap:
+def run_add_map(options: AddMapOptions) -> AddedMap:
     """Put rasters on one common grid and add them to the store as a Zarr group, with a quick look beside it.
 
     A second call with the same files and options does nothing.
-
-    Parameters
-    ----------
-    height, ortho, terrain
-        GeoTIFF, JPEG 2000 or ERDAS Imagine; the three need not share grid, resolution or CRS. Each is one file, a pattern such as
-        ``dem/*.tif`` (its files by name), or several of both: tiles of one grid, the last on top where they overlap. Terrain may also be
-        GeoJSON polygons whose property ``class`` is a class name, value or id.
-    layers
-        Other rasters of one band by the layer's name: numbers in a unit of their own, or classes.
-    categorical
-        Which of these are classes, with their class tables, as ``classes``; None: as the raster names its values.
-    ortho_bands
-        ``rgb`` keeps an orthophoto's colours as layers ``ortho_red``, ``ortho_green`` and ``ortho_blue`` beside its grey.
-    classes
-        CSV ``value,id,name,traversable`` or the same as TOML; None takes the store's, else the paper's seven classes. The first map with
-        terrain or classes sets the store's table; the others must have the same.
-    crs
-        Projected, metric CRS of the map (``EPSG:n``); None takes the height raster's, or its UTM zone.
-    force
-        Replace a map of that name that is made from something else.
 
     Raises
     ------
     MapError, StoreError
         When a raster cannot be placed, the classes are not the store's, or the store cannot be written: the store is as it was.
     """
-    given = {"height": height, "ortho": ortho, "terrain": terrain, "classes": classes}
-    layers, categorical = layers or {}, categorical or {}
-    _refuse_layers(layers, categorical, ortho=bool(ortho), ortho_bands=ortho_bands)
+    name, layers, categorical = options.name, options.layers or {}, options.categorical or {}
+    _refuse_layers(layers, categorical, ortho=bool(options.ortho), ortho_bands=options.ortho_bands)
+    given = {role: getattr(options, role) for role in _ROLES}
     tables = {f"{name} {_CLASSES}": table for name, table in categorical.items() if table}
     files = _found({role: value for role, value in {**given, **layers, **tables}.items() if value})
-    with gone_if_empty(store):
-        opened = open_store(store, create=True)
+    bands = None if options.ortho_bands == "grey" else options.ortho_bands
+    with gone_if_empty(options.store):
+        opened = open_store(options.store, create=True)
         before = opened.map_number(name)
-        kinds = MapInputs({}, crs, tuple(sorted(categorical)), None if ortho_bands == "grey" else ortho_bands)
-        inputs = replace(kinds, files=_checksums(files))
+        inputs = MapInputs(_checksums(files), options.crs, tuple(sorted(categorical)), bands)
         more = MoreLayers(
             {name: files[name] for name in layers},
             {name: files[f"{name} {_CLASSES}"][0] if table else None for name, table in categorical.items()},
-            ortho_bands,
+            options.ortho_bands,
         )
-        if before and not force:
+        if before and not options.force:
             return _unchanged(opened, name, inputs)
         try:
             with opened.new_map(name, after=before) as path:
@@ -127,7 +93,7 @@ def add_map(
                     more=more,
                     classes=files["classes"][0] if "classes" in files else None,
                     agreed=_agreed(opened, name),
-                    crs=crs,
+                    crs=options.crs,
                     inputs=inputs,
                 )
                 write_quick_look(path.with_suffix(".png"), quick_look(open_map(path)), seal_of(path))
@@ -136,6 +102,10 @@ def add_map(
                 raise
             return _unchanged(opened, name, inputs)  # another process was faster, or its own answer was lost
         return _added(opened, name, "done")
+
+
+add_map = as_function(AddMapOptions, run_add_map)
+"""`tcpipe.add_map`: its keywords are the fields of `AddMapOptions`."""
 
 
 def _refuse_layers(

@@ -8,7 +8,7 @@ and one that is done does nothing.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from itertools import chain
 from pathlib import Path
 from typing import Any, TypeVar
@@ -29,6 +29,7 @@ from tcpipe.formats.run_documents import Manifest, RunJson, StoreDocument
 from tcpipe.formats.seals import sealed
 from tcpipe.formats.store_mark import MARK, is_outdated, layout_of
 from tcpipe.pipeline.log_writer import is_committed, open_log
+from tcpipe.recipe import SplitConfig
 from tcpipe.store import Store
 from tcpipe.tables.findings import Finding, Subject, SubjectKind, make_finding
 from tcpipe.tables.levels import DATA_MODEL_VERSION, EARLIER_VERSIONS
@@ -207,6 +208,8 @@ def _bring_document(found: Document, where: str) -> Document:
         findings = _earlier(own, "dataset", str(found.get("name", "")))
         document |= {"findings": findings, "runs": [_with_findings(run, "run", run["run_id"]) for run in found["runs"]]}
         document |= {"maps": [_with_findings(of, "map", of["name"]) for of in found["maps"]]}
+        rules = {of.name for of in fields(SplitConfig)} - {"buffer_m"}  # the recipe has them
+        document |= {"split": _without(found.get("split", {}), *rules)}
     return {**document, "verdict": plain(judge(typed(findings, tuple[Finding, ...], where)))}
 
 

@@ -31,7 +31,7 @@ from tcpipe.stages.read import read_run
 from tcpipe.stages.read_roles import find_read_config, roles_by
 from tcpipe.tables.catalogue import threshold
 from tcpipe.tables.columns import integers
-from tcpipe.tables.facts import NOTHING_FOUND, EnergyBudget, RunFacts
+from tcpipe.tables.facts import NOTHING_FOUND, EnergyBudget, StageFacts
 from tcpipe.tables.findings import Finding, Subject, make_finding, sort_findings
 from tcpipe.tables.levels import LabelledSegments
 from tcpipe.tables.verdicts import Verdict, judge
@@ -260,7 +260,7 @@ def _hourly_std(start_ns: NDArray[np.int64], span_s: float) -> float | None:
     return float(3600.0 / span_s * math.sqrt(windows) * counts.std(ddof=1))
 
 
-def _topics(facts: RunFacts, span_s: float) -> Iterator[RoleTopic]:
+def _topics(facts: StageFacts, span_s: float) -> Iterator[RoleTopic]:
     for role, of in facts.roles.items():
         for name, topic in of.topics.items():
             whole = (topic.rate_hz or 0.0) * span_s

@@ -33,9 +33,9 @@ from tcpipe.formats.json_files import plain
 from tcpipe.formats.parquet import read_table
 from tcpipe.formats.recipe_toml import recipe_id
 from tcpipe.formats.seals import broken_checksums, broken_seal
+from tcpipe.motion.remedies import KEPT
 from tcpipe.pipeline.dataset.card import CARD_COLUMNS, measured
 from tcpipe.pipeline.dataset.redaction import what_is_told
-from tcpipe.pipeline.dataset.segments import KEPT
 from tcpipe.store import is_named_after
 from tcpipe.tables.columns import floats
 from tcpipe.tables.levels import DATA_MODEL_VERSION, READ_VERSIONS

@@ -30,7 +30,7 @@ from tcpipe.formats.run_documents import Manifest, MapDocument, RunJson
 from tcpipe.formats.seals import CHECKSUMS, Checksum, broken_checksums, broken_seal_in, read_checksums, wrong_checksum
 from tcpipe.formats.store_mark import MARK, SPOOL
 from tcpipe.formats.stored_runs import RunDirectory
-from tcpipe.pipeline.dataset.segments import KEPT
+from tcpipe.motion.remedies import KEPT
 from tcpipe.report.overview import shows_map
 from tcpipe.store import Store
 from tcpipe.tables.columns import floats, integers

@@ -39,7 +39,7 @@ def grid_over(source: MapReader, step_m: float) -> MapGrid:
     grid = source.grid
     cells = [int(size * grid.pitch_m / step_m + 1e-6) for size in (grid.rows, grid.cols)]
     if min(cells) < 1:
-        raise MapError(f"map {source.name}: is smaller than one cell of {step_m:g} m; choose a smaller --step")
+        raise MapError(f"map {source.name}: is smaller than one cell of {step_m:g} m; choose a smaller --cell-size")
     return MapGrid(grid.crs, grid.x_min_m, grid.y_max_m, step_m, cells[0], cells[1])
 
 

@@ -1,4 +1,4 @@
-"""The options of ``tcpipe predict-path`` and ``tcpipe plan-path``, and of the functions of the same names."""
+"""The options of ``tcpipe predict-path``, ``tcpipe plan-path`` and ``tcpipe cost-map``, and of the functions of these names."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from tcpipe.tables.options import MAP, MODEL, PHYSICS, SPEED, STORE, Option, Range, option, required
+from tcpipe.tables.options import CLUSTER, MAP, MODEL, PHYSICS, SPEED, STORE, Option, Range, option, required
 
 if TYPE_CHECKING:
     from tcpipe.planning.plan import Objective
@@ -50,11 +50,48 @@ class PlanPathOptions:
         Option("A cost map of this model and map; without one only what is needed is predicted.", (), "sealed", "DIR"),
     )
     step_m: float = option(
-        1.0, Option("Side of a cell; that of --cost-map rules.", ("--step",), Range(0.05, 1000.0), "METRES")
+        1.0,
+        Option(
+            "Side of a cell; that of --cost-map rules.",
+            ("--cell-size",),
+            Range(0.05, 1000.0),
+            "METRES",
+            earlier="--step",
+        ),
     )
-    allow_unseen: bool = option(False, Option("Also cross ground unlike any that the model was trained on."))
+    allow_unseen: bool = option(
+        False,
+        Option(
+            "Also cross ground unlike any that the model was trained on.",
+            ("--allow-extrapolation",), earlier="--allow-unseen",
+        ),
+    )  # fmt: skip
     physics: str | Path | None = option(None, PHYSICS)
     speed_mps: float | None = option(None, SPEED)
     store: str | Path = option("tcpipe-store", STORE)
     on_step: Callable[[int, int], None] | None = None
     """Called with how many blocks of how many are done, in each round of the search."""
+
+
+@dataclass(frozen=True, slots=True)
+class CostMapOptions:
+    """Of which map the costs are predicted, with which model, and how finely."""
+
+    model: str = required(MODEL)
+    out: str = option("cost-map", Option(kind="published", metavar="[OUT]", is_argument=True))
+    _: KW_ONLY
+    map_name: str | None = option(None, MAP)
+    step_m: float = option(
+        1.0, Option("Side of a cell.", ("--cell-size",), Range(0.05, 1000.0), "METRES", earlier="--step")
+    )
+    origin_deg: tuple[float, float] | None = option(
+        None,
+        Option(
+            "Where the Nav2 maps' frame begins, as navsat_transform's datum (default: where the map's CRS does).",
+            ("--origin",),
+            "lonlat",
+        ),
+    )
+    speed_mps: float | None = option(None, SPEED)
+    store: str = option("tcpipe-store", STORE)
+    cluster: str | None = option(None, CLUSTER)

@@ -167,7 +167,9 @@ class _Search:
             )
         elif len(set(self._cells.tolist())) == 1:
             pitch_m = self.survey.costs.grid.pitch_m
-            problems.append(f"{labels[0]} and {labels[1]} lie in one cell of {pitch_m:g} m; choose a smaller --step")
+            problems.append(
+                f"{labels[0]} and {labels[1]} lie in one cell of {pitch_m:g} m; choose a smaller --cell-size"
+            )
         if problems:
             raise PathError(*problems)
 
@@ -179,7 +181,9 @@ class _Search:
             if own.all():
                 common = int(np.bitwise_and.reduce(own)) or int(np.bitwise_or.reduce(own))
                 words = ", ".join(name.replace("_", " ") for name in names_of(common, Reason))
-                hint = "" if self.allow_unseen or common & BARRED else ", or cross such ground with --allow-unseen"
+                hint = (
+                    "" if self.allow_unseen or common & BARRED else ", or cross such ground with --allow-extrapolation"
+                )
                 problems.append(
                     f"{label}: no course can be driven from there on map {self.survey.source.name} ({words}); choose another point{hint}"
                 )
@@ -296,5 +300,7 @@ class _Search:
         if not self.allow_unseen:
             other = _Search(self.survey, self.ends_xy_m, self.ends_deg, allow_unseen=True, step=self.step)
             if other._found("distance", self.survey.judged) is not None:
-                return f"{text} but over ground unlike any that the model was trained on; --allow-unseen crosses it"
+                return (
+                    f"{text} but over ground unlike any that the model was trained on; --allow-extrapolation crosses it"
+                )
         return f"{text}: what lies between cannot be driven over, or has no data"

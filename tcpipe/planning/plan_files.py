@@ -103,7 +103,9 @@ class PlanResult:
         lines = [f"least {name}: {cost_text(plan)}" for name, plan in self.plans.items()]
         lines += [f"warning: {count} pieces: {name.replace('_', ' ')}" for name, count in first.reasons.items()]
         if not first.complete:
-            lines.append("warning: cells are so large that ground without a cost lies between; choose a smaller --step")
+            lines.append(
+                "warning: cells are so large that ground without a cost lies between; choose a smaller --cell-size"
+            )
         lines += _beaten(self.plans)
         if first.negative_steps:
             lines.append(
@@ -122,7 +124,7 @@ def _beaten(plans: Mapping[Objective, PlanTotals]) -> list[str]:
     if not asked.complete or taken[least] >= _AS_MUCH * taken[objective]:
         return []
     told = f"warning: the path of least {least} takes less {objective} than this one ({taken[least]:.0f} {unit}): "
-    return [told + "metre by metre the ground is not as its cells tell; choose a smaller --step"]
+    return [told + "metre by metre the ground is not as its cells tell; choose a smaller --cell-size"]
 
 
 def plan(

@@ -293,13 +293,14 @@ def _table_sections(card: DatasetCard, hrefs: Mapping[str, str]) -> list[Section
 
 def _provenance(card: DatasetCard) -> Section:
     """Return what the dataset is made from: enough to make it again."""
+    rules = card.recipe.split
     rows = [
         ("made by", f"tcpipe {card.tcpipe_version}, data model {card.data_model_version}, {card.format} format"),
         ("inputs", card.inputs),
         ("recipe of ingest", ", ".join(sorted({run.recipe_id for run in card.runs}))),
         (
             "split",
-            f"held out by {card.split.holdout}, test fraction {card.split.test_fraction:g}, seed {card.split.seed}",
+            f"held out by {rules.holdout}, test fraction {rules.test_fraction:g}, seed {rules.seed}",
         ),
         ("patches", f"{card.patch_m:g} m, {card.patch_px} px: {', '.join(card.layers)}"),
         *(

@@ -15,7 +15,7 @@ from tcpipe.report.run_series import Floats, Series, Spans, Timeline, thinned
 from tcpipe.tables.arrays import texts
 from tcpipe.tables.bits import DropReason, name_of
 from tcpipe.tables.columns import floats, integers
-from tcpipe.tables.facts import RunFacts
+from tcpipe.tables.facts import StageFacts
 
 REASON_WORDS = {
     DropReason.GAP: "no usable motion or power here: a gap of a sensor, a jump, or a position that is too uncertain",
@@ -89,7 +89,7 @@ class TimePlots:
 
 
 def time_plots(
-    timeline: Timeline, *, lines: Sequence[Line], spans: Spans, facts: RunFacts, refused: pa.Table, labels: bool
+    timeline: Timeline, *, lines: Sequence[Line], spans: Spans, facts: StageFacts, refused: pa.Table, labels: bool
 ) -> TimePlots:
     """Return the plots; ``labels`` is whether the run has segments."""
     first = _gates(timeline, spans, facts)
@@ -143,7 +143,7 @@ def _panel(
     return plot
 
 
-def _gates(timeline: Timeline, spans: Spans, facts: RunFacts) -> Plot:
+def _gates(timeline: Timeline, spans: Spans, facts: StageFacts) -> Plot:
     """Return the plot of what is kept and why the rest is not, and of what was found at a time; its axis is everyone's."""
     found = list(_events(timeline, facts))
     there = [bit for bit in DropReason if (spans.bits & int(bit)).any()]
@@ -174,7 +174,7 @@ def _gates(timeline: Timeline, spans: Spans, facts: RunFacts) -> Plot:
     return plot
 
 
-def _events(timeline: Timeline, facts: RunFacts) -> Iterator[tuple[str, float, float, str]]:
+def _events(timeline: Timeline, facts: StageFacts) -> Iterator[tuple[str, float, float, str]]:
     """Yield what has a time: its row, beginning and end [s], and what is to be said."""
     for each in facts.audit.disagreements if facts.audit else ():
         role = each.sensor.replace("_", " ")
@@ -233,7 +233,7 @@ def _allowed(ratio: Floats) -> Floats:
     return np.sqrt(np.where(np.isfinite(ratio), ratio, 1.0))
 
 
-def _clocks(timeline: Timeline, first: Plot, facts: RunFacts) -> Iterator[Plot]:
+def _clocks(timeline: Timeline, first: Plot, facts: StageFacts) -> Iterator[Plot]:
     """Yield how late sensors' stamps are over the run, pair by pair, where that is determined."""
     found = facts.clock_offsets
     start_s = {each.number: each.start_s for each in timeline.epochs}

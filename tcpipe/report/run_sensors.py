@@ -10,7 +10,7 @@ import pyarrow as pa
 from tcpipe.formats.finding_lines import describe_remedy
 from tcpipe.formats.run_documents import Counts, Manifest, RunJson
 from tcpipe.report.page import Section
-from tcpipe.tables.facts import ClockOffset, RunFacts
+from tcpipe.tables.facts import ClockOffset, StageFacts
 from tcpipe.tables.findings import Finding, select_findings
 
 
@@ -42,7 +42,7 @@ def _topics(known: RunJson, counts: Counts) -> Section:
     return Section("Sensors", "Which topic played which role.", header=header, rows=rows)
 
 
-def _trust(facts: RunFacts, rejections: pa.Table) -> list[Section]:
+def _trust(facts: StageFacts, rejections: pa.Table) -> list[Section]:
     """Return how many measurements each sensor gave, how many were refused and why, and how well the rest fitted."""
     counts, nis = (facts.fuse.measurements, facts.fuse.nis_mean) if facts.fuse else ({}, {})
     lost = Counter(zip(rejections.column("role").to_pylist(), rejections.column("reason").to_pylist(), strict=True))
@@ -68,7 +68,7 @@ def _trust(facts: RunFacts, rejections: pa.Table) -> list[Section]:
     return [Section("How far each sensor was believed", text, header=header, rows=rows)]
 
 
-def _disagreements(facts: RunFacts) -> list[Section]:
+def _disagreements(facts: StageFacts) -> list[Section]:
     """Return when sensors and track disagree, by what and how much; where they never do, nothing."""
     found = facts.audit.disagreements if facts.audit else ()
     if not found:
@@ -90,7 +90,7 @@ def _disagreements(facts: RunFacts) -> list[Section]:
     return [Section("Where sensors disagree with the track", text, header=header, rows=rows)]
 
 
-def _clocks(facts: RunFacts, findings: Sequence[Finding]) -> list[Section]:
+def _clocks(facts: StageFacts, findings: Sequence[Finding]) -> list[Section]:
     """Return how late each sensor's stamps are; where nothing could be compared, nothing."""
     found = facts.clock_offsets
     steps = [f"{step.step_s:+.3f} s at log time {step.log_time_ns} ns" for step in facts.clock_steps]

@@ -13,7 +13,7 @@ from tcpipe.logs.simulated_clock import LOG_CLOCK
 from tcpipe.power.readings import PowerReadings
 from tcpipe.stages.read_sources import TopicReadings
 from tcpipe.tables.catalogue import Severity, threshold
-from tcpipe.tables.facts import ClockStep, PowerSign, RobotChoice, RoleFacts, RunFacts, TopicClock, TopicFacts
+from tcpipe.tables.facts import ClockStep, PowerSign, RobotChoice, RoleFacts, StageFacts, TopicClock, TopicFacts
 from tcpipe.tables.findings import Finding, StageReport, Subject, make_finding
 from tcpipe.tables.levels import Sensor
 
@@ -29,7 +29,7 @@ def read_findings(
     power: PowerReadings,
     sensors: Mapping[str, Sensor],
     offset_s: Mapping[str, float],
-) -> StageReport[RunFacts]:
+) -> StageReport[StageFacts]:
     """Return the findings and facts of a read log; ``offset_s`` [s] is what the recipe adds to a role's stamps."""
     timelines, steps = clocks.timelines, clocks.steps
     findings = [*assignment.findings, *power.findings]
@@ -41,7 +41,7 @@ def read_findings(
             findings += _find_clock(source, timelines[source.key], is_simulated=clocks.simulated is not None)
     start_ns = min((int(of.readings.log_time_ns[0]) for of in sources if len(of.readings.row)), default=0)
     findings += [_find_step(step, start_ns) for step in steps]
-    facts = RunFacts(
+    facts = StageFacts(
         robot=RobotChoice(assignment.robot, assignment.robot_why),
         roles={role: _role_facts(role, assignment, sources, timelines, sensors[role]) for role in sensors},
         left_out=assignment.left_out,

@@ -404,7 +404,7 @@ class LabelFacts:
 
 
 @dataclass(frozen=True, slots=True)
-class RunFacts:
+class StageFacts:
     """The facts of a run: those of reading, and under its name those of each stage that it has come through."""
 
     robot: RobotChoice | None = None
@@ -428,4 +428,4 @@ class RunFacts:
     label: LabelFacts | None = field(default=None, metadata=LEFT_OUT)
 
 
-NOTHING_FOUND = StageReport((), RunFacts())
+NOTHING_FOUND = StageReport((), StageFacts())

@@ -28,7 +28,7 @@ import pyarrow as pa
 from tcpipe.errors import TableError
 from tcpipe.tables.bits import DropReason, Quality
 from tcpipe.tables.columns import Column, TableSchema
-from tcpipe.tables.facts import NOTHING_FOUND, RunFacts
+from tcpipe.tables.facts import NOTHING_FOUND, StageFacts
 from tcpipe.tables.findings import Finding, StageReport
 from tcpipe.tables.segment_columns import LINE_COLUMN, MOTION_COLUMNS, POINT_COLUMN, STANDING_COLUMNS
 
@@ -384,7 +384,7 @@ class Streams:
     gnss_crs: str = "EPSG:4326"
     power_averaged: bool = False
     """The source averages power over its message period (right-endpoint rectangle) rather than sampling it."""
-    report: StageReport[RunFacts] = NOTHING_FOUND
+    report: StageReport[StageFacts] = NOTHING_FOUND
 
     def __post_init__(self) -> None:
         """Check every table against its role's schema."""
@@ -418,7 +418,7 @@ class TrackInfo:
     datum: Datum | None
     rate_hz: float
     estimator: str
-    report: StageReport[RunFacts] = NOTHING_FOUND
+    report: StageReport[StageFacts] = NOTHING_FOUND
 
 
 @dataclass(frozen=True, slots=True)
@@ -473,7 +473,7 @@ class LabelledSegments:
         LABELLED_SEGMENTS.check(self.table)
 
 
-def add_findings(info: TrackInfo, findings: Iterable[Finding], facts: RunFacts) -> TrackInfo:
+def add_findings(info: TrackInfo, findings: Iterable[Finding], facts: StageFacts) -> TrackInfo:
     """Return ``info`` with one more stage's findings, and the facts with that stage's."""
     return replace(info, report=StageReport((*info.report.findings, *findings), facts))
 

@@ -39,6 +39,8 @@ class Option:
     envvar: str | None = None
     repeatable: bool = False
     is_argument: bool = False
+    earlier: str = ""
+    """The flag of versions before 0.9: still read, and shown nowhere."""
 
 
 STORE = Option("Where runs and maps are kept (or TCPIPE_STORE).", (), "published", "DIR|URL", envvar="TCPIPE_STORE")
@@ -56,10 +58,14 @@ MESSAGE_DEFINITIONS = Option(
 MAP = Option("Map to look at (default: the only one in the store).", ("--map",), "map", "NAME")
 MODEL = Option(kind="sealed", metavar="MODEL", is_argument=True)
 PHYSICS = Option(
-    "Dataset whose card says what turning costs the robot (default: the one that MODEL was trained on).", (), "sealed", "DATASET"
-)  # fmt: skip
+    "Dataset whose card says what turning costs the robot (default: the one that MODEL was trained on).",
+    ("--physics-from",),
+    "sealed",
+    "DATASET",
+    earlier="--physics",
+)
 SPEED = Option(
-    "Commanded speed, for a model trained with --beside (default: the mean of its training).",
+    "Commanded speed, for a model trained with --extra-features (default: the mean of its training).",
     ("--speed",),
     Range(0.0, 100.0, is_open=True),
     "MPS",

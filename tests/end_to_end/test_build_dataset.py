@@ -175,7 +175,7 @@ def test_a_second_identical_call_does_nothing_and_says_so(built):
     again = build_dataset(directory / "zarr", store=store.root, split=region, recipe=Recipe())
     assert again.status == "unchanged"
     assert "nothing to do" in str(again)
-    assert again.splits == results["zarr"].splits
+    assert again.card.splits == results["zarr"].card.splits
     assert {path: path.stat().st_mtime_ns for path in (directory / "zarr").rglob("*")} == before
 
 

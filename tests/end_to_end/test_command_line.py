@@ -238,7 +238,7 @@ def test_json_is_an_object_a_log_and_one_of_all_and_quiet_says_only_what_is_news
         of_all = told(done)
         assert [result["status"] for result in of_all["results"]] == status
         assert (of_all["exit_code"], of_all["recipe"]) == (code, "built-in defaults")
-        assert of_all["results"][0]["damage"]
+        assert of_all["results"][0]["run"]["damage"]
         assert "junk.bag" in of_all["results"][1]["problems"][0]
         assert [result["known"] for result in of_all["results"]] == [code == 0, code == 0, False]
         lines = done.stderr.splitlines()
@@ -297,7 +297,9 @@ def test_one_recording_is_one_run_under_any_name(log: Path, tmp_path: Path) -> N
     done = tcpipe("ingest", "logs", log, log, "--jobs", "2", "--json", cwd=tmp_path)
     results = told(done)["results"]
     assert Counter(result["status"] for result in results) == {"done": 1, "unchanged": 4, "failed": 1}
-    assert {result["run_id"] for result in results if result["status"] != "failed"} == {results[0]["run_id"]}
+    assert {result["run"]["run_id"] for result in results if result["status"] != "failed"} == {
+        results[0]["run"]["run_id"]
+    }
     assert sum(result["same_as"] is not None for result in results) == 4
     assert f"dangling.mcap: is a link to {tmp_path / 'nowhere.mcap'}, which is not there" in done.stderr
     assert done.returncode == 3

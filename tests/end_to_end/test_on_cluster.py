@@ -68,7 +68,7 @@ def test_workers_make_the_cost_map_that_this_machine_makes(tmp_path):
     small_store(tmp_path)
     build_dataset(tmp_path / "dataset", store=tmp_path / "store")
     train(tmp_path / "dataset", tmp_path / "model", config=FitConfig(model="physics"))
-    how = ("--store", "store", "--step", "4", "--quiet")
+    how = ("--store", "store", "--cell-size", "4", "--quiet")
     with dask_cluster(tmp_path) as cluster:
         far = tcpipe("cost-map", "model", "far", *how, "--cluster", cluster.address, cwd=tmp_path)
     near = tcpipe("cost-map", "model", "near", *how, cwd=tmp_path)

@@ -69,14 +69,14 @@ def segments(store, result):
 
 
 def run_of(store, result):
-    return next(run for run in Store(store).recipes_of(result.run_id) if run.recipe_id == result.recipe_id)
+    return next(run for run in Store(store).recipes_of(result.run.run_id) if run.recipe_id == result.run.recipe_id)
 
 
 def test_its_energy_is_that_of_the_same_drive_in_known_messages(drive, tmp_path):
     log, battery, recipe = drive
     (known,) = ingest([log], store=tmp_path / "store", recipe=Recipe(), robot="husky").results
     (ours,) = ingest([log, battery], store=tmp_path / "store", recipe=recipe, as_one=True).results
-    assert (ours.status, ours.robot) == ("done", "scout")
+    assert (ours.status, ours.run.robot) == ("done", "scout")
     report = run_of(tmp_path / "store", ours).manifest.info.report
     assert not [of for of in report.findings if of.subject.name == "power"]
     one, other = (segments(tmp_path / "store", result) for result in (known, ours))
@@ -100,7 +100,7 @@ def test_another_voltage_range_is_another_run(drive, tmp_path):
     both = [
         ingest([log, battery], store=tmp_path / "store", recipe=of, as_one=True).results[0] for of in (recipe, narrow)
     ]
-    assert both[0].recipe_id != both[1].recipe_id
+    assert both[0].run.recipe_id != both[1].run.recipe_id
     flagged = [
         segments(tmp_path / "store", result)["quality"].to_numpy() & np.uint32(Quality.VOLTAGE_OUT_OF_RANGE)
         for result in both

@@ -55,7 +55,7 @@ def test_a_path_is_costed_and_its_pieces_add_up(place: Path):
 
 
 def test_a_plan_over_a_cost_map_costs_what_predict_path_says_of_it(place: Path):
-    assert "cells with a cost" in _run("cost-map", "model", "costs", "--step", "2", cwd=place)
+    assert "cells with a cost" in _run("cost-map", "model", "costs", "--cell-size", "2", cwd=place)
     plan = ("plan-path", "model", "--from", _FROM, "--to", _TO, "--objective", "time", "--cost-map", "costs")
     outputs = ("--out", "plan.geojson", "--picture", "plan.png")
     said = json.loads(_run(*plan, *outputs, "--json", cwd=place))
@@ -81,7 +81,7 @@ def test_a_plan_over_a_cost_map_costs_what_predict_path_says_of_it(place: Path):
         (("plan-path", "model", "--from", "15.0,nan", "--to", _TO), 2, "wanted LON,LAT"),
         (("plan-path", "model", "--from", _FROM, "--to", "200,46.9"), 1, "no lon, lat"),
         (("cost-map", "model", "--map", "other"), 1, "no map 'other'"),
-        (("cost-map", "model", "--step", "0"), 2, "--step"),
+        (("cost-map", "model", "--cell-size", "0"), 2, "--cell-size"),
     ],
 )
 def test_bad_input_is_one_line(place: Path, arguments, code, words):

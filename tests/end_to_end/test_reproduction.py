@@ -102,7 +102,9 @@ def test_train_and_evaluate_by_hand(reproduced):
     trained = tcpipe("train", "here/dataset", "model", "--width", "16", "--epochs", "1", cwd=here, env=ENV)
     assert trained.returncode == 0, trained.stderr
     assert "% of the time feeding" in trained.stdout
-    done = tcpipe("evaluate", "model", "here/dataset", "--no-baselines", "--draws", "1", "--json", cwd=here, env=ENV)
+    done = tcpipe(
+        "evaluate", "model", "here/dataset", "--no-baselines", "--noise-draws", "1", "--json", cwd=here, env=ENV
+    )
     assert set(json.loads(done.stdout)["splits"]) == {"test", "unseen"}
     page = (here / "evaluation" / "evaluation.html").read_text()
     assert "The data are simulated" not in page  # a dataset does not say so of itself
@@ -111,7 +113,7 @@ def test_train_and_evaluate_by_hand(reproduced):
 def test_an_interrupted_training_ends_as_one_that_is_not(reproduced, tmp_path):
     """Ctrl-C in the second epoch, then the same command again: the model is the same, byte for byte."""
     here, _ = reproduced
-    options = ("train", here / "here" / "dataset", "--width", "16", "--epochs", "3", "--batch", "16")
+    options = ("train", here / "here" / "dataset", "--width", "16", "--epochs", "3", "--batch-size", "16")
     with subprocess.Popen(
         [COMMAND, *options, "stopped"], cwd=tmp_path, env={**os.environ, **ENV}, stderr=subprocess.PIPE, text=True
     ) as running:

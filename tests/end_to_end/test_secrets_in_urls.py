@@ -120,7 +120,9 @@ def test_a_signature_is_in_nothing_that_is_written_or_printed(site, tmp_path):
         run("inspect", path)
     assert [result["status"] for result in first] == ["failed", "failed", "done"]
     assert first[2]["log"] == url
-    assert [(result["status"], result["run_id"]) for result in again] == [("unchanged", first[2]["run_id"])]
+    assert [(result["status"], result["run"]["run_id"]) for result in again] == [
+        ("unchanged", first[2]["run"]["run_id"])
+    ]
     assert len(Store(tmp_path / "tcpipe-store").run_ids()) == 1
     secrets = ("5ecretS1gnature", OTHER, "wr0ngS1gnature", "X-Amz-Signature")
     assert_hidden(printed, *secrets[:3])

@@ -77,7 +77,7 @@ def test_a_sample_is_traced_to_its_log_and_made_again_bit_for_bit(work, ids):
     assert found["differences"] == []
     facts, gnss = found["facts"], found["facts"]["messages"]["gnss"]
     assert facts["sample"]["start_ns"] <= gnss["first_ns"] <= gnss["last_ns"] < facts["sample"]["end_ns"]
-    assert facts["log"]["paths"][0].endswith(".mcap")
+    assert facts["source"]["paths"][0].endswith(".mcap")
 
 
 def test_an_overlay_lies_on_its_logs_clock_and_on_its_segments(work):

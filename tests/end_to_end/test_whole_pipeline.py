@@ -259,8 +259,8 @@ def test_a_damaged_log_costs_only_itself(demo: Demo, tmp_path: Path) -> None:
     assert done.returncode == 3, done.stderr
     results = told(done)["results"]
     assert [result["status"] for result in results] == ["damaged", "failed", "done"]
-    assert results[0]["segments"] > 50
-    assert "broken.mcap" in results[0]["damage"][0]
+    assert results[0]["run"]["segments"] > 50
+    assert "broken.mcap" in results[0]["run"]["damage"][0]
     assert "garbage.bag" in results[1]["problems"][0]
 
 

@@ -70,7 +70,7 @@ def test_one_name_is_one_set_of_bytes_whatever_the_other_sections_say(log, tmp_p
         store = tmp_path / recipe.dataset.name
         (result,) = ingest([log], store=store, recipe=recipe).results
         assert result.status in {"done", "empty"}
-        run = store / "runs" / result.run_id
+        run = store / "runs" / result.run.run_id
         found.append({path.relative_to(run): path.read_bytes() for path in run.rglob("*") if path.is_file()})
     assert len(found[0]) > 5
     assert found[0] == found[1]

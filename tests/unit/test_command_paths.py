@@ -188,7 +188,9 @@ def test_functions_refuse_the_same_also_where_a_path_was_made_of_the_url(here, n
     assert not (here / "s3:").exists()
 
 
-@pytest.mark.parametrize("option", ["cost-map m --step nan", "cost-map m --step inf", "train d --learning-rate nan"])
+@pytest.mark.parametrize(
+    "option", ["cost-map m --cell-size nan", "cost-map m --cell-size inf", "train d --learning-rate nan"]
+)
 def test_no_number_is_nan(here, option):
     (here / "m").mkdir()
     (here / "d").mkdir()

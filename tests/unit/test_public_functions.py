@@ -131,7 +131,7 @@ def test_the_functions_give_what_the_commands_print(place, monkeypatch):
 
     found = tcpipe.evaluate("model", "dataset", draws=2, baselines=False)
     assert found.values.config == EvaluateConfig(draws=2, baselines=False)
-    said = _said(here, "evaluate", "model", "dataset", "again", "--draws", "2", "--no-baselines")
+    said = _said(here, "evaluate", "model", "dataset", "again", "--noise-draws", "2", "--no-baselines")
     assert said["splits"]["test"]["errors"]["E"]["all"]["rmse"] == found.values.splits["test"].errors["E"]["all"].rmse
     drives = tcpipe.evaluate("model", "dataset", "drives", drives=["north"], store=store)
     (drive,) = drives.values.drives
@@ -143,7 +143,15 @@ def test_the_functions_give_what_the_commands_print(place, monkeypatch):
 
     start, goal = ends = lonlat([(-12.0, -5.0), (-2.0, -4.0)]).round(9).tolist()
     plan = tcpipe.plan_path("model", start, goal, objective="time", allow_unseen=True, store=store)
-    asked = ("--from", "{},{}".format(*start), "--to", "{},{}".format(*goal), "--objective", "time", "--allow-unseen")
+    asked = (
+        "--from",
+        "{},{}".format(*start),
+        "--to",
+        "{},{}".format(*goal),
+        "--objective",
+        "time",
+        "--allow-extrapolation",
+    )
     said = _said(here, "plan-path", "model", *asked, "--store", store, "--out", "again.geojson")
     assert plan.plans["time"].duration_s == pytest.approx(said["plans"]["time"]["duration_s"])
     assert plan.lonlat_deg[[0, -1]] == pytest.approx(np.array(ends), abs=1e-8)

@@ -7,7 +7,7 @@ import shlex
 import shutil
 from collections.abc import Container, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -21,7 +21,7 @@ from tcpipe.formats.bucket import open_place
 from tcpipe.formats.bucket_directories import fetch_directory_by_range, find_newest
 from tcpipe.formats.commits import Call, Dataset, Entries
 from tcpipe.formats.croissant import croissant
-from tcpipe.formats.dataset_card import DatasetCard, Doubtful, Redacted, group_dataset_findings
+from tcpipe.formats.dataset_card import DatasetCard, group_dataset_findings
 from tcpipe.formats.dataset_files import (
     CARD,
     CLASSES,
@@ -33,7 +33,6 @@ from tcpipe.formats.dataset_files import (
     REPORT,
     SAMPLES,
     SHARDS,
-    FileFormat,
     read_card,
     read_current_card,
     read_samples,
@@ -50,15 +49,15 @@ from tcpipe.formats.places import local_output
 from tcpipe.formats.recipe_toml import recipe_of
 from tcpipe.formats.seals import Checksum, file_checksum, file_checksums, sealed_page, write_sealed
 from tcpipe.formats.store_mark import SPOOL
+from tcpipe.motion.remedies import KEPT
 from tcpipe.pipeline.begun_calls import OpenCall, begun_call
 from tcpipe.pipeline.calls import BUILD, Estimate, estimate, measure_call, started
 from tcpipe.pipeline.dataset.added_columns import read_all_covariates
 from tcpipe.pipeline.dataset.balance import BALANCE_COLUMNS, measure_balance
 from tcpipe.pipeline.dataset.build_dataset_options import BuildDatasetOptions
-from tcpipe.pipeline.dataset.card import CARD_COLUMNS, VELOCITY_COLUMN, dataset_card, is_whole
-from tcpipe.pipeline.dataset.content import gather_content
-from tcpipe.pipeline.dataset.inputs import Inputs, choose_inputs, earlier_splits
-from tcpipe.pipeline.dataset.physics import PHYSICS_COLUMNS
+from tcpipe.pipeline.dataset.card import CARD_COLUMNS, PHYSICS_COLUMNS, VELOCITY_COLUMN, dataset_card, is_whole
+from tcpipe.pipeline.dataset.content import gather_content, write_patches
+from tcpipe.pipeline.dataset.inputs import BuildOptions, Inputs, choose_inputs, earlier_splits
 from tcpipe.pipeline.dataset.redaction import (
     redacted_card,
     redacted_content,
@@ -66,25 +65,19 @@ from tcpipe.pipeline.dataset.redaction import (
     redacted_inputs,
     redaction_of,
 )
-from tcpipe.pipeline.dataset.replacing import BuildOptions, find_other_options
+from tcpipe.pipeline.dataset.replacing import find_other_options
 from tcpipe.pipeline.dataset.runs import CHOICE_CODES, find_gone_runs
 from tcpipe.pipeline.dataset.sampling import Workers
-from tcpipe.pipeline.dataset.segments import KEPT
-from tcpipe.pipeline.dataset.writing import write_patches
 from tcpipe.pipeline.generations import read_generations, write_generation
 from tcpipe.pipeline.log_writer import LogWriter, open_log
 from tcpipe.recipe import Recipe
 from tcpipe.report.dataset_report import dataset_report
 from tcpipe.report.overview import class_overview, maps_overview, relief_overview, write_overview
 from tcpipe.splits.assignment import SPLITS
-from tcpipe.splits.audit import HeldOut
-from tcpipe.splits.regions import Regions
 from tcpipe.store import Store, open_store
-from tcpipe.tables.facts import EnergyBudget
-from tcpipe.tables.findings import LEFT_OUT, Finding, is_problem, select_problems
+from tcpipe.tables.findings import Finding, is_problem, select_problems
 from tcpipe.tables.levels import DATA_MODEL_VERSION, READ_VERSIONS
 from tcpipe.tables.options import as_function
-from tcpipe.tables.verdicts import Verdict
 
 logger = logging.getLogger("tcpipe")
 
@@ -97,24 +90,14 @@ class BuildResult:
     """Its directory, or its URL in a bucket."""
     status: str
     """``done``, ``unchanged``, or, of a dry run, ``planned``."""
-    samples: int
-    splits: Mapping[str, int]
-    ledger_m: Mapping[str, float]
-    audit: tuple[HeldOut, ...]
     findings: tuple[Finding, ...]
     """Of the dataset itself: runs that belong in and are left out and splits that are empty, too."""
-    findings_by_run: Mapping[str, tuple[Finding, ...]] = field(default_factory=dict, metadata=LEFT_OUT)
-    findings_by_map: Mapping[str, tuple[Finding, ...]] = field(default_factory=dict, metadata=LEFT_OUT)
-    verdict: Verdict | None = None
-    energy_budget: EnergyBudget | None = None
+    card: DatasetCard | None = None
+    """None of a dry run."""
     exit_code: int = 0
     """3 if the dataset is not what it should be."""
     recipe: str = ""
     """Which recipe ruled, as a command found it."""
-    doubtful: Doubtful | None = None
-    """How many samples carry a quality flag."""
-    redacted: bool = False
-    """Whether names and places are not told."""
     estimate: Estimate | None = None
     """What a dry run expects of the work: of all segments, as if each became a sample."""
 
@@ -132,28 +115,32 @@ class BuildResult:
 
     def _lines(self, *, problems: bool) -> list[str]:
         own = [finding for finding in self.findings if is_problem(finding) == problems]
-        by_run = dict.fromkeys(self.findings_by_run, ()) if problems else self.findings_by_run
-        groups = group_dataset_findings(own, by_run, {} if problems else self.findings_by_map)
+        by_run = self.card.findings_by_run if self.card else {}
+        by_map = self.card.findings_by_map if self.card and not problems else {}
+        groups = group_dataset_findings(own, dict.fromkeys(by_run, ()) if problems else by_run, by_map)
         return format_mixed_groups(groups, more=f"tcpipe inspect {shlex.quote(self.path)}")
 
     def _facts(self) -> list[str]:
-        if self.estimate is not None:
+        card = self.card
+        if card is None:
             return [f"{self.path}: would be made of at most {self.estimate}"]
-        counts = ", ".join(f"{self.splits[name]} {name}" for name in SPLITS)
-        head = f"{self.path}: {self.samples} samples ({counts})"
+        counts = ", ".join(f"{card.splits[name]} {name}" for name in SPLITS)
+        head = f"{self.path}: {card.samples} samples ({counts})"
         if self.status == "unchanged":
             head += "; nothing to do: it is made from the same runs, map, region and recipe"
-        lost = [(name, metres) for name, metres in self.ledger_m.items() if metres >= 0.5 and name != KEPT]
+        lost = [(name, metres) for name, metres in card.ledger_m.items() if metres >= 0.5 and name != KEPT]
         lost.sort(key=lambda entry: (-entry[1], entry[0]))
-        ledger = f"{sum(self.ledger_m.values()):.0f} m driven: {self.ledger_m[KEPT]:.0f} m in samples"
+        ledger = f"{sum(card.ledger_m.values()):.0f} m driven: {card.ledger_m[KEPT]:.0f} m in samples"
         ledger += "".join(f", {metres:.0f} m {name.replace('_', ' ')}" for name, metres in lost)
-        floor = [] if self.energy_budget is None else [in_words(self.energy_budget)]
-        judged = [] if self.verdict is None else [f"verdict: {format_verdict(self.verdict)}"]
+        floor = [] if card.energy_budget is None else [in_words(card.energy_budget)]
+        judged = [] if card.verdict is None else [f"verdict: {format_verdict(card.verdict)}"]
         return [head, ledger, *floor, *judged]
 
     def _closing(self) -> list[str]:
+        if self.card is None or self.card.redaction is None:
+            return []
         publish = f"to publish it: hf upload OWNER/NAME {shlex.quote(self.path)} . --repo-type dataset"
-        return [*Redacted().lines(), publish] if self.redacted else []
+        return [*self.card.redaction.lines(), publish]
 
 
 def run_build_dataset(options: BuildDatasetOptions) -> BuildResult:
@@ -177,20 +164,17 @@ def run_build_dataset(options: BuildDatasetOptions) -> BuildResult:
     covariates, map_name, keep_split = options.covariates, options.map_name, options.keep_split
     tables = (covariates,) if isinstance(covariates, str | Path) else tuple(covariates)
     earlier = None if keep_split is None else earlier_splits(keep_split)
+    keeps_own = keep_split is not None and _absolute(keep_split) == _absolute(place)
+    marks = BuildOptions(ruling, regions, tags, options.file_format, options.redact, earlier, keeps_own)
     inputs = choose_inputs(
         opened,
-        ruling,
+        marks,
         map_names=(map_name,) if isinstance(map_name, str) else tuple(map_name or ()),
         robot=robot,
-        tags=tags,
         region=region,
-        file_format=options.file_format,
-        earlier=earlier,
         covariates=read_all_covariates([Path(path) for path in tables], ruling.covariates),
     )
     inputs = replace(inputs, digest=digest(("redacted", inputs.digest))) if options.redact else inputs
-    keeps_own = keep_split is not None and _absolute(keep_split) == _absolute(place)
-    marks = BuildOptions(ruling, regions, tags, options.file_format, options.redact, keep_split is not None, keeps_own)
     left_out = _find_left_out(
         inputs,
         None if known is not None and known.redaction else known,
@@ -205,7 +189,7 @@ def run_build_dataset(options: BuildDatasetOptions) -> BuildResult:
         and known.inputs == inputs.digest
         and (isinstance(place, str) or is_whole(place, known))
     ):
-        card, result = known, _result(place, "unchanged", known, left_out)
+        result = _result(place, "unchanged", known, left_out)
     elif dry_run:
         _refuse_other_options(place, known, marks, inputs, force=options.force)
         if isinstance(place, str):
@@ -217,22 +201,12 @@ def run_build_dataset(options: BuildDatasetOptions) -> BuildResult:
         with begun_call(open_log(opened), BUILD, [_absolute(place)]) as call:
             at_work = partial(_workers, jobs=options.jobs, cluster=options.cluster)
             with whole as directory, at_work(directory, opened, inputs.digest) as workers:
-                card = _build(
-                    directory,
-                    inputs,
-                    ruling,
-                    regions,
-                    earlier,
-                    file_format=options.file_format,
-                    workers=workers,
-                    redact=options.redact,
-                    tags=marks.tags,
-                )
+                card = _build(directory, inputs, marks, workers)
                 _refuse_others_since(place, {known.inputs if known else None, inputs.digest})
             for entry in workers.waiting.entries():
                 workers.waiting.delete(entry.name)
             result = _result(place, "done", card, left_out)
-            counts = {"runs": len(inputs.runs), "samples": result.samples}
+            counts = {"runs": len(inputs.runs), "samples": card.samples}
             written = sum(of.size_bytes for of in card.checksums.values())
             took = Call(BUILD, __version__, result.exit_code, counts, options.jobs, written_bytes=written)
             _end(call, measure_call(watch, took), _describe_dataset(result, inputs), known)
@@ -274,7 +248,7 @@ def _planned(place: Path | str, store: Store, inputs: Inputs, *, jobs: int) -> B
     most = sum(run.facts.segments - int(inputs.again[run.run_id].sum()) for run in inputs.runs)
     expected = estimate(store.state().calls, BUILD, most, jobs=jobs)
     code = 3 if select_problems(inputs.findings) else 0
-    return BuildResult(str(place), "planned", most, {}, {}, (), inputs.findings, exit_code=code, estimate=expected)
+    return BuildResult(str(place), "planned", inputs.findings, exit_code=code, estimate=expected)
 
 
 def _end(opened: OpenCall, call: Call, dataset: Dataset, known: DatasetCard | None) -> None:
@@ -334,22 +308,7 @@ def _result(place: Path | str, status: str, card: DatasetCard, left_out: Sequenc
     """Return what became of a dataset: runs that are left out are those of now, whatever the card has of them."""
     lasting = (finding for finding in card.findings if finding.code not in CHOICE_CODES)
     findings = (*left_out, *lasting)
-    return BuildResult(
-        path=str(place),
-        status=status,
-        samples=card.samples,
-        splits={name: card.splits[name] for name in SPLITS},
-        ledger_m=card.ledger_m,
-        audit=card.split.audit,
-        findings=findings,
-        findings_by_run=card.findings_by_run,
-        findings_by_map=card.findings_by_map,
-        verdict=card.verdict,
-        energy_budget=card.energy_budget,
-        exit_code=3 if select_problems(findings) else 0,
-        doubtful=card.doubtful,
-        redacted=card.redaction is not None,
-    )
+    return BuildResult(str(place), status, findings, card, 3 if select_problems(findings) else 0)
 
 
 def _ruling(recipe: Recipe | str | Path | None, *, holdout: str | None, seed: int | None) -> Recipe:
@@ -412,30 +371,19 @@ def _workers(directory: Path, store: Store, inputs: str, *, jobs: int, cluster: 
         ) from None
 
 
-def _build(
-    directory: Path,
-    inputs: Inputs,
-    recipe: Recipe,
-    regions: Regions | None,
-    earlier: pa.Table | None,
-    *,
-    file_format: FileFormat,
-    workers: Workers,
-    redact: bool,
-    tags: Mapping[str, str],
-) -> DatasetCard:
+def _build(directory: Path, inputs: Inputs, options: BuildOptions, workers: Workers) -> DatasetCard:
     """Write the dataset into ``directory`` and return its card."""
-    waiting = directory / SPOOL
+    waiting, recipe = directory / SPOOL, options.recipe
     waiting.mkdir()
-    content = gather_content(waiting, inputs, recipe, regions, earlier, workers=workers)
-    redaction = redaction_of(content, inputs, recipe) if redact else None
+    content = gather_content(waiting, inputs, options, workers)
+    redaction = redaction_of(content, inputs, recipe) if options.redact else None
     if redaction is not None:
         content, inputs = redacted_content(content, redaction), redacted_inputs(inputs, redaction)
     logger.info("writing %d samples", len(content.samples))
     with parquet_rows(directory / SAMPLES, content.samples.schema) as write:
         for piece in content.samples.pieces(ROWS_PER_GROUP):
             write(piece)
-    shards = write_patches(directory, content, file_format, workers, compression=recipe.dataset.compression)
+    shards = write_patches(directory, content, options.file_format, workers, compression=recipe.dataset.compression)
     shutil.rmtree(waiting)
     _write_overviews(directory, content.sources)
     balance, drive_next = measure_balance(
@@ -444,21 +392,12 @@ def _build(
         content.sources,
         velocity_column=VELOCITY_COLUMN[recipe.label.velocity],
         chord_m=recipe.segment.chord_m,
-        regions=regions,
+        regions=options.regions,
         buffer_m=content.drawn.buffer_m,
     )
     write_json(directory / DRIVE_NEXT, drive_next if redaction is None else redacted_features(drive_next, redaction))
-    card = dataset_card(
-        read_samples(directory, (*CARD_COLUMNS, *PHYSICS_COLUMNS)),
-        recipe,
-        inputs,
-        content,
-        file_format=file_format,
-        regions=regions,
-        balance=balance,
-        shards=shards,
-        tags=tags,
-    )
+    samples = read_samples(directory, (*CARD_COLUMNS, *PHYSICS_COLUMNS))
+    card = dataset_card(samples, options, inputs, content, balance=balance, shards=shards)
     card = card if redaction is None else redacted_card(card, redaction)
     spool, schema = content.spool, content.samples.schema
     files = file_checksums(directory)

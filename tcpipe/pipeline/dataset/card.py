@@ -1,8 +1,9 @@
-"""The card of a dataset, ``dataset.json``: everything needed to use it, to cite it, and to check it."""
+"""The card of a dataset, ``dataset.json``: everything needed to use it, to cite it, and to check it, with findings on its samples."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TypedDict
@@ -13,6 +14,8 @@ import pyarrow.compute as pc
 
 from tcpipe import __version__
 from tcpipe.cost.budget import pooled
+from tcpipe.cost.held_out import physics_of
+from tcpipe.cost.physics import ALL, Metres
 from tcpipe.formats.dataset_card import (
     Balance,
     DatasetCard,
@@ -22,21 +25,24 @@ from tcpipe.formats.dataset_card import (
     MapRegistration,
     MapSource,
     Shard,
-    SplitRules,
+    SplitResult,
     judge_dataset,
 )
-from tcpipe.formats.dataset_files import FileFormat
 from tcpipe.formats.json_files import recast
 from tcpipe.formats.layer_descriptions import described
 from tcpipe.formats.maps.map_files import MapFile
 from tcpipe.pipeline.dataset.content import Content
-from tcpipe.pipeline.dataset.findings import count_flagged, find_in_samples
-from tcpipe.pipeline.dataset.inputs import Inputs
-from tcpipe.pipeline.dataset.physics import physics_by_robot
-from tcpipe.pipeline.dataset.splitting import Drawn, regions_to_json
+from tcpipe.pipeline.dataset.inputs import BuildOptions, Inputs
+from tcpipe.pipeline.dataset.splitting import regions_to_json
 from tcpipe.recipe import Recipe
+from tcpipe.recipe.suggestions import suggest
 from tcpipe.splits.assignment import SPLITS
-from tcpipe.splits.regions import Regions
+from tcpipe.splits.audit import HeldOut
+from tcpipe.tables.bits import Quality, name_of
+from tcpipe.tables.catalogue import Severity, threshold
+from tcpipe.tables.columns import floats
+from tcpipe.tables.facts import PhysicsFit
+from tcpipe.tables.findings import Finding, Remedy, Subject, make_finding
 from tcpipe.tables.levels import DATA_MODEL_VERSION
 from tcpipe.terrain.layers import LAYERS, Layer
 
@@ -63,18 +69,16 @@ class SampleFigures(TypedDict):
 
 def dataset_card(
     samples: pa.Table,
-    recipe: Recipe,
+    options: BuildOptions,
     inputs: Inputs,
     content: Content,
     *,
-    file_format: FileFormat,
-    regions: Regions | None,
     balance: Balance,
     shards: Sequence[Shard],
-    tags: Mapping[str, str],
 ) -> DatasetCard:
     """Return the card without checksums; ``samples`` has the `CARD_COLUMNS` of every sample, and `physics.PHYSICS_COLUMNS`."""
-    about, drawn, classes = recipe.dataset, content.drawn, content.sources[0].classes
+    recipe, drawn, classes = options.recipe, content.drawn, content.sources[0].classes
+    about, regions = recipe.dataset, options.regions
     layers, has_terrain = content.spool.layers, "terrain" in content.spool.layers
     runs = tuple(replace(run, samples=_count(samples, "run_id", run.run_id)) for run in inputs.sources)
     card = DatasetCard(
@@ -87,7 +91,7 @@ def dataset_card(
         creator=about.creator,
         **measured(samples, has_terrain=has_terrain),
         recipe=recipe,
-        format=file_format,
+        format=options.file_format,
         patch_m=recipe.sample.patch_m,
         patch_px=recipe.sample.patch_px,
         layers={name: described(layer) for name, layer in layers.items()},
@@ -101,12 +105,14 @@ def dataset_card(
         classes=classes.classes if has_terrain else (),
         label=_label(recipe, inputs),
         energy_budget=pooled(run.energy_budget for run in inputs.sources),
-        split=_split_rules(recipe, drawn, regions),
+        split=SplitResult(
+            drawn.buffer_m, None if regions is None else regions_to_json(regions), drawn.audit, drawn.kept
+        ),
         ledger_m=content.ledger_m,
         removal=content.removal,
         balance=balance,
         runs=runs,
-        run_tags=tags,
+        run_tags=options.tags,
         maps=tuple(map(_map_source, content.sources, inputs.map_sha256, content.registrations)),
         physics=physics_by_robot(samples),
         covariates=content.covariates,
@@ -130,12 +136,6 @@ def _formula(layer: Layer) -> str:
     if layer.kind == "categorical":
         return f"(C - 1) / ({layer.high:g} - 1)"
     return "O / 255" if layer.stack == "greys" else f"(X - {layer.low!r}) / ({layer.high!r} - {layer.low!r})"
-
-
-def _split_rules(recipe: Recipe, drawn: Drawn, regions: Regions | None) -> SplitRules:
-    rules = {**asdict(recipe.split), "buffer_m": drawn.buffer_m}
-    region = None if regions is None else regions_to_json(regions)
-    return SplitRules(**rules, region=region, audit=drawn.audit, kept=drawn.kept)
 
 
 def _map_source(source: MapFile, sha256: str, registration: tuple[MapRegistration, ...]) -> MapSource:
@@ -198,3 +198,134 @@ def _statistics(samples: pa.Table) -> dict[str, LabelStatistics]:
         )
         found[name] = LabelStatistics(len(values), *figures)
     return found
+
+
+PHYSICS_COLUMNS = ("start_ns", "start_z_m", "end_z_m", "chord_m", "turn_rate_radps", "standing_power_watt")
+"""Columns of samples.parquet that the fit reads, beside those of the labels."""
+
+
+def physics_by_robot(samples: pa.Table) -> dict[str, PhysicsFit]:
+    """Return the fit of each robot's samples, whatever their split; robots for which none can be are left out.
+
+    Parameters
+    ----------
+    samples : with `PHYSICS_COLUMNS`, labels, robot and terrain.
+    """
+    found = {}
+    for robot in sorted(pc.unique(samples.column("robot")).to_pylist()):
+        mine = samples.filter(pc.equal(samples.column("robot"), robot)).sort_by("start_ns")
+        fit = physics_of(metres_of(mine), standing_watt=standing_of(mine))
+        if fit is not None:
+            found[robot] = fit
+    return found
+
+
+def metres_of(samples: pa.Table) -> Metres:
+    """Return samples, or segments, as physics takes them; the rise is that of the track, which every segment has."""
+    names = (
+        samples.column("terrain_name").fill_null(ALL).to_pylist()
+        if "terrain_name" in samples.column_names
+        else [ALL] * samples.num_rows
+    )
+    return Metres(
+        power_watt=floats(samples, "power_watt"),
+        velocity_mps=floats(samples, "velocity_mps"),
+        rise=(floats(samples, "end_z_m") - floats(samples, "start_z_m")) / floats(samples, "chord_m"),
+        turn_rate_radps=floats(samples, "turn_rate_radps"),
+        terrain=np.array(names, np.str_),
+    )
+
+
+def standing_of(samples: pa.Table) -> float | None:
+    """Return the power while standing [W], the mean over the samples of what their runs tell; None where none stood."""
+    watt = floats(samples, "standing_power_watt")
+    return float(np.nanmean(watt)) if np.isfinite(watt).any() else None
+
+
+def count_flagged(quality: pa.ChunkedArray) -> Doubtful:
+    """Return how many samples carry a quality bit that not all of them carry, and how many each; ``quality`` is their column."""
+    bits = quality.to_numpy().astype(np.int64)
+    counts = {name_of(bit): int(np.count_nonzero(bits & int(bit))) for bit in Quality}
+    common = int(np.bitwise_and.reduce(bits)) if len(bits) > 1 else 0
+    count = int(np.count_nonzero(bits & ~common))
+    return Doubtful(count, count / max(len(bits), 1), {name: of for name, of in counts.items() if of})
+
+
+def find_in_samples(card: DatasetCard) -> Iterator[Finding]:
+    """Yield what the samples of a dataset show: too few, flagged ones, empty splits, leakage, thin ground, no repetitions."""
+    dataset = Subject("dataset", card.name)
+    if card.samples < threshold("few-samples", "min_sample_count"):
+        yield make_finding("few-samples", dataset, sample_count=card.samples)
+    yield from _find_flagged(card, dataset)
+    yield from _find_empty_splits(card)
+    yield from (_find_leakage(part, card) for part in card.split.audit if part.overlapping_samples)
+    yield from _find_thin_ground(card)
+    if not any(card.balance.repeatability.values()):
+        yield make_finding("no-repeated-places", dataset)
+
+
+def _find_flagged(card: DatasetCard, dataset: Subject) -> Iterator[Finding]:
+    flagged = card.doubtful
+    if flagged is None or not flagged.samples:
+        return
+    by_bit = {name: count for name, count in flagged.by_bit.items() if count < card.samples} or flagged.by_bit
+    most = max(by_bit, key=lambda name: by_bit[name])
+    severity: Severity = "warning" if flagged.share > threshold("samples-flagged", "max_flagged_fraction") else "note"
+    yield make_finding(
+        "samples-flagged", dataset, severity=severity, names={"flag": most}, flagged_fraction=flagged.share
+    )
+
+
+def _find_empty_splits(card: DatasetCard) -> Iterator[Finding]:
+    """Yield a finding for each split that was asked for and holds no sample."""
+    rules = card.recipe.split
+    if not card.splits["train"]:
+        yield make_finding(
+            "split-empty", Subject("split", "train"), severity="error", names={"reason": "region_too_small"}
+        )
+    if not card.splits["test"] and rules.test_fraction > 0:
+        reasons = {"run": "one_run", "block": "one_block", "tag": "one_value_of_tag"}
+        remedies = (
+            *(suggest("sample", {"split": {"holdout": "sample"}}) if card.splits["train"] > 1 else ()),
+            *suggest("none", {"split": {"test_fraction": 0.0}}),
+        )
+        names = {"reason": reasons.get(rules.holdout, "too_few_samples")}
+        yield make_finding("split-empty", Subject("split", "test"), names=names, remedies=remedies)
+    if not card.splits["unseen"] and card.split.region is not None:
+        yield make_finding("split-empty", Subject("split", "unseen"), names={"reason": "all_inside_region"})
+
+
+def _find_leakage(part: HeldOut, card: DatasetCard) -> Finding:
+    """Return the finding that samples of a held-out split share ground with train."""
+    remedies: tuple[Remedy, ...] = ()
+    holdout = card.recipe.split.holdout if part.split == "test" else ""
+    if holdout == "sample":
+        remedies = suggest("block", {"split": {"holdout": "block"}})
+    elif holdout == "block":
+        remedies = (
+            *suggest("larger_blocks", {"split": {"block_m": 2 * card.recipe.split.block_m}}),
+            *suggest("run", {"split": {"holdout": "run"}}),
+        )
+    return make_finding(
+        "split-leakage",
+        Subject("split", part.split),
+        remedies=remedies,
+        overlapping_count=part.overlapping_samples,
+        sample_count=part.samples,
+    )
+
+
+def _find_thin_ground(card: DatasetCard) -> Iterator[Finding]:
+    """Yield a finding for each class of terrain with ranges of slope that hold few independent samples."""
+    is_thin = defaultdict[str, list[bool]](list)
+    for cell in card.balance.by_class_and_slope:
+        is_thin[cell["class"] or "any ground"].append(cell["rare"])
+    for name, thin in is_thin.items():
+        if any(thin):
+            yield make_finding(
+                "thin-ground",
+                Subject("class", name),
+                thin_count=sum(thin),
+                cell_count=len(thin),
+                enough_count=card.balance.enough_effective,
+            )

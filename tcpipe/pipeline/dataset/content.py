@@ -1,10 +1,13 @@
-"""What a dataset holds before it is written: samples in their order, their patches, and where every metre went."""
+"""What a dataset holds: usable segments of all runs, samples in their order with their patches, and where every metre went."""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Mapping, Sequence
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -13,31 +16,129 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
-from tcpipe.errors import DatasetError
-from tcpipe.formats.dataset_card import Covariate, MapRegistration, Removal, group_dataset_findings
+from tcpipe.errors import DatasetError, TcpipeError
+from tcpipe.execution import run_all, sound
+from tcpipe.formats.arrow_file import map_table, table_bytes, table_of, write_pieces
+from tcpipe.formats.dataset_card import Covariate, MapRegistration, Removal, Shard, group_dataset_findings
+from tcpipe.formats.dataset_files import Drawer, FileFormat, ParquetDrawer, Pixels, parquet_drawers, zarr_drawers
 from tcpipe.formats.finding_lines import format_mixed_groups
 from tcpipe.formats.geoparquet import located
 from tcpipe.formats.maps.map_files import MapFile, open_map
+from tcpipe.formats.place import DirectoryPlace, Place
 from tcpipe.formats.robot_files import profiles_of
+from tcpipe.formats.stored_runs import RunDirectory
+from tcpipe.formats.zarr_arrays import Compression
+from tcpipe.motion.remedies import KEPT
 from tcpipe.pipeline.dataset.added_columns import added_columns, find_narrow_patches, tag_of_each
-from tcpipe.pipeline.dataset.inputs import Inputs
+from tcpipe.pipeline.dataset.inputs import BuildOptions, Inputs
 from tcpipe.pipeline.dataset.registration import register_runs
 from tcpipe.pipeline.dataset.removal import removed_by_ground
 from tcpipe.pipeline.dataset.sampling import Spool, Workers, sample_all_segments
-from tcpipe.pipeline.dataset.segments import move_out, pool_segments
 from tcpipe.pipeline.dataset.splitting import Drawn, draw_splits
 from tcpipe.recipe import Recipe
 from tcpipe.recipe.suggestions import recipe_key
 from tcpipe.splits.assignment import EXCLUDED, NO_FOLD, Assignment
 from tcpipe.splits.ranking import order_ranks
-from tcpipe.splits.regions import Regions
 from tcpipe.stages.sample import Sampled, metres_lost
 from tcpipe.tables.bits import Loss, name_of
 from tcpipe.tables.columns import floats
-from tcpipe.tables.findings import Finding
-from tcpipe.tables.levels import SAMPLES
+from tcpipe.tables.findings import Finding, Subject, make_finding
+from tcpipe.tables.levels import LABELLED_SEGMENTS, SAMPLES
 from tcpipe.tables.wkb import point_column
 from tcpipe.terrain.projection import area_of, parse_crs
+
+
+@dataclass(frozen=True, slots=True)
+class Pool:
+    """Segments with power and position, of all runs, mapped from a file; ``ledger_m`` sums to the runs' odometers."""
+
+    segments: pa.Table
+    ledger_m: Mapping[str, float]
+    findings: tuple[Finding, ...]
+
+
+def pool_segments(
+    runs: Sequence[RunDirectory], directory: Path, *, again: Mapping[str, NDArray[np.bool_]] | None = None
+) -> Pool:
+    """Gather the segments that can become samples, run by run, in a file in ``directory``.
+
+    ``again`` marks, by run, the segments that another run has too, in the order of the run's file.
+
+    Raises
+    ------
+    DatasetError : None can: the lines say what the runs lack.
+    """
+    names = dict.fromkeys(name for run in runs for name in run.manifest.ledger_m)
+    ledger_m = {name: math.fsum(run.manifest.ledger_m.get(name, 0.0) for run in runs) for name in names}
+    path, counts = directory / "segments.arrow", list[_Count]()
+    write_pieces(path, LABELLED_SEGMENTS.arrow(), _usable(runs, again or {}, counts))
+    segments = map_table(path)
+    if segments.num_rows == 0:
+        every, powered, located = (
+            sum(getattr(count, name) for count in counts) for name in ("every", "powered", "located")
+        )
+        lack = "power where there is GNSS" if powered and located else "GNSS" if powered else "power"
+        raise DatasetError(
+            f"{len(runs)} runs, {every} segments, but none with {lack}: "
+            "there is nothing to learn from; ingest runs that have it"
+        )
+    lost_m = {
+        Loss.NO_POWER: math.fsum(count.no_power_m for count in counts),
+        Loss.OUTSIDE_MAP: math.fsum(count.no_place_m for count in counts),
+        Loss.RECORDED_TWICE: math.fsum(count.again_m for count in counts),
+    }
+    return Pool(segments, move_out(ledger_m, lost_m), tuple(_find_unusable(runs, counts)))
+
+
+@dataclass(frozen=True, slots=True)
+class _Count:
+    """What the segments of a run have: how many, and the metres of those that lack power, or else a place, or else are another run's."""
+
+    every: int
+    powered: int
+    located: int
+    no_power_m: float
+    no_place_m: float
+    again_m: float
+
+
+def _usable(
+    runs: Sequence[RunDirectory], again: Mapping[str, NDArray[np.bool_]], counts: list[_Count]
+) -> Iterator[pa.Table]:
+    """Yield each run's segments that can become samples; ``counts`` gets an entry a run."""
+    for run in runs:
+        segments = run.segments()
+        powered: NDArray[np.bool_] = np.isfinite(floats(segments, "power_watt"))
+        ends = [f"{end}_{axis}_deg" for end in ("start", "end") for axis in ("lon", "lat")]
+        located = np.isfinite([floats(segments, end) for end in ends]).all(axis=0)
+        arc_m = floats(segments, "arc_length_m")
+        usable = powered & located
+        twice = usable & again.get(run.run_id, np.zeros(len(usable), np.bool_))
+        lost_m = (float(arc_m[lost].sum()) for lost in (~powered, powered & ~located, twice))
+        counts.append(_Count(len(powered), int(powered.sum()), int(located.sum()), *lost_m))
+        usable &= ~twice
+        yield segments if usable.all() else segments.filter(pa.array(usable))
+
+
+def _find_unusable(runs: Sequence[RunDirectory], counts: Sequence[_Count]) -> Iterator[Finding]:
+    """Yield a finding for every run that lacks power or positions everywhere."""
+    for run, count in zip(runs, counts, strict=True):
+        lacks = [name for name, has in (("power", count.powered), ("gnss", count.located)) if not has]
+        if count.every and lacks:
+            yield make_finding("run-without-samples", Subject("run", run.run_id), names={"lacks": " and ".join(lacks)})
+
+
+def move_out(ledger_m: Mapping[str, float], lost_m: Mapping[Loss, float]) -> dict[str, float]:
+    """Return the ledger with metres moved from what is kept to losses [m]; its sum stays the odometer."""
+    moved = dict(ledger_m)
+    for loss, metres in lost_m.items():
+        name = name_of(loss)
+        moved[name] = moved.get(name, 0.0) + float(metres)
+    total = math.fsum(float(metres) for metres in lost_m.values())
+    left = moved.get(KEPT, 0.0) - total
+    moved[KEPT] = left if left > 1e-9 * total else 0.0  # nothing left but rounding
+    return moved
+
 
 logger = logging.getLogger("tcpipe")
 
@@ -164,21 +265,14 @@ class Content:
     findings: tuple[Finding, ...]
 
 
-def gather_content(
-    directory: Path,
-    inputs: Inputs,
-    recipe: Recipe,
-    regions: Regions | None,
-    earlier: pa.Table | None,
-    *,
-    workers: Workers,
-) -> Content:
+def gather_content(directory: Path, inputs: Inputs, options: BuildOptions, workers: Workers) -> Content:
     """Sample, split and order; segments wait in files in ``directory``, which must be empty, pixels where ``workers`` see them.
 
     Raises
     ------
     DatasetError, MapError : nothing comes of it: no segment, none on the map, none inside the region.
     """
+    recipe = options.recipe
     pool = pool_segments(inputs.runs, directory, again=inputs.again)
     logger.info("sampling %d segments of %d runs", pool.segments.num_rows, len(inputs.runs))
     ranks = _ranks(pool.segments, seed=recipe.split.seed)
@@ -193,7 +287,9 @@ def gather_content(
             _nothing_sampled(pool.segments, lost_m, sources), *_why_uncertain(pool.segments, lost_m, inputs, recipe)
         )
     tags = _tags(pool.segments, inputs, recipe)
-    drawn = draw_splits(pool.segments, sampled, sources[0].grid, regions, recipe, earlier=earlier, tags=tags)
+    drawn = draw_splits(
+        pool.segments, sampled, sources[0].grid, options.regions, recipe, earlier=options.earlier, tags=tags
+    )
     split = drawn.assigned.split
     arc_m = floats(pool.segments, "arc_length_m")[sampled.kept]
     unused_m = {Loss.SPLIT_BUFFER: arc_m[split == "buffer"].sum(), Loss.SPLIT_EXCLUDED: arc_m[split == EXCLUDED].sum()}
@@ -284,3 +380,51 @@ def _why_uncertain(segments: pa.Table, lost_m: Mapping[Loss, float], inputs: Inp
 def _covered(source: MapFile, *, alone: bool) -> str:
     west, south, east, north = area_of(parse_crs(source.grid.crs, where="map"), source.grid.bounds_m)
     return f"{'the map' if alone else f'map {source.name}'} covers {west:.5f} to {east:.5f}, {south:.5f} to {north:.5f}"
+
+
+def write_patches(
+    directory: Path, content: Content, file_format: FileFormat, workers: Workers, *, compression: Compression
+) -> list[Shard]:
+    """Have the layers written, shard by shard; return the shards, where the format has any."""
+    samples, spool = content.samples, content.spool
+    pixels = Pixels(spool.layers, spool.patch_px, samples.slots(), spool.read)
+    if file_format == "parquet":
+        rows = partial(_waiting_rows, workers.waiting, samples)
+        drawers = parquet_drawers(workers.out, pixels, rows, samples.splits())
+    else:
+        drawers = zarr_drawers(
+            directory, workers.out, pixels, samples.ids, compression=compression, threads=workers.jobs
+        )
+    with closing(run_all(_fill, drawers, jobs=1, cluster=workers.cluster)) as outcomes:
+        for outcome in outcomes:
+            sound(outcome)
+    _bring(workers.out, directory)
+    return [drawer.shard for drawer in drawers if isinstance(drawer, ParquetDrawer)]
+
+
+def _waiting_rows(waiting: Place, samples: SampleTable, rows: NDArray[np.int64]) -> Callable[[], pa.Table]:
+    """Put rows of the samples where whoever writes them sees them; return what gives them there."""
+    name = f"rows/{rows[0]}"
+    waiting.put(name, table_bytes(samples.take(rows)))
+    return partial(_rows_at, waiting, name)
+
+
+def _rows_at(waiting: Place, name: str) -> pa.Table:
+    return table_of(waiting.read(name) or b"")
+
+
+def _fill(drawer: Drawer) -> TcpipeError | None:
+    try:
+        drawer.write()
+    except TcpipeError as error:
+        return error
+    return None
+
+
+def _bring(out: Place, directory: Path) -> None:
+    """Bring the files into the directory that is made, one at a time, where they were written elsewhere."""
+    if out == DirectoryPlace(directory):
+        return
+    for entry in out.entries():
+        (directory / entry.name).parent.mkdir(parents=True, exist_ok=True)
+        (directory / entry.name).write_bytes(out.read_range(entry.name, 0, entry.size_bytes))

@@ -27,12 +27,29 @@ from tcpipe.formats.stored_runs import RunDirectory
 from tcpipe.pipeline.dataset.runs import Chosen, choose_runs
 from tcpipe.pipeline.recordings import each_drive_once
 from tcpipe.recipe import Recipe
+from tcpipe.splits.regions import Regions
 from tcpipe.store import Store
 from tcpipe.tables.findings import Finding
 from tcpipe.tables.levels import TABLES_VERSION
 
 if TYPE_CHECKING:
     from tcpipe.formats.covariates import CovariateTable
+
+
+@dataclass(frozen=True, slots=True)
+class BuildOptions:
+    """What a user chooses for a dataset, beside its runs and what the maps and tables hold."""
+
+    recipe: Recipe
+    """The one that rules, with holdout and seed of the call."""
+    regions: Regions | None
+    tags: Mapping[str, str]
+    file_format: FileFormat
+    redact: bool
+    earlier: pa.Table | None
+    """Samples of an earlier dataset, which keep their split."""
+    keeps_own_split: bool
+    """Whether that is the dataset that is replaced, which may be asked for at any time."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,20 +75,17 @@ class Inputs:
 
 def choose_inputs(
     store: Store,
-    recipe: Recipe,
+    options: BuildOptions,
     *,
     map_names: Sequence[str],
     robot: str | None,
     region: bytes | None,
-    file_format: FileFormat,
-    tags: Mapping[str, str] | None = None,
-    earlier: pa.Table | None = None,
-    covariates: tuple[CovariateTable, ...] = (),
+    covariates: tuple[CovariateTable, ...],
 ) -> Inputs:
     """Return the runs of one robot ingested with this recipe and the maps, or raise `DatasetError` that lists the candidates."""
     problems = list[str]()
     try:
-        chosen = choose_runs(store, recipe, robot=robot, tags=tags or {})
+        chosen = choose_runs(store, options.recipe, robot=robot, tags=options.tags)
         _refuse_without_segments(chosen.runs)
     except DatasetError as error:
         problems += error.problems
@@ -93,13 +107,13 @@ def choose_inputs(
     fingerprint = digest(
         {
             "versions": [__version__, TABLES_VERSION],
-            "recipe": recipe,
+            "recipe": options.recipe,
             "runs": [{key: value for key, value in plain(run).items() if key != "samples"} for run in sources],
             "maps": list(zip(names, map_sha256, strict=True)),
             "region": None if region is None else region.decode("utf-8", "replace"),
-            "format": file_format,
+            "format": options.file_format,
             **({"covariates": [(of.name, of.checksum) for of in covariates]} if covariates else {}),
-            **({} if earlier is None else {"kept_split": _table_digest(earlier)}),
+            **({} if options.earlier is None else {"kept_split": _table_digest(options.earlier)}),
         }
     )
     findings = (*chosen.findings, *once.findings)

@@ -3,33 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
 
 from tcpipe.formats.dataset_card import DatasetCard
 from tcpipe.formats.json_files import digest, plain
-from tcpipe.pipeline.dataset.inputs import Inputs
+from tcpipe.pipeline.dataset.inputs import BuildOptions, Inputs
 from tcpipe.pipeline.dataset.splitting import regions_to_json
 from tcpipe.pipeline.explain import flat_recipe
-from tcpipe.recipe import Recipe
-from tcpipe.splits.regions import Regions
 
 _LONGEST_VALUE = 80
-
-
-@dataclass(frozen=True, slots=True)
-class BuildOptions:
-    """What a user chooses for a dataset, beside its runs and what the maps and tables hold."""
-
-    recipe: Recipe
-    """The one that rules, with holdout and seed of the call."""
-    regions: Regions | None
-    tags: Mapping[str, str]
-    file_format: str
-    redact: bool
-    keeps_split: bool
-    """Of any earlier dataset."""
-    keeps_own_split: bool
-    """Of the dataset that is replaced, which may be asked for at any time."""
 
 
 def find_other_options(card: DatasetCard, options: BuildOptions, inputs: Inputs) -> list[str]:
@@ -63,7 +44,7 @@ def _values(card: DatasetCard, options: BuildOptions, inputs: Inputs) -> Iterato
     yield "--covariates", tuple(of.name for of in card.covariates), tuple(of.name for of in inputs.covariates)
     yield "--format", card.format, options.file_format
     if not options.keeps_own_split:
-        yield "--keep-split", card.split.kept is not None, options.keeps_split
+        yield "--keep-split", card.split.kept is not None, options.earlier is not None
 
 
 def _find_chosen_tags(card: DatasetCard, wanted: Mapping[str, str], inputs: Inputs) -> dict[str, str]:

@@ -10,16 +10,15 @@ from pathlib import Path
 
 from tcpipe.errors import DatasetError
 from tcpipe.formats.dataset_card import RunSource
-from tcpipe.formats.index_files import RunFacts
+from tcpipe.formats.index_files import KnownSensor, RunFacts
 from tcpipe.formats.recipe_toml import ingest_key
 from tcpipe.formats.run_documents import LogOrigin
 from tcpipe.formats.stored_runs import Ingestions, RunDirectory
-from tcpipe.pipeline.unknown_robots import alike, in_words
 from tcpipe.recipe import Recipe
 from tcpipe.robots.profiles import GENERIC
 from tcpipe.store import Store
 from tcpipe.tables.findings import Finding, Remedy, Subject, make_finding
-from tcpipe.tables.levels import DATA_MODEL_VERSION
+from tcpipe.tables.levels import DATA_MODEL_VERSION, Sensor
 
 CHOICE_CODES = frozenset({"run-damaged", "run-gone", "run-ingested-otherwise"})
 """Findings on runs that belong in a dataset and are left out."""
@@ -182,3 +181,50 @@ def find_gone_runs(
     here = {run.run_id for run in chosen.runs} | chosen.left_out
     gone = [run.run_id for run in before if run.run_id not in here and _belongs(run, robot, tags)]
     return tuple(make_finding("run-gone", Subject("run", run_id)) for run_id in sorted(gone))
+
+
+Seen = dict[str, tuple[str, str, str]]
+"""By role: a sensor's topic, its type and its frame, as far as a run shows them."""
+
+
+def alike(sensors: Mapping[str, Mapping[str, Sensor | KnownSensor]]) -> list[tuple[list[str], Seen]]:
+    """Return groups of runs, and what is seen of each, so that all sensors within one agree in type, frame and namespace.
+
+    A run belongs to the first group with which it shares a role and differs in none: a sensor may be off for a drive.
+
+    Parameters
+    ----------
+    sensors : by run and role, what its run.json says of the sensor.
+    """
+    groups: list[tuple[list[str], Seen]] = []
+    seen = {run_id: _seen(of) for run_id, of in sensors.items()}
+    for run_id, mine in sorted(seen.items(), key=lambda item: (-len(item[1]), item[0])):
+        for runs, theirs in groups:
+            shared = mine.keys() & theirs.keys()
+            if all(_agree(mine[role], theirs[role]) for role in shared) and (shared or not (mine or theirs)):
+                runs.append(run_id)
+                theirs.update({role: of for role, of in mine.items() if role not in theirs})
+                break
+        else:
+            groups.append(([run_id], mine))
+    return groups
+
+
+def in_words(seen: Seen) -> str:
+    """Return what is seen of a robot as one line."""
+    parts = (f"{role} {topic} ({kind}, frame {frame or 'none'})" for role, (topic, kind, frame) in sorted(seen.items()))
+    return ", ".join(parts) or "no sensor is known"
+
+
+def _seen(sensors: Mapping[str, Sensor | KnownSensor]) -> Seen:
+    return {role: (of.topic, of.type_name, of.frame_id.strip("/")) for role, of in sensors.items()}
+
+
+def _agree(one: tuple[str, str, str], other: tuple[str, str, str]) -> bool:
+    return one[1:] == other[1:] and not _in_two_namespaces(one[0], other[0])
+
+
+def _in_two_namespaces(one: str, other: str) -> bool:
+    """Return whether two topics are one but for what their names begin with: /imu, /rover1/imu and /rover2/imu."""
+    a, b = one.strip("/").split("/"), other.strip("/").split("/")
+    return a != b and (a[1:] == b or a == b[1:] or (a[1:] == b[1:] and len(a) > 1))

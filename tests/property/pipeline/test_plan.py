@@ -52,7 +52,7 @@ def make_row(row, task, sha256, kind):
     empty = make_finding("no-segments", subject, names={"reason": "gap"}, driven_m=80.0, lost_m=80.0)
     changes = {
         "damaged": {"damage": ("it was cut",), "findings": find_damage(("it was cut",), subject)},
-        "empty": {"segments": 0, "driven_m": 80.0, "findings": (empty,)},
+        "empty": {"segments": 0, "ledger_m": {"gap": 80.0}, "findings": (empty,)},
     }
     return replace(made, **changes.get(kind, {}))
 

@@ -84,7 +84,7 @@ def test_physics_is_a_model_like_the_others(told, tmp_path):
     with pytest.raises(ModelError, match="physics needs the slope and class of each patch"):
         model.predict(split.with_channels("height").patches)
     assert tcpipe("train", told, "model", "--model", "physics", cwd=tmp_path).stdout.startswith("model: nothing to do")
-    with pytest.raises(UsageError, match="leave out --physics"):
+    with pytest.raises(UsageError, match="leave out --physics-from"):
         chosen_model(str(tmp_path / "model"), physics=str(told))
     with pytest.raises(UsageError, match="takes no commanded speed; leave out --speed"):
         chosen_model(str(tmp_path / "model"), speed_mps=0.5)
@@ -112,7 +112,7 @@ def test_an_older_dataset_cannot_tell_and_says_so(dataset, tmp_path, monkeypatch
     assert [of.name for of in load_model(tmp_path / "model").card.beside] == ["turn_radpm"]
     absent.add("turn_rate_radps")
     with pytest.raises(
-        DatasetError, match=r"no turn \(turn_rate_radps\) and no commanded speed .* or train without --beside"
+        DatasetError, match=r"no turn \(turn_rate_radps\) and no commanded speed .* or train without --extra-features"
     ):
         train(dataset, tmp_path / "other", config=config)
     train(dataset, tmp_path / "physics", config=FitConfig(model="physics"))

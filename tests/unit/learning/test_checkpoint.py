@@ -69,5 +69,5 @@ def test_a_foreign_one_is_told(tmp_path, state):
     whole = {"key": "key", "epoch": 0, "best_epoch": 0, "best_loss": 1.0, "history": []}
     text = json.dumps({**whole, **state} if state else []).encode()
     write_arrays(tmp_path / "x.checkpoint", {"state": np.frombuffer(text, np.uint8)})
-    with pytest.raises(ModelError, match=r"x.checkpoint: not a checkpoint; remove it, or start anew with --fresh"):
+    with pytest.raises(ModelError, match=r"x.checkpoint: not a checkpoint; remove it, or start anew with --no-resume"):
         read_checkpoint(tmp_path / "x.checkpoint", "key")

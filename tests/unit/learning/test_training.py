@@ -174,11 +174,11 @@ def test_what_evaluation_trains_begins_anew_where_the_state_is_of_another_traini
 def test_a_state_of_another_training_or_cut_short_is_told(dataset, tmp_path, monkeypatch):
     _stopped(monkeypatch, 0, dataset, tmp_path / "other", CONFIG)
     checkpoint = tmp_path / "other.checkpoint"
-    with pytest.raises(ModelError, match=r"other.checkpoint: of another dataset or other options; .* --fresh"):
+    with pytest.raises(ModelError, match=r"other.checkpoint: of another dataset or other options; .* --no-resume"):
         train(dataset, tmp_path / "other", config=replace(CONFIG, seed=1))
     checkpoint.write_bytes(checkpoint.read_bytes()[:-1000])
     with pytest.raises(
-        ModelError, match=r"other.checkpoint: cut short or damaged .*; remove it, or start anew with --fresh"
+        ModelError, match=r"other.checkpoint: cut short or damaged .*; remove it, or start anew with --no-resume"
     ) as told:
         train(dataset, tmp_path / "other", config=CONFIG)
     assert len(told.value.problems) == 1

@@ -90,7 +90,7 @@ def test_a_store_of_another_data_model_is_told_so(store, tmp_path):
 
 def test_a_dry_run_counts_and_estimates_and_a_build_is_remembered(store, tmp_path):
     planned = build_dataset(tmp_path / "out", store=store.root, recipe=Recipe(), dry_run=True)
-    assert (planned.status, planned.samples, planned.exit_code) == ("planned", 60, 0)
+    assert (planned.status, planned.estimate.amount, planned.exit_code) == ("planned", 60, 0)
     assert "at most 60 samples: about 2 s and 258 kB (by figures measured elsewhere" in str(planned)
     assert not (tmp_path / "out").exists()
     made = build_dataset(tmp_path / "out", store=store.root, recipe=Recipe())
@@ -101,7 +101,7 @@ def test_a_dry_run_counts_and_estimates_and_a_build_is_remembered(store, tmp_pat
     before = store.state()
     build_dataset(tmp_path / "out", store=store.root, recipe=Recipe())
     assert store.state() == before, "a call with nothing to do writes nothing"
-    assert [call.counts for call in before.calls] == [{"runs": 3, "samples": made.samples}]
+    assert [call.counts for call in before.calls] == [{"runs": 3, "samples": made.card.samples}]
 
 
 def test_a_dataset_that_was_moved_before_another_was_built_in_its_place_still_holds_its_runs(store, tmp_path):

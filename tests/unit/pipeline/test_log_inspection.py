@@ -9,7 +9,7 @@ import pytest
 from tcpipe.errors import UsageError
 from tcpipe.formats.logs.log_file import open_log
 from tcpipe.formats.logs.writing import MessageStream, write_mcap
-from tcpipe.pipeline import log_stamps
+from tcpipe.pipeline import log_inspection
 from tcpipe.pipeline.inspect import inspect
 from tcpipe.pipeline.log_inspection import inspect_log
 from tcpipe.recipe import Recipe
@@ -47,14 +47,15 @@ def test_faults_that_were_put_in_are_found(tmp_path):
         tmp_path / "a.mcap", [stream("/faulty", faulty, log_ns), stream("/stepped", stepped, log_ns)]
     )
     one = topics["/faulty"]
-    assert one.messages_read == one.messages == 3000
-    assert one.gaps == 1
-    assert one.longest_gap_s == pytest.approx(4.02)
-    assert one.median_period_s == pytest.approx(0.02)
+    stamps = one.stamps
+    assert stamps.messages_read == one.messages == 3000
+    assert stamps.gaps == 1
+    assert stamps.longest_gap_s == pytest.approx(4.02)
+    assert stamps.median_period_s == pytest.approx(0.02)
     kinds = ("zero_stamps", "backward_stamps", "repeated_stamps", "duplicates")
-    assert [getattr(one, kind) for kind in kinds] == [1, 1, 0, 1]
-    assert one.longest_gap_at_ns == log_ns[1999]
-    assert topics["/stepped"].longest_gap_s == pytest.approx(4.02)  # the step of its header is none
+    assert [getattr(stamps, kind) for kind in kinds] == [1, 1, 0, 1]
+    assert stamps.longest_gap_at_ns == log_ns[1999]
+    assert topics["/stepped"].stamps.longest_gap_s == pytest.approx(4.02)  # the step of its header is none
     assert one.time == "header"
     assert one.header_minus_log_s == pytest.approx(-0.003)
     assert found.clock_epochs == 2
@@ -84,10 +85,10 @@ def test_a_topic_of_many_messages_is_thinned_out_and_its_counts_stay_exact(monke
     table = pa.table(
         {"log_time_ns": log_ns, "header.stamp.sec": header_ns // 10**9, "header.stamp.nanosec": header_ns % 10**9}
     )
-    whole = log_stamps.TopicStamps()
+    whole = log_inspection.TopicStamps()
     whole.add(table)
-    monkeypatch.setattr(log_stamps, "_MOST_ROWS", 1000)
-    thinned = log_stamps.TopicStamps()
+    monkeypatch.setattr(log_inspection, "_MOST_ROWS", 1000)
+    thinned = log_inspection.TopicStamps()
     for start in range(0, 10_000, 777):
         thinned.add(table[start : start + 777])
     assert len(thinned.times()[0]) <= 1000
@@ -103,12 +104,12 @@ def test_exact_duplicates_are_told_from_repeated_stamps(tmp_path):
     header_ns = log_ns - 3_000_000
     log_ns[1::2] += 1_000_000
     found, topics = inspected(tmp_path / "a.mcap", [stream("/twice", header_ns, log_ns)])
-    assert (topics["/twice"].duplicates, topics["/twice"].repeated_stamps) == (1000, 0)
+    assert (topics["/twice"].stamps.duplicates, topics["/twice"].stamps.repeated_stamps) == (1000, 0)
     assert topics["/twice"].time == "header"
     other = stream("/other", header_ns, log_ns)
     other.columns["angular_velocity.x"] = np.arange(2000.0)
     found, topics = inspected(tmp_path / "b.mcap", [other])
-    assert (topics["/other"].duplicates, topics["/other"].repeated_stamps) == (0, 1000)
+    assert (topics["/other"].stamps.duplicates, topics["/other"].stamps.repeated_stamps) == (0, 1000)
     assert topics["/other"].time == "log"
     assert found.damage == ()
 
@@ -125,7 +126,7 @@ def test_a_recorder_that_stalls_is_no_gap_and_another_clock_is_told(tmp_path):
             stream("/c", header_ns - 60 * 10**9, header_ns),
         ],
     )
-    assert topics["/stalled"].gaps == 0
+    assert topics["/stalled"].stamps.gaps == 0
     assert topics["/c"].moved_s == (pytest.approx(60.0, abs=0.01),)
     assert topics["/b"].moved_s == ()
     assert found.clock_steps == ()
@@ -141,7 +142,7 @@ def test_what_repeats_is_compared_in_every_kind_of_column():
         "texts": [["a"], ["a"], ["b"], ["b"], ["b"]],
         "on": [True, True, True, False, False],
     }
-    stamps = log_stamps.TopicStamps()
+    stamps = log_inspection.TopicStamps()
     table = pa.table(rows)
     for row in range(5):
         stamps.add(table[row : row + 1])

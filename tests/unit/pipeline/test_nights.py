@@ -58,7 +58,9 @@ def test_a_half_copied_log_is_superseded_when_it_is_complete_and_counts_when_it_
     whole, log, first = drive_at(tmp_path / "whole.mcap"), tmp_path / "logs" / "run.mcap", tmp_path / "logs" / name
     copy_part(whole, first, 0.6)
     half = (
-        night()[0][name].run_id if name == "run.mcap" else ingest([first], store=tmp_path / "store").results[0].run_id
+        night()[0][name].run.run_id
+        if name == "run.mcap"
+        else ingest([first], store=tmp_path / "store").results[0].run.run_id
     )
     first.unlink()
     shutil.copy(whole, log)
@@ -68,7 +70,7 @@ def test_a_half_copied_log_is_superseded_when_it_is_complete_and_counts_when_it_
         f"run {half}, made from this path before, is superseded: this log holds what it held",
     )
     assert half not in counted(tmp_path)
-    assert inspect(tmp_path / "store", recipe=Recipe()).superseded == {half: found["run.mcap"].run_id}
+    assert inspect(tmp_path / "store", recipe=Recipe()).superseded == {half: found["run.mcap"].run.run_id}
     assert night()[0]["run.mcap"].notes == ()  # said once
     for place in ("run.mcap", "elsewhere.mcap"):  # back where it was, then under another name
         copy_part(whole, tmp_path / "logs" / place, 0.6)
@@ -84,7 +86,7 @@ def test_a_half_copied_log_that_lies_elsewhere_too_still_counts(tmp_path, night)
     whole, log = drive_at(tmp_path / "whole.mcap"), tmp_path / "logs" / "run.mcap"
     copy_part(whole, log, 0.6)
     shutil.copy(log, tmp_path / "logs" / "twin.mcap")
-    half = night()[0]["run.mcap"].run_id
+    half = night()[0]["run.mcap"].run.run_id
     shutil.copy(whole, log)
     (note,) = night()[0]["run.mcap"].notes
     assert note.endswith(f"stays: its recording lies at {tmp_path}/logs/twin.mcap")
@@ -101,11 +103,11 @@ def test_a_half_copied_log_that_lies_elsewhere_too_still_counts(tmp_path, night)
 )
 def test_a_name_used_again_and_a_log_that_lost_something_supersede_nothing(tmp_path, night, later, why):
     log = drive_at(tmp_path / "logs" / "latest.mcap")
-    before = night()[0]["latest.mcap"].run_id
+    before = night()[0]["latest.mcap"].run.run_id
     drive_at(log, **later)
     found, code = night()
     assert (code, found["latest.mcap"].notes) == (0, (f"run {before}, made from this path before, stays: {why}",))
-    assert {before, found["latest.mcap"].run_id} <= counted(tmp_path)
+    assert {before, found["latest.mcap"].run.run_id} <= counted(tmp_path)
 
 
 # --- logs that are still written ------------------------------------------------------------------------------------
@@ -186,10 +188,10 @@ def test_damage_is_news_once_and_accepted_trouble_is_counted_apart(tmp_path, nig
         ("unchanged", True, 0),
         ("damaged", True, 3),  # junk.bag was tried again
     )
-    run_id = found["cut.mcap"].run_id
+    run_id = found["cut.mcap"].run.run_id
     with pytest.raises(UsageError) as caught:
-        acknowledge([run_id, "nosuch", found["other.mcap"].run_id], store=tmp_path / "store")
-    assert [line.split(":")[0] for line in caught.value.problems] == ["nosuch", found["other.mcap"].run_id]
+        acknowledge([run_id, "nosuch", found["other.mcap"].run.run_id], store=tmp_path / "store")
+    assert [line.split(":")[0] for line in caught.value.problems] == ["nosuch", found["other.mcap"].run.run_id]
     assert f"known problems: {junk}, {run_id}" in caught.value.problems[0]
     assert not found["cut.mcap"].acknowledged
     done = acknowledge([run_id, str(junk)], store=tmp_path / "store")
@@ -210,7 +212,7 @@ def test_damage_is_news_once_and_accepted_trouble_is_counted_apart(tmp_path, nig
 
 @pytest.mark.parametrize("broken", ["a digit", "half", "[]", "nothing", "gone"])
 def test_a_commit_that_is_not_as_it_was_written_is_a_problem_and_nothing_is_lost_for_good(tmp_path, night, broken):
-    run_id = night()[0]["other.mcap"].run_id
+    run_id = night()[0]["other.mcap"].run.run_id
     store = Store(tmp_path / "store")
     number = store.state().runs[run_id, next(iter(store.state().runs))[1]].commit
     commit = tmp_path / "store" / "log" / f"{number:010}.json"
@@ -298,7 +300,7 @@ def test_of_two_calls_that_ingest_one_recording_under_two_names_the_first_commit
     assert found["second.mcap"].same_as == str(tmp_path / "elsewhere" / "first.mcap")
     found, code = night()
     assert (found["second.mcap"].status, code) == ("unchanged", 0)
-    assert str(found["second.mcap"].run_id).startswith("first-")
+    assert str(found["second.mcap"].run.run_id).startswith("first-")
 
 
 def test_a_night_with_nothing_new_asks_a_bucket_the_same_however_many_runs_there_are(tmp_path, monkeypatch):
@@ -327,7 +329,7 @@ def test_a_link_is_called_what_the_user_calls_it(tmp_path):
     summary = ingest([tmp_path / "logs", annexed], store=tmp_path / "store", recipe=Recipe())
     (result,) = summary.results
     assert result.log == str(tmp_path / "logs" / "run.mcap")
-    assert str(result.run_id).startswith("run-")
+    assert result.run.run_id.startswith("run-")
     (known,) = [Store(tmp_path / "store").run_json(run_id) for run_id in counted(tmp_path)]
     assert known.source.paths == (result.log,)
     annexed.unlink()
@@ -347,7 +349,7 @@ def test_two_recordings_of_one_name_whose_hashes_begin_alike_are_two_runs(tmp_pa
 
 
 def test_a_run_json_that_is_not_as_it_was_written_costs_no_other_log_and_is_made_again(tmp_path, night):
-    run_id = night(tags={"weather": "dry"})[0]["other.mcap"].run_id
+    run_id = night(tags={"weather": "dry"})[0]["other.mcap"].run.run_id
     path = tmp_path / "store" / "runs" / run_id / "run-1.json"
     whole = path.read_bytes()
     path.write_bytes(whole[:-9])
@@ -366,14 +368,14 @@ def test_a_part_of_a_split_recording_takes_static_transforms_from_the_part_befor
     write_bag(second, wheel_drive(seed=1, start_ns=int(stream.log_time_ns[-1]) + 10**7))
     summary = ingest([tmp_path / "logs"], store=tmp_path / "store", recipe=Recipe())
     assert [result.status for result in summary.results] == ["done", "done"]
-    known = [Store(tmp_path / "store").run_json(result.run_id).remarks for result in summary.results]
+    known = [Store(tmp_path / "store").run_json(result.run.run_id).remarks for result in summary.results]
     taken = [sum("run_0.bag ends, whose static transforms are taken" in line for line in lines) for lines in known]
     assert taken == [0, 1]
 
 
 def test_a_log_that_was_lost_is_written_again_from_the_runs(tmp_path, night):
-    run_id = night()[0]["other.mcap"].run_id
+    run_id = night()[0]["other.mcap"].run.run_id
     shutil.rmtree(tmp_path / "store" / "log")
     found = night()[0]["other.mcap"]
-    assert (found.run_id, found.status) == (run_id, "done")
+    assert (found.run.run_id, found.status) == (run_id, "done")
     assert counted(tmp_path) == {run_id}

@@ -64,7 +64,7 @@ def build(store, out, names, **keywords):
 @pytest.mark.parametrize("order", [("west", "east"), ("east", "west")])
 def test_every_sample_lies_on_the_first_map_that_has_it_and_shows_the_world(store, tmp_path, order):
     result = build(store, tmp_path / "out", order)
-    assert result.samples > 600
+    assert result.card.samples > 600
     samples = read_samples(tmp_path / "out")
     names, ids = np.array(samples["map"].to_pylist()), samples["sample_id"].to_pylist()
     assert len(set(ids)) == len(ids)
@@ -147,7 +147,7 @@ def test_maps_are_held_open_only_while_samples_are_taken(store, tmp_path, monkey
         raise MapError("a tile is damaged")
 
     monkeypatch.setattr(dataset_sampling, "_HELD_MAPS", 1)
-    assert build(store, tmp_path / "out", ("west", "east")).samples > 600
+    assert build(store, tmp_path / "out", ("west", "east")).card.samples > 600
     assert not dataset_sampling._held
     monkeypatch.setattr(dataset_sampling, "sample_on_maps", failing)
     with pytest.raises(MapError, match="a tile is damaged"):
@@ -160,4 +160,4 @@ def test_the_option_may_be_repeated(store, tmp_path):
     arguments = ["build-dataset", str(tmp_path / "out"), "--store", str(store.root), "--map", "west", "--map", "east"]
     result = CliRunner().invoke(cli, [*arguments, "--quiet", "--json"], catch_exceptions=False)
     assert result.exit_code == 0
-    assert json.loads(result.stdout)["samples"] > 600
+    assert json.loads(result.stdout)["card"]["samples"] > 600

@@ -122,7 +122,7 @@ def test_a_plan_that_another_beats_says_so(source, tmp_path):
     dear = replace(energy, energy_joule=1.1 * energy.energy_joule)
     told = str(replace(found, plans={**found.plans, "energy": dear}))
     assert f"takes less energy than this one ({energy.energy_joule:.0f} J)" in told
-    assert "choose a smaller --step" in told
+    assert "choose a smaller --cell-size" in told
 
 
 def test_a_cost_map_gives_the_same_plan_and_one_of_another_model_is_refused(source, tmp_path):

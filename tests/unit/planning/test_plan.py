@@ -104,7 +104,7 @@ def test_ends_that_cannot_be_used_are_named_together():
         _plan(source, (15.0, 4.0), (4.0, 4.0), "time")
     with pytest.raises(PathError, match=r"are 0\.\d+ m apart"):
         _plan(source, (4.0, 4.0), (4.3, 4.0), "time")
-    with pytest.raises(PathError, match="lie in one cell of 5 m; choose a smaller --step"):
+    with pytest.raises(PathError, match="lie in one cell of 5 m; choose a smaller --cell-size"):
         _plan(source, (1.0, 4.0), (4.0, 4.0), "time", survey=new_survey(MODEL, source, 5.0))
     swapped = lonlat(source, (4.0, 4.0), (26.0, 4.0))[:, ::-1]
     with pytest.raises(PathError, match="axes look swapped") as error:
@@ -118,7 +118,7 @@ def test_no_way_says_what_would_open_one():
         _plan(source, (4.0, 4.0), (20.0, 4.0), "distance")
     mud = plane(24.0, classes=lambda east, _: np.where(np.abs(east - 12.0) < 1.5, 5, 4))
     grass_only = replace(MODEL, class_counts={4: 100}, pixel_classes=(4,))
-    with pytest.raises(PathError, match="--allow-unseen crosses it"):
+    with pytest.raises(PathError, match="--allow-extrapolation crosses it"):
         _plan(mud, (4.0, 4.0), (20.0, 4.0), "distance", model=grass_only)
     found = _plan(mud, (4.0, 4.0), (20.0, 4.0), "time", model=grass_only, allow_unseen=True)
     assert found.totals.reasons["class_not_seen"] >= 3
@@ -127,7 +127,7 @@ def test_no_way_says_what_would_open_one():
 def test_an_end_on_ground_that_is_not_known_says_so_before_all_the_map_is_looked_at():
     source = plane(40.0, classes=lambda east, _: np.where(east > 30.0, 5, 4))
     survey = new_survey(replace(MODEL, class_counts={4: 100}, pixel_classes=(4,)), source, 1.0)
-    with pytest.raises(PathError, match=r"--to: .*class not seen.*--allow-unseen"):
+    with pytest.raises(PathError, match=r"--to: .*class not seen.*--allow-extrapolation"):
         _plan(source, (22.0, 4.0), (33.0, 4.0), "time", survey=survey)
     assert survey.judged.mean() < 0.5
     assert not survey.predicted.any()

@@ -13,7 +13,7 @@ from tcpipe.report.run_report import run_report
 from tcpipe.report.run_series import gate_spans, rail_series, speed_series, thinned, timeline_of
 from tcpipe.store import open_store
 from tcpipe.tables.bits import Quality
-from tcpipe.tables.facts import ClockStep, RunFacts
+from tcpipe.tables.facts import ClockStep, StageFacts
 from tcpipe.tables.findings import Subject, make_finding
 from tcpipe.tables.levels import POWER, REJECTIONS, Sensor
 
@@ -188,7 +188,7 @@ def test_the_same_run_has_the_same_page(tmp_path):
 def test_a_step_of_the_clock_has_its_place_and_its_size():
     track, half = stepped(driven(drive()), 10**12)
     axis = timeline_of(track)
-    facts = RunFacts(clock_steps=(ClockStep(10**18, 1000.0, ("/gnss",)),))
+    facts = StageFacts(clock_steps=(ClockStep(10**18, 1000.0, ("/gnss",)),))
     shown = time_plots(
         axis, lines=[], spans=gate_spans(track, axis, 20.0), facts=facts, refused=REJECTIONS.empty(), labels=False
     )

@@ -18,7 +18,7 @@ from tcpipe.tables.facts import (
     Disagreement,
     FuseFacts,
     Reopening,
-    RunFacts,
+    StageFacts,
     StretchFacts,
 )
 from tcpipe.tables.findings import StageReport, select_findings
@@ -274,7 +274,7 @@ def test_clock_doubtful_when_the_recorder_stamped_what_counts(role, doubtful):
     sensors = {role: Sensor("/t", "x/msg/Y", "f", "why", time_source="log")}
     streams = power_streams({"drive": record()}, sensors=sensors)
     assert flagged(label(straight_track(SPEED), streams), Quality.CLOCK_DOUBTFUL).all() == doubtful
-    stepped = replace(streams, sensors={}, report=StageReport((), RunFacts(epochs=2)))
+    stepped = replace(streams, sensors={}, report=StageReport((), StageFacts(epochs=2)))
     assert flagged(label(straight_track(SPEED), stepped), Quality.CLOCK_DOUBTFUL).all()
 
 

@@ -17,7 +17,7 @@ from tcpipe.tables.facts import (
     FuseFacts,
     GateFacts,
     Reopening,
-    RunFacts,
+    StageFacts,
     StretchFacts,
 )
 from tcpipe.tables.findings import StageReport
@@ -61,7 +61,7 @@ def cut(count=1, **said):
 
 
 def info(**facts):
-    return TrackInfo("run-0", "husky", None, 20.0, "smoother", StageReport((), RunFacts(**{"gate": GATED} | facts)))
+    return TrackInfo("run-0", "husky", None, 20.0, "smoother", StageReport((), StageFacts(**{"gate": GATED} | facts)))
 
 
 def flags(segment, track=None, about=None):
@@ -151,7 +151,7 @@ def test_fixes_that_were_off_dispute_a_segment(role, disputed):
 
 def streams(*, epochs=1, **time_sources):
     sensors = {role: Sensor(f"/{role}", "x/msg/Y", role, "why", time_source=at) for role, at in time_sources.items()}
-    return Streams({}, sensors, "husky", report=StageReport((), RunFacts(epochs=epochs)))
+    return Streams({}, sensors, "husky", report=StageReport((), StageFacts(epochs=epochs)))
 
 
 def clocks(role, *, noted=False, drifts=False, heading_offset_s=None):

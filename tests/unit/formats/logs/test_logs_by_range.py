@@ -96,12 +96,12 @@ def test_a_recording_is_one_run_wherever_it_lies(drives, tmp_path):
         (made,) = ingest([first], store=store.root, recipe=Recipe()).results
         (again,) = ingest([then], store=store.root, recipe=Recipe()).results
         assert (made.status, again.status) == ("done", "unchanged")
-        assert again.run_id == made.run_id
+        assert again.run.run_id == made.run.run_id
         assert again.same_as == str(first)
-        source = store.run_json(made.run_id).source
+        source = store.run_json(made.run.run_id).source
         assert source.sha256_of == ("log" if first == here else "index")
-        assert made.run_id == f"run-{source.sha256[:8]}"
-        assert (again.distance_m, again.segments) == (made.distance_m, made.segments)
+        assert made.run.run_id == f"run-{source.sha256[:8]}"
+        assert (again.run.driven_m, again.run.segments) == (made.run.driven_m, made.run.segments)
     assert len(inspect(store.root, recipe=Recipe()).runs) == 1
 
 
@@ -115,7 +115,7 @@ def test_what_is_broken_in_one_copy_is_read_from_another(drives, tmp_path):
     (damaged,) = ingest(["s3://drives/run.mcap"], store=store, recipe=Recipe()).results
     (whole,) = ingest([here], store=store, recipe=Recipe()).results
     assert (damaged.status, whole.status) == ("damaged", "done")
-    assert damaged.run_id != whole.run_id
+    assert damaged.run.run_id != whole.run.run_id
 
 
 @pytest.mark.parametrize("kind", ["cut", "chunkless"])

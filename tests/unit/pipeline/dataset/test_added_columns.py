@@ -58,7 +58,7 @@ def missing(result):
 def test_tags_and_covariates_are_columns_of_the_samples(store, tmp_path, file_format):
     result = build(store, tmp_path / "out", covariates=weather(tmp_path / "weather.csv"), file_format=file_format)
     rows = read_samples(tmp_path / "out").to_pylist()
-    assert len(rows) == result.samples == 80
+    assert len(rows) == result.card.samples == 80
     for row in rows:
         day = "abcd".index(row["run_id"])
         assert row["tag_season"] == SEASONS[row["run_id"]]
@@ -133,7 +133,7 @@ def test_a_tag_is_held_out_whole(store, tmp_path):
     assert {row["sample_id"]: row["split"] for row in rows} == {
         row["sample_id"]: row["split"] for row in read_samples(tmp_path / "other").to_pylist()
     }
-    assert result.splits["test"] in {20, 40}
+    assert result.card.splits["test"] in {20, 40}
 
 
 def test_a_holdout_wants_a_tag_that_all_runs_carry(store, tmp_path):

@@ -89,7 +89,7 @@ def test_several_maps_are_listed_with_the_flag(store, tmp_path):
     assert "(site, yard)" in line
     assert "--map" in line
     assert "no map 'field'" in refused(store, tmp_path, map_name="field")
-    assert build(store, tmp_path, map_name="yard").samples == 20
+    assert build(store, tmp_path, map_name="yard").card.samples == 20
 
 
 def test_two_robots_are_not_pooled_unasked(store, tmp_path):
@@ -99,7 +99,7 @@ def test_two_robots_are_not_pooled_unasked(store, tmp_path):
     assert "husky, warthog" in line
     assert "--robot" in line
     assert "no run of robot 'jackal'" in refused(store, tmp_path, robot="jackal")
-    assert build(store, tmp_path, robot="warthog").samples == 20
+    assert build(store, tmp_path, robot="warthog").card.samples == 20
 
 
 def test_runs_of_another_recipe_are_left_out_and_named(store, tmp_path):
@@ -111,14 +111,14 @@ def test_runs_of_another_recipe_are_left_out_and_named(store, tmp_path):
     (found,) = select_findings(result.findings, "run-ingested-otherwise")
     assert (found.subject, found.names) == (Subject("run", "b"), {"what": "recipe", "has": recipe_id(other, "husky")})
     assert [of.command for of in found.remedies] == ["tcpipe ingest /logs/b.mcap"]
-    assert (result.samples, result.exit_code) == (20, 3)
+    assert (result.card.samples, result.exit_code) == (20, 3)
 
 
 def test_a_recording_under_two_names_counts_once(store, tmp_path):
     add(store, sha256="5ad0")
     add(store, "copy", sha256="5ad0")
     result = build(store, tmp_path)
-    assert result.samples == 20
+    assert result.card.samples == 20
     assert twice(result) == [("copy", "a", 20, 20)]
 
 
@@ -126,7 +126,7 @@ def test_one_drive_recorded_twice_counts_once(store, tmp_path):
     add(store, start_ns=10**18)
     add(store, "b", start_ns=10**18 + 300_000_000)
     result = build(store, tmp_path)
-    assert result.samples == 20
+    assert result.card.samples == 20
     assert twice(result) == [("b", "a", 20, 20)]
     assert [run.run_id for run in open_dataset(tmp_path / "out").card.runs] == ["a"]
 
@@ -139,12 +139,12 @@ def test_a_recording_that_overlaps_another_counts_once_where_it_does(store, tmp_
     add(store, late, x=(-9.0, 18.0), start_ns=10**18 + 10 * 1_200_000_000 + skew_ns)
     result = build(store, tmp_path)
     starts_m = np.sort(pq.read_table(tmp_path / "out" / "samples.parquet")["start_lon_deg"].to_numpy())
-    assert result.samples == 37
+    assert result.card.samples == 37
     assert np.diff(starts_m).min() > 0.9 * np.median(np.diff(starts_m))  # no metre of it twice
-    assert result.ledger_m["recorded_twice"] == pytest.approx(20)
+    assert result.card.ledger_m["recorded_twice"] == pytest.approx(20)
     second, first = sorted(names, reverse=True)
     assert twice(result) == [(second, first, 20, 30 if second == whole else 27)]
-    assert sum(result.ledger_m.values()) == pytest.approx(30 + 27 + 5)
+    assert sum(result.card.ledger_m.values()) == pytest.approx(30 + 27 + 5)
     assert verify(tmp_path / "out").problems == ()
 
 
@@ -152,7 +152,7 @@ def test_a_drive_that_was_recorded_in_two_pieces_is_one_and_a_short_one_after_it
     add(store, "a", x=(-15.0, 5.0), start_ns=10**18)
     add(store, "b", x=(5.0, 7.0), start_ns=10**18 + 20 * 1_200_000_000 + 50_000_000)
     result = build(store, tmp_path)
-    assert result.samples == 22
+    assert result.card.samples == 22
     assert twice(result) == []
 
 
@@ -160,7 +160,7 @@ def test_two_robots_at_one_time_and_one_robot_at_two_times_are_two_drives(store,
     add(store, start_ns=10**18)
     add(store, "b", (5.0,), start_ns=10**18)  # elsewhere
     add(store, "c", start_ns=2 * 10**18)  # the same place, later
-    assert build(store, tmp_path).samples == 60
+    assert build(store, tmp_path).card.samples == 60
 
 
 def test_no_segments(store, tmp_path):
@@ -189,11 +189,11 @@ def test_no_power_is_no_sample(store, tmp_path):
     assert "none with power" in refused(store, tmp_path)
     add(store, "b", (3.0,))
     result = build(store, tmp_path, page=True)
-    assert result.samples == 20
-    assert result.ledger_m["no_power"] == pytest.approx(20)
+    assert result.card.samples == 20
+    assert result.card.ledger_m["no_power"] == pytest.approx(20)
     (found,) = select_findings(result.findings, "run-without-samples")
     assert (found.subject, found.names) == (Subject("run", "a"), {"lacks": "power"})
-    assert sum(result.ledger_m.values()) == pytest.approx(45)
+    assert sum(result.card.ledger_m.values()) == pytest.approx(45)
 
 
 def test_a_map_that_does_not_cover_the_runs(store, tmp_path):
@@ -217,9 +217,9 @@ def test_a_map_that_lost_a_part_is_refused_and_not_taken_for_a_hole(store, tmp_p
 def test_metres_off_the_map_are_in_the_ledger(store, tmp_path):
     add(store, x=(9.5, 29.5))
     result = build(store, tmp_path)
-    assert result.samples == 10
-    assert result.ledger_m["outside_map"] == pytest.approx(10)
-    assert result.ledger_m["kept"] == pytest.approx(10)
+    assert result.card.samples == 10
+    assert result.card.ledger_m["outside_map"] == pytest.approx(10)
+    assert result.card.ledger_m["kept"] == pytest.approx(10)
 
 
 def test_a_region_elsewhere(store, tmp_path):
@@ -262,9 +262,9 @@ def test_an_exclude_region_takes_samples_out_of_the_dataset(store, tmp_path):
     region = region_file(tmp_path / "r.geojson", box(-20, -20, 20, 20), box(-5, -2, 5, 2), splits=(None, "exclude"))
     result = build(store, tmp_path, page=True, split=region)
     # 20 segments from -10 to 10: 10 lie in the exclude region, 1 m of gap to each border goes to the buffer
-    assert result.ledger_m["split_excluded"] == pytest.approx(10)
-    assert result.splits["buffer"] == 4
-    assert result.samples == 10
+    assert result.card.ledger_m["split_excluded"] == pytest.approx(10)
+    assert result.card.splits["buffer"] == 4
+    assert result.card.samples == 10
 
 
 @pytest.mark.parametrize("kind", ["file", "directory", "dataset with notes"])
@@ -305,7 +305,7 @@ def test_a_dataset_that_lost_a_file_is_built_again(store, tmp_path):
 def test_holdout_and_seed_overrule_the_recipe(store, tmp_path):
     add(store)
     sample = build(store, tmp_path, holdout="sample")
-    assert (sample.splits["train"], sample.splits["test"]) == (16, 4)
+    assert (sample.card.splits["train"], sample.card.splits["test"]) == (16, 4)
     first = set(open_dataset(tmp_path / "out")["test"].samples["sample_id"].to_pylist())
     build(store, tmp_path, holdout="sample", seed=1, force=True)
     assert set(open_dataset(tmp_path / "out")["test"].samples["sample_id"].to_pylist()) != first
@@ -314,7 +314,7 @@ def test_holdout_and_seed_overrule_the_recipe(store, tmp_path):
 def test_one_run_cannot_be_held_out_and_it_is_said(store, tmp_path):
     add(store)
     result = build(store, tmp_path, page=True, holdout="run")
-    assert result.splits["test"] == 0
+    assert result.card.splits["test"] == 0
     (found,) = select_findings(result.findings, "split-empty")
     assert (found.subject, found.names) == (Subject("split", "test"), {"reason": "one_run"})
     assert result.exit_code == 3

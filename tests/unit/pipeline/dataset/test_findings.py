@@ -13,7 +13,7 @@ from tcpipe.errors import DatasetError
 from tcpipe.formats.dataset_card import RunSource, group_dataset_findings, judge_dataset
 from tcpipe.formats.finding_lines import format_mixed_groups
 from tcpipe.pipeline.dataset.build import build_dataset
-from tcpipe.pipeline.dataset.findings import count_flagged
+from tcpipe.pipeline.dataset.card import count_flagged
 from tcpipe.pipeline.diff import diff
 from tcpipe.recipe import Recipe
 from tcpipe.store import open_store
@@ -125,8 +125,8 @@ def test_they_stand_in_the_commands_answer_the_card_and_what_is_opened(built):
     assert (card.doubtful.samples, card.doubtful.share) == (5, 0.125)
     (flagged,) = select_findings(card.findings, "samples-flagged")
     assert (flagged.severity, flagged.names) == ("warning", {"flag": "weak_gnss"})
-    assert card.findings_by_run == result.findings_by_run == {"a": (slow(0.6),), "b": (slow(0.7),)}
-    assert card.verdict == result.verdict
+    assert card.findings_by_run == result.card.findings_by_run == {"a": (slow(0.6),), "b": (slow(0.7),)}
+    assert card.verdict == result.card.verdict
 
 
 def test_the_page_has_one_verdict_with_the_worst_first_and_no_praise(built):

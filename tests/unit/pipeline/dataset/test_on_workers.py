@@ -54,7 +54,7 @@ def made(tmp_path_factory, many_tasks):
     add_run(store, "a", segments("a", *lanes(np.linspace(-14.0, 14.0, 30), -10.0, 10.0)))
     for kind in ("zarr", "parquet"):
         built = build_dataset(directory / kind, store=store.root, recipe=Recipe(), file_format=kind)
-        assert built.samples == ROWS
+        assert built.card.samples == ROWS
     return directory
 
 
@@ -152,4 +152,4 @@ def test_who_ends_second_on_one_spool_is_told(store, tmp_path, monkeypatch):
     with pytest.raises(StoreError, match=r"another build of the same was first, .* run the same command again"):
         build(store.root, tmp_path / "out")
     monkeypatch.undo()
-    assert build(store.root, tmp_path / "out").samples == ROWS
+    assert build(store.root, tmp_path / "out").card.samples == ROWS

@@ -64,7 +64,7 @@ def test_a_run_whose_ground_lies_elsewhere_on_the_map_is_a_warning(built):
     sizes = [shifted.numbers[name] for name in ("shift_m", "east_m", "north_m")]
     assert sizes == pytest.approx([1.7, -1.5, 0.8], abs=0.05)
     assert shifted.numbers["std_m"] < 0.1
-    assert result.verdict.position == "not usable"
+    assert result.card.verdict.position == "not usable"
     assert "error: off: its ground lies 1.7" in str(result)
 
 
