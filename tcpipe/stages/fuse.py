@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -71,9 +72,17 @@ def fuse_run(streams: Streams, config: FuseConfig, *, run_id: str) -> Track:
         audit=audit.facts,
         clock_offsets=clocks.facts,
     )
-    report = StageReport(streams.report.findings + findings, facts)
+    report = StageReport((*_drop_places(streams.report.findings, findings), *findings), facts)
     info = TrackInfo(run_id, streams.robot, datum, config.rate_hz, config.estimator, report)
     return Track(table, rejections_table(inputs, fused.found), info)
+
+
+def _drop_places(read: tuple[Finding, ...], fused: tuple[Finding, ...]) -> Iterator[Finding]:
+    """Yield the findings of reading; one without extrinsics suggests none where fusing has estimated them."""
+    estimated = {role for finding in fused for of in finding.remedies for role in of.recipe.get("read.placement", ())}
+    for finding in read:
+        is_estimated = finding.code == "sensor-not-placed" and finding.subject.name in estimated
+        yield replace(finding, remedies=()) if is_estimated else finding
 
 
 def _find_nothing(streams: Streams, inputs: FusionInputs, run: Subject) -> Finding:
