@@ -21,6 +21,7 @@ from tcpipe.learning.models import Model
 from tcpipe.learning.physics_model import fit_physics_model, standing_of
 from tcpipe.learning.predictions import Measured
 from tcpipe.learning.ratios import ratio_of_errors
+from tcpipe.tables.findings import Finding, Subject, make_finding
 
 logger = logging.getLogger("tcpipe")
 
@@ -44,7 +45,7 @@ Predictor = Callable[[Split], Array]
 
 def compared(
     ours: Model, data: Dataset, sets: Mapping[str, Measured], said: Mapping[str, Costs], *, seed: int
-) -> tuple[list[Compared], list[str]]:
+) -> tuple[list[Compared], list[Finding]]:
     """Return the errors of every baseline on the very samples of a model's, with the ratios of the model's to them; and what lacks.
 
     Parameters
@@ -57,7 +58,8 @@ def compared(
     own = {"table": TREES, "physics": PHYSICS}.get(kind)
     train = _fitted_on(data["train"], ours)
     if not len(train):
-        return [], ["no baselines: the dataset has no labelled samples in split train to fit them on"]
+        names = {"error": "the dataset has no labelled samples in split train"}
+        return [], [make_finding("baseline-missing", Subject("model", "baselines"), names=names)]
     predictors, lacking = _baselines(train, ours, [name for name in SIMPLEST_FIRST if name != own])
     logger.info("baselines: %s, fitted on %d samples", ", ".join(predictors), len(train))
     found: list[Compared] = []
@@ -78,15 +80,16 @@ def _fitted_on(train: Split, ours: Model) -> Split:
     return fitted if len(fitted) else labelled
 
 
-def _baselines(train: Split, ours: Model, wanted: Sequence[str]) -> tuple[dict[str, Predictor], list[str]]:
-    """Return the baselines by name, and a line for each that cannot be fitted."""
-    found, lacking = dict(_curves(train)), []
+def _baselines(train: Split, ours: Model, wanted: Sequence[str]) -> tuple[dict[str, Predictor], list[Finding]]:
+    """Return the baselines by name, and a finding for each that cannot be fitted."""
+    found, lacking = dict(_curves(train)), list[Finding]()
     for name, fit in ((PHYSICS, _physics), (TREES, _trees)):
         if name in wanted:
             try:
                 found[name] = fit(train, ours)
             except ModelError as error:
-                lacking.append(f"no baseline '{name}': {error.problems[0]}")
+                names = {"error": error.problems[0]}
+                lacking.append(make_finding("baseline-missing", Subject("model", name), names=names))
     return found, lacking
 
 
@@ -172,6 +175,8 @@ class Standing:
     beats_curves: bool | None
     """Whether it is surely better than every curve over class and slope; None of too few groups to say."""
     is_worse: bool
+    ratio: float
+    """Of the model's RMSE to that of the best."""
     text: str
 
 
@@ -195,7 +200,8 @@ def standing(found: Sequence[Compared], split: str, quantity: str) -> Standing |
     worse = ratio.low is not None and ratio.low > 1.0 and (ratio.value or 0.0) > _ALIKE
     curves = [row for row in rows if row.baseline in CURVES.values()]
     beats = None if ratio.high is None else all(map(_is_better, curves))
-    return Standing(best.baseline, _is_better(best), beats, worse, _verdict(rows, best, is_worse=worse))
+    text = _verdict(rows, best, is_worse=worse)
+    return Standing(best.baseline, _is_better(best), beats, worse, ratio.value or 0.0, text)
 
 
 def _is_better(row: Compared) -> bool:

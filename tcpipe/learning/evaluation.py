@@ -29,14 +29,17 @@ from tcpipe.learning.evaluation_facts import (
     Plotted,
     SplitErrors,
 )
+from tcpipe.learning.evaluation_findings import find_weaknesses
 from tcpipe.learning.leakage import by_blocks, leakage_of
 from tcpipe.learning.metrics import ALL, Array, Errors, Spread, errors_by_class, label_floor, mean_of_draws
 from tcpipe.learning.models import Model, load_model
 from tcpipe.learning.predicted_samples import predictions_table
 from tcpipe.learning.predictions import Measured, check_fit, measured, predicted_costs, spreads_of
 from tcpipe.learning.training import Variant, dataset_checksum, train, training_task
-from tcpipe.learning.wei_isler import FEWEST, OURS, PER_CLASS, Trained, energy_table
+from tcpipe.learning.wei_isler import OURS, PER_CLASS, Trained, energy_table
 from tcpipe.robots.profiles import Robot
+from tcpipe.tables.findings import Finding, Subject, make_finding
+from tcpipe.tables.verdicts import judge
 from tcpipe.terrain.classes import NODATA_ID
 
 logger = logging.getLogger("tcpipe")
@@ -121,9 +124,10 @@ def evaluate(
         baselines=tuple(baselines),
         blocks=by_blocks(ours, names),
         repeatability=_repeatability(data.card, ENERGIES[ours.label_energy]),
-        warnings=(*lacking, *_warnings(ours, data, sets), *_left_out(data, sets, energy.errors)),
         plots={name: _plotted(part, said[name], config.plotted) for name, part in sets.items()},
     )
+    findings = (*lacking, *_find_mismatches(ours, data, sets, energy.errors), *find_weaknesses(evaluation))
+    evaluation = replace(evaluation, findings=findings, verdict=judge(findings))
     return evaluation, predictions_table(sets, said, spreads)
 
 
@@ -207,41 +211,25 @@ def _time(ours: Model, sets: Sets, said: Said, *, max_velocity_mps: float | None
     return found
 
 
-def _warnings(ours: Model, data: Dataset, sets: Sets) -> list[str]:
-    """Return what a reader of the figures should know."""
-    lines = []
-    if "unseen" not in sets:
-        lines.append(
-            "the dataset has no unseen samples with labels: it was built without a --split region, or nothing lies outside it"
-        )
-    for name, found in sets.items():
-        for class_id, called in found.names.items():
-            count = int((found.class_ids == class_id).sum())
-            if class_id not in {NODATA_ID, *ours.class_counts}:
-                lines.append(f"{called}: {count} samples of {name}, none in training: the model never saw this class")
-    if (kind := ours.card.training.config.model) != "resnet18":
-        lines.append(
-            f"the model is {'a table' if kind == 'table' else 'physics'}: the networks of Wei and Isler are trained beside a network "
-            "alone, and are not here"
-        )
+def _find_mismatches(
+    ours: Model, data: Dataset, sets: Sets, energy: Mapping[str, Mapping[str, Errors]]
+) -> Iterator[Finding]:
+    """Yield where model and dataset do not fit, and the samples that some figures are without."""
     if dataset_checksum(data.card) != ours.card.dataset.sha256:
-        lines.append(
-            f"the model was trained on another dataset ({ours.card.dataset.name}, {ours.card.dataset.sha256[:12]}): "
-            "its test samples here may have been trained on there"
-        )
-    return lines
-
-
-def _left_out(data: Dataset, sets: Sets, energy: Mapping[str, Mapping[str, Errors]]) -> Iterator[str]:
-    """Yield a line for samples that some figures are without."""
+        names = {"dataset": ours.card.dataset.name}
+        yield make_finding("model-of-another-dataset", Subject("model", ours.name), names=names)
     for name, found in sets.items():
-        if unlabelled := len(data[name]) - len(found.split):
-            yield f"{unlabelled} of {len(data[name])} samples of {name} have no label and are in no figure"
+        subject, total = Subject("split", name), len(data[name])
+        for class_id, called in found.names.items():
+            if class_id not in {NODATA_ID, *ours.class_counts}:
+                count = int((found.class_ids == class_id).sum())
+                unseen = Subject("class", called)
+                yield make_finding("class-not-in-training", unseen, names={"split": name}, sample_count=count)
+        if unlabelled := total - len(found.split):
+            yield make_finding("samples-without-label", subject, unlabelled_count=unlabelled, sample_count=total)
         if PER_CLASS in energy and (without := len(found.split) - energy[PER_CLASS][name].count):
-            yield (
-                f"{without} of {len(found.split)} samples of {name} are of classes with too few training samples for a network of "
-                f"their own (fewer than {FEWEST}, or none in a fold) and are not in table IV"
-            )
+            total = len(found.split)
+            yield make_finding("classes-without-network", subject, left_count=without, sample_count=total)
 
 
 def _plotted(found: Measured, said: Mapping[str, Array], count: int) -> Plotted:

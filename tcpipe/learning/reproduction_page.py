@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from typing import Literal
 
 from tcpipe.learning.claims import Claim
 from tcpipe.learning.evaluation_facts import Evaluation
 from tcpipe.learning.evaluation_figures import EvaluatedSamples
 from tcpipe.learning.evaluation_files import SIMULATED
 from tcpipe.learning.evaluation_page import audit_lines, evaluation_page
-from tcpipe.learning.evaluation_verdict import Statement
 from tcpipe.learning.fidelity import differences
 from tcpipe.learning.metrics import ALL, QUANTITIES, UNITS
 from tcpipe.learning.plant_floor import CLASS_AND_SLOPE
@@ -19,12 +17,6 @@ from tcpipe.report.page import Section
 from tcpipe.simulation.paper_site import paper_parameters
 
 _QUICK = "This is a quick run: a small site, a narrow network, few epochs. It shows that everything runs; believe no figure of it."
-_KINDS: Mapping[str, Literal["good", "thin", "doubtful"]] = {
-    "held": "good",
-    "NOT held": "doubtful",
-    "open": "thin",
-    "not measured": "thin",
-}
 _PAPER_SHARES = {"grass": 51, "mud": 9, "unpaved road": 20, "paved road": 20}
 _PAPER_COUNTS = {"train": 5142, "test": 1286, "unseen": 4458}
 
@@ -62,13 +54,6 @@ def reproduction_page(
             _sources(quick=quick),
         ],
         warnings=[SIMULATED, *([_QUICK] if quick else [])],
-        claimed=[
-            Statement(
-                kind, f"Claims {name}: {'; '.join(f'{of.says} ({of.split})' for of in claims if of.verdict == name)}."
-            )
-            for name, kind in _KINDS.items()
-            if name in verdicts
-        ],
     )
 
 

@@ -206,17 +206,12 @@ def _along(
 
 def in_words(drive: DriveCost) -> list[str]:
     """Return what a drive shows, as plain lines."""
-    lines = [] if drive.held_back else [
-        f"warning: {drive.log}: {drive.samples_in_training} of its samples trained the model: it is not held back, and shows nothing"
-    ]  # fmt: skip
     rest = ", ".join(f"{metres:.0f} m {name.replace('_', ' ')}" for name, metres in drive.rest_m.items())
-    lines.append(
+    lines = [
         f"{drive.run_id}: {drive.compared_m:.0f} of {drive.driven_m:.0f} m driven are compared; {drive.segments_m:.0f} m are in segments"
-        + (f", of them not compared: {rest}" if rest else "")
-    )
-    lines.append(
-        f"{drive.run_id}: {drive.near_training_percent:.0f} % of its segments are within {CLOSE:g} chords of a training sample"
-    )
+        + (f", of them not compared: {rest}" if rest else ""),
+        f"{drive.run_id}: {drive.near_training_percent:.0f} % of its segments are within {CLOSE:g} chords of a training sample",
+    ]
     above = ", above standing" if drive.label_energy == "above_standing" else ""
     for called, of, unit in (("time", drive.duration_s, "s"), (f"energy{above}", drive.energy_joule, "J")):
         if drive.compared_m:

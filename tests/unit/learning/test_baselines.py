@@ -81,7 +81,7 @@ def test_what_cannot_be_fitted_is_said(sets, monkeypatch):
         Split, "column", lambda split, name: np.zeros(len(split)) if name == "fold" else real(split, name)
     )
     rows, lacking = compared(model_of(), data, parts, said_by(parts), seed=0)
-    assert any("no baseline 'gradient boosting'" in line and "in one fold" in line for line in lacking)
+    assert any(of.subject.name == "gradient boosting" and "in one fold" in of.names["error"] for of in lacking)
     assert {row.baseline for row in rows} == set(SIMPLEST_FIRST) - {"gradient boosting"}
     monkeypatch.setattr(Split, "labels", property(lambda split: np.full((len(split), 2), np.nan, np.float32)))
     assert compared(model_of(), data, parts, {}, seed=0)[0] == []

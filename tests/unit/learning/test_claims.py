@@ -31,7 +31,7 @@ def _run(**ratios):
         tcpipe_version="", key="", model=EvaluatedModel("", "", CARD.training), dataset=EvaluatedDataset("", "", {}),
         config=EvaluateConfig(), splits={"unseen": SplitErrors(10, {}, (), {}, {})}, ablation=(), energy={}, time={},
         networks=tuple(row for row in rows if row.baseline == PER_CLASS),
-        baselines=tuple(row for row in rows if row.baseline != PER_CLASS), repeatability={}, warnings=(), plots={},
+        baselines=tuple(row for row in rows if row.baseline != PER_CLASS), repeatability={}, plots={},
     )  # fmt: skip
 
 
