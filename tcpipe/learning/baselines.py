@@ -16,11 +16,10 @@ from tcpipe.errors import ModelError
 from tcpipe.geometry.datum import enu_from_geodetic
 from tcpipe.learning.curves import Curves, Form, fit_curves
 from tcpipe.learning.evaluation_facts import SPLITS, Compared
-from tcpipe.learning.metrics import LEAST, LEAST_VELOCITY_MPS, Array, Costs, costs, errors
+from tcpipe.learning.metrics import LEAST, LEAST_VELOCITY_MPS, Array, Costs, costs, errors, ratio_of_errors
 from tcpipe.learning.models import Model
 from tcpipe.learning.physics_model import fit_physics_model, standing_of
 from tcpipe.learning.predictions import Measured
-from tcpipe.learning.ratios import ratio_of_errors
 from tcpipe.tables.findings import Finding, Subject, make_finding
 
 logger = logging.getLogger("tcpipe")

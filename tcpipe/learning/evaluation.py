@@ -9,9 +9,11 @@ from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
+from numpy.typing import NDArray
 
 from tcpipe import __version__
 from tcpipe.balance.repeats import Floor
+from tcpipe.cost.prediction_errors import centring_of
 from tcpipe.dataset import Dataset, Split, open_dataset
 from tcpipe.dataset.energies import ENERGIES, Energy
 from tcpipe.errors import DatasetError
@@ -26,18 +28,19 @@ from tcpipe.learning.evaluation_facts import (
     EvaluatedDataset,
     EvaluatedModel,
     Evaluation,
+    Leakage,
     Plotted,
     SplitErrors,
 )
 from tcpipe.learning.evaluation_findings import find_weaknesses
-from tcpipe.learning.leakage import by_blocks, leakage_of
-from tcpipe.learning.metrics import ALL, Array, Errors, Spread, errors_by_class, label_floor, mean_of_draws
+from tcpipe.learning.metrics import ALL, Array, Errors, Spread, costs, errors_by_class, label_floor, mean_of_draws
 from tcpipe.learning.models import Model, load_model
 from tcpipe.learning.predicted_samples import predictions_table
 from tcpipe.learning.predictions import Measured, check_fit, measured, predicted_costs, spreads_of
 from tcpipe.learning.training import Variant, dataset_checksum, train, training_task
 from tcpipe.learning.wei_isler import OURS, PER_CLASS, Trained, energy_table
 from tcpipe.robots.profiles import Robot
+from tcpipe.splits.neighbours import CLOSE, PLACES, are_near, middles_deg
 from tcpipe.tables.findings import Finding, Subject, make_finding
 from tcpipe.tables.verdicts import judge
 from tcpipe.terrain.classes import NODATA_ID
@@ -243,3 +246,38 @@ def _plotted(found: Measured, said: Mapping[str, Array], count: int) -> Plotted:
         "E_predicted": said["E"][at].tolist(),
         "T_predicted": said["T"][at].tolist(),
     }
+
+
+_UNKNOWN = {0: "unknown"}
+
+
+def leakage_of(data: Dataset, held: Split) -> Leakage | None:
+    """Return how near the samples of a split are to those of train; None where either has no samples with a place."""
+    ours, theirs = (middles_deg({name: part.column(name) for name in PLACES}) for part in (held, data["train"]))
+    within_m = CLOSE * data.card.recipe.segment.chord_m
+    near = are_near(ours, theirs, within_m=within_m)
+    if not len(near) or not len(theirs):
+        return None
+    audit = next((part for part in data.card.split.audit if part.split == held.name and part.samples), None)
+    sharing = None if audit is None else 100.0 * audit.overlapping_samples / audit.samples
+    return Leakage(data.card.split.holdout, within_m, 100.0 * float(near.mean()), sharing)
+
+
+def by_blocks(model: Model, names: Mapping[int, str]) -> ErrorsByClass | None:
+    """Return the errors on the samples that a model keeps as held out, by class; None if it keeps none of power and velocity.
+
+    Folds are blocks of ground, so that this is what the errors are where blocks are held out. A network was stopped by its fold, and
+    of a table the folds told how many trees are best: both are a little too small.
+    """
+    found: Mapping[str, NDArray[np.generic]] = model.residuals
+    if "power_predicted_watt" not in found or not len(found["power_predicted_watt"]):
+        return None
+    power, velocity, said_power, said_velocity = (
+        found[name].astype(np.float64)
+        for name in ("power_watt", "velocity_mps", "power_predicted_watt", "velocity_predicted_mps")
+    )
+    class_ids = np.nan_to_num(found["terrain_class"].astype(np.float64)).astype(np.int64)
+    centred = centring_of(found).apply(said_power, said_velocity, class_ids)
+    known = {**_UNKNOWN, **names}
+    own = {number: known.get(number, str(number)) for number in np.unique(class_ids).tolist()}
+    return errors_by_class(costs(*centred, model.chord_m), costs(power, velocity, model.chord_m), class_ids, own)

@@ -9,9 +9,8 @@ from typing import Annotated, Literal, TypeAlias, TypedDict
 from tcpipe.balance.repeats import Floor
 from tcpipe.dataset.energies import EnergyName
 from tcpipe.learning.fitting import Seed
-from tcpipe.learning.metrics import Errors
+from tcpipe.learning.metrics import Errors, Ratio
 from tcpipe.learning.model_card import Training
-from tcpipe.learning.ratios import Ratio
 from tcpipe.tables.bounds import Bounds
 from tcpipe.tables.facts import ABSENT
 from tcpipe.tables.findings import Finding

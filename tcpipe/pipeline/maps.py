@@ -21,7 +21,7 @@ from tcpipe.formats.maps.terrain_polygons import is_drawn
 from tcpipe.formats.maps.text import map_lines
 from tcpipe.formats.seals import file_checksum, seal_of
 from tcpipe.formats.store_mark import gone_if_empty
-from tcpipe.report.overview import quick_look, write_quick_look
+from tcpipe.report.pictures import quick_look, write_quick_look
 from tcpipe.store import Store, open_store
 from tcpipe.tables.levels import SAMPLES
 from tcpipe.terrain.classes import ClassScheme

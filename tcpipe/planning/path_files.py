@@ -16,8 +16,7 @@ from tcpipe.formats.json_files import digest, recast
 from tcpipe.formats.maps.map_files import MapFile
 from tcpipe.formats.seals import file_checksum, read_sealed_as, write_sealed
 from tcpipe.planning.cost_model import CostModel
-from tcpipe.planning.path_cost import PathTotals, cost_of_path
-from tcpipe.planning.path_table import check_ending, write_pieces
+from tcpipe.planning.path_cost import PathTotals, check_ending, cost_of_path, write_pieces
 from tcpipe.tables.findings import Finding, Subject, make_finding
 
 VERSION = "1.2"

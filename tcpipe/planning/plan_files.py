@@ -17,11 +17,11 @@ from tcpipe.formats.geojson_lines import LineFeature, check_lonlat, line_feature
 from tcpipe.formats.json_files import digest, read_as, recast, write_json
 from tcpipe.formats.maps.map_files import MapFile
 from tcpipe.formats.seals import broken_seal, file_checksum
+from tcpipe.planning.cost_grid import Survey, new_survey, survey_from
 from tcpipe.planning.cost_map import CARD, CostMapCard, cost_map_key, open_cost_map, read_cost_map_card
 from tcpipe.planning.cost_model import CostModel, check_model
 from tcpipe.planning.path_files import cost_text, find_doubts
 from tcpipe.planning.plan import OBJECTIVES, Objective, PlanTotals, plan_path
-from tcpipe.planning.survey import Survey, new_survey, survey_from
 from tcpipe.tables.bounds import Bounds
 from tcpipe.tables.catalogue import threshold
 from tcpipe.tables.findings import LEFT_OUT, Finding, Subject, make_finding

@@ -74,7 +74,7 @@ from tcpipe.pipeline.dataset.writing import write_patches
 from tcpipe.pipeline.log_writer import LogWriter, open_log
 from tcpipe.recipe import Recipe
 from tcpipe.report.dataset_report import dataset_report
-from tcpipe.report.overview import class_overview, maps_overview, relief_overview, write_overview
+from tcpipe.report.pictures import class_overview, maps_overview, relief_overview, write_overview
 from tcpipe.splits.assignment import SPLITS
 from tcpipe.splits.audit import HeldOut
 from tcpipe.splits.regions import Regions

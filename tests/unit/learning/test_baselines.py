@@ -10,10 +10,9 @@ from tcpipe.dataset import Split, open_dataset
 from tcpipe.learning.baselines import SIMPLEST_FIRST, _groups, compared, verdicts
 from tcpipe.learning.evaluation_facts import Compared
 from tcpipe.learning.fitting import FitConfig
-from tcpipe.learning.metrics import Errors, costs
+from tcpipe.learning.metrics import Errors, Ratio, costs
 from tcpipe.learning.models import Model
 from tcpipe.learning.predictions import measured
-from tcpipe.learning.ratios import Ratio
 
 
 @pytest.fixture(scope="module")

@@ -12,8 +12,7 @@ from tcpipe.learning.evaluation_facts import (
     Evaluation,
     SplitErrors,
 )
-from tcpipe.learning.metrics import Errors
-from tcpipe.learning.ratios import Ratio
+from tcpipe.learning.metrics import Errors, Ratio
 from tcpipe.learning.wei_isler import PER_CLASS
 
 SURE = Ratio(0.8, 0.7, 0.9)

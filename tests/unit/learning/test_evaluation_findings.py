@@ -16,8 +16,7 @@ from tcpipe.learning.evaluation_facts import (
 )
 from tcpipe.learning.evaluation_findings import find_weaknesses
 from tcpipe.learning.fitting import FitConfig
-from tcpipe.learning.metrics import Errors
-from tcpipe.learning.ratios import Ratio
+from tcpipe.learning.metrics import Errors, Ratio
 from tcpipe.tables.verdicts import judge
 
 GOOD = Errors(500, 12.0, 6.0, 500, 90.0, 3.0, 6.0)
