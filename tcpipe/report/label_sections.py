@@ -1,4 +1,4 @@
-"""Sections on labels that the pages of runs and datasets share: quality bits, the error budget, the physics of a robot."""
+"""Sections on labels: quality bits, error budget, physics of the robot, and how samples are spread over ground, slope and speed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Pictures inside a page: WebP as data URIs, sheets of many small ones, and grey values made colours."""
+"""Pictures: of patches and maps as WebP inside a page, and quick looks of maps as files."""
 
 from __future__ import annotations
 
