@@ -167,30 +167,31 @@ def beside(
 
 @dataclass(frozen=True, slots=True)
 class Standing:
-    """How a model stands beside the simplest: the best of them, what is sure, and the same in words."""
+    """How a model compares with the baselines, of which ``best`` has the smallest RMSE."""
 
-    best: str
+    best: Compared
     beats_all: bool
     beats_curves: bool | None
-    """Whether it is surely better than every curve over class and slope; None of too few groups to say."""
+    """Whether it is significantly better than every curve over class and slope; None of too few groups."""
     is_worse: bool
-    ratio: float
-    """Of the model's RMSE to that of the best."""
-    text: str
 
 
-def verdicts(found: Sequence[Compared]) -> list[str]:
-    """Return in words, for energy and time of each split, whether the model is better than the simplest, and by how much."""
-    return [
-        f"{split}, {called}: {of.text}"
-        for split in SPLITS
-        for quantity, called in (("E", "energy E"), ("T", "time T"))
-        if (of := standing(found, split, quantity)) is not None
-    ]
+def describe_ratios(found: Sequence[Compared]) -> list[str]:
+    """Return the ratio of RMSE to that of the best baseline, for energy and time of each split."""
+    lines = []
+    for split in SPLITS:
+        for quantity, called in (("E", "energy E"), ("T", "time T")):
+            if (of := standing(found, split, quantity)) is not None:
+                ratio, groups = of.best.rmse_ratio, f"{of.best.groups} {of.best.drawn_by}"
+                few = f"{groups} are too few for an interval"
+                interval = few if ratio.low is None else f"95 % CI {ratio.low:.2f} to {ratio.high:.2f}, {groups}"
+                best = f"RMSE ratio to '{of.best.baseline}', the best baseline, {ratio.value:.2f}"
+                lines.append(f"{split}, {called}: {best} ({interval})")
+    return lines
 
 
 def standing(found: Sequence[Compared], split: str, quantity: str) -> Standing | None:
-    """Return how the model stands in a quantity of a split; None where no ratio is known."""
+    """Return how the model compares in a quantity of a split; None where no ratio is known."""
     rows = [row for row in found if (row.split, row.quantity) == (split, quantity) and row.rmse_ratio.value is not None]
     if not rows:
         return None
@@ -199,34 +200,8 @@ def standing(found: Sequence[Compared], split: str, quantity: str) -> Standing |
     worse = ratio.low is not None and ratio.low > 1.0 and (ratio.value or 0.0) > _ALIKE
     curves = [row for row in rows if row.baseline in CURVES.values()]
     beats = None if ratio.high is None else all(map(_is_better, curves))
-    text = _verdict(rows, best, is_worse=worse)
-    return Standing(best.baseline, _is_better(best), beats, worse, ratio.value or 0.0, text)
+    return Standing(best, _is_better(best), beats, worse)
 
 
 def _is_better(row: Compared) -> bool:
     return row.rmse_ratio.high is not None and row.rmse_ratio.high < 1.0
-
-
-def _verdict(rows: Sequence[Compared], best: Compared, *, is_worse: bool) -> str:
-    ratio = best.rmse_ratio
-    if ratio.low is None or ratio.high is None:
-        return (
-            f"best baseline is '{best.baseline}', RMSE of the model {ratio.value:.2f} of its; "
-            f"{best.groups} {best.drawn_by} are too few to say how sure that is"
-        )
-    sure = (
-        f"RMSE {ratio.value:.2f} of its, 95 %: {ratio.low:.2f} to {ratio.high:.2f} over {best.groups} {best.drawn_by}"
-    )
-    if _is_better(best):
-        by = 100.0 * (1.0 - (ratio.value or 0.0))
-        return f"the model is better than every baseline, than the best, '{best.baseline}', by {by:.0f} % ({sure})"
-    equal = next(
-        name for name in SIMPLEST_FIRST for row in rows
-        if row.baseline == name and not _is_better(row)
-    )  # fmt: skip
-    simplest = (
-        "" if equal == best.baseline else f"; already '{equal}' is no worse than the model, as far as can be told"
-    )
-    if is_worse:
-        return f"'{best.baseline}' is better than the model by {100.0 * (1.0 - 1.0 / (ratio.value or 1.0)):.0f} % ({sure}){simplest}"
-    return f"the model and '{best.baseline}' cannot be told apart ({sure}){simplest}"

@@ -20,7 +20,7 @@ from tcpipe.formats.object_storage import is_url
 from tcpipe.formats.parquet import read_table, write_table
 from tcpipe.formats.published import here, here_by_range, published
 from tcpipe.formats.seals import sealed
-from tcpipe.learning.baselines import verdicts
+from tcpipe.learning.baselines import describe_ratios
 from tcpipe.learning.evaluation import NETWORKS, PlantCosts, evaluate
 from tcpipe.learning.evaluation_facts import EvaluateConfig, Evaluation
 from tcpipe.learning.evaluation_figures import EvaluatedSamples, evaluated_samples
@@ -55,7 +55,7 @@ class EvaluationResult:
             if energy.held_percent is not None:
                 lines.append(f"{split}: 90 % intervals hold {energy.held_percent:.1f} % of E, CRPS {energy.crps:.2f} J")
             lines.append(f"{split}: {leakage_line(part.leakage)}")
-        lines += verdicts(self.values.baselines)
+        lines += describe_ratios(self.values.baselines)
         lines += [f"verdict: {format_verdict(self.values.verdict, PREDICTED)}", *format_findings(self.values.findings)]
         return plain_lines((*lines, f"open {self.path}/{PAGE}"))
 

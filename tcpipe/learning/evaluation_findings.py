@@ -53,11 +53,12 @@ def _find_baselines(found: Evaluation, subject: Subject) -> Iterator[Finding]:
         if of.beats_curves is False:
             yield make_finding(f"{name}-no-better-than-curves", subject)
         if quantity == "E" and not of.beats_all:
-            kind = {TREES: "table", PHYSICS: "physics", **dict.fromkeys(CURVES.values(), "table")}[of.best]
+            best, ratio = of.best.baseline, of.best.rmse_ratio.value or 0.0
+            kind = {TREES: "table", PHYSICS: "physics", **dict.fromkeys(CURVES.values(), "table")}[best]
             is_other = of.is_worse and kind != found.model.training.config.model
             remedies = [Remedy("train", command=f"tcpipe train DATASET --model {kind}")] if is_other else []
-            names = {"baseline": of.best}
-            yield make_finding("baseline-not-beaten", subject, names=names, remedies=remedies, rmse_fraction=of.ratio)
+            names = {"baseline": best}
+            yield make_finding("baseline-not-beaten", subject, names=names, remedies=remedies, rmse_fraction=ratio)
 
 
 def _find_coverage(part: SplitErrors, subject: Subject) -> Iterator[Finding]:

@@ -7,7 +7,7 @@ from dataclasses import astuple, fields
 from typing import Literal
 
 from tcpipe.learning import paper_tables as paper
-from tcpipe.learning.baselines import verdicts
+from tcpipe.learning.baselines import describe_ratios
 from tcpipe.learning.evaluation import EXPECTED
 from tcpipe.learning.evaluation_facts import SPLITS, ErrorsByClass, Evaluation, Leakage
 from tcpipe.learning.evaluation_figures import EvaluatedSamples, page_data, paper_pictures, sample_sections
@@ -134,7 +134,7 @@ def _unit(measure: str, quantity: str) -> str:
 
 
 def _baselines(found: Evaluation) -> Section:
-    """Return the model beside what is simplest, with the verdict in words before it."""
+    """Return the model beside what is simplest, with the ratio to the best of these before it."""
     rows = []
     for split in found.ordered_splits:
         for quantity in QUANTITIES:
@@ -160,7 +160,7 @@ def _baselines(found: Evaluation) -> Section:
         "baseline's, with their 95 % interval (paired bootstrap over runs or blocks): below 1 the model is better. Physics and boosting "
         "are told the turn of each metre, too. "
     )
-    text += f"{COUNTED}{'. '.join(verdicts(found.baselines))}. {audit_lines(found)}"
+    text += f"{COUNTED}{'. '.join(describe_ratios(found.baselines))}. {audit_lines(found)}"
     if not found.baselines:
         return Section("Beside what is simplest")
     return Section("Beside what is simplest", text, header=header, rows=rows, figures_from=3)

@@ -16,7 +16,7 @@ from tcpipe.errors import MapError
 from tcpipe.planning.cost_model import CostModel
 from tcpipe.planning.courses import COURSES, DIRECTIONS
 from tcpipe.planning.reasons import NO_COST, Bits, Reason
-from tcpipe.planning.verdicts import BATCH, Verdicts, verdicts_of
+from tcpipe.planning.segment_predictions import BATCH, SegmentPredictions, predict_segments
 from tcpipe.terrain.grid import MapGrid
 from tcpipe.terrain.patches import PatchFrames
 from tcpipe.terrain.point_classes import classes_at
@@ -74,7 +74,7 @@ class CostGrid:
         forbidden = np.uint16(BARRED) if allow_unseen else np.uint16(0xFFFF)
         return np.asarray(self.reasons & forbidden == 0)
 
-    def put(self, cells: Cells, found: Verdicts) -> None:
+    def put(self, cells: Cells, found: SegmentPredictions) -> None:
         """Write what was said of cells (flat indices, (n,)), 16 verdicts a cell, courses fastest."""
         for name in ("power_watt", "velocity_mps", "reasons"):
             array = getattr(self, name)
@@ -190,7 +190,7 @@ class Survey:
 
     def _learn(self, wanted: Mask, step: Callable[[int, int], None], *, ask: bool) -> None:
         todo = list(blocks(self.source, self.model, self.costs.grid, wanted))
-        answers = verdicts_of(self.model, self.source, (self.frames.of(cells) for cells in todo), ask=ask)
+        answers = predict_segments(self.model, self.source, (self.frames.of(cells) for cells in todo), ask=ask)
         for number, (cells, found) in enumerate(zip(todo, answers, strict=True), 1):
             self.costs.put(cells, found)
             step(number, len(todo))

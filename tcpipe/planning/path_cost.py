@@ -22,8 +22,8 @@ from tcpipe.formats.parquet import write_table
 from tcpipe.geometry.angles import wrap_to_pi
 from tcpipe.planning.cost_model import CostModel, check_model
 from tcpipe.planning.reasons import Reason, counts_of
+from tcpipe.planning.segment_predictions import SegmentPredictions, in_batches, joined, predict_segments
 from tcpipe.planning.turning import turning_of, turns_between
-from tcpipe.planning.verdicts import Verdicts, in_batches, joined, verdicts_of
 from tcpipe.tables.bits import names_of
 from tcpipe.tables.columns import Column, TableSchema
 from tcpipe.terrain.patches import PatchFrames, corners_on, footprints, patch_frames
@@ -93,7 +93,7 @@ def cost_of_path(model: CostModel, source: MapReader, lonlat_deg: Floats, *, whe
     if not corners_on(source.grid, footprints(frames, model.patch_m)).any():
         raise PathError(off_map_text(source, where, lonlat_deg))
     turn_radpm = _turn_radpm(model, turns_between(pieces.start_xy_m, pieces.end_xy_m) / pieces.arc_m)
-    said = joined(verdicts_of(model, source, in_batches(frames), turn_radpm=turn_radpm))
+    said = joined(predict_segments(model, source, in_batches(frames), turn_radpm=turn_radpm))
     said.reasons[pieces.arc_m > model.max_arc_to_chord * pieces.chord_m] |= np.uint16(Reason.CURVED)
     return _costed(model, source, pieces, said)
 
@@ -123,7 +123,7 @@ def pieces_of(source: MapReader, lonlat_deg: Floats, *, chord_m: float, where: s
     return pieces
 
 
-def _costed(model: CostModel, source: MapReader, pieces: Pieces, said: Verdicts) -> PathCost:
+def _costed(model: CostModel, source: MapReader, pieces: Pieces, said: SegmentPredictions) -> PathCost:
     bits, class_id, errors = said.reasons, said.terrain_class, errors_of(model.residuals)
     duration, nothing = pieces.arc_m / said.velocity_mps, np.full(len(bits), np.nan)
     turn_rad = turns_between(pieces.start_xy_m, pieces.end_xy_m)
