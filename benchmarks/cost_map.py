@@ -26,9 +26,9 @@ from tcpipe.formats.maps.map_files import MapFile, open_map
 from tcpipe.learning.architecture import Architecture
 from tcpipe.learning.model_card import Seen
 from tcpipe.learning.models import Model, load_model
+from tcpipe.planning.cost_grid import new_survey
 from tcpipe.planning.cost_map import make_cost_map
 from tcpipe.planning.cost_model import BATCH_PATCHES
-from tcpipe.planning.survey import new_survey
 
 ROUNDS = 5
 WANTED = 0.9

@@ -41,8 +41,7 @@ from tcpipe.simulation import Faults, Truth, read_truth, simulate
 from tcpipe.simulation.route import Wander
 from tcpipe.simulation.scenarios import DriveSpec, RasterSpec, Scenario, small_world
 from tcpipe.simulation.sensors import Gnss, Imu, Sensors, Visual, Wheels
-from tcpipe.stages.fuse_inputs import prepare_inputs
-from tcpipe.stages.fuse_sanity import sane_inputs
+from tcpipe.stages.fuse_inputs import prepare_inputs, sane_inputs
 from tcpipe.stages.read import read_run
 from tcpipe.tables.levels import Streams
 

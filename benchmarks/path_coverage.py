@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from tcpipe.cost.prediction_errors import Errors, centring_of, errors_of
 from tcpipe.learning.table_model import TableModel, fit_table
-from tcpipe.planning.pieces import cut_path
+from tcpipe.planning.path_cost import cut_path
 from tcpipe.simulation import scenario
 from tcpipe.simulation.robot import SimulatedRobot
 from tcpipe.simulation.route import Leg, Wander

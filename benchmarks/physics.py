@@ -20,7 +20,7 @@ from tcpipe.cost.held_out import physics_of
 from tcpipe.cost.physics import Metres
 from tcpipe.formats.recipe_toml import load_recipe
 from tcpipe.pipeline.dataset.card import metres_of, standing_of
-from tcpipe.report.physics import physics_in_words
+from tcpipe.report.label_sections import physics_in_words
 from tcpipe.simulation import Faults, scenario, simulate
 from tcpipe.simulation.robot import GRAVITY_MPS2, SimulatedRobot
 from tcpipe.simulation.route import Wander

@@ -19,7 +19,7 @@ from tcpipe.formats.contracts import DOCUMENTS
 from tcpipe.formats.finding_lines import describe_finding, format_number
 from tcpipe.formats.recipe_toml import commented_toml
 from tcpipe.formats.robot_files import shipped_profiles
-from tcpipe.planning.path_table import PIECES
+from tcpipe.planning.path_cost import PIECES
 from tcpipe.tables.catalogue import Entry, catalogue_sections, read_catalogue
 from tcpipe.tables.columns import Column, TableSchema
 from tcpipe.tables.findings import Finding, Subject

@@ -11,7 +11,7 @@ import numpy as np
 
 from tcpipe.motion.remedies import StoreLoss, loss_code
 from tcpipe.recipe.suggestions import RecipeFragment
-from tcpipe.tables.catalogue import AFFECTED, Entry, Severity, rank_severity, read_catalogue
+from tcpipe.tables.catalogue import AFFECTED, Affected, Entry, Severity, rank_severity, read_catalogue
 from tcpipe.tables.findings import Finding, Remedy, sort_findings
 from tcpipe.tables.verdicts import GRADES, Verdict
 
@@ -129,9 +129,9 @@ def _count_rest(findings: int, notes: int, more: str) -> list[str]:
     return [f"and {rest}{f': {more}' if more else ''}"] if rest else []
 
 
-def format_verdict(verdict: Verdict) -> str:
+def format_verdict(verdict: Verdict, of: Sequence[Affected] = AFFECTED) -> str:
     """Return the grades as one line, the worst first: ``energy not usable; position and time usable with care``."""
-    labels = {grade: [name for name in AFFECTED if getattr(verdict, name) == grade] for grade in reversed(GRADES)}
+    labels = {grade: [name for name in of if getattr(verdict, name) == grade] for grade in reversed(GRADES)}
     return "; ".join(f"{_join(names)} {grade}" for grade, names in labels.items() if names)
 
 

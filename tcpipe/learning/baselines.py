@@ -16,11 +16,11 @@ from tcpipe.errors import ModelError
 from tcpipe.geometry.datum import enu_from_geodetic
 from tcpipe.learning.curves import Curves, Form, fit_curves
 from tcpipe.learning.evaluation_facts import SPLITS, Compared
-from tcpipe.learning.metrics import LEAST, LEAST_VELOCITY_MPS, Array, Costs, costs, errors
+from tcpipe.learning.metrics import LEAST, LEAST_VELOCITY_MPS, Array, Costs, costs, errors, ratio_of_errors
 from tcpipe.learning.models import Model
 from tcpipe.learning.physics_model import fit_physics_model, standing_of
 from tcpipe.learning.predictions import Measured
-from tcpipe.learning.ratios import ratio_of_errors
+from tcpipe.tables.findings import Finding, Subject, make_finding
 
 logger = logging.getLogger("tcpipe")
 
@@ -44,7 +44,7 @@ Predictor = Callable[[Split], Array]
 
 def compared(
     ours: Model, data: Dataset, sets: Mapping[str, Measured], said: Mapping[str, Costs], *, seed: int
-) -> tuple[list[Compared], list[str]]:
+) -> tuple[list[Compared], list[Finding]]:
     """Return the errors of every baseline on the very samples of a model's, with the ratios of the model's to them; and what lacks.
 
     Parameters
@@ -57,7 +57,8 @@ def compared(
     own = {"table": TREES, "physics": PHYSICS}.get(kind)
     train = _fitted_on(data["train"], ours)
     if not len(train):
-        return [], ["no baselines: the dataset has no labelled samples in split train to fit them on"]
+        names = {"error": "the dataset has no labelled samples in split train"}
+        return [], [make_finding("baseline-missing", Subject("model", "baselines"), names=names)]
     predictors, lacking = _baselines(train, ours, [name for name in SIMPLEST_FIRST if name != own])
     logger.info("baselines: %s, fitted on %d samples", ", ".join(predictors), len(train))
     found: list[Compared] = []
@@ -78,15 +79,16 @@ def _fitted_on(train: Split, ours: Model) -> Split:
     return fitted if len(fitted) else labelled
 
 
-def _baselines(train: Split, ours: Model, wanted: Sequence[str]) -> tuple[dict[str, Predictor], list[str]]:
-    """Return the baselines by name, and a line for each that cannot be fitted."""
-    found, lacking = dict(_curves(train)), []
+def _baselines(train: Split, ours: Model, wanted: Sequence[str]) -> tuple[dict[str, Predictor], list[Finding]]:
+    """Return the baselines by name, and a finding for each that cannot be fitted."""
+    found, lacking = dict(_curves(train)), list[Finding]()
     for name, fit in ((PHYSICS, _physics), (TREES, _trees)):
         if name in wanted:
             try:
                 found[name] = fit(train, ours)
             except ModelError as error:
-                lacking.append(f"no baseline '{name}': {error.problems[0]}")
+                names = {"error": error.problems[0]}
+                lacking.append(make_finding("baseline-missing", Subject("model", name), names=names))
     return found, lacking
 
 
@@ -165,28 +167,31 @@ def beside(
 
 @dataclass(frozen=True, slots=True)
 class Standing:
-    """How a model stands beside the simplest: the best of them, what is sure, and the same in words."""
+    """How a model compares with the baselines, of which ``best`` has the smallest RMSE."""
 
-    best: str
+    best: Compared
     beats_all: bool
     beats_curves: bool | None
-    """Whether it is surely better than every curve over class and slope; None of too few groups to say."""
+    """Whether it is significantly better than every curve over class and slope; None of too few groups."""
     is_worse: bool
-    text: str
 
 
-def verdicts(found: Sequence[Compared]) -> list[str]:
-    """Return in words, for energy and time of each split, whether the model is better than the simplest, and by how much."""
-    return [
-        f"{split}, {called}: {of.text}"
-        for split in SPLITS
-        for quantity, called in (("E", "energy E"), ("T", "time T"))
-        if (of := standing(found, split, quantity)) is not None
-    ]
+def describe_ratios(found: Sequence[Compared]) -> list[str]:
+    """Return the ratio of RMSE to that of the best baseline, for energy and time of each split."""
+    lines = []
+    for split in SPLITS:
+        for quantity, called in (("E", "energy E"), ("T", "time T")):
+            if (of := standing(found, split, quantity)) is not None:
+                ratio, groups = of.best.rmse_ratio, f"{of.best.groups} {of.best.drawn_by}"
+                few = f"{groups} are too few for an interval"
+                interval = few if ratio.low is None else f"95 % CI {ratio.low:.2f} to {ratio.high:.2f}, {groups}"
+                best = f"RMSE ratio to '{of.best.baseline}', the best baseline, {ratio.value:.2f}"
+                lines.append(f"{split}, {called}: {best} ({interval})")
+    return lines
 
 
 def standing(found: Sequence[Compared], split: str, quantity: str) -> Standing | None:
-    """Return how the model stands in a quantity of a split; None where no ratio is known."""
+    """Return how the model compares in a quantity of a split; None where no ratio is known."""
     rows = [row for row in found if (row.split, row.quantity) == (split, quantity) and row.rmse_ratio.value is not None]
     if not rows:
         return None
@@ -195,33 +200,8 @@ def standing(found: Sequence[Compared], split: str, quantity: str) -> Standing |
     worse = ratio.low is not None and ratio.low > 1.0 and (ratio.value or 0.0) > _ALIKE
     curves = [row for row in rows if row.baseline in CURVES.values()]
     beats = None if ratio.high is None else all(map(_is_better, curves))
-    return Standing(best.baseline, _is_better(best), beats, worse, _verdict(rows, best, is_worse=worse))
+    return Standing(best, _is_better(best), beats, worse)
 
 
 def _is_better(row: Compared) -> bool:
     return row.rmse_ratio.high is not None and row.rmse_ratio.high < 1.0
-
-
-def _verdict(rows: Sequence[Compared], best: Compared, *, is_worse: bool) -> str:
-    ratio = best.rmse_ratio
-    if ratio.low is None or ratio.high is None:
-        return (
-            f"best baseline is '{best.baseline}', RMSE of the model {ratio.value:.2f} of its; "
-            f"{best.groups} {best.drawn_by} are too few to say how sure that is"
-        )
-    sure = (
-        f"RMSE {ratio.value:.2f} of its, 95 %: {ratio.low:.2f} to {ratio.high:.2f} over {best.groups} {best.drawn_by}"
-    )
-    if _is_better(best):
-        by = 100.0 * (1.0 - (ratio.value or 0.0))
-        return f"the model is better than every baseline, than the best, '{best.baseline}', by {by:.0f} % ({sure})"
-    equal = next(
-        name for name in SIMPLEST_FIRST for row in rows
-        if row.baseline == name and not _is_better(row)
-    )  # fmt: skip
-    simplest = (
-        "" if equal == best.baseline else f"; already '{equal}' is no worse than the model, as far as can be told"
-    )
-    if is_worse:
-        return f"'{best.baseline}' is better than the model by {100.0 * (1.0 - 1.0 / (ratio.value or 1.0)):.0f} % ({sure}){simplest}"
-    return f"the model and '{best.baseline}' cannot be told apart ({sure}){simplest}"

@@ -14,7 +14,7 @@ import numpy as np
 from tcpipe.learning import paper_tables as paper
 from tcpipe.learning.baselines import CURVES, TREES
 from tcpipe.learning.evaluation_facts import SPLITS, Compared, Evaluation
-from tcpipe.learning.ratios import Ratio
+from tcpipe.learning.metrics import Ratio
 from tcpipe.learning.wei_isler import OURS, PER_CLASS
 
 Verdict = Literal["held", "open", "NOT held", "not measured"]

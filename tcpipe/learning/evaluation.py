@@ -9,9 +9,11 @@ from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
+from numpy.typing import NDArray
 
 from tcpipe import __version__
 from tcpipe.balance.repeats import Floor
+from tcpipe.cost.prediction_errors import centring_of
 from tcpipe.dataset import Dataset, Split, open_dataset
 from tcpipe.dataset.energies import ENERGIES, Energy
 from tcpipe.errors import DatasetError
@@ -26,17 +28,21 @@ from tcpipe.learning.evaluation_facts import (
     EvaluatedDataset,
     EvaluatedModel,
     Evaluation,
+    Leakage,
     Plotted,
     SplitErrors,
 )
-from tcpipe.learning.leakage import by_blocks, leakage_of
-from tcpipe.learning.metrics import ALL, Array, Errors, Spread, errors_by_class, label_floor, mean_of_draws
+from tcpipe.learning.evaluation_findings import find_weaknesses
+from tcpipe.learning.metrics import ALL, Array, Errors, Spread, costs, errors_by_class, label_floor, mean_of_draws
 from tcpipe.learning.models import Model, load_model
 from tcpipe.learning.predicted_samples import predictions_table
 from tcpipe.learning.predictions import Measured, check_fit, measured, predicted_costs, spreads_of
 from tcpipe.learning.training import Variant, dataset_checksum, train, training_task
-from tcpipe.learning.wei_isler import FEWEST, OURS, PER_CLASS, Trained, energy_table
+from tcpipe.learning.wei_isler import OURS, PER_CLASS, Trained, energy_table
 from tcpipe.robots.profiles import Robot
+from tcpipe.splits.neighbours import CLOSE, PLACES, are_near, middles_deg
+from tcpipe.tables.findings import Finding, Subject, make_finding
+from tcpipe.tables.verdicts import judge
 from tcpipe.terrain.classes import NODATA_ID
 
 logger = logging.getLogger("tcpipe")
@@ -121,9 +127,10 @@ def evaluate(
         baselines=tuple(baselines),
         blocks=by_blocks(ours, names),
         repeatability=_repeatability(data.card, ENERGIES[ours.label_energy]),
-        warnings=(*lacking, *_warnings(ours, data, sets), *_left_out(data, sets, energy.errors)),
         plots={name: _plotted(part, said[name], config.plotted) for name, part in sets.items()},
     )
+    findings = (*lacking, *_find_mismatches(ours, data, sets, energy.errors), *find_weaknesses(evaluation))
+    evaluation = replace(evaluation, findings=findings, verdict=judge(findings))
     return evaluation, predictions_table(sets, said, spreads)
 
 
@@ -207,41 +214,25 @@ def _time(ours: Model, sets: Sets, said: Said, *, max_velocity_mps: float | None
     return found
 
 
-def _warnings(ours: Model, data: Dataset, sets: Sets) -> list[str]:
-    """Return what a reader of the figures should know."""
-    lines = []
-    if "unseen" not in sets:
-        lines.append(
-            "the dataset has no unseen samples with labels: it was built without a --split region, or nothing lies outside it"
-        )
-    for name, found in sets.items():
-        for class_id, called in found.names.items():
-            count = int((found.class_ids == class_id).sum())
-            if class_id not in {NODATA_ID, *ours.class_counts}:
-                lines.append(f"{called}: {count} samples of {name}, none in training: the model never saw this class")
-    if (kind := ours.card.training.config.model) != "resnet18":
-        lines.append(
-            f"the model is {'a table' if kind == 'table' else 'physics'}: the networks of Wei and Isler are trained beside a network "
-            "alone, and are not here"
-        )
+def _find_mismatches(
+    ours: Model, data: Dataset, sets: Sets, energy: Mapping[str, Mapping[str, Errors]]
+) -> Iterator[Finding]:
+    """Yield where model and dataset do not fit, and the samples that some figures are without."""
     if dataset_checksum(data.card) != ours.card.dataset.sha256:
-        lines.append(
-            f"the model was trained on another dataset ({ours.card.dataset.name}, {ours.card.dataset.sha256[:12]}): "
-            "its test samples here may have been trained on there"
-        )
-    return lines
-
-
-def _left_out(data: Dataset, sets: Sets, energy: Mapping[str, Mapping[str, Errors]]) -> Iterator[str]:
-    """Yield a line for samples that some figures are without."""
+        names = {"dataset": ours.card.dataset.name}
+        yield make_finding("model-of-another-dataset", Subject("model", ours.name), names=names)
     for name, found in sets.items():
-        if unlabelled := len(data[name]) - len(found.split):
-            yield f"{unlabelled} of {len(data[name])} samples of {name} have no label and are in no figure"
+        subject, total = Subject("split", name), len(data[name])
+        for class_id, called in found.names.items():
+            if class_id not in {NODATA_ID, *ours.class_counts}:
+                count = int((found.class_ids == class_id).sum())
+                unseen = Subject("class", called)
+                yield make_finding("class-not-in-training", unseen, names={"split": name}, sample_count=count)
+        if unlabelled := total - len(found.split):
+            yield make_finding("samples-without-label", subject, unlabelled_count=unlabelled, sample_count=total)
         if PER_CLASS in energy and (without := len(found.split) - energy[PER_CLASS][name].count):
-            yield (
-                f"{without} of {len(found.split)} samples of {name} are of classes with too few training samples for a network of "
-                f"their own (fewer than {FEWEST}, or none in a fold) and are not in table IV"
-            )
+            total = len(found.split)
+            yield make_finding("classes-without-network", subject, left_count=without, sample_count=total)
 
 
 def _plotted(found: Measured, said: Mapping[str, Array], count: int) -> Plotted:
@@ -255,3 +246,38 @@ def _plotted(found: Measured, said: Mapping[str, Array], count: int) -> Plotted:
         "E_predicted": said["E"][at].tolist(),
         "T_predicted": said["T"][at].tolist(),
     }
+
+
+_UNKNOWN = {0: "unknown"}
+
+
+def leakage_of(data: Dataset, held: Split) -> Leakage | None:
+    """Return how near the samples of a split are to those of train; None where either has no samples with a place."""
+    ours, theirs = (middles_deg({name: part.column(name) for name in PLACES}) for part in (held, data["train"]))
+    within_m = CLOSE * data.card.recipe.segment.chord_m
+    near = are_near(ours, theirs, within_m=within_m)
+    if not len(near) or not len(theirs):
+        return None
+    audit = next((part for part in data.card.split.audit if part.split == held.name and part.samples), None)
+    sharing = None if audit is None else 100.0 * audit.overlapping_samples / audit.samples
+    return Leakage(data.card.recipe.split.holdout, within_m, 100.0 * float(near.mean()), sharing)
+
+
+def by_blocks(model: Model, names: Mapping[int, str]) -> ErrorsByClass | None:
+    """Return the errors on the samples that a model keeps as held out, by class; None if it keeps none of power and velocity.
+
+    Folds are blocks of ground, so that this is what the errors are where blocks are held out. A network was stopped by its fold, and
+    of a table the folds told how many trees are best: both are a little too small.
+    """
+    found: Mapping[str, NDArray[np.generic]] = model.residuals
+    if "power_predicted_watt" not in found or not len(found["power_predicted_watt"]):
+        return None
+    power, velocity, said_power, said_velocity = (
+        found[name].astype(np.float64)
+        for name in ("power_watt", "velocity_mps", "power_predicted_watt", "velocity_predicted_mps")
+    )
+    class_ids = np.nan_to_num(found["terrain_class"].astype(np.float64)).astype(np.int64)
+    centred = centring_of(found).apply(said_power, said_velocity, class_ids)
+    known = {**_UNKNOWN, **names}
+    own = {number: known.get(number, str(number)) for number in np.unique(class_ids).tolist()}
+    return errors_by_class(costs(*centred, model.chord_m), costs(power, velocity, model.chord_m), class_ids, own)

@@ -9,11 +9,12 @@ from typing import Annotated, Literal, TypeAlias, TypedDict
 from tcpipe.balance.repeats import Floor
 from tcpipe.dataset.energies import EnergyName
 from tcpipe.learning.fitting import Seed
-from tcpipe.learning.metrics import Errors
+from tcpipe.learning.metrics import Errors, Ratio
 from tcpipe.learning.model_card import Training
-from tcpipe.learning.ratios import Ratio
 from tcpipe.tables.bounds import Bounds
 from tcpipe.tables.facts import ABSENT
+from tcpipe.tables.findings import Finding
+from tcpipe.tables.verdicts import Verdict
 
 KIND = "tcpipe evaluation"
 
@@ -144,7 +145,7 @@ class Evaluation:
     """All of evaluation.json."""
 
     kind: str = KIND
-    schema_version: int = 1
+    schema_version: int = 2
     tcpipe_version: str
     key: str
     """Hash of model, dataset and options: the same key, the same evaluation."""
@@ -165,7 +166,8 @@ class Evaluation:
     """Of all classes together, by split, baseline and quantity."""
     repeatability: Mapping[str, Floor | None]
     """How well each label repeats itself where ground was driven twice; None where none was."""
-    warnings: tuple[str, ...]
+    findings: tuple[Finding, ...] = ()
+    verdict: Verdict = field(default_factory=Verdict)
     plots: Mapping[str, Plotted]
     """By split."""
 

@@ -23,6 +23,7 @@ from tcpipe.report.packed import Column, packed, shown_to
 from tcpipe.report.page import Section, Shaded
 from tcpipe.report.plots import Plot, new_plot
 from tcpipe.tables.arrays import texts
+from tcpipe.tables.catalogue import threshold
 from tcpipe.tables.columns import floats
 
 MEASURED, PREDICTED = DROPPED, SPLIT_COLOURS["train"]
@@ -36,9 +37,6 @@ _MOST_SHOWN = 20_000
 """Samples of a split that can each be clicked: the first, which stand in random order."""
 _WORST = 30
 """Of each split, with their patches."""
-_ENOUGH = 20
-"""Labels of a class and slope of which the share that intervals hold is judged, and the least that is not marked:"""
-_HELD = 0.8
 _WHOLE_JOULE = 10.0
 """Error of E from which on whole joules tell enough: nine ranges of slope fit beside each other."""
 
@@ -178,6 +176,7 @@ def _by_class_and_slope(table: pa.Table, split: str, audit: str) -> Section:
     rmse = {key: float(np.sqrt(np.mean(of**2))) for key, of in cells.items()}
     most = max(rmse.values(), default=1.0) or 1.0
     digits = 0 if most >= _WHOLE_JOULE else 2
+    enough, least = (threshold("energy-overconfident", f"min_cell_{name}") for name in ("count", "coverage_fraction"))
     rows: list[list[str | Shaded]] = []
     for name in names:
         row: list[str | Shaded] = [name]
@@ -187,14 +186,14 @@ def _by_class_and_slope(table: pa.Table, split: str, audit: str) -> Section:
                 row.append("–")
                 continue
             outside = float(np.mean((energy[here] < low[here]) | (energy[here] > high[here])))
-            doubted = len(cells[name, at]) >= _ENOUGH and outside > 1.0 - _HELD
+            doubted = len(cells[name, at]) >= enough and outside > 1.0 - least
             mean = float(cells[name, at].mean())
             text = f"{rmse[name, at]:.{digits}f}, {mean:+.{digits}f} ({len(cells[name, at])}){'*' if doubted else ''}"
             row.append(Shaded(text, rmse[name, at] / most, alarm=doubted))
         rows.append(row)
     text = (
         "RMSE of E [J], mean error (predicted less measured), and in brackets of how many metres; darker is worse. * and a dashed border: "
-        f"90 % intervals hold fewer than {100 * _HELD:.0f} % of {_ENOUGH} labels or more there: believe no interval on such ground. {audit}"
+        f"90 % intervals hold fewer than {100 * least:.0f} % of {enough:.0f} labels or more there: do not rely on them. {audit}"
     )
     return Section(
         f"Error by class and slope, {split}", text, header=["class", *(SLOPE_NAMES[at] for at in met)], rows=rows

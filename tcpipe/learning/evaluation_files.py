@@ -14,20 +14,21 @@ from tcpipe.errors import StoreError, UsageError, plain_lines
 from tcpipe.formats.atomic import clear, write_text
 from tcpipe.formats.bucket_directories import fetch_directory, fetch_directory_by_range, find_newest, require_card
 from tcpipe.formats.dataset_files import is_shard, read_card
+from tcpipe.formats.finding_lines import format_findings, format_verdict
 from tcpipe.formats.json_files import digest, parse_json, read_as, read_json, typed, write_json
 from tcpipe.formats.object_storage import is_url
 from tcpipe.formats.parquet import read_table, write_table
 from tcpipe.formats.seals import sealed
-from tcpipe.learning.baselines import verdicts
+from tcpipe.learning.baselines import describe_ratios
 from tcpipe.learning.evaluation import NETWORKS, PlantCosts, evaluate
 from tcpipe.learning.evaluation_facts import EvaluateConfig, Evaluation
 from tcpipe.learning.evaluation_figures import EvaluatedSamples, evaluated_samples
 from tcpipe.learning.evaluation_page import COLUMNS, evaluation_page, evaluation_rows, leakage_line
-from tcpipe.learning.evaluation_verdict import verdict
 from tcpipe.learning.metrics import ALL, QUANTITIES
 from tcpipe.learning.models import read_model_card
 from tcpipe.learning.training import dataset_checksum
 from tcpipe.pipeline.generations import write_generation
+from tcpipe.tables.verdicts import PREDICTED
 
 SIMULATED = "The data are simulated: what can be compared with the paper is the pattern, not the figures."
 
@@ -43,7 +44,7 @@ class EvaluationResult:
 
     def __str__(self) -> str:
         """Return the errors of all classes together, as plain lines."""
-        lines = [f"warning: {text}" for text in self.values.warnings]
+        lines = list[str]()
         for split, part in self.values.splits.items():
             figures = (
                 f"{quantity} {of.mape_percent or float('nan'):.2f} % ({of.mape_count})"
@@ -54,8 +55,8 @@ class EvaluationResult:
             if energy.held_percent is not None:
                 lines.append(f"{split}: 90 % intervals hold {energy.held_percent:.1f} % of E, CRPS {energy.crps:.2f} J")
             lines.append(f"{split}: {leakage_line(part.leakage)}")
-        lines += verdicts(self.values.baselines)
-        lines += [line.text for line in verdict(self.values) if line.kind == "doubtful"]
+        lines += describe_ratios(self.values.baselines)
+        lines += [f"verdict: {format_verdict(self.values.verdict, PREDICTED)}", *format_findings(self.values.findings)]
         return plain_lines((*lines, f"open {self.path}/{PAGE}"))
 
 
@@ -103,14 +104,16 @@ def run_evaluation(
     name = values.dataset.name
     of = "" if values.model.label_energy == "total" else f" (w and E {ENERGIES[values.model.label_energy].words})"
     lead = f"Model {Path(model).name} on dataset {name}: errors of power w, velocity v, time T and energy E{of}, beside the paper's."
-    warnings = [SIMULATED] if plant is not None else []
     table = io.StringIO()
     writer = csv.writer(table, lineterminator="\n")
     writer.writerows([COLUMNS, *evaluation_rows(values)])
     write_text(place / CSV, table.getvalue())
     samples = samples_of(place, dataset)
     write_text(
-        place / PAGE, evaluation_page(values, samples, title=f"Evaluation on {name}", lead=lead, warnings=warnings)
+        place / PAGE,
+        evaluation_page(
+            values, samples, title=f"Evaluation on {name}", lead=lead, warnings=[SIMULATED] if plant is not None else []
+        ),
     )
     return EvaluationResult(place, values)
 

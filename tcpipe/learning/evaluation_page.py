@@ -7,14 +7,15 @@ from dataclasses import astuple, fields
 from typing import Literal
 
 from tcpipe.learning import paper_tables as paper
-from tcpipe.learning.baselines import verdicts
+from tcpipe.learning.baselines import describe_ratios
 from tcpipe.learning.evaluation import EXPECTED
 from tcpipe.learning.evaluation_facts import SPLITS, ErrorsByClass, Evaluation, Leakage
 from tcpipe.learning.evaluation_figures import EvaluatedSamples, page_data, paper_pictures, sample_sections
-from tcpipe.learning.evaluation_verdict import Statement, verdict, worst_first
 from tcpipe.learning.metrics import ALL, LEAST, QUANTITIES, UNITS, Errors
 from tcpipe.learning.wei_isler import GRASS_ONLY, OURS, PER_CLASS
 from tcpipe.report.page import Number, Section, render_page
+from tcpipe.report.verdict import show_verdict
+from tcpipe.tables.verdicts import PREDICTED, judge_again
 
 FLOORS = {"label_floor": "label noise alone", "simulation_floor": "simulation's own floor"}
 """What an error can hardly be less than, and what the page calls it."""
@@ -40,13 +41,11 @@ def evaluation_page(
     lead: str,
     before: Sequence[Section] = (),
     warnings: Sequence[str] = (),
-    claimed: Sequence[Statement] = (),
 ) -> str:
-    """Return the HTML page of what `evaluate` found; ``before``, ``warnings`` and what is ``claimed`` come first."""
+    """Return the HTML page of what `evaluate` found; ``before`` and ``warnings`` come first."""
     audits = {split: leakage_line(found.splits[split].leakage) for split in found.ordered_splits}
     drawn = sample_sections(samples, audits)
     sections = [
-        Section("Assessment", header=("", "statement"), rows=worst_first([*claimed, *verdict(found)])),
         *before,
         _baselines(found),
         *drawn,
@@ -67,7 +66,8 @@ def evaluation_page(
             for name in found.ordered_splits
             for quantity in ("E", "T")
         ],
-        warnings=[*warnings, *found.warnings],
+        verdict=show_verdict(judge_again(found.verdict, found.findings), found.findings, PREDICTED),
+        warnings=warnings,
         sections=[section for section in sections if section.rows or section.text],
         script="evaluation.js" if drawn else "",
         data=page_data(samples) if drawn else None,
@@ -134,7 +134,7 @@ def _unit(measure: str, quantity: str) -> str:
 
 
 def _baselines(found: Evaluation) -> Section:
-    """Return the model beside what is simplest, with the verdict in words before it."""
+    """Return the model beside what is simplest, with the ratio to the best of these before it."""
     rows = []
     for split in found.ordered_splits:
         for quantity in QUANTITIES:
@@ -160,7 +160,7 @@ def _baselines(found: Evaluation) -> Section:
         "baseline's, with their 95 % interval (paired bootstrap over runs or blocks): below 1 the model is better. Physics and boosting "
         "are told the turn of each metre, too. "
     )
-    text += f"{COUNTED}{'. '.join(verdicts(found.baselines))}. {audit_lines(found)}"
+    text += f"{COUNTED}{'. '.join(describe_ratios(found.baselines))}. {audit_lines(found)}"
     if not found.baselines:
         return Section("Beside what is simplest")
     return Section("Beside what is simplest", text, header=header, rows=rows, figures_from=3)
@@ -322,7 +322,9 @@ def _energy(found: Evaluation) -> Section:
     )
     ratios = "; ".join(f"{row.split}, {row.baseline}: {row.rmse_ratio}" for row in found.networks)
     text += (
-        f"RMSE of ours over theirs, with its 95 % interval: {ratios}." if ratios else "Here none of them was trained."
+        f"RMSE of ours over theirs, with its 95 % interval: {ratios}."
+        if ratios
+        else "They are trained beside a network only, and here none was."
     )
     return _compared("Table IV: energy against Wei and Isler", text, found, paper.ENERGY, "E")
 

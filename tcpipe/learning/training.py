@@ -310,11 +310,11 @@ def _checkpoint_of(place: Path) -> Path:
 
 
 def _is_of(checkpoint: Path, key: str) -> bool:
-    """Return whether a state can be gone on from, and say why not."""
+    """Return whether training can continue from a checkpoint; warn where it cannot."""
     try:
         read_checkpoint(checkpoint, key)
-    except ModelError as error:
-        logger.warning("%s; it begins anew", error.problems[0].partition(";")[0])
+    except ModelError:
+        logger.warning("%s: damaged, or of other options or another dataset; training starts again", checkpoint)
         return False
     return True
 

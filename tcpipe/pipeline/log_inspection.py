@@ -22,8 +22,7 @@ from tcpipe.pipeline.log_findings import find_damage
 from tcpipe.power.sources import sources_of
 from tcpipe.recipe import Recipe
 from tcpipe.robots.profiles import Profiles
-from tcpipe.stages.read_candidates import power_candidates
-from tcpipe.stages.read_roles import find_read_config, roles_by
+from tcpipe.stages.read_roles import find_read_config, power_candidates, roles_by
 from tcpipe.tables.facts import ABSENT, ClockStep
 from tcpipe.tables.findings import Finding, Subject, make_finding, sort_findings
 

@@ -15,14 +15,13 @@ from tcpipe.errors import MapError, StoreError, UsageError, plain_lines
 from tcpipe.formats.finding_lines import format_findings
 from tcpipe.formats.maps.building import MoreLayers, OrthoBands, build_map
 from tcpipe.formats.maps.geotiff import raster_files
-from tcpipe.formats.maps.map_facts import MapInputs, MapSummary
+from tcpipe.formats.maps.map_facts import MapInputs, MapSummary, map_lines
 from tcpipe.formats.maps.map_files import open_map
 from tcpipe.formats.maps.terrain_polygons import is_drawn
-from tcpipe.formats.maps.text import map_lines
 from tcpipe.formats.seals import file_checksum, seal_of
 from tcpipe.formats.store_mark import gone_if_empty
 from tcpipe.pipeline.add_map_options import AddMapOptions, Files
-from tcpipe.report.overview import quick_look, write_quick_look
+from tcpipe.report.pictures import quick_look, write_quick_look
 from tcpipe.store import Store, open_store
 from tcpipe.tables.levels import SAMPLES
 from tcpipe.tables.options import as_function

@@ -17,7 +17,7 @@ from tcpipe.pipeline.store_facts import store_facts
 from tcpipe.report.dataset_patches import all_patches, folder_of
 from tcpipe.report.dataset_report import dataset_report
 from tcpipe.report.dataset_samples import MOST_SAMPLES
-from tcpipe.report.physics import physics_in_words
+from tcpipe.report.label_sections import physics_in_words
 from tcpipe.report.run_map import Pictures
 from tcpipe.report.run_report import run_report
 from tcpipe.report.store_report import store_report

@@ -31,7 +31,7 @@ from tcpipe.formats.seals import CHECKSUMS, Checksum, broken_checksums, broken_s
 from tcpipe.formats.store_mark import MARK, SPOOL
 from tcpipe.formats.stored_runs import RunDirectory
 from tcpipe.motion.remedies import KEPT
-from tcpipe.report.overview import shows_map
+from tcpipe.report.pictures import shows_map
 from tcpipe.store import Store
 from tcpipe.tables.columns import floats, integers
 from tcpipe.tables.levels import DATA_MODEL_VERSION, GATED_TRACK, LABELLED_SEGMENTS, READ_VERSIONS, REJECTIONS, STREAMS

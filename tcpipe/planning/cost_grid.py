@@ -6,7 +6,7 @@ way.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,9 +16,10 @@ from tcpipe.errors import MapError
 from tcpipe.planning.cost_model import CostModel
 from tcpipe.planning.courses import COURSES, DIRECTIONS
 from tcpipe.planning.reasons import NO_COST, Bits, Reason
-from tcpipe.planning.verdicts import BATCH, Verdicts
+from tcpipe.planning.segment_predictions import BATCH, SegmentPredictions, predict_segments
 from tcpipe.terrain.grid import MapGrid
 from tcpipe.terrain.patches import PatchFrames
+from tcpipe.terrain.point_classes import classes_at
 from tcpipe.terrain.projection import metres_from_plane, parse_crs
 from tcpipe.terrain.tiles import CACHED_TILES, MapReader, level_for
 
@@ -73,7 +74,7 @@ class CostGrid:
         forbidden = np.uint16(BARRED) if allow_unseen else np.uint16(0xFFFF)
         return np.asarray(self.reasons & forbidden == 0)
 
-    def put(self, cells: Cells, found: Verdicts) -> None:
+    def put(self, cells: Cells, found: SegmentPredictions) -> None:
         """Write what was said of cells (flat indices, (n,)), 16 verdicts a cell, courses fastest."""
         for name in ("power_watt", "velocity_mps", "reasons"):
             array = getattr(self, name)
@@ -151,3 +152,58 @@ class CellFrames:
         (north_west, north_east), (south_west, south_east) = self._corners
         ground = (1 - v) * ((1 - u) * north_west + u * north_east) + v * ((1 - u) * south_west + u * south_east)
         return np.asarray(np.linalg.norm(DIRECTIONS @ ground.T, axis=1))
+
+
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True)
+class Survey:
+    """Costs and reasons, and of which cells they are known, shape (rows, cols) each."""
+
+    model: CostModel
+    source: MapReader
+    costs: CostGrid
+    judged: Mask
+    predicted: Mask
+    frames: CellFrames
+
+    def judge(self, wanted: Mask, step: Callable[[int, int], None]) -> None:
+        """Learn what ground the wanted cells are, without predictions."""
+        self._learn(wanted & ~self.judged, step, ask=False)
+        self.judged[wanted] = True
+
+    def predict(self, wanted: Mask, step: Callable[[int, int], None]) -> None:
+        """Learn what the wanted cells cost."""
+        self._learn(wanted & ~self.predicted, step, ask=True)
+        self.judged[wanted] = True
+        self.predicted[wanted] = True
+
+    def class_id(self) -> NDArray[np.uint8]:
+        """Return the class under the middle of each cell, shape (rows, cols); 0 without data, or without classes."""
+        grid = self.costs.grid
+        if "terrain" not in self.source.layers:
+            return np.zeros((grid.rows, grid.cols), np.uint8)
+        row, col = np.mgrid[: grid.rows, : grid.cols]
+        middle = grid.xy_from_px(np.stack([col, row], axis=-1).reshape(-1, 2).astype(np.float64))
+        return np.maximum(classes_at(self.source, middle), 0).astype(np.uint8).reshape(grid.rows, grid.cols)
+
+    def _learn(self, wanted: Mask, step: Callable[[int, int], None], *, ask: bool) -> None:
+        todo = list(blocks(self.source, self.model, self.costs.grid, wanted))
+        answers = predict_segments(self.model, self.source, (self.frames.of(cells) for cells in todo), ask=ask)
+        for number, (cells, found) in enumerate(zip(todo, answers, strict=True), 1):
+            self.costs.put(cells, found)
+            step(number, len(todo))
+
+
+def new_survey(model: CostModel, source: MapReader, step_m: float) -> Survey:
+    """Return a survey of which nothing is known."""
+    grid = grid_over(source, step_m)
+    known = np.zeros((2, grid.rows, grid.cols), np.bool_)
+    return Survey(model, source, empty_grid(grid), known[0], known[1], CellFrames(grid, where=f"map {source.name}"))
+
+
+def survey_from(model: CostModel, source: MapReader, costs: CostGrid) -> Survey:
+    """Return a survey of which all is known, from a cost map."""
+    known = np.ones((2, costs.grid.rows, costs.grid.cols), np.bool_)
+    return Survey(model, source, costs, known[0], known[1], CellFrames(costs.grid, where=f"map {source.name}"))

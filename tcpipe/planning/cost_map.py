@@ -43,7 +43,7 @@ from tcpipe.planning.cost_model import CostModel, check_model
 from tcpipe.planning.courses import ANGLES_DEG, COURSES
 from tcpipe.planning.path_cost import projection_of
 from tcpipe.planning.reasons import Reason
-from tcpipe.planning.verdicts import Verdicts, verdicts_of
+from tcpipe.planning.segment_predictions import SegmentPredictions, predict_segments
 from tcpipe.tables.bits import name_of
 from tcpipe.terrain.grid import MapGrid
 
@@ -323,17 +323,19 @@ class _Task:
     blocks: tuple[Cells, ...]
 
 
-def _from_cluster(cluster: Cluster, key: str, grid: MapGrid, todo: Sequence[Cells]) -> Iterator[tuple[Cells, Verdicts]]:
+def _from_cluster(
+    cluster: Cluster, key: str, grid: MapGrid, todo: Sequence[Cells]
+) -> Iterator[tuple[Cells, SegmentPredictions]]:
     """Yield what a cluster's workers say of each block, as their tasks end."""
     parts = [tuple(todo[first : first + _BLOCKS_KEPT]) for first in range(0, len(todo), _BLOCKS_KEPT)]
     tasks = [_Task(cluster.inputs, key, grid, part) for part in parts]
     with closing(run_all(_answer, tasks, jobs=1, cluster=cluster.address)) as outcomes:
         for outcome in outcomes:
-            found: list[Verdicts] = sound(outcome)
+            found: list[SegmentPredictions] = sound(outcome)
             yield from zip(tasks[outcome.index].blocks, found, strict=True)
 
 
-def _answer(task: _Task) -> list[Verdicts] | TcpipeError:
+def _answer(task: _Task) -> list[SegmentPredictions] | TcpipeError:
     """Ask the model about the blocks of a task, on a worker."""
     try:
         model, source = task.inputs()
@@ -343,7 +345,7 @@ def _answer(task: _Task) -> list[Verdicts] | TcpipeError:
                 "the same names"
             )
         frames = CellFrames(task.grid, where=f"map {source.name}")
-        return list(verdicts_of(model, source, (frames.of(cells) for cells in task.blocks)))
+        return list(predict_segments(model, source, (frames.of(cells) for cells in task.blocks)))
     except TcpipeError as error:  # it may lack what is here: an extra, a file
         return type(error)(*(f"{os.uname().nodename}: {problem}" for problem in error.problems))
 
@@ -353,7 +355,7 @@ def _fill(
     source: MapFile,
     spool: _Spool,
     step: Step,
-    elsewhere: Callable[[MapGrid, Sequence[Cells]], Iterator[tuple[Cells, Verdicts]]] | None,
+    elsewhere: Callable[[MapGrid, Sequence[Cells]], Iterator[tuple[Cells, SegmentPredictions]]] | None,
 ) -> None:
     """Ask the model about every cell that is not done."""
     costs = spool.costs
@@ -363,9 +365,9 @@ def _fill(
     if not missing.all():
         logger.info("going on where it was: %.0f %% of the cells are done", 100.0 * (1.0 - missing.mean()))
     ready: list[Cells] = []
-    answers: Iterator[tuple[Cells, Verdicts]]
+    answers: Iterator[tuple[Cells, SegmentPredictions]]
     if elsewhere is None:
-        answers = zip(todo, verdicts_of(model, source, (frames.of(cells) for cells in todo)), strict=True)
+        answers = zip(todo, predict_segments(model, source, (frames.of(cells) for cells in todo)), strict=True)
     else:
         answers = elsewhere(costs.grid, todo)
     for number, (cells, found) in enumerate(answers, 1):

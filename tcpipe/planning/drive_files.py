@@ -13,6 +13,7 @@ from tcpipe.dataset import Dataset
 from tcpipe.errors import UsageError, plain_lines
 from tcpipe.formats.atomic import clear, write_text
 from tcpipe.formats.bucket_directories import require_card
+from tcpipe.formats.finding_lines import format_findings, format_verdict
 from tcpipe.formats.json_files import write_json
 from tcpipe.formats.object_storage import is_url
 from tcpipe.pipeline.generations import write_generation
@@ -21,15 +22,14 @@ from tcpipe.planning.drives import Against, DriveCost, drive_cost, drive_in, in_
 from tcpipe.report.colours import DROPPED, SPLIT_COLOURS
 from tcpipe.report.page import Number, Section, render_page
 from tcpipe.report.plots import Plot, new_plot
+from tcpipe.report.verdict import show_verdict
 from tcpipe.store import open_store
+from tcpipe.tables.catalogue import threshold
+from tcpipe.tables.findings import Finding, Subject, make_finding
+from tcpipe.tables.verdicts import PREDICTED, Verdict, judge
 from tcpipe.terrain.tiles import MapReader
 
 JSON, PAGE = "drives.json", "drives.html"
-
-_NO_USE_PERCENT = 50.0
-_ENOUGH_DRIVES = 10
-_HELD = 0.7
-"""Share of drives whose intervals of 90 % hold them, from which on nothing speaks against these: drives are few."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -43,6 +43,8 @@ class Drives:
     drives: tuple[DriveCost, ...]
     duration_s: Against
     energy_joule: Against
+    findings: tuple[Finding, ...]
+    verdict: Verdict
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,6 +65,7 @@ class DrivesResult:
             lines.append(
                 f"all {len(held)} drives held back: {sums}; intervals hold {hits[0]} of the times and {hits[1]} of the energies"
             )
+        lines += [f"verdict: {format_verdict(self.values.verdict, PREDICTED)}", *format_findings(self.values.findings)]
         return plain_lines((*lines, f"open {self.path}/{PAGE}"))
 
 
@@ -85,10 +88,14 @@ def evaluate_drives(
     if place.exists() and not place.is_dir():
         raise UsageError(f"{place}: is a file, wanted a directory to write {JSON} and {PAGE} into")
     found = tuple(drive_cost(model, source, run, data, log=log) for run, log in zip(runs, logs, strict=True))
-    held = [drive for drive in found if drive.held_back]
+    held, findings = (
+        [drive for drive in found if drive.held_back],
+        tuple(_find_doubts(found, Subject("model", model.name))),
+    )
     values = Drives(
         model=model.name, model_checksum=model.checksum, drives=found,
         duration_s=_sum([drive.duration_s for drive in held]), energy_joule=_sum([drive.energy_joule for drive in held]),
+        findings=findings, verdict=judge(findings),
     )  # fmt: skip
     place.mkdir(parents=True, exist_ok=True)
     write_json(place / JSON, values)
@@ -110,46 +117,37 @@ def _page(values: Drives) -> str:
             for called, of in (("time", values.duration_s), ("energy", values.energy_joule))
             if of.measured
         ],
-        warnings=[line for drive in values.drives for line in in_words(drive) if line.startswith("warning: ")],
+        verdict=show_verdict(values.verdict, values.findings, PREDICTED),
         sections=[
-            Section("Assessment", header=("", "statement"), rows=_assess(values)),
-            *(
-                Section(
-                    drive.run_id,
-                    " ".join(f"{line}." for line in in_words(drive)),
-                    plots=list(_sums_along(number, drive)),
-                )
-                for number, drive in enumerate(values.drives)
-            ),
+            Section(
+                drive.run_id, " ".join(f"{line}." for line in in_words(drive)), plots=list(_sums_along(number, drive))
+            )
+            for number, drive in enumerate(values.drives)
         ],
     )
 
 
-def _assess(values: Drives) -> list[tuple[str, str]]:
-    """Return statements on the predictions, the worst first."""
-    order = ("doubtful", "thin", "do", "good")
-    return sorted(_statements(values), key=lambda statement: order.index(statement[0]))
-
-
-def _statements(values: Drives) -> Iterator[tuple[str, str]]:
-    held = [drive for drive in values.drives if drive.held_back and drive.compared_m]
-    if not held:
-        yield ("doubtful", "Nothing is shown: no drive with metres to compare was held back from training.")
-        yield (
-            "do",
-            "Train with a run held out (build-dataset --holdout run), or measure a drive that is in no dataset.",
-        )
-    for called, name in (("time", "duration_s"), ("energy", "energy_joule")):
-        off = np.array([abs(getattr(drive, name).off_percent) for drive in held])
-        if (off >= _NO_USE_PERCENT).any():
-            yield ("doubtful", f"Of no use for {called}: a drive is off by {off.max():.0f} %.")
-        told = [of.held for drive in held if (of := getattr(drive, name)).held is not None]
-        if told:
-            kind = "good" if sum(told) >= _HELD * len(told) else "doubtful"
-            yield (kind, f"90 % intervals hold the {called} of {sum(told)} of {len(told)} drives held back.")
-    if 0 < len(held) < _ENOUGH_DRIVES:
-        few = "One drive tells" if len(held) == 1 else f"{len(held)} drives tell"
-        yield ("thin", f"{few} little of how often 90 % intervals hold: hold back {_ENOUGH_DRIVES} or more.")
+def _find_doubts(drives: Sequence[DriveCost], model: Subject) -> Iterator[Finding]:
+    """Yield what drives show of a model's sums and intervals, and which drives show nothing."""
+    for drive in drives:
+        if not drive.held_back:
+            yield make_finding(
+                "drive-in-training", Subject("run", drive.run_id), trained_count=drive.samples_in_training
+            )
+    compared = [drive for drive in drives if drive.held_back and drive.compared_m]
+    if not compared:
+        yield make_finding("no-drive-compared", model)
+    for name, quantity in (("time", "duration_s"), ("energy", "energy_joule")):
+        sums: dict[str, Against] = {drive.run_id: getattr(drive, quantity) for drive in compared}
+        for run_id, of in sums.items():
+            error = abs(of.off_percent) / 100.0
+            if error >= threshold(f"{name}-far-off", "max_error_fraction"):
+                yield make_finding(f"{name}-far-off", Subject("run", run_id), error_fraction=error)
+        held = [of.held for of in sums.values() if of.held is not None]
+        if held and sum(held) < threshold(f"{name}-overconfident", "min_drive_coverage_fraction") * len(held):
+            yield make_finding(f"{name}-overconfident", model, coverage_fraction=sum(held) / len(held))
+    if 0 < len(compared) < threshold("few-drives", "min_drive_count"):
+        yield make_finding("few-drives", model, drive_count=len(compared))
 
 
 def _sums_along(number: int, drive: DriveCost) -> Iterator[Plot]:

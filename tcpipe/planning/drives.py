@@ -17,7 +17,7 @@ from tcpipe.errors import ModelError, UsageError
 from tcpipe.formats.stored_runs import RunDirectory
 from tcpipe.planning.cost_model import CostModel, check_model
 from tcpipe.planning.reasons import Reason
-from tcpipe.planning.verdicts import Verdicts, in_batches, joined, verdicts_of
+from tcpipe.planning.segment_predictions import SegmentPredictions, in_batches, joined, predict_segments
 from tcpipe.splits.neighbours import CLOSE, PLACES, are_near, middles_deg
 from tcpipe.store import Store
 from tcpipe.tables.bits import names_of
@@ -162,16 +162,16 @@ def drive_cost(model: CostModel, source: MapReader, run: RunDirectory, data: Dat
     )  # fmt: skip
 
 
-def _said(model: CostModel, source: MapReader, segments: pa.Table, data: Dataset) -> Verdicts:
+def _said(model: CostModel, source: MapReader, segments: pa.Table, data: Dataset) -> SegmentPredictions:
     """Return what the model says of each segment, where it was driven."""
     projection = projection_to(source, data.card.recipe.read.gnss_crs)
     start, end = (projection.forward(lonlat_deg(segments, name)) for name in ("start", "end"))
     turn_radpm = floats(segments, "turn_rate_radps") * floats(segments, "duration_s") / floats(segments, "arc_length_m")
     frames = patch_frames(start, end, floats(segments, "chord_m"))
-    return joined(verdicts_of(model, source, in_batches(frames), turn_radpm=turn_radpm))
+    return joined(predict_segments(model, source, in_batches(frames), turn_radpm=turn_radpm))
 
 
-def _reasons(model: CostModel, segments: pa.Table, said: Verdicts, data: Dataset) -> list[list[str]]:
+def _reasons(model: CostModel, segments: pa.Table, said: SegmentPredictions, data: Dataset) -> list[list[str]]:
     """Return why each segment is not compared; nothing where it is."""
     uncertain = floats(segments, "position_std_m") > data.card.recipe.sample.max_position_std_m
     unlabelled = ~np.isfinite(floats(segments, ENERGIES[model.label_energy].energy) + floats(segments, "duration_s"))
@@ -206,17 +206,12 @@ def _along(
 
 def in_words(drive: DriveCost) -> list[str]:
     """Return what a drive shows, as plain lines."""
-    lines = [] if drive.held_back else [
-        f"warning: {drive.log}: {drive.samples_in_training} of its samples trained the model: it is not held back, and shows nothing"
-    ]  # fmt: skip
     rest = ", ".join(f"{metres:.0f} m {name.replace('_', ' ')}" for name, metres in drive.rest_m.items())
-    lines.append(
+    lines = [
         f"{drive.run_id}: {drive.compared_m:.0f} of {drive.driven_m:.0f} m driven are compared; {drive.segments_m:.0f} m are in segments"
-        + (f", of them not compared: {rest}" if rest else "")
-    )
-    lines.append(
-        f"{drive.run_id}: {drive.near_training_percent:.0f} % of its segments are within {CLOSE:g} chords of a training sample"
-    )
+        + (f", of them not compared: {rest}" if rest else ""),
+        f"{drive.run_id}: {drive.near_training_percent:.0f} % of its segments are within {CLOSE:g} chords of a training sample",
+    ]
     above = ", above standing" if drive.label_energy == "above_standing" else ""
     for called, of, unit in (("time", drive.duration_s, "s"), (f"energy{above}", drive.energy_joule, "J")):
         if drive.compared_m:

@@ -2,26 +2,32 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
-from pyproj import Geod
+from pyarrow import csv
+from pyproj import CRS, Geod
 
 from tcpipe.cost.prediction_errors import COVERAGE, errors_of
-from tcpipe.errors import PathError
+from tcpipe.errors import PathError, UsageError
+from tcpipe.formats.atomic import atomic_file
+from tcpipe.formats.json_files import write_json
+from tcpipe.formats.parquet import write_table
 from tcpipe.geometry.angles import wrap_to_pi
 from tcpipe.planning.cost_model import CostModel, check_model
-from tcpipe.planning.path_table import PIECES
-from tcpipe.planning.pieces import Pieces, cut_path, ground_scale
 from tcpipe.planning.reasons import Reason, counts_of
+from tcpipe.planning.segment_predictions import SegmentPredictions, in_batches, joined, predict_segments
 from tcpipe.planning.turning import turning_of, turns_between
-from tcpipe.planning.verdicts import Verdicts, in_batches, joined, verdicts_of
 from tcpipe.tables.bits import names_of
-from tcpipe.terrain.patches import corners_on, footprints
-from tcpipe.terrain.projection import Projection, area_of
+from tcpipe.tables.columns import Column, TableSchema
+from tcpipe.terrain.patches import PatchFrames, corners_on, footprints, patch_frames
+from tcpipe.terrain.projection import Projection, area_of, metres_from_plane
 from tcpipe.terrain.tiles import MapReader, projection_to
 
 Floats = NDArray[np.float64]
@@ -87,7 +93,7 @@ def cost_of_path(model: CostModel, source: MapReader, lonlat_deg: Floats, *, whe
     if not corners_on(source.grid, footprints(frames, model.patch_m)).any():
         raise PathError(off_map_text(source, where, lonlat_deg))
     turn_radpm = _turn_radpm(model, turns_between(pieces.start_xy_m, pieces.end_xy_m) / pieces.arc_m)
-    said = joined(verdicts_of(model, source, in_batches(frames), turn_radpm=turn_radpm))
+    said = joined(predict_segments(model, source, in_batches(frames), turn_radpm=turn_radpm))
     said.reasons[pieces.arc_m > model.max_arc_to_chord * pieces.chord_m] |= np.uint16(Reason.CURVED)
     return _costed(model, source, pieces, said)
 
@@ -117,7 +123,7 @@ def pieces_of(source: MapReader, lonlat_deg: Floats, *, chord_m: float, where: s
     return pieces
 
 
-def _costed(model: CostModel, source: MapReader, pieces: Pieces, said: Verdicts) -> PathCost:
+def _costed(model: CostModel, source: MapReader, pieces: Pieces, said: SegmentPredictions) -> PathCost:
     bits, class_id, errors = said.reasons, said.terrain_class, errors_of(model.residuals)
     duration, nothing = pieces.arc_m / said.velocity_mps, np.full(len(bits), np.nan)
     turn_rad = turns_between(pieces.start_xy_m, pieces.end_xy_m)
@@ -198,3 +204,132 @@ def off_map_text(source: MapReader, where: str, lonlat_deg: Floats) -> str:
     )
     extent = f"lon {west:.5f} to {east:.5f}, lat {south:.5f} to {north:.5f}"
     return f"{where}: is not on map {source.name} ({extent}); {hint}"
+
+
+_F, _WGS84 = pa.float64(), "WGS84"
+
+PIECES = TableSchema(
+    "pieces",
+    "path",
+    "A path's pieces and what each costs, in order (tcpipe predict-path).",
+    (
+        Column("piece", pa.int64(), "", "Number of the piece, from 0."),
+        Column("start_lon_deg", _F, "deg", "Longitude of its start.", _WGS84),
+        Column("start_lat_deg", _F, "deg", "Latitude of its start.", _WGS84),
+        Column("end_lon_deg", _F, "deg", "Longitude of its end.", _WGS84),
+        Column("end_lat_deg", _F, "deg", "Latitude of its end.", _WGS84),
+        Column("distance_m", _F, "m", "Length of the path before it, horizontal."),
+        Column("chord_m", _F, "m", "Straight length, horizontal; the last piece is what remains."),
+        Column("arc_length_m", _F, "m", "Length along the path, horizontal; what its cost is for."),
+        Column("course_rad", _F, "rad", "Direction of its chord, counter-clockwise from true east.", "ENU"),
+        Column("terrain_class", pa.uint8(), "", "Majority class under the chord; 0: none."),
+        Column("terrain_name", pa.string(), "", "Name of that class."),
+        Column("slope_rad", _F, "rad", "Slope along travel, uphill positive.", nullable=True),
+        Column("cross_slope_rad", _F, "rad", "Slope across travel, positive when the left side is higher.", nullable=True),
+        Column("power_watt", _F, "W", "Predicted mean power; null without a cost, as all that follows.", nullable=True),
+        Column("velocity_mps", _F, "m/s", "Predicted ground velocity.", nullable=True),
+        Column("duration_s", _F, "s", "Predicted time: arc length over velocity.", nullable=True),
+        Column("duration_low_s", _F, "s", "Lower end of its 90 % interval.", nullable=True),
+        Column("duration_high_s", _F, "s", "Upper end of its 90 % interval.", nullable=True),
+        Column("turn_rad", _F, "rad", "Half of the change of course at either end: what it turns."),
+        Column("turn_energy_joule", _F, "J", "What that costs beyond the turns of training; null without physics.", nullable=True),
+        Column("energy_joule", _F, "J", "Predicted energy: power times time, and that of its turn.", nullable=True),
+        Column("energy_low_joule", _F, "J", "Lower end of its 90 % interval.", nullable=True),
+        Column("energy_high_joule", _F, "J", "Upper end of its 90 % interval.", nullable=True),
+        Column("reasons", pa.uint16(), "bits", "Why it has no cost, or none to be trusted; 0: neither.", flags=Reason),
+        Column("reason_names", pa.string(), "", "The same as words, separated by spaces."),
+    ),
+)  # fmt: skip
+
+ENDINGS = (".csv", ".parquet", ".json")
+
+
+def check_ending(path: Path) -> None:
+    """Raise `UsageError` unless a table can be written to a file of this name."""
+    if path.suffix.lower() not in ENDINGS:
+        raise UsageError(f"{path}: wanted a name that ends in {', '.join(ENDINGS[:-1])} or {ENDINGS[-1]}")
+    if path.is_dir():
+        raise UsageError(f"{path}: is a directory, wanted a file")
+
+
+def write_pieces(path: Path, table: pa.Table) -> None:
+    """Write the table in the format of the file's ending, whole or not at all."""
+    match path.suffix.lower():
+        case ".parquet":
+            write_table(table, path)
+        case ".json":
+            write_json(path, {"pieces": table.to_pylist()})
+        case _:
+            with atomic_file(path) as temporary:
+                csv.write_csv(table, temporary)
+
+
+_LEAST_M = 1e-3
+"""A rest shorter than this is the rounding of coordinates, not a piece [m]."""
+
+
+@dataclass(frozen=True, slots=True)
+class Pieces:
+    """N pieces of a path, in order.
+
+    Attributes
+    ----------
+    start_xy_m, end_xy_m : in the map's CRS [m], shape (N, 2).
+    chord_m, arc_m : straight and along the path, on the ground [m], shape (N,); ``chord_m`` is d but for the last.
+    scale : ground metres a map metre.
+    """
+
+    start_xy_m: Floats
+    end_xy_m: Floats
+    chord_m: Floats
+    arc_m: Floats
+    scale: float
+
+    def frames(self, chord_m: float) -> PatchFrames:
+        """Return the patch of each piece; that of a shorter last one ends with it and reaches back over the piece before."""
+        along = (self.end_xy_m - self.start_xy_m) / np.linalg.norm(self.end_xy_m - self.start_xy_m, axis=1)[:, None]
+        start = self.end_xy_m - along * (chord_m / self.scale)
+        return patch_frames(start, self.end_xy_m, np.full(len(start), chord_m))
+
+
+def ground_scale(crs: CRS, xy_m: Floats) -> float:
+    """Return metres of ground a metre of the map's plane, the mean over points of shape (N, 2)."""
+    return float(np.mean(np.sqrt(np.abs(np.linalg.det(metres_from_plane(crs, xy_m))))))
+
+
+def cut_path(xy_m: Floats, *, chord_m: float, scale: float) -> Pieces:
+    """Return the pieces of a polyline.
+
+    Parameters
+    ----------
+    xy_m : its points in the map's CRS [m], shape (P, 2).
+    chord_m : d, on the ground [m].
+    scale : ground metres a map metre; over the some kilometres that a robot drives it is one number to 1e-5.
+    """
+    points = xy_m[np.r_[True, (np.diff(xy_m, axis=0) != 0.0).any(axis=1)]]
+    cuts = _cuts(points.tolist(), chord_m / scale)
+    ends = np.array([(x, y) for x, y, _ in cuts]).reshape(-1, 2)
+    arc = np.diff(np.array([length for _, _, length in cuts])) * scale
+    chord = np.linalg.norm(np.diff(ends, axis=0), axis=1) * scale
+    return Pieces(ends[:-1], ends[1:], chord, arc, scale)
+
+
+def _cuts(points: list[list[float]], radius: float) -> list[tuple[float, float, float]]:
+    """Return x, y and length so far of the path's start, of each cut and, if a rest is left, of its end."""
+    (x0, y0), length = points[0], 0.0
+    cuts = [(x0, y0, 0.0)]
+    for (ax, ay), (bx, by) in pairwise(points):
+        side = math.hypot(bx - ax, by - ay)
+        ux, uy = (bx - ax) / side, (by - ay) / side
+        while True:  # the point at s along this side is `radius` from the last cut
+            along, off = (x0 - ax) * ux + (y0 - ay) * uy, (x0 - ax) * uy - (y0 - ay) * ux
+            s = along + math.sqrt(max(radius * radius - off * off, 0.0))
+            if s > side:
+                break
+            x0, y0 = ax + s * ux, ay + s * uy
+            cuts.append((x0, y0, length + s))
+        length += side
+    rest = math.hypot(points[-1][0] - x0, points[-1][1] - y0)
+    if rest > _LEAST_M and length - cuts[-1][2] > _LEAST_M:
+        cuts.append((points[-1][0], points[-1][1], length))
+    return cuts

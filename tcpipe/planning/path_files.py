@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -9,13 +10,14 @@ from typing import Literal
 from tcpipe.cost.prediction_errors import COVERAGE
 from tcpipe.errors import StoreError, UsageError, plain_lines
 from tcpipe.formats.atomic import clear_beside
+from tcpipe.formats.finding_lines import format_findings
 from tcpipe.formats.geojson_lines import read_line
 from tcpipe.formats.json_files import digest, recast
 from tcpipe.formats.maps.map_files import MapFile
 from tcpipe.formats.seals import file_checksum, read_sealed_as, write_sealed
 from tcpipe.planning.cost_model import CostModel
-from tcpipe.planning.path_cost import PathTotals, cost_of_path
-from tcpipe.planning.path_table import check_ending, write_pieces
+from tcpipe.planning.path_cost import PathTotals, check_ending, cost_of_path, write_pieces
+from tcpipe.tables.findings import Finding, Subject, make_finding
 
 VERSION = "1.2"
 
@@ -55,9 +57,10 @@ class PathResult(NamedTotals):
         return 0 if self.complete else 3
 
     def __str__(self) -> str:
-        """Return the totals, their intervals, and where the model has no business, as plain lines."""
+        """Return the totals, their intervals, and findings, as plain lines."""
         above = ", above standing" if self.label_energy == "above_standing" else ""
-        return plain_lines((f"{self.path}: {cost_text(self)}{above}", *_reason_lines(self), *self._out_lines()))
+        findings = format_findings(find_doubts(self, Subject("file", self.path.name)))
+        return plain_lines((f"{self.path}: {cost_text(self)}{above}", *findings, *self._out_lines()))
 
     def _out_lines(self) -> tuple[str, ...]:
         if self.out is None:
@@ -87,20 +90,19 @@ def _quantity(value: float, interval: tuple[float, float] | None, unit: str) -> 
     return f"{value:.{digits}f} {unit} ({COVERAGE:.0%}: {low:.{digits}f} to {high:.{digits}f})"
 
 
-def _reason_lines(of: PathTotals) -> list[str]:
-    lines = [f"warning: {count} of {of.pieces} pieces: {name.replace('_', ' ')}" for name, count in of.reasons.items()]
+def find_doubts(of: PathTotals, path: Subject) -> Iterator[Finding]:
+    """Yield where the model has no support on a path, and how little its intervals rest on."""
+    for reason, count in of.reasons.items():
+        names, total = {"reason": reason.replace("_", " ")}, of.pieces
+        yield make_finding("path-not-supported", path, names=names, segment_count=count, total_count=total)
     if of.duration_interval_s is None:
-        return [*lines, "warning: no intervals: the model has too few held-out samples to tell its errors"]
-    told = f"{of.held_out_samples} held-out samples of {of.held_out_runs} run{'s' if of.held_out_runs > 1 else ''}"
+        yield make_finding("no-intervals", path)
     of_both = {"time": (of.duration_s, of.duration_interval_s), "energy": (of.energy_joule, of.energy_interval_joule)}
-    lines += [
-        f"warning: {name}: the interval is wider than the {name} itself: {told} tell no more"
-        for name, (value, ends) in of_both.items()
-        if ends is not None and ends[1] - ends[0] > abs(value)
-    ]
-    if of.held_out_runs == 1:
-        lines.append(f"warning: {told} do not tell how runs differ: the intervals are of such a run on such a day")
-    return lines
+    for quantity, (value, ends) in of_both.items():
+        if ends is not None and ends[1] - ends[0] > abs(value):
+            yield make_finding("interval-wide", path, names={"quantity": quantity})
+    if of.held_out_runs == 1 and of.duration_interval_s is not None:
+        yield make_finding("one-held-out-run", path, sample_count=of.held_out_samples)
 
 
 def predict_path(model: CostModel, source: MapFile, path: Path, out: Path | None) -> PathResult:

@@ -2,8 +2,8 @@
 
 A path over a point p is at least as long as the straight ways start-p-goal. So no point outside an ellipse can lie on a path shorter than
 one that is known: the ellipse is looked at, without predictions, and grows until the shortest way is proved. Then the model is asked, first
-about the ground of the shortest way and a little of every class, then about whatever could lie on a better path than the best so far
-(`tcpipe.planning.bounds`), the likeliest first, until nothing could.
+about the ground of the shortest way and a little of every class, then about whatever could lie on a better path than the best so
+far, the likeliest first, until nothing could.
 """
 
 from __future__ import annotations
@@ -19,16 +19,13 @@ from numpy.typing import NDArray
 
 from tcpipe.errors import PathError
 from tcpipe.formats.json_files import recast
-from tcpipe.planning.bounds import could_be_better, probe_cells
-from tcpipe.planning.cost_grid import BARRED
+from tcpipe.planning.cost_grid import BARRED, Mask, Survey
 from tcpipe.planning.courses import COURSES
 from tcpipe.planning.path_cost import PathCost, PathTotals, cost_of_path, off_map_text, projection_of
 from tcpipe.planning.reasons import Reason
-from tcpipe.planning.search import Found, Steps, least_cost_path, steps_of
+from tcpipe.planning.search import Found, Steps, best_potential, least_cost_path, least_over_cells, steps_of
 from tcpipe.planning.straight import straightened
-from tcpipe.planning.survey import Mask, Survey
-from tcpipe.planning.turning import turning_of
-from tcpipe.planning.turning_search import least_turning_path
+from tcpipe.planning.turning import least_turning_path, turning_of
 from tcpipe.tables.bits import names_of
 from tcpipe.terrain.classes import NODATA_ID
 from tcpipe.terrain.point_classes import classes_at
@@ -304,3 +301,68 @@ class _Search:
                     f"{text} but over ground unlike any that the model was trained on; --allow-extrapolation crosses it"
                 )
         return f"{text}: what lies between cannot be driven over, or has no data"
+
+
+Classes = NDArray[np.uint8]
+
+_CHEAP = 0.1
+_FEWEST_STEPS = 20
+"""Known steps without which a class is taken to be as cheap as the cheapest other."""
+
+_PROBES = 6
+_CLASSES = 256
+
+
+def probe_cells(class_id: Classes, open_: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return cells to be predicted before anything is said of a class: squares of three by three around some of it, spread evenly.
+
+    Parameters
+    ----------
+    class_id, open_ : of each cell, and whether it may be driven over as far as is known, shape (rows, cols).
+    """
+    rows, cols = class_id.shape
+    found = np.zeros(class_id.shape, np.bool_)
+    for number in np.unique(class_id[open_]).tolist():
+        own = np.flatnonzero((class_id == number) & open_)
+        middle = own[((np.arange(_PROBES) + 0.5) / _PROBES * own.size).astype(np.int64)]
+        for row, col in np.stack(np.divmod(middle, cols), axis=1).tolist():
+            found[max(row - 1, 0) : min(row + 2, rows), max(col - 1, 0) : min(col + 2, cols)] = True
+    return found & open_
+
+
+def could_be_better(
+    steps: Steps, class_id: Classes, found: Found | None, start: int, goal: int
+) -> tuple[Floats, NDArray[np.bool_]]:
+    """Return the least that a path over each cell can cost, shape (cells,), and whether that is less than the path that was found.
+
+    Parameters
+    ----------
+    steps : every step that may be possible; those with a cost are known.
+    class_id : of each cell, shape (rows, cols).
+    found : the best path over known steps, None if there is none.
+    start, goal : flat indices of cells.
+    """
+    known = np.isfinite(steps.cost)
+    sure = Steps(steps.begin[known], steps.end[known], steps.cost[known], steps.length_m[known], steps.rise_m[known])
+    reduced = sure.cost - (found.potential if found else best_potential(sure)) * sure.rise_m
+    of_cell = class_id.reshape(-1)
+    cheap = _cheap_by_class(sure, reduced, of_cell)
+    least = np.empty(steps.cost.size)
+    least[known] = reduced
+    least[~known] = (0.5 * (cheap[of_cell[steps.begin]] + cheap[of_cell[steps.end]]) * steps.length_m)[~known]
+    limit = found.reduced_cost * (1.0 - 1e-9) if found else np.inf
+    over = least_over_cells(steps, least, of_cell.size, start, goal, limit=limit)
+    return over, over < limit
+
+
+def _cheap_by_class(steps: Steps, reduced: Floats, of_cell: Classes) -> Floats:
+    """Return the cheapest tenth of a metre of each class, shape (256,)."""
+    found = np.full(_CLASSES, np.nan)
+    within, per_m = of_cell[steps.begin], reduced / steps.length_m
+    inside = within == of_cell[steps.end]
+    for number in np.unique(within).tolist():
+        own = per_m[inside & (within == number)]
+        if own.size >= _FEWEST_STEPS:
+            found[number] = max(float(np.quantile(own, _CHEAP)), 0.0)
+    known = found[np.isfinite(found)]
+    return np.where(np.isfinite(found), found, known.min() if known.size else 0.0)

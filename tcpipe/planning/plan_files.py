@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Literal
@@ -12,23 +12,23 @@ from numpy.typing import NDArray
 
 from tcpipe.errors import ModelError, StoreError, UsageError, plain_lines
 from tcpipe.formats.atomic import clear_beside
+from tcpipe.formats.finding_lines import format_findings
 from tcpipe.formats.geojson_lines import LineFeature, check_lonlat, line_feature
 from tcpipe.formats.json_files import digest, read_as, recast, write_json
 from tcpipe.formats.maps.map_files import MapFile
 from tcpipe.formats.seals import broken_seal, file_checksum
+from tcpipe.planning.cost_grid import Survey, new_survey, survey_from
 from tcpipe.planning.cost_map import CARD, CostMapCard, cost_map_key, open_cost_map, read_cost_map_card
 from tcpipe.planning.cost_model import CostModel, check_model
-from tcpipe.planning.path_files import cost_text
+from tcpipe.planning.path_files import cost_text, find_doubts
 from tcpipe.planning.plan import OBJECTIVES, Objective, PlanTotals, plan_path
-from tcpipe.planning.survey import Survey, new_survey, survey_from
 from tcpipe.tables.bounds import Bounds
-from tcpipe.tables.facts import LEFT_OUT
+from tcpipe.tables.catalogue import threshold
+from tcpipe.tables.findings import LEFT_OUT, Finding, Subject, make_finding
 
 VERSION = "1.1"
 
-_TAKEN = {"energy": ("energy_joule", "J"), "time": ("duration_s", "s"), "distance": ("length_m", "m")}
-_AS_MUCH = 0.99
-"""Share of what a path takes from which on another takes as much."""
+_TAKEN = {"energy": "energy_joule", "time": "duration_s", "distance": "length_m"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,32 +99,23 @@ class PlanResult:
 
     def __str__(self) -> str:
         """Return what each path costs and where it is, as plain lines."""
-        first = next(iter(self.plans.values()))
         lines = [f"least {name}: {cost_text(plan)}" for name, plan in self.plans.items()]
-        lines += [f"warning: {count} pieces: {name.replace('_', ' ')}" for name, count in first.reasons.items()]
-        if not first.complete:
-            lines.append(
-                "warning: cells are so large that ground without a cost lies between; choose a smaller --cell-size"
-            )
-        lines += _beaten(self.plans)
-        if first.negative_steps:
-            lines.append(
-                f"warning: {first.negative_steps} steps give back more than their height explains; taken as free"
-            )
+        lines += format_findings(self._find_doubts())
         same = ": nothing to do: it is made from the same model, map and points" if self.status == "unchanged" else ""
         return plain_lines((*lines, f"{self.out}{same}", *([str(self.picture)] if self.picture else [])))
 
-
-def _beaten(plans: Mapping[Objective, PlanTotals]) -> list[str]:
-    """Return a line where another of the plans takes less of what was to be least: cells do not tell what its metres do."""
-    objective, asked = next(iter(plans.items()))
-    name, unit = _TAKEN[objective]
-    taken = {other: getattr(found, name) for other, found in plans.items() if found.complete}
-    least = min(taken, key=taken.__getitem__, default=objective)
-    if not asked.complete or taken[least] >= _AS_MUCH * taken[objective]:
-        return []
-    told = f"warning: the path of least {least} takes less {objective} than this one ({taken[least]:.0f} {unit}): "
-    return [told + "metre by metre the ground is not as its cells tell; choose a smaller --cell-size"]
+    def _find_doubts(self) -> Iterator[Finding]:
+        """Yield what the path segments of the plan show that its cells did not, and that another plan takes less."""
+        (objective, asked), path = next(iter(self.plans.items())), Subject("file", self.out.name)
+        yield from find_doubts(asked, path)
+        if not asked.complete:
+            yield make_finding("cells-too-large", path)
+        if asked.negative_steps:
+            yield make_finding("steps-gain-energy", path, step_count=asked.negative_steps)
+        taken = {other: getattr(found, _TAKEN[objective]) for other, found in self.plans.items() if found.complete}
+        least = min(taken, key=taken.__getitem__, default=objective)
+        if asked.complete and taken[least] < threshold("objective-missed", "max_cost_ratio") * taken[objective]:
+            yield make_finding("objective-missed", path, names={"other": least, "objective": objective})
 
 
 def plan(

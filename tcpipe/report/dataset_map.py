@@ -15,8 +15,7 @@ from tcpipe.formats.dataset_card import DatasetCard
 from tcpipe.formats.dataset_files import CLASSES, DRIVE_NEXT, OVERVIEW, RELIEF
 from tcpipe.formats.geojson import PolygonGeometry, read_polygons
 from tcpipe.report.dataset_samples import SamplesShown
-from tcpipe.report.overview import Bounds, joint_bounds_m
-from tcpipe.report.pictures import picture_uri, read_picture
+from tcpipe.report.pictures import Bounds, joint_bounds_m, picture_uri, read_picture
 from tcpipe.report.plots import Plot, lay_picture, new_plot
 
 _MOST_PLACES = 200

@@ -14,16 +14,19 @@ from tcpipe.formats.dataset_files import read_current_card, read_samples
 from tcpipe.formats.finding_lines import format_group, group_findings
 from tcpipe.formats.json_files import Json
 from tcpipe.formats.store_mark import MARK
-from tcpipe.report.balance import balance_sections
 from tcpipe.report.colours import CLASS_COLOURS, DROPPED, FAINT, KEPT, SPLIT_COLOURS, class_colour
 from tcpipe.report.dataset_map import map_plots
 from tcpipe.report.dataset_patches import PER_SHEET, patches_shown
 from tcpipe.report.dataset_samples import COLUMNS, MOST_SAMPLES, SamplesShown, first_starts_ns, samples_shown
-from tcpipe.report.error_budget import budget_sections
+from tcpipe.report.label_sections import (
+    QUALITY_WORDS,
+    balance_sections,
+    budget_sections,
+    physics_sections,
+    quality_sections,
+)
 from tcpipe.report.page import Link, Number, Section, render_page
-from tcpipe.report.physics import physics_sections
 from tcpipe.report.plots import Plot, label_histograms, new_plot, waterfall
-from tcpipe.report.quality import QUALITY_WORDS, quality_sections
 from tcpipe.report.verdict import VerdictBox, show_mixed_groups
 from tcpipe.tables.arrays import texts
 from tcpipe.tables.bits import Quality, name_of

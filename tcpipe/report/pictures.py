@@ -1,17 +1,24 @@
-"""Pictures inside a page: WebP as data URIs, sheets of many small ones, and grey values made colours."""
+"""Pictures: of patches and maps as WebP inside a page, and quick looks of maps as files."""
 
 from __future__ import annotations
 
 import base64
 import io
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
+import matplotlib.image
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
+from pyproj import Transformer
 
+from tcpipe.formats.atomic import atomic_file
+from tcpipe.formats.maps.map_files import MapFile
+from tcpipe.formats.seals import picture_text, seal_of
 from tcpipe.report.colours import CLASS_COLOURS
+from tcpipe.terrain.layers import COLOURS, Pixels
 
 Bytes = NDArray[np.uint8]
 
@@ -73,3 +80,142 @@ def relief_picture(values: NDArray[np.float64]) -> Bytes:
 
 def _rgb(colour: str) -> Sequence[int]:
     return [int(colour[n : n + 2], 16) for n in (1, 3, 5)]
+
+
+_SIDE_PX = 900
+_TINT = 0.35
+
+
+def map_overview(source: MapFile) -> NDArray[np.uint8]:
+    """Return the orthophoto, or a shaded relief without one, as grey bytes of at most `_SIDE_PX` a side; the map is read in strips."""
+    level, step = _level(source)
+    layer = "ortho" if "ortho" in level.layers else "height"
+    picture = _thinned(level, layer, step)
+    return picture.astype(np.uint8) if layer == "ortho" else _shaded(picture, step * level.grid.pitch_m)
+
+
+Bounds = tuple[float, float, float, float]
+"""x_min, y_min, x_max, y_max [m]."""
+
+
+def joint_bounds_m(places: Sequence[tuple[str, Bounds]]) -> Bounds:
+    """Return the bounds of all maps, each given with its CRS, in the CRS of the first."""
+    first = places[0][0]
+    every = [
+        bounds if crs == first else Transformer.from_crs(crs, first, always_xy=True).transform_bounds(*bounds)
+        for crs, bounds in places
+    ]
+    low, high = np.min(every, axis=0), np.max(every, axis=0)
+    return float(low[0]), float(low[1]), float(high[2]), float(high[3])
+
+
+def ortho_overview(source: MapFile) -> NDArray[np.uint8]:
+    """Return the orthophoto in colour, shape (R, C, 3), where the map has it so; else the `map_overview`."""
+    level, step = _level(source)
+    if not set(COLOURS) <= set(level.layers):
+        return map_overview(source)
+    return np.stack([_thinned(level, layer, step) for layer in COLOURS], axis=-1).astype(np.uint8)
+
+
+def relief_overview(source: MapFile) -> NDArray[np.uint8]:
+    """Return a shaded relief, shape (R, C)."""
+    level, step = _level(source)
+    return _shaded(_thinned(level, "height", step), step * level.grid.pitch_m)
+
+
+def class_overview(source: MapFile) -> NDArray[np.uint8]:
+    """Return the terrain classes in their colours, shape (R, C, 3); white without a terrain layer."""
+    level, step = _level(source)
+    if "terrain" not in level.layers:
+        return np.full((*relief_overview(source).shape, 3), 255, np.uint8)
+    return class_picture(_thinned(level, "terrain", step).astype(np.int64))
+
+
+def maps_overview(
+    sources: Sequence[MapFile], look: Callable[[MapFile], NDArray[np.uint8]] = ortho_overview
+) -> NDArray[np.uint8]:
+    """Return one picture of all maps over their joint bounds, each by ``look``; the first rules where they overlap."""
+    if len(sources) == 1:
+        return look(sources[0])
+    crs = sources[0].grid.crs
+    x_min_m, y_min_m, x_max_m, y_max_m = joint_bounds_m([(each.grid.crs, each.grid.bounds_m) for each in sources])
+    step_m = max(x_max_m - x_min_m, y_max_m - y_min_m) / _SIDE_PX
+    x_m, y_m = np.meshgrid(
+        np.arange(x_min_m + step_m / 2, x_max_m, step_m), np.arange(y_max_m - step_m / 2, y_min_m, -step_m)
+    )
+    whole = np.full((*x_m.shape, 3), 255, np.uint8)
+    for each in reversed(sources):
+        picture, (left, bottom, right, top) = look(each), each.grid.bounds_m
+        to_map = Transformer.from_crs(crs, each.grid.crs, always_xy=True)
+        x, y = (x_m, y_m) if each.grid.crs == crs else to_map.transform(x_m, y_m)
+        col = np.floor((x - left) / (right - left) * picture.shape[1]).astype(np.int64)
+        row = np.floor((top - y) / (top - bottom) * picture.shape[0]).astype(np.int64)
+        inside = (col >= 0) & (col < picture.shape[1]) & (row >= 0) & (row < picture.shape[0])
+        pixels = picture[row[inside], col[inside]]
+        whole[inside] = pixels if picture.ndim == 3 else pixels[:, None]
+    return whole
+
+
+def quick_look(source: MapFile) -> NDArray[np.uint8]:
+    """Return the overview in colour, shape (R, C, 3): terrain classes tinted over it, white where a layer has no data."""
+    level, step = _level(source)
+    picture = map_overview(source)[..., None].repeat(3, axis=2)
+    missing = np.zeros(picture.shape[:2], np.bool_)
+    for layer in level.layers:
+        pixels = _thinned(level, layer, step)
+        missing |= ~level.layers[layer].has_data(pixels)
+        if layer == "terrain":
+            picture = ((1.0 - _TINT) * picture + _TINT * class_picture(pixels.astype(np.int64))).astype(np.uint8)
+    return np.where(missing[..., None], np.uint8(255), picture)
+
+
+def _level(source: MapFile) -> tuple[MapFile, int]:
+    """Return the coarsest level that is still large enough, and which of its pixels to take."""
+    longer = max(source.grid.rows, source.grid.cols)
+    factor = max(factor for factor in source.factors if factor == 1 or longer // factor >= _SIDE_PX)
+    return source.at(factor), max(1, -(-(longer // factor) // _SIDE_PX))
+
+
+def _thinned(level: MapFile, layer: str, step: int) -> Pixels:
+    """Return every ``step``-th pixel of a layer."""
+    side = max(step, level.tile_px * 4 // step * step)
+    rows, cols = level.grid.rows, level.grid.cols
+    blocks = [
+        [
+            level.read(layer, i, min(i + side, rows), j, min(j + side, cols))[::step, ::step]
+            for j in range(0, cols, side)
+        ]
+        for i in range(0, rows, side)
+    ]
+    return np.block(blocks)
+
+
+def _shaded(height_m: NDArray[np.generic], pitch_m: float) -> NDArray[np.uint8]:
+    """Return Lambert shading of a height field lit from the north-west, 45° above the horizon; no data is white."""
+    down, right = np.gradient(height_m.astype(float), pitch_m)
+    light = (1.0 + right / np.sqrt(2.0) + down / np.sqrt(2.0)) / np.sqrt(2.0 * (1.0 + right**2 + down**2))
+    return np.where(np.isfinite(light), np.clip(light, 0.0, 1.0) * 255, 255).astype(np.uint8)
+
+
+_PLAIN_PNG: dict[str, Any] = {"Software": None}
+
+
+def write_overview(path: Path, picture: NDArray[np.uint8], *, texts: Mapping[str, str] | None = None) -> None:
+    """Write a picture, grey (R, C) or colour (R, C, 3), as PNG with texts by key; the same picture gives the same bytes."""
+    with atomic_file(path) as temporary:
+        metadata = {**_PLAIN_PNG, **(texts or {})}
+        matplotlib.image.imsave(temporary, picture, format="png", cmap="gray", vmin=0, vmax=255, metadata=metadata)
+
+
+_SHOWS = "tcpipe map"
+"""Key of the text in a quick look that tells which map it shows: the seal of the map's checksums."""
+
+
+def write_quick_look(picture: Path, look: NDArray[np.uint8], seal: str) -> None:
+    """Write the `quick_look` of a map; the picture carries which map it shows, by `tcpipe.formats.seals.seal_of`."""
+    write_overview(picture, look, texts={_SHOWS: seal})
+
+
+def shows_map(picture: Path, map_path: Path) -> bool:
+    """Return whether a picture is the quick look of the map at ``map_path``; `StoreError` if that cannot be read."""
+    return picture_text(picture, _SHOWS) == seal_of(map_path)

@@ -14,8 +14,7 @@ from tcpipe.errors import TcpipeError, plain_line
 from tcpipe.formats.maps.map_files import MapFile, open_map
 from tcpipe.formats.stored_runs import RunDirectory
 from tcpipe.report.colours import CURSOR
-from tcpipe.report.overview import Bounds, class_overview, ortho_overview, relief_overview
-from tcpipe.report.pictures import picture_uri
+from tcpipe.report.pictures import Bounds, class_overview, ortho_overview, picture_uri, relief_overview
 from tcpipe.report.plots import Plot, lay_picture, new_plot
 from tcpipe.store import Store
 from tcpipe.tables.columns import floats, lonlat_deg

@@ -18,12 +18,10 @@ from tcpipe.formats.run_documents import Manifest, RunJson
 from tcpipe.formats.stored_runs import RunDirectory
 from tcpipe.motion.remedies import losses_of
 from tcpipe.report.colours import DOUBTED, FAINT, KEPT, UNUSED
-from tcpipe.report.error_budget import budget_sections
+from tcpipe.report.label_sections import QUALITY_WORDS, budget_sections, physics_sections, quality_sections
 from tcpipe.report.packed import Column, packed, shown_to
 from tcpipe.report.page import Link, Number, Section, render_page
-from tcpipe.report.physics import physics_sections
 from tcpipe.report.plots import Plot, histogram, label_histograms, new_plot, waterfall
-from tcpipe.report.quality import QUALITY_WORDS, quality_sections
 from tcpipe.report.run_map import Pictures, RunMap, run_map
 from tcpipe.report.run_plots import SPEED_ROLES, Line, lines_of, reasons_told, time_plots
 from tcpipe.report.run_sensors import sensor_sections

@@ -3,11 +3,11 @@
 page.start(() => {
   const { data: told, at, make, fillSelect } = page;
   const runs = told.rows.map((row, number) => Object.assign({ number }, ...told.fields.map((name, i) => ({ [name]: row[i] }))));
-  const kind = (run) => run.state.startsWith("superseded") ? "superseded" : run.state;
+  const state_of = (run) => run.superseded_by ? `superseded by ${run.superseded_by}` : run.state;
   const date = (ms) => ms === null ? "" : new Date(ms).toISOString().slice(0, 16).replace("T", " ");
   const digits = (name, places) => (run) => run[name] === null ? "" : run[name].toFixed(places);
   const columns = [
-    ["run", (run) => run.run], ["start_ms", (run) => date(run.start_ms), 1], ["robot", (run) => run.robot], ["state", (run) => run.state],
+    ["run", (run) => run.run], ["start_ms", (run) => date(run.start_ms), 1], ["robot", (run) => run.robot], ["state", state_of],
     ["datasets", (run) => run.datasets.map((n) => told.datasets[n]).join(", ")], ["tags", (run) => run.tags],
     ["segments", digits("segments", 0), 1], ["driven", digits("driven", 0), 1], ["used", digits("used", 1), 1], ["floor", digits("floor", 2), 1],
     ["verdict", (run) => run.verdict], ["findings", digits("findings", 0), 1],
@@ -24,7 +24,7 @@ page.start(() => {
   const wanted = () => {
     const [robot, state, dataset, code] = ["robot", "state", "dataset", "code"].map((id) => at(id).value);
     const words = at("find").value.toLowerCase().split(/\s+/).filter(Boolean);
-    return runs.filter((run) => (!robot || run.robot === robot) && (!state || kind(run) === state)
+    return runs.filter((run) => (!robot || run.robot === robot) && (!state || run.state === state)
       && (!code || run.codes.includes(Number(code))) && words.every((word) => `${run.run} ${run.tags}`.toLowerCase().includes(word))
       && (!dataset || (dataset === "none" ? !run.datasets.length : run.datasets.includes(Number(dataset)))));
   };
@@ -98,7 +98,7 @@ page.start(() => {
     draw();
   };
   fillSelect(at("robot"), told.robots.map(([robot]) => robot));
-  fillSelect(at("state"), [...new Set(runs.map(kind))], (state) => `${state} (${runs.filter((run) => kind(run) === state).length})`);
+  fillSelect(at("state"), [...new Set(runs.map((run) => run.state))], (state) => `${state} (${runs.filter((run) => run.state === state).length})`);
   fillSelect(at("dataset"), ["none", ...told.datasets.keys()], (n) => told.datasets[n] ?? n);
   fillSelect(at("code"), [...told.codes.keys()], (n) => told.codes[n]);
   for (const id of ["robot", "state", "dataset", "code"]) at(id).onchange = filtered;

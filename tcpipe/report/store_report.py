@@ -78,9 +78,9 @@ def _table(store: StoreFacts, runs: Sequence[StoredRun]) -> list[Section]:
             Link(run.run_id, run.href) if run.href else run.run_id,
             day(run.facts),
             run.facts.robot if run.facts else "",
-            run.state,
+            f"superseded by {run.facts.superseded_by}" if run.facts and run.facts.superseded_by else run.state,
             ", ".join(names[number] for number in run.datasets),
-            *("" if cell is None else cell for cell in run.row([])[5:12]),
+            *("" if cell is None else cell for cell in run.row([])[6:13]),
         )
         for run in runs[:MOST_ROWS]
     ]
@@ -193,7 +193,7 @@ def _trouble(store: StoreFacts, runs: Sequence[StoredRun]) -> list[Section]:
     """Return the logs without a run, and the runs that are damaged or cannot be read."""
     rows = [(of.log, of.state, of.why) for of in store.failed]
     for run in runs:
-        if run.facts is None or run.state.startswith(("damaged", "empty")):
+        if run.facts is None or (run.is_current and (run.facts.damage or run.facts.is_empty)):
             line = store.found.damaged.get((run.run_id, run.recipe_id), "ingest its log again")
             rows.append((run.run_id, run.state, _describe_problem(run.facts) if run.facts else line))
     if not rows:

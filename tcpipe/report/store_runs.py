@@ -15,7 +15,6 @@ from tcpipe.formats.stored_runs import Ingestions
 from tcpipe.tables.findings import Finding
 from tcpipe.tables.verdicts import Verdict
 
-GOOD = "good"
 _PAGE = "report.html"
 
 
@@ -70,11 +69,8 @@ class StoredRun:
     datasets: tuple[int, ...]
     codes: tuple[int, ...]
     """Places in `StoreFacts.groups`."""
-
-    @property
-    def is_current(self) -> bool:
-        """Tell whether it counts: it is of the ruling recipe, and nothing has taken its place."""
-        return self.state.removesuffix(", acknowledged") in (GOOD, "damaged", "empty")
+    is_current: bool = False
+    """Whether it counts: it is of the ruling recipe, and nothing has taken its place."""
 
     @property
     def begin_ns(self) -> int:
@@ -95,13 +91,14 @@ class StoredRun:
         """Return what the page's script is told, in the order of `FIELDS`."""
         of = self.facts
         if of is None:
-            return [self.run_id, self.href, None, "", self.state, "", *[None] * 4, "", None, [], [], None, []]
+            return [self.run_id, self.href, None, "", self.state, "", "", *[None] * 4, "", None, [], [], None, []]
         return [
             self.run_id,
             self.href,
             None if of.start_ns is None else of.start_ns // 10**6,
             of.robot,
             self.state,
+            of.superseded_by,
             ", ".join(f"{key}={value}" for key, value in of.tags.items()),
             of.segments,
             round(of.driven_m, 1),
@@ -117,7 +114,20 @@ class StoredRun:
 
 
 FIELDS = (
-    *("run", "href", "start_ms", "robot", "state", "tags", "segments", "driven", "used", "floor", "verdict"),
+    *(
+        "run",
+        "href",
+        "start_ms",
+        "robot",
+        "state",
+        "superseded_by",
+        "tags",
+        "segments",
+        "driven",
+        "used",
+        "floor",
+        "verdict",
+    ),
     *("findings", "datasets", "codes", "standing", "terms"),
 )
 
@@ -141,6 +151,7 @@ def runs_shown(store: StoreFacts) -> list[StoredRun]:
             f"runs/{run_id}/{recipe_id}/{_PAGE}" if (run_id, recipe_id) in store.pages else "",
             tuple(members.get((run_id, recipe_id), ())),
             tuple(codes.get(run_id, ())) if facts.ingest_key == ruling else (),
+            is_current=facts.ingest_key == ruling and not facts.superseded_by,
         )
         for (run_id, recipe_id), facts in found.rows.items()
     ]
@@ -161,11 +172,11 @@ def ruling_key(found: Ingestions) -> str | None:
 
 def _state(facts: RunFacts, ruling: str | None, *, acknowledged: bool) -> str:
     if facts.superseded_by:
-        return f"superseded by {facts.superseded_by}"
+        return "superseded"
     if facts.ingest_key != ruling:
         return "of another recipe"
     wrong = "damaged" if facts.damage else "empty" if facts.is_empty else ""
-    return f"{wrong}{', acknowledged' * acknowledged}" if wrong else GOOD
+    return f"{wrong}{', acknowledged' * acknowledged}" if wrong else "current"
 
 
 def _percent(share: float | None) -> float | None:

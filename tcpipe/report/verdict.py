@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import TypeVar
 
 from tcpipe.formats.finding_lines import MOST_LINES, FindingGroup, block_lines, format_finding, format_group
-from tcpipe.tables.catalogue import AFFECTED, Severity
+from tcpipe.tables.catalogue import AFFECTED, Affected, Severity
 from tcpipe.tables.findings import Finding, sort_findings
 from tcpipe.tables.verdicts import Grade, Verdict
 
@@ -33,9 +33,9 @@ class VerdictBox:
     notes: tuple[ShownFinding, ...]
 
 
-def show_verdict(verdict: Verdict, findings: Iterable[Finding]) -> VerdictBox:
-    """Return the verdict on a run or a dataset with its findings."""
-    return _make_box(verdict, _show(sort_findings(findings)))
+def show_verdict(verdict: Verdict, findings: Iterable[Finding], labels: Sequence[Affected] = AFFECTED) -> VerdictBox:
+    """Return the verdict on a run, a dataset or a model with its findings; the grades are those of ``labels``."""
+    return _make_box(verdict, _show(sort_findings(findings)), labels)
 
 
 def show_groups(
@@ -62,10 +62,10 @@ def _show(findings: Iterable[Finding]) -> list[ShownFinding]:
     return [ShownFinding(of.severity, format_finding(of), "\n".join(block_lines([of]))) for of in findings]
 
 
-def _make_box(verdict: Verdict, lines: Sequence[ShownFinding]) -> VerdictBox:
+def _make_box(verdict: Verdict, lines: Sequence[ShownFinding], labels: Sequence[Affected] = AFFECTED) -> VerdictBox:
     found = [line for severity in ("error", "warning") for line in lines if line.severity == severity]
     return VerdictBox(
-        grades=tuple((name, getattr(verdict, name)) for name in AFFECTED),
+        grades=tuple((name, getattr(verdict, name)) for name in labels),
         shown=tuple(found[:MOST_LINES]),
         more=tuple(found[MOST_LINES:]),
         notes=tuple(line for line in lines if line.severity == "note"),

@@ -1,20 +1,22 @@
-"""What the sensors' clocks look like: offsets between them and their drift, and the remedy that corrects each."""
+"""Time offsets between the clocks of sensors and their drift, the remedy of each, and the time offset of GNSS along the path."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
 
 from tcpipe.fusion.checks.clock_offsets import ClockOffsets, Pair, PowerSignal, RoleOffset, find_clock_offsets
+from tcpipe.fusion.checks.mounting import lag_of
 from tcpipe.fusion.measurements import GNSS, IMU
 from tcpipe.power.rails import power_at
 from tcpipe.recipe.suggestions import suggest
-from tcpipe.stages.fuse_inputs import FusionInputs
-from tcpipe.stages.fuse_sanity import longest_epoch
+from tcpipe.stages.fuse_inputs import FusionInputs, longest_epoch
+from tcpipe.stages.fuse_mounting import moved_m
+from tcpipe.stages.fuse_stretches import Fused
 from tcpipe.stages.power_rails import rails_of
 from tcpipe.stages.read_pose import recipe_role
 from tcpipe.tables.columns import floats
@@ -124,3 +126,35 @@ def _power(streams: Streams, epoch: int) -> PowerSignal | None:
     _, _, watt = power_at(rails, stamp_ns, max_gap_ns=_MAX_GAP_NS)
     known = np.isfinite(watt)
     return PowerSignal(stamp_ns[known], watt[known], streams.power_averaged) if known.sum() > 1 else None
+
+
+def with_lag_on_path(
+    clocks: StageReport[ClockFacts], fused: Fused, inputs: FusionInputs, streams: Streams
+) -> StageReport[ClockFacts]:
+    """Return the findings on clocks with the lag of the fixes behind the path, where that is sure and was not told."""
+    if GNSS not in streams.sensors:
+        return clocks
+    return with_lag_of_fixes(clocks, lag_of(fused.arms, moved_m(inputs, streams)))
+
+
+def with_lag_of_fixes(clocks: StageReport[ClockFacts], lag: tuple[float, float] | None) -> StageReport[ClockFacts]:
+    """Return the findings with a lag of the fixes and its deviation [s].
+
+    Whether they are late or the odometry early, the path does not tell.
+    """
+    known = clocks.facts.offsets.get(GNSS)
+    if lag is None or clocks.facts.position_offset_s or (known is not None and (known.noted or known.drifts)):
+        return clocks
+    lag_s, std_s = lag
+    finding = make_finding(
+        "clocks-differ",
+        Subject("role", GNSS),
+        action="inflated",
+        names={"reference": "odometry", "by": "path"},
+        offset_s=lag_s,
+        offset_2std_s=2 * std_s,
+        apart_s=abs(lag_s),
+    )
+    offset = ClockOffset(lag_s, std_s, True, None, None, False, blamed=False)
+    facts = replace(clocks.facts, offsets={**clocks.facts.offsets, GNSS: offset}, position_offset_s=abs(lag_s))
+    return StageReport((*clocks.findings, finding), facts)

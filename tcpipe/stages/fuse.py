@@ -2,23 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from tcpipe.errors import FusionError
+from tcpipe.fusion.checks.audit import alone_in_most, confirmations, consistent, goes_astray, undecided_in_most
+from tcpipe.fusion.checks.refusals import Refusal, refuse_fixes
+from tcpipe.fusion.measurements import GNSS, IMU
 from tcpipe.recipe import FuseConfig
-from tcpipe.stages.clock_doctor import clock_findings, with_offset_cost
-from tcpipe.stages.fix_lag import with_lag_on_path
-from tcpipe.stages.fuse_agreeing import fuse_agreeing
-from tcpipe.stages.fuse_audit import audit_findings
-from tcpipe.stages.fuse_columns import rejections_table
-from tcpipe.stages.fuse_findings import fuse_facts, fuse_findings
-from tcpipe.stages.fuse_inputs import FusionInputs, prepare_inputs
-from tcpipe.stages.fuse_mounting_findings import mounting_findings
-from tcpipe.stages.fuse_sanity import sane_inputs
-from tcpipe.stages.read_pose import GNSS, pose_as_fixes, recipe_role
+from tcpipe.stages.clock_doctor import clock_findings, with_lag_on_path, with_offset_cost
+from tcpipe.stages.fuse_findings import audit_findings, fuse_facts, fuse_findings, mounting_findings
+from tcpipe.stages.fuse_inputs import FusionInputs, left_out, prepare_inputs, sane_inputs
+from tcpipe.stages.fuse_mounting import fuse_mounted
+from tcpipe.stages.fuse_stretches import Fused, fuse_stretches, rejections_table
+from tcpipe.stages.read_pose import pose_as_fixes, recipe_role
+from tcpipe.tables.facts import SensorChecks
 from tcpipe.tables.findings import Finding, StageReport, Subject, make_finding
 from tcpipe.tables.levels import TRACK, Datum, Streams, Track, TrackInfo
 
@@ -71,12 +72,90 @@ def fuse_run(streams: Streams, config: FuseConfig, *, run_id: str) -> Track:
         audit=audit.facts,
         clock_offsets=clocks.facts,
     )
-    report = StageReport(streams.report.findings + findings, facts)
+    report = StageReport((*_drop_places(streams.report.findings, findings), *findings), facts)
     info = TrackInfo(run_id, streams.robot, datum, config.rate_hz, config.estimator, report)
     return Track(table, rejections_table(inputs, fused.found), info)
+
+
+def _drop_places(read: tuple[Finding, ...], fused: tuple[Finding, ...]) -> Iterator[Finding]:
+    """Yield the findings of reading; one without extrinsics suggests none where fusing has estimated them."""
+    estimated = {role for finding in fused for of in finding.remedies for role in of.recipe.get("read.placement", ())}
+    for finding in read:
+        is_estimated = finding.code == "sensor-not-placed" and finding.subject.name in estimated
+        yield replace(finding, remedies=()) if is_estimated else finding
 
 
 def _find_nothing(streams: Streams, inputs: FusionInputs, run: Subject) -> Finding:
     rows: dict[str, Any] = {f"{role}_row_count": table.num_rows for role, table in streams.tables.items()}
     rows |= {f"{role}_unusable_count": count["invalid"] for role, count in inputs.counts.items() if count["invalid"]}
     return make_finding("no-motion", run, **rows)
+
+
+Judged = tuple[FusionInputs, StageReport[SensorChecks]]
+
+
+def fuse_agreeing(
+    inputs: FusionInputs, sanity: StageReport[SensorChecks], streams: Streams, config: FuseConfig, *, run: Subject
+) -> tuple[FusionInputs, StageReport[SensorChecks], Fused]:
+    """Fuse each stretch; where sensors contradict each other in most of the way, again without the one that is at fault.
+
+    The sensor that differs from the others is not always the wrong one: an IMU whose bias has jumped leads the track and the odometries
+    away from the fixes. So each sensor is left out for a trial. So it is where the track goes astray.
+    What a track that they led showed of mountings and scales is forgotten then.
+
+    Raises
+    ------
+    FusionError : the track goes astray whichever sensor is left out.
+    """
+    found, fused = fuse_mounted(inputs, streams, config)
+    lone, astray = alone_in_most(fused.tallies), _is_astray(fused)
+    if lone or astray or undecided_in_most(fused.tallies):
+        lone = _at_fault(inputs, sanity, streams, config, astray=astray) or lone
+        if lone:
+            inputs, sanity = _without(lone, inputs, sanity, streams, astray=astray)
+            found, fused = fuse_mounted(inputs, streams, config)
+    if _is_astray(fused):
+        astray_fraction = fused.astray / fused.windows
+        finding = make_finding("track-contradicts-sensors", run, astray_fraction=astray_fraction)
+        raise FusionError("the track contradicts every sensor", findings=(finding, *sanity.findings))
+    return found, sanity, fused
+
+
+def _is_astray(fused: Fused) -> bool:
+    return goes_astray(fused.windows, fused.astray)
+
+
+def _without(
+    roles: Sequence[str], inputs: FusionInputs, sanity: StageReport[SensorChecks], streams: Streams, *, astray: bool
+) -> Judged:
+    code = "misleads-track" if astray else "contradicted-by-others"
+    odometries = {name for m in inputs.measurements.values() for name in m.odometries()}.difference(roles)
+    refusals = [refuse_fixes(code, odometries) if role == GNSS else Refusal(role, code) for role in roles]
+    return left_out(inputs, sanity, refusals, streams)
+
+
+def _at_fault(
+    inputs: FusionInputs, sanity: StageReport[SensorChecks], streams: Streams, config: FuseConfig, *, astray: bool
+) -> tuple[str, ...]:
+    """Return the one sensor without which the others agree; of several that whose others confirm each other most, none of two equals.
+
+    Of two sensors either would do: nobody can tell. Of a track that goes ``astray`` it is the IMU, of which the process is made, if the
+    track does not without it; else the only sensor without which it does not.
+    """
+    roles = sorted({role for m in inputs.measurements.values() for role in m.sensors()})
+    if len(roles) <= 2 and not astray:
+        return ()
+    agreeing: dict[str, int] = {}
+    following: list[str] = []
+    for role in roles:
+        rest, _ = _without([role], inputs, sanity, streams, astray=astray)
+        if any(m.gnss is not None or m.odometries() for m in rest.measurements.values()):
+            tried = fuse_stretches(rest, streams, config)
+            if tried.tallies and consistent(tried.tallies):
+                agreeing[role] = confirmations(tried.tallies)
+            if tried.found and not _is_astray(tried):
+                following.append(role)
+    best = [role for role, confirmed in agreeing.items() if confirmed == max(agreeing.values())]
+    if astray and (len(best) != 1 or best[0] not in following):
+        best = [IMU] if IMU in following else following
+    return (best[0],) if len(best) == 1 else ()

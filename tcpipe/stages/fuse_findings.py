@@ -1,42 +1,28 @@
-"""What fusing noticed: facts for the manifest, and findings."""
+"""Facts and findings of fusing: rejections, contradictions, and corrected lever arms, extrinsics and scales."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from tcpipe.fusion.measurements import GNSS, VISUAL, WHEELS, InitialState
-from tcpipe.fusion.stretches import Stretch
-from tcpipe.fusion.trajectory import Trajectory
-from tcpipe.geometry.rotation import rpy_from_quat
-from tcpipe.stages.fuse_inputs import FusionInputs
-from tcpipe.stages.fuse_sanity import exclude_role
+from tcpipe.fusion.checks.audit import undecided_in_most
+from tcpipe.fusion.checks.mounting import Arm, Tilt
+from tcpipe.fusion.checks.odometry_scale import Scale, over_command
+from tcpipe.fusion.measurements import GNSS, IMU, VISUAL, WHEELS
+from tcpipe.geometry.rotation import matrix_from_quat, quat_from_rpy
+from tcpipe.recipe.suggestions import suggest
+from tcpipe.stages.fuse_inputs import FusionInputs, command_of, exclude_role, longest_epoch, state_extrinsics
+from tcpipe.stages.fuse_mounting import moved_m
+from tcpipe.stages.fuse_stretches import Fused
+from tcpipe.stages.read_pose import recipe_role
 from tcpipe.tables.catalogue import threshold
-from tcpipe.tables.facts import FuseFacts, Reopening, StretchFacts
-from tcpipe.tables.findings import Finding, Subject, make_finding
+from tcpipe.tables.facts import AuditFacts, Disagreement, FuseFacts, MountingFacts, Reopening, StretchFacts, vector
+from tcpipe.tables.findings import Finding, StageReport, Subject, make_finding
+from tcpipe.tables.levels import Sensor, Streams
 
 _COURSE = "course over ground"
-
-
-def stretch_facts(stretch: Stretch, initial: InitialState, found: Trajectory) -> StretchFacts:
-    """Return the facts of one stretch: the filter's, and where it lies and began."""
-    m = stretch.measurements
-    return replace(
-        found.facts,
-        epoch=stretch.epoch,
-        start_ns=stretch.start_ns,
-        end_ns=stretch.end_ns,
-        rows=int(found.stamp_ns.size),
-        sensors=tuple(m.sensors()),
-        gyro_noise_radps=None if m.imu is None else m.imu.gyro_std_radps,
-        accelerometer_noise_mps2=None if m.imu is None else m.imu.accelerometer_std_mps2,
-        initial_yaw_rad=float(rpy_from_quat(initial.quat_xyzw)[2]),
-        initial_yaw_std_rad=initial.yaw_std_rad,
-        heading_from=initial.heading_from,
-    )
 
 
 def fuse_facts(inputs: FusionInputs, stretches: Sequence[StretchFacts], *, rows: int, skipped_s: float) -> FuseFacts:
@@ -136,3 +122,108 @@ def _find_reopenings(facts: FuseFacts, first_ns: int) -> list[Finding]:
 
 def _span_s(each: StretchFacts | Reopening, first_ns: int) -> tuple[float, float]:
     return (each.start_ns - first_ns) / 1e9, (each.end_ns - first_ns) / 1e9
+
+
+_CODES = {"position": "position", "displacement": "distance", "turn": "turn"}
+"""Beginnings of the codes by what is compared."""
+
+
+def audit_findings(fused: Fused, inputs: FusionInputs, streams: Streams) -> StageReport[AuditFacts]:
+    """Return every disagreement, the sensors that contradict each other over most of the distance, and the findings of both."""
+    undecided = undecided_in_most(fused.tallies)
+    found = fused.disagreements
+    first_ns = min((stretch.start_ns for stretch in fused.facts), default=0)
+    kinds = dict.fromkeys((each.sensor, each.what, each.alone) for each in found)
+    findings = [
+        _find_disagreement([e for e in found if (e.sensor, e.what, e.alone) == kind], first_ns) for kind in kinds
+    ]
+    for sensor, what in undecided:
+        name = recipe_role(sensor, streams)
+        names, subject = {"quantity": what}, Subject("role", name)
+        findings.append(make_finding("disagreement-undecided", subject, names=names, remedies=exclude_role(name)))
+    sensors = {sensor for sensor, _ in undecided}
+    faster = _over_command(inputs, streams)
+    if faster is not None:
+        sensors.add(WHEELS)
+        scale = round((streams.report.facts.odometry_scale or {}).get(WHEELS, 1.0) / faster, 2)
+        remedies = suggest("state_scale", {"read.odometry_scale": {WHEELS: scale}})
+        remedies += exclude_role("command", "exclude_command")
+        wheels = Subject("role", WHEELS)
+        findings.append(make_finding("faster-than-commanded", wheels, remedies=remedies, speed_ratio=faster))
+    return StageReport(tuple(findings), AuditFacts(tuple(found), tuple(sorted(sensors))))
+
+
+def _over_command(inputs: FusionInputs, streams: Streams) -> float | None:
+    """Return how many times as fast as commanded the wheels go, where that is too fast and nothing else tells how long a metre is."""
+    if not inputs.measurements:
+        return None
+    epoch = longest_epoch(inputs)
+    m, command = inputs.measurements[epoch], command_of(streams, epoch)
+    if m.wheels is None or m.gnss is not None or m.visual is not None or command is None:
+        return None
+    return over_command(m.wheels, command.stamp_ns, command.forward_velocity_mps)
+
+
+def _find_disagreement(found: Sequence[Disagreement], first_ns: int) -> Finding:
+    """Return the finding of all disagreements of one kind: how often, the largest, and when that is."""
+    worst = max(found, key=lambda each: each.size / each.expected_std)
+    numbers: dict[str, Any] = {f"off_{worst.unit}": worst.size, f"expected_std_{worst.unit}": worst.expected_std}
+    return make_finding(
+        f"{_CODES[worst.what]}-disagrees",
+        Subject("role", worst.sensor),
+        severity="note" if worst.alone else None,
+        action="kept" if worst.alone else None,
+        span_s=((worst.start_ns - first_ns) / 1e9, (worst.end_ns - first_ns) / 1e9),
+        **numbers,
+        event_count=len(found),
+        total_s=sum(each.end_ns - each.start_ns for each in found) / 1e9,
+    )
+
+
+def mounting_findings(inputs: FusionInputs, streams: Streams) -> StageReport[MountingFacts | None]:
+    """Return what was corrected, with the recipe keys that would state it."""
+    arm, tilt = inputs.arm, inputs.imu_tilt
+    findings = [] if arm is None else [_find_arm(arm, streams.sensors[GNSS], recipe_role(GNSS, streams))]
+    findings += [] if tilt is None else [_find_tilt(tilt, streams.sensors[IMU])]
+    given = streams.report.facts.odometry_scale or {}
+    findings += [_find_odometry_scale(role, scale, given.get(role, 1.0)) for role, scale in inputs.scales.items()]
+    if not findings:
+        return StageReport((), None)
+    std_m = None if arm is None else vector(np.sqrt(np.diag(arm.covariance)[:3]))
+    moved = None if arm is None else vector(moved_m(inputs, streams))
+    roll_pitch = None if tilt is None else (float(tilt.rad[0]), float(tilt.rad[1]))
+    scales = {role: scale.factor for role, scale in inputs.scales.items()} or None
+    return StageReport(tuple(findings), MountingFacts(moved, std_m, roll_pitch, scales))
+
+
+def _find_odometry_scale(role: str, scale: Scale, given: float) -> Finding:
+    by_speed: dict[str, Any] = {} if scale.driven_m is None else {"driven_m": scale.driven_m}
+    remedies = suggest("state", {"read.odometry_scale": {role: round(given / scale.factor, 4)}})
+    subject, std = Subject("role", role), scale.std
+    return make_finding("odometry-scale", subject, remedies=remedies, scale=scale.factor, scale_std=std, **by_speed)
+
+
+def _find_arm(arm: Arm, sensor: Sensor, name: str) -> Finding:
+    place, std_m = np.asarray(sensor.xyz_m) + arm.error[:3], np.sqrt(np.diag(arm.covariance)[:3])
+    axes = ("forward", "left", "up")
+    return make_finding(
+        "lever-arm-unknown" if sensor.placed_by == "assumed" else "lever-arm-contradicted",
+        Subject("role", name),
+        names={"placed_by": sensor.placed_by},
+        remedies=state_extrinsics(name, np.round(place, 2).tolist(), matrix_from_quat(sensor.quat_xyzw)),
+        **{f"{axis}_m": value for axis, value in zip(axes, place.tolist(), strict=True)},
+        **{f"{axis}_std_m": value for axis, value in zip(axes, std_m.tolist(), strict=True)},
+    )
+
+
+def _find_tilt(tilt: Tilt, sensor: Sensor) -> Finding:
+    roll_rad, pitch_rad = tilt.rad.tolist()
+    turn = matrix_from_quat(quat_from_rpy(roll_rad, pitch_rad, 0.0)) @ matrix_from_quat(sensor.quat_xyzw)
+    return make_finding(
+        "imu-tilted",
+        Subject("role", IMU),
+        names={"placed_by": sensor.placed_by},
+        remedies=state_extrinsics(IMU, sensor.xyz_m, turn),
+        roll_rad=roll_rad,
+        pitch_rad=pitch_rad,
+    )

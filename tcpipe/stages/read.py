@@ -2,31 +2,33 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
+import numpy as np
 import pyarrow as pa
+from numpy.typing import NDArray
 
 from tcpipe.errors import RoleError
-from tcpipe.logs.clocks import TopicTimes, settle_clocks
+from tcpipe.logs.clocks import Timeline, TopicTimes, settle_clocks
 from tcpipe.logs.role_findings import find_missing_roles
 from tcpipe.logs.roles import MOTION_ROLES
 from tcpipe.logs.simulated_clock import CLOCK
+from tcpipe.power.readings import PowerReadings
 from tcpipe.power.sources import power_lists
 from tcpipe.recipe import ReadConfig
 from tcpipe.robots.profiles import Profiles
-from tcpipe.stages.gathered_messages import gather_messages
+from tcpipe.stages.message_arrays import gather_messages
 from tcpipe.stages.protocols import LogReader
-from tcpipe.stages.read_averaging import with_averaging
-from tcpipe.stages.read_candidates import power_candidates
 from tcpipe.stages.read_findings import read_findings
 from tcpipe.stages.read_pose import placed_pose
-from tcpipe.stages.read_repeats import find_repeats, without_repeats
-from tcpipe.stages.read_roles import roles_by
+from tcpipe.stages.read_power import currents_of, find_repeats, with_averaging, without_repeats
+from tcpipe.stages.read_roles import power_candidates, roles_by
 from tcpipe.stages.read_sensors import place_sensors
 from tcpipe.stages.read_sources import TopicReadings, read_sources
-from tcpipe.stages.read_tables import role_table
 from tcpipe.tables.findings import StageReport
-from tcpipe.tables.levels import Streams
+from tcpipe.tables.levels import STREAMS, Streams
 
 
 def read_run(log: LogReader, config: ReadConfig, *, robot: str | None, known: Profiles) -> Streams:
@@ -99,3 +101,38 @@ def _times(source: TopicReadings, config: ReadConfig) -> TopicTimes:
         prefer,
         round(config.time_offset_s.get(source.role, 0.0) * 1e9),
     )
+
+
+def role_table(
+    role: str, sources: Sequence[TopicReadings], timelines: Mapping[str, Timeline], power: PowerReadings
+) -> pa.Table:
+    """Return a role's table, sorted by epoch and stamp; the columns of its sources' readings are taken out."""
+    parts = []
+    for source in sources:
+        if source.role == role:
+            parts += list(_parts(source, timelines[source.key], power))
+    if len(parts) == 1:  # in order already
+        return STREAMS[role].table(**parts[0])
+    columns = {name: np.concatenate([part.pop(name) for part in parts]) for name in list(parts[0])}
+    order = np.lexsort((columns["stamp_ns"], columns["epoch"]))
+    return STREAMS[role].table(**{name: columns.pop(name)[order] for name in list(columns)})
+
+
+def _parts(source: TopicReadings, timeline: Timeline, power: PowerReadings) -> list[dict[str, NDArray[Any]]]:
+    """Return a topic's columns; one part a rail where it plays power."""
+    readings = source.readings.columns
+    columns = {name: readings.pop(name)[timeline.row] for name in list(readings)}
+    times: dict[str, NDArray[Any]] = {
+        "stamp_ns": timeline.stamp_ns,
+        "log_time_ns": source.readings.log_time_ns[timeline.row],
+        "epoch": timeline.epoch,
+    }
+    if source.role != "power":
+        return [times | columns]
+    parts = []
+    for rail in power.rails[source.topic]:
+        voltage, current = currents_of(rail, times, columns)
+        known = np.isfinite(voltage) | np.isfinite(current)
+        values = {**times, "rail": np.full(len(known), rail.name), "voltage_volt": voltage, "current_amp": current}
+        parts.append({name: value[known] for name, value in values.items()})
+    return parts

@@ -1,20 +1,31 @@
-"""The topics that play power: their messages as rails, and a topic's usable rows."""
+"""Topics of power: their messages as rails, whether they are averages, and rows that repeat a slower reading."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from tcpipe.logs.messages import LOG_TIME, Readings, header_ns
 from tcpipe.logs.roles import RoleAssignment
+from tcpipe.power.averaging import told_averaged
 from tcpipe.power.counters import Counter
 from tcpipe.power.readings import PowerReadings, read_power
+from tcpipe.power.repeats import find_readings
 from tcpipe.power.sources import RailReadings, reject_power
 from tcpipe.recipe import ReadConfig
+from tcpipe.recipe.suggestions import suggest
 from tcpipe.robots.profiles import Profiles
+from tcpipe.tables.arrays import rows_where, texts
+from tcpipe.tables.catalogue import Severity, threshold
+from tcpipe.tables.columns import floats, integers
+from tcpipe.tables.findings import Finding, Subject, make_finding
+from tcpipe.tables.levels import STREAMS
 
 
 def power_of_topics(
@@ -86,3 +97,128 @@ def currents_of(
         breaks = resets + times["epoch"] * (1 + np.max(resets, initial=0))
         current = np.where(np.isnan(current), np.nan, Counter(energy, breaks).mean_amp(times["stamp_ns"], voltage))
     return voltage, current
+
+
+def with_averaging(
+    power: PowerReadings, streams: Mapping[str, pa.Table], config: ReadConfig
+) -> tuple[PowerReadings, tuple[Finding, ...]]:
+    """Return the power with whether its values are means over their period, and the finding where that is assumed."""
+    counts = any(rail.counter is not None for rails in power.rails.values() for rail in rails)
+    if config.power_averaged != "auto" and not counts:
+        return replace(power, averaged=config.power_averaged == "yes"), ()
+    if not power.averaging_unknown or "power" not in streams:
+        return power, ()
+    table = rows_where(streams["power"], "epoch", 0)
+    rail = rows_where(table, "rail", table["rail"][0].as_py())
+    power_ns, watt = _power_at_current(rail)
+    period_s = float(np.median(np.diff(power_ns))) / 1e9 if len(power_ns) > 1 else np.inf
+    if period_s < threshold(_ASSUMED, "min_period_s"):
+        return power, ()
+    motion = next((streams[role] for role in ("wheel_odometry", "visual_odometry") if role in streams), None)
+    told = None if motion is None else _by_motion(power_ns, watt, rows_where(motion, "epoch", 0))
+    averaged = power.averaged if told is None else told
+    power = replace(power, averaged=averaged)
+    if told is None and period_s < threshold(_ASSUMED, "min_unobserved_period_s"):
+        return power, ()
+    severity: Severity | None = "warning" if told is None else None
+    names = {"value": "mean" if averaged else "sample", "evidence": "nothing" if told is None else "motion"}
+    remedies = [of for value in ("yes", "no") for of in suggest(value, {"read": {"power_averaged": value}})]
+    power_role = Subject("role", "power")
+    found = make_finding(_ASSUMED, power_role, severity=severity, names=names, remedies=remedies, period_s=period_s)
+    return power, (found,)
+
+
+_ASSUMED = "power-averaging-assumed"
+
+
+def _power_at_current(rail: pa.Table) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Return the stamps [ns] of a rail's currents and its power there [W]: its voltage may come at other times."""
+    stamp_ns, voltage, current = integers(rail, "stamp_ns"), floats(rail, "voltage_volt"), floats(rail, "current_amp")
+    at_ns = (stamp_ns - stamp_ns[0]).astype(np.float64)
+    of_voltage, of_current = np.isfinite(voltage), np.isfinite(current)
+    if not of_voltage.any():
+        return stamp_ns[:0], current[:0]
+    return stamp_ns[of_current], current[of_current] * np.interp(
+        at_ns[of_current], at_ns[of_voltage], voltage[of_voltage]
+    )
+
+
+def _by_motion(power_ns: NDArray[np.int64], watt: NDArray[np.float64], motion: pa.Table) -> bool | None:
+    twist = np.column_stack([floats(motion, name) for name in ("velocity_x_mps", "angular_velocity_z_radps")])
+    moving = np.isfinite(twist).all(axis=1)
+    return told_averaged(power_ns, watt, integers(motion, "stamp_ns")[moving], *twist[moving].T)
+
+
+_QUANTITIES = {"current": "current_amp", "voltage": "voltage_volt"}
+_BETWEEN_EPOCHS_NS = 1_000_000_000_000
+"""Their stamps may overlap; no reading lasts as long."""
+
+Streams = dict[str, pa.Table]
+Values = Mapping[str, NDArray[np.float64]]
+
+
+@dataclass(frozen=True, slots=True)
+class Repeats:
+    """The rates [Hz] of the messages that carry a rail's current or voltage, and of the readings that they repeat."""
+
+    rail: str
+    quantity: str
+    message_hz: float
+    reading_hz: float
+
+
+def without_repeats(streams: Streams) -> tuple[Streams, list[Repeats]]:
+    """Return the streams with only the readings of power, and what was repeated; a table that repeats none stays as it is.
+
+    A reading has the stamp of the first message that holds it.
+    """
+    power = streams.get("power")
+    if power is None:
+        return streams, []
+    step_ns = np.where(np.diff(integers(power, "epoch")) != 0, _BETWEEN_EPOCHS_NS, np.diff(integers(power, "stamp_ns")))
+    at_ns = np.concatenate(([0], np.cumsum(step_ns)))
+    values = {quantity: floats(power, column) for quantity, column in _QUANTITIES.items()}
+    kept = {quantity: np.isfinite(value) for quantity, value in values.items()}
+    repeats: list[Repeats] = []
+    for rail in pc.unique(power["rail"]).to_pylist():
+        rows = np.flatnonzero(texts(power["rail"]) == rail)
+        for quantity in _QUANTITIES:
+            own = rows[np.isfinite(values[quantity][rows])]
+            readings = _readings(at_ns, own, quantity, values)
+            if readings is not None:
+                kept[quantity][np.setdiff1d(own, readings)] = False
+                repeats.append(Repeats(rail, quantity, _rate_hz(at_ns[own]), _rate_hz(at_ns[readings])))
+    if not repeats:
+        return streams, []
+    columns = {name: power[name] for name in power.column_names}
+    columns |= {of: np.where(kept[quantity], values[quantity], np.nan) for quantity, of in _QUANTITIES.items()}
+    table = STREAMS["power"].table(**columns).filter(pa.array(kept["current"] | kept["voltage"]))
+    return {**streams, "power": table}, repeats
+
+
+def _readings(
+    at_ns: NDArray[np.int64], own: NDArray[np.int64], quantity: str, values: Values
+) -> NDArray[np.int64] | None:
+    """Return the rows of a quantity's readings, by its own changes or, where these hardly show, by those of the other on the same rows."""
+    found = find_readings(at_ns[own], values[quantity][own, None])
+    if found is None and all(np.isfinite(value[own]).all() for value in values.values()):
+        found = find_readings(at_ns[own], np.stack([value[own] for value in values.values()], axis=-1))
+    return None if found is None else own[found]
+
+
+def _rate_hz(at_ns: NDArray[np.int64]) -> float:
+    step_ns = np.diff(at_ns)
+    return 1e9 / float(np.mean(step_ns[step_ns < 1.5 * np.median(step_ns)]))
+
+
+def find_repeats(repeats: Sequence[Repeats]) -> Iterator[Finding]:
+    """Yield the finding that messages repeat readings, by the slowest of them; labels tell whether that is too slow."""
+    if not repeats:
+        return
+    slowest = min(repeats, key=lambda of: of.reading_hz)
+    names = {of: ", ".join(dict.fromkeys(getattr(each, of) for each in repeats)) for of in ("quantity", "rail")}
+    message_hz, reading_hz = slowest.message_hz, slowest.reading_hz
+    yield make_finding("power-readings-repeated", _POWER, names=names, message_hz=message_hz, reading_hz=reading_hz)
+
+
+_POWER = Subject("role", "power")

@@ -12,6 +12,8 @@ from tcpipe.tables.findings import Finding, sort_findings
 Grade: TypeAlias = Literal["usable", "usable with care", "not usable"]
 
 GRADES: tuple[Grade, ...] = ("usable", "usable with care", "not usable")
+PREDICTED: tuple[Affected, ...] = ("time", "energy")
+"""Labels that models predict."""
 _GRADE_OF: Mapping[Severity, Grade] = {"error": "not usable", "warning": "usable with care", "note": "usable"}
 
 

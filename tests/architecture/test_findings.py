@@ -21,6 +21,7 @@ MAKERS = {"make_finding": 0, "threshold": 0, "select_findings": 1}
 PRINTERS = {
     "tcpipe/formats/dataset_card.py",
     "tcpipe/formats/hub_card.py",
+    "tcpipe/learning/evaluation_files.py",
     "tcpipe/pipeline/dataset/build.py",
     "tcpipe/pipeline/dataset/content.py",
     "tcpipe/pipeline/diff.py",
@@ -29,6 +30,9 @@ PRINTERS = {
     "tcpipe/pipeline/preflight.py",
     "tcpipe/pipeline/status.py",
     "tcpipe/pipeline/store_facts.py",
+    "tcpipe/planning/drive_files.py",
+    "tcpipe/planning/path_files.py",
+    "tcpipe/planning/plan_files.py",
 }
 """Modules beside cli/ and report/ that print an answer, or group findings for a page."""
 

@@ -3,6 +3,7 @@
 import tomllib
 from collections.abc import Callable
 from dataclasses import replace
+from functools import reduce
 from pathlib import Path
 
 import numpy as np
@@ -210,7 +211,15 @@ def test_an_imu_that_nothing_places_is_refused_and_its_mounting_proposed(tmp_pat
     drive = make(placements=False)
     labelled = run(drive, tmp_path)
     assert refused(labelled) == {"imu"}
-    config = cure(labelled, "imu")
+    places = [
+        proposed(finding)
+        for finding in labelled.info.report.findings
+        if any("read.placement" in of.recipe for of in finding.remedies)
+    ]
+    values = reduce(merged, places)
+    assert values == reduce(merged, reversed(places))  # no two findings propose different values for one key
+    config = parse_recipe(values, where="followed").read
+    assert config.placement["imu"] == cure(labelled, "imu").placement["imu"]
     assert (
         np.abs(np.mod(np.subtract(config.placement["imu"].rpy_rad, (np.pi, 0.0, np.pi / 2)) + 1, 2 * np.pi) - 1).max()
         < 1e-3

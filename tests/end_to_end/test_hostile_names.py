@@ -12,7 +12,7 @@ from installed_command import tcpipe
 from mcap.writer import Writer
 
 from tcpipe.errors import MapError
-from tcpipe.formats.maps.class_table import read_class_scheme
+from tcpipe.formats.maps.building import read_class_scheme
 from tcpipe.simulation import simulate
 from tcpipe.store import Store
 

@@ -333,7 +333,11 @@ def _refuse_beside(path: Path) -> None:
 
 
 def _rewrite(path: Path) -> str:
-    return f"gdal_translate {shlex.quote(path.name)} out.tif"
+    """Return the command that writes a raster as a GeoTIFF beside it."""
+    target = path.with_suffix(".tif")
+    return shlex.join(
+        ["gdal_translate", str(path), str(target if target != path else path.with_stem(f"{path.stem}-copy"))]
+    )
 
 
 def _open_as(source: Source) -> Any:

@@ -72,7 +72,7 @@ from tcpipe.pipeline.generations import read_generations, write_generation
 from tcpipe.pipeline.log_writer import LogWriter, open_log
 from tcpipe.recipe import Recipe
 from tcpipe.report.dataset_report import dataset_report
-from tcpipe.report.overview import class_overview, maps_overview, relief_overview, write_overview
+from tcpipe.report.pictures import class_overview, maps_overview, relief_overview, write_overview
 from tcpipe.splits.assignment import SPLITS
 from tcpipe.store import Store, open_store
 from tcpipe.tables.findings import Finding, is_problem, select_problems

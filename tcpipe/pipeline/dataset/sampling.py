@@ -25,8 +25,7 @@ from tcpipe.formats.maps.map_files import MapFile, open_map
 from tcpipe.formats.place import Place
 from tcpipe.progress import Meter
 from tcpipe.recipe import SampleConfig
-from tcpipe.stages.sample import Sampled
-from tcpipe.stages.sample_maps import check_alike, sample_on_maps
+from tcpipe.stages.sample import Sampled, check_alike, sample_on_maps
 from tcpipe.tables.columns import floats
 from tcpipe.tables.findings import Finding
 from tcpipe.tables.levels import PLACED_SEGMENTS

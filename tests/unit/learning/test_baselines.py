@@ -7,13 +7,12 @@ import pytest
 from made_models import CARD
 
 from tcpipe.dataset import Split, open_dataset
-from tcpipe.learning.baselines import SIMPLEST_FIRST, _groups, compared, verdicts
+from tcpipe.learning.baselines import SIMPLEST_FIRST, _groups, compared, describe_ratios, standing
 from tcpipe.learning.evaluation_facts import Compared
 from tcpipe.learning.fitting import FitConfig
-from tcpipe.learning.metrics import Errors, costs
+from tcpipe.learning.metrics import Errors, Ratio, costs
 from tcpipe.learning.models import Model
 from tcpipe.learning.predictions import measured
-from tcpipe.learning.ratios import Ratio
 
 
 @pytest.fixture(scope="module")
@@ -81,7 +80,7 @@ def test_what_cannot_be_fitted_is_said(sets, monkeypatch):
         Split, "column", lambda split, name: np.zeros(len(split)) if name == "fold" else real(split, name)
     )
     rows, lacking = compared(model_of(), data, parts, said_by(parts), seed=0)
-    assert any("no baseline 'gradient boosting'" in line and "in one fold" in line for line in lacking)
+    assert any(of.subject.name == "gradient boosting" and "in one fold" in of.names["error"] for of in lacking)
     assert {row.baseline for row in rows} == set(SIMPLEST_FIRST) - {"gradient boosting"}
     monkeypatch.setattr(Split, "labels", property(lambda split: np.full((len(split), 2), np.nan, np.float32)))
     assert compared(model_of(), data, parts, {}, seed=0)[0] == []
@@ -94,29 +93,27 @@ def row(baseline, rmse, ratio, quantity="E"):
     )  # fmt: skip
 
 
-def test_who_is_better_is_said_in_words():
+def test_the_best_baseline_is_named_with_the_ratio_and_its_interval():
     mean, linear = (
         row("mean per class", 9.0, Ratio(0.5, 0.4, 0.6)),
         row("class and slope, linear", 5.0, Ratio(0.9, 0.8, 0.97)),
     )
-    assert verdicts([mean, linear])[0] == (
-        "unseen, energy E: the model is better than every baseline, than the best, 'class and slope, linear', by 10 % "
-        "(RMSE 0.90 of its, 95 %: 0.80 to 0.97 over 34 runs)"
-    )
+    assert describe_ratios([mean, linear]) == [
+        "unseen, energy E: RMSE ratio to 'class and slope, linear', the best baseline, 0.90 (95 % CI 0.80 to 0.97, 34 runs)"
+    ]
+    assert standing([mean, linear], "unseen", "E").beats_all
     trees = row("gradient boosting", 4.0, Ratio(1.25, 1.1, 1.4))
-    assert verdicts([mean, linear, trees])[0].startswith(
-        "unseen, energy E: 'gradient boosting' is better than the model by 20 % (RMSE 1.25"
-    )
+    worse = standing([mean, linear, trees], "unseen", "E")
+    assert (worse.best, worse.beats_all, worse.beats_curves, worse.is_worse) == (trees, False, True, True)
     alike = row("class and slope, spline", 4.5, Ratio(1.02, 0.95, 1.1))
-    told = verdicts([mean, alike, trees])[0]
-    assert told.endswith("already 'class and slope, spline' is no worse than the model, as far as can be told")
-    assert verdicts([mean, alike])[0].startswith(
-        "unseen, energy E: the model and 'class and slope, spline' cannot be told apart"
-    )
+    same = standing([mean, alike], "unseen", "E")
+    assert (same.beats_all, same.beats_curves, same.is_worse) == (False, False, False)
     rounded = row("physics", 4.5, Ratio(1.0001, 1.00005, 1.0002))
-    assert "cannot be told apart" in verdicts([mean, rounded])[0]
-    assert "34 runs are too few" in verdicts([row("physics", 5.0, Ratio(0.5, None, None))])[0]
-    assert verdicts([row("physics", 5.0, Ratio(None, None, None))]) == []
+    assert not standing([mean, rounded], "unseen", "E").is_worse
+    few = row("physics", 5.0, Ratio(0.5, None, None))
+    assert "34 runs are too few" in describe_ratios([few])[0]
+    assert standing([few], "unseen", "E").beats_curves is None
+    assert describe_ratios([row("physics", 5.0, Ratio(None, None, None))]) == []
 
 
 class Places:

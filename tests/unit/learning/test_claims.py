@@ -12,8 +12,7 @@ from tcpipe.learning.evaluation_facts import (
     Evaluation,
     SplitErrors,
 )
-from tcpipe.learning.metrics import Errors
-from tcpipe.learning.ratios import Ratio
+from tcpipe.learning.metrics import Errors, Ratio
 from tcpipe.learning.wei_isler import PER_CLASS
 
 SURE = Ratio(0.8, 0.7, 0.9)
@@ -31,7 +30,7 @@ def _run(**ratios):
         tcpipe_version="", key="", model=EvaluatedModel("", "", CARD.training), dataset=EvaluatedDataset("", "", {}),
         config=EvaluateConfig(), splits={"unseen": SplitErrors(10, {}, (), {}, {})}, ablation=(), energy={}, time={},
         networks=tuple(row for row in rows if row.baseline == PER_CLASS),
-        baselines=tuple(row for row in rows if row.baseline != PER_CLASS), repeatability={}, warnings=(), plots={},
+        baselines=tuple(row for row in rows if row.baseline != PER_CLASS), repeatability={}, plots={},
     )  # fmt: skip
 
 

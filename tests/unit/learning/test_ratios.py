@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tcpipe.learning.ratios import ratio_of_errors
+from tcpipe.learning.metrics import ratio_of_errors
 
 
 def test_a_ratio_by_hand():

@@ -88,5 +88,4 @@ def test_it_is_a_command_and_answers_planning(trained, dataset, tmp_path):
 def test_it_is_evaluated_without_networks(trained, dataset, tmp_path):
     found, _ = evaluate(trained[0], dataset, tmp_path / "evaluation", EvaluateConfig(draws=1), key="key")
     assert list(found.energy) == ["ours"]
-    assert any("the model is a table: the networks of Wei and Isler" in line for line in found.warnings)
     assert not (tmp_path / "evaluation").exists()

@@ -19,7 +19,7 @@ from tcpipe.formats.maps.map_files import open_map
 from tcpipe.pipeline.dataset import sampling as dataset_sampling
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.recipe import Recipe
-from tcpipe.report.overview import joint_bounds_m, maps_overview
+from tcpipe.report.pictures import joint_bounds_m, maps_overview
 from tcpipe.store import open_store
 
 

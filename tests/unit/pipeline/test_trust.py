@@ -30,7 +30,7 @@ from tcpipe.pipeline.log_writer import commit_run, open_log
 from tcpipe.pipeline.report import report
 from tcpipe.pipeline.verify import verify
 from tcpipe.recipe import Recipe, SampleConfig
-from tcpipe.report.overview import quick_look, write_quick_look
+from tcpipe.report.pictures import quick_look, write_quick_look
 from tcpipe.store import Store
 from tcpipe.tables.levels import DATA_MODEL_VERSION, STREAMS, Sensor, Streams
 

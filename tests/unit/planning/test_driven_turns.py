@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tcpipe.planning.pieces import cut_path
+from tcpipe.planning.path_cost import cut_path
 from tcpipe.planning.turning import turning_of, turns_between
 from tcpipe.simulation.drive import drive
 from tcpipe.simulation.robot import SimulatedRobot

@@ -64,14 +64,15 @@ def test_a_drive_that_was_trained_on_is_marked_and_in_no_sum(made, tmp_path):
     assert not north.held_back
     assert north.near_training_percent > 60.0
     assert south.near_training_percent < 20.0
-    assert "of its samples trained the model: it is not held back" in str(said)
+    assert "of its samples trained the model; it is in no sum" in str(said)
     assert said.values.energy_joule.measured == south.energy_joule.measured
     page = (tmp_path / "out" / "drives.html").read_text()
     assert page.count('class="plot"') == 4  # time and energy of both
-    holds = south.energy_joule.held
-    said = f"90 % intervals hold the energy of {int(holds)} of 1 drives held back"
-    assert f'<td>{"good" if holds else "doubtful"}</td><td class="long">{said}' in page
-    assert "One drive tells little of how often 90 % intervals hold: hold back 10 or more." in page
+    findings = {of.code: of for of in said.values.findings}
+    assert findings["drive-in-training"].subject.name == north.run_id
+    assert findings["few-drives"].numbers == {"drive_count": 1.0}
+    assert ("energy-overconfident" in findings) == (south.energy_joule.held is False)
+    assert "[few-drives]" in page
     assert "J measured" in page
     assert json.loads((tmp_path / "out" / "drives.json").read_text())["drives"][1]["run_id"] == "south"
 

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tcpipe.planning.pieces import cut_path
+from tcpipe.planning.path_cost import cut_path
 
 _POINT = st.tuples(st.floats(-20.0, 20.0), st.floats(-20.0, 20.0))
 

@@ -9,9 +9,9 @@ from physics_model import PhysicsModel, energy_joule, velocity_mps
 from planning_worlds import lonlat, plane
 
 from tcpipe.errors import PathError
+from tcpipe.planning.cost_grid import new_survey
 from tcpipe.planning.picture import draw_plans
 from tcpipe.planning.plan import OBJECTIVES, plan_path
-from tcpipe.planning.survey import new_survey
 from tcpipe.terrain.classes import ClassTable, TerrainClass
 
 MODEL = PhysicsModel()

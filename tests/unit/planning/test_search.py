@@ -6,9 +6,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
-from tcpipe.planning.bounds import could_be_better, probe_cells
 from tcpipe.planning.cost_grid import CostGrid
 from tcpipe.planning.courses import COURSES, MOVES, touches
+from tcpipe.planning.plan import could_be_better, probe_cells
 from tcpipe.planning.search import best_potential, least_cost_path, least_over_cells, steps_of
 from tcpipe.planning.straight import straightened
 from tcpipe.terrain.grid import MapGrid

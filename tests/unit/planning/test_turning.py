@@ -7,12 +7,11 @@ import pytest
 from physics_model import PhysicsModel
 from planning_worlds import lonlat, plane
 
+from tcpipe.planning.cost_grid import new_survey
 from tcpipe.planning.path_cost import cost_of_path
 from tcpipe.planning.plan import plan_path
 from tcpipe.planning.search import Steps, least_cost_path
-from tcpipe.planning.survey import new_survey
-from tcpipe.planning.turning import turning_of, turns_between
-from tcpipe.planning.turning_search import least_turning_path
+from tcpipe.planning.turning import least_turning_path, turning_of, turns_between
 from tcpipe.tables.facts import PhysicsFit, PhysicsTerm
 from tcpipe.terrain.classes import PAPER_CLASSES
 

@@ -22,7 +22,7 @@ from tcpipe.pipeline.verify import verify
 from tcpipe.report import dataset_samples
 from tcpipe.report.dataset_report import dataset_report
 from tcpipe.report.dataset_samples import COLUMNS, nearest_train_m, samples_shown
-from tcpipe.report.quality import QUALITY_WORDS
+from tcpipe.report.label_sections import QUALITY_WORDS
 from tcpipe.store import open_store
 from tcpipe.tables.bits import Quality
 

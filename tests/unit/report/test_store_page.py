@@ -69,7 +69,7 @@ def test_each_run_is_there_as_its_documents_say(store):
     page, _, told, rows = shown(store)
     assert page.path == str(store.root / "report.html")
     assert [(row["run"], row["state"]) for row in rows] == [
-        ("c", "good"), ("d", "superseded by a"), ("b", "good"), ("b", "of another recipe"), ("a", "good")
+        ("c", "current"), ("d", "superseded"), ("b", "current"), ("b", "of another recipe"), ("a", "current")
     ]  # fmt: skip
     for row, run_id in ((rows[0], "c"), (rows[-1], "a")):
         (run,) = store.recipes_of(run_id)

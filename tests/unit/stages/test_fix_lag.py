@@ -1,6 +1,6 @@
 """A lag of the fixes that only the path tells."""
 
-from tcpipe.stages.fix_lag import with_lag_of_fixes
+from tcpipe.stages.clock_doctor import with_lag_of_fixes
 from tcpipe.tables.facts import ClockFacts, ClockOffset
 from tcpipe.tables.findings import StageReport, Subject, make_finding
 

@@ -7,7 +7,7 @@ from tcpipe.errors import FusionError
 from tcpipe.fusion.checks.audit import Tally
 from tcpipe.fusion.measurements import BodyVelocities, InertialMeasurements, Measurements, Positions
 from tcpipe.recipe import FuseConfig
-from tcpipe.stages import fuse_agreeing
+from tcpipe.stages import fuse as stage
 from tcpipe.stages.fuse_inputs import FusionInputs
 from tcpipe.stages.fuse_stretches import Fused
 from tcpipe.tables.facts import SensorChecks
@@ -52,15 +52,15 @@ def fusing(monkeypatch):
             astray = 12 if tried[-1] in lost else 0
             return Fused(found=[None], tallies=tallies, windows=20, astray=astray)
 
-        monkeypatch.setattr(fuse_agreeing, "fuse_stretches", fuse)
-        monkeypatch.setattr(fuse_agreeing, "fuse_mounted", lambda given, *rest: (given, fuse(given, *rest)))
+        monkeypatch.setattr(stage, "fuse_stretches", fuse)
+        monkeypatch.setattr(stage, "fuse_mounted", lambda given, *rest: (given, fuse(given, *rest)))
         return tried
 
     return put
 
 
 def agreed(given):
-    found, sanity, _ = fuse_agreeing.fuse_agreeing(given, NOTHING, STREAMS, FuseConfig(), run=Subject("run", "r"))
+    found, sanity, _ = stage.fuse_agreeing(given, NOTHING, STREAMS, FuseConfig(), run=Subject("run", "r"))
     return set(found.measurements[0].sensors()), sanity
 
 

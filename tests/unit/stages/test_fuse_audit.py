@@ -6,7 +6,7 @@ from suggested_recipes import proposed
 
 from tcpipe.fusion.checks.audit import Tally
 from tcpipe.fusion.measurements import BodyVelocities, Measurements
-from tcpipe.stages.fuse_audit import audit_findings
+from tcpipe.stages.fuse_findings import audit_findings
 from tcpipe.stages.fuse_inputs import FusionInputs
 from tcpipe.stages.fuse_stretches import Fused
 from tcpipe.tables.facts import Disagreement, StretchFacts

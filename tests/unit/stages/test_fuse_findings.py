@@ -7,8 +7,9 @@ import pytest
 
 from tcpipe.fusion.measurements import InertialMeasurements, InitialState, Measurements, Positions
 from tcpipe.fusion.stretches import Stretch
-from tcpipe.stages.fuse_findings import fuse_facts, fuse_findings, stretch_facts
+from tcpipe.stages.fuse_findings import fuse_facts, fuse_findings
 from tcpipe.stages.fuse_inputs import FusionInputs
+from tcpipe.stages.fuse_stretches import stretch_facts
 from tcpipe.tables.facts import Reopening, StretchFacts
 from tcpipe.tables.findings import Subject, make_finding
 

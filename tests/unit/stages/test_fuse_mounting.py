@@ -10,8 +10,8 @@ from suggested_recipes import proposed
 from tcpipe.fusion.checks.mounting import Arm, ArmEvidence, Tilt, TiltEvidence
 from tcpipe.fusion.measurements import BodyVelocities, InertialMeasurements, Measurements, Positions
 from tcpipe.stages import fuse_mounting
+from tcpipe.stages.fuse_findings import mounting_findings
 from tcpipe.stages.fuse_inputs import FusionInputs
-from tcpipe.stages.fuse_mounting_findings import mounting_findings
 from tcpipe.stages.fuse_stretches import Fused
 from tcpipe.tables.levels import Sensor, Streams
 

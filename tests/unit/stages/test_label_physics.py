@@ -12,7 +12,7 @@ from tcpipe.recipe import Recipe
 from tcpipe.simulation import Faults, scenario
 from tcpipe.simulation.robot import GRAVITY_MPS2, SimulatedRobot
 from tcpipe.simulation.route import Wander
-from tcpipe.stages.label_physics import with_physics
+from tcpipe.stages.label import with_physics
 from tcpipe.tables.bits import Quality
 from tcpipe.tables.columns import floats
 

@@ -7,7 +7,7 @@ import pyarrow as pa
 import pytest
 from made_tracks import stamps
 
-from tcpipe.stages.label_quality import clock_doubtful, motion_flags
+from tcpipe.stages.label_motion import clock_doubtful, motion_flags
 from tcpipe.tables.bits import DropReason, Quality
 from tcpipe.tables.facts import (
     AuditFacts,

@@ -7,9 +7,9 @@ from made_tracks import power_streams, stamps, straight_track
 from tcpipe.power.energy import energy_joule
 from tcpipe.power.standing import StandingPower
 from tcpipe.recipe import GateConfig, SegmentConfig
-from tcpipe.stages.fuse_columns import power_columns
+from tcpipe.stages.fuse_stretches import power_columns
 from tcpipe.stages.gate import gate_track
-from tcpipe.stages.label_cost import segment_costs
+from tcpipe.stages.label import segment_costs
 from tcpipe.stages.power_rails import rails_of
 from tcpipe.stages.segment import segment_track
 from tcpipe.tables.columns import integers

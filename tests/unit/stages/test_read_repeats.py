@@ -11,7 +11,7 @@ from tcpipe.simulation.faults import Faults
 from tcpipe.simulation.scenarios import small_world
 from tcpipe.simulation.sensors import Noise, Power, Sensors, record
 from tcpipe.stages.power_rails import rails_of
-from tcpipe.stages.read_repeats import find_repeats, without_repeats
+from tcpipe.stages.read_power import find_repeats, without_repeats
 from tcpipe.tables.levels import Streams
 
 COUNT = 4000

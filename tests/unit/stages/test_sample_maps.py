@@ -6,8 +6,7 @@ from map_worlds import ArrayMap, random_map, segments_from
 
 from tcpipe.errors import MapError
 from tcpipe.recipe import SampleConfig
-from tcpipe.stages.sample import metres_lost, sample_segments
-from tcpipe.stages.sample_maps import sample_on_maps
+from tcpipe.stages.sample import metres_lost, sample_on_maps, sample_segments
 from tcpipe.tables.bits import Loss
 from tcpipe.terrain.classes import PAPER_CLASSES, ClassTable
 from tcpipe.terrain.grid import MapGrid

@@ -10,8 +10,7 @@ from rasterio import Affine
 
 from tcpipe.errors import MapError, RegionError
 from tcpipe.formats.geojson import MAX_VALUES, read_regions
-from tcpipe.formats.maps.building import build_map
-from tcpipe.formats.maps.class_table import read_class_scheme
+from tcpipe.formats.maps.building import build_map, read_class_scheme
 
 SMALL = Affine(1.0, 0.0, 560_000.0, 0.0, -1.0, 5_215_000.0)
 SQUARE = [[15.79, 47.08], [15.8, 47.08], [15.8, 47.09], [15.79, 47.09], [15.79, 47.08]]

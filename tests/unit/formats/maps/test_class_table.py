@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from tcpipe.errors import MapError
-from tcpipe.formats.maps.class_table import read_class_scheme
+from tcpipe.formats.maps.building import read_class_scheme
 from tcpipe.terrain.classes import PAPER_CLASSES, PAPER_SCHEME
 
 CSV = "value,id,name,traversable\n11,1,water,no\n40,2,grass,yes\n41,2,grass,true\n"

@@ -1,6 +1,7 @@
 """What GDAL would open for a user's raster: nothing but what lies beside it."""
 
 import resource
+import shlex
 import socket
 import subprocess
 import sys
@@ -51,14 +52,18 @@ def read(path):
 
 def hostile(site, secret, address):
     """Names of files, their content, and what is said of them."""
-    refused = r"is a GDAL virtual raster \(VRT\).*write it out as a GeoTIFF: gdal_translate '?{} ?"
+    refused = r"is a GDAL virtual raster \(VRT\).*write it out as a GeoTIFF: gdal_translate .*{}"
     for name in ("all.vrt", "called.tif", "a b.vrt"):
         yield name, VRT.format(1, "h.tif"), refused.format(name)
     yield "absolute.tif", VRT.format(0, secret), refused.format("absolute.tif")
     yield "network.vrt", VRT.format(0, f"/vsicurl/{address}"), refused.format("network.vrt")
     yield "spaced.vrt", f"\ufeff\n <?xml version='1.0'?>\n<!-- x -->{VRT.format(0, secret)}", refused.format("spaced")
     yield "cut.vrt", VRT.format(1, "h.tif")[:-9], refused.format("cut.vrt")
-    yield "hang.tif", "<!---->" * 38 + "<?", r"is XML, not a raster that is read.*\(gdal_translate hang.tif out.tif\)"
+    yield (
+        "hang.tif",
+        "<!---->" * 38 + "<?",
+        r"is XML, not a raster that is read.*\(gdal_translate \S*/hang.tif \S*/hang-copy.tif\)",
+    )
     yield "wms.tif", f"<GDAL_WMS><Service><ServerUrl>{address}</ServerUrl></Service></GDAL_WMS>", "is XML"
     yield "grid.tif", "ncols 2\nnrows 2\n", "an ASCII grid"
     yield (
@@ -84,6 +89,17 @@ def test_whatever_reaches_elsewhere_is_refused_in_one_line_and_nobody_is_called(
     assert capfd.readouterr().err == ""
 
 
+@pytest.mark.parametrize(("name", "target"), [("all of it.vrt", "all of it.tif"), ("all.tif", "all-copy.tif")])
+def test_the_line_on_a_virtual_raster_has_the_command_that_converts_it(folders, name, target):
+    site, _ = folders
+    (site / name).write_text(VRT.format(1, "h.tif"))
+    with pytest.raises(MapError) as caught:
+        read(site / name)
+    (line,) = caught.value.problems
+    assert line.startswith(f"{site / name}: ")
+    assert shlex.split(line.rpartition("GeoTIFF: ")[2]) == ["gdal_translate", str(site / name), str(site / target)]
+
+
 def beside(site, secret, address):
     """Files beside a raster that send GDAL elsewhere."""
     away = '<PAMDataset><Metadata domain="{}"><MDI key="{}">{}</MDI></Metadata></PAMDataset>'
@@ -94,11 +110,15 @@ def beside(site, secret, address):
         "names another file for its overviews",
     )
     for name in ("h.tif.msk", "h.tif.OVR"):
-        yield name, VRT.format(0, secret), rf"{name}: is a GDAL virtual raster.*: gdal_translate h.tif out.tif"
+        yield (
+            name,
+            VRT.format(0, secret),
+            rf"{name}: is a GDAL virtual raster.*: gdal_translate \S*/h.tif \S*/h-copy.tif",
+        )
     yield (
         "h.tif.msk",
         f"<GDAL_WMS><ServerUrl>{address}</ServerUrl></GDAL_WMS>",
-        r"h.tif.msk: is XML.*\(gdal_translate h.tif",
+        r"h.tif.msk: is XML.*\(gdal_translate \S*/h.tif",
     )
     yield "h.aux", f"EHFA_HEADER_TAG\0{VRT.format(0, secret)}", "damaged"
 

@@ -25,7 +25,7 @@ BATCH = 4_096
 
 
 @dataclass(frozen=True, slots=True)
-class Verdicts:
+class SegmentPredictions:
     """What is said of N metres, shape (N,): `Reason` bits, predictions (NaN without a cost), and what the ground is.
 
     Predictions are centred (`tcpipe.cost.prediction_errors`). ``velocity_mps`` is horizontal, whichever velocity the model predicts: a
@@ -41,14 +41,14 @@ class Verdicts:
     height_m: Floats
 
 
-def verdicts_of(
+def predict_segments(
     model: CostModel,
     source: MapReader,
     batches: Iterable[PatchFrames],
     *,
     ask: bool = True,
     turn_radpm: Floats | None = None,
-) -> Iterator[Verdicts]:
+) -> Iterator[SegmentPredictions]:
     """Yield what is said of each batch of frames, in order; tiles of the map are kept from batch to batch.
 
     Without ``ask`` the ground is judged alone: no predictions. ``turn_radpm`` is how far a metre of each frame turns, of all batches one
@@ -83,7 +83,7 @@ def _judged(
     *,
     centring: Centring,
     ask: bool,
-) -> Verdicts:
+) -> SegmentPredictions:
     bits = reasons_of(patches, on_map, model, source)
     asked = (bits & NO_COST == 0) & ask
     said = predict_patches(model, patches, asked, turn_radpm)
@@ -92,7 +92,7 @@ def _judged(
     known = bits & (Reason.OUTSIDE_MAP | Reason.NODATA) == 0
     horizontal = np.cos(patches.slope_rad) if model.label_velocity == "fused" else 1.0
     middle = patches.pixels["height"][:, model.patch_px // 2, model.patch_px // 2] * HEIGHT_STEP_M
-    return Verdicts(
+    return SegmentPredictions(
         reasons=bits,
         power_watt=power_watt,
         velocity_mps=velocity_mps * horizontal,
@@ -103,13 +103,14 @@ def _judged(
     )
 
 
-def joined(parts: Iterable[Verdicts]) -> Verdicts:
+def joined(parts: Iterable[SegmentPredictions]) -> SegmentPredictions:
     """Return the verdicts of all batches as one."""
     found = list(parts)
     columns: dict[str, Any] = {
-        entry.name: np.concatenate([getattr(part, entry.name) for part in found]) for entry in fields(Verdicts)
+        entry.name: np.concatenate([getattr(part, entry.name) for part in found])
+        for entry in fields(SegmentPredictions)
     }
-    return Verdicts(**columns)
+    return SegmentPredictions(**columns)
 
 
 def in_batches(frames: PatchFrames) -> Iterator[PatchFrames]:
