@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import shutil
 import sqlite3
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -181,7 +181,7 @@ class SqlitePart:
             spans, lost = {}, 0
             for _, topic, stamp, right in self._reachable(
                 f"SELECT id, topic_id, timestamp, {is_message} FROM messages WHERE TRUE"
-            ):  # noqa: S608
+            ):
                 lost += not right
                 if right:
                     count, first, last = spans.get(topic, (0, stamp, stamp))
