@@ -13,12 +13,19 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import TypeVar
 
-from tcpipe.logs.coverage import LITTLE_SPAN, LITTLE_SPAN_OF_POWER, coverage, covering_little
-from tcpipe.logs.robots import find_robot
+from tcpipe.logs.robots import find_robot, namespaces_of_robots, which_robot
 from tcpipe.logs.role_findings import find_left_out, find_missing_roles, find_undecodable
-from tcpipe.logs.several_robots import namespaces_of_robots, which_robot
-from tcpipe.logs.topic_texts import LISTED, list_undecodable, listing, short_list
-from tcpipe.logs.topics import Topic
+from tcpipe.logs.topics import (
+    LISTED,
+    LITTLE_SPAN,
+    LITTLE_SPAN_OF_POWER,
+    Topic,
+    coverage,
+    covering_little,
+    list_undecodable,
+    listing,
+    short_list,
+)
 from tcpipe.power.sources import BATTERY_STATE, FLOAT_TYPES, is_corrected, quantity, rail_of
 from tcpipe.recipe.suggestions import RecipeFragment, suggest
 from tcpipe.robots.profiles import Profiles

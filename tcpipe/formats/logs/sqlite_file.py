@@ -179,9 +179,8 @@ class SqlitePart:
             lost = every - sum(count for count, _, _ in spans.values())
         except _BROKEN:
             spans, lost = {}, 0
-            for _, topic, stamp, right in self._reachable(
-                f"SELECT id, topic_id, timestamp, {is_message} FROM messages WHERE TRUE"
-            ):
+            each = f"SELECT id, topic_id, timestamp, {is_message} FROM messages WHERE TRUE"  # noqa: S608
+            for _, topic, stamp, right in self._reachable(each):
                 lost += not right
                 if right:
                     count, first, last = spans.get(topic, (0, stamp, stamp))
