@@ -135,23 +135,22 @@ def list_undecodable(topics: Iterable[Topic]) -> Iterator[str]:
         yield f"topics that hold data which cannot be decoded: {reasons}{more}"
 
 
-LITTLE_SPAN = 0.5
+_LITTLE_SPAN = 0.5
 """A sensor that was silent for more than half of the drive does not win by its name."""
-LITTLE_SPAN_OF_POWER = 0.1
+_LITTLE_SPAN_OF_POWER = 0.1
 """What tells propulsion apart and what tells a whole battery are not of one quantity: there coverage weighs less."""
 _SILENCE_NS, _SILENT_PERIODS = 5_000_000_000, 10
 _LITTLE_COUNT = 0.01
 """Sensors that could play one role differ in rate, but not a hundredfold: 1 Hz of GNSS against 20 Hz, 10 Hz of odometry against 200 Hz."""
 
 
-def covering_little(
-    topics: Iterable[Topic], rivals: Iterable[Topic], *, little_span: float = LITTLE_SPAN
-) -> frozenset[str]:
+def covering_little(topics: Iterable[Topic], rivals: Iterable[Topic], *, of_power: bool = False) -> frozenset[str]:
     """Return which topics, by name, cover less than such a share of what a rival covers, or hold less than a hundredth of its messages.
 
     What the index does not tell speaks against nobody.
     """
     listed = list(rivals)
+    little_span = _LITTLE_SPAN_OF_POWER if of_power else _LITTLE_SPAN
     least_s = little_span * max((_covered_s(rival) or 0.0 for rival in listed), default=0.0)
     least = _LITTLE_COUNT * max((rival.message_count or 0 for rival in listed), default=0)
     return frozenset(topic.name for topic in topics if _is_little(topic, least_s, least))
