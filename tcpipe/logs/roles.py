@@ -13,12 +13,9 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import TypeVar
 
-from tcpipe.logs.coverage import LITTLE_SPAN, LITTLE_SPAN_OF_POWER, coverage, covering_little
-from tcpipe.logs.robots import find_robot
+from tcpipe.logs.robots import find_robot, namespaces_of_robots, which_robot
 from tcpipe.logs.role_findings import find_left_out, find_missing_roles, find_undecodable
-from tcpipe.logs.several_robots import namespaces_of_robots, which_robot
-from tcpipe.logs.topic_texts import LISTED, list_undecodable, listing, short_list
-from tcpipe.logs.topics import Topic
+from tcpipe.logs.topics import LISTED, Topic, coverage, covering_little, list_undecodable, listing, short_list
 from tcpipe.power.sources import BATTERY_STATE, FLOAT_TYPES, is_corrected, quantity, rail_of
 from tcpipe.recipe.suggestions import RecipeFragment, suggest
 from tcpipe.robots.profiles import Profiles
@@ -529,7 +526,7 @@ def _best(role: str, candidates: Ranked) -> list[tuple[str, Topic]]:
 
 
 def _thin(role: str, topics: Sequence[Topic], rivals: Sequence[Topic]) -> frozenset[str]:
-    return covering_little(topics, rivals, little_span=LITTLE_SPAN_OF_POWER if role == "power" else LITTLE_SPAN)
+    return covering_little(topics, rivals, of_power=role == "power")
 
 
 def _rails(topics: Iterable[Topic]) -> tuple[str, ...]:

@@ -1,9 +1,10 @@
-"""What a log says of itself: its topics, and what is damaged in it."""
+"""What a log says of itself: its topics, in data and in words, how much of a drive they cover, and what is damaged in it."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import accumulate
 
 MAX_DAMAGE = 1000
 """So many findings are told one by one."""
@@ -91,3 +92,103 @@ def normalized_type_name(name: str) -> str:
     """Return ``package/msg/Name`` for the ROS 1 form ``package/Name``; other forms stay as they are."""
     parts = name.split("/")
     return f"{parts[0]}/msg/{parts[1]}" if len(parts) == 2 else name
+
+
+LISTED = 8
+"""Of a long list so many are named."""
+
+
+def listing(topics: Iterable[Topic], types: Sequence[str] | None = None) -> str:
+    """Return topics as ``/name (type, n messages, rate)``, the longest lists cut; those of ``types`` only, where there are any."""
+    every = list(topics)
+    of_type = [topic for topic in every if types is not None and topic.type_name in types]
+    chosen = of_type or every
+    shown = ", ".join(_described(topic) for topic in chosen[:LISTED])
+    more = f", and {len(chosen) - LISTED} more" if len(chosen) > LISTED else ""
+    return shown + more if chosen else "no topic at all"
+
+
+def _described(topic: Topic) -> str:
+    parts = [topic.type_name]
+    if topic.message_count is not None:
+        parts.append(f"{topic.message_count} messages")
+        if topic.start_ns is not None and topic.end_ns is not None and topic.end_ns > topic.start_ns:
+            parts.append(f"{(topic.message_count - 1) / (topic.end_ns - topic.start_ns) * 1e9:.3g} Hz")
+    return f"{topic.name} ({', '.join(parts)})"
+
+
+def short_list(topics: Sequence[Topic]) -> str:
+    """Return the topics' names, the longest lists cut."""
+    shown = ", ".join(topic.name for topic in topics[:LISTED])
+    return f"{shown} and {len(topics) - LISTED} more" if len(topics) > LISTED else shown
+
+
+def list_undecodable(topics: Iterable[Topic]) -> Iterator[str]:
+    """Yield one line of the topics that hold data that cannot be decoded, by the reason; none where all can be."""
+    by_reason: dict[str, list[Topic]] = {}
+    for topic in topics:
+        if topic.problem is not None and topic.message_count != 0:
+            by_reason.setdefault(topic.problem, []).append(topic)
+    if by_reason:
+        reasons = "; ".join(f"{short_list(topics)}: {why}" for why, topics in list(by_reason.items())[:LISTED])
+        more = f"; {len(by_reason) - LISTED} more reasons" if len(by_reason) > LISTED else ""
+        yield f"topics that hold data which cannot be decoded: {reasons}{more}"
+
+
+_LITTLE_SPAN = 0.5
+"""A sensor that was silent for more than half of the drive does not win by its name."""
+_LITTLE_SPAN_OF_POWER = 0.1
+"""What tells propulsion apart and what tells a whole battery are not of one quantity: there coverage weighs less."""
+_SILENCE_NS, _SILENT_PERIODS = 5_000_000_000, 10
+_LITTLE_COUNT = 0.01
+"""Sensors that could play one role differ in rate, but not a hundredfold: 1 Hz of GNSS against 20 Hz, 10 Hz of odometry against 200 Hz."""
+
+
+def covering_little(topics: Iterable[Topic], rivals: Iterable[Topic], *, of_power: bool = False) -> frozenset[str]:
+    """Return which topics, by name, cover less than such a share of what a rival covers, or hold less than a hundredth of its messages.
+
+    What the index does not tell speaks against nobody.
+    """
+    listed = list(rivals)
+    little_span = _LITTLE_SPAN_OF_POWER if of_power else _LITTLE_SPAN
+    least_s = little_span * max((_covered_s(rival) or 0.0 for rival in listed), default=0.0)
+    least = _LITTLE_COUNT * max((rival.message_count or 0 for rival in listed), default=0)
+    return frozenset(topic.name for topic in topics if _is_little(topic, least_s, least))
+
+
+def silence_ns(spans_ns: Sequence[tuple[int, int]], count: int | None) -> int:
+    """Return how long a topic was silent [ns], by the spans (first, last time) of those pieces of a log that hold messages of it.
+
+    Silences below 5 s, or below ten of its mean periods, are none.
+    """
+    if len(spans_ns) < 2 or not count:
+        return 0
+    rising = sorted(spans_ns)
+    ends = list(accumulate((end for _, end in rising), max))
+    least_ns = max(_SILENCE_NS, _SILENT_PERIODS * (ends[-1] - rising[0][0]) // count)
+    pauses = (start - end for (start, _), end in zip(rising[1:], ends, strict=False))
+    return sum(pause for pause in pauses if pause > least_ns)
+
+
+def _is_little(topic: Topic, least_s: float, least: float) -> bool:
+    span_s, count = _covered_s(topic), topic.message_count
+    return (span_s is not None and span_s < least_s) or (count is not None and count < least)
+
+
+def coverage(topic: Topic) -> str:
+    """Return ``658 messages over 65.7 s``, as far as the index tells."""
+    span_s = _span_s(topic)
+    count = "some messages" if topic.message_count is None else f"{topic.message_count} messages"
+    silent = f", silent for {topic.silent_ns / 1e9:.1f} s of them" if topic.silent_ns else ""
+    return count if span_s is None else f"{count} over {span_s:.1f} s{silent}"
+
+
+def _covered_s(topic: Topic) -> float | None:
+    span_s = _span_s(topic)
+    return None if span_s is None else span_s - topic.silent_ns / 1e9
+
+
+def _span_s(topic: Topic) -> float | None:
+    if topic.start_ns is None or topic.end_ns is None:
+        return None
+    return (topic.end_ns - topic.start_ns) / 1e9

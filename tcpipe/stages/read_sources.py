@@ -9,14 +9,12 @@ from typing import Any, cast
 from numpy.typing import NDArray
 
 from tcpipe.errors import RoleError
-from tcpipe.logs.imu_units import imu_in_si
+from tcpipe.logs.conversions import imu_in_si, over_ground, scaled
 from tcpipe.logs.mapped import MAPPED_TYPES, mapped_message
 from tcpipe.logs.messages import LOG_TIME, Readings, find_utc_offset, frames, needed_fields, read_messages
-from tcpipe.logs.odometry_scale import scaled
 from tcpipe.logs.role_findings import topic_not_decoded
 from tcpipe.logs.roles import RoleAssignment
 from tcpipe.logs.topics import Topic
-from tcpipe.logs.velocity_frame import over_ground
 from tcpipe.power.readings import PowerReadings
 from tcpipe.recipe import ReadConfig, Role
 from tcpipe.robots.profiles import Profiles

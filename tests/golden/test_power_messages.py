@@ -8,7 +8,7 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from tcpipe.formats.logs.log_file import open_log
-from tcpipe.formats.logs.shipped_definitions import shipped_definitions
+from tcpipe.formats.logs.ros_types import shipped_definitions
 from tcpipe.formats.robot_files import profiles_of, shipped_profiles
 from tcpipe.power.readings import PowerReadings, read_power
 from tcpipe.power.sources import power_lists

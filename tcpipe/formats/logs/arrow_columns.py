@@ -22,7 +22,6 @@ from numpy.typing import NDArray
 from tcpipe.formats.logs.arrow_values import IrregularColumns, arrow_type, texts
 from tcpipe.formats.logs.log_part import MessageBlock, gathered
 from tcpipe.formats.logs.ros_types import DefinitionError, MessageType, RowError
-from tcpipe.logs.units import field_units
 from tcpipe.logs.wire_cursors import Walked, walk
 from tcpipe.logs.wire_layout import (
     Dialect,
@@ -41,7 +40,7 @@ from tcpipe.logs.wire_layout import (
     same_shape,
     strided,
 )
-from tcpipe.logs.wire_types import WIDE_FORMS, Array, Record, WireType, flat_fields, in_form, wide_texts
+from tcpipe.logs.wire_types import WIDE_FORMS, Array, Record, WireType, field_units, flat_fields, in_form, wide_texts
 from tcpipe.tables.arrays import number_column
 
 FLUSH_BYTES = 1 << 20

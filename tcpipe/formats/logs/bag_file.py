@@ -47,8 +47,7 @@ from tcpipe.formats.logs.log_part import (
     listed,
     outline_of,
 )
-from tcpipe.logs.coverage import silence_ns
-from tcpipe.logs.topics import Damage, normalized_type_name
+from tcpipe.logs.topics import Damage, normalized_type_name, silence_ns
 
 _CHUNK_MARK = b"\x04\0\0\0op=\x05"
 _MAX_CHUNK_HEADER = 128

@@ -57,17 +57,17 @@ from tcpipe.formats.logs.mcap_records import (
     OP_SCHEMA,
     RECORD_HEAD,
     Chunk,
+    Contents,
     Schema,
     index_entries,
     index_messages,
     message_offsets,
     messages_at,
     parse_chunk_head,
+    read_summary,
     record_offsets,
 )
-from tcpipe.formats.logs.mcap_summary import Contents, read_summary
-from tcpipe.logs.coverage import silence_ns
-from tcpipe.logs.topics import Damage, normalized_type_name
+from tcpipe.logs.topics import Damage, normalized_type_name, silence_ns
 
 _LOOSE_BYTES = 1 << 22
 """Messages outside chunks are read in runs of about this size."""

@@ -11,8 +11,10 @@ import functools
 import re
 import struct
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from functools import cache
+from importlib.resources import files
 from pathlib import Path, PurePosixPath
 from typing import Any, Literal
 
@@ -23,7 +25,6 @@ from rosbags.typesys.base import normalize_fieldname
 from rosbags.typesys.store import Typestore
 
 from tcpipe.errors import LogError
-from tcpipe.formats.logs.shipped_definitions import shipped_definitions
 from tcpipe.logs.msg_text import BASE_TYPES, FieldType, MsgTextError, parse_msg
 from tcpipe.logs.topics import normalized_type_name
 from tcpipe.logs.wire_types import (
@@ -368,3 +369,17 @@ def _plain(value: Any, of: WireType) -> Any:
             return [_plain(item, of.element) for item in value]
         case _:
             return value
+
+
+@cache
+def shipped_definitions() -> Mapping[str, str]:
+    """Return the robots' own definitions by type; what they refer to (std_msgs/Header, duration) belongs to every type store.
+
+    They are the packages' files without constants and comments, which change no byte; NOTICE names packages and licences.
+    """
+    packages = sorted(files("tcpipe.logs").joinpath("definitions").iterdir(), key=lambda package: package.name)
+    return {
+        f"{package.name}/msg/{file.name.removesuffix('.msg')}": file.read_text(encoding="utf-8")
+        for package in packages
+        for file in sorted(package.joinpath("msg").iterdir(), key=lambda file: file.name)
+    }

@@ -26,7 +26,7 @@ from rosbags.typesys.store import Typestore
 
 from tcpipe.errors import UsageError
 from tcpipe.formats.atomic import atomic_directory, atomic_file
-from tcpipe.formats.logs.shipped_definitions import shipped_definitions
+from tcpipe.formats.logs.ros_types import shipped_definitions
 
 Encoding = Literal["ros1", "cdr"]
 McapCompression = Literal["zstd", "lz4", "none"]

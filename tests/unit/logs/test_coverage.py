@@ -4,8 +4,7 @@ from dataclasses import replace
 
 import pytest
 
-from tcpipe.logs.coverage import coverage, covering_little, silence_ns
-from tcpipe.logs.topics import Topic
+from tcpipe.logs.topics import Topic, coverage, covering_little, silence_ns
 
 S = 1_000_000_000
 

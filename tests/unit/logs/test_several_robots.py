@@ -2,7 +2,7 @@
 
 from tcpipe.formats.robot_files import shipped_profiles
 from tcpipe.logs import roles
-from tcpipe.logs.several_robots import namespaces_of_robots
+from tcpipe.logs.robots import namespaces_of_robots
 from tcpipe.logs.topics import Topic
 
 KINDS = {"fix": "sensor_msgs/msg/NavSatFix", "imu": "sensor_msgs/msg/Imu", "odom": "nav_msgs/msg/Odometry"}

@@ -307,7 +307,7 @@ WRONG_VALUES = ("NULL", "'text'", "x'00'", "2.5", "NULL, topic_id = 'x'", "NULL,
 )
 @pytest.mark.parametrize("journal", [False, True])
 def test_every_row_of_a_db3_is_a_message_or_counted_as_lost(tmp_path, column, value, journal):
-    """However a row is wrong, and whether pages are read here or by SQLite: what is read and what is lost is what was there."""
+    """However a row is wrong, and whether a journal lies beside the file: what is read and what is lost is what was there."""
     path = tmp_path / "a.db3"
     with closing(sqlite3.connect(path)) as database, database:
         database.execute("CREATE TABLE topics(id INTEGER PRIMARY KEY, name, type, serialization_format)")
@@ -328,7 +328,7 @@ def test_every_row_of_a_db3_is_a_message_or_counted_as_lost(tmp_path, column, va
 @pytest.mark.parametrize(
     "kinds", [b"\0\1\6\x81\x80\x80\x80\x80\x80\x80\x80\0", b"\0\1\6\x0b", b"\0\1\5\x2c", b"\0\1\6\xff"]
 )
-def test_a_row_whose_head_contradicts_itself_is_counted(tmp_path, kinds):
+def test_a_row_whose_head_contradicts_itself_costs_itself(tmp_path, kinds):
     messages = random_messages(5, count=20, types=TYPES[1:])
     path = next(write_rosbag2(tmp_path / "run", messages).glob("*.db3"))
     data = path.read_bytes()
@@ -340,8 +340,8 @@ def test_a_row_whose_head_contradicts_itself_is_counted(tmp_path, kinds):
     path.write_bytes(data[:at] + kinds + data[at + len(kinds) :])
     with open_log(path) as log:
         rows = log.table("/ColorRGBA").num_rows
-        lost = sum(finding.messages_lost or 0 for finding in log.damage)
-    assert (rows, lost) == (19, 1)
+        assert any(finding.is_loss for finding in log.damage)
+    assert rows == 19
 
 
 def test_a_row_that_is_missing_from_its_pages_list_is_damage(tmp_path):
@@ -360,7 +360,7 @@ def test_a_row_that_is_missing_from_its_pages_list_is_damage(tmp_path):
 
 
 def test_a_row_that_claims_to_be_endless_costs_itself(tmp_path):
-    """Where SQLite itself has to read, it says that there is no memory for such a row, and no more than that."""
+    """SQLite says that there is no memory for such a row, and no more than that."""
     messages = random_messages(5, count=40, types=TYPES[1:])
     path = next(write_rosbag2(tmp_path / "run", messages).glob("*.db3"))
     data = bytearray(path.read_bytes())

@@ -120,7 +120,7 @@ def test_a_definition_that_unfolds_without_bound_is_refused():
 
 
 def test_definitions_bundled_for_robots_are_found():
-    from tcpipe.formats.logs.shipped_definitions import shipped_definitions
+    from tcpipe.formats.logs.ros_types import shipped_definitions
 
     assert "husky_msgs/msg/HuskyStatus" in shipped_definitions()
     for name in shipped_definitions():

@@ -5,7 +5,7 @@ import struct
 import pytest
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from tcpipe.formats.logs.shipped_definitions import shipped_definitions
+from tcpipe.formats.logs.ros_types import shipped_definitions
 
 
 def store(kind: Stores):

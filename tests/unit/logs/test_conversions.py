@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tcpipe.logs.imu_units import imu_in_si
+from tcpipe.logs.conversions import imu_in_si
 from tcpipe.logs.messages import Readings
 
 NAMES = (
