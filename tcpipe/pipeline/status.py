@@ -26,7 +26,7 @@ from tcpipe.pipeline.ingest_task import IngestTask
 from tcpipe.pipeline.log_sources import definitions_key, find_sources, in_shard, remembered
 from tcpipe.pipeline.plan import STANDINGS, TROUBLE, Standing, Step, plan
 from tcpipe.pipeline.problems import incomplete_runs, make_waiting
-from tcpipe.pipeline.store_verdict import judge_runs
+from tcpipe.pipeline.store_verdict import find_changes, judge_runs
 from tcpipe.recipe import Recipe
 from tcpipe.store import Store, open_store
 from tcpipe.tables.findings import Finding, Subject, make_finding
@@ -184,7 +184,7 @@ def status(
         superseded_runs=len(state.superseded),
         begun=tuple(call for call in begun if call.state != "killed" or call.name not in acknowledged),
         history=state.calls,
-        verdict=judge_runs(current),
+        verdict=judge_runs(current, find_changes(current)),
         runs=len(current),
         findings={of.code: len(of.of) for of in by_code if of.severity != "note"},
         losses=losses_of(run.ledger_m for run in current),

@@ -5,14 +5,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from synthetic_store import add_run, add_world, lanes, segments
+from synthetic_store import add_run, add_world, commit_run, lanes, segments
 
 from tcpipe.dataset import open_dataset
 from tcpipe.errors import DatasetError, StoreError
 from tcpipe.formats.commits import Entries
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.inspect import inspect
-from tcpipe.pipeline.log_writer import commit_run, open_log
+from tcpipe.pipeline.log_writer import open_log
 from tcpipe.pipeline.prune import prune
 from tcpipe.pipeline.report import report
 from tcpipe.recipe import ReadConfig, Recipe

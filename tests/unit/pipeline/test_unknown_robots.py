@@ -2,12 +2,11 @@
 
 import numpy as np
 import pytest
-from synthetic_store import add_run, add_world, lanes, segments
+from synthetic_store import add_run, add_world, commit_run, lanes, segments
 
 from tcpipe.dataset import open_dataset
 from tcpipe.errors import DatasetError
 from tcpipe.pipeline.dataset.build import build_dataset
-from tcpipe.pipeline.log_writer import commit_run
 from tcpipe.pipeline.unknown_robots import alike
 from tcpipe.store import open_store
 from tcpipe.tables.levels import Sensor
