@@ -313,7 +313,7 @@ def _is_of(checkpoint: Path, key: str) -> bool:
     try:
         read_checkpoint(checkpoint, key)
     except ModelError as error:
-        logger.warning("%s; it begins anew", error.problems[0].partition(";")[0])
+        logger.warning("%s. Training starts anew now", error.problems[0])
         return False
     return True
 

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import re
 import time
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
@@ -32,7 +31,6 @@ from tcpipe.store import Store, open_store
 from tcpipe.tables.findings import Finding, Subject, make_finding
 from tcpipe.tables.verdicts import Verdict
 
-_NUMBER = re.compile(r"\d[\d.,]*")
 _MOST_NAMES = 3
 _MOST_CALLS = 7
 _TWO_NIGHTS_NS = 2 * 86_400 * 10**9
@@ -215,13 +213,14 @@ def _absolute(log: str) -> str:
 
 
 def _groups(steps: Iterable[Step]) -> Iterator[Group]:
-    """Yield logs of one standing whose causes are the same but for numbers, which are shown where they are the same."""
-    groups: dict[tuple[Standing, str], list[Step]] = {}
+    """Yield logs of one standing with findings of the same codes on the same subjects; without findings, of the same cause."""
+    groups: dict[tuple[Standing, Hashable], list[Step]] = {}
     for step in steps:
-        alike = _NUMBER.sub("#", step.cause) if step.standing in (*TROUBLE, "quarantined") else step.cause
-        groups.setdefault((step.standing, alike), []).append(step)
-    for (standing, alike), of in sorted(groups.items(), key=lambda item: (STANDINGS.index(item[0][0]), -len(item[1]))):
-        cause = alike if any(step.cause != of[0].cause for step in of) else of[0].cause
+        alike = frozenset((of.code, None if of.subject.kind in ("log", "run") else of.subject) for of in step.findings)
+        groups.setdefault((step.standing, alike or step.cause), []).append(step)
+    for (standing, _), of in sorted(groups.items(), key=lambda item: (STANDINGS.index(item[0][0]), -len(item[1]))):
+        causes = list(dict.fromkeys(step.cause for step in of))
+        cause = causes[0] if len(causes) == 1 else f"{len(causes)} reasons, the first: {causes[0]}"
         yield Group(standing, cause, tuple(step.task.source.name for step in of), sum(map(_bytes, of)))
 
 
