@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from tcpipe import __version__
 from tcpipe.errors import DatasetError, MapError, StoreError
+from tcpipe.formats.commits import State
 from tcpipe.formats.dataset_card import RunSource
 from tcpipe.formats.dataset_files import FileFormat, is_shard, read_card, read_samples, sample_columns
 from tcpipe.formats.json_files import digest, plain, recast
@@ -60,6 +61,7 @@ def choose_inputs(
     store: Store,
     recipe: Recipe,
     *,
+    state: State,
     map_names: Sequence[str],
     robot: str | None,
     region: bytes | None,
@@ -71,7 +73,7 @@ def choose_inputs(
     """Return the runs of one robot ingested with this recipe and the maps, or raise `DatasetError` that lists the candidates."""
     problems = list[str]()
     try:
-        chosen = choose_runs(store, recipe, robot=robot, tags=tags or {})
+        chosen = choose_runs(store, recipe, state=state, robot=robot, tags=tags or {})
         _refuse_without_segments(chosen.runs)
     except DatasetError as error:
         problems += error.problems
