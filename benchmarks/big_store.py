@@ -7,10 +7,11 @@ import numpy as np
 from pyproj import Geod, Transformer
 
 from tcpipe import __version__
+from tcpipe.formats.commits import Entries
 from tcpipe.formats.maps.map_files import open_map
 from tcpipe.formats.recipe_toml import ingest_key, recipe_id
 from tcpipe.formats.run_documents import Counts, LogOrigin, Manifest, RunJson
-from tcpipe.pipeline.log_writer import commit_run
+from tcpipe.pipeline.log_writer import open_log
 from tcpipe.pipeline.maps import add_map
 from tcpipe.recipe import Recipe
 from tcpipe.simulation.scenarios import scenario
@@ -135,4 +136,4 @@ def _add_run(store: Store, number: int, rows: int) -> None:
         gated=GatedTrack(GATED_TRACK.empty(), info),
         labelled=LabelledSegments(table, info, ledger_m),
     )
-    commit_run(store, run_id)
+    open_log(store).commit("ingested", Entries(runs=tuple(store.read_rows(run_id).values())))

@@ -11,6 +11,7 @@ import hashlib
 import os
 import re
 import resource
+import subprocess
 import sys
 import time
 from collections.abc import Callable
@@ -109,8 +110,24 @@ def once(chosen: Chosen) -> int:
     return len(each_drive_once(chosen.runs, {run_id: log.sha256 for run_id, log in chosen.logs.items()}).runs)
 
 
+def ingest_new_logs(directory: Path, count: int) -> None:
+    """Ingest a new log into an empty store, twice, as the first one loads libraries, and into the store of many runs."""
+    logs, store = many_runs(directory, count)
+    stores = {"into an empty store, first": None, "into an empty store, again": None, "one new log": store.root}
+    for what, root in stores.items():
+        new = directory / f"new-{time.time_ns()}.mcap"
+        write_mcap(new, wheel_drive(seed=time.time_ns() % 2**31))
+        given, where = [new] if root is None else [logs, new], root or new.with_suffix("")
+        summary = timed(what, lambda given=given, where=where: ingest(given, store=where, recipe=Recipe()))
+        assert [result.status for result in summary.results].count("done") == 1
+        print(f"largest memory: {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024:.0f} MB", flush=True)
+
+
 def main() -> None:
     directory, count = Path(sys.argv[1]), int(sys.argv[2]) if len(sys.argv) > 2 else 10_000
+    if sys.argv[3:] == ["new"]:
+        ingest_new_logs(directory, count)
+        return
     directory.mkdir(parents=True, exist_ok=True)
     logs, store = timed("synthesise", lambda: many_runs(directory, count))
     timed("read the log", store.state)
@@ -120,15 +137,11 @@ def main() -> None:
         found = timed(f"status, {again}", lambda: status([logs], store=store.root, recipe=Recipe()))
         assert found.counts == {"done": count}, found.counts
         chosen = timed(f"choice of runs, {again}", lambda: choose_runs(store, Recipe(), robot=None, tags={}))
-        assert timed(f"each drive once, {again}", lambda chosen=chosen: once(chosen)) == count
+        assert timed(f"each drive once, {again}", lambda chosen=chosen: once(chosen)) >= count
         assert not timed(
             f"prune --dry-run, {again}", lambda: prune(store=store.root, recipe=Recipe(), dry_run=True)
         ).removed
-    new = directory / f"new-{count}-{time.time_ns()}.mcap"
-    write_mcap(new, wheel_drive(seed=time.time_ns() % 2**31))
-    summary = timed("one new log", lambda: ingest([logs, new], store=store.root, recipe=Recipe()))
-    assert [result.status for result in summary.results].count("done") == 1
-    print(f"largest memory: {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024:.0f} MB")
+    subprocess.run([sys.executable, __file__, str(directory), str(count), "new"], check=True)
 
 
 if __name__ == "__main__":

@@ -34,11 +34,11 @@ from tcpipe.errors import StoreError, TableError, UsageError
 from tcpipe.formats.atomic import clear_scratch
 from tcpipe.formats.bucket import open_place
 from tcpipe.formats.bucket_directories import FetchedShards, fetch_files
-from tcpipe.formats.commit_log import Stamp, put_commit, read_state
+from tcpipe.formats.commit_log import Stamp, put_commit, read_state, uncollected
 from tcpipe.formats.commits import Entries, Kind, State
 from tcpipe.formats.geoparquet import located_segments
 from tcpipe.formats.index_files import RunFacts, facts_of, known_log, write_index
-from tcpipe.formats.json_files import of_json, plain, to_json, to_json_line, typed
+from tcpipe.formats.json_files import compact_json, of_json, plain, to_json, typed
 from tcpipe.formats.numbered import digest_of, name_of, numbers, put_next, read_as_at
 from tcpipe.formats.object_storage import is_bucket, is_url
 from tcpipe.formats.parquet import read_table
@@ -48,6 +48,7 @@ from tcpipe.formats.run_documents import Manifest, MapDocument, RunJson, StreamI
 from tcpipe.formats.seals import CHECKSUMS, Checksum, file_checksums, sealed
 from tcpipe.formats.store_mark import MARK, is_outdated, layout_of, mark_store
 from tcpipe.formats.stored_runs import (
+    FilesState,
     Ingestions,
     Lost,
     RunDirectory,
@@ -226,17 +227,17 @@ class Store:
 
     def write_index(self, state: State) -> None:
         """Write the table of all runs for other tools."""
-        write_index(self.index_place, (state.runs[key] for key in sorted(state.runs)))
+        with uncollected():
+            write_index(self.index_place, (state.runs[key] for key in sorted(state.runs)))
 
     def prove(self, runs: Sequence[RunDirectory]) -> dict[str, str]:
         """Compare segments and tracks with what the manifests have of them; return by run what is wrong.
 
         Files that are as they were when they were compared before are not read again.
         """
-        damaged, proved = dict[str, str](), dict[str, str]()
+        damaged, proved, new = dict[str, str](), dict[str, FilesState](), dict[str, FilesState]()
         with suppress(StoreError):
-            proved = of_json(self.index_place.read(_PROVED) or b"{}", dict[str, str], _PROVED)
-        new = dict[str, str]()
+            proved = of_json(self.index_place.read(_PROVED) or b"{}", dict[str, FilesState], _PROVED)
         for run in runs:
             try:
                 if run.files_state != proved.get(f"{run.run_id}/{run.recipe_id}"):
@@ -246,7 +247,7 @@ class Store:
                 damaged[run.run_id] = error.problems[0]
         if new:
             with suppress(StoreError):
-                self.index_place.put(_PROVED, to_json_line({**proved, **new}).encode())
+                self.index_place.put(_PROVED, compact_json({**proved, **new}))
         return damaged
 
     def run_ids(self) -> list[str]:

@@ -8,10 +8,11 @@ import pyproj
 from map_worlds import World
 
 from tcpipe import __version__
+from tcpipe.formats.commits import Entries, Superseded
 from tcpipe.formats.maps.building import build_map
 from tcpipe.formats.recipe_toml import ingest_key, recipe_id
 from tcpipe.formats.run_documents import Counts, LogOrigin, Manifest, RunJson
-from tcpipe.pipeline.log_writer import commit_run
+from tcpipe.pipeline.log_writer import open_log
 from tcpipe.recipe import Recipe
 from tcpipe.store import Store, open_store
 from tcpipe.tables.bits import DropReason
@@ -167,6 +168,16 @@ def add_run(
         labelled=LabelledSegments(table, info, ledger_m),
     )
     commit_run(store, run_id)
+
+
+def commit_run(store, run_id):
+    """Commit what lies in the directory of a run."""
+    open_log(store).commit("ingested", Entries(runs=tuple(store.read_rows(run_id).values())))
+
+
+def supersede(store, run_id, by):
+    """Commit that the run ``by`` takes the place of a run."""
+    open_log(store).commit("superseded", Entries(superseded=(Superseded(run_id, by),)))
 
 
 def add_world(store, directory: Path, *, name="site", layers=("ortho", "terrain")):

@@ -36,6 +36,8 @@ _COMMIT = re.compile(r"(\d{10})\.json")
 _SNAPSHOT = "snapshot-"
 _EVERY, _EVERY_BYTES = 64, 4 << 20
 """After so many commits, or so many bytes of them, the next snapshot is written."""
+_SEAL_BYTES = 64
+"""The first line of a snapshot is the sha256 (hex) of the rest."""
 _KEPT = 2
 """So many snapshots stay."""
 
@@ -202,7 +204,8 @@ def _encode_snapshot(state: State, stamp: Stamp) -> bytes:
     text = compact_json(commit)
     sink = pa.BufferOutputStream()
     with pa.CompressedOutputStream(sink, "zstd") as stream:
-        stream.write(hashlib.sha256(text).hexdigest().encode() + b"\n" + text)
+        stream.write(hashlib.sha256(text).hexdigest().encode() + b"\n")
+        stream.write(text)
     return bytes(sink.getvalue())
 
 
@@ -215,15 +218,16 @@ def read_snapshot(log: Place, name: str) -> Commit:
     """Return a snapshot as the one commit that it stands for; `StoreError` where it is not as it was written."""
     where, data = log.where(name), log.read(name)
     try:
-        seal, _, text = pa.input_stream(pa.py_buffer(data or b""), compression="zstd").read().partition(b"\n")
+        whole = memoryview(pa.input_stream(pa.py_buffer(data or b""), compression="zstd").read())
     except OSError:
-        raise StoreError(f"{where}: is not as it was written") from None
+        whole = memoryview(b"")
+    seal, text = bytes(whole[:_SEAL_BYTES]), whole[_SEAL_BYTES + 1 :]
     if hashlib.sha256(text).hexdigest().encode() != seal:
         raise StoreError(f"{where}: is not as it was written")
     try:
         return of_json(text, Commit, where)
     except StoreError:
-        return typed(parse_json(text, where), Commit, where)
+        return typed(parse_json(bytes(text), where), Commit, where)
 
 
 _HERE: dict[Place, State] = {}

@@ -178,12 +178,13 @@ def group_findings(findings: Iterable[tuple[K, Iterable[Finding]]]) -> list[Find
         for finding in each:
             of = found.setdefault(finding.code, {})
             of[key] = (*of.get(key, ()), finding)
-    groups = [FindingGroup(code, of) for code, of in found.items()]
-    order = {
-        of.code: number
-        for number, of in reversed(list(enumerate(sort_findings(f for g in groups for f in g.findings))))
-    }
-    return sorted(groups, key=lambda group: (order[group.code], -len(group.of)))
+    catalogue = read_catalogue()
+
+    def rank(group: FindingGroup[K]) -> tuple[int, int, int]:
+        entry = catalogue.get(group.code)
+        return rank_severity(group.severity), -len(entry.affects if entry else ()), -len(group.of)
+
+    return sorted((FindingGroup(code, of) for code, of in found.items()), key=rank)
 
 
 def format_group(group: FindingGroup[K], total: int | None, what: str = "runs") -> str:

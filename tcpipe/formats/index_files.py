@@ -5,16 +5,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
+from operator import attrgetter
 from pathlib import PurePosixPath
 
 import pyarrow as pa
 
 from tcpipe.errors import StoreError
 from tcpipe.formats.json_files import recast
-from tcpipe.formats.parquet import write_table
+from tcpipe.formats.parquet import parquet_rows
 from tcpipe.formats.place import Place
 from tcpipe.formats.run_documents import Ingestion, LogOrigin, Manifest, RunJson
 from tcpipe.tables.arrays import column_of
@@ -25,6 +26,8 @@ from tcpipe.tables.verdicts import Verdict, judge
 
 RUNS = "runs.parquet"
 
+_TOGETHER = 2_000
+"""So many rows are written at once."""
 _ABOUT = b"tcpipe_index"
 _VERSION = b"6"
 
@@ -134,26 +137,31 @@ _SCHEMA = pa.schema({
 })  # fmt: skip
 
 
+def _pick(record: object, names: Iterable[str]) -> dict[str, object]:
+    return {name: getattr(record, name) for name in names}
+
+
+_CELLS: Mapping[str, Callable[[RunFacts], object]] = {
+    "findings": lambda row: [_pick(of, ("code", "severity")) for of in row.findings],
+    "verdict": lambda row: _pick(row.verdict, AFFECTED),
+    "log": lambda row: row.log and {"source": _pick(row.log.source, ("paths", "sha256", "size_bytes"))},
+}
+"""How a column is made that is no field of a row."""
+
+
 def write_index(place: Place, rows: Iterable[RunFacts]) -> None:
     """Write ``runs.parquet``, unless that cannot be: it is written again after the next commit."""
-    rows = list(rows)
-    columns = [_column([_cell(row, of.name) for row in rows], of.type) for of in _SCHEMA]
-    table = pa.table(columns, schema=_SCHEMA.with_metadata({_ABOUT: _VERSION}))
+    rows, schema = list(rows), _SCHEMA.with_metadata({_ABOUT: _VERSION})
     with suppress(StoreError), place.workshop() as directory:
-        write_table(table, directory / RUNS)
+        with parquet_rows(directory / RUNS, schema) as write:
+            for start in range(0, len(rows), _TOGETHER):
+                write(_make_table(rows[start : start + _TOGETHER], schema))
         place.put(RUNS, (directory / RUNS).read_bytes())
 
 
-def _cell(row: RunFacts, name: str) -> object:
-    value = getattr(row, name)
-    if name == "log" and value is not None:
-        source = value.source
-        return {"source": {"paths": source.paths, "sha256": source.sha256, "size_bytes": source.size_bytes}}
-    if name == "findings":
-        return [{"code": of.code, "severity": of.severity} for of in row.findings]
-    if name == "verdict":
-        return {label: getattr(value, label) for label in AFFECTED}
-    return value
+def _make_table(rows: Sequence[RunFacts], schema: pa.Schema) -> pa.Table:
+    cells = (map(_CELLS.get(of.name, attrgetter(of.name)), rows) for of in schema)
+    return pa.table([_column([*of], field.type) for of, field in zip(cells, schema, strict=True)], schema=schema)
 
 
 def _column(values: list[object], kind: pa.DataType) -> pa.Array:

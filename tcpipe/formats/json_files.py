@@ -9,6 +9,7 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from enum import Enum
+from functools import cache
 from pathlib import Path
 from threading import Lock
 from typing import Any, TypeVar
@@ -24,6 +25,8 @@ Json = str | float | bool | None | Sequence["Json"] | Mapping[str, "Json"]
 
 _CONVERTING = Lock()
 """msgspec (0.22) ends the process where two threads meet a dataclass for the first time at once."""
+
+_ABSENT = object()
 
 MOST_BYTES = 32 << 20
 """A document is at most so large [byte], written and read: the card of ten thousand runs."""
@@ -49,8 +52,13 @@ def plain(value: Any) -> Any:
 
 def recast(record: object, cls: Callable[..., T], **more: object) -> T:
     """Return a record of another dataclass: with the fields that ``record`` has too, and ``more``, which goes before."""
-    known = {of.name: getattr(record, of.name) for of in fields(cls) if hasattr(record, of.name)}  # type: ignore[arg-type]
-    return cls(**(known | more))
+    found = ((name, getattr(record, name, _ABSENT)) for name in _field_names(cls) if name not in more)
+    return cls(**{name: value for name, value in found if value is not _ABSENT}, **more)
+
+
+@cache
+def _field_names(cls: Callable[..., object]) -> tuple[str, ...]:
+    return tuple(of.name for of in fields(cls))  # type: ignore[arg-type]
 
 
 def compact_json(value: object) -> bytes:
@@ -132,7 +140,7 @@ def typed(value: object, cls: type[T], path: Path | str) -> T:
         raise StoreError(f"{path}: is not what this version writes: {_in_words(str(error))}") from None
 
 
-def of_json(text: str | bytes, cls: type[T], path: Path | str) -> T:
+def of_json(text: str | bytes | memoryview, cls: type[T], path: Path | str) -> T:
     """Return JSON text as a dataclass, or what is made of such; as `typed`."""
     try:
         with _CONVERTING:

@@ -8,6 +8,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path, PurePosixPath
+from typing import TypeAlias
 
 import pyarrow as pa
 
@@ -23,6 +24,9 @@ from tcpipe.formats.seals import Checksum, file_checksum, file_checksums, wrong_
 from tcpipe.tables.levels import LABELLED_SEGMENTS, GatedTrack
 from tcpipe.tables.verdicts import judge_again
 
+FilesState: TypeAlias = tuple[tuple[int, int], ...]
+"""Size [byte] and modification time [ns] of each file of an ingestion."""
+
 
 @dataclass(frozen=True, slots=True)
 class RunDirectory:
@@ -34,7 +38,7 @@ class RunDirectory:
     """``runs/`` of the store."""
     facts: RunFacts
     """What the log has of it: enough to choose by."""
-    files_state: str = ""
+    files_state: FilesState = ()
     """Distinguishes its files from what is written under their names later."""
 
     @property
@@ -139,7 +143,7 @@ class Ingestions:
         return self.state.superseded
 
 
-def look_at_files(place: Place, rows: Iterable[RunFacts]) -> Iterator[tuple[RunFacts, Lost | None, str]]:
+def look_at_files(place: Place, rows: Iterable[RunFacts]) -> Iterator[tuple[RunFacts, Lost | None, FilesState]]:
     """Yield each row with the first of its files that is gone or has another size, and with the state of its files.
 
     Parameters
@@ -157,7 +161,7 @@ def look_at_files(place: Place, rows: Iterable[RunFacts]) -> Iterator[tuple[RunF
                 lost = Lost(place.where(f"{row.run_id}/{name}"), size_bytes, seen and seen[0])
                 break
             states.append(seen)
-        yield row, lost, "" if lost else " ".join(f"{size}-{time}" for size, time in states)
+        yield row, lost, tuple(states)
 
 
 def _find_on_disk(root: Path) -> Callable[[str], tuple[int, int] | None]:
@@ -181,7 +185,7 @@ def _find_listed(place: Place, rows: Sequence[RunFacts]) -> Callable[[str], tupl
 
 
 @lru_cache(maxsize=64)
-def _manifest(place: Place, name: str, state: str) -> Manifest:
+def _manifest(place: Place, name: str, state: FilesState) -> Manifest:
     """Return a manifest while the files of its ingestion are in this state; judged by this version's catalogue."""
     del state
     manifest = read_as_at(place, name, Manifest)

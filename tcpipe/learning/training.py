@@ -313,8 +313,8 @@ def _is_of(checkpoint: Path, key: str) -> bool:
     """Return whether training can continue from a checkpoint; warn where it cannot."""
     try:
         read_checkpoint(checkpoint, key)
-    except ModelError:
-        logger.warning("%s: damaged, or of other options or another dataset; training starts again", checkpoint)
+    except ModelError as error:
+        logger.warning("%s. Training starts anew now", error.problems[0])
         return False
     return True
 

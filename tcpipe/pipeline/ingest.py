@@ -111,11 +111,11 @@ def run_ingest(options: IngestOptions) -> IngestSummary:
         common = (root, ruling, robot, dict(options.tags or {}), options.force, message_definitions)
         how = (*common, definitions_key(message_definitions), options.retry_failed, options.min_age_s)
         seen = {} if options.force else log.state.seen
-        tasks = [IngestTask(remembered(source, seen.get(source.lineage, ())), *how) for source in mine]
-        if options.on_found:
-            sizes = {task.source.name: sum(size for size, _ in task.source.files) for task in tasks}
-            options.on_found({**dict.fromkeys(map(plain_line, found.problems), 0), **sizes})
         with uncollected():
+            tasks = [IngestTask(remembered(source, seen.get(source.lineage, ())), *how) for source in mine]
+            if options.on_found:
+                sizes = {task.source.name: sum(size for size, _ in task.source.files) for task in tasks}
+                options.on_found({**dict.fromkeys(map(plain_line, found.problems), 0), **sizes})
             steps = plan(tasks, log.state, broken=find_broken(opened, log.state, tasks))
         results: dict[int, IngestResult] = {}
 

@@ -143,7 +143,7 @@ def find_sources(
         except LogError as error:
             problems[shown_path(entry)] = error.problems
             transient |= is_transient(error)
-    for part, line in _parts_alone({path for path, _ in paths.values()}, together=as_one):
+    for part, line in _parts_alone([path for path, _ in paths.values()], together=as_one):
         problems[str(part)] = (line,)
         paths = {real: found for real, found in paths.items() if found[0] != part}
     groups = [tuple(sorted(paths.values()))] if as_one and paths else [(found,) for found in paths.values()]
@@ -179,7 +179,7 @@ def _logs_at(path: Path, tables: Mappings) -> list[Path]:
         raise
 
 
-def _parts_alone(paths: set[Path], *, together: bool) -> Iterator[tuple[Path, str]]:
+def _parts_alone(paths: Iterable[Path], *, together: bool) -> Iterator[tuple[Path, str]]:
     """Yield the files that are parts of a ROS 2 bag, given without the others: what does not change stands in the first part only."""
     folders: dict[str, list[Path]] = {}
     for path in paths:
@@ -187,7 +187,7 @@ def _parts_alone(paths: set[Path], *, together: bool) -> Iterator[tuple[Path, st
             folders.setdefault(os.path.dirname(path), []).append(path)  # noqa: PTH120  of thousands
     for bag, mine in sorted(folders.items()):
         parts = frozenset(storage_files(Path(bag)) if is_one_bag(Path(bag)) else ())
-        if len(parts) > 1 and not (together and parts <= paths):
+        if len(parts) > 1 and not (together and parts.issubset(mine)):
             for path in sorted(parts.intersection(mine)):
                 what = f"{path}: is one of the {len(parts)} parts of the ROS 2 bag {bag}"
                 yield path, f"{what}, and static transforms stand in the first of them only; give the directory"

@@ -11,7 +11,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from tcpipe.formats.commit_log import Stamp
-from tcpipe.formats.commits import Entries, Kind, Process, State, Superseded
+from tcpipe.formats.commits import Entries, Kind, Process, State
 from tcpipe.formats.index_files import RunFacts
 from tcpipe.store import Store
 
@@ -35,25 +35,10 @@ def open_log(store: Store) -> LogWriter:
     return LogWriter(store, store.state())
 
 
-def commit_run(store: Store, run_id: str) -> None:
-    """Commit what lies in the directory of a run, where the log does not say so yet."""
-
-    def make(state: State) -> Entries:
-        rows = store.read_rows(run_id).values()
-        return Entries(runs=tuple(row for row in rows if not is_committed(row, state)))
-
-    open_log(store).commit("ingested", make)
-
-
 def is_committed(row: RunFacts, state: State) -> bool:
     """Return whether the log has an ingestion as it lies in its directory."""
     known = state.runs.get((row.run_id, row.recipe_id))
     return known is not None and (known.files, known.tags) == (row.files, row.tags)
-
-
-def supersede(store: Store, run_id: str, by: str | None) -> None:
-    """Commit that another run takes this one's place, or, without ``by``, that it counts again."""
-    open_log(store).commit("superseded", Entries(superseded=(Superseded(run_id, by),)))
 
 
 def this_process() -> Process:

@@ -39,6 +39,7 @@ T = TypeVar("T")
 
 Document = Mapping[str, Any]
 
+_KNOWN_VERSIONS = (*EARLIER_VERSIONS, DATA_MODEL_VERSION)
 _RECORDS, _INDEX = "records/", "index/"
 _TOGETHER = 500
 """So many runs are one commit."""
@@ -90,10 +91,8 @@ def migrate(path: Path | str, to: Path | str | None = None) -> Migrated:
             f"{path}: is a store of data model 1, which this version does not read, or an incomplete copy (no {MARK})"
         )
     if (version := layout_of(source)) is not None:
-        if version not in (*EARLIER_VERSIONS, DATA_MODEL_VERSION):
-            raise UsageError(
-                f"{path}: is of data model {version}, this version knows {', '.join((*EARLIER_VERSIONS, DATA_MODEL_VERSION))}"
-            )
+        if version not in _KNOWN_VERSIONS:
+            raise UsageError(f"{path}: is of data model {version}, this version knows {', '.join(_KNOWN_VERSIONS)}")
         return _store(source, source if to is None else open_place(to))
     if to is not None:
         raise UsageError(f"{path}: is no store; only stores are brought elsewhere")
@@ -183,11 +182,9 @@ def _bring(place: Place, name: str) -> bytes:
 
 def _bring_run(found: Document) -> Document:
     """Return what is known of a log, with ``findings`` as ``report``."""
-    return (
-        {**_without(found, "findings"), "report": _report(found["findings"], "run", "")}
-        if "findings" in found
-        else found
-    )
+    if "findings" not in found:
+        return found
+    return {**_without(found, "findings"), "report": _with_findings(found["findings"], "run", "")}
 
 
 def _bring_document(found: Document, where: str) -> Document:
@@ -196,11 +193,11 @@ def _bring_document(found: Document, where: str) -> Document:
     if version == DATA_MODEL_VERSION:
         return found
     if version not in EARLIER_VERSIONS:
-        known = ", ".join((*EARLIER_VERSIONS, DATA_MODEL_VERSION))
+        known = ", ".join(_KNOWN_VERSIONS)
         raise StoreError(f"{where}: of data model {version}, this version knows {known}; left as it is")
     document = {**_without(found, "warnings", "problems", "findings"), "data_model_version": DATA_MODEL_VERSION}
     if "info" in found:
-        report = _report({**found["info"]["findings"], "warnings": found["warnings"]}, "run", found["run_id"])
+        report = _with_findings({**found["info"]["findings"], "warnings": found["warnings"]}, "run", found["run_id"])
         findings = report["findings"]
         document |= {"info": {**_without(found["info"], "findings"), "report": report}}
     else:
@@ -217,11 +214,8 @@ def _without(document: Document, *names: str) -> dict[str, Any]:
     return {name: of for name, of in document.items() if name not in names}
 
 
-def _report(found: Document, kind: SubjectKind, name: str) -> dict[str, Any]:
-    return {**_without(found, "warnings"), "findings": _earlier(found["warnings"], kind, name)}
-
-
 def _with_findings(found: Document, kind: SubjectKind, name: str) -> dict[str, Any]:
+    """Return a part of a document with its warnings as findings."""
     return {**_without(found, "warnings"), "findings": _earlier(found.get("warnings", ()), kind, name)}
 
 

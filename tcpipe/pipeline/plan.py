@@ -14,6 +14,7 @@ from tcpipe.formats.index_files import RunFacts
 from tcpipe.formats.recipe_toml import ingest_key
 from tcpipe.pipeline.ingest_task import IngestTask, too_young
 from tcpipe.pipeline.problems import find_problems, is_acknowledged, make_failure
+from tcpipe.tables.findings import Finding
 
 Standing: TypeAlias = Literal[
     "done", "partial", "empty", "pending", "outdated", "growing", "failed_permanent", "failed_transient", "quarantined", "superseded"
@@ -37,6 +38,8 @@ class Step:
     """The ingestion of the log as it would be made now, where there is one."""
     failure: Failure | None = None
     """Why the log is not tried again."""
+    findings: tuple[Finding, ...] = ()
+    """What is wrong with it, where that is known as data."""
     has_failed: bool = False
     """Whether it failed before, under whatever conditions."""
 
@@ -87,12 +90,13 @@ def _decide(task: IngestTask, known: _Known, now_ns: int) -> Step:
     made = known.made.get(sha256, []) if sha256 else []
     current = next((row for row in made if task.is_made_by(row)), None)
     if current is not None and task.tags.items() <= current.tags.items():
-        return Step(task, *_find_standing(current, known.state), made=current)
+        return _stand(task, current, known.state)
     failed = None if task.force or task.retry_failed else known.state.failed.get(task.failure_key)
     if failed is not None:
         acknowledged = is_acknowledged([make_failure(failed.content, failed.log)], known.state)
         cause = _without_name("".join(failed.problems[:1]), task)
-        return Step(task, "quarantined" if acknowledged else "failed_permanent", cause, failure=failed)
+        standing: Standing = "quarantined" if acknowledged else "failed_permanent"
+        return Step(task, standing, cause, failure=failed, findings=failed.findings)
     if too_young(task, now_ns):
         return Step(task, "growing", has_failed=_content(task) in known.failures)
     if source.name in known.passing:
@@ -110,17 +114,18 @@ def _content(task: IngestTask) -> str:
     return task.source.sha256 or task.source.files_digest
 
 
-def _find_standing(made: RunFacts, state: State) -> tuple[Standing, str]:
-    """Return the standing of a log that is in the store as it would be made now, and why."""
+def _stand(task: IngestTask, made: RunFacts, state: State) -> Step:
+    """Return the step of a log that is in the store as it would be made now."""
     if made.superseded_by:
-        return "superseded", "a longer recording has taken its place"
+        return Step(task, "superseded", "a longer recording has taken its place", made)
     problems = find_problems(made)
     if not problems:
-        return "done", ""
+        return Step(task, "done", made=made)
     if is_acknowledged(problems, state):
-        return "done", f"{'damaged' if made.damage else 'empty'}, acknowledged"
-    worst = problems[0].finding
-    return "empty" if made.is_empty else "partial", made.damage[0] if made.damage else describe_finding(worst)
+        return Step(task, "done", f"{'damaged' if made.damage else 'empty'}, acknowledged", made)
+    findings = tuple(problem.finding for problem in problems)
+    cause = made.damage[0] if made.damage else describe_finding(findings[0])
+    return Step(task, "empty" if made.is_empty else "partial", cause, made, findings=findings)
 
 
 def _why_pending(task: IngestTask, known: _Known) -> str:

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import re
 import time
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
@@ -26,13 +25,12 @@ from tcpipe.pipeline.ingest_task import IngestTask
 from tcpipe.pipeline.log_sources import definitions_key, find_sources, in_shard, remembered
 from tcpipe.pipeline.plan import STANDINGS, TROUBLE, Standing, Step, plan
 from tcpipe.pipeline.problems import incomplete_runs, make_waiting
-from tcpipe.pipeline.store_verdict import judge_runs
+from tcpipe.pipeline.store_verdict import find_changes, judge_runs
 from tcpipe.recipe import Recipe
 from tcpipe.store import Store, open_store
 from tcpipe.tables.findings import Finding, Subject, make_finding
 from tcpipe.tables.verdicts import Verdict
 
-_NUMBER = re.compile(r"\d[\d.,]*")
 _MOST_NAMES = 3
 _MOST_CALLS = 7
 _TWO_NIGHTS_NS = 2 * 86_400 * 10**9
@@ -184,7 +182,7 @@ def status(
         superseded_runs=len(state.superseded),
         begun=tuple(call for call in begun if call.state != "killed" or call.name not in acknowledged),
         history=state.calls,
-        verdict=judge_runs(current),
+        verdict=judge_runs(current, find_changes(current)),
         runs=len(current),
         findings={of.code: len(of.of) for of in by_code if of.severity != "note"},
         losses=losses_of(run.ledger_m for run in current),
@@ -215,13 +213,14 @@ def _absolute(log: str) -> str:
 
 
 def _groups(steps: Iterable[Step]) -> Iterator[Group]:
-    """Yield logs of one standing whose causes are the same but for numbers, which are shown where they are the same."""
-    groups: dict[tuple[Standing, str], list[Step]] = {}
+    """Yield logs of one standing with findings of the same codes on the same subjects; without findings, of the same cause."""
+    groups: dict[tuple[Standing, Hashable], list[Step]] = {}
     for step in steps:
-        alike = _NUMBER.sub("#", step.cause) if step.standing in (*TROUBLE, "quarantined") else step.cause
-        groups.setdefault((step.standing, alike), []).append(step)
-    for (standing, alike), of in sorted(groups.items(), key=lambda item: (STANDINGS.index(item[0][0]), -len(item[1]))):
-        cause = alike if any(step.cause != of[0].cause for step in of) else of[0].cause
+        alike = frozenset((of.code, None if of.subject.kind in ("log", "run") else of.subject) for of in step.findings)
+        groups.setdefault((step.standing, alike or step.cause), []).append(step)
+    for (standing, _), of in sorted(groups.items(), key=lambda item: (STANDINGS.index(item[0][0]), -len(item[1]))):
+        causes = list(dict.fromkeys(step.cause for step in of))
+        cause = causes[0] if len(causes) == 1 else f"{len(causes)} reasons, the first: {causes[0]}"
         yield Group(standing, cause, tuple(step.task.source.name for step in of), sum(map(_bytes, of)))
 
 

@@ -27,14 +27,15 @@ def store_facts(store: Store, found: Ingestions, *, will_be: Sequence[RunDirecto
     known = {run.run_id for run in found.finished if is_acknowledged(find_problems(run.facts), state)}
     key = ruling_key(found)
     current = [run.facts for run in found.finished if run.facts.ingest_key == key]
+    changes = find_changes(current)
     return StoreFacts(
         where=str(store.root),
         found=found,
         acknowledged=frozenset(known),
         pages=frozenset(pages | {(run.run_id, run.recipe_id) for run in will_be}),
         datasets=tuple(_dataset(store, made) for made in state.datasets.values()),
-        verdict=judge_runs(current),
-        changes=find_changes(current),
+        verdict=judge_runs(current, changes),
+        changes=changes,
         groups=tuple(group_findings((run.run_id, run.findings) for run in current)),
         failed=tuple(_failed(state)),
     )

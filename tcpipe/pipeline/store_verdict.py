@@ -17,9 +17,9 @@ _CHANGE = "run-to-run-change"
 _IN_PERCENT = 100.0
 
 
-def judge_runs(runs: Sequence[RunFacts]) -> Verdict:
-    """Return the verdict on runs together and what the latest have changed; of each code the worst finding is a reason."""
-    return judge_by_code([*find_changes(runs), *(finding for run in runs for finding in run.findings)])
+def judge_runs(runs: Iterable[RunFacts], changes: Iterable[Finding]) -> Verdict:
+    """Return the verdict on runs together and on their `find_changes`; of each code the worst finding is a reason."""
+    return judge_by_code([*changes, *(finding for run in runs for finding in run.findings)])
 
 
 def find_changes(runs: Iterable[RunFacts]) -> tuple[Finding, ...]:

@@ -278,7 +278,7 @@ def _ingestion(runs: Place, run_id: str, recipe_name: str) -> Iterator[Finding]:
     yield from wrong
     yield "files", len(manifest.checksums)
     yield from _others(place, manifest)
-    run = RunDirectory(run_id, recipe_name, runs, facts_of(manifest, last, {}), str(time.time_ns()))
+    run = RunDirectory(run_id, recipe_name, runs, facts_of(manifest, last, {}), ((0, time.time_ns()),))
     yield from _tables(run, where) if not wrong else ()
 
 

@@ -119,8 +119,10 @@ def select_findings(findings: Iterable[Finding], *codes: str) -> list[Finding]:
 
 def is_problem(finding: Finding) -> bool:
     """Return whether a finding causes exit code 3; a note never does."""
+    if finding.severity == "note":
+        return False
     entry = read_catalogue().get(finding.code)
-    return entry is not None and entry.is_problem and finding.severity != "note"
+    return entry is not None and entry.is_problem
 
 
 def select_problems(findings: Iterable[Finding]) -> list[Finding]:

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Literal, TypeAlias
 
-from tcpipe.tables.catalogue import AFFECTED, Affected, Severity, catalogue_version, read_catalogue
+from tcpipe.tables.catalogue import Affected, Severity, catalogue_version, read_catalogue
 from tcpipe.tables.findings import Finding, sort_findings
 
 Grade: TypeAlias = Literal["usable", "usable with care", "not usable"]
@@ -14,7 +14,7 @@ Grade: TypeAlias = Literal["usable", "usable with care", "not usable"]
 GRADES: tuple[Grade, ...] = ("usable", "usable with care", "not usable")
 PREDICTED: tuple[Affected, ...] = ("time", "energy")
 """Labels that models predict."""
-_GRADE_OF: Mapping[Severity, Grade] = {"error": "not usable", "warning": "usable with care", "note": "usable"}
+_GRADE_OF: Mapping[Severity, Grade] = {"error": "not usable", "warning": "usable with care"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,16 +37,12 @@ class Verdict:
 def judge(findings: Iterable[Finding]) -> Verdict:
     """Return the verdict: each label has the grade of the worst finding that affects it."""
     catalogue = read_catalogue()
-    grades: dict[Affected, Grade] = dict.fromkeys(AFFECTED, "usable")
-    reasons = []
-    for finding in sort_findings(findings):
-        affected = catalogue[finding.code].affects if finding.code in catalogue else ()
-        grade = _GRADE_OF[finding.severity]
-        if affected and grade != "usable":
-            reasons.append(finding)
-        for name in affected:
-            grades[name] = max(grades[name], grade, key=GRADES.index)
-    return Verdict(**grades, reasons=tuple(reasons))
+    decisive = (of for of in findings if of.severity != "note" and of.code in catalogue and catalogue[of.code].affects)
+    reasons = tuple(sort_findings(decisive))
+    grades: dict[Affected, Grade] = {}
+    for finding in reversed(reasons):
+        grades |= dict.fromkeys(catalogue[finding.code].affects, _GRADE_OF[finding.severity])
+    return Verdict(**grades, reasons=reasons)
 
 
 def judge_by_code(findings: Iterable[Finding]) -> Verdict:

@@ -129,7 +129,7 @@ def test_nothing_but_what_prints_makes_sentences():
 
 
 def test_nothing_decides_on_a_finished_sentence():
-    """Nobody compares, splits or searches what `finding_lines` returns."""
+    """Nobody compares, splits or searches what `finding_lines` returns, or a field that holds finished sentences."""
     makers = {
         node.name
         for node in NODES["tcpipe/formats/finding_lines.py"]
@@ -137,9 +137,11 @@ def test_nothing_decides_on_a_finished_sentence():
     }
 
     def is_sentence(node):
-        return isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id in makers
+        node = node.value if isinstance(node, ast.Subscript) else node
+        is_field = isinstance(node, ast.Attribute) and node.attr in {"cause", "damage", "notes", "problems", "remarks"}
+        return is_field or (isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id in makers)
 
-    searches = {"startswith", "endswith", "split", "partition", "search", "match", "sub"}
+    searches = {"startswith", "endswith", "split", "partition", "search", "match", "fullmatch", "sub"}
     for path, nodes in NODES.items():
         for node in nodes if path != "tcpipe/formats/finding_lines.py" else ():
             looked_at = [node.left, *node.comparators] if isinstance(node, ast.Compare) else []

@@ -12,13 +12,12 @@ import pytest
 from object_gateway import in_environment
 from storage_server import OVERWRITING, READ_ONLY, object_store
 from stored_files import manifest, table
-from synthetic_store import add_run, lanes, segments
+from synthetic_store import add_run, commit_run, lanes, segments
 
 from tcpipe.errors import StoreError, UsageError
 from tcpipe.formats.bucket import BucketPlace
 from tcpipe.formats.place import DirectoryPlace
 from tcpipe.pipeline.inspect import inspect
-from tcpipe.pipeline.log_writer import commit_run
 from tcpipe.pipeline.verify import verify
 from tcpipe.recipe import Recipe
 from tcpipe.store import Store, open_store

@@ -19,7 +19,7 @@ from tcpipe.errors import DatasetError, RecipeError, StoreError, UsageError, pla
 from tcpipe.formats.atomic import atomic_directory, clear_beside, write_text
 from tcpipe.formats.bucket import open_place
 from tcpipe.formats.bucket_directories import fetch_directory_by_range, find_newest
-from tcpipe.formats.commits import Call, Dataset, Entries
+from tcpipe.formats.commits import Call, Dataset, Entries, State
 from tcpipe.formats.croissant import croissant
 from tcpipe.formats.dataset_card import DatasetCard, group_dataset_findings
 from tcpipe.formats.dataset_files import (
@@ -155,6 +155,7 @@ def run_build_dataset(options: BuildDatasetOptions) -> BuildResult:
     out, store, tags, dry_run = options.out, options.store, options.tags or {}, options.dry_run
     place = str(out).rstrip("/") if is_url(out) else local_output(out)
     opened = open_store(store if options.cluster is None or is_url(store) else Path(store).absolute())
+    log = open_log(opened)
     if isinstance(place, Path) and not dry_run:
         clear_beside(place)
     known, proved = _card_in_bucket(place) if isinstance(place, str) else _card_in_place(place)
@@ -169,6 +170,7 @@ def run_build_dataset(options: BuildDatasetOptions) -> BuildResult:
     inputs = choose_inputs(
         opened,
         marks,
+        state=log.state,
         map_names=(map_name,) if isinstance(map_name, str) else tuple(map_name or ()),
         robot=robot,
         region=region,
@@ -194,11 +196,11 @@ def run_build_dataset(options: BuildDatasetOptions) -> BuildResult:
         _refuse_other_options(place, known, marks, inputs, force=options.force)
         if isinstance(place, str):
             read_generations(open_place(place), CARD)
-        return _planned(place, opened, inputs, jobs=options.jobs)
+        return _planned(place, log.state, inputs, jobs=options.jobs)
     else:
         _refuse_other_options(place, known, marks, inputs, force=options.force)
         whole = write_generation(place, CARD) if isinstance(place, str) else atomic_directory(place.absolute())
-        with begun_call(open_log(opened), BUILD, [_absolute(place)]) as call:
+        with begun_call(log, BUILD, [_absolute(place)]) as call:
             at_work = partial(_workers, jobs=options.jobs, cluster=options.cluster)
             with whole as directory, at_work(directory, opened, inputs.digest) as workers:
                 card = _build(directory, inputs, marks, workers)
@@ -211,7 +213,7 @@ def run_build_dataset(options: BuildDatasetOptions) -> BuildResult:
             took = Call(BUILD, __version__, result.exit_code, counts, options.jobs, written_bytes=written)
             _end(call, measure_call(watch, took), _describe_dataset(result, inputs), known)
     if result.status == "unchanged":
-        _refer(open_log(opened), _describe_dataset(result, inputs))
+        _refer(log, _describe_dataset(result, inputs))
     return result
 
 
@@ -243,10 +245,10 @@ def _refuse_others_since(place: Path | str, expected: Container[str | None]) -> 
         )
 
 
-def _planned(place: Path | str, store: Store, inputs: Inputs, *, jobs: int) -> BuildResult:
+def _planned(place: Path | str, state: State, inputs: Inputs, *, jobs: int) -> BuildResult:
     """Return what is to be expected of a build."""
     most = sum(run.facts.segments - int(inputs.again[run.run_id].sum()) for run in inputs.runs)
-    expected = estimate(store.state().calls, BUILD, most, jobs=jobs)
+    expected = estimate(state.calls, BUILD, most, jobs=jobs)
     code = 3 if select_problems(inputs.findings) else 0
     return BuildResult(str(place), "planned", inputs.findings, exit_code=code, estimate=expected)
 

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from tcpipe import __version__
 from tcpipe.errors import DatasetError, MapError, StoreError
 from tcpipe.formats.bucket_directories import FetchedShards, fetch_directory_by_range
+from tcpipe.formats.commits import State
 from tcpipe.formats.dataset_card import RunSource
 from tcpipe.formats.dataset_files import FileFormat, is_shard, read_card, read_samples, sample_columns
 from tcpipe.formats.json_files import digest, plain, recast
@@ -77,6 +78,7 @@ def choose_inputs(
     store: Store,
     options: BuildOptions,
     *,
+    state: State,
     map_names: Sequence[str],
     robot: str | None,
     region: bytes | None,
@@ -85,7 +87,7 @@ def choose_inputs(
     """Return the runs of one robot ingested with this recipe and the maps, or raise `DatasetError` that lists the candidates."""
     problems = list[str]()
     try:
-        chosen = choose_runs(store, options.recipe, robot=robot, tags=options.tags)
+        chosen = choose_runs(store, options.recipe, state=state, robot=robot, tags=options.tags)
         _refuse_without_segments(chosen.runs)
     except DatasetError as error:
         problems += error.problems

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from tcpipe.errors import DatasetError
+from tcpipe.formats.commits import State
 from tcpipe.formats.dataset_card import RunSource
 from tcpipe.formats.index_files import KnownSensor, RunFacts
 from tcpipe.formats.recipe_toml import ingest_key
@@ -41,9 +42,11 @@ class Chosen:
     """On runs that nobody expects in the dataset: unfinished and superseded ones."""
 
 
-def choose_runs(store: Store, recipe: Recipe, *, robot: str | None, tags: Mapping[str, str]) -> Chosen:
+def choose_runs(
+    store: Store, recipe: Recipe, *, state: State | None = None, robot: str | None, tags: Mapping[str, str]
+) -> Chosen:
     """Return the runs to pool, those that carry all of the tags, each proved; two robots are never pooled unasked."""
-    found, key = store.ingestions(), ingest_key(recipe)
+    found, key = store.ingestions(state=state), ingest_key(recipe)
     mine = [run for run in found.finished if run.facts.ingest_key == key]
     if not mine:
         raise DatasetError(*_nothing_to_pool(store, found))

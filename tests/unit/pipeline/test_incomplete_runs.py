@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from object_gateway import in_environment
 from storage_server import object_store
-from synthetic_store import add_run, add_world, lanes, segments
+from synthetic_store import add_run, add_world, commit_run, lanes, segments, supersede
 from wheel_drives import START_NS, drive_at
 
 from tcpipe.pipeline import report as reporting
@@ -15,7 +15,6 @@ from tcpipe.pipeline.dataset import build as building
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.ingest import ingest
 from tcpipe.pipeline.inspect import inspect
-from tcpipe.pipeline.log_writer import commit_run, supersede
 from tcpipe.pipeline.prune import prune
 from tcpipe.pipeline.status import status
 from tcpipe.pipeline.verify import verify

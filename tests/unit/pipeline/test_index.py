@@ -7,14 +7,14 @@ import numpy as np
 import polars as pl
 import pyarrow.dataset as ds
 import pytest
-from synthetic_store import add_run, lanes, segments
+from synthetic_store import add_run, commit_run, lanes, segments, supersede
 
 import tcpipe.store as stores
 from tcpipe.errors import StoreError
 from tcpipe.formats import stored_runs
 from tcpipe.formats.commits import Entries, Sighting
 from tcpipe.pipeline.dataset.runs import choose_runs
-from tcpipe.pipeline.log_writer import commit_run, open_log, supersede
+from tcpipe.pipeline.log_writer import open_log
 from tcpipe.recipe import Recipe
 from tcpipe.store import Store
 

@@ -303,19 +303,21 @@ def test_of_two_calls_that_ingest_one_recording_under_two_names_the_first_commit
     assert str(found["second.mcap"].run.run_id).startswith("first-")
 
 
-def test_a_night_with_nothing_new_asks_a_bucket_the_same_however_many_runs_there_are(tmp_path, monkeypatch):
+def test_a_night_asks_a_bucket_the_same_however_many_runs_there_are(tmp_path, monkeypatch):
+    """Beyond one request for each commit that no snapshot has yet."""
     (tmp_path / "served" / "tests").mkdir(parents=True)
-    counts = []
+    store, logs, counts = "s3://tests/store", tmp_path / "logs", {"new log": [], "nothing new": [], "status": []}
     with object_store(tmp_path / "served") as (environment, fetched):
         in_environment(monkeypatch, environment, tmp_path / "cache")
-        for number in range(3):
-            drive_at(tmp_path / "logs" / f"{number}.mcap", seed=number, start_ns=START_NS + number * 10**13)
-            ingest([tmp_path / "logs"], store="s3://tests/store", recipe=Recipe())
-            fetched.requests = 0
-            summary = ingest([tmp_path / "logs"], store="s3://tests/store", recipe=Recipe())
-            assert {result.status for result in summary.results} == {"unchanged"}
-            counts.append(fetched.requests - Store("s3://tests/store").state().number)
-    assert len(set(counts)) == 1, "what is beyond one request for each commit that no snapshot has"
+        for number in range(4):
+            drive_at(logs / f"{number}.mcap", seed=number, start_ns=START_NS + number * 10**13)
+            calls = {"new log": ingest, "nothing new": ingest, "status": status}
+            for what, call in calls.items():
+                commits = Store(store).state().number
+                fetched.requests = 0
+                assert call([logs], store=store, recipe=Recipe()).exit_code == 0
+                counts[what].append(fetched.requests - commits)
+    assert {what: len(set(of[1:])) for what, of in counts.items()} == dict.fromkeys(counts, 1), counts
 
 
 # --- names ----------------------------------------------------------------------------------------------------------

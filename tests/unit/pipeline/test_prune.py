@@ -6,13 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from synthetic_store import add_run, lanes, segments
+from synthetic_store import add_run, lanes, segments, supersede
 
 from tcpipe.errors import UsageError
 from tcpipe.formats.commits import Dataset, Entries
 from tcpipe.formats.place import DirectoryPlace
 from tcpipe.formats.store_mark import SPOOL
-from tcpipe.pipeline.log_writer import open_log, supersede
+from tcpipe.pipeline.log_writer import open_log
 from tcpipe.pipeline.prune import prune
 from tcpipe.pipeline.verify import verify
 from tcpipe.recipe import ReadConfig, Recipe

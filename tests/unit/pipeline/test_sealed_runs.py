@@ -6,14 +6,14 @@ from dataclasses import replace
 
 import pytest
 from stored_files import manifest, run_document, table
-from synthetic_store import add_run, add_world, box, lanes, region_file, segments
+from synthetic_store import add_run, add_world, box, commit_run, lanes, region_file, segments, supersede
 
 from tcpipe.dataset import open_dataset
 from tcpipe.errors import DatasetError, StoreError
 from tcpipe.formats.commits import Entries
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.inspect import inspect
-from tcpipe.pipeline.log_writer import commit_run, open_log, supersede
+from tcpipe.pipeline.log_writer import open_log
 from tcpipe.pipeline.problems import acknowledge
 from tcpipe.pipeline.report import report
 from tcpipe.recipe import LabelConfig, Recipe, SplitConfig

@@ -183,7 +183,7 @@ def test_a_failure_that_was_acknowledged_is_tried_again_under_another_recipe_and
     assert told(other) == ("pending", f"failed with tcpipe {__version__}, acknowledged; to be tried again")
 
 
-def test_causes_that_differ_in_numbers_alone_are_one_line_and_else_told_as_they_are(first_night, tmp_path):
+def test_logs_with_findings_of_one_code_are_one_line_with_the_first_cause(first_night, tmp_path):
     logs = tmp_path / "logs"
     logs.mkdir()
     shutil.copytree(first_night / "store", tmp_path / "store")
@@ -199,7 +199,7 @@ def test_causes_that_differ_in_numbers_alone_are_one_line_and_else_told_as_they_
     shutil.copy2(first_night / "logs" / "junk.bag", logs / "b.bag")
     (logs / "c.bag").write_bytes(b"junk" * 10)
     (logs / "a.bag").unlink()
-    assert told() == (2, "not a log: it is # bytes that begin with b'junkjunk'")
+    assert told() == (2, "2 reasons, the first: not a log: it is 400 bytes that begin with b'junkjunk'")
 
 
 def test_a_run_whose_log_s_document_is_gone_is_named_and_asked_for_again(first_night, tmp_path):

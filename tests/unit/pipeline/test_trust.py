@@ -11,7 +11,7 @@ import pyarrow.parquet as pq
 import pytest
 from map_worlds import World
 from stored_files import manifest, run_document, table
-from synthetic_store import WORLD, add_run, box, lanes, put_map, region_file, segments, small_store
+from synthetic_store import WORLD, add_run, box, commit_run, lanes, put_map, region_file, segments, small_store
 
 from tcpipe.dataset import open_dataset
 from tcpipe.errors import DatasetError, UsageError
@@ -26,7 +26,7 @@ from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.diff import diff
 from tcpipe.pipeline.explain import explain
 from tcpipe.pipeline.inspect import inspect
-from tcpipe.pipeline.log_writer import commit_run, open_log
+from tcpipe.pipeline.log_writer import open_log
 from tcpipe.pipeline.report import report
 from tcpipe.pipeline.verify import verify
 from tcpipe.recipe import Recipe, SampleConfig

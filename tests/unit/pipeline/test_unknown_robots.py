@@ -2,13 +2,12 @@
 
 import numpy as np
 import pytest
-from synthetic_store import add_run, add_world, lanes, segments
+from synthetic_store import add_run, add_world, commit_run, lanes, segments
 
 from tcpipe.dataset import open_dataset
 from tcpipe.errors import DatasetError
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.dataset.runs import alike
-from tcpipe.pipeline.log_writer import commit_run
 from tcpipe.store import open_store
 from tcpipe.tables.levels import Sensor
 

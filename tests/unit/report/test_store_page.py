@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from page_reading import data_of
-from synthetic_store import add_run, add_world, lanes, segments
+from synthetic_store import add_run, add_world, lanes, segments, supersede
 
 from tcpipe.errors import StoreError, UsageError
 from tcpipe.formats.bucket import open_place
@@ -13,7 +13,7 @@ from tcpipe.formats.commits import Call, Entries, Failure
 from tcpipe.motion.remedies import losses_of
 from tcpipe.pipeline import calls
 from tcpipe.pipeline.dataset.build import build_dataset
-from tcpipe.pipeline.log_writer import open_log, supersede
+from tcpipe.pipeline.log_writer import open_log
 from tcpipe.pipeline.problems import acknowledge
 from tcpipe.pipeline.report import report
 from tcpipe.pipeline.store_verdict import find_changes, find_shift

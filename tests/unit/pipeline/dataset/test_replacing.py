@@ -9,14 +9,13 @@ import pytest
 from click.testing import CliRunner
 from object_gateway import in_environment
 from storage_server import object_store
-from synthetic_store import add_run, add_world, box, lanes, region_file, segments
+from synthetic_store import add_run, add_world, box, commit_run, lanes, region_file, segments
 
 from tcpipe.cli import cli
 from tcpipe.errors import DatasetError, StoreError, UsageError
 from tcpipe.formats.dataset_files import read_card
 from tcpipe.pipeline.dataset import build as building
 from tcpipe.pipeline.dataset.build import build_dataset
-from tcpipe.pipeline.log_writer import commit_run
 from tcpipe.recipe import DatasetConfig, Recipe, SampleConfig
 from tcpipe.store import open_store
 
