@@ -93,19 +93,13 @@ class StoreDocument:
 
 @dataclass(frozen=True, slots=True)
 class Counts:
-    """How many segments, rows and refused measurements a run has, and messages of each role."""
+    """How many segments, rows and refused measurements a run has, and messages."""
 
     segments: int
     track_rows: int | None = field(default=None, metadata=LEFT_OUT)
     rejections: int | None = field(default=None, metadata=LEFT_OUT)
-    gnss_messages: int | None = field(default=None, metadata=LEFT_OUT)
-    gnss_velocity_messages: int | None = field(default=None, metadata=LEFT_OUT)
-    imu_messages: int | None = field(default=None, metadata=LEFT_OUT)
-    wheel_odometry_messages: int | None = field(default=None, metadata=LEFT_OUT)
-    visual_odometry_messages: int | None = field(default=None, metadata=LEFT_OUT)
-    power_messages: int | None = field(default=None, metadata=LEFT_OUT)
-    command_messages: int | None = field(default=None, metadata=LEFT_OUT)
-    pose_messages: int | None = field(default=None, metadata=LEFT_OUT)
+    messages: Mapping[str, int] = field(default_factory=dict)
+    """By role."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

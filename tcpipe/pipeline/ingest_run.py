@@ -195,7 +195,7 @@ def manifest_of(
     subject = Subject("run", info.run_id)
     found = (*find_damage(known.damage, subject), *_find_few_segments(count, subject))
     info = add_findings(info, found, info.report.facts)
-    rows = {f"{role}_messages": table.num_rows for role, table in streams.tables.items()}
+    messages = {role: table.num_rows for role, table in streams.tables.items()}
     return Manifest(
         run_id=info.run_id,
         recipe_id=recipe_id(task.recipe, streams.robot),
@@ -205,7 +205,7 @@ def manifest_of(
         recipe=task.recipe.ingest,
         robot=streams.robot,
         tags=known.tags,
-        counts=Counts(count, track.table.num_rows, track.rejections.num_rows, **rows),
+        counts=Counts(count, track.table.num_rows, track.rejections.num_rows, messages),
         ledger_m=labelled.ledger_m,
         verdict=judge(info.report.findings),
         damage=known.damage,

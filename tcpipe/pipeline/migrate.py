@@ -200,14 +200,22 @@ def _bring_document(found: Document, where: str) -> Document:
         report = _with_findings({**found["info"]["findings"], "warnings": found["warnings"]}, "run", found["run_id"])
         findings = report["findings"]
         document |= {"info": {**_without(found["info"], "findings"), "report": report}}
+        document |= {"counts": _bring_counts(found["counts"])}
     else:
         own = chain(found.get("problems", ()), found.get("warnings", ()))
         findings = _earlier(own, "dataset", str(found.get("name", "")))
         document |= {"findings": findings, "runs": [_with_findings(run, "run", run["run_id"]) for run in found["runs"]]}
         document |= {"maps": [_with_findings(of, "map", of["name"]) for of in found["maps"]]}
         rules = {of.name for of in fields(SplitConfig)} - {"buffer_m"}  # the recipe has them
-        document |= {"split": _without(found.get("split", {}), *rules)}
+        document |= {"split": _without(found["split"], *rules)}
     return {**document, "verdict": plain(judge(typed(findings, tuple[Finding, ...], where)))}
+
+
+def _bring_counts(counts: Mapping[str, int]) -> dict[str, Any]:
+    """Return the counts of a manifest with those of messages by role."""
+    ending = "_messages"
+    messages = {name.removesuffix(ending): of for name, of in counts.items() if name.endswith(ending)}
+    return {**_without(counts, *(f"{role}{ending}" for role in messages)), "messages": messages}
 
 
 def _without(document: Document, *names: str) -> dict[str, Any]:

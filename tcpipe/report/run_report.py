@@ -184,7 +184,7 @@ def _told_series(store: Store, run: RunDirectory, timeline: Timeline) -> tuple[l
         tables = {role: read_table(path) for role, path in files.items()}
     except (StoreError, TableError) as error:
         return [], [f"What sensors told cannot be drawn: {error.problems[0]}."]
-    if not tables and run.manifest.counts.gnss_messages:
+    if not tables and run.manifest.counts.messages.get("gnss"):
         return [], ["What sensors told is gone or was read anew: of it the track's columns are drawn."]
     series = list(rail_series(tables.pop("power"), timeline)) if "power" in tables else []
     if "gnss_velocity" in tables:

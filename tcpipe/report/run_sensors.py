@@ -31,7 +31,7 @@ def _topics(known: RunJson, counts: Counts) -> Section:
             _name(role),
             sensor.topic,
             sensor.type_name,
-            getattr(counts, f"{role}_messages") or 0,
+            counts.messages.get(role, 0),
             sensor.time_source,
             sensor.placed_by,
             sensor.why,

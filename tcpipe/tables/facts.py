@@ -114,8 +114,6 @@ class StretchFacts:
     reopened: Mapping[str, int] | None = field(default=None, metadata=LEFT_OUT)
     events: int | None = field(default=None, metadata=LEFT_OUT)
     standing_updates: int | None = field(default=None, metadata=LEFT_OUT)
-    gnss_variance_factor: float | None = field(default=None, metadata=LEFT_OUT)
-    """Until tcpipe 0.3: by how much the fixes' variance was raised, over the whole run."""
     gnss_lasting_error_m: float | None = field(default=None, metadata=LEFT_OUT)
     reopenings: tuple[Reopening, ...] = field(default=(), metadata=LEFT_OUT)
     gyro_bias_radps: Vector | None = None

@@ -184,7 +184,7 @@ WARNED = ("imu: 0.1 s late", "gnss: no placement")
 def test_sentences_of_manifests_and_cards_become_findings():
     manifest = {
         "data_model_version": "2.1", "run_id": "a", "warnings": list(WARNED),
-        "info": {"findings": {"warnings": [], "facts": {"n": 1}}, "datum": None},
+        "info": {"findings": {"warnings": [], "facts": {"n": 1}}, "datum": None}, "counts": {"segments": 3, "gnss_messages": 9},
     }  # fmt: skip
     brought = migrating._bring_document(manifest, "manifest-1.json")
     assert (brought["data_model_version"], brought["info"]["report"]["facts"]) == (DATA_MODEL_VERSION, {"n": 1})
@@ -192,13 +192,16 @@ def test_sentences_of_manifests_and_cards_become_findings():
         (of["code"], of["subject"]["name"], of["names"]["text"]) for of in brought["info"]["report"]["findings"]
     ] == [("earlier-warning", "a", line) for line in WARNED]
     assert brought["verdict"]["position"] == "usable", "a note changes no verdict"
+    assert brought["counts"] == {"segments": 3, "messages": {"gnss": 9}}
     assert migrating._bring_document(brought, "manifest-1.json") is brought
     card = {
         "data_model_version": "2.1", "name": "d", "problems": [WARNED[0]], "warnings": [WARNED[1]], "findings": [{"example": "x"}],
         "runs": [{"run_id": "a", "warnings": list(WARNED)}], "maps": [{"name": "m", "warnings": []}],
+        "split": {"holdout": "block", "buffer_m": 1.4, "audit": []},
     }  # fmt: skip
     brought = migrating._bring_document(card, "dataset.json")
     assert [of["names"]["text"] for of in brought["findings"]] == list(WARNED)
+    assert brought["split"] == {"buffer_m": 1.4, "audit": []}, "the recipe has the rules"
     assert ([len(of["findings"]) for of in brought["runs"]], brought["maps"]) == ([2], [{"name": "m", "findings": []}])
     with pytest.raises(StoreError, match=r"of data model 4\.0, this version knows 2\.0, 2\.1, 3\.0; left as it is"):
         migrating._bring_document({"data_model_version": "4.0"}, "dataset.json")
