@@ -20,11 +20,6 @@ def test_the_whole_rotated_footprint_must_be_inside():
     assert side(0, 5) is Side.BUFFER
 
 
-def test_a_footprint_that_only_touches_the_border_has_not_crossed_it():
-    assert side(0.5, 5) is Side.INSIDE
-    assert side(-0.5, 5) is Side.UNSEEN
-
-
 @pytest.mark.parametrize(("gap_m", "inside"), [(1.4141, False), (1.4143, True)])
 def test_nearer_than_the_buffer_is_no_split_on_either_side(gap_m, inside):
     buffer_m = np.sqrt(2.0)
