@@ -1,23 +1,8 @@
 """Signals between samples, by hand."""
 
 import numpy as np
-import pytest
 
-from tcpipe.fusion.signals import hold_last, in_gap, integral, interval_means, median_period_ns, seconds
-
-T = np.array([0.0, 1.0, 3.0])
-V = np.array([[0.0], [2.0], [0.0]])
-
-
-def test_integral_of_a_piecewise_linear_signal_held_outside():
-    # A triangle: area 1 up to 1, 2 more up to 3; at 2 the value is 1, so 1 + 1.5; before and after, the ends are held (at 0).
-    found = integral(T, V + 1.0, np.array([-1.0, 0.0, 0.5, 1.0, 2.0, 3.0, 5.0]))[:, 0]
-    assert found == pytest.approx([-1.0, 0.0, 0.75, 2.0, 4.5, 6.0, 8.0])
-
-
-def test_means_over_intervals_and_values_where_they_are_empty():
-    found = interval_means(T, V, np.array([0.0, 0.5, 2.0]), np.array([1.0, 2.0, 2.0]))[:, 0]
-    assert found == pytest.approx([1.0, (0.75 + 1.5) / 1.5, 1.0])
+from tcpipe.fusion.signals import hold_last, in_gap
 
 
 def test_intervals_that_touch_a_gap():
@@ -34,10 +19,3 @@ def test_last_value_is_held_and_unknown_before_the_first():
     assert np.isnan(found[0])
     assert found[1:].tolist() == [1.0, 1.0, 2.0, 2.0]
     assert np.isnan(hold_last(np.empty(0, np.int64), np.empty(0), np.array([5], np.int64))).all()
-
-
-def test_seconds_keep_nanoseconds_of_large_stamps():
-    zero = 1_700_000_000_000_000_000
-    assert seconds(np.array([zero + 1], np.int64), zero)[0] == 1e-9
-    assert median_period_ns(np.array([zero, zero + 10, zero + 20, zero + 90], np.int64)) == 10
-    assert median_period_ns(np.array([zero], np.int64)) == 1

@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from rough_drive import ANTENNA_M, drive, measured, true_track
-from scipy.stats import chi2
 
 from tcpipe.fusion.checks import audit
 from tcpipe.fusion.checks.audit import Tally, alone_in_most, audited, goes_astray, undecided_in_most
@@ -158,11 +157,6 @@ def test_most_is_of_the_windows_of_all_stretches_together():
     assert undecided_in_most(parts) == ()
     assert undecided_in_most([Tally("gnss", "position", 9, 9, 0)]) == ()
     assert undecided_in_most([Tally("gnss", "displacement", 3, 3, 0)]) == ()
-
-
-def test_the_bound_is_that_of_chi_square_over_all_windows():
-    told = audit.Comparison("gnss", "position", np.zeros((40, 2)), np.ones(40), np.ones(40))
-    assert told._bound**2 == pytest.approx(chi2.isf(0.01 / 40, 2), rel=1e-9)
 
 
 def test_a_sensor_in_a_gap_says_nothing_there(track, sensors):

@@ -13,7 +13,6 @@ from tcpipe.fusion.checks.mounting import (
     antenna_doubt,
     arm_evidence,
     lag_of,
-    levelled,
     rearmed,
     solve_arm,
     solve_tilt,
@@ -149,12 +148,6 @@ def test_a_tilted_imu_is_found(track, sensors, roll_deg, pitch_deg):
     assert np.degrees(tilt.rad) == pytest.approx([roll_deg, pitch_deg], abs=1.0)
     assert (np.abs(np.degrees(tilt.rad) - [roll_deg, pitch_deg]) < 4 * np.degrees(tilt.std_rad)).all()
     assert np.degrees(tilt.std_rad).max() < 1.0
-
-
-def test_levelling_undoes_a_tilt(sensors):
-    there_and_back = levelled(tilted(sensors.imu, 4.0, -3.0), np.radians([4.0, -3.0]))
-    for name in ("angular_velocity_radps", "specific_force_mps2"):
-        assert getattr(there_and_back, name) == pytest.approx(getattr(sensors.imu, name), abs=1e-9)
 
 
 def test_without_fixes_or_force_nothing_tells_a_tilt(track, sensors):

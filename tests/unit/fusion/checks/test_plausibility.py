@@ -71,8 +71,3 @@ def test_agreement_counts_only_what_moves():
     assert agreement(SPEED, -SPEED) == -1.0
     assert agreement(SPEED, 0.8 * SPEED) == 1.0
     assert agreement(SPEED, np.zeros_like(SPEED)) is None
-
-
-def test_up_is_told_by_what_force_there_is():
-    assert up_axis(np.zeros((3, 3))) == pytest.approx([0.0, 0.0, 1.0])
-    assert up_axis(np.array([[0.0, 0.0, 0.0], [0.0, 9.8, 0.0]])) == pytest.approx([0.0, 1.0, 0.0])
