@@ -13,7 +13,7 @@ from tcpipe.errors import DatasetError, UsageError
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.recipe import Recipe
 from tcpipe.terrain.classes import ClassTable, TerrainClass
-from tcpipe.terrain.layers import LAYERS, PAPER_LAYERS, paper_layers
+from tcpipe.terrain.layers import LAYERS, paper_layers
 
 
 @pytest.fixture(scope="module")
@@ -105,19 +105,6 @@ def test_a_split_travels_to_a_worker_without_its_pixels(path):
     blob = pickle.dumps(train)
     assert len(blob) < whole.nbytes / 20
     np.testing.assert_array_equal(pickle.loads(blob)[3][0], whole[3])  # noqa: S301
-
-
-def test_torch_loads_shuffled_batches(path):
-    data = pytest.importorskip("torch.utils.data")
-    torch = pytest.importorskip("torch")
-    train = open_dataset(path)["train"]
-    loader = data.DataLoader(train, batch_size=64, shuffle=True, generator=torch.Generator().manual_seed(0))
-    batches = list(loader)
-    assert batches[0][0].shape == (64, 40, 40, 3)
-    assert batches[0][0].dtype == torch.float32
-    assert batches[0][1].shape == (64, 2)
-    seen = torch.cat([labels for _, labels in batches]).numpy()
-    np.testing.assert_array_equal(np.sort(seen[:, 0]), np.sort(train.labels[:, 0]))
 
 
 def test_opening_imports_no_trainer(path):
@@ -253,22 +240,6 @@ def test_every_stored_value_becomes_what_the_layers_say(count):
     np.testing.assert_array_equal(apart, wanted[..., [2, 0, 1]])
 
 
-def test_pixels_without_data_are_0_in_every_channel():
-    stored = {
-        "ortho": np.array([0, 255], np.uint8),
-        "terrain": np.array([0, 7], np.uint8),
-        "height": np.array([65535, 400], np.uint16),
-    }
-    pixels = {layer: np.full((1, 2, 2), values[0], values.dtype) for layer, values in stored.items()}
-    for layer, values in stored.items():
-        pixels[layer][0, 1] = values[1]
-    for channels in (LAYERS, ("ortho", "height", "terrain")):
-        found = tensor_form(channels, PAPER_LAYERS).form(pixels, np.array([0]))
-        assert not found[0, 0].any()
-        order = [LAYERS.index(channel) for channel in channels]
-        np.testing.assert_array_equal(found[0, 1, 0], np.array([1, 1, 0.2], np.float32)[order])
-
-
 def test_a_mirrored_patch_is_reversed_across_and_its_cross_slope_changes_sign(path):
     train = numbered(open_dataset(path)["train"])
     mirrored = 0
@@ -336,10 +307,3 @@ def test_torch_iterates_over_every_sample_once(path, workers, from_disk):
     for seen in epochs:
         np.testing.assert_array_equal(seen[np.lexsort(seen.T)], train.labels[np.lexsort(train.labels.T)])
     assert not np.array_equal(*epochs)
-
-
-def test_parts_share_nothing_and_leave_nothing_out(path):
-    batches = open_dataset(path)["train"].batches(32, from_disk=True)
-    parts = [[float(power) for _, labels in batches.part(number, 3) for power in labels[:, 0]] for number in range(3)]
-    whole = [float(power) for _, labels in batches for power in labels[:, 0]]
-    assert sorted(itertools.chain(*parts)) == sorted(whole)

@@ -115,16 +115,6 @@ def test_how_near_training_it_is_and_what_blocks_say(evaluated, model, dataset):
     assert "held-out blocks of train" in page
 
 
-def test_it_says_of_how_many_labels_a_percentage_is_and_how_well_it_knows_itself(evaluated):
-    place, values = evaluated
-    energy = values.splits["unseen"].errors["E"]["all"]
-    page = (place / "evaluation.html").read_text()
-    assert f"{energy.mape_percent:.2f} ({energy.mape_count})" in page
-    assert f"{energy.crps:.2f}" in page
-    for told in ("E, held by 90 % [%]", "E, NLL [nat]", "E, CRPS [J]"):
-        assert told in page
-
-
 def test_every_prediction_is_kept_and_stands_in_the_page(evaluated, dataset):
     place, values = evaluated
     table, data = read_table(place / "predictions.parquet"), open_dataset(dataset)
