@@ -1,6 +1,7 @@
 """A drive over a known bumpy surface, and what its sensors would measure: truth for tests of the forward filter."""
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 
@@ -49,6 +50,7 @@ def _frame(heading, dx, dy):
     return np.stack((ahead, np.cross(up, ahead), up), -1)
 
 
+@cache
 def drive(seconds=120.0, seed=0):
     """Speeds up, weaves at about 1 m/s, slows down twice a minute."""
     rng = np.random.default_rng(seed)

@@ -1,6 +1,7 @@
 """A drive over analytic hills with its truth, and measurements of it with every fault on request: independent of tcpipe.simulation."""
 
 from dataclasses import dataclass, field
+from functools import cache
 
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
@@ -50,6 +51,7 @@ class Drive:
         return np.stack([np.interp(t, self.t, values[:, k]) for k in range(values.shape[1])], -1)
 
 
+@cache
 def make_drive(seconds=180.0, *, start_yaw=0.7, stand_s=4.0, reverse_s=0.0, turns=1.0):
     t = np.arange(0, seconds, DT)
     n = t.size
@@ -71,11 +73,10 @@ def make_drive(seconds=180.0, *, start_yaw=0.7, stand_s=4.0, reverse_s=0.0, turn
     xy = np.zeros((n, 2))
     for k in range(n - 1):  # midpoint rule
         middle = 0.5 * (yaw[k] + yaw[k + 1]), 0.5 * (speed[k] + speed[k + 1])
-        for _ in range(1):
-            zx, zy = _slope(*xy[k])
-            climb = zx * np.cos(middle[0]) + zy * np.sin(middle[0])
-            step = middle[1] * DT / np.sqrt(1 + climb**2)
-            xy[k + 1] = xy[k] + step * np.array([np.cos(middle[0]), np.sin(middle[0])])
+        zx, zy = _slope(*xy[k])
+        climb = zx * np.cos(middle[0]) + zy * np.sin(middle[0])
+        step = middle[1] * DT / np.sqrt(1 + climb**2)
+        xy[k + 1] = xy[k] + step * np.array([np.cos(middle[0]), np.sin(middle[0])])
     position = np.column_stack((xy, height(*xy.T)))
     rotation = _attitude(*xy.T, yaw)
     velocity = np.gradient(position, DT, axis=0, edge_order=2)
@@ -100,7 +101,6 @@ def measure(
     gnss_hz=10.0,
     gnss_outliers=0.02,
     gnss_outages=(),
-    gnss_jump=None,
     slip=0.12,
     visual_scale=1.02,
     imu_hz=200.0,
@@ -126,8 +126,6 @@ def measure(
         antenna = drive.at(drive.position, t) + drive.slerp(t).apply(LEVER) + rng.normal(size=(t.size, 3)) * std
         wild = rng.random(t.size) < gnss_outliers
         antenna[wild] += rng.normal(size=(wild.sum(), 3)) * 1.5
-        if gnss_jump is not None:
-            antenna[(t > gnss_jump[0]) & (t < gnss_jump[1])] += gnss_jump[2]
         found["gnss"] = Positions(ns(t), antenna, np.tile(std**2, (t.size, 1)), LEVER)
     rate = drive.rate
     if wheels:
@@ -173,7 +171,6 @@ def errors(drive, trajectory, *, after_s=0.0):
     estimated = Rotation.from_quat(trajectory.quat_xyzw[chosen])
     true = drive.slerp(t)
     yaw = (true.inv() * estimated).as_rotvec()[:, 2]
-    tilt = (true.inv() * estimated).as_rotvec()[:, :2]
     forward = np.einsum("ni,ni->n", estimated.as_matrix()[:, :, 0], trajectory.velocity_enu_mps[chosen])
     forward -= np.interp(t, drive.t, drive.forward)
     rate = trajectory.angular_velocity_radps[chosen] - drive.at(drive.rate, t)
@@ -181,7 +178,6 @@ def errors(drive, trajectory, *, after_s=0.0):
         "xy": np.sqrt(np.mean(np.sum(position[:, :2] ** 2, 1))),
         "z": np.sqrt(np.mean(position[:, 2] ** 2)),
         "yaw_deg": np.degrees(np.sqrt(np.mean(yaw**2))),
-        "tilt_deg": np.degrees(np.sqrt(np.mean(tilt**2))),
         "forward": np.sqrt(np.mean(forward**2)),
         "yaw_rate": np.sqrt(np.mean(rate[:, 2] ** 2)),
         "nees_position": np.mean(position**2 / trajectory.position_std_m[chosen] ** 2),

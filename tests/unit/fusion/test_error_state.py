@@ -22,7 +22,6 @@ from tcpipe.geometry.rotation import matrix_from_quat
 PERIOD_NS = 50_000_000
 
 
-@cache
 def truth():
     return drive.make_drive(150.0)
 

@@ -4,29 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from rough_drive import ANTENNA_M, drive, measured, true_track
+from rough_drive import ANTENNA_M
 
 from tcpipe.fusion.checks import audit
 from tcpipe.fusion.checks.audit import Tally, alone_in_most, audited, goes_astray, undecided_in_most
 from tcpipe.fusion.measurements import GroundVelocities
 from tcpipe.fusion.trajectory import Rejections, Trajectory
-
-SECONDS = 120.0
-
-
-@pytest.fixture(scope="module")
-def truth():
-    return drive(SECONDS, 3)
-
-
-@pytest.fixture(scope="module")
-def sensors(truth):
-    return measured(truth, 3)
-
-
-@pytest.fixture(scope="module")
-def track(truth):
-    return true_track(truth)
 
 
 def seconds(track, stamp_ns):
