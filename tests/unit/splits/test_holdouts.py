@@ -67,34 +67,9 @@ def test_blocks_that_are_far_apart_are_told_apart():
     assert [found.names[member] for member in found.member] == [f"10:{column}:{row}" for column, row in cells]
 
 
-def test_groups_stay_whole_and_come_near_to_the_share():
-    groups = grouped([1 + i % 14 for i in range(150)])
-    test = drawn(groups)
-    assert not set(groups.member[test]) & set(groups.member[~test])
-    assert abs(test.mean() - 0.2) <= 0.5 / len(test) + 1e-12  # single-sample groups allow the nearest count
-
-
 def test_a_group_that_would_overshoot_is_passed_over():
     for seed in range(20):
         assert drawn(grouped([60, 20, 20]), seed=seed).sum() == 20
-
-
-def test_what_came_later_takes_nothing_out_of_test():
-    rng = np.random.default_rng(0)
-    for _ in range(20):
-        member = rng.integers(0, 40, 600)
-        arrival = np.sort(rng.integers(0, 6, 600))
-        names = tuple(f"g{i}" for i in range(40))
-        before = np.zeros(40, bool)
-        for runs in range(1, 7):
-            here = arrival < runs
-            used, number = np.unique(member[here], return_inverse=True)
-            groups = Groups(number, tuple(names[i] for i in used))
-            test = np.zeros(40, bool)
-            test[used] = draw_groups(groups, arrival[here], test_fraction=0.2, seed=1)
-            assert not (before & ~test).any()
-            before = test
-        assert 0.15 < test[member].mean() < 0.3
 
 
 def test_kept_groups_stay_as_they_are():

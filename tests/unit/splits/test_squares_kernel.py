@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-import shapely
 from splits_squares import squares
 
 from tcpipe.splits.neighbours import near_pairs, nearest_m, shared_fraction
@@ -14,14 +13,6 @@ def both(a, b):
     pair_distances(a, b, one, zero, distance)
     pair_overlaps(a, b, one, zero, area)
     return float(distance[0]), float(area[0])
-
-
-def test_random_pairs_are_those_of_shapely():
-    rng = np.random.default_rng(4)
-    for _ in range(60):
-        a, b = (squares(rng.uniform(0, 2.5, (1, 2)), rng.uniform(-np.pi, np.pi, 1)) for _ in range(2))
-        p, q = shapely.polygons(a[0]), shapely.polygons(b[0])
-        assert both(a, b) == pytest.approx((p.distance(q), p.intersection(q).area), abs=1e-12)
 
 
 @pytest.mark.parametrize(
