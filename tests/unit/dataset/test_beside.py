@@ -14,6 +14,7 @@ from tcpipe.dataset.beside import (
     nothing_beside,
     numbers_of,
     numbers_of_columns,
+    with_planes,
 )
 
 TURN = BesideInput("turn_radpm", 0.1, 0.05, 0.1, (0.0, 0.3))
@@ -54,3 +55,11 @@ def test_numbers_are_deviations_and_what_is_not_known_is_usual():
     columns = np.array([[0.2, 1.0, 1.0, np.nan], [np.nan, 1.0, 1.0, 0.6]])
     assert numbers_of_columns([TURN, SPEED], columns) == pytest.approx(numbers_of([TURN, SPEED], beside))
     assert numbers_of([], beside).shape == (2, 0)
+
+
+def test_each_number_is_a_channel_of_one_value():
+    patches = np.zeros((2, 3, 3, 1), np.float32)
+    found = with_planes(patches, np.array([[2.0, 0.5], [0.0, -1.0]]))
+    assert found.shape == (2, 3, 3, 3)
+    assert found[0, :, :, 1:].reshape(-1, 2) == pytest.approx(np.tile([2.0, 0.5], (9, 1)))
+    assert with_planes(patches, np.empty((2, 0))) is patches

@@ -70,6 +70,19 @@ def test_where_before_and_after_explain_a_jump_as_well_both_are_doubted_for_a_mi
     np.testing.assert_allclose(doubt_m2[:, 2], 0.0)
 
 
+def test_after_a_single_jump_the_shorter_span_is_no_better_for_being_short():
+    """Before it costs a second's price for two minutes, and explains somewhat more: the minutes beside the jump are doubted."""
+
+    def tried(spans):
+        length_s = sum((b - a) / S for a, b in spans)
+        cost = 600.0 if not spans else (80.0 if length_s > 60.0 else 100.0) + 2.0 * length_s
+        return Explained(spans, cost, () if spans else ((120 * S, 126 * S),), 0.5)
+
+    found = find_wrong_fixes(tried, WHOLE, ())
+    assert found.spans == ((117 * S, 126 * S),)
+    assert found.doubtful == ((60 * S, 180 * S),)
+
+
 def test_where_each_jump_alone_explains_about_as_much_all_between_them_is_doubted():
     """A filter that nothing holds follows the fixes after each jump: two short spans, against the one that is true."""
 

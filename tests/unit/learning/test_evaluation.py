@@ -204,14 +204,6 @@ def test_a_class_that_the_model_never_saw_is_said(evaluated):
     assert any("trained on another dataset" in line for line in values.warnings)
 
 
-def test_the_same_again_predicts_nothing(evaluated, model, dataset, monkeypatch):
-    place, values = evaluated
-    before = {path: path.read_bytes() for path in place.iterdir()}
-    monkeypatch.setattr("tcpipe.learning.evaluation_files.evaluate", None)
-    assert run_evaluation(model, dataset, place, config=CONFIG).values == values
-    assert {path: path.read_bytes() for path in place.iterdir()} == before
-
-
 def test_a_model_that_does_not_fit_is_told_every_reason(dataset, tmp_path):
     grass = replace(PAPER_CLASSES.classes[3], name="lawn")
     classes = (*PAPER_CLASSES.classes[:3], grass, *PAPER_CLASSES.classes[4:])
@@ -225,15 +217,6 @@ def test_a_model_that_does_not_fit_is_told_every_reason(dataset, tmp_path):
         "label.velocity is 'fused'",
     ):
         assert reason in told
-
-
-def test_a_network_of_energy_alone_is_no_model_to_evaluate(dataset, tmp_path):
-    architecture = replace(CARD.architecture, outputs=1, depth=1)
-    place = made_model(
-        tmp_path / "energy", architecture=architecture, channels=("height",), outputs=("energy_joule",), scale=(400.0,)
-    )
-    with pytest.raises(ModelError, match="it predicts energy_joule alone, wanted power_watt and velocity_mps"):
-        run_evaluation(place, dataset, tmp_path / "evaluation", config=CONFIG)
 
 
 def test_a_card_that_does_not_say_how_it_was_trained(dataset, tmp_path):

@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from tcpipe.fusion.checks.lags import GRID_S, averaged
-from tcpipe.fusion.checks.plausibility import agreement, forward_yaw_rad, levelling, nearest_mounting, up_axis, yaw_axis
+from tcpipe.fusion.checks.plausibility import forward_yaw_rad, levelling, nearest_mounting, up_axis, yaw_axis
 
 GRAVITY_MPS2 = 9.80665
 T = np.arange(0.0, 120.0, GRID_S)
@@ -39,12 +39,6 @@ def test_a_mounting_is_found_from_gravity_and_acceleration(rpy_deg):
     np.testing.assert_allclose(axis.axis, mounting.inv().apply([0.0, 0.0, 1.0]), atol=0.03)
 
 
-def test_degrees_show_as_a_scale():
-    rate, _ = felt(Rotation.identity())
-    axis = yaw_axis(averaged(YAW_RATE[:, None], 0.1)[:, 0], averaged(np.degrees(rate), 0.1))
-    assert axis.scale == pytest.approx(np.radians(1.0), rel=0.03)
-
-
 def test_noise_shows_no_mounting():
     noise = np.random.default_rng(1).normal(0.0, 1.0, (T.size, 3))
     assert forward_yaw_rad(np.column_stack((SPEED, YAW_RATE)), noise, 0.0) is None
@@ -58,16 +52,3 @@ def test_a_mounting_near_the_axes_is_taken_as_along_them():
     )
     tilted = Rotation.from_euler("y", 30.0, degrees=True).as_matrix()
     np.testing.assert_array_equal(nearest_mounting(tilted), tilted)
-
-
-@pytest.mark.parametrize("up", [(0.0, 0.0, 1.0), (0.0, 0.0, -1.0), (1.0, 0.0, 0.0), (0.0, -0.6, 0.8)])
-def test_levelling_turns_up_to_z(up):
-    level = levelling(np.array(up))
-    np.testing.assert_allclose(level @ up, [0.0, 0.0, 1.0], atol=1e-12)
-    assert np.linalg.det(level) == pytest.approx(1.0)
-
-
-def test_agreement_counts_only_what_moves():
-    assert agreement(SPEED, -SPEED) == -1.0
-    assert agreement(SPEED, 0.8 * SPEED) == 1.0
-    assert agreement(SPEED, np.zeros_like(SPEED)) is None
