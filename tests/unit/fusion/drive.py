@@ -1,5 +1,6 @@
 """A drive over analytic hills with its truth, and measurements of it with every fault on request: independent of tcpipe.simulation."""
 
+import math
 from dataclasses import dataclass, field
 from functools import cache
 
@@ -18,8 +19,8 @@ def height(x, y):
 
 
 def _slope(x, y):
-    e = 1e-4
-    return (height(x + e, y) - height(x - e, y)) / (2 * e), (height(x, y + e) - height(x, y - e)) / (2 * e)
+    small = 0.15 * np.cos(x / 2.1 + y / 3.3)
+    return 4.0 / 18.0 * np.cos(x / 18.0) + small / 2.1, -3.0 / 14.0 * np.sin(y / 14.0) + small / 3.3
 
 
 def _attitude(x, y, yaw):
@@ -71,12 +72,13 @@ def make_drive(seconds=180.0, *, start_yaw=0.7, stand_s=4.0, reverse_s=0.0, turn
     speed *= 1 - 0.15 * np.sin(t / 11.0) ** 2
     yaw = start_yaw + np.concatenate(([0], np.cumsum(0.5 * (yaw_rate[1:] + yaw_rate[:-1]) * DT)))
     xy = np.zeros((n, 2))
-    for k in range(n - 1):  # midpoint rule
-        middle = 0.5 * (yaw[k] + yaw[k + 1]), 0.5 * (speed[k] + speed[k + 1])
-        zx, zy = _slope(*xy[k])
-        climb = zx * np.cos(middle[0]) + zy * np.sin(middle[0])
-        step = middle[1] * DT / np.sqrt(1 + climb**2)
-        xy[k + 1] = xy[k] + step * np.array([np.cos(middle[0]), np.sin(middle[0])])
+    middle = 0.5 * (yaw[:-1] + yaw[1:])  # midpoint rule
+    way_m = (0.5 * (speed[:-1] + speed[1:]) * DT).tolist()
+    x = y = 0.0
+    for k, (east, north) in enumerate(np.column_stack((np.cos(middle), np.sin(middle))).tolist()):
+        zx, zy = _slope(x, y)
+        step = way_m[k] / math.hypot(1.0, zx * east + zy * north)
+        x, y = xy[k + 1] = x + step * east, y + step * north
     position = np.column_stack((xy, height(*xy.T)))
     rotation = _attitude(*xy.T, yaw)
     velocity = np.gradient(position, DT, axis=0, edge_order=2)

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tcpipe.simulation import Faults, scenario, simulated_drive, tiny, true_cost
+from tcpipe.simulation import Faults, scenario, true_cost
 from tcpipe.simulation.paper_site import paper_world
 from tcpipe.simulation.scenarios import SCENARIOS
 
@@ -63,9 +63,3 @@ def test_a_metre_costs_what_the_paper_found(long_truth):
     cost = true_cost(long_truth, long_truth.stamp_ns[steady][::200])
     assert np.nanmedian(cost.duration_s) == pytest.approx(1.2, abs=0.1)
     assert np.nanmean(cost.energy_joule) == pytest.approx(200, abs=30)
-
-
-def test_tiny_drives_last_about_as_long_as_asked():
-    for seconds in (20.0, 40.0, 60.0):
-        truth, _ = simulated_drive(tiny(seconds=seconds))
-        assert (truth.stamp_ns[-1] - truth.stamp_ns[0]) * 1e-9 == pytest.approx(seconds, abs=9.0)

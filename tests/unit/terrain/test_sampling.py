@@ -200,13 +200,6 @@ def test_windows_beyond_the_map_have_no_data_there():
     assert np.isnan(read_window(source, "height", 70, 75, 0, 5)).all()
 
 
-def test_no_frames_give_no_patches():
-    source = random_map()
-    got = sample(source, frames_at(source.grid, 0))
-    assert got.pixels["height"].shape == (0, 40, 40)
-    assert got.pixels["ortho"].shape == (0, 40, 40)
-
-
 def test_good_patches_move_together():
     source = random_map()
     frames = frames_at(source.grid, 700)
