@@ -43,3 +43,9 @@ def test_pieces_join_up_and_add_up_to_the_path(points):
             pieces.arc_m.sum() == pytest.approx(length, abs=2e-3)
             or np.linalg.norm(xy[-1] - pieces.end_xy_m[-1]) <= 1e-3
         )
+
+
+def test_points_that_repeat_change_nothing():
+    path = np.array([[0.0, 0.0], [0.7, 0.0], [0.7, 0.0], [2.5, 0.3]])
+    once, twice = (cut_path(points, chord_m=1.0, scale=1.0) for points in (path[[0, 1, 3]], path))
+    np.testing.assert_array_equal(once.end_xy_m, twice.end_xy_m)

@@ -52,3 +52,10 @@ def test_a_mounting_near_the_axes_is_taken_as_along_them():
     )
     tilted = Rotation.from_euler("y", 30.0, degrees=True).as_matrix()
     np.testing.assert_array_equal(nearest_mounting(tilted), tilted)
+
+
+@pytest.mark.parametrize("up", [(0.0, 0.0, 1.0), (0.0, 0.0, -1.0), (1.0, 0.0, 0.0), (0.0, -0.6, 0.8)])
+def test_levelling_turns_up_to_z(up):
+    level = levelling(np.array(up))
+    np.testing.assert_allclose(level @ up, [0.0, 0.0, 1.0], atol=1e-12)
+    assert np.linalg.det(level) == pytest.approx(1.0)
