@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from tcpipe.fusion.signals import hold_last, in_gap
+from tcpipe.fusion.signals import hold_last, in_gap, median_period_ns, seconds
 
 
 def test_intervals_that_touch_a_gap():
@@ -19,3 +19,10 @@ def test_last_value_is_held_and_unknown_before_the_first():
     assert np.isnan(found[0])
     assert found[1:].tolist() == [1.0, 1.0, 2.0, 2.0]
     assert np.isnan(hold_last(np.empty(0, np.int64), np.empty(0), np.array([5], np.int64))).all()
+
+
+def test_seconds_keep_nanoseconds_of_large_stamps():
+    zero = 1_700_000_000_000_000_000
+    assert seconds(np.array([zero + 1], np.int64), zero)[0] == 1e-9
+    assert median_period_ns(np.array([zero, zero + 10, zero + 20, zero + 90], np.int64)) == 10
+    assert median_period_ns(np.array([zero], np.int64)) == 1

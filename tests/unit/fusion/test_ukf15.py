@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from rough_drive import drive, initial, measured
 
-from tcpipe.fusion.measurements import GNSS, VISUAL, Measurements
+from tcpipe.fusion.measurements import GNSS, IMU, VISUAL, WHEELS, Measurements
 from tcpipe.fusion.ukf15 import run_ukf15, sources_of
 from tcpipe.fusion.ukf15_kernel import SELECT
 from tcpipe.geometry.angles import wrap_to_pi
@@ -136,3 +136,10 @@ def test_blocks_change_nothing(truth, monkeypatch):
     np.testing.assert_array_equal(whole.rejections.stamp_ns, blocks.rejections.stamp_ns)
     assert whole.facts == blocks.facts
     assert whole.facts.recovered[GNSS] >= 1
+
+
+def test_the_facts_count_what_was_fused(truth):
+    facts = _run(truth, measured(truth, 10)).facts
+    assert set(facts.measurements) == {GNSS, IMU, WHEELS, VISUAL}
+    assert 0.7 < facts.nis_mean[GNSS] < 1.2
+    assert facts.recovered == dict.fromkeys((GNSS, IMU, WHEELS, VISUAL), 0)

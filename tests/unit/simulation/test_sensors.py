@@ -252,3 +252,22 @@ def test_a_receivers_velocity_is_that_of_its_antenna_within_what_it_claims(conta
         assert np.abs(drift_m).max() < 4 * np.sqrt(variance[0] * 3.0 * at_s[-1])
         assert np.ptp(place[:, axis]) > 1.0
     assert np.isfinite(floats(velocity, "up_velocity_mps")).all()
+
+
+def test_rates_are_as_given(truth):
+    said = readings(truth)
+    rates = {name: 1e9 / np.median(np.diff(reading.stamp_ns)) for name, reading in said.items()}
+    assert rates == pytest.approx(
+        {"gnss": 10, "imu": 100, "wheels": 50, "visual": 30, "power": 20, "command": 20}, rel=1e-6
+    )
+
+
+def test_camera_pose_repeats_the_true_increments(truth):
+    visual = readings(truth)["visual"]
+    at = truth.at(visual.stamp_ns)
+    camera = Rotation.from_quat(at.quat_xyzw) * Rotation.from_euler("xyz", Visual().mounting.rpy_rad)
+    place = at.enu_m + Rotation.from_quat(at.quat_xyzw).apply(np.array(Visual().mounting.xyz_m))
+    relative = camera[0].inv().apply(place - place[0])
+    np.testing.assert_allclose(visual.values["position_m"], relative, atol=1e-6)
+    left = ((camera[0].inv() * camera).inv() * Rotation.from_quat(visual.values["orientation_xyzw"])).magnitude()
+    assert left.max() < 1e-6

@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from tcpipe.fusion.checks.lags import GRID_S, averaged
-from tcpipe.fusion.checks.plausibility import forward_yaw_rad, levelling, nearest_mounting, up_axis, yaw_axis
+from tcpipe.fusion.checks.plausibility import agreement, forward_yaw_rad, levelling, nearest_mounting, up_axis, yaw_axis
 
 GRAVITY_MPS2 = 9.80665
 T = np.arange(0.0, 120.0, GRID_S)
@@ -59,3 +59,14 @@ def test_levelling_turns_up_to_z(up):
     level = levelling(np.array(up))
     np.testing.assert_allclose(level @ up, [0.0, 0.0, 1.0], atol=1e-12)
     assert np.linalg.det(level) == pytest.approx(1.0)
+
+
+def test_agreement_counts_only_what_moves():
+    assert agreement(SPEED, -SPEED) == -1.0
+    assert agreement(SPEED, 0.8 * SPEED) == 1.0
+    assert agreement(SPEED, np.zeros_like(SPEED)) is None
+
+
+def test_up_is_told_by_what_force_there_is():
+    assert up_axis(np.zeros((3, 3))) == pytest.approx([0.0, 0.0, 1.0])
+    assert up_axis(np.array([[0.0, 0.0, 0.0], [0.0, 9.8, 0.0]])) == pytest.approx([0.0, 1.0, 0.0])
