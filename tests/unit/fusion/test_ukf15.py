@@ -143,3 +143,13 @@ def test_the_facts_count_what_was_fused(truth):
     assert set(facts.measurements) == {GNSS, IMU, WHEELS, VISUAL}
     assert 0.7 < facts.nis_mean[GNSS] < 1.2
     assert facts.recovered == dict.fromkeys((GNSS, IMU, WHEELS, VISUAL), 0)
+
+
+def test_both_engines_agree_on_a_drive():
+    truth = drive(seconds=4.0, seed=9)
+    measurements = measured(truth, 9)
+    ours, theirs = (_run(truth, measurements, engine=engine, end=500) for engine in ("compiled", "filterpy"))
+    np.testing.assert_allclose(ours.position_enu_m, theirs.position_enu_m, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(ours.quat_xyzw, theirs.quat_xyzw, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(ours.yaw_std_rad, theirs.yaw_std_rad, rtol=0, atol=1e-9)
+    assert ours.facts.nis_mean == pytest.approx(theirs.facts.nis_mean)

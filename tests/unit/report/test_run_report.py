@@ -158,3 +158,9 @@ def test_a_step_of_the_clock_has_its_place_and_its_size():
     (event,) = [drawn.data_source.data for drawn in shown.plots[0].figure.renderers if "text" in drawn.data_source.data]
     assert event["text"] == ("the clock steps by +1000.000 s",)
     assert event["right"][0] == pytest.approx((half - 1) * 0.05 + 1.0)
+
+
+def test_what_is_short_is_carried_whole():
+    shown = thinned("x", np.arange(5.0), {"y": (2, np.array([1.0, np.nan, 3.0, 2.0, 5.0]))})
+    assert shown.columns["y"][1] == pytest.approx([1.0, np.nan, 3.0, 2.0, 5.0], nan_ok=True)
+    assert shown.of == len(shown.t_s) == 5
