@@ -1,23 +1,8 @@
 """Signals between samples, by hand."""
 
 import numpy as np
-import pytest
 
-from tcpipe.fusion.signals import hold_last, in_gap, integral, interval_means, median_period_ns, seconds
-
-T = np.array([0.0, 1.0, 3.0])
-V = np.array([[0.0], [2.0], [0.0]])
-
-
-def test_integral_of_a_piecewise_linear_signal_held_outside():
-    # A triangle: area 1 up to 1, 2 more up to 3; at 2 the value is 1, so 1 + 1.5; before and after, the ends are held (at 0).
-    found = integral(T, V + 1.0, np.array([-1.0, 0.0, 0.5, 1.0, 2.0, 3.0, 5.0]))[:, 0]
-    assert found == pytest.approx([-1.0, 0.0, 0.75, 2.0, 4.5, 6.0, 8.0])
-
-
-def test_means_over_intervals_and_values_where_they_are_empty():
-    found = interval_means(T, V, np.array([0.0, 0.5, 2.0]), np.array([1.0, 2.0, 2.0]))[:, 0]
-    assert found == pytest.approx([1.0, (0.75 + 1.5) / 1.5, 1.0])
+from tcpipe.fusion.signals import hold_last, in_gap, median_period_ns, seconds
 
 
 def test_intervals_that_touch_a_gap():

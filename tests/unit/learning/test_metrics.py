@@ -13,7 +13,6 @@ from tcpipe.learning.metrics import (
     LEAST,
     Spread,
     combined,
-    costs,
     errors,
     errors_by_class,
     label_floor,
@@ -21,13 +20,6 @@ from tcpipe.learning.metrics import (
 )
 
 _VALUES = st.floats(20.0, 500.0)
-
-
-def test_by_hand():
-    found = errors(np.array([110.0, 190.0]), np.array([100.0, 200.0]))
-    assert found.count == found.mape_count == 2
-    assert found.rmse == pytest.approx(10.0)
-    assert found.mape_percent == pytest.approx(7.5)
 
 
 def test_a_label_near_nothing_is_in_the_rmse_alone():
@@ -77,12 +69,6 @@ def test_draws_are_averaged():
     draws = [errors(np.array([100.0 + d]), np.array([100.0])) for d in (1.0, 3.0)]
     assert mean_of_draws(draws).rmse == pytest.approx(2.0)
     assert mean_of_draws(draws).mape_percent == pytest.approx(2.0)
-
-
-def test_time_and_energy_follow_from_power_and_velocity():
-    found = costs(np.array([150.0]), np.array([0.75]), 1.5)
-    assert found["T"][0] == pytest.approx(2.0)
-    assert found["E"][0] == pytest.approx(300.0)
 
 
 def test_the_labels_floor_is_what_a_perfect_prediction_would_show():
