@@ -9,10 +9,9 @@ import pyarrow as pa
 from tcpipe.learning.architecture import Architecture
 from tcpipe.learning.evaluation_facts import Compared, EvaluateConfig, EvaluatedDataset, EvaluatedModel, Evaluation
 from tcpipe.learning.fitting import FitConfig
-from tcpipe.learning.metrics import Errors
+from tcpipe.learning.metrics import Errors, Ratio
 from tcpipe.learning.model_card import ModelCard, Seen, TrainedOn, Training
 from tcpipe.learning.models import write_model
-from tcpipe.learning.ratios import Ratio
 from tcpipe.terrain.classes import PAPER_CLASSES
 
 CARD = ModelCard(
