@@ -5,7 +5,8 @@ from __future__ import annotations
 import ast
 import inspect
 import sys
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from enum import IntFlag
 from itertools import pairwise
 from pathlib import Path
@@ -52,11 +53,52 @@ def pages() -> dict[str, str]:
 def _cli() -> str:
     parts = [_NOTE, "# Commands\n"]
     with click.Context(cli, info_name="tcpipe", terminal_width=110, **cli.context_settings) as parent:
+        contexts = [
+            click.Context(command, info_name=name, parent=parent, terminal_width=110)
+            for name, command in cli.commands.items()
+        ]
+        shared = _shared_options(contexts)
         parts.append(f"```\n{cli.get_help(parent)}\n```\n")
-        for name, command in cli.commands.items():
-            with click.Context(command, info_name=name, parent=parent, terminal_width=110) as context:
-                parts.append(f"## tcpipe {name}\n\n```\n{command.get_help(context)}\n```\n")
+        parts.append(f"## Options of several commands\n\n{_COMMON}\n```\n{_format_options(parent, shared)}```\n")
+        parts += [_describe_command(context, shared) for context in contexts]
     return "\n".join(parts)
+
+
+_COMMON = "`Also:` below a command names those of them that it takes. Each can be said differently in a command's own list; that list rules.\n"
+
+
+def _shared_options(contexts: Sequence[click.Context]) -> dict[str, str]:
+    """Return the options, with their help, that at least four commands have in the same words."""
+    records = Counter(record for context in contexts for record in _option_records(context))
+    return {names: text for (names, text), commands in records.items() if commands >= _COMMANDS}
+
+
+_COMMANDS = 4
+
+
+def _option_records(context: click.Context) -> list[tuple[str, str]]:
+    options = [parameter for parameter in context.command.get_params(context) if isinstance(parameter, click.Option)]
+    return [record for option in options if (record := option.get_help_record(context))]
+
+
+def _format_options(context: click.Context, options: Mapping[str, str]) -> str:
+    formatter = context.make_formatter()
+    formatter.write_dl(list(options.items()))
+    return formatter.getvalue()
+
+
+def _describe_command(context: click.Context, shared: Mapping[str, str]) -> str:
+    """Return a command's section: its help, with the options that it shares named only."""
+    formatter, command = context.make_formatter(), context.command
+    command.format_usage(context, formatter)
+    command.format_help_text(context, formatter)
+    records = _option_records(context)
+    if own := [record for record in records if record not in shared.items()]:
+        with formatter.section("Options"):
+            formatter.write_dl(own)
+    names = [names.split()[-2 if names.split()[-1].isupper() else -1] for names, text in records if shared.get(names) == text]
+    body = f"{formatter.getvalue().rstrip()}\n\nAlso: {', '.join(names)}"
+    return f"## tcpipe {context.info_name}\n\n```\n{body}\n```\n"
 
 
 def _documents() -> str:
@@ -100,25 +142,40 @@ def _rows(of: Mapping[str, type]) -> str:
 def _columns() -> str:
     parts = [
         _NOTE,
-        f"# Columns\n\nData model {DATA_MODEL_VERSION}. The same unit, frame and meaning stand in every file's Arrow field metadata.\n",
+        f"# Columns\n\nData model {DATA_MODEL_VERSION}. Every file has the same unit, frame and meaning in its Arrow field metadata. "
+        "A column marked *since 1.3* is null in files of earlier data models.\n",
     ]
     tables = (*STREAMS.values(), GATED_TRACK, REJECTIONS, LABELLED_SEGMENTS, SAMPLES, PIECES)
-    parts += [_table(table) for table in tables]
+    parts += [_table(table, tables[:number]) for number, table in enumerate(tables)]
     return "\n".join(parts)
 
 
-def _table(table: TableSchema) -> str:
-    rows = [
-        f"| `{c.name}` | {c.dtype}{' or null' if c.nullable else ''} | {c.unit} | {c.frame} | {c.doc}{_since(c)} |"
-        for c in table.columns
-    ]
-    flags = [_bits(c.name, c.flags) for c in table.columns if c.flags is not None]
-    head = "| column | type | unit | frame | meaning |\n|---|---|---|---|---|"
-    return f"## {table.name} ({table.level})\n\n{table.doc}\n\n{head}\n" + "\n".join(rows) + "\n" + "".join(flags)
+def _table(table: TableSchema, before: Sequence[TableSchema]) -> str:
+    """Return a table's section; columns that it has from a table before are named by that table."""
+    base = max(before, key=lambda other: len(set(other.columns) & set(table.columns)), default=None)
+    shared = set(base.columns) & set(table.columns) if base else set()
+    base = base if len(shared) >= _SHARED_COLUMNS else None
+    columns = [column for column in table.columns if not base or column not in shared]
+    title = f"## {table.name} ({table.level})\n\n{table.doc}\n"
+    if base:
+        missing = [f"`{column.name}`" for column in base.columns if column not in shared]
+        title += f"\nAll columns of [{base.name}](#{base.name}-{base.level.lower()})"
+        title += f" except {', '.join(missing)}" if missing else ""
+        title += "; and:\n" if columns else ".\n"
+    rows = "".join(
+        f"| `{c.name}` | {c.dtype}{' or null' if c.nullable else ''} | {c.unit} | {c.frame} | {c.doc}{_since(c)} |\n"
+        for c in columns
+    )
+    head = "\n| column | type | unit | frame | meaning |\n|---|---|---|---|---|\n" if columns else ""
+    flags = [_bits(c.name, c.flags) for c in columns if c.flags is not None]
+    return f"{title}{head}{rows}{''.join(flags)}"
+
+
+_SHARED_COLUMNS = 8
 
 
 def _since(column: Column) -> str:
-    return f"; since {column.since}, null in what is older" if column.since else ""
+    return f"; *since {column.since}*" if column.since else ""
 
 
 def _bits(column: str, flags: type[IntFlag]) -> str:
@@ -141,8 +198,9 @@ _TROUBLESHOOTING = """# Findings: troubleshooting
 What tcpipe reports about logs, maps, runs and datasets. Each line of a report ends with a code in brackets, as `[no-gnss]`; search this
 page for the code, or for words such as dropout, lever arm, time offset, drift, multipath, no power.
 
-An **error** makes the labels that it affects not usable, a **warning** usable with care; a **note** changes no verdict.
-`tcpipe inspect RUN` lists all findings of a run with their remedies; `--json` gives them as data. Figures below are examples.
+An **error** makes the labels that it affects not usable, a **warning** usable with care; a **note** changes no verdict. `tcpipe ingest`
+ends with exit code 3 for a **problem** until you acknowledge it (`tcpipe acknowledge`). `tcpipe inspect RUN` lists all findings of a run
+with their remedies and recipe keys; `--json` gives them as data. Figures below are examples.
 """
 
 
@@ -156,16 +214,14 @@ def _findings() -> str:
 
 
 def _finding(code: str, entry: Entry) -> str:
-    affected = f"affects {', '.join(entry.affects)}" if entry.affects else "affects no label"
-    more = [f"{entry.severity}, {entry.action}, {affected}"]
+    more = [entry.severity, entry.action]
+    more += [f"affects {', '.join(entry.affects)}"] if entry.affects else []
     more += [f"quality bit `{entry.flag}`"] if entry.flag else []
-    more += ["exit code 3 of `tcpipe ingest` until it is acknowledged"] if entry.is_problem else []
+    more += ["problem"] if entry.is_problem else []
     lines = [f"### {entry.title} `[{code}]`\n", f"> {describe_finding(example_finding(code))}\n"]
-    lines += [f"Template: `{entry.template}`\n"] if entry.fields else []
-    lines += [f"*{'; '.join(more)}.*\n", f"{_sentence(entry.cause)}\n"]
-    remedies = [*([_sentence(entry.advice)] if entry.advice else [])]
-    remedies += [f"{_sentence(text)} `tcpipe inspect` prints the keys." for text in entry.remedies.values()]
-    lines += ["What to do:\n", *(f"- {text}" for text in remedies), ""] if remedies else []
+    lines += [f"*{', '.join(more)}.* {_sentence(entry.cause)}\n"]
+    remedies = [_sentence(text) for text in (entry.advice, *entry.remedies.values()) if text]
+    lines += [f"**Remedy:** {' '.join(remedies)}\n"] if remedies else []
     limits = ", ".join(f"`{name}` {format_number(name, value)}" for name, value in entry.thresholds.items())
     lines += [f"Thresholds: {limits}.\n"] if limits else []
     lines += [f"Search words: {', '.join(entry.words)}.\n"] if entry.words else []
