@@ -7,6 +7,7 @@ import inspect
 import sys
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from enum import IntFlag
 from itertools import pairwise
 from pathlib import Path
@@ -112,16 +113,15 @@ def _documents() -> str:
 
 _FILES = """# JSON documents and answers
 
-`schemas/` has every key of each with its type and meaning, as JSON Schema: what a scheduler parses. Definitions that several share are in
-`schemas/defs.schema.json`, to which the others refer by its relative name: load the folder as a whole. Files have their seal beside
-(`document_sha256`).
+`schemas/` has every key with its type and meaning as JSON Schema. Load the folder as a whole: the schemas refer to `defs.schema.json`. Files
+also have a checksum (`document_sha256`).
 
 ## Files
 """
 
 _ANSWERS = """## What commands print with `--json`
 
-`ingest` prints a line for each log as it ends (`ingest-log`) and one of all (`ingest-summary`); what `inspect` prints is by the key `kind`.
+`ingest` prints a line for each log (`ingest-log`) and one summary (`ingest-summary`); the key `kind` tells what `inspect` prints.
 `evaluate` prints the file `evaluation`, and with `--drive` the answer `evaluate-drives`.
 A command that fails prints `exit_code` and `problems`.
 """
@@ -143,9 +143,13 @@ def _columns() -> str:
     parts = [
         _NOTE,
         f"# Columns\n\nData model {DATA_MODEL_VERSION}. Every file has the same unit, frame and meaning in its Arrow field metadata. "
-        "A column marked *since 1.3* is null in files of earlier data models.\n",
+        "A type with `?` allows null. A column marked *since 1.3* is null in files of earlier data models.\n",
     ]
-    tables = (*STREAMS.values(), GATED_TRACK, REJECTIONS, LABELLED_SEGMENTS, SAMPLES, PIECES)
+    streams = tuple(STREAMS.values())
+    common = [column for column in streams[0].columns if all(column in stream.columns for stream in streams)]
+    parts.append(f"## Every stream (L1)\n\nEach of the streams below has these columns too.\n{_column_rows(common)}")
+    own = [replace(stream, columns=tuple(c for c in stream.columns if c not in common)) for stream in streams]
+    tables = (*own, GATED_TRACK, REJECTIONS, LABELLED_SEGMENTS, SAMPLES, PIECES)
     parts += [_table(table, tables[:number]) for number, table in enumerate(tables)]
     return "\n".join(parts)
 
@@ -162,13 +166,18 @@ def _table(table: TableSchema, before: Sequence[TableSchema]) -> str:
         title += f"\nAll columns of [{base.name}](#{base.name}-{base.level.lower()})"
         title += f" except {', '.join(missing)}" if missing else ""
         title += "; and:\n" if columns else ".\n"
-    rows = "".join(
-        f"| `{c.name}` | {c.dtype}{' or null' if c.nullable else ''} | {c.unit} | {c.frame} | {c.doc}{_since(c)} |\n"
-        for c in columns
-    )
-    head = "\n| column | type | unit | frame | meaning |\n|---|---|---|---|---|\n" if columns else ""
     flags = [_bits(c.name, c.flags) for c in columns if c.flags is not None]
-    return f"{title}{head}{rows}{''.join(flags)}"
+    return f"{title}{_column_rows(columns)}{''.join(flags)}"
+
+
+def _column_rows(columns: Sequence[Column]) -> str:
+    """Return a table of columns; nothing of none."""
+    head = "\n| column | type | unit, frame | meaning |\n|---|---|---|---|\n"
+    rows = [
+        f"| `{c.name}` | {c.dtype}{'?' if c.nullable else ''} | {', '.join(filter(None, (c.unit, c.frame)))} | {c.doc}{_since(c)} |\n"
+        for c in columns
+    ]
+    return "".join((head, *rows)) if rows else ""
 
 
 _SHARED_COLUMNS = 8
@@ -218,7 +227,8 @@ def _finding(code: str, entry: Entry) -> str:
     more += [f"affects {', '.join(entry.affects)}"] if entry.affects else []
     more += [f"quality bit `{entry.flag}`"] if entry.flag else []
     more += ["problem"] if entry.is_problem else []
-    lines = [f"### {entry.title} `[{code}]`\n", f"> {describe_finding(example_finding(code))}\n"]
+    lines = [f"### {entry.title} `[{code}]`\n"]
+    lines += [f"> {describe_finding(example_finding(code))}\n"] if entry.fields else []
     lines += [f"*{', '.join(more)}.* {_sentence(entry.cause)}\n"]
     remedies = [_sentence(text) for text in (entry.advice, *entry.remedies.values()) if text]
     lines += [f"**Remedy:** {' '.join(remedies)}\n"] if remedies else []
@@ -282,20 +292,20 @@ def _robots() -> str:
         only = (source.platform, source.topic and f"…{source.topic}", source.husky_power and f"`{source.husky_power}`")
         only += ("in place of those above" if source.fallback else None,)
         counter = f"counter {source.energy} times {source.energy_scale:g} J" if source.energy else ""
-        drawn = {"drawn_positive": "positive", "drawn_negative": "negative", "auto": "told by its mean"}[source.sign]
+        drawn = {"drawn_positive": "positive", "drawn_negative": "negative", "auto": "from the mean over the run"}[source.sign]
         fields = (
             f"{source.voltage} | {counter or source.current}{', with ' + source.includes if source.includes else ''}"
         )
-        averaged = "told by motion" if source.averaging_unknown else "yes" if source.averaged else "no"
+        averaged = "found from motion" if source.averaging_unknown else "yes" if source.averaged else "no"
         cells = (f"`{source.type}`", ", ".join(filter(None, only)), fields, averaged, drawn, source.unknown)
         power += f"| {' | '.join(cells)} |\n"
     return (
-        f"{_NOTE}\n# Robots and power messages\n\nWhat comes with tcpipe, from the TOML files in `tcpipe/robots/`, where each number has "
-        "its source. A recipe holds the same tables ([your robot](../how-to/your-robot.md)).\n\n## Robots\n\nA log with "
+        f"{_NOTE}\n# Robots and power messages\n\nBuilt-in profiles, from the TOML files in `tcpipe/robots/`, where each number has "
+        "its source. A recipe can have the same tables ([your robot](../how-to/your-robot.md)).\n\n## Robots\n\nA log with "
         "`clearpath_platform_msgs/Power` and no other platform's name is a Husky's, the first to publish it.\n\n"
         f"{found_by}{sizes}\n## Power messages\n\nBest first; a row is a rail. Bare numbers "
-        f"(`std_msgs/Float32`, `Float64`) are told by their topic's name.\n\n{power}\n"
-        f"Types whose currents are no power drawn from a battery, or cannot be known to be; they play no role:\n\n{refused}"
+        f"(`std_msgs/Float32`, `Float64`) are identified by their topic's name.\n\n{power}\n"
+        f"Types whose currents are not, or may not be, drawn from a battery; tcpipe does not use them:\n\n{refused}"
     )
 
 
