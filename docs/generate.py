@@ -65,7 +65,7 @@ def _cli() -> str:
     return "\n".join(parts)
 
 
-_COMMON = "`Also:` below a command names those of them that it takes. Each can be said differently in a command's own list; that list rules.\n"
+_COMMON = "`Also:` below a command lists which of these it takes.\n"
 
 
 def _shared_options(contexts: Sequence[click.Context]) -> dict[str, str]:
@@ -94,11 +94,12 @@ def _describe_command(context: click.Context, shared: Mapping[str, str]) -> str:
     command.format_usage(context, formatter)
     command.format_help_text(context, formatter)
     records = _option_records(context)
+    also = [names for names, text in records if shared.get(names) == text]
     if own := [record for record in records if record not in shared.items()]:
         with formatter.section("Options"):
             formatter.write_dl(own)
-    names = [names.split()[-2 if names.split()[-1].isupper() else -1] for names, text in records if shared.get(names) == text]
-    body = f"{formatter.getvalue().rstrip()}\n\nAlso: {', '.join(names)}"
+    long_names = [next(word for word in names.split() if word.startswith("--")) for names in also]
+    body = f"{formatter.getvalue().rstrip()}\n\nAlso: {', '.join(long_names)}"
     return f"## tcpipe {context.info_name}\n\n```\n{body}\n```\n"
 
 
@@ -113,8 +114,8 @@ def _documents() -> str:
 
 _FILES = """# JSON documents and answers
 
-`schemas/` has every key with its type and meaning as JSON Schema. Load the folder as a whole: the schemas refer to `defs.schema.json`. Files
-also have a checksum (`document_sha256`).
+`schemas/` has every key with its type and meaning as JSON Schema. Load the folder as a whole: the schemas refer to
+`defs.schema.json`. Files also have a checksum (`document_sha256`).
 
 ## Files
 """
@@ -139,12 +140,15 @@ def _rows(of: Mapping[str, type]) -> str:
     )
 
 
+_COLUMNS = f"""# Columns
+
+Data model {DATA_MODEL_VERSION}. Every file has the same unit, frame and meaning in its Arrow field metadata. A type with `?` allows null.
+A column marked *since 1.3* is null in files of earlier data models.
+"""
+
+
 def _columns() -> str:
-    parts = [
-        _NOTE,
-        f"# Columns\n\nData model {DATA_MODEL_VERSION}. Every file has the same unit, frame and meaning in its Arrow field metadata. "
-        "A type with `?` allows null. A column marked *since 1.3* is null in files of earlier data models.\n",
-    ]
+    parts = [_NOTE, _COLUMNS]
     streams = tuple(STREAMS.values())
     common = [column for column in streams[0].columns if all(column in stream.columns for stream in streams)]
     parts.append(f"## Every stream (L1)\n\nEach of the streams below has these columns too.\n{_column_rows(common)}")
@@ -292,7 +296,9 @@ def _robots() -> str:
         only = (source.platform, source.topic and f"…{source.topic}", source.husky_power and f"`{source.husky_power}`")
         only += ("in place of those above" if source.fallback else None,)
         counter = f"counter {source.energy} times {source.energy_scale:g} J" if source.energy else ""
-        drawn = {"drawn_positive": "positive", "drawn_negative": "negative", "auto": "from the mean over the run"}[source.sign]
+        drawn = {"drawn_positive": "positive", "drawn_negative": "negative", "auto": "by the mean over the run"}[
+            source.sign
+        ]
         fields = (
             f"{source.voltage} | {counter or source.current}{', with ' + source.includes if source.includes else ''}"
         )
