@@ -238,7 +238,7 @@ def _finding(code: str, entry: Entry) -> str:
     lines += [f"**Remedy:** {' '.join(remedies)}\n"] if remedies else []
     limits = ", ".join(f"`{name}` {format_number(name, value)}" for name, value in entry.thresholds.items())
     lines += [f"Thresholds: {limits}.\n"] if limits else []
-    lines += [f"Search words: {', '.join(entry.words)}.\n"] if entry.words else []
+    lines += [f"*Search:* {', '.join(entry.words)}.\n"] if entry.words else []
     return "\n".join(lines)
 
 
