@@ -18,13 +18,12 @@ import click
 from tcpipe.cli import cli
 from tcpipe.cli.answers import answers
 from tcpipe.formats.contracts import DOCUMENTS
-from tcpipe.formats.finding_lines import describe_finding, format_number
+from tcpipe.formats.finding_lines import format_number
 from tcpipe.formats.recipe_toml import commented_toml
 from tcpipe.formats.robot_files import shipped_profiles
 from tcpipe.planning.path_table import PIECES
 from tcpipe.tables.catalogue import Entry, catalogue_sections, read_catalogue
 from tcpipe.tables.columns import Column, TableSchema
-from tcpipe.tables.findings import Finding, Subject
 from tcpipe.tables.levels import (
     DATA_MODEL_VERSION,
     GATED_TRACK,
@@ -213,7 +212,7 @@ page for the code, or for words such as dropout, lever arm, time offset, drift, 
 
 An **error** makes the labels that it affects not usable, a **warning** usable with care; a **note** changes no verdict. `tcpipe ingest`
 ends with exit code 3 for a **problem** until you acknowledge it (`tcpipe acknowledge`). `tcpipe inspect RUN` lists all findings of a run
-with their remedies and recipe keys; `--json` gives them as data. Figures below are examples.
+with their remedies and recipe keys; `--json` gives them as data.
 """
 
 
@@ -232,7 +231,6 @@ def _finding(code: str, entry: Entry) -> str:
     more += [f"quality bit `{entry.flag}`"] if entry.flag else []
     more += ["problem"] if entry.is_problem else []
     lines = [f"### {entry.title} `[{code}]`\n"]
-    lines += [f"> {describe_finding(example_finding(code))}\n"] if entry.fields else []
     lines += [f"*{', '.join(more)}.* {_sentence(entry.cause)}\n"]
     remedies = [_sentence(text) for text in (entry.advice, *entry.remedies.values()) if text]
     lines += [f"**Remedy:** {' '.join(remedies)}\n"] if remedies else []
@@ -240,33 +238,6 @@ def _finding(code: str, entry: Entry) -> str:
     lines += [f"Thresholds: {limits}.\n"] if limits else []
     lines += [f"*Search:* {', '.join(entry.words)}.\n"] if entry.words else []
     return "\n".join(lines)
-
-
-def example_finding(code: str) -> Finding:
-    """Return a finding with typical values: numbers by their suffix, names by their key."""
-    entry = read_catalogue()[code]
-    numbers = {
-        name: next((value for suffix, value in _NUMBERS.items() if name.endswith(suffix)), None)
-        for name in entry.fields
-    }
-    names = {name: _NAMES.get(name, name.replace("_", " ")) for name in entry.fields if numbers[name] is None}
-    role = next((role for role in _ROLES if code.startswith(role.split("_")[0])), "gnss")
-    known = {name: value for name, value in numbers.items() if value is not None}
-    return Finding(code, entry.severity, Subject("role", role), entry.action, (312.0, 318.0), known, names)
-
-
-_ROLES = ("imu", "power", "odometry", "pose", "velocity")
-_NUMBERS = {
-    "wanted_hz": 20.0, "at_20_hz_fraction": 0.041, "length_s": 30.0, "driven_m": 84.0, "limit_mps": 1.0,
-    "_count": 12.0, "_fraction": 0.123, "_ratio": 1.05, "_rad": 0.0524, "_hz": 9.87, "_mps2": 9.81, "_mps": 0.95, "_m2": 12.3,
-    "_std": 0.004,
-    "_volt": 25.6, "_amp": 12.3, "_watt": 123.0, "_s": 0.123, "_m": 1.23, "before": 84.1, "after": 96.2, "scale": 1.053,
-}  # fmt: skip
-_NAMES = {
-    "subject": "gnss", "topic": "/gps/fix", "topics": "/left/current, /battery/voltage", "reason": "gap", "reference": "wheel_odometry",
-    "role": "imu", "frame": "gps_link", "quantity": "current", "rail": "battery", "map": "site", "robot": "husky", "unit": "W",
-    "error": "LogError", "type": "sensor_msgs/msg/Imu", "span": "312 to 318 s",
-}  # fmt: skip
 
 
 def _sentence(text: str) -> str:
