@@ -58,7 +58,6 @@ def _cli() -> str:
             for name, command in cli.commands.items()
         ]
         shared = _shared_options(contexts)
-        parts.append(f"```\n{cli.get_help(parent)}\n```\n")
         parts.append(f"## Options of several commands\n\n{_COMMON}\n```\n{_format_options(parent, shared)}```\n")
         parts += [_describe_command(context, shared) for context in contexts]
     return "\n".join(parts)
