@@ -225,7 +225,7 @@ def _findings() -> str:
 
 
 def _finding(code: str, entry: Entry) -> str:
-    more = [entry.severity, entry.action]
+    more: list[str] = [entry.severity, entry.action]
     more += [f"affects {', '.join(entry.affects)}"] if entry.affects else []
     more += [f"quality bit `{entry.flag}`"] if entry.flag else []
     more += ["problem"] if entry.is_problem else []
