@@ -5,7 +5,9 @@ from __future__ import annotations
 import ast
 import inspect
 import sys
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from enum import IntFlag
 from itertools import pairwise
 from pathlib import Path
@@ -16,13 +18,12 @@ import click
 from tcpipe.cli import cli
 from tcpipe.cli.answers import answers
 from tcpipe.formats.contracts import DOCUMENTS
-from tcpipe.formats.finding_lines import describe_finding, format_number
+from tcpipe.formats.finding_lines import format_number
 from tcpipe.formats.recipe_toml import commented_toml
 from tcpipe.formats.robot_files import shipped_profiles
 from tcpipe.planning.path_cost import PIECES
 from tcpipe.tables.catalogue import Entry, catalogue_sections, read_catalogue
 from tcpipe.tables.columns import Column, TableSchema
-from tcpipe.tables.findings import Finding, Subject
 from tcpipe.tables.levels import (
     DATA_MODEL_VERSION,
     GATED_TRACK,
@@ -52,11 +53,52 @@ def pages() -> dict[str, str]:
 def _cli() -> str:
     parts = [_NOTE, "# Commands\n"]
     with click.Context(cli, info_name="tcpipe", terminal_width=110, **cli.context_settings) as parent:
-        parts.append(f"```\n{cli.get_help(parent)}\n```\n")
-        for name, command in cli.commands.items():
-            with click.Context(command, info_name=name, parent=parent, terminal_width=110) as context:
-                parts.append(f"## tcpipe {name}\n\n```\n{command.get_help(context)}\n```\n")
+        contexts = [
+            click.Context(command, info_name=name, parent=parent, terminal_width=110)
+            for name, command in cli.commands.items()
+        ]
+        shared = _shared_options(contexts)
+        parts.append(f"## Options of several commands\n\n{_COMMON}\n```\n{_format_options(parent, shared)}```\n")
+        parts += [_describe_command(context, shared) for context in contexts]
     return "\n".join(parts)
+
+
+_COMMON = "`Also:` below a command lists which of these it takes.\n"
+
+
+def _shared_options(contexts: Sequence[click.Context]) -> dict[str, str]:
+    """Return the options, with their help, that at least four commands have in the same words."""
+    records = Counter(record for context in contexts for record in _option_records(context))
+    return {names: text for (names, text), commands in records.items() if commands >= _COMMANDS}
+
+
+_COMMANDS = 4
+
+
+def _option_records(context: click.Context) -> list[tuple[str, str]]:
+    options = [parameter for parameter in context.command.get_params(context) if isinstance(parameter, click.Option)]
+    return [record for option in options if (record := option.get_help_record(context))]
+
+
+def _format_options(context: click.Context, options: Mapping[str, str]) -> str:
+    formatter = context.make_formatter()
+    formatter.write_dl(list(options.items()))
+    return formatter.getvalue()
+
+
+def _describe_command(context: click.Context, shared: Mapping[str, str]) -> str:
+    """Return a command's section: its help, with the options that it shares named only."""
+    formatter, command = context.make_formatter(), context.command
+    command.format_usage(context, formatter)
+    command.format_help_text(context, formatter)
+    records = _option_records(context)
+    also = [names for names, text in records if shared.get(names) == text]
+    if own := [record for record in records if record not in shared.items()]:
+        with formatter.section("Options"):
+            formatter.write_dl(own)
+    long_names = [next(word for word in names.split() if word.startswith("--")) for names in also]
+    body = f"{formatter.getvalue().rstrip()}\n\nAlso: {', '.join(long_names)}"
+    return f"## tcpipe {context.info_name}\n\n```\n{body}\n```\n"
 
 
 def _documents() -> str:
@@ -70,16 +112,15 @@ def _documents() -> str:
 
 _FILES = """# JSON documents and answers
 
-`schemas/` has every key of each with its type and meaning, as JSON Schema: what a scheduler parses. Definitions that several share are in
-`schemas/defs.schema.json`, to which the others refer by its relative name: load the folder as a whole. Files have their seal beside
-(`document_sha256`).
+`schemas/` has every key with its type and meaning as JSON Schema. Load the folder as a whole: the schemas refer to
+`defs.schema.json`. Files also have a checksum (`document_sha256`).
 
 ## Files
 """
 
 _ANSWERS = """## What commands print with `--json`
 
-`ingest` prints a line for each log as it ends (`ingest-log`) and one of all (`ingest-summary`); what `inspect` prints is by the key `kind`.
+`ingest` prints a line for each log (`ingest-log`) and one summary (`ingest-summary`); the key `kind` tells what `inspect` prints.
 `evaluate` prints the file `evaluation`, and with `--drive` the answer `evaluate-drives`.
 A command that fails prints `exit_code` and `problems`.
 """
@@ -97,28 +138,55 @@ def _rows(of: Mapping[str, type]) -> str:
     )
 
 
+_COLUMNS = f"""# Columns
+
+Data model {DATA_MODEL_VERSION}. Every file has the same unit, frame and meaning in its Arrow field metadata. A type with `?` allows null.
+A column marked *since 1.3* is null in files of earlier data models.
+"""
+
+
 def _columns() -> str:
-    parts = [
-        _NOTE,
-        f"# Columns\n\nData model {DATA_MODEL_VERSION}. The same unit, frame and meaning stand in every file's Arrow field metadata.\n",
-    ]
-    tables = (*STREAMS.values(), GATED_TRACK, REJECTIONS, LABELLED_SEGMENTS, SAMPLES, PIECES)
-    parts += [_table(table) for table in tables]
+    parts = [_NOTE, _COLUMNS]
+    streams = tuple(STREAMS.values())
+    common = [column for column in streams[0].columns if all(column in stream.columns for stream in streams)]
+    parts.append(f"## Every stream (L1)\n\nEach of the streams below has these columns too.\n{_column_rows(common)}")
+    own = [replace(stream, columns=tuple(c for c in stream.columns if c not in common)) for stream in streams]
+    tables = (*own, GATED_TRACK, REJECTIONS, LABELLED_SEGMENTS, SAMPLES, PIECES)
+    parts += [_table(table, tables[:number]) for number, table in enumerate(tables)]
     return "\n".join(parts)
 
 
-def _table(table: TableSchema) -> str:
+def _table(table: TableSchema, before: Sequence[TableSchema]) -> str:
+    """Return a table's section; columns that it has from a table before are named by that table."""
+    base = max(before, key=lambda other: len(set(other.columns) & set(table.columns)), default=None)
+    shared = set(base.columns) & set(table.columns) if base else set()
+    base = base if len(shared) >= _SHARED_COLUMNS else None
+    columns = [column for column in table.columns if not base or column not in shared]
+    title = f"## {table.name} ({table.level})\n\n{table.doc}\n"
+    if base:
+        missing = [f"`{column.name}`" for column in base.columns if column not in shared]
+        title += f"\nAll columns of [{base.name}](#{base.name}-{base.level.lower()})"
+        title += f" except {', '.join(missing)}" if missing else ""
+        title += "; and:\n" if columns else ".\n"
+    flags = [_bits(c.name, c.flags) for c in columns if c.flags is not None]
+    return f"{title}{_column_rows(columns)}{''.join(flags)}"
+
+
+def _column_rows(columns: Sequence[Column]) -> str:
+    """Return a table of columns; nothing of none."""
+    head = "\n| column | type | unit, frame | meaning |\n|---|---|---|---|\n"
     rows = [
-        f"| `{c.name}` | {c.dtype}{' or null' if c.nullable else ''} | {c.unit} | {c.frame} | {c.doc}{_since(c)} |"
-        for c in table.columns
+        f"| `{c.name}` | {c.dtype}{'?' if c.nullable else ''} | {', '.join(filter(None, (c.unit, c.frame)))} | {c.doc}{_since(c)} |\n"
+        for c in columns
     ]
-    flags = [_bits(c.name, c.flags) for c in table.columns if c.flags is not None]
-    head = "| column | type | unit | frame | meaning |\n|---|---|---|---|---|"
-    return f"## {table.name} ({table.level})\n\n{table.doc}\n\n{head}\n" + "\n".join(rows) + "\n" + "".join(flags)
+    return "".join((head, *rows)) if rows else ""
+
+
+_SHARED_COLUMNS = 8
 
 
 def _since(column: Column) -> str:
-    return f"; since {column.since}, null in what is older" if column.since else ""
+    return f"; *since {column.since}*" if column.since else ""
 
 
 def _bits(column: str, flags: type[IntFlag]) -> str:
@@ -141,8 +209,9 @@ _TROUBLESHOOTING = """# Findings: troubleshooting
 What tcpipe reports about logs, maps, runs and datasets. Each line of a report ends with a code in brackets, as `[no-gnss]`; search this
 page for the code, or for words such as dropout, lever arm, time offset, drift, multipath, no power.
 
-An **error** makes the labels that it affects not usable, a **warning** usable with care; a **note** changes no verdict.
-`tcpipe inspect RUN` lists all findings of a run with their remedies; `--json` gives them as data. Figures below are examples.
+An **error** makes the labels that it affects not usable, a **warning** usable with care; a **note** changes no verdict. `tcpipe ingest`
+ends with exit code 3 for a **problem** until you acknowledge it (`tcpipe acknowledge`). `tcpipe inspect RUN` lists all findings of a run
+with their remedies and recipe keys; `--json` gives them as data.
 """
 
 
@@ -156,47 +225,18 @@ def _findings() -> str:
 
 
 def _finding(code: str, entry: Entry) -> str:
-    affected = f"affects {', '.join(entry.affects)}" if entry.affects else "affects no label"
-    more = [f"{entry.severity}, {entry.action}, {affected}"]
+    more: list[str] = [entry.severity, entry.action]
+    more += [f"affects {', '.join(entry.affects)}"] if entry.affects else []
     more += [f"quality bit `{entry.flag}`"] if entry.flag else []
-    more += ["exit code 3 of `tcpipe ingest` until it is acknowledged"] if entry.is_problem else []
-    lines = [f"### {entry.title} `[{code}]`\n", f"> {describe_finding(example_finding(code))}\n"]
-    lines += [f"Template: `{entry.template}`\n"] if entry.fields else []
-    lines += [f"*{'; '.join(more)}.*\n", f"{_sentence(entry.cause)}\n"]
-    remedies = [*([_sentence(entry.advice)] if entry.advice else [])]
-    remedies += [f"{_sentence(text)} `tcpipe inspect` prints the keys." for text in entry.remedies.values()]
-    lines += ["What to do:\n", *(f"- {text}" for text in remedies), ""] if remedies else []
+    more += ["problem"] if entry.is_problem else []
+    lines = [f"### {entry.title} `[{code}]`\n"]
+    lines += [f"*{', '.join(more)}.* {_sentence(entry.cause)}\n"]
+    remedies = [_sentence(text) for text in (entry.advice, *entry.remedies.values()) if text]
+    lines += [f"**Remedy:** {' '.join(remedies)}\n"] if remedies else []
     limits = ", ".join(f"`{name}` {format_number(name, value)}" for name, value in entry.thresholds.items())
     lines += [f"Thresholds: {limits}.\n"] if limits else []
-    lines += [f"Search words: {', '.join(entry.words)}.\n"] if entry.words else []
+    lines += [f"*Search:* {', '.join(entry.words)}.\n"] if entry.words else []
     return "\n".join(lines)
-
-
-def example_finding(code: str) -> Finding:
-    """Return a finding with typical values: numbers by their suffix, names by their key."""
-    entry = read_catalogue()[code]
-    numbers = {
-        name: next((value for suffix, value in _NUMBERS.items() if name.endswith(suffix)), None)
-        for name in entry.fields
-    }
-    names = {name: _NAMES.get(name, name.replace("_", " ")) for name in entry.fields if numbers[name] is None}
-    role = next((role for role in _ROLES if code.startswith(role.split("_")[0])), "gnss")
-    known = {name: value for name, value in numbers.items() if value is not None}
-    return Finding(code, entry.severity, Subject("role", role), entry.action, (312.0, 318.0), known, names)
-
-
-_ROLES = ("imu", "power", "odometry", "pose", "velocity")
-_NUMBERS = {
-    "wanted_hz": 20.0, "at_20_hz_fraction": 0.041, "length_s": 30.0, "driven_m": 84.0, "limit_mps": 1.0,
-    "_count": 12.0, "_fraction": 0.123, "_ratio": 1.05, "_rad": 0.0524, "_hz": 9.87, "_mps2": 9.81, "_mps": 0.95, "_m2": 12.3,
-    "_std": 0.004,
-    "_volt": 25.6, "_amp": 12.3, "_watt": 123.0, "_s": 0.123, "_m": 1.23, "before": 84.1, "after": 96.2, "scale": 1.053,
-}  # fmt: skip
-_NAMES = {
-    "subject": "gnss", "topic": "/gps/fix", "topics": "/left/current, /battery/voltage", "reason": "gap", "reference": "wheel_odometry",
-    "role": "imu", "frame": "gps_link", "quantity": "current", "rail": "battery", "map": "site", "robot": "husky", "unit": "W",
-    "error": "LogError", "type": "sensor_msgs/msg/Imu", "span": "312 to 318 s",
-}  # fmt: skip
 
 
 def _sentence(text: str) -> str:
@@ -226,20 +266,22 @@ def _robots() -> str:
         only = (source.platform, source.topic and f"…{source.topic}", source.husky_power and f"`{source.husky_power}`")
         only += ("in place of those above" if source.fallback else None,)
         counter = f"counter {source.energy} times {source.energy_scale:g} J" if source.energy else ""
-        drawn = {"drawn_positive": "positive", "drawn_negative": "negative", "auto": "told by its mean"}[source.sign]
+        drawn = {"drawn_positive": "positive", "drawn_negative": "negative", "auto": "by the mean over the run"}[
+            source.sign
+        ]
         fields = (
             f"{source.voltage} | {counter or source.current}{', with ' + source.includes if source.includes else ''}"
         )
-        averaged = "told by motion" if source.averaging_unknown else "yes" if source.averaged else "no"
+        averaged = "found from motion" if source.averaging_unknown else "yes" if source.averaged else "no"
         cells = (f"`{source.type}`", ", ".join(filter(None, only)), fields, averaged, drawn, source.unknown)
         power += f"| {' | '.join(cells)} |\n"
     return (
-        f"{_NOTE}\n# Robots and power messages\n\nWhat comes with tcpipe, from the TOML files in `tcpipe/robots/`, where each number has "
-        "its source. A recipe holds the same tables ([your robot](../how-to/your-robot.md)).\n\n## Robots\n\nA log with "
+        f"{_NOTE}\n# Robots and power messages\n\nBuilt-in profiles, from the TOML files in `tcpipe/robots/`, where each number has "
+        "its source. A recipe can have the same tables ([your robot](../how-to/your-robot.md)).\n\n## Robots\n\nA log with "
         "`clearpath_platform_msgs/Power` and no other platform's name is a Husky's, the first to publish it.\n\n"
         f"{found_by}{sizes}\n## Power messages\n\nBest first; a row is a rail. Bare numbers "
-        f"(`std_msgs/Float32`, `Float64`) are told by their topic's name.\n\n{power}\n"
-        f"Types whose currents are no power drawn from a battery, or cannot be known to be; they play no role:\n\n{refused}"
+        f"(`std_msgs/Float32`, `Float64`) are identified by their topic's name.\n\n{power}\n"
+        f"Types whose currents are not, or may not be, drawn from a battery; tcpipe does not use them:\n\n{refused}"
     )
 
 

@@ -1,4 +1,4 @@
-"""The documentation as a site, as MkDocs asks for it: the README in front, a catalogue of errors, links into the code as text."""
+"""The documentation as a site, as MkDocs asks for it: the README in front, a list of all errors, links into the code as text."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from typing import Any
 ROOT = Path(__file__).parents[1]
 CATALOGUE = "reference/error-catalogue.md"
 _LINK = re.compile(r"(?<!!)\[([^\]]*)\]\(([^)#\s]+)(#[^)\s]*)?\)")
-_HEAD = """# Every error and its cure
+_HEAD = """# Every error
 
-What tcpipe says when something cannot be done, by error and module, as it stands in the code (`{…}` is filled in). The line itself says
-what to do; [exit codes and the tree of errors](errors.md) say what a script can go by. Made anew with the site.
+Messages of all errors, by error and module (`{…}` is filled in). Scripts use [exit codes and the tree of errors](errors.md). Generated with
+the site.
 """
 
 
@@ -29,7 +29,9 @@ def on_files(files: Any, config: Any) -> Any:
 
 
 def on_page_markdown(markdown: str, *, page: Any, config: Any, files: Any) -> str:  # noqa: ARG001  MkDocs' signature
-    """Return a page whose links out of the documentation are text."""
+    """Return a page whose links out of the documentation are text; keep decisions out of the search."""
+    if page.file.src_uri.startswith("adr/"):
+        page.meta["search"] = {"exclude": True}
     here = (ROOT / "docs" / page.file.src_uri).parent
 
     def link(found: re.Match[str]) -> str:

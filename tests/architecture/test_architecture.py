@@ -133,7 +133,7 @@ def test_page_and_linter_show_the_same_floors():
 def test_page_names_every_room():
     rooms = {path.name for path in PACKAGE.iterdir() if path.suffix == ".py" or (path / "__init__.py").is_file()}
     rooms = {name if name.endswith(".py") else f"{name}/" for name in rooms if name != "__init__.py"}
-    assert {name.strip("`") for name, _ in _table("Floors")} == rooms
+    assert {name.strip("`") for name, _ in _table("Layers")} == rooms
 
 
 def test_each_file_format_has_the_home_that_the_page_gives():
