@@ -84,18 +84,11 @@ def refresh(store: Place, state: State) -> State:
     found = {int(of[1]) for name in log.files_after("", commit_name(state.number)) if (of := _COMMIT.fullmatch(name))}
     numbers = sorted(number for number in found if number > state.number)
     for number, result in zip(numbers, side_by_side(log.where(), lambda n: _try(log, n), numbers), strict=True):
-        missing = [_problem("commit-missing", log, absent) for absent in range(state.number + 1, number)]
-        if missing:
-            state = replace(state, digest="", problems=(*state.problems, *missing))
-        if isinstance(result, StoreError):
-            state = replace(
-                state,
-                number=number,
-                digest="",
-                problems=(*state.problems, _problem("commit-damaged", log, number)),
-            )
-            continue
-        state = _follow(state, result, log)
+        wrong = [_problem("commit-missing", log, absent) for absent in range(state.number + 1, number)]
+        wrong += [_problem("commit-damaged", log, number)] if isinstance(result, StoreError) else []
+        if wrong:
+            state = replace(state, digest="", problems=(*state.problems, *wrong))
+        state = replace(state, number=number) if isinstance(result, StoreError) else _follow(state, result, log)
     return state
 
 
