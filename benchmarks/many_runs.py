@@ -3,6 +3,7 @@
 ::
 
     python benchmarks/many_runs.py DIRECTORY [RUNS]
+    python benchmarks/many_runs.py DIRECTORY RUNS new      one new log alone, with the memory that it takes
 
 Logs and runs are copies of one short drive under other names, hashes and times, laid out as ingestion would have; documents have its size.
 """
@@ -11,7 +12,6 @@ import hashlib
 import os
 import re
 import resource
-import subprocess
 import sys
 import time
 from collections.abc import Callable
@@ -141,7 +141,6 @@ def main() -> None:
         assert not timed(
             f"prune --dry-run, {again}", lambda: prune(store=store.root, recipe=Recipe(), dry_run=True)
         ).removed
-    subprocess.run([sys.executable, __file__, str(directory), str(count), "new"], check=True)
 
 
 if __name__ == "__main__":

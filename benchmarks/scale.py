@@ -147,7 +147,7 @@ def on_paper(of: Mapping[str, float]) -> list[tuple[str, str, str]]:
     """Return what each step takes at `HOURS` and `SAMPLES`, and where a machine of `CORES` and `MEMORY_GB` ends, from measured figures."""
     logs = HOURS * of["logs_an_hour"]
     night_s = logs * (of["night_ms"] + of["objects_a_log"] / 1_000 * of["listing_ms"]) / 1e3
-    index_gb, build_gb = logs * of["index_kb_a_log"] / 1e6, SAMPLES * of["build_bytes_a_sample"] / 1e9
+    state_gb, build_gb = logs * of["state_kb_a_log"] / 1e6, SAMPLES * of["build_bytes_a_sample"] / 1e9
     ingest_h, build_h = HOURS * of["ingest_s_an_hour"] / 3_600, SAMPLES * of["build_us_a_sample"] / 3.6e9
     room_tb, epoch_s = (
         (SAMPLES * of[f"{name}_bytes_a_sample"] / 1e12 for name in ("spool", "dataset")),
@@ -165,7 +165,11 @@ def on_paper(of: Mapping[str, float]) -> list[tuple[str, str, str]]:
             f"{night_s / 60:,.0f} min for {logs:,.0f} logs",
             f"an hour at {HOURS * 3_600 / night_s:,.0f} hours",
         ),
-        ("the index in memory", f"{index_gb:.1f} GB", f"{MEMORY_GB} GB at {HOURS * MEMORY_GB / index_gb:,.0f} hours"),
+        (
+            "the state of the log in memory",
+            f"{state_gb:.1f} GB",
+            f"{MEMORY_GB} GB at {HOURS * MEMORY_GB / state_gb:,.0f} hours",
+        ),
         (
             "build: CPU",
             f"{build_h:,.0f} core hours, {build_h / CORES:,.1f} h on {CORES} cores",

@@ -1,4 +1,4 @@
-"""The store: where runs and maps live, by content, in a directory or a bucket with one layout and one protocol (ADR 84).
+"""The store: where runs and maps live, by content, in a directory or a bucket with one layout and one protocol (ADR-28).
 
 ::
 
@@ -241,7 +241,8 @@ class Store:
         for run in runs:
             try:
                 if run.files_state != proved.get(f"{run.run_id}/{run.recipe_id}"):
-                    run.prove("segments.parquet", "track.parquet")
+                    for name in ("segments.parquet", "track.parquet"):
+                        run.file(name)
                     new[f"{run.run_id}/{run.recipe_id}"] = run.files_state
             except StoreError as error:
                 damaged[run.run_id] = error.problems[0]

@@ -1,4 +1,4 @@
-"""A log: commits as small sealed files that are put where there is none, and snapshots of the state (ADR 105, ADR 106).
+"""A log: commits as small sealed files that are put where there is none, and snapshots of the state (ADR-29, ADR-30).
 
 ::
 
@@ -83,18 +83,11 @@ def refresh(store: Place, state: State) -> State:
     log = store.below(LOG)
     numbers = _list_commits(log, state.number)
     for number, result in zip(numbers, side_by_side(log.where(), lambda n: _try(log, n), numbers), strict=True):
-        missing = [_problem("commit-missing", log, absent) for absent in range(state.number + 1, number)]
-        if missing:
-            state = replace(state, digest="", problems=(*state.problems, *missing))
-        if isinstance(result, StoreError):
-            state = replace(
-                state,
-                number=number,
-                digest="",
-                problems=(*state.problems, _problem("commit-damaged", log, number)),
-            )
-            continue
-        state = _follow(state, result, log)
+        wrong = [_problem("commit-missing", log, absent) for absent in range(state.number + 1, number)]
+        wrong += [_problem("commit-damaged", log, number)] if isinstance(result, StoreError) else []
+        if wrong:
+            state = replace(state, digest="", problems=(*state.problems, *wrong))
+        state = replace(state, number=number) if isinstance(result, StoreError) else _follow(state, result, log)
     return state
 
 

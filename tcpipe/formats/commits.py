@@ -1,4 +1,4 @@
-"""Commits: what each call wrote into the log of its store; and the state that they add up to, a pure function (ADR 105)."""
+"""Commits: what each call wrote into the log of its store; and the state that they add up to, a pure function (ADR-29)."""
 
 from __future__ import annotations
 
@@ -92,7 +92,7 @@ class Dataset:
 
 @dataclass(frozen=True, slots=True)
 class Generation:
-    """One build of what lies at a URL: a dataset, a model, a cost map or an evaluation (ADR 106)."""
+    """One build of what lies at a URL: a dataset, a model, a cost map or an evaluation (ADR-30)."""
 
     folder: str
     """Where its files are, from the URL."""

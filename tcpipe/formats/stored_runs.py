@@ -80,11 +80,6 @@ class RunDirectory:
         columns = None if columns is None else list(columns)
         return read_table(self.file(f"{name}.parquet"), columns).replace_schema_metadata(None)
 
-    def prove(self, *names: str) -> None:
-        """Compare files with what the manifest has of them; `StoreError` names the first that is not as it was written."""
-        for name in names:
-            self.file(name)
-
     def segments(self) -> pa.Table:
         """Read the labelled segments (schema LABELLED_SEGMENTS; columns that an earlier data model lacks are null)."""
         return LABELLED_SEGMENTS.completed(self.table("segments"))

@@ -193,15 +193,18 @@ def _results_without_work(
     for index, step in enumerate(steps):
         source, made = step.task.source, step.made
         if step.failure is not None:
-            failed = IngestResult(
-                source.name,
-                "failed",
-                problems=step.failure.problems,
-                causes=step.failure.findings,
-                sha256=source.sha256,
-                known=True,
+            yield (
+                index,
+                IngestResult(
+                    source.name,
+                    "failed",
+                    problems=step.failure.problems,
+                    causes=step.failure.findings,
+                    sha256=source.sha256,
+                    known=True,
+                    acknowledged=step.standing == "quarantined",
+                ),
             )
-            yield index, replace(failed, acknowledged=step.standing == "quarantined")
         elif made is not None:
             result = result_of(source, "unchanged", made, str(source.sha256), same_as=find_twin(made.log, source))
             if made.run_id in parties:

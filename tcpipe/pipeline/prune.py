@@ -258,8 +258,6 @@ def _named_in(place: Place, names: Sequence[str], rows: Sequence[RunFacts]) -> I
         if of is None:
             continue
         is_last = of[1] == last[of[0]]
-        if name in committed and "/" in name:
-            continue
         if name in committed or (is_last and (not rows or name.partition("/")[0] not in recipes)):
             yield from (name, *_named_by(place, name))
     yield from committed

@@ -141,11 +141,12 @@ def status(
     opened = Store(store if is_url(store) else local_output(store)) if create else open_store(store)
     state = opened.state()
     begun, given = begun_calls(state), [str(log) for log in logs]
+    sources = [shown_path(log) for log in given]
     ingests = [(call.begin, call.logs) for call in state.calls if call.logs]
     ingests += [(call.begin, call.works_on) for call in begun if call.command == INGEST]
     asked = list(dict.fromkeys(log for _, logs in sorted(ingests, reverse=True) for log in logs))
-    lately: Sequence[str] = [*map(shown_path, given)] or (max(ingests)[1] if ingests else ())
-    sources, given = [*map(shown_path, given)], given or asked
+    lately: Sequence[str] = sources or (max(ingests)[1] if ingests else ())
+    given = given or asked
     if not given and not state.calls:
         raise UsageError(f"{opened.root}: no call of ingest is remembered here; give the logs or their folders")
     with scratch_directory() as staging:
