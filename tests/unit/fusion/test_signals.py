@@ -1,8 +1,9 @@
 """Signals between samples, by hand."""
 
 import numpy as np
+import pytest
 
-from tcpipe.fusion.signals import hold_last, in_gap, median_period_ns, seconds
+from tcpipe.fusion.signals import hold_last, in_gap, median_period_ns, seconds, slopes, white_noise
 
 
 def test_intervals_that_touch_a_gap():
@@ -26,3 +27,17 @@ def test_seconds_keep_nanoseconds_of_large_stamps():
     assert seconds(np.array([zero + 1], np.int64), zero)[0] == 1e-9
     assert median_period_ns(np.array([zero, zero + 10, zero + 20, zero + 90], np.int64)) == 10
     assert median_period_ns(np.array([zero], np.int64)) == 1
+
+
+def test_slopes_of_a_line_are_its_own_whatever_its_stamps():
+    stamp_ns = np.sort(np.random.default_rng(0).integers(0, 10**10, 200)) + 10**18
+    values = 3.0 - 0.7 * (stamp_ns - 10**18) * 1e-9
+    assert slopes(stamp_ns, values, 0.6) == pytest.approx(np.full(200, -0.7), abs=1e-5)
+    assert slopes(stamp_ns[:1], values[:1], 0.6).tolist() == [0.0]
+
+
+def test_white_noise_is_told_from_motion():
+    t = np.arange(4000) / 200
+    noise = 0.05 * np.random.default_rng(1).normal(size=(4000, 3))
+    assert white_noise(noise + np.sin(t)[:, None]) == pytest.approx(0.05, rel=0.05)
+    assert white_noise(noise[:2]) == 0.0

@@ -303,3 +303,20 @@ def test_it_goes_to_a_bucket_and_another_one_is_the_next_generation(evaluated, m
         assert run_evaluation(model, dataset, "s3://found/by me", config=CONFIG).values == told.values
         other = run_evaluation(model, dataset, "s3://found/by me", config=replace(CONFIG, seed=1))
         assert "/generations/0000000002-" in other.path
+
+
+def test_the_same_again_predicts_nothing(evaluated, model, dataset, monkeypatch):
+    place, values = evaluated
+    before = {path: path.read_bytes() for path in place.iterdir()}
+    monkeypatch.setattr("tcpipe.learning.evaluation_files.evaluate", None)
+    assert run_evaluation(model, dataset, place, config=CONFIG).values == values
+    assert {path: path.read_bytes() for path in place.iterdir()} == before
+
+
+def test_a_network_of_energy_alone_is_no_model_to_evaluate(dataset, tmp_path):
+    architecture = replace(CARD.architecture, outputs=1, depth=1)
+    place = made_model(
+        tmp_path / "energy", architecture=architecture, channels=("height",), outputs=("energy_joule",), scale=(400.0,)
+    )
+    with pytest.raises(ModelError, match="it predicts energy_joule alone, wanted power_watt and velocity_mps"):
+        run_evaluation(place, dataset, tmp_path / "evaluation", config=CONFIG)

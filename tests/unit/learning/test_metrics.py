@@ -13,6 +13,7 @@ from tcpipe.learning.metrics import (
     LEAST,
     Spread,
     combined,
+    costs,
     errors,
     errors_by_class,
     label_floor,
@@ -109,3 +110,9 @@ def test_scores_of_classes_are_those_of_all_samples_and_absent_where_nothing_is_
         assert getattr(by_class[ALL], score) == pytest.approx(getattr(pooled, score))
     assert errors(predicted, measured).nll is None
     assert combined([pooled, errors(predicted, measured)]).crps is None
+
+
+def test_time_and_energy_follow_from_power_and_velocity():
+    found = costs(np.array([150.0]), np.array([0.75]), 1.5)
+    assert found["T"][0] == pytest.approx(2.0)
+    assert found["E"][0] == pytest.approx(300.0)

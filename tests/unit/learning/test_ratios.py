@@ -26,6 +26,16 @@ def test_nothing_to_divide_by_is_no_ratio(losses):
     assert found.value is found.low is found.high is None
 
 
+def test_groups_that_err_alike_make_it_less_sure():
+    rng = np.random.default_rng(3)
+    shared = np.repeat(rng.lognormal(0.0, 0.5, 20), 50)
+    ours, theirs = shared * rng.exponential(size=1000), rng.exponential(size=1000)
+    together, alone = (
+        ratio_of_errors(ours, theirs, groups, power=1.0, seed=0) for groups in (np.arange(1000) // 50, np.arange(1000))
+    )
+    assert np.log(together.high / together.low) > 1.5 * np.log(alone.high / alone.low)
+
+
 def test_how_often_an_interval_holds_the_truth():
     """30 groups of 20 in which both sides err alike; 200 such data sets, 92 to 95 of 100 hold it, less three deviations of that share."""
     held, sets, groups = 0, 200, np.repeat(np.arange(30), 20)
