@@ -1,4 +1,4 @@
-"""The store: where runs and maps live, by content, in a directory or a bucket with one layout and one protocol (ADR 84).
+"""The store: where runs and maps live, by content, in a directory or a bucket with one layout and one protocol (ADR-28).
 
 ::
 

@@ -1,4 +1,4 @@
-"""How alike the labels of near samples are, and to how many independent ones a set of samples is worth (ADR 20).
+"""How alike the labels of near samples are, and to how many independent ones a set of samples is worth (ADR-19).
 
 What is alike is not the label but its residual: what is left of it when class and slope have explained what they can. Its
 semivariogram γ(h), half the mean squared difference of residuals h apart, is fitted by c0 + c1 (1 - exp(-h / L)) (Cressie, *Statistics for

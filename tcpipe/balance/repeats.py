@@ -1,4 +1,4 @@
-"""The repeatability floor: how much a label differs where one place is driven again in one direction (ADR 21).
+"""The repeatability floor: how much a label differs where one place is driven again in one direction (ADR-19).
 
 No model that sees the ground alone can tell two passes apart, so none predicts single labels better than they repeat. Two passes of one
 place give s² = (r1 - r2)² / 2, r being the label without what class and slope explain of it, for two footprints are never quite the same

@@ -1,4 +1,4 @@
-"""Where to drive next: ground of rare class and slope that was not driven, as polygons (ADR 22)."""
+"""Where to drive next: ground of rare class and slope that was not driven, as polygons (ADR-19)."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """How wrong a model's time and energy are, of a metre and of a path, from how wrong it was on samples that it did not learn from.
 
-Held-out samples have a label and a prediction. Of them are taken, in this order (docs/adr, What a prediction's error is made of):
+Held-out samples have a label and a prediction. Of them are taken, in this order (ADR-25):
 
 * the **bias** of each terrain class: what all its metres took over what was said of them, less one, as far as it is beyond chance. With
   b the ratio of a class, b0 that of all and s its standard error over blocks of the drives, b0 + (b - b0) max(0, 1 - s² / (b - b0)²)

@@ -1,4 +1,4 @@
-"""The log of a store: commits as small sealed files that are put where there is none, and snapshots of the state (ADR 105).
+"""The log of a store: commits as small sealed files that are put where there is none, and snapshots of the state (ADR-29).
 
 ::
 

@@ -1,4 +1,4 @@
-"""Commits: what each call wrote into the log of its store; and the state that they add up to, a pure function (ADR 105)."""
+"""Commits: what each call wrote into the log of its store; and the state that they add up to, a pure function (ADR-29)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The key ``geo`` of a Parquet file, which tells QGIS, GDAL, GeoPandas and DuckDB where its rows lie (GeoParquet 1.1, ADR 90)."""
+"""The key ``geo`` of a Parquet file, which tells QGIS, GDAL, GeoPandas and DuckDB where its rows lie (GeoParquet 1.1, ADR-2)."""
 
 from __future__ import annotations
 

@@ -48,7 +48,7 @@ class KnownLog:
     sensors: Mapping[str, KnownSensor]
     """By role."""
     outline: str = ""
-    """Hash of the log's size and index; "" where it has none (ADR 86)."""
+    """Hash of the log's size and index; "" where it has none (ADR-30)."""
 
 
 @dataclass(frozen=True, slots=True)

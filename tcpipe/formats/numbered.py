@@ -1,4 +1,4 @@
-"""Numbered documents, ``<stem>-<n>.json``: none ever changes, and the one of the highest number holds (ADR 84).
+"""Numbered documents, ``<stem>-<n>.json``: none ever changes, and the one of the highest number holds (ADR-28).
 
 A writer first puts the files that its document names, each under a name that follows from its content, then the document under the next
 number, where there is none. So a reader sees a whole generation or the one before, and of two writers one is told that it came second.

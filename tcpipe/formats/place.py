@@ -1,4 +1,4 @@
-"""Where files lie, a directory or a bucket, behind the same few verbs: what a store, its index and its readers are made of (ADR 84).
+"""Where files lie, a directory or a bucket, behind the same few verbs: what a store, its index and its readers are made of (ADR-28).
 
 A name is relative, with ``/`` between its parts. What may be there already under a name is of three kinds, and there is a verb for each:
 

@@ -1,4 +1,4 @@
-"""Directories with a sealed card (datasets, models, cost maps) in a bucket: fetched to this machine, and put there, card last (ADR 86).
+"""Directories with a sealed card (datasets, models, cost maps) in a bucket: fetched to this machine, and put there, card last (ADR-30).
 
 The card lists every other file with its checksum. So a reader sees all of one attempt or none, what is cached is told by its content, and
 whoever else puts the same content helps.

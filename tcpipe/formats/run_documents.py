@@ -25,7 +25,7 @@ class LogOrigin:
     sha256: str
     size_bytes: int = 0
     sha256_of: Literal["log", "index"] = "log"
-    """What is hashed: of a log in object storage, of which only a part was fetched, sizes and indexes of its files (ADR 86)."""
+    """What is hashed: of a log in object storage, of which only a part was fetched, sizes and indexes of its files (ADR-30)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,7 +56,7 @@ class RunJson:
     streams_key: str = ""
     """Names the read settings that they were made with."""
     outline: str = field(default="", metadata=LEFT_OUT)
-    """Hash of the log's size and index, by which it is known where not all of it is at hand (ADR 86); "" where it has none."""
+    """Hash of the log's size and index, by which it is known where not all of it is at hand (ADR-30); "" where it has none."""
 
 
 def tell_the_same(one: RunJson, other: RunJson) -> bool:

@@ -1,4 +1,4 @@
-"""Seals: what lets `tcpipe verify` find one changed byte in files that no list of checksums can name (ADR 18).
+"""Seals: what lets `tcpipe verify` find one changed byte in files that no list of checksums can name (ADR-28).
 
 A JSON document holds the sha256 of the rest of itself, a page that of all before its last line; a PNG brings its own checksums. What
 a sealed document lists, by path, size and sha256, is proved by it in turn.

@@ -34,7 +34,7 @@ logger = logging.getLogger("tcpipe")
 _READ_TOGETHER = 1024
 
 FEW_SAMPLES = 20_000
-"""Training samples below which a network is not expected to do better than a table (docs/adr, A network begins where it may pay)."""
+"""Training samples below which a network is not expected to do better than a table (ADR-23)."""
 
 _CALLED = {"turn_radpm": "turn (turn_rate_radps)", "command_mps": "commanded speed (commanded_velocity_mps)"}
 

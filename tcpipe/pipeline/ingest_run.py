@@ -109,7 +109,7 @@ def _read_rows(store: Store, state: State, run_id: str, recipe_id: str) -> list[
 
 
 def _find_hash(state: State, log: AnyLog) -> str:
-    """Return the hash by which the store knows a log, or is to know it (ADR 86).
+    """Return the hash by which the store knows a log, or is to know it (ADR-30).
 
     That is the log's own unless the same recording was ingested from elsewhere, where more or less of it was at hand. A run with damage
     is not taken for it: what was broken there may be whole here.

@@ -1,4 +1,4 @@
-"""Recordings that are in the store twice: one file under two names, or two recordings of one drive, whole or in part (ADR 19)."""
+"""Recordings that are in the store twice: one file under two names, or two recordings of one drive, whole or in part (ADR-18)."""
 
 from __future__ import annotations
 

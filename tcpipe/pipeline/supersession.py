@@ -1,4 +1,4 @@
-"""Runs whose log was completed, repaired or recorded on: the older run is superseded, and counts again when its log is back (ADR 51)."""
+"""Runs whose log was completed, repaired or recorded on: the older run is superseded, and counts again when its log is back (ADR-18)."""
 
 from __future__ import annotations
 

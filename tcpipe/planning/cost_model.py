@@ -68,7 +68,7 @@ class CostModel(Protocol):
 
     @property
     def label_velocity(self) -> str:
-        """``ground``: chord over duration; ``fused``: forward velocity along the surface (docs/adr, Velocity is chord over duration)."""
+        """``ground``: chord over duration; ``fused``: forward velocity along the surface (ADR-10)."""
 
     @property
     def label_energy(self) -> str:

@@ -1,4 +1,4 @@
-"""The 16 courses of a cost map, and which cells a step along each of them touches (docs/adr, Courses and edge costs).
+"""The 16 courses of a cost map, and which cells a step along each of them touches (ADR-27).
 
 The courses are the directions from a cell to the nearest 16 cells that can be reached without passing another's centre: (1, 0), (2, 1),
 (1, 1), (1, 2) and so on around. They lie 18.4° to 26.6° apart, 0°, 26.6°, 45°, 63.4°, 90° …, counter-clockwise from the grid's east. So the

@@ -1,4 +1,4 @@
-"""Least-cost paths over a cost grid: scipy's Dijkstra on a sparse graph of 16 courses (docs/adr, Courses and edge costs).
+"""Least-cost paths over a cost grid: scipy's Dijkstra on a sparse graph of 16 courses (ADR-27).
 
 The cost of a step is the integral of the cost a metre, along the step's course, over the cells it crosses. Down a slope energy comes back
 and a metre may cost less than nothing, which Dijkstra forbids. A potential that is proportional to height takes the grade out: with

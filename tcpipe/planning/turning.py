@@ -1,8 +1,8 @@
 """What the turns of a path cost, by the physics of its robot: so many joules a radian, on the ground where it turns.
 
 A model of patches knows of turning only what its segments did: they were steady and nearly straight. Of a path that turns more than a metre
-of them, what is beyond costs ``M |turn|``: the torque of a skid-steered robot hardly depends on how fast it turns (docs/adr, Physics has a
-term for turning). Nothing is said of the time that a turn takes.
+of them, what is beyond costs ``M |turn|``: the torque of a skid-steered robot hardly depends on how fast it turns
+(ADR-13). Nothing is said of the time that a turn takes.
 """
 
 from __future__ import annotations

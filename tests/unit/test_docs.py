@@ -63,6 +63,23 @@ def test_every_decision_stands_once_in_the_index() -> None:
     assert sorted((name, f"# {number}. {title}") for number, title, name in listed) == sorted(pages.items())
 
 
+def test_references_to_decisions_lead_somewhere() -> None:
+    """Code and pages name a decision as ADR-n: its number exists, is the one that a link beside it leads to, and no older form is left."""
+    numbers = {int(page.name[:4]) for page in (ROOT / "docs/adr").glob("[0-9]*.md")}
+    assert len(numbers) <= 35
+    parts = [ROOT / "tcpipe", ROOT / "tests", ROOT / "docs", ROOT / "schemas", ROOT / "benchmarks", ROOT / "pipelines"]
+    files = [path for part in parts for path in part.rglob("*") if path.suffix in (".py", ".md", ".toml", ".json")]
+    named, wrong = 0, []
+    for path in (*files, *ROOT.glob("*.md")):
+        text = path.read_text(encoding="utf-8")
+        named += len(re.findall(r"\bADR-\d", text))
+        wrong += [(path.name, hit) for hit in re.findall(r"\bADRs?\s+\d+|docs/adr, [A-Z]\w+", text)]
+        wrong += [(path.name, hit) for hit in re.findall(r"\bADR-(\d+)", text) if int(hit) not in numbers]
+        wrong += [(path.name, hit) for hit in re.findall(r"\[ADR-(\d+)\]\((?!(?:\S*/)?0*\1-)", text)]
+    assert not wrong
+    assert named > 100
+
+
 def _command_lines(page: Path) -> Iterator[str]:
     """Yield every ``tcpipe …`` command in the page's plain and console blocks, and in its inline code."""
     text = page.read_text(encoding="utf-8").replace("\\\n", " ")
