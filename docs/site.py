@@ -29,7 +29,7 @@ def on_files(files: Any, config: Any) -> Any:
 
 
 def on_page_markdown(markdown: str, *, page: Any, config: Any, files: Any) -> str:  # noqa: ARG001  MkDocs' signature
-    """Return a page whose links out of the documentation are text; keep decisions (ADRs) out of the search."""
+    """Return a page whose links out of the documentation are text; keep decisions out of the search."""
     if page.file.src_uri.startswith("adr/"):
         page.meta["search"] = {"exclude": True}
     here = (ROOT / "docs" / page.file.src_uri).parent
