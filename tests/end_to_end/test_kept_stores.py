@@ -110,8 +110,9 @@ def test_a_card_is_migrated_once_and_nothing_else_changes(untouched, name):
     old, new = (json.loads(files[untouched / name / "dataset.json"]) for files in (before, after))
     changed = {key for key in {*old, *new} if new.get(key) != old.get(key)}
     assert changed <= {
-        "data_model_version", "document_sha256", "warnings", "problems", "findings", "runs", "maps", "verdict"
+        "data_model_version", "document_sha256", "warnings", "problems", "findings", "runs", "split", "maps", "verdict"
     }  # fmt: skip
+    assert old["split"].items() <= {**new["recipe"]["split"], **new["split"]}.items(), "nothing is lost with it"
     assert verify(untouched / name).problems == ()
     again = migrate(untouched / name)
     assert (again.migrated, again.exit_code) == ((), 0)
