@@ -146,9 +146,9 @@ def test_the_facts_count_what_was_fused(truth):
 
 
 def test_both_engines_agree_on_a_drive():
-    truth = drive(seconds=4.0, seed=9)
+    truth = drive(seconds=2.0, seed=9)
     measurements = measured(truth, 9)
-    ours, theirs = (_run(truth, measurements, engine=engine, end=500) for engine in ("compiled", "filterpy"))
+    ours, theirs = (_run(truth, measurements, engine=engine, end=300) for engine in ("compiled", "filterpy"))
     np.testing.assert_allclose(ours.position_enu_m, theirs.position_enu_m, rtol=0, atol=1e-9)
     np.testing.assert_allclose(ours.quat_xyzw, theirs.quat_xyzw, rtol=0, atol=1e-9)
     np.testing.assert_allclose(ours.yaw_std_rad, theirs.yaw_std_rad, rtol=0, atol=1e-9)
