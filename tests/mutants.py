@@ -32,7 +32,7 @@ ROOT = Path(__file__).resolve().parents[1]
 ROOMS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "motion": (("tcpipe/motion",), ("tests/unit/motion",)),
     "path": (("tcpipe/path",), ("tests/unit/path",)),
-    "splits": (("tcpipe/splits",), ("tests/unit/splits",)),
+    "splits": (("tcpipe/splits",), ("tests/unit/splits", "tests/property/test_splits.py")),
     "power": (("tcpipe/power",), ("tests/unit/power",)),
     "cost": (("tcpipe/cost",), ("tests/unit/cost", "tests/unit/stages/test_label.py")),
     "terrain": (("tcpipe/terrain",), ("tests/unit/terrain", "tests/unit/stages/test_sample.py")),

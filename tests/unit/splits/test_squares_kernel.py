@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-import shapely
 from splits_squares import squares
 
 from tcpipe.splits.neighbours import near_pairs, nearest_m, shared_fraction
@@ -14,14 +13,6 @@ def both(a, b):
     pair_distances(a, b, one, zero, distance)
     pair_overlaps(a, b, one, zero, area)
     return float(distance[0]), float(area[0])
-
-
-def test_random_pairs_are_those_of_shapely():
-    rng = np.random.default_rng(4)
-    for _ in range(60):
-        a, b = (squares(rng.uniform(0, 2.5, (1, 2)), rng.uniform(-np.pi, np.pi, 1)) for _ in range(2))
-        p, q = shapely.polygons(a[0]), shapely.polygons(b[0])
-        assert both(a, b) == pytest.approx((p.distance(q), p.intersection(q).area), abs=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -49,16 +40,6 @@ def test_each_footprint_is_held_against_its_nearest_however_many_there_are():
     assert nearest_m(ours[:0], theirs).size == 0
 
 
-def test_a_footprint_whose_centre_is_farther_may_be_nearer():
-    """Eight diamonds stand closer by their centres than a ninth square that reaches out with a corner."""
-    ring = [(2.0 * np.cos(turn), 2.0 * np.sin(turn)) for turn in np.linspace(0, 2 * np.pi, 9)[:-1]]
-    away = squares(ring, np.linspace(0, 2 * np.pi, 9)[:-1])  # an edge towards the middle
-    near = squares([(2.05, 0.1)], np.pi / 4)
-    found = nearest_m(squares([(0, 0)]), np.concatenate([away, near]))
-    expected = min(shapely.polygons(squares([(0, 0)])[0]).distance(shapely.polygons(each)) for each in (*away, *near))
-    assert found == pytest.approx([expected])
-
-
 def test_pairs_are_all_within_reach_and_in_order():
     ours, theirs = np.array([[0.0, 0.0], [9.0, 0.0], [3.0, 0.0]]), np.array([[1.0, 0.0], [0.0, 2.0], [50.0, 0.0]])
     ((i, j),) = near_pairs(ours, theirs, within_m=2.0)
@@ -72,11 +53,3 @@ def test_a_share_is_of_our_own_ground():
     index = np.zeros(1, np.int64)
     assert shared_fraction(ours, theirs, index, index) == pytest.approx([0.25])
     assert shared_fraction(theirs, ours, index, index) == pytest.approx([1.0])
-
-
-def test_a_square_whose_corner_is_nearest_is_found_behind_others_whose_centres_are_nearer():
-    """By hand: eight squares 2 m away, and a ninth, turned by 45 degrees, whose centre is farther and whose corner is nearer."""
-    ours = squares(np.zeros((1, 2)), np.zeros(1))
-    centres = np.array([[3.0, 0.0]] * 8 + [[0.0, 3.1]])
-    theirs = squares(centres, np.array([0.0] * 8 + [np.pi / 4.0]))
-    assert nearest_m(ours, theirs) == pytest.approx([3.1 - 0.5 - np.sqrt(0.5)], abs=1e-12)
