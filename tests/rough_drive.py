@@ -1,6 +1,8 @@
 """A drive over a known bumpy surface, and what its sensors would measure: truth for tests of the forward filter."""
 
+import math
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 
@@ -49,6 +51,7 @@ def _frame(heading, dx, dy):
     return np.stack((ahead, np.cross(up, ahead), up), -1)
 
 
+@cache
 def drive(seconds=120.0, seed=0):
     """Speeds up, weaves at about 1 m/s, slows down twice a minute."""
     rng = np.random.default_rng(seed)
@@ -64,12 +67,16 @@ def drive(seconds=120.0, seed=0):
     )
     heading -= heading[0] - phase[3]
     xy = np.zeros((n, 2))
+    ahead = np.column_stack((np.cos(heading), np.sin(heading))).tolist()
+    x = y = 0.0
     for k in range(n - 1):
-        step = xy[k]
+        at_x, at_y = x, y
         for half, share in ((2 * k, 0.5), (2 * k + 1, 1.0)):
-            _, dx, dy = _surface(*step)
-            step = xy[k] + speed[half] * _frame(heading[half], dx, dy)[:2, 0] * share / RATE_HZ
-        xy[k + 1] = step
+            _, dx, dy = _surface(at_x, at_y)
+            east, north = ahead[half]
+            step = speed[half] * share / RATE_HZ / math.hypot(1.0, dx * east + dy * north)
+            at_x, at_y = x + step * east, y + step * north
+        x, y = xy[k + 1] = at_x, at_y
     z, dx, dy = _surface(xy[:, 0], xy[:, 1])
     rotation = _frame(heading[::2], dx, dy)
     velocity = speed[::2, None] * rotation[:, :, 0]

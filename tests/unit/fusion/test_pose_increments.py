@@ -33,7 +33,7 @@ def test_a_velocity_that_turns_round_with_the_path_is_along_the_poses_axes_and_t
     assert in_child_axes(along, quats(yaw)) == pytest.approx(np.tile([SPEED, 0.0, 0.0], (T.size, 1)), abs=1e-9)
 
 
-@pytest.mark.parametrize("scale", [0.7, 1.0, 1.4])
+@pytest.mark.parametrize("scale", [0.7, 1.4])
 def test_a_velocity_of_another_scale_is_turned_as_well(scale):
     yaw, place, along = circle()
     assert along_pose_axes(STAMP_NS, scale * along, place, quats(yaw))
@@ -58,16 +58,10 @@ def test_an_odometry_without_poses_or_with_one_axis_is_left():
 
 def test_such_an_odometry_is_prepared_as_driving_forward_and_it_is_said():
     yaw, place, along = circle()
-    unknown = np.full(T.size, np.nan)
-    columns = dict.fromkeys(("yaw_rate_var", *(f"velocity_var_{axis}_m2ps2" for axis in "xyz")), unknown)
-    columns |= {f"angular_velocity_{axis}_radps": unknown for axis in "xy"}
-    columns |= {"angular_velocity_z_radps": np.full(T.size, RATE)}
+    columns = odometry(along[:, 0], yaw, np.full(T.size, RATE))
     columns |= {f"velocity_{axis}_mps": along[:, k] for k, axis in enumerate("xyz")}
     columns |= {f"{axis}_m": place[:, k] for k, axis in enumerate("xyz")}
-    columns |= {f"quat_{c}": quats(yaw)[:, k] for k, c in enumerate("xyzw")}
-    made, prepared = body_velocities(
-        STAMP_NS, columns, xyz_m=(0, 0, 0), quat_xyzw=(0, 0, 0, 1), default_std_mps=0.05, only_forward=True
-    )
+    made, prepared = twists(columns)
     assert made.velocity_mps[:, 0] == pytest.approx(np.full(T.size, SPEED))
     assert prepared.findings[0].code == "twist-in-pose-frame"
 
@@ -100,6 +94,11 @@ def test_a_rate_that_is_measured_stays_and_so_does_one_beside_an_orientation_tha
         assert not turns.any()
 
 
+def twists(columns):
+    given = {"xyz_m": (0.0, 0.0, 0.0), "quat_xyzw": (0.0, 0.0, 0.0, 1.0), "default_std_mps": 0.05}
+    return body_velocities(STAMP_NS, columns, **given, only_forward=True)
+
+
 def odometry(velocity_x, yaw, rate_z):
     """Columns of an odometry that tells no pose but its orientation."""
     nothing = np.full(T.size, np.nan)
@@ -113,8 +112,7 @@ def odometry(velocity_x, yaw, rate_z):
 
 def test_an_odometry_without_a_turn_rate_turns_with_its_orientation():
     yaw, _, _ = circle()
-    given = {"xyz_m": (0.0, 0.0, 0.0), "quat_xyzw": (0.0, 0.0, 0.0, 1.0), "default_std_mps": 0.05, "only_forward": True}
-    made, prepared = body_velocities(STAMP_NS, odometry(np.full(T.size, SPEED), yaw, np.full(T.size, np.nan)), **given)
+    made, prepared = twists(odometry(np.full(T.size, SPEED), yaw, np.full(T.size, np.nan)))
     assert made.yaw_rate_radps[1:-1] == pytest.approx(RATE)
     (finding,) = prepared.findings
     assert (finding.code, finding.names) == ("rate-from-orientation", {"axes": "z"})
@@ -123,14 +121,13 @@ def test_an_odometry_without_a_turn_rate_turns_with_its_orientation():
 def test_counts_that_come_with_every_other_message_are_averaged_and_as_uncertain_as_they_scatter():
     yaw, _, _ = circle()
     speed = np.where(np.arange(T.size) % 2, 2.0 * SPEED, 0.0)
-    given = {"xyz_m": (0.0, 0.0, 0.0), "quat_xyzw": (0.0, 0.0, 0.0, 1.0), "default_std_mps": 0.05, "only_forward": True}
-    made, prepared = body_velocities(STAMP_NS, odometry(speed, yaw, np.full(T.size, RATE)), **given)
+    made, prepared = twists(odometry(speed, yaw, np.full(T.size, RATE)))
     assert made.velocity_mps[5:-5, 0] == pytest.approx(SPEED, rel=0.25)
     assert made.velocity_mps[5:-5, 0].mean() == pytest.approx(SPEED, rel=0.01)
     assert (made.variance_m2ps2[5:-5, 0] > 1.0).all()
     assert "velocity-scatters" in {of.code for of in prepared.findings}
     noisy = SPEED + 0.05 * np.random.default_rng(1).standard_normal(T.size)
-    made, prepared = body_velocities(STAMP_NS, odometry(noisy, yaw, np.full(T.size, RATE)), **given)
+    made, prepared = twists(odometry(noisy, yaw, np.full(T.size, RATE)))
     assert (made.velocity_mps[:, 0] == noisy).all()
     assert not prepared.findings
 
@@ -139,7 +136,6 @@ def test_a_twist_that_tells_no_forward_velocity_is_none_where_the_poses_move():
     yaw, place, _ = circle()
     columns = odometry(np.full(T.size, np.nan), yaw, np.full(T.size, RATE))
     columns |= {"velocity_y_mps": np.full(T.size, 0.01), **{f"{a}_m": place[:, k] for k, a in enumerate("xyz")}}
-    given = {"xyz_m": (0.0, 0.0, 0.0), "quat_xyzw": (0.0, 0.0, 0.0, 1.0), "default_std_mps": 0.05, "only_forward": True}
-    made, prepared = body_velocities(STAMP_NS, columns, **given)
+    made, prepared = twists(columns)
     assert made.velocity_mps[:, 0] == pytest.approx(SPEED, rel=1e-3)
     assert [(of.code, of.subject.name) for of in prepared.findings] == [("pose-increments", "wheel_odometry")]

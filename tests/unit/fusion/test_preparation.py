@@ -9,6 +9,7 @@ from tcpipe.fusion.preparation import body_velocities, find_datum, ground_veloci
 
 NAN = np.nan
 ARM = (0.1, 0.2, 0.3)
+DATUM = (15.0, 47.0, 400.0)
 
 
 def stamps(count, period=100_000_000):
@@ -21,14 +22,16 @@ def gnss_columns(lon, lat, alt, variance=0.0004):
     return columns | {f"{axis}_var_m2": np.full(lon.size, variance) for axis in ("east", "north", "up")}
 
 
+def fixes(stamp_ns, columns):
+    rules = {"lever_arm_m": ARM, "default_std_m": 0.05, "floor_std_m": 0.01}
+    return positions(stamp_ns, columns, datum_deg_m=DATUM, **rules)
+
+
 def test_fixes_become_enu_and_a_fix_at_null_island_is_set_aside():
-    datum = (15.0, 47.0, 400.0)
     columns = gnss_columns([15.0, 0.0, 15.001, 15.002], [47.0, 0.0, 47.001, 47.002], [400.0, 0.0, 410.0, 420.0])
     stamp = stamps(4)
     stamp[3] = stamp[2]
-    found, prepared = positions(
-        stamp, columns, datum_deg_m=datum, lever_arm_m=ARM, default_std_m=0.05, floor_std_m=0.01
-    )
+    found, prepared = fixes(stamp, columns)
     assert found.stamp_ns.tolist() == stamp[[0, 2]].tolist()
     assert prepared.invalid_ns.tolist() == [stamp[1]]
     assert prepared.repeated == 1
@@ -40,23 +43,14 @@ def test_fixes_become_enu_and_a_fix_at_null_island_is_set_aside():
     assert found.position_enu_m[1] == pytest.approx(pipeline.transform(15.001, 47.001, 410.0), abs=1e-6)
 
 
-@pytest.mark.parametrize("claimed", [NAN, 0.0, -1.0, np.inf])
-def test_a_variance_that_says_nothing_is_the_recipes(claimed):
-    columns = gnss_columns([15.0], [47.0], [400.0], claimed)
-    found, prepared = positions(
-        stamps(1), columns, datum_deg_m=(15.0, 47.0, 400.0), lever_arm_m=ARM, default_std_m=0.05, floor_std_m=0.01
-    )
-    assert found.variance_m2[0] == pytest.approx([0.0025, 0.0025, 0.01])
-    assert prepared.variances_replaced == 1
-
-
-def test_a_variance_too_good_to_be_true_is_floored():
-    columns = gnss_columns([15.0], [47.0], [400.0], 1e-12)
-    found, prepared = positions(
-        stamps(1), columns, datum_deg_m=(15.0, 47.0, 400.0), lever_arm_m=ARM, default_std_m=0.05, floor_std_m=0.01
-    )
-    assert found.variance_m2[0] == pytest.approx([1e-4] * 3)
-    assert prepared.variances_replaced == 0
+@pytest.mark.parametrize(
+    ("claimed", "taken", "replaced"),
+    [*((nothing, [0.0025, 0.0025, 0.01], 1) for nothing in (NAN, 0.0, -1.0, np.inf)), (1e-12, [1e-4] * 3, 0)],
+)
+def test_a_variance_that_says_nothing_is_the_recipes_and_one_too_good_is_floored(claimed, taken, replaced):
+    found, prepared = fixes(stamps(1), gnss_columns([15.0], [47.0], [400.0], claimed))
+    assert found.variance_m2[0] == pytest.approx(taken)
+    assert prepared.variances_replaced == replaced
 
 
 def test_datum_is_the_median_of_the_first_fixes_also_at_the_date_line():
@@ -75,24 +69,20 @@ def odometry_columns(count, **known):
     return {name: np.full(count, NAN) for name in names} | {k: np.asarray(v, float) for k, v in known.items()}
 
 
+def twists(columns, **options):
+    given = {"xyz_m": ARM, "quat_xyzw": (0, 0, 0, 1), "default_std_mps": 0.05, "only_forward": False}
+    return body_velocities(stamps(len(columns["x_m"])), columns, **given | options)
+
+
 def test_a_twist_is_turned_into_base_link_with_its_variance():
     # A camera with x right, y down, z forward.
     quat = Rotation.from_matrix([[0, 0, 1], [-1, 0, 0], [0, -1, 0]]).as_quat()
-    columns = odometry_columns(
-        1,
-        velocity_x_mps=[0.1],
-        velocity_y_mps=[0.2],
-        velocity_z_mps=[1.0],
-        angular_velocity_x_radps=[0.0],
-        angular_velocity_y_radps=[-0.5],
-        angular_velocity_z_radps=[0.0],
-        velocity_var_x_m2ps2=[0.01],
-        velocity_var_y_m2ps2=[0.04],
-        velocity_var_z_m2ps2=[0.09],
-    )
-    found, _ = body_velocities(
-        stamps(1), columns, xyz_m=ARM, quat_xyzw=tuple(quat), default_std_mps=0.05, only_forward=False
-    )
+    columns = odometry_columns(1)
+    for axis, speed, turn, variance in (("x", 0.1, 0.0, 0.01), ("y", 0.2, -0.5, 0.04), ("z", 1.0, 0.0, 0.09)):
+        columns[f"velocity_{axis}_mps"][:] = speed
+        columns[f"angular_velocity_{axis}_radps"][:] = turn
+        columns[f"velocity_var_{axis}_m2ps2"][:] = variance
+    found, _ = twists(columns, quat_xyzw=tuple(quat))
     assert found.velocity_mps[0] == pytest.approx([1.0, -0.1, -0.2])
     assert found.variance_m2ps2[0] == pytest.approx([0.09, 0.01, 0.04])
     assert found.yaw_rate_radps[0] == pytest.approx(0.5)
@@ -106,9 +96,7 @@ def test_an_axis_that_is_not_measured_stays_so_whichever_way_the_sensor_is_turne
     )  # fmt: skip
     about_x = tuple(Rotation.from_euler("x", 90, degrees=True).as_quat())
     for quat, sideways in (((0.0, 0.0, 0.0, 1.0), 1), (about_x, 2)):
-        found, _ = body_velocities(
-            stamps(2), columns, xyz_m=ARM, quat_xyzw=quat, default_std_mps=0.1, only_forward=False
-        )
+        found, _ = twists(columns, quat_xyzw=quat, default_std_mps=0.1)
         assert found.velocity_mps[:, 0].tolist() == [0.5, 0.6]
         assert found.variance_m2ps2[:, sideways].tolist() == [1e6, 1e6]
         assert found.variance_m2ps2[0, 3 - sideways] == pytest.approx(0.01)
@@ -120,9 +108,7 @@ def test_wheels_measure_forward_only_and_rows_without_velocity_are_set_aside():
     columns = odometry_columns(
         3, velocity_x_mps=[1.0, NAN, 99.0], velocity_y_mps=[0.3, NAN, 0.0], velocity_z_mps=[0, NAN, 0]
     )
-    found, prepared = body_velocities(
-        stamps(3), columns, xyz_m=ARM, quat_xyzw=(0, 0, 0, 1), default_std_mps=0.05, only_forward=True
-    )
+    found, prepared = twists(columns, only_forward=True)
     assert found.velocity_mps[0, 0] == 1.0
     assert np.isnan(found.velocity_mps[0, 1:]).all()
     assert found.variance_m2ps2[0, 0] == pytest.approx(0.05**2)
@@ -138,18 +124,10 @@ def test_poses_become_the_velocity_of_a_circle_where_the_twist_is_empty(twist):
     turn = Rotation.from_euler("ZYX", np.column_stack((0.5 * t + 2.0, 0 * t, 0 * t)))
     xy = 2.0 * np.column_stack((np.sin(0.5 * t + 2.0), -np.cos(0.5 * t + 2.0)))
     quat = turn.as_quat() * np.where(np.arange(50) % 3 == 0, -1, 1)[:, None]
-    columns = odometry_columns(
-        50,
-        x_m=xy[:, 0],
-        y_m=xy[:, 1],
-        z_m=0 * t,
-        **dict(zip(("quat_x", "quat_y", "quat_z", "quat_w"), quat.T, strict=True)),
-    )
-    for axis in "xyz":
-        columns[f"velocity_{axis}_mps"] = np.full(50, twist)
-    found, prepared = body_velocities(
-        stamps(50), columns, xyz_m=ARM, quat_xyzw=(0, 0, 0, 1), default_std_mps=0.05, only_forward=False
-    )
+    columns = odometry_columns(50, x_m=xy[:, 0], y_m=xy[:, 1], z_m=0 * t)
+    columns |= {f"quat_{c}": quat[:, k] for k, c in enumerate("xyzw")}
+    columns |= {f"velocity_{axis}_mps": np.full(50, twist) for axis in "xyz"}
+    found, prepared = twists(columns)
     assert [(of.code, of.subject.name) for of in prepared.findings] == [("pose-increments", "visual_odometry")]
     chord = 2 * 2.0 * np.sin(0.025) / 0.1  # a chord is shorter than its arc
     assert found.velocity_mps == pytest.approx(np.tile([chord, 0, 0], (49, 1)), abs=1e-9)
@@ -158,20 +136,16 @@ def test_poses_become_the_velocity_of_a_circle_where_the_twist_is_empty(twist):
 
 
 def test_a_robot_that_stands_has_a_twist_of_zero():
-    columns = odometry_columns(
-        5,
-        velocity_x_mps=np.zeros(5),
-        velocity_y_mps=np.zeros(5),
-        velocity_z_mps=np.zeros(5),
-        x_m=np.ones(5),
-        y_m=np.ones(5),
-        z_m=np.zeros(5),
-    )
-    found, prepared = body_velocities(
-        stamps(5), columns, xyz_m=ARM, quat_xyzw=(0, 0, 0, 1), default_std_mps=0.05, only_forward=True
-    )
+    columns = odometry_columns(5, x_m=np.ones(5), y_m=np.ones(5), z_m=np.zeros(5))
+    found, prepared = twists(columns | {f"velocity_{axis}_mps": np.zeros(5) for axis in "xyz"}, only_forward=True)
     assert prepared.findings == ()
     assert found.velocity_mps[:, 0].tolist() == [0.0] * 5
+
+
+def prepared_imu(force, rate, quat=None, *, period_ns=100_000_000, **placed):
+    columns = imu_columns(force, rate, quat)
+    given = {"xyz_m": ARM, "quat_xyzw": (0, 0, 0, 1), "gyro_std_radps": 0.003, "accelerometer_std_mps2": 0.1}
+    return inertial(stamps(len(force), period_ns), columns, **given | placed)
 
 
 def imu_columns(force, rate, quat=None):
@@ -189,14 +163,7 @@ def test_imu_is_turned_by_its_mounting_orientation_too():
     up = attitude.inv().apply([0, 0, 9.8])
     force, rate = mounting.inv().apply(np.tile(up, (9, 1))), mounting.inv().apply(np.tile([0.1, 0.2, 0.3], (9, 1)))
     quat = np.tile((attitude * mounting).as_quat(), (9, 1))
-    found, prepared = inertial(
-        stamps(9),
-        imu_columns(force, rate, quat),
-        xyz_m=ARM,
-        quat_xyzw=tuple(mounting.as_quat()),
-        gyro_std_radps=0.003,
-        accelerometer_std_mps2=0.1,
-    )
+    found, prepared = prepared_imu(force, rate, quat, quat_xyzw=tuple(mounting.as_quat()))
     assert found.specific_force_mps2[0] == pytest.approx(up)
     assert found.angular_velocity_radps[0] == pytest.approx([0.1, 0.2, 0.3])
     assert found.quat_xyzw[0] == pytest.approx(attitude.as_quat(canonical=True))
@@ -207,14 +174,7 @@ def test_imu_is_turned_by_its_mounting_orientation_too():
 def test_noise_is_what_the_samples_show_where_that_is_more():
     rng = np.random.default_rng(7)
     force = [0, 0, 9.8] + rng.normal(size=(5000, 3)) * [0.2, 0.5, 0.1]
-    found, _ = inertial(
-        stamps(5000),
-        imu_columns(force, rng.normal(size=(5000, 3)) * 0.001),
-        xyz_m=ARM,
-        quat_xyzw=(0, 0, 0, 1),
-        gyro_std_radps=0.003,
-        accelerometer_std_mps2=0.1,
-    )
+    found, _ = prepared_imu(force, rng.normal(size=(5000, 3)) * 0.001)
     assert found.accelerometer_std_mps2 == pytest.approx(0.5, rel=0.05)
     assert found.gyro_std_radps == 0.003
 
@@ -224,28 +184,14 @@ def test_the_force_is_moved_to_base_link():
     t = np.arange(200) * 0.01
     rate = np.column_stack((0 * t, 0 * t, 0.2 * t + 0.5))
     force = np.column_stack((-2.0 * rate[:, 2] ** 2, 0 * t + 0.4, 0 * t + 9.8))
-    found, _ = inertial(
-        stamps(200, 10_000_000),
-        imu_columns(force, rate),
-        xyz_m=(2.0, 0.0, 0.3),
-        quat_xyzw=(0, 0, 0, 1),
-        gyro_std_radps=0.003,
-        accelerometer_std_mps2=0.1,
-    )
+    found, _ = prepared_imu(force, rate, period_ns=10_000_000, xyz_m=(2.0, 0.0, 0.3))
     assert found.specific_force_mps2[3:-3] == pytest.approx(np.tile([0.0, 0.0, 9.8], (194, 1)), abs=1e-9)
     assert found.lever_arm_m == (0.0, 0.0, 0.0)
 
 
 @pytest.mark.parametrize("norm", [1.0, 0.05])
 def test_a_force_in_g_or_without_gravity_is_not_used(norm):
-    found, prepared = inertial(
-        stamps(9),
-        imu_columns(np.tile([0, 0, norm], (9, 1)), np.zeros((9, 3))),
-        xyz_m=ARM,
-        quat_xyzw=(0, 0, 0, 1),
-        gyro_std_radps=0.003,
-        accelerometer_std_mps2=0.1,
-    )
+    found, prepared = prepared_imu(np.tile([0, 0, norm], (9, 1)), np.zeros((9, 3)))
     assert not found.accelerometer_usable
     (finding,) = prepared.findings
     assert (finding.code, finding.numbers) == ("specific-force-implausible", {"force_mps2": pytest.approx(norm)})

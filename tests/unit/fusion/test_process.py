@@ -12,26 +12,11 @@ from tcpipe.fusion import state_kernel as kernel
 from tcpipe.fusion.measurements import Measurements, Positions
 from tcpipe.fusion.preparation import inertial
 from tcpipe.fusion.process import process_noise, shake_density, slope_std_rad, turn_scale_std, turns_by_course
-from tcpipe.fusion.signals import slopes, white_noise
 
 
 @cache
 def measured(**options):
     return drive.measure(truth(), 1, **options)
-
-
-def test_slopes_of_a_line_are_its_own_whatever_its_stamps():
-    stamp_ns = np.sort(np.random.default_rng(0).integers(0, 10**10, 200)) + 10**18
-    values = 3.0 - 0.7 * (stamp_ns - 10**18) * 1e-9
-    assert slopes(stamp_ns, values, 0.6) == pytest.approx(np.full(200, -0.7), abs=1e-5)
-    assert slopes(stamp_ns[:1], values[:1], 0.6).tolist() == [0.0]
-
-
-def test_white_noise_is_told_from_motion():
-    t = np.arange(4000) / 200
-    noise = 0.05 * np.random.default_rng(1).normal(size=(4000, 3))
-    assert white_noise(noise + np.sin(t)[:, None]) == pytest.approx(0.05, rel=0.05)
-    assert white_noise(noise[:2]) == 0.0
 
 
 def test_vibration_counts_where_it_is():

@@ -3,21 +3,7 @@
 import numpy as np
 import pytest
 
-from tcpipe.fusion.signals import hold_last, in_gap, integral, interval_means, median_period_ns, seconds
-
-T = np.array([0.0, 1.0, 3.0])
-V = np.array([[0.0], [2.0], [0.0]])
-
-
-def test_integral_of_a_piecewise_linear_signal_held_outside():
-    # A triangle: area 1 up to 1, 2 more up to 3; at 2 the value is 1, so 1 + 1.5; before and after, the ends are held (at 0).
-    found = integral(T, V + 1.0, np.array([-1.0, 0.0, 0.5, 1.0, 2.0, 3.0, 5.0]))[:, 0]
-    assert found == pytest.approx([-1.0, 0.0, 0.75, 2.0, 4.5, 6.0, 8.0])
-
-
-def test_means_over_intervals_and_values_where_they_are_empty():
-    found = interval_means(T, V, np.array([0.0, 0.5, 2.0]), np.array([1.0, 2.0, 2.0]))[:, 0]
-    assert found == pytest.approx([1.0, (0.75 + 1.5) / 1.5, 1.0])
+from tcpipe.fusion.signals import hold_last, in_gap, median_period_ns, seconds, slopes, white_noise
 
 
 def test_intervals_that_touch_a_gap():
@@ -41,3 +27,17 @@ def test_seconds_keep_nanoseconds_of_large_stamps():
     assert seconds(np.array([zero + 1], np.int64), zero)[0] == 1e-9
     assert median_period_ns(np.array([zero, zero + 10, zero + 20, zero + 90], np.int64)) == 10
     assert median_period_ns(np.array([zero], np.int64)) == 1
+
+
+def test_slopes_of_a_line_are_its_own_whatever_its_stamps():
+    stamp_ns = np.sort(np.random.default_rng(0).integers(0, 10**10, 200)) + 10**18
+    values = 3.0 - 0.7 * (stamp_ns - 10**18) * 1e-9
+    assert slopes(stamp_ns, values, 0.6) == pytest.approx(np.full(200, -0.7), abs=1e-5)
+    assert slopes(stamp_ns[:1], values[:1], 0.6).tolist() == [0.0]
+
+
+def test_white_noise_is_told_from_motion():
+    t = np.arange(4000) / 200
+    noise = 0.05 * np.random.default_rng(1).normal(size=(4000, 3))
+    assert white_noise(noise + np.sin(t)[:, None]) == pytest.approx(0.05, rel=0.05)
+    assert white_noise(noise[:2]) == 0.0

@@ -72,11 +72,6 @@ def test_goes_on_without_a_sensor(truth, absent, within_m):
     assert trajectory.facts.covariance_repairs == 0
 
 
-def test_error_shrinks_with_the_gnss_noise(truth):
-    fine, coarse = (_errors(truth, _run(truth, measured(truth, 4, gnss_std=std)))[0] for std in (0.015, 0.5))
-    assert 3 * _rms(fine)[0] < _rms(coarse)[0] < 0.5
-
-
 def test_a_jump_of_the_gnss_is_refused_and_listed(truth):
     measurements = measured(truth, 5)
     gnss = measurements.gnss
@@ -94,28 +89,13 @@ def test_a_jump_of_the_gnss_is_refused_and_listed(truth):
     assert _rms(_errors(truth, trajectory)[0])[0] < 0.03
 
 
-def test_a_lasting_shift_of_the_gnss_does_not_lock_it_out(truth):
-    measurements = measured(truth, 6)
-    gnss = measurements.gnss
-    late = gnss.stamp_ns >= truth.stamp_ns[6000]
-    shifted = replace(gnss, position_enu_m=gnss.position_enu_m + late[:, None] * [5.0, 0.0, 0.0])
-    trajectory = _run(truth, replace(measurements, gnss=shifted))
-    east = trajectory.position_enu_m[:, 0] - truth.position[truth.at(trajectory.stamp_ns), 0]
-    after = trajectory.stamp_ns > truth.stamp_ns[6000] + 8_000_000_000
-    assert trajectory.facts.recovered[GNSS] >= 1
-    assert east[after] == pytest.approx(5.0, abs=0.1)
-
-
-def test_starts_from_a_heading_half_a_radian_off(truth):
-    start = replace(initial(truth, yaw_error=0.5), yaw_std_rad=np.pi)
+@pytest.mark.parametrize(("yaw_error", "yaw_std_rad", "found_after"), [(0.5, np.pi, 100), (2.0, 0.1, 600)])
+def test_finds_a_heading_that_it_does_not_know_or_of_which_it_was_wrongly_sure(
+    truth, yaw_error, yaw_std_rad, found_after
+):
+    start = replace(initial(truth, yaw_error=yaw_error), yaw_std_rad=yaw_std_rad)
     errors, _ = _errors(truth, _run(truth, measured(truth, 7), start))
-    assert np.abs(errors[100:, 4]).max() < np.radians(3.0)
-
-
-def test_finds_a_heading_of_which_it_was_wrongly_sure(truth):
-    start = replace(initial(truth, yaw_error=2.0), yaw_std_rad=0.1)
-    errors, _ = _errors(truth, _run(truth, measured(truth, 7), start))
-    assert np.abs(errors[600:, 4]).max() < np.radians(3.0)
+    assert np.abs(errors[found_after:, 4]).max() < np.radians(3.0)
 
 
 def test_an_estimate_uses_the_past_only(truth):
@@ -130,23 +110,6 @@ def test_an_estimate_uses_the_past_only(truth):
     past = Measurements(*(before(getattr(measurements, name)) for name in ("gnss", "imu", "wheels", "visual")))
     whole, part = _run(truth, measurements, end=3001), _run(truth, past, end=3001)
     np.testing.assert_array_equal(whole.position_enu_m, part.position_enu_m)
-
-
-def test_both_engines_agree_on_a_drive():
-    truth = drive(seconds=4.0, seed=9)
-    measurements = measured(truth, 9)
-    ours, theirs = (_run(truth, measurements, engine=engine, end=500) for engine in ("compiled", "filterpy"))
-    np.testing.assert_allclose(ours.position_enu_m, theirs.position_enu_m, rtol=0, atol=1e-9)
-    np.testing.assert_allclose(ours.quat_xyzw, theirs.quat_xyzw, rtol=0, atol=1e-9)
-    np.testing.assert_allclose(ours.yaw_std_rad, theirs.yaw_std_rad, rtol=0, atol=1e-9)
-    assert ours.facts.nis_mean == pytest.approx(theirs.facts.nis_mean)
-
-
-def test_the_facts_count_what_was_fused(truth):
-    facts = _run(truth, measured(truth, 10)).facts
-    assert set(facts.measurements) == {GNSS, IMU, WHEELS, VISUAL}
-    assert 0.7 < facts.nis_mean[GNSS] < 1.2
-    assert facts.recovered == dict.fromkeys((GNSS, IMU, WHEELS, VISUAL), 0)
 
 
 def test_entries_that_a_camera_does_not_give_are_left_out(truth):
@@ -173,3 +136,20 @@ def test_blocks_change_nothing(truth, monkeypatch):
     np.testing.assert_array_equal(whole.rejections.stamp_ns, blocks.rejections.stamp_ns)
     assert whole.facts == blocks.facts
     assert whole.facts.recovered[GNSS] >= 1
+
+
+def test_the_facts_count_what_was_fused(truth):
+    facts = _run(truth, measured(truth, 10)).facts
+    assert set(facts.measurements) == {GNSS, IMU, WHEELS, VISUAL}
+    assert 0.7 < facts.nis_mean[GNSS] < 1.2
+    assert facts.recovered == dict.fromkeys((GNSS, IMU, WHEELS, VISUAL), 0)
+
+
+def test_both_engines_agree_on_a_drive():
+    truth = drive(seconds=2.0, seed=9)
+    measurements = measured(truth, 9)
+    ours, theirs = (_run(truth, measurements, engine=engine, end=300) for engine in ("compiled", "filterpy"))
+    np.testing.assert_allclose(ours.position_enu_m, theirs.position_enu_m, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(ours.quat_xyzw, theirs.quat_xyzw, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(ours.yaw_std_rad, theirs.yaw_std_rad, rtol=0, atol=1e-9)
+    assert ours.facts.nis_mean == pytest.approx(theirs.facts.nis_mean)

@@ -4,30 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from rough_drive import ANTENNA_M, drive, measured, true_track
+from rough_drive import ANTENNA_M
 from scipy.stats import chi2
 
 from tcpipe.fusion.checks import audit
 from tcpipe.fusion.checks.audit import Tally, alone_in_most, audited, goes_astray, undecided_in_most
 from tcpipe.fusion.measurements import GroundVelocities
 from tcpipe.fusion.trajectory import Rejections, Trajectory
-
-SECONDS = 120.0
-
-
-@pytest.fixture(scope="module")
-def truth():
-    return drive(SECONDS, 3)
-
-
-@pytest.fixture(scope="module")
-def sensors(truth):
-    return measured(truth, 3)
-
-
-@pytest.fixture(scope="module")
-def track(truth):
-    return true_track(truth)
 
 
 def seconds(track, stamp_ns):
@@ -160,11 +143,6 @@ def test_most_is_of_the_windows_of_all_stretches_together():
     assert undecided_in_most([Tally("gnss", "displacement", 3, 3, 0)]) == ()
 
 
-def test_the_bound_is_that_of_chi_square_over_all_windows():
-    told = audit.Comparison("gnss", "position", np.zeros((40, 2)), np.ones(40), np.ones(40))
-    assert told._bound**2 == pytest.approx(chi2.isf(0.01 / 40, 2), rel=1e-9)
-
-
 def test_a_sensor_in_a_gap_says_nothing_there(track, sensors):
     at_s = seconds(track, sensors.wheels.stamp_ns)
     heard = (at_s < 40.0) | (at_s > 60.0)
@@ -221,3 +199,8 @@ def test_a_track_that_no_sensor_follows_is_astray_whatever_it_claims_and_refuses
     ahead = few.gnss.position_enu_m + np.outer(np.maximum(seconds(track, few.gnss.stamp_ns) - 60.0, 0.0), [2.0, 0, 0])
     _, held = audited(track, replace(sensors, gnss=replace(few.gnss, position_enu_m=ahead)))  # wheels follow the track
     assert held.astray == 0
+
+
+def test_the_bound_is_that_of_chi_square_over_all_windows():
+    told = audit.Comparison("gnss", "position", np.zeros((40, 2)), np.ones(40), np.ones(40))
+    assert told._bound**2 == pytest.approx(chi2.isf(0.01 / 40, 2), rel=1e-9)

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from rough_drive import ANTENNA_M, drive, measured
+from rough_drive import ANTENNA_M, measured
 
 from tcpipe.fusion.checks.doppler import doubt_of_velocity
 from tcpipe.fusion.measurements import GroundVelocities
@@ -19,16 +19,6 @@ def doppler(truth, *, late_ns=0, hz=10):
     velocity = np.gradient(places, 1 / 200, axis=0)[at]
     noise = np.random.default_rng(4).normal(0, STD_MPS, velocity.shape)
     return GroundVelocities(truth.stamp_ns[at] + late_ns, velocity + noise, np.full(velocity.shape, STD_MPS**2))
-
-
-@pytest.fixture(scope="module")
-def truth():
-    return drive(120.0, 3)
-
-
-@pytest.fixture(scope="module")
-def sensors(truth):
-    return measured(truth, 3)
 
 
 def with_velocity(sensors, truth, change=lambda v: v, **how):

@@ -151,12 +151,6 @@ def test_a_tilted_imu_is_found(track, sensors, roll_deg, pitch_deg):
     assert np.degrees(tilt.std_rad).max() < 1.0
 
 
-def test_levelling_undoes_a_tilt(sensors):
-    there_and_back = levelled(tilted(sensors.imu, 4.0, -3.0), np.radians([4.0, -3.0]))
-    for name in ("angular_velocity_radps", "specific_force_mps2"):
-        assert getattr(there_and_back, name) == pytest.approx(getattr(sensors.imu, name), abs=1e-9)
-
-
 def test_without_fixes_or_force_nothing_tells_a_tilt(track, sensors):
     assert tilt_evidence(track, replace(sensors, gnss=None)) is None
     assert tilt_evidence(track, replace(sensors, imu=None)) is None
@@ -225,3 +219,9 @@ def test_a_roll_that_no_turn_shows_stays_nothing(track, sensors):
     rows = np.full(60, 200.0)
     turning = TiltEvidence(rows * 0.1**2, rows * 0.1**2 * np.radians(5.0), rows, np.zeros(60))
     assert np.degrees(solve_tilt([turning]).rad[0]) == pytest.approx(5.0)
+
+
+def test_levelling_undoes_a_tilt(sensors):
+    there_and_back = levelled(tilted(sensors.imu, 4.0, -3.0), np.radians([4.0, -3.0]))
+    for name in ("angular_velocity_radps", "specific_force_mps2"):
+        assert getattr(there_and_back, name) == pytest.approx(getattr(sensors.imu, name), abs=1e-9)

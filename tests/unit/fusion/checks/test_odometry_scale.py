@@ -4,20 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from rough_drive import drive, measured, true_track
 
 from tcpipe.fusion.checks.odometry_scale import Scale, over_command, rescaled, solve_scales, way_ratios
 from tcpipe.fusion.measurements import BodyVelocities
-
-
-@pytest.fixture(scope="module")
-def track():
-    return true_track(drive(120.0, 3))
-
-
-@pytest.fixture(scope="module")
-def sensors():
-    return measured(drive(120.0, 3), 3)
 
 
 def times(source, factor):

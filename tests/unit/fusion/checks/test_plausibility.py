@@ -39,12 +39,6 @@ def test_a_mounting_is_found_from_gravity_and_acceleration(rpy_deg):
     np.testing.assert_allclose(axis.axis, mounting.inv().apply([0.0, 0.0, 1.0]), atol=0.03)
 
 
-def test_degrees_show_as_a_scale():
-    rate, _ = felt(Rotation.identity())
-    axis = yaw_axis(averaged(YAW_RATE[:, None], 0.1)[:, 0], averaged(np.degrees(rate), 0.1))
-    assert axis.scale == pytest.approx(np.radians(1.0), rel=0.03)
-
-
 def test_noise_shows_no_mounting():
     noise = np.random.default_rng(1).normal(0.0, 1.0, (T.size, 3))
     assert forward_yaw_rad(np.column_stack((SPEED, YAW_RATE)), noise, 0.0) is None

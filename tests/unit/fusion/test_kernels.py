@@ -1,15 +1,76 @@
-"""Filter and smoother against the same written out in plain numpy and scipy."""
+"""The compiled kernels against the same written out in plain numpy and scipy."""
 
 import numpy as np
 import pytest
 from unit.fusion import dense_reference, drive
+from unit.fusion.dense_reference import FORCE, LEVER, RATE, P, X
 
-from tcpipe.fusion import error_state_pass
+from tcpipe.fusion import error_state_pass, prediction_kernel, state_kernel, update_kernel
 from tcpipe.fusion.fix_errors import FixErrors
 from tcpipe.fusion.initial import find_initial_state
 from tcpipe.fusion.measurements import part
 from tcpipe.fusion.standing import standing_intervals
 from tcpipe.fusion.timeline import build_timeline
+
+
+def test_deviations_of_yaw_and_forward_velocity_are_those_of_a_cloud():
+    out = np.zeros(state_kernel.SAVED)
+    small = P * 1e-4
+    state_kernel.saved(X, small, out)
+    cloud = np.random.default_rng(6).multivariate_normal(np.zeros(17), small, 20_000)
+    states = np.array([dense_reference.plus(X, d) for d in cloud])
+    yaw = np.arctan2(states[:, 3], states[:, 0])
+    forward = np.sum(states[:, [0, 3, 6]] * states[:, 15:18], axis=1)
+    assert np.var(yaw) == pytest.approx(out[26], rel=0.05)
+    assert np.var(forward) == pytest.approx(out[27], rel=0.05)
+
+
+@pytest.mark.parametrize(("mode", "scaled"), [(0, 0), (1, 0), (1, 1), (2, 0), (3, 0)])
+def test_prediction_is_the_unscented_transform(mode, scaled):
+    x, covariance, moved = X.copy(), P.copy(), np.zeros((12, 9))
+    work, _ = state_kernel.workspace(17)
+    q = np.concatenate((np.linspace(0.01, 0.02, 19), [scaled, 0.03]))
+    prediction_kernel.predict(x, covariance, q, 0.03, 0.4, RATE, FORCE, mode, moved, work)
+    wanted_x, wanted_P, cross = dense_reference.predict(X, P, q, 0.03, 0.4, RATE, FORCE, mode)
+    assert np.allclose(x, wanted_x, atol=1e-13)
+    assert np.allclose(covariance, wanted_P, atol=1e-13)
+    transposed = np.linalg.solve(P, cross)  # the linear map with the sigma points' second moments
+    among = [0, 1, 2, *range(9, 15)]
+    assert np.allclose(moved, transposed[:12, among], atol=1e-9)
+    transposed[np.ix_(range(12), among)] = 0.0
+    stays = np.array([0, 0, 0, *[1] * 6, *[0] * 3, *[1] * 3, 1 - 0.4 * q[17], 1])
+    assert np.allclose(transposed, np.diag(stays), atol=1e-9)
+
+
+def test_a_covariance_that_is_none_is_repaired_and_counted():
+    work, _ = state_kernel.workspace(17)
+    broken = P.copy()
+    broken[3, 3] = -1e-12
+    prediction_kernel.predict(X.copy(), broken, np.zeros(21), 0.0, 0.1, RATE, FORCE, 3, np.zeros((12, 9)), work)
+    assert work[8][0] > 0
+    assert np.isfinite(broken).all()
+    assert np.linalg.eigvalsh(broken).min() > 0
+
+
+@pytest.mark.parametrize("kind", [1, 2, 3, 4, 5, 6, 7, 8])
+def test_update_is_the_unscented_transform(kind):
+    work, gain = state_kernel.workspace(17)
+    z, r = np.array([0.2, -0.1, 0.3]), np.array([0.02, 0.03, 0.04])
+    if kind in {state_kernel.SIDEWAYS, state_kernel.LEVEL}:
+        z[2] = 0.0
+    x, covariance = X.copy(), P.copy()
+    nis = update_kernel.innovation_of(kind, x, covariance, z, r, RATE, LEVER, 1.0, work, gain)
+    update_kernel.correct(x, covariance, work, gain, np.zeros((3, 3)))
+    wanted = dense_reference.update(kind, X, P, z, r, RATE, LEVER)
+    assert np.allclose(x, wanted[0], atol=1e-13)
+    assert np.allclose(covariance, wanted[1], atol=1e-9)
+    if kind == state_kernel.WHEEL_VELOCITY:  # only the wheels' own velocity is judged, not the constraint with it
+        d, wm, wc = dense_reference.sigma(P)
+        forward = np.array([dense_reference.expect(kind, dense_reference.plus(X, e), RATE, LEVER)[0] for e in d])
+        wanted_nis = (z[0] - wm @ forward) ** 2 / (wc @ (forward - wm @ forward) ** 2 + r[0])
+        assert nis == pytest.approx(wanted_nis, rel=1e-12)
+    else:
+        assert nis == pytest.approx(wanted[2], rel=1e-10)
 
 
 def _short_run():
