@@ -4,13 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from made_models import CARD
+from made_models import CARD, made_comparison
 
 from tcpipe.dataset import Split, open_dataset
 from tcpipe.learning.baselines import SIMPLEST_FIRST, _groups, compared, verdicts
-from tcpipe.learning.evaluation_facts import Compared
 from tcpipe.learning.fitting import FitConfig
-from tcpipe.learning.metrics import Errors, costs
+from tcpipe.learning.metrics import costs
 from tcpipe.learning.models import Model
 from tcpipe.learning.predictions import measured
 from tcpipe.learning.ratios import Ratio
@@ -87,36 +86,29 @@ def test_what_cannot_be_fitted_is_said(sets, monkeypatch):
     assert compared(model_of(), data, parts, {}, seed=0)[0] == []
 
 
-def row(baseline, rmse, ratio, quantity="E"):
-    return Compared(
-        baseline=baseline, split="unseen", quantity=quantity, errors=Errors(50, rmse, 5.0, 50), rmse_ratio=ratio,
-        mape_ratio=ratio, groups=34, drawn_by="runs",
-    )  # fmt: skip
-
-
 def test_who_is_better_is_said_in_words():
     mean, linear = (
-        row("mean per class", 9.0, Ratio(0.5, 0.4, 0.6)),
-        row("class and slope, linear", 5.0, Ratio(0.9, 0.8, 0.97)),
+        made_comparison("mean per class", Ratio(0.5, 0.4, 0.6), rmse=9.0),
+        made_comparison("class and slope, linear", Ratio(0.9, 0.8, 0.97), rmse=5.0),
     )
     assert verdicts([mean, linear])[0] == (
         "unseen, energy E: the model is better than every baseline, than the best, 'class and slope, linear', by 10 % "
         "(RMSE 0.90 of its, 95 %: 0.80 to 0.97 over 34 runs)"
     )
-    trees = row("gradient boosting", 4.0, Ratio(1.25, 1.1, 1.4))
+    trees = made_comparison("gradient boosting", Ratio(1.25, 1.1, 1.4), rmse=4.0)
     assert verdicts([mean, linear, trees])[0].startswith(
         "unseen, energy E: 'gradient boosting' is better than the model by 20 % (RMSE 1.25"
     )
-    alike = row("class and slope, spline", 4.5, Ratio(1.02, 0.95, 1.1))
+    alike = made_comparison("class and slope, spline", Ratio(1.02, 0.95, 1.1), rmse=4.5)
     told = verdicts([mean, alike, trees])[0]
     assert told.endswith("already 'class and slope, spline' is no worse than the model, as far as can be told")
     assert verdicts([mean, alike])[0].startswith(
         "unseen, energy E: the model and 'class and slope, spline' cannot be told apart"
     )
-    rounded = row("physics", 4.5, Ratio(1.0001, 1.00005, 1.0002))
+    rounded = made_comparison("physics", Ratio(1.0001, 1.00005, 1.0002), rmse=4.5)
     assert "cannot be told apart" in verdicts([mean, rounded])[0]
-    assert "34 runs are too few" in verdicts([row("physics", 5.0, Ratio(0.5, None, None))])[0]
-    assert verdicts([row("physics", 5.0, Ratio(None, None, None))]) == []
+    assert "34 runs are too few" in verdicts([made_comparison("physics", Ratio(0.5, None, None), rmse=5.0)])[0]
+    assert verdicts([made_comparison("physics", Ratio(None, None, None), rmse=5.0)]) == []
 
 
 class Places:

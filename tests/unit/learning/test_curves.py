@@ -14,16 +14,6 @@ def ground(seed=0, count=MANY, classes=(4, 6)):
     return rng.uniform(-0.3, 0.3, count), rng.choice(classes, count)
 
 
-def test_one_number_is_the_mean_of_a_class():
-    slope, class_id = ground()
-    labels = np.column_stack([class_id * 10.0 + slope, 1.0 / class_id])
-    curves = fit_curves("mean", slope, class_id, labels)
-    means = [labels[class_id == known].mean(axis=0) for known in (4, 6)]
-    said = curves.predict(np.zeros(3), np.array([4, 6, 2]))
-    assert said[:2] == pytest.approx(np.array(means), rel=1e-3)
-    assert said[2] == pytest.approx(labels.mean(axis=0))
-
-
 def test_straight_thirds_find_a_bent_line_of_each_class():
     slope, class_id = ground()
     bend = np.quantile(slope, 1 / 3)

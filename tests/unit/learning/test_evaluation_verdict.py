@@ -3,17 +3,9 @@
 from dataclasses import replace
 
 import pytest
-from made_models import CARD
+from made_models import CARD, made_comparison, made_evaluation
 
-from tcpipe.learning.evaluation_facts import (
-    Compared,
-    EvaluateConfig,
-    EvaluatedDataset,
-    EvaluatedModel,
-    Evaluation,
-    Leakage,
-    SplitErrors,
-)
+from tcpipe.learning.evaluation_facts import EvaluatedModel, Leakage, SplitErrors
 from tcpipe.learning.evaluation_verdict import is_of_no_use, verdict
 from tcpipe.learning.fitting import FitConfig
 from tcpipe.learning.metrics import Errors
@@ -21,44 +13,19 @@ from tcpipe.learning.ratios import Ratio
 
 GOOD = Errors(500, 12.0, 6.0, 500, 90.0, 3.0, 6.0)
 BETTER = Ratio(0.8, 0.7, 0.9)
+SPLINE = "class and slope, spline"
 
 
-def told(
-    energy=GOOD,
-    ratio=BETTER,
-    *,
-    split="unseen",
-    floor=1.0,
-    near=0.0,
-    baseline="class and slope, spline",
-    kind="resnet18",
-):
+def told(energy=GOOD, ratio=BETTER, *, split="unseen", floor=1.0, near=0.0, baseline=SPLINE, kind="resnet18"):
     """The sentences of an evaluation on one split, by kind; its own figures and those beside the best baseline."""
-    floors = {"E": {"all": Errors(500, floor, 1.0, 500)}}
-    part = SplitErrors(
-        energy.count,
-        {},
-        (),
-        {"E": {"all": energy}, "T": {"all": GOOD}},
-        floors,
-        leakage=Leakage("sample", 1.05, near, None),
-    )
-    row = Compared(
-        baseline=baseline,
-        split=split,
-        quantity="E",
-        errors=GOOD,
-        rmse_ratio=ratio,
-        mape_ratio=ratio,
-        groups=20,
-        drawn_by="runs",
-    )
+    errors, floors = {"E": {"all": energy}, "T": {"all": GOOD}}, {"E": {"all": Errors(500, floor, 1.0, 500)}}
+    part = SplitErrors(energy.count, {}, (), errors, floors, leakage=Leakage("sample", 1.05, near, None))
     training = replace(CARD.training, config=FitConfig(model=kind))
-    found = Evaluation(
-        tcpipe_version="", key="", model=EvaluatedModel("", "", training), dataset=EvaluatedDataset("", "", {}),
-        config=EvaluateConfig(), splits={split: part}, ablation=(), energy={}, time={}, baselines=(row,), repeatability={},
-        warnings=(), plots={},
-    )  # fmt: skip
+    found = made_evaluation(
+        model=EvaluatedModel("", "", training),
+        splits={split: part},
+        baselines=(made_comparison(baseline, ratio, split=split, groups=20),),
+    )
     lines = {
         kind: [line.text for line in verdict(found) if line.kind == kind] for kind in ("good", "thin", "doubtful", "do")
     }

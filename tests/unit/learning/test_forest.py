@@ -48,24 +48,6 @@ def test_they_say_what_lightgbm_says():
     assert all(np.array_equal(array, again.forest.arrays()[name]) for name, array in grown.forest.arrays().items())
 
 
-def test_what_is_held_out_is_not_learned_from():
-    """A fold whose labels are all wrong is predicted as if it were not there."""
-    pytest.importorskip("lightgbm")
-    features, labels, folds = _drawn(400)
-    labels[folds == 2] += [1000.0, 10.0]
-    held_out = forest.grow(features, labels, np.ones_like(labels), folds).held_out
-    assert held_out[folds == 2].max(axis=0) == pytest.approx([140.0, 0.9], rel=0.3)
-
-
-@pytest.mark.parametrize("count", [3, 12])
-def test_few_samples_and_equal_labels_have_their_mean(count):
-    pytest.importorskip("lightgbm")
-    features, labels, _ = _drawn(count)
-    labels[:, 0] = 7.0
-    grown = forest.grow(features, labels, np.ones_like(labels), np.arange(count) % 3)
-    assert grown.forest.predict(features) == pytest.approx(np.tile(labels.mean(axis=0), (count, 1)), rel=1e-6)
-
-
 def test_without_lightgbm_there_is_one_line(monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "lightgbm", None)
     with pytest.raises(ModelError, match=r"lightgbm not installed, .* pip install 'tcpipe\[tables\]'"):

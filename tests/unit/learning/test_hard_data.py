@@ -5,7 +5,6 @@ import json
 import numpy as np
 import pytest
 from installed_command import plain_lines, tcpipe
-from made_models import made_model
 from synthetic_store import add_run, add_world, box, lanes, lonlat, region_file, segments
 
 from tcpipe.dataset import Split, open_dataset
@@ -119,12 +118,3 @@ def test_who_gives_the_network_s_options_gets_the_network(dataset, tmp_path):
     pytest.importorskip("torch")
     tcpipe("train", dataset, "model", "--epochs", "1", "--width", "16", "--quiet", cwd=tmp_path)
     assert load_model(tmp_path / "model").card.training.config.model == "resnet18"
-
-
-def test_a_model_of_an_older_schema_is_told_what_to_do(tmp_path):
-    pytest.importorskip("torch")
-    place = made_model(tmp_path / "model")
-    card = json.loads((place / "model.json").read_text())
-    (place / "model.json").write_text(json.dumps({**card, "schema_version": 1}))
-    line = plain_lines(tcpipe("evaluate", "model", tmp_path, cwd=tmp_path), 1)
-    assert "written by model schema 1, wanted 2; train the model again" in line

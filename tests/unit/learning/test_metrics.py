@@ -23,13 +23,6 @@ from tcpipe.learning.metrics import (
 _VALUES = st.floats(20.0, 500.0)
 
 
-def test_by_hand():
-    found = errors(np.array([110.0, 190.0]), np.array([100.0, 200.0]))
-    assert found.count == found.mape_count == 2
-    assert found.rmse == pytest.approx(10.0)
-    assert found.mape_percent == pytest.approx(7.5)
-
-
 def test_a_label_near_nothing_is_in_the_rmse_alone():
     found = errors(np.array([110.0, 5.0]), np.array([100.0, -3.0]), LEAST["w"])
     assert (found.count, found.mape_count) == (2, 1)
@@ -79,12 +72,6 @@ def test_draws_are_averaged():
     assert mean_of_draws(draws).mape_percent == pytest.approx(2.0)
 
 
-def test_time_and_energy_follow_from_power_and_velocity():
-    found = costs(np.array([150.0]), np.array([0.75]), 1.5)
-    assert found["T"][0] == pytest.approx(2.0)
-    assert found["E"][0] == pytest.approx(300.0)
-
-
 def test_the_labels_floor_is_what_a_perfect_prediction_would_show():
     rng = np.random.default_rng(5)
     truth, sigma = rng.uniform(100.0, 300.0, 200_000), rng.uniform(2.0, 9.0, 200_000)
@@ -123,3 +110,9 @@ def test_scores_of_classes_are_those_of_all_samples_and_absent_where_nothing_is_
         assert getattr(by_class[ALL], score) == pytest.approx(getattr(pooled, score))
     assert errors(predicted, measured).nll is None
     assert combined([pooled, errors(predicted, measured)]).crps is None
+
+
+def test_time_and_energy_follow_from_power_and_velocity():
+    found = costs(np.array([150.0]), np.array([0.75]), 1.5)
+    assert found["T"][0] == pytest.approx(2.0)
+    assert found["E"][0] == pytest.approx(300.0)

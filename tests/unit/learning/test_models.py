@@ -15,7 +15,6 @@ from storage_server import object_store
 from tcpipe.errors import ModelError, UsageError
 from tcpipe.formats.published import published
 from tcpipe.formats.seals import write_sealed
-from tcpipe.learning.model_readme import model_readme
 from tcpipe.learning.models import WEIGHTS, load_model
 from tcpipe.pipeline.verify import verify
 
@@ -25,15 +24,6 @@ pytest.importorskip("torch")
 @pytest.fixture(scope="module")
 def place(tmp_path_factory):
     return made_model(tmp_path_factory.mktemp("made") / "model")
-
-
-def test_the_card_for_people_says_what_its_power_is():
-    text = model_readme(replace(CARD, label_energy="above_standing", label_includes=("computers", "user ports")))
-    assert (
-        "power is above what the robot draws while it stands; robot husky.\n  What was measured feeds computers; user ports, too.\n-"
-        in text
-    )
-    assert "feeds" not in model_readme(CARD)
 
 
 def _refused(place, match):

@@ -24,11 +24,6 @@ def table(label, said, std=None, split=None):
     )
 
 
-def test_columns_are_named_as_those_of_a_model():
-    assert column_of("w", "predicted") == "power_predicted_watt"
-    assert column_of("T", "predicted_low") == "duration_predicted_low_s"
-
-
 def test_the_worst_of_each_split_come_first():
     label, said = [10.0, 10.0, 10.0, 10.0, 10.0], [10.0, 4.0, 13.0, None, 11.0]
     split = ["test", "test", "test", "unseen", "unseen"]

@@ -79,11 +79,6 @@ def test_what_is_above_standing_can_be_trained_on(energy_only, dataset, tmp_path
     assert "above what the robot draws while it stands" in (tmp_path / "model" / "MODEL.md").read_text()
 
 
-def test_the_same_again_is_nothing_to_do(trained, dataset):
-    place, _ = trained
-    assert train(dataset, place, config=CONFIG).status == "unchanged"
-
-
 @pytest.mark.parametrize(
     ("held", "rate"),
     [
@@ -147,14 +142,6 @@ def test_short_epochs_share_a_checkpoint(dataset, tmp_path, monkeypatch):
     monkeypatch.setattr(fitting, "_epoch", lambda *_, **__: 1.0)
     result = train(dataset, tmp_path / "model", config=replace(CONFIG, epochs=45, patience=99, batch=64))
     assert epochs == list(range(0, 46, 32 * 64 // result.samples["fitted"]))
-
-
-def test_a_variant_goes_on_too(dataset, tmp_path, monkeypatch):
-    config, variant = replace(CONFIG, epochs=1), Variant(channels=("height",), energy_only=True)
-    train(dataset, tmp_path / "whole", config=config, variant=variant)
-    _stopped(monkeypatch, 0, dataset, tmp_path / "model", config, variant=variant)
-    train(dataset, tmp_path / "model", config=config, variant=variant)
-    assert _same(_weights(tmp_path / "whole"), _weights(tmp_path / "model"))
 
 
 def test_a_held_out_loss_that_is_no_number_is_gone_on_from(dataset, tmp_path, monkeypatch):
@@ -222,15 +209,6 @@ def test_a_variant_has_its_own_channels_classes_and_output(dataset):
     assert task.outputs == ("energy_joule",)
     batch = next(iter(task.fit.batches(8, features=("energy_joule",))))
     assert batch[0][0].shape == (8, 40, 40, 1)
-
-
-def test_the_fold_is_of_train_alone(dataset):
-    data = open_dataset(dataset)
-    task = training_task(data, 1, Variant())
-    train_ids = set(data["train"].column("sample_id"))
-    fit, held = set(task.fit.column("sample_id")), set(task.held.column("sample_id"))
-    assert fit | held == train_ids
-    assert not fit & held
 
 
 def test_what_cannot_be_trained_on(dataset, tmp_path, monkeypatch):
