@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from tcpipe.errors import UsageError
-from tcpipe.simulation import scenario, simulated_drive, true_cost
+from tcpipe.simulation import true_cost
 from tcpipe.simulation.drive import drive
 from tcpipe.simulation.robot import GRAVITY_MPS2, GroundModel, SimulatedRobot
 from tcpipe.simulation.route import Leg, Pause, Turn
@@ -14,11 +14,6 @@ from tcpipe.simulation.site import Site
 from tcpipe.simulation.world import GRASS, World
 
 DT_S = 0.005
-
-
-@pytest.fixture(scope="module")
-def truth():
-    return simulated_drive(scenario("manoeuvres"))[0]
 
 
 def test_position_stands_on_the_surface_and_agrees_with_pyproj(truth):
@@ -140,15 +135,6 @@ def small_tilt(rise):
 
     wavelength_m = 40000.0
     return (Wave(rise * wavelength_m / (2 * np.pi), wavelength_m, 0.0, 0.0),)
-
-
-def test_downhill_gives_back():
-    truth, _ = simulated_drive(scenario("hills12"))
-    downhill = (np.degrees(truth.slope_rad) < -15.0) & (truth.forward_velocity_mps > 0.5)
-    assert truth.current_amp[downhill].min() < 0
-    assert (
-        truth.voltage_volt[downhill].max() > truth.voltage_volt[~downhill & (truth.forward_velocity_mps > 0.5)].mean()
-    )
 
 
 def test_true_cost_against_a_plain_search(truth):

@@ -16,8 +16,7 @@ from shapely.geometry import Point, shape
 from tcpipe.errors import UsageError
 from tcpipe.simulation import Faults, read_truth, scenario, simulate, simulated_drive, tiny
 from tcpipe.simulation.messages import Recorder
-from tcpipe.simulation.scenarios import HUSKY_ROS1, HUSKY_ROS2, small_world
-from tcpipe.simulation.sensors import Power
+from tcpipe.simulation.scenarios import HUSKY_ROS1, small_world
 from tcpipe.terrain.classes import PAPER_CLASSES
 
 
@@ -162,23 +161,6 @@ def test_other_containers_hold_the_same_numbers(site, tmp_path, container, diale
     assert 24.0 < status[5][1].battery_voltage < 28.0
     said = simulated_drive(drive, seed=3)[1]["power"].values["left_amp"]
     np.testing.assert_allclose([m.left_driver_current for _, m in status], said, rtol=1e-6)
-
-
-def test_power_is_averaged_where_the_sensor_is_said_to():
-    """The mean over the period that ends at the stamp, or what it is at the stamp, as a Husky's driver asks for it in ROS 1 and 2."""
-    for recorder, averaged in ((HUSKY_ROS1, False), (HUSKY_ROS2, False), (HUSKY_ROS2, True)):
-        spec = tiny(recorder=recorder, seconds=40.0)
-        drive = replace(spec.drives[0], sensors=replace(spec.drives[0].sensors, power=Power(averaged=averaged)))
-        truth, readings = simulated_drive(replace(spec, drives=(drive,)), seed=3)
-        power = readings["power"]
-        watt = power.values["voltage_volt"] * (power.values["left_amp"] + power.values["right_amp"])
-        energy = np.interp(power.stamp_ns, truth.stamp_ns, truth.energy_joule)
-        mean = np.diff(energy) / np.diff(power.stamp_ns) * 1e9
-        now = np.interp(power.stamp_ns[1:], truth.stamp_ns, truth.power_watt)
-        changing = np.abs(now - mean) > 8.0
-        nearer_mean = np.abs(watt[1:] - mean)[changing].mean() < np.abs(watt[1:] - now)[changing].mean()
-        assert changing.sum() > 10
-        assert nearer_mean == averaged
 
 
 def test_gga_sentences_tell_the_fixes(tmp_path):

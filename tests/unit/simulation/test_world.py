@@ -58,23 +58,6 @@ def test_classes_by_hand_and_later_regions_win():
     assert classes.tolist() == [PAVED, GRASS, PAVED, MUD, GRASS, PAVED]
 
 
-def test_a_block_sees_every_region_that_touches_it():
-    world = small_world()
-    x, y = places(4000, seed=3)
-    whole = world.terrain_class(x, y)
-    alone = np.array([int(world.terrain_class(x[i : i + 1], y[i : i + 1])[0]) for i in range(0, 4000, 10)])
-    np.testing.assert_array_equal(whole[::10], alone)
-    assert set(np.unique(whole)) == {1, 2, 3, 4, 5, 6, 7}
-
-
-def test_slopes_reach_the_papers_and_not_much_more():
-    world = small_world()
-    x = SITE.west_m + np.arange(0.25, 120.0, 0.5)[None, :]
-    y = SITE.south_m + np.arange(0.25, 80.0, 0.5)[:, None]
-    steepest = np.degrees(np.arctan(np.hypot(*world.gradient(x, y)))).max()
-    assert 22.5 < steepest < 28.0
-
-
 def test_the_sun_shades_by_the_angle_that_it_falls_in():
     """Against the normal by differences of the height; level ground keeps its colour."""
     sun = np.array([0.48, -0.36, 0.8])
