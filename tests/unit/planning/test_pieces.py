@@ -10,13 +10,6 @@ from tcpipe.planning.pieces import cut_path
 _POINT = st.tuples(st.floats(-20.0, 20.0), st.floats(-20.0, 20.0))
 
 
-def test_a_straight_path_is_cut_every_metre_and_the_rest_is_a_piece():
-    pieces = cut_path(np.array([[0.0, 0.0], [3.4, 0.0]]), chord_m=1.0, scale=1.0)
-    np.testing.assert_allclose(pieces.start_xy_m[:, 0], [0.0, 1.0, 2.0, 3.0])
-    np.testing.assert_allclose(pieces.chord_m, [1.0, 1.0, 1.0, 0.4])
-    np.testing.assert_allclose(pieces.arc_m, pieces.chord_m)
-
-
 def test_a_metre_is_a_metre_of_ground_where_the_map_is_out_of_scale():
     pieces = cut_path(np.array([[0.0, 0.0], [10.0, 0.0]]), chord_m=1.0, scale=0.9996)
     np.testing.assert_allclose(np.diff(pieces.start_xy_m[:, 0]), 1.0 / 0.9996)
@@ -36,12 +29,6 @@ def test_the_patch_of_a_short_rest_ends_with_it_and_is_a_metre_long():
     np.testing.assert_allclose(frames.along_xy, [[1.0, 0.0], [1.0, 0.0]])
 
 
-def test_points_that_repeat_change_nothing():
-    path = np.array([[0.0, 0.0], [0.7, 0.0], [0.7, 0.0], [2.5, 0.3]])
-    once, twice = (cut_path(points, chord_m=1.0, scale=1.0) for points in (path[[0, 1, 3]], path))
-    np.testing.assert_array_equal(once.end_xy_m, twice.end_xy_m)
-
-
 @given(st.lists(_POINT, min_size=2, max_size=12, unique=True))
 def test_pieces_join_up_and_add_up_to_the_path(points):
     xy = np.array(points)
@@ -56,3 +43,9 @@ def test_pieces_join_up_and_add_up_to_the_path(points):
             pieces.arc_m.sum() == pytest.approx(length, abs=2e-3)
             or np.linalg.norm(xy[-1] - pieces.end_xy_m[-1]) <= 1e-3
         )
+
+
+def test_points_that_repeat_change_nothing():
+    path = np.array([[0.0, 0.0], [0.7, 0.0], [0.7, 0.0], [2.5, 0.3]])
+    once, twice = (cut_path(points, chord_m=1.0, scale=1.0) for points in (path[[0, 1, 3]], path))
+    np.testing.assert_array_equal(once.end_xy_m, twice.end_xy_m)

@@ -10,7 +10,6 @@ from tcpipe.planning.bounds import could_be_better, probe_cells
 from tcpipe.planning.cost_grid import CostGrid
 from tcpipe.planning.courses import COURSES, MOVES, touches
 from tcpipe.planning.search import best_potential, least_cost_path, least_over_cells, steps_of
-from tcpipe.planning.straight import straightened
 from tcpipe.terrain.grid import MapGrid
 
 METRES = np.ones(COURSES)
@@ -137,42 +136,3 @@ def test_what_gives_back_more_than_it_was_lifted_for_is_counted():
     found = least_cost_path(steps, 16, 0, 15)
     assert found.negative_steps == steps.cost.size
     assert found.cost < 0.0
-
-
-def _straight(costs, objective, start, goal, open_=None):
-    rows, cols = costs.grid.rows, costs.grid.cols
-    open_ = np.ones((COURSES, rows, cols), bool) if open_ is None else open_
-    found = least_cost_path(steps_of(costs, objective, open_, METRES), rows * cols, start, goal)
-    row, col = np.divmod(found.cells, cols)
-    points, cost = straightened(costs, objective, open_, METRES, np.stack([col, row], axis=1).astype(float))
-    assert cost <= found.cost * (1.0 + 1e-6)
-    return points, cost
-
-
-def test_open_ground_is_crossed_in_a_straight_line():
-    costs = _grid(100.0, 0.8, np.zeros((40, 60)))
-    points, length = _straight(costs, "distance", 3 * 60 + 2, 31 * 60 + 55)
-    assert len(points) == 2
-    assert length == pytest.approx(np.hypot(53, 28), rel=1e-9)
-
-
-def test_no_straight_line_cuts_through_what_is_closed():
-    free = np.ones((COURSES, 30, 30), bool)
-    free[:, 5:, 15] = False
-    costs = _grid(100.0, 0.8, np.zeros((30, 30)))
-    points, length = _straight(costs, "distance", 25 * 30 + 5, 25 * 30 + 25, free)
-    past = np.array([(15.0, 4.0)])
-    least = np.linalg.norm(past - points[0]) + np.linalg.norm(past - points[-1])
-    assert least <= length < 1.03 * least + 1.0
-
-
-def test_a_border_between_slow_and_fast_ground_bends_the_path_as_light():
-    """Snell's law gives the quickest time over a straight border; the path comes within half a per cent of it."""
-    rows = 80
-    velocity = np.where(np.arange(rows) < rows // 2, 1.0, 0.4)[:, None] * np.ones((1, rows))
-    costs = _grid(100.0, velocity, np.zeros((rows, rows)))
-    _, time = _straight(costs, "time", 10 * rows + 5, 70 * rows + 70)
-    border = rows / 2 - 0.5  # between the middles of the rows on its two sides
-    cross = np.linspace(5.0, 70.0, 65_001)
-    best = (np.hypot(cross - 5.0, border - 10.0) / 1.0 + np.hypot(70.0 - cross, 70.0 - border) / 0.4).min()
-    assert best * 0.999 <= time <= best * 1.005
