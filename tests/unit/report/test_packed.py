@@ -35,13 +35,6 @@ def test_what_is_packed_is_read_back_as_well_as_the_kind_says(columns):
     assert packed(columns) == told
 
 
-@pytest.mark.parametrize("count", [0, 1])
-def test_columns_may_be_empty_or_hold_one(count):
-    told = packed({"x": ("steps", np.full(count, 7.0)), "label": ("f32", np.full(count, 2.5))})
-    assert unpacked(told, "x").tolist() == [7.0] * count
-    assert unpacked(told, "label").tolist() == [2.5] * count
-
-
 def test_steps_are_taken_only_where_they_hide_no_digit_that_is_shown():
     assert shown_to(1, np.array([0.0, 3000.0]))[0] == "steps"
     assert shown_to(1, np.array([0.0, 4000.0]))[0] == "f32"

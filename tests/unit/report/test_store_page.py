@@ -10,7 +10,6 @@ from synthetic_store import add_run, add_world, lanes, segments
 from tcpipe.errors import StoreError, UsageError
 from tcpipe.formats.bucket import open_place
 from tcpipe.formats.commits import Call, Entries, Failure
-from tcpipe.motion.remedies import losses_of
 from tcpipe.pipeline import calls
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.log_writer import open_log, supersede
@@ -194,10 +193,3 @@ def test_a_change_from_run_to_run_is_a_finding_of_its_robot(tmp_path):
     assert change.numbers["before"] == pytest.approx(100 * 20 / 21)
     assert change.numbers["after"] == pytest.approx(50.0)
     assert "used share of the distance of husky: 95.2 % in 12 runs, 50 % in the latest 4" in shown(store)[1]
-
-
-def test_losses_add_up_over_runs():
-    found = losses_of([{"kept": 50.0, "gap": 30.0, "standing": 0.01}, {"kept": 10.0, "gap": 10.0}])
-    assert [(loss.reason, loss.metres, loss.runs) for loss in found] == [("gap", 40.0, 2)]
-    assert found[0].share == pytest.approx(0.4, abs=1e-3)
-    assert losses_of([]) == ()
