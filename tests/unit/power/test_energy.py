@@ -30,12 +30,6 @@ def test_rules_differ_as_they_must():
     assert energy_joule([straight], *half, rule="right_endpoint") == pytest.approx([44])
 
 
-def test_averaged_samples_hold_backwards():
-    # Means over the second before each stamp: 100 W until 1 s, 300 W until 2 s.
-    source = made_rail((0, 1, 2), (10.0, 10.0, 10.0), (0.0, 10.0, 30.0), averaged=True)
-    assert energy_joule([source], seconds(0.5), seconds(1.5), rule="averaged") == pytest.approx([50 + 150])
-
-
 def test_rails_add_up_and_regeneration_counts():
     left, right = made_rail((0, 2), (24.0, 24.0), (5.0, 5.0)), made_rail((0, 2), (24.0, 24.0), (-1.0, -1.0))
     assert energy_joule([left, right], seconds(0.5), seconds(1.5), rule="exact") == pytest.approx([96])

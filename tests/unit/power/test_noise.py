@@ -17,7 +17,7 @@ from tcpipe.power.noise import (
     squared_weights_s2,
 )
 from tcpipe.power.rails import Rail, Samples, rail, samples
-from tcpipe.power.signal_model import local_scale, signal_model
+from tcpipe.power.signal_model import signal_model
 
 ZERO = stamps(1)[0]
 STARTS = ZERO + (np.arange(5, 595, 1.3) * 1e9).astype(np.int64)
@@ -105,22 +105,6 @@ def test_means_err_by_their_noise_and_where_a_segment_divides_one(correlation_s,
     error = energy_joule(made, *spans, rule="averaged") - truth
     got = energy_noise_joule(made, *spans)
     assert 0.8 < np.sqrt((got**2).mean()) / error.std() < 1.6
-
-
-def test_how_much_a_signal_changes_is_local():
-    rng = np.random.default_rng(4)
-    t = np.arange(0, 600, 0.05)
-    decay = np.exp(-0.05 / 0.15)
-    rough = lfilter([np.sqrt(1 - decay**2)], [1, -decay], rng.normal(0, 1, len(t)))
-    signal = samples(ZERO + np.round(t * 1e9).astype(np.int64), rough * np.where(t < 300, 0.2, 2.0))
-    everywhere, nowhere = np.ones(len(t), dtype=bool), np.zeros(len(t), dtype=bool)
-    found = signal_model(signal, everywhere, nowhere, averaged=False)
-    got = local_scale(found, signal, everywhere, STARTS, ENDS)
-    early = (ENDS - ZERO) * 1e-9 < 290
-    late = (STARTS - ZERO) * 1e-9 > 310
-    whole = 0.5 * (0.2**2 + 2.0**2)
-    assert got[late].mean() * whole == pytest.approx(4.0, rel=0.1)
-    assert got[early].mean() * whole < 0.04 + 0.06 * whole  # the record as a whole is a prior of 4 samples
 
 
 @pytest.mark.parametrize("averaged", [False, True])

@@ -275,17 +275,6 @@ def test_a_row_beside_a_hole_does_not_tell_the_sign(topic: tuple[str, str]) -> N
     assert not found.is_rejected
 
 
-def test_a_current_against_its_type_is_refused_until_the_recipe_says_how_it_counts() -> None:
-    columns = husky_status()
-    columns = {**columns, **{name: -value for name, value in columns.items() if name.endswith("driver_current")}}
-    topics = {"/status": (HUSKY_STATUS, columns)}
-    found = read_power(topics, "husky")
-    assert reasons(found) == ["current-flows-back"]
-    assert found.findings[0].remedies[0].recipe == {"read": {"current_sign": "drawn_negative"}}
-    told = read_power(topics, "husky", current_sign="drawn_negative")
-    np.testing.assert_allclose(power_watt(told), VOLT * (2 * AMP + 1.0))
-
-
 def source(**said) -> PowerSource:
     return PowerSource("my_msgs/msg/Battery", **{"voltage": "v", "current": "i", **said})
 
