@@ -79,26 +79,6 @@ def test_a_height_of_a_mountain_keeps_a_tenth_of_a_millimetre():
     np.testing.assert_allclose(a.slope_rad, b.slope_rad, atol=1e-4)
 
 
-def test_quarter_turn_of_world_and_course_gives_the_same_patch():
-    source = random_map(rows=260, cols=260)
-    turned = ArrayMap(source.grid, {name: np.rot90(layer) for name, layer in source.arrays.items()})
-    frames = frames_at(source.grid, 100)
-    x_min, y_min, x_max, y_max = source.grid.bounds_m
-    middle = np.array([(x_min + x_max) / 2.0, (y_min + y_max) / 2.0])
-
-    def turn(xy):
-        return np.stack([-xy[:, 1], xy[:, 0]], 1)
-
-    centre = middle + turn(frames.centre_xy_m - middle)
-    half = turn(frames.along_xy) / 2.0
-    got, want = sample(turned, patch_frames(centre - half, centre + half, np.ones(100))), sample(source, frames)
-    assert np.abs(got.pixels["height"].astype(int) - want.pixels["height"]).max() <= 1
-    assert (got.pixels["terrain"] == want.pixels["terrain"]).mean() > 0.9999
-    assert np.abs(got.pixels["ortho"].astype(int) - want.pixels["ortho"]).max() <= 1
-    np.testing.assert_allclose(got.slope_rad, want.slope_rad, atol=1e-6)
-    np.testing.assert_allclose(got.terrain_purity, want.terrain_purity, atol=0.026)
-
-
 @pytest.mark.parametrize("layer", ["height", "ortho", "terrain"])
 def test_a_missing_map_pixel_is_missing_in_every_patch_that_touches_it(layer):
     source = random_map()
@@ -142,16 +122,6 @@ def test_layers_that_a_map_lacks_are_absent():
     got = sample(only, frames_at(source.grid, 5))
     assert list(got.pixels) == ["height"]
     assert got.terrain_class.tolist() == [0] * 5
-
-
-def test_rows_come_back_in_the_order_asked_for_and_do_not_depend_on_tiles():
-    small, large = random_map(tile_px=32), random_map(tile_px=512)
-    frames = frames_at(small.grid, 300)
-    a, b = sample(small, frames), sample(large, frames)
-    for name in ("height", "ortho", "terrain"):
-        np.testing.assert_array_equal(a.pixels[name], b.pixels[name])
-    for name in ("height_min_m", "slope_rad"):
-        np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
 
 
 @pytest.mark.parametrize("tile_px", [16, 64, 512])
@@ -228,13 +198,6 @@ def test_windows_beyond_the_map_have_no_data_there():
     np.testing.assert_array_equal(whole[5:-5, 7:-3], source.arrays["ortho"])
     assert not whole[:5].any()
     assert np.isnan(read_window(source, "height", 70, 75, 0, 5)).all()
-
-
-def test_no_frames_give_no_patches():
-    source = random_map()
-    got = sample(source, frames_at(source.grid, 0))
-    assert got.pixels["height"].shape == (0, 40, 40)
-    assert got.pixels["ortho"].shape == (0, 40, 40)
 
 
 def test_good_patches_move_together():
