@@ -44,13 +44,6 @@ def test_length_is_horizontal():
     assert path.length_m[-1] == pytest.approx(5.0 * np.cos(np.radians(22.5)), rel=1e-12)
 
 
-def test_first_crossing_on_a_circle_is_the_closed_form_chord():
-    path = circle(3.0, 0.9, 200)
-    start = int(path.stamp_ns[7]) + 12_345_678
-    end = path.first_crossing_ns(start, radius_m=1.0)
-    assert (end - start) * 1e-9 == pytest.approx(2 * 3.0 * np.arcsin(1.0 / 6.0) / 0.9, abs=1e-6)
-
-
 def test_first_crossing_on_a_hill_is_a_horizontal_chord():
     path = hill(np.radians(22.5), 0.8, 200)
     start = int(path.stamp_ns[3])
@@ -59,11 +52,6 @@ def test_first_crossing_on_a_hill_is_a_horizontal_chord():
     ends = path.position_at(np.array([start, end]))
     assert np.hypot(*(ends[1] - ends[0])[:2]) == pytest.approx(1.0, abs=1e-6)
     assert ends[1, 2] - ends[0, 2] == pytest.approx(np.tan(np.radians(22.5)), abs=1e-6)
-
-
-def test_no_crossing_where_the_path_stays_near():
-    path = circle(0.49, 0.5, 400)
-    assert path.first_crossing_ns(int(path.stamp_ns[0]), radius_m=1.0) is None
 
 
 def test_touching_the_circle_is_no_crossing_and_leaving_it_is():
