@@ -2,14 +2,8 @@
 
 import numpy as np
 import pytest
-from scipy.spatial import cKDTree
 
-from tcpipe.balance.correlation import residuals
 from tcpipe.balance.repeats import ALONG_RAD, NEAR, repeatability, repeated_pairs
-from tcpipe.simulation import true_cost
-from tcpipe.simulation.route import Leg, Pause
-from tcpipe.simulation.scenarios import DriveSpec, Scenario, small_world
-from tcpipe.simulation.site_files import simulated_drive
 
 
 def wrapped(angle):
@@ -70,40 +64,3 @@ def test_too_few_places_give_no_interval_and_no_pairs_nothing():
     assert (found.pairs, found.places, found.std_low, found.std_high) == (2, 1, None, None)
     assert found.std == pytest.approx(np.sqrt(0.5))
     assert repeatability(np.arange(4.0), np.arange(4.0), np.empty((0, 2), int), xy, chord_m=1.0) is None
-
-
-def test_the_floor_of_a_path_that_is_driven_twice_is_the_simulations_own():
-    """What two passes of one path truly cost at the very same places, against what samples cut anywhere on them say."""
-    plan = (Pause(1.0), Leg(((40.0, 20.0), (60.0, 34.0), (60.0, 60.0), (20.0, 60.0)), radius_m=3.0), Pause(1.0))
-    drives = tuple(DriveSpec(name, plan, (14.0, 34.0)) for name in ("once", "again"))
-    twice = Scenario("twice", small_world(), drives, ((1.0, 1.0), (80.0, 2.0), (2.0, 78.0)))
-    once, again = (simulated_drive(twice, number, seed=5)[0] for number in range(2))
-    parts = []
-    for truth, phase_m in ((once, 3.0), (again, 3.15)):
-        along = np.arange(phase_m, truth.distance_m[-1] - 3.0)
-        start_ns = np.interp(along, truth.distance_m, truth.stamp_ns.astype(float)).astype(np.int64)
-        cost = true_cost(truth, start_ns)
-        start, end = truth.at(start_ns), truth.at(cost.end_ns.astype(np.int64))
-        chord = end.enu_m - start.enu_m
-        parts.append(
-            {
-                "xy": (start.enu_m + end.enu_m)[:, :2] / 2,
-                "course": np.arctan2(chord[:, 1], chord[:, 0]),
-                "slope": np.arctan2(chord[:, 2], np.hypot(chord[:, 0], chord[:, 1])),
-                "kind": truth.at(((start_ns + cost.end_ns) / 2).astype(np.int64)).terrain_class.astype(int),
-                "power_watt": cost.power_watt,
-                "energy_joule": cost.energy_joule,
-            }
-        )
-    both = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-    pairs = repeated_pairs(both["xy"], both["course"], both["kind"], chord_m=1.0)
-    assert len(pairs) > 60
-    same_place = cKDTree(again.enu_m[:, :2]).query(once.enu_m[::100, :2])[1]
-    first, second = true_cost(once, once.stamp_ns[::100]), true_cost(again, again.stamp_ns[same_place])
-    driving = (once.forward_velocity_mps[::100] > 0.5) & np.isfinite(first.power_watt) & np.isfinite(second.power_watt)
-    for name in ("power_watt", "energy_joule"):
-        truly = (getattr(first, name) - getattr(second, name))[driving]
-        left = residuals(both[name], both["kind"], both["slope"])
-        found = repeatability(both[name], left, pairs, both["xy"], chord_m=1.0)
-        assert found.std == pytest.approx(np.sqrt(np.mean(truly**2) / 2), rel=0.25), name
-        assert found.share_of_variance < 0.02
