@@ -127,7 +127,7 @@ def test_a_tag_is_held_out_whole(store, tmp_path):
     assert set().union(*splits.values()) == {"train", "test"}
     folds = {row["run_id"]: row["fold"] for row in rows}
     assert folds["a"] == folds["c"]
-    rules = read_card(tmp_path / "out").split
+    rules = read_card(tmp_path / "out").recipe.split
     assert (rules.holdout, rules.holdout_tag) == ("tag", "season")
     result = build(store, tmp_path / "other", recipe=Recipe(split=SplitConfig(holdout="tag", holdout_tag="season")))
     assert {row["sample_id"]: row["split"] for row in rows} == {

@@ -15,7 +15,7 @@ from tcpipe.errors import StoreError
 from tcpipe.execution import Outcome
 from tcpipe.formats import dataset_files
 from tcpipe.pipeline.dataset import build as build_module
-from tcpipe.pipeline.dataset import sampling, writing
+from tcpipe.pipeline.dataset import content, sampling
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.prune import prune
 from tcpipe.recipe import Recipe
@@ -125,7 +125,7 @@ def test_a_killed_build_goes_on_and_what_is_half_written_does_not_count(made, st
     assert len(batches) == len(sampled) == 4
     for path, size in zip(batches, (0, 5, path_size(batches[2]) - 1), strict=False):
         path.write_bytes(path.read_bytes()[:size])
-    killed(store.root, tmp_path / "out", writing, after=1)
+    killed(store.root, tmp_path / "out", content, after=1)
     assert len(sampled) == 4 + 3 + (BATCHES - 4)
     assert len([path for path in (spool / "files").rglob("*") if path.is_file()]) == 2 * 3, "two shards of three layers"
     assert prune(store=store.root, recipe=Recipe(), dry_run=True).removed == (), "it may be going on"
