@@ -9,15 +9,15 @@ from pyproj import Geod, Transformer
 from tcpipe import __version__
 from tcpipe.formats.commits import Entries
 from tcpipe.formats.maps.map_files import open_map
-from tcpipe.formats.recipe_toml import ingest_key, recipe_id
+from tcpipe.formats.recipe_toml import ingest_key, make_recipe_id
 from tcpipe.formats.run_documents import Counts, LogOrigin, Manifest, RunJson
 from tcpipe.pipeline.log_writer import open_log
 from tcpipe.pipeline.maps import add_map
 from tcpipe.recipe import Recipe
-from tcpipe.simulation.scenarios import scenario
+from tcpipe.simulation.scenarios import find_scenario
 from tcpipe.simulation.site_files import write_rasters
 from tcpipe.store import Store, open_store
-from tcpipe.tables.columns import floats
+from tcpipe.tables.columns import to_floats
 from tcpipe.tables.levels import (
     DATA_MODEL_VERSION,
     GATED_TRACK,
@@ -31,7 +31,7 @@ from tcpipe.tables.levels import (
     TrackInfo,
 )
 from tcpipe.tables.verdicts import Verdict
-from tcpipe.tables.wkb import line_column
+from tcpipe.tables.wkb import make_lines
 
 RUN_ROWS = 3_300
 SMALL = 500
@@ -46,7 +46,7 @@ def store_of(directory: Path, samples: int) -> Store:
     """
     maps = directory / ("maps" if samples > SMALL else "small-maps")
     if not maps.exists():
-        spec = scenario("paper" if samples > SMALL else "tiny")
+        spec = find_scenario("paper" if samples > SMALL else "tiny")
         (directory / "rasters").mkdir(parents=True, exist_ok=True)
         add_map("site", store=maps, **write_rasters(directory / "rasters", spec.world, spec.rasters))
     store = Store(directory / f"store-{samples}")
@@ -109,15 +109,15 @@ def _add_run(store: Store, number: int, rows: int) -> None:
         for column in LABELLED_SEGMENTS.columns
         if column.name not in {*given, "geometry"}
     }
-    rest["geometry"] = line_column(np.stack([lon, lat], 1)[:-1], np.stack([lon, lat], 1)[1:])
+    rest["geometry"] = make_lines(np.stack([lon, lat], 1)[:-1], np.stack([lon, lat], 1)[1:])
     table = LABELLED_SEGMENTS.table(**given, **rest)
     info = TrackInfo(run_id, "husky", Datum(lon[0], lat[0], 600.0), 20.0, "smoother")
     recipe = Recipe()
-    ledger_m = {"kept": float(floats(table, "arc_length_m").sum())}
+    ledger_m = {"kept": float(to_floats(table, "arc_length_m").sum())}
     store.write_run_json(run_id, RunJson(LogOrigin((f"{run_id}.mcap",), f"{number:08x}".ljust(64, "0"), 1)))
     manifest = Manifest(
         run_id=run_id,
-        recipe_id=recipe_id(recipe, "husky"),
+        recipe_id=make_recipe_id(recipe, "husky"),
         data_model_version=DATA_MODEL_VERSION,
         tcpipe_version=__version__,
         ingest_key=ingest_key(recipe),

@@ -27,8 +27,8 @@ from scale import drive_streams, write_logs
 
 from tcpipe import open_dataset
 from tcpipe.formats.bucket import open_place
-from tcpipe.formats.logs.writing import _in_log_order
-from tcpipe.formats.object_storage import connected
+from tcpipe.formats.logs.writing import _sort_messages
+from tcpipe.formats.object_storage import connect_store
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.ingest import ingest
 from tcpipe.pipeline.inspect import inspect
@@ -133,10 +133,10 @@ def epoch(split):
 def ingest_camera(bucket, directory, gigabytes=1):
     drive = drive_streams()
     TYPES.update({stream.topic: stream.type_name for stream in drive})
-    told = [(at, drive[index].topic, payload) for index, _, payload, at, _ in _in_log_order(drive, "cdr")]
+    told = [(at, drive[index].topic, payload) for index, _, payload, at, _ in _sort_messages(drive, "cdr")]
     images = int((told[-1][0] - told[0][0]) / 1e9 * CAMERA_HZ)
     url = f"{bucket}/camera-{gigabytes}.mcap"
-    store, name = connected(url)
+    store, name = connect_store(url)
     with obstore.open_writer(store, name) as writer:
         write_mcap(
             Counting(writer),

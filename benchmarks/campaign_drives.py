@@ -19,21 +19,21 @@ import pyproj
 from tcpipe.errors import TcpipeError
 from tcpipe.formats.finding_lines import format_finding
 from tcpipe.formats.logs.writing import MessageStream
-from tcpipe.formats.robot_files import shipped_profiles
-from tcpipe.logs.messages import needed_fields
+from tcpipe.formats.robot_files import load_shipped_profiles
+from tcpipe.logs.messages import list_needed_fields
 from tcpipe.logs.topics import Topic
 from tcpipe.pipeline.run_stages import run_stages
 from tcpipe.recipe import Recipe
-from tcpipe.simulation import Faults, Truth, simulated_drive, true_cost
-from tcpipe.simulation.messages import Recorder, streams
+from tcpipe.simulation import Faults, Truth, compute_true_cost, simulate_readings
+from tcpipe.simulation.messages import Recorder, make_streams
 from tcpipe.simulation.route import Leg, Manoeuvre, Pause, Wander
-from tcpipe.simulation.scenarios import DriveSpec, RasterSpec, Scenario, small_world
+from tcpipe.simulation.scenarios import DriveSpec, RasterSpec, Scenario, make_small_world
 from tcpipe.simulation.sensors import Noise, Reading, Sensors, record
 from tcpipe.simulation.site import Site
 from tcpipe.stages.read import read_run
-from tcpipe.tables.arrays import numbers
-from tcpipe.tables.bits import Quality, name_of
-from tcpipe.tables.columns import floats, integers
+from tcpipe.tables.arrays import to_numbers
+from tcpipe.tables.bits import Quality, flag_name
+from tcpipe.tables.columns import to_floats, to_integers
 from tcpipe.tables.findings import Finding
 from tcpipe.tables.levels import LabelledSegments, Streams
 
@@ -117,7 +117,7 @@ def simulated(route: str, seed: int, length_m: float) -> Drive:
     """Return a drive: over hills, straight ahead, or standing."""
     start_m = _STARTS_M[seed % len(_STARTS_M)]
     site = Site(width_m=900.0) if route == "straight" else Site()
-    world = small_world(site)
+    world = make_small_world(site)
     plan: tuple[Manoeuvre, ...] | Wander
     if route == "straight":
         start_m, world = (10.0, 40.0), replace(world, hills=(), regions=(), holes=())
@@ -129,7 +129,7 @@ def simulated(route: str, seed: int, length_m: float) -> Drive:
     weave_m = 0.0 if route == "straight" else 0.04
     spec = DriveSpec("drive", plan, start_m, sensors=Sensors(*[None] * 6), weave_m=weave_m)
     scenario = Scenario("campaign", world, (spec,), ((1.0, 1.0), (80.0, 1.0), (80.0, 79.0)), RasterSpec(2.0, 2.0, 2.0))
-    truth, _ = simulated_drive(scenario, seed=seed)
+    truth, _ = simulate_readings(scenario, seed=seed)
     return Drive(truth, site, Noise(seed, 0))
 
 
@@ -181,7 +181,7 @@ def _lists(values: np.ndarray) -> pa.Array:
 
 def _fields(type_name: str) -> tuple[str, ...]:
     try:
-        return needed_fields(type_name)
+        return list_needed_fields(type_name)
     except KeyError:  # of power and of transforms
         return ()
 
@@ -190,7 +190,7 @@ def log_of(drive: Drive, sensors: Sensors, fault: Fault) -> MemoryLog:
     """Return what is recorded of a drive where a fault is."""
     real = fault.sensors(sensors).mounted(WHOLE)
     readings = fault.readings(record(drive.truth, drive.site, real, WHOLE, drive.noise), drive)
-    messages = streams(readings, fault.told(real), HUSKY, geoid_m=drive.site.geoid_m)
+    messages = make_streams(readings, fault.told(real), HUSKY, geoid_m=drive.site.geoid_m)
     recorded = fault.messages(messages, drive)
     return MemoryLog([m for m in recorded if m.constants.get("transforms") != []])
 
@@ -224,7 +224,7 @@ def outcome_of(drive: Drive, sensors: Sensors, fault: Fault) -> Outcome:
     true_m = float(drive.truth.distance_m[-1])
     recipe = Recipe()
     try:
-        read = read_run(log_of(drive, sensors, fault), recipe.read, robot="husky", known=shipped_profiles())
+        read = read_run(log_of(drive, sensors, fault), recipe.read, robot="husky", known=load_shipped_profiles())
         _, _, labelled = run_stages(read, recipe.ingest, run_id="run")
     except TcpipeError as error:
         return Outcome(
@@ -256,22 +256,22 @@ def _nothing() -> dict[str, list[float]]:
 
 def _compared(labelled: LabelledSegments, read: Streams, drive: Drive, fault: Fault, *, max_std_m: float) -> Outcome:
     table = labelled.table
-    start_ns = fault.true_ns(integers(table, "start_ns"), drive)
-    true = true_cost(drive.truth, start_ns)
+    start_ns = fault.true_ns(to_integers(table, "start_ns"), drive)
+    true = compute_true_cost(drive.truth, start_ns)
     error, claimed = {}, {}
     for name, column in list(QUANTITIES.items())[:-1]:
         quantity, unit = column.rsplit("_", 1)
-        error[name] = (floats(table, column) - getattr(true, column)).tolist()
-        claimed[name] = floats(table, f"{quantity}_std_{unit}").tolist()
+        error[name] = (to_floats(table, column) - getattr(true, column)).tolist()
+        claimed[name] = to_floats(table, f"{quantity}_std_{unit}").tolist()
     there = drive.truth.at(start_ns)
-    lon, lat = floats(table, "start_lon_deg"), floats(table, "start_lat_deg")
-    std_m = floats(table, "position_std_m")
+    lon, lat = to_floats(table, "start_lon_deg"), to_floats(table, "start_lat_deg")
+    std_m = to_floats(table, "position_std_m")
     _, _, apart_m = pyproj.Geod(ellps="WGS84").inv(lon, lat, there.lon_deg, there.lat_deg)
     error["start"], claimed["start"] = apart_m.tolist(), std_m.tolist()
     placed = np.isfinite(lon) & (std_m <= max_std_m)
     return Outcome(
         start_s=drive.seconds(start_ns).tolist(), error=error, claimed=claimed,
-        bits=numbers(table["quality"]).tolist(), placed=placed.tolist(),
+        bits=to_numbers(table["quality"]).tolist(), placed=placed.tolist(),
         driven_m=sum(labelled.ledger_m.values()), true_m=float(drive.truth.distance_m[-1]), wheels_m=wheels_m(read),
         kept_m=labelled.ledger_m.get("kept", 0.0), said=said_of(labelled.info.report.findings),
     )  # fmt: skip
@@ -282,11 +282,11 @@ def wheels_m(read: Streams) -> float:
     if "wheel_odometry" not in read.tables:
         return float("nan")
     table = read.tables["wheel_odometry"]
-    steps_s = np.diff(integers(table, "stamp_ns")) * 1e-9
-    speed = np.abs(floats(table, "velocity_x_mps"))
+    steps_s = np.diff(to_integers(table, "stamp_ns")) * 1e-9
+    speed = np.abs(to_floats(table, "velocity_x_mps"))
     return float(np.sum((speed[1:] + speed[:-1]) / 2 * np.minimum(steps_s, 1.0)))
 
 
 def bit_names(bits: int) -> list[str]:
     """Return the names of quality bits."""
-    return [name_of(bit) for bit in Quality if bits & bit]
+    return [flag_name(bit) for bit in Quality if bits & bit]

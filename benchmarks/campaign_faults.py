@@ -15,7 +15,7 @@ import numpy as np
 from campaign_drives import Drive, Fault, Messages, Readings
 
 from tcpipe.formats.logs.writing import MessageStream
-from tcpipe.geometry.rotation import inverse, rotate
+from tcpipe.geometry.rotation import invert, rotate
 from tcpipe.simulation.messages import TOPICS
 from tcpipe.simulation.sensors import Doppler, Gnss, Mounting, Power, Reading, Sensors
 
@@ -277,7 +277,7 @@ def _odometry_covariance(value: np.ndarray) -> Callable[[Messages, Drive], Messa
 
 def _of_the_body(reading: Reading, drive: Drive) -> Reading:
     """Return a receiver's velocity as a driver would write it that turns it into the body's axes."""
-    velocity = rotate(inverse(drive.truth.at(reading.stamp_ns).quat_xyzw), reading.values["velocity_enu_mps"])
+    velocity = rotate(invert(drive.truth.at(reading.stamp_ns).quat_xyzw), reading.values["velocity_enu_mps"])
     return _values(reading, velocity_enu_mps=velocity)
 
 

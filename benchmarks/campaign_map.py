@@ -17,10 +17,10 @@ from rasterio import Affine
 
 from tcpipe import add_map, build_dataset, ingest, open_dataset
 from tcpipe.errors import TcpipeError
-from tcpipe.simulation import Faults, read_truth, simulate, tiny
+from tcpipe.simulation import Faults, make_tiny, read_truth, simulate
 from tcpipe.simulation.scenarios import RasterSpec
 from tcpipe.simulation.world import World
-from tcpipe.tables.columns import floats, integers
+from tcpipe.tables.columns import to_floats, to_integers
 
 NAME = "map: heights in feet"
 _FOOT_M = 1200.0 / 3937.0
@@ -45,7 +45,7 @@ class MapResult:
 
 def map_in_feet(*, in_feet: bool = True) -> MapResult:
     """Add the map, build a dataset on it, and compare its slopes; the other way round the raster's heights are metres and say so."""
-    scenario = replace(tiny(Faults.every(), seconds=60.0), rasters=RasterSpec(0.3, 0.3, 0.3))
+    scenario = replace(make_tiny(Faults.every(), seconds=60.0), rasters=RasterSpec(0.3, 0.3, 0.3))
     with tempfile.TemporaryDirectory() as folder:
         site = simulate(Path(folder) / "site", scenario=scenario, seed=1)
         store, height = Path(folder) / "store", site.rasters["height"]
@@ -59,8 +59,8 @@ def map_in_feet(*, in_feet: bool = True) -> MapResult:
             return MapResult([*said, *error.problems], True, float("nan"))
         truth = read_truth(site.truths[0])
         samples = open_dataset(built.path)["train"].samples
-        true_rad = truth.at(integers(samples, "start_ns")).slope_rad
-        off = np.degrees(floats(samples, "slope_rad") - true_rad)
+        true_rad = truth.at(to_integers(samples, "start_ns")).slope_rad
+        off = np.degrees(to_floats(samples, "slope_rad") - true_rad)
         said += [*str(added).splitlines()[1:], *str(built).splitlines()[1:]]  # the first lines hold paths
         return MapResult(said, False, float(np.sqrt(np.mean(off**2))) if off.size else float("nan"))
 

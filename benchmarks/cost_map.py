@@ -24,9 +24,9 @@ from map_worlds import World
 from tcpipe.formats.maps.building import build_map
 from tcpipe.formats.maps.map_files import MapFile, open_map
 from tcpipe.learning.architecture import Architecture
-from tcpipe.learning.model_card import Seen
+from tcpipe.learning.model_card import TrainingRange
 from tcpipe.learning.models import Model, load_model
-from tcpipe.planning.cost_grid import new_survey
+from tcpipe.planning.cost_grid import make_survey
 from tcpipe.planning.cost_map import make_cost_map
 from tcpipe.planning.cost_model import BATCH_PATCHES
 
@@ -46,7 +46,7 @@ def prepared(directory: Path, side_m: float, width: int) -> tuple[MapFile, Model
     layers = World("EPSG:32633", 500_000.0, 5_200_000.0, side_m).write(directory, 0.05)
     build_map(directory / "site.zarr", name="site", **layers)
     ranges = {"slope_rad": (-1.5, 1.5), "cross_slope_rad": (-1.5, 1.5), "relief_m": (0.0, 9.0)}
-    seen = Seen(dict.fromkeys((4, 5, 6, 7), 100), (4, 5, 6, 7), ranges)
+    seen = TrainingRange(dict.fromkeys((4, 5, 6, 7), 100), (4, 5, 6, 7), ranges)
     made_model(directory / "model", seen=seen, architecture=Architecture(40, 3, 2, width), scale=CARD.scale)
     return open_map(directory / "site.zarr"), load_model(directory / "model")
 
@@ -58,7 +58,7 @@ def main() -> None:
         directory = Path(name)
         source, model = prepared(directory, side_m, width)
         costs = make_cost_map(model, source, directory / "warm", step_m=1.0).card.cells
-        survey = new_survey(model, source, 1.0)
+        survey = make_survey(model, source, 1.0)
         survey.predict(np.ones_like(survey.predicted), lambda _, __: None)
         patches = int(np.count_nonzero(np.isfinite(survey.costs.velocity_mps)))
         ready = np.random.default_rng(0).random((BATCH_PATCHES, 40, 40, 3)).astype(np.float32)
@@ -68,7 +68,7 @@ def main() -> None:
                 model.predict(ready[: min(BATCH_PATCHES, patches - first)])
 
         def judged() -> None:
-            bare = new_survey(model, source, 1.0)
+            bare = make_survey(model, source, 1.0)
             bare.judge(np.ones_like(bare.judged), lambda _, __: None)
 
         spent = []

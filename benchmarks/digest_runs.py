@@ -19,7 +19,7 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from tcpipe.simulation import Faults, scenario, simulate, tiny
+from tcpipe.simulation import Faults, find_scenario, make_tiny, simulate
 from tcpipe.simulation.sensors import Doppler
 
 SEED = 41
@@ -202,7 +202,7 @@ def make_drives(out: Path, *, quick: bool) -> dict[str, Path]:
         return {name: out / path for name, path in found}
     chosen = dict(list(DRIVES.items())[: QUICK_DRIVES if quick else None])
     specs = tuple(_specify(number, drive) for number, drive in enumerate(chosen.values()))
-    site = simulate(out / "site", scenario=replace(tiny(), drives=specs), seed=SEED)
+    site = simulate(out / "site", scenario=replace(make_tiny(), drives=specs), seed=SEED)
     logs = dict(zip(chosen, site.logs, strict=True))
     (out / "changed").mkdir(exist_ok=True)
     for number, (name, edits) in enumerate({} if quick else EDITS.items()):
@@ -215,7 +215,7 @@ def make_drives(out: Path, *, quick: bool) -> dict[str, Path]:
 
 def _specify(number: int, drive: Drive) -> Any:
     name, of = drive.like
-    spec = scenario(name).drives[of]
+    spec = find_scenario(name).drives[of]
     sensors = {
         name: replace(getattr(spec.sensors, name), **change) if isinstance(change, dict) else change
         for name, change in drive.sensors.items()

@@ -17,7 +17,7 @@ from campaign import LENGTH_M
 from campaign_drives import FIRST_SEED, log_of, simulated
 from campaign_faults import FAULTS
 
-from tcpipe.formats.robot_files import shipped_profiles
+from tcpipe.formats.robot_files import load_shipped_profiles
 from tcpipe.pipeline.run_stages import run_stages
 from tcpipe.recipe import Recipe
 from tcpipe.simulation.sensors import Power, Sensors
@@ -32,7 +32,7 @@ def budget_of(power: Power) -> EnergyBudget:
     recipe = Recipe()
     log = log_of(simulated("hills", FIRST_SEED, LENGTH_M), replace(Sensors(), power=power), FAULTS["clean"])
     read_config = replace(recipe.read, power_averaged="yes" if power.averaged else "no")
-    streams = read_run(log, read_config, robot="husky", known=shipped_profiles())
+    streams = read_run(log, read_config, robot="husky", known=load_shipped_profiles())
     _, _, labelled = run_stages(streams, recipe.ingest, run_id="run")
     facts = labelled.info.report.facts.label
     if facts is None or facts.energy_budget is None:

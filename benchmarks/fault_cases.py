@@ -16,7 +16,7 @@ from fault_children import INPUTS, command
 from fault_services import BUCKET
 
 import tcpipe
-from tcpipe.formats.atomic import atomic_directory, clear_beside, write_text
+from tcpipe.formats.atomic import clear_beside, write_atomic_directory, write_text
 
 Run = Callable[[], object]
 
@@ -76,7 +76,7 @@ def _directory(name: str, **files: str) -> Run:
         place = Path(name)
         clear_beside(place)
         if not place.is_dir() or {path.name: path.read_text() for path in place.iterdir()} != files:
-            with atomic_directory(place) as half:
+            with write_atomic_directory(place) as half:
                 for file, content in files.items():
                     write_text(half / file, content)
 
@@ -206,11 +206,13 @@ def _make_model(place: Path) -> None:
     from made_models import CARD, made_model
 
     from tcpipe.learning.fitting import FitConfig
-    from tcpipe.learning.model_card import Seen
+    from tcpipe.learning.model_card import TrainingRange
 
     ranges = {"slope_rad": (-0.5, 0.5), "cross_slope_rad": (-0.5, 0.5), "relief_m": (0.0, 1.0)}
     config = FitConfig(epochs=1, width=16)
     training = replace(CARD.training, config=config, samples={"fitted": 100, "held out": 20})
-    made_model(place / "model", seen=Seen(CARD.seen.class_counts | {5: 10}, (4, 5, 6, 7), ranges), training=training)
+    made_model(
+        place / "model", seen=TrainingRange(CARD.seen.class_counts | {5: 10}, (4, 5, 6, 7), ranges), training=training
+    )
     ends = [[float(value) for value in end.split(",")] for end in (FROM, TO)]
     (place / "path.geojson").write_text(json.dumps({"type": "LineString", "coordinates": ends}))

@@ -20,15 +20,15 @@ from numpy.typing import NDArray
 
 from tcpipe.dataset import Dataset, Split, open_dataset
 from tcpipe.learning.architecture import Architecture
-from tcpipe.learning.baselines import beside
-from tcpipe.learning.fitting import FitConfig, Task, fit, predicted
-from tcpipe.learning.metrics import LEAST_VELOCITY_MPS, costs
+from tcpipe.learning.baselines import compare_with_baseline
+from tcpipe.learning.fitting import FitConfig, Task, fit, predict_split
+from tcpipe.learning.metrics import LEAST_VELOCITY_MPS, compute_costs
 from tcpipe.learning.models import load_model
-from tcpipe.learning.network import resnet18
-from tcpipe.learning.predictions import measured
-from tcpipe.learning.table_fitting import features_of
+from tcpipe.learning.network import make_resnet18
+from tcpipe.learning.predictions import collect_measured
+from tcpipe.learning.table_fitting import compute_features
 from tcpipe.learning.table_model import fit_table
-from tcpipe.learning.training import Variant, class_table, training_task
+from tcpipe.learning.training import Variant, make_training_task, read_class_table
 
 Predict = Callable[[Split], NDArray[np.floating]]
 
@@ -42,11 +42,11 @@ def subset(task: Task, count: int) -> Task:
 
 def table_of(data: Dataset, train: Split) -> Predict:
     """Return a table of samples."""
-    labels, classes = train.labels.astype(np.float64), class_table(data.card).count
-    features = features_of(train, data.card.patch_m, classes)
+    labels, classes = train.labels.astype(np.float64), read_class_table(data.card).count
+    features = compute_features(train, data.card.patch_m, classes)
     folds, rules = train.column("fold"), {"channels": train.channels, "class_count": classes}
     table, _ = fit_table(features, labels, np.ones_like(labels), folds, **rules)
-    return lambda split: table.predict(features_of(split, data.card.patch_m, classes))
+    return lambda split: table.predict(compute_features(split, data.card.patch_m, classes))
 
 
 def network_of(task: Task, *, steps: int, width: int) -> Predict:
@@ -54,21 +54,23 @@ def network_of(task: Task, *, steps: int, width: int) -> Predict:
     config = FitConfig(width=width, epochs=-(-steps * 64 // len(task.fit)), patience=steps)
     with tempfile.TemporaryDirectory() as name:
         made = fit(task, config, name=f"{len(task.train)} samples", key="", checkpoint=Path(name, "state"))
-    network = resnet18(Architecture(40, len(task.train.channels), len(made.scale), width), seed=0, start=made.scale)
+    network = make_resnet18(
+        Architecture(40, len(task.train.channels), len(made.scale), width), seed=0, start=made.scale
+    )
     network.set_arrays(made.weights, "")
-    return lambda split: predicted(network, task, split, made.scale)
+    return lambda split: predict_split(network, task, split, made.scale)
 
 
 def compare(data: Dataset, network: Predict, table: Predict, called: str) -> None:
     """Print RMSE of E of both on test and unseen, and their ratio."""
     for name in (name for name in ("test", "unseen") if len(data[name])):
-        part = measured(data[name], {})
+        part = collect_measured(data[name], {})
         ours, theirs = (
-            costs(*np.maximum(predict(part.split).T.astype(np.float64), [[-np.inf], [LEAST_VELOCITY_MPS]]), 1.0)
+            compute_costs(*np.maximum(predict(part.split).T.astype(np.float64), [[-np.inf], [LEAST_VELOCITY_MPS]]), 1.0)
             for predict in (network, table)
         )
         rules = {"block_m": data.card.recipe.split.block_m, "seed": 0}
-        row = next(of for of in beside("table", name, part, ours, theirs, **rules) if of.quantity == "E")
+        row = next(of for of in compare_with_baseline("table", name, part, ours, theirs, **rules) if of.quantity == "E")
         rmse = float(np.sqrt(np.mean(np.square(ours["E"] - part.costs["E"]))))
         print(
             f"{called:>12} {name:6}: network {rmse:6.2f} J, table {row.errors.rmse:6.2f} J, ratio {row.rmse_ratio}",
@@ -85,7 +87,7 @@ def main() -> None:
     parser.add_argument("--model", type=Path)
     told = parser.parse_args()
     data = open_dataset(told.dataset)
-    whole = training_task(data, 0, Variant())
+    whole = make_training_task(data, 0, Variant())
     if told.model is not None:
         compare(data, lambda split: load_model(told.model).predict(split.patches), table_of(data, whole.train), "all")
     for count in told.counts:

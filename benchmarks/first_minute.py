@@ -9,7 +9,7 @@ from pathlib import Path
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
-from tcpipe.pipeline.preflight import Promise, preflight
+from tcpipe.pipeline.preflight import ExpectedYield, preflight
 from tcpipe.recipe import Recipe
 from tcpipe.simulation import simulate
 
@@ -34,7 +34,7 @@ def first_minute(log: Path, out: Path) -> Path:
     return out
 
 
-def promise_of(log: Path) -> tuple[Promise, str]:
+def promise_of(log: Path) -> tuple[ExpectedYield, str]:
     """Return what a log promises, and one sigma of its E."""
     found = preflight(log, recipe=Recipe())
     assert found.promise is not None, found.problems

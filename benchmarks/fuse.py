@@ -26,7 +26,7 @@ import numpy as np
 
 from tcpipe.fusion.error_state import run_error_state
 from tcpipe.fusion.initial import find_initial_state
-from tcpipe.fusion.standing import standing_intervals
+from tcpipe.fusion.stationary import find_stationary_intervals
 from tcpipe.fusion.ukf15 import PROCESS_VARIANCE, SensorRows, filter_forward
 from tcpipe.fusion.ukf15_kernel import ANTENNA, SELECT
 from tcpipe.geometry.datum import geodetic_from_enu
@@ -173,7 +173,7 @@ class ErrorState:
         streams = made_streams(seconds)
         self.measurements = prepare_inputs(streams, FuseConfig()).measurements[0]
         start_ns = int(self.measurements.imu.stamp_ns[0])
-        standing = standing_intervals(self.measurements)
+        standing = find_stationary_intervals(self.measurements)
         self.initial = find_initial_state(self.measurements, standing, start_ns)
         first, last = start_ns // 50_000_000 + 1, int(self.measurements.wheels.stamp_ns[-1]) // 50_000_000
         self.output_ns = np.arange(first, last + 1, dtype=np.int64) * 50_000_000

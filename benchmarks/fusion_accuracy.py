@@ -29,19 +29,19 @@ import numpy as np
 from scipy.stats import chi2
 
 from tcpipe.formats.logs.log_file import open_log
-from tcpipe.formats.robot_files import shipped_profiles
+from tcpipe.formats.robot_files import load_shipped_profiles
 from tcpipe.fusion.error_state import run_error_state
 from tcpipe.fusion.initial import find_initial_state
-from tcpipe.fusion.standing import standing_intervals
-from tcpipe.fusion.stretches import cut_stretches, track_stamps
+from tcpipe.fusion.stationary import find_stationary_intervals
+from tcpipe.fusion.track_sections import cut_stretches, track_stamps
 from tcpipe.geometry.datum import geodetic_from_enu
-from tcpipe.geometry.rotation import inverse, product, rotate, rotation_vector_from_quat
+from tcpipe.geometry.rotation import invert, multiply, rotate, rotation_vector_from_quat
 from tcpipe.recipe import FuseConfig, ReadConfig
 from tcpipe.simulation import Faults, Truth, read_truth, simulate
 from tcpipe.simulation.route import Wander
-from tcpipe.simulation.scenarios import DriveSpec, RasterSpec, Scenario, small_world
+from tcpipe.simulation.scenarios import DriveSpec, RasterSpec, Scenario, make_small_world
 from tcpipe.simulation.sensors import Gnss, Imu, Sensors, Visual, Wheels
-from tcpipe.stages.fuse_inputs import prepare_inputs, sane_inputs
+from tcpipe.stages.fuse_inputs import drop_implausible_sensors, prepare_inputs
 from tcpipe.stages.read import read_run
 from tcpipe.tables.levels import Streams
 
@@ -81,10 +81,10 @@ def made_drive(
     )
     region = ((1.0, 1.0), (100.0, 1.0), (100.0, 79.0), (1.0, 79.0))
     site = simulate(
-        out, scenario=Scenario("accuracy", small_world(), (drive,), region, RasterSpec(2.0, 2.0, 2.0)), seed=seed
+        out, scenario=Scenario("accuracy", make_small_world(), (drive,), region, RasterSpec(2.0, 2.0, 2.0)), seed=seed
     )
     with open_log(site.logs[0]) as log:
-        return read_run(log, ReadConfig(), robot=None, known=shipped_profiles()), read_truth(site.truths[0])
+        return read_run(log, ReadConfig(), robot=None, known=load_shipped_profiles()), read_truth(site.truths[0])
 
 
 @dataclass
@@ -104,12 +104,14 @@ class Errors:
 def errors(streams: Streams, truth: Truth, *, smooth: bool) -> Errors:
     """Fuse and compare, over every stretch."""
     config = FuseConfig()
-    inputs, _ = sane_inputs(prepare_inputs(streams, config), streams)
+    inputs, _ = drop_implausible_sensors(prepare_inputs(streams, config), streams)
     parts = []
     for stretch in cut_stretches(inputs.measurements):
         output_ns = track_stamps(stretch, period_ns=50_000_000, max_gap_ns=int(config.max_gap_s * 1e9))
         output_ns = output_ns[(output_ns > truth.stamp_ns[0]) & (output_ns < truth.stamp_ns[-1])]
-        initial = find_initial_state(stretch.measurements, standing_intervals(stretch.measurements), stretch.start_ns)
+        initial = find_initial_state(
+            stretch.measurements, find_stationary_intervals(stretch.measurements), stretch.start_ns
+        )
         found = run_error_state(
             stretch.measurements, initial, output_ns=output_ns, smooth=smooth,
             gate_probability=config.gate_probability,
@@ -140,8 +142,8 @@ def _in_outage(gnss: Any, at_ns: np.ndarray) -> np.ndarray:
 
 
 def _compared(found: Any, at: Any, position_error: np.ndarray, outage: np.ndarray) -> Errors:
-    turn = rotation_vector_from_quat(product(inverse(found.quat_xyzw), at.quat_xyzw))
-    forward = rotate(inverse(found.quat_xyzw), found.velocity_enu_mps)[:, 0] - at.forward_velocity_mps
+    turn = rotation_vector_from_quat(multiply(invert(found.quat_xyzw), at.quat_xyzw))
+    forward = rotate(invert(found.quat_xyzw), found.velocity_enu_mps)[:, 0] - at.forward_velocity_mps
     lag = 20
     way = found.position_enu_m[lag:, :2] - found.position_enu_m[:-lag, :2]
     length = np.linalg.norm(way, axis=1)

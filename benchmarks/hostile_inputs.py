@@ -274,13 +274,13 @@ def _dataset(spoil: Callable[[Path], None], *commands: Arguments) -> Callable[[P
         sys.path[:0] = [str(Path(__file__).parents[1] / "tests")]
         from synthetic_store import small_store
 
-        from tcpipe.formats.seals import file_checksums, write_sealed
+        from tcpipe.formats.integrity import compute_checksums, write_sealed
         from tcpipe.pipeline.dataset.build import build_dataset
 
         build_dataset(place / "d", store=small_store(place).root)
         card = json.loads((place / "d" / "dataset.json").read_text())
         spoil(place / "d")
-        known = file_checksums(place / "d")
+        known = compute_checksums(place / "d")
         card["checksums"] = {
             name: {"size_bytes": known[name].size_bytes, "sha256": known[name].sha256} for name in card["checksums"]
         }

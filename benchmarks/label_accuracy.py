@@ -23,9 +23,9 @@ from tcpipe.formats.recipe_toml import load_recipe
 from tcpipe.formats.stored_runs import RunDirectory
 from tcpipe.geometry.angles import wrap_to_pi
 from tcpipe.geometry.rotation import rpy_from_quat
-from tcpipe.simulation import Truth, read_truth, simulate, true_cost
+from tcpipe.simulation import Truth, compute_true_cost, read_truth, simulate
 from tcpipe.store import Store
-from tcpipe.tables.columns import floats, integers
+from tcpipe.tables.columns import to_floats, to_integers
 
 LABELS = {"energy_joule": "J", "power_watt": "W", "velocity_mps": "m/s", "duration_s": "s"}
 
@@ -33,11 +33,11 @@ LABELS = {"energy_joule": "J", "power_watt": "W", "velocity_mps": "m/s", "durati
 def figures(run: RunDirectory, truth: Truth) -> Iterator[tuple[str, str]]:
     """Yield what each figure is called, and the figure."""
     segments, track = run.segments(), run.track().table
-    start_ns = integers(segments, "start_ns")
-    true = true_cost(truth, start_ns)
+    start_ns = to_integers(segments, "start_ns")
+    true = compute_true_cost(truth, start_ns)
     for label, unit in LABELS.items():
-        error = floats(segments, label) - getattr(true, label)
-        std = floats(segments, _std_name(label))
+        error = to_floats(segments, label) - getattr(true, label)
+        std = to_floats(segments, _std_name(label))
         share = np.abs(error).sum() / np.abs(getattr(true, label)).sum()
         within = [np.mean(np.abs(error) <= k * std) for k in (1, 2)]
         bias = error.sum() / np.abs(getattr(true, label)).sum()
@@ -45,16 +45,16 @@ def figures(run: RunDirectory, truth: Truth) -> Iterator[tuple[str, str]]:
         yield f"{label}: sum |error| / sum |truth|", f"{share:.2%} (bias {bias:+.2%}); {claimed}"
     yield from above_standing(segments, truth)
     there = truth.at(start_ns)
-    lon, lat = floats(segments, "start_lon_deg"), floats(segments, "start_lat_deg")
+    lon, lat = to_floats(segments, "start_lon_deg"), to_floats(segments, "start_lat_deg")
     _, _, apart_m = pyproj.Geod(ellps="WGS84").inv(lon, lat, there.lon_deg, there.lat_deg)
     yield "start point, RMS", f"{100 * _rms(apart_m):.2f} cm"
     kept = track["dropped_by"].to_numpy() == 0
-    along = truth.at(integers(track, "stamp_ns"))
-    speed = floats(track, "forward_velocity_mps") - along.forward_velocity_mps
-    yaw = wrap_to_pi(floats(track, "yaw_rad") - rpy_from_quat(along.quat_xyzw)[:, 2])
+    along = truth.at(to_integers(track, "stamp_ns"))
+    speed = to_floats(track, "forward_velocity_mps") - along.forward_velocity_mps
+    yaw = wrap_to_pi(to_floats(track, "yaw_rad") - rpy_from_quat(along.quat_xyzw)[:, 2])
     yield "forward velocity of the kept track, RMS", f"{_rms(speed[kept]):.4f} m/s"
     yield "yaw of the kept track, RMS", f"{np.degrees(_rms(yaw[kept])):.2f} deg"
-    yield "chords, largest departure from 1 m", f"{1e3 * np.abs(floats(segments, 'chord_m') - 1).max():.6f} mm"
+    yield "chords, largest departure from 1 m", f"{1e3 * np.abs(to_floats(segments, 'chord_m') - 1).max():.6f} mm"
     energy = run.manifest.info.report.facts.label.energy_joule
     driven_m = sum(run.manifest.ledger_m.values())
     yield "energy of the whole run", f"{energy / truth.energy_joule[-1] - 1:+.3%} of {truth.energy_joule[-1]:.0f} J"
@@ -65,12 +65,12 @@ def above_standing(segments: pa.Table, truth: Truth) -> Iterator[tuple[str, str]
     """Yield the same of what is above standing; the truth's standing power is that of steps in which nothing moves."""
     still = (truth.wheel_velocity_mps == 0.0) & (np.abs(truth.angular_velocity_radps).max(axis=1) < 1e-6)
     standing = float(np.median(truth.power_watt[still]))
-    true = true_cost(truth, integers(segments, "start_ns"))
-    told, std = floats(segments, "standing_power_watt"), floats(segments, "standing_power_std_watt")
+    true = compute_true_cost(truth, to_integers(segments, "start_ns"))
+    told, std = to_floats(segments, "standing_power_watt"), to_floats(segments, "standing_power_std_watt")
     yield "standing power", f"{told[0]:.2f} W, claimed deviation {std[0]:.2f} W; truth {standing:.2f} W"
     wanted = true.energy_joule - standing * true.duration_s
-    error = floats(segments, "energy_above_standing_joule") - wanted
-    std = floats(segments, "energy_above_standing_std_joule")
+    error = to_floats(segments, "energy_above_standing_joule") - wanted
+    std = to_floats(segments, "energy_above_standing_std_joule")
     within = [np.mean(np.abs(error) <= k * std) for k in (1, 2)]
     share, bias = np.abs(error).sum() / np.abs(wanted).sum(), error.sum() / np.abs(wanted).sum()
     claimed = (

@@ -18,7 +18,7 @@ from rosbags.rosbag1 import Writer as BagWriter
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Rosbag2Writer
 
-from tcpipe.formats.logs.writing import MessageStream, _payloads, _typestore
+from tcpipe.formats.logs.writing import MessageStream, _make_typestore, _serialize_messages
 
 RATES_HZ = (
     ("/imu/data", "sensor_msgs/msg/Imu", 200, "angular_velocity.z"),
@@ -31,7 +31,7 @@ NAVIGATION = [topic for topic, *_ in RATES_HZ]
 CAMERA, CAMERA_HZ = "/camera/image_raw", 10
 RAGGED = "/diagnostics"
 START_NS = 1_700_000_000_000_000_000
-STORES = {"cdr": _typestore("cdr"), "ros1": _typestore("ros1")}
+STORES = {"cdr": _make_typestore("cdr"), "ros1": _make_typestore("ros1")}
 CHUNK_BYTES = 1 << 20
 
 Message = tuple[int, str, bytes]
@@ -50,7 +50,7 @@ def navigation(minutes: float, encoding: str = "cdr") -> Iterator[Message]:
             "header.stamp.nanosec": (stamp % 10**9).astype(np.uint32),
             field: rng.normal(size=count),
         }
-        payloads = _payloads(
+        payloads = _serialize_messages(
             MessageStream(topic, type_name, stamp, columns, {"header.frame_id": "base_link"}), encoding
         )
         rows = map(bytes, payloads)

@@ -22,16 +22,16 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from tcpipe.formats.commits import Entries
+from tcpipe.formats.integrity import compute_checksum
 from tcpipe.formats.logs.writing import write_mcap
-from tcpipe.formats.seals import file_checksum
 from tcpipe.formats.stored_runs import RunDirectory
-from tcpipe.pipeline.dataset.runs import Chosen, choose_runs
+from tcpipe.pipeline.dataset.runs import SelectedRuns, choose_runs
+from tcpipe.pipeline.duplicates import remove_duplicates
 from tcpipe.pipeline.ingest import ingest
 from tcpipe.pipeline.log_sources import LogSource, find_sources
 from tcpipe.pipeline.log_writer import open_log
 from tcpipe.pipeline.prune import prune
-from tcpipe.pipeline.recordings import each_drive_once
-from tcpipe.pipeline.status import status
+from tcpipe.pipeline.status import find_status
 from tcpipe.recipe import Recipe
 from tcpipe.store import Store, open_store
 
@@ -83,7 +83,7 @@ def _copy(run: RunDirectory, store: Store, source: LogSource, number: int) -> En
         at, column = segments.schema.get_field_index(name), pc.add(segments.column(name), number * DAY_NS)
         segments = segments.set_column(at, segments.schema.field(name), column)
     pq.write_table(segments, place / "segments.parquet")
-    new, old = file_checksum(place / "segments.parquet"), run.checksum("segments.parquet")
+    new, old = compute_checksum(place / "segments.parquet"), run.checksum("segments.parquet")
     log = run.facts.log.source
     names = {run.run_id: run_id, log.sha256: sha256, log.paths[0]: source.origins[0], old.sha256: new.sha256}
     names |= {f'"size_bytes": {old.size_bytes}': f'"size_bytes": {new.size_bytes}'}
@@ -106,8 +106,8 @@ def timed(what: str, act: Callable[[], T]) -> T:
     return found
 
 
-def once(chosen: Chosen) -> int:
-    return len(each_drive_once(chosen.runs, {run_id: log.sha256 for run_id, log in chosen.logs.items()}).runs)
+def once(chosen: SelectedRuns) -> int:
+    return len(remove_duplicates(chosen.runs, {run_id: log.sha256 for run_id, log in chosen.logs.items()}).runs)
 
 
 def ingest_new_logs(directory: Path, count: int) -> None:
@@ -134,7 +134,7 @@ def main() -> None:
     for again in ("first", "again"):
         summary = timed(f"nothing to ingest, {again}", lambda: ingest([logs], store=store.root, recipe=Recipe()))
         assert {result.status for result in summary.results} == {"unchanged"}
-        found = timed(f"status, {again}", lambda: status([logs], store=store.root, recipe=Recipe()))
+        found = timed(f"status, {again}", lambda: find_status([logs], store=store.root, recipe=Recipe()))
         assert found.counts == {"done": count}, found.counts
         chosen = timed(f"choice of runs, {again}", lambda: choose_runs(store, Recipe(), robot=None, tags={}))
         assert timed(f"each drive once, {again}", lambda chosen=chosen: once(chosen)) >= count

@@ -19,10 +19,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.cost.prediction_errors import Errors, centring_of, errors_of
+from tcpipe.cost.prediction_errors import Errors, fit_bias_correction, fit_errors
 from tcpipe.learning.table_model import TableModel, fit_table
 from tcpipe.planning.path_cost import cut_path
-from tcpipe.simulation import scenario
+from tcpipe.simulation import find_scenario
 from tcpipe.simulation.robot import SimulatedRobot
 from tcpipe.simulation.route import Leg, Wander
 from tcpipe.simulation.world import World
@@ -169,10 +169,10 @@ def trial(
     rng: np.random.Generator, *, train: int, metres: float, further: int
 ) -> Iterator[tuple[str, int, float, float]]:
     """Train on drives and yield `held` of further ones."""
-    site = scenario("paper")
+    site = find_scenario("paper")
     made = [drive(site.world, site.drives[0].robot, rng, metres=metres, run=f"run{k}") for k in range(train + further)]
     table, residuals = trained(made[:train])
-    centring, errors = centring_of(residuals), errors_of(residuals)
+    centring, errors = fit_bias_correction(residuals), fit_errors(residuals)
     assert errors is not None
     for of in made[train:]:
         power, velocity = centring.apply(*table.predict(of.features).T, of.class_id)

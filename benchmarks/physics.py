@@ -16,12 +16,12 @@ import numpy as np
 import pyarrow as pa
 
 from tcpipe import ingest
-from tcpipe.cost.held_out import physics_of
-from tcpipe.cost.physics import Metres
+from tcpipe.cost.held_out import fit_and_validate_physics
+from tcpipe.cost.physics import FitSamples
 from tcpipe.formats.recipe_toml import load_recipe
-from tcpipe.pipeline.dataset.card import metres_of, standing_of
-from tcpipe.report.label_sections import physics_in_words
-from tcpipe.simulation import Faults, scenario, simulate
+from tcpipe.pipeline.dataset.card import find_idle_power, make_fit_samples
+from tcpipe.report.label_sections import describe_physics
+from tcpipe.simulation import Faults, find_scenario, simulate
 from tcpipe.simulation.robot import GRAVITY_MPS2, SimulatedRobot
 from tcpipe.simulation.route import Wander
 from tcpipe.simulation.scenarios import RasterSpec, Scenario
@@ -40,7 +40,7 @@ def plain_robot(*, half_radius_m: float = math.inf) -> SimulatedRobot:
 
 def drive_of(robot: SimulatedRobot, *, metres: float) -> Scenario:
     """Return a scenario of one drive over hills and all classes, without sensor faults but noise."""
-    hills = scenario("hills12")
+    hills = find_scenario("hills12")
     noise = Faults.only("gnss_noise", "wheel_noise", "imu_noise", "power_noise")
     plan = Wander(metres, (14.0, 34.0), shares=tuple((k, 0.25) for k in NAMES), climbing=0.5, odd_manoeuvres=False)
     drive = replace(hills.drives[0], plan=plan, faults=noise, robot=robot)
@@ -48,14 +48,14 @@ def drive_of(robot: SimulatedRobot, *, metres: float) -> Scenario:
     return replace(hills, world=world, drives=(drive,), rasters=RasterSpec(1.0, 1.0, 1.0))
 
 
-def with_terrain(segments: pa.Table, world: World) -> Metres:
+def with_terrain(segments: pa.Table, world: World) -> FitSamples:
     """Return segments with the class of the world under their middle: no map has a part in it."""
     lonlat = [
         np.mean([segments[f"{end}_{axis}_deg"].to_numpy() for end in ("start", "end")], axis=0)
         for axis in ("lon", "lat")
     ]
     class_id = world.terrain_class(*world.site.map_xy_m(*lonlat))
-    return replace(metres_of(segments), terrain=np.array([NAMES.get(k, "other") for k in class_id.tolist()]))
+    return replace(make_fit_samples(segments), terrain=np.array([NAMES.get(k, "other") for k in class_id.tolist()]))
 
 
 def of_simulation(robot: SimulatedRobot, *, metres: float, seed: int) -> Sequence[str]:
@@ -66,9 +66,9 @@ def of_simulation(robot: SimulatedRobot, *, metres: float, seed: int) -> Sequenc
         ingest(made.logs, store=Path(directory) / "store")
         run = Store(Path(directory) / "store").runs()[0]
         segments = run.segments()
-    found = physics_of(with_terrain(segments, chosen.world), standing_watt=standing_of(segments))
+    found = fit_and_validate_physics(with_terrain(segments, chosen.world), standing_watt=find_idle_power(segments))
     assert found is not None
-    lines = [physics_in_words("simulated robot", found)]
+    lines = [describe_physics("simulated robot", found)]
     weight = robot.mass_kg * GRAVITY_MPS2 / robot.drive_efficiency
     ground = {name: robot.ground[k].rolling_resistance for k, name in NAMES.items()}
     true = {
@@ -94,8 +94,8 @@ def of_log(log: Path, recipe: Path | None) -> str:
     with tempfile.TemporaryDirectory() as directory:
         ingest([log], store=Path(directory) / "store", recipe=load_recipe(recipe))
         segments = Store(Path(directory) / "store").runs()[0].segments()
-    found = physics_of(metres_of(segments), standing_watt=standing_of(segments))
-    return f"{log.name}: no fit" if found is None else physics_in_words(log.stem, found)
+    found = fit_and_validate_physics(make_fit_samples(segments), standing_watt=find_idle_power(segments))
+    return f"{log.name}: no fit" if found is None else describe_physics(log.stem, found)
 
 
 def main() -> None:

@@ -36,7 +36,7 @@ from made_logs import (
 from rosbags.highlevel import AnyReader
 
 from tcpipe.formats.logs.log_file import open_log
-from tcpipe.formats.logs.log_part import ByteSource, decompressed
+from tcpipe.formats.logs.log_part import ByteSource, decompress
 from tcpipe.formats.logs.mcap_file import McapPart
 from tcpipe.pipeline.export import export
 
@@ -98,7 +98,7 @@ def floor(path: Path, _topics: list[str]) -> None:
     for chunk in part._contents.chunks:  # noqa: SLF001
         data = source.read_once(chunk.data_offset, chunk.data_bytes)
         if chunk.compression:
-            decompressed(chunk.compression, data, chunk.uncompressed_bytes, checked=True)
+            decompress(chunk.compression, data, chunk.uncompressed_bytes, checked=True)
 
 
 def assert_equal_content(path: Path, topics: list[str]) -> None:

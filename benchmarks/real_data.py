@@ -23,14 +23,22 @@ from numpy.typing import NDArray
 from path_coverage import END_STD_M, drive
 
 from tcpipe import ingest
-from tcpipe.cost.physics import ALL, Metres, fit_physics
-from tcpipe.cost.prediction_errors import centring_of, errors_of
+from tcpipe.cost.physics import ALL, FitSamples, fit_physics
+from tcpipe.cost.prediction_errors import fit_bias_correction, fit_errors
 from tcpipe.formats.recipe_toml import load_recipe
 from tcpipe.learning.forest import grow
-from tcpipe.learning.metrics import LEAST, LEAST_VELOCITY_MPS, Errors, Spread, costs, errors, label_floor
-from tcpipe.simulation import scenario
+from tcpipe.learning.metrics import (
+    LEAST,
+    LEAST_VELOCITY_MPS,
+    Errors,
+    Spread,
+    compute_costs,
+    compute_errors,
+    label_floor,
+)
+from tcpipe.simulation import find_scenario
 from tcpipe.store import Store
-from tcpipe.tables.columns import floats
+from tcpipe.tables.columns import to_floats
 
 Floats = NDArray[np.float64]
 
@@ -62,20 +70,20 @@ def recorded(log: str, recipe: str | None) -> Metre:
     with tempfile.TemporaryDirectory() as directory:
         ingest([Path(log)], store=Path(directory) / "store", recipe=load_recipe(Path(recipe) if recipe else None))
         found = Store(Path(directory) / "store").runs()[0].segments().sort_by("start_ns")
-    command = floats(found, "commanded_velocity_mps")
-    velocity = floats(found, "velocity_mps")
+    command = to_floats(found, "commanded_velocity_mps")
+    velocity = to_floats(found, "velocity_mps")
     metres = Metre(
-        floats(found, "power_watt"), velocity,
-        (floats(found, "end_z_m") - floats(found, "start_z_m")) / floats(found, "chord_m"),
-        floats(found, "turn_rate_radps") / velocity, np.where(np.isfinite(command), command, 1.0),
-        floats(found, "duration_std_s"), floats(found, "energy_std_joule"), floats(found, "start_ns").astype(np.int64),
+        to_floats(found, "power_watt"), velocity,
+        (to_floats(found, "end_z_m") - to_floats(found, "start_z_m")) / to_floats(found, "chord_m"),
+        to_floats(found, "turn_rate_radps") / velocity, np.where(np.isfinite(command), command, 1.0),
+        to_floats(found, "duration_std_s"), to_floats(found, "energy_std_joule"), to_floats(found, "start_ns").astype(np.int64),
     )  # fmt: skip
     return metres.take(np.isfinite(metres.power + metres.velocity + metres.rise + metres.turn_radpm))
 
 
 def simulated(metres: int) -> Metre:
     """Return a simulated drive on all classes, of which none is told."""
-    site = scenario("paper")
+    site = find_scenario("paper")
     made = drive(site.world, site.drives[0].robot, np.random.default_rng(0), metres=metres + 10.0, run="simulated")
     still = np.zeros(len(made.block))
     time = 1.0 / made.velocity_mps
@@ -97,8 +105,8 @@ def by_mean(of: Metre) -> Predictor:
 def by_physics(of: Metre) -> Predictor:
     rate = np.polyfit(of.rise, of.velocity / of.command, 1)
 
-    def metres_of(there: Metre, velocity: Floats) -> Metres:
-        return Metres(there.power, velocity, there.rise, there.turn_radpm * velocity, np.full(len(velocity), ALL))
+    def metres_of(there: Metre, velocity: Floats) -> FitSamples:
+        return FitSamples(there.power, velocity, there.rise, there.turn_radpm * velocity, np.full(len(velocity), ALL))
 
     found = fit_physics(metres_of(of, of.velocity))
     assert found is not None, "fewer than 20 segments"
@@ -144,9 +152,9 @@ def told(fit: Callable[[Metre], Predictor], known: Metre, there: Metre) -> Told:
         "power_watt": known.power, "velocity_mps": known.velocity,
         "power_predicted_watt": held[:, 0], "velocity_predicted_mps": held[:, 1],
     }  # fmt: skip
-    nowhere, found = np.zeros(len(there.power), np.int64), errors_of(residuals)
+    nowhere, found = np.zeros(len(there.power), np.int64), fit_errors(residuals)
     assert found is not None, "fewer than 20 segments"
-    said = costs(*centring_of(residuals).apply(*fit(known)(there).T, nowhere), 1.0)
+    said = compute_costs(*fit_bias_correction(residuals).apply(*fit(known)(there).T, nowhere), 1.0)
     spread = {
         name: Spread(found[of].spread(said[name], nowhere), *found[of].of_pieces(said[name], nowhere))
         for name, of in QUANTITIES.items()
@@ -184,7 +192,7 @@ def lines(name: str, held_out: str, model: str, of: Metre, found: Told) -> Itera
     """Yield the table's rows of a drive and a model."""
     measured = {"T": 1.0 / of.velocity, "E": of.power / of.velocity}
     for quantity in UNITS:
-        found_errors = errors(found.said[quantity], measured[quantity], LEAST[quantity], found.spread[quantity])
+        found_errors = compute_errors(found.said[quantity], measured[quantity], LEAST[quantity], found.spread[quantity])
         yield _row(name, held_out, model, found_errors, quantity)
 
 

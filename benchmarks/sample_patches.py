@@ -22,16 +22,16 @@ import rasterio
 from rasterio.windows import Window
 from scipy.ndimage import map_coordinates
 
-from tcpipe.compiled import kernel
+from tcpipe.compiled import compile_kernel
 from tcpipe.formats.maps.building import build_map
 from tcpipe.formats.maps.geotiff import write_geotiff
 from tcpipe.formats.maps.map_files import open_map
 from tcpipe.terrain.classes import PAPER_CLASSES, ClassTable
 from tcpipe.terrain.grid import MapGrid
-from tcpipe.terrain.layers import paper_layers
+from tcpipe.terrain.layers import make_paper_layers
 from tcpipe.terrain.patches import map_px_from_patch, patch_frames
 from tcpipe.terrain.sampling import sample_patches
-from tcpipe.terrain.tiles import TilePool, groups_by_tile
+from tcpipe.terrain.tiles import TilePool, group_by_tile
 
 ROWS, COLS, PX = 6100, 11920, 40
 REPEATS = 7
@@ -51,7 +51,7 @@ class MemoryMap:
     arrays: dict[str, Any]
     grid: MapGrid = GRID
     classes: ClassTable = PAPER_CLASSES
-    layers: dict[str, Any] = field(default_factory=lambda: paper_layers(LAYERS, PAPER_CLASSES))
+    layers: dict[str, Any] = field(default_factory=lambda: make_paper_layers(LAYERS, PAPER_CLASSES))
     tile_px: int = max(ROWS, COLS)
     height_reference_m: float = 600.0
     name: str = "memory"
@@ -65,7 +65,7 @@ class MemoryMap:
         return self.arrays[layer][row0:row1, col0:col1]
 
 
-@kernel
+@compile_kernel
 def gather(  # noqa: PLR0917
     height, ortho, terrain, width, frames, out_height, out_ortho, out_terrain
 ):
@@ -159,7 +159,7 @@ def files(source: MemoryMap, directory: Path) -> dict[str, Path]:
 
 def decode_only(disk, placed):
     """Read the tiles that the patches lie in, and nothing else."""
-    for group in groups_by_tile(disk.grid.px_from_xy(placed.centre_xy_m), disk):
+    for group in group_by_tile(disk.grid.px_from_xy(placed.centre_xy_m), disk):
         i, j = np.floor(disk.grid.px_from_xy(placed.centre_xy_m[group[:1]]))[0, ::-1].astype(int)
         TilePool(disk).hold(np.array([(i, j, i + 1, j + 1)]))
 

@@ -57,13 +57,13 @@ def write_logs(directory: Path, hours: int) -> list[Path]:
 
 def drive_streams() -> list[MessageStream]:
     """Return what is recorded of the drive, at most `MOST_HZ` of each topic: hours are to be had in minutes."""
-    from tcpipe.simulation.messages import streams
-    from tcpipe.simulation.scenarios import scenario
-    from tcpipe.simulation.site_files import simulated_drive
+    from tcpipe.simulation.messages import make_streams
+    from tcpipe.simulation.scenarios import find_scenario
+    from tcpipe.simulation.site_files import simulate_readings
 
-    (spec,) = (of := scenario("hills12")).drives
-    readings = simulated_drive(of)[1]
-    said = streams(readings, spec.sensors.mounted(spec.faults), spec.recorder, geoid_m=of.world.site.geoid_m)
+    (spec,) = (of := find_scenario("hills12")).drives
+    readings = simulate_readings(of)[1]
+    said = make_streams(readings, spec.sensors.mounted(spec.faults), spec.recorder, geoid_m=of.world.site.geoid_m)
     return [thinned(stream) for stream in said]
 
 

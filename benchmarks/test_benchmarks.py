@@ -19,7 +19,7 @@ from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.ingest import ingest
 from tcpipe.pipeline.maps import add_map
 from tcpipe.simulation import simulate
-from tcpipe.simulation.scenarios import scenario
+from tcpipe.simulation.scenarios import find_scenario
 
 HERE = Path(__file__).parent
 PROGRAMS = sorted(
@@ -80,7 +80,7 @@ SMALLEST = {
 @pytest.fixture(scope="module")
 def site(tmp_path_factory):
     """Return a site with a log of 190 m."""
-    spec = scenario("paper_quick")
+    spec = find_scenario("paper_quick")
     return simulate(tmp_path_factory.mktemp("benchmarks") / "site", scenario=replace(spec, drives=spec.drives[:1]))
 
 

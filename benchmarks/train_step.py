@@ -16,23 +16,23 @@ import torch
 
 from tcpipe.dataset import open_dataset
 from tcpipe.learning.architecture import Architecture
-from tcpipe.learning.losses import loss_factors
-from tcpipe.learning.network import resnet18
+from tcpipe.learning.losses import compute_loss_factors
+from tcpipe.learning.network import make_resnet18
 from tcpipe.learning.trainer import Trainer
-from tcpipe.learning.training import Variant, training_task
+from tcpipe.learning.training import Variant, make_training_task
 
 STEPS, BATCH = 10, 64
 WANTED = 0.9
 
 
 def main() -> None:
-    task = training_task(open_dataset(sys.argv[1]), 0, Variant())
+    task = make_training_task(open_dataset(sys.argv[1]), 0, Variant())
     width = int(sys.argv[2]) if len(sys.argv) > 2 else 64
     batches = task.fit.batches(BATCH, shuffle=True, mirror=True, drop_last=True)
     list(batches)  # reads the split, loads the kernels
     shape = Architecture(task.fit.view.stored.files.patch_px, task.fit.view.form.depth, 2, width)
-    trainer = Trainer(resnet18(shape, seed=0, start=(0.4, 0.8)), loss_factors("nrmse", (1.0, 1.0)))
-    bare = resnet18(shape, seed=0, start=(0.4, 0.8)).train().to(memory_format=torch.contiguous_format)
+    trainer = Trainer(make_resnet18(shape, seed=0, start=(0.4, 0.8)), compute_loss_factors("nrmse", (1.0, 1.0)))
+    bare = make_resnet18(shape, seed=0, start=(0.4, 0.8)).train().to(memory_format=torch.contiguous_format)
     optimizer = torch.optim.Adam(bare.parameters(), 1e-4)
     images, wanted = torch.rand(BATCH, shape.depth, shape.patch_px, shape.patch_px), torch.rand(BATCH, 2)
     spent: dict[str, list[float]] = {"feeding": [], "training": [], "predicting": [], "bare training": []}

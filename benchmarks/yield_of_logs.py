@@ -20,12 +20,12 @@ from campaign_figures import OF_THE_DRIVE
 
 from tcpipe.errors import TcpipeError
 from tcpipe.formats.logs.log_file import open_log
-from tcpipe.formats.robot_files import shipped_profiles
+from tcpipe.formats.robot_files import load_shipped_profiles
 from tcpipe.pipeline.run_stages import run_stages
 from tcpipe.recipe import Recipe
 from tcpipe.stages.read import read_run
-from tcpipe.tables.arrays import numbers
-from tcpipe.tables.columns import floats
+from tcpipe.tables.arrays import to_numbers
+from tcpipe.tables.columns import to_floats
 
 HEAD = ("wheels", "driven", "steady", "labelled", "with power", "undoubted", "sampled")
 
@@ -43,16 +43,16 @@ def ladder(path: Path, robot: str | None) -> Ladder:
     recipe = Recipe()
     try:
         with open_log(path) as log:
-            streams = read_run(log, recipe.read, robot=robot, known=shipped_profiles())
+            streams = read_run(log, recipe.read, robot=robot, known=load_shipped_profiles())
         _, _, labelled = run_stages(streams, recipe.ingest, run_id="run")
     except TcpipeError as error:
         return Ladder((np.nan, *[0.0] * (len(HEAD) - 1)), (*error.problems, *said_of(error.findings)))
     table, ledger_m = labelled.table, labelled.ledger_m
-    power = np.isfinite(floats(table, "energy_joule"))
-    sure = (numbers(table["quality"]).astype(np.int64) & ~int(OF_THE_DRIVE)) == 0
-    placed = np.isfinite(floats(table, "start_lon_deg"))
-    placed &= floats(table, "position_std_m") <= recipe.sample.max_position_std_m
-    arc_m = floats(table, "arc_length_m")
+    power = np.isfinite(to_floats(table, "energy_joule"))
+    sure = (to_numbers(table["quality"]).astype(np.int64) & ~int(OF_THE_DRIVE)) == 0
+    placed = np.isfinite(to_floats(table, "start_lon_deg"))
+    placed &= to_floats(table, "position_std_m") <= recipe.sample.max_position_std_m
+    arc_m = to_floats(table, "arc_length_m")
     chosen = (np.ones_like(power), power, sure, sure & placed)
     steps_m = (wheels_m(streams), sum(ledger_m.values()), ledger_m.get("kept", 0.0))
     return Ladder(

@@ -16,13 +16,13 @@ from typing import cast
 import click
 
 from tcpipe.cli import cli
-from tcpipe.cli.answers import answers
+from tcpipe.cli.json_output import json_output_types
 from tcpipe.formats.contracts import DOCUMENTS
 from tcpipe.formats.finding_lines import format_number
-from tcpipe.formats.recipe_toml import commented_toml
-from tcpipe.formats.robot_files import shipped_profiles
+from tcpipe.formats.recipe_toml import format_commented_toml
+from tcpipe.formats.robot_files import load_shipped_profiles
 from tcpipe.planning.path_cost import PIECES
-from tcpipe.tables.catalogue import Entry, catalogue_sections, read_catalogue
+from tcpipe.tables.catalogue import Entry, read_catalogue, read_sections
 from tcpipe.tables.columns import Column, TableSchema
 from tcpipe.tables.levels import (
     DATA_MODEL_VERSION,
@@ -102,7 +102,7 @@ def _describe_command(context: click.Context, shared: Mapping[str, str]) -> str:
 
 
 def _documents() -> str:
-    known = {**DOCUMENTS, **answers()}
+    known = {**DOCUMENTS, **json_output_types()}
     files = {name: cls for name, cls in known.items() if not name.endswith(".answer")}
     told = {name: cls for name, cls in known.items() if name not in files}
     head = "| schema | dataclass | holds |\n|---|---|---|\n"
@@ -219,7 +219,7 @@ def _findings() -> str:
     """Return the catalogue of findings, section by section, each code as a heading."""
     catalogue = read_catalogue()
     parts = [_NOTE, _TROUBLESHOOTING]
-    for section, codes in catalogue_sections().items():
+    for section, codes in read_sections().items():
         parts += [f"## {section}\n", *(_finding(code, catalogue[code]) for code in codes)]
     return "\n".join(parts)
 
@@ -245,11 +245,11 @@ def _sentence(text: str) -> str:
 
 
 def _recipe() -> str:
-    return f"{_NOTE}\n# Recipe\n\nWhat `tcpipe init` writes: every key with its default.\n\n```toml\n{commented_toml()}```\n"
+    return f"{_NOTE}\n# Recipe\n\nWhat `tcpipe init` writes: every key with its default.\n\n```toml\n{format_commented_toml()}```\n"
 
 
 def _robots() -> str:
-    known = shipped_profiles()
+    known = load_shipped_profiles()
     found_by = "| robot | found by message types | found by words of topic names | platform |\n|---|---|---|---|\n"
     sizes = "\n| robot | width | length | maximum speed | voltage |\n|---|---|---|---|---|\n"
     for name, of in sorted(known.robots.items()):

@@ -84,11 +84,11 @@ def run_evaluate(options: EvaluateOptions) -> EvaluationResult | DrivesResult:
         from tcpipe.learning.models import load_model
         from tcpipe.learning.predictions import check_origin
         from tcpipe.planning.drive_files import evaluate_drives
-        from tcpipe.planning.inputs import chosen_map
+        from tcpipe.planning.inputs import choose_map
 
         loaded, data = load_model(model), open_dataset(dataset)
         check_origin(loaded.card, data, str(model))
-        source = chosen_map(options.store, options.map_name)
+        source = choose_map(options.store, options.map_name)
         return evaluate_drives(loaded, data, source, [*map(str, options.drives)], store=options.store, out=out)
     from tcpipe.learning.evaluation_facts import EvaluateConfig
     from tcpipe.learning.evaluation_files import run_evaluation
@@ -107,12 +107,12 @@ def run_predict_path(options: PredictPathOptions) -> PathResult:
     The result has length [m], time [s], energy [J], their intervals, and the pieces without a cost; ``str`` of it is what the command
     prints. Raises `PathError`, `ModelError`, `MapError`, `StoreError` or `UsageError` where an input cannot be used.
     """
-    from tcpipe.learning.models import chosen_model
-    from tcpipe.planning.inputs import chosen_map
+    from tcpipe.learning.models import choose_model
+    from tcpipe.planning.inputs import choose_map
     from tcpipe.planning.path_files import predict_path as run
 
-    source = chosen_map(options.store, options.map_name)
-    asked = chosen_model(options.model, physics=options.physics, speed_mps=options.speed_mps)
+    source = choose_map(options.store, options.map_name)
+    asked = choose_model(options.model, physics=options.physics, speed_mps=options.speed_mps)
     return run(asked, source, Path(options.path), None if options.out is None else Path(options.out))
 
 
@@ -126,8 +126,8 @@ def run_plan_path(options: PlanPathOptions) -> PlanResult:
     Raises `PathError`, `ModelError`, `MapError`, `StoreError` or `UsageError` where an input cannot be used, or there is no path.
     """
     from tcpipe.formats.bucket_directories import fetch_directory
-    from tcpipe.learning.models import chosen_model
-    from tcpipe.planning.inputs import chosen_map
+    from tcpipe.learning.models import choose_model
+    from tcpipe.planning.inputs import choose_map
     from tcpipe.planning.plan_files import PlanRequest, plan
     from tcpipe.recipe.checking import from_values
 
@@ -136,9 +136,9 @@ def run_plan_path(options: PlanPathOptions) -> PlanResult:
     request = from_values(PlanRequest, asked, where="plan_path")
     if options.cost_map is not None:
         request = replace(request, cost_map=fetch_directory(options.cost_map))
-    source = chosen_map(options.store, options.map_name)
+    source = choose_map(options.store, options.map_name)
     return plan(
-        chosen_model(options.model, physics=options.physics, speed_mps=options.speed_mps),
+        choose_model(options.model, physics=options.physics, speed_mps=options.speed_mps),
         source,
         request,
         out=Path(options.out),

@@ -68,7 +68,7 @@ def _load_without_blas(context: CPUContext) -> None:
 CPUContext.load_additional_registries = _load_without_blas
 
 
-def kernel(function: Callable[..., Any]) -> Any:
+def compile_kernel(function: Callable[..., Any]) -> Any:
     """Compile ``function`` with numba on first call: no Python objects, no GIL, IEEE arithmetic, cached on disk."""
     options = {"cache": True, "nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
     try:

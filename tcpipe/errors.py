@@ -58,7 +58,7 @@ def split_secrets(scheme: str, rest: str) -> tuple[str, str]:
     return (public, query) if is_http or "=" in query else (rest, "")  # names of objects may hold question marks
 
 
-def plain_line(text: str) -> str:
+def clean_line(text: str) -> str:
     """Return ``text`` as one line that every terminal can show, without secrets: what cannot be printed as escapes."""
     text = hide_secrets(text)
     if text.isprintable():
@@ -66,9 +66,9 @@ def plain_line(text: str) -> str:
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text)
 
 
-def plain_lines(lines: Iterable[str]) -> str:
-    """Return lines as one text, a `plain_line` each: no name in them makes a line of its own."""
-    return "\n".join(map(plain_line, lines))
+def clean_lines(lines: Iterable[str]) -> str:
+    """Return lines as one text, a `clean_line` each: no name in them makes a line of its own."""
+    return "\n".join(map(clean_line, lines))
 
 
 class TcpipeError(Exception):
@@ -80,7 +80,7 @@ class TcpipeError(Exception):
     exit_code = 1
 
     def __init__(self, *problems: str, findings: Iterable[Any] = ()) -> None:
-        self.problems: tuple[str, ...] = tuple(plain_line(problem) for problem in problems)
+        self.problems: tuple[str, ...] = tuple(clean_line(problem) for problem in problems)
         self.findings = tuple(findings)
         super().__init__("\n".join(self.problems))
 

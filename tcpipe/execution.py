@@ -51,7 +51,7 @@ class Outcome(Generic[R]):
     died: bool = False
 
 
-def sound(outcome: Outcome[R | TcpipeError]) -> R:
+def unwrap_result(outcome: Outcome[R | TcpipeError]) -> R:
     """Return what a task gave that returns its error; raise that, or that its worker died."""
     if isinstance(outcome.result, TcpipeError):
         raise outcome.result
@@ -164,7 +164,7 @@ def _repeat(heard: Connection) -> None:
 def _begin_worker(life: Connection, saying: Connection, level: int) -> None:
     """Prepare a worker: an interrupt is its parent's business, what it logs goes to its parent, and so does its life."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    logger.addHandler(_Saying(saying.send))
+    logger.addHandler(_LogForwarder(saying.send))
     logger.setLevel(level)
     logger.propagate = False
     threading.Thread(target=_end_with, args=(life,), daemon=True).start()
@@ -176,7 +176,7 @@ def _end_with(life: Connection) -> None:
     os._exit(1)
 
 
-class _Saying(logging.Handler):
+class _LogForwarder(logging.Handler):
     """Hands what a worker logs to ``send``, as arguments of `Logger.log`: plain values, what is said as text of one argument."""
 
     def __init__(self, send: Callable[[Said], object]) -> None:
@@ -193,7 +193,7 @@ class _Saying(logging.Handler):
 _spent = {"cpu_s": 0.0}
 
 
-def cluster_cpu_s() -> float:
+def read_cluster_cpu_s() -> float:
     """Return the CPU seconds that clusters' workers spent on tasks of this process, as `resource.RUSAGE_CHILDREN` counts local ones."""
     return _spent["cpu_s"]
 
@@ -211,19 +211,20 @@ def _run_on_cluster(function: Callable[[T], R], tasks: Sequence[T], address: str
     """Run the tasks on a cluster's workers; one that is killed has its task run again on another, three times."""
     from distributed import KilledWorker  # noqa: PLC0415  most calls stay on this machine
 
-    with _client(address) as client:
+    with _connect_client(address) as client:
         channel, todo = _Channel(f"tcpipe-{client.id}", logger.getEffectiveLevel()), iter(range(len(tasks)))
         client.subscribe_topic(channel.topic, lambda event: logger.log(*event[1]))
 
         def submit(count: int) -> dict[Any, int]:
             at_once = islice(todo, count)
             return {
-                client.submit(_on_worker, function, tasks[at], __version__, channel, pure=False): at for at in at_once
+                client.submit(_run_on_worker, function, tasks[at], __version__, channel, pure=False): at
+                for at in at_once
             }
 
-        running = submit(_AHEAD * _workers(client, address))
+        running = submit(_AHEAD * _count_workers(client, address))
         while running:
-            for future in _ended(client, running, address):
+            for future in _wait_for_first(client, running, address):
                 index = running.pop(future)
                 try:
                     result, cpu_s = future.result()
@@ -245,7 +246,7 @@ def _run_on_cluster(function: Callable[[T], R], tasks: Sequence[T], address: str
                 running |= submit(1)
 
 
-def _ended(client: Client, running: Iterable[Any], address: str) -> Sequence[Any]:
+def _wait_for_first(client: Client, running: Iterable[Any], address: str) -> Sequence[Any]:
     """Return the tasks that have ended, when the first has; `TcpipeError` where the scheduler goes, or workers stay away."""
     from distributed import wait as wait_for  # noqa: PLC0415  as above
 
@@ -263,14 +264,14 @@ def _ended(client: Client, running: Iterable[Any], address: str) -> Sequence[Any
 
 
 @contextmanager
-def _client(address: str) -> Iterator[Client]:
+def _connect_client(address: str) -> Iterator[Client]:
     try:
         from distributed import Client  # noqa: PLC0415  most calls stay on this machine
     except ImportError:
         raise UsageError("dask not installed, wanted for --cluster: pip install 'tcpipe[cluster]'") from None
     if not _ADDRESS.fullmatch(address):
         raise UsageError(f"{address!r}: no address of a Dask scheduler; wanted tcp://host:port or tls://host:port")
-    with _silent("distributed", "distributed.client"):
+    with _mute_loggers("distributed", "distributed.client"):
         try:
             client = Client(address, timeout=_ANSWER_S, set_as_default=False)
         except (OSError, ValueError) as error:
@@ -284,7 +285,7 @@ def _client(address: str) -> Iterator[Client]:
 
 
 @contextmanager
-def _silent(*names: str) -> Iterator[None]:
+def _mute_loggers(*names: str) -> Iterator[None]:
     """Silence loggers, which tell a lost connection by a traceback."""
     levels = {name: logging.getLogger(name).level for name in names}
     try:
@@ -296,7 +297,7 @@ def _silent(*names: str) -> Iterator[None]:
             logging.getLogger(name).setLevel(level)
 
 
-def _workers(client: Client, address: str) -> int:
+def _count_workers(client: Client, address: str) -> int:
     """Return the number of workers; `UsageError` where there is none, or one has several threads, no tcpipe, or another."""
     try:
         with suppress(TimeoutError):
@@ -318,11 +319,11 @@ def _workers(client: Client, address: str) -> int:
         if isinstance(version, ImportError):
             raise UsageError(f"{worker}: a worker lacks tcpipe ({version}); install there what is installed here")
         if version != __version__ and isinstance(version, str):  # else it is gone again
-            raise _another(worker, version, wanted=__version__)
+            raise _make_cluster_error(worker, version, wanted=__version__)
     return len(threads)
 
 
-def _another(worker: str, version: str, *, wanted: str) -> UsageError:
+def _make_cluster_error(worker: str, version: str, *, wanted: str) -> UsageError:
     return UsageError(f"{worker}: a worker has tcpipe {version}, wanted {wanted} as here; install that")
 
 
@@ -334,13 +335,13 @@ class _Channel:
     level: int
 
 
-def _on_worker(function: Callable[[T], R], task: T, version: str, channel: _Channel) -> tuple[R, float]:
+def _run_on_worker(function: Callable[[T], R], task: T, version: str, channel: _Channel) -> tuple[R, float]:
     """Run a task on a cluster's worker; return its result and the CPU seconds that it took; what it logs goes to the client before."""
     from distributed import get_worker  # noqa: PLC0415  most calls stay on this machine
 
     if version != __version__:
-        raise _another(os.uname().nodename, __version__, wanted=version)
-    saying, began_s = _Saying(partial(get_worker().log_event, channel.topic)), time.process_time()
+        raise _make_cluster_error(os.uname().nodename, __version__, wanted=version)
+    saying, began_s = _LogForwarder(partial(get_worker().log_event, channel.topic)), time.process_time()
     logger.addHandler(saying)
     logger.setLevel(channel.level)
     try:

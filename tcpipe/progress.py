@@ -30,7 +30,7 @@ class Step:
 
 
 @contextmanager
-def working_on(task: str) -> Iterator[None]:
+def set_task(task: str) -> Iterator[None]:
     """Let what is told inside be of this task."""
     before = _task.set(task[-_LONGEST_NAME:])
     try:

@@ -34,31 +34,31 @@ from tcpipe.errors import StoreError, TableError, UsageError
 from tcpipe.formats.atomic import clear_scratch
 from tcpipe.formats.bucket import open_place
 from tcpipe.formats.bucket_directories import FetchedShards, fetch_files
-from tcpipe.formats.commit_log import Stamp, put_commit, read_state, uncollected
+from tcpipe.formats.commit_log import Stamp, pause_garbage_collection, put_commit, read_state
 from tcpipe.formats.commits import Entries, Kind, State
-from tcpipe.formats.geoparquet import located_segments
-from tcpipe.formats.index_files import RunFacts, facts_of, known_log, write_index
-from tcpipe.formats.json_files import compact_json, of_json, plain, to_json, typed
-from tcpipe.formats.numbered import digest_of, name_of, numbers, put_next, read_as_at
+from tcpipe.formats.geoparquet import add_segments_metadata
+from tcpipe.formats.index_files import RunFacts, make_run_facts, read_known_log, write_index
+from tcpipe.formats.integrity import CHECKSUMS, Checksum, compute_checksums, seal_document
+from tcpipe.formats.json_files import parse_typed, parse_typed_json, to_compact_json, to_json, to_plain
+from tcpipe.formats.numbered_documents import digest_of, find_highest_numbers, name_of, put_next, read_as_at
 from tcpipe.formats.object_storage import is_bucket, is_url
 from tcpipe.formats.parquet import read_table
 from tcpipe.formats.place import DirectoryPlace, Place
-from tcpipe.formats.places import local_output
 from tcpipe.formats.run_documents import Manifest, MapDocument, RunJson, StreamInfo, Tags, tell_the_same
-from tcpipe.formats.seals import CHECKSUMS, Checksum, file_checksums, sealed
-from tcpipe.formats.store_mark import MARK, is_outdated, layout_of, mark_store
+from tcpipe.formats.store_document import MARK, is_outdated, mark_store, read_layout
 from tcpipe.formats.stored_runs import (
     FilesState,
     Ingestions,
     Lost,
     RunDirectory,
-    below,
-    local_file,
+    add_span,
+    convert_run_errors,
+    fetch_local_file,
     look_at_files,
     put_tables,
-    told_of,
-    with_span,
+    subdirectory,
 )
+from tcpipe.formats.user_paths import check_local_output
 from tcpipe.tables.levels import (
     DATA_MODEL_VERSION,
     EARLIER_VERSIONS,
@@ -68,8 +68,8 @@ from tcpipe.tables.levels import (
     LabelledSegments,
     Streams,
     Track,
-    metadata_of,
-    with_metadata,
+    add_metadata,
+    read_metadata,
 )
 
 logger = logging.getLogger("tcpipe")
@@ -101,7 +101,7 @@ class Store:
 
     def maps(self) -> list[str]:
         """Return the names of the maps, sorted."""
-        return sorted(numbers(self.place.files("maps")))
+        return sorted(find_highest_numbers(self.place.files("maps")))
 
     def map_number(self, name: str) -> int:
         """Return the number of a map's last document, 0 where there is none; `StoreError` if the name cannot be one."""
@@ -109,7 +109,7 @@ class Store:
             raise StoreError(
                 f"map name {name!r}: wanted letters, digits, '_', '-', '.', beginning with a letter or digit"
             )
-        return numbers(self.place.files("maps")).get(name, 0)
+        return find_highest_numbers(self.place.files("maps")).get(name, 0)
 
     def map_document(self, name: str) -> MapDocument:
         """Return where a map lies, and its files; `StoreError` where there is none, or its document is not as it was written."""
@@ -144,14 +144,14 @@ class Store:
         """
         maps = self.place.below("maps")
         with maps.workshop() as directory:
-            with told_of(maps.where(name), directory):
+            with convert_run_errors(maps.where(name), directory):
                 yield directory / f"{name}.zarr"
-            checksums = file_checksums(directory)
+            checksums = compute_checksums(directory)
             prefix = f"{name}/{digest_of(checksums)}"
             if free := self.map_number(name) == after:
                 maps.put_files(prefix, directory)
-        told = DATA_MODEL_VERSION, f"{prefix}/{name}.zarr", f"{prefix}/{name}.png", below(prefix, checksums)
-        data, new = to_json(sealed(MapDocument(*told))).encode(), name_of(name, after + 1)
+        told = DATA_MODEL_VERSION, f"{prefix}/{name}.zarr", f"{prefix}/{name}.png", subdirectory(prefix, checksums)
+        data, new = to_json(seal_document(MapDocument(*told))).encode(), name_of(name, after + 1)
         same = free and after > 0 and maps.read(name_of(name, after)) == data
         put = same or (free and maps.put_new(new, data))
         if not put and not (after and maps.read(new) == data):  # the answer to one's own may be lost
@@ -200,7 +200,7 @@ class Store:
         sizes = {
             of.name.removeprefix(f"{run_id}/"): of.size_bytes for of in self.runs_place.entries(run_id, but=_STREAMS)
         }
-        last = numbers(sizes)
+        last = find_highest_numbers(sizes)
         known = self.known_run(run_id, last)
         about = {name: sizes[name] for stem in ("run", "tags") if stem in last for name in [name_of(stem, last[stem])]}
         found = dict[str, RunFacts]()
@@ -214,10 +214,10 @@ class Store:
                         continue
                     tables = {f"{recipe_id}/{file}": of.size_bytes for file, of in manifest.checksums.items()}
                     if tables.items() <= sizes.items():
-                        row = facts_of(manifest, name, {document: sizes[document], **about, **tables})
-                        row = with_span(row, place.below(recipe_id), manifest)
+                        row = make_run_facts(manifest, name, {document: sizes[document], **about, **tables})
+                        row = add_span(row, place.below(recipe_id), manifest)
                         tags = known.tags if "tags" in last else manifest.tags
-                        found[recipe_id] = replace(row, log=known_log(known), tags=tags)
+                        found[recipe_id] = replace(row, log=read_known_log(known), tags=tags)
         return found
 
     @property
@@ -227,7 +227,7 @@ class Store:
 
     def write_index(self, state: State) -> None:
         """Write the table of all runs for other tools."""
-        with uncollected():
+        with pause_garbage_collection():
             write_index(self.index_place, (state.runs[key] for key in sorted(state.runs)))
 
     def prove(self, runs: Sequence[RunDirectory]) -> dict[str, str]:
@@ -237,7 +237,7 @@ class Store:
         """
         damaged, proved, new = dict[str, str](), dict[str, FilesState](), dict[str, FilesState]()
         with suppress(StoreError):
-            proved = of_json(self.index_place.read(_PROVED) or b"{}", dict[str, FilesState], _PROVED)
+            proved = parse_typed_json(self.index_place.read(_PROVED) or b"{}", dict[str, FilesState], _PROVED)
         for run in runs:
             try:
                 if run.files_state != proved.get(f"{run.run_id}/{run.recipe_id}"):
@@ -248,7 +248,7 @@ class Store:
                 damaged[run.run_id] = error.problems[0]
         if new:
             with suppress(StoreError):
-                self.index_place.put(_PROVED, compact_json({**proved, **new}))
+                self.index_place.put(_PROVED, to_compact_json({**proved, **new}))
         return damaged
 
     def run_ids(self) -> list[str]:
@@ -273,12 +273,12 @@ class Store:
             tags = Tags({**before, **given})
             if tags.tags == before:
                 return False
-            data = to_json(sealed(tags)).encode()
+            data = to_json(seal_document(tags)).encode()
             if self.runs_place.put_new(f"{run_id}/{name_of('tags', number + 1)}", data):
                 return True
 
     def _last(self, run_id: str, stem: str) -> int:
-        return numbers(self.runs_place.files(run_id)).get(stem, 0)
+        return find_highest_numbers(self.runs_place.files(run_id)).get(stem, 0)
 
     def _tags(self, run_id: str, number: int) -> Mapping[str, str] | None:
         """Return the tags in a document; None for number 0."""
@@ -289,7 +289,7 @@ class Store:
 
         ``last`` are the highest numbers of its documents, where they are known.
         """
-        last = numbers(self.runs_place.files(run_id)) if last is None else last
+        last = find_highest_numbers(self.runs_place.files(run_id)) if last is None else last
         if not last.get("run"):
             return None
         name = f"{run_id}/{name_of('run', last['run'])}"
@@ -310,7 +310,7 @@ class Store:
 
     def write_run_json(self, run_id: str, values: RunJson) -> None:
         """Write what is known of a run's log; where that is known already nothing is written."""
-        place, last = self.runs_place.below(run_id), numbers(self.runs_place.files(run_id))
+        place, last = self.runs_place.below(run_id), find_highest_numbers(self.runs_place.files(run_id))
         known = self.known_run(run_id) if last.get("run") else None
         if known is None or not tell_the_same(known, values) or values.streams != known.streams:
             known = put_next(place, "run", values, after=last.get("run", 0), settled=partial(tell_the_same, values))
@@ -323,7 +323,7 @@ class Store:
         for role, table in streams.tables.items():
             read_with = key, streams.robot, streams.gnss_crs, streams.power_averaged
             info = StreamInfo(*read_with, report=streams.report, sensor=streams.sensors[role])
-            told[role] = with_metadata(table, plain(info))
+            told[role] = add_metadata(table, to_plain(info))
         return put_tables(self.runs_place.below(run_id), told, folder=f"{_STREAMS}/")
 
     def read_streams(self, run_id: str, *, key: str) -> Streams | None:
@@ -335,7 +335,7 @@ class Store:
         try:
             for role, path in self.stream_files(run_id, known).items():
                 table = read_table(path)
-                of[role] = told = typed(metadata_of(table), StreamInfo, path)
+                of[role] = told = parse_typed(read_metadata(table), StreamInfo, path)
                 if told.key != key or told.data_model_version not in READ_TABLES:
                     return None
                 tables[role] = table.replace_schema_metadata(None)
@@ -349,7 +349,9 @@ class Store:
     def stream_files(self, run_id: str, known: RunJson) -> dict[str, Path]:
         """Return the files of L1 on this machine by role, proved; `StoreError` if one is not as it was written."""
         place = self.runs_place.below(run_id)
-        return {PurePosixPath(name).stem: local_file(place, name, of) for name, of in sorted(known.streams.items())}
+        return {
+            PurePosixPath(name).stem: fetch_local_file(place, name, of) for name, of in sorted(known.streams.items())
+        }
 
     def write_run(
         self,
@@ -363,18 +365,18 @@ class Store:
         """Write one ingestion, its checksums added to the manifest; return that, or the one of others that is ``settled``."""
         place = self.runs_place.below(f"{manifest.run_id}/{manifest.recipe_id}")
         told = {
-            "run_id": manifest.run_id, "recipe_id": manifest.recipe_id, "datum": plain(manifest.info.datum), "robot": manifest.robot,
+            "run_id": manifest.run_id, "recipe_id": manifest.recipe_id, "datum": to_plain(manifest.info.datum), "robot": manifest.robot,
         }  # fmt: skip
         tables = {
             "track": gated.table,
-            "segments": located_segments(labelled.table, manifest.info.datum),
+            "segments": add_segments_metadata(labelled.table, manifest.info.datum),
             "rejections": track.rejections,
         }
         whole = self.read_rows(manifest.run_id).get(manifest.recipe_id)
         if whole is not None and settled(known := read_as_at(place, whole.manifest, Manifest)):
             return known
-        checksums = put_tables(place, {name: with_metadata(table, told) for name, table in tables.items()})
-        after = numbers(place.files()).get("manifest", 0)
+        checksums = put_tables(place, {name: add_metadata(table, told) for name, table in tables.items()})
+        after = find_highest_numbers(place.files()).get("manifest", 0)
         return put_next(place, "manifest", replace(manifest, checksums=checksums), after=after, settled=settled)
 
 
@@ -391,7 +393,7 @@ def is_store(path: Path | str) -> bool:
     place = open_place(path)
     if place.read(MARK) is not None:  # not its size: only what is asked for with a body is refused with a reason
         with suppress(StoreError):
-            _refuse_earlier(place, layout_of(place))
+            _refuse_earlier(place, read_layout(place))
         return True
     if is_outdated(place):
         raise UsageError(
@@ -413,7 +415,7 @@ def run_at(path: Path | str) -> tuple[Store, list[RunDirectory]] | None:
     ------
     StoreError : it is a run's, but holds no finished run of this data-model version.
     """
-    inside = inside_store(path)
+    inside = find_store_above(path)
     if inside is None:
         return None
     store, run_id, recipe_id = inside
@@ -426,7 +428,7 @@ def run_at(path: Path | str) -> tuple[Store, list[RunDirectory]] | None:
     return store, runs
 
 
-def inside_store(path: Path | str) -> tuple[Store, str, str | None] | None:
+def find_store_above(path: Path | str) -> tuple[Store, str, str | None] | None:
     """Return of ``STORE/runs/<run_id>[/<recipe_id>]`` the store, the run and the recipe; None for any other path."""
     text = str(path).rstrip("/") if is_url(path) else str(Path(path).resolve())
     found = re.fullmatch(r"(.+)/runs/([^/]+)(?:/([^/]+))?", text)
@@ -446,13 +448,13 @@ def open_store(root: str | Path, *, create: bool = False) -> Store:
     """
     if is_url(root) and not is_bucket(root):
         raise UsageError(f"{root}: no store can lie there; wanted a directory, s3://bucket/name, gs:// or az://")
-    root = str(root).rstrip("/") if is_url(root) else local_output(root)
+    root = str(root).rstrip("/") if is_url(root) else check_local_output(root)
     store = Store(root)
     if isinstance(root, Path):
         _refuse_file(root, create=create)
     else:
         store.place.check()
-    version = layout_of(store.place)
+    version = read_layout(store.place)
     _refuse_earlier(store.place, version)
     found = version is not None or is_store(root)
     if not found and not create and not isinstance(root, Path):

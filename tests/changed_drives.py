@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from tcpipe.formats.logs.writing import MessageStream
-from tcpipe.simulation import Faults, Truth, scenario, simulated_drive
-from tcpipe.simulation.messages import TOPICS, streams
+from tcpipe.simulation import Faults, Truth, find_scenario, simulate_readings
+from tcpipe.simulation.messages import TOPICS, make_streams
 from tcpipe.simulation.route import Wander
 
 NAMES = TOPICS["ros2"]
@@ -35,7 +35,7 @@ class Drive:
 
 
 def make(plan=None, *, placements: bool = True) -> Drive:
-    demo = scenario("demo")
+    demo = find_scenario("demo")
     spec = demo.drives[0]
     spec = replace(
         spec,
@@ -44,6 +44,6 @@ def make(plan=None, *, placements: bool = True) -> Drive:
         faults=replace(Faults.every(), gnss_outage=False, visual_dropouts=False, power_gap=False),
     )
     demo = replace(demo, drives=(spec,))
-    truth, readings = simulated_drive(demo, seed=5)
-    made = streams(readings, spec.sensors.mounted(spec.faults), spec.recorder, geoid_m=demo.world.site.geoid_m)
+    truth, readings = simulate_readings(demo, seed=5)
+    made = make_streams(readings, spec.sensors.mounted(spec.faults), spec.recorder, geoid_m=demo.world.site.geoid_m)
     return Drive(truth, tuple(made))

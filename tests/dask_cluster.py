@@ -16,7 +16,7 @@ from pathlib import Path
 from distributed import Client
 
 from tcpipe.formats.json_files import read_json
-from tcpipe.progress import step, working_on
+from tcpipe.progress import set_task, step
 
 _LONGEST_S = 300.0
 """A machine that others use takes its time to start a process."""
@@ -73,7 +73,7 @@ def _ended(process: subprocess.Popen[bytes]) -> None:
 
 def where(value: int) -> tuple[int, int]:
     """Return the square, and which process it is from."""
-    with working_on(f"log {value}"):
+    with set_task(f"log {value}"):
         step("squaring")
     logging.getLogger("tcpipe").info("task %d", value)
     return value * value, os.getpid()

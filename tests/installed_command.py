@@ -18,8 +18,8 @@ from typing import Any
 from unittest.mock import patch
 
 from tcpipe.cli import main
-from tcpipe.cli.answers import answers
-from tcpipe.formats.json_files import plain, typed
+from tcpipe.cli.json_output import json_output_types
+from tcpipe.formats.json_files import parse_typed, to_plain
 
 COMMAND = Path(sys.executable).parent / "tcpipe"
 HANGS_S = 3600.0
@@ -76,14 +76,14 @@ def _exit_code(command: list[str]) -> int:
 
 def _as_promised(done: subprocess.CompletedProcess[str]) -> subprocess.CompletedProcess[str]:
     """Return what is given; assert that what a command printed with ``--json`` is all of its contract, and no more."""
-    command, known = done.args[1], answers()
+    command, known = done.args[1], json_output_types()
     if "--json" in done.args[1:] and done.returncode in {0, 1, 3} and '"problems"' not in done.stdout[:40]:
         for text in done.stdout.splitlines() if command == "ingest" else [done.stdout]:
             said = json.loads(text)
             name = "evaluation" if command == "evaluate" else f"{command}.answer"  # it prints its file
             cls = known.get(f"{command}-{said.get('kind')}.answer") or known.get(name)
             assert cls is not None, f"{command} --json has no contract"
-            assert plain(typed(said, cls, Path(command))) == said
+            assert to_plain(parse_typed(said, cls, Path(command))) == said
     return done
 
 

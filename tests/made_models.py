@@ -7,10 +7,16 @@ import numpy as np
 import pyarrow as pa
 
 from tcpipe.learning.architecture import Architecture
-from tcpipe.learning.evaluation_facts import Compared, EvaluateConfig, EvaluatedDataset, EvaluatedModel, Evaluation
+from tcpipe.learning.evaluation_facts import (
+    BaselineResult,
+    EvaluateConfig,
+    EvaluatedDataset,
+    EvaluatedModel,
+    Evaluation,
+)
 from tcpipe.learning.fitting import FitConfig
 from tcpipe.learning.metrics import Errors, Ratio
-from tcpipe.learning.model_card import ModelCard, Seen, TrainedOn, Training
+from tcpipe.learning.model_card import ModelCard, TrainedOn, Training, TrainingRange
 from tcpipe.learning.models import write_model
 from tcpipe.terrain.classes import PAPER_CLASSES
 
@@ -25,7 +31,7 @@ CARD = ModelCard(
     label_velocity="ground",
     robot="husky",
     classes=PAPER_CLASSES.classes,
-    seen=Seen(
+    seen=TrainingRange(
         {4: 60, 6: 25, 7: 15},
         (4, 6, 7),
         {"slope_rad": (-0.3, 0.3), "cross_slope_rad": (-0.25, 0.25), "relief_m": (0.0, 0.5)},
@@ -37,10 +43,10 @@ CARD = ModelCard(
 
 def made_model(directory: Path, *, seed: int = 0, rows: int = 60, **changes) -> Path:
     """Write a model folder; ``changes`` replace fields of its card."""
-    from tcpipe.learning.network import resnet18  # needs torch
+    from tcpipe.learning.network import make_resnet18  # needs torch
 
     card = replace(CARD, **changes)
-    network = resnet18(card.architecture, seed=seed, start=(0.4, 0.85)[: card.architecture.outputs])
+    network = make_resnet18(card.architecture, seed=seed, start=(0.4, 0.85)[: card.architecture.outputs])
     rng = np.random.default_rng(seed)
     power, velocity = rng.uniform(100.0, 250.0, rows), rng.uniform(0.7, 0.95, rows)
     residuals = pa.table(
@@ -60,9 +66,11 @@ def made_model(directory: Path, *, seed: int = 0, rows: int = 60, **changes) -> 
     return directory
 
 
-def made_comparison(baseline: str, ratio: Ratio, *, quantity="E", split="unseen", rmse=5.0, groups=34) -> Compared:
+def made_comparison(
+    baseline: str, ratio: Ratio, *, quantity="E", split="unseen", rmse=5.0, groups=34
+) -> BaselineResult:
     """A model beside a baseline, whose errors are ``ratio`` of the baseline's."""
-    return Compared(
+    return BaselineResult(
         baseline=baseline, split=split, quantity=quantity, errors=Errors(50, rmse, 5.0, 50), rmse_ratio=ratio, mape_ratio=ratio,
         groups=groups, drawn_by="runs",
     )  # fmt: skip

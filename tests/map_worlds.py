@@ -10,10 +10,10 @@ import rasterio
 from rasterio import Affine
 
 from tcpipe.tables.levels import LABELLED_SEGMENTS
-from tcpipe.tables.wkb import line_column
+from tcpipe.tables.wkb import make_lines
 from tcpipe.terrain.classes import PAPER_CLASSES, ClassTable
 from tcpipe.terrain.grid import MapGrid
-from tcpipe.terrain.layers import missing, paper_layers
+from tcpipe.terrain.layers import find_no_data_value, make_paper_layers
 
 
 @dataclass(frozen=True)
@@ -116,7 +116,7 @@ def segment_table(
     rest = {name: np.zeros(count) for name in LABELLED_SEGMENTS.names() if name not in given}
     whole = {c.name for c in LABELLED_SEGMENTS.columns if str(c.dtype).startswith(("int", "uint"))}
     rest = {name: values.astype(np.int64) if name in whole else values for name, values in rest.items()}
-    return LABELLED_SEGMENTS.table(**given, **rest | {"geometry": line_column(start, end)})
+    return LABELLED_SEGMENTS.table(**given, **rest | {"geometry": make_lines(start, end)})
 
 
 @dataclass(frozen=True)
@@ -135,7 +135,7 @@ class ArrayMap:
 
     @property
     def layers(self):
-        return paper_layers([name for name in self.arrays if name not in self.more], self.classes) | self.more
+        return make_paper_layers([name for name in self.arrays if name not in self.more], self.classes) | self.more
 
     def read(self, layer, row0, row1, col0, col1):
         return self.arrays[layer][row0:row1, col0:col1]
@@ -146,7 +146,7 @@ class ArrayMap:
     def read_tile(self, layer, i, j, out):
         side = self.tile_px
         part = self.read(layer, i * side, (i + 1) * side, j * side, (j + 1) * side)
-        out[...] = missing(self.layers[layer].mapped)
+        out[...] = find_no_data_value(self.layers[layer].mapped)
         out[: part.shape[0], : part.shape[1]] = part
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 from map_worlds import ArrayMap
 
-from tcpipe.planning.path_cost import projection_of
+from tcpipe.planning.path_cost import find_projection
 from tcpipe.terrain.grid import MapGrid
 
 WEST_M, NORTH_M = 500_000.0, 5_200_000.0
@@ -26,4 +26,4 @@ def plane(side_m=24.0, *, rise_east=0.0, rise_north=0.0, classes=None, pitch_m=0
 def lonlat(source, *points):
     """Return lon, lat [deg] of points given east and north of the map's south-west corner [m], shape (P, 2)."""
     x_min, y_min, _, _ = source.grid.bounds_m
-    return projection_of(source).inverse(np.array(points, np.float64) + np.array([x_min, y_min]))
+    return find_projection(source).inverse(np.array(points, np.float64) + np.array([x_min, y_min]))

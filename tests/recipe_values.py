@@ -6,7 +6,7 @@ from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 from tcpipe.recipe import Recipe
-from tcpipe.recipe.checking import kinds_of
+from tcpipe.recipe.checking import read_annotations
 from tcpipe.robots.profiles import PowerSource
 from tcpipe.tables.bounds import Bounds
 
@@ -16,7 +16,7 @@ def keys() -> list[str]:
     default, found = Recipe(), ["robot", "robots", "power_sources", "tables"]
     for section in fields(default):
         of = getattr(default, section.name)
-        found += [f"{section.name}.{name}" for name in kinds_of(type(of))] if is_dataclass(of) else []
+        found += [f"{section.name}.{name}" for name in read_annotations(type(of))] if is_dataclass(of) else []
     return found
 
 
@@ -24,7 +24,7 @@ def other_values(key: str) -> list[Any]:
     """Return valid values of a key that are not its default: of a number both ends, of a choice all others."""
     section, _, name = key.rpartition(".")
     holder = getattr(Recipe(), section) if section else Recipe()
-    return [value for value in _values(kinds_of(type(holder))[name]) if value != getattr(holder, name)]
+    return [value for value in _values(read_annotations(type(holder))[name]) if value != getattr(holder, name)]
 
 
 def with_value(recipe: Recipe, key: str, value: Any) -> Recipe:
@@ -50,7 +50,9 @@ def _values(kind: Any, bounds: tuple[Any, ...] = ()) -> Iterator[Any]:
         yield from zip(*(list(_values(each)) for each in of), strict=True)
     elif is_dataclass(kind):
         made = PowerSource("a/msg/B", "v", "i") if kind is PowerSource else kind()
-        others = (replace(made, **{name: value}) for name, each in kinds_of(kind).items() for value in _values(each))
+        others = (
+            replace(made, **{name: value}) for name, each in read_annotations(kind).items() for value in _values(each)
+        )
         yield from (
             other for other in others if not hasattr(other, "contradictions") or not any(other.contradictions())
         )

@@ -4,7 +4,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from tcpipe.formats.logs.log_file import open_log
-from tcpipe.formats.robot_files import shipped_profiles
+from tcpipe.formats.robot_files import load_shipped_profiles
 from tcpipe.recipe import ReadConfig
 from tcpipe.simulation import simulate
 from tcpipe.simulation.scenarios import DriveSpec, RasterSpec, Scenario
@@ -20,4 +20,4 @@ def log_of(scenario: Scenario, drive: DriveSpec, out: Path, *, seed: int = 1) ->
 
 def streams_of(log: Path, config: ReadConfig | None = None) -> Streams:
     with open_log(log) as opened:
-        return read_run(opened, config or ReadConfig(), robot=None, known=shipped_profiles())
+        return read_run(opened, config or ReadConfig(), robot=None, known=load_shipped_profiles())

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from tcpipe.cost.physics import Metres
+from tcpipe.cost.physics import FitSamples
 
 NEWTON, RECOVERED, STANDING_WATT = 953.4, 0.40, 14.0
 RESISTANCE = {"grass": 0.17, "paved": 0.115}
@@ -29,4 +29,4 @@ def made(
     work = NEWTON * (rolling * np.cos(angle) + np.sin(angle)) * speed / np.cos(angle) + turning * rate
     always = STANDING_WATT + drivetrain_newton * speed / np.cos(angle)
     power = always + np.where(work > 0, work, RECOVERED * work) + noise_watt * rng.standard_normal(count)
-    return Metres(power, speed, np.tan(angle), rate, terrain)
+    return FitSamples(power, speed, np.tan(angle), rate, terrain)

@@ -2,14 +2,14 @@
 
 from pathlib import Path
 
-from tcpipe.formats.numbered import name_of, numbers
+from tcpipe.formats.numbered_documents import find_highest_numbers, name_of
 from tcpipe.formats.stored_runs import RunDirectory
 from tcpipe.store import Store
 
 
 def last(directory: Path, stem: str) -> Path:
     """The document of the highest number in a directory."""
-    number = numbers(path.name for path in directory.iterdir())[stem]
+    number = find_highest_numbers(path.name for path in directory.iterdir())[stem]
     return directory / name_of(stem, number)
 
 

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
-from tcpipe.formats.finding_lines import recipe_lines
+from tcpipe.formats.finding_lines import format_remedy_lines
 from tcpipe.formats.recipe_toml import parse_recipe
 from tcpipe.recipe import Recipe
 from tcpipe.tables.findings import Finding
@@ -13,7 +13,7 @@ from tcpipe.tables.findings import Finding
 
 def proposed(finding: Finding, *, alternative: int = 0) -> dict[str, Any]:
     """The recipe values that a remedy of a finding proposes, by the lines that are printed."""
-    return tomllib.loads("\n".join(recipe_lines(replace(finding, remedies=(finding.remedies[alternative],)))))
+    return tomllib.loads("\n".join(format_remedy_lines(replace(finding, remedies=(finding.remedies[alternative],)))))
 
 
 def merged(one: Mapping[str, Any], other: Mapping[str, Any]) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from map_worlds import World
 from tcpipe import __version__
 from tcpipe.formats.commits import Entries, Superseded
 from tcpipe.formats.maps.building import build_map
-from tcpipe.formats.recipe_toml import ingest_key, recipe_id
+from tcpipe.formats.recipe_toml import ingest_key, make_recipe_id
 from tcpipe.formats.run_documents import Counts, LogOrigin, Manifest, RunJson
 from tcpipe.pipeline.log_writer import open_log
 from tcpipe.recipe import Recipe
@@ -31,7 +31,7 @@ from tcpipe.tables.levels import (
     TrackInfo,
 )
 from tcpipe.tables.verdicts import judge
-from tcpipe.tables.wkb import line_column
+from tcpipe.tables.wkb import make_lines
 
 STANDING_WATT = 90.0
 WORLD = World("EPSG:32633", 533_000.0, 5_213_000.0, side_m=40.0)
@@ -92,7 +92,7 @@ def segments(run_id, start_xy_m, end_xy_m, *, start_ns=0, powered=True, robot="h
     for column in LABELLED_SEGMENTS.columns:
         if column.name not in given:
             rest[column.name] = np.zeros(n, np.int64 if pa.types.is_integer(column.dtype) else np.float64)
-    rest["geometry"] = line_column(start, end)
+    rest["geometry"] = make_lines(start, end)
     return LABELLED_SEGMENTS.table(**given, **rest)
 
 
@@ -140,7 +140,7 @@ def add_run(
     power = PowerSign("drawn_positive", averaged=False, includes=includes)
     found = StageReport(tuple(findings), StageFacts(power=power) if includes else StageFacts())
     info = TrackInfo(run_id, robot, Datum(15.43, 47.07, 400.0), 20.0, "smoother", found)
-    identity = recipe_id(recipe, robot)
+    identity = make_recipe_id(recipe, robot)
     metres = float(np.sum(table.column("arc_length_m").to_numpy()))
     ledger_m = ledger_m or {"kept": metres, "standing": 0.0, "accelerating": 2.5}
     store.write_run_json(

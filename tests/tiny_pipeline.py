@@ -9,11 +9,11 @@ from pathlib import Path
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.ingest import ingest
 from tcpipe.pipeline.maps import add_map
-from tcpipe.simulation import Faults, simulate, tiny
+from tcpipe.simulation import Faults, make_tiny, simulate
 
 
 def main(out: Path, first: Path) -> None:
-    site = simulate(out / "site", scenario=tiny(Faults.every()))
+    site = simulate(out / "site", scenario=make_tiny(Faults.every()))
     layers = {name: first / path.relative_to(out) for name, path in site.rasters.items()}
     assert ingest([first / path.relative_to(out) for path in site.logs], store=out / "store").exit_code == 0
     add_map("site", **layers, store=out / "store")

@@ -24,7 +24,7 @@ from typing import Any
 import dagster as dg
 
 from tcpipe.formats.finding_lines import format_finding, list_findings
-from tcpipe.formats.json_files import typed
+from tcpipe.formats.json_files import parse_typed
 from tcpipe.pipeline.log_sources import LogSource, find_sources
 from tcpipe.tables.catalogue import AFFECTED
 from tcpipe.tables.findings import Finding, is_problem, select_findings
@@ -95,7 +95,7 @@ def _check(name: str, problems: list[str], *, warn: bool = False, **more: int | 
 
 def _judged(result: Answer) -> dg.AssetCheckResult:
     """Return whether position, time and energy of a run are usable; the reasons are the problems, the worst first."""
-    verdict = typed(result["verdict"], Verdict, "tcpipe ingest --json")
+    verdict = parse_typed(result["verdict"], Verdict, "tcpipe ingest --json")
     lines = [*map(format_finding, verdict.reasons), *result["run"]["damage"]]
     grades = {name: getattr(verdict, name) for name in AFFECTED}
     return _check("usable", lines, warn=verdict.worst != "not usable", **grades)
@@ -166,7 +166,7 @@ def dataset() -> dg.MaterializeResult:
     out = _place("TCPIPE_DATASET", "dataset")
     region = os.environ.get("TCPIPE_SPLIT")
     (made,) = _answers("build-dataset", out, *(["--split", region] if region else []))
-    card, findings = made["card"], typed(made["findings"], tuple[Finding, ...], "tcpipe build-dataset --json")
+    card, findings = made["card"], parse_typed(made["findings"], tuple[Finding, ...], "tcpipe build-dataset --json")
     problems = [format_finding(finding) for finding in findings if is_problem(finding)]
     shared = [format_finding(finding) for finding in select_findings(findings, "split-leakage")]
     return dg.MaterializeResult(

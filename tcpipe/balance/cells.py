@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.balance.correlation import Correlation, effective_size
-from tcpipe.tables.catalogue import threshold
+from tcpipe.balance.correlation import Correlation, compute_effective_size
+from tcpipe.tables.catalogue import read_threshold
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -47,15 +47,15 @@ class Cell:
     def rare(self) -> bool:
         """Whether it is worth few independent samples: with 30, its mean is known to 1/√30, a fifth, of its standard deviation."""
         known = self.effective if self.effective is not None else sum(self.samples.values())
-        return known < threshold("thin-ground", "enough_count")
+        return known < read_threshold("thin-ground", "enough_count")
 
 
-def slope_ranges(slope_rad: Floats) -> Ints:
+def find_slope_ranges(slope_rad: Floats) -> Ints:
     """Return the range of `SLOPE_NAMES` that each slope [rad] lies in, shape (N,)."""
     return np.searchsorted(np.radians(SLOPE_EDGES_DEG), slope_rad, side="right").astype(np.int64)
 
 
-def speed_edges(velocity_mps: Floats) -> tuple[float, ...]:
+def choose_speed_edges(velocity_mps: Floats) -> tuple[float, ...]:
     """Return the borders between ranges of speed [m/s]: round steps, about five of them up to the fastest hundredth."""
     top = float(np.quantile(velocity_mps, 0.99)) if len(velocity_mps) else 0.0
     if not top > 0.0:
@@ -98,8 +98,8 @@ def count_cells(
                 slope,
                 speed[0] if speed else None,
                 {name: int((split[rows] == name).sum()) for name in splits},
-                effective_size(xy_m[rows], *correlations) if correlations else None,
-                effective_size(xy_m[train], *correlations) if correlations else None,
+                compute_effective_size(xy_m[rows], *correlations) if correlations else None,
+                compute_effective_size(xy_m[train], *correlations) if correlations else None,
             )
         )
     return cells

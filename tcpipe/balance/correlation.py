@@ -48,7 +48,7 @@ class Correlation:
     """Pairs of samples that it was estimated from."""
 
 
-def residuals(values: Floats, terrain_class: Ints, slope_rad: Floats) -> Floats:
+def compute_slope_residuals(values: Floats, terrain_class: Ints, slope_rad: Floats) -> Floats:
     """Return what a parabola over slope, one a class, leaves of a label, shape (N,)."""
     left = np.empty(len(values))
     for kind in np.unique(terrain_class):
@@ -59,19 +59,19 @@ def residuals(values: Floats, terrain_class: Ints, slope_rad: Floats) -> Floats:
     return left
 
 
-def correlations(
+def estimate_correlations(
     residual_by_label: Mapping[str, Floats], xy_m: Floats, run: Ints, start_ns: Ints, *, chord_m: float
 ) -> dict[str, Correlation | None]:
     """Return how the residuals of each label are correlated over distance; None where too few samples are near each other to say.
 
     Parameters
     ----------
-    residual_by_label : of `residuals`, shape (N,) each.
+    residual_by_label : of `compute_slope_residuals`, shape (N,) each.
     xy_m : centres of the footprints [m], shape (N, 2).
     run, start_ns : number of each sample's run, and its start [ns], shape (N,).
     chord_m : segment length [m].
     """
-    rows = _stretches(run, start_ns)
+    rows = _draw_sections(run, start_ns)
     apart = pdist(xy_m[rows]) / chord_m
     bins, size = np.digitize(apart, _LAGS) - 1, len(_LAGS)
     pairs = np.bincount(bins, minlength=size)[: size - 1]
@@ -89,7 +89,7 @@ def correlations(
     return found
 
 
-def _stretches(run: Ints, start_ns: Ints) -> Ints:
+def _draw_sections(run: Ints, start_ns: Ints) -> Ints:
     """Return rows of whole stretches of the drives, spread evenly; all rows where there are few."""
     order = np.lexsort((start_ns, run))
     if len(order) <= _MOST:
@@ -109,7 +109,7 @@ def _fit(lag: Floats, gamma: Floats, pairs: Ints) -> tuple[float, float, float]:
     return best[1:]
 
 
-def effective_size(xy_m: Floats, *found: Correlation) -> float:
+def compute_effective_size(xy_m: Floats, *found: Correlation) -> float:
     """Return to how many independent samples those at ``xy_m`` [m], shape (n, 2), are worth: from 1 to n, 0 of none.
 
     Of several correlations, the one that leaves fewest counts.

@@ -18,8 +18,8 @@ from typing import Any, NoReturn, TypeVar
 import click
 
 from tcpipe import __version__
-from tcpipe.cli.output import debug_log, print_traceback, say_failure
-from tcpipe.cli.process import NOTHING_HALF, Ended, ended_in_time, prepare_process
+from tcpipe.cli.output import print_traceback, say_failure, write_debug_log
+from tcpipe.cli.process import NOTHING_HALF, Terminated, prepare_process, terminate_on_signal
 from tcpipe.errors import TcpipeError, UsageError, hide_secrets
 
 _EXTRAS = {"torch": "train", "lightgbm": "tables", "dask": "cluster", "distributed": "cluster", "dagster": "dagster"}
@@ -105,7 +105,7 @@ def _begin_debugging(context: click.Context, _: click.Parameter, wanted: bool) -
     root = context.find_root()
     if wanted and not root.meta.get("debugging"):
         root.meta["debugging"] = True
-        root.with_resource(debug_log())
+        root.with_resource(write_debug_log())
         where = f"tcpipe {__version__}, Python {platform.python_version()}, {platform.platform()}"
         logging.getLogger("tcpipe").debug("%s: %s", where, hide_secrets(shlex.join(sys.argv[1:])))
 
@@ -144,7 +144,7 @@ def main() -> None:
     _run()
 
 
-@ended_in_time()
+@terminate_on_signal()
 def _run() -> NoReturn:
     try:
         _refuse_empty(sys.argv[1:])
@@ -152,7 +152,7 @@ def _run() -> NoReturn:
         sys.stdout.flush()
     except (click.exceptions.Abort, KeyboardInterrupt):
         _fail([f"interrupted; {NOTHING_HALF}"], 128 + signal.SIGINT)
-    except Ended as ended:
+    except Terminated as ended:
         _fail([f"{ended}; {NOTHING_HALF}"], ended.exit_code)
     except click.UsageError as error:
         if not sys.argv[1:]:
@@ -169,7 +169,7 @@ def _run() -> NoReturn:
         where = f"{error.filename}: " if error.filename else ""
         _fail([f"{where}{error.strerror or error}"], 1)
     except Exception as error:  # noqa: BLE001  the last resort
-        _fail([_unforeseen(error)], 1)
+        _fail([_describe_unforeseen(error)], 1)
     sys.exit(code if isinstance(code, int) else 0)
 
 
@@ -182,7 +182,7 @@ def _list_causes(error: TcpipeError) -> list[str]:
     return format_findings(error.findings)
 
 
-def _unforeseen(error: Exception) -> str:
+def _describe_unforeseen(error: Exception) -> str:
     """Return what to say of a package that only an extra brings, or of a bug."""
     lacking = str(error.name).partition(".")[0] if isinstance(error, ModuleNotFoundError) else ""
     if extra := _EXTRAS.get(lacking):

@@ -20,7 +20,7 @@ def acknowledge(names: tuple[str, ...], *, store: str, as_json: bool) -> int:
 
     This holds for this problem of this content: another problem, or other content, is reported.
     """
-    from tcpipe.cli.output import print_json, say
+    from tcpipe.cli.output import print_json, print_line
     from tcpipe.formats.finding_lines import describe_title
     from tcpipe.pipeline.problems import acknowledge as run
 
@@ -30,7 +30,7 @@ def acknowledge(names: tuple[str, ...], *, store: str, as_json: bool) -> int:
         return 0
     for word, problems in (("acknowledged", found.acknowledged), ("acknowledged before", found.before)):
         for problem in problems:
-            say(f"{word}: {problem.name}: {describe_title(problem.finding)} [{problem.finding.code}]")
+            print_line(f"{word}: {problem.name}: {describe_title(problem.finding)} [{problem.finding.code}]")
     if not found.acknowledged:
-        say("nothing to do: these problems are already acknowledged")
+        print_line("nothing to do: these problems are already acknowledged")
     return 0

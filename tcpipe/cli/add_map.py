@@ -20,11 +20,11 @@ def add_map(options: AddMapOptions, *, strays: tuple[str, ...], as_json: bool, q
     A raster is a GeoTIFF, JPEG 2000 or ERDAS Imagine file. One in many tiles is given as a pattern in quotes, --height 'dem/*.tif', or by
     repeating the option; where tiles overlap, the last lies on top.
     """
-    from tcpipe.cli.output import progress, say_result
+    from tcpipe.cli.output import say_result, show_progress
     from tcpipe.pipeline.maps import run_add_map
 
     if strays:
         raise UsageError(f"{strays[0]}: belongs to no option; is a pattern without quotes? wanted --height 'dem/*.tif'")
-    with progress(f"map {options.name}", quiet=quiet):
+    with show_progress(f"map {options.name}", quiet=quiet):
         added = run_add_map(options)
     say_result(added, as_json=as_json)

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn
 
-from tcpipe.errors import plain_line
+from tcpipe.errors import clean_line
 from tcpipe.progress import Step
 
 _SHARES = {"hashing": (0.0, 0.03), "reading": (0.03, 0.2), "fusing": (0.2, 0.95), "cutting and labelling": (0.95, 1.0)}
@@ -40,7 +40,7 @@ class Bars:
             redirect_stdout=False,
             refresh_per_second=4,
         )
-        self._all = self._shown.add_task(plain_line(what), total=None, said="")
+        self._all = self._shown.add_task(clean_line(what), total=None, said="")
         self._rows: dict[str, _Row] = {}
         self._sizes: Mapping[str, int] = {}
         self._waiting, self._done, self._begun_s = 0, 0, time.monotonic()
@@ -75,12 +75,12 @@ class Bars:
         row = self._rows.get(step.task)
         if row is None:
             room = sum(other.row is not None for other in self._rows.values()) < _MOST_ROWS
-            name = plain_line(step.task.rsplit("/", 1)[-1])[-_LONGEST_NAME:]
+            name = clean_line(step.task.rsplit("/", 1)[-1])[-_LONGEST_NAME:]
             row = self._rows[step.task] = _Row(self._shown.add_task(f"  {name}", total=1.0, said="") if room else None)
         start, end = _SHARES.get(step.stage, (row.share, row.share))
         row.share = max(row.share, start + (end - start) * step.done / max(step.total, 1))
         if row.row is not None:
-            of = f" {_megabytes(step.done)} of {_megabytes(step.total)} MB" if step.total else ""
+            of = f" {_format_megabytes(step.done)} of {_format_megabytes(step.total)} MB" if step.total else ""
             self._shown.update(row.row, completed=row.share, said=step.stage + of)
         self._say_rate()
 
@@ -102,10 +102,10 @@ class Bars:
         said = f"{finished}/{len(self._sizes)}"
         if done and took_s > 0:
             left = divmod(round((self._waiting - under_way) / done * took_s), 60)
-            said += f", {_megabytes(done / took_s)} MB/s, {left[0]}:{left[1]:02d} left"
+            said += f", {_format_megabytes(done / took_s)} MB/s, {left[0]}:{left[1]:02d} left"
         hidden = sum(row.row is None for row in self._rows.values())
         self._shown.update(self._all, said=said + (f", {hidden} more under way" if hidden else ""))
 
 
-def _megabytes(size_bytes: float) -> str:
+def _format_megabytes(size_bytes: float) -> str:
     return f"{size_bytes / 1e6:.1f}"

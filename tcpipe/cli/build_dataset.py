@@ -24,13 +24,13 @@ def build_dataset(options: BuildDatasetOptions, *, as_json: bool, quiet: bool) -
     """
     from dataclasses import replace
 
-    from tcpipe.cli.output import print_json, progress, ruling_recipe, say, say_lines
+    from tcpipe.cli.output import print_json, print_line, resolve_recipe_with_source, say_lines, show_progress
     from tcpipe.pipeline.dataset.build import run_build_dataset
 
-    ruling, source = ruling_recipe(cast("str | None", options.recipe))
+    ruling, source = resolve_recipe_with_source(cast("str | None", options.recipe))
     if not as_json:
-        say(f"recipe: {source}")
-    with progress("build-dataset", quiet=quiet) as shown:
+        print_line(f"recipe: {source}")
+    with show_progress("build-dataset", quiet=quiet) as shown:
         result = run_build_dataset(replace(options, recipe=ruling))
         shown.problem(*result.problem_lines())
     if as_json:

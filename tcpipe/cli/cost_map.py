@@ -27,34 +27,34 @@ def cost_map(options: CostMapOptions, *, as_json: bool, quiet: bool) -> None:
     Writes to OUT (default: cost-map) Cloud-Optimised GeoTIFFs with a band a course, the reasons where MODEL has no business, and
     maps for Nav2. An interrupted call goes on where it was; OUT may be a URL in a bucket, where each map is a generation.
     """
-    from tcpipe.cli.output import progress, say_result
+    from tcpipe.cli.output import say_result, show_progress
     from tcpipe.planning.cost_map import Cluster, make_cost_map
 
     cluster = options.cluster
     if cluster is not None:  # its workers have another working directory
-        options = replace(options, model=_anywhere(options.model), store=_anywhere(options.store))
-    with progress("cost-map", quiet=quiet) as shown:
+        options = replace(options, model=_make_absolute(options.model), store=_make_absolute(options.store))
+    with show_progress("cost-map", quiet=quiet) as shown:
         result = make_cost_map(
-            *_inputs(options),
+            *_load_inputs(options),
             options.out,
             step_m=options.step_m,
             origin_deg=options.origin_deg,
             step=shown.count,
-            cluster=None if cluster is None else Cluster(cluster, partial(_inputs, options)),
+            cluster=None if cluster is None else Cluster(cluster, partial(_load_inputs, options)),
         )
     say_result(result, as_json=as_json)
 
 
-def _anywhere(path: str) -> str:
+def _make_absolute(path: str) -> str:
     from tcpipe.formats.object_storage import is_url
 
     return path if is_url(path) else str(Path(path).absolute())
 
 
-def _inputs(options: CostMapOptions) -> tuple[CostModel, MapFile]:
+def _load_inputs(options: CostMapOptions) -> tuple[CostModel, MapFile]:
     """Return the model and the map, wherever this is called."""
-    from tcpipe.learning.models import chosen_model
-    from tcpipe.planning.inputs import chosen_map
+    from tcpipe.learning.models import choose_model
+    from tcpipe.planning.inputs import choose_map
 
-    source = chosen_map(options.store, options.map_name)
-    return chosen_model(options.model, speed_mps=options.speed_mps), source
+    source = choose_map(options.store, options.map_name)
+    return choose_model(options.model, speed_mps=options.speed_mps), source

@@ -18,9 +18,9 @@ def demo(directory: str, *, seed: int, quiet: bool) -> None:
 
     Writes to DIR (default: tcpipe-demo): real .mcap and .bag logs, real GeoTIFFs, a store, a dataset and its report.
     """
-    from tcpipe.cli.output import progress, say_lines
+    from tcpipe.cli.output import say_lines, show_progress
     from tcpipe.pipeline.demo import run_demo
 
-    with progress("demo", quiet=quiet) as shown:
+    with show_progress("demo", quiet=quiet) as shown:
         result = run_demo(Path(directory), seed=seed, say=shown.line)
     say_lines(result)

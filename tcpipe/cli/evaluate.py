@@ -24,9 +24,9 @@ def evaluate(options: EvaluateOptions, *, as_json: bool, quiet: bool) -> None:
     drives.json and drives.html of OUT; DATASET, that MODEL was trained on, tells whether a drive was held back.
     """
     from tcpipe.api import run_evaluate
-    from tcpipe.cli.output import print_json, progress, say_lines
+    from tcpipe.cli.output import print_json, say_lines, show_progress
 
-    with progress("evaluate", quiet=quiet):
+    with show_progress("evaluate", quiet=quiet):
         result = run_evaluate(options)
     if as_json:
         print_json(result.values)

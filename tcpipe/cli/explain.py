@@ -15,10 +15,10 @@ from tcpipe.cli.options import SEALED, json_option, quiet_option, store_option
 @quiet_option
 def explain(sample_id: str, *, dataset: str, store: str, as_json: bool, quiet: bool) -> int:
     """Trace SAMPLE_ID to its log, stamps, messages, gates nearby, map tiles and recipe, and make it again: exit code 1 if it differs."""
-    from tcpipe.cli.output import progress, say_result
+    from tcpipe.cli.output import say_result, show_progress
     from tcpipe.pipeline.explain import explain as run
 
-    with progress("explain", quiet=quiet):
+    with show_progress("explain", quiet=quiet):
         found = run(sample_id, dataset=dataset, store=store)
     say_result(found, as_json=as_json)
     return 1 if found.differences else 0

@@ -56,16 +56,16 @@ def export(
 
 
 def _print(exported: Exported, log: str, out: str) -> None:
-    from tcpipe.cli.output import say
+    from tcpipe.cli.output import print_line
 
     if exported.status == "unchanged":
         count = len(exported.topics)
-        say(f"nothing to do: {count} of {count} topics of {log} are in {out} already")
+        print_line(f"nothing to do: {count} of {count} topics of {log} are in {out} already")
     else:
         for of in exported.topics:
-            say(f"{of.messages:>9} messages  {of.topic}  {of.path}")
+            print_line(f"{of.messages:>9} messages  {of.topic}  {of.path}")
         if not exported.topics:
-            say(f"nothing to export: {log} holds no topic")
+            print_line(f"nothing to export: {log} holds no topic")
     for kind in ("damage", "remarks"):
         for line in getattr(exported, kind):
-            say(f"{kind.rstrip('s')}: {line}", err=True)
+            print_line(f"{kind.rstrip('s')}: {line}", err=True)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, cast
 import click
 
 from tcpipe.cli.options import add_options, dry_run_option, quiet_option
-from tcpipe.cli.output import say
+from tcpipe.cli.output import print_line
 from tcpipe.pipeline.ingest_options import IngestOptions
 
 if TYPE_CHECKING:
@@ -34,19 +34,19 @@ def ingest(options: IngestOptions, *, dry_run: bool, as_json: bool, quiet: bool)
     """
     from dataclasses import replace
 
-    from tcpipe.cli.output import print_json_line, progress, ruling_recipe, say_result
-    from tcpipe.formats.json_files import recast
+    from tcpipe.cli.output import print_json_line, resolve_recipe_with_source, say_result, show_progress
+    from tcpipe.formats.json_files import convert_record
     from tcpipe.pipeline.ingest import SummaryLine, run_ingest
     from tcpipe.pipeline.ingest_task import LogLine
 
-    ruling, source = ruling_recipe(cast("str | None", options.recipe))
+    ruling, source = resolve_recipe_with_source(cast("str | None", options.recipe))
     options = replace(options, recipe=ruling)
     if not as_json:
-        say(f"recipe: {source}")
+        print_line(f"recipe: {source}")
     if dry_run:
-        from tcpipe.pipeline.status import status
+        from tcpipe.pipeline.status import find_status
 
-        planned = status(
+        planned = find_status(
             options.logs,
             store=options.store,
             recipe=ruling,
@@ -62,7 +62,7 @@ def ingest(options: IngestOptions, *, dry_run: bool, as_json: bool, quiet: bool)
         )
         say_result(replace(planned, history=()), as_json=as_json)
         return 0
-    with progress("ingest", quiet=quiet, as_json=as_json) as shown:
+    with show_progress("ingest", quiet=quiet, as_json=as_json) as shown:
         several = False
 
         def on_found(sizes: Mapping[str, int]) -> None:
@@ -76,9 +76,9 @@ def ingest(options: IngestOptions, *, dry_run: bool, as_json: bool, quiet: bool)
                 worked=result.status in ("done", "damaged", "empty") or not (result.known or result.transient),
             )
             if as_json:
-                print_json_line(recast(result, LogLine))
+                print_json_line(convert_record(result, LogLine))
             else:
-                for line in _of_one(result, options.store, several=several):
+                for line in _list_outcome(result, options.store, several=several):
                     shown.result(line)
             for problem in result.problems if result.is_news else ():
                 shown.problem(problem)
@@ -94,9 +94,9 @@ def ingest(options: IngestOptions, *, dry_run: bool, as_json: bool, quiet: bool)
     return summary.exit_code
 
 
-def _of_one(result: IngestResult, store: Path | str, *, several: bool) -> Iterator[str]:
+def _list_outcome(result: IngestResult, store: Path | str, *, several: bool) -> Iterator[str]:
     """Yield what became of a log: of one alone with its findings, of several one line each, and what is broken."""
-    from tcpipe.cost.budget import in_words
+    from tcpipe.cost.budget import format_budget
     from tcpipe.formats.finding_lines import describe_finding, format_findings, format_verdict
     from tcpipe.tables.findings import select_problems
 
@@ -119,7 +119,7 @@ def _of_one(result: IngestResult, store: Path | str, *, several: bool) -> Iterat
     if result.same_as:
         yield f"  {result.log} is the same recording as {result.same_as}: one run"
     if budget is not None and not several:
-        yield f"  {in_words(budget)}"
+        yield f"  {format_budget(budget)}"
     yield from (f"  {note}" for note in result.notes)
     if result.status == "failed" and result.is_news:
         yield from (f"  {line}" for line in format_findings(of for of in result.causes if of.code != "log-failed"))
@@ -141,7 +141,7 @@ def _print_findings(summary: IngestSummary) -> None:
     made = [result.run for result in summary.results if result.run and result.status != "unchanged"]
     groups = group_findings((run.run_id, run.findings) for run in made)
     for line in format_groups(groups, len(made), more=f"tcpipe report {summary.store}"):
-        say(line)
+        print_line(line)
 
 
 def _print_sum(summary: IngestSummary) -> None:
@@ -152,14 +152,14 @@ def _print_sum(summary: IngestSummary) -> None:
         for status in ("done", "unchanged", "damaged", "empty", "failed", "waiting")
     }
     if not number:
-        say("nothing to do: this shard holds none of the logs")
+        print_line("nothing to do: this shard holds none of the logs")
     elif count["unchanged"] + len(old) == number:
-        say(f"nothing to do: {count['unchanged']} of {number} logs are in {summary.store} already")
+        print_line(f"nothing to do: {count['unchanged']} of {number} logs are in {summary.store} already")
     elif count["failed"] == number:
-        say(f"no run came into {summary.store}: {number} of {number} logs failed")
+        print_line(f"no run came into {summary.store}: {number} of {number} logs failed")
     else:
         said = ", ".join(f"{of} {status}" for status, of in count.items() if of)
-        say(f"{summary.store}: {said}")
+        print_line(f"{summary.store}: {said}")
     _print_known(summary)
 
 
@@ -170,8 +170,10 @@ def _print_known(summary: IngestSummary) -> None:
     failed = sum(result.status == "failed" for result in known)
     if failed:
         tried = "tries them" if failed > 1 else "tries it"
-        say(f"{failed} known failure{'s' * (failed > 1)}, not tried again; --retry-failed {tried}")
+        print_line(f"{failed} known failure{'s' * (failed > 1)}, not tried again; --retry-failed {tried}")
     if len(known) > failed:
-        say(f"{len(known) - failed} known to be damaged or empty; 'tcpipe acknowledge RUN' when it has been looked at")
+        print_line(
+            f"{len(known) - failed} known to be damaged or empty; 'tcpipe acknowledge RUN' when it has been looked at"
+        )
     if acknowledged:
-        say(f"{acknowledged} with acknowledged problems")
+        print_line(f"{acknowledged} with acknowledged problems")

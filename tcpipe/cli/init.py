@@ -13,17 +13,17 @@ from tcpipe.cli.options import OUTPUT_DIRECTORY
 @click.argument("directory", default=".", type=OUTPUT_DIRECTORY, metavar="[DIR]")
 def init(directory: str) -> None:
     """Write tcpipe.toml, the recipe: every key with its default and its meaning, commented out."""
-    from tcpipe.cli.output import say
+    from tcpipe.cli.output import print_line
     from tcpipe.errors import UsageError
     from tcpipe.formats.atomic import clear_beside, write_text
-    from tcpipe.formats.recipe_toml import FILE_NAME, commented_toml
+    from tcpipe.formats.recipe_toml import FILE_NAME, format_commented_toml
 
     path = Path(directory) / FILE_NAME
     clear_beside(path)
     if not path.exists():
-        write_text(path, commented_toml())
-        say(f"wrote {path}")
-    elif path.is_file() and path.read_bytes() == commented_toml().encode():
-        say(f"nothing to do: {path} is there already")
+        write_text(path, format_commented_toml())
+        print_line(f"wrote {path}")
+    elif path.is_file() and path.read_bytes() == format_commented_toml().encode():
+        print_line(f"nothing to do: {path} is there already")
     else:
         raise UsageError(f"{path}: is there already and holds something else; it is never overwritten")

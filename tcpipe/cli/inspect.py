@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from tcpipe.cli.options import LOG, json_option, msgdef_option, recipe_option, robot_option
-from tcpipe.cli.output import say
+from tcpipe.cli.output import print_line
 
 if TYPE_CHECKING:
     from tcpipe.pipeline.inspect import InspectedLogs, InspectedRun, InspectedStore
@@ -28,10 +28,10 @@ if TYPE_CHECKING:
 @json_option
 def inspect(path: str, *, full: bool, robot: str | None, recipe: str | None, msgdef: str | None, as_json: bool) -> int:
     """Show what PATH holds: a log's topics, types, rates, and which topic plays which role and why; a map; a dataset; a run; a store."""
-    from tcpipe.cli.output import print_json, ruling_recipe
+    from tcpipe.cli.output import print_json, resolve_recipe_with_source
     from tcpipe.pipeline.inspect import inspect as run
 
-    ruling, _ = ruling_recipe(recipe)
+    ruling, _ = resolve_recipe_with_source(recipe)
     definitions = Path(msgdef) if msgdef else None
     found = run(path, recipe=ruling, robot=robot, full=full, message_definitions=definitions)
     if as_json:
@@ -55,26 +55,26 @@ _COLUMNS = 14
 def _print_logs(found: InspectedLogs) -> None:
     for log in found.logs:
         _print_log(log)
-        say("")
+        print_line("")
 
 
 def _print_log(log: InspectedLog) -> None:
     if log.topics is None:
         for problem in log.problems:
-            say(problem)
+            print_line(problem)
         return
     duration = "" if log.duration_s is None else f", {log.duration_s:.1f} s"
-    say(f"{log.path}: {log.container}, {(log.size_bytes or 0) / 1e6:.1f} MB{duration}")
-    say(f"robot {log.robot}: {log.robot_why}")
-    say("")
+    print_line(f"{log.path}: {log.container}, {(log.size_bytes or 0) / 1e6:.1f} MB{duration}")
+    print_line(f"robot {log.robot}: {log.robot_why}")
+    print_line("")
     full = any(topic.stamps for topic in log.topics)
     header = ["topic", "type", "messages", "Hz", "role", "why", *(_READ_HEADER if full else [])]
     rows = [
         [
             topic.name,
             topic.type,
-            _text(topic.messages),
-            _text(topic.rate_hz),
+            _format_answer(topic.messages),
+            _format_answer(topic.rate_hz),
             topic.role or "",
             topic.why or "",
             *(_read_cells(topic) if full else []),
@@ -85,20 +85,20 @@ def _print_log(log: InspectedLog) -> None:
     if full:
         _print_clocks(log)
     if log.problems:
-        say("to be decided:")
+        print_line("to be decided:")
     for line in log.problems:
-        say(f"  {line}")
+        print_line(f"  {line}")
     _print_findings(log.findings or ())
     for kind, lines in (("damage", log.damage), ("remark", log.remarks)):
         for line in lines or ():
-            say(f"{kind}: {line}")
+            print_line(f"{kind}: {line}")
 
 
 def _print_findings(findings: Iterable[Finding]) -> None:
     from tcpipe.formats.finding_lines import list_findings
 
     for line in list_findings(findings):
-        say(line)
+        print_line(line)
 
 
 _READ_HEADER = ["read", "gaps", "longest gap [s]", "time", "offset [s]", "stamps"]
@@ -116,36 +116,36 @@ def _read_cells(topic: InspectedTopic) -> list[str]:
         "duplicates": stamps.duplicates,
     }
     values = [stamps.messages_read, stamps.gaps, stamps.longest_gap_s, topic.time, topic.header_minus_log_s]
-    return [*map(_text, values), ", ".join(f"{count} {kind}" for kind, count in odd.items() if count)]
+    return [*map(_format_answer, values), ", ".join(f"{count} {kind}" for kind, count in odd.items() if count)]
 
 
 def _print_clocks(log: InspectedLog) -> None:
     for step in log.clock_steps or ():
-        say(f"clock step: {step.step_s:+.3f} s at log time {step.log_time_ns} ns on {', '.join(step.topics)}")
+        print_line(f"clock step: {step.step_s:+.3f} s at log time {step.log_time_ns} ns on {', '.join(step.topics)}")
     for topic in log.topics or ():
         if topic.simulated_time:
-            say(f"simulated time: the headers of {topic.name} are not the wall clock's")
+            print_line(f"simulated time: the headers of {topic.name} are not the wall clock's")
         for moved_s in topic.moved_s or ():
-            say(f"another clock: the stamps of {topic.name} lie {-moved_s:+.3f} s off those of most topics")
+            print_line(f"another clock: the stamps of {topic.name} lie {-moved_s:+.3f} s off those of most topics")
         if topic.time == "log":
-            say(f"log time rules on {topic.name}: {topic.time_why}")
+            print_line(f"log time rules on {topic.name}: {topic.time_why}")
 
 
 def _print_map(found: InspectedMap) -> None:
     size = " x ".join(f"{pixels * found.pitch_m:.1f} m" for pixels in (found.cols, found.rows))
-    say(f"{found.path}: {size} at {found.pitch_m:g} m a pixel in {found.crs}")
-    say("")
+    print_line(f"{found.path}: {size} at {found.pitch_m:g} m a pixel in {found.crs}")
+    print_line("")
     rows = [[layer, found.sources[layer], f"{found.covered[layer]:.1%}"] for layer in found.layers]
     _print_table(["layer", "made from", "covered"], rows)
-    say("")
-    say(f"height: {found.height_min_m:.1f} m to {found.height_max_m:.1f} m")
+    print_line("")
+    print_line(f"height: {found.height_min_m:.1f} m to {found.height_max_m:.1f} m")
     share = found.class_share
     classes = [
         [str(entry.id), entry.name, "yes" if entry.traversable else "no", f"{share.get(entry.name, 0.0):.1%}"]
         for entry in found.class_table
     ]
     if "terrain" in found.layers:
-        say("")
+        print_line("")
         _print_table(["id", "class", "traversable", "share"], classes)
     _print_findings(found.findings)
 
@@ -154,30 +154,32 @@ def _print_dataset(found: InspectedDataset) -> None:
     from tcpipe.formats.dataset_card import group_dataset_findings
     from tcpipe.formats.finding_lines import format_verdict, list_mixed_groups
 
-    say(
+    print_line(
         f"{found.path}: dataset {found.name}, {found.samples} samples of {', '.join(found.robots)}, "
         f"format {found.format}, data model {found.data_model_version}"
     )
-    say("")
+    print_line("")
     names = [entry.name for entry in found.classes if any(entry.name in of for of in found.terrain.values())]
     rows = [
         [split, str(found.splits[split]), *(str(found.terrain.get(split, {}).get(name, 0)) for name in names)]
         for split in ("train", "test", "unseen", "buffer")
     ]
     _print_table(["split", "samples", *names], rows)
-    say("")
-    say(f"layers: {', '.join(found.layers)}; labels: {', '.join(found.label.columns)}")
-    say(f"runs: {', '.join(run.run_id for run in found.runs)}; map: {', '.join(entry.name for entry in found.maps)}")
+    print_line("")
+    print_line(f"layers: {', '.join(found.layers)}; labels: {', '.join(found.label.columns)}")
+    print_line(
+        f"runs: {', '.join(run.run_id for run in found.runs)}; map: {', '.join(entry.name for entry in found.maps)}"
+    )
     if found.verdict is not None:
-        say(f"verdict: {format_verdict(found.verdict)}")
+        print_line(f"verdict: {format_verdict(found.verdict)}")
     for line in list_mixed_groups(group_dataset_findings(found.findings, found.findings_by_run, found.findings_by_map)):
-        say(line)
+        print_line(line)
 
 
 def _print_store(found: InspectedStore) -> None:
     runs = len({run.run_id for run in found.runs})
-    say(f"{found.path}: {runs} run{'' if runs == 1 else 's'}, maps: {', '.join(found.maps) or 'none'}")
-    say("")
+    print_line(f"{found.path}: {runs} run{'' if runs == 1 else 's'}, maps: {', '.join(found.maps) or 'none'}")
+    print_line("")
     rows = [
         [
             *(run.run_id, run.recipe_id, run.robot, str(run.segments), f"{run.driven_m:.1f}"),
@@ -188,62 +190,62 @@ def _print_store(found: InspectedStore) -> None:
     header = ["run", "recipe", "robot", "segments", "metres", "position", "time", "energy", "findings", "damage"]
     _print_table(header, rows)
     for run_id, version in found.outdated.items():
-        say(f"of another data model ({version}): {run_id}; ingest its log again")
+        print_line(f"of another data model ({version}): {run_id}; ingest its log again")
     for line in dict.fromkeys(found.damaged_runs.values()):
-        say(f"damaged: {line}")
+        print_line(f"damaged: {line}")
     for run_id, by in found.superseded.items():
-        say(f"superseded by {by}: {run_id}; its log was completed or repaired")
+        print_line(f"superseded by {by}: {run_id}; its log was completed or repaired")
 
 
 def _print_run(found: InspectedRun) -> None:
     from tcpipe.formats.finding_lines import format_verdict
 
-    say(f"{found.run_id}: from {' + '.join(found.source.paths if found.source else ['an unknown log'])}")
+    print_line(f"{found.run_id}: from {' + '.join(found.source.paths if found.source else ['an unknown log'])}")
     if found.tags:
-        say("tags: " + ", ".join(f"{key}={value}" for key, value in sorted(found.tags.items())))
+        print_line("tags: " + ", ".join(f"{key}={value}" for key, value in sorted(found.tags.items())))
     for line in found.remarks:
-        say(f"remark: {line}")
+        print_line(f"remark: {line}")
     for run in found.recipes:
         ledger = run.ledger_m
-        say("")
-        say(f"recipe {run.recipe_id}: {run.counts.segments} segments of robot {run.robot}")
+        print_line("")
+        print_line(f"recipe {run.recipe_id}: {run.counts.segments} segments of robot {run.robot}")
         lost = sorted(((metres, name) for name, metres in ledger.items() if metres >= 0.05), reverse=True)
         said = ", ".join(f"{metres:.1f} m {name.replace('_', ' ')}" for metres, name in lost)
-        say(f"{run.driven_m:.1f} m driven: {said}" if said else "not driven")
-        say(f"verdict: {format_verdict(run.verdict)}")
+        print_line(f"{run.driven_m:.1f} m driven: {said}" if said else "not driven")
+        print_line(f"verdict: {format_verdict(run.verdict)}")
         _print_findings(run.findings)
         for line in run.damage:
-            say(f"damage: {line}")
+            print_line(f"damage: {line}")
 
 
 def _print_tables(found: InspectedTables) -> None:
-    say(f"{found.path}: {len(found.columns) + len(found.problems)} tables that no recipe maps")
-    say("")
-    _print_table(["table", "columns"], [[file, _listed(names)] for file, names in found.columns.items()])
+    print_line(f"{found.path}: {len(found.columns) + len(found.problems)} tables that no recipe maps")
+    print_line("")
+    _print_table(["table", "columns"], [[file, _format_list(names)] for file, names in found.columns.items()])
     for line in found.problems.values():
-        say(line)
-    say("")
-    say(
+        print_line(line)
+    print_line("")
+    print_line(
         "a recipe for it, by what the columns are called; look at units and stamps:"
         if found.recipe
         else "no column says what it is"
     )
     for line in found.recipe.splitlines():
-        say(line)
+        print_line(line)
 
 
-def _listed(names: Sequence[str]) -> str:
+def _format_list(names: Sequence[str]) -> str:
     return ", ".join(names[:_COLUMNS]) + (f" and {len(names) - _COLUMNS} more" if len(names) > _COLUMNS else "")
 
 
-def _text(value: object) -> str:
+def _format_answer(value: object) -> str:
     return "" if value is None else f"{value:.2f}" if isinstance(value, float) else str(value)
 
 
 def _print_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
     widths = [max(len(row[i]) for row in (header, *rows)) for i in range(len(header))]
     for row in (header, *rows):
-        say("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
+        print_line("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
 
 
 _PRINTERS: dict[str, Callable[..., None]] = {

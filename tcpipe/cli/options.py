@@ -17,7 +17,7 @@ from click.core import ParameterSource
 from click.shell_completion import CompletionItem
 
 from tcpipe.errors import TcpipeError, UsageError
-from tcpipe.formats import places
+from tcpipe.formats import user_paths
 from tcpipe.tables import options
 
 if TYPE_CHECKING:
@@ -90,7 +90,7 @@ Option: TypeAlias = Callable[[Any], Any]
 Complete: TypeAlias = Callable[[click.Context, click.Parameter, str], list[str]]
 
 
-def _completing(names: Callable[[click.Context], Iterable[str]]) -> Complete:
+def _complete_names(names: Callable[[click.Context], Iterable[str]]) -> Complete:
     """Return what offers the names that go on as typed; what is broken offers none."""
 
     def complete(context: click.Context, _: click.Parameter, typed: str) -> list[str]:
@@ -101,11 +101,11 @@ def _completing(names: Callable[[click.Context], Iterable[str]]) -> Complete:
     return complete
 
 
-def _robots(context: click.Context) -> Iterable[str]:
-    from tcpipe.formats.recipe_toml import recipe_of
-    from tcpipe.formats.robot_files import profiles_of
+def _list_robots(context: click.Context) -> Iterable[str]:
+    from tcpipe.formats.recipe_toml import resolve_recipe
+    from tcpipe.formats.robot_files import load_profiles
 
-    return sorted(profiles_of(recipe_of(context.params.get("recipe"))).robots)
+    return sorted(load_profiles(resolve_recipe(context.params.get("recipe"))).robots)
 
 
 def _store(context: click.Context) -> Store | None:
@@ -116,35 +116,38 @@ def _store(context: click.Context) -> Store | None:
     return None if "://" in place else Store(Path(place))
 
 
-def _scenarios(_: click.Context) -> Iterable[str]:
+def _list_scenarios(_: click.Context) -> Iterable[str]:
     from tcpipe.simulation.scenarios import SCENARIOS
 
     return SCENARIOS
 
 
-complete_robots = _completing(_robots)
+complete_robots = _complete_names(_list_robots)
 """Offers the robots that the recipe knows."""
-complete_scenarios = _completing(_scenarios)
+complete_scenarios = _complete_names(_list_scenarios)
 """Offers the sites that can be simulated."""
-complete_runs = _completing(lambda context: store.run_ids() if (store := _store(context)) else ())
+complete_runs = _complete_names(lambda context: store.run_ids() if (store := _store(context)) else ())
 """Offers the store's runs."""
-complete_maps = _completing(lambda context: store.maps() if (store := _store(context)) else ())
+complete_maps = _complete_names(lambda context: store.maps() if (store := _store(context)) else ())
 """Offers the store's maps."""
 
-OUTPUT_DIRECTORY = Place(places.output_directory, written=True)
-OUTPUT_FILE = Place(places.output_file, written=True)
+OUTPUT_DIRECTORY = Place(user_paths.check_output_directory, written=True)
+OUTPUT_FILE = Place(user_paths.check_output_file, written=True)
 GEOPACKAGE = ".gpkg"
 OUTPUT_EXPORT = Place(
-    lambda path: (places.output_file if path.endswith(GEOPACKAGE) else places.output_directory)(path), written=True
+    lambda path: (user_paths.check_output_file if path.endswith(GEOPACKAGE) else user_paths.check_output_directory)(
+        path
+    ),
+    written=True,
 )
 """A directory, or a GeoPackage by its name."""
-INPUT_FILE = Place(places.input_file)
-INPUT_DIRECTORY = Place(places.input_directory)
-SEALED = Place(places.input_directory, urls=True)
+INPUT_FILE = Place(user_paths.check_input_file)
+INPUT_DIRECTORY = Place(user_paths.check_input_directory)
+SEALED = Place(user_paths.check_input_directory, urls=True)
 """A dataset, a model, a store or a run, here or in a bucket."""
-PUBLISHED = Place(places.output_directory, written=True, urls=True)
+PUBLISHED = Place(user_paths.check_output_directory, written=True, urls=True)
 """Where a dataset, a model or a store is written, here or in a bucket."""
-LOG = Place(places.input_path, urls=True)
+LOG = Place(user_paths.check_input_path, urls=True)
 """A log, here or in object storage."""
 ONE_OF_SEVERAL = Place(str)
 """A log or raster, by pattern or address: the command looks at each for itself, and tells of all at once."""
@@ -154,7 +157,7 @@ _SECONDS = {"": 1.0, "s": 1.0, "m": 60.0, "h": 3600.0, "d": 86400.0}
 _MOST_SHARDS = 100_000
 
 
-def duration_value(context: click.Context, parameter: click.Parameter, value: str) -> float:
+def parse_duration(context: click.Context, parameter: click.Parameter, value: str) -> float:
     """Turn ``90``, ``90s``, ``10m``, ``2h``, ``1d`` into seconds."""
     found = re.fullmatch(r"(\d{1,9}(?:\.\d{1,9})?)\s*([smhd]?)", value.strip())
     if found is None:
@@ -162,7 +165,7 @@ def duration_value(context: click.Context, parameter: click.Parameter, value: st
     return float(found[1]) * _SECONDS[found[2]]
 
 
-def shard_value(context: click.Context, parameter: click.Parameter, value: str | None) -> tuple[int, int] | None:
+def parse_shard(context: click.Context, parameter: click.Parameter, value: str | None) -> tuple[int, int] | None:
     """Turn ``I/N`` into two numbers, I from 1 to N."""
     if value is None:
         return None
@@ -187,7 +190,7 @@ def tag_values(context: click.Context, parameter: click.Parameter, values: tuple
 
 def layer_values(_: click.Context, __: click.Parameter, values: tuple[str, ...]) -> dict[str, str]:
     """Turn ``NAME=FILE`` pairs into a dict."""
-    files = _by_name("--layer", values, "the tiles of one layer are a pattern: NAME='tiles/*.tif'")
+    files = _parse_named_files("--layer", values, "the tiles of one layer are a pattern: NAME='tiles/*.tif'")
     if bare := [layer for layer, file in files.items() if not (layer and file)]:
         raise UsageError(f"--layer {bare[0]}: wanted NAME=FILE")
     return files
@@ -195,11 +198,11 @@ def layer_values(_: click.Context, __: click.Parameter, values: tuple[str, ...])
 
 def class_table_values(_: click.Context, __: click.Parameter, values: tuple[str, ...]) -> dict[str, str | None]:
     """Turn ``NAME`` and ``NAME=FILE`` into a dict, None where there is no file."""
-    tables = _by_name("--categorical", values, "wanted one class table a layer")
+    tables = _parse_named_files("--categorical", values, "wanted one class table a layer")
     return {name: table or None for name, table in tables.items()}
 
 
-def _by_name(option: str, given: tuple[str, ...], hint: str) -> dict[str, str]:
+def _parse_named_files(option: str, given: tuple[str, ...], hint: str) -> dict[str, str]:
     found: dict[str, str] = {}
     for name, _, file in (text.partition("=") for text in given):
         if name in found:
@@ -208,7 +211,7 @@ def _by_name(option: str, given: tuple[str, ...], hint: str) -> dict[str, str]:
     return found
 
 
-def holdout_value(context: click.Context, parameter: click.Parameter, value: str | None) -> str | None:
+def parse_holdout(context: click.Context, parameter: click.Parameter, value: str | None) -> str | None:
     """Let pass what draws test; anything else is a usage error."""
     if value is not None and re.fullmatch(r"block|sample|run|tag:.+", value) is None:
         raise click.BadParameter(f"{value!r}: wanted block, sample, run, or tag:NAME", ctx=context, param=parameter)
@@ -228,14 +231,14 @@ KINDS: dict[str, dict[str, Any]] = {
     "tags": {"callback": tag_values, "multiple": True},
     "layers": {"callback": layer_values, "multiple": True, "type": ONE_OF_SEVERAL},
     "class_tables": {"callback": class_table_values, "multiple": True, "type": ONE_OF_SEVERAL},
-    "duration": {"callback": duration_value},
-    "shard": {"callback": shard_value},
-    "holdout": {"callback": holdout_value},
+    "duration": {"callback": parse_duration},
+    "shard": {"callback": parse_shard},
+    "holdout": {"callback": parse_holdout},
 }
 """What click has to know of a declared option, by its kind."""
 
 
-def parameter(name: str, default: Any, shown: options.Option) -> Option:
+def make_click_option(name: str, default: Any, shown: options.Option) -> Option:
     """Return the decorator of click for a declared option or argument."""
     settings: dict[str, Any] = {"metavar": shown.metavar}
     match shown.kind:
@@ -275,19 +278,19 @@ def add_options(cls: type[Any]) -> Option:
             return run(cls(**{name: own[name] for name in given}), **values)
 
         for name, (default, shown) in reversed(declared.items()):
-            command = parameter(name, default, shown)(command)
+            command = make_click_option(name, default, shown)(command)
         return command
 
     return decorate
 
 
-store_option = parameter("store", "tcpipe-store", options.STORE)
+store_option = make_click_option("store", "tcpipe-store", options.STORE)
 """``--store``, or TCPIPE_STORE, or ./tcpipe-store."""
 
-recipe_option = parameter("recipe", None, options.RECIPE)
+recipe_option = make_click_option("recipe", None, options.RECIPE)
 """``--recipe``; without it TCPIPE_RECIPE, the nearest tcpipe.toml upward, or the defaults."""
 
-msgdef_option = parameter("msgdef", None, options.MESSAGE_DEFINITIONS)
+msgdef_option = make_click_option("msgdef", None, options.MESSAGE_DEFINITIONS)
 """``--msgdef``: definitions of types that a log does not define."""
 
 json_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON object instead of text.")
@@ -304,16 +307,16 @@ def robot_option(about: str = "Robot profile.") -> Option:
 
 def jobs_option(about: str) -> Option:
     """Return ``--jobs``."""
-    return parameter("jobs", 1, options.jobs(about).metadata["option"])
+    return make_click_option("jobs", 1, options.jobs(about).metadata["option"])
 
 
 def min_age_option(default: str, about: str) -> Option:
     """Return ``--min-age``."""
-    return click.option("--min-age", "min_age_s", default=default, metavar="T", callback=duration_value, help=about)
+    return click.option("--min-age", "min_age_s", default=default, metavar="T", callback=parse_duration, help=about)
 
 
-seed_option = parameter("seed", 1, options.Option("Same seed, same site.", kind=options.SEED))
+seed_option = make_click_option("seed", 1, options.Option("Same seed, same site.", kind=options.SEED))
 """``--seed`` of a simulation."""
 
-dry_run_option = parameter("dry_run", False, options.DRY_RUN)
+dry_run_option = make_click_option("dry_run", False, options.DRY_RUN)
 """``--dry-run``: nothing is done."""

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Self
 
 import click
 
-from tcpipe.errors import hide_secrets, plain_line
+from tcpipe.errors import clean_line, hide_secrets
 from tcpipe.progress import STEP, Step, step_of
 
 if TYPE_CHECKING:
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from tcpipe.recipe import Recipe
 
 
-def ruling_recipe(explicit: str | None) -> tuple[Recipe, str]:
+def resolve_recipe_with_source(explicit: str | None) -> tuple[Recipe, str]:
     """Return the recipe that rules here and where it comes from, for printing."""
     from tcpipe.formats.recipe_toml import find_recipe, load_recipe
 
@@ -31,11 +31,11 @@ def ruling_recipe(explicit: str | None) -> tuple[Recipe, str]:
 
 
 @contextmanager
-def progress(what: str, *, quiet: bool, as_json: bool = False) -> Iterator[Progress]:
+def show_progress(what: str, *, quiet: bool, as_json: bool = False) -> Iterator[Progress]:
     """Show progress on stderr: bars on a terminal, else plain lines, nothing with ``quiet``; with ``--debug`` its log says all."""
     logger = logging.getLogger("tcpipe")
     debugging = logger.isEnabledFor(logging.DEBUG)
-    shown = Progress(what, quiet=quiet, bars=None if quiet or debugging else _bars(what, as_json=as_json))
+    shown = Progress(what, quiet=quiet, bars=None if quiet or debugging else _make_bars(what, as_json=as_json))
     handler = _Lines(shown)
     before = logger.level
     if not debugging:
@@ -49,7 +49,7 @@ def progress(what: str, *, quiet: bool, as_json: bool = False) -> Iterator[Progr
         logger.setLevel(before)
 
 
-def _bars(what: str, *, as_json: bool) -> Bars | None:
+def _make_bars(what: str, *, as_json: bool) -> Bars | None:
     """Return bars where stderr is a terminal that can draw them, and no JSON goes to it."""
     if not sys.stderr.isatty() or (as_json and sys.stdout.isatty()):
         return None
@@ -94,16 +94,16 @@ class Progress:
     def result(self, text: str) -> None:
         """Say a line of the result on stdout, above the bars where both are on one terminal."""
         if self._bars is not None and sys.stdout.isatty():
-            self._bars.print(plain_line(text))
+            self._bars.print(clean_line(text))
         else:
-            say(text)
+            print_line(text)
 
     def _say(self, text: str) -> None:
         with suppress(OSError):  # nobody listening is no reason to stop
             if self._bars is not None:
-                self._bars.print(plain_line(text))
+                self._bars.print(clean_line(text))
             else:
-                say(text, err=True)
+                print_line(text, err=True)
 
     def expect(self, sizes: Mapping[str, int]) -> None:
         """Begin with logs of these sizes [byte]."""
@@ -147,7 +147,7 @@ class _Lines(logging.Handler):
 
 
 @contextmanager
-def debug_log() -> Iterator[None]:
+def write_debug_log() -> Iterator[None]:
     """Say on stderr what is done and when, and what is behind each error."""
     logger, handler = logging.getLogger("tcpipe"), _DebugLog()
     before = logger.level
@@ -168,18 +168,18 @@ class _DebugLog(logging.Handler):
         text = record.getMessage() if step is None else f"{step.task}: {step.stage}"
         when = datetime.fromtimestamp(record.created, UTC).strftime("%H:%M:%S.%f")[:-3]
         with suppress(OSError):
-            say(f"{when} {text}", err=True)
+            print_line(f"{when} {text}", err=True)
 
 
-def say(text: str, *, err: bool = False) -> None:
+def print_line(text: str, *, err: bool = False) -> None:
     """Print one line on stdout, or on stderr."""
-    click.echo(plain_line(text), err=err)
+    click.echo(clean_line(text), err=err)
 
 
 def say_lines(result: object) -> None:
     """Print a result that tells itself in lines of text on stdout."""
     for line in str(result).split("\n"):
-        say(line)
+        print_line(line)
 
 
 def say_result(result: object, *, as_json: bool) -> None:
@@ -194,17 +194,17 @@ def print_json(value: Any) -> None:
     """Print one JSON object on stdout, what no terminal should see as escapes of JSON."""
     from tcpipe.formats.json_files import to_json
 
-    click.echo(_shown(to_json(value)), nl=False)
+    click.echo(_format_value(to_json(value)), nl=False)
 
 
 def print_json_line(value: Any) -> None:
     """Print one JSON object on one line of stdout, as `print_json` does."""
     from tcpipe.formats.json_files import to_json_line
 
-    click.echo(_shown(to_json_line(value)))
+    click.echo(_format_value(to_json_line(value)))
 
 
-def _shown(text: str) -> str:
+def _format_value(text: str) -> str:
     return "".join(c if c.isprintable() or c == "\n" else json.dumps(c)[1:-1] for c in text)
 
 
@@ -217,6 +217,6 @@ def say_failure(problems: Sequence[str], exit_code: int, *, as_json: bool) -> No
     """Say on stderr what went wrong, and print it on stdout as a JSON object if that is wanted."""
     with suppress(OSError):
         for problem in problems:
-            say(f"tcpipe: {problem}", err=True)
+            print_line(f"tcpipe: {problem}", err=True)
     if as_json:
         click.echo(json.dumps({"exit_code": exit_code, "problems": [hide_secrets(problem) for problem in problems]}))

@@ -19,6 +19,6 @@ def overlay(run: str, out: str, *, as_json: bool) -> None:
     It holds the fused track, segments with labels, what was dropped and why, and the measurements that were refused.
     """
     from tcpipe.cli.output import say_result
-    from tcpipe.pipeline.overlay import overlay as write
+    from tcpipe.pipeline.overlay import write_overlay as write
 
     say_result(write(run, Path(out)), as_json=as_json)

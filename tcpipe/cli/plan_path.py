@@ -20,9 +20,9 @@ def plan_path(options: PlanPathOptions, *, as_json: bool, quiet: bool) -> int:
     Exit code 3: some of the path has no cost, because --cell-size is large.
     """
     from tcpipe.api import run_plan_path
-    from tcpipe.cli.output import progress, say_result
+    from tcpipe.cli.output import say_result, show_progress
 
-    with progress("plan-path", quiet=quiet) as shown:
+    with show_progress("plan-path", quiet=quiet) as shown:
         result = run_plan_path(replace(options, on_step=shown.count))
     say_result(result, as_json=as_json)
     return result.exit_code

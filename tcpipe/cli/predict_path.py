@@ -19,9 +19,9 @@ def predict_path(options: PredictPathOptions, *, as_json: bool, quiet: bool) -> 
     traversable) are marked and counted. Exit code 3: some pieces have no cost.
     """
     from tcpipe.api import run_predict_path
-    from tcpipe.cli.output import progress, say_result
+    from tcpipe.cli.output import say_result, show_progress
 
-    with progress("predict-path", quiet=quiet):
+    with show_progress("predict-path", quiet=quiet):
         result = run_predict_path(options)
     say_result(result, as_json=as_json)
     return result.exit_code

@@ -26,12 +26,15 @@ def preflight(
 
     Exit codes: 0 ready; 3 there are warnings, errors or no segments; 1 ingesting it would fail.
     """
-    from tcpipe.cli.output import progress, ruling_recipe, say_result
+    from tcpipe.cli.output import resolve_recipe_with_source, say_result, show_progress
     from tcpipe.pipeline.preflight import preflight as run
 
-    with progress("preflight", quiet=quiet):
+    with show_progress("preflight", quiet=quiet):
         found = run(
-            log, recipe=ruling_recipe(recipe)[0], robot=robot, message_definitions=Path(msgdef) if msgdef else None
+            log,
+            recipe=resolve_recipe_with_source(recipe)[0],
+            robot=robot,
+            message_definitions=Path(msgdef) if msgdef else None,
         )
     say_result(found, as_json=as_json)
     return found.exit_code

@@ -19,7 +19,7 @@ _LATEST_S = 4.0
 """So long a process has to end in order: a library that waits for a network or computes lets no signal through to Python."""
 
 
-class Ended(BaseException):
+class Terminated(BaseException):
     """A signal asks this process to end; raised where it runs, so that workers end and temporaries go."""
 
     def __init__(self, number: int) -> None:
@@ -50,7 +50,7 @@ def prepare_process() -> None:
 
 
 @contextmanager
-def ended_in_time() -> Iterator[None]:
+def terminate_on_signal() -> Iterator[None]:
     """Have a signal that asks this process to end do so, whatever library it is in; what it leaves then, the next call removes."""
     heard, said = os.pipe()
     os.set_blocking(said, False)
@@ -73,18 +73,18 @@ def _watch(heard: int) -> None:
         if not ending and told[0] in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             end, ending = time.monotonic() + _LATEST_S, told[0]
         left_s = max(0.0, end - time.monotonic()) if ending else None
-    say_failure([f"{Ended(ending)}; {NOTHING_HALF}"], 128 + ending, as_json="--json" in sys.argv)
+    say_failure([f"{Terminated(ending)}; {NOTHING_HALF}"], 128 + ending, as_json="--json" in sys.argv)
     os._exit(128 + ending)
 
 
 def _end(number: int, _: object) -> None:
-    raise Ended(number)
+    raise Terminated(number)
 
 
 def _raise_again(unraisable: sys.UnraisableHookArgs) -> None:
     """Where a signal came in a place that swallows errors (a destructor, a callback), let it come again."""
     error = unraisable.exc_value
-    if not isinstance(error, Ended | KeyboardInterrupt):
+    if not isinstance(error, Terminated | KeyboardInterrupt):
         sys.__unraisablehook__(unraisable)
         return
 

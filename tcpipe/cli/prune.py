@@ -37,11 +37,16 @@ def prune(
 
     Nothing goes that a dataset refers to, built from this store wherever it lies now, nor a directory that holds a file of somebody else.
     """
-    from tcpipe.cli.output import ruling_recipe, say_result
+    from tcpipe.cli.output import resolve_recipe_with_source, say_result
     from tcpipe.pipeline.prune import prune as run
 
     found = run(
-        store=store, recipe=ruling_recipe(recipe)[0], keep=keep, forget=forget, min_age_s=min_age_s, dry_run=dry_run
+        store=store,
+        recipe=resolve_recipe_with_source(recipe)[0],
+        keep=keep,
+        forget=forget,
+        min_age_s=min_age_s,
+        dry_run=dry_run,
     )
     say_result(found, as_json=as_json)
     return 0

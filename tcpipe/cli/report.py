@@ -22,13 +22,13 @@ def report(path: str, *, no_runs: bool, patches: bool) -> None:
 
     The page needs no network.
     """
-    from tcpipe.cli.output import say
+    from tcpipe.cli.output import print_line
     from tcpipe.pipeline.report import report as run
 
     written = run(path, runs=not no_runs, patches=patches)
     for page in written:
-        say(page.path)
+        print_line(page.path)
         for line in page.physics:
-            say(f"  {line}")
+            print_line(f"  {line}")
     if not any(page.changed for page in written):
-        say("nothing to do: the pages are there as they would be written")
+        print_line("nothing to do: the pages are there as they would be written")

@@ -30,9 +30,9 @@ def reproduce(
     Takes up to an hour and a half on two cores, and goes on from where it was stopped. The data are simulated: what is compared with the
     paper is the pattern, not the figures. Writes reproduction.html, reproduction.json and everything behind them to DIR.
     """
-    from tcpipe.cli.output import progress, say_result
+    from tcpipe.cli.output import say_result, show_progress
     from tcpipe.learning.reproduction import reproduce as run
 
-    with progress("reproduce", quiet=quiet):
+    with show_progress("reproduce", quiet=quiet):
         result = run(directory, quick=quick, seeds=seeds, jobs=jobs, hidden=hidden, baselines=baselines)
     say_result(result, as_json=as_json)

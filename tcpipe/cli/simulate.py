@@ -23,15 +23,15 @@ from tcpipe.cli.options import OUTPUT_DIRECTORY, complete_scenarios, json_option
 @quiet_option
 def simulate(out: str, *, scenario: str, seed: int, as_json: bool, quiet: bool) -> None:
     """Write a simulated site to OUT: real .mcap and .bag logs, real GeoTIFFs, and the truth behind them."""
-    from tcpipe.cli.output import print_json, progress, say
+    from tcpipe.cli.output import print_json, print_line, show_progress
     from tcpipe.simulation import simulate as run
 
-    with progress("simulate", quiet=quiet):
+    with show_progress("simulate", quiet=quiet):
         site = run(Path(out), scenario=scenario, seed=seed)
     if as_json:
         print_json(site)
     else:
         for path in (*site.logs, *site.rasters.values(), site.region, *site.truths):
-            say(str(path))
+            print_line(str(path))
         if site.unchanged:
-            say(f"nothing to do: the site is in {out} already")
+            print_line(f"nothing to do: the site is in {out} already")

@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 from tcpipe.cli.options import ONE_OF_SEVERAL, json_option, min_age_option, recipe_option, robot_option, store_option
-from tcpipe.cli.output import say
+from tcpipe.cli.output import print_line
 
 
 @click.command()
@@ -27,22 +27,22 @@ def status(
     Exit code 3: a log failed, is damaged or gave no segment, a call was killed, a log waits for more than two nights, files of a run or
     a commit are missing, and nobody acknowledged that (tcpipe acknowledge).
     """
-    from tcpipe.cli.output import print_json, ruling_recipe, say_lines
+    from tcpipe.cli.output import print_json, resolve_recipe_with_source, say_lines
     from tcpipe.errors import UsageError
     from tcpipe.formats.finding_lines import format_finding
     from tcpipe.formats.object_storage import is_url
-    from tcpipe.pipeline.status import status as run
+    from tcpipe.pipeline.status import find_status as run
     from tcpipe.store import is_store
 
     if paths and is_store(paths[0]):
         store, paths = paths[0], paths[1:]
     elif paths and not is_url(store) and not Path(store).exists():
         raise UsageError(f"{paths[0]}: there is no store here, nor one at {store}; name it with --store")
-    found = run(paths, store=store, recipe=ruling_recipe(recipe)[0], robot=robot, min_age_s=min_age_s)
+    found = run(paths, store=store, recipe=resolve_recipe_with_source(recipe)[0], robot=robot, min_age_s=min_age_s)
     if as_json:
         print_json(found)
         return found.exit_code
     say_lines(found)
     for finding in found.problems:
-        say(f"tcpipe: {format_finding(finding)}", err=True)
+        print_line(f"tcpipe: {format_finding(finding)}", err=True)
     return found.exit_code

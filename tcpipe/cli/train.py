@@ -19,8 +19,8 @@ def train(options: TrainOptions, *, as_json: bool, quiet: bool) -> None:
     goes on where it was stopped.
     """
     from tcpipe.api import run_train
-    from tcpipe.cli.output import progress, say_result
+    from tcpipe.cli.output import say_result, show_progress
 
-    with progress("train", quiet=quiet):
+    with show_progress("train", quiet=quiet):
         result = run_train(options)
     say_result(result, as_json=as_json)

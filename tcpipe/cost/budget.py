@@ -8,7 +8,7 @@ from dataclasses import asdict
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.tables.catalogue import threshold
+from tcpipe.tables.catalogue import read_threshold
 from tcpipe.tables.facts import EnergyBudget
 from tcpipe.tables.findings import Finding, Subject, make_finding
 
@@ -16,7 +16,7 @@ CAUSES = ("position", "rate", "current", "voltage")
 """Displacement of both ends; what the current did between samples; noise and rounding of the current; the voltage's."""
 
 
-def energy_budget(
+def estimate_energy_budget(
     energy_joule: NDArray[np.float64], variance_j2: Mapping[str, NDArray[np.float64]]
 ) -> EnergyBudget | None:
     """Return the noise floor of E; None without energies.
@@ -36,7 +36,7 @@ def energy_budget(
     return EnergyBudget(int(known.sum()), mean_joule, **shares)
 
 
-def pooled(budgets: Iterable[EnergyBudget | None]) -> EnergyBudget | None:
+def pool_budgets(budgets: Iterable[EnergyBudget | None]) -> EnergyBudget | None:
     """Return the budget of several sets of segments together; None of none."""
     known = [asdict(budget) for budget in budgets if budget is not None]
     count = sum(each["segments"] for each in known)
@@ -54,13 +54,13 @@ def pooled(budgets: Iterable[EnergyBudget | None]) -> EnergyBudget | None:
 
 def find_noise(budget: EnergyBudget | None, subject: Subject) -> tuple[Finding, ...]:
     """Return the finding that the noise floor of E is high."""
-    if budget is None or budget.total < threshold("energy-noise", "max_total_fraction"):
+    if budget is None or budget.total < read_threshold("energy-noise", "max_total_fraction"):
         return ()
     numbers = {f"{name}_fraction": getattr(budget, name) for name in ("total", *CAUSES, "at_20_hz")}
     return (make_finding("energy-noise", subject, **numbers),)
 
 
-def in_words(budget: EnergyBudget) -> str:
+def format_budget(budget: EnergyBudget) -> str:
     """Return the budget as a sentence: the floor, its causes from the largest, and what power at 20 Hz would leave where that is less."""
     names = {"position": "position", "rate": "power rate", "current": "current noise", "voltage": "voltage"}
     shares = {cause: getattr(budget, cause) for cause in CAUSES}

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.cost.physics import FEWEST, Metres, fit_physics
+from tcpipe.cost.physics import FEWEST, FitSamples, fit_physics
 from tcpipe.tables.facts import PhysicsFit, PhysicsScore, PhysicsTerm
 
 Floats = NDArray[np.float64]
@@ -29,7 +29,7 @@ class _HeldOut:
     said: Floats
 
 
-def physics_of(metres: Metres, *, standing_watt: float | None) -> PhysicsFit | None:
+def fit_and_validate_physics(metres: FitSamples, *, standing_watt: float | None) -> PhysicsFit | None:
     """Fit a robot's metres, in the order of driving; None where nothing can be fitted, or no robot can be so.
 
     Parameters
@@ -45,8 +45,8 @@ def physics_of(metres: Metres, *, standing_watt: float | None) -> PhysicsFit | N
     kinds = list(dict.fromkeys(term for term, _ in found.terms))
     whole = float(np.nansum(known.power_watt / known.velocity_mps))
     share = {kind: float(np.nansum(parts[:, [term == kind for term, _ in found.terms]])) / whole for kind in kinds}
-    scored = _held_out(known, standing_watt, turning=True)
-    without = _held_out(known, standing_watt, turning=False) if "turning" in kinds else None
+    scored = _predict_held_out(known, standing_watt, turning=True)
+    without = _predict_held_out(known, standing_watt, turning=False) if "turning" in kinds else None
     return PhysicsFit(
         segments=found.segments,
         terms=tuple(
@@ -63,18 +63,18 @@ def physics_of(metres: Metres, *, standing_watt: float | None) -> PhysicsFit | N
         energy_share=share,
         held_out=None if scored is None else _score(scored),
         without_turning=None if without is None else _score(without),
-        usual_turn_radpm=_usual_turn(known),
-        gain_of_turning=_gain(scored, without),
+        usual_turn_radpm=_compute_mean_turn(known),
+        gain_of_turning=_compare_held_out(scored, without),
     )
 
 
-def _usual_turn(metres: Metres) -> float:
+def _compute_mean_turn(metres: FitSamples) -> float:
     """Return how far a metre turns in the mean [rad/m]; 0 where no rate is known."""
     turned = metres.turn_rate_radps / metres.velocity_mps
     return float(turned[np.isfinite(turned)].mean()) if np.isfinite(turned).any() else 0.0
 
 
-def _held_out(metres: Metres, standing_watt: float | None, *, turning: bool) -> _HeldOut | None:
+def _predict_held_out(metres: FitSamples, standing_watt: float | None, *, turning: bool) -> _HeldOut | None:
     """Return energies of every fifth of the drive by a fit on the others; None where too few are left to fit."""
     count = len(metres.power_watt)
     fold = np.arange(count) * _FOLDS // max(count, 1)
@@ -100,7 +100,7 @@ def _score(held: _HeldOut) -> PhysicsScore:
     return PhysicsScore(r2, float(np.mean(np.abs(off[counted] / held.true[counted]))) if counted.any() else 0.0)
 
 
-def _gain(scored: _HeldOut | None, without: _HeldOut | None) -> tuple[float, float] | None:
+def _compare_held_out(scored: _HeldOut | None, without: _HeldOut | None) -> tuple[float, float] | None:
     """Return the 90 % interval of how much R² rises by turning: blocks of consecutive metres drawn again (Künsch 1989)."""
     if scored is None or without is None or len(scored.true) != len(without.true):
         return None

@@ -38,7 +38,7 @@ class Labels:
     energy_std_joule: Floats
 
 
-def labels(
+def compute_labels(
     *,
     chord_m: Floats,
     duration_s: Floats,
@@ -74,7 +74,7 @@ def labels(
 
 
 @dataclass(frozen=True, slots=True)
-class AboveStanding:
+class NetLabels:
     """What of each segment's cost is not what the robot draws while it stands, all of shape (M,); NaN where either is not known.
 
     Attributes
@@ -92,21 +92,21 @@ class AboveStanding:
     energy_above_standing_std_joule: Floats
 
 
-def above_standing(
+def subtract_idle_power(
     cost: Labels, *, standing_watt: float, standing_std_watt: float, end_power_watt: Floats, energy_noise_joule: Floats
-) -> AboveStanding:
+) -> NetLabels:
     """Return the labels less what standing takes: E_true = E - P0 T - (P_end - P0) e / v_end, as in the head of this module.
 
     Parameters
     ----------
     standing_watt, standing_std_watt : [W], P0 and its standard deviation; NaN where it is not known.
-    end_power_watt, energy_noise_joule : as in `labels`.
+    end_power_watt, energy_noise_joule : as in `compute_labels`.
     """
     noise_joule = np.hypot(energy_noise_joule, standing_std_watt * cost.duration_s)
     energy_joule = cost.energy_joule - standing_watt * cost.duration_s
     known = np.isfinite(energy_joule)
     displaced_joule = (end_power_watt - standing_watt) * cost.duration_std_s
-    return AboveStanding(
+    return NetLabels(
         standing_power_watt=np.where(known, standing_watt, np.nan),
         standing_power_std_watt=np.where(known, standing_std_watt, np.nan),
         power_above_standing_watt=cost.power_watt - standing_watt,

@@ -25,7 +25,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.power.least_squares import non_negative
+from tcpipe.power.least_squares import solve_non_negative
 
 Floats = NDArray[np.float64]
 
@@ -58,7 +58,7 @@ ALL = "all"
 
 
 @dataclass(frozen=True, slots=True)
-class Metres:
+class FitSamples:
     """Labelled metres, all of shape (M,), in the order of driving.
 
     Attributes
@@ -74,9 +74,9 @@ class Metres:
     turn_rate_radps: Floats
     terrain: NDArray[np.str_]
 
-    def take(self, rows: NDArray[np.int64] | NDArray[np.bool_]) -> Metres:
+    def take(self, rows: NDArray[np.int64] | NDArray[np.bool_]) -> FitSamples:
         """Return some of them."""
-        return Metres(*(getattr(self, name)[rows] for name in self.__slots__))
+        return FitSamples(*(getattr(self, name)[rows] for name in self.__slots__))
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,17 +116,17 @@ class Physics:
         slope = np.array([1.0 / grade, -rolling / grade**2])
         return rolling / grade, float(np.sqrt(slope @ self.covariance[np.ix_(places, places)] @ slope))
 
-    def is_driven(self, metres: Metres) -> NDArray[np.bool_]:
+    def is_driven(self, metres: FitSamples) -> NDArray[np.bool_]:
         """Return where motors drive the robot rather than the slope, shape (M,)."""
         always = _always(self.terms)
-        return np.asarray(_design(metres, self.terms)[:, ~always] @ self.value[~always] > 0.0)
+        return np.asarray(_build_design_matrix(metres, self.terms)[:, ~always] @ self.value[~always] > 0.0)
 
-    def parts_watt(self, metres: Metres) -> Floats:
+    def parts_watt(self, metres: FitSamples) -> Floats:
         """Return what each coefficient adds to the predicted power [W], shape (M, J)."""
         gain = np.where(_always(self.terms) | self.is_driven(metres)[:, None], 1.0, self.recovered)
-        return np.asarray(_design(metres, self.terms) * gain * self.value)
+        return np.asarray(_build_design_matrix(metres, self.terms) * gain * self.value)
 
-    def power_watt(self, metres: Metres) -> Floats:
+    def power_watt(self, metres: FitSamples) -> Floats:
         """Return the predicted power [W], shape (M,)."""
         return np.asarray(self.parts_watt(metres).sum(axis=1))
 
@@ -145,7 +145,7 @@ class Physics:
         return found
 
 
-def fit_physics(metres: Metres, *, standing_watt: float | None = None, turning: bool = True) -> Physics | None:
+def fit_physics(metres: FitSamples, *, standing_watt: float | None = None, turning: bool = True) -> Physics | None:
     """Fit the terms to labels; None for fewer than 20.
 
     Parameters
@@ -160,12 +160,12 @@ def fit_physics(metres: Metres, *, standing_watt: float | None = None, turning: 
     if rows.size < FEWEST:
         return None
     used = metres.take(rows[:: -(-rows.size // _MOST_ROWS)])
-    terms = _terms(used, standing_watt=standing_watt, turning=turning)
-    found = _fitted(used, terms, standing_watt)
+    terms = _list_determined_terms(used, standing_watt=standing_watt, turning=turning)
+    found = _fit_robustly(used, terms, standing_watt)
     for term in ("drivetrain", "standing"):
         if not _is_told(found, term, used) and not (term == "standing" and standing_watt is not None):
             terms = [known for known in terms if known[0] != term]
-            found = _fitted(used, terms, standing_watt)
+            found = _fit_robustly(used, terms, standing_watt)
     off = used.power_watt - found.power_watt(used)
     spread = _NORMAL * float(np.median(np.abs(off - np.median(off))))
     return replace(
@@ -173,7 +173,7 @@ def fit_physics(metres: Metres, *, standing_watt: float | None = None, turning: 
     )
 
 
-def _is_told(found: Physics, term: str, metres: Metres) -> bool:
+def _is_told(found: Physics, term: str, metres: FitSamples) -> bool:
     """Return whether a term is sure to be there: what nothing tells from rolling is rolling's."""
     value, std = found.of(term) or (np.inf, 0.0)
     bend = (~found.is_driven(metres)).sum() >= _FEWEST_DOWNHILL and found.recovered < _MOST_RECOVERED
@@ -184,7 +184,7 @@ def _always(terms: Sequence[tuple[str, str]]) -> NDArray[np.bool_]:
     return np.array([term in _ALWAYS for term, _ in terms])
 
 
-def _terms(metres: Metres, *, standing_watt: float | None, turning: bool) -> list[tuple[str, str]]:
+def _list_determined_terms(metres: FitSamples, *, standing_watt: float | None, turning: bool) -> list[tuple[str, str]]:
     """Return the coefficients that these metres can tell."""
     names, counts = np.unique(metres.terrain, return_counts=True)
     own = [str(name) for name, count in zip(names, counts, strict=True) if count >= FEWEST and name != ALL]
@@ -203,7 +203,7 @@ def _terms(metres: Metres, *, standing_watt: float | None, turning: bool) -> lis
     return terms + [("turning", name) for name, rates in groups.items() if rates.size * np.var(rates) >= least]
 
 
-def _design(metres: Metres, terms: Sequence[tuple[str, str]]) -> Floats:
+def _build_design_matrix(metres: FitSamples, terms: Sequence[tuple[str, str]]) -> Floats:
     """Return what each coefficient is multiplied with, shape (M, J)."""
     of = {
         "standing": np.ones_like(metres.velocity_mps),
@@ -220,13 +220,13 @@ def _design(metres: Metres, terms: Sequence[tuple[str, str]]) -> Floats:
     return np.column_stack(columns)
 
 
-def _fitted(metres: Metres, terms: Sequence[tuple[str, str]], standing_watt: float | None) -> Physics:
+def _fit_robustly(metres: FitSamples, terms: Sequence[tuple[str, str]], standing_watt: float | None) -> Physics:
     """Return the coefficients by iteratively reweighted least squares on the force P / v; what is measured at halts is one row more.
 
     Of downhill metres force is a product of k and the coefficients: each step solves for both by its tangent (Gauss and Newton).
     """
     always, count = _always(terms), len(terms)
-    design = _design(metres, terms) / metres.velocity_mps[:, None]
+    design = _build_design_matrix(metres, terms) / metres.velocity_mps[:, None]
     force = metres.power_watt / metres.velocity_mps
     value, recovered = np.zeros(count), 0.0
     prior = None if standing_watt is None else np.zeros(count + 1)
@@ -250,22 +250,22 @@ def _fitted(metres: Metres, terms: Sequence[tuple[str, str]], standing_watt: flo
         if prior is not None and standing_watt is not None:
             by, seen = np.vstack([by, prior]), np.append(seen, prior.max() * standing_watt)
         q, r = np.linalg.qr(by)
-        before, found = value, _sizes(r, q.T @ seen)
+        before, found = value, _fit_non_negative(r, q.T @ seen)
         value, recovered = found[:count], min(float(found[count]), 1.0)
         if np.abs(value - before).max() < 1e-7 * np.abs(value).max():
             break
     free = np.append(value > 0.0, 0.0 < recovered < 1.0)
-    covariance = _covariance(made, off, weight, scale, free=free, prior=prior)[:count, :count]
+    covariance = _estimate_covariance(made, off, weight, scale, free=free, prior=prior)[:count, :count]
     return Physics(tuple(terms), value, covariance, recovered, 0.0, len(force))
 
 
-def _sizes(made: Floats, seen: Floats) -> Floats:
+def _fit_non_negative(made: Floats, seen: Floats) -> Floats:
     """Return what fits best with no size below zero: mostly no bound holds, and the plain solution is it."""
     plain = np.asarray(np.linalg.lstsq(made, seen, rcond=None)[0], np.float64)
-    return plain if (plain >= 0.0).all() else non_negative(made, seen)
+    return plain if (plain >= 0.0).all() else solve_non_negative(made, seen)
 
 
-def _covariance(
+def _estimate_covariance(
     made: Floats, off: Floats, weight: Floats, scale: float, *, free: NDArray[np.bool_], prior: Floats | None
 ) -> Floats:
     """Return the covariance of coefficients and k, shape (J + 1, J + 1), by what blocks of consecutive rows leave over."""

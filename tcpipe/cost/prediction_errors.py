@@ -122,7 +122,7 @@ class Errors:
 
 
 @dataclass(frozen=True, slots=True)
-class Centring:
+class BiasCorrection:
     """What power and velocity are corrected by, so that time and energy of a class's metres are right on average."""
 
     duration: Bias
@@ -137,15 +137,15 @@ class Centring:
 _NOTHING = Bias(np.zeros(_CLASSES), np.zeros(_CLASSES))
 
 
-def centring_of(residuals: Residuals) -> Centring:
+def fit_bias_correction(residuals: Residuals) -> BiasCorrection:
     """Return by what a model's power and velocity are centred; by nothing with fewer than `FEWEST` held-out samples of both."""
     held = _Held.of(residuals)
     if held is None:
-        return Centring(_NOTHING, _NOTHING)
-    return Centring(*(_bias(held.said[name], held.true[name], held) for name in ("duration", "energy")))
+        return BiasCorrection(_NOTHING, _NOTHING)
+    return BiasCorrection(*(_fit_bias(held.said[name], held.true[name], held) for name in ("duration", "energy")))
 
 
-def errors_of(residuals: Residuals) -> dict[str, Errors] | None:
+def fit_errors(residuals: Residuals) -> dict[str, Errors] | None:
     """Return the errors of ``power``, ``velocity``, ``duration`` and ``energy`` a metre; None with fewer than `FEWEST` held-out samples.
 
     Parameters
@@ -155,12 +155,12 @@ def errors_of(residuals: Residuals) -> dict[str, Errors] | None:
     held = _Held.of(residuals)
     if held is None:
         return None
-    centring = Centring(*(_bias(held.said[name], held.true[name], held) for name in ("duration", "energy")))
+    centring = BiasCorrection(*(_fit_bias(held.said[name], held.true[name], held) for name in ("duration", "energy")))
     power, velocity = centring.apply(held.said["power"], held.said["velocity"], held.class_id)
     said = {"power": power, "velocity": velocity, "duration": 1.0 / velocity, "energy": power / velocity}
     std = {"duration": centring.duration.std, "energy": centring.energy.std}
     nothing = np.zeros(_CLASSES)
-    return {name: _errors(of, held.true[name], held, std.get(name, nothing)) for name, of in said.items()}
+    return {name: _fit_class_errors(of, held.true[name], held, std.get(name, nothing)) for name, of in said.items()}
 
 
 @dataclass(frozen=True, slots=True)
@@ -199,18 +199,18 @@ class _Held:
         return cls(true, said, class_id, of_run, way_m)
 
 
-def _bias(said: Floats, true: Floats, held: _Held) -> Bias:
+def _fit_bias(said: Floats, true: Floats, held: _Held) -> Bias:
     """Return the bias of all ground, and of each class as far as it is beyond chance."""
     block = held.run
     if np.unique(block).size < _ENOUGH_RUNS:
         block = np.cumsum(np.r_[True, np.diff(held.run) != 0] | (np.arange(said.size) % _BLOCK == 0)) - 1
-    everywhere, error = _ratio(said, true, block)
+    everywhere, error = _estimate_ratio(said, true, block)
     everywhere *= max(0.0, 1.0 - (error / everywhere) ** 2) if everywhere else 0.0
     value, std = np.full(_CLASSES, everywhere), np.full(_CLASSES, error)
     numbers, counts = np.unique(held.class_id, return_counts=True)
     for number in numbers[counts >= FEWEST].tolist():  # fewer lie in a block or two, which tell no chance
         own = held.class_id == number
-        found, chance = _ratio(said[own], true[own], block[own])
+        found, chance = _estimate_ratio(said[own], true[own], block[own])
         beyond = found - everywhere
         kept = max(0.0, 1.0 - (chance / beyond) ** 2) if beyond else 0.0
         value[number] = everywhere + kept * beyond
@@ -218,7 +218,7 @@ def _bias(said: Floats, true: Floats, held: _Held) -> Bias:
     return Bias(np.clip(value, -_MOST_BIAS, _MOST_BIAS), std)
 
 
-def _ratio(said: Floats, true: Floats, block: Ints) -> tuple[float, float]:
+def _estimate_ratio(said: Floats, true: Floats, block: Ints) -> tuple[float, float]:
     """Return what was true over what was said, less one, and its standard error over blocks; a single block tells no error but itself."""
     whole = float(np.abs(said).sum())
     if not whole:
@@ -231,7 +231,7 @@ def _ratio(said: Floats, true: Floats, block: Ints) -> tuple[float, float]:
     return found, float(np.sqrt((of_block**2).sum() * several / (several - 1.0))) / whole
 
 
-def _errors(said: Floats, true: Floats, held: _Held, bias_std: Floats) -> Errors:
+def _fit_class_errors(said: Floats, true: Floats, held: _Held, bias_std: Floats) -> Errors:
     error = true - said
     design = np.column_stack([np.ones_like(said), np.abs(said)])
     (floor, share), _ = nnls(design, np.abs(error))
@@ -243,16 +243,18 @@ def _errors(said: Floats, true: Floats, held: _Held, bias_std: Floats) -> Errors
         of_class[number] = max(float(np.mean(own**2)), 1e-4) ** (0.5 * own.size / (own.size + _HALFWAY))
     standard = standard / of_class[held.class_id]
     low, high = np.quantile(standard, (_TAIL, 1.0 - _TAIL)).tolist()
-    lag_m, correlation = _correlation(standard, held)
+    lag_m, correlation = _estimate_correlation(standard, held)
     runs = int(np.unique(held.run).size)
-    of_run = max(_of_run(error, scale * plain * of_class[held.class_id], held.run), float(correlation[-1]))
+    of_run = max(
+        _estimate_run_variance(error, scale * plain * of_class[held.class_id], held.run), float(correlation[-1])
+    )
     return Errors(
         float(floor) * scale, float(share) * scale, of_class, min(low, 0.0), max(high, 0.0), bias_std,
         lag_m, correlation, of_run, runs, standard.size,
     )  # fmt: skip
 
 
-def _of_run(error: Floats, spread: Floats, run: Ints) -> float:
+def _estimate_run_variance(error: Floats, spread: Floats, run: Ints) -> float:
     """Return the variance of a new run's mean error over its spread, raised as Student's t wants it: a normal interval holds it then."""
     means = (np.bincount(run, weights=error) / np.maximum(np.bincount(run, weights=spread), 1e-300))[np.unique(run)]
     if means.size < 2:
@@ -261,10 +263,10 @@ def _of_run(error: Floats, spread: Floats, run: Ints) -> float:
     return float(means.var(ddof=1)) * (quantile / _Z) ** 2
 
 
-def _correlation(standard: Floats, held: _Held) -> tuple[Floats, Floats]:
+def _estimate_correlation(standard: Floats, held: _Held) -> tuple[Floats, Floats]:
     """Return lags and the correlation from each on."""
-    sill = _between_runs(standard, held.run)
-    half, far_m = _pairs(standard, held)
+    sill = _estimate_variance_between_runs(standard, held.run)
+    half, far_m = _pair_errors(standard, held)
     bins = np.searchsorted(_LAGS_M, far_m, side="right") - 1
     count = np.bincount(bins, minlength=_LAGS_M.size)
     total = np.bincount(bins, weights=half, minlength=_LAGS_M.size)
@@ -285,7 +287,7 @@ def _correlation(standard: Floats, held: _Held) -> tuple[Floats, Floats]:
     return np.array(edges), np.clip(rho, -0.5, 1.0)
 
 
-def _between_runs(standard: Floats, run: Ints) -> float:
+def _estimate_variance_between_runs(standard: Floats, run: Ints) -> float:
     """Return half the mean squared difference of errors of two runs; of one run alone, their variance."""
     count = np.bincount(run).astype(np.float64)
     total, squares = np.bincount(run, weights=standard), np.bincount(run, weights=standard**2)
@@ -296,7 +298,7 @@ def _between_runs(standard: Floats, run: Ints) -> float:
     return max(float(apart / pairs / 2.0), 1e-12)
 
 
-def _pairs(standard: Floats, held: _Held) -> tuple[Floats, Floats]:
+def _pair_errors(standard: Floats, held: _Held) -> tuple[Floats, Floats]:
     """Return half the squared difference of rows of one run, and how far apart they were driven [m]."""
     half, far_m = [np.empty(0)], [np.empty(0)]
     for step in _STEPS[standard.size > _STEPS]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.power.noise import median_period_s
+from tcpipe.power.noise import compute_median_period_s
 from tcpipe.power.rails import Rail, Samples
 from tcpipe.tables.bits import Quality
 
@@ -16,7 +16,7 @@ _VOLTAGE_SHARE = 0.02
 _RATE_TOLERANCE = 0.98  # a 10 Hz source is 10 Hz though its stamps jitter
 
 
-def bits(flags: dict[Quality, NDArray[np.bool_]], count: int) -> NDArray[np.uint32]:
+def combine_flags(flags: dict[Quality, NDArray[np.bool_]], count: int) -> NDArray[np.uint32]:
     """Return the flags of ``count`` segments as bits, shape (M,)."""
     quality = np.zeros(count, dtype=np.uint32)
     for bit, flagged in flags.items():
@@ -24,36 +24,36 @@ def bits(flags: dict[Quality, NDArray[np.bool_]], count: int) -> NDArray[np.uint
     return quality
 
 
-def wanted_rate_hz(*, averaged: bool) -> float:
+def find_wanted_rate(*, averaged: bool) -> float:
     """Return how often power is wanted [Hz]."""
     return MIN_AVERAGED_HZ if averaged else MIN_INSTANTANEOUS_HZ
 
 
 def is_too_slow(rate_hz: float, *, averaged: bool) -> bool:
     """Return whether power at a rate [Hz] comes less often than is wanted."""
-    return rate_hz < _RATE_TOLERANCE * wanted_rate_hz(averaged=averaged)
+    return rate_hz < _RATE_TOLERANCE * find_wanted_rate(averaged=averaged)
 
 
-def low_power_rate(rails: list[Rail]) -> bool:
+def has_low_power_rate(rails: list[Rail]) -> bool:
     """Return whether the current of any rail comes more slowly than 10 Hz (averaged by its source: 2 Hz), or a voltage that varies.
 
     A voltage varies where it changes by more than 2 % (root mean square) from sample to sample; a battery's mostly does by less.
     """
     return any(
-        _is_slow(each.current, each) or (_is_slow(each.voltage, each) and _varies(each.voltage)) for each in rails
+        _is_slow(each.current, each) or (_is_slow(each.voltage, each) and _is_varying(each.voltage)) for each in rails
     )
 
 
 def _is_slow(signal: Samples, each: Rail) -> bool:
-    return is_too_slow(1.0 / median_period_s(signal), averaged=each.averaged)
+    return is_too_slow(1.0 / compute_median_period_s(signal), averaged=each.averaged)
 
 
-def _varies(voltage: Samples) -> bool:
+def _is_varying(voltage: Samples) -> bool:
     steps = np.diff(voltage.value)
     return steps.size > 0 and float(np.sqrt(np.mean(steps**2))) > _VOLTAGE_SHARE * abs(float(np.mean(voltage.value)))
 
 
-def voltage_outside(
+def touches_voltage_outside(
     rails: list[Rail], start_ns: NDArray[np.int64], end_ns: NDArray[np.int64], *, range_volt: tuple[float, float] | None
 ) -> NDArray[np.bool_]:
     """Return the spans that touch a voltage sample outside the range [V], shape (M,); none without a range."""
@@ -74,7 +74,7 @@ def _touches_outside(
     return bad[last] > bad[first]
 
 
-def near(position_m: Floats, start_m: Floats, end_m: Floats, *, within_m: float) -> NDArray[np.bool_]:
+def spans_near(position_m: Floats, start_m: Floats, end_m: Floats, *, within_m: float) -> NDArray[np.bool_]:
     """Return the spans of path length that have one of the positions inside or within a distance of either end, shape (M,).
 
     Parameters
@@ -89,7 +89,7 @@ def near(position_m: Floats, start_m: Floats, end_m: Floats, *, within_m: float)
     return last > first
 
 
-def slipping(wheel_mps: Floats, ground_mps: Floats, *, above: float = 0.2) -> NDArray[np.bool_]:
+def has_slip(wheel_mps: Floats, ground_mps: Floats, *, above: float = 0.2) -> NDArray[np.bool_]:
     """Return where wheel and body speed along the ground differ by more than a share of the wheel speed; not where it is unknown.
 
     Parameters
@@ -99,6 +99,6 @@ def slipping(wheel_mps: Floats, ground_mps: Floats, *, above: float = 0.2) -> ND
     return np.abs(wheel_mps - ground_mps) > above * np.abs(wheel_mps)
 
 
-def means_differ(mean_watt: Floats, power_watt: Floats, *, above: float = 0.05) -> NDArray[np.bool_]:
+def has_mean_mismatch(mean_watt: Floats, power_watt: Floats, *, above: float = 0.05) -> NDArray[np.bool_]:
     """Return where the plain mean of the power samples is off the time-weighted mean by more than a share of it; not where unknown."""
     return np.abs(mean_watt - power_watt) > above * np.abs(power_watt)

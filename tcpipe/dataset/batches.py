@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.dataset.pixels import Pixels, View
+from tcpipe.dataset.pixels import Pixels, SampleView
 
 Floats = NDArray[np.float32]
 Ints = NDArray[np.int64]
@@ -26,7 +26,7 @@ _POOL_PIECES = 16
 class BatchContent:
     """What batches are made of, sample by sample: pixels, labels, shape (N, 2), weights (N, 2) and named columns (N,) if wanted."""
 
-    view: View
+    view: SampleView
     labels: Floats
     weights: Floats | None
     features: tuple[tuple[str, NDArray[np.generic]], ...]
@@ -121,12 +121,12 @@ class Batches:
         content = self._content
         mirrored = mirrors.random(len(rows)) < 0.5 if self._rules.mirror else np.zeros(len(rows), np.bool_)
         patches = content.view.form.form(pixels, rows, mirrored)
-        given = (patches, _features(content.features, samples, mirrored)) if content.features else patches
+        given = (patches, _compute_features(content.features, samples, mirrored)) if content.features else patches
         batch = (given, content.labels[samples])
         return batch if content.weights is None else (*batch, content.weights[samples])
 
 
-def _features(
+def _compute_features(
     named: Sequence[tuple[str, NDArray[np.generic]]], samples: Ints, mirrored: NDArray[np.bool_]
 ) -> NDArray[np.float32]:
     columns = [np.where(mirrored & (name in _FLIPPED), -1.0, 1.0) * column[samples] for name, column in named]

@@ -35,7 +35,7 @@ ENERGIES: Mapping[str, Energy] = {
 }
 
 
-def energy_called(name: str) -> Energy:
+def find_energy(name: str) -> Energy:
     """Return an energy by its name; `DatasetError` lists those there are."""
     if name not in ENERGIES:
         raise DatasetError(f"label {name!r}: wanted one of {', '.join(ENERGIES)}")

@@ -7,14 +7,14 @@ from pathlib import Path
 
 import numpy as np
 
-from tcpipe.dataset.energies import Energy, energy_called
-from tcpipe.dataset.pixels import StoredPixels, View
+from tcpipe.dataset.energies import Energy, find_energy
+from tcpipe.dataset.pixels import SampleView, StoredPixels
 from tcpipe.dataset.split import SampleColumns, Split
-from tcpipe.dataset.tensor import tensor_form
+from tcpipe.dataset.tensor import make_tensor_layout
 from tcpipe.errors import DatasetError
 from tcpipe.formats.bucket_directories import fetch_directory_by_range
 from tcpipe.formats.dataset_card import DatasetCard
-from tcpipe.formats.dataset_files import is_shard, open_patches, read_current_card, read_samples, rows_in_files
+from tcpipe.formats.dataset_files import find_rows_in_files, is_shard, open_patches, read_current_card, read_samples
 from tcpipe.terrain.layers import LAYERS
 
 
@@ -70,7 +70,7 @@ def open_dataset(path: str | Path, *, layers: Sequence[str] | None = None, label
         There is no dataset, it is of another data model, or its samples do not fit its card, or it has no such layer or label.
 
     """
-    energy = energy_called(label)
+    energy = find_energy(label)
     directory, fetched = fetch_directory_by_range(path, by_range=is_shard)
     card = read_current_card(directory)
     split = read_samples(directory, ["split"]).column("split").to_numpy()
@@ -81,11 +81,13 @@ def open_dataset(path: str | Path, *, layers: Sequence[str] | None = None, label
     _refuse_without(energy, directory, card)
     files = open_patches(directory, card, fetched)
     asked = [name for name in LAYERS if name in files.layers] if layers is None else layers
-    form = tensor_form(asked, files.layers)
+    form = make_tensor_layout(asked, files.layers)
     parts = {}
-    for name, rows in rows_in_files(card, split).items():
+    for name, rows in find_rows_in_files(card, split).items():
         columns = SampleColumns(directory, np.flatnonzero(split == name))
-        parts[name] = Split(name, card, columns, View(StoredPixels(files, rows), np.arange(len(rows)), form), energy)
+        parts[name] = Split(
+            name, card, columns, SampleView(StoredPixels(files, rows), np.arange(len(rows)), form), energy
+        )
     return Dataset(directory, card, parts)
 
 

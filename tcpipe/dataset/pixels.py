@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.dataset.tensor import TensorForm
+from tcpipe.dataset.tensor import TensorLayout
 from tcpipe.formats.dataset_files import PatchFiles
 
 Ints = NDArray[np.int64]
@@ -129,9 +129,9 @@ class StoredPixels:
 
 
 @dataclass(frozen=True, slots=True)
-class View:
+class SampleView:
     """Which of the stored samples a split has, ``at``, (N,), and how their tensors are formed."""
 
     stored: StoredPixels
     at: Ints
-    form: TensorForm
+    form: TensorLayout

@@ -13,12 +13,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from tcpipe.dataset.batches import BatchContent, Batches, BatchRules
 from tcpipe.dataset.energies import ENERGIES, Energy
-from tcpipe.dataset.pixels import View
-from tcpipe.dataset.tensor import tensor_form
+from tcpipe.dataset.pixels import SampleView
+from tcpipe.dataset.tensor import make_tensor_layout
 from tcpipe.errors import DatasetError
 from tcpipe.formats.dataset_card import DatasetCard
 from tcpipe.formats.dataset_files import read_samples, sample_columns
-from tcpipe.tables.bits import Quality, name_of
+from tcpipe.tables.bits import Quality, flag_name
 from tcpipe.tables.levels import SAMPLES
 
 if TYPE_CHECKING:
@@ -70,7 +70,7 @@ class Split:
     """
 
     def __init__(
-        self, name: str, card: DatasetCard, columns: SampleColumns, view: View, energy: Energy = ENERGIES["total"]
+        self, name: str, card: DatasetCard, columns: SampleColumns, view: SampleView, energy: Energy = ENERGIES["total"]
     ) -> None:
         self.name = name
         self.view = view
@@ -139,7 +139,9 @@ class Split:
         """Inverse variance of each label over its mean, float32, shape (N, 2): how much it says of the ground; 0 where it is not known."""
         if self._weights is None:
             std = np.column_stack([self.column(name) for name in (self.energy.power_std, "velocity_std_mps")])
-            self._weights = np.column_stack([_inverse_variance(column) for column in std.T]).astype(np.float32)
+            self._weights = np.column_stack([_compute_inverse_variance_weights(column) for column in std.T]).astype(
+                np.float32
+            )
         return self._weights
 
     @property
@@ -166,7 +168,7 @@ class Split:
 
     def with_channels(self, *channels: str) -> Split:
         """Return the split with these channels: layers by name, or ``terrain_one_hot`` (a channel a class; of any categorical layer)."""
-        form = tensor_form(channels, self.view.stored.files.layers)
+        form = make_tensor_layout(channels, self.view.stored.files.layers)
         return self._with(replace(self.view, form=form))
 
     def take(self, chosen: ArrayLike) -> Split:
@@ -190,7 +192,7 @@ class Split:
             Samples with a larger standard deviation are left out [W], [m/s].
 
         """
-        named = {name_of(bit): int(bit) for bit in Quality}
+        named = {flag_name(bit): int(bit) for bit in Quality}
         unknown = [name for name in without if name not in named]
         if unknown:
             raise DatasetError(f"quality {', '.join(unknown)}: wanted some of {', '.join(named)}")
@@ -254,7 +256,7 @@ class Split:
 
         return TorchBatches(self.batches(size, **rules))
 
-    def _with(self, view: View) -> Split:
+    def _with(self, view: SampleView) -> Split:
         return Split(self.name, self._card, self._columns, view, self.energy)
 
     def _tensor(self, indices: Ints) -> Floats:
@@ -264,7 +266,7 @@ class Split:
         return self.view.form.form(self.layers(indices), np.arange(len(indices)))
 
 
-def _inverse_variance(std: NDArray[np.float64]) -> NDArray[np.float64]:
+def _compute_inverse_variance_weights(std: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return weights with a mean of 1 from standard deviations, shape (N,); 0 where one is not finite."""
     known = np.isfinite(std)
     if not known.any():

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.errors import DatasetError
-from tcpipe.terrain.layers import LAYERS, Layer, in_order
+from tcpipe.terrain.layers import LAYERS, Layer, sort_layers
 
 Floats = NDArray[np.float32]
 Pixels = Mapping[str, NDArray[np.uint8 | np.uint16 | np.float32]]
@@ -22,7 +22,7 @@ _BYTES = np.arange(256, dtype=np.uint8)
 
 
 @dataclass(frozen=True)
-class TensorForm:
+class TensorLayout:
     """Channels in their order: names of layers as in the paper, or of a categorical one with `ONE_HOT`; ``known`` are all layers."""
 
     channels: tuple[str, ...]
@@ -31,7 +31,7 @@ class TensorForm:
     @cached_property
     def layers(self) -> tuple[str, ...]:
         """Stored layers that are needed."""
-        return tuple(in_order({name: self.known[name] for name in map(self._of, self.channels)}))
+        return tuple(sort_layers({name: self.known[name] for name in map(self._of, self.channels)}))
 
     @cached_property
     def depth(self) -> int:
@@ -84,11 +84,11 @@ class TensorForm:
         return out
 
 
-def tensor_form(channels: Sequence[str], known: Mapping[str, Layer]) -> TensorForm:
+def make_tensor_layout(channels: Sequence[str], known: Mapping[str, Layer]) -> TensorLayout:
     """Return the form with these channels; `DatasetError` names those that the stored layers cannot give."""
     possible = [*known, *(f"{name}{ONE_HOT}" for name, layer in known.items() if layer.kind == "categorical")]
     unknown = [channel for channel in channels if channel not in possible]
     if unknown or not channels:
         named = ", ".join(unknown) or "none"
         raise DatasetError(f"channels asked for: {named}; this dataset can give {', '.join(possible)}")
-    return TensorForm(tuple(channels), known)
+    return TensorLayout(tuple(channels), known)

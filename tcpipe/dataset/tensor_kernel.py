@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.compiled import kernel
+from tcpipe.compiled import compile_kernel
 from tcpipe.terrain.sampling_kernel import HEIGHT_NODATA
 
 Floats = NDArray[np.float32]
@@ -16,7 +16,7 @@ Ints = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
 
-@kernel
+@compile_kernel
 def form_paper_tensor(  # noqa: PLR0917
     ortho: NDArray[np.uint8],
     terrain: NDArray[np.uint8],
@@ -52,7 +52,7 @@ def form_paper_tensor(  # noqa: PLR0917
                 line[at + depth - one] = rise if heights[i] != HEIGHT_NODATA else none
 
 
-@kernel
+@compile_kernel
 def form_bytes(layer: NDArray[np.uint8], rows: Ints, mirrored: Mask, value: Floats, channel: int, out: Floats) -> None:  # noqa: PLR0917
     """Write ``value`` of each byte of ``rows`` to one channel of ``out``, (B, px, px, C)."""
     px = out.shape[1]
@@ -65,7 +65,7 @@ def form_bytes(layer: NDArray[np.uint8], rows: Ints, mirrored: Mask, value: Floa
                 line[c, channel] = value[stored[c]]
 
 
-@kernel
+@compile_kernel
 def form_numbers(  # noqa: PLR0917
     layer: NDArray[np.uint16 | np.float32],
     rows: Ints,

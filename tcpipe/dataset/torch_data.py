@@ -27,11 +27,11 @@ class TorchBatches(IterableDataset[Any]):
         worker, number = get_worker_info(), self._passes
         self._passes += 1
         if worker is None:
-            return map(_tensors, self._batches.epoch(number))
+            return map(_to_tensors, self._batches.epoch(number))
         loader_seed = worker.seed - worker.id  # of this epoch, equal in all workers; a loader's generator rules it
-        return map(_tensors, self._batches.part(worker.id, worker.num_workers).epoch(loader_seed + number))
+        return map(_to_tensors, self._batches.part(worker.id, worker.num_workers).epoch(loader_seed + number))
 
 
-def _tensors(values: Any) -> Any:
+def _to_tensors(values: Any) -> Any:
     """Return arrays, and tuples of them, as tensors without copying."""
-    return tuple(_tensors(value) for value in values) if isinstance(values, tuple) else torch.from_numpy(values)
+    return tuple(_to_tensors(value) for value in values) if isinstance(values, tuple) else torch.from_numpy(values)

@@ -21,15 +21,15 @@ def map_table(path: Path) -> pa.Table:
         return pa.ipc.open_file(source).read_all()
 
 
-def table_bytes(table: pa.Table) -> bytes:
-    """Return a table as bytes, schema and all; `table_of` is the way back."""
+def write_table_bytes(table: pa.Table) -> bytes:
+    """Return a table as bytes, schema and all; `read_table_bytes` is the way back."""
     sink = pa.BufferOutputStream()
     with pa.ipc.new_stream(sink, table.schema) as writer:
         writer.write_table(table)
     return bytes(sink.getvalue())
 
 
-def table_of(data: bytes) -> pa.Table:
-    """Return the table in bytes of `table_bytes`."""
+def read_table_bytes(data: bytes) -> pa.Table:
+    """Return the table in bytes of `write_table_bytes`."""
     with pa.ipc.open_stream(data) as reader:
         return reader.read_all()

@@ -22,7 +22,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from tcpipe.errors import StoreError
-from tcpipe.formats.places import local_output
+from tcpipe.formats.user_paths import check_local_output
 
 TEMPORARY_PREFIX = ".tmp-"
 """What is left behind by a killed process begins with this; readers skip it."""
@@ -45,14 +45,14 @@ _RENAME_EXCHANGE = 2
 
 
 @contextmanager
-def atomic_file(path: Path) -> Iterator[Path]:
+def write_atomic_file(path: Path) -> Iterator[Path]:
     """Yield a temporary path; on success it is synced and renamed to ``path``, on failure removed.
 
     Raises
     ------
     StoreError : the place cannot be written.
     """
-    with _told(path), _parents_of(path) as place, _holder_beside(place) as holder:
+    with _convert_os_errors(path), _make_parents(path) as place, _make_locked_holder(place) as holder:
         temporary = holder / place.name
         temporary.touch()
         yield temporary
@@ -63,14 +63,14 @@ def atomic_file(path: Path) -> Iterator[Path]:
 
 
 @contextmanager
-def atomic_directory(path: Path) -> Iterator[Path]:
+def write_atomic_directory(path: Path) -> Iterator[Path]:
     """Yield a temporary directory; on success it takes the place of ``path`` (an old one goes), on failure it is removed.
 
     Raises
     ------
     StoreError : the place cannot be written.
     """
-    with _told(path), _parents_of(path) as place, _holder_beside(place) as holder:
+    with _convert_os_errors(path), _make_parents(path) as place, _make_locked_holder(place) as holder:
         temporary = holder / place.name
         temporary.mkdir()
         yield temporary
@@ -79,7 +79,7 @@ def atomic_directory(path: Path) -> Iterator[Path]:
 
 def write_text(path: Path, text: str) -> None:
     """Write a text file whole or not at all."""
-    with atomic_file(path) as temporary:
+    with write_atomic_file(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
 
 
@@ -89,18 +89,18 @@ def put_file(path: Path, data: bytes, *, staging: Path, over: bool = False) -> b
     ``staging`` is a directory of the same file system, above ``path``: what a killed process leaves behind lies there, and goes with the
     next call.
     """
-    with _told(path), _parents_of(path) as place, working_directory(staging) as directory:
+    with _convert_os_errors(path), _make_parents(path) as place, make_working_directory(staging) as directory:
         temporary = directory / "new"
         _write_synced(os.open(temporary, os.O_WRONLY | os.O_CREAT, 0o666), data)
         if over:
             temporary.replace(place)
-        elif not _linked(temporary, place, data):
+        elif not _is_link_made(temporary, place, data):
             return False
         _sync_directory(place.parent)
     return True
 
 
-def _linked(temporary: Path, place: Path, data: bytes) -> bool:
+def _is_link_made(temporary: Path, place: Path, data: bytes) -> bool:
     try:
         os.link(temporary, place)
     except FileExistsError:
@@ -115,19 +115,19 @@ def _linked(temporary: Path, place: Path, data: bytes) -> bool:
 
 
 @contextmanager
-def working_directory(staging: Path) -> Iterator[Path]:
+def make_working_directory(staging: Path) -> Iterator[Path]:
     """Yield an empty directory among the temporaries in ``staging``; it goes in the end, or with the next call if this one is killed."""
-    with _holder_beside(Path(os.path.realpath(staging), "new")) as holder:
+    with _make_locked_holder(Path(os.path.realpath(staging), "new")) as holder:
         directory = holder / "new"
         directory.mkdir()
         yield directory
 
 
 @contextmanager
-def scratch_directory() -> Iterator[Path]:
+def make_scratch_directory() -> Iterator[Path]:
     """Yield an empty directory of this user in the system's own (``TMPDIR``); what killed processes left there goes first."""
     clear_scratch()
-    holder, lock = _locked_directory(Path(tempfile.gettempdir()), _scratch_prefix(), mode=0o700)
+    holder, lock = _make_locked_directory(Path(tempfile.gettempdir()), _make_scratch_prefix(), mode=0o700)
     try:
         directory = holder / "new"  # which others lock in their turn
         directory.mkdir()
@@ -139,25 +139,25 @@ def scratch_directory() -> Iterator[Path]:
 
 def clear_scratch() -> None:
     """Remove what killed processes left of their scratch directories."""
-    for left in Path(tempfile.gettempdir()).glob(f"{_scratch_prefix()}*"):
-        _claimed(left, lambda left=left: shutil.rmtree(left))  # type: ignore[misc]
+    for left in Path(tempfile.gettempdir()).glob(f"{_make_scratch_prefix()}*"):
+        _remove_if_abandoned(left, lambda left=left: shutil.rmtree(left))  # type: ignore[misc]
 
 
-def _scratch_prefix() -> str:
+def _make_scratch_prefix() -> str:
     return f"tcpipe-{os.getuid()}-"
 
 
-def lasting_scratch() -> Path:
-    """Return a `scratch_directory` that goes when this process ends."""
-    context = scratch_directory()
+def make_lasting_scratch() -> Path:
+    """Return a `make_scratch_directory` that goes when this process ends."""
+    context = make_scratch_directory()
     directory = context.__enter__()
     atexit.register(context.__exit__, None, None, None)
     return directory
 
 
 def put_directory(directory: Path, path: Path) -> None:
-    """Put a directory, from a `working_directory` of the same file system, to its place by one rename; what is there goes."""
-    with _told(path), _parents_of(path) as place:
+    """Put a directory, from a `make_working_directory` of the same file system, to its place by one rename; what is there goes."""
+    with _convert_os_errors(path), _make_parents(path) as place:
         _put_synced(directory, place, before="old")
 
 
@@ -166,7 +166,7 @@ def _put_synced(directory: Path, place: Path, before: str = _BEFORE) -> None:
         for name in files:
             with (Path(above) / name).open("rb") as stream:
                 os.fsync(stream.fileno())
-    with exclusive(place.parent):
+    with lock_directory(place.parent):
         _take_place(directory, place, before)
     _sync_directory(place.parent)
 
@@ -179,7 +179,7 @@ def _write_synced(descriptor: int, data: bytes) -> None:
 
 
 @contextmanager
-def exclusive(directory: Path) -> Iterator[None]:
+def lock_directory(directory: Path) -> Iterator[None]:
     """Let one process at a time through, by a lock on ``directory``; where the file system has no locks, all."""
     descriptor = os.open(directory, os.O_RDONLY)
     try:
@@ -191,7 +191,7 @@ def exclusive(directory: Path) -> Iterator[None]:
 
 
 @contextmanager
-def _told(path: Path) -> Iterator[None]:
+def _convert_os_errors(path: Path) -> Iterator[None]:
     """Turn what the operating system says while ``path`` is written into one line about ``path`` itself.
 
     An error that names another file is of that file: what is read for ``path``. One that names none is of writing, whatever its number,
@@ -217,9 +217,9 @@ def _is_of_writing(error: OSError, place: Path) -> bool:
 
 
 @contextmanager
-def _parents_of(path: Path) -> Iterator[Path]:
+def _make_parents(path: Path) -> Iterator[Path]:
     """Make the directories above ``path`` and yield its real place; those that were made go again on failure."""
-    place = Path(os.path.realpath(local_output(path)))
+    place = Path(os.path.realpath(check_local_output(path)))
     missing = [parent for parent in place.parents if not parent.exists()]
     in_the_way = next((parent for parent in place.parents if parent.exists() and not parent.is_dir()), None)
     if in_the_way is not None:
@@ -235,10 +235,10 @@ def _parents_of(path: Path) -> Iterator[Path]:
 
 
 @contextmanager
-def _holder_beside(place: Path) -> Iterator[Path]:
+def _make_locked_holder(place: Path) -> Iterator[Path]:
     """Yield a new locked directory beside ``place`` and remove it in the end; what was abandoned there is cleared first."""
     clear(place.parent)
-    holder, lock = _locked_directory(place.parent, _prefix(place.name))
+    holder, lock = _make_locked_directory(place.parent, _make_prefix(place.name))
     try:
         yield holder
     except BaseException:
@@ -253,7 +253,7 @@ def _holder_beside(place: Path) -> Iterator[Path]:
             os.close(lock)
 
 
-def _locked_directory(parent: Path, prefix: str, mode: int = 0o777) -> tuple[Path, int]:
+def _make_locked_directory(parent: Path, prefix: str, mode: int = 0o777) -> tuple[Path, int]:
     while True:
         holder = parent / f"{prefix}{uuid.uuid4().hex[:8]}"
         try:
@@ -270,34 +270,34 @@ def _locked_directory(parent: Path, prefix: str, mode: int = 0o777) -> tuple[Pat
             raise
 
 
-def _prefix(name: str) -> str:
+def _make_prefix(name: str) -> str:
     return f"{TEMPORARY_PREFIX}{os.fsdecode(os.fsencode(name)[:_LONGEST_NAME])}-"
 
 
 def clear(directory: Path) -> None:
     """Put a directory in order after killed writers: what they took away comes back, what they left behind goes."""
-    for holder in _holders(local_output(directory)):
-        _claimed(holder, lambda holder=holder: _clear_holder(holder))  # type: ignore[misc]
+    for holder in _list_holders(check_local_output(directory)):
+        _remove_if_abandoned(holder, lambda holder=holder: _clear_holder(holder))  # type: ignore[misc]
 
 
 def clear_beside(path: Path) -> None:
     """Clear the directory in which ``path`` lies, or would."""
-    clear(Path(os.path.realpath(local_output(path))).parent)
+    clear(Path(os.path.realpath(check_local_output(path))).parent)
 
 
-def left_beside(path: Path) -> list[Path]:
+def find_leftovers(path: Path) -> list[Path]:
     """Return what killed writers of ``path`` left beside it."""
     place = Path(os.path.realpath(path))
-    mine = (holder for holder in _holders(place.parent) if holder.name.startswith(_prefix(place.name)))
+    mine = (holder for holder in _list_holders(place.parent) if holder.name.startswith(_make_prefix(place.name)))
     return [holder for holder in mine if is_abandoned(holder)]
 
 
 def is_abandoned(holder: Path) -> bool:
     """Return whether nobody writes into a temporary any more; it may be removed then."""
-    return _claimed(holder, lambda: None)
+    return _remove_if_abandoned(holder, lambda: None)
 
 
-def _holders(directory: Path) -> list[Path]:
+def _list_holders(directory: Path) -> list[Path]:
     try:
         names = [entry.name for entry in os.scandir(directory) if entry.name.startswith(TEMPORARY_PREFIX)]
     except OSError:  # nothing to be cleared here, or by us
@@ -314,7 +314,7 @@ def _clear_holder(holder: Path) -> None:
     shutil.rmtree(holder)
 
 
-def _claimed(holder: Path, act: Callable[[], object]) -> bool:
+def _remove_if_abandoned(holder: Path, act: Callable[[], object]) -> bool:
     """Do something while a temporary is locked, unless its writer lives; return whether it was done."""
     with suppress(OSError):
         lock = os.open(holder, os.O_RDONLY)
@@ -337,7 +337,7 @@ def _take_place(temporary: Path, place: Path, before: str) -> None:
                 raise
         else:
             return
-    if _exchanged(temporary, place):
+    if _exchange_directories(temporary, place):
         return
     old = temporary.with_name(before)
     place.rename(old)
@@ -348,7 +348,7 @@ def _take_place(temporary: Path, place: Path, before: str) -> None:
         raise
 
 
-def _exchanged(one: Path, other: Path) -> bool:
+def _exchange_directories(one: Path, other: Path) -> bool:
     renameat2 = getattr(ctypes.CDLL(None), "renameat2", None)
     if renameat2 is None:
         return False

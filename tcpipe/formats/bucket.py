@@ -13,11 +13,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
 from tcpipe.errors import StoreError
-from tcpipe.formats.atomic import scratch_directory
-from tcpipe.formats.content_cache import cached
-from tcpipe.formats.object_storage import connected, is_url, split_url, told
+from tcpipe.formats.atomic import make_scratch_directory
+from tcpipe.formats.content_cache import fetch_cached
+from tcpipe.formats.integrity import Checksum
+from tcpipe.formats.object_storage import connect_store, convert_errors, is_url, split_url
 from tcpipe.formats.place import DirectoryPlace, Entry, Place
-from tcpipe.formats.seals import Checksum
 
 if TYPE_CHECKING:
     from obstore import ListResult, ObjectMeta
@@ -38,7 +38,7 @@ def open_place(path: str | Path) -> Place:
     return BucketPlace(split_url(str(path))[0].rstrip("/")) if is_url(path) else DirectoryPlace(Path(path))
 
 
-def side_by_side(path: str | Path, function: Callable[[T], U], items: Sequence[T]) -> list[U]:
+def map_concurrently(path: str | Path, function: Callable[[T], U], items: Sequence[T]) -> list[U]:
     """Return what a function gives for each item, one after another; some at once where it asks a bucket, as each answer takes a while."""
     if not is_url(path) or not items:
         return list(map(function, items))
@@ -63,33 +63,33 @@ class BucketPlace:
     def check(self) -> None:
         """Raise `StoreError` where nothing can be listed here."""
         store, key = self._store()
-        with told(self.url, StoreError):
+        with convert_errors(self.url, StoreError):
             next(iter(store.list(prefix=key or None, chunk_size=1)), None)
 
     def read(self, name: str) -> bytes | None:
         """Return a whole object; None where there is none."""
         store, key = self._store(name)
-        with suppress(FileNotFoundError), told(self.where(name), StoreError):
+        with suppress(FileNotFoundError), convert_errors(self.where(name), StoreError):
             return bytes(store.get(key).bytes())
         return None
 
     def read_range(self, name: str, start: int, size: int) -> bytes:
         """Return ``size`` bytes from ``start`` on."""
         store, key = self._store(name)
-        with _gone(self.where(name)), told(self.where(name), StoreError):
+        with _convert_missing(self.where(name)), convert_errors(self.where(name), StoreError):
             return bytes(store.get_range(key, start=start, length=size)) if size else b""
 
     def size(self, name: str) -> int | None:
         """Return how large an object is [byte]."""
         store, key = self._store(name)
-        with suppress(FileNotFoundError), told(self.where(name), StoreError):
+        with suppress(FileNotFoundError), convert_errors(self.where(name), StoreError):
             return int(store.head(key)["size"])
         return None
 
     def version(self, name: str) -> str | None:
         """Return the URL of an object and its ETag; None where the bucket gives none."""
         store, key = self._store(name)
-        with _gone(self.where(name)), told(self.where(name), StoreError):
+        with _convert_missing(self.where(name)), convert_errors(self.where(name), StoreError):
             tag = store.head(key)["e_tag"]
         return None if tag is None else f"{self.where(name)} {tag}"
 
@@ -98,7 +98,7 @@ class BucketPlace:
         del but
         store, key = self._store(prefix)
         cut = len(self._store()[1]) + 1 if self._store()[1] else 0
-        with told(self.where(prefix), StoreError):
+        with convert_errors(self.where(prefix), StoreError):
             found = [meta for batch in store.list(prefix=key or None) for meta in batch]
         entries = (
             Entry(meta["path"][cut:], meta["size"], round(meta["last_modified"].timestamp() * 1e6) * 1000)
@@ -117,21 +117,21 @@ class BucketPlace:
     def files_after(self, prefix: str, after: str) -> list[str]:
         """Return the names of the objects in ``prefix`` that sort after a name: a request for every thousand."""
         store, key = self._store(prefix)
-        with told(self.where(prefix), StoreError):
+        with convert_errors(self.where(prefix), StoreError):
             batches = list(store.list(prefix=key or None, offset="/".join(part for part in (key, after) if part)))
         names = (meta["path"][len(key) + 1 if key else 0 :] for batch in batches for meta in batch)
         return sorted(name for name in names if name > after and "/" not in name)
 
     def _in(self, prefix: str) -> ListResult[Sequence[ObjectMeta]]:
         store, key = self._store(prefix)
-        with told(self.where(prefix), StoreError):
+        with convert_errors(self.where(prefix), StoreError):
             return store.list_with_delimiter(prefix=key or None)
 
     def put(self, name: str, data: bytes, *, lasting: bool = True) -> None:
         """Write an object."""
         del lasting
         store, key = self._store(name)
-        with told(self.where(name), StoreError, what="written"):
+        with convert_errors(self.where(name), StoreError, what="written"):
             store.put(key, data, use_multipart=False)
 
     def put_new(self, name: str, data: bytes) -> bool:
@@ -139,7 +139,7 @@ class BucketPlace:
         from obstore.exceptions import AlreadyExistsError  # noqa: PLC0415  most runs stay on this machine
 
         store, key = self._store(name)
-        with told(self.where(name), StoreError, what="written"):
+        with convert_errors(self.where(name), StoreError, what="written"):
             try:
                 store.put(key, data, mode="create", use_multipart=False)
             except AlreadyExistsError:
@@ -148,7 +148,7 @@ class BucketPlace:
 
     def workshop(self) -> AbstractContextManager[Path]:
         """Return a context: a temporary directory of this machine."""
-        return scratch_directory()
+        return make_scratch_directory()
 
     def put_files(self, prefix: str, directory: Path) -> None:
         """Upload the files of a directory, several at once."""
@@ -156,10 +156,10 @@ class BucketPlace:
         def upload(path: Path) -> None:
             name = "/".join(part for part in (prefix, path.relative_to(directory).as_posix()) if part)
             store, key = self._store(name)
-            with told(self.where(name), StoreError, what="written"):
+            with convert_errors(self.where(name), StoreError, what="written"):
                 store.put(key, path)
 
-        side_by_side(self.url, upload, sorted(path for path in directory.rglob("*") if path.is_file()))
+        map_concurrently(self.url, upload, sorted(path for path in directory.rglob("*") if path.is_file()))
 
     def checksum(self, name: str) -> Checksum | None:
         """Return size and sha256 of an object."""
@@ -174,7 +174,7 @@ class BucketPlace:
     def delete(self, name: str) -> None:
         """Remove an object."""
         store, key = self._store(name)
-        with suppress(FileNotFoundError), told(self.where(name), StoreError, what="written"):
+        with suppress(FileNotFoundError), convert_errors(self.where(name), StoreError, what="written"):
             store.delete(key)
 
     def local(self, name: str, checksum: Checksum) -> Path:
@@ -191,32 +191,32 @@ class BucketPlace:
                     f"{self.where(name)}: its sha256 is {digest.hexdigest()[:12]}…, wanted {checksum.sha256[:12]}…"
                 )
 
-        return cached(checksum.sha256, fetch)
+        return fetch_cached(checksum.sha256, fetch)
 
     def pieces(self, name: str) -> Iterator[bytes]:
         """Yield an object piece by piece; `StoreError` where there is none."""
         store, key = self._store(name)
-        with _gone(self.where(name)), told(self.where(name), StoreError):
+        with _convert_missing(self.where(name)), convert_errors(self.where(name), StoreError):
             for piece in store.get(key).stream(min_chunk_size=_PIECE_BYTES):
                 yield bytes(piece)
 
     def _store(self, name: str = "") -> tuple[ObjectStore, str]:
         """Return the bucket, and the name in it of what is called ``name`` here."""
         settings = tuple(sorted((key, value) for key, value in os.environ.items() if key.upper().startswith(_SETTINGS)))
-        with told(self.url, StoreError):
-            store, prefix = _connected(self.url, settings)
+        with convert_errors(self.url, StoreError):
+            store, prefix = _connect_cached(self.url, settings)
         return store, "/".join(part for part in (prefix, name) if part)
 
 
 @lru_cache(maxsize=64)
-def _connected(url: str, settings: tuple[tuple[str, str], ...]) -> tuple[ObjectStore, str]:
-    """Return what `connected` does, once for each setting of the environment."""
+def _connect_cached(url: str, settings: tuple[tuple[str, str], ...]) -> tuple[ObjectStore, str]:
+    """Return what `connect_store` does, once for each setting of the environment."""
     del settings
-    return connected(url)
+    return connect_store(url)
 
 
 @contextmanager
-def _gone(where: str) -> Iterator[None]:
+def _convert_missing(where: str) -> Iterator[None]:
     try:
         yield
     except FileNotFoundError:

@@ -24,16 +24,16 @@ from typing import NamedTuple
 import google_crc32c
 
 from tcpipe.errors import StoreError, UsageError
-from tcpipe.formats.atomic import lasting_scratch, scratch_directory
-from tcpipe.formats.bucket import open_place, side_by_side
+from tcpipe.formats.atomic import make_lasting_scratch, make_scratch_directory
+from tcpipe.formats.bucket import map_concurrently, open_place
 from tcpipe.formats.commit_log import LOG, read_newest_commit, read_state
 from tcpipe.formats.commits import State
-from tcpipe.formats.content_cache import cached, is_cached
-from tcpipe.formats.json_files import parse_json, typed
+from tcpipe.formats.content_cache import fetch_cached, is_cached
+from tcpipe.formats.integrity import Checksum, Checksums, find_broken_checksums
+from tcpipe.formats.json_files import parse_json, parse_typed
 from tcpipe.formats.object_storage import is_bucket, is_url
 from tcpipe.formats.place import DirectoryPlace, Place
-from tcpipe.formats.proved_content import wrong_files
-from tcpipe.formats.seals import Checksum, Checksums, broken_checksums
+from tcpipe.formats.proved_content import find_wrong_files
 
 CARDS = ("dataset.json", "model.json", "cost-map.json")
 """Documents that prove all files beside them."""
@@ -79,7 +79,7 @@ class FetchedShards:
         pieces = list(pieces)
         self._prove({self._name(path) for path, *_ in pieces})
         absent = [piece for piece in pieces if not is_cached(self._key(*piece))]
-        side_by_side(self.place.where(), lambda piece: self._held(*piece), absent)
+        map_concurrently(self.place.where(), lambda piece: self._held(*piece), absent)
 
     def fetch_file(self, path: Path) -> Path:
         """Return a cached copy of a whole file."""
@@ -94,13 +94,13 @@ class FetchedShards:
         """Raise `StoreError` where a shard is not what its card says."""
         if not self.proves or names <= self._proved:
             return
-        if wrong := wrong_files(self.place, self.checksums, sorted(names - self._proved)):
+        if wrong := find_wrong_files(self.place, self.checksums, sorted(names - self._proved)):
             raise StoreError(*wrong)
         self._proved.update(names)
 
     def _held(self, path: Path, offset: int, size: int) -> Path:
         key, name = self._key(path, offset, size), self._name(path)
-        return cached(key, lambda to: to.write_bytes(self.place.read_range(name, offset, size)))
+        return fetch_cached(key, lambda to: to.write_bytes(self.place.read_range(name, offset, size)))
 
     def _key(self, path: Path, offset: int, size: int) -> str:
         return f"{self._checksum(path).sha256} {offset} {size}"
@@ -136,7 +136,7 @@ def fetch_unproved(url: str) -> Iterator[Path]:
     StoreError : it cannot be read.
     """
     card = require_card(url)
-    with scratch_directory() as held:
+    with make_scratch_directory() as held:
         root = _below(held, url)
 
         def bring(name: str) -> None:
@@ -144,7 +144,7 @@ def fetch_unproved(url: str) -> Iterator[Path]:
                 (root / name).parent.mkdir(parents=True, exist_ok=True)
                 (root / name).write_bytes(data)
 
-        side_by_side(url, bring, [*_read_checksums(card), card.name, *_UNLISTED])
+        map_concurrently(url, bring, [*_read_checksums(card), card.name, *_UNLISTED])
         yield root
 
 
@@ -225,7 +225,7 @@ def require_card(url: str, cards: Sequence[str] = CARDS) -> FoundCard:
 def _read_checksums(card: FoundCard) -> Mapping[str, Checksum]:
     """Return the files that a card lists; `StoreError` where one of them is not beside it."""
     where = card.place.where(card.name)
-    checksums = typed(parse_json(card.data, Path(where)), Checksums, Path(where)).checksums
+    checksums = parse_typed(parse_json(card.data, Path(where)), Checksums, Path(where)).checksums
     if outside := [file for file in checksums if file.startswith("/") or ".." in file.split("/")]:
         raise StoreError(f"{where}: names {outside[0]!r}, which is no file beside it")
     return checksums
@@ -260,7 +260,7 @@ def _brought(
 ) -> FetchedShards:
     """Bring what is wanted of a place's files below ``root``; return where the others are read."""
     absent = [(file, checksum) for file, checksum in checksums.items() if wanted(file) and not (root / file).exists()]
-    side_by_side(place.where(), lambda of: _bring(place, *of, root / of[0]), absent)
+    map_concurrently(place.where(), lambda of: _bring(place, *of, root / of[0]), absent)
     return FetchedShards(place, root, checksums)
 
 
@@ -268,7 +268,7 @@ def _brought(
 def _kept(url: str, card: bytes) -> Path:
     """Return a directory for a card at a URL, which goes when the process ends."""
     del url, card
-    return lasting_scratch()
+    return make_lasting_scratch()
 
 
 def _below(directory: Path, url: str) -> Path:
@@ -288,7 +288,7 @@ def _bring(place: Place, name: str, checksum: Checksum, to: Path) -> None:
                 os.link(held, to)
             except OSError:
                 shutil.copyfile(held, to)
-        if not list(broken_checksums(to.parent, {to.name: checksum})):
+        if not list(find_broken_checksums(to.parent, {to.name: checksum})):
             return
         held.unlink(missing_ok=True)
         to.unlink()

@@ -22,11 +22,11 @@ from typing import TypeAlias
 import pyarrow as pa
 
 from tcpipe.errors import StoreError
-from tcpipe.formats.bucket import side_by_side
-from tcpipe.formats.commits import Commit, Entries, Kind, Problem, Process, State, compact, fold
-from tcpipe.formats.json_files import compact_json, of_json, parse_json, to_json, typed
+from tcpipe.formats.bucket import map_concurrently
+from tcpipe.formats.commits import Commit, Entries, Kind, Problem, Process, State, compact_state, fold
+from tcpipe.formats.integrity import SEAL, seal_document, verify_document
+from tcpipe.formats.json_files import parse_json, parse_typed, parse_typed_json, to_compact_json, to_json
 from tcpipe.formats.place import Place
-from tcpipe.formats.seals import SEAL, proved, sealed
 from tcpipe.tables.findings import Subject, make_finding
 
 logger = logging.getLogger("tcpipe")
@@ -54,7 +54,7 @@ class Stamp:
 
 
 @contextmanager
-def uncollected() -> Iterator[None]:
+def pause_garbage_collection() -> Iterator[None]:
     """Let Python's search for cycles rest: rows have none, and it would go through ten thousand of them again and again."""
     was = gc.isenabled()
     gc.disable()
@@ -65,7 +65,7 @@ def uncollected() -> Iterator[None]:
             gc.enable()
 
 
-@uncollected()
+@pause_garbage_collection()
 def read_state(store: Place) -> State:
     """Return what the log of a store says: the newest readable snapshot, and the commits after it."""
     log, state = store.below(LOG), State()
@@ -82,9 +82,11 @@ def refresh(store: Place, state: State) -> State:
     """Return the state after the commits that were written since."""
     log = store.below(LOG)
     numbers = _list_commits(log, state.number)
-    for number, result in zip(numbers, side_by_side(log.where(), lambda n: _try(log, n), numbers), strict=True):
-        wrong = [_problem("commit-missing", log, absent) for absent in range(state.number + 1, number)]
-        wrong += [_problem("commit-damaged", log, number)] if isinstance(result, StoreError) else []
+    for number, result in zip(
+        numbers, map_concurrently(log.where(), lambda n: _try_read_commit(log, n), numbers), strict=True
+    ):
+        wrong = [_make_problem("commit-missing", log, absent) for absent in range(state.number + 1, number)]
+        wrong += [_make_problem("commit-damaged", log, number)] if isinstance(result, StoreError) else []
         if wrong:
             state = replace(state, digest="", problems=(*state.problems, *wrong))
         state = replace(state, number=number) if isinstance(result, StoreError) else _follow(state, result, log)
@@ -104,7 +106,7 @@ def _list_commits(log: Place, after: int) -> list[int]:
     return sorted(int(of[1]) for of in found if of)
 
 
-def _try(log: Place, number: int) -> ReadCommit | StoreError:
+def _try_read_commit(log: Place, number: int) -> ReadCommit | StoreError:
     try:
         return read_commit(log, number)
     except StoreError as error:
@@ -115,11 +117,11 @@ def _follow(state: State, result: ReadCommit, log: Place) -> State:
     """Return the state after a commit; one that was written after another commit than the last is a problem."""
     commit, digest, size_bytes = result
     follows = commit.parent == state.digest or not state.digest
-    problems = state.problems if follows else (*state.problems, _problem("commit-damaged", log, commit.number))
+    problems = state.problems if follows else (*state.problems, _make_problem("commit-damaged", log, commit.number))
     return replace(fold([commit], state), digest=digest, tail_bytes=state.tail_bytes + size_bytes, problems=problems)
 
 
-def _problem(code: str, log: Place, number: int) -> Problem:
+def _make_problem(code: str, log: Place, number: int) -> Problem:
     name = commit_name(number)
     return Problem(make_finding(code, Subject("file", f"log/{name}")), f"commit {number}", (log.where(name),))
 
@@ -129,7 +131,7 @@ def commit_name(number: int) -> str:
     return f"{number:010}.json"
 
 
-def snapshot_name(number: int) -> str:
+def make_snapshot_name(number: int) -> str:
     """Return the name of the file of a snapshot."""
     return f"{_SNAPSHOT}{number:010}.json.zst"
 
@@ -140,8 +142,8 @@ def read_commit(log: Place, number: int) -> ReadCommit:
     data, where = log.read(name), log.where(name)
     if data is None:
         raise StoreError(f"{where}: is gone")
-    document = proved(data, where)
-    commit = typed(document, Commit, where)
+    document = verify_document(data, where)
+    commit = parse_typed(document, Commit, where)
     if commit.number != number:
         raise StoreError(f"{where}: is commit {commit.number}")
     return commit, str(document[SEAL]), len(data)
@@ -163,12 +165,12 @@ def put_commit(store: Place, state: State, stamp: Stamp, kind: Kind, make: Calla
         entries, number = make(state), state.number + 1
         if entries.is_empty:
             return state
-        document = sealed(Commit(number, state.digest, kind, stamp.who, stamp.at, entries))
+        document = seal_document(Commit(number, state.digest, kind, stamp.who, stamp.at, entries))
         data = to_json(document).encode()
         if (
             log.put_new(commit_name(number), data) or log.read(commit_name(number)) == data
         ):  # the answer to one's own may be lost
-            state = _follow(state, (typed(document, Commit, log.where()), str(document[SEAL]), len(data)), log)
+            state = _follow(state, (parse_typed(document, Commit, log.where()), str(document[SEAL]), len(data)), log)
             return _keep_snapshot(log, state, stamp) if _is_due(state) else state
         state = refresh(store, state)
 
@@ -182,7 +184,7 @@ def _keep_snapshot(log: Place, state: State, stamp: Stamp) -> State:
     if any(problem.key not in state.acknowledged for problem in state.problems):
         return state
     with suppress(StoreError):
-        log.put_new(snapshot_name(state.number), _encode_snapshot(state, stamp))
+        log.put_new(make_snapshot_name(state.number), _encode_snapshot(state, stamp))
         for name in _list_snapshots(log)[:-_KEPT]:
             log.delete(name)
     return replace(state, snapshot=state.number, tail_bytes=0)
@@ -193,8 +195,8 @@ def _list_snapshots(log: Place) -> list[str]:
 
 
 def _encode_snapshot(state: State, stamp: Stamp) -> bytes:
-    commit = Commit(state.number, state.digest, "snapshot", stamp.who, stamp.at, compact(state))
-    text = compact_json(commit)
+    commit = Commit(state.number, state.digest, "snapshot", stamp.who, stamp.at, compact_state(state))
+    text = to_compact_json(commit)
     sink = pa.BufferOutputStream()
     with pa.CompressedOutputStream(sink, "zstd") as stream:
         stream.write(hashlib.sha256(text).hexdigest().encode() + b"\n")
@@ -218,9 +220,9 @@ def read_snapshot(log: Place, name: str) -> Commit:
     if hashlib.sha256(text).hexdigest().encode() != seal:
         raise StoreError(f"{where}: is not as it was written")
     try:
-        return of_json(text, Commit, where)
+        return parse_typed_json(text, Commit, where)
     except StoreError:
-        return typed(parse_json(bytes(text), where), Commit, where)
+        return parse_typed(parse_json(bytes(text), where), Commit, where)
 
 
 _HERE: dict[Place, State] = {}

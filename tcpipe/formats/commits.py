@@ -26,7 +26,7 @@ _UNFINISHED = ".active"
 
 
 @dataclass(frozen=True, slots=True)
-class Sighting:
+class LogSnapshot:
     """A log when it was seen: its files, the size [byte] and modification time [ns] of each, and the hash of its content."""
 
     log: tuple[str, ...]
@@ -134,7 +134,7 @@ class Begun:
 
 
 @dataclass(frozen=True, slots=True)
-class Call:
+class CallRecord:
     """What a call of ingest or build-dataset did and took; times are of the clock of where it ran."""
 
     command: str
@@ -167,7 +167,7 @@ class Call:
 class Entries:
     """What a commit adds."""
 
-    seen: tuple[Sighting, ...] = field(default=(), metadata=LEFT_OUT)
+    seen: tuple[LogSnapshot, ...] = field(default=(), metadata=LEFT_OUT)
     runs: tuple[RunFacts, ...] = field(default=(), metadata=LEFT_OUT)
     """Ingestions, each in the place of an earlier one of the same run and recipe."""
     failed: tuple[Failure, ...] = field(default=(), metadata=LEFT_OUT)
@@ -182,7 +182,7 @@ class Entries:
     begun: tuple[Begun, ...] = field(default=(), metadata=LEFT_OUT)
     ended: tuple[int, ...] = field(default=(), metadata=LEFT_OUT)
     """Numbers of the commits of calls that ended, or whose work another call has done."""
-    calls: tuple[Call, ...] = field(default=(), metadata=LEFT_OUT)
+    calls: tuple[CallRecord, ...] = field(default=(), metadata=LEFT_OUT)
 
     @property
     def is_empty(self) -> bool:
@@ -218,7 +218,7 @@ class State:
     """Size of the commits after it."""
     runs: Mapping[tuple[str, str], RunFacts] = field(default_factory=dict)
     """By run and recipe."""
-    seen: Mapping[str, tuple[Sighting, ...]] = field(default_factory=dict)
+    seen: Mapping[str, tuple[LogSnapshot, ...]] = field(default_factory=dict)
     """By `find_lineage` the log."""
     failed: Mapping[str, Failure] = field(default_factory=dict)
     """By key."""
@@ -232,7 +232,7 @@ class State:
     """Those that are kept, the newest last."""
     begun: Mapping[int, Begun] = field(default_factory=dict)
     """Calls that have not ended, by the number of their commit."""
-    calls: tuple[Call, ...] = ()
+    calls: tuple[CallRecord, ...] = ()
     """The latest, the last one first."""
     problems: tuple[Problem, ...] = ()
     """Commits that are missing or damaged."""
@@ -256,7 +256,7 @@ class State:
         """Return the run of a content; None where there is none."""
         return next((row.run_id for row in self.runs.values() if row.log and row.log.source.sha256 == sha256), None)
 
-    def has_seen(self, sighting: Sighting) -> bool:
+    def has_seen(self, sighting: LogSnapshot) -> bool:
         """Return whether a log was seen as it is now."""
         return sighting in self.seen.get(find_lineage(sighting.log), ())
 
@@ -343,7 +343,7 @@ def _number(call: Begun, commit: Commit) -> tuple[int, Begun]:
     return known.number, known
 
 
-def compact(state: State) -> Entries:
+def compact_state(state: State) -> Entries:
     """Return the entries of one commit that adds up to a state."""
     return Entries(
         seen=tuple(sighting for of in state.seen.values() for sighting in of),

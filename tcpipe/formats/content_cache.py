@@ -25,9 +25,9 @@ _IN_USE_S = 60.0
 """What was used so lately stays: another process may be about to open it."""
 
 
-def cached(key: str, fetch: Callable[[Path], object]) -> Path:
+def fetch_cached(key: str, fetch: Callable[[Path], object]) -> Path:
     """Return the file of a key; where there is none, ``fetch`` writes it. `StoreError`: the cache cannot be written."""
-    path = _path_of(key)
+    path = _find_cache_path(key)
     if _is_there(path):
         return path
     temporary = path.with_name(f"{path.name}-{os.getpid()}-{threading.get_ident()}")
@@ -44,7 +44,7 @@ def cached(key: str, fetch: Callable[[Path], object]) -> Path:
         with suppress(OSError):
             temporary.unlink()
     _unseen_bytes[0] += put.st_size
-    if _unseen_bytes[0] * _SHARE_UNSEEN > (most := _most_bytes()):
+    if _unseen_bytes[0] * _SHARE_UNSEEN > (most := _read_cache_limit()):
         _make_room(path.parent.parent, most, now=put.st_mtime)
         _unseen_bytes[0] = 0
     return path
@@ -52,7 +52,7 @@ def cached(key: str, fetch: Callable[[Path], object]) -> Path:
 
 def is_cached(key: str) -> bool:
     """Tell whether there is a file of a key, which then stays for a while."""
-    return _is_there(_path_of(key))
+    return _is_there(_find_cache_path(key))
 
 
 def _is_there(path: Path) -> bool:
@@ -62,12 +62,12 @@ def _is_there(path: Path) -> bool:
     return False
 
 
-def _path_of(key: str) -> Path:
+def _find_cache_path(key: str) -> Path:
     digest = hashlib.sha256(key.encode()).hexdigest()
-    return _directory() / digest[:2] / digest
+    return _find_cache_directory() / digest[:2] / digest
 
 
-def _directory() -> Path:
+def _find_cache_directory() -> Path:
     if given := os.environ.get("TCPIPE_CACHE"):
         return Path(given)
     base = Path(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache"))  # noqa: PTH111  also without a home
@@ -76,7 +76,7 @@ def _directory() -> Path:
     return Path(tempfile.gettempdir()) / f"tcpipe-cache-{os.getuid()}"
 
 
-def _most_bytes() -> int:
+def _read_cache_limit() -> int:
     given = os.environ.get("TCPIPE_CACHE_BYTES", str(_MOST_BYTES))
     if not given.isdecimal():
         raise UsageError(f"TCPIPE_CACHE_BYTES is {given!r}, wanted a number of bytes")

@@ -12,7 +12,7 @@ from tcpipe.formats.json_files import to_json
 from tcpipe.formats.run_documents import Manifest, RunJson
 from tcpipe.recipe import Recipe
 from tcpipe.recipe.checking import describe
-from tcpipe.tables.bits import name_of
+from tcpipe.tables.bits import flag_name
 from tcpipe.tables.columns import Column, TableSchema
 from tcpipe.tables.levels import DATA_MODEL_VERSION, GATED_TRACK, LABELLED_SEGMENTS, REJECTIONS, SAMPLES, STREAMS
 
@@ -24,7 +24,7 @@ DOCUMENTS = {"run": RunJson, "manifest": Manifest, "dataset": DatasetCard}
 """The JSON documents that others read, by the name of their schema."""
 
 
-def contracts(answers: Mapping[str, type]) -> dict[str, str]:
+def make_contracts(answers: Mapping[str, type]) -> dict[str, str]:
     """Return file name → JSON Schema text, for every table (one row as an object), the recipe, and every document and answer.
 
     Parameters
@@ -32,7 +32,7 @@ def contracts(answers: Mapping[str, type]) -> dict[str, str]:
     answers : the dataclasses of what commands print and of the documents of the upper floors, by the name of their schema.
     """
     tables = (*STREAMS.values(), GATED_TRACK, REJECTIONS, LABELLED_SEGMENTS, SAMPLES)
-    schemas = {table.name: _table_schema(table) for table in tables} | {"recipe": _recipe_schema()}
+    schemas = {table.name: _make_table_schema(table) for table in tables} | {"recipe": _make_recipe_schema()}
     documents = {**DOCUMENTS, **answers}
     pointers, definitions = describe(*documents.values(), file=f"{DEFINITIONS}.schema.json")
     inner = to_json(definitions)
@@ -43,14 +43,14 @@ def contracts(answers: Mapping[str, type]) -> dict[str, str]:
     return {f"{name}.schema.json": to_json({"$schema": DIALECT, **schema}) for name, schema in schemas.items()}
 
 
-def _recipe_schema() -> dict[str, Any]:
+def _make_recipe_schema() -> dict[str, Any]:
     """Return the schema of a recipe in one piece, as an editor loads it: a key that is not in it is refused."""
     ((pointer,), definitions) = describe(Recipe)
     closed = {name: {**definition, "additionalProperties": False} for name, definition in definitions.items()}
     return {**pointer, "$defs": closed}
 
 
-def _table_schema(table: TableSchema) -> dict[str, Any]:
+def _make_table_schema(table: TableSchema) -> dict[str, Any]:
     return {
         "title": table.name,
         "description": f"{table.doc} One row.",
@@ -59,11 +59,11 @@ def _table_schema(table: TableSchema) -> dict[str, Any]:
         "type": "object",
         "additionalProperties": False,
         "required": table.names(),
-        "properties": {column.name: _column_schema(column) for column in table.columns},
+        "properties": {column.name: _make_column_schema(column) for column in table.columns},
     }
 
 
-def _column_schema(column: Column) -> dict[str, Any]:
+def _make_column_schema(column: Column) -> dict[str, Any]:
     text = pa.types.is_string(column.dtype) or pa.types.is_binary(column.dtype)
     kind = "string" if text else "integer" if pa.types.is_integer(column.dtype) else "number"
     schema: dict[str, Any] = {
@@ -75,5 +75,5 @@ def _column_schema(column: Column) -> dict[str, Any]:
     if column.frame:
         schema["x-frame"] = column.frame
     if column.flags is not None:
-        schema["x-flags"] = {str(int(bit)): name_of(bit) for bit in column.flags}
+        schema["x-flags"] = {str(int(bit)): flag_name(bit) for bit in column.flags}
     return schema

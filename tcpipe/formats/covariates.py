@@ -13,9 +13,9 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from tcpipe.errors import DatasetError
-from tcpipe.formats.seals import Checksum, file_checksum
-from tcpipe.logs.mapped import stamps_ns
-from tcpipe.recipe.suggestions import recipe_key
+from tcpipe.formats.integrity import Checksum, compute_checksum
+from tcpipe.logs.field_mapping import parse_stamps_ns
+from tcpipe.recipe.suggestions import format_recipe_key
 from tcpipe.tables.findings import Finding, Subject, make_finding
 
 TimeUnit = Literal["auto", "s", "ms", "us", "ns"]
@@ -48,7 +48,7 @@ class CovariateTable:
     @property
     def span(self) -> tuple[str, str]:
         """First and last stamp, ISO 8601."""
-        return _in_utc(self.rows[_STAMP][0]), _in_utc(self.rows[_STAMP][-1])
+        return _format_utc(self.rows[_STAMP][0]), _format_utc(self.rows[_STAMP][-1])
 
     def join(self, stamp_ns: NDArray[np.int64], *, max_age_s: float) -> tuple[pa.Table, NDArray[np.bool_]]:
         """Return the last row at or before each stamp that is not older than the limit; and which stamps a row reaches.
@@ -108,9 +108,9 @@ def read_covariates(path: Path, *, time_column: str | None = None, time_unit: Ti
             f"{path}: not a readable table ({str(error).splitlines()[0]}); wanted CSV or Parquet"
         ) from None
     column = _time_column(path, table, time_column)
-    stamps = _stamps_ns(path, table[column], time_unit)
+    stamps = _parse_stamps(path, table[column], time_unit)
     known = stamps.is_not_null()
-    values, findings = _values(path, table.drop(column))
+    values, findings = _parse_values(path, table.drop(column))
     rows = (
         pl.DataFrame([stamps.alias(_STAMP), *values])
         .filter(known)
@@ -124,19 +124,19 @@ def read_covariates(path: Path, *, time_column: str | None = None, time_unit: Ti
         raise DatasetError(
             f"{path}: {rows.height} rows of {rows.width - 1} columns beside {column}; wanted one of each at least"
         )
-    if twice := _first_repeated(rows[_STAMP]):
+    if twice := _find_first_repeated(rows[_STAMP]):
         raise DatasetError(
-            f"{path}: rows of {_in_utc(twice)} differ from one another; wanted one row a stamp: one station, one depth a file"
+            f"{path}: rows of {_format_utc(twice)} differ from one another; wanted one row a stamp: one station, one depth a file"
         )
-    return CovariateTable(path.name, file_checksum(path), column, rows, tuple(findings))
+    return CovariateTable(path.name, compute_checksum(path), column, rows, tuple(findings))
 
 
-def _in_utc(stamp_ns: int) -> str:
+def _format_utc(stamp_ns: int) -> str:
     """Return a stamp as ISO 8601 to the second."""
     return datetime.fromtimestamp(stamp_ns // 10**9, UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
 
 
-_COLUMN = recipe_key("covariates.time_column")
+_COLUMN = format_recipe_key("covariates.time_column")
 
 
 def _time_column(path: Path, table: pl.DataFrame, wanted: str | None) -> str:
@@ -157,18 +157,18 @@ def _time_column(path: Path, table: pl.DataFrame, wanted: str | None) -> str:
     return found[0]
 
 
-def _stamps_ns(path: Path, column: pl.Series, unit: TimeUnit) -> pl.Series:
+def _parse_stamps(path: Path, column: pl.Series, unit: TimeUnit) -> pl.Series:
     """Return stamps [ns since 1970, UTC], null where there is none."""
     if column.dtype.is_temporal() and column.dtype not in {pl.Time, pl.Duration}:
         return column.cast(pl.Datetime("ns", getattr(column.dtype, "time_zone", None))).cast(pl.Int64)
     if column.dtype.is_numeric():
-        return _counted_ns(path, column, unit)
+        return _convert_numeric_stamps(path, column, unit)
     if column.dtype != pl.String:
         raise DatasetError(f"{path}: {column.name} is {column.dtype}; wanted stamps: numbers, or text in ISO 8601")
-    return pl.Series([_iso_ns(path, column.name, text) for text in column], dtype=pl.Int64)
+    return pl.Series([_parse_iso_stamp(path, column.name, text) for text in column], dtype=pl.Int64)
 
 
-def _iso_ns(path: Path, name: str, text: str | None) -> int | None:
+def _parse_iso_stamp(path: Path, name: str, text: str | None) -> int | None:
     if text is None:
         return None
     try:
@@ -179,19 +179,19 @@ def _iso_ns(path: Path, name: str, text: str | None) -> int | None:
     return (since.days * 86_400 + since.seconds) * 10**9 + since.microseconds * 1000
 
 
-def _counted_ns(path: Path, column: pl.Series, unit: TimeUnit) -> pl.Series:
+def _convert_numeric_stamps(path: Path, column: pl.Series, unit: TimeUnit) -> pl.Series:
     """Return stamps that are numbers [ns], in the unit that is asked for, the one at the end of the name, or the one of their size."""
     ending = column.name.lower().rsplit("_", 1)[-1]
     numbers = column if column.dtype.is_integer() else column.set(~column.is_finite(), None)
-    stamps = stamps_ns(numbers.drop_nulls().to_numpy(), ending if unit == "auto" and ending in _UNITS else unit)
+    stamps = parse_stamps_ns(numbers.drop_nulls().to_numpy(), ending if unit == "auto" and ending in _UNITS else unit)
     if isinstance(stamps, str):
-        raise DatasetError(f"{path}: {column.name}: {stamps} ({recipe_key('covariates.time_unit')})")
+        raise DatasetError(f"{path}: {column.name}: {stamps} ({format_recipe_key('covariates.time_unit')})")
     made = np.zeros(len(numbers), np.int64)
     made[numbers.is_not_null().to_numpy()] = stamps
     return pl.Series(made).set(numbers.is_null(), None)
 
 
-def _values(path: Path, table: pl.DataFrame) -> tuple[list[pl.Series], list[Finding]]:
+def _parse_values(path: Path, table: pl.DataFrame) -> tuple[list[pl.Series], list[Finding]]:
     """Return numbers as float64 without NaN, all else as text; and findings on columns of numbers that a few words make text."""
     made, findings = list[pl.Series](), list[Finding]()
     for column in table:
@@ -214,6 +214,6 @@ def _values(path: Path, table: pl.DataFrame) -> tuple[list[pl.Series], list[Find
     return made, findings
 
 
-def _first_repeated(stamps: pl.Series) -> int | None:
+def _find_first_repeated(stamps: pl.Series) -> int | None:
     twice = stamps.filter(stamps.is_duplicated())
     return int(twice[0]) if len(twice) else None

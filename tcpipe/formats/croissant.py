@@ -6,8 +6,8 @@ from collections.abc import Mapping
 
 import pyarrow as pa
 
+from tcpipe.formats.integrity import Checksum
 from tcpipe.formats.json_files import Json, to_json
-from tcpipe.formats.seals import Checksum
 
 _TERMS = (
     *("annotation", "arrayShape", "citeAs", "column", "containedIn", "equivalentProperty", "excludes", "extract"),
@@ -40,7 +40,7 @@ _ENCODING_BY_SUFFIX = {
 }
 
 
-def croissant(
+def format_croissant(
     *,
     name: str,
     description: str,
@@ -70,7 +70,9 @@ def croissant(
     JSON-LD.
     """
     samples_source = {"fileObject": {"@id": samples_file}}
-    records = [_records("samples", "One record a sample, in the order of the patches.", samples, samples_source)]
+    records = [
+        _describe_records("samples", "One record a sample, in the order of the patches.", samples, samples_source)
+    ]
     sets = []
     if shards is not None and layers is not None:
         sets.append(
@@ -90,7 +92,7 @@ def croissant(
             ]
         )
         about = "One record a sample with its patch, split by split: rows of the patch one after another."
-        records.append(_records("patches", about, columns, {"fileSet": {"@id": "shards"}}))
+        records.append(_describe_records("patches", about, columns, {"fileSet": {"@id": "shards"}}))
     document = {
         "@context": _CONTEXT,
         "@type": "sc:Dataset",
@@ -100,13 +102,13 @@ def croissant(
         "license": licence,
         "creator": {"@type": "sc:Person", "name": creator} if creator else None,
         "version": version,
-        "distribution": [*(_file_object(path, files[path]) for path in sorted(files)), *sets],
+        "distribution": [*(_describe_file_object(path, files[path]) for path in sorted(files)), *sets],
         "recordSet": records,
     }
     return to_json({key: value for key, value in document.items() if value})
 
 
-def _file_object(path: str, file: Checksum) -> Json:
+def _describe_file_object(path: str, file: Checksum) -> Json:
     suffix = path[path.rfind(".") :] if "." in path.rsplit("/", 1)[-1] else ""
     return {
         "@type": "cr:FileObject",
@@ -119,7 +121,7 @@ def _file_object(path: str, file: Checksum) -> Json:
     }
 
 
-def _records(name: str, about: str, columns: pa.Schema, source: Mapping[str, Json]) -> Json:
+def _describe_records(name: str, about: str, columns: pa.Schema, source: Mapping[str, Json]) -> Json:
     return {
         "@type": "cr:RecordSet",
         "@id": name,
@@ -127,7 +129,7 @@ def _records(name: str, about: str, columns: pa.Schema, source: Mapping[str, Jso
         "description": about,
         "key": {"@id": f"{name}/sample_id"},
         # Croissant has no type for binary columns.
-        "field": [_field(name, field, source) for field in columns if not pa.types.is_binary(field.type)],
+        "field": [_describe_field(name, field, source) for field in columns if not pa.types.is_binary(field.type)],
     }
 
 
@@ -139,7 +141,7 @@ def _patch_field(layer: str, values: int, kind: str) -> pa.Field:
     )
 
 
-def _field(records: str, field: pa.Field, source: Mapping[str, Json]) -> Json:
+def _describe_field(records: str, field: pa.Field, source: Mapping[str, Json]) -> Json:
     metadata = {key.decode(): value.decode() for key, value in (field.metadata or {}).items()}
     unit = f" [{metadata['unit']}]" if metadata.get("unit") else ""
     many = pa.types.is_fixed_size_list(field.type)
@@ -148,13 +150,13 @@ def _field(records: str, field: pa.Field, source: Mapping[str, Json]) -> Json:
         "@id": f"{records}/{field.name}",
         "name": field.name,
         "description": metadata.get("doc", "") + unit,
-        "dataType": _data_type(field.type.value_type if many else field.type),
+        "dataType": _find_data_type(field.type.value_type if many else field.type),
         **({"isArray": True, "arrayShape": str(field.type.list_size)} if many else {}),
         "source": {**source, "extract": {"column": field.name}},
     }
 
 
-def _data_type(dtype: pa.DataType) -> str:
+def _find_data_type(dtype: pa.DataType) -> str:
     if pa.types.is_integer(dtype):
         return "sc:Integer"
     return "sc:Float" if pa.types.is_floating(dtype) else "sc:Text"

@@ -7,13 +7,13 @@ from dataclasses import dataclass, field
 from typing import NotRequired, TypedDict
 
 from tcpipe.balance.correlation import Correlation
-from tcpipe.balance.repeats import Floor
+from tcpipe.balance.repeatability import Floor
 from tcpipe.formats.finding_lines import FindingGroup, group_findings
 from tcpipe.formats.geojson import PolygonGeometry
+from tcpipe.formats.integrity import Checksum
 from tcpipe.formats.layer_descriptions import Description
 from tcpipe.formats.maps.map_facts import MapInputs
-from tcpipe.formats.seals import Checksum
-from tcpipe.motion.removal import Group
+from tcpipe.motion.selection_bias import Group
 from tcpipe.recipe import Recipe
 from tcpipe.splits.audit import HeldOut
 from tcpipe.tables.facts import ABSENT, EnergyBudget, PhysicsFit

@@ -24,18 +24,18 @@ from numpy.typing import NDArray
 from tcpipe.errors import DatasetError, RecipeError, StoreError, UsageError
 from tcpipe.formats.bucket_directories import FetchedShards
 from tcpipe.formats.dataset_card import KIND, DatasetCard, Shard
-from tcpipe.formats.json_files import typed
-from tcpipe.formats.layer_descriptions import cf_attributes, layers_described
-from tcpipe.formats.parquet import column_names, parquet_bytes, read_row_group, read_table, row_count
+from tcpipe.formats.integrity import prove_files, read_sealed
+from tcpipe.formats.json_files import parse_typed
+from tcpipe.formats.layer_descriptions import make_cf_attributes, read_layers
+from tcpipe.formats.parquet import read_column_names, read_row_count, read_row_group, read_table, write_parquet_bytes
 from tcpipe.formats.place import DirectoryPlace, Place
-from tcpipe.formats.proved_content import wrong_files
-from tcpipe.formats.seals import prove_files, read_sealed
-from tcpipe.formats.shards import DESCRIPTION, ShardedArray, decoded_chunk, open_sharded
-from tcpipe.formats.zarr_arrays import Compression, add_array, consolidate, create_group
+from tcpipe.formats.proved_content import find_wrong_files
+from tcpipe.formats.shards import DESCRIPTION, ShardedArray, decode_chunk, open_sharded
+from tcpipe.formats.zarr_arrays import Compression, add_array, consolidate_metadata, create_group
 from tcpipe.splits.assignment import SPLITS
 from tcpipe.tables.levels import DATA_MODEL_VERSION, EARLIER_VERSIONS, READ_VERSIONS
 from tcpipe.tables.levels import SAMPLES as SAMPLES_SCHEMA
-from tcpipe.terrain.layers import Layer, in_order, missing
+from tcpipe.terrain.layers import Layer, find_no_data_value, sort_layers
 
 FileFormat = Literal["zarr", "parquet"]
 LayerPixels = NDArray[np.uint8 | np.uint16 | np.float32]
@@ -88,7 +88,7 @@ class Pixels:
 
 
 @dataclass(frozen=True, slots=True)
-class ZarrDrawer:
+class ZarrShardWriter:
     """A shard of every layer, to be written by whoever sees where the patches wait, and ``out``."""
 
     out: Place
@@ -108,8 +108,8 @@ class ZarrDrawer:
 
 
 @dataclass(frozen=True, slots=True)
-class ParquetDrawer:
-    """A Parquet shard, as `ZarrDrawer`; ``rows`` gives its rows of the samples table."""
+class ParquetShardWriter:
+    """A Parquet shard, as `ZarrShardWriter`; ``rows`` gives its rows of the samples table."""
 
     out: Place
     pixels: Pixels
@@ -122,13 +122,13 @@ class ParquetDrawer:
             table = self.rows()
             for layer in self.pixels.layers.values():
                 table = table.append_column(*_list_column(layer, self.pixels.read(layer.name, self.pixels.slots)))
-            self.out.put(self.shard.path, parquet_bytes(table, rows_per_group=GROUP_ROWS))
+            self.out.put(self.shard.path, write_parquet_bytes(table, rows_per_group=GROUP_ROWS))
 
 
-Drawer = ZarrDrawer | ParquetDrawer
+Drawer = ZarrShardWriter | ParquetShardWriter
 
 
-def zarr_drawers(
+def make_zarr_writers(
     directory: Path,
     out: Place,
     pixels: Pixels,
@@ -147,7 +147,7 @@ def zarr_drawers(
     threads : chunks of a shard encoded side by side; the bytes do not depend on it.
     """
     n, px = len(pixels.slots), pixels.patch_px
-    shard = _shard_rows(n)
+    shard = _choose_shard_rows(n)
     attributes = {"Conventions": "CF-1.11", "title": "patches of a tcpipe dataset, in the order of samples.parquet"}
     group = create_group(directory / PATCHES, attributes)
     for layer in pixels.layers.values():
@@ -159,8 +159,8 @@ def zarr_drawers(
             chunks=(CHUNK_ROWS, px, px),
             shards=(shard, px, px),
             dimensions=("sample", "row", "column"),
-            fill_value=missing(layer.stored),
-            attributes={**cf_attributes(layer), "coordinates": "sample_id"},
+            fill_value=find_no_data_value(layer.stored),
+            attributes={**make_cf_attributes(layer), "coordinates": "sample_id"},
             compression=compression,
             level=_LEVELS[compression],
         )
@@ -177,18 +177,18 @@ def zarr_drawers(
     for first in range(0, n, SHARD_ROWS):
         last = min(first + SHARD_ROWS, n)
         ids[first:last] = np.array(sample_ids(first, last), dtype=object)
-    consolidate(group)
-    arrays = {name: _layer_array(directory, layer, n, px) for name, layer in pixels.layers.items()}
+    consolidate_metadata(group)
+    arrays = {name: _open_layer_array(directory, layer, n, px) for name, layer in pixels.layers.items()}
     rows = (slice(first, first + shard) for first in range(0, n, shard))
-    return [ZarrDrawer(out, pixels.of(part), arrays, number, threads) for number, part in enumerate(rows)]
+    return [ZarrShardWriter(out, pixels.of(part), arrays, number, threads) for number, part in enumerate(rows)]
 
 
-def _shard_rows(samples: int) -> int:
+def _choose_shard_rows(samples: int) -> int:
     """Return how many patches a shard holds in a Zarr dataset of so many."""
     return min(SHARD_ROWS, max(-(-samples // CHUNK_ROWS), 1) * CHUNK_ROWS)
 
 
-def _layer_array(
+def _open_layer_array(
     directory: Path, layer: Layer, samples: int, px: int, fetched: FetchedShards | None = None
 ) -> ShardedArray:
     """Return the array of a layer; `StoreError` if its description is not of so many patches of so many pixels."""
@@ -196,14 +196,14 @@ def _layer_array(
         directory / PATCHES / layer.name,
         shape=(samples, px, px),
         chunk_shape=(CHUNK_ROWS, px, px),
-        shard_shape=(_shard_rows(samples), px, px),
+        shard_shape=(_choose_shard_rows(samples), px, px),
         dtype=np.dtype(layer.stored),
-        fill=missing(layer.stored),
+        fill=find_no_data_value(layer.stored),
         fetched=fetched,
     )
 
 
-def parquet_drawers(
+def make_parquet_writers(
     out: Place, pixels: Pixels, samples: Callable[[NDArray[np.int64]], Callable[[], pa.Table]], split: NDArray[np.str_]
 ) -> list[Drawer]:
     """Return ``data/<split>-*.parquet``, to be written to ``out``: the columns of the samples and each layer as a plain fixed-size list.
@@ -221,7 +221,7 @@ def parquet_drawers(
         for number in range(count):
             part = here[number * SHARD_ROWS : (number + 1) * SHARD_ROWS]
             shard = Shard(f"{SHARDS}/{name}-{number:05d}-of-{count:05d}.parquet", name, len(part))
-            drawers.append(ParquetDrawer(out, pixels.of(part), samples(part), shard))
+            drawers.append(ParquetShardWriter(out, pixels.of(part), samples(part), shard))
     return drawers
 
 
@@ -229,7 +229,7 @@ def _list_column(layer: Layer, patches: LayerPixels) -> tuple[pa.Field, pa.Array
     """Return a layer as a column: rows of the patch one after another."""
     px = patches.shape[1]
     values = pa.array(np.ascontiguousarray(patches, layer.stored).reshape(-1))
-    metadata = {"shape": f"[{px}, {px}]", **{key: str(value) for key, value in cf_attributes(layer).items()}}
+    metadata = {"shape": f"[{px}, {px}]", **{key: str(value) for key, value in make_cf_attributes(layer).items()}}
     dtype = pa.list_(values.type, px * px)  # plain: a tensor extension type makes other readers fail
     column = pa.FixedSizeListArray.from_arrays(values, px * px)
     return pa.field(layer.name, dtype, nullable=False, metadata=metadata), column
@@ -257,13 +257,15 @@ def read_card(directory: Path, *, proved: bool = True) -> DatasetCard:
     if not _is_current(found) or "verdict" not in found:  # before data model 3.0 its findings were sentences
         found.pop("findings", None)
     try:
-        return typed(found, DatasetCard, directory / CARD)
+        return parse_typed(found, DatasetCard, directory / CARD)
     except (StoreError, RecipeError) as error:
-        problems = error.problems if _is_current(found) else (_outdated(directory, found.get("data_model_version")),)
+        problems = (
+            error.problems if _is_current(found) else (_describe_outdated(directory, found.get("data_model_version")),)
+        )
         raise DatasetError(*problems) from None
 
 
-def _outdated(directory: Path, version: object) -> str:
+def _describe_outdated(directory: Path, version: object) -> str:
     remedy = "run 'tcpipe migrate' on it or build it again" if version in EARLIER_VERSIONS else "build it again"
     return f"{directory}: written by data model {version}, wanted {DATA_MODEL_VERSION}; {remedy}"
 
@@ -283,7 +285,7 @@ def read_current_card(directory: Path) -> DatasetCard:
     """
     card = read_card(directory)
     if card.data_model_version not in READ_VERSIONS:
-        raise DatasetError(_outdated(directory, card.data_model_version))
+        raise DatasetError(_describe_outdated(directory, card.data_model_version))
     described = [name for name in card.checksums if Path(name).name == DESCRIPTION]
     try:
         prove_files(directory, card.checksums, [SAMPLES, *described])
@@ -300,7 +302,7 @@ def read_samples(directory: Path, columns: Sequence[str] | None = None) -> pa.Ta
     later = {column.name for column in SAMPLES_SCHEMA.columns if column.since}
     asked = SAMPLES_SCHEMA.names() if columns is None else list(columns)
     try:
-        absent = later.intersection(asked).difference(column_names(directory / SAMPLES))
+        absent = later.intersection(asked).difference(read_column_names(directory / SAMPLES))
         there = None if columns is None else [name for name in columns if name not in absent]
         return SAMPLES_SCHEMA.only(*asked).completed(read_table(directory / SAMPLES, there))
     except StoreError as error:
@@ -310,7 +312,7 @@ def read_samples(directory: Path, columns: Sequence[str] | None = None) -> pa.Ta
 def sample_count(directory: Path) -> int:
     """Return the rows of a dataset's samples table, from its footer; `DatasetError` if that cannot be read."""
     try:
-        return row_count(directory / SAMPLES)
+        return read_row_count(directory / SAMPLES)
     except StoreError as error:
         raise DatasetError(*error.problems) from None
 
@@ -318,7 +320,7 @@ def sample_count(directory: Path) -> int:
 def sample_columns(directory: Path) -> list[str]:
     """Return the names of the columns of a dataset's samples table; `DatasetError` if it cannot be read."""
     try:
-        return column_names(directory / SAMPLES)
+        return read_column_names(directory / SAMPLES)
     except StoreError as error:
         raise DatasetError(*error.problems) from None
 
@@ -408,7 +410,7 @@ def open_patches(
     DatasetError : they are gone, or not what the card says, as where a folder was copied in part over another build.
     """
     px, samples = card.patch_px, card.samples
-    layers = in_order(layers_described(card.layers, card.classes, directory / CARD))
+    layers = sort_layers(read_layers(card.layers, card.classes, directory / CARD))
     known = card.format in get_args(FileFormat)
     if not (layers and known and 0 < px <= MOST_PX and 0 <= samples <= MOST_SAMPLES):
         raise DatasetError(
@@ -420,11 +422,11 @@ def open_patches(
     fetched = fetched and replace(fetched, proves=proved)
     if proved and fetched is None:
         shards = [name for name in card.checksums if is_shard(name)]
-        _refuse_others(wrong_files(DirectoryPlace(directory), card.checksums, shards), directory)
+        _refuse_others(find_wrong_files(DirectoryPlace(directory), card.checksums, shards), directory)
     if card.format == "parquet":
-        return replace(_in_shards(directory, layers, px, card), fetched=fetched)
+        return replace(_open_sharded_patches(directory, layers, px, card), fetched=fetched)
     try:
-        arrays = {name: _layer_array(directory, layer, samples, px, fetched) for name, layer in layers.items()}
+        arrays = {name: _open_layer_array(directory, layer, samples, px, fetched) for name, layer in layers.items()}
     except StoreError as error:
         raise DatasetError(*(f"{problem}; build the dataset again" for problem in error.problems)) from None
     starts = np.append(np.arange(0, samples, CHUNK_ROWS), samples)
@@ -440,7 +442,7 @@ def _refuse_others(wrong: Sequence[str], directory: Path) -> None:
         )
 
 
-def _in_shards(directory: Path, layers: Mapping[str, Layer], px: int, card: DatasetCard) -> PatchFiles:
+def _open_sharded_patches(directory: Path, layers: Mapping[str, Layer], px: int, card: DatasetCard) -> PatchFiles:
     rows = [shard.rows for shard in card.shards]
     if min(rows, default=0) < 0 or sum(rows) != card.samples:
         raise DatasetError(f"{directory / CARD}: its shards hold {sum(rows)} rows, wanted {card.samples}")
@@ -453,7 +455,7 @@ def _in_shards(directory: Path, layers: Mapping[str, Layer], px: int, card: Data
     return PatchFiles(directory, layers, px, starts, groups=tuple((path, group) for path, group, _ in groups))
 
 
-def holds_sample_ids(directory: Path, ids: Sequence[str]) -> bool:
+def has_sample_ids(directory: Path, ids: Sequence[str]) -> bool:
     """Tell whether the ids beside the patches of a Zarr dataset are these; `StoreError` if they cannot be read.
 
     They are compared as Zarr encodes them (vlen-utf8: a count, and each text after its length), so that no more is decoded than that.
@@ -465,7 +467,7 @@ def holds_sample_ids(directory: Path, ids: Sequence[str]) -> bool:
         wanted = SHARD_ROWS.to_bytes(4, "little") + b"".join(len(text).to_bytes(4, "little") + text for text in texts)
         path = place / "c" / str(number)
         try:
-            if decoded_chunk(place, path.read_bytes(), len(wanted)) != wanted:
+            if decode_chunk(place, path.read_bytes(), len(wanted)) != wanted:
                 return False
         except FileNotFoundError:
             raise StoreError(f"{path}: is gone") from None
@@ -474,15 +476,15 @@ def holds_sample_ids(directory: Path, ids: Sequence[str]) -> bool:
     return True
 
 
-def rows_in_files(card: DatasetCard, splits: NDArray[np.object_]) -> dict[str, NDArray[np.int64]]:
+def find_rows_in_files(card: DatasetCard, splits: NDArray[np.object_]) -> dict[str, NDArray[np.int64]]:
     """Return, for every split, where its samples lie in the order of the files; ``splits`` is the samples' column, (N,)."""
     rows = {name: np.flatnonzero(splits == name) for name in SPLITS}
     if card.format == "parquet":
-        return dict(_following(rows))
+        return dict(_iterate_splits(rows))
     return rows
 
 
-def _following(rows: Mapping[str, NDArray[np.int64]]) -> Iterator[tuple[str, NDArray[np.int64]]]:
+def _iterate_splits(rows: Mapping[str, NDArray[np.int64]]) -> Iterator[tuple[str, NDArray[np.int64]]]:
     first = 0
     for name, here in rows.items():
         yield name, np.arange(first, first + len(here))

@@ -9,7 +9,7 @@ from typing import Generic, TypeVar
 
 import numpy as np
 
-from tcpipe.motion.remedies import StoreLoss, loss_code
+from tcpipe.motion.remedies import StoreLoss, make_loss_code
 from tcpipe.recipe.suggestions import RecipeFragment
 from tcpipe.tables.catalogue import AFFECTED, Affected, Entry, Severity, rank_severity, read_catalogue
 from tcpipe.tables.findings import Finding, Remedy, sort_findings
@@ -70,7 +70,13 @@ def describe_remedy(finding: Finding, remedy: Remedy) -> str:
     entry = read_catalogue().get(finding.code)
     purpose = (entry.remedies.get(remedy.name) if entry else None) or remedy.name.replace("_", " ")
     what = [f"'{remedy.command}'"] if remedy.command else []
-    what += ["the recipe below"] if _is_block(remedy) else [_fragment(remedy).inline()] if remedy.recipe else []
+    what += (
+        ["the recipe below"]
+        if _is_block(remedy)
+        else [_build_recipe_fragment(remedy).inline()]
+        if remedy.recipe
+        else []
+    )
     return f"{purpose}: {' and '.join(what)}" if what else purpose
 
 
@@ -82,15 +88,15 @@ def format_finding(finding: Finding) -> str:
     return f"{describe_finding(finding)}{f'. {remedy}' if remedy else ''}".rstrip(".") + f" [{finding.code}]"
 
 
-def recipe_lines(finding: Finding) -> list[str]:
+def format_remedy_lines(finding: Finding) -> list[str]:
     """Return the lines of a recipe that the finding's remedies propose, as they stand in a file."""
-    return [line for of in finding.remedies if of.recipe for line in _fragment(of).toml().splitlines()]
+    return [line for of in finding.remedies if of.recipe for line in _build_recipe_fragment(of).toml().splitlines()]
 
 
-def block_lines(findings: Iterable[Finding]) -> list[str]:
+def format_remedy_blocks(findings: Iterable[Finding]) -> list[str]:
     """Return the recipes of remedies that fit in no line, each once, as they stand in a file."""
     remedies = (of for finding in findings for of in finding.remedies if _is_block(of))
-    blocks = dict.fromkeys(_fragment(of).toml() for of in remedies)
+    blocks = dict.fromkeys(_build_recipe_fragment(of).toml() for of in remedies)
     return [line for block in blocks for line in block.splitlines()]
 
 
@@ -98,7 +104,7 @@ def _is_block(remedy: Remedy) -> bool:
     return any(not isinstance(keys, Mapping) for keys in remedy.recipe.values())
 
 
-def _fragment(remedy: Remedy) -> RecipeFragment:
+def _build_recipe_fragment(remedy: Remedy) -> RecipeFragment:
     """Return the part of a recipe without checking it: another version may have written it."""
     return RecipeFragment(remedy.recipe, is_checked=True)
 
@@ -107,19 +113,22 @@ def format_findings(findings: Iterable[Finding], *, most: int = MOST_LINES, more
     """Return at most ``most`` findings as lines, the worst first, then how many others and notes are listed by the command ``more``."""
     ordered = sort_findings(findings)
     found = [of for of in ordered if of.severity != "note"]
-    return _lines(found[:most]) + _count_rest(len(found) - most, len(ordered) - len(found), more)
+    return _format_lines(found[:most]) + _count_rest(len(found) - most, len(ordered) - len(found), more)
 
 
 def list_findings(findings: Iterable[Finding]) -> list[str]:
     """Return every finding as a line, the worst first, notes too."""
-    return _lines(sort_findings(findings))
+    return _format_lines(sort_findings(findings))
 
 
-def _lines(findings: Iterable[Finding]) -> list[str]:
+def _format_lines(findings: Iterable[Finding]) -> list[str]:
     """Return each finding as a line, with the recipe that fits in no line below it."""
     lines = []
     for finding in findings:
-        lines += [f"{finding.severity}: {format_finding(finding)}", *(f"    {line}" for line in block_lines([finding]))]
+        lines += [
+            f"{finding.severity}: {format_finding(finding)}",
+            *(f"    {line}" for line in format_remedy_blocks([finding])),
+        ]
     return lines
 
 
@@ -148,7 +157,7 @@ def format_loss(loss: StoreLoss) -> str:
 
 def advise_on_loss(reason: str) -> str:
     """Return how to lose less distance for a reason of the breakdown; "" where nothing is to be done."""
-    entry = read_catalogue().get(loss_code(reason))
+    entry = read_catalogue().get(make_loss_code(reason))
     return entry.advice if entry else ""
 
 
@@ -245,5 +254,5 @@ def _group_lines(groups: Iterable[tuple[FindingGroup[K], int | None, str]]) -> l
     lines = []
     for group, total, what in groups:
         lines += [f"{group.severity}: {format_group(group, total, what)}"]
-        lines += [f"    {line}" for line in block_lines(group.findings)]
+        lines += [f"    {line}" for line in format_remedy_blocks(group.findings)]
     return lines

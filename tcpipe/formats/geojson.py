@@ -57,15 +57,17 @@ def read_regions(path: Path) -> Regions:
         if kind in KINDS:
             polygons[str(kind)] += feature.polygons
         else:
-            problems.append(f"{feature.where}: property split is {brief(kind)}, wanted one of {', '.join(KINDS)}")
+            problems.append(
+                f"{feature.where}: property split is {shorten_value(kind)}, wanted one of {', '.join(KINDS)}"
+            )
     if not problems and not any(polygons.values()):
         problems.append(f"{path}: no polygon in it; draw the region that trains and tests as a polygon")
     if not problems and not polygons["train_test"]:
         problems.append(f"{path}: every feature is unseen or exclude: nothing could train; add a train_test polygon")
     if not problems:
-        problems += _disagreements(path, polygons)
+        problems += _find_disagreements(path, polygons)
     if problems:
-        raise RegionError(*shortened(problems))
+        raise RegionError(*shorten_problems(problems))
     return Regions(*(shapely.union_all(polygons[kind]) for kind in KINDS))
 
 
@@ -112,29 +114,29 @@ def read_polygons(path: Path) -> tuple[list[PolygonFeature], list[str]]:
     """
     features: list[PolygonFeature] = []
     problems: list[str] = []
-    for where, properties, geometry in _features(path, _document(path)):
-        features.append(PolygonFeature(where, properties, tuple(_polygons(where, geometry, problems))))
+    for where, properties, geometry in _iterate_features(path, _parse_document(path)):
+        features.append(PolygonFeature(where, properties, tuple(_iterate_polygons(where, geometry, problems))))
     return features, problems
 
 
 def read_features(path: Path) -> Iterator[tuple[str, Mapping[str, Json], Json]]:
     """Yield where, properties and geometry object of every feature of a file; `RegionError` if it is not GeoJSON in WGS84."""
-    yield from _features(path, _document(path))
+    yield from _iterate_features(path, _parse_document(path))
 
 
-def brief(value: object) -> str:
+def shorten_value(value: object) -> str:
     """Return a value as it stands in a file, cut if it is long."""
     text = repr(value)
     return text if len(text) <= _SHOWN_CHARACTERS else f"{text[:_SHOWN_CHARACTERS]}…"
 
 
-def shortened(problems: list[str]) -> list[str]:
+def shorten_problems(problems: list[str]) -> list[str]:
     """Return the first few problems, and how many more there are."""
     more = len(problems) - _SHOWN
     return problems if more <= 0 else [*problems[:_SHOWN], f"… and {more} more"]
 
 
-def _document(path: Path) -> Mapping[str, Json]:
+def _parse_document(path: Path) -> Mapping[str, Json]:
     try:
         size = path.stat().st_size
         if size > MAX_BYTES:
@@ -158,7 +160,7 @@ def _document(path: Path) -> Mapping[str, Json]:
     return document
 
 
-def _features(path: Path, document: Mapping[str, Json]) -> Iterator[tuple[str, Mapping[str, Json], Json]]:
+def _iterate_features(path: Path, document: Mapping[str, Json]) -> Iterator[tuple[str, Mapping[str, Json], Json]]:
     """Yield where, properties and geometry object of every feature."""
     name, listed = document["type"], document.get("features")
     features: Sequence[Json]
@@ -169,7 +171,9 @@ def _features(path: Path, document: Mapping[str, Json]) -> Iterator[tuple[str, M
     elif name in _GEOMETRIES:
         features = [{"type": "Feature", "properties": None, "geometry": document}]
     else:
-        raise RegionError(f"{path}: not GeoJSON: type {brief(name)}, wanted FeatureCollection, Feature or a geometry")
+        raise RegionError(
+            f"{path}: not GeoJSON: type {shorten_value(name)}, wanted FeatureCollection, Feature or a geometry"
+        )
     for number, feature in enumerate(features):
         where = f"{path}: feature {number}"
         if not isinstance(feature, dict) or feature.get("type") != "Feature":
@@ -178,7 +182,7 @@ def _features(path: Path, document: Mapping[str, Json]) -> Iterator[tuple[str, M
         yield where, properties if isinstance(properties, dict) else {}, feature.get("geometry")
 
 
-def _polygons(where: str, geometry: Json, problems: list[str], *, depth: int = 0) -> Iterator[BaseGeometry]:
+def _iterate_polygons(where: str, geometry: Json, problems: list[str], *, depth: int = 0) -> Iterator[BaseGeometry]:
     """Yield the sound polygons of one geometry object; add a line to ``problems`` for every unsound one."""
     told = geometry if isinstance(geometry, dict) else {}
     name = told.get("type")
@@ -192,21 +196,21 @@ def _polygons(where: str, geometry: Json, problems: list[str], *, depth: int = 0
             )
             return
         for part in parts:
-            yield from _polygons(where, part, problems, depth=depth + 1)
+            yield from _iterate_polygons(where, part, problems, depth=depth + 1)
     elif name not in ("Polygon", "MultiPolygon"):
-        problems.append(f"{where}: geometry is {brief(name)}, wanted Polygon or MultiPolygon")
+        problems.append(f"{where}: geometry is {shorten_value(name)}, wanted Polygon or MultiPolygon")
     else:
         coordinates = told.get("coordinates")
         parts = coordinates if name == "MultiPolygon" else [coordinates]
         for rings in parts if isinstance(parts, list) else [None]:
-            found = _polygon(rings)
+            found = _read_polygon(rings)
             if isinstance(found, str):
                 problems.append(f"{where}: {found}")
             else:
                 yield found
 
 
-def _polygon(rings: Json) -> BaseGeometry | str:
+def _read_polygon(rings: Json) -> BaseGeometry | str:
     """Return the polygon, or what is wrong with it."""
     if not isinstance(rings, list) or not rings:
         return "its geometry is empty; draw it or remove the feature"
@@ -215,7 +219,7 @@ def _polygon(rings: Json) -> BaseGeometry | str:
     except (TypeError, ValueError, KeyError, OverflowError):
         return "its coordinates are not rings of [lon, lat] positions"
     for ring in lonlat:
-        problem = _ring_problem(ring)
+        problem = _find_ring_problem(ring)
         if problem:
             return problem
     polygon = shapely.Polygon(lonlat[0], lonlat[1:])
@@ -224,7 +228,7 @@ def _polygon(rings: Json) -> BaseGeometry | str:
     return polygon
 
 
-def _ring_problem(lonlat: NDArray[np.float64]) -> str | None:
+def _find_ring_problem(lonlat: NDArray[np.float64]) -> str | None:
     if lonlat.ndim != 2 or lonlat.shape[1:] != (2,) or not np.isfinite(lonlat).all():
         return "its coordinates are not rings of finite [lon, lat] positions"
     lon, lat = lonlat[np.argmax(np.abs(lonlat).max(axis=1))]
@@ -240,7 +244,7 @@ def _ring_problem(lonlat: NDArray[np.float64]) -> str | None:
     return None
 
 
-def _disagreements(path: Path, polygons: Mapping[str, list[BaseGeometry]]) -> Iterator[str]:
+def _find_disagreements(path: Path, polygons: Mapping[str, list[BaseGeometry]]) -> Iterator[str]:
     train_test, unseen = shapely.union_all(polygons["train_test"]), shapely.union_all(polygons["unseen"])
     both = shapely.intersection(train_test, unseen)
     if shapely.is_empty(both):

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.errors import PathError, RegionError
-from tcpipe.formats.geojson import brief, read_features
+from tcpipe.formats.geojson import read_features, shorten_value
 from tcpipe.formats.json_files import Json
 
 P = TypeVar("P")
@@ -57,11 +57,11 @@ def read_line(path: Path) -> NDArray[np.float64]:
     if name == "MultiLineString" and isinstance(coordinates, list) and len(coordinates) == 1:
         name, coordinates = "LineString", coordinates[0]
     if name != "LineString":
-        raise PathError(f"{where}: geometry is {brief(name)}, wanted one LineString")
-    return _positions(where, coordinates)
+        raise PathError(f"{where}: geometry is {shorten_value(name)}, wanted one LineString")
+    return _read_positions(where, coordinates)
 
 
-def _positions(where: str, coordinates: Json) -> NDArray[np.float64]:
+def _read_positions(where: str, coordinates: Json) -> NDArray[np.float64]:
     if not isinstance(coordinates, list) or not coordinates:
         raise PathError(f"{where}: its line has no points; wanted at least two")
     try:
@@ -87,7 +87,7 @@ def check_lonlat(where: str, lonlat_deg: NDArray[np.float64]) -> None:
         )
 
 
-def line_feature(lonlat_deg: NDArray[np.float64], properties: P) -> LineFeature[P]:
+def make_line_feature(lonlat_deg: NDArray[np.float64], properties: P) -> LineFeature[P]:
     """Return a line through points, shape (P, 2), as a feature of GeoJSON."""
     points = np.round(lonlat_deg, _DECIMALS).tolist()
     return LineFeature(properties, LineString(tuple((lon, lat) for lon, lat in points)))

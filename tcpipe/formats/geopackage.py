@@ -13,7 +13,7 @@ from typing import Literal
 import pyarrow as pa
 
 from tcpipe.errors import UsageError
-from tcpipe.formats.atomic import atomic_file
+from tcpipe.formats.atomic import write_atomic_file
 
 _ANY_DAY = "1970-01-01T00:00:00.000Z"
 """When everything in a file was written: the same is the same by bytes."""
@@ -45,11 +45,11 @@ def write_geopackage(path: Path, layers: Sequence[VectorLayer]) -> None:
     ------
     UsageError : pyogrio is not installed, or ``path`` is there and holds something else than such layers.
     """
-    ogr = _pyogrio()
+    ogr = _import_pyogrio()
     if path.exists() and not _is_of(ogr, path, {layer.name for layer in layers}):
         raise UsageError(f"{path}: is there, and no GeoPackage of tcpipe; give another name")
     ogr.set_gdal_config_options({"OGR_CURRENT_DATE": _ANY_DAY})
-    with atomic_file(path) as temporary:
+    with write_atomic_file(path) as temporary:
         made = temporary.with_name("layers.gpkg")
         for layer in layers:
             told = layer.table.select([of.name for of in layer.table.schema if _is_plain(of.type)])
@@ -90,7 +90,7 @@ def _is_of(ogr: ModuleType, path: Path, names: set[str]) -> bool:
     return found <= {*names, "layer_styles"}
 
 
-def _pyogrio() -> ModuleType:
+def _import_pyogrio() -> ModuleType:
     try:
         import pyogrio  # noqa: PLC0415  an extra
     except ImportError:

@@ -9,20 +9,20 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from tcpipe.formats.json_files import to_json_line
-from tcpipe.tables.columns import lonlat_deg
+from tcpipe.tables.columns import read_lonlat_deg
 from tcpipe.tables.levels import Datum
 from tcpipe.tables.segment_columns import GEOMETRY
 
 _WGS84 = "EPSG:4326"
 
 
-def located_segments(table: pa.Table, datum: Datum | None) -> pa.Table:
+def add_segments_metadata(table: pa.Table, datum: Datum | None) -> pa.Table:
     """Return a table of segments which says where it lies; ``datum`` is the track's."""
-    ends = np.concatenate([lonlat_deg(table, "start"), lonlat_deg(table, "end")])
-    return located(table, "LineString", ends, crs=_WGS84 if datum is None else datum.crs)
+    ends = np.concatenate([read_lonlat_deg(table, "start"), read_lonlat_deg(table, "end")])
+    return add_geo_metadata(table, "LineString", ends, crs=_WGS84 if datum is None else datum.crs)
 
 
-def located(
+def add_geo_metadata(
     table: pa.Table, kind: Literal["LineString", "Point"], points_deg: NDArray[np.float64], *, crs: str = _WGS84
 ) -> pa.Table:
     """Return a table whose metadata says what its column ``geometry`` holds.

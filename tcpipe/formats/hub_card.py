@@ -10,7 +10,7 @@ from collections.abc import Iterator, Sequence
 
 import pyarrow as pa
 
-from tcpipe.errors import plain_line
+from tcpipe.errors import clean_line
 from tcpipe.formats.dataset_card import DatasetCard
 from tcpipe.formats.finding_lines import format_verdict
 from tcpipe.formats.json_files import Json
@@ -25,7 +25,7 @@ _DTYPES = {"double": "float64", "float": "float32", "halffloat": "float16"}
 _SHOWN_LAYERS = 12
 
 
-def hub_card(card: DatasetCard, samples: pa.Schema, *, samples_file: str, picture: str) -> str:
+def format_hub_card(card: DatasetCard, samples: pa.Schema, *, samples_file: str, picture: str) -> str:
     """Return the document: a YAML head (as JSON, which is YAML) and what a reader wants to know.
 
     Parameters
@@ -34,12 +34,12 @@ def hub_card(card: DatasetCard, samples: pa.Schema, *, samples_file: str, pictur
     samples : schema of its table of samples.
     samples_file, picture : where that table and an overview lie in the dataset.
     """
-    text = "\n".join(_lines(card, picture))
-    return f"---\n{_yaml(_head(card, samples, samples_file))}---\n\n{text}\n"
+    text = "\n".join(_iterate_lines(card, picture))
+    return f"---\n{_format_yaml(_make_head(card, samples, samples_file))}---\n\n{text}\n"
 
 
-def _head(card: DatasetCard, samples: pa.Schema, samples_file: str) -> dict[str, Json]:
-    columns = [_feature(field.name, field.type) for field in samples]
+def _make_head(card: DatasetCard, samples: pa.Schema, samples_file: str) -> dict[str, Json]:
+    columns = [_describe_feature(field.name, field.type) for field in samples]
     table: Json = {"config_name": "samples", "data_files": [{"split": "full", "path": samples_file}]}
     configs: list[Json] = [table]
     infos: list[Json] = [
@@ -74,7 +74,7 @@ def _split(card: DatasetCard, name: str, samples: int, files: Sequence[str]) -> 
     return {"name": name, "num_examples": samples, "num_bytes": sum(card.checksums[file].size_bytes for file in files)}
 
 
-def _feature(name: str, dtype: pa.DataType) -> Json:
+def _describe_feature(name: str, dtype: pa.DataType) -> Json:
     if pa.types.is_fixed_size_list(dtype):
         return {"name": name, "list": _name_of(dtype.value_type), "length": dtype.list_size}
     return (
@@ -90,28 +90,28 @@ def _name_of(dtype: pa.DataType) -> str:
     return _DTYPES.get(str(dtype), str(dtype))
 
 
-def _yaml(head: dict[str, Json]) -> str:
+def _format_yaml(head: dict[str, Json]) -> str:
     """Return the head as YAML: a key a line, its value as JSON, which YAML holds as it is."""
     return "".join(f"{key}: {json.dumps(value, ensure_ascii=True)}\n" for key, value in head.items())
 
 
-def _text(value: str) -> str:
+def _escape_markdown(value: str) -> str:
     """Return text as Markdown shows it, and nothing else: no HTML, no markup."""
-    escaped = plain_line(value).replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")
+    escaped = clean_line(value).replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")
     return "".join(f"\\{c}" if c in "\\`*_[]|#{}" else c for c in escaped)
 
 
-def _lines(card: DatasetCard, picture: str) -> Iterator[str]:
+def _iterate_lines(card: DatasetCard, picture: str) -> Iterator[str]:
     """Yield the lines of what a reader wants to know."""
     splits = ", ".join(f"{count} {split}" for split, count in card.splits.items())
     side = f"{card.patch_px} × {card.patch_px} pixels of {card.patch_m:g} m × {card.patch_m:g} m"
-    yield from (f"# {_text(card.name)}", "")
+    yield from (f"# {_escape_markdown(card.name)}", "")
     if card.description:
-        yield from (_text(card.description), "")
+        yield from (_escape_markdown(card.description), "")
     yield (
         f"{card.samples} samples ({splits}) of what driving a metre of ground costs a robot "
-        f"({', '.join(map(_text, card.robots)) or 'none'}): power, velocity, duration and energy, each with its standard deviation, "
-        f"beside a patch of the ground under it: {side}."
+        f"({', '.join(map(_escape_markdown, card.robots)) or 'none'}): power, velocity, duration and energy, "
+        f"each with its standard deviation, beside a patch of the ground under it: {side}."
     )
     yield from ("", f"![the maps from above]({picture})", "", "## Labels, over train alone", "")
     yield from ("| label | mean | standard deviation | least | most |", "|---|---|---|---|---|")
@@ -120,7 +120,7 @@ def _lines(card: DatasetCard, picture: str) -> Iterator[str]:
         yield f"| `{name}` | " + " | ".join("–" if value is None else f"{value:.4g}" for value in figures) + " |"
     yield from ("", "## Layers of a patch", "", "| layer | stored as | unit |", "|---|---|---|")
     for name, layer in list(card.layers.items())[:_SHOWN_LAYERS]:
-        yield f"| {_text(name)} | {layer['dtype']} | {_text(str(layer.get('units', '')))} |"
+        yield f"| {_escape_markdown(name)} | {layer['dtype']} | {_escape_markdown(str(layer.get('units', '')))} |"
     yield from (
         "",
         "`dataset.json` says how each is decoded.",
@@ -128,26 +128,26 @@ def _lines(card: DatasetCard, picture: str) -> Iterator[str]:
         "## Reading it",
         "",
         "```python",
-        *_reading(card),
+        *_describe_reading(card),
         "```",
         "",
     )
-    yield from ("## Splits", "", _splits_in_words(card), "")
+    yield from ("## Splits", "", _format_splits(card), "")
     if card.verdict is not None:
         yield from ("## Verdict", "", f"Labels: {format_verdict(card.verdict)}. `dataset.json` has the findings.", "")
     if card.redaction is not None:
-        yield from ("## Redacted", "", *map(_text, card.redaction.lines()), "")
+        yield from ("## Redacted", "", *map(_escape_markdown, card.redaction.lines()), "")
     yield from (
         "## Licence and citation",
         "",
-        f"Licence: {_text(card.licence) or 'not stated; ask before you use it'}.",
+        f"Licence: {_escape_markdown(card.licence) or 'not stated; ask before you use it'}.",
         "",
     )
-    yield from ("```bibtex", *_bibtex(card), "```", "")
+    yield from ("```bibtex", *_format_bibtex(card), "```", "")
     yield f"Made with tcpipe {card.tcpipe_version}, data model {card.data_model_version}. `tcpipe verify` proves every file."
 
 
-def _reading(card: DatasetCard) -> Iterator[str]:
+def _describe_reading(card: DatasetCard) -> Iterator[str]:
     if card.shards:
         yield from (
             "from datasets import load_dataset",
@@ -156,7 +156,7 @@ def _reading(card: DatasetCard) -> Iterator[str]:
     yield from ("import tcpipe", 'tcpipe.open_dataset("PATH")["train"].patches  # float32 (N, px, px, layers), decoded')
 
 
-def _splits_in_words(card: DatasetCard) -> str:
+def _format_splits(card: DatasetCard) -> str:
     rules = card.recipe.split
     return (
         f"`test` is drawn by {rules.holdout} ({100 * rules.test_fraction:g} % of the samples inside the region), `unseen` lies "
@@ -166,9 +166,9 @@ def _splits_in_words(card: DatasetCard) -> str:
     )
 
 
-def _bibtex(card: DatasetCard) -> Iterator[str]:
+def _format_bibtex(card: DatasetCard) -> Iterator[str]:
     def braced(text: str) -> str:
-        return "".join(c for c in plain_line(text) if c not in "{}\\`")
+        return "".join(c for c in clean_line(text) if c not in "{}\\`")
 
     yield f"@misc{{tcpipe-{card.inputs[:12]},"
     yield f"  title = {{{braced(card.name)}}},"

@@ -14,11 +14,11 @@ from pathlib import PurePosixPath
 import pyarrow as pa
 
 from tcpipe.errors import StoreError
-from tcpipe.formats.json_files import recast
-from tcpipe.formats.parquet import parquet_rows
+from tcpipe.formats.json_files import convert_record
+from tcpipe.formats.parquet import write_parquet_rows
 from tcpipe.formats.place import Place
 from tcpipe.formats.run_documents import Ingestion, LogOrigin, Manifest, RunJson
-from tcpipe.tables.arrays import column_of
+from tcpipe.tables.arrays import make_column
 from tcpipe.tables.catalogue import AFFECTED
 from tcpipe.tables.facts import EnergyBudget, PhysicsFit
 from tcpipe.tables.findings import Finding, select_findings
@@ -94,13 +94,13 @@ class RunFacts(Ingestion):
         return bool(select_findings(self.findings, "no-segments"))
 
 
-def facts_of(manifest: Manifest, name: str, files: Mapping[str, int]) -> RunFacts:
+def make_run_facts(manifest: Manifest, name: str, files: Mapping[str, int]) -> RunFacts:
     """Return the row of an ingestion; ``name`` is that of its manifest, ``files`` as in the row."""
     label, place = manifest.info.report.facts.label, f"runs/{manifest.run_id}/{manifest.recipe_id}"
     named = {PurePosixPath(of).name: of for of in manifest.checksums}
     if gone := [of for of in ("segments.parquet", "track.parquet", "rejections.parquet") if of not in named]:
         raise StoreError(f"{place}: its manifest lists no {gone[0]}; ingest the log again")
-    return recast(
+    return convert_record(
         manifest,
         RunFacts,
         manifest=name,
@@ -112,17 +112,17 @@ def facts_of(manifest: Manifest, name: str, files: Mapping[str, int]) -> RunFact
         track_file=f"{place}/{named['track.parquet']}",
         files=files,
         standing_watt=None if label is None else label.physics.standing_watt,
-        physics={} if label is None or label.physics.fit is None else _terms(label.physics.fit),
+        physics={} if label is None or label.physics.fit is None else _read_terms(label.physics.fit),
     )
 
 
-def _terms(fit: PhysicsFit) -> dict[str, tuple[float, float]]:
+def _read_terms(fit: PhysicsFit) -> dict[str, tuple[float, float]]:
     return {of.term if of.terrain == "all" else f"{of.term} on {of.terrain}": (of.value, of.std) for of in fit.terms}
 
 
-def known_log(known: RunJson) -> KnownLog:
+def read_known_log(known: RunJson) -> KnownLog:
     """Return what a row has of what is known of a log."""
-    sensors = {role: recast(sensor, KnownSensor) for role, sensor in known.sensors.items()}
+    sensors = {role: convert_record(sensor, KnownSensor) for role, sensor in known.sensors.items()}
     return KnownLog(known.source, known.tags, sensors, known.outline)
 
 
@@ -153,7 +153,7 @@ def write_index(place: Place, rows: Iterable[RunFacts]) -> None:
     """Write ``runs.parquet``, unless that cannot be: it is written again after the next commit."""
     rows, schema = list(rows), _SCHEMA.with_metadata({_ABOUT: _VERSION})
     with suppress(StoreError), place.workshop() as directory:
-        with parquet_rows(directory / RUNS, schema) as write:
+        with write_parquet_rows(directory / RUNS, schema) as write:
             for start in range(0, len(rows), _TOGETHER):
                 write(_make_table(rows[start : start + _TOGETHER], schema))
         place.put(RUNS, (directory / RUNS).read_bytes())
@@ -161,20 +161,20 @@ def write_index(place: Place, rows: Iterable[RunFacts]) -> None:
 
 def _make_table(rows: Sequence[RunFacts], schema: pa.Schema) -> pa.Table:
     cells = (map(_CELLS.get(of.name, attrgetter(of.name)), rows) for of in schema)
-    return pa.table([_column([*of], field.type) for of, field in zip(cells, schema, strict=True)], schema=schema)
+    return pa.table([_to_column([*of], field.type) for of, field in zip(cells, schema, strict=True)], schema=schema)
 
 
-def _column(values: list[object], kind: pa.DataType) -> pa.Array:
+def _to_column(values: list[object], kind: pa.DataType) -> pa.Array:
     """Return values as Arrow takes them: names of files that are no text with escapes."""
     try:
-        return column_of(values, kind)
+        return make_column(values, kind)
     except UnicodeEncodeError:
-        return column_of([_text(value) for value in values], kind)
+        return make_column([_to_text(value) for value in values], kind)
 
 
-def _text(value: object) -> object:
+def _to_text(value: object) -> object:
     if isinstance(value, str):
         return value.encode("utf-8", "backslashreplace").decode()
     if isinstance(value, Mapping):
-        return {str(_text(key)): _text(of) for key, of in value.items()}
-    return [_text(of) for of in value] if isinstance(value, tuple | list) else value
+        return {str(_to_text(key)): _to_text(of) for key, of in value.items()}
+    return [_to_text(of) for of in value] if isinstance(value, tuple | list) else value

@@ -32,7 +32,7 @@ MOST_BYTES = 32 << 20
 """A document is at most so large [byte], written and read: the card of ten thousand runs."""
 
 
-def plain(value: Any) -> Any:
+def to_plain(value: Any) -> Any:
     """Return ``value`` as JSON values: dataclasses become objects, numpy values numbers and lists, what is not finite null."""
     if is_dataclass(value) and not isinstance(value, type):
         told = ((of.name, getattr(value, of.name), of.metadata.get("json", ())) for of in fields(value))
@@ -42,15 +42,15 @@ def plain(value: Any) -> Any:
     elif hasattr(value, "tolist"):  # numpy scalars and arrays
         value = value.tolist()
     if isinstance(value, Mapping):
-        return {str(key): plain(item) for key, item in value.items()}
+        return {str(key): to_plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [plain(item) for item in value]
+        return [to_plain(item) for item in value]
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return str(value) if isinstance(value, Path) else value
 
 
-def recast(record: object, cls: Callable[..., T], **more: object) -> T:
+def convert_record(record: object, cls: Callable[..., T], **more: object) -> T:
     """Return a record of another dataclass: with the fields that ``record`` has too, and ``more``, which goes before."""
     found = ((name, getattr(record, name, _ABSENT)) for name in _field_names(cls) if name not in more)
     return cls(**{name: value for name, value in found if value is not _ABSENT}, **more)
@@ -61,8 +61,8 @@ def _field_names(cls: Callable[..., object]) -> tuple[str, ...]:
     return tuple(of.name for of in fields(cls))  # type: ignore[arg-type]
 
 
-def compact_json(value: object) -> bytes:
-    """Return the JSON of dataclasses whose numbers are finite, for `of_json`, in a tenth of the time of `to_json_line`."""
+def to_compact_json(value: object) -> bytes:
+    """Return the JSON of dataclasses whose numbers are finite, for `parse_typed_json`, in a tenth of the time of `to_json_line`."""
     try:
         return msgspec.json.encode(value)
     except UnicodeEncodeError:  # the name of a file is no text
@@ -71,13 +71,13 @@ def compact_json(value: object) -> bytes:
 
 def to_json(value: Any) -> str:
     """Return canonical JSON text: sorted keys, two-space indent, final newline; file names that are no text as escapes."""
-    text = json.dumps(plain(value), sort_keys=True, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+    text = json.dumps(to_plain(value), sort_keys=True, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
     return text.encode("utf-8", "backslashreplace").decode("utf-8")
 
 
 def to_json_line(value: Any) -> str:
     """Return the same on one line, without an end."""
-    text = json.dumps(plain(value), sort_keys=True, ensure_ascii=False, allow_nan=False)
+    text = json.dumps(to_plain(value), sort_keys=True, ensure_ascii=False, allow_nan=False)
     return text.encode("utf-8", "backslashreplace").decode("utf-8")
 
 
@@ -123,10 +123,10 @@ def parse_json(data: bytes, path: Path | str) -> dict[str, Json]:
 
 def read_as(path: Path, cls: type[T]) -> T:
     """Read one JSON object as a dataclass; `StoreError` names a file that cannot be read, or the file and the key of what does not fit."""
-    return typed(read_json(path), cls, path)
+    return parse_typed(read_json(path), cls, path)
 
 
-def typed(value: object, cls: type[T], path: Path | str) -> T:
+def parse_typed(value: object, cls: type[T], path: Path | str) -> T:
     """Return a JSON object as a dataclass: a key that it lacks is its default, one that the dataclass lacks is left aside.
 
     Raises
@@ -137,11 +137,11 @@ def typed(value: object, cls: type[T], path: Path | str) -> T:
         with _CONVERTING:
             return msgspec.convert(value, cls, str_keys=True, dec_hook=_from_text)
     except msgspec.ValidationError as error:
-        raise StoreError(f"{path}: is not what this version writes: {_in_words(str(error))}") from None
+        raise StoreError(f"{path}: is not what this version writes: {_format_validation_error(str(error))}") from None
 
 
-def of_json(text: str | bytes | memoryview, cls: type[T], path: Path | str) -> T:
-    """Return JSON text as a dataclass, or what is made of such; as `typed`."""
+def parse_typed_json(text: str | bytes | memoryview, cls: type[T], path: Path | str) -> T:
+    """Return JSON text as a dataclass, or what is made of such; as `parse_typed`."""
     try:
         with _CONVERTING:
             return msgspec.json.decode(text, type=cls)
@@ -149,7 +149,7 @@ def of_json(text: str | bytes | memoryview, cls: type[T], path: Path | str) -> T
         raise StoreError(f"{path}: is not what this version writes: {error}") from None
 
 
-def _in_words(message: str) -> str:
+def _format_validation_error(message: str) -> str:
     """Return what msgspec finds wrong, the key first: of ``Expected `int`, got `str` - at `$.counts.segments``` and such."""
     what, _, place = message.partition(" - at ")
     key = re.sub(r"^key in ", "", place.strip("`")).removeprefix("$").removeprefix(".")

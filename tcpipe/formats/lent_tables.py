@@ -8,9 +8,9 @@ from pathlib import Path, PurePosixPath
 
 import pyarrow as pa
 
+from tcpipe.formats.integrity import Checksum
 from tcpipe.formats.parquet import read_table
 from tcpipe.formats.place import DirectoryPlace, Place
-from tcpipe.formats.seals import Checksum
 from tcpipe.tables.levels import Streams
 
 _LENT = ("imu", "wheel_odometry", "visual_odometry")

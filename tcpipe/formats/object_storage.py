@@ -17,8 +17,8 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import unquote
 
 from tcpipe.errors import LogError, TcpipeError, UsageError, split_secrets
-from tcpipe.formats.atomic import scratch_directory
-from tcpipe.formats.logs.log_part import no_room
+from tcpipe.formats.atomic import make_scratch_directory
+from tcpipe.formats.logs.log_part import describe_full_disk
 
 if TYPE_CHECKING:
     from obstore import GetOptions, ObjectMeta
@@ -76,7 +76,7 @@ class StoredObject:
         ------
         LogError : it cannot be had, also after some attempts, or the object is another than it was.
         """
-        with told(self.url):
+        with convert_errors(self.url):
             if len(spans) == 1:
                 return [self._range(spans[0])]
             with ThreadPoolExecutor(_AT_ONCE) as pool:
@@ -84,7 +84,7 @@ class StoredObject:
 
     def copy(self, to: Path) -> None:
         """Write all of it to a file; `LogError` as `ranges`, and where there is no room."""
-        with told(self.url), to.open("wb") as target:
+        with convert_errors(self.url), to.open("wb") as target:
             for start in range(0, self.size_bytes, _PIECE_BYTES):
                 target.write(self._range((start, min(start + _PIECE_BYTES, self.size_bytes))))
         os.utime(to, ns=(self.modified_ns, self.modified_ns))
@@ -124,15 +124,15 @@ def split_url(url: str, *, one_object: bool = False) -> tuple[str, str]:
     shown, query = split_secrets(scheme, rest)
     public = f"{scheme}{slashes}{shown}"
     if shown + query != rest:
-        raise UsageError(f"{public}: a URL may not hold a user name or password; {_credentials(scheme)}")
+        raise UsageError(f"{public}: a URL may not hold a user name or password; {_describe_credentials(scheme)}")
     query = query.partition("#")[0].removeprefix("?")
     if query and not (one_object and scheme.lower() in ("http", "https")):
         what = "only the http:// or https:// URL of one log may have a query (?…)"
-        raise UsageError(f"{public}: {what}; {_credentials(scheme)}")
+        raise UsageError(f"{public}: {what}; {_describe_credentials(scheme)}")
     return public, query
 
 
-def shown_path(path: str | Path) -> str:
+def format_path(path: str | Path) -> str:
     """Return a path or the URL of a log as it is shown and stored."""
     return split_url(str(path), one_object=True)[0] if is_url(path) else str(path)
 
@@ -142,14 +142,14 @@ def is_presigned(path: str | Path) -> bool:
     return is_url(path) and bool(split_url(str(path), one_object=True)[1])
 
 
-def _credentials(scheme: str) -> str:
+def _describe_credentials(scheme: str) -> str:
     """Return how to give the credentials that a URL may not hold."""
     variables = _CREDENTIALS.get(scheme.lower())
     return f"set {variables}" if variables else "give the presigned URL of a log, or copy the files to this machine"
 
 
 @contextmanager
-def laid_out(
+def lay_out_objects(
     url: str, *, wanted: Callable[[str], bool], by_range: tuple[str, ...]
 ) -> Iterator[tuple[Path, dict[Path, StoredObject]]]:
     """Lay out an object, or what is wanted below a prefix, in a temporary directory, until the block ends.
@@ -167,8 +167,8 @@ def laid_out(
     LogError : there is no such object, or it cannot be read. What goes wrong inside the block is told with the URL instead of the path.
     """
     shown, query = split_url(url, one_object=True)
-    with scratch_directory() as directory:
-        laid = _laid_out(shown, query, directory, wanted)
+    with make_scratch_directory() as directory:
+        laid = _lay_out_stand_ins(shown, query, directory, wanted)
         place = _place_of(shown, directory)
         try:
             for path, stored in laid.items():
@@ -179,7 +179,7 @@ def laid_out(
             raise type(error)(*(problem.replace(str(place), shown.rstrip("/")) for problem in error.problems)) from None
 
 
-def stand_ins(url: str, directory: Path, *, wanted: Callable[[str], bool]) -> Path:
+def make_stand_ins(url: str, directory: Path, *, wanted: Callable[[str], bool]) -> Path:
     """Lay out what lies at or below a URL as files of the right names, sizes and times that hold nothing and take no room.
 
     Raises
@@ -187,20 +187,22 @@ def stand_ins(url: str, directory: Path, *, wanted: Callable[[str], bool]) -> Pa
     LogError : there is no such object, or the store cannot be read.
     """
     shown, query = split_url(url, one_object=True)
-    _laid_out(shown, query, directory, wanted)
+    _lay_out_stand_ins(shown, query, directory, wanted)
     return _place_of(shown, directory)
 
 
 def _place_of(url: str, directory: Path) -> Path:
-    name = _container_and_name(url)[1]
+    name = _split_url(url)[1]
     return directory / name if name else directory
 
 
-def _laid_out(url: str, query: str, directory: Path, wanted: Callable[[str], bool]) -> dict[Path, StoredObject]:
+def _lay_out_stand_ins(
+    url: str, query: str, directory: Path, wanted: Callable[[str], bool]
+) -> dict[Path, StoredObject]:
     """Lay out stand-ins, and return their objects."""
-    with told(url):
-        store, name = connected(url, query)
-        found = list(_found(store, url, name, wanted, presigned=bool(query)))
+    with convert_errors(url):
+        store, name = connect_store(url, query)
+        found = list(_iterate_objects(store, url, name, wanted, presigned=bool(query)))
         if not found:
             raise LogError(f"{url}: there is no such object, and no log below it")
         laid = {_place(stored.name, directory): stored for stored in found}
@@ -212,7 +214,7 @@ def _laid_out(url: str, query: str, directory: Path, wanted: Callable[[str], boo
 
 
 @contextmanager
-def told(url: str, error: type[TcpipeError] = LogError, *, what: str = "read") -> Iterator[None]:
+def convert_errors(url: str, error: type[TcpipeError] = LogError, *, what: str = "read") -> Iterator[None]:
     """Turn what goes wrong while an object is ``read`` or ``written`` into one line; that it is not there passes as `FileNotFoundError`."""
     from obstore.exceptions import BaseError  # noqa: PLC0415
 
@@ -222,10 +224,12 @@ def told(url: str, error: type[TcpipeError] = LogError, *, what: str = "read") -
         code = _CODE.search(str(found))
         if isinstance(found, FileNotFoundError) and error is not LogError and not (code and code[1] == "NoSuchBucket"):
             raise
-        raise error(f"{url}: it cannot be {what} ({_reason(url, found, code and code[1], what)})") from None
+        raise error(
+            f"{url}: it cannot be {what} ({_describe_store_error(url, found, code and code[1], what)})"
+        ) from None
 
 
-def _reason(url: str, error: Exception, code: str | None, what: str) -> str:
+def _describe_store_error(url: str, error: Exception, code: str | None, what: str) -> str:
     """Return in words what a store, or the operating system, answered."""
     from obstore.exceptions import PermissionDeniedError, UnauthenticatedError  # noqa: PLC0415
 
@@ -244,7 +248,7 @@ def _reason(url: str, error: Exception, code: str | None, what: str) -> str:
         return "the store refuses the credentials that are set, or this machine's clock is not the store's"
     if denied and scheme in _CREDENTIALS:
         return f"the store wants credentials; set {_CREDENTIALS[scheme]}"
-    return no_room(error) or reason
+    return describe_full_disk(error) or reason
 
 
 def _refuse_endpoints_that_are_none(scheme: str) -> None:
@@ -255,7 +259,7 @@ def _refuse_endpoints_that_are_none(scheme: str) -> None:
             raise ValueError(f"{name} is {value!r}, wanted http://host or https://host, with :port where it has one")
 
 
-def _container_and_name(url: str) -> tuple[str, str]:
+def _split_url(url: str) -> tuple[str, str]:
     """Return the URL of a bucket, directory or server, and the name of the object or prefix in it."""
     scheme, _, rest = url.partition("://")
     scheme, rest = scheme.lower(), rest.rstrip("/")
@@ -269,12 +273,12 @@ def _container_and_name(url: str) -> tuple[str, str]:
     return f"{scheme}://{container}", unquote(name) if scheme in _PERCENT_ENCODED else name
 
 
-def connected(url: str, query: str = "") -> tuple[ObjectStore, str]:
+def connect_store(url: str, query: str = "") -> tuple[ObjectStore, str]:
     """Return the store, and the name of the object or prefix in it; a presigned URL's server gets its ``query`` with each request."""
     import obstore  # noqa: PLC0415
 
     url = split_url(url)[0]
-    container, name = _container_and_name(url)
+    container, name = _split_url(url)
     scheme, _, bucket = container.partition("://")
     if not bucket:
         raise ValueError(f"it names no bucket; wanted {scheme}://bucket/name")
@@ -287,26 +291,28 @@ def connected(url: str, query: str = "") -> tuple[ObjectStore, str]:
     return obstore.store.from_url(container, **options), name
 
 
-def _found(
+def _iterate_objects(
     store: ObjectStore, url: str, name: str, wanted: Callable[[str], bool], *, presigned: bool
 ) -> Iterator[StoredObject]:
     """Yield the object of a name; where there is none, what is wanted below it."""
     if presigned:  # for one object and method: neither HEAD nor a list is allowed
         if name:
-            yield _stored(store, url, name, store.get(name, options={"range": (0, 1)}).meta)
+            yield _make_stored_object(store, url, name, store.get(name, options={"range": (0, 1)}).meta)
         return
     if name:
         try:
-            yield _stored(store, url, name, store.head(name))
+            yield _make_stored_object(store, url, name, store.head(name))
         except (FileNotFoundError, IsADirectoryError):
             pass
         else:
             return
     for listed in store.list(prefix=name or None):
-        yield from (_stored(store, url, name, meta) for meta in listed if wanted(PurePosixPath(meta["path"]).name))
+        yield from (
+            _make_stored_object(store, url, name, meta) for meta in listed if wanted(PurePosixPath(meta["path"]).name)
+        )
 
 
-def _stored(store: ObjectStore, url: str, name: str, meta: ObjectMeta) -> StoredObject:
+def _make_stored_object(store: ObjectStore, url: str, name: str, meta: ObjectMeta) -> StoredObject:
     path, tag = str(meta["path"]), meta.get("e_tag")
     modified_ns = round(meta["last_modified"].timestamp() * 1e6) * 1000
     return StoredObject(store, url.rstrip("/") + path.removeprefix(name), path, int(meta["size"]), modified_ns, tag)

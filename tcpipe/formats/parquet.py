@@ -16,7 +16,7 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from tcpipe.errors import StoreError
-from tcpipe.formats.atomic import atomic_file
+from tcpipe.formats.atomic import write_atomic_file
 
 ROWS_PER_GROUP = 1 << 17
 """Rows of a group: what is decoded together."""
@@ -31,26 +31,26 @@ EMPTY_MEMBER = "structure_needs_at_least_one_member"
 
 def write_table(table: pa.Table, path: Path) -> None:
     """Write ``table`` to ``path`` whole or not at all; zstd level 1 without dictionaries (half the default's time)."""
-    with parquet_rows(path, table.schema) as write:
+    with write_parquet_rows(path, table.schema) as write:
         write(table)
 
 
 @contextmanager
-def parquet_rows(path: Path, schema: pa.Schema) -> Iterator[Callable[[pa.Table], None]]:
+def write_parquet_rows(path: Path, schema: pa.Schema) -> Iterator[Callable[[pa.Table], None]]:
     """Yield a function that adds rows to ``path``, each call a row group or more; the file appears at the end, whole or not at all."""
-    with atomic_file(path) as temporary, _writer(temporary, schema) as writer:
+    with write_atomic_file(path) as temporary, _open_writer(temporary, schema) as writer:
         yield lambda table: writer.write_table(table.combine_chunks(), row_group_size=ROWS_PER_GROUP)
 
 
-def parquet_bytes(table: pa.Table, *, rows_per_group: int) -> bytes:
+def write_parquet_bytes(table: pa.Table, *, rows_per_group: int) -> bytes:
     """Return the file that `write_table` writes, in groups of so many rows."""
     sink = pa.BufferOutputStream()
-    with _writer(sink, table.schema) as writer:
+    with _open_writer(sink, table.schema) as writer:
         writer.write_table(table.combine_chunks(), row_group_size=rows_per_group)
     return bytes(sink.getvalue())
 
 
-def _writer(sink: Path | pa.NativeFile, schema: pa.Schema) -> pq.ParquetWriter:
+def _open_writer(sink: Path | pa.NativeFile, schema: pa.Schema) -> pq.ParquetWriter:
     return pq.ParquetWriter(
         sink,
         schema,
@@ -62,27 +62,27 @@ def _writer(sink: Path | pa.NativeFile, schema: pa.Schema) -> pq.ParquetWriter:
     )
 
 
-def storable(table: pa.Table) -> pa.Table:
+def make_storable(table: pa.Table) -> pa.Table:
     """Return the table as Parquet can hold it: messages without fields, in arrays, get the member ROS 2 gives them on the wire, null."""
     for at, field in enumerate(table.schema):
-        wanted = _with_a_member(field.type)
+        wanted = _add_struct_member(field.type)
         if wanted != field.type:
             table = table.set_column(at, field.with_type(wanted), pa.array(table.column(at).to_pylist(), wanted))
     return table
 
 
-def _with_a_member(of: pa.DataType) -> pa.DataType:
+def _add_struct_member(of: pa.DataType) -> pa.DataType:
     """Return the type with a member in every struct that has none."""
     if pa.types.is_struct(of):
-        fields = [field.with_type(_with_a_member(field.type)) for field in of]
+        fields = [field.with_type(_add_struct_member(field.type)) for field in of]
         return pa.struct(fields or [pa.field(EMPTY_MEMBER, pa.uint8())])
     if pa.types.is_fixed_size_list(of):
-        return pa.list_(_with_a_member(of.value_type), of.list_size)
-    return pa.list_(_with_a_member(of.value_type)) if pa.types.is_list(of) else of
+        return pa.list_(_add_struct_member(of.value_type), of.list_size)
+    return pa.list_(_add_struct_member(of.value_type)) if pa.types.is_list(of) else of
 
 
 @contextmanager
-def _damage_of(where: Path | str) -> Iterator[None]:
+def _convert_damage(where: Path | str) -> Iterator[None]:
     """Raise `StoreError` where the file cannot be read."""
     try:
         yield
@@ -93,24 +93,26 @@ def _damage_of(where: Path | str) -> Iterator[None]:
 
 def read_table(path: Path, columns: list[str] | None = None) -> pa.Table:
     """Read a Parquet file with its schema metadata; `StoreError` names a file that cannot be read."""
-    with _damage_of(path), pa.memory_map(str(path)) as file:
-        return _bounded(file.read_buffer(), columns)
+    with _convert_damage(path), pa.memory_map(str(path)) as file:
+        return _check_text_sizes(file.read_buffer(), columns)
 
 
 def read_row_group(path: Path, group: int, columns: list[str]) -> pa.Table:
     """Read columns of one row group of a Parquet file; `StoreError` names a file that cannot be read."""
-    with _damage_of(path), pa.memory_map(str(path)) as file:
-        return _bounded(file.read_buffer(), columns, group)
+    with _convert_damage(path), pa.memory_map(str(path)) as file:
+        return _check_text_sizes(file.read_buffer(), columns, group)
 
 
-def _bounded(data: pa.Buffer, columns: list[str] | None, group: int | None = None) -> pa.Table:
+def _check_text_sizes(data: pa.Buffer, columns: list[str] | None, group: int | None = None) -> pa.Table:
     """Return columns of a file, or of one of its row groups, once they are known to be in proportion to it; `ValueError` if not."""
     about = pq.read_metadata(pa.BufferReader(data))
     most = max(MOST_BYTES, MOST_TIMES * data.size)
     groups = [n for n in range(about.num_row_groups) if group in (None, n) and about.row_group(n).num_rows]
     schema = about.schema.to_arrow_schema()
     size, at_most = 0, dict.fromkeys((field.name for field in schema if pa.types.is_string(field.type)), 0)
-    for name, least, longest in _sizes(memoryview(data), about, groups, None if columns is None else set(columns)):
+    for name, least, longest in _iterate_column_sizes(
+        memoryview(data), about, groups, None if columns is None else set(columns)
+    ):
         size += least if name in at_most else longest
         at_most[name] = at_most.get(name, 0) + longest
     if size > most:
@@ -123,7 +125,7 @@ def _bounded(data: pa.Buffer, columns: list[str] | None, group: int | None = Non
         table = file.read_row_groups(groups, columns)
     for at, field in enumerate(table.schema):  # a text that occurs in many rows lies here once so far
         if pa.types.is_dictionary(field.type):
-            size += sum(_text_bytes(chunk) for chunk in table.column(at).chunks)
+            size += sum(_count_text_bytes(chunk) for chunk in table.column(at).chunks)
             if size > most:
                 raise ValueError(f"its texts unfold to more than {most / 1e6:.0f} MB")
             plain = schema.field(field.name)
@@ -131,11 +133,11 @@ def _bounded(data: pa.Buffer, columns: list[str] | None, group: int | None = Non
     return table
 
 
-def _text_bytes(chunk: pa.DictionaryArray) -> int:
+def _count_text_bytes(chunk: pa.DictionaryArray) -> int:
     return int(pc.sum(pc.binary_length(chunk.dictionary).cast(pa.int64()).take(chunk.indices)).as_py() or 0)
 
 
-def _sizes(
+def _iterate_column_sizes(
     data: memoryview, about: pq.FileMetaData, groups: Iterable[int], columns: Collection[str] | None
 ) -> Iterator[tuple[str, int, int]]:
     """Yield each column of each row group and how large it becomes [byte], by the headers of its pages.
@@ -151,7 +153,7 @@ def _sizes(
                 continue
             chunk = group.column(index)
             width = leaf.length if leaf.physical_type == "FIXED_LEN_BYTE_ARRAY" else _WIDTHS.get(leaf.physical_type, 0)
-            pages = list(_pages(data, chunk))
+            pages = list(_iterate_pages(data, chunk))
             values = sum(count for _, count, _ in pages)
             encoded = sum(size for size, *_ in pages)
             least = encoded + values * (width or 4)
@@ -159,7 +161,7 @@ def _sizes(
             yield name, least, max(least, encoded + values * dictionary)
 
 
-def _pages(data: memoryview, chunk: pq.ColumnChunkMetaData) -> Iterator[tuple[int, int, bool]]:
+def _iterate_pages(data: memoryview, chunk: pq.ColumnChunkMetaData) -> Iterator[tuple[int, int, bool]]:
     """Yield of every page of a column its size without compression [byte], its values, and whether these are the dictionary."""
     at = min(chunk.data_page_offset, chunk.dictionary_page_offset or chunk.data_page_offset)
     end = at + chunk.total_compressed_size
@@ -219,36 +221,36 @@ def _read_varint(data: memoryview, at: int) -> tuple[int, int]:
     return value | byte << shift, at + 1
 
 
-def column_names(path: Path) -> list[str]:
+def read_column_names(path: Path) -> list[str]:
     """Return the names of the columns of a Parquet file from its footer."""
     return list(read_schema(path).names)
 
 
 def read_schema(path: Path) -> pa.Schema:
     """Return the schema of a Parquet file, with its metadata, from its footer; `StoreError` names a file that cannot be read."""
-    with _damage_of(path):
+    with _convert_damage(path):
         return pq.read_schema(path)
 
 
-def row_count(path: Path) -> int:
+def read_row_count(path: Path) -> int:
     """Return the rows of a Parquet file from its footer; `StoreError` names a file that cannot be read."""
-    with _damage_of(path):
+    with _convert_damage(path):
         return int(pq.read_metadata(path).num_rows)
 
 
-def lowest(path: Path, column: str) -> int:
+def read_lowest(path: Path, column: str) -> int:
     """Return the lowest value of a column of whole numbers, from the statistics in the footer; `StoreError` where they lack."""
-    return min(_statistics(path, column))[0]
+    return min(_read_statistics(path, column))[0]
 
 
-def highest(path: Path, column: str) -> int:
-    """Return the highest value of a column of whole numbers, as `lowest`."""
-    return max(of[1] for of in _statistics(path, column))
+def read_highest(path: Path, column: str) -> int:
+    """Return the highest value of a column of whole numbers, as `read_lowest`."""
+    return max(of[1] for of in _read_statistics(path, column))
 
 
-def _statistics(path: Path, column: str) -> list[tuple[int, int]]:
+def _read_statistics(path: Path, column: str) -> list[tuple[int, int]]:
     """Return the lowest and the highest value of a column in every row group that has rows."""
-    with _damage_of(path):
+    with _convert_damage(path):
         about = pq.read_metadata(path)
         groups = [about.row_group(index) for index in range(about.num_row_groups)]
         at = about.schema.to_arrow_schema().get_field_index(column)

@@ -19,8 +19,8 @@ from pathlib import Path, PurePosixPath
 from typing import NamedTuple, Protocol
 
 from tcpipe.errors import StoreError
-from tcpipe.formats.atomic import TEMPORARY_PREFIX, clear, put_directory, put_file, working_directory
-from tcpipe.formats.seals import Checksum, file_checksum
+from tcpipe.formats.atomic import TEMPORARY_PREFIX, clear, make_working_directory, put_directory, put_file
+from tcpipe.formats.integrity import Checksum, compute_checksum
 
 
 class Entry(NamedTuple):
@@ -113,37 +113,37 @@ class DirectoryPlace:
 
     def check(self) -> None:
         """Raise `StoreError` where this is no directory, or cannot be listed."""
-        with _told(self.where(), "read"):
+        with _convert_os_errors(self.where(), "read"):
             os.scandir(self.root).close()
 
     def read(self, name: str) -> bytes | None:
         """Return a whole file; None where there is none."""
-        with _told(self.where(name), "read"), suppress(FileNotFoundError, NotADirectoryError):
+        with _convert_os_errors(self.where(name), "read"), suppress(FileNotFoundError, NotADirectoryError):
             return self._path(name).read_bytes()
         return None
 
     def read_range(self, name: str, start: int, size: int) -> bytes:
         """Return ``size`` bytes from ``start`` on."""
-        with _told(self.where(name), "read"), self._path(name).open("rb") as stream:
+        with _convert_os_errors(self.where(name), "read"), self._path(name).open("rb") as stream:
             return os.pread(stream.fileno(), size, start)
 
     def size(self, name: str) -> int | None:
         """Return how large a file is [byte]."""
         path = self._path(name)
-        with _told(self.where(name), "read"), suppress(FileNotFoundError, NotADirectoryError):
+        with _convert_os_errors(self.where(name), "read"), suppress(FileNotFoundError, NotADirectoryError):
             return path.stat().st_size if path.is_file() else None
         return None
 
     def version(self, name: str) -> str | None:
         """Return the inode of a file and when it was changed."""
-        with _told(self.where(name), "read"):
+        with _convert_os_errors(self.where(name), "read"):
             seen = self._path(name).stat()
         return f"{seen.st_dev} {seen.st_ino} {seen.st_size} {seen.st_mtime_ns} {seen.st_ctime_ns}"
 
     def entries(self, prefix: str = "", *, but: str = "") -> list[Entry]:
         """Return the files below ``prefix/``, by name, without those in folders called ``but``."""
-        with _told(self.where(prefix), "read"):
-            return sorted(_walked(self._path(prefix), prefix, but))
+        with _convert_os_errors(self.where(prefix), "read"):
+            return sorted(_walk_files(self._path(prefix), prefix, but))
 
     def folders(self, prefix: str = "") -> list[str]:
         """Return the names of the directories in ``prefix``."""
@@ -158,7 +158,7 @@ class DirectoryPlace:
         return [name for name in self.files(prefix) if name > after]
 
     def _in(self, prefix: str) -> list[os.DirEntry[str]]:
-        with _told(self.where(prefix), "read"), suppress(FileNotFoundError, NotADirectoryError):
+        with _convert_os_errors(self.where(prefix), "read"), suppress(FileNotFoundError, NotADirectoryError):
             found = sorted(os.scandir(self._path(prefix)), key=lambda entry: entry.name)
             return [entry for entry in found if not entry.name.startswith(TEMPORARY_PREFIX)]
         return []
@@ -166,7 +166,7 @@ class DirectoryPlace:
     def put(self, name: str, data: bytes, *, lasting: bool = True) -> None:
         """Write a file by a rename; without ``lasting`` as it is."""
         if not lasting:
-            with _told(self.where(name), "written"):
+            with _convert_os_errors(self.where(name), "written"):
                 self._path(name).parent.mkdir(parents=True, exist_ok=True)
                 self._path(name).write_bytes(data)
             return
@@ -178,7 +178,7 @@ class DirectoryPlace:
 
     def workshop(self) -> AbstractContextManager[Path]:
         """Return a context: an empty directory among the temporaries."""
-        return working_directory(self._staging())
+        return make_working_directory(self._staging())
 
     def put_files(self, prefix: str, directory: Path) -> None:
         """Put the directory there by one rename."""
@@ -187,13 +187,13 @@ class DirectoryPlace:
     def checksum(self, name: str) -> Checksum | None:
         """Return size and sha256 of a file."""
         path = self._path(name)
-        with _told(self.where(name), "read"):
-            return file_checksum(path) if path.is_file() else None
+        with _convert_os_errors(self.where(name), "read"):
+            return compute_checksum(path) if path.is_file() else None
 
     def delete(self, name: str) -> None:
         """Remove a file, and the directories above it that it leaves empty."""
         path = self._path(name)
-        with _told(self.where(name), "written"), suppress(FileNotFoundError, NotADirectoryError):
+        with _convert_os_errors(self.where(name), "written"), suppress(FileNotFoundError, NotADirectoryError):
             path.unlink()
         with suppress(OSError):
             for parent in path.parents:
@@ -221,7 +221,7 @@ class DirectoryPlace:
         return staging
 
 
-def _walked(directory: Path, prefix: str, but: str) -> list[Entry]:
+def _walk_files(directory: Path, prefix: str, but: str) -> list[Entry]:
     """Return the files below a directory, ``prefix/`` before their names; a file that goes meanwhile is none."""
     found, todo = list[Entry](), [(str(directory), f"{prefix}/" if prefix else "")]
     while todo:
@@ -242,7 +242,7 @@ def _walked(directory: Path, prefix: str, but: str) -> list[Entry]:
 
 
 @contextmanager
-def _told(where: str, what: str) -> Iterator[None]:
+def _convert_os_errors(where: str, what: str) -> Iterator[None]:
     """Turn what the operating system says into one line."""
     try:
         yield

@@ -14,27 +14,27 @@ Shape = Literal["line", "fill"]
 _HEAD = "<!DOCTYPE qgis PUBLIC 'http://mrcc.com/qgis.dtd' 'SYSTEM'>\n<qgis version=\"3.22.0\">\n"
 
 
-def classes_style(attribute: str, colours: Mapping[str, str], shape: Shape) -> str:
+def make_classes_style(attribute: str, colours: Mapping[str, str], shape: Shape) -> str:
     """Return the style of a vector layer that has a colour for each value of a column."""
     values = [
         f'<category render="true" symbol="{at}" value={quoteattr(of)} label={quoteattr(of)}/>'
         for at, of in enumerate(colours)
     ]
-    return _vector(
+    return _make_vector_style(
         f'type="categorizedSymbol" attr={quoteattr(attribute)}', "categories", values, list(colours.values()), shape
     )
 
 
-def ranges_style(attribute: str, edges: Sequence[float], shape: Shape) -> str:
+def make_ranges_style(attribute: str, edges: Sequence[float], shape: Shape) -> str:
     """Return the style of a vector layer that has a colour for each range of a column; six edges bound the five ranges."""
     ranges = [
         f'<range render="true" symbol="{at}" lower="{low!r}" upper="{high!r}" label="{low:.4g} - {high:.4g}"/>'
         for at, (low, high) in enumerate(pairwise(edges))
     ]
-    return _vector(f'type="graduatedSymbol" attr={quoteattr(attribute)}', "ranges", ranges, VIRIDIS, shape)
+    return _make_vector_style(f'type="graduatedSymbol" attr={quoteattr(attribute)}', "ranges", ranges, VIRIDIS, shape)
 
 
-def raster_style(band: int, low: float, high: float) -> str:
+def make_raster_style(band: int, low: float, high: float) -> str:
     """Return the style of a raster whose band, counted from 1, is coloured from the least value to the greatest."""
     step = (high - low) / (len(VIRIDIS) - 1)
     stops = [(low + at * step, colour) for at, colour in enumerate(VIRIDIS)]
@@ -47,13 +47,13 @@ def raster_style(band: int, low: float, high: float) -> str:
     )
 
 
-def _vector(renderer: str, groups: str, entries: Sequence[str], colours: Sequence[str], shape: Shape) -> str:
-    symbols = "".join(_symbol(at, colour, shape) for at, colour in enumerate(colours))
+def _make_vector_style(renderer: str, groups: str, entries: Sequence[str], colours: Sequence[str], shape: Shape) -> str:
+    symbols = "".join(_make_symbol(at, colour, shape) for at, colour in enumerate(colours))
     told = f"<{groups}>{''.join(entries)}</{groups}><symbols>{symbols}</symbols>"
     return f'{_HEAD}<renderer-v2 {renderer} symbollevels="0" forceraster="0">{told}</renderer-v2>\n</qgis>\n'
 
 
-def _symbol(name: int, colour: str, shape: Shape) -> str:
+def _make_symbol(name: int, colour: str, shape: Shape) -> str:
     rgb = ",".join(str(int(colour[at : at + 2], 16)) for at in (1, 3, 5))
     line = {"line_color": f"{rgb},255", "line_width": "0.8", "line_style": "solid"}
     fill = {

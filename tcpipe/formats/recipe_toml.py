@@ -10,11 +10,11 @@ from pathlib import Path
 from typing import Any
 
 from tcpipe.errors import RecipeError
-from tcpipe.formats.json_files import Json, digest, plain
-from tcpipe.formats.robot_files import shipped_profiles
+from tcpipe.formats.json_files import Json, digest, to_plain
+from tcpipe.formats.robot_files import load_shipped_profiles
 from tcpipe.formats.toml_text import parse_toml
 from tcpipe.recipe import IngestSections, Recipe, TableMapping
-from tcpipe.recipe.checking import as_toml, describe, from_values, kinds_of, values_in_words
+from tcpipe.recipe.checking import as_toml, describe, format_values, from_values, read_annotations
 from tcpipe.robots.profiles import PowerSource, Robot
 
 FILE_NAME = "tcpipe.toml"
@@ -52,7 +52,7 @@ def load_recipe(path: Path | None) -> Recipe:
         raise RecipeError(f"{path}: not valid TOML: {error}") from None
 
 
-def recipe_of(given: Recipe | str | Path | None) -> Recipe:
+def resolve_recipe(given: Recipe | str | Path | None) -> Recipe:
     """Return a recipe: the one given, itself or by its path, else the one that rules here, as `find_recipe` says."""
     if isinstance(given, Recipe):
         return given
@@ -67,8 +67,8 @@ def parse_recipe(values: Mapping[str, Any], *, where: str) -> Recipe:
 def ingest_key(recipe: Recipe | Mapping[str, Json]) -> str:
     """Return the hash (hex) of what rules a run's files in a recipe or in what a manifest holds of one; the dataset's sections do not."""
     if isinstance(recipe, Recipe):
-        return _key_of(_Itself(recipe))
-    return _key_of_values(recipe)
+        return _make_recipe_key(_Itself(recipe))
+    return _hash_values(recipe)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -85,11 +85,11 @@ class _Itself:
 
 
 @lru_cache(maxsize=4)
-def _key_of(of: _Itself) -> str:
-    return _key_of_values(plain(of.recipe.ingest))
+def _make_recipe_key(of: _Itself) -> str:
+    return _hash_values(to_plain(of.recipe.ingest))
 
 
-def _key_of_values(values: Mapping[str, Json]) -> str:
+def _hash_values(values: Mapping[str, Json]) -> str:
     names = [section.name for section in fields(IngestSections)]
     return digest({name: values.get(name) for name in names if values.get(name) or name not in _OWN_TABLES})
 
@@ -100,50 +100,54 @@ def read_key(recipe: Recipe | IngestSections, robot: str | None, *, definitions:
     return digest({"read": recipe.read, "robot": robot, "definitions": definitions, **own})
 
 
-def recipe_id(recipe: Recipe | Mapping[str, Json], robot: str) -> str:
+def make_recipe_id(recipe: Recipe | Mapping[str, Json], robot: str) -> str:
     """Return the name of a run's recipe directory: first 8 hex of the hash of the ingest sections and the robot."""
     return digest({"ingest": ingest_key(recipe), "robot": robot})[:8]
 
 
-def commented_toml(recipe: Recipe | None = None) -> str:
+def format_commented_toml(recipe: Recipe | None = None) -> str:
     """Return every key with its default and meaning as TOML; keys at their default are commented out."""
-    return "\n".join(_toml_lines(recipe or Recipe(), describe(Recipe)[1])) + "\n"
+    return "\n".join(_iterate_toml_lines(recipe or Recipe(), describe(Recipe)[1])) + "\n"
 
 
-def _toml_lines(recipe: Recipe, definitions: Mapping[str, Any]) -> Iterator[str]:
+def _iterate_toml_lines(recipe: Recipe, definitions: Mapping[str, Any]) -> Iterator[str]:
     yield "# The recipe of tcpipe. Every key is here with its default, commented out; remove the # to change one."
     yield "# Units stand in the names. Reasons: docs/explanation/rulings.md"
     default = Recipe()
-    names = f"one of {', '.join(sorted(shipped_profiles().robots))}, or of [robots]"
-    yield from _key_lines(definitions["Recipe"]["properties"]["robot"], "robot", recipe.robot, default.robot, names)
+    names = f"one of {', '.join(sorted(load_shipped_profiles().robots))}, or of [robots]"
+    yield from _iterate_key_lines(
+        definitions["Recipe"]["properties"]["robot"], "robot", recipe.robot, default.robot, names
+    )
     for section in fields(recipe):
         here = getattr(recipe, section.name)
         if not is_dataclass(here):
             continue
-        yield from _table_lines(f"[{section.name}]", here, getattr(default, section.name), definitions)
+        yield from _iterate_table_lines(f"[{section.name}]", here, getattr(default, section.name), definitions)
     robots: Mapping[str, Robot | None] = recipe.robots or {"NAME": None}
     for name, robot in robots.items():
-        yield from _table_lines(f"[robots.{as_toml(name) if robot else name}]", robot, Robot(), definitions)
+        yield from _iterate_table_lines(f"[robots.{as_toml(name) if robot else name}]", robot, Robot(), definitions)
     sources: Sequence[PowerSource | None] = recipe.power_sources or [None]
     for source in sources:
-        yield from _table_lines("[[power_sources]]", source, PowerSource(""), definitions)
+        yield from _iterate_table_lines("[[power_sources]]", source, PowerSource(""), definitions)
     tables: Mapping[str, TableMapping | None] = recipe.tables or {"ROLE": None}
     for name, table in tables.items():
-        yield from _table_lines(f"[tables.{as_toml(name) if table else name}]", table, TableMapping(), definitions)
+        yield from _iterate_table_lines(
+            f"[tables.{as_toml(name) if table else name}]", table, TableMapping(), definitions
+        )
 
 
-def _table_lines(head: str, here: Any, default: Any, definitions: Mapping[str, Any]) -> Iterator[str]:
+def _iterate_table_lines(head: str, here: Any, default: Any, definitions: Mapping[str, Any]) -> Iterator[str]:
     """Yield a table of the recipe; one that it does not have is shown behind two #, since its keys alone would be another's."""
     definition = definitions[type(default).__name__]
     told = (f"# {line}" for line in definition["description"].splitlines() if line)
     yield from ("", *told, head if here else f"## {head}")
-    for name, kind in kinds_of(type(default)).items():
+    for name, kind in read_annotations(type(default)).items():
         value, usual = getattr(here or default, name), getattr(default, name)
-        for line in _key_lines(definition["properties"][name], name, value, usual, values_in_words(kind)):
+        for line in _iterate_key_lines(definition["properties"][name], name, value, usual, format_values(kind)):
             yield line if here else f"#{line}"
 
 
-def _key_lines(schema: Mapping[str, Any], name: str, value: Any, usual: Any, choices: str) -> Iterator[str]:
+def _iterate_key_lines(schema: Mapping[str, Any], name: str, value: Any, usual: Any, choices: str) -> Iterator[str]:
     yield f"# {schema.get('description', '')}"
     note = choices and f"  # {choices}"
     if value is None:

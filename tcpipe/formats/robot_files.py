@@ -12,7 +12,7 @@ from tcpipe.robots.profiles import GENERIC, Profiles, Robot
 
 
 @cache
-def shipped_profiles() -> Profiles:
+def load_shipped_profiles() -> Profiles:
     """Return what the package knows."""
     known = Profiles({GENERIC: Robot()})
     for file in sorted(files("tcpipe.robots").iterdir(), key=lambda file: file.name):
@@ -21,6 +21,6 @@ def shipped_profiles() -> Profiles:
     return known
 
 
-def profiles_of(recipe: Recipe | IngestSections) -> Profiles:
+def load_profiles(recipe: Recipe | IngestSections) -> Profiles:
     """Return what a recipe knows, and beyond that the package."""
-    return Profiles(recipe.robots, recipe.power_sources).before(shipped_profiles())
+    return Profiles(recipe.robots, recipe.power_sources).before(load_shipped_profiles())

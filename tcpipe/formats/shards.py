@@ -29,7 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.errors import StoreError
-from tcpipe.formats.json_files import read_json, typed
+from tcpipe.formats.json_files import parse_typed, read_json
 
 DESCRIPTION = "zarr.json"
 """What an array or a group is, in its directory."""
@@ -41,7 +41,7 @@ _ABSENT = 2**64 - 1
 _BLOSC_SHUFFLES = {"noshuffle": 0, "shuffle": 1, "bitshuffle": 2}
 
 
-class Fetched(Protocol):
+class ShardFetcher(Protocol):
     """Shards that lie elsewhere, by the path that they would have here."""
 
     def size(self, path: Path) -> int:
@@ -68,7 +68,7 @@ class ShardedArray:
     """A shard without a file is all fill value, as in Zarr; otherwise it is damage."""
     codec: Any
     """What encodes and decodes a chunk, beneath its checksum."""
-    fetched: Fetched | None = None
+    fetched: ShardFetcher | None = None
     """Where the shards are; None: on this machine."""
     _indices: dict[tuple[int, ...], NDArray[np.uint64]] = field(default_factory=dict)
 
@@ -158,10 +158,10 @@ class ShardedArray:
             encoded = map if threads == 1 else pool.map
             for place, data in zip(places, encoded(lambda place: self._encoded(values, place), places), strict=True):
                 index[place] = end, len(data) + _CRC_BYTES
-                pieces += [data, _crc(data)]
+                pieces += [data, _compute_crc(data)]
                 end += len(data) + _CRC_BYTES
         table = index.astype("<u8").tobytes()
-        return b"".join((*pieces, table, _crc(table)))
+        return b"".join((*pieces, table, _compute_crc(table)))
 
     @staticmethod
     def shard_name(shard: tuple[int, ...]) -> str:
@@ -190,7 +190,7 @@ class ShardedArray:
     ) -> bytes | None:
         """Return a chunk as it is stored, proved; None for one that is all fill value."""
         offset, size = (int(value) for value in self._index(shard, end, read)[place])
-        return None if offset == _ABSENT else _checked(read, size, offset)
+        return None if offset == _ABSENT else _read_checked(read, size, offset)
 
     def _index(
         self, shard: tuple[int, ...], end: Callable[[], int], read: Callable[[int, int], bytes]
@@ -198,7 +198,7 @@ class ShardedArray:
         """Return the shard's table of offsets and sizes, shape (*chunks per shard, 2)."""
         if shard not in self._indices:
             offset, size = self._index_span(end())
-            table = np.frombuffer(_checked(read, size, offset), "<u8").reshape(*self.per_shard, 2)
+            table = np.frombuffer(_read_checked(read, size, offset), "<u8").reshape(*self.per_shard, 2)
             start, length = table[..., 0], table[..., 1]
             lies_within = (start <= offset) & (length >= _CRC_BYTES) & (length <= offset - np.minimum(start, offset))
             if not (lies_within | (start == _ABSENT)).all():
@@ -221,7 +221,7 @@ def open_sharded(
     dtype: np.dtype[Any],
     fill: float,
     sparse: bool = False,
-    fetched: Fetched | None = None,
+    fetched: ShardFetcher | None = None,
 ) -> ShardedArray:
     """Return the array in ``path``, once its description, ``zarr.json``, says that it has the form that is wanted.
 
@@ -241,7 +241,7 @@ def open_sharded(
     if not where.exists():
         raise StoreError(f"{path}: is gone")
     described = read_json(where)
-    compression = _compression_in(described)
+    compression = _find_compression(described)
     wanted = {
         "zarr_format": 3,
         "node_type": "array",
@@ -250,17 +250,17 @@ def open_sharded(
         "fill_value": "NaN" if math.isnan(fill) else fill,
         "chunk_grid": {"name": "regular", "configuration": {"chunk_shape": list(shard_shape)}},
         "chunk_key_encoding": {"name": "default", "configuration": {"separator": "/"}},
-        "codecs": _sharding(list(chunk_shape), dtype, compression),
+        "codecs": _make_codecs(list(chunk_shape), dtype, compression),
         "storage_transformers": [],
     }
     for key, value in wanted.items():
         if described.get(key) != value:
             raise StoreError(f"{where}: {key} is {reprlib.repr(described.get(key))}, wanted {value}")
-    codec = _codec(compression, where)
+    codec = _make_codec(compression, where)
     return ShardedArray(path, shape, chunk_shape, shard_shape, dtype, fill, sparse, codec, fetched)
 
 
-def decoded_chunk(path: Path, data: bytes, size: int) -> bytes:
+def decode_chunk(path: Path, data: bytes, size: int) -> bytes:
     """Return the bytes of a chunk that is a file of its own, which its array's description in ``path`` says how to decode.
 
     Parameters
@@ -274,13 +274,13 @@ def decoded_chunk(path: Path, data: bytes, size: int) -> bytes:
     StoreError : the description names no compression that is known.
     ValueError : the chunk is damaged, or holds more or fewer bytes.
     """
-    codec = _codec(_compression_in(read_json(path / DESCRIPTION)), path / DESCRIPTION)
+    codec = _make_codec(_find_compression(read_json(path / DESCRIPTION)), path / DESCRIPTION)
     out = np.empty(size, np.uint8)
-    _decode(codec, _checked(lambda _, __: data, len(data), 0), out)
+    _decode(codec, _read_checked(lambda _, __: data, len(data), 0), out)
     return out.tobytes()
 
 
-def _compression_in(described: Mapping[str, Any]) -> Any:
+def _find_compression(described: Mapping[str, Any]) -> Any:
     """Return the second codec of an array's chunks, wherever it stands; None where the description has another form."""
     try:
         codecs = described["codecs"]
@@ -289,7 +289,7 @@ def _compression_in(described: Mapping[str, Any]) -> Any:
         return None
 
 
-def _sharding(chunk_shape: list[int], dtype: np.dtype[Any], compression: Any) -> list[Any]:
+def _make_codecs(chunk_shape: list[int], dtype: np.dtype[Any], compression: Any) -> list[Any]:
     """Return the codecs of an array as this program writes them."""
     little, crc = {"name": "bytes", "configuration": {"endian": "little"}}, {"name": "crc32c"}
     values = {"name": "bytes"} if dtype.itemsize == 1 else little
@@ -312,14 +312,14 @@ class _Blosc:
     blocksize: int
 
 
-def _codec(compression: Any, where: Path) -> Any:
+def _make_codec(compression: Any, where: Path) -> Any:
     """Return the codec that a description asks for; it decodes all its settings."""
     name = compression.get("name") if isinstance(compression, dict) else None
     if name == "zstd":
-        zstd = typed(compression.get("configuration"), _Zstd, where)
+        zstd = parse_typed(compression.get("configuration"), _Zstd, where)
         return numcodecs.Zstd(level=zstd.level, checksum=zstd.checksum)
     if name == "blosc":
-        blosc = typed(compression.get("configuration"), _Blosc, where)
+        blosc = parse_typed(compression.get("configuration"), _Blosc, where)
         shuffle = _BLOSC_SHUFFLES[blosc.shuffle]
         return numcodecs.Blosc(cname=blosc.cname, clevel=blosc.clevel, shuffle=shuffle, blocksize=blosc.blocksize)
     raise StoreError(f"{where}: compressed by {reprlib.repr(name)}, wanted zstd or blosc")
@@ -327,13 +327,13 @@ def _codec(compression: Any, where: Path) -> Any:
 
 def _decode(codec: Any, data: bytes, out: NDArray[Any]) -> None:
     """Fill ``out`` with what is encoded; `ValueError` where that is more or less."""
-    size = int.from_bytes(data[4:8], "little") if isinstance(codec, numcodecs.Blosc) else _zstd_size(data)
+    size = int.from_bytes(data[4:8], "little") if isinstance(codec, numcodecs.Blosc) else _read_zstd_size(data)
     if size != out.nbytes:
         raise ValueError(f"it holds {size} bytes, wanted {out.nbytes}")
     codec.decode(data, out=out)
 
 
-def _zstd_size(data: bytes) -> int:
+def _read_zstd_size(data: bytes) -> int:
     """Return how many bytes a frame says that it holds (RFC 8878, 3.1.1); 0 where it does not say."""
     if len(data) < 5:
         raise ValueError("it is cut short")
@@ -343,15 +343,15 @@ def _zstd_size(data: bytes) -> int:
     return int.from_bytes(data[start : start + width], "little") + (256 if width == 2 else 0)
 
 
-def _crc(data: bytes) -> bytes:
+def _compute_crc(data: bytes) -> bytes:
     checksum: int = google_crc32c.value(data)
     return checksum.to_bytes(_CRC_BYTES, "little")
 
 
-def _checked(read: Callable[[int, int], bytes], size: int, offset: int) -> bytes:
+def _read_checked(read: Callable[[int, int], bytes], size: int, offset: int) -> bytes:
     """Read so many bytes, the last of which are a checksum, and return the others; `ValueError` if it does not agree."""
     found = read(offset, size)
     content = found[:-_CRC_BYTES]
-    if _crc(content) != found[-_CRC_BYTES:]:
+    if _compute_crc(content) != found[-_CRC_BYTES:]:
         raise ValueError("its checksum does not agree")
     return content

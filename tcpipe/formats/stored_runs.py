@@ -15,12 +15,12 @@ import pyarrow as pa
 from tcpipe.errors import StoreError
 from tcpipe.formats.commits import State
 from tcpipe.formats.index_files import RunFacts
-from tcpipe.formats.numbered import digest_of, read_as_at
-from tcpipe.formats.parquet import highest, lowest, read_table, write_table
+from tcpipe.formats.integrity import Checksum, compute_checksum, compute_checksums, find_wrong_checksum
+from tcpipe.formats.numbered_documents import digest_of, read_as_at
+from tcpipe.formats.parquet import read_highest, read_lowest, read_table, write_table
 from tcpipe.formats.place import DirectoryPlace, Place
 from tcpipe.formats.recipe_toml import read_key
 from tcpipe.formats.run_documents import Manifest
-from tcpipe.formats.seals import Checksum, file_checksum, file_checksums, wrong_checksum
 from tcpipe.tables.levels import LABELLED_SEGMENTS, GatedTrack
 from tcpipe.tables.verdicts import judge_again
 
@@ -49,7 +49,7 @@ class RunDirectory:
     @property
     def manifest(self) -> Manifest:
         """The whole manifest, with the run's tags as they are now; `StoreError` if it is not as it was written."""
-        manifest = _manifest(self.place, self.facts.manifest, self.files_state)
+        manifest = _read_manifest(self.place, self.facts.manifest, self.files_state)
         if (manifest.run_id, manifest.recipe_id) != (self.run_id, self.recipe_id):
             what = f"is of {manifest.run_id}/{manifest.recipe_id}, but lies in {self.run_id}/{self.recipe_id}"
             raise StoreError(f"{self.place.where(self.facts.manifest)}: {what}")
@@ -73,7 +73,7 @@ class RunDirectory:
 
     def file(self, name: str) -> Path:
         """Return ``track.parquet`` and such on this machine, proved; `StoreError` if it is not as it was written."""
-        return local_file(self.place, self._name(name), self.checksum(name))
+        return fetch_local_file(self.place, self._name(name), self.checksum(name))
 
     def table(self, name: str, columns: Sequence[str] | None = None) -> pa.Table:
         """Read ``track``, ``segments`` or ``rejections``, or some of its columns; `StoreError` if it is not as it was written."""
@@ -180,25 +180,25 @@ def _find_listed(place: Place, rows: Sequence[RunFacts]) -> Callable[[str], tupl
 
 
 @lru_cache(maxsize=64)
-def _manifest(place: Place, name: str, state: FilesState) -> Manifest:
+def _read_manifest(place: Place, name: str, state: FilesState) -> Manifest:
     """Return a manifest while the files of its ingestion are in this state; judged by this version's catalogue."""
     del state
     manifest = read_as_at(place, name, Manifest)
     return replace(manifest, verdict=judge_again(manifest.verdict, manifest.info.report.findings))
 
 
-def with_span(row: RunFacts, place: Place, manifest: Manifest) -> RunFacts:
+def add_span(row: RunFacts, place: Place, manifest: Manifest) -> RunFacts:
     """Return a row with when its segments begin and end, from the statistics of their file; without where it has none."""
     name = row.segments_file.removeprefix(f"runs/{row.run_id}/{row.recipe_id}/")
     with suppress(StoreError):
         if row.segments:
             path = place.local(name, manifest.checksums[name])
-            return replace(row, start_ns=lowest(path, "start_ns"), end_ns=highest(path, "end_ns"))
+            return replace(row, start_ns=read_lowest(path, "start_ns"), end_ns=read_highest(path, "end_ns"))
     return row
 
 
 @contextmanager
-def told_of(where: str, directory: Path) -> Iterator[None]:
+def convert_run_errors(where: str, directory: Path) -> Iterator[None]:
     """Tell what goes wrong in a working directory of the place for which it is."""
     try:
         yield
@@ -209,24 +209,24 @@ def told_of(where: str, directory: Path) -> Iterator[None]:
 def put_tables(place: Place, tables: Mapping[str, pa.Table], *, folder: str = "") -> dict[str, Checksum]:
     """Put tables as Parquet into a directory named after their content; return the files."""
     with place.workshop() as directory:
-        with told_of(place.where(folder), directory):
+        with convert_run_errors(place.where(folder), directory):
             for name, table in tables.items():
                 write_table(table, directory / f"{name}.parquet")
-        checksums = file_checksums(directory)
+        checksums = compute_checksums(directory)
         prefix = f"{folder}{digest_of(checksums)}"
         place.put_files(prefix, directory)
-    return below(prefix, checksums)
+    return subdirectory(prefix, checksums)
 
 
-def below(prefix: str, checksums: Mapping[str, Checksum]) -> dict[str, Checksum]:
+def subdirectory(prefix: str, checksums: Mapping[str, Checksum]) -> dict[str, Checksum]:
     """Return checksums by the names that their files have where ``prefix`` lies."""
     return {f"{prefix}/{name}": of for name, of in checksums.items()}
 
 
-def local_file(place: Place, name: str, wanted: Checksum) -> Path:
+def fetch_local_file(place: Place, name: str, wanted: Checksum) -> Path:
     """Return a file on this machine, proved; `StoreError` if it is not as it was written."""
     path = place.local(name, wanted)
-    wrong = wrong_checksum(place.where(name), file_checksum(path) if path.is_file() else None, wanted)
+    wrong = find_wrong_checksum(place.where(name), compute_checksum(path) if path.is_file() else None, wanted)
     if wrong and not isinstance(place, DirectoryPlace):  # the copy in the cache; a new one is proved when it is made
         path.unlink(missing_ok=True)
         return place.local(name, wanted)

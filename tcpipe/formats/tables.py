@@ -45,7 +45,7 @@ class Cells:
     remarks: tuple[str, ...] = ()
 
 
-def column_names(path: Path) -> list[str]:
+def read_column_names(path: Path) -> list[str]:
     """Return what the columns of a table are called; `LogError` where it cannot be read."""
     return _scan(path).collect_schema().names()
 
@@ -56,13 +56,15 @@ def read_cells(path: Path, *, stamp: str, columns: list[str]) -> Cells:
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
         try:
-            frame = _collected(path, [stamp, *(name for name in wanted if name != stamp)], numbers=wanted)
+            frame = _collect_columns(path, [stamp, *(name for name in wanted if name != stamp)], numbers=wanted)
             stamps = frame[stamp]
-            stamps = _times(stamps) if stamps.dtype == pl.String else stamps
+            stamps = _parse_times(stamps) if stamps.dtype == pl.String else stamps
             if is_time := stamps.dtype.is_temporal():
                 stamps = stamps.cast(pl.Datetime("ns")).cast(pl.Int64)
             numbers = {name: frame[name].cast(pl.Float64, strict=False) for name in wanted}
-            texts = {name: odd for name in wanted if numbers[name].null_count() and (odd := _no_numbers(path, name))}
+            texts = {
+                name: odd for name in wanted if numbers[name].null_count() and (odd := _find_non_number(path, name))
+            }
         except (pl.exceptions.PolarsError, OSError) as error:
             raise LogError(f"{path}: it cannot be read as a table ({str(error).splitlines()[0]})") from None
     whole = stamps.dtype.is_integer()
@@ -77,7 +79,7 @@ def read_cells(path: Path, *, stamp: str, columns: list[str]) -> Cells:
     )
 
 
-def _collected(path: Path, columns: list[str], numbers: list[str] | None) -> pl.DataFrame:
+def _collect_columns(path: Path, columns: list[str], numbers: list[str] | None) -> pl.DataFrame:
     """Return columns of a table; a quote that nothing closes (a log that broke off) costs its own line only."""
     try:
         return _scan(path, numbers).select(columns).collect()
@@ -85,7 +87,7 @@ def _collected(path: Path, columns: list[str], numbers: list[str] | None) -> pl.
         return _scan(path, numbers, quote=None).select(columns).collect()
 
 
-def _times(texts: pl.Series) -> pl.Series:
+def _parse_times(texts: pl.Series) -> pl.Series:
     """Return texts as times; where they are none, null: ISO 8601 with and without a zone, UTC where none is told."""
     for zone in ("", "%#z"):
         for between in ("T", " "):
@@ -95,9 +97,9 @@ def _times(texts: pl.Series) -> pl.Series:
     return texts.cast(pl.Float64, strict=False)
 
 
-def _no_numbers(path: Path, name: str) -> tuple[int, int, str] | None:
+def _find_non_number(path: Path, name: str) -> tuple[int, int, str] | None:
     """Return how many cells of a column hold what is no number, and the row (from 1) and text of the first."""
-    texts = _collected(path, [name], numbers=None)[name].cast(pl.String)
+    texts = _collect_columns(path, [name], numbers=None)[name].cast(pl.String)
     odd = texts.is_not_null() & (texts.str.strip_chars() != "") & texts.cast(pl.Float64, strict=False).is_null()
     rows = odd.arg_true()
     return (len(rows), int(rows[0]) + 1, str(texts[int(rows[0])])) if len(rows) else None
@@ -112,14 +114,14 @@ def _scan(path: Path, numbers: list[str] | None = None, *, quote: str | None = '
             head = file.read(_HEAD_BYTES)
     except OSError as error:
         raise LogError(f"{path}: it cannot be read ({error.strerror})") from None
-    comments, lines = _lines(head)
+    comments, lines = _split_comment_lines(head)
     if not lines:
         raise LogError(f"{path}: it holds no table: it is empty")
     separator = next((sign for sign in (b",", b";", b"\t") if sign in lines[0]), b" ")
     first = (_DAY_AND_TIME.sub(rb"\1-\2-\3T", lines[0]) if separator == b" " else lines[0]).split(
         None if separator == b" " else separator
     )
-    names = None if any(map(_is_name, first)) else _names(comments, len(first), spaced=separator == b" ")
+    names = None if any(map(_is_name, first)) else _find_column_names(comments, len(first), spaced=separator == b" ")
     source: Path | BytesIO = path
     if separator == b" ":  # several of them are one
         text = _SPACES.sub(b" ", _DAY_AND_TIME.sub(rb"\1-\2-\3T", path.read_bytes().replace(b"\r", b"")))
@@ -140,7 +142,7 @@ def _scan(path: Path, numbers: list[str] | None = None, *, quote: str | None = '
     )
 
 
-def _lines(head: bytes) -> tuple[list[bytes], list[bytes]]:
+def _split_comment_lines(head: bytes) -> tuple[list[bytes], list[bytes]]:
     """Return the first lines that are comments, and those that are not."""
     lines = [line.strip() for line in head.splitlines() if line.strip()]
     count = next((at for at, line in enumerate(lines) if not _COMMENT.match(line)), len(lines))
@@ -157,7 +159,7 @@ def _is_name(field: bytes) -> bool:
     return False
 
 
-def _names(comments: list[bytes], count: int, *, spaced: bool) -> list[str]:
+def _find_column_names(comments: list[bytes], count: int, *, spaced: bool) -> list[str]:
     """Return the names of a table without a header: those of its last comment where they are as many, TUM's, or numbers."""
     told = comments[-1].lstrip(b"#% ").replace(b",", b" ").split() if comments else []
     if len(told) == count:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.errors import ModelError
-from tcpipe.formats.atomic import atomic_file
+from tcpipe.formats.atomic import write_atomic_file
 
 ArrayForm = tuple[str, tuple[int | str, ...]]
 """Type and shape of an array; a name stands for any length, and for the same one wherever it stands."""
@@ -21,7 +21,7 @@ ArrayForm = tuple[str, tuple[int | str, ...]]
 
 def write_arrays(path: Path, arrays: Mapping[str, NDArray[np.generic]]) -> None:
     """Write the arrays, whole or not at all."""
-    with atomic_file(path) as temporary, temporary.open("wb") as stream:
+    with write_atomic_file(path) as temporary, temporary.open("wb") as stream:
         np.savez(stream, allow_pickle=False, **dict(arrays))
 
 
@@ -44,8 +44,8 @@ def read_arrays(
         raise ModelError(f"{path}: cut short or damaged (no end of an archive in it)")
     try:
         with path.open("rb") as stream:
-            found = _headers(stream, path.stat().st_size)
-            if forms is not None and (wrong := _wrong_form(found, forms, optional)):
+            found = _read_headers(stream, path.stat().st_size)
+            if forms is not None and (wrong := _find_wrong_form(found, forms, optional)):
                 raise ModelError(f"{path}: holds the weights of another model: {wrong}; train the model again")
             with np.load(stream, allow_pickle=False) as held:
                 return {name: held[name] for name in held.files}
@@ -65,7 +65,7 @@ def read_arrays(
         raise ModelError(f"{path}: cut short or damaged ({error})") from None
 
 
-def _headers(stream: BinaryIO, size: int) -> dict[str, ArrayForm]:
+def _read_headers(stream: BinaryIO, size: int) -> dict[str, ArrayForm]:
     """Return what an archive's arrays say that they are; `ValueError` where they claim more bytes than the file has."""
     found: dict[str, ArrayForm] = {}
     with zipfile.ZipFile(stream) as archive:
@@ -92,7 +92,7 @@ def _headers(stream: BinaryIO, size: int) -> dict[str, ArrayForm]:
 _READERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 
 
-def _wrong_form(
+def _find_wrong_form(
     found: Mapping[str, ArrayForm], forms: Mapping[str, ArrayForm], optional: Collection[str]
 ) -> str | None:
     """Return in words the first array that is not as it is wanted; None where all are."""

@@ -76,7 +76,7 @@ def add_array(
     )
 
 
-def consolidate(group: zarr.Group) -> None:
+def consolidate_metadata(group: zarr.Group) -> None:
     """Gather the descriptions of all arrays in the group's own, so that xarray opens it in one read and without a warning."""
     with warnings.catch_warnings():
         # zarr's own reservation

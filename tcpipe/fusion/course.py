@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.fusion.measurements import BodyVelocities, Positions
-from tcpipe.fusion.signals import interval_means, seconds
+from tcpipe.fusion.signals import compute_interval_means, compute_seconds
 
 _GRID_S = 0.5
 _WINDOWS_S = (1.0, 2.0, 4.0, 8.0, 16.0)
@@ -19,7 +19,7 @@ _WILD = 5.0
 _TURNS_MPS2 = 2.0
 
 
-def course_rate(
+def compute_course_rate(
     gnss: Positions, odometry: BodyVelocities | None, zero_ns: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return how fast the course over ground turns: stamps [s] from ``zero_ns`` on, twice a second at most, and rates [rad/s].
@@ -27,16 +27,18 @@ def course_rate(
     The course is that of the way over a second, or over as many as it takes to be longer than the fixes are noisy; in between it turns
     evenly. Where the odometry goes backwards, the body looks the other way. Single wild fixes are bridged.
     """
-    stamp_s = seconds(gnss.stamp_ns, zero_ns)
+    stamp_s = compute_seconds(gnss.stamp_ns, zero_ns)
     grid_s = np.arange(stamp_s[0], stamp_s[-1], _GRID_S)
     std_m = float(np.sqrt(np.median(gnss.variance_m2[:, :2])))
     least_m = max(_MOVING_M, _CLEARLY * std_m)
-    places = _bridged(stamp_s, gnss.position_enu_m[:, :2] @ np.array([1.0, 1j]), std_m)[:, None]
+    places = _bridge_outliers(stamp_s, gnss.position_enu_m[:, :2] @ np.array([1.0, 1j]), std_m)[:, None]
     for window_s in _WINDOWS_S:
         rows = round(window_s / _GRID_S)
         if grid_s.size <= rows:
             return stamp_s[:1], np.zeros(1)
-        means = interval_means(stamp_s, np.column_stack((places.real, places.imag)), grid_s - _GRID_S, grid_s + _GRID_S)
+        means = compute_interval_means(
+            stamp_s, np.column_stack((places.real, places.imag)), grid_s - _GRID_S, grid_s + _GRID_S
+        )
         way = (means[rows:] - means[:-rows]) @ np.array([1.0, 1j])
         at_s = 0.5 * (grid_s[rows:] + grid_s[:-rows])
         moving = np.abs(way) > least_m
@@ -44,7 +46,9 @@ def course_rate(
             break
     if odometry is not None:
         start_s, end_s = at_s - window_s / 2, at_s + window_s / 2
-        driven = interval_means(seconds(odometry.stamp_ns, zero_ns), odometry.velocity_mps[:, :1], start_s, end_s)[:, 0]
+        driven = compute_interval_means(
+            compute_seconds(odometry.stamp_ns, zero_ns), odometry.velocity_mps[:, :1], start_s, end_s
+        )[:, 0]
         moving &= np.abs(driven) > _MOVING_MPS
         way = way * np.sign(driven)
     if moving.sum() < 2:
@@ -57,7 +61,9 @@ def course_rate(
     return stamp_s, np.concatenate(([0.0], rate, [0.0]))
 
 
-def _bridged(stamp_s: NDArray[np.float64], places: NDArray[np.complex128], std_m: float) -> NDArray[np.complex128]:
+def _bridge_outliers(
+    stamp_s: NDArray[np.float64], places: NDArray[np.complex128], std_m: float
+) -> NDArray[np.complex128]:
     """Return places [m], shape (N,), those on the line between their neighbours that lie further off it than noise and a turn explain."""
     if places.size < 3:
         return places
@@ -72,7 +78,7 @@ def _bridged(stamp_s: NDArray[np.float64], places: NDArray[np.complex128], std_m
     return found
 
 
-def course_of(velocity_mps: NDArray[np.float64]) -> NDArray[np.float64]:
+def compute_course(velocity_mps: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the direction of horizontal velocities (N, 3) [rad], continuous; that before it where the robot hardly moves."""
     moving = np.flatnonzero(np.hypot(velocity_mps[:, 0], velocity_mps[:, 1]) > _MOVING_MPS)
     if moving.size == 0:

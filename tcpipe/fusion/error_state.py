@@ -23,16 +23,23 @@ from numpy.typing import NDArray
 
 from tcpipe.errors import FusionError
 from tcpipe.fusion import state_kernel as kernel
-from tcpipe.fusion.error_state_pass import FilterPass, lags_of
-from tcpipe.fusion.error_state_results import reopenings, trajectory_of
+from tcpipe.fusion.error_state_pass import FilterPass, compute_lag_rows
+from tcpipe.fusion.error_state_results import find_gate_resets, make_trajectory
 from tcpipe.fusion.fix_errors import FixErrors, find_fix_errors
-from tcpipe.fusion.measurements import GNSS, InitialState, Measurements, part
+from tcpipe.fusion.gnss_faults import (
+    FaultHypothesis,
+    GnssFaults,
+    Spans,
+    find_returned_fixes,
+    find_wrong_fixes,
+    is_inside,
+)
+from tcpipe.fusion.measurements import GNSS, InitialState, Measurements, select_measurements
 from tcpipe.fusion.process import VISUAL_SCALE_STD, WHEEL_SCALE_STD
-from tcpipe.fusion.signals import median_period_ns
-from tcpipe.fusion.standing import standing_intervals
+from tcpipe.fusion.signals import compute_median_period_ns
+from tcpipe.fusion.stationary import find_stationary_intervals
 from tcpipe.fusion.timeline import EventTimeline, build_timeline
 from tcpipe.fusion.trajectory import Trajectory
-from tcpipe.fusion.wrong_fixes import Explained, Spans, WrongFixes, find_wrong_fixes, inside, returned
 from tcpipe.geometry.rotation import quat_from_matrix
 from tcpipe.tables.facts import Reopening
 from tcpipe.tables.findings import Subject, make_finding
@@ -69,10 +76,10 @@ def run_error_state(
     FusionError : the estimate is not finite.
     """
     if measurements.imu is None and output_ns.size:
-        initial = _levelled(measurements, initial, output_ns, gate_probability)
-    standing = standing_intervals(measurements)
+        initial = _level_start(measurements, initial, output_ns, gate_probability)
+    standing = find_stationary_intervals(measurements)
     errors = find_fix_errors(measurements)
-    case = _Case(measurements, initial, output_ns, gate_probability, None)
+    case = _FilterSection(measurements, initial, output_ns, gate_probability, None)
     if errors is not None and errors.matters:
         case = replace(case, errors=errors)
     timeline = case.timeline(standing, errors)
@@ -82,27 +89,27 @@ def run_error_state(
         del run, outputs, timeline  # each takes room as the log is long
         case = replace(case, errors=errors)
         timeline = case.timeline(standing, errors)
-        wrong = _wrong_fixes(case, timeline)
+        wrong = _find_gnss_faults(case, timeline)
         run, outputs = case.passed(timeline, () if wrong is None else wrong.spans, keep=smooth)
     elif not run.carried:
-        wrong = returned(run.jumps())
+        wrong = find_returned_fixes(run.jumps())
     if smooth:
         run.smooth(outputs)
     if errors is not None and case.errors is None:
-        run.lasting_m2 = _at_outputs(errors, measurements, output_ns)
+        run.lasting_m2 = _interpolate_fix_error(errors, measurements, output_ns)
     if wrong is not None:
         run.wrong = _as_reopenings(wrong, outputs, output_ns)
         run.lasting_m2 = run.lasting_m2 + wrong.doubt_m2(output_ns)
-    run.unseen_scale_std = _unseen_scale_std(run, measurements)
+    run.unseen_scale_std = _compute_unseen_scale_std(run, measurements)
     if not np.isfinite(outputs).all():
         raise FusionError(
             "the estimate is not finite", findings=[make_finding("estimate-not-finite", Subject("run", ""))]
         )
-    return trajectory_of(run.timeline, outputs, run, output_ns)
+    return make_trajectory(run.timeline, outputs, run, output_ns)
 
 
 @dataclass(frozen=True, slots=True)
-class _Case:
+class _FilterSection:
     """A stretch that is filtered, more than once where its fixes contradict the rest; with ``errors`` that of the fixes is in the state."""
 
     measurements: Measurements
@@ -113,7 +120,7 @@ class _Case:
 
     def timeline(self, standing: NDArray[np.int64], errors: FixErrors | None) -> EventTimeline:
         """Return the events, fixes with the variance that counts from one to the next."""
-        heard = _counted(self.measurements, errors, doubted=self.errors is not None)
+        heard = _inflate_correlated_fixes(self.measurements, errors, doubted=self.errors is not None)
         return build_timeline(heard, standing, self.output_ns)
 
     def passed(
@@ -125,21 +132,21 @@ class _Case:
 
     def prepared(self, timeline: EventTimeline, spans: Spans, *, follows: bool) -> FilterPass:
         """Return the pass before it is made."""
-        run = FilterPass(timeline, self.measurements, self.gate_probability, lags=lags_of(self.output_ns))
+        run = FilterPass(timeline, self.measurements, self.gate_probability, lags=compute_lag_rows(self.output_ns))
         if self.errors is not None:
             run.doubt_fixes(self.errors, spans, follows=follows)
         return run
 
 
-def _wrong_fixes(case: _Case, timeline: EventTimeline) -> WrongFixes | None:
+def _find_gnss_faults(case: _FilterSection, timeline: EventTimeline) -> GnssFaults | None:
     """Return when the fixes erred together, where that explains what contradicts them."""
     follower, _ = case.passed(timeline)
-    known = tuple((r.start_ns, r.end_ns) for r in reopenings(timeline, follower) if r.role == GNSS)
+    known = tuple((r.start_ns, r.end_ns) for r in find_gate_resets(timeline, follower) if r.role == GNSS)
     del follower
     plain, _ = case.passed(timeline, follows=False)
     usual = plain.usual()
 
-    def tried(spans: Spans) -> Explained:
+    def tried(spans: Spans) -> FaultHypothesis:
         run = case.prepared(timeline, spans, follows=False) if spans else plain
         if spans:
             run.filtered_like(plain, case.initial)
@@ -149,18 +156,18 @@ def _wrong_fixes(case: _Case, timeline: EventTimeline) -> WrongFixes | None:
 
 
 def _as_reopenings(
-    wrong: WrongFixes, outputs: NDArray[np.float64], output_ns: NDArray[np.int64]
+    wrong: GnssFaults, outputs: NDArray[np.float64], output_ns: NDArray[np.int64]
 ) -> tuple[Reopening, ...]:
     """Return the spans in which the fixes were wrong, with how far they were off; then those of which nobody can tell."""
     off_m = np.linalg.norm(outputs[:, kernel.SAVED - 3 : kernel.SAVED - 1], axis=1)
     found = []
     for span in wrong.spans:
-        within = off_m[inside(output_ns, (span,))]
+        within = off_m[is_inside(output_ns, (span,))]
         found.append(Reopening(GNSS, *span, float(within.max()) if within.size else wrong.size_m))
     return (*found, *(Reopening(GNSS, *span, wrong.size_m) for span in wrong.doubtful))
 
 
-def _counted(measurements: Measurements, errors: FixErrors | None, *, doubted: bool) -> Measurements:
+def _inflate_correlated_fixes(measurements: Measurements, errors: FixErrors | None, *, doubted: bool) -> Measurements:
     """Return the measurements with the variance of fixes that counts from one to the next: the claim, where nothing else holds the rest."""
     if errors is None or measurements.gnss is None:
         return measurements
@@ -169,13 +176,15 @@ def _counted(measurements: Measurements, errors: FixErrors | None, *, doubted: b
     if gnss.unclaimed is not None:
         variance = np.where(gnss.unclaimed[:, None], errors.white_m2, variance)
     if errors.of_metres:  # odometry knows better for half a minute: so often they count
-        together = max(1.0, _LASTS_S * 1e9 / median_period_ns(gnss.stamp_ns))
+        together = max(1.0, _LASTS_S * 1e9 / compute_median_period_ns(gnss.stamp_ns))
         lasting_m2 = np.median(errors.lasting_m2[:, 0])
         variance = np.maximum(variance, errors.lasting_m2) * min(together, lasting_m2 / _ODOMETRY_HOLDS_M**2)
     return replace(measurements, gnss=replace(measurements.gnss, variance_m2=variance))
 
 
-def _at_outputs(errors: FixErrors, measurements: Measurements, output_ns: NDArray[np.int64]) -> NDArray[np.float64]:
+def _interpolate_fix_error(
+    errors: FixErrors, measurements: Measurements, output_ns: NDArray[np.int64]
+) -> NDArray[np.float64]:
     """Return what lasts of the fixes' errors at each wanted stamp [m²], shape (N, 3)."""
     if measurements.gnss is None:
         return np.zeros((output_ns.size, 3))
@@ -183,20 +192,20 @@ def _at_outputs(errors: FixErrors, measurements: Measurements, output_ns: NDArra
     return np.asarray(errors.lasting_m2[nearest])
 
 
-def _levelled(
+def _level_start(
     measurements: Measurements, initial: InitialState, output_ns: NDArray[np.int64], gate_probability: float
 ) -> InitialState:
     """Return the start with the attitude that its first minute, smoothed, says it had: without an IMU it starts level, on any slope."""
     output_ns = output_ns[output_ns < output_ns[0] + _LEVELLING_NS]
-    first = part(measurements, np.iinfo(np.int64).min, int(output_ns[-1]))
-    timeline = build_timeline(first, standing_intervals(first), output_ns)
-    outputs = FilterPass(timeline, first, gate_probability, lags=lags_of(output_ns)).smoothed(initial)
+    first = select_measurements(measurements, np.iinfo(np.int64).min, int(output_ns[-1]))
+    timeline = build_timeline(first, find_stationary_intervals(first), output_ns)
+    outputs = FilterPass(timeline, first, gate_probability, lags=compute_lag_rows(output_ns)).smoothed(initial)
     if not np.isfinite(outputs[0]).all():
         return initial
     return replace(initial, quat_xyzw=quat_from_matrix(outputs[0, 0:9].reshape(3, 3)))
 
 
-def _unseen_scale_std(run: FilterPass, measurements: Measurements) -> float:
+def _compute_unseen_scale_std(run: FilterPass, measurements: Measurements) -> float:
     """Return what the fixes cannot tell of the odometry's scale: their error at both ends of the ground that they span.
 
     It is at most the scale's own deviation. The white part of the error of many fixes is the filter's business.

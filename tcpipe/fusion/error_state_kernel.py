@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.compiled import kernel
+from tcpipe.compiled import compile_kernel
 from tcpipe.fusion.prediction_kernel import predict
 from tcpipe.fusion.state_kernel import (
     ACCEPTED,
@@ -27,11 +27,11 @@ from tcpipe.fusion.state_kernel import (
     Matrix,
     N,
     Vector,
-    copied,
-    saved,
-    workspace,
+    allocate_workspace,
+    copy_values,
+    save_state,
 )
-from tcpipe.fusion.update_kernel import correct, innovation_of, observation
+from tcpipe.fusion.update_kernel import compute_innovation, compute_observation, correct
 
 FIXED = 1e-10
 """A scale of no more variance is held."""
@@ -43,8 +43,8 @@ _KNOWN_M = 0.1
 _MEAN_OF, SURELY, _WILD = 10, 2.5, 4.0
 
 
-@kernel
-def _lifted(kind: int, P: Matrix, y: Vector, alone: bool) -> None:  # noqa: FBT001
+@compile_kernel
+def _inflate_after_lockout(kind: int, P: Matrix, y: Vector, alone: bool) -> None:  # noqa: FBT001
     """Lift P after a lock-out so that the sensor can be heard again: the state may have jumped, or the sensor's scale."""
     if kind == GNSS_POSITION:
         P[2, 2] += 0.1**2
@@ -62,8 +62,8 @@ def _lifted(kind: int, P: Matrix, y: Vector, alone: bool) -> None:  # noqa: FBT0
                 P[9 + i, 9 + i] += y[0] * y[0] + y[1] * y[1] + y[2] * y[2]
 
 
-@kernel
-def _renewed(x: Vector, P: Matrix, variance: Vector) -> None:
+@compile_kernel
+def _reset_fix_error(x: Vector, P: Matrix, variance: Vector) -> None:
     """Forget the fixes' error: another one has taken its place."""
     for i in range(N, P.shape[0]):
         x[6 + i] = 0.0
@@ -74,8 +74,8 @@ def _renewed(x: Vector, P: Matrix, variance: Vector) -> None:
         P[i, i] = variance[i - N]
 
 
-@kernel
-def _drifts(y: Vector, S: Matrix, gate: float, opened: Vector) -> bool:
+@compile_kernel
+def _has_drift(y: Vector, S: Matrix, gate: float, opened: Vector) -> bool:
     """Whether innovations lie on one side on average, each of them within the gate as it may be; the mean follows in ``opened[3:]``."""
     size = 0.0
     for a in range(3):
@@ -85,7 +85,7 @@ def _drifts(y: Vector, S: Matrix, gate: float, opened: Vector) -> bool:
     return (2 * _MEAN_OF - 1) * size > SURELY * gate
 
 
-@kernel
+@compile_kernel
 def _is_gone(x: Vector, P: Matrix) -> bool:
     """Whether the fixes' error is known well enough to say that it is none."""
     gone = True
@@ -94,9 +94,9 @@ def _is_gone(x: Vector, P: Matrix) -> bool:
     return gone
 
 
-@kernel
-def most_drift(normal: Matrix) -> float:
-    """Return the largest that `_drifts` would see in normalised innovations, shape (F, 3)."""
+@compile_kernel
+def find_largest_drift(normal: Matrix) -> float:
+    """Return the largest that `_has_drift` would see in normalised innovations, shape (F, 3)."""
     mean = np.zeros(3)
     most = 0.0
     for row in range(normal.shape[0]):
@@ -109,8 +109,8 @@ def most_drift(normal: Matrix) -> float:
     return most
 
 
-@kernel
-def _faded(x: Vector, P: Matrix, kept: float, noise: Vector, opened: Vector, dt: float) -> None:
+@compile_kernel
+def _decay_fix_error(x: Vector, P: Matrix, kept: float, noise: Vector, opened: Vector, dt: float) -> None:
     """Let the fixes' error fade: ``kept`` of it remains, ``noise`` is added; where a gate has reopened it may stay as large as that."""
     for i in range(N, P.shape[0]):
         x[6 + i] *= kept
@@ -121,7 +121,7 @@ def _faded(x: Vector, P: Matrix, kept: float, noise: Vector, opened: Vector, dt:
         P[i, i] += noise[i - N] + opened[i - N] * max(1.0 - kept * kept, 0.0)
 
 
-@kernel
+@compile_kernel
 def filter_block(
     first: int,
     last: int,
@@ -177,7 +177,7 @@ def filter_block(
         each wanted stamp in turn.
     nis, innovation, verdict, outputs : filled for the events.
     """
-    work, gain = workspace(P.shape[0])
+    work, gain = allocate_workspace(P.shape[0])
     store_F, store_KH, store_y, store_P = store
     F = np.zeros((12 if keep else 0, 9))
     J = np.zeros((3, 3))
@@ -185,7 +185,7 @@ def filter_block(
     for e in range(first, last):
         kept = kept_error[e]
         if P.shape[0] > N:
-            _faded(x, P, kept, error_noise[e], opened, dt[e])
+            _decay_fix_error(x, P, kept, error_noise[e], opened, dt[e])
         if dt[e] > 0.0:
             predict(x, P, densities[mode[e]], q_v[e], dt[e], turn_rate[e], force[e], mode[e], F, work)
             for k in range(silent.size):
@@ -198,15 +198,15 @@ def filter_block(
             if k == GNSS_POSITION and opened[0] > 0.0 and _is_gone(x, P):
                 kept = 0.0
                 opened[:] = 0.0
-                _renewed(x, P, error_level[e])
-            value = innovation_of(k, x, P, z[e], r[e], turn_rate_now[e], levers[k], bias, work, gain)
+                _reset_fix_error(x, P, error_level[e])
+            value = compute_innovation(k, x, P, z[e], r[e], turn_rate_now[e], levers[k], bias, work, gain)
             hears = True
             verdict[e] = ACCEPTED
             for a in range(3):
                 innovation[e, a] = gain[0][a]
             off_for_long = False
             if k == GNSS_POSITION and lock_out[k, 3] > 0.0 and opened[0] == 0.0:
-                off_for_long = _drifts(gain[0], gain[2], gates[k], opened)
+                off_for_long = _has_drift(gain[0], gain[2], gates[k], opened)
             if off_for_long or not value <= gates[k]:
                 hears = False
                 verdict[e] = REFUSED
@@ -218,33 +218,35 @@ def filter_block(
                 if refused[k] >= lock_out[k, 0] and long:
                     if lock_out[k, 3] > 0.0 and P.shape[0] > N:
                         kept = 0.0  # either the fixes are right again, or they err in another way
-                        _renewed(x, P, error_level[e])
-                        again = innovation_of(k, x, P, z[e], r[e], turn_rate_now[e], levers[k], bias, work, gain)
+                        _reset_fix_error(x, P, error_level[e])
+                        again = compute_innovation(k, x, P, z[e], r[e], turn_rate_now[e], levers[k], bias, work, gain)
                         for a in range(3):
                             opened[a] = max(gain[0][a] ** 2, OFF_M**2) if again > SURELY * gates[k] else 0.0
                             opened[3 + a] = 0.0
                         if again > SURELY * gates[k]:
-                            _renewed(x, P, np.maximum(opened[:3], error_level[e]))
+                            _reset_fix_error(x, P, np.maximum(opened[:3], error_level[e]))
                     else:
-                        _lifted(k, P, gain[0], alone)
-                    again = innovation_of(k, x, P, z[e], r[e], turn_rate_now[e], levers[k], bias, work, gain)
+                        _inflate_after_lockout(k, P, gain[0], alone)
+                    again = compute_innovation(k, x, P, z[e], r[e], turn_rate_now[e], levers[k], bias, work, gain)
                     softer = max(again / gates[k], 1.0)
                     for a in range(3):
                         gain[2][a, a] = r[e, a] * softer * softer
-                    innovation_of(k, x, P, z[e], np.diag(gain[2]).copy(), turn_rate_now[e], levers[k], bias, work, gain)
+                    compute_innovation(
+                        k, x, P, z[e], np.diag(gain[2]).copy(), turn_rate_now[e], levers[k], bias, work, gain
+                    )
                     hears = True
                     verdict[e] = REOPENED
             nis[e] = value
         row = e - first
         if keep:
-            copied(F, store_F[row])
+            copy_values(F, store_F[row])
             store_y[row, 0] = 1.0 if dt[e] > 0.0 else 0.0
             store_y[row, 1] = 1.0 - dt[e] * densities[mode[e], DECAY]
             store_y[row, 2] = 1.0 if hears else 0.0
             store_y[row, 24] = kept
             if hears:
                 y, Z, _, _, inverse = gain
-                observation(work[0], Z, store_KH[row, 1])
+                compute_observation(work[0], Z, store_KH[row, 1])
                 for a in range(3):
                     store_y[row, 3 + a] = inverse[a, 0] * y[0] + inverse[a, 1] * y[1] + inverse[a, 2] * y[2]
                     for b in range(3):
@@ -254,14 +256,14 @@ def filter_block(
             refused[k] = 0.0
             silent[k] = 0.0
             if keep:
-                copied(work[1], store_KH[row, 0])
+                copy_values(work[1], store_KH[row, 0])
                 for a in range(3):
                     for b in range(3):
                         store_y[row, 15 + 3 * a + b] = J[a, b]
         if keep and output[e] >= 0:
-            copied(P, store_P[wanted])
+            copy_values(P, store_P[wanted])
             wanted += 1
         if output[e] >= 0:
-            saved(x, P, outputs[output[e]])
+            save_state(x, P, outputs[output[e]])
     repairs: float = work[8][0]
     return repairs

@@ -11,24 +11,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.fusion import state_kernel as kernel
-from tcpipe.fusion.error_state_kernel import OFF_M, SURELY, filter_block, most_drift
+from tcpipe.fusion.error_state_kernel import OFF_M, SURELY, filter_block, find_largest_drift
 from tcpipe.fusion.fix_errors import FixErrors
-from tcpipe.fusion.gates import chi_square_gate
+from tcpipe.fusion.gates import find_chi_square_threshold
+from tcpipe.fusion.gnss_faults import FaultHypothesis, Innovations, Jump, Spans, is_inside, unexplained_innovation
 from tcpipe.fusion.measurements import DOPPLER, GNSS, VISUAL, WHEELS, InitialState, Measurements
 from tcpipe.fusion.process import (
     SLOPE_RAD,
-    glides,
+    estimate_slope_std_rad,
+    is_gliding,
+    is_turned_by_course,
     process_noise,
     scale_stds,
-    slope_std_rad,
     turn_scale_std,
-    turns_by_course,
 )
-from tcpipe.fusion.signals import median_period_ns
+from tcpipe.fusion.signals import compute_median_period_ns
 from tcpipe.fusion.smoother_kernel import smooth_block
 from tcpipe.fusion.timeline import EventTimeline
 from tcpipe.fusion.trajectory import DISPLACEMENT_LAGS_S
-from tcpipe.fusion.wrong_fixes import Explained, Innovations, Jump, Spans, explained, inside
 from tcpipe.geometry.rotation import matrix_from_quat
 from tcpipe.tables.facts import Reopening
 
@@ -85,7 +85,7 @@ class FilterPass:
     ----------
     timeline, measurements : the events, and what they are made of.
     gate_probability : a measurement less likely than 1 minus this is refused.
-    lags : [rows of the wanted stamps], over which displacements are judged, see `lags_of`.
+    lags : [rows of the wanted stamps], over which displacements are judged, see `compute_lag_rows`.
     """
 
     def __init__(
@@ -106,11 +106,11 @@ class FilterPass:
         self.displacement_variance_m2 = np.full((timeline.output.max() + 1, len(DISPLACEMENT_LAGS_S)), np.nan)
         self.gates = np.full(kernel.KINDS, np.inf)
         for kind in (*ROLES, kernel.STANDING, kernel.STANDING_RATE):
-            self.gates[kind] = chi_square_gate(DOF[kind], gate_probability)
-        self._levers = _lever_arms(measurements)
+            self.gates[kind] = find_chi_square_threshold(DOF[kind], gate_probability)
+        self._levers = _collect_lever_arms(measurements)
         self._densities = process_noise(measurements)
         self._lock_out = _lock_out(measurements)
-        gnss, carriers = measurements.gnss, _carries(measurements)
+        gnss, carriers = measurements.gnss, _has_dead_reckoning(measurements)
         self._tilt_known = measurements.imu is not None
         self.carried = carriers and gnss is not None and float(np.median(gnss.variance_m2[:, 0])) < _CARRIED_M**2
         # Without GNSS nothing tells how long a metre of odometry is; an accelerometer has a scale and an alignment of its own.
@@ -119,9 +119,9 @@ class FilterPass:
         self.unseen_yaw_std = 0.0
         self.antenna_m = self._levers[kernel.GNSS_POSITION].copy()
         self.unplaced = measurements.gnss is None
-        self.along_course = glides(measurements)
-        self.turns_by_course = turns_by_course(measurements)
-        self.slope_std_rad = slope_std_rad(measurements) or SLOPE_RAD
+        self.along_course = is_gliding(measurements)
+        self.turns_by_course = is_turned_by_course(measurements)
+        self.slope_std_rad = estimate_slope_std_rad(measurements) or SLOPE_RAD
         if self.along_course:
             self._levers[:] = 0.0
         if measurements.imu is None and not measurements.odometries():
@@ -141,7 +141,7 @@ class FilterPass:
         fix = np.searchsorted(stamp_ns, self.timeline.stamp_ns, "right").clip(1, stamp_ns.size) - 1
         lasting_m2 = np.maximum(errors.lasting_m2, _LEAST_ERROR_M**2)
         if wrong:
-            lasting_m2[inside(stamp_ns, wrong)] = np.maximum(lasting_m2[inside(stamp_ns, wrong)], OFF_M**2)
+            lasting_m2[is_inside(stamp_ns, wrong)] = np.maximum(lasting_m2[is_inside(stamp_ns, wrong)], OFF_M**2)
         lasting_m2 = lasting_m2[fix]
         # What comes with another kind of fix comes when time passes next.
         passes = np.maximum.accumulate(np.where(self.timeline.dt_s > 0, np.arange(fix.size), 0))
@@ -172,18 +172,18 @@ class FilterPass:
             return False
         heard = of_gnss[~refused]
         normal = self.innovation[heard] / np.sqrt(self.timeline.variance[heard])
-        return bool(most_drift(normal) > SURELY * self.gates[kernel.GNSS_POSITION])
+        return bool(find_largest_drift(normal) > SURELY * self.gates[kernel.GNSS_POSITION])
 
     def jumps(self) -> list[Jump]:
         """Return where the gate of the fixes reopened, and which way they then were off."""
         rows = np.flatnonzero((self.timeline.kind == kernel.GNSS_POSITION) & (self.verdict == kernel.REOPENED))
         return [Jump(int(self.timeline.stamp_ns[row]), self.innovation[row, :2]) for row in rows]
 
-    def explained(self, spans: Spans, usual: float) -> Explained:
+    def explained(self, spans: Spans, usual: float) -> FaultHypothesis:
         """Return what remains unexplained if the fixes err in ``spans``; ``usual`` is the squared innovation of a fix that is right."""
         fixes = self._innovations(kernel.GNSS_POSITION)
         others = [self._innovations(kind) for kind in _WITHOUT_PLACE]
-        return explained(spans, fixes, others, usual)
+        return unexplained_innovation(spans, fixes, others, usual)
 
     def usual(self) -> float:
         """Return the mean squared normalised innovation of the fixes that the gate took."""
@@ -235,7 +235,7 @@ class FilterPass:
         """Make the filtered states, as `filtered` has kept them, smoothed ones."""
         n = self._errors
         adjoint, information = np.zeros(n), np.zeros((n, n))
-        links = _links(self.lags, n)
+        links = _allocate_links(self.lags, n)
         blocks = self._blocks()
         for index in range(len(blocks) - 1, -1, -1):
             first, last = blocks[index]
@@ -312,12 +312,12 @@ class FilterPass:
         )
 
 
-def _carries(m: Measurements) -> bool:
+def _has_dead_reckoning(m: Measurements) -> bool:
     """Return whether an IMU and an odometry, or a camera that sees all turns, carry the pose on without fixes."""
     return bool(m.odometries()) if m.imu is not None else m.visual is not None and m.visual.turn_rate_radps is not None
 
 
-def _lever_arms(measurements: Measurements) -> NDArray[np.float64]:
+def _collect_lever_arms(measurements: Measurements) -> NDArray[np.float64]:
     """Return the lever arm by kind of event [m], shape (9, 3)."""
     levers = np.zeros((kernel.KINDS, 3))
     for kind, source in (
@@ -344,7 +344,7 @@ def _lock_out(measurements: Measurements) -> NDArray[np.float64]:
     return lock_out
 
 
-def _links(lags: Sequence[int], n: int) -> tuple[NDArray[Any], ...]:
+def _allocate_links(lags: Sequence[int], n: int) -> tuple[NDArray[Any], ...]:
     """Return what the smoother remembers to link each wanted stamp to those ``lags`` rows later, in the kernel's order.
 
     The chain from the event at hand to the next wanted stamp; by node and row (a ring) the chains over the node's lag; by row the columns
@@ -401,7 +401,7 @@ def _start(
     return _Memory(x, P, np.zeros(kernel.KINDS), np.zeros(kernel.KINDS), np.zeros(6))
 
 
-def lags_of(output_ns: NDArray[np.int64]) -> list[int]:
+def compute_lag_rows(output_ns: NDArray[np.int64]) -> list[int]:
     """Rows that each of `DISPLACEMENT_LAGS_S` spans."""
-    period_s = median_period_ns(output_ns) * 1e-9 if output_ns.size > 1 else 1.0
+    period_s = compute_median_period_ns(output_ns) * 1e-9 if output_ns.size > 1 else 1.0
     return [max(1, round(lag_s / period_s)) for lag_s in DISPLACEMENT_LAGS_S]

@@ -6,17 +6,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.fusion import state_kernel as kernel
-from tcpipe.fusion.course import course_of
-from tcpipe.fusion.error_state_pass import DOF, ROLES, FilterPass, lags_of
+from tcpipe.fusion.course import compute_course
+from tcpipe.fusion.error_state_pass import DOF, ROLES, FilterPass, compute_lag_rows
 from tcpipe.fusion.measurements import GNSS
 from tcpipe.fusion.process import GROUND, UNSEEN_TURN_RADPS
 from tcpipe.fusion.timeline import EventTimeline
 from tcpipe.fusion.trajectory import DISPLACEMENT_LAGS_S, Rejections, Trajectory
 from tcpipe.geometry.rotation import matrix_from_quat, quat_from_matrix, quat_from_rpy
-from tcpipe.tables.facts import Reopening, StretchFacts, vector
+from tcpipe.tables.facts import Reopening, StretchFacts, make_vector
 
 
-def trajectory_of(
+def make_trajectory(
     timeline: EventTimeline, outputs: NDArray[np.float64], run: FilterPass, output_ns: NDArray[np.int64]
 ) -> Trajectory:
     """Return the trajectory at the wanted stamps [ns], of ``outputs`` as `FilterPass` gives them; they are changed in place.
@@ -35,7 +35,7 @@ def trajectory_of(
         # The course takes a sway of the antenna for a turn: nothing tells one from the other, and roll is taken to be none.
         outputs[:, 23:25] += (run.slope_std_rad * run.antenna_m[2] * rotation[:, :2, 1]) ** 2
     if run.unseen_yaw_std:
-        _doubt_yaw(outputs, rotation, run.unseen_yaw_std, run.antenna_m)
+        _add_unknown_yaw(outputs, rotation, run.unseen_yaw_std, run.antenna_m)
     bias = outputs[:, 9:12] * (timeline.output_rate_radps if run.turn_scale_std else timeline.output_has_gyro[:, None])
     return Trajectory(
         stamp_ns=output_ns,
@@ -46,12 +46,12 @@ def trajectory_of(
         position_std_m=np.sqrt(outputs[:, 23:26]),
         yaw_std_rad=np.sqrt(outputs[:, 26]),
         forward_velocity_std_mps=np.hypot(np.sqrt(outputs[:, 27]), scale_std * speed_mps),
-        rejections=_rejections(timeline, run),
+        rejections=_make_rejections(timeline, run),
         displacement_std_m=np.hypot(
-            np.hypot(_displacement_std_m(run, output_ns), _sway_m(run, speed_mps)),
+            np.hypot(_compute_displacement_std_m(run, output_ns), _compute_sway_m(run, speed_mps)),
             scale_std * speed_mps[:, None] * DISPLACEMENT_LAGS_S,
         ),
-        facts=_facts(timeline, run),
+        facts=_make_facts(timeline, run),
     )
 
 
@@ -59,7 +59,7 @@ def _look_along(
     outputs: NDArray[np.float64], output_ns: NDArray[np.int64], antenna_m: NDArray[np.float64], slope_std_rad: float
 ) -> NDArray[np.float64]:
     """Make the antenna's states the body's, level and along its course; return how fast that turns [rad/s], shape (N, 3)."""
-    yaw = course_of(outputs[:, 15:18])
+    yaw = compute_course(outputs[:, 15:18])
     rotation = matrix_from_quat(quat_from_rpy(0.0, 0.0, yaw))
     outputs[:, 0:9] = rotation.reshape(-1, 9)
     outputs[:, 18:21] -= rotation @ antenna_m
@@ -72,7 +72,7 @@ def _look_along(
     return rate
 
 
-def _sway_m(run: FilterPass, speed_mps: NDArray[np.float64]) -> NDArray[np.float64]:
+def _compute_sway_m(run: FilterPass, speed_mps: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return by how much an antenna on a body of unseen attitude moves otherwise than the body over each displacement, shape (N, 4)."""
     if not run.along_course:
         return np.zeros((speed_mps.size, 1))
@@ -80,7 +80,7 @@ def _sway_m(run: FilterPass, speed_mps: NDArray[np.float64]) -> NDArray[np.float
     return np.asarray(np.sqrt(tilt2) * abs(run.antenna_m[2]))
 
 
-def _doubt_yaw(
+def _add_unknown_yaw(
     outputs: NDArray[np.float64], rotation: NDArray[np.float64], yaw_std: float, antenna_m: NDArray[np.float64]
 ) -> None:
     """Add what cannot be known where yaw may be anything: itself, where below its antenna the robot is, and whether it drives forward."""
@@ -92,15 +92,15 @@ def _doubt_yaw(
     outputs[:, 27] += 1.5 * np.sum(velocity**2, axis=1)
 
 
-def _displacement_std_m(run: FilterPass, output_ns: NDArray[np.int64]) -> NDArray[np.float64]:
+def _compute_displacement_std_m(run: FilterPass, output_ns: NDArray[np.int64]) -> NDArray[np.float64]:
     std = np.sqrt(run.displacement_variance_m2)
-    for column, (lag, lag_s) in enumerate(zip(lags_of(output_ns), DISPLACEMENT_LAGS_S, strict=True)):
+    for column, (lag, lag_s) in enumerate(zip(compute_lag_rows(output_ns), DISPLACEMENT_LAGS_S, strict=True)):
         step_s = (output_ns[lag:] - output_ns[:-lag]) * 1e-9
         std[: step_s.size, column][np.abs(step_s - lag_s) > 0.1 * lag_s] = np.nan  # across a gap
     return std
 
 
-def _rejections(timeline: EventTimeline, run: FilterPass) -> Rejections:
+def _make_rejections(timeline: EventTimeline, run: FilterPass) -> Rejections:
     refused = np.flatnonzero((run.verdict == kernel.REFUSED) & np.isin(timeline.kind, list(ROLES)))
     kind = timeline.kind[refused]
     return Rejections(
@@ -112,7 +112,7 @@ def _rejections(timeline: EventTimeline, run: FilterPass) -> Rejections:
     )
 
 
-def reopenings(timeline: EventTimeline, run: FilterPass) -> tuple[Reopening, ...]:
+def find_gate_resets(timeline: EventTimeline, run: FilterPass) -> tuple[Reopening, ...]:
     """Return each reopening of a gate: since when the sensor was refused, and how far it was off."""
     found = []
     for event in np.flatnonzero(run.verdict == kernel.REOPENED):
@@ -127,7 +127,7 @@ def reopenings(timeline: EventTimeline, run: FilterPass) -> tuple[Reopening, ...
     return tuple(sorted((*run.wrong, *found), key=lambda reopening: reopening.start_ns))
 
 
-def _facts(timeline: EventTimeline, run: FilterPass) -> StretchFacts:
+def _make_facts(timeline: EventTimeline, run: FilterPass) -> StretchFacts:
     kinds = {role: timeline.kind == kind for kind, role in ROLES.items() if (timeline.kind == kind).any()}
     taken = {role: of_kind & (run.verdict == kernel.ACCEPTED) for role, of_kind in kinds.items()}
     dof = {role: DOF[kind] for kind, role in ROLES.items()}
@@ -140,11 +140,11 @@ def _facts(timeline: EventTimeline, run: FilterPass) -> StretchFacts:
         events=int(timeline.stamp_ns.size),
         standing_updates=int((timeline.kind == kernel.STANDING).sum()),
         gnss_lasting_error_m=run.lasting_error_m(),
-        reopenings=reopenings(timeline, run),
+        reopenings=find_gate_resets(timeline, run),
         covariance_repairs=int(run.repairs),
-        gyro_bias_radps=None if run.turn_scale_std else vector(x[9:12]),
+        gyro_bias_radps=None if run.turn_scale_std else make_vector(x[9:12]),
         turn_scale=float(1 + x[11]) if run.turn_scale_std else None,
-        accelerometer_bias_mps2=vector(x[12:15]),
+        accelerometer_bias_mps2=make_vector(x[12:15]),
         wheel_scale=float(1 + x[21]),
         wheel_scale_std=float(max(deviation[15], run.unseen_scale_std)),
         visual_scale=float(1 + x[22]),

@@ -16,7 +16,7 @@ from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter
 from numpy.typing import NDArray
 
 from tcpipe.fusion import ukf15_kernel as kernel
-from tcpipe.fusion.ukf15_events import ACCEPTED, RECOVERED, REJECTED, Belief, Events, Outputs, Sources
+from tcpipe.fusion.ukf15_events import ACCEPTED, RECOVERED, REJECTED, Events, FilterState, Outputs, Sources
 from tcpipe.geometry.angles import wrap_to_pi
 
 _ANGLE_ENTRIES = (kernel.ROLL, kernel.PITCH, kernel.YAW)
@@ -33,14 +33,16 @@ class _Measurement(NamedTuple):
     variance: _Array
 
 
-def _measurement(events: Events, sources: Sources, e: int) -> _Measurement:
+def _make_measurement(events: Events, sources: Sources, e: int) -> _Measurement:
     s = int(events.source[e])
     entries = sources.entries[s, : sources.width[s]]
     here = slice(int(events.at[e]), int(events.at[e]) + entries.size)
     return _Measurement(int(sources.kind[s]), entries, sources.lever_m[s], events.z[here], events.variance[here])
 
 
-def _circular(angles: tuple[int, ...]) -> tuple[Callable[[_Array, _Array], _Array], Callable[[_Array, _Array], _Array]]:
+def _make_circular_functions(
+    angles: tuple[int, ...],
+) -> tuple[Callable[[_Array, _Array], _Array], Callable[[_Array, _Array], _Array]]:
     """Return the mean of sigma points and the difference of two vectors whose entries ``angles`` lie on a circle."""
     on_circle = list(angles)
 
@@ -101,9 +103,9 @@ def observe(x: _Array, kind: int, entries: NDArray[np.int64], lever_m: _Array) -
     return np.asarray(seen[entries])
 
 
-def _new_filter(belief: Belief) -> UnscentedKalmanFilter:
+def _make_filter(belief: FilterState) -> UnscentedKalmanFilter:
     points = MerweScaledSigmaPoints(kernel.STATES, alpha=1.0, beta=2.0, kappa=0.0)
-    mean, difference = _circular(_ANGLE_ENTRIES)
+    mean, difference = _make_circular_functions(_ANGLE_ENTRIES)
     ukf = UnscentedKalmanFilter(
         dim_x=kernel.STATES,
         dim_z=1,
@@ -131,7 +133,7 @@ def _update(ukf: UnscentedKalmanFilter, measured: _Measurement, gate: float) -> 
     kind, entries, lever_m, z, variance = measured
     ukf.sigmas_f = ukf.points_fn.sigma_points(ukf.x, ukf.P)
     angles = tuple(k for k, state in enumerate(entries) if kind == kernel.SELECT and state in _ANGLE_ENTRIES)
-    ukf.z_mean, ukf.residual_z = _circular(angles)
+    ukf.z_mean, ukf.residual_z = _make_circular_functions(angles)
     before = ukf.x.copy(), ukf.P.copy()
     ukf.update(z, R=np.diag(variance), kind=kind, entries=entries, lever_m=lever_m)
     nis = float(ukf.y @ np.linalg.solve(ukf.S, ukf.y))
@@ -144,7 +146,7 @@ def _update(ukf: UnscentedKalmanFilter, measured: _Measurement, gate: float) -> 
 def _open_up(ukf: UnscentedKalmanFilter, measured: _Measurement) -> None:
     innovation = measured.z - observe(ukf.x, measured.kind, measured.entries, measured.lever_m)
     for at, entry in enumerate(measured.entries):
-        state = kernel.opened_state(measured.kind, entry)
+        state = kernel.find_observed_state(measured.kind, entry)
         if state in _ANGLE_ENTRIES:
             innovation[at] = min(abs(float(wrap_to_pi(innovation[at]))), kernel.MAX_OPENED_RAD)
         ukf.P[state, state] += innovation[at] ** 2
@@ -152,22 +154,22 @@ def _open_up(ukf: UnscentedKalmanFilter, measured: _Measurement) -> None:
             ukf.P[kernel.YAW, kernel.YAW] += kernel.MAX_OPENED_RAD**2
 
 
-def run(belief: Belief, q: NDArray[np.float64], events: Events, sources: Sources, outputs: Outputs) -> int:
+def run(belief: FilterState, q: NDArray[np.float64], events: Events, sources: Sources, outputs: Outputs) -> int:
     """Filter forward as `tcpipe.fusion.ukf15_kernel.run` does; a covariance that is not positive definite raises here."""
-    ukf = _new_filter(belief)
+    ukf = _make_filter(belief)
     refused, clock_s, e = belief.refused, float(belief.clock_s[0]), 0
     for k, output_s in enumerate(outputs.time_s.tolist()):
         while e < events.time_s.size and events.time_s[e] <= output_s:
             now_s, s = float(events.time_s[e]), int(events.source[e])
             _advance(ukf, q, now_s - clock_s)
             clock_s = max(clock_s, now_s)
-            measured = _measurement(events, sources, e)
+            measured = _make_measurement(events, sources, e)
             outputs.nis[e] = nis = _update(ukf, measured, float(sources.gate[s]))
             accepted = nis <= sources.gate[s]
             outputs.outcome[e] = ACCEPTED if accepted else REJECTED
             refused[s, 1] = refused[s, 1] if refused[s, 0] else now_s
             refused[s, 0] = 0.0 if accepted else refused[s, 0] + 1.0
-            if kernel.locked_out(*refused[s], now_s):
+            if kernel.is_locked_out(*refused[s], now_s):
                 _open_up(ukf, measured)
                 _update(ukf, measured, math.inf)
                 outputs.outcome[e], refused[s, 0] = RECOVERED, 0.0

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from tcpipe.fusion.measurements import Measurements, Positions
 from tcpipe.fusion.process import turn_sources
-from tcpipe.fusion.signals import integral, median_period_ns, seconds
+from tcpipe.fusion.signals import compute_median_period_ns, compute_seconds, integrate_signal
 
 Floats = NDArray[np.float64]
 
@@ -63,12 +63,14 @@ def find_fix_errors(measurements: Measurements) -> FixErrors | None:
         return None
     claimed = gnss.variance_m2
     white, lasting = claimed.copy(), np.zeros_like(claimed)
-    drawn = _drawn(measurements, gnss)
-    left = _left(gnss, drawn)
+    drawn = _draw_path(measurements, gnss)
+    left = _compute_residual_path(gnss, drawn)
     scatter = np.empty_like(claimed)
-    second = _second_differences(left)
-    scatter[:, 0] = scatter[:, 1] = _rolling_median(gnss, second) / (6 * _SQUARES_OF_TWO)
-    scatter[:, 2] = _rolling_median(gnss, _second_differences(gnss.position_enu_m[:, 2])) / (6 * _SQUARES_OF_ONE)
+    second = _compute_second_differences(left)
+    scatter[:, 0] = scatter[:, 1] = _compute_rolling_median(gnss, second) / (6 * _SQUARES_OF_TWO)
+    scatter[:, 2] = _compute_rolling_median(gnss, _compute_second_differences(gnss.position_enu_m[:, 2])) / (
+        6 * _SQUARES_OF_ONE
+    )
     least = np.minimum(np.maximum(0.01 * claimed, _LEAST_M**2), claimed)  # a robot that stands does not show it
     little = scatter < _LITTLE * claimed
     white[little] = np.maximum(scatter, least)[little]
@@ -76,7 +78,7 @@ def find_fix_errors(measurements: Measurements) -> FixErrors | None:
     if drawn is not None and gnss.unclaimed is not None:
         unclaimed = gnss.unclaimed & np.isfinite(scatter).all(1)
         white[unclaimed] = np.maximum(scatter, _LEAST_M**2)[unclaimed]
-        lasting[unclaimed] = _bends(gnss, np.abs(left) ** 2)[unclaimed]
+        lasting[unclaimed] = _compute_bends(gnss, np.abs(left) ** 2)[unclaimed]
     if drawn is not None:
         much = scatter > _FAR_MORE * claimed
         white[much] = scatter[much]
@@ -88,14 +90,14 @@ def find_fix_errors(measurements: Measurements) -> FixErrors | None:
     return FixErrors(white, lasting, lasts_s)
 
 
-def _bends(gnss: Positions, left_m2: Floats) -> Floats:
+def _compute_bends(gnss: Positions, left_m2: Floats) -> Floats:
     """Return what lasts of fixes that claim nothing: where they bend off the drawn path by more than an odometry does, shape (N, 3)."""
-    wander_m2 = _rolling_median(gnss, left_m2, _BLOCK_S) / _SQUARES_OF_TWO
+    wander_m2 = _compute_rolling_median(gnss, left_m2, _BLOCK_S) / _SQUARES_OF_TWO
     seen = np.where(wander_m2 > _BENDS_M**2, _SHARE_SEEN**2 * wander_m2, 0.0)
     return np.asarray(seen[:, None] * np.array([1.0, 1.0, 4.0]))
 
 
-def _drawn(measurements: Measurements, gnss: Positions) -> NDArray[np.complex128] | None:
+def _draw_path(measurements: Measurements, gnss: Positions) -> NDArray[np.complex128] | None:
     """Return the antenna's places as odometry and turn rates draw them, from any yaw; None where they do not."""
     odometries = list(measurements.odometries().values())
     imu, sources = measurements.imu, turn_sources(measurements)
@@ -104,23 +106,23 @@ def _drawn(measurements: Measurements, gnss: Positions) -> NDArray[np.complex128
     zero = int(gnss.stamp_ns[0])
     source = odometries[-1]
     if imu is not None:
-        turn_s, turn = seconds(imu.stamp_ns, zero), imu.angular_velocity_radps[:, 2:]
+        turn_s, turn = compute_seconds(imu.stamp_ns, zero), imu.angular_velocity_radps[:, 2:]
     else:
         known = np.isfinite(sources[-1].yaw_rate_radps)
-        turn_s, turn = seconds(sources[-1].stamp_ns[known], zero), sources[-1].yaw_rate_radps[known, None]
-    at_s, driven_s = seconds(gnss.stamp_ns, zero), seconds(source.stamp_ns, zero)
-    yaw = integral(turn_s, turn, driven_s)[:, 0]
+        turn_s, turn = compute_seconds(sources[-1].stamp_ns[known], zero), sources[-1].yaw_rate_radps[known, None]
+    at_s, driven_s = compute_seconds(gnss.stamp_ns, zero), compute_seconds(source.stamp_ns, zero)
+    yaw = integrate_signal(turn_s, turn, driven_s)[:, 0]
     velocity = source.velocity_mps[:, :1] * np.stack((np.cos(yaw), np.sin(yaw)), -1)
-    places = integral(driven_s, velocity, at_s) @ np.array([1.0, 1j])
+    places = integrate_signal(driven_s, velocity, at_s) @ np.array([1.0, 1j])
     lever = complex(*gnss.lever_arm_m[:2])
-    return np.asarray(places + lever * np.exp(1j * integral(turn_s, turn, at_s)[:, 0]), np.complex128)
+    return np.asarray(places + lever * np.exp(1j * integrate_signal(turn_s, turn, at_s)[:, 0]), np.complex128)
 
 
-def _left(gnss: Positions, drawn: NDArray[np.complex128] | None) -> NDArray[np.complex128]:
+def _compute_residual_path(gnss: Positions, drawn: NDArray[np.complex128] | None) -> NDArray[np.complex128]:
     """Return what is left of the fixes, east and i times north [m], when the drawn path is laid on them block by block; NaN in between."""
     places = gnss.position_enu_m[:, :2] @ np.array([1.0, 1j])
-    at_s = seconds(gnss.stamp_ns, int(gnss.stamp_ns[0]))
-    length_s = max(_BLOCK_S, _FEWEST * 1e-9 * median_period_ns(gnss.stamp_ns))
+    at_s = compute_seconds(gnss.stamp_ns, int(gnss.stamp_ns[0]))
+    length_s = max(_BLOCK_S, _FEWEST * 1e-9 * compute_median_period_ns(gnss.stamp_ns))
     left = np.full(places.size, np.nan + 0j)
     for first_s in np.arange(0.0, at_s[-1], length_s):
         rows = slice(*np.searchsorted(at_s, (first_s, first_s + length_s)))
@@ -136,16 +138,16 @@ def _left(gnss: Positions, drawn: NDArray[np.complex128] | None) -> NDArray[np.c
     return left
 
 
-def _second_differences(values: NDArray[np.complex128] | Floats) -> Floats:
+def _compute_second_differences(values: NDArray[np.complex128] | Floats) -> Floats:
     """Return the squared size of each second difference, NaN at the ends and beside NaN, shape (N,)."""
     squared = np.full(values.size, np.nan)
     squared[1:-1] = np.abs(np.diff(values, n=2)) ** 2
     return squared
 
 
-def _rolling_median(gnss: Positions, values: Floats, window_s: float = _WINDOW_S) -> Floats:
+def _compute_rolling_median(gnss: Positions, values: Floats, window_s: float = _WINDOW_S) -> Floats:
     """Return the median of the known values over some seconds around each fix, shape (N,); where none is known, that of all."""
-    count = max(_FEWEST, round(window_s * 1e9 / median_period_ns(gnss.stamp_ns)))
+    count = max(_FEWEST, round(window_s * 1e9 / compute_median_period_ns(gnss.stamp_ns)))
     known = np.flatnonzero(np.isfinite(values))
     if known.size < count:
         return np.full(values.size, np.nan)

@@ -5,18 +5,18 @@ from __future__ import annotations
 import math
 
 
-def chi_square_gate(freedom: int, probability: float) -> float:
+def find_chi_square_threshold(freedom: int, probability: float) -> float:
     """Return what a chi-square variate of ``freedom`` degrees stays below with this probability, [1].
 
     scipy.special has it too, and is what the tests compare with; it takes a third of a second to load.
     """
     low, high = 0.0, 4096.0
     while low < (middle := 0.5 * (low + high)) < high:
-        low, high = (middle, high) if _beyond(freedom, middle) > 1.0 - probability else (low, middle)
+        low, high = (middle, high) if _compute_chi_square_tail(freedom, middle) > 1.0 - probability else (low, middle)
     return high
 
 
-def _beyond(freedom: int, value: float) -> float:
+def _compute_chi_square_tail(freedom: int, value: float) -> float:
     """Return how likely a chi-square variate is larger (Abramowitz and Stegun, 26.4.4 and 26.4.5)."""
     half, odd = 0.5 * value, freedom % 2
     total = math.erfc(math.sqrt(half)) if odd else 0.0

@@ -16,10 +16,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.fusion.course import course_rate
+from tcpipe.fusion.course import compute_course_rate
 from tcpipe.fusion.measurements import BodyVelocities, InertialMeasurements, InitialState, Measurements, Positions
 from tcpipe.fusion.process import turn_sources
-from tcpipe.fusion.signals import integral, interval_means, is_covered, median_of_five, seconds
+from tcpipe.fusion.signals import (
+    compute_interval_means,
+    compute_median_of_five,
+    compute_seconds,
+    integrate_signal,
+    is_covered,
+)
 from tcpipe.geometry.rotation import quat_from_rpy, rotate, rpy_from_quat
 
 Floats = NDArray[np.float64]
@@ -43,10 +49,10 @@ def find_initial_state(measurements: Measurements, standing_ns: NDArray[np.int64
     standing_ns : [ns], shape (K, 2), when the robot stands.
     start_ns : [ns].
     """
-    bias, bias_std = _gyro_bias(measurements.imu, standing_ns)
-    roll, pitch, tilt_std = _tilt(measurements.imu, standing_ns, start_ns)
+    bias, bias_std = _estimate_gyro_bias(measurements.imu, standing_ns)
+    roll, pitch, tilt_std = _estimate_tilt(measurements.imu, standing_ns, start_ns)
     path = _Path(measurements, start_ns, bias)
-    yaw, yaw_std, heading_from = _yaw(measurements, path, start_ns, bias_std)
+    yaw, yaw_std, heading_from = _estimate_yaw(measurements, path, start_ns, bias_std)
     quat = quat_from_rpy(roll, pitch, yaw)
     position, position_std = _position(measurements.gnss, path, quat, yaw)
     velocity, velocity_std = path.start_velocity(yaw, pitch)
@@ -64,7 +70,7 @@ def find_initial_state(measurements: Measurements, standing_ns: NDArray[np.int64
     )
 
 
-def _gyro_bias(imu: InertialMeasurements | None, standing_ns: NDArray[np.int64]) -> tuple[Floats, float]:
+def _estimate_gyro_bias(imu: InertialMeasurements | None, standing_ns: NDArray[np.int64]) -> tuple[Floats, float]:
     if imu is None or standing_ns.size == 0:
         return np.zeros(3), _GYRO_BIAS_STD_RADPS
     inside = (imu.stamp_ns >= standing_ns[0, 0]) & (imu.stamp_ns <= standing_ns[0, 1])
@@ -74,7 +80,7 @@ def _gyro_bias(imu: InertialMeasurements | None, standing_ns: NDArray[np.int64])
     return mean, max(0.002, imu.gyro_std_radps / np.sqrt(inside.sum()))
 
 
-def _tilt(
+def _estimate_tilt(
     imu: InertialMeasurements | None, standing_ns: NDArray[np.int64], start_ns: int
 ) -> tuple[float, float, float]:
     """Roll and pitch [rad] at the start, and their standard deviation."""
@@ -86,9 +92,9 @@ def _tilt(
     own = rpy_from_quat(imu.quat_xyzw[oriented[0]]) if oriented.size else None
     if not imu.accelerometer_usable:
         return (0.0, 0.0, 0.2) if own is None else (float(own[0]), float(own[1]), 0.05)
-    stamp_s = seconds(imu.stamp_ns, start_ns)
+    stamp_s = compute_seconds(imu.stamp_ns, start_ns)
     span_s = np.array([(standing_ns[0, 0] if stands else start_ns) - start_ns, end - start_ns]) * 1e-9
-    fx, fy, fz = interval_means(stamp_s, imu.specific_force_mps2, span_s[:1], span_s[1:])[0]
+    fx, fy, fz = compute_interval_means(stamp_s, imu.specific_force_mps2, span_s[:1], span_s[1:])[0]
     roll, pitch = float(np.arctan2(fy, fz)), float(np.arctan2(-fx, np.hypot(fy, fz)))
     if own is not None and max(abs(own[0] - roll), abs(own[1] - pitch)) < _TILT_AGREES_RAD and not stands:
         return float(own[0]), float(own[1]), 0.05
@@ -100,13 +106,13 @@ class _Path:
 
     def __init__(self, measurements: Measurements, start_ns: int, bias: Floats) -> None:
         self.start_ns = start_ns
-        self._yaw_s, self._yaw_rate = _yaw_rate_samples(measurements, start_ns, bias)
-        source = _speed_source(measurements)
+        self._yaw_s, self._yaw_rate = _collect_yaw_rate(measurements, start_ns, bias)
+        source = _choose_speed_source(measurements)
         self.known = source is not None
         self._lever = np.zeros(2) if measurements.gnss is None else np.asarray(measurements.gnss.lever_arm_m)[:2]
         if source is None:
             return
-        self._stamp_s = seconds(source.stamp_ns, start_ns)
+        self._stamp_s = compute_seconds(source.stamp_ns, start_ns)
         self._speed = source.velocity_mps[:, 0]
         yaw = self.yaw(self._stamp_s)
         self._velocity = self._speed[:, None] * np.stack((np.cos(yaw), np.sin(yaw)), -1)
@@ -115,15 +121,17 @@ class _Path:
         """Yaw turned since the start [rad]."""
         if self._yaw_s.size == 0:
             return np.zeros(at_s.size)
-        turned = integral(self._yaw_s, self._yaw_rate, at_s) - integral(self._yaw_s, self._yaw_rate, np.zeros(1))
+        turned = integrate_signal(self._yaw_s, self._yaw_rate, at_s) - integrate_signal(
+            self._yaw_s, self._yaw_rate, np.zeros(1)
+        )
         return turned[:, 0]
 
     def antenna(self, at_s: Floats) -> NDArray[np.complex128]:
         """Antenna east + i north [m] as drawn."""
         antenna = np.asarray(complex(*self._lever) * np.exp(1j * self.yaw(at_s)), np.complex128)
         if self.known:
-            start = integral(self._stamp_s, self._velocity, np.zeros(1))
-            xy = integral(self._stamp_s, self._velocity, at_s) - start
+            start = integrate_signal(self._stamp_s, self._velocity, np.zeros(1))
+            xy = integrate_signal(self._stamp_s, self._velocity, at_s) - start
             antenna += xy[:, 0] + 1j * xy[:, 1]
         return antenna
 
@@ -132,7 +140,7 @@ class _Path:
         if not self.known:
             return max(until_s, 0.0)
         speed = np.abs(self._speed)[:, None]
-        return float(np.diff(integral(self._stamp_s, speed, np.array([0.0, max(until_s, 0.0)])), axis=0)[0, 0])
+        return float(np.diff(integrate_signal(self._stamp_s, speed, np.array([0.0, max(until_s, 0.0)])), axis=0)[0, 0])
 
     def start_velocity(self, yaw: float, pitch: float) -> tuple[Floats, float]:
         """Velocity at the start [m/s] and its standard deviation."""
@@ -142,49 +150,49 @@ class _Path:
         return speed * np.array([np.cos(yaw) * np.cos(pitch), np.sin(yaw) * np.cos(pitch), -np.sin(pitch)]), 0.3
 
 
-def _yaw_rate_samples(measurements: Measurements, start_ns: int, bias: Floats) -> tuple[Floats, Floats]:
+def _collect_yaw_rate(measurements: Measurements, start_ns: int, bias: Floats) -> tuple[Floats, Floats]:
     """Return samples of the yaw rate by the gyroscope, and through its gaps by what tells turning besides."""
     imu = measurements.imu
-    other_s, other_rate = _yaw_rate_without_gyroscope(measurements, start_ns)
+    other_s, other_rate = _collect_other_yaw_rate(measurements, start_ns)
     if imu is None or imu.stamp_ns.size == 0:
         return other_s, other_rate
     other_ns = start_ns + np.rint(other_s * 1e9).astype(np.int64)
     missing = ~is_covered(imu.stamp_ns, other_ns, other_ns)
-    stamp_s = np.concatenate((seconds(imu.stamp_ns, start_ns), other_s[missing]))
+    stamp_s = np.concatenate((compute_seconds(imu.stamp_ns, start_ns), other_s[missing]))
     rate = np.concatenate((imu.angular_velocity_radps[:, 2:] - bias[2], other_rate[missing]))
     order = np.argsort(stamp_s, kind="stable")
     return stamp_s[order], rate[order]
 
 
-def _yaw_rate_without_gyroscope(measurements: Measurements, start_ns: int) -> tuple[Floats, Floats]:
-    sources, odometry, gnss = turn_sources(measurements), _speed_source(measurements), measurements.gnss
+def _collect_other_yaw_rate(measurements: Measurements, start_ns: int) -> tuple[Floats, Floats]:
+    sources, odometry, gnss = turn_sources(measurements), _choose_speed_source(measurements), measurements.gnss
     if not sources and odometry is not None and gnss is not None and gnss.stamp_ns.size:
-        stamp_s, rate = course_rate(gnss, odometry, start_ns)
+        stamp_s, rate = compute_course_rate(gnss, odometry, start_ns)
         return stamp_s, rate[:, None]
     if not sources:
         return np.empty(0), np.empty((0, 1))
     source = sources[-1]
     known = np.isfinite(source.yaw_rate_radps)
-    return seconds(source.stamp_ns[known], start_ns), source.yaw_rate_radps[known, None]
+    return compute_seconds(source.stamp_ns[known], start_ns), source.yaw_rate_radps[known, None]
 
 
-def _speed_source(measurements: Measurements) -> BodyVelocities | None:
+def _choose_speed_source(measurements: Measurements) -> BodyVelocities | None:
     return next((source for source in measurements.odometries().values() if source.stamp_ns.size), None)
 
 
-def _yaw(measurements: Measurements, path: _Path, start_ns: int, bias_std: float) -> tuple[float, float, str]:
+def _estimate_yaw(measurements: Measurements, path: _Path, start_ns: int, bias_std: float) -> tuple[float, float, str]:
     """Yaw at the start [rad], its standard deviation, and where it is from."""
-    own = _own_yaw(measurements.imu, start_ns)
+    own = _read_own_yaw(measurements.imu, start_ns)
     if measurements.gnss is None or measurements.gnss.stamp_ns.size == 0:
         return (0.0, 0.01, "local frame") if own is None else (own, 0.01, "orientation")
-    fit = _course_fit(measurements.gnss, path, start_ns)
+    fit = _fit_course(measurements.gnss, path, start_ns)
     if fit is not None:
         std = float(np.hypot(np.hypot(fit.yaw_std_rad, 0.03), bias_std * fit.centre_s))
         return fit.yaw_rad, min(std, _UNKNOWN_YAW_STD_RAD), "course over ground"
     return (0.0, _UNKNOWN_YAW_STD_RAD, "unknown") if own is None else (own, _UNKNOWN_YAW_STD_RAD, "orientation")
 
 
-def _own_yaw(imu: InertialMeasurements | None, start_ns: int) -> float | None:
+def _read_own_yaw(imu: InertialMeasurements | None, start_ns: int) -> float | None:
     if imu is None:
         return None
     oriented = np.flatnonzero(np.isfinite(imu.quat_xyzw).all(1) & (imu.stamp_ns >= start_ns))
@@ -199,10 +207,12 @@ class _Fit:
     centre_s: float
 
 
-def _course_fit(gnss: Positions, path: _Path, start_ns: int) -> _Fit | None:
+def _fit_course(gnss: Positions, path: _Path, start_ns: int) -> _Fit | None:
     """Find the first window of fixes that the drawn path fits; the best of all where none fits well."""
-    stamp_s = seconds(gnss.stamp_ns, start_ns)
-    east_north = median_of_five(gnss.position_enu_m[:, 0]) + 1j * median_of_five(gnss.position_enu_m[:, 1])
+    stamp_s = compute_seconds(gnss.stamp_ns, start_ns)
+    east_north = compute_median_of_five(gnss.position_enu_m[:, 0]) + 1j * compute_median_of_five(
+        gnss.position_enu_m[:, 1]
+    )
     noise = float(np.median(np.sqrt(gnss.variance_m2[:, :2].mean(1))))
     wanted = max(_MIN_COURSE_M, _MIN_COURSE_STD * noise)
     drawn = path.antenna(stamp_s)
@@ -221,7 +231,7 @@ def _course_fit(gnss: Positions, path: _Path, start_ns: int) -> _Fit | None:
             continue
         fit = _fit(east_north[inside], drawn[inside], stamp_s[inside], noise) if path.known else None
         if not path.known:
-            return _course(east_north[inside], path.yaw(stamp_s[inside]), stamp_s[inside])
+            return _fit_course_to_fixes(east_north[inside], path.yaw(stamp_s[inside]), stamp_s[inside])
         if fit is None:
             continue
         if fit.residual_m <= max(3 * noise, 0.05 * wanted):
@@ -242,7 +252,7 @@ def _fit(fixes: NDArray[np.complex128], drawn: NDArray[np.complex128], stamp_s: 
     return _Fit(float(np.angle(product)), float(std), residual, float(stamp_s.mean()))
 
 
-def _course(fixes: NDArray[np.complex128], turned: Floats, stamp_s: Floats) -> _Fit:
+def _fit_course_to_fixes(fixes: NDArray[np.complex128], turned: Floats, stamp_s: Floats) -> _Fit:
     """Without odometry: each step between fixes goes forward, turned back by the yaw turned until then."""
     middle = 0.5 * (turned[1:] + turned[:-1])
     return _Fit(float(np.angle(np.sum(np.diff(fixes) * np.exp(-1j * middle)))), 0.2, 0.0, float(stamp_s.mean()))
@@ -253,7 +263,7 @@ def _position(gnss: Positions | None, path: _Path, quat: Floats, yaw: float) -> 
     if gnss is None or gnss.stamp_ns.size == 0:
         return np.zeros(3), np.full(3, 1e-3)
     few = slice(0, min(10, gnss.stamp_ns.size))
-    at_s = seconds(gnss.stamp_ns[few], path.start_ns)
+    at_s = compute_seconds(gnss.stamp_ns[few], path.start_ns)
     drawn = path.antenna(at_s) * np.exp(1j * yaw)
     position = np.array(
         [

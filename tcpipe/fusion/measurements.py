@@ -173,19 +173,19 @@ class InitialState:
 _Source = TypeVar("_Source", Positions, GroundVelocities, BodyVelocities, InertialMeasurements)
 
 
-def part(whole: Measurements, start_ns: int, end_ns: int) -> Measurements:
+def select_measurements(whole: Measurements, start_ns: int, end_ns: int) -> Measurements:
     """Return the measurements between two stamps, both included; a sensor without any is None."""
     return replace(
         whole,
-        gnss=_part(whole.gnss, start_ns, end_ns),
-        doppler=_part(whole.doppler, start_ns, end_ns),
-        imu=_part(whole.imu, start_ns, end_ns),
-        wheels=_part(whole.wheels, start_ns, end_ns),
-        visual=_part(whole.visual, start_ns, end_ns),
+        gnss=_select_source(whole.gnss, start_ns, end_ns),
+        doppler=_select_source(whole.doppler, start_ns, end_ns),
+        imu=_select_source(whole.imu, start_ns, end_ns),
+        wheels=_select_source(whole.wheels, start_ns, end_ns),
+        visual=_select_source(whole.visual, start_ns, end_ns),
     )
 
 
-def _part(source: _Source | None, start_ns: int, end_ns: int) -> _Source | None:
+def _select_source(source: _Source | None, start_ns: int, end_ns: int) -> _Source | None:
     if source is None:
         return None
     rows = slice(*np.searchsorted(source.stamp_ns, (start_ns, end_ns + 1)))

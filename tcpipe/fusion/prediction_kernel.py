@@ -14,7 +14,7 @@ from __future__ import annotations
 from math import sqrt
 from typing import Any
 
-from tcpipe.compiled import kernel
+from tcpipe.compiled import compile_kernel
 from tcpipe.fusion.state_kernel import (
     CENTRE_WEIGHT,
     DECAY,
@@ -29,22 +29,24 @@ from tcpipe.fusion.state_kernel import (
     Matrix,
     N,
     Vector,
-    difference,
-    displaced,
-    factor,
-    rotation_exp,
+    compute_error,
+    compute_rotation,
+    displace_state,
+    factorize_covariance,
 )
 
 
-@kernel
-def _propagated(x: Vector, w: Vector, a: Vector, dt: float, mode: int, q: Vector, out: Vector, turn: Vector) -> None:
+@compile_kernel
+def _propagate_state(
+    x: Vector, w: Vector, a: Vector, dt: float, mode: int, q: Vector, out: Vector, turn: Vector
+) -> None:
     """State after dt; see the module's equations. q as in `predict`."""
     h = 0.5 * dt
     if mode >= GYRO_TURN:
-        rotation_exp(h * (w[0] - x[9]), h * (w[1] - x[10]), h * (w[2] - x[11]), turn)
+        compute_rotation(h * (w[0] - x[9]), h * (w[1] - x[10]), h * (w[2] - x[11]), turn)
     else:
         s = q[SCALED]
-        rotation_exp(h * w[0] * (1.0 - s * x[9]), h * w[1] * (1.0 - s * x[10]), h * w[2] * (1.0 - s * x[11]), turn)
+        compute_rotation(h * w[0] * (1.0 - s * x[9]), h * w[1] * (1.0 - s * x[10]), h * w[2] * (1.0 - s * x[11]), turn)
     f0 = a[0] - x[12]
     f1 = a[1] - x[13]
     f2 = a[2] - x[14]
@@ -79,8 +81,10 @@ def _propagated(x: Vector, w: Vector, a: Vector, dt: float, mode: int, q: Vector
         out[i] = x[i]
 
 
-@kernel
-def _stray(P: Matrix, x: Vector, centre: Vector, q: Vector, q_v: float, dt: float, w: Vector, mode: int) -> None:
+@compile_kernel
+def _add_stray_noise(
+    P: Matrix, x: Vector, centre: Vector, q: Vector, q_v: float, dt: float, w: Vector, mode: int
+) -> None:
     """Add the noise of attitude and velocity over dt to P; see `predict`. A velocity that is kept in the body turns with its noise."""
     speed = sqrt(x[15] * x[15] + x[16] * x[16] + x[17] * x[17])
     for k in range(3):
@@ -105,7 +109,7 @@ def _stray(P: Matrix, x: Vector, centre: Vector, q: Vector, q_v: float, dt: floa
                 P[9 + i, 9 + j] += turned * vi * vj + more * centre[3 * i + k] * centre[3 * j + k]
 
 
-@kernel
+@compile_kernel
 def predict(
     x: Vector, P: Matrix, q: Vector, q_v: float, dt: float, w: Vector, a: Vector, mode: int, F: Matrix, work: Any
 ) -> None:
@@ -120,8 +124,8 @@ def predict(
     U, D, d, moved, middle, shifted, centre, turn, tally = work
     n = P.shape[0]
     gamma, wi = sqrt(n), 0.5 / n
-    factor(P, U, tally)
-    _propagated(x, w, a, dt, mode, q, centre, turn)
+    factorize_covariance(P, U, tally)
+    _propagate_state(x, w, a, dt, mode, q, centre, turn)
     for i in range(0, 9, 3):  # R exp(half the turn)
         for j in range(3):
             middle[i + j] = x[i] * turn[j] + x[i + 1] * turn[3 + j] + x[i + 2] * turn[6 + j]
@@ -136,9 +140,9 @@ def predict(
             d[j] = gamma * U[i, j] if j >= i else 0.0
         if i < 6:  # touches R or b_g
             for side in range(2):
-                displaced(x, d, 1.0 - 2.0 * side, i < 3, shifted, turn)
-                _propagated(shifted, w, a, dt, mode, q, moved, turn)
-                difference(moved, centre, D[side])
+                displace_state(x, d, 1.0 - 2.0 * side, i < 3, shifted, turn)
+                _propagate_state(shifted, w, a, dt, mode, q, moved, turn)
+                compute_error(moved, centre, D[side])
             for j in range(n):
                 mean[j] += wi * (D[0, j] + D[1, j])
             for r in range(n):
@@ -177,14 +181,14 @@ def predict(
             P[i, j] += (CENTRE_WEIGHT - 1.0) * mean[i] * mean[j]
         if i >= 3 and not 9 <= i < 12 and i < N:
             P[i, i] += q[i] * dt
-    _stray(P, x, centre, q, q_v, dt, w, mode)
+    _add_stray_noise(P, x, centre, q, q_v, dt, w, mode)
     if F.shape[0] > 0:
-        _transition(x, middle, centre, dt, mode, U, F)
-    displaced(centre, mean, 1.0, True, x, turn)
+        _complete_transition(x, middle, centre, dt, mode, U, F)
+    displace_state(centre, mean, 1.0, True, x, turn)
 
 
-@kernel
-def _transition(x: Vector, middle: Vector, centre: Vector, dt: float, mode: int, U: Matrix, F: Matrix) -> None:
+@compile_kernel
+def _complete_transition(x: Vector, middle: Vector, centre: Vector, dt: float, mode: int, U: Matrix, F: Matrix) -> None:
     """Complete F' = P⁻¹ C = U⁻¹ M, of which rows 0 to 5 hold M; what b_a, v and p become is linear and known."""
     h = 0.5 * dt
     for m in range(3):

@@ -22,10 +22,16 @@ from tcpipe.fusion.measurements import (
     InertialMeasurements,
     Positions,
 )
-from tcpipe.fusion.pose_increments import along_pose_axes, has_twist, in_child_axes, increments, orientation_rates
-from tcpipe.fusion.signals import median_period_ns, white_noise
+from tcpipe.fusion.pose_increments import (
+    compute_increments,
+    compute_orientation_rates,
+    has_twist,
+    is_along_pose_axes,
+    rotate_to_child_axes,
+)
+from tcpipe.fusion.signals import compute_median_period_ns, estimate_white_noise
 from tcpipe.geometry.datum import enu_from_geodetic
-from tcpipe.geometry.rotation import inverse, matrix_from_quat, normalized, product, rotate
+from tcpipe.geometry.rotation import invert, matrix_from_quat, multiply, normalize, rotate
 from tcpipe.tables.findings import Finding, Subject, make_finding
 
 Floats = NDArray[np.float64]
@@ -82,7 +88,7 @@ def _is_fix(lon_deg: Floats, lat_deg: Floats, alt_m: Floats) -> Mask:
     return fix
 
 
-def positions(
+def prepare_positions(
     stamp_ns: Ints,
     columns: Columns,
     *,
@@ -93,31 +99,33 @@ def positions(
 ) -> tuple[Positions, Prepared]:
     """Prepare GNSS fixes (columns of the role gnss); unknown variances: ``default_std_m`` horizontally, twice that vertically."""
     lon, lat, alt = columns["lon_deg"], columns["lat_deg"], columns["alt_m"]
-    usable, repeated = _usable(stamp_ns, _is_fix(lon, lat, alt))
+    usable, repeated = _select_usable_rows(stamp_ns, _is_fix(lon, lat, alt))
     variance = np.stack([columns[f"{axis}_var_m2"] for axis in ("east", "north", "up")], -1)[usable]
     default = np.square(default_std_m * np.array([1.0, 1.0, 2.0]))
-    unclaimed = np.asarray(~_known(variance[:, :2]).all(1))
-    variance, replaced = _variances(variance, default, floor_std_m**2)
+    unclaimed = np.asarray(~_is_known(variance[:, :2]).all(1))
+    variance, replaced = _clean_variances(variance, default, floor_std_m**2)
     fixes = enu_from_geodetic(lon[usable], lat[usable], alt[usable], datum_deg_m=datum_deg_m)
     prepared = Prepared(stamp_ns[~_is_fix(lon, lat, alt)], repeated, replaced)
     return Positions(stamp_ns[usable], fixes, variance, lever_arm_m, unclaimed if unclaimed.any() else None), prepared
 
 
-def ground_velocities(stamp_ns: Ints, columns: Columns, *, default_std_mps: float) -> tuple[GroundVelocities, Prepared]:
+def prepare_ground_velocities(
+    stamp_ns: Ints, columns: Columns, *, default_std_mps: float
+) -> tuple[GroundVelocities, Prepared]:
     """Prepare a receiver's velocities (columns of the role gnss_velocity); unknown variances: ``default_std_mps``, twice that for up."""
-    velocity = _matrix(columns, [f"{axis}_velocity_mps" for axis in ("east", "north", "up")])
-    variance = _matrix(columns, [f"{axis}_var_m2ps2" for axis in ("east", "north", "up")])
+    velocity = _make_rotation_matrix(columns, [f"{axis}_velocity_mps" for axis in ("east", "north", "up")])
+    variance = _make_rotation_matrix(columns, [f"{axis}_var_m2ps2" for axis in ("east", "north", "up")])
     measured = np.asarray(np.isfinite(velocity[:, :2]).all(1) & ~(np.abs(velocity) >= _MAX_VELOCITY_MPS).any(1))
-    usable, repeated = _usable(stamp_ns, measured)
+    usable, repeated = _select_usable_rows(stamp_ns, measured)
     velocity, variance = velocity[usable], variance[usable]
     default = np.square(default_std_mps * np.array([1.0, 1.0, 2.0]))
-    variance, replaced = _variances(variance, default, _VELOCITY_FLOOR_MPS**2)
+    variance, replaced = _clean_variances(variance, default, _VELOCITY_FLOOR_MPS**2)
     variance[np.isnan(velocity[:, 2]), 2] = _NO_TRUST
     made = GroundVelocities(stamp_ns[usable], np.nan_to_num(velocity), variance)
     return made, Prepared(stamp_ns[~measured], repeated, replaced)
 
 
-def body_velocities(
+def prepare_body_velocities(
     stamp_ns: Ints,
     columns: Columns,
     *,
@@ -139,45 +147,45 @@ def body_velocities(
     default_std_mps : [m/s], where the variance is unknown.
     only_forward : wheels measure only the velocity along base_link's x.
     """
-    pose = _matrix(columns, ("x_m", "y_m", "z_m"))
-    velocity = _matrix(columns, [f"velocity_{axis}_mps" for axis in "xyz"])
-    rate = _matrix(columns, [f"angular_velocity_{axis}_radps" for axis in "xyz"])
-    variance = _matrix(columns, [f"velocity_var_{axis}_m2ps2" for axis in "xyz"])
+    pose = _make_rotation_matrix(columns, ("x_m", "y_m", "z_m"))
+    velocity = _make_rotation_matrix(columns, [f"velocity_{axis}_mps" for axis in "xyz"])
+    rate = _make_rotation_matrix(columns, [f"angular_velocity_{axis}_radps" for axis in "xyz"])
+    variance = _make_rotation_matrix(columns, [f"velocity_var_{axis}_m2ps2" for axis in "xyz"])
     subject = Subject("role", WHEELS if only_forward else VISUAL)
     findings: list[Finding] = []
-    quat = normalized(_matrix(columns, [f"quat_{c}" for c in "xyzw"]))
+    quat = normalize(_make_rotation_matrix(columns, [f"quat_{c}" for c in "xyzw"]))
     rotation = matrix_from_quat(quat_xyzw)
-    if not has_twist(_turned(rotation, velocity)[:, :1], pose):
-        stamp_ns, velocity, rate = increments(stamp_ns, pose, quat)
+    if not has_twist(_rotate_vectors(rotation, velocity)[:, :1], pose):
+        stamp_ns, velocity, rate = compute_increments(stamp_ns, pose, quat)
         variance = np.full_like(velocity, np.nan)
         yaw_rate_var = np.full(stamp_ns.size, np.nan)
         findings.append(make_finding("pose-increments", subject))
     else:
         yaw_rate_var = columns["yaw_rate_var"]
-        if along_pose_axes(stamp_ns, velocity, pose, quat):
-            velocity = in_child_axes(velocity, quat)
+        if is_along_pose_axes(stamp_ns, velocity, pose, quat):
+            velocity = rotate_to_child_axes(velocity, quat)
             findings.append(make_finding("twist-in-pose-frame", subject))
-        rates, of_orientation = orientation_rates(stamp_ns, rate, quat)
+        rates, of_orientation = compute_orientation_rates(stamp_ns, rate, quat)
         if of_orientation[2] or not only_forward:
             rate = rates
             findings += _find_orientation_rates(of_orientation, subject)
-    turned = _turned(rotation, velocity)
+    turned = _rotate_vectors(rotation, velocity)
     measured = np.isfinite(turned[:, 0]) & ~(np.abs(turned) >= _MAX_VELOCITY_MPS).any(1)
-    usable, repeated = _usable(stamp_ns, measured)
+    usable, repeated = _select_usable_rows(stamp_ns, measured)
     # Off-diagonal terms that the rotation makes are dropped.
-    variance = _turned(rotation**2, variance[usable])
+    variance = _rotate_vectors(rotation**2, variance[usable])
     turned = turned[usable]
     variance[np.isnan(turned)] = _NO_TRUST
-    variance, replaced = _variances(variance, np.full(3, default_std_mps**2), _VELOCITY_FLOOR_MPS**2)
-    turn_rate = _turned(rotation, rate)[usable]
+    variance, replaced = _clean_variances(variance, np.full(3, default_std_mps**2), _VELOCITY_FLOOR_MPS**2)
+    turn_rate = _rotate_vectors(rotation, rate)[usable]
     yaw_rate = turn_rate[:, 2]
     floor = _YAW_RATE_FLOOR_RADPS**2
-    yaw_rate_var = _variances(yaw_rate_var[usable, None], np.array([_YAW_RATE_STD_RADPS**2]), floor)[0][:, 0]
-    yaw_rate_var = np.maximum(yaw_rate_var, _shown_variance(stamp_ns[usable], yaw_rate, yaw_rate_var))
-    shown = _shown_variance(stamp_ns[usable], turned[:, 0], variance[:, 0])
+    yaw_rate_var = _clean_variances(yaw_rate_var[usable, None], np.array([_YAW_RATE_STD_RADPS**2]), floor)[0][:, 0]
+    yaw_rate_var = np.maximum(yaw_rate_var, _estimate_shown_variance(stamp_ns[usable], yaw_rate, yaw_rate_var))
+    shown = _estimate_shown_variance(stamp_ns[usable], turned[:, 0], variance[:, 0])
     if shown.any():
         variance = np.maximum(variance, shown[:, None])
-        turned = _moving_mean(stamp_ns[usable], turned)
+        turned = _compute_moving_mean(stamp_ns[usable], turned)
         findings.append(make_finding("velocity-scatters", subject, mean_s=_MEAN_S))
     if only_forward:
         turned[:, 1:] = np.nan
@@ -195,7 +203,7 @@ def _find_orientation_rates(of_orientation: Mask, subject: Subject) -> list[Find
     return [make_finding("rate-from-orientation", subject, names={"axes": axes})] if axes else []
 
 
-def _shown_variance(stamp_ns: Ints, values: Floats, variance: Floats) -> Floats:
+def _estimate_shown_variance(stamp_ns: Ints, values: Floats, variance: Floats) -> Floats:
     """Return the variance that samples (N,) show around each where they mostly scatter by much more than is claimed; zeros elsewhere."""
     known = np.flatnonzero(np.isfinite(values))
     second = np.abs(np.diff(values[known], n=2))
@@ -205,11 +213,11 @@ def _shown_variance(stamp_ns: Ints, values: Floats, variance: Floats) -> Floats:
         return shown
     noise = 1.4826 / np.sqrt(6.0) * float(np.median(second[moving]))
     if noise > _SCATTERS_MORE * float(np.sqrt(np.median(variance[known]))):
-        shown[known] = np.square(_local_noise(stamp_ns[known], values[known, None]))
+        shown[known] = np.square(_estimate_local_noise(stamp_ns[known], values[known, None]))
     return shown
 
 
-def _moving_mean(stamp_ns: Ints, values: Floats) -> Floats:
+def _compute_moving_mean(stamp_ns: Ints, values: Floats) -> Floats:
     """Return the mean of the samples (N, k) from a quarter of a second before each to a quarter after."""
     half_ns = round(_MEAN_S * 0.5e9)
     first = np.searchsorted(stamp_ns, stamp_ns - half_ns, "left")
@@ -218,14 +226,14 @@ def _moving_mean(stamp_ns: Ints, values: Floats) -> Floats:
     return np.asarray((total[last] - total[first]) / (last - first)[:, None])
 
 
-def _turned(matrix: Floats, values: Floats) -> Floats:
+def _rotate_vectors(matrix: Floats, values: Floats) -> Floats:
     """Return ``matrix`` (3, 3) times vectors (N, 3); NaN, what is not measured, makes each axis NaN into which it turns."""
     unknown = np.isnan(values)
     turned = np.where(unknown, 0.0, values) @ matrix.T
     return np.where(unknown @ (np.abs(matrix).T > _TURNS_INTO), np.nan, turned)
 
 
-def inertial(
+def prepare_imu(
     stamp_ns: Ints,
     columns: Columns,
     *,
@@ -239,17 +247,17 @@ def inertial(
     The specific force is moved to base_link: what the unit feels beyond base_link, since it sits off it and the robot turns, is taken
     off. The noise is the one given or, where that is larger, what the samples show: motion too fast for the unit's rate counts as noise.
     """
-    rate = _matrix(columns, [f"angular_velocity_{axis}_radps" for axis in "xyz"])
-    force = _matrix(columns, [f"linear_acceleration_{axis}_mps2" for axis in "xyz"])
+    rate = _make_rotation_matrix(columns, [f"angular_velocity_{axis}_radps" for axis in "xyz"])
+    force = _make_rotation_matrix(columns, [f"linear_acceleration_{axis}_mps2" for axis in "xyz"])
     of_orientation = np.zeros(3, np.bool_)
     if (np.nan_to_num(rate) == 0.0).all(0).any() and np.nan_to_num(
         np.diff(force, axis=0)
     ).any():  # a dead IMU stays dead
-        quat = normalized(_matrix(columns, [f"quat_{c}" for c in "xyzw"]))
-        rate, of_orientation = orientation_rates(stamp_ns, rate, quat)
+        quat = normalize(_make_rotation_matrix(columns, [f"quat_{c}" for c in "xyzw"]))
+        rate, of_orientation = compute_orientation_rates(stamp_ns, rate, quat)
     # NaN compares false.
     good: Mask = np.all(np.abs(rate) < _MAX_RATE_RADPS, 1) & np.all(np.abs(force) < _MAX_FORCE_MPS2, 1)
-    usable, repeated = _usable(stamp_ns, good)
+    usable, repeated = _select_usable_rows(stamp_ns, good)
     if usable.size < stamp_ns.size:
         rate, force = rate[usable], force[usable]
     norm = float(np.median(np.linalg.norm(force, axis=1))) if usable.size else 0.0
@@ -258,17 +266,17 @@ def inertial(
     weighs = not usable.size or low <= norm <= high
     if not weighs:
         findings.append(make_finding("specific-force-implausible", _IMU, force_mps2=norm))
-    gyro_std = max(gyro_std_radps, white_noise(rate))
-    noise = np.maximum(accelerometer_std_mps2, _local_noise(stamp_ns[usable], force))
-    accelerometer_std = max(accelerometer_std_mps2, white_noise(force))
-    for piece in _pieces(usable.size):
+    gyro_std = max(gyro_std_radps, estimate_white_noise(rate))
+    noise = np.maximum(accelerometer_std_mps2, _estimate_local_noise(stamp_ns[usable], force))
+    accelerometer_std = max(accelerometer_std_mps2, estimate_white_noise(force))
+    for piece in _iterate_slices(usable.size):
         rate[piece], force[piece] = rotate(quat_xyzw, rate[piece]), rotate(quat_xyzw, force[piece])
     _move_to_base_link(stamp_ns[usable], rate, force, np.asarray(xyz_m))
     made = InertialMeasurements(
         stamp_ns[usable],
         rate,
         force,
-        _orientations(columns, usable, quat_xyzw),
+        _read_orientations(columns, usable, quat_xyzw),
         gyro_std,
         accelerometer_std,
         weighs,
@@ -277,20 +285,20 @@ def inertial(
     return made, Prepared(stamp_ns[~good], repeated, 0, tuple(findings))
 
 
-def _pieces(rows: int) -> Iterator[slice]:
+def _iterate_slices(rows: int) -> Iterator[slice]:
     """Yield slices of so many rows: what is reckoned row by row takes little room then, however long a log is."""
     return (slice(first, first + _PIECE) for first in range(0, rows, _PIECE))
 
 
-def _orientations(columns: Columns, usable: Ints, quat_xyzw: tuple[float, float, float, float]) -> Floats:
+def _read_orientations(columns: Columns, usable: Ints, quat_xyzw: tuple[float, float, float, float]) -> Floats:
     """Return enu_from_base_link by the unit's own filter, shape (N, 4); NaN where it tells none."""
     told = [columns[f"quat_{c}"] for c in "xyzw"]
     if any(np.isnan(component).all() for component in told):
         return np.broadcast_to(np.nan, (usable.size, 4))
     found = np.empty((usable.size, 4))
-    for piece in _pieces(usable.size):
-        unit = normalized(np.stack([component[usable[piece]] for component in told], -1))
-        found[piece] = product(unit, inverse(quat_xyzw))
+    for piece in _iterate_slices(usable.size):
+        unit = normalize(np.stack([component[usable[piece]] for component in told], -1))
+        found[piece] = multiply(unit, invert(quat_xyzw))
     return found
 
 
@@ -302,19 +310,19 @@ def _move_to_base_link(stamp_ns: Ints, turn_radps: Floats, force_mps2: Floats, l
     """
     if stamp_ns.size < 5 or not lever_m.any():
         return
-    ten_periods_s = 10e-9 * median_period_ns(stamp_ns)
-    for piece in _pieces(stamp_ns.size):
+    ten_periods_s = 10e-9 * compute_median_period_ns(stamp_ns)
+    for piece in _iterate_slices(stamp_ns.size):
         rows = np.arange(piece.start - 2, min(piece.stop, stamp_ns.size) + 2)
         smooth = turn_radps[rows.clip(0, stamp_ns.size - 1)]
         slope = (2 * (smooth[4:] - smooth[:-4]) + smooth[3:-1] - smooth[1:-3]) / ten_periods_s
         force_mps2[piece] -= np.cross(slope, lever_m) + np.cross(smooth[2:-2], np.cross(smooth[2:-2], lever_m))
 
 
-def _local_noise(stamp_ns: Ints, values: Floats) -> Floats:
+def _estimate_local_noise(stamp_ns: Ints, values: Floats) -> Floats:
     """Estimate the white noise over two seconds around each sample, the largest of the axes, shape (N,)."""
     if values.shape[0] < 3:
         return np.zeros(values.shape[0])
-    half = max(1, round(_NOISE_WINDOW_S * 0.5e9 / median_period_ns(stamp_ns)))
+    half = max(1, round(_NOISE_WINDOW_S * 0.5e9 / compute_median_period_ns(stamp_ns)))
     row = np.arange(values.shape[0]) - 1
     last_row = values.shape[0] - 2
     first, last = np.clip(row - half, 0, last_row), np.clip(row + half + 1, 0, last_row)
@@ -325,11 +333,11 @@ def _local_noise(stamp_ns: Ints, values: Floats) -> Floats:
     return np.asarray(np.sqrt(largest / np.maximum(last - first, 1)))
 
 
-def _matrix(columns: Columns, names: list[str] | tuple[str, ...]) -> Floats:
+def _make_rotation_matrix(columns: Columns, names: list[str] | tuple[str, ...]) -> Floats:
     return np.stack([columns[name] for name in names], -1)
 
 
-def _usable(stamp_ns: Ints, good: Mask) -> tuple[Ints, int]:
+def _select_usable_rows(stamp_ns: Ints, good: Mask) -> tuple[Ints, int]:
     """Return rows in order of time, one a stamp (the first of equals), and how many repeated one."""
     rows = np.flatnonzero(good)
     if (np.diff(stamp_ns[rows]) > 0).all():
@@ -338,16 +346,24 @@ def _usable(stamp_ns: Ints, good: Mask) -> tuple[Ints, int]:
     return rows[first], int(rows.size - first.size)
 
 
-def _known(variance: Floats) -> Mask:
+def _is_known(variance: Floats) -> Mask:
     known: Mask = np.isfinite(variance) & (variance > 0)
     return known
 
 
-def _variances(variance: Floats, default: Floats, floor: float) -> tuple[Floats, int]:
+def _clean_variances(variance: Floats, default: Floats, floor: float) -> tuple[Floats, int]:
     """Return usable variances (N, k) and how many rows had one replaced."""
-    known = _known(variance)
+    known = _is_known(variance)
     filled = np.clip(np.where(known, variance, default), floor, _NO_TRUST)
     return filled, int((~known).any(1).sum())
 
 
-__all__ = ["Columns", "Prepared", "body_velocities", "find_datum", "ground_velocities", "inertial", "positions"]
+__all__ = [
+    "Columns",
+    "Prepared",
+    "find_datum",
+    "prepare_body_velocities",
+    "prepare_ground_velocities",
+    "prepare_imu",
+    "prepare_positions",
+]

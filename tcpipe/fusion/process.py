@@ -15,7 +15,14 @@ from numpy.typing import NDArray
 
 from tcpipe.fusion import state_kernel as kernel
 from tcpipe.fusion.measurements import BodyVelocities, GroundVelocities, InertialMeasurements, Measurements, Positions
-from tcpipe.fusion.signals import in_gap, median_of_five, median_period_ns, seconds, slopes, white_noise
+from tcpipe.fusion.signals import (
+    compute_median_of_five,
+    compute_median_period_ns,
+    compute_seconds,
+    compute_slopes,
+    estimate_white_noise,
+    is_in_gap,
+)
 
 WHEEL_SCALE_STD = 0.12  # a skid-steered robot on grass slips by so much
 VISUAL_SCALE_STD = 0.05
@@ -48,32 +55,34 @@ def turn_sources(measurements: Measurements) -> list[BodyVelocities]:
     return [source for source in measurements.odometries().values() if np.isfinite(source.yaw_rate_radps).any()]
 
 
-def glides(measurements: Measurements) -> bool:
+def is_gliding(measurements: Measurements) -> bool:
     """Return whether positions are all there is, too noisy to show a course.
 
     The velocity then strays over ground, and which way the body looks is not asked.
     """
     alone = measurements.imu is None and not measurements.odometries()
-    return alone and measurements.gnss is not None and _fix_velocity_std_mps(measurements.gnss) > _SHOWS_COURSE_MPS
+    return (
+        alone and measurements.gnss is not None and _compute_fix_velocity_std_mps(measurements.gnss) > _SHOWS_COURSE_MPS
+    )
 
 
-def turns_by_course(measurements: Measurements) -> bool:
+def is_turned_by_course(measurements: Measurements) -> bool:
     """Return whether the course over ground is all that tells how the robot turns."""
     told = measurements.imu is not None or turn_sources(measurements)
-    return not told and measurements.gnss is not None and not glides(measurements)
+    return not told and measurements.gnss is not None and not is_gliding(measurements)
 
 
-def _fix_velocity_std_mps(gnss: Positions) -> float:
-    """Return how well the fixes of `_window_s` show a velocity: the slope of a line through them."""
-    fixes = max(2.0, _window_s(gnss) * 1e9 / median_period_ns(gnss.stamp_ns))
-    return float(np.sqrt(12.0 / fixes * np.median(gnss.variance_m2[:, :2]))) / _window_s(gnss)
+def _compute_fix_velocity_std_mps(gnss: Positions) -> float:
+    """Return how well the fixes of `_choose_window_s` show a velocity: the slope of a line through them."""
+    fixes = max(2.0, _choose_window_s(gnss) * 1e9 / compute_median_period_ns(gnss.stamp_ns))
+    return float(np.sqrt(12.0 / fixes * np.median(gnss.variance_m2[:, :2]))) / _choose_window_s(gnss)
 
 
-def _window_s(gnss: Positions) -> float:
-    return max(_FIX_WINDOW_S, _FIXES * 1e-9 * median_period_ns(gnss.stamp_ns))
+def _choose_window_s(gnss: Positions) -> float:
+    return max(_FIX_WINDOW_S, _FIXES * 1e-9 * compute_median_period_ns(gnss.stamp_ns))
 
 
-def slope_std_rad(measurements: Measurements) -> float | None:
+def estimate_slope_std_rad(measurements: Measurements) -> float | None:
     """Return how steep the ground is by how fixes climb it [rad], root mean square; None where they are too few or too noisy.
 
     It is as steep across as along. One deviation is added of what so few slopes tell: each lasts for some metres.
@@ -81,8 +90,8 @@ def slope_std_rad(measurements: Measurements) -> float | None:
     gnss = measurements.gnss
     if gnss is None or gnss.stamp_ns.size < _FIXES:
         return None
-    rows = max(1, round(_CHORD_S * 1e9 / median_period_ns(gnss.stamp_ns)))
-    east, north, up = (median_of_five(axis) for axis in gnss.position_enu_m.T)
+    rows = max(1, round(_CHORD_S * 1e9 / compute_median_period_ns(gnss.stamp_ns)))
+    east, north, up = (compute_median_of_five(axis) for axis in gnss.position_enu_m.T)
     way_m = np.hypot(east[rows:] - east[:-rows], north[rows:] - north[:-rows])
     climbs = way_m > _CHORD_M
     if climbs.sum() < _FIXES:
@@ -99,7 +108,7 @@ def level_stds_rad(measurements: Measurements) -> tuple[float, float]:
 
     Where the course alone tells the turns, what the antenna sways by would pass for roll: it is held.
     """
-    return _LEVEL_STD_RAD, _HELD_STD_RAD if turns_by_course(measurements) else _LEVEL_STD_RAD
+    return _LEVEL_STD_RAD, _HELD_STD_RAD if is_turned_by_course(measurements) else _LEVEL_STD_RAD
 
 
 def turn_scale_std(measurements: Measurements) -> float:
@@ -137,7 +146,7 @@ def process_noise(measurements: Measurements) -> NDArray[np.float64]:
     density[:, 0:3] = _DRIFT
     density[:, 3:6] = (1e-4) ** 2
     density[:, 6:9] = (1.5e-3) ** 2  # a milli-g or two in a minute, as uncooled MEMS units drift
-    density[:, 10:12] = _slides(measurements.visual)
+    density[:, 10:12] = _estimate_slide_density(measurements.visual)
     density[:, kernel.SLIDING] = measurements.visual is None and measurements.wheels is None
     density[: kernel.GYRO_TURN, kernel.GROUND] = GROUND
     density[:, 12:15] = 1e-8
@@ -145,25 +154,25 @@ def process_noise(measurements: Measurements) -> NDArray[np.float64]:
     density[:, 16] = 0.002**2
     density[:, kernel.DECAY] = 1 / _WHEEL_SCALE_TIME_S
     density[:, 15:17] *= np.square(scale_stds(measurements)) > 0
-    _odometric_turns(measurements, density)
+    _fill_turn_noise(measurements, density)
     imu = measurements.imu
     if imu is not None:
-        rate_hz = 1e9 / median_period_ns(imu.stamp_ns)
-        density[kernel.GYRO_TURN :, 0:3] = gyro_density(imu.gyro_std_radps, rate_hz)
+        rate_hz = 1e9 / compute_median_period_ns(imu.stamp_ns)
+        density[kernel.GYRO_TURN :, 0:3] = estimate_gyro_density(imu.gyro_std_radps, rate_hz)
     else:
         density[:, 3:6] = 2 * turn_scale_std(measurements) ** 2 / _TURN_SCALE_TIME_S
     return density
 
 
-def gyro_density(gyro_std_radps: float, rate_hz: float) -> float:
+def estimate_gyro_density(gyro_std_radps: float, rate_hz: float) -> float:
     """Return how fast the variance of an angle grows that a gyroscope tells [rad²/s]."""
     return 1.5 * gyro_std_radps**2 / rate_hz + 1e-8
 
 
-def _odometric_turns(measurements: Measurements, density: NDArray[np.float64]) -> None:
+def _fill_turn_noise(measurements: Measurements, density: NDArray[np.float64]) -> None:
     """Fill in the noise of turning where an odometry, or nothing, tells how the robot turns."""
     sources = turn_sources(measurements)
-    if glides(measurements):
+    if is_gliding(measurements):
         density[:, kernel.GROUND] = 0.0
     elif not sources:
         density[kernel.FLAT_TURN, 2] = _COURSE_TURN
@@ -171,9 +180,9 @@ def _odometric_turns(measurements: Measurements, density: NDArray[np.float64]) -
         visual = source is measurements.visual
         rows = [kernel.VISUAL_TURN] if visual else [kernel.FLAT_TURN]
         known = np.isfinite(source.yaw_rate_radps)
-        rate_hz = 1e9 / median_period_ns(source.stamp_ns[known])
+        rate_hz = 1e9 / compute_median_period_ns(source.stamp_ns[known])
         turns = source.yaw_rate_radps[known, None] if source.turn_rate_radps is None else source.turn_rate_radps[known]
-        density[rows, 0 if turns.shape[1] == 3 else 2 : 3] = 1.1 * white_noise(turns) ** 2 / rate_hz + _DRIFT
+        density[rows, 0 if turns.shape[1] == 3 else 2 : 3] = 1.1 * estimate_white_noise(turns) ** 2 / rate_hz + _DRIFT
         if turns.shape[1] == 3:
             density[rows, kernel.GROUND] = 0.0
         best = measurements.imu is None and source is sources[-1]
@@ -182,7 +191,7 @@ def _odometric_turns(measurements: Measurements, density: NDArray[np.float64]) -
         density[rows, kernel.TURNING] = (0.02 if visual else 0.1 if best else 0.3) ** 2
 
 
-def shake_density(
+def estimate_shake_density(
     measurements: Measurements, stamp_ns: NDArray[np.int64], mode: NDArray[np.int8]
 ) -> NDArray[np.float64]:
     """Return the noise density of the velocity at each event [m²/s³], shape (E,), for its process mode."""
@@ -190,82 +199,85 @@ def shake_density(
     q_v = np.full(stamp_ns.size, np.nan)
     inertial = mode == kernel.INERTIAL
     if imu is not None and inertial.any():
-        q_v[inertial] = _accelerometer_density(imu)(stamp_ns[inertial])
+        q_v[inertial] = _make_accelerometer_density(imu)(stamp_ns[inertial])
     if not inertial.all():
-        q_v[~inertial] = _held_density(measurements)(stamp_ns[~inertial])
+        q_v[~inertial] = _make_odometry_density(measurements)(stamp_ns[~inertial])
     return q_v
 
 
 _Density = Callable[[NDArray[np.int64]], NDArray[np.float64]]
 
 
-def _accelerometer_density(imu: InertialMeasurements) -> _Density:
-    rate_hz = 1e9 / median_period_ns(imu.stamp_ns)
+def _make_accelerometer_density(imu: InertialMeasurements) -> _Density:
+    rate_hz = 1e9 / compute_median_period_ns(imu.stamp_ns)
     noise = imu.accelerometer_noise_mps2
     density = np.square(np.full(imu.stamp_ns.size, imu.accelerometer_std_mps2) if noise is None else noise)
     density = density / rate_hz + 1e-6
-    return lambda at_ns: _interpolated(imu.stamp_ns, density, at_ns)
+    return lambda at_ns: _interpolate_density(imu.stamp_ns, density, at_ns)
 
 
-def _held_density(measurements: Measurements) -> _Density:
+def _make_odometry_density(measurements: Measurements) -> _Density:
     """Without an accelerometer: the square of the acceleration around an event, times how long it lasts.
 
     Where two odometries differ, the one that shows the least of it is right: wheels that dig in show much.
     """
     sources = [source for source in measurements.odometries().values() if source.stamp_ns.size > 2]
-    slope = [slopes(s.stamp_ns, s.velocity_mps[:, 0], _ACCELERATION_WINDOW_S) for s in sources]
+    slope = [compute_slopes(s.stamp_ns, s.velocity_mps[:, 0], _ACCELERATION_WINDOW_S) for s in sources]
     doppler = None if sources else measurements.doppler
-    unknown = _shown_density(doppler) if doppler else _unseen_density(None if sources else measurements.gnss)
+    unknown = _make_velocity_density(doppler) if doppler else _make_fix_density(None if sources else measurements.gnss)
 
     def density(at_ns: NDArray[np.int64]) -> NDArray[np.float64]:
         found = np.full(at_ns.size, np.nan)
         for source, acceleration in zip(sources, slope, strict=True):
-            covered = ~in_gap(source.stamp_ns, at_ns, at_ns, longest_ns=_MAX_GAP_NS)
-            shown = _interpolated(source.stamp_ns, np.abs(acceleration), at_ns[covered])
+            covered = ~is_in_gap(source.stamp_ns, at_ns, at_ns, longest_ns=_MAX_GAP_NS)
+            shown = _interpolate_density(source.stamp_ns, np.abs(acceleration), at_ns[covered])
             found[covered] = np.fmin(found[covered], shown)
         return np.where(np.isnan(found), unknown(at_ns), _STEADY + _ACCELERATION_LASTS_S * found**2)
 
     return density
 
 
-def _unseen_density(gnss: Positions | None) -> _Density:
+def _make_fix_density(gnss: Positions | None) -> _Density:
     """Without odometry: the square of the acceleration of the fixes, over a second or five of them; else what is usual.
 
     Fixes that are too noisy to show a velocity over that time do not show how steady it is either.
     """
     if gnss is None or gnss.stamp_ns.size < _FIXES:
         return lambda at_ns: np.full(at_ns.size, _UNKNOWN)
-    window_s = _window_s(gnss)
+    window_s = _choose_window_s(gnss)
     found = np.zeros(gnss.stamp_ns.size)
     for axis in range(2):
-        velocity = slopes(gnss.stamp_ns, gnss.position_enu_m[:, axis], window_s)
-        found += np.square(slopes(gnss.stamp_ns, velocity, window_s))
-    unseen = _UNKNOWN * min(1.0, (_fix_velocity_std_mps(gnss) / _UNSEEN_MPS) ** 2)
+        velocity = compute_slopes(gnss.stamp_ns, gnss.position_enu_m[:, axis], window_s)
+        found += np.square(compute_slopes(gnss.stamp_ns, velocity, window_s))
+    unseen = _UNKNOWN * min(1.0, (_compute_fix_velocity_std_mps(gnss) / _UNSEEN_MPS) ** 2)
     density = np.minimum(np.maximum(_UNSEEN_STEADY + _UNSEEN_LASTS_S * found, unseen), _UNKNOWN)
     stamp_ns = gnss.stamp_ns
-    return lambda at_ns: _interpolated(stamp_ns, density, at_ns)
+    return lambda at_ns: _interpolate_density(stamp_ns, density, at_ns)
 
 
-def _shown_density(doppler: GroundVelocities) -> _Density:
+def _make_velocity_density(doppler: GroundVelocities) -> _Density:
     """Without odometry: the square of the acceleration that a receiver's own velocity shows, as far as it is not its noise."""
-    stamp_ns, window_s = doppler.stamp_ns, max(_FIX_WINDOW_S, _FIXES * 1e-9 * median_period_ns(doppler.stamp_ns))
+    stamp_ns, window_s = (
+        doppler.stamp_ns,
+        max(_FIX_WINDOW_S, _FIXES * 1e-9 * compute_median_period_ns(doppler.stamp_ns)),
+    )
     if stamp_ns.size < _FIXES:
         return lambda at_ns: np.full(at_ns.size, _UNKNOWN)
-    shown = sum(np.square(slopes(stamp_ns, axis, window_s)) for axis in doppler.velocity_enu_mps[:, :2].T)
+    shown = sum(np.square(compute_slopes(stamp_ns, axis, window_s)) for axis in doppler.velocity_enu_mps[:, :2].T)
     density = np.minimum(_UNSEEN_STEADY + _UNSEEN_LASTS_S * np.asarray(shown), _UNKNOWN)
-    return lambda at_ns: _interpolated(stamp_ns, density, at_ns)
+    return lambda at_ns: _interpolate_density(stamp_ns, density, at_ns)
 
 
-def _interpolated(
+def _interpolate_density(
     stamp_ns: NDArray[np.int64], values: NDArray[np.float64], at_ns: NDArray[np.int64]
 ) -> NDArray[np.float64]:
     zero = int(stamp_ns[0])
-    return np.interp(seconds(at_ns, zero), seconds(stamp_ns, zero), values)
+    return np.interp(compute_seconds(at_ns, zero), compute_seconds(stamp_ns, zero), values)
 
 
-def _slides(visual: BodyVelocities | None) -> float:
+def _estimate_slide_density(visual: BodyVelocities | None) -> float:
     """Return how fast a body that is held to drive straight comes to slide [m²/s³]: as visual odometry shows it, or a guess."""
     if visual is None or visual.stamp_ns.size < 3:
         return _UNSEEN_SLIDE
-    shown = [slopes(visual.stamp_ns, visual.velocity_mps[:, axis], _SLIDE_WINDOW_S) for axis in (1, 2)]
+    shown = [compute_slopes(visual.stamp_ns, visual.velocity_mps[:, axis], _SLIDE_WINDOW_S) for axis in (1, 2)]
     return max(_SLIDE, _ACCELERATION_LASTS_S * float(np.median(np.square(shown)) / 0.4549))

@@ -11,12 +11,12 @@ Ints = NDArray[np.int64]
 _MIN_INPUT_GAP_NS = 100_000_000
 
 
-def seconds(stamp_ns: Ints | int, zero_ns: int) -> Floats:
+def compute_seconds(stamp_ns: Ints | int, zero_ns: int) -> Floats:
     """Return the time since ``zero_ns`` [s]; the difference is taken before rounding."""
     return np.asarray(np.asarray(stamp_ns, np.int64) - zero_ns, np.float64) * 1e-9
 
 
-def integral(stamp_s: Floats, values: Floats, at_s: Floats) -> Floats:
+def integrate_signal(stamp_s: Floats, values: Floats, at_s: Floats) -> Floats:
     """Return the integral, from the first sample on, of the piecewise-linear signal through the samples.
 
     Parameters
@@ -44,19 +44,21 @@ def integral(stamp_s: Floats, values: Floats, at_s: Floats) -> Floats:
     return found
 
 
-def interval_means(stamp_s: Floats, values: Floats, start_s: Floats, end_s: Floats) -> Floats:
+def compute_interval_means(stamp_s: Floats, values: Floats, start_s: Floats, end_s: Floats) -> Floats:
     """Return the mean of the piecewise-linear signal over each interval, shape (M, k); its value where the interval is empty."""
     width = (end_s - start_s)[:, None]
-    mean = (integral(stamp_s, values, end_s) - integral(stamp_s, values, start_s)) / np.where(width > 0, width, 1.0)
-    return np.where(width > 0, mean, at(stamp_s, values, end_s))
+    mean = (integrate_signal(stamp_s, values, end_s) - integrate_signal(stamp_s, values, start_s)) / np.where(
+        width > 0, width, 1.0
+    )
+    return np.where(width > 0, mean, interpolate_signal(stamp_s, values, end_s))
 
 
-def at(stamp_s: Floats, values: Floats, at_s: Floats) -> Floats:
+def interpolate_signal(stamp_s: Floats, values: Floats, at_s: Floats) -> Floats:
     """Return (N, k) samples interpolated linearly, shape (M, k); held outside."""
     return np.stack([np.interp(at_s, stamp_s, values[:, k]) for k in range(values.shape[1])], -1)
 
 
-def in_gap(stamp_ns: Ints, start_ns: Ints, end_ns: Ints, *, longest_ns: int) -> NDArray[np.bool_]:
+def is_in_gap(stamp_ns: Ints, start_ns: Ints, end_ns: Ints, *, longest_ns: int) -> NDArray[np.bool_]:
     """Return whether each interval touches a stretch between samples longer than ``longest_ns``, or lies outside the samples.
 
     Half that long outside the first and last sample is still inside.
@@ -74,8 +76,8 @@ def in_gap(stamp_ns: Ints, start_ns: Ints, end_ns: Ints, *, longest_ns: int) -> 
 
 def is_covered(stamp_ns: Ints, start_ns: Ints, end_ns: Ints) -> NDArray[np.bool_]:
     """Return whether each interval lies among samples without a gap: three periods of the samples, at least 0.1 s."""
-    longest = max(_MIN_INPUT_GAP_NS, 3 * median_period_ns(stamp_ns))
-    return ~in_gap(stamp_ns, start_ns, end_ns, longest_ns=longest)
+    longest = max(_MIN_INPUT_GAP_NS, 3 * compute_median_period_ns(stamp_ns))
+    return ~is_in_gap(stamp_ns, start_ns, end_ns, longest_ns=longest)
 
 
 def hold_last(stamp_ns: Ints, values: Floats, at_ns: Ints) -> Floats:
@@ -84,12 +86,12 @@ def hold_last(stamp_ns: Ints, values: Floats, at_ns: Ints) -> Floats:
     return np.where(index >= 0, values[np.maximum(index, 0)] if values.size else np.nan, np.nan)
 
 
-def median_period_ns(stamp_ns: Ints) -> int:
+def compute_median_period_ns(stamp_ns: Ints) -> int:
     """Return the median time between samples [ns], at least 1; 1 for fewer than two samples."""
     return max(1, int(np.median(np.diff(stamp_ns)))) if stamp_ns.size > 1 else 1
 
 
-def median_of_five(values: Floats) -> Floats:
+def compute_median_of_five(values: Floats) -> Floats:
     """Return the running median of five of a signal (N,), its ends repeated: single outliers vanish."""
     if values.size < 5:
         return values
@@ -97,9 +99,9 @@ def median_of_five(values: Floats) -> Floats:
     return np.asarray(np.median(np.lib.stride_tricks.sliding_window_view(padded, 5), axis=1))
 
 
-def slopes(stamp_ns: Ints, values: Floats, window_s: float) -> Floats:
+def compute_slopes(stamp_ns: Ints, values: Floats, window_s: float) -> Floats:
     """Return the slope [u/s] at each sample of the line through the samples within half a window, shape (N,); 0 where there is one only."""
-    t = seconds(stamp_ns, int(stamp_ns[0]))
+    t = compute_seconds(stamp_ns, int(stamp_ns[0]))
     first = np.searchsorted(t, t - 0.5 * window_s, "left")
     last = np.searchsorted(t, t + 0.5 * window_s, "right")
     count = (last - first).astype(np.float64)
@@ -116,7 +118,7 @@ def slopes(stamp_ns: Ints, values: Floats, window_s: float) -> Floats:
     return np.where(spread > 1e-9, covariance / np.maximum(spread, 1e-9), 0.0)
 
 
-def white_noise(values: Floats) -> float:
+def estimate_white_noise(values: Floats) -> float:
     """Estimate the standard deviation of white noise on a signal (N, k), the largest of its axes; 0 for fewer than three samples.
 
     The second difference of white noise has sqrt(6) times its standard deviation.

@@ -20,12 +20,22 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.compiled import kernel
-from tcpipe.fusion.state_kernel import MOVED, NX, Matrix, N, Vector, copied, displaced, saved, workspace
+from tcpipe.compiled import compile_kernel
+from tcpipe.fusion.state_kernel import (
+    MOVED,
+    NX,
+    Matrix,
+    N,
+    Vector,
+    allocate_workspace,
+    copy_values,
+    displace_state,
+    save_state,
+)
 
 
-@kernel
-def _transposed_times(F: Matrix, scale: float, A: Matrix, out: Matrix) -> None:
+@compile_kernel
+def _multiply_transposed(F: Matrix, scale: float, A: Matrix, out: Matrix) -> None:
     """F' A; ``scale`` is what remains of s_w."""
     n = A.shape[0]
     for i in range(n):
@@ -44,8 +54,8 @@ def _transposed_times(F: Matrix, scale: float, A: Matrix, out: Matrix) -> None:
                 out[i, j] += f * row[j]
 
 
-@kernel
-def _product(A: Matrix, B: Matrix, out: Matrix) -> None:
+@compile_kernel
+def _multiply(A: Matrix, B: Matrix, out: Matrix) -> None:
     n = A.shape[0]
     for i in range(n):
         for j in range(n):
@@ -56,8 +66,10 @@ def _product(A: Matrix, B: Matrix, out: Matrix) -> None:
                 out[i, j] += f * B[k, j]
 
 
-@kernel
-def _linked(j: int, xy: Vector, P: Matrix, Ps: Matrix, rest: Matrix, links: Any, variances: Matrix) -> None:
+@compile_kernel
+def _fill_link_variances(
+    j: int, xy: Vector, P: Matrix, Ps: Matrix, rest: Matrix, links: Any, variances: Matrix
+) -> None:
     """Fill row ``j`` of ``variances``: how far the displacement from wanted stamp j to later ones may be wrong, along its direction.
 
     ``P`` is the filter's covariance, ``Ps`` the smoother's, ``rest`` is I - L P. Products over longer lags are made of shorter ones.
@@ -77,7 +89,7 @@ def _linked(j: int, xy: Vector, P: Matrix, Ps: Matrix, rest: Matrix, links: Any,
     for node in range(1, lags.size):
         if j + lags[node] <= newest:
             between = (j + lags[recipe[node, 0]]) % size
-            _product(chains[recipe[node, 0], here], chains[recipe[node, 1], between], chains[node, here])
+            _multiply(chains[recipe[node, 0], here], chains[recipe[node, 1], between], chains[node, here])
     for column in range(wanted.size):
         node = wanted[column]
         if j + lags[node] > newest:
@@ -100,7 +112,7 @@ def _linked(j: int, xy: Vector, P: Matrix, Ps: Matrix, rest: Matrix, links: Any,
         variances[j, column] = max(variance, 0.0)
 
 
-@kernel
+@compile_kernel
 def smooth_block(
     first: int,
     last: int,
@@ -119,11 +131,11 @@ def smooth_block(
     store : of these events, as `filter_block` kept it.
     adjoint, information : l (n,) and L (n, n) of the state before event ``last``; become those before ``first``.
     outputs : holds the filter's states at the wanted stamps; they become the smoothed ones.
-    links : what `_linked` remembers of later wanted stamps, see `tcpipe.fusion.error_state_pass`.
-    displacement_variances : filled by `_linked`.
+    links : what `_fill_link_variances` remembers of later wanted stamps, see `tcpipe.fusion.error_state_pass`.
+    displacement_variances : filled by `_fill_link_variances`.
     """
     n = information.shape[0]
-    work, _ = workspace(n)
+    work, _ = allocate_workspace(n)
     _, _, d, x, _, shifted, _, turn, _ = work
     store_F, store_KH, store_y, store_P = store
     T = np.zeros((n, n))
@@ -147,9 +159,9 @@ def smooth_block(
                 d[i] = 0.0
                 for j in range(n):
                     d[i] -= P[i, j] * adjoint[j]
-            displaced(x, d, 1.0, True, shifted, turn)
-            _product(information, P, T)
-            _product(P, T, Ps)
+            displace_state(x, d, 1.0, True, shifted, turn)
+            _multiply(information, P, T)
+            _multiply(P, T, Ps)
             for i in range(n):
                 for j in range(n):
                     T[i, j] = (1.0 if i == j else 0.0) - T[i, j]
@@ -158,14 +170,14 @@ def smooth_block(
                     s = 0.5 * (P[i, j] - Ps[i, j] + P[j, i] - Ps[j, i])
                     Ps[i, j] = s
                     Ps[j, i] = s
-            saved(shifted, Ps, out)
-            copied(chain, links[1][0, output[e] % links[1].shape[1]])
+            save_state(shifted, Ps, out)
+            copy_values(chain, links[1][0, output[e] % links[1].shape[1]])
             for i in range(n):
                 for j in range(n):
                     chain[i, j] = 1.0 if i == j else 0.0
-            _linked(output[e], shifted[18:20], P, Ps, T, links, displacement_variances)
+            _fill_link_variances(output[e], shifted[18:20], P, Ps, T, links, displacement_variances)
         if store_y[row, 2] > 0.0:
-            _before_update(store_KH[row, 0], store_KH[row, 1], store_y[row], adjoint, information, chain, B)
+            _step_before_update(store_KH[row, 0], store_KH[row, 1], store_y[row], adjoint, information, chain, B)
         if store_y[row, 0] > 0.0:
             F = store_F[row]
             scale = store_y[row, 1]
@@ -177,13 +189,13 @@ def smooth_block(
                     s += F[i, c] * d[MOVED[c]]
                 adjoint[i] = s
             adjoint[15] = scale * d[15]
-            _transposed_times(F, scale, information, T)
+            _multiply_transposed(F, scale, information, T)
             for i in range(n):
                 for j in range(n):
                     Ps[i, j] = T[j, i]
-            _transposed_times(F, scale, Ps, information)
-            _transposed_times(F, scale, chain, T)
-            copied(T, chain)
+            _multiply_transposed(F, scale, Ps, information)
+            _multiply_transposed(F, scale, chain, T)
+            copy_values(T, chain)
         kept = store_y[row, 24]
         for i in range(N, n if kept != 1.0 else N):
             adjoint[i] *= kept
@@ -193,8 +205,8 @@ def smooth_block(
                 chain[i, j] *= kept
 
 
-@kernel
-def _projected(K: Matrix, A: Matrix, B: Matrix) -> None:
+@compile_kernel
+def _project_gain(K: Matrix, A: Matrix, B: Matrix) -> None:
     """Fill B, shape (3, n), with K' A; K holds K'."""
     n = A.shape[0]
     for a in range(3):
@@ -206,8 +218,8 @@ def _projected(K: Matrix, A: Matrix, B: Matrix) -> None:
                 B[a, j] += f * A[i, j]
 
 
-@kernel
-def _before_update(
+@compile_kernel
+def _step_before_update(
     K: Matrix, H: Matrix, y: Vector, adjoint: Vector, information: Matrix, chain: Matrix, B: Matrix
 ) -> None:
     """Take l, L and the chain back over an update; K holds K', y what `filter_block` kept."""
@@ -235,11 +247,11 @@ def _before_update(
         B[a, 0] = s
     for i in range(n):
         adjoint[i] -= H[0, i] * B[0, 0] + H[1, i] * B[1, 0] + H[2, i] * B[2, 0]
-    _projected(K, chain, B)
+    _project_gain(K, chain, B)
     for i in range(n):
         for j in range(n):
             chain[i, j] -= H[0, i] * B[0, j] + H[1, i] * B[1, j] + H[2, i] * B[2, j]
-    _projected(K, information, B)
+    _project_gain(K, information, B)
     half = np.empty((3, 3))
     for a in range(3):
         for b in range(3):

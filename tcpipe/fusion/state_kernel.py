@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.compiled import kernel
+from tcpipe.compiled import compile_kernel
 
 N = 17
 NX = 23
@@ -57,8 +57,8 @@ Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]
 
 
-@kernel
-def rotation_exp(x: float, y: float, z: float, out: Vector) -> None:
+@compile_kernel
+def compute_rotation(x: float, y: float, z: float, out: Vector) -> None:
     """Rotation matrix (flat) of a rotation vector. Solà eq. 77."""
     t2 = x * x + y * y + z * z
     if t2 < 1e-8:
@@ -79,8 +79,8 @@ def rotation_exp(x: float, y: float, z: float, out: Vector) -> None:
     out[7] = b * y * z + a * x
 
 
-@kernel
-def difference(y: Vector, x: Vector, out: Vector) -> None:
+@compile_kernel
+def compute_error(y: Vector, x: Vector, out: Vector) -> None:
     """Error y ⊟ x."""
     a = 0.0
     b = 0.0
@@ -110,11 +110,11 @@ def difference(y: Vector, x: Vector, out: Vector) -> None:
         out[i] = y[i + 6] - x[i + 6]
 
 
-@kernel
-def displaced(x: Vector, d: Vector, sign: float, rotate: bool, out: Vector, turn: Vector) -> None:  # noqa: FBT001
+@compile_kernel
+def displace_state(x: Vector, d: Vector, sign: float, rotate: bool, out: Vector, turn: Vector) -> None:  # noqa: FBT001
     """State x ⊞ sign d; ``rotate`` is False where d has no rotation."""
     if rotate:
-        rotation_exp(sign * d[0], sign * d[1], sign * d[2], turn)
+        compute_rotation(sign * d[0], sign * d[1], sign * d[2], turn)
         for i in range(0, 9, 3):
             for j in range(3):
                 out[i + j] = x[i] * turn[j] + x[i + 1] * turn[3 + j] + x[i + 2] * turn[6 + j]
@@ -125,8 +125,8 @@ def displaced(x: Vector, d: Vector, sign: float, rotate: bool, out: Vector, turn
         out[i + 6] = x[i + 6] + sign * d[i]
 
 
-@kernel
-def _cholesky(P: Matrix, U: Matrix) -> bool:
+@compile_kernel
+def _factorize(P: Matrix, U: Matrix) -> bool:
     """Upper factor of P = U'U; False where P is not positive definite."""
     n = P.shape[0]
     for i in range(n):
@@ -146,11 +146,11 @@ def _cholesky(P: Matrix, U: Matrix) -> bool:
     return True
 
 
-@kernel
-def factor(P: Matrix, U: Matrix, tally: Vector) -> None:
-    """`_cholesky`, with P lifted a little where rounding has spoiled it; how often is counted."""
+@compile_kernel
+def factorize_covariance(P: Matrix, U: Matrix, tally: Vector) -> None:
+    """`_factorize`, with P lifted a little where rounding has spoiled it; how often is counted."""
     lift = 1e-12
-    while not _cholesky(P, U):
+    while not _factorize(P, U):
         tally[0] += 1.0
         for i in range(P.shape[0]):
             P[i, i] += lift * abs(P[i, i]) + 1e-3 * lift
@@ -164,16 +164,16 @@ def factor(P: Matrix, U: Matrix, tally: Vector) -> None:
                 P[i, i] = variance
 
 
-@kernel
-def copied(values: Matrix, out: Matrix) -> None:
+@compile_kernel
+def copy_values(values: Matrix, out: Matrix) -> None:
     """Fill ``out``; a slice that is assigned makes numba compile the words of an error for it, in seconds."""
     for i in range(values.shape[0]):
         for j in range(values.shape[1]):
             out[i, j] = values[i, j]
 
 
-@kernel
-def saved(x: Vector, P: Matrix, out: Vector) -> None:
+@compile_kernel
+def save_state(x: Vector, P: Matrix, out: Vector) -> None:
     """State, then variances of p (3), yaw and forward velocity, then of s_w and s_v, then the fixes' error, shape (33,)."""
     for i in range(NX):
         out[i] = x[i]
@@ -200,8 +200,8 @@ def saved(x: Vector, P: Matrix, out: Vector) -> None:
         out[30 + i] = x[NX + i] if x.size > NX else 0.0
 
 
-@kernel
-def workspace(n: int) -> Any:
+@compile_kernel
+def allocate_workspace(n: int) -> Any:
     """Scratch memory of the functions above for n errors; the last entry counts repairs of P."""
     work = (
         np.zeros((n, n)),

@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.fusion import ukf15_kernel as kernel
-from tcpipe.fusion.gates import chi_square_gate
+from tcpipe.fusion.gates import find_chi_square_threshold
 from tcpipe.fusion.measurements import (
     GNSS,
     IMU,
@@ -38,8 +38,8 @@ from tcpipe.fusion.measurements import (
 )
 from tcpipe.fusion.signals import is_covered
 from tcpipe.fusion.trajectory import DISPLACEMENT_LAGS_S, Rejections, Trajectory
-from tcpipe.fusion.ukf15_events import ACCEPTED, NOT_RUN, RECOVERED, REJECTED, Belief, Events, Outputs, Sources
-from tcpipe.geometry.rotation import inverse, quat_from_rpy, rotate, rpy_from_quat
+from tcpipe.fusion.ukf15_events import ACCEPTED, NOT_RUN, RECOVERED, REJECTED, Events, FilterState, Outputs, Sources
+from tcpipe.geometry.rotation import invert, quat_from_rpy, rotate, rpy_from_quat
 from tcpipe.tables.facts import StretchFacts
 
 _PLACE, _TURNING, _ACCELERATING = (
@@ -93,7 +93,7 @@ class SensorRows:
 
 
 @dataclass(frozen=True, slots=True)
-class Forward:
+class ForwardResult:
     """What the filter made of its sources.
 
     Attributes
@@ -134,9 +134,9 @@ def run_ukf15(
     -------
     Trajectory : at ``output_ns``; each state uses the measurements up to its stamp.
     """
-    sources = sources_of(measurements, initial, end_ns=int(output_ns[-1]))
-    gates = [_gate(source, gate_probability) for source in sources]
-    x, P = _initial_belief(initial)
+    sources = collect_sources(measurements, initial, end_ns=int(output_ns[-1]))
+    gates = [_find_gate(source, gate_probability) for source in sources]
+    x, P = _make_initial_state(initial)
     start_ns = min(int(source.stamp_ns[0]) for source in sources if source.stamp_ns.size)
     found = filter_forward(
         sources, gates, x=x, P=P, q=PROCESS_VARIANCE, start_ns=start_ns, output_ns=output_ns, engine=engine
@@ -152,9 +152,9 @@ def run_ukf15(
         position_std_m=std[:, kernel.POSITION],
         yaw_std_rad=std[:, kernel.YAW],
         forward_velocity_std_mps=std[:, kernel.VX],
-        rejections=_rejections(sources, gates, found),
+        rejections=_make_rejections(sources, gates, found),
         displacement_std_m=np.full((output_ns.size, len(DISPLACEMENT_LAGS_S)), np.nan),
-        facts=_facts(sources, found),
+        facts=_make_facts(sources, found),
     )
 
 
@@ -168,7 +168,7 @@ def filter_forward(
     start_ns: int,
     output_ns: NDArray[np.int64],
     engine: Literal["compiled", "filterpy"] = "compiled",
-) -> Forward:
+) -> ForwardResult:
     """Run the 15-state filter over any sources.
 
     Parameters
@@ -185,30 +185,32 @@ def filter_forward(
     -------
     Forward
     """
-    belief = Belief(
+    belief = FilterState(
         np.zeros(kernel.ROW), np.zeros((kernel.STATES, kernel.ROW)), np.zeros(1), np.zeros((len(sources), 2))
     )
     belief.x[: kernel.STATES], belief.P[:, : kernel.STATES] = x, P
     states, variances = np.empty((output_ns.size, kernel.STATES)), np.empty((output_ns.size, kernel.STATES))
     nis = [np.full(source.stamp_ns.size, np.nan) for source in sources]
     outcome = [np.full(source.stamp_ns.size, NOT_RUN, np.int8) for source in sources]
-    packed = _packed(sources, gates)
+    packed = _pack_sources(sources, gates)
     run = _run_of(engine)
     reached, repairs = [0] * len(sources), 0
     for first in range(0, output_ns.size, _BLOCK):
         block = slice(first, first + _BLOCK)
         until = [int(np.searchsorted(s.stamp_ns, output_ns[block][-1], side="right")) for s in sources]
         rows = [slice(begin, end) for begin, end in zip(reached, until, strict=True)]
-        events, order = _events(sources, rows, start_ns)
+        events, order = _sort_events(sources, rows, start_ns)
         times_s = np.asarray((output_ns[block] - start_ns) * 1e-9, np.float64)
         outputs = Outputs(times_s, states[block], variances[block], np.empty(order.size), np.empty(order.size, np.int8))
         repairs += int(run(belief, np.asarray(q, np.float64), events, packed, outputs))
         cuts = np.cumsum([s.stop - s.start for s in rows])[:-1]
         for written, all_of in ((outputs.nis, nis), (outputs.outcome, outcome)):
-            for at, part in enumerate(np.split(_unsorted(written, order), cuts)):
+            for at, part in enumerate(np.split(_restore_order(written, order), cuts)):
                 all_of[at][rows[at]] = part
         reached = until
-    return Forward(states, variances, (belief.x[: kernel.STATES], belief.P[:, : kernel.STATES]), nis, outcome, repairs)
+    return ForwardResult(
+        states, variances, (belief.x[: kernel.STATES], belief.P[:, : kernel.STATES]), nis, outcome, repairs
+    )
 
 
 def _run_of(engine: Literal["compiled", "filterpy"]) -> Callable[..., int]:
@@ -220,7 +222,7 @@ def _run_of(engine: Literal["compiled", "filterpy"]) -> Callable[..., int]:
     return filterpy_engine.run
 
 
-def sources_of(measurements: Measurements, initial: InitialState, *, end_ns: int) -> list[SensorRows]:
+def collect_sources(measurements: Measurements, initial: InitialState, *, end_ns: int) -> list[SensorRows]:
     """Return what the filter fuses of a stretch: its sensors, the ground, and priors for what no sensor shows.
 
     Parameters
@@ -234,21 +236,23 @@ def sources_of(measurements: Measurements, initial: InitialState, *, end_ns: int
     """
     imu = measurements.imu
     sensors = (
-        _imu_sources(measurements, initial)
-        + _velocity_sources(WHEELS, measurements.wheels, imu)
-        + _velocity_sources(VISUAL, measurements.visual)
-        + _gnss_sources(measurements)
+        _make_imu_sources(measurements, initial)
+        + _make_velocity_sources(WHEELS, measurements.wheels, imu)
+        + _make_velocity_sources(VISUAL, measurements.visual)
+        + _make_gnss_sources(measurements)
     )
     start_ns = min(int(source.stamp_ns[0]) for source in sensors if source.stamp_ns.size)
     std = measurements.nonholonomic_std_mps
-    ground = _held(_GROUND, {kernel.VY: std, kernel.VZ: std}, start_ns, end_ns, _GROUND_PERIOD_NS)
-    priors = _priors(sensors, start_ns, end_ns)
+    ground = _make_zero_source(_GROUND, {kernel.VY: std, kernel.VZ: std}, start_ns, end_ns, _GROUND_PERIOD_NS)
+    priors = _make_priors(sensors, start_ns, end_ns)
     if imu is not None:  # in its gaps the filter must not go on turning and accelerating as it did before them
-        priors += _in_gaps(imu, _priors([source for source in sensors if source.role != IMU], start_ns, end_ns))
+        priors += _select_in_gaps(
+            imu, _make_priors([source for source in sensors if source.role != IMU], start_ns, end_ns)
+        )
     return [*sensors, ground, *priors]
 
 
-def _imu_sources(measurements: Measurements, initial: InitialState) -> list[SensorRows]:
+def _make_imu_sources(measurements: Measurements, initial: InitialState) -> list[SensorRows]:
     imu = measurements.imu
     if imu is None:
         return []
@@ -269,7 +273,7 @@ def _imu_sources(measurements: Measurements, initial: InitialState) -> list[Sens
     return sources
 
 
-def _velocity_sources(
+def _make_velocity_sources(
     role: str, odometry: BodyVelocities | None, imu: InertialMeasurements | None = None
 ) -> list[SensorRows]:
     """One source for each combination of entries that the odometry gives; its yaw rate only where that ``imu`` gives none."""
@@ -299,7 +303,7 @@ def _velocity_sources(
     return sources
 
 
-def _gnss_sources(measurements: Measurements) -> list[SensorRows]:
+def _make_gnss_sources(measurements: Measurements) -> list[SensorRows]:
     gnss = measurements.gnss
     if gnss is None:
         return []
@@ -307,27 +311,27 @@ def _gnss_sources(measurements: Measurements) -> list[SensorRows]:
     return [SensorRows(GNSS, kind, _PLACE, gnss.stamp_ns, gnss.position_enu_m, gnss.variance_m2, gnss.lever_arm_m)]
 
 
-def _held(role: str, stds: Mapping[int, float], start_ns: int, end_ns: int, period_ns: int) -> SensorRows:
+def _make_zero_source(role: str, stds: Mapping[int, float], start_ns: int, end_ns: int, period_ns: int) -> SensorRows:
     """Return states that are zero to within their standard deviations, said again and again."""
     stamps = np.arange(start_ns + period_ns, end_ns + 1, period_ns, dtype=np.int64)
     z = np.zeros((stamps.size, len(stds)))
     return SensorRows(role, kernel.SELECT, tuple(stds), stamps, z, z + np.square(list(stds.values())))
 
 
-def _priors(sensors: Sequence[SensorRows], start_ns: int, end_ns: int) -> list[SensorRows]:
+def _make_priors(sensors: Sequence[SensorRows], start_ns: int, end_ns: int) -> list[SensorRows]:
     selected = {entry for source in sensors if source.kind == kernel.SELECT for entry in source.entries}
     force = any(source.kind == kernel.SPECIFIC_FORCE for source in sensors)
     calm = {state: std for state, std in zip(_TURNING, _CALM_STD_RADPS, strict=True) if state not in selected}
     calm |= {} if force else dict.fromkeys(_ACCELERATING, _CALM_STD_MPS2)
     level = {} if force or kernel.ROLL in selected else dict.fromkeys((kernel.ROLL, kernel.PITCH), _LEVEL_STD_RAD)
     return [
-        _held(_PRIOR, stds, start_ns, end_ns, period_ns)
+        _make_zero_source(_PRIOR, stds, start_ns, end_ns, period_ns)
         for stds, period_ns in ((calm, _GROUND_PERIOD_NS), (level, _LEVEL_PERIOD_NS))
         if stds
     ]
 
 
-def _in_gaps(imu: InertialMeasurements, sources: Sequence[SensorRows]) -> list[SensorRows]:
+def _select_in_gaps(imu: InertialMeasurements, sources: Sequence[SensorRows]) -> list[SensorRows]:
     """Return the rows of sources that lie in gaps of an IMU; without any, none."""
     found = []
     for source in sources:
@@ -338,24 +342,26 @@ def _in_gaps(imu: InertialMeasurements, sources: Sequence[SensorRows]) -> list[S
     return found
 
 
-def _gate(source: SensorRows, probability: float) -> float:
+def _find_gate(source: SensorRows, probability: float) -> float:
     if source.role in {_GROUND, _PRIOR}:
         return math.inf
-    return chi_square_gate(len(source.entries), probability)
+    return find_chi_square_threshold(len(source.entries), probability)
 
 
-def _initial_belief(initial: InitialState) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _make_initial_state(initial: InitialState) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     x, std = np.zeros(kernel.STATES), np.empty(kernel.STATES)
     x[kernel.POSITION], std[kernel.POSITION] = initial.position_enu_m, initial.position_std_m
     x[kernel.ANGLES] = rpy_from_quat(initial.quat_xyzw)
     attitude_std = (initial.tilt_std_rad, initial.tilt_std_rad, initial.yaw_std_rad)
     std[kernel.ANGLES] = np.minimum(attitude_std, kernel.MAX_OPENED_RAD)  # sigma points lie at sqrt(15) deviations
-    x[kernel.VELOCITY] = rotate(inverse(initial.quat_xyzw), initial.velocity_enu_mps)
+    x[kernel.VELOCITY] = rotate(invert(initial.quat_xyzw), initial.velocity_enu_mps)
     std[kernel.VELOCITY], std[kernel.TURN], std[kernel.ACCELERATION] = initial.velocity_std_mps, 0.1, 0.5
     return x, np.diag(std**2)
 
 
-def _events(sources: Sequence[SensorRows], rows: Sequence[slice], start_ns: int) -> tuple[Events, NDArray[np.int64]]:
+def _sort_events(
+    sources: Sequence[SensorRows], rows: Sequence[slice], start_ns: int
+) -> tuple[Events, NDArray[np.int64]]:
     """Return these rows in order of time, and for each which one it was of those of the sources end to end."""
     stamp_ns = np.concatenate([source.stamp_ns[of] for source, of in zip(sources, rows, strict=True)])
     which = np.repeat(np.arange(len(sources), dtype=np.int8), [of.stop - of.start for of in rows])
@@ -370,13 +376,13 @@ def _events(sources: Sequence[SensorRows], rows: Sequence[slice], start_ns: int)
     ), order
 
 
-def _unsorted(values: NDArray[Any], order: NDArray[np.int64]) -> NDArray[Any]:
+def _restore_order(values: NDArray[Any], order: NDArray[np.int64]) -> NDArray[Any]:
     found = np.empty_like(values)
     found[order] = values
     return found
 
 
-def _packed(sources: Sequence[SensorRows], gates: Sequence[float]) -> Sources:
+def _pack_sources(sources: Sequence[SensorRows], gates: Sequence[float]) -> Sources:
     entries = np.zeros((len(sources), 6), np.int64)
     for row, source in zip(entries, sources, strict=True):
         row[: len(source.entries)] = source.entries
@@ -389,7 +395,7 @@ def _packed(sources: Sequence[SensorRows], gates: Sequence[float]) -> Sources:
     )
 
 
-def _rejections(sources: Sequence[SensorRows], gates: Sequence[float], found: Forward) -> Rejections:
+def _make_rejections(sources: Sequence[SensorRows], gates: Sequence[float], found: ForwardResult) -> Rejections:
     refused = [outcome == REJECTED for outcome in found.outcome]
     count = [int(rows.sum()) for rows in refused]
     stamp_ns = np.concatenate([source.stamp_ns[rows] for source, rows in zip(sources, refused, strict=True)])
@@ -399,7 +405,7 @@ def _rejections(sources: Sequence[SensorRows], gates: Sequence[float], found: Fo
     return Rejections(stamp_ns[order], role, np.full(role.size, "gate"), nis, np.repeat(gates, count)[order])
 
 
-def _facts(sources: Sequence[SensorRows], found: Forward) -> StretchFacts:
+def _make_facts(sources: Sequence[SensorRows], found: ForwardResult) -> StretchFacts:
     measurements, rejected, recovered, nis_mean = {}, {}, {}, dict[str, float | None]()
     for role in (GNSS, IMU, WHEELS, VISUAL):
         mine = [at for at, source in enumerate(sources) if source.role == role]

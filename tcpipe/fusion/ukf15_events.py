@@ -17,7 +17,7 @@ RECOVERED = 3
 """Outcome: fused although outside the gate, after the states it measures were opened up (see `tcpipe.fusion.ukf15_kernel.run`)."""
 
 
-class Belief(NamedTuple):
+class FilterState(NamedTuple):
     """What the filter knows at one moment; moved in place, so that a long run can be filtered in blocks."""
 
     x: NDArray[np.float64]

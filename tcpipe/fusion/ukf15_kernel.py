@@ -26,8 +26,8 @@ from math import atan2, cos, floor, pi, sin, sqrt
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.compiled import kernel
-from tcpipe.fusion.ukf15_events import ACCEPTED, RECOVERED, REJECTED, Belief, Events, Outputs, Sources
+from tcpipe.compiled import compile_kernel
+from tcpipe.fusion.ukf15_events import ACCEPTED, RECOVERED, REJECTED, Events, FilterState, Outputs, Sources
 
 STATES = 15
 """Length of the state."""
@@ -60,7 +60,7 @@ MAX_OPENED_RAD = 0.5
 _LOCKOUT_S, _LOCKOUT_COUNT = 5.0, 5
 
 
-@kernel
+@compile_kernel
 def _wrap(angle: float) -> float:
     if -pi <= angle < pi:
         return angle
@@ -68,8 +68,8 @@ def _wrap(angle: float) -> float:
     return wrapped if wrapped < pi else -pi
 
 
-@kernel
-def _factor(P: NDArray[np.float64], L: NDArray[np.float64]) -> bool:
+@compile_kernel
+def _factorize(P: NDArray[np.float64], L: NDArray[np.float64]) -> bool:
     """Write the Cholesky factor's columns as rows of L; False where P is not positive definite."""
     for k in range(STATES):
         row, first = L[k], k // 4 * 4  # from a multiple of four on, so that it vectorises
@@ -90,7 +90,7 @@ def _factor(P: NDArray[np.float64], L: NDArray[np.float64]) -> bool:
     return True
 
 
-@kernel
+@compile_kernel
 def _sin(angle: float) -> float:
     """Sine, by its series where that is exact to the last bit or two: most angles here are small deviations."""
     if abs(angle) > 0.3:
@@ -99,7 +99,7 @@ def _sin(angle: float) -> float:
     return angle * (1.0 + t * (-1 / 6 + t * (1 / 120 + t * (-1 / 5040 + t * (1 / 362880 - t / 39916800)))))
 
 
-@kernel
+@compile_kernel
 def _cos(angle: float) -> float:
     """Cosine, likewise."""
     if abs(angle) > 0.3:
@@ -108,8 +108,8 @@ def _cos(angle: float) -> float:
     return 1.0 + t * (-1 / 2 + t * (1 / 24 + t * (-1 / 720 + t * (1 / 40320 - t / 3628800))))
 
 
-@kernel
-def _attitude_terms(s: NDArray[np.float64], c: NDArray[np.float64], C: NDArray[np.float64]) -> None:
+@compile_kernel
+def _compute_attitude_terms(s: NDArray[np.float64], c: NDArray[np.float64], C: NDArray[np.float64]) -> None:
     """Write what the process needs of sines and cosines of roll, pitch, yaw: the rotation map_from_body, and the Euler rates' terms."""
     sr, sp, sy = s[0], s[1], s[2]
     cr, cp, cy = c[0], c[1], c[2]
@@ -119,7 +119,7 @@ def _attitude_terms(s: NDArray[np.float64], c: NDArray[np.float64], C: NDArray[n
     C[9], C[10], C[11], C[12] = sr, cr, sp / cp, 1.0 / cp
 
 
-@kernel
+@compile_kernel
 def _process(x: NDArray[np.float64], C: NDArray[np.float64], dt: float, out: NDArray[np.float64]) -> None:
     """Move one point by dt with the attitude terms C; linear in everything but the attitude."""
     half = 0.5 * dt
@@ -136,7 +136,7 @@ def _process(x: NDArray[np.float64], C: NDArray[np.float64], dt: float, out: NDA
         out[k] = x[k]
 
 
-@kernel
+@compile_kernel
 def predict(
     x: NDArray[np.float64], P: NDArray[np.float64], q: NDArray[np.float64], dt: float, work: NDArray[np.float64]
 ) -> bool:
@@ -164,11 +164,11 @@ def predict(
     D = work[16:38]  # deviations: 12 points, 9 linear pairs, the mean
     xs, centre, C, turned = work[40], work[41], work[42], work[43]
     s0, c0, s1, c1 = turned[0:3], turned[3:6], turned[6:9], turned[9:12]
-    if not _factor(P, L):
+    if not _factorize(P, L):
         return False
     for k in range(3):
         s0[k], c0[k] = sin(x[ROLL + k]), cos(x[ROLL + k])
-    _attitude_terms(s0, c0, C)
+    _compute_attitude_terms(s0, c0, C)
     _process(x, C, dt, centre)
     # columns that leave the attitude alone: both points of a pair deviate by the same, with opposite signs
     for i in range(_POSED, STATES):
@@ -185,7 +185,7 @@ def predict(
                 ds, dc = _sin(step), _cos(step)
                 s1[k], c1[k] = s0[k] * dc + c0[k] * ds, c0[k] * dc - s0[k] * ds
             row = D[2 * i + side]
-            _attitude_terms(s1, c1, C)
+            _compute_attitude_terms(s1, c1, C)
             _process(xs, C, dt, row)
             for j in range(ROW):
                 row[j] -= centre[j]
@@ -256,7 +256,7 @@ def predict(
     return True
 
 
-@kernel
+@compile_kernel
 def _observe(kind: int, x: NDArray[np.float64], lever: NDArray[np.float64], out: NDArray[np.float64]) -> None:
     """Write the three entries that a sensor of this kind would show in state x."""
     lx, ly, lz = lever[0], lever[1], lever[2]
@@ -277,7 +277,7 @@ def _observe(kind: int, x: NDArray[np.float64], lever: NDArray[np.float64], out:
     out[2] = x[AZ] + wx * uy - wy * ux + GRAVITY_MPS2 * cp * cr
 
 
-@kernel
+@compile_kernel
 def _correct(
     x: NDArray[np.float64],
     P: NDArray[np.float64],
@@ -331,7 +331,7 @@ def _correct(
     return nis
 
 
-@kernel
+@compile_kernel
 def update(
     x: NDArray[np.float64],
     P: NDArray[np.float64],
@@ -387,7 +387,7 @@ def update(
     # of row i the entries of the pair of points i, plus in 0..2 and minus in 3..5; row 15: the centre and the mean
     seen = work[16:32]
     xs = work[32]
-    if not _factor(P, L):
+    if not _factorize(P, L):
         return np.inf
     centre = seen[15]
     _observe(kind, x, lever, centre)
@@ -426,7 +426,7 @@ def update(
     return float(_correct(x, P, C, S, y, size, gate))
 
 
-@kernel
+@compile_kernel
 def _forget_correlations(P: NDArray[np.float64]) -> None:
     """Make a covariance positive definite that rounding has made useless: keep its variances alone."""
     for i in range(STATES):
@@ -436,7 +436,7 @@ def _forget_correlations(P: NDArray[np.float64]) -> None:
         P[i, i] = max(variance, 1e-12)
 
 
-@kernel
+@compile_kernel
 def advance(
     x: NDArray[np.float64], P: NDArray[np.float64], q: NDArray[np.float64], dt: float, work: NDArray[np.float64]
 ) -> int:
@@ -453,13 +453,13 @@ def advance(
     return repairs
 
 
-@kernel
-def opened_state(kind: int, index: int) -> int:
+@compile_kernel
+def find_observed_state(kind: int, index: int) -> int:
     """Return the state that entry ``index`` of a measurement of this kind shows most directly."""
     return index + (AX if kind == SPECIFIC_FORCE else VX if kind == SENSOR_VELOCITY else X)
 
 
-@kernel
+@compile_kernel
 def _open_up(
     x: NDArray[np.float64],
     P: NDArray[np.float64],
@@ -474,7 +474,7 @@ def _open_up(
     if kind != SELECT:
         _observe(kind, x, lever, seen)
     for a in range(index.size):
-        i = opened_state(kind, index[a])
+        i = find_observed_state(kind, index[a])
         y = z[a] - seen[index[a]]
         if ROLL <= i <= YAW:
             y = min(abs(_wrap(y)), MAX_OPENED_RAD)
@@ -483,14 +483,14 @@ def _open_up(
             P[YAW, YAW] += MAX_OPENED_RAD * MAX_OPENED_RAD
 
 
-@kernel
-def locked_out(count: float, since_s: float, now_s: float) -> bool:
+@compile_kernel
+def is_locked_out(count: float, since_s: float, now_s: float) -> bool:
     """Tell whether a gate that refused ``count`` measurements in a row since ``since_s`` guards a wrong belief."""
     return count >= _LOCKOUT_COUNT and now_s - since_s >= _LOCKOUT_S
 
 
-@kernel
-def run(belief: Belief, q: NDArray[np.float64], events: Events, sources: Sources, outputs: Outputs) -> int:
+@compile_kernel
+def run(belief: FilterState, q: NDArray[np.float64], events: Events, sources: Sources, outputs: Outputs) -> int:
     """Filter forward through all events up to the last output; events after it belong to the next call.
 
     When a gate has refused every measurement of a source for 5 s (and five of them), it guards a wrong belief: the states that the
@@ -541,7 +541,7 @@ def run(belief: Belief, q: NDArray[np.float64], events: Events, sources: Sources
                 if refused[s, 0] == 0.0:
                     refused[s, 1] = now_s
                 refused[s, 0] += 1.0
-                if locked_out(refused[s, 0], refused[s, 1], now_s):
+                if is_locked_out(refused[s, 0], refused[s, 1], now_s):
                     _open_up(x, P, kind, index, lever, z, work)
                     update(x, P, kind, index, lever, z, variance, np.inf, work)
                     outputs.outcome[e] = RECOVERED

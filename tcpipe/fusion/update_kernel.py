@@ -5,7 +5,7 @@ from __future__ import annotations
 from math import cos, sin, sqrt
 from typing import Any
 
-from tcpipe.compiled import kernel
+from tcpipe.compiled import compile_kernel
 from tcpipe.fusion.state_kernel import (
     CENTRE_WEIGHT,
     GNSS_POSITION,
@@ -18,14 +18,14 @@ from tcpipe.fusion.state_kernel import (
     WHEEL_VELOCITY,
     Matrix,
     Vector,
-    displaced,
-    factor,
+    displace_state,
+    factorize_covariance,
 )
 
 
-@kernel
-def observation(U: Matrix, Z: Matrix, H: Matrix) -> None:
-    """Fill H, shape (3, n): H' = P⁻⁻¹ cov(dx⁻, z) = U⁻¹ M, by the sigma points of `innovation_of`."""
+@compile_kernel
+def compute_observation(U: Matrix, Z: Matrix, H: Matrix) -> None:
+    """Fill H, shape (3, n): H' = P⁻⁻¹ cov(dx⁻, z) = U⁻¹ M, by the sigma points of `compute_innovation`."""
     n = U.shape[0]
     for a in range(3):
         for i in range(n - 1, -1, -1):
@@ -35,8 +35,8 @@ def observation(U: Matrix, Z: Matrix, H: Matrix) -> None:
             H[a, i] = s / U[i, i]
 
 
-@kernel
-def _expected(kind: int, x: Vector, w: Vector, lever: Vector, bias: float, out: Vector) -> None:
+@compile_kernel
+def _predict_measurement(kind: int, x: Vector, w: Vector, lever: Vector, bias: float, out: Vector) -> None:
     """Measurement h(x) of an event; w: angular velocity now, of which ``bias`` times b_g is taken off."""
     out[0] = 0.0
     out[1] = 0.0
@@ -79,8 +79,8 @@ def _expected(kind: int, x: Vector, w: Vector, lever: Vector, bias: float, out: 
             out[1] = v2
 
 
-@kernel
-def innovation_of(
+@compile_kernel
+def compute_innovation(
     kind: int, x: Vector, P: Matrix, z: Vector, r: Vector, w: Vector, lever: Vector, bias: float, work: Any, gain: Any
 ) -> float:
     """Fill innovation, cross covariance and the inverse innovation covariance; return the squared normalised innovation.
@@ -91,8 +91,8 @@ def innovation_of(
     y, Z, S, cross, inverse = gain
     n = P.shape[0]
     gamma, wi = sqrt(n), 0.5 / n
-    factor(P, U, tally)
-    _expected(kind, x, w, lever, bias, y)
+    factorize_covariance(P, U, tally)
+    _predict_measurement(kind, x, w, lever, bias, y)
     centre0 = y[0]
     centre1 = y[1]
     centre2 = y[2]
@@ -104,8 +104,8 @@ def innovation_of(
         for j in range(n):
             d[j] = gamma * U[i, j] if j >= i else 0.0
         for side in range(2):
-            displaced(x, d, 1.0 - 2.0 * side, i < 3, shifted, turn)
-            _expected(kind, shifted, w, lever, bias, Z[i + side * n])
+            displace_state(x, d, 1.0 - 2.0 * side, i < 3, shifted, turn)
+            _predict_measurement(kind, shifted, w, lever, bias, Z[i + side * n])
         for a in range(3):
             y[a] += wi * (Z[i, a] + Z[i + n, a])
             e = wi * (Z[i, a] - Z[i + n, a])
@@ -138,7 +138,7 @@ def innovation_of(
     return nis
 
 
-@kernel
+@compile_kernel
 def _reset(a: float, b: float, c: float, out: Matrix) -> None:
     """Fill J, which carries a small rotation error over to the axes that a correction by (a, b, c) has turned (Solà 2017, eq. 183).
 
@@ -164,9 +164,9 @@ def _reset(a: float, b: float, c: float, out: Matrix) -> None:
     out[0, 2] -= f * b
 
 
-@kernel
+@compile_kernel
 def correct(x: Vector, P: Matrix, work: Any, gain: Any, J: Matrix) -> None:
-    """X ⊞ K y and J (P - K S K') J' with what `innovation_of` left; K' stays in the first rows of the work's second array."""
+    """X ⊞ K y and J (P - K S K') J' with what `compute_innovation` left; K' stays in the first rows of the work's second array."""
     _, D, d, _, _, shifted, _, turn, _ = work
     y, _, _, cross, inverse = gain
     n = P.shape[0]
@@ -198,6 +198,6 @@ def correct(x: Vector, P: Matrix, work: Any, gain: Any, J: Matrix) -> None:
             s = 0.5 * (P[i, j] + P[j, i])
             P[i, j] = s
             P[j, i] = s
-    displaced(x, d, 1.0, True, shifted, turn)
+    displace_state(x, d, 1.0, True, shifted, turn)
     for i in range(x.size):
         x[i] = shifted[i]

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.geometry.polyline import row_before
+from tcpipe.geometry.polyline import find_row_before
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -27,7 +27,7 @@ def interpolate(stamp_ns: Ints, value: Floats, at_ns: Ints) -> Floats:
     return between
 
 
-def integral_to(stamp_ns: Ints, value: Floats, at_ns: Ints) -> Floats:
+def integrate_to(stamp_ns: Ints, value: Floats, at_ns: Ints) -> Floats:
     """Return the exact integral from the first sample to each time, shape (M,), in the unit of ``value`` times seconds.
 
     Parameters
@@ -36,24 +36,24 @@ def integral_to(stamp_ns: Ints, value: Floats, at_ns: Ints) -> Floats:
     value : any unit, shape (N,).
     at_ns : [ns], shape (M,), inside the span of ``stamp_ns``.
     """
-    return product_integral_to(stamp_ns, value, np.ones_like(value), at_ns)
+    return integrate_product_to(stamp_ns, value, np.ones_like(value), at_ns)
 
 
 def mean_between(stamp_ns: Ints, value: Floats, start_ns: Ints, end_ns: Ints) -> Floats:
     """Return the exact time-mean of the signal over each span, shape (M,); NaN where the signal has a NaN that touches the span.
 
-    Parameters as in `integral_to`; every span is longer than nothing.
+    Parameters as in `integrate_to`; every span is longer than nothing.
     """
     known = np.isfinite(value)
     total, unknown = (
-        integral_to(stamp_ns, x, end_ns) - integral_to(stamp_ns, x, start_ns)
+        integrate_to(stamp_ns, x, end_ns) - integrate_to(stamp_ns, x, start_ns)
         for x in (np.where(known, value, 0.0), 1.0 - known)
     )
     mean: Floats = np.where(unknown > _NS, np.nan, total / ((end_ns - start_ns) * _NS))
     return mean
 
 
-def product_integral_to(stamp_ns: Ints, a: Floats, b: Floats, at_ns: Ints) -> Floats:
+def integrate_product_to(stamp_ns: Ints, a: Floats, b: Floats, at_ns: Ints) -> Floats:
     """Return the exact integral of the product of two piecewise-linear signals on one grid, from its first stamp to each time.
 
     On an interval of length h with end values a0, a1 and b0, b1 it is h (2 a0 b0 + 2 a1 b1 + a0 b1 + a1 b0) / 6.
@@ -65,29 +65,29 @@ def product_integral_to(stamp_ns: Ints, a: Floats, b: Floats, at_ns: Ints) -> Fl
     at_ns : [ns], shape (M,), inside the span of ``stamp_ns``.
     """
     step_s = np.diff(stamp_ns) * _NS
-    whole = np.concatenate(([0.0], np.cumsum(_product(step_s, a[:-1], a[1:], b[:-1], b[1:]))))
-    row = row_before(stamp_ns, at_ns)
+    whole = np.concatenate(([0.0], np.cumsum(_integrate_product(step_s, a[:-1], a[1:], b[:-1], b[1:]))))
+    row = find_row_before(stamp_ns, at_ns)
     part_s = (at_ns - stamp_ns[row]) * _NS
     share = part_s / step_s[row]
     a_end = a[row] + share * (a[row + 1] - a[row])
     b_end = b[row] + share * (b[row + 1] - b[row])
-    integral: Floats = whole[row] + _product(part_s, a[row], a_end, b[row], b_end)
+    integral: Floats = whole[row] + _integrate_product(part_s, a[row], a_end, b[row], b_end)
     return integral
 
 
-def held_back_integral_to(stamp_ns: Ints, value: Floats, at_ns: Ints) -> Floats:
+def integrate_held_to(stamp_ns: Ints, value: Floats, at_ns: Ints) -> Floats:
     """Return the integral of the step signal whose value on an interval is that of its right end, from the first stamp to each time.
 
     A source that reports the average over the time since its last message means exactly this (right-endpoint rectangle); it is also
-    the sum of the paper's Eq. 1. Parameters as in `integral_to`.
+    the sum of the paper's Eq. 1. Parameters as in `integrate_to`.
     """
     step_s = np.diff(stamp_ns) * _NS
     whole = np.concatenate(([0.0], np.cumsum(step_s * value[1:])))
-    row = row_before(stamp_ns, at_ns)
+    row = find_row_before(stamp_ns, at_ns)
     integral: Floats = whole[row] + (at_ns - stamp_ns[row]) * _NS * value[row + 1]
     return integral
 
 
-def _product(step_s: NDArray[np.floating[Any]], a0: Floats, a1: Floats, b0: Floats, b1: Floats) -> Floats:
+def _integrate_product(step_s: NDArray[np.floating[Any]], a0: Floats, a1: Floats, b0: Floats, b1: Floats) -> Floats:
     integral: Floats = step_s * (2.0 * a0 * b0 + 2.0 * a1 * b1 + a0 * b1 + a1 * b0) / 6.0
     return integral

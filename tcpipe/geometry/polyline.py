@@ -13,13 +13,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.compiled import kernel
+from tcpipe.compiled import compile_kernel
 
 _GAUSS_NODES, _GAUSS_WEIGHTS = np.polynomial.legendre.leggauss(8)
 _NS = 1e-9
 
 
-def row_before(stamp_ns: NDArray[np.int64], at_ns: NDArray[np.int64]) -> NDArray[np.intp]:
+def find_row_before(stamp_ns: NDArray[np.int64], at_ns: NDArray[np.int64]) -> NDArray[np.intp]:
     """Return for each time the row that begins its interval: the last row at or before it, at most the last but one.
 
     Parameters
@@ -62,7 +62,7 @@ class Polyline:
         Differences telescope, so the pieces of a path add up to the whole.
         """
         row, u, step_s = _locate(self.stamp_ns, at_ns)
-        between: NDArray[np.float64] = self.length_m[row] + _partial_length_m(
+        between: NDArray[np.float64] = self.length_m[row] + _compute_partial_length_m(
             self.position_m[:, :2], self.velocity_mps[:, :2], row, u, step_s
         )
         return between
@@ -78,11 +78,11 @@ class Polyline:
         row, u, _ = _locate(self.stamp_ns, at)
         x0, y0, _z0 = self.position_at(at)[0]
         start = (row[0], u[0, 0])
-        found = int(_first_crossing(self.stamp_ns, self.position_m, self.velocity_mps, start, (x0, y0, radius_m)))
+        found = int(_find_first_crossing(self.stamp_ns, self.position_m, self.velocity_mps, start, (x0, y0, radius_m)))
         return None if found < 0 else found
 
 
-def polyline(
+def fit_polyline(
     stamp_ns: NDArray[np.int64], position_m: NDArray[np.float64], velocity_mps: NDArray[np.float64]
 ) -> Polyline:
     """Return the path through samples: cubic Hermite between them, its length by 8-node Gauss-Legendre quadrature of its speed.
@@ -95,7 +95,7 @@ def polyline(
     position_m, velocity_mps = np.ascontiguousarray(position_m), np.ascontiguousarray(velocity_mps)
     row = np.arange(len(stamp_ns) - 1)
     step_s = np.diff(stamp_ns)[:, None] * _NS
-    steps = _partial_length_m(position_m[:, :2], velocity_mps[:, :2], row, np.ones((len(row), 1)), step_s)
+    steps = _compute_partial_length_m(position_m[:, :2], velocity_mps[:, :2], row, np.ones((len(row), 1)), step_s)
     return Polyline(stamp_ns, position_m, velocity_mps, np.concatenate(([0.0], np.cumsum(steps))))
 
 
@@ -103,12 +103,12 @@ def _locate(
     stamp_ns: NDArray[np.int64], at_ns: NDArray[np.int64]
 ) -> tuple[NDArray[np.intp], NDArray[np.float64], NDArray[np.float64]]:
     """Return each time's interval, its share of it (0 to 1) and the interval's length [s]; the latter two of shape (M, 1)."""
-    row = row_before(stamp_ns, at_ns)
+    row = find_row_before(stamp_ns, at_ns)
     step_s = (stamp_ns[row + 1] - stamp_ns[row])[:, None].astype(np.float64) * _NS
     return row, ((at_ns - stamp_ns[row]) * _NS)[:, None] / step_s, step_s
 
 
-def _partial_length_m(
+def _compute_partial_length_m(
     xy_m: NDArray[np.float64],
     velocity_mps: NDArray[np.float64],
     row: NDArray[np.intp],
@@ -124,23 +124,23 @@ def _partial_length_m(
     return length
 
 
-@kernel
-def _first_crossing(stamp_ns, xy_m, velocity_mps, start, circle):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
+@compile_kernel
+def _find_first_crossing(stamp_ns, xy_m, velocity_mps, start, circle):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
     row, share = start
     distance = np.empty(7)
     for k in range(row, len(stamp_ns) - 1):
         step_ns = stamp_ns[k + 1] - stamp_ns[k]
-        _squared_distance(distance, xy_m[k : k + 2], velocity_mps[k : k + 2] * (step_ns * 1e-9), circle)
+        _compute_squared_distance(distance, xy_m[k : k + 2], velocity_mps[k : k + 2] * (step_ns * 1e-9), circle)
         if distance.max() < 0.0:
             continue
-        u = _first_root(distance, share if k == row else 0.0)
+        u = _find_first_root(distance, share if k == row else 0.0)
         if u >= 0.0:
             return stamp_ns[k] + np.int64(np.round(u * step_ns))
     return np.int64(-1)
 
 
-@kernel
-def _squared_distance(out, ends_m, slopes_m, circle):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
+@compile_kernel
+def _compute_squared_distance(out, ends_m, slopes_m, circle):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
     """Bernstein coefficients of |p(u) - p0|² - d² on one interval: products of the cubic's control points."""
     x0, y0, radius_m = circle
     control = np.empty((2, 4))
@@ -160,17 +160,17 @@ def _squared_distance(out, ends_m, slopes_m, circle):  # type: ignore[no-untyped
     out -= radius_m * radius_m
 
 
-@kernel
-def _first_root(coefficients, begin):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
+@compile_kernel
+def _find_first_root(coefficients, begin):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
     """First u in [begin, 1] at which the Bernstein polynomial rises through zero, or -1; leftmost piece first, from a stack."""
     stack = np.empty((64, 7))
     low, high = np.empty(64), np.empty(64)
-    _copied(coefficients, stack[0])
+    _copy_values(coefficients, stack[0])
     low[0], high[0] = 0.0, 1.0
     top = 0
     if begin > 0.0:
         left, right = _split(coefficients, begin)
-        _copied(right, stack[0])
+        _copy_values(right, stack[0])
         low[0] = begin
     while top >= 0:
         piece, a, b = stack[top].copy(), low[top], high[top]
@@ -189,21 +189,21 @@ def _first_root(coefficients, begin):  # type: ignore[no-untyped-def]  # noqa: A
             continue  # touches the circle without leaving it
         left, right = _split(piece, 0.5)
         middle = 0.5 * (a + b)
-        _copied(right, stack[top + 1])
-        _copied(left, stack[top + 2])
+        _copy_values(right, stack[top + 1])
+        _copy_values(left, stack[top + 2])
         low[top + 1], high[top + 1] = middle, b
         low[top + 2], high[top + 2] = a, middle
         top += 2
     return -1.0
 
 
-@kernel
-def _copied(values, out):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
-    for i in range(7):  # no slices, see `tcpipe.fusion.state_kernel.copied`
+@compile_kernel
+def _copy_values(values, out):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
+    for i in range(7):  # no slices, see `tcpipe.fusion.state_kernel.copy_values`
         out[i] = values[i]
 
 
-@kernel
+@compile_kernel
 def _bisect(coefficients):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
     a, b = 0.0, 1.0
     for _ in range(60):
@@ -216,7 +216,7 @@ def _bisect(coefficients):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN2
     return b
 
 
-@kernel
+@compile_kernel
 def _split(coefficients, u):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
     """Coefficients of both parts of a Bernstein polynomial split at u (de Casteljau); the value at u stands between them."""
     work = coefficients.copy()

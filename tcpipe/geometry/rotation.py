@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 
-def normalized(quat_xyzw: ArrayLike) -> NDArray[np.float64]:
+def normalize(quat_xyzw: ArrayLike) -> NDArray[np.float64]:
     """Return quaternions of unit length with w >= 0; NaN where the length is zero or not finite. Shape (..., 4)."""
     quat = np.asarray(quat_xyzw, np.float64)
     length = np.linalg.norm(quat, axis=-1, keepdims=True)
@@ -45,14 +45,14 @@ def quat_from_matrix(rotation: ArrayLike) -> NDArray[np.float64]:
         candidates[..., i, 3] = candidates[..., 3, i] = R[..., k, j] - R[..., j, k]
     candidates[..., 3, 3] = 1 + trace
     best = np.argmax(np.diagonal(candidates, axis1=-2, axis2=-1), axis=-1)
-    return normalized(np.take_along_axis(candidates, best[..., None, None], axis=-2)[..., 0, :])
+    return normalize(np.take_along_axis(candidates, best[..., None, None], axis=-2)[..., 0, :])
 
 
 def quat_from_rpy(roll_rad: ArrayLike, pitch_rad: ArrayLike, yaw_rad: ArrayLike) -> NDArray[np.float64]:
     """Return unit quaternions (..., 4) of fixed-axis roll, pitch, yaw [rad]."""
     r, p, y = np.broadcast_arrays(*(np.asarray(a, np.float64) / 2 for a in (roll_rad, pitch_rad, yaw_rad)))
     sr, cr, sp, cp, sy, cy = np.sin(r), np.cos(r), np.sin(p), np.cos(p), np.sin(y), np.cos(y)
-    return normalized(
+    return normalize(
         np.stack(
             (
                 sr * cp * cy - cr * sp * sy,
@@ -78,11 +78,11 @@ def rpy_from_quat(quat_xyzw: ArrayLike) -> NDArray[np.float64]:
     return rpy_from_matrix(matrix_from_quat(quat_xyzw))
 
 
-def product(a_from_b_xyzw: ArrayLike, b_from_c_xyzw: ArrayLike) -> NDArray[np.float64]:
+def multiply(a_from_b_xyzw: ArrayLike, b_from_c_xyzw: ArrayLike) -> NDArray[np.float64]:
     """Return a_from_c (..., 4), w >= 0: the quaternion product. Solà eq. 12."""
     x1, y1, z1, w1 = np.moveaxis(np.asarray(a_from_b_xyzw, np.float64), -1, 0)
     x2, y2, z2, w2 = np.moveaxis(np.asarray(b_from_c_xyzw, np.float64), -1, 0)
-    return normalized(
+    return normalize(
         np.stack(
             (
                 w1 * x2 + x1 * w2 + y1 * z2 - z1 * y2,
@@ -95,7 +95,7 @@ def product(a_from_b_xyzw: ArrayLike, b_from_c_xyzw: ArrayLike) -> NDArray[np.fl
     )
 
 
-def inverse(a_from_b_xyzw: ArrayLike) -> NDArray[np.float64]:
+def invert(a_from_b_xyzw: ArrayLike) -> NDArray[np.float64]:
     """Return b_from_a (..., 4) of unit quaternions: the conjugate."""
     conjugate: NDArray[np.float64] = np.asarray(a_from_b_xyzw, np.float64) * np.array([-1.0, -1.0, -1.0, 1.0])
     return conjugate
@@ -112,12 +112,12 @@ def quat_from_rotation_vector(rotation_vector_rad: ArrayLike) -> NDArray[np.floa
     vector = np.asarray(rotation_vector_rad, np.float64)
     angle = np.linalg.norm(vector, axis=-1, keepdims=True)
     half_sinc = 0.5 * np.sinc(angle / (2 * np.pi))
-    return normalized(np.concatenate((half_sinc * vector, np.cos(angle / 2)), -1))
+    return normalize(np.concatenate((half_sinc * vector, np.cos(angle / 2)), -1))
 
 
 def rotation_vector_from_quat(quat_xyzw: ArrayLike) -> NDArray[np.float64]:
     """Return the logarithm: rotation vectors [rad] (..., 3), length in [0, pi], of quaternions (..., 4). Solà eq. 105."""
-    quat = normalized(quat_xyzw)
+    quat = normalize(quat_xyzw)
     sine = np.linalg.norm(quat[..., :3], axis=-1, keepdims=True)
     angle = 2 * np.arctan2(sine, quat[..., 3:])
     return quat[..., :3] * np.where(sine > 1e-12, angle / np.where(sine > 1e-12, sine, 1.0), 2.0)

@@ -11,14 +11,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.dataset import Dataset, Split
-from tcpipe.dataset.beside import beside_of
+from tcpipe.dataset.extra_features import read_extra_features
 from tcpipe.errors import ModelError
 from tcpipe.geometry.datum import enu_from_geodetic
 from tcpipe.learning.curves import Curves, Form, fit_curves
-from tcpipe.learning.evaluation_facts import SPLITS, Compared
-from tcpipe.learning.metrics import LEAST, LEAST_VELOCITY_MPS, Array, Costs, costs, errors, ratio_of_errors
+from tcpipe.learning.evaluation_facts import SPLITS, BaselineResult
+from tcpipe.learning.metrics import (
+    LEAST,
+    LEAST_VELOCITY_MPS,
+    Array,
+    Costs,
+    compare_errors,
+    compute_costs,
+    compute_errors,
+)
 from tcpipe.learning.models import Model
-from tcpipe.learning.physics_model import fit_physics_model, standing_of
+from tcpipe.learning.physics_model import find_idle_power, fit_physics_model
 from tcpipe.learning.predictions import Measured
 from tcpipe.tables.findings import Finding, Subject, make_finding
 
@@ -42,9 +50,9 @@ Predictor = Callable[[Split], Array]
 """Power [W] and velocity [m/s] of the samples of a split, shape (N, 2)."""
 
 
-def compared(
+def compare_baselines(
     ours: Model, data: Dataset, sets: Mapping[str, Measured], said: Mapping[str, Costs], *, seed: int
-) -> tuple[list[Compared], list[Finding]]:
+) -> tuple[list[BaselineResult], list[Finding]]:
     """Return the errors of every baseline on the very samples of a model's, with the ratios of the model's to them; and what lacks.
 
     Parameters
@@ -55,22 +63,24 @@ def compared(
     """
     kind = ours.card.training.config.model
     own = {"table": TREES, "physics": PHYSICS}.get(kind)
-    train = _fitted_on(data["train"], ours)
+    train = _select_fitted_samples(data["train"], ours)
     if not len(train):
         names = {"error": "the dataset has no labelled samples in split train"}
         return [], [make_finding("baseline-missing", Subject("model", "baselines"), names=names)]
-    predictors, lacking = _baselines(train, ours, [name for name in SIMPLEST_FIRST if name != own])
+    predictors, lacking = _fit_baselines(train, ours, [name for name in SIMPLEST_FIRST if name != own])
     logger.info("baselines: %s, fitted on %d samples", ", ".join(predictors), len(train))
-    found: list[Compared] = []
+    found: list[BaselineResult] = []
     for split, part in sets.items():
         for name, predict in predictors.items():
             power, velocity = predict(part.split).T
-            theirs = costs(power, np.maximum(velocity, LEAST_VELOCITY_MPS), ours.chord_m)
-            found += beside(name, split, part, said[split], theirs, block_m=data.card.recipe.split.block_m, seed=seed)
+            theirs = compute_costs(power, np.maximum(velocity, LEAST_VELOCITY_MPS), ours.chord_m)
+            found += compare_with_baseline(
+                name, split, part, said[split], theirs, block_m=data.card.recipe.split.block_m, seed=seed
+            )
     return found, lacking
 
 
-def _fitted_on(train: Split, ours: Model) -> Split:
+def _select_fitted_samples(train: Split, ours: Model) -> Split:
     """Return the samples that a model of this kind is fitted on: without the fold that stops a network, unless there is no other."""
     labelled = train.take(np.isfinite(train.labels).all(axis=1))
     if ours.card.training.config.model != "resnet18":
@@ -79,10 +89,10 @@ def _fitted_on(train: Split, ours: Model) -> Split:
     return fitted if len(fitted) else labelled
 
 
-def _baselines(train: Split, ours: Model, wanted: Sequence[str]) -> tuple[dict[str, Predictor], list[Finding]]:
+def _fit_baselines(train: Split, ours: Model, wanted: Sequence[str]) -> tuple[dict[str, Predictor], list[Finding]]:
     """Return the baselines by name, and a finding for each that cannot be fitted."""
-    found, lacking = dict(_curves(train)), list[Finding]()
-    for name, fit in ((PHYSICS, _physics), (TREES, _trees)):
+    found, lacking = dict(_fit_curves(train)), list[Finding]()
+    for name, fit in ((PHYSICS, _fit_physics), (TREES, _fit_trees)):
         if name in wanted:
             try:
                 found[name] = fit(train, ours)
@@ -92,27 +102,29 @@ def _baselines(train: Split, ours: Model, wanted: Sequence[str]) -> tuple[dict[s
     return found, lacking
 
 
-def _curves(train: Split) -> Iterator[tuple[str, Predictor]]:
-    labels, beside = train.labels.astype(np.float64), beside_of(train)
+def _fit_curves(train: Split) -> Iterator[tuple[str, Predictor]]:
+    labels, beside = train.labels.astype(np.float64), read_extra_features(train)
     for form, name in CURVES.items():
         curves = fit_curves(form, beside.slope_rad, beside.class_id, labels)
 
         def predict(split: Split, curves: Curves = curves) -> Array:
-            there = beside_of(split)
+            there = read_extra_features(split)
             return curves.predict(there.slope_rad, there.class_id)
 
         yield name, predict
 
 
-def _physics(train: Split, ours: Model) -> Predictor:
+def _fit_physics(train: Split, ours: Model) -> Predictor:
     del ours
-    fitted = fit_physics_model(beside_of(train), train.labels.astype(np.float64), standing_watt=standing_of(train))
-    return lambda split: fitted.predict(beside_of(split))
+    fitted = fit_physics_model(
+        read_extra_features(train), train.labels.astype(np.float64), standing_watt=find_idle_power(train)
+    )
+    return lambda split: fitted.predict(read_extra_features(split))
 
 
-def _trees(train: Split, ours: Model) -> Predictor:
+def _fit_trees(train: Split, ours: Model) -> Predictor:
     """Return trees over features of all layers, and of the turn."""
-    from tcpipe.learning.table_fitting import features_of  # noqa: PLC0415  numba loads with it, and with the next
+    from tcpipe.learning.table_fitting import compute_features  # noqa: PLC0415  numba loads with it, and with the next
     from tcpipe.learning.table_model import fit_table  # noqa: PLC0415
 
     folds, labels = train.column("fold"), train.labels.astype(np.float64)
@@ -123,7 +135,10 @@ def _trees(train: Split, ours: Model) -> Predictor:
 
     def features(split: Split) -> Array:
         return np.column_stack(
-            [features_of(split, ours.patch_m, ours.classes.count), np.nan_to_num(beside_of(split).turn_radpm)]
+            [
+                compute_features(split, ours.patch_m, ours.classes.count),
+                np.nan_to_num(read_extra_features(split).turn_radpm),
+            ]
         )
 
     model, _ = fit_table(
@@ -132,7 +147,7 @@ def _trees(train: Split, ours: Model) -> Predictor:
     return lambda split: model.predict(features(split))
 
 
-def _groups(split: Split, block_m: float) -> tuple[Literal["runs", "blocks"], NDArray[np.generic]]:
+def _group_samples(split: Split, block_m: float) -> tuple[Literal["runs", "blocks"], NDArray[np.generic]]:
     """Return what errs alike: runs where there are enough, else blocks of ground."""
     runs = split.column("run_id").astype(np.str_)
     if len(np.unique(runs)) >= _FEWEST_RUNS:
@@ -143,45 +158,45 @@ def _groups(split: Split, block_m: float) -> tuple[Literal["runs", "blocks"], ND
     return "blocks", np.unique(places, axis=0, return_inverse=True)[1].reshape(-1)
 
 
-def beside(
+def compare_with_baseline(
     name: str, split: str, part: Measured, ours: Costs, theirs: Costs, *, block_m: float, seed: int
-) -> Iterator[Compared]:
+) -> Iterator[BaselineResult]:
     """Yield the errors of a baseline ``name`` in every quantity that it says, with the ratios of the model's to them, of the same samples.
 
     ``ours`` and ``theirs`` are of the samples of ``part``; the bootstrap with ``seed`` draws runs, or blocks of ``block_m``.
     """
-    drawn_by, groups = _groups(part.split, block_m)
+    drawn_by, groups = _group_samples(part.split, block_m)
     for quantity in theirs:
         measured = part.costs[quantity]
         large = measured >= LEAST[quantity]
         off, other = (np.abs(costs_of[quantity] - measured) for costs_of in (ours, theirs))
         over = np.where(large, measured, 1.0)
-        yield Compared(
+        yield BaselineResult(
             baseline=name, split=split, quantity=quantity,
-            errors=errors(theirs[quantity], measured, LEAST[quantity]),
-            rmse_ratio=ratio_of_errors(off**2, other**2, groups, power=0.5, seed=seed),
-            mape_ratio=ratio_of_errors(off[large] / over[large], other[large] / over[large], groups[large], power=1.0, seed=seed),
+            errors=compute_errors(theirs[quantity], measured, LEAST[quantity]),
+            rmse_ratio=compare_errors(off**2, other**2, groups, power=0.5, seed=seed),
+            mape_ratio=compare_errors(off[large] / over[large], other[large] / over[large], groups[large], power=1.0, seed=seed),
             groups=len(np.unique(groups)), drawn_by=drawn_by,
         )  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
-class Standing:
+class ModelRank:
     """How a model compares with the baselines, of which ``best`` has the smallest RMSE."""
 
-    best: Compared
+    best: BaselineResult
     beats_all: bool
     beats_curves: bool | None
     """Whether it is significantly better than every curve over class and slope; None of too few groups."""
     is_worse: bool
 
 
-def describe_ratios(found: Sequence[Compared]) -> list[str]:
+def describe_ratios(found: Sequence[BaselineResult]) -> list[str]:
     """Return the ratio of RMSE to that of the best baseline, for energy and time of each split."""
     lines = []
     for split in SPLITS:
         for quantity, called in (("E", "energy E"), ("T", "time T")):
-            if (of := standing(found, split, quantity)) is not None:
+            if (of := rank_model(found, split, quantity)) is not None:
                 ratio, groups = of.best.rmse_ratio, f"{of.best.groups} {of.best.drawn_by}"
                 few = f"{groups} are too few for an interval"
                 interval = few if ratio.low is None else f"95 % CI {ratio.low:.2f} to {ratio.high:.2f}, {groups}"
@@ -190,7 +205,7 @@ def describe_ratios(found: Sequence[Compared]) -> list[str]:
     return lines
 
 
-def standing(found: Sequence[Compared], split: str, quantity: str) -> Standing | None:
+def rank_model(found: Sequence[BaselineResult], split: str, quantity: str) -> ModelRank | None:
     """Return how the model compares in a quantity of a split; None where no ratio is known."""
     rows = [row for row in found if (row.split, row.quantity) == (split, quantity) and row.rmse_ratio.value is not None]
     if not rows:
@@ -200,8 +215,8 @@ def standing(found: Sequence[Compared], split: str, quantity: str) -> Standing |
     worse = ratio.low is not None and ratio.low > 1.0 and (ratio.value or 0.0) > _ALIKE
     curves = [row for row in rows if row.baseline in CURVES.values()]
     beats = None if ratio.high is None else all(map(_is_better, curves))
-    return Standing(best, _is_better(best), beats, worse)
+    return ModelRank(best, _is_better(best), beats, worse)
 
 
-def _is_better(row: Compared) -> bool:
+def _is_better(row: BaselineResult) -> bool:
     return row.rmse_ratio.high is not None and row.rmse_ratio.high < 1.0

@@ -45,7 +45,7 @@ def read_checkpoint(path: Path, key: str) -> tuple[TrainingProgress, dict[str, A
     """Return what `write_checkpoint` wrote. `ModelError`: it is cut short, or of another dataset or other options."""
     try:
         arrays = read_arrays(path)
-        progress = _progress(json.loads(arrays.pop(_STATE).tobytes()))
+        progress = _read_progress(json.loads(arrays.pop(_STATE).tobytes()))
     except (ModelError, KeyError, TypeError, ValueError) as error:
         reason = error.problems[0].removeprefix(f"{path}: ") if isinstance(error, ModelError) else "not a checkpoint"
         raise ModelError(f"{path}: {reason}; remove it, or start anew with --no-resume") from None
@@ -58,7 +58,7 @@ def read_checkpoint(path: Path, key: str) -> tuple[TrainingProgress, dict[str, A
     return progress, dict(parts)
 
 
-def _progress(found: Any) -> TrainingProgress:
+def _read_progress(found: Any) -> TrainingProgress:
     """Return what was saved of a `TrainingProgress`; ValueError, TypeError or KeyError where it is none."""
     history = [(int(epoch), float(loss), float(held)) for epoch, loss, held in found["history"]]
     made = TrainingProgress(**{**found, "best_loss": float(found["best_loss"]), "history": history})

@@ -13,7 +13,7 @@ import numpy as np
 
 from tcpipe.learning import paper_tables as paper
 from tcpipe.learning.baselines import CURVES, TREES
-from tcpipe.learning.evaluation_facts import SPLITS, Compared, Evaluation
+from tcpipe.learning.evaluation_facts import SPLITS, BaselineResult, Evaluation
 from tcpipe.learning.metrics import Ratio
 from tcpipe.learning.wei_isler import OURS, PER_CLASS
 
@@ -44,23 +44,23 @@ class Claim:
         return f"{self.verdict}: {self.says}, {self.split}: RMSE of E {self.ratio} of its{told}"
 
 
-def checked_claims(runs: Sequence[Evaluation]) -> list[Claim]:
+def check_claims(runs: Sequence[Evaluation]) -> list[Claim]:
     """Return every claim as it stands after all runs (one evaluation a seed): mean ratios, within the widest of their intervals."""
     found = []
     for split in runs[0].splits:
         for baseline, says in CLAIMS.items():
-            ratio = _of_all([_ratio(run, baseline, split) for run in runs])
-            found.append(Claim(says, split, ratio, _in_the_paper(baseline, split), _verdict(ratio)))
+            ratio = _select_all_classes([_compute_ratio(run, baseline, split) for run in runs])
+            found.append(Claim(says, split, ratio, _read_paper_value(baseline, split), _describe_rank(ratio)))
     return found
 
 
-def _ratio(run: Evaluation, baseline: str, split: str) -> Ratio:
-    rows: tuple[Compared, ...] = (*run.networks, *run.baselines)
+def _compute_ratio(run: Evaluation, baseline: str, split: str) -> Ratio:
+    rows: tuple[BaselineResult, ...] = (*run.networks, *run.baselines)
     mine = (row.rmse_ratio for row in rows if (row.baseline, row.split, row.quantity) == (baseline, split, "E"))
     return next(mine, Ratio(None, None, None))
 
 
-def _of_all(ratios: Sequence[Ratio]) -> Ratio:
+def _select_all_classes(ratios: Sequence[Ratio]) -> Ratio:
     values, lows, highs = ([getattr(ratio, end) for ratio in ratios] for end in ("value", "low", "high"))
     if None in values:
         return Ratio(None, None, None)
@@ -68,7 +68,7 @@ def _of_all(ratios: Sequence[Ratio]) -> Ratio:
     return Ratio(mean, None, None) if None in lows else Ratio(mean, min(lows), max(highs))
 
 
-def _verdict(ratio: Ratio) -> Verdict:
+def _describe_rank(ratio: Ratio) -> Verdict:
     if ratio.value is None:
         return "not measured"
     if ratio.low is None or ratio.high is None or ratio.low <= 1.0 <= ratio.high:
@@ -76,7 +76,7 @@ def _verdict(ratio: Ratio) -> Verdict:
     return "held" if ratio.high < 1.0 else "NOT held"
 
 
-def _in_the_paper(baseline: str, split: str) -> float | None:
+def _read_paper_value(baseline: str, split: str) -> float | None:
     """Return the same ratio of the paper's table IV."""
     at = SPLITS.index(split)
     return paper.ENERGY[OURS][at][0] / paper.ENERGY[baseline][at][0] if baseline in paper.ENERGY else None

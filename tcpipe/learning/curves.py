@@ -41,14 +41,14 @@ class Curves:
 
     def predict(self, slope_rad: Floats, class_id: NDArray[np.int64]) -> Floats:
         """Return outputs, shape (N, outputs), of metres of ground."""
-        made = _functions(self.form, self.knots_rad, slope_rad)
+        made = _evaluate_functions(self.form, self.knots_rad, slope_rad)
         out = made @ self.pooled
         for known, numbers in zip(self.class_id.tolist(), self.own, strict=True):
             out[class_id == known] = made[class_id == known] @ numbers
         return out
 
     def arrays(self) -> dict[str, NDArray[np.generic]]:
-        """Return everything but the form by name, as `curves_of` takes it."""
+        """Return everything but the form by name, as `read_curves` takes it."""
         return {f"{_STORED}{name}": getattr(self, name) for name in _ARRAYS}
 
 
@@ -56,7 +56,7 @@ _MOST_KNOTS, _MOST_CLASSES = 6, 256
 _ARRAYS, _STORED = ("knots_rad", "pooled", "class_id", "own"), "curve_"
 
 
-def curve_forms(outputs: int) -> dict[str, ArrayForm]:
+def list_curve_arrays(outputs: int) -> dict[str, ArrayForm]:
     """Return types and shapes of the arrays of curves of so many outputs."""
     forms: dict[str, ArrayForm] = {
         "knots_rad": ("float64", ("knots",)),
@@ -67,7 +67,7 @@ def curve_forms(outputs: int) -> dict[str, ArrayForm]:
     return {f"{_STORED}{name}": form for name, form in forms.items()}
 
 
-def curves_of(form: Form, arrays: Mapping[str, NDArray[Any]], where: str) -> tuple[Curves, dict[str, NDArray[Any]]]:
+def read_curves(form: Form, arrays: Mapping[str, NDArray[Any]], where: str) -> tuple[Curves, dict[str, NDArray[Any]]]:
     """Return the curves that `Curves.arrays` told of, and what else is there; `ModelError` if they are not there."""
     rest = dict(arrays)
     try:
@@ -76,7 +76,9 @@ def curves_of(form: Form, arrays: Mapping[str, NDArray[Any]], where: str) -> tup
         raise ModelError(
             f"{where}: holds the weights of another model, or of an older kind; train the model again"
         ) from None
-    functions = _functions(form, curves.knots_rad, np.zeros(1)).shape[1] if curves.knots_rad.size <= _MOST_KNOTS else 0
+    functions = (
+        _evaluate_functions(form, curves.knots_rad, np.zeros(1)).shape[1] if curves.knots_rad.size <= _MOST_KNOTS else 0
+    )
     finite = all(np.isfinite(of).all() for of in (curves.knots_rad, curves.pooled, curves.own))
     if len(curves.pooled) != functions or not finite or len(curves.class_id) > _MOST_CLASSES:
         raise ModelError(f"{where}: holds curves that no training makes; train the model again")
@@ -93,7 +95,7 @@ def fit_curves(form: Form, slope_rad: Floats, class_id: NDArray[np.int64], label
     labels : finite, shape (N, outputs).
     """
     knots = np.unique(np.quantile(slope_rad, _KNOTS[form])) if _KNOTS[form] else np.empty(0)
-    made = _functions(form, knots, slope_rad)
+    made = _evaluate_functions(form, knots, slope_rad)
     pooled = np.asarray(np.linalg.lstsq(made, labels, rcond=None)[0], np.float64)
     drawn = made.T @ made * (made.shape[1] / len(made))
     classes = np.unique(class_id[class_id > 0])
@@ -104,7 +106,7 @@ def fit_curves(form: Form, slope_rad: Floats, class_id: NDArray[np.int64], label
     return Curves(form, knots, pooled, classes, own)
 
 
-def _functions(form: Form, knots_rad: Floats, slope_rad: Floats) -> Floats:
+def _evaluate_functions(form: Form, knots_rad: Floats, slope_rad: Floats) -> Floats:
     """Return the functions of a form at these slopes, shape (N, J); all of order one, so that none is lost beside another."""
     one = np.ones_like(slope_rad)
     if form == "mean" or not knots_rad.size:

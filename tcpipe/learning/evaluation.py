@@ -12,14 +12,14 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from tcpipe import __version__
-from tcpipe.balance.repeats import Floor
-from tcpipe.cost.prediction_errors import centring_of
+from tcpipe.balance.repeatability import Floor
+from tcpipe.cost.prediction_errors import fit_bias_correction
 from tcpipe.dataset import Dataset, Split, open_dataset
 from tcpipe.dataset.energies import ENERGIES, Energy
 from tcpipe.errors import DatasetError
 from tcpipe.formats.dataset_card import DatasetCard
-from tcpipe.formats.robot_files import shipped_profiles
-from tcpipe.learning.baselines import compared
+from tcpipe.formats.robot_files import load_shipped_profiles
+from tcpipe.learning.baselines import compare_baselines
 from tcpipe.learning.evaluation_facts import (
     SPLITS,
     AblationRow,
@@ -33,14 +33,23 @@ from tcpipe.learning.evaluation_facts import (
     SplitErrors,
 )
 from tcpipe.learning.evaluation_findings import find_weaknesses
-from tcpipe.learning.metrics import ALL, Array, Errors, Spread, costs, errors_by_class, label_floor, mean_of_draws
+from tcpipe.learning.metrics import (
+    ALL,
+    Array,
+    Errors,
+    Spread,
+    compute_costs,
+    compute_errors_by_class,
+    label_floor,
+    mean_of_draws,
+)
 from tcpipe.learning.models import Model, load_model
-from tcpipe.learning.predicted_samples import predictions_table
-from tcpipe.learning.predictions import Measured, check_fit, measured, predicted_costs, spreads_of
-from tcpipe.learning.training import Variant, dataset_checksum, train, training_task
-from tcpipe.learning.wei_isler import OURS, PER_CLASS, Trained, energy_table
+from tcpipe.learning.predicted_samples import make_predictions_table
+from tcpipe.learning.predictions import Measured, check_fit, collect_measured, predict_costs, predict_spreads
+from tcpipe.learning.training import Variant, compute_dataset_checksum, make_training_task, train
+from tcpipe.learning.wei_isler import OURS, PER_CLASS, Trained, make_energy_table
 from tcpipe.robots.profiles import Robot
-from tcpipe.splits.neighbours import CLOSE, PLACES, are_near, middles_deg
+from tcpipe.splits.neighbours import CLOSE, PLACES, are_near, compute_middles_deg
 from tcpipe.tables.findings import Finding, Subject, make_finding
 from tcpipe.tables.verdicts import judge
 from tcpipe.terrain.classes import NODATA_ID
@@ -91,50 +100,50 @@ def evaluate(
     check_fit(ours.card, data, str(model))
     fitting, fitted = ours.card.training.config, ours.card.training.samples["fitted"]
     names = {entry.id: entry.name for entry in ours.classes.classes}
-    sets = {name: found for name in SPLITS if len((found := measured(data[name], names)).split)}
+    sets = {name: found for name in SPLITS if len((found := collect_measured(data[name], names)).split)}
     if not sets:
         raise DatasetError(
             f"{data.path}: no labelled samples in test nor unseen: nothing to evaluate on; build it with a --split"
         )
-    said = {name: predicted_costs(ours, found.split) for name, found in sets.items()}
-    spreads = {name: spreads_of(ours, said[name], found.class_ids) for name, found in sets.items()}
+    said = {name: predict_costs(ours, found.split) for name, found in sets.items()}
+    spreads = {name: predict_spreads(ours, said[name], found.class_ids) for name, found in sets.items()}
     for name, found in sets.items():
         logger.info("%s: %d samples of %s", name, len(found.split), ", ".join(found.names.values()))
 
     def trained(name: str, variant: Variant) -> Model:
         place = out / NETWORKS / name
-        few = len(training_task(data, fitting.fold, variant).fit)
+        few = len(make_training_task(data, fitting.fold, variant).fit)
         longer = np.ceil(fitted / fitting.batch) / np.ceil(few / fitting.batch)  # as many steps, not as many epochs
         rules = replace(fitting, epochs=round(longer * fitting.epochs), patience=round(longer * fitting.patience))
         train(dataset, place, config=rules, variant=variant, disposable=True)
         return load_model(place)
 
-    ablation = list(_ablation(ours, sets, config, trained))
+    ablation = list(_iterate_ablation(ours, sets, config, trained))
     with_networks = config.baselines and fitting.model == "resnet18"
-    energy = energy_table(ours, data, sets, said, trained if with_networks else None, seed=config.seed)
-    baselines, lacking = compared(ours, data, sets, said, seed=config.seed)
+    energy = make_energy_table(ours, data, sets, said, trained if with_networks else None, seed=config.seed)
+    baselines, lacking = compare_baselines(ours, data, sets, said, seed=config.seed)
     evaluation = Evaluation(
         tcpipe_version=__version__,
         key=key,
         model=EvaluatedModel(ours.name, ours.checksum, ours.card.training, ours.card.label_energy),
-        dataset=EvaluatedDataset(data.card.name, dataset_checksum(data.card), data.card.splits),
+        dataset=EvaluatedDataset(data.card.name, compute_dataset_checksum(data.card), data.card.splits),
         config=config,
         splits={name: _split_errors(data, part, said[name], spreads[name], plant) for name, part in sets.items()},
         ablation=tuple(ablation),
         energy=energy.errors,
         networks=tuple(energy.compared),
-        time=_time(ours, sets, said, max_velocity_mps=_fastest_mps(ours.robot, data)),
+        time=_time(ours, sets, said, max_velocity_mps=_find_fastest_mps(ours.robot, data)),
         baselines=tuple(baselines),
-        blocks=by_blocks(ours, names),
-        repeatability=_repeatability(data.card, ENERGIES[ours.label_energy]),
-        plots={name: _plotted(part, said[name], config.plotted) for name, part in sets.items()},
+        blocks=compute_block_errors(ours, names),
+        repeatability=_estimate_repeatability(data.card, ENERGIES[ours.label_energy]),
+        plots={name: _select_plotted(part, said[name], config.plotted) for name, part in sets.items()},
     )
     findings = (*lacking, *_find_mismatches(ours, data, sets, energy.errors), *find_weaknesses(evaluation))
     evaluation = replace(evaluation, findings=findings, verdict=judge(findings))
-    return evaluation, predictions_table(sets, said, spreads)
+    return evaluation, make_predictions_table(sets, said, spreads)
 
 
-def _repeatability(card: DatasetCard, energy: Energy) -> dict[str, Floor | None]:
+def _estimate_repeatability(card: DatasetCard, energy: Energy) -> dict[str, Floor | None]:
     """Return how well each label repeats itself where ground was driven twice, as the dataset's card has it; None where it was not."""
     columns = {"w": energy.power, "v": card.label.columns[1], "T": "duration_s", "E": energy.energy}
     found = card.balance.repeatability
@@ -145,7 +154,7 @@ def _split_errors(
     data: Dataset, found: Measured, said: Mapping[str, Array], spreads: Mapping[str, Spread], plant: PlantCosts | None
 ) -> SplitErrors:
     def errors_of(costs: Mapping[str, Array], spreads: Mapping[str, Spread] | None = None) -> ErrorsByClass:
-        return errors_by_class(costs, found.costs, found.class_ids, found.names, spreads)
+        return compute_errors_by_class(costs, found.costs, found.class_ids, found.names, spreads)
 
     counts = {name: int((found.class_ids == class_id).sum()) for class_id, name in found.names.items()}
     return SplitErrors(
@@ -153,23 +162,23 @@ def _split_errors(
         classes=counts,
         class_order=tuple(counts),
         errors=errors_of(said, spreads),
-        leakage=leakage_of(data, found.split),
+        leakage=measure_leakage(data, found.split),
         label_floor=label_floor(found.deviations, found.costs, found.class_ids, found.names),
         simulation_floor=None if plant is None else errors_of(plant(found.split)),
     )
 
 
-def _ablation(ours: Model, sets: Sets, config: EvaluateConfig, trained: Trained) -> Iterator[AblationRow]:
+def _iterate_ablation(ours: Model, sets: Sets, config: EvaluateConfig, trained: Trained) -> Iterator[AblationRow]:
     """Yield table III, row by row: the trained network with layers replaced by noise, and networks that never had them."""
-    for number, letters in enumerate(_input_sets(ours)):
+    for number, letters in enumerate(_list_input_sets(ours)):
         left = tuple(LETTERS[letter] for letter in letters)
         noise = [channel for channel in ours.channels if channel not in left]
         logger.info("ablation: {%s}", ",".join(letters))
         by_split = {}
         for at, (name, found) in enumerate(sets.items()):
             draws = [
-                _all_errors(
-                    predicted_costs(ours, found.split, noise=noise, seed=(config.seed, number, at, draw)), found, ours
+                _compute_errors(
+                    predict_costs(ours, found.split, noise=noise, seed=(config.seed, number, at, draw)), found, ours
                 )
                 for draw in range(config.draws if noise else 1)
             ]
@@ -178,39 +187,39 @@ def _ablation(ours: Model, sets: Sets, config: EvaluateConfig, trained: Trained)
         if config.retrain and noise:
             anew = trained("ablation_" + "".join(letters), Variant(channels=left))
             by_split = {
-                name: _all_errors(predicted_costs(anew, found.split), found, anew) for name, found in sets.items()
+                name: _compute_errors(predict_costs(anew, found.split), found, anew) for name, found in sets.items()
             }
             yield AblationRow(letters, "retrained", **by_split)
 
 
-def _input_sets(ours: Model) -> list[tuple[str, ...]]:
+def _list_input_sets(ours: Model) -> list[tuple[str, ...]]:
     """Return the paper's input sets, as far as the model has their layers."""
     has = {letter for letter, layer in LETTERS.items() if layer in ours.channels}
     found = [tuple(letter for letter in letters if letter in has) for letters in INPUT_SETS]
     return list(dict.fromkeys(letters for letters in found if letters))
 
 
-def _all_errors(said: Mapping[str, Array], found: Measured, by: Model | None = None) -> dict[str, Errors]:
+def _compute_errors(said: Mapping[str, Array], found: Measured, by: Model | None = None) -> dict[str, Errors]:
     """Return the errors of all classes, and how well a model told them; ``by`` None tells none."""
-    spreads = None if by is None else spreads_of(by, said, found.class_ids)
-    by_class = errors_by_class(said, found.costs, found.class_ids, found.names, spreads)
+    spreads = None if by is None else predict_spreads(by, said, found.class_ids)
+    by_class = compute_errors_by_class(said, found.costs, found.class_ids, found.names, spreads)
     return {quantity: by_class[quantity][ALL] for quantity in by_class}
 
 
-def _fastest_mps(robot: str, data: Dataset) -> float | None:
+def _find_fastest_mps(robot: str, data: Dataset) -> float | None:
     """Return a robot's greatest speed [m/s], as the recipe of the dataset or else the package knows it."""
-    known = {**shipped_profiles().robots, **data.card.recipe.robots}
+    known = {**load_shipped_profiles().robots, **data.card.recipe.robots}
     return known.get(robot, Robot()).max_velocity_mps
 
 
 def _time(ours: Model, sets: Sets, said: Said, *, max_velocity_mps: float | None) -> dict[str, dict[str, Errors]]:
     """Return table V: T by this model, and T_e = d / v_e at the robot's greatest speed."""
-    found = {OURS: {name: _all_errors(said[name], part, ours)["T"] for name, part in sets.items()}}
+    found = {OURS: {name: _compute_errors(said[name], part, ours)["T"] for name, part in sets.items()}}
     if max_velocity_mps is not None:
         expected = {
             name: {"T": np.full(len(part.split), ours.chord_m / max_velocity_mps)} for name, part in sets.items()
         }
-        found[EXPECTED] = {name: _all_errors(expected[name], part)["T"] for name, part in sets.items()}
+        found[EXPECTED] = {name: _compute_errors(expected[name], part)["T"] for name, part in sets.items()}
     return found
 
 
@@ -218,7 +227,7 @@ def _find_mismatches(
     ours: Model, data: Dataset, sets: Sets, energy: Mapping[str, Mapping[str, Errors]]
 ) -> Iterator[Finding]:
     """Yield where model and dataset do not fit, and the samples that some figures are without."""
-    if dataset_checksum(data.card) != ours.card.dataset.sha256:
+    if compute_dataset_checksum(data.card) != ours.card.dataset.sha256:
         names = {"dataset": ours.card.dataset.name}
         yield make_finding("model-of-another-dataset", Subject("model", ours.name), names=names)
     for name, found in sets.items():
@@ -235,7 +244,7 @@ def _find_mismatches(
             yield make_finding("classes-without-network", subject, left_count=without, sample_count=total)
 
 
-def _plotted(found: Measured, said: Mapping[str, Array], count: int) -> Plotted:
+def _select_plotted(found: Measured, said: Mapping[str, Array], count: int) -> Plotted:
     """Return the first samples of every class (the rows stand in random order)."""
     rows = [np.flatnonzero(found.class_ids == class_id)[:count] for class_id in found.names]
     at = np.concatenate(rows)
@@ -251,9 +260,9 @@ def _plotted(found: Measured, said: Mapping[str, Array], count: int) -> Plotted:
 _UNKNOWN = {0: "unknown"}
 
 
-def leakage_of(data: Dataset, held: Split) -> Leakage | None:
+def measure_leakage(data: Dataset, held: Split) -> Leakage | None:
     """Return how near the samples of a split are to those of train; None where either has no samples with a place."""
-    ours, theirs = (middles_deg({name: part.column(name) for name in PLACES}) for part in (held, data["train"]))
+    ours, theirs = (compute_middles_deg({name: part.column(name) for name in PLACES}) for part in (held, data["train"]))
     within_m = CLOSE * data.card.recipe.segment.chord_m
     near = are_near(ours, theirs, within_m=within_m)
     if not len(near) or not len(theirs):
@@ -263,7 +272,7 @@ def leakage_of(data: Dataset, held: Split) -> Leakage | None:
     return Leakage(data.card.recipe.split.holdout, within_m, 100.0 * float(near.mean()), sharing)
 
 
-def by_blocks(model: Model, names: Mapping[int, str]) -> ErrorsByClass | None:
+def compute_block_errors(model: Model, names: Mapping[int, str]) -> ErrorsByClass | None:
     """Return the errors on the samples that a model keeps as held out, by class; None if it keeps none of power and velocity.
 
     Folds are blocks of ground, so that this is what the errors are where blocks are held out. A network was stopped by its fold, and
@@ -277,7 +286,9 @@ def by_blocks(model: Model, names: Mapping[int, str]) -> ErrorsByClass | None:
         for name in ("power_watt", "velocity_mps", "power_predicted_watt", "velocity_predicted_mps")
     )
     class_ids = np.nan_to_num(found["terrain_class"].astype(np.float64)).astype(np.int64)
-    centred = centring_of(found).apply(said_power, said_velocity, class_ids)
+    centred = fit_bias_correction(found).apply(said_power, said_velocity, class_ids)
     known = {**_UNKNOWN, **names}
     own = {number: known.get(number, str(number)) for number in np.unique(class_ids).tolist()}
-    return errors_by_class(costs(*centred, model.chord_m), costs(power, velocity, model.chord_m), class_ids, own)
+    return compute_errors_by_class(
+        compute_costs(*centred, model.chord_m), compute_costs(power, velocity, model.chord_m), class_ids, own
+    )

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Annotated, Literal, TypeAlias, TypedDict
 
-from tcpipe.balance.repeats import Floor
+from tcpipe.balance.repeatability import Floor
 from tcpipe.dataset.energies import EnergyName
 from tcpipe.learning.fitting import Seed
 from tcpipe.learning.metrics import Errors, Ratio
@@ -112,7 +112,7 @@ class AblationRow:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Compared:
+class BaselineResult:
     """A baseline beside the model, on the same samples: its errors, and the ratios of the model's to them."""
 
     baseline: str
@@ -156,13 +156,13 @@ class Evaluation:
     ablation: tuple[AblationRow, ...]
     energy: Mapping[str, Mapping[str, Errors]]
     """Table IV: errors of E by predictor and split, of the same samples."""
-    networks: tuple[Compared, ...] = ()
+    networks: tuple[BaselineResult, ...] = ()
     """Those of the networks of Wei and Isler, with the ratios of the model's to them."""
     time: Mapping[str, Mapping[str, Errors]]
     """Table V: errors of T by predictor and split."""
     blocks: ErrorsByClass | None = field(default=None, metadata=ABSENT)
     """Of the model on blocks of ground that it was not fitted on, which it keeps as its held-out samples."""
-    baselines: tuple[Compared, ...] = ()
+    baselines: tuple[BaselineResult, ...] = ()
     """Of all classes together, by split, baseline and quantity."""
     repeatability: Mapping[str, Floor | None]
     """How well each label repeats itself where ground was driven twice; None where none was."""

@@ -11,20 +11,26 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
-from tcpipe.balance.cells import SLOPE_NAMES, slope_ranges
+from tcpipe.balance.cells import SLOPE_NAMES, find_slope_ranges
 from tcpipe.dataset import Dataset
 from tcpipe.formats.json_files import Json
 from tcpipe.learning.evaluation_facts import Plotted
 from tcpipe.learning.metrics import QUANTITIES, UNITS
-from tcpipe.learning.predicted_samples import LEVELS, calibration, column_of, errors_joule, worst_rows
-from tcpipe.report.colours import CLASS_COLOURS, DROPPED, FAINT, SPLIT_COLOURS, class_colour
-from tcpipe.report.dataset_patches import sheets, thinned_by
-from tcpipe.report.packed import Column, packed, shown_to
+from tcpipe.learning.predicted_samples import (
+    LEVELS,
+    compute_calibration,
+    compute_errors_joule,
+    find_worst_rows,
+    make_column_name,
+)
+from tcpipe.report.colours import CLASS_COLOURS, DROPPED, FAINT, SPLIT_COLOURS, find_class_colour
+from tcpipe.report.column_packing import Column, make_shown_column, pack_columns
+from tcpipe.report.dataset_patches import choose_thinning, make_sheets
 from tcpipe.report.page import Section, Shaded
-from tcpipe.report.plots import Plot, new_plot
-from tcpipe.tables.arrays import texts
-from tcpipe.tables.catalogue import threshold
-from tcpipe.tables.columns import floats
+from tcpipe.report.plots import Plot, make_plot
+from tcpipe.tables.arrays import to_texts
+from tcpipe.tables.catalogue import read_threshold
+from tcpipe.tables.columns import to_floats
 
 MEASURED, PREDICTED = DROPPED, SPLIT_COLOURS["train"]
 MOST_PERCENT = 50.0
@@ -51,9 +57,9 @@ class EvaluatedSamples:
     patches: Json
 
 
-def evaluated_samples(table: pa.Table, data: Dataset) -> EvaluatedSamples:
+def select_evaluated_samples(table: pa.Table, data: Dataset) -> EvaluatedSamples:
     """Return what a page shows of the samples of ``table``, with patches of the dataset that they are of."""
-    rows, every = worst_rows(table, _WORST), texts(table.column("split"))
+    rows, every = find_worst_rows(table, _WORST), to_texts(table.column("split"))
     first = [np.flatnonzero(every == name)[:_MOST_SHOWN] for name in dict.fromkeys(every.tolist())]
     shown, split = np.unique(np.concatenate([*first, rows])), every[rows]
     parts: list[dict[str, NDArray[np.generic]]] = []
@@ -63,35 +69,35 @@ def evaluated_samples(table: pa.Table, data: Dataset) -> EvaluatedSamples:
         parts.append(data[name].layers(pc.index_in(ids.combine_chunks(), value_set=known).to_numpy()))
     if not parts:
         return EvaluatedSamples(table, shown, None)
-    step = thinned_by(data.card.patch_px)
+    step = choose_thinning(data.card.patch_px)
     pixels = {layer: np.concatenate([part[layer][:, ::step, ::step] for part in parts]) for layer in parts[0]}
     files = data[str(split[0])].view.stored.files
-    return EvaluatedSamples(table, shown, sheets(np.searchsorted(shown, rows).tolist(), pixels, files))
+    return EvaluatedSamples(table, shown, make_sheets(np.searchsorted(shown, rows).tolist(), pixels, files))
 
 
-def page_data(samples: EvaluatedSamples) -> Json:
+def make_page_data(samples: EvaluatedSamples) -> Json:
     """Return what the page's script is told."""
     table = samples.table.take(pa.array(samples.shown))
-    split, name = (texts(table.column(of)) for of in ("split", "terrain_name"))
+    split, name = (to_texts(table.column(of)) for of in ("split", "terrain_name"))
     splits, class_id = list(dict.fromkeys(split.tolist())), table.column("terrain_class").to_numpy()
     columns: dict[str, Column] = {
-        "id": ("text", texts(table.column("sample_id"))),
+        "id": ("text", to_texts(table.column("sample_id"))),
         "split": ("u8", np.array([splits.index(of) for of in split.tolist()], np.int64)),
         "class": ("u8", class_id),
-        "slope": ("half", np.degrees(floats(table, "slope_rad"))),
+        "slope": ("half", np.degrees(to_floats(table, "slope_rad"))),
     }
     for q in QUANTITIES:
-        said = floats(table, column_of(q, "predicted"))
-        columns[q] = shown_to(_DIGITS[q], floats(table, column_of(q)))
-        columns[f"{q} predicted"] = shown_to(_DIGITS[q], said)
-        columns[f"{q} std"] = ("half", floats(table, column_of(q, "std")))
+        said = to_floats(table, make_column_name(q, "predicted"))
+        columns[q] = make_shown_column(_DIGITS[q], to_floats(table, make_column_name(q)))
+        columns[f"{q} predicted"] = make_shown_column(_DIGITS[q], said)
+        columns[f"{q} std"] = ("half", to_floats(table, make_column_name(q, "std")))
         for end in ("low", "high"):
-            columns[f"{q} {end}"] = ("half", floats(table, column_of(q, f"predicted_{end}")) - said)
+            columns[f"{q} {end}"] = ("half", to_floats(table, make_column_name(q, f"predicted_{end}")) - said)
     return {
-        "samples": packed(columns),
+        "samples": pack_columns(columns),
         "splits": [{"name": of, "colour": SPLIT_COLOURS[of]} for of in splits],
         "classes": [
-            {"id": int(number), "name": str(name[class_id == number][0]), "colour": class_colour(int(number))}
+            {"id": int(number), "name": str(name[class_id == number][0]), "colour": find_class_colour(int(number))}
             for number in np.unique(class_id)
         ],
         "quantities": [
@@ -110,14 +116,14 @@ def sample_sections(samples: EvaluatedSamples, audits: Mapping[str, str]) -> lis
         "Look for what they share: a class that the map has wrong, a step that the heights miss, a label with a large σ."
     )
     return [
-        _against(samples),
+        _draw_predictions(samples),
         Section("Worst metres", worst, controls="gallery.html"),
-        *(_by_class_and_slope(samples.table, split, audit) for split, audit in audits.items()),
-        _calibration(samples.table),
+        *(_draw_errors_by_slope(samples.table, split, audit) for split, audit in audits.items()),
+        _draw_calibration(samples.table),
     ]
 
 
-def _against(samples: EvaluatedSamples) -> Section:
+def _draw_predictions(samples: EvaluatedSamples) -> Section:
     text = (
         "Each point is a metre; on the line it is predicted right. Hover for its figures, click it for σ, intervals and where it is from, "
         "or draw a box; Next goes on to the one that is less off."
@@ -126,14 +132,14 @@ def _against(samples: EvaluatedSamples) -> Section:
         text += f" {len(samples.shown)} of {samples.table.num_rows} are shown, drawn at random, and the worst."
     corners = {name: [0.0, 1.0] for name in ("measured", "predicted", "slope", "error")}
     start = {**corners, "fill": ["#ffffff"] * 2, "class": [""] * 2}  # until the page's script has unpacked the samples
-    against, points = _scatter("against", "samples", "measured", "predicted", start)
-    off, _ = _scatter("off", "samples off", "slope", "error", points.data_source)
+    against, points = _draw_scatter("against", "samples", "measured", "predicted", start)
+    off, _ = _draw_scatter("off", "samples off", "slope", "error", points.data_source)
     return Section("Measured against predicted", text, controls="evaluation.html", plots=[against, off])
 
 
-def _scatter(name: str, points_name: str, across: str, up: str, source: Any) -> tuple[Plot, Any]:
+def _draw_scatter(name: str, points_name: str, across: str, up: str, source: Any) -> tuple[Plot, Any]:
     """Return a plot of every sample with the line of those that are right, and its points; the page's script fills both."""
-    plot = new_plot(
+    plot = make_plot(
         name,
         alt=f"{up.capitalize()} over {across}, a point a sample; the tables below hold the figures by class.",
         axes=("slope along travel [°]", "predicted less measured") if across == "slope" else (across, up),
@@ -157,12 +163,12 @@ def _scatter(name: str, points_name: str, across: str, up: str, source: Any) -> 
     return plot, points
 
 
-def _by_class_and_slope(table: pa.Table, split: str, audit: str) -> Section:
+def _draw_errors_by_slope(table: pa.Table, split: str, audit: str) -> Section:
     """Return the RMSE of E by class and range of slope, as a heat map."""
     part = table.filter(pc.and_(pc.equal(table.column("split"), split), pc.is_valid(table.column("slope_rad"))))
-    off, ranges = errors_joule(part), slope_ranges(floats(part, "slope_rad"))
-    energy, low, high = (floats(part, column_of("E", of)) for of in ("", "predicted_low", "predicted_high"))
-    classes = texts(part.column("terrain_name"))
+    off, ranges = compute_errors_joule(part), find_slope_ranges(to_floats(part, "slope_rad"))
+    energy, low, high = (to_floats(part, make_column_name("E", of)) for of in ("", "predicted_low", "predicted_high"))
+    classes = to_texts(part.column("terrain_name"))
     names = [
         name for _, name in sorted(set(zip(part.column("terrain_class").to_pylist(), classes.tolist(), strict=True)))
     ]
@@ -176,7 +182,9 @@ def _by_class_and_slope(table: pa.Table, split: str, audit: str) -> Section:
     rmse = {key: float(np.sqrt(np.mean(of**2))) for key, of in cells.items()}
     most = max(rmse.values(), default=1.0) or 1.0
     digits = 0 if most >= _WHOLE_JOULE else 2
-    enough, least = (threshold("energy-overconfident", f"min_cell_{name}") for name in ("count", "coverage_fraction"))
+    enough, least = (
+        read_threshold("energy-overconfident", f"min_cell_{name}") for name in ("count", "coverage_fraction")
+    )
     rows: list[list[str | Shaded]] = []
     for name in names:
         row: list[str | Shaded] = [name]
@@ -200,15 +208,15 @@ def _by_class_and_slope(table: pa.Table, split: str, audit: str) -> Section:
     )
 
 
-def _calibration(table: pa.Table) -> Section:
+def _draw_calibration(table: pa.Table) -> Section:
     """Return how many labels lie below what the model states, for every share that it may state."""
     plots = []
     for split in pc.unique(table.column("split")).to_pylist():
         part = table.filter(pc.equal(table.column("split"), split))
-        found = {q: shares for q in QUANTITIES if (shares := calibration(part, q)) is not None}
+        found = {q: shares for q in QUANTITIES if (shares := compute_calibration(part, q)) is not None}
         if not found:
             continue
-        plot = new_plot(
+        plot = make_plot(
             f"calibration {split}",
             alt=f"Share of labels of {split} below each quantile that the model states; on the diagonal it knows its own errors.",
             axes=("share stated", f"share of {split} labels below"),
@@ -236,7 +244,7 @@ def _calibration(table: pa.Table) -> Section:
     return Section("Does it know how wrong it is", text, plots=plots)
 
 
-def paper_pictures(plots: Mapping[str, Plotted]) -> Iterator[Section]:
+def draw_paper_figures(plots: Mapping[str, Plotted]) -> Iterator[Section]:
     """Yield the paper's pictures: E of test samples and T of the unseen area, some of every class, each with its error."""
     for split, quantity in (("test", "E"), ("unseen", "T")):
         if split in plots:
@@ -244,11 +252,11 @@ def paper_pictures(plots: Mapping[str, Plotted]) -> Iterator[Section]:
             text = (
                 f"As the paper's figures. Below: the absolute percentage error; its axis ends at {MOST_PERCENT:.0f} %."
             )
-            drawn = _by_patch(plots[split], quantity, label)
+            drawn = _draw_by_patch(plots[split], quantity, label)
             yield Section(f"{label}, {split}: measured and predicted", text, plots=drawn, stacked=True)
 
 
-def _by_patch(told: Plotted, quantity: str, label: str) -> list[Plot]:
+def _draw_by_patch(told: Plotted, quantity: str, label: str) -> list[Plot]:
     measured, predicted = (
         np.asarray(told["E_measured" if quantity == "E" else "T_measured"], np.float64),
         np.asarray(told["E_predicted" if quantity == "E" else "T_predicted"], np.float64),
@@ -264,11 +272,11 @@ def _by_patch(told: Plotted, quantity: str, label: str) -> list[Plot]:
         ("error", "@percent{0.0} %"),
     ]
     legend = {"measured": MEASURED, "predicted": PREDICTED}
-    values = new_plot(
+    values = make_plot(
         f"patches {quantity}", alt=f"Measured and predicted {label} of some patches of every class.", axes=("", label),
         legend=legend, tools="xpan,xwheel_zoom,reset,save", tooltips=tips, waits=True,
     )  # fmt: skip
-    errors = new_plot(
+    errors = make_plot(
         f"patch errors {quantity}", alt="Their absolute error in percent.", axes=("", "absolute error [%]"),
         tools="xpan,xwheel_zoom,reset,save", tooltips=tips, beside=values, waits=True,
     )  # fmt: skip

@@ -10,23 +10,23 @@ from pathlib import Path
 from tcpipe import __version__
 from tcpipe.dataset import open_dataset
 from tcpipe.dataset.energies import ENERGIES
-from tcpipe.errors import StoreError, UsageError, plain_lines
+from tcpipe.errors import StoreError, UsageError, clean_lines
 from tcpipe.formats.atomic import clear, write_text
 from tcpipe.formats.bucket_directories import fetch_directory, fetch_directory_by_range, find_newest, require_card
 from tcpipe.formats.dataset_files import is_shard, read_card
 from tcpipe.formats.finding_lines import format_findings, format_verdict
-from tcpipe.formats.json_files import digest, parse_json, read_as, read_json, typed, write_json
+from tcpipe.formats.integrity import seal_document
+from tcpipe.formats.json_files import digest, parse_json, parse_typed, read_as, read_json, write_json
 from tcpipe.formats.object_storage import is_url
 from tcpipe.formats.parquet import read_table, write_table
-from tcpipe.formats.seals import sealed
 from tcpipe.learning.baselines import describe_ratios
 from tcpipe.learning.evaluation import NETWORKS, PlantCosts, evaluate
 from tcpipe.learning.evaluation_facts import EvaluateConfig, Evaluation
-from tcpipe.learning.evaluation_figures import EvaluatedSamples, evaluated_samples
-from tcpipe.learning.evaluation_page import COLUMNS, evaluation_page, evaluation_rows, leakage_line
+from tcpipe.learning.evaluation_figures import EvaluatedSamples, select_evaluated_samples
+from tcpipe.learning.evaluation_page import COLUMNS, format_leakage, list_evaluation_rows, render_evaluation_page
 from tcpipe.learning.metrics import ALL, QUANTITIES
 from tcpipe.learning.models import read_model_card
-from tcpipe.learning.training import dataset_checksum
+from tcpipe.learning.training import compute_dataset_checksum
 from tcpipe.pipeline.generations import write_generation
 from tcpipe.tables.verdicts import PREDICTED
 
@@ -54,10 +54,10 @@ class EvaluationResult:
             energy = part.errors["E"][ALL]
             if energy.held_percent is not None:
                 lines.append(f"{split}: 90 % intervals hold {energy.held_percent:.1f} % of E, CRPS {energy.crps:.2f} J")
-            lines.append(f"{split}: {leakage_line(part.leakage)}")
+            lines.append(f"{split}: {format_leakage(part.leakage)}")
         lines += describe_ratios(self.values.baselines)
         lines += [f"verdict: {format_verdict(self.values.verdict, PREDICTED)}", *format_findings(self.values.findings)]
-        return plain_lines((*lines, f"open {self.path}/{PAGE}"))
+        return clean_lines((*lines, f"open {self.path}/{PAGE}"))
 
 
 def run_evaluation(
@@ -80,7 +80,7 @@ def run_evaluation(
     ModelError, DatasetError : as `evaluate`.
     """
     rules = config or EvaluateConfig()
-    key = _key(model, dataset, rules, simulated=plant is not None)
+    key = _make_key(model, dataset, rules, simulated=plant is not None)
     if is_url(out):
         if (known := _read_at_url(str(out))) is not None and known.values.key == key:
             return known
@@ -96,7 +96,7 @@ def run_evaluation(
         raise UsageError(f"{place}: exists and is no evaluation; it is left alone; give another OUT")
     if not ((place / JSON).is_file() and (place / SAMPLES).is_file()) or read_json(place / JSON).get("key") != key:
         found, table = evaluate(model, dataset, place, rules, key=key, plant=plant)
-        if _key(model, dataset, rules, simulated=plant is not None) != key:
+        if _make_key(model, dataset, rules, simulated=plant is not None) != key:
             raise StoreError(f"{dataset} or {model}: another call has replaced it meanwhile; run the command again")
         write_table(table, place / SAMPLES)
         write_json(place / JSON, found)  # last: with it the evaluation is whole
@@ -106,21 +106,21 @@ def run_evaluation(
     lead = f"Model {Path(model).name} on dataset {name}: errors of power w, velocity v, time T and energy E{of}, beside the paper's."
     table = io.StringIO()
     writer = csv.writer(table, lineterminator="\n")
-    writer.writerows([COLUMNS, *evaluation_rows(values)])
+    writer.writerows([COLUMNS, *list_evaluation_rows(values)])
     write_text(place / CSV, table.getvalue())
-    samples = samples_of(place, dataset)
+    samples = read_evaluated_samples(place, dataset)
     write_text(
         place / PAGE,
-        evaluation_page(
+        render_evaluation_page(
             values, samples, title=f"Evaluation on {name}", lead=lead, warnings=[SIMULATED] if plant is not None else []
         ),
     )
     return EvaluationResult(place, values)
 
 
-def samples_of(place: Path, dataset: str | Path) -> EvaluatedSamples:
+def read_evaluated_samples(place: Path, dataset: str | Path) -> EvaluatedSamples:
     """Return what the page of the evaluation in ``place`` shows of the samples of its dataset."""
-    return evaluated_samples(read_table(place / SAMPLES), open_dataset(dataset))
+    return select_evaluated_samples(read_table(place / SAMPLES), open_dataset(dataset))
 
 
 def _read_at_url(url: str) -> EvaluationResult | None:
@@ -129,14 +129,14 @@ def _read_at_url(url: str) -> EvaluationResult | None:
     if found is None:
         return None
     where = found.place.where(JSON)
-    return EvaluationResult(found.place.where(), typed(parse_json(found.data, where), Evaluation, where))
+    return EvaluationResult(found.place.where(), parse_typed(parse_json(found.data, where), Evaluation, where))
 
 
-def _key(model: str | Path, dataset: str | Path, config: EvaluateConfig, *, simulated: bool) -> str:
+def _make_key(model: str | Path, dataset: str | Path, config: EvaluateConfig, *, simulated: bool) -> str:
     """Return what tells one evaluation from another."""
     told = [
-        sealed(read_model_card(fetch_directory(model))),
-        dataset_checksum(read_card(fetch_directory_by_range(dataset, by_range=is_shard)[0])),
+        seal_document(read_model_card(fetch_directory(model))),
+        compute_dataset_checksum(read_card(fetch_directory_by_range(dataset, by_range=is_shard)[0])),
         asdict(config),
         simulated,
         __version__,

@@ -13,12 +13,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.dataset import Split
-from tcpipe.dataset.beside import COLUMNS, BesideInput, beside_of, numbers_of, numbers_of_columns, with_planes
 from tcpipe.dataset.energies import EnergyName
+from tcpipe.dataset.extra_features import (
+    COLUMNS,
+    ExtraFeature,
+    append_planes,
+    read_extra_features,
+    standardize_columns,
+    standardize_features,
+)
 from tcpipe.errors import ModelError
 from tcpipe.learning.architecture import Architecture, check_trainable
 from tcpipe.learning.checkpoint import Arrays, TrainingProgress, read_checkpoint, write_checkpoint
-from tcpipe.learning.losses import Loss, loss_factors, mean_loss
+from tcpipe.learning.losses import Loss, compute_loss_factors, mean_loss
 from tcpipe.tables.bounds import Bounds
 
 if TYPE_CHECKING:
@@ -88,12 +95,12 @@ class Task:
     held: Split
     outputs: tuple[str, ...]
     """The split's label columns, or its energy alone."""
-    beside: tuple[BesideInput, ...] = ()
+    beside: tuple[ExtraFeature, ...] = ()
     """What it is told beside a patch."""
 
 
 @dataclass(slots=True)
-class Spent:
+class TrainingTimes:
     """Where the time of training went [s], of this process."""
 
     total_s: float = 0.0
@@ -118,7 +125,7 @@ class Fitted:
     said: NDArray[np.floating]
     """What it predicted of them, in the labels' units, shape (N, outputs)."""
     progress: TrainingProgress
-    spent: Spent
+    spent: TrainingTimes
     device: str
 
 
@@ -133,8 +140,8 @@ def fit(task: Task, config: FitConfig, *, name: str, key: str, checkpoint: Path)
     checkpoint : written before the first epoch and after every one, or every so many short ones, and gone on from where it is.
     """
     scale = label_scale(task)
-    factors = loss_factors(config.loss, scale)
-    trainer, device = _new_trainer(task, config, scale, factors)
+    factors = compute_loss_factors(config.loss, scale)
+    trainer, device = _make_trainer(task, config, scale, factors)
     network = trainer.network
     logger.info("%s: %d samples to fit, %d to stop by, on %s", name, len(task.fit), len(task.held), device)
     progress = TrainingProgress(key)
@@ -146,10 +153,10 @@ def fit(task: Task, config: FitConfig, *, name: str, key: str, checkpoint: Path)
         logger.info("%s: goes on after epoch %d", name, progress.epoch)
     else:  # a place that cannot be written is found now, not after an epoch
         write_checkpoint(checkpoint, progress, _state(trainer, best))
-    spent = Spent()
+    spent = TrainingTimes()
     while progress.epoch < config.epochs and progress.epoch - progress.best_epoch < config.patience:
-        loss = _epoch(trainer, task, config, scale=np.array(scale, np.float32), progress=progress, spent=spent)
-        held = held_loss(network, task, scale, factors, weighted=config.weights)
+        loss = _train_epoch(trainer, task, config, scale=np.array(scale, np.float32), progress=progress, spent=spent)
+        held = compute_held_loss(network, task, scale, factors, weighted=config.weights)
         progress.epoch += 1
         progress.history.append((progress.epoch, loss, held))
         if held < progress.best_loss:
@@ -158,46 +165,52 @@ def fit(task: Task, config: FitConfig, *, name: str, key: str, checkpoint: Path)
             write_checkpoint(checkpoint, progress, _state(trainer, best))
         _say(name, progress, config, spent)
     network.set_arrays(best, str(checkpoint))
-    return Fitted(best, scale, task.held, predicted(network, task, task.held, scale), progress, spent, device)
+    return Fitted(best, scale, task.held, predict_split(network, task, task.held, scale), progress, spent, device)
 
 
-def _new_trainer(task: Task, config: FitConfig, scale: Sequence[float], factors: Floats) -> tuple[Trainer, str]:
+def _make_trainer(task: Task, config: FitConfig, scale: Sequence[float], factors: Floats) -> tuple[Trainer, str]:
     """Return an untrained network with its optimiser, and what it runs on."""
-    start = labels_of(task.fit, task.outputs).mean(axis=0) / scale
+    start = collect_labels(task.fit, task.outputs).mean(axis=0) / scale
     shape = Architecture(
         task.fit.view.stored.files.patch_px, task.fit.view.form.depth, len(scale), config.width, len(task.beside)
     )
     check_trainable(shape)
-    from tcpipe.learning.network import device_name, resnet18  # noqa: PLC0415  torch takes seconds and half a gigabyte
+    from tcpipe.learning.network import find_device_name, make_resnet18  # noqa: PLC0415  torch takes seconds and half a gigabyte
     from tcpipe.learning.trainer import Trainer  # noqa: PLC0415
 
-    return Trainer(resnet18(shape, seed=config.seed, start=start.tolist()), factors), device_name()
+    return Trainer(make_resnet18(shape, seed=config.seed, start=start.tolist()), factors), find_device_name()
 
 
 def label_scale(task: Task) -> tuple[float, ...]:
     """Return the largest label of each output among all of train: what labels are divided by."""
-    return tuple(float(value) for value in labels_of(task.train, task.outputs).max(axis=0))
+    return tuple(float(value) for value in collect_labels(task.train, task.outputs).max(axis=0))
 
 
-def predicted(network: ResNet18, task: Task, split: Split, scale: Sequence[float]) -> Floats:
+def predict_split(network: ResNet18, task: Task, split: Split, scale: Sequence[float]) -> Floats:
     """Return what a network says of all samples of a split, in the labels' units, shape (N, outputs)."""
-    numbers, found, first = numbers_of(task.beside, beside_of(split)), [np.empty((0, len(scale)), np.float32)], 0
+    numbers, found, first = (
+        standardize_features(task.beside, read_extra_features(split)),
+        [np.empty((0, len(scale)), np.float32)],
+        0,
+    )
     batches: Iterable[Any] = split.batches(_TOGETHER)
     for patches, _ in batches:
-        found.append(network.predict(with_planes(patches, numbers[first : first + len(patches)])))
+        found.append(network.predict(append_planes(patches, numbers[first : first + len(patches)])))
         first += len(patches)
     return np.concatenate(found) * np.array(scale, np.float32)
 
 
-def held_loss(network: ResNet18, task: Task, scale: Sequence[float], factors: Floats, *, weighted: bool) -> float:
+def compute_held_loss(
+    network: ResNet18, task: Task, scale: Sequence[float], factors: Floats, *, weighted: bool
+) -> float:
     """Return the loss of the held-out fold."""
     over = np.array(scale, np.float32)
-    labels = labels_of(task.held, task.outputs) / over
+    labels = collect_labels(task.held, task.outputs) / over
     weights = task.held.weights if weighted and len(over) == task.held.weights.shape[1] else np.ones_like(labels)
-    return float(mean_loss(predicted(network, task, task.held, scale) / over, labels, factors, weights))
+    return float(mean_loss(predict_split(network, task, task.held, scale) / over, labels, factors, weights))
 
 
-def learning_rate(config: FitConfig, progress: TrainingProgress) -> float:
+def compute_learning_rate(config: FitConfig, progress: TrainingProgress) -> float:
     """Return the rate of the next epoch: a tenth each time that half the patience brings nothing better, and a tenth of that at the end.
 
     Steps of one length end beside the minimum, and the moving means of the batch normalisation behind the weights: predictions of
@@ -212,13 +225,13 @@ def learning_rate(config: FitConfig, progress: TrainingProgress) -> float:
     return rate * (_SLOWER if progress.epoch >= _LAST * config.epochs else 1.0)
 
 
-def labels_of(split: Split, outputs: Sequence[str]) -> Floats:
+def collect_labels(split: Split, outputs: Sequence[str]) -> Floats:
     """Return what a network is to predict of a split's samples, float32, shape (N, outputs)."""
     return split.column(outputs[0]).astype(np.float32)[:, None] if len(outputs) == 1 else split.labels
 
 
-def _epoch(
-    trainer: Trainer, task: Task, config: FitConfig, *, scale: Floats, progress: TrainingProgress, spent: Spent
+def _train_epoch(
+    trainer: Trainer, task: Task, config: FitConfig, *, scale: Floats, progress: TrainingProgress, spent: TrainingTimes
 ) -> float:
     """Train on every sample once; return the mean loss."""
     energy = len(task.outputs) == 1
@@ -226,14 +239,14 @@ def _epoch(
     if task.beside:
         rules["features"] = COLUMNS
     batches = task.fit.batches(config.batch, shuffle=True, seed=config.seed, mirror=config.mirror, **rules)
-    rate = learning_rate(config, progress)
+    rate = compute_learning_rate(config, progress)
     total, count, began = 0.0, 0, time.perf_counter()
     feed: Iterator[Any] = batches.epoch(progress.epoch)
     asked = began
     while (batch := next(feed, None)) is not None:
         patches, labels = batch[0] if energy else batch[:2]
         if task.beside:
-            patches = with_planes(patches[0], numbers_of_columns(task.beside, patches[1]))
+            patches = append_planes(patches[0], standardize_columns(task.beside, patches[1]))
         weights = batch[2] if len(batch) == 3 else np.ones_like(labels)
         spent.feeding_s += time.perf_counter() - asked
         total += trainer.step(patches, labels / scale, weights, rate) * len(patches)
@@ -262,7 +275,7 @@ def _restore(trainer: Trainer, parts: dict[str, Arrays], where: str) -> None:
     trainer.remember(parts["optimizer"], where)
 
 
-def _say(name: str, progress: TrainingProgress, config: FitConfig, spent: Spent) -> None:
+def _say(name: str, progress: TrainingProgress, config: FitConfig, spent: TrainingTimes) -> None:
     epoch, loss, held = progress.history[-1]
     logger.info(
         "%s: epoch %d of at most %d: loss %.4f, held-out fold %.4f (best %.4f in epoch %d); %.0f samples/s, %.1f %% of the time feeding",

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.compiled import kernel
+from tcpipe.compiled import compile_kernel
 from tcpipe.errors import ModelError
 from tcpipe.formats.weights import ArrayForm
 
@@ -58,7 +58,7 @@ class Forest:
         return out
 
     def arrays(self) -> dict[str, NDArray[np.generic]]:
-        """Return everything by name, as `forest_of` takes it."""
+        """Return everything by name, as `read_forest` takes it."""
         return asdict(self)
 
 
@@ -71,7 +71,7 @@ FOREST_FORMS: Mapping[str, ArrayForm] = {
 _MOST_FEATURES, _MOST_DEPTH, _MOST_OUTPUTS = 100_000, 64, 1024
 
 
-def forest_of(arrays: Mapping[str, NDArray[Any]], where: str) -> Forest:
+def read_forest(arrays: Mapping[str, NDArray[Any]], where: str) -> Forest:
     """Return the forest that `Forest.arrays` told of; `ModelError` if these are another model's."""
     if arrays.keys() != {of.name for of in fields(Forest)}:
         raise ModelError(f"{where}: holds the weights of another model; remove it and train the model again")
@@ -88,14 +88,14 @@ def forest_of(arrays: Mapping[str, NDArray[Any]], where: str) -> Forest:
 
 
 @dataclass(frozen=True, slots=True)
-class Grown:
+class CrossFittedForest:
     """Trees of all samples, and what those of the other folds said of each sample, shape (N, outputs)."""
 
     forest: Forest
     held_out: Floats
 
 
-def grow(features: Floats, labels: Floats, weights: Floats, folds: NDArray[np.generic]) -> Grown:
+def grow(features: Floats, labels: Floats, weights: Floats, folds: NDArray[np.generic]) -> CrossFittedForest:
     """Fit trees of every output, as many as are best where each fold is predicted by the others.
 
     Parameters
@@ -113,7 +113,7 @@ def grow(features: Floats, labels: Floats, weights: Floats, folds: NDArray[np.ge
         LightGBM is not installed, or cannot be loaded.
 
     """
-    lightgbm, planted, held_out = _load_lightgbm(), _Nursery(), np.empty(labels.shape)
+    lightgbm, planted, held_out = _load_lightgbm(), _ForestBuilder(), np.empty(labels.shape)
     for number, (label, weight) in enumerate(zip(labels.T, weights.T, strict=True)):
         errors, by_fold = np.zeros(MOST_ROUNDS), []
         for fold in np.unique(folds):
@@ -132,10 +132,10 @@ def grow(features: Floats, labels: Floats, weights: Floats, folds: NDArray[np.ge
         whole = lightgbm.train(_RULES, lightgbm.Dataset(features, label, weight=weight), rounds)
         for tree in whole.dump_model()["tree_info"]:
             planted.plant(tree["tree_structure"], number)
-    return Grown(planted.forest(), held_out)
+    return CrossFittedForest(planted.forest(), held_out)
 
 
-class _Nursery:
+class _ForestBuilder:
     """Nodes and trees so far."""
 
     def __init__(self) -> None:
@@ -177,7 +177,7 @@ def _load_lightgbm() -> Any:
     return lightgbm
 
 
-@kernel
+@compile_kernel
 def _descend(  # noqa: PLR0917
     features: Floats,
     feature: Indices,

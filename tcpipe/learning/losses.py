@@ -23,7 +23,7 @@ _SMALLEST = 1e-12
 """Under the root, so that a perfect sample has a slope."""
 
 
-def loss_factors(loss: Loss, scale: Sequence[float]) -> Floats:
+def compute_loss_factors(loss: Loss, scale: Sequence[float]) -> Floats:
     """Return the factor of each output's squared error over its maximum, shape (outputs,)."""
     return np.array(scale, np.float32) if loss == "paper_eq4" else np.ones(len(scale), np.float32)
 

@@ -69,13 +69,15 @@ class Spread:
         return Spread(self.std[rows], self.low[rows], self.high[rows])
 
 
-def errors(predicted: Array, measured: Array, least: float = 0.0, spread: Spread | None = None) -> Errors:
+def compute_errors(predicted: Array, measured: Array, least: float = 0.0, spread: Spread | None = None) -> Errors:
     """Return the errors of predictions, both of shape (N,), and their scores where a spread is stated."""
     difference = np.asarray(predicted, np.float64) - measured
     large = measured >= least
     rmse = float(np.sqrt(np.mean(difference**2))) if len(difference) else None
     mape = 100.0 * float(np.mean(np.abs(difference[large]) / measured[large])) if large.any() else None
-    scores = (None, None, None) if spread is None or not len(difference) else _scores(-difference, measured, spread)
+    scores = (
+        (None, None, None) if spread is None or not len(difference) else _compute_scores(-difference, measured, spread)
+    )
     return Errors(len(difference), rmse, mape, int(large.sum()), *scores)
 
 
@@ -83,7 +85,7 @@ _LEAST_STD = 1e-9
 """Of a spread: labels that are all equal have none."""
 
 
-def _scores(off: Array, measured: Array, spread: Spread) -> tuple[float, float, float]:
+def _compute_scores(off: Array, measured: Array, spread: Spread) -> tuple[float, float, float]:
     std = np.maximum(spread.std, _LEAST_STD)
     z = off / std
     density = np.exp(-(z**2) / 2.0) / np.sqrt(2.0 * np.pi)
@@ -93,20 +95,20 @@ def _scores(off: Array, measured: Array, spread: Spread) -> tuple[float, float, 
     return 100.0 * float(held.mean()), float(nll.mean()), float(crps.mean())
 
 
-def combined(parts: Iterable[Errors]) -> Errors:
+def combine_errors(parts: Iterable[Errors]) -> Errors:
     """Return the errors of all parts together: RMSE in quadrature, MAPE weighted by count."""
     found = [part for part in parts if part.count]
     count, mape_count = sum(part.count for part in found), sum(part.mape_count for part in found)
     squares = sum(part.count * part.rmse**2 for part in found if part.rmse is not None)
     shares = sum(part.mape_count * part.mape_percent for part in found if part.mape_percent is not None)
     rmse = float(np.sqrt(squares / count)) if count else None
-    return Errors(count, rmse, shares / mape_count if mape_count else None, mape_count, *_weighted_scores(found, count))
+    return Errors(count, rmse, shares / mape_count if mape_count else None, mape_count, *_combine_scores(found, count))
 
 
 _SCORES = tuple(of.name for of in fields(Errors))[4:]
 
 
-def _weighted_scores(found: list[Errors], count: int) -> list[float | None]:
+def _combine_scores(found: list[Errors], count: int) -> list[float | None]:
     """Return the scores of all parts together, each None where a part has none."""
     of_parts = [[getattr(part, name) for part in found] for name in _SCORES]
     return [
@@ -130,7 +132,7 @@ def _mean(values: Iterable[float | None]) -> float | None:
     return float(np.mean(known)) if known else None
 
 
-def errors_by_class(
+def compute_errors_by_class(
     predicted: Costs,
     measured: Costs,
     class_ids: NDArray[np.int64],
@@ -150,13 +152,13 @@ def errors_by_class(
     for quantity in predicted:
         spread = (spreads or {}).get(quantity)
         by_class = {
-            name: errors(
+            name: compute_errors(
                 predicted[quantity][here], measured[quantity][here], LEAST[quantity], spread and spread.take(here)
             )
             for class_id, name in names.items()
             if (here := class_ids == class_id).any()
         }
-        found[quantity] = {**by_class, ALL: combined(by_class.values())}
+        found[quantity] = {**by_class, ALL: combine_errors(by_class.values())}
     return found
 
 
@@ -178,11 +180,11 @@ def label_floor(
             large = label >= LEAST[quantity]
             mape = 100.0 * np.sqrt(2.0 / np.pi) * float(np.mean(std[large] / label[large])) if large.any() else None
             by_class[name] = Errors(int(here.sum()), float(np.sqrt(np.mean(std**2))), mape, int(large.sum()))
-        found[quantity] = {**by_class, ALL: combined(by_class.values())}
+        found[quantity] = {**by_class, ALL: combine_errors(by_class.values())}
     return found
 
 
-def costs(power_watt: Array, velocity_mps: Array, chord_m: float) -> dict[str, Array]:
+def compute_costs(power_watt: Array, velocity_mps: Array, chord_m: float) -> dict[str, Array]:
     """Return w, v, T = d / v and E = w d / v."""
     w, v = np.asarray(power_watt, np.float64), np.asarray(velocity_mps, np.float64)
     return {"w": w, "v": v, "T": chord_m / v, "E": w * chord_m / v}
@@ -212,7 +214,7 @@ class Ratio:
         return f"{self.value:.2f}" + ("" if self.low is None else f" ({self.low:.2f} to {self.high:.2f})")
 
 
-def ratio_of_errors(ours: Floats, theirs: Floats, groups: NDArray[np.generic], *, power: float, seed: int) -> Ratio:
+def compare_errors(ours: Floats, theirs: Floats, groups: NDArray[np.generic], *, power: float, seed: int) -> Ratio:
     """Return the ratio of two mean losses over the same samples, raised to ``power``, with its interval.
 
     Groups are drawn anew with all of their samples, the same ones for both sides. Quantiles of the logarithm are widened by as much as

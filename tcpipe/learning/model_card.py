@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from tcpipe.dataset.beside import BesideInput
 from tcpipe.dataset.energies import EnergyName
+from tcpipe.dataset.extra_features import ExtraFeature
+from tcpipe.formats.integrity import Checksum
 from tcpipe.formats.json_files import Json
-from tcpipe.formats.seals import Checksum
 from tcpipe.learning.architecture import Architecture
 from tcpipe.learning.fitting import FitConfig
 from tcpipe.tables.facts import LEFT_OUT, PhysicsFit
@@ -21,7 +21,7 @@ SCHEMA_VERSION = 2
 
 
 @dataclass(frozen=True, slots=True)
-class Seen:
+class TrainingRange:
     """What the training samples held: beyond it a model has no business."""
 
     class_counts: Mapping[int, int]
@@ -70,7 +70,7 @@ class ModelCard:
     channels: tuple[str, ...]
     outputs: tuple[str, ...]
     """Columns that it predicts, in order: w, v (or E for a baseline)."""
-    beside: tuple[BesideInput, ...] = ()
+    beside: tuple[ExtraFeature, ...] = ()
     """What it takes beside a patch."""
     scale: tuple[float, ...]
     """Largest label of train in each output's unit: what the network gives is multiplied by it."""
@@ -87,7 +87,7 @@ class ModelCard:
     """What the power that was measured feeds besides the drives, as the dataset's card has it."""
     robot: str
     classes: tuple[TerrainClass, ...]
-    seen: Seen
+    seen: TrainingRange
     physics: PhysicsFit | None = field(default=None, metadata=LEFT_OUT)
     """Of the robot, by the dataset: the planner takes what turns cost from it."""
     dataset: TrainedOn

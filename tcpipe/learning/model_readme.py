@@ -9,7 +9,7 @@ import numpy as np
 from jinja2 import Environment, StrictUndefined
 
 from tcpipe.dataset.energies import ENERGIES
-from tcpipe.errors import plain_line
+from tcpipe.errors import clean_line
 from tcpipe.learning.model_card import ModelCard
 
 _TEXT = """# Terrain-cost model
@@ -54,22 +54,22 @@ def model_readme(card: ModelCard) -> str:
     """Return the text of MODEL.md."""
     names = {entry.id: entry.name for entry in card.classes}
     counts = (
-        f"{_in_markdown(str(names.get(class_id, class_id)))} {count}"
+        f"{_escape_markdown(str(names.get(class_id, class_id)))} {count}"
         for class_id, count in card.seen.class_counts.items()
     )
-    dataset = replace(card.dataset, name=_in_markdown(card.dataset.name))
+    dataset = replace(card.dataset, name=_escape_markdown(card.dataset.name))
     return Environment(autoescape=False, undefined=StrictUndefined, keep_trailing_newline=True).from_string(_TEXT).render(  # noqa: S701  Markdown
         outputs=", ".join(card.outputs), chord=f"{card.chord_m:g}", px=card.architecture.patch_px,
         depth=card.architecture.depth, channels=", ".join(card.channels), patch=f"{card.patch_m:g}",
         velocity=card.label_velocity, energy=ENERGIES[card.label_energy].words,
         beside=", ".join(f"{of.name} (usually {of.usual:.3g})" for of in card.beside),
-        includes="; ".join(map(_in_markdown, card.label_includes)), robot=card.robot, width=card.architecture.width,
+        includes="; ".join(map(_escape_markdown, card.label_includes)), robot=card.robot, width=card.architecture.width,
         config=card.training.config, told=card.training, dataset=dataset, classes=", ".join(counts),
         slope=" to ".join(f"{np.degrees(value):.1f}°" for value in card.seen.ranges["slope_rad"]),
         relief=" to ".join(f"{value:.2f} m" for value in card.seen.ranges.get("relief_m", ())) or "not looked at",
     )  # fmt: skip
 
 
-def _in_markdown(name: str) -> str:
+def _escape_markdown(name: str) -> str:
     """Return a name as text that Markdown takes for nothing else."""
-    return re.sub(r"([\\`*_\[\]<>|#~])", r"\\\1", plain_line(name))
+    return re.sub(r"([\\`*_\[\]<>|#~])", r"\\\1", clean_line(name))

@@ -21,19 +21,19 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from tcpipe.dataset.beside import Beside, nothing_beside, numbers_of, with_planes
+from tcpipe.dataset.extra_features import ExtraFeatures, append_planes, empty_extra_features, standardize_features
 from tcpipe.errors import ModelError, StoreError, UsageError
-from tcpipe.formats.atomic import atomic_directory, write_text
+from tcpipe.formats.atomic import write_atomic_directory, write_text
 from tcpipe.formats.bucket_directories import fetch_directory, fetch_directory_by_range
 from tcpipe.formats.dataset_files import is_shard, read_card
-from tcpipe.formats.json_files import digest, typed
+from tcpipe.formats.integrity import compute_checksums, find_broken_checksums, read_sealed, seal_document, write_sealed
+from tcpipe.formats.json_files import digest, parse_typed
 from tcpipe.formats.parquet import read_table, write_table
-from tcpipe.formats.seals import broken_checksums, file_checksums, read_sealed, sealed, write_sealed
 from tcpipe.formats.weights import read_arrays, write_arrays
 from tcpipe.learning.architecture import check_trainable, weight_forms
 from tcpipe.learning.metrics import LEAST_VELOCITY_MPS
 from tcpipe.learning.model_card import KIND, SCHEMA_VERSION, ModelCard, is_current
-from tcpipe.learning.physics_model import PhysicsModel, physics_forms, physics_model_of
+from tcpipe.learning.physics_model import PhysicsModel, list_physics_arrays, read_physics_model
 from tcpipe.tables.facts import PhysicsFit
 from tcpipe.terrain.classes import ClassTable
 
@@ -77,27 +77,27 @@ class Model:
         if kind != "resnet18":
             raise ModelError(f"{self.name}: is a model of {kind}, which has no network; predict asks any model")
         check_trainable(self.card.architecture)
-        from tcpipe.learning.network import resnet18  # noqa: PLC0415  torch takes seconds and half a gigabyte
+        from tcpipe.learning.network import make_resnet18  # noqa: PLC0415  torch takes seconds and half a gigabyte
 
         arrays = read_arrays(self.place / WEIGHTS, weight_forms(self.card.architecture))
-        network = resnet18(self.card.architecture, seed=0, start=[0.0] * self.card.architecture.outputs)
+        network = make_resnet18(self.card.architecture, seed=0, start=[0.0] * self.card.architecture.outputs)
         network.set_arrays(arrays, str(self.place / WEIGHTS))
         return network
 
     @cached_property
     def table(self) -> TableModel:
         """Return the curves and trees of a table."""
-        from tcpipe.learning.table_model import table_forms, table_model_of  # noqa: PLC0415  numba takes a second
+        from tcpipe.learning.table_model import list_table_arrays, read_table_model  # noqa: PLC0415  numba takes a second
 
-        arrays = read_arrays(self.place / WEIGHTS, table_forms(len(self.card.outputs)))
-        return table_model_of(arrays, str(self.place / WEIGHTS), self.channels, self.classes.count)
+        arrays = read_arrays(self.place / WEIGHTS, list_table_arrays(len(self.card.outputs)))
+        return read_table_model(arrays, str(self.place / WEIGHTS), self.channels, self.classes.count)
 
     @cached_property
     def physics_model(self) -> PhysicsModel:
         """Return the coefficients of a model of physics."""
         older = ("drivetrain_newton",)
-        arrays = read_arrays(self.place / WEIGHTS, physics_forms(), optional=older)
-        return physics_model_of(arrays, str(self.place / WEIGHTS))
+        arrays = read_arrays(self.place / WEIGHTS, list_physics_arrays(), optional=older)
+        return read_physics_model(arrays, str(self.place / WEIGHTS))
 
     @property
     def takes_turns(self) -> bool:
@@ -169,11 +169,11 @@ class Model:
         """Smallest and largest slope_rad, cross_slope_rad, relief_m in training."""
         return self.card.seen.ranges
 
-    def predict(self, patches: Floats, beside: Beside | None = None) -> Floats:
+    def predict(self, patches: Floats, beside: ExtraFeatures | None = None) -> Floats:
         """Return power [W] and velocity [m/s], shape (N, 2), of patches in [0, 1], shape (N, px, px, depth).
 
-        ``beside`` is what is known of the N metres beside their patches (`tcpipe.dataset.beside.beside_of` of a split): physics needs
-        it, other models take what they were trained with, and what is usual where it is not given.
+        ``beside`` holds what is known of the N segments besides their patches (`tcpipe.dataset.extra_features.read_extra_features` of a
+        split). Physics needs it; other models take what they were trained with, and their usual values where it is not given.
         """
         wanted = (self.patch_px, self.patch_px, self.card.architecture.depth)
         if patches.shape[1:] != wanted:
@@ -186,7 +186,7 @@ class Model:
             out[:, column] = np.maximum(out[:, column], np.float32(LEAST_VELOCITY_MPS))
         return out
 
-    def outputs(self, patches: Floats, beside: Beside | None = None) -> Floats:
+    def outputs(self, patches: Floats, beside: ExtraFeatures | None = None) -> Floats:
         """Return what the model gives, in the units of its outputs, shape (N, outputs)."""
         kind = self.card.training.config.model
         if kind == "physics":
@@ -195,9 +195,9 @@ class Model:
                     f"{self.name}: physics needs the slope and class of each patch: predict(patches, beside)"
                 )
             return self.physics_model.predict(beside).astype(np.float32)
-        numbers = numbers_of(self.card.beside, beside or nothing_beside(len(patches)))
+        numbers = standardize_features(self.card.beside, beside or empty_extra_features(len(patches)))
         if kind == "resnet18":
-            return self.network.predict(with_planes(patches, numbers)) * np.array(self.card.scale, np.float32)
+            return self.network.predict(append_planes(patches, numbers)) * np.array(self.card.scale, np.float32)
         from tcpipe.learning.patch_features import patch_features  # noqa: PLC0415  where it is needed, as is the next
 
         out = np.empty((len(patches), len(self.card.scale)), np.float32)
@@ -218,12 +218,12 @@ def write_model(
     place: Path, *, card: ModelCard, weights: Arrays, residuals: pa.Table, history: str, readme: str
 ) -> None:
     """Write the folder, whole or not at all."""
-    with atomic_directory(place) as directory:
+    with write_atomic_directory(place) as directory:
         write_arrays(directory / WEIGHTS, weights)
         write_table(residuals, directory / RESIDUALS)
         write_text(directory / HISTORY, history)
         write_text(directory / README, readme)
-        write_sealed(directory / CARD, replace(card, checksums=file_checksums(directory)))
+        write_sealed(directory / CARD, replace(card, checksums=compute_checksums(directory)))
 
 
 def load_model(path: str | Path) -> Model:
@@ -239,23 +239,23 @@ def load_model(path: str | Path) -> Model:
     """
     place = fetch_directory(path)
     card = read_model_card(place)
-    if problems := list(broken_checksums(place, card.checksums)):
+    if problems := list(find_broken_checksums(place, card.checksums)):
         raise ModelError(*(f"{problem}; train the model again" for problem in problems))
     table = read_table(place / RESIDUALS)
     residuals = {name: table.column(name).to_numpy() for name in table.column_names}
     if "terrain_class" in residuals:  # of a map without classes: null
         residuals["terrain_class"] = np.nan_to_num(residuals["terrain_class"].astype(np.float64)).astype(np.uint8)
-    return Model(str(path), card, place, card_checksum(card), residuals)
+    return Model(str(path), card, place, compute_card_checksum(card), residuals)
 
 
-def chosen_model(path: str | Path, *, physics: str | Path | None = None, speed_mps: float | None = None) -> Model:
+def choose_model(path: str | Path, *, physics: str | Path | None = None, speed_mps: float | None = None) -> Model:
     """Return a model as `load_model`, with the physics of a dataset and asked for a commanded speed [m/s] where these are given."""
     model = load_model(path)
-    model = model if physics is None else with_physics(model, physics)
-    return model if speed_mps is None else at_speed(model, speed_mps)
+    model = model if physics is None else set_physics(model, physics)
+    return model if speed_mps is None else set_speed(model, speed_mps)
 
 
-def at_speed(model: Model, speed_mps: float) -> Model:
+def set_speed(model: Model, speed_mps: float) -> Model:
     """Return the model asked for a commanded speed [m/s] instead of the usual one; `UsageError` if it knows no such speed."""
     command = next((of for of in model.card.beside if of.name == "command_mps"), None)
     if command is None:
@@ -271,7 +271,7 @@ def at_speed(model: Model, speed_mps: float) -> Model:
     return replace(model, card=replace(model.card, beside=beside), checksum=digest([model.checksum, speed_mps]))
 
 
-def with_physics(model: Model, dataset: str | Path) -> Model:
+def set_physics(model: Model, dataset: str | Path) -> Model:
     """Return the model with the physics of its robot that a dataset's card holds, instead of its own; `ModelError` if it holds none."""
     if model.takes_turns:
         raise UsageError(
@@ -302,12 +302,12 @@ def read_model_card(place: Path) -> ModelCard:
             raise ModelError(
                 f"{where}: written by model schema {version}, wanted {SCHEMA_VERSION}; train the model again"
             )
-        return typed(found, ModelCard, where)
+        return parse_typed(found, ModelCard, where)
     except StoreError as error:
         reason = error.problems[0].removesuffix("; remove it and run the command again")
         raise ModelError(f"{reason}; remove the folder and train the model again") from None
 
 
-def card_checksum(card: ModelCard) -> str:
+def compute_card_checksum(card: ModelCard) -> str:
     """Return the hash of a card, which is of its files, too."""
-    return digest(sealed(card))
+    return digest(seal_document(card))

@@ -46,7 +46,7 @@ class Normed(nn.Module):
     def forward(self, images: Any) -> Any:
         """Return (N, filters, rows, columns)."""
         size, stride = self.convolution.kernel_size[0], self.convolution.stride[0]
-        return self.norm(self.convolution(images if stride == 1 else _padded(images, size, stride)))
+        return self.norm(self.convolution(images if stride == 1 else _pad_images(images, size, stride)))
 
 
 class BasicBlock(nn.Module):
@@ -80,7 +80,7 @@ class ResNet18(nn.Module):
     def forward(self, images: Any) -> Any:
         """Return the outputs."""
         values = functional.relu(self.stem(images))
-        values = functional.max_pool2d(_padded(values, 3, 2), 3, 2)  # zeros: nothing is less after a ReLU
+        values = functional.max_pool2d(_pad_images(values, 3, 2), 3, 2)  # zeros: nothing is less after a ReLU
         for name, block in self.named_children():
             values = block(values) if name.startswith("stage") else values
         return self.head(values.mean((2, 3)))
@@ -92,28 +92,31 @@ class ResNet18(nn.Module):
         with torch.inference_mode():
             for first in range(0, len(patches), _TOGETHER):
                 part = slice(first, first + _TOGETHER)
-                out[part] = self(on_device(patches[part])).numpy(force=True)
+                out[part] = self(move_to_device(patches[part])).numpy(force=True)
         return out
 
     def arrays(self) -> dict[str, NDArray[np.float32]]:
         """Return a copy of every weight by its name in a file; kernels have the shape (rows, columns, channels in, channels out)."""
-        return {_filed(name): _file_order(value).numpy(force=True).copy() for name, value in self._weights().items()}
+        return {
+            _make_weight_name(name): _reorder_axes(value).numpy(force=True).copy()
+            for name, value in self._weights().items()
+        }
 
     def set_arrays(self, arrays: Arrays, where: str) -> None:
         """Put weights in; `ModelError` if they are another network's."""
         there = self._weights()
-        shapes = {_filed(name): tuple(_file_order(value).shape) for name, value in there.items()}
+        shapes = {_make_weight_name(name): tuple(_reorder_axes(value).shape) for name, value in there.items()}
         if {name: value.shape for name, value in arrays.items()} != shapes:
             raise ModelError(f"{where}: holds the weights of another network; remove it and train the model again")
         for name, value in there.items():
-            _file_order(value).copy_(torch.from_numpy(np.ascontiguousarray(arrays[_filed(name)])))
+            _reorder_axes(value).copy_(torch.from_numpy(np.ascontiguousarray(arrays[_make_weight_name(name)])))
 
     def _weights(self) -> dict[str, Any]:
         """Return every weight by torch's name, without the count of batches that no fixed share asks for."""
         return {name: value for name, value in self.state_dict().items() if not name.endswith("num_batches_tracked")}
 
 
-def resnet18(shape: Architecture, *, seed: int, start: Sequence[float]) -> ResNet18:
+def make_resnet18(shape: Architecture, *, seed: int, start: Sequence[float]) -> ResNet18:
     """Return the untrained network on the GPU that there is, else the CPU; the same seed gives the same weights.
 
     Parameters
@@ -129,37 +132,37 @@ def resnet18(shape: Architecture, *, seed: int, start: Sequence[float]) -> ResNe
             nn.init.trunc_normal_(layer.weight, 0.0, deviation, -2.0 * deviation, 2.0 * deviation, generator=drawn)
     nn.init.normal_(network.head.weight, 0.0, 0.01, generator=drawn)
     network.head.bias.data[:] = torch.tensor(list(start))
-    made: ResNet18 = network.to(device(), memory_format=torch.channels_last)
+    made: ResNet18 = network.to(find_device(), memory_format=torch.channels_last)
     return made
 
 
-def device() -> Any:
+def find_device() -> Any:
     """Return what networks run on."""
     return torch.device("cuda" if torch.cuda.is_available() else "cpu")
 
 
-def device_name() -> str:
+def find_device_name() -> str:
     """Return the name of the GPU that networks run on, else ``cpu``."""
     return str(torch.cuda.get_device_name()) if torch.cuda.is_available() else "cpu"
 
 
-def on_device(patches: Floats) -> Any:
+def move_to_device(patches: Floats) -> Any:
     """Return patches (N, px, px, depth) as images (N, depth, px, px), which lie in memory as the patches do."""
-    return torch.from_numpy(np.ascontiguousarray(patches, np.float32)).to(device()).permute(0, 3, 1, 2)
+    return torch.from_numpy(np.ascontiguousarray(patches, np.float32)).to(find_device()).permute(0, 3, 1, 2)
 
 
-def _padded(images: Any, size: int, stride: int) -> Any:
+def _pad_images(images: Any, size: int, stride: int) -> Any:
     """Put zeros around images so that a window in steps gives ceil(pixels / stride), as TensorFlow's "same" does."""
     missing = [max((-(-pixels // stride) - 1) * stride + size - pixels, 0) for pixels in images.shape[:1:-1]]
     return functional.pad(images, [part for pixels in missing for part in (pixels // 2, pixels - pixels // 2)])
 
 
-def _filed(name: str) -> str:
+def _make_weight_name(name: str) -> str:
     """Return a weight's name in a file."""
     layer, _, kind = name.rpartition(".")
     return f"{layer.replace('.', '_')}/{(_FILED_NORM if layer.endswith('norm') else _FILED)[kind]}"
 
 
-def _file_order(value: Any) -> Any:
+def _reorder_axes(value: Any) -> Any:
     """Return a view with the axes that a file has: outputs last."""
     return value.permute(2, 3, 1, 0) if value.ndim == 4 else value.T if value.ndim == 2 else value

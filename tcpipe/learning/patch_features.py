@@ -42,16 +42,18 @@ def patch_features(patches: Patches, *, channels: Sequence[str], class_count: in
     for at, channel in enumerate(channels):
         values = np.ascontiguousarray(patches[..., at])
         if channel == "height":
-            parts.append(_of_ground(values * np.float32(HEIGHT_RANGE_M), patch_m))
+            parts.append(_compute_ground_features(values * np.float32(HEIGHT_RANGE_M), patch_m))
         elif channel == "terrain":
-            parts.append(_class_shares(values, class_count))
+            parts.append(_compute_class_shares(values, class_count))
         else:
             texture = np.abs(np.diff(values, axis=2)).mean(axis=(1, 2))
             parts.append(np.column_stack([values.mean(axis=(1, 2)), values.std(axis=(1, 2)), texture]))
     return np.column_stack(parts).astype(np.float64)
 
 
-def slope_and_class(features: Floats, channels: Sequence[str], class_count: int) -> tuple[Floats, NDArray[np.int64]]:
+def find_slope_and_class(
+    features: Floats, channels: Sequence[str], class_count: int
+) -> tuple[Floats, NDArray[np.int64]]:
     """Return slope [rad] and most frequent class of patches by their features, shape (N,) each; 0 without heights, or classes."""
     slope, class_id, at = np.zeros(len(features)), np.zeros(len(features), np.int64), 0
     for channel in channels:
@@ -63,7 +65,7 @@ def slope_and_class(features: Floats, channels: Sequence[str], class_count: int)
     return slope, class_id
 
 
-def _of_ground(height_m: Patches, patch_m: float) -> NDArray[np.float32]:
+def _compute_ground_features(height_m: Patches, patch_m: float) -> NDArray[np.float32]:
     px = height_m.shape[1]
     along = np.tile((np.arange(px) + 0.5) / px * patch_m - patch_m / 2.0, (px, 1))
     across = along.T
@@ -75,7 +77,7 @@ def _of_ground(height_m: Patches, patch_m: float) -> NDArray[np.float32]:
     return np.column_stack([slope, steepness, 2.0 * fitted[:, 3:5], roughness, np.ptp(flat, axis=1)])
 
 
-def _class_shares(values: Patches, class_count: int) -> Floats:
+def _compute_class_shares(values: Patches, class_count: int) -> Floats:
     ids = np.rint(values * np.float32(class_count - 1)).astype(np.int64)
     ids += np.arange(len(values))[:, None, None] * class_count
     counts = np.bincount(ids.ravel(), minlength=len(values) * class_count)

@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.cost.physics import ALL, FEWEST, Metres, Physics, fit_physics
+from tcpipe.cost.physics import ALL, FEWEST, FitSamples, Physics, fit_physics
 from tcpipe.dataset import Split
-from tcpipe.dataset.beside import Beside
 from tcpipe.dataset.energies import ENERGIES
+from tcpipe.dataset.extra_features import ExtraFeatures
 from tcpipe.errors import ModelError
 from tcpipe.formats.weights import ArrayForm
-from tcpipe.learning.curves import Curves, curve_forms, curves_of, fit_curves
+from tcpipe.learning.curves import Curves, fit_curves, list_curve_arrays, read_curves
 from tcpipe.learning.metrics import LEAST_VELOCITY_MPS
 
 Floats = NDArray[np.float64]
@@ -44,7 +44,7 @@ class PhysicsModel:
     turning_joule_per_rad: Floats
     """M by class id, shape (256,)."""
 
-    def predict(self, beside: Beside) -> Floats:
+    def predict(self, beside: ExtraFeatures) -> Floats:
         """Return power [W] and velocity [m/s], shape (N, 2)."""
         velocity = np.maximum(self.speed.predict(beside.slope_rad, beside.class_id)[:, 0], LEAST_VELOCITY_MPS)
         turn = np.where(np.isfinite(beside.turn_radpm), beside.turn_radpm, self.usual_turn_radpm)
@@ -54,22 +54,22 @@ class PhysicsModel:
         return np.column_stack([always + np.where(work > 0.0, 1.0, self.recovered) * work, velocity])
 
     def arrays(self) -> dict[str, NDArray[np.generic]]:
-        """Return everything by name, as `physics_model_of` takes it."""
+        """Return everything by name, as `read_physics_model` takes it."""
         return {**{name: getattr(self, name) for name in _NUMBERS}, **self.speed.arrays()}
 
 
 _NUMBERS = tuple(of.name for of in fields(PhysicsModel) if of.name != "speed")
 
 
-def physics_forms() -> dict[str, ArrayForm]:
+def list_physics_arrays() -> dict[str, ArrayForm]:
     """Return types and shapes of the arrays of a model of physics."""
     by_class = ("rolling_newton", "turning_joule_per_rad")
-    return {**{name: ("float64", (_CLASSES,) if name in by_class else ()) for name in _NUMBERS}, **curve_forms(1)}
+    return {**{name: ("float64", (_CLASSES,) if name in by_class else ()) for name in _NUMBERS}, **list_curve_arrays(1)}
 
 
-def physics_model_of(arrays: Mapping[str, NDArray[Any]], where: str) -> PhysicsModel:
+def read_physics_model(arrays: Mapping[str, NDArray[Any]], where: str) -> PhysicsModel:
     """Return the model that `PhysicsModel.arrays` told of; `ModelError` if these are another's."""
-    speed, rest = curves_of("linear", arrays, where)
+    speed, rest = read_curves("linear", arrays, where)
     rest = {"drivetrain_newton": np.array(0.0), **rest}  # models before 0.7 have all of it in P0
     if rest.keys() != set(_NUMBERS):
         raise ModelError(f"{where}: holds the weights of another model; train the model again")
@@ -78,7 +78,7 @@ def physics_model_of(arrays: Mapping[str, NDArray[Any]], where: str) -> PhysicsM
     return PhysicsModel(speed, **rest)
 
 
-def fit_physics_model(beside: Beside, labels: Floats, *, standing_watt: float | None) -> PhysicsModel:
+def fit_physics_model(beside: ExtraFeatures, labels: Floats, *, standing_watt: float | None) -> PhysicsModel:
     """Fit it to samples.
 
     Parameters
@@ -93,24 +93,24 @@ def fit_physics_model(beside: Beside, labels: Floats, *, standing_watt: float | 
     """
     names = np.where(beside.class_id > 0, beside.class_id.astype(np.str_), ALL)
     power, velocity = labels.T
-    metres = Metres(power, velocity, np.tan(beside.slope_rad), beside.turn_radpm * velocity, names)
+    metres = FitSamples(power, velocity, np.tan(beside.slope_rad), beside.turn_radpm * velocity, names)
     found = fit_physics(metres, standing_watt=standing_watt)
     if found is None:
         raise ModelError(f"{len(labels)} samples to fit physics to, wanted at least {FEWEST} that move")
     known = beside.turn_radpm[np.isfinite(beside.turn_radpm)]
     return PhysicsModel(
         speed=fit_curves("linear", beside.slope_rad, beside.class_id, labels[:, 1:]),
-        no_load_watt=_of_all(found, "standing"),
-        drivetrain_newton=_of_all(found, "drivetrain"),
-        grade_newton=_of_all(found, "grade"),
+        no_load_watt=_evaluate_all(found, "standing"),
+        drivetrain_newton=_evaluate_all(found, "drivetrain"),
+        grade_newton=_evaluate_all(found, "grade"),
         recovered=np.array(found.recovered),
         usual_turn_radpm=np.array(float(known.mean()) if known.size else 0.0),
-        rolling_newton=_by_class(found, "rolling"),
-        turning_joule_per_rad=_by_class(found, "turning"),
+        rolling_newton=_collect_by_class(found, "rolling"),
+        turning_joule_per_rad=_collect_by_class(found, "turning"),
     )
 
 
-def standing_of(split: Split) -> float | None:
+def find_idle_power(split: Split) -> float | None:
     """Return what the robot draws while it stands, of the power that a split's labels are of [W]; None where no run of it stood."""
     if split.energy is not ENERGIES["total"]:
         return 0.0
@@ -118,12 +118,12 @@ def standing_of(split: Split) -> float | None:
     return float(np.nanmean(watt)) if np.isfinite(watt).any() else None
 
 
-def _of_all(found: Physics, term: str) -> Floats:
+def _evaluate_all(found: Physics, term: str) -> Floats:
     told = found.of(term)
     return np.array(0.0 if told is None else told[0])
 
 
-def _by_class(found: Physics, term: str) -> Floats:
+def _collect_by_class(found: Physics, term: str) -> Floats:
     """Return a coefficient by class id, shape (256,); a class that the fit does not name has that of the others, or their mean."""
     own = {name: found.value[at] for at, (kind, name) in enumerate(found.terms) if kind == term}
     rest = own.get(ALL, np.mean(list(own.values())) if own else 0.0)

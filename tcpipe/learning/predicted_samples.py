@@ -12,8 +12,8 @@ from scipy.special import ndtri
 from tcpipe.cost.prediction_errors import COVERAGE
 from tcpipe.learning.metrics import QUANTITIES, UNITS, Array, Spread
 from tcpipe.learning.predictions import CALLED, Measured
-from tcpipe.tables.arrays import texts
-from tcpipe.tables.columns import Column, floats
+from tcpipe.tables.arrays import to_texts
+from tcpipe.tables.columns import Column, to_floats
 
 _SUFFIX = {"w": "watt", "v": "mps", "T": "s", "E": "joule"}
 _PARTS = {
@@ -37,18 +37,18 @@ LEVELS = np.linspace(0.02, 0.98, 49)
 """Quantiles that predictions are held to."""
 
 
-def column_of(quantity: str, part: str = "") -> str:
+def make_column_name(quantity: str, part: str = "") -> str:
     """Return the name of the column that holds a part of w, v, T or E, as ``energy_predicted_low_joule``."""
     return "_".join(name for name in (CALLED[quantity], part, _SUFFIX[quantity]) if name)
 
 
-def predictions_table(
+def make_predictions_table(
     sets: Mapping[str, Measured], said: Mapping[str, Mapping[str, Array]], spreads: Mapping[str, Mapping[str, Spread]]
 ) -> pa.Table:
     """Return one row a labelled sample: what was measured, what a model said, and how sure it was; null where it did not say."""
     fields = [of.field() for of in _KEYS]
     fields += [
-        Column(column_of(q, part), pa.float64(), UNITS[q], doc, nullable=True).field()
+        Column(make_column_name(q, part), pa.float64(), UNITS[q], doc, nullable=True).field()
         for q in QUANTITIES
         for part, doc in _PARTS.items()
     ]
@@ -63,16 +63,16 @@ def predictions_table(
             "slope_rad": found.split.column("slope_rad").astype(np.float64),
         }
         values = {
-            column_of(q, part): of
+            make_column_name(q, part): of
             for q in QUANTITIES
-            for part, of in zip(_PARTS, _parts(found, said[name], spreads[name], q), strict=True)
+            for part, of in zip(_PARTS, _iterate_parts(found, said[name], spreads[name], q), strict=True)
         }
         arrays = [pa.array((keys | values)[of.name], of.type, from_pandas=True) for of in schema]
         parts.append(pa.Table.from_arrays(arrays, schema=schema))
     return pa.concat_tables(parts)
 
 
-def _parts(
+def _iterate_parts(
     found: Measured, said: Mapping[str, Array], spreads: Mapping[str, Spread], quantity: str
 ) -> Iterator[Array | None]:
     nothing = np.full(len(found.split), np.nan)
@@ -81,14 +81,14 @@ def _parts(
     yield from (spread.std, spread.low, spread.high)
 
 
-def errors_joule(table: pa.Table) -> Array:
+def compute_errors_joule(table: pa.Table) -> Array:
     """Return predicted less measured E, shape (N,)."""
-    return floats(table, column_of("E", "predicted")) - floats(table, column_of("E"))
+    return to_floats(table, make_column_name("E", "predicted")) - to_floats(table, make_column_name("E"))
 
 
-def worst_rows(table: pa.Table, count: int) -> NDArray[np.int64]:
+def find_worst_rows(table: pa.Table, count: int) -> NDArray[np.int64]:
     """Return the rows of the ``count`` samples of each split whose E is furthest off, the furthest first, split by split."""
-    off, split = np.abs(errors_joule(table)), texts(table.column("split"))
+    off, split = np.abs(compute_errors_joule(table)), to_texts(table.column("split"))
     found = [np.empty(0, np.int64)]
     for name in dict.fromkeys(split.tolist()):
         rows = np.flatnonzero((split == name) & np.isfinite(off))
@@ -96,9 +96,11 @@ def worst_rows(table: pa.Table, count: int) -> NDArray[np.int64]:
     return np.concatenate(found)
 
 
-def calibration(table: pa.Table, quantity: str) -> Array | None:
+def compute_calibration(table: pa.Table, quantity: str) -> Array | None:
     """Return what share of labels lies below each of `LEVELS` as a model states it, its errors taken as normal; None if it states none."""
-    label, said, std = (floats(table, column_of(quantity, part)) for part in ("", "predicted", "predicted_std"))
+    label, said, std = (
+        to_floats(table, make_column_name(quantity, part)) for part in ("", "predicted", "predicted_std")
+    )
     known = np.isfinite(label + said + std)
     if not known.any():
         return None

@@ -8,14 +8,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.cost.prediction_errors import centring_of, errors_of
+from tcpipe.cost.prediction_errors import fit_bias_correction, fit_errors
 from tcpipe.dataset import Dataset, Split
-from tcpipe.dataset.beside import beside_of
+from tcpipe.dataset.extra_features import read_extra_features
 from tcpipe.errors import ModelError
-from tcpipe.learning.metrics import LEAST_VELOCITY_MPS, Array, Spread, costs
+from tcpipe.learning.metrics import LEAST_VELOCITY_MPS, Array, Spread, compute_costs
 from tcpipe.learning.model_card import ModelCard
 from tcpipe.learning.models import Model
-from tcpipe.learning.training import class_table, dataset_checksum
+from tcpipe.learning.training import compute_dataset_checksum, read_class_table
 from tcpipe.terrain.classes import ClassTable
 
 _TOGETHER = 1024
@@ -44,7 +44,7 @@ class Measured:
         return Measured(self.split.take(rows), costs, deviations, self.class_ids[rows], self.names)
 
 
-def measured(split: Split, names: Mapping[int, str]) -> Measured:
+def collect_measured(split: Split, names: Mapping[int, str]) -> Measured:
     """Return what was measured; samples without a label are left out.
 
     Parameters
@@ -75,7 +75,7 @@ def measured(split: Split, names: Mapping[int, str]) -> Measured:
     )
 
 
-def predicted_costs(
+def predict_costs(
     model: Model, split: Split, *, noise: Sequence[str] = (), seed: Sequence[int] = (0,)
 ) -> dict[str, Array]:
     """Return what a model says of w, v, T, E of every sample, centred, shape (N,) each; of E alone where it predicts nothing else.
@@ -92,8 +92,8 @@ def predicted_costs(
     rng = np.random.default_rng(list(seed))
     replaced = [model.channels.index(name) for name in noise]
     parts = [np.empty((0, len(model.card.outputs)), np.float32)]
-    beside, first = beside_of(split), 0
-    for patches in _patches(chosen):
+    beside, first = read_extra_features(split), 0
+    for patches in _iterate_patches(chosen):
         for channel in replaced:
             patches[..., channel] = rng.random(patches.shape[:3], np.float32)
         parts.append(model.predict(patches, beside.take(slice(first, first + len(patches)))))
@@ -103,13 +103,13 @@ def predicted_costs(
         return {"E": said[:, 0]}
     shown = "terrain" in model.channels and "terrain" not in noise
     class_id = beside.class_id if shown else np.zeros(len(said), np.int64)
-    power, velocity = centring_of(model.residuals).apply(said[:, 0], said[:, 1], class_id)
-    return costs(power, np.maximum(velocity, LEAST_VELOCITY_MPS), model.chord_m)
+    power, velocity = fit_bias_correction(model.residuals).apply(said[:, 0], said[:, 1], class_id)
+    return compute_costs(power, np.maximum(velocity, LEAST_VELOCITY_MPS), model.chord_m)
 
 
-def spreads_of(model: Model, said: Mapping[str, Array], class_ids: NDArray[np.int64]) -> dict[str, Spread]:
+def predict_spreads(model: Model, said: Mapping[str, Array], class_ids: NDArray[np.int64]) -> dict[str, Spread]:
     """Return what a model states of the errors of its costs, by quantity; nothing if it has too few held-out samples."""
-    stated = errors_of(model.residuals)
+    stated = fit_errors(model.residuals)
     if stated is None:
         return {}
     scale = {"w": 1.0, "v": 1.0, "T": model.chord_m, "E": model.chord_m}  # of a metre's errors
@@ -121,14 +121,14 @@ def spreads_of(model: Model, said: Mapping[str, Array], class_ids: NDArray[np.in
     return found
 
 
-def _patches(split: Split) -> Iterator[NDArray[np.float32]]:
+def _iterate_patches(split: Split) -> Iterator[NDArray[np.float32]]:
     for first in range(0, len(split), _TOGETHER):
         yield split.batch(np.arange(first, min(first + _TOGETHER, len(split))))[0].copy()
 
 
 def check_origin(card: ModelCard, data: Dataset, name: str) -> None:
     """Raise an error if a model was trained on another dataset, which does not tell what it has seen."""
-    if dataset_checksum(data.card) != card.dataset.sha256:
+    if compute_dataset_checksum(data.card) != card.dataset.sha256:
         raise ModelError(
             f"{name}: was trained on another dataset ({card.dataset.name}, {card.dataset.sha256[:12]}) than {data.path}; "
             "wanted that one, which tells whether a drive was held back"
@@ -138,7 +138,9 @@ def check_origin(card: ModelCard, data: Dataset, name: str) -> None:
 def check_fit(card: ModelCard, data: Dataset, name: str) -> None:
     """Raise an error with every reason for which a model cannot be asked about a dataset."""
     told = data.card
-    problems = [f"classes: in the model {clause}" for clause in ClassTable(card.classes).differences(class_table(told))]
+    problems = [
+        f"classes: in the model {clause}" for clause in ClassTable(card.classes).differences(read_class_table(told))
+    ]
     same = (
         ("patch_px", card.architecture.patch_px, told.patch_px),
         ("patch_m", card.patch_m, told.patch_m),

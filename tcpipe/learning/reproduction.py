@@ -14,22 +14,22 @@ from pathlib import Path
 import numpy as np
 
 from tcpipe.dataset import Split, open_dataset
-from tcpipe.errors import DatasetError, UsageError, plain_lines
+from tcpipe.errors import DatasetError, UsageError, clean_lines
 from tcpipe.formats.atomic import clear, write_text
 from tcpipe.formats.json_files import write_json
-from tcpipe.learning.claims import Claim, checked_claims
+from tcpipe.learning.claims import Claim, check_claims
 from tcpipe.learning.evaluation_facts import EvaluateConfig, Evaluation, SplitErrors
-from tcpipe.learning.evaluation_files import run_evaluation, samples_of
+from tcpipe.learning.evaluation_files import read_evaluated_samples, run_evaluation
 from tcpipe.learning.fitting import FitConfig
-from tcpipe.learning.plant_floor import plant_costs, shown, variance_shares
-from tcpipe.learning.reproduction_page import reproduction_page
+from tcpipe.learning.reproduction_page import render_reproduction_page
+from tcpipe.learning.simulation_floor import compute_true_costs, compute_variance_shares, remove_hidden_variation
 from tcpipe.learning.training import train
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.ingest import ingest
 from tcpipe.pipeline.maps import add_map
 from tcpipe.recipe import Recipe
-from tcpipe.simulation import Scenario, SimulatedSite, scenario, simulate
-from tcpipe.simulation.paper_site import hidden_as
+from tcpipe.simulation import Scenario, SimulatedSite, find_scenario, simulate
+from tcpipe.simulation.paper_site import scale_hidden_variance
 
 logger = logging.getLogger("tcpipe")
 
@@ -108,7 +108,7 @@ class Reproduction:
         verdicts = Counter(claim.verdict for claim in self.claims)
         shares = (f"{100.0 * share:.2f} % of the variance of E: {name}" for name, share in self.variance_shares.items())
         spent = ", ".join(f"{name} {seconds:.0f} s" for name, seconds in self.seconds.items())
-        return plain_lines(
+        return clean_lines(
             (
                 "the data are simulated: what is compared with the paper is the pattern, not the figures",
                 *shares,
@@ -149,29 +149,31 @@ def reproduce(
     clear(place)
     if place.exists() and (not place.is_dir() or (any(place.iterdir()) and not (place / "site").exists())):
         raise UsageError(f"{place}: exists and is no reproduction; give another DIR")
-    frozen, result = scenario(plan.scenario), Reproduction(place, plan.scenario)
-    made = replace(frozen, world=hidden_as(frozen.world, hidden))
-    with _timed(result, "simulate"):
+    frozen, result = find_scenario(plan.scenario), Reproduction(place, plan.scenario)
+    made = replace(frozen, world=scale_hidden_variance(frozen.world, hidden))
+    with _measure_time(result, "simulate"):
         site = simulate(place / "site", scenario=made, seed=SIMULATION_SEED)
-    with _timed(result, "ingest and build"):
+    with _measure_time(result, "ingest and build"):
         _build(place, site, jobs)
     data = open_dataset(place / "dataset")
     result.counts = SampleCounts(data.card.splits, data.card.terrain, data.card.samples)
-    result.variance_shares = _variance_shares(data["unseen"], made)
+    result.variance_shares = _compute_variance_shares(data["unseen"], made)
     for seed in range(seeds):
         result.runs.append(_train_and_evaluate(place, made, plan, seed, result))
-    result.claims = checked_claims(result.runs)
+    result.claims = check_claims(result.runs)
     _write(result, plan, hidden)
     return result
 
 
-def _variance_shares(split: Split, made: Scenario) -> dict[str, float]:
+def _compute_variance_shares(split: Split, made: Scenario) -> dict[str, float]:
     some = split.take(np.arange(min(len(split), _ENOUGH)))  # rows stand in random order
-    return variance_shares(made.world, made.drives[0].robot, some, some.column("energy_joule").astype(np.float64))
+    return compute_variance_shares(
+        made.world, made.drives[0].robot, some, some.column("energy_joule").astype(np.float64)
+    )
 
 
 @contextmanager
-def _timed(result: Reproduction, stage: str) -> Iterator[None]:
+def _measure_time(result: Reproduction, stage: str) -> Iterator[None]:
     began = time.perf_counter()
     yield
     result.seconds[stage] = result.seconds.get(stage, 0.0) + time.perf_counter() - began
@@ -196,10 +198,10 @@ def _build(place: Path, site: SimulatedSite, jobs: int) -> None:
 
 def _train_and_evaluate(place: Path, made: Scenario, plan: Experiment, seed: int, result: Reproduction) -> Evaluation:
     here, dataset = place / f"seed-{seed}", place / "dataset"
-    with _timed(result, "train"):
+    with _measure_time(result, "train"):
         train(dataset, here / "model", config=replace(plan.fitting, seed=seed), disposable=True)
-    with _timed(result, "evaluate"):
-        known = partial(plant_costs, shown(made.world), made.drives[0].robot)
+    with _measure_time(result, "evaluate"):
+        known = partial(compute_true_costs, remove_hidden_variation(made.world), made.drives[0].robot)
         config = replace(plan.evaluating, seed=seed)
         return run_evaluation(here / "model", dataset, here / "evaluation", config=config, plant=known).values
 
@@ -218,9 +220,9 @@ def _write(result: Reproduction, plan: Experiment, hidden: float) -> None:
     write_json(result.directory / JSON, summary)
     write_text(
         result.directory / PAGE,
-        reproduction_page(
+        render_reproduction_page(
             result.runs,
-            samples_of(result.directory / "seed-0" / "evaluation", result.directory / "dataset"),
+            read_evaluated_samples(result.directory / "seed-0" / "evaluation", result.directory / "dataset"),
             result.claims,
             splits=result.counts.splits,
             terrain=result.counts.terrain,

@@ -9,18 +9,18 @@ from tcpipe.learning.claims import Claim
 from tcpipe.learning.evaluation_facts import Evaluation
 from tcpipe.learning.evaluation_figures import EvaluatedSamples
 from tcpipe.learning.evaluation_files import SIMULATED
-from tcpipe.learning.evaluation_page import audit_lines, evaluation_page
+from tcpipe.learning.evaluation_page import format_audit, render_evaluation_page
 from tcpipe.learning.metrics import ALL, LEAST, QUANTITIES, UNITS
-from tcpipe.learning.plant_floor import CLASS_AND_SLOPE
+from tcpipe.learning.simulation_floor import CLASS_AND_SLOPE
 from tcpipe.report.page import Section
-from tcpipe.simulation.paper_site import paper_parameters
+from tcpipe.simulation.paper_site import read_paper_parameters
 
 _QUICK = "This is a quick run: a small site, a narrow network, few epochs. It shows that everything runs; believe no figure of it."
 _PAPER_SHARES = {"grass": 51, "mud": 9, "unpaved road": 20, "paved road": 20}
 _PAPER_COUNTS = {"train": 5142, "test": 1286, "unseen": 4458}
 
 
-def reproduction_page(
+def render_reproduction_page(
     runs: Sequence[Evaluation],
     samples: EvaluatedSamples,
     claims: Sequence[Claim],
@@ -38,25 +38,25 @@ def reproduction_page(
     """
     verdicts = Counter(claim.verdict for claim in claims)
     told = ", ".join(f"{count} {name}" for name, count in verdicts.items())
-    return evaluation_page(
+    return render_evaluation_page(
         runs[0],
         samples,
         title="The paper's experiment on a simulated site",
         lead=f"Of {len(claims)} claims: {told}; {len(runs)} training{'s' if len(runs) > 1 else ''}.",
         before=[
-            _claims(claims, audit_lines(runs[0])),
-            _floor(runs[0]),
-            _variance(shares, hidden),
-            _driven(splits, terrain),
-            *_seeds(runs),
-            _fidelity(runs[0]),
-            _sources(quick=quick),
+            _make_claims_section(claims, format_audit(runs[0])),
+            _make_floor_section(runs[0]),
+            _make_variance_section(shares, hidden),
+            _make_drives_section(splits, terrain),
+            *_make_seed_sections(runs),
+            _make_fidelity_section(runs[0]),
+            _make_sources_section(quick=quick),
         ],
         warnings=[SIMULATED, *([_QUICK] if quick else [])],
     )
 
 
-def _claims(claims: Sequence[Claim], audit: str) -> Section:
+def _make_claims_section(claims: Sequence[Claim], audit: str) -> Section:
     rows = [
         (claim.says, claim.split, claim.verdict, str(claim.ratio), "–" if claim.in_the_paper is None else f"{claim.in_the_paper:.2f}")
         for claim in claims
@@ -70,7 +70,7 @@ def _claims(claims: Sequence[Claim], audit: str) -> Section:
     return Section("What could have failed", text, header=header, rows=rows, figures_from=3)
 
 
-def _floor(run: Evaluation) -> Section:
+def _make_floor_section(run: Evaluation) -> Section:
     """Return how far errors lie above those of a predictor that knows the simulator."""
     rows = []
     for split, part in run.splits.items():
@@ -82,12 +82,12 @@ def _floor(run: Evaluation) -> Section:
             mape = (here.mape_percent, least.mape_percent, here.mape_percent - least.mape_percent)
             rows.append((split, quantity, *rmse, *(f"{value:.2f} %" for value in mape)))
     text = "The floor knows the simulator, map, path and turn without error; what nothing shows and the labels' noise are left to it. "
-    text += audit_lines(run)
+    text += format_audit(run)
     header = ("", "", "RMSE", "of the floor", "excess", "MAPE", "of the floor", "excess")
     return Section("How far above the floor", text, header=header, rows=rows, figures_from=2)
 
 
-def _variance(shares: Mapping[str, float], hidden: float) -> Section:
+def _make_variance_section(shares: Mapping[str, float], hidden: float) -> Section:
     """Return what E's variance is made of, and what of the rest that class and slope leave."""
     left = sum(share for name, share in shares.items() if name != CLASS_AND_SLOPE)
     rows = [
@@ -107,12 +107,12 @@ def _variance(shares: Mapping[str, float], hidden: float) -> Section:
     return Section("What E's variance is made of", text, header=header, rows=rows, figures_from=1)
 
 
-def _fidelity(run: Evaluation) -> Section:
+def _make_fidelity_section(run: Evaluation) -> Section:
     header = ("", "the paper", "here")
-    return Section("Where this differs from the paper", header=header, rows=list(differences(run)))
+    return Section("Where this differs from the paper", header=header, rows=list(list_differences(run)))
 
 
-def _driven(splits: Mapping[str, int], terrain: Mapping[str, Mapping[str, int]]) -> Section:
+def _make_drives_section(splits: Mapping[str, int], terrain: Mapping[str, Mapping[str, int]]) -> Section:
     total = sum(splits.values())
     by_class = {name: sum(part.get(name, 0) for part in terrain.values()) for name in _PAPER_SHARES}
     rows = [
@@ -123,7 +123,7 @@ def _driven(splits: Mapping[str, int], terrain: Mapping[str, Mapping[str, int]])
     return Section("What was driven", header=("", "here", "the paper"), rows=rows, figures_from=1)
 
 
-def _seeds(runs: Sequence[Evaluation]) -> list[Section]:
+def _make_seed_sections(runs: Sequence[Evaluation]) -> list[Section]:
     """Return the spread between trainings, where there are several."""
     if len(runs) < 2:
         return []
@@ -138,12 +138,14 @@ def _seeds(runs: Sequence[Evaluation]) -> list[Section]:
             rows.append((split, quantity, *figures))
     header = ("", "", *(f"seed {number}" for number in range(len(runs))))
     title = "Every training: RMSE and MAPE of all classes"
-    return [Section(title, audit_lines(runs[0]), header=header, rows=rows, figures_from=2)]
+    return [Section(title, format_audit(runs[0]), header=header, rows=rows, figures_from=2)]
 
 
-def _sources(*, quick: bool) -> Section:
+def _make_sources_section(*, quick: bool) -> Section:
     """Return where the numbers of the run's own site come from."""
-    tables = {name: table for name, table in paper_parameters().items() if not (quick and name in {"site", "drives"})}
+    tables = {
+        name: table for name, table in read_paper_parameters().items() if not (quick and name in {"site", "drives"})
+    }
     grouped = {
         f"{group}, {name.replace('_', ' ')}": table
         for group in ("look", "ground")
@@ -177,7 +179,7 @@ DIFFERENCES = (
 """What, in the paper, here."""
 
 
-def differences(found: Evaluation) -> Iterator[tuple[str, str, str]]:
+def list_differences(found: Evaluation) -> Iterator[tuple[str, str, str]]:
     """Yield them, and what every MAPE of an evaluation leaves out, with counts."""
     yield from DIFFERENCES
     for split, part in found.splits.items():

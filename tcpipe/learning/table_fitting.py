@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.dataset import Split
-from tcpipe.dataset.beside import beside_of, numbers_of
+from tcpipe.dataset.extra_features import read_extra_features, standardize_features
 from tcpipe.learning.checkpoint import TrainingProgress
-from tcpipe.learning.fitting import FitConfig, Fitted, Spent, Task, label_scale, labels_of
-from tcpipe.learning.losses import loss_factors, mean_loss
+from tcpipe.learning.fitting import FitConfig, Fitted, Task, TrainingTimes, collect_labels, label_scale
+from tcpipe.learning.losses import compute_loss_factors, mean_loss
 from tcpipe.learning.patch_features import Floats, patch_features
-from tcpipe.learning.physics_model import fit_physics_model, standing_of
+from tcpipe.learning.physics_model import find_idle_power, fit_physics_model
 from tcpipe.learning.table_model import fit_table
 
 logger = logging.getLogger("tcpipe")
@@ -24,7 +24,7 @@ _READ_TOGETHER = 1024
 
 
 @dataclass(frozen=True, slots=True)
-class _Made:
+class _FittedModel:
     """A model's arrays, what it and what those of the other folds said of each sample, (N, outputs); how large it is."""
 
     weights: dict[str, NDArray[np.generic]]
@@ -50,44 +50,48 @@ def fit_at_once(task: Task, config: FitConfig, *, name: str, key: str, patch_m: 
     ModelError : LightGBM is not installed, or there are too few samples.
     """
     split, scale, began = task.train, label_scale(task), time.perf_counter()
-    labels = labels_of(split, task.outputs).astype(np.float64)
+    labels = collect_labels(split, task.outputs).astype(np.float64)
     weighed = config.weights and split.weights.shape == labels.shape
     weights = split.weights.astype(np.float64) if weighed else np.ones_like(labels)
     logger.info("%s: %d samples, each predicted by the other folds", name, len(split))
-    made = _physics(split, labels) if config.model == "physics" else _trees(task, labels, weights, patch_m, class_count)
-    factors, over = loss_factors(config.loss, scale), np.array(scale)
+    made = (
+        _fit_physics(split, labels)
+        if config.model == "physics"
+        else _fit_trees(task, labels, weights, patch_m, class_count)
+    )
+    factors, over = compute_loss_factors(config.loss, scale), np.array(scale)
     loss, held = (float(mean_loss(said / over, labels / over, factors, weights)) for said in (made.said, made.held_out))
     progress = TrainingProgress(key, made.rounds, made.rounds, held, [(made.rounds, loss, held)])
-    spent = Spent(time.perf_counter() - began, made.fed_s, len(split))
+    spent = TrainingTimes(time.perf_counter() - began, made.fed_s, len(split))
     return Fitted(made.weights, (1.0,) * labels.shape[1], split, made.held_out, progress, spent, "cpu")
 
 
-def _trees(task: Task, labels: Floats, weights: Floats, patch_m: float, class_count: int) -> _Made:
+def _fit_trees(task: Task, labels: Floats, weights: Floats, patch_m: float, class_count: int) -> _FittedModel:
     """Grow trees, as many as the folds are told best by."""
     split, began = task.train, time.perf_counter()
-    numbers = numbers_of(task.beside, beside_of(split))
-    features = np.column_stack([features_of(split, patch_m, class_count), numbers])
+    numbers = standardize_features(task.beside, read_extra_features(split))
+    features = np.column_stack([compute_features(split, patch_m, class_count), numbers])
     fed_s = time.perf_counter() - began
     model, held_out = fit_table(
         features, labels, weights, split.column("fold"), channels=split.channels, class_count=class_count
     )
     rounds = int(np.bincount(model.forest.output).max())
-    return _Made(model.arrays(), model.predict(features), held_out, rounds, fed_s)
+    return _FittedModel(model.arrays(), model.predict(features), held_out, rounds, fed_s)
 
 
-def _physics(split: Split, labels: Floats) -> _Made:
+def _fit_physics(split: Split, labels: Floats) -> _FittedModel:
     """Fit physics to all, and to all but each fold."""
-    beside, folds, standing_watt = beside_of(split), split.column("fold"), standing_of(split)
+    beside, folds, standing_watt = read_extra_features(split), split.column("fold"), find_idle_power(split)
     held_out = np.empty_like(labels)
     for fold in np.unique(folds):
         held = folds == fold
         fitted = fit_physics_model(beside.take(~held), labels[~held], standing_watt=standing_watt)
         held_out[held] = fitted.predict(beside.take(held))
     whole = fit_physics_model(beside, labels, standing_watt=standing_watt)
-    return _Made(whole.arrays(), whole.predict(beside), held_out, 1)
+    return _FittedModel(whole.arrays(), whole.predict(beside), held_out, 1)
 
 
-def features_of(split: Split, patch_m: float, class_count: int) -> Floats:
+def compute_features(split: Split, patch_m: float, class_count: int) -> Floats:
     """Return the features of all samples, shape (N, features); patches are formed some at a time."""
     parts = []
     for first in range(0, len(split), _READ_TOGETHER):

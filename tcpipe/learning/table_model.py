@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.formats.weights import ArrayForm
-from tcpipe.learning.curves import Curves, curve_forms, curves_of, fit_curves
-from tcpipe.learning.forest import FOREST_FORMS, Forest, forest_of, grow
-from tcpipe.learning.patch_features import slope_and_class
+from tcpipe.learning.curves import Curves, fit_curves, list_curve_arrays, read_curves
+from tcpipe.learning.forest import FOREST_FORMS, Forest, grow, read_forest
+from tcpipe.learning.patch_features import find_slope_and_class
 
 Floats = NDArray[np.float64]
 
@@ -31,7 +31,7 @@ class TableModel:
 
     def predict(self, features: Floats) -> Floats:
         """Return outputs, shape (N, outputs), of features, shape (N, features)."""
-        slope_rad, class_id = slope_and_class(features, self.channels, self.class_count)
+        slope_rad, class_id = find_slope_and_class(features, self.channels, self.class_count)
         return self.curves.predict(slope_rad, class_id) + self.forest.predict(features)
 
     def arrays(self) -> dict[str, NDArray[np.generic]]:
@@ -39,17 +39,17 @@ class TableModel:
         return {**self.forest.arrays(), **self.curves.arrays()}
 
 
-def table_forms(outputs: int) -> dict[str, ArrayForm]:
+def list_table_arrays(outputs: int) -> dict[str, ArrayForm]:
     """Return types and shapes of the arrays of a table model of so many outputs."""
-    return {**FOREST_FORMS, **curve_forms(outputs)}
+    return {**FOREST_FORMS, **list_curve_arrays(outputs)}
 
 
-def table_model_of(
+def read_table_model(
     arrays: Mapping[str, NDArray[Any]], where: str, channels: Sequence[str], class_count: int
 ) -> TableModel:
     """Return the model that `TableModel.arrays` told of; `ModelError` if these are another's."""
-    curves, rest = curves_of("linear", arrays, where)
-    return TableModel(curves, forest_of(rest, where), tuple(channels), class_count)
+    curves, rest = read_curves("linear", arrays, where)
+    return TableModel(curves, read_forest(rest, where), tuple(channels), class_count)
 
 
 def fit_table(
@@ -74,7 +74,7 @@ def fit_table(
     ------
     ModelError : LightGBM is not installed, or cannot be loaded.
     """
-    slope_rad, class_id = slope_and_class(features, channels, class_count)
+    slope_rad, class_id = find_slope_and_class(features, channels, class_count)
     told = np.empty_like(labels)
     for fold in np.unique(folds):
         held = folds == fold

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from tcpipe.errors import ModelError
 from tcpipe.learning.losses import mean_loss
-from tcpipe.learning.network import Arrays, Floats, ResNet18, device, on_device
+from tcpipe.learning.network import Arrays, Floats, ResNet18, find_device, move_to_device
 
 _EPSILON = 1e-7
 """Of Adam, as Keras has it; torch's own is 1e-8."""
@@ -22,7 +22,7 @@ class Trainer:
 
     def __init__(self, network: ResNet18, factors: Floats) -> None:
         self.network = network
-        self._factors = torch.from_numpy(factors).to(device())
+        self._factors = torch.from_numpy(factors).to(find_device())
         self._optimizer = torch.optim.Adam(network.parameters(), eps=_EPSILON)
         for weight in network.parameters():  # as its first step makes it: a state has the same arrays before and after
             self._optimizer.state[weight] = {
@@ -39,8 +39,8 @@ class Trainer:
             patches, labels, weights = (np.repeat(values, 2, axis=0) for values in (patches, labels, weights))
         self._optimizer.param_groups[0]["lr"] = learning_rate
         self.network.train()
-        wanted, weigh = (torch.from_numpy(values).to(device()) for values in (labels, weights))
-        loss = mean_loss(self.network(on_device(patches)), wanted, self._factors, weigh)
+        wanted, weigh = (torch.from_numpy(values).to(find_device()) for values in (labels, weights))
+        loss = mean_loss(self.network(move_to_device(patches)), wanted, self._factors, weigh)
         self._optimizer.zero_grad()
         loss.backward()
         self._optimizer.step()

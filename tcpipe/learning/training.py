@@ -12,7 +12,7 @@ import numpy as np
 import pyarrow as pa
 
 from tcpipe.dataset import Dataset, Split, open_dataset
-from tcpipe.dataset.beside import beside_of, inputs_of
+from tcpipe.dataset.extra_features import available_features, read_extra_features
 from tcpipe.errors import DatasetError, ModelError, StoreError, UsageError
 from tcpipe.formats.atomic import clear_beside
 from tcpipe.formats.bucket_directories import fetch_directory, fetch_directory_by_range, has_card
@@ -22,13 +22,13 @@ from tcpipe.formats.json_files import digest, read_json
 from tcpipe.formats.object_storage import is_url
 from tcpipe.learning.architecture import Architecture
 from tcpipe.learning.checkpoint import read_checkpoint
-from tcpipe.learning.fitting import FitConfig, Fitted, ModelKind, Spent, Task, fit, labels_of
-from tcpipe.learning.model_card import KIND, ModelCard, Seen, TrainedOn, Training, is_current
+from tcpipe.learning.fitting import FitConfig, Fitted, ModelKind, Task, TrainingTimes, collect_labels, fit
+from tcpipe.learning.model_card import KIND, ModelCard, TrainedOn, Training, TrainingRange, is_current
 from tcpipe.learning.model_readme import model_readme
 from tcpipe.learning.models import CARD, FILES, load_model, read_model_card, write_model
 from tcpipe.pipeline.generations import write_generation
 from tcpipe.terrain.classes import NODATA_ID, PAPER_CLASSES, ClassTable
-from tcpipe.terrain.relief import relief_m
+from tcpipe.terrain.relief import compute_relief_m
 
 logger = logging.getLogger("tcpipe")
 
@@ -67,7 +67,7 @@ class TrainResult:
     best_epoch: int
     held_out_loss: float
     device: str
-    spent: Spent
+    spent: TrainingTimes
     feeding_share: float
     """Share of the time in which the network waited for batches."""
 
@@ -140,26 +140,26 @@ def train(
     data = open_dataset(dataset, label=rules.label)
     if rules.model == "physics":
         other = replace(other, channels=("height",))  # the patch itself is not looked at; every dataset has heights
-    key = digest({"dataset": dataset_checksum(data.card), "config": asdict(rules), "variant": asdict(other)})
+    key = digest({"dataset": compute_dataset_checksum(data.card), "config": asdict(rules), "variant": asdict(other)})
     if is_url(out):
-        return _into_bucket(dataset, str(out).rstrip("/"), key, rules, other)
+        return _train_into_bucket(dataset, str(out).rstrip("/"), key, rules, other)
     place = Path(out)
     clear_beside(place)
-    checkpoint = _checkpoint_of(place)
-    if (known := _known(place)) is not None and known.training.key == key and not fresh and _is_whole(place):
+    checkpoint = _find_checkpoint_path(place)
+    if (known := _read_known_card(place)) is not None and known.training.key == key and not fresh and _is_whole(place):
         _drop_what_is_done(checkpoint, key)
-        return _unchanged(place, known.training)
-    task = _with_beside(training_task(data, rules.fold, other), rules, data)
+        return _make_unchanged_result(place, known.training)
+    task = _add_extra_features(make_training_task(data, rules.fold, other), rules, data)
     _refuse_strangers(place)
     if rules.weights and not other.energy_only:
         _refuse_without_deviations(task, data)
     if fresh or (disposable and checkpoint.exists() and not _is_of(checkpoint, key)):
         checkpoint.unlink(missing_ok=True)
-    fitted = _fitted(task, rules, data, name=str(place), key=key, checkpoint=checkpoint)
-    card = _card(data, task, rules, fitted, key)
+    fitted = _fit_model(task, rules, data, name=str(place), key=key, checkpoint=checkpoint)
+    card = _make_card(data, task, rules, fitted, key)
     history = "".join(f"{epoch},{loss!r},{held!r}\n" for epoch, loss, held in fitted.progress.history)
     write_model(
-        place, card=card, weights=fitted.weights, residuals=_residuals(fitted, task.outputs),
+        place, card=card, weights=fitted.weights, residuals=_make_residuals_table(fitted, task.outputs),
         history="epoch,loss,held_out_loss\n" + history, readme=model_readme(card),
     )  # fmt: skip
     checkpoint.unlink(missing_ok=True)
@@ -178,32 +178,32 @@ def train(
     )
 
 
-def _into_bucket(dataset: str | Path, url: str, key: str, rules: FitConfig, other: Variant) -> TrainResult:
+def _train_into_bucket(dataset: str | Path, url: str, key: str, rules: FitConfig, other: Variant) -> TrainResult:
     """Train on this machine, and put the model to a URL."""
     known = read_model_card(fetch_directory(url)) if has_card(url) else None
     if known is not None and known.training.key == key:
-        return _unchanged(url, known.training)
+        return _make_unchanged_result(url, known.training)
     with write_generation(url, CARD) as place:
         result = train(dataset, place, config=rules, variant=other)
     return replace(result, path=url)
 
 
-def _fitted(task: Task, rules: FitConfig, data: Dataset, *, name: str, key: str, checkpoint: Path) -> Fitted:
+def _fit_model(task: Task, rules: FitConfig, data: Dataset, *, name: str, key: str, checkpoint: Path) -> Fitted:
     if rules.model == "resnet18":
         return fit(task, rules, name=name, key=key, checkpoint=checkpoint)
     from tcpipe.learning.table_fitting import fit_at_once  # noqa: PLC0415  numba loads with it
 
     return fit_at_once(
-        task, rules, name=name, key=key, patch_m=data.card.patch_m, class_count=class_table(data.card).count
+        task, rules, name=name, key=key, patch_m=data.card.patch_m, class_count=read_class_table(data.card).count
     )
 
 
-def dataset_checksum(card: DatasetCard) -> str:
+def compute_dataset_checksum(card: DatasetCard) -> str:
     """Return one checksum of every file of a dataset."""
     return digest(card.checksums)
 
 
-def training_task(data: Dataset, fold: int, variant: Variant) -> Task:
+def make_training_task(data: Dataset, fold: int, variant: Variant) -> Task:
     """Return what is fitted and what it is stopped by: a fold of train, never anything else; samples without a label are left out.
 
     Raises
@@ -238,12 +238,12 @@ def training_task(data: Dataset, fold: int, variant: Variant) -> Task:
     return Task(train, fitted, held, outputs)
 
 
-def _with_beside(task: Task, rules: FitConfig, data: Dataset) -> Task:
+def _add_extra_features(task: Task, rules: FitConfig, data: Dataset) -> Task:
     """Return the task with what its model is told beside a patch; physics takes the turn in any case, a network of energy alone nothing."""
     if rules.model != "physics" and (not rules.beside or len(task.outputs) == 1):
         return task
     wanted = ("turn_radpm",) if rules.model == "physics" else ("turn_radpm", "command_mps")
-    found = tuple(of for of in inputs_of(beside_of(task.fit)) if of.name in wanted)
+    found = tuple(of for of in available_features(read_extra_features(task.fit)) if of.name in wanted)
     lacking = [_CALLED[name] for name in wanted if name not in {of.name for of in found}]
     if lacking and not found and rules.model != "physics":
         raise DatasetError(
@@ -255,7 +255,7 @@ def _with_beside(task: Task, rules: FitConfig, data: Dataset) -> Task:
     return replace(task, beside=found)
 
 
-def what_was_seen(split: Split) -> Seen:
+def find_training_range(split: Split) -> TrainingRange:
     """Return classes and ranges of what a split holds."""
     pixel_classes: set[int] = set()
     reliefs_m: list[float] = []
@@ -264,22 +264,22 @@ def what_was_seen(split: Split) -> Seen:
         if "terrain" in layers:
             pixel_classes |= set(np.flatnonzero(np.bincount(layers["terrain"].ravel())).tolist()) - {NODATA_ID}
         if "height" in layers:
-            found_m = relief_m(np.asarray(layers["height"], np.uint16))
+            found_m = compute_relief_m(np.asarray(layers["height"], np.uint16))
             reliefs_m += [float(found_m.min()), float(found_m.max())]
     slopes = {name: split.column(name) for name in ("slope_rad", "cross_slope_rad")}
     ranges = {name: (float(np.min(of)), float(np.max(of))) for name, of in slopes.items()}
     if reliefs_m:
         ranges["relief_m"] = (min(reliefs_m), max(reliefs_m))
-    return Seen(_class_counts(split), tuple(sorted(pixel_classes)), ranges)
+    return TrainingRange(_count_classes(split), tuple(sorted(pixel_classes)), ranges)
 
 
-def _class_counts(split: Split) -> dict[int, int]:
+def _count_classes(split: Split) -> dict[int, int]:
     found = split.column("terrain_class").astype(np.float64)
     ids, counts = np.unique(found[np.isfinite(found)].astype(int), return_counts=True)
     return dict(zip(ids.tolist(), counts.tolist(), strict=True))
 
 
-def _known(place: Path) -> ModelCard | None:
+def _read_known_card(place: Path) -> ModelCard | None:
     """Return the card of the model that is there, None if there is none or one of another schema; an error if it is something else."""
     if not place.exists() or (place.is_dir() and not any(place.iterdir())):
         return None
@@ -303,7 +303,7 @@ def _refuse_strangers(place: Path) -> None:
         )
 
 
-def _checkpoint_of(place: Path) -> Path:
+def _find_checkpoint_path(place: Path) -> Path:
     """Return where training keeps its state: beside the folder, also of one called ``.`` or ``..``."""
     named = place if place.name not in {"", ".."} else place.resolve()
     return named.with_name(f"{named.name}.checkpoint")
@@ -343,7 +343,7 @@ def _refuse_without_deviations(task: Task, data: Dataset) -> None:
         )
 
 
-def _unchanged(place: Path | str, told: Training) -> TrainResult:
+def _make_unchanged_result(place: Path | str, told: Training) -> TrainResult:
     return TrainResult(
         str(place),
         "unchanged",
@@ -353,12 +353,12 @@ def _unchanged(place: Path | str, told: Training) -> TrainResult:
         told.best_epoch,
         told.held_out_loss,
         told.device,
-        Spent(),
+        TrainingTimes(),
         0.0,
     )
 
 
-def _card(data: Dataset, task: Task, config: FitConfig, fitted: Fitted, key: str) -> ModelCard:
+def _make_card(data: Dataset, task: Task, config: FitConfig, fitted: Fitted, key: str) -> ModelCard:
     card, form = data.card, task.fit.view.form
     return ModelCard(
         architecture=Architecture(
@@ -379,15 +379,15 @@ def _card(data: Dataset, task: Task, config: FitConfig, fitted: Fitted, key: str
         label_energy=config.label,
         label_includes=card.label.includes,
         robot=", ".join(card.robots),
-        classes=class_table(card).classes,
-        seen=what_was_seen((task.fit if config.model == "resnet18" else task.train).with_channels(*card.layers)),
+        classes=read_class_table(card).classes,
+        seen=find_training_range((task.fit if config.model == "resnet18" else task.train).with_channels(*card.layers)),
         physics=card.physics.get(card.robots[0]) if len(card.robots) == 1 else None,
-        dataset=TrainedOn(card.name, dataset_checksum(card), card.data_model_version, card.splits),
-        training=_told(task, config, fitted, key),
+        dataset=TrainedOn(card.name, compute_dataset_checksum(card), card.data_model_version, card.splits),
+        training=_describe_training(task, config, fitted, key),
     )
 
 
-def class_table(card: DatasetCard) -> ClassTable:
+def read_class_table(card: DatasetCard) -> ClassTable:
     """Return a dataset's class table; one without a terrain layer has the paper's."""
     return ClassTable(card.classes) if card.classes else PAPER_CLASSES
 
@@ -395,7 +395,7 @@ def class_table(card: DatasetCard) -> ClassTable:
 _OPTIMIZERS: Mapping[ModelKind, str] = {"resnet18": "Adam", "table": "LightGBM", "physics": "robust least squares"}
 
 
-def _told(task: Task, config: FitConfig, fitted: Fitted, key: str) -> Training:
+def _describe_training(task: Task, config: FitConfig, fitted: Fitted, key: str) -> Training:
     """Return what a model card tells of its training."""
     progress = fitted.progress
     return Training(
@@ -410,9 +410,9 @@ def _told(task: Task, config: FitConfig, fitted: Fitted, key: str) -> Training:
     )
 
 
-def _residuals(fitted: Fitted, outputs: tuple[str, ...]) -> pa.Table:
+def _make_residuals_table(fitted: Fitted, outputs: tuple[str, ...]) -> pa.Table:
     """Return labels and predictions of what was held out, one row a sample."""
-    held, said, labels = fitted.held, fitted.said, labels_of(fitted.held, outputs)
+    held, said, labels = fitted.held, fitted.said, collect_labels(fitted.held, outputs)
     columns = {name: held.column(name) for name in ("sample_id", "run_id", "start_ns", "terrain_class")}
     for number, name in enumerate(("power_watt", "velocity_mps") if len(outputs) > 1 else outputs):
         quantity, _, unit = name.rpartition("_")

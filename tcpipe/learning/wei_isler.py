@@ -10,11 +10,11 @@ import numpy as np
 
 from tcpipe.dataset import Dataset
 from tcpipe.errors import DatasetError
-from tcpipe.learning.baselines import beside
-from tcpipe.learning.evaluation_facts import Compared
-from tcpipe.learning.metrics import ALL, Array, Errors, Spread, errors_by_class
+from tcpipe.learning.baselines import compare_with_baseline
+from tcpipe.learning.evaluation_facts import BaselineResult
+from tcpipe.learning.metrics import ALL, Array, Errors, Spread, compute_errors_by_class
 from tcpipe.learning.models import Model
-from tcpipe.learning.predictions import Measured, predicted_costs, spreads_of
+from tcpipe.learning.predictions import Measured, predict_costs, predict_spreads
 from tcpipe.learning.training import Variant
 
 logger = logging.getLogger("tcpipe")
@@ -32,10 +32,10 @@ class EnergyTable:
     """Errors of E by predictor and split, and the model's over theirs."""
 
     errors: dict[str, dict[str, Errors]] = field(default_factory=dict)
-    compared: list[Compared] = field(default_factory=list)
+    compared: list[BaselineResult] = field(default_factory=list)
 
 
-def energy_table(
+def make_energy_table(
     ours: Model,
     data: Dataset,
     sets: Mapping[str, Measured],
@@ -45,25 +45,27 @@ def energy_table(
     seed: int,
 ) -> EnergyTable:
     """Return table IV, of the samples whose class has a network of its own; of all where none is trained (``trained`` is None)."""
-    networks = {} if trained is None or "height" not in data.card.layers else _networks(ours, trained)
+    networks = {} if trained is None or "height" not in data.card.layers else _fit_networks(ours, trained)
     grass = next((entry.id for entry in ours.classes.classes if entry.name == "grass" and entry.id in networks), None)
     found, block_m = EnergyTable(), data.card.recipe.split.block_m
     for split, part in sets.items():
         rows = np.flatnonzero(np.isin(part.class_ids, list(networks)) | (not networks))
         same, mine = part.take(rows), {"E": said[split]["E"][rows]}
-        found.errors.setdefault(OURS, {})[split] = _error(mine, same, spreads_of(ours, mine, same.class_ids))
+        found.errors.setdefault(OURS, {})[split] = _compute_error(
+            mine, same, predict_spreads(ours, mine, same.class_ids)
+        )
         if not networks or not len(rows):
             continue
-        theirs = {PER_CLASS: _by_own_network(networks, same)}
+        theirs = {PER_CLASS: _predict_by_class_network(networks, same)}
         if grass is not None:
-            theirs[GRASS_ONLY] = predicted_costs(networks[grass], same.split)["E"]
+            theirs[GRASS_ONLY] = predict_costs(networks[grass], same.split)["E"]
         for name, energy in theirs.items():
-            found.errors.setdefault(name, {})[split] = _error({"E": energy}, same)
-            found.compared += beside(name, split, same, mine, {"E": energy}, block_m=block_m, seed=seed)
+            found.errors.setdefault(name, {})[split] = _compute_error({"E": energy}, same)
+            found.compared += compare_with_baseline(name, split, same, mine, {"E": energy}, block_m=block_m, seed=seed)
     return found
 
 
-def _networks(ours: Model, trained: Trained) -> dict[int, Model]:
+def _fit_networks(ours: Model, trained: Trained) -> dict[int, Model]:
     """Return a network for every class with enough samples, by class id."""
     found = {}
     for class_id in (class_id for class_id, count in ours.card.seen.class_counts.items() if count >= FEWEST):
@@ -75,14 +77,14 @@ def _networks(ours: Model, trained: Trained) -> dict[int, Model]:
     return found
 
 
-def _by_own_network(networks: Mapping[int, Model], found: Measured) -> Array:
+def _predict_by_class_network(networks: Mapping[int, Model], found: Measured) -> Array:
     energy = np.empty(len(found.split))
     for class_id, network in networks.items():
         here = np.flatnonzero(found.class_ids == class_id)
         if len(here):
-            energy[here] = predicted_costs(network, found.split.take(here))["E"]
+            energy[here] = predict_costs(network, found.split.take(here))["E"]
     return energy
 
 
-def _error(energy: Mapping[str, Array], found: Measured, spreads: Mapping[str, Spread] | None = None) -> Errors:
-    return errors_by_class(energy, found.costs, found.class_ids, found.names, spreads)["E"][ALL]
+def _compute_error(energy: Mapping[str, Array], found: Measured, spreads: Mapping[str, Spread] | None = None) -> Errors:
+    return compute_errors_by_class(energy, found.costs, found.class_ids, found.names, spreads)["E"][ALL]

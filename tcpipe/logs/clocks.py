@@ -79,7 +79,7 @@ class Timeline:
 
 
 @dataclass(frozen=True, slots=True)
-class Settled:
+class AlignedClocks:
     """Each topic's timeline, the clock steps that divide them into epochs, and the simulation's clock where that rules."""
 
     timelines: dict[str, Timeline]
@@ -87,7 +87,7 @@ class Settled:
     simulated: SimulatedClock | None = None
 
 
-def settle_clocks(topics: Mapping[str, TopicTimes], *, clock_published: bool = False) -> Settled:
+def settle_clocks(topics: Mapping[str, TopicTimes], *, clock_published: bool = False) -> AlignedClocks:
     """Return each topic's timeline, and what the clocks did.
 
     Parameters
@@ -102,52 +102,56 @@ def settle_clocks(topics: Mapping[str, TopicTimes], *, clock_published: bool = F
     }
     simulated = find_simulated_clock(stamped, published=clock_published)
     if simulated is not None:
-        return Settled({name: _simulated(name, times, simulated) for name, times in topics.items()}, [], simulated)
-    steps_of = {name: _steps(times) for name, times in topics.items()}
-    reasons = {name: _why_not_header(times, steps_of[name]) for name, times in topics.items()}
+        return AlignedClocks(
+            {name: _make_simulated_timeline(name, times, simulated) for name, times in topics.items()}, [], simulated
+        )
+    steps_of = {name: _find_steps(times) for name, times in topics.items()}
+    reasons = {name: _find_header_problem(times, steps_of[name]) for name, times in topics.items()}
     # A header that does not rule has no say about the others' clock either.
     trusted = {name: steps for name, steps in steps_of.items() if reasons[name] is None}
-    steps = _common_steps({name: topics[name].log_time_ns for name in topics}, trusted)
+    steps = _find_common_steps({name: topics[name].log_time_ns for name in topics}, trusted)
     drafts = {
-        name: _draft(times, reasons[name], _epochs(name, times, steps, trusted.get(name, [])))
+        name: _make_draft(times, reasons[name], _assign_epochs(name, times, steps, trusted.get(name, [])))
         for name, times in topics.items()
     }
-    reference = [_reference_offset(drafts, epoch) for epoch in range(len(steps) + 1)]
-    moves = {name: _moves(topics[name], draft, reference) for name, draft in drafts.items()}
-    return Settled({name: _timeline(topics[name], draft, moves[name]) for name, draft in drafts.items()}, steps)
+    reference = [_find_reference_offset(drafts, epoch) for epoch in range(len(steps) + 1)]
+    moves = {name: _find_clock_shifts(topics[name], draft, reference) for name, draft in drafts.items()}
+    return AlignedClocks(
+        {name: _make_timeline(topics[name], draft, moves[name]) for name, draft in drafts.items()}, steps
+    )
 
 
-def _simulated(name: str, times: TopicTimes, clock: SimulatedClock) -> Timeline:
+def _make_simulated_timeline(name: str, times: TopicTimes, clock: SimulatedClock) -> Timeline:
     """Return the timeline of a topic in a simulation: by its header, or by the simulation's time when it was received."""
     known, epoch = _is_set(times), np.zeros(len(times.log_time_ns), np.int64)
-    median, every = _median_offset(times, known), np.ones(len(epoch), bool)
+    median, every = _compute_median_offset(times, known), np.ones(len(epoch), bool)
     if times.prefer == "header" and times.header_ns is not None:
         draft = _Draft("header", RECIPE, times.header_ns, known, epoch, {}, median, 0)
-        return _timeline(times, draft, [0])
+        return _make_timeline(times, draft, [0])
     told = clock.at(times.log_time_ns)
-    why = _why_not_simulated(name, times, clock)
+    why = _find_simulated_problem(name, times, clock)
     if why is None and times.header_ns is not None:
         stamps = np.where(known, times.header_ns, told)
         draft = _Draft("header", "simulated-time", stamps, every, epoch, {}, median, int(np.count_nonzero(~known)))
-        return _timeline(times, draft, [0])
+        return _make_timeline(times, draft, [0])
     draft = _Draft("log", str(why), told, every, epoch, {}, median, 0)
-    return replace(_timeline(times, draft, [0]), moved_s=(float(np.median(told - times.log_time_ns)) / SECOND_NS,))
+    return replace(_make_timeline(times, draft, [0]), moved_s=(float(np.median(told - times.log_time_ns)) / SECOND_NS,))
 
 
-def _why_not_simulated(name: str, times: TopicTimes, clock: SimulatedClock) -> str | None:
+def _find_simulated_problem(name: str, times: TopicTimes, clock: SimulatedClock) -> str | None:
     """Return why a topic's header does not rule in a simulation, or None where it does."""
     if times.prefer == "log":
         return RECIPE
     if name not in clock.topics:
         return "header-not-simulated"
-    return "header-repeats" if _repeated_share(times) > _MOST_REPEATED else None
+    return "header-repeats" if _compute_repeated_share(times) > _MOST_REPEATED else None
 
 
 def _is_set(times: TopicTimes) -> Mask:
     return np.zeros(len(times.log_time_ns), bool) if times.header_ns is None else times.header_ns > 0
 
 
-def _steps(times: TopicTimes) -> list[tuple[int, int]]:
+def _find_steps(times: TopicTimes) -> list[tuple[int, int]]:
     """Return the lasting steps of header minus log time: (row that begins the new level, step [ns])."""
     rows = np.flatnonzero(_is_set(times))
     if times.header_ns is None or len(rows) < 2 * _FEWEST:
@@ -181,7 +185,7 @@ def _steps(times: TopicTimes) -> list[tuple[int, int]]:
     return found
 
 
-def _common_steps(log_times: Mapping[str, Ints], steps_of: Mapping[str, list[tuple[int, int]]]) -> list[ClockStep]:
+def _find_common_steps(log_times: Mapping[str, Ints], steps_of: Mapping[str, list[tuple[int, int]]]) -> list[ClockStep]:
     """Return steps common to all topics: those of several topics within 5 s of log time are one."""
     every = sorted((int(log_times[name][row]), name, step) for name, steps in steps_of.items() for row, step in steps)
     groups: list[list[tuple[int, str, int]]] = []
@@ -212,29 +216,29 @@ class _Draft:
     replaced: int
 
 
-def _draft(times: TopicTimes, reason: str | None, epoch: Ints) -> _Draft:
+def _make_draft(times: TopicTimes, reason: str | None, epoch: Ints) -> _Draft:
     known = _is_set(times)
-    median = _median_offset(times, known)
+    median = _compute_median_offset(times, known)
     usable = np.ones(len(known), bool)
     if reason is not None or times.header_ns is None:
         return _Draft("log", str(reason), times.log_time_ns, usable, epoch, {}, median, 0)
-    offset = _offsets(times, known, epoch)
+    offset = _compute_offsets(times, known, epoch)
     if times.prefer == "header":
         return _Draft("header", RECIPE, times.header_ns, known, epoch, offset, median, 0)
-    expected = _expected(times, offset, epoch)
+    expected = _predict_stamps(times, offset, epoch)
     stray = known & (np.abs(times.header_ns - expected) > FOLLOWS_NS)
-    replaced = ~known | stray | _leaps(times, known & ~stray)
+    replaced = ~known | stray | _find_leaps(times, known & ~stray)
     stamps = np.where(replaced, expected, times.header_ns)
     count = int(np.count_nonzero(replaced))
     return _Draft("header", "header-follows-log-time", stamps, usable, epoch, offset, median, count)
 
 
-def _expected(times: TopicTimes, offset_ns: Mapping[int, int], epoch: Ints) -> Ints:
+def _predict_stamps(times: TopicTimes, offset_ns: Mapping[int, int], epoch: Ints) -> Ints:
     """Return where the log time and the epoch's offset put each stamp [ns]."""
     return times.log_time_ns + np.array([offset_ns[int(e)] for e in epoch], np.int64)
 
 
-def _epochs(name: str, times: TopicTimes, steps: Sequence[ClockStep], own: Sequence[tuple[int, int]]) -> Ints:
+def _assign_epochs(name: str, times: TopicTimes, steps: Sequence[ClockStep], own: Sequence[tuple[int, int]]) -> Ints:
     """Return each row's epoch: by its own topic's step where it has one, else by the step's log time."""
     own_rows = {int(times.log_time_ns[row]): row for row, _ in own}
     epoch = np.zeros(len(times.log_time_ns), np.int64)
@@ -245,13 +249,13 @@ def _epochs(name: str, times: TopicTimes, steps: Sequence[ClockStep], own: Seque
     return epoch
 
 
-def _median_offset(times: TopicTimes, known: Mask) -> int | None:
+def _compute_median_offset(times: TopicTimes, known: Mask) -> int | None:
     if times.header_ns is None or not known.any():
         return None
     return int(np.median(times.header_ns[known] - times.log_time_ns[known]))
 
 
-def _offsets(times: TopicTimes, known: Mask, epoch: Ints) -> dict[int, int]:
+def _compute_offsets(times: TopicTimes, known: Mask, epoch: Ints) -> dict[int, int]:
     """Return the median of header minus log time [ns] by epoch; an epoch without set stamps takes the whole log's."""
     header = times.log_time_ns if times.header_ns is None else times.header_ns
     behind = header - times.log_time_ns
@@ -262,7 +266,7 @@ def _offsets(times: TopicTimes, known: Mask, epoch: Ints) -> dict[int, int]:
     }
 
 
-def _why_not_header(times: TopicTimes, own_steps: Sequence[tuple[int, int]]) -> str | None:
+def _find_header_problem(times: TopicTimes, own_steps: Sequence[tuple[int, int]]) -> str | None:
     """Return why a topic's log time rules, or None where its header does."""
     known = _is_set(times)
     if times.prefer == "log":
@@ -273,21 +277,21 @@ def _why_not_header(times: TopicTimes, own_steps: Sequence[tuple[int, int]]) -> 
         return None
     if 1 - np.mean(known) > _MOST_UNSET:
         return "header-unset"
-    if _stray_share(times, known, own_steps) > _MOST_STRAY:
+    if _compute_stray_share(times, known, own_steps) > _MOST_STRAY:
         return "header-differs-from-log-time"
-    return "header-repeats" if _repeated_share(times) > _MOST_REPEATED else None
+    return "header-repeats" if _compute_repeated_share(times) > _MOST_REPEATED else None
 
 
-def _stray_share(times: TopicTimes, known: Mask, own_steps: Sequence[tuple[int, int]]) -> float:
+def _compute_stray_share(times: TopicTimes, known: Mask, own_steps: Sequence[tuple[int, int]]) -> float:
     epoch = np.zeros(len(known), np.int64)
     for row, _ in own_steps:
         epoch[row:] += 1
     header = times.log_time_ns if times.header_ns is None else times.header_ns
-    stray = np.abs(header - _expected(times, _offsets(times, known, epoch), epoch)) > FOLLOWS_NS
+    stray = np.abs(header - _predict_stamps(times, _compute_offsets(times, known, epoch), epoch)) > FOLLOWS_NS
     return float(np.mean(known & stray))
 
 
-def _repeated_share(times: TopicTimes) -> float:
+def _compute_repeated_share(times: TopicTimes) -> float:
     if times.header_ns is None or len(times.header_ns) < 2 * _FEWEST:
         return 0.0
     again = np.diff(times.header_ns) == 0
@@ -297,7 +301,7 @@ def _repeated_share(times: TopicTimes) -> float:
     return float(np.mean(again))
 
 
-def _leaps(times: TopicTimes, known: Mask) -> Mask:
+def _find_leaps(times: TopicTimes, known: Mask) -> Mask:
     """Whether single stamps lie more than 1 s ahead of their neighbours': nothing is received before it is measured."""
     leaps = np.zeros(len(known), bool)
     rows = np.flatnonzero(known)
@@ -312,7 +316,7 @@ def _leaps(times: TopicTimes, known: Mask) -> Mask:
     return leaps
 
 
-def _reference_offset(drafts: Mapping[str, _Draft], epoch: int) -> int:
+def _find_reference_offset(drafts: Mapping[str, _Draft], epoch: int) -> int:
     """Return the offset [ns] that most topics with header time share in an epoch; 0 where there is none.
 
     Among equally large groups the one nearest to the log's clock is taken.
@@ -325,19 +329,19 @@ def _reference_offset(drafts: Mapping[str, _Draft], epoch: int) -> int:
     return best[len(best) // 2]
 
 
-def _moves(times: TopicTimes, draft: _Draft, reference: Sequence[int]) -> list[int]:
+def _find_clock_shifts(times: TopicTimes, draft: _Draft, reference: Sequence[int]) -> list[int]:
     """Return what brings a topic to the clock of the others [ns], by epoch."""
     apart = [target - draft.offset_ns.get(epoch, 0) for epoch, target in enumerate(reference)]
     return [move if abs(move) > APART_NS and times.prefer != "header" else 0 for move in apart]
 
 
-def _timeline(times: TopicTimes, draft: _Draft, moves: Sequence[int]) -> Timeline:
+def _make_timeline(times: TopicTimes, draft: _Draft, moves: Sequence[int]) -> Timeline:
     stamps = draft.stamp_ns + np.array(moves, np.int64)[draft.epoch] + times.offset_ns
-    late = _lateness(stamps, draft.epoch, draft.usable)
+    late = _compute_lateness(stamps, draft.epoch, draft.usable)
     keep = draft.usable & (late < LATE_NS)
     rows = np.flatnonzero(keep)
     order = rows[np.lexsort((rows, stamps[rows], draft.epoch[rows]))]
-    again = _repeats(stamps[order], draft.epoch[order])
+    again = _find_repeats(stamps[order], draft.epoch[order])
     same = np.zeros(len(order), bool)
     repeats = np.flatnonzero(again)
     pairs = ((column[order[repeats]], column[order[repeats - 1]]) for column in times.content)
@@ -363,7 +367,7 @@ def _timeline(times: TopicTimes, draft: _Draft, moves: Sequence[int]) -> Timelin
     )
 
 
-def _lateness(stamp_ns: Ints, epoch: Ints, usable: Mask) -> Ints:
+def _compute_lateness(stamp_ns: Ints, epoch: Ints, usable: Mask) -> Ints:
     """Return how far each row lies before the latest stamp that came earlier in its epoch [ns], 0 where it does not."""
     late = np.zeros(len(stamp_ns), np.int64)
     for e in np.unique(epoch):
@@ -373,7 +377,7 @@ def _lateness(stamp_ns: Ints, epoch: Ints, usable: Mask) -> Ints:
     return late
 
 
-def _repeats(stamp_ns: Ints, epoch: Ints) -> Mask:
+def _find_repeats(stamp_ns: Ints, epoch: Ints) -> Mask:
     again = np.zeros(len(stamp_ns), bool)
     again[1:] = (np.diff(stamp_ns) == 0) & (np.diff(epoch) == 0)
     return again

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 from math import pi
 
+from tcpipe.logs.extrinsics import is_base
 from tcpipe.logs.messages import GNSS_VELOCITY, Readings
-from tcpipe.logs.placements import is_base
 from tcpipe.recipe.suggestions import suggest
 from tcpipe.tables.findings import make_finding
 
@@ -20,7 +20,7 @@ _FACTORS = {
 }
 
 
-def imu_in_si(readings: Readings, units: str) -> Readings:
+def convert_imu_to_si(readings: Readings, units: str) -> Readings:
     """Return an IMU's readings in rad/s and m/s², variances included.
 
     Parameters
@@ -40,7 +40,7 @@ _LENGTHS = {"velocity_": 1, "velocity_var_": 2, "x_m": 1, "y_m": 1, "z_m": 1}
 """Columns of an odometry, or how they begin, that hold lengths, and to which power."""
 
 
-def scaled(readings: Readings, factor: float) -> Readings:
+def scale_odometry(readings: Readings, factor: float) -> Readings:
     """Return an odometry's readings with all lengths times ``factor``, variances included; turns stay."""
     columns = dict(readings.columns)
     for name, values in readings.columns.items():
@@ -50,7 +50,7 @@ def scaled(readings: Readings, factor: float) -> Readings:
     return replace(readings, columns=columns)
 
 
-def over_ground(readings: Readings, frame: str, topic: str) -> Readings:
+def select_ground_velocity(readings: Readings, frame: str, topic: str) -> Readings:
     """Return a receiver's velocities, none with a finding where their frame is the body's: whose axes they have is not known."""
     if not is_base(frame):
         return readings

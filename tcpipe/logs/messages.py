@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.geometry.rotation import normalized
+from tcpipe.geometry.rotation import normalize
 from tcpipe.logs import roles
-from tcpipe.logs.nmea import STATUS_AND_STD_OF_QUALITY, read_gga, read_over_ground, with_date
+from tcpipe.logs.nmea import STATUS_AND_STD_OF_QUALITY, add_date, read_gga, read_over_ground
 from tcpipe.recipe.suggestions import suggest
-from tcpipe.tables.catalogue import threshold
+from tcpipe.tables.catalogue import read_threshold
 from tcpipe.tables.findings import Finding, Subject, make_finding
 
 Columns = Mapping[str, NDArray[Any]]
@@ -47,10 +47,10 @@ class Readings:
     notes: dict[str, int] = field(default_factory=dict)
     findings: tuple[Finding, ...] = ()
     own_time_ns: Ints | None = None
-    """Time that the measurement itself carries (NMEA), as `header_ns`."""
+    """Time that the measurement itself carries (NMEA), as `read_header_ns`."""
 
 
-def needed_fields(type_name: str) -> tuple[str, ...]:
+def list_needed_fields(type_name: str) -> tuple[str, ...]:
     """Return the fields that a type of message must have to be read here."""
     return _FIELDS[type_name]
 
@@ -65,14 +65,14 @@ def read_messages(columns: Columns, role: str, type_name: str) -> Readings:
     role : gnss, gnss_velocity, imu, wheel_odometry, visual_odometry, command or pose (power is read by `tcpipe.power.readings`).
     type_name : ``package/msg/Name``.
     """
-    return _READERS[role, type_name]({name: _possible(name, values) for name, values in columns.items()})
+    return _READERS[role, type_name]({name: _mask_impossible(name, values) for name, values in columns.items()})
 
 
 _IMPOSSIBLE = 1e9
 """No position, velocity or acceleration in SI units is larger; squares of what is overflow."""
 
 
-def _possible(name: str, values: NDArray[Any]) -> NDArray[Any]:
+def _mask_impossible(name: str, values: NDArray[Any]) -> NDArray[Any]:
     """Return the values of a field with NaN for those that no sensor can mean; covariances are judged where they are used."""
     if not np.issubdtype(values.dtype, np.floating) or name.endswith("covariance"):
         return values
@@ -80,7 +80,7 @@ def _possible(name: str, values: NDArray[Any]) -> NDArray[Any]:
     return values if possible.all() else np.where(possible, values, np.nan)
 
 
-def frames(columns: Columns, type_name: str) -> dict[str, int]:
+def count_frames(columns: Columns, type_name: str) -> dict[str, int]:
     """Return the frames that a topic's measurements are given in, with their counts, most frequent first; leading slashes stripped.
 
     A pose names only the frame it is in, not whose pose it is: none.
@@ -97,14 +97,16 @@ def frames(columns: Columns, type_name: str) -> dict[str, int]:
     return dict(sorted(found.items(), key=lambda item: (-item[1], item[0])))
 
 
-def header_ns(columns: Columns) -> Ints | None:
+def read_header_ns(columns: Columns) -> Ints | None:
     """Return header stamps [ns], 0 where unset; None where the message has no header."""
     if _STAMP[0] not in columns:
         return None
     return columns[_STAMP[0]].astype(np.int64) * 1_000_000_000 + columns[_STAMP[1]].astype(np.int64)
 
 
-def _kept(columns: Columns, values: dict[str, NDArray[Any]], drops: Mapping[str, Mask], **extra: Any) -> Readings:
+def _select_rows(
+    columns: Columns, values: dict[str, NDArray[Any]], drops: Mapping[str, Mask], **extra: Any
+) -> Readings:
     """Return the readings of the rows that no reason drops; a row counts under its first reason."""
     keep = np.ones(len(columns[LOG_TIME]), bool)
     dropped: dict[str, int] = {}
@@ -114,7 +116,7 @@ def _kept(columns: Columns, values: dict[str, NDArray[Any]], drops: Mapping[str,
         keep &= ~mask
     row = np.flatnonzero(keep)
     every = slice(None) if row.size == keep.size else row  # nothing is copied where every row is used
-    stamps = header_ns(columns)
+    stamps = read_header_ns(columns)
     return Readings(
         row,
         columns[LOG_TIME][every].astype(np.int64, copy=False),
@@ -125,16 +127,16 @@ def _kept(columns: Columns, values: dict[str, NDArray[Any]], drops: Mapping[str,
     )
 
 
-def _vector(columns: Columns, prefix: str) -> Floats:
+def _read_vector(columns: Columns, prefix: str) -> Floats:
     """Return fields x, y, z as shape (N, 3)."""
     return np.stack([columns[f"{prefix}.{axis}"].astype(np.float64) for axis in "xyz"], -1)
 
 
-def _axes(name: str, suffix: str, values: Floats) -> dict[str, NDArray[Any]]:
+def _name_axes(name: str, suffix: str, values: Floats) -> dict[str, NDArray[Any]]:
     return {f"{name}_{axis}_{suffix}": values[:, i] for i, axis in enumerate("xyz")}
 
 
-def _variances(columns: Columns, name: str, *diagonal: int) -> Floats:
+def _read_variances(columns: Columns, name: str, *diagonal: int) -> Floats:
     """Return diagonal entries of a covariance, shape (N, k); NaN where they cannot be trusted: zero, negative or not finite."""
     if name not in columns:
         return np.full((len(columns[LOG_TIME]), len(diagonal)), np.nan)
@@ -154,7 +156,7 @@ _UNMEASURED_VAR = 1e3
 """Drivers fill in 1e3 to 1e9 [SI units squared] for what they do not measure; nobody measures as badly as that."""
 
 
-def _unmeasured(columns: Columns, name: str, twist: Floats) -> Mask:
+def _find_unmeasured(columns: Columns, name: str, twist: Floats) -> Mask:
     """Return which components of a twist (N, 6) are no measurements: variance -1 or vast, or zero throughout while the robot moves.
 
     Velocity ahead is left to its variance. A constant is told from a calm sensor by its last digit, and only in some rows.
@@ -172,12 +174,12 @@ def _unmeasured(columns: Columns, name: str, twist: Floats) -> Mask:
 _FEWEST_ZEROS = 20
 
 
-def _orientation(columns: Columns, prefix: str) -> tuple[Floats, Mask]:
+def _read_orientation(columns: Columns, prefix: str) -> tuple[Floats, Mask]:
     """Return unit quaternions (N, 4), NaN where they are none, and which rows those are."""
     given = np.stack([columns[f"{prefix}.{c}"].astype(np.float64) for c in "xyzw"], -1)
     length = np.linalg.norm(given, axis=-1)
     bad = ~(np.abs(length - 1.0) < _QUAT_TOLERANCE)
-    return normalized(np.where(bad[:, None], np.nan, given)), bad
+    return normalize(np.where(bad[:, None], np.nan, given)), bad
 
 
 _QUAT_TOLERANCE = 0.01
@@ -187,7 +189,9 @@ def _is_outside(lat_deg: Floats, lon_deg: Floats) -> Mask:
     return (np.abs(lat_deg) > 90) | (np.abs(lon_deg) > 180)
 
 
-def _gnss(lon: Floats, lat: Floats, alt: Floats, variances: Floats, status: NDArray[Any]) -> dict[str, NDArray[Any]]:
+def _read_gnss(
+    lon: Floats, lat: Floats, alt: Floats, variances: Floats, status: NDArray[Any]
+) -> dict[str, NDArray[Any]]:
     return {
         "lon_deg": lon,
         "lat_deg": lat,
@@ -199,7 +203,7 @@ def _gnss(lon: Floats, lat: Floats, alt: Floats, variances: Floats, status: NDAr
 
 def _read_nav_sat_fix(columns: Columns) -> Readings:
     lat, lon, alt = (columns[name].astype(np.float64) for name in ("latitude", "longitude", "altitude"))
-    variances = _variances(columns, "position_covariance", 0, 4, 8)
+    variances = _read_variances(columns, "position_covariance", 0, 4, 8)
     unknown = columns["position_covariance_type"] == 0
     variances[unknown] = np.nan
     status = columns["status.status"].astype(np.int64)
@@ -210,25 +214,25 @@ def _read_nav_sat_fix(columns: Columns) -> Readings:
         "outside_the_globe": _is_outside(lat, lon),
     }
     fixed = ~np.any(list(drops.values()), axis=0)
-    alt, unmeasured = _altitude(alt, fixed)
+    alt, unmeasured = _read_altitude(alt, fixed)
     variances[unmeasured, 2] = _NO_HEIGHT_M2
     missing, fixes = int(np.count_nonzero(unmeasured & fixed)), int(np.count_nonzero(fixed))
     notes = {"without_covariance": int(np.count_nonzero(np.isnan(variances[:, 0]))), "without_altitude": missing}
     findings = (make_finding("altitude-missing", GNSS, missing_count=missing, fixes_count=fixes),) if missing else ()
-    return _kept(columns, _gnss(lon, lat, alt, variances, status), drops, notes=notes, findings=findings)
+    return _select_rows(columns, _read_gnss(lon, lat, alt, variances, status), drops, notes=notes, findings=findings)
 
 
 _NO_HEIGHT_M2 = 1e6
 
 
-def _altitude(alt: Floats, fixed: Mask) -> tuple[Floats, Mask]:
+def _read_altitude(alt: Floats, fixed: Mask) -> tuple[Floats, Mask]:
     """Return heights with the median of the known ones where there is none, and where that is.
 
     NaN is sensor_msgs/NavSatFix's word for it; a receiver's own digits never stand still, so one constant is a word for it too.
     """
     unknown = ~np.isfinite(alt)
     known = alt[~unknown & fixed]
-    if known.size >= threshold("altitude-missing", "min_equal_count") and np.ptp(known) == 0.0:
+    if known.size >= read_threshold("altitude-missing", "min_equal_count") and np.ptp(known) == 0.0:
         unknown = np.ones_like(unknown)
     return np.where(unknown, np.median(known) if known.size else 0.0, alt), unknown
 
@@ -252,10 +256,10 @@ def _read_nmea(columns: Columns) -> Readings:
         "outside_the_globe": _is_outside(gga.lat_deg, gga.lon_deg),
     }
     without_geoid = len(gga.row) > 0 and not known.any()
-    values = _gnss(gga.lon_deg, gga.lat_deg, alt, variances, status)
-    found = _kept(of_gga, values, drops)
+    values = _read_gnss(gga.lon_deg, gga.lat_deg, alt, variances, status)
+    found = _select_rows(of_gga, values, drops)
     others = len(sentences) - len(gga.row)
-    own_time_ns = with_date(gga.time_of_day_ns[found.row], found.log_time_ns)
+    own_time_ns = add_date(gga.time_of_day_ns[found.row], found.log_time_ns)
     return Readings(
         gga.row[found.row],
         found.log_time_ns,
@@ -274,13 +278,15 @@ def find_utc_offset(readings: Readings) -> tuple[Finding, ...]:
     if own_time_ns is None or stamps_ns is None or not (known := (own_time_ns > 0) & (stamps_ns > 0)).any():
         return ()
     apart_s = float(np.median(own_time_ns[known] - stamps_ns[known])) / 1e9
-    if abs(apart_s) <= threshold("utc-differs-from-header", "max_offset_s"):
+    if abs(apart_s) <= read_threshold("utc-differs-from-header", "max_offset_s"):
         return ()
     remedies = suggest("header", {"read.time": {"gnss": "header"}})
     return (make_finding("utc-differs-from-header", GNSS, offset_s=apart_s, remedies=remedies),)
 
 
-def _ground_velocity(velocity: Floats, variances: Floats, status: NDArray[Any] | int = -1) -> dict[str, NDArray[Any]]:
+def _make_ground_velocity(
+    velocity: Floats, variances: Floats, status: NDArray[Any] | int = -1
+) -> dict[str, NDArray[Any]]:
     """Return the columns of velocities east, north, up (N, 3) and their variances."""
     axes = ("east", "north", "up")
     return {
@@ -295,7 +301,7 @@ _HELD_COURSE_MPS = 0.3
 _SLOW_STD_MPS = 0.1
 
 
-def _by_course(speed: Floats, course_rad: Floats, var: Floats) -> tuple[Floats, Floats]:
+def _compute_course_velocity(speed: Floats, course_rad: Floats, var: Floats) -> tuple[Floats, Floats]:
     """Return velocities east and north (N, 2) from speed [m/s] and course (clockwise from north), and their variances, (N, 2)."""
     slow = speed < _HELD_COURSE_MPS
     velocity = speed[:, None] * np.column_stack((np.sin(course_rad), np.cos(course_rad)))
@@ -318,12 +324,14 @@ def _read_velocity_sentences(columns: Columns) -> Readings:
         nearest = np.where(before_is_nearer, after - 1, np.minimum(after, gga.row.size - 1))
         near = np.abs(beside_ns[nearest] - at_ns) < _BESIDE_NS
         time_of_day_ns = np.where(near, gga.time_of_day_ns[nearest], -1)
-    over_ground, variances = _by_course(told.speed_mps, told.course_rad, np.full(told.row.size, np.nan))
+    over_ground, variances = _compute_course_velocity(told.speed_mps, told.course_rad, np.full(told.row.size, np.nan))
     unknown = np.full((told.row.size, 1), np.nan)
-    values = _ground_velocity(np.hstack((over_ground, unknown)), np.hstack((variances, unknown)), told.status)
+    values = _make_ground_velocity(np.hstack((over_ground, unknown)), np.hstack((variances, unknown)), told.status)
     drops = {"broken": told.broken, "no_fix": told.status < 0, "not_finite": ~np.isfinite(over_ground.sum(-1))}
-    found = _kept(of_told, values, drops, notes={"course_unknown": int((told.speed_mps < _HELD_COURSE_MPS).sum())})
-    own_time_ns = with_date(time_of_day_ns[found.row], found.log_time_ns)
+    found = _select_rows(
+        of_told, values, drops, notes={"course_unknown": int((told.speed_mps < _HELD_COURSE_MPS).sum())}
+    )
+    own_time_ns = add_date(time_of_day_ns[found.row], found.log_time_ns)
     others = len(texts) - len(told.row)
     dropped = {**({"no_velocity": others} if others else {}), **found.dropped}
     return replace(found, row=told.row[found.row], dropped=dropped, own_time_ns=own_time_ns)
@@ -341,14 +349,14 @@ def _read_gps_fix(columns: Columns) -> Readings:
     std = np.fmax(
         np.where(err_speed > 0, err_speed, np.nan), np.where(err_track > 0, speed * np.radians(err_track), np.nan)
     )
-    over_ground, variances = _by_course(speed, course, (std / _STDS_OF_95) ** 2)
+    over_ground, variances = _compute_course_velocity(speed, course, (std / _STDS_OF_95) ** 2)
     climb_var = np.where(err_climb > 0, (err_climb / _STDS_OF_95) ** 2, np.nan)
     climb = climb if np.any(climb) else np.full_like(climb, np.nan)
     velocity = np.column_stack((over_ground, climb))
     status = columns["status.status"].astype(np.int64) if "status.status" in columns else np.zeros(speed.size, np.int64)
-    values = _ground_velocity(velocity, np.column_stack((variances, climb_var)), np.clip(status, -1, 2))
+    values = _make_ground_velocity(velocity, np.column_stack((variances, climb_var)), np.clip(status, -1, 2))
     drops = {"no_fix": status < 0, "not_finite": ~np.isfinite(over_ground.sum(-1)) | (speed < 0)}
-    return _kept(columns, values, drops)
+    return _select_rows(columns, values, drops)
 
 
 _STDS_OF_95 = 2.0
@@ -359,9 +367,9 @@ def _read_velocity_twist(columns: Columns) -> Readings:
     """Return the linear part as east, north, up, as the drivers of receivers write it; one that has no north is of the body."""
     with_covariance = "twist.twist.linear.x" in columns
     prefix = "twist.twist" if with_covariance else "twist"
-    velocity = _vector(columns, f"{prefix}.linear")
-    variances = _variances(columns, "twist.covariance", 0, 7, 14)
-    unmeasured = _unmeasured(columns, "twist.covariance", np.hstack((velocity, velocity)))[:, :3]
+    velocity = _read_vector(columns, f"{prefix}.linear")
+    variances = _read_variances(columns, "twist.covariance", 0, 7, 14)
+    unmeasured = _find_unmeasured(columns, "twist.covariance", np.hstack((velocity, velocity)))[:, :3]
     if "twist.covariance" in columns:
         first = columns["twist.covariance"][:, 0]
         unmeasured[:, 0] = (first == -1) | (first >= _UNMEASURED_VAR)
@@ -373,25 +381,25 @@ def _read_velocity_twist(columns: Columns) -> Readings:
         "of_the_body": np.full(len(velocity), of_body),
     }
     findings = (make_finding("velocity-not-over-ground", GNSS_VELOCITY),) if of_body else ()
-    return _kept(columns, _ground_velocity(velocity, variances), drops, findings=findings)
+    return _select_rows(columns, _make_ground_velocity(velocity, variances), drops, findings=findings)
 
 
 def _read_imu(columns: Columns) -> Readings:
-    rate = _vector(columns, "angular_velocity")
-    force = _vector(columns, "linear_acceleration")
-    quat, bad = _orientation(columns, "orientation")
+    rate = _read_vector(columns, "angular_velocity")
+    force = _read_vector(columns, "linear_acceleration")
+    quat, bad = _read_orientation(columns, "orientation")
     absent = _is_absent(columns, "orientation_covariance")
     # A driver without a filter fills in one constant orientation; a sensor's own digits never stand still.
     constant = len(quat) > 10 and not absent.any() and bool(np.all(quat == quat[0]))
     quat[absent | constant] = np.nan
     variances = {
-        f"{name}_var": np.mean(_variances(columns, f"{name}_covariance", 0, 4, 8), axis=-1)
+        f"{name}_var": np.mean(_read_variances(columns, f"{name}_covariance", 0, 4, 8), axis=-1)
         for name in ("angular_velocity", "linear_acceleration", "orientation")
     }
     variances["orientation_var"][np.isnan(quat[:, 0])] = np.nan
     values = {
-        **_axes("angular_velocity", "radps", rate),
-        **_axes("linear_acceleration", "mps2", force),
+        **_name_axes("angular_velocity", "radps", rate),
+        **_name_axes("linear_acceleration", "mps2", force),
         **{f"quat_{c}": quat[:, i] for i, c in enumerate("xyzw")},
         **variances,
     }
@@ -405,68 +413,68 @@ def _read_imu(columns: Columns) -> Readings:
         "bad_quaternions": int(np.count_nonzero(bad & ~absent)),
     }
     findings = (make_finding("orientation-constant", Subject("role", "imu")),) if constant else ()
-    return _kept(columns, values, drops, notes=notes, findings=findings)
+    return _select_rows(columns, values, drops, notes=notes, findings=findings)
 
 
 _POSE = ("x_m", "y_m", "z_m", "quat_x", "quat_y", "quat_z", "quat_w")
 
 
-def _body_twist(columns: Columns, prefix: str, covariance: str) -> tuple[dict[str, NDArray[Any]], Floats]:
+def _read_body_twist(columns: Columns, prefix: str, covariance: str) -> tuple[dict[str, NDArray[Any]], Floats]:
     """Return a twist's columns, null where it is not measured, and the twist as it was told, shape (N, 6)."""
-    linear, angular = _vector(columns, f"{prefix}.linear"), _vector(columns, f"{prefix}.angular")
+    linear, angular = _read_vector(columns, f"{prefix}.linear"), _read_vector(columns, f"{prefix}.angular")
     twist = np.concatenate((linear, angular), -1)
-    unmeasured = _unmeasured(columns, covariance, twist)
+    unmeasured = _find_unmeasured(columns, covariance, twist)
     linear, angular = (np.where(unmeasured[:, part], np.nan, twist[:, part]) for part in (slice(3), slice(3, 6)))
-    variances = np.where(unmeasured[:, [0, 1, 2, 5]], np.nan, _variances(columns, covariance, 0, 7, 14, 35))
+    variances = np.where(unmeasured[:, [0, 1, 2, 5]], np.nan, _read_variances(columns, covariance, 0, 7, 14, 35))
     values = {
-        **_axes("velocity", "mps", linear),
-        **_axes("angular_velocity", "radps", angular),
-        **_axes("velocity_var", "m2ps2", variances),
+        **_name_axes("velocity", "mps", linear),
+        **_name_axes("angular_velocity", "radps", angular),
+        **_name_axes("velocity_var", "m2ps2", variances),
         "yaw_rate_var": variances[:, 3],
     }
     return values, twist
 
 
 def _read_odometry(columns: Columns, role: str) -> Readings:
-    values, twist = _body_twist(columns, "twist.twist", "twist.covariance")
-    position = _vector(columns, "pose.pose.position")
-    quat, bad = _orientation(columns, "pose.pose.orientation")
+    values, twist = _read_body_twist(columns, "twist.twist", "twist.covariance")
+    position = _read_vector(columns, "pose.pose.position")
+    quat, bad = _read_orientation(columns, "pose.pose.orientation")
     pose = np.concatenate((position, quat), -1)
     pose[~np.isfinite(pose).all(-1)] = np.nan
     moved_m = float(np.nansum(np.linalg.norm(np.diff(position, axis=0), axis=-1)))
-    empty = not np.any(twist) and moved_m > threshold("twist-zero", "min_moved_m")
+    empty = not np.any(twist) and moved_m > read_threshold("twist-zero", "min_moved_m")
     findings = (make_finding("twist-zero", Subject("role", role), moved_m=moved_m),) if empty else ()
     if empty:
         values = {name: np.full(len(twist), np.nan) for name in values}
     values |= {name: pose[:, i] for i, name in enumerate(_POSE)}
     lost = np.asarray(np.isnan(pose).any(-1) if empty else ~np.isfinite(twist.sum(-1)))
     notes = {"bad_quaternions": int(np.count_nonzero(bad))}
-    return _kept(columns, values, {"not_finite": lost}, notes=notes, findings=findings)
+    return _select_rows(columns, values, {"not_finite": lost}, notes=notes, findings=findings)
 
 
 def _read_twist_stamped(columns: Columns) -> Readings:
     with_covariance = "twist.twist.linear.x" in columns
-    values, twist = _body_twist(columns, "twist.twist" if with_covariance else "twist", "twist.covariance")
+    values, twist = _read_body_twist(columns, "twist.twist" if with_covariance else "twist", "twist.covariance")
     values |= {name: np.full(len(twist), np.nan) for name in _POSE}
-    return _kept(columns, values, {"not_finite": ~np.isfinite(twist.sum(-1))})
+    return _select_rows(columns, values, {"not_finite": ~np.isfinite(twist.sum(-1))})
 
 
 def _read_command(columns: Columns) -> Readings:
     prefix = "twist." if "twist.linear.x" in columns else ""
     forward, yaw_rate = (columns[f"{prefix}{name}"].astype(np.float64) for name in ("linear.x", "angular.z"))
     values: dict[str, NDArray[Any]] = {"forward_velocity_mps": forward, "yaw_rate_radps": yaw_rate}
-    return _kept(columns, values, {"not_finite": ~np.isfinite(forward + yaw_rate)})
+    return _select_rows(columns, values, {"not_finite": ~np.isfinite(forward + yaw_rate)})
 
 
 def _read_pose(columns: Columns) -> Readings:
     prefix = "pose.pose.position" if "pose.pose.position.x" in columns else "pose.position"
-    place, variances = _vector(columns, prefix), _variances(columns, "pose.covariance", 0, 7, 14)
+    place, variances = _read_vector(columns, prefix), _read_variances(columns, "pose.covariance", 0, 7, 14)
     unknown = np.full(len(place), np.nan)
     values: dict[str, NDArray[Any]] = {f"{axis}_m": place[:, i] for i, axis in enumerate("xyz")}
     values |= dict.fromkeys(("lon_deg", "lat_deg", "alt_m"), unknown)
     values |= {f"{axis}_var_m2": variances[:, i] for i, axis in enumerate(("east", "north", "up"))}
     notes = {"without_covariance": int(np.count_nonzero(np.isnan(variances[:, 0])))}
-    return _kept(columns, values, {"not_finite": ~np.isfinite(place.sum(-1))}, notes=notes)
+    return _select_rows(columns, values, {"not_finite": ~np.isfinite(place.sum(-1))}, notes=notes)
 
 
 _READERS: dict[tuple[str, str], Callable[[Columns], Readings]] = {
@@ -492,7 +500,7 @@ _READERS: dict[tuple[str, str], Callable[[Columns], Readings]] = {
 }
 
 
-def _fields_of(*prefixes: str) -> tuple[str, ...]:
+def _expand_field_names(*prefixes: str) -> tuple[str, ...]:
     """Return field names; a prefix that ends with a dot stands for its x, y, z."""
     return tuple(
         name
@@ -501,7 +509,7 @@ def _fields_of(*prefixes: str) -> tuple[str, ...]:
     )
 
 
-def _quat_of(prefix: str) -> tuple[str, ...]:
+def _list_quat_fields(prefix: str) -> tuple[str, ...]:
     return tuple(f"{prefix}.{c}" for c in "xyzw")
 
 
@@ -509,15 +517,19 @@ _FIELDS: dict[str, tuple[str, ...]] = {
     roles.NAV_SAT_FIX: (*_STAMP, "latitude", "longitude", "altitude", "status.status", "position_covariance_type"),
     roles.NMEA_SENTENCE: ("sentence",),
     **dict.fromkeys(roles.GPS_FIXES, (*_STAMP, "speed", "track")),
-    roles.IMU: (*_STAMP, *_fields_of("angular_velocity.", "linear_acceleration."), *_quat_of("orientation")),
+    roles.IMU: (
+        *_STAMP,
+        *_expand_field_names("angular_velocity.", "linear_acceleration."),
+        *_list_quat_fields("orientation"),
+    ),
     roles.ODOMETRY: (
         *_STAMP,
-        *_fields_of("twist.twist.linear.", "twist.twist.angular.", "pose.pose.position."),
-        *_quat_of("pose.pose.orientation"),
+        *_expand_field_names("twist.twist.linear.", "twist.twist.angular.", "pose.pose.position."),
+        *_list_quat_fields("pose.pose.orientation"),
     ),
-    roles.POSE_WITH_COVARIANCE_STAMPED: (*_STAMP, *_fields_of("pose.pose.position.")),
-    roles.POSE_STAMPED: (*_STAMP, *_fields_of("pose.position.")),
-    roles.TWIST: _fields_of("linear.", "angular."),
-    roles.TWIST_STAMPED: (*_STAMP, *_fields_of("twist.linear.", "twist.angular.")),
-    roles.TWIST_WITH_COVARIANCE_STAMPED: (*_STAMP, *_fields_of("twist.twist.linear.", "twist.twist.angular.")),
+    roles.POSE_WITH_COVARIANCE_STAMPED: (*_STAMP, *_expand_field_names("pose.pose.position.")),
+    roles.POSE_STAMPED: (*_STAMP, *_expand_field_names("pose.position.")),
+    roles.TWIST: _expand_field_names("linear.", "angular."),
+    roles.TWIST_STAMPED: (*_STAMP, *_expand_field_names("twist.linear.", "twist.angular.")),
+    roles.TWIST_WITH_COVARIANCE_STAMPED: (*_STAMP, *_expand_field_names("twist.twist.linear.", "twist.twist.angular.")),
 }

@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 
-from tcpipe.logs.topics import normalized_type_name
+from tcpipe.logs.topics import normalize_type_name
 
 BASE_TYPES = frozenset(
     [
@@ -62,11 +62,13 @@ def parse_msg(text: str, type_name: str) -> dict[str, FieldTypes]:
     MsgTextError : a line cannot be read.
     """
     pieces = _SECTION.split(text.replace("\r\n", "\n") + "\n")
-    names = [type_name, *map(normalized_type_name, pieces[1::2])]
-    return {name: _fields(lines, name) for name, lines in zip(reversed(names), reversed(pieces[0::2]), strict=True)}
+    names = [type_name, *map(normalize_type_name, pieces[1::2])]
+    return {
+        name: _parse_fields(lines, name) for name, lines in zip(reversed(names), reversed(pieces[0::2]), strict=True)
+    }
 
 
-def _fields(lines: str, owner: str) -> FieldTypes:
+def _parse_fields(lines: str, owner: str) -> FieldTypes:
     fields = []
     for line in lines.splitlines():
         line = line.strip()  # noqa: PLW2901
@@ -76,15 +78,15 @@ def _fields(lines: str, owner: str) -> FieldTypes:
         if found is None:
             raise MsgTextError(f"{owner}: {line[:60]!r} is no field")
         if not found["rest"].startswith("="):
-            fields.append((found["name"], _field_type(found, owner)))
+            fields.append((found["name"], _parse_field_type(found, owner)))
     return tuple(fields)
 
 
-def _field_type(found: re.Match[str], owner: str) -> FieldType:
+def _parse_field_type(found: re.Match[str], owner: str) -> FieldType:
     name = found["type"]
     if name not in BASE_TYPES:
         name = _KNOWN_AS.get(name, name)
-        name = f"{owner.rsplit('/', 1)[0]}/{name}" if "/" not in name else normalized_type_name(name)
+        name = f"{owner.rsplit('/', 1)[0]}/{name}" if "/" not in name else normalize_type_name(name)
     if found["limit"] and name not in ("string", "wstring"):
         raise MsgTextError(f"{owner}: only texts are bounded, not {name}")
     limit = int(found["limit"] or 0)

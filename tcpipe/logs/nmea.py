@@ -66,7 +66,7 @@ def read_gga(sentences: Sequence[str]) -> Gga:
         found = _GGA.search(sentence)
         if found is None:
             continue
-        fields = _fields(found[1], found[2])
+        fields = _parse_fields(found[1], found[2])
         rows.append(row)
         times.append(-1 if fields is None else fields[0])
         values.append(None if fields is None else fields[1])
@@ -104,7 +104,7 @@ def read_over_ground(sentences: Sequence[str]) -> OverGround:
     """Return the RMC sentences, which have a time, or where there are none the VTG sentences."""
     found = [(row, match) for row, text in enumerate(sentences) if (match := _RMC_OR_VTG.search(text)) is not None]
     kind = "RMC" if any(match[2] == "RMC" for _, match in found) else "VTG"
-    told = [(row, _over_ground(match[1], kind, match[3])) for row, match in found if match[2] == kind]
+    told = [(row, _parse_ground_velocity(match[1], kind, match[3])) for row, match in found if match[2] == kind]
     none = (-1, np.nan, np.nan, -1)
     times, speed, course, status = (
         zip(*(none if fields is None else fields for _, fields in told), strict=True) if told else ((),) * 4
@@ -119,9 +119,9 @@ def read_over_ground(sentences: Sequence[str]) -> OverGround:
     )
 
 
-def _over_ground(body: str, kind: str, checksum: str | None) -> tuple[int, float, float, int] | None:
+def _parse_ground_velocity(body: str, kind: str, checksum: str | None) -> tuple[int, float, float, int] | None:
     """Return time of day [ns], speed [m/s], course [deg] and status; None where the sentence is broken."""
-    if checksum is not None and int(checksum, 16) != _checksum(body):
+    if checksum is not None and int(checksum, 16) != _compute_checksum(body):
         return None
     parts = [part.strip() for part in body.split(",")] + [""] * 3
     try:
@@ -142,30 +142,30 @@ def _number(text: str) -> float:
     return value
 
 
-def _fields(body: str, checksum: str | None) -> tuple[int, tuple[float, ...]] | None:
+def _parse_fields(body: str, checksum: str | None) -> tuple[int, tuple[float, ...]] | None:
     """Return time of day [ns] and lat, lon [deg], quality, hdop, altitude, separation [m]; None where the sentence is broken."""
-    if checksum is not None and int(checksum, 16) != _checksum(body):
+    if checksum is not None and int(checksum, 16) != _compute_checksum(body):
         return None
     parts = body.split(",")
     if len(parts) < 12:
         return None
     try:
-        latitude = _degrees(parts[2], 2) * {"N": 1.0, "S": -1.0, "": np.nan}[parts[3]]
-        longitude = _degrees(parts[4], 3) * {"E": 1.0, "W": -1.0, "": np.nan}[parts[5]]
+        latitude = _parse_degrees(parts[2], 2) * {"N": 1.0, "S": -1.0, "": np.nan}[parts[3]]
+        longitude = _parse_degrees(parts[4], 3) * {"E": 1.0, "W": -1.0, "": np.nan}[parts[5]]
         numbers = [float(text) if text else np.nan for text in (parts[6], parts[8], parts[9], parts[11])]
     except (ValueError, KeyError):
         return None
     return _time_of_day_ns(parts[1]), (latitude, longitude, *numbers)
 
 
-def _checksum(body: str) -> int:
+def _compute_checksum(body: str) -> int:
     total = 0
     for byte in body.encode("utf-8", "replace"):
         total ^= byte
     return total
 
 
-def _degrees(text: str, degree_digits: int) -> float:
+def _parse_degrees(text: str, degree_digits: int) -> float:
     """Return degrees of ``ddmm.mmmm``; NaN for an empty field."""
     return float(text[:degree_digits]) + float(text[degree_digits:]) / 60.0 if text else np.nan
 
@@ -182,7 +182,7 @@ def _time_of_day_ns(text: str) -> int:
     return ((hours * 60 + minutes) * 60 + seconds) * 1_000_000_000 + nanoseconds
 
 
-def with_date(time_of_day_ns: NDArray[np.int64], log_time_ns: NDArray[np.int64]) -> NDArray[np.int64]:
+def add_date(time_of_day_ns: NDArray[np.int64], log_time_ns: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return UTC stamps: each time of day on the day that keeps it nearest to the log's clock, midnight included.
 
     Parameters
@@ -200,11 +200,11 @@ def with_date(time_of_day_ns: NDArray[np.int64], log_time_ns: NDArray[np.int64])
     if not known.any():
         return stamps
     behind = time_of_day_ns[known] - log_time_ns[known] % NS_PER_DAY
-    first = _nearest_to_zero(behind[:1])[0]
-    stamps[known] = log_time_ns[known] + first + _nearest_to_zero(behind - first)
+    first = _wrap_to_zero(behind[:1])[0]
+    stamps[known] = log_time_ns[known] + first + _wrap_to_zero(behind - first)
     return stamps
 
 
-def _nearest_to_zero(offset_ns: NDArray[np.int64]) -> NDArray[np.int64]:
+def _wrap_to_zero(offset_ns: NDArray[np.int64]) -> NDArray[np.int64]:
     wrapped: NDArray[np.int64] = (offset_ns + NS_PER_DAY // 2) % NS_PER_DAY - NS_PER_DAY // 2
     return wrapped

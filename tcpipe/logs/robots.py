@@ -35,9 +35,11 @@ def find_robot(topics: Iterable[Topic], name: str | None, robots: Mapping[str, R
             raise RecipeError(f"robot: no profile is called {name!r}; there are {', '.join(sorted(robots))}")
         return name, "given"
     listed = sorted(topics, key=lambda topic: topic.name)
-    if by_type := _only_one((n, t) for t in listed for n, of in robots.items() if t.type_name in of.status_types):
+    if by_type := _find_only_topic(
+        (n, t) for t in listed for n, of in robots.items() if t.type_name in of.status_types
+    ):
         return by_type[0], f"topic {by_type[1].name} is {by_type[1].type_name}"
-    if by_name := _only_one((n, t) for t in listed for n, of in robots.items() if _is_called(of, t)):
+    if by_name := _find_only_topic((n, t) for t in listed for n, of in robots.items() if _is_called(of, t)):
         return by_name[0], f"topic {by_name[1].name} is called so"
     for topic in listed:
         if topic.type_name == _POWER_OF_ANY_CLEARPATH:
@@ -53,7 +55,7 @@ def _is_called(robot: Robot, topic: Topic) -> bool:
     return bool(words) and re.search(rf"(?<![a-z])({words})(?![a-z])", topic.name.lower()) is not None
 
 
-def _only_one(found: Iterable[tuple[str, Topic]]) -> tuple[str, Topic] | None:
+def _find_only_topic(found: Iterable[tuple[str, Topic]]) -> tuple[str, Topic] | None:
     """Return the first pair if all of them agree on the robot."""
     pairs = list(found)
     return pairs[0] if pairs and len({name for name, _ in pairs}) == 1 else None
@@ -63,7 +65,7 @@ _ENOUGH = 3
 _PLACES = frozenset({"gnss", "wheel_odometry"})
 
 
-def namespaces_of_robots(candidates: Mapping[str, Sequence[str]]) -> dict[str, tuple[str, ...]]:
+def find_robot_namespaces(candidates: Mapping[str, Sequence[str]]) -> dict[str, tuple[str, ...]]:
     """Return the roles that could be played in each robot's namespace, or nothing where one robot explains the topics.
 
     Two namespaces are two robots when three roles or more, GNSS or wheels among them, could be played in either. A camera that brings an
@@ -89,7 +91,7 @@ def namespaces_of_robots(candidates: Mapping[str, Sequence[str]]) -> dict[str, t
     return {name: tuple(role for role in candidates if role in roles_of[name]) for name in sorted(robots)}
 
 
-def which_robot(robots: Mapping[str, Sequence[str]]) -> list[str]:
+def ask_which_robot(robots: Mapping[str, Sequence[str]]) -> list[str]:
     """Return the one question that a log of several robots asks, and the recipe line that answers it."""
     each = "; ".join(f"{name} ({', '.join(roles)})" for name, roles in robots.items())
     first, *others = robots

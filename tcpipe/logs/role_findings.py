@@ -27,10 +27,10 @@ def find_undecodable(topics: Iterable[Topic], types: Collection[str]) -> Iterato
     """Yield a finding for each topic that holds data that cannot be decoded: a warning where its type can be used as a role."""
     for topic in topics:
         if topic.problem is not None and topic.message_count != 0:
-            yield topic_not_decoded(topic, severity="warning" if topic.type_name in types else "note")
+            yield make_topic_not_decoded(topic, severity="warning" if topic.type_name in types else "note")
 
 
-def topic_not_decoded(topic: Topic, *, severity: Severity = "warning") -> Finding:
+def make_topic_not_decoded(topic: Topic, *, severity: Severity = "warning") -> Finding:
     """Return the finding that a topic's messages cannot be decoded."""
     names = {"type": topic.type_name or "?", "encoding": topic.encoding or "?"}
     return make_finding("topic-not-decoded", Subject("topic", topic.name), severity=severity, names=names)

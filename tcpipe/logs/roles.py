@@ -13,10 +13,18 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import TypeVar
 
-from tcpipe.logs.robots import find_robot, namespaces_of_robots, which_robot
+from tcpipe.logs.robots import ask_which_robot, find_robot, find_robot_namespaces
 from tcpipe.logs.role_findings import find_left_out, find_missing_roles, find_undecodable
-from tcpipe.logs.topics import LISTED, Topic, coverage, covering_little, list_undecodable, listing, short_list
-from tcpipe.power.sources import BATTERY_STATE, FLOAT_TYPES, is_corrected, quantity, rail_of
+from tcpipe.logs.topics import (
+    LISTED,
+    Topic,
+    find_short_topics,
+    format_coverage,
+    format_topic_names,
+    format_topics,
+    list_undecodable,
+)
+from tcpipe.power.sources import BATTERY_STATE, FLOAT_TYPES, find_quantity, is_corrected, make_rail_name
 from tcpipe.recipe.suggestions import RecipeFragment, suggest
 from tcpipe.robots.profiles import Profiles
 from tcpipe.tables.findings import Finding, Subject, make_finding
@@ -154,7 +162,7 @@ def assign_roles(
     decided = _Decisions(types, propulsion, known.refusals())
     if namespace is not None and not any(topic.type_name not in TRANSFORMS for topic in listed.values()):
         decided.problems.append(
-            f"recipe read.namespace: no topic lies below {namespace}; the log holds {listing(every.values())}"
+            f"recipe read.namespace: no topic lies below {namespace}; the log holds {format_topics(every.values())}"
         )
     _take_chosen(decided, listed, wanted, mapped)
     taken = {name for role in decided.roles.values() for name in role.topics}
@@ -164,24 +172,24 @@ def assign_roles(
         _let_stand_in(decided, settled, pose_from)
     found = {
         role: candidates
-        for role, candidates in _candidates(decided, free, settled)
+        for role, candidates in _iterate_candidates(decided, free, settled)
         if role not in decided.roles and role not in settled
     }
     poses, velocities = found.pop("pose", []), found.pop("gnss_velocity", [])
-    robots = namespaces_of_robots({role: [topic.name for _, _, topic in ranked] for role, ranked in found.items()})
+    robots = find_robot_namespaces({role: [topic.name for _, _, topic in ranked] for role, ranked in found.items()})
     if robots:
-        decided.problems += which_robot(robots)
+        decided.problems += ask_which_robot(robots)
         decided.undecided |= set(found)
     else:
         for role, candidates in found.items():
             _decide(decided, role, candidates)
     _decide_pose(decided, poses, taken="gnss" in {*decided.roles, *decided.undecided} or "pose" in wanted)
     if "gnss_velocity" not in settled:
-        _decide_velocity(decided, velocities + _sentences(decided, listed.values(), ignored))
+        _decide_velocity(decided, velocities + _collect_nmea_topics(decided, listed.values(), ignored))
     elif "gnss_velocity" in decided.roles and "gnss" not in decided.roles:
         decided.problems.append(f"recipe read.topics.gnss_velocity: {_NO_FIXES}")
     no_motion, proposed = _find_no_motion(decided, list(listed.values()))
-    problems = decided.problems + (no_motion or _questions(decided))
+    problems = decided.problems + (no_motion or _list_questions(decided))
     return RoleAssignment(
         name,
         robot_why,
@@ -218,7 +226,7 @@ def _let_stand_in(decided: _Decisions, settled: dict[str, str], pose_from: Colle
 
 def _decide_pose(decided: _Decisions, candidates: Ranked, *, taken: bool) -> None:
     """Let a pose made elsewhere play, where its name clearly says so, there is one such, and nothing else tells a position."""
-    best = [] if taken else _best("pose", candidates) if candidates else []
+    best = [] if taken else _select_best("pose", candidates) if candidates else []
     for _, why, topic in candidates:
         if [topic] == [of for _, of in best]:
             decided.roles["pose"] = PlayedRole("pose", (topic.name,), topic.type_name, f"{why}, and there is no GNSS")
@@ -236,8 +244,10 @@ _NO_FIXES = "it goes with the fixes of its receiver, and no topic plays gnss"
 def _decide_velocity(decided: _Decisions, candidates: Ranked) -> None:
     """Let the velocity play that comes from the receiver of the fixes; one that nobody can tell to be of it stays out, and is said."""
     fixes = decided.roles["gnss"].topics[0] if "gnss" in decided.roles else ""
-    near = [(rank, why, topic) for rank, why, topic in candidates if _receiver(topic.name) == _receiver(fixes)]
-    best = _best("gnss_velocity", near or candidates) if candidates and fixes else []
+    near = [
+        (rank, why, topic) for rank, why, topic in candidates if _find_receiver(topic.name) == _find_receiver(fixes)
+    ]
+    best = _select_best("gnss_velocity", near or candidates) if candidates and fixes else []
     why = best[0][0] if best else ""
     if len(best) == 1:
         topic = best[0][1]
@@ -255,14 +265,14 @@ def _decide_velocity(decided: _Decisions, candidates: Ranked) -> None:
             decided.pass_over("gnss_velocity", topic, why, reason)
 
 
-def _sentences(decided: _Decisions, topics: Iterable[Topic], ignored: Sequence[str]) -> Ranked:
+def _collect_nmea_topics(decided: _Decisions, topics: Iterable[Topic], ignored: Sequence[str]) -> Ranked:
     """Return the topics of NMEA sentences, which may tell places and velocities at once."""
     rank = (ROLE_TYPES["gnss_velocity"].index(NMEA_SENTENCE),)
     of_type = [topic for topic in topics if topic.type_name == NMEA_SENTENCE]
     return [(rank, "", topic) for topic in of_type if _is_usable(decided, topic, ignored)]
 
 
-def _receiver(name: str) -> str:
+def _find_receiver(name: str) -> str:
     return name.rpartition("/")[0]
 
 
@@ -280,7 +290,7 @@ def _take_chosen(
             decided.undecided.add(role)
             decided.problems.append(
                 f"recipe read.topics.{role} names {', '.join(missing)}, which the log does not hold; "
-                f"it holds {listing(topics.values(), decided.types[role])}"
+                f"it holds {format_topics(topics.values(), decided.types[role])}"
             )
         for name in wanted:
             if topics[name].type_name not in decided.types[role] and role not in mapped:
@@ -297,7 +307,7 @@ def _take_chosen(
 def _is_usable(decided: _Decisions, topic: Topic, ignored: Sequence[str]) -> bool:
     if not any(topic.type_name in types for types in decided.types.values()):
         return False
-    if topic.type_name in FLOAT_TYPES and quantity(topic.name) is None:
+    if topic.type_name in FLOAT_TYPES and find_quantity(topic.name) is None:
         return False
     why = None
     if topic.name in ignored:
@@ -333,20 +343,20 @@ _HUMAN_OR_PLANNER = re.compile(r"joy|teleop|nav|move|interactive|marker|key|web|
 _SIDES = frozenset({"left", "right", "front", "rear", "back", "l", "r", "fl", "fr", "rl", "rr"})
 
 
-def _words(name: str) -> list[str]:
+def _split_words(name: str) -> list[str]:
     return [word for word in re.split(r"[/_\-.]+", name.lower()) if word]
 
 
-def _says(pattern: re.Pattern[str], name: str) -> str | None:
+def _find_role_word(pattern: re.Pattern[str], name: str) -> str | None:
     """Return the first word of a topic's name that the pattern matches from its start."""
-    return next((word for word in _words(name) if pattern.match(word)), None)
+    return next((word for word in _split_words(name) if pattern.match(word)), None)
 
 
 Ranked = list[tuple[tuple[int, ...], str, Topic]]
 """Candidates with their rank (smaller is better) and what speaks for them."""
 
 
-def _candidates(
+def _iterate_candidates(
     decided: _Decisions, topics: Sequence[Topic], settled: Mapping[str, str]
 ) -> Iterable[tuple[str, Ranked]]:
     """Yield each role with its ranked candidates; what can be no candidate is left out with its reason."""
@@ -366,7 +376,7 @@ def _candidates(
         else:
             found[role].append((rank, why, topic))
     if "power" not in settled:
-        found["power"] += _bare_power(decided, bare)
+        found["power"] += _find_bare_power(decided, bare)
     return found.items()
 
 
@@ -374,19 +384,19 @@ Sorted = tuple[str | None, tuple[int, ...], str]
 
 
 def _sort_gnss(topic: Topic) -> Sorted:
-    if word := _says(re.compile(r"filtered|fused|fusion|ekf|ukf|truth"), topic.name):
+    if word := _find_role_word(re.compile(r"filtered|fused|fusion|ekf|ukf|truth"), topic.name):
         return None, (), f"its name ({word}) says that it is another estimator's output"
     return "gnss", (ROLE_TYPES["gnss"].index(topic.type_name),), ""
 
 
 def _sort_gps_fix(topic: Topic) -> Sorted:
-    if word := _says(_FUSED, topic.name):
+    if word := _find_role_word(_FUSED, topic.name):
         return None, (), f"its name ({word}) says that it is another estimator's output"
     return "gnss_velocity", (ROLE_TYPES["gnss_velocity"].index(topic.type_name),), ""
 
 
 def _sort_imu(topic: Topic) -> Sorted:
-    if word := _says(_OTHER_IMU, topic.name):
+    if word := _find_role_word(_OTHER_IMU, topic.name):
         return "imu", (1,), f"its name ({word}) says that it is another device's or made from odometry"
     raw = bool(re.search(r"(^|[/_])raw$", topic.name))
     return "imu", (0, int(raw)), ""
@@ -394,32 +404,32 @@ def _sort_imu(topic: Topic) -> Sorted:
 
 def _sort_odometry(topic: Topic) -> Sorted:
     name = topic.name
-    if topic.type_name == ODOMETRY and _says(_SLAM, name) and not _says(_VISUAL, name):
+    if topic.type_name == ODOMETRY and _find_role_word(_SLAM, name) and not _find_role_word(_VISUAL, name):
         return _sort_pose(topic)
     kind = ROLE_TYPES["wheel_odometry"].index(topic.type_name)
     for pattern, what in _NO_SENSOR:
-        if word := _says(pattern, name):
+        if word := _find_role_word(pattern, name):
             return None, (), f"its name ({word}) says that it is {what}"
-    if word := _says(_VISUAL, name):
+    if word := _find_role_word(_VISUAL, name):
         return "visual_odometry", (kind,), f"its name says {word}"
     explicit = bool(re.search(r"wheel|velocity_controller|platform|encoder|diff_drive|drive_base", name.lower()))
-    if topic.type_name != ODOMETRY and not explicit and not _says(_WHEEL, name):
+    if topic.type_name != ODOMETRY and not explicit and not _find_role_word(_WHEEL, name):
         return None, (), "its name does not say what it measures"
     return "wheel_odometry", (int(not explicit), kind), "its name says wheels" if explicit else ""
 
 
 def _sort_twist(topic: Topic) -> Sorted:
     """Sort a twist without a pose: of a command, of a receiver (over ground), else of an odometry."""
-    name, word = topic.name, _says(_OF_GNSS, topic.name)
-    if topic.type_name == TWIST_STAMPED and _says(_COMMAND, name):
+    name, word = topic.name, _find_role_word(_OF_GNSS, topic.name)
+    if topic.type_name == TWIST_STAMPED and _find_role_word(_COMMAND, name):
         return _sort_command(topic)
-    if word and not _says(_NOT_DOPPLER, name):
+    if word and not _find_role_word(_NOT_DOPPLER, name):
         return "gnss_velocity", (ROLE_TYPES["gnss_velocity"].index(topic.type_name),), f"its name says {word}"
     return _sort_odometry(topic)
 
 
 def _sort_pose(topic: Topic) -> Sorted:
-    if word := _says(_SLAM, topic.name):
+    if word := _find_role_word(_SLAM, topic.name):
         return "pose", (ROLE_TYPES["pose"].index(topic.type_name),), f"its name ({word}) says"
     return (
         None,
@@ -430,12 +440,12 @@ def _sort_pose(topic: Topic) -> Sorted:
 
 def _sort_command(topic: Topic) -> Sorted:
     name = topic.name.lower()
-    if not _says(_COMMAND, name):
+    if not _find_role_word(_COMMAND, name):
         return None, (), "a Twist that is not called a command"
     stamped = ROLE_TYPES["command"].index(topic.type_name)
     if name.endswith("cmd_vel_out"):
         return "command", (0, stamped), "it leaves the controller"
-    if _says(_HUMAN_OR_PLANNER, name):
+    if _find_role_word(_HUMAN_OR_PLANNER, name):
         return "command", (3, stamped), "the only command"
     if re.search(r"controller|platform|base", name):
         return "command", (1, stamped), "it reaches the controller"
@@ -452,21 +462,21 @@ def _sort_power(decided: _Decisions, topic: Topic) -> Sorted:
     if topic.type_name in decided.propulsion:
         return "power", (0, decided.propulsion.index(topic.type_name)), "its type tells propulsion apart"
     if topic.type_name == BATTERY_STATE:
-        return "power", (1 if _says(_DRIVES, topic.name) else 4,), ""
+        return "power", (1 if _find_role_word(_DRIVES, topic.name) else 4,), ""
     return "power", (3,), ""
 
 
-def _bare_power(decided: _Decisions, topics: Iterable[Topic]) -> Ranked:
+def _find_bare_power(decided: _Decisions, topics: Iterable[Topic]) -> Ranked:
     """Return bare numbers that make whole rails: one voltage and one current that are called alike, on drives or batteries."""
     rails: dict[str, list[Topic]] = {}
     for topic in topics:
-        if quantity(topic.name) is not None and re.search(r"drive|motor|traction|batter", topic.name.lower()):
-            rails.setdefault(rail_of(topic.name), []).append(topic)
+        if find_quantity(topic.name) is not None and re.search(r"drive|motor|traction|batter", topic.name.lower()):
+            rails.setdefault(make_rail_name(topic.name), []).append(topic)
     found: Ranked = []
     for parts in rails.values():
-        corrected = {quantity(topic.name) for topic in parts if is_corrected(topic.name)}
-        used = [topic for topic in parts if is_corrected(topic.name) or quantity(topic.name) not in corrected]
-        if sorted(str(quantity(topic.name)) for topic in used) == ["current", "voltage"]:
+        corrected = {find_quantity(topic.name) for topic in parts if is_corrected(topic.name)}
+        used = [topic for topic in parts if is_corrected(topic.name) or find_quantity(topic.name) not in corrected]
+        if sorted(str(find_quantity(topic.name)) for topic in used) == ["current", "voltage"]:
             found += [((2,), "", topic) for topic in used]
             decided.left_out |= {topic.name: "its corrected form is taken" for topic in parts if topic not in used}
     return found
@@ -486,7 +496,7 @@ _SORTERS: dict[str, Callable[[Topic], Sorted]] = {
 def _decide(decided: _Decisions, role: str, candidates: Ranked) -> None:
     if not candidates:
         return
-    first = _best(role, candidates)
+    first = _select_best(role, candidates)
     topics = [topic for _, topic in first]
     names = tuple(topic.name for topic in topics)
     taken = set(names)
@@ -494,18 +504,20 @@ def _decide(decided: _Decisions, role: str, candidates: Ranked) -> None:
     thin = _thin(role, others, topics)
     if len(first) == 1:
         better = "it covers more" if thin and len(thin) == len(others) else "it fits better"
-        better = f"{better} than {short_list(others)}" if others else f"the only {topics[0].type_name}"
+        better = f"{better} than {format_topic_names(others)}" if others else f"the only {topics[0].type_name}"
         why = first[0][0] or better
-    elif role == "power" and _are_sides(rails := _rails(topics)):
+    elif role == "power" and _are_sides(rails := _name_rails(topics)):
         why = f"{len(rails)} sides of one robot, summed" if len(rails) > 1 else "voltage and current on two topics"
     else:
-        decided.ambiguous.append(f"role {role} is ambiguous, {len(first)} topics could play it: {listing(topics)}")
-        decided.recipe_lines.append(_recipe_line(role, names))
+        decided.ambiguous.append(
+            f"role {role} is ambiguous, {len(first)} topics could play it: {format_topics(topics)}"
+        )
+        decided.recipe_lines.append(_format_recipe_line(role, names))
         decided.undecided.add(role)
         return
     decided.roles[role] = PlayedRole(role, names, topics[0].type_name, why)
     winner = " + ".join(names)
-    little = f"it covers little of what {winner} covers ({coverage(topics[0])})"
+    little = f"it covers little of what {winner} covers ({format_coverage(topics[0])})"
     for topic in others:
         if topic.name in thin:
             decided.pass_over(role, topic, little, "covers-little")
@@ -513,7 +525,7 @@ def _decide(decided: _Decisions, role: str, candidates: Ranked) -> None:
             decided.pass_over(role, topic, f"{winner} fits {role} better", "another-fits-better")
 
 
-def _best(role: str, candidates: Ranked) -> list[tuple[str, Topic]]:
+def _select_best(role: str, candidates: Ranked) -> list[tuple[str, Topic]]:
     """Return the candidates of the best rank, each with what speaks for it; those that cover little beside another do not count.
 
     Of power all of a rank are taken, since sides are summed: one that fell silent is still a side.
@@ -526,12 +538,12 @@ def _best(role: str, candidates: Ranked) -> list[tuple[str, Topic]]:
 
 
 def _thin(role: str, topics: Sequence[Topic], rivals: Sequence[Topic]) -> frozenset[str]:
-    return covering_little(topics, rivals, of_power=role == "power")
+    return find_short_topics(topics, rivals, of_power=role == "power")
 
 
-def _rails(topics: Iterable[Topic]) -> tuple[str, ...]:
+def _name_rails(topics: Iterable[Topic]) -> tuple[str, ...]:
     """Return the rails' names: bare numbers share one, other topics are one each."""
-    return tuple(dict.fromkeys(rail_of(t.name) if t.type_name in FLOAT_TYPES else t.name for t in topics))
+    return tuple(dict.fromkeys(make_rail_name(t.name) if t.type_name in FLOAT_TYPES else t.name for t in topics))
 
 
 def _are_sides(names: Sequence[str]) -> bool:
@@ -544,14 +556,14 @@ def _are_sides(names: Sequence[str]) -> bool:
     return len(bare) == 1 and len(sides) == len(names) and () not in sides
 
 
-def _recipe_line(role: str, names: Sequence[str]) -> str:
+def _format_recipe_line(role: str, names: Sequence[str]) -> str:
     others = "".join(f' or ["{name}"]' for name in names[1:])
     summed = f", or several to be summed: [{', '.join(f'{chr(34)}{name}{chr(34)}' for name in names)}]"
     line = RecipeFragment({"read.topics": {role: [names[0]]}}).toml().splitlines()[-1]
     return f"{line}  #{others}{summed if role == 'power' else ''}"
 
 
-def _questions(decided: _Decisions) -> list[str]:
+def _list_questions(decided: _Decisions) -> list[str]:
     head = RecipeFragment({"read.topics": {}}).toml()
     how = ["settle it in the recipe (tcpipe.toml), for example:", head, *decided.recipe_lines]
     return [*decided.ambiguous, *how] if decided.ambiguous else []
@@ -563,7 +575,7 @@ def _find_no_motion(decided: _Decisions, topics: Sequence[Topic]) -> tuple[list[
         return [], []
     findings = []
     lines = ["nothing in the log tells motion: no topic plays wheel_odometry, visual_odometry or gnss"]
-    able = {of.name: _motion_role(of.type_name) for of in topics if of.message_count != 0}
+    able = {of.name: _find_motion_role(of.type_name) for of in topics if of.message_count != 0}
     could = {name: why for name, why in decided.left_out.items() if able.get(name)}
     if could:
         reasons = "; ".join(f"{name} since {why}" for name, why in list(could.items())[:LISTED])
@@ -575,10 +587,10 @@ def _find_no_motion(decided: _Decisions, topics: Sequence[Topic]) -> tuple[list[
             names, remedies = {"role": role, "reason": "name"}, suggest("use", {"read.topics": {role: [name]}})
             subject = Subject("topic", name)
             findings.append(make_finding("topic-left-out", subject, severity="warning", names=names, remedies=remedies))
-    return [*lines, *list_undecodable(topics), f"the log holds {listing(topics)}"], findings
+    return [*lines, *list_undecodable(topics), f"the log holds {format_topics(topics)}"], findings
 
 
-def _motion_role(type_name: str) -> str | None:
+def _find_motion_role(type_name: str) -> str | None:
     return next((role for role in MOTION_ROLES if type_name in ROLE_TYPES[role]), None)
 
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.tables.catalogue import threshold
+from tcpipe.tables.catalogue import read_threshold
 from tcpipe.tables.findings import Finding, Subject, make_finding
 
 Ints = NDArray[np.int64]
@@ -53,7 +53,7 @@ class SimulatedClock:
 
     def find_simulated_time(self) -> tuple[Finding, ...]:
         """Return the finding that durations are those of the simulation; none where the log's own clock is the simulation's."""
-        least = threshold("simulated-time", "min_rate_difference_fraction")
+        least = read_threshold("simulated-time", "min_rate_difference_fraction")
         if abs(self.rate - 1.0) < least and self.log_time_ns[0] < SIMULATED_NS:
             return ()
         names = {"topics": ", ".join(sorted(self.topics))}
@@ -69,7 +69,7 @@ def find_simulated_clock(stamps: Mapping[str, tuple[Ints, Ints]], *, published: 
     published : whether the log holds a /clock topic; without, stamps must be no wall clock's.
     """
     told = {name: (log[header > 0], header[header > 0]) for name, (log, header) in stamps.items() if _is_told(header)}
-    counting = [name for name, (_, header) in told.items() if _counts(header, published=published)]
+    counting = [name for name, (_, header) in told.items() if _is_counting_clock(header, published=published)]
     if not counting or 2 * len(counting) <= len(told):
         return None
     log, clock = max((told[name] for name in counting), key=lambda of: len(of[0]))
@@ -83,7 +83,7 @@ def _is_told(header_ns: Ints) -> bool:
     return known >= _FEWEST and known > _MOST_UNSET * len(header_ns)
 
 
-def _counts(header_ns: Ints, *, published: bool) -> bool:
+def _is_counting_clock(header_ns: Ints, *, published: bool) -> bool:
     """Whether headers count simulated time that runs forward."""
     back = np.maximum.accumulate(header_ns) - header_ns > _BACK_NS
     return bool(np.mean(back) <= _MOST_BACK and (published or np.median(header_ns) < SIMULATED_NS))

@@ -74,7 +74,7 @@ class Damage:
         return f"{self.where}{topic}: {self.what}" + (f" ({', '.join(lost)} lost)" if lost else "")
 
 
-def condensed(damage: Sequence[Damage]) -> list[Damage]:
+def condense_damage(damage: Sequence[Damage]) -> list[Damage]:
     """Return the first thousand findings, and one that sums up the others: a log that is made to be broken has one for some bytes of it."""
     rest = damage[MAX_DAMAGE:]
     if not rest:
@@ -88,7 +88,7 @@ def condensed(damage: Sequence[Damage]) -> list[Damage]:
     return [*damage[:MAX_DAMAGE], Damage(rest[0].where, what, None, None if unknown else lost[0], lost[1] or None)]
 
 
-def normalized_type_name(name: str) -> str:
+def normalize_type_name(name: str) -> str:
     """Return ``package/msg/Name`` for the ROS 1 form ``package/Name``; other forms stay as they are."""
     parts = name.split("/")
     return f"{parts[0]}/msg/{parts[1]}" if len(parts) == 2 else name
@@ -98,17 +98,17 @@ LISTED = 8
 """Of a long list so many are named."""
 
 
-def listing(topics: Iterable[Topic], types: Sequence[str] | None = None) -> str:
+def format_topics(topics: Iterable[Topic], types: Sequence[str] | None = None) -> str:
     """Return topics as ``/name (type, n messages, rate)``, the longest lists cut; those of ``types`` only, where there are any."""
     every = list(topics)
     of_type = [topic for topic in every if types is not None and topic.type_name in types]
     chosen = of_type or every
-    shown = ", ".join(_described(topic) for topic in chosen[:LISTED])
+    shown = ", ".join(_describe_topic(topic) for topic in chosen[:LISTED])
     more = f", and {len(chosen) - LISTED} more" if len(chosen) > LISTED else ""
     return shown + more if chosen else "no topic at all"
 
 
-def _described(topic: Topic) -> str:
+def _describe_topic(topic: Topic) -> str:
     parts = [topic.type_name]
     if topic.message_count is not None:
         parts.append(f"{topic.message_count} messages")
@@ -117,7 +117,7 @@ def _described(topic: Topic) -> str:
     return f"{topic.name} ({', '.join(parts)})"
 
 
-def short_list(topics: Sequence[Topic]) -> str:
+def format_topic_names(topics: Sequence[Topic]) -> str:
     """Return the topics' names, the longest lists cut."""
     shown = ", ".join(topic.name for topic in topics[:LISTED])
     return f"{shown} and {len(topics) - LISTED} more" if len(topics) > LISTED else shown
@@ -130,7 +130,7 @@ def list_undecodable(topics: Iterable[Topic]) -> Iterator[str]:
         if topic.problem is not None and topic.message_count != 0:
             by_reason.setdefault(topic.problem, []).append(topic)
     if by_reason:
-        reasons = "; ".join(f"{short_list(topics)}: {why}" for why, topics in list(by_reason.items())[:LISTED])
+        reasons = "; ".join(f"{format_topic_names(topics)}: {why}" for why, topics in list(by_reason.items())[:LISTED])
         more = f"; {len(by_reason) - LISTED} more reasons" if len(by_reason) > LISTED else ""
         yield f"topics that hold data which cannot be decoded: {reasons}{more}"
 
@@ -144,19 +144,19 @@ _LITTLE_COUNT = 0.01
 """Sensors that could play one role differ in rate, but not a hundredfold: 1 Hz of GNSS against 20 Hz, 10 Hz of odometry against 200 Hz."""
 
 
-def covering_little(topics: Iterable[Topic], rivals: Iterable[Topic], *, of_power: bool = False) -> frozenset[str]:
+def find_short_topics(topics: Iterable[Topic], rivals: Iterable[Topic], *, of_power: bool = False) -> frozenset[str]:
     """Return which topics, by name, cover less than such a share of what a rival covers, or hold less than a hundredth of its messages.
 
     What the index does not tell speaks against nobody.
     """
     listed = list(rivals)
     little_span = _LITTLE_SPAN_OF_POWER if of_power else _LITTLE_SPAN
-    least_s = little_span * max((_covered_s(rival) or 0.0 for rival in listed), default=0.0)
+    least_s = little_span * max((_compute_covered_s(rival) or 0.0 for rival in listed), default=0.0)
     least = _LITTLE_COUNT * max((rival.message_count or 0 for rival in listed), default=0)
     return frozenset(topic.name for topic in topics if _is_little(topic, least_s, least))
 
 
-def silence_ns(spans_ns: Sequence[tuple[int, int]], count: int | None) -> int:
+def compute_silence_ns(spans_ns: Sequence[tuple[int, int]], count: int | None) -> int:
     """Return how long a topic was silent [ns], by the spans (first, last time) of those pieces of a log that hold messages of it.
 
     Silences below 5 s, or below ten of its mean periods, are none.
@@ -171,24 +171,24 @@ def silence_ns(spans_ns: Sequence[tuple[int, int]], count: int | None) -> int:
 
 
 def _is_little(topic: Topic, least_s: float, least: float) -> bool:
-    span_s, count = _covered_s(topic), topic.message_count
+    span_s, count = _compute_covered_s(topic), topic.message_count
     return (span_s is not None and span_s < least_s) or (count is not None and count < least)
 
 
-def coverage(topic: Topic) -> str:
+def format_coverage(topic: Topic) -> str:
     """Return ``658 messages over 65.7 s``, as far as the index tells."""
-    span_s = _span_s(topic)
+    span_s = _compute_span_s(topic)
     count = "some messages" if topic.message_count is None else f"{topic.message_count} messages"
     silent = f", silent for {topic.silent_ns / 1e9:.1f} s of them" if topic.silent_ns else ""
     return count if span_s is None else f"{count} over {span_s:.1f} s{silent}"
 
 
-def _covered_s(topic: Topic) -> float | None:
-    span_s = _span_s(topic)
+def _compute_covered_s(topic: Topic) -> float | None:
+    span_s = _compute_span_s(topic)
     return None if span_s is None else span_s - topic.silent_ns / 1e9
 
 
-def _span_s(topic: Topic) -> float | None:
+def _compute_span_s(topic: Topic) -> float | None:
     if topic.start_ns is None or topic.end_ns is None:
         return None
     return (topic.end_ns - topic.start_ns) / 1e9

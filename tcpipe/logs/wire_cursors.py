@@ -59,14 +59,16 @@ Values = Scalars | Runs | Fields | Lists
 
 
 @dataclass(frozen=True, slots=True)
-class Walked:
+class WalkResult:
     """What a walk found; ``fits`` (N,) says which messages fit their definition: the values are those of these only."""
 
     root: Fields | None
     fits: NDArray[np.bool_]
 
 
-def walk(message: Record, data: NDArray[np.uint8], starts: Int64Array, ends: Int64Array, dialect: Dialect) -> Walked:
+def walk(
+    message: Record, data: NDArray[np.uint8], starts: Int64Array, ends: Int64Array, dialect: Dialect
+) -> WalkResult:
     """Find every field of every message.
 
     Parameters
@@ -87,9 +89,9 @@ def walk(message: Record, data: NDArray[np.uint8], starts: Int64Array, ends: Int
         left = cursors.ends - cursors.positions
         good = cursors.good & (left >= 0) & (left <= dialect.padding)
         if good.all():
-            return Walked(root, fits)
+            return WalkResult(root, fits)
         fits[fits] = good
-    return Walked(None, fits)
+    return WalkResult(None, fits)
 
 
 class _Cursors:
@@ -153,11 +155,11 @@ class _Cursors:
             places.append(starts[longer] + index)
         order = np.empty(int(counts.sum()), np.int64)
         order[np.concatenate(places)] = np.arange(len(order))
-        return _joined(pieces, order)
+        return _join_values(pieces, order)
 
     def regular(self, of: Text | Record, rows: Int64Array, counts: Int64Array) -> Values | None:
         """Step over all elements at once where each takes the same room wherever it stands; None where they do not."""
-        size, alignment = _regular(of, self._dialect.max_alignment)
+        size, alignment = _find_regular_size(of, self._dialect.max_alignment)
         if not size or counts.max(initial=0) < 2:
             return None
         first = self.take(rows, counts * size, np.where(counts > 0, alignment, 1))
@@ -188,7 +190,7 @@ class _Cursors:
         return offsets
 
 
-def _joined(pieces: Sequence[Values], order: Int64Array) -> Values:
+def _join_values(pieces: Sequence[Values], order: Int64Array) -> Values:
     """Concatenate values and put them in order: the n-th is number ``order[n]`` of the concatenation."""
     match pieces[0]:
         case Scalars(dtype=dtype):
@@ -201,23 +203,23 @@ def _joined(pieces: Sequence[Values], order: Int64Array) -> Values:
             return Runs(offsets, lengths, kind)
         case Fields():
             columns = zip(*(p.fields for p in pieces if isinstance(p, Fields)), strict=True)
-            return Fields(len(order), tuple(_joined(column, order) for column in columns))
+            return Fields(len(order), tuple(_join_values(column, order) for column in columns))
         case Lists():
             lists = [p for p in pieces if isinstance(p, Lists)]
             counts = np.concatenate([p.counts for p in lists])
             starts, chosen = np.cumsum(counts) - counts, counts[order]
             within = np.arange(int(chosen.sum())) - np.repeat(np.cumsum(chosen) - chosen, chosen)
-            return Lists(chosen, _joined([p.elements for p in lists], np.repeat(starts[order], chosen) + within))
+            return Lists(chosen, _join_values([p.elements for p in lists], np.repeat(starts[order], chosen) + within))
 
 
-def _regular(of: WireType, max_alignment: int) -> tuple[int, int]:
+def _find_regular_size(of: WireType, max_alignment: int) -> tuple[int, int]:
     """Return size and alignment of a type whose values follow one another without padding between them; (0, 1) for others."""
     match of:
         case Scalar():
             size = np.dtype(of.code).itemsize
             return size, min(size, max_alignment)
         case Record() if of.fields:
-            parts = [_regular(field, max_alignment) for _, field in of.fields]
+            parts = [_find_regular_size(field, max_alignment) for _, field in of.fields]
             alignment = parts[0][1]
             position = 0
             for size, own in parts:
@@ -226,7 +228,7 @@ def _regular(of: WireType, max_alignment: int) -> tuple[int, int]:
                 position += size
             return (position, alignment) if position % alignment == 0 else (0, 1)
         case Array() if of.length:
-            size, alignment = _regular(of.element, max_alignment)
+            size, alignment = _find_regular_size(of.element, max_alignment)
             return size * of.length, alignment
         case _:
             return 0, 1

@@ -1,8 +1,8 @@
 """Where the fields of a message lie: one example is walked, and all messages of the same shape are strided views.
 
 Two messages have the same *shape* when all their string and sequence lengths agree; then every field lies at the same offset in
-both. A definition is therefore walked once on one example (`layout_of`), which notes each length it met; `same_shape` proves for all
-other messages of equal size, by comparing just these lengths, that they have the same layout; `strided` reads a field of all of them at
+both. A definition is therefore walked once on one example (`walk_layout`), which notes each length it met; `has_layout` proves for all
+other messages of equal size, by comparing just these lengths, that they have the same layout; `view_field` reads a field of all of them at
 once. Nothing here touches a message in Python.
 
 Serialisations: ROS 1 (no alignment, little-endian) and CDR as ROS 2 writes it (4 bytes of header, then fields aligned to their
@@ -62,7 +62,7 @@ class Dialect:
 ROS1 = Dialect("<", 0, 1, 0, 0, 0)
 
 
-def dialect_of(payload: bytes, encoding: str) -> Dialect:
+def find_dialect(payload: bytes, encoding: str) -> Dialect:
     """Return the dialect of a message, in CDR by its first bytes; `LayoutError` where these are none of CDR's plain ones.
 
     Parameters
@@ -142,7 +142,7 @@ class Layout:
     length_dtype: np.dtype[np.generic]
 
 
-def layout_of(message: Record, payload: bytes, *, encoding: str) -> Layout:
+def walk_layout(message: Record, payload: bytes, *, encoding: str) -> Layout:
     """Walk one example message.
 
     Parameters
@@ -164,15 +164,15 @@ def layout_of(message: Record, payload: bytes, *, encoding: str) -> Layout:
     return Layout(root, tuple(walk.lengths), np.dtype(walk.dialect.byte_order + "u4"))
 
 
-def same_shape(layout: Layout, payloads: NDArray[np.void]) -> NDArray[np.bool_]:
+def has_layout(layout: Layout, payloads: NDArray[np.void]) -> NDArray[np.bool_]:
     """Return which of the payloads (equal in size) have the layout, shape (N,)."""
     same = np.ones(len(payloads), np.bool_)
     for offset, value in layout.lengths:
-        same &= strided(payloads, offset, layout.length_dtype) == value
+        same &= view_field(payloads, offset, layout.length_dtype) == value
     return same
 
 
-def strided(
+def view_field(
     payloads: NDArray[np.void], offset: int, dtype: np.dtype[np.generic], repeats: tuple[tuple[int, int], ...] = ()
 ) -> NDArray[np.generic]:
     """View one field of all payloads, shape (N, *counts); ``repeats`` are (count, stride in bytes) of enclosing arrays."""
@@ -188,7 +188,7 @@ class _Walk:
         self.payload = payload
         self.lengths: list[tuple[int, int]] = []
         self.nodes = 0
-        self.dialect = dialect_of(payload, encoding)
+        self.dialect = find_dialect(payload, encoding)
         self.position = self.dialect.origin
         self._count = struct.Struct(self.dialect.byte_order + "I")
         if self.dialect.origin:
@@ -239,10 +239,10 @@ class _Walk:
         for _ in range(3):
             elements.append(self.node(of.element))
             ends.append(self.position)
-        first, second, third = (np.array(list(_offsets(element))) for element in elements)
+        first, second, third = (np.array(list(_iterate_offsets(element))) for element in elements)
         strides = np.concatenate([second - first, third - second])
         stride = ends[2] - ends[1]
-        if stride % min(_alignment(of.element), self.dialect.max_alignment) or (strides != stride).any():
+        if stride % min(_find_alignment(of.element), self.dialect.max_alignment) or (strides != stride).any():
             self.position, self.nodes = start, nodes
             return None
         self.position = start
@@ -268,23 +268,23 @@ class _Walk:
         return start
 
 
-def _offsets(node: Node) -> Iterator[int]:
+def _iterate_offsets(node: Node) -> Iterator[int]:
     match node:
         case ScalarAt() | TextAt() | ScalarsAt():
             yield node.offset
         case RecordAt():
             for _, field in node.fields:
-                yield from _offsets(field)
+                yield from _iterate_offsets(field)
         case RepeatAt():
-            for offset in _offsets(node.element):
+            for offset in _iterate_offsets(node.element):
                 yield offset
                 yield offset + node.stride * (node.count - 1)
         case ElementsAt():
             for element in node.elements:
-                yield from _offsets(element)
+                yield from _iterate_offsets(element)
 
 
-def _alignment(of: WireType) -> int:
+def _find_alignment(of: WireType) -> int:
     """Return the largest scalar in the type: elements that start in the same phase of it lie alike."""
     match of:
         case Scalar():
@@ -292,6 +292,6 @@ def _alignment(of: WireType) -> int:
         case Text():
             return 4
         case Record():
-            return max((_alignment(field) for _, field in of.fields), default=1)
+            return max((_find_alignment(field) for _, field in of.fields), default=1)
         case Array():
-            return max(_alignment(of.element), 1 if of.length is not None else 4)
+            return max(_find_alignment(of.element), 1 if of.length is not None else 4)

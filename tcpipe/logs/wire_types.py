@@ -78,31 +78,31 @@ def is_fixed(wire_type: WireType) -> bool:
             return wire_type.length is not None and is_fixed(wire_type.element)
 
 
-def leaf_count(wire_type: WireType) -> int:
+def count_leaves(wire_type: WireType) -> int:
     """Return into how many columns the type unfolds; an array counts its element once."""
     match wire_type:
         case Record():
             return wire_type.leaves
         case Array():
-            return leaf_count(wire_type.element)
+            return count_leaves(wire_type.element)
         case _:
             return 1
 
 
-def fixed_elements(wire_type: WireType) -> int:
+def count_fixed_elements(wire_type: WireType) -> int:
     """Return how many texts and messages the type's fixed arrays hold at least, arrays within arrays multiplied."""
     match wire_type:
         case Record():
-            return sum(fixed_elements(field) for _, field in wire_type.fields)
+            return sum(count_fixed_elements(field) for _, field in wire_type.fields)
         case Array(element=Text() | Record() as element, length=int() as length):
-            return length * max(fixed_elements(element), 1)
+            return length * max(count_fixed_elements(element), 1)
         case Array():
-            return fixed_elements(wire_type.element)
+            return count_fixed_elements(wire_type.element)
         case _:
             return 0
 
 
-def least_bytes(wire_type: WireType, *, empty_bytes: int) -> int:
+def compute_least_bytes(wire_type: WireType, *, empty_bytes: int) -> int:
     """Return how many bytes a value takes at least, alignment aside; a message without fields takes ``empty_bytes``."""
     match wire_type:
         case Scalar():
@@ -112,9 +112,9 @@ def least_bytes(wire_type: WireType, *, empty_bytes: int) -> int:
         case Record():
             if not wire_type.fields:
                 return empty_bytes
-            return sum(least_bytes(of, empty_bytes=empty_bytes) for _, of in wire_type.fields)
+            return sum(compute_least_bytes(of, empty_bytes=empty_bytes) for _, of in wire_type.fields)
         case Array():
-            return (wire_type.length or 0) * least_bytes(wire_type.element, empty_bytes=empty_bytes)
+            return (wire_type.length or 0) * compute_least_bytes(wire_type.element, empty_bytes=empty_bytes)
 
 
 def is_boundless(wire_type: WireType, *, empty_bytes: int) -> bool:
@@ -123,7 +123,9 @@ def is_boundless(wire_type: WireType, *, empty_bytes: int) -> bool:
         case Record():
             return any(is_boundless(of, empty_bytes=empty_bytes) for _, of in wire_type.fields)
         case Array():
-            weightless = wire_type.length is None and not least_bytes(wire_type.element, empty_bytes=empty_bytes)
+            weightless = wire_type.length is None and not compute_least_bytes(
+                wire_type.element, empty_bytes=empty_bytes
+            )
             return weightless or is_boundless(wire_type.element, empty_bytes=empty_bytes)
         case _:
             return False
@@ -131,47 +133,47 @@ def is_boundless(wire_type: WireType, *, empty_bytes: int) -> bool:
 
 def record(name: str, fields: tuple[tuple[str, WireType], ...]) -> Record:
     """Make a record; whether it is fixed and how wide it unfolds follow from its fields."""
-    return Record(name, fields, all(is_fixed(of) for _, of in fields), sum(leaf_count(of) for _, of in fields))
+    return Record(name, fields, all(is_fixed(of) for _, of in fields), sum(count_leaves(of) for _, of in fields))
 
 
-def wide_texts(of: WireType) -> bool:
+def has_wide_texts(of: WireType) -> bool:
     """Return whether there are wide strings in the type."""
     match of:
         case Text():
             return of.wide is not None
         case Record():
-            return any(wide_texts(field) for _, field in of.fields)
+            return any(has_wide_texts(field) for _, field in of.fields)
         case Array():
-            return wide_texts(of.element)
+            return has_wide_texts(of.element)
         case _:
             return False
 
 
-def in_form(of: Record, form: Wide) -> Record:
+def convert_wide_texts(of: Record, form: Wide) -> Record:
     """Return the type with its wide strings in another form."""
-    fields = tuple((name, _in_form(field, form)) for name, field in of.fields)
+    fields = tuple((name, _convert_type(field, form)) for name, field in of.fields)
     return Record(of.name, fields, of.fixed, of.leaves)
 
 
-def _in_form(of: WireType, form: Wide) -> WireType:
+def _convert_type(of: WireType, form: Wide) -> WireType:
     match of:
         case Text(wide=Wide()):
             return Text(form)
         case Record():
-            return in_form(of, form)
+            return convert_wide_texts(of, form)
         case Array(element=Text(wide=Wide())):
             return Array(Text(form), of.length)
         case Array(element=Record() as element):
-            return Array(in_form(element, form), of.length)
+            return Array(convert_wide_texts(element, form), of.length)
         case _:
             return of
 
 
-def flat_fields(of: Record, prefix: str = "") -> Iterator[tuple[str, WireType]]:
+def iterate_flat_fields(of: Record, prefix: str = "") -> Iterator[tuple[str, WireType]]:
     """Yield the columns of a message: nested messages unfold into dotted names, arrays stay whole."""
     for name, wire_type in of.fields:
         if isinstance(wire_type, Record):
-            yield from flat_fields(wire_type, f"{prefix}{name}.")
+            yield from iterate_flat_fields(wire_type, f"{prefix}{name}.")
         else:
             yield prefix + name, wire_type
 
@@ -260,15 +262,15 @@ UNITS: Mapping[str, Mapping[str, str]] = {
 """Unit by message type and field; that of a nested message holds for all its numbers."""
 
 
-def field_units(of: Record) -> dict[str, str]:
+def find_field_units(of: Record) -> dict[str, str]:
     """Return the unit of every number of a message of which it is known, by dotted name; elements of arrays by their array's name.
 
     The outermost type that names a field rules: a ``Vector3`` has no unit of its own, inside a ``Twist`` it has.
     """
-    return dict(_units(of, "", ()))
+    return dict(_iterate_units(of, "", ()))
 
 
-def _units(of: WireType, name: str, within: tuple[tuple[str, str], ...]) -> Iterator[tuple[str, str]]:
+def _iterate_units(of: WireType, name: str, within: tuple[tuple[str, str], ...]) -> Iterator[tuple[str, str]]:
     """Yield (name, unit) below ``name``; ``within`` holds those types around it that have units, and the name inside each."""
     if isinstance(of, Array):
         of = of.element
@@ -277,15 +279,15 @@ def _units(of: WireType, name: str, within: tuple[tuple[str, str], ...]) -> Iter
             around = tuple((kind, f"{path}.{field}") for kind, path in within)
             if of.name in UNITS:
                 around += ((of.name, field),)
-            yield from _units(inner, f"{name}.{field}" if name else field, around)
+            yield from _iterate_units(inner, f"{name}.{field}" if name else field, around)
         return
-    units = (UNITS.get(kind, {}).get(part) for kind, path in within for part in _beginnings(path))
+    units = (UNITS.get(kind, {}).get(part) for kind, path in within for part in _iterate_prefixes(path))
     unit = next((unit for unit in units if unit is not None), None)
     if unit is not None:
         yield name, unit
 
 
-def _beginnings(path: str) -> Iterator[str]:
+def _iterate_prefixes(path: str) -> Iterator[str]:
     """Yield a dotted name and what it begins with, the longest first."""
     parts = path.split(".")
     return (".".join(parts[:count]) for count in range(len(parts), 0, -1))

@@ -9,27 +9,27 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.motion.pieces import (
+from tcpipe.motion.row_sections import (
     Floats,
     Mask,
     MotionRows,
-    dilated,
-    lasting,
+    compute_window_mean,
+    dilate_mask,
+    drop_short_runs,
+    find_piece_bounds,
+    find_runs,
+    fit_slope,
     mask_of,
-    piece_bounds,
-    slope,
-    spans_where,
-    window_mean,
 )
 
 
-def stuck(rows: MotionRows, *, standing_velocity_mps: float, wheel_velocity_above_mps: float) -> Mask:
+def find_stuck(rows: MotionRows, *, standing_velocity_mps: float, wheel_velocity_above_mps: float) -> Mask:
     """Return rows where the wheels turn but the ground speed is that of standing; never where the wheels are unknown."""
     turning_wheels = np.abs(np.nan_to_num(rows.wheel_velocity_mps)) > wheel_velocity_above_mps
     return turning_wheels & (np.abs(rows.velocity_mps) < standing_velocity_mps)
 
 
-def standing(rows: MotionRows, *, below_velocity_mps: float, below_yaw_rate_radps: float) -> Mask:
+def find_stationary(rows: MotionRows, *, below_velocity_mps: float, below_yaw_rate_radps: float) -> Mask:
     """Return rows that move less than both limits, and the slower row of a change of direction that skips them.
 
     At 20 Hz a quick change between forward and backward may jump over the band around zero; the robot stood for an instant all the same.
@@ -42,35 +42,35 @@ def standing(rows: MotionRows, *, below_velocity_mps: float, below_yaw_rate_radp
     return still
 
 
-def turning_in_place(
+def find_turning_in_place(
     rows: MotionRows, *, below_velocity_mps: float, above_yaw_rate_radps: float, min_radius_m: float, min_s: float
 ) -> Mask:
     """Return rows that turn on the spot for at least ``min_s`` [s], or turn tighter than ``min_radius_m`` at any speed."""
     speed, turn = np.abs(rows.velocity_mps), np.abs(rows.yaw_rate_radps)
     spot = (speed < below_velocity_mps) & (turn > above_yaw_rate_radps)
-    return lasting(spot, rows.piece, min_rows=rows.count(min_s)) | (speed < min_radius_m * turn)
+    return drop_short_runs(spot, rows.piece, min_rows=rows.count(min_s)) | (speed < min_radius_m * turn)
 
 
-def reversing(rows: MotionRows, *, standing_velocity_mps: float) -> Mask:
+def find_reversing(rows: MotionRows, *, standing_velocity_mps: float) -> Mask:
     """Return rows driven backwards faster than standing."""
     return rows.velocity_mps < -standing_velocity_mps
 
 
-def forward_acceleration_mps2(rows: MotionRows, *, window_s: float) -> Floats:
+def estimate_forward_acceleration_mps2(rows: MotionRows, *, window_s: float) -> Floats:
     """Return the slope of the forward velocity over a centred window of ``window_s`` [s]: [m/s²], shape (N,)."""
     half = max(1, round((window_s / rows.period_s - 1) / 2))
-    return slope(rows.velocity_mps, rows.piece, half_window=half, period_s=rows.period_s)
+    return fit_slope(rows.velocity_mps, rows.piece, half_window=half, period_s=rows.period_s)
 
 
-def accelerating(
+def find_accelerating(
     rows: MotionRows, acceleration_mps2: Floats, *, above_mps2: float, min_s: float, dilate_s: float
 ) -> Mask:
     """Return rows of lasting acceleration or braking, widened on both sides: what can be told without a command topic."""
-    lasts = lasting(np.abs(acceleration_mps2) > above_mps2, rows.piece, min_rows=rows.count(min_s))
-    return dilated(lasts, rows.piece, before=rows.count(dilate_s), after=rows.count(dilate_s))
+    lasts = drop_short_runs(np.abs(acceleration_mps2) > above_mps2, rows.piece, min_rows=rows.count(min_s))
+    return dilate_mask(lasts, rows.piece, before=rows.count(dilate_s), after=rows.count(dilate_s))
 
 
-def ramps(rows: MotionRows, acceleration_mps2: Floats, halted: Mask, *, above_mps2: float, min_s: float) -> Mask:
+def find_ramps(rows: MotionRows, acceleration_mps2: Floats, halted: Mask, *, above_mps2: float, min_s: float) -> Mask:
     """Return the rows beside halted ones over which the speed still grows after, or already falls before, the halt.
 
     A ramp ends where the speed changes by less than ``above_mps2`` for ``min_s`` [s]. It is marked with and without commands: a robot
@@ -85,50 +85,50 @@ def ramps(rows: MotionRows, acceleration_mps2: Floats, halted: Mask, *, above_mp
     halts = np.concatenate(([0], np.cumsum(halted)))
     found = np.zeros(len(halted), dtype=np.bool_)
     for changes in (speeding_up > above_mps2, speeding_up < -above_mps2):
-        going_on = ~lasting(~(changes | halted), rows.piece, min_rows=rows.count(min_s))
-        spans = spans_where(going_on, rows.piece)
+        going_on = ~drop_short_runs(~(changes | halted), rows.piece, min_rows=rows.count(min_s))
+        spans = find_runs(going_on, rows.piece)
         found |= mask_of(spans[halts[spans[:, 1] + 1] > halts[spans[:, 0]]], len(halted))
     return found & ~halted
 
 
-def command_changed(rows: MotionRows, *, step_mps: float, window_s: float, settle_s: float) -> Mask:
+def find_command_changes(rows: MotionRows, *, step_mps: float, window_s: float, settle_s: float) -> Mask:
     """Return rows from the first to the last moment of each commanded change of speed, and for ``settle_s`` [s] after it.
 
     The mean command over the window ahead of a row is compared with the mean over the window from it on: a step or a ramp of more than
     ``step_mps`` within one window shows at full size. The jitter of a joystick averages out; twice what its scatter leaves in the
     difference of both means is allowed for.
     """
-    part, command = _known_command(rows)
+    part, command = _select_known_command(rows)
     window = max(1, rows.count(window_s))
-    before = window_mean(command, part, before=window, after=-1)
-    after = window_mean(command, part, before=0, after=window - 1)
-    allowed = step_mps + 2.0 * _jitter_of_difference(command, part, window)
+    before = compute_window_mean(command, part, before=window, after=-1)
+    after = compute_window_mean(command, part, before=0, after=window - 1)
+    allowed = step_mps + 2.0 * _estimate_jitter(command, part, window)
     # NaN, where a part begins, is no change.
     changing = np.isfinite(rows.commanded_mps) & (np.abs(after - before) > allowed)
-    _, high = piece_bounds(rows.piece)
+    _, high = find_piece_bounds(rows.piece)
     spans = [
         (first + begin, min(first + end + rows.count(settle_s), high[first]))
-        for first, last in spans_where(changing, part)
-        for begin, end in [_moment(command[first : last + 1], before[first], after[last], step_mps=step_mps)]
+        for first, last in find_runs(changing, part)
+        for begin, end in [_find_moment(command[first : last + 1], before[first], after[last], step_mps=step_mps)]
     ]
     return mask_of(np.array(spans, dtype=np.int64).reshape(-1, 2), len(command))
 
 
-def _jitter_of_difference(command: Floats, part: NDArray[np.int64], window: int) -> Floats:
+def _estimate_jitter(command: Floats, part: NDArray[np.int64], window: int) -> Floats:
     """Return what row-to-row scatter leaves in the difference of the means after and before each row, [m/s], shape (N,)."""
     square = np.concatenate((np.zeros(min(len(command), 1)), 0.5 * np.diff(command) ** 2))
     scatter = np.fmax(
-        np.nan_to_num(window_mean(square, part, before=window - 1, after=-1)),
-        np.nan_to_num(window_mean(square, part, before=-1, after=window - 1)),
+        np.nan_to_num(compute_window_mean(square, part, before=window - 1, after=-1)),
+        np.nan_to_num(compute_window_mean(square, part, before=-1, after=window - 1)),
     )
-    low, high = piece_bounds(part)
+    low, high = find_piece_bounds(part)
     row = np.arange(len(part))
     count_before, count_after = np.clip(row - low, 1, window), np.minimum(high - row + 1, window)
     jitter: Floats = np.sqrt(scatter * (1.0 / count_before + 1.0 / count_after))
     return jitter
 
 
-def _moment(command: Floats, before_mps: float, after_mps: float, *, step_mps: float) -> tuple[int, int]:
+def _find_moment(command: Floats, before_mps: float, after_mps: float, *, step_mps: float) -> tuple[int, int]:
     """Return, among the rows that see a change, the first that has left the old value and the first that stays at the new one."""
     left = np.flatnonzero(np.abs(command - before_mps) > step_mps)
     unreached = np.flatnonzero(np.abs(command - after_mps) > step_mps)
@@ -136,25 +136,25 @@ def _moment(command: Floats, before_mps: float, after_mps: float, *, step_mps: f
     return begin, max(begin, int(unreached[-1]) + 1 if len(unreached) else 0)
 
 
-def below_limit(rows: MotionRows, *, limit_mps: float, window_s: float) -> Mask:
+def find_below_full_speed(rows: MotionRows, *, limit_mps: float, window_s: float) -> Mask:
     """Return rows commanded slower than the limit, by their own command and by the mean around them (a joystick jitters)."""
-    part, command = _known_command(rows)
+    part, command = _select_known_command(rows)
     speed = np.abs(command)
     half = rows.count(window_s / 2)
-    settled = window_mean(speed, part, before=half, after=half)
+    settled = compute_window_mean(speed, part, before=half, after=half)
     return np.isfinite(rows.commanded_mps) & (speed < limit_mps) & (settled < limit_mps)
 
 
-def top_command(
+def find_top_command(
     rows: MotionRows, *, moving_above_mps: float, share_of_top: float, window_s: float
 ) -> tuple[float, float]:
     """Return the speed [m/s] that a moving run was commanded at most (but for a hundredth of the time), and the share of it held there.
 
     A row is held at the top where the mean command around it is at least ``share_of_top`` of it: a joystick jitters. 0, 0 without commands.
     """
-    part, command = _known_command(rows)
+    part, command = _select_known_command(rows)
     half = rows.count(window_s / 2)
-    settled = window_mean(np.abs(command), part, before=half, after=half)
+    settled = compute_window_mean(np.abs(command), part, before=half, after=half)
     moving = np.isfinite(rows.commanded_mps) & (np.abs(rows.velocity_mps) > moving_above_mps)
     if not moving.any():
         return 0.0, 0.0
@@ -162,7 +162,7 @@ def top_command(
     return top, float(np.mean(settled[moving] >= share_of_top * top))
 
 
-def _known_command(rows: MotionRows) -> tuple[NDArray[np.int64], Floats]:
+def _select_known_command(rows: MotionRows) -> tuple[NDArray[np.int64], Floats]:
     """Return pieces that end also where the command becomes known or unknown, and the command with 0 for unknown."""
     known = np.isfinite(rows.commanded_mps)
     broken = (np.diff(rows.piece) != 0) | (np.diff(known.astype(np.int8)) != 0)

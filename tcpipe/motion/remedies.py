@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
-from tcpipe.tables.catalogue import threshold
+from tcpipe.tables.catalogue import read_threshold
 from tcpipe.tables.findings import Finding, Subject, make_finding
 
 KEPT = "kept"
@@ -15,7 +15,7 @@ _MOST_LOSSES = 10
 _WORTH_M = 0.05
 
 
-def loss_code(reason: str) -> str:
+def make_loss_code(reason: str) -> str:
     """Return the code of the finding on metres that were lost for a reason, as ``below_limit``."""
     return f"lost-{reason.replace('_', '-')}"
 
@@ -23,12 +23,12 @@ def loss_code(reason: str) -> str:
 def find_losses(breakdown_m: Mapping[str, float], subject: Subject) -> list[Finding]:
     """Return the findings on losses of more than a twentieth of the distance [m], the largest first; none of a robot that did not move."""
     total_m = sum(breakdown_m.values())
-    if total_m < threshold("no-segments", "min_driven_m"):
+    if total_m < read_threshold("no-segments", "min_driven_m"):
         return []
-    least_m = threshold("lost-gap", "min_lost_fraction") * total_m
+    least_m = read_threshold("lost-gap", "min_lost_fraction") * total_m
     lost = sorted(breakdown_m.items(), key=lambda item: -item[1])
     return [
-        make_finding(loss_code(reason), subject, lost_m=lost_m, lost_fraction=lost_m / total_m)
+        make_finding(make_loss_code(reason), subject, lost_m=lost_m, lost_fraction=lost_m / total_m)
         for reason, lost_m in lost
         if reason != KEPT and lost_m > least_m
     ]
@@ -46,7 +46,7 @@ class StoreLoss:
     """Runs that lost metres so."""
 
 
-def losses_of(ledgers_m: Iterable[Mapping[str, float]]) -> tuple[StoreLoss, ...]:
+def find_largest_losses(ledgers_m: Iterable[Mapping[str, float]]) -> tuple[StoreLoss, ...]:
     """Return the ten largest losses of runs, by their ledgers [m], the largest first."""
     metres, of_runs = Counter[str](), Counter[str]()
     for ledger_m in ledgers_m:

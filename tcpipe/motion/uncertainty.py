@@ -1,8 +1,8 @@
 """How far two estimated positions may be wrong *against each other*: what a cost per metre suffers from.
 
 The absolute error of an RTK or dead-reckoned position is nearly the same at both ends of a metre and cancels. How nearly a smoother
-knows exactly, and tells for some durations (`between_durations_m`). Elsewhere, as at the end of a track and in a forward filter, it follows
-from what a track states of every row.
+knows exactly, and states for some durations (`interpolate_durations_m`). Elsewhere, as at the end of a track and in a forward filter,
+it follows from what a track states of every row.
 Over a short time the error of the displacement is that of the velocity, sigma_v T; over a long time it is that of two independent
 positions, hypot(sigma_1, sigma_2). A position error that is correlated in time like 1 / (1 + t² / (2 tau²)), with
 tau = sigma_position / sigma_velocity as both variances demand, gives in between::
@@ -19,10 +19,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from tcpipe.motion.pieces import Floats, MotionRows, piece_bounds
+from tcpipe.motion.row_sections import Floats, MotionRows, find_piece_bounds
 
 
-def displacement_std_m(
+def compute_displacement_std_m(
     *, velocity_std_mps: Floats, duration_s: Floats, start_std_m: Floats, end_std_m: Floats, smoothed: bool
 ) -> Floats:
     """Return the standard deviation of the displacement between two estimated positions, [m], shape (M,).
@@ -43,7 +43,7 @@ def displacement_std_m(
     return result
 
 
-def between_durations_m(duration_s: Floats, *, told_s: Sequence[float], told_std_m: Floats) -> Floats:
+def interpolate_durations_m(duration_s: Floats, *, told_s: Sequence[float], told_std_m: Floats) -> Floats:
     """Return the displacement error over each duration from what is told for some, [m], shape (M,); NaN where that is not told.
 
     Between two durations it is taken as a power of time, below the shortest as that of a constant velocity error.
@@ -65,7 +65,7 @@ def between_durations_m(duration_s: Floats, *, told_s: Sequence[float], told_std
     return np.where(duration_s <= known[-1], std_m, np.nan)
 
 
-def along_std_m(east_std_m: Floats, north_std_m: Floats, course_rad: Floats) -> Floats:
+def compute_along_std_m(east_std_m: Floats, north_std_m: Floats, course_rad: Floats) -> Floats:
     """Return the position standard deviation along a course from those along east and north, [m], shape (M,).
 
     The correlation of east and north is not in a track; it is taken as zero.
@@ -73,7 +73,7 @@ def along_std_m(east_std_m: Floats, north_std_m: Floats, course_rad: Floats) -> 
     return np.hypot(east_std_m * np.cos(course_rad), north_std_m * np.sin(course_rad))
 
 
-def chord_ahead_std_m(
+def compute_chord_ahead_std_m(
     rows: MotionRows,
     *,
     velocity_std_mps: Floats,
@@ -86,7 +86,7 @@ def chord_ahead_std_m(
 ) -> Floats:
     """Return for each row the displacement error over the next chord at the row's speed, [m], shape (N,).
 
-    As the smoother tells it (`between_durations_m`), elsewhere as the row's deviations allow (`displacement_std_m`).
+    As the smoother tells it (`interpolate_durations_m`), elsewhere as the row's deviations allow (`compute_displacement_std_m`).
 
     Parameters
     ----------
@@ -96,12 +96,12 @@ def chord_ahead_std_m(
     slowest_mps : [m/s], rows slower than this are taken as this fast.
     told_s, told_std_m : [s], L durations, and [m], shape (N, L), the displacement error over them, NaN where it is not told.
     """
-    _, high = piece_bounds(rows.piece)
+    _, high = find_piece_bounds(rows.piece)
     duration_s = chord_m / np.maximum(np.abs(rows.velocity_mps), slowest_mps)
     row = np.arange(len(duration_s))
     end = np.minimum(row + np.ceil(duration_s / rows.period_s).astype(np.int64), high)
-    told = between_durations_m(duration_s, told_s=told_s, told_std_m=told_std_m)
-    modelled = displacement_std_m(
+    told = interpolate_durations_m(duration_s, told_s=told_s, told_std_m=told_std_m)
+    modelled = compute_displacement_std_m(
         velocity_std_mps=velocity_std_mps,
         duration_s=duration_s,
         start_std_m=position_std_m,

@@ -21,7 +21,7 @@ _RINGS_S = 1.0 / LOW_HZ  # so far from a gap the filter still tells of it
 _NS = 1e-9
 
 
-def vibration_mps2(stamp_ns: Stamps, specific_force_mps2: Floats, start_ns: Stamps, end_ns: Stamps) -> Floats:
+def compute_vibration_mps2(stamp_ns: Stamps, specific_force_mps2: Floats, start_ns: Stamps, end_ns: Stamps) -> Floats:
     """Return the root mean square over each span of the band-passed specific force, its axes together, [m/s²], shape (M,).
 
     NaN where the sensor is slower than 50 Hz, has a gap of more than three periods in the span or near it, or does not reach over it.
@@ -42,16 +42,16 @@ def vibration_mps2(stamp_ns: Stamps, specific_force_mps2: Floats, start_ns: Stam
     if 1.0 / period_s < _RATE_TOLERANCE * LEAST_RATE_HZ:
         return unknown
     mean = specific_force_mps2.mean(axis=0)
-    square = sum(_band_passed(axis - of, period_s) ** 2 for axis, of in zip(specific_force_mps2.T, mean, strict=True))
+    square = sum(_filter_band(axis - of, period_s) ** 2 for axis, of in zip(specific_force_mps2.T, mean, strict=True))
     total = np.concatenate(([0.0], np.cumsum(square)))
     begin, end = (np.searchsorted(stamp_ns, at_ns, side="right") for at_ns in (start_ns, end_ns))
     mean_square = np.divide(total[end] - total[begin], end - begin, out=unknown.copy(), where=end > begin)
-    known = _without_gap(stamp_ns, start_ns, end_ns, longest_s=_GAP_PERIODS * period_s)
+    known = _is_without_gap(stamp_ns, start_ns, end_ns, longest_s=_GAP_PERIODS * period_s)
     rms: Floats = np.sqrt(np.where(known, np.maximum(mean_square, 0.0), np.nan))
     return rms
 
 
-def _band_passed(values: Floats, period_s: float) -> Floats:
+def _filter_band(values: Floats, period_s: float) -> Floats:
     """Return what of regularly sampled values, shape (N,), lies in the band."""
     spectrum = np.fft.rfft(values)
     frequency_hz = np.fft.rfftfreq(len(values), period_s)[1:]
@@ -62,7 +62,7 @@ def _band_passed(values: Floats, period_s: float) -> Floats:
     return passed
 
 
-def _without_gap(stamp_ns: Stamps, start_ns: Stamps, end_ns: Stamps, *, longest_s: float) -> NDArray[np.bool_]:
+def _is_without_gap(stamp_ns: Stamps, start_ns: Stamps, end_ns: Stamps, *, longest_s: float) -> NDArray[np.bool_]:
     """Return the spans over which, and around which, samples follow one another."""
     gaps = np.concatenate(([0], np.cumsum(np.diff(stamp_ns) * _NS > longest_s)))
     last, near_ns = len(stamp_ns) - 1, round(_RINGS_S / _NS)

@@ -71,9 +71,9 @@ def cut_by_chord(path: Polyline, *, chord_m: float, max_arc_to_chord: float) -> 
         else:
             curved.append((start, following))
         start = following
-    spans = _spans(kept)
-    return Cut(spans[:, 0], spans[:, 1], _spans(curved), _spans([(start, last)] if start < last else []))
+    spans = _find_spans(kept)
+    return Cut(spans[:, 0], spans[:, 1], _find_spans(curved), _find_spans([(start, last)] if start < last else []))
 
 
-def _spans(pairs: list[tuple[int, int]]) -> NDArray[np.int64]:
+def _find_spans(pairs: list[tuple[int, int]]) -> NDArray[np.int64]:
     return np.array(pairs, dtype=np.int64).reshape(-1, 2)

@@ -13,7 +13,7 @@ from typing import Literal
 from tcpipe import __version__
 from tcpipe.errors import StoreError
 from tcpipe.formats.commits import Begun, Entries, Kind, Problem, State
-from tcpipe.formats.json_files import digest, recast
+from tcpipe.formats.json_files import convert_record, digest
 from tcpipe.pipeline.log_writer import LogWriter, is_alive
 from tcpipe.tables.findings import Remedy, Subject, make_finding
 
@@ -57,7 +57,7 @@ class OpenCall:
 
 
 @contextmanager
-def begun_call(log: LogWriter, command: str, works_on: Sequence[str], *, options: object = None) -> Iterator[OpenCall]:
+def commit_call(log: LogWriter, command: str, works_on: Sequence[str], *, options: object = None) -> Iterator[OpenCall]:
     """Commit that a call begins, and in the end that it ended; one that is killed, or ended by a signal, has no end.
 
     When it ends well, calls that were to do the same, and do not run, end with it. A store that cannot be written goes without.
@@ -69,8 +69,8 @@ def begun_call(log: LogWriter, command: str, works_on: Sequence[str], *, options
     works_on : logs and folders, or the dataset, in full.
     options : what else distinguishes its work from that of another call.
     """
-    call, opened, begun = new_call(command, works_on, options), OpenCall(), list[int]()
-    done = settled_calls(log.state, call)
+    call, opened, begun = make_call(command, works_on, options), OpenCall(), list[int]()
+    done = find_settled_calls(log.state, call)
     try:
         log.commit("begun", Entries(begun=(call,)))
         begun = [log.state.number]
@@ -91,14 +91,14 @@ def _end(log: LogWriter, kind: Kind, entries: Entries) -> None:
         logger.warning("%s: so the store does not know how this call ended", error.problems[0])
 
 
-def new_call(command: str, works_on: Sequence[str], options: object = None) -> Begun:
+def make_call(command: str, works_on: Sequence[str], options: object = None) -> Begun:
     """Return what a commit has of a call that begins."""
     return Begun(command, __version__, tuple(works_on), digest(options)[:_DIGITS])
 
 
-def settled_calls(state: State, call: Begun) -> list[int]:
+def find_settled_calls(state: State, call: Begun) -> list[int]:
     """Return the numbers of the calls that do not run and whose work another call does."""
-    return [of.number for of in begun_calls(state) if of.state != "running" and _is_done_by(of, call)]
+    return [of.number for of in list_begun_calls(state) if of.state != "running" and _is_done_by(of, call)]
 
 
 def _is_done_by(call: Begun, other: Begun) -> bool:
@@ -112,10 +112,10 @@ def is_below(entry: str, folders: Sequence[str]) -> bool:
     return any(entry == folder or entry.startswith(f"{folder.rstrip('/')}/") for folder in folders)
 
 
-def begun_calls(state: State) -> list[BegunCall]:
+def list_begun_calls(state: State) -> list[BegunCall]:
     """Return the calls that have begun and not ended, by when they began."""
     return [
-        recast(call, BegunCall, name=f"call-{number}", state=_find_state(call))
+        convert_record(call, BegunCall, name=f"call-{number}", state=_find_state(call))
         for number, call in sorted(state.begun.items())
     ]
 

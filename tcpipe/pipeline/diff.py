@@ -11,13 +11,13 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
-from tcpipe.errors import plain_lines
+from tcpipe.errors import clean_lines
 from tcpipe.formats.bucket_directories import fetch_directory
 from tcpipe.formats.dataset_card import DatasetCard, MapSource, RunSource
-from tcpipe.formats.dataset_files import open_patches, read_card, read_samples, rows_in_files, sample_columns
+from tcpipe.formats.dataset_files import find_rows_in_files, open_patches, read_card, read_samples, sample_columns
 from tcpipe.formats.finding_lines import format_findings
-from tcpipe.formats.json_files import plain
-from tcpipe.pipeline.explain import flat_recipe
+from tcpipe.formats.json_files import to_plain
+from tcpipe.pipeline.explain import flatten_recipe
 from tcpipe.splits.assignment import SPLITS
 from tcpipe.tables.findings import Finding, Subject
 
@@ -56,7 +56,7 @@ class Difference:
 
     def __str__(self) -> str:
         """Return causes and effects as plain lines."""
-        return plain_lines(_lines(self))
+        return clean_lines(_iterate_lines(self))
 
 
 _CHANGES = ("only in a", "only in b", "other labels", "other columns", "other patches", "other fold")
@@ -83,18 +83,20 @@ def diff(a: str | Path, b: str | Path) -> Difference:
         "only in a": tables[0].num_rows - len(in_a),
         "only in b": tables[1].num_rows - len(in_a),
         "in both": len(in_a),
-        "other labels": _other(both, [name for name in shared if name in _LABELLED]),
-        "other columns": _other(both, [name for name in shared if name not in (*_LABELLED, *_DRAWN)]),
-        "other patches": _other_patches((first, second), cards, tables, in_a, in_b),
-        "other fold": _other(both, [name for name in shared if name == "fold"]),
+        "other labels": _count_differing(both, [name for name in shared if name in _LABELLED]),
+        "other columns": _count_differing(both, [name for name in shared if name not in (*_LABELLED, *_DRAWN)]),
+        "other patches": _count_differing_patches((first, second), cards, tables, in_a, in_b),
+        "other fold": _count_differing(both, [name for name in shared if name == "fold"]),
     }
-    moved = _moved(tables[0].column("split").to_numpy()[in_a], tables[1].column("split").to_numpy()[in_b])
+    moved = _count_moved(tables[0].column("split").to_numpy()[in_a], tables[1].column("split").to_numpy()[in_b])
     train = [table.filter(pc.equal(table.column("split"), "train")) for table in tables]
-    causes = tuple(_causes(*cards))
+    causes = tuple(_iterate_causes(*cards))
     (ours, theirs) = (_find_all(card) for card in cards)
     gone, new = (tuple(of[key] for key in of if key not in other) for of, other in ((ours, theirs), (theirs, ours)))
     same = not (causes or moved or gone or new or any(counts[name] for name in _CHANGES))
-    return Difference(str(a), str(b), causes, counts, moved, _shifts(tables), _shifts(train), gone, new, same)
+    return Difference(
+        str(a), str(b), causes, counts, moved, _compute_shifts(tables), _compute_shifts(train), gone, new, same
+    )
 
 
 def _find_all(card: DatasetCard) -> dict[tuple[str, str, Subject], Finding]:
@@ -103,19 +105,19 @@ def _find_all(card: DatasetCard) -> dict[tuple[str, str, Subject], Finding]:
     return {(where, of.code, of.subject): of for where, findings in every for of in findings}
 
 
-def _shifts(tables: Sequence[pa.Table]) -> dict[str, dict[str, float]]:
-    found: dict[str, dict[str, float]] = plain(
-        {name: _shift(*(_values(table, name) for table in tables)) for name in _LABELS}
+def _compute_shifts(tables: Sequence[pa.Table]) -> dict[str, dict[str, float]]:
+    found: dict[str, dict[str, float]] = to_plain(
+        {name: _shift(*(_read_values(table, name) for table in tables)) for name in _LABELS}
     )
     return found
 
 
-def _values(table: pa.Table, name: str) -> NDArray[np.float64]:
+def _read_values(table: pa.Table, name: str) -> NDArray[np.float64]:
     values: NDArray[np.float64] = table.column(name).to_numpy().astype(np.float64)
     return values
 
 
-def _other(both: Sequence[tuple[Path, Ints]], names: Sequence[str]) -> int:
+def _count_differing(both: Sequence[tuple[Path, Ints]], names: Sequence[str]) -> int:
     """Return how many of the given rows of two datasets differ in any of the columns; what is missing in both is the same."""
     other = np.zeros(len(both[0][1]), np.bool_)
     for name in names:  # one at a time: a large dataset has gigabytes of them
@@ -125,7 +127,7 @@ def _other(both: Sequence[tuple[Path, Ints]], names: Sequence[str]) -> int:
     return int(other.sum())
 
 
-def _other_patches(
+def _count_differing_patches(
     directories: tuple[Path, Path],
     cards: tuple[DatasetCard, DatasetCard],
     tables: Sequence[pa.Table],
@@ -136,12 +138,12 @@ def _other_patches(
     if set(cards[0].layers) != set(cards[1].layers) or cards[0].patch_px != cards[1].patch_px:
         return len(in_a)
     ours, theirs = (
-        _hashes(directory, card, table) for directory, card, table in zip(directories, cards, tables, strict=True)
+        _hash_patches(directory, card, table) for directory, card, table in zip(directories, cards, tables, strict=True)
     )
     return int((ours[in_a] != theirs[in_b]).sum())
 
 
-def _hashes(directory: Path, card: DatasetCard, table: pa.Table) -> NDArray[np.int64]:
+def _hash_patches(directory: Path, card: DatasetCard, table: pa.Table) -> NDArray[np.int64]:
     """Return a hash of every patch, in the order of the samples: equal pixels, equal hashes."""
     files = open_patches(directory, card)
     split = table.column("split").to_numpy()
@@ -154,12 +156,12 @@ def _hashes(directory: Path, card: DatasetCard, table: pa.Table) -> NDArray[np.i
             hash(b"".join(part.tobytes() for part in parts)) for parts in zip(*flat, strict=True)
         ]
     out = np.empty_like(found)
-    for name, rows in rows_in_files(card, split).items():
+    for name, rows in find_rows_in_files(card, split).items():
         out[split == name] = found[rows]
     return out
 
 
-def _moved(ours: NDArray[np.object_], theirs: NDArray[np.object_]) -> dict[str, int]:
+def _count_moved(ours: NDArray[np.object_], theirs: NDArray[np.object_]) -> dict[str, int]:
     moves = {f"{a} to {b}": int(((ours == a) & (theirs == b)).sum()) for a in SPLITS for b in SPLITS if a != b}
     return {name: count for name, count in moves.items() if count}
 
@@ -179,22 +181,22 @@ def _shift(ours: NDArray[np.float64], theirs: NDArray[np.float64]) -> dict[str, 
     }
 
 
-def _causes(a: DatasetCard, b: DatasetCard) -> Iterator[str]:
+def _iterate_causes(a: DatasetCard, b: DatasetCard) -> Iterator[str]:
     """Yield a line for everything that the two are made from differently."""
     for name in _VERSIONS:
         was, now = getattr(a, name), getattr(b, name)
         if was != now:
             yield f"code: {name} {was} → {now}"
-    ours, theirs = flat_recipe(a.recipe), flat_recipe(b.recipe)
+    ours, theirs = flatten_recipe(a.recipe), flatten_recipe(b.recipe)
     for key in sorted({*ours, *theirs}):
         if ours.get(key) != theirs.get(key):
-            yield f"recipe: {key} {_shown(ours.get(key))} → {_shown(theirs.get(key))}"
+            yield f"recipe: {key} {_format_value(ours.get(key))} → {_format_value(theirs.get(key))}"
     yield from _run_causes({run.run_id: run for run in a.runs}, {run.run_id: run for run in b.runs})
     yield from _map_causes({entry.name: entry for entry in a.maps}, {entry.name: entry for entry in b.maps})
     if a.split.region != b.split.region:
         yield f"region: {'added' if a.split.region is None else 'removed' if b.split.region is None else 'another one'}"
     if a.split.kept != b.split.kept:
-        yield f"kept split: {_shown(plain(a.split.kept))} → {_shown(plain(b.split.kept))}"
+        yield f"kept split: {_format_value(to_plain(a.split.kept))} → {_format_value(to_plain(b.split.kept))}"
     if a.format != b.format:
         yield f"format: {a.format} → {b.format}"
 
@@ -221,16 +223,16 @@ def _map_causes(a: Mapping[str, MapSource], b: Mapping[str, MapSource]) -> Itera
 def _map_changes(a: MapSource, b: MapSource) -> Iterator[str]:
     for key in ("crs", "pitch_m", "rows", "cols", "sources"):
         if getattr(a, key) != getattr(b, key):
-            yield f"{key} {_shown(getattr(a, key))} → {_shown(getattr(b, key))}"
+            yield f"{key} {_format_value(getattr(a, key))} → {_format_value(getattr(b, key))}"
     ours, theirs = ({} if entry.inputs is None else entry.inputs.files for entry in (a, b))
     yield from (f"another {role} file" for role in sorted({*ours, *theirs}) if ours.get(role) != theirs.get(role))
 
 
-def _shown(value: object) -> str:
+def _format_value(value: object) -> str:
     return "none" if value is None else str(value)
 
 
-def _lines(found: Difference) -> Iterator[str]:
+def _iterate_lines(found: Difference) -> Iterator[str]:
     if found.same:
         yield f"{found.a} and {found.b}: the same {found.samples['in both']} samples, made from the same"
         return

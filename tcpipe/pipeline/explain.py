@@ -14,20 +14,20 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from tcpipe import __version__
-from tcpipe.errors import DatasetError, StoreError, TcpipeError, plain_lines
+from tcpipe.errors import DatasetError, StoreError, TcpipeError, clean_lines
 from tcpipe.formats.bucket_directories import fetch_directory_by_range
 from tcpipe.formats.dataset_card import DatasetCard
 from tcpipe.formats.dataset_files import (
     SAMPLES,
     PatchFiles,
+    find_rows_in_files,
     is_shard,
     open_patches,
     read_current_card,
     read_samples,
-    rows_in_files,
     sample_columns,
 )
-from tcpipe.formats.json_files import plain, recast
+from tcpipe.formats.json_files import convert_record, to_plain
 from tcpipe.formats.maps.map_facts import MapInputs
 from tcpipe.formats.maps.map_files import MapFile, open_map
 from tcpipe.formats.parquet import ROWS_PER_GROUP, read_row_group
@@ -37,8 +37,8 @@ from tcpipe.pipeline.run_stages import run_stages
 from tcpipe.recipe import Recipe
 from tcpipe.stages.sample import Sampled, sample_segments
 from tcpipe.store import Store, open_store
-from tcpipe.tables.bits import DropReason, Quality, names_of
-from tcpipe.tables.columns import integers
+from tcpipe.tables.bits import DropReason, Quality, flag_names
+from tcpipe.tables.columns import to_integers
 from tcpipe.tables.levels import PLACED_SEGMENTS, Streams
 from tcpipe.tables.segment_columns import GEOMETRY
 from tcpipe.terrain.sampling import Patches
@@ -147,7 +147,7 @@ class Explained:
 
     def __str__(self) -> str:
         """Return the history as plain lines."""
-        return plain_lines(tuple(_lines(self.sample_id, self.facts, self.differences)))
+        return clean_lines(tuple(_iterate_lines(self.sample_id, self.facts, self.differences)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -185,28 +185,28 @@ def explain(sample_id: str, *, dataset: str | Path = "dataset", store: str | Pat
     run = _run(opened, directory, card, sample)
     streams = opened.read_streams(run.run_id, key=run.streams_key)
     source = open_map(*opened.map_files(sample.map))
-    made = _made_again(sample, run, streams, source, card.recipe)
-    differences = tuple(_differences(open_patches(directory, card, fetched), card, sample, made))
+    made = _sample_again(sample, run, streams, source, card.recipe)
+    differences = tuple(_iterate_differences(open_patches(directory, card, fetched), card, sample, made))
     if differences:
-        differences += tuple(_reasons(card, sample, run, source))
-    return Explained(sample_id, _history(opened, card, sample, run, streams=streams, source=source), differences)
+        differences += tuple(_iterate_reasons(card, sample, run, source))
+    return Explained(sample_id, _read_history(opened, card, sample, run, streams=streams, source=source), differences)
 
 
-def _history(
+def _read_history(
     store: Store, card: DatasetCard, sample: _Sample, run: RunDirectory, *, streams: Streams | None, source: MapFile
 ) -> History:
     window, known = (sample.start_ns, sample.end_ns), store.run_json(run.run_id)
     return History(
         sample={**sample.values, "row": sample.row},
         labels=sample.labels,
-        quality=names_of(sample.quality, Quality),
-        run=recast(run.manifest, Ingestion),
+        quality=flag_names(sample.quality, Quality),
+        run=convert_record(run.manifest, Ingestion),
         source=known.source if known else None,
-        messages={} if streams is None else dict(_messages(streams, *window)),
-        gates=tuple(_gates(run, *window)),
-        refused=tuple(_refused(run, *window)),
+        messages={} if streams is None else dict(_find_messages(streams, *window)),
+        gates=tuple(_iterate_gates(run, *window)),
+        refused=tuple(_iterate_rejections(run, *window)),
         map=_map(source, sample, card.recipe),
-        recipe_differs_in=_changed_keys(card.recipe),
+        recipe_differs_in=_find_changed_keys(card.recipe),
         versions=Versions(card.tcpipe_version, __version__, card.data_model_version),
         made_from="segments" if streams is None else "streams",
     )
@@ -254,10 +254,10 @@ def _run(store: Store, directory: Path, card: DatasetCard, sample: _Sample) -> R
     )
 
 
-def _messages(streams: Streams, start_ns: int, end_ns: int) -> Iterator[tuple[str, MessageRange]]:
+def _find_messages(streams: Streams, start_ns: int, end_ns: int) -> Iterator[tuple[str, MessageRange]]:
     """Yield, for every role, its topic and which of its messages lie in the segment."""
     for role, table in streams.tables.items():
-        stamps = integers(table, "stamp_ns")
+        stamps = to_integers(table, "stamp_ns")
         first, last = np.searchsorted(stamps, [start_ns, end_ns], side="left")
         inside = stamps[first:last]
         sensor = streams.sensors[role]
@@ -277,22 +277,22 @@ def _messages(streams: Streams, start_ns: int, end_ns: int) -> Iterator[tuple[st
         )
 
 
-def _gates(run: RunDirectory, start_ns: int, end_ns: int) -> Iterator[NearbyGate]:
+def _iterate_gates(run: RunDirectory, start_ns: int, end_ns: int) -> Iterator[NearbyGate]:
     table = run.track().table
-    stamps, bits = integers(table, "stamp_ns"), integers(table, "dropped_by")
+    stamps, bits = to_integers(table, "stamp_ns"), to_integers(table, "dropped_by")
     near = slice(*np.searchsorted(stamps, [start_ns - _NEARBY_NS, end_ns + _NEARBY_NS]))
     stamps, bits = stamps[near], bits[near]
     for part in np.split(np.arange(len(bits)), np.flatnonzero(np.diff(bits)) + 1):
         if len(part) and bits[part[0]]:
-            names = names_of(int(bits[part[0]]), DropReason)
+            names = flag_names(int(bits[part[0]]), DropReason)
             before = stamps[part[0]] < start_ns
             offset_ns = start_ns - stamps[part[-1]] if before else stamps[part[0]] - end_ns
             yield NearbyGate(names, "before" if before else "after", float(offset_ns) / 1e9, len(part))
 
 
-def _refused(run: RunDirectory, start_ns: int, end_ns: int) -> Iterator[NearbyRefusal]:
+def _iterate_rejections(run: RunDirectory, start_ns: int, end_ns: int) -> Iterator[NearbyRefusal]:
     table = run.rejections()
-    stamps = integers(table, "stamp_ns")
+    stamps = to_integers(table, "stamp_ns")
     near = (stamps >= start_ns - _NEARBY_NS) & (stamps <= end_ns + _NEARBY_NS)
     rows = table.filter(pa.array(near)).select(["role", "reason"]).to_pylist()
     for (role, reason), count in sorted(Counter((row["role"], row["reason"]) for row in rows).items()):
@@ -300,7 +300,7 @@ def _refused(run: RunDirectory, start_ns: int, end_ns: int) -> Iterator[NearbyRe
 
 
 def _map(source: MapFile, sample: _Sample, recipe: Recipe) -> SampleMap:
-    corners = _sampled(sample.values, source, recipe).footprint_xy_m.reshape(-1, 2)
+    corners = _sample_segment(sample.values, source, recipe).footprint_xy_m.reshape(-1, 2)
     px = source.grid.px_from_xy(corners)
     ends = (px.min(axis=0), px.max(axis=0)) if len(px) else (np.zeros(2), -np.ones(2))
     low, high = (np.floor(end / source.tile_px).astype(int) for end in ends)
@@ -315,14 +315,14 @@ def _map(source: MapFile, sample: _Sample, recipe: Recipe) -> SampleMap:
     )
 
 
-def _sampled(segment: Mapping[str, Value], source: MapFile, recipe: Recipe) -> Sampled:
+def _sample_segment(segment: Mapping[str, Value], source: MapFile, recipe: Recipe) -> Sampled:
     """Sample one segment, given as a row of values."""
     row = {column.name: pa.array([segment[column.name]], column.dtype) for column in PLACED_SEGMENTS.columns}
     table = pa.Table.from_arrays(list(row.values()), schema=PLACED_SEGMENTS.arrow())
     return sample_segments(table, source, recipe.sample, gnss_crs=recipe.read.gnss_crs)
 
 
-def _made_again(
+def _sample_again(
     sample: _Sample, run: RunDirectory, streams: Streams | None, source: MapFile, recipe: Recipe
 ) -> tuple[Mapping[str, Value], Patches] | str:
     """Return the segment and its patch as they come out now, or why they do not.
@@ -338,17 +338,17 @@ def _made_again(
             return "; ".join(error.problems)
     row = pc.index(segments.column("segment_id"), sample.sample_id).as_py()
     if row < 0:
-        away_s = np.abs(integers(segments, "start_ns") - sample.start_ns).min(initial=np.iinfo(np.int64).max) / 1e9
+        away_s = np.abs(to_integers(segments, "start_ns") - sample.start_ns).min(initial=np.iinfo(np.int64).max) / 1e9
         near = f"; the nearest begins {away_s:.3f} s away" if segments.num_rows else "; it has none now"
         return f"no segment of run {run.run_id} begins at this stamp any more{near}"
     segment = segments.slice(row, 1).to_pylist()[0]
-    sampled = _sampled(segment, source, recipe)
+    sampled = _sample_segment(segment, source, recipe)
     if len(sampled.kept) == 0:
         return f"map {source.name} gives no patch for it any more"
     return segment, sampled.patches
 
 
-def _differences(
+def _iterate_differences(
     files: PatchFiles, card: DatasetCard, sample: _Sample, made: tuple[Mapping[str, Value], Patches] | str
 ) -> Iterator[str]:
     """Yield a line for each value and each layer that is not, bit for bit, what the dataset holds."""
@@ -363,7 +363,7 @@ def _differences(
         now = None if name.startswith("terrain") and "terrain" not in patches.pixels else values[0].item()
         if now != sample.values[name]:
             yield f"{name}: {now!r} now, {sample.values[name]!r} in the dataset"
-    for layer, stored in _stored(files, card, sample.row).items():
+    for layer, stored in _read_stored_layers(files, card, sample.row).items():
         pixels = patches.pixels.get(layer)
         if pixels is None:
             yield f"{layer}: map {sample.map} has no such layer any more"
@@ -371,7 +371,7 @@ def _differences(
             yield f"{layer}: {int((pixels[0] != stored).sum())} of {stored.size} pixels differ"
 
 
-def _reasons(card: DatasetCard, sample: _Sample, run: RunDirectory, source: MapFile) -> Iterator[str]:
+def _iterate_reasons(card: DatasetCard, sample: _Sample, run: RunDirectory, source: MapFile) -> Iterator[str]:
     """Yield what is not as it was when the dataset was built, which may be why."""
     versions = {card.tcpipe_version, run.manifest.tcpipe_version, __version__}
     if len(versions) > 1:
@@ -385,31 +385,31 @@ def _reasons(card: DatasetCard, sample: _Sample, run: RunDirectory, source: MapF
             yield f"run {run.run_id} was ingested anew since, with other segments"
 
 
-def _stored(files: PatchFiles, card: DatasetCard, row: int) -> dict[str, NDArray[np.generic]]:
+def _read_stored_layers(files: PatchFiles, card: DatasetCard, row: int) -> dict[str, NDArray[np.generic]]:
     """Return the stored layers of the sample in a row of samples.parquet, each of shape (px, px)."""
     split = read_samples(files.directory, ["split"]).column("split").to_numpy()
-    place = rows_in_files(card, split)[split[row]][int((split[:row] == split[row]).sum())]
+    place = find_rows_in_files(card, split)[split[row]][int((split[:row] == split[row]).sum())]
     piece = int(np.searchsorted(files.starts, place, side="right")) - 1
     return {name: pixels[place - files.starts[piece]] for name, pixels in files.read(piece, files.layers).items()}
 
 
-def _changed_keys(recipe: Recipe) -> dict[str, Setting]:
+def _find_changed_keys(recipe: Recipe) -> dict[str, Setting]:
     """Return the recipe's keys that are not at their default."""
-    return {key: value for key, value in flat_recipe(recipe).items() if value != _DEFAULTS.get(key)}
+    return {key: value for key, value in flatten_recipe(recipe).items() if value != _DEFAULTS.get(key)}
 
 
-def flat_recipe(recipe: Recipe) -> dict[str, Setting]:
+def flatten_recipe(recipe: Recipe) -> dict[str, Setting]:
     """Return a recipe's values by dotted key; a table whose keys are the user's own is one value."""
     flat: dict[str, Setting] = {}
-    for key, value in plain(asdict(recipe)).items():
+    for key, value in to_plain(asdict(recipe)).items():
         flat |= {f"{key}.{name}": of for name, of in value.items()} if isinstance(value, Mapping) else {key: value}
     return flat
 
 
-_DEFAULTS = flat_recipe(Recipe())
+_DEFAULTS = flatten_recipe(Recipe())
 
 
-def _lines(sample_id: str, facts: History, differences: Sequence[str]) -> Iterator[str]:
+def _iterate_lines(sample_id: str, facts: History, differences: Sequence[str]) -> Iterator[str]:
     sample, labels, run, ground = facts.sample, facts.labels, facts.run, facts.map
     fold = "" if sample["fold"] is None else f", fold {sample['fold']}"
     yield f"{sample_id}: row {sample['row']}, split {sample['split']}{fold}"

@@ -15,14 +15,14 @@ import pyarrow as pa
 from tcpipe import __version__
 from tcpipe.errors import LogError, StoreError, UsageError
 from tcpipe.formats.atomic import clear
-from tcpipe.formats.json_files import read_json, typed, write_json
+from tcpipe.formats.json_files import parse_typed, read_json, write_json
 from tcpipe.formats.logs.log_file import Log, open_log
-from tcpipe.formats.object_storage import is_url, shown_path
-from tcpipe.formats.parquet import parquet_rows, read_schema, storable
-from tcpipe.pipeline.log_sources import definitions_key
-from tcpipe.power.sources import bare_unit
-from tcpipe.store import inside_store, is_store
-from tcpipe.tables.levels import metadata_of, with_metadata
+from tcpipe.formats.object_storage import format_path, is_url
+from tcpipe.formats.parquet import make_storable, read_schema, write_parquet_rows
+from tcpipe.pipeline.log_sources import make_definitions_key
+from tcpipe.power.sources import find_bare_unit
+from tcpipe.store import find_store_above, is_store
+from tcpipe.tables.levels import add_metadata, read_metadata
 
 INDEX = "export.json"
 """What a directory of exported topics holds, and of which log: a second call finds it done."""
@@ -113,16 +113,16 @@ def export(
     """
     _refuse_what_is_ours(out)
     clear(out)
-    shown = shown_path(log_path)
+    shown = format_path(log_path)
     with open_log(log_path, message_definitions=message_definitions) as log:
-        wanted = _wanted(log, shown, topics)
-        made_from = _identity(log, shown, message_definitions)
-        paths = _paths(out, sorted(log.topics))
+        wanted = _select_topics(log, shown, topics)
+        made_from = _make_origin(log, shown, message_definitions)
+        paths = _make_paths(out, sorted(log.topics))
         index = _index(out)
         _refuse_others_files(index, made_from, {name: paths[name] for name in wanted})
         known = {name for name in wanted if _is_there(index.get(name), made_from, out)}
         if wanted and known == set(wanted):
-            return _exported("unchanged", index, wanted, shown, out)
+            return _make_exported("unchanged", index, wanted, shown, out)
         rows = _write(log, {name: paths[name] for name in wanted}, threads)
         if wanted and not any(count is not None for count in rows.values()):
             raise LogError(f"{shown}: nothing to export: no topic can be read", *map(str, log.damage))
@@ -142,10 +142,10 @@ def export(
             for name, count in rows.items()
         }
     write_json(out / INDEX, ExportIndex({**index, **entries}))
-    return _exported("done", entries, wanted, shown, out)
+    return _make_exported("done", entries, wanted, shown, out)
 
 
-def _wanted(log: Log, log_path: str, topics: Sequence[str]) -> list[str]:
+def _select_topics(log: Log, log_path: str, topics: Sequence[str]) -> list[str]:
     """Return the topics asked for, each once, or all; a text that is no topic's name is taken for several with commas between."""
     parts = (part.strip() for text in topics for part in ([text] if text in log.topics else text.split(",")))
     split = list(dict.fromkeys(part for part in parts if part))
@@ -158,11 +158,11 @@ def _wanted(log: Log, log_path: str, topics: Sequence[str]) -> list[str]:
     return split or sorted(log.topics)
 
 
-def _identity(log: Log, log_path: str, message_definitions: Path | None) -> ExportOrigin:
+def _make_origin(log: Log, log_path: str, message_definitions: Path | None) -> ExportOrigin:
     return ExportOrigin(
         log=log_path if is_url(log_path) else str(Path(log_path).resolve()),
         size_and_time=tuple((size, time_ns) for size, time_ns in log.size_and_time),
-        message_definitions=definitions_key(message_definitions),
+        message_definitions=make_definitions_key(message_definitions),
         tcpipe_version=__version__,
     )
 
@@ -173,7 +173,7 @@ def _index(out: Path) -> dict[str, IndexEntry]:
     found: dict[str, IndexEntry] = {}
     for name, entry in entries.items() if isinstance(entries, dict) else ():
         with suppress(StoreError):
-            found[name] = typed(entry, IndexEntry, out / INDEX)
+            found[name] = parse_typed(entry, IndexEntry, out / INDEX)
     return found
 
 
@@ -182,7 +182,7 @@ def _refuse_what_is_ours(out: Path) -> None:
     signs = {
         "dataset": "dataset.json", "map": "zarr.json", "model": "model.json", "cost map": "cost-map.json",
     }  # fmt: skip
-    ours = "store" if is_store(out) else "run" if inside_store(out) else None
+    ours = "store" if is_store(out) else "run" if find_store_above(out) else None
     kind = ours or next((kind for kind, sign in signs.items() if (out / sign).is_file()), None)
     if kind:
         raise UsageError(f"{out}: is a {kind}; give another directory for the topics")
@@ -205,7 +205,7 @@ def _refuse_others_files(index: Mapping[str, IndexEntry], made_from: ExportOrigi
 def _is_a_topics(path: Path) -> bool:
     """Return whether a file is one of `export`, which may have been interrupted before it wrote its index."""
     with suppress(StoreError):
-        return "topic" in metadata_of(read_schema(path).empty_table())
+        return "topic" in read_metadata(read_schema(path).empty_table())
     return False
 
 
@@ -216,7 +216,7 @@ def _is_there(entry: IndexEntry | None, made_from: ExportOrigin, out: Path) -> b
     return path is None or (path.is_file() and path.stat().st_size == entry.bytes)
 
 
-def _exported(
+def _make_exported(
     status: Literal["done", "unchanged"], entries: Mapping[str, IndexEntry], wanted: Sequence[str], log: str, out: Path
 ) -> Exported:
     found = {name: entries[name] for name in wanted}
@@ -234,25 +234,25 @@ def _write(log: Log, paths: Mapping[str, Path], threads: int) -> dict[str, int |
         for tables in log.batches(list(paths), threads=threads):
             for name, table in tables.items():
                 if name not in writers:
-                    writers[name] = files.enter_context(parquet_rows(paths[name], _schema(log, name, table)))
-                writers[name](storable(table))
+                    writers[name] = files.enter_context(write_parquet_rows(paths[name], _make_schema(log, name, table)))
+                writers[name](make_storable(table))
                 rows[name] += table.num_rows
     return {name: count if name in writers else None for name, count in rows.items()}
 
 
-def _schema(log: Log, name: str, table: pa.Table) -> pa.Schema:
+def _make_schema(log: Log, name: str, table: pa.Table) -> pa.Schema:
     """Return the schema of a topic's file: the table's, with the topic, its type and definition."""
     topic, (definition, source) = log.topics[name], log.definition(name)
-    schema = storable(table[:0]).schema
-    unit = bare_unit(topic.type_name, name)
+    schema = make_storable(table[:0]).schema
+    unit = find_bare_unit(topic.type_name, name)
     if unit is not None:
         at = schema.get_field_index("data")
         schema = schema.set(at, schema.field(at).with_metadata({"unit": unit}))
     described = {"topic": name, "type": topic.type_name, "definition": definition, "definition_from": source}
-    return with_metadata(schema.empty_table(), described).schema
+    return add_metadata(schema.empty_table(), described).schema
 
 
-def _paths(out: Path, topics: Sequence[str]) -> dict[str, Path]:
+def _make_paths(out: Path, topics: Sequence[str]) -> dict[str, Path]:
     """Return a file for each topic, named after it; where two would share a name, the later ones get a number."""
     paths: dict[str, Path] = {}
     taken: set[str] = set()

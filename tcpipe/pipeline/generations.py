@@ -8,8 +8,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from tcpipe.errors import UsageError
-from tcpipe.formats.atomic import scratch_directory
-from tcpipe.formats.bucket import open_place, side_by_side
+from tcpipe.formats.atomic import make_scratch_directory
+from tcpipe.formats.bucket import map_concurrently, open_place
 from tcpipe.formats.bucket_directories import GENERATIONS, is_left_over, name_generation
 from tcpipe.formats.commit_log import LOG, Stamp, put_commit, read_state
 from tcpipe.formats.commits import Entries, Generation, Process, State
@@ -33,7 +33,7 @@ def write_generation(url: str, card: str) -> Iterator[Path]:
     """
     place = open_place(url)
     read_generations(place, card)
-    with scratch_directory() as scratch:
+    with make_scratch_directory() as scratch:
         directory = scratch / (url.rstrip("/").rpartition("/")[2])
         directory.mkdir()
         yield directory
@@ -87,4 +87,4 @@ def _commit_as(number: int, generation: Generation) -> Callable[[State], Entries
 def _remove_leftovers(place: Place, state: State) -> None:
     """Remove what killed and slower calls left, and generations that were replaced for long."""
     names = [entry.name for entry in place.entries(GENERATIONS)]
-    side_by_side(place.where(), place.delete, [name for name in names if is_left_over(name, state)])
+    map_concurrently(place.where(), place.delete, [name for name in names if is_left_over(name, state)])

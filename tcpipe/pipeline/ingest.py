@@ -13,37 +13,37 @@ from pathlib import Path
 from typing import Literal
 
 from tcpipe import __version__
-from tcpipe.errors import LogError, StoreError, UsageError, plain_line
+from tcpipe.errors import LogError, StoreError, UsageError, clean_line
 from tcpipe.execution import run_all
-from tcpipe.formats.atomic import scratch_directory
-from tcpipe.formats.commit_log import keep_state_here, uncollected
-from tcpipe.formats.commits import Call, Entries, Failure, Kind, State
+from tcpipe.formats.atomic import make_scratch_directory
+from tcpipe.formats.commit_log import keep_state_here, pause_garbage_collection
+from tcpipe.formats.commits import CallRecord, Entries, Failure, Kind, State
 from tcpipe.formats.index_files import RunFacts
 from tcpipe.formats.object_storage import is_presigned, is_url
-from tcpipe.formats.recipe_toml import ingest_key, recipe_of
-from tcpipe.formats.robot_files import profiles_of
-from tcpipe.formats.store_mark import gone_if_empty
+from tcpipe.formats.recipe_toml import ingest_key, resolve_recipe
+from tcpipe.formats.robot_files import load_profiles
+from tcpipe.formats.store_document import remove_if_empty
 from tcpipe.formats.stored_runs import look_at_files
-from tcpipe.pipeline.begun_calls import begun_call, new_call, settled_calls
-from tcpipe.pipeline.calls import INGEST, measure_call, room_of, started
+from tcpipe.pipeline.begun_calls import commit_call, find_settled_calls, make_call
+from tcpipe.pipeline.call_history import INGEST, measure_call, start_stopwatch, stored_bytes
 from tcpipe.pipeline.ingest_options import IngestOptions
 from tcpipe.pipeline.ingest_run import Ingested, find_twin, ingest_one
-from tcpipe.pipeline.ingest_task import IngestResult, IngestTask, died, result_of, too_young
+from tcpipe.pipeline.ingest_task import IngestResult, IngestTask, check_age, make_died_result, make_result
 from tcpipe.pipeline.log_findings import find_failure
 from tcpipe.pipeline.log_sources import (
     FoundLogs,
     LogSource,
-    definitions_key,
+    add_hashes,
     find_sources,
-    in_shard,
-    in_turns,
-    remembered,
-    with_hashes,
+    make_definitions_key,
+    plan_rounds,
+    recall_hash,
+    select_shard,
 )
 from tcpipe.pipeline.log_writer import LogWriter, open_log
 from tcpipe.pipeline.plan import Step, plan
 from tcpipe.pipeline.problems import find_problems, is_acknowledged, make_failure
-from tcpipe.pipeline.supersession import superseded_by
+from tcpipe.pipeline.supersession import find_superseded
 from tcpipe.store import Store, open_store
 from tcpipe.tables.findings import select_problems
 from tcpipe.tables.options import as_function
@@ -90,32 +90,32 @@ def run_ingest(options: IngestOptions) -> IngestSummary:
     Raises `LogError`, `StoreError`, `RecipeError` or `UsageError` when nothing can be begun; what goes wrong with one log or path stands
     in its result.
     """
-    watch = started()
-    ruling, shard = recipe_of(options.recipe), options.shard
+    watch = start_stopwatch()
+    ruling, shard = resolve_recipe(options.recipe), options.shard
     robot = options.robot or ruling.robot
-    if robot is not None and robot not in (robots := profiles_of(ruling).robots):
+    if robot is not None and robot not in (robots := load_profiles(ruling).robots):
         raise UsageError(f"robot {robot!r} is not known; known: {', '.join(sorted(robots))}")
-    with _place_for_stand_ins(logs := list(options.logs)) as staging, gone_if_empty(options.store):
+    with _place_for_stand_ins(logs := list(options.logs)) as staging, remove_if_empty(options.store):
         found = find_sources(logs, as_one=options.as_one, staging=staging, tables=ruling.tables)
         if not found.sources:
             raise (LogError if found.transient else UsageError)(*chain(*found.problems.values()) or [_NO_LOGS])
         opened = open_store(options.store, create=True)
         log = open_log(opened)
-        before, given = log.state.number, _in_full(logs)
-        mine = found.sources if shard is None else in_shard(found.sources, shard)
+        before, given = log.state.number, _make_absolute(logs)
+        mine = found.sources if shard is None else select_shard(found.sources, shard)
         root = opened.root
         message_definitions = None if options.message_definitions is None else Path(options.message_definitions)
         if options.cluster is not None:  # its workers are elsewhere
             root = root.absolute() if isinstance(root, Path) else root
             message_definitions = None if message_definitions is None else message_definitions.absolute()
         common = (root, ruling, robot, dict(options.tags or {}), options.force, message_definitions)
-        how = (*common, definitions_key(message_definitions), options.retry_failed, options.min_age_s)
+        how = (*common, make_definitions_key(message_definitions), options.retry_failed, options.min_age_s)
         seen = {} if options.force else log.state.seen
-        with uncollected():
-            tasks = [IngestTask(remembered(source, seen.get(source.lineage, ())), *how) for source in mine]
+        with pause_garbage_collection():
+            tasks = [IngestTask(recall_hash(source, seen.get(source.lineage, ())), *how) for source in mine]
             if options.on_found:
                 sizes = {task.source.name: sum(size for size, _ in task.source.files) for task in tasks}
-                options.on_found({**dict.fromkeys(map(plain_line, found.problems), 0), **sizes})
+                options.on_found({**dict.fromkeys(map(clean_line, found.problems), 0), **sizes})
             steps = plan(tasks, log.state, broken=find_broken(opened, log.state, tasks))
         results: dict[int, IngestResult] = {}
 
@@ -126,16 +126,16 @@ def run_ingest(options: IngestOptions) -> IngestSummary:
                     options.on_result(result)
             return IngestSummary(opened.root, tuple(results[index] for index in sorted(results)))
 
-        with uncollected():
-            summary = tell(_results_without_work(log, found, steps))
+        with pause_garbage_collection():
+            summary = tell(_iterate_finished(log, found, steps))
         work = {index: step.task for index, step in enumerate(steps) if step.is_todo}
         begin = (INGEST, given, (ingest_key(ruling), robot, shard))
         if work:
-            with begun_call(log, *begin[:2], options=begin[2]) as call:
-                summary = tell(_results(log, work, jobs=options.jobs, cluster=options.cluster))
+            with commit_call(log, *begin[:2], options=begin[2]) as call:
+                summary = tell(_iterate_results(log, work, jobs=options.jobs, cluster=options.cluster))
                 call.end = Entries(calls=(measure_call(watch, _call_of(opened, summary, given, tasks, options.jobs)),))
         else:
-            log.commit("ended", Entries(ended=tuple(settled_calls(log.state, new_call(*begin)))))
+            log.commit("ended", Entries(ended=tuple(find_settled_calls(log.state, make_call(*begin)))))
         if log.state.number != before and log.state.runs:
             opened.write_index(log.state)
         return summary
@@ -145,7 +145,7 @@ ingest = as_function(IngestOptions, run_ingest)
 """`tcpipe.ingest`: its keywords are the fields of `IngestOptions`."""
 
 
-def _in_full(logs: Iterable[str | Path]) -> tuple[str, ...]:
+def _make_absolute(logs: Iterable[str | Path]) -> tuple[str, ...]:
     """Return logs and folders as they were given, in full; those whose URL is signed are not remembered."""
     return tuple(str(of) if is_url(of) else str(Path(of).absolute()) for of in logs if not is_presigned(of))
 
@@ -164,11 +164,11 @@ def find_broken(store: Store, state: State, tasks: Iterable[IngestTask]) -> set[
 
 def _call_of(
     store: Store, summary: IngestSummary, given: tuple[str, ...], tasks: Iterable[IngestTask], jobs: int
-) -> Call:
+) -> CallRecord:
     """Return what the history holds of a call."""
     done = [result for result in summary.results if result.status in ("done", "damaged", "empty")]
     sizes = {task.source.name: sum(size for size, _ in task.source.files) for task in tasks}
-    return Call(
+    return CallRecord(
         INGEST,
         __version__,
         summary.exit_code,
@@ -177,17 +177,15 @@ def _call_of(
         logs=given,
         failed={result.log: result.problems[0] for result in summary.results if result.transient and result.problems},
         done_bytes=sum(sizes.get(result.log, 0) for result in done),
-        written_bytes=room_of(store, [result.run.run_id for result in done if result.run]),
+        written_bytes=stored_bytes(store, [result.run.run_id for result in done if result.run]),
     )
 
 
-def _results_without_work(
-    log: LogWriter, found: FoundLogs, steps: Sequence[Step]
-) -> Iterator[tuple[int, IngestResult]]:
+def _iterate_finished(log: LogWriter, found: FoundLogs, steps: Sequence[Step]) -> Iterator[tuple[int, IngestResult]]:
     """Yield the result of each path that holds no log, and of each log that is in the store, is known to fail, or has to wait."""
     parties = log.state.parties
     for index, (path, lines) in enumerate(found.problems.items(), start=-len(found.problems)):
-        name = plain_line(path)
+        name = clean_line(path)
         findings = find_failure(name, "LogError")
         yield index, IngestResult(name, "failed", causes=findings, problems=lines, transient=True)
     for index, step in enumerate(steps):
@@ -206,31 +204,33 @@ def _results_without_work(
                 ),
             )
         elif made is not None:
-            result = result_of(source, "unchanged", made, str(source.sha256), same_as=find_twin(made.log, source))
+            result = make_result(source, "unchanged", made, str(source.sha256), same_as=find_twin(made.log, source))
             if made.run_id in parties:
-                superseded, notes = superseded_by(log.store, log.state, source, made.run_id, str(source.sha256))
+                superseded, notes = find_superseded(log.store, log.state, source, made.run_id, str(source.sha256))
                 log.commit("superseded", Entries(superseded=tuple(superseded)))
                 result = replace(result, notes=(*result.notes, *notes))
             if select_problems(result.findings):
                 result = replace(result, known=True, acknowledged=is_acknowledged(find_problems(made), log.state))
             yield index, result
         elif not step.is_todo:
-            yield index, too_young(step.task) or IngestResult(source.name, "waiting")
+            yield index, check_age(step.task) or IngestResult(source.name, "waiting")
 
 
-def _results(
+def _iterate_results(
     log: LogWriter, work: Mapping[int, IngestTask], *, jobs: int, cluster: str | None
 ) -> Iterator[tuple[int, IngestResult]]:
     """Yield what became of each log by its index, once that is committed; what ends within a second is one commit."""
-    indices, hashed = list(work), with_hashes([task.source for task in work.values()])
+    indices, hashed = list(work), add_hashes([task.source for task in work.values()])
     tasks = [replace(task, source=source) for task, source in zip(work.values(), hashed, strict=True)]
     keep_state_here(log.store.place, log.state)
-    for turn in in_turns(hashed):
+    for turn in plan_rounds(hashed):
         waiting, last_s = list[tuple[int, IngestTask, Ingested]](), 0.0
         with closing(run_all(ingest_one, [tasks[at] for at in turn], jobs=jobs, cluster=cluster)) as outcomes:
             for outcome in outcomes:
                 task = tasks[at := turn[outcome.index]]
-                waiting.append((indices[at], task, outcome.result or Ingested(task.source, died(task.source))))
+                waiting.append(
+                    (indices[at], task, outcome.result or Ingested(task.source, make_died_result(task.source)))
+                )
                 if time.monotonic() - last_s >= _TOGETHER_S:
                     yield from _commit(log, waiting)
                     waiting, last_s = [], time.monotonic()
@@ -265,14 +265,14 @@ def _commit(log: LogWriter, ended: Sequence[tuple[int, IngestTask, Ingested]]) -
         result = replace(of.result, notes=(*of.result.notes, *notes[index]))
         if result.run and (by := others.get(result.run.run_id)):
             result = _settle_for(log.state.runs.get((by, result.run.recipe_id)), by, result, of.source)
-        yield index, _judged(log.state, result, of.source, before=before)
+        yield index, _judge_result(log.state, result, of.source, before=before)
 
 
 def _settle_for(made: RunFacts | None, run_id: str, result: IngestResult, source: LogSource) -> IngestResult:
     """Return what becomes of a log whose content another call has committed as ``run_id`` meanwhile: that run, if it is of this recipe."""
     if made is not None and made.log is not None:
         same_as = " + ".join(made.log.source.paths)
-        return result_of(source, "unchanged", made, str(result.sha256), same_as=same_as)
+        return make_result(source, "unchanged", made, str(result.sha256), same_as=same_as)
     problem = (
         f"{result.log}: another call ingested the same log as run {run_id} at the same time; run the command again"
     )
@@ -290,7 +290,7 @@ def _make_entries(log: LogWriter, task: IngestTask, of: Ingested) -> tuple[Entri
     run_id = result.run.run_id if result.run else None
     if run_id and sha256 and (new or result.status != "unchanged" or run_id in log.state.parties):
         try:
-            superseded, notes = superseded_by(log.store, log.state, source, run_id, sha256)
+            superseded, notes = find_superseded(log.store, log.state, source, run_id, sha256)
             entries = replace(entries, superseded=tuple(superseded))
         except StoreError as error:
             notes += error.problems
@@ -301,7 +301,7 @@ def _make_entries(log: LogWriter, task: IngestTask, of: Ingested) -> tuple[Entri
     return replace(entries, seen=(source.sighting(sha256),) if new and sha256 else ()), tuple(notes)
 
 
-def _judged(state: State, result: IngestResult, source: LogSource, *, before: State) -> IngestResult:
+def _judge_result(state: State, result: IngestResult, source: LogSource, *, before: State) -> IngestResult:
     """Return a result with whether its problems were known before, and are acknowledged."""
     if result.status == "failed":
         problem = make_failure(result.sha256 or source.files_digest, source.origins)
@@ -316,4 +316,4 @@ def _judged(state: State, result: IngestResult, source: LogSource, *, before: St
 def _place_for_stand_ins(logs: Iterable[str | Path]) -> AbstractContextManager[Path]:
     """Return a temporary directory, where a log is named by its URL."""
     remote = any(is_url(log) for log in logs)
-    return scratch_directory() if remote else nullcontext(Path())
+    return make_scratch_directory() if remote else nullcontext(Path())

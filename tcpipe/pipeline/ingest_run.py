@@ -16,18 +16,18 @@ from tcpipe.formats.commit_log import read_state_here
 from tcpipe.formats.commits import State
 from tcpipe.formats.index_files import KnownLog, RunFacts
 from tcpipe.formats.lent_tables import lend_streams
-from tcpipe.formats.logs.joined import AnyLog, open_logs
-from tcpipe.formats.recipe_toml import ingest_key, read_key, recipe_id
-from tcpipe.formats.robot_files import profiles_of
+from tcpipe.formats.logs.log_joining import AnyLog, open_logs
+from tcpipe.formats.recipe_toml import ingest_key, make_recipe_id, read_key
+from tcpipe.formats.robot_files import load_profiles
 from tcpipe.formats.run_documents import Counts, LogOrigin, Manifest, RunJson, TopicCount
-from tcpipe.pipeline.ingest_task import IngestResult, IngestTask, result_of, told, too_young
+from tcpipe.pipeline.ingest_task import IngestResult, IngestTask, check_age, make_result, mark_reported
 from tcpipe.pipeline.log_findings import find_damage
 from tcpipe.pipeline.log_sources import LogSource
 from tcpipe.pipeline.log_writer import is_committed
 from tcpipe.pipeline.run_stages import run_stages
-from tcpipe.progress import step, working_on
+from tcpipe.progress import set_task, step
 from tcpipe.store import Store
-from tcpipe.tables.catalogue import threshold
+from tcpipe.tables.catalogue import read_threshold
 from tcpipe.tables.findings import Finding, Subject, make_finding
 from tcpipe.tables.levels import DATA_MODEL_VERSION, LabelledSegments, Streams, Track, add_findings
 from tcpipe.tables.verdicts import judge
@@ -49,11 +49,11 @@ def ingest_one(task: IngestTask) -> Ingested:
     _return_freed_memory()
     task = replace(task, source=task.source.now())
     hashed, rows = list[str](), list[RunFacts]()
-    young = too_young(task)
+    young = check_age(task)
     if young is not None:
         return Ingested(task.source, young)
-    with working_on(task.source.name):
-        result = told(task, partial(_ingest, hashed=hashed, rows=rows))
+    with set_task(task.source.name):
+        result = mark_reported(task, partial(_ingest, hashed=hashed, rows=rows))
     if task.source.has_changed():
         note = "it changed while it was looked at; it is ingested when its recording has ended"
         return Ingested(task.source, IngestResult(task.source.name, "waiting", notes=(note,)))
@@ -74,19 +74,19 @@ def _ingest(task: IngestTask, *, hashed: list[str], rows: list[RunFacts]) -> Ing
     store, source = Store(task.store), task.source
     state = read_state_here(store.place)
     with ExitStack() as stack:
-        opened = None if source.sha256 else _opened(task, stack)
+        opened = None if source.sha256 else _open_log(task, stack)
         sha256 = _find_hash(state, opened) if opened else str(source.sha256)
         hashed.append(sha256)
         run_id = state.find_run(sha256) or store.name_run(source.stem, sha256)
         before = store.known_run(run_id)
         same_as = find_twin(before, source)
-        if before and not task.force and (made := _made_before(store, run_id, task)):
+        if before and not task.force and (made := _find_made_before(store, run_id, task)):
             rows += () if is_committed(made, state) else _read_rows(store, state, run_id, made.recipe_id)
-            return result_of(source, "done" if rows else "unchanged", made, sha256, same_as=same_as)
-        log = opened or _opened(task, stack)
+            return make_result(source, "done" if rows else "unchanged", made, sha256, same_as=same_as)
+        log = opened or _open_log(task, stack)
         step("reading")
         streams, known = _read(store, run_id, before, log, task, sha256=sha256)
-        known = replace(known, tags={**(before.tags if before else _tags(state, run_id)), **task.tags})
+        known = replace(known, tags={**(before.tags if before else _read_tags(state, run_id)), **task.tags})
         if not known.streams:
             known = replace(known, streams=store.write_streams(run_id, streams, key=known.streams_key))
         store.write_run_json(run_id, known)
@@ -95,10 +95,10 @@ def _ingest(task: IngestTask, *, hashed: list[str], rows: list[RunFacts]) -> Ing
         manifest = _fuse_and_label(store, run_id, streams, known, task)
     rows += _read_rows(store, state, run_id, manifest.recipe_id)
     (made,) = (row for row in rows if row.recipe_id == manifest.recipe_id)
-    return result_of(source, "done", made, sha256, same_as=same_as)
+    return make_result(source, "done", made, sha256, same_as=same_as)
 
 
-def _made_before(store: Store, run_id: str, task: IngestTask) -> RunFacts | None:
+def _find_made_before(store: Store, run_id: str, task: IngestTask) -> RunFacts | None:
     """Return an ingestion that is there as it would be made now, after setting its tags; also one that a killed call did not commit."""
     made = next((row for row in store.read_rows(run_id).values() if task.is_made_by(row)), None)
     if made is not None and store.tag_run(run_id, task.tags):
@@ -126,7 +126,7 @@ def _find_hash(state: State, log: AnyLog) -> str:
     return sha256
 
 
-def _opened(task: IngestTask, stack: ExitStack) -> AnyLog:
+def _open_log(task: IngestTask, stack: ExitStack) -> AnyLog:
     """Return the log, open until ``stack`` ends."""
     log = open_logs(task.source.locations(), message_definitions=task.message_definitions, tables=task.recipe.tables)
     stack.enter_context(log)
@@ -135,7 +135,7 @@ def _opened(task: IngestTask, stack: ExitStack) -> AnyLog:
 
 def _fuse_and_label(store: Store, run_id: str, streams: Streams, known: RunJson, task: IngestTask) -> Manifest:
     track, gated, labelled = run_stages(streams, task.recipe.ingest, run_id=run_id)
-    manifest = manifest_of(task, known, streams, track, labelled)
+    manifest = make_manifest(task, known, streams, track, labelled)
     settled = (lambda _: False) if task.force else task.is_made_by
     return store.write_run(manifest, track=track, gated=gated, labelled=labelled, settled=settled)
 
@@ -145,7 +145,7 @@ def find_twin(known: RunJson | KnownLog | None, source: LogSource) -> str | None
     return None if known is None or known.source.paths == source.origins else " + ".join(known.source.paths)
 
 
-def _tags(state: State, run_id: str) -> Mapping[str, str]:
+def _read_tags(state: State, run_id: str) -> Mapping[str, str]:
     """Return the tags that a run has, where its run.json is lost."""
     return next((row.tags for row in state.find_rows(run_id)), {})
 
@@ -165,7 +165,9 @@ def _read(
             return cached, replace(
                 known, damage=before.damage, remarks=before.remarks, streams=before.streams, streams_key=key
             )
-    streams = read_run(log, find_read_config(task.recipe, log.topics), robot=task.robot, known=profiles_of(task.recipe))
+    streams = read_run(
+        log, find_read_config(task.recipe, log.topics), robot=task.robot, known=load_profiles(task.recipe)
+    )
     if task.source.has_changed():
         raise LogError(f"{task.source.name}: changed while it was read")
     damage = tuple(str(damage) for damage in log.damage if damage.is_loss)
@@ -187,7 +189,7 @@ def run_json_of(task: IngestTask, log: AnyLog, streams: Streams, sha256: str) ->
     )
 
 
-def manifest_of(
+def make_manifest(
     task: IngestTask, known: RunJson, streams: Streams, track: Track, labelled: LabelledSegments
 ) -> Manifest:
     """Return what became of a run; ``known`` gives tags and damage."""
@@ -198,7 +200,7 @@ def manifest_of(
     messages = {role: table.num_rows for role, table in streams.tables.items()}
     return Manifest(
         run_id=info.run_id,
-        recipe_id=recipe_id(task.recipe, streams.robot),
+        recipe_id=make_recipe_id(task.recipe, streams.robot),
         data_model_version=DATA_MODEL_VERSION,
         tcpipe_version=__version__,
         ingest_key=ingest_key(task.recipe),
@@ -216,5 +218,5 @@ def manifest_of(
 
 
 def _find_few_segments(count: int, subject: Subject) -> tuple[Finding, ...]:
-    few = 0 < count < threshold("few-segments", "min_segments_count")
+    few = 0 < count < read_threshold("few-segments", "min_segments_count")
     return (make_finding("few-segments", subject, segments_count=count),) if few else ()

@@ -11,14 +11,14 @@ from pathlib import Path
 from typing import Literal, TypeVar
 
 from tcpipe import __version__
-from tcpipe.errors import TcpipeError, hide_secrets, plain_line
+from tcpipe.errors import TcpipeError, clean_line, hide_secrets
 from tcpipe.formats.index_files import RunFacts
 from tcpipe.formats.json_files import digest
 from tcpipe.formats.recipe_toml import ingest_key
 from tcpipe.formats.run_documents import Manifest
 from tcpipe.pipeline.log_findings import find_failure
 from tcpipe.pipeline.log_sources import LogSource
-from tcpipe.pipeline.transience import is_transient
+from tcpipe.pipeline.transient_errors import is_transient
 from tcpipe.recipe import Recipe
 from tcpipe.tables.findings import Finding, select_problems
 from tcpipe.tables.verdicts import Verdict
@@ -110,14 +110,14 @@ class LogLine(IngestResult):
     is_news: bool = False
 
 
-def result_of(source: LogSource, status: Status, made: RunFacts, sha256: str, *, same_as: str | None) -> IngestResult:
+def make_result(source: LogSource, status: Status, made: RunFacts, sha256: str, *, same_as: str | None) -> IngestResult:
     """Return what became of a log whose run is in the store."""
     if status == "done":
         status = "damaged" if made.damage else "empty" if made.is_empty else status
     return IngestResult(source.name, status, made, made.verdict, same_as=same_as, sha256=sha256)
 
 
-def too_young(task: IngestTask, now_ns: int | None = None) -> IngestResult | None:
+def check_age(task: IngestTask, now_ns: int | None = None) -> IngestResult | None:
     """Return that a log has to wait, None where it has not."""
     age_s = ((time.time_ns() if now_ns is None else now_ns) - task.source.youngest_ns) / 1e9
     if not task.source.files or age_s >= task.min_age_s or not task.min_age_s:
@@ -126,21 +126,21 @@ def too_young(task: IngestTask, now_ns: int | None = None) -> IngestResult | Non
     return IngestResult(task.source.name, "waiting", notes=(note,))
 
 
-def died(source: LogSource) -> IngestResult:
+def make_died_result(source: LogSource) -> IngestResult:
     """Return that the process which worked on a log is gone."""
     problem = f"{source.name}: its worker process died (killed, or out of memory); run it again"
     findings = find_failure(source.name, "WorkerDied")
     return IngestResult(source.name, "failed", causes=findings, problems=(problem,), transient=True)
 
 
-def told(task: IngestTask, act: Callable[[IngestTask], R]) -> R | IngestResult:
+def mark_reported(task: IngestTask, act: Callable[[IngestTask], R]) -> R | IngestResult:
     """Do something with a log; an error becomes its result."""
     try:
         return act(task)
     except Exception as error:  # noqa: BLE001  at last a bug that one log meets
         for line in "".join(traceback.format_exception(error)).splitlines():
             logger.debug("%s: %s", task.source.name, line)
-        problems, trace = _in_words(error, task.source)
+        problems, trace = _format_error(error, task.source)
         causes = error.findings if isinstance(error, TcpipeError) else ()
         return IngestResult(
             task.source.name,
@@ -152,21 +152,21 @@ def told(task: IngestTask, act: Callable[[IngestTask], R]) -> R | IngestResult:
         )
 
 
-def _in_words(error: Exception, source: LogSource) -> tuple[tuple[str, ...], str | None]:
+def _format_error(error: Exception, source: LogSource) -> tuple[tuple[str, ...], str | None]:
     """Return lines about what went wrong with a log, and where an internal error comes from."""
     if isinstance(error, TcpipeError):
-        return _naming(source, error.problems), None
+        return _add_log_name(source, error.problems), None
     if isinstance(error, OSError):
         where = f"{error.filename}: " if error.filename else ""
-        return _naming(source, (plain_line(f"{where}{error.strerror or error}"),)), None
+        return _add_log_name(source, (clean_line(f"{where}{error.strerror or error}"),)), None
     if isinstance(error, MemoryError):
         return (f"{source.name}: not enough memory; fewer --jobs need less",), None
     what = f"internal error, {type(error).__name__}: {error}; please report it (tcpipe --debug shows where)"
-    return (plain_line(f"{source.name}: {what}"),), hide_secrets("".join(traceback.format_exception(error)))
+    return (clean_line(f"{source.name}: {what}"),), hide_secrets("".join(traceback.format_exception(error)))
 
 
-def _naming(source: LogSource, problems: tuple[str, ...]) -> tuple[str, ...]:
+def _add_log_name(source: LogSource, problems: tuple[str, ...]) -> tuple[str, ...]:
     """Return the problems with the log's name in the first, unless a file of it is named there."""
-    if any(plain_line(origin) in problems[0] for origin in source.origins):
+    if any(clean_line(origin) in problems[0] for origin in source.origins):
         return problems
     return (f"{source.name}: {problems[0]}", *problems[1:])

@@ -10,18 +10,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal, TypeAlias
 
 from tcpipe.errors import StoreError, TcpipeError, UsageError
-from tcpipe.formats.atomic import scratch_directory
+from tcpipe.formats.atomic import make_scratch_directory
 from tcpipe.formats.bucket_directories import fetch_directory_by_range, has_card
-from tcpipe.formats.json_files import recast
-from tcpipe.formats.logs.joined import opened
-from tcpipe.formats.logs.log_file import belongs_to_a_log, logs_below
-from tcpipe.formats.logs.table_folders import table_files, table_folders
-from tcpipe.formats.object_storage import is_presigned, is_url, shown_path
+from tcpipe.formats.json_files import convert_record
+from tcpipe.formats.logs.log_file import is_log_file, list_logs_below
+from tcpipe.formats.logs.log_joining import open_single_log
+from tcpipe.formats.logs.table_folders import find_table_folders, list_table_files
+from tcpipe.formats.object_storage import format_path, is_presigned, is_url
 from tcpipe.formats.run_documents import Counts, Ingestion, LogOrigin
 from tcpipe.formats.stored_runs import RunDirectory
 from tcpipe.pipeline.log_inspection import InspectedLog, inspect_log
-from tcpipe.pipeline.log_sources import remote_logs
-from tcpipe.pipeline.table_proposal import InspectedTables, proposed
+from tcpipe.pipeline.log_sources import find_remote_logs
+from tcpipe.pipeline.table_proposal import InspectedTables, propose_tables
 from tcpipe.recipe import Recipe
 from tcpipe.store import Store, is_store, run_at
 from tcpipe.tables.catalogue import AFFECTED
@@ -120,87 +120,89 @@ def inspect(
     ------
     LogError, MapError, DatasetError, StoreError : when it is none of these, or cannot be read.
     """
-    ask = partial(_one, recipe=recipe, robot=robot or recipe.robot, full=full, message_definitions=message_definitions)
+    ask = partial(
+        _inspect_one, recipe=recipe, robot=robot or recipe.robot, full=full, message_definitions=message_definitions
+    )
     if is_url(path):
-        return _at_url(str(path).rstrip("/"), ask)
+        return _inspect_url(str(path).rstrip("/"), ask)
     path = Path(path)
     if not path.exists():
         raise UsageError(f"{path}: there is no such file or directory")
     if (path / "dataset.json").is_file():
-        return _dataset(path, str(path))
-    if stored := _in_store(path):
+        return _inspect_dataset(path, str(path))
+    if stored := _inspect_in_store(path):
         return stored
     if path.suffix == ".zarr":
         from tcpipe.formats.maps.map_files import open_map  # noqa: PLC0415  it takes longer to load than a log to inspect
         from tcpipe.pipeline.inspected import InspectedMap  # noqa: PLC0415
 
-        return recast(open_map(path).summary(), InspectedMap, path=str(path))
-    return _logs_or_tables(path, recipe, ask)
+        return convert_record(open_map(path).summary(), InspectedMap, path=str(path))
+    return _inspect_logs_or_tables(path, recipe, ask)
 
 
-def _at_url(url: str, ask: Callable[[Path | str], InspectedLog]) -> Inspected:
+def _inspect_url(url: str, ask: Callable[[Path | str], InspectedLog]) -> Inspected:
     if is_presigned(url):
         return ask(url)
-    if not belongs_to_a_log(url):  # of a log nothing else need be readable
+    if not is_log_file(url):  # of a log nothing else need be readable
         with suppress(StoreError):  # what is wrong with the bucket is told where logs are looked for
-            if stored := _in_store(url):
+            if stored := _inspect_in_store(url):
                 return stored
         if has_card(url):
             from tcpipe.formats.dataset_files import is_shard  # noqa: PLC0415  as above
 
-            return _dataset(fetch_directory_by_range(url, by_range=is_shard)[0], url)
-    with scratch_directory() as directory:
-        urls = list(remote_logs(url, directory / "logs").values())
-    return _logs_at(urls, url, ask)
+            return _inspect_dataset(fetch_directory_by_range(url, by_range=is_shard)[0], url)
+    with make_scratch_directory() as directory:
+        urls = list(find_remote_logs(url, directory / "logs").values())
+    return _inspect_logs_at(urls, url, ask)
 
 
-def _dataset(directory: Path, name: str) -> InspectedDataset:
+def _inspect_dataset(directory: Path, name: str) -> InspectedDataset:
     from tcpipe.formats.dataset_files import read_current_card  # noqa: PLC0415  as above
     from tcpipe.pipeline.inspected import InspectedDataset  # noqa: PLC0415
 
-    return recast(read_current_card(directory), InspectedDataset, kind="dataset", path=name)
+    return convert_record(read_current_card(directory), InspectedDataset, kind="dataset", path=name)
 
 
-def _in_store(path: Path | str) -> InspectedStore | InspectedRun | None:
+def _inspect_in_store(path: Path | str) -> InspectedStore | InspectedRun | None:
     if is_store(path):
         return _store(Store(path))
     found = run_at(path)
     return _run(path, *found) if found else None
 
 
-def _logs_or_tables(
+def _inspect_logs_or_tables(
     path: Path, recipe: Recipe, ask: Callable[[Path | str], InspectedLog]
 ) -> InspectedLog | InspectedLogs | InspectedTables:
     if not path.is_dir():
         return ask(path)
-    logs = [*logs_below(path), *table_folders(path, recipe.tables)]
-    if logs or not (tables := table_files(path)):
-        return _logs_at(logs, path, ask)
-    return proposed(path, tables)
+    logs = [*list_logs_below(path), *find_table_folders(path, recipe.tables)]
+    if logs or not (tables := list_table_files(path)):
+        return _inspect_logs_at(logs, path, ask)
+    return propose_tables(path, tables)
 
 
-def _logs_at(
+def _inspect_logs_at(
     logs: Sequence[Path | str], path: Path | str, ask: Callable[[Path | str], InspectedLog]
 ) -> InspectedLog | InspectedLogs:
     if not logs:
         raise UsageError(f"{path}: is no map, dataset, run or store, and holds no log")
     if len(logs) == 1:
         return ask(logs[0])
-    return InspectedLogs(path=str(path), logs=tuple(_one_of(entry, ask) for entry in logs))
+    return InspectedLogs(path=str(path), logs=tuple(_inspect_one_of(entry, ask) for entry in logs))
 
 
-def _one(
+def _inspect_one(
     path: Path | str, *, recipe: Recipe, robot: str | None, full: bool, message_definitions: Path | None
 ) -> InspectedLog:
-    with opened(path, message_definitions=message_definitions, tables=recipe.tables) as log:
-        return replace(inspect_log(log, recipe, robot, full=full), path=shown_path(path))
+    with open_single_log(path, message_definitions=message_definitions, tables=recipe.tables) as log:
+        return replace(inspect_log(log, recipe, robot, full=full), path=format_path(path))
 
 
-def _one_of(path: Path | str, ask: Callable[[Path | str], InspectedLog]) -> InspectedLog:
+def _inspect_one_of(path: Path | str, ask: Callable[[Path | str], InspectedLog]) -> InspectedLog:
     try:
         return ask(path)
     except TcpipeError as error:
-        return InspectedLog(path=shown_path(path), problems=error.problems)
+        return InspectedLog(path=format_path(path), problems=error.problems)
 
 
 def _run(path: Path | str, store: Store, runs: list[RunDirectory]) -> InspectedRun:
@@ -213,7 +215,7 @@ def _run(path: Path | str, store: Store, runs: list[RunDirectory]) -> InspectedR
         tags=known.tags if known else {},
         remarks=known.remarks if known else (),
         recipes=tuple(
-            recast(run.manifest, InspectedIngestion, findings=run.manifest.info.report.findings) for run in runs
+            convert_record(run.manifest, InspectedIngestion, findings=run.manifest.info.report.findings) for run in runs
         ),
     )
 
@@ -224,14 +226,14 @@ def _store(store: Store) -> InspectedStore:
     return InspectedStore(
         path=str(store.root),
         maps=tuple(store.maps()),
-        runs=tuple(_stored(run) for run in runs),
+        runs=tuple(_make_stored(run) for run in runs),
         outdated=outdated,
         damaged_runs={store.runs_place.where("/".join(filter(None, run))): line for run, line in found.damaged.items()},
         superseded=dict(found.superseded),
     )
 
 
-def _stored(run: RunDirectory) -> StoredIngestion:
+def _make_stored(run: RunDirectory) -> StoredIngestion:
     facts, verdict = run.facts, run.facts.verdict
     grades = {name: getattr(verdict, name) for name in AFFECTED}
-    return recast(facts, StoredIngestion, **grades, findings=len(facts.findings), damage=len(facts.damage))
+    return convert_record(facts, StoredIngestion, **grades, findings=len(facts.findings), damage=len(facts.damage))

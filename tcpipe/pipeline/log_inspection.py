@@ -11,18 +11,18 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from tcpipe.cost.quality import is_too_slow, wanted_rate_hz
+from tcpipe.cost.quality import find_wanted_rate, is_too_slow
 from tcpipe.formats.logs.log_file import Log
-from tcpipe.formats.robot_files import profiles_of
+from tcpipe.formats.robot_files import load_profiles
 from tcpipe.logs.clocks import SECOND_NS, Timeline, TopicTimes, settle_clocks
 from tcpipe.logs.roles import RoleAssignment
 from tcpipe.logs.simulated_clock import CLOCK, LOG_CLOCK, SIMULATED_NS
 from tcpipe.logs.topics import Topic
 from tcpipe.pipeline.log_findings import find_damage
-from tcpipe.power.sources import sources_of
+from tcpipe.power.sources import find_sources
 from tcpipe.recipe import Recipe
 from tcpipe.robots.profiles import Profiles
-from tcpipe.stages.read_roles import find_read_config, power_candidates, roles_by
+from tcpipe.stages.read_roles import decide_roles, find_power_candidates, find_read_config
 from tcpipe.tables.facts import ABSENT, ClockStep
 from tcpipe.tables.findings import Finding, Subject, make_finding, sort_findings
 
@@ -115,16 +115,19 @@ def inspect_log(log: Log | TableLog, recipe: Recipe, robot: str | None, *, full:
     ----------
     full : read every message: counts, gaps, stamps, clock steps and damage, not the index alone.
     """
-    known = profiles_of(recipe)
+    known = load_profiles(recipe)
     config = find_read_config(recipe, log.topics)
-    cast = roles_by(config, log.topics.values(), robot, known=known)
-    topics, steps = tuple(_indexed(topic, cast) for topic in sorted(log.topics.values(), key=attrgetter("name"))), None
+    cast = decide_roles(config, log.topics.values(), robot, known=known)
+    topics, steps = (
+        tuple(_inspect_index(topic, cast) for topic in sorted(log.topics.values(), key=attrgetter("name"))),
+        None,
+    )
     if full:
         topics, steps = _read(log, topics)
     damage = tuple(str(damage) for damage in log.damage if damage.is_loss)
     findings = (
         *cast.findings,
-        *power_candidates(log, cast, config),
+        *find_power_candidates(log, cast, config),
         *_find_simulated_time(log.topics.values()),
         *_find_slow_power(log, cast, recipe, known),
         *find_damage(damage, Subject("log", str(log.path))),
@@ -149,7 +152,7 @@ def inspect_log(log: Log | TableLog, recipe: Recipe, robot: str | None, *, full:
     )
 
 
-def _indexed(topic: Topic, cast: RoleAssignment) -> InspectedTopic:
+def _inspect_index(topic: Topic, cast: RoleAssignment) -> InspectedTopic:
     """Return what the index tells of a topic."""
     mine = {name: role.why for name, role in cast.roles.items() if topic.name in role.topics}
     played = (", ".join(mine), "; ".join(mine.values())) if mine else None
@@ -176,7 +179,7 @@ def _read(
     clock = settled.simulated
     counting = clock.topics if clock is not None and clock.find_simulated_time() else frozenset()
     read = tuple(
-        _with_stamps(topic, found[topic.name], settled.timelines.get(topic.name), simulated=topic.name in counting)
+        _add_stamps(topic, found[topic.name], settled.timelines.get(topic.name), simulated=topic.name in counting)
         if topic.name in found
         else topic
         for topic in topics
@@ -184,7 +187,7 @@ def _read(
     return read, tuple(settled.steps)
 
 
-def _with_stamps(
+def _add_stamps(
     topic: InspectedTopic, stamps: TopicStamps, timeline: Timeline | None, *, simulated: bool
 ) -> InspectedTopic:
     """Return a topic with what its messages do; without a timeline they have no header."""
@@ -209,7 +212,7 @@ def _find_slow_power(log: Log | TableLog, cast: RoleAssignment, recipe: Recipe, 
     robot = known.robots[cast.robot]
     for name in cast.roles["power"].topics if "power" in cast.roles else ():
         topic = log.topics[name]
-        choices = sources_of(
+        choices = find_sources(
             topic.type_name, name, known.power_sources, platform=robot.platform, husky_power=recipe.read.husky_power
         )
         rate_hz = _rate_hz(topic)
@@ -218,7 +221,7 @@ def _find_slow_power(log: Log | TableLog, cast: RoleAssignment, recipe: Recipe, 
         averaged = {"auto": choices[0][0].averaged, "yes": True, "no": False}[recipe.read.power_averaged]
         if is_too_slow(rate_hz, averaged=averaged):
             names = {"quantity": "current", "topic": name, "setting": choices[0][0].rate_setting}
-            wanted_hz = wanted_rate_hz(averaged=averaged)
+            wanted_hz = find_wanted_rate(averaged=averaged)
             subject = Subject("role", "power")
             yield make_finding("power-too-slow", subject, names=names, rate_hz=rate_hz, wanted_hz=wanted_hz)
 
@@ -256,7 +259,7 @@ class TopicStamps:
         if not table.num_rows:
             return
         first = table if self._last is None else pa.concat_tables([self._last, table])
-        log_ns, header_ns = _log_ns(first), _header_ns(first)
+        log_ns, header_ns = _log_ns(first), _read_header_ns(first)
         again = np.zeros(len(log_ns), bool)
         steps = np.diff(log_ns)
         if header_ns is not None:
@@ -264,7 +267,7 @@ class TopicStamps:
             steps = np.minimum(steps, np.where(header_ns[1:] != 0, np.diff(header_ns), steps))
             self._count_stamps(header_ns[len(header_ns) - table.num_rows :])
         same = again.copy()
-        same[again] = _same_as_before(first, np.flatnonzero(again))
+        same[again] = _find_repeated_rows(first, np.flatnonzero(again))
         self._repeated += int(np.count_nonzero(again & ~same))
         self._duplicates += int(np.count_nonzero(same))
         self._note_gaps(steps, log_ns)
@@ -337,7 +340,7 @@ def _log_ns(table: pa.Table) -> Ints:
     return log_ns
 
 
-def _header_ns(table: pa.Table) -> Ints | None:
+def _read_header_ns(table: pa.Table) -> Ints | None:
     if not set(_STAMP) <= set(table.column_names):
         return None
     seconds, nanoseconds = (table.column(name).to_numpy().astype(np.int64) for name in _STAMP)
@@ -345,7 +348,7 @@ def _header_ns(table: pa.Table) -> Ints | None:
     return stamps
 
 
-def _same_as_before(table: pa.Table, rows: Ints) -> Mask:
+def _find_repeated_rows(table: pa.Table, rows: Ints) -> Mask:
     """Return which of the rows repeat the row before exactly, times of the log aside, shape (len(rows),)."""
     same = np.ones(len(rows), bool)
     for column in table.columns[_TIMES:]:

@@ -10,15 +10,15 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from tcpipe.errors import LogError, TcpipeError, plain_line
-from tcpipe.formats.commits import Sighting, find_lineage
+from tcpipe.errors import LogError, TcpipeError, clean_line
+from tcpipe.formats.commits import LogSnapshot, find_lineage
 from tcpipe.formats.json_files import digest
-from tcpipe.formats.logs.joined import open_logs
-from tcpipe.formats.logs.log_file import LOG_SUFFIXES, belongs_to_a_log, find_logs, logs_below
-from tcpipe.formats.logs.rosbag2 import STORAGE_SUFFIXES, is_one_bag, storage_files
-from tcpipe.formats.logs.table_folders import Mappings, table_files, table_folders
-from tcpipe.formats.object_storage import is_url, shown_path, split_url, stand_ins
-from tcpipe.pipeline.transience import is_transient
+from tcpipe.formats.logs.log_file import LOG_SUFFIXES, find_logs, is_log_file, list_logs_below
+from tcpipe.formats.logs.log_joining import open_logs
+from tcpipe.formats.logs.rosbag2 import STORAGE_SUFFIXES, is_one_bag, list_storage_files
+from tcpipe.formats.logs.table_folders import Mappings, find_table_folders, list_table_files
+from tcpipe.formats.object_storage import format_path, is_url, make_stand_ins, split_url
+from tcpipe.pipeline.transient_errors import is_transient
 
 _LONGEST_STEM_BYTES = 200
 
@@ -44,7 +44,7 @@ class LogSource:
     @property
     def name(self) -> str:
         """What the log is called in messages."""
-        return plain_line(" + ".join(self.origins))
+        return clean_line(" + ".join(self.origins))
 
     @property
     def origins(self) -> tuple[str, ...]:
@@ -63,7 +63,7 @@ class LogSource:
         path = self.paths[0]
         suffix = next((end for end in sorted(LOG_SUFFIXES, key=len, reverse=True) if path.name.endswith(end)), "")
         stem = path.name if path.is_dir() else path.name.removesuffix(suffix)
-        return plain_line(stem).encode()[:_LONGEST_STEM_BYTES].decode(errors="ignore")
+        return clean_line(stem).encode()[:_LONGEST_STEM_BYTES].decode(errors="ignore")
 
     @property
     def files_digest(self) -> str:
@@ -75,9 +75,9 @@ class LogSource:
         """What identifies the place of the log."""
         return find_lineage(self.origins)
 
-    def sighting(self, sha256: str) -> Sighting:
+    def sighting(self, sha256: str) -> LogSnapshot:
         """Return what is remembered of the log as it is now."""
-        return Sighting(self.origins, self.files, sha256)
+        return LogSnapshot(self.origins, self.files, sha256)
 
     @property
     def youngest_ns(self) -> int:
@@ -87,19 +87,19 @@ class LogSource:
     @property
     def arrival_ns(self) -> int:
         """When a file of the log last came here or was changed [ns since 1970], which a copy that keeps its time does not hide."""
-        times = (seen.st_ctime_ns for path in self.paths for seen in _seen(path))
+        times = (seen.st_ctime_ns for path in self.paths for seen in _stat_files(path))
         return self.youngest_ns if self.urls else max(times, default=0)
 
     def now(self) -> LogSource:
         """Return the log as it is now: what was written since is another content; in object storage nobody looks again."""
         if self.urls:
             return self
-        files = _files(self.paths)
+        files = _list_file_states(self.paths)
         return self if files == self.files else replace(self, files=files, sha256=None)
 
     def has_changed(self) -> bool:
         """Tell whether a file was written since; an object that was is refused when it is read."""
-        return not self.urls and _files(self.paths) != self.files
+        return not self.urls and _list_file_states(self.paths) != self.files
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,26 +131,26 @@ def find_sources(
         try:
             if is_url(entry):
                 above_url, query = split_url(str(entry), one_object=True)
-                remote = remote_logs(str(entry), staging / str(number))
+                remote = find_remote_logs(str(entry), staging / str(number))
                 urls.update(remote)
                 queries.update(dict.fromkeys(remote, query))
                 for path, url in remote.items():
                     paths.setdefault(str(path), (path, url.removeprefix(above_url.rstrip("/")).lstrip("/") or url))
             else:
                 above = Path(entry)
-                for path in _logs_at(above, tables or {}):
-                    paths.setdefault(_real(path, folders), (_as_named(path), _place_in(path, above)))
+                for path in _find_logs_at(above, tables or {}):
+                    paths.setdefault(_resolve_path(path, folders), (_as_named(path), _place_in(path, above)))
         except LogError as error:
-            problems[shown_path(entry)] = error.problems
+            problems[format_path(entry)] = error.problems
             transient |= is_transient(error)
-    for part, line in _parts_alone([path for path, _ in paths.values()], together=as_one):
+    for part, line in _find_lone_parts([path for path, _ in paths.values()], together=as_one):
         problems[str(part)] = (line,)
         paths = {real: found for real, found in paths.items() if found[0] != part}
     groups = [tuple(sorted(paths.values()))] if as_one and paths else [(found,) for found in paths.values()]
     sources = tuple(
         LogSource(
             tuple(path for path, _ in group),
-            _files([path for path, _ in group]),
+            _list_file_states([path for path, _ in group]),
             urls=tuple(urls.get(path, str(path)) for path, _ in group if urls),
             queries=tuple(queries.get(path, "") for path, _ in group if urls),
             place="|".join(place for _, place in group),
@@ -160,11 +160,11 @@ def find_sources(
     return FoundLogs(sources, problems, transient)
 
 
-def _logs_at(path: Path, tables: Mappings) -> list[Path]:
+def _find_logs_at(path: Path, tables: Mappings) -> list[Path]:
     """Return the logs at or below a path, folders of mapped tables among them; `LogError` where there is none."""
-    folders = table_folders(path, tables) if tables and path.is_dir() else []
+    folders = find_table_folders(path, tables) if tables and path.is_dir() else []
     if folders:
-        return [*logs_below(path), *folders]
+        return [*list_logs_below(path), *folders]
     try:
         return find_logs(path)
     except LogError as error:
@@ -173,33 +173,33 @@ def _logs_at(path: Path, tables: Mappings) -> list[Path]:
             raise LogError(
                 *error.problems, f"{path}: nor is one of the files that the recipe's tables name: {files}"
             ) from None
-        if path.is_dir() and (held := table_files(path)):
+        if path.is_dir() and (held := list_table_files(path)):
             hint = f"{path}: it holds {len(held)} tables ({held[0].name}, …): map them in the recipe; tcpipe inspect proposes how"
             raise LogError(*error.problems, hint) from None
         raise
 
 
-def _parts_alone(paths: Iterable[Path], *, together: bool) -> Iterator[tuple[Path, str]]:
+def _find_lone_parts(paths: Iterable[Path], *, together: bool) -> Iterator[tuple[Path, str]]:
     """Yield the files that are parts of a ROS 2 bag, given without the others: what does not change stands in the first part only."""
     folders: dict[str, list[Path]] = {}
     for path in paths:
         if str(path).endswith(STORAGE_SUFFIXES):
             folders.setdefault(os.path.dirname(path), []).append(path)  # noqa: PTH120  of thousands
     for bag, mine in sorted(folders.items()):
-        parts = frozenset(storage_files(Path(bag)) if is_one_bag(Path(bag)) else ())
+        parts = frozenset(list_storage_files(Path(bag)) if is_one_bag(Path(bag)) else ())
         if len(parts) > 1 and not (together and parts.issubset(mine)):
             for path in sorted(parts.intersection(mine)):
                 what = f"{path}: is one of the {len(parts)} parts of the ROS 2 bag {bag}"
                 yield path, f"{what}, and static transforms stand in the first of them only; give the directory"
 
 
-def in_shard(sources: Sequence[LogSource], shard: tuple[int, int]) -> list[LogSource]:
+def select_shard(sources: Sequence[LogSource], shard: tuple[int, int]) -> list[LogSource]:
     """Return the logs of share ``(i, n)``, i from 1: whose turn a log is depends on where it lies in the folder given, on no other log."""
     index, count = shard
     return [source for source in sources if int(digest(source.place), 16) % count == index - 1]
 
 
-def definitions_key(directory: Path | None) -> str:
+def make_definitions_key(directory: Path | None) -> str:
     """Return a short hash of the definition files that the user gives; "" where none are given."""
     if directory is None:
         return ""
@@ -209,24 +209,26 @@ def definitions_key(directory: Path | None) -> str:
     return digest.hexdigest()[:8]
 
 
-def remote_logs(url: str, directory: Path) -> dict[Path, str]:
+def find_remote_logs(url: str, directory: Path) -> dict[Path, str]:
     """Return stand-ins for the logs at or below a URL, and the URL of each."""
     directory.mkdir(parents=True)
-    place = stand_ins(url, directory, wanted=belongs_to_a_log)
+    place = make_stand_ins(url, directory, wanted=is_log_file)
     folders: dict[str, str] = {}
     return {
-        Path(_real(path, folders)): "/".join((shown_path(url).rstrip("/"), *path.relative_to(place).parts))
+        Path(_resolve_path(path, folders)): "/".join((format_path(url).rstrip("/"), *path.relative_to(place).parts))
         for path in find_logs(place)
     }
 
 
-def with_hashes(sources: Sequence[LogSource]) -> list[LogSource]:
+def add_hashes(sources: Sequence[LogSource]) -> list[LogSource]:
     """Return the sources with their hashes where two of one size may be the same recording."""
-    sizes = Counter(_size(source) for source in sources)
-    return [source if source.sha256 or sizes[_size(source)] == 1 else _hashed(source) for source in sources]
+    sizes = Counter(_measure_size(source) for source in sources)
+    return [
+        source if source.sha256 or sizes[_measure_size(source)] == 1 else _hash_source(source) for source in sources
+    ]
 
 
-def in_turns(sources: Sequence[LogSource]) -> list[list[int]]:
+def plan_rounds(sources: Sequence[LogSource]) -> list[list[int]]:
     """Return the indices of what can be ingested side by side, and then of what holds the same recording as one of those."""
     seen: set[str] = set()
     turns: list[list[int]] = [[], []]
@@ -236,7 +238,7 @@ def in_turns(sources: Sequence[LogSource]) -> list[list[int]]:
     return turns
 
 
-def _real(path: Path, folders: dict[str, str]) -> str:
+def _resolve_path(path: Path, folders: dict[str, str]) -> str:
     """Return where a log really lies; a link that leads nowhere is where it is. ``folders`` keeps where folders lie."""
     folder, name = os.path.split(path)  # of thousands: no Path for each
     if name in ("", "..") or os.path.islink(path):  # noqa: PTH114
@@ -259,11 +261,11 @@ def _place_in(path: Path, entry: Path) -> str:
     return str(path).removeprefix(f"{entry}/").lstrip("/")
 
 
-def _files(paths: Sequence[Path]) -> tuple[tuple[int, int], ...]:
-    return tuple((seen.st_size, seen.st_mtime_ns) for path in paths for seen in _seen(path))
+def _list_file_states(paths: Sequence[Path]) -> tuple[tuple[int, int], ...]:
+    return tuple((seen.st_size, seen.st_mtime_ns) for path in paths for seen in _stat_files(path))
 
 
-def _seen(path: Path) -> list[os.stat_result]:
+def _stat_files(path: Path) -> list[os.stat_result]:
     """Return what the file system has of a file, or of all files below a directory; nothing of what cannot be looked at."""
     try:
         seen = os.stat(path)  # noqa: PTH116
@@ -274,25 +276,25 @@ def _seen(path: Path) -> list[os.stat_result]:
     return [seen] if stat.S_ISREG(seen.st_mode) else []
 
 
-def is_there(sighting: Sighting) -> bool:
+def is_there(sighting: LogSnapshot) -> bool:
     """Tell whether a log that was seen lies where it was, unchanged; in object storage nobody looks, and it is taken to be there."""
     if any(is_url(origin) for origin in sighting.log):
         return True
-    return _files([Path(origin) for origin in sighting.log]) == sighting.size_and_time
+    return _list_file_states([Path(origin) for origin in sighting.log]) == sighting.size_and_time
 
 
-def _size(source: LogSource) -> int:
+def _measure_size(source: LogSource) -> int:
     return sum(size for size, _ in source.files)
 
 
-def remembered(source: LogSource, seen: Sequence[Sighting]) -> LogSource:
+def recall_hash(source: LogSource, seen: Sequence[LogSnapshot]) -> LogSource:
     """Return the source with its hash; where nothing is known of these sizes and times, or two different things, without."""
     dated = bool(source.files) and all(time_ns for _, time_ns in source.files)  # not every server tells the time
     found = {sighting.sha256 for sighting in seen if dated and sighting.size_and_time == source.files}
     return replace(source, sha256=found.pop()) if len(found) == 1 else source
 
 
-def _hashed(source: LogSource) -> LogSource:
+def _hash_source(source: LogSource) -> LogSource:
     if source.urls:  # it is hashed when it is read
         return source
     try:

@@ -26,7 +26,7 @@ class LogWriter:
     def commit(self, kind: Kind, entries: Entries | Callable[[State], Entries]) -> None:
         """Write a commit, unless it adds nothing; `StoreError` where it cannot be written."""
         make = entries if callable(entries) else lambda _: entries
-        stamp = Stamp(this_process(), datetime.now(UTC).isoformat(timespec="milliseconds"))
+        stamp = Stamp(identify_process(), datetime.now(UTC).isoformat(timespec="milliseconds"))
         self.state = self.store.commit(self.state, stamp, kind, make)
 
 
@@ -41,9 +41,9 @@ def is_committed(row: RunFacts, state: State) -> bool:
     return known is not None and (known.files, known.tags) == (row.files, row.tags)
 
 
-def this_process() -> Process:
+def identify_process() -> Process:
     """Return what distinguishes this process from any other; "" for what the system does not say (other than Linux)."""
-    boot, machine = (_text(path) for path in ("/proc/sys/kernel/random/boot_id", "/etc/machine-id"))
+    boot, machine = (_read_text(path) for path in ("/proc/sys/kernel/random/boot_id", "/etc/machine-id"))
     namespace = ""
     with suppress(OSError):
         namespace = os.readlink("/proc/self/ns/pid")  # noqa: PTH115  no path
@@ -52,7 +52,7 @@ def this_process() -> Process:
 
 def is_alive(process: Process) -> bool | None:
     """Return whether a process lives; None where that cannot be seen from here: another machine or container, another system."""
-    here = this_process()
+    here = identify_process()
     if (process.host, process.machine) != (here.host, here.machine) or not (process.boot and process.start):
         return None
     if process.boot != here.boot:  # of a machine without an identity only its name is known, which others may have
@@ -62,11 +62,11 @@ def is_alive(process: Process) -> bool | None:
 
 def _read_start_time(pid: int) -> str:
     """Return when a living process began, in ticks since the start of the machine (proc(5): stat); "" where there is none."""
-    state, *more = _text(f"/proc/{pid}/stat").rpartition(")")[2].split() or [""]
+    state, *more = _read_text(f"/proc/{pid}/stat").rpartition(")")[2].split() or [""]
     return "" if state in ("", "Z", "X", "x") else more[18]
 
 
-def _text(path: str) -> str:
+def _read_text(path: str) -> str:
     with suppress(OSError):
         return Path(path).read_text().strip()
     return ""

@@ -11,22 +11,22 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Literal
 
-from tcpipe.errors import MapError, StoreError, UsageError, plain_lines
+from tcpipe.errors import MapError, StoreError, UsageError, clean_lines
 from tcpipe.formats.finding_lines import format_findings
+from tcpipe.formats.integrity import compute_checksum, seal_of
 from tcpipe.formats.maps.building import MoreLayers, OrthoBands, build_map
-from tcpipe.formats.maps.geotiff import raster_files
+from tcpipe.formats.maps.geotiff import list_raster_files
 from tcpipe.formats.maps.map_facts import MapInputs, MapSummary, map_lines
 from tcpipe.formats.maps.map_files import open_map
 from tcpipe.formats.maps.terrain_polygons import is_drawn
-from tcpipe.formats.seals import file_checksum, seal_of
-from tcpipe.formats.store_mark import gone_if_empty
+from tcpipe.formats.store_document import remove_if_empty
 from tcpipe.pipeline.add_map_options import AddMapOptions, Files
-from tcpipe.report.pictures import quick_look, write_quick_look
+from tcpipe.report.pictures import draw_quick_look, write_quick_look
 from tcpipe.store import Store, open_store
 from tcpipe.tables.levels import SAMPLES
 from tcpipe.tables.options import as_function
 from tcpipe.terrain.classes import ClassScheme
-from tcpipe.terrain.layers import wrong_name
+from tcpipe.terrain.layers import find_wrong_name
 
 logger = logging.getLogger("tcpipe")
 
@@ -51,7 +51,7 @@ class AddedMap:
         if self.status == "unchanged":
             head += ": nothing to do: it is made from the same files and options"
         more = f"tcpipe inspect {shlex.quote(self.path)}"
-        return plain_lines((head, *map_lines(self.map), *format_findings(self.map.findings, more=more)))
+        return clean_lines((head, *map_lines(self.map), *format_findings(self.map.findings, more=more)))
 
 
 def run_add_map(options: AddMapOptions) -> AddedMap:
@@ -68,19 +68,19 @@ def run_add_map(options: AddMapOptions) -> AddedMap:
     _refuse_layers(layers, categorical, ortho=bool(options.ortho), ortho_bands=options.ortho_bands)
     given = {role: getattr(options, role) for role in _ROLES}
     tables = {f"{name} {_CLASSES}": table for name, table in categorical.items() if table}
-    files = _found({role: value for role, value in {**given, **layers, **tables}.items() if value})
+    files = _find_files({role: value for role, value in {**given, **layers, **tables}.items() if value})
     bands = None if options.ortho_bands == "grey" else options.ortho_bands
-    with gone_if_empty(options.store):
+    with remove_if_empty(options.store):
         opened = open_store(options.store, create=True)
         before = opened.map_number(name)
-        inputs = MapInputs(_checksums(files), options.crs, tuple(sorted(categorical)), bands)
+        inputs = MapInputs(_compute_checksums(files), options.crs, tuple(sorted(categorical)), bands)
         more = MoreLayers(
             {name: files[name] for name in layers},
             {name: files[f"{name} {_CLASSES}"][0] if table else None for name, table in categorical.items()},
             options.ortho_bands,
         )
         if before and not options.force:
-            return _unchanged(opened, name, inputs)
+            return _check_unchanged(opened, name, inputs)
         try:
             with opened.new_map(name, after=before) as path:
                 build_map(
@@ -91,16 +91,16 @@ def run_add_map(options: AddMapOptions) -> AddedMap:
                     terrain=files.get("terrain", ()),
                     more=more,
                     classes=files["classes"][0] if "classes" in files else None,
-                    agreed=_agreed(opened, name),
+                    agreed=_agree_classes(opened, name),
                     crs=options.crs,
                     inputs=inputs,
                 )
-                write_quick_look(path.with_suffix(".png"), quick_look(open_map(path)), seal_of(path))
+                write_quick_look(path.with_suffix(".png"), draw_quick_look(open_map(path)), seal_of(path))
         except StoreError:
             if before or opened.map_number(name) == before:
                 raise
-            return _unchanged(opened, name, inputs)  # another process was faster, or its own answer was lost
-        return _added(opened, name, "done")
+            return _check_unchanged(opened, name, inputs)  # another process was faster, or its own answer was lost
+        return _make_added(opened, name, "done")
 
 
 add_map = as_function(AddMapOptions, run_add_map)
@@ -111,7 +111,7 @@ def _refuse_layers(
     layers: Mapping[str, Files], categorical: Iterable[str], *, ortho: bool, ortho_bands: OrthoBands
 ) -> None:
     """Raise `UsageError` for names that cannot be, classes of no layer, and colours of no orthophoto: all at once."""
-    problems = [problem for name in layers if (problem := wrong_name(name, taken=SAMPLES.names()))]
+    problems = [problem for name in layers if (problem := find_wrong_name(name, taken=SAMPLES.names()))]
     listed = ", ".join(layers) or "none is given"
     problems += [
         f"--categorical {name}: no layer of that name; --layer gives {listed}"
@@ -124,26 +124,26 @@ def _refuse_layers(
         raise UsageError(*problems)
 
 
-def _unchanged(store: Store, name: str, inputs: MapInputs) -> AddedMap:
+def _check_unchanged(store: Store, name: str, inputs: MapInputs) -> AddedMap:
     """Return the map that is there; `MapError` if it is made from something else."""
     _refuse_other(store, name, inputs)
-    return _added(store, name, "unchanged")
+    return _make_added(store, name, "unchanged")
 
 
-def _added(store: Store, name: str, status: Literal["done", "unchanged"]) -> AddedMap:
+def _make_added(store: Store, name: str, status: Literal["done", "unchanged"]) -> AddedMap:
     document, place = store.map_document(name), store.place.below("maps")
     found = open_map(*store.map_at(document)).summary()
     return AddedMap(place.where(document.zarr), status, found, place.where(document.picture))
 
 
-def _found(given: Mapping[str, Files]) -> dict[str, list[Path]]:
+def _find_files(given: Mapping[str, Files]) -> dict[str, list[Path]]:
     """Return the files of every role: patterns become the files that match, by name; of one that comes twice the last counts."""
     files: dict[str, list[Path]] = {}
     problems: list[str] = []
     for role, value in given.items():
         texts = [str(item) for item in ([value] if isinstance(value, str | Path) else value)]
-        matches = [_matches(text) for text in texts]
-        problems += [_no_file(text) for text, found in zip(texts, matches, strict=True) if not found]
+        matches = [_match_files(text) for text in texts]
+        problems += [_describe_no_file(text) for text, found in zip(texts, matches, strict=True) if not found]
         every = [Path(name) for found in matches for name in found]
         files[role] = list(reversed({path.absolute(): path for path in reversed(every)}.values()))
     if problems:
@@ -151,14 +151,14 @@ def _found(given: Mapping[str, Files]) -> dict[str, list[Path]]:
     return files
 
 
-def _matches(text: str) -> list[str]:
+def _match_files(text: str) -> list[str]:
     """Return the file of that name, or the files that match it, by name."""
     if os.path.lexists(text):
         return [] if Path(text).is_dir() else [text]
     return sorted(glob.glob(text, recursive=True))  # noqa: PTH207  a pattern may begin at the root
 
 
-def _no_file(text: str) -> str:
+def _describe_no_file(text: str) -> str:
     """Say why a text names no file."""
     if "://" in text or text.startswith("/vsi"):
         return f"{text}: is an address, wanted a file on this machine: gdal_translate {text} local.tif"
@@ -167,7 +167,7 @@ def _no_file(text: str) -> str:
     return f"{text}: no file matches" if glob.has_magic(text) else f"{text}: there is no such file"
 
 
-def _checksums(files: Mapping[str, Sequence[Path]]) -> dict[str, dict[str, str]]:
+def _compute_checksums(files: Mapping[str, Sequence[Path]]) -> dict[str, dict[str, str]]:
     """Return a checksum for every file of every role, in their order."""
     checksums: dict[str, dict[str, str]] = {}
     problems: list[str] = []
@@ -176,8 +176,10 @@ def _checksums(files: Mapping[str, Sequence[Path]]) -> dict[str, dict[str, str]]
         folder = os.path.commonpath([path.absolute().parent for path in paths])
         try:
             plain = role.endswith(_CLASSES) or (role == "terrain" and is_drawn(paths))
-            for part in dict.fromkeys(part for path in paths for part in ([path] if plain else raster_files(path))):
-                checksums[role][os.path.relpath(part, folder)] = file_checksum(part).sha256
+            for part in dict.fromkeys(
+                part for path in paths for part in ([path] if plain else list_raster_files(path))
+            ):
+                checksums[role][os.path.relpath(part, folder)] = compute_checksum(part).sha256
         except MapError as error:
             problems += error.problems
         except OSError as error:
@@ -195,7 +197,7 @@ def _refuse_other(store: Store, name: str, inputs: MapInputs) -> None:
         raise MapError(*error.problems, f"map {name}: add it anew with --force") from None
     before = found.facts.inputs
     roles = dict.fromkeys([*_ROLES, *before.files, *inputs.files])
-    changes = [_change(role, before.files.get(role, {}), inputs.files.get(role, {})) for role in roles]
+    changes = [_describe_change(role, before.files.get(role, {}), inputs.files.get(role, {})) for role in roles]
     changes = [change for change in changes if change]
     for option in ("crs", "categorical", "ortho_bands"):
         now, then = (getattr(made_from, option) or "not given" for made_from in (inputs, before))
@@ -208,7 +210,7 @@ def _refuse_other(store: Store, name: str, inputs: MapInputs) -> None:
         )
 
 
-def _change(role: str, before: Mapping[str, str], now: Mapping[str, str]) -> str:
+def _describe_change(role: str, before: Mapping[str, str], now: Mapping[str, str]) -> str:
     """Say how the files of a role, name to checksum, differ; nothing where their contents are the same."""
     if list(before.values()) == list(now.values()):
         return ""
@@ -221,7 +223,7 @@ def _change(role: str, before: Mapping[str, str], now: Mapping[str, str]) -> str
     return f"{role} has another content ({', '.join(names or before)})"
 
 
-def _agreed(opened: Store, name: str) -> ClassScheme | None:
+def _agree_classes(opened: Store, name: str) -> ClassScheme | None:
     """Return the classes that the store's other maps share; None while none of them has any."""
     for other in opened.maps():
         if other == name:

@@ -13,21 +13,21 @@ from itertools import chain
 from pathlib import Path
 from typing import Any, TypeVar
 
-from tcpipe.errors import StoreError, TcpipeError, UsageError, plain_lines
+from tcpipe.errors import StoreError, TcpipeError, UsageError, clean_lines
 from tcpipe.formats.bucket import open_place
 from tcpipe.formats.bucket_directories import find_newest
 from tcpipe.formats.commit_log import LOG
-from tcpipe.formats.commits import Call, Dataset, Entries, Failure, Problem, Sighting, State, Superseded
+from tcpipe.formats.commits import CallRecord, Dataset, Entries, Failure, LogSnapshot, Problem, State, Superseded
 from tcpipe.formats.dataset_card import DatasetCard
 from tcpipe.formats.dataset_files import CARD
-from tcpipe.formats.json_files import Json, plain, to_json, typed
+from tcpipe.formats.integrity import seal_document
+from tcpipe.formats.json_files import Json, parse_typed, to_json, to_plain
 from tcpipe.formats.maps.map_files import open_map
-from tcpipe.formats.numbered import read_sealed_at, stem_and_number
+from tcpipe.formats.numbered_documents import read_sealed_at, split_number
 from tcpipe.formats.object_storage import is_url
 from tcpipe.formats.place import Place
 from tcpipe.formats.run_documents import Manifest, RunJson, StoreDocument
-from tcpipe.formats.seals import sealed
-from tcpipe.formats.store_mark import MARK, is_outdated, layout_of
+from tcpipe.formats.store_document import MARK, is_outdated, read_layout
 from tcpipe.pipeline.log_writer import is_committed, open_log
 from tcpipe.recipe import SplitConfig
 from tcpipe.store import Store
@@ -70,7 +70,7 @@ class Migrated:
             count = f"nothing to do: {self.current} documents are current"
         head = f"{count}; {self.copied} files copied" if self.copied else count
         done = (f"migrated: {path}" for path in self.migrated)
-        return plain_lines((f"{self.path}: {head}", *done, *(f"problem: {problem}" for problem in self.problems)))
+        return clean_lines((f"{self.path}: {head}", *done, *(f"problem: {problem}" for problem in self.problems)))
 
 
 def migrate(path: Path | str, to: Path | str | None = None) -> Migrated:
@@ -90,7 +90,7 @@ def migrate(path: Path | str, to: Path | str | None = None) -> Migrated:
         raise UsageError(
             f"{path}: is a store of data model 1, which this version does not read, or an incomplete copy (no {MARK})"
         )
-    if (version := layout_of(source)) is not None:
+    if (version := read_layout(source)) is not None:
         if version not in _KNOWN_VERSIONS:
             raise UsageError(f"{path}: is of data model {version}, this version knows {', '.join(_KNOWN_VERSIONS)}")
         return _store(source, source if to is None else open_place(to))
@@ -120,8 +120,8 @@ def _bring_card(place: Place) -> tuple[str, ...]:
     document = _bring_document(found, where)
     if document is found:
         return ()
-    typed(document, DatasetCard, where)
-    place.put(CARD, to_json(sealed(document)).encode())
+    parse_typed(document, DatasetCard, where)
+    place.put(CARD, to_json(seal_document(document)).encode())
     return (where,)
 
 
@@ -138,11 +138,11 @@ def _store(source: Place, target: Place) -> Migrated:
             problems += error.problems
         if data is not None and target.read(name) != data:
             target.put(name, data)
-            migrated += [target.where(name)] if layout_of(source) != DATA_MODEL_VERSION else []
+            migrated += [target.where(name)] if read_layout(source) != DATA_MODEL_VERSION else []
     records = [name for name in names if name.startswith(_RECORDS)]
-    if records or layout_of(target) != DATA_MODEL_VERSION:
+    if records or read_layout(target) != DATA_MODEL_VERSION:
         problems += _write_log(Store(target.where()), source, records)
-    mark = to_json(sealed(StoreDocument(DATA_MODEL_VERSION))).encode()
+    mark = to_json(seal_document(StoreDocument(DATA_MODEL_VERSION))).encode()
     if target.read(MARK) != mark:
         target.put(MARK, mark)
     for name in (name for name in names if target == source and name.startswith((_RECORDS, f"{_INDEX}logs."))):
@@ -151,7 +151,7 @@ def _store(source: Place, target: Place) -> Migrated:
 
 
 def _is_document(name: str) -> bool:
-    of = stem_and_number(name.rpartition("/")[2])
+    of = split_number(name.rpartition("/")[2])
     return of is not None and of[0] in ("run", "manifest", "tags")
 
 
@@ -176,15 +176,15 @@ def _bring(place: Place, name: str) -> bytes:
     document = _bring_document(found, where) if kind == "manifest" else _bring_run(found) if kind == "run" else found
     if document is found:
         return place.read(name) or b""
-    typed(document, Manifest if kind == "manifest" else RunJson, where)
-    return to_json(sealed(document)).encode()
+    parse_typed(document, Manifest if kind == "manifest" else RunJson, where)
+    return to_json(seal_document(document)).encode()
 
 
 def _bring_run(found: Document) -> Document:
     """Return what is known of a log, with ``findings`` as ``report``."""
     if "findings" not in found:
         return found
-    return {**_without(found, "findings"), "report": _with_findings(found["findings"], "run", "")}
+    return {**_remove_keys(found, "findings"), "report": _convert_findings(found["findings"], "run", "")}
 
 
 def _bring_document(found: Document, where: str) -> Document:
@@ -195,41 +195,44 @@ def _bring_document(found: Document, where: str) -> Document:
     if version not in EARLIER_VERSIONS:
         known = ", ".join(_KNOWN_VERSIONS)
         raise StoreError(f"{where}: of data model {version}, this version knows {known}; left as it is")
-    document = {**_without(found, "warnings", "problems", "findings"), "data_model_version": DATA_MODEL_VERSION}
+    document = {**_remove_keys(found, "warnings", "problems", "findings"), "data_model_version": DATA_MODEL_VERSION}
     if "info" in found:
-        report = _with_findings({**found["info"]["findings"], "warnings": found["warnings"]}, "run", found["run_id"])
+        report = _convert_findings({**found["info"]["findings"], "warnings": found["warnings"]}, "run", found["run_id"])
         findings = report["findings"]
-        document |= {"info": {**_without(found["info"], "findings"), "report": report}}
+        document |= {"info": {**_remove_keys(found["info"], "findings"), "report": report}}
         document |= {"counts": _bring_counts(found["counts"])}
     else:
         own = chain(found.get("problems", ()), found.get("warnings", ()))
-        findings = _earlier(own, "dataset", str(found.get("name", "")))
-        document |= {"findings": findings, "runs": [_with_findings(run, "run", run["run_id"]) for run in found["runs"]]}
-        document |= {"maps": [_with_findings(of, "map", of["name"]) for of in found["maps"]]}
+        findings = _read_earlier(own, "dataset", str(found.get("name", "")))
+        document |= {
+            "findings": findings,
+            "runs": [_convert_findings(run, "run", run["run_id"]) for run in found["runs"]],
+        }
+        document |= {"maps": [_convert_findings(of, "map", of["name"]) for of in found["maps"]]}
         rules = {of.name for of in fields(SplitConfig)} - {"buffer_m"}  # the recipe has them
-        document |= {"split": _without(found["split"], *rules)}
-    return {**document, "verdict": plain(judge(typed(findings, tuple[Finding, ...], where)))}
+        document |= {"split": _remove_keys(found["split"], *rules)}
+    return {**document, "verdict": to_plain(judge(parse_typed(findings, tuple[Finding, ...], where)))}
 
 
 def _bring_counts(counts: Mapping[str, int]) -> dict[str, Any]:
     """Return the counts of a manifest with those of messages by role."""
     ending = "_messages"
     messages = {name.removesuffix(ending): of for name, of in counts.items() if name.endswith(ending)}
-    return {**_without(counts, *(f"{role}{ending}" for role in messages)), "messages": messages}
+    return {**_remove_keys(counts, *(f"{role}{ending}" for role in messages)), "messages": messages}
 
 
-def _without(document: Document, *names: str) -> dict[str, Any]:
+def _remove_keys(document: Document, *names: str) -> dict[str, Any]:
     return {name: of for name, of in document.items() if name not in names}
 
 
-def _with_findings(found: Document, kind: SubjectKind, name: str) -> dict[str, Any]:
+def _convert_findings(found: Document, kind: SubjectKind, name: str) -> dict[str, Any]:
     """Return a part of a document with its warnings as findings."""
-    return {**_without(found, "warnings"), "findings": _earlier(found.get("warnings", ()), kind, name)}
+    return {**_remove_keys(found, "warnings"), "findings": _read_earlier(found.get("warnings", ()), kind, name)}
 
 
-def _earlier(lines: Iterable[str], kind: SubjectKind, name: str) -> list[Json]:
+def _read_earlier(lines: Iterable[str], kind: SubjectKind, name: str) -> list[Json]:
     return [
-        plain(make_finding("earlier-warning", Subject(kind, name), names={"text": line}))
+        to_plain(make_finding("earlier-warning", Subject(kind, name), names={"text": line}))
         for line in dict.fromkeys(lines)
     ]
 
@@ -261,16 +264,16 @@ def _convert_records(records: Mapping[str, Sequence[Document]], state: State) ->
     """Return what records say and a state does not."""
 
     def read(kind: str, cls: type[T]) -> list[T]:
-        return [typed(of, cls, kind) for of in records.get(kind, ())]
+        return [parse_typed(of, cls, kind) for of in records.get(kind, ())]
 
     replaced = {(of.out, of.inputs) for of in read("replaced", Dataset)}
     superseded = sorted(records.get("superseded", ()), key=lambda of: (of["number"], of["by"] is None))
     failed = ({**of, "problems": of["lines"], "version": of.get("version") or ""} for of in records.get("failed", ()))
-    accepted = chain(*map(_acknowledged, records.get("accepted", ())))
-    calls = sorted(read("calls", Call), key=lambda of: of.begin)
+    accepted = chain(*map(_iterate_acknowledged, records.get("accepted", ())))
+    calls = sorted(read("calls", CallRecord), key=lambda of: of.begin)
     return Entries(
-        seen=tuple(of for of in read("logs", Sighting) if not state.has_seen(of)),
-        failed=tuple(of for of in typed([*failed], list[Failure], "failed") if of.key not in state.failed),
+        seen=tuple(of for of in read("logs", LogSnapshot) if not state.has_seen(of)),
+        failed=tuple(of for of in parse_typed([*failed], list[Failure], "failed") if of.key not in state.failed),
         acknowledged=tuple(of for of in accepted if of.key not in state.acknowledged),
         superseded=() if state.supersessions else tuple(Superseded(of["run_id"], of["by"]) for of in superseded),
         datasets=tuple(
@@ -280,7 +283,7 @@ def _convert_records(records: Mapping[str, Sequence[Document]], state: State) ->
     )
 
 
-def _acknowledged(of: Document) -> Iterator[Problem]:
+def _iterate_acknowledged(of: Document) -> Iterator[Problem]:
     """Yield the problems of which somebody said so; that a call was killed is not carried over."""
     name = of.get("run_id") or " + ".join(of["log"])
     kind: SubjectKind = "run" if of.get("run_id") else "log"

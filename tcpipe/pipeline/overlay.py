@@ -16,7 +16,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from tcpipe.errors import LogError, StoreError, UsageError, plain_lines
+from tcpipe.errors import LogError, StoreError, UsageError, clean_lines
 from tcpipe.formats.logs.log_file import open_log
 from tcpipe.formats.logs.writing import MessageStream, write_mcap
 from tcpipe.formats.parquet import read_table
@@ -24,8 +24,8 @@ from tcpipe.formats.stored_runs import RunDirectory
 from tcpipe.geometry.rotation import quat_from_rpy
 from tcpipe.logs.roles import NAV_SAT_FIX, OVERLAY, POSE_STAMPED
 from tcpipe.store import Store, run_at
-from tcpipe.tables.arrays import numbers, text_column, texts
-from tcpipe.tables.bits import DropReason, Quality, names_of
+from tcpipe.tables.arrays import make_text_column, to_numbers, to_texts
+from tcpipe.tables.bits import DropReason, Quality, flag_names
 from tcpipe.tables.segment_columns import GEOMETRY
 
 GEOJSON = "foxglove_msgs/msg/GeoJSON"
@@ -61,10 +61,10 @@ class Overlay:
     def __str__(self) -> str:
         """Return the file and its topics, a line each."""
         said = (f"{count:>9} messages  {topic}" for topic, count in self.messages.items())
-        return plain_lines((f"{self.path}: run {self.run_id} under recipe {self.recipe_id}, on its log's clock", *said))
+        return clean_lines((f"{self.path}: run {self.run_id} under recipe {self.recipe_id}, on its log's clock", *said))
 
 
-def overlay(path: Path | str, out: Path) -> Overlay:
+def write_overlay(path: Path | str, out: Path) -> Overlay:
     """Write what became of a run as an MCAP of ROS 2 messages, whole or not at all; the same run gives the same bytes.
 
     Parameters
@@ -86,7 +86,7 @@ def overlay(path: Path | str, out: Path) -> Overlay:
         names = ", ".join(run.recipe_id for run in runs)
         raise UsageError(f"{path}: was ingested under several recipes; give one of them: {path}/… {names}")
     _refuse_others(out)
-    streams = list(_streams(store, runs[0]))
+    streams = list(_iterate_streams(store, runs[0]))
     write_mcap(out, streams)
     count: dict[str, int] = {}
     for stream in streams:
@@ -106,35 +106,37 @@ def _refuse_others(out: Path) -> None:
         raise UsageError(f"{out}: is there, and no overlay; give another name")
 
 
-def _streams(store: Store, run: RunDirectory) -> Iterator[MessageStream]:
+def _iterate_streams(store: Store, run: RunDirectory) -> Iterator[MessageStream]:
     """Yield every topic's messages."""
-    clock = _recorder_clock(store, run)
+    clock = _find_recorder_clock(store, run)
     track, segments, refused = run.track(), run.segments().drop_columns([GEOMETRY]), run.rejections()
-    rows = _named(track.table, "dropped_by", DropReason, "reasons", "kept")
-    cut = _named(segments, "quality", Quality, "quality_names", "clean")
-    times = clock(_column(rows, "stamp_ns"), _column(rows, "epoch"))
+    rows = _add_bit_names(track.table, "dropped_by", DropReason, "reasons", "kept")
+    cut = _add_bit_names(segments, "quality", Quality, "quality_names", "clean")
+    times = clock(_read_column(rows, "stamp_ns"), _read_column(rows, "epoch"))
     if track.info.datum is not None:
-        yield _fixes(rows, times)
+        yield _make_fixes(rows, times)
         if len(times):
             geojson = json.dumps(
-                {"type": "FeatureCollection", "features": [*_dropped_lines(rows), *_segment_lines(cut)]}
+                {"type": "FeatureCollection", "features": [*_iterate_dropped_lines(rows), *_iterate_segment_lines(cut)]}
             )
             yield MessageStream(
                 f"{OVERLAY}segments", GEOJSON, times[:1], {}, {"geojson": geojson}, definition="string geojson\n"
             )
-    yield _poses(rows, times)
-    yield from _messages("track", "stamp_ns", rows, times)
-    yield from _gates(texts(rows.column("reasons")), times)
-    yield from _messages("segment", "start_ns", cut, clock(_column(cut, "start_ns"), _column(cut, "epoch")))
-    yield from _messages("refused", "stamp_ns", refused, clock(_column(refused, "stamp_ns"), None))
+    yield _make_poses(rows, times)
+    yield from _iterate_messages("track", "stamp_ns", rows, times)
+    yield from _iterate_masks(to_texts(rows.column("reasons")), times)
+    yield from _iterate_messages(
+        "segment", "start_ns", cut, clock(_read_column(cut, "start_ns"), _read_column(cut, "epoch"))
+    )
+    yield from _iterate_messages("refused", "stamp_ns", refused, clock(_read_column(refused, "stamp_ns"), None))
 
 
 class _Clock:
     """When the recorder received what was measured at a time, by the messages of one role; in between the delay is interpolated."""
 
     def __init__(self, rows: pa.Table) -> None:
-        self._epoch, stamps = _column(rows, "epoch"), _column(rows, "stamp_ns")
-        self._stamp_ns, self._behind_ns = stamps, (_column(rows, "log_time_ns") - stamps).astype(np.float64)
+        self._epoch, stamps = _read_column(rows, "epoch"), _read_column(rows, "stamp_ns")
+        self._stamp_ns, self._behind_ns = stamps, (_read_column(rows, "log_time_ns") - stamps).astype(np.float64)
 
     def __call__(self, stamp_ns: Ints, epoch: Ints | None) -> Ints:
         """Return the log time of each stamp [ns]; without epochs a stamp is of the first that holds it."""
@@ -157,7 +159,7 @@ class _Clock:
         return epoch
 
 
-def _recorder_clock(store: Store, run: RunDirectory) -> _Clock:
+def _find_recorder_clock(store: Store, run: RunDirectory) -> _Clock:
     """Return the clock of a run's log; `StoreError` where its streams are not those that the run was made from."""
     known = store.run_json(run.run_id)
     if known is None or known.streams_key != run.streams_key or not known.streams:
@@ -167,43 +169,43 @@ def _recorder_clock(store: Store, run: RunDirectory) -> _Clock:
     return _Clock(max(tables, key=lambda table: table.num_rows))
 
 
-def _column(table: pa.Table, name: str) -> NDArray[Any]:
-    return numbers(table.column(name))
+def _read_column(table: pa.Table, name: str) -> NDArray[Any]:
+    return to_numbers(table.column(name))
 
 
-def _named(table: pa.Table, column: str, flags: type[DropReason | Quality], name: str, none: str) -> pa.Table:
+def _add_bit_names(table: pa.Table, column: str, flags: type[DropReason | Quality], name: str, none: str) -> pa.Table:
     """Return the table with the names of its bits as a text column."""
-    bits = _column(table, column)
-    told = {int(value): ", ".join(names_of(int(value), flags)) or none for value in np.unique(bits)}
-    return table.append_column(name, text_column([told[int(value)] for value in bits]))
+    bits = _read_column(table, column)
+    told = {int(value): ", ".join(flag_names(int(value), flags)) or none for value in np.unique(bits)}
+    return table.append_column(name, make_text_column([told[int(value)] for value in bits]))
 
 
-def _header(stamp_ns: Ints) -> dict[str, NDArray[Any]]:
+def _make_header(stamp_ns: Ints) -> dict[str, NDArray[Any]]:
     return {"header.stamp.sec": stamp_ns // 10**9, "header.stamp.nanosec": stamp_ns % 10**9}
 
 
-def _fixes(rows: pa.Table, times: Ints) -> MessageStream:
+def _make_fixes(rows: pa.Table, times: Ints) -> MessageStream:
     """Return the track as NavSatFix, in the datum of the log's own fixes, its variances beside."""
-    columns = _header(_column(rows, "stamp_ns"))
+    columns = _make_header(_read_column(rows, "stamp_ns"))
     columns |= {
-        name: _column(rows, f"{name[:3]}_{unit}")
+        name: _read_column(rows, f"{name[:3]}_{unit}")
         for name, unit in (("longitude", "deg"), ("latitude", "deg"), ("altitude", "m"))
     }
     covariance = np.zeros((len(times), 9))
-    covariance[:, ::4] = np.stack([_column(rows, f"{axis}_std_m") for axis in "xyz"], axis=-1) ** 2
+    covariance[:, ::4] = np.stack([_read_column(rows, f"{axis}_std_m") for axis in "xyz"], axis=-1) ** 2
     constants = {"header.frame_id": "base_link", "position_covariance_type": _DIAGONAL_KNOWN}
     return MessageStream(f"{OVERLAY}fix", NAV_SAT_FIX, times, columns | {"position_covariance": covariance}, constants)
 
 
-def _poses(rows: pa.Table, times: Ints) -> MessageStream:
-    columns = _header(_column(rows, "stamp_ns"))
-    columns |= {f"pose.position.{axis}": _column(rows, f"{axis}_m") for axis in "xyz"}
-    quat = quat_from_rpy(*(_column(rows, f"{name}_rad") for name in ("roll", "pitch", "yaw")))
+def _make_poses(rows: pa.Table, times: Ints) -> MessageStream:
+    columns = _make_header(_read_column(rows, "stamp_ns"))
+    columns |= {f"pose.position.{axis}": _read_column(rows, f"{axis}_m") for axis in "xyz"}
+    quat = quat_from_rpy(*(_read_column(rows, f"{name}_rad") for name in ("roll", "pitch", "yaw")))
     columns |= {f"pose.orientation.{axis}": quat[:, at] for at, axis in enumerate("xyzw")}
     return MessageStream(f"{OVERLAY}pose", POSE_STAMPED, times, columns, {"header.frame_id": _FRAME})
 
 
-def _gates(reasons: NDArray[np.str_], times: Ints) -> Iterator[MessageStream]:
+def _iterate_masks(reasons: NDArray[np.str_], times: Ints) -> Iterator[MessageStream]:
     """Yield why rows are not used, a message where that changes."""
     changes = np.flatnonzero(np.append(True, reasons[1:] != reasons[:-1])[: len(reasons)])
     for reason in np.unique(reasons):
@@ -211,18 +213,18 @@ def _gates(reasons: NDArray[np.str_], times: Ints) -> Iterator[MessageStream]:
         yield MessageStream(f"{OVERLAY}gate", "std_msgs/msg/String", at, {}, {"data": str(reason)})
 
 
-def _messages(name: str, stamp: str, table: pa.Table, times: Ints) -> Iterator[MessageStream]:
+def _iterate_messages(name: str, stamp: str, table: pa.Table, times: Ints) -> Iterator[MessageStream]:
     """Yield the rows of a table as messages of a type of their own: a field a column, null as NaN; rows of equally long texts together."""
     kinds = {field.name: _ROS_TYPES[field.type] for field in table.schema}
     definition = "std_msgs/Header header\n" + "".join(f"{kind} {of}\n" for of, kind in kinds.items())
-    columns = _header(_column(table, stamp))
+    columns = _make_header(_read_column(table, stamp))
     lengths = np.zeros((len(times), 0), np.int64)
     for of, kind in kinds.items():
         if kind == "string":
-            columns[of] = np.char.encode(texts(table.column(of)), "utf-8") if len(times) else np.empty(0, "S1")
+            columns[of] = np.char.encode(to_texts(table.column(of)), "utf-8") if len(times) else np.empty(0, "S1")
             lengths = np.column_stack([lengths, np.char.str_len(columns[of])])
         else:
-            columns[of] = _column(table, of)
+            columns[of] = _read_column(table, of)
     for length in np.unique(lengths, axis=0) if len(times) else lengths[:1]:
         rows = (lengths == length).all(axis=-1)
         sizes = iter(length.tolist())
@@ -236,30 +238,34 @@ def _messages(name: str, stamp: str, table: pa.Table, times: Ints) -> Iterator[M
         )
 
 
-def _line(lonlat: Sequence[Sequence[float]], colour: str, properties: Mapping[str, Any]) -> dict[str, Any]:
+def _make_line(lonlat: Sequence[Sequence[float]], colour: str, properties: Mapping[str, Any]) -> dict[str, Any]:
     geometry = {"type": "LineString", "coordinates": lonlat}
     return {"type": "Feature", "geometry": geometry, "properties": {**properties, "style": {"color": colour}}}
 
 
-def _segment_lines(segments: pa.Table) -> Iterator[dict[str, Any]]:
+def _iterate_segment_lines(segments: pa.Table) -> Iterator[dict[str, Any]]:
     """Yield a GeoJSON line a segment, with its labels and quality."""
     for row in segments.select(["segment_id", *_ENDS, *_LABELS, "quality_names"]).to_pylist():
         lonlat = [row.pop(name) for name in _ENDS]
-        yield _line([lonlat[:2], lonlat[2:]], _SEGMENT_COLOUR, {"name": row["segment_id"], **row})
+        yield _make_line([lonlat[:2], lonlat[2:]], _SEGMENT_COLOUR, {"name": row["segment_id"], **row})
 
 
 _ENDS = ("start_lon_deg", "start_lat_deg", "end_lon_deg", "end_lat_deg")
 
 
-def _dropped_lines(rows: pa.Table) -> Iterator[dict[str, Any]]:
+def _iterate_dropped_lines(rows: pa.Table) -> Iterator[dict[str, Any]]:
     """Yield a GeoJSON line for each stretch of one gate, and why."""
-    reasons, bits, epoch = texts(rows.column("reasons")), _column(rows, "dropped_by"), _column(rows, "epoch")
-    lonlat = np.stack([_column(rows, "lon_deg"), _column(rows, "lat_deg")], axis=-1)
+    reasons, bits, epoch = (
+        to_texts(rows.column("reasons")),
+        _read_column(rows, "dropped_by"),
+        _read_column(rows, "epoch"),
+    )
+    lonlat = np.stack([_read_column(rows, "lon_deg"), _read_column(rows, "lat_deg")], axis=-1)
     breaks = np.flatnonzero((np.diff(bits.astype(np.int64)) != 0) | (np.diff(epoch) != 0)) + 1
     for part in np.split(np.arange(len(bits)), breaks):
         if len(part) > 1 and bits[part[0]]:
             vertices = np.append(part[:-1:_ROWS_A_VERTEX], part[-1])
-            yield _line(
+            yield _make_line(
                 lonlat[vertices].tolist(),
                 _DROPPED_COLOUR,
                 {"name": str(reasons[part[0]]), "gate": str(reasons[part[0]])},

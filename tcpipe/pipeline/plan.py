@@ -8,11 +8,11 @@ from dataclasses import dataclass
 from typing import Literal, TypeAlias, get_args
 
 from tcpipe import __version__
-from tcpipe.formats.commits import Call, Failure, State
+from tcpipe.formats.commits import CallRecord, Failure, State
 from tcpipe.formats.finding_lines import describe_finding
 from tcpipe.formats.index_files import RunFacts
 from tcpipe.formats.recipe_toml import ingest_key
-from tcpipe.pipeline.ingest_task import IngestTask, too_young
+from tcpipe.pipeline.ingest_task import IngestTask, check_age
 from tcpipe.pipeline.problems import find_problems, is_acknowledged, make_failure
 from tcpipe.tables.findings import Finding
 
@@ -81,7 +81,7 @@ def plan(
             made.setdefault(row.log.source.sha256, []).append(row)
     for failure in state.failed.values():
         failures.setdefault(failure.content, []).append(failure)
-    known = _Known(state, made, failures, failed_for_now(state.calls), names)
+    known = _Known(state, made, failures, list_transient_failures(state.calls), names)
     return tuple(_decide(task, known, now_ns) for task in tasks)
 
 
@@ -94,23 +94,23 @@ def _decide(task: IngestTask, known: _Known, now_ns: int) -> Step:
     failed = None if task.force or task.retry_failed else known.state.failed.get(task.failure_key)
     if failed is not None:
         acknowledged = is_acknowledged([make_failure(failed.content, failed.log)], known.state)
-        cause = _without_name("".join(failed.problems[:1]), task)
+        cause = _remove_name("".join(failed.problems[:1]), task)
         standing: Standing = "quarantined" if acknowledged else "failed_permanent"
         return Step(task, standing, cause, failure=failed, findings=failed.findings)
-    if too_young(task, now_ns):
-        return Step(task, "growing", has_failed=_content(task) in known.failures)
+    if check_age(task, now_ns):
+        return Step(task, "growing", has_failed=_describe_content(task) in known.failures)
     if source.name in known.passing:
-        return Step(task, "failed_transient", _without_name(known.passing[source.name], task))
+        return Step(task, "failed_transient", _remove_name(known.passing[source.name], task))
     if current is not None:
         return Step(task, "outdated", "its tags change")
     return (
-        Step(task, "outdated", _why_outdated(made[-1], task))
+        Step(task, "outdated", _describe_outdated(made[-1], task))
         if made
-        else Step(task, "pending", _why_pending(task, known), has_failed=_content(task) in known.failures)
+        else Step(task, "pending", _describe_pending(task, known), has_failed=_describe_content(task) in known.failures)
     )
 
 
-def _content(task: IngestTask) -> str:
+def _describe_content(task: IngestTask) -> str:
     return task.source.sha256 or task.source.files_digest
 
 
@@ -128,12 +128,12 @@ def _stand(task: IngestTask, made: RunFacts, state: State) -> Step:
     return Step(task, "empty" if made.is_empty else "partial", cause, made, findings=findings)
 
 
-def _why_pending(task: IngestTask, known: _Known) -> str:
+def _describe_pending(task: IngestTask, known: _Known) -> str:
     """Return why a log that was seen before is to be ingested; "" of a new one."""
     sha256 = task.source.sha256
-    if before := known.failures.get(_content(task)):
+    if before := known.failures.get(_describe_content(task)):
         acknowledged = is_acknowledged([make_failure(of.content, of.log) for of in before], known.state)
-        return f"{_how_it_failed(before, task)}{', acknowledged' if acknowledged else ''}; to be tried again"
+        return f"{_describe_failure(before, task)}{', acknowledged' if acknowledged else ''}; to be tried again"
     if task.force:
         return "to be done again if it is there already"
     if sha256 and any(run_id.endswith(f"-{sha256[:8]}") for run_id in known.broken):
@@ -141,7 +141,7 @@ def _why_pending(task: IngestTask, known: _Known) -> str:
     return "its content is another than before" if task.source.lineage in known.state.seen and not sha256 else ""
 
 
-def _how_it_failed(before: Sequence[Failure], task: IngestTask) -> str:
+def _describe_failure(before: Sequence[Failure], task: IngestTask) -> str:
     if task.force or task.retry_failed:
         return "failed before"
     latest = max(of.version for of in before)
@@ -150,7 +150,7 @@ def _how_it_failed(before: Sequence[Failure], task: IngestTask) -> str:
     return "failed under another recipe, for another robot or with other message definitions"
 
 
-def _why_outdated(made: RunFacts, task: IngestTask) -> str:
+def _describe_outdated(made: RunFacts, task: IngestTask) -> str:
     """Return in which an ingestion differs from what would be made now."""
     if made.ingest_key != ingest_key(task.recipe):
         return f"made under another recipe ({made.recipe_id})"
@@ -159,7 +159,7 @@ def _why_outdated(made: RunFacts, task: IngestTask) -> str:
     return "made for another robot, or with other message definitions"
 
 
-def failed_for_now(calls: Sequence[Call]) -> dict[str, str]:
+def list_transient_failures(calls: Sequence[CallRecord]) -> dict[str, str]:
     """Return the logs whose latest failure may pass, and what that was."""
     found: dict[str, str] = {}
     for call in reversed(calls):
@@ -167,7 +167,7 @@ def failed_for_now(calls: Sequence[Call]) -> dict[str, str]:
     return found
 
 
-def _without_name(line: str, task: IngestTask) -> str:
+def _remove_name(line: str, task: IngestTask) -> str:
     """Return what is wrong without the name of the log."""
     for name in (task.source.name, *task.source.origins):
         line = line.replace(f"{name}: ", "").replace(name, "it")

@@ -14,23 +14,23 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.errors import TcpipeError, plain_lines
+from tcpipe.errors import TcpipeError, clean_lines
 from tcpipe.formats.finding_lines import format_findings, format_loss, format_verdict
-from tcpipe.formats.logs.joined import opened
-from tcpipe.formats.object_storage import is_url, shown_path
-from tcpipe.formats.robot_files import profiles_of
+from tcpipe.formats.logs.log_joining import open_single_log
+from tcpipe.formats.object_storage import format_path, is_url
+from tcpipe.formats.robot_files import load_profiles
 from tcpipe.logs.roles import OVERLAY
 from tcpipe.logs.simulated_clock import CLOCK
 from tcpipe.logs.topics import Topic
-from tcpipe.motion.remedies import StoreLoss, losses_of
+from tcpipe.motion.remedies import StoreLoss, find_largest_losses
 from tcpipe.motion.vibration import LEAST_RATE_HZ
 from tcpipe.pipeline.log_inspection import InspectedLog, inspect_log
 from tcpipe.pipeline.run_stages import run_stages
 from tcpipe.recipe import ReadConfig, Recipe, Role
 from tcpipe.stages.read import read_run
-from tcpipe.stages.read_roles import find_read_config, roles_by
-from tcpipe.tables.catalogue import threshold
-from tcpipe.tables.columns import integers
+from tcpipe.stages.read_roles import decide_roles, find_read_config
+from tcpipe.tables.catalogue import read_threshold
+from tcpipe.tables.columns import to_integers
 from tcpipe.tables.facts import NOTHING_FOUND, EnergyBudget, StageFacts
 from tcpipe.tables.findings import Finding, Subject, make_finding, sort_findings
 from tcpipe.tables.levels import LabelledSegments
@@ -47,7 +47,7 @@ MISSING: Mapping[Role, str] = {
 
 WANTED_HZ: Mapping[str, float] = {
     "imu": LEAST_RATE_HZ,
-    **{role: threshold("rate-too-low", f"{role}_hz") for role in ("gnss", "wheel_odometry", "visual_odometry")},
+    **{role: read_threshold("rate-too-low", f"{role}_hz") for role in ("gnss", "wheel_odometry", "visual_odometry")},
 }
 """Slower topics cost precision or columns; the rate of power depends on its source (`tcpipe.cost.quality`)."""
 
@@ -80,7 +80,7 @@ class RoleTopic:
 
 
 @dataclass(frozen=True, slots=True)
-class Promise:
+class ExpectedYield:
     """What the excerpt gives; rates are an hour's, of recording and of driving (standing left out)."""
 
     span_s: float
@@ -127,7 +127,7 @@ class Preflight:
 
     log: str
     robot: str | None
-    promise: Promise | None
+    promise: ExpectedYield | None
     """None where ingesting it would fail."""
     topics: tuple[RoleTopic, ...]
     problems: tuple[str, ...]
@@ -156,7 +156,7 @@ class Preflight:
         rates = ", ".join(name if hz is None else f"{name} at {hz:.3g} Hz" for name, hz in self.large.items())
         said += [f"large     images and point clouds, not recorded by that: {rates}"] if rates else []
         said += ["ready: no problems found"] if self.exit_code == 0 else []
-        return plain_lines(said)
+        return clean_lines(said)
 
 
 def _rate(of: RoleTopic) -> str:
@@ -180,11 +180,11 @@ def preflight(
     """
     robot = robot or recipe.robot
     path = log if is_url(log) else Path(log)
-    with opened(path, message_definitions=message_definitions, tables=recipe.tables) as found:
-        seen = replace(inspect_log(found, recipe, robot, full=False), path=shown_path(log))
+    with open_single_log(path, message_definitions=message_definitions, tables=recipe.tables) as found:
+        seen = replace(inspect_log(found, recipe, robot, full=False), path=format_path(log))
         topics = tuple(found.topics.values())
         read = find_read_config(recipe, found.topics)
-        cast = roles_by(read, topics, robot, known=profiles_of(recipe))
+        cast = decide_roles(read, topics, robot, known=load_profiles(recipe))
         large = {of.name: of.rate_hz for of in seen.topics or () if of.type in LARGE_TYPES and of.role is None}
         kept = [of.name for of in topics if of.name not in large and not of.name.startswith(OVERLAY)]
         record = record_command(topics, kept)
@@ -192,7 +192,7 @@ def preflight(
         missing = tuple(find_missing(cast.roles, read))
         labelled, problems, causes = None, tuple[str, ...](), tuple[Finding, ...]()
         try:
-            streams = read_run(found, read, robot=robot, known=profiles_of(recipe))
+            streams = read_run(found, read, robot=robot, known=load_profiles(recipe))
             labelled = run_stages(streams, recipe.ingest, run_id="preflight")[2]
         except TcpipeError as error:
             problems, causes = error.problems, error.findings
@@ -209,8 +209,8 @@ def _summarize(
     problems: tuple[str, ...],
 ) -> Preflight:
     report = labelled.info.report if labelled else NOTHING_FOUND
-    promise = _promise(labelled) if labelled else None
-    topics = tuple(_topics(report.facts, seen.duration_s or 0.0))
+    promise = _estimate_yield(labelled) if labelled else None
+    topics = tuple(_iterate_topics(report.facts, seen.duration_s or 0.0))
     findings = [*missing, *find_slow(topics, promise, seen.duration_s or 0.0)]
     for more in (report.findings, seen.findings or ()):
         made = {(of.code, of.subject) for of in findings}
@@ -224,26 +224,26 @@ def _summarize(
         problems=problems,
         findings=tuple(sort_findings(findings)),
         verdict=judge(findings),
-        losses=_largest_losses(promise),
+        losses=_find_largest_losses(promise),
         record=record,
         large=large,
         exit_code=0 if ready else 3 if promise else 1,
     )
 
 
-def _promise(labelled: LabelledSegments) -> Promise:
+def _estimate_yield(labelled: LabelledSegments) -> ExpectedYield:
     facts, ledger_m = labelled.info.report.facts, labelled.ledger_m
     cut, label = facts.segment, facts.label
     seconds = cut.ledger_s if cut else {}
     span_s, count = math.fsum(seconds.values()), labelled.table.num_rows
     hourly = 3600.0 * count / span_s if span_s else 0.0
     moving_s = span_s - seconds.get("standing", 0.0)
-    return Promise(
+    return ExpectedYield(
         span_s=span_s,
         driven_m=math.fsum(ledger_m.values()),
         segments=count,
         segments_per_hour=hourly,
-        segments_per_hour_std=_hourly_std(integers(labelled.table, "start_ns"), span_s),
+        segments_per_hour_std=_compute_hourly_std(to_integers(labelled.table, "start_ns"), span_s),
         segments_per_driven_hour=3600.0 * count / moving_s if moving_s > 0.0 else 0.0,
         ledger_m=ledger_m,
         relative_std_median=label.relative_std_median if label and count else {},
@@ -251,7 +251,7 @@ def _promise(labelled: LabelledSegments) -> Promise:
     )
 
 
-def _hourly_std(start_ns: NDArray[np.int64], span_s: float) -> float | None:
+def _compute_hourly_std(start_ns: NDArray[np.int64], span_s: float) -> float | None:
     windows = int(span_s // _WINDOW_S)
     if windows < _FEWEST_WINDOWS:
         return None
@@ -260,7 +260,7 @@ def _hourly_std(start_ns: NDArray[np.int64], span_s: float) -> float | None:
     return float(3600.0 / span_s * math.sqrt(windows) * counts.std(ddof=1))
 
 
-def _topics(facts: StageFacts, span_s: float) -> Iterator[RoleTopic]:
+def _iterate_topics(facts: StageFacts, span_s: float) -> Iterator[RoleTopic]:
     for role, of in facts.roles.items():
         for name, topic in of.topics.items():
             whole = (topic.rate_hz or 0.0) * span_s
@@ -282,14 +282,14 @@ def find_missing(roles: Collection[str], read: ReadConfig) -> Iterator[Finding]:
             yield replace(found, severity="warning") if found.severity == "note" else found
 
 
-def find_slow(topics: Sequence[RoleTopic], promise: Promise | None, span_s: float) -> Iterator[Finding]:
+def find_slow(topics: Sequence[RoleTopic], promise: ExpectedYield | None, span_s: float) -> Iterator[Finding]:
     """Yield what is too slow, too short or absent for a part of the time to record a day in this way."""
     for of in topics:
         subject, names = Subject("role", of.role), {"topic": of.topic}
-        least_hz = threshold("rate-too-low", "min_rate_fraction") * (of.wanted_hz or 0.0)
+        least_hz = read_threshold("rate-too-low", "min_rate_fraction") * (of.wanted_hz or 0.0)
         if of.rate_hz is not None and of.wanted_hz is not None and of.rate_hz < least_hz:
             yield make_finding("rate-too-low", subject, names=names, rate_hz=of.rate_hz, wanted_hz=of.wanted_hz)
-        if of.role != "command" and of.there < threshold("topic-incomplete", "min_present_fraction"):
+        if of.role != "command" and of.there < read_threshold("topic-incomplete", "min_present_fraction"):
             yield make_finding("topic-incomplete", subject, names=names, present_fraction=of.there)
     budget = promise.energy_budget if promise else None
     if budget is not None and _is_ruled_by_rate(budget):
@@ -299,18 +299,18 @@ def find_slow(topics: Sequence[RoleTopic], promise: Promise | None, span_s: floa
             total_fraction=budget.total,
             at_20_hz_fraction=budget.at_20_hz,
         )
-    if promise is not None and span_s < threshold("log-too-short", "min_span_s"):
+    if promise is not None and span_s < read_threshold("log-too-short", "min_span_s"):
         yield make_finding("log-too-short", Subject("log", "log"), length_s=span_s)
 
 
 def _is_ruled_by_rate(budget: EnergyBudget) -> bool:
-    least_share = threshold("power-rate-dominates", "min_variance_fraction")
-    gain = threshold("power-rate-dominates", "max_remaining_fraction")
+    least_share = read_threshold("power-rate-dominates", "min_variance_fraction")
+    gain = read_threshold("power-rate-dominates", "max_remaining_fraction")
     return budget.rate**2 > least_share * budget.total**2 and budget.at_20_hz < gain * budget.total
 
 
-def _largest_losses(promise: Promise | None) -> tuple[StoreLoss, ...]:
-    losses = losses_of([promise.ledger_m] if promise else [])
+def _find_largest_losses(promise: ExpectedYield | None) -> tuple[StoreLoss, ...]:
+    losses = find_largest_losses([promise.ledger_m] if promise else [])
     return tuple(loss for loss in losses if loss.share > _WORTH_SAYING)[:_MOST_LOSSES]
 
 

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from tcpipe.errors import UsageError
-from tcpipe.formats.atomic import scratch_directory
+from tcpipe.formats.atomic import make_scratch_directory
 from tcpipe.formats.commits import Entries, Problem, State, find_lineage
 from tcpipe.formats.index_files import RunFacts
 from tcpipe.formats.stored_runs import Ingestions
-from tcpipe.pipeline.begun_calls import begun_calls
+from tcpipe.pipeline.begun_calls import list_begun_calls
 from tcpipe.pipeline.log_sources import LogSource, find_sources
 from tcpipe.pipeline.log_writer import LogWriter
 from tcpipe.store import Store, open_store
@@ -39,7 +39,7 @@ def make_failure(content: str, log: tuple[str, ...]) -> Problem:
     return Problem(Finding("log-failed", "error", Subject("log", " + ".join(log)), "rejected"), content, log)
 
 
-def incomplete_runs(found: Ingestions) -> Iterator[Problem]:
+def find_incomplete_runs(found: Ingestions) -> Iterator[Problem]:
     """Yield the runs of which files are missing."""
     for (run_id, recipe_id), lost in found.lost.items():
         finding = make_finding("run-incomplete", Subject("run", run_id), names={"file": lost.where})
@@ -57,13 +57,13 @@ def is_acknowledged(problems: Sequence[Problem], state: State) -> bool:
     return bool(problems) and all(problem.key in state.acknowledged for problem in problems)
 
 
-def known_problems(state: State) -> Iterator[Problem]:
+def find_known_problems(state: State) -> Iterator[Problem]:
     """Yield the problems that the log of a store has: of logs and runs, of killed calls, and of commits."""
     for failure in state.failed.values():
         yield make_failure(failure.content, failure.log)
     for row in state.runs.values():
         yield from find_problems(row)
-    yield from (call.problem for call in begun_calls(state) if call.state == "killed")
+    yield from (call.problem for call in list_begun_calls(state) if call.state == "killed")
     yield from state.problems
 
 
@@ -84,15 +84,19 @@ def acknowledge(names: Sequence[str], *, store: str | Path = "tcpipe-store") -> 
     """
     opened = open_store(store)
     log = LogWriter(opened, state := opened.state())
-    known = {problem.key: problem for problem in known_problems(state)}
+    known = {problem.key: problem for problem in find_known_problems(state)}
     chosen, wrong = dict[str, Problem](), list[str]()
     for name in dict.fromkeys(names):
-        found = _named(name, known.values(), state) or _lost(name, opened, state) or _waiting(name, state)
+        found = (
+            _name_problems(name, known.values(), state)
+            or _make_lost_problem(name, opened, state)
+            or _make_waiting_problem(name, state)
+        )
         if len({problem.name for problem in found}) == 1:
             chosen |= {problem.key: problem for problem in found}
         else:
             wrong.append(
-                _not_one(
+                _describe_no_match(
                     name, found, [of for of in known.values() if of.key not in state.acknowledged], state, opened.root
                 )
             )
@@ -107,7 +111,7 @@ def acknowledge(names: Sequence[str], *, store: str | Path = "tcpipe-store") -> 
     return Acknowledged(now, tuple(problem for problem in chosen.values() if problem not in now))
 
 
-def _named(name: str, known: Iterable[Problem], state: State) -> list[Problem]:
+def _name_problems(name: str, known: Iterable[Problem], state: State) -> list[Problem]:
     paths = {name, str(Path(name).absolute()), str(Path(name).resolve())}
     contents = {sighting.sha256 for path in paths for sighting in state.seen.get(find_lineage((path,)), ())}
     known = list(known)
@@ -115,28 +119,30 @@ def _named(name: str, known: Iterable[Problem], state: State) -> list[Problem]:
     return exact or [of for of in known if name in {Path(origin).name for origin in of.log}]
 
 
-def _lost(name: str, store: Store, state: State) -> list[Problem]:
+def _make_lost_problem(name: str, store: Store, state: State) -> list[Problem]:
     """Return the problem of a run of which files are missing: to acknowledge it is to give the run up."""
-    return list(incomplete_runs(store.ingestions(name, state=state))) if state.find_rows(name) else []
+    return list(find_incomplete_runs(store.ingestions(name, state=state))) if state.find_rows(name) else []
 
 
-def _waiting(name: str, state: State) -> list[Problem]:
+def _make_waiting_problem(name: str, state: State) -> list[Problem]:
     """Return the problem of a log by its path or URL that the store does not hold: nobody wants to be told that it waits."""
-    with scratch_directory() as staging:
+    with make_scratch_directory() as staging:
         sources = find_sources([name], as_one=False, staging=staging).sources
     return [make_waiting(source, "pending") for source in sources if source.lineage not in state.seen]
 
 
-def _not_one(name: str, found: Sequence[Problem], candidates: Sequence[Problem], state: State, root: object) -> str:
+def _describe_no_match(
+    name: str, found: Sequence[Problem], candidates: Sequence[Problem], state: State, root: object
+) -> str:
     if found:
-        return f"{name}: {len(found)} logs have this name; give the path of one: {_listed(found)}"
+        return f"{name}: {len(found)} logs have this name; give the path of one: {_format_list(found)}"
     if state.find_rows(name):
         return f"{name}: this run has no known problem; there is nothing to acknowledge"
-    listed = f"known problems: {_listed(candidates)}" if candidates else "there are no known problems"
+    listed = f"known problems: {_format_list(candidates)}" if candidates else "there are no known problems"
     return f"{name}: is no run or log with a known problem in {root}; {listed}"
 
 
-def _listed(problems: Sequence[Problem]) -> str:
+def _format_list(problems: Sequence[Problem]) -> str:
     names = sorted({problem.name for problem in problems})
     more = f" and {len(names) - _MOST_CANDIDATES} more" if len(names) > _MOST_CANDIDATES else ""
     return ", ".join(names[:_MOST_CANDIDATES]) + more

@@ -11,19 +11,19 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from tcpipe import __version__
-from tcpipe.errors import DatasetError, StoreError, UsageError, plain_lines
+from tcpipe.errors import DatasetError, StoreError, UsageError, clean_lines
 from tcpipe.formats.atomic import TEMPORARY_PREFIX, clear, clear_scratch, is_abandoned
 from tcpipe.formats.commits import Dataset, Entries, State
 from tcpipe.formats.dataset_files import CARD, read_card
 from tcpipe.formats.index_files import RunFacts
-from tcpipe.formats.numbered import numbers, read_sealed_at, stem_and_number
+from tcpipe.formats.numbered_documents import find_highest_numbers, read_sealed_at, split_number
 from tcpipe.formats.place import DirectoryPlace, Entry, Place
-from tcpipe.formats.recipe_toml import ingest_key, recipe_of
-from tcpipe.formats.store_mark import SPOOL
+from tcpipe.formats.recipe_toml import ingest_key, resolve_recipe
+from tcpipe.formats.store_document import SPOOL
 from tcpipe.formats.stored_runs import Ingestions
-from tcpipe.pipeline.calls import in_bytes
+from tcpipe.pipeline.call_history import format_bytes
 from tcpipe.pipeline.log_writer import LogWriter
-from tcpipe.pipeline.verify_store import strangers_in
+from tcpipe.pipeline.verify_store import find_strangers
 from tcpipe.recipe import Recipe
 from tcpipe.store import Store, open_store
 
@@ -42,7 +42,7 @@ class Leftover:
 
     def __str__(self) -> str:
         """Return it as one line."""
-        line = f"{self.what} {self.path}: {in_bytes(self.size_bytes)}"
+        line = f"{self.what} {self.path}: {format_bytes(self.size_bytes)}"
         return line if self.stays is None else f"{line}; stays: {self.stays}"
 
 
@@ -60,10 +60,10 @@ class Pruned:
     def __str__(self) -> str:
         """Return the lines as one text."""
         verb = "would be removed" if self.dry_run else "removed"
-        head = f"{self.store}: {len(self.removed)} {verb}, {in_bytes(self.size_bytes)}"
+        head = f"{self.store}: {len(self.removed)} {verb}, {format_bytes(self.size_bytes)}"
         if not self.removed:
             head = f"{self.store}: nothing to do: there is nothing to remove"
-        return plain_lines([head, *(str(each) for each in (*self.removed, *self.kept))])
+        return clean_lines([head, *(str(each) for each in (*self.removed, *self.kept))])
 
 
 def prune(
@@ -89,7 +89,7 @@ def prune(
     ------
     StoreError, UsageError, RecipeError : there is no store, or something cannot be removed; what went before is gone.
     """
-    ruling = recipe_of(recipe)
+    ruling = resolve_recipe(recipe)
     opened = open_store(store)
     log = LogWriter(opened, opened.state())
     _forget(log, forget, dry_run=dry_run)
@@ -97,22 +97,28 @@ def prune(
     unknown = set(keep) - {name for key in found.rows for name in key}
     if unknown:
         raise UsageError(f"{opened.root}: no run or recipe is called {min(unknown)}; nothing is removed")
-    referred, unread = _referred(log.state)
+    referred, unread = _find_references(log.state)
     removed, kept = list[Leftover](), list[Leftover]()
-    for what, place, parts in (*_old_recipes(opened, found, ingest_key(ruling)), *_superseded(opened, found)):
-        why = unread or _why_it_stays(place, parts, referred, keep)
-        (removed if why is None else kept).append(Leftover(what, place.where(), _size(place), why))
+    for what, place, parts in (
+        *_iterate_old_recipes(opened, found, ingest_key(ruling)),
+        *_iterate_superseded(opened, found),
+    ):
+        why = unread or _find_reason_to_stay(place, parts, referred, keep)
+        (removed if why is None else kept).append(Leftover(what, place.where(), _measure_size(place), why))
         if why is None and not dry_run:  # the commit first: nobody looks for what is about to go
             log.commit("pruned", Entries(removed=tuple(parts)))
             _remove(place)
     left = [
-        Leftover("left by a killed call", str(path), _size(DirectoryPlace(path)))
-        for path in _temporaries(opened, min_age_s)
+        Leftover("left by a killed call", str(path), _measure_size(DirectoryPlace(path)))
+        for path in _iterate_temporaries(opened, min_age_s)
     ]
     removed += left
     if left and not dry_run:
         clear(Path(opened.root))
-    for what, place, entries, why in (*_spooled(opened, min_age_s), *_replaced(opened, log.state, min_age_s, unread)):
+    for what, place, entries, why in (
+        *_iterate_spooled(opened, min_age_s),
+        *_iterate_replaced(opened, log.state, min_age_s, unread),
+    ):
         (removed if why is None else kept).extend(
             Leftover(what, place.where(of.name), of.size_bytes, why) for of in entries
         )
@@ -130,7 +136,7 @@ Parts = Sequence[tuple[str, str]]
 """Ingestions: runs and their recipes."""
 
 
-def _old_recipes(store: Store, found: Ingestions, key: str) -> Iterator[tuple[str, Place, Parts]]:
+def _iterate_old_recipes(store: Store, found: Ingestions, key: str) -> Iterator[tuple[str, Place, Parts]]:
     """Yield the ingestions that are older than one of the same run under the ruling recipe."""
     by_run: dict[str, list[RunFacts]] = {}
     for row in found.rows.values():
@@ -142,7 +148,7 @@ def _old_recipes(store: Store, found: Ingestions, key: str) -> Iterator[tuple[st
                 yield "old recipe", store.runs_place.below(f"{run_id}/{row.recipe_id}"), [(run_id, row.recipe_id)]
 
 
-def _superseded(store: Store, found: Ingestions) -> Iterator[tuple[str, Place, Parts]]:
+def _iterate_superseded(store: Store, found: Ingestions) -> Iterator[tuple[str, Place, Parts]]:
     """Yield the runs whose place another has taken that is there."""
     there = {run.run_id for run in found.finished}
     for run_id, by in found.superseded.items():
@@ -150,14 +156,14 @@ def _superseded(store: Store, found: Ingestions) -> Iterator[tuple[str, Place, P
             yield "superseded run", store.runs_place.below(run_id), [key for key in found.rows if key[0] == run_id]
 
 
-def _why_it_stays(
+def _find_reason_to_stay(
     place: Place, parts: Parts, referred: Mapping[tuple[str, str], str], keep: Sequence[str]
 ) -> str | None:
     if any(name in keep for part in parts for name in part):
         return "--keep names it"
     if why := next((referred[part] for part in parts if part in referred), None):
         return why
-    strange = next(strangers_in(place), None)
+    strange = next(find_strangers(place), None)
     return None if strange is None else f"{strange} is no file of this store"
 
 
@@ -171,7 +177,7 @@ def _forget(log: LogWriter, names: Sequence[str], *, dry_run: bool) -> None:
         log.commit("pruned", Entries(forgotten=tuple(of for each in gone.values() for of in each)))
 
 
-def _referred(state: State) -> tuple[dict[tuple[str, str], str], str | None]:
+def _find_references(state: State) -> tuple[dict[tuple[str, str], str], str | None]:
     """Return the ingestions that datasets are made of, and why each stays; and why everything does, where a commit cannot be read."""
     if state.problems:
         return {}, f"{state.problems[0].log[0]} is missing or damaged: it may name what a dataset refers to"
@@ -193,7 +199,7 @@ def is_replaced(made: Dataset) -> bool:
         return False
 
 
-def _temporaries(store: Store, min_age_s: float) -> Iterator[Path]:
+def _iterate_temporaries(store: Store, min_age_s: float) -> Iterator[Path]:
     """Yield what killed calls left on disk, if it is old enough."""
     place = store.place
     for path in sorted(place.root.glob(f"{TEMPORARY_PREFIX}*")) if isinstance(place, DirectoryPlace) else ():
@@ -205,7 +211,7 @@ _Unnamed = tuple[str, Place, list[Entry], str | None]
 """Files that no document names: what they are, where they lie, and why they stay, if they do."""
 
 
-def _spooled(store: Store, min_age_s: float) -> Iterator[_Unnamed]:
+def _iterate_spooled(store: Store, min_age_s: float) -> Iterator[_Unnamed]:
     """Yield what builds left that were killed while a cluster's workers sampled for them, if it is old enough."""
     before_ns = time.time_ns() - int(min_age_s * 1e9)
     for name in store.place.folders(SPOOL):
@@ -215,7 +221,7 @@ def _spooled(store: Store, min_age_s: float) -> Iterator[_Unnamed]:
             yield "left by a killed build", place, entries, None
 
 
-def _replaced(store: Store, state: State, min_age_s: float, unread: str | None) -> Iterator[_Unnamed]:
+def _iterate_replaced(store: Store, state: State, min_age_s: float, unread: str | None) -> Iterator[_Unnamed]:
     """Yield, by run and for the maps, documents and files that nothing names any more, if they are old enough.
 
     Files of one directory go together: its content is put there together. Where a document cannot be read they stay; so do ingestions
@@ -229,41 +235,43 @@ def _replaced(store: Store, state: State, min_age_s: float, unread: str | None) 
         place = store.place.below("maps") if run_id is None else store.runs_place.below(run_id)
         entries, rows = place.entries(), by_run.get(run_id or "", [])
         try:
-            named = set(_named_in(place, [entry.name for entry in entries], rows))
+            named = set(_iterate_named(place, [entry.name for entry in entries], rows))
             why = unread
         except StoreError as error:
             named, why = set(), error.problems[0]
-        uncommitted = _uncommitted(numbers(entry.name for entry in entries), rows) if run_id else set()
+        uncommitted = (
+            _find_uncommitted(find_highest_numbers(entry.name for entry in entries), rows) if run_id else set()
+        )
         for recipe_id in uncommitted:
             left = [entry for entry in entries if entry.name.startswith(f"{recipe_id}/")]
             yield "no commit names it", place, left, "ingest its log again, or remove it"
-        young = {_folder(entry.name) for entry in entries if entry.modified_ns >= before_ns}
-        content = [of for of in entries if stem_and_number(of.name) or _CONTENT.search(of.name)]
-        over = [of for of in content if of.name not in named and _folder(of.name) not in young]
+        young = {_find_folder(entry.name) for entry in entries if entry.modified_ns >= before_ns}
+        content = [of for of in entries if split_number(of.name) or _CONTENT.search(of.name)]
+        over = [of for of in content if of.name not in named and _find_folder(of.name) not in young]
         yield "no document names it", place, over, why
 
 
-def _uncommitted(last: Mapping[str, int], rows: Sequence[RunFacts]) -> set[str]:
+def _find_uncommitted(last: Mapping[str, int], rows: Sequence[RunFacts]) -> set[str]:
     """Return the recipes of a run with a manifest and no commit."""
     parted = (stem.partition("/") for stem in last)
     return {recipe for recipe, _, kind in parted if kind == "manifest"} - {row.recipe_id for row in rows}
 
 
-def _named_in(place: Place, names: Sequence[str], rows: Sequence[RunFacts]) -> Iterator[str]:
+def _iterate_named(place: Place, names: Sequence[str], rows: Sequence[RunFacts]) -> Iterator[str]:
     """Yield the files that the log names, those that their documents name, and the same of what no commit names but the last document."""
-    last, committed = numbers(names), {name for row in rows for name in row.files}
+    last, committed = find_highest_numbers(names), {name for row in rows for name in row.files}
     recipes = {row.recipe_id for row in rows}
     for name in names:
-        of = stem_and_number(name)
+        of = split_number(name)
         if of is None:
             continue
         is_last = of[1] == last[of[0]]
         if name in committed or (is_last and (not rows or name.partition("/")[0] not in recipes)):
-            yield from (name, *_named_by(place, name))
+            yield from (name, *_iterate_named_by(place, name))
     yield from committed
 
 
-def _named_by(place: Place, name: str) -> Iterator[str]:
+def _iterate_named_by(place: Place, name: str) -> Iterator[str]:
     """Yield the files that a document names; `StoreError` where it is not as it was written."""
     found, folder = read_sealed_at(place, name), name.rpartition("/")[0]
     for key in ("checksums", "streams"):
@@ -271,7 +279,7 @@ def _named_by(place: Place, name: str) -> Iterator[str]:
         yield from (f"{folder}/{file}" if folder else file for file in (listed if isinstance(listed, Mapping) else ()))
 
 
-def _folder(name: str) -> str:
+def _find_folder(name: str) -> str:
     """Return the directory of content in which a file lies; a document is one for itself."""
     found = _CONTENT.search(name)
     return name[: found.end()] if found else name
@@ -279,7 +287,7 @@ def _folder(name: str) -> str:
 
 def _remove(place: Place) -> None:
     """Remove a run or an ingestion: its documents first, so that no reader looks for the rest."""
-    for entry in sorted(place.entries(), key=lambda entry: stem_and_number(entry.name) is None):
+    for entry in sorted(place.entries(), key=lambda entry: split_number(entry.name) is None):
         place.delete(entry.name)
 
 
@@ -294,5 +302,5 @@ def _remove_empty(store: Store, min_age_s: float) -> None:
                 Path(above).rmdir()
 
 
-def _size(place: Place) -> int:
+def _measure_size(place: Place) -> int:
     return sum(entry.size_bytes for entry in place.entries())

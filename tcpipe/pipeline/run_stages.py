@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from tcpipe.formats.robot_files import profiles_of
+from tcpipe.formats.robot_files import load_profiles
 from tcpipe.progress import step
 from tcpipe.recipe import IngestSections
 from tcpipe.tables.levels import GatedTrack, LabelledSegments, Streams, Track
@@ -16,15 +16,15 @@ def run_stages(
     A stage gets its own section, and of the others nothing but the chord; no section that `recipe_id` is not the hash of is in reach.
     """
     from tcpipe.stages.fuse import fuse_run  # noqa: PLC0415  kernels load only when there is work
-    from tcpipe.stages.gate import gate_track  # noqa: PLC0415
     from tcpipe.stages.label import label_segments  # noqa: PLC0415
+    from tcpipe.stages.mask import mask_track  # noqa: PLC0415
     from tcpipe.stages.segment import segment_track  # noqa: PLC0415
 
-    profile = profiles_of(sections).robots[streams.robot]
+    profile = load_profiles(sections).robots[streams.robot]
     step("fusing")
     track = fuse_run(streams, sections.fuse, run_id=run_id)
     step("cutting and labelling")
-    gated = gate_track(
+    gated = mask_track(
         track,
         sections.gate,
         max_velocity_mps=profile.max_velocity_mps,

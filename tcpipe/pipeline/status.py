@@ -9,22 +9,22 @@ from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
 
-from tcpipe.errors import UsageError, plain_lines
-from tcpipe.formats.atomic import scratch_directory
-from tcpipe.formats.commit_log import uncollected
-from tcpipe.formats.commits import Call, Problem
+from tcpipe.errors import UsageError, clean_lines
+from tcpipe.formats.atomic import make_scratch_directory
+from tcpipe.formats.commit_log import pause_garbage_collection
+from tcpipe.formats.commits import CallRecord, Problem
 from tcpipe.formats.finding_lines import MOST_LINES, format_count, format_loss, format_verdict, group_findings
-from tcpipe.formats.object_storage import is_url, shown_path
-from tcpipe.formats.places import local_output
-from tcpipe.formats.recipe_toml import ingest_key, recipe_of
+from tcpipe.formats.object_storage import format_path, is_url
+from tcpipe.formats.recipe_toml import ingest_key, resolve_recipe
 from tcpipe.formats.stored_runs import Ingestions
-from tcpipe.motion.remedies import StoreLoss, losses_of
-from tcpipe.pipeline.begun_calls import BegunCall, begun_calls, is_below
-from tcpipe.pipeline.calls import INGEST, Estimate, estimate, in_time
+from tcpipe.formats.user_paths import check_local_output
+from tcpipe.motion.remedies import StoreLoss, find_largest_losses
+from tcpipe.pipeline.begun_calls import BegunCall, is_below, list_begun_calls
+from tcpipe.pipeline.call_history import INGEST, Estimate, estimate, format_duration
 from tcpipe.pipeline.ingest_task import IngestTask
-from tcpipe.pipeline.log_sources import definitions_key, find_sources, in_shard, remembered
+from tcpipe.pipeline.log_sources import find_sources, make_definitions_key, recall_hash, select_shard
 from tcpipe.pipeline.plan import STANDINGS, TROUBLE, Standing, Step, plan
-from tcpipe.pipeline.problems import incomplete_runs, make_waiting
+from tcpipe.pipeline.problems import find_incomplete_runs, make_waiting
 from tcpipe.pipeline.store_verdict import find_changes, judge_runs
 from tcpipe.recipe import Recipe
 from tcpipe.store import Store, open_store
@@ -54,7 +54,7 @@ class Group:
         more = f" and {len(self.logs) - _MOST_NAMES} more" if len(self.logs) > _MOST_NAMES else ""
         names = f": {', '.join(self.logs[:_MOST_NAMES])}{more}" if self.state != "done" else ""
         cause = f", {self.cause}" if self.cause else ""
-        return f"{len(self.logs):>7} {_words(self.state)}{cause}{names}"
+        return f"{len(self.logs):>7} {_format_words(self.state)}{cause}{names}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,7 +76,7 @@ class Status:
     superseded_runs: int
     begun: tuple[BegunCall, ...]
     """Calls that have begun and not ended: they run, perhaps run, or were killed and nobody acknowledged that."""
-    history: tuple[Call, ...]
+    history: tuple[CallRecord, ...]
     """The latest calls, the last one first."""
     verdict: Verdict
     """On the runs under the ruling recipe together; of each code the worst finding is a reason."""
@@ -91,7 +91,7 @@ class Status:
 
     def __str__(self) -> str:
         """Return the lines as one text."""
-        said = ", ".join(f"{count} {_words(state)}" for state, count in self.counts.items()) or "no logs"
+        said = ", ".join(f"{count} {_format_words(state)}" for state, count in self.counts.items()) or "no logs"
         lines = [f"{self.store}: {said}", *(str(group) for group in self.groups)]
         lines += [f"to do: {self.to_do}"] if self.to_do else []
         lines += [f"of earlier calls: {line}" for line in self.gone]
@@ -101,11 +101,11 @@ class Status:
         lines += [f"  {format_count(code, count, self.runs)}" for code, count in [*self.findings.items()][:MOST_LINES]]
         lines += ["losses:", *map(format_loss, self.losses)] if self.losses else []
         lines += ["history:"] if self.history else []
-        return plain_lines([*lines, *(_told(call) for call in self.history[:_MOST_CALLS])])
+        return clean_lines([*lines, *(_format_call(call) for call in self.history[:_MOST_CALLS])])
 
 
-@uncollected()
-def status(
+@pause_garbage_collection()
+def find_status(
     logs: Iterable[str | Path] = (),
     *,
     store: str | Path = "tcpipe-store",
@@ -137,11 +137,11 @@ def status(
         There is no store, or nothing is known of its sources.
 
     """
-    ruling = recipe_of(recipe)
-    opened = Store(store if is_url(store) else local_output(store)) if create else open_store(store)
+    ruling = resolve_recipe(recipe)
+    opened = Store(store if is_url(store) else check_local_output(store)) if create else open_store(store)
     state = opened.state()
-    begun, given = begun_calls(state), [str(log) for log in logs]
-    sources = [shown_path(log) for log in given]
+    begun, given = list_begun_calls(state), [str(log) for log in logs]
+    sources = [format_path(log) for log in given]
     ingests = [(call.begin, call.logs) for call in state.calls if call.logs]
     ingests += [(call.begin, call.works_on) for call in begun if call.command == INGEST]
     asked = list(dict.fromkeys(log for _, logs in sorted(ingests, reverse=True) for log in logs))
@@ -149,26 +149,26 @@ def status(
     given = given or asked
     if not given and not state.calls:
         raise UsageError(f"{opened.root}: no call of ingest is remembered here; give the logs or their folders")
-    with scratch_directory() as staging:
+    with make_scratch_directory() as staging:
         found = find_sources(given, as_one=as_one, staging=staging, tables=ruling.tables)
     no_tags: Mapping[str, str] = {}
     common = (opened.root, ruling, robot or ruling.robot, no_tags, force, message_definitions)
-    how = (*common, definitions_key(message_definitions), retry_failed)
+    how = (*common, make_definitions_key(message_definitions), retry_failed)
     seen, runs = {} if force else state.seen, opened.ingestions(state=state)
-    mine = found.sources if shard is None else in_shard(found.sources, shard)
-    tasks = (IngestTask(remembered(source, seen.get(source.lineage, ())), *how, min_age_s) for source in mine)
+    mine = found.sources if shard is None else select_shard(found.sources, shard)
+    tasks = (IngestTask(recall_hash(source, seen.get(source.lineage, ())), *how, min_age_s) for source in mine)
     steps = plan(tasks, state, broken=() if isinstance(opened.root, str) else runs.lost)
     problems = [*_store_problems(runs)]
     if (
         not create
         and all(call.state == "killed" for call in begun)
-        and all(is_below(_absolute(log), asked) for log in given)
+        and all(is_below(_make_absolute(log), asked) for log in given)
     ):
-        problems += _waiting_too_long(steps)
+        problems += _find_waiting(steps)
     problems = [problem for problem in problems if problem.key not in state.acknowledged]
     acknowledged = {call.name for call in begun if call.problem.key in state.acknowledged}
     missing = [make_finding("log-missing", Subject("log", path)) for path in found.problems if path in lately]
-    groups, waiting = tuple(_groups(steps)), [step for step in steps if step.is_todo]
+    groups, waiting = tuple(_iterate_groups(steps)), [step for step in steps if step.is_todo]
     current = [run.facts for run in runs.finished if run.facts.ingest_key == ingest_key(ruling)]
     by_code = group_findings((run.run_id, run.findings) for run in current)
     trouble = problems or missing or any(group.state in TROUBLE for group in groups)
@@ -177,7 +177,7 @@ def status(
         sources=tuple(sources),
         counts=dict(sum((Counter({group.state: len(group.logs)}) for group in groups), Counter())),
         groups=groups,
-        to_do=estimate(state.calls, INGEST, sum(map(_bytes, waiting)), jobs=jobs) if waiting else None,
+        to_do=estimate(state.calls, INGEST, sum(map(_sum_bytes, waiting)), jobs=jobs) if waiting else None,
         problems=(*missing, *(problem.finding for problem in problems)),
         gone=tuple(chain(*(lines for path, lines in found.problems.items() if path not in lately))),
         superseded_runs=len(state.superseded),
@@ -186,7 +186,7 @@ def status(
         verdict=judge_runs(current, find_changes(current)),
         runs=len(current),
         findings={of.code: len(of.of) for of in by_code if of.severity != "note"},
-        losses=losses_of(run.ledger_m for run in current),
+        losses=find_largest_losses(run.ledger_m for run in current),
         exit_code=3 if trouble else 0,
     )
 
@@ -194,11 +194,11 @@ def status(
 def _store_problems(found: Ingestions) -> Iterator[Problem]:
     """Yield what is wrong with a store: commits, runs that are not complete, calls that were killed."""
     yield from found.state.problems
-    yield from incomplete_runs(found)
-    yield from (call.problem for call in begun_calls(found.state) if call.state == "killed")
+    yield from find_incomplete_runs(found)
+    yield from (call.problem for call in list_begun_calls(found.state) if call.state == "killed")
 
 
-def _waiting_too_long(steps: Iterable[Step]) -> Iterator[Problem]:
+def _find_waiting(steps: Iterable[Step]) -> Iterator[Problem]:
     """Yield the logs that lie there for more than two nights and were never ingested.
 
     Since when is told by the file system, not by the modification time, which a copy may keep.
@@ -209,11 +209,11 @@ def _waiting_too_long(steps: Iterable[Step]) -> Iterator[Problem]:
             yield make_waiting(step.task.source, step.standing)
 
 
-def _absolute(log: str) -> str:
+def _make_absolute(log: str) -> str:
     return log if is_url(log) else str(Path(log).absolute())
 
 
-def _groups(steps: Iterable[Step]) -> Iterator[Group]:
+def _iterate_groups(steps: Iterable[Step]) -> Iterator[Group]:
     """Yield logs of one standing with findings of the same codes on the same subjects; without findings, of the same cause."""
     groups: dict[tuple[Standing, Hashable], list[Step]] = {}
     for step in steps:
@@ -222,18 +222,19 @@ def _groups(steps: Iterable[Step]) -> Iterator[Group]:
     for (standing, _), of in sorted(groups.items(), key=lambda item: (STANDINGS.index(item[0][0]), -len(item[1]))):
         causes = list(dict.fromkeys(step.cause for step in of))
         cause = causes[0] if len(causes) == 1 else f"{len(causes)} reasons, the first: {causes[0]}"
-        yield Group(standing, cause, tuple(step.task.source.name for step in of), sum(map(_bytes, of)))
+        yield Group(standing, cause, tuple(step.task.source.name for step in of), sum(map(_sum_bytes, of)))
 
 
-def _bytes(step: Step) -> int:
+def _sum_bytes(step: Step) -> int:
     return sum(size for size, _ in step.task.source.files)
 
 
-def _words(state: Standing) -> str:
+def _format_words(state: Standing) -> str:
     return _IN_WORDS.get(state, state)
 
 
-def _told(call: Call) -> str:
+def _format_call(call: CallRecord) -> str:
     """Return a call as one line."""
     said = ", ".join(f"{count} {what}" for what, count in call.counts.items() if count) or "nothing"
-    return f"  {call.begin[:19]} {call.command}: {said}; {in_time(call.wall_s)}, CPU {in_time(call.cpu_s)}, exit code {call.exit_code}"
+    times = f"{format_duration(call.wall_s)}, CPU {format_duration(call.cpu_s)}"
+    return f"  {call.begin[:19]} {call.command}: {said}; {times}, exit code {call.exit_code}"

@@ -9,7 +9,7 @@ import numpy as np
 
 from tcpipe.cost.held_out import PHYSICS_UNITS
 from tcpipe.formats.index_files import RunFacts
-from tcpipe.tables.catalogue import Severity, threshold
+from tcpipe.tables.catalogue import Severity, read_threshold
 from tcpipe.tables.findings import Finding, Subject, make_finding
 from tcpipe.tables.verdicts import Verdict, judge_by_code
 
@@ -27,7 +27,7 @@ def find_changes(runs: Iterable[RunFacts]) -> tuple[Finding, ...]:
     series = dict[tuple[str, str, str], list[float]]()
     dated = [run for run in runs if run.start_ns is not None]
     for run in sorted(dated, key=lambda run: (run.start_ns or 0, run.run_id)):
-        for measure, unit, value in _measures(run):
+        for measure, unit, value in _iterate_measures(run):
             series.setdefault((run.robot, measure, unit), []).append(value)
     return tuple(_find_changes(series.items()))
 
@@ -52,7 +52,7 @@ def _find_changes(series: Iterable[tuple[tuple[str, str, str], Sequence[float]]]
 _USED = "used share of the distance"
 
 
-def _measures(run: RunFacts) -> Iterator[tuple[str, str, float]]:
+def _iterate_measures(run: RunFacts) -> Iterator[tuple[str, str, float]]:
     """Yield name, unit and value of measures that should stay the same from run to run."""
     if run.driven_m > 0.0:
         yield _USED, "%", _IN_PERCENT * run.kept_m / run.driven_m
@@ -61,7 +61,7 @@ def _measures(run: RunFacts) -> Iterator[tuple[str, str, float]]:
     if run.standing_watt is not None:
         yield "standing power", PHYSICS_UNITS["standing"], run.standing_watt
     for term, (value, std) in run.physics.items():
-        if not term.startswith("standing") and abs(value) > threshold(_CHANGE, "min_scatter_ratio") * std:
+        if not term.startswith("standing") and abs(value) > read_threshold(_CHANGE, "min_scatter_ratio") * std:
             yield f"physics term {term}", PHYSICS_UNITS.get(term.partition(" ")[0], ""), value
 
 
@@ -81,14 +81,17 @@ def find_shift(values: Sequence[float]) -> Shift | None:
     The latest quarter of the values, at most 20, is compared with those before: the medians must differ by more than three robust standard
     deviations (1.4826 times the median absolute deviation) of the earlier values and by 5 % of their median (thresholds of the catalogue).
     """
-    if len(values) < threshold(_CHANGE, "min_runs_count"):
+    if len(values) < read_threshold(_CHANGE, "min_runs_count"):
         return None
-    count = int(min(len(values) * threshold(_CHANGE, "latest_fraction"), threshold(_CHANGE, "max_latest_count")))
+    count = int(
+        min(len(values) * read_threshold(_CHANGE, "latest_fraction"), read_threshold(_CHANGE, "max_latest_count"))
+    )
     earlier, latest = np.array(values[:-count], float), np.array(values[-count:], float)
     before, after = float(np.median(earlier)), float(np.median(latest))
     scatter = 1.4826 * float(np.median(np.abs(earlier - before)))
     enough = max(
-        threshold(_CHANGE, "min_scatter_ratio") * scatter, threshold(_CHANGE, "min_change_fraction") * abs(before)
+        read_threshold(_CHANGE, "min_scatter_ratio") * scatter,
+        read_threshold(_CHANGE, "min_change_fraction") * abs(before),
     )
     if abs(after - before) <= enough:
         return None

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Literal
 
 from tcpipe.errors import LogError
-from tcpipe.logs.names_of_fields import CALLED, fields_called
+from tcpipe.logs.field_names import CALLED, match_field_names
 from tcpipe.recipe.checking import as_toml
 
 
@@ -32,26 +32,28 @@ _BARE = {"voltage": re.compile(r"volt"), "current": re.compile(r"curr|amp")}
 _STAMP = re.compile(r"t|stamp|.*time(stamp)?.*|gpst|utc|date")
 
 
-def proposed(folder: Path, files: Sequence[Path]) -> InspectedTables:
+def propose_tables(folder: Path, files: Sequence[Path]) -> InspectedTables:
     """Return the columns of each table, why some cannot be read, and a recipe for the rest."""
-    from tcpipe.formats.tables import column_names  # noqa: PLC0415  polars only where a table is read
+    from tcpipe.formats.tables import read_column_names  # noqa: PLC0415  polars only where a table is read
 
     columns: dict[str, tuple[str, ...]] = {}
     problems: dict[str, str] = {}
     for file in files:
         name = file.relative_to(folder).as_posix()
         try:
-            columns[name] = tuple(column_names(file))
+            columns[name] = tuple(read_column_names(file))
         except LogError as error:
             problems[name] = str(error)
-    return InspectedTables(path=str(folder), columns=columns, problems=problems, recipe="\n".join(_tables(columns)))
+    return InspectedTables(
+        path=str(folder), columns=columns, problems=problems, recipe="\n".join(_iterate_recipe_lines(columns))
+    )
 
 
-def _tables(columns: Mapping[str, Sequence[str]]) -> Iterator[str]:
+def _iterate_recipe_lines(columns: Mapping[str, Sequence[str]]) -> Iterator[str]:
     """Yield the lines of the recipe; of two tables for one role the second is a comment."""
     taken: set[str] = set()
     for file, names in columns.items():
-        role, found = _role(file, names)
+        role, found = _match_role(file, names)
         if role is None:
             continue
         stamp = next((name for name in names if _STAMP.fullmatch(name.lower())), names[0])
@@ -69,12 +71,12 @@ def _tables(columns: Mapping[str, Sequence[str]]) -> Iterator[str]:
         yield f"{again}stamp = {as_toml(stamp)}"
 
 
-def _role(file: str, names: Sequence[str]) -> tuple[str | None, dict[str, str]]:
+def _match_role(file: str, names: Sequence[str]) -> tuple[str | None, dict[str, str]]:
     """Return the role that a table plays by its columns, and which column is which field."""
     for role in CALLED:
         if (role in ("command", "wheel_odometry")) and (role == "command") != bool(_COMMAND.search(file.lower())):
             continue
-        found = fields_called(role, names)
+        found = match_field_names(role, names)
         if found and (role != "power" or len(found) == 2):
             return role, found
     for quantity, word in _BARE.items():

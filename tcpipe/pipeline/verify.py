@@ -7,17 +7,17 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from tcpipe.errors import TcpipeError, UsageError, plain_lines
-from tcpipe.formats.atomic import left_beside
+from tcpipe.errors import TcpipeError, UsageError, clean_lines
+from tcpipe.formats.atomic import find_leftovers
 from tcpipe.formats.bucket import open_place
 from tcpipe.formats.bucket_directories import fetch_unproved, find_unlisted_files
 from tcpipe.formats.commit_log import LOG
 from tcpipe.formats.dataset_files import CARD, read_card
+from tcpipe.formats.integrity import Checksums, find_broken_checksums, read_sealed_as
 from tcpipe.formats.object_storage import is_bucket, is_url
-from tcpipe.formats.seals import Checksums, broken_checksums, read_sealed_as
 from tcpipe.pipeline.verify_dataset import verify_dataset
 from tcpipe.pipeline.verify_store import verify_log, verify_map, verify_run, verify_store
-from tcpipe.store import Store, inside_store, is_store
+from tcpipe.store import Store, find_store_above, is_store
 from tcpipe.tables.facts import LEFT_OUT
 
 Finding = tuple[str, int] | str
@@ -49,7 +49,7 @@ class Verified:
         read = ", ".join(f"{count} {what}" for what, count in self.read.items()) or "nothing"
         count = len(self.problems)
         verdict = f"{count} problem{'s' if count > 1 else ''}" if count else "all as it was written"
-        return plain_lines((f"{self.path}: {self.kind}; {read} read again: {verdict}", *self.problems, *self.notes))
+        return clean_lines((f"{self.path}: {self.kind}; {read} read again: {verdict}", *self.problems, *self.notes))
 
 
 def verify(path: Path | str) -> Verified:
@@ -59,14 +59,14 @@ def verify(path: Path | str) -> Verified:
     ------
     UsageError : when the path is none of these.
     """
-    stored = _stored(str(path)) if is_url(path) else None
+    stored = _verify_stored(str(path)) if is_url(path) else None
     if is_url(path) and stored is None:
         with fetch_unproved(str(path).rstrip("/")) as copy:
             found = verify(copy)
         return replace(found, path=str(path), problems=(*found.problems, *_verify_generations(str(path), found.kind)))
     if stored is None and not Path(path).exists():
         raise UsageError(f"{path}: there is no such directory; give a {_KNOWN}")
-    kind, findings = stored or _what(Path(path))
+    kind, findings = stored or _find_kind(Path(path))
     read: dict[str, int] = {}
     problems: list[str] = []
     try:
@@ -80,10 +80,10 @@ def verify(path: Path | str) -> Verified:
     if kind not in ("store", "run"):
         again = "the next command that writes it removes it"
         problems += [
-            f"{left}: was left behind by a command that was killed; {again}" for left in left_beside(Path(path))
+            f"{left}: was left behind by a command that was killed; {again}" for left in find_leftovers(Path(path))
         ]
     return Verified(
-        str(path), kind, read, tuple(dict.fromkeys(problems)), _notes(Path(path)) if kind == "dataset" else ()
+        str(path), kind, read, tuple(dict.fromkeys(problems)), _read_notes(Path(path)) if kind == "dataset" else ()
     )
 
 
@@ -94,7 +94,7 @@ def _verify_generations(url: str, kind: str) -> Iterator[str]:
     yield from (f"{name}: is no file of this {kind}" for name in find_unlisted_files(url))
 
 
-def _notes(dataset: Path) -> tuple[str, ...]:
+def _read_notes(dataset: Path) -> tuple[str, ...]:
     """Return what a dataset says that it does not tell; nothing where its card cannot be read, which is a problem already."""
     with suppress(TcpipeError):
         redaction = read_card(dataset, proved=False).redaction
@@ -102,33 +102,33 @@ def _notes(dataset: Path) -> tuple[str, ...]:
     return ()
 
 
-def _stored(path: Path | str) -> tuple[str, Iterator[Finding]] | None:
-    if inside := inside_store(path):
+def _verify_stored(path: Path | str) -> tuple[str, Iterator[Finding]] | None:
+    if inside := find_store_above(path):
         return "run", verify_run(*inside)
     if is_store(path):
         return "store", verify_store(Store(path))
     return None
 
 
-def _what(path: Path) -> tuple[str, Iterator[Finding]]:
+def _find_kind(path: Path) -> tuple[str, Iterator[Finding]]:
     """Return what a path is, and its findings, which are made as they are asked for."""
     if (path / CARD).is_file():
         return "dataset", verify_dataset(path)
     place = path.resolve()
     if place.suffix == ".zarr" and not (place.parent / CARD).is_file():
         return "map", verify_map(path)
-    if stored := _stored(path):
+    if stored := _verify_stored(path):
         return stored
     for card, kind in _SEALED_CARDS.items():
         if (path / card).is_file():
-            return kind, _sealed_directory(path, card)
+            return kind, _verify_sealed_directory(path, card)
     raise UsageError(f"{path}: is no {_KNOWN}; give one of these directories")
 
 
-def _sealed_directory(directory: Path, card: str) -> Iterator[Finding]:
+def _verify_sealed_directory(directory: Path, card: str) -> Iterator[Finding]:
     """Compare every file with what the card has of it; name those that it does not know."""
     checksums = read_sealed_as(directory / card, Checksums).checksums
-    yield from broken_checksums(directory, checksums)
+    yield from find_broken_checksums(directory, checksums)
     yield "files", len(checksums) + 1
     there = {path.relative_to(directory).as_posix() for path in directory.rglob("*") if not path.is_dir()}
     for name in sorted(there - {*checksums, card}):

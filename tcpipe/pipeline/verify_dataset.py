@@ -11,7 +11,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
-from tcpipe.cost.budget import pooled
+from tcpipe.cost.budget import pool_budgets
 from tcpipe.errors import DatasetError, TcpipeError
 from tcpipe.formats.bucket_directories import REPORT_PATCHES
 from tcpipe.formats.dataset_card import DatasetCard
@@ -21,23 +21,23 @@ from tcpipe.formats.dataset_files import (
     REPORT,
     SAMPLES,
     PatchFiles,
-    holds_sample_ids,
+    find_rows_in_files,
+    has_sample_ids,
     open_patches,
     read_card,
     read_samples,
-    rows_in_files,
     sample_columns,
     sample_count,
 )
-from tcpipe.formats.json_files import plain
+from tcpipe.formats.integrity import find_broken_checksums, find_broken_seal
+from tcpipe.formats.json_files import to_plain
 from tcpipe.formats.parquet import read_table
-from tcpipe.formats.recipe_toml import recipe_id
-from tcpipe.formats.seals import broken_checksums, broken_seal
+from tcpipe.formats.recipe_toml import make_recipe_id
 from tcpipe.motion.remedies import KEPT
-from tcpipe.pipeline.dataset.card import CARD_COLUMNS, measured
-from tcpipe.pipeline.dataset.redaction import what_is_told
+from tcpipe.pipeline.dataset.card import CARD_COLUMNS, measure_samples
+from tcpipe.pipeline.dataset.redaction import find_leaks
 from tcpipe.store import is_named_after
-from tcpipe.tables.columns import floats
+from tcpipe.tables.columns import to_floats
 from tcpipe.tables.levels import DATA_MODEL_VERSION, READ_VERSIONS
 from tcpipe.tables.levels import SAMPLES as SAMPLES_SCHEMA
 from tcpipe.terrain.layers import Layer
@@ -49,7 +49,7 @@ def verify_dataset(directory: Path) -> Iterator[Finding]:
     """Yield what was read, and a line for everything that is not as the card says."""
     card = read_card(directory, proved=False)
     for path in (directory / CARD, directory / REPORT):
-        problem = broken_seal(path)
+        problem = find_broken_seal(path)
         yield problem or ("files", 1)
     if card.data_model_version not in READ_VERSIONS:
         yield (
@@ -57,7 +57,7 @@ def verify_dataset(directory: Path) -> Iterator[Finding]:
             "verify it with the version that wrote it, or build it again"
         )
         return
-    wrong = list(_files(directory, card))
+    wrong = list(_verify_files(directory, card))
     yield from wrong
     yield "files", len(card.checksums)
     if any(line.startswith(f"{directory / SAMPLES}: ") for line in wrong):
@@ -65,19 +65,19 @@ def verify_dataset(directory: Path) -> Iterator[Finding]:
     if (rows := sample_count(directory)) != card.samples:
         yield f"{directory / CARD}: samples is {card.samples}, but the samples give {rows}"
         return
-    yield from _samples(directory, card)
+    yield from _verify_samples(directory, card)
 
 
-def _files(directory: Path, card: DatasetCard) -> Iterator[str]:
+def _verify_files(directory: Path, card: DatasetCard) -> Iterator[str]:
     """Compare every file with the checksum that the card has of it; name those that it does not know."""
-    yield from broken_checksums(directory, card.checksums)
+    yield from find_broken_checksums(directory, card.checksums)
     there = {path.relative_to(directory).as_posix() for path in directory.rglob("*") if not path.is_dir()}
     for name in sorted(there - {*card.checksums, CARD, REPORT}):
         if not name.startswith(f"{REPORT_PATCHES}/"):
             yield f"{directory / name}: is no file of this dataset"
 
 
-def _samples(directory: Path, card: DatasetCard) -> Iterator[Finding]:
+def _verify_samples(directory: Path, card: DatasetCard) -> Iterator[Finding]:
     samples, where = read_samples(directory), directory / SAMPLES
     yield "samples", samples.num_rows
     try:
@@ -88,30 +88,30 @@ def _samples(directory: Path, card: DatasetCard) -> Iterator[Finding]:
         yield from (f"{where}: {problem}" for problem in error.problems)
         return
     yield from (f"{where}: has no column {name}" for name in card.added_columns if name not in samples.column_names)
-    yield from (f"{where}: {problem}" for problem in _wrong_joins(samples, card))
-    for key, value in measured(samples.select(CARD_COLUMNS), has_terrain="terrain" in card.layers).items():
+    yield from (f"{where}: {problem}" for problem in _find_wrong_joins(samples, card))
+    for key, value in measure_samples(samples.select(CARD_COLUMNS), has_terrain="terrain" in card.layers).items():
         told = getattr(card, key)
         if told != value and not (told is None and key == "doubtful"):  # before data model 1.2 nobody counted them
-            yield f"{directory / CARD}: {key} is {plain(told)}, but the samples give {plain(value)}"
-    yield from (f"{directory / CARD}: {problem}" for problem in _wrong_runs(samples, card))
-    used_m = math.fsum(floats(samples, "arc_length_m")[samples.column("split").to_numpy() != "buffer"])
+            yield f"{directory / CARD}: {key} is {to_plain(told)}, but the samples give {to_plain(value)}"
+    yield from (f"{directory / CARD}: {problem}" for problem in _find_wrong_runs(samples, card))
+    used_m = math.fsum(to_floats(samples, "arc_length_m")[samples.column("split").to_numpy() != "buffer"])
     if not math.isclose(used_m, card.ledger_m[KEPT], rel_tol=1e-9, abs_tol=1e-6):
         yield f"{directory / CARD}: the ledger keeps {card.ledger_m[KEPT]:.3f} m, the samples cover {used_m:.3f} m"
     if card.redaction is not None:
-        yield from (f"{directory / CARD}: {problem}" for problem in what_is_told(card, samples))
-    yield from _patches(directory, card, samples)
+        yield from (f"{directory / CARD}: {problem}" for problem in find_leaks(card, samples))
+    yield from _verify_patches(directory, card, samples)
 
 
-def _wrong_joins(samples: pa.Table, card: DatasetCard) -> Iterator[str]:
+def _find_wrong_joins(samples: pa.Table, card: DatasetCard) -> Iterator[str]:
     """Yield a line for each kind of row that belongs to nothing, or to something else than its columns say."""
     ids = samples.column("sample_id")
     repeated = len(ids) - pc.count_distinct(ids).as_py()
     if repeated:
         yield f"{repeated} sample ids occur more than once"
-    yield from _rows(pc.not_equal(ids, samples.column("segment_id")), "have another id than their segment")
+    yield from _verify_rows(pc.not_equal(ids, samples.column("segment_id")), "have another id than their segment")
     for column, known in (("run_id", [run.run_id for run in card.runs]), ("map", [entry.name for entry in card.maps])):
         strange = pc.invert(pc.is_in(samples.column(column), value_set=pa.array(known, pa.string())))
-        yield from _rows(strange, f"have a {column} that the card does not list")
+        yield from _verify_rows(strange, f"have a {column} that the card does not list")
     names = {entry.id: entry.name for entry in card.classes}
     pairs = samples.select(["terrain_class", "terrain_name"]).group_by(["terrain_class", "terrain_name"]).aggregate([])
     for pair in pairs.to_pylist():
@@ -119,7 +119,7 @@ def _wrong_joins(samples: pa.Table, card: DatasetCard) -> Iterator[str]:
             yield f"class {pair['terrain_class']} is called {pair['terrain_name']!r}, {names.get(pair['terrain_class'])!r} in the card"
 
 
-def _wrong_runs(samples: pa.Table, card: DatasetCard) -> Iterator[str]:
+def _find_wrong_runs(samples: pa.Table, card: DatasetCard) -> Iterator[str]:
     """Yield a line for what the card copied from its runs and the samples, the recipe or the rest of the card say otherwise."""
     robots: dict[str, dict[str, int]] = {}
     for row in samples.group_by(["run_id", "robot"]).aggregate([([], "count_all")]).to_pylist():
@@ -131,7 +131,7 @@ def _wrong_runs(samples: pa.Table, card: DatasetCard) -> Iterator[str]:
             yield f"run {name} is of robot {robot}, its samples of {', '.join(sorted(of))}"
         if sum(of.values()) != run.samples:
             yield f"run {name} has {run.samples} samples, {sum(of.values())} are there"
-        if card.redaction is None and run.recipe_id != (wanted := recipe_id(card.recipe, robot)):
+        if card.redaction is None and run.recipe_id != (wanted := make_recipe_id(card.recipe, robot)):
             yield f"run {name} is of recipe {run.recipe_id}, the card's for robot {robot} is {wanted}"
         if not is_named_after(name, run.sha256):
             yield f"run {name} is of a log whose sha256 begins with {run.sha256[:8]}"
@@ -139,33 +139,33 @@ def _wrong_runs(samples: pa.Table, card: DatasetCard) -> Iterator[str]:
     known_m = [metres for metres in driven_m if metres is not None]
     if len(known_m) == len(driven_m) and not math.isclose(math.fsum(known_m), ledger_m, rel_tol=1e-9, abs_tol=1e-6):
         yield f"the ledger sums to {ledger_m:.3f} m, its runs drove {math.fsum(known_m):.3f} m"
-    if pooled(run.energy_budget for run in card.runs) != card.energy_budget:
+    if pool_budgets(run.energy_budget for run in card.runs) != card.energy_budget:
         yield "its energy budget is not that of its runs"
 
 
-def _rows(wrong: pa.ChunkedArray, what: str) -> Iterator[str]:
+def _verify_rows(wrong: pa.ChunkedArray, what: str) -> Iterator[str]:
     count = int(pc.sum(wrong).as_py() or 0)
     if count:
         yield f"{count} rows {what}, the first is row {pc.index(wrong, value=True).as_py()}"
 
 
-def _patches(directory: Path, card: DatasetCard, samples: pa.Table) -> Iterator[Finding]:
+def _verify_patches(directory: Path, card: DatasetCard, samples: pa.Table) -> Iterator[Finding]:
     """Decode every patch; compare order, ids and values with the samples and the class table."""
     files = open_patches(directory, card, proved=False)
     split = samples.column("split").to_numpy()
     place = np.empty(samples.num_rows, np.int64)  # of each row of samples in the files
-    for name, rows in rows_in_files(card, split).items():
+    for name, rows in find_rows_in_files(card, split).items():
         place[split == name] = rows
     for piece in range(len(files.starts) - 1):
         try:
-            yield from _piece(files, piece)
+            yield from _verify_piece(files, piece)
         except DatasetError as error:
             yield from error.problems
     in_files = samples.take(pa.array(np.argsort(place, kind="stable")))
-    yield from _beside_patches(directory, card, in_files)
+    yield from _verify_patch_columns(directory, card, in_files)
 
 
-def _piece(files: PatchFiles, piece: int) -> Iterator[Finding]:
+def _verify_piece(files: PatchFiles, piece: int) -> Iterator[Finding]:
     pixels = files.read(piece, files.layers)
     first, rows = int(files.starts[piece]), len(next(iter(pixels.values())))
     where = f"{files.directory}: patches {first} to {first + rows - 1}"
@@ -173,7 +173,7 @@ def _piece(files: PatchFiles, piece: int) -> Iterator[Finding]:
         if layer.kind == "categorical" and pixels[name].max(initial=0) > layer.high:
             of = "" if name == "terrain" else f" of {name}"
             yield f"{where} hold classes{of} above {layer.high:g}, the last of the table"
-        if layer.stack == "floats" and not _within(pixels[name], layer):
+        if layer.stack == "floats" and not _is_within_range(pixels[name], layer):
             yield f"{where} hold {name} beyond {layer.low!r} to {layer.high!r} {layer.unit}"
     floor = pixels["height"].reshape(rows, -1).min(axis=1)
     if floor.any():
@@ -181,17 +181,17 @@ def _piece(files: PatchFiles, piece: int) -> Iterator[Finding]:
     yield "patches", rows
 
 
-def _within(pixels: NDArray[np.generic], layer: Layer) -> bool:
+def _is_within_range(pixels: NDArray[np.generic], layer: Layer) -> bool:
     """Return whether all pixels with data lie in the layer's range, but for rounding."""
     there = pixels[np.isfinite(pixels)]
     slack = 1e-5 * max(abs(layer.low), abs(layer.high))
     return bool(((there >= layer.low - slack) & (there <= layer.high + slack)).all())
 
 
-def _beside_patches(directory: Path, card: DatasetCard, samples: pa.Table) -> Iterator[str]:
+def _verify_patch_columns(directory: Path, card: DatasetCard, samples: pa.Table) -> Iterator[str]:
     """Compare what stands beside the patches with the samples, given in the order of the files."""
     if card.format == "zarr":
-        if not holds_sample_ids(directory, samples.column("sample_id").to_pylist()):
+        if not has_sample_ids(directory, samples.column("sample_id").to_pylist()):
             yield f"{directory / PATCHES}: its sample ids are not those of {SAMPLES}, in their order"
         return
     first, names = 0, sample_columns(directory)

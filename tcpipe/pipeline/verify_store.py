@@ -17,23 +17,30 @@ import pyarrow as pa
 from tcpipe.errors import StoreError, TcpipeError
 from tcpipe.formats.atomic import TEMPORARY_PREFIX, is_abandoned
 from tcpipe.formats.bucket_directories import FetchedShards
-from tcpipe.formats.commit_log import LOG, commit_name, read_commit, read_snapshot, snapshot_name
+from tcpipe.formats.commit_log import LOG, commit_name, make_snapshot_name, read_commit, read_snapshot
 from tcpipe.formats.commits import Commit, State, fold
-from tcpipe.formats.index_files import facts_of
-from tcpipe.formats.json_files import typed
+from tcpipe.formats.index_files import make_run_facts
+from tcpipe.formats.integrity import (
+    CHECKSUMS,
+    Checksum,
+    find_broken_checksums,
+    find_broken_seal_in,
+    find_wrong_checksum,
+    read_checksums,
+)
+from tcpipe.formats.json_files import parse_typed
 from tcpipe.formats.maps.map_files import MapFile, open_map
-from tcpipe.formats.numbered import name_of, numbers, read_as_at, read_sealed_at, stem_and_number
+from tcpipe.formats.numbered_documents import find_highest_numbers, name_of, read_as_at, read_sealed_at, split_number
 from tcpipe.formats.parquet import read_table
 from tcpipe.formats.place import DirectoryPlace, Place
-from tcpipe.formats.recipe_toml import ingest_key, recipe_id
+from tcpipe.formats.recipe_toml import ingest_key, make_recipe_id
 from tcpipe.formats.run_documents import Manifest, MapDocument, RunJson
-from tcpipe.formats.seals import CHECKSUMS, Checksum, broken_checksums, broken_seal_in, read_checksums, wrong_checksum
-from tcpipe.formats.store_mark import MARK, SPOOL
+from tcpipe.formats.store_document import MARK, SPOOL
 from tcpipe.formats.stored_runs import RunDirectory
 from tcpipe.motion.remedies import KEPT
-from tcpipe.report.pictures import shows_map
+from tcpipe.report.pictures import is_picture_of_map
 from tcpipe.store import Store
-from tcpipe.tables.columns import floats, integers
+from tcpipe.tables.columns import to_floats, to_integers
 from tcpipe.tables.levels import DATA_MODEL_VERSION, GATED_TRACK, LABELLED_SEGMENTS, READ_VERSIONS, REJECTIONS, STREAMS
 
 Finding = tuple[str, int] | str
@@ -48,22 +55,22 @@ _INDEX = "index"
 def verify_store(store: Store) -> Iterator[Finding]:
     """Yield what was read of all maps and runs, and a line for everything that is not as it was written."""
     place = store.place
-    yield broken_seal_in(place.read(MARK), place.where(MARK)) or ("files", 1)
+    yield find_broken_seal_in(place.read(MARK), place.where(MARK)) or ("files", 1)
     for name in place.files():
         if name == _REPORT:
-            yield from _seals(place, [name])
+            yield from _verify_seals(place, [name])
         elif name != MARK:
-            yield _stranger(place, name)
+            yield _describe_stranger(place, name)
     for name in place.folders():
         if name == SPOOL:
             yield f"{place.where(name)}: is of a build that goes on, or was killed; 'tcpipe prune' removes what is old"
         elif name not in (LOG, "maps", "runs", _INDEX):
-            yield _stranger(place, name)
+            yield _describe_stranger(place, name)
     yield from verify_log(place.below(LOG))
-    yield from _maps(store)
-    yield from _runs(store)
+    yield from _verify_maps(store)
+    yield from _verify_runs(store)
     if isinstance(place, DirectoryPlace):
-        yield from _left_behind(place.root)
+        yield from _find_left_behind(place.root)
 
 
 def verify_log(log: Place) -> Iterator[Finding]:
@@ -72,7 +79,7 @@ def verify_log(log: Place) -> Iterator[Finding]:
     for name in log.files():
         number = int(name[:10]) if name[:10].isdigit() and name[10:] == ".json" else None
         if number is None and not name.startswith("snapshot-"):
-            yield _stranger(log, name)
+            yield _describe_stranger(log, name)
         if number is None:
             continue
         yield from (f"{log.where(commit_name(absent))}: is missing" for absent in range(last + 1, number))
@@ -87,11 +94,11 @@ def verify_log(log: Place) -> Iterator[Finding]:
         whole = whole and number == last + 1
         state, last = replace(fold([commit], state), digest=digest), number
         yield "commits", 1
-        yield from _snapshot(log, state) if whole else ()
+        yield from _verify_snapshot(log, state) if whole else ()
 
 
-def _snapshot(log: Place, state: State) -> Iterator[Finding]:
-    name = snapshot_name(state.number)
+def _verify_snapshot(log: Place, state: State) -> Iterator[Finding]:
+    name = make_snapshot_name(state.number)
     if log.size(name) is None:
         return
     try:
@@ -103,7 +110,7 @@ def _snapshot(log: Place, state: State) -> Iterator[Finding]:
     yield ("files", 1) if same else f"{log.where(name)}: does not say what the commits say; remove it"
 
 
-def _runs(store: Store) -> Iterator[Finding]:
+def _verify_runs(store: Store) -> Iterator[Finding]:
     """Yield the same of all runs, of those that the log names and of which files are gone, and of ingestions that no commit names."""
     wrong, found = set[str](), store.ingestions()
     for run_id in store.run_ids():
@@ -120,8 +127,8 @@ def verify_run(store: Store, run_id: str, recipe: str | None = None) -> Iterator
     """Yield the same of one run: its log's description, its streams, and what became of it under every recipe, or one."""
     place = store.runs_place.below(run_id)
     names = [entry.name for entry in place.entries()]
-    there, last, folders = _documents(place), numbers(names), place.folders()
-    yield from _seals(place, sorted(there))
+    there, last, folders = _list_documents(place), find_highest_numbers(names), place.folders()
+    yield from _verify_seals(place, sorted(there))
     if "run" not in last:
         yield f"{place.where(name_of('run', 1))}: is gone"
     known = None
@@ -129,98 +136,98 @@ def verify_run(store: Store, run_id: str, recipe: str | None = None) -> Iterator
         with suppress(StoreError):
             known = read_as_at(place, name_of("run", number), RunJson)
             there |= set(known.streams)
-    yield from _isolated(_streams(place, known))
-    recipes = [name for name in folders if name != _STREAMS and numbers(place.files(name)).get("manifest")]
+    yield from _isolate_errors(_verify_streams(place, known))
+    recipes = [name for name in folders if name != _STREAMS and find_highest_numbers(place.files(name)).get("manifest")]
     for name in recipes if recipe is None else [recipe]:
-        yield from _isolated(_ingestion(store.runs_place, run_id, name))
+        yield from _isolate_errors(_make_ingestion(store.runs_place, run_id, name))
     if not recipes:
         yield f"{place.where()}: holds no finished run; ingest its log again"
     for name in names:
         if name not in there and name.partition("/")[0] not in recipes:
-            yield _stranger(place, name)
+            yield _describe_stranger(place, name)
 
 
-def _documents(place: Place) -> set[str]:
-    return {name for name in place.files() if stem_and_number(name) or name == _REPORT}
+def _list_documents(place: Place) -> set[str]:
+    return {name for name in place.files() if split_number(name) or name == _REPORT}
 
 
-def _seals(place: Place, names: Iterable[str]) -> Iterator[Finding]:
+def _verify_seals(place: Place, names: Iterable[str]) -> Iterator[Finding]:
     for name in names:
-        yield broken_seal_in(place.read(name), place.where(name)) or ("files", 1)
+        yield find_broken_seal_in(place.read(name), place.where(name)) or ("files", 1)
 
 
-def _maps(store: Store) -> Iterator[Finding]:
+def _verify_maps(store: Store) -> Iterator[Finding]:
     place = store.place.below("maps")
-    known = _documents(place)
-    yield from _seals(place, sorted(known))
-    for name, last in numbers(known).items():
+    known = _list_documents(place)
+    yield from _verify_seals(place, sorted(known))
+    for name, last in find_highest_numbers(known).items():
         for number in range(1, last + 1):
             with suppress(StoreError):
                 known |= set(read_as_at(place, name_of(name, number), MapDocument).checksums)
-        yield from _isolated(_stored_map(store, name))
+        yield from _isolate_errors(_verify_stored_map(store, name))
     for entry in place.entries():
         if entry.name not in known:
-            yield _stranger(place, entry.name)
+            yield _describe_stranger(place, entry.name)
 
 
-def _stored_map(store: Store, name: str) -> Iterator[Finding]:
+def _verify_stored_map(store: Store, name: str) -> Iterator[Finding]:
     yield "maps", 1
     place, document = store.place.below("maps"), store.map_document(name)
-    wrong = list(_wrong(place, document.checksums))
+    wrong = list(_find_wrong_files(place, document.checksums))
     yield from wrong
     yield "files", len(document.checksums)
     if not wrong:
         path, fetched = store.map_files(name)
-        yield from _tiles(path, fetched)
-        if document.picture in document.checksums and not shows_map(store.map_picture(name), path):
+        yield from _verify_tiles(path, fetched)
+        if document.picture in document.checksums and not is_picture_of_map(store.map_picture(name), path):
             yield f"{place.where(document.picture)}: does not show the map as it is; add the map again with --force"
 
 
-def _wrong(place: Place, checksums: Mapping[str, Checksum]) -> Iterator[str]:
+def _find_wrong_files(place: Place, checksums: Mapping[str, Checksum]) -> Iterator[str]:
     """Yield a line for every file that is not what a document has of it."""
     for name, wanted in checksums.items():
-        if line := wrong_checksum(place.where(name), place.checksum(name), wanted):
+        if line := find_wrong_checksum(place.where(name), place.checksum(name), wanted):
             yield line
 
 
-def _stranger(place: Place, name: str) -> str:
+def _describe_stranger(place: Place, name: str) -> str:
     """Return a line about what no document knows."""
     if any(_DIGEST.fullmatch(part) for part in name.split("/")):
         return f"{place.where(name)}: was left behind by a command that was killed; 'tcpipe prune' removes it"
     return f"{place.where(name)}: is no file of this store"
 
 
-def _left_behind(root: Path) -> Iterator[str]:
+def _find_left_behind(root: Path) -> Iterator[str]:
     for path in sorted(root.glob(f"{TEMPORARY_PREFIX}*")):
         if is_abandoned(path):
             yield f"{path}: was left behind by a command that was killed; the next tcpipe ingest or add-map removes it"
 
 
-def strangers_in(place: Place) -> Iterator[str]:
+def find_strangers(place: Place) -> Iterator[str]:
     """Yield what no call of tcpipe has written into the directory of a run, or of one of its ingestions."""
     known = {f"{role}.parquet" for role in STREAMS} | {f"{name}.parquet" for name in _TABLES} | {_REPORT}
     names = ((entry.name, entry.name.rpartition("/")[2]) for entry in place.entries())
-    yield from (place.where(name) for name, last in names if last not in known and not stem_and_number(last))
+    yield from (place.where(name) for name, last in names if last not in known and not split_number(last))
 
 
 def verify_map(path: Path) -> Iterator[Finding]:
     """Yield the same of one map: every file, and every tile of every layer and level decoded."""
     yield "maps", 1
-    checksums = yield from _listed(path)
+    checksums = yield from _verify_listed(path)
     if checksums is None:
         return
-    yield from _tiles(path)
+    yield from _verify_tiles(path)
 
 
-def _tiles(path: Path, fetched: FetchedShards | None = None) -> Iterator[Finding]:
+def _verify_tiles(path: Path, fetched: FetchedShards | None = None) -> Iterator[Finding]:
     source = open_map(path, fetched, proved=False)
     for factor in source.factors:
         level = source if factor == 1 else source.at(factor)
         for layer in source.layers:
-            yield from _layer(path, level, layer, None if factor > 1 else source.facts.covered[layer])
+            yield from _verify_layer(path, level, layer, None if factor > 1 else source.facts.covered[layer])
 
 
-def _isolated(findings: Iterator[Finding]) -> Iterator[Finding]:
+def _isolate_errors(findings: Iterator[Finding]) -> Iterator[Finding]:
     """Turn an error into problems, so that one damaged run or map does not hide the others."""
     try:
         yield from findings
@@ -228,25 +235,25 @@ def _isolated(findings: Iterator[Finding]) -> Iterator[Finding]:
         yield from error.problems
 
 
-def _listed(directory: Path) -> Any:
+def _verify_listed(directory: Path) -> Any:
     """Compare every file below a directory with its ``checksums.json``; return what that lists, or None if it cannot be trusted."""
     try:
         checksums = read_checksums(directory)
     except StoreError as error:
         yield from error.problems
         return None
-    yield from broken_checksums(directory, checksums)
+    yield from find_broken_checksums(directory, checksums)
     yield "files", len(checksums) + 1
     place = DirectoryPlace(directory)
     for entry in place.entries():
         if entry.name not in {*checksums, CHECKSUMS}:
-            yield _stranger(place, entry.name)
+            yield _describe_stranger(place, entry.name)
     return checksums
 
 
-def _streams(place: Place, known: RunJson | None) -> Iterator[Finding]:
+def _verify_streams(place: Place, known: RunJson | None) -> Iterator[Finding]:
     checksums = known.streams if known else {}
-    wrong = list(_wrong(place, checksums))
+    wrong = list(_find_wrong_files(place, checksums))
     yield from wrong
     yield "files", len(checksums)
     for name, of in checksums.items() if not wrong else ():
@@ -258,11 +265,11 @@ def _streams(place: Place, known: RunJson | None) -> Iterator[Finding]:
         yield "rows", table.num_rows
 
 
-def _ingestion(runs: Place, run_id: str, recipe_name: str) -> Iterator[Finding]:
+def _make_ingestion(runs: Place, run_id: str, recipe_name: str) -> Iterator[Finding]:
     """Compare what a run became under one recipe with its manifest."""
     yield "runs", 1
     place = runs.below(f"{run_id}/{recipe_name}")
-    last = name_of("manifest", numbers(place.files())["manifest"])
+    last = name_of("manifest", find_highest_numbers(place.files())["manifest"])
     document, where = read_sealed_at(place, last), place.where(last)
     if document["data_model_version"] not in READ_VERSIONS:
         yield (
@@ -270,32 +277,32 @@ def _ingestion(runs: Place, run_id: str, recipe_name: str) -> Iterator[Finding]:
             "ingest the log again, then remove this directory"
         )
         return
-    manifest, recipe = typed(document, Manifest, where), document["recipe"]
-    of = (ingest_key(recipe), recipe_id(recipe, manifest.robot)) if isinstance(recipe, Mapping) else None
+    manifest, recipe = parse_typed(document, Manifest, where), document["recipe"]
+    of = (ingest_key(recipe), make_recipe_id(recipe, manifest.robot)) if isinstance(recipe, Mapping) else None
     if of != (manifest.ingest_key, recipe_name):
         yield f"{where}: its recipe is not the one that the directory is named after"
-    wrong = list(_wrong(place, manifest.checksums))
+    wrong = list(_find_wrong_files(place, manifest.checksums))
     yield from wrong
     yield "files", len(manifest.checksums)
-    yield from _others(place, manifest)
-    run = RunDirectory(run_id, recipe_name, runs, facts_of(manifest, last, {}), ((0, time.time_ns()),))
-    yield from _tables(run, where) if not wrong else ()
+    yield from _verify_others(place, manifest)
+    run = RunDirectory(run_id, recipe_name, runs, make_run_facts(manifest, last, {}), ((0, time.time_ns()),))
+    yield from _verify_tables(run, where) if not wrong else ()
 
 
-def _others(place: Place, manifest: Manifest) -> Iterator[Finding]:
+def _verify_others(place: Place, manifest: Manifest) -> Iterator[Finding]:
     """Yield what is wrong with the documents beside a manifest, and what no manifest knows."""
-    documents = _documents(place)
-    yield from _seals(place, sorted(documents))
+    documents = _list_documents(place)
+    yield from _verify_seals(place, sorted(documents))
     known = {*documents, *manifest.checksums}
     for name in documents:
         with suppress(StoreError):
             known |= set(read_as_at(place, name, Manifest).checksums) if name != _REPORT else set()
     for entry in place.entries():
         if entry.name not in known:
-            yield _stranger(place, entry.name)
+            yield _describe_stranger(place, entry.name)
 
 
-def _tables(run: RunDirectory, where: str) -> Iterator[Finding]:
+def _verify_tables(run: RunDirectory, where: str) -> Iterator[Finding]:
     tables = {}
     for name, schema in _TABLES.items():
         tables[name] = schema.completed(run.table(name))
@@ -305,28 +312,28 @@ def _tables(run: RunDirectory, where: str) -> Iterator[Finding]:
             yield from (f"{run.where}/{name}.parquet: {problem}" for problem in error.problems)
             return
         yield "rows", tables[name].num_rows
-    yield from (f"{where}: {problem}" for problem in _disagreements(run, tables))
-    yield from (f"{run.where}/segments.parquet: {problem}" for problem in _wrong_joins(run, tables))
+    yield from (f"{where}: {problem}" for problem in _find_disagreements(run, tables))
+    yield from (f"{run.where}/segments.parquet: {problem}" for problem in _find_wrong_joins(run, tables))
 
 
-def _disagreements(run: RunDirectory, tables: Mapping[str, pa.Table]) -> Iterator[str]:
+def _find_disagreements(run: RunDirectory, tables: Mapping[str, pa.Table]) -> Iterator[str]:
     """Yield what the manifest says otherwise than its directory and its tables."""
     manifest = run.manifest
     for name, count in _COUNTS.items():
         said = getattr(manifest.counts, count)
         if said not in (None, tables[name].num_rows):
             yield f"{count} is {said}, but {name}.parquet has {tables[name].num_rows} rows"
-    covered_m, kept_m = math.fsum(floats(tables["segments"], "arc_length_m")), manifest.ledger_m.get(KEPT, 0.0)
+    covered_m, kept_m = math.fsum(to_floats(tables["segments"], "arc_length_m")), manifest.ledger_m.get(KEPT, 0.0)
     if not math.isclose(covered_m, kept_m, rel_tol=1e-9, abs_tol=1e-6):
         yield f"the ledger keeps {kept_m:.3f} m, the segments cover {covered_m:.3f} m"
     if manifest.run_id != run.run_id:
         yield f"is of run {manifest.run_id}, but lies in {run.run_id}"
 
 
-def _wrong_joins(run: RunDirectory, tables: Mapping[str, pa.Table]) -> Iterator[str]:
+def _find_wrong_joins(run: RunDirectory, tables: Mapping[str, pa.Table]) -> Iterator[str]:
     """Yield what is wrong between segments and their run and track."""
     segments, run_id = tables["segments"], run.run_id
-    start_ns, end_ns = (integers(segments, f"{end}_ns") for end in ("start", "end"))
+    start_ns, end_ns = (to_integers(segments, f"{end}_ns") for end in ("start", "end"))
     if segments.column("segment_id").to_pylist() != [f"{run_id}-{stamp}" for stamp in start_ns.tolist()]:
         yield "its segment ids are not the run's id and their start stamps"
     for column, wanted in (("run_id", run_id), ("robot", run.manifest.robot)):
@@ -335,12 +342,12 @@ def _wrong_joins(run: RunDirectory, tables: Mapping[str, pa.Table]) -> Iterator[
             yield f"holds segments of {column} {', '.join(sorted(others))}; wanted {wanted}"
     if len(start_ns) and (np.any(end_ns <= start_ns) or np.any(start_ns[1:] < end_ns[:-1])):
         yield "its segments do not follow one another in time"
-    stamps = integers(tables["track"], "stamp_ns")
+    stamps = to_integers(tables["track"], "stamp_ns")
     if len(start_ns) and len(stamps) and (start_ns.min() < stamps.min() or end_ns.max() > stamps.max()):
         yield "its segments begin before the track or end after it"
 
 
-def _layer(path: Path, level: MapFile, layer: str, covered: float | None) -> Iterator[Finding]:
+def _verify_layer(path: Path, level: MapFile, layer: str, covered: float | None) -> Iterator[Finding]:
     """Decode every tile of a layer; compare its coverage with what was recorded, and its classes with the table."""
     grid, side, kind, with_data, highest = level.grid, level.tile_px, level.layers[layer], 0, 0
     for row in range(0, grid.rows, side):

@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 from tcpipe.errors import MapError
 from tcpipe.planning.cost_model import CostModel
 from tcpipe.planning.courses import COURSES, DIRECTIONS
-from tcpipe.planning.reasons import NO_COST, Bits, Reason
+from tcpipe.planning.no_cost_reasons import NO_COST, Bits, Reason
 from tcpipe.planning.segment_predictions import BATCH, SegmentPredictions, predict_segments
 from tcpipe.terrain.grid import MapGrid
 from tcpipe.terrain.patches import PatchFrames
-from tcpipe.terrain.point_classes import classes_at
-from tcpipe.terrain.projection import metres_from_plane, parse_crs
+from tcpipe.terrain.point_classes import find_classes_at
+from tcpipe.terrain.projection import make_metres_from_plane, parse_crs
 from tcpipe.terrain.tiles import CACHED_TILES, MapReader, level_for
 
 Floats32 = NDArray[np.float32]
@@ -35,7 +35,7 @@ BARRED = NO_COST | Reason.OBSTACLE
 """Ground that a planner never crosses."""
 
 
-def grid_over(source: MapReader, step_m: float) -> MapGrid:
+def make_grid(source: MapReader, step_m: float) -> MapGrid:
     """Return the grid of cells: from the map's north-west corner, as many as fit whole. `MapError`: the map is smaller than a cell."""
     grid = source.grid
     cells = [int(size * grid.pitch_m / step_m + 1e-6) for size in (grid.rows, grid.cols)]
@@ -85,7 +85,7 @@ class CostGrid:
         self.height_m.reshape(-1)[cells] = np.where(count > 0, total / np.maximum(count, 1), np.nan)
 
 
-def empty_grid(grid: MapGrid) -> CostGrid:
+def make_empty_grid(grid: MapGrid) -> CostGrid:
     """Return a grid of which nothing is known, in memory."""
     shape = (COURSES, grid.rows, grid.cols)
     nothing = np.float32(np.nan)
@@ -98,7 +98,7 @@ def empty_grid(grid: MapGrid) -> CostGrid:
     )
 
 
-def blocks(
+def iterate_blocks(
     source: MapReader, model: CostModel, grid: MapGrid, wanted: NDArray[np.bool_] | None = None
 ) -> Iterator[Cells]:
     """Yield flat indices of cells, at most `CELLS_OF_BLOCK` together, by tile of the map, so that each tile is decoded once.
@@ -136,7 +136,7 @@ class CellFrames:
         corners = grid.xy_from_px(
             np.array([(c, r) for r in (0, grid.rows - 1) for c in (0, grid.cols - 1)], np.float64)
         )
-        self._corners = metres_from_plane(parse_crs(grid.crs, where=where), corners).reshape(2, 2, 2, 2)
+        self._corners = make_metres_from_plane(parse_crs(grid.crs, where=where), corners).reshape(2, 2, 2, 2)
 
     def of(self, cells: Cells) -> PatchFrames:
         """Return the frames of cells (flat indices, (n,)), shape (16 n,), courses fastest."""
@@ -158,7 +158,7 @@ Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True)
-class Survey:
+class LazyCostGrid:
     """Costs and reasons, and of which cells they are known, shape (rows, cols) each."""
 
     model: CostModel
@@ -186,24 +186,26 @@ class Survey:
             return np.zeros((grid.rows, grid.cols), np.uint8)
         row, col = np.mgrid[: grid.rows, : grid.cols]
         middle = grid.xy_from_px(np.stack([col, row], axis=-1).reshape(-1, 2).astype(np.float64))
-        return np.maximum(classes_at(self.source, middle), 0).astype(np.uint8).reshape(grid.rows, grid.cols)
+        return np.maximum(find_classes_at(self.source, middle), 0).astype(np.uint8).reshape(grid.rows, grid.cols)
 
     def _learn(self, wanted: Mask, step: Callable[[int, int], None], *, ask: bool) -> None:
-        todo = list(blocks(self.source, self.model, self.costs.grid, wanted))
+        todo = list(iterate_blocks(self.source, self.model, self.costs.grid, wanted))
         answers = predict_segments(self.model, self.source, (self.frames.of(cells) for cells in todo), ask=ask)
         for number, (cells, found) in enumerate(zip(todo, answers, strict=True), 1):
             self.costs.put(cells, found)
             step(number, len(todo))
 
 
-def new_survey(model: CostModel, source: MapReader, step_m: float) -> Survey:
+def make_survey(model: CostModel, source: MapReader, step_m: float) -> LazyCostGrid:
     """Return a survey of which nothing is known."""
-    grid = grid_over(source, step_m)
+    grid = make_grid(source, step_m)
     known = np.zeros((2, grid.rows, grid.cols), np.bool_)
-    return Survey(model, source, empty_grid(grid), known[0], known[1], CellFrames(grid, where=f"map {source.name}"))
+    return LazyCostGrid(
+        model, source, make_empty_grid(grid), known[0], known[1], CellFrames(grid, where=f"map {source.name}")
+    )
 
 
-def survey_from(model: CostModel, source: MapReader, costs: CostGrid) -> Survey:
+def read_survey(model: CostModel, source: MapReader, costs: CostGrid) -> LazyCostGrid:
     """Return a survey of which all is known, from a cost map."""
     known = np.ones((2, costs.grid.rows, costs.grid.cols), np.bool_)
-    return Survey(model, source, costs, known[0], known[1], CellFrames(costs.grid, where=f"map {source.name}"))
+    return LazyCostGrid(model, source, costs, known[0], known[1], CellFrames(costs.grid, where=f"map {source.name}"))

@@ -26,25 +26,25 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.errors import MapError, StoreError, TcpipeError, UsageError, plain_lines
-from tcpipe.execution import run_all, sound
-from tcpipe.formats.atomic import atomic_directory, clear_beside, exclusive, write_text
+from tcpipe.errors import MapError, StoreError, TcpipeError, UsageError, clean_lines
+from tcpipe.execution import run_all, unwrap_result
+from tcpipe.formats.atomic import clear_beside, lock_directory, write_atomic_directory, write_text
 from tcpipe.formats.bucket_directories import fetch_directory, has_card
+from tcpipe.formats.integrity import Checksum, compute_checksums, find_broken_checksums, read_sealed_as, write_sealed
 from tcpipe.formats.json_files import digest, read_json, write_json
 from tcpipe.formats.maps.geotiff import read_bands, write_cog
 from tcpipe.formats.maps.map_files import MapFile
 from tcpipe.formats.maps.nav2 import HIGHEST, LETHAL, write_nav2_map
 from tcpipe.formats.object_storage import is_url
-from tcpipe.formats.qgis_styles import raster_style
-from tcpipe.formats.seals import Checksum, broken_checksums, file_checksums, read_sealed_as, write_sealed
+from tcpipe.formats.qgis_styles import make_raster_style
 from tcpipe.pipeline.generations import write_generation
-from tcpipe.planning.cost_grid import BARRED, CellFrames, Cells, CostGrid, blocks, empty_grid, grid_over
+from tcpipe.planning.cost_grid import BARRED, CellFrames, Cells, CostGrid, iterate_blocks, make_empty_grid, make_grid
 from tcpipe.planning.cost_model import CostModel, check_model
 from tcpipe.planning.courses import ANGLES_DEG, COURSES
-from tcpipe.planning.path_cost import projection_of
-from tcpipe.planning.reasons import Reason
+from tcpipe.planning.no_cost_reasons import Reason
+from tcpipe.planning.path_cost import find_projection
 from tcpipe.planning.segment_predictions import SegmentPredictions, predict_segments
-from tcpipe.tables.bits import name_of
+from tcpipe.tables.bits import flag_name
 from tcpipe.terrain.grid import MapGrid
 
 logger = logging.getLogger("tcpipe")
@@ -129,7 +129,7 @@ class CostMapResult:
         if self.status == "unchanged":
             head += "; nothing to do: it is made from the same model, map and step"
         reasons = ", ".join(f"{name.replace('_', ' ')} {share:.1%}" for name, share in self.card.reason_share.items())
-        return plain_lines(
+        return clean_lines(
             (
                 head,
                 f"{cells.with_cost} cells with a cost, {cells.trusted} of them on ground the model knows along some course",
@@ -138,7 +138,7 @@ class CostMapResult:
         )
 
 
-def cost_map_key(model: CostModel, source: MapFile, step_m: float) -> str:
+def make_cost_map_key(model: CostModel, source: MapFile, step_m: float) -> str:
     """Return what a cost map is made from, as a digest."""
     return digest({"model": model.checksum, "map": source.summary(), "step_m": step_m, "version": VERSION})
 
@@ -173,31 +173,37 @@ def make_cost_map(
     """
     check_model(model, source)
     if is_url(out):
-        return _into_bucket(model, source, str(out), step_m=step_m, origin_deg=origin_deg, step=step, cluster=cluster)
+        return _map_into_bucket(
+            model, source, str(out), step_m=step_m, origin_deg=origin_deg, step=step, cluster=cluster
+        )
     out = Path(out)
     clear_beside(out)
-    grid, key, origin_m = grid_over(source, step_m), cost_map_key(model, source, step_m), _origin_m(source, origin_deg)
+    grid, key, origin_m = (
+        make_grid(source, step_m),
+        make_cost_map_key(model, source, step_m),
+        _find_origin_m(source, origin_deg),
+    )
     if out.exists() and not (out / CARD).is_file() and (not out.is_dir() or any(out.iterdir())):
         raise UsageError(f"{out}: exists and is no cost map; give another directory")
-    with _claimed(out) as place:
+    with _claim_spool(out) as place:
         found = read_cost_map_card(out)  # another process may have been first
-        if found is not None and found.key == key and not any(broken_checksums(out, found.checksums)):
+        if found is not None and found.key == key and not any(find_broken_checksums(out, found.checksums)):
             if found.origin_deg == origin_deg:
                 rmtree(place)
                 return CostMapResult(str(out), "unchanged", found)
             costs = open_cost_map(out, found)
         else:
-            spool = _spool(place, key, grid)
+            spool = _open_spool(place, key, grid)
             _fill(model, source, spool, step, None if cluster is None else partial(_from_cluster, cluster, key))
             costs = spool.costs
-        with atomic_directory(out) as directory:
-            card = replace(_card(model, source, key, directory, costs, origin_m=origin_m), origin_deg=origin_deg)
+        with write_atomic_directory(out) as directory:
+            card = replace(_write_files(model, source, key, directory, costs, origin_m=origin_m), origin_deg=origin_deg)
             write_sealed(directory / CARD, card)
         rmtree(place)
     return CostMapResult(str(out), "done", card)
 
 
-def _into_bucket(
+def _map_into_bucket(
     model: CostModel,
     source: MapFile,
     url: str,
@@ -209,7 +215,7 @@ def _into_bucket(
 ) -> CostMapResult:
     """Make it on this machine, and put it to a URL."""
     known = read_cost_map_card(fetch_directory(url)) if has_card(url) else None
-    if known is not None and (known.key, known.origin_deg) == (cost_map_key(model, source, step_m), origin_deg):
+    if known is not None and (known.key, known.origin_deg) == (make_cost_map_key(model, source, step_m), origin_deg):
         return CostMapResult(url, "unchanged", known)
     with write_generation(url, CARD) as place:
         made = make_cost_map(model, source, place, step_m=step_m, origin_deg=origin_deg, step=step, cluster=cluster)
@@ -228,7 +234,7 @@ def read_cost_map_card(path: Path) -> CostMapCard | None:
 def open_cost_map(path: Path, card: CostMapCard) -> CostGrid:
     """Read the costs of a cost map into memory; `MapError` names every file that is damaged."""
     read = {f"{name}.tif": card.checksums[f"{name}.tif"] for name in ("power", "velocity", "reasons", "height")}
-    if problems := list(broken_checksums(path, read)):
+    if problems := list(find_broken_checksums(path, read)):
         raise MapError(*(f"{problem}; make the cost map again" for problem in problems))
     courses = range(1, COURSES + 1)
     power, velocity, reasons = (read_bands(path / f"{name}.tif", courses) for name in ("power", "velocity", "reasons"))
@@ -254,7 +260,7 @@ class _Spool:
 
 
 @contextmanager
-def _claimed(out: Path) -> Iterator[Path]:
+def _claim_spool(out: Path) -> Iterator[Path]:
     """Yield the directory beside ``out`` where its costs wait, for one process at a time; it stays when that is interrupted."""
     whole = out.absolute()
     place = whole.parent / f".{whole.name}.partial"
@@ -262,19 +268,19 @@ def _claimed(out: Path) -> Iterator[Path]:
         place.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise StoreError(f"{out}: cannot be written ({error.strerror})") from None
-    with exclusive(place):
+    with lock_directory(place):
         place.mkdir(exist_ok=True)  # another process may have finished meanwhile
         yield place
     with suppress(OSError):
         place.rmdir()
 
 
-def _spool(place: Path, key: str, grid: MapGrid) -> _Spool:
+def _open_spool(place: Path, key: str, grid: MapGrid) -> _Spool:
     """Return the costs so far, or new files without any."""
-    if _job(place) != key:
+    if _read_job(place) != key:
         for file in place.iterdir():
             file.unlink()
-        nothing = empty_grid(replace(grid, rows=1, cols=1))
+        nothing = make_empty_grid(replace(grid, rows=1, cols=1))
         for name in _ARRAYS:
             one = getattr(nothing, name)
             shape = (*one.shape[:-2], grid.rows, grid.cols)
@@ -298,7 +304,7 @@ def _allocate(path: Path, size_bytes: int) -> None:
         raise StoreError(f"{path}: cannot be written ({error.strerror}); wanted {size_bytes / 1e6:.0f} MB") from None
 
 
-def _job(place: Path) -> str | None:
+def _read_job(place: Path) -> str | None:
     try:
         return str(read_json(place / "job.json")["key"])
     except (StoreError, KeyError):
@@ -331,7 +337,7 @@ def _from_cluster(
     tasks = [_Task(cluster.inputs, key, grid, part) for part in parts]
     with closing(run_all(_answer, tasks, jobs=1, cluster=cluster.address)) as outcomes:
         for outcome in outcomes:
-            found: list[SegmentPredictions] = sound(outcome)
+            found: list[SegmentPredictions] = unwrap_result(outcome)
             yield from zip(tasks[outcome.index].blocks, found, strict=True)
 
 
@@ -339,7 +345,7 @@ def _answer(task: _Task) -> list[SegmentPredictions] | TcpipeError:
     """Ask the model about the blocks of a task, on a worker."""
     try:
         model, source = task.inputs()
-        if cost_map_key(model, source, task.grid.pitch_m) != task.key:
+        if make_cost_map_key(model, source, task.grid.pitch_m) != task.key:
             raise UsageError(
                 f"a worker finds another map {source.name} or model {model.name} than the caller; wanted the same files under "
                 "the same names"
@@ -361,7 +367,7 @@ def _fill(
     costs = spool.costs
     frames = CellFrames(costs.grid, where=f"map {source.name}")
     missing = (spool.done == 0).reshape(costs.grid.rows, costs.grid.cols)
-    todo = list(blocks(source, model, costs.grid, missing))
+    todo = list(iterate_blocks(source, model, costs.grid, missing))
     if not missing.all():
         logger.info("going on where it was: %.0f %% of the cells are done", 100.0 * (1.0 - missing.mean()))
     ready: list[Cells] = []
@@ -383,11 +389,11 @@ _FARTHEST_ORIGIN_M = 100_000.0
 """From the map. A frame that begins further away has its longitude and latitude exchanged, or is of another site."""
 
 
-def _origin_m(source: MapFile, origin_deg: tuple[float, float] | None) -> tuple[float, float]:
+def _find_origin_m(source: MapFile, origin_deg: tuple[float, float] | None) -> tuple[float, float]:
     """Return a place in the plane of the map's CRS, (0, 0) without one; `UsageError` where it is not near the map."""
     if origin_deg is None:
         return 0.0, 0.0
-    x_m, y_m = projection_of(source).forward(np.array([origin_deg]))[0].tolist()
+    x_m, y_m = find_projection(source).forward(np.array([origin_deg]))[0].tolist()
     x_min, y_min, x_max, y_max = source.grid.bounds_m
     off_m = np.hypot(x_m - np.clip(x_m, x_min, x_max), y_m - np.clip(y_m, y_min, y_max))
     if not off_m <= _FARTHEST_ORIGIN_M:
@@ -398,12 +404,12 @@ def _origin_m(source: MapFile, origin_deg: tuple[float, float] | None) -> tuple[
     return x_m, y_m
 
 
-def _card(
+def _write_files(
     model: CostModel, source: MapFile, key: str, directory: Path, costs: CostGrid, *, origin_m: tuple[float, float]
 ) -> CostMapCard:
     """Write all files but the card; return it."""
     scales = _write(directory, costs, origin_m)
-    cells, shares = _shares(costs)
+    cells, shares = _compute_shares(costs)
     return CostMapCard(
         key=key,
         map=source.name,
@@ -414,12 +420,12 @@ def _card(
         courses_deg=tuple(ANGLES_DEG.tolist()),
         bands=dict.fromkeys(_QUANTITIES, (*_BAND_NAMES, "min", "mean", "best course")),
         units=_QUANTITIES,
-        reasons={str(int(reason)): name_of(reason) for reason in Reason},
+        reasons={str(int(reason)): flag_name(reason) for reason in Reason},
         nav2_scale=scales,
         cells=cells,
         reason_share=shares,
-        barred_by=tuple(name_of(reason) for reason in Reason if reason & BARRED),
-        checksums=file_checksums(directory),
+        barred_by=tuple(flag_name(reason) for reason in Reason if reason & BARRED),
+        checksums=compute_checksums(directory),
     )
 
 
@@ -433,7 +439,7 @@ def _write(directory: Path, costs: CostGrid, origin_m: tuple[float, float]) -> d
         strip = _strip_of(costs, name)
         write_cog(directory / f"{name}.tif", strip, dtype="float32", nodata=float("nan"), bands=bands, **layout)
     bands = [(band, "bits") for band in (*_BAND_NAMES, "all courses")]
-    write_cog(directory / "reasons.tif", _reason_strip(costs), dtype="uint16", nodata=None, bands=bands, **layout)
+    write_cog(directory / "reasons.tif", _make_reason_reader(costs), dtype="uint16", nodata=None, bands=bands, **layout)
     height = [("height", "m")]
     write_cog(
         directory / "height.tif",
@@ -445,11 +451,11 @@ def _write(directory: Path, costs: CostGrid, origin_m: tuple[float, float]) -> d
     )
     scales = {name: _write_nav2(directory / f"{name}.yaml", costs, name, origin_m) for name in ("duration", "energy")}
     for name, scale in scales.items():
-        write_text(directory / f"{name}.qml", raster_style(_MEAN_BAND, scale.lowest, scale.highest))
+        write_text(directory / f"{name}.qml", make_raster_style(_MEAN_BAND, scale.lowest, scale.highest))
     return scales
 
 
-def _values(costs: CostGrid, name: str, first: int, last: int) -> Floats32:
+def _read_values(costs: CostGrid, name: str, first: int, last: int) -> Floats32:
     """Return a quantity of rows, shape (16, rows, cols)."""
     power, velocity = costs.power_watt[:, first:last], costs.velocity_mps[:, first:last]
     values = {"power": power, "velocity": velocity}.get(name)
@@ -460,7 +466,7 @@ def _values(costs: CostGrid, name: str, first: int, last: int) -> Floats32:
 
 def _strip_of(costs: CostGrid, name: str) -> Callable[[int, int], Floats32]:
     def strip(first: int, last: int) -> Floats32:
-        values = _values(costs, name, first, last)
+        values = _read_values(costs, name, first, last)
         known = ~np.isnan(values)
         some = known.any(axis=0)
         least = np.where(known, values, np.inf).min(axis=0)
@@ -480,7 +486,7 @@ def _mean(values: Floats32) -> NDArray[np.float64]:
     return np.asarray(np.where(count > 0, total / np.maximum(count, 1), np.nan))
 
 
-def _reason_strip(costs: CostGrid) -> Callable[[int, int], NDArray[np.uint16]]:
+def _make_reason_reader(costs: CostGrid) -> Callable[[int, int], NDArray[np.uint16]]:
     def strip(first: int, last: int) -> NDArray[np.uint16]:
         bits = np.asarray(costs.reasons[:, first:last])
         return np.concatenate([bits, np.bitwise_and.reduce(bits, axis=0)[None]])
@@ -491,7 +497,7 @@ def _reason_strip(costs: CostGrid) -> Callable[[int, int], NDArray[np.uint16]]:
 _ROWS_TOGETHER = 256
 
 
-def _row_strips(costs: CostGrid) -> Iterator[tuple[int, int]]:
+def _iterate_row_strips(costs: CostGrid) -> Iterator[tuple[int, int]]:
     rows = costs.grid.rows
     yield from ((first, min(first + _ROWS_TOGETHER, rows)) for first in range(0, rows, _ROWS_TOGETHER))
 
@@ -499,9 +505,9 @@ def _row_strips(costs: CostGrid) -> Iterator[tuple[int, int]]:
 def _write_nav2(path: Path, costs: CostGrid, name: str, origin_m: tuple[float, float]) -> Nav2Scale:
     """Write the mean over the trusted courses from 0 to `HIGHEST`; return what these two stand for."""
     means = []
-    for first, last in _row_strips(costs):
+    for first, last in _iterate_row_strips(costs):
         trusted = costs.reasons[:, first:last] == 0
-        means.append(_mean(np.where(trusted, _values(costs, name, first, last), np.float32(np.nan))))
+        means.append(_mean(np.where(trusted, _read_values(costs, name, first, last), np.float32(np.nan))))
     mean = np.concatenate(means)
     known = np.isfinite(mean)
     low, high = np.percentile(mean[known], (1.0, 99.0)).tolist() if known.any() else (0.0, 1.0)
@@ -513,14 +519,14 @@ def _write_nav2(path: Path, costs: CostGrid, name: str, origin_m: tuple[float, f
     return Nav2Scale(low, high)
 
 
-def _shares(costs: CostGrid) -> tuple[CellCounts, dict[str, float]]:
+def _compute_shares(costs: CostGrid) -> tuple[CellCounts, dict[str, float]]:
     """Return how many cells have a cost, and the share of cells and courses that each reason holds."""
     counts, with_cost, trusted = dict.fromkeys(Reason, 0), 0, 0
-    for first, last in _row_strips(costs):
+    for first, last in _iterate_row_strips(costs):
         bits = np.asarray(costs.reasons[:, first:last])
         with_cost += int(np.count_nonzero((~np.isnan(costs.velocity_mps[:, first:last])).any(axis=0)))
         trusted += int(np.count_nonzero((bits == 0).any(axis=0)))
         for reason in counts:
             counts[reason] += int(np.count_nonzero(bits & reason))
-    shares = {name_of(reason): count / costs.reasons.size for reason, count in counts.items() if count}
+    shares = {flag_name(reason): count / costs.reasons.size for reason, count in counts.items() if count}
     return CellCounts(costs.grid.rows * costs.grid.cols, with_cost, trusted), shares

@@ -12,12 +12,12 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.dataset.beside import Beside
-from tcpipe.dataset.tensor import TensorForm
+from tcpipe.dataset.extra_features import ExtraFeatures
+from tcpipe.dataset.tensor import TensorLayout
 from tcpipe.errors import ModelError
 from tcpipe.tables.facts import PhysicsFit
 from tcpipe.terrain.classes import ClassTable
-from tcpipe.terrain.layers import PAPER_LAYERS, paper_layers
+from tcpipe.terrain.layers import PAPER_LAYERS, make_paper_layers
 from tcpipe.terrain.sampling import Patches
 from tcpipe.terrain.tiles import MapReader
 
@@ -102,7 +102,7 @@ class CostModel(Protocol):
     def takes_turns(self) -> bool:
         """Whether it is told how far a metre turns: its predictions hold what that costs."""
 
-    def predict(self, patches: NDArray[np.float32], beside: Beside) -> NDArray[np.float32]:
+    def predict(self, patches: NDArray[np.float32], beside: ExtraFeatures) -> NDArray[np.float32]:
         """Return power [W] and velocity [m/s], shape (N, 2), of tensors of shape (N, px, px, channels), and what is known beside them."""
 
 
@@ -114,14 +114,14 @@ class Predicted:
     velocity_mps: Floats
 
 
-def _form(model: CostModel) -> TensorForm:
-    return TensorForm(model.channels, paper_layers(PAPER_LAYERS, model.classes))
+def _make_layout(model: CostModel) -> TensorLayout:
+    return TensorLayout(model.channels, make_paper_layers(PAPER_LAYERS, model.classes))
 
 
 def check_model(model: CostModel, source: MapReader) -> None:
     """Raise `ModelError` if a map cannot give the model what it was trained on; all differences at once."""
     problems = []
-    needed = _form(model).layers
+    needed = _make_layout(model).layers
     missing = [layer for layer in needed if layer not in source.layers]
     if missing:
         problems.append(
@@ -148,12 +148,12 @@ def predict_patches(
     ------
     ModelError : it gives something else than power and velocity.
     """
-    form = _form(model)
+    form = _make_layout(model)
     pixels = {layer: patches.pixels[layer] for layer in form.layers}
     out, unknown = np.full((asked.size, 2), np.nan), np.full(asked.size, np.nan)
     turns = unknown if turn_radpm is None else turn_radpm
-    beside = Beside(patches.terrain_class.astype(np.int64), patches.slope_rad, turns, unknown)
-    for rows in _batches(np.flatnonzero(asked)):
+    beside = ExtraFeatures(patches.terrain_class.astype(np.int64), patches.slope_rad, turns, unknown)
+    for rows in _iterate_batches(np.flatnonzero(asked)):
         said = model.predict(form.form(pixels, rows), beside.take(rows))
         if said.shape != (rows.size, 2):
             raise ModelError(
@@ -164,5 +164,5 @@ def predict_patches(
     return Predicted(out[:, 0].copy(), out[:, 1].copy())
 
 
-def _batches(rows: NDArray[np.int64]) -> Iterator[NDArray[np.int64]]:
+def _iterate_batches(rows: NDArray[np.int64]) -> Iterator[NDArray[np.int64]]:
     yield from (rows[first : first + BATCH_PATCHES] for first in range(0, rows.size, BATCH_PATCHES))

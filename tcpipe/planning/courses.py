@@ -22,7 +22,7 @@ _FIRST_QUARTER = ((1, 0), (2, 1), (1, 1), (1, 2))
 """East and north in cells."""
 
 
-def _moves() -> NDArray[np.int64]:
+def _list_moves() -> NDArray[np.int64]:
     moves = np.array(_FIRST_QUARTER)
     quarters = [moves]
     for _ in range(3):
@@ -31,7 +31,7 @@ def _moves() -> NDArray[np.int64]:
     return np.concatenate(quarters)
 
 
-MOVES = _moves()
+MOVES = _list_moves()
 """East and north of each course's step, in cells, shape (16, 2)."""
 
 DIRECTIONS = MOVES / np.linalg.norm(MOVES, axis=1)[:, None]
@@ -42,7 +42,7 @@ ANGLES_DEG = np.degrees(np.arctan2(DIRECTIONS[:, 1], DIRECTIONS[:, 0])) % 360.0
 
 
 @dataclass(frozen=True, slots=True)
-class Touch:
+class CrossedCell:
     """A cell that a step touches: east and north of where it begins, in cells, and the share of the step that lies in it.
 
     A share of 0 is a corner: the step only touches it, but a robot has a width.
@@ -53,13 +53,18 @@ class Touch:
     share: float
 
 
-def touches(course: int) -> tuple[Touch, ...]:
+def find_crossed_cells(course: int) -> tuple[CrossedCell, ...]:
     """Return the cells that a step along a course touches, the first and the last included."""
     east, north = MOVES[course].tolist()
     side_e, side_n = (east > 0) - (east < 0), (north > 0) - (north < 0)
     if abs(east) + abs(north) == 1:
-        return Touch(0, 0, 0.5), Touch(east, north, 0.5)
+        return CrossedCell(0, 0, 0.5), CrossedCell(east, north, 0.5)
     if abs(east) == abs(north):
-        return Touch(0, 0, 0.5), Touch(side_e, 0, 0.0), Touch(0, side_n, 0.0), Touch(east, north, 0.5)
-    middle = Touch(side_e, 0, 0.25) if abs(east) == 2 else Touch(0, side_n, 0.25)
-    return Touch(0, 0, 0.25), middle, Touch(side_e, side_n, 0.25), Touch(east, north, 0.25)
+        return (
+            CrossedCell(0, 0, 0.5),
+            CrossedCell(side_e, 0, 0.0),
+            CrossedCell(0, side_n, 0.0),
+            CrossedCell(east, north, 0.5),
+        )
+    middle = CrossedCell(side_e, 0, 0.25) if abs(east) == 2 else CrossedCell(0, side_n, 0.25)
+    return CrossedCell(0, 0, 0.25), middle, CrossedCell(side_e, side_n, 0.25), CrossedCell(east, north, 0.25)

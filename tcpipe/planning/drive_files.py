@@ -10,7 +10,7 @@ import numpy as np
 
 from tcpipe import __version__
 from tcpipe.dataset import Dataset
-from tcpipe.errors import UsageError, plain_lines
+from tcpipe.errors import UsageError, clean_lines
 from tcpipe.formats.atomic import clear, write_text
 from tcpipe.formats.bucket_directories import require_card
 from tcpipe.formats.finding_lines import format_findings, format_verdict
@@ -18,13 +18,13 @@ from tcpipe.formats.json_files import write_json
 from tcpipe.formats.object_storage import is_url
 from tcpipe.pipeline.generations import write_generation
 from tcpipe.planning.cost_model import CostModel
-from tcpipe.planning.drives import Against, DriveCost, drive_cost, drive_in, in_words
+from tcpipe.planning.drives import DriveCost, IntervalComparison, compute_drive_cost, find_drive, format_drive
 from tcpipe.report.colours import DROPPED, SPLIT_COLOURS
 from tcpipe.report.page import Number, Section, render_page
-from tcpipe.report.plots import Plot, new_plot
+from tcpipe.report.plots import Plot, make_plot
 from tcpipe.report.verdict import show_verdict
 from tcpipe.store import open_store
-from tcpipe.tables.catalogue import threshold
+from tcpipe.tables.catalogue import read_threshold
 from tcpipe.tables.findings import Finding, Subject, make_finding
 from tcpipe.tables.verdicts import PREDICTED, Verdict, judge
 from tcpipe.terrain.tiles import MapReader
@@ -41,8 +41,8 @@ class Drives:
     model: str
     model_checksum: str
     drives: tuple[DriveCost, ...]
-    duration_s: Against
-    energy_joule: Against
+    duration_s: IntervalComparison
+    energy_joule: IntervalComparison
     findings: tuple[Finding, ...]
     verdict: Verdict
 
@@ -56,7 +56,7 @@ class DrivesResult:
 
     def __str__(self) -> str:
         """Return each drive and their sum, as plain lines."""
-        lines = [line for drive in self.values.drives for line in in_words(drive)]
+        lines = [line for drive in self.values.drives for line in format_drive(drive)]
         held = [drive for drive in self.values.drives if drive.held_back]
         if len(held) > 1:
             of_both = {"time": self.values.duration_s, "energy": self.values.energy_joule}
@@ -66,7 +66,7 @@ class DrivesResult:
                 f"all {len(held)} drives held back: {sums}; intervals hold {hits[0]} of the times and {hits[1]} of the energies"
             )
         lines += [f"verdict: {format_verdict(self.values.verdict, PREDICTED)}", *format_findings(self.values.findings)]
-        return plain_lines((*lines, f"open {self.path}/{PAGE}"))
+        return clean_lines((*lines, f"open {self.path}/{PAGE}"))
 
 
 def evaluate_drives(
@@ -83,11 +83,11 @@ def evaluate_drives(
             result = evaluate_drives(model, data, source, logs, store=store, out=made)
         return replace(result, path=require_card(str(out), [JSON]).place.where())
     place, opened = Path(out), open_store(store)
-    runs = [drive_in(opened, log) for log in logs]
+    runs = [find_drive(opened, log) for log in logs]
     clear(place)
     if place.exists() and not place.is_dir():
         raise UsageError(f"{place}: is a file, wanted a directory to write {JSON} and {PAGE} into")
-    found = tuple(drive_cost(model, source, run, data, log=log) for run, log in zip(runs, logs, strict=True))
+    found = tuple(compute_drive_cost(model, source, run, data, log=log) for run, log in zip(runs, logs, strict=True))
     held, findings = (
         [drive for drive in found if drive.held_back],
         tuple(_find_doubts(found, Subject("model", model.name))),
@@ -99,16 +99,16 @@ def evaluate_drives(
     )  # fmt: skip
     place.mkdir(parents=True, exist_ok=True)
     write_json(place / JSON, values)
-    write_text(place / PAGE, _page(values))
+    write_text(place / PAGE, _render_page(values))
     return DrivesResult(place, values)
 
 
-def _sum(parts: Sequence[Against]) -> Against:
+def _sum(parts: Sequence[IntervalComparison]) -> IntervalComparison:
     """Return sums over drives; how errors of drives go together is not known, so there is no interval."""
-    return Against(sum(of.measured for of in parts), sum(of.predicted for of in parts), None, None)
+    return IntervalComparison(sum(of.measured for of in parts), sum(of.predicted for of in parts), None, None)
 
 
-def _page(values: Drives) -> str:
+def _render_page(values: Drives) -> str:
     return render_page(
         title="Drives, measured and predicted",
         lead=f"Model {Path(values.model).name}: sums along each drive over the metres that can be compared, with 90 % intervals.",
@@ -120,7 +120,9 @@ def _page(values: Drives) -> str:
         verdict=show_verdict(values.verdict, values.findings, PREDICTED),
         sections=[
             Section(
-                drive.run_id, " ".join(f"{line}." for line in in_words(drive)), plots=list(_sums_along(number, drive))
+                drive.run_id,
+                " ".join(f"{line}." for line in format_drive(drive)),
+                plots=list(_draw_sums(number, drive)),
             )
             for number, drive in enumerate(values.drives)
         ],
@@ -138,25 +140,25 @@ def _find_doubts(drives: Sequence[DriveCost], model: Subject) -> Iterator[Findin
     if not compared:
         yield make_finding("no-drive-compared", model)
     for name, quantity in (("time", "duration_s"), ("energy", "energy_joule")):
-        sums: dict[str, Against] = {drive.run_id: getattr(drive, quantity) for drive in compared}
+        sums: dict[str, IntervalComparison] = {drive.run_id: getattr(drive, quantity) for drive in compared}
         for run_id, of in sums.items():
             error = abs(of.off_percent) / 100.0
-            if error >= threshold(f"{name}-far-off", "max_error_fraction"):
+            if error >= read_threshold(f"{name}-far-off", "max_error_fraction"):
                 yield make_finding(f"{name}-far-off", Subject("run", run_id), error_fraction=error)
         held = [of.held for of in sums.values() if of.held is not None]
-        if held and sum(held) < threshold(f"{name}-overconfident", "min_drive_coverage_fraction") * len(held):
+        if held and sum(held) < read_threshold(f"{name}-overconfident", "min_drive_coverage_fraction") * len(held):
             yield make_finding(f"{name}-overconfident", model, coverage_fraction=sum(held) / len(held))
-    if 0 < len(compared) < threshold("few-drives", "min_drive_count"):
+    if 0 < len(compared) < read_threshold("few-drives", "min_drive_count"):
         yield make_finding("few-drives", model, drive_count=len(compared))
 
 
-def _sums_along(number: int, drive: DriveCost) -> Iterator[Plot]:
+def _draw_sums(number: int, drive: DriveCost) -> Iterator[Plot]:
     """Yield what a drive took so far over the distance driven, measured and predicted, with its interval."""
     distance_m, first = np.array(drive.along.distance_m), None
     for label, sums in (("time T [s]", drive.along.duration_s), ("energy E [J]", drive.along.energy_joule)):
         if not len(distance_m):
             return
-        plot = new_plot(
+        plot = make_plot(
             f"{label} {number}",
             alt=f"{label} of {drive.run_id} so far over the distance driven, measured and predicted, with its 90 % interval.",
             axes=("distance driven in segments [m]", label),
@@ -169,7 +171,7 @@ def _sums_along(number: int, drive: DriveCost) -> Iterator[Plot]:
                 ("90 %", "@low{0.0} to @high{0.0}"),
             ],
         )
-        columns = dict(zip(("measured", "predicted", "low", "high"), _columns(sums), strict=True))
+        columns = dict(zip(("measured", "predicted", "low", "high"), _collect_columns(sums), strict=True))
         source = {"metres": distance_m, **columns}
         plot.figure.varea("metres", "low", "high", source=source, color=SPLIT_COLOURS["train"], alpha=0.2)
         plot.figure.hover.renderers = [
@@ -182,7 +184,7 @@ def _sums_along(number: int, drive: DriveCost) -> Iterator[Plot]:
         yield plot
 
 
-def _columns(sums: Sequence[Against]) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
+def _collect_columns(sums: Sequence[IntervalComparison]) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
     """Return measured, predicted, low, high, shape (4, N)."""
     return np.array(
         [[np.nan if v is None else v for v in (of.measured, of.predicted, of.low, of.high)] for of in sums]

@@ -10,20 +10,20 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from tcpipe.cost.prediction_errors import COVERAGE, Errors, errors_of
+from tcpipe.cost.prediction_errors import COVERAGE, Errors, fit_errors
 from tcpipe.dataset import Dataset
 from tcpipe.dataset.energies import ENERGIES
 from tcpipe.errors import ModelError, UsageError
 from tcpipe.formats.stored_runs import RunDirectory
 from tcpipe.planning.cost_model import CostModel, check_model
-from tcpipe.planning.reasons import Reason
-from tcpipe.planning.segment_predictions import SegmentPredictions, in_batches, joined, predict_segments
-from tcpipe.splits.neighbours import CLOSE, PLACES, are_near, middles_deg
+from tcpipe.planning.no_cost_reasons import Reason
+from tcpipe.planning.segment_predictions import SegmentPredictions, iterate_batches, join_predictions, predict_segments
+from tcpipe.splits.neighbours import CLOSE, PLACES, are_near, compute_middles_deg
 from tcpipe.store import Store
-from tcpipe.tables.bits import names_of
-from tcpipe.tables.columns import floats, lonlat_deg
+from tcpipe.tables.bits import flag_names
+from tcpipe.tables.columns import read_lonlat_deg, to_floats
 from tcpipe.terrain.patches import patch_frames
-from tcpipe.terrain.tiles import MapReader, projection_to
+from tcpipe.terrain.tiles import MapReader, find_map_projection
 
 Floats = NDArray[np.float64]
 
@@ -35,7 +35,7 @@ _POINTS = 60
 
 
 @dataclass(frozen=True, slots=True)
-class Against:
+class IntervalComparison:
     """A drive's sum as it was measured and predicted, and the ends of its interval, None where the model tells no errors."""
 
     measured: float
@@ -55,12 +55,12 @@ class Against:
 
 
 @dataclass(frozen=True, slots=True)
-class Along:
+class CumulativeSums:
     """Sums along a drive, over the metres that are compared, at up to 60 places."""
 
     distance_m: tuple[float, ...]
-    duration_s: tuple[Against, ...]
-    energy_joule: tuple[Against, ...]
+    duration_s: tuple[IntervalComparison, ...]
+    energy_joule: tuple[IntervalComparison, ...]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -82,10 +82,10 @@ class DriveCost:
     """Of this very drive: a drive with any is not held back."""
     near_training_percent: float
     """Of its segments with their middle within 1.05 chords of that of a training sample of any drive."""
-    duration_s: Against
-    energy_joule: Against
+    duration_s: IntervalComparison
+    energy_joule: IntervalComparison
     label_energy: str
-    along: Along
+    along: CumulativeSums
 
     @property
     def held_back(self) -> bool:
@@ -93,7 +93,7 @@ class DriveCost:
         return self.samples_in_training == 0
 
 
-def drive_in(store: Store, log: str) -> RunDirectory:
+def find_drive(store: Store, log: str) -> RunDirectory:
     """Return the ingested run of a log, by its path or its run's name; `UsageError` if there is none, or it lies under several recipes."""
     found = []
     for run in store.runs():
@@ -113,7 +113,7 @@ def drive_in(store: Store, log: str) -> RunDirectory:
     return found[0]
 
 
-def drive_cost(model: CostModel, source: MapReader, run: RunDirectory, data: Dataset, *, log: str) -> DriveCost:
+def compute_drive_cost(model: CostModel, source: MapReader, run: RunDirectory, data: Dataset, *, log: str) -> DriveCost:
     """Return what a drive took beside what a model says of it.
 
     Parameters
@@ -135,20 +135,20 @@ def drive_cost(model: CostModel, source: MapReader, run: RunDirectory, data: Dat
     if not segments.num_rows:
         raise UsageError(f"{log}: run {run.run_id} has no segments to compare; see 'tcpipe report' for why")
     segments = segments.sort_by("start_ns")
-    said = _said(model, source, segments, data)
-    reasons, energy = _reasons(model, segments, said, data), ENERGIES[model.label_energy].energy
-    length_m, good = floats(segments, "arc_length_m"), np.array([not why for why in reasons])
+    said = _predict_drive(model, source, segments, data)
+    reasons, energy = _list_reasons(model, segments, said, data), ENERGIES[model.label_energy].energy
+    length_m, good = to_floats(segments, "arc_length_m"), np.array([not why for why in reasons])
     named = sorted({name for why in reasons for name in why})
     trained = data["train"]
     near = are_near(
-        middles_deg({name: floats(segments, name) for name in PLACES}),
-        middles_deg({name: trained.column(name) for name in PLACES}), within_m=CLOSE * model.chord_m,
+        compute_middles_deg({name: to_floats(segments, name) for name in PLACES}),
+        compute_middles_deg({name: trained.column(name) for name in PLACES}), within_m=CLOSE * model.chord_m,
     )  # fmt: skip
-    duration = floats(segments, "chord_m") / said.velocity_mps
-    along = _along(
-        errors_of(model.residuals), said.terrain_class[good], np.cumsum(length_m)[good],
-        (floats(segments, "duration_s")[good], duration[good]),
-        (floats(segments, energy)[good], (said.power_watt * duration)[good]),
+    duration = to_floats(segments, "chord_m") / said.velocity_mps
+    along = _sum_along(
+        fit_errors(model.residuals), said.terrain_class[good], np.cumsum(length_m)[good],
+        (to_floats(segments, "duration_s")[good], duration[good]),
+        (to_floats(segments, energy)[good], (said.power_watt * duration)[good]),
     )  # fmt: skip
     return DriveCost(
         run_id=run.run_id, log=log, map=source.name, driven_m=float(sum(run.manifest.ledger_m.values())),
@@ -156,55 +156,59 @@ def drive_cost(model: CostModel, source: MapReader, run: RunDirectory, data: Dat
         rest_m={name: float(length_m[[name in why for why in reasons]].sum()) for name in named},
         samples_in_training=int((trained.column("run_id").astype(np.str_) == run.run_id).sum()),
         near_training_percent=100.0 * float(near.mean()),
-        duration_s=along.duration_s[-1] if along.duration_s else Against(0.0, 0.0, None, None),
-        energy_joule=along.energy_joule[-1] if along.energy_joule else Against(0.0, 0.0, None, None),
+        duration_s=along.duration_s[-1] if along.duration_s else IntervalComparison(0.0, 0.0, None, None),
+        energy_joule=along.energy_joule[-1] if along.energy_joule else IntervalComparison(0.0, 0.0, None, None),
         label_energy=model.label_energy, along=along,
     )  # fmt: skip
 
 
-def _said(model: CostModel, source: MapReader, segments: pa.Table, data: Dataset) -> SegmentPredictions:
+def _predict_drive(model: CostModel, source: MapReader, segments: pa.Table, data: Dataset) -> SegmentPredictions:
     """Return what the model says of each segment, where it was driven."""
-    projection = projection_to(source, data.card.recipe.read.gnss_crs)
-    start, end = (projection.forward(lonlat_deg(segments, name)) for name in ("start", "end"))
-    turn_radpm = floats(segments, "turn_rate_radps") * floats(segments, "duration_s") / floats(segments, "arc_length_m")
-    frames = patch_frames(start, end, floats(segments, "chord_m"))
-    return joined(predict_segments(model, source, in_batches(frames), turn_radpm=turn_radpm))
+    projection = find_map_projection(source, data.card.recipe.read.gnss_crs)
+    start, end = (projection.forward(read_lonlat_deg(segments, name)) for name in ("start", "end"))
+    turn_radpm = (
+        to_floats(segments, "turn_rate_radps") * to_floats(segments, "duration_s") / to_floats(segments, "arc_length_m")
+    )
+    frames = patch_frames(start, end, to_floats(segments, "chord_m"))
+    return join_predictions(predict_segments(model, source, iterate_batches(frames), turn_radpm=turn_radpm))
 
 
-def _reasons(model: CostModel, segments: pa.Table, said: SegmentPredictions, data: Dataset) -> list[list[str]]:
+def _list_reasons(model: CostModel, segments: pa.Table, said: SegmentPredictions, data: Dataset) -> list[list[str]]:
     """Return why each segment is not compared; nothing where it is."""
-    uncertain = floats(segments, "position_std_m") > data.card.recipe.sample.max_position_std_m
-    unlabelled = ~np.isfinite(floats(segments, ENERGIES[model.label_energy].energy) + floats(segments, "duration_s"))
+    uncertain = to_floats(segments, "position_std_m") > data.card.recipe.sample.max_position_std_m
+    unlabelled = ~np.isfinite(
+        to_floats(segments, ENERGIES[model.label_energy].energy) + to_floats(segments, "duration_s")
+    )
     return [
-        [*names_of(bits, Reason), *[UNCERTAIN] * bool(unsure), *[UNLABELLED] * bool(without)]
+        [*flag_names(bits, Reason), *[UNCERTAIN] * bool(unsure), *[UNLABELLED] * bool(without)]
         for bits, unsure, without in zip(said.reasons, uncertain, unlabelled, strict=True)
     ]
 
 
-def _along(
+def _sum_along(
     errors: Mapping[str, Errors] | None,
     class_id: NDArray[np.uint8],
     distance_m: Floats,
     duration: tuple[Floats, Floats],
     energy: tuple[Floats, Floats],
-) -> Along:
+) -> CumulativeSums:
     """Return sums of measured and predicted from the drive's beginning to places spread over it, the last at its end."""
     count = len(distance_m)
     ends = sorted({round(end) for end in np.linspace(1, count, min(_POINTS, count)).tolist()}) if count else []
 
-    def sums(quantity: str, measured: Floats, predicted: Floats) -> tuple[Against, ...]:
+    def sums(quantity: str, measured: Floats, predicted: Floats) -> tuple[IntervalComparison, ...]:
         found = []
         for end in ends:
             low, high = (None, None) if errors is None else errors[quantity].of_sum(predicted[:end], class_id[:end])
-            found.append(Against(float(measured[:end].sum()), float(predicted[:end].sum()), low, high))
+            found.append(IntervalComparison(float(measured[:end].sum()), float(predicted[:end].sum()), low, high))
         return tuple(found)
 
-    return Along(
+    return CumulativeSums(
         tuple(float(distance_m[end - 1]) for end in ends), sums("duration", *duration), sums("energy", *energy)
     )
 
 
-def in_words(drive: DriveCost) -> list[str]:
+def format_drive(drive: DriveCost) -> list[str]:
     """Return what a drive shows, as plain lines."""
     rest = ", ".join(f"{metres:.0f} m {name.replace('_', ' ')}" for name, metres in drive.rest_m.items())
     lines = [

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.compiled import kernel
+from tcpipe.compiled import compile_kernel
 
 
-@kernel
-def class_facts(  # noqa: PLR0917
+@compile_kernel
+def find_class_facts(  # noqa: PLR0917
     terrain: NDArray[np.uint8],
     known: NDArray[np.uint8],
     blocked: NDArray[np.uint8],

@@ -9,7 +9,7 @@ from tcpipe.formats.maps.map_files import MapFile, open_map
 from tcpipe.store import open_store
 
 
-def chosen_map(store: str | Path, name: str | None) -> MapFile:
+def choose_map(store: str | Path, name: str | None) -> MapFile:
     """Return the named map of a store, or its only one.
 
     Raises

@@ -14,21 +14,21 @@ from numpy.typing import NDArray
 from pyarrow import csv
 from pyproj import CRS, Geod
 
-from tcpipe.cost.prediction_errors import COVERAGE, errors_of
+from tcpipe.cost.prediction_errors import COVERAGE, fit_errors
 from tcpipe.errors import PathError, UsageError
-from tcpipe.formats.atomic import atomic_file
+from tcpipe.formats.atomic import write_atomic_file
 from tcpipe.formats.json_files import write_json
 from tcpipe.formats.parquet import write_table
 from tcpipe.geometry.angles import wrap_to_pi
 from tcpipe.planning.cost_model import CostModel, check_model
-from tcpipe.planning.reasons import Reason, counts_of
-from tcpipe.planning.segment_predictions import SegmentPredictions, in_batches, joined, predict_segments
-from tcpipe.planning.turning import turning_of, turns_between
-from tcpipe.tables.bits import names_of
+from tcpipe.planning.no_cost_reasons import Reason, count_reasons
+from tcpipe.planning.segment_predictions import SegmentPredictions, iterate_batches, join_predictions, predict_segments
+from tcpipe.planning.turning import compute_turns, find_turning
+from tcpipe.tables.bits import flag_names
 from tcpipe.tables.columns import Column, TableSchema
-from tcpipe.terrain.patches import PatchFrames, corners_on, footprints, patch_frames
-from tcpipe.terrain.projection import Projection, area_of, metres_from_plane
-from tcpipe.terrain.tiles import MapReader, projection_to
+from tcpipe.terrain.patches import PatchFrames, compute_footprints, count_corners_on, patch_frames
+from tcpipe.terrain.projection import Projection, compute_area, make_metres_from_plane
+from tcpipe.terrain.tiles import MapReader, find_map_projection
 
 Floats = NDArray[np.float64]
 
@@ -68,12 +68,12 @@ class PathCost:
     totals: PathTotals
 
 
-def projection_of(source: MapReader) -> Projection:
+def find_projection(source: MapReader) -> Projection:
     """Return the operation from WGS 84 lon, lat [deg] to the map's CRS."""
-    return projection_to(source, "EPSG:4326")
+    return find_map_projection(source, "EPSG:4326")
 
 
-def cost_of_path(model: CostModel, source: MapReader, lonlat_deg: Floats, *, where: str) -> PathCost:
+def compute_path_cost(model: CostModel, source: MapReader, lonlat_deg: Floats, *, where: str) -> PathCost:
     """Return what a path costs.
 
     Parameters
@@ -88,14 +88,14 @@ def cost_of_path(model: CostModel, source: MapReader, lonlat_deg: Floats, *, whe
     PathError : the path is shorter than a piece, or nowhere on the map.
     """
     check_model(model, source)
-    pieces = pieces_of(source, lonlat_deg, chord_m=model.chord_m, where=where)
+    pieces = cut_into_pieces(source, lonlat_deg, chord_m=model.chord_m, where=where)
     frames = pieces.frames(model.chord_m)
-    if not corners_on(source.grid, footprints(frames, model.patch_m)).any():
-        raise PathError(off_map_text(source, where, lonlat_deg))
-    turn_radpm = _turn_radpm(model, turns_between(pieces.start_xy_m, pieces.end_xy_m) / pieces.arc_m)
-    said = joined(predict_segments(model, source, in_batches(frames), turn_radpm=turn_radpm))
+    if not count_corners_on(source.grid, compute_footprints(frames, model.patch_m)).any():
+        raise PathError(describe_off_map(source, where, lonlat_deg))
+    turn_radpm = _turn_radpm(model, compute_turns(pieces.start_xy_m, pieces.end_xy_m) / pieces.arc_m)
+    said = join_predictions(predict_segments(model, source, iterate_batches(frames), turn_radpm=turn_radpm))
     said.reasons[pieces.arc_m > model.max_arc_to_chord * pieces.chord_m] |= np.uint16(Reason.CURVED)
-    return _costed(model, source, pieces, said)
+    return _sum_costs(model, source, pieces, said)
 
 
 def _turn_radpm(model: CostModel, planned_radpm: Floats) -> Floats:
@@ -104,14 +104,14 @@ def _turn_radpm(model: CostModel, planned_radpm: Floats) -> Floats:
     return np.where(planned_radpm > usual_radpm, planned_radpm, np.nan)
 
 
-def pieces_of(source: MapReader, lonlat_deg: Floats, *, chord_m: float, where: str) -> Pieces:
+def cut_into_pieces(source: MapReader, lonlat_deg: Floats, *, chord_m: float, where: str) -> Pieces:
     """Return the pieces of a path; `PathError` where it is shorter than one."""
-    projection = projection_of(source)
+    projection = find_projection(source)
     xy_m = projection.forward(lonlat_deg)
     if not np.isfinite(xy_m).all():
         raise PathError(f"{where}: points of it lie outside the area where the CRS of map {source.name} is defined")
     length_m = float(np.linalg.norm(np.diff(xy_m, axis=0), axis=1).sum()) if len(xy_m) > 1 else 0.0
-    scale = ground_scale(projection.target, xy_m)
+    scale = compute_ground_scale(projection.target, xy_m)
     if not length_m:
         raise PathError(f"{where}: is one point; wanted a path of at least {chord_m:g} m")
     pieces = cut_path(xy_m, chord_m=chord_m, scale=scale)
@@ -123,11 +123,11 @@ def pieces_of(source: MapReader, lonlat_deg: Floats, *, chord_m: float, where: s
     return pieces
 
 
-def _costed(model: CostModel, source: MapReader, pieces: Pieces, said: SegmentPredictions) -> PathCost:
-    bits, class_id, errors = said.reasons, said.terrain_class, errors_of(model.residuals)
+def _sum_costs(model: CostModel, source: MapReader, pieces: Pieces, said: SegmentPredictions) -> PathCost:
+    bits, class_id, errors = said.reasons, said.terrain_class, fit_errors(model.residuals)
     duration, nothing = pieces.arc_m / said.velocity_mps, np.full(len(bits), np.nan)
-    turn_rad = turns_between(pieces.start_xy_m, pieces.end_xy_m)
-    turning = None if model.takes_turns else turning_of(model.physics, model.classes)
+    turn_rad = compute_turns(pieces.start_xy_m, pieces.end_xy_m)
+    turning = None if model.takes_turns else find_turning(model.physics, model.classes)
     turn_joule = nothing if turning is None else turning.energy_joule(turn_rad, pieces.arc_m, class_id)
     energy = said.power_watt * duration + np.nan_to_num(turn_joule)
     turn_joule = np.where(np.isfinite(energy), turn_joule, np.nan)
@@ -138,7 +138,7 @@ def _costed(model: CostModel, source: MapReader, pieces: Pieces, said: SegmentPr
         sums = errors["duration"].of_sum(duration, class_id), errors["energy"].of_sum(energy, class_id)
     table = PIECES.table(
         piece=np.arange(len(bits)),
-        **_places(source, pieces),
+        **_locate_pieces(source, pieces),
         terrain_class=class_id,
         terrain_name=source.classes.names()[class_id].tolist(),
         slope_rad=said.slope_rad,
@@ -154,7 +154,7 @@ def _costed(model: CostModel, source: MapReader, pieces: Pieces, said: SegmentPr
         energy_low_joule=least,
         energy_high_joule=most,
         reasons=bits,
-        reason_names=[" ".join(names_of(int(value), Reason)) for value in bits],
+        reason_names=[" ".join(flag_names(int(value), Reason)) for value in bits],
     )
     without_cost = int(table.column("duration_s").null_count)
     totals = PathTotals(
@@ -169,15 +169,15 @@ def _costed(model: CostModel, source: MapReader, pieces: Pieces, said: SegmentPr
         energy_interval_joule=sums[1] if sums else None,
         held_out_samples=errors["energy"].samples if errors else 0,
         held_out_runs=errors["energy"].runs if errors else 0,
-        reasons=counts_of(bits),
+        reasons=count_reasons(bits),
         complete=not without_cost,
     )
     return PathCost(table, totals)
 
 
-def _places(source: MapReader, pieces: Pieces) -> dict[str, Floats]:
+def _locate_pieces(source: MapReader, pieces: Pieces) -> dict[str, Floats]:
     """Return where the pieces lie, as columns."""
-    projection = projection_of(source)
+    projection = find_projection(source)
     start, end = (projection.inverse(xy_m) for xy_m in (pieces.start_xy_m, pieces.end_xy_m))
     azimuth_deg, _, _ = Geod(ellps="WGS84").inv(start[:, 0], start[:, 1], end[:, 0], end[:, 1])
     return {
@@ -192,9 +192,9 @@ def _places(source: MapReader, pieces: Pieces) -> dict[str, Floats]:
     }
 
 
-def off_map_text(source: MapReader, where: str, lonlat_deg: Floats) -> str:
+def describe_off_map(source: MapReader, where: str, lonlat_deg: Floats) -> str:
     """Say that points, shape (P, 2), are not on a map, where that lies, and whether their axes are swapped."""
-    west, south, east, north = area_of(projection_of(source).target, source.grid.bounds_m)
+    west, south, east, north = compute_area(find_projection(source).target, source.grid.bounds_m)
     lat, lon = lonlat_deg.T
     swapped = bool(((lon >= west) & (lon <= east) & (lat >= south) & (lat <= north)).any())
     hint = (
@@ -260,7 +260,7 @@ def write_pieces(path: Path, table: pa.Table) -> None:
         case ".json":
             write_json(path, {"pieces": table.to_pylist()})
         case _:
-            with atomic_file(path) as temporary:
+            with write_atomic_file(path) as temporary:
                 csv.write_csv(table, temporary)
 
 
@@ -292,9 +292,9 @@ class Pieces:
         return patch_frames(start, self.end_xy_m, np.full(len(start), chord_m))
 
 
-def ground_scale(crs: CRS, xy_m: Floats) -> float:
+def compute_ground_scale(crs: CRS, xy_m: Floats) -> float:
     """Return metres of ground a metre of the map's plane, the mean over points of shape (N, 2)."""
-    return float(np.mean(np.sqrt(np.abs(np.linalg.det(metres_from_plane(crs, xy_m))))))
+    return float(np.mean(np.sqrt(np.abs(np.linalg.det(make_metres_from_plane(crs, xy_m))))))
 
 
 def cut_path(xy_m: Floats, *, chord_m: float, scale: float) -> Pieces:
@@ -307,14 +307,14 @@ def cut_path(xy_m: Floats, *, chord_m: float, scale: float) -> Pieces:
     scale : ground metres a map metre; over the some kilometres that a robot drives it is one number to 1e-5.
     """
     points = xy_m[np.r_[True, (np.diff(xy_m, axis=0) != 0.0).any(axis=1)]]
-    cuts = _cuts(points.tolist(), chord_m / scale)
+    cuts = _find_cuts(points.tolist(), chord_m / scale)
     ends = np.array([(x, y) for x, y, _ in cuts]).reshape(-1, 2)
     arc = np.diff(np.array([length for _, _, length in cuts])) * scale
     chord = np.linalg.norm(np.diff(ends, axis=0), axis=1) * scale
     return Pieces(ends[:-1], ends[1:], chord, arc, scale)
 
 
-def _cuts(points: list[list[float]], radius: float) -> list[tuple[float, float, float]]:
+def _find_cuts(points: list[list[float]], radius: float) -> list[tuple[float, float, float]]:
     """Return x, y and length so far of the path's start, of each cut and, if a rest is left, of its end."""
     (x0, y0), length = points[0], 0.0
     cuts = [(x0, y0, 0.0)]

@@ -8,15 +8,15 @@ from pathlib import Path
 from typing import Literal
 
 from tcpipe.cost.prediction_errors import COVERAGE
-from tcpipe.errors import StoreError, UsageError, plain_lines
+from tcpipe.errors import StoreError, UsageError, clean_lines
 from tcpipe.formats.atomic import clear_beside
 from tcpipe.formats.finding_lines import format_findings
 from tcpipe.formats.geojson_lines import read_line
-from tcpipe.formats.json_files import digest, recast
+from tcpipe.formats.integrity import compute_checksum, read_sealed_as, write_sealed
+from tcpipe.formats.json_files import convert_record, digest
 from tcpipe.formats.maps.map_files import MapFile
-from tcpipe.formats.seals import file_checksum, read_sealed_as, write_sealed
 from tcpipe.planning.cost_model import CostModel
-from tcpipe.planning.path_cost import PathTotals, check_ending, cost_of_path, write_pieces
+from tcpipe.planning.path_cost import PathTotals, check_ending, compute_path_cost, write_pieces
 from tcpipe.tables.findings import Finding, Subject, make_finding
 
 VERSION = "1.2"
@@ -60,7 +60,7 @@ class PathResult(NamedTotals):
         """Return the totals, their intervals, and findings, as plain lines."""
         above = ", above standing" if self.label_energy == "above_standing" else ""
         findings = format_findings(find_doubts(self, Subject("file", self.path.name)))
-        return plain_lines((f"{self.path}: {cost_text(self)}{above}", *findings, *self._out_lines()))
+        return clean_lines((f"{self.path}: {format_cost(self)}{above}", *findings, *self._out_lines()))
 
     def _out_lines(self) -> tuple[str, ...]:
         if self.out is None:
@@ -69,10 +69,10 @@ class PathResult(NamedTotals):
         return (f"{self.out}: {self.pieces} pieces{same if self.status == 'unchanged' else ''}",)
 
 
-def cost_text(of: PathTotals) -> str:
+def format_cost(of: PathTotals) -> str:
     """Return length, time and energy with their intervals, as one line."""
-    duration = _quantity(of.duration_s, of.duration_interval_s, "s")
-    energy = _quantity(of.energy_joule, of.energy_interval_joule, "J")
+    duration = _format_quantity(of.duration_s, of.duration_interval_s, "s")
+    energy = _format_quantity(of.energy_joule, of.energy_interval_joule, "J")
     part = "" if of.complete else f", without {of.pieces_without_cost} of {of.pieces} pieces"
     turns = (
         ""
@@ -82,7 +82,7 @@ def cost_text(of: PathTotals) -> str:
     return f"{of.length_m:.1f} m, {duration}, {energy}{turns}{part}"
 
 
-def _quantity(value: float, interval: tuple[float, float] | None, unit: str) -> str:
+def _format_quantity(value: float, interval: tuple[float, float] | None, unit: str) -> str:
     digits = 1 if unit == "s" else 0
     if interval is None:
         return f"{value:.{digits}f} {unit}"
@@ -121,29 +121,31 @@ def predict_path(model: CostModel, source: MapFile, path: Path, out: Path | None
     lonlat_deg = read_line(path)
     line = {"lonlat_deg": lonlat_deg.tolist(), "version": VERSION}
     key = digest({**line, "model": model.checksum, "map": source.summary()})
-    if out is not None and (known := _totals_of(out, key)) is not None:
-        return recast(known, PathResult, path=path, out=out, status="unchanged")
-    cost = cost_of_path(model, source, lonlat_deg, where=str(path))
-    totals = recast(
+    if out is not None and (known := _compute_totals(out, key)) is not None:
+        return convert_record(known, PathResult, path=path, out=out, status="unchanged")
+    cost = compute_path_cost(model, source, lonlat_deg, where=str(path))
+    totals = convert_record(
         cost.totals, NamedTotals, model=model.name, map=source.name, robot=model.robot, label_energy=model.label_energy
     )
     if out is not None:
         write_pieces(out, cost.pieces)
-        write_sealed(summary_path(out), recast(totals, TableTotals, key=key, sha256=file_checksum(out).sha256))
-    return recast(totals, PathResult, path=path, out=out, status="done")
+        write_sealed(
+            make_summary_path(out), convert_record(totals, TableTotals, key=key, sha256=compute_checksum(out).sha256)
+        )
+    return convert_record(totals, PathResult, path=path, out=out, status="done")
 
 
-def summary_path(out: Path) -> Path:
+def make_summary_path(out: Path) -> Path:
     """Return where the totals of a table of pieces stand."""
     return out.with_name(f"{out.name}.summary.json")
 
 
-def _totals_of(out: Path, key: str) -> TableTotals | None:
+def _compute_totals(out: Path, key: str) -> TableTotals | None:
     """Return the totals beside a table that is made from the same, and whole; else None."""
-    if not (out.is_file() and summary_path(out).is_file()):
+    if not (out.is_file() and make_summary_path(out).is_file()):
         return None
     try:
-        found = read_sealed_as(summary_path(out), TableTotals)
+        found = read_sealed_as(make_summary_path(out), TableTotals)
     except StoreError:
         return None
-    return found if found.key == key and found.sha256 == file_checksum(out).sha256 else None
+    return found if found.key == key and found.sha256 == compute_checksum(out).sha256 else None

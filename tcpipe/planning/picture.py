@@ -18,9 +18,9 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
-from tcpipe.formats.atomic import atomic_file
+from tcpipe.formats.atomic import write_atomic_file
 from tcpipe.planning.plan import Plan
-from tcpipe.tables.columns import floats
+from tcpipe.tables.columns import to_floats
 from tcpipe.terrain.tiles import MapReader, level_for, read_window
 
 Array = NDArray[np.float64]
@@ -55,7 +55,7 @@ def draw_plans(path: Path, source: MapReader, plans: Sequence[Plan]) -> None:
     """Draw plans between the same points as PNG, a panel each; the same plans give the same bytes."""
     bounds = _crop(source, np.concatenate([plan.xy_m for plan in plans]))
     backdrop = _Backdrop(source, bounds)
-    spent = [_per_metre(plan) for plan in plans]
+    spent = [_compute_cost_per_metre(plan) for plan in plans]
     known = np.concatenate(spent)
     known = known[np.isfinite(known)]
     scale = Normalize(*(np.percentile(known, (2.0, 98.0)) if known.size else (0.0, 1.0)))
@@ -78,7 +78,7 @@ def draw_plans(path: Path, source: MapReader, plans: Sequence[Plan]) -> None:
                     axes.plot(*other.xy_m.T, color="white", lw=1.6, ls=(0, (1.2, 1.6)), alpha=0.95)
             line = _draw_path(axes, plan, values, scale)
             _draw_ends(axes, plan)
-            _title(axes, plan, plans)
+            _draw_title(axes, plan, plans)
         _scale_bar(panels[0], bounds)
         bar = figure.colorbar(line, ax=panels, shrink=0.7, pad=0.008, aspect=28)
         bar.set_label("energy a metre along the path [J/m]")
@@ -89,12 +89,12 @@ def draw_plans(path: Path, source: MapReader, plans: Sequence[Plan]) -> None:
                 handles=[Patch(facecolor=colour, label=name, alpha=0.75) for name, colour in backdrop.classes],
                 loc="outside lower center", ncols=len(backdrop.classes), frameon=False, fontsize=9,
             )  # fmt: skip
-        with atomic_file(path) as temporary:
+        with write_atomic_file(path) as temporary:
             figure.savefig(temporary, format="png", dpi=130, metadata={"Software": None})
 
 
-def _per_metre(plan: Plan) -> Array:
-    return np.asarray(floats(plan.cost.pieces, "energy_joule") / floats(plan.cost.pieces, "arc_length_m"))
+def _compute_cost_per_metre(plan: Plan) -> Array:
+    return np.asarray(to_floats(plan.cost.pieces, "energy_joule") / to_floats(plan.cost.pieces, "arc_length_m"))
 
 
 def _crop(source: MapReader, xy_m: Array) -> tuple[float, float, float, float]:
@@ -124,9 +124,9 @@ class _Backdrop:
         self._height = layers["height"].astype(np.float64) + level.height_reference_m
         pitch = level.grid.pitch_m * step
         self._extent = (left, right, bottom, top)
-        self._picture = _blend(layers, _shade(self._height, pitch))
+        self._picture = _blend_picture(layers, _shade_relief(self._height, pitch))
         ids = np.unique(layers["terrain"]).tolist() if "terrain" in layers else []
-        self.classes = [(source.classes.name(i), _colour(i)) for i in ids if i]
+        self.classes = [(source.classes.name(i), _choose_colour(i)) for i in ids if i]
 
     def height_at(self, xy_m: Array) -> Array:
         """Return the height of the nearest pixel [m], shape (N,)."""
@@ -141,7 +141,7 @@ class _Backdrop:
         axes.imshow(self._picture, extent=self._extent, interpolation="bilinear")
         known = self._height[np.isfinite(self._height)]
         if known.size and np.ptp(known) > 1.0:
-            step = _nice(float(np.ptp(known)) / 14.0)
+            step = _round_nicely(float(np.ptp(known)) / 14.0)
             levels = np.arange(np.ceil(known.min() / step) * step, known.max(), step)
             left, right, bottom, top = self._extent
             rows, cols = self._height.shape
@@ -158,11 +158,11 @@ class _Backdrop:
             spine.set_visible(False)
 
 
-def _colour(class_id: int) -> str:
+def _choose_colour(class_id: int) -> str:
     return _TINTS[(class_id - 1) % len(_TINTS)]
 
 
-def _shade(height_m: Array, pitch_m: float) -> Array:
+def _shade_relief(height_m: Array, pitch_m: float) -> Array:
     """Return light from the north-west at 40°, exaggerated to the relief there is, in [0, 1]; NaN without data."""
     down, right = np.gradient(height_m, pitch_m)
     steep = np.nanpercentile(np.hypot(down, right), 90.0) if np.isfinite(down).any() else 1.0
@@ -174,7 +174,7 @@ def _shade(height_m: Array, pitch_m: float) -> Array:
     return np.asarray(np.clip(light, 0.0, 1.0))
 
 
-def _blend(layers: dict[str, Array], light: Array) -> Array:
+def _blend_picture(layers: dict[str, Array], light: Array) -> Array:
     """Return the picture, RGB in [0, 1]; what has no data is white."""
     grey = np.full(light.shape, 0.7)
     if "ortho" in layers:
@@ -183,7 +183,7 @@ def _blend(layers: dict[str, Array], light: Array) -> Array:
         grey = 0.35 + 0.6 * np.clip((ortho - low) / max(high - low, 1.0), 0.0, 1.0)
     picture = np.repeat(grey[..., None], 3, axis=2)
     if "terrain" in layers:
-        tints = np.array([[1.0, 1.0, 1.0]] + [mpl.colors.to_rgb(_colour(i)) for i in range(1, 256)])
+        tints = np.array([[1.0, 1.0, 1.0]] + [mpl.colors.to_rgb(_choose_colour(i)) for i in range(1, 256)])
         tint = tints[layers["terrain"]]
         picture = picture * 0.45 + tint * 0.55
     picture = np.clip(picture * (0.45 + 0.75 * light)[..., None], 0.0, 1.0)
@@ -197,7 +197,7 @@ def _draw_path(axes: Axes, plan: Plan, values: Array, scale: Normalize) -> LineC
     """Draw the path, coloured by what its metres cost; return the coloured line."""
     points = plan.xy_m
     length = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))]
-    ends = np.r_[floats(plan.cost.pieces, "distance_m"), plan.totals.length_m]
+    ends = np.r_[to_floats(plan.cost.pieces, "distance_m"), plan.totals.length_m]
     at = ends / ends[-1] * length[-1]
     cuts = np.stack([np.interp(at, length, points[:, axis]) for axis in (0, 1)], axis=1)
     axes.plot(*points.T, color="white", lw=7.0, solid_capstyle="round", solid_joinstyle="round")
@@ -226,11 +226,13 @@ def _draw_ends(axes: Axes, plan: Plan) -> None:
         )
 
 
-def _title(axes: Axes, plan: Plan, plans: Sequence[Plan]) -> None:
+def _draw_title(axes: Axes, plan: Plan, plans: Sequence[Plan]) -> None:
     colour = _COLOURS[plan.totals.objective]
     axes.set_title(f"Least {plan.totals.objective}", loc="left", pad=28, fontsize=16, weight="bold", color=colour)
     totals = [other.totals for other in plans]
-    parts = [_said(name, getattr(plan.totals, name), min(getattr(of, name) for of in totals)) for name in _SHOWN]
+    parts = [
+        _format_number(name, getattr(plan.totals, name), min(getattr(of, name) for of in totals)) for name in _SHOWN
+    ]
     axes.annotate(
         "     ".join(parts), (0.0, 1.0), (0, 9), xycoords="axes fraction", textcoords="offset points", fontsize=10.5
     )
@@ -239,7 +241,7 @@ def _title(axes: Axes, plan: Plan, plans: Sequence[Plan]) -> None:
 _SHOWN = ("energy_joule", "duration_s", "length_m")
 
 
-def _said(name: str, value: float, best: float) -> str:
+def _format_number(name: str, value: float, best: float) -> str:
     text = {"energy_joule": f"{value / 1000.0:.2f} kJ", "duration_s": f"{value:.0f} s", "length_m": f"{value:.0f} m"}[
         name
     ]
@@ -249,7 +251,7 @@ def _said(name: str, value: float, best: float) -> str:
 
 def _scale_bar(axes: Axes, bounds: tuple[float, float, float, float]) -> None:
     left, bottom, right, top = bounds
-    length = _nice((right - left) / 4.0)
+    length = _round_nicely((right - left) / 4.0)
     x, y = left + 0.04 * (right - left), bottom + 0.05 * (top - bottom)
     axes.plot((x, x + length), (y, y), color="white", lw=6, solid_capstyle="butt")
     axes.plot((x, x + length), (y, y), color=_INK, lw=3, solid_capstyle="butt")
@@ -259,7 +261,7 @@ def _scale_bar(axes: Axes, bounds: tuple[float, float, float, float]) -> None:
     )  # fmt: skip
 
 
-def _nice(value: float) -> float:
+def _round_nicely(value: float) -> float:
     """Return the largest of 1, 2, 5 times a power of ten that is not above ``value``."""
     power = 10.0 ** np.floor(np.log10(max(value, 1e-9)))
     return float(power * max(step for step in (1.0, 2.0, 5.0) if step * power <= value * (1.0 + 1e-9)))

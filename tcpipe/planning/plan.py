@@ -18,17 +18,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.errors import PathError
-from tcpipe.formats.json_files import recast
-from tcpipe.planning.cost_grid import BARRED, Mask, Survey
+from tcpipe.formats.json_files import convert_record
+from tcpipe.planning.cost_grid import BARRED, LazyCostGrid, Mask
 from tcpipe.planning.courses import COURSES
-from tcpipe.planning.path_cost import PathCost, PathTotals, cost_of_path, off_map_text, projection_of
-from tcpipe.planning.reasons import Reason
-from tcpipe.planning.search import Found, Steps, best_potential, least_cost_path, least_over_cells, steps_of
-from tcpipe.planning.straight import straightened
-from tcpipe.planning.turning import least_turning_path, turning_of
-from tcpipe.tables.bits import names_of
+from tcpipe.planning.no_cost_reasons import Reason
+from tcpipe.planning.path_cost import PathCost, PathTotals, compute_path_cost, describe_off_map, find_projection
+from tcpipe.planning.search import (
+    LeastCostPath,
+    Steps,
+    compute_least_costs,
+    find_best_potential,
+    find_least_cost_path,
+    make_steps,
+)
+from tcpipe.planning.shortcuts import straighten_path
+from tcpipe.planning.turning import find_least_turning_path, find_turning
+from tcpipe.tables.bits import flag_names
 from tcpipe.terrain.classes import NODATA_ID
-from tcpipe.terrain.point_classes import classes_at
+from tcpipe.terrain.point_classes import find_classes_at
 
 logger = logging.getLogger("tcpipe")
 
@@ -78,7 +85,7 @@ class Plan:
 
 
 def plan_path(
-    survey: Survey,
+    survey: LazyCostGrid,
     start_deg: Floats,
     goal_deg: Floats,
     objective: Objective,
@@ -100,15 +107,15 @@ def plan_path(
     ------
     PathError : start or goal is off the map, cannot be stood on, or there is no way between them.
     """
-    ends_xy_m = projection_of(survey.source).forward(np.stack([start_deg, goal_deg]))
+    ends_xy_m = find_projection(survey.source).forward(np.stack([start_deg, goal_deg]))
     search = _Search(survey, ends_xy_m, np.stack([start_deg, goal_deg]), allow_unseen, step)
     search.check_ends()
     bound_m, shortest = search.shortest()
     found = shortest if objective == "distance" else search.best(objective, bound_m)
     xy_m, grid_cost = search.straight(found, objective)
-    lonlat = projection_of(survey.source).inverse(xy_m)
-    cost = cost_of_path(survey.model, survey.source, lonlat, where="the planned path")
-    totals = recast(
+    lonlat = find_projection(survey.source).inverse(xy_m)
+    cost = compute_path_cost(survey.model, survey.source, lonlat, where="the planned path")
+    totals = convert_record(
         cost.totals,
         PlanTotals,
         objective=objective,
@@ -121,7 +128,7 @@ def plan_path(
 
 @dataclass(frozen=True, slots=True)
 class _Search:
-    survey: Survey
+    survey: LazyCostGrid
     ends_xy_m: Floats
     ends_deg: Floats
     allow_unseen: bool
@@ -144,7 +151,7 @@ class _Search:
             np.nan_to_num(self.ends_xy_m, posinf=np.inf)
         )
         problems += [
-            off_map_text(source, label, end[None])
+            describe_off_map(source, label, end[None])
             for label, end, inside in zip(labels, self.ends_deg, on, strict=True)
             if not inside
         ]
@@ -152,7 +159,7 @@ class _Search:
             raise PathError(*problems)
         if "terrain" in source.layers:
             names, may = source.classes.names(), source.classes.traversable()
-            for label, class_id in zip(labels, classes_at(source, self.ends_xy_m).tolist(), strict=True):
+            for label, class_id in zip(labels, find_classes_at(source, self.ends_xy_m).tolist(), strict=True):
                 if class_id == NODATA_ID:
                     problems.append(f"{label}: map {source.name} has no data there")
                 elif not may[class_id]:
@@ -177,7 +184,7 @@ class _Search:
         for label, own in zip(("--from", "--to"), (bits & (BARRED if self.allow_unseen else 0xFFFF)).T, strict=True):
             if own.all():
                 common = int(np.bitwise_and.reduce(own)) or int(np.bitwise_or.reduce(own))
-                words = ", ".join(name.replace("_", " ") for name in names_of(common, Reason))
+                words = ", ".join(name.replace("_", " ") for name in flag_names(common, Reason))
                 hint = (
                     "" if self.allow_unseen or common & BARRED else ", or cross such ground with --allow-extrapolation"
                 )
@@ -199,22 +206,24 @@ class _Search:
     def _metres(self) -> Floats:
         return self.survey.frames.metres(self._cells)
 
-    def _found(self, objective: Objective, known: Mask, class_id: NDArray[np.uint8] | None = None) -> Found | None:
+    def _found(
+        self, objective: Objective, known: Mask, class_id: NDArray[np.uint8] | None = None
+    ) -> LeastCostPath | None:
         """Return the best path over known cells; with their classes, that of least energy with its turns."""
         costs, (start, goal) = self.survey.costs, self._cells.tolist()
         open_ = costs.open_courses(allow_unseen=self.allow_unseen) & known
         if start == goal or not open_.any():
             return None
-        steps = steps_of(costs, objective, open_, self._metres())
-        turning = turning_of(self.survey.model.physics, self.survey.model.classes)
+        steps = make_steps(costs, objective, open_, self._metres())
+        turning = find_turning(self.survey.model.physics, self.survey.model.classes)
         if objective == "energy" and turning is not None and class_id is not None:
             told = np.isfinite(steps.cost)
             known_steps = Steps(*(getattr(steps, name)[told] for name in Steps.__slots__))
             per_rad = turning.joule_per_rad[class_id.reshape(-1)]
-            return least_turning_path(known_steps, costs.grid.cols, start, goal, per_rad)
-        return least_cost_path(steps, costs.grid.rows * costs.grid.cols, start, goal)
+            return find_least_turning_path(known_steps, costs.grid.cols, start, goal, per_rad)
+        return find_least_cost_path(steps, costs.grid.rows * costs.grid.cols, start, goal)
 
-    def shortest(self) -> tuple[float, Found]:
+    def shortest(self) -> tuple[float, LeastCostPath]:
         """Return the shortest way that can be driven, and its length; only the ground is looked at."""
         straight_m = float(np.linalg.norm(self.ends_xy_m[1] - self.ends_xy_m[0]) * self._metres().max())
         bound_m = straight_m * _FIRST
@@ -231,7 +240,7 @@ class _Search:
                 raise PathError(self._no_way())
             bound_m = max(bound_m * _GROWTH, found.cost if found else 0.0)
 
-    def best(self, objective: Objective, bound_m: float) -> Found:
+    def best(self, objective: Objective, bound_m: float) -> LeastCostPath:
         """Return the least-cost path; the model is asked about every cell that could be on it."""
         survey = self.survey
         class_id, open_ = survey.class_id(), np.asarray(self._maybe_open().any(axis=0))
@@ -258,13 +267,13 @@ class _Search:
         """Return where a course may be driven as far as is known, shape (16, rows, cols)."""
         return np.asarray(self.survey.costs.open_courses(allow_unseen=self.allow_unseen) | ~self.survey.judged)
 
-    def _could_be_better(self, objective: Objective, found: Found | None, class_id: NDArray[np.uint8]) -> Mask:
+    def _could_be_better(self, objective: Objective, found: LeastCostPath | None, class_id: NDArray[np.uint8]) -> Mask:
         """Return those cells to ask about next that are the likeliest of all that could lie on a better path."""
         survey, (start, goal) = self.survey, self._cells.tolist()
         if survey.predicted.all():
             return ~survey.predicted
-        steps = steps_of(survey.costs, objective, self._maybe_open(), self._metres())
-        over, better = could_be_better(steps, class_id, found, start, goal)
+        steps = make_steps(survey.costs, objective, self._maybe_open(), self._metres())
+        over, better = find_possible_gain(steps, class_id, found, start, goal)
         cells = np.flatnonzero(better & ~survey.predicted.reshape(-1))
         most = max(_FEWEST_ASKED, int(survey.predicted.sum()) // 2)
         wanted = np.zeros(survey.predicted.shape, np.bool_)
@@ -281,14 +290,14 @@ class _Search:
         self.survey.predict(wanted, self.step)
         return (time.monotonic() - begun_s) / count
 
-    def straight(self, found: Found, objective: Objective) -> tuple[Floats, float]:
+    def straight(self, found: LeastCostPath, objective: Objective) -> tuple[Floats, float]:
         """Return the path's points in the map's CRS [m], from end to end as they were given, and its cost; bends that cost are left out."""
         costs = self.survey.costs
         row, col = np.divmod(found.cells, costs.grid.cols)
         points = np.stack([col, row], axis=1).astype(np.float64)
         points[[0, -1]] = costs.grid.px_from_xy(self.ends_xy_m)
         open_ = costs.open_courses(allow_unseen=self.allow_unseen) & (objective == "distance" or self.survey.predicted)
-        kept, cost = straightened(costs, objective, open_, self._metres(), points)
+        kept, cost = straighten_path(costs, objective, open_, self._metres(), points)
         return costs.grid.xy_from_px(kept), cost
 
     def _no_way(self) -> str:
@@ -330,8 +339,8 @@ def probe_cells(class_id: Classes, open_: NDArray[np.bool_]) -> NDArray[np.bool_
     return found & open_
 
 
-def could_be_better(
-    steps: Steps, class_id: Classes, found: Found | None, start: int, goal: int
+def find_possible_gain(
+    steps: Steps, class_id: Classes, found: LeastCostPath | None, start: int, goal: int
 ) -> tuple[Floats, NDArray[np.bool_]]:
     """Return the least that a path over each cell can cost, shape (cells,), and whether that is less than the path that was found.
 
@@ -344,18 +353,18 @@ def could_be_better(
     """
     known = np.isfinite(steps.cost)
     sure = Steps(steps.begin[known], steps.end[known], steps.cost[known], steps.length_m[known], steps.rise_m[known])
-    reduced = sure.cost - (found.potential if found else best_potential(sure)) * sure.rise_m
+    reduced = sure.cost - (found.potential if found else find_best_potential(sure)) * sure.rise_m
     of_cell = class_id.reshape(-1)
-    cheap = _cheap_by_class(sure, reduced, of_cell)
+    cheap = _find_cheap_by_class(sure, reduced, of_cell)
     least = np.empty(steps.cost.size)
     least[known] = reduced
     least[~known] = (0.5 * (cheap[of_cell[steps.begin]] + cheap[of_cell[steps.end]]) * steps.length_m)[~known]
     limit = found.reduced_cost * (1.0 - 1e-9) if found else np.inf
-    over = least_over_cells(steps, least, of_cell.size, start, goal, limit=limit)
+    over = compute_least_costs(steps, least, of_cell.size, start, goal, limit=limit)
     return over, over < limit
 
 
-def _cheap_by_class(steps: Steps, reduced: Floats, of_cell: Classes) -> Floats:
+def _find_cheap_by_class(steps: Steps, reduced: Floats, of_cell: Classes) -> Floats:
     """Return the cheapest tenth of a metre of each class, shape (256,)."""
     found = np.full(_CLASSES, np.nan)
     within, per_m = of_cell[steps.begin], reduced / steps.length_m

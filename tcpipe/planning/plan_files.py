@@ -10,20 +10,20 @@ from typing import Annotated, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.errors import ModelError, StoreError, UsageError, plain_lines
+from tcpipe.errors import ModelError, StoreError, UsageError, clean_lines
 from tcpipe.formats.atomic import clear_beside
 from tcpipe.formats.finding_lines import format_findings
-from tcpipe.formats.geojson_lines import LineFeature, check_lonlat, line_feature
-from tcpipe.formats.json_files import digest, read_as, recast, write_json
+from tcpipe.formats.geojson_lines import LineFeature, check_lonlat, make_line_feature
+from tcpipe.formats.integrity import compute_checksum, find_broken_seal
+from tcpipe.formats.json_files import convert_record, digest, read_as, write_json
 from tcpipe.formats.maps.map_files import MapFile
-from tcpipe.formats.seals import broken_seal, file_checksum
-from tcpipe.planning.cost_grid import Survey, new_survey, survey_from
-from tcpipe.planning.cost_map import CARD, CostMapCard, cost_map_key, open_cost_map, read_cost_map_card
+from tcpipe.planning.cost_grid import LazyCostGrid, make_survey, read_survey
+from tcpipe.planning.cost_map import CARD, CostMapCard, make_cost_map_key, open_cost_map, read_cost_map_card
 from tcpipe.planning.cost_model import CostModel, check_model
-from tcpipe.planning.path_files import cost_text, find_doubts
+from tcpipe.planning.path_files import find_doubts, format_cost
 from tcpipe.planning.plan import OBJECTIVES, Objective, PlanTotals, plan_path
 from tcpipe.tables.bounds import Bounds
-from tcpipe.tables.catalogue import threshold
+from tcpipe.tables.catalogue import read_threshold
 from tcpipe.tables.findings import LEFT_OUT, Finding, Subject, make_finding
 
 VERSION = "1.1"
@@ -99,10 +99,10 @@ class PlanResult:
 
     def __str__(self) -> str:
         """Return what each path costs and where it is, as plain lines."""
-        lines = [f"least {name}: {cost_text(plan)}" for name, plan in self.plans.items()]
+        lines = [f"least {name}: {format_cost(plan)}" for name, plan in self.plans.items()]
         lines += format_findings(self._find_doubts())
         same = ": nothing to do: it is made from the same model, map and points" if self.status == "unchanged" else ""
-        return plain_lines((*lines, f"{self.out}{same}", *([str(self.picture)] if self.picture else [])))
+        return clean_lines((*lines, f"{self.out}{same}", *([str(self.picture)] if self.picture else [])))
 
     def _find_doubts(self) -> Iterator[Finding]:
         """Yield what the path segments of the plan show that its cells did not, and that another plan takes less."""
@@ -114,7 +114,7 @@ class PlanResult:
             yield make_finding("steps-gain-energy", path, step_count=asked.negative_steps)
         taken = {other: getattr(found, _TAKEN[objective]) for other, found in self.plans.items() if found.complete}
         least = min(taken, key=taken.__getitem__, default=objective)
-        if asked.complete and taken[least] < threshold("objective-missed", "max_cost_ratio") * taken[objective]:
+        if asked.complete and taken[least] < read_threshold("objective-missed", "max_cost_ratio") * taken[objective]:
             yield make_finding("objective-missed", path, names={"other": least, "objective": objective})
 
 
@@ -141,13 +141,13 @@ def plan(
         check_lonlat(label, end[None])
     check_model(model, source)
     drawn = picture is not None
-    card = None if request.cost_map is None else _card_of(request.cost_map, model, source)
+    card = None if request.cost_map is None else _read_card(request.cost_map, model, source)
     rules = replace(request, cost_map=None, step_m=card.grid.pitch_m if card else request.step_m)
     made_from = {"model": model.checksum, "map": source.summary(), "request": rules, "drawn": drawn}
     key = digest({**made_from, "cost_map": card is not None, "version": VERSION})
-    if (found := _plans_of(out, picture, key)) is not None:
+    if (found := _read_plans(out, picture, key)) is not None:
         return PlanResult(request.objective, out, picture, "unchanged", found)
-    survey = _survey(model, source, request, card)
+    survey = _open_survey(model, source, request, card)
     wanted = (request.objective, *(name for name in OBJECTIVES if drawn and name != request.objective))
     plans = {
         name: plan_path(survey, start, goal, name, allow_unseen=request.allow_unseen, step=step) for name in wanted
@@ -157,11 +157,11 @@ def plan(
         from tcpipe.planning.picture import draw_plans  # noqa: PLC0415  matplotlib loads only to draw
 
         draw_plans(picture, source, [plans[name] for name in OBJECTIVES])
-        origin = replace(origin, picture_sha256=file_checksum(picture).sha256)
+        origin = replace(origin, picture_sha256=compute_checksum(picture).sha256)
     asked = plans[request.objective]
     who = {"model": model.name, "map": source.name, "robot": model.robot, "allow_unseen": request.allow_unseen}
     who["label_energy"] = model.label_energy
-    path = line_feature(asked.lonlat_deg, recast(asked.totals, PlannedPath, **who))
+    path = make_line_feature(asked.lonlat_deg, convert_record(asked.totals, PlannedPath, **who))
     write_json(out, PlanFile((path,), origin))
     return PlanResult(request.objective, out, picture, "done", origin.plans)
 
@@ -173,28 +173,28 @@ def _check_names(out: Path, picture: Path | None) -> None:
         raise UsageError(f"{picture}: wanted the name of a file that ends in .png")
 
 
-def _card_of(path: Path, model: CostModel, source: MapFile) -> CostMapCard:
+def _read_card(path: Path, model: CostModel, source: MapFile) -> CostMapCard:
     """Return the card of a cost map of this model and map; `ModelError` if it is none."""
     card = read_cost_map_card(path)
     if card is None:
         if not (path / CARD).is_file():
             raise UsageError(f"{path}: not a cost map; make one with tcpipe cost-map")
-        raise ModelError(f"{broken_seal(path / CARD)}; make one with tcpipe cost-map")
-    if card.key != cost_map_key(model, source, card.grid.pitch_m):
+        raise ModelError(f"{find_broken_seal(path / CARD)}; make one with tcpipe cost-map")
+    if card.key != make_cost_map_key(model, source, card.grid.pitch_m):
         raise ModelError(
             f"{path}: is made from another model or map than {model.name} and {source.name}; make it again with tcpipe cost-map"
         )
     return card
 
 
-def _survey(model: CostModel, source: MapFile, request: PlanRequest, card: CostMapCard | None) -> Survey:
+def _open_survey(model: CostModel, source: MapFile, request: PlanRequest, card: CostMapCard | None) -> LazyCostGrid:
     """Return what a cost map knows, or nothing yet."""
     if request.cost_map is None or card is None:
-        return new_survey(model, source, request.step_m)
-    return survey_from(model, source, open_cost_map(request.cost_map, card))
+        return make_survey(model, source, request.step_m)
+    return read_survey(model, source, open_cost_map(request.cost_map, card))
 
 
-def _plans_of(out: Path, picture: Path | None, key: str) -> dict[Objective, PlanTotals] | None:
+def _read_plans(out: Path, picture: Path | None, key: str) -> dict[Objective, PlanTotals] | None:
     """Return what was found before, if it is made from the same, and whole; else None. `UsageError` for a file that is no plan."""
     if not out.exists():
         return None
@@ -204,6 +204,6 @@ def _plans_of(out: Path, picture: Path | None, key: str) -> dict[Objective, Plan
         raise UsageError(f"{out}: exists and is no plan; it is left alone; give another --out") from None
     if about.key != key:
         return None
-    if picture is not None and not (picture.is_file() and file_checksum(picture).sha256 == about.picture_sha256):
+    if picture is not None and not (picture.is_file() and compute_checksum(picture).sha256 == about.picture_sha256):
         return None
     return {name: about.plans[name] for name in about.order}

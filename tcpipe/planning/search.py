@@ -17,7 +17,7 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
 from tcpipe.planning.cost_grid import CostGrid
-from tcpipe.planning.courses import COURSES, MOVES, touches
+from tcpipe.planning.courses import COURSES, MOVES, find_crossed_cells
 
 Floats = NDArray[np.float64]
 
@@ -52,7 +52,7 @@ class Steps:
 
 
 @dataclass(frozen=True, slots=True)
-class Found:
+class LeastCostPath:
     """A least-cost path: flat indices of its cells, its cost, its cost without the grade, and the potential a metre that takes it out."""
 
     cells: NDArray[np.int64]
@@ -62,7 +62,7 @@ class Found:
     negative_steps: int
 
 
-def steps_of(costs: CostGrid, objective: str, open_: NDArray[np.bool_], metres: Floats) -> Steps:
+def make_steps(costs: CostGrid, objective: str, open_: NDArray[np.bool_], metres: Floats) -> Steps:
     """Return every step along every course.
 
     Parameters
@@ -73,7 +73,7 @@ def steps_of(costs: CostGrid, objective: str, open_: NDArray[np.bool_], metres: 
     """
     rows, cols = costs.grid.rows, costs.grid.cols
     per_metre = costs.per_metre(objective)
-    height = np.nan_to_num(costs.height_m.astype(np.float64), nan=_middle(costs))
+    height = np.nan_to_num(costs.height_m.astype(np.float64), nan=_compute_middle(costs))
     parts: list[tuple[NDArray[np.int64], NDArray[np.int64], Floats, Floats, Floats]] = []
     for course in range(COURSES):
         east, north = MOVES[course].tolist()
@@ -84,7 +84,7 @@ def steps_of(costs: CostGrid, objective: str, open_: NDArray[np.bool_], metres: 
             continue
         can = np.ones((row1 - row0, col1 - col0), np.bool_)
         mean = np.zeros(can.shape)
-        for touch in touches(course):
+        for touch in find_crossed_cells(course):
             part = (slice(row0 - touch.north, row1 - touch.north), slice(col0 + touch.east, col1 + touch.east))
             can &= open_[course][part]
             if touch.share:
@@ -97,12 +97,12 @@ def steps_of(costs: CostGrid, objective: str, open_: NDArray[np.bool_], metres: 
     return Steps(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
 
-def _middle(costs: CostGrid) -> float:
+def _compute_middle(costs: CostGrid) -> float:
     known = costs.height_m[np.isfinite(costs.height_m)]
     return float(np.median(known)) if known.size else 0.0
 
 
-def best_potential(steps: Steps) -> float:
+def find_best_potential(steps: Steps) -> float:
     """Return k, the potential a metre of height, that makes the cheapest metre of ``steps`` as dear as can be: a concave search.
 
     Metres of about the same grade are taken as their cheapest at either end of the bin, so that a step is never dearer than it is.
@@ -122,41 +122,41 @@ def best_potential(steps: Steps) -> float:
     return 0.5 * (low + high)
 
 
-def least_cost_path(steps: Steps, cells: int, start: int, goal: int) -> Found | None:
+def find_least_cost_path(steps: Steps, cells: int, start: int, goal: int) -> LeastCostPath | None:
     """Return the least-cost path from a cell to another (flat indices of ``cells`` in all); None where there is none."""
     if not steps.cost.size:
         return None
-    k = best_potential(steps)
+    k = find_best_potential(steps)
     reduced = steps.cost - k * steps.rise_m
     negative = int(np.count_nonzero(reduced < 0.0))
-    cost, before = dijkstra(_graph(steps, reduced, cells), indices=start, return_predecessors=True)
+    cost, before = dijkstra(_build_graph(steps, reduced, cells), indices=start, return_predecessors=True)
     if not np.isfinite(cost[goal]):
         return None
     path = [goal]
     while path[-1] != start:
         path.append(int(before[path[-1]]))
     order = np.array(path[::-1])
-    return Found(order, float(path_cost(steps, order, cells)), float(cost[goal]), k, negative)
+    return LeastCostPath(order, float(sum_path_cost(steps, order, cells)), float(cost[goal]), k, negative)
 
 
-def least_over_cells(steps: Steps, reduced: Floats, cells: int, start: int, goal: int, *, limit: float) -> Floats:
+def compute_least_costs(steps: Steps, reduced: Floats, cells: int, start: int, goal: int, *, limit: float) -> Floats:
     """Return what the cheapest path over each cell costs, shape (cells,); infinite where that is more than ``limit``.
 
     Parameters
     ----------
     steps, reduced : all steps, and what each is taken to cost without the grade, shape (M,).
     """
-    graph = _graph(steps, reduced, cells)
+    graph = _build_graph(steps, reduced, cells)
     there = dijkstra(graph, indices=start, limit=limit)
     back = dijkstra(graph.T.tocsr(), indices=goal, limit=limit)
     return np.asarray(there + back)
 
 
-def _graph(steps: Steps, reduced: Floats, cells: int) -> csr_array:
+def _build_graph(steps: Steps, reduced: Floats, cells: int) -> csr_array:
     return csr_array((np.maximum(reduced, _LEAST), (steps.begin, steps.end)), shape=(cells, cells))
 
 
-def path_cost(steps: Steps, path: NDArray[np.int64], cells: int) -> float:
+def sum_path_cost(steps: Steps, path: NDArray[np.int64], cells: int) -> float:
     """Return the summed cost of the steps of a path."""
     taken = np.isin(steps.begin * cells + steps.end, path[:-1] * cells + path[1:])
     return float(steps.cost[taken].sum())

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.cost.prediction_errors import Centring, centring_of
+from tcpipe.cost.prediction_errors import BiasCorrection, fit_bias_correction
 from tcpipe.planning.cost_model import CostModel, predict_patches
-from tcpipe.planning.reasons import NO_COST, Bits, Reason, reasons_of
+from tcpipe.planning.no_cost_reasons import NO_COST, Bits, Reason, find_reasons
 from tcpipe.terrain.layers import HEIGHT_STEP_M
-from tcpipe.terrain.patches import PatchFrames, corners_on, footprints
+from tcpipe.terrain.patches import PatchFrames, compute_footprints, count_corners_on
 from tcpipe.terrain.sampling import Patches, sample_patches
 from tcpipe.terrain.tiles import MapReader, TilePool, level_for
 
@@ -54,11 +54,11 @@ def predict_segments(
     Without ``ask`` the ground is judged alone: no predictions. ``turn_radpm`` is how far a metre of each frame turns, of all batches one
     after another; without it all turn as usual.
     """
-    centring, tiles = centring_of(model.residuals), TilePool(level_for(source, model.patch_m / model.patch_px))
+    centring, tiles = fit_bias_correction(model.residuals), TilePool(level_for(source, model.patch_m / model.patch_px))
 
     def sampled(frames: PatchFrames, first: int) -> tuple[Patches, NDArray[np.bool_], Floats | None]:
         chord_m = np.full(len(frames.centre_xy_m), model.chord_m)
-        on_map = corners_on(source.grid, footprints(frames, model.patch_m)) == 4
+        on_map = count_corners_on(source.grid, compute_footprints(frames, model.patch_m)) == 4
         patch_m, patch_px = model.patch_m, model.patch_px
         found = sample_patches(source, frames, chord_m, patch_m=patch_m, patch_px=patch_px, pool=tiles)
         return found, on_map, None if turn_radpm is None else turn_radpm[first : first + len(chord_m)]
@@ -68,23 +68,23 @@ def predict_segments(
         for frames in batches:
             following, first = ahead.submit(sampled, frames, first), first + len(frames.centre_xy_m)
             if waiting is not None:
-                yield _judged(model, source, *waiting.result(), centring=centring, ask=ask)
+                yield _predict_batch(model, source, *waiting.result(), centring=centring, ask=ask)
             waiting = following
         if waiting is not None:
-            yield _judged(model, source, *waiting.result(), centring=centring, ask=ask)
+            yield _predict_batch(model, source, *waiting.result(), centring=centring, ask=ask)
 
 
-def _judged(
+def _predict_batch(
     model: CostModel,
     source: MapReader,
     patches: Patches,
     on_map: NDArray[np.bool_],
     turn_radpm: Floats | None,
     *,
-    centring: Centring,
+    centring: BiasCorrection,
     ask: bool,
 ) -> SegmentPredictions:
-    bits = reasons_of(patches, on_map, model, source)
+    bits = find_reasons(patches, on_map, model, source)
     asked = (bits & NO_COST == 0) & ask
     said = predict_patches(model, patches, asked, turn_radpm)
     power_watt, velocity_mps = centring.apply(said.power_watt, said.velocity_mps, patches.terrain_class)
@@ -103,7 +103,7 @@ def _judged(
     )
 
 
-def joined(parts: Iterable[SegmentPredictions]) -> SegmentPredictions:
+def join_predictions(parts: Iterable[SegmentPredictions]) -> SegmentPredictions:
     """Return the verdicts of all batches as one."""
     found = list(parts)
     columns: dict[str, Any] = {
@@ -113,7 +113,7 @@ def joined(parts: Iterable[SegmentPredictions]) -> SegmentPredictions:
     return SegmentPredictions(**columns)
 
 
-def in_batches(frames: PatchFrames) -> Iterator[PatchFrames]:
+def iterate_batches(frames: PatchFrames) -> Iterator[PatchFrames]:
     """Yield frames in batches of `BATCH`, in order."""
     for first in range(0, len(frames.centre_xy_m), BATCH):
         yield frames.rows(np.arange(first, min(first + BATCH, len(frames.centre_xy_m))))

@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.compiled import kernel
+from tcpipe.compiled import compile_kernel
 
 SAMPLES_A_CELL = 4
 
 
-@kernel
-def best_line_from(  # noqa: PLR0917
+@compile_kernel
+def find_best_lines(  # noqa: PLR0917
     per_metre: NDArray[np.float32],
     open_: NDArray[np.bool_],
     angles: NDArray[np.float64],
@@ -43,13 +43,15 @@ def best_line_from(  # noqa: PLR0917
     for j in range(1, points.shape[0]):
         so_far[j] = np.inf
         for i in range(max(j - window, 0), j):
-            cost = so_far[i] + _line(per_metre, open_, angles, metres, points[i], points[j], i == j - 1)
+            cost = so_far[i] + _compute_line_cost(per_metre, open_, angles, metres, points[i], points[j], i == j - 1)
             if cost < so_far[j] - 1e-9 * abs(so_far[j]) or (so_far[j] == np.inf and cost < np.inf):
                 so_far[j], before[j] = cost, i
 
 
-@kernel
-def _line(per_metre: Any, open_: Any, angles: Any, metres: Any, begin: Any, end: Any, is_step: Any) -> float:  # noqa: PLR0917
+@compile_kernel
+def _compute_line_cost(  # noqa: PLR0917
+    per_metre: Any, open_: Any, angles: Any, metres: Any, begin: Any, end: Any, is_step: Any
+) -> float:
     """Return the cost of a straight line, of its course by interpolation between the two nearest; infinite where it may not be driven."""
     east, north = end[0] - begin[0], begin[1] - end[1]
     length = np.hypot(east, north)

@@ -16,7 +16,7 @@ from scipy.sparse.csgraph import dijkstra
 
 from tcpipe.geometry.angles import wrap_to_pi
 from tcpipe.planning.courses import ANGLES_DEG, COURSES, MOVES
-from tcpipe.planning.search import Found, Steps, best_potential
+from tcpipe.planning.search import LeastCostPath, Steps, find_best_potential
 from tcpipe.tables.facts import PhysicsFit
 from tcpipe.terrain.classes import ClassTable
 
@@ -39,7 +39,7 @@ class Turning:
         return np.asarray(self.joule_per_rad[class_id] * beyond_rad)
 
 
-def turning_of(fit: PhysicsFit | None, classes: ClassTable) -> Turning | None:
+def find_turning(fit: PhysicsFit | None, classes: ClassTable) -> Turning | None:
     """Return what turning costs by a fit; a class that it does not name costs the mean of those that it does. None without such a term."""
     found = {} if fit is None else {of.terrain: of.value for of in fit.terms if of.term == "turning"}
     if fit is None or not found:
@@ -50,7 +50,7 @@ def turning_of(fit: PhysicsFit | None, classes: ClassTable) -> Turning | None:
     return Turning(joule_per_rad, fit.usual_turn_radpm)
 
 
-def turns_between(start_xy_m: Floats, end_xy_m: Floats) -> Floats:
+def compute_turns(start_xy_m: Floats, end_xy_m: Floats) -> Floats:
     """Return how far each of N pieces of a path turns [rad], shape (N,): half of the change of course at either of its ends.
 
     The chords' courses are compared, not those of the drawn line, so that the jitter of its points is no turn.
@@ -73,7 +73,9 @@ _TURNS_RAD = np.radians(np.diff(np.append(ANGLES_DEG, 360.0)))
 """From each course to the next [rad], shape (16,)."""
 
 
-def least_turning_path(steps: Steps, cols: int, start: int, goal: int, joule_per_rad: Floats) -> Found | None:
+def find_least_turning_path(
+    steps: Steps, cols: int, start: int, goal: int, joule_per_rad: Floats
+) -> LeastCostPath | None:
     """Return the path of least energy, that of its turns included; None where there is none.
 
     Parameters
@@ -83,12 +85,12 @@ def least_turning_path(steps: Steps, cols: int, start: int, goal: int, joule_per
     start, goal : flat indices of cells.
     joule_per_rad : what a turn costs in each cell, shape (cells,).
     """
-    cells, first, end = _numbered(steps, start, goal)
+    cells, first, end = _number_nodes(steps, start, goal)
     if cells is None:
         return None
-    k = best_potential(steps)
+    k = find_best_potential(steps)
     reduced = steps.cost - k * steps.rise_m
-    course = _courses(steps, cols)
+    course = _find_courses(steps, cols)
     node, there = first * COURSES + course, end * COURSES + course
     here = np.arange(len(cells) * COURSES)
     following = here - here % COURSES + (here + 1) % COURSES
@@ -112,17 +114,17 @@ def least_turning_path(steps: Steps, cols: int, start: int, goal: int, joule_per
     order = visited[np.append(True, np.diff(visited) != 0)]
     taken = np.isin(steps.begin * len(joule_per_rad) + steps.end, order[:-1] * len(joule_per_rad) + order[1:])
     total = float(cost[last] + k * steps.rise_m[taken].sum())
-    return Found(order, total, float(cost[last]), k, int(np.count_nonzero(reduced < 0.0)))
+    return LeastCostPath(order, total, float(cost[last]), k, int(np.count_nonzero(reduced < 0.0)))
 
 
-def _numbered(steps: Steps, start: int, goal: int) -> tuple[Ints | None, Ints, Ints]:
+def _number_nodes(steps: Steps, start: int, goal: int) -> tuple[Ints | None, Ints, Ints]:
     """Return the cells that steps begin or end in, rising, and the place of each step's ends among them; None where an end is not one."""
     cells, place = np.unique(np.concatenate([steps.begin, steps.end]), return_inverse=True)
     first, end = place[: len(steps.begin)], place[len(steps.begin) :]
     return (cells if np.isin([start, goal], cells).all() else None), first, end
 
 
-def _courses(steps: Steps, cols: int) -> Ints:
+def _find_courses(steps: Steps, cols: int) -> Ints:
     """Return the course of each step, shape (M,); rows run south."""
     (row0, col0), (row1, col1) = np.divmod(steps.begin, cols), np.divmod(steps.end, cols)
     table = np.zeros((5, 5), np.int64)

@@ -19,7 +19,7 @@ _CLEARLY = 0.9
 """The better of two delays says so when its squared residuals are below this share of the other's."""
 
 
-def told_averaged(
+def is_stated_averaged(
     power_ns: Stamps, power_watt: Floats, motion_ns: Stamps, forward_mps: Floats, yaw_rate_radps: Floats
 ) -> bool | None:
     """Return whether each value is the mean since the one before it (True) or sampled (False); None where motion tells neither.
@@ -44,10 +44,10 @@ def told_averaged(
         (motion_ns - motion_ns[0]) / 1e9,
         period_ns / 1e9,
     )
-    sums = _sums(motion_s, _causes(motion_s, forward_mps, yaw_rate_radps))
+    sums = _integrate_causes(motion_s, _collect_causes(motion_s, forward_mps, yaw_rate_radps))
     left = np.array(
         [
-            _unexplained(power_watt[inside], _mean_about(at_s - late * period_s, period_s, motion_s, sums))
+            _compute_unexplained(power_watt[inside], _mean_about(at_s - late * period_s, period_s, motion_s, sums))
             for late in _LATE
         ]
     )
@@ -58,14 +58,14 @@ def told_averaged(
     return averaged < sampled
 
 
-def _causes(motion_s: Floats, forward_mps: Floats, yaw_rate_radps: Floats) -> Floats:
+def _collect_causes(motion_s: Floats, forward_mps: Floats, yaw_rate_radps: Floats) -> Floats:
     """Return what power follows, shape (M, 5)."""
     speed, turning = np.abs(forward_mps), np.abs(yaw_rate_radps)
     gained = np.gradient(0.5 * speed**2, motion_s)
     return np.column_stack((np.ones_like(speed), speed, speed**2, turning, gained))
 
 
-def _sums(motion_s: Floats, causes: Floats) -> Floats:
+def _integrate_causes(motion_s: Floats, causes: Floats) -> Floats:
     """Return the integral of each cause from the first time, shape (M, 5)."""
     steps = np.diff(motion_s)[:, None] * (causes[1:] + causes[:-1]) / 2.0
     return np.concatenate((np.zeros((1, causes.shape[1])), np.cumsum(steps, axis=0)))
@@ -79,6 +79,6 @@ def _mean_about(at_s: Floats, width_s: float, motion_s: Floats, sums: Floats) ->
     )
 
 
-def _unexplained(power_watt: Floats, causes: Floats) -> float:
+def _compute_unexplained(power_watt: Floats, causes: Floats) -> float:
     fitted = causes @ np.linalg.lstsq(causes, power_watt, rcond=None)[0]
     return float(np.sum((power_watt - fitted) ** 2))

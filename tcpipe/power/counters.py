@@ -42,7 +42,7 @@ class Counter:
         return amp
 
 
-def counted(parts: Sequence[tuple[float, Floats]], *, wraps: float | None) -> Counter:
+def count_energy(parts: Sequence[tuple[float, Floats]], *, wraps: float | None) -> Counter:
     """Return what counters that only rise counted together.
 
     Parameters

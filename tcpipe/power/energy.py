@@ -16,7 +16,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.geometry.piecewise_linear import held_back_integral_to, product_integral_to
+from tcpipe.geometry.piecewise_linear import integrate_held_to, integrate_product_to
 from tcpipe.power.rails import Rail
 
 Floats = NDArray[np.float64]
@@ -25,7 +25,7 @@ Ints = NDArray[np.int64]
 Rule = Literal["exact", "averaged", "right_endpoint"]
 
 
-def energy_joule(rails: list[Rail], start_ns: Ints, end_ns: Ints, *, rule: Rule) -> Floats:
+def integrate_energy(rails: list[Rail], start_ns: Ints, end_ns: Ints, *, rule: Rule) -> Floats:
     """Return the energy of all rails over each span, [J], shape (M,); NaN where any rail is not known throughout, or there is none.
 
     Parameters
@@ -37,25 +37,25 @@ def energy_joule(rails: list[Rail], start_ns: Ints, end_ns: Ints, *, rule: Rule)
         energy = np.full(len(start_ns), np.nan)
         if len(each.stamp_ns) >= 2:
             inside = (start_ns >= each.stamp_ns[0]) & (end_ns <= each.stamp_ns[-1])
-            energy[inside] = _energy_to(each, end_ns[inside], rule) - _energy_to(each, start_ns[inside], rule)
+            energy[inside] = _integrate_to(each, end_ns[inside], rule) - _integrate_to(each, start_ns[inside], rule)
         total += energy
     return total
 
 
-def recorded_energy_joule(rails: list[Rail], start_ns: Ints, end_ns: Ints, *, rule: Rule) -> Floats:
+def integrate_recorded_energy(rails: list[Rail], start_ns: Ints, end_ns: Ints, *, rule: Rule) -> Floats:
     """Return the energy that the record holds for each span, [J], shape (M,): where a rail is not known it adds nothing.
 
-    Unlike a label's, this is bookkeeping: spans that tile a run add up to the run's energy. Parameters as in `energy_joule`.
+    Unlike a label's, this is bookkeeping: spans that tile a run add up to the run's energy. Parameters as in `integrate_energy`.
     """
     total = np.zeros(len(start_ns))
     for each in rails:
         if len(each.stamp_ns) >= 2:
             begin, end = (np.clip(at_ns, each.stamp_ns[0], each.stamp_ns[-1]) for at_ns in (start_ns, end_ns))
-            total += _energy_to(each, end, rule) - _energy_to(each, begin, rule)
+            total += _integrate_to(each, end, rule) - _integrate_to(each, begin, rule)
     return total
 
 
-def samples_inside(rails: list[Rail], start_ns: Ints, end_ns: Ints) -> tuple[Ints, Floats]:
+def count_samples_inside(rails: list[Rail], start_ns: Ints, end_ns: Ints) -> tuple[Ints, Floats]:
     """Return how many current samples lie in (start, end], the fewest of any rail, and the plain mean power of the samples there.
 
     Returns
@@ -80,7 +80,7 @@ def _count(stamp_ns: Ints, start_ns: Ints, end_ns: Ints) -> Ints:
     return after.astype(np.int64)
 
 
-def _energy_to(each: Rail, at_ns: Ints, rule: Rule) -> Floats:
+def _integrate_to(each: Rail, at_ns: Ints, rule: Rule) -> Floats:
     if rule == "exact":
-        return product_integral_to(each.stamp_ns, each.voltage_volt, each.current_amp, at_ns)
-    return held_back_integral_to(each.stamp_ns, each.voltage_volt * each.current_amp, at_ns)
+        return integrate_product_to(each.stamp_ns, each.voltage_volt, each.current_amp, at_ns)
+    return integrate_held_to(each.stamp_ns, each.voltage_volt * each.current_amp, at_ns)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 
 
-def non_negative(made: Floats, seen: Floats) -> Floats:
+def solve_non_negative(made: Floats, seen: Floats) -> Floats:
     """Return the sizes, none negative, with which the columns of ``made`` add up nearest to what is seen.
 
     Lawson and Hanson, Solving Least Squares Problems (1974), algorithm 23.10 (NNLS): columns that would lessen the residual most become
@@ -34,7 +34,7 @@ def non_negative(made: Floats, seen: Floats) -> Floats:
         if gain[best] <= rounding[best] or free.sum() == len(seen):
             break
         free[best] = True
-        tried = _tried(made, seen, free)
+        tried = _solve_subset(made, seen, free)
         if tried[best] <= 0.0:  # its gain was rounding
             free[best], vain[best] = False, True
             continue
@@ -43,12 +43,12 @@ def non_negative(made: Floats, seen: Floats) -> Floats:
             size = size + share.min() * (tried - size)
             size[np.flatnonzero(negative)[share == share.min()]] = 0.0
             free &= size > 0.0
-            tried = _tried(made, seen, free)
+            tried = _solve_subset(made, seen, free)
         size, vain = tried, np.zeros_like(vain)
     return size
 
 
-def _tried(made: Floats, seen: Floats, free: NDArray[np.bool_]) -> Floats:
+def _solve_subset(made: Floats, seen: Floats, free: NDArray[np.bool_]) -> Floats:
     sizes = np.zeros(made.shape[1])
     sizes[free] = np.linalg.lstsq(made[:, free], seen, rcond=None)[0]
     return sizes

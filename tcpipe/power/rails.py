@@ -50,7 +50,7 @@ class Rail:
     current_amp: Floats
 
 
-def samples(stamp_ns: Stamps, value: Floats) -> Samples:
+def make_samples(stamp_ns: Stamps, value: Floats) -> Samples:
     """Return the finite values in time order; of several at one stamp the first given, as for every other sensor.
 
     Of means the second says nothing: no time lies between it and the first.
@@ -60,7 +60,7 @@ def samples(stamp_ns: Stamps, value: Floats) -> Samples:
     return Samples(stamps, value[known][first])
 
 
-def rail(name: str, voltage: Samples, current: Samples, *, averaged: bool) -> Rail:
+def make_rail(name: str, voltage: Samples, current: Samples, *, averaged: bool) -> Rail:
     """Return a rail of its voltage [V] and current [A], with both signals on the union of their stamps."""
     union = np.union1d(voltage.stamp_ns, current.stamp_ns)
     if not len(voltage.stamp_ns) or not len(current.stamp_ns):
@@ -69,11 +69,11 @@ def rail(name: str, voltage: Samples, current: Samples, *, averaged: bool) -> Ra
     begin = max(voltage.stamp_ns[0], current.stamp_ns[0])
     end = min(voltage.stamp_ns[-1], current.stamp_ns[-1])
     union = union[(union >= begin) & (union <= end)]
-    volt, amp = (value_at(each, union, averaged=averaged) for each in (voltage, current))
+    volt, amp = (interpolate_value(each, union, averaged=averaged) for each in (voltage, current))
     return Rail(name, voltage, current, averaged, union, volt, amp)
 
 
-def value_at(
+def interpolate_value(
     signal: Samples,
     at_ns: Stamps,
     *,
@@ -87,24 +87,24 @@ def value_at(
     return straight(signal.stamp_ns, signal.value, at_ns)
 
 
-def rail_at(each: Rail, at_ns: Stamps) -> tuple[Floats, Floats]:
+def interpolate_rail(each: Rail, at_ns: Stamps) -> tuple[Floats, Floats]:
     """Return voltage [V] and current [A] of a rail at each time, shape (M,), ends held; NaN if they are never both known."""
     if not len(each.stamp_ns):
         return np.full(len(at_ns), np.nan), np.full(len(at_ns), np.nan)
     volt, amp = (Samples(each.stamp_ns, value) for value in (each.voltage_volt, each.current_amp))
-    return value_at(volt, at_ns, averaged=each.averaged), value_at(amp, at_ns, averaged=each.averaged)
+    return interpolate_value(volt, at_ns, averaged=each.averaged), interpolate_value(amp, at_ns, averaged=each.averaged)
 
 
-def power_watt(rails: list[Rail], at_ns: Stamps) -> Floats:
+def compute_power_watt(rails: list[Rail], at_ns: Stamps) -> Floats:
     """Return the power of all rails at each time, [W], shape (M,), ends held; NaN if a rail is never known, or there is none."""
     total = np.full(len(at_ns), np.nan if not rails else 0.0)
     for each in rails:
-        volt, amp = rail_at(each, at_ns)
+        volt, amp = interpolate_rail(each, at_ns)
         total += volt * amp
     return total
 
 
-def power_at(rails: list[Rail], at_ns: Stamps, *, max_gap_ns: int) -> tuple[Floats, Floats, Floats]:
+def compute_power_at(rails: list[Rail], at_ns: Stamps, *, max_gap_ns: int) -> tuple[Floats, Floats, Floats]:
     """Return mean voltage [V], summed current [A] and summed power [W] at each stamp, each of shape (M,).
 
     NaN without rails, and where any rail's voltage or current has no sample on both sides within max(3 of its periods, ``max_gap_ns``).
@@ -112,7 +112,12 @@ def power_at(rails: list[Rail], at_ns: Stamps, *, max_gap_ns: int) -> tuple[Floa
     if not rails:
         return (np.full(at_ns.size, np.nan),) * 3
     voltage, current = (
-        np.stack([_known_at(signal, at_ns, averaged=each.averaged, max_gap_ns=max_gap_ns) for each, signal in signals])
+        np.stack(
+            [
+                _interpolate_known(signal, at_ns, averaged=each.averaged, max_gap_ns=max_gap_ns)
+                for each, signal in signals
+            ]
+        )
         for signals in ([(each, each.voltage) for each in rails], [(each, each.current) for each in rails])
     )
     power = voltage * current
@@ -121,7 +126,7 @@ def power_at(rails: list[Rail], at_ns: Stamps, *, max_gap_ns: int) -> tuple[Floa
     return np.where(known, volt, np.nan), np.where(known, amp, np.nan), np.where(known, watt, np.nan)
 
 
-def _known_at(signal: Samples, at_ns: Stamps, *, averaged: bool, max_gap_ns: int) -> Floats:
+def _interpolate_known(signal: Samples, at_ns: Stamps, *, averaged: bool, max_gap_ns: int) -> Floats:
     """Return a signal at each stamp; NaN where that lies neither on a sample nor between two that are near each other."""
     stamp_ns = signal.stamp_ns
     if stamp_ns.size == 0:
@@ -132,11 +137,11 @@ def _known_at(signal: Samples, at_ns: Stamps, *, averaged: bool, max_gap_ns: int
     covered = (before >= 0) & (after < stamp_ns.size)
     last = stamp_ns.size - 1
     width = stamp_ns[np.minimum(after, last)] - stamp_ns[np.clip(before, 0, last)]
-    value = value_at(signal, at_ns, averaged=averaged, straight=_straight_in_ns)
+    value = interpolate_value(signal, at_ns, averaged=averaged, straight=_interpolate_ns)
     return np.where(covered & (width <= longest), value, np.nan)
 
 
-def _straight_in_ns(stamp_ns: Stamps, value: Floats, at_ns: Stamps) -> Floats:
+def _interpolate_ns(stamp_ns: Stamps, value: Floats, at_ns: Stamps) -> Floats:
     """Return what `interpolate` does, reckoned in nanoseconds: in seconds the last digits of every track would be others."""
     zero = stamp_ns[0]
     between: Floats = np.interp((at_ns - zero).astype(np.float64), (stamp_ns - zero).astype(np.float64), value)

@@ -17,17 +17,17 @@ from tcpipe.power.sources import (
     Floats,
     HuskyPower,
     RailReadings,
+    apply_sign,
     find_rejection,
+    find_sources,
     read_rails,
     reject_power,
     sign_by_mean,
-    sources_of,
-    with_sign,
 )
-from tcpipe.power.wrapped import wrap_of
+from tcpipe.power.unsigned_currents import find_wrap
 from tcpipe.recipe.suggestions import suggest
 from tcpipe.robots.profiles import CurrentSign, PowerSource
-from tcpipe.tables.catalogue import Severity, threshold
+from tcpipe.tables.catalogue import Severity, read_threshold
 from tcpipe.tables.findings import Finding, Remedy, Subject, make_finding
 
 _LOG_TIME = "log_time_ns"
@@ -85,16 +85,18 @@ def read_power(
         if too_few := _find_too_few(topic, np.asarray(columns[_LOG_TIME], np.float64)):
             rejected += too_few
             continue
-        choices = sources_of(type_name, topic, known, platform=platform, husky_power=husky_power)
+        choices = find_sources(type_name, topic, known, platform=platform, husky_power=husky_power)
         found = [choices] if isinstance(choices, Finding) else _read_first_valid(topic, columns, choices, known)
         if isinstance(found, list):
             rejected += found
-            scaled[topic] = [] if isinstance(choices, Finding) else _in_thousandths(topic, columns, choices[0], known)
+            scaled[topic] = (
+                [] if isinstance(choices, Finding) else _convert_thousandths(topic, columns, choices[0], known)
+            )
             continue
         sources += found.sources
         findings += found.findings
         rails[topic] = found.rails if current_sign != "auto" else found.apply_type_signs()
-    rails = _paired(rails)
+    rails = _pair_rails(rails)
     rejected = rejected or _find_incomplete(rails)
     if rejected:
         if len(scaled) == len(topics) and all(scaled.values()):
@@ -108,7 +110,7 @@ def read_power(
     includes = tuple(dict.fromkeys(of.includes for of in sources if of.includes))
     loads = (make_finding("power-includes-loads", _POWER, names={"loads": name}) for name in includes)
     findings += [*of_sign, *odd, *loads]
-    signed = {topic: [with_sign(rail, sign) for rail in found] for topic, found in rails.items()}
+    signed = {topic: [apply_sign(rail, sign) for rail in found] for topic, found in rails.items()}
     counts = any(of.energy for of in sources)
     unknown = any(of.averaging_unknown for of in sources) and not counts
     averaged = counts or any(of.averaged for of in sources)
@@ -126,7 +128,7 @@ class _TopicRails:
     def apply_type_signs(self) -> list[RailReadings]:
         """Return the rails with the sign that their type gives a drawn current."""
         each = zip(self.rails, self.sources, strict=True)
-        return [with_sign(rail, -1 if of.sign == "drawn_negative" else 1) for rail, of in each]
+        return [apply_sign(rail, -1 if of.sign == "drawn_negative" else 1) for rail, of in each]
 
 
 def _read_first_valid(
@@ -139,7 +141,7 @@ def _read_first_valid(
         if isinstance(found, Finding):
             rejected.append(found)
             continue
-        read = [_unwrapped(rail) for rail in found]
+        read = [_unwrap_currents(rail) for rail in found]
         rails, findings = [rail for rail, _ in read], [found for _, each in read for found in each]
         if problems := [why for rail in rails if (why := find_rejection(rail, topic, columns)) is not None]:
             rejected += problems
@@ -150,7 +152,7 @@ def _read_first_valid(
     return rejected
 
 
-def _in_thousandths(
+def _convert_thousandths(
     topic: str, columns: Columns, sources: Sequence[PowerSource], known: Sequence[PowerSource]
 ) -> list[PowerSource]:
     """Return the sources in millivolts or milliamperes, as far as their numbers are power then; none where they are not."""
@@ -175,13 +177,13 @@ def _propose_sources(sources: Mapping[str, Sequence[PowerSource]]) -> tuple[Reme
     return suggest("scale", {"power_sources": rows})
 
 
-def _unwrapped(rail: RailReadings) -> tuple[RailReadings, list[Finding]]:
+def _unwrap_currents(rail: RailReadings) -> tuple[RailReadings, list[Finding]]:
     """Return a rail with negative currents that were read as unsigned made negative again, and findings on that and its counter."""
     names = {"rail": rail.name}
     if rail.counter is not None:
         resets = int(rail.counter.resets.max(initial=0))
         return rail, [make_finding("counter-reset", _POWER, names=names, resets_count=resets)] if resets else []
-    wraps_amp = wrap_of(rail.current_amp)
+    wraps_amp = find_wrap(rail.current_amp)
     if wraps_amp is None:
         return rail, []
     upper = rail.current_amp > wraps_amp / 2
@@ -190,7 +192,7 @@ def _unwrapped(rail: RailReadings) -> tuple[RailReadings, list[Finding]]:
     return replace(rail, current_amp=np.where(upper, rail.current_amp - wraps_amp, rail.current_amp)), [found]
 
 
-def _paired(rails: dict[str, list[RailReadings]]) -> dict[str, list[RailReadings]]:
+def _pair_rails(rails: dict[str, list[RailReadings]]) -> dict[str, list[RailReadings]]:
     """Give the one rail without current and the one without voltage a common name: they are one rail on two topics."""
     flat = [rail for found in rails.values() for rail in found]
     without_voltage = [rail.name for rail in flat if not np.isfinite(rail.voltage_volt).any()]
@@ -220,11 +222,13 @@ def _find_incomplete(rails: Rails) -> list[Finding]:
 
 def _find_too_few(topic: str, log_time_ns: Floats) -> list[Finding]:
     """Return why a topic's rate is too low for the energy of a segment: too few messages, or too far apart."""
-    if log_time_ns.size < threshold(REJECTED, "min_messages_count"):
+    if log_time_ns.size < read_threshold(REJECTED, "min_messages_count"):
         return [reject_power(topic, "too-few-messages", messages_count=log_time_ns.size)]
     period_s = float(np.median(np.diff(log_time_ns))) / 1e9
     return (
-        [reject_power(topic, "too-slow", period_s=period_s)] if period_s > threshold(REJECTED, "max_period_s") else []
+        [reject_power(topic, "too-slow", period_s=period_s)]
+        if period_s > read_threshold(REJECTED, "max_period_s")
+        else []
     )
 
 
@@ -233,7 +237,7 @@ def _exclude_implausible(rails: Rails) -> tuple[dict[str, list[RailReadings]], l
 
     Without current a low voltage may be true: a drive that is not switched on yet sends zeros.
     """
-    low, high = threshold(_ODD, "min_of_median"), threshold(_ODD, "max_of_median")
+    low, high = read_threshold(_ODD, "min_of_median"), read_threshold(_ODD, "max_of_median")
     kept: dict[str, list[RailReadings]] = {}
     findings = []
     for topic, found in rails.items():
@@ -263,14 +267,14 @@ def _sign(
     """Return what makes a drawn current positive (0 where the record contradicts its type), findings, and what tells it."""
     if given != "auto":
         return (1 if given == "drawn_positive" else -1), (), f"{given} (recipe)"
-    time_s, whole = _whole_current(rails, log_times)
+    time_s, whole = _sum_currents(rails, log_times)
     sign, net = sign_by_mean(whole, _weight_s(time_s))
     signs = {source.sign for source in sources}
     if "auto" not in signs:
         told, other = "drawn_positive", "drawn_negative"
         if signs == {other}:
             told, other = other, told
-        if sign >= 0 or time_s.size < threshold(REJECTED, "min_sign_count"):
+        if sign >= 0 or time_s.size < read_threshold(REJECTED, "min_sign_count"):
             return 1, (), f"{told} (message type)"
         return 0, (_find_sign(REJECTED, {"reason": "current-flows-back"}, net, other, told),), ""
     return _sign_by_charge(sign, net, sources)
@@ -303,7 +307,7 @@ def _weight_s(time_s: Floats) -> Floats:
     return weight
 
 
-def _whole_current(rails: Rails, log_times: Mapping[str, Floats]) -> tuple[Floats, Floats]:
+def _sum_currents(rails: Rails, log_times: Mapping[str, Floats]) -> tuple[Floats, Floats]:
     """Return the sum of all rails' currents [A] at the log times of the first topic that carries one, and these times [s]."""
     parts = [
         (log_times[topic][known] / 1e9, rail.current_amp[known])

@@ -38,23 +38,23 @@ def find_readings(stamp_ns: Stamps, values: Floats) -> NDArray[np.int64] | None:
     values : shape (N, K), quantities that are read together, finite.
     """
     changed = np.flatnonzero((values[1:] != values[:-1]).any(axis=1)) + 1
-    if changed.size <= _FEWEST_INTERVALS or not _jumps(values[changed]):
+    if changed.size <= _FEWEST_INTERVALS or not _has_jumps(values[changed]):
         return None
     message_ns = float(np.median(np.diff(stamp_ns)))
-    messages = _reading_period(np.diff(stamp_ns[changed]) / message_ns)
+    messages = _find_reading_period(np.diff(stamp_ns[changed]) / message_ns)
     if messages is None:
         return None
     at_ns = (stamp_ns - stamp_ns[0]).astype(np.float64)
-    return _arrivals(at_ns, changed, period_ns=messages * message_ns, message_ns=message_ns)
+    return _find_arrivals(at_ns, changed, period_ns=messages * message_ns, message_ns=message_ns)
 
 
-def _jumps(values: Floats) -> bool:
+def _has_jumps(values: Floats) -> bool:
     """Return whether successive values of one of the quantities often pass over a level that occurs elsewhere."""
     levels = [np.unique(column, return_inverse=True)[1] for column in values.T]
     return any(np.mean(np.abs(np.diff(level)) > 1) > _JUMPING_SHARE for level in levels)
 
 
-def _reading_period(interval: Floats) -> float | None:
+def _find_reading_period(interval: Floats) -> float | None:
     """Return how many messages a reading lasts, by the intervals between changes [messages]; None where they are not regular."""
     period = float(interval[interval <= 1.5 * np.quantile(interval, 0.2)].mean())
     for _ in range(3):
@@ -72,7 +72,9 @@ def _reading_period(interval: Floats) -> float | None:
     return period if is_repeated else None
 
 
-def _arrivals(at_ns: Floats, changed: NDArray[np.int64], *, period_ns: float, message_ns: float) -> NDArray[np.int64]:
+def _find_arrivals(
+    at_ns: Floats, changed: NDArray[np.int64], *, period_ns: float, message_ns: float
+) -> NDArray[np.int64]:
     """Return the rows that change, and those at which equal readings are expected: evenly between changes, and beyond the outer ones.
 
     Where messages are missing for a reading's period, the age of the first message after them is not known: it is no arrival.

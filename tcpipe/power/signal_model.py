@@ -20,7 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.power.least_squares import non_negative
+from tcpipe.power.least_squares import solve_non_negative
 from tcpipe.power.rails import Samples
 
 Mask = NDArray[np.bool_]
@@ -58,7 +58,7 @@ class SignalModel:
     period_s : [s], between samples.
     error_variance : independent error of each sample.
     variance, tau_s, smooth : of each process, shape (J,), with its correlation time [s] and family.
-    curvature_variance : expected variance of a sample against its neighbours that the processes make (`curvature` less the errors).
+    curvature_variance : expected variance of a sample against its neighbours that the processes make (`compute_curvature` less the errors).
     """
 
     period_s: float
@@ -72,11 +72,11 @@ class SignalModel:
         """Return the covariance of the processes at each lag [s], any shape."""
         total = np.zeros_like(lag_s)
         for variance, tau_s, smooth in zip(self.variance, self.tau_s, self.smooth, strict=True):
-            total += variance * _correlation(lag_s / tau_s, smooth=bool(smooth))
+            total += variance * _estimate_correlation(lag_s / tau_s, smooth=bool(smooth))
         return total
 
 
-def signal_model(signal: Samples, steady: Mask, still: Mask, *, averaged: bool) -> SignalModel:
+def fit_signal_model(signal: Samples, steady: Mask, still: Mask, *, averaged: bool) -> SignalModel:
     """Return what the signal is made of where it counts.
 
     Parameters
@@ -86,35 +86,35 @@ def signal_model(signal: Samples, steady: Mask, still: Mask, *, averaged: bool) 
     averaged : whether a sample is the mean since the one before it.
     """
     period_s = float(np.median(np.diff(signal.stamp_ns))) * _NS
-    spacing, seen, weight = _second_differences(signal, steady, period_s)
+    spacing, seen, weight = _compute_second_differences(signal, steady, period_s)
     if not len(spacing):
         everywhere = np.ones_like(steady)
-        spacing, seen, weight = _second_differences(signal, everywhere, period_s)
+        spacing, seen, weight = _compute_second_differences(signal, everywhere, period_s)
     tau_s = period_s * np.array(_ROUGH_TAU + _SMOOTH_TAU)
     smooth = np.arange(len(tau_s)) >= len(_ROUGH_TAU)
     if not len(spacing):
         return SignalModel(period_s, 0.0, np.zeros(len(tau_s)), tau_s, smooth, 0.0)
     made = np.stack(
         [
-            _expected(spacing, period_s, tau, smooth=bool(kind), averaged=averaged)
+            _predict_second_differences(spacing, period_s, tau, smooth=bool(kind), averaged=averaged)
             for tau, kind in zip(tau_s, smooth, strict=True)
         ]
     )
-    error, calmest = _error_while_still(signal, still), calmest_variance(signal, period_s)
+    error, calmest = _estimate_stationary_error(signal, still), estimate_calmest_variance(signal, period_s)
     if averaged or error is not None:
         error = calmest if error is None else min(error, _MOST_OF_CALMEST * calmest)
     variance = np.zeros(len(tau_s))
     if error is None:
         slow = tau_s >= period_s
-        *slowly, error = _fitted(np.vstack((made[slow], np.ones(len(spacing)))), seen, weight)
+        *slowly, error = _fit_sizes(np.vstack((made[slow], np.ones(len(spacing)))), seen, weight)
         variance[slow] = slowly
     else:
         error = min(error, float(seen.min()))
-        variance[:] = _fitted(made, seen - error, weight)
+        variance[:] = _fit_sizes(made, seen - error, weight)
     return SignalModel(period_s, error, variance, tau_s, smooth, float(variance @ made[:, 0]))
 
 
-def local_scale(model: SignalModel, signal: Samples, steady: Mask, start_ns: Stamps, end_ns: Stamps) -> Floats:
+def estimate_local_scale(model: SignalModel, signal: Samples, steady: Mask, start_ns: Stamps, end_ns: Stamps) -> Floats:
     """Return how large the processes' variance is near each span against the record's, [1], shape (M,).
 
     Taken over the steady samples from 2 s before to 2 s after the span, with the whole record as a prior of 4 samples.
@@ -124,7 +124,7 @@ def local_scale(model: SignalModel, signal: Samples, steady: Mask, start_ns: Sta
     counted = steady[1:-1]
     if not counted.any():
         counted = np.ones_like(counted)
-    off = np.where(counted, curvature(signal), 0.0)
+    off = np.where(counted, compute_curvature(signal), 0.0)
     sums, counts = (np.concatenate(([0.0], np.cumsum(each))) for each in (off, counted))
     inner = signal.stamp_ns[1:-1]
     first = np.searchsorted(inner, start_ns - _LOCAL_NS, side="left")
@@ -135,7 +135,7 @@ def local_scale(model: SignalModel, signal: Samples, steady: Mask, start_ns: Sta
     return scale
 
 
-def curvature(signal: Samples) -> Floats:
+def compute_curvature(signal: Samples) -> Floats:
     """Return each inner sample's squared deviation from the line through its neighbours, as the variance of one sample, shape (N - 2,)."""
     stamp_ns, value = signal.stamp_ns, signal.value
     right = (stamp_ns[1:-1] - stamp_ns[:-2]) / (stamp_ns[2:] - stamp_ns[:-2])
@@ -144,13 +144,13 @@ def curvature(signal: Samples) -> Floats:
     return single
 
 
-def _fitted(made: Floats, seen: Floats, weight: Floats) -> list[float]:
+def _fit_sizes(made: Floats, seen: Floats, weight: Floats) -> list[float]:
     """Return the non-negative size of each row of ``made``, shape (J, S), whose sum is nearest to what is seen."""
-    fitted: list[float] = non_negative((made * weight).T, seen * weight).tolist()
+    fitted: list[float] = solve_non_negative((made * weight).T, seen * weight).tolist()
     return fitted
 
 
-def _error_while_still(signal: Samples, still: Mask) -> float | None:
+def _estimate_stationary_error(signal: Samples, still: Mask) -> float | None:
     """Return the variance of a sample while the robot stands, in the signal's unit squared; None where it hardly does.
 
     From the squared differences of following samples, without those that a motor makes which starts or stops among them: what lies
@@ -165,7 +165,7 @@ def _error_while_still(signal: Samples, still: Mask) -> float | None:
     return variance / 2.0
 
 
-def calmest_variance(signal: Samples, period_s: float) -> float:
+def estimate_calmest_variance(signal: Samples, period_s: float) -> float:
     """Return the variance of a sample against its neighbours where the record is calmest, as while standing, in its unit squared.
 
     Of all stretches of 1.5 s, and of 8 samples at least, one in twenty is calmer.
@@ -173,11 +173,11 @@ def calmest_variance(signal: Samples, period_s: float) -> float:
     count = max(_CALM_SAMPLES, round(_CALM_S / period_s))
     if len(signal.value) < count + 2:
         return 0.0
-    sums = np.concatenate(([0.0], np.cumsum(curvature(signal))))
+    sums = np.concatenate(([0.0], np.cumsum(compute_curvature(signal))))
     return float(np.quantile((sums[count:] - sums[:-count]) / count, 0.05))
 
 
-def _second_differences(signal: Samples, steady: Mask, period_s: float) -> tuple[Stamps, Floats, Floats]:
+def _compute_second_differences(signal: Samples, steady: Mask, period_s: float) -> tuple[Stamps, Floats, Floats]:
     """Return spacings, the variance that second differences at each show for one sample, and the weight of each."""
     found = []
     x, t = signal.value, signal.stamp_ns
@@ -195,7 +195,9 @@ def _second_differences(signal: Samples, steady: Mask, period_s: float) -> tuple
     return spacing.astype(np.int64), seen, np.divide(weight, seen, out=np.zeros_like(weight), where=seen > 0.0)
 
 
-def _expected(spacing: Stamps, period_s: float, tau_s: float, *, smooth: bool, averaged: bool) -> Floats:
+def _predict_second_differences(
+    spacing: Stamps, period_s: float, tau_s: float, *, smooth: bool, averaged: bool
+) -> Floats:
     """Return what second differences show of a process of unit variance, as the variance of one sample, shape (S,)."""
     lag_s = np.stack((0 * spacing, spacing, 2 * spacing)).astype(np.float64) * period_s
     each: Floats
@@ -203,13 +205,13 @@ def _expected(spacing: Stamps, period_s: float, tau_s: float, *, smooth: bool, a
         u = (np.arange(-_NODES, _NODES) + 0.5) / _NODES
         weight = (1.0 - np.abs(u)) / np.sum(1.0 - np.abs(u))
         apart: Floats = np.abs(lag_s[..., None] + u * period_s)
-        each = _correlation(apart / tau_s, smooth=smooth) @ weight
+        each = _estimate_correlation(apart / tau_s, smooth=smooth) @ weight
     else:
-        each = _correlation(lag_s / tau_s, smooth=smooth)
+        each = _estimate_correlation(lag_s / tau_s, smooth=smooth)
     expected: Floats = (6.0 * each[0] - 8.0 * each[1] + 2.0 * each[2]) / 6.0
     return expected
 
 
-def _correlation(lag: Floats, *, smooth: bool) -> Floats:
+def _estimate_correlation(lag: Floats, *, smooth: bool) -> Floats:
     correlation: Floats = (1.0 + lag) * np.exp(-lag) if smooth else np.exp(-lag)
     return correlation

@@ -14,9 +14,9 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.power.counters import Counter, counted
-from tcpipe.robots.profiles import FieldPath, PowerSource, fields_of
-from tcpipe.tables.catalogue import threshold
+from tcpipe.power.counters import Counter, count_energy
+from tcpipe.robots.profiles import FieldPath, PowerSource, parse_fields
+from tcpipe.tables.catalogue import read_threshold
 from tcpipe.tables.findings import Finding, Subject, make_finding
 
 Columns = Mapping[str, NDArray[Any]]
@@ -52,7 +52,7 @@ FLOAT_TYPES = ("std_msgs/msg/Float32", "std_msgs/msg/Float64")
 """A voltage or a current alone, told apart by the topic's name."""
 
 
-def sources_of(
+def find_sources(
     type_name: str, topic: str, known: Sequence[PowerSource], *, platform: str | None, husky_power: HuskyPower
 ) -> list[list[PowerSource]] | Finding:
     """Return what a topic's messages hold of power, one source a rail, then what to fall back on; or why it is not known.
@@ -67,30 +67,30 @@ def sources_of(
         and source.husky_power in (None, husky_power)
         and topic.endswith(source.topic or "")
     ]
-    choices = [_most_particular([of for of in fitting if of.fallback is last]) for last in (False, True)]
+    choices = [_select_most_specific([of for of in fitting if of.fallback is last]) for last in (False, True)]
     if choices := [choice for choice in choices if choice]:
         is_refused = any(of.refused for of in choices[0])
         return reject_power(topic, "no-battery-current", names={"type": type_name}) if is_refused else choices
     if type_name in FLOAT_TYPES:
-        return _float_source(type_name, topic)
+        return _make_float_source(type_name, topic)
     names = {"type": type_name}
     if platforms := sorted({source.platform for source in of_type if source.platform}):
         return reject_power(topic, "robot-platform-unknown", names=names | {"platforms": ", ".join(platforms)})
     return reject_power(topic, "message-type-unknown", names=names)
 
 
-def power_lists(type_name: str, known: Sequence[PowerSource]) -> frozenset[str]:
+def list_power_lists(type_name: str, known: Sequence[PowerSource]) -> frozenset[str]:
     """Return the columns inside lists of messages that a type's tables name, as drivers[].current."""
     texts = [text for of in known if of.type == type_name for text in (of.voltage, of.current, of.energy)]
-    return frozenset(of.column for text in texts for of in fields_of(text) if "[]." in of.column)
+    return frozenset(of.column for text in texts for of in parse_fields(text) if "[]." in of.column)
 
 
-def _most_particular(fitting: Sequence[PowerSource]) -> list[PowerSource]:
-    best = max(map(_particular, fitting), default=None)
-    return [source for source in fitting if _particular(source) == best]
+def _select_most_specific(fitting: Sequence[PowerSource]) -> list[PowerSource]:
+    best = max(map(_rank_specificity, fitting), default=None)
+    return [source for source in fitting if _rank_specificity(source) == best]
 
 
-def _particular(source: PowerSource) -> tuple[bool, bool, bool]:
+def _rank_specificity(source: PowerSource) -> tuple[bool, bool, bool]:
     return source.husky_power is not None, source.platform is not None, source.topic is not None
 
 
@@ -98,7 +98,7 @@ _QUANTITY = re.compile(r"volt(?:age)?|curr(?:ent)?|amp(?:ere)?s?")
 _CORRECTED = "_corrected"
 
 
-def quantity(topic: str) -> Literal["voltage", "current"] | None:
+def find_quantity(topic: str) -> Literal["voltage", "current"] | None:
     """Return what a bare number on a topic is, by the topic's last word that says so."""
     found = _QUANTITY.findall(topic.lower())
     if not found:
@@ -106,12 +106,12 @@ def quantity(topic: str) -> Literal["voltage", "current"] | None:
     return "voltage" if found[-1].startswith("v") else "current"
 
 
-def bare_unit(type_name: str, topic: str) -> str | None:
+def find_bare_unit(type_name: str, topic: str) -> str | None:
     """Return the unit of a bare number on a topic, V or A, None where neither its type nor the name says so."""
-    return {"voltage": "V", "current": "A", None: None}[quantity(topic) if type_name in FLOAT_TYPES else None]
+    return {"voltage": "V", "current": "A", None: None}[find_quantity(topic) if type_name in FLOAT_TYPES else None]
 
 
-def rail_of(topic: str) -> str:
+def make_rail_name(topic: str) -> str:
     """Return the rail's name: the topic's without its quantity, so that a rail's voltage and current share it."""
     return _QUANTITY.sub("", topic.lower().removesuffix(_CORRECTED)).rstrip("/_")
 
@@ -126,9 +126,9 @@ def is_corrected(topic: str) -> bool:
     return topic.lower().endswith(_CORRECTED)
 
 
-def _float_source(type_name: str, topic: str) -> list[list[PowerSource]] | Finding:
+def _make_float_source(type_name: str, topic: str) -> list[list[PowerSource]] | Finding:
     """Return the source of a bare number, by its topic's name."""
-    what = quantity(topic)
+    what = find_quantity(topic)
     if what is None:
         return reject_power(topic, "quantity-unknown", names={"type": type_name})
     voltage, current = ("data", "") if what == "voltage" else ("", "data")
@@ -143,20 +143,20 @@ def read_rails(
     Parameters
     ----------
     columns : ``log_time_ns`` and the message's fields by dotted name; lists as shape (N, k), rows padded with NaN.
-    sources : from `sources_of`.
+    sources : from `find_sources`.
     topic : its name; a rail without a name of its own is called so.
     known : every table, for those that would fit.
     """
     for source in sources:
         if found := _find_misfit(columns, source, topic, known):
             return found
-    return [_rail(columns, source, topic) for source in sources]
+    return [_read_rail(columns, source, topic) for source in sources]
 
 
 def _find_misfit(columns: Columns, source: PowerSource, topic: str, known: Sequence[PowerSource]) -> Finding | None:
     """Return why messages do not fit a source."""
-    currents = fields_of(source.current)
-    for of in [*fields_of(source.voltage), *currents, *fields_of(source.energy)]:
+    currents = parse_fields(source.current)
+    for of in [*parse_fields(source.voltage), *currents, *parse_fields(source.energy)]:
         names = {"field": of.column}
         if of.column not in columns:
             return reject_power(topic, "field-missing", names=names)
@@ -174,20 +174,20 @@ def _find_misfit(columns: Columns, source: PowerSource, topic: str, known: Seque
     return None
 
 
-def _rail(columns: Columns, source: PowerSource, topic: str) -> RailReadings:
-    name = source.rail or (rail_of(topic) if source.type in FLOAT_TYPES else topic)
-    voltage = source.voltage_scale * _summed(columns, fields_of(source.voltage))
+def _read_rail(columns: Columns, source: PowerSource, topic: str) -> RailReadings:
+    name = source.rail or (make_rail_name(topic) if source.type in FLOAT_TYPES else topic)
+    voltage = source.voltage_scale * _sum_fields(columns, parse_fields(source.voltage))
     if source.energy:
-        parts = [(of.sign * source.energy_scale, _values(columns, of)) for of in fields_of(source.energy)]
-        counter = counted(parts, wraps=source.counter_wraps)
-        return RailReadings(name, voltage, counter.mean_amp(_first_stamps(columns), voltage), counter)
-    current = source.current_scale * _summed(columns, fields_of(source.current))
+        parts = [(of.sign * source.energy_scale, _read_values(columns, of)) for of in parse_fields(source.energy)]
+        counter = count_energy(parts, wraps=source.counter_wraps)
+        return RailReadings(name, voltage, counter.mean_amp(_choose_stamps(columns), voltage), counter)
+    current = source.current_scale * _sum_fields(columns, parse_fields(source.current))
     if source.wraps_amp is not None:
         current = np.where(current > source.wraps_amp / 2, current - source.wraps_amp, current)
     return RailReadings(name, voltage, current)
 
 
-def _first_stamps(columns: Columns) -> NDArray[np.int64]:
+def _choose_stamps(columns: Columns) -> NDArray[np.int64]:
     """Return the header's stamps where all are set, else the log's times [ns]: messages are written down in bursts."""
     if "header.stamp.sec" in columns:
         stamps = np.asarray(columns["header.stamp.sec"], np.int64) * 1_000_000_000
@@ -197,12 +197,13 @@ def _first_stamps(columns: Columns) -> NDArray[np.int64]:
     return np.asarray(columns["log_time_ns"], np.int64)
 
 
-def _summed(columns: Columns, fields: Sequence[FieldPath]) -> Floats:
+def _sum_fields(columns: Columns, fields: Sequence[FieldPath]) -> Floats:
     """Return the sum of fields, NaN where there is none or one of them is not known."""
     if not fields:
         return np.full(len(next(iter(columns.values()))), np.nan)
     parts = [
-        np.where(np.abs(values) <= _IMPOSSIBLE, values, np.nan) for values in (_values(columns, of) for of in fields)
+        np.where(np.abs(values) <= _IMPOSSIBLE, values, np.nan)
+        for values in (_read_values(columns, of) for of in fields)
     ]
     total: Floats = np.sum([of.sign * values for of, values in zip(fields, parts, strict=True)], axis=0)
     return total
@@ -212,7 +213,7 @@ _IMPOSSIBLE = 1e6
 """No battery has more volts, no drive more amperes (a current in milliamperes is refused by its median)."""
 
 
-def _values(columns: Columns, of: FieldPath) -> Floats:
+def _read_values(columns: Columns, of: FieldPath) -> Floats:
     """Return a field's values, shape (N,); of a list that is summed NaN where a row is shorter than others."""
     values = np.asarray(columns[of.column], np.float64)
     return values.sum(axis=1) if of.every else values if of.index is None else values[:, of.index]
@@ -226,7 +227,7 @@ def find_rejection(rail: RailReadings, topic: str, columns: Columns) -> Finding 
     voltage, current = (values[np.isfinite(values)] for values in (rail.voltage_volt, rail.current_amp))
     volt = float(np.median(voltage)) if len(voltage) else np.nan
     amp = float(np.median(np.abs(current))) if len(current) else np.nan
-    reason = _reason_of_voltage(voltage, volt, rail.voltage_volt, columns) or _reason_of_current(current, amp)
+    reason = _check_voltage(voltage, volt, rail.voltage_volt, columns) or _check_current(current, amp)
     if not len(voltage) and not len(current):
         reason = "no-numbers"
     if reason is None:
@@ -236,7 +237,7 @@ def find_rejection(rail: RailReadings, topic: str, columns: Columns) -> Finding 
     return reject_power(topic, reason, names={"rail": rail.name}, **evidence)
 
 
-def _reason_of_voltage(voltage: Floats, median_volt: float, every_voltage: Floats, columns: Columns) -> str | None:
+def _check_voltage(voltage: Floats, median_volt: float, every_voltage: Floats, columns: Columns) -> str | None:
     if not len(voltage):
         return None
     if not np.any(voltage):
@@ -250,16 +251,16 @@ def _reason_of_voltage(voltage: Floats, median_volt: float, every_voltage: Float
     return "voltage-too-small" if median_volt < _SMALLEST_VOLT else None
 
 
-def _reason_of_current(current: Floats, median_amp: float) -> str | None:
+def _check_current(current: Floats, median_amp: float) -> str | None:
     if len(current) > _MIN_ROWS_TO_JUDGE and np.ptp(current) == 0:
         return "current-constant"
     return "current-in-milliamperes" if median_amp > LARGEST_AMP else None
 
 
-LARGEST_VOLT, LARGEST_AMP = threshold(REJECTED, "max_median_volt"), threshold(REJECTED, "max_median_amp")
-_SMALLEST_VOLT = threshold(REJECTED, "min_median_volt")
-_MIN_ROWS_TO_JUDGE = threshold(REJECTED, "max_equal_count")
-_UNAMBIGUOUS = threshold(REJECTED, "min_net_fraction")  # of the charge moved flows one way
+LARGEST_VOLT, LARGEST_AMP = read_threshold(REJECTED, "max_median_volt"), read_threshold(REJECTED, "max_median_amp")
+_SMALLEST_VOLT = read_threshold(REJECTED, "min_median_volt")
+_MIN_ROWS_TO_JUDGE = read_threshold(REJECTED, "max_equal_count")
+_UNAMBIGUOUS = read_threshold(REJECTED, "min_net_fraction")  # of the charge moved flows one way
 
 
 def sign_by_mean(current_amp: Floats, weight_s: Floats) -> tuple[int, float]:
@@ -282,7 +283,7 @@ def sign_by_mean(current_amp: Floats, weight_s: Floats) -> tuple[int, float]:
     return (int(np.sign(ratio)) if abs(ratio) > _UNAMBIGUOUS else 0), ratio
 
 
-def with_sign(rail: RailReadings, sign: int) -> RailReadings:
+def apply_sign(rail: RailReadings, sign: int) -> RailReadings:
     """Return the rail with its current positive when drawn."""
     counter = None if rail.counter is None else rail.counter.times(sign)
     return replace(rail, current_amp=sign * rail.current_amp, counter=counter)

@@ -46,8 +46,8 @@ def validate_fields(made: Any, section: str) -> None:
     RecipeError : one line for every wrong value.
     """
     problems: list[str] = []
-    for name, kind in kinds_of(type(made)).items():
-        object.__setattr__(made, name, _checked(kind, getattr(made, name), _below(section, name), problems))
+    for name, kind in read_annotations(type(made)).items():
+        object.__setattr__(made, name, _check_value(kind, getattr(made, name), _join_key(section, name), problems))
     if problems:
         raise RecipeError(*(f"recipe: {problem}" for problem in problems))
 
@@ -60,13 +60,13 @@ def from_values(cls: type[T], values: Mapping[str, Any], *, where: str) -> T:
     RecipeError : one line for every wrong or unknown key, beginning with ``where``.
     """
     problems: list[str] = []
-    made: T = _checked(cls, values, "", problems)
+    made: T = _check_value(cls, values, "", problems)
     if problems:
         raise RecipeError(*(f"{where}: {problem}" for problem in problems))
     return made
 
 
-def kinds_of(cls: type) -> dict[str, Any]:
+def read_annotations(cls: type) -> dict[str, Any]:
     """Return the annotation of every field of a dataclass."""
     hints = get_type_hints(cls, include_extras=True)
     return {of.name: hints[of.name] for of in fields(cls)}
@@ -85,32 +85,32 @@ def describe(*kinds: Any, file: str = "") -> tuple[list[dict[str, Any]], dict[st
     for definition in definitions.values():
         if "description" in definition:  # a docstring, whose indentation Python 3.13 takes away when it compiles it
             definition["description"] = inspect.cleandoc(definition["description"])
-    for cls in _dataclasses_in(kinds, set()):
+    for cls in _find_dataclasses(kinds, set()):
         properties = definitions.get(cls.__name__, {}).get("properties", {})
-        for name, docstring in _key_docstrings(cls):
+        for name, docstring in _iterate_key_docstrings(cls):
             properties.get(name, {})["description"] = docstring
     return [*schemas], definitions
 
 
-def values_in_words(kind: Any) -> str:
+def format_values(kind: Any) -> str:
     """Return the choices or the bounds of an annotation, "" where it has none."""
     ((schema,), _) = describe(kind)
     schema = schema.get("anyOf", [schema])[0]
-    return _in_words(schema) if "enum" in schema else _range_in_words(schema)
+    return _format_schema(schema) if "enum" in schema else _format_range(schema)
 
 
-def _dataclasses_in(kind: Any, found: set[type]) -> set[type]:
+def _find_dataclasses(kind: Any, found: set[type]) -> set[type]:
     """Return those that were found, and the dataclasses that an annotation, or each of several, is made of."""
     parts = kind if isinstance(kind, tuple) else get_args(kind)
     if isinstance(kind, type) and is_dataclass(kind) and kind not in found:
         found.add(kind)
-        parts = tuple(kinds_of(kind).values())
+        parts = tuple(read_annotations(kind).values())
     for part in parts:
-        _dataclasses_in(part, found)
+        _find_dataclasses(part, found)
     return found
 
 
-def _key_docstrings(cls: type) -> Iterator[tuple[str, str]]:
+def _iterate_key_docstrings(cls: type) -> Iterator[tuple[str, str]]:
     """Yield the fields of a dataclass with the docstring that stands below each."""
     body = cast("ast.ClassDef", ast.parse(dedent(inspect.getsource(cls))).body[0]).body
     for of, text in pairwise(body):
@@ -119,25 +119,25 @@ def _key_docstrings(cls: type) -> Iterator[tuple[str, str]]:
                 yield name, docstring
 
 
-def _range_in_words(schema: Mapping[str, Any]) -> str:
+def _format_range(schema: Mapping[str, Any]) -> str:
     """Return the bounds of a number by its JSON Schema, "" where it has none."""
     words = {"minimum": "from", "exclusiveMinimum": "above", "maximum": "to", "exclusiveMaximum": "to below"}
     bounds = ((word, schema[key]) for key, word in words.items() if key in schema)
     return " ".join(f"{word} {bound if isinstance(bound, int) else f'{bound:.12g}'}" for word, bound in bounds)
 
 
-def _in_words(schema: Mapping[str, Any]) -> str:
+def _format_schema(schema: Mapping[str, Any]) -> str:
     """Return what a JSON Schema asks for."""
     match schema:
         case {"anyOf": [first, *_]}:
-            return _in_words(first)
+            return _format_schema(first)
         case {"enum": choices}:
             return f"one of {', '.join(choices)}"
         case {"prefixItems": [item, *_] as items}:
-            return f"{len(items)} values in a list, each {_in_words(item)}"
+            return f"{len(items)} values in a list, each {_format_schema(item)}"
         case {"type": "array"}:
-            return f"a list, each item {_in_words(schema.get('items', {}))}"
-    return f"{_TYPES.get(schema.get('type', ''), 'another value')} {_range_in_words(schema)}".strip()
+            return f"a list, each item {_format_schema(schema.get('items', {}))}"
+    return f"{_TYPES.get(schema.get('type', ''), 'another value')} {_format_range(schema)}".strip()
 
 
 def as_toml(value: Any) -> str:
@@ -147,7 +147,7 @@ def as_toml(value: Any) -> str:
     if isinstance(value, list | tuple):
         return "[" + ", ".join(as_toml(item) for item in value) + "]"
     if isinstance(value, Mapping):
-        return "{" + ", ".join(f"{_key(str(name))} = {as_toml(item)}" for name, item in value.items()) + "}"
+        return "{" + ", ".join(f"{_make_key(str(name))} = {as_toml(item)}" for name, item in value.items()) + "}"
     if is_dataclass(value) and not isinstance(value, type):
         return as_toml(asdict(value))
     if isinstance(value, int) and value.bit_length() > _DECIMAL_BITS:
@@ -155,28 +155,28 @@ def as_toml(value: Any) -> str:
     return repr(value)
 
 
-def _key(name: str) -> str:
+def _make_key(name: str) -> str:
     return name if _BARE_KEY.fullmatch(name) else as_toml(name)
 
 
-def _checked(kind: Any, value: Any, key: str, problems: list[str]) -> Any:
+def _check_value(kind: Any, value: Any, key: str, problems: list[str]) -> Any:
     """Return the plain value of an annotation; what is wrong becomes a problem."""
     origin, of = get_origin(kind), get_args(kind)
     if is_dataclass(kind):
-        return _dataclass(kind, value, key, problems)
+        return _find_dataclass(kind, value, key, problems)
     if origin is dict and isinstance(value, Mapping):
         known = None if of[0] is str else get_args(of[0])
         items = ((name, item) for name, item in value.items() if _is_known(name, known, key, problems))
-        return {name: _checked(of[1], item, _below(key, name), problems) for name, item in items}
+        return {name: _check_value(of[1], item, _join_key(key, name), problems) for name, item in items}
     if origin is list and isinstance(value, list | tuple):
-        return [_checked(of[0], item, f"{key}.{place}", problems) for place, item in enumerate(value)]
+        return [_check_value(of[0], item, f"{key}.{place}", problems) for place, item in enumerate(value)]
     try:
-        return msgspec.convert(_plain(value), kind)
+        return msgspec.convert(_to_plain(value), kind)
     except (msgspec.ValidationError, ValueError):  # a number of thousands of digits is the latter
-        return _reject(key, value, _in_words(describe(kind)[0][0]), problems)
+        return _reject(key, value, _format_schema(describe(kind)[0][0]), problems)
 
 
-def _plain(value: Any) -> Any:
+def _to_plain(value: Any) -> Any:
     """Return a value as msgspec takes it: whole numbers as int, which makes -0.0 a 0; no type accepts NaN, infinity and sets."""
     if hasattr(value, "tolist"):  # numpy scalars and arrays
         value = value.tolist()
@@ -186,35 +186,35 @@ def _plain(value: Any) -> Any:
         case str():
             return str.__str__(value)
         case list() | tuple():
-            return [_plain(item) for item in value]
+            return [_to_plain(item) for item in value]
         case float() | set() | frozenset():
             return object()
     return value
 
 
-def _dataclass(cls: Any, values: Any, key: str, problems: list[str]) -> Any:
+def _find_dataclass(cls: Any, values: Any, key: str, problems: list[str]) -> Any:
     if isinstance(values, cls):
         if hasattr(cls, "__post_init__"):  # it has checked itself
             return values
         values = {of.name: getattr(values, of.name) for of in fields(cls)}
     if not isinstance(values, Mapping):
         return _reject(key, values, "a table of keys", problems)
-    kinds, before = kinds_of(cls), len(problems)
+    kinds, before = read_annotations(cls), len(problems)
     items = ((name, value) for name, value in values.items() if _is_known(name, kinds, key, problems))
-    made = {name: _checked(kinds[name], value, _below(key, name), problems) for name, value in items}
+    made = {name: _check_value(kinds[name], value, _join_key(key, name), problems) for name, value in items}
     needed = (of.name for of in fields(cls) if of.default is MISSING and of.default_factory is MISSING)
-    problems += [f"{_below(key, name)} is missing" for name in needed if name not in values]
+    problems += [f"{_join_key(key, name)} is missing" for name in needed if name not in values]
     if len(problems) > before:
         return None
     whole = cls(**made)
     for name, expected in whole.contradictions() if hasattr(cls, "contradictions") else ():
-        _reject(_below(key, name), getattr(whole, name), expected, problems)
+        _reject(_join_key(key, name), getattr(whole, name), expected, problems)
     return whole
 
 
 def _is_known(name: Any, known: Any, key: str, problems: list[str]) -> bool:
     if known is not None and name not in known:
-        problems.append(f"unknown key {_below(key, name)}; known here: {', '.join(known)}")
+        problems.append(f"unknown key {_join_key(key, name)}; known here: {', '.join(known)}")
     return known is None or name in known
 
 
@@ -224,5 +224,5 @@ def _reject(key: str, value: Any, expected: str, problems: list[str]) -> None:
     problems.append(f"{key} is {shown}; expected {expected}")
 
 
-def _below(above: str, name: Any) -> str:
+def _join_key(above: str, name: Any) -> str:
     return f"{above}.{name}" if above else str(name)

@@ -8,7 +8,7 @@ from functools import cache
 from typing import Any, TypeAlias
 
 from tcpipe.errors import RecipeError
-from tcpipe.recipe.checking import as_toml, from_values, kinds_of
+from tcpipe.recipe.checking import as_toml, from_values, read_annotations
 from tcpipe.recipe.sections import Recipe
 from tcpipe.tables.findings import Remedy
 
@@ -50,7 +50,7 @@ class RecipeFragment:
             for name, keys in self.tables.items()
             for each in ([keys] if isinstance(keys, Mapping) else keys)
         ]
-        return " and ".join(f"{head} {', '.join(_lines(each))}" for head, each in parts)
+        return " and ".join(f"{head} {', '.join(_format_lines(each))}" for head, each in parts)
 
     def toml(self) -> str:
         """Return it as lines that stand in a recipe as they are."""
@@ -58,11 +58,11 @@ class RecipeFragment:
         for name, keys in self.tables.items():
             for each in [keys] if isinstance(keys, Mapping) else keys:
                 head = f"[{name}]" if isinstance(keys, Mapping) else f"[[{name}]]"
-                lines += [head, *_lines(each)]
+                lines += [head, *_format_lines(each)]
         return "\n".join(lines)
 
 
-def _lines(keys: Keys) -> list[str]:
+def _format_lines(keys: Keys) -> list[str]:
     return [f"{name} = {as_toml(value)}" for name, value in keys.items()]
 
 
@@ -82,7 +82,7 @@ def suggest(name: str, tables: Mapping[str, Keys | Sequence[Keys]]) -> tuple[Rem
 
 
 @cache
-def recipe_key(name: str) -> str:
+def format_recipe_key(name: str) -> str:
     """Return the dotted name of a key whose value only the reader knows, as a message names it.
 
     Raises
@@ -90,7 +90,7 @@ def recipe_key(name: str) -> str:
     RecipeError : the recipe has no such key.
     """
     section, _, key = name.partition(".")
-    known = kinds_of(Recipe)
-    if section not in known or (key and key not in kinds_of(known[section])):
+    known = read_annotations(Recipe)
+    if section not in known or (key and key not in read_annotations(known[section])):
         raise RecipeError(f"there is no key {name} in a recipe")
     return f"recipe key {name}"

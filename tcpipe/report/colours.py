@@ -29,6 +29,6 @@ LINE_COLOURS = ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00"
 """Of lines in one plot, the first for what the pipeline goes on with."""
 
 
-def class_colour(number: int) -> str:
+def find_class_colour(number: int) -> str:
     """Return the colour of a terrain class; 0 is unknown."""
     return CLASS_COLOURS[(number - 1) % len(CLASS_COLOURS)] if number > 0 else FAINT

@@ -15,8 +15,8 @@ from tcpipe.formats.dataset_card import DatasetCard
 from tcpipe.formats.dataset_files import CLASSES, DRIVE_NEXT, OVERVIEW, RELIEF
 from tcpipe.formats.geojson import PolygonGeometry, read_polygons
 from tcpipe.report.dataset_samples import SamplesShown
-from tcpipe.report.pictures import Bounds, joint_bounds_m, picture_uri, read_picture
-from tcpipe.report.plots import Plot, lay_picture, new_plot
+from tcpipe.report.pictures import Bounds, compute_joint_bounds_m, make_picture_uri, read_picture
+from tcpipe.report.plots import Plot, lay_picture, make_plot
 
 _MOST_PLACES = 200
 """Places to drive next that are drawn, the most wanted first."""
@@ -24,10 +24,10 @@ _MOST_PLACES = 200
 
 def map_plots(directory: Path, card: DatasetCard, shown: SamplesShown) -> tuple[list[Plot], list[str]]:
     """Return the map and the plot to brush on, and what of the map is lost, in words."""
-    bounds = joint_bounds_m([(grid.crs, grid.bounds_m) for grid in card.maps])
+    bounds = compute_joint_bounds_m([(grid.crs, grid.bounds_m) for grid in card.maps])
     tools = "pan,wheel_zoom,box_select,lasso_select,tap,reset,save"
     height_px = int(np.clip(110 + 500 * (bounds[3] - bounds[1]) / max(bounds[2] - bounds[0], 1e-9), 330, 600))
-    plot = new_plot(
+    plot = make_plot(
         "map",
         alt=f"Map of {len(shown.xy_m)} points, coloured by what is chosen above; the tables below hold the counts.",
         axes=("easting [m]", "northing [m]"),
@@ -42,7 +42,7 @@ def map_plots(directory: Path, card: DatasetCard, shown: SamplesShown) -> tuple[
     ends = {end: np.empty(0) for end in ("x0", "y0", "x1", "y1")}
     lines = figure.segment(source=ends, color="#ff2d95", line_width=1.5, name="leaks", visible=False)
     lines.level = "overlay"  # above the points that they join
-    rings = _rings(card.split.region, Transformer.from_crs("EPSG:4326", card.maps[0].crs, always_xy=True))
+    rings = _project_rings(card.split.region, Transformer.from_crs("EPSG:4326", card.maps[0].crs, always_xy=True))
     figure.multi_line(
         [ring[:, 0] for ring in rings],
         [ring[:, 1] for ring in rings],
@@ -74,7 +74,7 @@ def map_plots(directory: Path, card: DatasetCard, shown: SamplesShown) -> tuple[
     figure.xgrid.visible = figure.ygrid.visible = False
     figure.axis.formatter.use_scientific = False
     figure.axis.ticker.desired_num_ticks = 4
-    brush = new_plot(
+    brush = make_plot(
         "brush",
         alt="Points of the map as a plot of what is chosen above it; a box drawn here chooses them on the map.",
         axes=("slope along travel [°]", "power w [W]"),
@@ -106,7 +106,7 @@ def _draw_pictures(plot: Plot, directory: Path, card: DatasetCard, bounds: Bound
         if pixels is None:
             lost.append(f"{file} is lost or damaged: the map has no {name.strip()}")
             continue
-        lay_picture(plot, name.strip(), picture_uri(pixels, exact=file == CLASSES), bounds, visible=number == 0)
+        lay_picture(plot, name.strip(), make_picture_uri(pixels, exact=file == CLASSES), bounds, visible=number == 0)
     return lost
 
 
@@ -141,7 +141,7 @@ def _draw_places(plot: Plot, directory: Path, card: DatasetCard) -> list[str]:
     return list(problems)
 
 
-def _rings(region: Mapping[str, PolygonGeometry] | None, to_map: Transformer) -> list[NDArray[np.float64]]:
+def _project_rings(region: Mapping[str, PolygonGeometry] | None, to_map: Transformer) -> list[NDArray[np.float64]]:
     """Return every ring of every polygon of the region in the map's plane [m], each of shape (M, 2)."""
     rings = []
     for geometry in (region or {}).values():

@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 
 from tcpipe.formats.bucket_directories import REPORT_PATCHES
 from tcpipe.formats.dataset_card import DatasetCard
-from tcpipe.formats.dataset_files import PatchFiles, open_patches, read_samples, rows_in_files
+from tcpipe.formats.dataset_files import PatchFiles, find_rows_in_files, open_patches, read_samples
 from tcpipe.formats.json_files import Json
-from tcpipe.report.pictures import ACROSS, class_picture, picture_bytes, picture_uri, relief_picture, sheet
-from tcpipe.tables.columns import floats
+from tcpipe.report.pictures import ACROSS, colour_classes, colour_heights, encode_picture, make_picture_uri, make_sheet
+from tcpipe.tables.columns import to_floats
 from tcpipe.terrain.layers import COLOURS
 
 MOST_PATCHES = 500
@@ -45,48 +45,50 @@ class _Patches:
 
     def some(self, samples: pa.Table) -> NDArray[np.int64]:
         """Return up to `MOST_PATCHES` rows of all kinds, rising."""
-        near = np.flatnonzero(np.isin(self.piece, _some(np.unique(self.piece))))
-        return near[_stratified(samples.take(near))]
+        near = np.flatnonzero(np.isin(self.piece, _select_rows(np.unique(self.piece))))
+        return near[_select_stratified(samples.take(near))]
 
 
-def _patches(directory: Path, card: DatasetCard, samples: pa.Table) -> _Patches:
+def _read_patches(directory: Path, card: DatasetCard, samples: pa.Table) -> _Patches:
     files = open_patches(directory, card)
     splits = samples.column("split").to_numpy(zero_copy_only=False)
     place = np.empty(samples.num_rows, dtype=np.int64)
-    for name, rows in rows_in_files(card, splits).items():
+    for name, rows in find_rows_in_files(card, splits).items():
         place[splits == name] = rows
-    return _Patches(files, place, np.searchsorted(files.starts, place, side="right") - 1, thinned_by(card.patch_px))
+    return _Patches(
+        files, place, np.searchsorted(files.starts, place, side="right") - 1, choose_thinning(card.patch_px)
+    )
 
 
-def patches_shown(directory: Path, card: DatasetCard, samples: pa.Table, row_of: NDArray[np.int64]) -> Json:
+def make_patches_data(directory: Path, card: DatasetCard, samples: pa.Table, row_of: NDArray[np.int64]) -> Json:
     """Return sheets of patches by layer and the rows of the page that they belong to (``row_of`` each sample, (T,)).
 
     `DatasetError` if they cannot be read.
     """
     if not samples.num_rows:
         return None
-    every = _patches(directory, card, samples)
+    every = _read_patches(directory, card, samples)
     chosen = every.some(samples)
-    return sheets(row_of[chosen].tolist(), every.read(chosen), every.files)
+    return make_sheets(row_of[chosen].tolist(), every.read(chosen), every.files)
 
 
-def thinned_by(patch_px: int) -> int:
+def choose_thinning(patch_px: int) -> int:
     """Return the step in which pixels of a patch are shown."""
     return -(-patch_px // _PX)
 
 
-def sheets(rows: Sequence[int], pixels: Mapping[str, NDArray[Any]], files: PatchFiles) -> Json:
+def make_sheets(rows: Sequence[int], pixels: Mapping[str, NDArray[Any]], files: PatchFiles) -> Json:
     """Return thinned patches, (N, px, px) by layer, as a sheet for each layer, and the rows of the page that they belong to."""
-    pixels = _in_colour(pixels)
+    pixels = _join_colours(pixels)
     return {
         "rows": rows,
         "px": next(iter(pixels.values())).shape[1],
         "across": ACROSS,
-        "layers": [{"name": name, "uri": _uri(name, stack, files)} for name, stack in pixels.items()],
+        "layers": [{"name": name, "uri": _make_uri(name, stack, files)} for name, stack in pixels.items()],
     }
 
 
-def _in_colour(pixels: Mapping[str, NDArray[Any]]) -> Mapping[str, NDArray[Any]]:
+def _join_colours(pixels: Mapping[str, NDArray[Any]]) -> Mapping[str, NDArray[Any]]:
     """Return one orthophoto in colour, (N, px, px, 3), in the place of its grey and its three colours."""
     if not set(COLOURS) <= set(pixels):
         return pixels
@@ -94,18 +96,18 @@ def _in_colour(pixels: Mapping[str, NDArray[Any]]) -> Mapping[str, NDArray[Any]]
     return {name: colour if name == "ortho" else stack for name, stack in pixels.items() if name not in COLOURS}
 
 
-def _uri(name: str, stack: NDArray[np.generic], files: PatchFiles) -> str:
-    pixels, exact = _picture(name, stack, files, _range(stack))
-    return picture_uri(pixels, exact=exact)
+def _make_uri(name: str, stack: NDArray[np.generic], files: PatchFiles) -> str:
+    pixels, exact = _make_picture(name, stack, files, _find_range(stack))
+    return make_picture_uri(pixels, exact=exact)
 
 
-def folder_of(card: DatasetCard) -> tuple[str, int]:
+def find_picture_folder(card: DatasetCard) -> tuple[str, int]:
     """Return where the pictures of all of this dataset's patches lie from its page, and how many there are."""
     layers = len(card.layers) - (len(COLOURS) if set(COLOURS) <= set(card.layers) else 0)
     return f"{REPORT_PATCHES}/{card.inputs[:16]}", layers * -(-card.samples // PER_SHEET)
 
 
-def all_patches(directory: Path, card: DatasetCard) -> Iterator[tuple[str, bytes]]:
+def iterate_pictures(directory: Path, card: DatasetCard) -> Iterator[tuple[str, bytes]]:
     """Yield the pictures of all patches, in the order of the samples, and what each is called in its folder.
 
     Raises
@@ -113,26 +115,26 @@ def all_patches(directory: Path, card: DatasetCard) -> Iterator[tuple[str, bytes
     DatasetError : they cannot be read.
     """
     samples = read_samples(directory, ("split", "terrain_name", "slope_rad"))
-    every = _patches(directory, card, samples)
+    every = _read_patches(directory, card, samples)
     ranges = (
-        {name: _range(stack) for name, stack in _in_colour(every.read(every.some(samples))).items()}
+        {name: _find_range(stack) for name, stack in _join_colours(every.read(every.some(samples))).items()}
         if samples.num_rows
         else {}
     )
     for number, first in enumerate(range(0, samples.num_rows, PER_SHEET)):
-        stacks = _in_colour(every.read(np.arange(first, min(first + PER_SHEET, samples.num_rows))))
+        stacks = _join_colours(every.read(np.arange(first, min(first + PER_SHEET, samples.num_rows))))
         for layer, (name, stack) in enumerate(stacks.items()):
-            pixels, exact = _picture(name, stack, every.files, ranges[name])
-            yield f"{layer}-{number}.webp", picture_bytes(pixels, exact=exact)
+            pixels, exact = _make_picture(name, stack, every.files, ranges[name])
+            yield f"{layer}-{number}.webp", encode_picture(pixels, exact=exact)
 
 
-def _some(pieces: NDArray[np.int64]) -> NDArray[np.int64]:
+def _select_rows(pieces: NDArray[np.int64]) -> NDArray[np.int64]:
     return np.asarray(pieces[np.unique(np.linspace(0, len(pieces) - 1, _PIECES).astype(int))])
 
 
-def _stratified(samples: pa.Table) -> NDArray[np.int64]:
+def _select_stratified(samples: pa.Table) -> NDArray[np.int64]:
     """Return rows, rising, taken in turn from each split, class and 5° of slope: the same dataset shows the same ones."""
-    slope = np.floor(np.degrees(floats(samples, "slope_rad")) / 5.0).tolist()
+    slope = np.floor(np.degrees(to_floats(samples, "slope_rad")) / 5.0).tolist()
     keys = list(
         zip(samples.column("split").to_pylist(), samples.column("terrain_name").to_pylist(), slope, strict=True)
     )
@@ -159,22 +161,22 @@ def _read(
     return {layer: np.concatenate(parts)[back] for layer, parts in stacks.items()}
 
 
-def _range(stack: NDArray[np.generic]) -> tuple[float, float]:
+def _find_range(stack: NDArray[np.generic]) -> tuple[float, float]:
     """Return between which values most pixels lie."""
     low, high = np.percentile(stack.astype(np.float64), (1, 99))
     return float(low), float(high)
 
 
-def _picture(
+def _make_picture(
     name: str, stack: NDArray[np.generic], files: PatchFiles, shown: tuple[float, float]
 ) -> tuple[NDArray[np.uint8], bool]:
     """Return patches of a layer as one sheet, and whether every pixel counts; a photograph is shown over a range of its values."""
     layer = files.layers[name]
     if layer.kind == "categorical":
-        return sheet(class_picture(stack.astype(np.int64))), True
+        return make_sheet(colour_classes(stack.astype(np.int64))), True
     values = stack.astype(np.float64)
     if name.startswith("ortho"):
         low, high = shown
-        return sheet(np.clip((values - low) / max(high - low, 1.0) * 255, 0, 255).astype(np.uint8)), False
+        return make_sheet(np.clip((values - low) / max(high - low, 1.0) * 255, 0, 255).astype(np.uint8)), False
     values[stack == layer.nodata] = np.nan
-    return sheet(relief_picture(values)), False
+    return make_sheet(colour_heights(values)), False

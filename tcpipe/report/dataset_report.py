@@ -13,75 +13,75 @@ from tcpipe.formats.dataset_card import DatasetCard, RunSource, group_dataset_fi
 from tcpipe.formats.dataset_files import read_current_card, read_samples
 from tcpipe.formats.finding_lines import format_group, group_findings
 from tcpipe.formats.json_files import Json
-from tcpipe.formats.store_mark import MARK
-from tcpipe.report.colours import CLASS_COLOURS, DROPPED, FAINT, KEPT, SPLIT_COLOURS, class_colour
+from tcpipe.formats.store_document import MARK
+from tcpipe.report.colours import CLASS_COLOURS, DROPPED, FAINT, KEPT, SPLIT_COLOURS, find_class_colour
 from tcpipe.report.dataset_map import map_plots
-from tcpipe.report.dataset_patches import PER_SHEET, patches_shown
-from tcpipe.report.dataset_samples import COLUMNS, MOST_SAMPLES, SamplesShown, first_starts_ns, samples_shown
+from tcpipe.report.dataset_patches import PER_SHEET, make_patches_data
+from tcpipe.report.dataset_samples import COLUMNS, MOST_SAMPLES, SamplesShown, find_first_starts_ns, select_samples
 from tcpipe.report.label_sections import (
     QUALITY_WORDS,
     balance_sections,
-    budget_sections,
-    physics_sections,
-    quality_sections,
+    make_budget_sections,
+    make_physics_sections,
+    make_quality_sections,
 )
 from tcpipe.report.page import Link, Number, Section, render_page
-from tcpipe.report.plots import Plot, label_histograms, new_plot, waterfall
+from tcpipe.report.plots import Plot, draw_waterfall, label_histograms, make_plot
 from tcpipe.report.verdict import VerdictBox, show_mixed_groups
-from tcpipe.tables.arrays import texts
-from tcpipe.tables.bits import Quality, name_of
+from tcpipe.tables.arrays import to_texts
+from tcpipe.tables.bits import Quality, flag_name
 
 _PAGE = "report.html"
 
 
-def dataset_report(directory: Path, beside: Path | None = None, *, folder: str = "") -> str:
+def render_dataset_report(directory: Path, beside: Path | None = None, *, folder: str = "") -> str:
     """Return the HTML page of the dataset in ``directory``; `DatasetError` if it is none, or of another data model.
 
     ``beside`` is the directory in which the dataset lies: the page leads to runs of stores that lie there too. ``folder`` beside the page
-    holds pictures of all patches (`tcpipe.report.dataset_patches.all_patches`), if it is given.
+    holds pictures of all patches (`tcpipe.report.dataset_patches.iterate_pictures`), if it is given.
     Patches, pictures and places to drive that are lost or damaged are said on the page, which is written without them.
     """
     card, samples = read_current_card(directory), read_samples(directory, COLUMNS)
-    shown = samples_shown(card, samples)
+    shown = select_samples(card, samples)
     plots, lost = map_plots(directory, card, shown)
     try:
-        patches = patches_shown(directory, card, samples, shown.row_of)
+        patches = make_patches_data(directory, card, samples, shown.row_of)
     except DatasetError as error:
         patches, lost = None, [*lost, f"no patch is shown: {error.problems[0]}"]
     hrefs = {} if beside is None else _run_pages(beside, card)
     return render_page(
         title=f"Dataset {card.name}",
         lead=card.description or f"{card.format} format, data model {card.data_model_version}",
-        verdict=_verdict(card),
-        numbers=_numbers(card),
+        verdict=_make_verdict(card),
+        numbers=_make_numbers(card),
         links=[] if beside is None else _store_pages(beside, hrefs),
         warnings=lost,
         sections=[
             _map_section(shown, plots),
             *([] if patches is None else [_GALLERY]),
             *_label_sections(samples),
-            *quality_sections(_quality_counts(samples), "samples"),
-            *_finding_sections(card),
-            *physics_sections(dict(card.physics)),
-            *budget_sections(card.energy_budget),
+            *make_quality_sections(_count_quality(samples), "samples"),
+            *_make_finding_sections(card),
+            *make_physics_sections(dict(card.physics)),
+            *make_budget_sections(card.energy_budget),
             Section(
                 "Where every metre went",
                 "In samples and lost add up to the odometer.",
-                plots=[waterfall(card.ledger_m)],
+                plots=[draw_waterfall(card.ledger_m)],
             ),
-            *_removal_sections(card),
+            *_make_removal_sections(card),
             *balance_sections(card.balance),
-            _audit_section(card, samples, shown),
-            *_table_sections(card, hrefs),
-            _provenance(card),
+            _make_audit_section(card, samples, shown),
+            *_make_table_sections(card, hrefs),
+            _make_provenance_section(card),
         ],
         script="dataset.js" if samples.num_rows else "",
-        data={**_data(card, samples, shown, patches=patches, drawn=plots[0], hrefs=hrefs), "folder": folder},
+        data={**_make_data(card, samples, shown, patches=patches, drawn=plots[0], hrefs=hrefs), "folder": folder},
         reads_pictures=bool(folder),
     )
 
 
-def _verdict(card: DatasetCard) -> VerdictBox | None:
+def _make_verdict(card: DatasetCard) -> VerdictBox | None:
     """Return the verdict and the findings by code; None of a dataset of before data model 3.0."""
     if card.verdict is None:
         return None
@@ -96,7 +96,7 @@ _GALLERY = Section(
 )
 
 
-def _numbers(card: DatasetCard) -> list[Number]:
+def _make_numbers(card: DatasetCard) -> list[Number]:
     return [
         Number(f"{card.samples}", "samples"),
         *(Number(f"{card.splits[split]}", split) for split in SPLIT_COLOURS),
@@ -118,7 +118,7 @@ def _map_section(shown: SamplesShown, plots: list[Plot]) -> Section:
     return Section("The samples on the map", text, controls="dataset.html", plots=plots)
 
 
-def _data(
+def _make_data(
     card: DatasetCard, samples: pa.Table, shown: SamplesShown, *, patches: Json, drawn: Plot, hrefs: Mapping[str, str]
 ) -> dict[str, Json]:
     names = [renderer.name or "" for renderer in drawn.figure.renderers]
@@ -128,22 +128,22 @@ def _data(
         "samples": shown.json,
         "patches": patches,
         "ground": [name.removeprefix("layer ") for name in names if name.startswith("layer ")],
-        "classes": [{"id": of.id, "name": of.name, "colour": class_colour(of.id)} for of in card.classes],
+        "classes": [{"id": of.id, "name": of.name, "colour": find_class_colour(of.id)} for of in card.classes],
         "splits": [{"name": name, "colour": SPLIT_COLOURS[name], "count": card.splits[name]} for name in SPLIT_COLOURS],
         "runs": [
             {"id": run.run_id, "first_ns": str(first), "href": hrefs.get(run.run_id)}
-            for run, first in zip(card.runs, first_starts_ns(card, samples), strict=True)
+            for run, first in zip(card.runs, find_first_starts_ns(card, samples), strict=True)
         ],
         "quality": [[int(bit), words] for bit, words in QUALITY_WORDS.items()],
         "colours": list(CLASS_COLOURS),
         "unknown": FAINT,
         "clean": KEPT,
         "flagged": DROPPED,
-        "flags": _distinguishing_bits(samples),
+        "flags": _find_distinguishing_bits(samples),
     }
 
 
-def _distinguishing_bits(samples: pa.Table) -> int:
+def _find_distinguishing_bits(samples: pa.Table) -> int:
     """Return the quality bits that some samples carry and others do not: a bit of all of them says nothing on a map."""
     bits = samples.column("quality").to_numpy().astype(np.int64)
     return int(np.bitwise_or.reduce(bits, initial=0) & ~np.bitwise_and.reduce(bits)) if len(bits) else 0
@@ -174,20 +174,20 @@ def _label_sections(samples: pa.Table) -> list[Section]:
     )
 
 
-def _quality_counts(samples: pa.Table) -> dict[str, int]:
+def _count_quality(samples: pa.Table) -> dict[str, int]:
     quality = samples.column("quality").to_numpy()
-    return {name_of(bit): int(((quality & int(bit)) != 0).sum()) for bit in Quality}
+    return {flag_name(bit): int(((quality & int(bit)) != 0).sum()) for bit in Quality}
 
 
-def _apart(samples: pa.Table, shown: SamplesShown) -> Iterator[Plot]:
+def _draw_distances(samples: pa.Table, shown: SamplesShown) -> Iterator[Plot]:
     """Yield how far what tests lies from what trains, where every sample is shown and both are there."""
-    split = texts(samples.column("split"))
+    split = to_texts(samples.column("split"))
     if shown.cell_m is not None:
         return
     there = [name for name in ("test", "unseen") if np.isfinite(shown.apart_m[split == name]).any()]
     if not there:
         return
-    plot = new_plot(
+    plot = make_plot(
         "apart",
         alt="Share of held-out samples whose nearest train sample is no further than this; the table below has the counts.",
         axes=("middle to nearest train middle [m]", "share of samples"),
@@ -205,7 +205,7 @@ def _apart(samples: pa.Table, shown: SamplesShown) -> Iterator[Plot]:
     yield plot
 
 
-def _audit_section(card: DatasetCard, samples: pa.Table, shown: SamplesShown) -> Section:
+def _make_audit_section(card: DatasetCard, samples: pa.Table, shown: SamplesShown) -> Section:
     rows = [
         (
             part.split,
@@ -228,10 +228,10 @@ def _audit_section(card: DatasetCard, samples: pa.Table, shown: SamplesShown) ->
         "median",
     )
     text = "How much of what tests has been seen in training. On the map: colour by the way to the nearest train metre, or tick its lines."
-    return Section("Leakage audit", text, header=header, rows=rows, plots=list(_apart(samples, shown)))
+    return Section("Leakage audit", text, header=header, rows=rows, plots=list(_draw_distances(samples, shown)))
 
 
-def _finding_sections(card: DatasetCard) -> list[Section]:
+def _make_finding_sections(card: DatasetCard) -> list[Section]:
     """Return the findings of ingest by code; nothing where there is none."""
     samples = {run.run_id: run.samples for run in card.runs}
     rows = [
@@ -242,7 +242,7 @@ def _finding_sections(card: DatasetCard) -> list[Section]:
     return [Section("Findings of ingest", text, header=("finding", "runs", "samples"), rows=rows)] if rows else []
 
 
-def _removal_sections(card: DatasetCard) -> list[Section]:
+def _make_removal_sections(card: DatasetCard) -> list[Section]:
     """Return what of each class and slope is in samples; nothing for datasets of before, and where nothing was driven."""
     found = []
     for groups, what in ((card.removal.by_class, "class"), (card.removal.by_slope, "slope along travel")):
@@ -251,7 +251,7 @@ def _removal_sections(card: DatasetCard) -> list[Section]:
                 group.name,
                 f"{group.driven_m:.0f}",
                 f"{100 * group.used_share:.0f} %",
-                ", ".join(f"{name.replace('_', ' ')} {metres:.0f}" for name, metres in _largest(group.removed_m)),
+                ", ".join(f"{name.replace('_', ' ')} {metres:.0f}" for name, metres in _find_largest(group.removed_m)),
             )
             for group in groups
         ]
@@ -262,12 +262,12 @@ def _removal_sections(card: DatasetCard) -> list[Section]:
     return found
 
 
-def _largest(metres: Mapping[str, float]) -> list[tuple[str, float]]:
+def _find_largest(metres: Mapping[str, float]) -> list[tuple[str, float]]:
     """Return the three largest entries of half a metre or more."""
     return sorted(((n, m) for n, m in metres.items() if m >= 0.5), key=lambda item: (-item[1], item[0]))[:3]
 
 
-def _table_sections(card: DatasetCard, hrefs: Mapping[str, str]) -> list[Section]:
+def _make_table_sections(card: DatasetCard, hrefs: Mapping[str, str]) -> list[Section]:
     sections = []
     if card.terrain:
         names = sorted({name for counts in card.terrain.values() for name in counts})
@@ -279,7 +279,7 @@ def _table_sections(card: DatasetCard, hrefs: Mapping[str, str]) -> list[Section
             run.robot,
             ", ".join(run.logs),
             f"{run.samples}",
-            _floor(run),
+            _format_floor(run),
         )
         for run in card.runs
     ]
@@ -294,7 +294,7 @@ def _table_sections(card: DatasetCard, hrefs: Mapping[str, str]) -> list[Section
     return sections
 
 
-def _provenance(card: DatasetCard) -> Section:
+def _make_provenance_section(card: DatasetCard) -> Section:
     """Return what the dataset is made from: enough to make it again."""
     rules = card.recipe.split
     rows = [
@@ -321,5 +321,5 @@ def _provenance(card: DatasetCard) -> Section:
     return Section("Provenance", text, header=("what", "is"), rows=rows, folded=True)
 
 
-def _floor(run: RunSource) -> str:
+def _format_floor(run: RunSource) -> str:
     return "none" if run.energy_budget is None else f"{100 * run.energy_budget.total:.1f} %"

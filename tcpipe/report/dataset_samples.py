@@ -14,10 +14,10 @@ from scipy.spatial import cKDTree
 
 from tcpipe.formats.dataset_card import DatasetCard
 from tcpipe.formats.json_files import Json
-from tcpipe.report.packed import Column, packed, shown_to
+from tcpipe.report.column_packing import Column, make_shown_column, pack_columns
 from tcpipe.splits.assignment import SPLITS
-from tcpipe.tables.arrays import texts
-from tcpipe.tables.columns import floats, lonlat_deg
+from tcpipe.tables.arrays import to_texts
+from tcpipe.tables.columns import read_lonlat_deg, to_floats
 
 MOST_SAMPLES = 100_000
 """Samples that can each be clicked; more are means over cells."""
@@ -59,14 +59,14 @@ class SamplesShown:
     json: Json
 
 
-def middles_m(card: DatasetCard, table: pa.Table) -> Floats:
+def compute_middles_m(card: DatasetCard, table: pa.Table) -> Floats:
     """Return the middle of every sample's chord in the first map's plane [m], shape (N, 2)."""
     to_map = Transformer.from_crs(card.recipe.read.gnss_crs, card.maps[0].crs, always_xy=True)
-    middle_deg = 0.5 * (lonlat_deg(table, "start") + lonlat_deg(table, "end"))
+    middle_deg = 0.5 * (read_lonlat_deg(table, "start") + read_lonlat_deg(table, "end"))
     return np.column_stack(to_map.transform(*middle_deg.T)).reshape(-1, 2)
 
 
-def nearest_train_m(xy_m: Floats, split: NDArray[np.str_]) -> tuple[Floats, Ints]:
+def find_nearest_train_m(xy_m: Floats, split: NDArray[np.str_]) -> tuple[Floats, Ints]:
     """Return how far the nearest middle of a train sample lies from every held-out one [m], NaN elsewhere, and its row, shape (N,)."""
     apart, nearest = np.full(len(xy_m), np.nan), np.zeros(len(xy_m), np.int64)
     held, train = np.flatnonzero(np.isin(split, ("test", "unseen"))), np.flatnonzero(split == "train")
@@ -76,38 +76,38 @@ def nearest_train_m(xy_m: Floats, split: NDArray[np.str_]) -> tuple[Floats, Ints
     return apart, nearest
 
 
-def samples_shown(card: DatasetCard, table: pa.Table) -> SamplesShown:
+def select_samples(card: DatasetCard, table: pa.Table) -> SamplesShown:
     """Return what the page holds of the samples."""
-    xy_m = middles_m(card, table)
-    split = texts(table.column("split"))
-    apart_m, nearest = nearest_train_m(xy_m, split)
-    values = _values(card, table, apart_m) | {"x": xy_m[:, 0], "y": xy_m[:, 1], "count": np.ones(len(xy_m))}
+    xy_m = compute_middles_m(card, table)
+    split = to_texts(table.column("split"))
+    apart_m, nearest = find_nearest_train_m(xy_m, split)
+    values = _read_values(card, table, apart_m) | {"x": xy_m[:, 0], "y": xy_m[:, 1], "count": np.ones(len(xy_m))}
     cell_m, row_of = None, np.arange(table.num_rows)
-    keys = {"split": _split_numbers(split), "class": np.nan_to_num(floats(table, "terrain_class")).astype(np.int64)}
+    keys = {"split": _split_numbers(split), "class": np.nan_to_num(to_floats(table, "terrain_class")).astype(np.int64)}
     keys |= {"quality": table.column("quality").to_numpy().astype(np.int64), "run": _run_numbers(card, table)}
     if table.num_rows > MOST_SAMPLES:
-        values, keys, row_of, cell_m = _in_cells(values, keys)
+        values, keys, row_of, cell_m = _average_in_cells(values, keys)
         xy_m = np.column_stack([values["x"], values["y"]])
     columns: dict[str, Column] = {"x": ("steps", values["x"]), "y": ("steps", values["y"])}
-    columns |= {name: shown_to(digits, values[name]) for name, digits in _DIGITS.items()}
+    columns |= {name: make_shown_column(digits, values[name]) for name, digits in _DIGITS.items()}
     columns |= {name: ("half", part) for name, part in values.items() if name not in {*columns, "count"}}
     columns |= {"split": ("u8", keys["split"]), "class": ("u8", keys["class"]), "quality": ("u16", keys["quality"])}
     columns |= {"run": ("u16", keys["run"]), "count": ("u32", values["count"])}
     if cell_m is None:
-        columns |= _starts(card, table)
+        columns |= _read_starts(card, table)
         near = apart_m < np.sqrt(2.0) * card.patch_m
         columns["nearest"] = ("u32", np.where(near, nearest, np.arange(len(near))))
-    told: dict[str, Json] = {"packed": packed(columns), "cell_m": cell_m, "ids": _ids_if_odd(table)}
+    told: dict[str, Json] = {"packed": pack_columns(columns), "cell_m": cell_m, "ids": _find_odd_ids(table)}
     return SamplesShown(xy_m, row_of, apart_m, cell_m, told)
 
 
-def _values(card: DatasetCard, table: pa.Table, apart_m: Floats) -> dict[str, Floats]:
-    found = {name: floats(table, column) for name, column in _LABELS.items()}
-    found |= {f"{name}_std": floats(table, column) for name, column in _STD.items()}
-    found["slope"] = np.degrees(floats(table, "slope_rad"))
-    found["turn"] = np.degrees(floats(table, "turn_rad"))
+def _read_values(card: DatasetCard, table: pa.Table, apart_m: Floats) -> dict[str, Floats]:
+    found = {name: to_floats(table, column) for name, column in _LABELS.items()}
+    found |= {f"{name}_std": to_floats(table, column) for name, column in _STD.items()}
+    found["slope"] = np.degrees(to_floats(table, "slope_rad"))
+    found["turn"] = np.degrees(to_floats(table, "turn_rad"))
     if card.physics:
-        found["residual"] = found["power"] - floats(table, "physics_power_watt")
+        found["residual"] = found["power"] - to_floats(table, "physics_power_watt")
     return found | {"apart": apart_m}
 
 
@@ -125,7 +125,7 @@ def _run_numbers(card: DatasetCard, table: pa.Table) -> Ints:
     return numbers
 
 
-def first_starts_ns(card: DatasetCard, table: pa.Table) -> list[int]:
+def find_first_starts_ns(card: DatasetCard, table: pa.Table) -> list[int]:
     """Return when each run's first sample begins [ns]; 0 where it has none."""
     runs, starts = _run_numbers(card, table), table.column("start_ns").to_numpy()
     first = np.full(len(card.runs), np.iinfo(np.int64).max)
@@ -133,15 +133,15 @@ def first_starts_ns(card: DatasetCard, table: pa.Table) -> list[int]:
     return [int(stamp) if stamp != np.iinfo(np.int64).max else 0 for stamp in first]
 
 
-def _starts(card: DatasetCard, table: pa.Table) -> Mapping[str, Column]:
+def _read_starts(card: DatasetCard, table: pa.Table) -> Mapping[str, Column]:
     after = (
         table.column("start_ns").to_numpy()
-        - np.array(first_starts_ns(card, table), np.int64)[_run_numbers(card, table)]
+        - np.array(find_first_starts_ns(card, table), np.int64)[_run_numbers(card, table)]
     )
     return {"after_s": ("u32", after // 10**9), "after_ns": ("u32", after % 10**9)}
 
 
-def _ids_if_odd(table: pa.Table) -> Sequence[str] | None:
+def _find_odd_ids(table: pa.Table) -> Sequence[str] | None:
     """Return the ids where they are not the run's and the start's, which the page puts together itself; None for too many."""
     if table.num_rows > MOST_SAMPLES:
         return None
@@ -150,7 +150,7 @@ def _ids_if_odd(table: pa.Table) -> Sequence[str] | None:
     return None if ids == [f"{run}-{start}" for run, start in made] else ids
 
 
-def _in_cells(
+def _average_in_cells(
     values: Mapping[str, Floats], keys: Mapping[str, Ints]
 ) -> tuple[dict[str, Floats], dict[str, Ints], Ints, float]:
     """Return means over square cells, one row for each split and class in a cell, each sample's row, and the cells' side [m]."""

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 from tcpipe.balance.cells import SLOPE_NAMES
-from tcpipe.cost.budget import in_words
+from tcpipe.cost.budget import format_budget
 from tcpipe.formats.dataset_card import Balance, CellRow
 from tcpipe.report.page import Section, Shaded
-from tcpipe.tables.bits import Quality, name_of
+from tcpipe.tables.bits import Quality, flag_name
 from tcpipe.tables.facts import EnergyBudget, PhysicsFit, PhysicsTerm
 
 QUALITY_WORDS = {
@@ -28,9 +28,9 @@ QUALITY_WORDS = {
 """What a bit says, in words."""
 
 
-def quality_sections(counts: Mapping[str, int], of_what: str) -> list[Section]:
+def make_quality_sections(counts: Mapping[str, int], of_what: str) -> list[Section]:
     """Return the table of the bits that any label carries; ``counts`` are by the bit's name."""
-    rows = [(name_of(bit).replace("_", " "), count) for bit in Quality if (count := counts.get(name_of(bit), 0))]
+    rows = [(flag_name(bit).replace("_", " "), count) for bit in Quality if (count := counts.get(flag_name(bit), 0))]
     if not rows:
         return [Section("Quality flags", f"None: all {of_what} are clean.")] if counts else []
     return [
@@ -53,23 +53,25 @@ _ROWS = {
 }
 
 
-def budget_sections(budget: EnergyBudget | None) -> list[Section]:
+def make_budget_sections(budget: EnergyBudget | None) -> list[Section]:
     """Return the section on the noise floor of E; none where no segment has an energy."""
     if budget is None:
         return []
     rows = [(text, f"{100 * getattr(budget, name):.2f} %") for name, text in _ROWS.items()]
-    return [Section("How wrong a label may be", in_words(budget), header=("from", "of E"), rows=rows, figures_from=1)]
+    return [
+        Section("How wrong a label may be", format_budget(budget), header=("from", "of E"), rows=rows, figures_from=1)
+    ]
 
 
 _ASIDE = {"grade": "weight over efficiency"}
 
 
-def physics_in_words(robot: str, fit: PhysicsFit) -> str:
+def describe_physics(robot: str, fit: PhysicsFit) -> str:
     """Return the fit as a few sentences: the numbers that a roboticist wants first, each with its standard deviation."""
     grounds = list(dict.fromkeys(of.terrain for of in fit.terms if of.term in {"rolling", "turning"}))
     values = {(of.term, of.terrain): of for of in fit.terms}
     everywhere = [
-        f"{_with_std(of)} {of.unit} {_ASIDE.get(of.term, of.term)}"
+        f"{_format_with_std(of)} {of.unit} {_ASIDE.get(of.term, of.term)}"
         for of in fit.terms
         if of.term not in {"rolling", "turning"}
     ]
@@ -80,9 +82,9 @@ def physics_in_words(robot: str, fit: PhysicsFit) -> str:
             value, std = fit.rolling_resistance[ground]
             parts.append(f"C_rr {value:.3f} ± {std:.3f}")
         elif (rolling := values.get(("rolling", ground))) is not None:
-            parts.append(f"rolling {_with_std(rolling)} N")
+            parts.append(f"rolling {_format_with_std(rolling)} N")
         if (turning := values.get(("turning", ground))) is not None:
-            parts.append(f"{_with_std(turning)} W per rad/s of turning")
+            parts.append(f"{_format_with_std(turning)} W per rad/s of turning")
         said.append(f"on {'all ground' if ground == 'all' else ground}: {', '.join(parts)}")
     share = ", ".join(f"{name} {100.0 * part:.0f} %" for name, part in fit.energy_share.items())
     text = f"{'; '.join(said)}. Of all energy: {share} ({fit.segments} segments)."
@@ -97,14 +99,14 @@ def physics_in_words(robot: str, fit: PhysicsFit) -> str:
     return text
 
 
-def _with_std(of: PhysicsTerm) -> str:
+def _format_with_std(of: PhysicsTerm) -> str:
     digits = 0 if of.std >= 1.0 else 1
     return f"{of.value:.{digits}f} ± {of.std:.{digits}f}"
 
 
-def physics_sections(fits: dict[str, PhysicsFit]) -> list[Section]:
+def make_physics_sections(fits: dict[str, PhysicsFit]) -> list[Section]:
     """Return a section of the fits by robot; none where there are none."""
-    text = " ".join(physics_in_words(robot, fit) for robot, fit in fits.items())
+    text = " ".join(describe_physics(robot, fit) for robot, fit in fits.items())
     return [Section("What a metre costs: standing, drivetrain, rolling, grade, turning", text)] if fits else []
 
 
@@ -113,13 +115,13 @@ _UNITS = {"watt": "W", "mps": "m/s", "s": "s", "joule": "J"}
 
 def balance_sections(balance: Balance) -> list[Section]:
     """Return the sections."""
-    return [_by_class(balance), _by_speed(balance), _repeatability(balance)]
+    return [_make_class_section(balance), _make_speed_section(balance), _make_repeatability_section(balance)]
 
 
-def _by_class(balance: Balance) -> Section:
+def _make_class_section(balance: Balance) -> Section:
     cells = balance.by_class_and_slope
     text = (
-        f"Samples, and in brackets how many independent ones they are worth: neighbours are alike ({_alike(balance)}). "
+        f"Samples, and in brackets how many independent ones they are worth: neighbours are alike ({_format_alike(balance)}). "
         f"{sum(cell['rare'] for cell in cells)} of {len(cells)} cells are worth fewer than {balance.enough_effective:g} and marked "
         "with * and a dashed border; – is ground of the map that nobody drove. drive-next.geojson holds where to drive for them."
     )
@@ -127,7 +129,7 @@ def _by_class(balance: Balance) -> Section:
     return Section("Balance of class and slope", text, header=header, rows=rows)
 
 
-def _by_speed(balance: Balance) -> Section:
+def _make_speed_section(balance: Balance) -> Section:
     cells = balance.cells
     keys = [(cell["class"] or "any", cell["speed_mps"]) for cell in cells]
     header, rows = _table(cells, "class, speed [m/s]", keys)
@@ -149,11 +151,11 @@ def _table(
     most = max((sum(cell["samples"].values()) for cell in cells), default=0)
     texts = {(key, cell["slope"]): _shaded(cell, most) for key, cell in zip(keys, cells, strict=True)}
     return [name, *slopes], [
-        [", ".join(key), *(texts.get((key, slope), "") for slope in slopes)] for key in _in_order(keys)
+        [", ".join(key), *(texts.get((key, slope), "") for slope in slopes)] for key in _sort_keys(keys)
     ]
 
 
-def _in_order(keys: Sequence[tuple[str, ...]]) -> list[tuple[str, ...]]:
+def _sort_keys(keys: Sequence[tuple[str, ...]]) -> list[tuple[str, ...]]:
     """Return each key once: classes as they come, which is by id, and under each its ranges of speed, rising."""
     classes = list(dict.fromkeys(key[0] for key in keys))
     return sorted(dict.fromkeys(keys), key=lambda key: (classes.index(key[0]), *map(_lower_end, key[1:])))
@@ -171,7 +173,7 @@ def _shaded(row: CellRow, most: int) -> Shaded:
     return Shaded(text, (count / max(most, 1)) ** 0.5, alarm=row["rare"])
 
 
-def _alike(balance: Balance) -> str:
+def _format_alike(balance: Balance) -> str:
     found = [
         f"{_name(label)} over {entry.length_m:.1f} m, {100 * entry.share:.0f} % of its variance"
         for label, entry in balance.correlation.items()
@@ -180,7 +182,7 @@ def _alike(balance: Balance) -> str:
     return "; ".join(found) or "how far cannot be told from so few"
 
 
-def _repeatability(balance: Balance) -> Section:
+def _make_repeatability_section(balance: Balance) -> Section:
     rows = []
     for label, entry in balance.repeatability.items():
         unit = _UNITS[label.rsplit("_", 1)[1]]

@@ -18,7 +18,7 @@ from urllib.parse import quote
 from jinja2 import Environment, StrictUndefined
 
 from tcpipe import __version__
-from tcpipe.errors import plain_line
+from tcpipe.errors import clean_line
 from tcpipe.formats.json_files import Json
 from tcpipe.report import plots
 from tcpipe.report.plots import Plot
@@ -47,7 +47,7 @@ class Link:
 
     def __html__(self) -> str:
         """Return it as HTML; no path becomes another scheme or leaves the attribute."""
-        return f'<a href="{quote(self.path)}">{_breakable(self.text)}</a>'
+        return f'<a href="{quote(self.path)}">{_format_breakable(self.text)}</a>'
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,7 +61,7 @@ class Shaded:
     def __html__(self) -> str:
         """Return it as HTML."""
         mark = " alarm" if self.alarm else ""
-        return f'<span class="shaded{mark}" style="--share:{min(max(self.share, 0.0), 1.0):.2f}">{_breakable(self.text)}</span>'
+        return f'<span class="shaded{mark}" style="--share:{min(max(self.share, 0.0), 1.0):.2f}">{_format_breakable(self.text)}</span>'
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,11 +115,11 @@ def render_page(
 
     """
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True)
-    environment.filters["cell"] = _cell
+    environment.filters["cell"] = _format_cell
     every = [plot for section in sections for plot in section.plots]
-    drawn, ids = plots.figures(every)
+    drawn, ids = plots.render_plots(every)
     names = iter(ids)
-    page = environment.from_string(_file("page.html.j2")).render(
+    page = environment.from_string(_read_file("page.html.j2")).render(
         title=title,
         lead=lead,
         numbers=numbers,
@@ -131,45 +131,45 @@ def render_page(
             (
                 section,
                 [(plot, next(names)) for plot in section.plots],
-                _file(section.controls) if section.controls else "",
+                _read_file(section.controls) if section.controls else "",
             )
             for section in sections
         ],
         version=__version__,
-        style=_file("page.css"),
+        style=_read_file("page.css"),
         scripts=_SCRIPTS,
     )
-    seen = _UNSEEN.sub(lambda found: plain_line(found[0]), page)
-    blocks = [_json_block("page-data", _shown(data)), _json_block("page-figures", drawn)]
-    code = [plots.script()] if every else []
-    code += [_file("page.js"), *([_file(script)] if script else [])]
+    seen = _UNSEEN.sub(lambda found: clean_line(found[0]), page)
+    blocks = [_format_json("page-data", _clean_data(data)), _format_json("page-figures", drawn)]
+    code = [plots.make_script()] if every else []
+    code += [_read_file("page.js"), *([_read_file(script)] if script else [])]
     return seen.replace(_SCRIPTS, "\n".join(blocks + [f"<script>\n{part}\n</script>" for part in code]), 1)
 
 
-def _file(name: str) -> str:
+def _read_file(name: str) -> str:
     return files("tcpipe.report").joinpath(name).read_text(encoding="utf-8")
 
 
-def _json_block(name: str, value: Json) -> str:
+def _format_json(name: str, value: Json) -> str:
     """Return JSON as a part of the page that no text in it can end."""
     text = json.dumps(value, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
     return f'<script type="application/json" id="{name}">{text}</script>'
 
 
-def _shown(value: Json) -> Json:
+def _clean_data(value: Json) -> Json:
     """Return plain data with every text as one line that can be seen whole."""
     if isinstance(value, Mapping):
-        return {plain_line(key): _shown(part) for key, part in value.items()}
+        return {clean_line(key): _clean_data(part) for key, part in value.items()}
     if isinstance(value, str):
-        return value if value.isprintable() else plain_line(value)
-    return [_shown(part) for part in value] if isinstance(value, Sequence) else value
+        return value if value.isprintable() else clean_line(value)
+    return [_clean_data(part) for part in value] if isinstance(value, Sequence) else value
 
 
-def _cell(cell: object) -> str:
+def _format_cell(cell: object) -> str:
     """Return a cell as HTML."""
-    return cell.__html__() if isinstance(cell, Link | Shaded) else _breakable(cell)
+    return cell.__html__() if isinstance(cell, Link | Shaded) else _format_breakable(cell)
 
 
-def _breakable(cell: object) -> str:
+def _format_breakable(cell: object) -> str:
     """Return a text as HTML, escaped, that may break after every / and _, as topics and types are long."""
     return html.escape(str(cell)).replace("/", "/<wbr>").replace("_", "_<wbr>")

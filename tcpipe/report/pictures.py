@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 from pyproj import Transformer
 
-from tcpipe.formats.atomic import atomic_file
+from tcpipe.formats.atomic import write_atomic_file
+from tcpipe.formats.integrity import read_picture_text, seal_of
 from tcpipe.formats.maps.map_files import MapFile
-from tcpipe.formats.seals import picture_text, seal_of
 from tcpipe.report.colours import CLASS_COLOURS
 from tcpipe.terrain.layers import COLOURS, Pixels
 
@@ -28,12 +28,12 @@ ACROSS = 25
 _CIVIDIS = np.array([[0, 34, 78], [65, 77, 107], [124, 123, 120], [188, 175, 111], [254, 232, 56]], np.float64)
 
 
-def picture_uri(pixels: Bytes, *, exact: bool = False) -> str:
-    """Return a picture as a data URI; arguments as of `picture_bytes`."""
-    return f"data:image/webp;base64,{base64.b64encode(picture_bytes(pixels, exact=exact)).decode('ascii')}"
+def make_picture_uri(pixels: Bytes, *, exact: bool = False) -> str:
+    """Return a picture as a data URI; arguments as of `encode_picture`."""
+    return f"data:image/webp;base64,{base64.b64encode(encode_picture(pixels, exact=exact)).decode('ascii')}"
 
 
-def picture_bytes(pixels: Bytes, *, exact: bool = False) -> bytes:
+def encode_picture(pixels: Bytes, *, exact: bool = False) -> bytes:
     """Return a picture, grey (R, C) or colour (R, C, 3), as WebP; ``exact`` keeps every pixel as it is."""
     stream = io.BytesIO()
     Image.fromarray(pixels).save(stream, format="WEBP", quality=78, lossless=exact, method=4)
@@ -49,7 +49,7 @@ def read_picture(path: Path) -> Bytes | None:
         return None
 
 
-def sheet(patches: NDArray[np.uint8]) -> Bytes:
+def make_sheet(patches: NDArray[np.uint8]) -> Bytes:
     """Return patches (N, px, px) or (N, px, px, 3) side by side, `ACROSS` in a row, the rest black."""
     count, px = patches.shape[:2]
     rows = -(-count // ACROSS)
@@ -59,15 +59,15 @@ def sheet(patches: NDArray[np.uint8]) -> Bytes:
     return np.ascontiguousarray(whole.reshape(rows * px, ACROSS * px, *patches.shape[3:]))
 
 
-def class_picture(ids: NDArray[np.integer]) -> Bytes:
+def colour_classes(ids: NDArray[np.integer]) -> Bytes:
     """Return class ids of any shape as colours, one axis more; 0, no data, is white."""
-    table = np.array([_rgb("#ffffff"), *map(_rgb, CLASS_COLOURS)], np.uint8)
+    table = np.array([_parse_rgb("#ffffff"), *map(_parse_rgb, CLASS_COLOURS)], np.uint8)
     index = np.where(ids > 0, (ids.astype(np.int64) - 1) % len(CLASS_COLOURS) + 1, 0)
     picture: Bytes = table[index]
     return picture
 
 
-def relief_picture(values: NDArray[np.float64]) -> Bytes:
+def colour_heights(values: NDArray[np.float64]) -> Bytes:
     """Return each patch (N, px, px) over its own range from dark blue to yellow (cividis), shape (N, px, px, 3); no data is white."""
     known = np.isfinite(values)
     low = np.where(known, values, np.inf).min(axis=(1, 2), keepdims=True)
@@ -78,7 +78,7 @@ def relief_picture(values: NDArray[np.float64]) -> Bytes:
     return np.where(known[..., None], colours, 255.0).astype(np.uint8)
 
 
-def _rgb(colour: str) -> Sequence[int]:
+def _parse_rgb(colour: str) -> Sequence[int]:
     return [int(colour[n : n + 2], 16) for n in (1, 3, 5)]
 
 
@@ -90,7 +90,7 @@ def map_overview(source: MapFile) -> NDArray[np.uint8]:
     """Return the orthophoto, or a shaded relief without one, as grey bytes of at most `_SIDE_PX` a side; the map is read in strips."""
     level, step = _level(source)
     layer = "ortho" if "ortho" in level.layers else "height"
-    picture = _thinned(level, layer, step)
+    picture = _thin_layer(level, layer, step)
     return picture.astype(np.uint8) if layer == "ortho" else _shaded(picture, step * level.grid.pitch_m)
 
 
@@ -98,7 +98,7 @@ Bounds = tuple[float, float, float, float]
 """x_min, y_min, x_max, y_max [m]."""
 
 
-def joint_bounds_m(places: Sequence[tuple[str, Bounds]]) -> Bounds:
+def compute_joint_bounds_m(places: Sequence[tuple[str, Bounds]]) -> Bounds:
     """Return the bounds of all maps, each given with its CRS, in the CRS of the first."""
     first = places[0][0]
     every = [
@@ -109,36 +109,38 @@ def joint_bounds_m(places: Sequence[tuple[str, Bounds]]) -> Bounds:
     return float(low[0]), float(low[1]), float(high[2]), float(high[3])
 
 
-def ortho_overview(source: MapFile) -> NDArray[np.uint8]:
+def draw_ortho(source: MapFile) -> NDArray[np.uint8]:
     """Return the orthophoto in colour, shape (R, C, 3), where the map has it so; else the `map_overview`."""
     level, step = _level(source)
     if not set(COLOURS) <= set(level.layers):
         return map_overview(source)
-    return np.stack([_thinned(level, layer, step) for layer in COLOURS], axis=-1).astype(np.uint8)
+    return np.stack([_thin_layer(level, layer, step) for layer in COLOURS], axis=-1).astype(np.uint8)
 
 
-def relief_overview(source: MapFile) -> NDArray[np.uint8]:
+def draw_relief(source: MapFile) -> NDArray[np.uint8]:
     """Return a shaded relief, shape (R, C)."""
     level, step = _level(source)
-    return _shaded(_thinned(level, "height", step), step * level.grid.pitch_m)
+    return _shaded(_thin_layer(level, "height", step), step * level.grid.pitch_m)
 
 
-def class_overview(source: MapFile) -> NDArray[np.uint8]:
+def draw_classes(source: MapFile) -> NDArray[np.uint8]:
     """Return the terrain classes in their colours, shape (R, C, 3); white without a terrain layer."""
     level, step = _level(source)
     if "terrain" not in level.layers:
-        return np.full((*relief_overview(source).shape, 3), 255, np.uint8)
-    return class_picture(_thinned(level, "terrain", step).astype(np.int64))
+        return np.full((*draw_relief(source).shape, 3), 255, np.uint8)
+    return colour_classes(_thin_layer(level, "terrain", step).astype(np.int64))
 
 
-def maps_overview(
-    sources: Sequence[MapFile], look: Callable[[MapFile], NDArray[np.uint8]] = ortho_overview
+def draw_maps(
+    sources: Sequence[MapFile], look: Callable[[MapFile], NDArray[np.uint8]] = draw_ortho
 ) -> NDArray[np.uint8]:
     """Return one picture of all maps over their joint bounds, each by ``look``; the first rules where they overlap."""
     if len(sources) == 1:
         return look(sources[0])
     crs = sources[0].grid.crs
-    x_min_m, y_min_m, x_max_m, y_max_m = joint_bounds_m([(each.grid.crs, each.grid.bounds_m) for each in sources])
+    x_min_m, y_min_m, x_max_m, y_max_m = compute_joint_bounds_m(
+        [(each.grid.crs, each.grid.bounds_m) for each in sources]
+    )
     step_m = max(x_max_m - x_min_m, y_max_m - y_min_m) / _SIDE_PX
     x_m, y_m = np.meshgrid(
         np.arange(x_min_m + step_m / 2, x_max_m, step_m), np.arange(y_max_m - step_m / 2, y_min_m, -step_m)
@@ -156,16 +158,16 @@ def maps_overview(
     return whole
 
 
-def quick_look(source: MapFile) -> NDArray[np.uint8]:
+def draw_quick_look(source: MapFile) -> NDArray[np.uint8]:
     """Return the overview in colour, shape (R, C, 3): terrain classes tinted over it, white where a layer has no data."""
     level, step = _level(source)
     picture = map_overview(source)[..., None].repeat(3, axis=2)
     missing = np.zeros(picture.shape[:2], np.bool_)
     for layer in level.layers:
-        pixels = _thinned(level, layer, step)
+        pixels = _thin_layer(level, layer, step)
         missing |= ~level.layers[layer].has_data(pixels)
         if layer == "terrain":
-            picture = ((1.0 - _TINT) * picture + _TINT * class_picture(pixels.astype(np.int64))).astype(np.uint8)
+            picture = ((1.0 - _TINT) * picture + _TINT * colour_classes(pixels.astype(np.int64))).astype(np.uint8)
     return np.where(missing[..., None], np.uint8(255), picture)
 
 
@@ -176,7 +178,7 @@ def _level(source: MapFile) -> tuple[MapFile, int]:
     return source.at(factor), max(1, -(-(longer // factor) // _SIDE_PX))
 
 
-def _thinned(level: MapFile, layer: str, step: int) -> Pixels:
+def _thin_layer(level: MapFile, layer: str, step: int) -> Pixels:
     """Return every ``step``-th pixel of a layer."""
     side = max(step, level.tile_px * 4 // step * step)
     rows, cols = level.grid.rows, level.grid.cols
@@ -202,7 +204,7 @@ _PLAIN_PNG: dict[str, Any] = {"Software": None}
 
 def write_overview(path: Path, picture: NDArray[np.uint8], *, texts: Mapping[str, str] | None = None) -> None:
     """Write a picture, grey (R, C) or colour (R, C, 3), as PNG with texts by key; the same picture gives the same bytes."""
-    with atomic_file(path) as temporary:
+    with write_atomic_file(path) as temporary:
         metadata = {**_PLAIN_PNG, **(texts or {})}
         matplotlib.image.imsave(temporary, picture, format="png", cmap="gray", vmin=0, vmax=255, metadata=metadata)
 
@@ -212,10 +214,10 @@ _SHOWS = "tcpipe map"
 
 
 def write_quick_look(picture: Path, look: NDArray[np.uint8], seal: str) -> None:
-    """Write the `quick_look` of a map; the picture carries which map it shows, by `tcpipe.formats.seals.seal_of`."""
+    """Write the `draw_quick_look` of a map; the picture carries which map it shows, by `tcpipe.formats.integrity.seal_of`."""
     write_overview(picture, look, texts={_SHOWS: seal})
 
 
-def shows_map(picture: Path, map_path: Path) -> bool:
+def is_picture_of_map(picture: Path, map_path: Path) -> bool:
     """Return whether a picture is the quick look of the map at ``map_path``; `StoreError` if that cannot be read."""
-    return picture_text(picture, _SHOWS) == seal_of(map_path)
+    return read_picture_text(picture, _SHOWS) == seal_of(map_path)

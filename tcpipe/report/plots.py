@@ -25,10 +25,10 @@ from bokeh.models.annotations.geometry import Span
 from bokeh.plotting import figure
 from numpy.typing import NDArray
 
-from tcpipe.errors import plain_line
+from tcpipe.errors import clean_line
 from tcpipe.formats.json_files import Json
 from tcpipe.report.colours import CURSOR, DROPPED, KEPT, SPLIT_COLOURS
-from tcpipe.tables.columns import floats
+from tcpipe.tables.columns import to_floats
 
 _TEX = re.compile(r"\$\$|\\\(|\\\[")
 _UNREAD = "\u2060"
@@ -46,7 +46,7 @@ class Plot:
     """Whether it is drawn when the page answers already; the page's script is told of each (``page.js``)."""
 
 
-def new_plot(
+def make_plot(
     name: str,
     *,
     alt: str,
@@ -151,14 +151,14 @@ def say_of(plot: Plot, drawn: Any) -> None:
     plot.figure.add_tools(HoverTool(renderers=[drawn], tooltips=[("", "@text")]))
 
 
-def waterfall(ledger_m: Mapping[str, float]) -> Plot:
+def draw_waterfall(ledger_m: Mapping[str, float]) -> Plot:
     """Return where every metre went: all that was driven, each loss taken away, the largest first, and what is left."""
     losses = sorted(((n, m) for n, m in ledger_m.items() if n != "kept" and m > 0), key=lambda item: -item[1])
     total, kept = sum(ledger_m.values()), ledger_m.get("kept", 0.0)
     ends = total - np.cumsum([metres for _, metres in losses])
     names = ["driven", *(name.replace("_", " ") for name, _ in losses), "kept"]
     metres = [total, *(metres for _, metres in losses), kept]
-    plot = new_plot(
+    plot = make_plot(
         "ledger",
         alt=f"Waterfall of the loss ledger: of {total:.0f} m driven, {kept:.0f} m are kept.",
         axes=("metres", ""),
@@ -189,12 +189,12 @@ def waterfall(ledger_m: Mapping[str, float]) -> Plot:
     return plot
 
 
-def histogram(name: str, values: NDArray[np.float64], *, label: str, of_what: str) -> Plot:
+def draw_histogram(name: str, values: NDArray[np.float64], *, label: str, of_what: str) -> Plot:
     """Return how often values occur; what is not finite is left out, and said."""
     finite = values[np.isfinite(values)]
     lost = len(values) - len(finite)
     alt = f"Histogram of {label} of {len(finite)} {of_what}" + (f"; {lost} have none" if lost else "")
-    plot = new_plot(name, alt=f"{alt}.", axes=(label, of_what), height_px=220, tools="save", waits=True)
+    plot = make_plot(name, alt=f"{alt}.", axes=(label, of_what), height_px=220, tools="save", waits=True)
     if len(finite):
         counts, edges = np.histogram(finite, bins=min(40, max(5, int(np.sqrt(len(finite))))))
         plot.figure.quad(left=edges[:-1], right=edges[1:], bottom=0, top=counts, color=SPLIT_COLOURS["train"])
@@ -207,18 +207,18 @@ def label_histograms(rows: pa.Table, of_what: str, *, prefix: str = "") -> list[
     """Return how often values of each label occur that any of the rows has."""
     labels = {"w [W]": "power_watt", "v [m/s]": "velocity_mps", "T [s]": "duration_s", "E [J]": "energy_joule"}
     return [
-        histogram(f"{prefix}{name}", values, label=label, of_what=of_what)
+        draw_histogram(f"{prefix}{name}", values, label=label, of_what=of_what)
         for label, name in labels.items()
-        if np.isfinite(values := floats(rows, name)).any()
+        if np.isfinite(values := to_floats(rows, name)).any()
     ]
 
 
-def script() -> str:
+def make_script() -> str:
     """Return BokehJS: what a page needs of it."""
     return (Path(bokeh.__file__).parent / "server/static/js/bokeh.min.js").read_text(encoding="utf-8")
 
 
-def figures(plots: Sequence[Plot]) -> tuple[Json, list[str]]:
+def render_plots(plots: Sequence[Plot]) -> tuple[Json, list[str]]:
     """Return what a page draws, and the id of each plot; the same plots have the same ids, whatever was drawn before in this process.
 
     ``first`` is a Bokeh document of all plots that do not wait. ``later`` are the roots that join it, in the order of the page; what
@@ -231,19 +231,21 @@ def figures(plots: Sequence[Plot]) -> tuple[Json, list[str]]:
     with whole.models.freeze():  # else every root that is added looks through all others again
         for plot in ordered:
             whole.add_root(plot.figure)
-    told = cast("dict[str, Json]", _told(cast("Json", whole.to_json(deferred=False)), ids))
+    told = cast("dict[str, Json]", _make_plot_json(cast("Json", whole.to_json(deferred=False)), ids))
     roots, soon = cast("list[Json]", told["roots"]), sum(not plot.waits for plot in plots)
     return {"first": {**told, "roots": roots[:soon]}, "later": roots[soon:]}, [ids[plot.figure.id] for plot in plots]
 
 
-def _told(value: Json, ids: dict[str, str]) -> Json:
+def _make_plot_json(value: Json, ids: dict[str, str]) -> Json:
     """Return a part of Bokeh's JSON with ids in order of appearance, and texts that nothing reads as a formula or a control character."""
     if isinstance(value, Mapping):
         return {
-            key: ids.setdefault(part, f"p{len(ids) + 1}") if key == "id" and isinstance(part, str) else _told(part, ids)
+            key: ids.setdefault(part, f"p{len(ids) + 1}")
+            if key == "id" and isinstance(part, str)
+            else _make_plot_json(part, ids)
             for key, part in value.items()
         }
     if isinstance(value, str):
-        text = value if value.isprintable() else plain_line(value)
+        text = value if value.isprintable() else clean_line(value)
         return _TEX.sub(lambda found: found[0][0] + _UNREAD + found[0][1:], text)
-    return [_told(part, ids) for part in value] if isinstance(value, Sequence) else value
+    return [_make_plot_json(part, ids) for part in value] if isinstance(value, Sequence) else value

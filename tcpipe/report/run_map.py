@@ -10,14 +10,14 @@ import pyarrow as pa
 from numpy.typing import NDArray
 from pyproj import Transformer
 
-from tcpipe.errors import TcpipeError, plain_line
+from tcpipe.errors import TcpipeError, clean_line
 from tcpipe.formats.maps.map_files import MapFile, open_map
 from tcpipe.formats.stored_runs import RunDirectory
 from tcpipe.report.colours import CURSOR
-from tcpipe.report.pictures import Bounds, class_overview, ortho_overview, picture_uri, relief_overview
-from tcpipe.report.plots import Plot, lay_picture, new_plot
+from tcpipe.report.pictures import Bounds, draw_classes, draw_ortho, draw_relief, make_picture_uri
+from tcpipe.report.plots import Plot, lay_picture, make_plot
 from tcpipe.store import Store
-from tcpipe.tables.columns import floats, lonlat_deg
+from tcpipe.tables.columns import read_lonlat_deg, to_floats
 
 Floats = NDArray[np.float64]
 
@@ -51,27 +51,27 @@ def run_map(
     of_maps: MutableMapping[str, Pictures],
 ) -> RunMap:
     """Return the map; ``located`` is whether the track has a place on Earth, ``of_maps`` are the pictures of maps drawn so far, by name."""
-    lonlat = np.column_stack([floats(track, "lon_deg"), floats(track, "lat_deg")])
+    lonlat = np.column_stack([to_floats(track, "lon_deg"), to_floats(track, "lat_deg")])
     found, missing = _map_under(store, run, lonlat, of_maps) if located else (None, [])
     if found is None:
         ends = tuple(
-            np.column_stack([floats(segments, f"{end}_{axis}_m") for axis in "xy"]) for end in ("start", "end")
+            np.column_stack([to_floats(segments, f"{end}_{axis}_m") for axis in "xy"]) for end in ("start", "end")
         )
-        xy_m = np.column_stack([floats(track, "x_m"), floats(track, "y_m")])
-        plot = _empty("map", ("east [m]", "north [m]"), xy_m)
+        xy_m = np.column_stack([to_floats(track, "x_m"), to_floats(track, "y_m")])
+        plot = _make_empty_plot("map", ("east [m]", "north [m]"), xy_m)
         return RunMap(
-            plot, xy_m, (ends[0], ends[1]), (), (*missing, *_absent(store, located=located, lost=bool(missing)))
+            plot, xy_m, (ends[0], ends[1]), (), (*missing, *_find_absent(store, located=located, lost=bool(missing)))
         )
     to_map, bounds_m, pictures = found
     xy_m = to_map(lonlat)
-    plot = _empty("map", ("easting [m]", "northing [m]"), xy_m)
+    plot = _make_empty_plot("map", ("easting [m]", "northing [m]"), xy_m)
     for number, (name, uri) in enumerate(pictures.items()):
         lay_picture(plot, name, uri, bounds_m, visible=number == 0)
-    ends_xy_m = to_map(lonlat_deg(segments, "start")), to_map(lonlat_deg(segments, "end"))
+    ends_xy_m = to_map(read_lonlat_deg(segments, "start")), to_map(read_lonlat_deg(segments, "end"))
     return RunMap(plot, xy_m, ends_xy_m, tuple(pictures), tuple(missing))
 
 
-def _absent(store: Store, *, located: bool, lost: bool) -> Sequence[str]:
+def _find_absent(store: Store, *, located: bool, lost: bool) -> Sequence[str]:
     if not located:
         return ["No fix of a GNSS: the track lies in a plane of its own, and no map can be laid under it."]
     if lost:
@@ -98,17 +98,17 @@ def _map_under(
 
             if source.grid.contains(to_map(lonlat)).mean() > _MOSTLY:
                 if name not in of_maps:
-                    of_maps[name] = _pictures(source)
+                    of_maps[name] = _read_pictures(source)
                 return (to_map, source.grid.bounds_m, of_maps[name]), lost
         except (TcpipeError, OSError) as error:
-            lost.append(f"Map {name} cannot be shown: {plain_line(str(error))}.")
+            lost.append(f"Map {name} cannot be shown: {clean_line(str(error))}.")
     return None, lost
 
 
-def _empty(name: str, axes: tuple[str, str], xy_m: Floats) -> Plot:
+def _make_empty_plot(name: str, axes: tuple[str, str], xy_m: Floats) -> Plot:
     low, high = xy_m.min(axis=0), xy_m.max(axis=0)
     wide, tall = np.maximum(high - low, 0.1 * np.max(high - low, initial=10.0))
-    plot = new_plot(
+    plot = make_plot(
         name,
         alt="Map of the track: segments, and where and why the rest is not used; the waterfall below holds the metres.",
         axes=axes,
@@ -132,9 +132,9 @@ def _empty(name: str, axes: tuple[str, str], xy_m: Floats) -> Plot:
     return plot
 
 
-def _pictures(source: MapFile) -> Pictures:
+def _read_pictures(source: MapFile) -> Pictures:
     """Return a map's pictures, the one to be seen first."""
     layers = source.layers
-    looks = [("orthophoto", ortho_overview)] if any(name.startswith("ortho") for name in layers) else []
-    looks += [("hillshade", relief_overview), *([("classes", class_overview)] if "terrain" in layers else [])]
-    return {name: picture_uri(look(source), exact=name == "classes") for name, look in looks}
+    looks = [("orthophoto", draw_ortho)] if any(name.startswith("ortho") for name in layers) else []
+    looks += [("hillshade", draw_relief), *([("classes", draw_classes)] if "terrain" in layers else [])]
+    return {name: make_picture_uri(look(source), exact=name == "classes") for name, look in looks}

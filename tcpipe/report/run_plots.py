@@ -10,11 +10,11 @@ import pyarrow as pa
 
 from tcpipe.formats.json_files import Json
 from tcpipe.report.colours import DROPPED, KEPT, LINE_COLOURS, REASON_COLOURS
-from tcpipe.report.plots import Plot, add_cursor, new_plot, say_of
-from tcpipe.report.run_series import Floats, Series, Spans, Timeline, thinned
-from tcpipe.tables.arrays import texts
-from tcpipe.tables.bits import DropReason, name_of
-from tcpipe.tables.columns import floats, integers
+from tcpipe.report.plots import Plot, add_cursor, make_plot, say_of
+from tcpipe.report.run_series import Floats, Series, Spans, Timeline, downsample_columns
+from tcpipe.tables.arrays import to_texts
+from tcpipe.tables.bits import DropReason, flag_name
+from tcpipe.tables.columns import to_floats, to_integers
 from tcpipe.tables.facts import StageFacts
 
 REASON_WORDS = {
@@ -67,7 +67,7 @@ _OF_TRACK = (
 )
 
 
-def lines_of(series: Sequence[Series]) -> list[Line]:
+def make_lines(series: Sequence[Series]) -> list[Line]:
     """Return what can be drawn, in the order of the page."""
     there = {(each.name, column) for each in series for column in each.columns}
     lines = [line for line in _OF_TRACK if (line.series, line.column) in there]
@@ -92,23 +92,23 @@ def time_plots(
     timeline: Timeline, *, lines: Sequence[Line], spans: Spans, facts: StageFacts, refused: pa.Table, labels: bool
 ) -> TimePlots:
     """Return the plots; ``labels`` is whether the run has segments."""
-    first = _gates(timeline, spans, facts)
+    first = _draw_masks(timeline, spans, facts)
     plots = [first]
     told: list[Json] = []
     for name in dict.fromkeys(line.plot for line in lines):
         mine = [line for line in lines if line.plot == name]
         coloured = {line: LINE_COLOURS[number % len(LINE_COLOURS)] for number, line in enumerate(mine)}
         legend = {line.name: colour for line, colour in coloured.items()} if len(mine) > 1 else {}
-        plot = _panel(name, f"{name} [{_UNITS[name]}]", first, legend=legend)
+        plot = _draw_panel(name, f"{name} [{_UNITS[name]}]", first, legend=legend)
         at = [f"line {len(told) + number}" for number in range(len(mine))]
         for place, colour in reversed(list(zip(at, coloured.values(), strict=True))):  # the first lies on top
             ends = {"t": [0.0, 1.0], "y": [0.0, 1.0]}  # until the page's script has unpacked the series
             plot.figure.line("t", "y", color=colour, line_width=1.3, source=ends, name=place)
         told += [line.told(colour) for line, colour in coloured.items()]
         plots.append(plot)
-    plots += [*_refusals(timeline, first, refused), *_clocks(timeline, first, facts)]
+    plots += [*_draw_rejections(timeline, first, refused), *_draw_clocks(timeline, first, facts)]
     if labels:
-        plots.append(_labels(first))
+        plots.append(_draw_labels(first))
     for plot in plots[1:-1]:
         plot.figure.xaxis.visible = False
     plots[-1].figure.xaxis.axis_label = "time since the track began [s]"
@@ -126,10 +126,10 @@ def time_plots(
     return TimePlots(tuple(plots), tuple(told))
 
 
-def _panel(
+def _draw_panel(
     name: str, label: str, first: Plot | None, *, legend: Mapping[str, str] | None = None, alt: str = ""
 ) -> Plot:
-    plot = new_plot(
+    plot = make_plot(
         name,
         alt=alt or f"{label} over time; zoom and cursor are those of all plots here.",
         axes=("", label),
@@ -143,12 +143,12 @@ def _panel(
     return plot
 
 
-def _gates(timeline: Timeline, spans: Spans, facts: StageFacts) -> Plot:
+def _draw_masks(timeline: Timeline, spans: Spans, facts: StageFacts) -> Plot:
     """Return the plot of what is kept and why the rest is not, and of what was found at a time; its axis is everyone's."""
-    found = list(_events(timeline, facts))
+    found = list(_iterate_events(timeline, facts))
     there = [bit for bit in DropReason if (spans.bits & int(bit)).any()]
-    rows = ["kept", *(name_of(bit).replace("_", " ") for bit in there), *dict.fromkeys(row for row, *_ in found)]
-    plot = new_plot(
+    rows = ["kept", *(flag_name(bit).replace("_", " ") for bit in there), *dict.fromkeys(row for row, *_ in found)]
+    plot = make_plot(
         "gates",
         alt="What of the drive is kept, by which gates the rest is dropped, and when sensors were refused or disagreed.",
         axes=("", ""),
@@ -174,7 +174,7 @@ def _gates(timeline: Timeline, spans: Spans, facts: StageFacts) -> Plot:
     return plot
 
 
-def _events(timeline: Timeline, facts: StageFacts) -> Iterator[tuple[str, float, float, str]]:
+def _iterate_events(timeline: Timeline, facts: StageFacts) -> Iterator[tuple[str, float, float, str]]:
     """Yield what has a time: its row, beginning and end [s], and what is to be said."""
     for each in facts.audit.disagreements if facts.audit else ():
         role = each.sensor.replace("_", " ")
@@ -203,15 +203,15 @@ def _events(timeline: Timeline, facts: StageFacts) -> Iterator[tuple[str, float,
         )
 
 
-def _refusals(timeline: Timeline, first: Plot, refused: pa.Table) -> Iterator[Plot]:
+def _draw_rejections(timeline: Timeline, first: Plot, refused: pa.Table) -> Iterator[Plot]:
     """Yield how far off refused measurements are; those without a χ² stand at 1."""
     if not refused.num_rows:
         return
-    roles, t_s = texts(refused.column("role")), timeline.seconds(integers(refused, "stamp_ns"))
-    ratio = floats(refused, "normalized_innovation_squared") / floats(refused, "threshold")
+    roles, t_s = to_texts(refused.column("role")), timeline.seconds(to_integers(refused, "stamp_ns"))
+    ratio = to_floats(refused, "normalized_innovation_squared") / to_floats(refused, "threshold")
     names = sorted(set(roles.tolist()))
     colours = {role: LINE_COLOURS[number % len(LINE_COLOURS)] for number, role in enumerate(names)}
-    plot = _panel(
+    plot = _draw_panel(
         "refused",
         "√(χ²/gate)",
         first,
@@ -221,7 +221,7 @@ def _refusals(timeline: Timeline, first: Plot, refused: pa.Table) -> Iterator[Pl
     for role, colour in colours.items():
         mine = (roles == role) & np.isfinite(t_s)
         if mine.any():
-            shown = thinned(role, t_s[mine], {"y": (6, _allowed(ratio[mine]))}, most=_MOST_REFUSED)
+            shown = downsample_columns(role, t_s[mine], {"y": (6, _compute_allowed(ratio[mine]))}, most=_MOST_REFUSED)
             plot.figure.scatter(
                 shown.t_s.astype(np.float32), shown.columns["y"][1].astype(np.float32), size=5, color=colour, alpha=0.7
             )
@@ -229,11 +229,11 @@ def _refusals(timeline: Timeline, first: Plot, refused: pa.Table) -> Iterator[Pl
     yield plot
 
 
-def _allowed(ratio: Floats) -> Floats:
+def _compute_allowed(ratio: Floats) -> Floats:
     return np.sqrt(np.where(np.isfinite(ratio), ratio, 1.0))
 
 
-def _clocks(timeline: Timeline, first: Plot, facts: StageFacts) -> Iterator[Plot]:
+def _draw_clocks(timeline: Timeline, first: Plot, facts: StageFacts) -> Iterator[Plot]:
     """Yield how late sensors' stamps are over the run, pair by pair, where that is determined."""
     found = facts.clock_offsets
     start_s = {each.number: each.start_s for each in timeline.epochs}
@@ -244,7 +244,7 @@ def _clocks(timeline: Timeline, first: Plot, facts: StageFacts) -> Iterator[Plot
     colours = {name: LINE_COLOURS[number % len(LINE_COLOURS)] for number, name in enumerate(names)}
     if not pairs:
         return
-    plot = _panel("clocks", "late by [ms], ± σ", first, legend=colours)
+    plot = _draw_panel("clocks", "late by [ms], ± σ", first, legend=colours)
     for pair, name in zip(pairs, names, strict=True):
         at_s, offset_s, std_s = np.array(pair.windows).T
         at_s = at_s + start_s[found.epoch]
@@ -255,8 +255,8 @@ def _clocks(timeline: Timeline, first: Plot, facts: StageFacts) -> Iterator[Plot
     yield plot
 
 
-def _labels(first: Plot) -> Plot:
-    plot = _panel(
+def _draw_labels(first: Plot) -> Plot:
+    plot = _draw_panel(
         "label plot",
         "w [W], ± σ",
         first,
@@ -270,8 +270,8 @@ def _labels(first: Plot) -> Plot:
     return plot
 
 
-def reasons_told() -> Json:
+def make_reasons_data() -> Json:
     """Return the gates' bits, names, words and colours as the page's script reads them."""
     return [
-        [int(bit), name_of(bit).replace("_", " "), words, REASON_COLOURS[bit]] for bit, words in REASON_WORDS.items()
+        [int(bit), flag_name(bit).replace("_", " "), words, REASON_COLOURS[bit]] for bit, words in REASON_WORDS.items()
     ]

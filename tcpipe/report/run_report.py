@@ -16,20 +16,33 @@ from tcpipe.formats.json_files import Json
 from tcpipe.formats.parquet import read_table
 from tcpipe.formats.run_documents import Manifest, RunJson
 from tcpipe.formats.stored_runs import RunDirectory
-from tcpipe.motion.remedies import losses_of
+from tcpipe.motion.remedies import find_largest_losses
 from tcpipe.report.colours import DOUBTED, FAINT, KEPT, UNUSED
-from tcpipe.report.label_sections import QUALITY_WORDS, budget_sections, physics_sections, quality_sections
-from tcpipe.report.packed import Column, packed, shown_to
+from tcpipe.report.column_packing import Column, make_shown_column, pack_columns
+from tcpipe.report.label_sections import (
+    QUALITY_WORDS,
+    make_budget_sections,
+    make_physics_sections,
+    make_quality_sections,
+)
 from tcpipe.report.page import Link, Number, Section, render_page
-from tcpipe.report.plots import Plot, histogram, label_histograms, new_plot, waterfall
+from tcpipe.report.plots import Plot, draw_histogram, draw_waterfall, label_histograms, make_plot
 from tcpipe.report.run_map import Pictures, RunMap, run_map
-from tcpipe.report.run_plots import SPEED_ROLES, Line, lines_of, reasons_told, time_plots
-from tcpipe.report.run_sensors import sensor_sections
-from tcpipe.report.run_series import Series, Timeline, gate_spans, rail_series, speed_series, timeline_of, track_series
+from tcpipe.report.run_plots import SPEED_ROLES, Line, make_lines, make_reasons_data, time_plots
+from tcpipe.report.run_sensors import make_sensor_sections
+from tcpipe.report.run_series import (
+    Series,
+    Timeline,
+    find_mask_spans,
+    make_rail_series,
+    make_speed_series,
+    make_timeline,
+    track_series,
+)
 from tcpipe.report.verdict import show_verdict
 from tcpipe.store import Store
-from tcpipe.tables.bits import Quality, name_of
-from tcpipe.tables.columns import floats, integers
+from tcpipe.tables.bits import Quality, flag_name
+from tcpipe.tables.columns import to_floats, to_integers
 from tcpipe.tables.facts import PhysicsFacts
 
 _PAGE = "report.html"
@@ -61,12 +74,12 @@ def run_report(store: Store, run: RunDirectory, of_maps: MutableMapping[str, Pic
     label = manifest.info.report.facts.label
     known = store.run_json(run.run_id)
     ledger, total = manifest.ledger_m, sum(manifest.ledger_m.values())
-    bits = integers(segments, "quality")
-    quality = {name_of(bit): int(((bits & int(bit)) != 0).sum()) for bit in Quality}
-    drawn = _drawn(store, run, track, segments, refused=refused, of_maps={} if of_maps is None else of_maps)
+    bits = to_integers(segments, "quality")
+    quality = {flag_name(bit): int(((bits & int(bit)) != 0).sum()) for bit in Quality}
+    drawn = _draw_run(store, run, track, segments, refused=refused, of_maps={} if of_maps is None else of_maps)
     return render_page(
         title=f"Run {run.run_id}",
-        lead=f"Robot {manifest.robot}, recipe {run.recipe_id}, {_source_line(known)}",
+        lead=f"Robot {manifest.robot}, recipe {run.recipe_id}, {_format_source(known)}",
         verdict=show_verdict(manifest.verdict, manifest.info.report.findings),
         numbers=[
             Number(f"{total:.0f} m", "driven"),
@@ -78,37 +91,37 @@ def run_report(store: Store, run: RunDirectory, of_maps: MutableMapping[str, Pic
         links=[Link("All runs of the store", f"../../../{_PAGE}")] if store.place.size(_PAGE) is not None else [],
         sections=[
             *drawn.sections,
-            _losses(ledger),
+            _make_losses_section(ledger),
             *_label_sections(segments, label.physics if label else None, manifest.robot),
-            *(quality_sections(quality, "segments") if segments.num_rows else []),
-            *budget_sections(run.facts.energy_budget),
-            *sensor_sections(known, manifest, refused),
-            *_damage(manifest.damage),
-            _provenance(run, manifest, known),
+            *(make_quality_sections(quality, "segments") if segments.num_rows else []),
+            *make_budget_sections(run.facts.energy_budget),
+            *make_sensor_sections(known, manifest, refused),
+            *_make_damage_sections(manifest.damage),
+            _make_provenance_section(run, manifest, known),
         ],
         script="run.js" if drawn.data is not None else "",
         data=drawn.data,
     )
 
 
-def _losses(ledger_m: Mapping[str, float]) -> Section:
+def _make_losses_section(ledger_m: Mapping[str, float]) -> Section:
     """Return where the distance went, and how to lose less of it."""
     rows = [
         (loss.reason.replace("_", " "), f"{loss.metres:.1f}", f"{100 * loss.share:.1f} %", advise_on_loss(loss.reason))
-        for loss in losses_of([ledger_m])
+        for loss in find_largest_losses([ledger_m])
     ]
     text = "Kept and dropped distances add up to the odometer."
     header = ("lost to", "metres", "of all", "to lose less")
-    return Section("Where every metre went", text, header=header, rows=rows, plots=[waterfall(ledger_m)])
+    return Section("Where every metre went", text, header=header, rows=rows, plots=[draw_waterfall(ledger_m)])
 
 
-def _damage(lines: Sequence[str]) -> list[Section]:
+def _make_damage_sections(lines: Sequence[str]) -> list[Section]:
     rows = [(line,) for line in lines]
     text = "Where messages are lost or may be."
     return [Section("Damage of the log", text, header=("what",), rows=rows, folded=True)] if rows else []
 
 
-def _source_line(known: RunJson | None) -> str:
+def _format_source(known: RunJson | None) -> str:
     if known is None:
         return "source unknown"
     return f"from {', '.join(known.source.paths)} ({known.source.size_bytes / 1e6:.1f} MB)"
@@ -119,7 +132,7 @@ def _mean(segments: pa.Table, name: str, unit: str, *, digits: int = 0) -> str:
     return f"{values.mean():.{digits}f} {unit}" if len(values) else "none"
 
 
-def _drawn(
+def _draw_run(
     store: Store,
     run: RunDirectory,
     track: pa.Table,
@@ -132,11 +145,11 @@ def _drawn(
     if not track.num_rows:
         return _Drawn((Section("The drive", "No track: the log holds nothing that could be fused."),))
     info = run.manifest.info
-    timeline = timeline_of(track)
+    timeline = make_timeline(track)
     ground = run_map(store, run, track, segments, located=info.datum is not None, of_maps=of_maps)
-    told, lost = _told_series(store, run, timeline)
+    told, lost = _read_series(store, run, timeline)
     series = [track_series(track, timeline, ground.track_xy_m), *told]
-    lines, spans = lines_of(series), gate_spans(track, timeline, info.rate_hz)
+    lines, spans = make_lines(series), find_mask_spans(track, timeline, info.rate_hz)
     over_time = time_plots(
         timeline, lines=lines, spans=spans, facts=info.report.facts, refused=refused, labels=bool(segments.num_rows)
     )
@@ -148,11 +161,11 @@ def _drawn(
         "series": {each.name: each.json for each in series},
         "lines": over_time.lines,
         "spans": spans.json,
-        "segments": _segments(segments, timeline, ground),
-        "starts": [str(stamp) for stamp in integers(segments, "start_ns").tolist()],
-        "reasons": reasons_told(),
+        "segments": _make_segments_data(segments, timeline, ground),
+        "starts": [str(stamp) for stamp in to_integers(segments, "start_ns").tolist()],
+        "reasons": make_reasons_data(),
         "quality": [[int(bit), words] for bit, words in QUALITY_WORDS.items()],
-        "flags": _distinguishing(integers(segments, "quality")),
+        "flags": _find_distinguishing_bits(to_integers(segments, "quality")),
         "ground": list(ground.ground),
         "step_m": _STEP_M,
         "kept": KEPT,
@@ -169,12 +182,12 @@ def _drawn(
     return _Drawn(sections, data)
 
 
-def _distinguishing(bits: NDArray[np.int64]) -> int:
+def _find_distinguishing_bits(bits: NDArray[np.int64]) -> int:
     """Return the quality bits that some segments carry and others do not: a bit of all of them says nothing on a map."""
     return int(np.bitwise_or.reduce(bits, initial=0) & ~np.bitwise_and.reduce(bits)) if len(bits) else 0
 
 
-def _told_series(store: Store, run: RunDirectory, timeline: Timeline) -> tuple[list[Series], list[str]]:
+def _read_series(store: Store, run: RunDirectory, timeline: Timeline) -> tuple[list[Series], list[str]]:
     """Return what sensors told, from the streams, and in words what of it is lost."""
     try:
         known = store.run_json(run.run_id)
@@ -186,10 +199,10 @@ def _told_series(store: Store, run: RunDirectory, timeline: Timeline) -> tuple[l
         return [], [f"What sensors told cannot be drawn: {error.problems[0]}."]
     if not tables and run.manifest.counts.messages.get("gnss"):
         return [], ["What sensors told is gone or was read anew: of it the track's columns are drawn."]
-    series = list(rail_series(tables.pop("power"), timeline)) if "power" in tables else []
+    series = list(make_rail_series(tables.pop("power"), timeline)) if "power" in tables else []
     if "gnss_velocity" in tables:
         tables.pop("gnss", None)
-    speeds = [speed_series(role, table, timeline) for role, table in tables.items()]
+    speeds = [make_speed_series(role, table, timeline) for role, table in tables.items()]
     return [*series, *(each for each in speeds if each is not None)], []
 
 
@@ -210,26 +223,26 @@ def _time_text(series: Sequence[Series], lines: Sequence[Line]) -> str:
     return text
 
 
-def _segments(segments: pa.Table, timeline: Timeline, ground: RunMap) -> Json:
+def _make_segments_data(segments: pa.Table, timeline: Timeline, ground: RunMap) -> Json:
     """Return what the page holds of each segment."""
-    epoch = integers(segments, "epoch")
+    epoch = to_integers(segments, "epoch")
     columns: dict[str, Column] = {
-        name: ("f32", timeline.seconds(integers(segments, f"{name}_ns"), epoch)) for name in ("start", "end")
+        name: ("f32", timeline.seconds(to_integers(segments, f"{name}_ns"), epoch)) for name in ("start", "end")
     }
     for number, end in enumerate(ground.ends_xy_m):
         columns |= {f"{axis}{number}": ("steps", end[:, place]) for place, axis in enumerate("xy")}
     for name, (value, std, digits) in _LABELS.items():
         columns[name], columns[f"{name}_std"] = (
-            shown_to(digits, floats(segments, value)),
-            ("half", floats(segments, std)),
+            make_shown_column(digits, to_floats(segments, value)),
+            ("half", to_floats(segments, std)),
         )
-    rise_m = floats(segments, "end_z_m") - floats(segments, "start_z_m")
-    columns["slope"] = "f32", np.degrees(np.arctan2(rise_m, floats(segments, "chord_m")))
+    rise_m = to_floats(segments, "end_z_m") - to_floats(segments, "start_z_m")
+    columns["slope"] = "f32", np.degrees(np.arctan2(rise_m, to_floats(segments, "chord_m")))
     columns["turn"], columns["turn_std"] = (
-        ("f32", np.degrees(floats(segments, f"turn_{part}rad"))) for part in ("", "std_")
+        ("f32", np.degrees(to_floats(segments, f"turn_{part}rad"))) for part in ("", "std_")
     )
-    columns["residual"] = "f32", floats(segments, "power_watt") - floats(segments, "physics_power_watt")
-    return packed(columns | {"quality": ("u16", integers(segments, "quality"))})
+    columns["residual"] = "f32", to_floats(segments, "power_watt") - to_floats(segments, "physics_power_watt")
+    return pack_columns(columns | {"quality": ("u16", to_integers(segments, "quality"))})
 
 
 def _label_sections(segments: pa.Table, physics: PhysicsFacts | None, robot: str) -> Iterator[Section]:
@@ -238,20 +251,20 @@ def _label_sections(segments: pa.Table, physics: PhysicsFacts | None, robot: str
     yield Section("Labels", "One value a segment.", plots=label_histograms(segments, "segments", prefix="of "))
     if physics is None or not physics.fitted:
         return
-    yield from physics_sections({} if physics.fit is None else {robot: physics.fit})
+    yield from make_physics_sections({} if physics.fit is None else {robot: physics.fit})
     text = (
         f"Power minus what standing, drivetrain, rolling, grade and turning, fitted on this run, predict ({physics.segments} segments): "
         f"terrain and errors. {physics.outliers} segments are further than four standard deviations of "
         f"{physics.residual_watt:.0f} W."
     )
-    yield Section("What physics leaves unexplained", text, plots=list(_physics_plots(segments)))
+    yield Section("What physics leaves unexplained", text, plots=list(_draw_physics(segments)))
 
 
-def _physics_plots(segments: pa.Table) -> Iterator[Plot]:
-    measured, fitted = floats(segments, "power_watt"), floats(segments, "physics_power_watt")
-    yield histogram("residual", measured - fitted, label="w - physics [W]", of_what="segments")
+def _draw_physics(segments: pa.Table) -> Iterator[Plot]:
+    measured, fitted = to_floats(segments, "power_watt"), to_floats(segments, "physics_power_watt")
+    yield draw_histogram("residual", measured - fitted, label="w - physics [W]", of_what="segments")
     known = np.isfinite(measured) & np.isfinite(fitted)
-    plot = new_plot(
+    plot = make_plot(
         "physics",
         alt="Power of each segment as it was measured against what physics predicts; on the line they are equal.",
         axes=("w by physics [W]", "w [W]"),
@@ -267,7 +280,7 @@ def _physics_plots(segments: pa.Table) -> Iterator[Plot]:
     yield plot
 
 
-def _provenance(run: RunDirectory, manifest: Manifest, known: RunJson | None) -> Section:
+def _make_provenance_section(run: RunDirectory, manifest: Manifest, known: RunJson | None) -> Section:
     """Return what the run is made from: enough to make it again."""
     tags: Mapping[str, str] = manifest.tags
     rows = [

@@ -14,18 +14,23 @@ from tcpipe.tables.facts import ClockOffset, StageFacts
 from tcpipe.tables.findings import Finding, select_findings
 
 
-def sensor_sections(known: RunJson | None, manifest: Manifest, rejections: pa.Table) -> list[Section]:
+def make_sensor_sections(known: RunJson | None, manifest: Manifest, rejections: pa.Table) -> list[Section]:
     """Return the sections on topics, on trust, on disagreement and on clocks; ``known`` is None where the run's ``run.json`` is lost."""
     facts = manifest.info.report.facts
-    topics = [] if known is None else [_topics(known, manifest.counts)]
-    return [*topics, *_trust(facts, rejections), *_disagreements(facts), *_clocks(facts, manifest.info.report.findings)]
+    topics = [] if known is None else [_make_topics_section(known, manifest.counts)]
+    return [
+        *topics,
+        *_make_trust_sections(facts, rejections),
+        *_make_disagreement_sections(facts),
+        *_make_clock_sections(facts, manifest.info.report.findings),
+    ]
 
 
 def _name(role: str) -> str:
     return role.replace("_", " ")
 
 
-def _topics(known: RunJson, counts: Counts) -> Section:
+def _make_topics_section(known: RunJson, counts: Counts) -> Section:
     rows = [
         (
             _name(role),
@@ -42,7 +47,7 @@ def _topics(known: RunJson, counts: Counts) -> Section:
     return Section("Sensors", "Which topic played which role.", header=header, rows=rows)
 
 
-def _trust(facts: StageFacts, rejections: pa.Table) -> list[Section]:
+def _make_trust_sections(facts: StageFacts, rejections: pa.Table) -> list[Section]:
     """Return how many measurements each sensor gave, how many were refused and why, and how well the rest fitted."""
     counts, nis = (facts.fuse.measurements, facts.fuse.nis_mean) if facts.fuse else ({}, {})
     lost = Counter(zip(rejections.column("role").to_pylist(), rejections.column("reason").to_pylist(), strict=True))
@@ -68,7 +73,7 @@ def _trust(facts: StageFacts, rejections: pa.Table) -> list[Section]:
     return [Section("How far each sensor was believed", text, header=header, rows=rows)]
 
 
-def _disagreements(facts: StageFacts) -> list[Section]:
+def _make_disagreement_sections(facts: StageFacts) -> list[Section]:
     """Return when sensors and track disagree, by what and how much; where they never do, nothing."""
     found = facts.audit.disagreements if facts.audit else ()
     if not found:
@@ -90,7 +95,7 @@ def _disagreements(facts: StageFacts) -> list[Section]:
     return [Section("Where sensors disagree with the track", text, header=header, rows=rows)]
 
 
-def _clocks(facts: StageFacts, findings: Sequence[Finding]) -> list[Section]:
+def _make_clock_sections(facts: StageFacts, findings: Sequence[Finding]) -> list[Section]:
     """Return how late each sensor's stamps are; where nothing could be compared, nothing."""
     found = facts.clock_offsets
     steps = [f"{step.step_s:+.3f} s at log time {step.log_time_ns} ns" for step in facts.clock_steps]
@@ -102,8 +107,8 @@ def _clocks(facts: StageFacts, findings: Sequence[Finding]) -> list[Section]:
             _name(role),
             f"{1e3 * (each.offset_s or 0.0):+.0f} ms",
             f"{2e3 * (each.std_s or 0.0):.0f} ms",
-            _drift(each),
-            _correction(role, findings),
+            _format_drift(each),
+            _format_correction(role, findings),
         )
         for role, each in sorted(offsets.items())
     ]
@@ -116,7 +121,7 @@ def _clocks(facts: StageFacts, findings: Sequence[Finding]) -> list[Section]:
     return [Section("Clocks", text.strip(), header=header, rows=rows)]
 
 
-def _correction(role: str, findings: Sequence[Finding]) -> str:
+def _format_correction(role: str, findings: Sequence[Finding]) -> str:
     """Return what corrects a sensor's clock, as the findings on it propose."""
     clocks = select_findings(findings, "time-offset", "clock-drift", "clocks-differ")
     found = [finding for finding in clocks if finding.subject.name == role]
@@ -124,7 +129,7 @@ def _correction(role: str, findings: Sequence[Finding]) -> str:
     return "; ".join(remedies) or ", ".join(finding.code.replace("-", " ") for finding in found)
 
 
-def _drift(offset: ClockOffset) -> str:
+def _format_drift(offset: ClockOffset) -> str:
     if offset.drift_s_per_h is None or offset.drift_std_s_per_h is None:
         return ""
     return f"{1e3 * offset.drift_s_per_h:+.0f} ± {2e3 * offset.drift_std_s_per_h:.0f} ms/h"

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from tcpipe.formats.json_files import Json
 from tcpipe.geometry.datum import enu_from_geodetic
-from tcpipe.report.packed import Column, packed, shown_to
-from tcpipe.tables.arrays import texts
-from tcpipe.tables.columns import floats, integers
+from tcpipe.report.column_packing import Column, make_shown_column, pack_columns
+from tcpipe.tables.arrays import to_texts
+from tcpipe.tables.columns import to_floats, to_integers
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -64,9 +64,9 @@ class Timeline:
         return found
 
 
-def timeline_of(track: pa.Table) -> Timeline:
+def make_timeline(track: pa.Table) -> Timeline:
     """Return the axis of a track that has rows."""
-    stamps, epochs = integers(track, "stamp_ns"), integers(track, "epoch")
+    stamps, epochs = to_integers(track, "stamp_ns"), to_integers(track, "epoch")
     found: list[Epoch] = []
     start_s = 0.0
     for number in dict.fromkeys(epochs.tolist()):
@@ -91,10 +91,10 @@ class Series:
     def json(self) -> Json:
         """The series as the page's script reads it."""
         times: dict[str, Column] = {"t": ("f32", self.t_s)}
-        return {"packed": packed(times | dict(self.columns)), "gap_s": self.gap_s}
+        return {"packed": pack_columns(times | dict(self.columns)), "gap_s": self.gap_s}
 
 
-def thinned(
+def downsample_columns(
     name: str,
     t_s: Floats,
     values: Mapping[str, tuple[int, Floats]],
@@ -112,13 +112,13 @@ def thinned(
     if per_bin > 1:
         begin = np.arange(0, count, per_bin)
         rows = np.stack([begin, np.minimum(begin + per_bin // 2, count - 1)], axis=1).ravel()
-    kept = {key: shown_to(digits, _extremes(part, per_bin)) for key, (digits, part) in values.items()}
+    kept = {key: make_shown_column(digits, _find_extremes(part, per_bin)) for key, (digits, part) in values.items()}
     kept |= {key: (kind, part[rows]) for key, (kind, part) in (sampled or {}).items()}
     period_s = float(np.median(np.diff(t_s))) if count > 1 else 1.0
     return Series(name, t_s[rows], kept, max(_GAP_PERIODS * period_s, per_bin * period_s * 2.0, 0.3), count)
 
 
-def _extremes(values: Floats, per_bin: int) -> Floats:
+def _find_extremes(values: Floats, per_bin: int) -> Floats:
     """Return the lowest and the highest of every bin in the order they occur; NaN where it holds none."""
     if per_bin == 1:
         return values
@@ -133,62 +133,71 @@ def _extremes(values: Floats, per_bin: int) -> Floats:
 def track_series(track: pa.Table, timeline: Timeline, xy_m: Floats) -> Series:
     """Return the fused track with its places in the plane of the map (N, 2); columns that hold nothing are left out."""
     values = {
-        "power": floats(track, "power_watt"),
-        "speed": floats(track, "forward_velocity_mps"),
-        "wheels": floats(track, "wheel_velocity_mps"),
-        "commanded": floats(track, "commanded_velocity_mps"),
-        "height": floats(track, "z_m"),
-        "position_std": np.hypot(floats(track, "x_std_m"), floats(track, "y_std_m")),
-        "height_std": floats(track, "z_std_m"),
-        "chord_std": floats(track, "displacement_std_1s_m"),
+        "power": to_floats(track, "power_watt"),
+        "speed": to_floats(track, "forward_velocity_mps"),
+        "wheels": to_floats(track, "wheel_velocity_mps"),
+        "commanded": to_floats(track, "commanded_velocity_mps"),
+        "height": to_floats(track, "z_m"),
+        "position_std": np.hypot(to_floats(track, "x_std_m"), to_floats(track, "y_std_m")),
+        "height_std": to_floats(track, "z_std_m"),
+        "chord_std": to_floats(track, "displacement_std_1s_m"),
     }
     told = {name: (TRACK_DIGITS[name], part) for name, part in values.items() if np.isfinite(part).any()}
-    return thinned(
-        "track", _seconds(track, timeline), told, sampled={"x": ("steps", xy_m[:, 0]), "y": ("steps", xy_m[:, 1])}
+    return downsample_columns(
+        "track",
+        _compute_seconds(track, timeline),
+        told,
+        sampled={"x": ("steps", xy_m[:, 0]), "y": ("steps", xy_m[:, 1])},
     )
 
 
-def rail_series(power: pa.Table, timeline: Timeline) -> Iterator[Series]:
+def make_rail_series(power: pa.Table, timeline: Timeline) -> Iterator[Series]:
     """Yield voltage and current of each rail as they were told."""
-    rails = texts(power.column("rail"))
+    rails = to_texts(power.column("rail"))
     for rail in dict.fromkeys(rails.tolist()):
         mine = power.filter(pa.array(rails == rail))
         for name, column, digits in (("voltage", "voltage_volt", 2), ("current", "current_amp", 3)):
-            values, t_s = floats(mine, column), _seconds(mine, timeline)
+            values, t_s = to_floats(mine, column), _compute_seconds(mine, timeline)
             known = np.isfinite(values) & np.isfinite(t_s)
             if known.any():
-                yield thinned(f"{name} {rail}", t_s[known], {name: (digits, values[known])}, most=MOST_VALUES // 2)
+                yield downsample_columns(
+                    f"{name} {rail}", t_s[known], {name: (digits, values[known])}, most=MOST_VALUES // 2
+                )
 
 
-def _seconds(table: pa.Table, timeline: Timeline) -> Floats:
-    return timeline.seconds(integers(table, "stamp_ns"), integers(table, "epoch"))
+def _compute_seconds(table: pa.Table, timeline: Timeline) -> Floats:
+    return timeline.seconds(to_integers(table, "stamp_ns"), to_integers(table, "epoch"))
 
 
-def speed_series(role: str, table: pa.Table, timeline: Timeline) -> Series | None:
+def make_speed_series(role: str, table: pa.Table, timeline: Timeline) -> Series | None:
     """Return what a sensor says of the speed [m/s]: its own, else chords over a second of its places; None without either."""
-    t_s = _seconds(table, timeline)
+    t_s = _compute_seconds(table, timeline)
     table, t_s = table.filter(pa.array(np.isfinite(t_s))), t_s[np.isfinite(t_s)]
-    speed = _told_speed(table)
+    speed = _read_speed(table)
     if not np.isfinite(speed).any():
-        t_s, speed = _chord_speed(table, t_s)
+        t_s, speed = _compute_chord_speed(table, t_s)
     known = np.isfinite(speed)
-    return thinned(role, t_s[known], {"speed": (3, speed[known])}, most=MOST_VALUES // 2) if known.any() else None
+    return (
+        downsample_columns(role, t_s[known], {"speed": (3, speed[known])}, most=MOST_VALUES // 2)
+        if known.any()
+        else None
+    )
 
 
-def _told_speed(table: pa.Table) -> Floats:
+def _read_speed(table: pa.Table) -> Floats:
     if "east_velocity_mps" in table.column_names:
-        return np.hypot(floats(table, "east_velocity_mps"), floats(table, "north_velocity_mps"))
+        return np.hypot(to_floats(table, "east_velocity_mps"), to_floats(table, "north_velocity_mps"))
     if "velocity_x_mps" in table.column_names:
-        return floats(table, "velocity_x_mps")
+        return to_floats(table, "velocity_x_mps")
     return np.full(table.num_rows, np.nan)
 
 
-def _chord_speed(table: pa.Table, t_s: Floats) -> tuple[Floats, Floats]:
+def _compute_chord_speed(table: pa.Table, t_s: Floats) -> tuple[Floats, Floats]:
     """Return times in the middle of a second, and how fast the place moved over it [m/s]."""
     if "x_m" in table.column_names:
-        xy_m = np.column_stack([floats(table, "x_m"), floats(table, "y_m")])
+        xy_m = np.column_stack([to_floats(table, "x_m"), to_floats(table, "y_m")])
     else:
-        lon, lat, alt = (floats(table, name) for name in ("lon_deg", "lat_deg", "alt_m"))
+        lon, lat, alt = (to_floats(table, name) for name in ("lon_deg", "lat_deg", "alt_m"))
         first = (float(lon[0]), float(lat[0]), float(alt[0])) if len(lon) else (0.0, 0.0, 0.0)
         xy_m = enu_from_geodetic(lon, lat, alt, datum_deg_m=first)[:, :2]
     known = np.isfinite(xy_m).all(axis=1)
@@ -211,12 +220,12 @@ class Spans:
     @property
     def json(self) -> Json:
         """The spans as the page's script reads them."""
-        return packed({"start": ("f32", self.start_s), "end": ("f32", self.end_s), "bits": ("u16", self.bits)})
+        return pack_columns({"start": ("f32", self.start_s), "end": ("f32", self.end_s), "bits": ("u16", self.bits)})
 
 
-def gate_spans(track: pa.Table, timeline: Timeline, rate_hz: float) -> Spans:
+def find_mask_spans(track: pa.Table, timeline: Timeline, rate_hz: float) -> Spans:
     """Return the stretches, kept ones (bits 0) too; a row lasts a period of the track, and where rows are missing no stretch is."""
-    t_s, bits = _seconds(track, timeline), integers(track, "dropped_by")
+    t_s, bits = _compute_seconds(track, timeline), to_integers(track, "dropped_by")
     period_s = 1.0 / rate_hz
     begin = np.flatnonzero(np.r_[True, (np.diff(bits) != 0) | (np.diff(t_s) > 1.5 * period_s)])
     last = np.r_[begin[1:], len(t_s)] - 1

@@ -12,11 +12,11 @@ from tcpipe.cost.held_out import PHYSICS_UNITS
 from tcpipe.formats.finding_lines import advise_on_loss, describe_finding, format_group
 from tcpipe.formats.index_files import RunFacts
 from tcpipe.formats.json_files import Json
-from tcpipe.motion.remedies import StoreLoss, losses_of
+from tcpipe.motion.remedies import StoreLoss, find_largest_losses
 from tcpipe.report.colours import CLASS_COLOURS
 from tcpipe.report.page import Link, Number, Section, render_page
-from tcpipe.report.plots import Plot, new_plot, waterfall
-from tcpipe.report.store_runs import FIELDS, StoredRun, StoreFacts, dataset_names, day, runs_shown
+from tcpipe.report.plots import Plot, draw_waterfall, make_plot
+from tcpipe.report.store_runs import FIELDS, StoredRun, StoreFacts, format_day, name_datasets, sort_runs
 from tcpipe.report.verdict import show_groups
 from tcpipe.tables.findings import select_problems
 
@@ -30,31 +30,31 @@ _MORE_COLUMNS = ("noise floor of E [%]", "verdict", "findings")
 
 def store_report(store: StoreFacts) -> str:
     """Return the HTML page of a store."""
-    runs = runs_shown(store)
+    runs = sort_runs(store)
     current = [run for run in runs if run.is_current]
-    losses = losses_of(run.facts.ledger_m for run in current if run.facts)
+    losses = find_largest_losses(run.facts.ledger_m for run in current if run.facts)
     return render_page(
         title=f"Store {store.where}",
         lead="All its runs. Sums, drift and losses are of the recipe that most runs are of, superseded runs left aside.",
         verdict=show_groups(store.verdict, store.groups, len(current), findings=store.changes) if current else None,
-        numbers=_numbers(store, current),
+        numbers=_make_numbers(store, current),
         warnings=[]
         if current
         else ["No run can be used. 'tcpipe ingest LOG' adds runs; 'tcpipe preflight LOG' checks a log."],
         sections=[
-            *_table(store, runs),
-            *_drift(runs),
-            *_losses(current, losses),
-            *_findings(store, current),
-            *_datasets(store, runs),
-            *_trouble(store, runs),
+            *_make_table_section(store, runs),
+            *_make_drift_sections(runs),
+            *_make_losses_sections(current, losses),
+            *_make_findings_sections(store, current),
+            *_make_datasets_sections(store, runs),
+            *_make_problem_sections(store, runs),
         ],
         script="store.js" if runs else "",
-        data=_data(store, runs),
+        data=_make_data(store, runs),
     )
 
 
-def _numbers(store: StoreFacts, current: Sequence[StoredRun]) -> list[Number]:
+def _make_numbers(store: StoreFacts, current: Sequence[StoredRun]) -> list[Number]:
     facts = [run.facts for run in current if run.facts]
     driven_m, kept_m = math.fsum(of.driven_m for of in facts), math.fsum(of.kept_m for of in facts)
     floors = [run.floor for run in current if run.floor is not None]
@@ -69,14 +69,14 @@ def _numbers(store: StoreFacts, current: Sequence[StoredRun]) -> list[Number]:
     ]
 
 
-def _table(store: StoreFacts, runs: Sequence[StoredRun]) -> list[Section]:
+def _make_table_section(store: StoreFacts, runs: Sequence[StoredRun]) -> list[Section]:
     if not runs:
         return []
-    names = dataset_names(store.datasets)
+    names = name_datasets(store.datasets)
     rows = [
         (
             Link(run.run_id, run.href) if run.href else run.run_id,
-            day(run.facts),
+            format_day(run.facts),
             run.facts.robot if run.facts else "",
             f"superseded by {run.facts.superseded_by}" if run.facts and run.facts.superseded_by else run.state,
             ", ".join(names[number] for number in run.datasets),
@@ -90,7 +90,7 @@ def _table(store: StoreFacts, runs: Sequence[StoredRun]) -> list[Section]:
     return [Section("All runs", text, header=(*_COLUMNS, *_MORE_COLUMNS), rows=rows, controls="store.html")]
 
 
-def _drift(runs: Sequence[StoredRun]) -> list[Section]:
+def _make_drift_sections(runs: Sequence[StoredRun]) -> list[Section]:
     """Return the plots over time; the page's script fills them."""
     dated = [run for run in runs if run.facts and run.facts.start_ns is not None]
     labels = {}
@@ -106,13 +106,13 @@ def _drift(runs: Sequence[StoredRun]) -> list[Section]:
         return []
     plots = list[Plot]()
     for name, label in labels.items():
-        plots.append(_over_time(name, label, dict(_robots(runs)), plots))
+        plots.append(_draw_over_time(name, label, dict(_list_robots(runs)), plots))
     text = "A point is a run. A box drawn here chooses runs in the table, and the table's filters choose here."
     return [Section("Over the nights", text, plots=plots, controls="store-drift.html" if "term" in labels else "")]
 
 
-def _over_time(name: str, label: str, colours: dict[str, str], drawn: Sequence[Plot]) -> Plot:
-    plot = new_plot(
+def _draw_over_time(name: str, label: str, colours: dict[str, str], drawn: Sequence[Plot]) -> Plot:
+    plot = make_plot(
         f"drift {name}",
         alt=f"{label} of every run over the time at which it began; the table has the same figures.",
         axes=("", label),
@@ -140,13 +140,13 @@ def _over_time(name: str, label: str, colours: dict[str, str], drawn: Sequence[P
     return plot
 
 
-def _robots(runs: Sequence[StoredRun]) -> list[tuple[str, str]]:
+def _list_robots(runs: Sequence[StoredRun]) -> list[tuple[str, str]]:
     """Return the robots with their colours, those of most runs first."""
     counts = Counter(run.facts.robot for run in runs if run.facts)
     return [(robot, CLASS_COLOURS[n % len(CLASS_COLOURS)]) for n, (robot, _) in enumerate(counts.most_common())]
 
 
-def _losses(current: Sequence[StoredRun], losses: Sequence[StoreLoss]) -> list[Section]:
+def _make_losses_sections(current: Sequence[StoredRun], losses: Sequence[StoreLoss]) -> list[Section]:
     ledger_m = Counter[str]()
     for run in current:
         ledger_m.update(run.facts.ledger_m if run.facts else {})
@@ -164,17 +164,17 @@ def _losses(current: Sequence[StoredRun], losses: Sequence[StoreLoss]) -> list[S
     ]
     header = ("lost to", "metres", "of all", "runs", "to lose less")
     text = "The largest losses, and how to lose less; 'tcpipe status' lists the same."
-    return [Section("Where every metre went", text, header=header, rows=rows, plots=[waterfall(ledger_m)])]
+    return [Section("Where every metre went", text, header=header, rows=rows, plots=[draw_waterfall(ledger_m)])]
 
 
-def _findings(store: StoreFacts, current: Sequence[StoredRun]) -> list[Section]:
+def _make_findings_sections(store: StoreFacts, current: Sequence[StoredRun]) -> list[Section]:
     rows = [(of.severity, format_group(of, len(current)), len(of.of), ", ".join([*of.of][:3])) for of in store.groups]
     header = ("severity", "finding", "runs", "such as")
     text = "Of the current runs, by code, the worst first; each run's own page has all of its own."
     return [Section("Findings by code", text, header=header, rows=rows)] if rows else []
 
 
-def _datasets(store: StoreFacts, runs: Sequence[StoredRun]) -> list[Section]:
+def _make_datasets_sections(store: StoreFacts, runs: Sequence[StoredRun]) -> list[Section]:
     here = {(run.run_id, run.recipe_id) for run in runs if run.is_current}
     rows = [
         (
@@ -189,7 +189,7 @@ def _datasets(store: StoreFacts, runs: Sequence[StoredRun]) -> list[Section]:
     return [Section("Datasets", "Those that were built of this store.", header=header, rows=rows)] if rows else []
 
 
-def _trouble(store: StoreFacts, runs: Sequence[StoredRun]) -> list[Section]:
+def _make_problem_sections(store: StoreFacts, runs: Sequence[StoredRun]) -> list[Section]:
     """Return the logs without a run, and the runs that are damaged or cannot be read."""
     rows = [(of.log, of.state, of.why) for of in store.failed]
     for run in runs:
@@ -209,13 +209,13 @@ def _describe_problem(facts: RunFacts) -> str:
     return next(iter(facts.damage), "") or describe_finding(select_problems(facts.findings)[0])
 
 
-def _data(store: StoreFacts, runs: Sequence[StoredRun]) -> Json:
+def _make_data(store: StoreFacts, runs: Sequence[StoredRun]) -> Json:
     terms = sorted({term for run in runs if run.facts for term in run.facts.physics if not term.startswith("standing")})
     return {
         "fields": list(FIELDS),
         "rows": [run.row(terms) for run in runs],
-        "robots": [list(of) for of in _robots(runs)],
-        "datasets": dataset_names(store.datasets),
+        "robots": [list(of) for of in _list_robots(runs)],
+        "datasets": name_datasets(store.datasets),
         "codes": [f"{of.severity}: {of.code.replace('-', ' ')}" for of in store.groups],
         "terms": [f"{term} [{PHYSICS_UNITS.get(term.partition(' ')[0], '')}]" for term in terms],
     }

@@ -102,8 +102,8 @@ class StoredRun:
             ", ".join(f"{key}={value}" for key, value in of.tags.items()),
             of.segments,
             round(of.driven_m, 1),
-            _percent(self.used_share),
-            _percent(self.floor),
+            _compute_percent(self.used_share),
+            _compute_percent(self.floor),
             of.verdict.worst,
             sum(finding.severity != "note" for finding in of.findings),
             list(self.datasets),
@@ -132,9 +132,9 @@ FIELDS = (
 )
 
 
-def runs_shown(store: StoreFacts) -> list[StoredRun]:
+def sort_runs(store: StoreFacts) -> list[StoredRun]:
     """Return every ingestion, what began last first; then those without a segment, and those that cannot be read."""
-    found, ruling = store.found, ruling_key(store.found)
+    found, ruling = store.found, find_recipe_key(store.found)
     members, codes = dict[tuple[str, str], list[int]](), dict[str, list[int]]()
     for number, dataset in enumerate(store.datasets):
         for part in dataset.runs if dataset.there else ():
@@ -163,7 +163,7 @@ def runs_shown(store: StoreFacts) -> list[StoredRun]:
     ]
 
 
-def ruling_key(found: Ingestions) -> str | None:
+def find_recipe_key(found: Ingestions) -> str | None:
     """Return the key of the recipe that most runs are of; of two that the latest run is of."""
     keys = Counter(run.facts.ingest_key for run in found.finished)
     latest = {run.facts.ingest_key: max(0, run.facts.start_ns or 0) for run in found.finished}
@@ -179,17 +179,17 @@ def _state(facts: RunFacts, ruling: str | None, *, acknowledged: bool) -> str:
     return f"{wrong}{', acknowledged' * acknowledged}" if wrong else "current"
 
 
-def _percent(share: float | None) -> float | None:
+def _compute_percent(share: float | None) -> float | None:
     return None if share is None else round(100.0 * share, 2)
 
 
-def dataset_names(datasets: Sequence[StoredDataset]) -> list[str]:
+def name_datasets(datasets: Sequence[StoredDataset]) -> list[str]:
     """Return what each dataset is called: the last part of its path, all of it where two would be called the same."""
     short = [PurePosixPath(of.out).name for of in datasets]
     return [name if short.count(name) == 1 else of.out for name, of in zip(short, datasets, strict=True)]
 
 
-def day(facts: RunFacts | None) -> str:
+def format_day(facts: RunFacts | None) -> str:
     """Return when the first segment of a run begins, to the minute, UTC; "" where that is not known."""
     if facts is None or facts.start_ns is None:
         return ""

@@ -6,7 +6,7 @@ from collections.abc import Hashable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import TypeVar
 
-from tcpipe.formats.finding_lines import MOST_LINES, FindingGroup, block_lines, format_finding, format_group
+from tcpipe.formats.finding_lines import MOST_LINES, FindingGroup, format_finding, format_group, format_remedy_blocks
 from tcpipe.tables.catalogue import AFFECTED, Affected, Severity
 from tcpipe.tables.findings import Finding, sort_findings
 from tcpipe.tables.verdicts import Grade, Verdict
@@ -53,13 +53,13 @@ def show_mixed_groups(verdict: Verdict, groups: Iterable[tuple[FindingGroup[K], 
 
 def _show_groups(groups: Iterable[tuple[FindingGroup[K], int | None, str]]) -> list[ShownFinding]:
     return [
-        ShownFinding(group.severity, format_group(group, total, what), "\n".join(block_lines(group.findings)))
+        ShownFinding(group.severity, format_group(group, total, what), "\n".join(format_remedy_blocks(group.findings)))
         for group, total, what in groups
     ]
 
 
 def _show(findings: Iterable[Finding]) -> list[ShownFinding]:
-    return [ShownFinding(of.severity, format_finding(of), "\n".join(block_lines([of]))) for of in findings]
+    return [ShownFinding(of.severity, format_finding(of), "\n".join(format_remedy_blocks([of]))) for of in findings]
 
 
 def _make_box(verdict: Verdict, lines: Sequence[ShownFinding], labels: Sequence[Affected] = AFFECTED) -> VerdictBox:

@@ -166,7 +166,7 @@ class Profiles:
         return Profiles({**others.robots, **self.robots}, [*self.power_sources, *there])
 
 
-def fields_of(text: str) -> list[FieldPath]:
+def parse_fields(text: str) -> list[FieldPath]:
     """Return the fields that a source's text joins by + and -."""
     found = []
     for part in re.finditer(r"([+-]?)([^+-]+)", text):

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from tcpipe.errors import UsageError
-from tcpipe.geometry.rotation import inverse, product, quat_from_matrix, rotation_vector_from_quat
-from tcpipe.simulation.robot import SimulatedRobot, correlated_noise, drive_along
+from tcpipe.geometry.rotation import invert, multiply, quat_from_matrix, rotation_vector_from_quat
+from tcpipe.simulation.robot import SimulatedRobot, drive_along, make_correlated_noise
 from tcpipe.simulation.route import (
     PATH_GRID_M,
     Leg,
@@ -23,13 +23,13 @@ from tcpipe.simulation.route import (
     Reverse,
     Stuck,
     Turn,
-    leg_path,
-    moving_average,
-    straight_path,
+    compute_moving_average,
+    make_leg_path,
+    make_straight_path,
 )
 from tcpipe.simulation.site import Float
 from tcpipe.simulation.truth import Truth
-from tcpipe.simulation.wheels import rolling_resistance
+from tcpipe.simulation.wheels import compute_rolling_resistance
 from tcpipe.simulation.world import World
 
 STEP_NS = 5_000_000
@@ -52,7 +52,7 @@ class _Stretch:
     command_radps: Float
 
 
-def drive(
+def simulate_drive(
     world: World,
     plan: Sequence[Manoeuvre],
     *,
@@ -70,7 +70,7 @@ def drive(
     stretches: list[_Stretch] = []
     place, yaw = np.array(start_m, dtype=np.float64), start_yaw_rad
     for manoeuvre in plan:
-        for stretch in _stretches(world, manoeuvre, place, yaw, robot=robot, weave_m=weave_m, rng=rng):
+        for stretch in _plan_stretches(world, manoeuvre, place, yaw, robot=robot, weave_m=weave_m, rng=rng):
             stretches.append(stretch)
             place, yaw = stretch.uv_m[-1], float(stretch.yaw_map_rad[-1])
     if not stretches:
@@ -78,10 +78,10 @@ def drive(
     joined = _Stretch(
         *(np.concatenate([getattr(stretch, name) for stretch in stretches]) for name in _Stretch.__dataclass_fields__)
     )
-    return _truth(world, joined, robot, start_ns, rng)
+    return _make_truth(world, joined, robot, start_ns, rng)
 
 
-def _stretches(
+def _plan_stretches(
     world: World,
     manoeuvre: Manoeuvre,
     place: Float,
@@ -93,30 +93,32 @@ def _stretches(
 ) -> list[_Stretch]:
     match manoeuvre:
         case Pause(duration_s):
-            return [_still(place, yaw, duration_s)]
+            return [_make_halt(place, yaw, duration_s)]
         case Stuck(duration_s):
             return [
-                _still(
+                _make_halt(
                     place, yaw, duration_s, wheel_mps=0.6 * robot.max_velocity_mps, command_mps=robot.max_velocity_mps
                 )
             ]
         case Turn(angle_rad):
             return [_turn(place, yaw, angle_rad, robot)]
         case Reverse(distance_m, command):
-            path = straight_path(place, yaw + np.pi, distance_m)
-            return [_along(world, path, command, robot, backwards=True)]
+            path = make_straight_path(place, yaw + np.pi, distance_m)
+            return [_drive_path(world, path, command, robot, backwards=True)]
         case Leg():
             weave = (rng.uniform(5.0, 12.0, 3), rng.uniform(0.0, 2.0 * np.pi, 3), np.full(3, 1.0 / 3.0))
-            path = leg_path(place, manoeuvre, weave=weave, weave_m=weave_m)
+            path = make_leg_path(place, manoeuvre, weave=weave, weave_m=weave_m)
             wanted = float(path.at(np.zeros(1))[1][0])
             turn = (wanted - yaw + np.pi) % (2.0 * np.pi) - np.pi
             first = (
-                [_turn(place, yaw, turn, robot), _still(place, yaw + turn, 0.5)] if abs(turn) > _SMALL_TURN_RAD else []
+                [_turn(place, yaw, turn, robot), _make_halt(place, yaw + turn, 0.5)]
+                if abs(turn) > _SMALL_TURN_RAD
+                else []
             )
-            return [*first, _along(world, path, manoeuvre.command, robot, backwards=False)]
+            return [*first, _drive_path(world, path, manoeuvre.command, robot, backwards=False)]
 
 
-def _still(
+def _make_halt(
     place: Float, yaw: float, duration_s: float, *, wheel_mps: float = 0.0, command_mps: float = 0.0
 ) -> _Stretch:
     count = max(round(duration_s / _DT_S), 1)
@@ -139,7 +141,7 @@ def _turn(place: Float, yaw: float, angle_rad: float, robot: SimulatedRobot) -> 
     return _Stretch(np.tile(place, (t.size, 1)), yaw + angle_rad * swept / swept[-1], zero, zero, zero, command)
 
 
-def _along(world: World, path: Path, command: float, robot: SimulatedRobot, *, backwards: bool) -> _Stretch:
+def _drive_path(world: World, path: Path, command: float, robot: SimulatedRobot, *, backwards: bool) -> _Stretch:
     """Drive a path from rest to rest."""
     grid = np.arange(0.0, path.length_m, PATH_GRID_M)
     uv, direction = path.at(grid)
@@ -148,12 +150,12 @@ def _along(world: World, path: Path, command: float, robot: SimulatedRobot, *, b
     gx, gy = world.gradient(x, y)
     slope = np.arctan((gx * np.cos(direction) + gy * np.sin(direction)) / scale)
     ground = robot.ground_table()[world.terrain_class(x, y)]
-    speed_factor = robot.speed_factor(moving_average(ground[:, 0], robot.wheelbase_m), np.sin(slope))
+    speed_factor = robot.speed_factor(compute_moving_average(ground[:, 0], robot.wheelbase_m), np.sin(slope))
     if robot.wheels is not None:
-        usual = moving_average(ground[:, 2], robot.wheelbase_m)
-        excess = rolling_resistance(world, robot, x, y, direction) - usual
+        usual = compute_moving_average(ground[:, 2], robot.wheelbase_m)
+        excess = compute_rolling_resistance(world, robot, x, y, direction) - usual
         speed_factor = speed_factor * (1.0 - robot.wheels.slowdown * excess)
-    slip = robot.slip(moving_average(ground[:, 1], robot.wheelbase_m), np.sin(slope))
+    slip = robot.slip(compute_moving_average(ground[:, 1], robot.wheelbase_m), np.sin(slope))
     command_mps = command * robot.max_velocity_mps
     brake_at_m = max(path.stop_m - _BRAKE_BEFORE_M * command, 0.1)
     s, wheel, steps = drive_along(
@@ -173,7 +175,9 @@ def _along(world: World, path: Path, command: float, robot: SimulatedRobot, *, b
     return _Stretch(uv, yaw, sign * wheel, np.interp(s, grid, slip), commanded, commanded_rate)
 
 
-def _truth(world: World, driven: _Stretch, robot: SimulatedRobot, start_ns: int, rng: np.random.Generator) -> Truth:
+def _make_truth(
+    world: World, driven: _Stretch, robot: SimulatedRobot, start_ns: int, rng: np.random.Generator
+) -> Truth:
     site = world.site
     x, y = driven.uv_m[:, 0] + site.west_m, driven.uv_m[:, 1] + site.south_m
     alt = world.height_m(x, y) + site.geoid_m
@@ -183,19 +187,19 @@ def _truth(world: World, driven: _Stretch, robot: SimulatedRobot, start_ns: int,
     gx, gy = world.gradient(x, y)
     rise_east = (gx * np.cos(rotation) - gy * np.sin(rotation)) / scale
     rise_north = (gx * np.sin(rotation) + gy * np.cos(rotation)) / scale
-    quat = _tangent_pose(driven.yaw_map_rad + rotation, rise_east, rise_north)
+    quat = _compute_tangent_pose(driven.yaw_map_rad + rotation, rise_east, rise_north)
     yaw = driven.yaw_map_rad + rotation
     slope = np.arctan(rise_east * np.cos(yaw) + rise_north * np.sin(yaw))
     stamp_ns = start_ns + np.arange(x.size, dtype=np.int64) * STEP_NS
     terrain = world.terrain_class(x, y)
-    rolling = rolling_resistance(world, robot, x, y, driven.yaw_map_rad)
-    voltage, current, right_share = _power(robot, driven, slope, rolling, rng)
+    rolling = compute_rolling_resistance(world, robot, x, y, driven.yaw_map_rad)
+    voltage, current, right_share = _compute_power(robot, driven, slope, rolling, rng)
     step = np.diff(enu, axis=0)
     energy_step = 0.5 * (voltage[1:] * current[1:] + voltage[:-1] * current[:-1]) * _DT_S
     return Truth(
         stamp_ns=stamp_ns, x_map_m=x, y_map_m=y, lon_deg=lon, lat_deg=lat, alt_m=alt, enu_m=enu, quat_xyzw=quat,
         velocity_enu_mps=np.gradient(enu, _DT_S, axis=0),
-        angular_velocity_radps=_angular_velocity(quat),
+        angular_velocity_radps=_compute_angular_velocity(quat),
         forward_velocity_mps=driven.wheel_mps * (1.0 - driven.slip),
         wheel_velocity_mps=driven.wheel_mps, slip=driven.slip, slope_rad=slope, terrain_class=terrain,
         command_velocity_mps=driven.command_mps, command_yaw_rate_radps=driven.command_radps,
@@ -205,7 +209,7 @@ def _truth(world: World, driven: _Stretch, robot: SimulatedRobot, start_ns: int,
     )  # fmt: skip
 
 
-def _tangent_pose(yaw_rad: Float, rise_east: Float, rise_north: Float) -> Float:
+def _compute_tangent_pose(yaw_rad: Float, rise_east: Float, rise_north: Float) -> Float:
     """Return enu_from_base_link: x looks along the yaw on the surface, z along its normal."""
     c, s = np.cos(yaw_rad), np.sin(yaw_rad)
     forward = np.stack([c, s, rise_east * c + rise_north * s], axis=-1)
@@ -215,21 +219,21 @@ def _tangent_pose(yaw_rad: Float, rise_east: Float, rise_north: Float) -> Float:
     return quat_from_matrix(np.stack([forward, np.cross(up, forward), up], axis=-1))
 
 
-def _angular_velocity(quat_xyzw: Float) -> Float:
+def _compute_angular_velocity(quat_xyzw: Float) -> Float:
     """Return the body rates [rad/s] by central differences on the rotation group."""
     before = np.concatenate([quat_xyzw[:1], quat_xyzw[:-1]])
     after = np.concatenate([quat_xyzw[1:], quat_xyzw[-1:]])
     span_s = np.full(quat_xyzw.shape[0], 2.0 * _DT_S)
     span_s[[0, -1]] = _DT_S
-    return np.asarray(rotation_vector_from_quat(product(inverse(before), after)) / span_s[:, None])
+    return np.asarray(rotation_vector_from_quat(multiply(invert(before), after)) / span_s[:, None])
 
 
-def _power(
+def _compute_power(
     robot: SimulatedRobot, driven: _Stretch, slope: Float, rolling: Float, rng: np.random.Generator
 ) -> tuple[Float, Float, Float]:
     """Return voltage, propulsion current, and the right driver's share of it."""
     rolling = np.where(driven.slip == 1.0, _DIGGING_RESISTANCE, rolling)
-    noise = correlated_noise(rng.standard_normal(slope.size), float(np.exp(-_DT_S / robot.resistance_noise_s)))
+    noise = make_correlated_noise(rng.standard_normal(slope.size), float(np.exp(-_DT_S / robot.resistance_noise_s)))
     yaw_rate = np.gradient(np.unwrap(driven.yaw_map_rad), _DT_S)
     wheel_power = robot.wheel_power_watt(
         wheel_velocity_mps=driven.wheel_mps,

@@ -54,7 +54,7 @@ class Recorder:
     """Whether /tf_static tells where the sensors sit."""
 
 
-def streams(
+def make_streams(
     readings: Mapping[str, Reading], sensors: Sensors, recorder: Recorder, *, geoid_m: float
 ) -> list[MessageStream]:
     """Return the messages of all readings (by sensor: gnss, imu, wheels, visual, power, command), transforms first."""
@@ -62,74 +62,76 @@ def streams(
     first_ns = min(
         (int(reading.log_time_ns[0]) for reading in readings.values() if reading.log_time_ns.size), default=0
     )
-    made = [_placements(topics["tf_static"], sensors, first_ns)] if recorder.placements else []
+    made = [_make_placements(topics["tf_static"], sensors, first_ns)] if recorder.placements else []
     for name, reading in readings.items():
-        made += _messages(topics[name], reading, getattr(sensors, name), recorder, geoid_m)
+        made += _make_messages(topics[name], reading, getattr(sensors, name), recorder, geoid_m)
     return made
 
 
-def _messages(topic: str, reading: Reading, sensor: object, recorder: Recorder, geoid_m: float) -> list[MessageStream]:
+def _make_messages(
+    topic: str, reading: Reading, sensor: object, recorder: Recorder, geoid_m: float
+) -> list[MessageStream]:
     match sensor:
         case Gnss():
-            made = [_gnss(topic, reading) if recorder.gnss == "fix" else _nmea(reading, geoid_m)]
+            made = [_make_gnss(topic, reading) if recorder.gnss == "fix" else _make_nmea(reading, geoid_m)]
         case Doppler():
-            made = [_doppler(topic, reading)]
+            made = [_make_doppler(topic, reading)]
         case Imu():
-            made = [_imu(topic, reading, sensor)]
+            made = [_make_imu(topic, reading, sensor)]
         case Wheels():
-            made = [_wheels(topic, reading, sensor)]
+            made = [_make_wheels(topic, reading, sensor)]
         case Visual():
-            made = [_visual(topic, reading, sensor)]
+            made = [_make_visual(topic, reading, sensor)]
         case Power():
-            made = _power(topic, reading, recorder.power)
+            made = _make_power(topic, reading, recorder.power)
         case _:
-            made = [_command(topic, reading, recorder.dialect)]
+            made = [_make_command(topic, reading, recorder.dialect)]
     return made
 
 
-def _stream(
+def _make_stream(
     topic: str, type_name: str, reading: Reading, frame: str, columns: dict[str, Any], **constants: Any
 ) -> MessageStream:
-    columns = {**_header(reading.stamp_ns), **columns}
+    columns = {**_make_header(reading.stamp_ns), **columns}
     fixed = {"header.frame_id": frame, **{name.replace("__", "."): value for name, value in constants.items()}}
     return MessageStream(topic, type_name, reading.log_time_ns, columns, fixed, publish_time_ns=reading.stamp_ns)
 
 
-def _header(stamp_ns: NDArray[np.int64]) -> dict[str, NDArray[np.int64]]:
+def _make_header(stamp_ns: NDArray[np.int64]) -> dict[str, NDArray[np.int64]]:
     sec, nanosec = np.divmod(stamp_ns, 1_000_000_000)
     return {"header.seq": np.arange(stamp_ns.size), "header.stamp.sec": sec, "header.stamp.nanosec": nanosec}
 
 
-def _vector(prefix: str, values: NDArray[np.float64], axes: str = "xyz") -> dict[str, NDArray[np.float64]]:
+def _make_vector(prefix: str, values: NDArray[np.float64], axes: str = "xyz") -> dict[str, NDArray[np.float64]]:
     return {f"{prefix}.{axis}": values[:, i] for i, axis in enumerate(axes)}
 
 
-def _gnss(topic: str, reading: Reading) -> MessageStream:
+def _make_gnss(topic: str, reading: Reading) -> MessageStream:
     values = reading.values
     columns = {"latitude": values["lat_deg"], "longitude": values["lon_deg"], "altitude": values["alt_m"]}
     columns |= {"position_covariance": values["covariance"], "position_covariance_type": values["covariance_type"]}
     columns |= {"status.status": values["status"]}
-    return _stream(topic, "sensor_msgs/msg/NavSatFix", reading, _FRAMES["gnss"], columns, status__service=1)
+    return _make_stream(topic, "sensor_msgs/msg/NavSatFix", reading, _FRAMES["gnss"], columns, status__service=1)
 
 
-def _doppler(topic: str, reading: Reading) -> MessageStream:
-    columns = _vector("twist.twist.linear", reading.values["velocity_enu_mps"])
+def _make_doppler(topic: str, reading: Reading) -> MessageStream:
+    columns = _make_vector("twist.twist.linear", reading.values["velocity_enu_mps"])
     columns |= {"twist.covariance": reading.values["covariance"]}
-    return _stream(topic, "geometry_msgs/msg/TwistWithCovarianceStamped", reading, _FRAMES["gnss"], columns)
+    return _make_stream(topic, "geometry_msgs/msg/TwistWithCovarianceStamped", reading, _FRAMES["gnss"], columns)
 
 
-def _nmea(reading: Reading, geoid_m: float) -> MessageStream:
+def _make_nmea(reading: Reading, geoid_m: float) -> MessageStream:
     """Return GGA sentences of fixed length; fixes that are none are left out."""
     kept = np.flatnonzero(reading.values["status"] >= 0)
     lon, lat, alt = (reading.values[name][kept].tolist() for name in ("lon_deg", "lat_deg", "alt_m"))
     fixes = zip(reading.stamp_ns[kept].tolist(), lat, lon, alt, strict=True)
-    sentences = [_gga(stamp_ns, *place, geoid_m=geoid_m) for stamp_ns, *place in fixes]
+    sentences = [_format_gga(stamp_ns, *place, geoid_m=geoid_m) for stamp_ns, *place in fixes]
     said = Reading(reading.stamp_ns[kept], reading.log_time_ns[kept], {})
     columns = {"sentence": np.array(sentences, "S")}
-    return _stream("/nmea_sentence", "nmea_msgs/msg/Sentence", said, _FRAMES["gnss"], columns)
+    return _make_stream("/nmea_sentence", "nmea_msgs/msg/Sentence", said, _FRAMES["gnss"], columns)
 
 
-def _gga(stamp_ns: int, lat_deg: float, lon_deg: float, alt_m: float, *, geoid_m: float) -> str:
+def _format_gga(stamp_ns: int, lat_deg: float, lon_deg: float, alt_m: float, *, geoid_m: float) -> str:
     seconds, rest = divmod(stamp_ns % 86_400_000_000_000, 1_000_000_000)
     clock = f"{seconds // 3600:02d}{seconds // 60 % 60:02d}{seconds % 60:02d}.{rest // 1_000_000:03d}"
     lat = f"{int(abs(lat_deg)):02d}{abs(lat_deg) % 1 * 60:010.7f},{'N' if lat_deg >= 0 else 'S'}"
@@ -141,13 +143,13 @@ def _gga(stamp_ns: int, lat_deg: float, lon_deg: float, alt_m: float, *, geoid_m
     return f"${body}*{checksum:02X}"
 
 
-def _imu(topic: str, reading: Reading, sensor: Imu) -> MessageStream:
-    columns = _vector("angular_velocity", reading.values["angular_velocity_radps"])
-    columns |= _vector("linear_acceleration", reading.values["specific_force_mps2"])
+def _make_imu(topic: str, reading: Reading, sensor: Imu) -> MessageStream:
+    columns = _make_vector("angular_velocity", reading.values["angular_velocity_radps"])
+    columns |= _make_vector("linear_acceleration", reading.values["specific_force_mps2"])
     if sensor.orientation:
-        columns |= _vector("orientation", reading.values["orientation_xyzw"], "xyzw")
+        columns |= _make_vector("orientation", reading.values["orientation_xyzw"], "xyzw")
     known = np.diag([1e-4, 1e-4, 1e-2]).ravel() if sensor.orientation else np.array([-1.0, *np.zeros(8)])
-    return _stream(
+    return _make_stream(
         topic, "sensor_msgs/msg/Imu", reading, _FRAMES["imu"], columns,
         orientation__w=1.0,
         orientation_covariance=known,
@@ -156,7 +158,7 @@ def _imu(topic: str, reading: Reading, sensor: Imu) -> MessageStream:
     )  # fmt: skip
 
 
-def _wheels(topic: str, reading: Reading, sensor: Wheels) -> MessageStream:
+def _make_wheels(topic: str, reading: Reading, sensor: Wheels) -> MessageStream:
     values = reading.values
     columns = {"twist.twist.linear.x": values["velocity_mps"], "twist.twist.angular.z": values["yaw_rate_radps"]}
     columns |= {"pose.pose.position.x": values["x_m"], "pose.pose.position.y": values["y_m"]}
@@ -167,29 +169,29 @@ def _wheels(topic: str, reading: Reading, sensor: Wheels) -> MessageStream:
     known = sensor.covariance == "known"
     twist = known * np.diag([sensor.std_mps**2, 1e-3, 1e6, 1e6, 1e6, sensor.yaw_rate_std_radps**2]).ravel()
     pose = known * np.diag([1e-3, 1e-3, 1e6, 1e6, 1e6, 1e-3]).ravel()
-    return _stream(
+    return _make_stream(
         topic, "nav_msgs/msg/Odometry", reading, "odom", columns,
         child_frame_id="base_link", twist__covariance=twist, pose__covariance=pose,
     )  # fmt: skip
 
 
-def _visual(topic: str, reading: Reading, sensor: Visual) -> MessageStream:
-    columns = _vector("pose.pose.position", reading.values["position_m"])
-    columns |= _vector("pose.pose.orientation", reading.values["orientation_xyzw"], "xyzw")
+def _make_visual(topic: str, reading: Reading, sensor: Visual) -> MessageStream:
+    columns = _make_vector("pose.pose.position", reading.values["position_m"])
+    columns |= _make_vector("pose.pose.orientation", reading.values["orientation_xyzw"], "xyzw")
     known = sensor.covariance == "known"
     constants: dict[str, Any] = {"pose__covariance": known * np.diag(np.full(6, 1e-2)).ravel()}
     if sensor.says == "twist":
-        columns |= _vector("twist.twist.linear", reading.values["linear_mps"])
-        columns |= _vector("twist.twist.angular", reading.values["angular_radps"])
+        columns |= _make_vector("twist.twist.linear", reading.values["linear_mps"])
+        columns |= _make_vector("twist.twist.angular", reading.values["angular_radps"])
         constants["twist__covariance"] = (
             known * np.diag([*[sensor.std_mps**2] * 3, *[sensor.yaw_rate_std_radps**2] * 3]).ravel()
         )
-    return _stream(
+    return _make_stream(
         topic, "nav_msgs/msg/Odometry", reading, "odom_visual", columns, child_frame_id=_FRAMES["visual"], **constants
     )
 
 
-def _power(topic: str, reading: Reading, power: PowerType) -> list[MessageStream]:
+def _make_power(topic: str, reading: Reading, power: PowerType) -> list[MessageStream]:
     values = reading.values
     volt, left, right, rest = (values[name] for name in ("voltage_volt", "left_amp", "right_amp", "electronics_amp"))
     match power:
@@ -198,37 +200,43 @@ def _power(topic: str, reading: Reading, power: PowerType) -> list[MessageStream
             columns |= {"left_driver_current": left, "right_driver_current": right, "mcu_and_user_port_current": rest}
             columns |= {"uptime": (reading.stamp_ns - reading.stamp_ns[0]) // 1_000_000}
             return [
-                _stream(topic, "husky_msgs/msg/HuskyStatus", reading, "base_link", columns, ros_control_loop_freq=10.0)
+                _make_stream(
+                    topic, "husky_msgs/msg/HuskyStatus", reading, "base_link", columns, ros_control_loop_freq=10.0
+                )
             ]
         case "clearpath_power":
             columns = {"measured_voltages": np.column_stack([volt, volt, volt])}
             columns |= {"measured_currents": np.column_stack([rest, left, right])}
             return [
-                _stream(topic, "clearpath_platform_msgs/msg/Power", reading, "base_link", columns, battery_connected=1)
+                _make_stream(
+                    topic, "clearpath_platform_msgs/msg/Power", reading, "base_link", columns, battery_connected=1
+                )
             ]
         case "battery_state":
             columns = {"voltage": volt, "current": -(left + right)}  # REP-147: negative when discharging
             return [
-                _stream("/battery_state", "sensor_msgs/msg/BatteryState", reading, "base_link", columns, present=True)
+                _make_stream(
+                    "/battery_state", "sensor_msgs/msg/BatteryState", reading, "base_link", columns, present=True
+                )
             ]
         case "battery_states":
             return [
-                _stream(f"/{side}_drive/battery_state", "sensor_msgs/msg/BatteryState", reading, "base_link",
+                _make_stream(f"/{side}_drive/battery_state", "sensor_msgs/msg/BatteryState", reading, "base_link",
                         {"voltage": volt, "current": amp}, present=True)
                 for side, amp in (("left", left), ("right", right))
             ]  # fmt: skip
 
 
-def _command(topic: str, reading: Reading, dialect: Dialect) -> MessageStream:
+def _make_command(topic: str, reading: Reading, dialect: Dialect) -> MessageStream:
     velocity, yaw_rate = reading.values["velocity_mps"], reading.values["yaw_rate_radps"]
     if dialect == "ros2":
         columns = {"twist.linear.x": velocity, "twist.angular.z": yaw_rate}
-        return _stream(topic, "geometry_msgs/msg/TwistStamped", reading, "base_link", columns)
+        return _make_stream(topic, "geometry_msgs/msg/TwistStamped", reading, "base_link", columns)
     columns = {"linear.x": velocity, "angular.z": yaw_rate}
     return MessageStream(topic, "geometry_msgs/msg/Twist", reading.log_time_ns, columns)
 
 
-def _placements(topic: str, sensors: Sensors, log_time_ns: int) -> MessageStream:
+def _make_placements(topic: str, sensors: Sensors, log_time_ns: int) -> MessageStream:
     placed: list[tuple[str, Mounting]] = [
         (_FRAMES[name], sensor.mounting)
         for name, sensor in (("gnss", sensors.gnss), ("imu", sensors.imu), ("visual", sensors.visual))

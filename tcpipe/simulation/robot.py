@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.compiled import kernel
+from tcpipe.compiled import compile_kernel
 from tcpipe.simulation.site import Float
 from tcpipe.simulation.world import GRASS, MUD, PAVED, UNPAVED
 from tcpipe.tables.facts import ABSENT
@@ -154,7 +154,7 @@ class SimulatedRobot:
         return voltage, propulsion_watt / voltage
 
 
-@kernel
+@compile_kernel
 def drive_along(  # noqa: PLR0917 - numba takes positional arguments
     grid_m: float,
     speed_factor: NDArray[np.float64],
@@ -198,8 +198,8 @@ def drive_along(  # noqa: PLR0917 - numba takes positional arguments
     return position, wheel, max_steps
 
 
-@kernel
-def correlated_noise(white: NDArray[np.float64], correlation: float) -> NDArray[np.float64]:
+@compile_kernel
+def make_correlated_noise(white: NDArray[np.float64], correlation: float) -> NDArray[np.float64]:
     """Return a first-order Gauss-Markov series of unit variance from white noise; ``correlation`` is that of neighbours."""
     out = np.empty_like(white)
     gain = np.sqrt(1.0 - correlation * correlation)

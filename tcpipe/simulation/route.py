@@ -78,13 +78,13 @@ class Path:
         return self.curve(s_m), np.arctan2(tangent[:, 1], tangent[:, 0])
 
 
-def leg_path(start_m: Float, leg: Leg, *, weave: tuple[Float, Float, Float], weave_m: float) -> Path:
+def make_leg_path(start_m: Float, leg: Leg, *, weave: tuple[Float, Float, Float], weave_m: float) -> Path:
     """Return the curve of ``leg`` from ``start_m``, shape (2,), in the coordinates of its waypoints.
 
     ``weave`` holds wavelengths [m], phases [rad] and weights of the sideways weaving, of total amplitude ``weave_m``.
     """
     corners = np.vstack([start_m, np.asarray(leg.waypoints_m, dtype=np.float64)])
-    curvature, straight_m = _curvature(corners, leg.radius_m)
+    curvature, straight_m = _compute_curvature(corners, leg.radius_m)
     first = corners[1] - corners[0]
     yaw = np.arctan2(first[1], first[0]) + np.concatenate(
         [[0.0], np.cumsum(curvature[:-1] + curvature[1:]) * PATH_GRID_M / 2]
@@ -94,7 +94,7 @@ def leg_path(start_m: Float, leg: Leg, *, weave: tuple[Float, Float, Float], wea
     window = np.clip(np.minimum(s, straight_m - s) / 3.0, 0.0, 1.0)
     sway = np.sin(2.0 * np.pi * s[:, None] / wavelengths + phases) @ weights
     offset = weave_m * (window * window * (3.0 - 2.0 * window)) * sway
-    middle = np.column_stack([_integral(np.cos(yaw)), _integral(np.sin(yaw))]) + corners[0]
+    middle = np.column_stack([_integrate(np.cos(yaw)), _integrate(np.sin(yaw))]) + corners[0]
     points = middle + offset[:, None] * np.column_stack([-np.sin(yaw), np.cos(yaw)])
     arc = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
     coarse = slice(None, None, 10)
@@ -102,22 +102,22 @@ def leg_path(start_m: Float, leg: Leg, *, weave: tuple[Float, Float, Float], wea
     return Path(CubicSpline(arc[coarse], points[coarse]), float(arc[coarse][-1]), stop_m)
 
 
-def straight_path(start_m: Float, direction_rad: float, distance_m: float) -> Path:
+def make_straight_path(start_m: Float, direction_rad: float, distance_m: float) -> Path:
     """Return a straight path that should be stopped on after ``distance_m``."""
     s = np.linspace(0.0, distance_m + _RUN_OUT_M, 8)
     points = start_m + s[:, None] * np.array([np.cos(direction_rad), np.sin(direction_rad)])
     return Path(CubicSpline(s, points), float(s[-1]), distance_m)
 
 
-def _integral(values: Float) -> Float:
+def _integrate(values: Float) -> Float:
     return np.concatenate([[0.0], np.cumsum(values[:-1] + values[1:]) * PATH_GRID_M / 2])
 
 
-def _curvature(corners: Float, radius_m: float) -> tuple[Float, float]:
+def _compute_curvature(corners: Float, radius_m: float) -> tuple[Float, float]:
     """Return the smoothed curvature every PATH_GRID_M, run-out included, and the length up to the last corner."""
     steps = np.diff(corners, axis=0)
     lengths = np.hypot(steps[:, 0], steps[:, 1])
-    turns = _wrapped(np.diff(np.arctan2(steps[:, 1], steps[:, 0])))
+    turns = _wrap_angle(np.diff(np.arctan2(steps[:, 1], steps[:, 0])))
     cuts = np.zeros(lengths.size + 1)
     for i, turn in enumerate(turns):
         cuts[i + 1] = min(radius_m * np.tan(abs(turn) / 2.0), 0.45 * min(lengths[i], lengths[i + 1]))
@@ -130,10 +130,10 @@ def _curvature(corners: Float, radius_m: float) -> tuple[Float, float]:
             pieces.append(np.full(count, turns[i] / (count * PATH_GRID_M)))
     straight_m = sum(piece.size for piece in pieces) * PATH_GRID_M
     pieces.append(np.zeros(round(_RUN_OUT_M / PATH_GRID_M)))
-    return moving_average(moving_average(np.concatenate(pieces), _SMOOTH_M), _SMOOTH_M), straight_m
+    return compute_moving_average(compute_moving_average(np.concatenate(pieces), _SMOOTH_M), _SMOOTH_M), straight_m
 
 
-def moving_average(values: Float, window_m: float) -> Float:
+def compute_moving_average(values: Float, window_m: float) -> Float:
     """Return the centred mean over ``window_m`` of values given every PATH_GRID_M; ends are held."""
     half = max(round(window_m / PATH_GRID_M / 2), 1)
     padded = np.concatenate([np.full(half, values[0]), values, np.full(half, values[-1])])
@@ -141,7 +141,7 @@ def moving_average(values: Float, window_m: float) -> Float:
     return np.asarray((sums[2 * half + 1 :] - sums[: -2 * half - 1]) / (2 * half + 1))
 
 
-def _wrapped(angle_rad: Float) -> Float:
+def _wrap_angle(angle_rad: Float) -> Float:
     return np.asarray((angle_rad + np.pi) % (2.0 * np.pi) - np.pi)
 
 

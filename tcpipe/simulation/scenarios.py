@@ -11,8 +11,8 @@ import numpy as np
 from tcpipe.errors import UsageError
 from tcpipe.simulation.faults import Faults
 from tcpipe.simulation.messages import Recorder
-from tcpipe.simulation.paper_site import paper_site, paper_surface
-from tcpipe.simulation.ripples import waves
+from tcpipe.simulation.paper_site import make_paper_site, make_paper_surface
+from tcpipe.simulation.random_fields import draw_waves
 from tcpipe.simulation.robot import SimulatedRobot
 from tcpipe.simulation.route import AlongRoad, Leg, Manoeuvre, Pause, Reverse, Stuck, Turn, Wander
 from tcpipe.simulation.sensors import Imu, Sensors, Visual
@@ -76,7 +76,7 @@ class Scenario:
         return _FIRST_START_NS + drive * _BETWEEN_DRIVES_NS
 
 
-def small_world(site: Site | None = None) -> World:
+def make_small_world(site: Site | None = None) -> World:
     """Return 120 m × 80 m with three hills of up to 22.5°, two roads, mud, trees, and a hole in the rasters."""
     return World(
         site=Site() if site is None else site,
@@ -87,7 +87,7 @@ def small_world(site: Site | None = None) -> World:
             Hill(92.0, 66.0, 4.2, 14.0, 9.0),
             Hill(52.0, 12.0, -2.6, 16.0, 9.0),
         ),
-        waves=waves(11, count=5, total=0.10, wavelength_m=(9.0, 22.0)),
+        waves=draw_waves(11, count=5, total=0.10, wavelength_m=(9.0, 22.0)),
         regions=(
             Band(UNPAVED, 62.0, 40.0, 1.35, 4.0, 3.0, 70.0, 0.4),
             Band(PAVED, 60.0, 24.0, 0.12, 4.6, 4.0, 85.0, 1.0),
@@ -101,29 +101,29 @@ def small_world(site: Site | None = None) -> World:
             Ellipse(OBSTACLE, 30.0, 8.0, 3.0, 1.5, 0.9),
         ),
         holes=(Ellipse(0, 118.0, 78.0, 9.0, 7.0), Ellipse(0, 71.0, 30.4, 2.2, 1.6)),
-        texture=waves(12, count=10, total=0.05, wavelength_m=(0.8, 5.0)),
-        resistance=waves(13, count=8, total=0.03, wavelength_m=(1.5, 12.0)),
+        texture=draw_waves(12, count=10, total=0.05, wavelength_m=(0.8, 5.0)),
+        resistance=draw_waves(13, count=8, total=0.03, wavelength_m=(1.5, 12.0)),
     )
 
 
-def _shown_world() -> World:
+def _make_visible_world() -> World:
     """Return the small world as a drone sees it one morning: sunlit, wet here and there, with a wood and a hedge.
 
     They stand within 5 m of the border, where no drive goes: these are the drives of the small world.
     """
-    world = small_world()
+    world = make_small_world()
     edges = (
         Band(VEGETATION, 60.0, 1.2, 0.0, 2.2, 0.5, 17.0),
         Band(TREE, 30.0, 79.6, 0.02, 3.6, 0.7, 7.3, 1.0),
         Band(TREE, 30.0, 79.2, 0.02, 3.0, 0.9, 4.1),
     )
-    surface = replace(paper_surface(), wetness=waves(31, count=16, total=1.0, wavelength_m=(4.0, 28.0)))
+    surface = replace(make_paper_surface(), wetness=draw_waves(31, count=16, total=1.0, wavelength_m=(4.0, 28.0)))
     return replace(world, regions=(*edges, *world.regions), surface=surface, sun=(0.5, 0.35, 0.79))
 
 
-def _paper() -> Scenario:
+def _make_paper() -> Scenario:
     """Drives over the paper's site, mcap and bag in turn; its western part is to train and test in."""
-    site = paper_site()
+    site = make_paper_site()
     drives = tuple(
         DriveSpec(
             f"paper_{number:02d}", tour, tour.start_m, "mcap" if number % 2 else "bag",
@@ -135,9 +135,9 @@ def _paper() -> Scenario:
     return Scenario("paper", site.world, drives, region)
 
 
-def _paper_quick() -> Scenario:
+def _make_paper_quick() -> Scenario:
     """Return the paper's robot and sensors on the small world for some minutes, with coarse rasters: to see everything run."""
-    site = paper_site()
+    site = make_paper_site()
     starts = ((14.0, 34.0), (40.0, 60.0), (110.0, 30.0))
     drives = tuple(
         DriveSpec(
@@ -146,16 +146,16 @@ def _paper_quick() -> Scenario:
         )
         for number, start in enumerate(starts, 1)
     )  # fmt: skip
-    world = replace(small_world(), surface=paper_surface(), resistance=site.world.resistance)
+    world = replace(make_small_world(), surface=make_paper_surface(), resistance=site.world.resistance)
     return Scenario("paper_quick", world, drives, _WEST, RasterSpec(0.1, 0.12, 0.1))
 
 
-def _demo() -> Scenario:
+def _make_demo() -> Scenario:
     faults = Faults.every()
     pose_only = replace(Sensors(), visual=Visual(says="pose"), imu=Imu(rate_hz=100.0, orientation=False))
     return Scenario(
         name="demo",
-        world=_shown_world(),
+        world=_make_visible_world(),
         drives=(
             DriveSpec(
                 "husky_2023-11-14_a", Wander(170.0, (110.0, 30.0)), (110.0, 30.0), "mcap", HUSKY_ROS2, Sensors(), faults
@@ -168,7 +168,7 @@ def _demo() -> Scenario:
     )
 
 
-def _hills12() -> Scenario:
+def _make_hills12() -> Scenario:
     sensors = replace(Sensors(), imu=Imu(rate_hz=200.0))
     drive = DriveSpec(
         "hills12",
@@ -179,10 +179,10 @@ def _hills12() -> Scenario:
         sensors,
         Faults.every(),
     )
-    return Scenario("hills12", small_world(), (drive,), region_m=_WEST)
+    return Scenario("hills12", make_small_world(), (drive,), region_m=_WEST)
 
 
-def tiny(
+def make_tiny(
     faults: Faults | None = None,
     *,
     container: Container = "mcap",
@@ -205,10 +205,10 @@ def tiny(
         faults if faults is not None else Faults(),
     )  # fmt: skip
     region = ((2.0, 2.0), (60.0, 2.0), (60.0, 78.0), (2.0, 78.0))
-    return Scenario("tiny", small_world(), (drive,), region, RasterSpec(0.1, 0.12, 0.1))
+    return Scenario("tiny", make_small_world(), (drive,), region, RasterSpec(0.1, 0.12, 0.1))
 
 
-def _manoeuvres() -> Scenario:
+def _make_manoeuvres() -> Scenario:
     plan = (
         Pause(3.0),
         Leg(((30.0, 34.0),)),
@@ -226,7 +226,7 @@ def _manoeuvres() -> Scenario:
     drive = DriveSpec("manoeuvres", plan, (14.0, 34.0), "mcap", HUSKY_ROS2, Sensors(), Faults())
     return Scenario(
         "manoeuvres",
-        small_world(),
+        make_small_world(),
         (drive,),
         ((2.0, 2.0), (60.0, 2.0), (60.0, 78.0), (2.0, 78.0)),
         RasterSpec(0.1, 0.12, 0.1),
@@ -234,19 +234,19 @@ def _manoeuvres() -> Scenario:
 
 
 SCENARIOS: Mapping[str, Callable[[], Scenario]] = {
-    "demo": _demo,
-    "hills12": _hills12,
-    "paper": _paper,
-    "paper_quick": _paper_quick,
-    "tiny": tiny,
-    "manoeuvres": _manoeuvres,
+    "demo": _make_demo,
+    "hills12": _make_hills12,
+    "paper": _make_paper,
+    "paper_quick": _make_paper_quick,
+    "tiny": make_tiny,
+    "manoeuvres": _make_manoeuvres,
 }
 """Scenarios by name: demo (two drives of four minutes), hills12 (twelve minutes, all faults), paper (eleven drives of 0.5 km to 1.5 km
 over a site of the paper's size), paper_quick (three short ones of the same robot), tiny (half a minute), manoeuvres (one of each, no
 faults)."""
 
 
-def scenario(name: str) -> Scenario:
+def find_scenario(name: str) -> Scenario:
     """Return a scenario by name; `UsageError` lists those there are."""
     if name not in SCENARIOS:
         raise UsageError(f"scenario {name!r} is unknown; there are {', '.join(SCENARIOS)}")

@@ -15,9 +15,9 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.geometry.rotation import inverse, product, quat_from_rotation_vector, quat_from_rpy, rotate, rpy_from_quat
+from tcpipe.geometry.rotation import invert, multiply, quat_from_rotation_vector, quat_from_rpy, rotate, rpy_from_quat
 from tcpipe.simulation.faults import Faults
-from tcpipe.simulation.robot import GRAVITY_MPS2, correlated_noise
+from tcpipe.simulation.robot import GRAVITY_MPS2, make_correlated_noise
 from tcpipe.simulation.site import Float, Site
 from tcpipe.simulation.truth import Truth
 
@@ -195,10 +195,10 @@ def record(truth: Truth, site: Site, sensors: Sensors, faults: Faults, noise: No
     }  # fmt: skip
     carried = {name: of for name in readers if (of := getattr(sensors, name)) is not None}
     readings = {name: readers[name](truth, of, faults, noise) for name, of in carried.items()}
-    readings = {name: _offset(name, reading, sensors, faults) for name, reading in readings.items()}
+    readings = {name: _offset_stamps(name, reading, sensors, faults) for name, reading in readings.items()}
     if faults.clock_step:
         middle_ns = (int(truth.stamp_ns[0]) + int(truth.stamp_ns[-1])) // 2
-        return {name: _stepped(reading, middle_ns) for name, reading in readings.items()}
+        return {name: _step_clock(reading, middle_ns) for name, reading in readings.items()}
     return readings
 
 
@@ -229,7 +229,7 @@ def read_gnss(truth: Truth, sensor: Gnss, faults: Faults, noise: Noise, *, site:
     status = np.full(stamp.size, 2, dtype=np.int8)
     keep = np.ones(stamp.size, dtype=bool)
     if faults.gnss_outage:
-        begin = _middle_ns(truth, noise("gnss.outage"), sensor.outage_s)
+        begin = _draw_begin_ns(truth, noise("gnss.outage"), sensor.outage_s)
         half = round(sensor.outage_s * 0.5e9)
         status[(stamp >= begin) & (stamp < begin + half)] = -1
         keep = (stamp < begin + half) | (stamp >= begin + 2 * half)
@@ -246,19 +246,19 @@ def read_gnss(truth: Truth, sensor: Gnss, faults: Faults, noise: Noise, *, site:
             np.int64
         )
     log_time = _log_times(stamp, sensor.delay_s, faults, noise("gnss.delay"))
-    return _repeated(_kept(Reading(said, log_time, values), keep), faults, noise("gnss.duplicates"))
+    return _repeat_readings(_keep_rows(Reading(said, log_time, values), keep), faults, noise("gnss.duplicates"))
 
 
 def read_doppler(truth: Truth, sensor: Doppler, faults: Faults, noise: Noise) -> Reading:
     """Return velocity_enu_mps of the antenna, (N, 3), and what the receiver claims of it, covariance (N, 36)."""
     stamp = _sample_times(truth, sensor.rate_hz, noise("gnss.phase"))
     place = truth.enu_m + rotate(truth.quat_xyzw, np.array(sensor.mounting.xyz_m))
-    velocity = _interpolated(np.gradient(place, truth.stamp_ns * 1e-9, axis=0), truth, stamp)
+    velocity = _interpolate(np.gradient(place, truth.stamp_ns * 1e-9, axis=0), truth, stamp)
     axes = np.array([1.0, 1.0, 2.0])
     if faults.gnss_noise:
         kept = float(np.exp(-1.0 / (sensor.rate_hz * sensor.lasts_s)))
         white = noise("doppler.lasting").standard_normal((3, stamp.size))
-        lasting = np.stack([correlated_noise(np.ascontiguousarray(row), kept) for row in white], axis=-1)
+        lasting = np.stack([make_correlated_noise(np.ascontiguousarray(row), kept) for row in white], axis=-1)
         scatter = noise("doppler.noise").standard_normal((stamp.size, 3))
         velocity = velocity + axes * (sensor.lasting_std_mps * lasting + sensor.std_mps * scatter)
     covariance = np.zeros((stamp.size, 36))
@@ -282,7 +282,7 @@ def read_wheels(truth: Truth, sensor: Wheels, faults: Faults, noise: Noise) -> R
         turning = (np.abs(velocity) > 1e-6) | (np.abs(yaw_rate) > 1e-6)  # standing encoders are exactly still
         velocity = velocity + turning * sensor.std_mps * rng.standard_normal(stamp.size)
         yaw_rate = yaw_rate + turning * sensor.yaw_rate_std_radps * rng.standard_normal(stamp.size)
-    x, y, yaw = _dead_reckoning(velocity, yaw_rate, 1.0 / sensor.rate_hz)
+    x, y, yaw = _dead_reckon(velocity, yaw_rate, 1.0 / sensor.rate_hz)
     values = {"velocity_mps": velocity, "yaw_rate_radps": yaw_rate, "x_m": x, "y_m": y, "yaw_rad": yaw}
     return _finish(stamp, sensor.delay_s, values, faults, noise, name="wheels")
 
@@ -292,14 +292,14 @@ def read_imu(truth: Truth, sensor: Imu, faults: Faults, noise: Noise) -> Reading
     stamp = _sample_times(truth, sensor.rate_hz, noise("imu.phase"))
     at = truth.at(stamp)
     place = truth.enu_m + rotate(truth.quat_xyzw, np.array(sensor.mounting.xyz_m))
-    acceleration = _interpolated(_second_difference(place, truth), truth, stamp)
-    unit_from_base = inverse(sensor.mounting.quat_xyzw())
-    enu_from_unit = product(at.quat_xyzw, sensor.mounting.quat_xyzw())
-    force = rotate(inverse(enu_from_unit), acceleration + np.array([0.0, 0.0, GRAVITY_MPS2]))
+    acceleration = _interpolate(_compute_acceleration(place, truth), truth, stamp)
+    unit_from_base = invert(sensor.mounting.quat_xyzw())
+    enu_from_unit = multiply(at.quat_xyzw, sensor.mounting.quat_xyzw())
+    force = rotate(invert(enu_from_unit), acceleration + np.array([0.0, 0.0, GRAVITY_MPS2]))
     rate = rotate(unit_from_base, at.angular_velocity_radps)
     if faults.imu_bias:
-        rate = rate + _wandering(stamp, sensor.gyro_bias_radps, noise("imu.gyro_bias"))
-        force = force + _wandering(stamp, sensor.accelerometer_bias_mps2, noise("imu.accelerometer_bias"))
+        rate = rate + _make_wandering_bias(stamp, sensor.gyro_bias_radps, noise("imu.gyro_bias"))
+        force = force + _make_wandering_bias(stamp, sensor.accelerometer_bias_mps2, noise("imu.accelerometer_bias"))
     if faults.imu_noise:
         rate = rate + sensor.gyro_std_radps * noise("imu.gyro_noise").standard_normal(rate.shape)
         force = force + sensor.accelerometer_std_mps2 * noise("imu.accelerometer_noise").standard_normal(force.shape)
@@ -312,7 +312,7 @@ def read_imu(truth: Truth, sensor: Imu, faults: Faults, noise: Noise) -> Reading
     if faults.imu_noise:
         error = sensor.orientation_std_rad * noise("imu.orientation").standard_normal((3, stamp.size))
         roll, pitch, yaw = roll + error[0], pitch + error[1], yaw + error[2]
-    orientation = product(quat_from_rpy(roll, pitch, yaw), sensor.mounting.quat_xyzw())
+    orientation = multiply(quat_from_rpy(roll, pitch, yaw), sensor.mounting.quat_xyzw())
     values: dict[str, Any] = {
         "angular_velocity_radps": rate,
         "specific_force_mps2": force,
@@ -327,9 +327,9 @@ def read_visual(truth: Truth, sensor: Visual, faults: Faults, noise: Noise) -> R
     at = truth.at(stamp)
     base_from_camera = sensor.mounting.quat_xyzw()
     lever = np.array(sensor.mounting.xyz_m)
-    body_velocity = rotate(inverse(at.quat_xyzw), at.velocity_enu_mps) + np.cross(at.angular_velocity_radps, lever)
-    linear = rotate(inverse(base_from_camera), body_velocity)
-    angular = rotate(inverse(base_from_camera), at.angular_velocity_radps)
+    body_velocity = rotate(invert(at.quat_xyzw), at.velocity_enu_mps) + np.cross(at.angular_velocity_radps, lever)
+    linear = rotate(invert(base_from_camera), body_velocity)
+    angular = rotate(invert(base_from_camera), at.angular_velocity_radps)
     wrong = np.zeros_like(linear)
     if faults.visual_scale:
         linear = linear * sensor.scale
@@ -342,8 +342,8 @@ def read_visual(truth: Truth, sensor: Visual, faults: Faults, noise: Noise) -> R
         hit = rng.random(stamp.size) < sensor.outlier_share
         wrong = wrong + hit[:, None] * sensor.outlier_mps * rng.standard_normal(linear.shape)
     linear = linear + wrong
-    keep = _but_for(stamp, truth, noise("visual.dropouts"), sensor.dropout_s) if faults.visual_dropouts else None
-    position, orientation = _camera_pose(at, sensor, faults, wrong, noise)
+    keep = _remove_stretch(stamp, truth, noise("visual.dropouts"), sensor.dropout_s) if faults.visual_dropouts else None
+    position, orientation = _make_camera_pose(at, sensor, faults, wrong, noise)
     values: dict[str, Any] = {"linear_mps": linear, "angular_radps": angular}
     values |= {"position_m": position, "orientation_xyzw": orientation}
     return _finish(stamp, sensor.delay_s, values, faults, noise, name="visual", keep=keep)
@@ -373,7 +373,7 @@ def read_power(truth: Truth, sensor: Power, faults: Faults, noise: Noise) -> Rea
         last = np.maximum(np.searchsorted(read_ns, stamp, side="right") - 1, 0)
         values = {name: reading[last] for name, reading in values.items()}
     values["electronics_amp"] = sensor.electronics_watt / values["voltage_volt"]
-    keep = _but_for(stamp, truth, noise("power.gap"), sensor.gap_s) if faults.power_gap else None
+    keep = _remove_stretch(stamp, truth, noise("power.gap"), sensor.gap_s) if faults.power_gap else None
     return _finish(stamp, sensor.delay_s, values, faults, noise, name="power", keep=keep)
 
 
@@ -402,8 +402,8 @@ def _finish(
 ) -> Reading:
     reading = Reading(stamp, _log_times(stamp, delay_s, faults, noise(f"{name}.delay")), values)
     if keep is not None:
-        reading = _kept(reading, keep)
-    return _repeated(reading, faults, noise(f"{name}.duplicates"))
+        reading = _keep_rows(reading, keep)
+    return _repeat_readings(reading, faults, noise(f"{name}.duplicates"))
 
 
 def _sample_times(truth: Truth, rate_hz: float, rng: np.random.Generator) -> NDArray[np.int64]:
@@ -422,12 +422,12 @@ def _log_times(stamp: NDArray[np.int64], delay_s: float, faults: Faults, rng: np
     return np.asarray(stamp + np.round(late_s * 1e9).astype(np.int64))
 
 
-def _kept(reading: Reading, keep: NDArray[np.bool_]) -> Reading:
+def _keep_rows(reading: Reading, keep: NDArray[np.bool_]) -> Reading:
     values = {name: values[keep] for name, values in reading.values.items()}
     return Reading(reading.stamp_ns[keep], reading.log_time_ns[keep], values)
 
 
-def _repeated(reading: Reading, faults: Faults, rng: np.random.Generator) -> Reading:
+def _repeat_readings(reading: Reading, faults: Faults, rng: np.random.Generator) -> Reading:
     if not faults.duplicates:
         return reading
     times = 1 + (rng.random(reading.stamp_ns.size) < 0.002)
@@ -435,7 +435,7 @@ def _repeated(reading: Reading, faults: Faults, rng: np.random.Generator) -> Rea
     return Reading(np.repeat(reading.stamp_ns, times), np.repeat(reading.log_time_ns, times), values)
 
 
-def _offset(name: str, reading: Reading, sensors: Sensors, faults: Faults) -> Reading:
+def _offset_stamps(name: str, reading: Reading, sensors: Sensors, faults: Faults) -> Reading:
     """Return the reading with header stamps late by its sensor's constant, if that fault is on; the recorder's clock is right."""
     if not getattr(faults, f"{_SINGULAR.get(name, name)}_clock_offset", False):
         return reading
@@ -445,47 +445,49 @@ def _offset(name: str, reading: Reading, sensors: Sensors, faults: Faults) -> Re
 _SINGULAR = {"wheels": "wheel"}
 
 
-def _stepped(reading: Reading, middle_ns: int) -> Reading:
+def _step_clock(reading: Reading, middle_ns: int) -> Reading:
     return replace(
         reading, stamp_ns=np.where(reading.stamp_ns < middle_ns, reading.stamp_ns, reading.stamp_ns + CLOCK_STEP_NS)
     )
 
 
-def _middle_ns(truth: Truth, rng: np.random.Generator, length_s: float) -> int:
+def _draw_begin_ns(truth: Truth, rng: np.random.Generator, length_s: float) -> int:
     """Return when something of that length begins, somewhere in the middle half of the drive."""
     span = int(truth.stamp_ns[-1] - truth.stamp_ns[0])
     return int(truth.stamp_ns[0] + rng.uniform(0.25, 0.75) * max(span - length_s * 1e9, 0.0))
 
 
-def _but_for(stamp: NDArray[np.int64], truth: Truth, rng: np.random.Generator, length_s: float) -> NDArray[np.bool_]:
+def _remove_stretch(
+    stamp: NDArray[np.int64], truth: Truth, rng: np.random.Generator, length_s: float
+) -> NDArray[np.bool_]:
     """Return which messages are left when some stretch of that length is missing."""
-    begin = _middle_ns(truth, rng, length_s)
+    begin = _draw_begin_ns(truth, rng, length_s)
     return (stamp < begin) | (stamp >= begin + round(length_s * 1e9))
 
 
-def _dead_reckoning(velocity: Float, yaw_rate: Float, dt_s: float) -> tuple[Float, Float, Float]:
+def _dead_reckon(velocity: Float, yaw_rate: Float, dt_s: float) -> tuple[Float, Float, Float]:
     yaw = np.concatenate([[0.0], np.cumsum(yaw_rate[1:] + yaw_rate[:-1]) * dt_s / 2])
     step_x, step_y = velocity * np.cos(yaw) * dt_s, velocity * np.sin(yaw) * dt_s
     return np.cumsum(step_x) - step_x[0], np.cumsum(step_y) - step_y[0], (yaw + np.pi) % (2 * np.pi) - np.pi
 
 
-def _second_difference(place_m: Float, truth: Truth) -> Float:
+def _compute_acceleration(place_m: Float, truth: Truth) -> Float:
     dt_s = float(truth.stamp_ns[1] - truth.stamp_ns[0]) * 1e-9
     acceleration = np.zeros_like(place_m)
     acceleration[1:-1] = (place_m[2:] - 2.0 * place_m[1:-1] + place_m[:-2]) / dt_s**2
     return acceleration
 
 
-def _interpolated(values: Float, truth: Truth, stamp: NDArray[np.int64]) -> Float:
+def _interpolate(values: Float, truth: Truth, stamp: NDArray[np.int64]) -> Float:
     return np.stack([np.interp(stamp, truth.stamp_ns, column) for column in values.T], axis=-1)
 
 
-def _wandering(stamp: NDArray[np.int64], size: float, rng: np.random.Generator) -> Float:
+def _make_wandering_bias(stamp: NDArray[np.int64], size: float, rng: np.random.Generator) -> Float:
     """Return a constant of about ``size`` per axis that drifts by a fifth of it with a correlation time of 100 s, shape (N, 3)."""
     constant = size * np.sign(rng.standard_normal(3)) * rng.uniform(0.6, 1.2, 3)
     step_s = float(np.median(np.diff(stamp))) * 1e-9
     white = rng.standard_normal((3, stamp.size))
-    drift = [correlated_noise(np.ascontiguousarray(row), float(np.exp(-step_s / 100.0))) for row in white]
+    drift = [make_correlated_noise(np.ascontiguousarray(row), float(np.exp(-step_s / 100.0))) for row in white]
     return constant + 0.2 * size * np.stack(drift, axis=-1)
 
 
@@ -498,17 +500,19 @@ def _mean_before(truth: Truth, values: Float, stamp: NDArray[np.int64], period_n
     return np.asarray(area / np.maximum((stamp - start) * 1e-9, 1e-12))
 
 
-def _camera_pose(at: Truth, sensor: Visual, faults: Faults, wrong_mps: Float, noise: Noise) -> tuple[Float, Float]:
+def _make_camera_pose(at: Truth, sensor: Visual, faults: Faults, wrong_mps: Float, noise: Noise) -> tuple[Float, Float]:
     """Return the camera's drifting pose: increments of the true pose, scaled, with the velocity errors integrated."""
     base_from_camera = sensor.mounting.quat_xyzw()
-    enu_from_camera = product(at.quat_xyzw, base_from_camera)
+    enu_from_camera = multiply(at.quat_xyzw, base_from_camera)
     place = at.enu_m + rotate(at.quat_xyzw, np.array(sensor.mounting.xyz_m))
     drift = np.zeros((at.stamp_ns.size, 3))
     if faults.visual_noise:
         white = noise("visual.rotation").standard_normal((at.stamp_ns.size, 3))
         drift = np.cumsum(white, axis=0) * sensor.yaw_rate_std_radps / sensor.rate_hz
-    start_from_camera = product(inverse(enu_from_camera[0]), product(enu_from_camera, quat_from_rotation_vector(drift)))
-    moved = rotate(inverse(enu_from_camera[:-1]), np.diff(place, axis=0))
+    start_from_camera = multiply(
+        invert(enu_from_camera[0]), multiply(enu_from_camera, quat_from_rotation_vector(drift))
+    )
+    moved = rotate(invert(enu_from_camera[:-1]), np.diff(place, axis=0))
     moved = moved * (sensor.scale if faults.visual_scale else 1.0) + wrong_mps[:-1] / sensor.rate_hz
     steps = rotate(start_from_camera[:-1], moved)
     return np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)]), start_from_camera

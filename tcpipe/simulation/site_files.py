@@ -12,15 +12,15 @@ from numpy.typing import NDArray
 
 from tcpipe import __version__
 from tcpipe.errors import UsageError
-from tcpipe.formats.atomic import atomic_directory, clear_beside, write_text
+from tcpipe.formats.atomic import clear_beside, write_atomic_directory, write_text
 from tcpipe.formats.json_files import to_json, write_json
 from tcpipe.formats.logs.writing import write_bag, write_mcap, write_rosbag2
 from tcpipe.formats.maps.geotiff import write_geotiff
 from tcpipe.formats.parquet import read_table, write_table
-from tcpipe.simulation.drive import drive
-from tcpipe.simulation.messages import streams
+from tcpipe.simulation.drive import simulate_drive
+from tcpipe.simulation.messages import make_streams
 from tcpipe.simulation.scenarios import DriveSpec, RasterSpec, Scenario
-from tcpipe.simulation.scenarios import scenario as scenario_by_name
+from tcpipe.simulation.scenarios import find_scenario as scenario_by_name
 from tcpipe.simulation.sensors import Noise, Reading, record
 from tcpipe.simulation.truth import Truth
 from tcpipe.simulation.world import World
@@ -63,45 +63,45 @@ def simulate(out: Path, *, scenario: str | Scenario = "demo", seed: int = 1) -> 
     chosen = scenario_by_name(scenario) if isinstance(scenario, str) else scenario
     about = {"seed": seed, "datum": chosen.world.site.datum, "scenario": chosen, "tcpipe_version": __version__}
     clear_beside(out)
-    site = _site_at(out, chosen)
-    if _holds(site, about):
+    site = _read_site(out, chosen)
+    if _is_complete(site, about):
         return replace(site, unchanged=True)
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise UsageError(f"{out}: exists and is not this simulated site; give another directory")
-    with atomic_directory(out) as directory:
-        half = _site_at(directory, chosen)
+    with write_atomic_directory(out) as directory:
+        half = _read_site(directory, chosen)
         for index, spec in enumerate(chosen.drives):
-            truth, readings = simulated_drive(chosen, index, seed=seed)
+            truth, readings = simulate_readings(chosen, index, seed=seed)
             write_table(truth.table(), half.truths[index])
             _write_log(half.logs[index], spec, readings, geoid_m=chosen.world.site.geoid_m)
-        write_json(half.region, _region(chosen))
+        write_json(half.region, _make_region(chosen))
         write_rasters(directory / "maps", chosen.world, chosen.rasters)
         write_json(half.world, about)
     return site
 
 
-def _site_at(out: Path, scenario: Scenario) -> SimulatedSite:
+def _read_site(out: Path, scenario: Scenario) -> SimulatedSite:
     suffixes = {"mcap": ".mcap", "bag": ".bag"}
     return SimulatedSite(
         out,
         tuple(out / "logs" / f"{spec.name}{suffixes.get(spec.container, '')}" for spec in scenario.drives),
-        _raster_paths(out / "maps"),
+        _make_raster_paths(out / "maps"),
         out / "region.geojson",
         tuple(out / "truth" / f"{spec.name}.parquet" for spec in scenario.drives),
         out / "world.json",
     )
 
 
-def _holds(site: SimulatedSite, about: Mapping[str, Any]) -> bool:
+def _is_complete(site: SimulatedSite, about: Mapping[str, Any]) -> bool:
     files = (*site.logs, *site.rasters.values(), site.region, *site.truths, site.world)
     return all(path.exists() for path in files) and site.world.read_bytes() == to_json(about).encode()
 
 
-def simulated_drive(scenario: Scenario, index: int = 0, *, seed: int = 1) -> tuple[Truth, dict[str, Reading]]:
+def simulate_readings(scenario: Scenario, index: int = 0, *, seed: int = 1) -> tuple[Truth, dict[str, Reading]]:
     """Return the truth of one drive of a scenario, and what its sensors said; nothing is written."""
     spec, noise = scenario.drives[index], Noise(seed, index)
     plan = spec.plan if isinstance(spec.plan, tuple) else spec.plan.plan(scenario.world, noise("plan"))
-    truth = drive(
+    truth = simulate_drive(
         scenario.world,
         plan,
         start_m=spec.start_m,
@@ -121,7 +121,7 @@ def read_truth(path: Path) -> Truth:
 
 
 def _write_log(path: Path, spec: DriveSpec, readings: dict[str, Reading], *, geoid_m: float) -> None:
-    messages = streams(readings, spec.sensors.mounted(spec.faults), spec.recorder, geoid_m=geoid_m)
+    messages = make_streams(readings, spec.sensors.mounted(spec.faults), spec.recorder, geoid_m=geoid_m)
     match spec.container:
         case "mcap":
             write_mcap(path, messages, encoding="ros1" if spec.recorder.dialect == "ros1" else "cdr")
@@ -135,13 +135,21 @@ def _write_log(path: Path, spec: DriveSpec, readings: dict[str, Reading], *, geo
 
 def write_rasters(directory: Path, world: World, spec: RasterSpec) -> dict[str, Path]:
     """Write height (float32), ortho (RGBA) and terrain (palette) GeoTIFFs and the class table."""
-    paths = _raster_paths(directory)
+    paths = _make_raster_paths(directory)
     _write_raster(
-        paths["height"], world, spec.height_pitch_m, (0.0, 0.0), _height_pixels, dtype="float32", nodata=_HEIGHT_NODATA
+        paths["height"],
+        world,
+        spec.height_pitch_m,
+        (0.0, 0.0),
+        _make_height_pixels,
+        dtype="float32",
+        nodata=_HEIGHT_NODATA,
     )
-    _write_raster(paths["ortho"], world, spec.ortho_pitch_m, spec.ortho_shift_m, _ortho_pixels, dtype="uint8", bands=4)
     _write_raster(
-        paths["terrain"], world, spec.terrain_pitch_m, spec.terrain_shift_m, _terrain_pixels,
+        paths["ortho"], world, spec.ortho_pitch_m, spec.ortho_shift_m, _make_ortho_pixels, dtype="uint8", bands=4
+    )
+    _write_raster(
+        paths["terrain"], world, spec.terrain_pitch_m, spec.terrain_shift_m, _make_terrain_pixels,
         dtype="uint8", nodata=0, palette=_PALETTE,
     )  # fmt: skip
     lines = [f"{10 * c.id},{c.id},{c.name},{str(c.traversable).lower()}" for c in PAPER_CLASSES.classes]
@@ -149,7 +157,7 @@ def write_rasters(directory: Path, world: World, spec: RasterSpec) -> dict[str, 
     return paths
 
 
-def _raster_paths(directory: Path) -> dict[str, Path]:
+def _make_raster_paths(directory: Path) -> dict[str, Path]:
     rasters = {name: directory / f"{name}.tif" for name in ("height", "ortho", "terrain")}
     return {**rasters, "classes": directory / "classes.csv"}
 
@@ -182,21 +190,21 @@ def _write_raster(
     )
 
 
-def _height_pixels(world: World, x: NDArray[np.float64], y: NDArray[np.float64]) -> Pixels:
+def _make_height_pixels(world: World, x: NDArray[np.float64], y: NDArray[np.float64]) -> Pixels:
     return np.where(world.mapped(x, y), world.mapped_height_m(x, y), _HEIGHT_NODATA).astype(np.float32)[None]
 
 
-def _ortho_pixels(world: World, x: NDArray[np.float64], y: NDArray[np.float64]) -> Pixels:
+def _make_ortho_pixels(world: World, x: NDArray[np.float64], y: NDArray[np.float64]) -> Pixels:
     mapped = world.mapped(x, y)
     rgb = np.where(mapped[..., None], np.clip(np.round(world.ortho(x, y)), 0, 255), 0)
     return np.concatenate([np.moveaxis(rgb, -1, 0), np.where(mapped, 255, 0)[None]]).astype(np.uint8)
 
 
-def _terrain_pixels(world: World, x: NDArray[np.float64], y: NDArray[np.float64]) -> Pixels:
+def _make_terrain_pixels(world: World, x: NDArray[np.float64], y: NDArray[np.float64]) -> Pixels:
     return np.where(world.mapped(x, y), 10 * world.terrain_class(x, y), 0).astype(np.uint8)[None]
 
 
-def _region(scenario: Scenario) -> dict[str, Any]:
+def _make_region(scenario: Scenario) -> dict[str, Any]:
     site = scenario.world.site
     corners = np.array(scenario.region_m) + np.array([site.west_m, site.south_m])
     lon, lat = site.lonlat_deg(corners[:, 0], corners[:, 1])

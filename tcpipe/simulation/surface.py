@@ -12,12 +12,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.simulation.ripples import Wave, field, state
+from tcpipe.simulation.random_fields import Wave, evaluate_field, state
 from tcpipe.simulation.site import Float
 
 
 @dataclass(frozen=True, slots=True)
-class Look:
+class SurfaceEffect:
     """What the states do to one class of ground, where they are 1; where they are -1 the opposite."""
 
     wet_shade: float = 0.0
@@ -36,7 +36,7 @@ class Look:
 class Surface:
     """The states of a site's ground; the waves of each have a deviation of 1 together."""
 
-    looks: dict[int, Look]
+    looks: dict[int, SurfaceEffect]
     """By class id; a class that is not named has none."""
     wetness: tuple[Wave, ...]
     cover: tuple[Wave, ...]
@@ -53,7 +53,7 @@ class Surface:
     def shade(self, classes: NDArray[np.uint8], u: Float, v: Float) -> Float:
         """Return what the brightness is multiplied with, at offsets from the site's corner [m]."""
         grain = 1.0 + self.swing * state(self.cover, u, v)
-        grain *= self._by_class("grain")[classes] * field(self.grain, u, v)
+        grain *= self._by_class("grain")[classes] * evaluate_field(self.grain, u, v)
         return np.asarray((1.0 - self._by_class("wet_shade")[classes] * state(self.wetness, u, v)) * (1.0 + grain))
 
     def resistance(self, classes: NDArray[np.uint8], u: Float, v: Float) -> Float:
@@ -63,13 +63,13 @@ class Surface:
 
     def relief_m(self, classes: NDArray[np.uint8], u: Float, v: Float) -> Float:
         """Return the height of bumps and ridges [m]."""
-        relief = self._by_class("bump_m")[classes] * field(self.bumps, u, v)
-        relief += self._by_class("ridge_m")[classes] * field(self.ridges, u, v)
+        relief = self._by_class("bump_m")[classes] * evaluate_field(self.bumps, u, v)
+        relief += self._by_class("ridge_m")[classes] * evaluate_field(self.ridges, u, v)
         return np.asarray(relief * (1.0 + self.swing * state(self.roughness, u, v)))
 
     def map_noise_m(self, u: Float, v: Float) -> Float:
         """Return what the height raster errs by [m]."""
-        return self.map_noise_std_m * field(self.noise, u, v)
+        return self.map_noise_std_m * evaluate_field(self.noise, u, v)
 
     def _by_class(self, name: str) -> Float:
         """Return one number of every class's look, by class id."""

@@ -9,8 +9,8 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from tcpipe.compiled import kernel
-from tcpipe.geometry.rotation import normalized, rpy_from_quat
+from tcpipe.compiled import compile_kernel
+from tcpipe.geometry.rotation import normalize, rpy_from_quat
 from tcpipe.simulation.site import Float
 
 _COMPONENTS = {
@@ -77,7 +77,7 @@ class Truth:
         }
         first, second = self.quat_xyzw[low], self.quat_xyzw[low + 1]
         second = np.where(np.sum(first * second, axis=1, keepdims=True) < 0, -second, second)
-        quat = normalized(first + part[:, None] * (second - first))
+        quat = normalize(first + part[:, None] * (second - first))
         return Truth(
             stamp_ns=stamp_ns,
             terrain_class=self.terrain_class[np.round(position).astype(np.int64)],
@@ -116,22 +116,22 @@ class TrueCost:
     arc_length_m: Float
 
 
-def true_cost(truth: Truth, start_ns: NDArray[np.int64], chord_m: float = 1.0) -> TrueCost:
+def compute_true_cost(truth: Truth, start_ns: NDArray[np.int64], chord_m: float = 1.0) -> TrueCost:
     """Return what the metre cost that begins where the robot truly was at ``start_ns``, shape (N,).
 
     It ends at the first crossing of the horizontal distance ``chord_m`` from there, found within a step by linear motion.
     """
     seconds = (truth.stamp_ns - truth.stamp_ns[0]) * 1e-9
     start = (np.asarray(start_ns, dtype=np.int64) - truth.stamp_ns[0]) * 1e-9
-    end = _crossing(seconds, np.ascontiguousarray(truth.enu_m[:, :2]), start, chord_m)
+    end = _find_crossing(seconds, np.ascontiguousarray(truth.enu_m[:, :2]), start, chord_m)
     duration = end - start
     energy = np.interp(end, seconds, truth.energy_joule) - np.interp(start, seconds, truth.energy_joule)
     arc = np.interp(end, seconds, truth.distance_m) - np.interp(start, seconds, truth.distance_m)
     return TrueCost(truth.stamp_ns[0] + end * 1e9, duration, energy, energy / duration, chord_m / duration, arc)
 
 
-@kernel
-def _crossing(seconds: Float, xy_m: Float, start_s: Float, chord_m: float) -> Float:
+@compile_kernel
+def _find_crossing(seconds: Float, xy_m: Float, start_s: Float, chord_m: float) -> Float:
     """Return when the distance from the place at each start first reaches the chord [s]; NaN if never."""
     end = np.full(start_s.size, np.nan)
     last = seconds.size - 1

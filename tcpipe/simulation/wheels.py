@@ -12,7 +12,7 @@ Heading = tuple[Float, Float]
 """Cosine and sine of the direction from the map's x axis."""
 
 
-def rolling_resistance(world: World, robot: SimulatedRobot, x: Float, y: Float, yaw_map_rad: Float) -> Float:
+def compute_rolling_resistance(world: World, robot: SimulatedRobot, x: Float, y: Float, yaw_map_rad: Float) -> Float:
     """Return the traction force over the normal force at poses in the map, any shapes that broadcast.
 
     Without `Wheels` it is the mean along the wheelbase, under the middle; with them the mean of four contacts.
@@ -25,14 +25,16 @@ def rolling_resistance(world: World, robot: SimulatedRobot, x: Float, y: Float, 
         places = [(at, side) for at in (-ahead, ahead) for side in (-aside, aside)]
     cos, sin = np.cos(yaw_map_rad), np.sin(yaw_map_rad)
     found = [
-        _at_contact(world, robot, x + at * cos - side * sin, y + at * sin + side * cos, (cos, sin))
+        _evaluate_at_contact(world, robot, x + at * cos - side * sin, y + at * sin + side * cos, (cos, sin))
         for at, side in places
     ]
     mean = np.mean(found, axis=0)
-    return np.asarray(mean if robot.wheels is None else mean + _sidelong(world, robot.wheels, x, y, (cos, sin)))
+    return np.asarray(
+        mean if robot.wheels is None else mean + _compute_side_drag(world, robot.wheels, x, y, (cos, sin))
+    )
 
 
-def _at_contact(world: World, robot: SimulatedRobot, x: Float, y: Float, heading: Heading) -> Float:
+def _evaluate_at_contact(world: World, robot: SimulatedRobot, x: Float, y: Float, heading: Heading) -> Float:
     cos, sin = heading
     classes = world.terrain_class(x, y)
     usual = robot.ground_table()[:, 2][classes] * world.resistance_factor(x, y)
@@ -44,7 +46,7 @@ def _at_contact(world: World, robot: SimulatedRobot, x: Float, y: Float, heading
     return np.asarray(usual + 0.5 * robot.wheels.bump_loss * np.abs(higher - lower) / robot.wheels.contact_m)
 
 
-def _sidelong(world: World, wheels: Wheels, x: Float, y: Float, heading: Heading) -> Float:
+def _compute_side_drag(world: World, wheels: Wheels, x: Float, y: Float, heading: Heading) -> Float:
     """Return the drag of running sidelong: of a side force sin(slope across) at the slip angle that gives it."""
     rise_x, rise_y = world.gradient(x, y)
     across = rise_y * heading[0] - rise_x * heading[1]

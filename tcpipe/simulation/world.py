@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.simulation.ripples import Wave, ripple
+from tcpipe.simulation.random_fields import Wave, sum_waves
 from tcpipe.simulation.site import Float, Site
 from tcpipe.simulation.surface import Surface
 from tcpipe.tables.facts import ABSENT
@@ -134,8 +134,12 @@ class World:
         u, v = x_map_m - self.site.west_m, y_map_m - self.site.south_m
         total = np.full(np.broadcast_shapes(np.shape(u), np.shape(v)), self.base_m)
         for hill in self.hills:
-            total += hill.height_m * _bell(u - hill.x_m, hill.x_sigma_m) * _bell(v - hill.y_m, hill.y_sigma_m)
-        return total + ripple(self.waves, u, v)
+            total += (
+                hill.height_m
+                * _evaluate_bell(u - hill.x_m, hill.x_sigma_m)
+                * _evaluate_bell(v - hill.y_m, hill.y_sigma_m)
+            )
+        return total + sum_waves(self.waves, u, v)
 
     def mapped_height_m(self, x_map_m: Float, y_map_m: Float) -> Float:
         """Return the height that a raster holds: with bumps and ridges, which wheels feel and the pose does not, and the map's noise."""
@@ -151,7 +155,11 @@ class World:
         u, v = x_map_m - self.site.west_m, y_map_m - self.site.south_m
         gx, gy = np.zeros(np.broadcast_shapes(np.shape(u), np.shape(v))), np.zeros(())
         for hill in self.hills:
-            bump = hill.height_m * _bell(u - hill.x_m, hill.x_sigma_m) * _bell(v - hill.y_m, hill.y_sigma_m)
+            bump = (
+                hill.height_m
+                * _evaluate_bell(u - hill.x_m, hill.x_sigma_m)
+                * _evaluate_bell(v - hill.y_m, hill.y_sigma_m)
+            )
             gx = gx - bump * (u - hill.x_m) / hill.x_sigma_m**2
             gy = gy - bump * (v - hill.y_m) / hill.y_sigma_m**2
         for wave in self.waves:
@@ -177,7 +185,7 @@ class World:
             share = np.clip(region.depth_m(u, v) / _SOFT_BORDER_M + 0.5, 0.0, 1.0)
             share = (share * share * (3.0 - 2.0 * share))[..., None]
             rgb += share * (_COLOUR[region.class_id] - rgb)
-        shade = 1.0 + ripple(self.texture, u, v)
+        shade = 1.0 + sum_waves(self.texture, u, v)
         if self.surface is not None:
             shade = shade * self.surface.shade(self.terrain_class(x_map_m, y_map_m), u, v)
         if self.sun is not None:
@@ -197,7 +205,7 @@ class World:
     def resistance_factor(self, x_map_m: Float, y_map_m: Float) -> Float:
         """Return what the class's rolling resistance is multiplied with here: what the orthophoto shows, and what nothing does."""
         u, v = x_map_m - self.site.west_m, y_map_m - self.site.south_m
-        hidden = ripple(self.resistance, u, v)
+        hidden = sum_waves(self.resistance, u, v)
         if self.surface is None:
             return 1.0 + hidden
         return 1.0 + hidden + self.surface.resistance(self.terrain_class(x_map_m, y_map_m), u, v)
@@ -212,5 +220,5 @@ class World:
         return [region for region in regions if box is not None and region.may_touch(box)]
 
 
-def _bell(offset_m: Float, sigma_m: float) -> Float:
+def _evaluate_bell(offset_m: Float, sigma_m: float) -> Float:
     return np.exp(-0.5 * (offset_m / sigma_m) ** 2)

@@ -8,8 +8,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.splits.holdouts import UNDECIDED, Holdout, blocks, draw_folds, draw_groups, draw_samples, runs_as_groups
-from tcpipe.splits.regions import Regions, Side, sides_of
+from tcpipe.splits.holdouts import (
+    UNDECIDED,
+    Holdout,
+    assign_blocks,
+    draw_folds,
+    draw_groups,
+    draw_samples,
+    group_by_run,
+)
+from tcpipe.splits.regions import Regions, Side, classify_footprints
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -68,7 +76,7 @@ def assign_splits(
     tagged : with the holdout ``tag``: number of each sample's value of the tag, shape (N,), and the values by number.
     """
     n = len(ranks)
-    sides = np.zeros(n, np.uint8) if regions is None else sides_of(corners_xy_m, regions, buffer_m=buffer_m)
+    sides = np.zeros(n, np.uint8) if regions is None else classify_footprints(corners_xy_m, regions, buffer_m=buffer_m)
     split = np.array(["train", "unseen", "buffer", EXCLUDED], dtype=np.str_)[sides]
     old = np.full(n, "", np.str_) if kept is None else np.where(sides == Side.EXCLUDED, "", kept.split)
     split[old != ""] = old[old != ""]
@@ -76,9 +84,9 @@ def assign_splits(
     known = np.select([old[inside] == "test", old[inside] == "train"], [1, 0], UNDECIDED)
     whole = {"run": (run, run_names), "tag": tagged}.get(holdout)
     groups = (
-        blocks(corners_xy_m[inside].mean(axis=1), block_m=block_m)
+        assign_blocks(corners_xy_m[inside].mean(axis=1), block_m=block_m)
         if whole is None
-        else runs_as_groups(whole[0][inside], whole[1])
+        else group_by_run(whole[0][inside], whole[1])
     )
     if holdout == "sample":
         test = draw_samples(ranks[inside], run[inside], test_fraction=test_fraction, kept=known)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.splits.neighbours import near_pairs, nearest_m, shared_fraction
+from tcpipe.splits.neighbours import compute_nearest_m, compute_shared_fraction, iterate_near_pairs
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -54,11 +54,11 @@ def audit_leakage(
     -------
     One entry for ``test`` and one for ``unseen``.
     """
-    follows = _consecutive(run, start_ns, corners_xy_m.mean(axis=1), chord_m=chord_m)
-    return tuple(_audit(name, split, run, follows, corners_xy_m) for name in ("test", "unseen"))
+    follows = _find_consecutive(run, start_ns, corners_xy_m.mean(axis=1), chord_m=chord_m)
+    return tuple(_audit_split(name, split, run, follows, corners_xy_m) for name in ("test", "unseen"))
 
 
-def _consecutive(run: Ints, start_ns: Ints, centres_xy_m: Floats, *, chord_m: float) -> Ints:
+def _find_consecutive(run: Ints, start_ns: Ints, centres_xy_m: Floats, *, chord_m: float) -> Ints:
     """Return index pairs of samples that follow one another on one track, shape (P, 2)."""
     order = np.lexsort((start_ns, run))
     before, after = order[:-1], order[1:]
@@ -67,17 +67,17 @@ def _consecutive(run: Ints, start_ns: Ints, centres_xy_m: Floats, *, chord_m: fl
     return np.column_stack([before[adjoining], after[adjoining]])
 
 
-def _audit(name: str, split: NDArray[np.str_], run: Ints, follows: Ints, corners_xy_m: Floats) -> HeldOut:
+def _audit_split(name: str, split: NDArray[np.str_], run: Ints, follows: Ints, corners_xy_m: Floats) -> HeldOut:
     held, train = np.flatnonzero(split == name), np.flatnonzero(split == "train")
     ours, theirs = corners_xy_m[held], corners_xy_m[train]
     pairs, overlaps, repeated = 0, np.zeros(len(held), np.bool_), np.zeros(len(held), np.bool_)
-    for i, j in near_pairs(ours.mean(axis=1), theirs.mean(axis=1), within_m=_diagonal_m(corners_xy_m)):
-        real = shared_fraction(ours, theirs, i, j) > _CONTACT_FRACTION
+    for i, j in iterate_near_pairs(ours.mean(axis=1), theirs.mean(axis=1), within_m=_compute_diagonal_m(corners_xy_m)):
+        real = compute_shared_fraction(ours, theirs, i, j) > _CONTACT_FRACTION
         pairs += int(real.sum())
         overlaps[i[real]] = True
         repeated[i[real & (run[held[i]] != run[train[j]])]] = True
     crossing = (split[follows] == name).any(axis=1) & (split[follows] == "train").any(axis=1)
-    apart_m = nearest_m(ours, theirs)
+    apart_m = compute_nearest_m(ours, theirs)
     return HeldOut(
         split=name,
         samples=len(held),
@@ -90,6 +90,6 @@ def _audit(name: str, split: NDArray[np.str_], run: Ints, follows: Ints, corners
     )
 
 
-def _diagonal_m(corners_xy_m: Floats) -> float:
+def _compute_diagonal_m(corners_xy_m: Floats) -> float:
     """Return the longest diagonal: centres farther apart share no ground."""
     return float(np.linalg.norm(corners_xy_m[:, 2] - corners_xy_m[:, 0], axis=1).max(initial=0.0))

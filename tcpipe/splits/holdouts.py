@@ -15,7 +15,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.splits.ranking import ranked_order
+from tcpipe.splits.ranking import sort_by_rank
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -49,7 +49,7 @@ class Groups:
         return np.where(votes.any(axis=1), votes.argmax(axis=1), UNDECIDED)
 
 
-def blocks(centres_xy_m: Floats, *, block_m: float) -> Groups:
+def assign_blocks(centres_xy_m: Floats, *, block_m: float) -> Groups:
     """Return the spatial block of each footprint's centre: square cells of ``block_m`` [m] on the plane's own origin."""
     cells = np.floor(centres_xy_m / block_m).astype(np.int64)
     codes, first, member = np.unique((cells[:, 0] << 32) + cells[:, 1], return_index=True, return_inverse=True)
@@ -113,8 +113,8 @@ def draw_groups(
     count = len(groups.names)
     kept = np.full(count, UNDECIDED) if kept is None else kept
     tests: Mask = kept == 1
-    order = ranked_order(groups.names, seed=seed, purpose="test")
-    for sizes in _growing(groups, arrival):
+    order = sort_by_rank(groups.names, seed=seed, purpose="test")
+    for sizes in _iterate_sizes(groups, arrival):
         free = order[(kept[order] == UNDECIDED) & (sizes[order] > 0)]
         _take(tests, free, sizes, wanted=test_fraction * float(sizes.sum()))
     return tests
@@ -146,8 +146,8 @@ def draw_folds(groups: Groups, arrival: Ints, *, folds: int, seed: int, kept: In
     Fold of each group from 0 on, shape (G,).
     """
     fold = np.full(len(groups.names), UNDECIDED) if kept is None else kept.copy()
-    order = ranked_order(groups.names, seed=seed, purpose="fold")
-    for sizes in _growing(groups, arrival):
+    order = sort_by_rank(groups.names, seed=seed, purpose="fold")
+    for sizes in _iterate_sizes(groups, arrival):
         new = order[(fold[order] == UNDECIDED) & (sizes[order] > 0)]
         known = fold != UNDECIDED
         filled = np.bincount(fold[known], weights=sizes[known], minlength=folds)
@@ -157,7 +157,7 @@ def draw_folds(groups: Groups, arrival: Ints, *, folds: int, seed: int, kept: In
     return fold
 
 
-def _growing(groups: Groups, arrival: Ints) -> Iterator[Ints]:
+def _iterate_sizes(groups: Groups, arrival: Ints) -> Iterator[Ints]:
     """Yield the sizes of the groups, (G,), after each arrival."""
     sizes = np.zeros(len(groups.names), np.int64)
     order = np.argsort(arrival, kind="stable")
@@ -167,7 +167,7 @@ def _growing(groups: Groups, arrival: Ints) -> Iterator[Ints]:
             yield sizes
 
 
-def runs_as_groups(run: Ints, names: Sequence[str]) -> Groups:
+def group_by_run(run: Ints, names: Sequence[str]) -> Groups:
     """Return runs as groups: the number of each sample's run, shape (N,), and the runs' names by number."""
     used, member = np.unique(run, return_inverse=True)
     return Groups(member.astype(np.int64).reshape(len(run)), tuple(names[number] for number in used.tolist()))

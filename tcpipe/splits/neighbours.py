@@ -25,7 +25,7 @@ PLACES = ("start_lon_deg", "start_lat_deg", "end_lon_deg", "end_lat_deg")
 _M_A_DEG = 111_195.0  # of a great circle: to half a per cent
 
 
-def middles_deg(ends: Mapping[str, NDArray[np.generic]]) -> Floats:
+def compute_middles_deg(ends: Mapping[str, NDArray[np.generic]]) -> Floats:
     """Return lon, lat [deg] of the middles of chords, shape (N, 2), by the columns `PLACES`."""
     x0, y0, x1, y1 = (ends[name].astype(np.float64) for name in PLACES)
     return np.column_stack([(x0 + x1) / 2.0, (y0 + y1) / 2.0])
@@ -44,7 +44,7 @@ def are_near(ours_deg: Floats, theirs_deg: Floats, *, within_m: float) -> NDArra
     return found
 
 
-def near_pairs(ours_xy_m: Floats, theirs_xy_m: Floats, *, within_m: float) -> Iterator[tuple[Ints, Ints]]:
+def iterate_near_pairs(ours_xy_m: Floats, theirs_xy_m: Floats, *, within_m: float) -> Iterator[tuple[Ints, Ints]]:
     """Yield the index pairs of points at most ``within_m`` apart [m]: ``ours`` (N, 2) against ``theirs`` (M, 2), chunk by chunk of ours."""
     if len(ours_xy_m) == 0 or len(theirs_xy_m) == 0:
         return
@@ -56,7 +56,7 @@ def near_pairs(ours_xy_m: Floats, theirs_xy_m: Floats, *, within_m: float) -> It
         yield found["i"][order] + first, found["j"][order]
 
 
-def shared_fraction(ours: Floats, theirs: Floats, i: Ints, j: Ints) -> Floats:
+def compute_shared_fraction(ours: Floats, theirs: Floats, i: Ints, j: Ints) -> Floats:
     """Return the share of the ground of ``ours[i]`` that ``theirs[j]`` covers too, (P,); corners counter-clockwise, (N, 4, 2)."""
     shared_m2 = np.empty(len(i))
     pair_overlaps(ours, theirs, i, j, shared_m2)
@@ -64,7 +64,7 @@ def shared_fraction(ours: Floats, theirs: Floats, i: Ints, j: Ints) -> Floats:
     return np.asarray(shared_m2 / side_m[i] ** 2)
 
 
-def nearest_m(ours: Floats, theirs: Floats) -> Floats:
+def compute_nearest_m(ours: Floats, theirs: Floats) -> Floats:
     """Return the distance from each of ``ours`` to the nearest of ``theirs`` [m], (N,); empty if either is.
 
     Parameters
@@ -74,9 +74,9 @@ def nearest_m(ours: Floats, theirs: Floats) -> Floats:
     if len(ours) == 0 or len(theirs) == 0:
         return np.empty(0)
     tree = cKDTree(theirs.mean(axis=1))
-    reach_m = _half_diagonal_m(ours) + _half_diagonal_m(theirs)
+    reach_m = _compute_half_diagonal_m(ours) + _compute_half_diagonal_m(theirs)
     best_m = np.full(len(ours), np.inf)
-    pending = [(rows, 8) for rows in _parts(np.arange(len(ours)), _CHUNK)]
+    pending = [(rows, 8) for rows in _split_points(np.arange(len(ours)), _CHUNK)]
     while pending:
         rows, count = pending.pop()
         asked = min(count, len(theirs))
@@ -87,14 +87,14 @@ def nearest_m(ours: Floats, theirs: Floats) -> Floats:
         # squares are nearer than their centres by at most two half diagonals: what is farther still cannot win
         doubtful = rows[(best_m[rows] > np.asarray(distances_m)[:, -1] - reach_m) & (best_m[rows] > 0.0)]
         if asked < len(theirs):
-            pending += [(part, 4 * count) for part in _parts(doubtful, max(_CHUNK * 2 // count, 1))]
+            pending += [(part, 4 * count) for part in _split_points(doubtful, max(_CHUNK * 2 // count, 1))]
     return best_m
 
 
-def _parts(rows: Ints, size: int) -> list[Ints]:
+def _split_points(rows: Ints, size: int) -> list[Ints]:
     return [rows[first : first + size] for first in range(0, len(rows), size)]
 
 
-def _half_diagonal_m(corners: Floats) -> float:
+def _compute_half_diagonal_m(corners: Floats) -> float:
     across: Floats = corners[:, 2] - corners[:, 0]
     return float(np.hypot(across[:, 0], across[:, 1]).max()) / 2.0

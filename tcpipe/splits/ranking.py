@@ -29,7 +29,7 @@ def hash_ranks(names: Sequence[str], *, seed: int, purpose: str) -> Ranks:
     return np.frombuffer(digests, dtype=">u8").astype(np.uint64)
 
 
-def ranked_order(names: Sequence[str], *, seed: int, purpose: str) -> NDArray[np.int64]:
+def sort_by_rank(names: Sequence[str], *, seed: int, purpose: str) -> NDArray[np.int64]:
     """Return the indices that sort ``names`` by their rank, names themselves breaking a tie; shape (N,)."""
     ranks = hash_ranks(names, seed=seed, purpose=purpose)
     order = np.argsort(ranks, kind="stable")

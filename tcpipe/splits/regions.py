@@ -77,7 +77,7 @@ def project_regions(regions: Regions, project: Project, *, window_deg: tuple[flo
     return Regions(carry(regions.train_test), carry(regions.unseen), carry(regions.exclude))
 
 
-def sides_of(corners_xy_m: Floats, regions: Regions, *, buffer_m: float) -> NDArray[np.uint8]:
+def classify_footprints(corners_xy_m: Floats, regions: Regions, *, buffer_m: float) -> NDArray[np.uint8]:
     """Return the `Side` of every footprint.
 
     Parameters
@@ -92,7 +92,7 @@ def sides_of(corners_xy_m: Floats, regions: Regions, *, buffer_m: float) -> NDAr
     """
     usable, borders = (
         shapely.difference(regions.train_test, regions.exclude),
-        shapely.STRtree(_pieces(regions.borders())),
+        shapely.STRtree(_cut_lines(regions.borders())),
     )
     for geometry in (usable, regions.exclude):
         shapely.prepare(geometry)
@@ -102,12 +102,12 @@ def sides_of(corners_xy_m: Floats, regions: Regions, *, buffer_m: float) -> NDAr
         squares = shapely.polygons(corners_xy_m[first : first + _CHUNK])
         centres = shapely.points(corners_xy_m[first : first + _CHUNK].mean(axis=1))
         part[shapely.contains(usable, centres)] = Side.INSIDE
-        part[_on_border(squares, borders, buffer_m=buffer_m)] = Side.BUFFER
+        part[_is_on_border(squares, borders, buffer_m=buffer_m)] = Side.BUFFER
         part[shapely.covers(regions.exclude, squares)] = Side.EXCLUDED
     return sides
 
 
-def _pieces(borders: BaseGeometry) -> NDArray[np.object_]:
+def _cut_lines(borders: BaseGeometry) -> NDArray[np.object_]:
     """Return lines in pieces of a few edges, so that a square is held against those near it, not against a whole border."""
     lines = shapely.get_parts(borders)
     xy_m, line = shapely.get_coordinates(lines, return_index=True)
@@ -120,7 +120,7 @@ def _pieces(borders: BaseGeometry) -> NDArray[np.object_]:
     return np.asarray(shapely.linestrings(xy_m[at], indices=np.repeat(np.arange(len(first)), counts)))
 
 
-def _on_border(squares: NDArray[np.object_], borders: shapely.STRtree, *, buffer_m: float) -> NDArray[np.bool_]:
+def _is_on_border(squares: NDArray[np.object_], borders: shapely.STRtree, *, buffer_m: float) -> NDArray[np.bool_]:
     """Tell which squares a border runs through, or passes nearer than the buffer."""
     found = np.zeros(len(squares), np.bool_)
     if buffer_m > 0.0:

@@ -7,26 +7,28 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.compiled import kernel
+from tcpipe.compiled import compile_kernel
 
 Floats = NDArray[np.float64]
 
 
-@kernel
+@compile_kernel
 def pair_distances(ours: Floats, theirs: Floats, i: NDArray[np.int64], j: NDArray[np.int64], out: Floats) -> None:
     """Write the distance between squares ``ours[i]`` and ``theirs[j]`` to ``out``, (P,); 0 where they touch; corners are (N, 4, 2)."""
     for pair in range(i.size):
         a, b = ours[i[pair]], theirs[j[pair]]
-        out[pair] = 0.0 if _touch(a, b) else np.sqrt(min(_corner_to_edge(a, b), _corner_to_edge(b, a)))
+        out[pair] = (
+            0.0 if _touch(a, b) else np.sqrt(min(_compute_corner_distance(a, b), _compute_corner_distance(b, a)))
+        )
 
 
-@kernel
+@compile_kernel
 def pair_overlaps(ours: Floats, theirs: Floats, i: NDArray[np.int64], j: NDArray[np.int64], out: Floats) -> None:
     """Write the area that squares ``ours[i]`` and ``theirs[j]`` share to ``out``, (P,); corners run counter-clockwise."""
     polygon, clipped = np.empty((8, 2)), np.empty((8, 2))
     for pair in range(i.size):
         a, b = ours[i[pair]], theirs[j[pair]]
-        for k in range(4):  # not as slices, see `tcpipe.fusion.state_kernel.copied`
+        for k in range(4):  # not as slices, see `tcpipe.fusion.state_kernel.copy_values`
             polygon[k, 0], polygon[k, 1] = a[k, 0], a[k, 1]
         corners = 4
         for edge in range(4):
@@ -40,28 +42,28 @@ def pair_overlaps(ours: Floats, theirs: Floats, i: NDArray[np.int64], j: NDArray
         out[pair] = area / 2.0
 
 
-@kernel
-def _side(p: Floats, q: Floats, x: float, y: float) -> Any:
+@compile_kernel
+def _compute_side(p: Floats, q: Floats, x: float, y: float) -> Any:
     """Return twice the signed area of p, q and (x, y): positive to the left of p → q."""
     return (q[0] - p[0]) * (y - p[1]) - (q[1] - p[1]) * (x - p[0])
 
 
-@kernel
+@compile_kernel
 def _touch(a: Floats, b: Floats) -> bool:
     """Tell whether no edge of either square has the other wholly to its right."""
     for one, other in ((a, b), (b, a)):
         for edge in range(4):
             apart = True
             for k in range(4):
-                if _side(one[edge], one[(edge + 1) % 4], other[k, 0], other[k, 1]) >= 0.0:
+                if _compute_side(one[edge], one[(edge + 1) % 4], other[k, 0], other[k, 1]) >= 0.0:
                     apart = False
             if apart:
                 return False
     return True
 
 
-@kernel
-def _corner_to_edge(a: Floats, b: Floats) -> float:
+@compile_kernel
+def _compute_corner_distance(a: Floats, b: Floats) -> float:
     """Return the smallest squared distance from a corner of ``a`` to an edge of ``b``."""
     best = np.inf
     for k in range(4):
@@ -74,13 +76,13 @@ def _corner_to_edge(a: Floats, b: Floats) -> float:
     return best
 
 
-@kernel
+@compile_kernel
 def _clip(polygon: Floats, corners: int, p: Floats, q: Floats, out: Floats) -> int:
     """Keep what lies to the left of p → q (Sutherland and Hodgman 1974); return its corners."""
     kept = 0
     for k in range(corners):
         a, b = polygon[k], polygon[(k + 1) % corners]
-        left, right = _side(p, q, a[0], a[1]), _side(p, q, b[0], b[1])
+        left, right = _compute_side(p, q, a[0], a[1]), _compute_side(p, q, b[0], b[1])
         if left >= 0.0:
             out[kept, 0], out[kept, 1] = a[0], a[1]
             kept += 1

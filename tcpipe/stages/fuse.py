@@ -9,16 +9,22 @@ from typing import Any
 import numpy as np
 
 from tcpipe.errors import FusionError
-from tcpipe.fusion.checks.audit import alone_in_most, confirmations, consistent, goes_astray, undecided_in_most
-from tcpipe.fusion.checks.refusals import Refusal, refuse_fixes
+from tcpipe.fusion.checks.audit import (
+    count_confirmations,
+    find_isolated_sensors,
+    find_undecided_sensors,
+    is_astray,
+    is_consistent,
+)
+from tcpipe.fusion.checks.refusals import SensorExclusion, refuse_fixes
 from tcpipe.fusion.measurements import GNSS, IMU
 from tcpipe.recipe import FuseConfig
-from tcpipe.stages.clock_doctor import clock_findings, with_lag_on_path, with_offset_cost
-from tcpipe.stages.fuse_findings import audit_findings, fuse_facts, fuse_findings, mounting_findings
-from tcpipe.stages.fuse_inputs import FusionInputs, left_out, prepare_inputs, sane_inputs
+from tcpipe.stages.clock_findings import add_lag_on_path, add_offset_uncertainty, clock_findings
+from tcpipe.stages.fuse_findings import fuse_facts, fuse_findings, make_audit_findings, make_mounting_findings
+from tcpipe.stages.fuse_inputs import FusionInputs, drop_implausible_sensors, exclude_sensors, prepare_inputs
 from tcpipe.stages.fuse_mounting import fuse_mounted
-from tcpipe.stages.fuse_stretches import Fused, fuse_stretches, rejections_table
-from tcpipe.stages.read_pose import pose_as_fixes, recipe_role
+from tcpipe.stages.fuse_stretches import Fused, fuse_stretches, make_rejections_table
+from tcpipe.stages.read_pose import convert_pose_to_fixes, find_recipe_role
 from tcpipe.tables.facts import SensorChecks
 from tcpipe.tables.findings import Finding, StageReport, Subject, make_finding
 from tcpipe.tables.levels import TRACK, Datum, Streams, Track, TrackInfo
@@ -42,9 +48,9 @@ def fuse_run(streams: Streams, config: FuseConfig, *, run_id: str) -> Track:
     """
     # 1. A pose made elsewhere is what the fixes are.
     #    Streams become measurements: one frame, one set of units, usable variances; sensors that cannot be right are left out.
-    streams, local = pose_as_fixes(streams)
+    streams, local = convert_pose_to_fixes(streams)
     run = Subject("run", run_id)
-    inputs, sanity = sane_inputs(prepare_inputs(streams, config), streams)
+    inputs, sanity = drop_implausible_sensors(prepare_inputs(streams, config), streams)
     # 2. Each stretch for itself: where it starts, filter and smoother; again where that shows other mountings, or a sensor to be alone.
     inputs, sanity, fused = fuse_agreeing(inputs, sanity, streams, config, run=run)
     if not fused.found:
@@ -56,12 +62,12 @@ def fuse_run(streams: Streams, config: FuseConfig, *, run_id: str) -> Track:
     datum = None if local or inputs.datum_deg_m is None else Datum(*inputs.datum_deg_m, crs=streams.gnss_crs)
     # 3. What was left out, where sensors disagree with the track, and whether their clocks agree.
     summary = fuse_facts(inputs, fused.facts, rows=table.num_rows, skipped_s=fused.skipped_s)
-    clocks = with_lag_on_path(clock_findings(streams, inputs), fused, inputs, streams)
-    table = with_offset_cost(table, clocks.facts)
-    mounting, audit = mounting_findings(inputs, streams), audit_findings(fused, inputs, streams)
+    clocks = add_lag_on_path(clock_findings(streams, inputs), fused, inputs, streams)
+    table = add_offset_uncertainty(table, clocks.facts)
+    mounting, audit = make_mounting_findings(inputs, streams), make_audit_findings(fused, inputs, streams)
     found = (sanity, mounting, audit, clocks)
     findings = (
-        *fuse_findings(inputs, summary, run=run, fixes=recipe_role(GNSS, streams)),
+        *fuse_findings(inputs, summary, run=run, fixes=find_recipe_role(GNSS, streams)),
         *(finding for each in found for finding in each.findings),
     )
     facts = replace(
@@ -74,7 +80,7 @@ def fuse_run(streams: Streams, config: FuseConfig, *, run_id: str) -> Track:
     )
     report = StageReport((*_drop_places(streams.report.findings, findings), *findings), facts)
     info = TrackInfo(run_id, streams.robot, datum, config.rate_hz, config.estimator, report)
-    return Track(table, rejections_table(inputs, fused.found), info)
+    return Track(table, make_rejections_table(inputs, fused.found), info)
 
 
 def _drop_places(read: tuple[Finding, ...], fused: tuple[Finding, ...]) -> Iterator[Finding]:
@@ -108,9 +114,9 @@ def fuse_agreeing(
     FusionError : the track goes astray whichever sensor is left out.
     """
     found, fused = fuse_mounted(inputs, streams, config)
-    lone, astray = alone_in_most(fused.tallies), _is_astray(fused)
-    if lone or astray or undecided_in_most(fused.tallies):
-        lone = _at_fault(inputs, sanity, streams, config, astray=astray) or lone
+    lone, astray = find_isolated_sensors(fused.tallies), _is_astray(fused)
+    if lone or astray or find_undecided_sensors(fused.tallies):
+        lone = _find_fault(inputs, sanity, streams, config, astray=astray) or lone
         if lone:
             inputs, sanity = _without(lone, inputs, sanity, streams, astray=astray)
             found, fused = fuse_mounted(inputs, streams, config)
@@ -122,7 +128,7 @@ def fuse_agreeing(
 
 
 def _is_astray(fused: Fused) -> bool:
-    return goes_astray(fused.windows, fused.astray)
+    return is_astray(fused.windows, fused.astray)
 
 
 def _without(
@@ -130,11 +136,11 @@ def _without(
 ) -> Judged:
     code = "misleads-track" if astray else "contradicted-by-others"
     odometries = {name for m in inputs.measurements.values() for name in m.odometries()}.difference(roles)
-    refusals = [refuse_fixes(code, odometries) if role == GNSS else Refusal(role, code) for role in roles]
-    return left_out(inputs, sanity, refusals, streams)
+    refusals = [refuse_fixes(code, odometries) if role == GNSS else SensorExclusion(role, code) for role in roles]
+    return exclude_sensors(inputs, sanity, refusals, streams)
 
 
-def _at_fault(
+def _find_fault(
     inputs: FusionInputs, sanity: StageReport[SensorChecks], streams: Streams, config: FuseConfig, *, astray: bool
 ) -> tuple[str, ...]:
     """Return the one sensor without which the others agree; of several that whose others confirm each other most, none of two equals.
@@ -151,8 +157,8 @@ def _at_fault(
         rest, _ = _without([role], inputs, sanity, streams, astray=astray)
         if any(m.gnss is not None or m.odometries() for m in rest.measurements.values()):
             tried = fuse_stretches(rest, streams, config)
-            if tried.tallies and consistent(tried.tallies):
-                agreeing[role] = confirmations(tried.tallies)
+            if tried.tallies and is_consistent(tried.tallies):
+                agreeing[role] = count_confirmations(tried.tallies)
             if tried.found and not _is_astray(tried):
                 following.append(role)
     best = [role for role, confirmed in agreeing.items() if confirmed == max(agreeing.values())]

@@ -7,18 +7,18 @@ from typing import Any
 
 import numpy as np
 
-from tcpipe.fusion.checks.audit import undecided_in_most
+from tcpipe.fusion.checks.audit import find_undecided_sensors
 from tcpipe.fusion.checks.mounting import Arm, Tilt
-from tcpipe.fusion.checks.odometry_scale import Scale, over_command
+from tcpipe.fusion.checks.odometry_scale import Scale, compute_command_ratio
 from tcpipe.fusion.measurements import GNSS, IMU, VISUAL, WHEELS
 from tcpipe.geometry.rotation import matrix_from_quat, quat_from_rpy
 from tcpipe.recipe.suggestions import suggest
-from tcpipe.stages.fuse_inputs import FusionInputs, command_of, exclude_role, longest_epoch, state_extrinsics
-from tcpipe.stages.fuse_mounting import moved_m
+from tcpipe.stages.fuse_inputs import FusionInputs, exclude_role, find_longest_epoch, read_command, state_extrinsics
+from tcpipe.stages.fuse_mounting import compute_moved_m
 from tcpipe.stages.fuse_stretches import Fused
-from tcpipe.stages.read_pose import recipe_role
-from tcpipe.tables.catalogue import threshold
-from tcpipe.tables.facts import AuditFacts, Disagreement, FuseFacts, MountingFacts, Reopening, StretchFacts, vector
+from tcpipe.stages.read_pose import find_recipe_role
+from tcpipe.tables.catalogue import read_threshold
+from tcpipe.tables.facts import AuditFacts, Disagreement, FuseFacts, MountingFacts, Reopening, StretchFacts, make_vector
 from tcpipe.tables.findings import Finding, StageReport, Subject, make_finding
 from tcpipe.tables.levels import Sensor, Streams
 
@@ -70,13 +70,13 @@ def fuse_findings(inputs: FusionInputs, facts: FuseFacts, *, run: Subject, fixes
 
 def _find_initial_yaw(stretch: StretchFacts, first_ns: int, gnss: Subject) -> Finding:
     names = {"source": stretch.heading_from}
-    return make_finding("initial-yaw-uncertain", gnss, span_s=_span_s(stretch, first_ns), names=names)
+    return make_finding("initial-yaw-uncertain", gnss, span_s=_find_span_s(stretch, first_ns), names=names)
 
 
 def _find_scale(inputs: FusionInputs, facts: FuseFacts) -> list[Finding]:
     """Return the finding that nothing shows well how long a metre of odometry is."""
     std = max((stretch.common_scale_std or 0.0 for stretch in facts.stretches), default=0.0)
-    if std <= threshold("odometry-scale-unobservable", "min_scale_std_fraction"):
+    if std <= read_threshold("odometry-scale-unobservable", "min_scale_std_fraction"):
         return []
     role = WHEELS if WHEELS in facts.sensors or VISUAL not in facts.sensors else VISUAL
     names = {"reason": "coarse-gnss" if GNSS in facts.sensors or inputs.scales else "no-gnss"}
@@ -85,7 +85,7 @@ def _find_scale(inputs: FusionInputs, facts: FuseFacts) -> list[Finding]:
 
 
 def _find_rejections(facts: FuseFacts, fixes: str) -> list[Finding]:
-    most = threshold("measurements-rejected", "max_rejected_fraction")
+    most = read_threshold("measurements-rejected", "max_rejected_fraction")
     findings = []
     for role, count in facts.measurements.items():
         rejected, name = facts.rejected[role], fixes if role == GNSS else role
@@ -110,7 +110,7 @@ def _find_reopenings(facts: FuseFacts, first_ns: int) -> list[Finding]:
     for role in sorted({reopening.role for reopening in reopenings}):
         of_role = [reopening for reopening in reopenings if reopening.role == role]
         worst = max(of_role, key=lambda reopening: reopening.size)
-        subject, span_s = Subject("role", role), _span_s(worst, first_ns)
+        subject, span_s = Subject("role", role), _find_span_s(worst, first_ns)
         code, off = (
             ("gnss-contradicts-odometry", "off_m") if role == GNSS else ("odometry-contradicts-others", "off_mps")
         )
@@ -120,7 +120,7 @@ def _find_reopenings(facts: FuseFacts, first_ns: int) -> list[Finding]:
     return findings
 
 
-def _span_s(each: StretchFacts | Reopening, first_ns: int) -> tuple[float, float]:
+def _find_span_s(each: StretchFacts | Reopening, first_ns: int) -> tuple[float, float]:
     return (each.start_ns - first_ns) / 1e9, (each.end_ns - first_ns) / 1e9
 
 
@@ -128,9 +128,9 @@ _CODES = {"position": "position", "displacement": "distance", "turn": "turn"}
 """Beginnings of the codes by what is compared."""
 
 
-def audit_findings(fused: Fused, inputs: FusionInputs, streams: Streams) -> StageReport[AuditFacts]:
+def make_audit_findings(fused: Fused, inputs: FusionInputs, streams: Streams) -> StageReport[AuditFacts]:
     """Return every disagreement, the sensors that contradict each other over most of the distance, and the findings of both."""
-    undecided = undecided_in_most(fused.tallies)
+    undecided = find_undecided_sensors(fused.tallies)
     found = fused.disagreements
     first_ns = min((stretch.start_ns for stretch in fused.facts), default=0)
     kinds = dict.fromkeys((each.sensor, each.what, each.alone) for each in found)
@@ -138,11 +138,11 @@ def audit_findings(fused: Fused, inputs: FusionInputs, streams: Streams) -> Stag
         _find_disagreement([e for e in found if (e.sensor, e.what, e.alone) == kind], first_ns) for kind in kinds
     ]
     for sensor, what in undecided:
-        name = recipe_role(sensor, streams)
+        name = find_recipe_role(sensor, streams)
         names, subject = {"quantity": what}, Subject("role", name)
         findings.append(make_finding("disagreement-undecided", subject, names=names, remedies=exclude_role(name)))
     sensors = {sensor for sensor, _ in undecided}
-    faster = _over_command(inputs, streams)
+    faster = _compute_command_ratio(inputs, streams)
     if faster is not None:
         sensors.add(WHEELS)
         scale = round((streams.report.facts.odometry_scale or {}).get(WHEELS, 1.0) / faster, 2)
@@ -153,15 +153,15 @@ def audit_findings(fused: Fused, inputs: FusionInputs, streams: Streams) -> Stag
     return StageReport(tuple(findings), AuditFacts(tuple(found), tuple(sorted(sensors))))
 
 
-def _over_command(inputs: FusionInputs, streams: Streams) -> float | None:
+def _compute_command_ratio(inputs: FusionInputs, streams: Streams) -> float | None:
     """Return how many times as fast as commanded the wheels go, where that is too fast and nothing else tells how long a metre is."""
     if not inputs.measurements:
         return None
-    epoch = longest_epoch(inputs)
-    m, command = inputs.measurements[epoch], command_of(streams, epoch)
+    epoch = find_longest_epoch(inputs)
+    m, command = inputs.measurements[epoch], read_command(streams, epoch)
     if m.wheels is None or m.gnss is not None or m.visual is not None or command is None:
         return None
-    return over_command(m.wheels, command.stamp_ns, command.forward_velocity_mps)
+    return compute_command_ratio(m.wheels, command.stamp_ns, command.forward_velocity_mps)
 
 
 def _find_disagreement(found: Sequence[Disagreement], first_ns: int) -> Finding:
@@ -180,17 +180,17 @@ def _find_disagreement(found: Sequence[Disagreement], first_ns: int) -> Finding:
     )
 
 
-def mounting_findings(inputs: FusionInputs, streams: Streams) -> StageReport[MountingFacts | None]:
+def make_mounting_findings(inputs: FusionInputs, streams: Streams) -> StageReport[MountingFacts | None]:
     """Return what was corrected, with the recipe keys that would state it."""
     arm, tilt = inputs.arm, inputs.imu_tilt
-    findings = [] if arm is None else [_find_arm(arm, streams.sensors[GNSS], recipe_role(GNSS, streams))]
+    findings = [] if arm is None else [_find_arm(arm, streams.sensors[GNSS], find_recipe_role(GNSS, streams))]
     findings += [] if tilt is None else [_find_tilt(tilt, streams.sensors[IMU])]
     given = streams.report.facts.odometry_scale or {}
     findings += [_find_odometry_scale(role, scale, given.get(role, 1.0)) for role, scale in inputs.scales.items()]
     if not findings:
         return StageReport((), None)
-    std_m = None if arm is None else vector(np.sqrt(np.diag(arm.covariance)[:3]))
-    moved = None if arm is None else vector(moved_m(inputs, streams))
+    std_m = None if arm is None else make_vector(np.sqrt(np.diag(arm.covariance)[:3]))
+    moved = None if arm is None else make_vector(compute_moved_m(inputs, streams))
     roll_pitch = None if tilt is None else (float(tilt.rad[0]), float(tilt.rad[1]))
     scales = {role: scale.factor for role, scale in inputs.scales.items()} or None
     return StageReport(tuple(findings), MountingFacts(moved, std_m, roll_pitch, scales))

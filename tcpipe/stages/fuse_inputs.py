@@ -12,20 +12,20 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from tcpipe.fusion import preparation
-from tcpipe.fusion.checks.doppler import doubt_of_velocity
+from tcpipe.fusion.checks.doppler import check_ground_velocity
 from tcpipe.fusion.checks.mounting import Arm, Tilt
-from tcpipe.fusion.checks.odometry_scale import Scale, rescaled_odometries
-from tcpipe.fusion.checks.refusals import Refusal
+from tcpipe.fusion.checks.odometry_scale import Scale, rescale_odometries
+from tcpipe.fusion.checks.refusals import SensorExclusion
 from tcpipe.fusion.checks.sensors import CommandedSpeed, check_sensors
-from tcpipe.fusion.checks.stamp_jitter import steadied
+from tcpipe.fusion.checks.stamp_jitter import smooth_stamps
 from tcpipe.fusion.measurements import DOPPLER, GNSS, IMU, VISUAL, WHEELS, Measurements
 from tcpipe.fusion.preparation import Prepared
 from tcpipe.geometry.rotation import matrix_from_quat, rpy_from_matrix
 from tcpipe.recipe import FuseConfig
 from tcpipe.recipe.suggestions import suggest
-from tcpipe.stages.read_pose import recipe_role
-from tcpipe.tables.arrays import rows_where
-from tcpipe.tables.columns import FloatColumns, floats, integers
+from tcpipe.stages.read_pose import find_recipe_role
+from tcpipe.tables.arrays import select_rows
+from tcpipe.tables.columns import FloatColumns, to_floats, to_integers
 from tcpipe.tables.facts import SensorChecks
 from tcpipe.tables.findings import Finding, Remedy, StageReport, Subject, make_finding
 from tcpipe.tables.levels import Sensor, Streams
@@ -70,9 +70,9 @@ def prepare_inputs(streams: Streams, config: FuseConfig) -> FusionInputs:
         names = {"estimator": config.estimator}
         inputs.findings.append(make_finding("unused-by-estimator", Subject("role", DOPPLER), names=names))
     for epoch in sorted({int(e) for table in tables.values() for e in pc.unique(table["epoch"]).to_pylist()}):
-        parts = {role: rows_where(table, "epoch", epoch) for role, table in tables.items()}
+        parts = {role: select_rows(table, "epoch", epoch) for role, table in tables.items()}
         found = {role: _prepare(role, part, streams.sensors[role], config, inputs) for role, part in parts.items()}
-        gnss, findings = steadied(found.get(GNSS), found.get(WHEELS) or found.get(VISUAL))
+        gnss, findings = smooth_stamps(found.get(GNSS), found.get(WHEELS) or found.get(VISUAL))
         inputs.findings += findings
         inputs.measurements[epoch] = Measurements(
             gnss=gnss,
@@ -86,14 +86,14 @@ def prepare_inputs(streams: Streams, config: FuseConfig) -> FusionInputs:
 
 
 def _prepare(role: str, table: pa.Table, sensor: Sensor, config: FuseConfig, inputs: FusionInputs) -> Any:
-    stamp_ns, columns = integers(table, "stamp_ns"), FloatColumns(table)
+    stamp_ns, columns = to_integers(table, "stamp_ns"), FloatColumns(table)
     place: Mapping[str, Any] = {"xyz_m": sensor.xyz_m, "quat_xyzw": sensor.quat_xyzw}
     made: Any
     if role == GNSS:
         if inputs.datum_deg_m is None:
             inputs.note(role, Prepared(stamp_ns))
             return None
-        made, prepared = preparation.positions(
+        made, prepared = preparation.prepare_positions(
             stamp_ns,
             columns,
             datum_deg_m=inputs.datum_deg_m,
@@ -102,9 +102,11 @@ def _prepare(role: str, table: pa.Table, sensor: Sensor, config: FuseConfig, inp
             floor_std_m=config.gnss_std_floor_m,
         )
     elif role == DOPPLER:
-        made, prepared = preparation.ground_velocities(stamp_ns, columns, default_std_mps=config.gnss_velocity_std_mps)
+        made, prepared = preparation.prepare_ground_velocities(
+            stamp_ns, columns, default_std_mps=config.gnss_velocity_std_mps
+        )
     elif role == IMU:
-        made, prepared = preparation.inertial(
+        made, prepared = preparation.prepare_imu(
             stamp_ns,
             columns,
             **place,
@@ -113,7 +115,7 @@ def _prepare(role: str, table: pa.Table, sensor: Sensor, config: FuseConfig, inp
         )
     else:
         std = config.wheel_std_mps if role == WHEELS else config.visual_std_mps
-        made, prepared = preparation.body_velocities(
+        made, prepared = preparation.prepare_body_velocities(
             stamp_ns, columns, **place, default_std_mps=std, only_forward=role == WHEELS
         )
     inputs.note(role, prepared)
@@ -123,25 +125,28 @@ def _prepare(role: str, table: pa.Table, sensor: Sensor, config: FuseConfig, inp
 _STATED = ("recipe", "tf_static", "same frame")
 
 
-def sane_inputs(inputs: FusionInputs, streams: Streams) -> tuple[FusionInputs, StageReport[SensorChecks]]:
+def drop_implausible_sensors(inputs: FusionInputs, streams: Streams) -> tuple[FusionInputs, StageReport[SensorChecks]]:
     """Return the inputs without the sensors that are refused, and the findings, judged over the longest clock epoch."""
     if not inputs.measurements:
         return inputs, StageReport((), SensorChecks())
-    epoch = longest_epoch(inputs)
+    epoch = find_longest_epoch(inputs)
     stated = {role: sensor.placed_by in _STATED for role, sensor in streams.sensors.items()}
     checks = check_sensors(
-        inputs.measurements[epoch], command=command_of(streams, epoch), stated=stated, felt=_felt(streams)
+        inputs.measurements[epoch],
+        command=read_command(streams, epoch),
+        stated=stated,
+        felt=_median_specific_force(streams),
     )
     if checks.scales:
-        measured = {number: rescaled_odometries(m, checks.scales) for number, m in inputs.measurements.items()}
+        measured = {number: rescale_odometries(m, checks.scales) for number, m in inputs.measurements.items()}
         inputs = replace(inputs, measurements=measured, scales=checks.scales)
-    sane, found = left_out(inputs, StageReport((), checks.facts), checks.refusals, streams)
-    doubt = doubt_of_velocity(sane.measurements[epoch])
-    return (sane, found) if doubt is None else left_out(sane, found, [doubt], streams)
+    sane, found = exclude_sensors(inputs, StageReport((), checks.facts), checks.refusals, streams)
+    doubt = check_ground_velocity(sane.measurements[epoch])
+    return (sane, found) if doubt is None else exclude_sensors(sane, found, [doubt], streams)
 
 
-def left_out(
-    inputs: FusionInputs, before: StageReport[SensorChecks], refusals: Sequence[Refusal], streams: Streams
+def exclude_sensors(
+    inputs: FusionInputs, before: StageReport[SensorChecks], refusals: Sequence[SensorExclusion], streams: Streams
 ) -> tuple[FusionInputs, StageReport[SensorChecks]]:
     """Return the inputs without refused sensors, the findings, and the codes of these by role."""
     refused = inputs.refused | {refusal.role for refusal in refusals}
@@ -164,34 +169,34 @@ def _without(refused: frozenset[str], m: Measurements) -> Measurements:
     )
 
 
-def longest_epoch(inputs: FusionInputs) -> int:
+def find_longest_epoch(inputs: FusionInputs) -> int:
     """Return the clock epoch with most measurements."""
-    return max(inputs.measurements, key=lambda epoch: _rows(inputs.measurements[epoch]))
+    return max(inputs.measurements, key=lambda epoch: _count_rows(inputs.measurements[epoch]))
 
 
-def _rows(measurements: Measurements) -> int:
+def _count_rows(measurements: Measurements) -> int:
     return sum(sensor.stamp_ns.size for sensor in measurements.sensors().values())
 
 
-def command_of(streams: Streams, epoch: int) -> CommandedSpeed | None:
+def read_command(streams: Streams, epoch: int) -> CommandedSpeed | None:
     """Return the commanded speed of a clock epoch; None without."""
     if "command" not in streams.tables:
         return None
-    table = rows_where(streams.tables["command"], "epoch", epoch)
-    return CommandedSpeed(integers(table, "stamp_ns"), floats(table, "forward_velocity_mps"))
+    table = select_rows(streams.tables["command"], "epoch", epoch)
+    return CommandedSpeed(to_integers(table, "stamp_ns"), to_floats(table, "forward_velocity_mps"))
 
 
-def _felt(streams: Streams) -> float:
+def _median_specific_force(streams: Streams) -> float:
     """Return the median size of the specific force."""
     if IMU not in streams.tables:
         return float("nan")
-    force = np.stack([floats(streams.tables[IMU], f"linear_acceleration_{axis}_mps2") for axis in "xyz"], -1)
+    force = np.stack([to_floats(streams.tables[IMU], f"linear_acceleration_{axis}_mps2") for axis in "xyz"], -1)
     return float(np.median(np.linalg.norm(force, axis=1)))
 
 
-def _find_exclusion(refusal: Refusal, streams: Streams) -> Finding:
+def _find_exclusion(refusal: SensorExclusion, streams: Streams) -> Finding:
     """Return the finding of a sensor that is not fused; a receiver's velocity helps fixes that are fused, and no label needs it."""
-    sensor, name = streams.sensors[refusal.role], recipe_role(refusal.role, streams)
+    sensor, name = streams.sensors[refusal.role], find_recipe_role(refusal.role, streams)
     if refusal.units is not None:
         remedies = suggest("state_units", {"read": {"imu_units": refusal.units}})
     elif refusal.late_s is not None:
@@ -200,7 +205,7 @@ def _find_exclusion(refusal: Refusal, streams: Streams) -> Finding:
     elif refusal.turned_by is not None:
         remedies = state_extrinsics(name, sensor.xyz_m, refusal.turned_by @ matrix_from_quat(sensor.quat_xyzw))
     elif refusal.is_suspect_excludable:
-        remedies = exclude_role(recipe_role(refusal.names["suspect"], streams), "exclude_suspect")
+        remedies = exclude_role(find_recipe_role(refusal.names["suspect"], streams), "exclude_suspect")
     else:
         remedies = exclude_role(name)
     numbers: Mapping[str, Any] = refusal.numbers

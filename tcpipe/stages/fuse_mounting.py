@@ -8,8 +8,17 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.fusion.checks.mounting import ARM_STD_M, Arm, Tilt, levelled, rearmed, solve_arm, solve_tilt, unknown_arm
-from tcpipe.fusion.checks.odometry_scale import Scale, rescaled_odometries, solve_scales
+from tcpipe.fusion.checks.mounting import (
+    ARM_STD_M,
+    Arm,
+    Tilt,
+    level_imu,
+    make_unknown_arm,
+    move_antenna,
+    solve_arm,
+    solve_tilt,
+)
+from tcpipe.fusion.checks.odometry_scale import Scale, rescale_odometries, solve_scales
 from tcpipe.fusion.measurements import GNSS, Measurements
 from tcpipe.recipe import FuseConfig
 from tcpipe.stages.fuse_inputs import FusionInputs
@@ -32,22 +41,22 @@ def fuse_mounted(inputs: FusionInputs, streams: Streams, config: FuseConfig) -> 
     """Fuse each stretch, and again as long as that shows an antenna or an IMU to be mounted, or an odometry to be scaled, otherwise."""
     fused = fuse_stretches(inputs, streams, config)
     for _ in range(_ROUNDS):
-        mended = _mended(inputs, fused, streams)
+        mended = _correct_mounting(inputs, fused, streams)
         if mended is None:
             break
         inputs, fused = mended, fuse_stretches(mended, streams, config)
     return inputs, fused
 
 
-def _mended(inputs: FusionInputs, fused: Fused, streams: Streams) -> FusionInputs | None:
+def _correct_mounting(inputs: FusionInputs, fused: Fused, streams: Streams) -> FusionInputs | None:
     """Return the inputs with what a track shows to be mounted otherwise mended; None where all is settled."""
-    tilt = _tilted(inputs, fused)
+    tilt = _find_tilt(inputs, fused)
     turn = np.zeros(2) if tilt is None else tilt.rad
-    arm, move_m = _rearming(inputs, fused, streams, trusted=tilt is None)
+    arm, move_m = _find_lever_arm(inputs, fused, streams, trusted=tilt is None)
     scales = solve_scales(fused.ratios)
     if tilt is None and arm is None and not scales:
         return None
-    mended = {epoch: _remounted(m, turn, move_m, scales) for epoch, m in inputs.measurements.items()}
+    mended = {epoch: _apply_mounting(m, turn, move_m, scales) for epoch, m in inputs.measurements.items()}
     if tilt is not None and inputs.imu_tilt is not None:
         tilt = replace(tilt, rad=tilt.rad + inputs.imu_tilt.rad)
     arm, tilt = arm or inputs.arm, tilt or inputs.imu_tilt
@@ -55,7 +64,7 @@ def _mended(inputs: FusionInputs, fused: Fused, streams: Streams) -> FusionInput
     return replace(inputs, measurements=mended, arm=arm, imu_tilt=tilt, scales={**inputs.scales, **scales})
 
 
-def _tilted(inputs: FusionInputs, fused: Fused) -> Tilt | None:
+def _find_tilt(inputs: FusionInputs, fused: Fused) -> Tilt | None:
     """Return by how much the IMU is still to be turned; None where it stays."""
     tilt = solve_tilt(fused.tilts)
     if tilt is None:
@@ -67,7 +76,7 @@ def _tilted(inputs: FusionInputs, fused: Fused) -> Tilt | None:
     return replace(tilt, rad=turned) if turned.any() else None
 
 
-def _rearming(
+def _find_lever_arm(
     inputs: FusionInputs, fused: Fused, streams: Streams, *, trusted: bool
 ) -> tuple[Arm | None, NDArray[np.float64]]:
     """Return the antenna's arm and by how much to move it; None and nothing where it stays.
@@ -80,12 +89,12 @@ def _rearming(
     if inputs.datum_deg_m is None or GNSS not in streams.sensors:
         return None, nothing
     unknown = streams.sensors[GNSS].placed_by == "assumed"
-    moved = moved_m(inputs, streams)
+    moved = compute_moved_m(inputs, streams)
     height_std_m = ARM_STD_M if unknown else _STATED_HEIGHT_STD_M
-    arm = solve_arm(fused.arms, moved, height_std_m=height_std_m) or (unknown_arm() if unknown else None)
+    arm = solve_arm(fused.arms, moved, height_std_m=height_std_m) or (make_unknown_arm() if unknown else None)
     if arm is None:
         return None, nothing
-    if inputs.arm is None and not unknown and not (trusted and _contradicted(arm)):
+    if inputs.arm is None and not unknown and not (trusted and _is_contradicted(arm)):
         return None, nothing
     move_m = arm.error[:3] - moved
     if inputs.arm is not None and float(np.linalg.norm(move_m[_ANTENNA])) < _SETTLED_M:
@@ -93,24 +102,24 @@ def _rearming(
     return arm, move_m
 
 
-def _contradicted(arm: Arm) -> bool:
+def _is_contradicted(arm: Arm) -> bool:
     """Return whether the turns show an antenna elsewhere than it is stated to be."""
     aside = arm.error[_ANTENNA]
     squared = float(aside @ np.linalg.solve(arm.covariance[_ANTENNA, _ANTENNA], aside))
     return squared > _SURE_OF_ARM**2 and float(np.linalg.norm(aside)) > _LEAST_ARM_M
 
 
-def moved_m(inputs: FusionInputs, streams: Streams) -> NDArray[np.float64]:
+def compute_moved_m(inputs: FusionInputs, streams: Streams) -> NDArray[np.float64]:
     """Return by how much the arm in use differs from the one that was read [m], shape (3,)."""
     arms = [m.gnss.lever_arm_m for m in inputs.measurements.values() if m.gnss is not None]
     return np.asarray(arms[0]) - np.asarray(streams.sensors[GNSS].xyz_m) if arms else np.zeros(3)
 
 
-def _remounted(
+def _apply_mounting(
     m: Measurements, turn_rad: NDArray[np.float64], move_m: NDArray[np.float64], scales: Mapping[str, Scale]
 ) -> Measurements:
     return replace(
-        rescaled_odometries(m, scales),
-        imu=None if m.imu is None else levelled(m.imu, turn_rad) if turn_rad.any() else m.imu,
-        gnss=None if m.gnss is None else rearmed(m.gnss, move_m),
+        rescale_odometries(m, scales),
+        imu=None if m.imu is None else level_imu(m.imu, turn_rad) if turn_rad.any() else m.imu,
+        gnss=None if m.gnss is None else move_antenna(m.gnss, move_m),
     )

@@ -10,31 +10,31 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from tcpipe.fusion.checks.audit import Tally, audited
+from tcpipe.fusion.checks.audit import Tally, audit_trajectory
 from tcpipe.fusion.checks.mounting import (
     ArmEvidence,
     TiltEvidence,
-    antenna_doubt,
-    arm_evidence,
-    tilt_evidence,
-    with_antenna_doubt,
+    add_antenna_uncertainty,
+    collect_arm_evidence,
+    collect_tilt_evidence,
+    estimate_antenna_uncertainty,
 )
-from tcpipe.fusion.checks.odometry_scale import way_ratios
+from tcpipe.fusion.checks.odometry_scale import distance_ratios
 from tcpipe.fusion.error_state import run_error_state
 from tcpipe.fusion.initial import find_initial_state
 from tcpipe.fusion.measurements import BodyVelocities, InitialState
-from tcpipe.fusion.signals import hold_last, in_gap, median_period_ns, seconds
-from tcpipe.fusion.standing import standing_intervals
-from tcpipe.fusion.stretches import Stretch, cut_stretches, track_stamps
+from tcpipe.fusion.signals import compute_median_period_ns, compute_seconds, hold_last, is_in_gap
+from tcpipe.fusion.stationary import find_stationary_intervals
+from tcpipe.fusion.track_sections import TrackSection, cut_stretches, track_stamps
 from tcpipe.fusion.trajectory import DISPLACEMENT_LAGS_S, Trajectory
 from tcpipe.geometry.datum import geodetic_from_enu
 from tcpipe.geometry.rotation import matrix_from_quat, rpy_from_matrix, rpy_from_quat
-from tcpipe.power.rails import power_at
+from tcpipe.power.rails import compute_power_at
 from tcpipe.recipe import FuseConfig
 from tcpipe.stages.fuse_inputs import FusionInputs
-from tcpipe.stages.power_rails import rails_of
-from tcpipe.tables.arrays import rows_where
-from tcpipe.tables.columns import floats, integers
+from tcpipe.stages.power_rails import make_rails
+from tcpipe.tables.arrays import select_rows
+from tcpipe.tables.columns import to_floats, to_integers
 from tcpipe.tables.facts import Disagreement, StretchFacts
 from tcpipe.tables.levels import REJECTIONS, Streams
 
@@ -66,42 +66,44 @@ def fuse_stretches(inputs: FusionInputs, streams: Streams, config: FuseConfig) -
             fused.skipped_s += (stretch.end_ns - stretch.start_ns) * 1e-9
             continue
         # 1. Where it starts; a local frame goes on from where the last stretch ended.
-        initial = _initial(stretch, fused.found[-1] if fused.found and inputs.datum_deg_m is None else None)
+        initial = _make_initial_state(stretch, fused.found[-1] if fused.found and inputs.datum_deg_m is None else None)
         # 2. Filter and smoother.
         trajectory = _estimate(stretch, initial, output_ns, config)
         # 3. What it tells of how antenna and IMU are mounted and odometries scaled, and what nobody knows of it.
-        fused.arms.append(arm_evidence(trajectory, stretch.measurements))
-        fused.tilts.append(tilt_evidence(trajectory, stretch.measurements))
-        fused.ratios.append(way_ratios(trajectory, stretch.measurements))
-        trajectory = _doubted(trajectory, stretch, inputs)
+        fused.arms.append(collect_arm_evidence(trajectory, stretch.measurements))
+        fused.tilts.append(collect_tilt_evidence(trajectory, stretch.measurements))
+        fused.ratios.append(distance_ratios(trajectory, stretch.measurements))
+        trajectory = _add_mounting_uncertainty(trajectory, stretch, inputs)
         # 4. What came out is held against what went in.
-        trajectory, audit = audited(trajectory, stretch.measurements)
+        trajectory, audit = audit_trajectory(trajectory, stretch.measurements)
         fused.disagreements += (replace(each, epoch=stretch.epoch) for each in audit.disagreements)
         fused.tallies += audit.tallies
         fused.windows, fused.astray = fused.windows + audit.windows, fused.astray + audit.astray
         fused.found.append(trajectory)
         fused.facts.append(stretch_facts(stretch, initial, trajectory))
         # 5. What else is known at the track's stamps.
-        fused.columns.append(_columns(stretch, trajectory, inputs, streams, config))
+        fused.columns.append(_make_columns(stretch, trajectory, inputs, streams, config))
     return fused
 
 
-def _doubted(found: Trajectory, stretch: Stretch, inputs: FusionInputs) -> Trajectory:
+def _add_mounting_uncertainty(found: Trajectory, stretch: TrackSection, inputs: FusionInputs) -> Trajectory:
     """Return the trajectory with what is not known of a mended or unstated mounting."""
     gnss = stretch.measurements.gnss
-    covariance = None if gnss is None else antenna_doubt(inputs.arm, inputs.imu_tilt, gnss.lever_arm_m)
-    return found if gnss is None or covariance is None else with_antenna_doubt(found, covariance, gnss)
+    covariance = None if gnss is None else estimate_antenna_uncertainty(inputs.arm, inputs.imu_tilt, gnss.lever_arm_m)
+    return found if gnss is None or covariance is None else add_antenna_uncertainty(found, covariance, gnss)
 
 
-def _initial(stretch: Stretch, last: Trajectory | None) -> InitialState:
+def _make_initial_state(stretch: TrackSection, last: Trajectory | None) -> InitialState:
     m = stretch.measurements
-    initial = find_initial_state(m, standing_intervals(m), stretch.start_ns)
+    initial = find_initial_state(m, find_stationary_intervals(m), stretch.start_ns)
     if last is None:
         return initial
     return replace(initial, position_enu_m=last.position_enu_m[-1], quat_xyzw=last.quat_xyzw[-1])
 
 
-def _estimate(stretch: Stretch, initial: InitialState, output_ns: NDArray[np.int64], config: FuseConfig) -> Trajectory:
+def _estimate(
+    stretch: TrackSection, initial: InitialState, output_ns: NDArray[np.int64], config: FuseConfig
+) -> Trajectory:
     gate = config.gate_probability
     if config.estimator == "ukf":
         from tcpipe.fusion.ukf15 import run_ukf15  # noqa: PLC0415  its kernels load only when it is asked for
@@ -112,24 +114,24 @@ def _estimate(stretch: Stretch, initial: InitialState, output_ns: NDArray[np.int
     return run_error_state(stretch.measurements, initial, output_ns=output_ns, gate_probability=gate)
 
 
-def _columns(
-    stretch: Stretch, trajectory: Trajectory, inputs: FusionInputs, streams: Streams, config: FuseConfig
+def _make_columns(
+    stretch: TrackSection, trajectory: Trajectory, inputs: FusionInputs, streams: Streams, config: FuseConfig
 ) -> dict[str, NDArray[Any]]:
     stamp_ns, gap_ns, power_gap_ns = trajectory.stamp_ns, int(config.max_gap_s * 1e9), int(config.max_power_gap_s * 1e9)
     return {
         "stamp_ns": stamp_ns,
         "epoch": np.full(stamp_ns.size, stretch.epoch, np.int16),
-        **pose_columns(trajectory, inputs.datum_deg_m),
-        "wheel_velocity_mps": wheel_column(stretch.measurements.wheels, stamp_ns, max_gap_ns=gap_ns),
-        **command_columns(streams, stretch.epoch, stamp_ns),
-        **power_columns(streams, stretch.epoch, stamp_ns, max_gap_ns=power_gap_ns),
+        **make_pose_columns(trajectory, inputs.datum_deg_m),
+        "wheel_velocity_mps": make_wheel_column(stretch.measurements.wheels, stamp_ns, max_gap_ns=gap_ns),
+        **make_command_columns(streams, stretch.epoch, stamp_ns),
+        **make_power_columns(streams, stretch.epoch, stamp_ns, max_gap_ns=power_gap_ns),
     }
 
 
 Arrays = dict[str, NDArray[np.float64]]
 
 
-def pose_columns(found: Trajectory, datum_deg_m: tuple[float, float, float] | None) -> Arrays:
+def make_pose_columns(found: Trajectory, datum_deg_m: tuple[float, float, float] | None) -> Arrays:
     """Return pose, twist and their deviations; longitude, latitude and height are NaN in a local frame."""
     rotation = matrix_from_quat(found.quat_xyzw)
     rpy = rpy_from_matrix(rotation)
@@ -153,34 +155,36 @@ def pose_columns(found: Trajectory, datum_deg_m: tuple[float, float, float] | No
     return columns
 
 
-def wheel_column(wheels: BodyVelocities | None, at_ns: NDArray[np.int64], *, max_gap_ns: int) -> NDArray[np.float64]:
+def make_wheel_column(
+    wheels: BodyVelocities | None, at_ns: NDArray[np.int64], *, max_gap_ns: int
+) -> NDArray[np.float64]:
     """Return the wheels' forward velocity, interpolated; NaN in gaps."""
     if wheels is None:
         return np.full(at_ns.size, np.nan)
     zero = int(wheels.stamp_ns[0])
-    between = np.interp(seconds(at_ns, zero), seconds(wheels.stamp_ns, zero), wheels.velocity_mps[:, 0])
-    longest = max(max_gap_ns, 3 * median_period_ns(wheels.stamp_ns))
-    return np.where(in_gap(wheels.stamp_ns, at_ns, at_ns, longest_ns=longest), np.nan, between)
+    between = np.interp(compute_seconds(at_ns, zero), compute_seconds(wheels.stamp_ns, zero), wheels.velocity_mps[:, 0])
+    longest = max(max_gap_ns, 3 * compute_median_period_ns(wheels.stamp_ns))
+    return np.where(is_in_gap(wheels.stamp_ns, at_ns, at_ns, longest_ns=longest), np.nan, between)
 
 
-def command_columns(streams: Streams, epoch: int, at_ns: NDArray[np.int64]) -> Arrays:
+def make_command_columns(streams: Streams, epoch: int, at_ns: NDArray[np.int64]) -> Arrays:
     """Return the last command at each stamp; NaN before the first and without commands."""
     table = streams.tables.get("command")
     names = {"commanded_velocity_mps": "forward_velocity_mps", "commanded_yaw_rate_radps": "yaw_rate_radps"}
     if table is None:
         return {name: np.full(at_ns.size, np.nan) for name in names}
-    table = rows_where(table, "epoch", epoch)
-    stamp_ns = integers(table, "stamp_ns")
-    return {name: hold_last(stamp_ns, floats(table, source), at_ns) for name, source in names.items()}
+    table = select_rows(table, "epoch", epoch)
+    stamp_ns = to_integers(table, "stamp_ns")
+    return {name: hold_last(stamp_ns, to_floats(table, source), at_ns) for name, source in names.items()}
 
 
-def power_columns(streams: Streams, epoch: int, at_ns: NDArray[np.int64], *, max_gap_ns: int) -> Arrays:
+def make_power_columns(streams: Streams, epoch: int, at_ns: NDArray[np.int64], *, max_gap_ns: int) -> Arrays:
     """Return voltage, current and power at each stamp; NaN in power gaps and without power."""
-    values = power_at(rails_of(streams, epoch), at_ns, max_gap_ns=max_gap_ns)
+    values = compute_power_at(make_rails(streams, epoch), at_ns, max_gap_ns=max_gap_ns)
     return dict(zip(("voltage_volt", "current_amp", "power_watt"), values, strict=True))
 
 
-def rejections_table(inputs: FusionInputs, found: list[Trajectory]) -> pa.Table:
+def make_rejections_table(inputs: FusionInputs, found: list[Trajectory]) -> pa.Table:
     """Return every refused measurement in order of time: by the gate, and those without a usable value."""
     parts = [trajectory.rejections for trajectory in found]
     invalid = [(role, np.concatenate(stamps)) for role, stamps in sorted(inputs.invalid_ns.items())]
@@ -198,7 +202,7 @@ def rejections_table(inputs: FusionInputs, found: list[Trajectory]) -> pa.Table:
     return REJECTIONS.table(**{name: values[order] for name, values in joined.items()})
 
 
-def stretch_facts(stretch: Stretch, initial: InitialState, found: Trajectory) -> StretchFacts:
+def stretch_facts(stretch: TrackSection, initial: InitialState, found: Trajectory) -> StretchFacts:
     """Return the facts of one stretch: the filter's, and where it lies and began."""
     m = stretch.measurements
     return replace(

@@ -8,12 +8,12 @@ import numpy as np
 
 from tcpipe.errors import FusionError
 from tcpipe.fusion.trajectory import DISPLACEMENT_LAGS_S
-from tcpipe.motion.ledger import JUMP_M, unexplained_m
-from tcpipe.motion.pieces import Floats, Mask, MotionRows
-from tcpipe.motion.uncertainty import along_std_m, chord_ahead_std_m
+from tcpipe.motion.distance_breakdown import JUMP_M, compute_unexplained_m
+from tcpipe.motion.row_sections import Floats, Mask, MotionRows
+from tcpipe.motion.uncertainty import compute_along_std_m, compute_chord_ahead_std_m
 from tcpipe.recipe import GateConfig
-from tcpipe.tables.catalogue import threshold
-from tcpipe.tables.columns import floats, integers
+from tcpipe.tables.catalogue import read_threshold
+from tcpipe.tables.columns import to_floats, to_integers
 from tcpipe.tables.findings import Finding, Subject, make_finding
 from tcpipe.tables.levels import TRACK, Track
 
@@ -49,26 +49,26 @@ def find_gaps(track: Track, rows: MotionRows, *, chord_m: float, config: GateCon
     Where its sensors contradict each other in most of the way undecided, they are all rows of the run. Rows faster than
     ``max_plausible_mps`` [m/s] are no driving; see `find_implausible`.
     """
-    power = floats(track.table, "power_watt")
+    power = to_floats(track.table, "power_watt")
     without_power = np.isnan(power) & bool(np.isfinite(power).any())
     moving = np.abs(rows.velocity_mps) >= config.turning_velocity_mps
-    uncertain = moving & (_chord_std_m(track, rows, chord_m, config) > config.max_relative_position_std_m)
-    off_m = _unexplained_m(track, rows)
+    uncertain = moving & (_compute_chord_std_m(track, rows, chord_m, config) > config.max_relative_position_std_m)
+    off_m = _compute_unexplained_m(track, rows)
     jumps = np.zeros(len(moving), dtype=np.bool_)
     steps = np.flatnonzero(off_m > config.max_relative_position_std_m)
     jumps[steps] = jumps[steps + 1] = True
     run, findings = Subject("run", track.info.run_id), []
     share = float(without_power[moving].mean()) if moving.any() else 0.0
-    if share > threshold("power-gaps", "min_lost_fraction"):
+    if share > read_threshold("power-gaps", "min_lost_fraction"):
         findings.append(make_finding("power-gaps", Subject("role", "power"), lost_fraction=share))
     share = float(uncertain[moving].mean()) if moving.any() else 0.0
-    if share > threshold("distance-uncertain", "min_lost_fraction"):
+    if share > read_threshold("distance-uncertain", "min_lost_fraction"):
         limit_m = config.max_relative_position_std_m
         findings.append(
             make_finding("distance-uncertain", run, lost_fraction=share, chord_m=chord_m, max_std_m=limit_m)
         )
     if far := int((off_m > JUMP_M).sum()):
-        stamp_ns, furthest = integers(track.table, "stamp_ns"), int(np.argmax(off_m))
+        stamp_ns, furthest = to_integers(track.table, "stamp_ns"), int(np.argmax(off_m))
         at_s = (int(stamp_ns[furthest]) - int(stamp_ns[0])) / 1e9
         jump_m = float(off_m.max())
         findings.append(make_finding("position-jumps", run, span_s=(at_s, at_s), jump_m=jump_m, jump_count=far))
@@ -78,28 +78,28 @@ def find_gaps(track: Track, rows: MotionRows, *, chord_m: float, config: GateCon
     return Gaps(without_power, uncertain, jumps, contradicted, implausible, (*findings, *too_fast))
 
 
-def _chord_std_m(track: Track, rows: MotionRows, chord_m: float, config: GateConfig) -> Floats:
+def _compute_chord_std_m(track: Track, rows: MotionRows, chord_m: float, config: GateConfig) -> Floats:
     table = track.table
-    course = np.arctan2(floats(table, "north_velocity_mps"), floats(table, "east_velocity_mps"))
-    common_mps = _common_std_mps(track)
-    told_m = np.column_stack([floats(table, name) for name in _DISPLACEMENTS])
-    return chord_ahead_std_m(
+    course = np.arctan2(to_floats(table, "north_velocity_mps"), to_floats(table, "east_velocity_mps"))
+    common_mps = _compute_common_std_mps(track)
+    told_m = np.column_stack([to_floats(table, name) for name in _DISPLACEMENTS])
+    return compute_chord_ahead_std_m(
         rows,
-        velocity_std_mps=_without(floats(table, "forward_velocity_std_mps"), common_mps),
-        position_std_m=along_std_m(floats(table, "x_std_m"), floats(table, "y_std_m"), course),
+        velocity_std_mps=_subtract_variance(to_floats(table, "forward_velocity_std_mps"), common_mps),
+        position_std_m=compute_along_std_m(to_floats(table, "x_std_m"), to_floats(table, "y_std_m"), course),
         chord_m=chord_m,
         slowest_mps=config.turning_velocity_mps,
         smoothed=track.info.estimator == "smoother",
         told_s=DISPLACEMENT_LAGS_S,
-        told_std_m=_without(told_m, common_mps[:, None] * DISPLACEMENT_LAGS_S),
+        told_std_m=_subtract_variance(told_m, common_mps[:, None] * DISPLACEMENT_LAGS_S),
     )
 
 
-def _common_std_mps(track: Track) -> Floats:
+def _compute_common_std_mps(track: Track) -> Floats:
     """Return the part of each row's velocity deviation that its whole stretch has in common, since nothing tells how long a metre is."""
     table = track.table
-    stamp_ns, epoch = integers(table, "stamp_ns"), integers(table, "epoch")
-    speed_mps = np.linalg.norm([floats(table, f"{name}_velocity_mps") for name in ("east", "north", "up")], axis=0)
+    stamp_ns, epoch = to_integers(table, "stamp_ns"), to_integers(table, "epoch")
+    speed_mps = np.linalg.norm([to_floats(table, f"{name}_velocity_mps") for name in ("east", "north", "up")], axis=0)
     scale_std = np.zeros(len(speed_mps))
     fuse = track.info.report.facts.fuse
     for stretch in fuse.stretches if fuse else ():
@@ -109,16 +109,16 @@ def _common_std_mps(track: Track) -> Floats:
     return common_mps
 
 
-def _without(std: Floats, part: Floats) -> Floats:
+def _subtract_variance(std: Floats, part: Floats) -> Floats:
     """Return a deviation less a part of it; NaN where it is not known."""
     return np.sqrt(np.maximum(std**2 - part**2, 0.0))
 
 
-def _unexplained_m(track: Track, rows: MotionRows) -> Floats:
+def _compute_unexplained_m(track: Track, rows: MotionRows) -> Floats:
     table = track.table
-    position_m = np.column_stack([floats(table, f"{axis}_m") for axis in "xyz"])
-    velocity_mps = np.column_stack([floats(table, f"{name}_velocity_mps") for name in ("east", "north", "up")])
-    return np.append(unexplained_m(integers(table, "stamp_ns"), position_m, velocity_mps, rows.piece), 0.0)
+    position_m = np.column_stack([to_floats(table, f"{axis}_m") for axis in "xyz"])
+    velocity_mps = np.column_stack([to_floats(table, f"{name}_velocity_mps") for name in ("east", "north", "up")])
+    return np.append(compute_unexplained_m(to_integers(table, "stamp_ns"), position_m, velocity_mps, rows.piece), 0.0)
 
 
 _WINDOW_S = 60.0
@@ -138,8 +138,8 @@ def find_implausible(track: Track, rows: MotionRows, jumps: Mask, limit_mps: flo
     FusionError : the moving median of the speed, over a minute of driving, exceeds the limit.
     """
     table = track.table
-    speed_mps = np.hypot(floats(table, "east_velocity_mps"), floats(table, "north_velocity_mps"))
-    step_mps = np.hypot(*(np.diff(floats(table, f"{axis}_m")) for axis in "xy")) / rows.period_s
+    speed_mps = np.hypot(to_floats(table, "east_velocity_mps"), to_floats(table, "north_velocity_mps"))
+    step_mps = np.hypot(*(np.diff(to_floats(table, f"{axis}_m")) for axis in "xy")) / rows.period_s
     step_mps = np.where((np.diff(rows.piece) == 0) & ~(jumps[1:] & jumps[:-1]), step_mps, 0.0)
     speed_mps = np.maximum(speed_mps, np.maximum(np.append(step_mps, 0.0), np.append(0.0, step_mps)))
     implausible: Mask = speed_mps > limit_mps

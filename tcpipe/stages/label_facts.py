@@ -8,15 +8,15 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from tcpipe.cost.budget import energy_budget, find_noise
-from tcpipe.cost.quality import wanted_rate_hz
+from tcpipe.cost.budget import estimate_energy_budget, find_noise
+from tcpipe.cost.quality import find_wanted_rate
 from tcpipe.power.energy import Rule
 from tcpipe.power.rails import Rail
-from tcpipe.stages.power_rails import rail_facts
-from tcpipe.tables.arrays import numbers
-from tcpipe.tables.bits import Quality, name_of
-from tcpipe.tables.catalogue import threshold
-from tcpipe.tables.columns import floats
+from tcpipe.stages.power_rails import describe_rail
+from tcpipe.tables.arrays import to_numbers
+from tcpipe.tables.bits import Quality, flag_name
+from tcpipe.tables.catalogue import read_threshold
+from tcpipe.tables.columns import to_floats
 from tcpipe.tables.facts import EnergyBudget, LabelFacts, PhysicsFacts
 from tcpipe.tables.findings import Finding, Subject, make_finding
 
@@ -45,34 +45,36 @@ def label_facts(
     velocity : which velocity trains, ground or fused.
     """
     powered = any(len(each.stamp_ns) for epoch in rails.values() for each in epoch)
-    quality = numbers(table["quality"])
-    energy = floats(table, "energy_joule")
+    quality = to_numbers(table["quality"])
+    energy = to_floats(table, "energy_joule")
     return LabelFacts(
         distance_m=sum(ledger_m.values()),
         energy_joule=sum(energy_by_entry_joule.values()) if powered else None,
         energy_by_entry_joule=dict(energy_by_entry_joule) if powered else None,
         integration=rule,
         velocity=velocity,
-        rails={str(epoch): tuple(rail_facts(each) for each in rails[epoch]) for epoch in rails if rails[epoch]},
+        rails={str(epoch): tuple(describe_rail(each) for each in rails[epoch]) for epoch in rails if rails[epoch]},
         segments=table.num_rows,
         segments_without_power=int(np.isnan(energy).sum()),
-        median_power_watt=_median(floats(table, "power_watt")),
+        median_power_watt=_compute_median(to_floats(table, "power_watt")),
         relative_std_median={
-            name: _median(_share(floats(table, f"{name}_std_{unit}"), floats(table, f"{name}_{unit}")))
+            name: _compute_median(
+                _compute_share(to_floats(table, f"{name}_std_{unit}"), to_floats(table, f"{name}_{unit}"))
+            )
             for name, unit in (("duration", "s"), ("velocity", "mps"), ("power", "watt"), ("energy", "joule"))
         },
-        energy_budget=_budget(energy, energy_variance_j2),
-        quality={name_of(bit): int(((quality & np.uint32(bit)) != 0).sum()) for bit in Quality},
+        energy_budget=_make_budget(energy, energy_variance_j2),
+        quality={flag_name(bit): int(((quality & np.uint32(bit)) != 0).sum()) for bit in Quality},
         physics=physics,
     )
 
 
-def _budget(
+def _make_budget(
     energy_joule: NDArray[np.float64], variance_j2: Sequence[Mapping[str, NDArray[np.float64]]]
 ) -> EnergyBudget | None:
     if not variance_j2:
         return None
-    return energy_budget(
+    return estimate_energy_budget(
         energy_joule, {name: np.concatenate([part[name] for part in variance_j2]) for name in variance_j2[0]}
     )
 
@@ -86,10 +88,10 @@ def label_findings(facts: LabelFacts) -> tuple[Finding, ...]:
         lost, total = facts.segments_without_power, facts.segments
         findings.append(make_finding("segments-without-power", _POWER, unlabelled_count=lost, segment_count=total))
     slips = facts.quality["high_slip"]
-    if slips > threshold("wheels-slip", "min_segment_fraction") * facts.segments:
+    if slips > read_threshold("wheels-slip", "min_segment_fraction") * facts.segments:
         findings.append(make_finding("wheels-slip", _WHEELS, segment_fraction=slips / facts.segments))
     idle, driving = facts.physics.standing_watt, facts.median_power_watt
-    least, few = (threshold("idle-power-high", name) for name in ("min_idle_fraction", "min_idle_watt"))
+    least, few = (read_threshold("idle-power-high", name) for name in ("min_idle_fraction", "min_idle_watt"))
     if idle is not None and driving is not None and idle > max(least * driving, few):
         findings.append(make_finding("idle-power-high", _POWER, idle_watt=idle, driving_watt=driving))
     return (*findings, *find_noise(facts.energy_budget, _POWER))
@@ -102,16 +104,16 @@ def _find_low_rate(facts: LabelFacts) -> Finding:
         min((each.rate_hz for each in signals if each.rate_hz), default=0.0)
         for signals in ([rail.current for rail in rails], [rail.voltage for rail in rails])
     )
-    wanted_hz = wanted_rate_hz(averaged=facts.integration == "averaged")
+    wanted_hz = find_wanted_rate(averaged=facts.integration == "averaged")
     quantity, rate_hz = ("current", current_hz) if current_hz < wanted_hz else ("voltage", voltage_hz)
     return make_finding("power-too-slow", _POWER, names={"quantity": quantity}, rate_hz=rate_hz, wanted_hz=wanted_hz)
 
 
-def _share(part: NDArray[np.float64], whole: NDArray[np.float64]) -> NDArray[np.float64]:
+def _compute_share(part: NDArray[np.float64], whole: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return a part of each value; NaN where the value is zero (no current, no energy)."""
     return np.divide(part, whole, out=np.full_like(part, np.nan), where=whole != 0.0)
 
 
-def _median(values: NDArray[np.float64]) -> float | None:
+def _compute_median(values: NDArray[np.float64]) -> float | None:
     known = values[np.isfinite(values)]
     return float(np.median(np.abs(known))) if len(known) else None

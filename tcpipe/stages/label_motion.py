@@ -7,17 +7,17 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from tcpipe.cost.labels import Labels
-from tcpipe.cost.quality import low_power_rate, near, slipping, voltage_outside
+from tcpipe.cost.quality import has_low_power_rate, has_slip, spans_near, touches_voltage_outside
 from tcpipe.fusion.measurements import GNSS, IMU
-from tcpipe.fusion.process import gyro_density
-from tcpipe.fusion.signals import median_period_ns, white_noise
+from tcpipe.fusion.process import estimate_gyro_density
+from tcpipe.fusion.signals import compute_median_period_ns, estimate_white_noise
 from tcpipe.geometry.piecewise_linear import interpolate, mean_between
-from tcpipe.motion.pieces import piece_of_rows
-from tcpipe.motion.vibration import vibration_mps2
+from tcpipe.motion.row_sections import number_pieces
+from tcpipe.motion.vibration import compute_vibration_mps2
 from tcpipe.power.rails import Rail
-from tcpipe.tables.arrays import numbers, rows_where
+from tcpipe.tables.arrays import select_rows, to_numbers
 from tcpipe.tables.bits import DropReason, Quality
-from tcpipe.tables.columns import floats, integers
+from tcpipe.tables.columns import to_floats, to_integers
 from tcpipe.tables.levels import Streams, TrackInfo
 
 Arrays = dict[str, NDArray[np.float64]]
@@ -28,7 +28,7 @@ _GRAVITY_BAND_MPS2 = (8.0, 12.0)
 """Of the median specific force: another one is of another unit, or without gravity, and its vibration is not known."""
 
 
-def motion_columns(cut: pa.Table, rows: pa.Table, streams: Streams, info: TrackInfo, cost: Labels) -> Arrays:
+def make_motion_columns(cut: pa.Table, rows: pa.Table, streams: Streams, info: TrackInfo, cost: Labels) -> Arrays:
     """Return the columns `tcpipe.tables.segment_columns.MOTION_COLUMNS` of one epoch's segments, shape (M,) each.
 
     Parameters
@@ -37,27 +37,27 @@ def motion_columns(cut: pa.Table, rows: pa.Table, streams: Streams, info: TrackI
     streams : for the IMU's samples.
     cost : of the segments, for how sure their velocity is.
     """
-    epoch = int(integers(cut, "epoch")[0])
-    imu = rows_where(streams.tables["imu"], "epoch", epoch) if "imu" in streams.tables else None
-    spans = integers(cut, "start_ns"), integers(cut, "end_ns")
+    epoch = int(to_integers(cut, "epoch")[0])
+    imu = select_rows(streams.tables["imu"], "epoch", epoch) if "imu" in streams.tables else None
+    spans = to_integers(cut, "start_ns"), to_integers(cut, "end_ns")
     return {
-        **_turns(cut, rows, imu, info),
-        **_attitude(rows, spans[0] + (spans[1] - spans[0]) // 2),
-        **_slip(cut, rows, cost),
-        "vibration_mps2": _vibration(imu, *spans),
+        **_compute_turns(cut, rows, imu, info),
+        **_compute_attitude(rows, spans[0] + (spans[1] - spans[0]) // 2),
+        **_compute_slip(cut, rows, cost),
+        "vibration_mps2": _compute_vibration(imu, *spans),
     }
 
 
-def _turns(cut: pa.Table, rows: pa.Table, imu: pa.Table | None, info: TrackInfo) -> Arrays:
-    stamp_ns, start_ns, end_ns = integers(rows, "stamp_ns"), integers(cut, "start_ns"), integers(cut, "end_ns")
-    yaw_rad = np.unwrap(floats(rows, "yaw_rad"))
+def _compute_turns(cut: pa.Table, rows: pa.Table, imu: pa.Table | None, info: TrackInfo) -> Arrays:
+    stamp_ns, start_ns, end_ns = to_integers(rows, "stamp_ns"), to_integers(cut, "start_ns"), to_integers(cut, "end_ns")
+    yaw_rad = np.unwrap(to_floats(rows, "yaw_rad"))
     turn_rad = interpolate(stamp_ns, yaw_rad, end_ns) - interpolate(stamp_ns, yaw_rad, start_ns)
-    duration_s, arc_m = (end_ns - start_ns) * 1e-9, floats(cut, "arc_length_m")
+    duration_s, arc_m = (end_ns - start_ns) * 1e-9, to_floats(cut, "arc_length_m")
     std_rad = np.sqrt(_turn_density(cut, imu, info) * duration_s)
     return {
         "turn_rad": turn_rad,
         "turn_std_rad": std_rad,
-        "turn_rate_radps": mean_between(stamp_ns, np.abs(floats(rows, "yaw_rate_radps")), start_ns, end_ns),
+        "turn_rate_radps": mean_between(stamp_ns, np.abs(to_floats(rows, "yaw_rate_radps")), start_ns, end_ns),
         "turn_rate_std_radps": std_rad / duration_s,
         "curvature_radpm": turn_rad / arc_m,
         "curvature_std_radpm": std_rad / arc_m,
@@ -71,67 +71,69 @@ def _turn_density(cut: pa.Table, imu: pa.Table | None, info: TrackInfo) -> NDArr
 
     Positions and odometry hold the yaw itself; of how it changes within a second they tell far less.
     """
-    start_ns, density = integers(cut, "start_ns"), np.full(cut.num_rows, np.nan)
+    start_ns, density = to_integers(cut, "start_ns"), np.full(cut.num_rows, np.nan)
     facts = info.report.facts.fuse
     if imu is None or imu.num_rows < 2 or facts is None or info.estimator != "smoother":
         return density
-    rate_hz = 1e9 / median_period_ns(np.unique(integers(imu, "stamp_ns")))
-    epoch = int(integers(cut, "epoch")[0])
+    rate_hz = 1e9 / compute_median_period_ns(np.unique(to_integers(imu, "stamp_ns")))
+    epoch = int(to_integers(cut, "epoch")[0])
     for each in facts.stretches:
         if each.epoch == epoch and IMU in each.sensors and each.gyro_noise_radps is not None:
             mine = (start_ns >= each.start_ns) & (start_ns <= each.end_ns)
-            density[mine] = gyro_density(each.gyro_noise_radps, rate_hz)
+            density[mine] = estimate_gyro_density(each.gyro_noise_radps, rate_hz)
     return density
 
 
-def _attitude(rows: pa.Table, middle_ns: NDArray[np.int64]) -> Arrays:
-    stamp_ns = integers(rows, "stamp_ns")
-    return {name: interpolate(stamp_ns, floats(rows, name), middle_ns) for name in ("roll_rad", "pitch_rad")}
+def _compute_attitude(rows: pa.Table, middle_ns: NDArray[np.int64]) -> Arrays:
+    stamp_ns = to_integers(rows, "stamp_ns")
+    return {name: interpolate(stamp_ns, to_floats(rows, name), middle_ns) for name in ("roll_rad", "pitch_rad")}
 
 
-def _slip(cut: pa.Table, rows: pa.Table, cost: Labels) -> Arrays:
+def _compute_slip(cut: pa.Table, rows: pa.Table, cost: Labels) -> Arrays:
     """Return the slip, and how sure it is: of the way over ground, and of the wheels' white noise."""
-    stamp_ns, wheel_mps = integers(rows, "stamp_ns"), floats(rows, "wheel_velocity_mps")
-    mean_mps = mean_between(stamp_ns, wheel_mps, integers(cut, "start_ns"), integers(cut, "end_ns"))
+    stamp_ns, wheel_mps = to_integers(rows, "stamp_ns"), to_floats(rows, "wheel_velocity_mps")
+    mean_mps = mean_between(stamp_ns, wheel_mps, to_integers(cut, "start_ns"), to_integers(cut, "end_ns"))
     rolling_mps = np.where(np.abs(mean_mps) > _ROLLING_MPS, mean_mps, np.nan)
-    ratio = floats(cut, "fused_velocity_mps") / rolling_mps
-    noise_mps = white_noise(wheel_mps[np.isfinite(wheel_mps), None])
-    period_s = median_period_ns(stamp_ns) * 1e-9
+    ratio = to_floats(cut, "fused_velocity_mps") / rolling_mps
+    noise_mps = estimate_white_noise(wheel_mps[np.isfinite(wheel_mps), None])
+    period_s = compute_median_period_ns(stamp_ns) * 1e-9
     wheel_std_mps = noise_mps * np.sqrt(period_s / cost.duration_s)
     relative = np.hypot(cost.velocity_std_mps / cost.velocity_mps, wheel_std_mps / rolling_mps)
     return {"slip_fraction": 1.0 - ratio, "slip_std_fraction": np.abs(ratio) * relative}
 
 
-def _vibration(imu: pa.Table | None, start_ns: NDArray[np.int64], end_ns: NDArray[np.int64]) -> NDArray[np.float64]:
+def _compute_vibration(
+    imu: pa.Table | None, start_ns: NDArray[np.int64], end_ns: NDArray[np.int64]
+) -> NDArray[np.float64]:
     unknown = np.full(len(start_ns), np.nan)
     if imu is None:
         return unknown
-    force = np.column_stack([floats(imu, f"linear_acceleration_{axis}_mps2") for axis in "xyz"])
+    force = np.column_stack([to_floats(imu, f"linear_acceleration_{axis}_mps2") for axis in "xyz"])
     told = np.isfinite(force).all(axis=1)
     low, high = _GRAVITY_BAND_MPS2
     if not told.any() or not low <= float(np.median(np.linalg.norm(force[told], axis=1))) <= high:
         return unknown
-    return vibration_mps2(integers(imu, "stamp_ns")[told], force[told], start_ns, end_ns)
+    return compute_vibration_mps2(to_integers(imu, "stamp_ns")[told], force[told], start_ns, end_ns)
 
 
 Flags = dict[Quality, NDArray[np.bool_]]
 
 
-def power_flags(cut: pa.Table, rails: list[Rail], *, range_volt: tuple[float, float] | None) -> Flags:
+def find_power_flags(cut: pa.Table, rails: list[Rail], *, range_volt: tuple[float, float] | None) -> Flags:
     """Return the flags that the power samples of one epoch give its segments.
 
     Parameters
     ----------
     range_volt : [V], of the robot's profile; None flags nothing.
     """
-    spans = integers(cut, "start_ns"), integers(cut, "end_ns")
+    spans = to_integers(cut, "start_ns"), to_integers(cut, "end_ns")
     return {
-        Quality.LOW_POWER_RATE: np.full(cut.num_rows, low_power_rate(rails)),
-        Quality.VOLTAGE_OUT_OF_RANGE: voltage_outside(rails, *spans, range_volt=range_volt),
+        Quality.LOW_POWER_RATE: np.full(cut.num_rows, has_low_power_rate(rails)),
+        Quality.VOLTAGE_OUT_OF_RANGE: touches_voltage_outside(rails, *spans, range_volt=range_volt),
     }
 
 
-def motion_flags(
+def find_motion_flags(
     cut: pa.Table, rows: pa.Table, info: TrackInfo, *, arc_to_chord: float, max_position_std_m: float
 ) -> Flags:
     """Return the flags that the gated rows of one epoch give its segments.
@@ -142,27 +144,29 @@ def motion_flags(
     arc_to_chord : a segment more curved than this is flagged.
     max_position_std_m : [m], a segment with an end less certain than this is flagged.
     """
-    stamp_ns, start_ns, end_ns = integers(rows, "stamp_ns"), integers(cut, "start_ns"), integers(cut, "end_ns")
-    chord_m = floats(cut, "chord_m")
-    wheel_mps = mean_between(stamp_ns, floats(rows, "wheel_velocity_mps"), start_ns, end_ns)
-    driven_m = np.concatenate(([0.0], np.cumsum(np.hypot(*(np.diff(floats(rows, f"{axis}_m")) for axis in "xy")))))
+    stamp_ns, start_ns, end_ns = to_integers(rows, "stamp_ns"), to_integers(cut, "start_ns"), to_integers(cut, "end_ns")
+    chord_m = to_floats(cut, "chord_m")
+    wheel_mps = mean_between(stamp_ns, to_floats(rows, "wheel_velocity_mps"), start_ns, end_ns)
+    driven_m = np.concatenate(([0.0], np.cumsum(np.hypot(*(np.diff(to_floats(rows, f"{axis}_m")) for axis in "xy")))))
     start_m, end_m = (interpolate(stamp_ns, driven_m, at_ns) for at_ns in (start_ns, end_ns))
-    gate, commanded_mps = info.report.facts.gate, floats(cut, "commanded_velocity_mps")
+    gate, commanded_mps = info.report.facts.gate, to_floats(cut, "commanded_velocity_mps")
     full_speed_mps = gate.full_speed_mps if gate else None
     return {
-        Quality.NEAR_GAP: near(driven_m[_gap_edges(rows, info.rate_hz)], start_m, end_m, within_m=float(chord_m[0])),
-        Quality.HIGH_SLIP: slipping(wheel_mps, floats(cut, "fused_velocity_mps")),
-        Quality.WEAK_GNSS: floats(cut, "position_std_m") > max_position_std_m,
-        Quality.CURVED: floats(cut, "arc_length_m") > arc_to_chord * chord_m,
+        Quality.NEAR_GAP: spans_near(
+            driven_m[_find_gap_edges(rows, info.rate_hz)], start_m, end_m, within_m=float(chord_m[0])
+        ),
+        Quality.HIGH_SLIP: has_slip(wheel_mps, to_floats(cut, "fused_velocity_mps")),
+        Quality.WEAK_GNSS: to_floats(cut, "position_std_m") > max_position_std_m,
+        Quality.CURVED: to_floats(cut, "arc_length_m") > arc_to_chord * chord_m,
         Quality.NO_COMMAND: np.isnan(commanded_mps),
         Quality.NOT_AT_LIMIT: np.abs(commanded_mps) < (full_speed_mps or 0.0),
-        Quality.SENSORS_DISAGREE: _disputed(cut, info),
+        Quality.SENSORS_DISAGREE: _find_disputed(cut, info),
     }
 
 
-def _disputed(cut: pa.Table, info: TrackInfo) -> NDArray[np.bool_]:
+def _find_disputed(cut: pa.Table, info: TrackInfo) -> NDArray[np.bool_]:
     """Return the segments of one epoch that touch a time in which a sensor disagrees with the track undecided, or fixes were off it."""
-    start_ns, end_ns, epoch = integers(cut, "start_ns"), integers(cut, "end_ns"), integers(cut, "epoch")
+    start_ns, end_ns, epoch = to_integers(cut, "start_ns"), to_integers(cut, "end_ns"), to_integers(cut, "epoch")
     facts = info.report.facts
     times = [(e.epoch, e.start_ns, e.end_ns) for e in (facts.audit.disagreements if facts.audit else ()) if not e.alone]
     for stretch in facts.fuse.stretches if facts.fuse else ():
@@ -173,11 +177,11 @@ def _disputed(cut: pa.Table, info: TrackInfo) -> NDArray[np.bool_]:
     return disputed
 
 
-def _gap_edges(rows: pa.Table, rate_hz: float) -> NDArray[np.bool_]:
+def _find_gap_edges(rows: pa.Table, rate_hz: float) -> NDArray[np.bool_]:
     """Return the rows that are in a gap, or beside a hole."""
-    piece = piece_of_rows(integers(rows, "stamp_ns"), integers(rows, "epoch"), period_ns=1e9 / rate_hz)
+    piece = number_pieces(to_integers(rows, "stamp_ns"), to_integers(rows, "epoch"), period_ns=1e9 / rate_hz)
     hole = np.diff(piece) != 0
-    edge: NDArray[np.bool_] = (numbers(rows["dropped_by"]) & np.uint32(DropReason.GAP)) != 0
+    edge: NDArray[np.bool_] = (to_numbers(rows["dropped_by"]) & np.uint32(DropReason.GAP)) != 0
     edge[:-1] |= hole
     edge[1:] |= hole
     return edge

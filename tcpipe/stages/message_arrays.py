@@ -10,12 +10,12 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
+from tcpipe.logs.extrinsics import Transforms
 from tcpipe.logs.messages import LOG_TIME
-from tcpipe.logs.placements import Transforms
-from tcpipe.tables.arrays import numbers, texts
+from tcpipe.tables.arrays import to_numbers, to_texts
 
 
-def message_arrays(table: pa.Table, in_lists: Collection[str] = ()) -> dict[str, NDArray[Any]]:
+def make_message_arrays(table: pa.Table, in_lists: Collection[str] = ()) -> dict[str, NDArray[Any]]:
     """Return a table's columns: numbers as they are, texts as str, lists of numbers as (N, k) with NaN where a row is shorter.
 
     Columns of other kinds (lists of messages, null) are left out, but for the numbers inside lists of messages that ``in_lists`` names
@@ -23,25 +23,25 @@ def message_arrays(table: pa.Table, in_lists: Collection[str] = ()) -> dict[str,
     """
     found: dict[str, NDArray[Any]] = {}
     for name in table.column_names:
-        array = _combined(table.column(name))
+        array = _combine_chunks(table.column(name))
         kind = array.type
         if pa.types.is_string(kind) or pa.types.is_large_string(kind):
-            found[name] = texts(array)
+            found[name] = to_texts(array)
         elif _is_number(kind):
-            found[name] = numbers(array)
+            found[name] = to_numbers(array)
         elif _is_list(kind) and _is_number(kind.value_type):
-            found[name] = _matrix(array)
+            found[name] = _make_matrix(array)
     for path in in_lists:
         name, _, inner = path.partition("[].")
         if (
             name in table.column_names
-            and (values := _inside(_combined(table.column(name)), inner.split("."))) is not None
+            and (values := _read_nested(_combine_chunks(table.column(name)), inner.split("."))) is not None
         ):
             found[path] = values
     return found
 
 
-def _inside(lists: pa.Array, path: list[str]) -> NDArray[np.float64] | None:
+def _read_nested(lists: pa.Array, path: list[str]) -> NDArray[np.float64] | None:
     """Return a number of every message in lists of messages, shape (N, k); None where there is no such number."""
     kind = lists.type.value_type if _is_list(lists.type) else pa.null()
     for name in path:
@@ -51,10 +51,12 @@ def _inside(lists: pa.Array, path: list[str]) -> NDArray[np.float64] | None:
         kind = kind.field(index).type
     if not _is_number(kind):
         return None
-    return _filled(numbers(pc.list_value_length(lists)).astype(np.int64), pc.struct_field(pc.list_flatten(lists), path))
+    return _fill_nulls(
+        to_numbers(pc.list_value_length(lists)).astype(np.int64), pc.struct_field(pc.list_flatten(lists), path)
+    )
 
 
-def _combined(column: pa.ChunkedArray) -> pa.Array:
+def _combine_chunks(column: pa.ChunkedArray) -> pa.Array:
     combined = column.combine_chunks()
     return combined if isinstance(combined, pa.Array) else pa.concat_arrays(combined.chunks)
 
@@ -67,15 +69,15 @@ def _is_list(kind: pa.DataType) -> bool:
     return bool(pa.types.is_list(kind) or pa.types.is_large_list(kind) or pa.types.is_fixed_size_list(kind))
 
 
-def _matrix(lists: pa.Array) -> NDArray[np.float64]:
+def _make_matrix(lists: pa.Array) -> NDArray[np.float64]:
     if pa.types.is_fixed_size_list(lists.type):
-        values: NDArray[np.float64] = numbers(pc.list_flatten(lists)).astype(np.float64, copy=False)
+        values: NDArray[np.float64] = to_numbers(pc.list_flatten(lists)).astype(np.float64, copy=False)
         return values.reshape(len(lists), lists.type.list_size)
-    return _filled(numbers(pc.list_value_length(lists)).astype(np.int64), pc.list_flatten(lists))
+    return _fill_nulls(to_numbers(pc.list_value_length(lists)).astype(np.int64), pc.list_flatten(lists))
 
 
-def _filled(lengths: NDArray[np.int64], flat: pa.Array) -> NDArray[np.float64]:
-    values: NDArray[np.float64] = numbers(flat).astype(np.float64, copy=False)
+def _fill_nulls(lengths: NDArray[np.int64], flat: pa.Array) -> NDArray[np.float64]:
+    values: NDArray[np.float64] = to_numbers(flat).astype(np.float64, copy=False)
     if len(lengths) and lengths.min() == lengths.max():
         return values.reshape(len(lengths), -1)
     matrix = np.full((len(lengths), int(lengths.max(initial=0))), np.nan)
@@ -83,9 +85,9 @@ def _filled(lengths: NDArray[np.int64], flat: pa.Array) -> NDArray[np.float64]:
     return matrix
 
 
-def transforms(table: pa.Table) -> Transforms:
+def read_transforms(table: pa.Table) -> Transforms:
     """Return all transforms of a tf2_msgs/TFMessage table, message after message."""
-    flat = pc.list_flatten(_combined(table.column("transforms")))
+    flat = pc.list_flatten(_combine_chunks(table.column("transforms")))
 
     def names(*path: str) -> list[str]:
         found: list[str] = pc.struct_field(flat, list(path)).to_pylist()
@@ -93,7 +95,7 @@ def transforms(table: pa.Table) -> Transforms:
 
     def vectors(name: str, components: str) -> NDArray[np.float64]:
         parts = [pc.struct_field(flat, ["transform", name, component]) for component in components]
-        return np.stack([numbers(part).astype(np.float64) for part in parts], -1)
+        return np.stack([to_numbers(part).astype(np.float64) for part in parts], -1)
 
     return Transforms(
         names("header", "frame_id"), names("child_frame_id"), vectors("translation", "xyz"), vectors("rotation", "xyzw")
@@ -113,7 +115,7 @@ def gather_messages(
     Parameters
     ----------
     batches : tables by topic, piece after piece, as a log gives them.
-    played : topics whose messages are wanted as arrays, each with the numbers inside lists of messages (see `message_arrays`).
+    played : topics whose messages are wanted as arrays, each with the numbers inside lists of messages (see `make_message_arrays`).
 
     Returns
     -------
@@ -125,15 +127,15 @@ def gather_messages(
     for tables in batches:
         for topic, table in tables.items():
             if topic in played:
-                arrays = message_arrays(table.drop_columns(_PUBLISH_TIME), played[topic])
-                pieces.setdefault(topic, []).append({name: _compact(values) for name, values in arrays.items()})
+                arrays = make_message_arrays(table.drop_columns(_PUBLISH_TIME), played[topic])
+                pieces.setdefault(topic, []).append({name: _compact_column(values) for name, values in arrays.items()})
             else:
                 others.setdefault(topic, []).append(table)
     joined = {topic: pa.concat_tables(tables) for topic, tables in others.items()}
-    return {topic: _in_order(_joined(parts)) for topic, parts in pieces.items()}, joined
+    return {topic: _sort_columns(_join_columns(parts)) for topic, parts in pieces.items()}, joined
 
 
-def _compact(values: NDArray[Any]) -> NDArray[Any]:
+def _compact_column(values: NDArray[Any]) -> NDArray[Any]:
     """Return a copy of its own of a column's values; one row for all, where every row has the same bits."""
     values = np.ascontiguousarray(values)
     row_bytes = values[:1].nbytes
@@ -145,13 +147,13 @@ def _compact(values: NDArray[Any]) -> NDArray[Any]:
     return values.copy()
 
 
-def _joined(parts: list[Arrays]) -> Arrays:
+def _join_columns(parts: list[Arrays]) -> Arrays:
     """Return the columns of all pieces one after the other; the pieces are taken apart."""
     parts = [part for part in parts if len(part[LOG_TIME])] or parts[:1]
-    return {name: _concatenated([part.pop(name) for part in parts]) for name in list(parts[0])}
+    return {name: _concatenate_column([part.pop(name) for part in parts]) for name in list(parts[0])}
 
 
-def _concatenated(pieces: list[NDArray[Any]]) -> NDArray[Any]:
+def _concatenate_column(pieces: list[NDArray[Any]]) -> NDArray[Any]:
     """Return pieces of one column as one; rows of lists that are shorter than the longest are filled up with NaN."""
     if len(pieces) == 1:
         return pieces[0]
@@ -171,7 +173,7 @@ def _is_constant(values: NDArray[Any]) -> bool:
     return len(values) == 1 or values.strides[0] == 0
 
 
-def _in_order(columns: Arrays) -> Arrays:
+def _sort_columns(columns: Arrays) -> Arrays:
     """Return the columns in the order of log time; messages of equal times as they lie in the log."""
     log_time_ns = columns[LOG_TIME]
     if not (np.diff(log_time_ns) < 0).any():

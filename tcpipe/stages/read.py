@@ -16,15 +16,15 @@ from tcpipe.logs.role_findings import find_missing_roles
 from tcpipe.logs.roles import MOTION_ROLES
 from tcpipe.logs.simulated_clock import CLOCK
 from tcpipe.power.readings import PowerReadings
-from tcpipe.power.sources import power_lists
+from tcpipe.power.sources import list_power_lists
 from tcpipe.recipe import ReadConfig
 from tcpipe.robots.profiles import Profiles
 from tcpipe.stages.message_arrays import gather_messages
 from tcpipe.stages.protocols import LogReader
 from tcpipe.stages.read_findings import read_findings
-from tcpipe.stages.read_pose import placed_pose
-from tcpipe.stages.read_power import currents_of, find_repeats, with_averaging, without_repeats
-from tcpipe.stages.read_roles import power_candidates, roles_by
+from tcpipe.stages.read_pose import place_pose
+from tcpipe.stages.read_power import add_averaging, find_repeats, read_rail_power, remove_repeats
+from tcpipe.stages.read_roles import decide_roles, find_power_candidates
 from tcpipe.stages.read_sensors import place_sensors
 from tcpipe.stages.read_sources import TopicReadings, read_sources
 from tcpipe.tables.findings import StageReport
@@ -47,36 +47,37 @@ def read_run(log: LogReader, config: ReadConfig, *, robot: str | None, known: Pr
     RecipeError : no profile has the robot's name.
     """
     # 1. Which topic plays which role, from the topic list alone.
-    assignment = roles_by(config, log.topics.values(), robot, known=known)
+    assignment = decide_roles(config, log.topics.values(), robot, known=known)
     if assignment.problems:
         raise RoleError(*assignment.problems, findings=assignment.findings)
     # 2. Messages to SI columns; what cannot be used is counted.
     played = dict.fromkeys(topic for role in assignment.roles.values() for topic in role.topics)
-    lists = {topic: power_lists(log.topics[topic].type_name, known.power_sources) for topic in played}
+    lists = {topic: list_power_lists(log.topics[topic].type_name, known.power_sources) for topic in played}
     messages, tables = gather_messages(log.batches([*played, *assignment.static_transforms]), lists)
     every, power, unread = read_sources(messages, log.topics, assignment, config, known=known)
     # 3. Every stamp on one clock, every epoch common to all.
     clocks = settle_clocks(
-        {source.key: _times(source, config) for source in every if len(source.readings.row)},
+        {source.key: _read_times(source, config) for source in every if len(source.readings.row)},
         clock_published=any(topic.type_name == CLOCK and topic.message_count for topic in log.topics.values()),
     )
     timelines = clocks.timelines
     # 4. One checked table a role, and where its sensor sits.
     sources = [source for source in every if source.key in timelines]
     streams: dict[str, pa.Table] = {
-        role: role_table(role, sources, timelines, power) for role in dict.fromkeys(source.role for source in sources)
+        role: make_role_table(role, sources, timelines, power)
+        for role in dict.fromkeys(source.role for source in sources)
     }
-    streams, repeats = without_repeats(streams)
-    streams, crs, of_pose = placed_pose(streams, assignment, config)
+    streams, repeats = remove_repeats(streams)
+    streams, crs, of_pose = place_pose(streams, assignment, config)
     sensors, unplaced = place_sensors(log, tables, assignment, sources, timelines, config=config)
-    power, assumed = with_averaging(power, streams, config)
+    power, assumed = add_averaging(power, streams, config)
     offset_s = {str(role): offset for role, offset in config.time_offset_s.items()}
     report = read_findings(assignment, every, clocks, power=power, sensors=sensors, offset_s=offset_s)
     scale = {str(role): factor for role, factor in config.odometry_scale.items()} or None
     findings = (
         *report.findings,
         *find_missing_roles({*streams, "power"} if power.is_rejected else streams.keys()),
-        *power_candidates(log, assignment, config),
+        *find_power_candidates(log, assignment, config),
         *unread,
         *unplaced,
         *find_repeats(repeats),
@@ -90,7 +91,7 @@ def read_run(log: LogReader, config: ReadConfig, *, robot: str | None, known: Pr
     return Streams(streams, sensors, assignment.robot, crs, power.averaged, report)
 
 
-def _times(source: TopicReadings, config: ReadConfig) -> TopicTimes:
+def _read_times(source: TopicReadings, config: ReadConfig) -> TopicTimes:
     readings = source.readings
     prefer = config.time.get(source.role, "auto")
     stamps = readings.header_ns if readings.own_time_ns is None or prefer == "header" else readings.own_time_ns
@@ -103,14 +104,14 @@ def _times(source: TopicReadings, config: ReadConfig) -> TopicTimes:
     )
 
 
-def role_table(
+def make_role_table(
     role: str, sources: Sequence[TopicReadings], timelines: Mapping[str, Timeline], power: PowerReadings
 ) -> pa.Table:
     """Return a role's table, sorted by epoch and stamp; the columns of its sources' readings are taken out."""
     parts = []
     for source in sources:
         if source.role == role:
-            parts += list(_parts(source, timelines[source.key], power))
+            parts += list(_read_parts(source, timelines[source.key], power))
     if len(parts) == 1:  # in order already
         return STREAMS[role].table(**parts[0])
     columns = {name: np.concatenate([part.pop(name) for part in parts]) for name in list(parts[0])}
@@ -118,7 +119,7 @@ def role_table(
     return STREAMS[role].table(**{name: columns.pop(name)[order] for name in list(columns)})
 
 
-def _parts(source: TopicReadings, timeline: Timeline, power: PowerReadings) -> list[dict[str, NDArray[Any]]]:
+def _read_parts(source: TopicReadings, timeline: Timeline, power: PowerReadings) -> list[dict[str, NDArray[Any]]]:
     """Return a topic's columns; one part a rail where it plays power."""
     readings = source.readings.columns
     columns = {name: readings.pop(name)[timeline.row] for name in list(readings)}
@@ -131,7 +132,7 @@ def _parts(source: TopicReadings, timeline: Timeline, power: PowerReadings) -> l
         return [times | columns]
     parts = []
     for rail in power.rails[source.topic]:
-        voltage, current = currents_of(rail, times, columns)
+        voltage, current = read_rail_power(rail, times, columns)
         known = np.isfinite(voltage) | np.isfinite(current)
         values = {**times, "rail": np.full(len(known), rail.name), "voltage_volt": voltage, "current_amp": current}
         parts.append({name: value[known] for name, value in values.items()})

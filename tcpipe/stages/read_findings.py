@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from tcpipe.logs.clocks import RECIPE, Settled, Timeline
+from tcpipe.logs.clocks import RECIPE, AlignedClocks, Timeline
 from tcpipe.logs.roles import RoleAssignment
 from tcpipe.logs.simulated_clock import LOG_CLOCK
 from tcpipe.power.readings import PowerReadings
 from tcpipe.stages.read_sources import TopicReadings
-from tcpipe.tables.catalogue import Severity, threshold
+from tcpipe.tables.catalogue import Severity, read_threshold
 from tcpipe.tables.facts import ClockStep, PowerSign, RobotChoice, RoleFacts, StageFacts, TopicClock, TopicFacts
 from tcpipe.tables.findings import Finding, StageReport, Subject, make_finding
 from tcpipe.tables.levels import Sensor
@@ -24,7 +24,7 @@ _EXPECTED = frozenset({"not_gga", "no_velocity"})
 def read_findings(
     assignment: RoleAssignment,
     sources: Sequence[TopicReadings],
-    clocks: Settled,
+    clocks: AlignedClocks,
     *,
     power: PowerReadings,
     sensors: Mapping[str, Sensor],
@@ -43,7 +43,7 @@ def read_findings(
     findings += [_find_step(step, start_ns) for step in steps]
     facts = StageFacts(
         robot=RobotChoice(assignment.robot, assignment.robot_why),
-        roles={role: _role_facts(role, assignment, sources, timelines, sensors[role]) for role in sensors},
+        roles={role: _make_role_facts(role, assignment, sources, timelines, sensors[role]) for role in sensors},
         left_out=assignment.left_out,
         epochs=len(steps) + 1,
         clock_steps=tuple(steps),
@@ -58,7 +58,7 @@ def _find_unused(source: TopicReadings, timeline: Timeline | None) -> Iterator[F
     dropped = source.readings.dropped | (timeline.dropped if timeline is not None else {})
     counts = {f"{reason}_count": count for reason, count in dropped.items() if reason not in _EXPECTED}
     unused, messages = sum(counts.values()), source.messages
-    if unused > threshold("messages-unused", "min_unused_fraction") * messages:
+    if unused > read_threshold("messages-unused", "min_unused_fraction") * messages:
         numbers: dict[str, Any] = {"unused_fraction": unused / messages, "messages_count": messages, **counts}
         names = {"topic": source.topic, "reasons": ", ".join(name.removesuffix("_count") for name in counts)}
         yield make_finding("messages-unused", Subject("role", source.role), names=names, **numbers)
@@ -84,7 +84,7 @@ def _find_step(step: ClockStep, start_ns: int) -> Finding:
     return make_finding("clock-step", LOG_CLOCK, span_s=(at_s, at_s), names=names, step_s=step.step_s, at_s=at_s)
 
 
-def _role_facts(
+def _make_role_facts(
     role: str,
     assignment: RoleAssignment,
     sources: Sequence[TopicReadings],
@@ -92,11 +92,11 @@ def _role_facts(
     sensor: Sensor,
 ) -> RoleFacts:
     played = [source for source in sources if source.role == role and source.key in timelines]
-    topics = {source.topic: _topic_facts(source, timelines[source.key]) for source in played}
+    topics = {source.topic: _make_topic_facts(source, timelines[source.key]) for source in played}
     return RoleFacts(assignment.roles[role].why, sensor.frame_id, sensor.placed_by, topics)
 
 
-def _topic_facts(source: TopicReadings, timeline: Timeline) -> TopicFacts:
+def _make_topic_facts(source: TopicReadings, timeline: Timeline) -> TopicFacts:
     return TopicFacts(
         type=source.type_name,
         messages=source.messages,

@@ -11,9 +11,9 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
-from tcpipe.logs.messages import LOG_TIME, Readings, header_ns
+from tcpipe.logs.messages import LOG_TIME, Readings, read_header_ns
 from tcpipe.logs.roles import RoleAssignment
-from tcpipe.power.averaging import told_averaged
+from tcpipe.power.averaging import is_stated_averaged
 from tcpipe.power.counters import Counter
 from tcpipe.power.readings import PowerReadings, read_power
 from tcpipe.power.repeats import find_readings
@@ -21,14 +21,14 @@ from tcpipe.power.sources import RailReadings, reject_power
 from tcpipe.recipe import ReadConfig
 from tcpipe.recipe.suggestions import suggest
 from tcpipe.robots.profiles import Profiles
-from tcpipe.tables.arrays import rows_where, texts
-from tcpipe.tables.catalogue import Severity, threshold
-from tcpipe.tables.columns import floats, integers
+from tcpipe.tables.arrays import select_rows, to_texts
+from tcpipe.tables.catalogue import Severity, read_threshold
+from tcpipe.tables.columns import to_floats, to_integers
 from tcpipe.tables.findings import Finding, Subject, make_finding
 from tcpipe.tables.levels import STREAMS
 
 
-def power_of_topics(
+def read_power_of_topics(
     topics: Mapping[str, tuple[str, Mapping[str, NDArray[Any]]]],
     assignment: RoleAssignment,
     config: ReadConfig,
@@ -51,29 +51,29 @@ def power_of_topics(
     )
 
 
-def columns_of(rail: str) -> tuple[str, str]:
+def name_rail_columns(rail: str) -> tuple[str, str]:
     """Return the names of a rail's voltage and current columns in its topic's readings."""
     return f"{rail}: voltage_volt", f"{rail}: current_amp"
 
 
-def counter_of(rail: str) -> tuple[str, str]:
+def name_counter_columns(rail: str) -> tuple[str, str]:
     """Return the names of the columns in which a rail's counter of energy stands, where it has one."""
     return f"{rail}: energy_joule", f"{rail}: resets"
 
 
-def power_rows(columns: Mapping[str, NDArray[Any]], rails: Sequence[RailReadings]) -> Readings:
+def select_power_rows(columns: Mapping[str, NDArray[Any]], rails: Sequence[RailReadings]) -> Readings:
     """Return the rows of a power topic on which at least one rail carries a voltage or a current."""
     values = {
         name: values
         for rail in rails
-        for name, values in zip(columns_of(rail.name), (rail.voltage_volt, rail.current_amp), strict=True)
+        for name, values in zip(name_rail_columns(rail.name), (rail.voltage_volt, rail.current_amp), strict=True)
     }
     row = np.flatnonzero(np.any([np.isfinite(value) for value in values.values()], axis=0))
     for rail in rails:
         if rail.counter is not None:
-            energy, resets = counter_of(rail.name)
+            energy, resets = name_counter_columns(rail.name)
             values |= {energy: rail.counter.energy_joule, resets: rail.counter.resets.astype(np.float64)}
-    stamps = header_ns(columns)
+    stamps = read_header_ns(columns)
     lost = len(columns[LOG_TIME]) - len(row)
     return Readings(
         row,
@@ -84,22 +84,22 @@ def power_rows(columns: Mapping[str, NDArray[Any]], rails: Sequence[RailReadings
     )
 
 
-def currents_of(
+def read_rail_power(
     rail: RailReadings, times: Mapping[str, NDArray[Any]], columns: Mapping[str, NDArray[Any]]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return a rail's voltages [V] and currents [A] in its topic's readings.
 
     Those of a counter of energy are means by the times that rule; none across a reset or a step of the clock.
     """
-    voltage, current = (columns[name] for name in columns_of(rail.name))
+    voltage, current = (columns[name] for name in name_rail_columns(rail.name))
     if rail.counter is not None:
-        energy, resets = (columns[name] for name in counter_of(rail.name))
+        energy, resets = (columns[name] for name in name_counter_columns(rail.name))
         breaks = resets + times["epoch"] * (1 + np.max(resets, initial=0))
         current = np.where(np.isnan(current), np.nan, Counter(energy, breaks).mean_amp(times["stamp_ns"], voltage))
     return voltage, current
 
 
-def with_averaging(
+def add_averaging(
     power: PowerReadings, streams: Mapping[str, pa.Table], config: ReadConfig
 ) -> tuple[PowerReadings, tuple[Finding, ...]]:
     """Return the power with whether its values are means over their period, and the finding where that is assumed."""
@@ -108,17 +108,17 @@ def with_averaging(
         return replace(power, averaged=config.power_averaged == "yes"), ()
     if not power.averaging_unknown or "power" not in streams:
         return power, ()
-    table = rows_where(streams["power"], "epoch", 0)
-    rail = rows_where(table, "rail", table["rail"][0].as_py())
-    power_ns, watt = _power_at_current(rail)
+    table = select_rows(streams["power"], "epoch", 0)
+    rail = select_rows(table, "rail", table["rail"][0].as_py())
+    power_ns, watt = _compute_power_at_currents(rail)
     period_s = float(np.median(np.diff(power_ns))) / 1e9 if len(power_ns) > 1 else np.inf
-    if period_s < threshold(_ASSUMED, "min_period_s"):
+    if period_s < read_threshold(_ASSUMED, "min_period_s"):
         return power, ()
     motion = next((streams[role] for role in ("wheel_odometry", "visual_odometry") if role in streams), None)
-    told = None if motion is None else _by_motion(power_ns, watt, rows_where(motion, "epoch", 0))
+    told = None if motion is None else _test_by_motion(power_ns, watt, select_rows(motion, "epoch", 0))
     averaged = power.averaged if told is None else told
     power = replace(power, averaged=averaged)
-    if told is None and period_s < threshold(_ASSUMED, "min_unobserved_period_s"):
+    if told is None and period_s < read_threshold(_ASSUMED, "min_unobserved_period_s"):
         return power, ()
     severity: Severity | None = "warning" if told is None else None
     names = {"value": "mean" if averaged else "sample", "evidence": "nothing" if told is None else "motion"}
@@ -131,9 +131,13 @@ def with_averaging(
 _ASSUMED = "power-averaging-assumed"
 
 
-def _power_at_current(rail: pa.Table) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+def _compute_power_at_currents(rail: pa.Table) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Return the stamps [ns] of a rail's currents and its power there [W]: its voltage may come at other times."""
-    stamp_ns, voltage, current = integers(rail, "stamp_ns"), floats(rail, "voltage_volt"), floats(rail, "current_amp")
+    stamp_ns, voltage, current = (
+        to_integers(rail, "stamp_ns"),
+        to_floats(rail, "voltage_volt"),
+        to_floats(rail, "current_amp"),
+    )
     at_ns = (stamp_ns - stamp_ns[0]).astype(np.float64)
     of_voltage, of_current = np.isfinite(voltage), np.isfinite(current)
     if not of_voltage.any():
@@ -143,10 +147,10 @@ def _power_at_current(rail: pa.Table) -> tuple[NDArray[np.int64], NDArray[np.flo
     )
 
 
-def _by_motion(power_ns: NDArray[np.int64], watt: NDArray[np.float64], motion: pa.Table) -> bool | None:
-    twist = np.column_stack([floats(motion, name) for name in ("velocity_x_mps", "angular_velocity_z_radps")])
+def _test_by_motion(power_ns: NDArray[np.int64], watt: NDArray[np.float64], motion: pa.Table) -> bool | None:
+    twist = np.column_stack([to_floats(motion, name) for name in ("velocity_x_mps", "angular_velocity_z_radps")])
     moving = np.isfinite(twist).all(axis=1)
-    return told_averaged(power_ns, watt, integers(motion, "stamp_ns")[moving], *twist[moving].T)
+    return is_stated_averaged(power_ns, watt, to_integers(motion, "stamp_ns")[moving], *twist[moving].T)
 
 
 _QUANTITIES = {"current": "current_amp", "voltage": "voltage_volt"}
@@ -167,7 +171,7 @@ class Repeats:
     reading_hz: float
 
 
-def without_repeats(streams: Streams) -> tuple[Streams, list[Repeats]]:
+def remove_repeats(streams: Streams) -> tuple[Streams, list[Repeats]]:
     """Return the streams with only the readings of power, and what was repeated; a table that repeats none stays as it is.
 
     A reading has the stamp of the first message that holds it.
@@ -175,16 +179,18 @@ def without_repeats(streams: Streams) -> tuple[Streams, list[Repeats]]:
     power = streams.get("power")
     if power is None:
         return streams, []
-    step_ns = np.where(np.diff(integers(power, "epoch")) != 0, _BETWEEN_EPOCHS_NS, np.diff(integers(power, "stamp_ns")))
+    step_ns = np.where(
+        np.diff(to_integers(power, "epoch")) != 0, _BETWEEN_EPOCHS_NS, np.diff(to_integers(power, "stamp_ns"))
+    )
     at_ns = np.concatenate(([0], np.cumsum(step_ns)))
-    values = {quantity: floats(power, column) for quantity, column in _QUANTITIES.items()}
+    values = {quantity: to_floats(power, column) for quantity, column in _QUANTITIES.items()}
     kept = {quantity: np.isfinite(value) for quantity, value in values.items()}
     repeats: list[Repeats] = []
     for rail in pc.unique(power["rail"]).to_pylist():
-        rows = np.flatnonzero(texts(power["rail"]) == rail)
+        rows = np.flatnonzero(to_texts(power["rail"]) == rail)
         for quantity in _QUANTITIES:
             own = rows[np.isfinite(values[quantity][rows])]
-            readings = _readings(at_ns, own, quantity, values)
+            readings = _find_readings(at_ns, own, quantity, values)
             if readings is not None:
                 kept[quantity][np.setdiff1d(own, readings)] = False
                 repeats.append(Repeats(rail, quantity, _rate_hz(at_ns[own]), _rate_hz(at_ns[readings])))
@@ -196,7 +202,7 @@ def without_repeats(streams: Streams) -> tuple[Streams, list[Repeats]]:
     return {**streams, "power": table}, repeats
 
 
-def _readings(
+def _find_readings(
     at_ns: NDArray[np.int64], own: NDArray[np.int64], quantity: str, values: Values
 ) -> NDArray[np.int64] | None:
     """Return the rows of a quantity's readings, by its own changes or, where these hardly show, by those of the other on the same rows."""

@@ -8,15 +8,15 @@ from typing import Any, cast, get_args
 
 import numpy as np
 
-from tcpipe.logs.mapped import topic_of
-from tcpipe.logs.names_of_fields import propose_roles
+from tcpipe.logs.field_mapping import find_topic
+from tcpipe.logs.field_names import propose_roles
 from tcpipe.logs.roles import OVERLAY, RoleAssignment, assign_roles
 from tcpipe.logs.topics import Topic
-from tcpipe.power.sources import FLOAT_TYPES, LARGEST_AMP, LARGEST_VOLT, is_of_drives, quantity, rail_of
+from tcpipe.power.sources import FLOAT_TYPES, LARGEST_AMP, LARGEST_VOLT, find_quantity, is_of_drives, make_rail_name
 from tcpipe.recipe import ReadConfig, Recipe, Role
 from tcpipe.recipe.suggestions import TomlValue, suggest
 from tcpipe.robots.profiles import Profiles
-from tcpipe.stages.message_arrays import message_arrays
+from tcpipe.stages.message_arrays import make_message_arrays
 from tcpipe.stages.protocols import LogReader
 from tcpipe.tables.findings import Finding, Subject, make_finding
 
@@ -26,12 +26,12 @@ def find_read_config(recipe: Recipe, topics: Collection[str]) -> ReadConfig:
     roles: dict[Role, list[str]] = {}
     for name, table in recipe.tables.items():
         role = cast("Role", table.role or name)
-        if role in get_args(Role) and (topic := topic_of(name, role, table.columns)[0]) in topics:
+        if role in get_args(Role) and (topic := find_topic(name, role, table.columns)[0]) in topics:
             roles.setdefault(role, []).append(topic)
     return replace(recipe.read, topics={**roles, **recipe.read.topics}) if roles else recipe.read
 
 
-def roles_by(config: ReadConfig, topics: Iterable[Topic], robot: str | None, *, known: Profiles) -> RoleAssignment:
+def decide_roles(config: ReadConfig, topics: Iterable[Topic], robot: str | None, *, known: Profiles) -> RoleAssignment:
     """Return which topic plays which role, and why; `RecipeError` where no profile has the robot's name."""
     topics = list(topics)
     assignment = assign_roles(
@@ -86,7 +86,7 @@ class _Candidate:
         return keys | ({f"{self.what}_scale": self.scale} if self.scale != 1.0 else {})
 
 
-def power_candidates(log: LogReader, assignment: RoleAssignment, config: ReadConfig) -> tuple[Finding, ...]:
+def find_power_candidates(log: LogReader, assignment: RoleAssignment, config: ReadConfig) -> tuple[Finding, ...]:
     """Return what could be power in a log without a power topic; nothing where the recipe names its topics or there are no such numbers."""
     if "power" in assignment.roles or "power" in config.topics:
         return ()
@@ -94,17 +94,17 @@ def power_candidates(log: LogReader, assignment: RoleAssignment, config: ReadCon
     tables = log.tables([topic.name for topic in wanted]) if wanted else {}
     found = []
     for topic in wanted:
-        values = message_arrays(tables[topic.name], ()).get("data") if topic.name in tables else None
+        values = make_message_arrays(tables[topic.name], ()).get("data") if topic.name in tables else None
         known = np.asarray([] if values is None else values, np.float64)
         known = known[np.isfinite(known)]
-        what = str(quantity(topic.name))
+        what = str(find_quantity(topic.name))
         if known.size and np.any(known):
             most = LARGEST_VOLT if what == "voltage" else LARGEST_AMP
             scale = 0.001 if np.median(np.abs(known)) > most else 1.0
             found.append(_Candidate(topic, what, scale, (scale * float(known.min()), scale * float(known.max()))))
     if not found:
         return ()
-    used = _rails(found)
+    used = _pair_rails(found)
     topics: list[TomlValue] = list(dict.fromkeys(each.topic.name for _, each in used))
     sources = [of.source(rail) for rail, of in used]
     ranges: dict[str, Any] = {
@@ -126,19 +126,19 @@ def power_candidates(log: LogReader, assignment: RoleAssignment, config: ReadCon
 
 
 def _is_wanted(topic: Topic, config: ReadConfig) -> bool:
-    told = topic.type_name in FLOAT_TYPES and quantity(topic.name) is not None
+    told = topic.type_name in FLOAT_TYPES and find_quantity(topic.name) is not None
     readable = topic.problem is None and topic.message_count != 0
     return told and readable and topic.name not in config.ignore_topics and not topic.name.startswith(OVERLAY)
 
 
-def _rails(found: Sequence[_Candidate]) -> list[tuple[str, _Candidate]]:
+def _pair_rails(found: Sequence[_Candidate]) -> list[tuple[str, _Candidate]]:
     """Return each rail's voltage and current: called alike, or all currents at the only voltage; of drives alone where some are."""
-    voltages = {rail_of(of.topic.name): of for of in found if of.what == "voltage"}
+    voltages = {make_rail_name(of.topic.name): of for of in found if of.what == "voltage"}
     currents = [of for of in found if of.what == "current"]
     currents = [of for of in currents if is_of_drives(of.topic.name)] or currents
     used = []
     for of in currents:
-        rail = rail_of(of.topic.name)
+        rail = make_rail_name(of.topic.name)
         voltage = voltages.get(rail) or (next(iter(voltages.values())) if len(voltages) == 1 else None)
         if voltage is None:
             return []

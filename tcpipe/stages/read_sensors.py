@@ -10,11 +10,11 @@ import pyarrow as pa
 
 from tcpipe.geometry.rotation import quat_from_rpy
 from tcpipe.logs.clocks import Timeline
-from tcpipe.logs.placements import IDENTITY, Pose, Tree, base_link_from, is_base, static_tree
+from tcpipe.logs.extrinsics import IDENTITY, Pose, Tree, build_static_tree, find_base_link_from, is_base
 from tcpipe.logs.roles import RoleAssignment
 from tcpipe.recipe import Placement, ReadConfig, Role
 from tcpipe.recipe.suggestions import suggest
-from tcpipe.stages.message_arrays import transforms
+from tcpipe.stages.message_arrays import read_transforms
 from tcpipe.stages.protocols import LogReader
 from tcpipe.stages.read_sources import TopicReadings
 from tcpipe.tables.findings import Finding, Subject, make_finding
@@ -38,13 +38,13 @@ def place_sensors(
     /tf is read only where /tf_static leaves a frame unplaced: it is large, and constant only in logs that lack the other.
     """
     of_role = {role: [source for source in sources if source.role == role] for role in get_args(Role)}
-    frame_of = {role: _frame(found) for role, found in of_role.items() if found}
+    frame_of = {role: _find_frame(found) for role, found in of_role.items() if found}
     open_frames = {
         frame
         for role, frame in frame_of.items()
         if role not in config.placement and role not in _WITHOUT_PLACE and not is_base(frame)
     }
-    tree = _tree(log, tables, assignment, open_frames)
+    tree = _build_tree(log, tables, assignment, open_frames)
     sensors: dict[str, Sensor] = {}
     findings: list[Finding] = []
     for role, frame in frame_of.items():
@@ -70,16 +70,18 @@ def place_sensors(
     return sensors, findings
 
 
-def _frame(sources: Sequence[TopicReadings]) -> str:
+def _find_frame(sources: Sequence[TopicReadings]) -> str:
     return next(iter(sources[0].frames), "")
 
 
-def _tree(log: LogReader, tables: Mapping[str, pa.Table], assignment: RoleAssignment, open_frames: set[str]) -> Tree:
-    static = [transforms(tables[topic]) for topic in assignment.transforms if topic in tables]
-    tree = static_tree(static)
+def _build_tree(
+    log: LogReader, tables: Mapping[str, pa.Table], assignment: RoleAssignment, open_frames: set[str]
+) -> Tree:
+    static = [read_transforms(tables[topic]) for topic in assignment.transforms if topic in tables]
+    tree = build_static_tree(static)
     moving = [topic for topic in assignment.transforms if topic not in tables]
-    if moving and any(base_link_from(frame, tree) is None for frame in open_frames):
-        tree = static_tree([*static, *(transforms(table) for table in log.tables(moving).values())])
+    if moving and any(find_base_link_from(frame, tree) is None for frame in open_frames):
+        tree = build_static_tree([*static, *(read_transforms(table) for table in log.tables(moving).values())])
     return tree
 
 
@@ -89,7 +91,7 @@ def _place(role: Role, frame: str, tree: Tree, config: ReadConfig) -> tuple[Pose
         return Pose(IDENTITY.xyz_m + given.xyz_m, quat_from_rpy(*given.rpy_rad)), "recipe"
     if role in _WITHOUT_PLACE:
         return IDENTITY, "not needed"
-    found = base_link_from(frame, tree)
+    found = find_base_link_from(frame, tree)
     if frame.rsplit("/", 1)[-1] == "base_link":
         return IDENTITY, "same frame"
     if found is not None and frame in tree:

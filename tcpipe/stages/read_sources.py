@@ -9,16 +9,16 @@ from typing import Any, cast
 from numpy.typing import NDArray
 
 from tcpipe.errors import RoleError
-from tcpipe.logs.conversions import imu_in_si, over_ground, scaled
-from tcpipe.logs.mapped import MAPPED_TYPES, mapped_message
-from tcpipe.logs.messages import LOG_TIME, Readings, find_utc_offset, frames, needed_fields, read_messages
-from tcpipe.logs.role_findings import topic_not_decoded
+from tcpipe.logs.conversions import convert_imu_to_si, scale_odometry, select_ground_velocity
+from tcpipe.logs.field_mapping import MAPPED_TYPES, make_mapped_message
+from tcpipe.logs.messages import LOG_TIME, Readings, count_frames, find_utc_offset, list_needed_fields, read_messages
+from tcpipe.logs.role_findings import make_topic_not_decoded
 from tcpipe.logs.roles import RoleAssignment
 from tcpipe.logs.topics import Topic
 from tcpipe.power.readings import PowerReadings
 from tcpipe.recipe import ReadConfig, Role
 from tcpipe.robots.profiles import Profiles
-from tcpipe.stages.read_power import power_of_topics, power_rows
+from tcpipe.stages.read_power import read_power_of_topics, select_power_rows
 from tcpipe.tables.findings import Finding, Subject, make_finding
 
 
@@ -64,10 +64,10 @@ def read_sources(
     arrays: dict[tuple[Role, str], Mapping[str, NDArray[Any]]] = {}
     for role, topic in played:
         if topic not in messages:
-            findings.append(topic_not_decoded(topics[topic]))
+            findings.append(make_topic_not_decoded(topics[topic]))
             continue
-        found = _fields(messages[topic], role, config)
-        needed = () if role == "power" else needed_fields(_type_of(topics[topic], role, config))
+        found = _read_fields(messages[topic], role, config)
+        needed = () if role == "power" else list_needed_fields(_find_type(topics[topic], role, config))
         if missing := [name for name in needed if name not in found]:
             names = {"role": role, "fields": ", ".join(missing)}
             findings.append(make_finding("fields-missing", Subject("topic", topic), names=names))
@@ -75,18 +75,18 @@ def read_sources(
             arrays[role, topic] = found
     types = {topic: topics[topic].type_name for _, topic in arrays}
     of_power = {topic: (types[topic], columns) for (role, topic), columns in arrays.items() if role == "power"}
-    power = power_of_topics(of_power, assignment, config, known=known)
+    power = read_power_of_topics(of_power, assignment, config, known=known)
     sources = []
     messages.clear()
     for role, topic in list(arrays):
         columns = arrays.pop((role, topic))
         if role != "power":
-            readings = read_messages(columns, role, _type_of(topics[topic], role, config))
+            readings = read_messages(columns, role, _find_type(topics[topic], role, config))
         elif topic in power.rails:
-            readings = power_rows(columns, power.rails[topic])
+            readings = select_power_rows(columns, power.rails[topic])
         else:
             continue
-        seen_frames = frames(columns, types[topic])
+        seen_frames = count_frames(columns, types[topic])
         source = TopicReadings(topic, role, types[topic], len(columns[LOG_TIME]), seen_frames, readings)
         sources.append(replace(source, readings=_as_the_recipe_says(source, config)))
     return sources, power, findings
@@ -98,21 +98,21 @@ def _as_the_recipe_says(source: TopicReadings, config: ReadConfig) -> Readings:
     if role == "gnss" and config.time.get(role) != "header":
         return replace(readings, findings=(*readings.findings, *find_utc_offset(readings)))
     if role == "imu":
-        return imu_in_si(readings, config.imu_units)
+        return convert_imu_to_si(readings, config.imu_units)
     if role == "gnss_velocity" and role not in config.topics:
-        return over_ground(readings, next(iter(source.frames), ""), source.topic)
-    return scaled(readings, config.odometry_scale[role]) if role in config.odometry_scale else readings
+        return select_ground_velocity(readings, next(iter(source.frames), ""), source.topic)
+    return scale_odometry(readings, config.odometry_scale[role]) if role in config.odometry_scale else readings
 
 
-def _type_of(topic: Topic, role: Role, config: ReadConfig) -> str:
+def _find_type(topic: Topic, role: Role, config: ReadConfig) -> str:
     return MAPPED_TYPES[role] if role in config.fields else topic.type_name
 
 
-def _fields(columns: dict[str, NDArray[Any]], role: Role, config: ReadConfig) -> dict[str, NDArray[Any]]:
+def _read_fields(columns: dict[str, NDArray[Any]], role: Role, config: ReadConfig) -> dict[str, NDArray[Any]]:
     """Return the fields of a topic's messages, those of a message type of the user's own as the recipe maps them."""
     if role not in config.fields:
         return columns
-    mapped = mapped_message(role, columns, config.fields[role])
+    mapped = make_mapped_message(role, columns, config.fields[role])
     if isinstance(mapped, list):
         raise RoleError(*mapped)
     return mapped

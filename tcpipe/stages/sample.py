@@ -13,13 +13,13 @@ from tcpipe.errors import MapError
 from tcpipe.recipe import SampleConfig
 from tcpipe.recipe.suggestions import suggest
 from tcpipe.tables.bits import Loss
-from tcpipe.tables.columns import floats, lonlat_deg
+from tcpipe.tables.columns import read_lonlat_deg, to_floats
 from tcpipe.tables.findings import Finding, Subject, make_finding
 from tcpipe.tables.levels import PLACED_SEGMENTS
-from tcpipe.terrain.patches import check_scale, corners_on, footprints, has_other_pixels, patch_frames
+from tcpipe.terrain.patches import check_scale, compute_footprints, count_corners_on, has_other_pixels, patch_frames
 from tcpipe.terrain.projection import Projection
-from tcpipe.terrain.sampling import Patches, joined, sample_patches
-from tcpipe.terrain.tiles import MapReader, TilePool, level_for, projection_to
+from tcpipe.terrain.sampling import Patches, join_patches, sample_patches
+from tcpipe.terrain.tiles import MapReader, TilePool, find_map_projection, level_for
 
 _LOSSES = (Loss.POSITION_UNCERTAIN, Loss.OUTSIDE_MAP, Loss.NODATA, Loss.NOT_TRAVERSABLE)
 
@@ -58,18 +58,18 @@ def sample_segments(
     TableError : chords and positions contradict each other. MapError : CRSs cannot be connected, or a tile is damaged.
     """
     PLACED_SEGMENTS.check(segments, more=True)
-    chord_m, projection = floats(segments, "chord_m"), projection_to(source, gnss_crs)
-    start, end = (projection.forward(lonlat_deg(segments, name)) for name in ("start", "end"))
+    chord_m, projection = to_floats(segments, "chord_m"), find_map_projection(source, gnss_crs)
+    start, end = (projection.forward(read_lonlat_deg(segments, name)) for name in ("start", "end"))
     frames = patch_frames(start, end, chord_m)
-    corners = footprints(frames, config.patch_m)
+    corners = compute_footprints(frames, config.patch_m)
     lost_by = np.zeros(segments.num_rows, np.uint32)
-    lost_by[corners_on(source.grid, corners) < (4 if config.min_valid_fraction >= 1.0 else 1)] = Loss.OUTSIDE_MAP
-    lost_by[floats(segments, "position_std_m") > config.max_position_std_m] = Loss.POSITION_UNCERTAIN
+    lost_by[count_corners_on(source.grid, corners) < (4 if config.min_valid_fraction >= 1.0 else 1)] = Loss.OUTSIDE_MAP
+    lost_by[to_floats(segments, "position_std_m") > config.max_position_std_m] = Loss.POSITION_UNCERTAIN
     rows = np.flatnonzero(lost_by == 0)
     frames = frames.rows(rows)
     check_scale(frames)
     patches = sample_patches(source, frames, chord_m[rows], patch_m=config.patch_m, patch_px=config.patch_px, pool=pool)
-    lost_by[rows] = _lost(patches, corners[rows], source, config)
+    lost_by[rows] = _find_losses(patches, corners[rows], source, config)
     good = lost_by[rows] == 0
     kept, patches = rows[good], patches if good.all() else patches.only(good)
     return Sampled(
@@ -77,13 +77,13 @@ def sample_segments(
         map_index=np.zeros(kept.size, np.uint8),
         patches=patches,
         footprint_xy_m=corners[kept],
-        footprint_lonlat_deg=projection_to(source, "EPSG:4326").inverse(corners[kept]),
+        footprint_lonlat_deg=find_map_projection(source, "EPSG:4326").inverse(corners[kept]),
         lost_by=lost_by,
         findings=_find_in_map(source, config, projection),
     )
 
 
-def _lost(
+def _find_losses(
     patches: Patches, corners: NDArray[np.float64], source: MapReader, config: SampleConfig
 ) -> NDArray[np.uint32]:
     lost = np.zeros(patches.valid_fraction.size, np.uint32)
@@ -92,11 +92,11 @@ def _lost(
         lost[patches.terrain_class == 0] = Loss.NODATA
     thin = patches.valid_fraction < max(config.min_valid_fraction, 1.0 / config.patch_px**2)
     lost[thin] = Loss.NODATA
-    lost[thin & (corners_on(source.grid, corners) < 4)] = Loss.OUTSIDE_MAP
+    lost[thin & (count_corners_on(source.grid, corners) < 4)] = Loss.OUTSIDE_MAP
     return lost
 
 
-def metres_lost(arc_length_m: NDArray[np.float64], lost_by: NDArray[np.uint32]) -> dict[Loss, float]:
+def sum_losses(arc_length_m: NDArray[np.float64], lost_by: NDArray[np.uint32]) -> dict[Loss, float]:
     """Return metres driven by what they are lost to."""
     return {loss: float(arc_length_m[lost_by == loss].sum()) for loss in _LOSSES}
 
@@ -154,13 +154,13 @@ def sample_on_maps(
         known = found.lost_by != Loss.OUTSIDE_MAP  # a hole in one map outweighs lying outside the next
         lost_by[waiting[known]] = found.lost_by[known]
         place = np.full(found.kept.size, number, np.uint8)
-        placed = _in_first_plane(found, source, sources[0])
+        placed = _project_to_first_map(found, source, sources[0])
         parts.append(replace(found, kept=waiting[found.kept], map_index=place, footprint_xy_m=placed))
         waiting = waiting[np.isin(found.lost_by, _ELSEWHERE)]
     return Sampled(
         kept=np.concatenate([part.kept for part in parts]),
         map_index=np.concatenate([part.map_index for part in parts]),
-        patches=joined([part.patches for part in parts]),
+        patches=join_patches([part.patches for part in parts]),
         footprint_xy_m=np.concatenate([part.footprint_xy_m for part in parts]),
         footprint_lonlat_deg=np.concatenate([part.footprint_lonlat_deg for part in parts]),
         lost_by=lost_by,
@@ -168,11 +168,11 @@ def sample_on_maps(
     )
 
 
-def _in_first_plane(sampled: Sampled, source: MapReader, first: MapReader) -> NDArray[np.float64]:
+def _project_to_first_map(sampled: Sampled, source: MapReader, first: MapReader) -> NDArray[np.float64]:
     """Return footprints in the CRS of the first map [m], in which splits are drawn and distances measured."""
     if source.grid.crs == first.grid.crs:
         return sampled.footprint_xy_m
-    placed = projection_to(first, "EPSG:4326").forward(sampled.footprint_lonlat_deg)
+    placed = find_map_projection(first, "EPSG:4326").forward(sampled.footprint_lonlat_deg)
     if not np.isfinite(placed).all():
         raise MapError(f"map {source.name}: lies too far from map {first.name} for one dataset; build one from each")
     return placed

@@ -11,48 +11,54 @@ from numpy.typing import NDArray
 
 from tcpipe.geometry.datum import geodetic_from_enu
 from tcpipe.geometry.piecewise_linear import interpolate, mean_between
-from tcpipe.geometry.polyline import Polyline, polyline
-from tcpipe.motion.ledger import by_reason, interval_duration_s, interval_length_m, interval_reason, stretches
-from tcpipe.motion.pieces import piece_of_rows
+from tcpipe.geometry.polyline import Polyline, fit_polyline
+from tcpipe.motion.distance_breakdown import (
+    compute_interval_duration_s,
+    compute_interval_length_m,
+    find_interval_reason,
+    find_kept_spans,
+    sum_by_reason,
+)
 from tcpipe.motion.remedies import find_losses
+from tcpipe.motion.row_sections import number_pieces
 from tcpipe.path.cutting import Cut, cut_by_chord
 from tcpipe.recipe import SegmentConfig
-from tcpipe.tables.arrays import numbers
-from tcpipe.tables.bits import DropReason, Loss, name_of
-from tcpipe.tables.catalogue import threshold
-from tcpipe.tables.columns import floats, integers
+from tcpipe.tables.arrays import to_numbers
+from tcpipe.tables.bits import DropReason, Loss, flag_name
+from tcpipe.tables.catalogue import read_threshold
+from tcpipe.tables.columns import to_floats, to_integers
 from tcpipe.tables.facts import SegmentFacts
 from tcpipe.tables.findings import Finding, Subject, make_finding
 from tcpipe.tables.levels import SEGMENTS, Datum, GatedTrack, Segments, TrackInfo, add_findings
 
-ENTRIES = ("kept", *(name_of(bit) for bit in (*DropReason, Loss.CURVED, Loss.LEFTOVER)))
+ENTRIES = ("kept", *(flag_name(bit) for bit in (*DropReason, Loss.CURVED, Loss.LEFTOVER)))
 """Names of the ledger's entries, in order."""
 
 
 def segment_track(gated: GatedTrack, config: SegmentConfig) -> Segments:
     """Return the segments of the track's steady stretches, and the ledger of all its metres: its sum is the odometer."""
     table, info = gated.table, gated.info
-    stamp_ns, epoch = integers(table, "stamp_ns"), integers(table, "epoch")
-    position_m = np.column_stack([floats(table, f"{axis}_m") for axis in "xyz"])
-    velocity_mps = np.column_stack([floats(table, f"{name}_velocity_mps") for name in ("east", "north", "up")])
-    piece = piece_of_rows(stamp_ns, epoch, period_ns=1e9 / info.rate_hz)
-    dropped_by = numbers(table["dropped_by"])
-    reason = interval_reason(dropped_by, piece)
-    metres = dict.fromkeys(ENTRIES, 0.0) | by_reason(
-        reason, interval_length_m(stamp_ns, position_m, velocity_mps, piece)
+    stamp_ns, epoch = to_integers(table, "stamp_ns"), to_integers(table, "epoch")
+    position_m = np.column_stack([to_floats(table, f"{axis}_m") for axis in "xyz"])
+    velocity_mps = np.column_stack([to_floats(table, f"{name}_velocity_mps") for name in ("east", "north", "up")])
+    piece = number_pieces(stamp_ns, epoch, period_ns=1e9 / info.rate_hz)
+    dropped_by = to_numbers(table["dropped_by"])
+    reason = find_interval_reason(dropped_by, piece)
+    metres = dict.fromkeys(ENTRIES, 0.0) | sum_by_reason(
+        reason, compute_interval_length_m(stamp_ns, position_m, velocity_mps, piece)
     )
-    seconds = dict.fromkeys(ENTRIES, 0.0) | by_reason(reason, interval_duration_s(stamp_ns, epoch))
+    seconds = dict.fromkeys(ENTRIES, 0.0) | sum_by_reason(reason, compute_interval_duration_s(stamp_ns, epoch))
     tables = [SEGMENTS.empty()]
-    spans = stretches(dropped_by, piece)
+    spans = find_kept_spans(dropped_by, piece)
     for first, last in spans:
         rows = slice(first, last + 1)
-        path = polyline(stamp_ns[rows], position_m[rows], velocity_mps[rows])
+        path = fit_polyline(stamp_ns[rows], position_m[rows], velocity_mps[rows])
         cut = cut_by_chord(path, chord_m=config.chord_m, max_arc_to_chord=config.max_arc_to_chord)
         for entry, (length_m, duration_s) in cut.ledger(path).items():
             metres[entry] += length_m
             seconds[entry] += duration_s
         if len(cut.start_ns):
-            tables.append(_segments(table.slice(first, last + 1 - first), path, cut, info))
+            tables.append(_make_segments(table.slice(first, last + 1 - first), path, cut, info))
     segments = pa.concat_tables(tables).combine_chunks()
     facts = SegmentFacts(segments.num_rows, len(spans), odometer_m=sum(metres.values()), ledger_s=seconds)
     findings = [] if segments.num_rows else [_find_why_none(metres, info.run_id)]
@@ -60,7 +66,7 @@ def segment_track(gated: GatedTrack, config: SegmentConfig) -> Segments:
     return Segments(segments, add_findings(info, findings, replace(info.report.facts, segment=facts)), metres)
 
 
-def _segments(rows: pa.Table, path: Polyline, cut: Cut, info: TrackInfo) -> pa.Table:
+def _make_segments(rows: pa.Table, path: Polyline, cut: Cut, info: TrackInfo) -> pa.Table:
     """Return the segments of one stretch."""
     start_m, end_m = path.position_at(cut.start_ns), path.position_at(cut.end_ns)
     step_m, count = end_m - start_m, len(cut.start_ns)
@@ -68,7 +74,7 @@ def _segments(rows: pa.Table, path: Polyline, cut: Cut, info: TrackInfo) -> pa.T
         "segment_id": [f"{info.run_id}-{stamp}" for stamp in cut.start_ns],
         "run_id": [info.run_id] * count,
         "robot": [info.robot] * count,
-        "epoch": np.full(count, integers(rows, "epoch")[0]),
+        "epoch": np.full(count, to_integers(rows, "epoch")[0]),
         "start_ns": cut.start_ns,
         "end_ns": cut.end_ns,
         "chord_m": np.hypot(step_m[:, 0], step_m[:, 1]),
@@ -77,16 +83,18 @@ def _segments(rows: pa.Table, path: Polyline, cut: Cut, info: TrackInfo) -> pa.T
     }
     for end, position_m in (("start", start_m), ("end", end_m)):
         columns |= {f"{end}_{axis}_m": position_m[:, i] for i, axis in enumerate("xyz")}
-        columns |= _lon_lat(end, position_m, info.datum)
+        columns |= _make_lon_lat(end, position_m, info.datum)
     for name, source in (("fused", "forward"), ("commanded", "commanded")):
-        signal = floats(rows, f"{source}_velocity_mps")
+        signal = to_floats(rows, f"{source}_velocity_mps")
         columns[f"{name}_velocity_mps"] = mean_between(path.stamp_ns, signal, cut.start_ns, cut.end_ns)
-    std_m = np.hypot(floats(rows, "x_std_m"), floats(rows, "y_std_m"))  # DRMS: holds whatever way the error points
+    std_m = np.hypot(
+        to_floats(rows, "x_std_m"), to_floats(rows, "y_std_m")
+    )  # DRMS: holds whatever way the error points
     ends_m = [interpolate(path.stamp_ns, std_m, at_ns) for at_ns in (cut.start_ns, cut.end_ns)]
     return SEGMENTS.table(**columns, position_std_m=np.maximum(*ends_m))
 
 
-def _lon_lat(end: str, position_m: NDArray[np.float64], datum: Datum | None) -> dict[str, NDArray[np.float64]]:
+def _make_lon_lat(end: str, position_m: NDArray[np.float64], datum: Datum | None) -> dict[str, NDArray[np.float64]]:
     """Return longitude and latitude of one end; nowhere in a local frame."""
     lon, lat = np.full((2, len(position_m)), np.nan)
     if datum is not None:
@@ -97,7 +105,7 @@ def _lon_lat(end: str, position_m: NDArray[np.float64], datum: Datum | None) -> 
 def _find_why_none(metres: dict[str, float], run_id: str) -> Finding:
     """Return the finding that a run has no segment, with the largest loss."""
     driven_m, reason = sum(metres.values()), max(metres, key=lambda entry: metres[entry])
-    if driven_m < threshold("no-segments", "min_driven_m"):
+    if driven_m < read_threshold("no-segments", "min_driven_m"):
         return make_finding("robot-did-not-move", Subject("run", run_id), driven_m=driven_m)
     lost_m = metres[reason]
     return make_finding(

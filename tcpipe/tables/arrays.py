@@ -10,24 +10,24 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 
-def numbers(column: pa.Array | pa.ChunkedArray) -> NDArray[Any]:
+def to_numbers(column: pa.Array | pa.ChunkedArray) -> NDArray[Any]:
     """Return a column of numbers or truth values, shape (N,), perhaps read-only; whole numbers with nulls as float64, null as NaN."""
     array = column.combine_chunks() if isinstance(column, pa.ChunkedArray) else column
     if pa.types.is_boolean(array.type) and not array.null_count:
         return np.from_dlpack(array.cast(pa.uint8())).view(np.bool_)
     if array.null_count:
-        known, kind = numbers(array.is_valid()), array.type if pa.types.is_floating(array.type) else pa.float64()
+        known, kind = to_numbers(array.is_valid()), array.type if pa.types.is_floating(array.type) else pa.float64()
         array = array.cast(kind)
         bare = pa.Array.from_buffers(kind, len(array), [None, array.buffers()[1]], offset=array.offset)
         return np.where(known, np.from_dlpack(bare), np.array(np.nan, kind.to_pandas_dtype()))
     return np.from_dlpack(array)
 
 
-def texts(column: pa.Array | pa.ChunkedArray) -> NDArray[np.str_]:
+def to_texts(column: pa.Array | pa.ChunkedArray) -> NDArray[np.str_]:
     """Return a column of texts, shape (N,)."""
     array = column.combine_chunks() if isinstance(column, pa.ChunkedArray) else column
     encoded = array.dictionary_encode(null_encoding="encode")
-    found: NDArray[np.str_] = np.array(encoded.dictionary.to_pylist(), np.str_)[numbers(encoded.indices)]
+    found: NDArray[np.str_] = np.array(encoded.dictionary.to_pylist(), np.str_)[to_numbers(encoded.indices)]
     return found
 
 
@@ -42,7 +42,7 @@ def number_column(values: NDArray[Any], *, nan_is_null: bool = False) -> pa.Arra
     return pa.Array.from_buffers(pa.from_numpy_dtype(values.dtype), values.size, [valid, pa.py_buffer(values)])
 
 
-def text_column(values: Iterable[str]) -> pa.Array:
+def make_text_column(values: Iterable[str]) -> pa.Array:
     """Return an Arrow array of texts; `pyarrow.ArrowInvalid` beyond 2 GB."""
     raw = [value.encode() for value in values]
     ends = np.cumsum([0, *map(len, raw)], dtype=np.int64)
@@ -50,38 +50,38 @@ def text_column(values: Iterable[str]) -> pa.Array:
     return pa.Array.from_buffers(pa.large_string(), len(raw), buffers).cast(pa.string())
 
 
-def column_of(values: Sequence[Any], of: pa.DataType) -> pa.Array:
+def make_column(values: Sequence[Any], of: pa.DataType) -> pa.Array:
     """Return values as an Arrow array: numbers, truth values, texts, None; mappings as structs or maps, sequences as lists."""
     known = np.array([value is not None for value in values], np.bool_)
     valid = None if known.all() else pa.py_buffer(np.packbits(known, bitorder="little"))
     if pa.types.is_struct(of):
         rows = [value or {} for value in values]
-        parts = [column_of([row.get(field.name) for row in rows], field.type) for field in of]
+        parts = [make_column([row.get(field.name) for row in rows], field.type) for field in of]
         return pa.Array.from_buffers(of, len(values), [valid], children=parts)
     if pa.types.is_string(of):
         raw = [(value or "").encode() for value in values]
-        return pa.Array.from_buffers(of, len(raw), [valid, _ends(raw), pa.py_buffer(b"".join(raw))])
+        return pa.Array.from_buffers(of, len(raw), [valid, _make_offsets(raw), pa.py_buffer(b"".join(raw))])
     if pa.types.is_map(of):
         pairs = [[{"key": key, "value": row[key]} for key in sorted(row)] for row in (value or {} for value in values)]
         entries = pa.struct([pa.field("key", of.key_type, nullable=False), pa.field("value", of.item_type)])
-        parts = [column_of([pair for row in pairs for pair in row], entries)]
-        return pa.Array.from_buffers(of, len(values), [valid, _ends(pairs)], children=parts)
+        parts = [make_column([pair for row in pairs for pair in row], entries)]
+        return pa.Array.from_buffers(of, len(values), [valid, _make_offsets(pairs)], children=parts)
     if pa.types.is_list(of):
         lists = [value or () for value in values]
-        parts = [column_of([item for row in lists for item in row], of.value_type)]
-        return pa.Array.from_buffers(of, len(values), [valid, _ends(lists)], children=parts)
+        parts = [make_column([item for row in lists for item in row], of.value_type)]
+        return pa.Array.from_buffers(of, len(values), [valid, _make_offsets(lists)], children=parts)
     made = np.array([value or 0 for value in values], of.to_pandas_dtype())
     data = np.packbits(made, bitorder="little") if pa.types.is_boolean(of) else made
     return pa.Array.from_buffers(of, len(values), [valid, pa.py_buffer(data)])
 
 
-def _ends(rows: Sequence[Sequence[Any]]) -> pa.Buffer:
+def _make_offsets(rows: Sequence[Sequence[Any]]) -> pa.Buffer:
     """Return where each row begins and ends when they lie one after another, as Arrow has it."""
     return pa.py_buffer(np.cumsum([0, *map(len, rows)], dtype=np.int32))
 
 
-def rows_where(table: pa.Table, name: str, value: str | int) -> pa.Table:
+def select_rows(table: pa.Table, name: str, value: str | int) -> pa.Table:
     """Return the rows whose column ``name`` holds ``value``; the table itself where all do."""
     column = table.column(name)
-    chosen = (texts(column) if isinstance(value, str) else numbers(column)) == value
+    chosen = (to_texts(column) if isinstance(value, str) else to_numbers(column)) == value
     return table if chosen.all() else table.filter(number_column(chosen))

@@ -8,14 +8,14 @@ from __future__ import annotations
 from enum import IntFlag
 
 
-def name_of(bit: IntFlag) -> str:
+def flag_name(bit: IntFlag) -> str:
     """Return a flag's name as files and pages have it."""
     return str(bit.name).lower()
 
 
-def names_of(bits: int, flags: type[IntFlag]) -> tuple[str, ...]:
+def flag_names(bits: int, flags: type[IntFlag]) -> tuple[str, ...]:
     """Return the names of the flags that are set in a number, in their order."""
-    return tuple(name_of(bit) for bit in flags if int(bits) & bit)
+    return tuple(flag_name(bit) for bit in flags if int(bits) & bit)
 
 
 class DropReason(IntFlag):

@@ -67,7 +67,7 @@ def read_catalogue() -> Mapping[str, Entry]:
     return {code: _make_entry(values) for code, values in tomllib.loads(_read_text()).items()}
 
 
-def catalogue_sections() -> dict[str, list[str]]:
+def read_sections() -> dict[str, list[str]]:
     """Return the codes by section, in the order of the file."""
     sections: dict[str, list[str]] = {}
     codes: list[str] = []
@@ -89,12 +89,12 @@ def _read_text() -> str:
 
 
 @cache
-def catalogue_version() -> str:
+def read_catalogue_version() -> str:
     """Return the first digits of the catalogue's hash: a verdict that was judged by another catalogue is judged again."""
     return sha256(_read_text().encode()).hexdigest()[:8]
 
 
-def threshold(code: str, name: str) -> float:
+def read_threshold(code: str, name: str) -> float:
     """Return a number that decides whether a finding is made, in the unit of its suffix."""
     return read_catalogue()[code].thresholds[name]
 

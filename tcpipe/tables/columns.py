@@ -16,8 +16,8 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from tcpipe.errors import TableError
-from tcpipe.tables.arrays import number_column, numbers, text_column
-from tcpipe.tables.bits import name_of
+from tcpipe.tables.arrays import make_text_column, number_column, to_numbers
+from tcpipe.tables.bits import flag_name
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +42,7 @@ class Column:
         if self.frame:
             metadata["frame"] = self.frame
         if self.flags is not None:
-            metadata["flags"] = json.dumps({str(int(bit)): name_of(bit) for bit in self.flags})
+            metadata["flags"] = json.dumps({str(int(bit)): flag_name(bit) for bit in self.flags})
         return pa.field(self.name, self.dtype, nullable=self.nullable, metadata=metadata)
 
 
@@ -72,7 +72,7 @@ class TableSchema:
                 *(f"table {self.name}: column {name} is not in its schema" for name in sorted(unknown)),
                 *(f"table {self.name}: column {name} is missing" for name in sorted(missing)),
             )
-        columns = [_arrow_array(arrays[column.name], column) for column in self.columns]
+        columns = [_to_arrow(arrays[column.name], column) for column in self.columns]
         table = pa.Table.from_arrays(columns, schema=self.arrow())
         self.check(table)
         return table
@@ -127,26 +127,26 @@ class TableSchema:
                 yield f"table {self.name}: column {name} is not in its schema"
 
 
-def floats(table: pa.Table, name: str) -> NDArray[np.float64]:
+def to_floats(table: pa.Table, name: str) -> NDArray[np.float64]:
     """Return a column as float64, null as NaN, shape (N,)."""
-    values: NDArray[np.float64] = numbers(table.column(name)).astype(np.float64, copy=False)
+    values: NDArray[np.float64] = to_numbers(table.column(name)).astype(np.float64, copy=False)
     return values
 
 
-def lonlat_deg(table: pa.Table, end: str) -> NDArray[np.float64]:
+def read_lonlat_deg(table: pa.Table, end: str) -> NDArray[np.float64]:
     """Return longitude and latitude of the ``start`` or ``end`` of segments [deg], null as NaN, shape (N, 2)."""
-    return np.stack([floats(table, f"{end}_{axis}_deg") for axis in ("lon", "lat")], axis=1)
+    return np.stack([to_floats(table, f"{end}_{axis}_deg") for axis in ("lon", "lat")], axis=1)
 
 
 class FloatColumns(Mapping[str, NDArray[np.float64]]):
-    """A table's columns of numbers by name, as `floats` gives them, made when they are asked for: a long log has many nobody asks for."""
+    """A table's columns of numbers by name, as `to_floats` gives them, made on demand: a long log has many that nobody needs."""
 
     def __init__(self, table: pa.Table) -> None:
         self._table = table
 
     def __getitem__(self, name: str) -> NDArray[np.float64]:
         """Return one column, null as NaN."""
-        return floats(self._table, name)
+        return to_floats(self._table, name)
 
     def __iter__(self) -> Iterator[str]:
         """Yield the names."""
@@ -157,20 +157,20 @@ class FloatColumns(Mapping[str, NDArray[np.float64]]):
         return sum(1 for _ in self)
 
 
-def integers(table: pa.Table, name: str) -> NDArray[np.int64]:
+def to_integers(table: pa.Table, name: str) -> NDArray[np.int64]:
     """Return a column without nulls as int64, shape (N,)."""
-    values: NDArray[np.int64] = numbers(table.column(name)).astype(np.int64, copy=False)
+    values: NDArray[np.int64] = to_numbers(table.column(name)).astype(np.int64, copy=False)
     return values
 
 
-def _arrow_array(values: object, column: Column) -> pa.Array:
+def _to_arrow(values: object, column: Column) -> pa.Array:
     if isinstance(values, pa.ChunkedArray):
         values = values.combine_chunks()
     if isinstance(values, pa.Array):
         return values if values.type == column.dtype else values.cast(column.dtype)
     wanted, array = column.dtype, np.asarray(values)
     if pa.types.is_string(wanted) and array.dtype.kind == "U":
-        return text_column(array.tolist())
+        return make_text_column(array.tolist())
     if array.dtype.kind not in "biuf":
         return pa.array(values, type=wanted)
     return number_column(array, nan_is_null=column.nullable and array.dtype.kind == "f").cast(wanted)

@@ -20,7 +20,7 @@ ABSENT: Mapping[str, tuple[object, ...]] = {"json": (None,)}
 Vector = tuple[float, float, float]
 
 
-def vector(values: NDArray[np.float64]) -> Vector:
+def make_vector(values: NDArray[np.float64]) -> Vector:
     """Return the three values of an array."""
     x, y, z = values.tolist()
     return x, y, z

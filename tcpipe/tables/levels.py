@@ -59,39 +59,44 @@ _EPOCH = Column(
 )
 
 
-def _stream(name: str, doc: str, *columns: Column) -> TableSchema:
+def _make_stream_schema(name: str, doc: str, *columns: Column) -> TableSchema:
     return TableSchema(name, "L1", doc, (_STAMP, _LOG_TIME, _EPOCH, *columns))
 
 
-def _or_null(name: str, unit: str, doc: str, frame: str = "") -> Column:
+def _make_nullable(name: str, unit: str, doc: str, frame: str = "") -> Column:
     """Return a column of numbers that are not always known."""
     return Column(name, _F64, unit, doc, frame, nullable=True)
 
 
-def _xyz(prefix: str, suffix: str, unit: str, doc: str, frame: str, *, nullable: bool = False) -> tuple[Column, ...]:
+def _make_xyz(
+    prefix: str, suffix: str, unit: str, doc: str, frame: str, *, nullable: bool = False
+) -> tuple[Column, ...]:
     return tuple(Column(f"{prefix}_{axis}_{suffix}", _F64, unit, f"{doc}, {axis}", frame, nullable) for axis in "xyz")
 
 
-GNSS = _stream(
+GNSS = _make_stream_schema(
     "gnss",
     "Antenna positions, fixes only.",
     Column("lon_deg", _F64, "deg", "longitude of the antenna", "gnss_crs"),
     Column("lat_deg", _F64, "deg", "latitude of the antenna", "gnss_crs"),
     Column("alt_m", _F64, "m", "height of the antenna above the ellipsoid", "gnss_crs"),
-    _or_null("east_var_m2", "m2", "variance east; null where the receiver gives none", "enu"),
-    _or_null("north_var_m2", "m2", "variance north; null where the receiver gives none", "enu"),
-    _or_null("up_var_m2", "m2", "variance up; null where the receiver gives none", "enu"),
+    _make_nullable("east_var_m2", "m2", "variance east; null where the receiver gives none", "enu"),
+    _make_nullable("north_var_m2", "m2", "variance north; null where the receiver gives none", "enu"),
+    _make_nullable("up_var_m2", "m2", "variance up; null where the receiver gives none", "enu"),
     Column("fix_status", pa.int8(), "1", "NavSatStatus: 0 fix, 1 satellite-based, 2 ground-based augmentation"),
 )
 
-IMU = _stream(
+IMU = _make_stream_schema(
     "imu",
     "Inertial measurements in the sensor's frame.",
-    *_xyz("angular_velocity", "radps", "rad/s", "angular velocity", "sensor"),
-    *_xyz("linear_acceleration", "mps2", "m/s2", "specific force (gravity included)", "sensor"),
-    *(_or_null(f"quat_{c}", "1", f"orientation world_from_sensor, {c}; null where absent", "world") for c in "xyzw"),
+    *_make_xyz("angular_velocity", "radps", "rad/s", "angular velocity", "sensor"),
+    *_make_xyz("linear_acceleration", "mps2", "m/s2", "specific force (gravity included)", "sensor"),
     *(
-        _or_null(f"{name}_var", unit, f"mean variance of the {doc}; null where unknown", "sensor")
+        _make_nullable(f"quat_{c}", "1", f"orientation world_from_sensor, {c}; null where absent", "world")
+        for c in "xyzw"
+    ),
+    *(
+        _make_nullable(f"{name}_var", unit, f"mean variance of the {doc}; null where unknown", "sensor")
         for name, unit, doc in (
             ("angular_velocity", "rad2/s2", "angular velocity"),
             ("linear_acceleration", "m2/s4", "specific force"),
@@ -101,14 +106,14 @@ IMU = _stream(
 )
 
 
-def _odometry(name: str, doc: str) -> TableSchema:
-    return _stream(
+def _make_odometry_schema(name: str, doc: str) -> TableSchema:
+    return _make_stream_schema(
         name,
         doc,
-        *_xyz(
+        *_make_xyz(
             "velocity", "mps", "m/s", "body velocity; null where the source does not measure it", "child", nullable=True
         ),
-        *_xyz(
+        *_make_xyz(
             "angular_velocity",
             "radps",
             "rad/s",
@@ -116,7 +121,7 @@ def _odometry(name: str, doc: str) -> TableSchema:
             "child",
             nullable=True,
         ),
-        *_xyz(
+        *_make_xyz(
             "velocity_var",
             "m2ps2",
             "m2/s2",
@@ -124,55 +129,55 @@ def _odometry(name: str, doc: str) -> TableSchema:
             "child",
             nullable=True,
         ),
-        _or_null("yaw_rate_var", "rad2/s2", "variance of the yaw rate; null where unknown", "child"),
+        _make_nullable("yaw_rate_var", "rad2/s2", "variance of the yaw rate; null where unknown", "child"),
         *(
-            _or_null(f"{axis}_m", "m", f"pose {axis} in the source's own odom frame; for increments only", "odom")
+            _make_nullable(f"{axis}_m", "m", f"pose {axis} in the source's own odom frame; for increments only", "odom")
             for axis in "xyz"
         ),
         *(
-            _or_null(f"quat_{c}", "1", f"pose orientation odom_from_child, {c}; for increments only", "odom")
+            _make_nullable(f"quat_{c}", "1", f"pose orientation odom_from_child, {c}; for increments only", "odom")
             for c in "xyzw"
         ),
     )
 
 
-WHEEL_ODOMETRY = _odometry("wheel_odometry", "Wheel odometry: a body twist in the child frame.")
-VISUAL_ODOMETRY = _odometry(
+WHEEL_ODOMETRY = _make_odometry_schema("wheel_odometry", "Wheel odometry: a body twist in the child frame.")
+VISUAL_ODOMETRY = _make_odometry_schema(
     "visual_odometry", "Visual odometry: a body twist, or poses to be used as increments, in its own child frame."
 )
 
-GNSS_VELOCITY = _stream(
+GNSS_VELOCITY = _make_stream_schema(
     "gnss_velocity",
     "Velocity of the antenna over ground as its receiver tells it (Doppler).",
     *(Column(f"{axis}_velocity_mps", _F64, "m/s", f"velocity {axis}", "enu", axis == "up") for axis in _ENU),
-    *(_or_null(f"{axis}_var_m2ps2", "m2/s2", f"its variance {axis}; null: not told", "enu") for axis in _ENU),
+    *(_make_nullable(f"{axis}_var_m2ps2", "m2/s2", f"its variance {axis}; null: not told", "enu") for axis in _ENU),
     Column("fix_status", pa.int8(), "1", "NavSatStatus as in gnss; -1 where the message tells none"),
 )
 
-POWER = _stream(
+POWER = _make_stream_schema(
     "power",
     "Voltage and current of each drive rail; a rail's power is their product, the robot's the sum over rails.",
     Column("rail", pa.string(), "", "name of the rail (profile or topic)"),
-    _or_null("voltage_volt", "V", "voltage; null where this row carries only a current"),
-    _or_null("current_amp", "A", "current, positive when drawn; null where this row carries only a voltage"),
+    _make_nullable("voltage_volt", "V", "voltage; null where this row carries only a current"),
+    _make_nullable("current_amp", "A", "current, positive when drawn; null where this row carries only a voltage"),
 )
 
-COMMAND = _stream(
+COMMAND = _make_stream_schema(
     "command",
     "Commanded body velocity.",
     Column("forward_velocity_mps", _F64, "m/s", "commanded forward velocity", "base_link"),
     Column("yaw_rate_radps", _F64, "rad/s", "commanded yaw rate", "base_link"),
 )
 
-POSE = _stream(
+POSE = _make_stream_schema(
     "pose",
     "Positions made elsewhere (SLAM, post-processing), which stand in for GNSS.",
     *(Column(f"{axis}_m", _F64, "m", f"position, {axis}, as it was made", "pose_crs or its own") for axis in "xyz"),
-    _or_null("lon_deg", "deg", "longitude; null where no CRS is told", "gnss_crs"),
-    _or_null("lat_deg", "deg", "latitude; null where no CRS is told", "gnss_crs"),
-    _or_null("alt_m", "m", "height, as it was made; null where no CRS is told", "gnss_crs"),
+    _make_nullable("lon_deg", "deg", "longitude; null where no CRS is told", "gnss_crs"),
+    _make_nullable("lat_deg", "deg", "latitude; null where no CRS is told", "gnss_crs"),
+    _make_nullable("alt_m", "m", "height, as it was made; null where no CRS is told", "gnss_crs"),
     *(
-        _or_null(f"{name}_var_m2", "m2", f"variance along {axis}; null where none is given", "")
+        _make_nullable(f"{name}_var_m2", "m2", f"variance along {axis}; null where none is given", "")
         for name, axis in (("east", "x"), ("north", "y"), ("up", "z"))
     ),
 )
@@ -189,9 +194,9 @@ _TRACK_COLUMNS = (
         Column(f"{axis}_m", _F64, "m", f"base_link {name} of the datum", "enu")
         for axis, name in zip("xyz", ("east", "north", "up"), strict=True)
     ),
-    _or_null("lon_deg", "deg", "longitude of base_link; null in a local frame", "gnss_crs"),
-    _or_null("lat_deg", "deg", "latitude of base_link; null in a local frame", "gnss_crs"),
-    _or_null("alt_m", "m", "ellipsoidal height of base_link; null in a local frame", "gnss_crs"),
+    _make_nullable("lon_deg", "deg", "longitude of base_link; null in a local frame", "gnss_crs"),
+    _make_nullable("lat_deg", "deg", "latitude of base_link; null in a local frame", "gnss_crs"),
+    _make_nullable("alt_m", "m", "ellipsoidal height of base_link; null in a local frame", "gnss_crs"),
     Column("roll_rad", _F64, "rad", "roll", "enu"),
     Column("pitch_rad", _F64, "rad", "pitch, positive nose down (REP-103)", "enu"),
     Column("yaw_rad", _F64, "rad", "yaw of the body, counter-clockwise from true east, [-pi, pi)", "enu"),
@@ -205,7 +210,7 @@ _TRACK_COLUMNS = (
     Column("yaw_std_rad", _F64, "rad", "standard deviation of yaw", "enu"),
     Column("forward_velocity_std_mps", _F64, "m/s", "standard deviation of the forward velocity", "base_link"),
     *(
-        _or_null(
+        _make_nullable(
             f"displacement_std_{name}_m",
             "m",
             f"standard deviation of the horizontal displacement over the next {name}, along it, the correlation of both ends counted; "
@@ -214,12 +219,16 @@ _TRACK_COLUMNS = (
         )
         for name in ("500ms", "1s", "2s", "4s")
     ),
-    _or_null("wheel_velocity_mps", "m/s", "forward velocity by the wheels, interpolated; null without", "base_link"),
-    _or_null("commanded_velocity_mps", "m/s", "commanded forward velocity, last value; null without", "base_link"),
-    _or_null("commanded_yaw_rate_radps", "rad/s", "commanded yaw rate, last value; null without", "base_link"),
-    _or_null("voltage_volt", "V", "mean voltage over the rails, interpolated; null without power"),
-    _or_null("current_amp", "A", "sum of the rails' currents, interpolated; null without power"),
-    _or_null("power_watt", "W", "sum over rails of voltage times current; null without power"),
+    _make_nullable(
+        "wheel_velocity_mps", "m/s", "forward velocity by the wheels, interpolated; null without", "base_link"
+    ),
+    _make_nullable(
+        "commanded_velocity_mps", "m/s", "commanded forward velocity, last value; null without", "base_link"
+    ),
+    _make_nullable("commanded_yaw_rate_radps", "rad/s", "commanded yaw rate, last value; null without", "base_link"),
+    _make_nullable("voltage_volt", "V", "mean voltage over the rails, interpolated; null without power"),
+    _make_nullable("current_amp", "A", "sum of the rails' currents, interpolated; null without power"),
+    _make_nullable("power_watt", "W", "sum over rails of voltage times current; null without power"),
 )
 
 TRACK = TableSchema("track", "L2", "The fused track, 20 Hz, base_link.", _TRACK_COLUMNS)
@@ -239,7 +248,7 @@ _SEGMENT_COLUMNS = (
     Column("start_ns", _I64, "ns", "time at the segment's start, interpolated"),
     Column("end_ns", _I64, "ns", "time at the segment's end, interpolated"),
     *(
-        _or_null(f"{end}_{name}_deg", "deg", f"{doc} of the {end}; null in a local frame", "gnss_crs")
+        _make_nullable(f"{end}_{name}_deg", "deg", f"{doc} of the {end}; null in a local frame", "gnss_crs")
         for end in ("start", "end")
         for name, doc in (("lon", "longitude"), ("lat", "latitude"))
     ),
@@ -261,7 +270,9 @@ _SEGMENT_COLUMNS = (
         "DRMS of the horizontal position (root of the sum of both variances), less certain end",
         "enu",
     ),
-    _or_null("commanded_velocity_mps", "m/s", "mean commanded forward velocity; null without commands", "base_link"),
+    _make_nullable(
+        "commanded_velocity_mps", "m/s", "mean commanded forward velocity; null without commands", "base_link"
+    ),
 )
 
 SEGMENTS = TableSchema("segments", "L4", "Steady, straight pieces of one chord each.", _SEGMENT_COLUMNS)
@@ -269,14 +280,14 @@ SEGMENTS = TableSchema("segments", "L4", "Steady, straight pieces of one chord e
 _LABEL_COLUMNS = (
     Column("duration_s", _F64, "s", "T: time from start to end"),
     Column("velocity_mps", _F64, "m/s", "v: chord / duration"),
-    _or_null("power_watt", "W", "w: energy / duration; null without power"),
-    _or_null("energy_joule", "J", "E: integral of voltage times current; null without power"),
+    _make_nullable("power_watt", "W", "w: energy / duration; null without power"),
+    _make_nullable("energy_joule", "J", "E: integral of voltage times current; null without power"),
     Column("duration_std_s", _F64, "s", "standard deviation of the duration, as a label of the true metre"),
     Column("velocity_std_mps", _F64, "m/s", "standard deviation of the velocity, likewise"),
-    _or_null("power_std_watt", "W", "standard deviation of the power, likewise; null without power"),
-    _or_null("energy_std_joule", "J", "standard deviation of the energy, likewise; null without power"),
+    _make_nullable("power_std_watt", "W", "standard deviation of the power, likewise; null without power"),
+    _make_nullable("energy_std_joule", "J", "standard deviation of the energy, likewise; null without power"),
     *STANDING_COLUMNS,
-    _or_null(
+    _make_nullable(
         "physics_power_watt",
         "W",
         "power by standing, drivetrain, rolling, grade and turning alone, fitted on the run; null without power or fit",
@@ -324,7 +335,7 @@ SAMPLES = TableSchema(
             nullable=True,
         ),
         Column("terrain_name", pa.string(), "", "its name; null without a terrain layer", nullable=True),
-        _or_null("terrain_purity", "1", "share of the chord on that class; null without a terrain layer"),
+        _make_nullable("terrain_purity", "1", "share of the chord on that class; null without a terrain layer"),
         Column(
             "slope_rad", _F64, "rad", "slope of a plane fitted to the patch's heights, positive uphill along travel"
         ),
@@ -349,8 +360,8 @@ REJECTIONS = TableSchema(
         Column("stamp_ns", _I64, "ns", "time of the measurement"),
         Column("role", pa.string(), "", "gnss, gnss_velocity, imu, wheel_odometry, visual_odometry"),
         Column("reason", pa.string(), "", "gate: chi-square; invalid: not finite; covariance: unusable"),
-        _or_null("normalized_innovation_squared", "1", "innovation' S^-1 innovation; null where not computed"),
-        _or_null("threshold", "1", "the gate; null where not computed"),
+        _make_nullable("normalized_innovation_squared", "1", "innovation' S^-1 innovation; null where not computed"),
+        _make_nullable("threshold", "1", "the gate; null where not computed"),
     ),
 )
 
@@ -478,13 +489,13 @@ def add_findings(info: TrackInfo, findings: Iterable[Finding], facts: StageFacts
     return replace(info, report=StageReport((*info.report.findings, *findings), facts))
 
 
-def with_metadata(table: pa.Table, metadata: Mapping[str, Any]) -> pa.Table:
+def add_metadata(table: pa.Table, metadata: Mapping[str, Any]) -> pa.Table:
     """Return the table with ``metadata`` (JSON values) in its schema, under the key ``tcpipe``."""
     text = json.dumps({"data_model_version": TABLES_VERSION, **metadata}, sort_keys=True)
     return table.replace_schema_metadata({**(table.schema.metadata or {}), _METADATA_KEY: text.encode()})
 
 
-def metadata_of(table: pa.Table) -> dict[str, Any]:
-    """Return what `with_metadata` stored, or an empty dict."""
+def read_metadata(table: pa.Table) -> dict[str, Any]:
+    """Return what `add_metadata` stored, or an empty dict."""
     found: dict[str, Any] = json.loads((table.schema.metadata or {}).get(_METADATA_KEY, b"{}"))
     return found

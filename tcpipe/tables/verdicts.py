@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Literal, TypeAlias
 
-from tcpipe.tables.catalogue import Affected, Severity, catalogue_version, read_catalogue
+from tcpipe.tables.catalogue import Affected, Severity, read_catalogue, read_catalogue_version
 from tcpipe.tables.findings import Finding, sort_findings
 
 Grade: TypeAlias = Literal["usable", "usable with care", "not usable"]
@@ -25,7 +25,7 @@ class Verdict:
     time: Grade = "usable"
     energy: Grade = "usable"
     reasons: tuple[Finding, ...] = ()
-    catalogue: str = field(default_factory=catalogue_version)
+    catalogue: str = field(default_factory=read_catalogue_version)
     """Version of the catalogue that judged."""
 
     @property
@@ -55,4 +55,4 @@ def judge_by_code(findings: Iterable[Finding]) -> Verdict:
 
 def judge_again(verdict: Verdict, findings: Iterable[Finding]) -> Verdict:
     """Return a verdict that was stored; where another catalogue judged it, the verdict of this one."""
-    return verdict if verdict.catalogue == catalogue_version() else judge(findings)
+    return verdict if verdict.catalogue == read_catalogue_version() else judge(findings)

@@ -64,11 +64,11 @@ class ClassTable:
         for class_id in sorted(mine | theirs):
             here, there = mine.get(class_id), theirs.get(class_id)
             if here != there:
-                clauses.append(f"id {class_id} is {_described(here)}, but {_described(there)} in the other")
+                clauses.append(f"id {class_id} is {_describe_class(here)}, but {_describe_class(there)} in the other")
         return tuple(clauses)
 
 
-def _described(entry: TerrainClass | None) -> str:
+def _describe_class(entry: TerrainClass | None) -> str:
     return "nothing" if entry is None else f"{entry.name} ({'' if entry.traversable else 'not '}traversable)"
 
 
@@ -93,14 +93,14 @@ def name_key(name: str) -> str:
     return " ".join(name.casefold().replace("_", " ").replace("-", " ").split())
 
 
-def named_scheme(name_by_value: Mapping[int, str], table: ClassTable) -> ClassScheme | None:
+def find_named_scheme(name_by_value: Mapping[int, str], table: ClassTable) -> ClassScheme | None:
     """Return the scheme in which a raster's own names say what its values are; None if none of them is a name of the table."""
     by_name = {name_key(entry.name): entry.id for entry in table.classes}
     found = {value: by_name[name_key(name)] for value, name in name_by_value.items() if name_key(name) in by_name}
     return ClassScheme(table, found) if found else None
 
 
-def own_scheme(name_by_value: Mapping[int, str]) -> ClassScheme | None:
+def make_own_scheme(name_by_value: Mapping[int, str]) -> ClassScheme | None:
     """Return classes as a raster itself names them, all traversable; None where it names none, or more than there are ids.
 
     A class's id is its value where all values can be ids, else its place in the order of the values; values of one name are one class.

@@ -86,7 +86,7 @@ class Layer:
     @property
     def nodata(self) -> float:
         """Return what a pixel of a patch without data holds: 0, NaN, or the largest number of a relative layer."""
-        return HEIGHT_NODATA if self.kind == "relative" else missing(self.stored)
+        return HEIGHT_NODATA if self.kind == "relative" else find_no_data_value(self.stored)
 
     @property
     def stack(self) -> Stack:
@@ -117,7 +117,7 @@ class Layer:
         return self.step / width, -self.low / width
 
 
-def missing(dtype: np.dtype[Any]) -> float:
+def find_no_data_value(dtype: np.dtype[Any]) -> float:
     """Return what stands for no data in a map's pixels of a type."""
     return float("nan") if dtype.kind == "f" else 0
 
@@ -143,34 +143,34 @@ PAPER_LAYERS: dict[str, Layer] = {
     ),
     **{name: replace(_ORTHO, name=name, long_name=f"orthophoto, {name[6:]}") for name in COLOURS},
 }
-"""Layers that a map may have by their names alone; those of a user are made by `continuous_layer` and `categorical_layer`."""
+"""Layers that a map may have by their names alone; those of a user are made by `make_continuous_layer` and `make_categorical_layer`."""
 
 
-def continuous_layer(name: str, *, unit: str, low: float, high: float) -> Layer:
+def make_continuous_layer(name: str, *, unit: str, low: float, high: float) -> Layer:
     """Return a user's continuous layer, whose values from ``low`` to ``high`` [unit] are scaled onto [0, 1]."""
     return Layer(name, "continuous", name.replace("_", " "), _FLOAT, _FLOAT, unit=unit or "1", low=low, high=high)
 
 
-def categorical_layer(name: str, classes: ClassTable) -> Layer:
+def make_categorical_layer(name: str, classes: ClassTable) -> Layer:
     """Return a categorical layer with classes of its own."""
     long_name = f"{name.replace('_', ' ')} class id"
     return Layer(name, "categorical", long_name, _BYTE, _BYTE, low=1.0, high=float(classes.count), classes=classes)
 
 
-def paper_layers(names: Iterable[str], classes: ClassTable) -> dict[str, Layer]:
+def make_paper_layers(names: Iterable[str], classes: ClassTable) -> dict[str, Layer]:
     """Return layers of `PAPER_LAYERS` by name, in the order given; ``classes`` are those of terrain."""
-    terrain = categorical_layer("terrain", classes)
+    terrain = make_categorical_layer("terrain", classes)
     known = {**PAPER_LAYERS, "terrain": replace(terrain, long_name=PAPER_LAYERS["terrain"].long_name)}
     return {name: known[name] for name in names}
 
 
-def in_order(layers: Mapping[str, Layer]) -> dict[str, Layer]:
+def sort_layers(layers: Mapping[str, Layer]) -> dict[str, Layer]:
     """Return layers in the order of channels: the paper's first, then the others as they come."""
     rest = [name for name in layers if name not in LAYERS]
     return {name: layers[name] for name in (*(name for name in LAYERS if name in layers), *rest)}
 
 
-def joint(maps: Sequence[Mapping[str, Layer]]) -> dict[str, Layer]:
+def join_layers(maps: Sequence[Mapping[str, Layer]]) -> dict[str, Layer]:
     """Return the layers that maps have in common, each with the range of all."""
     return {
         name: replace(layer, low=min(each[name].low for each in maps), high=max(each[name].high for each in maps))
@@ -178,12 +178,12 @@ def joint(maps: Sequence[Mapping[str, Layer]]) -> dict[str, Layer]:
     }
 
 
-def stacked(layers: Mapping[str, Layer]) -> dict[Stack, list[str]]:
+def group_stacks(layers: Mapping[str, Layer]) -> dict[Stack, list[str]]:
     """Return the names of layers by what they are sampled together with."""
     return {stack: [name for name, layer in layers.items() if layer.stack == stack] for stack in STACKS}
 
 
-def wrong_name(name: str, *, taken: Collection[str]) -> str | None:
+def find_wrong_name(name: str, *, taken: Collection[str]) -> str | None:
     """Say why a user's layer cannot have a name, among those that are taken already; None where it can."""
     if name in _TAKEN or name in taken or name.endswith("_one_hot"):
         return f"layer {name}: the name is taken; choose another"

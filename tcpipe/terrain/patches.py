@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.errors import TableError
-from tcpipe.tables.catalogue import threshold
+from tcpipe.tables.catalogue import read_threshold
 from tcpipe.terrain.grid import MapGrid
 
 FloatArray = NDArray[np.float64]
@@ -51,7 +51,7 @@ def patch_frames(start_xy_m: FloatArray, end_xy_m: FloatArray, chord_m: FloatArr
     return PatchFrames((start_xy_m + end_xy_m) / 2.0, along, left)
 
 
-def footprints(frames: PatchFrames, patch_m: float) -> FloatArray:
+def compute_footprints(frames: PatchFrames, patch_m: float) -> FloatArray:
     """Return each patch's corners in the map's CRS [m], counter-clockwise from rear right, shape (N, 4, 2)."""
     signs = np.array([(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)]) * (patch_m / 2.0)
     corners: FloatArray = (
@@ -62,7 +62,7 @@ def footprints(frames: PatchFrames, patch_m: float) -> FloatArray:
     return corners
 
 
-def corners_on(grid: MapGrid, footprint_xy_m: FloatArray) -> NDArray[np.int64]:
+def count_corners_on(grid: MapGrid, footprint_xy_m: FloatArray) -> NDArray[np.int64]:
     """Return how many corners of each footprint, shape (N, 4, 2), lie on the map, shape (N,); what is not finite does not."""
     inside = grid.contains(np.where(np.isfinite(footprint_xy_m), footprint_xy_m, np.inf))
     return np.asarray(np.count_nonzero(inside, axis=1))
@@ -93,7 +93,7 @@ def map_px_from_patch(frames: PatchFrames, grid: MapGrid, *, patch_m: float, pat
     return np.hstack([grid.px_from_xy(first), frames.along_xy * down, -frames.left_xy * down])
 
 
-def chord_px(frames: PatchFrames, grid: MapGrid, *, chord_m: FloatArray, points: int) -> FloatArray:
+def sample_chord_px(frames: PatchFrames, grid: MapGrid, *, chord_m: FloatArray, points: int) -> FloatArray:
     """Return map pixel coordinates of evenly spread points on each chord.
 
     Returns
@@ -107,5 +107,5 @@ def chord_px(frames: PatchFrames, grid: MapGrid, *, chord_m: FloatArray, points:
 
 def has_other_pixels(patch_pixel_m: float, map_pixel_m: float) -> bool:
     """Return whether patches ask for finer or much coarser pixels than the map's level has."""
-    least, most = threshold(_PIXELS_DIFFER, "min_ratio"), threshold(_PIXELS_DIFFER, "max_ratio")
+    least, most = read_threshold(_PIXELS_DIFFER, "min_ratio"), read_threshold(_PIXELS_DIFFER, "max_ratio")
     return not least * map_pixel_m <= patch_pixel_m <= most * map_pixel_m

@@ -20,7 +20,7 @@ from pyproj.transformer import AreaOfInterest as TransformArea
 from pyproj.transformer import TransformerGroup
 
 from tcpipe.errors import MapError
-from tcpipe.tables.catalogue import threshold
+from tcpipe.tables.catalogue import read_threshold
 from tcpipe.tables.findings import Finding, Subject, make_finding
 
 FloatArray = NDArray[np.float64]
@@ -42,7 +42,7 @@ def parse_crs(text: str, *, where: str) -> CRS:
     crs = crs.to_2d()
     if crs.geodetic_crs is None or not (crs.is_projected or crs.is_geographic):
         raise MapError(f"{where}: the CRS {crs.name!r} is not tied to the earth (wanted a projected or geographic CRS)")
-    radius_m = _ellipsoid(crs)[0]
+    radius_m = _read_ellipsoid(crs)[0]
     if abs(radius_m / _EARTH_RADIUS_M - 1.0) > 0.02:
         raise MapError(
             f"{where}: the CRS {crs.name!r} is of another body (radius {radius_m / 1000:.0f} km), not the earth"
@@ -51,13 +51,13 @@ def parse_crs(text: str, *, where: str) -> CRS:
     return CRS.from_authority(*authority) if authority else crs
 
 
-def crs_text(crs: CRS) -> str:
+def format_crs(crs: CRS) -> str:
     """Return ``AUTHORITY:code`` where the CRS is exactly that, else WKT 2."""
     authority = crs.to_authority(min_confidence=100)
     return ":".join(authority) if authority else crs.to_wkt()
 
 
-def metres_from_plane(crs: CRS, xy: FloatArray) -> FloatArray:
+def make_metres_from_plane(crs: CRS, xy: FloatArray) -> FloatArray:
     """Return the local map from the CRS plane to the ground, at points of the plane.
 
     Returns
@@ -71,20 +71,22 @@ def metres_from_plane(crs: CRS, xy: FloatArray) -> FloatArray:
     east, north = (np.array(to_lonlat.transform(x + dx, y + dy)) for dx, dy in ((step, 0.0), (0.0, step)))
     west, south = (np.array(to_lonlat.transform(x - dx, y - dy)) for dx, dy in ((step, 0.0), (0.0, step)))
     latitude = np.radians((north[1] + south[1]) / 2.0)
-    a, e2 = _ellipsoid(crs)
+    a, e2 = _read_ellipsoid(crs)
     w = 1.0 - e2 * np.sin(latitude) ** 2
     per_degree = np.stack([a / np.sqrt(w) * np.cos(latitude), a * (1.0 - e2) / w**1.5]) * (math.pi / 180.0)
-    columns = [_wrapped(ahead - behind) * per_degree / (2.0 * step) for ahead, behind in ((east, west), (north, south))]
+    columns = [
+        _wrap_longitudes(ahead - behind) * per_degree / (2.0 * step) for ahead, behind in ((east, west), (north, south))
+    ]
     found = np.stack(columns, axis=-1).swapaxes(0, 1)
     return np.where(np.isfinite(found), found, np.nan)
 
 
-def _wrapped(lonlat_deg: FloatArray) -> FloatArray:
+def _wrap_longitudes(lonlat_deg: FloatArray) -> FloatArray:
     """Return differences of longitude and latitude, shape (2, N) [deg], the short way around the earth."""
     return np.stack([(lonlat_deg[0] + 180.0) % 360.0 - 180.0, lonlat_deg[1]])
 
 
-def _ellipsoid(crs: CRS) -> tuple[float, float]:
+def _read_ellipsoid(crs: CRS) -> tuple[float, float]:
     ellipsoid = CRS(crs.geodetic_crs).ellipsoid
     assert ellipsoid is not None  # noqa: S101  (a geodetic CRS has one)
     a, b = ellipsoid.semi_major_metre, ellipsoid.semi_minor_metre
@@ -95,14 +97,14 @@ def is_metric(crs: CRS, xy: FloatArray) -> bool:
     """Return whether the CRS is right-handed and within one per cent of metres at all the given points of its plane."""
     if not crs.is_projected:
         return False
-    ground = metres_from_plane(crs, xy)
+    ground = make_metres_from_plane(crs, xy)
     if not np.isfinite(ground).all():
         return False
     scales = np.linalg.svd(ground, compute_uv=False)
     return bool((np.linalg.det(ground) > 0.0).all() and (np.abs(scales - 1.0) < MAX_SCALE_ERROR).all())
 
 
-def utm_crs(crs: CRS, xy: tuple[float, float]) -> CRS:
+def find_utm_crs(crs: CRS, xy: tuple[float, float]) -> CRS:
     """Return the UTM zone of a point of another CRS, on its datum where that has one, else on WGS 84."""
     geodetic = CRS(crs.geodetic_crs)
     lon, lat = Transformer.from_crs(crs, geodetic, always_xy=True).transform(*xy)
@@ -154,11 +156,11 @@ class Projection:
 
     def find_rough_shift(self, subject: Subject) -> tuple[Finding, ...]:
         """Return the finding, if any, that the two datums differ and the shift between them is known only roughly."""
-        if _share_datum(self.source, self.target):
+        if _has_same_datum(self.source, self.target):
             return ()
         accuracy_m = self._transformer.accuracy
         is_ballpark = "ballpark" in self._transformer.description.lower()
-        if not is_ballpark and 0.0 <= accuracy_m <= threshold("datum-shift-rough", "max_accuracy_m"):
+        if not is_ballpark and 0.0 <= accuracy_m <= read_threshold("datum-shift-rough", "max_accuracy_m"):
             return ()
         source, target = (CRS(crs.geodetic_crs).name for crs in (self.source, self.target))
         names = {"source": source, "target": target}
@@ -168,11 +170,11 @@ class Projection:
 
 
 @lru_cache(maxsize=64)
-def _share_datum(one: CRS, other: CRS) -> bool:
+def _has_same_datum(one: CRS, other: CRS) -> bool:
     return bool(CRS(one.geodetic_crs).datum == CRS(other.geodetic_crs).datum)
 
 
-def area_of(crs: CRS, bounds: tuple[float, float, float, float]) -> tuple[float, float, float, float]:
+def compute_area(crs: CRS, bounds: tuple[float, float, float, float]) -> tuple[float, float, float, float]:
     """Return west, south, east, north [deg] of a rectangle (x min, y min, x max, y max) in a CRS."""
     transformer = Transformer.from_crs(crs, CRS(crs.geodetic_crs), always_xy=True)
     west, south, east, north = transformer.transform_bounds(*bounds)

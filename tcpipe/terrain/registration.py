@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import minimum_filter
 
-from tcpipe.tables.catalogue import threshold
-from tcpipe.terrain.tiles import MapReader, groups_by_tile, level_for, read_window
+from tcpipe.tables.catalogue import read_threshold
+from tcpipe.terrain.tiles import MapReader, group_by_tile, level_for, read_window
 
 FloatArray = NDArray[np.float64]
 
@@ -72,7 +72,7 @@ class HeightScale:
     def is_off(self) -> bool:
         """Whether map and track surely do not rise alike."""
         return self.is_known and abs(self.value - 1.0) > max(
-            _SIGMAS * self.std, threshold("map-height-scale", "min_error_fraction")
+            _SIGMAS * self.std, read_threshold("map-height-scale", "min_error_fraction")
         )
 
 
@@ -118,24 +118,24 @@ def register_track(source: MapReader, xy_m: FloatArray, height_m: FloatArray) ->
     """
     level = level_for(source, _STEP_M)
     finite = np.isfinite(xy_m).all(axis=1) & np.isfinite(height_m)
-    at = np.flatnonzero(finite)[_thinned(xy_m[finite])]
+    at = np.flatnonzero(finite)[_thin_points(xy_m[finite])]
     at = at[level.grid.contains(xy_m[at])]
     steps = round(REACH_M / _STEP_M)
     shift_m = np.arange(-steps, steps + 1, dtype=np.float64) * _STEP_M
-    ground_m = _ground(level, xy_m[at], shift_m)
+    ground_m = _sample_heights(level, xy_m[at], shift_m)
     whole = np.isfinite(ground_m).all(axis=(1, 2))
     if whole.sum() < _FEWEST_POINTS:
         return None
     excess_m = ground_m[whole] - height_m[at][whole, None, None]
-    best = _least(np.median(np.abs(excess_m - np.median(excess_m, axis=0)), axis=0))
+    best = _find_least(np.median(np.abs(excess_m - np.median(excess_m, axis=0)), axis=0))
     left = np.abs(excess_m[:, *best] - np.median(excess_m[:, *best]))
     good = left <= _OUTLIER * 1.4826 * np.median(left) + 1e-6  # what is not the ground: bridges, trees
-    best = _least(excess_m[good].var(axis=0))
-    scale = _height_scale(ground_m[whole][good], height_m[at][whole][good])
-    return _refined(excess_m[good], best, shift_m, scale)
+    best = _find_least(excess_m[good].var(axis=0))
+    scale = _fit_height_scale(ground_m[whole][good], height_m[at][whole][good])
+    return _refine_shift(excess_m[good], best, shift_m, scale)
 
 
-def _thinned(xy_m: FloatArray) -> NDArray[np.int64]:
+def _thin_points(xy_m: FloatArray) -> NDArray[np.int64]:
     """Return indices of points `_SPACING_M` of path apart, or further where that would be too many."""
     if len(xy_m) == 0:
         return np.zeros(0, np.int64)
@@ -144,23 +144,23 @@ def _thinned(xy_m: FloatArray) -> NDArray[np.int64]:
     return np.unique((path_m / spacing_m).astype(np.int64), return_index=True)[1]
 
 
-def _ground(level: MapReader, xy_m: FloatArray, shift_m: FloatArray) -> FloatArray:
+def _sample_heights(level: MapReader, xy_m: FloatArray, shift_m: FloatArray) -> FloatArray:
     """Return the map's heights at every point moved by every pair of shifts (north, east), shape (N, K, K); NaN without data."""
     px = level.grid.px_from_xy(xy_m)
     offset_px = shift_m / level.grid.pitch_m
     reach_px = int(np.ceil(offset_px[-1])) + 2
     found = np.empty((len(xy_m), shift_m.size, shift_m.size))
-    for group in groups_by_tile(px, level):
+    for group in group_by_tile(px, level):
         col0, row0 = np.floor(px[group].min(axis=0)).astype(int) - reach_px
         col1, row1 = np.floor(px[group].max(axis=0)).astype(int) + reach_px + 1
         window = read_window(level, "height", row0, row1, col0, col1).astype(np.float64)
         x = px[group, 0, None] - col0 + offset_px
         y = px[group, 1, None] - row0 - offset_px  # rows run south
-        found[group] = _bilinear(window, y[:, :, None], x[:, None, :])
+        found[group] = _interpolate_bilinear(window, y[:, :, None], x[:, None, :])
     return found + level.height_reference_m
 
 
-def _bilinear(values: FloatArray, row: FloatArray, col: FloatArray) -> FloatArray:
+def _interpolate_bilinear(values: FloatArray, row: FloatArray, col: FloatArray) -> FloatArray:
     i, j = np.floor(row).astype(np.int64), np.floor(col).astype(np.int64)
     v, u = row - i, col - j
     upper = values[i, j] * (1.0 - u) + values[i, j + 1] * u
@@ -168,26 +168,26 @@ def _bilinear(values: FloatArray, row: FloatArray, col: FloatArray) -> FloatArra
     return np.asarray(upper * (1.0 - v) + lower * v)
 
 
-def _least(spread: FloatArray) -> tuple[int, int]:
+def _find_least(spread: FloatArray) -> tuple[int, int]:
     """Return the lattice indices (north, east) of the shift that leaves the least spread."""
     i, j = np.unravel_index(int(spread.argmin()), spread.shape)
     return int(i), int(j)
 
 
-def _height_scale(ground_m: FloatArray, height_m: FloatArray) -> HeightScale:
+def _fit_height_scale(ground_m: FloatArray, height_m: FloatArray) -> HeightScale:
     """Regress the track's heights (N,) on the map's (N, K, K) where both are most alike; how sure, by leaving stretches out."""
     ground, height = ground_m - ground_m.mean(axis=0), height_m - height_m.mean()
     squares, products = np.einsum("nij,nij->ij", ground, ground), np.einsum("nij,n->ij", ground, height)
     explained = products**2 / (squares * (height @ height) + _RIDGE)
     i, j = np.unravel_index(int(explained.argmax()), explained.shape)
     along = ground[:, i, j]
-    parts = [(along[block] @ along[block], along[block] @ height[block]) for block in _stretches(len(height))]
+    parts = [(along[block] @ along[block], along[block] @ height[block]) for block in _cut_stretches(len(height))]
     without = [(products[i, j] - product) / (squares[i, j] - square + _RIDGE) for square, product in parts]
-    std = float(np.sqrt(_jackknife_covariance(np.array(without)[:, None])[0, 0]))
+    std = float(np.sqrt(_estimate_covariance(np.array(without)[:, None])[0, 0]))
     return HeightScale(float(products[i, j] / (squares[i, j] + _RIDGE)), std, float(explained[i, j]))
 
 
-def _refined(excess_m: FloatArray, best: tuple[int, int], shift_m: FloatArray, scale: HeightScale) -> Registration:
+def _refine_shift(excess_m: FloatArray, best: tuple[int, int], shift_m: FloatArray, scale: HeightScale) -> Registration:
     """Refine the best shift of the lattice by one Gauss-Newton step, and tell how sure it is by leaving stretches out."""
     last, middle = shift_m.size - 1, shift_m.size // 2
     i, j = (min(max(index, 1), last - 1) for index in best)
@@ -198,13 +198,13 @@ def _refined(excess_m: FloatArray, best: tuple[int, int], shift_m: FloatArray, s
     step_m, covariance = _step(slope, left)
     variances, axes = np.linalg.eigh(covariance)
     known = axes[:, variances < KNOWN_M**2]
-    if not _distinct(excess_m, (i, j), known, shift_m):
+    if not _is_distinct(excess_m, (i, j), known, shift_m):
         known = axes[:, :0]
     step_m = known @ np.clip(known.T @ step_m, -_STEP_M, _STEP_M)
     shifted = left + slope @ step_m
     fitted = known @ known.T @ np.array([shift_m[j], shift_m[i]]) + step_m
     weight = float(((known.T @ fitted) ** 2 / variances[: known.shape[1]]).sum())
-    gain, sigmas = _gain(unshifted, shifted)
+    gain, sigmas = _compute_gain(unshifted, shifted)
     return Registration(
         points=len(excess_m),
         shift_xy_m=(float(fitted[0]), float(fitted[1])),
@@ -229,36 +229,36 @@ def _step(slope: FloatArray, left: FloatArray) -> tuple[FloatArray, FloatArray]:
     step_m = np.linalg.solve(total, force)
     without = [
         np.linalg.solve(total - information[block].sum(axis=0), force - pull[block].sum(axis=0))
-        for block in _stretches(len(left))
+        for block in _cut_stretches(len(left))
     ]
-    return step_m, np.linalg.inv(total) * (left + slope @ step_m).var() + _jackknife_covariance(np.stack(without))
+    return step_m, np.linalg.inv(total) * (left + slope @ step_m).var() + _estimate_covariance(np.stack(without))
 
 
-def _distinct(excess_m: FloatArray, best: tuple[int, int], known: FloatArray, shift_m: FloatArray) -> bool:
+def _is_distinct(excess_m: FloatArray, best: tuple[int, int], known: FloatArray, shift_m: FloatArray) -> bool:
     """Tell whether every other shift that fits best around it, away along the known directions, fits clearly worse."""
     variance = excess_m.var(axis=0)
     north, east = np.meshgrid(shift_m - shift_m[best[0]], shift_m - shift_m[best[1]], indexing="ij")
     away = np.linalg.norm(np.stack([east, north], axis=-1) @ known, axis=-1) >= _APART_M
     rivals = np.argwhere(away & (variance == minimum_filter(variance, 3, mode="nearest")))
     left = excess_m[:, *best] - excess_m[:, *best].mean()
-    return all(_gain(excess_m[:, a, b] - excess_m[:, a, b].mean(), left)[1] > _RIVAL_SIGMAS for a, b in rivals)
+    return all(_compute_gain(excess_m[:, a, b] - excess_m[:, a, b].mean(), left)[1] > _RIVAL_SIGMAS for a, b in rivals)
 
 
-def _gain(unshifted: FloatArray, shifted: FloatArray) -> tuple[float, float]:
+def _compute_gain(unshifted: FloatArray, shifted: FloatArray) -> tuple[float, float]:
     """Return by how much the log of the mean squared misfit falls, and over how many of its standard deviations."""
     squares = np.stack([unshifted**2, shifted**2])
     gain = np.log(squares[0].sum() / squares[1].sum())
-    parts = np.stack([squares[:, block].sum(axis=1) for block in _stretches(len(shifted))], axis=1)
+    parts = np.stack([squares[:, block].sum(axis=1) for block in _cut_stretches(len(shifted))], axis=1)
     sums = squares.sum(axis=1, keepdims=True) - parts
-    std = np.sqrt(_jackknife_covariance(np.log(sums[0] / sums[1])[:, None])[0, 0])
+    std = np.sqrt(_estimate_covariance(np.log(sums[0] / sums[1])[:, None])[0, 0])
     return float(gain), float(gain / max(std, 1e-12))
 
 
-def _stretches(count: int) -> list[NDArray[np.int64]]:
+def _cut_stretches(count: int) -> list[NDArray[np.int64]]:
     return np.array_split(np.arange(count), _BLOCKS)
 
 
-def _jackknife_covariance(without: FloatArray) -> FloatArray:
+def _estimate_covariance(without: FloatArray) -> FloatArray:
     """Return the covariance of an estimate from its values with each stretch left out, shape (B, K)."""
     spread = without - without.mean(axis=0)
     covariance: FloatArray = (len(without) - 1) / len(without) * spread.T @ spread

@@ -12,13 +12,13 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.compiled import kernel
+from tcpipe.compiled import compile_kernel
 
 SNAP_PX = 1e-4
 """A position nearer than this to a source pixel's centre is at the centre [source px]."""
 
 
-@kernel
+@compile_kernel
 def _position(lattice: NDArray[np.float64], step: int, row: float, col: float) -> tuple[float, float]:
     i, j = row / step + 1.0, col / step + 1.0
     a, b = min(int(i), lattice.shape[0] - 2), min(int(j), lattice.shape[1] - 2)
@@ -32,8 +32,10 @@ def _position(lattice: NDArray[np.float64], step: int, row: float, col: float) -
     return x, y
 
 
-@kernel
-def bilinear(source: NDArray[np.float64], lattice: NDArray[np.float64], step: int, out: NDArray[np.float64]) -> None:
+@compile_kernel
+def resample_bilinear(
+    source: NDArray[np.float64], lattice: NDArray[np.float64], step: int, out: NDArray[np.float64]
+) -> None:
     """Interpolate ``source`` (NaN: no data), shape (H, W), at every pixel of ``out``; NaN where a tap has no data or lies outside."""
     rows, cols = source.shape
     for i in range(out.shape[0]):
@@ -55,7 +57,7 @@ def bilinear(source: NDArray[np.float64], lattice: NDArray[np.float64], step: in
             out[i, j] = upper + v * (lower - upper) if v > 0.0 else upper
 
 
-@kernel
+@compile_kernel
 def mean(
     source: NDArray[np.float64], lattice: NDArray[np.float64], step: int, parts: int, out: NDArray[np.float64]
 ) -> None:
@@ -72,8 +74,8 @@ def mean(
             out[i, j] = total / (parts * parts)
 
 
-@kernel
-def majority(
+@compile_kernel
+def resample_majority(
     source: NDArray[np.uint8], lattice: NDArray[np.float64], step: int, parts: int, out: NDArray[np.uint8]
 ) -> None:
     """Take the commonest class over every pixel of ``out`` at parts x parts points (1: nearest); 0 is no data and votes; ties go low."""
@@ -97,8 +99,8 @@ def majority(
                 votes[:] = 0
 
 
-@kernel
-def block_majority(ids: NDArray[np.uint8], factor: int, out: NDArray[np.uint8]) -> None:
+@compile_kernel
+def reduce_majority(ids: NDArray[np.uint8], factor: int, out: NDArray[np.uint8]) -> None:
     """Take the commonest class of every whole ``factor`` x ``factor`` block of ``ids``; 0 is no data and votes; ties go low."""
     votes = np.zeros(256, np.int64)
     for i in range(out.shape[0]):

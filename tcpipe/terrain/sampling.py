@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.terrain.layers import HEIGHT_STEP_M, STACKS, stacked
-from tcpipe.terrain.patches import PatchFrames, chord_px, map_px_from_patch
+from tcpipe.terrain.layers import HEIGHT_STEP_M, STACKS, group_stacks
+from tcpipe.terrain.patches import PatchFrames, map_px_from_patch, sample_chord_px
 from tcpipe.terrain.sampling_kernel import Ground, Stacks, sample_tiles
-from tcpipe.terrain.tiles import MapReader, TilePool, groups_by_tile, level_for
+from tcpipe.terrain.tiles import MapReader, TilePool, group_by_tile, level_for
 
 _MOVED_ROWS = 128
 """Patches moved at once: they stay in the processor's cache on the way."""
@@ -51,7 +51,7 @@ class Patches:
         return Patches(pixels, **{name: values[good] for name, values in self.columns().items()})
 
 
-def joined(parts: Sequence[Patches]) -> Patches:
+def join_patches(parts: Sequence[Patches]) -> Patches:
     """Return patches one after another, all of the same layers."""
     if len(parts) == 1:
         return parts[0]
@@ -82,9 +82,9 @@ def sample_patches(
     level = level_for(source, patch_m / patch_px)
     pixels = map_px_from_patch(frames, level.grid, patch_m=patch_m, patch_px=patch_px)
     points = max(round(patch_px * float(np.median(chord_m)) / patch_m), 1) if chord_m.size else 1
-    chords = chord_px(frames, level.grid, chord_m=chord_m, points=points)
-    boxes = _boxes(pixels, patch_px, chords, points)
-    pitch_m, stacks = patch_m / patch_px, stacked(level.layers)
+    chords = sample_chord_px(frames, level.grid, chord_m=chord_m, points=points)
+    boxes = _compute_boxes(pixels, patch_px, chords, points)
+    pitch_m, stacks = patch_m / patch_px, group_stacks(level.layers)
     ground = Ground(boxes, pixels, chords, points, _place("terrain", stacks["classes"]), pitch_m, HEIGHT_STEP_M)
     shape = (chord_m.size, patch_px, patch_px)
     floats, greys, classes = (
@@ -93,7 +93,7 @@ def sample_patches(
     out = Stacks(np.empty(shape, np.uint16), floats, greys, classes, np.empty((chord_m.size, 7)))
     pool = pool or TilePool(level)
     pool.expect(boxes)
-    for chosen in groups_by_tile(level.grid.px_from_xy(frames.centre_xy_m), level):
+    for chosen in group_by_tile(level.grid.px_from_xy(frames.centre_xy_m), level):
         pool.hold(boxes[chosen])
         sample_tiles(pool.tiles, ground, chosen, out)
     stats = out.stats
@@ -117,7 +117,9 @@ def _place(name: str, names: Sequence[str]) -> int:
     return names.index(name) if name in names else -1
 
 
-def _boxes(pixels: NDArray[np.float64], patch_px: int, chords: NDArray[np.float64], points: int) -> NDArray[np.int64]:
+def _compute_boxes(
+    pixels: NDArray[np.float64], patch_px: int, chords: NDArray[np.float64], points: int
+) -> NDArray[np.int64]:
     """Return the map pixels that each patch and its chord touch: first row and column, last row and column (exclusive), (N, 4)."""
     first, along, down = pixels[:, :2], pixels[:, 2:4] * (patch_px - 1), pixels[:, 4:6] * (patch_px - 1)
     begin, end = chords[:, :2], chords[:, :2] + chords[:, 2:] * (points - 1)

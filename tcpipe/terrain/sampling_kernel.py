@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.compiled import kernel
+from tcpipe.compiled import compile_kernel
 
 RUN_PX = 16
 """Pixels copied at once; windows are a multiple of it wide."""
@@ -83,7 +83,7 @@ class _Near(NamedTuple):
     classes: NDArray[np.uint8]
 
 
-@kernel
+@compile_kernel
 def sample_tiles(tiles: Tiles, ground: Ground, chosen: NDArray[np.int64], out: Stacks) -> None:
     """Sample patches from tiles that are in memory; ``chosen`` are those rows of ``ground`` and ``out``, shape (n,)."""
     side = out.relative.shape[1]
@@ -91,7 +91,7 @@ def sample_tiles(tiles: Tiles, ground: Ground, chosen: NDArray[np.int64], out: S
     most = 0
     for n in chosen:
         box = ground.boxes[n]
-        most = max(most, (box[2] - box[0] + 2) * _width(box) + 2 * RUN_PX)
+        most = max(most, (box[2] - box[0] + 2) * _compute_width(box) + 2 * RUN_PX)
     near = _Near(
         np.zeros(most, np.float32),
         np.zeros(len(out.floats) * most, np.float32),
@@ -106,11 +106,11 @@ def sample_tiles(tiles: Tiles, ground: Ground, chosen: NDArray[np.int64], out: S
     votes = np.zeros(256, np.int64)
     for n in chosen:
         box, frame = ground.boxes[n], ground.frames[n]
-        width, rows = _width(box), box[2] - box[0]
+        width, rows = _compute_width(box), box[2] - box[0]
         heights = out.relative[n].reshape(-1)
         middle_x = np.int64(np.floor(frame[0] + 0.5 * (side - 1) * (frame[2] + frame[4])))
         middle_y = np.int64(np.floor(frame[1] + 0.5 * (side - 1) * (frame[3] + frame[5])))
-        reference = _height_at(tiles, middle_y, middle_x)
+        reference = _read_height(tiles, middle_y, middle_x)
         _copy_near(tiles, box, near)
         _lower(near.relative[: rows * width], reference)
         whole = _is_known(near.relative[: rows * width]) and _is_whole(near, rows * width)
@@ -141,14 +141,14 @@ def sample_tiles(tiles: Tiles, ground: Ground, chosen: NDArray[np.int64], out: S
             _fill_gaps(rise, good)
         lowest, clipped = _store_height(rise, ground.step_m, heights)
         if count == whole_patch:
-            along, left = _slopes(rise, side)
+            along, left = _fit_slopes(rise, side)
         else:
-            along, left = _good_slopes(rise, good, side)
+            along, left = _fit_good_slopes(rise, good, side)
             _clear(out, n, good)
         entry, share = np.int64(0), 0.0
         if ground.classed >= 0:
             under = near.classes[ground.classed * most :]
-            entry, share = _class_under(under, width, box, ground.chords[n], ground.chord_points, votes)
+            entry, share = _find_class_under(under, width, box, ground.chords[n], ground.chord_points, votes)
         stats = out.stats[n]
         stats[0] = np.float64(reference) + np.float64(lowest)
         stats[1], stats[2] = np.arctan(along / ground.pitch_m), np.arctan(left / ground.pitch_m)
@@ -156,44 +156,44 @@ def sample_tiles(tiles: Tiles, ground: Ground, chosen: NDArray[np.int64], out: S
         stats[5], stats[6] = entry, share
 
 
-@kernel
-def _width(box: NDArray[np.int64]) -> int:
+@compile_kernel
+def _compute_width(box: NDArray[np.int64]) -> int:
     return int((box[3] - box[1] + RUN_PX - 1) // RUN_PX * RUN_PX)
 
 
-@kernel
-def _slot(slots: NDArray[np.int32], i: int, j: int) -> int:
+@compile_kernel
+def _find_slot(slots: NDArray[np.int32], i: int, j: int) -> int:
     return slots[i, j] if 0 <= i < slots.shape[0] and 0 <= j < slots.shape[1] else -1
 
 
-@kernel
-def _height_at(tiles: Tiles, row: int, col: int) -> np.float32:
+@compile_kernel
+def _read_height(tiles: Tiles, row: int, col: int) -> np.float32:
     """Return a pixel's height; 0 where it has none."""
     i, j = row // tiles.rows, col // tiles.cols
-    slot = _slot(tiles.slots, i, j)
+    slot = _find_slot(tiles.slots, i, j)
     if slot < 0:
         return np.float32(0.0)
     found = tiles.relative[(slot * tiles.rows + row - i * tiles.rows) * tiles.cols + col - j * tiles.cols]
     return found if np.isfinite(found) else np.float32(0.0)
 
 
-@kernel
+@compile_kernel
 def _copy_near(tiles: Tiles, box: NDArray[np.int64], near: _Near) -> None:
     """Copy a box of the map from one or more tiles, row by row; what a run carries too far, the next one overwrites."""
     heights, floats, greys, classes, slots, high, wide = (
         tiles  # taken out once: a field costs a reference count each time
     )
     near_heights, near_floats, near_greys, near_classes = near
-    width, size, most = _width(box), heights.size, near_heights.size
+    width, size, most = _compute_width(box), heights.size, near_heights.size
     float_count, grey_count, class_count = near_floats.size // most, near_greys.size // most, near_classes.size // most
     first_j, last_j = box[1] // wide, (box[3] - 1) // wide
     for i in range(box[0] // high, (box[2] - 1) // high + 1):
         for row in range(max(box[0], i * high), min(box[2], (i + 1) * high)):
             for j in range(first_j, last_j + 1):
                 begin, end = max(box[1], j * wide), min(box[3], (j + 1) * wide)
-                there, slot = (row - box[0]) * width + begin - box[1], _slot(slots, i, j)
+                there, slot = (row - box[0]) * width + begin - box[1], _find_slot(slots, i, j)
                 if slot < 0:
-                    _blank(near, there, there + end - begin)
+                    _fill_blank(near, there, there + end - begin)
                     continue
                 here = (slot * high + row - i * high) * wide + begin - j * wide
                 _copy_run(heights, here, near_heights, there, end - begin)
@@ -205,7 +205,7 @@ def _copy_near(tiles: Tiles, box: NDArray[np.int64], near: _Near) -> None:
                     _copy_run(classes, k * size + here, near_classes, k * most + there, end - begin)
 
 
-@kernel
+@compile_kernel
 def _copy_run(source: NDArray[Any], here: int, near: NDArray[Any], there: int, count: int) -> None:
     run, begin, place = np.uint64(RUN_PX), np.uint64(here), np.uint64(there)
     if here + count + RUN_PX > source.size:  # the last pixels of all
@@ -217,8 +217,8 @@ def _copy_run(source: NDArray[Any], here: int, near: NDArray[Any], there: int, c
             near[place + j * run + k] = source[begin + j * run + k]
 
 
-@kernel
-def _blank(near: _Near, first: int, last: int) -> None:
+@compile_kernel
+def _fill_blank(near: _Near, first: int, last: int) -> None:
     """Leave a stretch of the window without data."""
     most = near.relative.size
     near.relative[first:last] = np.nan
@@ -230,27 +230,27 @@ def _blank(near: _Near, first: int, last: int) -> None:
         near.classes[k * most + first : k * most + last] = 0
 
 
-@kernel
+@compile_kernel
 def _lower(near: NDArray[np.float32], reference: np.float32) -> None:
     """Take heights above a reference."""
     for k in range(near.size):
         near[k] -= reference
 
 
-@kernel
+@compile_kernel
 def _is_whole(near: _Near, count: int) -> bool:
     """Tell whether no pixel of the window lacks data of any other layer."""
     most, whole = near.relative.size, True
     for first in range(0, near.floats.size, most):
         whole &= _is_known(near.floats[first : first + count])
     for first in range(0, near.greys.size, most):
-        whole &= _least(near.greys[first : first + count]) > 0
+        whole &= _find_least(near.greys[first : first + count]) > 0
     for first in range(0, near.classes.size, most):
-        whole &= _least(near.classes[first : first + count]) > 0
+        whole &= _find_least(near.classes[first : first + count]) > 0
     return whole
 
 
-@kernel
+@compile_kernel
 def _is_known(values: NDArray[np.float32]) -> bool:
     broken = np.uint32(0)
     for k in range(values.size):
@@ -258,15 +258,15 @@ def _is_known(values: NDArray[np.float32]) -> bool:
     return bool(broken == 0)
 
 
-@kernel
-def _least(values: NDArray[np.uint8]) -> np.uint8:
+@compile_kernel
+def _find_least(values: NDArray[np.uint8]) -> np.uint8:
     least = np.uint8(255)
     for k in range(values.size):
         least = min(least, values[k])
     return least
 
 
-@kernel
+@compile_kernel
 def _pack_taps(near: NDArray[np.uint8], width: int, rows: int, taps: NDArray[np.uint32]) -> None:
     """Put each pixel and its right, lower and lower right neighbours into one word, from the lowest byte up."""
     one, run, stride = np.uint64(1), np.uint64(RUN_PX), np.uint64(width)
@@ -279,7 +279,7 @@ def _pack_taps(near: NDArray[np.uint8], width: int, rows: int, taps: NDArray[np.
             taps[i] = upper | lower
 
 
-@kernel
+@compile_kernel
 def _find_positions(
     width: int,
     box: NDArray[np.int64],
@@ -302,7 +302,7 @@ def _find_positions(
             at[first + c] = np.uint32(iy) * stride + np.uint32(ix)
 
 
-@kernel
+@compile_kernel
 def _sample_floats(
     near: NDArray[np.float32],
     width: int,
@@ -321,7 +321,7 @@ def _sample_floats(
         rise[k] = upper + fy[k] * (lower - upper)
 
 
-@kernel
+@compile_kernel
 def _sample_greys(
     taps: NDArray[np.uint32],
     at: NDArray[np.uint32],
@@ -339,7 +339,7 @@ def _sample_greys(
         out[k] = np.uint8(np.int32(upper + fy[k] * (lower - upper) + half))
 
 
-@kernel
+@compile_kernel
 def _sample_classes(
     taps: NDArray[np.uint32],
     at: NDArray[np.uint32],
@@ -353,14 +353,14 @@ def _sample_classes(
         out[k] = np.uint8(np.int32(taps[np.uint64(at[k])] >> shift & byte))
 
 
-@kernel
+@compile_kernel
 def _mark_known(values: NDArray[np.float32], good: NDArray[np.uint8]) -> None:
     """Leave good what is not NaN: no tap lacked data."""
     for k in range(values.size):
         good[k] &= np.uint8(values[k] == values[k])
 
 
-@kernel
+@compile_kernel
 def _mark_tapped(taps: NDArray[np.uint32], at: NDArray[np.uint32], good: NDArray[np.uint8]) -> None:
     """Leave good what has data in all four taps."""
     b8, b16, b24, byte = np.uint32(8), np.uint32(16), np.uint32(24), np.uint32(255)
@@ -370,14 +370,14 @@ def _mark_tapped(taps: NDArray[np.uint32], at: NDArray[np.uint32], good: NDArray
         good[k] &= np.uint8(whole)
 
 
-@kernel
+@compile_kernel
 def _mark_classed(classes: NDArray[np.uint8], good: NDArray[np.uint8]) -> None:
     """Leave good what has a class."""
     for k in range(classes.size):
         good[k] &= np.uint8(classes[k] != 0)
 
 
-@kernel
+@compile_kernel
 def _store_height(rise: NDArray[np.float32], step_m: float, out: NDArray[np.uint16]) -> tuple[np.float32, int]:
     """Store heights of a whole patch in steps above the smallest; return that, and how many lie more than a metre above it."""
     lanes = np.full(RUN_PX, np.inf, np.float32)
@@ -399,7 +399,7 @@ def _store_height(rise: NDArray[np.float32], step_m: float, out: NDArray[np.uint
     return lowest, int(np.int64(clipped))
 
 
-@kernel
+@compile_kernel
 def _fill_gaps(rise: NDArray[np.float32], good: NDArray[np.uint8]) -> None:
     """Set heights without data to the smallest that has some, 0 where none has: it stays the smallest, and none of them is high."""
     lowest = np.float32(np.inf)
@@ -412,7 +412,7 @@ def _fill_gaps(rise: NDArray[np.float32], good: NDArray[np.uint8]) -> None:
             rise[k] = lowest
 
 
-@kernel
+@compile_kernel
 def _clear(out: Stacks, n: int, good: NDArray[np.uint8]) -> None:
     """Take the data of a patch where any layer lacks it."""
     for k in range(good.size):
@@ -424,8 +424,8 @@ def _clear(out: Stacks, n: int, good: NDArray[np.uint8]) -> None:
             out.classes[:, n, row, col] = 0
 
 
-@kernel
-def _slopes(rise: NDArray[np.float32], side: int) -> tuple[float, float]:
+@compile_kernel
+def _fit_slopes(rise: NDArray[np.float32], side: int) -> tuple[float, float]:
     """Return the fitted plane's rise for one pixel along and one to the left: weighted sums, since the grid is symmetric."""
     of_column = np.zeros(side, np.float32)
     left_of_column = np.zeros(side, np.float32)
@@ -444,9 +444,9 @@ def _slopes(rise: NDArray[np.float32], side: int) -> tuple[float, float]:
     return along / weight, across / weight
 
 
-@kernel
-def _good_slopes(rise: NDArray[np.float32], good: NDArray[np.uint8], side: int) -> tuple[float, float]:
-    """Return what `_slopes` does, of good pixels alone; 0 where they do not span a plane."""
+@compile_kernel
+def _fit_good_slopes(rise: NDArray[np.float32], good: NDArray[np.uint8], side: int) -> tuple[float, float]:
+    """Return what `_fit_slopes` does, of good pixels alone; 0 where they do not span a plane."""
     middle = 0.5 * (side - 1)
     count = su = sv = suu = suv = svv = sh = suh = svh = 0.0
     for r in range(side):
@@ -471,8 +471,8 @@ def _good_slopes(rise: NDArray[np.float32], good: NDArray[np.uint8], side: int) 
     return (suh * svv - svh * suv) / determinant, (svh * suu - suh * suv) / determinant
 
 
-@kernel
-def _class_under(
+@compile_kernel
+def _find_class_under(
     near: NDArray[np.uint8],
     width: int,
     box: NDArray[np.int64],
@@ -500,8 +500,8 @@ def _class_under(
     return best, share
 
 
-@kernel
-def morton(x: NDArray[np.int64], y: NDArray[np.int64]) -> NDArray[np.int64]:
+@compile_kernel
+def compute_morton(x: NDArray[np.int64], y: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return positions on the Z-order curve of non-negative integer cells, shape (N,): neighbours stay near."""
     code = np.empty(x.size, np.int64)
     for n in range(x.size):

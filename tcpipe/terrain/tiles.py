@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 
 from tcpipe.terrain.classes import ClassTable
 from tcpipe.terrain.grid import MapGrid
-from tcpipe.terrain.layers import STACKS, Layer, Stack, missing, stacked
-from tcpipe.terrain.overviews import factor_for
-from tcpipe.terrain.projection import Projection, area_of, parse_crs
-from tcpipe.terrain.sampling_kernel import Tiles, morton
+from tcpipe.terrain.layers import STACKS, Layer, Stack, find_no_data_value, group_stacks
+from tcpipe.terrain.overviews import choose_factor
+from tcpipe.terrain.projection import Projection, compute_area, parse_crs
+from tcpipe.terrain.sampling_kernel import Tiles, compute_morton
 
 CACHED_TILES = 96
 """Decoded tiles kept: 150 MB of three layers at 512 px."""
@@ -73,17 +73,17 @@ class MapReader(Protocol):
 
 def level_for(source: MapReader, pitch_m: float) -> MapReader:
     """Return the map's level whose pixels are nearest below ``pitch_m`` [m]: coarse enough not to alias, fine enough to show all."""
-    factor = factor_for(source.factors, source.grid.pitch_m, pitch_m)
+    factor = choose_factor(source.factors, source.grid.pitch_m, pitch_m)
     return source if factor == 1 else source.at(factor)
 
 
-def projection_to(source: MapReader, gnss_crs: str) -> Projection:
+def find_map_projection(source: MapReader, gnss_crs: str) -> Projection:
     """Return the operation from the longitudes and latitudes of a geographic CRS to the map's CRS; `MapError` where one of them is none."""
     crs = parse_crs(source.grid.crs, where=f"map {source.name}")
-    return Projection(parse_crs(gnss_crs, where="gnss_crs"), crs, area_of(crs, source.grid.bounds_m))
+    return Projection(parse_crs(gnss_crs, where="gnss_crs"), crs, compute_area(crs, source.grid.bounds_m))
 
 
-def groups_by_tile(px: NDArray[np.float64], source: MapReader) -> Iterator[NDArray[np.int64]]:
+def group_by_tile(px: NDArray[np.float64], source: MapReader) -> Iterator[NDArray[np.int64]]:
     """Yield the indices of pixel positions, shape (N, 2), by tile; within a tile in Z-order.
 
     Tiles come row by row inside strips narrow enough that a tile is still held when the rows above and below want it.
@@ -91,7 +91,7 @@ def groups_by_tile(px: NDArray[np.float64], source: MapReader) -> Iterator[NDArr
     limit = np.array([source.grid.cols - 1, source.grid.rows - 1])
     cells = np.clip(np.floor(px), 0, limit).astype(np.int64)
     tile_j, tile_i = (cells // source.tile_px).T
-    fine = morton(cells[:, 0] % source.tile_px, cells[:, 1] % source.tile_px)
+    fine = compute_morton(cells[:, 0] % source.tile_px, cells[:, 1] % source.tile_px)
     order = np.lexsort((np.arange(len(px)), fine, tile_j, tile_i, tile_j // _STRIP_TILES))
     changed = (np.diff(tile_i[order]) != 0) | (np.diff(tile_j[order]) != 0)
     yield from (group for group in np.split(order, np.flatnonzero(changed) + 1) if group.size)
@@ -102,7 +102,7 @@ def read_window(  # noqa: PLR0917
 ) -> NDArray[Any]:
     """Return a window of a layer that may reach beyond the map, where it holds no data."""
     dtype = source.layers[layer].mapped
-    out: NDArray[Any] = np.full((row1 - row0, col1 - col0), missing(dtype), dtype)
+    out: NDArray[Any] = np.full((row1 - row0, col1 - col0), find_no_data_value(dtype), dtype)
     top, bottom = max(row0, 0), min(row1, source.grid.rows)
     left, right = max(col0, 0), min(col1, source.grid.cols)
     if top < bottom and left < right:
@@ -121,7 +121,7 @@ class TilePool:
     def __init__(self, source: MapReader) -> None:
         grid, side = source.grid, source.tile_px
         self._map = source
-        self._stacks = stacked(source.layers)
+        self._stacks = group_stacks(source.layers)
         self.slots: NDArray[np.int32] = np.full((-(-grid.rows // side), -(-grid.cols // side)), -1, np.int32)
         """Which of the held tiles is the one in row i and column j; -1 where it is not held."""
         self.tile_shape = (side, side) if self.slots.size > 1 else (grid.rows, grid.cols)
@@ -142,12 +142,12 @@ class TilePool:
 
     def expect(self, boxes: NDArray[np.int64]) -> None:
         """Have the tiles at hand that any of the boxes touches, as `hold` has them: it is called for parts of them soon."""
-        touched = _touched(boxes, self._map.tile_px, self.slots.shape)
+        touched = _list_touched(boxes, self._map.tile_px, self.slots.shape)
         self._map.expect([tile for tile in touched if tile not in self._held])
 
     def hold(self, boxes: NDArray[np.int64]) -> None:
         """Make the tiles available that any of the boxes touches (first row and column, last row and column exclusive; (N, 4))."""
-        wanted = _touched(boxes, self._map.tile_px, self.slots.shape)
+        wanted = _list_touched(boxes, self._map.tile_px, self.slots.shape)
         absent = [tile for tile in wanted if tile not in self._held]
         for tile in wanted:
             if tile in self._held:
@@ -190,7 +190,7 @@ class TilePool:
                     place[:] = whole
 
 
-def _touched(boxes: NDArray[np.int64], side: int, shape: tuple[int, int]) -> list[tuple[int, int]]:
+def _list_touched(boxes: NDArray[np.int64], side: int, shape: tuple[int, int]) -> list[tuple[int, int]]:
     """Return the tiles of the map that boxes touch, row by row."""
     first, last = boxes[:, :2] // side, (boxes[:, 2:] - 1) // side
     rows, cols = (last - first + 1).max(axis=0, initial=0).tolist()

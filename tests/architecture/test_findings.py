@@ -4,8 +4,8 @@ import ast
 from pathlib import Path
 
 from tcpipe.formats.finding_lines import describe_finding
-from tcpipe.tables.bits import Quality, name_of
-from tcpipe.tables.catalogue import AFFECTED, SEVERITIES, catalogue_sections, read_catalogue
+from tcpipe.tables.bits import Quality, flag_name
+from tcpipe.tables.catalogue import AFFECTED, SEVERITIES, read_catalogue, read_sections
 from tcpipe.tables.findings import Finding, Subject
 
 ROOT = Path(__file__).parents[2]
@@ -118,14 +118,14 @@ def test_every_remedy_of_the_catalogue_is_used():
 
 
 def test_entries_are_whole():
-    bits = {name_of(bit) for bit in Quality}
+    bits = {flag_name(bit) for bit in Quality}
     for code, entry in read_catalogue().items():
         assert not entry.flag or entry.flag in bits, code
         assert entry.severity in SEVERITIES, code
         assert set(entry.affects) <= set(AFFECTED), code
         assert entry.title, code
         assert entry.cause, code
-    assert [code for codes in catalogue_sections().values() for code in codes] == list(read_catalogue())
+    assert [code for codes in read_sections().values() for code in codes] == list(read_catalogue())
 
 
 def test_every_line_is_short_with_typical_values():

@@ -22,7 +22,7 @@ from rasterio.windows import from_bounds
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.ingest import ingest
 from tcpipe.pipeline.maps import add_map
-from tcpipe.simulation import simulate, tiny
+from tcpipe.simulation import make_tiny, simulate
 from tcpipe.simulation.sensors import Imu, Sensors, Visual, Wheels
 
 ROOT = Path("/tmp/tcpipe-kept")  # noqa: S108  stands in the records of the store
@@ -51,7 +51,7 @@ def main(out: Path) -> None:
     slow = Sensors(
         imu=replace(Imu(), rate_hz=50.0), wheels=replace(Wheels(), rate_hz=20.0), visual=replace(Visual(), rate_hz=15.0)
     )
-    site = simulate(ROOT / "site", scenario=tiny(sensors=slow))
+    site = simulate(ROOT / "site", scenario=make_tiny(sensors=slow))
     with rasterio.open(site.rasters["height"]) as raster:
         origin = raster.bounds.left, raster.bounds.bottom
     for name in ("height", "ortho", "terrain"):

@@ -15,11 +15,11 @@ from tcpipe.errors import FusionError, RoleError
 from tcpipe.formats.logs.log_file import open_log
 from tcpipe.formats.logs.writing import MessageStream, write_mcap
 from tcpipe.formats.recipe_toml import parse_recipe
-from tcpipe.formats.robot_files import shipped_profiles
+from tcpipe.formats.robot_files import load_shipped_profiles
 from tcpipe.pipeline.preflight import preflight
 from tcpipe.pipeline.run_stages import run_stages
 from tcpipe.recipe import FuseConfig, ReadConfig, Recipe
-from tcpipe.simulation import Truth, true_cost
+from tcpipe.simulation import Truth, compute_true_cost
 from tcpipe.simulation.route import Pause
 from tcpipe.stages.read import read_run
 from tcpipe.tables.findings import Finding, select_findings
@@ -34,7 +34,7 @@ def drive() -> Drive:
 def read(drive: Drive, out: Path, config: ReadConfig | None = None) -> Streams:
     write_mcap(out / "run.mcap", drive.messages)
     with open_log(out / "run.mcap") as log:
-        return read_run(log, config or ReadConfig(), robot=None, known=shipped_profiles())
+        return read_run(log, config or ReadConfig(), robot=None, known=load_shipped_profiles())
 
 
 def run(
@@ -71,7 +71,7 @@ def assert_labels_hold(labelled: LabelledSegments, truth: Truth, *, at_least: in
     assert table.num_rows >= at_least
     if table.num_rows == 0:
         return
-    wanted = true_cost(truth, table["start_ns"].to_numpy())
+    wanted = compute_true_cost(truth, table["start_ns"].to_numpy())
     for name, unit in (("duration", "s"), ("energy", "joule")):
         got, std = (table[column].to_numpy() for column in (f"{name}_{unit}", f"{name}_std_{unit}"))
         off = got - getattr(wanted, f"{name}_{unit}")

@@ -23,7 +23,7 @@ from mcap.writer import Writer
 from stored_files import only_run, tables
 
 from tcpipe.formats.logs.writing import MessageStream, write_mcap
-from tcpipe.simulation import Faults, SimulatedSite, simulate, tiny
+from tcpipe.simulation import Faults, SimulatedSite, make_tiny, simulate
 from tcpipe.store import Store, open_store
 
 _SECONDS = (32.0, 17.0, 17.0)
@@ -34,7 +34,7 @@ def sites(tmp_path_factory: pytest.TempPathFactory) -> list[SimulatedSite]:
     """Three short drives over one small world; the first is long enough for some segments."""
     here = tmp_path_factory.mktemp("sites")
     return [
-        simulate(here / str(seed), scenario=tiny(Faults(), seconds=seconds), seed=seed)
+        simulate(here / str(seed), scenario=make_tiny(Faults(), seconds=seconds), seed=seed)
         for seed, seconds in enumerate(_SECONDS)
     ]
 
@@ -260,7 +260,7 @@ def test_nobody_listening_is_no_reason_to_stop(logs: list[Path], tmp_path: Path)
 
 
 def test_debug_shows_where_an_error_comes_from_inside_workers_too(logs: list[Path], tmp_path: Path) -> None:
-    broken = "import tcpipe.stages.gate as gate\ndef broken(*_, **__): raise ZeroDivisionError('boom')\n"
+    broken = "import tcpipe.stages.mask as gate\ndef broken(*_, **__): raise ZeroDivisionError('boom')\n"
     env = _patched(tmp_path, f"{broken}gate.gate_track = broken\n")
     shown = tcpipe("--debug", "ingest", *logs[1:], "--jobs", "2", cwd=tmp_path, env=env)
     assert shown.returncode == 1
@@ -480,7 +480,7 @@ def test_a_batch_that_is_ended_goes_on_where_it_was(number: signal.Signals, logs
 
 
 def test_a_worker_that_is_killed_costs_only_its_own_log(logs: list[Path], tmp_path: Path) -> None:
-    kill = "import os, tcpipe.stages.gate as gate\nfirst = gate.gate_track\n"
+    kill = "import os, tcpipe.stages.mask as gate\nfirst = gate.gate_track\n"
     kill += "def killing(track, *a, **k):\n    if 'run1' in track.info.run_id: os.kill(os.getpid(), 9)\n"
     env = _patched(tmp_path, f"{kill}    return first(track, *a, **k)\ngate.gate_track = killing\n")
     done = tcpipe("ingest", *logs, "--jobs", "2", cwd=tmp_path, env=env)

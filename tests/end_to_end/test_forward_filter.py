@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from tcpipe.formats.logs.log_file import open_log
-from tcpipe.formats.robot_files import shipped_profiles
+from tcpipe.formats.robot_files import load_shipped_profiles
 from tcpipe.geometry.angles import wrap_to_pi
 from tcpipe.geometry.rotation import rpy_from_quat
 from tcpipe.recipe import FuseConfig, ReadConfig
-from tcpipe.simulation import Faults, read_truth, simulate, tiny
+from tcpipe.simulation import Faults, make_tiny, read_truth, simulate
 from tcpipe.stages.fuse import fuse_run
 from tcpipe.stages.read import read_run
 
@@ -18,9 +18,9 @@ SETTLED_NS = 8_000_000_000
 @pytest.fixture(scope="module", params=["no faults", "every fault"])
 def drive(request, tmp_path_factory):
     faults = Faults() if request.param == "no faults" else Faults.every()
-    site = simulate(tmp_path_factory.mktemp("site"), scenario=tiny(faults, seconds=60.0), seed=5)
+    site = simulate(tmp_path_factory.mktemp("site"), scenario=make_tiny(faults, seconds=60.0), seed=5)
     with open_log(site.logs[0]) as log:
-        streams = read_run(log, ReadConfig(), robot=None, known=shipped_profiles())
+        streams = read_run(log, ReadConfig(), robot=None, known=load_shipped_profiles())
     return streams, read_truth(site.truths[0])
 
 

@@ -5,21 +5,21 @@ import pytest
 from shared_data import shared_data
 
 from tcpipe.formats.logs.log_file import open_log
-from tcpipe.formats.robot_files import shipped_profiles
+from tcpipe.formats.robot_files import load_shipped_profiles
 from tcpipe.recipe import FuseConfig, Placement, ReadConfig
 from tcpipe.stages.fuse import fuse_run
 from tcpipe.stages.read import read_run
-from tcpipe.tables.columns import floats, integers
+from tcpipe.tables.columns import to_floats, to_integers
 
 
 def fused(name, config=None):
     with open_log(shared_data(name)) as log:
-        streams = read_run(log, config or ReadConfig(), robot=None, known=shipped_profiles())
+        streams = read_run(log, config or ReadConfig(), robot=None, known=load_shipped_profiles())
     return streams, fuse_run(streams, FuseConfig(), run_id="run")
 
 
 def path_m(table):
-    return float(np.hypot(np.diff(floats(table, "x_m")), np.diff(floats(table, "y_m"))).sum())
+    return float(np.hypot(np.diff(to_floats(table, "x_m")), np.diff(to_floats(table, "y_m"))).sum())
 
 
 def test_warthog_on_grass_follows_fixes_that_come_late():
@@ -27,7 +27,7 @@ def test_warthog_on_grass_follows_fixes_that_come_late():
     table = track.table
     # reference.json: the path by ICP is 83.1 m, by the wheels 83.5 m.
     assert path_m(table) == pytest.approx(83.1, rel=0.03)
-    watt, time_s = floats(table, "power_watt"), integers(table, "stamp_ns") * 1e-9
+    watt, time_s = to_floats(table, "power_watt"), to_integers(table, "stamp_ns") * 1e-9
     measured = np.isfinite(
         watt
     )  # both drives are read at 1 Hz: what lies before the first reading and after the last is not known
@@ -37,7 +37,7 @@ def test_warthog_on_grass_follows_fixes_that_come_late():
     assert "stamp-jitter" in {of.code for of in track.info.report.findings}
     assert track.info.report.facts.fuse.rejected["gnss"] < 0.1 * streams.tables["gnss"].num_rows
     # It ends where it was fixed last, having stood there.
-    assert floats(table, "forward_velocity_mps")[-20:] == pytest.approx(np.zeros(20), abs=0.02)
+    assert to_floats(table, "forward_velocity_mps")[-20:] == pytest.approx(np.zeros(20), abs=0.02)
 
 
 def test_husky_with_an_imu_mounted_on_its_side_and_sbas():
@@ -45,22 +45,24 @@ def test_husky_with_an_imu_mounted_on_its_side_and_sbas():
     streams, track = fused("robot_localization/test1.bag", ReadConfig(placement={"imu": mounting}))
     table = track.table
     gnss = streams.tables["gnss"]
-    stamp = integers(table, "stamp_ns")
+    stamp = to_integers(table, "stamp_ns")
     for name, metres in (
         ("lat_deg", 111_200.0),
-        ("lon_deg", 111_200.0 * np.cos(np.radians(floats(gnss, "lat_deg")[0]))),
+        ("lon_deg", 111_200.0 * np.cos(np.radians(to_floats(gnss, "lat_deg")[0]))),
     ):
-        error_m = metres * (np.interp(integers(gnss, "stamp_ns"), stamp, floats(table, name)) - floats(gnss, name))
+        error_m = metres * (
+            np.interp(to_integers(gnss, "stamp_ns"), stamp, to_floats(table, name)) - to_floats(gnss, name)
+        )
         std_m = np.interp(
-            integers(gnss, "stamp_ns"), stamp, floats(table, "y_std_m" if name == "lat_deg" else "x_std_m")
+            to_integers(gnss, "stamp_ns"), stamp, to_floats(table, "y_std_m" if name == "lat_deg" else "x_std_m")
         )
         # These fixes claim 0.9 m, which wanders, and jump by 5 m: the track follows neither, and says so.
         assert np.median(np.abs(error_m) / np.hypot(0.9, std_m)) < 1.0
         assert np.median(np.abs(error_m)) < 1.5
-    assert np.abs(floats(table, "roll_rad")).max() < 0.15  # a flat campus
-    assert np.abs(floats(table, "pitch_rad")).max() < 0.15
-    moving = floats(table, "wheel_velocity_mps") > 0.5
-    assert np.median(floats(table, "forward_velocity_mps")[moving]) == pytest.approx(0.98, abs=0.1)
+    assert np.abs(to_floats(table, "roll_rad")).max() < 0.15  # a flat campus
+    assert np.abs(to_floats(table, "pitch_rad")).max() < 0.15
+    moving = to_floats(table, "wheel_velocity_mps") > 0.5
+    assert np.median(to_floats(table, "forward_velocity_mps")[moving]) == pytest.approx(0.98, abs=0.1)
     assert track.info.report.facts.fuse.stretches[0].heading_from == "course over ground"
 
 
@@ -69,14 +71,14 @@ def test_logs_without_gnss_give_a_local_track(name):
     _, track = fused(name)
     assert track.info.datum is None
     assert track.table.num_rows > 1000
-    assert np.isfinite(floats(track.table, "x_m")).all()
+    assert np.isfinite(to_floats(track.table, "x_m")).all()
     assert "no-gnss" in {of.code for of in track.info.report.findings}
 
 
 def test_a_metre_of_the_wheels_stays_one_where_nothing_else_tells_it():
     streams, track = fused("robot_localization/test2.bag")
     wheels = streams.tables["wheel_odometry"]
-    own_m = np.sum(np.abs(floats(wheels, "velocity_x_mps")[1:]) * np.diff(integers(wheels, "stamp_ns")) * 1e-9)
+    own_m = np.sum(np.abs(to_floats(wheels, "velocity_x_mps")[1:]) * np.diff(to_integers(wheels, "stamp_ns")) * 1e-9)
     assert path_m(track.table) == pytest.approx(own_m, rel=0.02)  # an accelerometer had made half of it
-    assert np.isnan(floats(wheels, "velocity_y_mps")).all()
+    assert np.isnan(to_floats(wheels, "velocity_y_mps")).all()
     assert "odometry-scale-unobservable" in {of.code for of in track.info.report.findings}

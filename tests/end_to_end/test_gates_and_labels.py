@@ -6,27 +6,27 @@ import numpy as np
 import pytest
 
 from tcpipe.formats.logs.log_file import open_log
-from tcpipe.formats.robot_files import shipped_profiles
+from tcpipe.formats.robot_files import load_shipped_profiles
 from tcpipe.geometry.rotation import rpy_from_quat
 from tcpipe.recipe import FuseConfig, GateConfig, LabelConfig, ReadConfig, SegmentConfig
-from tcpipe.simulation import Faults, read_truth, scenario, simulate, tiny, true_cost
+from tcpipe.simulation import Faults, compute_true_cost, find_scenario, make_tiny, read_truth, simulate
 from tcpipe.simulation.messages import Recorder
 from tcpipe.simulation.robot import SimulatedRobot
 from tcpipe.simulation.sensors import Imu, Wheels
 from tcpipe.stages.fuse import fuse_run
-from tcpipe.stages.gate import gate_track
 from tcpipe.stages.label import label_segments
+from tcpipe.stages.mask import mask_track
 from tcpipe.stages.read import read_run
 from tcpipe.stages.segment import segment_track
 from tcpipe.tables.bits import DropReason
-from tcpipe.tables.columns import floats, integers
+from tcpipe.tables.columns import to_floats, to_integers
 
 
 def run(site, *, config=None):
     with open_log(site.logs[0]) as log:
-        streams = read_run(log, ReadConfig(), robot="husky", known=shipped_profiles())
+        streams = read_run(log, ReadConfig(), robot="husky", known=load_shipped_profiles())
     track = fuse_run(streams, FuseConfig(), run_id="run")
-    gated = gate_track(track, config or GateConfig(), max_velocity_mps=1.0, chord_m=1.0)
+    gated = mask_track(track, config or GateConfig(), max_velocity_mps=1.0, chord_m=1.0)
     segments = segment_track(gated, SegmentConfig())
     labelled = label_segments(
         segments,
@@ -41,7 +41,7 @@ def run(site, *, config=None):
 @pytest.fixture(scope="module")
 def manoeuvres(tmp_path_factory):
     """One of each manoeuvre, with noisy, slipping sensors."""
-    plan = scenario("manoeuvres")
+    plan = find_scenario("manoeuvres")
     noisy = Faults(
         gnss_noise=True, imu_noise=True, wheel_noise=True, wheel_slip=True, visual_noise=True, power_noise=True
     )
@@ -50,7 +50,7 @@ def manoeuvres(tmp_path_factory):
 
 
 def row_truth(gated, truth):
-    return truth.at(integers(gated.table, "stamp_ns"))
+    return truth.at(to_integers(gated.table, "stamp_ns"))
 
 
 def dropped(gated, reason):
@@ -93,7 +93,9 @@ def test_no_segment_contains_standing_or_turning_in_place(manoeuvres):
     v, w = np.abs(truth.forward_velocity_mps), np.abs(truth.angular_velocity_radps[:, 2])
     bad = ((v < 0.05) & (w < 0.05)) | ((v < 0.10) & (w > 0.10)) | (v < 0.5 * w) | (truth.forward_velocity_mps < 0)
     sums = np.concatenate(([0], np.cumsum(bad)))
-    first, last = (np.searchsorted(truth.stamp_ns, integers(labelled.table, name)) for name in ("start_ns", "end_ns"))
+    first, last = (
+        np.searchsorted(truth.stamp_ns, to_integers(labelled.table, name)) for name in ("start_ns", "end_ns")
+    )
     assert len(first) > 20
     assert (sums[last] == sums[first]).all()
 
@@ -102,24 +104,24 @@ def test_no_segment_contains_standing_or_turning_in_place(manoeuvres):
 def faulty(request, tmp_path_factory):
     """Four minutes with every sensor fault."""
     recorder = Recorder("ros1" if request.param == "husky_status" else "ros2", request.param)
-    plan = tiny(Faults.every(), recorder=recorder, seconds=240.0)
+    plan = make_tiny(Faults.every(), recorder=recorder, seconds=240.0)
     return run(simulate(tmp_path_factory.mktemp(request.param), scenario=plan, seed=4))
 
 
 def test_labels_are_as_wrong_as_they_say(faulty):
     _, labelled, truth = faulty
-    true = true_cost(truth, integers(labelled.table, "start_ns"))
+    true = compute_true_cost(truth, to_integers(labelled.table, "start_ns"))
     for name in ("duration_s", "velocity_mps", "power_watt", "energy_joule"):
         quantity, unit = name.rsplit("_", 1)
-        error = floats(labelled.table, name) - getattr(true, name)
+        error = to_floats(labelled.table, name) - getattr(true, name)
         assert np.abs(error).sum() < 0.015 * np.abs(getattr(true, name)).sum()
-        normalized = error / floats(labelled.table, f"{quantity}_std_{unit}")
+        normalized = error / to_floats(labelled.table, f"{quantity}_std_{unit}")
         assert len(normalized) > 120
         assert 0.5 < np.sqrt(np.mean(normalized**2)) < 1.5, name
 
 
 def spans(labelled):
-    return tuple(integers(labelled.table, name) for name in ("start_ns", "end_ns"))
+    return tuple(to_integers(labelled.table, name) for name in ("start_ns", "end_ns"))
 
 
 def meant(truth, values, labelled):
@@ -132,19 +134,21 @@ def meant(truth, values, labelled):
 
 def test_what_is_above_standing_is_as_wrong_as_it_says(faulty):
     _, labelled, truth = faulty
-    true, idle = true_cost(truth, spans(labelled)[0]), SimulatedRobot().idle_watt
+    true, idle = compute_true_cost(truth, spans(labelled)[0]), SimulatedRobot().idle_watt
     for name, wanted in (
         ("standing_power_watt", np.full(labelled.table.num_rows, idle)),
         ("power_above_standing_watt", true.power_watt - idle),
         ("energy_above_standing_joule", true.energy_joule - idle * true.duration_s),
     ):
         quantity, unit = name.rsplit("_", 1)
-        normalized = (floats(labelled.table, name) - wanted) / floats(labelled.table, f"{quantity}_std_{unit}")
+        normalized = (to_floats(labelled.table, name) - wanted) / to_floats(labelled.table, f"{quantity}_std_{unit}")
         assert np.sqrt(np.mean(normalized**2)) < 1.5, name
-    assert floats(labelled.table, "standing_power_std_watt").max() < 2.0
-    identity = floats(labelled.table, "power_above_standing_watt") * floats(labelled.table, "duration_s")
-    assert floats(labelled.table, "energy_above_standing_joule") == pytest.approx(identity)
-    assert floats(labelled.table, "voltage_volt") == pytest.approx(meant(truth, truth.voltage_volt, labelled), abs=0.02)
+    assert to_floats(labelled.table, "standing_power_std_watt").max() < 2.0
+    identity = to_floats(labelled.table, "power_above_standing_watt") * to_floats(labelled.table, "duration_s")
+    assert to_floats(labelled.table, "energy_above_standing_joule") == pytest.approx(identity)
+    assert to_floats(labelled.table, "voltage_volt") == pytest.approx(
+        meant(truth, truth.voltage_volt, labelled), abs=0.02
+    )
 
 
 def test_turns_attitude_slip_and_vibration_are_the_robots(faulty):
@@ -163,13 +167,13 @@ def test_turns_attitude_slip_and_vibration_are_the_robots(faulty):
         ("slip_fraction", slip),
     ):
         quantity, unit = name.rsplit("_", 1)
-        normalized = (floats(table, name) - wanted) / floats(table, f"{quantity}_std_{unit}")
+        normalized = (to_floats(table, name) - wanted) / to_floats(table, f"{quantity}_std_{unit}")
         assert 0.5 < np.sqrt(np.mean(normalized**2)) < 1.5, name
     middle_ns = start_ns + (end_ns - start_ns) // 2
     for name, angle in (("roll_rad", roll), ("pitch_rad", pitch)):
-        assert floats(table, name) == pytest.approx(np.interp(middle_ns, truth.stamp_ns, angle), abs=0.006)
+        assert to_floats(table, name) == pytest.approx(np.interp(middle_ns, truth.stamp_ns, angle), abs=0.006)
     # White noise of three axes at 100 Hz, of which the band, half passed at its edges, passes 14.4 of 50 Hz.
     white = np.hypot(Imu().vibration_mps2 * wheel_mps, Imu().accelerometer_std_mps2)
-    ratio = floats(table, "vibration_mps2") / (white * np.sqrt(3 * 14.4 / 50))
+    ratio = to_floats(table, "vibration_mps2") / (white * np.sqrt(3 * 14.4 / 50))
     assert np.median(ratio) == pytest.approx(1.0, abs=0.03)
     assert ratio.std() < 0.12

@@ -17,10 +17,10 @@ from storage_server import object_store
 
 import tcpipe
 from tcpipe.errors import DatasetError, StoreError, UsageError
+from tcpipe.formats.integrity import seal_document, write_sealed
 from tcpipe.formats.json_files import to_json
 from tcpipe.formats.maps.map_files import open_map
 from tcpipe.formats.place import DirectoryPlace
-from tcpipe.formats.seals import sealed, write_sealed
 from tcpipe.pipeline import migrate as migrating
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.explain import explain
@@ -221,7 +221,7 @@ def test_what_is_remembered_becomes_commits(untouched):
         "datasets/1": {"out": "/out", "inputs": "1", "runs": []},
     }
     for name, record in records.items():
-        place.put(f"records/{name}.json", to_json(sealed(record)).encode())
+        place.put(f"records/{name}.json", to_json(seal_document(record)).encode())
     place.put("records/logs/x/y.json", b"damaged")
     found = migrate(store)
     assert (len(found.problems), found.exit_code) == (1, 3)

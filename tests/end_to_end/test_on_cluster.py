@@ -18,7 +18,7 @@ from tcpipe.learning.training import train
 from tcpipe.pipeline.dataset import sampling
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.maps import add_map
-from tcpipe.simulation import Faults, simulate, tiny
+from tcpipe.simulation import Faults, make_tiny, simulate
 
 KILLED = """
 import os, signal, sys
@@ -41,7 +41,7 @@ def _files(directory: Path) -> dict[str, bytes]:
 
 
 def test_a_cluster_makes_the_bytes_that_this_machine_makes(tmp_path, monkeypatch):
-    site = simulate(tmp_path / "site", scenario=tiny(Faults.every()))
+    site = simulate(tmp_path / "site", scenario=make_tiny(Faults.every()))
     logs = [path.relative_to(tmp_path) for path in site.logs]
     assert tcpipe("ingest", *logs, "--store", "here", cwd=tmp_path).returncode == 0
     with dask_cluster(tmp_path, workers=1) as cluster:

@@ -14,10 +14,10 @@ from tcpipe.formats.recipe_toml import load_recipe
 from tcpipe.pipeline.dataset.runs import choose_runs
 from tcpipe.pipeline.ingest import ingest
 from tcpipe.recipe import Recipe
-from tcpipe.simulation import tiny
+from tcpipe.simulation import make_tiny
 from tcpipe.store import Store
 from tcpipe.tables.bits import Quality
-from tcpipe.tables.columns import floats, integers
+from tcpipe.tables.columns import to_floats, to_integers
 
 RECIPE = """
 robot = "scout"
@@ -44,11 +44,11 @@ DEFINITION = f"Bus bus\nfloat64[2] amps\n{'=' * 80}\nMSG: my_msgs/Bus\nfloat64 v
 @pytest.fixture(scope="module")
 def drive(tmp_path_factory):
     """A simulated drive's log, the same power as messages of a type of our own, and the recipe that says what they mean."""
-    directory, scenario = tmp_path_factory.mktemp("own"), tiny()
+    directory, scenario = tmp_path_factory.mktemp("own"), make_tiny()
     log = log_of(scenario, scenario.drives[0], directory / "site")
     streams = streams_of(log)
     table = streams.tables["power"]
-    columns = (integers(table, "stamp_ns"), floats(table, "voltage_volt"), floats(table, "current_amp"))
+    columns = (to_integers(table, "stamp_ns"), to_floats(table, "voltage_volt"), to_floats(table, "current_amp"))
     with (directory / "battery.mcap").open("wb") as out:
         writer = Writer(out)
         writer.start()
@@ -82,7 +82,7 @@ def test_its_energy_is_that_of_the_same_drive_in_known_messages(drive, tmp_path)
     one, other = (segments(tmp_path / "store", result) for result in (known, ours))
     assert one.num_rows == other.num_rows > 5
     assert set(other["robot"].to_pylist()) == {"scout"}
-    np.testing.assert_allclose(floats(other, "energy_joule"), floats(one, "energy_joule"), rtol=1e-12)
+    np.testing.assert_allclose(to_floats(other, "energy_joule"), to_floats(one, "energy_joule"), rtol=1e-12)
     again = ingest([log, battery], store=tmp_path / "store", recipe=recipe, as_one=True).results[0]
     assert again.status == "unchanged"
     assert (

@@ -11,7 +11,7 @@ from tcpipe.pipeline.maps import add_map
 from tcpipe.simulation import Faults, read_truth, simulate
 from tcpipe.simulation.messages import Recorder
 from tcpipe.simulation.route import Leg, Pause
-from tcpipe.simulation.scenarios import DriveSpec, RasterSpec, Scenario, small_world
+from tcpipe.simulation.scenarios import DriveSpec, RasterSpec, Scenario, make_small_world
 from tcpipe.tables.bits import DropReason
 from tcpipe.terrain.classes import PAPER_CLASSES
 
@@ -28,7 +28,7 @@ def site(tmp_path_factory):
     plan = (Pause(2.0), *LAP, *LAP, Pause(1.0))
     drive = DriveSpec("laps", plan, (12.0, 22.0), recorder=Recorder("ros2", "clearpath_power"), faults=Faults())
     region = ((2.0, 2.0), (60.0, 2.0), (60.0, 78.0), (2.0, 78.0))
-    scenario = Scenario("laps", small_world(), (drive,), region, RasterSpec(0.1, 0.12, 0.1))
+    scenario = Scenario("laps", make_small_world(), (drive,), region, RasterSpec(0.1, 0.12, 0.1))
     return simulate(tmp_path_factory.mktemp("laps") / "site", scenario=scenario, seed=2)
 
 

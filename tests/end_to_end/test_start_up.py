@@ -5,7 +5,7 @@ import sys
 
 from simulated_streams import log_of
 
-from tcpipe.simulation import tiny
+from tcpipe.simulation import make_tiny
 
 UNUSED = {
     "pandas", "filterpy", "pydantic", "zarr", "rasterio", "matplotlib", "polars", "pyproj", "shapely", "mcap", "torch", "lightgbm",
@@ -30,7 +30,7 @@ def loaded(tmp_path, jobs, *logs):
 
 
 def test_an_ingest_loads_nothing_that_it_does_not_use(tmp_path):
-    scenario = tiny()
+    scenario = make_tiny()
     assert not loaded(tmp_path, 1, log_of(scenario, scenario.drives[0], tmp_path / "site")) & UNUSED
 
 

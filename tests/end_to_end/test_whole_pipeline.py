@@ -17,7 +17,7 @@ import tcpipe as package
 from tcpipe.formats.stored_runs import RunDirectory
 from tcpipe.geometry.angles import wrap_to_pi
 from tcpipe.geometry.rotation import rpy_from_quat
-from tcpipe.simulation import SimulatedSite, read_truth, scenario, simulate, true_cost
+from tcpipe.simulation import SimulatedSite, compute_true_cost, find_scenario, read_truth, simulate
 from tcpipe.store import Store
 from tcpipe.tables.bits import DropReason
 
@@ -65,7 +65,7 @@ def _share(estimate, truth):
 
 def test_labels_are_those_of_the_true_metre(site: SimulatedSite, run: RunDirectory) -> None:
     segments = run.segments()
-    truth = true_cost(read_truth(site.truths[0]), _column(segments, "start_ns"))
+    truth = compute_true_cost(read_truth(site.truths[0]), _column(segments, "start_ns"))
     assert _share(_column(segments, "energy_joule"), truth.energy_joule) <= 0.006
     assert _share(_column(segments, "velocity_mps"), truth.velocity_mps) <= 0.005
     assert _share(_column(segments, "duration_s"), truth.duration_s) <= 0.005
@@ -130,7 +130,7 @@ def test_every_metre_is_in_the_ledger_of_the_run_and_of_the_dataset(work: Path, 
 
 def test_labels_know_their_own_error(site: SimulatedSite, run: RunDirectory) -> None:
     segments = run.segments()
-    truth = true_cost(read_truth(site.truths[0]), _column(segments, "start_ns"))
+    truth = compute_true_cost(read_truth(site.truths[0]), _column(segments, "start_ns"))
     for quantity, unit in (("duration", "s"), ("velocity", "mps"), ("power", "watt"), ("energy", "joule")):
         error = _column(segments, f"{quantity}_{unit}") - getattr(truth, f"{quantity}_{unit}")
         normalized = np.abs(error) / _column(segments, f"{quantity}_std_{unit}")
@@ -159,7 +159,7 @@ def test_no_segment_contains_standing_or_turning_in_place(site: SimulatedSite, r
 
 
 def test_patches_show_the_world_at_their_own_pixel_centres(site: SimulatedSite, work: Path) -> None:
-    world = scenario("hills12").world
+    world = find_scenario("hills12").world
     data = package.open_dataset(work / "dataset")
     card = json.loads((work / "dataset" / "dataset.json").read_text())
     classes = {entry["id"]: entry["name"] for entry in card["classes"]}

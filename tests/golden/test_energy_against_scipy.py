@@ -7,8 +7,8 @@ import pytest
 from made_tracks import stamps
 from scipy.integrate import quad
 
-from tcpipe.power.energy import energy_joule
-from tcpipe.power.rails import rail, samples
+from tcpipe.power.energy import integrate_energy
+from tcpipe.power.rails import make_rail, make_samples
 
 
 def uneven(rng, count, mean_ns):
@@ -20,7 +20,7 @@ def test_voltage_and_current_at_their_own_stamps(averaged):
     rng = np.random.default_rng(3)
     volt_ns, amp_ns = uneven(rng, 40, 300_000_000), uneven(rng, 300, 40_000_000)
     volt, amp = 24 + rng.normal(0, 1, 40), 6 + rng.normal(0, 5, 300)
-    rails = [rail("drive", samples(volt_ns, volt), samples(amp_ns, amp), averaged=averaged)]
+    rails = [make_rail("drive", make_samples(volt_ns, volt), make_samples(amp_ns, amp), averaged=averaged)]
     zero = stamps(1)[0]
     volt_s, amp_s = (volt_ns - zero) * 1e-9, (amp_ns - zero) * 1e-9
 
@@ -31,7 +31,7 @@ def test_voltage_and_current_at_their_own_stamps(averaged):
 
     start = np.array([1.0, 2.34, 5.001])
     end = np.array([2.1, 2.36, 7.7])
-    got = energy_joule(
+    got = integrate_energy(
         rails,
         zero + (start * 1e9).astype(np.int64),
         zero + (end * 1e9).astype(np.int64),

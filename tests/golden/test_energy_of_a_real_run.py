@@ -7,12 +7,12 @@ import pytest
 from shared_data import shared_data
 
 from tcpipe.formats.logs.log_file import open_log
-from tcpipe.formats.robot_files import shipped_profiles
-from tcpipe.power.energy import recorded_energy_joule
-from tcpipe.power.rails import rail, samples
+from tcpipe.formats.robot_files import load_shipped_profiles
+from tcpipe.power.energy import integrate_recorded_energy
+from tcpipe.power.rails import make_rail, make_samples
 from tcpipe.recipe import ReadConfig
 from tcpipe.stages import read
-from tcpipe.stages.power_rails import rails_of
+from tcpipe.stages.power_rails import make_rails
 from tcpipe.stages.read import read_run
 
 
@@ -27,11 +27,11 @@ def test_exact_and_trapezoid_energy_of_the_warthog():
     log_path = shared_data("warthog_grass_a/run.mcap")
     reference = json.loads(shared_data("warthog_grass_a/reference.json").read_text())["E_trapezoid_joule"]
     with open_log(log_path) as log:
-        streams = read_run(log, ReadConfig(), robot=None, known=shipped_profiles())
-    rails = rails_of(streams, 0)
+        streams = read_run(log, ReadConfig(), robot=None, known=load_shipped_profiles())
+    rails = make_rails(streams, 0)
     assert len(rails) == 2
     begin, end = (np.array([pick(each.stamp_ns[k] for each in rails)]) for pick, k in ((min, 0), (max, -1)))
-    exact = recorded_energy_joule(rails, begin, end, rule="exact")[0]
+    exact = integrate_recorded_energy(rails, begin, end, rule="exact")[0]
     trapezoid, correction = 0.0, 0.0
     for each in rails:
         t = (each.stamp_ns - begin[0]) * 1e-9
@@ -47,27 +47,27 @@ def test_exact_and_trapezoid_energy_of_the_warthog():
 def test_the_readings_alone_hold_the_same_energy():
     reference = json.loads(shared_data("warthog_grass_a/reference.json").read_text())["E_trapezoid_joule"]
     with open_log(shared_data("warthog_grass_a/run.mcap")) as log:
-        streams = read_run(log, ReadConfig(), robot=None, known=shipped_profiles())
-    rails = rails_of(streams, 0)
+        streams = read_run(log, ReadConfig(), robot=None, known=load_shipped_profiles())
+    rails = make_rails(streams, 0)
     for each in rails:
         assert np.median(np.diff(each.current.stamp_ns)) == pytest.approx(1e9, rel=0.01)
     begin, end = (np.array([pick(each.stamp_ns[k] for each in rails)]) for pick, k in ((min, 0), (max, -1)))
-    assert recorded_energy_joule(rails, begin, end, rule="exact")[0] == pytest.approx(reference, rel=2e-3)
+    assert integrate_recorded_energy(rails, begin, end, rule="exact")[0] == pytest.approx(reference, rel=2e-3)
 
 
 @pytest.mark.usefixtures("every_message")
 def test_reading_half_the_samples_changes_the_run_little():
     with open_log(shared_data("warthog_grass_a/run.mcap")) as log:
-        streams = read_run(log, ReadConfig(), robot=None, known=shipped_profiles())
+        streams = read_run(log, ReadConfig(), robot=None, known=load_shipped_profiles())
     whole, half = 0.0, 0.0
-    for each in rails_of(streams, 0):
-        thinned = rail(
+    for each in make_rails(streams, 0):
+        thinned = make_rail(
             each.name,
-            samples(each.voltage.stamp_ns[::2], each.voltage.value[::2]),
-            samples(each.current.stamp_ns[::2], each.current.value[::2]),
+            make_samples(each.voltage.stamp_ns[::2], each.voltage.value[::2]),
+            make_samples(each.current.stamp_ns[::2], each.current.value[::2]),
             averaged=False,
         )
         ends = thinned.stamp_ns[:1], thinned.stamp_ns[-1:]
-        whole += recorded_energy_joule([each], *ends, rule="exact")[0]
-        half += recorded_energy_joule([thinned], *ends, rule="exact")[0]
+        whole += integrate_recorded_energy([each], *ends, rule="exact")[0]
+        half += integrate_recorded_energy([thinned], *ends, rule="exact")[0]
     assert half == pytest.approx(whole, rel=5e-3)

@@ -5,7 +5,7 @@ from datetime import UTC, datetime
 import numpy as np
 
 from tcpipe.logs.messages import read_messages
-from tcpipe.logs.nmea import NS_PER_DAY, read_gga, read_over_ground, with_date
+from tcpipe.logs.nmea import NS_PER_DAY, add_date, read_gga, read_over_ground
 from tcpipe.logs.roles import NMEA_SENTENCE
 
 S = 1_000_000_000
@@ -72,7 +72,7 @@ def test_the_date_comes_from_the_log_over_midnight_too() -> None:
     # The fix is made just before it is logged: the second sentence still carries the evening's time.
     time_of_day = np.array([NS_PER_DAY - 2 * S, NS_PER_DAY - S // 2, 2 * S])
     expected = [at(2024, 2, 28, 23, 59, 58), at(2024, 2, 29) - S // 2, at(2024, 2, 29, 0, 0, 2)]
-    assert with_date(time_of_day, log).tolist() == expected
+    assert add_date(time_of_day, log).tolist() == expected
 
 
 def test_a_clock_half_a_day_off_keeps_its_side_and_unknown_times_are_zero() -> None:
@@ -80,7 +80,7 @@ def test_a_clock_half_a_day_off_keeps_its_side_and_unknown_times_are_zero() -> N
     noise = np.where(np.arange(100) % 2, S // 10, -S // 10)
     time_of_day = (log - NS_PER_DAY // 2 + noise) % NS_PER_DAY
     time_of_day[50] = -1
-    found = with_date(time_of_day, log)
+    found = add_date(time_of_day, log)
     offset = np.delete(found - log, 50)
     assert found[50] == 0
     assert np.ptp(offset) == 2 * (S // 10)

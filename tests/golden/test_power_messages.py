@@ -8,13 +8,13 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from tcpipe.formats.logs.log_file import open_log
-from tcpipe.formats.logs.ros_types import shipped_definitions
-from tcpipe.formats.robot_files import profiles_of, shipped_profiles
+from tcpipe.formats.logs.ros_types import load_shipped_definitions
+from tcpipe.formats.robot_files import load_profiles, load_shipped_profiles
 from tcpipe.power.readings import PowerReadings, read_power
-from tcpipe.power.sources import power_lists
+from tcpipe.power.sources import list_power_lists
 from tcpipe.recipe import Recipe
 from tcpipe.robots.profiles import PowerSource
-from tcpipe.stages.message_arrays import message_arrays
+from tcpipe.stages.message_arrays import make_message_arrays
 from tcpipe.tables.findings import select_findings
 
 N = 60
@@ -48,7 +48,7 @@ def made(types, kind, of, value, empty):
 def log_of(path: Path, name: str, rows: list[dict]) -> Path:
     types = get_typestore(Stores.ROS2_HUMBLE)
     found = {}
-    for of, text in shipped_definitions().items():
+    for of, text in load_shipped_definitions().items():
         found.update(get_types_from_msg(text, of))
     types.register(found)
     with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
@@ -62,10 +62,12 @@ def log_of(path: Path, name: str, rows: list[dict]) -> Path:
 
 
 def power_of(path: Path, robot: str = "generic", recipe: Recipe | None = None, **options) -> PowerReadings:
-    known = profiles_of(recipe) if recipe else shipped_profiles()
+    known = load_profiles(recipe) if recipe else load_shipped_profiles()
     with open_log(path) as log:
         type_name = log.topics["/power"].type_name
-        columns = message_arrays(log.tables(["/power"])["/power"], power_lists(type_name, known.power_sources))
+        columns = make_message_arrays(
+            log.tables(["/power"])["/power"], list_power_lists(type_name, known.power_sources)
+        )
     platform = known.robots[robot].platform
     return read_power({"/power": (type_name, columns)}, known.power_sources, platform=platform, **options)
 

@@ -13,7 +13,7 @@ import pytest
 
 from tcpipe.errors import ModelError
 from tcpipe.learning.architecture import Architecture
-from tcpipe.learning.losses import loss_factors
+from tcpipe.learning.losses import compute_loss_factors
 
 pytest.importorskip("torch")
 
@@ -34,7 +34,7 @@ def _drawn(rng, name, shape):
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: f"{case['patch_px']}px")
 def test_it_is_the_network_of_keras(case):
-    from tcpipe.learning.network import resnet18
+    from tcpipe.learning.network import make_resnet18
     from tcpipe.learning.trainer import Trainer
 
     px, depth, outputs = case["patch_px"], case["depth"], case["outputs"]
@@ -43,11 +43,11 @@ def test_it_is_the_network_of_keras(case):
     patches, labels, weigh = (
         rng.random(shape, np.float32) for shape in ((8, px, px, depth), (8, outputs), (8, outputs))
     )
-    network = resnet18(Architecture(px, depth, outputs, 16), seed=0, start=[0.0] * outputs)
+    network = make_resnet18(Architecture(px, depth, outputs, 16), seed=0, start=[0.0] * outputs)
     network.set_arrays(weights, "golden")
     assert network.predict(patches) == pytest.approx(predicted, rel=1e-5, abs=1e-5)
     assert all(np.array_equal(array, weights[name]) for name, array in network.arrays().items())
-    trainer = Trainer(network, loss_factors("nrmse", [1.0] * outputs))
+    trainer = Trainer(network, compute_loss_factors("nrmse", [1.0] * outputs))
     first, second = (trainer.step(patches, labels, weigh, 1e-3) for _ in range(2))
     assert first == pytest.approx(case["losses"][0], rel=1e-5)
     assert second == pytest.approx(case["losses"][1], rel=1e-3)

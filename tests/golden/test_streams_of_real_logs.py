@@ -12,7 +12,7 @@ from shared_data import shared_data
 import tcpipe
 from tcpipe.errors import RoleError
 from tcpipe.formats.logs.log_file import open_log
-from tcpipe.formats.robot_files import shipped_profiles
+from tcpipe.formats.robot_files import load_shipped_profiles
 from tcpipe.recipe import Placement, ReadConfig
 from tcpipe.stages.read import read_run
 from tcpipe.tables.findings import select_findings
@@ -23,7 +23,7 @@ _DRIVES = ("/left_drive/battery", "/right_drive/battery")
 
 def read(path: Path, robot: str | None = None, **config) -> Streams:
     with open_log(path) as log:
-        return read_run(log, ReadConfig(**config), robot=robot, known=shipped_profiles())
+        return read_run(log, ReadConfig(**config), robot=robot, known=load_shipped_profiles())
 
 
 @pytest.mark.parametrize("robot", [None, "warthog"])

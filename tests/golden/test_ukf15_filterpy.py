@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from tcpipe.fusion import filterpy_engine, ukf15_kernel
-from tcpipe.fusion.ukf15_events import ACCEPTED, RECOVERED, REJECTED, Belief, Events, Outputs, Sources
+from tcpipe.fusion.ukf15_events import ACCEPTED, RECOVERED, REJECTED, Events, FilterState, Outputs, Sources
 from tcpipe.fusion.ukf15_kernel import ANTENNA, SELECT, SENSOR_VELOCITY, SPECIFIC_FORCE
 
 Q = np.array([0.05, 0.05, 0.06, 0.03, 0.03, 0.06, 0.025, 0.025, 0.04, 0.01, 0.01, 0.02, 0.3, 0.3, 0.3])
@@ -17,7 +17,7 @@ def _belief(seed, *, std):
     x[:15] = rng.normal(0.0, 0.3, 15)
     spread = rng.normal(size=(15, 15))
     P[:, :15] = std**2 * (spread @ spread.T / 15 + 0.5 * np.eye(15))
-    return Belief(x, P, np.zeros(1), np.zeros((5, 2)))
+    return FilterState(x, P, np.zeros(1), np.zeros((5, 2)))
 
 
 def _sources(*rows, gate=np.inf):
@@ -46,7 +46,7 @@ def _events(sources, time_s, seed, *, std, scale=1.0):
 def _run_both(belief, events, sources, output_s):
     found = []
     for run in ENGINES:
-        b = Belief(*(array.copy() for array in belief))
+        b = FilterState(*(array.copy() for array in belief))
         n, k = events.time_s.size, output_s.size
         outputs = Outputs(output_s, np.zeros((k, 15)), np.zeros((k, 15)), np.zeros(n), np.zeros(n, np.int8))
         assert run(b, Q, events, sources, outputs) == 0
@@ -65,7 +65,7 @@ def _assert_equal(found):
 
 
 def test_linear_case_upright_at_rest_measured_entry_by_entry():
-    belief = Belief(np.zeros(16), np.zeros((15, 16)), np.zeros(1), np.zeros((5, 2)))
+    belief = FilterState(np.zeros(16), np.zeros((15, 16)), np.zeros(1), np.zeros((5, 2)))
     belief.P[np.arange(15), np.arange(15)] = 1e-6
     sources = _sources(
         (SELECT, (0, 1, 2), (0, 0, 0)), (SELECT, (6, 7, 8, 11), (0, 0, 0)), (SELECT, (12, 13, 14), (0, 0, 0))

@@ -10,7 +10,7 @@ from shared_data import shared_data
 
 from tcpipe.fusion.ukf15 import SensorRows, filter_forward
 from tcpipe.fusion.ukf15_kernel import AX, AY, AZ, GRAVITY_MPS2, PITCH, ROLL, SELECT, VX, VY, VZ, WX, WY, WZ, YAW
-from tcpipe.geometry.rotation import inverse, product, quat_from_rpy, rotate, rpy_from_quat
+from tcpipe.geometry.rotation import invert, multiply, quat_from_rpy, rotate, rpy_from_quat
 
 VELOCITY, TURN, ACCELERATION = (VX, VY, VZ), (WX, WY, WZ), (AX, AY, AZ)
 
@@ -60,8 +60,8 @@ def _imu(reader, base_from_imu, turn_entries):
             ]
         )
     stamp_ns, variances = np.array(stamp_ns), np.array(variances)
-    acceleration = rotate(base_from_imu, force - rotate(inverse(quat), [0.0, 0.0, GRAVITY_MPS2]))
-    attitude = rpy_from_quat(product(quat, inverse(base_from_imu)))
+    acceleration = rotate(base_from_imu, force - rotate(invert(quat), [0.0, 0.0, GRAVITY_MPS2]))
+    attitude = rpy_from_quat(multiply(quat, invert(base_from_imu)))
     turn = rotate(base_from_imu, turn)
     columns = [entry - TURN[0] for entry in turn_entries]
     return (

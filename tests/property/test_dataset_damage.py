@@ -9,8 +9,8 @@ from synthetic_store import add_run, add_world, lanes, segments
 
 from tcpipe.dataset import open_dataset
 from tcpipe.errors import DatasetError, TcpipeError
+from tcpipe.formats.integrity import SEAL
 from tcpipe.formats.json_files import MOST_BYTES, digest, to_json
-from tcpipe.formats.seals import SEAL
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.recipe import Recipe
 from tcpipe.store import open_store

@@ -8,13 +8,20 @@ from recipe_values import keys, other_values, with_value
 from simulated_streams import log_of, streams_of
 
 from tcpipe.errors import TcpipeError
-from tcpipe.formats.recipe_toml import commented_toml, ingest_key, load_recipe, parse_recipe, read_key, recipe_id
+from tcpipe.formats.recipe_toml import (
+    format_commented_toml,
+    ingest_key,
+    load_recipe,
+    make_recipe_id,
+    parse_recipe,
+    read_key,
+)
 from tcpipe.pipeline.ingest import ingest
 from tcpipe.recipe import IngestSections, Recipe
-from tcpipe.simulation.scenarios import tiny
+from tcpipe.simulation.scenarios import make_tiny
 from tcpipe.stages.fuse import fuse_run
-from tcpipe.stages.gate import gate_track
 from tcpipe.stages.label import label_segments
+from tcpipe.stages.mask import mask_track
 from tcpipe.stages.segment import segment_track
 
 INGEST = {section.name for section in fields(IngestSections)}
@@ -26,7 +33,7 @@ def section(key):
 
 @pytest.fixture(scope="module")
 def log(tmp_path_factory):
-    scenario = tiny(seconds=20.0)
+    scenario = make_tiny(seconds=20.0)
     return log_of(scenario, scenario.drives[0], tmp_path_factory.mktemp("site"))
 
 
@@ -41,7 +48,7 @@ def track(streams):
 
 
 def after_fusion(track, streams, recipe):
-    gated = gate_track(track, recipe.gate, max_velocity_mps=1.0, chord_m=recipe.segment.chord_m)
+    gated = mask_track(track, recipe.gate, max_velocity_mps=1.0, chord_m=recipe.segment.chord_m)
     segments = segment_track(gated, recipe.segment)
     return label_segments(segments, gated, streams, recipe.label, voltage_range_volt=None)
 
@@ -53,7 +60,7 @@ def test_a_key_changes_the_name_of_a_run_if_and_only_if_its_section_reaches_a_st
     assert values
     for value in values:
         other = with_value(default, key, value)
-        assert (recipe_id(other, "husky") != recipe_id(default, "husky")) == (section(key) in INGEST)
+        assert (make_recipe_id(other, "husky") != make_recipe_id(default, "husky")) == (section(key) in INGEST)
         assert (ingest_key(other) != ingest_key(default)) == (section(key) in INGEST)
         streams_differ = read_key(other, None, definitions="") != read_key(default, None, definitions="")
         assert streams_differ == (section(key) in {"read", "robots", "power_sources", "tables"})
@@ -104,6 +111,6 @@ def test_no_placement_and_no_offset_breaks_fusion(log, value):
 def test_toml_and_python_make_the_same_recipe(tmp_path, key):
     for value in other_values(key):
         recipe = with_value(Recipe(), key, value)
-        (tmp_path / "r.toml").write_text(commented_toml(recipe), encoding="utf-8")
+        (tmp_path / "r.toml").write_text(format_commented_toml(recipe), encoding="utf-8")
         assert load_recipe(tmp_path / "r.toml") == recipe
     assert parse_recipe({}, where="r") == Recipe()

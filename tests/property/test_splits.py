@@ -10,9 +10,9 @@ from splits_squares import squares
 from tcpipe.splits.assignment import NO_FOLD, Assignment, assign_splits
 from tcpipe.splits.audit import audit_leakage
 from tcpipe.splits.holdouts import Groups, draw_groups
-from tcpipe.splits.neighbours import near_pairs, nearest_m, shared_fraction
+from tcpipe.splits.neighbours import compute_nearest_m, compute_shared_fraction, iterate_near_pairs
 from tcpipe.splits.ranking import hash_ranks
-from tcpipe.splits.regions import Regions, Side, sides_of
+from tcpipe.splits.regions import Regions, Side, classify_footprints
 
 coordinate = st.floats(-30, 30, allow_nan=False)
 
@@ -37,7 +37,7 @@ def test_sides_agree_with_plain_geometry_one_footprint_at_a_time(areas, seed, bu
     corners = squares(rng.uniform(-30, 30, (40, 2)), rng.uniform(-np.pi, np.pi, 40))
     usable = areas.train_test.difference(areas.exclude)
     other = areas.unseen.difference(areas.exclude)
-    for corner, side in zip(corners, sides_of(corners, areas, buffer_m=buffer_m), strict=True):
+    for corner, side in zip(corners, classify_footprints(corners, areas, buffer_m=buffer_m), strict=True):
         square = shapely.Polygon(corner)
         nearest = min(square.distance(area.boundary) for area in (usable, other, areas.exclude) if not area.is_empty)
         if abs(nearest - buffer_m) < 1e-9:
@@ -174,10 +174,10 @@ def test_distance_and_shared_ground_are_those_of_shapely(seed, n, m, extent_m):
         squares(rng.uniform(0, extent_m, (count, 2)), rng.uniform(-np.pi, np.pi, count)) for count in (n, m)
     )
     a, b = shapely.polygons(ours)[:, None], shapely.polygons(theirs)[None]
-    np.testing.assert_allclose(nearest_m(ours, theirs), shapely.distance(a, b).min(axis=1), atol=1e-9)
+    np.testing.assert_allclose(compute_nearest_m(ours, theirs), shapely.distance(a, b).min(axis=1), atol=1e-9)
     shared = np.zeros((n, m))
-    for i, j in near_pairs(ours.mean(axis=1), theirs.mean(axis=1), within_m=np.sqrt(2) + 1e-9):
-        shared[i, j] = shared_fraction(ours, theirs, i, j)
+    for i, j in iterate_near_pairs(ours.mean(axis=1), theirs.mean(axis=1), within_m=np.sqrt(2) + 1e-9):
+        shared[i, j] = compute_shared_fraction(ours, theirs, i, j)
     np.testing.assert_allclose(shared, shapely.area(shapely.intersection(a, b)), atol=1e-9)
 
 

@@ -12,8 +12,8 @@ from rosbags.typesys import get_types_from_msg
 from tcpipe.formats.logs.arrow_columns import TopicTable
 from tcpipe.formats.logs.log_part import MessageBlock
 from tcpipe.formats.logs.ros_types import MessageType
-from tcpipe.logs.wire_layout import LayoutError, layout_of
-from tcpipe.logs.wire_types import WIDE_FORMS, Array, Record, Scalar, Text, in_form, record
+from tcpipe.logs.wire_layout import LayoutError, walk_layout
+from tcpipe.logs.wire_types import WIDE_FORMS, Array, Record, Scalar, Text, convert_wide_texts, record
 
 CODES = ("?", "i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8", "f4", "f8")
 HEADERS = {b"\x00\x00": (">", 8), b"\x00\x01": ("<", 8), b"\x00\x06": (">", 4), b"\x00\x07": ("<", 4), None: ("<", 1)}
@@ -152,14 +152,16 @@ def _ambiguous(of, payloads, form):
         count = 0
         for payload in payloads[:32]:
             try:
-                layout_of(of, payload, encoding="cdr")
+                walk_layout(of, payload, encoding="cdr")
                 count += 1
             except LayoutError:
                 pass
         return count
 
-    others = [fitting(in_form(of, other)) for other in WIDE_FORMS if other != form]
-    return in_form(of, WIDE_FORMS[0]) != in_form(of, WIDE_FORMS[1]) and max(others) >= fitting(in_form(of, form))
+    others = [fitting(convert_wide_texts(of, other)) for other in WIDE_FORMS if other != form]
+    return convert_wide_texts(of, WIDE_FORMS[0]) != convert_wide_texts(of, WIDE_FORMS[1]) and max(others) >= fitting(
+        convert_wide_texts(of, form)
+    )
 
 
 @pytest.mark.parametrize("header", list(HEADERS))

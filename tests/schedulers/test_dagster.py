@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from tcpipe.pipeline.maps import add_map
-from tcpipe.simulation import Faults, simulate, tiny
+from tcpipe.simulation import Faults, make_tiny, simulate
 
 dg = pytest.importorskip("dagster", reason="dagster is not installed (make test-dagster)")
 
@@ -20,7 +20,7 @@ DEFINITIONS = Path(__file__).parents[2] / "pipelines" / "dagster" / "definitions
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     place = tmp_path_factory.mktemp("site")
-    made = simulate(place, scenario=tiny(Faults.every()))
+    made = simulate(place, scenario=make_tiny(Faults.every()))
     add_map("site", **made.rasters, store=place / "store")
     os.utime(place / "logs" / "tiny.mcap", ns=(10**18, 10**18))
     return place

@@ -16,7 +16,7 @@ from dask_cluster import DaskCluster, dask_cluster, die_once, spend, wants_more,
 import tcpipe
 from tcpipe import execution
 from tcpipe.errors import TcpipeError, UsageError
-from tcpipe.execution import cluster_cpu_s, run_all
+from tcpipe.execution import read_cluster_cpu_s, run_all
 from tcpipe.progress import STEP, Step, step_of
 
 
@@ -86,9 +86,9 @@ def test_a_worker_without_tcpipe_is_refused_at_once(tmp_path, monkeypatch):
 
 
 def test_what_workers_spend_counts_here(cluster):
-    before_s = cluster_cpu_s()
+    before_s = read_cluster_cpu_s()
     assert [outcome.result for outcome in run_all(spend, [0.1, 0.1], jobs=1, cluster=cluster.address)] == [None, None]
-    assert 0.2 <= cluster_cpu_s() - before_s < 2.0
+    assert 0.2 <= read_cluster_cpu_s() - before_s < 2.0
 
 
 def test_a_worker_of_many_threads_is_refused(tmp_path):

@@ -11,7 +11,7 @@ import tcpipe
 from tcpipe.cli import cli
 from tcpipe.cli.options import ONE_OF_SEVERAL, Place
 from tcpipe.errors import UsageError
-from tcpipe.formats.atomic import atomic_file
+from tcpipe.formats.atomic import write_atomic_file
 from tcpipe.pipeline.export import export
 from tcpipe.simulation import simulate
 from tcpipe.store import open_store
@@ -173,7 +173,7 @@ FUNCTIONS = {
     "open_store": lambda out, _: open_store(out, create=True),
     "simulate": lambda out, _: simulate(out),
     "export": lambda out, log: export(log, Path(out)),
-    "atomic_file": lambda out, _: atomic_file(out).__enter__(),
+    "atomic_file": lambda out, _: write_atomic_file(out).__enter__(),
 }
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from tcpipe.compiled import _cache_directory, kernel
+from tcpipe.compiled import _cache_directory, compile_kernel
 
 PROGRAM = """
 import numba
@@ -86,7 +86,7 @@ def temporary(tmp_path, monkeypatch):
 
 
 def test_a_kernel_computes():
-    assert kernel(lambda x: x + 1.0)(2.0) == 3.0
+    assert compile_kernel(lambda x: x + 1.0)(2.0) == 3.0
 
 
 def test_falls_back_to_a_temporary_cache(tmp_path):

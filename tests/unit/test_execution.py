@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from tcpipe.execution import run_all
-from tcpipe.progress import STEP, step, step_of, working_on
+from tcpipe.progress import STEP, set_task, step, step_of
 
 
 def _square(value: int) -> int:
@@ -40,7 +40,7 @@ def test_a_killed_worker_costs_only_its_own_task() -> None:
 
 
 def _say(value: int) -> int:
-    with working_on("/long" * 100):
+    with set_task("/long" * 100):
         step("reading", value, 10)
     logging.getLogger("tcpipe").info("task %d", value)
     return os.getpid()

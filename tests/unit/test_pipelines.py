@@ -11,10 +11,10 @@ import polars as pl
 from tcpipe.cli import cli
 from tcpipe.formats.logs.table_log import TableLog
 from tcpipe.formats.recipe_toml import ingest_key, load_recipe
-from tcpipe.formats.robot_files import profiles_of
+from tcpipe.formats.robot_files import load_profiles
 from tcpipe.logs.topics import Topic
 from tcpipe.recipe import Recipe
-from tcpipe.stages.read_roles import find_read_config, roles_by
+from tcpipe.stages.read_roles import decide_roles, find_read_config
 
 PIPELINES = Path(__file__).parents[2] / "pipelines"
 VI, SIDES = ("voltage", "current"), ("left", "right")
@@ -22,7 +22,9 @@ VI, SIDES = ("voltage", "current"), ("left", "right")
 
 def played(recipe: Recipe, log: TableLog) -> set[str]:
     """The roles that are played, all that the recipe says settled."""
-    found = roles_by(find_read_config(recipe, log.topics), log.topics.values(), recipe.robot, known=profiles_of(recipe))
+    found = decide_roles(
+        find_read_config(recipe, log.topics), log.topics.values(), recipe.robot, known=load_profiles(recipe)
+    )
     assert found.problems == ()
     return set(found.roles)
 
@@ -80,7 +82,7 @@ def test_rellis_plays_its_roles_by_the_topics_of_its_readme() -> None:
         "/warthog_velocity_controller/cmd_vel": "geometry_msgs/msg/Twist",
     }
     topics = [Topic(name, kind, 600, 0, 60_000_000_000, "ros1", "") for name, kind in kinds.items()]
-    found = roles_by(recipe.read, topics, recipe.robot, known=profiles_of(recipe))
+    found = decide_roles(recipe.read, topics, recipe.robot, known=load_profiles(recipe))
     assert found.problems == ()
     assert set(found.roles) == {"gnss", "imu", "wheel_odometry", "command", "power"}
     assert len(found.roles["power"].topics) == 4

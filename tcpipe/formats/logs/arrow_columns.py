@@ -19,10 +19,10 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from tcpipe.formats.logs.arrow_values import IrregularColumns, arrow_type, texts
-from tcpipe.formats.logs.log_part import MessageBlock, gathered
+from tcpipe.formats.logs.arrow_values import IrregularColumns, find_arrow_type, make_texts
+from tcpipe.formats.logs.log_part import MessageBlock, gather_integers
 from tcpipe.formats.logs.ros_types import DefinitionError, MessageType, RowError
-from tcpipe.logs.wire_cursors import Walked, walk
+from tcpipe.logs.wire_cursors import WalkResult, walk
 from tcpipe.logs.wire_layout import (
     Dialect,
     ElementsAt,
@@ -35,12 +35,21 @@ from tcpipe.logs.wire_layout import (
     ScalarAt,
     ScalarsAt,
     TextAt,
-    dialect_of,
-    layout_of,
-    same_shape,
-    strided,
+    find_dialect,
+    has_layout,
+    view_field,
+    walk_layout,
 )
-from tcpipe.logs.wire_types import WIDE_FORMS, Array, Record, WireType, field_units, flat_fields, in_form, wide_texts
+from tcpipe.logs.wire_types import (
+    WIDE_FORMS,
+    Array,
+    Record,
+    WireType,
+    convert_wide_texts,
+    find_field_units,
+    has_wide_texts,
+    iterate_flat_fields,
+)
 from tcpipe.tables.arrays import number_column
 
 FLUSH_BYTES = 1 << 20
@@ -76,25 +85,25 @@ _Repeats = tuple[tuple[int, int], ...]
 _Int64 = NDArray[np.int64]
 
 
-def arrow_schema(message: Record) -> pa.Schema:
+def make_arrow_schema(message: Record) -> pa.Schema:
     """Return the schema of a topic's table: both times, then the message's fields by dotted name.
 
     The metadata of a field says its ``unit`` where that is known; of an array of messages, ``units`` of their fields as JSON.
     A field of the message that is called like one of the times gets ``_`` behind its name.
     """
-    units = field_units(message)
+    units = find_field_units(message)
     fields = [pa.field(name, pa.int64(), metadata={"unit": "ns"}) for name in (LOG_TIME, PUBLISH_TIME)]
     taken = {LOG_TIME, PUBLISH_TIME}
-    for name, of in flat_fields(message):
+    for name, of in iterate_flat_fields(message):
         column = name
         while column in taken:
             column += "_"
         taken.add(column)
-        fields.append(pa.field(column, arrow_type(of), metadata=_unit_metadata(name, units)))
+        fields.append(pa.field(column, find_arrow_type(of), metadata=_make_unit_metadata(name, units)))
     return pa.schema(fields)
 
 
-def _unit_metadata(name: str, units: Mapping[str, str]) -> dict[str, str] | None:
+def _make_unit_metadata(name: str, units: Mapping[str, str]) -> dict[str, str] | None:
     if name in units:
         return {"unit": units[name]}
     inner = {path.removeprefix(f"{name}."): unit for path, unit in units.items() if path.startswith(f"{name}.")}
@@ -111,7 +120,7 @@ class TopicTable:
     def __init__(
         self, message_type: MessageType, encoding: str, *, expected_rows: int = 0, in_pieces: bool = False
     ) -> None:
-        self.schema = arrow_schema(message_type.wire)
+        self.schema = make_arrow_schema(message_type.wire)
         self._in_pieces = in_pieces
         self._fields = pa.schema(list(self.schema)[2:])
         self.undecodable: dict[str, int] = {}
@@ -124,7 +133,7 @@ class TopicTable:
         """About how much memory the messages take that no table was taken of yet."""
         self._type, self._encoding = message_type, encoding
         self._wire = message_type.wire
-        self._wide_open = wide_texts(message_type.wire)
+        self._wide_open = has_wide_texts(message_type.wire)
         self._groups: dict[int, list[tuple[_Int64, NDArray[np.void]]]] = {}
         self._shapes: dict[int, list[_Shape]] = {}
         self._expected_rows = expected_rows
@@ -158,7 +167,7 @@ class TopicTable:
         """Find out in which form wide strings are written: the one that the messages fit; those without such a string tell nothing."""
         places = zip(block.offsets[:_FEW].tolist(), block.lengths[:_FEW].tolist(), strict=True)
         payloads = [bytes(block.buffer[start : start + length]) for start, length in places]
-        forms = {form: in_form(self._type.wire, form) for form in WIDE_FORMS}
+        forms = {form: convert_wide_texts(self._type.wire, form) for form in WIDE_FORMS}
         fitting = {form: sum(self._fits(of, payload) for payload in payloads) for form, of in forms.items()}
         best = max(fitting, key=fitting.__getitem__)
         self._wire = forms[best]
@@ -166,7 +175,7 @@ class TopicTable:
 
     def _fits(self, of: Record, payload: bytes) -> bool:
         try:
-            layout_of(of, payload, encoding=self._encoding)
+            walk_layout(of, payload, encoding=self._encoding)
         except (LayoutError, RaggedError):
             return False
         return True
@@ -210,14 +219,14 @@ class TopicTable:
         log, publish, ordinal = times
         order = np.lexsort((ordinal, log))
         if (np.diff(order) < 0).any():
-            table = _contiguous(table).take(number_column(order))
+            table = _make_contiguous(table).take(number_column(order))
             log, publish, ordinal = log[order], publish[order], ordinal[order]
         count = len(log) if share >= 1 else int(np.searchsorted(log, log[int(share * (len(log) - 1))], "right"))
         self._expected_rows = len(log)
         self._hold(table, (log, publish, ordinal), count)
         self.late += int(np.searchsorted(log[:count], self._taken_until))
         self._taken_until = max(self._taken_until, int(log[count - 1]))
-        return _contiguous(table[:count])
+        return _make_contiguous(table[:count])
 
     def _joined(self, times: Sequence[_Int64]) -> pa.Table:
         """Return all parts as one table of many pieces, both times before the fields."""
@@ -256,7 +265,7 @@ class TopicTable:
         """Split payloads of equal length into shapes; known shapes first, then new ones, then row by row."""
         known = self._shapes.setdefault(length, [])
         for shape in known:
-            fits = same_shape(shape.layout, payloads)
+            fits = has_layout(shape.layout, payloads)
             if fits.all():
                 self._keep(shape, rows, payloads)
                 return
@@ -268,20 +277,20 @@ class TopicTable:
             worthwhile = len(rows) >= MIN_GROUP or self._seen < MIN_GROUP
             fresh = self._new_layout(payloads[0].tobytes()) if worthwhile and len(known) < MAX_SHAPES else None
             if fresh is None or misses > MAX_MISSES:
-                self._add_ragged(rows, *_laid_out(payloads))
+                self._add_ragged(rows, *_join_payloads(payloads))
                 return
-            fits = same_shape(fresh, payloads)
+            fits = has_layout(fresh, payloads)
             if fits.sum() >= MIN_GROUP or self._seen < MIN_GROUP:
                 known.append(_Shape(fresh, self._wire, in_pieces=self._in_pieces))
                 self._keep(known[-1], rows[fits], payloads[fits])
             else:
                 misses += 1
-                self._add_ragged(rows[fits], *_laid_out(payloads[fits]))
+                self._add_ragged(rows[fits], *_join_payloads(payloads[fits]))
             rows, payloads = rows[~fits], payloads[~fits]
 
     def _new_layout(self, payload: bytes) -> Layout | None:
         try:
-            return layout_of(self._wire, payload, encoding=self._encoding)
+            return walk_layout(self._wire, payload, encoding=self._encoding)
         except (LayoutError, RaggedError):
             return None
 
@@ -298,36 +307,36 @@ class TopicTable:
             self._add_part(rows, columns)
 
     def _column(self, node: Node, of: WireType, count: int, leaves: Iterator[NDArray[np.generic]]) -> pa.Array:
-        """Build one column of ``count`` elements from its leaves, which come in the order of `_leaves`."""
+        """Build one column of ``count`` elements from its leaves, which come in the order of `_iterate_leaves`."""
         match node:
             case ScalarAt():
                 return number_column(next(leaves).reshape(-1))
             case ScalarsAt():
-                return _listed(number_column(next(leaves).reshape(-1)), count, node.array)
+                return _make_lists(number_column(next(leaves).reshape(-1)), count, node.array)
             case TextAt():
                 raw = pa.py_buffer(next(leaves).reshape(-1).view(np.uint8) if node.length else b"")
-                found, replaced = texts(count, _offsets(count, node.length), raw, node.codec)
+                found, replaced = make_texts(count, _make_offsets(count, node.length), raw, node.codec)
                 self.replaced_texts += replaced
                 return found
             case RecordAt():
                 children = [
                     self._column(child, field, count, leaves)
-                    for (_, child), (_, field) in zip(node.fields, _fields(of), strict=True)
+                    for (_, child), (_, field) in zip(node.fields, _list_fields(of), strict=True)
                 ]
-                return pa.Array.from_buffers(arrow_type(of), count, [None], children=children)
+                return pa.Array.from_buffers(find_arrow_type(of), count, [None], children=children)
             case RepeatAt():
                 element = self._column(node.element, node.array.element, count * node.count, leaves)
-                return _listed(element, count, node.array)
+                return _make_lists(element, count, node.array)
             case ElementsAt():
                 return self._elements(node, count, leaves)
 
     def _elements(self, node: ElementsAt, count: int, leaves: Iterator[NDArray[np.generic]]) -> pa.Array:
         each = len(node.elements)
         if not each:
-            return _listed(pa.array([], arrow_type(node.array.element)), count, node.array)
+            return _make_lists(pa.array([], find_arrow_type(node.array.element)), count, node.array)
         columns = [self._column(element, node.array.element, count, leaves) for element in node.elements]
         in_turn = (np.arange(each) * count + np.arange(count)[:, None]).ravel()
-        return _listed(pa.concat_arrays(columns).take(number_column(in_turn)), count, node.array)
+        return _make_lists(pa.concat_arrays(columns).take(number_column(in_turn)), count, node.array)
 
     def _add_ragged(self, rows: _Int64, buffer: memoryview, offsets: _Int64, lengths: _Int64) -> None:
         self._ragged.add(rows, buffer, offsets, lengths)
@@ -338,7 +347,7 @@ class TopicTable:
         """Decode what no layout fits: side by side, and what that cannot do message by message."""
         for rows, data, starts, ends in self._ragged.take():
             try:
-                dialect = dialect_of(data[starts[0] : ends[0]][:4].tobytes(), self._encoding)
+                dialect = find_dialect(data[starts[0] : ends[0]][:4].tobytes(), self._encoding)
             except LayoutError as error:
                 self._leave_out(str(error), len(rows))
                 continue
@@ -348,18 +357,18 @@ class TopicTable:
                 self._add_part(rows[walked.fits], list(irregular.columns(walked.root, self._wire)))
                 self.replaced_texts += irregular.replaced_texts
             left = ~walked.fits
-            if left.any() and dialect.known_to_rosbags and not wide_texts(self._wire):
+            if left.any() and dialect.known_to_rosbags and not has_wide_texts(self._wire):
                 self._row_by_row(rows[left], data, starts[left], ends[left])
             elif left.any():
                 self._leave_out("its lengths contradict its size", int(left.sum()))
 
-    def _walked(self, data: NDArray[np.uint8], starts: _Int64, ends: _Int64, dialect: Dialect) -> Walked:
+    def _walked(self, data: NDArray[np.uint8], starts: _Int64, ends: _Int64, dialect: Dialect) -> WalkResult:
         if self._side_by_side:
             try:
                 return walk(self._wire, data, starts, ends, dialect)
             except RaggedError:
                 self._side_by_side = False
-        return Walked(None, np.zeros(len(starts), np.bool_))
+        return WalkResult(None, np.zeros(len(starts), np.bool_))
 
     def _row_by_row(self, rows: _Int64, data: NDArray[np.uint8], starts: _Int64, ends: _Int64) -> None:
         """Decode message by message; one that does not fit its definition is counted and left out."""
@@ -380,7 +389,7 @@ class TopicTable:
                 self._refused += 1
             else:
                 kept.append(row)
-        names = [name for name, _ in flat_fields(self._type.wire)]
+        names = [name for name, _ in iterate_flat_fields(self._type.wire)]
         columns = [
             pa.array([value[name] for value in values], of) for name, of in zip(names, self._fields.types, strict=True)
         ]
@@ -396,7 +405,7 @@ class TopicTable:
             self._parts.append((rows, pa.Table.from_arrays(columns, schema=self._fields)))
 
 
-def _contiguous(table: pa.Table) -> pa.Table:
+def _make_contiguous(table: pa.Table) -> pa.Table:
     return table.combine_chunks() if table.nbytes < MAX_CONTIGUOUS_BYTES else table
 
 
@@ -409,9 +418,9 @@ class _Shape:
     def __init__(self, layout: Layout, wire: Record, *, in_pieces: bool) -> None:
         self.layout = layout
         self._in_pieces = in_pieces
-        self.nodes = list(_flat_nodes(layout.root, wire))
+        self.nodes = list(_iterate_flat_nodes(layout.root, wire))
         self.held_bytes = 0
-        self._leaves = [leaf for node, _ in self.nodes for leaf in _leaves(node)]
+        self._leaves = [leaf for node, _ in self.nodes for leaf in _iterate_leaves(node)]
         self._row_bytes = sum(dtype.itemsize * math.prod(n for n, _ in repeats) for _, dtype, repeats in self._leaves)
         self._values: list[NDArray[np.generic]] = []
         self._rows: list[_Int64] = []
@@ -423,13 +432,13 @@ class _Shape:
         if end > self._room:
             self._grow(end, expected)
         for values, (offset, dtype, repeats) in zip(self._values, self._leaves, strict=True):
-            values[self._count : end] = strided(payloads, offset, dtype, repeats)
+            values[self._count : end] = view_field(payloads, offset, dtype, repeats)
         self._rows.append(rows)
         self._count = end
         self.held_bytes += len(rows) * self._row_bytes
 
     def take(self) -> tuple[_Int64, Iterator[NDArray[np.generic]]]:
-        """Return the rows held and, in the order of `_leaves`, the arrays of their values, and forget them."""
+        """Return the rows held and, in the order of `_iterate_leaves`, the arrays of their values, and forget them."""
         rows = np.concatenate([np.zeros(0, np.int64), *self._rows])
         held = iter([values[: self._count] for values in self._values])
         self._values, self._rows, self._count, self._room, self.held_bytes = [], [], 0, 0, 0
@@ -440,7 +449,7 @@ class _Shape:
         most = least + MAX_SHAPE_BYTES // max(self._row_bytes, 1)
         self._room = max(least, 2 * self._room, min(expected, most))
         before = self._values
-        self._values = _empty(
+        self._values = _allocate_arrays(
             [((self._room, *(n for n, _ in repeats)), dtype.newbyteorder("=")) for _, dtype, repeats in self._leaves],
             own=self._in_pieces and self._room * self._row_bytes > _OWN_BYTES,
         )
@@ -448,7 +457,9 @@ class _Shape:
             new[: self._count] = old[: self._count]
 
 
-def _empty(kinds: Sequence[tuple[tuple[int, ...], np.dtype[np.generic]]], *, own: bool) -> list[NDArray[np.generic]]:
+def _allocate_arrays(
+    kinds: Sequence[tuple[tuple[int, ...], np.dtype[np.generic]]], *, own: bool
+) -> list[NDArray[np.generic]]:
     """Return an array to be filled of each shape and type.
 
     With ``own`` their memory goes back to the system with the last of them: the heap would be left full of holes, and grow with the log.
@@ -492,13 +503,13 @@ class _Ragged:
         kinds = np.zeros(len(rows), np.int64)
         if self._cdr:
             kinds[lengths < 4] = -1
-            kinds[lengths >= 4] = gathered(data.data, starts[lengths >= 4], "u2")
+            kinds[lengths >= 4] = gather_integers(data.data, starts[lengths >= 4], "u2")
         for kind in np.unique(kinds).tolist():
             of = kinds == kind
             yield rows[of], data, starts[of], starts[of] + lengths[of]
 
 
-def _laid_out(payloads: NDArray[np.void]) -> tuple[memoryview, _Int64, _Int64]:
+def _join_payloads(payloads: NDArray[np.void]) -> tuple[memoryview, _Int64, _Int64]:
     """Return payloads of equal length as one buffer, with offsets and lengths."""
     count, length = len(payloads), payloads.dtype.itemsize
     raw = memoryview(payloads.tobytes())
@@ -513,15 +524,15 @@ def _gather(buffer: memoryview, offsets: _Int64, length: int) -> NDArray[np.void
     return windows[offsets]
 
 
-def _flat_nodes(node: RecordAt, of: WireType) -> Iterator[tuple[Node, WireType]]:
-    for (_, child), (_, field) in zip(node.fields, _fields(of), strict=True):
+def _iterate_flat_nodes(node: RecordAt, of: WireType) -> Iterator[tuple[Node, WireType]]:
+    for (_, child), (_, field) in zip(node.fields, _list_fields(of), strict=True):
         if isinstance(child, RecordAt):
-            yield from _flat_nodes(child, field)
+            yield from _iterate_flat_nodes(child, field)
         else:
             yield child, field
 
 
-def _leaves(node: Node, repeats: _Repeats = ()) -> Iterator[tuple[int, np.dtype[np.generic], _Repeats]]:
+def _iterate_leaves(node: Node, repeats: _Repeats = ()) -> Iterator[tuple[int, np.dtype[np.generic], _Repeats]]:
     """Yield the values a node consists of: offset, type, and (count, stride in bytes) of the arrays they are in."""
     match node:
         case ScalarAt():
@@ -533,25 +544,25 @@ def _leaves(node: Node, repeats: _Repeats = ()) -> Iterator[tuple[int, np.dtype[
                 yield node.offset, np.dtype(f"V{node.length}"), repeats
         case RecordAt():
             for _, child in node.fields:
-                yield from _leaves(child, repeats)
+                yield from _iterate_leaves(child, repeats)
         case RepeatAt():
-            yield from _leaves(node.element, (*repeats, (node.count, node.stride)))
+            yield from _iterate_leaves(node.element, (*repeats, (node.count, node.stride)))
         case ElementsAt():
             for element in node.elements:
-                yield from _leaves(element, repeats)
+                yield from _iterate_leaves(element, repeats)
 
 
-def _offsets(count: int, length: int) -> pa.Buffer:
+def _make_offsets(count: int, length: int) -> pa.Buffer:
     return pa.py_buffer((np.arange(count + 1, dtype=np.int64) * length).astype(np.int32))
 
 
-def _listed(values: pa.Array, count: int, of: Array) -> pa.Array:
+def _make_lists(values: pa.Array, count: int, of: Array) -> pa.Array:
     """Return ``values`` as ``count`` lists of equal length."""
     if of.length:
         return pa.FixedSizeListArray.from_arrays(values, of.length)
     length = len(values) // count if count else 0
-    return pa.Array.from_buffers(pa.list_(values.type), count, [None, _offsets(count, length)], children=[values])
+    return pa.Array.from_buffers(pa.list_(values.type), count, [None, _make_offsets(count, length)], children=[values])
 
 
-def _fields(of: WireType) -> tuple[tuple[str, WireType], ...]:
+def _list_fields(of: WireType) -> tuple[tuple[str, WireType], ...]:
     return of.fields if isinstance(of, Record) else ()

@@ -13,7 +13,7 @@ from tcpipe.logs.wire_types import Array, Record, Scalar, Text, WireType
 from tcpipe.tables.arrays import number_column
 
 
-def arrow_type(of: WireType) -> pa.DataType:
+def find_arrow_type(of: WireType) -> pa.DataType:
     """Return the Arrow type: arrays become lists (fixed-size ones where the definition fixes it), messages structs."""
     match of:
         case Scalar():
@@ -21,12 +21,12 @@ def arrow_type(of: WireType) -> pa.DataType:
         case Text():
             return pa.string()
         case Record():
-            return pa.struct([pa.field(name, arrow_type(field)) for name, field in of.fields])
+            return pa.struct([pa.field(name, find_arrow_type(field)) for name, field in of.fields])
         case Array():
-            return pa.list_(arrow_type(of.element), of.length or -1)
+            return pa.list_(find_arrow_type(of.element), of.length or -1)
 
 
-def texts(count: int, offsets: pa.Buffer, raw: pa.Buffer, codec: str) -> tuple[pa.StringArray, int]:
+def make_texts(count: int, offsets: pa.Buffer, raw: pa.Buffer, codec: str) -> tuple[pa.StringArray, int]:
     """Return texts from Arrow's offsets and their bytes, and how many are not in the encoding: what is no character there is replaced."""
     if codec != "utf-8":
         pieces = pa.BinaryArray.from_buffers(pa.binary(), count, [None, offsets, raw]).to_pylist()
@@ -48,7 +48,7 @@ def texts(count: int, offsets: pa.Buffer, raw: pa.Buffer, codec: str) -> tuple[p
     return found, 0
 
 
-def lists(values: pa.Array, counts: Int64Array, length: int | None) -> pa.Array:
+def make_lists(values: pa.Array, counts: Int64Array, length: int | None) -> pa.Array:
     """Return ``values`` as lists of ``counts`` elements; ``length`` is given where the definition fixes it."""
     if length:
         return pa.FixedSizeListArray.from_arrays(values, length)
@@ -78,14 +78,14 @@ class IrregularColumns:
                 children = [
                     self._array(child, field) for child, (_, field) in zip(values.fields, of.fields, strict=True)
                 ]
-                return pa.Array.from_buffers(arrow_type(of), values.count, [None], children=children)
+                return pa.Array.from_buffers(find_arrow_type(of), values.count, [None], children=children)
             case Lists(), Array():
-                return lists(self._array(values.elements, of.element), values.counts, of.length)
+                return make_lists(self._array(values.elements, of.element), values.counts, of.length)
             case Runs(kind=np.dtype() as dtype), Array():
                 elements = number_column(np.frombuffer(self._compact(values)[1], dtype))
-                return lists(elements, values.lengths // dtype.itemsize, of.length)
+                return make_lists(elements, values.lengths // dtype.itemsize, of.length)
             case Runs(kind=str() as codec), Text():
-                found, replaced = texts(len(values.offsets), *self._compact(values), codec)
+                found, replaced = make_texts(len(values.offsets), *self._compact(values), codec)
                 self.replaced_texts += replaced
                 return found
             case Scalars(offsets=offsets, dtype=dtype), Scalar():

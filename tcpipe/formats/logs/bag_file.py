@@ -27,12 +27,12 @@ from tcpipe.formats.logs.bag_records import (
     OP_INDEX,
     BagRecord,
     ChunkRecords,
-    header_fields,
-    indexed_messages,
+    parse_header_fields,
+    read_indexed_messages,
     stamp_ns,
     walk_chunk,
 )
-from tcpipe.formats.logs.chunk_reading import Entries, Excerpt, Messages, by_place, chunk_blocks, copy_pieces
+from tcpipe.formats.logs.chunk_reading import Entries, Excerpt, Messages, copy_pieces, read_chunk_blocks, sort_by_place
 from tcpipe.formats.logs.fetched_file import FetchedFile
 from tcpipe.formats.logs.log_part import (
     MAX_CHUNK_BYTES,
@@ -42,12 +42,12 @@ from tcpipe.formats.logs.log_part import (
     DamageError,
     Int64Array,
     MessageBlock,
-    decompressed,
-    decompressed_prefix,
-    listed,
+    decompress,
+    decompress_prefix,
+    format_numbered,
     outline_of,
 )
-from tcpipe.logs.topics import Damage, normalized_type_name, silence_ns
+from tcpipe.logs.topics import Damage, compute_silence_ns, normalize_type_name
 
 _CHUNK_MARK = b"\x04\0\0\0op=\x05"
 _MAX_CHUNK_HEADER = 128
@@ -105,7 +105,7 @@ class BagPart:
         except LogError:
             self.close()
             raise
-        self.channels = {number: _channel(self._connections[number]) for number in sorted(self._connections)}
+        self.channels = {number: _make_channel(self._connections[number]) for number in sorted(self._connections)}
 
     def _read_index_or_walk(self) -> None:
         try:
@@ -129,7 +129,7 @@ class BagPart:
         """Yield the messages of the wanted connections, chunk by chunk, or some chunks at once where little of them is wanted."""
         if any(chunk.counts is not None and wanted.isdisjoint(chunk.counts) for chunk in self._chunks):
             self._bytes.skips()
-        yield from chunk_blocks(self, wanted, threads=threads)
+        yield from read_chunk_blocks(self, wanted, threads=threads)
 
     def chunks_with(self, wanted: frozenset[int]) -> list[tuple[int, _Chunk]]:
         """Return the chunks that may hold wanted connections, each with the number of bytes in all chunks before it, at most."""
@@ -167,7 +167,7 @@ class BagPart:
 
     def indexed(self, found: Excerpt) -> tuple[Messages, NDArray[np.bool_]]:
         """Return the messages of an excerpt, and which of them there are: the chunk bears its index out."""
-        return indexed_messages(found)
+        return read_indexed_messages(found)
 
     def walked(self, chunk: _Chunk, data: memoryview, wanted: frozenset[int], noted: list[Damage]) -> Messages:
         """Return the wanted messages of a chunk by its records; what these lack is added to ``noted``."""
@@ -196,7 +196,7 @@ class BagPart:
             found.append(Damage(where, "the records of a chunk end before it does", bytes_lost=size - walked.end))
         if unknown := sorted(walked.offsets.keys() - self._connections.keys()):
             lost = sum(len(walked.offsets[number]) for number in unknown)
-            what = f"messages of {listed('connection', unknown)}, which nothing declares"
+            what = f"messages of {format_numbered('connection', unknown)}, which nothing declares"
             found.append(Damage(where, what, messages_lost=lost))
         counts = {number: len(offsets) for number, offsets in walked.offsets.items()}
         if chunk.counts is not None and counts != chunk.counts:
@@ -210,7 +210,7 @@ class BagPart:
         held: list[bytes] = []
         places: list[tuple[int, int, int]] = []
         unsound = []
-        self._bytes.expect([_needed(chunk.offset, chunk.record) for chunk in chunks if chunk.record])
+        self._bytes.expect([_find_needed_bytes(chunk.offset, chunk.record) for chunk in chunks if chunk.record])
         for number, chunk in enumerate(chunks):
             try:
                 found = self._index_of(chunk)
@@ -221,7 +221,7 @@ class BagPart:
             places += [(number, connection, len(entries) // _INDEX_ENTRY_BYTES) for connection, entries in found]
         of, connections, counts = np.array(places, np.int64).reshape(-1, 3).T
         words = np.frombuffer(b"".join(held), "<u4").reshape(-1, 3).astype(np.int64)
-        entries, sound = by_place(
+        entries, sound = sort_by_place(
             np.repeat(of, counts),
             np.repeat(connections, counts),
             words[:, 2],
@@ -291,7 +291,7 @@ class BagPart:
             raise DamageError("no chunk is where the index says")
         if chunk.cut:
             data = self._bytes.read(record.data_offset, self._bytes.size - record.data_offset)
-            kept = data if codec == "none" else decompressed_prefix(codec, data, size)
+            kept = data if codec == "none" else decompress_prefix(codec, data, size)
             what = f"the file ends inside a chunk; {len(kept)} bytes of it are read, unchecked"
             self._note(chunk.offset, what, bytes_lost=size - len(kept))
             return kept
@@ -299,7 +299,7 @@ class BagPart:
             raise DamageError("it runs past the file's end")
         if codec == "none":
             return self._bytes.read(record.data_offset, record.data_bytes)
-        return decompressed(codec, self._bytes.read_once(record.data_offset, record.data_bytes), size)
+        return decompress(codec, self._bytes.read_once(record.data_offset, record.data_bytes), size)
 
     def _read_index(self) -> None:
         """Read the connections and chunk summaries at the file's end; `DamageError` when they cannot be used."""
@@ -348,14 +348,14 @@ class BagPart:
             self._tally(connection, count, chunk.start_ns, chunk.end_ns)
 
     def _take_connection(self, record: BagRecord, data: memoryview | bytes) -> None:
-        described = header_fields(data)
+        described = parse_header_fields(data)
         topic = record.fields.get(b"topic", described.get(b"topic", b""))
         self._bounds.count(len(self._chunks), len(self._connections))
         self._connections.setdefault(
             record.number(b"conn"),
             _Connection(
                 topic.decode(errors="backslashreplace"),
-                normalized_type_name(described.get(b"type", b"").decode(errors="backslashreplace")),
+                normalize_type_name(described.get(b"type", b"").decode(errors="backslashreplace")),
                 described.get(b"message_definition", b"").decode(errors="replace"),
             ),
         )
@@ -451,7 +451,7 @@ class BagPart:
         if len(header) < length + 4:
             raise DamageError("the file ends inside a record")
         return BagRecord(
-            header_fields(header[:length]), position + 8 + length, int.from_bytes(header[length:], "little")
+            parse_header_fields(header[:length]), position + 8 + length, int.from_bytes(header[length:], "little")
         )
 
     def _tally(self, connection: int, count: int, start_ns: int, end_ns: int) -> None:
@@ -475,14 +475,14 @@ class BagPart:
         )
 
 
-def _needed(offset: int, record: BagRecord) -> tuple[int, int]:
+def _find_needed_bytes(offset: int, record: BagRecord) -> tuple[int, int]:
     """Return which bytes (offset, size) are read of a chunk that holds something wanted: of a plain one, its indexes to begin with."""
     return (
         (record.end, _INDEX_HEAD_BYTES) if record.codec == "none" else (offset, record.end + _INDEX_HEAD_BYTES - offset)
     )
 
 
-def _channel(connection: _Connection) -> Channel:
+def _make_channel(connection: _Connection) -> Channel:
     return Channel(
         connection.topic,
         connection.type_name,
@@ -492,5 +492,5 @@ def _channel(connection: _Connection) -> Channel:
         connection.count,
         min(connection.starts, default=None),
         max(connection.ends, default=None),
-        silence_ns(list(zip(connection.starts, connection.ends, strict=True)), connection.count),
+        compute_silence_ns(list(zip(connection.starts, connection.ends, strict=True)), connection.count),
     )

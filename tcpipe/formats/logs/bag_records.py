@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.formats.logs.chunk_reading import Excerpt, Messages
-from tcpipe.formats.logs.log_part import DamageError, gathered
+from tcpipe.formats.logs.log_part import DamageError, gather_integers
 
 MAGIC = b"#ROSBAG V2.0\n"
 
@@ -69,8 +69,8 @@ class ChunkRecords:
         stamp_ns = np.array([at for number in numbers for at in self.stamps[number]], np.int64)
         if not len(offset):
             return Messages(data, channel, offset, offset, offset, stamp_ns, stamp_ns)
-        payload = offset + 8 + gathered(data, offset, "u4")
-        return Messages(data, channel, offset, payload, gathered(data, payload - 4, "u4"), stamp_ns, stamp_ns)
+        payload = offset + 8 + gather_integers(data, offset, "u4")
+        return Messages(data, channel, offset, payload, gather_integers(data, payload - 4, "u4"), stamp_ns, stamp_ns)
 
 
 def walk_chunk(data: memoryview, most: int) -> ChunkRecords:
@@ -93,7 +93,7 @@ def walk_chunk(data: memoryview, most: int) -> ChunkRecords:
         connection = known.get(header[:time_at] + header[time_at + 8 :])
         if connection is None:
             try:
-                record = BagRecord(header_fields(header), header_end + 4, end - header_end - 4)
+                record = BagRecord(parse_header_fields(header), header_end + 4, end - header_end - 4)
                 if record.opcode == OP_CONNECTION:
                     found.connections.append(record)
                 elif record.opcode == OP_MESSAGE:
@@ -112,7 +112,7 @@ def walk_chunk(data: memoryview, most: int) -> ChunkRecords:
     return found
 
 
-def header_fields(header: bytes | memoryview) -> dict[bytes, bytes]:
+def parse_header_fields(header: bytes | memoryview) -> dict[bytes, bytes]:
     """Return the fields of a record's header."""
     header = bytes(header)
     fields, position = {}, 0
@@ -135,7 +135,7 @@ def stamp_ns(fields: dict[bytes, bytes], name: bytes) -> int:
     return seconds * NS + nanoseconds  # type: ignore[no-any-return]
 
 
-def indexed_messages(found: Excerpt) -> tuple[Messages, NDArray[np.bool_]]:
+def read_indexed_messages(found: Excerpt) -> tuple[Messages, NDArray[np.bool_]]:
     """Return the messages of an excerpt, and at which of its entries there is one of that connection and time that ends before the next.
 
     Headers of messages agree but for connection and time, so the first is parsed and the others compared to it.
@@ -145,13 +145,13 @@ def indexed_messages(found: Excerpt) -> tuple[Messages, NDArray[np.bool_]]:
     if not len(offset):
         return none, np.zeros(0, np.bool_)
     room = entries.end - entries.offset
-    length = int(gathered(data, offset[:1], "u4")[0])
+    length = int(gather_integers(data, offset[:1], "u4")[0])
     fits = room >= length + 8
     if not fits[0] or length > MAX_HEADER_BYTES:
         return none, np.zeros(len(offset), np.bool_)
     windows: NDArray[np.uint8] = np.ndarray((len(data) - length - 7, length + 8), np.uint8, data, 0, (1, 1))
     heads = windows[np.where(fits, offset, offset[0])]
-    conn_at, time_at = _places(heads[0, 4 : length + 4].tobytes())
+    conn_at, time_at = _find_message_fields(heads[0, 4 : length + 4].tobytes())
     if not conn_at or not time_at:
         return none, np.zeros(len(offset), np.bool_)
     varies = np.zeros(length + 8, np.bool_)
@@ -170,10 +170,10 @@ def indexed_messages(found: Excerpt) -> tuple[Messages, NDArray[np.bool_]]:
     return Messages(data, channel, offset, offset + (length + 8), payload_bytes, stamp_ns, stamp_ns), true
 
 
-def _places(header: bytes) -> tuple[int, int]:
+def _find_message_fields(header: bytes) -> tuple[int, int]:
     """Return where in a message's record its connection and its time stand; zeros where the header is none of a message."""
     try:
-        fields = header_fields(header)
+        fields = parse_header_fields(header)
     except DamageError:
         return 0, 0
     sizes = len(fields.get(b"conn", b"")), len(fields.get(b"time", b""))

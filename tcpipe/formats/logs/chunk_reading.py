@@ -13,7 +13,7 @@ from typing import Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.formats.logs.log_part import DamageError, Int64Array, MessageBlock, blocks_by_channel, in_order
+from tcpipe.formats.logs.log_part import DamageError, Int64Array, MessageBlock, map_in_order, split_by_channel
 from tcpipe.logs.topics import Damage
 
 GROUP_BYTES = 1 << 23
@@ -114,7 +114,7 @@ class Messages:
         if (self.channel[1:] < self.channel[:-1]).any():
             order = np.argsort(self.channel, kind="stable")
             found, ordinal = self.at(order), ordinal[order]
-        return blocks_by_channel(
+        return split_by_channel(
             found.data,
             found.channel,
             found.payload,
@@ -141,7 +141,7 @@ AnyChunk = TypeVar("AnyChunk", bound=PlacedChunk)
 
 
 class ChunkedFile(Protocol[AnyChunk]):
-    """A file of chunks: what `chunk_blocks` asks of it. `DamageError` where a chunk is lost."""
+    """A file of chunks: what `read_chunk_blocks` asks of it. `DamageError` where a chunk is lost."""
 
     name: str
     damage: dict[Damage, None]
@@ -174,30 +174,32 @@ class ChunkedFile(Protocol[AnyChunk]):
         """Return what to say of a chunk that is lost as a whole."""
 
 
-def chunk_blocks(file: ChunkedFile[AnyChunk], wanted: frozenset[int], *, threads: int) -> Iterator[MessageBlock]:
+def read_chunk_blocks(file: ChunkedFile[AnyChunk], wanted: frozenset[int], *, threads: int) -> Iterator[MessageBlock]:
     """Yield the messages of the wanted channels, chunk by chunk, or some chunks at once where little of them is wanted."""
 
     def read(planned: tuple[Span, list[tuple[int, AnyChunk]]]) -> tuple[list[MessageBlock], list[Damage]]:
         noted: list[Damage] = []
-        return list(_span_blocks(file, *planned, wanted, noted)), noted
+        return list(_read_span_blocks(file, *planned, wanted, noted)), noted
 
-    for blocks, noted in in_order(read, _planned(file, wanted), threads=threads):
+    for blocks, noted in map_in_order(read, _plan_spans(file, wanted), threads=threads):
         file.damage.update(dict.fromkeys(noted))
         yield from blocks
 
 
-def _planned(file: ChunkedFile[AnyChunk], wanted: frozenset[int]) -> Iterator[tuple[Span, list[tuple[int, AnyChunk]]]]:
+def _plan_spans(
+    file: ChunkedFile[AnyChunk], wanted: frozenset[int]
+) -> Iterator[tuple[Span, list[tuple[int, AnyChunk]]]]:
     """Yield what to read at once, and the chunks of its group; the indexes of a group are read ahead."""
     chunks = file.chunks_with(wanted)
-    for group in groups(chunk.size for _, chunk in chunks):
+    for group in group_chunks(chunk.size for _, chunk in chunks):
         members = chunks[group.start : group.stop]
         sizes = np.array([min(chunk.size, MAX_PLANNED_BYTES) for _, chunk in members], np.int64)
         entries, sound = file.entries([chunk for _, chunk in members], sizes)
-        for span in spans(entries, sizes, sound, sorted(wanted)):
+        for span in plan_chunk_spans(entries, sizes, sound, sorted(wanted)):
             yield span, members
 
 
-def _span_blocks(
+def _read_span_blocks(
     file: ChunkedFile[AnyChunk],
     span: Span,
     members: list[tuple[int, AnyChunk]],
@@ -207,7 +209,7 @@ def _span_blocks(
     """Yield the wanted messages of a span; what is lost or contradicts itself is added to ``noted``."""
     doubtful: Sequence[int] = span.chunks
     if span.entries is not None:
-        found = excerpt(
+        found = read_excerpt(
             span,
             span.entries,
             load=lambda number: file.load(members[number][1]),
@@ -220,7 +222,7 @@ def _span_blocks(
         if doubtful:
             right = ~np.isin(found.entries.chunk, doubtful)
             messages, ordinal = messages.at(right), ordinal[right]
-        yield from _in_time(file.name, messages, ordinal, noted)
+        yield from _split_in_time(file.name, messages, ordinal, noted)
     for number in doubtful:
         base, chunk = members[number]
         try:
@@ -230,11 +232,11 @@ def _span_blocks(
         else:
             messages = file.walked(chunk, data, wanted, noted)
             entries = None if span.entries is None else span.entries.of_chunk(number)
-            noted += _disagreement(file, chunk, messages, entries)
-            yield from _in_time(file.name, messages, base + messages.offset, noted)
+            noted += _find_index_disagreement(file, chunk, messages, entries)
+            yield from _split_in_time(file.name, messages, base + messages.offset, noted)
 
 
-def _in_time(name: str, messages: Messages, ordinal: Int64Array, noted: list[Damage]) -> list[MessageBlock]:
+def _split_in_time(name: str, messages: Messages, ordinal: Int64Array, noted: list[Damage]) -> list[MessageBlock]:
     """Return messages as blocks, without those whose time is past what 63 bits hold."""
     times = (messages.log_time_ns >= 0) & (messages.publish_time_ns >= 0)
     if not times.all():
@@ -243,7 +245,7 @@ def _in_time(name: str, messages: Messages, ordinal: Int64Array, noted: list[Dam
     return messages.blocks(ordinal)
 
 
-def _disagreement(
+def _find_index_disagreement(
     file: ChunkedFile[AnyChunk], chunk: AnyChunk, messages: Messages, entries: Entries | None
 ) -> list[Damage]:
     """Return what to say where a chunk's index is broken, or names other messages than its records hold."""
@@ -261,7 +263,7 @@ def _disagreement(
     return [Damage(where, what, messages_lost=0 if file.is_proved(chunk) else lost or None)]
 
 
-def groups(sizes: Iterable[int]) -> Iterator[range]:
+def group_chunks(sizes: Iterable[int]) -> Iterator[range]:
     """Yield which of successive chunks of these sizes [byte] to plan together."""
     first = last = held = 0
     for size in sizes:
@@ -274,7 +276,7 @@ def groups(sizes: Iterable[int]) -> Iterator[range]:
         yield range(first, last)
 
 
-def by_place(
+def sort_by_place(
     chunk: Int64Array,
     channel: Int64Array,
     offset: Int64Array,
@@ -300,7 +302,9 @@ def by_place(
     return (entries if sound.all() else entries.at(sound[chunk])), sound
 
 
-def spans(entries: Entries, sizes: Int64Array, sound: NDArray[np.bool_], wanted: Sequence[int]) -> Iterator[Span]:
+def plan_chunk_spans(
+    entries: Entries, sizes: Int64Array, sound: NDArray[np.bool_], wanted: Sequence[int]
+) -> Iterator[Span]:
     """Yield, in order, how to read the chunks of a group: those of which little is wanted together, others one by one.
 
     Parameters
@@ -324,7 +328,7 @@ def spans(entries: Entries, sizes: Int64Array, sound: NDArray[np.bool_], wanted:
         first = after
 
 
-def layout(entries: Entries) -> ChunkLayout:
+def find_chunk_layout(entries: Entries) -> ChunkLayout:
     """Return the pieces of a span's chunks that hold its messages."""
     begins = np.ones(len(entries.offset), np.bool_)
     far = entries.offset[1:] - entries.end[:-1] > _GAP_BYTES
@@ -339,7 +343,7 @@ def layout(entries: Entries) -> ChunkLayout:
     return ChunkLayout(places, offset, int((stop - start).sum()))
 
 
-def excerpt(
+def read_excerpt(
     span: Span,
     entries: Entries,
     *,
@@ -354,7 +358,7 @@ def excerpt(
     load : returns all records of a chunk by its number.
     copy : copies pieces (start, stop, place) of a chunk into a buffer. Both raise `DamageError` where the chunk is lost.
     """
-    kept = layout(entries) if span.compact else None
+    kept = find_chunk_layout(entries) if span.compact else None
     data = np.empty(kept.size if kept else 0, np.uint8).data
     lost = []
     for number in span.chunks:

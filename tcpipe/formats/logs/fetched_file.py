@@ -79,7 +79,7 @@ class FetchedFile:
             found = {number: self._held[number] for number in numbers if number in self._held}
             for number in found:
                 self._held.move_to_end(number)
-        runs = _runs(sorted(set(numbers) - found.keys()))
+        runs = _find_runs(sorted(set(numbers) - found.keys()))
         size = self._stored.size_bytes
         spans = [(run.start * _BLOCK_BYTES, min(run.stop * _BLOCK_BYTES, size)) for run in runs]
         for run, data in zip(runs, self._stored.ranges(spans) if spans else (), strict=True):
@@ -95,7 +95,7 @@ class FetchedFile:
         return found
 
 
-def _runs(numbers: Sequence[int]) -> list[range]:
+def _find_runs(numbers: Sequence[int]) -> list[range]:
     """Return rising numbers as runs, short gaps filled."""
     runs: list[range] = []
     for number in numbers:

@@ -6,13 +6,13 @@ from contextlib import ExitStack
 from pathlib import Path
 
 from tcpipe.errors import LogError
-from tcpipe.formats.atomic import scratch_directory
+from tcpipe.formats.atomic import make_scratch_directory
 from tcpipe.formats.logs import bag_records, mcap_records, sqlite_file
 from tcpipe.formats.logs.bag_file import BagPart
 from tcpipe.formats.logs.fetched_file import FetchedFile
 from tcpipe.formats.logs.log_part import LogPart
 from tcpipe.formats.logs.mcap_file import McapPart
-from tcpipe.formats.logs.rosbag2 import ZSTD_MAGIC, decompressed_file
+from tcpipe.formats.logs.rosbag2 import ZSTD_MAGIC, decompress_file
 from tcpipe.formats.logs.sqlite_file import SqlitePart
 
 WANTED = "wanted an .mcap, a .bag (2.0), or a ROS 2 bag directory or .db3"
@@ -31,14 +31,14 @@ _KNOWN_MAGIC = (
 
 def open_part(path: Path, name: str, stack: ExitStack, fetched: FetchedFile | None) -> LogPart:
     """Open a file of a log until the stack ends; `LogError` where it is none, which says what it seems to be."""
-    magic, given = _magic(path, fetched), path
+    magic, given = _read_magic(path, fetched), path
     if fetched is not None and not magic.startswith((mcap_records.MAGIC, bag_records.MAGIC)):
         fetched.whole()
     if magic.startswith(ZSTD_MAGIC):
-        path = decompressed_file(path, stack.enter_context(scratch_directory()))
-        magic = _magic(path, None)
+        path = decompress_file(path, stack.enter_context(make_scratch_directory()))
+        magic = _read_magic(path, None)
     part: LogPart
-    if magic.startswith(mcap_records.MAGIC) or _tail(path, len(mcap_records.MAGIC)) == mcap_records.MAGIC:
+    if magic.startswith(mcap_records.MAGIC) or _read_tail(path, len(mcap_records.MAGIC)) == mcap_records.MAGIC:
         part = McapPart(path, name, fetched)
     elif magic.startswith(bag_records.MAGIC):
         part = BagPart(path, name, fetched)
@@ -46,21 +46,21 @@ def open_part(path: Path, name: str, stack: ExitStack, fetched: FetchedFile | No
         part = SqlitePart(path, name)
     else:
         held = "" if path == given else "what it holds, decompressed: "
-        raise LogError(f"{given}: not a log: {held}{_described(path, magic)}; {WANTED}")
+        raise LogError(f"{given}: not a log: {held}{_describe_other_file(path, magic)}; {WANTED}")
     stack.callback(part.close)
     return part
 
 
-def container_of(path: Path, fetched: FetchedFile | None) -> str:
+def find_container(path: Path, fetched: FetchedFile | None) -> str:
     """Return ``bag``, ``mcap`` or ``rosbag2``."""
     name = path.name.removesuffix(".zstd")
-    magic = _magic(path, fetched)
+    magic = _read_magic(path, fetched)
     if magic.startswith(bag_records.MAGIC):
         return "bag"
     return "mcap" if magic.startswith(mcap_records.MAGIC) or name.endswith(".mcap") else "rosbag2"
 
 
-def _magic(path: Path, fetched: FetchedFile | None) -> bytes:
+def _read_magic(path: Path, fetched: FetchedFile | None) -> bytes:
     if fetched is not None and not fetched.is_whole:
         return fetched.read(0, 16)
     try:
@@ -70,7 +70,7 @@ def _magic(path: Path, fetched: FetchedFile | None) -> bytes:
         raise LogError(f"{path}: it cannot be read ({error.strerror})") from None
 
 
-def _tail(path: Path, size: int) -> bytes:
+def _read_tail(path: Path, size: int) -> bytes:
     """Return a file's last bytes; nothing where they cannot be read."""
     try:
         with path.open("rb") as file:
@@ -80,7 +80,7 @@ def _tail(path: Path, size: int) -> bytes:
         return b""
 
 
-def _described(path: Path, magic: bytes) -> str:
+def _describe_other_file(path: Path, magic: bytes) -> str:
     """Say what a file that is no log seems to be."""
     if not magic:
         return "it is empty (0 bytes)"

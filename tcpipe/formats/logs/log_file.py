@@ -19,12 +19,12 @@ import pyarrow as pa
 from tcpipe.errors import LogError
 from tcpipe.formats.logs.arrow_columns import TopicTable
 from tcpipe.formats.logs.fetched_file import FetchedFile
-from tcpipe.formats.logs.log_container import WANTED, container_of, open_part
+from tcpipe.formats.logs.log_container import WANTED, find_container, open_part
 from tcpipe.formats.logs.log_part import Channel, LogPart, MessageBlock
 from tcpipe.formats.logs.ros_types import DefinitionError, MessageType, TypeLibrary
-from tcpipe.formats.logs.rosbag2 import METADATA, STORAGE_SUFFIXES, decompressed_blocks, is_one_bag, rosbag2_files
-from tcpipe.formats.object_storage import StoredObject, is_url, laid_out
-from tcpipe.logs.topics import Damage, Topic, condensed
+from tcpipe.formats.logs.rosbag2 import METADATA, STORAGE_SUFFIXES, decompress_blocks, find_rosbag2_files, is_one_bag
+from tcpipe.formats.object_storage import StoredObject, is_url, lay_out_objects
+from tcpipe.logs.topics import Damage, Topic, condense_damage
 from tcpipe.progress import Meter
 
 _READ_BY_RANGE = (".mcap", ".bag")
@@ -63,7 +63,7 @@ def open_log(path: Path | str, *, message_definitions: Path | None = None) -> Lo
     with ExitStack() as stack:
         stored: dict[Path, StoredObject] = {}
         if is_url(path):
-            path, stored = stack.enter_context(laid_out(str(path), wanted=belongs_to_a_log, by_range=_READ_BY_RANGE))
+            path, stored = stack.enter_context(lay_out_objects(str(path), wanted=is_log_file, by_range=_READ_BY_RANGE))
         path = Path(path)
         _refuse_what_is_no_file(path)
         fetched = {file: FetchedFile(of, file) for file, of in stored.items()}
@@ -84,7 +84,7 @@ def _refuse_what_is_not_there(path: Path) -> None:
         raise LogError(f"{path}: there is no such file or directory")
 
 
-def belongs_to_a_log(name: str) -> bool:
+def is_log_file(name: str) -> bool:
     """Return whether a file of this name is a log or part of one."""
     return name.lower().endswith((*LOG_SUFFIXES, ".db3-wal")) or name == METADATA
 
@@ -103,15 +103,15 @@ def find_logs(path: Path) -> list[Path]:
     _refuse_what_is_not_there(path)
     if not path.is_dir():
         return [path]
-    found = logs_below(path)
+    found = list_logs_below(path)
     if not found:
         raise LogError(f"{path}: no log in this directory or below it; {WANTED}")
     return found
 
 
-def logs_below(directory: Path) -> list[Path]:
+def list_logs_below(directory: Path) -> list[Path]:
     """Return the logs in a directory as `find_logs` does; none where there is none."""
-    return list(_logs_below(directory))
+    return list(_iterate_logs_below(directory))
 
 
 @dataclass(frozen=True, slots=True)
@@ -175,7 +175,7 @@ class Log:
         found = dict(self._damage)
         for part in self._parts:
             found.update(part.damage)
-        return condensed(list(found))
+        return condense_damage(list(found))
 
     @property
     def remarks(self) -> list[str]:
@@ -338,7 +338,7 @@ class Log:
         unknown = [name for name in wanted if name not in self.topics]
         if unknown:
             raise LogError(
-                *(f"{self.path}: there is no topic {name}; it has {_listed(self.topics)}" for name in unknown)
+                *(f"{self.path}: there is no topic {name}; it has {_format_list(self.topics)}" for name in unknown)
             )
         types, columns = {}, 0
         for name in wanted:
@@ -372,7 +372,7 @@ class Log:
                     what = f"the topic changes its type to {channel.type_name} ({channel.encoding}); these messages are left out"
                     self._damage[Damage(part.name, what, channel.topic, channel.message_count)] = None
         if channels:
-            for block in decompressed_blocks(part, frozenset(channels), threads=threads):
+            for block in decompress_blocks(part, frozenset(channels), threads=threads):
                 later = replace(block, ordinal=block.ordinal + (index << 48)) if index else block
                 yield channels[block.channel], later
 
@@ -430,7 +430,7 @@ class Log:
         topics: dict[str, Topic] = {}
         channels = [channel for part in self._parts for channel in part.channels.values()]
         for channel in sorted(channels, key=lambda c: (c.topic, -(c.message_count or 0), not c.definition)):
-            topic = _topic(channel, self._types)
+            topic = _make_topic(channel, self._types)
             first = self._channel_of.setdefault(channel.topic, channel)
             if channel is first:
                 topics[channel.topic] = topic
@@ -441,7 +441,7 @@ class Log:
         return topics
 
 
-def _topic(channel: Channel, types: TypeLibrary) -> Topic:
+def _make_topic(channel: Channel, types: TypeLibrary) -> Topic:
     problem = None
     if channel.encoding not in ("cdr", "ros1"):
         problem = f"its messages are encoded as {channel.encoding or 'nothing known'}; cdr and ros1 are read"
@@ -465,15 +465,15 @@ def _topic(channel: Channel, types: TypeLibrary) -> Topic:
 
 def _open_file(path: Path, stack: ExitStack, fetched: Mapping[Path, FetchedFile]) -> _OpenFiles:
     part = open_part(path, path.name, stack, fetched.get(path))
-    return _OpenFiles(container_of(path, fetched.get(path)), (path,), (part,), fetched)
+    return _OpenFiles(find_container(path, fetched.get(path)), (path,), (part,), fetched)
 
 
 def _open_directory(directory: Path, stack: ExitStack, fetched: Mapping[Path, FetchedFile]) -> _OpenFiles:
     """Open the files of a ROS 2 bag; one that cannot be opened costs only itself."""
     try:
-        found = rosbag2_files(directory)
+        found = find_rosbag2_files(directory)
     except LogError as error:
-        below = [str(path) for path in islice(_logs_below(directory), _LISTED + 1) if path.parent != directory]
+        below = [str(path) for path in islice(_iterate_logs_below(directory), _LISTED + 1) if path.parent != directory]
         if not below:
             raise
         names = ", ".join(below[:_LISTED]) + (" and more" if len(below) > _LISTED else "")
@@ -501,7 +501,7 @@ def _allow_files(count: int) -> None:
         resource.setrlimit(resource.RLIMIT_NOFILE, (most, hard))
 
 
-def _logs_below(directory: Path) -> Iterator[Path]:
+def _iterate_logs_below(directory: Path) -> Iterator[Path]:
     """Yield the logs in and below a directory; each directory is looked at once, whatever links lead to it."""
     seen: set[tuple[int, int]] = set()
     waiting = [(directory, True)]
@@ -513,12 +513,12 @@ def _logs_below(directory: Path) -> Iterator[Path]:
                 yield path
             elif (found.st_dev, found.st_ino) not in seen:
                 seen.add((found.st_dev, found.st_ino))
-                waiting += reversed(_entries(path))
+                waiting += reversed(_list_entries(path))
         except OSError:
             yield path
 
 
-def _entries(directory: Path) -> list[tuple[Path, bool]]:
+def _list_entries(directory: Path) -> list[tuple[Path, bool]]:
     """Return what may be a log in a directory, and whether it is one that has to be looked into; the directory itself where it is a bag."""
     with os.scandir(directory) as there:
         entries = sorted(there, key=lambda entry: entry.name)
@@ -543,5 +543,5 @@ def _is_directory(entry: os.DirEntry[str]) -> bool:
     return False
 
 
-def _listed(topics: Iterable[str]) -> str:
+def _format_list(topics: Iterable[str]) -> str:
     return ", ".join(sorted(topics)) or "no topics"

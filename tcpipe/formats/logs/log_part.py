@@ -92,7 +92,7 @@ class MessageBlock:
     length: int | None
 
 
-def blocks_by_channel(
+def split_by_channel(
     buffer: memoryview,
     channels: Int64Array,
     offsets: Int64Array,
@@ -122,7 +122,7 @@ def blocks_by_channel(
     ]
 
 
-def grouped(keys: Int64Array) -> Iterator[tuple[int, Int64Array]]:
+def group_by_key(keys: Int64Array) -> Iterator[tuple[int, Int64Array]]:
     """Yield each key, rising, and where it stands, shape (M,) each: at the cost of one sort, however many keys there are."""
     order = np.argsort(keys, kind="stable")
     starts = np.flatnonzero(np.diff(keys[order], prepend=keys[order[:1]] - 1))
@@ -245,7 +245,7 @@ class ByteSource:
         try:
             return os.pread(self._file.fileno(), size, offset)
         except OSError as error:
-            raise _unreadable(offset, error) from None
+            raise _make_unreadable_error(offset, error) from None
 
     def _fill(self, view: memoryview, offset: int) -> bool:
         """Read the bytes at ``offset`` into a view; return whether there were enough."""
@@ -256,10 +256,10 @@ class ByteSource:
         try:
             return os.preadv(self._file.fileno(), [view], offset) == len(view)
         except OSError as error:
-            raise _unreadable(offset, error) from None
+            raise _make_unreadable_error(offset, error) from None
 
 
-def _unreadable(offset: int, error: OSError) -> DamageError:
+def _make_unreadable_error(offset: int, error: OSError) -> DamageError:
     return DamageError(f"the disk does not give what lies at byte {offset} ({error.strerror})")
 
 
@@ -287,10 +287,10 @@ def load_only(window: mmap.mmap, starts: Int64Array, ends: Int64Array) -> None:
             window.madvise(_MADV_POPULATE_READ, start, size)
         except OSError as error:
             if error.errno != errno.EINVAL:  # which an older system says: it does not know this advice
-                raise _unreadable(start, error) from None
+                raise _make_unreadable_error(start, error) from None
 
 
-def in_order(work: Callable[[_Piece], _Result], pieces: Iterable[_Piece], *, threads: int) -> Iterator[_Result]:
+def map_in_order(work: Callable[[_Piece], _Result], pieces: Iterable[_Piece], *, threads: int) -> Iterator[_Result]:
     """Yield ``work(piece)`` of each piece in their order; several threads run ahead by one piece each."""
     if threads <= 1:
         yield from map(work, pieces)
@@ -314,7 +314,7 @@ def outline_of(size: int, index: bytes | memoryview) -> str:
     return hashlib.sha256(size.to_bytes(8, "little") + bytes(index)).hexdigest()
 
 
-def listed(what: str, numbers: Sequence[int]) -> str:
+def format_numbered(what: str, numbers: Sequence[int]) -> str:
     """Return a short list of numbered things: ``topic 3``, ``2 topics (3, 7)``."""
     if len(numbers) == 1:
         return f"{what} {numbers[0]}"
@@ -322,7 +322,7 @@ def listed(what: str, numbers: Sequence[int]) -> str:
     return f"{len(numbers)} {what}s ({shown}{', …' if len(numbers) > _LISTED else ''})"
 
 
-def no_room(error: Exception) -> str:
+def describe_full_disk(error: Exception) -> str:
     """Say that there is no room for a copy of a log, where that is the error; else nothing."""
     full = isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
     return "no room for a copy here; TMPDIR names a place that has some" if full else ""
@@ -385,7 +385,7 @@ def search_windows(start: int, end: int, overlap: int) -> Iterator[tuple[int, in
         start, size = start + size, min(2 * size, SEARCH_BYTES)
 
 
-def decompressed(codec: str, data: memoryview, size: int, *, checked: bool = False) -> memoryview:
+def decompress(codec: str, data: memoryview, size: int, *, checked: bool = False) -> memoryview:
     """Return the ``size`` bytes that ``data`` holds.
 
     Parameters
@@ -405,7 +405,7 @@ def decompressed(codec: str, data: memoryview, size: int, *, checked: bool = Fal
         raise DamageError(f"it claims to hold {size} bytes in {len(data)}")
     _refuse_unknown(codec)
     try:
-        if codec == "zstd" or (codec == "lz4" and (checked or _lz4_content_bytes(data) == size)):
+        if codec == "zstd" or (codec == "lz4" and (checked or _read_lz4_content_size(data) == size)):
             return memoryview(pa.decompress(pa.py_buffer(data), size, codec=codec)).cast("B")
         with pa.CompressedInputStream(pa.BufferReader(pa.py_buffer(data)), codec) as stream:
             found = stream.read_buffer(size)
@@ -422,7 +422,7 @@ def _refuse_unknown(codec: str) -> None:
         raise DamageError(f"its compression {codec!r} is unknown (lz4, zstd and bz2 are read)")
 
 
-def _lz4_content_bytes(frame: memoryview) -> int:
+def _read_lz4_content_size(frame: memoryview) -> int:
     """Return what an LZ4 frame says of its content's size, which decompressing proves; -1 where it says nothing.
 
     Without either this or a checksum, what a frame lacks of the size that a chunk claims would be whatever lay in memory before.
@@ -432,7 +432,7 @@ def _lz4_content_bytes(frame: memoryview) -> int:
     return int(_LZ4_HEAD.unpack_from(frame)[3])
 
 
-def decompressed_prefix(codec: str, data: memoryview, size: int) -> memoryview:
+def decompress_prefix(codec: str, data: memoryview, size: int) -> memoryview:
     """Return as many of the ``size`` bytes as the cut ``data`` still gives."""
     _refuse_unknown(codec)
     found = bytearray()
@@ -445,7 +445,7 @@ def decompressed_prefix(codec: str, data: memoryview, size: int) -> memoryview:
     return memoryview(found)[:size]
 
 
-def gathered(buffer: bytes | memoryview, offsets: Int64Array, code: str) -> Int64Array:
+def gather_integers(buffer: bytes | memoryview, offsets: Int64Array, code: str) -> Int64Array:
     """Return the little-endian integers (numpy's ``code``: ``u2``, ``u4``, ``i8``) that lie at ``offsets``, of any alignment.
 
     The caller has checked the bounds. Unsigned 64-bit values are read as ``i8``: no length or time in a log reaches the sign bit, and

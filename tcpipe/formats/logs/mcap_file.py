@@ -22,9 +22,9 @@ from tcpipe.formats.logs.chunk_reading import (
     Entries,
     Excerpt,
     Messages,
-    by_place,
-    chunk_blocks,
     copy_pieces,
+    read_chunk_blocks,
+    sort_by_place,
 )
 from tcpipe.formats.logs.fetched_file import FetchedFile
 from tcpipe.formats.logs.log_part import (
@@ -35,11 +35,11 @@ from tcpipe.formats.logs.log_part import (
     DamageError,
     Int64Array,
     MessageBlock,
-    decompressed,
-    decompressed_prefix,
-    gathered,
-    grouped,
-    listed,
+    decompress,
+    decompress_prefix,
+    format_numbered,
+    gather_integers,
+    group_by_key,
 )
 from tcpipe.formats.logs.mcap_records import (
     CHUNK_CRC,
@@ -59,15 +59,15 @@ from tcpipe.formats.logs.mcap_records import (
     Chunk,
     Contents,
     Schema,
+    find_message_offsets,
     index_entries,
     index_messages,
-    message_offsets,
-    messages_at,
     parse_chunk_head,
+    read_messages_at,
     read_summary,
     record_offsets,
 )
-from tcpipe.logs.topics import Damage, normalized_type_name, silence_ns
+from tcpipe.logs.topics import Damage, compute_silence_ns, normalize_type_name
 
 _LOOSE_BYTES = 1 << 22
 """Messages outside chunks are read in runs of about this size."""
@@ -149,7 +149,7 @@ class McapPart:
         if any(chunk.index is not None and wanted.isdisjoint(chunk.index) for chunk in self._contents.chunks):
             self._bytes.skips()
 
-        yield from chunk_blocks(self, wanted, threads=threads)
+        yield from read_chunk_blocks(self, wanted, threads=threads)
         self._note_odd_ones_without_crc()
 
     def chunks_with(self, wanted: frozenset[int]) -> list[tuple[int, Chunk]]:
@@ -163,7 +163,7 @@ class McapPart:
 
     def indexed(self, found: Excerpt) -> tuple[Messages, NDArray[np.bool_]]:
         """Return the messages of an excerpt, and which of them there are: the chunk bears its index out."""
-        messages, right = messages_at(found.data, found.offset)
+        messages, right = read_messages_at(found.data, found.offset)
         entries = found.entries
         room = entries.end - entries.offset - RECORD_HEAD - MESSAGE_HEAD
         same = (messages.channel == entries.channel) & (messages.log_time_ns == entries.log_time_ns)
@@ -178,7 +178,7 @@ class McapPart:
     def walked(self, chunk: Chunk, data: memoryview, wanted: frozenset[int], noted: list[Damage]) -> Messages:
         """Return the wanted messages of a chunk by its records; where these end too early, or are none, that is noted."""
         records, end = self._records(chunk, data)
-        messages, _ = messages_at(data, message_offsets(data, records))
+        messages, _ = read_messages_at(data, find_message_offsets(data, records))
         every = int((np.frombuffer(data, np.uint8)[records] == OP_MESSAGE).sum()) if len(records) else 0
         where = f"{self.name}, byte {chunk.offset}"
         if lost := every - len(messages.offset):
@@ -188,7 +188,7 @@ class McapPart:
         unknown = [n for n in np.unique(messages.channel).tolist() if n not in self._contents.channels]
         counted = chunk.headless or (chunk.index is None and not self._contents.statistics)  # when the file was opened
         if unknown and not counted:
-            what = f"messages of {listed('channel', unknown)}, which nothing declares"
+            what = f"messages of {format_numbered('channel', unknown)}, which nothing declares"
             noted.append(Damage(where, what, messages_lost=int(np.isin(messages.channel, unknown).sum())))
         return messages.at(np.isin(messages.channel, sorted(wanted)))
 
@@ -253,7 +253,7 @@ class McapPart:
             return self._load_cut(chunk, self._bytes.read(chunk.data_offset, chunk.data_bytes))
         if chunk.compression:
             data = self._bytes.read_once(chunk.data_offset, chunk.data_bytes)
-            data = decompressed(chunk.compression, data, chunk.uncompressed_bytes, checked=bool(crc))
+            data = decompress(chunk.compression, data, chunk.uncompressed_bytes, checked=bool(crc))
         else:
             data = (self._bytes.read_once if once else self._bytes.read)(chunk.data_offset, chunk.data_bytes)
         if crc and crc32(data) != crc:
@@ -261,7 +261,7 @@ class McapPart:
         return data
 
     def _load_cut(self, chunk: Chunk, data: memoryview) -> memoryview:
-        kept = decompressed_prefix(chunk.compression, data, chunk.uncompressed_bytes) if chunk.compression else data
+        kept = decompress_prefix(chunk.compression, data, chunk.uncompressed_bytes) if chunk.compression else data
         lost = chunk.uncompressed_bytes - len(kept)
         self._note(
             chunk.offset, f"the file ends inside a chunk; {len(kept)} bytes of it are read, unchecked", bytes_lost=lost
@@ -273,7 +273,7 @@ class McapPart:
         regions: list[memoryview | bytes] = []
         places: list[tuple[int, int, int, int]] = []
         unsound, before = [], 0
-        self._bytes.expect([_needed(chunk) for chunk in chunks if chunk.index is not None])
+        self._bytes.expect([_find_needed_bytes(chunk) for chunk in chunks if chunk.index is not None])
         for number, chunk in enumerate(chunks):
             if chunk.index is None or chunk.cut or chunk.size > MAX_PLANNED_BYTES:
                 unsound.append(number)
@@ -289,7 +289,7 @@ class McapPart:
             before = end
         of, channels, at, ends = np.array(places, np.int64).reshape(-1, 4).T
         right, record, stamps, offsets = index_messages(b"".join(regions), at, ends, channels)
-        entries, sound = by_place(
+        entries, sound = sort_by_place(
             of[record], channels[record], offsets, stamps, sizes, least_bytes=RECORD_HEAD + MESSAGE_HEAD
         )
         sound[unsound] = False
@@ -430,7 +430,7 @@ class McapPart:
     def _next_chunk(self, start: int, end: int) -> int:
         """Return where the next plausible chunk begins: its lengths agree with one another and with the file's."""
         for block_start, size, block in self._bytes.windows(start, end, RECORD_HEAD + CHUNK_HEAD + 4):
-            for candidate in _possible_chunks(block, size):
+            for candidate in _find_possible_chunks(block, size):
                 length = int.from_bytes(block[candidate + 1 : candidate + RECORD_HEAD], "little")
                 try:
                     chunk = parse_chunk_head(block[candidate + RECORD_HEAD :], block_start + candidate)
@@ -466,7 +466,9 @@ class McapPart:
             self._note(0, "messages without times", messages_lost=self._untimed)
         if unknown := sorted(self._tallies.keys() - self._contents.channels.keys()):
             lost = sum(self._tallies[channel].count for channel in unknown)
-            self._note(0, f"messages of {listed('channel', unknown)}, which nothing declares", messages_lost=lost)
+            self._note(
+                0, f"messages of {format_numbered('channel', unknown)}, which nothing declares", messages_lost=lost
+            )
 
     def _declare_and_count(self, chunk: Chunk) -> None:
         try:
@@ -477,7 +479,7 @@ class McapPart:
         records, _ = self._records(chunk, data)
         self._declare(chunk, data, records)
         if chunk.index is None:
-            self._tally_messages(data, message_offsets(data, records))
+            self._tally_messages(data, find_message_offsets(data, records))
 
     def _declare(self, chunk: Chunk, data: memoryview, records: Int64Array) -> None:
         for offset in records.tolist():
@@ -499,14 +501,14 @@ class McapPart:
             count, start_ns, end_ns = tally.count, tally.start_ns, tally.end_ns
         return Channel(
             channel.topic,
-            normalized_type_name(schema.name),
+            normalize_type_name(schema.name),
             channel.encoding,
             schema.encoding,
             schema.definition,
             count,
             start_ns,
             end_ns,
-            silence_ns([(chunk.start_ns, chunk.end_ns) for chunk in self._holding(number)], count),
+            compute_silence_ns([(chunk.start_ns, chunk.end_ns) for chunk in self._holding(number)], count),
         )
 
     def _holding(self, channel: int) -> list[Chunk]:
@@ -534,9 +536,9 @@ class McapPart:
         tally.end_ns = end_ns if tally.end_ns is None else max(end_ns, tally.end_ns)
 
     def _tally_messages(self, data: memoryview, messages: Int64Array) -> None:
-        channels = gathered(data, messages + RECORD_HEAD, "u2") if len(messages) else np.zeros(0, np.int64)
-        for channel, of in grouped(channels):
-            stamps = gathered(data, messages[of] + RECORD_HEAD + 6, "i8")
+        channels = gather_integers(data, messages + RECORD_HEAD, "u2") if len(messages) else np.zeros(0, np.int64)
+        for channel, of in group_by_key(channels):
+            stamps = gather_integers(data, messages[of] + RECORD_HEAD + 6, "i8")
             self._tally(channel, len(stamps), int(stamps.min()), int(stamps.max()))
 
     def _note(self, offset: int, what: str, *, messages_lost: int | None = None, bytes_lost: int | None = None) -> None:
@@ -581,18 +583,18 @@ class _LooseMessages:
         self._start = self._end = 0
 
 
-def _needed(chunk: Chunk) -> tuple[int, int]:
+def _find_needed_bytes(chunk: Chunk) -> tuple[int, int]:
     """Return which bytes (offset, size) are read of a chunk that holds something wanted: of a plain one, its indexes to begin with."""
     start = chunk.offset if chunk.compression else chunk.end
     return start, chunk.end + chunk.index_bytes - start
 
 
-def _possible_chunks(block: memoryview, size: int) -> list[int]:
+def _find_possible_chunks(block: memoryview, size: int) -> list[int]:
     """Return where in ``size`` bytes a chunk's opcode is followed, at the right distance, by the length of a compression's name."""
     opcodes = np.frombuffer(block, np.uint8)[: max(min(size, len(block) - RECORD_HEAD - CHUNK_HEAD), 0)]
     candidates = np.flatnonzero(opcodes == OP_CHUNK)
     if not len(candidates):
         return []
-    name_bytes = gathered(block, candidates + RECORD_HEAD + 28, "u4")
+    name_bytes = gather_integers(block, candidates + RECORD_HEAD + 28, "u4")
     found: list[int] = candidates[np.isin(name_bytes, (0, 3, 4))].tolist()
     return found

@@ -12,7 +12,7 @@ from isal.isal_zlib import crc32
 from numpy.typing import NDArray
 
 from tcpipe.formats.logs.chunk_reading import Messages
-from tcpipe.formats.logs.log_part import ByteSource, DamageError, Int64Array, gathered, outline_of
+from tcpipe.formats.logs.log_part import ByteSource, DamageError, Int64Array, gather_integers, outline_of
 
 MAGIC = b"\x89MCAP0\r\n"
 CHUNK_CRC = 33
@@ -224,11 +224,13 @@ def index_messages(
     right, size = np.zeros(len(records), np.bool_), np.zeros(len(records), np.int64)
     if len(whole):
         at = records[whole]
-        size[whole] = gathered(data, at + RECORD_HEAD + 2, "u4")
+        size[whole] = gather_integers(data, at + RECORD_HEAD + 2, "u4")
         right[whole] = (
             (np.frombuffer(data, np.uint8)[at] == OP_MESSAGE_INDEX)
-            & (gathered(data, at + 1, "i8") == size[whole] + 6)  # padding is allowed, but so would a broken count look
-            & (gathered(data, at + RECORD_HEAD, "u2") == channels[whole])
+            & (
+                gather_integers(data, at + 1, "i8") == size[whole] + 6
+            )  # padding is allowed, but so would a broken count look
+            & (gather_integers(data, at + RECORD_HEAD, "u2") == channels[whole])
             & (size[whole] % 16 == 0)
             & (at + RECORD_HEAD + 6 + size[whole] <= ends[whole])
         )
@@ -238,10 +240,10 @@ def index_messages(
     places = records[record] + (RECORD_HEAD + 6) + 16 * within
     if not len(places):
         return right, record, places, places
-    return right, record, gathered(data, places, "i8"), gathered(data, places + 8, "i8")
+    return right, record, gather_integers(data, places, "i8"), gather_integers(data, places + 8, "i8")
 
 
-def messages_at(data: memoryview, offsets: Int64Array) -> tuple[Messages, NDArray[np.bool_]]:
+def read_messages_at(data: memoryview, offsets: Int64Array) -> tuple[Messages, NDArray[np.bool_]]:
     """Return the messages whose records begin at ``offsets``, within the data, and which of them are messages by opcode and length."""
     count = max(len(data) - _MESSAGE.itemsize + 1, 0)
     windows: NDArray[np.void] = np.ndarray((count,), f"V{_MESSAGE.itemsize}", data if count else b"", 0, (1,))
@@ -271,12 +273,12 @@ def record_offsets(data: bytes | memoryview, most: int) -> tuple[Int64Array, int
     return np.array(found, np.int64), position
 
 
-def message_offsets(data: memoryview, records: Int64Array) -> Int64Array:
+def find_message_offsets(data: memoryview, records: Int64Array) -> Int64Array:
     """Return those of the records that are whole messages."""
     if not len(records):
         return records
     messages: Int64Array = records[np.frombuffer(data, np.uint8)[records] == OP_MESSAGE]
-    return messages[gathered(data, messages + 1, "i8") >= MESSAGE_HEAD] if len(messages) else messages
+    return messages[gather_integers(data, messages + 1, "i8") >= MESSAGE_HEAD] if len(messages) else messages
 
 
 _DATA_END = RECORD_HEAD + 4

@@ -26,7 +26,7 @@ from rosbags.typesys.store import Typestore
 
 from tcpipe.errors import LogError
 from tcpipe.logs.msg_text import BASE_TYPES, FieldType, MsgTextError, parse_msg
-from tcpipe.logs.topics import normalized_type_name
+from tcpipe.logs.topics import normalize_type_name
 from tcpipe.logs.wire_types import (
     MAX_COLUMNS,
     MAX_FIXED_ELEMENTS,
@@ -36,7 +36,7 @@ from tcpipe.logs.wire_types import (
     Scalar,
     Text,
     WireType,
-    fixed_elements,
+    count_fixed_elements,
     is_boundless,
     record,
 )
@@ -104,7 +104,7 @@ class MessageType:
         ------
         DefinitionError : rosbags makes no type of the definition.
         """
-        store = _typestore(self.definitions)
+        store = _make_typestore(self.definitions)
         name = self.wire.name
         deserialize = store.deserialize_ros1 if encoding == "ros1" else store.deserialize_cdr
 
@@ -113,17 +113,17 @@ class MessageType:
                 message = deserialize(payload, name)
             except (SerdeError, ValueError, IndexError, OverflowError, AssertionError, struct.error) as error:
                 raise RowError(str(error)) from None
-            return dict(_flat_values(message, self.wire, ""))
+            return dict(_iterate_flat_values(message, self.wire, ""))
 
         return decode
 
     def text(self, *, ros1: bool) -> str:
         """Return the definition as text, without comments: for where the log holds none."""
-        store = _typestore(self.definitions)
+        store = _make_typestore(self.definitions)
         return store.generate_msgdef(self.wire.name, ros_version=1 if ros1 else 2)[0]
 
 
-def _typestore(definitions: _Definitions) -> Typestore:
+def _make_typestore(definitions: _Definitions) -> Typestore:
     """Return rosbags' store of types; it makes Python code of their names and runs it, so that only plain names may reach it."""
     odd = [name for name in definitions if not _TYPE_NAME.fullmatch(name)]
     odd += [field for _, fields in definitions.values() for field, _ in fields if not _FIELD_NAME.fullmatch(field)]
@@ -141,7 +141,7 @@ class TypeLibrary:
     """Finds and parses message definitions; one per log."""
 
     def __init__(self, message_definitions: Path | None = None) -> None:
-        self._own = _definitions_of_directory(message_definitions) if message_definitions else {}
+        self._own = _read_definitions_of_directory(message_definitions) if message_definitions else {}
         self._types: dict[tuple[str, str, str, bool], MessageType | DefinitionError] = {}
 
     def message_type(self, type_name: str, *, definition: str, schema_encoding: str, ros1: bool) -> MessageType:
@@ -180,7 +180,7 @@ class TypeLibrary:
         wire = _Unfold(known, fallback, definitions).record(type_name, ())
         if wire.leaves > MAX_COLUMNS:
             raise DefinitionError(f"type {type_name} unfolds to {wire.leaves} columns, more than {MAX_COLUMNS}")
-        elements = fixed_elements(wire)
+        elements = count_fixed_elements(wire)
         if elements > MAX_FIXED_ELEMENTS:
             what = f"holds {elements} texts or messages in arrays of fixed length, more than {MAX_FIXED_ELEMENTS}"
             raise DefinitionError(f"type {type_name} {what}")
@@ -199,19 +199,19 @@ class TypeLibrary:
             what = f"its definition has {len(definition)} bytes, more than {MAX_DEFINITION_BYTES}"
             raise DefinitionError(f"type {type_name}: {what}")
         try:
-            return _parsed(type_name, definition, schema_encoding), "log"
+            return _parse_definitions(type_name, definition, schema_encoding), "log"
         except DefinitionError:
             if given == "given":
                 return {}, given
             raise
 
     def _fallback(self, type_name: str, *, ros1: bool) -> Any | None:
-        for known in (self._own, _bundled_by_tcpipe()):
+        for known in (self._own, _load_own_definitions()):
             if type_name in known:
                 return known[type_name]
         for edition in (ros1, not ros1):
-            if type_name in _bundled_by_rosbags(ros1=edition):
-                return _bundled_by_rosbags(ros1=edition)[type_name]
+            if type_name in _load_rosbags_definitions(ros1=edition):
+                return _load_rosbags_definitions(ros1=edition)[type_name]
         return None
 
 
@@ -262,12 +262,12 @@ class _Unfold:
         return Scalar(_CODES[argument[0]])
 
 
-def _parsed(type_name: str, definition: str, schema_encoding: str) -> _Definitions:
-    definition = _event_definition(type_name, definition)
+def _parse_definitions(type_name: str, definition: str, schema_encoding: str) -> _Definitions:
+    definition = _make_event_definition(type_name, definition)
     try:
         if schema_encoding == "ros2idl" or definition.startswith(_IDL_SEPARATOR + "IDL: "):
-            return _parsed_idl(definition)
-        return _parsed_msg(type_name, definition)
+            return _parse_idl(definition)
+        return _parse_msg(type_name, definition)
     except (TypesysError, RecursionError, ValueError, KeyError, IndexError) as error:
         if "\n---\n" in definition:
             raise DefinitionError(f"type {type_name}: its definition is that of a service, not of a message") from None
@@ -275,7 +275,7 @@ def _parsed(type_name: str, definition: str, schema_encoding: str) -> _Definitio
         raise DefinitionError(f"type {type_name}: its definition cannot be parsed ({stopped_at[:80]})") from None
 
 
-def _event_definition(type_name: str, definition: str) -> str:
+def _make_event_definition(type_name: str, definition: str) -> str:
     """Return the definition of a service's events where the log defines the service, as ROS 2 logs do; any other as it is."""
     service, *others = definition.split(_MSG_SEPARATOR)
     parts = _SERVICE_SPLIT.split(service)
@@ -290,15 +290,15 @@ def _event_definition(type_name: str, definition: str) -> str:
     return _MSG_SEPARATOR.join([event, *halves, _EVENT_INFO, *others])
 
 
-def _parsed_msg(type_name: str, definition: str) -> _Definitions:
+def _parse_msg(type_name: str, definition: str) -> _Definitions:
     try:
         parsed = parse_msg(definition, type_name)
     except MsgTextError:  # rosbags may know better, and says what is wrong
         return get_types_from_msg(definition.replace("\r\n", "\n"), type_name)
-    return {name: ([], [(field, _described(of)) for field, of in fields]) for name, fields in parsed.items()}
+    return {name: ([], [(field, _describe_field_type(of)) for field, of in fields]) for name, fields in parsed.items()}
 
 
-def _described(of: FieldType) -> Any:
+def _describe_field_type(of: FieldType) -> Any:
     """Return a field's type as rosbags describes it."""
     one: Any = (Nodetype.BASE, (of.name, of.text_limit)) if of.name in BASE_TYPES else (Nodetype.NAME, of.name)
     if of.length is None:
@@ -306,7 +306,7 @@ def _described(of: FieldType) -> Any:
     return (Nodetype.ARRAY if of.fixed else Nodetype.SEQUENCE, (one, of.length))
 
 
-def _parsed_idl(definition: str) -> _Definitions:
+def _parse_idl(definition: str) -> _Definitions:
     if not definition.startswith(_IDL_SEPARATOR):
         return get_types_from_idl(definition)
     found: _Definitions = {}
@@ -316,23 +316,23 @@ def _parsed_idl(definition: str) -> _Definitions:
 
 
 @functools.cache
-def _bundled_by_rosbags(*, ros1: bool) -> _Definitions:
+def _load_rosbags_definitions(*, ros1: bool) -> _Definitions:
     return dict(get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_HUMBLE).fielddefs)
 
 
 @functools.cache
-def _bundled_by_tcpipe() -> _Definitions:
-    return _definitions_of(shipped_definitions().items())
+def _load_own_definitions() -> _Definitions:
+    return _read_definitions(load_shipped_definitions().items())
 
 
-def _definitions_of(texts: Iterable[tuple[str, str]]) -> _Definitions:
+def _read_definitions(texts: Iterable[tuple[str, str]]) -> _Definitions:
     found: _Definitions = {}
     for name, text in texts:
-        found.update(_parsed(name, text, "ros2msg"))
+        found.update(_parse_definitions(name, text, "ros2msg"))
     return found
 
 
-def _definitions_of_directory(directory: Path) -> _Definitions:
+def _read_definitions_of_directory(directory: Path) -> _Definitions:
     """Parse ``package/msg/Name.msg`` or ``package/Name.msg`` files below a directory, and .idl files."""
     if not directory.is_dir():
         raise LogError(f"{directory}: there is no such directory; wanted one with package/msg/Name.msg files below it")
@@ -340,9 +340,9 @@ def _definitions_of_directory(directory: Path) -> _Definitions:
     problems = []
     for path in sorted([*directory.rglob("*.idl"), *directory.rglob("*.msg")]):
         package = path.parent.parent.name if path.parent.name == "msg" else path.parent.name
-        name = normalized_type_name(str(PurePosixPath(package, path.stem)))
+        name = normalize_type_name(str(PurePosixPath(package, path.stem)))
         try:
-            found.update(_parsed(name, path.read_text(errors="replace"), f"ros2{path.suffix[1:]}"))
+            found.update(_parse_definitions(name, path.read_text(errors="replace"), f"ros2{path.suffix[1:]}"))
         except DefinitionError as error:
             problems.append(f"{path}: {error}")
     if problems:
@@ -352,27 +352,27 @@ def _definitions_of_directory(directory: Path) -> _Definitions:
     return found
 
 
-def _flat_values(message: object, of: Record, prefix: str) -> Iterable[tuple[str, Any]]:
+def _iterate_flat_values(message: object, of: Record, prefix: str) -> Iterable[tuple[str, Any]]:
     for name, wire_type in of.fields:
         value = getattr(message, normalize_fieldname(name))
         if isinstance(wire_type, Record):
-            yield from _flat_values(value, wire_type, f"{prefix}{name}.")
+            yield from _iterate_flat_values(value, wire_type, f"{prefix}{name}.")
         else:
-            yield prefix + name, _plain(value, wire_type)
+            yield prefix + name, _to_plain(value, wire_type)
 
 
-def _plain(value: Any, of: WireType) -> Any:
+def _to_plain(value: Any, of: WireType) -> Any:
     match of:
         case Record():
-            return {name: _plain(getattr(value, normalize_fieldname(name)), field) for name, field in of.fields}
+            return {name: _to_plain(getattr(value, normalize_fieldname(name)), field) for name, field in of.fields}
         case Array() if not isinstance(of.element, Scalar):
-            return [_plain(item, of.element) for item in value]
+            return [_to_plain(item, of.element) for item in value]
         case _:
             return value
 
 
 @cache
-def shipped_definitions() -> Mapping[str, str]:
+def load_shipped_definitions() -> Mapping[str, str]:
     """Return the robots' own definitions by type; what they refer to (std_msgs/Header, duration) belongs to every type store.
 
     They are the packages' files without constants and comments, which change no byte; NOTICE names packages and licences.

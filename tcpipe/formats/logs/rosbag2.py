@@ -14,7 +14,7 @@ import numpy as np
 import pyarrow as pa
 
 from tcpipe.errors import LogError
-from tcpipe.formats.logs.log_part import MAX_CHUNK_BYTES, LogPart, MessageBlock, is_bomb, no_room
+from tcpipe.formats.logs.log_part import MAX_CHUNK_BYTES, LogPart, MessageBlock, describe_full_disk, is_bomb
 from tcpipe.logs.topics import Damage
 
 METADATA = "metadata.yaml"
@@ -42,7 +42,7 @@ class Rosbag2Files:
     topic_counts: Mapping[str, int] = field(default_factory=dict)
 
 
-def rosbag2_files(directory: Path) -> Rosbag2Files:
+def find_rosbag2_files(directory: Path) -> Rosbag2Files:
     """Return the storage files of a bag directory, by metadata.yaml, or by their names where it is missing.
 
     Raises
@@ -51,18 +51,22 @@ def rosbag2_files(directory: Path) -> Rosbag2Files:
         The directory holds no ROS 2 bag, or cannot be read.
     """
     try:
-        present = storage_files(directory)
+        present = list_storage_files(directory)
     except OSError as error:
         raise LogError(f"{directory}: it cannot be read ({error.strerror})") from None
     if len(present) > MAX_FILES:
         raise LogError(f"{directory}: it holds {len(present)} files; bags of up to {MAX_FILES} are read")
-    information = _bag_information(directory / METADATA)
-    return _by_name(directory, present) if information is None else _by_metadata(directory, present, information)
+    information = _read_bag_information(directory / METADATA)
+    return (
+        _find_files_by_name(directory, present)
+        if information is None
+        else _find_files_by_metadata(directory, present, information)
+    )
 
 
-def _by_name(directory: Path, present: tuple[Path, ...]) -> Rosbag2Files:
+def _find_files_by_name(directory: Path, present: tuple[Path, ...]) -> Rosbag2Files:
     kinds = {path.name.removesuffix(".zstd").rsplit(".", 1)[-1] for path in present}
-    what = _trouble(directory / METADATA)
+    what = _describe_metadata_problem(directory / METADATA)
     if len(kinds) != 1:
         found = "no .db3 or .mcap file is there" if not kinds else "both .db3 and .mcap files are there"
         raise LogError(f"{directory}: not a ROS 2 bag: {METADATA} {what}, and {found}")
@@ -76,7 +80,7 @@ def _by_name(directory: Path, present: tuple[Path, ...]) -> Rosbag2Files:
     return Rosbag2Files(present, (Damage(directory.name, why, messages_lost=0),))
 
 
-def _by_metadata(directory: Path, present: tuple[Path, ...], information: Mapping[str, Any]) -> Rosbag2Files:
+def _find_files_by_metadata(directory: Path, present: tuple[Path, ...], information: Mapping[str, Any]) -> Rosbag2Files:
     named = information.get("relative_file_paths")
     if isinstance(named, list) and len(named) > MAX_FILES:
         raise LogError(f"{directory}: {METADATA} names {len(named)} files; bags of up to {MAX_FILES} are read")
@@ -98,7 +102,7 @@ def _by_metadata(directory: Path, present: tuple[Path, ...], information: Mappin
     if not paths:
         names = ", ".join(listed[:_LISTED]) + (", …" if len(listed) > _LISTED else "")
         raise LogError(f"{directory}: not a ROS 2 bag: no file that {METADATA} names is there ({names or 'none'})")
-    return Rosbag2Files(tuple(paths), damage, count if _is_count(count) else None, _topic_counts(information))
+    return Rosbag2Files(tuple(paths), damage, count if _is_count(count) else None, _read_topic_counts(information))
 
 
 def _is_file(path: Path) -> bool:
@@ -111,7 +115,7 @@ def _is_count(value: object) -> bool:
     return isinstance(value, int) and 0 <= value < 1 << 63
 
 
-def _topic_counts(information: Mapping[str, Any]) -> dict[str, int]:
+def _read_topic_counts(information: Mapping[str, Any]) -> dict[str, int]:
     """Return how many messages metadata.yaml counts of each topic; nothing where it is not as the recorder writes it."""
     counts: dict[str, int] = {}
     with suppress(KeyError, TypeError):
@@ -122,12 +126,12 @@ def _topic_counts(information: Mapping[str, Any]) -> dict[str, int]:
     return counts
 
 
-def storage_files(directory: Path) -> tuple[Path, ...]:
+def list_storage_files(directory: Path) -> tuple[Path, ...]:
     """Return the .db3 and .mcap files directly in a directory, compressed ones too, by name with numbers in order."""
-    return tuple(sorted((directory / name for name in _storage_names(directory)), key=_natural))
+    return tuple(sorted((directory / name for name in _list_storage_names(directory)), key=_make_natural_key))
 
 
-def _storage_names(directory: Path) -> list[str]:
+def _list_storage_names(directory: Path) -> list[str]:
     with os.scandir(directory) as there:
         named = [entry for entry in there if entry.name.endswith(STORAGE_SUFFIXES) and not entry.name.startswith(".")]
         return [entry.name for entry in named if entry.is_file()]
@@ -137,48 +141,50 @@ def is_one_bag(directory: Path) -> bool:
     """Return whether a directory is one ROS 2 bag: by metadata.yaml, or by files named after it as the recorder does."""
     if (directory / METADATA).is_file():
         return True
-    names = _storage_names(directory)
+    names = _list_storage_names(directory)
     kinds = {name.removesuffix(".zstd").rsplit(".", 1)[-1] for name in names}
     named = re.compile(re.escape(directory.name) + r"(_\d+)?\.(db3|mcap)(\.zstd)?")
     return len(kinds) == 1 and all(map(named.fullmatch, names))
 
 
-def decompressed_file(path: Path, directory: Path) -> Path:
+def decompress_file(path: Path, directory: Path) -> Path:
     """Decompress a zstd file into ``directory`` and return its copy; of a cut one, as much as can be had."""
     copy = Path(directory, path.name.removesuffix(".zstd"))
     size, written = path.stat().st_size, 0
     try:
         with copy.open("wb") as target:
-            for block in _decompressed_blocks(path):
+            for block in _decompress_stream(path):
                 target.write(block)
                 written += len(block)
                 if is_bomb(size, written):
                     raise LogError(f"{path}: {size} bytes hold more than {written}; it is taken for a bomb, not a log")
     except OSError as error:
-        raise LogError(f"{path}: it cannot be decompressed into a copy ({no_room(error) or error.strerror})") from None
+        raise LogError(
+            f"{path}: it cannot be decompressed into a copy ({describe_full_disk(error) or error.strerror})"
+        ) from None
     return copy
 
 
-def _decompressed_blocks(path: Path) -> Iterator[bytes]:
+def _decompress_stream(path: Path) -> Iterator[bytes]:
     """Yield what a zstd file holds; where it is cut or damaged, or the disk fails, it ends: what follows sees that."""
     with suppress(OSError), pa.input_stream(str(path), compression="zstd") as stream:
         while block := stream.read(_COPY_BYTES):
             yield block
 
 
-def decompressed_blocks(part: LogPart, wanted: frozenset[int], *, threads: int) -> Iterator[MessageBlock]:
+def decompress_blocks(part: LogPart, wanted: frozenset[int], *, threads: int) -> Iterator[MessageBlock]:
     """Yield a part's messages of the wanted channels; those that are zstd frames each (``compression_mode: MESSAGE``) decompressed."""
     compressed: dict[int, bool] = {}
     for block in part.blocks(wanted, threads=threads):
         if block.channel not in compressed:
             compressed[block.channel] = part.channels[block.channel].encoding == "cdr" and _is_compressed(block)
-        yield _decompressed(block, part) if compressed[block.channel] else block
+        yield _decompress_block(block, part) if compressed[block.channel] else block
 
 
-def _decompressed(block: MessageBlock, part: LogPart) -> MessageBlock:
+def _decompress_block(block: MessageBlock, part: LogPart) -> MessageBlock:
     payloads, kept = [], []
     for row, (offset, length) in enumerate(zip(block.offsets.tolist(), block.lengths.tolist(), strict=True)):
-        payload = _unframed(block.buffer[offset : offset + length])
+        payload = _decompress_frame(block.buffer[offset : offset + length])
         if payload is not None:
             payloads.append(payload)
             kept.append(row)
@@ -205,7 +211,7 @@ def _is_compressed(block: MessageBlock) -> bool:
     return bool(len(block.offsets)) and bytes(block.buffer[block.offsets[0] : block.offsets[0] + 4]) == ZSTD_MAGIC
 
 
-def _unframed(frame: memoryview) -> bytes | None:
+def _decompress_frame(frame: memoryview) -> bytes | None:
     pieces: list[bytes] = []
     found = 0
     try:
@@ -220,7 +226,7 @@ def _unframed(frame: memoryview) -> bytes | None:
     return b"".join(pieces)
 
 
-def _bag_information(path: Path) -> dict[str, Any] | None:
+def _read_bag_information(path: Path) -> dict[str, Any] | None:
     """Return what metadata.yaml says of the bag; None where it is missing or broken, as a recorder that is killed leaves it."""
     from ruamel.yaml import YAML  # noqa: PLC0415  most logs are none of these
     from ruamel.yaml.error import YAMLError  # noqa: PLC0415
@@ -235,7 +241,7 @@ def _bag_information(path: Path) -> dict[str, Any] | None:
     return information if isinstance(information, dict) else None
 
 
-def _trouble(path: Path) -> str:
+def _describe_metadata_problem(path: Path) -> str:
     """Say why a metadata.yaml tells nothing."""
     if not path.is_file():
         return "is missing"
@@ -243,5 +249,5 @@ def _trouble(path: Path) -> str:
     return f"has {size} bytes, more than {MAX_METADATA_BYTES}" if size > MAX_METADATA_BYTES else "is broken"
 
 
-def _natural(path: Path) -> list[tuple[int, str]]:
+def _make_natural_key(path: Path) -> list[tuple[int, str]]:
     return [(int(piece), "") if piece.isdigit() else (-1, piece) for piece in re.split(r"(\d+)", path.name)]

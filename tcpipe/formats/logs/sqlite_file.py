@@ -18,9 +18,17 @@ from urllib.parse import quote
 import numpy as np
 
 from tcpipe.errors import LogError
-from tcpipe.formats.atomic import scratch_directory
-from tcpipe.formats.logs.log_part import MAX_CHANNELS, Bounds, Channel, MessageBlock, grouped, listed, no_room
-from tcpipe.logs.topics import Damage, normalized_type_name
+from tcpipe.formats.atomic import make_scratch_directory
+from tcpipe.formats.logs.log_part import (
+    MAX_CHANNELS,
+    Bounds,
+    Channel,
+    MessageBlock,
+    describe_full_disk,
+    format_numbered,
+    group_by_key,
+)
+from tcpipe.logs.topics import Damage, normalize_type_name
 
 MAGIC = b"SQLite format 3\0"
 
@@ -63,14 +71,14 @@ class SqlitePart:
             raise
         except OSError as error:
             self.close()
-            why = no_room(error) or error.strerror
+            why = describe_full_disk(error) or error.strerror
             raise LogError(
                 f"{path}: it cannot be read, or copied to be read ({why}); nothing can be had from it"
             ) from None
         except _BROKEN as error:
             self.close()
             raise LogError(
-                f"{path}: its table of topics cannot be read ({_why(error)}); nothing can be had from it"
+                f"{path}: its table of topics cannot be read ({_describe_error(error)}); nothing can be had from it"
             ) from None
 
     def close(self) -> None:
@@ -90,10 +98,10 @@ class SqlitePart:
             rows.append(row)
             held += len(row[-1])
             if held > _BLOCK_BYTES or len(rows) == _BLOCK_ROWS:
-                yield from _blocks(rows)
+                yield from _read_blocks(rows)
                 rows, held = [], 0
         if rows:
-            yield from _blocks(rows)
+            yield from _read_blocks(rows)
 
     def _open(self, path: Path) -> sqlite3.Connection:
         """Open without locks or files beside it; a file with an unmerged journal, or that ends inside a page, through a copy."""
@@ -110,7 +118,7 @@ class SqlitePart:
             self._is_cut = True
             self._note(f"the file ends at byte {size} of {wanted}", bytes_lost=wanted - size)
         if has_journal or (self._is_cut and size % page_bytes):
-            copy = self._opened.enter_context(scratch_directory()) / path.name
+            copy = self._opened.enter_context(make_scratch_directory()) / path.name
             shutil.copyfile(path, copy)
             if has_journal:
                 shutil.copyfile(journal, copy.with_name(journal.name))
@@ -145,14 +153,14 @@ class SqlitePart:
                 continue
             channels[number] = Channel(
                 str(topic),
-                normalized_type_name(str(type_name)),
+                normalize_type_name(str(type_name)),
                 str(encoding),
                 *definitions.get(type_name, ("", "")),
                 *spans.get(number, (0, None, None)),
             )
         if unknown := sorted(spans.keys() - channels.keys()):
             lost = sum(spans[number][0] for number in unknown)
-            self._note(f"messages of {listed('topic', unknown)}, which nothing declares", messages_lost=lost)
+            self._note(f"messages of {format_numbered('topic', unknown)}, which nothing declares", messages_lost=lost)
         return channels
 
     def _definitions(self) -> dict[str, tuple[str, str]]:
@@ -214,7 +222,7 @@ class SqlitePart:
                             yield row
                     break
                 except _BROKEN as error:
-                    broken = _why(error)
+                    broken = _describe_error(error)
             if not broken:
                 return
             start = "the beginning" if row is None else f"message {low}"
@@ -258,7 +266,7 @@ class SqlitePart:
             self._database.execute("PRAGMA ignore_check_constraints = ON")
             found = self._database.execute("PRAGMA quick_check(1)").fetchone()[0]
         except _BROKEN as error:
-            found = _why(error)
+            found = _describe_error(error)
         if found != "ok" and " value in " not in found:  # a value that is none is the row's own trouble, and counted
             self._note(f"its pages contradict one another ({found.splitlines()[-1]}); rows may be missing or wrong")
 
@@ -266,16 +274,16 @@ class SqlitePart:
         self.damage[Damage(self.name, what, messages_lost=messages_lost, bytes_lost=bytes_lost)] = None
 
 
-def _why(error: Exception) -> str:
+def _describe_error(error: Exception) -> str:
     return str(error) or "a row claims more than memory holds"
 
 
-def _blocks(rows: list[_Row]) -> Iterator[MessageBlock]:
+def _read_blocks(rows: list[_Row]) -> Iterator[MessageBlock]:
     """Yield rows as one block a topic."""
     numbers, channels, log_ns, publish_ns, payloads = zip(*rows, strict=True)
     lengths = np.fromiter(map(len, payloads), np.int64, len(payloads))
     offsets = np.cumsum(lengths) - lengths
     buffer = memoryview(b"".join(payloads))
     ordinal, channel, log, publish = np.array([numbers, channels, log_ns, publish_ns], np.int64)
-    for topic, of in grouped(channel):
+    for topic, of in group_by_key(channel):
         yield MessageBlock(topic, buffer, offsets[of], lengths[of], log[of], publish[of], ordinal[of], None)

@@ -16,23 +16,23 @@ Mappings = Mapping[str, TableMapping]
 """The recipe's tables, by name."""
 
 
-def table_files(folder: Path) -> list[Path]:
+def list_table_files(folder: Path) -> list[Path]:
     """Return the tables in a folder and below it, by name; hidden ones are passed over."""
-    return sorted(Path(place) / name for place, _, names in _walked(folder) for name in names if is_table(name))
+    return sorted(Path(place) / name for place, _, names in _walk_folders(folder) for name in names if is_table(name))
 
 
-def table_folders(path: Path, mappings: Mappings) -> list[Path]:
+def find_table_folders(path: Path, mappings: Mappings) -> list[Path]:
     """Return the folders at or below a path that hold a mapped file, in order of their names; what lies below one is its own."""
     wanted = [mapping.file for mapping in mappings.values() if mapping.file]
     found = list[Path]()
-    for place, folders, _ in _walked(path):
+    for place, folders, _ in _walk_folders(path):
         if any((Path(place) / file).is_file() for file in wanted):
             found.append(Path(place))
             folders.clear()
     return found
 
 
-def _walked(folder: Path) -> Iterator[tuple[str, list[str], list[str]]]:
+def _walk_folders(folder: Path) -> Iterator[tuple[str, list[str], list[str]]]:
     """Yield each folder with the names of folders in it, which the caller may take out, and of files; links to folders are not followed.
 
     As `os.walk`, which on Python 3.11 calls itself as deep as folders are nested.

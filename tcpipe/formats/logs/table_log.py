@@ -17,9 +17,16 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from tcpipe.errors import LogError
-from tcpipe.formats.logs.table_folders import TABLE_SUFFIXES, Mappings, is_table, table_files
-from tcpipe.formats.tables import Cells, column_names, read_cells
-from tcpipe.logs.mapped import in_units, mapping_problems, message_fields, stamps_ns, topic_of, utc_from_gps_ns
+from tcpipe.formats.logs.table_folders import TABLE_SUFFIXES, Mappings, is_table, list_table_files
+from tcpipe.formats.tables import Cells, read_cells, read_column_names
+from tcpipe.logs.field_mapping import (
+    convert_units,
+    find_mapping_problems,
+    find_topic,
+    make_message_fields,
+    parse_stamps_ns,
+    utc_from_gps_ns,
+)
 from tcpipe.logs.topics import Damage, Topic
 from tcpipe.power.sources import FLOAT_TYPES
 from tcpipe.recipe import TableMapping
@@ -56,7 +63,7 @@ class TableLog:
                 read.append(found)
             else:
                 problems += found
-        problems += _two_clocks(read)
+        problems += _find_clock_mismatch(read)
         if problems:
             raise LogError(*(f"{path}: {problem}" for problem in problems))
         self._tables = {found.topic.name: found.messages for found in read}
@@ -64,7 +71,7 @@ class TableLog:
         """Every mapped table by its topic's name."""
         self.damage = [damage for found in read for damage in found.damage]
         self.remarks = [remark for found in read for remark in found.remarks]
-        self._files = table_files(path)
+        self._files = list_table_files(path)
 
     def __enter__(self) -> Self:
         """Return the log."""
@@ -120,17 +127,17 @@ def _read_table(folder: Path, name: str, mapping: TableMapping) -> _Read | list[
     """Return a table's messages, or every problem of its mapping."""
     where = f"recipe tables.{name}"
     role = mapping.role or name
-    problems = list(mapping_problems(where, role, mapping.columns, mapping.units))
+    problems = list(find_mapping_problems(where, role, mapping.columns, mapping.units))
     path = folder / mapping.file
     if not is_table(mapping.file):
         problems.append(f"{where}.file is {mapping.file!r}; wanted a name that ends in {', '.join(TABLE_SUFFIXES)}")
     elif not path.is_file():
-        held = ", ".join(str(file.relative_to(folder)) for file in table_files(folder)[:20])
+        held = ", ".join(str(file.relative_to(folder)) for file in list_table_files(folder)[:20])
         problems.append(f"{where}.file: there is no {mapping.file} here; there are {held or 'no tables at all'}")
     if problems:
         return problems
     try:
-        names = column_names(path)
+        names = read_column_names(path)
         stamp = names[0] if mapping.stamp is None else mapping.stamp
         if missing := [name for name in dict.fromkeys([stamp, *mapping.columns.values()]) if name not in names]:
             return [f"{where}: {mapping.file} has no column {', '.join(missing)}; it has {', '.join(names)}"]
@@ -142,25 +149,25 @@ def _read_table(folder: Path, name: str, mapping: TableMapping) -> _Read | list[
         for column, (_, row, text) in cells.texts.items()
         if not np.isfinite(cells.columns[column]).any()
     ]
-    stamp_ns = _stamps(cells, stamp, mapping)
+    stamp_ns = _read_stamps(cells, stamp, mapping)
     if isinstance(stamp_ns, str):
         return [*empty, f"{where}: {mapping.file}, column {stamp}: {stamp_ns}"]
-    return empty or _messages(topic_of(name, role, mapping.columns), role, mapping, cells, stamp_ns)
+    return empty or _read_messages(find_topic(name, role, mapping.columns), role, mapping, cells, stamp_ns)
 
 
-def _stamps(cells: Cells, stamp: str, mapping: TableMapping) -> NDArray[np.int64] | str:
+def _read_stamps(cells: Cells, stamp: str, mapping: TableMapping) -> NDArray[np.int64] | str:
     """Return the known stamps [ns, UTC], or what is in the way of that."""
     known = cells.stamp[cells.stamp_known]
     if not known.size:
         return "it holds neither numbers nor dates (wanted seconds, or text as 2025-10-14T15:41:25.7Z)"
-    found = stamps_ns(known, "ns" if cells.stamp_is_time else mapping.stamp_unit)
+    found = parse_stamps_ns(known, "ns" if cells.stamp_is_time else mapping.stamp_unit)
     if isinstance(found, str):
         return f"{found} (stamp_unit)"
     found = utc_from_gps_ns(found) if cells.stamp_is_time and stamp == _GPS_TIME else found
     return found + round(mapping.offset_s * 1e9)
 
 
-def _messages(
+def _read_messages(
     read_as: tuple[str, str], role: str, mapping: TableMapping, cells: Cells, stamp_ns: NDArray[np.int64]
 ) -> _Read:
     """Return a table as the messages of its topic and type, in order of time, and what of it is lost."""
@@ -177,18 +184,18 @@ def _messages(
     if backward:
         by_time = np.argsort(stamp_ns, kind="stable")
         order, stamp_ns = np.flatnonzero(cells.stamp_known)[by_time], stamp_ns[by_time]
-    values = in_units(role, {field: value[order] for field, value in values.items()}, mapping.units)
+    values = convert_units(role, {field: value[order] for field, value in values.items()}, mapping.units)
     if kind in FLOAT_TYPES:
         columns = {"data": next(iter(values.values()))}
     else:
         second, rest = np.divmod(stamp_ns, 1_000_000_000)
         columns = {"header.stamp.sec": second, "header.stamp.nanosec": rest}
-        columns |= message_fields(role, values, stamp_ns.size)
+        columns |= make_message_fields(role, values, stamp_ns.size)
     table = pa.table(
         {
             "log_time_ns": number_column(stamp_ns),
             "publish_time_ns": number_column(stamp_ns),
-            **{column: _arrow(value) for column, value in columns.items()},
+            **{column: _to_arrow(value) for column, value in columns.items()},
         }
     )
     span = (int(stamp_ns[0]), int(stamp_ns[-1]))
@@ -199,13 +206,13 @@ def _messages(
     return _Read(found, table, tuple(damage), (*cells.remarks, *remarks))
 
 
-def _arrow(values: NDArray[np.float64]) -> pa.Array:
+def _to_arrow(values: NDArray[np.float64]) -> pa.Array:
     if values.ndim == 1:
         return number_column(values)
     return pa.FixedSizeListArray.from_arrays(number_column(values.ravel()), values.shape[1])
 
 
-def _two_clocks(read: Iterable[_Read]) -> Iterator[str]:
+def _find_clock_mismatch(read: Iterable[_Read]) -> Iterator[str]:
     """Yield a line for tables that have no time in common with the longest: they are on another clock, or of another drive."""
     spans = {found.topic.name: (found.topic.start_ns or 0, found.topic.end_ns or 0) for found in read}
     if not spans:

@@ -25,8 +25,8 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
 from tcpipe.errors import UsageError
-from tcpipe.formats.atomic import atomic_directory, atomic_file
-from tcpipe.formats.logs.ros_types import shipped_definitions
+from tcpipe.formats.atomic import write_atomic_directory, write_atomic_file
+from tcpipe.formats.logs.ros_types import load_shipped_definitions
 
 Encoding = Literal["ros1", "cdr"]
 McapCompression = Literal["zstd", "lz4", "none"]
@@ -53,7 +53,7 @@ class MessageStream:
     publish_time_ns: NDArray[np.int64] | None = None
     latched: bool = False
     definition: str = ""
-    """Text of a type that neither rosbags nor `shipped_definitions` knows."""
+    """Text of a type that neither rosbags nor `load_shipped_definitions` knows."""
 
 
 def write_mcap(
@@ -62,7 +62,7 @@ def write_mcap(
     """Write a log in chunks with CRCs: ROS 2 (cdr), or ROS 1 messages in MCAP (ros1); streams of one topic share its channel."""
     version = 1 if encoding == "ros1" else 2
     codec = {"zstd": CompressionType.ZSTD, "lz4": CompressionType.LZ4, "none": CompressionType.NONE}
-    with atomic_file(path) as temporary, temporary.open("wb") as out:
+    with write_atomic_file(path) as temporary, temporary.open("wb") as out:
         writer = McapWriter(out, chunk_size=_CHUNK_BYTES, compression=codec[compression], enable_data_crcs=True)
         writer.start(profile=f"ros{version}", library="tcpipe")
         channels: dict[str, int] = {}
@@ -73,16 +73,16 @@ def write_mcap(
             name = stream.type_name if version == 2 else stream.type_name.replace("/msg/", "/")
             schema = writer.register_schema(name, f"ros{version}msg", text.encode())
             channels[stream.topic] = writer.register_channel(stream.topic, encoding, schema)
-        for index, row, payload, log_time, publish_time in _in_log_order(streams, encoding):
+        for index, row, payload, log_time, publish_time in _sort_messages(streams, encoding):
             writer.add_message(channels[streams[index].topic], log_time, payload, publish_time, row)
         writer.finish()  # type: ignore[no-untyped-call]
 
 
 def write_bag(path: Path, streams: Sequence[MessageStream], *, compression: BagCompression = "lz4") -> None:
     """Write a ROS 1 bag, version 2.0."""
-    store = _typestore("ros1")
+    store = _make_typestore("ros1")
     formats = {"lz4": BagWriter.CompressionFormat.LZ4, "bz2": BagWriter.CompressionFormat.BZ2}
-    with atomic_file(path) as temporary:
+    with write_atomic_file(path) as temporary:
         temporary.unlink(missing_ok=True)  # rosbags insists on making it
         writer = BagWriter(temporary)
         if compression != "none":
@@ -94,7 +94,7 @@ def write_bag(path: Path, streams: Sequence[MessageStream], *, compression: BagC
                 )
                 for s in streams
             ]
-            for index, _, payload, log_time, _ in _in_log_order(streams, "ros1"):
+            for index, _, payload, log_time, _ in _sort_messages(streams, "ros1"):
                 writer.write(connections[index], log_time, payload)
 
 
@@ -102,18 +102,18 @@ def write_rosbag2(
     path: Path, streams: Sequence[MessageStream], *, storage: Literal["sqlite3", "mcap"] = "sqlite3"
 ) -> None:
     """Write a ROS 2 bag directory (metadata.yaml beside one .db3 or .mcap)."""
-    store, plugin = _typestore("cdr"), {"sqlite3": StoragePlugin.SQLITE3, "mcap": StoragePlugin.MCAP}
-    with atomic_directory(path) as directory:
+    store, plugin = _make_typestore("cdr"), {"sqlite3": StoragePlugin.SQLITE3, "mcap": StoragePlugin.MCAP}
+    with write_atomic_directory(path) as directory:
         directory.rmdir()  # the writer wants to make it; the files inside are named after it
         with Rosbag2Writer(directory, version=9, storage_plugin=plugin[storage]) as writer:
             connections = [writer.add_connection(s.topic, s.type_name, typestore=store) for s in streams]
-            for index, _, payload, log_time, _ in _in_log_order(streams, "cdr"):
+            for index, _, payload, log_time, _ in _sort_messages(streams, "cdr"):
                 writer.write(connections[index], log_time, payload)
 
 
-def _in_log_order(streams: Sequence[MessageStream], encoding: Encoding) -> list[tuple[int, int, bytes, int, int]]:
+def _sort_messages(streams: Sequence[MessageStream], encoding: Encoding) -> list[tuple[int, int, bytes, int, int]]:
     """Return (stream, row, payload, log time, publish time) of all messages by rising log time."""
-    payloads = [_payloads(stream, encoding) for stream in streams]
+    payloads = [_serialize_messages(stream, encoding) for stream in streams]
     log_times = np.concatenate([stream.log_time_ns for stream in streams])
     publish = np.concatenate([s.log_time_ns if s.publish_time_ns is None else s.publish_time_ns for s in streams])
     index = np.repeat(np.arange(len(streams)), [stream.log_time_ns.size for stream in streams])
@@ -123,7 +123,7 @@ def _in_log_order(streams: Sequence[MessageStream], encoding: Encoding) -> list[
     return [(i, r, payloads[i][r].tobytes(), t, p) for i, r, t, p in zip(*listed, strict=True)]
 
 
-def _payloads(stream: MessageStream, encoding: Encoding) -> NDArray[np.uint8]:
+def _serialize_messages(stream: MessageStream, encoding: Encoding) -> NDArray[np.uint8]:
     """Return the serialised messages, one a row."""
     store = _store_of(stream, encoding)
     encode: Callable[[object, str], Any] = store.serialize_ros1 if encoding == "ros1" else store.serialize_cdr
@@ -132,15 +132,15 @@ def _payloads(stream: MessageStream, encoding: Encoding) -> NDArray[np.uint8]:
         return np.empty((0, 0), np.uint8)
     columns = {name: values for name, values in stream.columns.items() if _has_field(store, stream.type_name, name)}
     _check_lengths(stream.topic, columns)
-    first = {name: _value(values[0]) for name, values in columns.items()}
-    message = _message(store, stream.type_name, _nested({**stream.constants, **first}))
+    first = {name: _to_rosbags_value(values[0]) for name, values in columns.items()}
+    message = _make_message(store, stream.type_name, _nest_fields({**stream.constants, **first}))
 
     def serialize() -> NDArray[np.uint8]:
         return np.frombuffer(bytes(encode(message, stream.type_name)), np.uint8)
 
     rows = np.tile(serialize(), (count, 1))
     for name, values in columns.items():
-        dtype = values.dtype if values.dtype.kind == "S" else np.dtype(_leaf_dtype(store, stream.type_name, name))
+        dtype = values.dtype if values.dtype.kind == "S" else np.dtype(_find_leaf_dtype(store, stream.type_name, name))
         start = _place(message, name, dtype, serialize)
         packed = np.ascontiguousarray(values.reshape(count, -1), dtype=dtype).view(np.uint8)
         rows[:, start : start + packed.shape[1]] = packed
@@ -172,17 +172,17 @@ def _place(message: Any, name: str, dtype: np.dtype[Any], serialize: Callable[[]
     return int(np.flatnonzero(written[0] != written[1])[0])
 
 
-def _leaf_dtype(store: Typestore, type_name: str, name: str) -> str:
+def _find_leaf_dtype(store: Typestore, type_name: str, name: str) -> str:
     """Return the type of a number, or of the numbers of an array."""
     parent, _, leaf = name.rpartition(".")
-    owner = _type_of(store, type_name, parent) if parent else type_name
+    owner = _find_type(store, type_name, parent) if parent else type_name
     fields: dict[str, Any] = dict(store.fielddefs[owner][1])
     kind, argument = fields[leaf]
     base = str(argument[0] if kind == Nodetype.BASE else argument[0][1][0])
     return {"octet": "uint8", "char": "uint8"}.get(base, base)
 
 
-def _type_of(store: Typestore, type_name: str, name: str) -> str:
+def _find_type(store: Typestore, type_name: str, name: str) -> str:
     for part in name.split("."):
         type_name = str(dict(store.fielddefs[type_name][1])[part][1])
     return type_name
@@ -191,11 +191,11 @@ def _type_of(store: Typestore, type_name: str, name: str) -> str:
 def _has_field(store: Typestore, type_name: str, name: str) -> bool:
     """Say whether the dialect has the field: ``header.seq`` is ROS 1 only."""
     parent, _, leaf = name.rpartition(".")
-    owner = _type_of(store, type_name, parent) if parent else type_name
+    owner = _find_type(store, type_name, parent) if parent else type_name
     return leaf in dict(store.fielddefs[owner][1])
 
 
-def _nested(flat: Mapping[str, Any]) -> dict[str, Any]:
+def _nest_fields(flat: Mapping[str, Any]) -> dict[str, Any]:
     tree: dict[str, Any] = {}
     for name, value in flat.items():
         *parents, leaf = name.split(".")
@@ -206,32 +206,32 @@ def _nested(flat: Mapping[str, Any]) -> dict[str, Any]:
     return tree
 
 
-def _value(value: Any) -> Any:
+def _to_rosbags_value(value: Any) -> Any:
     """Return a row of a column as rosbags wants it in a message."""
     if isinstance(value, np.bytes_):
         return value.decode()
     return value if isinstance(value, np.ndarray) else value.item()
 
 
-def _message(store: Typestore, type_name: str, values: Mapping[str, Any]) -> Any:
+def _make_message(store: Typestore, type_name: str, values: Mapping[str, Any]) -> Any:
     """Return a message with the given values; the rest is zero or empty."""
     made = {}
     fields: list[tuple[str, Any]] = store.fielddefs[type_name][1]
     for name, (kind, argument) in fields:
         value = values.get(name)
         if kind == Nodetype.NAME:
-            made[name] = _message(store, argument, value or {})
+            made[name] = _make_message(store, argument, value or {})
         elif kind == Nodetype.BASE:
             made[name] = value if value is not None else {"string": "", "bool": False}.get(argument[0], 0)
         else:
-            made[name] = _elements(store, argument, value)
+            made[name] = _make_elements(store, argument, value)
     return store.types[type_name](**made)
 
 
-def _elements(store: Typestore, argument: Any, value: Any) -> Any:
+def _make_elements(store: Typestore, argument: Any, value: Any) -> Any:
     (kind, inner), length = argument
     if kind == Nodetype.NAME:
-        return [_message(store, inner, element) for element in (value or [])]
+        return [_make_message(store, inner, element) for element in (value or [])]
     if inner[0] == "string":
         return list(value or [])
     dtype = {"octet": "uint8", "char": "uint8"}.get(inner[0], inner[0])
@@ -240,15 +240,15 @@ def _elements(store: Typestore, argument: Any, value: Any) -> Any:
 
 def _store_of(stream: MessageStream, encoding: Encoding) -> Typestore:
     """Return the types, with that of the stream among them."""
-    store = _typestore(encoding)
+    store = _make_typestore(encoding)
     if stream.definition and stream.type_name not in store.types:
         store.register(get_types_from_msg(stream.definition, stream.type_name))
     return store
 
 
 @functools.cache
-def _typestore(encoding: Encoding) -> Typestore:
+def _make_typestore(encoding: Encoding) -> Typestore:
     store = get_typestore(Stores.ROS1_NOETIC if encoding == "ros1" else Stores.ROS2_HUMBLE)
-    for name, text in {**_MISSING_IN_ROSBAGS, **shipped_definitions()}.items():
+    for name, text in {**_MISSING_IN_ROSBAGS, **load_shipped_definitions()}.items():
         store.register(get_types_from_msg(text, name))
     return store

@@ -11,21 +11,36 @@ from pathlib import Path
 from typing import Any, Literal
 
 from tcpipe.errors import MapError
-from tcpipe.formats.atomic import atomic_directory
+from tcpipe.formats.atomic import write_atomic_directory
+from tcpipe.formats.integrity import write_checksums
 from tcpipe.formats.maps.geotiff import USES, Use
-from tcpipe.formats.maps.layer_building import LayerSource, RasterLayer, shards_of
+from tcpipe.formats.maps.layer_building import LayerSource, RasterLayer, iterate_shards
 from tcpipe.formats.maps.map_facts import MapFacts, MapInputs
 from tcpipe.formats.maps.map_files import SHARD_PX, MapWriter
 from tcpipe.formats.maps.mosaic import Raster, open_raster
 from tcpipe.formats.maps.terrain_polygons import is_drawn, place_polygons
-from tcpipe.formats.seals import write_checksums
 from tcpipe.formats.toml_text import parse_toml
-from tcpipe.tables.catalogue import threshold
+from tcpipe.tables.catalogue import read_threshold
 from tcpipe.tables.findings import Finding, Subject, make_finding
-from tcpipe.terrain.classes import MAX_ID, PAPER_SCHEME, ClassScheme, ClassTable, TerrainClass, named_scheme, own_scheme
+from tcpipe.terrain.classes import (
+    MAX_ID,
+    PAPER_SCHEME,
+    ClassScheme,
+    ClassTable,
+    TerrainClass,
+    find_named_scheme,
+    make_own_scheme,
+)
+from tcpipe.terrain.common_grid import Georeference, choose_crs, choose_grid, find_projection
 from tcpipe.terrain.grid import MapGrid
-from tcpipe.terrain.layers import COLOURS, PAPER_LAYERS, Layer, categorical_layer, continuous_layer, paper_layers
-from tcpipe.terrain.placement import Footing, choose_crs, choose_grid, projection_to
+from tcpipe.terrain.layers import (
+    COLOURS,
+    PAPER_LAYERS,
+    Layer,
+    make_categorical_layer,
+    make_continuous_layer,
+    make_paper_layers,
+)
 from tcpipe.terrain.projection import parse_crs
 
 Files = Path | Sequence[Path]
@@ -93,7 +108,7 @@ def build_map(
     with ExitStack() as stack:
         rasters = _open_all(stack, paths, more)
         scheme, origin = _choose_scheme(classes, agreed, rasters.get("terrain"))
-        schemes = {"terrain": scheme} | _own_schemes(more, rasters)
+        schemes = {"terrain": scheme} | _read_own_schemes(more, rasters)
         wanted = parse_crs(crs, where="--crs") if crs else None
         footings = _place_all(rasters, crs)
         map_crs = choose_crs(footings["height"], wanted)
@@ -101,10 +116,10 @@ def build_map(
         grid = choose_grid(footings["height"], others, map_crs, pitch_m)
         layers: dict[str, LayerSource] = {
             role: RasterLayer(
-                _layer(raster, schemes),
+                _make_layer(raster, schemes),
                 raster,
                 footings[role],
-                projection_to(footings[role], map_crs),
+                find_projection(footings[role], map_crs),
                 schemes.get(role),
             )
             for role, raster in rasters.items()
@@ -112,42 +127,42 @@ def build_map(
         if drawn:
             layers["terrain"] = place_polygons(drawn, scheme, map_crs, grid.bounds_m)
         kinds = {role: source.layer for role, source in layers.items()}
-        with atomic_directory(out_path) as half:
+        with write_atomic_directory(out_path) as half:
             writer = MapWriter(half, name=name, grid=grid, scheme=scheme, layers=kinds)
             _write_layers(writer, layers, grid)
             _refuse_empty(layers)
-            facts = _facts(grid, layers, origin, inputs or MapInputs())
-            writer.finish(facts, {role: _ranged(source) for role, source in layers.items()})
+            facts = _make_facts(grid, layers, origin, inputs or MapInputs())
+            writer.finish(facts, {role: _set_range(source) for role, source in layers.items()})
             write_checksums(half)
     return facts
 
 
-def _layer(raster: Raster, schemes: Mapping[str, ClassScheme]) -> Layer:
+def _make_layer(raster: Raster, schemes: Mapping[str, ClassScheme]) -> Layer:
     """Return the layer that a raster becomes; the range of numbers is not known before they are read."""
     if raster.role in PAPER_LAYERS:
-        return paper_layers([raster.role], schemes["terrain"].table)[raster.role]
+        return make_paper_layers([raster.role], schemes["terrain"].table)[raster.role]
     if raster.role in schemes:
-        return categorical_layer(raster.role, schemes[raster.role].table)
-    return continuous_layer(raster.role, unit=raster.unit, low=0.0, high=1.0)
+        return make_categorical_layer(raster.role, schemes[raster.role].table)
+    return make_continuous_layer(raster.role, unit=raster.unit, low=0.0, high=1.0)
 
 
-def _ranged(source: LayerSource) -> Layer:
+def _set_range(source: LayerSource) -> Layer:
     layer = source.layer
     return replace(layer, low=source.tally.low, high=source.tally.high) if layer.stack == "floats" else layer
 
 
 def _write_layers(writer: MapWriter, layers: Mapping[str, LayerSource], grid: MapGrid) -> None:
     for role, layer in layers.items():
-        for row0, col0, rows, cols in shards_of(grid, SHARD_PX):
+        for row0, col0, rows, cols in iterate_shards(grid, SHARD_PX):
             shard = layer.shard(grid, row0, col0, rows, cols)
             if layer.tally.count(layer, shard):
                 writer.write(role, row0, col0, shard)
 
 
-def _own_schemes(more: MoreLayers, rasters: Mapping[str, Raster]) -> dict[str, ClassScheme]:
+def _read_own_schemes(more: MoreLayers, rasters: Mapping[str, Raster]) -> dict[str, ClassScheme]:
     """Return the classes of the user's categorical layers: of a file, or as the raster itself names its values."""
     schemes = {
-        name: own_scheme(rasters[name].names) if table is None else read_class_scheme(table)
+        name: make_own_scheme(rasters[name].names) if table is None else read_class_scheme(table)
         for name, table in more.categorical.items()
     }
     if problems := [
@@ -163,11 +178,11 @@ def _own_schemes(more: MoreLayers, rasters: Mapping[str, Raster]) -> dict[str, C
 def _choose_scheme(classes: Path | None, agreed: ClassScheme | None, terrain: Raster | None) -> tuple[ClassScheme, str]:
     """Return the classes and where they come from: ``file``, ``names`` of the raster's values, ``store`` or ``default``."""
     if classes is not None:
-        return _scheme_of_file(classes, agreed), "file"
+        return _read_scheme(classes, agreed), "file"
     scheme, origin = (PAPER_SCHEME, "default") if agreed is None else (agreed, "store")
     if terrain is None or not terrain.names:
         return scheme, origin
-    named = named_scheme(terrain.names, scheme.table)
+    named = find_named_scheme(terrain.names, scheme.table)
     if named is None:
         theirs = ", ".join(dict.fromkeys(terrain.names.values()))
         ours = ", ".join(entry.name for entry in scheme.table.classes)
@@ -178,7 +193,7 @@ def _choose_scheme(classes: Path | None, agreed: ClassScheme | None, terrain: Ra
     return named, "names"
 
 
-def _scheme_of_file(classes: Path, agreed: ClassScheme | None) -> ClassScheme:
+def _read_scheme(classes: Path, agreed: ClassScheme | None) -> ClassScheme:
     scheme = read_class_scheme(classes)
     different = () if agreed is None else scheme.table.differences(agreed.table)
     if different:
@@ -206,8 +221,8 @@ def _open_all(stack: ExitStack, paths: Mapping[str, Sequence[Path]], more: MoreL
     return rasters
 
 
-def _place_all(rasters: dict[str, Raster], crs: str | None) -> dict[str, Footing]:
-    footings: dict[str, Footing] = {}
+def _place_all(rasters: dict[str, Raster], crs: str | None) -> dict[str, Georeference]:
+    footings: dict[str, Georeference] = {}
     problems: list[str] = []
     for role, raster in rasters.items():
         text = raster.crs or crs
@@ -219,7 +234,7 @@ def _place_all(rasters: dict[str, Raster], crs: str | None) -> dict[str, Footing
         except MapError as error:
             problems += error.problems
             continue
-        footings[role] = Footing(found, raster.affine, raster.rows, raster.cols, raster.label)
+        footings[role] = Georeference(found, raster.affine, raster.rows, raster.cols, raster.label)
     if problems:
         raise MapError(*dict.fromkeys(problems))
     return footings
@@ -241,7 +256,7 @@ def _refuse_empty(layers: Mapping[str, LayerSource]) -> None:
 
 def _find_all(layers: Mapping[str, LayerSource], covered: Mapping[str, float]) -> tuple[Finding, ...]:
     findings: list[Finding] = []
-    least = threshold("layer-covers-little", "min_share_of_height_fraction") * covered["height"]
+    least = read_threshold("layer-covers-little", "min_share_of_height_fraction") * covered["height"]
     for role, layer in layers.items():
         findings += layer.list_findings()
         if covered[role] < least:
@@ -251,9 +266,9 @@ def _find_all(layers: Mapping[str, LayerSource], covered: Mapping[str, float]) -
     return tuple(findings)
 
 
-def _facts(grid: MapGrid, layers: Mapping[str, LayerSource], origin: str, inputs: MapInputs) -> MapFacts:
+def _make_facts(grid: MapGrid, layers: Mapping[str, LayerSource], origin: str, inputs: MapInputs) -> MapFacts:
     covered = {role: layer.tally.pixels / (grid.rows * grid.cols) for role, layer in layers.items()}
-    shares = {name: found for name, layer in layers.items() if (found := _shares(layer))}
+    shares = {name: found for name, layer in layers.items() if (found := _compute_class_shares(layer))}
     return MapFacts(
         sources={role: layer.name for role, layer in layers.items()},
         covered=covered,
@@ -267,7 +282,7 @@ def _facts(grid: MapGrid, layers: Mapping[str, LayerSource], origin: str, inputs
     )
 
 
-def _shares(source: LayerSource) -> dict[str, float]:
+def _compute_class_shares(source: LayerSource) -> dict[str, float]:
     """Return the share of each class that occurs among the pixels that have one; nothing of a layer without classes."""
     counts, classes = source.tally.by_class, source.layer.classes
     total = max(int(counts[1:].sum()), 1)
@@ -299,14 +314,14 @@ def read_class_scheme(path: Path) -> ClassScheme:
                 f"{path}: a class table of {size / 1e6:.1f} MB, at most {MAX_BYTES // 10**6}: {MAX_ID} classes and their values"
             )
         text = path.read_text(encoding="utf-8-sig")
-        rows = _toml_rows(text) if path.suffix.lower() == ".toml" else _csv_rows(text, path)
+        rows = _read_toml_rows(text) if path.suffix.lower() == ".toml" else _read_csv_rows(text, path)
     except (OSError, ValueError, csv.Error) as error:
         raise MapError(f"{path}: the class table cannot be read ({error})") from error
     problems: list[str] = []
     classes: dict[int, TerrainClass] = {}
     id_by_value: dict[int, int] = {}
     for where, row in rows:
-        found = _entry(row, f"{path}: {where}", problems)
+        found = _parse_entry(row, f"{path}: {where}", problems)
         if found is None:
             continue
         values, entry = found
@@ -323,7 +338,7 @@ def read_class_scheme(path: Path) -> ClassScheme:
     return ClassScheme(ClassTable(tuple(classes[key] for key in sorted(classes))), dict(sorted(id_by_value.items())))
 
 
-def _csv_rows(text: str, path: Path) -> list[tuple[str, dict[str, Any]]]:
+def _read_csv_rows(text: str, path: Path) -> list[tuple[str, dict[str, Any]]]:
     reader = csv.DictReader(StringIO(text, newline=""), skipinitialspace=True)
     missing = [name for name in _COLUMNS if name not in (reader.fieldnames or ())]
     if missing:
@@ -331,12 +346,12 @@ def _csv_rows(text: str, path: Path) -> list[tuple[str, dict[str, Any]]]:
     return [(f"line {reader.line_num}", row) for row in reader]
 
 
-def _toml_rows(text: str) -> list[tuple[str, dict[str, Any]]]:
+def _read_toml_rows(text: str) -> list[tuple[str, dict[str, Any]]]:
     rows = parse_toml(text).get("class", [])
     return [(f"class {number}", row) for number, row in enumerate(rows if isinstance(rows, list) else [rows], 1)]
 
 
-def _entry(row: Any, where: str, problems: list[str]) -> tuple[list[int], TerrainClass] | None:
+def _parse_entry(row: Any, where: str, problems: list[str]) -> tuple[list[int], TerrainClass] | None:
     before = len(problems)
     if not isinstance(row, dict):
         problems.append(f"{where}: wanted a table with {', '.join(_COLUMNS)}")

@@ -33,8 +33,8 @@ from rasterio.io import MemoryFile
 from rasterio.windows import Window
 
 from tcpipe.errors import MapError
-from tcpipe.formats.atomic import atomic_file
-from tcpipe.formats.maps.value_names import value_names
+from tcpipe.formats.atomic import write_atomic_file
+from tcpipe.formats.maps.value_names import read_value_names
 from tcpipe.tables.findings import Finding, Subject, make_finding
 from tcpipe.terrain.layers import LUMA_RGB
 
@@ -164,12 +164,15 @@ class RasterTiles:
             valid = dataset.dataset_mask(window=window) >= _OPAQUE
         except RasterioError as error:
             raise MapError(
-                f"{tile.path}: rows {row0} to {row1}, columns {col0} to {col1} cannot be read; the file is damaged: {_reason(error)}"
+                f"{tile.path}: rows {row0} to {row1}, columns {col0} to {col1} cannot be read; the file is damaged: "
+                f"{_describe_error(error)}"
             ) from error
         if tile.use == "classes":
             return raw[0], valid if tile.opaque is None else valid & tile.opaque[raw[0]]
         weights = _WEIGHTS.get(tile.use)
-        values = raw[0] * tile.scale[0] + tile.scale[1] if weights is None else _grey(dataset, tile.bands, raw, weights)
+        values = (
+            raw[0] * tile.scale[0] + tile.scale[1] if weights is None else _read_grey(dataset, tile.bands, raw, weights)
+        )
         return values, valid & np.isfinite(values)
 
     def _dataset(self, tile: Tile) -> Any:
@@ -188,17 +191,17 @@ class RasterTiles:
         self._open.clear()
 
 
-def _grey(
+def _read_grey(
     dataset: Any, bands: tuple[int, ...], raw: NDArray[Any], weights_rgb: tuple[float, float, float]
 ) -> NDArray[np.float64]:
     if dataset.colorinterp[bands[0] - 1] == ColorInterp.palette:
-        return np.asarray(_palette_grey(dataset.colormap(bands[0]), weights_rgb)[raw[0]])
+        return np.asarray(_read_palette_grey(dataset.colormap(bands[0]), weights_rgb)[raw[0]])
     weights = np.array(weights_rgb if len(bands) == 3 else (1.0,)) * (255.0 / np.iinfo(raw.dtype).max)
     return np.asarray(np.tensordot(weights, raw.astype(np.float64), 1))
 
 
 @contextmanager
-def raster_tiles() -> Iterator[RasterTiles]:
+def open_raster_tiles() -> Iterator[RasterTiles]:
     """Read tiles, with GDAL set up as `_CONFIG` says."""
     pool = RasterTiles()
     with rasterio.Env(**_CONFIG):
@@ -217,11 +220,11 @@ def read_tile(path: Path, role: str, use: Use | None = None) -> Tile:
     """
     use = use or USES[role]
     with rasterio.Env(**_CONFIG):
-        source = _checked(path)
+        source = _check_source(path)
         with _open_as(source) as dataset:
             _refuse_unplaced(dataset, path)
             bands, unusual = _choose_bands(dataset, path, role, use)
-            scale, ignored = _scaling(dataset, path, role, use, bands)
+            scale, ignored = _read_scaling(dataset, path, role, use, bands)
             unit = (dataset.units[bands[0] - 1] or "").strip() if use == "numbers" else ""
             palette = use == "classes" and dataset.colorinterp[bands[0] - 1] == ColorInterp.palette
             colours = ", ".join(dataset.colorinterp[band - 1].name for band in bands)
@@ -235,17 +238,17 @@ def read_tile(path: Path, role: str, use: Use | None = None) -> Tile:
                 cols=dataset.width,
                 kind=f"{dataset.dtypes[bands[0] - 1]} ({colours}{', ' if unit else ''}{unit})",
                 findings=(*unusual, *ignored),
-                names=value_names(_described(dataset), bands[0]) if use == "classes" else {},
+                names=read_value_names(_describe_as_vrt(dataset), bands[0]) if use == "classes" else {},
                 source=source,
                 dtype=dataset.dtypes[bands[0] - 1] if use == "classes" else "float64",
                 bands=bands,
                 scale=scale,
                 unit=unit,
-                opaque=np.isfinite(_palette_grey(dataset.colormap(bands[0]))) if palette else None,
+                opaque=np.isfinite(_read_palette_grey(dataset.colormap(bands[0]))) if palette else None,
             )
 
 
-def raster_files(path: Path) -> tuple[Path, ...]:
+def list_raster_files(path: Path) -> tuple[Path, ...]:
     """Return every file that a raster is made of: itself, and what lies beside it (masks, world files, statistics).
 
     Raises
@@ -253,18 +256,18 @@ def raster_files(path: Path) -> tuple[Path, ...]:
     MapError : it is no raster of a kind that is read.
     """
     with rasterio.Env(**_CONFIG):
-        return _checked(path).files
+        return _check_source(path).files
 
 
-def _checked(path: Path) -> Source:
+def _check_source(path: Path) -> Source:
     """Return how a user's file is opened, once neither it nor what lies beside it reaches elsewhere."""
-    driver = _driver(path, raster=path)
-    return Source(path, driver, _plain_files(path, driver))
+    driver = _find_driver(path, raster=path)
+    return Source(path, driver, _list_plain_files(path, driver))
 
 
-def _driver(path: Path, *, raster: Path) -> str:
+def _find_driver(path: Path, *, raster: Path) -> str:
     """Return the driver of a file by what it begins with, which GDAL goes by; ``raster`` is the one that it is or lies beside."""
-    head = _begins(path)
+    head = _read_beginning(path)
     for start, driver in _DRIVERS.items():
         if head.startswith(start):
             return driver
@@ -277,11 +280,11 @@ def _driver(path: Path, *, raster: Path) -> str:
     what = known or ("something else" if head else "empty")
     rewrite = f" ({_rewrite(raster)})" if known else ""
     raise MapError(
-        f"{path}: is {what}, not a raster that is read; wanted GeoTIFF, JPEG 2000 or ERDAS Imagine{rewrite}{_or_polygons(path)}"
+        f"{path}: is {what}, not a raster that is read; wanted GeoTIFF, JPEG 2000 or ERDAS Imagine{rewrite}{_suggest_polygons(path)}"
     )
 
 
-def _begins(path: Path) -> bytes:
+def _read_beginning(path: Path) -> bytes:
     try:
         with path.open("rb") as stream:
             return stream.read(4096)
@@ -291,7 +294,7 @@ def _begins(path: Path) -> bytes:
         raise MapError(f"{path}: cannot be read ({error.strerror})") from None
 
 
-def _plain_files(path: Path, driver: str) -> tuple[Path, ...]:
+def _list_plain_files(path: Path, driver: str) -> tuple[Path, ...]:
     """Return a raster's files, itself first; refuse one that names others elsewhere, has such beside it, or does not fit into memory."""
     _refuse_beside(path)
     with _open_as(Source(path, driver, ())) as dataset:
@@ -310,7 +313,7 @@ def _plain_files(path: Path, driver: str) -> tuple[Path, ...]:
                 f"write it in tiles: {_rewrite(path)} -co TILED=YES -co BIGTIFF=IF_SAFER"
             )
         files = {Path(name) for name in dataset.files}
-    strangers = sorted(str(file) for file in files if file.parent != _absolute(path).parent)
+    strangers = sorted(str(file) for file in files if file.parent != _make_absolute(path).parent)
     if strangers:
         raise MapError(f"{path}: reaches for {strangers[0]}, which does not lie beside it; {_rewrite(path)}")
     return (path, *sorted(path.with_name(file.name) for file in files if file.name != path.name))
@@ -321,9 +324,9 @@ def _refuse_beside(path: Path) -> None:
     endings = [ending for lower in (".msk", ".ovr", ".aux") for ending in (lower, lower.upper())]
     names = [*(f"{path.name}{ending}" for ending in endings), *(f"{path.stem}{ending}" for ending in endings[-2:])]
     for beside in (path.with_name(name) for name in names if name != path.name):
-        if not beside.is_file() or (beside.suffix.lower() == ".aux" and not _begins(beside).startswith(_HFA)):
+        if not beside.is_file() or (beside.suffix.lower() == ".aux" and not _read_beginning(beside).startswith(_HFA)):
             continue
-        _plain_files(beside, _driver(beside, raster=path))
+        _list_plain_files(beside, _find_driver(beside, raster=path))
     statistics = path.with_name(f"{path.name}.aux.xml")
     if statistics.is_file() and statistics.stat().st_size > _MAX_STATISTICS_BYTES:
         size = f"{statistics.stat().st_size / 1e6:.0f} MB"
@@ -345,23 +348,23 @@ def _open_as(source: Source) -> Any:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", NotGeoreferencedWarning)
         try:
-            return rasterio.open(_absolute(source.path), driver=source.driver)
+            return rasterio.open(_make_absolute(source.path), driver=source.driver)
         except RasterioError as error:
             raise MapError(
-                f"{source.path}: not a raster that GDAL can read; the file is damaged: {_reason(error)}"
+                f"{source.path}: not a raster that GDAL can read; the file is damaged: {_describe_error(error)}"
             ) from error
 
 
-def _absolute(path: Path) -> Path:
+def _make_absolute(path: Path) -> Path:
     """Return a path that begins at the root: no GDAL prefix, no address."""
     return path.absolute()
 
 
-def _reason(error: BaseException) -> str:
+def _describe_error(error: BaseException) -> str:
     return str(error.__cause__ or error).splitlines()[0][:200]
 
 
-def _or_polygons(path: Path) -> str:
+def _suggest_polygons(path: Path) -> str:
     vector = path.suffix.lower() in {".shp", ".gpkg", ".kml", ".geojson", ".json"}
     return "; terrain may also be polygons, exported as .geojson" if vector else ""
 
@@ -415,7 +418,7 @@ def _choose_bands(dataset: Any, path: Path, role: str, use: Use) -> tuple[tuple[
     return (plain[0],), ()
 
 
-def _scaling(
+def _read_scaling(
     dataset: Any, path: Path, role: str, use: Use, bands: tuple[int, ...]
 ) -> tuple[tuple[float, float], tuple[Finding, ...]]:
     """Return scale and offset to metres or numbers; for other uses, a finding that such tags were not applied."""
@@ -430,11 +433,11 @@ def _scaling(
     unit = (dataset.units[bands[0] - 1] or "").strip()
     if unit.lower() not in _METRES:
         raise MapError(f"{path}: height is in {unit!r}, wanted metres (or cm, mm, ft)")
-    metres = _METRES[unit.lower()] if unit else _vertical_unit_m(dataset, path)
+    metres = _METRES[unit.lower()] if unit else _find_vertical_unit_m(dataset, path)
     return (scale * metres, offset * metres), ()
 
 
-def _vertical_unit_m(dataset: Any, path: Path) -> float:
+def _find_vertical_unit_m(dataset: Any, path: Path) -> float:
     """Return the unit of a compound CRS's heights [m]; a metre where the CRS says nothing of heights and is metric itself."""
     crs = CRS.from_wkt(dataset.crs.to_wkt()) if dataset.crs else None
     vertical = [part for part in crs.sub_crs_list if part.is_vertical] if crs else []
@@ -448,7 +451,7 @@ def _vertical_unit_m(dataset: Any, path: Path) -> float:
     return 1.0
 
 
-def _described(dataset: Any) -> str:
+def _describe_as_vrt(dataset: Any) -> str:
     """Return the dataset as a VRT document: GDAL's own reading of attribute tables and names, wherever a format keeps them."""
     with MemoryFile(ext=".vrt") as memory:
         rasterio.shutil.copy(dataset, memory.name, driver="VRT")
@@ -470,7 +473,7 @@ def burn_polygons(
     return np.asarray(rasterize(shapes, (rows, cols), transform=rasterio.Affine(*affine), dtype=np.uint8))
 
 
-def _palette_grey(
+def _read_palette_grey(
     colormap: dict[int, tuple[int, int, int, int]], weights_rgb: tuple[float, float, float] = LUMA_RGB
 ) -> NDArray[np.float64]:
     """Return grey by palette index; NaN where the palette is transparent or has no entry."""
@@ -521,7 +524,7 @@ def write_geotiff(
     profile |= {"compress": "deflate", "zlevel": 1, "predictor": 3 if dtype == "float32" else 2}
     if bands == 4:
         profile |= {"photometric": "RGB", "alpha": "YES"}
-    with atomic_file(path) as temporary, rasterio.open(temporary, "w", **profile) as dataset:
+    with write_atomic_file(path) as temporary, rasterio.open(temporary, "w", **profile) as dataset:
         if palette is not None:  # before the first pixel: GDAL cannot change what is on disk already
             dataset.write_colormap(1, {value: (*colour, 255) for value, colour in palette.items()})
         for first in range(0, rows, _STRIP_ROWS):
@@ -545,7 +548,7 @@ def write_cog(
 
     ``strip`` and ``affine`` as in `write_geotiff`; ``bands`` are names and units.
     """
-    with atomic_file(path) as temporary:
+    with write_atomic_file(path) as temporary:
         plain = temporary.with_name("plain.tif")
         write_geotiff(
             plain, strip, rows=rows, cols=cols, affine=affine, crs=crs, dtype=dtype, bands=len(bands), nodata=nodata
@@ -560,7 +563,7 @@ def write_cog(
 def read_bands(path: Path, bands: Sequence[int]) -> NDArray[Any]:
     """Return bands, counted from 1, of a GeoTIFF that `write_cog` wrote, shape (B, rows, cols). `MapError`: it cannot be read."""
     try:
-        with rasterio.Env(**_CONFIG), _open_as(_checked(path)) as dataset:
+        with rasterio.Env(**_CONFIG), _open_as(_check_source(path)) as dataset:
             return np.asarray(dataset.read(list(bands)))
     except RasterioError as error:
-        raise MapError(f"{path}: cannot be read; the file is damaged ({_reason(error)})") from error
+        raise MapError(f"{path}: cannot be read; the file is damaged ({_describe_error(error)})") from error

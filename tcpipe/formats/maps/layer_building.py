@@ -14,11 +14,11 @@ from tcpipe.errors import MapError
 from tcpipe.formats.maps.mosaic import Raster
 from tcpipe.tables.findings import Finding, Subject, make_finding
 from tcpipe.terrain.classes import ClassScheme
+from tcpipe.terrain.common_grid import LATTICE_STEP_PX, Georeference, compute_source_lattice
 from tcpipe.terrain.grid import MapGrid
 from tcpipe.terrain.layers import Layer, Pixels
-from tcpipe.terrain.placement import LATTICE_STEP_PX, Footing, source_lattice
 from tcpipe.terrain.projection import Projection
-from tcpipe.terrain.resampling_kernel import bilinear, majority, mean
+from tcpipe.terrain.resampling_kernel import mean, resample_bilinear, resample_majority
 
 _BLOCK_PX = 1024
 _HIGHEST_M = 9_000.0
@@ -102,7 +102,7 @@ class RasterLayer:
 
     layer: Layer
     raster: Raster
-    footing: Footing
+    footing: Georeference
     projection: Projection | None
     scheme: ClassScheme | None
     """Of a categorical layer."""
@@ -160,12 +160,12 @@ class RasterLayer:
 
     def _block_px(self, grid: MapGrid, row0: int, col0: int) -> int:
         """Return the side of the blocks a shard is made in, small where the raster is so much finer that its window would not fit."""
-        ratio = _source_px_per_px(source_lattice(grid, self.footing, self.projection, row0, 1, col0, 1))
+        ratio = _compute_source_px_per_px(compute_source_lattice(grid, self.footing, self.projection, row0, 1, col0, 1))
         return _BLOCK_PX if not ratio > 2.0 else max(int(2 * _BLOCK_PX / ratio), LATTICE_STEP_PX)
 
     def _fill(self, part: Pixels, grid: MapGrid, row0: int, col0: int) -> None:
         """Resample one block of the map from the raster."""
-        lattice = source_lattice(grid, self.footing, self.projection, row0, part.shape[0], col0, part.shape[1])
+        lattice = compute_source_lattice(grid, self.footing, self.projection, row0, part.shape[0], col0, part.shape[1])
         part[...] = 0 if self.layer.kind == "categorical" else np.nan
         flat = lattice.reshape(-1, 2)
         if not np.isfinite(flat).all():
@@ -177,29 +177,29 @@ class RasterLayer:
         values, valid = self.raster.read(int(low[1]), int(high[1]), int(low[0]), int(high[0]))
         if not valid.any():  # the most of a survey that is laid across its bounding box
             return
-        ratio = _source_px_per_px(lattice)
+        ratio = _compute_source_px_per_px(lattice)
         lattice -= low
         parts = math.ceil(ratio) if ratio > _MEAN_FROM else 1
         if self.scheme is not None:
             ids = self.scheme.ids(values, valid)
             self.tally.note_unnamed(values[valid & (ids == 0)])
-            majority(ids, lattice, LATTICE_STEP_PX, parts, part)
+            resample_majority(ids, lattice, LATTICE_STEP_PX, parts, part)
             return
         source = np.where(valid, values, np.nan).astype(np.float64, copy=False)
         if parts > 1:
             mean(source, lattice, LATTICE_STEP_PX, parts, part)
         else:
-            bilinear(source, lattice, LATTICE_STEP_PX, part)
+            resample_bilinear(source, lattice, LATTICE_STEP_PX, part)
 
 
-def _source_px_per_px(lattice: NDArray[np.float64]) -> float:
+def _compute_source_px_per_px(lattice: NDArray[np.float64]) -> float:
     """Return how many source pixels a map pixel spans, the longer way; NaN where the raster's CRS is not defined."""
     across = np.linalg.norm(lattice[0, 1] - lattice[0, 0])
     down = np.linalg.norm(lattice[1, 0] - lattice[0, 0])
     return float(max(across, down)) / LATTICE_STEP_PX
 
 
-def shards_of(grid: MapGrid, side_px: int) -> Iterator[tuple[int, int, int, int]]:
+def iterate_shards(grid: MapGrid, side_px: int) -> Iterator[tuple[int, int, int, int]]:
     """Yield the parts that a map is written in: first row, first column, rows, columns."""
     for row0 in range(0, grid.rows, side_px):
         for col0 in range(0, grid.cols, side_px):

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from tcpipe.formats.layer_descriptions import Description, layers_described
+from tcpipe.formats.layer_descriptions import Description, read_layers
 from tcpipe.tables.findings import LEFT_OUT, Finding
 from tcpipe.terrain.classes import TerrainClass
 
@@ -71,26 +71,26 @@ def map_lines(of: MapSummary) -> list[str]:
     lines = [f"{cols} x {rows} px of {pitch_m:g} m ({cols * pitch_m:.0f} x {rows * pitch_m:.0f} m) in {crs}"]
     width = max(8, *(len(layer) for layer in of.layers))
     for layer in of.layers:
-        line = f"{layer:{width}s} {_percent(of.covered[layer]):>5s} covered, from {of.sources[layer]}"
-        lines.append(line + _detail(layer, of))
+        line = f"{layer:{width}s} {_format_percent(of.covered[layer]):>5s} covered, from {of.sources[layer]}"
+        lines.append(line + _format_detail(layer, of))
     return lines
 
 
-def _detail(layer: str, of: MapSummary) -> str:
+def _format_detail(layer: str, of: MapSummary) -> str:
     if layer == "height":
         return f": {of.height_min_m:.1f} to {of.height_max_m:.1f} m"
-    own = layers_described(of.described, (), Path(of.name)).get(layer)
+    own = read_layers(of.described, (), Path(of.name)).get(layer)
     if own is not None and own.stack == "floats":
         return f": {own.low:.6g} to {own.high:.6g}" + ("" if own.unit == "1" else f" {own.unit}")
     if layer == "terrain" or own is not None:
         classes = of.class_share if layer == "terrain" else of.class_shares[layer]
         shares = sorted(classes.items(), key=lambda entry: (-entry[1], entry[0]))
-        listed = [f"{_percent(share)} {name}" for name, share in shares[:_SHARES]]
+        listed = [f"{_format_percent(share)} {name}" for name, share in shares[:_SHARES]]
         return ": " + ", ".join(listed) + (" …" if len(shares) > _SHARES else "")
     return ""
 
 
-def _percent(share: float) -> str:
+def _format_percent(share: float) -> str:
     """Return a share as per cent; never 0 % of something or 100 % of less than all."""
     percent = 100.0 * share
     if 0.0 < percent < 0.5:

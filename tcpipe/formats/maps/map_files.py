@@ -31,18 +31,18 @@ from numpy.typing import NDArray
 from pyproj import CRS
 
 from tcpipe.errors import MapError, StoreError
-from tcpipe.formats.json_files import plain, read_json, recast, typed
-from tcpipe.formats.layer_descriptions import Description, described, flags, layers_described
+from tcpipe.formats.integrity import prove_files, read_checksums
+from tcpipe.formats.json_files import convert_record, parse_typed, read_json, to_plain
+from tcpipe.formats.layer_descriptions import Description, describe_layer, make_cf_flags, read_layers
 from tcpipe.formats.maps.map_facts import MapFacts, MapSummary
-from tcpipe.formats.seals import prove_files, read_checksums
-from tcpipe.formats.shards import DESCRIPTION, Fetched, ShardedArray, open_sharded
-from tcpipe.formats.zarr_arrays import add_array, consolidate, create_group
+from tcpipe.formats.shards import DESCRIPTION, ShardedArray, ShardFetcher, open_sharded
+from tcpipe.formats.zarr_arrays import add_array, consolidate_metadata, create_group
 from tcpipe.tables.facts import LEFT_OUT
 from tcpipe.terrain.classes import ClassScheme, ClassTable, TerrainClass
+from tcpipe.terrain.common_grid import MAX_PIXELS, MAX_SIDE_PX
 from tcpipe.terrain.grid import MapGrid
-from tcpipe.terrain.layers import LAYERS, PAPER_LAYERS, Layer, Pixels, missing
-from tcpipe.terrain.overviews import coarser_levels, overview_factors, overview_grid
-from tcpipe.terrain.placement import MAX_PIXELS, MAX_SIDE_PX
+from tcpipe.terrain.layers import LAYERS, PAPER_LAYERS, Layer, Pixels, find_no_data_value
+from tcpipe.terrain.overviews import iterate_levels, list_factors, make_overview_grid
 
 TILE_PX = 512
 """Side of a tile: the unit that is decoded."""
@@ -91,12 +91,12 @@ class MapFile:
 
     def at(self, factor: int) -> MapFile:
         """Return the map at one of its ``factors``, which are the full map's."""
-        return replace(self, grid=overview_grid(self.grid, factor), factors=(1,), _factor=factor)
+        return replace(self, grid=make_overview_grid(self.grid, factor), factors=(1,), _factor=factor)
 
     def summary(self) -> MapSummary:
         """Return what the map is as a whole."""
         grid = self.grid
-        return recast(
+        return convert_record(
             self.facts,
             MapSummary,
             name=self.name,
@@ -108,7 +108,7 @@ class MapFile:
             layers=tuple(self.layers),
             overviews=self.factors[1:],
             class_table=self.classes.classes,
-            described=_described(self.layers),
+            described=_describe_layers(self.layers),
         )
 
     def read(self, layer: str, row0: int, row1: int, col0: int, col1: int) -> NDArray[Any]:
@@ -141,7 +141,7 @@ class MapFile:
             ) from error
 
 
-def open_map(path: Path, fetched: Fetched | None = None, *, proved: bool = True) -> MapFile:
+def open_map(path: Path, fetched: ShardFetcher | None = None, *, proved: bool = True) -> MapFile:
     """Open a map for reading; its shards lie beside their descriptions, or are ``fetched``.
 
     Raises
@@ -160,9 +160,9 @@ def open_map(path: Path, fetched: Fetched | None = None, *, proved: bool = True)
         version = found.get("version") if isinstance(found, dict) else None
         raise MapError(f"{path}: not a map of this version (got {version}, wanted {MAP_VERSION}); add it again")
     try:
-        kept = typed(found, _Attributes, path)
+        kept = parse_typed(found, _Attributes, path)
         described = {name: kept.described.get(name, {}) for name in kept.layers}
-        layers = layers_described(described, kept.class_table, path)
+        layers = read_layers(described, kept.class_table, path)
         _refuse_sizes(kept, path)
     except StoreError as error:
         raise MapError(*(f"{problem}; add the map again" for problem in error.problems)) from None
@@ -174,12 +174,12 @@ def open_map(path: Path, fetched: Fetched | None = None, *, proved: bool = True)
         _prove(path, fetched)
     try:
         levels = {
-            factor: {name: _array(path, layer, kept.grid, factor, fetched) for name, layer in layers.items()}
+            factor: {name: _open_array(path, layer, kept.grid, factor, fetched) for name, layer in layers.items()}
             for factor in kept.factors
         }
     except StoreError as error:
         raise MapError(*(f"{problem}; add the map again" for problem in error.problems)) from None
-    return recast(kept, MapFile, classes=ClassTable(kept.class_table), layers=layers, _levels=levels)
+    return convert_record(kept, MapFile, classes=ClassTable(kept.class_table), layers=layers, _levels=levels)
 
 
 def _refuse_sizes(kept: _Attributes, path: Path) -> None:
@@ -189,38 +189,38 @@ def _refuse_sizes(kept: _Attributes, path: Path) -> None:
         raise StoreError(
             f"{path}: says that it has {rows} x {cols} pixels of {pitch_m} m, at most {MAX_SIDE_PX} a side"
         )
-    wanted = (TILE_PX, overview_factors(kept.grid))
+    wanted = (TILE_PX, list_factors(kept.grid))
     if (kept.tile_px, kept.factors) != wanted:
         raise StoreError(f"{path}: tiles and overviews are {(kept.tile_px, kept.factors)}, wanted {wanted}")
 
 
-def _array(path: Path, layer: Layer, whole: MapGrid, factor: int, fetched: Fetched | None) -> ShardedArray:
-    grid, shard_px = overview_grid(whole, factor), _shard_px(factor)
+def _open_array(path: Path, layer: Layer, whole: MapGrid, factor: int, fetched: ShardFetcher | None) -> ShardedArray:
+    grid, shard_px = make_overview_grid(whole, factor), _compute_shard_px(factor)
     return open_sharded(
         path / f"{_level_path(factor)}{layer.name}",
         shape=(grid.rows, grid.cols),
         chunk_shape=(TILE_PX, TILE_PX),
         shard_shape=(shard_px, shard_px),
         dtype=np.dtype(layer.mapped),
-        fill=missing(layer.mapped),
+        fill=find_no_data_value(layer.mapped),
         sparse=True,
         fetched=fetched,
     )
 
 
-def _shard_px(factor: int) -> int:
+def _compute_shard_px(factor: int) -> int:
     """Return the side of a shard at a level."""
     return max(SHARD_PX // factor, TILE_PX)
 
 
-def _prove(path: Path, fetched: Fetched | None) -> None:
+def _prove(path: Path, fetched: ShardFetcher | None) -> None:
     """Compare what describes a map with its checksums, and its other files by size: their tiles carry checksums of their own."""
     try:
         listed = read_checksums(path)
         prove_files(path, listed, [name for name in listed if Path(name).name == DESCRIPTION])
     except StoreError as error:
         raise MapError(*(f"{problem}; add the map again" for problem in error.problems)) from None
-    size_of = fetched.size if fetched else _size_on_disk
+    size_of = fetched.size if fetched else _measure_size_on_disk
     lost = [str(path / name) for name, entry in listed.items() if not _has_size(path / name, entry.size_bytes, size_of)]
     if lost:
         more = f" and {len(lost) - 1} more" if len(lost) > 1 else ""
@@ -234,7 +234,7 @@ def _has_size(path: Path, size_bytes: int, size_of: Callable[[Path], int]) -> bo
         return False
 
 
-def _size_on_disk(path: Path) -> int:
+def _measure_size_on_disk(path: Path) -> int:
     return path.stat().st_size
 
 
@@ -251,7 +251,7 @@ class MapWriter:
         self, directory: Path, *, name: str, grid: MapGrid, scheme: ClassScheme, layers: Mapping[str, Layer]
     ) -> None:
         self._name, self._grid, self._scheme, self._layers = name, grid, scheme, layers
-        self._factors = overview_factors(grid)
+        self._factors = list_factors(grid)
         self._group = create_group(directory)
         self._levels = {factor: self._add_level(factor) for factor in self._factors}
         self.height_reference_m: float | None = None
@@ -259,8 +259,8 @@ class MapWriter:
 
     def _add_level(self, factor: int) -> dict[str, Any]:
         group = self._group if factor == 1 else self._group.create_group(_level_path(factor).rstrip("/"))
-        grid = overview_grid(self._grid, factor)
-        return {name: _add_layer(group, layer, grid, _shard_px(factor)) for name, layer in self._layers.items()}
+        grid = make_overview_grid(self._grid, factor)
+        return {name: _add_layer(group, layer, grid, _compute_shard_px(factor)) for name, layer in self._layers.items()}
 
     def write(self, layer: str, row0: int, col0: int, values: Pixels) -> None:
         """Write a shard whose corner is at a multiple of `SHARD_PX`; floats with NaN, bytes with 0, as no data."""
@@ -269,7 +269,7 @@ class MapWriter:
                 self.height_reference_m = float(np.floor(np.nanmin(values)))
             values = values - (self.height_reference_m or 0.0)
         _put(self._levels[1][layer], row0, col0, values)
-        for factor, level in coarser_levels(self._layers[layer], values, self._factors):
+        for factor, level in iterate_levels(self._layers[layer], values, self._factors):
             _put(self._levels[factor][layer], row0 // factor, col0 // factor, level)
 
     def finish(self, facts: MapFacts, layers: Mapping[str, Layer]) -> None:
@@ -280,7 +280,7 @@ class MapWriter:
             group = self._group if factor == 1 else self._group[_level_path(factor).rstrip("/")]
             _place(
                 group,
-                overview_grid(self._grid, factor),
+                make_overview_grid(self._grid, factor),
                 f"{self._name}, {factor} x coarser" if factor > 1 else self._name,
             )
         kept = _Attributes(
@@ -290,14 +290,14 @@ class MapWriter:
             class_table=self._scheme.table.classes,
             id_by_value=self._scheme.id_by_value,
             layers=tuple(layers),
-            described=_described(layers),
+            described=_describe_layers(layers),
             factors=self._factors,
             tile_px=TILE_PX,
             height_reference_m=reference_m,
             facts=facts,
         )
-        self._group.attrs.update({"tcpipe_map": plain(kept)})
-        consolidate(self._group)
+        self._group.attrs.update({"tcpipe_map": to_plain(kept)})
+        consolidate_metadata(self._group)
 
 
 def _put(array: Any, row0: int, col0: int, values: Pixels) -> None:
@@ -338,15 +338,15 @@ def _place(group: Any, grid: MapGrid, title: str) -> None:
 _LONG_NAMES = {"height": "height of the ground", "ortho": "grey of the orthophoto", "terrain": "terrain class"}
 
 
-def _described(layers: Mapping[str, Layer]) -> dict[str, Description]:
+def _describe_layers(layers: Mapping[str, Layer]) -> dict[str, Description]:
     """Return what the names of layers alone do not tell."""
-    return {name: described(layer) for name, layer in layers.items() if name not in PAPER_LAYERS}
+    return {name: describe_layer(layer) for name, layer in layers.items() if name not in PAPER_LAYERS}
 
 
 def _add_layer(group: Any, layer: Layer, grid: MapGrid, shard_px: int) -> Any:
     attributes: dict[str, Any] = {"long_name": _LONG_NAMES.get(layer.name, layer.long_name)}
     if layer.kind == "categorical":
-        attributes |= {**flags(layer.classes), "_FillValue": 0}
+        attributes |= {**make_cf_flags(layer.classes), "_FillValue": 0}
     else:
         attributes |= {"units": layer.unit, "scale_factor": layer.step if layer.stack == "greys" else 1.0}
         attributes |= {"_FillValue": 0} if layer.stack == "greys" else {}
@@ -358,7 +358,7 @@ def _add_layer(group: Any, layer: Layer, grid: MapGrid, shard_px: int) -> Any:
         chunks=(TILE_PX, TILE_PX),
         shards=(shard_px, shard_px),
         dimensions=("y", "x"),
-        fill_value=missing(layer.mapped),
+        fill_value=find_no_data_value(layer.mapped),
         attributes={**attributes, "grid_mapping": "spatial_ref"},
     )
 

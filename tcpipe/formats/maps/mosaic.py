@@ -19,7 +19,7 @@ from pyproj import CRS
 from pyproj.exceptions import CRSError
 
 from tcpipe.errors import MapError
-from tcpipe.formats.maps.geotiff import RasterTiles, Tile, Use, raster_tiles, read_tile
+from tcpipe.formats.maps.geotiff import RasterTiles, Tile, Use, open_raster_tiles, read_tile
 from tcpipe.tables.findings import Finding
 
 MAX_FILES = 100_000
@@ -94,11 +94,11 @@ def open_raster(paths: Sequence[Path], role: str, use: Use | None = None) -> Ite
         except MapError as error:
             problems += error.problems
     if problems:
-        raise MapError(*_few(problems))
-    _refuse_odd(tiles, "CRS", _crs_keys(tiles), "gdalwarp -t_srs EPSG:n in.tif out.tif")
+        raise MapError(*_shorten_list(problems))
+    _refuse_odd(tiles, "CRS", _find_crs_keys(tiles), "gdalwarp -t_srs EPSG:n in.tif out.tif")
     _refuse_odd(tiles, "type and bands", [tile.kind for tile in tiles], "gdal_translate -ot T -b n in.tif out.tif")
-    affine, corners = _laid(tiles)
-    with raster_tiles() as pool:
+    affine, corners = _lay_out_tiles(tiles)
+    with open_raster_tiles() as pool:
         yield Raster(
             label=_label(paths),
             role=role,
@@ -108,7 +108,7 @@ def open_raster(paths: Sequence[Path], role: str, use: Use | None = None) -> Ite
             rows=int(corners[:, 1].max()),
             cols=int(corners[:, 3].max()),
             findings=tuple({of.code: of for tile in reversed(tiles) for of in reversed(tile.findings)}.values()),
-            names=_joint_names(tiles),
+            names=_join_value_names(tiles),
             tiles=tuple(tiles),
             _corners=corners,
             _pool=pool,
@@ -119,19 +119,19 @@ def _label(paths: Sequence[Path], of: Callable[[Path], str] = str) -> str:
     return of(paths[0]) if len(paths) == 1 else f"{of(paths[0])} … {paths[-1].name} ({len(paths)} files)"
 
 
-def _few(lines: list[str]) -> list[str]:
+def _shorten_list(lines: list[str]) -> list[str]:
     return [*lines[:_SHOWN], f"… and {len(lines) - _SHOWN} more"] if len(lines) > _SHOWN + 1 else lines
 
 
-def _crs_keys(tiles: Sequence[Tile]) -> list[str]:
+def _find_crs_keys(tiles: Sequence[Tile]) -> list[str]:
     """Return by tile the first WKT that says the same as its own."""
     first: dict[str, str] = {}
     for text in dict.fromkeys(tile.crs for tile in tiles):
-        first[text] = next((known for known in first.values() if _same_crs(known, text)), text)
+        first[text] = next((known for known in first.values() if _is_same_crs(known, text)), text)
     return [first[tile.crs] for tile in tiles]
 
 
-def _same_crs(one: str, other: str) -> bool:
+def _is_same_crs(one: str, other: str) -> bool:
     try:
         return bool(one and other) and CRS(one).equals(CRS(other), ignore_axis_order=True)
     except CRSError:
@@ -150,15 +150,15 @@ def _refuse_odd(tiles: Sequence[Tile], what: str, keys: Sequence[str], mended: s
     usual = Counter(keys).most_common(1)[0][0]
     odd = [(tile, key) for tile, key in zip(tiles, keys, strict=True) if key != usual]
     if odd:
-        names = ", ".join(_few([str(tile.path) for tile, _ in odd]))
-        got, wanted = (_brief(key) for key in (odd[0][1], usual))
+        names = ", ".join(_shorten_list([str(tile.path) for tile, _ in odd]))
+        got, wanted = (_shorten_crs(key) for key in (odd[0][1], usual))
         raise MapError(
             f"{tiles[0].role}: {len(odd)} of {len(tiles)} files have another {what} than the rest ({got}, wanted {wanted}): {names}; "
             f"write them like the rest: {mended}"
         )
 
 
-def _brief(key: str) -> str:
+def _shorten_crs(key: str) -> str:
     """Return a CRS by its name, anything else as it is."""
     try:
         return CRS(key).name if "[" in key else key or "none"
@@ -166,20 +166,20 @@ def _brief(key: str) -> str:
         return key[:40]
 
 
-def _laid(tiles: Sequence[Tile]) -> tuple[tuple[float, float, float, float, float, float], NDArray[np.int64]]:
+def _lay_out_tiles(tiles: Sequence[Tile]) -> tuple[tuple[float, float, float, float, float, float], NDArray[np.int64]]:
     """Return the affine of all tiles together, and where each lies in it: first row, last row, first column, last column."""
     pixels = [tuple(f"{tile.affine[n]:.6g}" for n in (0, 1, 3, 4)) for tile in tiles]
     base = pixels.index(Counter(pixels).most_common(1)[0][0])
-    at, off = _on_pixels_of(tiles, base)
+    at, off = _find_grid_positions(tiles, base)
     if off.sum() > len(tiles) / 2:  # it is the odd one itself
         base = next((n for n in np.flatnonzero(off).tolist() if pixels[n] == pixels[base]), base)
-        at, off = _on_pixels_of(tiles, base)
+        at, off = _find_grid_positions(tiles, base)
     odd = [tile for tile, far in zip(tiles, off, strict=True) if far]
     if odd:
         got, wanted = (f"{abs(tile.affine[0]):.6g} x {abs(tile.affine[4]):.6g}" for tile in (odd[0], tiles[base]))
         raise MapError(
             f"{tiles[0].role}: {len(odd)} of {len(tiles)} files do not lie on the pixels of the rest "
-            f"({got}, the rest {wanted}): {', '.join(_few([str(tile.path) for tile in odd]))}; "
+            f"({got}, the rest {wanted}): {', '.join(_shorten_list([str(tile.path) for tile in odd]))}; "
             "put all on one grid: gdalwarp -r bilinear *.tif joined.tif"
         )
     a, b, x, d, e, y = tiles[base].affine
@@ -190,7 +190,7 @@ def _laid(tiles: Sequence[Tile]) -> tuple[tuple[float, float, float, float, floa
     return (a, b, x + a * col + b * row, d, e, y + d * col + e * row), corners
 
 
-def _on_pixels_of(tiles: Sequence[Tile], base: int) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+def _find_grid_positions(tiles: Sequence[Tile], base: int) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """Return the column and row of every tile's first pixel on the grid of one of them, shape (T, 2), and which do not lie on it."""
     affines = np.array([tile.affine for tile in tiles], np.float64).reshape(-1, 2, 3)
     sizes = np.array([(tile.cols, tile.rows) for tile in tiles])
@@ -204,7 +204,7 @@ def _on_pixels_of(tiles: Sequence[Tile], base: int) -> tuple[NDArray[np.float64]
     return at, ~(far <= _OFF_GRID_PX)
 
 
-def _joint_names(tiles: Sequence[Tile]) -> dict[int, str]:
+def _join_value_names(tiles: Sequence[Tile]) -> dict[int, str]:
     """Return what the tiles' values are called; `MapError` if two call one value otherwise."""
     names: dict[int, str] = {}
     for tile in tiles:

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.formats.atomic import atomic_file, write_text
+from tcpipe.formats.atomic import write_atomic_file, write_text
 from tcpipe.terrain.grid import MapGrid
 
 LETHAL = 100
@@ -39,7 +39,7 @@ def write_nav2_map(
     """
     grey = np.where(cost == LETHAL, 0.0, np.rint(255.0 * (1.0 - _OCCUPIED * cost / 100.0))).astype(np.uint8)
     picture = path.with_suffix(".pgm")
-    with atomic_file(picture) as temporary:
+    with write_atomic_file(picture) as temporary:
         temporary.write_bytes(f"P5\n{grid.cols} {grid.rows}\n255\n".encode() + grey.tobytes())
     x_min, y_min, _, _ = grid.bounds_m
     lines = (

@@ -18,15 +18,15 @@ from numpy.typing import NDArray
 from pyproj import CRS
 
 from tcpipe.errors import MapError, RegionError
-from tcpipe.formats.geojson import PolygonFeature, brief, read_polygons, shortened
+from tcpipe.formats.geojson import PolygonFeature, read_polygons, shorten_problems, shorten_value
 from tcpipe.formats.maps.geotiff import burn_polygons
 from tcpipe.formats.maps.layer_building import Tally
-from tcpipe.tables.catalogue import threshold
+from tcpipe.tables.catalogue import read_threshold
 from tcpipe.tables.findings import Finding, Subject, make_finding
 from tcpipe.terrain.classes import ClassScheme, name_key
 from tcpipe.terrain.grid import MapGrid
-from tcpipe.terrain.layers import Layer, Pixels, paper_layers
-from tcpipe.terrain.projection import Projection, area_of
+from tcpipe.terrain.layers import Layer, Pixels, make_paper_layers
+from tcpipe.terrain.projection import Projection, compute_area
 
 PROPERTY = "class"
 """The property that tells a polygon's class, in any case."""
@@ -113,19 +113,19 @@ def place_polygons(
     features, problems = _read_all(paths)
     label = f"{paths[0]}" if len(paths) == 1 else f"{paths[0]} … {paths[-1].name} ({len(paths)} files)"
     name = label.removeprefix(f"{paths[0].parent}/")
-    ids = [_class_id(feature, scheme, problems) for feature in features]
+    ids = [_read_class_id(feature, scheme, problems) for feature in features]
     if not features:
         problems.append(f"{label}: no polygon in it; draw the terrain as polygons")
     if problems:
-        raise MapError(*shortened(problems))
+        raise MapError(*shorten_problems(problems))
     flat = [polygon for feature in features for polygon in feature.polygons]
     id_of_each = np.repeat(np.array(ids, np.uint8), [len(feature.polygons) for feature in features])
-    projection = Projection(CRS.from_epsg(4326), crs, area_of(crs, bounds_m))
-    polygons = _carried(label, np.array(flat, dtype=object), projection, bounds_m)
+    projection = Projection(CRS.from_epsg(4326), crs, compute_area(crs, bounds_m))
+    polygons = _project_polygons(label, np.array(flat, dtype=object), projection, bounds_m)
     on_map = ~shapely.is_empty(polygons)
     polygons, id_of_each = polygons[on_map], id_of_each[on_map]
     findings = (*projection.find_rough_shift(_TERRAIN), *_find_overlaps(polygons, id_of_each, scheme))
-    terrain = paper_layers(["terrain"], scheme.table)["terrain"]
+    terrain = make_paper_layers(["terrain"], scheme.table)["terrain"]
     return PolygonLayer(terrain, label, name, polygons, id_of_each, findings, shapely.STRtree(polygons))
 
 
@@ -142,32 +142,32 @@ def _read_all(paths: Sequence[Path]) -> tuple[list[PolygonFeature], list[str]]:
     return features, problems
 
 
-def _class_id(feature: PolygonFeature, scheme: ClassScheme, problems: list[str]) -> int:
+def _read_class_id(feature: PolygonFeature, scheme: ClassScheme, problems: list[str]) -> int:
     """Return a feature's class id; 0, and a line in ``problems``, where it has none."""
-    given = _property(feature.properties)
+    given = _read_property(feature.properties)
     if given is None:
-        there = brief(", ".join(sorted(feature.properties)) or "none")[1:-1]
+        there = shorten_value(", ".join(sorted(feature.properties)) or "none")[1:-1]
         problems.append(
             f"{feature.where}: has no property {PROPERTY!r} that names its terrain (its properties: {there})"
         )
         return 0
     by_name = {name_key(entry.name): entry.id for entry in scheme.table.classes}
     found = by_name.get(name_key(str(given)))
-    number = _integer(given)
+    number = _parse_integer(given)
     if found is None and number is not None:
         known = {entry.id: entry.id for entry in scheme.table.classes} | dict(scheme.id_by_value)
         found = known.get(number)
     if found is None:
         names = ", ".join(entry.name for entry in scheme.table.classes)
-        problems.append(f"{feature.where}: {PROPERTY} {brief(given)} is not in the class table ({names})")
+        problems.append(f"{feature.where}: {PROPERTY} {shorten_value(given)} is not in the class table ({names})")
     return found or 0
 
 
-def _property(properties: Mapping[str, Any]) -> Any:
+def _read_property(properties: Mapping[str, Any]) -> Any:
     return next((value for name, value in properties.items() if name.casefold() == PROPERTY), None)
 
 
-def _integer(given: Any) -> int | None:
+def _parse_integer(given: Any) -> int | None:
     try:
         number = float(given)
     except (TypeError, ValueError):
@@ -175,7 +175,7 @@ def _integer(given: Any) -> int | None:
     return int(number) if number.is_integer() and not isinstance(given, bool) else None
 
 
-def _carried(
+def _project_polygons(
     label: str, polygons: NDArray[np.object_], projection: Projection, bounds_m: tuple[float, float, float, float]
 ) -> NDArray[np.object_]:
     """Return the polygons in the map's CRS, empty where they are not on the map; `MapError` if none is."""
@@ -220,6 +220,6 @@ def _find_overlaps(polygons: NDArray[np.object_], ids: NDArray[np.uint8], scheme
             names = {key: scheme.table.name(int(ids[part[at]])) for key, part in (("above", above), ("below", below))}
         if not looked_at.all():
             break
-    if shared_m2 <= threshold("polygons-overlap", "min_overlap_m2"):
+    if shared_m2 <= read_threshold("polygons-overlap", "min_overlap_m2"):
         return ()
     return (make_finding("polygons-overlap", _TERRAIN, names=names, overlap_m2=shared_m2),)

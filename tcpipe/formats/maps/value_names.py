@@ -13,7 +13,7 @@ _STRING_TYPE = "2"
 _NAME_TITLES = ("class name", "classname", "class names", "class", "name", "label", "category", "terrain")
 
 
-def value_names(vrt: str, band: int) -> dict[int, str]:
+def read_value_names(vrt: str, band: int) -> dict[int, str]:
     """Return names by value from a VRT document that GDAL wrote of a raster; those of the attribute table come first.
 
     Parameters
@@ -26,16 +26,16 @@ def value_names(vrt: str, band: int) -> dict[int, str]:
     if described is None:
         return {}
     table = described.find("GDALRasterAttributeTable")
-    names = {} if table is None else _table_names(table)
-    return names or _category_names(described)
+    names = {} if table is None else _read_table_names(table)
+    return names or _read_category_names(described)
 
 
-def _category_names(described: Element) -> dict[int, str]:
+def _read_category_names(described: Element) -> dict[int, str]:
     names = [(entry.text or "").strip() for entry in described.findall("./CategoryNames/Category")]
     return {value: name for value, name in enumerate(names) if name}
 
 
-def _table_names(table: Element) -> dict[int, str]:
+def _read_table_names(table: Element) -> dict[int, str]:
     columns = [
         tuple((column.findtext(tag) or "").strip() for tag in ("Name", "Type", "Usage"))
         for column in table.findall("FieldDefn")
@@ -51,11 +51,11 @@ def _table_names(table: Element) -> dict[int, str]:
         return {}
     uppers = [n for n, column in enumerate(columns) if column[2] == _UPPER_USAGE]
     rows = [[(cell.text or "").strip() for cell in row.findall("F")] for row in table.findall("Row")]
-    found = ((_single(row, values[0], uppers), row[named[0]]) for row in rows if len(row) == len(columns))
+    found = ((_parse_single_value(row, values[0], uppers), row[named[0]]) for row in rows if len(row) == len(columns))
     return {value: name for value, name in found if value is not None and name}
 
 
-def _single(row: Sequence[str], column: int, uppers: Sequence[int]) -> int | None:
+def _parse_single_value(row: Sequence[str], column: int, uppers: Sequence[int]) -> int | None:
     """Return the one integer that a row is about; None where it is about a range or a fraction."""
     try:
         value = float(row[column])

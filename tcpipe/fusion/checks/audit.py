@@ -31,10 +31,10 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.fusion.gates import chi_square_gate
+from tcpipe.fusion.gates import find_chi_square_threshold
 from tcpipe.fusion.measurements import DOPPLER, GNSS, IMU, VISUAL, WHEELS, BodyVelocities, Measurements, Positions
 from tcpipe.fusion.process import DOPPLER_LASTS_S, VISUAL_SCALE_STD, WHEEL_SCALE_STD
-from tcpipe.fusion.signals import in_gap, interval_means, median_period_ns, seconds
+from tcpipe.fusion.signals import compute_interval_means, compute_median_period_ns, compute_seconds, is_in_gap
 from tcpipe.fusion.trajectory import DISPLACEMENT_LAGS_S, Trajectory
 from tcpipe.geometry.rotation import matrix_from_quat, quat_from_matrix, rotation_vector_from_quat
 from tcpipe.tables.facts import Disagreement
@@ -108,7 +108,7 @@ class Comparison:
     @property
     def _bound(self) -> float:
         windows = max(1, int(self.told.sum()))
-        return float(np.sqrt(chi_square_gate(self.difference.shape[1], 1.0 - _CHANCE / windows)))
+        return float(np.sqrt(find_chi_square_threshold(self.difference.shape[1], 1.0 - _CHANCE / windows)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,7 +136,7 @@ class Audit:
     astray: int = 0
 
 
-def audited(found: Trajectory, measurements: Measurements) -> tuple[Trajectory, Audit]:
+def audit_trajectory(found: Trajectory, measurements: Measurements) -> tuple[Trajectory, Audit]:
     """Return the trajectory with deviations raised where sensors disagree with it, and what was found.
 
     Parameters
@@ -144,12 +144,12 @@ def audited(found: Trajectory, measurements: Measurements) -> tuple[Trajectory, 
     found : of one stretch.
     measurements : what fed it.
     """
-    windows = _windows(found.stamp_ns)
+    windows = _find_windows(found.stamp_ns)
     if not windows.size:
         return found, Audit((), ())
-    compared = list(_comparisons(found, measurements, windows))
-    alone = {id(one): _alone(one, compared) for one in compared}
-    moving = _moving(found, windows)
+    compared = list(_iterate_comparisons(found, measurements, windows))
+    alone = {id(one): _find_isolated(one, compared) for one in compared}
+    moving = _find_moving_rows(found, windows)
     tallies = tuple(
         Tally(
             one.sensor,
@@ -160,12 +160,12 @@ def audited(found: Trajectory, measurements: Measurements) -> tuple[Trajectory, 
         )
         for one in compared
     )
-    told = [each for one in compared for each in _told(one, alone[id(one)], found.stamp_ns, windows)]
-    way_m = _astray_m(compared, _all_fixes(found, measurements.gnss, windows), windows.shape[0])
+    told = [each for one in compared for each in _find_disagreements(one, alone[id(one)], found.stamp_ns, windows)]
+    way_m = _compute_distance_error_m(compared, _compare_all_fixes(found, measurements.gnss, windows), windows.shape[0])
     for what in UNITS:
         same = [(one.size, one.disagrees & ~alone[id(one)]) for one in compared if one.what == what]
         same += [(way_m, way_m > 0.0)] if what == "displacement" else []
-        found = _raised(found, what, _largest(same, windows, found.stamp_ns.size))
+        found = _inflate_trajectory(found, what, _find_largest_differences(same, windows, found.stamp_ns.size))
     return found, Audit(
         tuple(sorted(told, key=lambda each: each.start_ns)),
         tallies,
@@ -174,44 +174,44 @@ def audited(found: Trajectory, measurements: Measurements) -> tuple[Trajectory, 
     )
 
 
-def goes_astray(windows: int, astray: int) -> bool:
+def is_astray(windows: int, astray: int) -> bool:
     """Return whether the track is astray in more than a little of the windows in which a sensor tells the robot's way."""
     return astray > max(1.0, _LITTLE * windows)
 
 
-def alone_in_most(tallies: Iterable[Tally]) -> tuple[str, ...]:
+def find_isolated_sensors(tallies: Iterable[Tally]) -> tuple[str, ...]:
     """Return the sensors that two others contradict in most of the way."""
-    return tuple(dict.fromkeys(t.sensor for t in _summed(tallies) if _most(t.alone, t.moving)))
+    return tuple(dict.fromkeys(t.sensor for t in _sum_tallies(tallies) if _is_most(t.alone, t.moving)))
 
 
-def undecided_in_most(tallies: Iterable[Tally]) -> tuple[tuple[str, What], ...]:
+def find_undecided_sensors(tallies: Iterable[Tally]) -> tuple[tuple[str, What], ...]:
     """Return what sensors contradict in most of the way, where no third tells throughout who is right.
 
     A position that is off while ways and turns agree is known to be off by how much, and stands in the deviations.
     """
     return tuple(
         (t.sensor, t.what)
-        for t in _summed(tallies)
-        if t.what != "position" and _most(t.undecided + t.alone, t.moving) and not _most(t.alone, t.moving)
+        for t in _sum_tallies(tallies)
+        if t.what != "position" and _is_most(t.undecided + t.alone, t.moving) and not _is_most(t.alone, t.moving)
     )
 
 
-def consistent(tallies: Iterable[Tally]) -> bool:
+def is_consistent(tallies: Iterable[Tally]) -> bool:
     """Return whether nothing is contradicted in more than a little of the way, positions included."""
-    return all(t.undecided + t.alone <= _LITTLE * t.moving for t in _summed(tallies))
+    return all(t.undecided + t.alone <= _LITTLE * t.moving for t in _sum_tallies(tallies))
 
 
-def confirmations(tallies: Iterable[Tally]) -> int:
+def count_confirmations(tallies: Iterable[Tally]) -> int:
     """Return how many sensors say a thing that another says as well: those that nothing else tells are held against themselves alone."""
-    told = [t.what for t in _summed(tallies) if _most(t.moving, t.moving) and t.what != "position"]
+    told = [t.what for t in _sum_tallies(tallies) if _is_most(t.moving, t.moving) and t.what != "position"]
     return len(told) - len(set(told))
 
 
-def _most(windows: int, moving: int) -> bool:
+def _is_most(windows: int, moving: int) -> bool:
     return moving >= _FEWEST_WINDOWS and windows > _MOSTLY * moving
 
 
-def _summed(tallies: Iterable[Tally]) -> list[Tally]:
+def _sum_tallies(tallies: Iterable[Tally]) -> list[Tally]:
     """Return the tallies of all stretches, one by sensor and thing."""
     total: dict[tuple[str, What], Tally] = {}
     for each in tallies:
@@ -222,64 +222,64 @@ def _summed(tallies: Iterable[Tally]) -> list[Tally]:
     return list(total.values())
 
 
-def _windows(stamp_ns: NDArray[np.int64]) -> NDArray[np.int64]:
+def _find_windows(stamp_ns: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return first and last row of each window, shape (W, 2): each begins in the middle of the one before; none bridges a hole."""
     if stamp_ns.size < 2:
         return np.empty((0, 2), np.int64)
-    rows = max(2, round(_WINDOW_S * 1e9 / median_period_ns(stamp_ns)))
+    rows = max(2, round(_WINDOW_S * 1e9 / compute_median_period_ns(stamp_ns)))
     first = np.arange(0, stamp_ns.size - rows, max(1, rows // 2), dtype=np.int64)
     length_s = (stamp_ns[first + rows] - stamp_ns[first]) * 1e-9
     first = first[length_s < 1.1 * _WINDOW_S]
     return np.column_stack((first, first + rows))
 
 
-def _moving(found: Trajectory, windows: NDArray[np.int64]) -> Mask:
+def _find_moving_rows(found: Trajectory, windows: NDArray[np.int64]) -> Mask:
     way_m = np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(found.position_enu_m[:, :2], axis=0).T))))
     moving: Mask = way_m[windows[:, 1]] - way_m[windows[:, 0]] > _MOVES_M
     return moving
 
 
-def _comparisons(found: Trajectory, m: Measurements, windows: NDArray[np.int64]) -> Iterable[Comparison]:
+def _iterate_comparisons(found: Trajectory, m: Measurements, windows: NDArray[np.int64]) -> Iterable[Comparison]:
     """Yield every comparison that the sensors allow."""
     zero = int(found.stamp_ns[0])
-    at_s = seconds(found.stamp_ns, zero)
+    at_s = compute_seconds(found.stamp_ns, zero)
     step_s = np.diff(at_s)[:, None]
     rotation = matrix_from_quat(found.quat_xyzw)
     turned = rotation_vector_from_quat(quat_from_matrix(np.einsum("kji,kjl->kil", rotation[:-1], rotation[1:])))
     way = np.einsum("kji,kj->ki", rotation[:-1] + rotation[1:], np.diff(found.position_enu_m, axis=0)) / 2.0
-    turn_std, way_std = found.yaw_std_rad[windows[:, 0]], _way_std_m(found)[windows[:, 0]]
+    turn_std, way_std = found.yaw_std_rad[windows[:, 0]], _compute_distance_std_m(found)[windows[:, 0]]
 
     def means(stamp_ns: NDArray[np.int64], values: Floats) -> Floats:
-        told = interval_means(seconds(stamp_ns, zero), values, at_s[:-1], at_s[1:])
-        longest_ns = max(_MAX_GAP_NS, 3 * median_period_ns(stamp_ns))
-        told[in_gap(stamp_ns, found.stamp_ns[:-1], found.stamp_ns[1:], longest_ns=longest_ns)] = np.nan
+        told = compute_interval_means(compute_seconds(stamp_ns, zero), values, at_s[:-1], at_s[1:])
+        longest_ns = max(_MAX_GAP_NS, 3 * compute_median_period_ns(stamp_ns))
+        told[is_in_gap(stamp_ns, found.stamp_ns[:-1], found.stamp_ns[1:], longest_ns=longest_ns)] = np.nan
         return told
 
     if m.gnss is not None:
-        yield from _fixes(found, rotation, m.gnss, windows, way_std)
+        yield from _compare_fixes(found, rotation, m.gnss, windows, way_std)
     if m.gnss is not None and m.doppler is not None:
         said = means(m.doppler.stamp_ns, m.doppler.velocity_enu_mps[:, :2]) * step_s
         antenna = (found.position_enu_m + rotation @ np.asarray(m.gnss.lever_arm_m))[:, :2]
-        moved = _sums(said - np.diff(antenna, axis=0), windows)
+        moved = _sum_increments(said - np.diff(antenna, axis=0), windows)
         variance = float(np.median(m.doppler.variance_m2ps2[:, :2]))
         std = np.hypot(_LASTING_MPS * _WINDOW_S, np.sqrt(variance * DOPPLER_LASTS_S * _WINDOW_S))
-        difference = _ahead_and_aside(moved, rotation[windows.sum(1) // 2])
+        difference = _split_along_and_aside(moved, rotation[windows.sum(1) // 2])
         yield Comparison(DOPPLER, "displacement", difference, np.full(way_std.size, std), way_std)
     if m.imu is not None:
         rate = means(m.imu.stamp_ns, m.imu.angular_velocity_radps[:, 2:]) * step_s
-        noise = m.imu.gyro_std_radps * np.sqrt(median_period_ns(m.imu.stamp_ns) * 1e-9)
-        yield _turn(IMU, _sums(rate, windows), _sums(turned[:, 2:], windows), noise, turn_std)
+        noise = m.imu.gyro_std_radps * np.sqrt(compute_median_period_ns(m.imu.stamp_ns) * 1e-9)
+        yield _turn(IMU, _sum_increments(rate, windows), _sum_increments(turned[:, 2:], windows), noise, turn_std)
     for role, source in m.odometries().items():
         axes = slice(0, 2 if source.measured[1] else 1)
         point = way + np.cross(turned, source.lever_arm_m)
         said = means(source.stamp_ns, source.velocity_mps[:, axes]) * step_s
         if role == WHEELS:  # that turn while the robot stands: it is stuck, and they are right
             said[(np.abs(point[:, :1]) < _STANDS_MPS * step_s) & (np.abs(said) > _STANDS_MPS * step_s)] = np.nan
-        yield _way(
+        yield _compare_distances(
             role,
-            _sums(said, windows),
-            _sums(point[:, axes], windows),
-            _noise(source.variance_m2ps2[:, 0], source),
+            _sum_increments(said, windows),
+            _sum_increments(point[:, axes], windows),
+            _compute_noise_density(source.variance_m2ps2[:, 0], source),
             way_std,
             scale_seen=m.gnss is not None,
         )
@@ -287,16 +287,16 @@ def _comparisons(found: Trajectory, m: Measurements, windows: NDArray[np.int64])
         skids = role == WHEELS and m.imu is not None  # their turn is not what fed the track
         if known.sum() > 1 and not skids:
             rate = means(source.stamp_ns[known], source.yaw_rate_radps[known, None]) * step_s
-            noise = _noise(source.yaw_rate_var[known], source)
-            yield _turn(role, _sums(rate, windows), _sums(turned[:, 2:], windows), noise, turn_std)
+            noise = _compute_noise_density(source.yaw_rate_var[known], source)
+            yield _turn(role, _sum_increments(rate, windows), _sum_increments(turned[:, 2:], windows), noise, turn_std)
 
 
-def _noise(variance: Floats, source: BodyVelocities) -> float:
+def _compute_noise_density(variance: Floats, source: BodyVelocities) -> float:
     """Return the root of the density of a velocity's white noise."""
-    return float(np.sqrt(np.median(variance) * median_period_ns(source.stamp_ns) * 1e-9))
+    return float(np.sqrt(np.median(variance) * compute_median_period_ns(source.stamp_ns) * 1e-9))
 
 
-def _sums(values: Floats, windows: NDArray[np.int64]) -> Floats:
+def _sum_increments(values: Floats, windows: NDArray[np.int64]) -> Floats:
     """Return the sum of (N - 1, k) increments over each window, shape (W, k); NaN where one is unknown."""
     known = np.asarray(np.isfinite(values).all(1))
     total = np.concatenate((np.zeros((1, values.shape[1])), np.cumsum(np.where(known[:, None], values, 0.0), axis=0)))
@@ -306,14 +306,16 @@ def _sums(values: Floats, windows: NDArray[np.int64]) -> Floats:
     return np.where(whole[:, None], total[last] - total[first], np.nan)
 
 
-def _way_std_m(found: Trajectory) -> Floats:
+def _compute_distance_std_m(found: Trajectory) -> Floats:
     """Return what the track claims of its displacement over a window [m], shape (N,): the longest told one, lengthened."""
     last_s = DISPLACEMENT_LAGS_S[-1]
     told = found.displacement_std_m[:, -1] * _WINDOW_S / last_s
     return np.where(np.isfinite(told), told, found.forward_velocity_std_mps * _WINDOW_S)
 
 
-def _way(role: str, said: Floats, track: Floats, noise: float, track_std: Floats, *, scale_seen: bool) -> Comparison:
+def _compare_distances(
+    role: str, said: Floats, track: Floats, noise: float, track_std: Floats, *, scale_seen: bool
+) -> Comparison:
     """Return what an odometry says of the way in each window; its scale is taken out where fixes tell it."""
     if scale_seen:
         said = said / _scale(said[:, 0], track[:, 0])
@@ -337,55 +339,59 @@ def _turn(role: str, said: Floats, track: Floats, noise: float, track_std: Float
     return Comparison(role, "turn", difference - bias, np.hypot(lasting, noise * np.sqrt(_WINDOW_S)), track_std)
 
 
-def _fixes(
+def _compare_fixes(
     found: Trajectory, rotation: Floats, gnss: Positions, windows: NDArray[np.int64], way_std: Floats
 ) -> Iterable[Comparison]:
     """Yield where the fixes are, and how those that the gate took move along and aside, against the antenna on the track."""
-    inside, off = _off_fixes(found, rotation, gnss)
+    inside, off = _find_fix_residuals(found, rotation, gnss)
     stamp_ns, zero = gnss.stamp_ns[inside], int(found.stamp_ns[0])
-    fix_s, at_s = seconds(stamp_ns, zero), seconds(found.stamp_ns, zero)
+    fix_s, at_s = compute_seconds(stamp_ns, zero), compute_seconds(found.stamp_ns, zero)
     claim = np.sqrt(gnss.variance_m2[inside, :2].mean(1))
     begin, end = at_s[windows].T
-    more_s = max(0.0, _FEWEST_FIXES * 1e-9 * median_period_ns(stamp_ns) - _WINDOW_S) / 2.0
-    place, std = _medians(fix_s, off, claim, begin - more_s, end + more_s)
+    more_s = max(0.0, _FEWEST_FIXES * 1e-9 * compute_median_period_ns(stamp_ns) - _WINDOW_S) / 2.0
+    place, std = _compute_medians(fix_s, off, claim, begin - more_s, end + more_s)
     place_std = found.position_std_m[windows[:, 0], :2].max(1)
     yield Comparison(GNSS, "position", place, std, place_std)
     refused = found.rejections.stamp_ns[found.rejections.role == GNSS]
     fed = ~np.isin(stamp_ns, refused)
-    moved = _moved(fix_s[fed], off[fed], claim[fed], begin, end)
-    difference = _ahead_and_aside(moved.difference, rotation[windows.sum(1) // 2])
+    moved = _compare_fix_displacements(fix_s[fed], off[fed], claim[fed], begin, end)
+    difference = _split_along_and_aside(moved.difference, rotation[windows.sum(1) // 2])
     yield replace(moved, difference=difference, track_std=way_std)
 
 
-def _off_fixes(found: Trajectory, rotation: Floats, gnss: Positions) -> tuple[Mask, Floats]:
+def _find_fix_residuals(found: Trajectory, rotation: Floats, gnss: Positions) -> tuple[Mask, Floats]:
     """Return which fixes lie inside the track's time, and how far those are off its antenna, east and north [m], shape (F, 2)."""
     inside = (gnss.stamp_ns >= found.stamp_ns[0]) & (gnss.stamp_ns <= found.stamp_ns[-1])
     antenna = (found.position_enu_m + rotation @ np.asarray(gnss.lever_arm_m))[:, :2]
     zero = int(found.stamp_ns[0])
-    fix_s, at_s = seconds(gnss.stamp_ns[inside], zero), seconds(found.stamp_ns, zero)
+    fix_s, at_s = compute_seconds(gnss.stamp_ns[inside], zero), compute_seconds(found.stamp_ns, zero)
     return inside, gnss.position_enu_m[inside, :2] - np.column_stack(
         [np.interp(fix_s, at_s, axis) for axis in antenna.T]
     )
 
 
-def _moved(fix_s: Floats, off_m: Floats, claim_m: Floats, begin_s: Floats, end_s: Floats) -> Comparison:
+def _compare_fix_displacements(
+    fix_s: Floats, off_m: Floats, claim_m: Floats, begin_s: Floats, end_s: Floats
+) -> Comparison:
     """Return by how much fixes move otherwise than the track in each window, east and north: the later half against the earlier."""
     middle_s = (begin_s + end_s) / 2.0
     (first, first_std), (last, last_std) = (
-        _medians(fix_s, off_m, claim_m, *half) for half in ((begin_s, middle_s), (middle_s, end_s))
+        _compute_medians(fix_s, off_m, claim_m, *half) for half in ((begin_s, middle_s), (middle_s, end_s))
     )
     claimed = 2.0 * np.hypot(first_std, last_std)
     return Comparison(GNSS, "displacement", 2.0 * (last - first), claimed, np.zeros_like(claimed))
 
 
-def _ahead_and_aside(moved: Floats, rotation: Floats) -> Floats:
+def _split_along_and_aside(moved: Floats, rotation: Floats) -> Floats:
     """Return horizontal displacements (W, 2) along and aside of bodies whose attitudes are (W, 3, 3)."""
     ahead = rotation[:, :2, 0] / np.linalg.norm(rotation[:, :2, 0], axis=1, keepdims=True)
     aside = moved[:, 1] * ahead[:, 0] - moved[:, 0] * ahead[:, 1]
     return np.column_stack((np.sum(moved * ahead, axis=1), aside))
 
 
-def _medians(at_s: Floats, values: Floats, claim: Floats, begin_s: Floats, end_s: Floats) -> tuple[Floats, Floats]:
+def _compute_medians(
+    at_s: Floats, values: Floats, claim: Floats, begin_s: Floats, end_s: Floats
+) -> tuple[Floats, Floats]:
     """Return the medians of values (N, 2) and of claims between times, shapes (W, 2) and (W,); NaN and 0 where there are none."""
     found = np.full((begin_s.size, 3), np.nan)
     both = np.column_stack((values, claim))
@@ -396,10 +402,10 @@ def _medians(at_s: Floats, values: Floats, claim: Floats, begin_s: Floats, end_s
     return found[:, :2], np.nan_to_num(found[:, 2])
 
 
-def _alone(one: Comparison, compared: Sequence[Comparison]) -> Mask:
+def _find_isolated(one: Comparison, compared: Sequence[Comparison]) -> Mask:
     """Return where two others contradict one, and not each other, shape (W,)."""
     if one.what == "position":
-        return one.disagrees & (one.size > _NO_ARM_M) & (_holding(compared) >= 2)
+        return one.disagrees & (one.size > _NO_ARM_M) & (_count_agreeing(compared) >= 2)
     against = [(each, one.excludes(each)) for each in compared if each.what == one.what and each is not one]
     alone = np.zeros(one.told.size, np.bool_)
     for (a, by_a), (b, by_b) in combinations(against, 2):
@@ -407,14 +413,14 @@ def _alone(one: Comparison, compared: Sequence[Comparison]) -> Mask:
     return alone
 
 
-def _holding(compared: Sequence[Comparison]) -> NDArray[np.int64]:
+def _count_agreeing(compared: Sequence[Comparison]) -> NDArray[np.int64]:
     """Return how many sensors besides the fixes hold with the track in all that they tell, shape (W,)."""
     others = {each.sensor: [c for c in compared if c.sensor == each.sensor] for each in compared if each.sensor != GNSS}
     holds = [np.all([c.told & ~c.disagrees for c in told], axis=0) for told in others.values()]
     return np.sum(holds, axis=0) if holds else np.zeros(1, np.int64)
 
 
-def _told(
+def _find_disagreements(
     one: Comparison, alone: Mask, stamp_ns: NDArray[np.int64], windows: NDArray[np.int64]
 ) -> Iterable[Disagreement]:
     """Yield a disagreement for every row of windows that overlap."""
@@ -435,7 +441,7 @@ def _told(
             )
 
 
-def _astray_m(compared: Sequence[Comparison], fixes: Iterable[Comparison], windows: int) -> Floats:
+def _compute_distance_error_m(compared: Sequence[Comparison], fixes: Iterable[Comparison], windows: int) -> Floats:
     """Return how far the track's way in each window is off what every sensor says of it [m], shape (W,).
 
     0 where one holds with it, NaN where none tells. What the track claims and what the gate refused does not count: an estimate that has
@@ -449,20 +455,20 @@ def _astray_m(compared: Sequence[Comparison], fixes: Iterable[Comparison], windo
     return off_m
 
 
-def _all_fixes(found: Trajectory, gnss: Positions | None, windows: NDArray[np.int64]) -> Iterable[Comparison]:
+def _compare_all_fixes(found: Trajectory, gnss: Positions | None, windows: NDArray[np.int64]) -> Iterable[Comparison]:
     """Yield how all fixes move, refused or not, against the antenna on the track; their scatter counts where they claim less."""
     if gnss is None:
         return
-    inside, off = _off_fixes(found, matrix_from_quat(found.quat_xyzw), gnss)
+    inside, off = _find_fix_residuals(found, matrix_from_quat(found.quat_xyzw), gnss)
     zero = int(found.stamp_ns[0])
-    begin, end = seconds(found.stamp_ns, zero)[windows].T
+    begin, end = compute_seconds(found.stamp_ns, zero)[windows].T
     second = np.diff(gnss.position_enu_m[inside, :2], n=2, axis=0)
     scatter = np.sqrt(np.median(second**2) / (6 * _MEDIAN_OF_SQUARES)) if second.size else 0.0
     claim = np.maximum(np.sqrt(gnss.variance_m2[inside, :2].mean(1)), scatter)
-    yield _moved(seconds(gnss.stamp_ns[inside], zero), off, claim, begin, end)
+    yield _compare_fix_displacements(compute_seconds(gnss.stamp_ns[inside], zero), off, claim, begin, end)
 
 
-def _largest(disputed: Iterable[tuple[Floats, Mask]], windows: NDArray[np.int64], rows: int) -> Floats:
+def _find_largest_differences(disputed: Iterable[tuple[Floats, Mask]], windows: NDArray[np.int64], rows: int) -> Floats:
     """Return the largest difference by any sensor at each of the track's rows, in the windows that are disputed; 0 elsewhere."""
     size = np.zeros(rows)
     for off, where in disputed:
@@ -471,7 +477,7 @@ def _largest(disputed: Iterable[tuple[Floats, Mask]], windows: NDArray[np.int64]
     return size
 
 
-def _raised(found: Trajectory, what: str, size: Floats) -> Trajectory:
+def _inflate_trajectory(found: Trajectory, what: str, size: Floats) -> Trajectory:
     """Return the trajectory with its deviations raised by the size of what is disputed at each row, shape (N,)."""
     if not size.any():
         return found

@@ -18,11 +18,20 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.fusion.checks.gridded_motion import FIXES_S, fix_velocity, on_grid, twist_on_grid
-from tcpipe.fusion.checks.lags import GRID_S, Floats, averaged, lag_of, lag_products
-from tcpipe.fusion.checks.windows import span_ns, windows_ns
-from tcpipe.fusion.measurements import GNSS, IMU, VISUAL, WHEELS, InertialMeasurements, Measurements, Positions, part
-from tcpipe.fusion.signals import median_period_ns
+from tcpipe.fusion.checks.lags import GRID_S, Floats, compute_lag_products, compute_moving_mean, estimate_lag
+from tcpipe.fusion.checks.resampled_motion import FIXES_S, compute_fix_velocity, resample_signal, resample_twist
+from tcpipe.fusion.checks.windows import find_span_ns, iterate_windows_ns
+from tcpipe.fusion.measurements import (
+    GNSS,
+    IMU,
+    VISUAL,
+    WHEELS,
+    InertialMeasurements,
+    Measurements,
+    Positions,
+    select_measurements,
+)
+from tcpipe.fusion.signals import compute_median_period_ns
 
 POWER = "power"
 ROLES = (IMU, WHEELS, VISUAL, GNSS, POWER)
@@ -79,7 +88,7 @@ class Pair:
     @property
     def determined(self) -> bool:
         """Whether the offset is known well enough to be spoken of: to a small error, or as surely not zero."""
-        return _determined(self.late, self.offset_s, self.std_s, self.explained)
+        return _is_determined(self.late, self.offset_s, self.std_s, self.explained)
 
     @property
     def weight_std_s(self) -> float:
@@ -158,85 +167,98 @@ def find_clock_offsets(measurements: Measurements, power: PowerSignal | None) ->
     measurements : of one clock epoch; mountings need not be right, since a yaw rate is compared with all three axes of a gyroscope.
     power : sum over the drive rails; None without.
     """
-    span = span_ns(measurements)
+    span = find_span_ns(measurements)
     if span is None:
         return ClockOffsets((), "", {})
     told: dict[tuple[str, str, str], list[tuple[float, Floats]]] = {}
-    for at_ns in windows_ns(measurements, _WINDOW_NS):
+    for at_ns in iterate_windows_ns(measurements, _WINDOW_NS):
         first_ns, last_ns = int(at_ns[0]) - _MARGIN_NS, int(at_ns[-1]) + _MARGIN_NS
         middle_s = ((int(at_ns[0]) + int(at_ns[-1])) / 2 - span[0]) * 1e-9
-        for late, against, by, target, regressors in _signals(
-            part(measurements, first_ns, last_ns), _within(power, first_ns, last_ns), at_ns
+        for late, against, by, target, regressors in _iterate_signals(
+            select_measurements(measurements, first_ns, last_ns), _select_power(power, first_ns, last_ns), at_ns
         ):
-            products = lag_products(target, regressors)
+            products = compute_lag_products(target, regressors)
             if products is not None:
                 told.setdefault((late, against, by), []).append((middle_s, products))
     span_s = (span[1] - span[0]) * 1e-9
     pairs = (_pair(names, windows, span_s) for names, windows in told.items())
-    return _settled(tuple(pair for pair in pairs if pair is not None), span_s)
+    return _solve_offsets(tuple(pair for pair in pairs if pair is not None), span_s)
 
 
-def _signals(m: Measurements, power: PowerSignal | None, at_ns: NDArray[np.int64]) -> Iterable[Signals]:
+def _iterate_signals(m: Measurements, power: PowerSignal | None, at_ns: NDArray[np.int64]) -> Iterable[Signals]:
     """Yield what can be compared in a window: whose stamps against whose, by what, target and regressors on the grid."""
-    twists = {role: twist_on_grid(source, at_ns) for role, source in m.odometries().items()}
+    twists = {role: resample_twist(source, at_ns) for role, source in m.odometries().items()}
     if m.imu is not None:
-        yield from _against_imu(m.imu, twists, m.gnss, at_ns)
-    speeds = {role: averaged(np.abs(of[:, :1]), _ODOMETRY_S) for role, of in twists.items()}
+        yield from _compare_with_imu(m.imu, twists, m.gnss, at_ns)
+    speeds = {role: compute_moving_mean(np.abs(of[:, :1]), _ODOMETRY_S) for role, of in twists.items()}
     if len(twists) == 2:
-        yield VISUAL, WHEELS, SPEED, *where_it_changes(speeds[VISUAL], speeds[WHEELS])
+        yield VISUAL, WHEELS, SPEED, *select_speed_changes(speeds[VISUAL], speeds[WHEELS])
     for role, twist in twists.items():
         if m.gnss is not None:
-            seen = averaged(averaged(_antenna_speed(twist, m.gnss.lever_arm_m), FIXES_S), FIXES_S)
-            yield GNSS, role, SPEED, *where_it_changes(np.abs(fix_velocity(m.gnss, at_ns))[:, None], seen)
+            seen = compute_moving_mean(
+                compute_moving_mean(_compute_antenna_speed(twist, m.gnss.lever_arm_m), FIXES_S), FIXES_S
+            )
+            yield GNSS, role, SPEED, *select_speed_changes(np.abs(compute_fix_velocity(m.gnss, at_ns))[:, None], seen)
     if power is not None and twists:
         role = next(iter(twists))
-        yield POWER, role, "power of speed, acceleration and turning", *_power(power, twists[role], at_ns)
+        yield POWER, role, "power of speed, acceleration and turning", *_prepare_power(power, twists[role], at_ns)
 
 
-def _against_imu(
+def _compare_with_imu(
     imu: InertialMeasurements, twists: Mapping[str, Floats], gnss: Positions | None, at_ns: NDArray[np.int64]
 ) -> Iterable[Signals]:
     """Yield what the gyroscope and the accelerometer tell of turns and changes of speed."""
-    gyro = averaged(on_grid(imu.stamp_ns, imu.angular_velocity_radps, at_ns), _ODOMETRY_S)
+    gyro = compute_moving_mean(resample_signal(imu.stamp_ns, imu.angular_velocity_radps, at_ns), _ODOMETRY_S)
     for role, twist in twists.items():
-        turning = averaged(twist, _ODOMETRY_S)[:, 1]
-        yield role, IMU, YAW_RATE, np.where(_beside(np.abs(turning) > _TURNS_RADPS), turning, np.nan), gyro
+        turning = compute_moving_mean(twist, _ODOMETRY_S)[:, 1]
+        yield role, IMU, YAW_RATE, np.where(_find_rows_near(np.abs(turning) > _TURNS_RADPS), turning, np.nan), gyro
     if not imu.accelerometer_usable:
         return
-    force = on_grid(imu.stamp_ns, imu.specific_force_mps2, at_ns)
+    force = resample_signal(imu.stamp_ns, imu.specific_force_mps2, at_ns)
     for role, twist in twists.items():
         yield (
             role,
             IMU,
             ACCELERATION,
-            *_changes(averaged(twist[:, :1], _ACCELERATION_S), averaged(force, _ACCELERATION_S)),
+            *_compute_accelerations(
+                compute_moving_mean(twist[:, :1], _ACCELERATION_S), compute_moving_mean(force, _ACCELERATION_S)
+            ),
         )
     if gnss is not None:
         ahead = np.sign(next(iter(twists.values()))[:, 0]) if twists else 1.0
-        speed = averaged((ahead * np.abs(fix_velocity(gnss, at_ns)))[:, None], FIXES_S)
-        yield GNSS, IMU, ACCELERATION, *_changes(speed, averaged(averaged(averaged(force, FIXES_S), FIXES_S), FIXES_S))
+        speed = compute_moving_mean((ahead * np.abs(compute_fix_velocity(gnss, at_ns)))[:, None], FIXES_S)
+        yield (
+            GNSS,
+            IMU,
+            ACCELERATION,
+            *_compute_accelerations(
+                speed, compute_moving_mean(compute_moving_mean(compute_moving_mean(force, FIXES_S), FIXES_S), FIXES_S)
+            ),
+        )
 
 
-def _changes(speed: Floats, force: Floats) -> tuple[Floats, Floats]:
+def _compute_accelerations(speed: Floats, force: Floats) -> tuple[Floats, Floats]:
     """Return how fast a speed (M, 1) changes [m/s²] and the force (M, 3) that would do it, where the speed changes."""
-    lively = _beside(np.abs(_quick(speed)[:, 0]) > _CHANGES_MPS)
-    rate = _quick(np.gradient(speed, GRID_S, axis=0))[:, 0]
-    return np.where(lively, rate, np.nan), _quick(force)
+    lively = _find_rows_near(np.abs(_remove_slow_parts(speed)[:, 0]) > _CHANGES_MPS)
+    rate = _remove_slow_parts(np.gradient(speed, GRID_S, axis=0))[:, 0]
+    return np.where(lively, rate, np.nan), _remove_slow_parts(force)
 
 
-def where_it_changes(target: Floats, seen: Floats) -> tuple[Floats, Floats]:
+def select_speed_changes(target: Floats, seen: Floats) -> tuple[Floats, Floats]:
     """Return two speeds (M, 1) without their slow parts, the first only near changes of the second."""
-    quick = _quick(seen)
-    return np.where(_beside(np.abs(quick[:, 0]) > _CHANGES_MPS), _quick(target)[:, 0], np.nan), quick
+    quick = _remove_slow_parts(seen)
+    return np.where(
+        _find_rows_near(np.abs(quick[:, 0]) > _CHANGES_MPS), _remove_slow_parts(target)[:, 0], np.nan
+    ), quick
 
 
-def _beside(lively: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _find_rows_near(lively: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Return what lies near something lively, shape (M,)."""
-    beside: NDArray[np.bool_] = averaged(lively.astype(np.float64)[:, None], 2 * _LIVELY_S)[:, 0] > 0
+    beside: NDArray[np.bool_] = compute_moving_mean(lively.astype(np.float64)[:, None], 2 * _LIVELY_S)[:, 0] > 0
     return beside
 
 
-def _within(power: PowerSignal | None, first_ns: int, last_ns: int) -> PowerSignal | None:
+def _select_power(power: PowerSignal | None, first_ns: int, last_ns: int) -> PowerSignal | None:
     """Return the part of a power signal between two stamps; None where there is too little."""
     if power is None:
         return None
@@ -248,12 +270,14 @@ def _within(power: PowerSignal | None, first_ns: int, last_ns: int) -> PowerSign
 
 def _pair(names: tuple[str, str, str], windows: list[tuple[float, Floats]], span_s: float) -> Pair | None:
     """Return a pair of the whole run; where it drifts for sure, as it is in the middle of the run."""
-    lags = [(at_s, lag_of([products])) for at_s, products in windows] if len(windows) > 1 else []
-    known = [(at_s, lag) for at_s, lag in lags if lag and _determined(names[0], lag.offset_s, lag.std_s, lag.explained)]
+    lags = [(at_s, estimate_lag([products])) for at_s, products in windows] if len(windows) > 1 else []
+    known = [
+        (at_s, lag) for at_s, lag in lags if lag and _is_determined(names[0], lag.offset_s, lag.std_s, lag.explained)
+    ]
     told = tuple((at_s, lag.offset_s, lag.std_s) for at_s, lag in known)
-    whole = lag_of([products for _, products in windows])
+    whole = estimate_lag([products for _, products in windows])
     if len(told) >= _FEWEST_WINDOWS:
-        (middle_s, rate), (middle_std_s, rate_std) = _line(np.array(told), span_s)
+        (middle_s, rate), (middle_std_s, rate_std) = _fit_offset_line(np.array(told), span_s)
         drift = (3600.0 * rate, 3600.0 * rate_std)
         if whole is None or abs(rate) > _SURE * rate_std:
             explained = float(np.median([lag.explained for _, lag in known]))
@@ -262,7 +286,7 @@ def _pair(names: tuple[str, str, str], windows: list[tuple[float, Floats]], span
     return None if whole is None else Pair(*names, whole.offset_s, whole.std_s, whole.explained, windows=told)
 
 
-def _line(told: Floats, span_s: float) -> tuple[tuple[float, float], tuple[float, float]]:
+def _fit_offset_line(told: Floats, span_s: float) -> tuple[tuple[float, float], tuple[float, float]]:
     """Return offset in the middle of the run [s] and its rate [s/s] by weighted least squares, and their standard deviations.
 
     Windows that scatter by more than they claim widen the deviations (Birge's ratio).
@@ -278,49 +302,49 @@ def _line(told: Floats, span_s: float) -> tuple[tuple[float, float], tuple[float
     return (float(solved[0]), float(solved[1])), (middle_std_s, rate_std)
 
 
-def _determined(role: str, offset_s: float, std_s: float, explained: float) -> bool:
+def _is_determined(role: str, offset_s: float, std_s: float, explained: float) -> bool:
     limit_s = _MAX_STD_S.get(role, _MAX_MOTION_STD_S)
     known = std_s <= limit_s or (std_s <= 3 * limit_s and abs(offset_s) > _SURE * std_s)
     return known and explained >= _MIN_EXPLAINED
 
 
-def _quick(values: Floats) -> Floats:
+def _remove_slow_parts(values: Floats) -> Floats:
     """Return (M, k) values without their slow parts, which slip and terrain change, and starts, stops and turns do not need."""
-    return values - averaged(values, _SLOW_S)
+    return values - compute_moving_mean(values, _SLOW_S)
 
 
-def _antenna_speed(twist: Floats, lever_arm_m: tuple[float, float, float]) -> Floats:
+def _compute_antenna_speed(twist: Floats, lever_arm_m: tuple[float, float, float]) -> Floats:
     forward, yaw_rate = twist.T
     speed: Floats = np.hypot(forward - yaw_rate * lever_arm_m[1], yaw_rate * lever_arm_m[0])
     return speed[:, None]
 
 
-def _power(power: PowerSignal, twist: Floats, at_ns: NDArray[np.int64]) -> tuple[Floats, Floats]:
+def _prepare_power(power: PowerSignal, twist: Floats, at_ns: NDArray[np.int64]) -> tuple[Floats, Floats]:
     """Return power, and what it may depend on, without their slow parts."""
     stamp_ns = power.stamp_ns
     if power.averaged:
-        stamp_ns = stamp_ns - median_period_ns(stamp_ns) // 2
-    drawn = on_grid(stamp_ns, power.power_watt[:, None], at_ns)
+        stamp_ns = stamp_ns - compute_median_period_ns(stamp_ns) // 2
+    drawn = resample_signal(stamp_ns, power.power_watt[:, None], at_ns)
     speed, turning = np.abs(twist).T
-    causes = averaged(np.column_stack((drawn, speed, turning, turning * speed, speed**2)), _POWER_S)
+    causes = compute_moving_mean(np.column_stack((drawn, speed, turning, turning * speed, speed**2)), _POWER_S)
     # Speed times acceleration, as half the slope of the squared speed: smoothed like the power itself.
     causes[:, -1] = np.gradient(causes[:, -1], GRID_S) / 2
-    fast = _quick(causes)
-    near_stop = averaged((speed < _STOPPED_MPS).astype(np.float64)[:, None], _NEAR_STOP_S)[:, 0] > 0
+    fast = _remove_slow_parts(causes)
+    near_stop = compute_moving_mean((speed < _STOPPED_MPS).astype(np.float64)[:, None], _NEAR_STOP_S)[:, 0] > 0
     return np.where(near_stop, fast[:, 0], np.nan), fast[:, 1:]
 
 
-def _settled(pairs: tuple[Pair, ...], span_s: float = 0.0) -> ClockOffsets:
+def _solve_offsets(pairs: tuple[Pair, ...], span_s: float = 0.0) -> ClockOffsets:
     """Return each sensor's offset from the clock that most sensors share, by weighted least squares over the pairs that are determined."""
     known = [pair for pair in pairs if pair.determined]
     linked = [role for role in ROLES if any(role in {pair.late, pair.against} for pair in known)]
     best: dict[str, RoleOffset] = {}
     reference = ""
     for role in linked:
-        offsets = _against(role, linked, known, span_s)
-        if not best or len(_agreeing(offsets)) > len(_agreeing(best)):
+        offsets = _solve_against_reference(role, linked, known, span_s)
+        if not best or len(_find_agreeing(offsets)) > len(_find_agreeing(best)):
             best, reference = offsets, role
-    agreeing = _agreeing(best)
+    agreeing = _find_agreeing(best)
     told = {
         role: replace(offset, blamed=role not in agreeing and _is_blamed(role, agreeing, best, known))
         for role, offset in best.items()
@@ -329,7 +353,7 @@ def _settled(pairs: tuple[Pair, ...], span_s: float = 0.0) -> ClockOffsets:
     return ClockOffsets(pairs, reference, told, span_s)
 
 
-def _agreeing(offsets: Mapping[str, RoleOffset]) -> frozenset[str]:
+def _find_agreeing(offsets: Mapping[str, RoleOffset]) -> frozenset[str]:
     """Return the sensors that are near the reference; how surely does not matter: against a doubtful clock nobody is surely off."""
     return frozenset(
         role
@@ -357,12 +381,14 @@ def _is_blamed(role: str, agreeing: frozenset[str], offsets: Mapping[str, RoleOf
     return False
 
 
-def _against(reference: str, roles: list[str], pairs: list[Pair], span_s: float) -> dict[str, RoleOffset]:
+def _solve_against_reference(
+    reference: str, roles: list[str], pairs: list[Pair], span_s: float
+) -> dict[str, RoleOffset]:
     """Return the offsets of the sensors that pairs connect to the reference, its own (zero) included."""
-    offsets = _solved(reference, roles, [(p.late, p.against, p.offset_s, p.weight_std_s) for p in pairs])
+    offsets = _solve_network(reference, roles, [(p.late, p.against, p.offset_s, p.weight_std_s) for p in pairs])
     least = 3600.0 * _LEAST_STD_S / max(span_s, 1.0)
     told = [p for p in pairs if math.isfinite(p.drift_s_per_h)]
-    drifts = _solved(
+    drifts = _solve_network(
         reference, roles, [(p.late, p.against, p.drift_s_per_h, max(p.drift_std_s_per_h, least)) for p in told]
     )
     found = {}
@@ -375,7 +401,7 @@ def _against(reference: str, roles: list[str], pairs: list[Pair], span_s: float)
     return found
 
 
-def _solved(
+def _solve_network(
     reference: str, roles: list[str], differences: list[tuple[str, str, float, float]]
 ) -> dict[str, tuple[float, float]]:
     """Return each connected role's value against the reference's zero, with its standard deviation.

@@ -15,9 +15,9 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.fusion.checks.gridded_motion import fix_places
 from tcpipe.fusion.checks.lags import GRID_S, Floats
-from tcpipe.fusion.checks.refusals import Refusal
+from tcpipe.fusion.checks.refusals import SensorExclusion
+from tcpipe.fusion.checks.resampled_motion import resample_fixes
 from tcpipe.fusion.measurements import GNSS, WHEELS, Positions
 
 COMMAND = "command"
@@ -84,18 +84,18 @@ def find_distances(gnss: Positions | None, twists: Mapping[str, Floats], at_ns: 
     twists : by name, forward velocity [m/s] and yaw rate [rad/s] on the grid, shape (M, 2).
     at_ns : the grid's stamps, shape (M,).
     """
-    places = {name: _dead_reckoned(twist) for name, twist in twists.items()}
+    places = {name: _dead_reckon(twist) for name, twist in twists.items()}
     least_m = _FAR_M
     if gnss is not None:
-        places[GNSS] = fix_places(gnss, at_ns)
+        places[GNSS] = resample_fixes(gnss, at_ns)
         least_m += _SURE * float(np.sqrt(np.median(gnss.variance_m2[:, :2])))
-    found = Distances({name: _chords_m(place, _WINDOW) for name, place in places.items()}, least_m)
+    found = Distances({name: _compute_chords_m(place, _WINDOW) for name, place in places.items()}, least_m)
     if any(found.ratio(*pair) is not None for pair in combinations(places, 2)):
         return found
-    return Distances({name: _chords_m(place, _LONG_WINDOW) for name, place in places.items()}, least_m)
+    return Distances({name: _compute_chords_m(place, _LONG_WINDOW) for name, place in places.items()}, least_m)
 
 
-def contradictions(found: Distances, *, turning: frozenset[str]) -> dict[str, Refusal]:
+def find_contradictions(found: Distances, *, turning: frozenset[str]) -> dict[str, SensorExclusion]:
     """Return the refusals by sensor: of two that differ the one that fewer others agree with, or both.
 
     Parameters
@@ -104,8 +104,8 @@ def contradictions(found: Distances, *, turning: frozenset[str]) -> dict[str, Re
     """
     sensors = [name for name in found.chord_m if name != COMMAND]
     heard = {name: [other for other in found.chord_m if other != name and found.agree(name, other)] for name in sensors}
-    refusals: dict[str, Refusal] = {}
-    for slow, fast, ratio in _differing(found, sensors):
+    refusals: dict[str, SensorExclusion] = {}
+    for slow, fast, ratio in _find_differing_pairs(found, sensors):
         still = ratio > 1 / _STILL
         # A command tells how fast a robot that moves is to go, not that it moves; a gyroscope that turns with it does.
         for_fast = len(set(heard[fast]) - {COMMAND}) + (fast in turning) if still else len(heard[fast])
@@ -120,7 +120,7 @@ def contradictions(found: Distances, *, turning: frozenset[str]) -> dict[str, Re
     return refusals
 
 
-def path_of_fixes(
+def compare_path_of_fixes(
     gnss: Positions, twist: Floats, at_ns: NDArray[np.int64]
 ) -> Literal["alike", "mirrored", "unlike"] | None:
     """Return how the path of the fixes lies to what an odometry adds up to; None where there is too little to tell.
@@ -130,8 +130,8 @@ def path_of_fixes(
     """
     left, bound = [], []
     noise_m2 = _SURE**2 * float(np.median(gnss.variance_m2[:, :2]))
-    for a, b in _both_paths(gnss, twist, at_ns):
-        left.append((_unlike_m2(a, b), _unlike_m2(a, np.conj(b))))
+    for a, b in _iterate_path_pairs(gnss, twist, at_ns):
+        left.append((_compute_path_misfit_m2(a, b), _compute_path_misfit_m2(a, np.conj(b))))
         bound.append(_UNLIKE_M**2 + noise_m2 + _UNLIKE_SHARE**2 * float(np.mean(np.abs(b) ** 2)))
     if len(left) < _FEWEST_WINDOWS:
         return None
@@ -144,7 +144,7 @@ def path_of_fixes(
     return "alike" if as_it_is.sum() < as_mirrored.sum() else "mirrored"
 
 
-def far_scale(gnss: Positions, twist: Floats, at_ns: NDArray[np.int64]) -> tuple[float, float] | None:
+def estimate_far_scale(gnss: Positions, twist: Floats, at_ns: NDArray[np.int64]) -> tuple[float, float] | None:
     """Return how many times as far as the fixes an odometry goes, and its standard deviation, where that is far from 1 throughout.
 
     In every window the odometry's path is laid on the fixes by rotation and scale. The scale is the odometry's where the paths are alike
@@ -152,11 +152,11 @@ def far_scale(gnss: Positions, twist: Floats, at_ns: NDArray[np.int64]) -> tuple
     """
     noise_m2 = 2.0 * float(np.median(gnss.variance_m2[:, :2]))
     ratios, windows = [], 0
-    for a, b in _both_paths(gnss, twist, at_ns):
+    for a, b in _iterate_path_pairs(gnss, twist, at_ns):
         energy, own = float(np.mean(np.abs(a) ** 2)), float(np.mean(np.abs(b) ** 2))
         if energy > max(noise_m2, _UNLIKE_M**2) and own > 0.0:
             windows += 1
-            if _unlike_m2(a, b) < noise_m2 + _UNLIKE_SHARE**2 * energy:
+            if _compute_path_misfit_m2(a, b) < noise_m2 + _UNLIKE_SHARE**2 * energy:
                 ratios.append(own / float(np.abs(np.mean(a * np.conj(b)))))
     if len(ratios) < max(_FEWEST_WINDOWS, (1.0 - _UNLIKE_WINDOWS) * windows):
         return None
@@ -168,24 +168,24 @@ def far_scale(gnss: Positions, twist: Floats, at_ns: NDArray[np.int64]) -> tuple
     return factor, spread / float(np.sqrt(len(ratios) / 2))  # windows overlap by half
 
 
-def _both_paths(
+def _iterate_path_pairs(
     gnss: Positions, twist: Floats, at_ns: NDArray[np.int64]
 ) -> Iterable[tuple[NDArray[np.complex128], NDArray[np.complex128]]]:
     """Yield the fixes and what an odometry adds up to in every window of twice the length, each about its mean."""
-    fixes, path = fix_places(gnss, at_ns), _dead_reckoned(twist)
+    fixes, path = resample_fixes(gnss, at_ns), _dead_reckon(twist)
     for first in range(0, at_ns.size - 2 * _WINDOW, _WINDOW):
         rows = slice(first, first + 2 * _WINDOW)
         if np.isfinite(fixes[rows] + path[rows]).all():
             yield fixes[rows] - fixes[rows].mean(), path[rows] - path[rows].mean()
 
 
-def _unlike_m2(a: NDArray[np.complex128], b: NDArray[np.complex128]) -> float:
+def _compute_path_misfit_m2(a: NDArray[np.complex128], b: NDArray[np.complex128]) -> float:
     """Return the mean square that is left when b, turned and scaled, is laid on a; both about their mean."""
     energy, own = float(np.mean(np.abs(a) ** 2)), float(np.mean(np.abs(b) ** 2))
     return energy - float(np.abs(np.mean(a * np.conj(b))) ** 2) / own if own > 0 else energy
 
 
-def _differing(found: Distances, sensors: list[str]) -> Iterable[tuple[str, str, float]]:
+def _find_differing_pairs(found: Distances, sensors: list[str]) -> Iterable[tuple[str, str, float]]:
     """Return the pairs that differ: the slower, the faster, and how many times as far it goes."""
     for a, b in combinations(sensors, 2):
         ratio = found.ratio(a, b)
@@ -193,18 +193,18 @@ def _differing(found: Distances, sensors: list[str]) -> Iterable[tuple[str, str,
             yield (b, a, ratio) if ratio > 1 else (a, b, 1 / ratio)
 
 
-def _refuse(role: str, other: str, ratio: float, *, undecided: bool) -> Refusal:
+def _refuse(role: str, other: str, ratio: float, *, undecided: bool) -> SensorExclusion:
     """Return the refusal of a sensor that goes ``ratio`` times as far as another."""
     names = {"reference": other} | ({"suspect": other} if undecided else {})
     numbers = {"distance_ratio": ratio}
     if _KMH[0] < ratio < _KMH[1]:
-        return Refusal(role, "unit-suspected", {**names, "unit": "km/h"}, numbers)
+        return SensorExclusion(role, "unit-suspected", {**names, "unit": "km/h"}, numbers)
     if role == GNSS and _RADIANS[0] < ratio < _RADIANS[1]:
-        return Refusal(role, "unit-suspected", {**names, "unit": "radians"}, numbers)
-    return Refusal(role, "distance-contradicted", names, numbers)
+        return SensorExclusion(role, "unit-suspected", {**names, "unit": "radians"}, numbers)
+    return SensorExclusion(role, "distance-contradicted", names, numbers)
 
 
-def _dead_reckoned(twist: Floats) -> NDArray[np.complex128]:
+def _dead_reckon(twist: Floats) -> NDArray[np.complex128]:
     """Return the places that a twist (M, 2) adds up to, east and i times north [m]; NaN where it is unknown."""
     known = np.isfinite(twist.sum(1))
     forward, yaw_rate = np.where(known[:, None], twist, 0.0).T
@@ -212,7 +212,7 @@ def _dead_reckoned(twist: Floats) -> NDArray[np.complex128]:
     return np.where(known, place, np.nan)
 
 
-def _chords_m(place_m: NDArray[np.complex128], window: int) -> Floats:
+def _compute_chords_m(place_m: NDArray[np.complex128], window: int) -> Floats:
     """Return the distance over every window of so many rows [m]; NaN where a place in it is unknown."""
     lost = np.concatenate(([0], np.cumsum(np.isnan(place_m))))
     first = np.arange(0, place_m.size - window, _STEP)

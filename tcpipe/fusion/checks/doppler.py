@@ -11,14 +11,14 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.fusion.checks.clock_offsets import where_it_changes
+from tcpipe.fusion.checks.clock_offsets import select_speed_changes
 from tcpipe.fusion.checks.frozen import refuse_frozen
-from tcpipe.fusion.checks.gridded_motion import FIXES_S, fix_velocity, on_grid, twist_on_grid
-from tcpipe.fusion.checks.lags import Floats, Lag, averaged, find_lag
-from tcpipe.fusion.checks.refusals import Refusal
-from tcpipe.fusion.checks.windows import liveliest_ns
+from tcpipe.fusion.checks.lags import Floats, Lag, compute_moving_mean, find_lag
+from tcpipe.fusion.checks.refusals import SensorExclusion
+from tcpipe.fusion.checks.resampled_motion import FIXES_S, compute_fix_velocity, resample_signal, resample_twist
+from tcpipe.fusion.checks.windows import find_liveliest_window_ns
 from tcpipe.fusion.measurements import DOPPLER, GNSS, GroundVelocities, Measurements, Positions
-from tcpipe.fusion.signals import in_gap, integral, median_period_ns, seconds
+from tcpipe.fusion.signals import compute_median_period_ns, compute_seconds, integrate_signal, is_in_gap
 
 _WINDOWS_S = (4.0, 8.0, 16.0, 32.0, 64.0)
 _FEWEST_WINDOWS = 3
@@ -30,42 +30,49 @@ _LATE_S, _SURE, _MAX_STD_S, _MIN_EXPLAINED = 0.05, 4.0, 0.03, 0.5
 _MAX_GAP_NS = 1_000_000_000
 
 
-def doubt_of_velocity(m: Measurements) -> Refusal | None:
+def check_ground_velocity(m: Measurements) -> SensorExclusion | None:
     """Return why the receiver's velocity of a clock epoch is not to be fused; None where the fixes confirm it."""
     if m.doppler is None:
         return None
     if m.gnss is None:
-        return Refusal(DOPPLER, "velocity-unverified")
-    windows = _ways(m.gnss, m.doppler)
+        return SensorExclusion(DOPPLER, "velocity-unverified")
+    windows = _compute_displacements(m.gnss, m.doppler)
     if windows is None:
-        return Refusal(DOPPLER, "velocity-unverified")
-    return _frame(*windows, m.doppler.stamp_ns.size) or _lateness(m)
+        return SensorExclusion(DOPPLER, "velocity-unverified")
+    return _check_frame(*windows, m.doppler.stamp_ns.size) or _check_time_offset(m)
 
 
-def _ways(gnss: Positions, doppler: GroundVelocities) -> tuple[NDArray[np.complex128], NDArray[np.complex128]] | None:
+def _compute_displacements(
+    gnss: Positions, doppler: GroundVelocities
+) -> tuple[NDArray[np.complex128], NDArray[np.complex128]] | None:
     """Return the way by the fixes and by the velocity in windows [m], east and i times north; None where the fixes show too little."""
     noise_m = float(np.sqrt(2.0 * np.median(gnss.variance_m2[:, :2])))
     zero = int(gnss.stamp_ns[0])
-    fix_s = seconds(gnss.stamp_ns, zero)
+    fix_s = compute_seconds(gnss.stamp_ns, zero)
     east_north = np.array([1.0, 1j])
-    longest_ns = max(_MAX_GAP_NS, 3 * median_period_ns(doppler.stamp_ns))
+    longest_ns = max(_MAX_GAP_NS, 3 * compute_median_period_ns(doppler.stamp_ns))
     for window_s in _WINDOWS_S:
         last = np.searchsorted(fix_s, fix_s + window_s)
         first = np.flatnonzero(last < fix_s.size)
         last = last[first]
-        whole = ~in_gap(doppler.stamp_ns, gnss.stamp_ns[first], gnss.stamp_ns[last], longest_ns=longest_ns)
+        whole = ~is_in_gap(doppler.stamp_ns, gnss.stamp_ns[first], gnss.stamp_ns[last], longest_ns=longest_ns)
         first, last = first[whole], last[whole]
         by_fixes = (gnss.position_enu_m[last, :2] - gnss.position_enu_m[first, :2]) @ east_north
         far = np.abs(by_fixes) > max(_MOVES_M, _CLEARLY * noise_m)
-        apart = max(1, round(window_s * 1e9 / median_period_ns(gnss.stamp_ns)))
+        apart = max(1, round(window_s * 1e9 / compute_median_period_ns(gnss.stamp_ns)))
         if far.sum() < _FEWEST_WINDOWS * apart:
             continue
-        total = integral(seconds(doppler.stamp_ns, zero), doppler.velocity_enu_mps[:, :2], fix_s) @ east_north
+        total = (
+            integrate_signal(compute_seconds(doppler.stamp_ns, zero), doppler.velocity_enu_mps[:, :2], fix_s)
+            @ east_north
+        )
         return by_fixes[far], (total[last] - total[first])[far]
     return None
 
 
-def _frame(by_fixes: NDArray[np.complex128], by_velocity: NDArray[np.complex128], messages: int) -> Refusal | None:
+def _check_frame(
+    by_fixes: NDArray[np.complex128], by_velocity: NDArray[np.complex128], messages: int
+) -> SensorExclusion | None:
     """Return what is wrong with the directions or the size of the velocity."""
 
     def off(told: NDArray[np.complex128]) -> float:
@@ -77,42 +84,42 @@ def _frame(by_fixes: NDArray[np.complex128], by_velocity: NDArray[np.complex128]
     if size < _STANDS:
         return refuse_frozen(DOPPLER, "velocity", messages)
     if off(1j * np.conj(by_velocity)) <= _OFF:
-        return Refusal(DOPPLER, "velocity-frame", {"frame": "north-east-down"})
+        return SensorExclusion(DOPPLER, "velocity-frame", {"frame": "north-east-down"})
     if abs(size - 1.0) <= _OFF:
-        return Refusal(DOPPLER, "velocity-frame", {"frame": "unknown"})
-    return Refusal(DOPPLER, "distance-contradicted", {"reference": GNSS}, {"distance_ratio": size})
+        return SensorExclusion(DOPPLER, "velocity-frame", {"frame": "unknown"})
+    return SensorExclusion(DOPPLER, "distance-contradicted", {"reference": GNSS}, {"distance_ratio": size})
 
 
-def _lateness(m: Measurements) -> Refusal | None:
+def _check_time_offset(m: Measurements) -> SensorExclusion | None:
     """Return by how much its stamps are off: by the first odometry, or, where that tells no lag, by how the fixes go."""
-    at_ns = liveliest_ns(m)
+    at_ns = find_liveliest_window_ns(m)
     if at_ns is None or m.doppler is None or m.gnss is None:
         return None
-    velocity = on_grid(m.doppler.stamp_ns, m.doppler.velocity_enu_mps[:, :2], at_ns)
+    velocity = resample_signal(m.doppler.stamp_ns, m.doppler.velocity_enu_mps[:, :2], at_ns)
     for role in list(m.odometries())[:1]:
-        speed = averaged(np.linalg.norm(velocity, axis=1)[:, None], _SMOOTH_S)
-        lag = find_lag(*where_it_changes(speed, averaged(_antenna(m, at_ns), _SMOOTH_S)))
+        speed = compute_moving_mean(np.linalg.norm(velocity, axis=1)[:, None], _SMOOTH_S)
+        lag = find_lag(*select_speed_changes(speed, compute_moving_mean(_compute_antenna_speed(m, at_ns), _SMOOTH_S)))
         if lag is not None and _is_known(lag):
             return _refuse_late("time-offset", role, lag, late_s=lag.offset_s) if _is_off(lag) else None
-    seen = fix_velocity(m.gnss, at_ns)
-    for axis, of_fixes in zip(averaged(velocity, FIXES_S).T, (seen.real, seen.imag), strict=True):
-        lag = find_lag(axis, averaged(of_fixes[:, None], _SMOOTH_S))
+    seen = compute_fix_velocity(m.gnss, at_ns)
+    for axis, of_fixes in zip(compute_moving_mean(velocity, FIXES_S).T, (seen.real, seen.imag), strict=True):
+        lag = find_lag(axis, compute_moving_mean(of_fixes[:, None], _SMOOTH_S))
         if lag is not None and _is_known(lag) and _is_off(lag):
             return _refuse_late("clocks-differ", GNSS, lag)
     return None
 
 
-def _refuse_late(code: str, reference: str, lag: Lag, *, late_s: float | None = None) -> Refusal:
+def _refuse_late(code: str, reference: str, lag: Lag, *, late_s: float | None = None) -> SensorExclusion:
     numbers = {"offset_s": lag.offset_s, "offset_2std_s": 2 * lag.std_s, "apart_s": abs(lag.offset_s)}
-    return Refusal(DOPPLER, code, {"reference": reference}, numbers, late_s=late_s)
+    return SensorExclusion(DOPPLER, code, {"reference": reference}, numbers, late_s=late_s)
 
 
 _SMOOTH_S = 0.3
 
 
-def _antenna(m: Measurements, at_ns: NDArray[np.int64]) -> Floats:
+def _compute_antenna_speed(m: Measurements, at_ns: NDArray[np.int64]) -> Floats:
     """Return the antenna's speed by the first odometry [m/s], shape (M, 1)."""
-    forward, yaw_rate = twist_on_grid(next(iter(m.odometries().values())), at_ns).T
+    forward, yaw_rate = resample_twist(next(iter(m.odometries().values())), at_ns).T
     ahead, left, _ = (0.0, 0.0, 0.0) if m.gnss is None else m.gnss.lever_arm_m
     return np.asarray(np.hypot(forward - yaw_rate * left, yaw_rate * ahead)[:, None])
 

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.fusion.signals import in_gap, integral, seconds
+from tcpipe.fusion.signals import compute_seconds, integrate_signal, is_in_gap
 
 GRID_S = 0.02
 """Spacing of the grid [s]."""
@@ -47,22 +47,24 @@ class Lag:
     explained: float
 
 
-def grid_ns(first_ns: int, last_ns: int) -> NDArray[np.int64]:
+def make_grid_ns(first_ns: int, last_ns: int) -> NDArray[np.int64]:
     """Return a grid's stamps [ns] from first to last."""
     return np.arange(first_ns, last_ns + 1, GRID_NS, dtype=np.int64)
 
 
-def gridded(stamp_ns: NDArray[np.int64], values: Floats, at_ns: NDArray[np.int64], *, longest_gap_ns: int) -> Floats:
+def average_on_grid(
+    stamp_ns: NDArray[np.int64], values: Floats, at_ns: NDArray[np.int64], *, longest_gap_ns: int
+) -> Floats:
     """Return the means of the piecewise-linear signal (N, k) over each grid cell, shape (M, k); NaN in gaps and outside."""
     zero = int(at_ns[0])
     edges_s: Floats = (np.arange(at_ns.size + 1, dtype=np.float64) - 0.5) * GRID_S
-    means = np.diff(integral(seconds(stamp_ns, zero), values, edges_s), axis=0) / GRID_S
+    means = np.diff(integrate_signal(compute_seconds(stamp_ns, zero), values, edges_s), axis=0) / GRID_S
     half = GRID_NS // 2
-    means[in_gap(stamp_ns, at_ns - half, at_ns + half, longest_ns=longest_gap_ns)] = np.nan
+    means[is_in_gap(stamp_ns, at_ns - half, at_ns + half, longest_ns=longest_gap_ns)] = np.nan
     return means
 
 
-def averaged(values: Floats, width_s: float) -> Floats:
+def compute_moving_mean(values: Floats, width_s: float) -> Floats:
     """Return the centred running mean over ``width_s`` of (M, k) values, NaN where the window holds one or leaves the grid."""
     half = round(width_s / GRID_S / 2)
     known = np.isfinite(values.sum(1))
@@ -90,21 +92,21 @@ def find_lag(target: Floats, regressors: Floats) -> Lag | None:
     None where too little is known, where the best lag lies at the end of the search or another is as good, or where a constant explains
     the target.
     """
-    products = lag_products(target, regressors)
-    return None if products is None else lag_of([products])
+    products = compute_lag_products(target, regressors)
+    return None if products is None else estimate_lag([products])
 
 
-def lag_of(windows: Sequence[Floats]) -> Lag | None:
-    """Return the lag of several windows of time together; ``windows`` are of `lag_products`, of the same signals."""
-    products = _merged(np.concatenate(windows, axis=1))
+def estimate_lag(windows: Sequence[Floats]) -> Lag | None:
+    """Return the lag of several windows of time together; ``windows`` are of `compute_lag_products`, of the same signals."""
+    products = _merge_products(np.concatenate(windows, axis=1))
     products = products[:, (products[:, :, -2, -2] > 0).all(axis=0)]
     groups = products.shape[1]
     if groups < _FEWEST_EVENTS:
         return None
     whole = products.sum(1)
-    explained = _explained(whole)
-    offset_s = _peak(explained)
-    left_out = [_peak(_explained(whole - products[:, g])) for g in range(groups)]
+    explained = _compute_explained_variance(whole)
+    offset_s = _find_peak(explained)
+    left_out = [_find_peak(_compute_explained_variance(whole - products[:, g])) for g in range(groups)]
     if not np.isfinite([offset_s, *left_out]).all():
         return None
     best = int(np.argmax(explained))
@@ -112,10 +114,10 @@ def lag_of(windows: Sequence[Floats]) -> Lag | None:
     if _has_rival(explained, best, independent):
         return None
     jackknife_s = float(np.sqrt((groups - 1) / groups * np.sum((np.array(left_out) - np.mean(left_out)) ** 2)))
-    return Lag(offset_s, max(jackknife_s, _flatness_s(explained, best, independent)), float(explained[best]))
+    return Lag(offset_s, max(jackknife_s, _compute_peak_std_s(explained, best, independent)), float(explained[best]))
 
 
-def _flatness_s(explained: Floats, best: int, independent: float) -> float:
+def _compute_peak_std_s(explained: Floats, best: int, independent: float) -> float:
     """Return the standard deviation of a peak [s] by least squares: the noise that is left over the peak's curvature."""
     before, at, after = explained[best - 1 : best + 2]
     curvature = (2 * at - before - after) / GRID_S**2
@@ -131,7 +133,7 @@ def _has_rival(explained: Floats, best: int, independent: float) -> bool:
     return bool((worse < _CLEARLY).any())
 
 
-def _merged(products: Floats) -> Floats:
+def _merge_products(products: Floats) -> Floats:
     """Return the products of fewer, longer groups of time, at most twice `_GROUPS`."""
     together = -(-products.shape[1] // (2 * _GROUPS))
     first = np.arange(0, products.shape[1], together)
@@ -139,8 +141,8 @@ def _merged(products: Floats) -> Floats:
     return merged
 
 
-def lag_products(target: Floats, regressors: Floats) -> Floats | None:
-    """Return what `lag_of` needs of a window: sums of products of (regressors, 1, target) by lag and group of time.
+def compute_lag_products(target: Floats, regressors: Floats) -> Floats | None:
+    """Return what `estimate_lag` needs of a window: sums of products of (regressors, 1, target) by lag and group of time.
 
     Shape (L, G, k + 2, k + 2); parameters are `find_lag`'s. None where the window is too short.
     """
@@ -165,7 +167,7 @@ def lag_products(target: Floats, regressors: Floats) -> Floats | None:
     return found
 
 
-def _explained(products: Floats) -> Floats:
+def _compute_explained_variance(products: Floats) -> Floats:
     """Return the share of the target's variance that the regressors explain at each lag, shape (L,)."""
     k = products.shape[1] - 2
     counts = products[:, k, k]
@@ -181,7 +183,7 @@ def _explained(products: Floats) -> Floats:
     return np.where(total > _TINY, np.sum(fitted * cross, axis=1) / np.maximum(total, _TINY), np.nan)
 
 
-def _peak(explained: Floats) -> float:
+def _find_peak(explained: Floats) -> float:
     """Return the lag of the maximum [s], by a parabola through its neighbours; NaN at the end of the search and without one."""
     if not np.isfinite(explained).all():
         return float("nan")

@@ -20,9 +20,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.fusion.measurements import VISUAL, WHEELS, BodyVelocities, InertialMeasurements, Measurements, Positions
-from tcpipe.fusion.signals import in_gap, interval_means, median_of_five, median_period_ns, seconds
+from tcpipe.fusion.signals import (
+    compute_interval_means,
+    compute_median_of_five,
+    compute_median_period_ns,
+    compute_seconds,
+    is_in_gap,
+)
 from tcpipe.fusion.trajectory import DISPLACEMENT_LAGS_S, Trajectory
-from tcpipe.geometry.rotation import inverse, matrix_from_quat, product, quat_from_rpy, rotate
+from tcpipe.geometry.rotation import invert, matrix_from_quat, multiply, quat_from_rpy, rotate
 
 Floats = NDArray[np.float64]
 
@@ -91,14 +97,14 @@ class Tilt:
     std_rad: Floats
 
 
-def arm_evidence(found: Trajectory, m: Measurements) -> ArmEvidence | None:
+def collect_arm_evidence(found: Trajectory, m: Measurements) -> ArmEvidence | None:
     """Return what one stretch tells of the antenna's arm; None without fixes or odometry."""
     role, source = (VISUAL, m.visual) if m.visual is not None else (WHEELS, m.wheels)
     if m.gnss is None or source is None or found.stamp_ns.size < _FEWEST:
         return None
-    rotation, path = matrix_from_quat(found.quat_xyzw), _drawn(found, source)
+    rotation, path = matrix_from_quat(found.quat_xyzw), _draw_path(found, source)
     zero = int(found.stamp_ns[0])
-    row_s, fix_s = seconds(found.stamp_ns, zero), seconds(m.gnss.stamp_ns, zero)
+    row_s, fix_s = compute_seconds(found.stamp_ns, zero), compute_seconds(m.gnss.stamp_ns, zero)
     known = (fix_s > row_s[0]) & (fix_s < row_s[-1])
     fix_s = fix_s[known]
 
@@ -113,8 +119,8 @@ def arm_evidence(found: Trajectory, m: Measurements) -> ArmEvidence | None:
     told = []
     for begin in np.arange(0.0, row_s[-1], _WINDOW_S):
         rows = (fix_s >= begin) & (fix_s < begin + _WINDOW_S)
-        if rows.sum() >= _FEWEST and _turned_rad(axes[rows]) > _LEAST_TURN_RAD:
-            told.append(_window(place[rows], drawn[rows], axes[rows], float(np.median(claim[rows]))))
+        if rows.sum() >= _FEWEST and _compute_turned_range_rad(axes[rows]) > _LEAST_TURN_RAD:
+            told.append(_build_window_equations(place[rows], drawn[rows], axes[rows], float(np.median(claim[rows]))))
     if not told:
         return None
     return ArmEvidence(
@@ -122,18 +128,18 @@ def arm_evidence(found: Trajectory, m: Measurements) -> ArmEvidence | None:
     )
 
 
-def _turned_rad(axes: Floats) -> float:
+def _compute_turned_range_rad(axes: Floats) -> float:
     """Return between which yaws the robot turned."""
     return float(np.ptp(np.unwrap(np.arctan2(axes[:, 1, 0], axes[:, 0, 0]))))
 
 
-def _drawn(found: Trajectory, source: BodyVelocities) -> Floats:
+def _draw_path(found: Trajectory, source: BodyVelocities) -> Floats:
     """Return the horizontal path that an odometry draws with the track's attitude [m], shape (N, 2)."""
     zero = int(found.stamp_ns[0])
-    row_s, step_s = seconds(found.stamp_ns, zero), np.diff(seconds(found.stamp_ns, zero))
+    row_s, step_s = compute_seconds(found.stamp_ns, zero), np.diff(compute_seconds(found.stamp_ns, zero))
     rotation = matrix_from_quat(found.quat_xyzw)
     point = np.nan_to_num(source.velocity_mps)
-    said = interval_means(seconds(source.stamp_ns, zero), point, row_s[:-1], row_s[1:])
+    said = compute_interval_means(compute_seconds(source.stamp_ns, zero), point, row_s[:-1], row_s[1:])
     turn = (found.angular_velocity_radps[1:] + found.angular_velocity_radps[:-1]) / 2.0
     body = said - np.cross(turn, source.lever_arm_m)
     body[:, ~source.measured] = 0.0  # along an axis that it does not measure a robot slides little
@@ -141,7 +147,7 @@ def _drawn(found: Trajectory, source: BodyVelocities) -> Floats:
     return np.concatenate((np.zeros((1, 2)), np.cumsum(steps, axis=0)))
 
 
-def _window(place: Floats, drawn: Floats, axes: Floats, claim_m: float) -> tuple[Floats, Floats]:
+def _build_window_equations(place: Floats, drawn: Floats, axes: Floats, claim_m: float) -> tuple[Floats, Floats]:
     """Return the normal equations of arm and lag in one window, its own place, scale and turn taken out; wild fixes are left out."""
     path = drawn - drawn.mean(0)
     rows = np.ones(len(place), np.bool_)
@@ -151,7 +157,7 @@ def _window(place: Floats, drawn: Floats, axes: Floats, claim_m: float) -> tuple
         own[:, 0, 0] = own[:, 1, 1] = 1.0
         own[:, 0, 2], own[:, 1, 2] = path[rows].T
         own[:, 0, 3], own[:, 1, 3] = -path[rows, 1], path[rows, 0]
-        basis = _basis(own.reshape(-1, 4))
+        basis = _make_orthonormal_basis(own.reshape(-1, 4))
         arm, target = axes[rows].reshape(-1, 4), (place - path)[rows].reshape(-1)
         arm, target = (values - basis @ (basis.T @ values) for values in (arm, target))
         solved = np.linalg.lstsq(arm, target, rcond=1e-6)[0]
@@ -165,7 +171,7 @@ def _window(place: Floats, drawn: Floats, axes: Floats, claim_m: float) -> tuple
     return matrix, vector
 
 
-def _basis(columns: Floats) -> Floats:
+def _make_orthonormal_basis(columns: Floats) -> Floats:
     """Return orthonormal columns that span the given ones (N, k): standing still has no path."""
     left, size, _ = np.linalg.svd(columns, full_matrices=False)
     spanning: Floats = left[:, size > 1e-6 * size[0]]
@@ -205,7 +211,7 @@ def solve_arm(told: Sequence[ArmEvidence | None], moved_m: Floats, *, height_std
     return Arm(error, covariance * np.outer(beyond, beyond))
 
 
-def lag_of(told: Sequence[ArmEvidence | None], moved_m: Floats) -> tuple[float, float] | None:
+def solve_lag(told: Sequence[ArmEvidence | None], moved_m: Floats) -> tuple[float, float] | None:
     """Return by how much the fixes lag behind the path [s] and its deviation, where that is sure and matters; None elsewhere."""
     arm = solve_arm(told, moved_m)
     if arm is None:
@@ -214,7 +220,9 @@ def lag_of(told: Sequence[ArmEvidence | None], moved_m: Floats) -> tuple[float, 
     return (lag_s, std_s) if abs(lag_s) > max(_SURELY_LATE * std_s, _LATE_S) else None
 
 
-def antenna_doubt(arm: Arm | None, tilt: Tilt | None, lever_arm_m: tuple[float, float, float]) -> Floats | None:
+def estimate_antenna_uncertainty(
+    arm: Arm | None, tilt: Tilt | None, lever_arm_m: tuple[float, float, float]
+) -> Floats | None:
     """Return the covariance of the arm that what was mended leaves [m²], shape (3, 3): a tilted IMU moves an antenna above it.
 
     A mounting that was not mended is as it is stated.
@@ -228,48 +236,48 @@ def antenna_doubt(arm: Arm | None, tilt: Tilt | None, lever_arm_m: tuple[float, 
     return covariance
 
 
-def unknown_arm() -> Arm:
+def make_unknown_arm() -> Arm:
     """Return what is known of an arm of which nothing tells."""
     return Arm(np.zeros(4), np.diag(np.square([ARM_STD_M] * 3 + [0.0])))
 
 
-def tilt_evidence(found: Trajectory, m: Measurements) -> TiltEvidence | None:
+def collect_tilt_evidence(found: Trajectory, m: Measurements) -> TiltEvidence | None:
     """Return what one stretch tells of the IMU's roll and pitch; None without fixes, which tell the slope, or a usable IMU."""
     if m.imu is None or m.gnss is None or not m.imu.accelerometer_usable or found.stamp_ns.size < _FEWEST:
         return None
     zero = int(found.stamp_ns[0])
-    row_s, imu_s = seconds(found.stamp_ns, zero), seconds(m.imu.stamp_ns, zero)
-    felt = interval_means(imu_s, m.imu.specific_force_mps2[:, :1], row_s[:-1], row_s[1:])[:, 0]
-    rate = interval_means(imu_s, m.imu.angular_velocity_radps[:, 1:], row_s[:-1], row_s[1:])
+    row_s, imu_s = compute_seconds(found.stamp_ns, zero), compute_seconds(m.imu.stamp_ns, zero)
+    felt = compute_interval_means(imu_s, m.imu.specific_force_mps2[:, :1], row_s[:-1], row_s[1:])[:, 0]
+    rate = compute_interval_means(imu_s, m.imu.angular_velocity_radps[:, 1:], row_s[:-1], row_s[1:])
     velocity = (found.velocity_enu_mps[1:] + found.velocity_enu_mps[:-1]) / 2.0
     speed = np.linalg.norm(velocity, axis=1)
     ahead = np.sum(matrix_from_quat(found.quat_xyzw)[:-1, :, 0] * velocity, axis=1)
     quicker = np.diff(np.sign(ahead.mean()) * np.linalg.norm(found.velocity_enu_mps, axis=1)) / np.diff(row_s)
-    climb, known = _climb_mps(m.gnss, found.stamp_ns)
+    climb, known = _compute_climb_mps(m.gnss, found.stamp_ns)
     moving = known & (speed > _MOVES_MPS) & (np.sign(ahead) == np.sign(ahead.mean()))
     rise = np.sign(ahead) * climb / np.maximum(speed, _MOVES_MPS)
     beyond = np.where(moving, (felt - quicker) / _GRAVITY_MPS2 - rise, 0.0)
     rate = rate - np.median(rate, axis=0)
     rate[np.abs(rate[:, 1]) < _TURNS_RADPS] = 0.0
-    block = max(1, round(_BLOCK_S * 1e9 / median_period_ns(found.stamp_ns)))
+    block = max(1, round(_BLOCK_S * 1e9 / compute_median_period_ns(found.stamp_ns)))
     first = np.arange(0, row_s.size - 1, block)
     sums = (rate[:, 1] ** 2, rate[:, 0] * rate[:, 1], moving.astype(np.float64), beyond)
     return TiltEvidence(*(np.add.reduceat(values, first) for values in sums))
 
 
-def _climb_mps(gnss: Positions, stamp_ns: NDArray[np.int64]) -> tuple[Floats, NDArray[np.bool_]]:
+def _compute_climb_mps(gnss: Positions, stamp_ns: NDArray[np.int64]) -> tuple[Floats, NDArray[np.bool_]]:
     """Return how fast the fixes climb in each row's interval, wild ones bridged, and where they tell it, shape (N - 1,).
 
     The track would not do: an IMU that is surely pitched may have led it off the fixes.
     """
     zero, reach_ns = int(stamp_ns[0]), int(_CLIMB_S * 0.5e9)
-    height = median_of_five(gnss.position_enu_m[:, 2])
+    height = compute_median_of_five(gnss.position_enu_m[:, 2])
     before, after = stamp_ns[:-1] - reach_ns, stamp_ns[1:] + reach_ns
-    fix_s = seconds(gnss.stamp_ns, zero)
-    low, high = (np.interp(seconds(at_ns, zero), fix_s, height) for at_ns in (before, after))
-    longest_ns = max(int(_CLIMB_S * 1e9), 3 * median_period_ns(gnss.stamp_ns))
+    fix_s = compute_seconds(gnss.stamp_ns, zero)
+    low, high = (np.interp(compute_seconds(at_ns, zero), fix_s, height) for at_ns in (before, after))
+    longest_ns = max(int(_CLIMB_S * 1e9), 3 * compute_median_period_ns(gnss.stamp_ns))
     inside = (before >= gnss.stamp_ns[0]) & (after <= gnss.stamp_ns[-1])
-    known = inside & ~in_gap(gnss.stamp_ns, before, after, longest_ns=longest_ns)
+    known = inside & ~is_in_gap(gnss.stamp_ns, before, after, longest_ns=longest_ns)
     return (high - low) / ((after - before) * 1e-9), known
 
 
@@ -284,11 +292,11 @@ def solve_tilt(told: Sequence[TiltEvidence | None]) -> Tilt | None:
     turning, beside, moving, felt = (
         np.concatenate([getattr(e, name) for e in evidence]) for name in TiltEvidence.__slots__
     )
-    (roll, roll_std), (pitch, pitch_std) = _ratio(beside, turning), _ratio(-felt, moving)
+    (roll, roll_std), (pitch, pitch_std) = _estimate_ratio(beside, turning), _estimate_ratio(-felt, moving)
     return Tilt(np.array([roll, pitch]), np.array([roll_std, np.hypot(pitch_std, _LEAST_TILT_STD_RAD)]))
 
 
-def _ratio(above: Floats, below: Floats) -> tuple[float, float]:
+def _estimate_ratio(above: Floats, below: Floats) -> tuple[float, float]:
     """Return the ratio of two sums over blocks, and its deviation by the scatter of the blocks.
 
     Where fewer than three blocks tell it, what is stated stays.
@@ -301,24 +309,24 @@ def _ratio(above: Floats, below: Floats) -> tuple[float, float]:
     return value, std
 
 
-def levelled(imu: InertialMeasurements, tilt_rad: Floats) -> InertialMeasurements:
+def level_imu(imu: InertialMeasurements, tilt_rad: Floats) -> InertialMeasurements:
     """Return the measurements of an IMU whose roll and pitch against the robot are taken out."""
     base_from_unit = quat_from_rpy(float(tilt_rad[0]), float(tilt_rad[1]), 0.0)
     return replace(
         imu,
         angular_velocity_radps=rotate(base_from_unit, imu.angular_velocity_radps),
         specific_force_mps2=rotate(base_from_unit, imu.specific_force_mps2),
-        quat_xyzw=product(imu.quat_xyzw, inverse(base_from_unit)),
+        quat_xyzw=multiply(imu.quat_xyzw, invert(base_from_unit)),
     )
 
 
-def rearmed(gnss: Positions, error_m: Floats) -> Positions:
+def move_antenna(gnss: Positions, error_m: Floats) -> Positions:
     """Return the fixes of an antenna whose place in base_link is mended."""
     x, y, z = (np.asarray(gnss.lever_arm_m) + error_m).tolist()
     return replace(gnss, lever_arm_m=(x, y, z))
 
 
-def with_antenna_doubt(found: Trajectory, covariance_m2: Floats, gnss: Positions) -> Trajectory:
+def add_antenna_uncertainty(found: Trajectory, covariance_m2: Floats, gnss: Positions) -> Trajectory:
     """Return the trajectory with what is not known of the arm: it turns with the robot, so that ways and speeds err where it turns.
 
     They err as far as the fixes tell them: a metre that odometry tells, between fixes of a metre, knows nothing of the arm.
@@ -327,8 +335,8 @@ def with_antenna_doubt(found: Trajectory, covariance_m2: Floats, gnss: Positions
     doubt_m2 = np.einsum("kij,jl,kil->ki", rotation, covariance_m2, rotation)
     ahead = np.column_stack((np.zeros(rate.shape[0]), -rate[:, 2], rate[:, 1]))  # of w x l
     speed_m2ps2 = np.einsum("ki,ij,kj->k", ahead, covariance_m2, ahead)
-    share = _share_of_fixes(found, gnss)
-    swung_m = share * _swung_std_m(found, rotation, covariance_m2)
+    share = _compute_share_of_fixes(found, gnss)
+    swung_m = share * _compute_swing_std_m(found, rotation, covariance_m2)
     return replace(
         found,
         position_std_m=np.sqrt(found.position_std_m**2 + doubt_m2),
@@ -337,20 +345,20 @@ def with_antenna_doubt(found: Trajectory, covariance_m2: Floats, gnss: Positions
     )
 
 
-def _share_of_fixes(found: Trajectory, gnss: Positions) -> Floats:
+def _compute_share_of_fixes(found: Trajectory, gnss: Positions) -> Floats:
     """Return how much of what is known of each displacement the fixes may tell, shape (N, 4), at most 1.
 
     Those within half a minute, for so long odometry holds, tell it to no less than 2 var / number [m²].
     """
-    count = max(1.0, _HELD_S * 1e9 / median_period_ns(gnss.stamp_ns))
+    count = max(1.0, _HELD_S * 1e9 / compute_median_period_ns(gnss.stamp_ns))
     alone_m2 = 2.0 * float(np.median(gnss.variance_m2[:, :2])) / count
     return np.asarray(np.minimum(1.0, np.nan_to_num(found.displacement_std_m, nan=np.inf) ** 2 / alone_m2))
 
 
-def _swung_std_m(found: Trajectory, rotation: Floats, covariance_m2: Floats) -> Floats:
+def _compute_swing_std_m(found: Trajectory, rotation: Floats, covariance_m2: Floats) -> Floats:
     """Return how far an arm's error goes round along the robot's way within each of `DISPLACEMENT_LAGS_S` [m], shape (N, 4)."""
     swung_m2 = np.zeros((rotation.shape[0], len(DISPLACEMENT_LAGS_S)))
-    period_s = median_period_ns(found.stamp_ns) * 1e-9
+    period_s = compute_median_period_ns(found.stamp_ns) * 1e-9
     for column, lag_s in enumerate(DISPLACEMENT_LAGS_S):
         rows = round(lag_s / period_s)
         if not 0 < rows < rotation.shape[0]:

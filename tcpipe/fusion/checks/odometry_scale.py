@@ -15,7 +15,13 @@ from numpy.typing import NDArray
 
 from tcpipe.fusion.measurements import VISUAL, WHEELS, BodyVelocities, Measurements
 from tcpipe.fusion.process import VISUAL_SCALE_STD, WHEEL_SCALE_STD
-from tcpipe.fusion.signals import hold_last, in_gap, interval_means, median_period_ns, seconds
+from tcpipe.fusion.signals import (
+    compute_interval_means,
+    compute_median_period_ns,
+    compute_seconds,
+    hold_last,
+    is_in_gap,
+)
 from tcpipe.fusion.trajectory import Trajectory
 from tcpipe.geometry.rotation import matrix_from_quat
 
@@ -25,7 +31,7 @@ _WINDOW_NS = 5_000_000_000
 _MAX_GAP_NS = 500_000_000
 _MOVES_M = 1.5
 _FEWEST_WINDOWS = 8
-_SURELY = 2.0
+_MIN_SIGNIFICANCE_SIGMA = 2.0
 _ALIKE = 0.25
 _HELD_NS = 3_000_000_000
 _STEP_MPS = 0.1
@@ -50,19 +56,19 @@ class Scale:
         return self if before is None else Scale(before.factor * self.factor, before.factor * self.std, before.driven_m)
 
 
-def way_ratios(found: Trajectory, m: Measurements) -> Mapping[str, Floats]:
+def distance_ratios(found: Trajectory, m: Measurements) -> Mapping[str, Floats]:
     """Return by odometry how many times as far as the track it goes in each window that tells, where something else tells the scale."""
     measures = (m.gnss is not None) + (m.visual is not None)
     told = {WHEELS: measures > 0, VISUAL: m.gnss is not None}
-    return {role: _ratios(found, source) for role, source in m.odometries().items() if told[role]}
+    return {role: _compute_ratios(found, source) for role, source in m.odometries().items() if told[role]}
 
 
-def _ratios(found: Trajectory, source: BodyVelocities) -> Floats:
+def _compute_ratios(found: Trajectory, source: BodyVelocities) -> Floats:
     begin_ns = np.arange(found.stamp_ns[0], found.stamp_ns[-1] - _WINDOW_NS, _WINDOW_NS, dtype=np.int64)
     end_ns = begin_ns + _WINDOW_NS
-    longest_ns = max(_MAX_GAP_NS, 3 * median_period_ns(source.stamp_ns))
-    whole = ~in_gap(source.stamp_ns, begin_ns, end_ns, longest_ns=longest_ns)
-    whole &= ~in_gap(found.stamp_ns, begin_ns, end_ns, longest_ns=_MAX_GAP_NS)
+    longest_ns = max(_MAX_GAP_NS, 3 * compute_median_period_ns(source.stamp_ns))
+    whole = ~is_in_gap(source.stamp_ns, begin_ns, end_ns, longest_ns=longest_ns)
+    whole &= ~is_in_gap(found.stamp_ns, begin_ns, end_ns, longest_ns=_MAX_GAP_NS)
     begin_ns, end_ns = begin_ns[whole], end_ns[whole]
     point = found.velocity_enu_mps + np.einsum(
         "kij,kj->ki",
@@ -73,8 +79,11 @@ def _ratios(found: Trajectory, source: BodyVelocities) -> Floats:
     zero = int(found.stamp_ns[0])
 
     def ways_m(stamp_ns: NDArray[np.int64], speed_mps: Floats) -> Floats:
-        means = interval_means(
-            seconds(stamp_ns, zero), speed_mps[:, None], seconds(begin_ns, zero), seconds(end_ns, zero)
+        means = compute_interval_means(
+            compute_seconds(stamp_ns, zero),
+            speed_mps[:, None],
+            compute_seconds(begin_ns, zero),
+            compute_seconds(end_ns, zero),
         )
         return np.asarray(means[:, 0] * _WINDOW_NS * 1e-9)
 
@@ -93,27 +102,27 @@ def solve_scales(told: Sequence[Mapping[str, Floats]]) -> Mapping[str, Scale]:
         factor = float(np.median(ratios))
         spread = 1.4826 * float(np.median(np.abs(ratios - factor)))
         off = abs(factor - 1.0)
-        if factor > 0.0 and off > _SURELY * _SCALE_STD[role] and spread < _ALIKE * off:
+        if factor > 0.0 and off > _MIN_SIGNIFICANCE_SIGMA * _SCALE_STD[role] and spread < _ALIKE * off:
             found[role] = Scale(factor, spread / float(np.sqrt(ratios.size)))
     return found
 
 
-def rescaled(source: BodyVelocities, factor: float) -> BodyVelocities:
+def rescale_odometry(source: BodyVelocities, factor: float) -> BodyVelocities:
     """Return an odometry that goes ``factor`` times too far with its velocities as they should be; its claim does not become better."""
     variance = source.variance_m2ps2 * max(1.0, factor**-2.0)
     return replace(source, velocity_mps=source.velocity_mps / factor, variance_m2ps2=variance)
 
 
-def rescaled_odometries(m: Measurements, scales: Mapping[str, Scale]) -> Measurements:
-    """Return measurements with the odometries of which a scale is known `rescaled`."""
+def rescale_odometries(m: Measurements, scales: Mapping[str, Scale]) -> Measurements:
+    """Return measurements with the odometries of which a scale is known `rescale_odometry`."""
 
     def in_metres(role: str, source: BodyVelocities | None) -> BodyVelocities | None:
-        return source if source is None or role not in scales else rescaled(source, scales[role].factor)
+        return source if source is None or role not in scales else rescale_odometry(source, scales[role].factor)
 
     return replace(m, wheels=in_metres(WHEELS, m.wheels), visual=in_metres(VISUAL, m.visual))
 
 
-def over_command(wheels: BodyVelocities, command_ns: NDArray[np.int64], commanded_mps: Floats) -> float | None:
+def compute_command_ratio(wheels: BodyVelocities, command_ns: NDArray[np.int64], commanded_mps: Floats) -> float | None:
     """Return how many times as fast as it is told to a robot goes by its wheels, where that is surely too fast; None where it is not.
 
     Only times count in which a command has stood for three seconds: a robot that brakes is faster than its command.
@@ -130,7 +139,7 @@ def over_command(wheels: BodyVelocities, command_ns: NDArray[np.int64], commande
     since_ns = wheels.stamp_ns - wheels.stamp_ns[changed[np.maximum(last, 0)] if changed.size else np.zeros_like(last)]
     since_ns = np.where(last >= 0, since_ns, wheels.stamp_ns - wheels.stamp_ns[0])
     rows = (since_ns > _HELD_NS) & (np.abs(told) > _DRIVES_MPS) & np.isfinite(told)
-    if rows.sum() * median_period_ns(wheels.stamp_ns) < _FEWEST_WINDOWS * _WINDOW_NS:
+    if rows.sum() * compute_median_period_ns(wheels.stamp_ns) < _FEWEST_WINDOWS * _WINDOW_NS:
         return None
     ratio = wheels.velocity_mps[rows, 0] / told[rows]
     return float(np.median(ratio)) if np.quantile(ratio, 0.25) > _FASTER else None

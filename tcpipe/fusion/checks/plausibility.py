@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.fusion.checks.lags import GRID_S, Floats, averaged, find_lag
+from tcpipe.fusion.checks.lags import GRID_S, Floats, compute_moving_mean, find_lag
 from tcpipe.geometry.rotation import matrix_from_quat, quat_from_rotation_vector
 
 _MIN_EXPLAINED = 0.5
@@ -36,7 +36,7 @@ class YawAxis:
     late_s: float
 
 
-def yaw_axis(yaw_rate_radps: Floats, rate: Floats) -> YawAxis | None:
+def find_yaw_axis(yaw_rate_radps: Floats, rate: Floats) -> YawAxis | None:
     """Return the axis of a gyroscope about which the robot yaws, or None where its rates do not explain the yaw rate.
 
     Parameters
@@ -47,14 +47,14 @@ def yaw_axis(yaw_rate_radps: Floats, rate: Floats) -> YawAxis | None:
     lag = find_lag(yaw_rate_radps, rate)
     if lag is None or lag.explained < _MIN_EXPLAINED:
         return None
-    target, axes = _known(yaw_rate_radps, _later(rate, lag.offset_s))
+    target, axes = _select_known(yaw_rate_radps, _shift_later(rate, lag.offset_s))
     solved = np.linalg.lstsq(np.column_stack((axes, np.ones(target.size))), target, rcond=None)
     coefficients: Floats = solved[0][:3].astype(np.float64)
     scale = float(np.linalg.norm(coefficients))
     return YawAxis(np.divide(coefficients, scale), scale, lag.offset_s) if scale > 0 else None
 
 
-def up_axis(force: Floats) -> Floats:
+def find_up_axis(force: Floats) -> Floats:
     """Return the direction of the mean specific force (N, 3), shape (3,); of none at all that is z."""
     size = np.linalg.norm(force, axis=1, keepdims=True)
     mean: Floats = np.mean(np.divide(force, size, out=np.zeros_like(force), where=size > 0), axis=0)
@@ -62,7 +62,7 @@ def up_axis(force: Floats) -> Floats:
     return mean / length if length > 0 else np.array([0.0, 0.0, 1.0])
 
 
-def levelling(up: Floats) -> Floats:
+def compute_levelling_rotation(up: Floats) -> Floats:
     """Return the smallest rotation, as a matrix (3, 3), that turns a unit vector to +z."""
     cross = np.cross(up, [0.0, 0.0, 1.0])
     size = float(np.linalg.norm(cross))
@@ -72,7 +72,7 @@ def levelling(up: Floats) -> Floats:
     return matrix
 
 
-def forward_yaw_rad(twist: Floats, level_force_mps2: Floats, late_s: float) -> tuple[float, float] | None:
+def find_forward_yaw_rad(twist: Floats, level_force_mps2: Floats, late_s: float) -> tuple[float, float] | None:
     """Return the yaw of a levelled IMU in base_link [rad] and its standard deviation, or None where acceleration does not show it.
 
     Parameters
@@ -86,11 +86,11 @@ def forward_yaw_rad(twist: Floats, level_force_mps2: Floats, late_s: float) -> t
     In base_link a = dv/dt forward and v w to the left; the unit feels a turned by minus its yaw. With both as complex numbers the yaw is
     the angle of the sum of a times the conjugate of what is felt (the plane case of Wahba's problem, 1965).
     """
-    smooth = averaged(twist, _SMOOTH_S)
+    smooth = compute_moving_mean(twist, _SMOOTH_S)
     driven = np.gradient(smooth[:, 0], GRID_S) + 1j * smooth[:, 0] * smooth[:, 1]
-    level = averaged(_later(level_force_mps2[:, :2], late_s), _SMOOTH_S)
-    level = level - averaged(level, _SLOW_S)
-    slow = averaged(np.column_stack((driven.real, driven.imag)), _SLOW_S)
+    level = compute_moving_mean(_shift_later(level_force_mps2[:, :2], late_s), _SMOOTH_S)
+    level = level - compute_moving_mean(level, _SLOW_S)
+    slow = compute_moving_mean(np.column_stack((driven.real, driven.imag)), _SLOW_S)
     driven = driven - (slow[:, 0] + 1j * slow[:, 1])
     felt = level[:, 0] + 1j * level[:, 1]
     known = np.isfinite(driven) & np.isfinite(felt)
@@ -106,7 +106,7 @@ def forward_yaw_rad(twist: Floats, level_force_mps2: Floats, late_s: float) -> t
     return (yaw, std) if coherence > _MIN_COHERENCE and std < _SURE_RAD else None
 
 
-def nearest_mounting(base_from_sensor: Floats) -> Floats:
+def find_nearest_mounting(base_from_sensor: Floats) -> Floats:
     """Return the rotation (3, 3) with axes along axes that is nearest, or the given one where none is near."""
     largest = np.argmax(np.abs(base_from_sensor), axis=1)
     aligned = np.zeros((3, 3))
@@ -117,7 +117,7 @@ def nearest_mounting(base_from_sensor: Floats) -> Floats:
     return aligned if angle < _AXIS_ALIGNED_RAD else base_from_sensor
 
 
-def agreement(velocity_mps: Floats, other_mps: Floats) -> float | None:
+def compute_agreement(velocity_mps: Floats, other_mps: Floats) -> float | None:
     """Return by how much two signed velocities go the same way, -1 to 1, or None where one of them hardly moves; shape (M,) each."""
     moving = (np.abs(velocity_mps) > _MOVING_MPS) & (np.abs(other_mps) > _MOVING_MPS)
     if moving.sum() < _FEWEST_ROWS:
@@ -125,7 +125,7 @@ def agreement(velocity_mps: Floats, other_mps: Floats) -> float | None:
     return float(np.mean(np.sign(velocity_mps[moving] * other_mps[moving])))
 
 
-def _later(values: Floats, late_s: float) -> Floats:
+def _shift_later(values: Floats, late_s: float) -> Floats:
     """Return values moved to ``late_s`` later on the grid, NaN where they came from outside."""
     rows = round(late_s / GRID_S)
     moved = np.full_like(values, np.nan)
@@ -136,6 +136,6 @@ def _later(values: Floats, late_s: float) -> Floats:
     return moved
 
 
-def _known(target: Floats, regressors: Floats) -> tuple[Floats, Floats]:
+def _select_known(target: Floats, regressors: Floats) -> tuple[Floats, Floats]:
     known: NDArray[np.bool_] = np.isfinite(target) & np.isfinite(regressors.sum(1))
     return target[known], regressors[known]

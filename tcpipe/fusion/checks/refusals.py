@@ -12,7 +12,7 @@ from tcpipe.fusion.measurements import GNSS
 
 
 @dataclass(frozen=True, slots=True)
-class Refusal:
+class SensorExclusion:
     """A sensor that is not to be fused.
 
     Attributes
@@ -35,11 +35,11 @@ class Refusal:
     is_suspect_excludable: bool = False
 
 
-def refuse_fixes(code: str, odometries: Collection[str], names: Mapping[str, str] | None = None) -> Refusal:
+def refuse_fixes(code: str, odometries: Collection[str], names: Mapping[str, str] | None = None) -> SensorExclusion:
     """Return the refusal of fixes that odometries contradict; a single odometry is suspect, whoever confirms how it turns."""
     if len(odometries) != 1:
-        return Refusal(GNSS, code, names or {})
-    return Refusal(GNSS, code, {**(names or {}), "suspect": next(iter(odometries))}, is_suspect_excludable=True)
+        return SensorExclusion(GNSS, code, names or {})
+    return SensorExclusion(GNSS, code, {**(names or {}), "suspect": next(iter(odometries))}, is_suspect_excludable=True)
 
 
 def join_names(roles: Collection[str]) -> str:

@@ -13,25 +13,37 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.fusion.checks.distances import COMMAND, Distances, contradictions, far_scale, find_distances, path_of_fixes
-from tcpipe.fusion.checks.frozen import frozen_sensors
-from tcpipe.fusion.checks.gridded_motion import course_rate, fix_velocity, on_grid, twist_on_grid
-from tcpipe.fusion.checks.lags import GRID_S, Floats, averaged
+from tcpipe.fusion.checks.distances import (
+    COMMAND,
+    Distances,
+    compare_path_of_fixes,
+    estimate_far_scale,
+    find_contradictions,
+    find_distances,
+)
+from tcpipe.fusion.checks.frozen import find_frozen_sensors
+from tcpipe.fusion.checks.lags import GRID_S, Floats, compute_moving_mean
 from tcpipe.fusion.checks.odometry_scale import Scale
 from tcpipe.fusion.checks.plausibility import (
     YawAxis,
-    agreement,
-    forward_yaw_rad,
-    levelling,
-    nearest_mounting,
-    up_axis,
-    yaw_axis,
+    compute_agreement,
+    compute_levelling_rotation,
+    find_forward_yaw_rad,
+    find_nearest_mounting,
+    find_up_axis,
+    find_yaw_axis,
 )
-from tcpipe.fusion.checks.refusals import Refusal, join_names, refuse_fixes
-from tcpipe.fusion.checks.windows import liveliest_ns
+from tcpipe.fusion.checks.refusals import SensorExclusion, join_names, refuse_fixes
+from tcpipe.fusion.checks.resampled_motion import (
+    compute_course_rate,
+    compute_fix_velocity,
+    resample_signal,
+    resample_twist,
+)
+from tcpipe.fusion.checks.windows import find_liveliest_window_ns
 from tcpipe.fusion.measurements import GNSS, IMU, VISUAL, WHEELS, InertialMeasurements, Measurements, Positions
 from tcpipe.fusion.signals import hold_last
-from tcpipe.tables.facts import AxisFacts, SensorChecks, vector
+from tcpipe.tables.facts import AxisFacts, SensorChecks, make_vector
 
 _SMOOTH_S = 0.1
 _IN_G = (0.8, 1.25)
@@ -55,7 +67,7 @@ YAW = np.diag([1.0, -1.0, -1.0])
 class Checks:
     """What was found: refusals in order, the scale of an odometry that is far off throughout, and the figures they rest on."""
 
-    refusals: list[Refusal] = field(default_factory=list)
+    refusals: list[SensorExclusion] = field(default_factory=list)
     scales: dict[str, Scale] = field(default_factory=dict)
     facts: SensorChecks = field(default_factory=SensorChecks)
 
@@ -90,56 +102,56 @@ def check_sensors(
     if slow is not None:
         checks.refusals.append(slow)
         measurements = replace(measurements, imu=None)
-    at_ns = liveliest_ns(measurements)
+    at_ns = find_liveliest_window_ns(measurements)
     if at_ns is None:
         return checks
-    twists = {role: twist_on_grid(source, at_ns) for role, source in measurements.odometries().items()}
+    twists = {role: resample_twist(source, at_ns) for role, source in measurements.odometries().items()}
     if measurements.gnss is not None:
-        checks.scales = _far_scale(measurements.gnss, twists, command, at_ns)
+        checks.scales = _estimate_scales(measurements.gnss, twists, command, at_ns)
         twists |= {role: twists[role] / [scale.factor, 1.0] for role, scale in checks.scales.items()}
-    found = find_distances(measurements.gnss, _with_command(twists, command, at_ns), at_ns)
-    frozen = frozen_sensors(measurements, found)
+    found = find_distances(measurements.gnss, _add_command(twists, command, at_ns), at_ns)
+    frozen = find_frozen_sensors(measurements, found)
     checks.refusals += frozen.values()
     twists = {role: twist for role, twist in twists.items() if role not in frozen}
     gnss = None if GNSS in frozen else measurements.gnss
-    turning = {role: averaged(twist, _SMOOTH_S)[:, 1] for role, twist in twists.items()}
+    turning = {role: compute_moving_mean(twist, _SMOOTH_S)[:, 1] for role, twist in twists.items()}
     if gnss is not None:
-        turning[GNSS] = course_rate(fix_velocity(gnss, at_ns))
+        turning[GNSS] = compute_course_rate(compute_fix_velocity(gnss, at_ns))
     looks: dict[str, float] = {}
     if measurements.imu is not None and IMU not in frozen:
         looks = _check_imu(checks, measurements.imu, at_ns, felt, twists=twists, turning=turning, stated=stated)
     _check_directions(checks, twists, at_ns, command=command, looks=looks, stated=stated)
     _check_distances(checks, found.without(frozen))
     if gnss is not None:
-        _check_path(checks, gnss, _turning_as_felt(checks, twists, measurements.imu, at_ns), at_ns)
+        _check_path(checks, gnss, _replace_yaw_rate(checks, twists, measurements.imu, at_ns), at_ns)
     return checks
 
 
-def _refuse_slow(imu: InertialMeasurements) -> Refusal | None:
+def _refuse_slow(imu: InertialMeasurements) -> SensorExclusion | None:
     """Return the refusal of an IMU whose samples are, for most of its time, too far apart to tell the motion between them."""
     step_s = np.diff(imu.stamp_ns) * 1e-9
     span_s = float(step_s.sum())
     if span_s > 0 and float(step_s[step_s < _LONGEST_IMU_STEP_S].sum()) >= _MOSTLY * span_s:
         return None
-    return Refusal(IMU, "imu-too-slow", numbers={"rate_hz": step_s.size / max(span_s, 1.0)})
+    return SensorExclusion(IMU, "imu-too-slow", numbers={"rate_hz": step_s.size / max(span_s, 1.0)})
 
 
-def _far_scale(
+def _estimate_scales(
     gnss: Positions, twists: Mapping[str, Floats], command: CommandedSpeed | None, at_ns: NDArray[np.int64]
 ) -> dict[str, Scale]:
     """Return the scale of the only odometry, by role, where its path is that of the fixes but far longer or shorter.
 
-    A second odometry decides which of them errs (`contradictions`); a command at which the robot goes by the odometry confirms that.
+    A second odometry decides which of them errs (`find_contradictions`); a command at which the robot goes by the odometry confirms that.
     """
     if len(twists) != 1:
         return {}
     (role,) = twists
-    scale = far_scale(gnss, twists[role], at_ns)
+    scale = estimate_far_scale(gnss, twists[role], at_ns)
     if scale is None:
         return {}
     driven_m = {
         name: float(np.nansum(np.abs(twist[:, 0]))) * GRID_S
-        for name, twist in _with_command(twists, command, at_ns).items()
+        for name, twist in _add_command(twists, command, at_ns).items()
     }
     told_m = driven_m.get(COMMAND, 0.0)
     if told_m and abs(np.log(told_m / driven_m[role])) < abs(np.log(scale[0])) / 2:
@@ -147,7 +159,7 @@ def _far_scale(
     return {role: Scale(*scale, driven_m=driven_m[role])}
 
 
-def _with_command(
+def _add_command(
     twists: Mapping[str, Floats], command: CommandedSpeed | None, at_ns: NDArray[np.int64]
 ) -> dict[str, Floats]:
     """Return the twists and, under `COMMAND`, the commanded speed with the yaw rate that an odometry tells."""
@@ -163,17 +175,17 @@ def _check_distances(checks: Checks, found: Distances) -> None:
     far_m = {role: float(np.nanmedian(chord)) for role, chord in found.chord_m.items() if np.isfinite(chord).any()}
     checks.facts = replace(checks.facts, distance_m=far_m)
     refused = {refusal.role for refusal in checks.refusals}
-    checks.refusals += [of for role, of in contradictions(found, turning=turning).items() if role not in refused]
+    checks.refusals += [of for role, of in find_contradictions(found, turning=turning).items() if role not in refused]
 
 
-def _turning_as_felt(
+def _replace_yaw_rate(
     checks: Checks, twists: Mapping[str, Floats], imu: InertialMeasurements | None, at_ns: NDArray[np.int64]
 ) -> dict[str, Floats]:
     """Return the twists with the yaw rate of the gyroscope where it confirms theirs: wheels that skid turn by too much."""
     confirmed = {role for role, axis in checks.yaw_axis.items() if axis.axis[2] > -_OTHER_WAY}
     if imu is None or any(refusal.role == IMU for refusal in checks.refusals):
         return dict(twists)
-    felt = on_grid(imu.stamp_ns, imu.angular_velocity_radps, at_ns)[:, 2]
+    felt = resample_signal(imu.stamp_ns, imu.angular_velocity_radps, at_ns)[:, 2]
     return {
         role: np.column_stack((twist[:, 0], np.where(np.isfinite(felt), felt, twist[:, 1])))
         if role in confirmed
@@ -185,7 +197,7 @@ def _turning_as_felt(
 def _check_path(checks: Checks, gnss: Positions, twists: Mapping[str, Floats], at_ns: NDArray[np.int64]) -> None:
     """Check that the fixes go the way the odometries do; one odometry that no gyroscope confirms is as doubtful as they are."""
     refused = {refusal.role for refusal in checks.refusals}
-    told = {role: path_of_fixes(gnss, twist, at_ns) for role, twist in twists.items() if role not in refused}
+    told = {role: compare_path_of_fixes(gnss, twist, at_ns) for role, twist in twists.items() if role not in refused}
     against = [role for role, how in told.items() if how in {"mirrored", "unlike"}]
     if GNSS in refused or not against or "alike" in told.values():
         return
@@ -195,11 +207,11 @@ def _check_path(checks: Checks, gnss: Positions, twists: Mapping[str, Floats], a
         if confirmed:
             checks.refusals.append(refuse_fixes("path-unlike", told, names))
     elif confirmed:
-        checks.refusals.append(Refusal(GNSS, "path-mirrored", names))
+        checks.refusals.append(SensorExclusion(GNSS, "path-mirrored", names))
     else:
-        checks.refusals.append(Refusal(GNSS, "path-mirrored", {**names, "suspect": against[0]}))
+        checks.refusals.append(SensorExclusion(GNSS, "path-mirrored", {**names, "suspect": against[0]}))
         names = {"reference": GNSS, "suspect": GNSS}
-        checks.refusals.append(Refusal(against[0], "yaw-rate-sign", names, turned_by=YAW))
+        checks.refusals.append(SensorExclusion(against[0], "yaw-rate-sign", names, turned_by=YAW))
 
 
 def _check_imu(
@@ -213,38 +225,40 @@ def _check_imu(
     stated: Mapping[str, bool],
 ) -> dict[str, float]:
     """Check units, gravity and yaw; return the yaw of the unit by each odometry [rad] where it is upright."""
-    rate = averaged(on_grid(imu.stamp_ns, imu.angular_velocity_radps, at_ns), _SMOOTH_S)
-    axes = {role: found for role, yaw in turning.items() if (found := yaw_axis(yaw, rate)) is not None}
-    up = up_axis(imu.specific_force_mps2)
-    told = {role: AxisFacts(vector(axis.axis), axis.scale) for role, axis in axes.items()}
-    checks.facts = replace(checks.facts, specific_force_median=felt, up=vector(up), yaw_axis=told)
-    units = _units(rate, axes, felt)
+    rate = compute_moving_mean(resample_signal(imu.stamp_ns, imu.angular_velocity_radps, at_ns), _SMOOTH_S)
+    axes = {role: found for role, yaw in turning.items() if (found := find_yaw_axis(yaw, rate)) is not None}
+    up = find_up_axis(imu.specific_force_mps2)
+    told = {role: AxisFacts(make_vector(axis.axis), axis.scale) for role, axis in axes.items()}
+    checks.facts = replace(checks.facts, specific_force_median=felt, up=make_vector(up), yaw_axis=told)
+    units = _find_units(rate, axes, felt)
     if units is not None:
         checks.refusals.append(
-            Refusal(IMU, "imu-units", {"units": units}, _unit_evidence(units, axes, rate, felt), units)
+            SensorExclusion(IMU, "imu-units", {"units": units}, _collect_unit_evidence(units, axes, rate, felt), units)
         )
         return {}
     if felt == 0.0:
-        checks.refusals.append(Refusal(IMU, "imu-no-acceleration"))
+        checks.refusals.append(SensorExclusion(IMU, "imu-no-acceleration"))
     if not _IN_MPS2[0] <= felt <= _IN_MPS2[1]:
         return {}
-    level = levelling(up)
-    force = on_grid(imu.stamp_ns, imu.specific_force_mps2 @ level.T, at_ns)
+    level = compute_levelling_rotation(up)
+    force = resample_signal(imu.stamp_ns, imu.specific_force_mps2 @ level.T, at_ns)
     late_s = {role: axis.late_s for role, axis in axes.items()}
-    ahead = {role: forward_yaw_rad(twist, force, late_s.get(role, 0.0)) for role, twist in twists.items()}
+    ahead = {role: find_forward_yaw_rad(twist, force, late_s.get(role, 0.0)) for role, twist in twists.items()}
     looks_rad = {role: yaw for role, yaw in ahead.items() if yaw is not None}
     checks.facts = replace(checks.facts, looks_rad=looks_rad or None)
     looks = {role: yaw for role, (yaw, _) in looks_rad.items()}
     if up[2] < np.cos(_TILTED_RAD):
         tilt = {"off_rad": float(np.arccos(up[2]))}
         checks.refusals.append(
-            Refusal(IMU, "imu-rotated", {"evidence": "gravity"}, tilt, turned_by=_upright(level, looks))
+            SensorExclusion(
+                IMU, "imu-rotated", {"evidence": "gravity"}, tilt, turned_by=_find_upright_rotation(level, looks)
+            )
         )
         return {}
     return _check_yaw_sign(checks, axes, looks, stated)
 
 
-def _units(rate: Floats, axes: Mapping[str, YawAxis], felt: float) -> str | None:
+def _find_units(rate: Floats, axes: Mapping[str, YawAxis], felt: float) -> str | None:
     """Return the recipe's word for the units an IMU seems to be in, or None where they are SI."""
     if axes:
         degrees = float(np.median([axis.scale for axis in axes.values()])) < _IN_DEGREES
@@ -255,7 +269,7 @@ def _units(rate: Floats, axes: Mapping[str, YawAxis], felt: float) -> str | None
     return "_".join(words) or None
 
 
-def _unit_evidence(units: str, axes: Mapping[str, YawAxis], rate: Floats, felt: float) -> dict[str, float]:
+def _collect_unit_evidence(units: str, axes: Mapping[str, YawAxis], rate: Floats, felt: float) -> dict[str, float]:
     """Return what shows the units: times the gyroscope turns as fast as another sensor (degrees: 57), or its fastest; median force."""
     evidence = {"force_median": felt} if "g" in units.split("_") else {}
     if "deg" in units and axes:
@@ -265,13 +279,13 @@ def _unit_evidence(units: str, axes: Mapping[str, YawAxis], rate: Floats, felt: 
     return evidence
 
 
-def _upright(level: Floats, looks: Mapping[str, float]) -> Floats:
+def _find_upright_rotation(level: Floats, looks: Mapping[str, float]) -> Floats:
     """Return the rotation that stands an IMU upright and, where acceleration shows it, looking ahead."""
     yaw = next(iter(looks.values()), 0.0)
-    return nearest_mounting(_about_z(yaw) @ level)
+    return find_nearest_mounting(_rotate_about_z(yaw) @ level)
 
 
-def _about_z(yaw_rad: float) -> Floats:
+def _rotate_about_z(yaw_rad: float) -> Floats:
     c, s = np.cos(yaw_rad), np.sin(yaw_rad)
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
@@ -287,9 +301,9 @@ def _check_yaw_sign(
         return looks
     if others or (len(against) == 1 and stated.get(IMU, False)):
         names = {"reference": join_names((IMU, *others))}
-        checks.refusals += [Refusal(role, "yaw-rate-sign", names, turned_by=YAW) for role in blamed]
+        checks.refusals += [SensorExclusion(role, "yaw-rate-sign", names, turned_by=YAW) for role in blamed]
         return looks
-    checks.refusals.append(Refusal(IMU, "imu-sign", {"reference": join_names(against)}))
+    checks.refusals.append(SensorExclusion(IMU, "imu-sign", {"reference": join_names(against)}))
     return {}
 
 
@@ -304,7 +318,7 @@ def _check_directions(
 ) -> None:
     """Check that the odometries go forward when the command or, without one, the accelerations say so."""
     forward = {role: twist[:, 0] for role, twist in twists.items()}
-    against = _against_command(forward, command, at_ns)
+    against = _check_against_command(forward, command, at_ns)
     if against:
         for role in (role for role, backwards in against.items() if backwards):
             _add_turned(checks, role, {"reference": COMMAND})
@@ -315,29 +329,29 @@ def _check_directions(
         return
     for role in backwards:
         _add_turned(checks, role, {"reference": IMU})
-    same = agreement(forward[WHEELS], forward[VISUAL]) if len(forward) > 1 and not looks else None
+    same = compute_agreement(forward[WHEELS], forward[VISUAL]) if len(forward) > 1 and not looks else None
     if same is not None and same < _OTHER_WAY:
         _add_turned(checks, VISUAL, {"reference": WHEELS, "suspect": WHEELS})
     aside = {role: yaw for role, yaw in looks.items() if _LOOKS_ELSEWHERE_RAD < abs(yaw) <= _BACKWARDS_RAD}
     if aside and len(aside) == len(looks):
-        checks.refusals.append(_refuse_yaw(aside, nearest_mounting(_about_z(next(iter(aside.values()))))))
+        checks.refusals.append(_refuse_yaw(aside, find_nearest_mounting(_rotate_about_z(next(iter(aside.values()))))))
 
 
-def _refuse_yaw(looks: Mapping[str, float], turned_by: Floats) -> Refusal:
+def _refuse_yaw(looks: Mapping[str, float], turned_by: Floats) -> SensorExclusion:
     """Return the refusal of an IMU that looks elsewhere by the accelerations of odometries, by yaw [rad]."""
     names = {"evidence": "acceleration", "reference": join_names(looks)}
     numbers = {"off_rad": next(iter(looks.values()))}
-    return Refusal(IMU, "imu-rotated", names, numbers, turned_by=turned_by)
+    return SensorExclusion(IMU, "imu-rotated", names, numbers, turned_by=turned_by)
 
 
-def _against_command(
+def _check_against_command(
     forward: Mapping[str, Floats], command: CommandedSpeed | None, at_ns: NDArray[np.int64]
 ) -> dict[str, bool]:
     """Return for each odometry that moves while a command stands whether it goes the other way."""
     if command is None:
         return {}
     wanted = hold_last(command.stamp_ns, command.forward_velocity_mps, at_ns)
-    same = {role: agreement(velocity, wanted) for role, velocity in forward.items()}
+    same = {role: compute_agreement(velocity, wanted) for role, velocity in forward.items()}
     return {role: value < _OTHER_WAY for role, value in same.items() if value is not None}
 
 
@@ -348,4 +362,4 @@ def _add_turned(checks: Checks, role: str, names: Mapping[str, str]) -> None:
     if before is not None and before.turned_by is not None:
         checks.refusals.remove(before)
         turned_by = FORWARD @ before.turned_by
-    checks.refusals.append(Refusal(role, "drives-backwards", names, turned_by=turned_by))
+    checks.refusals.append(SensorExclusion(role, "drives-backwards", names, turned_by=turned_by))

@@ -18,7 +18,7 @@ from tcpipe.formats.dataset_card import Covariate, RunSource
 from tcpipe.recipe import CovariateConfig
 from tcpipe.recipe.suggestions import suggest
 from tcpipe.robots.profiles import Robot
-from tcpipe.tables.columns import integers
+from tcpipe.tables.columns import to_integers
 from tcpipe.tables.findings import Finding, Subject, make_finding
 from tcpipe.tables.levels import SAMPLES
 
@@ -54,7 +54,7 @@ def read_all_covariates(paths: Sequence[Path], config: CovariateConfig) -> tuple
     return tuple(read_covariates(path, time_column=config.time_column, time_unit=config.time_unit) for path in paths)
 
 
-def added_columns(
+def make_added_columns(
     segments: pa.Table,
     kept: NDArray[np.int64],
     runs: Sequence[RunSource],
@@ -77,10 +77,10 @@ def added_columns(
     ------
     DatasetError : two columns would have one name.
     """
-    table, findings = _tags(segments.column("run_id"), runs)
+    table, findings = _make_tag_columns(segments.column("run_id"), runs)
     told = list[Covariate]()
     for covariates in tables:
-        found, reached = covariates.join(integers(segments, "start_ns"), max_age_s=config.max_age_s)
+        found, reached = covariates.join(to_integers(segments, "start_ns"), max_age_s=config.max_age_s)
         without = {name: int(found.column(name).take(pa.array(kept)).null_count) for name in found.column_names}
         told.append(
             Covariate(
@@ -114,7 +114,7 @@ def _find_missing(told: Covariate, unreached: int, samples: int) -> list[Finding
     ]
 
 
-def _tags(run_ids: pa.ChunkedArray, runs: Sequence[RunSource]) -> tuple[pa.Table, list[Finding]]:
+def _make_tag_columns(run_ids: pa.ChunkedArray, runs: Sequence[RunSource]) -> tuple[pa.Table, list[Finding]]:
     """Return a column a tag: numbers where every run that carries it has one, else text; null for runs without it."""
     tags = {run.run_id: run.tags or {} for run in runs}
     place = pc.index_in(run_ids, value_set=pa.array(list(tags), pa.string()))

@@ -13,27 +13,27 @@ from pyproj import CRS
 from shapely.geometry.base import BaseGeometry
 from shapely.geometry.polygon import orient
 
-from tcpipe.balance.cells import SLOPE_EDGES_DEG, SLOPE_NAMES, Cell, count_cells, slope_ranges, speed_edges
-from tcpipe.balance.correlation import correlations, residuals
-from tcpipe.balance.repeats import Floor, repeatability, repeated_pairs
-from tcpipe.balance.thin_ground import (
+from tcpipe.balance.cells import SLOPE_EDGES_DEG, SLOPE_NAMES, Cell, choose_speed_edges, count_cells, find_slope_ranges
+from tcpipe.balance.correlation import compute_slope_residuals, estimate_correlations
+from tcpipe.balance.repeatability import Floor, estimate_repeatability, find_repeated_pairs
+from tcpipe.balance.undersampled_ground import (
     CELL_M,
     CLOSED,
     MapGround,
     Patch,
-    cell_classes,
-    cell_gradients,
-    offered,
-    thin_ground,
+    cells_available,
+    find_cell_classes,
+    find_undersampled_ground,
+    fit_cell_gradients,
 )
 from tcpipe.formats.dataset_card import Balance, CellRow
 from tcpipe.formats.geojson import Feature, FeatureCollection, PolygonGeometry
 from tcpipe.formats.maps.map_files import MapFile
 from tcpipe.splits.assignment import SPLITS
 from tcpipe.splits.regions import Regions
-from tcpipe.tables.catalogue import threshold
-from tcpipe.tables.columns import floats, integers
-from tcpipe.terrain.projection import Projection, area_of, parse_crs
+from tcpipe.tables.catalogue import read_threshold
+from tcpipe.tables.columns import to_floats, to_integers
+from tcpipe.terrain.projection import Projection, compute_area, parse_crs
 
 BALANCE_COLUMNS = (
     *("run_id", "split", "start_ns", "course_rad", "terrain_class", "slope_rad"),
@@ -86,9 +86,11 @@ def measure_balance(
     chord_m : segment length [m].
     regions, buffer_m : of the split, in WGS84 lon/lat [deg] and [m]: what they exclude, and what lies in the buffer, is not worth driving.
     """
-    samples = _samples(table, xy_m, velocity_column)
-    left = {name: residuals(values, samples.terrain, samples.slope) for name, values in samples.labels.items()}
-    alike = correlations(
+    samples = _collect_samples(table, xy_m, velocity_column)
+    left = {
+        name: compute_slope_residuals(values, samples.terrain, samples.slope) for name, values in samples.labels.items()
+    }
+    alike = estimate_correlations(
         {name: left[name] for name in ("power_watt", velocity_column)},
         xy_m,
         samples.run,
@@ -96,7 +98,7 @@ def measure_balance(
         chord_m=chord_m,
     )
     known = [found for found in alike.values() if found is not None]
-    slopes, edges = slope_ranges(samples.slope), speed_edges(samples.labels[velocity_column])
+    slopes, edges = find_slope_ranges(samples.slope), choose_speed_edges(samples.labels[velocity_column])
     speeds = np.searchsorted(edges, samples.labels[velocity_column], side="right").astype(np.int64)
     pairs = count_cells((samples.terrain, slopes), samples.split, xy_m, known, splits=_USED)
     cells = count_cells((samples.terrain, slopes, speeds), samples.split, xy_m, known, splits=_USED)
@@ -104,41 +106,43 @@ def measure_balance(
         _OpenGround(source, sources[:number], sources[0], regions, buffer_m) for number, source in enumerate(sources)
     ]
     names = dict(enumerate(sources[0].classes.names().tolist()))
-    rows, features = _by_ground(pairs, grounds, samples, slopes, names)
+    rows, features = _count_by_ground(pairs, grounds, samples, slopes, names)
     balance = Balance(
         slope_edges_deg=SLOPE_EDGES_DEG,
         speed_edges_mps=tuple(edges),
-        enough_effective=threshold("thin-ground", "enough_count"),
+        enough_effective=read_threshold("thin-ground", "enough_count"),
         correlation=alike,
         by_class_and_slope=tuple(rows),
-        cells=tuple(_row(cell, names, edges) for cell in cells),
-        repeatability=dict(_floors(samples, left, chord_m)),
+        cells=tuple(_make_row(cell, names, edges) for cell in cells),
+        repeatability=dict(_iterate_floors(samples, left, chord_m)),
     )
     return balance, FeatureCollection(tuple(features))
 
 
-def _samples(table: pa.Table, xy_m: Floats, velocity_column: str) -> _Samples:
+def _collect_samples(table: pa.Table, xy_m: Floats, velocity_column: str) -> _Samples:
     labels = ("power_watt", velocity_column, "duration_s", "energy_joule")
     splits, runs = (table.column(name).combine_chunks().dictionary_encode() for name in ("split", "run_id"))
     return _Samples(
         split=np.array(splits.dictionary.to_pylist(), np.str_)[splits.indices.to_numpy()],
         run=runs.indices.to_numpy().astype(np.int64),
-        start_ns=integers(table, "start_ns"),
-        course_rad=floats(table, "course_rad"),
+        start_ns=to_integers(table, "start_ns"),
+        course_rad=to_floats(table, "course_rad"),
         terrain=table.column("terrain_class").fill_null(0).to_numpy().astype(np.int64),
-        slope=floats(table, "slope_rad"),
-        labels={name: floats(table, name) for name in labels},
+        slope=to_floats(table, "slope_rad"),
+        labels={name: to_floats(table, name) for name in labels},
         xy_m=xy_m,
     )
 
 
-def _floors(samples: _Samples, left: Mapping[str, Floats], chord_m: float) -> Iterator[tuple[str, Floor | None]]:
-    pairs = repeated_pairs(samples.xy_m, samples.course_rad, samples.terrain, chord_m=chord_m)
+def _iterate_floors(
+    samples: _Samples, left: Mapping[str, Floats], chord_m: float
+) -> Iterator[tuple[str, Floor | None]]:
+    pairs = find_repeated_pairs(samples.xy_m, samples.course_rad, samples.terrain, chord_m=chord_m)
     for name, values in samples.labels.items():
-        yield name, repeatability(values, left[name], pairs, samples.xy_m, chord_m=chord_m)
+        yield name, estimate_repeatability(values, left[name], pairs, samples.xy_m, chord_m=chord_m)
 
 
-def _row(cell: Cell, names: Mapping[int, str], edges: Sequence[float]) -> CellRow:
+def _make_row(cell: Cell, names: Mapping[int, str], edges: Sequence[float]) -> CellRow:
     found: CellRow = {
         "class": names[cell.terrain_class] or None,
         "class_id": cell.terrain_class,
@@ -162,11 +166,11 @@ class _OpenGround:
         self, source: MapFile, earlier: Sequence[MapFile], first: MapFile, regions: Regions | None, buffer_m: float
     ) -> None:
         plane, own = parse_crs(first.grid.crs, where="map"), parse_crs(source.grid.crs, where="map")
-        area_deg = area_of(own, source.grid.bounds_m)
+        area_deg = compute_area(own, source.grid.bounds_m)
         self._from_plane = Projection(plane, own, area_deg)
         self._to_lonlat = Projection(own, CRS.from_epsg(4326), area_deg)
-        self.ground = _ground(source)
-        taken = [shapely.box(*_bounds_in(other, own)) for other in earlier]
+        self.ground = _read_ground(source)
+        taken = [shapely.box(*_project_bounds(other, own)) for other in earlier]
         for area, reach_m in () if regions is None else ((regions.exclude, 0.0), (regions.borders(), buffer_m)):
             near = shapely.segmentize(shapely.intersection(area, shapely.box(*area_deg)), _EDGE_STEP_DEG)
             taken.append(shapely.buffer(shapely.transform(near, self._to_lonlat.inverse), reach_m))
@@ -174,19 +178,19 @@ class _OpenGround:
 
     def area_m2(self, terrain_class: int, slope: int) -> float:
         """Return how much ground offers a class and a range of slope."""
-        return float(offered(self.ground, terrain_class, slope).sum()) * self.ground.cell_m**2
+        return float(cells_available(self.ground, terrain_class, slope).sum()) * self.ground.cell_m**2
 
     def patches(self, terrain_class: int, slope: int, driven_xy_m: Floats) -> Iterator[tuple[Patch, BaseGeometry]]:
-        """Yield the patches of `thin_ground` and their polygons in WGS84 lon/lat; ``driven_xy_m`` is in the first map's plane."""
-        for patch in thin_ground(self.ground, terrain_class, slope, self._from_plane.forward(driven_xy_m)):
+        """Yield the patches of `find_undersampled_ground` with polygons in WGS84; ``driven_xy_m`` is in the first map's plane."""
+        for patch in find_undersampled_ground(self.ground, terrain_class, slope, self._from_plane.forward(driven_xy_m)):
             lonlat = shapely.transform(patch.polygon, self._to_lonlat.forward)
             yield patch, orient(shapely.transform(lonlat, lambda deg: np.round(deg, _DECIMALS)))
 
 
-def _bounds_in(source: MapFile, crs: CRS) -> tuple[float, float, float, float]:
+def _project_bounds(source: MapFile, crs: CRS) -> tuple[float, float, float, float]:
     from_crs = parse_crs(source.grid.crs, where="map")
     corners = shapely.segmentize(shapely.box(*source.grid.bounds_m), 50.0)
-    projection = Projection(from_crs, crs, area_of(from_crs, source.grid.bounds_m))
+    projection = Projection(from_crs, crs, compute_area(from_crs, source.grid.bounds_m))
     found: tuple[float, float, float, float] = tuple(shapely.bounds(shapely.transform(corners, projection.forward)))
     return found
 
@@ -202,7 +206,7 @@ def _close(ground: MapGround, taken: Sequence[BaseGeometry]) -> None:
         ground.terrain_class[rows[inside], cols[inside]] = CLOSED
 
 
-def _ground(source: MapFile) -> MapGround:
+def _read_ground(source: MapFile) -> MapGround:
     """Read the cells of a map from its coarsest level, strip by strip."""
     level = source.at(source.factors[-1]) if len(source.factors) > 1 else source
     grid = level.grid
@@ -212,12 +216,12 @@ def _ground(source: MapFile) -> MapGround:
     for row in range(0, grid.rows - pixels + 1, strip):
         last = min(row + strip, grid.rows)
         heights = level.read("height", row, last, 0, grid.cols)
-        gradient = cell_gradients(heights.astype(np.float64), pixels, grid.pitch_m)
+        gradient = fit_cell_gradients(heights.astype(np.float64), pixels, grid.pitch_m)
         known = np.isfinite(gradient).all(axis=-1)
         kinds = np.zeros(known.shape, np.int16)
         if "terrain" in level.layers:
             terrain = level.read("terrain", row, last, 0, grid.cols)
-            kinds = cell_classes(terrain, pixels, level.classes.traversable())
+            kinds = find_cell_classes(terrain, pixels, level.classes.traversable())
         classes.append(np.where(known, kinds, np.int16(CLOSED)))
         gradients.append(gradient)
     shape = (0, grid.cols // pixels)
@@ -230,7 +234,7 @@ def _ground(source: MapFile) -> MapGround:
     )
 
 
-def _by_ground(
+def _count_by_ground(
     pairs: Sequence[Cell], grounds: Sequence[_OpenGround], samples: _Samples, slopes: Ints, names: Mapping[int, str]
 ) -> tuple[list[CellRow], list[Feature]]:
     """Return a row for each class and slope that was driven or that the maps offer, and the features of where to drive next."""
@@ -243,16 +247,18 @@ def _by_ground(
             area_m2 = sum(part.area_m2(kind, slope) for part in grounds)
             if area_m2 == 0.0 and (kind, slope) not in driven:
                 continue
-            rows.append({**_row(cell, names, ()), "offered_m2": area_m2})
+            rows.append({**_make_row(cell, names, ()), "offered_m2": area_m2})
             if cell.rare and area_m2 > 0.0:
                 here = samples.xy_m[(samples.terrain == kind) & (slopes == slope) & (samples.split != "buffer")]
                 thin += [(cell, patch, lonlat) for part in grounds for patch, lonlat in part.patches(kind, slope, here)]
     thin.sort(key=lambda found: (found[0].effective or 0.0, found[0].terrain_class, found[0].slope, -found[1].area_m2))
-    features = [_feature(rank, cell, patch, lonlat, names) for rank, (cell, patch, lonlat) in enumerate(thin, start=1)]
+    features = [
+        _make_feature(rank, cell, patch, lonlat, names) for rank, (cell, patch, lonlat) in enumerate(thin, start=1)
+    ]
     return rows, features
 
 
-def _feature(rank: int, cell: Cell, patch: Patch, lonlat: BaseGeometry, names: Mapping[int, str]) -> Feature:
+def _make_feature(rank: int, cell: Cell, patch: Patch, lonlat: BaseGeometry, names: Mapping[int, str]) -> Feature:
     properties = {
         "rank": rank,
         "class": names[cell.terrain_class] or None,

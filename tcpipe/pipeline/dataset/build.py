@@ -14,13 +14,13 @@ from pathlib import Path
 import pyarrow as pa
 
 from tcpipe import __version__
-from tcpipe.cost.budget import in_words
-from tcpipe.errors import DatasetError, RecipeError, StoreError, UsageError, plain_lines
-from tcpipe.formats.atomic import atomic_directory, clear_beside, write_text
+from tcpipe.cost.budget import format_budget
+from tcpipe.errors import DatasetError, RecipeError, StoreError, UsageError, clean_lines
+from tcpipe.formats.atomic import clear_beside, write_atomic_directory, write_text
 from tcpipe.formats.bucket import open_place
 from tcpipe.formats.bucket_directories import fetch_directory_by_range, find_newest
-from tcpipe.formats.commits import Call, Dataset, Entries, State
-from tcpipe.formats.croissant import croissant
+from tcpipe.formats.commits import CallRecord, Dataset, Entries, State
+from tcpipe.formats.croissant import format_croissant
 from tcpipe.formats.dataset_card import DatasetCard, group_dataset_findings
 from tcpipe.formats.dataset_files import (
     CARD,
@@ -39,31 +39,31 @@ from tcpipe.formats.dataset_files import (
 )
 from tcpipe.formats.finding_lines import format_mixed_groups, format_verdict
 from tcpipe.formats.geojson import read_regions
-from tcpipe.formats.hub_card import hub_card
+from tcpipe.formats.hub_card import format_hub_card
+from tcpipe.formats.integrity import Checksum, compute_checksum, compute_checksums, seal_page, write_sealed
 from tcpipe.formats.json_files import digest, write_json
 from tcpipe.formats.maps.map_files import MapFile
 from tcpipe.formats.object_storage import is_url
-from tcpipe.formats.parquet import ROWS_PER_GROUP, parquet_rows
+from tcpipe.formats.parquet import ROWS_PER_GROUP, write_parquet_rows
 from tcpipe.formats.place import DirectoryPlace
-from tcpipe.formats.places import local_output
-from tcpipe.formats.recipe_toml import recipe_of
-from tcpipe.formats.seals import Checksum, file_checksum, file_checksums, sealed_page, write_sealed
-from tcpipe.formats.store_mark import SPOOL
+from tcpipe.formats.recipe_toml import resolve_recipe
+from tcpipe.formats.store_document import SPOOL
+from tcpipe.formats.user_paths import check_local_output
 from tcpipe.motion.remedies import KEPT
-from tcpipe.pipeline.begun_calls import OpenCall, begun_call
-from tcpipe.pipeline.calls import BUILD, Estimate, estimate, measure_call, started
+from tcpipe.pipeline.begun_calls import OpenCall, commit_call
+from tcpipe.pipeline.call_history import BUILD, Estimate, estimate, measure_call, start_stopwatch
 from tcpipe.pipeline.dataset.added_columns import read_all_covariates
 from tcpipe.pipeline.dataset.balance import BALANCE_COLUMNS, measure_balance
 from tcpipe.pipeline.dataset.build_dataset_options import BuildDatasetOptions
-from tcpipe.pipeline.dataset.card import CARD_COLUMNS, PHYSICS_COLUMNS, VELOCITY_COLUMN, dataset_card, is_whole
+from tcpipe.pipeline.dataset.card import CARD_COLUMNS, PHYSICS_COLUMNS, VELOCITY_COLUMN, is_whole, make_dataset_card
 from tcpipe.pipeline.dataset.content import gather_content, write_patches
-from tcpipe.pipeline.dataset.inputs import BuildOptions, Inputs, choose_inputs, earlier_splits
+from tcpipe.pipeline.dataset.inputs import BuildOptions, Inputs, choose_inputs, read_earlier_splits
 from tcpipe.pipeline.dataset.redaction import (
-    redacted_card,
-    redacted_content,
-    redacted_features,
-    redacted_inputs,
-    redaction_of,
+    make_redaction,
+    redact_card,
+    redact_content,
+    redact_features,
+    redact_inputs,
 )
 from tcpipe.pipeline.dataset.replacing import find_other_options
 from tcpipe.pipeline.dataset.runs import CHOICE_CODES, find_gone_runs
@@ -71,8 +71,8 @@ from tcpipe.pipeline.dataset.sampling import Workers
 from tcpipe.pipeline.generations import read_generations, write_generation
 from tcpipe.pipeline.log_writer import LogWriter, open_log
 from tcpipe.recipe import Recipe
-from tcpipe.report.dataset_report import dataset_report
-from tcpipe.report.pictures import class_overview, maps_overview, relief_overview, write_overview
+from tcpipe.report.dataset_report import render_dataset_report
+from tcpipe.report.pictures import draw_classes, draw_maps, draw_relief, write_overview
 from tcpipe.splits.assignment import SPLITS
 from tcpipe.store import Store, open_store
 from tcpipe.tables.findings import Finding, is_problem, select_problems
@@ -103,11 +103,11 @@ class BuildResult:
 
     def __str__(self) -> str:
         """Return counts, where the metres went, how wrong a label may be, the verdict and findings, as plain lines."""
-        return plain_lines((*self._facts(), *self.problem_lines(), *self._lines(problems=False), *self._closing()))
+        return clean_lines((*self._facts(), *self.problem_lines(), *self._lines(problems=False), *self._closing()))
 
     def without_problems(self) -> str:
         """Return the same without the lines of problems, which a command prints as errors."""
-        return plain_lines((*self._facts(), *self._lines(problems=False), *self._closing()))
+        return clean_lines((*self._facts(), *self._lines(problems=False), *self._closing()))
 
     def problem_lines(self) -> list[str]:
         """Return a line for each code that makes the exit code 3."""
@@ -132,7 +132,7 @@ class BuildResult:
         lost.sort(key=lambda entry: (-entry[1], entry[0]))
         ledger = f"{sum(card.ledger_m.values()):.0f} m driven: {card.ledger_m[KEPT]:.0f} m in samples"
         ledger += "".join(f", {metres:.0f} m {name.replace('_', ' ')}" for name, metres in lost)
-        floor = [] if card.energy_budget is None else [in_words(card.energy_budget)]
+        floor = [] if card.energy_budget is None else [format_budget(card.energy_budget)]
         judged = [] if card.verdict is None else [f"verdict: {format_verdict(card.verdict)}"]
         return [head, ledger, *floor, *judged]
 
@@ -151,21 +151,21 @@ def run_build_dataset(options: BuildDatasetOptions) -> BuildResult:
 
     Raises `DatasetError`, `RegionError`, `MapError`, `StoreError`, `RecipeError` or `UsageError`; nothing is written then.
     """
-    watch, ruling = started(), _ruling(options.recipe, holdout=options.holdout, seed=options.seed)
+    watch, ruling = start_stopwatch(), _merge_recipe(options.recipe, holdout=options.holdout, seed=options.seed)
     out, store, tags, dry_run = options.out, options.store, options.tags or {}, options.dry_run
-    place = str(out).rstrip("/") if is_url(out) else local_output(out)
+    place = str(out).rstrip("/") if is_url(out) else check_local_output(out)
     opened = open_store(store if options.cluster is None or is_url(store) else Path(store).absolute())
     log = open_log(opened)
     if isinstance(place, Path) and not dry_run:
         clear_beside(place)
-    known, proved = _card_in_bucket(place) if isinstance(place, str) else _card_in_place(place)
+    known, proved = _read_card_in_bucket(place) if isinstance(place, str) else _read_card_in_place(place)
     regions = None if options.split is None else read_regions(Path(options.split))
     region = None if options.split is None else Path(options.split).read_bytes()
     robot = options.robot or ruling.robot
     covariates, map_name, keep_split = options.covariates, options.map_name, options.keep_split
     tables = (covariates,) if isinstance(covariates, str | Path) else tuple(covariates)
-    earlier = None if keep_split is None else earlier_splits(keep_split)
-    keeps_own = keep_split is not None and _absolute(keep_split) == _absolute(place)
+    earlier = None if keep_split is None else read_earlier_splits(keep_split)
+    keeps_own = keep_split is not None and _make_absolute(keep_split) == _make_absolute(place)
     marks = BuildOptions(ruling, regions, tags, options.file_format, options.redact, earlier, keeps_own)
     inputs = choose_inputs(
         opened,
@@ -191,29 +191,29 @@ def run_build_dataset(options: BuildDatasetOptions) -> BuildResult:
         and known.inputs == inputs.digest
         and (isinstance(place, str) or is_whole(place, known))
     ):
-        result = _result(place, "unchanged", known, left_out)
+        result = _make_result(place, "unchanged", known, left_out)
     elif dry_run:
         _refuse_other_options(place, known, marks, inputs, force=options.force)
         if isinstance(place, str):
             read_generations(open_place(place), CARD)
-        return _planned(place, log.state, inputs, jobs=options.jobs)
+        return _plan_result(place, log.state, inputs, jobs=options.jobs)
     else:
         _refuse_other_options(place, known, marks, inputs, force=options.force)
-        whole = write_generation(place, CARD) if isinstance(place, str) else atomic_directory(place.absolute())
-        with begun_call(log, BUILD, [_absolute(place)]) as call:
-            at_work = partial(_workers, jobs=options.jobs, cluster=options.cluster)
+        whole = write_generation(place, CARD) if isinstance(place, str) else write_atomic_directory(place.absolute())
+        with commit_call(log, BUILD, [_make_absolute(place)]) as call:
+            at_work = partial(_start_workers, jobs=options.jobs, cluster=options.cluster)
             with whole as directory, at_work(directory, opened, inputs.digest) as workers:
                 card = _build(directory, inputs, marks, workers)
                 _refuse_others_since(place, {known.inputs if known else None, inputs.digest})
             for entry in workers.waiting.entries():
                 workers.waiting.delete(entry.name)
-            result = _result(place, "done", card, left_out)
+            result = _make_result(place, "done", card, left_out)
             counts = {"runs": len(inputs.runs), "samples": card.samples}
             written = sum(of.size_bytes for of in card.checksums.values())
-            took = Call(BUILD, __version__, result.exit_code, counts, options.jobs, written_bytes=written)
+            took = CallRecord(BUILD, __version__, result.exit_code, counts, options.jobs, written_bytes=written)
             _end(call, measure_call(watch, took), _describe_dataset(result, inputs), known)
     if result.status == "unchanged":
-        _refer(log, _describe_dataset(result, inputs))
+        _commit_references(log, _describe_dataset(result, inputs))
     return result
 
 
@@ -236,7 +236,7 @@ def _refuse_others_since(place: Path | str, expected: Container[str | None]) -> 
     """Raise `StoreError` where another call has put a dataset in this place since."""
     known = None
     if isinstance(place, str):
-        known = _card_in_bucket(place)[0]
+        known = _read_card_in_bucket(place)[0]
     elif (place / CARD).is_file():
         known = read_card(place, proved=False)
     if known is not None and known.inputs not in expected:
@@ -245,7 +245,7 @@ def _refuse_others_since(place: Path | str, expected: Container[str | None]) -> 
         )
 
 
-def _planned(place: Path | str, state: State, inputs: Inputs, *, jobs: int) -> BuildResult:
+def _plan_result(place: Path | str, state: State, inputs: Inputs, *, jobs: int) -> BuildResult:
     """Return what is to be expected of a build."""
     most = sum(run.facts.segments - int(inputs.again[run.run_id].sum()) for run in inputs.runs)
     expected = estimate(state.calls, BUILD, most, jobs=jobs)
@@ -253,17 +253,19 @@ def _planned(place: Path | str, state: State, inputs: Inputs, *, jobs: int) -> B
     return BuildResult(str(place), "planned", inputs.findings, exit_code=code, estimate=expected)
 
 
-def _end(opened: OpenCall, call: Call, dataset: Dataset, known: DatasetCard | None) -> None:
+def _end(opened: OpenCall, call: CallRecord, dataset: Dataset, known: DatasetCard | None) -> None:
     """Let the last commit of the call say which dataset was built, for what it refers to stays, and what the call took."""
     before = () if known is None or known.inputs == dataset.inputs else (Dataset(dataset.out, known.inputs),)
     opened.kind, opened.end = "built", Entries(datasets=(dataset,), forgotten=before, calls=(call,))
 
 
 def _describe_dataset(result: BuildResult, inputs: Inputs) -> Dataset:
-    return Dataset(_lasting(result), inputs.digest, tuple((run.run_id, run.recipe_id) for run in inputs.runs))
+    return Dataset(
+        _make_absolute_place(result), inputs.digest, tuple((run.run_id, run.recipe_id) for run in inputs.runs)
+    )
 
 
-def _refer(log: LogWriter, dataset: Dataset) -> None:
+def _commit_references(log: LogWriter, dataset: Dataset) -> None:
     """Commit what a dataset refers to that was built before, where the log does not say so."""
     if log.state.datasets.get((dataset.out, dataset.inputs)) != dataset:
         try:
@@ -272,12 +274,12 @@ def _refer(log: LogWriter, dataset: Dataset) -> None:
             logger.warning("%s; so 'tcpipe prune' does not know what this dataset refers to", error.problems[0])
 
 
-def _lasting(result: BuildResult) -> str:
+def _make_absolute_place(result: BuildResult) -> str:
     """Return where a dataset lies, wherever that is asked from."""
-    return _absolute(result.path)
+    return _make_absolute(result.path)
 
 
-def _absolute(place: Path | str) -> str:
+def _make_absolute(place: Path | str) -> str:
     return str(place).rstrip("/") if is_url(place) else str(Path(place).absolute())
 
 
@@ -296,7 +298,7 @@ def _find_left_out(
     return (*chosen.damaged, *(replace(finding, severity="note") for finding in fewer))
 
 
-def _card_in_bucket(url: str) -> tuple[DatasetCard | None, bool]:
+def _read_card_in_bucket(url: str) -> tuple[DatasetCard | None, bool]:
     """Return the card of the dataset that lies at a URL, if one does, and whether all of it is there and can be read."""
     open_place(url).check()
     if find_newest(url, [CARD]) is None:
@@ -306,16 +308,16 @@ def _card_in_bucket(url: str) -> tuple[DatasetCard | None, bool]:
     return card, fetched is not None and fetched.is_complete() and card.data_model_version in READ_VERSIONS
 
 
-def _result(place: Path | str, status: str, card: DatasetCard, left_out: Sequence[Finding]) -> BuildResult:
+def _make_result(place: Path | str, status: str, card: DatasetCard, left_out: Sequence[Finding]) -> BuildResult:
     """Return what became of a dataset: runs that are left out are those of now, whatever the card has of them."""
     lasting = (finding for finding in card.findings if finding.code not in CHOICE_CODES)
     findings = (*left_out, *lasting)
     return BuildResult(str(place), status, findings, card, 3 if select_problems(findings) else 0)
 
 
-def _ruling(recipe: Recipe | str | Path | None, *, holdout: str | None, seed: int | None) -> Recipe:
+def _merge_recipe(recipe: Recipe | str | Path | None, *, holdout: str | None, seed: int | None) -> Recipe:
     """Return the recipe with the command's own choices in it."""
-    recipe = recipe_of(recipe)
+    recipe = resolve_recipe(recipe)
     kind, _, tag = (holdout or recipe.split.holdout).partition(":")
     rules = replace(
         recipe.split,
@@ -330,7 +332,7 @@ def _ruling(recipe: Recipe | str | Path | None, *, holdout: str | None, seed: in
     return replace(recipe, split=rules)
 
 
-def _card_in_place(place: Path) -> tuple[DatasetCard | None, bool]:
+def _read_card_in_place(place: Path) -> tuple[DatasetCard | None, bool]:
     """Return the card of the dataset that is there, if one is, and whether it is as it was written; `DatasetError` for anything else."""
     if not place.exists() or (place.is_dir() and not any(place.iterdir())):
         return None, False
@@ -357,7 +359,7 @@ def _card_in_place(place: Path) -> tuple[DatasetCard | None, bool]:
 
 
 @contextmanager
-def _workers(directory: Path, store: Store, inputs: str, *, jobs: int, cluster: str | None) -> Iterator[Workers]:
+def _start_workers(directory: Path, store: Store, inputs: str, *, jobs: int, cluster: str | None) -> Iterator[Workers]:
     """Yield who samples and writes; what waits lies in the directory that is made, or in the store, which a cluster's workers see."""
     if cluster is None:
         yield Workers(jobs, None, DirectoryPlace(directory / SPOOL), DirectoryPlace(directory))
@@ -378,11 +380,11 @@ def _build(directory: Path, inputs: Inputs, options: BuildOptions, workers: Work
     waiting, recipe = directory / SPOOL, options.recipe
     waiting.mkdir()
     content = gather_content(waiting, inputs, options, workers)
-    redaction = redaction_of(content, inputs, recipe) if options.redact else None
+    redaction = make_redaction(content, inputs, recipe) if options.redact else None
     if redaction is not None:
-        content, inputs = redacted_content(content, redaction), redacted_inputs(inputs, redaction)
+        content, inputs = redact_content(content, redaction), redact_inputs(inputs, redaction)
     logger.info("writing %d samples", len(content.samples))
-    with parquet_rows(directory / SAMPLES, content.samples.schema) as write:
+    with write_parquet_rows(directory / SAMPLES, content.samples.schema) as write:
         for piece in content.samples.pieces(ROWS_PER_GROUP):
             write(piece)
     shards = write_patches(directory, content, options.file_format, workers, compression=recipe.dataset.compression)
@@ -397,35 +399,36 @@ def _build(directory: Path, inputs: Inputs, options: BuildOptions, workers: Work
         regions=options.regions,
         buffer_m=content.drawn.buffer_m,
     )
-    write_json(directory / DRIVE_NEXT, drive_next if redaction is None else redacted_features(drive_next, redaction))
+    write_json(directory / DRIVE_NEXT, drive_next if redaction is None else redact_features(drive_next, redaction))
     samples = read_samples(directory, (*CARD_COLUMNS, *PHYSICS_COLUMNS))
-    card = dataset_card(samples, options, inputs, content, balance=balance, shards=shards)
-    card = card if redaction is None else redacted_card(card, redaction)
+    card = make_dataset_card(samples, options, inputs, content, balance=balance, shards=shards)
+    card = card if redaction is None else redact_card(card, redaction)
     spool, schema = content.spool, content.samples.schema
-    files = file_checksums(directory)
+    files = compute_checksums(directory)
     write_text(
-        directory / HUB_CARD, hub_card(replace(card, checksums=files), schema, samples_file=SAMPLES, picture=OVERVIEW)
+        directory / HUB_CARD,
+        format_hub_card(replace(card, checksums=files), schema, samples_file=SAMPLES, picture=OVERVIEW),
     )
-    files = {**files, HUB_CARD: file_checksum(directory / HUB_CARD)}
+    files = {**files, HUB_CARD: compute_checksum(directory / HUB_CARD)}
     patches = {name: (spool.patch_px**2, layer.stored.kind) for name, layer in spool.layers.items()} if shards else None
-    write_text(directory / CROISSANT, _croissant(files, recipe, inputs.digest, patches, samples=schema))
-    card = replace(card, checksums={**files, CROISSANT: file_checksum(directory / CROISSANT)})
+    write_text(directory / CROISSANT, _make_croissant(files, recipe, inputs.digest, patches, samples=schema))
+    card = replace(card, checksums={**files, CROISSANT: compute_checksum(directory / CROISSANT)})
     write_sealed(directory / CARD, card)
-    write_text(directory / REPORT, sealed_page(dataset_report(directory)))
+    write_text(directory / REPORT, seal_page(render_dataset_report(directory)))
     return card
 
 
 def _write_overviews(directory: Path, sources: Sequence[MapFile]) -> None:
     """Write what the page shows of the maps: photograph (or relief), relief and classes, as far as there are any."""
-    write_overview(directory / OVERVIEW, maps_overview(sources))
+    write_overview(directory / OVERVIEW, draw_maps(sources))
     layers = {layer for source in sources for layer in source.layers}
     if "ortho" in layers:
-        write_overview(directory / RELIEF, maps_overview(sources, relief_overview))
+        write_overview(directory / RELIEF, draw_maps(sources, draw_relief))
     if "terrain" in layers:
-        write_overview(directory / CLASSES, maps_overview(sources, class_overview))
+        write_overview(directory / CLASSES, draw_maps(sources, draw_classes))
 
 
-def _croissant(
+def _make_croissant(
     files: Mapping[str, Checksum],
     recipe: Recipe,
     inputs: str,
@@ -434,7 +437,7 @@ def _croissant(
     samples: pa.Schema,
 ) -> str:
     about = recipe.dataset
-    return croissant(
+    return format_croissant(
         name=about.name,
         description=about.description,
         licence=about.licence,

@@ -13,9 +13,9 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from tcpipe import __version__
-from tcpipe.cost.budget import pooled
-from tcpipe.cost.held_out import physics_of
-from tcpipe.cost.physics import ALL, Metres
+from tcpipe.cost.budget import pool_budgets
+from tcpipe.cost.held_out import fit_and_validate_physics
+from tcpipe.cost.physics import ALL, FitSamples
 from tcpipe.formats.dataset_card import (
     Balance,
     DatasetCard,
@@ -28,8 +28,8 @@ from tcpipe.formats.dataset_card import (
     SplitResult,
     judge_dataset,
 )
-from tcpipe.formats.json_files import recast
-from tcpipe.formats.layer_descriptions import described
+from tcpipe.formats.json_files import convert_record
+from tcpipe.formats.layer_descriptions import describe_layer
 from tcpipe.formats.maps.map_files import MapFile
 from tcpipe.pipeline.dataset.content import Content
 from tcpipe.pipeline.dataset.inputs import BuildOptions, Inputs
@@ -38,9 +38,9 @@ from tcpipe.recipe import Recipe
 from tcpipe.recipe.suggestions import suggest
 from tcpipe.splits.assignment import SPLITS
 from tcpipe.splits.audit import HeldOut
-from tcpipe.tables.bits import Quality, name_of
-from tcpipe.tables.catalogue import Severity, threshold
-from tcpipe.tables.columns import floats
+from tcpipe.tables.bits import Quality, flag_name
+from tcpipe.tables.catalogue import Severity, read_threshold
+from tcpipe.tables.columns import to_floats
 from tcpipe.tables.facts import PhysicsFit
 from tcpipe.tables.findings import Finding, Remedy, Subject, make_finding
 from tcpipe.tables.levels import DATA_MODEL_VERSION
@@ -67,7 +67,7 @@ class SampleFigures(TypedDict):
     doubtful: Doubtful
 
 
-def dataset_card(
+def make_dataset_card(
     samples: pa.Table,
     options: BuildOptions,
     inputs: Inputs,
@@ -89,22 +89,22 @@ def dataset_card(
         description=about.description,
         licence=about.licence,
         creator=about.creator,
-        **measured(samples, has_terrain=has_terrain),
+        **measure_samples(samples, has_terrain=has_terrain),
         recipe=recipe,
         format=options.file_format,
         patch_m=recipe.sample.patch_m,
         patch_px=recipe.sample.patch_px,
-        layers={name: described(layer) for name, layer in layers.items()},
+        layers={name: describe_layer(layer) for name, layer in layers.items()},
         tensor={
             "channels": tuple(name for name in LAYERS if name in layers),
             "ortho": "O / 255",
             "terrain": f"(C - 1) / ({classes.count} - 1)",
             "height": "min((H - min H) / 1 m, 1)",
-            **{name: _formula(layer) for name, layer in layers.items() if name not in LAYERS},
+            **{name: _describe_formula(layer) for name, layer in layers.items() if name not in LAYERS},
         },
         classes=classes.classes if has_terrain else (),
         label=_label(recipe, inputs),
-        energy_budget=pooled(run.energy_budget for run in inputs.sources),
+        energy_budget=pool_budgets(run.energy_budget for run in inputs.sources),
         split=SplitResult(
             drawn.buffer_m, None if regions is None else regions_to_json(regions), drawn.audit, drawn.kept
         ),
@@ -114,7 +114,7 @@ def dataset_card(
         runs=runs,
         run_tags=options.tags,
         maps=tuple(map(_map_source, content.sources, inputs.map_sha256, content.registrations)),
-        physics=physics_by_robot(samples),
+        physics=fit_physics_by_robot(samples),
         covariates=content.covariates,
         added_columns={field.name: field.metadata[b"doc"].decode() for field in content.samples.added.schema},
         shards=tuple(shards),
@@ -131,7 +131,7 @@ def _label(recipe: Recipe, inputs: Inputs) -> LabelColumns:
     return LabelColumns(("power_watt", VELOCITY_COLUMN[velocity]), velocity, includes)
 
 
-def _formula(layer: Layer) -> str:
+def _describe_formula(layer: Layer) -> str:
     """Return what becomes of a layer that is not the paper's where it is asked for in the tensor."""
     if layer.kind == "categorical":
         return f"(C - 1) / ({layer.high:g} - 1)"
@@ -140,18 +140,18 @@ def _formula(layer: Layer) -> str:
 
 def _map_source(source: MapFile, sha256: str, registration: tuple[MapRegistration, ...]) -> MapSource:
     told = {"name": source.name, "layers": tuple(source.layers), "sha256": sha256, "registration": registration}
-    return recast(source.facts, MapSource, **told, **asdict(source.grid))
+    return convert_record(source.facts, MapSource, **told, **asdict(source.grid))
 
 
-def measured(samples: pa.Table, *, has_terrain: bool) -> SampleFigures:
+def measure_samples(samples: pa.Table, *, has_terrain: bool) -> SampleFigures:
     """Return what the card says of the samples by their `CARD_COLUMNS` alone: it can be measured again at any time."""
     return {
         "samples": samples.num_rows,
         "robots": tuple(sorted(pc.unique(samples.column("robot")).to_pylist())),
         "splits": split_counts(samples),
         "folds_of_train": _fold_counts(samples),
-        "terrain": _terrain_counts(samples) if has_terrain else {},
-        "label_statistics_of_train": _statistics(samples),
+        "terrain": _count_terrain(samples) if has_terrain else {},
+        "label_statistics_of_train": _compute_statistics(samples),
         "doubtful": count_flagged(samples.column("quality")),
     }
 
@@ -178,7 +178,7 @@ def is_whole(directory: Path, card: DatasetCard) -> bool:
     return all(path.is_file() and path.stat().st_size == size_bytes for path, size_bytes in files)
 
 
-def _terrain_counts(samples: pa.Table) -> dict[str, dict[str, int]]:
+def _count_terrain(samples: pa.Table) -> dict[str, dict[str, int]]:
     """Return samples by split and terrain name."""
     groups = samples.group_by(["split", "terrain_name"]).aggregate([([], "count_all")]).to_pylist()
     counts: dict[str, dict[str, int]] = {name: {} for name in SPLITS}
@@ -187,7 +187,7 @@ def _terrain_counts(samples: pa.Table) -> dict[str, dict[str, int]]:
     return counts
 
 
-def _statistics(samples: pa.Table) -> dict[str, LabelStatistics]:
+def _compute_statistics(samples: pa.Table) -> dict[str, LabelStatistics]:
     """Return count, mean, standard deviation, least and most of each label over train alone."""
     train = samples.filter(pc.equal(samples.column("split"), "train"))
     found = {}
@@ -204,7 +204,7 @@ PHYSICS_COLUMNS = ("start_ns", "start_z_m", "end_z_m", "chord_m", "turn_rate_rad
 """Columns of samples.parquet that the fit reads, beside those of the labels."""
 
 
-def physics_by_robot(samples: pa.Table) -> dict[str, PhysicsFit]:
+def fit_physics_by_robot(samples: pa.Table) -> dict[str, PhysicsFit]:
     """Return the fit of each robot's samples, whatever their split; robots for which none can be are left out.
 
     Parameters
@@ -214,38 +214,38 @@ def physics_by_robot(samples: pa.Table) -> dict[str, PhysicsFit]:
     found = {}
     for robot in sorted(pc.unique(samples.column("robot")).to_pylist()):
         mine = samples.filter(pc.equal(samples.column("robot"), robot)).sort_by("start_ns")
-        fit = physics_of(metres_of(mine), standing_watt=standing_of(mine))
+        fit = fit_and_validate_physics(make_fit_samples(mine), standing_watt=find_idle_power(mine))
         if fit is not None:
             found[robot] = fit
     return found
 
 
-def metres_of(samples: pa.Table) -> Metres:
+def make_fit_samples(samples: pa.Table) -> FitSamples:
     """Return samples, or segments, as physics takes them; the rise is that of the track, which every segment has."""
     names = (
         samples.column("terrain_name").fill_null(ALL).to_pylist()
         if "terrain_name" in samples.column_names
         else [ALL] * samples.num_rows
     )
-    return Metres(
-        power_watt=floats(samples, "power_watt"),
-        velocity_mps=floats(samples, "velocity_mps"),
-        rise=(floats(samples, "end_z_m") - floats(samples, "start_z_m")) / floats(samples, "chord_m"),
-        turn_rate_radps=floats(samples, "turn_rate_radps"),
+    return FitSamples(
+        power_watt=to_floats(samples, "power_watt"),
+        velocity_mps=to_floats(samples, "velocity_mps"),
+        rise=(to_floats(samples, "end_z_m") - to_floats(samples, "start_z_m")) / to_floats(samples, "chord_m"),
+        turn_rate_radps=to_floats(samples, "turn_rate_radps"),
         terrain=np.array(names, np.str_),
     )
 
 
-def standing_of(samples: pa.Table) -> float | None:
+def find_idle_power(samples: pa.Table) -> float | None:
     """Return the power while standing [W], the mean over the samples of what their runs tell; None where none stood."""
-    watt = floats(samples, "standing_power_watt")
+    watt = to_floats(samples, "standing_power_watt")
     return float(np.nanmean(watt)) if np.isfinite(watt).any() else None
 
 
 def count_flagged(quality: pa.ChunkedArray) -> Doubtful:
     """Return how many samples carry a quality bit that not all of them carry, and how many each; ``quality`` is their column."""
     bits = quality.to_numpy().astype(np.int64)
-    counts = {name_of(bit): int(np.count_nonzero(bits & int(bit))) for bit in Quality}
+    counts = {flag_name(bit): int(np.count_nonzero(bits & int(bit))) for bit in Quality}
     common = int(np.bitwise_and.reduce(bits)) if len(bits) > 1 else 0
     count = int(np.count_nonzero(bits & ~common))
     return Doubtful(count, count / max(len(bits), 1), {name: of for name, of in counts.items() if of})
@@ -254,7 +254,7 @@ def count_flagged(quality: pa.ChunkedArray) -> Doubtful:
 def find_in_samples(card: DatasetCard) -> Iterator[Finding]:
     """Yield what the samples of a dataset show: too few, flagged ones, empty splits, leakage, thin ground, no repetitions."""
     dataset = Subject("dataset", card.name)
-    if card.samples < threshold("few-samples", "min_sample_count"):
+    if card.samples < read_threshold("few-samples", "min_sample_count"):
         yield make_finding("few-samples", dataset, sample_count=card.samples)
     yield from _find_flagged(card, dataset)
     yield from _find_empty_splits(card)
@@ -270,7 +270,9 @@ def _find_flagged(card: DatasetCard, dataset: Subject) -> Iterator[Finding]:
         return
     by_bit = {name: count for name, count in flagged.by_bit.items() if count < card.samples} or flagged.by_bit
     most = max(by_bit, key=lambda name: by_bit[name])
-    severity: Severity = "warning" if flagged.share > threshold("samples-flagged", "max_flagged_fraction") else "note"
+    severity: Severity = (
+        "warning" if flagged.share > read_threshold("samples-flagged", "max_flagged_fraction") else "note"
+    )
     yield make_finding(
         "samples-flagged", dataset, severity=severity, names={"flag": most}, flagged_fraction=flagged.share
     )

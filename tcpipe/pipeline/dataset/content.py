@@ -17,35 +17,42 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from tcpipe.errors import DatasetError, TcpipeError
-from tcpipe.execution import run_all, sound
-from tcpipe.formats.arrow_file import map_table, table_bytes, table_of, write_pieces
+from tcpipe.execution import run_all, unwrap_result
+from tcpipe.formats.arrow_file import map_table, read_table_bytes, write_pieces, write_table_bytes
 from tcpipe.formats.dataset_card import Covariate, MapRegistration, Removal, Shard, group_dataset_findings
-from tcpipe.formats.dataset_files import Drawer, FileFormat, ParquetDrawer, Pixels, parquet_drawers, zarr_drawers
+from tcpipe.formats.dataset_files import (
+    Drawer,
+    FileFormat,
+    ParquetShardWriter,
+    Pixels,
+    make_parquet_writers,
+    make_zarr_writers,
+)
 from tcpipe.formats.finding_lines import format_mixed_groups
-from tcpipe.formats.geoparquet import located
+from tcpipe.formats.geoparquet import add_geo_metadata
 from tcpipe.formats.maps.map_files import MapFile, open_map
 from tcpipe.formats.place import DirectoryPlace, Place
-from tcpipe.formats.robot_files import profiles_of
+from tcpipe.formats.robot_files import load_profiles
 from tcpipe.formats.stored_runs import RunDirectory
 from tcpipe.formats.zarr_arrays import Compression
 from tcpipe.motion.remedies import KEPT
-from tcpipe.pipeline.dataset.added_columns import added_columns, find_narrow_patches, tag_of_each
+from tcpipe.pipeline.dataset.added_columns import find_narrow_patches, make_added_columns, tag_of_each
+from tcpipe.pipeline.dataset.bias_check import find_removed_by_ground
 from tcpipe.pipeline.dataset.inputs import BuildOptions, Inputs
 from tcpipe.pipeline.dataset.registration import register_runs
-from tcpipe.pipeline.dataset.removal import removed_by_ground
 from tcpipe.pipeline.dataset.sampling import Spool, Workers, sample_all_segments
-from tcpipe.pipeline.dataset.splitting import Drawn, draw_splits
+from tcpipe.pipeline.dataset.splitting import SplitResult, draw_splits
 from tcpipe.recipe import Recipe
-from tcpipe.recipe.suggestions import recipe_key
+from tcpipe.recipe.suggestions import format_recipe_key
 from tcpipe.splits.assignment import EXCLUDED, NO_FOLD, Assignment
 from tcpipe.splits.ranking import order_ranks
-from tcpipe.stages.sample import Sampled, metres_lost
-from tcpipe.tables.bits import Loss, name_of
-from tcpipe.tables.columns import floats
+from tcpipe.stages.sample import Sampled, sum_losses
+from tcpipe.tables.bits import Loss, flag_name
+from tcpipe.tables.columns import to_floats
 from tcpipe.tables.findings import Finding, Subject, make_finding
 from tcpipe.tables.levels import LABELLED_SEGMENTS, SAMPLES
-from tcpipe.tables.wkb import point_column
-from tcpipe.terrain.projection import area_of, parse_crs
+from tcpipe.tables.wkb import make_points
+from tcpipe.terrain.projection import compute_area, parse_crs
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,7 +78,7 @@ def pool_segments(
     names = dict.fromkeys(name for run in runs for name in run.manifest.ledger_m)
     ledger_m = {name: math.fsum(run.manifest.ledger_m.get(name, 0.0) for run in runs) for name in names}
     path, counts = directory / "segments.arrow", list[_Count]()
-    write_pieces(path, LABELLED_SEGMENTS.arrow(), _usable(runs, again or {}, counts))
+    write_pieces(path, LABELLED_SEGMENTS.arrow(), _iterate_usable(runs, again or {}, counts))
     segments = map_table(path)
     if segments.num_rows == 0:
         every, powered, located = (
@@ -102,16 +109,16 @@ class _Count:
     again_m: float
 
 
-def _usable(
+def _iterate_usable(
     runs: Sequence[RunDirectory], again: Mapping[str, NDArray[np.bool_]], counts: list[_Count]
 ) -> Iterator[pa.Table]:
     """Yield each run's segments that can become samples; ``counts`` gets an entry a run."""
     for run in runs:
         segments = run.segments()
-        powered: NDArray[np.bool_] = np.isfinite(floats(segments, "power_watt"))
+        powered: NDArray[np.bool_] = np.isfinite(to_floats(segments, "power_watt"))
         ends = [f"{end}_{axis}_deg" for end in ("start", "end") for axis in ("lon", "lat")]
-        located = np.isfinite([floats(segments, end) for end in ends]).all(axis=0)
-        arc_m = floats(segments, "arc_length_m")
+        located = np.isfinite([to_floats(segments, end) for end in ends]).all(axis=0)
+        arc_m = to_floats(segments, "arc_length_m")
         usable = powered & located
         twice = usable & again.get(run.run_id, np.zeros(len(usable), np.bool_))
         lost_m = (float(arc_m[lost].sum()) for lost in (~powered, powered & ~located, twice))
@@ -132,7 +139,7 @@ def move_out(ledger_m: Mapping[str, float], lost_m: Mapping[Loss, float]) -> dic
     """Return the ledger with metres moved from what is kept to losses [m]; its sum stays the odometer."""
     moved = dict(ledger_m)
     for loss, metres in lost_m.items():
-        name = name_of(loss)
+        name = flag_name(loss)
         moved[name] = moved.get(name, 0.0) + float(metres)
     total = math.fsum(float(metres) for metres in lost_m.values())
     left = moved.get(KEPT, 0.0) - total
@@ -146,7 +153,7 @@ _ROWS = 1 << 17
 """Whose centres are looked for at once."""
 
 
-class Tells(Protocol):
+class Redactor(Protocol):
     """What redacts samples (`tcpipe.pipeline.dataset.redaction.Redaction`)."""
 
     def table(self, samples: pa.Table) -> pa.Table:
@@ -173,7 +180,7 @@ class SampleTable:
     patch: NDArray[np.int64]
     added: pa.Table
     """Columns beyond SAMPLES, in the segments' order."""
-    redaction: Tells | None = None
+    redaction: Redactor | None = None
     """How names and places are told; None: as they are."""
 
     @property
@@ -181,7 +188,7 @@ class SampleTable:
         """The samples' columns, and where they lie."""
         bare = pa.schema([*SAMPLES.arrow(), *self.added.schema]).empty_table()
         pieces = (self._centres_deg(self.patch[first : first + _ROWS]) for first in range(0, len(self), _ROWS))
-        return located(bare, "Point", np.concatenate([np.empty((0, 2)), *pieces])).schema
+        return add_geo_metadata(bare, "Point", np.concatenate([np.empty((0, 2)), *pieces])).schema
 
     def _centres_deg(self, patches: NDArray[np.int64]) -> NDArray[np.float64]:
         """Return the centre of patches of ``sampled``, WGS 84 lon, lat [deg], shape (N, 2)."""
@@ -202,7 +209,7 @@ class SampleTable:
             name: segments.column(name) for name in SAMPLES.names() if name in segments.column_names
         }
         columns |= {name: values[at] for name, values in self.sampled.patches.columns().items()}
-        columns["geometry"] = point_column(centres := self._centres_deg(at))
+        columns["geometry"] = make_points(centres := self._centres_deg(at))
         columns["terrain_name"] = self.class_names[columns["terrain_class"]].tolist()
         if not self.has_terrain:
             of_terrain = (column for column in SAMPLES.columns if column.name.startswith("terrain"))
@@ -217,7 +224,7 @@ class SampleTable:
         for field in self.added.schema:
             table = table.append_column(field, self.added.column(field.name).take(rows_of_segments))
         told = table if self.redaction is None else self.redaction.table(table)
-        return located(told, "Point", centres)
+        return add_geo_metadata(told, "Point", centres)
 
     def pieces(self, rows: int) -> Iterator[pa.Table]:
         """Yield the table in pieces of so many rows; at least one, which may be empty."""
@@ -255,7 +262,7 @@ class Content:
     spool: Spool
     """Where the pixels wait, and what the layers mean."""
     sources: tuple[MapFile, ...]
-    drawn: Drawn
+    drawn: SplitResult
     ledger_m: Mapping[str, float]
     registrations: Sequence[tuple[MapRegistration, ...]]
     """How each map lies against each run's track."""
@@ -275,36 +282,37 @@ def gather_content(directory: Path, inputs: Inputs, options: BuildOptions, worke
     recipe = options.recipe
     pool = pool_segments(inputs.runs, directory, again=inputs.again)
     logger.info("sampling %d segments of %d runs", pool.segments.num_rows, len(inputs.runs))
-    ranks = _ranks(pool.segments, seed=recipe.split.seed)
+    ranks = _rank_segments(pool.segments, seed=recipe.split.seed)
     gnss_crs = recipe.read.gnss_crs
     sampled, slot, spool = sample_all_segments(
         pool.segments, ranks, inputs.maps, recipe.sample, gnss_crs=gnss_crs, workers=workers
     )
     sources = tuple(open_map(*of) for of in inputs.maps())
-    lost_m = metres_lost(floats(pool.segments, "arc_length_m"), sampled.lost_by)
+    lost_m = sum_losses(to_floats(pool.segments, "arc_length_m"), sampled.lost_by)
     if len(sampled.kept) == 0:
         raise DatasetError(
-            _nothing_sampled(pool.segments, lost_m, sources), *_why_uncertain(pool.segments, lost_m, inputs, recipe)
+            _describe_nothing_sampled(pool.segments, lost_m, sources),
+            *_describe_uncertainty(pool.segments, lost_m, inputs, recipe),
         )
-    tags = _tags(pool.segments, inputs, recipe)
+    tags = _read_tags(pool.segments, inputs, recipe)
     drawn = draw_splits(
         pool.segments, sampled, sources[0].grid, options.regions, recipe, earlier=options.earlier, tags=tags
     )
     split = drawn.assigned.split
-    arc_m = floats(pool.segments, "arc_length_m")[sampled.kept]
+    arc_m = to_floats(pool.segments, "arc_length_m")[sampled.kept]
     unused_m = {Loss.SPLIT_BUFFER: arc_m[split == "buffer"].sum(), Loss.SPLIT_EXCLUDED: arc_m[split == EXCLUDED].sum()}
     registered = [register_runs(inputs.runs, source, recipe) for source in sources]
     shifted = [finding for _, findings in registered for finding in findings]
     in_use = sampled.kept[(split != "buffer") & (split != EXCLUDED)]
-    removal, biased = removed_by_ground(inputs.runs, pool.segments, in_use, sources, recipe)
+    removal, biased = find_removed_by_ground(inputs.runs, pool.segments, in_use, sources, recipe)
     kept = np.flatnonzero(split != EXCLUDED)
     order = kept[np.argsort(ranks[sampled.kept[kept]], kind="stable")]
     covariates, rows = inputs.covariates, sampled.kept[order]
-    added = added_columns(
+    added = make_added_columns(
         pool.segments, rows, inputs.sources, covariates, recipe.covariates, layers=tuple(spool.layers)
     )
     robots = [run.robot for run in inputs.sources]
-    narrow = find_narrow_patches(robots, profiles_of(recipe).robots, patch_m=recipe.sample.patch_m)
+    narrow = find_narrow_patches(robots, load_profiles(recipe).robots, patch_m=recipe.sample.patch_m)
     return Content(
         samples=SampleTable(
             pool.segments,
@@ -328,7 +336,7 @@ def gather_content(directory: Path, inputs: Inputs, options: BuildOptions, worke
     )
 
 
-def _tags(segments: pa.Table, inputs: Inputs, recipe: Recipe) -> dict[str, str] | None:
+def _read_tags(segments: pa.Table, inputs: Inputs, recipe: Recipe) -> dict[str, str] | None:
     """Return the value of the holdout's tag by run, None where another holdout rules."""
     if recipe.split.holdout != "tag":
         return None
@@ -336,7 +344,7 @@ def _tags(segments: pa.Table, inputs: Inputs, recipe: Recipe) -> dict[str, str] 
     return dict(zip(run_ids, tag_of_each(run_ids, inputs.sources, recipe.split.holdout_tag), strict=True))
 
 
-def _ranks(segments: pa.Table, *, seed: int) -> NDArray[np.uint64]:
+def _rank_segments(segments: pa.Table, *, seed: int) -> NDArray[np.uint64]:
     """Return the rank of every segment in the dataset's order, (M,); `DatasetError` where an id occurs twice."""
     column = segments.column("segment_id")
     ranks = np.concatenate([order_ranks(chunk.to_pylist(), seed=seed) for chunk in column.chunks])
@@ -349,27 +357,29 @@ def _ranks(segments: pa.Table, *, seed: int) -> NDArray[np.uint64]:
     return ranks
 
 
-def _nothing_sampled(segments: pa.Table, lost_m: Mapping[Loss, float], sources: Sequence[MapFile]) -> str:
+def _describe_nothing_sampled(segments: pa.Table, lost_m: Mapping[Loss, float], sources: Sequence[MapFile]) -> str:
     """Say where the segments went instead, and where maps and runs lie."""
-    lost = sorted(((metres, name_of(loss)) for loss, metres in lost_m.items() if metres > 0.0), reverse=True)
+    lost = sorted(((metres, flag_name(loss)) for loss, metres in lost_m.items() if metres > 0.0), reverse=True)
     where = ", ".join(f"{metres:.0f} m {name.replace('_', ' ')}" for metres, name in lost)
-    lon, lat = (float(np.mean(floats(segments, f"start_{axis}_deg"))) for axis in ("lon", "lat"))
+    lon, lat = (float(np.mean(to_floats(segments, f"start_{axis}_deg"))) for axis in ("lon", "lat"))
     names = f"map{'s' if len(sources) > 1 else ''} {', '.join(source.name for source in sources)}"
     return (
         f"{names}: none of {segments.num_rows} segments gives a sample ({where}); the runs lie around "
-        f"{lon:.5f}, {lat:.5f} (lon, lat), {'; '.join(_covered(source, alone=len(sources) == 1) for source in sources)}"
+        f"{lon:.5f}, {lat:.5f} (lon, lat), {'; '.join(_describe_coverage(source, alone=len(sources) == 1) for source in sources)}"
     )
 
 
-def _why_uncertain(segments: pa.Table, lost_m: Mapping[Loss, float], inputs: Inputs, recipe: Recipe) -> list[str]:
+def _describe_uncertainty(
+    segments: pa.Table, lost_m: Mapping[Loss, float], inputs: Inputs, recipe: Recipe
+) -> list[str]:
     """Return how well positions are known, and what ingest found, where that is what most is lost to."""
     uncertain_m = lost_m.get(Loss.POSITION_UNCERTAIN, 0.0)
     if uncertain_m == 0.0 or uncertain_m < max(lost_m.values()):
         return []
-    known_m = float(np.median(floats(segments, "position_std_m")))
+    known_m = float(np.median(to_floats(segments, "position_std_m")))
     how_sure = (
         f"positions are known to {known_m:.2f} m (median standard deviation), wanted {recipe.sample.max_position_std_m:g} m: mend what "
-        f"follows, or accept patches that lie so far off ({recipe_key('sample.max_position_std_m')})"
+        f"follows, or accept patches that lie so far off ({format_recipe_key('sample.max_position_std_m')})"
     )
     return [
         how_sure,
@@ -377,8 +387,8 @@ def _why_uncertain(segments: pa.Table, lost_m: Mapping[Loss, float], inputs: Inp
     ]
 
 
-def _covered(source: MapFile, *, alone: bool) -> str:
-    west, south, east, north = area_of(parse_crs(source.grid.crs, where="map"), source.grid.bounds_m)
+def _describe_coverage(source: MapFile, *, alone: bool) -> str:
+    west, south, east, north = compute_area(parse_crs(source.grid.crs, where="map"), source.grid.bounds_m)
     return f"{'the map' if alone else f'map {source.name}'} covers {west:.5f} to {east:.5f}, {south:.5f} to {north:.5f}"
 
 
@@ -389,28 +399,28 @@ def write_patches(
     samples, spool = content.samples, content.spool
     pixels = Pixels(spool.layers, spool.patch_px, samples.slots(), spool.read)
     if file_format == "parquet":
-        rows = partial(_waiting_rows, workers.waiting, samples)
-        drawers = parquet_drawers(workers.out, pixels, rows, samples.splits())
+        rows = partial(_spool_rows, workers.waiting, samples)
+        drawers = make_parquet_writers(workers.out, pixels, rows, samples.splits())
     else:
-        drawers = zarr_drawers(
+        drawers = make_zarr_writers(
             directory, workers.out, pixels, samples.ids, compression=compression, threads=workers.jobs
         )
     with closing(run_all(_fill, drawers, jobs=1, cluster=workers.cluster)) as outcomes:
         for outcome in outcomes:
-            sound(outcome)
+            unwrap_result(outcome)
     _bring(workers.out, directory)
-    return [drawer.shard for drawer in drawers if isinstance(drawer, ParquetDrawer)]
+    return [drawer.shard for drawer in drawers if isinstance(drawer, ParquetShardWriter)]
 
 
-def _waiting_rows(waiting: Place, samples: SampleTable, rows: NDArray[np.int64]) -> Callable[[], pa.Table]:
+def _spool_rows(waiting: Place, samples: SampleTable, rows: NDArray[np.int64]) -> Callable[[], pa.Table]:
     """Put rows of the samples where whoever writes them sees them; return what gives them there."""
     name = f"rows/{rows[0]}"
-    waiting.put(name, table_bytes(samples.take(rows)))
-    return partial(_rows_at, waiting, name)
+    waiting.put(name, write_table_bytes(samples.take(rows)))
+    return partial(_read_rows_at, waiting, name)
 
 
-def _rows_at(waiting: Place, name: str) -> pa.Table:
-    return table_of(waiting.read(name) or b"")
+def _read_rows_at(waiting: Place, name: str) -> pa.Table:
+    return read_table_bytes(waiting.read(name) or b"")
 
 
 def _fill(drawer: Drawer) -> TcpipeError | None:

@@ -21,12 +21,12 @@ from tcpipe.formats.bucket_directories import FetchedShards, fetch_directory_by_
 from tcpipe.formats.commits import State
 from tcpipe.formats.dataset_card import RunSource
 from tcpipe.formats.dataset_files import FileFormat, is_shard, read_card, read_samples, sample_columns
-from tcpipe.formats.json_files import digest, plain, recast
+from tcpipe.formats.integrity import CHECKSUMS, Checksum, compute_checksums, read_checksums
+from tcpipe.formats.json_files import convert_record, digest, to_plain
 from tcpipe.formats.run_documents import LogOrigin, MapDocument
-from tcpipe.formats.seals import CHECKSUMS, Checksum, file_checksums, read_checksums
 from tcpipe.formats.stored_runs import RunDirectory
-from tcpipe.pipeline.dataset.runs import Chosen, choose_runs
-from tcpipe.pipeline.recordings import each_drive_once
+from tcpipe.pipeline.dataset.runs import SelectedRuns, choose_runs
+from tcpipe.pipeline.duplicates import remove_duplicates
 from tcpipe.recipe import Recipe
 from tcpipe.splits.regions import Regions
 from tcpipe.store import Store
@@ -68,7 +68,7 @@ class Inputs:
     again: Mapping[str, NDArray[np.bool_]]
     """By run: which of its segments another run has too."""
     digest: str
-    chosen: Chosen
+    chosen: SelectedRuns
     findings: tuple[Finding, ...]
     """On the choice of runs."""
     covariates: tuple[CovariateTable, ...] = ()
@@ -97,7 +97,7 @@ def choose_inputs(
         problems += error.problems
     if problems:
         raise DatasetError(*problems)
-    once = each_drive_once(chosen.runs, {run_id: log.sha256 for run_id, log in chosen.logs.items()})
+    once = remove_duplicates(chosen.runs, {run_id: log.sha256 for run_id, log in chosen.logs.items()})
     runs = once.runs
     documents = tuple(store.map_document(name) for name in names)
     maps = partial(_map_files, store, documents)
@@ -110,12 +110,12 @@ def choose_inputs(
         {
             "versions": [__version__, TABLES_VERSION],
             "recipe": options.recipe,
-            "runs": [{key: value for key, value in plain(run).items() if key != "samples"} for run in sources],
+            "runs": [{key: value for key, value in to_plain(run).items() if key != "samples"} for run in sources],
             "maps": list(zip(names, map_sha256, strict=True)),
             "region": None if region is None else region.decode("utf-8", "replace"),
             "format": options.file_format,
             **({"covariates": [(of.name, of.checksum) for of in covariates]} if covariates else {}),
-            **({} if options.earlier is None else {"kept_split": _table_digest(options.earlier)}),
+            **({} if options.earlier is None else {"kept_split": _hash_table(options.earlier)}),
         }
     )
     findings = (*chosen.findings, *once.findings)
@@ -143,7 +143,7 @@ def _map_files(store: Store, maps: Sequence[MapDocument]) -> tuple[tuple[Path, F
 
 def _map_digest(name: str, path: Path) -> str:
     """Return one hash over a map's files; `MapError` if they are not as they were written: a lost one would read as no data."""
-    found, wrong = file_checksums(path), list[str]()
+    found, wrong = compute_checksums(path), list[str]()
     try:
         recorded = read_checksums(path)
         names = {*found, *recorded} - {CHECKSUMS}
@@ -166,7 +166,7 @@ def _digest_of(files: Mapping[str, Checksum], below: str = "") -> str:
     )
 
 
-def earlier_splits(dataset: str | Path) -> pa.Table:
+def read_earlier_splits(dataset: str | Path) -> pa.Table:
     """Return ``sample_id``, ``split`` and, where there is one, ``fold`` of a dataset of any data model; `DatasetError` if it is none."""
     directory, _ = fetch_directory_by_range(dataset, by_range=is_shard)
     if read_card(directory).redaction is not None:
@@ -199,10 +199,10 @@ def choose_maps(store: Store, names: Sequence[str]) -> tuple[str, ...]:
 def run_source(run: RunDirectory, log: LogOrigin) -> RunSource:
     """Return what the card says of a run: its log, by name and sha256, its recipe, robot, tags, metres, findings and error budget."""
     named = {"run_id": run.run_id, "recipe_id": run.recipe_id, "sha256": log.sha256}
-    return recast(run.facts, RunSource, logs=tuple(Path(path).name for path in log.paths), **named)
+    return convert_record(run.facts, RunSource, logs=tuple(Path(path).name for path in log.paths), **named)
 
 
-def _table_digest(table: pa.Table) -> str:
+def _hash_table(table: pa.Table) -> str:
     """Return the sha256 (hex) of a table's values, hashed piece by piece."""
     found = hashlib.sha256()
     for batch in table.to_batches(max_chunksize=65_536):

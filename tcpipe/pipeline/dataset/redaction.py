@@ -23,7 +23,7 @@ from tcpipe.pipeline.dataset.inputs import Inputs
 from tcpipe.recipe import Recipe
 from tcpipe.splits.audit import HeldOut
 from tcpipe.tables.catalogue import read_catalogue
-from tcpipe.tables.columns import floats, lonlat_deg
+from tcpipe.tables.columns import read_lonlat_deg, to_floats
 from tcpipe.tables.findings import Finding, Subject
 
 PLANE = "+proj=tmerc +lat_0=0 +lon_0=0 +k=1 +x_0=0 +y_0=0 +datum=WGS84 +type=crs"
@@ -68,11 +68,11 @@ class Redaction:
 
     def in_plane(self, lonlat_deg: Floats) -> Floats:
         """Return where places (lon, lat) [deg], shape (..., 2), lie from the new origin, along the maps' grid, in metres of ground."""
-        return (_in_map_plane(lonlat_deg, self.gnss_crs, self.map_crs) - self.origin_xy_m) / self.scale
+        return (_project_to_map(lonlat_deg, self.gnss_crs, self.map_crs) - self.origin_xy_m) / self.scale
 
     def placed(self, lonlat_deg: Floats) -> Floats:
         """Return where places (lon, lat) [deg], shape (..., 2), are said to lie."""
-        return _laid_down(self.in_plane(lonlat_deg))
+        return _move_to_origin(self.in_plane(lonlat_deg))
 
     def segment_id(self, name: str, run_id: str) -> str:
         """Return what a run's segment is called."""
@@ -83,9 +83,11 @@ class Redaction:
 
         In its run's own frame x is towards the east: against the grid that would tell the meridian's convergence, and so the latitude.
         """
-        ends = {end: self.in_plane(lonlat_deg(samples, end)) for end in _ENDS}
+        ends = {end: self.in_plane(read_lonlat_deg(samples, end)) for end in _ENDS}
         columns: dict[str, Any] = {
-            f"{end}_{axis}_deg": _laid_down(xy_m)[:, at] for end, xy_m in ends.items() for at, axis in enumerate(_AXES)
+            f"{end}_{axis}_deg": _move_to_origin(xy_m)[:, at]
+            for end, xy_m in ends.items()
+            for at, axis in enumerate(_AXES)
         }
         columns |= {
             f"{end}_{axis}_m": (xy_m[:, at] / _PLACE_M).round() * _PLACE_M
@@ -93,7 +95,7 @@ class Redaction:
             for at, axis in enumerate("xy")
         }
         columns["course_rad"] = np.arctan2(*(ends["end"] - ends["start"]).T[::-1])
-        columns["height_min_m"] = floats(samples, "height_min_m") - self.height_m
+        columns["height_min_m"] = to_floats(samples, "height_min_m") - self.height_m
         runs = samples.column("run_id").to_pylist()
         columns["run_id"] = [self.runs[run_id] for run_id in runs]
         columns["map"] = [self.maps[name] for name in samples.column("map").to_pylist()]
@@ -107,12 +109,12 @@ class Redaction:
 
 
 @cache
-def _between(source: str, target: str) -> Transformer:
+def _make_transformer(source: str, target: str) -> Transformer:
     return Transformer.from_crs(source, target, always_xy=True)
 
 
-def _in_map_plane(lonlat_deg: Floats, gnss_crs: str, map_crs: str) -> Floats:
-    to_map = _between(gnss_crs, map_crs)
+def _project_to_map(lonlat_deg: Floats, gnss_crs: str, map_crs: str) -> Floats:
+    to_map = _make_transformer(gnss_crs, map_crs)
     return np.stack(to_map.transform(lonlat_deg[..., 0], lonlat_deg[..., 1]), axis=-1)
 
 
@@ -125,8 +127,8 @@ def _scale(samples: SampleTable, gnss_crs: str, map_crs: str) -> float:
     """
     plane_chord = chord_chord = 0.0
     for piece in samples.pieces(ROWS_PER_GROUP):
-        start, end = (_in_map_plane(lonlat_deg(piece, end), gnss_crs, map_crs) for end in _ENDS)
-        chord_m = floats(piece, "chord_m")
+        start, end = (_project_to_map(read_lonlat_deg(piece, end), gnss_crs, map_crs) for end in _ENDS)
+        chord_m = to_floats(piece, "chord_m")
         plane_chord += float(np.hypot(*(end - start).T) @ chord_m)
         chord_chord += float(chord_m @ chord_m)
     scale = plane_chord / chord_chord if chord_chord else 1.0
@@ -138,13 +140,13 @@ def _scale(samples: SampleTable, gnss_crs: str, map_crs: str) -> float:
     return scale
 
 
-def _laid_down(xy_m: Floats) -> Floats:
+def _move_to_origin(xy_m: Floats) -> Floats:
     """Return (lon, lat) [deg] of places in the plane at 0 N 0 E, shape (..., 2)."""
-    lonlat = _between(PLANE, "EPSG:4326").transform(xy_m[..., 0], xy_m[..., 1])
+    lonlat = _make_transformer(PLANE, "EPSG:4326").transform(xy_m[..., 0], xy_m[..., 1])
     return np.stack(lonlat, axis=-1).round(_PLACE_DIGITS_DEG)
 
 
-def redaction_of(content: Content, inputs: Inputs, recipe: Recipe) -> Redaction:
+def make_redaction(content: Content, inputs: Inputs, recipe: Recipe) -> Redaction:
     """Return how a dataset is redacted; `DatasetError` where its maps lie in different planes, of which one offset makes none."""
     planes = {source.grid.crs for source in content.sources}
     if len(planes) > 1:
@@ -164,7 +166,7 @@ def redaction_of(content: Content, inputs: Inputs, recipe: Recipe) -> Redaction:
     )
 
 
-def redacted_content(content: Content, redaction: Redaction) -> Content:
+def redact_content(content: Content, redaction: Redaction) -> Content:
     """Return content whose samples have the names and places that are told."""
     sampled = content.samples.sampled
     footprints = replace(redaction, gnss_crs="EPSG:4326").placed(sampled.footprint_lonlat_deg)
@@ -175,7 +177,7 @@ def redacted_content(content: Content, redaction: Redaction) -> Content:
     return replace(content, samples=samples, registrations=[() for _ in content.registrations])
 
 
-def redacted_inputs(inputs: Inputs, redaction: Redaction) -> Inputs:
+def redact_inputs(inputs: Inputs, redaction: Redaction) -> Inputs:
     """Return inputs whose runs are called as is told, without what their logs are called."""
     runs = tuple(replace(run, run_id=redaction.runs[run.run_id], logs=(), tags=None) for run in inputs.sources)
     return replace(inputs, sources=runs)
@@ -199,10 +201,10 @@ def _redact_finding(finding: Finding) -> Finding:
     )
 
 
-def redacted_card(card: DatasetCard, redaction: Redaction) -> DatasetCard:
+def redact_card(card: DatasetCard, redaction: Redaction) -> DatasetCard:
     """Return a card, made from redacted inputs and samples, without what is left in it of names and places."""
     region = card.split.region
-    told = None if region is None else {kind: _moved(of, redaction) for kind, of in region.items()}
+    told = None if region is None else {kind: _move_polygon(of, redaction) for kind, of in region.items()}
     bare = replace(Recipe(), **{name: getattr(card.recipe, name) for name in _KEPT_SECTIONS})
     findings, maps = redact_findings(card.findings), tuple(_map(source, redaction) for source in card.maps)
     runs = tuple(replace(run, findings=redact_findings(run.findings)) for run in card.runs)
@@ -210,7 +212,9 @@ def redacted_card(card: DatasetCard, redaction: Redaction) -> DatasetCard:
         card,
         recipe=bare,
         run_tags=None,
-        split=replace(card.split, region=told, audit=tuple(_of_ground(of, redaction.scale) for of in card.split.audit)),
+        split=replace(
+            card.split, region=told, audit=tuple(_convert_distances(of, redaction.scale) for of in card.split.audit)
+        ),
         label=replace(card.label, includes=()),
         runs=runs,
         maps=maps,
@@ -225,7 +229,7 @@ _KEPT_SECTIONS = ("fuse", "gate", "segment", "label", "sample", "split", "covari
 """Of the recipe: the others tell topics, files and robots by name."""
 
 
-def _of_ground(held: HeldOut, scale: float) -> HeldOut:
+def _convert_distances(held: HeldOut, scale: float) -> HeldOut:
     """Return what the audit found with its distances in metres of ground."""
     names = [of.name for of in fields(held) if of.name.endswith("_m") and getattr(held, of.name) is not None]
     return replace(held, **{name: getattr(held, name) / scale for name in names})
@@ -249,37 +253,37 @@ def _map(source: MapSource, redaction: Redaction) -> MapSource:
     )
 
 
-def _moved(polygon: PolygonGeometry, redaction: Redaction) -> PolygonGeometry:
+def _move_polygon(polygon: PolygonGeometry, redaction: Redaction) -> PolygonGeometry:
     move = replace(redaction, gnss_crs="EPSG:4326").placed
-    return replace(polygon, coordinates=moved_coordinates(polygon.coordinates, move))
+    return replace(polygon, coordinates=move_coordinates(polygon.coordinates, move))
 
 
-def redacted_features(collection: FeatureCollection, redaction: Redaction) -> FeatureCollection:
+def redact_features(collection: FeatureCollection, redaction: Redaction) -> FeatureCollection:
     """Return polygons (WGS84) where they are said to lie: whole cells of the maps' plane, which divided would tell its scale."""
     redaction = replace(redaction, scale=1.0)
-    features = (replace(of, geometry=_moved(of.geometry, redaction)) for of in collection.features)
+    features = (replace(of, geometry=_move_polygon(of.geometry, redaction)) for of in collection.features)
     return replace(collection, features=tuple(features))
 
 
-def moved_coordinates(coordinates: Any, move: Callable[[Floats], Floats]) -> Any:
+def move_coordinates(coordinates: Any, move: Callable[[Floats], Floats]) -> Any:
     """Return the coordinates of a GeoJSON geometry with each position moved."""
     if isinstance(coordinates[0], int | float):
         return tuple(move(np.array(coordinates[:2], np.float64)).round(9).tolist())
-    return tuple(moved_coordinates(part, move) for part in coordinates)
+    return tuple(move_coordinates(part, move) for part in coordinates)
 
 
-def what_is_told(card: DatasetCard, samples: pa.Table) -> Iterator[str]:
+def find_leaks(card: DatasetCard, samples: pa.Table) -> Iterator[str]:
     """Yield a line for each thing that a redacted dataset tells and should not; ``samples`` has where their ends lie."""
     for end in _ENDS:
-        lon, lat, x_m, y_m = (floats(samples, f"{end}_{name}") for name in ("lon_deg", "lat_deg", "x_m", "y_m"))
-        plane_x_m, plane_y_m = _between("EPSG:4326", PLANE).transform(lon, lat)
+        lon, lat, x_m, y_m = (to_floats(samples, f"{end}_{name}") for name in ("lon_deg", "lat_deg", "x_m", "y_m"))
+        plane_x_m, plane_y_m = _make_transformer("EPSG:4326", PLANE).transform(lon, lat)
         if (np.hypot(x_m - plane_x_m, y_m - plane_y_m) > _REDACTED_WITHIN_M).any():
             yield (
                 f"it is said to be redacted, but {end}_x_m and {end}_y_m are not along its lon and lat: their angle tells the latitude; "
                 "build it again"
             )
         for axis in _AXES:
-            if (np.abs(floats(samples, f"{end}_{axis}_deg")) > REACH_DEG).any():
+            if (np.abs(to_floats(samples, f"{end}_{axis}_deg")) > REACH_DEG).any():
                 yield f"it is said to be redacted, but {end}_{axis}_deg is beyond {REACH_DEG:g} degrees"
     elsewhere = [source for source in card.maps if source.crs != PLANE]
     yield from (f"it is said to be redacted, but map {source.name} has the CRS {source.crs}" for source in elsewhere)
@@ -296,7 +300,7 @@ def what_is_told(card: DatasetCard, samples: pa.Table) -> Iterator[str]:
 
 def _find_revealed_scale(samples: pa.Table) -> Iterator[str]:
     """Yield a line where distances of ends are not those of the chords, beyond what rounding places leaves."""
-    ratio, _, most = plane_per_chord(samples)
+    ratio, _, most = compute_plane_per_chord(samples)
     if abs(ratio - 1.0) > max(most, _SCALE_VARIES):
         yield (
             f"it is said to be redacted, but distances are {ratio:.6f} of chord_m: the scale of the maps' plane tells the place; "
@@ -304,7 +308,7 @@ def _find_revealed_scale(samples: pa.Table) -> Iterator[str]:
         )
 
 
-def plane_per_chord(samples: pa.Table) -> tuple[float, float, float]:
+def compute_plane_per_chord(samples: pa.Table) -> tuple[float, float, float]:
     """Return how long a metre of ``chord_m`` is in x and y, the standard deviation that rounding leaves, and the most; without samples inf.
 
     Segments that follow one another are added up: only their two outer ends are rounded.
@@ -312,9 +316,9 @@ def plane_per_chord(samples: pa.Table) -> tuple[float, float, float]:
     samples = samples.sort_by([("run_id", "ascending"), ("start_ns", "ascending")])
     if not samples.num_rows:
         return 1.0, math.inf, math.inf
-    start_m, end_m = (np.stack([floats(samples, f"{end}_{axis}_m") for axis in "xy"], axis=-1) for end in _ENDS)
-    course_rad = floats(samples, "course_rad")
-    chord_m = floats(samples, "chord_m")[:, None] * np.stack([np.cos(course_rad), np.sin(course_rad)], axis=-1)
+    start_m, end_m = (np.stack([to_floats(samples, f"{end}_{axis}_m") for axis in "xy"], axis=-1) for end in _ENDS)
+    course_rad = to_floats(samples, "course_rad")
+    chord_m = to_floats(samples, "chord_m")[:, None] * np.stack([np.cos(course_rad), np.sin(course_rad)], axis=-1)
     follows = np.hypot(*(start_m[1:] - end_m[:-1]).T) < _PLACE_M / 2
     first = np.flatnonzero(np.concatenate([[True], ~follows]))
     last = np.append(first[1:], len(start_m)) - 1

@@ -26,7 +26,7 @@ CHOICE_CODES = frozenset({"run-damaged", "run-gone", "run-ingested-otherwise"})
 
 
 @dataclass(frozen=True, slots=True)
-class Chosen:
+class SelectedRuns:
     """Runs of one robot and recipe, and what belongs to them but cannot be used."""
 
     runs: tuple[RunDirectory, ...]
@@ -44,16 +44,16 @@ class Chosen:
 
 def choose_runs(
     store: Store, recipe: Recipe, *, state: State | None = None, robot: str | None, tags: Mapping[str, str]
-) -> Chosen:
+) -> SelectedRuns:
     """Return the runs to pool, those that carry all of the tags, each proved; two robots are never pooled unasked."""
     found, key = store.ingestions(state=state), ingest_key(recipe)
     mine = [run for run in found.finished if run.facts.ingest_key == key]
     if not mine:
-        raise DatasetError(*_nothing_to_pool(store, found))
-    runs, logs, damaged = _proved(store, _of_one_robot(store, _tagged(store, mine, tags), robot))
+        raise DatasetError(*_describe_no_runs(store, found))
+    runs, logs, damaged = _verify_runs(store, _select_one_robot(store, _select_tagged(store, mine, tags), robot))
     known = {run.run_id for run in mine}
     for (run_id, recipe_id), line in found.damaged.items():
-        if run_id not in known and _belongs(found.rows[run_id, recipe_id], robot, tags):
+        if run_id not in known and _is_selected(found.rows[run_id, recipe_id], robot, tags):
             damaged.setdefault(run_id, line)
     if not runs:
         raise DatasetError(
@@ -62,8 +62,8 @@ def choose_runs(
     if robot is None:
         _refuse_unlike(store, [run for run in runs if run.facts.robot == GENERIC])
     settled = {*known, *damaged}
-    others = {run.run_id: run.recipe_id for run in found.finished if _belongs(run.facts, robot, tags)}
-    older = {name: str(of.data_model_version) for name, of in found.outdated.items() if _belongs(of, robot, tags)}
+    others = {run.run_id: run.recipe_id for run in found.finished if _is_selected(run.facts, robot, tags)}
+    older = {name: str(of.data_model_version) for name, of in found.outdated.items() if _is_selected(of, robot, tags)}
     others, older = ({name: of for name, of in each.items() if name not in settled} for each in (others, older))
     left_out = {*damaged, *others, *older}
     otherwise = {run_id: {"what": "recipe", "has": of} for run_id, of in others.items()}
@@ -72,7 +72,7 @@ def choose_runs(
     missing = tuple(_find_left_out(found, "run-ingested-otherwise", otherwise))
     broken = tuple(_find_left_out(found, "run-damaged", dict.fromkeys(damaged, nothing), force=True))
     superseded = frozenset(left_out | found.superseded.keys())
-    return Chosen(tuple(runs), logs, missing, broken, superseded, tuple(_find_expected(found)))
+    return SelectedRuns(tuple(runs), logs, missing, broken, superseded, tuple(_find_expected(found)))
 
 
 def _find_expected(found: Ingestions) -> Iterator[Finding]:
@@ -85,13 +85,13 @@ def _find_left_out(
     found: Ingestions, code: str, names: Mapping[str, Mapping[str, str]], *, force: bool = False
 ) -> Iterator[Finding]:
     """Yield a finding on each run, of which ``names`` holds what the finding names, with the command that ingests their logs again."""
-    command = f"tcpipe ingest {_logs_of(found, names)}{' --force' if force else ''}" if names else ""
+    command = f"tcpipe ingest {_suggest_logs(found, names)}{' --force' if force else ''}" if names else ""
     for run_id in sorted(names):
         subject, remedy = Subject("run", run_id), Remedy("ingest", command=command)
         yield make_finding(code, subject, names=names[run_id], remedies=[remedy])
 
 
-def _of_one_robot(store: Store, runs: list[RunDirectory], robot: str | None) -> list[RunDirectory]:
+def _select_one_robot(store: Store, runs: list[RunDirectory], robot: str | None) -> list[RunDirectory]:
     robots = sorted({run.facts.robot for run in runs})
     wanted = [run for run in runs if robot is None or run.facts.robot == robot]
     if not wanted:
@@ -103,16 +103,16 @@ def _of_one_robot(store: Store, runs: list[RunDirectory], robot: str | None) -> 
 
 def _refuse_unlike(store: Store, runs: Iterable[RunDirectory]) -> None:
     """Raise an error where runs of a robot that no profile knows are of robots whose sensors differ."""
-    groups = alike({run.run_id: run.facts.log.sensors if run.facts.log else {} for run in runs})
+    groups = group_similar_runs({run.run_id: run.facts.log.sensors if run.facts.log else {} for run in runs})
     if len(groups) > 1:
         raise DatasetError(
             f"{store.root}: the runs of robot {GENERIC} are not all of one robot: their sensors differ; wanted one: tag each "
             "(tcpipe ingest LOG --tag robot=NAME) and choose it with --tag robot=NAME, or pool them with --robot generic",
-            *(f"{_named(names)}: {in_words(seen)}" for names, seen in groups),
+            *(f"{_format_names(names)}: {format_robot(seen)}" for names, seen in groups),
         )
 
 
-def _tagged(store: Store, runs: list[RunDirectory], tags: Mapping[str, str]) -> list[RunDirectory]:
+def _select_tagged(store: Store, runs: list[RunDirectory], tags: Mapping[str, str]) -> list[RunDirectory]:
     """Return the runs that carry all of the tags; `DatasetError` with the tags there are where none does."""
     chosen = [run for run in runs if tags.items() <= run.facts.tags.items()]
     if not chosen:
@@ -122,7 +122,7 @@ def _tagged(store: Store, runs: list[RunDirectory], tags: Mapping[str, str]) -> 
     return chosen
 
 
-def _nothing_to_pool(store: Store, found: Ingestions) -> list[str]:
+def _describe_no_runs(store: Store, found: Ingestions) -> list[str]:
     """Say why no run of the store can be used."""
     if not (found.finished or found.outdated or found.damaged):
         return [f"{store.root}: no runs in the store; ingest one: tcpipe ingest LOG"]
@@ -141,7 +141,7 @@ def _nothing_to_pool(store: Store, found: Ingestions) -> list[str]:
     return [*([f"{store.root}: {head}"] if head else []), *dict.fromkeys(found.damaged.values())]
 
 
-def _proved(
+def _verify_runs(
     store: Store, runs: Sequence[RunDirectory]
 ) -> tuple[list[RunDirectory], dict[str, LogOrigin], dict[str, str]]:
     """Return the runs that are as they were written, what is known of their logs, and by run what is wrong with the others."""
@@ -153,19 +153,19 @@ def _proved(
     return [run for run in runs if run.run_id in logs], logs, damaged
 
 
-def _belongs(known: RunFacts | RunSource, robot: str | None, tags: Mapping[str, str]) -> bool:
+def _is_selected(known: RunFacts | RunSource, robot: str | None, tags: Mapping[str, str]) -> bool:
     """Tell whether a run is of the robot and the tags that were asked for, as far as is known."""
     its_robot = robot is None or known.robot == robot
     return its_robot and (known.tags is None or tags.items() <= known.tags.items())
 
 
-def _named(run_ids: Iterable[str], most: int = 3) -> str:
+def _format_names(run_ids: Iterable[str], most: int = 3) -> str:
     """Return the first names, and how many more there are."""
     names = sorted(run_ids)
     return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
 
 
-def _logs_of(found: Ingestions, run_ids: Iterable[str]) -> str:
+def _suggest_logs(found: Ingestions, run_ids: Iterable[str]) -> str:
     """Return what to give to `tcpipe ingest` for the logs of runs: their folder, where they have one in common."""
     names = set(run_ids)
     logs = [row.log.source for row in found.rows.values() if row.log and row.run_id in names]
@@ -178,11 +178,11 @@ def _logs_of(found: Ingestions, run_ids: Iterable[str]) -> str:
 
 
 def find_gone_runs(
-    before: Sequence[RunSource], chosen: Chosen, *, robot: str | None, tags: Mapping[str, str]
+    before: Sequence[RunSource], chosen: SelectedRuns, *, robot: str | None, tags: Mapping[str, str]
 ) -> tuple[Finding, ...]:
     """Return a finding on each run of the dataset that is replaced which the store no longer has, if it was not left out by choice."""
     here = {run.run_id for run in chosen.runs} | chosen.left_out
-    gone = [run.run_id for run in before if run.run_id not in here and _belongs(run, robot, tags)]
+    gone = [run.run_id for run in before if run.run_id not in here and _is_selected(run, robot, tags)]
     return tuple(make_finding("run-gone", Subject("run", run_id)) for run_id in sorted(gone))
 
 
@@ -190,7 +190,7 @@ Seen = dict[str, tuple[str, str, str]]
 """By role: a sensor's topic, its type and its frame, as far as a run shows them."""
 
 
-def alike(sensors: Mapping[str, Mapping[str, Sensor | KnownSensor]]) -> list[tuple[list[str], Seen]]:
+def group_similar_runs(sensors: Mapping[str, Mapping[str, Sensor | KnownSensor]]) -> list[tuple[list[str], Seen]]:
     """Return groups of runs, and what is seen of each, so that all sensors within one agree in type, frame and namespace.
 
     A run belongs to the first group with which it shares a role and differs in none: a sensor may be off for a drive.
@@ -204,7 +204,7 @@ def alike(sensors: Mapping[str, Mapping[str, Sensor | KnownSensor]]) -> list[tup
     for run_id, mine in sorted(seen.items(), key=lambda item: (-len(item[1]), item[0])):
         for runs, theirs in groups:
             shared = mine.keys() & theirs.keys()
-            if all(_agree(mine[role], theirs[role]) for role in shared) and (shared or not (mine or theirs)):
+            if all(_is_similar(mine[role], theirs[role]) for role in shared) and (shared or not (mine or theirs)):
                 runs.append(run_id)
                 theirs.update({role: of for role, of in mine.items() if role not in theirs})
                 break
@@ -213,7 +213,7 @@ def alike(sensors: Mapping[str, Mapping[str, Sensor | KnownSensor]]) -> list[tup
     return groups
 
 
-def in_words(seen: Seen) -> str:
+def format_robot(seen: Seen) -> str:
     """Return what is seen of a robot as one line."""
     parts = (f"{role} {topic} ({kind}, frame {frame or 'none'})" for role, (topic, kind, frame) in sorted(seen.items()))
     return ", ".join(parts) or "no sensor is known"
@@ -223,11 +223,11 @@ def _seen(sensors: Mapping[str, Sensor | KnownSensor]) -> Seen:
     return {role: (of.topic, of.type_name, of.frame_id.strip("/")) for role, of in sensors.items()}
 
 
-def _agree(one: tuple[str, str, str], other: tuple[str, str, str]) -> bool:
-    return one[1:] == other[1:] and not _in_two_namespaces(one[0], other[0])
+def _is_similar(one: tuple[str, str, str], other: tuple[str, str, str]) -> bool:
+    return one[1:] == other[1:] and not _is_in_two_namespaces(one[0], other[0])
 
 
-def _in_two_namespaces(one: str, other: str) -> bool:
+def _is_in_two_namespaces(one: str, other: str) -> bool:
     """Return whether two topics are one but for what their names begin with: /imu, /rover1/imu and /rover2/imu."""
     a, b = one.strip("/").split("/"), other.strip("/").split("/")
     return a != b and (a[1:] == b or a == b[1:] or (a[1:] == b[1:] and len(a) > 1))

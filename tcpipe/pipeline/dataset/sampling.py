@@ -17,21 +17,21 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from tcpipe.errors import TcpipeError
-from tcpipe.execution import run_all, sound
+from tcpipe.execution import run_all, unwrap_result
 from tcpipe.formats.bucket_directories import FetchedShards
 from tcpipe.formats.dataset_files import LayerPixels
-from tcpipe.formats.json_files import compact_json, of_json
+from tcpipe.formats.json_files import parse_typed_json, to_compact_json
 from tcpipe.formats.maps.map_files import MapFile, open_map
 from tcpipe.formats.place import Place
 from tcpipe.progress import Meter
 from tcpipe.recipe import SampleConfig
 from tcpipe.stages.sample import Sampled, check_alike, sample_on_maps
-from tcpipe.tables.columns import floats
+from tcpipe.tables.columns import to_floats
 from tcpipe.tables.findings import Finding
 from tcpipe.tables.levels import PLACED_SEGMENTS
-from tcpipe.terrain.layers import Layer, in_order, joint
+from tcpipe.terrain.layers import Layer, join_layers, sort_layers
 from tcpipe.terrain.sampling import Patches
-from tcpipe.terrain.sampling_kernel import morton
+from tcpipe.terrain.sampling_kernel import compute_morton
 from tcpipe.terrain.tiles import TilePool, level_for
 
 logger = logging.getLogger("tcpipe")
@@ -109,7 +109,7 @@ class Spool:
         end = max(size - _SIZE_BYTES, 0)
         said = int.from_bytes(self.place.read_range(name, end, _SIZE_BYTES), "little")
         try:
-            sampled = _of_bytes(self.place.read_range(name, max(end - said, 0), min(said, end)))
+            sampled = _read_sampled(self.place.read_range(name, max(end - said, 0), min(said, end)))
         except (ValueError, OSError, EOFError, KeyError, BadZipFile):
             sampled = None
         if sampled is None or size != len(sampled.kept) * sum(map(self._patch_bytes, self.layers)) + said + _SIZE_BYTES:
@@ -213,8 +213,8 @@ def sample_all_segments(
     """
     sources = [open_map(*of) for of in maps()]
     check_alike(sources)
-    rows = list(_batch_rows(segments))
-    layers = in_order(joint([source.layers for source in sources]))
+    rows = list(_iterate_batches(segments))
+    layers = sort_layers(join_layers([source.layers for source in sources]))
     spool = Spool(workers.waiting.below("pixels"), layers, config.patch_px, kept=workers.cluster is not None)
     if there := len(spool.place.files()):
         logger.info("going on where it was: %d of %d batches are sampled", there, len(rows))
@@ -227,13 +227,13 @@ def sample_all_segments(
     try:
         with closing(run_all(_sample_batch, batches, jobs=workers.jobs, cluster=workers.cluster)) as outcomes:
             for outcome in outcomes:
-                part, batch = sound(outcome), outcome.index
+                part, batch = unwrap_result(outcome), outcome.index
                 meter.add(len(rows[batch]))
                 kept = rows[batch][part.kept]
                 lost_by[rows[batch]] = part.lost_by
-                slots[kept[_in_order(ranks[kept])]] = (batch << _ROW_BITS) + np.arange(len(kept))
+                slots[kept[_sort_rows(ranks[kept])]] = (batch << _ROW_BITS) + np.arange(len(kept))
                 counts[batch], findings[batch] = len(kept), part.findings
-                for name, values in _columns(part).items():
+                for name, values in _make_columns(part).items():
                     whole = columns.setdefault(name, np.zeros((len(lost_by), *values.shape[1:]), values.dtype))
                     whole[kept] = values
     finally:
@@ -250,32 +250,32 @@ def sample_all_segments(
 def _as_bytes(sampled: Sampled) -> bytes:
     arrays: dict[str, Any] = {name: getattr(sampled, name) for name in _SAMPLED} | sampled.patches.columns()
     with BytesIO() as file:
-        np.savez(file, findings=np.array(compact_json(sampled.findings)), **arrays)
+        np.savez(file, findings=np.array(to_compact_json(sampled.findings)), **arrays)
         return file.getvalue()
 
 
-def _of_bytes(data: bytes) -> Sampled:
+def _read_sampled(data: bytes) -> Sampled:
     with np.load(BytesIO(data), allow_pickle=False) as held:
         columns = dict(held)
-    findings = of_json(columns.pop("findings").item(), tuple[Finding, ...], "findings")
+    findings = parse_typed_json(columns.pop("findings").item(), tuple[Finding, ...], "findings")
     rest = {name: columns.pop(name) for name in _SAMPLED}
     return Sampled(patches=Patches({}, **columns), findings=findings, **rest)
 
 
-def _in_order(ranks: NDArray[np.uint64]) -> NDArray[np.intp]:
+def _sort_rows(ranks: NDArray[np.uint64]) -> NDArray[np.intp]:
     """Return the rows of a batch in the order of the dataset."""
     return np.argsort(ranks, kind="stable")
 
 
-def _columns(sampled: Sampled) -> dict[str, NDArray[Any]]:
+def _make_columns(sampled: Sampled) -> dict[str, NDArray[Any]]:
     """Return what is said of the patches, an array each."""
     return {**sampled.patches.columns(), **{name: getattr(sampled, name) for name in _PLACING}}
 
 
-def _batch_rows(segments: pa.Table) -> Iterator[NDArray[np.int64]]:
+def _iterate_batches(segments: pa.Table) -> Iterator[NDArray[np.int64]]:
     """Yield the rows of each batch, rising."""
-    places = [np.floor((floats(segments, f"start_{axis}_deg") + 360.0) / _CELL_DEG) for axis in ("lon", "lat")]
-    order = np.argsort(morton(*(place.astype(np.int64) for place in places)), kind="stable")
+    places = [np.floor((to_floats(segments, f"start_{axis}_deg") + 360.0) / _CELL_DEG) for axis in ("lon", "lat")]
+    order = np.argsort(compute_morton(*(place.astype(np.int64) for place in places)), kind="stable")
     for first in range(0, len(order), _BATCH_ROWS):
         yield np.sort(order[first : first + _BATCH_ROWS])
 
@@ -285,15 +285,15 @@ def _sample_batch(batch: _Batch) -> Sampled | TcpipeError:
     try:
         if (found := batch.spool.found(batch.number)) is not None:
             return found
-        held = [_held_map(*of, batch.config) for of in batch.maps()]
+        held = [_reuse_map(*of, batch.config) for of in batch.maps()]
         sources, pools = [each.source for each in held], [each.tiles for each in held]
         sampled = sample_on_maps(batch.segments, sources, batch.config, gnss_crs=batch.gnss_crs, pools=pools)
-        return batch.spool.write(batch.number, _in_order(batch.ranks[sampled.kept]), sampled)
+        return batch.spool.write(batch.number, _sort_rows(batch.ranks[sampled.kept]), sampled)
     except TcpipeError as error:
         return error
 
 
-def _held_map(path: Path, fetched: FetchedShards | None, config: SampleConfig) -> _HeldMap:
+def _reuse_map(path: Path, fetched: FetchedShards | None, config: SampleConfig) -> _HeldMap:
     """Return a map as this process's last batch left it: the next one lies beside it and wants the same tiles."""
     held = _held.pop(path, None)
     if held is None:

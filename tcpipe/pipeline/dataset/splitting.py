@@ -17,22 +17,22 @@ from tcpipe.errors import DatasetError
 from tcpipe.formats.dataset_card import KeptSplit
 from tcpipe.formats.geojson import PolygonGeometry
 from tcpipe.recipe import Recipe
-from tcpipe.recipe.suggestions import recipe_key
+from tcpipe.recipe.suggestions import format_recipe_key
 from tcpipe.splits.assignment import EXCLUDED, NO_FOLD, Assignment, assign_splits
 from tcpipe.splits.audit import HeldOut, audit_leakage
 from tcpipe.splits.ranking import hash_ranks
 from tcpipe.splits.regions import Regions, project_regions
 from tcpipe.stages.sample import Sampled
-from tcpipe.tables.columns import integers
+from tcpipe.tables.columns import to_integers
 from tcpipe.terrain.grid import MapGrid
-from tcpipe.terrain.projection import Projection, area_of, parse_crs
+from tcpipe.terrain.projection import Projection, compute_area, parse_crs
 
 _MARGIN_DEG = 0.05
 """Regions are followed this far around the samples (3 km or more below 60° latitude)."""
 
 
 @dataclass(frozen=True, slots=True)
-class Drawn:
+class SplitResult:
     """Split and fold of every patch, the buffer that was kept [m], the audit, and what an earlier dataset decided."""
 
     assigned: Assignment
@@ -51,7 +51,7 @@ def draw_splits(
     *,
     earlier: pa.Table | None = None,
     tags: Mapping[str, str] | None = None,
-) -> Drawn:
+) -> SplitResult:
     """Assign every patch to a split by its whole footprint, and audit the result.
 
     Parameters
@@ -70,17 +70,17 @@ def draw_splits(
     """
     rules, chord_m = recipe.split, recipe.segment.chord_m
     buffer_m = math.sqrt(2.0) * chord_m if rules.buffer_m is None else rules.buffer_m
-    starts_ns = integers(segments, "start_ns")
-    run, run_names = _runs(segments, starts_ns)
+    starts_ns = to_integers(segments, "start_ns")
+    run, run_names = _number_runs(segments, starts_ns)
     run, starts_ns = run[sampled.kept], starts_ns[sampled.kept]
     ids = segments.column("segment_id").take(pa.array(sampled.kept))
-    kept = None if earlier is None else _kept(ids, earlier)
+    kept = None if earlier is None else _read_earlier_assignment(ids, earlier)
     assigned = assign_splits(
         np.concatenate([hash_ranks(part.to_pylist(), seed=rules.seed, purpose="test") for part in ids.chunks]),
         run,
         run_names,
         sampled.footprint_xy_m,
-        None if regions is None else _in_plane(regions, grid, sampled.footprint_lonlat_deg),
+        None if regions is None else _project_regions(regions, grid, sampled.footprint_lonlat_deg),
         holdout=rules.holdout,
         test_fraction=rules.test_fraction,
         block_m=rules.block_m,
@@ -88,20 +88,20 @@ def draw_splits(
         folds=rules.folds,
         seed=rules.seed,
         kept=kept,
-        tagged=None if tags is None else _by_value(run, [tags[name] for name in run_names]),
+        tagged=None if tags is None else _number_values(run, [tags[name] for name in run_names]),
     )
     split = assigned.split
     if regions is not None and not np.isin(split, ("train", "test")).any():
-        raise DatasetError(_nothing_inside(regions, sampled.footprint_lonlat_deg, split))
+        raise DatasetError(_describe_nothing_inside(regions, sampled.footprint_lonlat_deg, split))
     audit = audit_leakage(split, run, starts_ns, sampled.footprint_xy_m, chord_m=chord_m)
     counts = None
     if kept is not None and earlier is not None:
         found = int((kept.split != "").sum())
         counts = KeptSplit(found, earlier.num_rows - found)
-    return Drawn(assigned, buffer_m, audit, counts)
+    return SplitResult(assigned, buffer_m, audit, counts)
 
 
-def _runs(segments: pa.Table, starts_ns: NDArray[np.int64]) -> tuple[NDArray[np.int64], list[str]]:
+def _number_runs(segments: pa.Table, starts_ns: NDArray[np.int64]) -> tuple[NDArray[np.int64], list[str]]:
     """Return the number of each segment's run in the order of recording, (M,), and the runs' ids by number."""
     coded = segments.column("run_id").dictionary_encode().unify_dictionaries()
     names = coded.chunk(0).dictionary.to_pylist()
@@ -114,13 +114,13 @@ def _runs(segments: pa.Table, starts_ns: NDArray[np.int64]) -> tuple[NDArray[np.
     return number[codes], [names[code] for code in order]
 
 
-def _by_value(run: NDArray[np.int64], values: list[str]) -> tuple[NDArray[np.int64], list[str]]:
+def _number_values(run: NDArray[np.int64], values: list[str]) -> tuple[NDArray[np.int64], list[str]]:
     """Return the number of each sample's value, (N,), and the values by number; run i has ``values[i]``."""
     names = list(dict.fromkeys(values))
     return np.array([names.index(value) for value in values], np.int64)[run], names
 
 
-def _kept(ids: pa.ChunkedArray, earlier: pa.Table) -> Assignment:
+def _read_earlier_assignment(ids: pa.ChunkedArray, earlier: pa.Table) -> Assignment:
     """Return what an earlier dataset says of each sample."""
     at = pc.index_in(ids, value_set=earlier.column("sample_id").combine_chunks())
     row = at.to_numpy(zero_copy_only=False)  # NaN where it is not there
@@ -143,19 +143,19 @@ def regions_to_json(regions: Regions) -> dict[str, PolygonGeometry]:
     }
 
 
-def _in_plane(regions: Regions, grid: MapGrid, footprint_lonlat_deg: NDArray[np.float64]) -> Regions:
+def _project_regions(regions: Regions, grid: MapGrid, footprint_lonlat_deg: NDArray[np.float64]) -> Regions:
     crs = parse_crs(grid.crs, where="map")
-    projection = Projection(CRS.from_epsg(4326), crs, area_of(crs, grid.bounds_m))
-    return project_regions(regions, projection.forward, window_deg=_window_deg(footprint_lonlat_deg))
+    projection = Projection(CRS.from_epsg(4326), crs, compute_area(crs, grid.bounds_m))
+    return project_regions(regions, projection.forward, window_deg=_compute_window_deg(footprint_lonlat_deg))
 
 
-def _window_deg(lonlat_deg: NDArray[np.float64]) -> tuple[float, float, float, float]:
+def _compute_window_deg(lonlat_deg: NDArray[np.float64]) -> tuple[float, float, float, float]:
     west, south = lonlat_deg.min(axis=(0, 1)) - _MARGIN_DEG
     east, north = lonlat_deg.max(axis=(0, 1)) + _MARGIN_DEG
     return float(west), float(south), float(east), float(north)
 
 
-def _nothing_inside(regions: Regions, lonlat_deg: NDArray[np.float64], split: NDArray[np.str_]) -> str:
+def _describe_nothing_inside(regions: Regions, lonlat_deg: NDArray[np.float64], split: NDArray[np.str_]) -> str:
     """Say why no sample is inside, and what may be wrong with the region."""
     points = shapely.multipoints(lonlat_deg.mean(axis=1))
     lon, lat = lonlat_deg.mean(axis=(0, 1))
@@ -168,7 +168,7 @@ def _nothing_inside(regions: Regions, lonlat_deg: NDArray[np.float64], split: ND
     if near:
         return (
             f"the region (--split) holds no whole footprint: {near} of {len(split)} samples lie on its border or nearer "
-            f"to it than the buffer; draw it larger, or lower the {recipe_key('split.buffer_m')}"
+            f"to it than the buffer; draw it larger, or lower the {format_recipe_key('split.buffer_m')}"
         )
     swapped = shapely.transform(regions.train_test, lambda lonlat: lonlat[:, ::-1])
     if shapely.intersects(swapped, points):

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from made_tracks import stamps
 
-from tcpipe.geometry.polyline import polyline
+from tcpipe.geometry.polyline import fit_polyline
 
 
 @st.composite
@@ -16,7 +16,7 @@ def paths(draw, wildness=(0.02, 0.3, 2.0)):
     wild = draw(st.sampled_from(wildness))
     velocity = np.array([0.8, 0.3, 0.0]) + rng.normal(0, wild, (count, 3))
     position = np.cumsum(velocity, axis=0) * 0.05 + rng.normal(0, 0.05 * wild, (count, 3))
-    return polyline(stamps(count), position, velocity)
+    return fit_polyline(stamps(count), position, velocity)
 
 
 @settings(max_examples=60, deadline=None)

@@ -15,16 +15,16 @@ from synthetic_store import add_run, lanes, segments
 from tcpipe.errors import UsageError
 from tcpipe.formats.commit_log import read_state_here
 from tcpipe.formats.index_files import KnownLog, RunFacts
-from tcpipe.formats.recipe_toml import ingest_key, recipe_id
+from tcpipe.formats.recipe_toml import ingest_key, make_recipe_id
 from tcpipe.formats.run_documents import LogOrigin
 from tcpipe.pipeline import ingest as ingest_module
 from tcpipe.pipeline.ingest import ingest
 from tcpipe.pipeline.ingest_run import Ingested
-from tcpipe.pipeline.ingest_task import IngestResult, result_of, too_young
+from tcpipe.pipeline.ingest_task import IngestResult, check_age, make_result
 from tcpipe.pipeline.log_findings import find_damage
 from tcpipe.pipeline.plan import TO_DO
 from tcpipe.pipeline.problems import acknowledge
-from tcpipe.pipeline.status import status
+from tcpipe.pipeline.status import find_status
 from tcpipe.recipe import ReadConfig, Recipe
 from tcpipe.store import Store, open_store
 from tcpipe.tables.findings import Subject, make_finding
@@ -47,7 +47,9 @@ def make_row(row, task, sha256, kind):
     log = KnownLog(LogOrigin(task.source.origins, sha256), task.tags, {})
     key, name = ingest_key(task.recipe), f"{task.source.stem}-{sha256[:8]}"
     asked = {"robot_requested": task.robot, "message_definitions": task.definitions, "ingest_key": key}
-    made = replace(row, run_id=name, recipe_id=recipe_id(task.recipe, row.robot), log=log, files={}, commit=0, **asked)
+    made = replace(
+        row, run_id=name, recipe_id=make_recipe_id(task.recipe, row.robot), log=log, files={}, commit=0, **asked
+    )
     subject = Subject("run", name)
     empty = make_finding("no-segments", subject, names={"reason": "gap"}, driven_m=80.0, lost_m=80.0)
     changes = {
@@ -63,7 +65,7 @@ def worker(row, worked):
     def ingest_one(task):
         task = replace(task, source=task.source.now())
         worked.append(task.source.name)
-        if (young := too_young(task)) is not None:
+        if (young := check_age(task)) is not None:
             return Ingested(task.source, young)
         data = task.source.paths[0].read_bytes()
         kind, sha256 = data.split()[0].decode(), hashlib.sha256(data).hexdigest()
@@ -77,8 +79,8 @@ def worker(row, worked):
         made = made if named is None else replace(made, run_id=named)
         same = state.runs.get((made.run_id, made.recipe_id))
         if same is not None and not task.force and task.tags.items() <= same.tags.items():
-            return Ingested(task.source, result_of(task.source, "unchanged", same, sha256, same_as=None))
-        return Ingested(task.source, result_of(task.source, "done", made, sha256, same_as=None), (made,))
+            return Ingested(task.source, make_result(task.source, "unchanged", same, sha256, same_as=None))
+        return Ingested(task.source, make_result(task.source, "done", made, sha256, same_as=None), (made,))
 
     return ingest_one
 
@@ -118,7 +120,9 @@ def test_what_status_predicts_is_what_ingest_does(row, actions):
 
 def compare(logs, store, worked, **how):
     predicted = {
-        name: group.state for group in status([logs], store=store, create=True, **how).groups for name in group.logs
+        name: group.state
+        for group in find_status([logs], store=store, create=True, **how).groups
+        for name in group.logs
     }
     before, worked[:] = Store(store).state(), []
     results = {result.log: result for result in ingest([logs], store=store, **how).results}

@@ -5,8 +5,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from made_tracks import stamps
 
-from tcpipe.power.energy import energy_joule, recorded_energy_joule
-from tcpipe.power.rails import rail, samples
+from tcpipe.power.energy import integrate_energy, integrate_recorded_energy
+from tcpipe.power.rails import make_rail, make_samples
 
 
 @st.composite
@@ -19,8 +19,8 @@ def rails(draw, averaged=None):
         for level, noise in ((24.0, 0.5), (6.0, 6.0)):
             count = draw(st.integers(2, 80))
             stamp_ns = stamps(1)[0] + np.cumsum(rng.integers(1, 2 * 4_000_000_000 // count, count))
-            signals.append(samples(stamp_ns, level + rng.normal(0, noise, count)))
-        made.append(rail(name, *signals, averaged=averaged))
+            signals.append(make_samples(stamp_ns, level + rng.normal(0, noise, count)))
+        made.append(make_rail(name, *signals, averaged=averaged))
     return made, averaged
 
 
@@ -30,10 +30,10 @@ def test_energy_of_the_parts_is_the_energy_of_the_whole(given_rails, offsets, pa
     made, averaged = given_rails
     rule = "averaged" if averaged else ("right_endpoint" if paper else "exact")
     cuts = stamps(1)[0] + np.sort(np.array(offsets))
-    parts = recorded_energy_joule(made, cuts[:-1], cuts[1:], rule=rule)
-    whole = recorded_energy_joule(made, cuts[:1], cuts[-1:], rule=rule)
+    parts = integrate_recorded_energy(made, cuts[:-1], cuts[1:], rule=rule)
+    whole = integrate_recorded_energy(made, cuts[:1], cuts[-1:], rule=rule)
     np.testing.assert_allclose(parts.sum(), whole[0], rtol=1e-9, atol=1e-9)
-    known = energy_joule(made, cuts[:-1], cuts[1:], rule=rule)
+    known = integrate_energy(made, cuts[:-1], cuts[1:], rule=rule)
     inside = np.isfinite(known)
     np.testing.assert_array_equal(known[inside], parts[inside])
 
@@ -49,6 +49,6 @@ def test_energy_is_that_of_a_dense_sum(given_rails):
     t = (first.stamp_ns - ends[0]).astype(float)
     power = np.interp(dense, t, first.voltage_volt) * np.interp(dense, t, first.current_amp)
     wanted = np.trapezoid(power, dense * 1e-9)
-    got = energy_joule([first], ends[:1], ends[1:], rule="exact")[0]
+    got = integrate_energy([first], ends[:1], ends[1:], rule="exact")[0]
     scale = np.abs(power).max() * (ends[1] - ends[0]) * 1e-9
     assert abs(got - wanted) < 1e-3 * scale + 1e-9

@@ -6,8 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from made_tracks import stamps
 
-from tcpipe.power.noise import energy_noise
-from tcpipe.power.rails import rail, samples
+from tcpipe.power.noise import estimate_energy_noise
+from tcpipe.power.rails import make_rail, make_samples
 
 
 @st.composite
@@ -27,8 +27,8 @@ def records(draw):
 
 
 def noise_of(stamp_ns, amp, spans, *, averaged, rate_hz=None):
-    signals = (samples(stamp_ns, value) for value in (np.full(len(stamp_ns), 24.0), amp))
-    return energy_noise([rail("drive", *signals, averaged=averaged)], *spans, rate_hz=rate_hz)
+    signals = (make_samples(stamp_ns, value) for value in (np.full(len(stamp_ns), 24.0), amp))
+    return estimate_energy_noise([make_rail("drive", *signals, averaged=averaged)], *spans, rate_hz=rate_hz)
 
 
 @settings(max_examples=80, deadline=None)

@@ -7,10 +7,10 @@ from hypothesis import strategies as st
 from made_tracks import make_track, power_streams, stamps
 
 from tcpipe.recipe import GateConfig, LabelConfig, SegmentConfig
-from tcpipe.stages.gate import gate_track
 from tcpipe.stages.label import label_segments
+from tcpipe.stages.mask import mask_track
 from tcpipe.stages.segment import segment_track
-from tcpipe.tables.columns import floats
+from tcpipe.tables.columns import to_floats
 
 FINE = 50
 """Steps of the truth to one row of the track."""
@@ -56,7 +56,7 @@ def drives(draw):
 
 
 def labelled(track):
-    gated = gate_track(track, GateConfig(), max_velocity_mps=1.0, chord_m=1.0)
+    gated = mask_track(track, GateConfig(), max_velocity_mps=1.0, chord_m=1.0)
     stamp_ns = gated.table["stamp_ns"].to_numpy()
     t_ns = np.arange(stamp_ns[0] - 10**9, stamp_ns[-1] + 10**9, 40_000_000)
     power = power_streams({"drive": (t_ns, np.full(len(t_ns), 24.0), np.full(len(t_ns), 6.0))})
@@ -79,7 +79,7 @@ def test_kept_and_lost_are_what_was_driven_and_drawn(given_drives):
         entries = found.ledger_m
         assert min(entries.values()) >= 0.0
         assert sum(entries.values()) == pytest.approx(true_m, rel=1e-3, abs=1e-3)
-        assert entries["kept"] == pytest.approx(floats(found.table, "arc_length_m").sum(), rel=1e-9, abs=1e-9)
+        assert entries["kept"] == pytest.approx(to_floats(found.table, "arc_length_m").sum(), rel=1e-9, abs=1e-9)
         facts = found.info.report.facts.label
         assert facts.distance_m == pytest.approx(sum(entries.values()), rel=1e-12)
         if not track.table["epoch"].to_numpy().any():  # power is of the first epoch alone

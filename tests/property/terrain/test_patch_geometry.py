@@ -5,8 +5,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tcpipe.terrain.grid import MapGrid
-from tcpipe.terrain.patches import chord_px, footprints, map_px_from_patch, patch_frames
-from tcpipe.terrain.sampling_kernel import morton
+from tcpipe.terrain.patches import compute_footprints, map_px_from_patch, patch_frames, sample_chord_px
+from tcpipe.terrain.sampling_kernel import compute_morton
 
 PLACES = st.tuples(st.floats(-4e5, 4e5), st.floats(-4e5, 4e5))
 
@@ -28,7 +28,7 @@ def test_pixels_lie_where_the_ruling_says(*, start, angle, scale, chord_m, facto
     pn = p0 + scale * chord_m * direction
     frames = patch_frames(p0, pn, np.array([chord_m]))
 
-    corners = footprints(frames, patch_m)[0]
+    corners = compute_footprints(frames, patch_m)[0]
     sides = np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1)
     np.testing.assert_allclose(sides, patch_m * scale, rtol=1e-8)
     area = 0.5 * np.sum(
@@ -49,7 +49,7 @@ def test_pixels_lie_where_the_ruling_says(*, start, angle, scale, chord_m, facto
     np.testing.assert_allclose(first, rear_left + inset, atol=1e-7)
     np.testing.assert_allclose(last, front_right - inset, atol=1e-7)
 
-    line = chord_px(frames, grid, chord_m=np.array([chord_m]), points=7)[0]
+    line = sample_chord_px(frames, grid, chord_m=np.array([chord_m]), points=7)[0]
     np.testing.assert_allclose(grid.xy_from_px(line[:2] + 3 * line[2:]), (p0[0] + pn[0]) / 2.0, atol=1e-7)
     np.testing.assert_allclose(grid.xy_from_px(line[:2] - 0.5 * line[2:]), p0[0], atol=1e-7)
 
@@ -64,7 +64,7 @@ def test_pixels_and_points_are_inverse(place):
 @given(st.lists(st.tuples(st.integers(0, 2**20), st.integers(0, 2**20)), min_size=1, max_size=50))
 def test_morton_interleaves_bits(cells):
     x, y = np.array(cells, np.int64).T
-    code = morton(np.ascontiguousarray(x), np.ascontiguousarray(y))
+    code = compute_morton(np.ascontiguousarray(x), np.ascontiguousarray(y))
     for a, b, c in zip(x.tolist(), y.tolist(), code.tolist(), strict=True):
         digits = "".join(q + p for p, q in zip(f"{a:021b}", f"{b:021b}", strict=True))
         assert c == int(digits, 2)

@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from tcpipe.balance.cells import SLOPE_EDGES_DEG, SLOPE_NAMES, count_cells, slope_ranges, speed_edges
-from tcpipe.balance.correlation import Correlation, effective_size
+from tcpipe.balance.cells import SLOPE_EDGES_DEG, SLOPE_NAMES, choose_speed_edges, count_cells, find_slope_ranges
+from tcpipe.balance.correlation import Correlation, compute_effective_size
 
 SPLITS = ("train", "test", "unseen")
 
@@ -10,7 +10,7 @@ SPLITS = ("train", "test", "unseen")
 def test_ranges_of_slope_are_named_after_their_ends():
     assert len(SLOPE_NAMES) == len(SLOPE_EDGES_DEG) + 1
     degrees = np.array([-30.0, -15.0, -12.0, -4.9, 0.0, 1.99, 2.0, 14.9, 15.0, 40.0])
-    assert [SLOPE_NAMES[number] for number in slope_ranges(np.radians(degrees))] == [
+    assert [SLOPE_NAMES[number] for number in find_slope_ranges(np.radians(degrees))] == [
         *("below -15°", "-15° to -10°", "-15° to -10°", "-5° to -2°", "-2° to 2°"),
         *("-2° to 2°", "2° to 5°", "10° to 15°", "above 15°", "above 15°"),
     ]
@@ -21,13 +21,13 @@ def test_ranges_of_slope_are_named_after_their_ends():
     [(1.0, (0.2, 0.4, 0.6, 0.8)), (0.9, (0.2, 0.4, 0.6, 0.8)), (4.9, (1, 2, 3, 4)), (0.3, (0.1, 0.2))],
 )
 def test_borders_of_speed_are_round_and_few(fastest, edges):
-    found = speed_edges(np.linspace(0.0, fastest / 0.99, 1000))
+    found = choose_speed_edges(np.linspace(0.0, fastest / 0.99, 1000))
     assert found == pytest.approx(edges)
 
 
 def test_no_speed_has_no_borders():
-    assert speed_edges(np.empty(0)) == ()
-    assert speed_edges(np.zeros(5)) == ()
+    assert choose_speed_edges(np.empty(0)) == ()
+    assert choose_speed_edges(np.zeros(5)) == ()
 
 
 def test_cells_count_every_sample_once_and_are_worth_what_the_least_label_says():
@@ -43,8 +43,10 @@ def test_cells_count_every_sample_once_and_are_worth_what_the_least_label_says()
             rows = (kind == cell.terrain_class) & (slope == cell.slope) & (split != "buffer")
             rows &= (speed == cell.speed) if cell.speed is not None else True
             assert cell.samples == {name: int((rows & (split == name)).sum()) for name in SPLITS}
-            assert cell.effective == pytest.approx(effective_size(xy[rows], labels[1]))
-            assert cell.effective_train == pytest.approx(effective_size(xy[rows & (split == "train")], labels[1]))
+            assert cell.effective == pytest.approx(compute_effective_size(xy[rows], labels[1]))
+            assert cell.effective_train == pytest.approx(
+                compute_effective_size(xy[rows & (split == "train")], labels[1])
+            )
             assert cell.effective <= rows.sum() + 1e-9
             assert cell.rare
 

@@ -3,7 +3,12 @@
 import numpy as np
 import pytest
 
-from tcpipe.balance.correlation import Correlation, correlations, effective_size, residuals
+from tcpipe.balance.correlation import (
+    Correlation,
+    compute_effective_size,
+    compute_slope_residuals,
+    estimate_correlations,
+)
 
 
 def track(n):
@@ -14,7 +19,7 @@ def track(n):
 
 def correlation(field, xy):
     """Of a field along one run."""
-    return correlations({"w": field}, xy, np.zeros(len(xy), int), np.arange(len(xy)), chord_m=1.0)["w"]
+    return estimate_correlations({"w": field}, xy, np.zeros(len(xy), int), np.arange(len(xy)), chord_m=1.0)["w"]
 
 
 def covariance(xy, length_m, share):
@@ -38,7 +43,7 @@ def test_labels_without_any_likeness_are_worth_their_number():
     rng, xy = np.random.default_rng(2), track(2000)
     found = correlation(rng.standard_normal(2000), xy)
     assert found.share < 0.1 or found.length_m < 0.5
-    assert effective_size(xy, found) > 1000
+    assert compute_effective_size(xy, found) > 1000
 
 
 @pytest.mark.parametrize("length_m", [1.0, 5.0, 50.0])
@@ -46,7 +51,7 @@ def test_the_effective_size_is_that_of_the_variance_of_the_mean(length_m):
     """Against the definition, and against means of fields that were really drawn."""
     rng, xy = np.random.default_rng(3), track(300)
     cov = covariance(xy, length_m, 0.8)
-    found = effective_size(xy, Correlation(length_m, 0.8, 0))
+    found = compute_effective_size(xy, Correlation(length_m, 0.8, 0))
     assert found == pytest.approx(300**2 / cov.sum())
     means = (np.linalg.cholesky(cov + 1e-9 * np.eye(300)) @ rng.standard_normal((300, 4000))).mean(axis=0)
     assert found == pytest.approx(1.0 / means.var(), rel=0.1)
@@ -59,7 +64,7 @@ def test_long_drives_are_judged_by_stretches_of_them():
     for part in np.array_split(np.arange(len(xy)), 10):  # 500 samples at a time, else the matrix is too large
         root = np.linalg.cholesky(covariance(xy[part], 3.0, 0.9) + 1e-9 * np.eye(len(part)))
         field[part] = root @ rng.standard_normal(len(part))
-    found = correlations({"w": field}, xy, np.repeat([0, 1], 2500), np.arange(5000), chord_m=1.0)["w"]
+    found = estimate_correlations({"w": field}, xy, np.repeat([0, 1], 2500), np.arange(5000), chord_m=1.0)["w"]
     assert found.length_m == pytest.approx(3.0, rel=0.4)
     assert found.share == pytest.approx(0.9, abs=0.1)
 
@@ -68,13 +73,15 @@ def test_many_samples_are_judged_by_the_first_which_are_random():
     rng = np.random.default_rng(4)
     xy = rng.uniform(0.0, 50.0, (4000, 2))
     cov = covariance(xy, 3.0, 0.9)
-    assert effective_size(xy, Correlation(3.0, 0.9, 0)) == pytest.approx(4000**2 / cov.sum(), rel=0.1)
+    assert compute_effective_size(xy, Correlation(3.0, 0.9, 0)) == pytest.approx(4000**2 / cov.sum(), rel=0.1)
 
 
 def test_one_sample_is_one_and_none_is_none():
-    assert effective_size(np.zeros((1, 2)), Correlation(1.0, 1.0, 0)) == 1.0
-    assert effective_size(np.zeros((0, 2)), Correlation(1.0, 1.0, 0)) == 0.0
-    assert effective_size(np.zeros((9, 2)), Correlation(1.0, 1.0, 0)) == pytest.approx(1.0)  # nine times the same place
+    assert compute_effective_size(np.zeros((1, 2)), Correlation(1.0, 1.0, 0)) == 1.0
+    assert compute_effective_size(np.zeros((0, 2)), Correlation(1.0, 1.0, 0)) == 0.0
+    assert compute_effective_size(np.zeros((9, 2)), Correlation(1.0, 1.0, 0)) == pytest.approx(
+        1.0
+    )  # nine times the same place
 
 
 def test_too_few_samples_or_labels_that_are_all_alike_say_nothing():
@@ -86,7 +93,7 @@ def test_class_and_slope_are_taken_out_of_a_label():
     rng = np.random.default_rng(6)
     kind, slope = rng.integers(4, 7, 600), rng.uniform(-0.4, 0.4, 600)
     noise = rng.normal(0.0, 1.0, 600)
-    left = residuals(kind * 50.0 + kind * 300.0 * slope + 200.0 * slope**2 + noise, kind, slope)
+    left = compute_slope_residuals(kind * 50.0 + kind * 300.0 * slope + 200.0 * slope**2 + noise, kind, slope)
     assert left.std() == pytest.approx(noise.std(), rel=0.02)
-    few = residuals(np.array([1.0, 3.0]), np.array([1, 1]), np.array([0.0, 0.3]))
+    few = compute_slope_residuals(np.array([1.0, 3.0]), np.array([1, 1]), np.array([0.0, 0.3]))
     assert few.tolist() == pytest.approx([-1.0, 1.0])

@@ -6,18 +6,18 @@ from pathlib import Path
 from typing import Any
 
 from tcpipe.cli import cli
-from tcpipe.cli.answers import answers, every_contract
+from tcpipe.cli.json_output import collect_contracts, json_output_types
 
 SCHEMAS = Path(__file__).parents[3] / "schemas"
 
 
 def test_committed_schemas_are_what_the_code_says() -> None:
     committed = {path.name: path.read_text() for path in SCHEMAS.glob("*.json")}
-    assert committed == every_contract(), "run 'make schemas' and commit the result"
+    assert committed == collect_contracts(), "run 'make schemas' and commit the result"
 
 
 def test_every_command_that_prints_json_has_a_contract_of_it() -> None:
-    told = {name.removesuffix(".answer") for name in answers() if name.endswith(".answer")}
+    told = {name.removesuffix(".answer") for name in json_output_types() if name.endswith(".answer")}
     printing = {
         name
         for name, command in cli.commands.items()

@@ -7,8 +7,8 @@ from installed_command import tcpipe
 
 from tcpipe import __version__
 from tcpipe.cli import output
-from tcpipe.cli.output import debug_log, progress
-from tcpipe.progress import Meter, step, working_on
+from tcpipe.cli.output import show_progress, write_debug_log
+from tcpipe.progress import Meter, set_task, step
 
 LOGGER = logging.getLogger("tcpipe")
 
@@ -22,14 +22,14 @@ def listening(monkeypatch):
     ("quiet", "said"), [(False, ["reading", "tcpipe: the disk is full"]), (True, ["tcpipe: the disk is full"])]
 )
 def test_an_error_is_told_also_where_progress_is_not_wanted(quiet, said, capsys):
-    with progress("ingest", quiet=quiet):
+    with show_progress("ingest", quiet=quiet):
         LOGGER.info("reading")
         LOGGER.error("the disk is full")
     assert capsys.readouterr().err.splitlines() == said
 
 
 def test_without_a_terminal_each_stage_of_a_log_is_one_line(capsys):
-    with progress("ingest", quiet=False), working_on("a.bag"):
+    with show_progress("ingest", quiet=False), set_task("a.bag"):
         step("reading")
         meter = Meter("reading", 1000)
         for _ in range(100):
@@ -39,7 +39,7 @@ def test_without_a_terminal_each_stage_of_a_log_is_one_line(capsys):
 
 
 def test_a_stage_is_told_hundredth_by_hundredth_and_never_beyond_its_end(caplog):
-    with caplog.at_level(logging.DEBUG, "tcpipe"), working_on("a.bag"):
+    with caplog.at_level(logging.DEBUG, "tcpipe"), set_task("a.bag"):
         meter = Meter("reading", 1000)
         for _ in range(4000):
             meter.add(0.5)
@@ -56,9 +56,9 @@ def test_bars_are_drawn_where_no_json_goes_to_the_terminal(as_json, of_stdout, d
     monkeypatch.setenv("TERM", "xterm")
     monkeypatch.setattr(output.sys.stderr, "isatty", lambda: True, raising=False)
     monkeypatch.setattr(output.sys.stdout, "isatty", lambda: of_stdout, raising=False)
-    assert (output._bars("ingest", as_json=as_json) is not None) is drawn
+    assert (output._make_bars("ingest", as_json=as_json) is not None) is drawn
     monkeypatch.setenv("TERM", "dumb")
-    assert output._bars("ingest", as_json=as_json) is None
+    assert output._make_bars("ingest", as_json=as_json) is None
 
 
 @pytest.mark.parametrize("words", [("--debug", "inspect", "nothing"), ("inspect", "nothing", "--debug")])
@@ -83,14 +83,14 @@ def test_what_an_extra_brings_is_named_with_it(lacking, said, tmp_path, monkeypa
     def lacks(*_, **__):
         raise ModuleNotFoundError(name=lacking)
 
-    monkeypatch.setattr("tcpipe.formats.recipe_toml.commented_toml", lacks)
+    monkeypatch.setattr("tcpipe.formats.recipe_toml.format_commented_toml", lacks)
     done = tcpipe("init", cwd=tmp_path)
     assert done.returncode == 1
     assert said in done.stderr
 
 
 def test_the_debug_log_says_when_and_takes_the_place_of_progress(capsys):
-    with debug_log(), progress("ingest", quiet=False), working_on("a.bag"):
+    with write_debug_log(), show_progress("ingest", quiet=False), set_task("a.bag"):
         step("reading")
         step("reading", 5, 10)
         LOGGER.debug("which topic is what")

@@ -9,7 +9,7 @@ import threading
 import pytest
 
 from tcpipe.cli import process
-from tcpipe.cli.process import ended_in_time
+from tcpipe.cli.process import terminate_on_signal
 
 
 @pytest.fixture
@@ -25,7 +25,7 @@ def ended(monkeypatch):
 
 def test_who_does_not_end_is_ended(ended, capfd):
     event, codes = ended
-    with ended_in_time():
+    with terminate_on_signal():
         signal.raise_signal(signal.SIGTERM)
         assert event.wait(60)
     assert codes == [128 + signal.SIGTERM]
@@ -35,7 +35,7 @@ def test_who_does_not_end_is_ended(ended, capfd):
 def test_who_ends_in_time_and_other_signals_are_left_alone(ended):
     event, codes = ended
     before = signal.signal(signal.SIGALRM, lambda *_: None)
-    with ended_in_time():
+    with terminate_on_signal():
         signal.raise_signal(signal.SIGALRM)
         assert not event.wait(0.2)
         signal.raise_signal(signal.SIGTERM)

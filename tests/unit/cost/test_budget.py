@@ -5,7 +5,7 @@ from dataclasses import asdict
 import numpy as np
 import pytest
 
-from tcpipe.cost.budget import CAUSES, energy_budget, find_noise, in_words, pooled
+from tcpipe.cost.budget import CAUSES, estimate_energy_budget, find_noise, format_budget, pool_budgets
 from tcpipe.tables.findings import Subject
 
 
@@ -18,10 +18,10 @@ def made(rng, count):
 def test_shares_of_hand_made_variances():
     energy = np.array([90.0, np.nan, 110.0])
     variance = dict(zip(CAUSES, np.array([[4.0], [9.0], [2.0], [1.0]]) * np.ones(3), strict=True))
-    got = energy_budget(energy, {**variance, "at_20_hz": np.full(3, 5.0)})
+    got = estimate_energy_budget(energy, {**variance, "at_20_hz": np.full(3, 5.0)})
     assert got.segments == 2
     assert (got.position, got.rate, got.total) == pytest.approx((0.02, 0.03, 0.04))
-    text = in_words(got)
+    text = format_budget(got)
     assert text.startswith(
         "Noise floor of E 4.0 % of a segment's mean 100 J: power rate 3.0, position 2.0, current noise 1.4, voltage 1.0"
     )
@@ -31,7 +31,7 @@ def test_shares_of_hand_made_variances():
 @pytest.mark.parametrize(("watt_factor", "noisy"), [(1.0, False), (1.6, True)])
 def test_a_high_noise_floor_is_a_finding_with_its_causes(watt_factor, noisy):
     variance = dict(zip(CAUSES, watt_factor * np.array([[4.0], [9.0], [2.0], [1.0]]) * np.ones(2), strict=True))
-    budget = energy_budget(np.array([90.0, 110.0]), {**variance, "at_20_hz": np.full(2, 5.0)})
+    budget = estimate_energy_budget(np.array([90.0, 110.0]), {**variance, "at_20_hz": np.full(2, 5.0)})
     found = find_noise(budget, Subject("role", "power"))
     assert [of.code for of in found] == ["energy-noise"] * noisy
     assert all(of.numbers["rate_fraction"] == budget.rate for of in found)
@@ -41,13 +41,13 @@ def test_a_high_noise_floor_is_a_finding_with_its_causes(watt_factor, noisy):
 def test_runs_pool_as_one():
     rng = np.random.default_rng(0)
     one, two = made(rng, 40), made(rng, 7)
-    together = energy_budget(
+    together = estimate_energy_budget(
         np.concatenate((one[0], two[0])), {name: np.concatenate((one[1][name], two[1][name])) for name in one[1]}
     )
-    got = pooled([energy_budget(*one), energy_budget(*two)])
+    got = pool_budgets([estimate_energy_budget(*one), estimate_energy_budget(*two)])
     assert asdict(got) == pytest.approx(asdict(together))
 
 
 def test_without_energy_there_is_no_budget():
-    assert energy_budget(np.full(3, np.nan), {cause: np.ones(3) for cause in CAUSES}) is None
-    assert pooled([]) is None
+    assert estimate_energy_budget(np.full(3, np.nan), {cause: np.ones(3) for cause in CAUSES}) is None
+    assert pool_budgets([]) is None

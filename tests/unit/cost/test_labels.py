@@ -3,13 +3,15 @@
 import numpy as np
 import pytest
 
-from tcpipe.cost.labels import above_standing, labels
+from tcpipe.cost.labels import compute_labels, subtract_idle_power
 
 EXACT = {"chord_m": 1.0, "displacement_std_m": 0.01, "energy_noise_joule": 0.0}
 
 
 def one(**values):
-    return labels(**{name: np.atleast_1d(np.asarray(value, dtype=float)) for name, value in (EXACT | values).items()})
+    return compute_labels(
+        **{name: np.atleast_1d(np.asarray(value, dtype=float)) for name, value in (EXACT | values).items()}
+    )
 
 
 def test_identities():
@@ -43,7 +45,7 @@ def test_deviations_are_those_of_many_estimated_metres():
     assert got.velocity_std_mps[0] == pytest.approx((1 / duration).std(), rel=0.02)
     assert got.energy_std_joule[0] == pytest.approx(spent.std(), rel=0.01)
     assert got.power_std_watt[0] == pytest.approx((spent / duration).std(), rel=0.03)
-    above = above_standing(got, standing_watt=90.0, standing_std_watt=2.0, **ends)
+    above = subtract_idle_power(got, standing_watt=90.0, standing_std_watt=2.0, **ends)
     beside = spent - (90 + other) * duration
     assert above.energy_above_standing_joule[0] == pytest.approx(got.energy_joule[0] - 90 * end_s)
     assert above.energy_above_standing_std_joule[0] == pytest.approx(beside.std(), rel=0.02)
@@ -63,5 +65,5 @@ def test_without_energy_there_is_none_of_its_deviations():
 def test_above_standing_is_not_known_where_either_is_not(standing_watt, energy_joule):
     ends = {"end_power_watt": np.array([150.0]), "energy_noise_joule": np.array([1.0])}
     cost = one(duration_s=1.2, energy_joule=energy_joule, end_velocity_mps=0.8, **ends)
-    got = above_standing(cost, standing_watt=standing_watt, standing_std_watt=2.0, **ends)
+    got = subtract_idle_power(cost, standing_watt=standing_watt, standing_std_watt=2.0, **ends)
     assert all(np.isnan(getattr(got, name)[0]) for name in got.__slots__)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from physics_model import made_residuals
 
-from tcpipe.cost.prediction_errors import centring_of, errors_of
+from tcpipe.cost.prediction_errors import fit_bias_correction, fit_errors
 
 _GRASS = np.uint8(4)
 
@@ -15,15 +15,15 @@ def _width(errors, count):
 
 
 def test_one_piece_has_the_quantiles_of_the_held_out_errors():
-    found = errors_of(made_residuals(4000, sigma=0.1))["energy"]
+    found = fit_errors(made_residuals(4000, sigma=0.1))["energy"]
     low, high = found.of_pieces(np.array([200.0]), np.array([_GRASS]))
     assert low[0] == pytest.approx(200.0 * (1.0 - 1.645 * 0.1), rel=0.01)
     assert high[0] == pytest.approx(200.0 * (1.0 + 1.645 * 0.1), rel=0.01)
 
 
 def test_independent_errors_shrink_with_the_root_of_the_length_and_shared_ones_do_not():
-    alone = errors_of(made_residuals(4000, shared=0.0))["energy"]
-    together = errors_of(made_residuals(4000, shared=1.0, runs=40))["energy"]
+    alone = fit_errors(made_residuals(4000, shared=0.0))["energy"]
+    together = fit_errors(made_residuals(4000, shared=1.0, runs=40))["energy"]
     assert _width(alone, 400) < 0.3 * _width(alone, 1)
     assert _width(together, 400) > 0.95 * _width(together, 1)
 
@@ -36,11 +36,11 @@ def _with_power(residuals, factor, rows=slice(None)):
 
 def test_a_model_that_is_off_on_average_is_centred_and_lies_in_its_interval():
     residuals = _with_power(made_residuals(1000, sigma=0.01), 1.2)
-    power, velocity = centring_of(residuals).apply(np.full(50, 100.0), np.full(50, 0.8), np.full(50, _GRASS))
+    power, velocity = fit_bias_correction(residuals).apply(np.full(50, 100.0), np.full(50, 0.8), np.full(50, _GRASS))
     assert power == pytest.approx(120.0, rel=0.003)
     assert velocity == pytest.approx(0.8)
     energy = power / velocity
-    low, high = errors_of(residuals)["energy"].of_sum(energy, np.full(50, _GRASS))
+    low, high = fit_errors(residuals)["energy"].of_sum(energy, np.full(50, _GRASS))
     assert 0.97 * energy.sum() < low < energy.sum() < high < 1.03 * energy.sum()
 
 
@@ -49,7 +49,7 @@ def test_a_few_samples_of_a_class_do_not_make_its_bias():
     residuals = made_residuals(1000, sigma=0.1)
     for count, least, most in ((3, -0.02, 0.02), (300, 0.07, 0.13)):
         few = {**residuals, "terrain_class": np.where(np.arange(1000) % 3 * 1000 + np.arange(1000) // 3 < count, 5, 4)}
-        power, _ = centring_of(_with_power(few, 1.1, few["terrain_class"] == 5)).apply(
+        power, _ = fit_bias_correction(_with_power(few, 1.1, few["terrain_class"] == 5)).apply(
             np.ones(1), np.ones(1), np.array([5])
         )
         assert least < power[0] - 1.0 < most
@@ -60,7 +60,7 @@ def test_the_few_samples_of_a_class_err_alike_and_make_no_bias_of_it():
     residuals = made_residuals(150, sigma=0.02)
     few = {**residuals, "terrain_class": np.where(np.abs(np.arange(150) - 40) < 3, 7, 4).astype(np.uint8)}
     few["terrain_class"][43] = 7
-    power, _ = centring_of(_with_power(few, 0.7, few["terrain_class"] == 7)).apply(
+    power, _ = fit_bias_correction(_with_power(few, 0.7, few["terrain_class"] == 7)).apply(
         np.ones(1), np.ones(1), np.array([7])
     )
     assert power[0] == pytest.approx(1.0, abs=0.03)
@@ -70,13 +70,13 @@ def test_an_end_that_two_metres_share_is_an_error_of_neither_together():
     """Where one metre is too long its neighbour is too short: ten in a row err like the two outer ends alone."""
     residuals, rng = made_residuals(8000), np.random.default_rng(1)
     residuals["power_watt"] = 150.0 * (1.0 + 0.1 * np.diff(rng.normal(size=8001)))
-    found = errors_of(residuals)["energy"]
+    found = fit_errors(residuals)["energy"]
     assert found.correlation[0] == pytest.approx(-0.5, abs=0.05)
     assert _width(found, 10) == pytest.approx(2.0 * 1.645 * 0.1 * np.sqrt(2.0) / 10.0, rel=0.3)
 
 
 def test_two_runs_tell_less_of_a_third_than_twenty_do():
-    few, many = (errors_of(made_residuals(4000, shared=0.3, runs=runs))["energy"] for runs in (3, 40))
+    few, many = (fit_errors(made_residuals(4000, shared=0.3, runs=runs))["energy"] for runs in (3, 40))
     assert (few.runs, many.runs) == (3, 40)
     assert many.of_run == pytest.approx(0.3, rel=0.4)
     errors = made_residuals(4000, shared=0.3, runs=3)["power_watt"][:3999] / 150.0
@@ -86,7 +86,7 @@ def test_two_runs_tell_less_of_a_third_than_twenty_do():
 
 @pytest.mark.parametrize("count", [25, 60])
 def test_small_data_still_average_out(count):
-    found = errors_of(made_residuals(count, runs=1))["energy"]
+    found = fit_errors(made_residuals(count, runs=1))["energy"]
     assert _width(found, 100) < 0.6 * _width(found, 1)
 
 
@@ -96,7 +96,7 @@ def test_a_class_with_enough_held_out_samples_has_errors_of_its_own():
     residuals["power_watt"] = np.where(
         residuals["terrain_class"] == 5, 150.0 + 6.0 * (residuals["power_watt"] - 150.0), residuals["power_watt"]
     )
-    errors = errors_of(residuals)["energy"]
+    errors = fit_errors(residuals)["energy"]
     ends = [errors.of_pieces(np.array([100.0]), np.array([number], np.uint8)) for number in (4, 5, 7)]
     grass, mud, other = ((high - low)[0] for low, high in ends)
     assert grass < other < mud
@@ -104,11 +104,11 @@ def test_a_class_with_enough_held_out_samples_has_errors_of_its_own():
 
 
 def test_pieces_without_a_cost_add_nothing():
-    errors = errors_of(made_residuals(1000))["energy"]
+    errors = fit_errors(made_residuals(1000))["energy"]
     some = errors.of_sum(np.array([100.0, np.nan, 100.0]), np.full(3, _GRASS))
     assert np.isfinite(some).all()
     assert some[0] < 200.0 < some[1]
 
 
 def test_too_few_held_out_samples_say_nothing():
-    assert errors_of(made_residuals(19)) is None
+    assert fit_errors(made_residuals(19)) is None

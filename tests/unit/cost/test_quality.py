@@ -3,17 +3,20 @@
 import numpy as np
 import pytest
 
-from tcpipe.cost.quality import low_power_rate, voltage_outside
-from tcpipe.power.rails import rail, samples
+from tcpipe.cost.quality import has_low_power_rate, touches_voltage_outside
+from tcpipe.power.rails import make_rail, make_samples
 
 
 @pytest.mark.parametrize(("volt", "outside"), [(19.9, True), (20.0, False), (30.0, False), (30.1, True)])
 def test_a_voltage_below_or_above_the_range_is_outside_and_the_ends_are_not(volt, outside):
     at = 1_000_000_000 * np.arange(5)
-    made = rail(
-        "drive", samples(at, np.array([24.0, 24.0, volt, 24.0, 24.0])), samples(at, np.zeros(5)), averaged=False
+    made = make_rail(
+        "drive",
+        make_samples(at, np.array([24.0, 24.0, volt, 24.0, 24.0])),
+        make_samples(at, np.zeros(5)),
+        averaged=False,
     )
-    found = voltage_outside([made], at[1:2] + 500_000_000, at[2:3] + 500_000_000, range_volt=(20.0, 30.0))
+    found = touches_voltage_outside([made], at[1:2] + 500_000_000, at[2:3] + 500_000_000, range_volt=(20.0, 30.0))
     assert found.tolist() == [outside]
 
 
@@ -23,8 +26,8 @@ def test_a_voltage_below_or_above_the_range_is_outside_and_the_ends_are_not(volt
 )
 def test_the_rate_is_that_of_the_current_and_of_a_voltage_that_varies(current_hz, voltage_hz, swing_volt, slow):
     def sampled(hz, values):
-        return samples((np.arange(30 * hz) * (1_000_000_000 // hz)).astype(np.int64), values(np.arange(30 * hz)))
+        return make_samples((np.arange(30 * hz) * (1_000_000_000 // hz)).astype(np.int64), values(np.arange(30 * hz)))
 
     voltage = sampled(voltage_hz, lambda i: 24.0 + swing_volt * (i % 2))
-    made = rail("drive", voltage, sampled(current_hz, lambda i: 5.0 + i % 3), averaged=False)
-    assert low_power_rate([made]) is slow
+    made = make_rail("drive", voltage, sampled(current_hz, lambda i: 5.0 + i % 3), averaged=False)
+    assert has_low_power_rate([made]) is slow

@@ -9,12 +9,12 @@ from synthetic_store import STANDING_WATT, box, region_file, small_store
 
 from tcpipe.dataset import batches as batches_module
 from tcpipe.dataset import open_dataset, pixels
-from tcpipe.dataset.tensor import tensor_form
+from tcpipe.dataset.tensor import make_tensor_layout
 from tcpipe.errors import DatasetError, UsageError
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.recipe import Recipe
 from tcpipe.terrain.classes import ClassTable, TerrainClass
-from tcpipe.terrain.layers import LAYERS, paper_layers
+from tcpipe.terrain.layers import LAYERS, make_paper_layers
 
 
 @pytest.fixture(scope="module")
@@ -221,9 +221,9 @@ def test_every_stored_value_becomes_what_the_layers_say(count):
     heights[pixels["height"] == 65535] = 0
     wanted = np.stack([grey, classes, heights], axis=-1)[rows]
     wanted[mirrored] = wanted[mirrored, ::-1]
-    known = paper_layers(LAYERS, ClassTable((TerrainClass(count, "last", traversable=True),)))
-    np.testing.assert_array_equal(tensor_form(LAYERS, known).form(pixels, rows, mirrored), wanted)
-    apart = tensor_form(("height", "ortho", "terrain"), known).form(pixels, rows, mirrored)
+    known = make_paper_layers(LAYERS, ClassTable((TerrainClass(count, "last", traversable=True),)))
+    np.testing.assert_array_equal(make_tensor_layout(LAYERS, known).form(pixels, rows, mirrored), wanted)
+    apart = make_tensor_layout(("height", "ortho", "terrain"), known).form(pixels, rows, mirrored)
     np.testing.assert_array_equal(apart, wanted[..., [2, 0, 1]])
 
 

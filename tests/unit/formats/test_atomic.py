@@ -14,7 +14,13 @@ from typing import Any
 import pytest
 
 from tcpipe.errors import StoreError
-from tcpipe.formats.atomic import atomic_directory, atomic_file, clear_beside, left_beside, scratch_directory
+from tcpipe.formats.atomic import (
+    clear_beside,
+    find_leftovers,
+    make_scratch_directory,
+    write_atomic_directory,
+    write_atomic_file,
+)
 
 
 class _Cut(Exception):  # noqa: N818
@@ -24,7 +30,7 @@ class _Cut(Exception):  # noqa: N818
 def test_a_failed_file_leaves_the_old_one_and_nothing_else(tmp_path: Path) -> None:
     path = tmp_path / "f"
     path.write_text("old")
-    with pytest.raises(_Cut), atomic_file(path) as temporary:  # noqa: PT012
+    with pytest.raises(_Cut), write_atomic_file(path) as temporary:  # noqa: PT012
         temporary.write_text("half")
         raise _Cut
     assert path.read_text() == "old"
@@ -34,10 +40,10 @@ def test_a_failed_file_leaves_the_old_one_and_nothing_else(tmp_path: Path) -> No
 def test_a_failed_directory_leaves_the_old_one_and_nothing_else(tmp_path: Path) -> None:
     path = tmp_path / "d"
     for content in ("first", "second"):
-        with atomic_directory(path) as temporary:
+        with write_atomic_directory(path) as temporary:
             (temporary / "f").write_text(content)
             (temporary / content).touch()
-    with pytest.raises(_Cut), atomic_directory(path) as temporary:  # noqa: PT012
+    with pytest.raises(_Cut), write_atomic_directory(path) as temporary:  # noqa: PT012
         (temporary / "f").write_text("half")
         raise _Cut
     assert (path / "f").read_text() == "second"
@@ -53,25 +59,25 @@ def test_what_a_killed_process_left_goes_when_its_place_is_written_again(tmp_pat
     )
     subprocess.run([sys.executable, "-c", program, tmp_path], check=False)
     assert len(list(tmp_path.iterdir())) == 2
-    with atomic_directory(tmp_path / "d"), atomic_file(tmp_path / "f"):
+    with write_atomic_directory(tmp_path / "d"), write_atomic_file(tmp_path / "f"):
         pass
     assert sorted(p.name for p in tmp_path.iterdir()) == ["d", "f"]
 
 
 def test_what_another_process_is_writing_stays(tmp_path: Path) -> None:
-    with atomic_directory(tmp_path / "d") as slow:
+    with write_atomic_directory(tmp_path / "d") as slow:
         (slow / "slow").touch()
         shutil.rmtree(slow)  # as zarr does with a directory that it is given
         slow.mkdir()
         (slow / "slow").touch()
-        with atomic_directory(tmp_path / "d") as fast:
+        with write_atomic_directory(tmp_path / "d") as fast:
             (fast / "fast").touch()
         assert slow.is_dir()
     assert [p.name for p in (tmp_path / "d").iterdir()] == ["slow"]
     assert [p.name for p in tmp_path.iterdir()] == ["d"]
 
 
-@pytest.mark.parametrize("write", [atomic_file, atomic_directory])
+@pytest.mark.parametrize("write", [write_atomic_file, write_atomic_directory])
 def test_a_place_that_cannot_be_is_told_by_its_own_name(tmp_path: Path, write: Callable[..., Any]) -> None:
     (tmp_path / "file").touch()
     path = tmp_path / "file" / "below" / "it"
@@ -82,7 +88,7 @@ def test_a_place_that_cannot_be_is_told_by_its_own_name(tmp_path: Path, write: C
         pass
 
 
-@pytest.mark.parametrize("write", [atomic_file, atomic_directory])
+@pytest.mark.parametrize("write", [write_atomic_file, write_atomic_directory])
 def test_a_full_disk_is_told_by_the_place_and_new_directories_go(tmp_path: Path, write: Callable[..., Any]) -> None:
     path = tmp_path / "new" / "er" / "it"
     full = OSError(errno.ENOSPC, "Error writing bytes to file")  # as pyarrow says it
@@ -94,7 +100,7 @@ def test_a_full_disk_is_told_by_the_place_and_new_directories_go(tmp_path: Path,
     assert not any(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("write", [atomic_file, atomic_directory])
+@pytest.mark.parametrize("write", [write_atomic_file, write_atomic_directory])
 @pytest.mark.parametrize(
     "number", [errno.EACCES, errno.EPERM, errno.EIO, errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.ESTALE, errno.ENXIO]
 )
@@ -111,7 +117,7 @@ def test_whatever_fails_in_writing_names_the_place(
 
 
 @pytest.mark.parametrize("failing", ["fsync", "rename"])
-@pytest.mark.parametrize("write", [atomic_file, atomic_directory])
+@pytest.mark.parametrize("write", [write_atomic_file, write_atomic_directory])
 def test_a_disk_that_fails_at_the_end_names_the_place(
     tmp_path: Path, write: Callable[..., Any], failing: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -119,7 +125,7 @@ def test_a_disk_that_fails_at_the_end_names_the_place(
         raise OSError(errno.EIO, os.strerror(errno.EIO))
 
     for name in ("replace", "rename", "_exchanged") if failing == "rename" else ("fsync",):
-        target: object = "tcpipe.formats.atomic._exchanged" if name == "_exchanged" else f"os.{name}"
+        target: object = "tcpipe.formats.atomic._exchange_directories" if name == "_exchanged" else f"os.{name}"
         monkeypatch.setattr(target, fail)
     path = tmp_path / "it"
     with (
@@ -132,20 +138,20 @@ def test_a_disk_that_fails_at_the_end_names_the_place(
 
 
 def test_an_unreadable_source_is_not_told_as_an_unwritable_place(tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError), atomic_file(tmp_path / "f"):
+    with pytest.raises(FileNotFoundError), write_atomic_file(tmp_path / "f"):
         (tmp_path / "source").read_text()
-    with pytest.raises(PermissionError, match="source"), atomic_file(tmp_path / "f"):
+    with pytest.raises(PermissionError, match="source"), write_atomic_file(tmp_path / "f"):
         raise PermissionError(errno.EACCES, "Permission denied", str(tmp_path / "source"))
-    with pytest.raises(StoreError, match=r"^source is damaged$"), atomic_file(tmp_path / "f"):
+    with pytest.raises(StoreError, match=r"^source is damaged$"), write_atomic_file(tmp_path / "f"):
         raise StoreError("source is damaged")
-    with pytest.raises(BrokenPipeError), atomic_file(tmp_path / "f"):
+    with pytest.raises(BrokenPipeError), write_atomic_file(tmp_path / "f"):
         raise BrokenPipeError(errno.EPIPE, "Broken pipe")
 
 
 def test_a_link_to_a_directory_stays_a_link(tmp_path: Path) -> None:
     (tmp_path / "real").mkdir()
     (tmp_path / "link").symlink_to("real")
-    with atomic_directory(tmp_path / "link") as directory:
+    with write_atomic_directory(tmp_path / "link") as directory:
         (directory / "f").touch()
     assert (tmp_path / "link").is_symlink()
     assert [p.name for p in (tmp_path / "real").iterdir()] == ["f"]
@@ -215,10 +221,10 @@ def test_killed_at_any_step_a_place_is_old_or_new_and_what_is_left_goes_with_the
 
 def test_clearing_leaves_what_lives_and_what_is_not_ours(tmp_path: Path) -> None:
     (tmp_path / ".tmp-mine").mkdir()
-    with atomic_directory(tmp_path / "d-e") as slow:
+    with write_atomic_directory(tmp_path / "d-e") as slow:
         clear_beside(tmp_path / "d")
         assert slow.is_dir()
-        assert left_beside(tmp_path / "d-e") == []
+        assert find_leftovers(tmp_path / "d-e") == []
     assert sorted(path.name for path in tmp_path.iterdir()) == [".tmp-mine", "d-e"]
     clear_beside(tmp_path / "nowhere" / "x")
 
@@ -229,9 +235,9 @@ def test_scratch_of_the_killed_goes_and_of_the_living_stays(tmp_path: Path, monk
     left.mkdir()
     (left / "copy.mcap").touch()
     (tmp_path / "tcpipe-cache").mkdir()
-    with scratch_directory() as one, scratch_directory() as other:
+    with make_scratch_directory() as one, make_scratch_directory() as other:
         assert {path.name for path in tmp_path.iterdir()} == {one.parent.name, other.parent.name, "tcpipe-cache"}
         assert one.parent.stat().st_mode & 0o077 == 0
-        with atomic_directory(one / "a") as directory:  # waits for no lock of its own process
+        with write_atomic_directory(one / "a") as directory:  # waits for no lock of its own process
             (directory / "b").touch()
     assert [path.name for path in tmp_path.iterdir()] == ["tcpipe-cache"]

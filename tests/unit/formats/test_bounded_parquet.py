@@ -10,7 +10,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from tcpipe.errors import StoreError
-from tcpipe.formats.parquet import parquet_bytes, read_row_group, read_table, write_table
+from tcpipe.formats.parquet import read_row_group, read_table, write_parquet_bytes, write_table
 
 READ = (
     "import sys; from pathlib import Path; from tcpipe.formats.parquet import read_table; read_table(Path(sys.argv[1]))"
@@ -95,14 +95,14 @@ def test_what_is_written_is_read_whatever_it_holds(tmp_path, rows):
     assert found.equals(table)
     assert found.schema.metadata == table.schema.metadata
     assert read_table(tmp_path / "a.parquet", ["text", "n"]).equals(table.select(["text", "n"]))
-    (tmp_path / "b.parquet").write_bytes(parquet_bytes(table, rows_per_group=1024))
+    (tmp_path / "b.parquet").write_bytes(write_parquet_bytes(table, rows_per_group=1024))
     assert read_table(tmp_path / "b.parquet", ["each"]).equals(table.select(["each"]))
 
 
 def test_a_damaged_file_is_an_error_in_a_line_wherever_a_byte_changed(tmp_path):
     path = tmp_path / "a.parquet"
     table = pa.table({"a": np.arange(300.0), "s": [f"t{n % 9}" for n in range(300)]})
-    whole, rng = parquet_bytes(table, rows_per_group=100), np.random.default_rng(0)
+    whole, rng = write_parquet_bytes(table, rows_per_group=100), np.random.default_rng(0)
     said = []
     for at in rng.integers(4, len(whole) - 4, 300):
         data = bytearray(whole)

@@ -15,18 +15,18 @@ from tcpipe.formats.bucket import BucketPlace
 from tcpipe.formats.commit_log import Stamp, put_commit, read_commit, read_state, refresh
 from tcpipe.formats.commits import (
     Begun,
-    Call,
+    CallRecord,
     Commit,
     Dataset,
     Entries,
     Failure,
     Generation,
+    LogSnapshot,
     Problem,
     Process,
-    Sighting,
     State,
     Superseded,
-    compact,
+    compact_state,
     fold,
 )
 from tcpipe.formats.place import DirectoryPlace
@@ -47,7 +47,7 @@ def place(request, tmp_path, monkeypatch):
 
 
 def saw(number):
-    return Entries(seen=(Sighting(("/logs/a.mcap",), ((number, 1),), f"{number:064}"),))
+    return Entries(seen=(LogSnapshot(("/logs/a.mcap",), ((number, 1),), f"{number:064}"),))
 
 
 def write(place, count, state=None):
@@ -70,10 +70,10 @@ EVERYTHING = (
     Entries(superseded=(Superseded("a", "b"), Superseded("c", "b"))),
     Entries(superseded=(Superseded("c", None),)),
     Entries(datasets=(Dataset("/out", "1", (("a", "r"),)), Dataset("/out", "2"))),
-    Entries(forgotten=(Dataset("/out", "1"),), calls=(Call("build-dataset", "1", 0, {"samples": 3}),)),
+    Entries(forgotten=(Dataset("/out", "1"),), calls=(CallRecord("build-dataset", "1", 0, {"samples": 3}),)),
     Entries(generations=(Generation("generations/0000000009-0", "model.json", "2026-11-01T00:00:00+00:00"),)),
     Entries(generations=(Generation("generations/0000000010-1", "model.json", "2026-11-30T00:00:00+00:00"),)),
-    Entries(ended=(1,), calls=(Call("ingest", "1", 3, {"failed": 1}, failed={"/logs/c.bag": "full"}),)),
+    Entries(ended=(1,), calls=(CallRecord("ingest", "1", 3, {"failed": 1}, failed={"/logs/c.bag": "full"}),)),
 )
 
 
@@ -81,7 +81,7 @@ def test_a_state_is_the_fold_of_commits_and_of_the_one_commit_that_it_is_compact
     state, digest = State(), ""
     for number, entries in enumerate(EVERYTHING, 1):
         state = fold([Commit(number, digest, "seen", STAMP.who, STAMP.at, entries)], state)
-        snapshot = Commit(number, digest, "snapshot", STAMP.who, STAMP.at, compact(state))
+        snapshot = Commit(number, digest, "snapshot", STAMP.who, STAMP.at, compact_state(state))
         assert fold([snapshot]) == state, entries
     commits = [Commit(number, "", "seen", STAMP.who, STAMP.at, of) for number, of in enumerate(EVERYTHING, 1)]
     assert fold(commits) == state

@@ -5,12 +5,12 @@ from dataclasses import replace
 import pytest
 
 from tcpipe.formats.finding_lines import (
-    block_lines,
     describe_finding,
     format_findings,
     format_group,
     format_groups,
     format_number,
+    format_remedy_blocks,
     format_verdict,
     group_findings,
     list_findings,
@@ -65,7 +65,7 @@ def test_a_recipe_that_fits_in_no_line_stands_below_its_finding():
     line, *block = format_findings([found])
     assert line.endswith("To accept any speed: the recipe below [driven-below-limit]")
     assert block[:2] == ["    [[power_sources]]", '    type = "std_msgs/msg/Float32"']
-    assert block_lines([found, found]) == [line.strip() for line in block]
+    assert format_remedy_blocks([found, found]) == [line.strip() for line in block]
 
 
 def test_findings_of_several_runs_are_one_line_a_code():

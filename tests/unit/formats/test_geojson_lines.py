@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from tcpipe.errors import PathError
-from tcpipe.formats.geojson_lines import line_feature, read_line
+from tcpipe.formats.geojson_lines import make_line_feature, read_line
 from tcpipe.formats.json_files import write_json
 
 LINE = {"type": "LineString", "coordinates": [[15.0, 47.0], [15.1, 47.1, 350.0]]}
@@ -62,7 +62,7 @@ def test_a_missing_file_is_named(tmp_path):
 
 def test_what_is_written_is_read_back(tmp_path):
     points = np.array([[15.123456789, 47.0], [15.2, 47.1]])
-    feature = line_feature(points, {"a": 1})
+    feature = make_line_feature(points, {"a": 1})
     write_json(tmp_path / "o.geojson", {"type": "FeatureCollection", "features": [feature]})
     np.testing.assert_array_equal(read_line(tmp_path / "o.geojson"), points)
     found = json.loads((tmp_path / "o.geojson").read_text())

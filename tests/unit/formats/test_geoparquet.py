@@ -6,15 +6,15 @@ import numpy as np
 import pyarrow as pa
 from pyproj import CRS
 
-from tcpipe.formats.geoparquet import located
-from tcpipe.tables.wkb import point_column
+from tcpipe.formats.geoparquet import add_geo_metadata
+from tcpipe.tables.wkb import make_points
 
 POINTS = np.array([[15.5, 47.0], [np.nan, np.nan], [15.25, 47.5]])
 
 
 def told(points, **how):
-    table = pa.table({"geometry": point_column(points)}).replace_schema_metadata({b"tcpipe": b"{}"})
-    metadata = located(table, "Point", points, **how).schema.metadata
+    table = pa.table({"geometry": make_points(points)}).replace_schema_metadata({b"tcpipe": b"{}"})
+    metadata = add_geo_metadata(table, "Point", points, **how).schema.metadata
     assert metadata[b"tcpipe"] == b"{}"
     return json.loads(metadata[b"geo"])
 

@@ -9,7 +9,7 @@ import pytest
 from synthetic_store import box, region_file, small_store
 
 from tcpipe.formats.dataset_files import read_card
-from tcpipe.formats.hub_card import hub_card
+from tcpipe.formats.hub_card import format_hub_card
 from tcpipe.pipeline.dataset.build import build_dataset
 
 
@@ -47,7 +47,7 @@ def test_names_are_text(built):
     card, schema = read_card(built), pq.read_schema(built / "samples.parquet")
     hostile = '<script>a</script>](x)\n---\n"b: [c]\x1b[31m'
     card = replace(card, name=hostile, description=hostile, licence=hostile, creator=hostile + "}")
-    text = hub_card(card, schema, samples_file="samples.parquet", picture="overview.png")
+    text = format_hub_card(card, schema, samples_file="samples.parquet", picture="overview.png")
     head = head_of(text)
     assert (head["pretty_name"], head["license"], head["license_name"]) == (hostile, "other", hostile)
     body, citation = text.split("---\n", 2)[2].split("```bibtex")
@@ -61,6 +61,6 @@ def test_names_are_text(built):
 def test_a_known_licence_is_told_by_the_name_the_hub_has_for_it(built):
     card, schema = read_card(built), pq.read_schema(built / "samples.parquet")
     for given, told in (("CC-BY-4.0", "cc-by-4.0"), ("", "unknown")):
-        text = hub_card(replace(card, licence=given), schema, samples_file="samples.parquet", picture="p")
+        text = format_hub_card(replace(card, licence=given), schema, samples_file="samples.parquet", picture="p")
         assert head_of(text)["license"] == told
         assert "license_name" not in head_of(text)

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from tcpipe.errors import StoreError
-from tcpipe.formats.json_files import read_as, typed, write_json
+from tcpipe.formats.json_files import parse_typed, read_as, write_json
 from tcpipe.recipe.checking import describe
 
 
@@ -39,12 +39,12 @@ def test_what_is_written_is_read_again(tmp_path):
 
 
 def test_keys_that_are_missing_have_defaults_and_unknown_ones_are_left_aside():
-    document = typed({"counts": {"segments": 1, "later": []}, "new": None}, Document, Path("x"))
+    document = parse_typed({"counts": {"segments": 1, "later": []}, "new": None}, Document, Path("x"))
     assert document == Document(Counts(1))
 
 
 def test_a_whole_number_is_a_number():
-    assert typed({"counts": {"segments": 1, "lost_m": 2}}, Document, Path("x")).counts.lost_m == 2.0
+    assert parse_typed({"counts": {"segments": 1, "lost_m": 2}}, Document, Path("x")).counts.lost_m == 2.0
 
 
 @pytest.mark.parametrize(

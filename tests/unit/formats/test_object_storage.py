@@ -7,8 +7,8 @@ from random_messages import assert_same, expected_columns, random_messages, writ
 from storage_server import FORBIDDEN, object_store
 
 from tcpipe.errors import LogError
-from tcpipe.formats.logs.log_file import belongs_to_a_log, open_log
-from tcpipe.formats.object_storage import is_url, laid_out, stand_ins
+from tcpipe.formats.logs.log_file import is_log_file, open_log
+from tcpipe.formats.object_storage import is_url, lay_out_objects, make_stand_ins
 from tcpipe.pipeline.inspect import inspect
 from tcpipe.recipe import Recipe
 
@@ -68,7 +68,7 @@ def test_only_what_belongs_to_a_log_is_copied(bucket):
 
 def test_stand_ins_cost_nothing(bucket, tmp_path):
     (tmp_path / "here").mkdir()
-    place = stand_ins("s3://drives/field", tmp_path / "here", wanted=belongs_to_a_log)
+    place = make_stand_ins("s3://drives/field", tmp_path / "here", wanted=is_log_file)
     stand_in = place / "my run.mcap"
     assert stand_in.stat().st_size == (bucket[0] / "field" / "my run.mcap").stat().st_size
     assert stand_in.stat().st_mtime == 1_600_000_000
@@ -112,7 +112,7 @@ def test_a_copy_that_does_not_fit_is_told_in_one_line(bucket):
 
 def test_a_file_whose_url_is_percent_encoded(tmp_path):
     path = write_mcap(tmp_path / "a b%20c.mcap", MESSAGES)
-    with laid_out(path.as_uri(), wanted=belongs_to_a_log, by_range=()) as (copy, by_range):
+    with lay_out_objects(path.as_uri(), wanted=is_log_file, by_range=()) as (copy, by_range):
         assert copy.name == path.name
         assert copy.read_bytes() == path.read_bytes()
         assert not by_range

@@ -13,8 +13,8 @@ from storage_server import FORBIDDEN, READ_ONLY, SKEWED, object_store
 
 from tcpipe.errors import StoreError
 from tcpipe.formats.bucket import open_place
+from tcpipe.formats.integrity import Checksum
 from tcpipe.formats.place import Entry, Place
-from tcpipe.formats.seals import Checksum
 
 NAMES = ("a.json", "drives of May/ü ñ #1?.json", "runs/100%/track.parquet", "runs/x/[1] & 'two'+~.bin")
 

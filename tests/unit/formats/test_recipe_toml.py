@@ -10,27 +10,27 @@ import pytest
 
 from tcpipe.errors import RecipeError
 from tcpipe.formats.recipe_toml import (
-    commented_toml,
     find_recipe,
+    format_commented_toml,
     ingest_key,
     load_recipe,
+    make_recipe_id,
     parse_recipe,
     read_key,
-    recipe_id,
 )
 from tcpipe.recipe import FuseConfig, Placement, ReadConfig, Recipe, SegmentConfig, SplitConfig
 
 
 def test_commented_recipe_is_the_default_recipe(tmp_path: Path) -> None:
     path = tmp_path / "tcpipe.toml"
-    path.write_text(commented_toml())
+    path.write_text(format_commented_toml())
     assert load_recipe(path) == Recipe()
 
 
 def test_uncommented_keys_parse_to_the_same_defaults(tmp_path: Path) -> None:
     lines = [
         line[2:] if line.startswith("# ") and " = " in line and not re.search(r"=( +#|$)", line) else line
-        for line in commented_toml().splitlines()
+        for line in format_commented_toml().splitlines()
     ]
     path = tmp_path / "tcpipe.toml"
     path.write_text("\n".join(line for line in lines if not line.startswith("#") and not line[:1].isupper()))
@@ -138,7 +138,7 @@ def test_names_of_recipes_are_those_of_0_8() -> None:
         "power_sources": [{"type": "a/msg/B", "voltage": "v"}],
     }
     names = {
-        recipe_id(recipe, "husky"): (ingest_key(recipe)[:8], read_key(recipe, "husky", definitions="x")[:8])
+        make_recipe_id(recipe, "husky"): (ingest_key(recipe)[:8], read_key(recipe, "husky", definitions="x")[:8])
         for recipe in (Recipe(), parse_recipe(own, where="r"))
     }
     assert names == {"87f31f5a": ("fd3f3c8a", "4ddf11ad"), "1652ca06": ("92c6ab9a", "0b4c8076")}
@@ -195,7 +195,7 @@ def test_dataset_keys_do_not_rename_runs_but_ingest_keys_do() -> None:
     split = parse_recipe({"split": {"seed": 7}, "sample": {"patch_px": 20}}, where="r")
     fused = parse_recipe({"label": {"velocity": "fused"}}, where="r")
     assert ingest_key(default) == ingest_key(split) != ingest_key(fused)
-    assert recipe_id(default, "husky") == recipe_id(split, "husky") != recipe_id(default, "warthog")
+    assert make_recipe_id(default, "husky") == make_recipe_id(split, "husky") != make_recipe_id(default, "warthog")
     plain = read_key(default, None, definitions="")
     assert plain == read_key(fused, None, definitions="")
     assert plain not in (read_key(default, "husky", definitions=""), read_key(default, None, definitions="ab"))
@@ -209,6 +209,6 @@ def test_a_key_of_many_parts_is_refused_before_it_takes_for_ever(tmp_path):
 
 
 def test_the_commented_recipe_is_toml_whatever_its_docstrings_say() -> None:
-    text = commented_toml()
+    text = format_commented_toml()
     assert parse_recipe(tomllib.loads(text), where="init") == Recipe()
     assert all(line.startswith(("#", "[")) for line in text.splitlines() if line)

@@ -5,40 +5,42 @@ from importlib.resources import files
 import pytest
 
 from tcpipe.errors import RecipeError
-from tcpipe.formats.json_files import plain
-from tcpipe.formats.recipe_toml import commented_toml, parse_recipe
-from tcpipe.formats.robot_files import profiles_of, shipped_profiles
+from tcpipe.formats.json_files import to_plain
+from tcpipe.formats.recipe_toml import format_commented_toml, parse_recipe
+from tcpipe.formats.robot_files import load_profiles, load_shipped_profiles
 from tcpipe.recipe import Recipe
-from tcpipe.robots.profiles import GENERIC, FieldPath, PowerSource, Robot, fields_of
+from tcpipe.robots.profiles import GENERIC, FieldPath, PowerSource, Robot, parse_fields
 
 
 def test_a_robot_has_a_file_of_its_name_and_stands_in_the_recipe_that_init_writes():
     stems = {file.name.removesuffix(".toml") for file in files("tcpipe.robots").iterdir() if file.name.endswith("toml")}
-    robots = shipped_profiles().robots
+    robots = load_shipped_profiles().robots
     assert set(robots) == stems - {"power_sources"} | {GENERIC}
-    assert f"one of {', '.join(sorted(robots))}" in commented_toml()
+    assert f"one of {', '.join(sorted(robots))}" in format_commented_toml()
 
 
 def test_what_is_shipped_can_be_told_apart_and_is_of_a_robots_size():
-    robots = shipped_profiles().robots.values()
+    robots = load_shipped_profiles().robots.values()
     for key in ("platform", "status_types", "called"):
         said = [value for of in robots for value in ([getattr(of, key)] if key == "platform" else getattr(of, key))]
         assert len(said) == len(set(said)), key
     for of in robots:
         assert of.width_m is None or 0.3 < of.width_m < of.length_m < 2.0
         assert of.max_velocity_mps is None or 0.5 <= of.max_velocity_mps <= 5.0
-    platforms = {of.platform for of in shipped_profiles().power_sources}
+    platforms = {of.platform for of in load_shipped_profiles().power_sources}
     assert platforms <= {of.platform for of in robots}
 
 
 def test_a_recipes_own_come_before_the_packages():
     source = PowerSource("sensor_msgs/msg/BatteryState", "v", "i")
-    known = profiles_of(Recipe(robots={"husky": Robot(max_velocity_mps=0.5), "scout": Robot()}, power_sources=[source]))
+    known = load_profiles(
+        Recipe(robots={"husky": Robot(max_velocity_mps=0.5), "scout": Robot()}, power_sources=[source])
+    )
     assert known.robots["husky"] == Robot(max_velocity_mps=0.5)
     assert {"scout", "warthog", GENERIC} <= set(known.robots)
     assert known.types()[0] == source.type
     assert [of for of in known.power_sources if of.type == source.type] == [source]
-    assert len(known.types()) == len(shipped_profiles().types())
+    assert len(known.types()) == len(load_shipped_profiles().types())
 
 
 @pytest.mark.parametrize(
@@ -52,7 +54,7 @@ def test_a_recipes_own_come_before_the_packages():
     ],
 )
 def test_fields_are_joined_by_plus_and_minus(text, wanted):
-    assert fields_of(text) == wanted
+    assert parse_fields(text) == wanted
 
 
 def test_everything_that_is_wrong_with_a_robot_is_said_at_once_by_its_key():
@@ -100,5 +102,5 @@ def test_a_robot_made_in_python_is_checked_where_a_recipe_takes_it():
 
 
 def test_a_recipe_without_tables_of_its_own_is_written_as_before_there_were_any():
-    assert not {"robots", "power_sources"} & set(plain(Recipe()))
-    assert plain(Recipe(robots={"mine": Robot()}))["robots"]["mine"]["width_m"] is None
+    assert not {"robots", "power_sources"} & set(to_plain(Recipe()))
+    assert to_plain(Recipe(robots={"mine": Robot()}))["robots"]["mine"]["width_m"] is None

@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 
 from tcpipe.errors import StoreError
-from tcpipe.formats.json_files import plain, read_as
+from tcpipe.formats.integrity import SEAL, write_sealed
+from tcpipe.formats.json_files import read_as, to_plain
 from tcpipe.formats.run_documents import Manifest, RunJson
-from tcpipe.formats.seals import SEAL, write_sealed
 from tcpipe.pipeline.migrate import migrate
 from tcpipe.store import Store
 
@@ -51,7 +51,7 @@ def test_a_kept_document_is_read_whole_and_written_as_it_was(kept, pattern, cls)
         written.get("info", {}).get("report", {}).get("facts", {}).get("clock_offsets", {}).get("offsets", {}).values()
     ):
         del offset["recipe"]  # since 3.0 the remedy of a finding
-    assert without(plain(read_as(path, cls)), SINCE) == without(written, SINCE)
+    assert without(to_plain(read_as(path, cls)), SINCE) == without(written, SINCE)
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tcpipe.fusion.course import course_rate
+from tcpipe.fusion.course import compute_course_rate
 from tcpipe.fusion.measurements import Positions
 
 
@@ -16,7 +16,7 @@ def _circling(hz, speed_mps=0.9, rate_radps=0.3):
 
 @pytest.mark.parametrize("hz", [1.0, 5.0])
 def test_a_circle_turns_evenly(hz):
-    stamp_s, rate = course_rate(_circling(hz), None, 0)
+    stamp_s, rate = compute_course_rate(_circling(hz), None, 0)
     inside = (stamp_s > 2.0) & (stamp_s < 57.0)
     assert rate[inside] == pytest.approx(np.full(inside.sum(), 0.3), abs=0.04)
 
@@ -24,6 +24,6 @@ def test_a_circle_turns_evenly(hz):
 def test_a_wild_fix_does_not_turn_the_course():
     fixes = _circling(5.0)
     fixes.position_enu_m[150] += [0.7, -1.2, 0.0]
-    stamp_s, rate = course_rate(fixes, None, 0)
+    stamp_s, rate = compute_course_rate(fixes, None, 0)
     inside = (stamp_s > 2.0) & (stamp_s < 57.0)
     assert rate[inside] == pytest.approx(np.full(inside.sum(), 0.3), abs=0.04)

@@ -10,12 +10,12 @@ from unit.fusion import drive
 
 from tcpipe.errors import FusionError
 from tcpipe.fusion.error_state import run_error_state
-from tcpipe.fusion.error_state_pass import FilterPass, lags_of
+from tcpipe.fusion.error_state_pass import FilterPass, compute_lag_rows
 from tcpipe.fusion.fix_errors import find_fix_errors
 from tcpipe.fusion.initial import find_initial_state
 from tcpipe.fusion.measurements import GNSS, VISUAL, WHEELS
-from tcpipe.fusion.process import WHEEL_SCALE_STD, slope_std_rad
-from tcpipe.fusion.standing import standing_intervals
+from tcpipe.fusion.process import WHEEL_SCALE_STD, estimate_slope_std_rad
+from tcpipe.fusion.stationary import find_stationary_intervals
 from tcpipe.fusion.timeline import build_timeline
 from tcpipe.geometry.rotation import matrix_from_quat
 
@@ -29,7 +29,7 @@ def truth():
 def fuse(measurements, **options):
     motion = [s for s in (measurements.gnss, measurements.wheels, measurements.visual) if s is not None]
     start, end = int(min(s.stamp_ns[0] for s in motion)), int(max(s.stamp_ns[-1] for s in motion))
-    initial = find_initial_state(measurements, standing_intervals(measurements), start)
+    initial = find_initial_state(measurements, find_stationary_intervals(measurements), start)
     output = np.arange(-(-start // PERIOD_NS) * PERIOD_NS, end, PERIOD_NS, dtype=np.int64)
     return run_error_state(measurements, initial, output_ns=output, **options)
 
@@ -248,7 +248,7 @@ def test_a_speed_without_a_yaw_rate_goes_where_the_fixes_go():
     # The course takes a roll for a turn: across the way nobody knows where below its antenna the robot is.
     rotation = matrix_from_quat(found.quat_xyzw)
     across = np.sqrt(np.sum((rotation[:, :2, 1] * found.position_std_m[:, :2]) ** 2, axis=1))
-    slope = slope_std_rad(measurements)
+    slope = estimate_slope_std_rad(measurements)
     assert slope is not None
     sway_m = slope * abs(measurements.gnss.lever_arm_m[2])
     assert (across > sway_m * (1.0 - rotation[:, 2, 1] ** 2) / np.sqrt(2.0)).all()
@@ -265,8 +265,10 @@ def test_the_noise_of_a_turn_rate_is_no_scale_of_it():
     )
     output_ns = np.arange(int(measurements.gnss.stamp_ns[-1]) - 10**9, int(measurements.gnss.stamp_ns[-1]), 10**8)
     seen = replace(measurements, visual=turning)
-    run = FilterPass(build_timeline(seen, standing_intervals(seen), output_ns), seen, 0.999, lags=lags_of(output_ns))
-    run.filtered(find_initial_state(seen, standing_intervals(seen), int(seen.gnss.stamp_ns[0])))
+    run = FilterPass(
+        build_timeline(seen, find_stationary_intervals(seen), output_ns), seen, 0.999, lags=compute_lag_rows(output_ns)
+    )
+    run.filtered(find_initial_state(seen, find_stationary_intervals(seen), int(seen.gnss.stamp_ns[0])))
     scale, std = run.last.x[9:12], np.sqrt(np.diag(run.last.P)[3:6])
     assert std[0] < 0.08
     assert (np.abs(scale) < 2.0 * std).all()
@@ -275,7 +277,7 @@ def test_the_noise_of_a_turn_rate_is_no_scale_of_it():
 @pytest.mark.parametrize("span_s", [(60.0, 90.0), (0.0, 40.0)])
 def test_a_pass_that_goes_on_from_another_ones_checkpoint_is_the_pass_itself(span_s):
     measurements = drive.measure(truth(), 1)
-    standing, output_ns = standing_intervals(measurements), measurements.gnss.stamp_ns[:1]
+    standing, output_ns = find_stationary_intervals(measurements), measurements.gnss.stamp_ns[:1]
     timeline = build_timeline(measurements, standing, output_ns)
     first_ns = int(timeline.stamp_ns[0])
     initial = find_initial_state(measurements, standing, first_ns)
@@ -314,7 +316,9 @@ def test_an_estimate_that_is_not_finite_is_an_error():
     broken = replace(measurements.gnss, position_enu_m=measurements.gnss.position_enu_m.copy())
     broken.position_enu_m[5] = np.nan
     wanted = replace(measurements, gnss=broken)
-    initial = find_initial_state(measurements, standing_intervals(measurements), int(measurements.gnss.stamp_ns[0]))
+    initial = find_initial_state(
+        measurements, find_stationary_intervals(measurements), int(measurements.gnss.stamp_ns[0])
+    )
     output = np.array([measurements.gnss.stamp_ns[100]])
     found = run_error_state(wanted, initial, output_ns=output)  # the gate refuses what compares to nothing
     assert np.isfinite(found.position_enu_m).all()

@@ -5,9 +5,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.special import chdtri
 
-from tcpipe.fusion.gates import chi_square_gate
+from tcpipe.fusion.gates import find_chi_square_threshold
 
 
 @given(st.integers(1, 9), st.floats(1e-3, 1.0 - 1e-9))
 def test_as_scipy(freedom, probability):
-    assert chi_square_gate(freedom, probability) == pytest.approx(chdtri(freedom, 1.0 - probability), rel=1e-7)
+    assert find_chi_square_threshold(freedom, probability) == pytest.approx(
+        chdtri(freedom, 1.0 - probability), rel=1e-7
+    )

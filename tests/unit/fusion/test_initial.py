@@ -8,14 +8,14 @@ from scipy.spatial.transform import Rotation
 from unit.fusion import drive
 
 from tcpipe.fusion.initial import find_initial_state
-from tcpipe.fusion.standing import standing_intervals
+from tcpipe.fusion.stationary import find_stationary_intervals
 from tcpipe.geometry.rotation import rpy_from_quat
 
 
 def start_of(measurements):
     motion = [s for s in (measurements.gnss, measurements.wheels, measurements.visual) if s is not None]
     start = int(min(s.stamp_ns[0] for s in motion))
-    return find_initial_state(measurements, standing_intervals(measurements), start)
+    return find_initial_state(measurements, find_stationary_intervals(measurements), start)
 
 
 @pytest.mark.parametrize(

@@ -8,15 +8,15 @@ from unit.fusion.dense_reference import FORCE, LEVER, RATE, P, X
 from tcpipe.fusion import error_state_pass, prediction_kernel, state_kernel, update_kernel
 from tcpipe.fusion.fix_errors import FixErrors
 from tcpipe.fusion.initial import find_initial_state
-from tcpipe.fusion.measurements import part
-from tcpipe.fusion.standing import standing_intervals
+from tcpipe.fusion.measurements import select_measurements
+from tcpipe.fusion.stationary import find_stationary_intervals
 from tcpipe.fusion.timeline import build_timeline
 
 
 def test_deviations_of_yaw_and_forward_velocity_are_those_of_a_cloud():
     out = np.zeros(state_kernel.SAVED)
     small = P * 1e-4
-    state_kernel.saved(X, small, out)
+    state_kernel.save_state(X, small, out)
     cloud = np.random.default_rng(6).multivariate_normal(np.zeros(17), small, 20_000)
     states = np.array([dense_reference.plus(X, d) for d in cloud])
     yaw = np.arctan2(states[:, 3], states[:, 0])
@@ -28,7 +28,7 @@ def test_deviations_of_yaw_and_forward_velocity_are_those_of_a_cloud():
 @pytest.mark.parametrize(("mode", "scaled"), [(0, 0), (1, 0), (1, 1), (2, 0), (3, 0)])
 def test_prediction_is_the_unscented_transform(mode, scaled):
     x, covariance, moved = X.copy(), P.copy(), np.zeros((12, 9))
-    work, _ = state_kernel.workspace(17)
+    work, _ = state_kernel.allocate_workspace(17)
     q = np.concatenate((np.linspace(0.01, 0.02, 19), [scaled, 0.03]))
     prediction_kernel.predict(x, covariance, q, 0.03, 0.4, RATE, FORCE, mode, moved, work)
     wanted_x, wanted_P, cross = dense_reference.predict(X, P, q, 0.03, 0.4, RATE, FORCE, mode)
@@ -43,7 +43,7 @@ def test_prediction_is_the_unscented_transform(mode, scaled):
 
 
 def test_a_covariance_that_is_none_is_repaired_and_counted():
-    work, _ = state_kernel.workspace(17)
+    work, _ = state_kernel.allocate_workspace(17)
     broken = P.copy()
     broken[3, 3] = -1e-12
     prediction_kernel.predict(X.copy(), broken, np.zeros(21), 0.0, 0.1, RATE, FORCE, 3, np.zeros((12, 9)), work)
@@ -54,12 +54,12 @@ def test_a_covariance_that_is_none_is_repaired_and_counted():
 
 @pytest.mark.parametrize("kind", [1, 2, 3, 4, 5, 6, 7, 8])
 def test_update_is_the_unscented_transform(kind):
-    work, gain = state_kernel.workspace(17)
+    work, gain = state_kernel.allocate_workspace(17)
     z, r = np.array([0.2, -0.1, 0.3]), np.array([0.02, 0.03, 0.04])
     if kind in {state_kernel.SIDEWAYS, state_kernel.LEVEL}:
         z[2] = 0.0
     x, covariance = X.copy(), P.copy()
-    nis = update_kernel.innovation_of(kind, x, covariance, z, r, RATE, LEVER, 1.0, work, gain)
+    nis = update_kernel.compute_innovation(kind, x, covariance, z, r, RATE, LEVER, 1.0, work, gain)
     update_kernel.correct(x, covariance, work, gain, np.zeros((3, 3)))
     wanted = dense_reference.update(kind, X, P, z, r, RATE, LEVER)
     assert np.allclose(x, wanted[0], atol=1e-13)
@@ -77,7 +77,7 @@ def _short_run():
     truth = drive.make_drive(12.0, stand_s=1.0)
     measurements = drive.measure(truth, 3, gnss_outliers=0.0)
     start = int(min(s.stamp_ns[0] for s in (measurements.gnss, measurements.wheels, measurements.visual)))
-    standing = standing_intervals(measurements)
+    standing = find_stationary_intervals(measurements)
     initial = find_initial_state(measurements, standing, start)
     period = 50_000_000
     output = np.arange(-(-start // period) * period, drive.ns(2.2), period, dtype=np.int64)
@@ -87,7 +87,7 @@ def _short_run():
 @pytest.mark.parametrize("doubted", [False, True])
 def test_filter_and_smoother_are_those_written_out(monkeypatch, doubted):
     measurements, standing, initial, output = _short_run()
-    timeline = build_timeline(part(measurements, 0, int(output[-1])), standing, output)
+    timeline = build_timeline(select_measurements(measurements, 0, int(output[-1])), standing, output)
     monkeypatch.setattr(error_state_pass, "_BLOCK", 40)  # several blocks,
     monkeypatch.setattr(error_state_pass, "_KEPT_BLOCKS", 2)  # some of them filtered twice
     run = error_state_pass.FilterPass(timeline, measurements, 0.999, lags=(3, 10))

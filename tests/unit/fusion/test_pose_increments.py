@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from tcpipe.fusion.pose_increments import along_pose_axes, in_child_axes, orientation_rates
-from tcpipe.fusion.preparation import body_velocities
+from tcpipe.fusion.pose_increments import compute_orientation_rates, is_along_pose_axes, rotate_to_child_axes
+from tcpipe.fusion.preparation import prepare_body_velocities
 from tcpipe.geometry.rotation import quat_from_rpy
 
 SPEED, RATE = 1.5, 0.3
@@ -29,31 +29,31 @@ def quats(yaw):
 
 def test_a_velocity_that_turns_round_with_the_path_is_along_the_poses_axes_and_turned():
     yaw, place, along = circle()
-    assert along_pose_axes(STAMP_NS, along, place, quats(yaw))
-    assert in_child_axes(along, quats(yaw)) == pytest.approx(np.tile([SPEED, 0.0, 0.0], (T.size, 1)), abs=1e-9)
+    assert is_along_pose_axes(STAMP_NS, along, place, quats(yaw))
+    assert rotate_to_child_axes(along, quats(yaw)) == pytest.approx(np.tile([SPEED, 0.0, 0.0], (T.size, 1)), abs=1e-9)
 
 
 @pytest.mark.parametrize("scale", [0.7, 1.4])
 def test_a_velocity_of_another_scale_is_turned_as_well(scale):
     yaw, place, along = circle()
-    assert along_pose_axes(STAMP_NS, scale * along, place, quats(yaw))
+    assert is_along_pose_axes(STAMP_NS, scale * along, place, quats(yaw))
 
 
 def test_a_velocity_along_the_robots_axes_is_left():
     yaw, place, _ = circle()
-    assert not along_pose_axes(STAMP_NS, np.tile([SPEED, 0.0, 0.0], (T.size, 1)), place, quats(yaw))
+    assert not is_along_pose_axes(STAMP_NS, np.tile([SPEED, 0.0, 0.0], (T.size, 1)), place, quats(yaw))
 
 
 def test_straight_along_the_first_axis_both_are_the_same_and_nothing_is_turned():
     yaw, place, along = circle(rate=0.0, start_rad=0.0)
-    assert not along_pose_axes(STAMP_NS, along, place, quats(yaw))
+    assert not is_along_pose_axes(STAMP_NS, along, place, quats(yaw))
 
 
 def test_an_odometry_without_poses_or_with_one_axis_is_left():
     yaw, place, along = circle()
-    assert not along_pose_axes(STAMP_NS, along, np.full_like(place, np.nan), quats(yaw))
+    assert not is_along_pose_axes(STAMP_NS, along, np.full_like(place, np.nan), quats(yaw))
     along[:, 1] = np.nan
-    assert not along_pose_axes(STAMP_NS, along, place, quats(yaw))
+    assert not is_along_pose_axes(STAMP_NS, along, place, quats(yaw))
 
 
 def test_such_an_odometry_is_prepared_as_driving_forward_and_it_is_said():
@@ -74,7 +74,7 @@ def test_a_rate_that_is_zero_or_missing_throughout_is_that_of_the_orientation_th
     rpy[axis] = angle
     rate = np.full((T.size, 3), 0.01)
     rate[:, axis] = silent
-    found, turns = orientation_rates(STAMP_NS, rate, quat_from_rpy(*rpy))
+    found, turns = compute_orientation_rates(STAMP_NS, rate, quat_from_rpy(*rpy))
     assert turns.tolist() == [k == axis for k in range(3)]
     assert found[1:-1, axis] == pytest.approx(0.2 * np.cos(0.5 * T)[1:-1], abs=1e-3)
     assert np.isnan(found[[0, -1], axis]).all()
@@ -85,18 +85,18 @@ def test_a_rate_that_is_measured_stays_and_so_does_one_beside_an_orientation_tha
     yaw, _, _ = circle()
     measured = np.zeros((T.size, 3))
     measured[7, 2] = 1e-3
-    found, turns = orientation_rates(STAMP_NS, measured, quats(yaw))
+    found, turns = compute_orientation_rates(STAMP_NS, measured, quats(yaw))
     assert found is measured or (found == measured).all()
     assert not turns.any()
     for quat in (quats(0.0 * yaw), np.full((T.size, 4), np.nan)):
-        found, turns = orientation_rates(STAMP_NS, np.zeros((T.size, 3)), quat)
+        found, turns = compute_orientation_rates(STAMP_NS, np.zeros((T.size, 3)), quat)
         assert not found.any()
         assert not turns.any()
 
 
 def twists(columns):
     given = {"xyz_m": (0.0, 0.0, 0.0), "quat_xyzw": (0.0, 0.0, 0.0, 1.0), "default_std_mps": 0.05}
-    return body_velocities(STAMP_NS, columns, **given, only_forward=True)
+    return prepare_body_velocities(STAMP_NS, columns, **given, only_forward=True)
 
 
 def odometry(velocity_x, yaw, rate_z):

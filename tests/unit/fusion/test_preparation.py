@@ -5,7 +5,13 @@ import pyproj
 import pytest
 from scipy.spatial.transform import Rotation
 
-from tcpipe.fusion.preparation import body_velocities, find_datum, ground_velocities, inertial, positions
+from tcpipe.fusion.preparation import (
+    find_datum,
+    prepare_body_velocities,
+    prepare_ground_velocities,
+    prepare_imu,
+    prepare_positions,
+)
 
 NAN = np.nan
 ARM = (0.1, 0.2, 0.3)
@@ -24,7 +30,7 @@ def gnss_columns(lon, lat, alt, variance=0.0004):
 
 def fixes(stamp_ns, columns):
     rules = {"lever_arm_m": ARM, "default_std_m": 0.05, "floor_std_m": 0.01}
-    return positions(stamp_ns, columns, datum_deg_m=DATUM, **rules)
+    return prepare_positions(stamp_ns, columns, datum_deg_m=DATUM, **rules)
 
 
 def test_fixes_become_enu_and_a_fix_at_null_island_is_set_aside():
@@ -71,7 +77,7 @@ def odometry_columns(count, **known):
 
 def twists(columns, **options):
     given = {"xyz_m": ARM, "quat_xyzw": (0, 0, 0, 1), "default_std_mps": 0.05, "only_forward": False}
-    return body_velocities(stamps(len(columns["x_m"])), columns, **given | options)
+    return prepare_body_velocities(stamps(len(columns["x_m"])), columns, **given | options)
 
 
 def test_a_twist_is_turned_into_base_link_with_its_variance():
@@ -145,7 +151,7 @@ def test_a_robot_that_stands_has_a_twist_of_zero():
 def prepared_imu(force, rate, quat=None, *, period_ns=100_000_000, **placed):
     columns = imu_columns(force, rate, quat)
     given = {"xyz_m": ARM, "quat_xyzw": (0, 0, 0, 1), "gyro_std_radps": 0.003, "accelerometer_std_mps2": 0.1}
-    return inertial(stamps(len(force), period_ns), columns, **given | placed)
+    return prepare_imu(stamps(len(force), period_ns), columns, **given | placed)
 
 
 def imu_columns(force, rate, quat=None):
@@ -202,7 +208,7 @@ def test_a_receivers_velocity_has_a_deviation_always_and_a_vast_one_where_it_tel
     variance = np.array([[0.04, 0.04, NAN], [NAN, NAN, NAN], [1.0, 1.0, 1.0], [1.0, 1.0, 1.0], [1e-9, 0.09, 0.16]])
     columns = {f"{axis}_velocity_mps": velocity[:, i] for i, axis in enumerate(("east", "north", "up"))}
     columns |= {f"{axis}_var_m2ps2": variance[:, i] for i, axis in enumerate(("east", "north", "up"))}
-    found, prepared = ground_velocities(stamps(5), columns, default_std_mps=0.1)
+    found, prepared = prepare_ground_velocities(stamps(5), columns, default_std_mps=0.1)
     assert found.stamp_ns.tolist() == stamps(5)[[0, 1, 4]].tolist()
     assert prepared.invalid_ns.tolist() == stamps(5)[[2, 3]].tolist()
     assert found.velocity_enu_mps.tolist() == [[1.0, 2.0, 0.0], [1.0, 2.0, 0.1], [1.0, 1.0, 0.0]]

@@ -10,8 +10,14 @@ from unit.fusion.test_error_state import fuse, truth
 
 from tcpipe.fusion import state_kernel as kernel
 from tcpipe.fusion.measurements import Measurements, Positions
-from tcpipe.fusion.preparation import inertial
-from tcpipe.fusion.process import process_noise, shake_density, slope_std_rad, turn_scale_std, turns_by_course
+from tcpipe.fusion.preparation import prepare_imu
+from tcpipe.fusion.process import (
+    estimate_shake_density,
+    estimate_slope_std_rad,
+    is_turned_by_course,
+    process_noise,
+    turn_scale_std,
+)
 
 
 @cache
@@ -28,25 +34,25 @@ def test_vibration_counts_where_it_is():
     columns |= {f"angular_velocity_{axis}_radps": np.zeros(4000) for axis in "xyz"}
     columns |= {f"quat_{c}": np.full(4000, np.nan) for c in "xyzw"}
     place = {"xyz_m": (0.0, 0.0, 0.0), "quat_xyzw": (0.0, 0.0, 0.0, 1.0)}
-    imu, _ = inertial(stamp_ns, columns, **place, gyro_std_radps=0.002, accelerometer_std_mps2=0.02)
+    imu, _ = prepare_imu(stamp_ns, columns, **place, gyro_std_radps=0.002, accelerometer_std_mps2=0.02)
     assert imu.accelerometer_noise_mps2[:1700] == pytest.approx(np.full(1700, 0.05), rel=0.3)
     assert imu.accelerometer_noise_mps2[2300:] == pytest.approx(np.full(1700, 0.4), rel=0.3)
     at_ns, inertial_mode = stamp_ns[[1000, 3000]], np.full(2, kernel.INERTIAL, np.int8)
-    density = shake_density(replace(measured(), imu=imu), at_ns, inertial_mode)
+    density = estimate_shake_density(replace(measured(), imu=imu), at_ns, inertial_mode)
     assert density == pytest.approx(np.array([0.05, 0.4]) ** 2 / 200, rel=0.6)
 
 
 def test_without_an_imu_the_velocity_may_change_where_every_odometry_says_so():
     moving, held = measured(imu=False), np.zeros(2, np.int8)
     at_ns = drive.ns([4.3, 30.0])  # starting, and driving steadily
-    starting, steady = shake_density(moving, at_ns, held)
+    starting, steady = estimate_shake_density(moving, at_ns, held)
     assert starting > 5 * steady
     digging = moving.wheels.velocity_mps.copy()
     digging[:, 0] += np.clip((moving.wheels.stamp_ns - at_ns[1]) * 1e-9, 0, 1)  # the camera sees no such start
-    again = shake_density(replace(moving, wheels=replace(moving.wheels, velocity_mps=digging)), at_ns, held)
+    again = estimate_shake_density(replace(moving, wheels=replace(moving.wheels, velocity_mps=digging)), at_ns, held)
     assert again[1] < 5 * steady
     blind = replace(moving, visual=None, wheels=replace(moving.wheels, velocity_mps=digging))
-    assert shake_density(blind, at_ns + 300_000_000, held)[1] > 5 * steady
+    assert estimate_shake_density(blind, at_ns + 300_000_000, held)[1] > 5 * steady
 
 
 def test_a_turn_rate_of_an_odometry_has_a_scale_to_be_found():
@@ -65,9 +71,9 @@ def test_the_course_tells_turns_only_where_no_other_sensor_does():
     wheels = measured(imu=False, visual=False)
     nothing = np.full_like(wheels.wheels.yaw_rate_radps, np.nan)
     speed_only = replace(wheels, wheels=replace(wheels.wheels, yaw_rate_radps=nothing, yaw_rate_var=nothing))
-    assert turns_by_course(speed_only)
-    assert turns_by_course(measured(imu=False, visual=False, wheels=False))
-    assert not any(turns_by_course(m) for m in (wheels, measured(), replace(speed_only, gnss=None)))
+    assert is_turned_by_course(speed_only)
+    assert is_turned_by_course(measured(imu=False, visual=False, wheels=False))
+    assert not any(is_turned_by_course(m) for m in (wheels, measured(), replace(speed_only, gnss=None)))
 
 
 def test_positions_alone_do_not_tell_which_way_the_robot_looks():
@@ -108,11 +114,11 @@ def test_ground_is_as_steep_as_the_fixes_climb():
         noise = std_m * np.random.default_rng(4).normal(size=(2000, 3))
         place = np.column_stack((way_m, 0.0 * way_m, height_m(way_m))) + noise
         fixes = Positions(np.arange(2000, dtype=np.int64) * 10**8, place, np.full((2000, 3), std_m**2))
-        return slope_std_rad(Measurements(gnss=fixes))
+        return estimate_slope_std_rad(Measurements(gnss=fixes))
 
     # A wave of 60 m that is 0.1 steep at most, 0.0707 on average, is seen over chords of 3.6 m, in 18 slopes.
     wave = over(lambda way_m: 0.1 * 60 / (2 * np.pi) * np.sin(2 * np.pi * way_m / 60))
     assert wave == pytest.approx(0.0707 * (1 + np.sqrt(0.5 / 18)), rel=0.03)
     assert over(np.zeros_like) is None or over(np.zeros_like) < 0.01
     assert over(np.zeros_like, 2.0) is None
-    assert slope_std_rad(Measurements()) is None
+    assert estimate_slope_std_rad(Measurements()) is None

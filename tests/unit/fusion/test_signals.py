@@ -3,7 +3,14 @@
 import numpy as np
 import pytest
 
-from tcpipe.fusion.signals import hold_last, in_gap, median_period_ns, seconds, slopes, white_noise
+from tcpipe.fusion.signals import (
+    compute_median_period_ns,
+    compute_seconds,
+    compute_slopes,
+    estimate_white_noise,
+    hold_last,
+    is_in_gap,
+)
 
 
 def test_intervals_that_touch_a_gap():
@@ -11,8 +18,8 @@ def test_intervals_that_touch_a_gap():
     start = np.array([0, 12, 15, 25, 100, -4, -6, 109, 109, 20], np.int64)
     end = np.array([20, 15, 30, 30, 110, 0, 0, 114, 116, 20], np.int64)
     wanted = [False, False, True, True, False, False, True, False, True, False]
-    assert in_gap(stamp, start, end, longest_ns=10).tolist() == wanted
-    assert in_gap(np.empty(0, np.int64), start, end, longest_ns=10).all()
+    assert is_in_gap(stamp, start, end, longest_ns=10).tolist() == wanted
+    assert is_in_gap(np.empty(0, np.int64), start, end, longest_ns=10).all()
 
 
 def test_last_value_is_held_and_unknown_before_the_first():
@@ -24,20 +31,20 @@ def test_last_value_is_held_and_unknown_before_the_first():
 
 def test_seconds_keep_nanoseconds_of_large_stamps():
     zero = 1_700_000_000_000_000_000
-    assert seconds(np.array([zero + 1], np.int64), zero)[0] == 1e-9
-    assert median_period_ns(np.array([zero, zero + 10, zero + 20, zero + 90], np.int64)) == 10
-    assert median_period_ns(np.array([zero], np.int64)) == 1
+    assert compute_seconds(np.array([zero + 1], np.int64), zero)[0] == 1e-9
+    assert compute_median_period_ns(np.array([zero, zero + 10, zero + 20, zero + 90], np.int64)) == 10
+    assert compute_median_period_ns(np.array([zero], np.int64)) == 1
 
 
 def test_slopes_of_a_line_are_its_own_whatever_its_stamps():
     stamp_ns = np.sort(np.random.default_rng(0).integers(0, 10**10, 200)) + 10**18
     values = 3.0 - 0.7 * (stamp_ns - 10**18) * 1e-9
-    assert slopes(stamp_ns, values, 0.6) == pytest.approx(np.full(200, -0.7), abs=1e-5)
-    assert slopes(stamp_ns[:1], values[:1], 0.6).tolist() == [0.0]
+    assert compute_slopes(stamp_ns, values, 0.6) == pytest.approx(np.full(200, -0.7), abs=1e-5)
+    assert compute_slopes(stamp_ns[:1], values[:1], 0.6).tolist() == [0.0]
 
 
 def test_white_noise_is_told_from_motion():
     t = np.arange(4000) / 200
     noise = 0.05 * np.random.default_rng(1).normal(size=(4000, 3))
-    assert white_noise(noise + np.sin(t)[:, None]) == pytest.approx(0.05, rel=0.05)
-    assert white_noise(noise[:2]) == 0.0
+    assert estimate_white_noise(noise + np.sin(t)[:, None]) == pytest.approx(0.05, rel=0.05)
+    assert estimate_white_noise(noise[:2]) == 0.0

@@ -7,10 +7,10 @@ import pytest
 from rough_drive import drive, initial, measured
 
 from tcpipe.fusion.measurements import GNSS, IMU, VISUAL, WHEELS, Measurements
-from tcpipe.fusion.ukf15 import run_ukf15, sources_of
+from tcpipe.fusion.ukf15 import collect_sources, run_ukf15
 from tcpipe.fusion.ukf15_kernel import SELECT
 from tcpipe.geometry.angles import wrap_to_pi
-from tcpipe.geometry.rotation import inverse, rotate, rpy_from_matrix, rpy_from_quat
+from tcpipe.geometry.rotation import invert, rotate, rpy_from_matrix, rpy_from_quat
 
 SETTLED = 100  # rows, 5 s: the start is wrong on purpose
 
@@ -30,7 +30,7 @@ def _errors(truth, trajectory):
     """Error over deviation and error, of the settled rows: east and north [m], up [m], forward velocity [m/s], yaw [rad]."""
     at = truth.at(trajectory.stamp_ns)
     position = trajectory.position_enu_m - truth.position[at]
-    forward = rotate(inverse(trajectory.quat_xyzw), trajectory.velocity_enu_mps)[:, 0] - truth.body_velocity[at, 0]
+    forward = rotate(invert(trajectory.quat_xyzw), trajectory.velocity_enu_mps)[:, 0] - truth.body_velocity[at, 0]
     yaw = wrap_to_pi(rpy_from_quat(trajectory.quat_xyzw)[:, 2] - rpy_from_matrix(truth.rotation[at])[:, 2])
     errors = np.column_stack((position, forward, yaw))[SETTLED:]
     std = np.column_stack((trajectory.position_std_m, trajectory.forward_velocity_std_mps, trajectory.yaw_std_rad))[
@@ -117,7 +117,7 @@ def test_entries_that_a_camera_does_not_give_are_left_out(truth):
     velocity, variance = measurements.visual.velocity_mps.copy(), measurements.visual.variance_m2ps2.copy()
     velocity[::2, 1:] = variance[::2, 1:] = np.nan
     visual = replace(measurements.visual, velocity_mps=velocity, variance_m2ps2=variance)
-    sources = sources_of(replace(measurements, visual=visual), initial(truth), end_ns=int(truth.stamp_ns[-1]))
+    sources = collect_sources(replace(measurements, visual=visual), initial(truth), end_ns=int(truth.stamp_ns[-1]))
     shapes = {source.z.shape for source in sources if source.role == VISUAL and source.kind != SELECT}
     n = visual.stamp_ns.size
     assert shapes == {((n + 1) // 2, 1), (n // 2, 3)}

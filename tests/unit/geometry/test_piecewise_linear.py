@@ -5,11 +5,11 @@ import pytest
 from made_tracks import stamps
 
 from tcpipe.geometry.piecewise_linear import (
-    held_back_integral_to,
-    integral_to,
+    integrate_held_to,
+    integrate_product_to,
+    integrate_to,
     interpolate,
     mean_between,
-    product_integral_to,
 )
 
 SECONDS = stamps(3, step_ns=1_000_000_000)
@@ -20,7 +20,7 @@ def at(*seconds):
 
 
 def test_integral_of_a_triangle():
-    assert integral_to(SECONDS, np.array([0.0, 1.0, 0.0]), at(0, 0.5, 1, 1.5, 2)) == pytest.approx(
+    assert integrate_to(SECONDS, np.array([0.0, 1.0, 0.0]), at(0, 0.5, 1, 1.5, 2)) == pytest.approx(
         [0, 0.125, 0.5, 0.875, 1]
     )
 
@@ -28,13 +28,13 @@ def test_integral_of_a_triangle():
 def test_product_of_two_ramps_is_a_cubic():
     # t times (2 - t) from 0 to x is x² - x³ / 3.
     t = np.array([0.0, 1.0, 2.0])
-    got = product_integral_to(SECONDS, t, 2 - t, at(0.3, 1.0, 1.7, 2.0))
+    got = integrate_product_to(SECONDS, t, 2 - t, at(0.3, 1.0, 1.7, 2.0))
     assert got == pytest.approx([x**2 - x**3 / 3 for x in (0.3, 1.0, 1.7, 2.0)], rel=1e-12)
 
 
 def test_held_back_takes_the_value_of_the_right_end():
     value = np.array([9.0, 2.0, 5.0])
-    assert held_back_integral_to(SECONDS, value, at(0, 0.25, 1, 1.5, 2)) == pytest.approx([0, 0.5, 2, 4.5, 7])
+    assert integrate_held_to(SECONDS, value, at(0, 0.25, 1, 1.5, 2)) == pytest.approx([0, 0.5, 2, 4.5, 7])
 
 
 def test_interpolation_resolves_nanoseconds_far_from_the_epoch():

@@ -5,7 +5,7 @@ import pytest
 from made_tracks import stamps
 from scipy.interpolate import CubicHermiteSpline
 
-from tcpipe.geometry.polyline import polyline
+from tcpipe.geometry.polyline import fit_polyline
 
 
 def circle(radius_m, speed_mps, count):
@@ -13,20 +13,20 @@ def circle(radius_m, speed_mps, count):
     angle = speed_mps * t / radius_m
     position = np.column_stack((radius_m * np.cos(angle), radius_m * np.sin(angle), 0 * t))
     velocity = speed_mps * np.column_stack((-np.sin(angle), np.cos(angle), 0 * t))
-    return polyline(stamps(count), position, velocity)
+    return fit_polyline(stamps(count), position, velocity)
 
 
 def hill(slope_rad, speed_mps, count):
     along = speed_mps * 0.05 * np.arange(count)
     direction = np.array([0.6 * np.cos(slope_rad), 0.8 * np.cos(slope_rad), np.sin(slope_rad)])
-    return polyline(stamps(count), along[:, None] * direction, np.tile(speed_mps * direction, (count, 1)))
+    return fit_polyline(stamps(count), along[:, None] * direction, np.tile(speed_mps * direction, (count, 1)))
 
 
 def test_positions_are_those_of_scipys_hermite_spline():
     rng = np.random.default_rng(1)
     stamp_ns = np.cumsum(rng.integers(30_000_000, 70_000_000, 30)) + 1_700_000_000_000_000_000
     position, velocity = rng.normal(0, 3, (30, 3)), rng.normal(0, 1, (30, 3))
-    path = polyline(stamp_ns, position, velocity)
+    path = fit_polyline(stamp_ns, position, velocity)
     at_ns = np.sort(rng.integers(stamp_ns[0], stamp_ns[-1], 500))
     spline = CubicHermiteSpline((stamp_ns - stamp_ns[0]) * 1e-9, position, velocity)
     np.testing.assert_allclose(path.position_at(at_ns), spline((at_ns - stamp_ns[0]) * 1e-9), atol=1e-12)
@@ -60,7 +60,7 @@ def test_touching_the_circle_is_no_crossing_and_leaving_it_is():
     x = np.where(t < 2, 1 - (t - 1) ** 2, 2 * (t - 2))
     vx = np.where(t < 2, -2 * (t - 1), 2.0)
     zero = 0 * t
-    path = polyline(stamps(len(t)), np.column_stack((x, zero, zero)), np.column_stack((vx, zero, zero)))
+    path = fit_polyline(stamps(len(t)), np.column_stack((x, zero, zero)), np.column_stack((vx, zero, zero)))
     end = path.first_crossing_ns(int(path.stamp_ns[0]), radius_m=1.0 + 1e-9)
     assert (end - path.stamp_ns[0]) * 1e-9 == pytest.approx(2.5, abs=1e-6)
 
@@ -70,7 +70,7 @@ def test_a_loop_between_two_samples_is_found():
     stamp_ns = stamps(3, step_ns=1_000_000_000)
     position = np.array([[0.0, 0, 0], [0.5, 0, 0], [0.6, 0, 0]])
     velocity = np.array([[6.0, 0, 0], [-6.0, 0, 0], [0.1, 0, 0]])
-    path = polyline(stamp_ns, position, velocity)
+    path = fit_polyline(stamp_ns, position, velocity)
     end = path.first_crossing_ns(int(stamp_ns[0]), radius_m=1.0)
     assert stamp_ns[0] < end < stamp_ns[1]
     assert path.position_at(np.array([end]))[0, 0] == pytest.approx(1.0, abs=1e-7)

@@ -38,8 +38,8 @@ def test_yaw_of_half_a_turn_is_minus_pi():
 
 def test_product_inverse_and_rotate_are_scipys():
     a, b = Rotation.from_quat(QUAT), Rotation.from_quat(OTHER)
-    assert np.allclose(rotation.product(QUAT, OTHER), (a * b).as_quat(canonical=True), atol=1e-13)
-    assert np.allclose(rotation.product(QUAT, rotation.inverse(QUAT)), [0, 0, 0, 1], atol=1e-13)
+    assert np.allclose(rotation.multiply(QUAT, OTHER), (a * b).as_quat(canonical=True), atol=1e-13)
+    assert np.allclose(rotation.multiply(QUAT, rotation.invert(QUAT)), [0, 0, 0, 1], atol=1e-13)
     vector = np.random.default_rng(3).normal(size=(200, 3))
     assert np.allclose(rotation.rotate(QUAT, vector), a.apply(vector), atol=1e-13)
 
@@ -53,7 +53,7 @@ def test_exponential_and_logarithm_are_scipys_also_near_zero():
 
 
 def test_unusable_quaternions_become_nan():
-    quat = rotation.normalized([[0, 0, 0, 0.0], [np.nan, 0, 0, 1], [0, 0, 0, -2.0], [np.inf, 0, 0, 1]])
+    quat = rotation.normalize([[0, 0, 0, 0.0], [np.nan, 0, 0, 1], [0, 0, 0, -2.0], [np.inf, 0, 0, 1]])
     assert np.isnan(quat[[0, 1, 3]]).all()
     assert quat[2].tolist() == [0, 0, 0, 1]
 

@@ -7,25 +7,25 @@ import pytest
 from made_models import CARD
 
 from tcpipe.dataset import Split, open_dataset
-from tcpipe.learning.baselines import SIMPLEST_FIRST, _groups, compared, describe_ratios, standing
-from tcpipe.learning.evaluation_facts import Compared
+from tcpipe.learning.baselines import SIMPLEST_FIRST, _group_samples, compare_baselines, describe_ratios, rank_model
+from tcpipe.learning.evaluation_facts import BaselineResult
 from tcpipe.learning.fitting import FitConfig
-from tcpipe.learning.metrics import Errors, Ratio, costs
+from tcpipe.learning.metrics import Errors, Ratio, compute_costs
 from tcpipe.learning.models import Model
-from tcpipe.learning.predictions import measured
+from tcpipe.learning.predictions import collect_measured
 
 
 @pytest.fixture(scope="module")
 def sets(dataset):
     data = open_dataset(dataset)
     names = {entry.id: entry.name for entry in data.card.classes}
-    return data, {name: measured(data[name], names) for name in ("test", "unseen")}
+    return data, {name: collect_measured(data[name], names) for name in ("test", "unseen")}
 
 
 def said_by(sets, factor=1.0):
     """A model that says every label times a factor."""
     return {
-        name: costs(factor * part.costs["w"], part.costs["v"], 1.0) | {"E": factor * part.costs["E"]}
+        name: compute_costs(factor * part.costs["w"], part.costs["v"], 1.0) | {"E": factor * part.costs["E"]}
         for name, part in sets.items()
     }
 
@@ -39,7 +39,7 @@ def model_of(kind="resnet18"):
 def found(sets):
     pytest.importorskip("lightgbm")
     data, parts = sets
-    return compared(model_of(), data, parts, said_by(parts, 1.1), seed=0)
+    return compare_baselines(model_of(), data, parts, said_by(parts, 1.1), seed=0)
 
 
 def test_the_mean_of_each_class_by_hand(found, sets):
@@ -69,7 +69,7 @@ def test_two_runs_are_too_few_so_blocks_of_ground_are_drawn(found, sets):
 
 def test_a_model_is_not_its_own_baseline(sets):
     data, parts = sets
-    rows, _ = compared(model_of("table"), data, parts, said_by(parts), seed=0)
+    rows, _ = compare_baselines(model_of("table"), data, parts, said_by(parts), seed=0)
     assert "gradient boosting" not in {row.baseline for row in rows}
 
 
@@ -79,15 +79,15 @@ def test_what_cannot_be_fitted_is_said(sets, monkeypatch):
     monkeypatch.setattr(
         Split, "column", lambda split, name: np.zeros(len(split)) if name == "fold" else real(split, name)
     )
-    rows, lacking = compared(model_of(), data, parts, said_by(parts), seed=0)
+    rows, lacking = compare_baselines(model_of(), data, parts, said_by(parts), seed=0)
     assert any(of.subject.name == "gradient boosting" and "in one fold" in of.names["error"] for of in lacking)
     assert {row.baseline for row in rows} == set(SIMPLEST_FIRST) - {"gradient boosting"}
     monkeypatch.setattr(Split, "labels", property(lambda split: np.full((len(split), 2), np.nan, np.float32)))
-    assert compared(model_of(), data, parts, {}, seed=0)[0] == []
+    assert compare_baselines(model_of(), data, parts, {}, seed=0)[0] == []
 
 
 def row(baseline, rmse, ratio, quantity="E"):
-    return Compared(
+    return BaselineResult(
         baseline=baseline, split="unseen", quantity=quantity, errors=Errors(50, rmse, 5.0, 50), rmse_ratio=ratio,
         mape_ratio=ratio, groups=34, drawn_by="runs",
     )  # fmt: skip
@@ -101,18 +101,18 @@ def test_the_best_baseline_is_named_with_the_ratio_and_its_interval():
     assert describe_ratios([mean, linear]) == [
         "unseen, energy E: RMSE ratio to 'class and slope, linear', the best baseline, 0.90 (95 % CI 0.80 to 0.97, 34 runs)"
     ]
-    assert standing([mean, linear], "unseen", "E").beats_all
+    assert rank_model([mean, linear], "unseen", "E").beats_all
     trees = row("gradient boosting", 4.0, Ratio(1.25, 1.1, 1.4))
-    worse = standing([mean, linear, trees], "unseen", "E")
+    worse = rank_model([mean, linear, trees], "unseen", "E")
     assert (worse.best, worse.beats_all, worse.beats_curves, worse.is_worse) == (trees, False, True, True)
     alike = row("class and slope, spline", 4.5, Ratio(1.02, 0.95, 1.1))
-    same = standing([mean, alike], "unseen", "E")
+    same = rank_model([mean, alike], "unseen", "E")
     assert (same.beats_all, same.beats_curves, same.is_worse) == (False, False, False)
     rounded = row("physics", 4.5, Ratio(1.0001, 1.00005, 1.0002))
-    assert not standing([mean, rounded], "unseen", "E").is_worse
+    assert not rank_model([mean, rounded], "unseen", "E").is_worse
     few = row("physics", 5.0, Ratio(0.5, None, None))
     assert "34 runs are too few" in describe_ratios([few])[0]
-    assert standing([few], "unseen", "E").beats_curves is None
+    assert rank_model([few], "unseen", "E").beats_curves is None
     assert describe_ratios([row("physics", 5.0, Ratio(None, None, None))]) == []
 
 
@@ -130,7 +130,7 @@ class Places:
 
 
 def test_blocks_are_of_ground_whatever_the_runs_frames():
-    kind, groups = _groups(Places(), 10.0)
+    kind, groups = _group_samples(Places(), 10.0)
     assert kind == "blocks"
     assert groups[1] == groups[2]
     assert len(set(groups.tolist())) == 3

@@ -7,11 +7,11 @@ import pytest
 from installed_command import tcpipe
 
 from tcpipe.dataset import Split, open_dataset
-from tcpipe.dataset.beside import beside_of
+from tcpipe.dataset.extra_features import read_extra_features
 from tcpipe.errors import DatasetError, ModelError, UsageError
 from tcpipe.learning.fitting import FitConfig
-from tcpipe.learning.models import at_speed, chosen_model, load_model
-from tcpipe.learning.predictions import predicted_costs
+from tcpipe.learning.models import choose_model, load_model, set_speed
+from tcpipe.learning.predictions import predict_costs
 from tcpipe.learning.training import train
 from tcpipe.pipeline.verify import verify
 
@@ -36,7 +36,7 @@ def _column(split, name):
 
 
 def _labels(split):
-    beside = beside_of(split)
+    beside = read_extra_features(split)
     return (real_labels(split) + np.column_stack([400.0 * beside.turn_radpm, 1.0 * beside.command_mps])).astype(
         np.float32
     )
@@ -51,16 +51,16 @@ def test_what_is_told_beside_a_patch_is_heeded(told, tmp_path, kind):
     assert [of.name for of in model.card.beside] == ["turn_radpm", "command_mps"]
     assert model.card.beside[1].seen == (0.5, 1.0)
     assert model.takes_turns
-    beside = beside_of(split)
+    beside = read_extra_features(split)
     said = model.predict(split.patches, beside)
-    assert predicted_costs(replace(model, residuals={}), split)["w"] == pytest.approx(said[:, 0])  # not centred
+    assert predict_costs(replace(model, residuals={}), split)["w"] == pytest.approx(said[:, 0])  # not centred
     usual = model.predict(split.patches)
     straight = replace(
         beside, turn_radpm=np.full(len(split), model.card.beside[0].usual), command_mps=np.full(len(split), np.nan)
     )
     assert model.predict(split.patches, straight) == pytest.approx(usual, rel=1e-5)
     assert np.abs(said - usual).max() > 0.0
-    full, half = (at_speed(model, mps).predict(split.patches)[:, 1] for mps in (1.0, 0.5))
+    full, half = (set_speed(model, mps).predict(split.patches)[:, 1] for mps in (1.0, 0.5))
     assert np.abs(full - half).max() > 0.0
     if kind == "table":
         assert 0.35 < (full - half).mean() < 0.6  # 0.5 was put in
@@ -76,8 +76,8 @@ def test_physics_is_a_model_like_the_others(told, tmp_path):
     assert model.takes_turns
     assert sorted(model.residuals["sample_id"]) == sorted(split.column("sample_id"))
     assert set(model.pixel_classes) >= {4, 5}
-    said = model.predict(split.with_channels("height").patches, beside_of(split))
-    centred = predicted_costs(model, split)["w"] / said[:, 0]
+    said = model.predict(split.with_channels("height").patches, read_extra_features(split))
+    centred = predict_costs(model, split)["w"] / said[:, 0]
     for of in (4, 5):
         assert np.ptp(centred[split.column("terrain_class") == of]) < 1e-5, "a class is centred as one"
     assert np.std(said[:, 0] - split.labels[:, 0]) < np.std(split.labels[:, 0])
@@ -85,9 +85,9 @@ def test_physics_is_a_model_like_the_others(told, tmp_path):
         model.predict(split.with_channels("height").patches)
     assert tcpipe("train", told, "model", "--model", "physics", cwd=tmp_path).stdout.startswith("model: nothing to do")
     with pytest.raises(UsageError, match="leave out --physics-from"):
-        chosen_model(str(tmp_path / "model"), physics=str(told))
+        choose_model(str(tmp_path / "model"), physics=str(told))
     with pytest.raises(UsageError, match="takes no commanded speed; leave out --speed"):
-        chosen_model(str(tmp_path / "model"), speed_mps=0.5)
+        choose_model(str(tmp_path / "model"), speed_mps=0.5)
 
 
 def test_a_speed_that_nobody_drove_is_refused(told, tmp_path):
@@ -96,7 +96,7 @@ def test_a_speed_that_nobody_drove_is_refused(told, tmp_path):
     with pytest.raises(
         UsageError, match=r"--speed 2: .* trained at commanded speeds of 0\.5 to 1 m/s; give one of these"
     ):
-        chosen_model(str(tmp_path / "model"), speed_mps=2.0)
+        choose_model(str(tmp_path / "model"), speed_mps=2.0)
 
 
 def test_an_older_dataset_cannot_tell_and_says_so(dataset, tmp_path, monkeypatch, caplog):

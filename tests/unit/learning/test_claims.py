@@ -3,9 +3,9 @@
 import pytest
 from made_models import CARD
 
-from tcpipe.learning.claims import CLAIMS, checked_claims
+from tcpipe.learning.claims import CLAIMS, check_claims
 from tcpipe.learning.evaluation_facts import (
-    Compared,
+    BaselineResult,
     EvaluateConfig,
     EvaluatedDataset,
     EvaluatedModel,
@@ -20,7 +20,7 @@ SURE = Ratio(0.8, 0.7, 0.9)
 
 def _run(**ratios):
     rows = [
-        Compared(
+        BaselineResult(
             baseline=name, split="unseen", quantity=quantity, errors=Errors(10, 1.0, 1.0, 10),
             rmse_ratio=ratios.get(name, SURE) if quantity == "E" else Ratio(9.0, 8.0, 10.0), mape_ratio=SURE, groups=9, drawn_by="blocks",
         )
@@ -35,12 +35,12 @@ def _run(**ratios):
 
 
 def _verdicts(runs):
-    return {claim.says: claim.verdict for claim in checked_claims(runs)}
+    return {claim.says: claim.verdict for claim in check_claims(runs)}
 
 
 def test_intervals_below_one_hold_every_claim():
     assert set(_verdicts([_run()]).values()) == {"held"}
-    assert len(checked_claims([_run()])) == len(CLAIMS)
+    assert len(check_claims([_run()])) == len(CLAIMS)
 
 
 @pytest.mark.parametrize("baseline", list(CLAIMS))
@@ -61,18 +61,18 @@ def test_a_figure_that_turns_fells_its_claim_alone(baseline, ratio, verdict):
 
 def test_the_papers_own_ratio():
     """By hand, from its table IV: RMSE of E on the unseen area."""
-    told = {claim.says: claim.in_the_paper for claim in checked_claims([_run()])}
+    told = {claim.says: claim.in_the_paper for claim in check_claims([_run()])}
     assert told.pop("one net beats a net per class") == pytest.approx(26.63 / 32.92)
     assert set(told.values()) == {None}
 
 
 def test_several_trainings_have_the_mean_ratio_and_the_widest_interval():
     runs = [_run(**{PER_CLASS: Ratio(0.5, 0.4, 0.6)}), _run(**{PER_CLASS: Ratio(0.98, 0.9, 1.05)})]
-    claim = checked_claims(runs)[0]
+    claim = check_claims(runs)[0]
     assert claim.ratio.value == pytest.approx(0.7)
     assert (claim.ratio.low, claim.ratio.high, claim.verdict) == (0.4, 1.05, "open")
 
 
 def test_what_was_not_measured_in_one_training_is_not_measured():
-    claim = checked_claims([_run(), _run(**{PER_CLASS: Ratio(None, None, None)})])[0]
+    claim = check_claims([_run(), _run(**{PER_CLASS: Ratio(None, None, None)})])[0]
     assert str(claim) == "not measured: one net beats a net per class, unseen: RMSE of E – of its (0.81 in the paper)"

@@ -19,18 +19,18 @@ from PIL import Image
 from storage_server import object_store
 from synthetic_store import STANDING_WATT, small_store
 
-from tcpipe.cost.prediction_errors import centring_of
+from tcpipe.cost.prediction_errors import fit_bias_correction
 from tcpipe.dataset import Split, open_dataset
 from tcpipe.errors import DatasetError, ModelError, StoreError, UsageError
 from tcpipe.formats.dataset_files import read_card
-from tcpipe.formats.json_files import plain
+from tcpipe.formats.integrity import Checksum, write_sealed
+from tcpipe.formats.json_files import to_plain
 from tcpipe.formats.parquet import read_table
-from tcpipe.formats.seals import Checksum, write_sealed
 from tcpipe.learning.evaluation_facts import EvaluateConfig
 from tcpipe.learning.evaluation_files import run_evaluation
 from tcpipe.learning.fitting import FitConfig
 from tcpipe.learning.models import load_model
-from tcpipe.learning.predictions import predicted_costs
+from tcpipe.learning.predictions import predict_costs
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.recipe import Recipe
 from tcpipe.tables.findings import select_findings
@@ -57,7 +57,9 @@ def evaluated(model, dataset, tmp_path_factory):
 def _centred(model, split):
     """What a model says, shape (N, 2), by its bias on held-out samples corrected."""
     said = load_model(model).predict(split.patches).astype(float)
-    return np.stack(centring_of(load_model(model).residuals).apply(*said.T, split.column("terrain_class")), axis=1)
+    return np.stack(
+        fit_bias_correction(load_model(model).residuals).apply(*said.T, split.column("terrain_class")), axis=1
+    )
 
 
 def test_the_figures_are_the_arrays_own(evaluated, model, dataset):
@@ -166,8 +168,8 @@ def test_what_is_ablated_is_noise_and_nothing_else(model, dataset):
     patches[..., 1] = np.random.default_rng([7, 1]).random(patches.shape[:3], np.float32)
     ours = replace(ours, residuals={})  # not centred
     by_hand = ours.predict(patches)[:, 0]
-    assert predicted_costs(ours, test, noise=["terrain"], seed=(7, 1))["w"] == pytest.approx(by_hand, rel=1e-5)
-    assert predicted_costs(ours, test)["w"] == pytest.approx(ours.predict(test.patches)[:, 0], rel=1e-5)
+    assert predict_costs(ours, test, noise=["terrain"], seed=(7, 1))["w"] == pytest.approx(by_hand, rel=1e-5)
+    assert predict_costs(ours, test)["w"] == pytest.approx(ours.predict(test.patches)[:, 0], rel=1e-5)
 
 
 def test_seven_input_sets(evaluated):
@@ -180,7 +182,7 @@ def test_seven_input_sets(evaluated):
 
 def test_its_files_say_the_same(evaluated):
     place, values = evaluated
-    assert json.loads((place / "evaluation.json").read_text()) == plain(values)
+    assert json.loads((place / "evaluation.json").read_text()) == to_plain(values)
     with (place / "evaluation.csv").open() as stream:
         rows = list(csv.DictReader(stream))
     row = next(

@@ -6,7 +6,7 @@ import pytest
 from made_models import CARD
 
 from tcpipe.learning.evaluation_facts import (
-    Compared,
+    BaselineResult,
     EvaluateConfig,
     EvaluatedDataset,
     EvaluatedModel,
@@ -43,7 +43,7 @@ def told(
         floors,
         leakage=Leakage("sample", 1.05, near, None),
     )
-    row = Compared(
+    row = BaselineResult(
         baseline=baseline,
         split=split,
         quantity="E",

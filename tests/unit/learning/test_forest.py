@@ -30,9 +30,9 @@ def test_trees_by_hand():
     features = np.array([[0.0, 0.5], [3.0, 0.6], [3.0, -1.0], [2.0, 0.0]])
     assert made.predict(features).tolist() == [[11.0, 3.0], [12.0, 5.0], [11.0, 4.0], [11.0, 3.0]]
     assert made.predict(np.tile(features, (200, 1)))[796:].tolist() == made.predict(features).tolist()
-    assert forest.forest_of(made.arrays(), "here").predict(features[:1]).tolist() == [[11.0, 3.0]]
+    assert forest.read_forest(made.arrays(), "here").predict(features[:1]).tolist() == [[11.0, 3.0]]
     with pytest.raises(ModelError, match="here: holds the weights of another model"):
-        forest.forest_of({"head/bias": np.zeros(2)}, "here")
+        forest.read_forest({"head/bias": np.zeros(2)}, "here")
 
 
 def test_they_say_what_lightgbm_says():

@@ -12,10 +12,10 @@ from tcpipe.learning.metrics import (
     ALL,
     LEAST,
     Spread,
-    combined,
-    costs,
-    errors,
-    errors_by_class,
+    combine_errors,
+    compute_costs,
+    compute_errors,
+    compute_errors_by_class,
     label_floor,
     mean_of_draws,
 )
@@ -24,7 +24,7 @@ _VALUES = st.floats(20.0, 500.0)
 
 
 def test_a_label_near_nothing_is_in_the_rmse_alone():
-    found = errors(np.array([110.0, 5.0]), np.array([100.0, -3.0]), LEAST["w"])
+    found = compute_errors(np.array([110.0, 5.0]), np.array([100.0, -3.0]), LEAST["w"])
     assert (found.count, found.mape_count) == (2, 1)
     assert found.mape_percent == pytest.approx(10.0)
     assert found.rmse == pytest.approx(np.sqrt((100.0 + 64.0) / 2.0))
@@ -40,8 +40,8 @@ def test_a_label_near_nothing_is_in_the_rmse_alone():
 def test_all_is_the_samples_pooled(drawn):
     predicted, measured, class_ids = drawn
     names = {4: "grass", 5: "mud", 6: "unpaved road", 7: "paved road"}
-    by_class = errors_by_class({"E": predicted}, {"E": measured}, class_ids, names)["E"]
-    pooled = errors(predicted, measured, LEAST["E"])
+    by_class = compute_errors_by_class({"E": predicted}, {"E": measured}, class_ids, names)["E"]
+    pooled = compute_errors(predicted, measured, LEAST["E"])
     assert by_class[ALL].count == len(predicted)
     assert by_class[ALL].rmse == pytest.approx(pooled.rmse, rel=1e-9, abs=1e-9)
     assert by_class[ALL].mape_percent == pytest.approx(pooled.mape_percent, rel=1e-9, abs=1e-9)
@@ -57,17 +57,17 @@ def test_the_papers_own_all_is_its_classes_combined():
     for quantity in "wE":
         rmse, mape = (BY_CLASS["test", quantity, measure] for measure in ("rmse", "mape_percent"))
         parts = [Errors(int(n), r, m, int(n)) for n, r, m in zip(shares, rmse[:4], mape[:4], strict=True)]
-        assert combined(parts).rmse == pytest.approx(rmse[4], rel=0.1)
-        assert combined(parts).mape_percent == pytest.approx(mape[4], rel=0.1)
+        assert combine_errors(parts).rmse == pytest.approx(rmse[4], rel=0.1)
+        assert combine_errors(parts).mape_percent == pytest.approx(mape[4], rel=0.1)
 
 
 def test_nothing_combined_is_no_number():
-    assert combined([]).rmse is None
-    assert combined([]).mape_percent is None
+    assert combine_errors([]).rmse is None
+    assert combine_errors([]).mape_percent is None
 
 
 def test_draws_are_averaged():
-    draws = [errors(np.array([100.0 + d]), np.array([100.0])) for d in (1.0, 3.0)]
+    draws = [compute_errors(np.array([100.0 + d]), np.array([100.0])) for d in (1.0, 3.0)]
     assert mean_of_draws(draws).rmse == pytest.approx(2.0)
     assert mean_of_draws(draws).mape_percent == pytest.approx(2.0)
 
@@ -77,7 +77,7 @@ def test_the_labels_floor_is_what_a_perfect_prediction_would_show():
     truth, sigma = rng.uniform(100.0, 300.0, 200_000), rng.uniform(2.0, 9.0, 200_000)
     labels, ids = truth + sigma * rng.standard_normal(truth.size), np.full(truth.size, 4)
     told = label_floor({"w": sigma}, {"w": labels}, ids, {4: "grass"})["w"][ALL]
-    seen = errors(truth, labels, LEAST["w"])
+    seen = compute_errors(truth, labels, LEAST["w"])
     assert told.rmse == pytest.approx(seen.rmse, rel=0.01)
     assert told.mape_percent == pytest.approx(seen.mape_percent, rel=0.01)
 
@@ -89,7 +89,7 @@ def _spread(predicted, std):
 def test_scores_are_those_of_their_definitions():
     """CRPS is the integral of the squared difference of the predicted and the measured distribution, NLL that of the density."""
     predicted, measured, std = np.array([100.0, 60.0]), np.array([104.0, 40.0]), np.array([5.0, 8.0])
-    found = errors(predicted, measured, 0.0, _spread(predicted, std))
+    found = compute_errors(predicted, measured, 0.0, _spread(predicted, std))
     crps = []
     for m, y, s in zip(predicted, measured, std, strict=True):
         below = quad(lambda x, m=m, s=s: norm.cdf(x, m, s) ** 2, m - 60.0, y)[0]
@@ -104,15 +104,17 @@ def test_scores_of_classes_are_those_of_all_samples_and_absent_where_nothing_is_
     measured, ids = rng.uniform(100.0, 200.0, 90), rng.choice([4, 5], 90)
     predicted = measured + rng.normal(0.0, 9.0, 90)
     spread = _spread(predicted, rng.uniform(6.0, 12.0, 90))
-    by_class = errors_by_class({"E": predicted}, {"E": measured}, ids, {4: "grass", 5: "mud"}, {"E": spread})["E"]
-    pooled = errors(predicted, measured, LEAST["E"], spread)
+    by_class = compute_errors_by_class({"E": predicted}, {"E": measured}, ids, {4: "grass", 5: "mud"}, {"E": spread})[
+        "E"
+    ]
+    pooled = compute_errors(predicted, measured, LEAST["E"], spread)
     for score in ("held_percent", "nll", "crps"):
         assert getattr(by_class[ALL], score) == pytest.approx(getattr(pooled, score))
-    assert errors(predicted, measured).nll is None
-    assert combined([pooled, errors(predicted, measured)]).crps is None
+    assert compute_errors(predicted, measured).nll is None
+    assert combine_errors([pooled, compute_errors(predicted, measured)]).crps is None
 
 
 def test_time_and_energy_follow_from_power_and_velocity():
-    found = costs(np.array([150.0]), np.array([0.75]), 1.5)
+    found = compute_costs(np.array([150.0]), np.array([0.75]), 1.5)
     assert found["T"][0] == pytest.approx(2.0)
     assert found["E"][0] == pytest.approx(300.0)

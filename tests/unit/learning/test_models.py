@@ -13,7 +13,7 @@ from made_models import CARD, made_model
 from storage_server import object_store
 
 from tcpipe.errors import ModelError, UsageError
-from tcpipe.formats.seals import write_sealed
+from tcpipe.formats.integrity import write_sealed
 from tcpipe.learning.models import WEIGHTS, load_model
 from tcpipe.pipeline.generations import write_generation
 from tcpipe.pipeline.verify import verify

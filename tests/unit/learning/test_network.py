@@ -37,10 +37,10 @@ def test_widths_that_are_no_multiple_of_sixteen(width):
 
 def test_first_weights_are_he_s_of_the_seed():
     """Variance 2 / inputs of a filter, nothing beyond two deviations of the uncut normal; the head starts with what it is given."""
-    from tcpipe.learning.network import resnet18
+    from tcpipe.learning.network import make_resnet18
 
     shape = Architecture(40, 3, 2, 32)
-    one, other, third = (resnet18(shape, seed=seed, start=[0.4, 0.8]).arrays() for seed in (0, 0, 1))
+    one, other, third = (make_resnet18(shape, seed=seed, start=[0.4, 0.8]).arrays() for seed in (0, 0, 1))
     assert all(np.array_equal(one[name], other[name]) for name in one)
     kernel = "stage3_block2_first_convolution/kernel"
     assert one[kernel].shape == (3, 3, 128, 128)
@@ -52,10 +52,10 @@ def test_first_weights_are_he_s_of_the_seed():
 
 def test_a_batch_of_one_sample_of_one_pixel_is_trained_on():
     """The last stage sees a patch of 16 pixels as one, of which a batch normalisation has no deviation."""
-    from tcpipe.learning.network import resnet18
+    from tcpipe.learning.network import make_resnet18
     from tcpipe.learning.trainer import Trainer
 
-    trainer = Trainer(resnet18(Architecture(16, 1, 1, 16), seed=0, start=[0.5]), np.ones(1, np.float32))
+    trainer = Trainer(make_resnet18(Architecture(16, 1, 1, 16), seed=0, start=[0.5]), np.ones(1, np.float32))
     patch, label = np.full((1, 16, 16, 1), 0.5, np.float32), np.array([[0.7]], np.float32)
     losses = [trainer.step(patch, label, np.ones_like(label), 1e-2) for _ in range(5)]
     assert losses[0] == pytest.approx(0.2, abs=0.1)

@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tcpipe.dataset.beside import Beside
+from tcpipe.dataset.extra_features import ExtraFeatures
 from tcpipe.errors import ModelError
-from tcpipe.learning.physics_model import fit_physics_model, physics_model_of
+from tcpipe.learning.physics_model import fit_physics_model, read_physics_model
 
 COUNT = 600
 
@@ -19,7 +19,7 @@ def drive(seed=0, count=COUNT):
     velocity = np.where(class_id == 4, 0.8, 0.9) - 1.0 * slope
     rolling = np.where(class_id == 4, 60.0, 30.0)
     power = 50.0 + velocity * (rolling + 400.0 * np.tan(slope) + 80.0 * turn)
-    return Beside(class_id, slope, turn, np.full(count, np.nan)), np.column_stack([power, velocity])
+    return ExtraFeatures(class_id, slope, turn, np.full(count, np.nan)), np.column_stack([power, velocity])
 
 
 def test_a_robot_is_found_again():
@@ -45,7 +45,7 @@ def test_what_the_drives_take_without_a_load_is_found_where_halts_tell_less():
     assert np.abs(model.predict(moved)[:, 0] - power).mean() < 1.0
     arrays = model.arrays()
     del arrays["drivetrain_newton"]
-    older = physics_model_of(arrays, "weights.npz").predict(moved)
+    older = read_physics_model(arrays, "weights.npz").predict(moved)
     assert model.predict(moved)[:, 0] - older[:, 0] == pytest.approx(
         62.0 * older[:, 1] / np.cos(moved.slope_rad), rel=0.01
     )
@@ -57,7 +57,7 @@ def test_what_is_not_known_is_as_usual():
     unknown = replace(beside, turn_radpm=np.full(COUNT, np.nan))
     usual = replace(beside, turn_radpm=np.full(COUNT, np.mean(beside.turn_radpm)))
     assert model.predict(unknown) == pytest.approx(model.predict(usual))
-    elsewhere = model.predict(Beside(np.array([2]), np.array([0.0]), np.array([0.0]), np.array([np.nan])))[0]
+    elsewhere = model.predict(ExtraFeatures(np.array([2]), np.array([0.0]), np.array([0.0]), np.array([np.nan])))[0]
     assert 50.0 + 30.0 * 0.7 < elsewhere[0] < 50.0 + 60.0 * 1.0
     assert 0.75 < elsewhere[1] < 0.95
 
@@ -71,10 +71,10 @@ def test_without_turns_in_the_data_there_is_no_term_for_them():
 def test_arrays_there_and_back():
     beside, labels = drive()
     model = fit_physics_model(beside, labels, standing_watt=50.0)
-    again = physics_model_of(model.arrays(), "weights.npz")
+    again = read_physics_model(model.arrays(), "weights.npz")
     assert again.predict(beside) == pytest.approx(model.predict(beside), abs=0.0)
     with pytest.raises(ModelError, match="weights of another model"):
-        physics_model_of({"feature": np.zeros(3)}, "weights.npz")
+        read_physics_model({"feature": np.zeros(3)}, "weights.npz")
 
 
 def test_too_few_samples_are_said():

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from tcpipe.errors import ModelError
-from tcpipe.learning.patch_features import slope_and_class
-from tcpipe.learning.table_model import fit_table, table_model_of
+from tcpipe.learning.patch_features import find_slope_and_class
+from tcpipe.learning.table_model import fit_table, read_table_model
 
 pytest.importorskip("lightgbm")
 
@@ -31,12 +31,12 @@ def fitted():
 
 def test_slope_and_class_stand_where_the_channels_say():
     features, _, _ = ground(5)
-    slope, class_id = slope_and_class(features, CHANNELS, CLASSES)
+    slope, class_id = find_slope_and_class(features, CHANNELS, CLASSES)
     assert slope.tolist() == features[:, 8].tolist()
     assert set(class_id.tolist()) <= {4, 5}
-    height_first, _ = slope_and_class(features, ("height", "ortho"), CLASSES)
+    height_first, _ = find_slope_and_class(features, ("height", "ortho"), CLASSES)
     assert height_first.tolist() == features[:, 0].tolist()
-    nothing = slope_and_class(features[:, :3], ("ortho",), CLASSES)
+    nothing = find_slope_and_class(features[:, :3], ("ortho",), CLASSES)
     assert not np.any(nothing)
 
 
@@ -64,9 +64,9 @@ def test_what_the_other_folds_said_is_no_better_than_what_is_new(fitted):
 def test_arrays_there_and_back_and_an_older_kind(fitted):
     model, _ = fitted
     features, _, _ = ground(20)
-    again = table_model_of(model.arrays(), "weights.npz", CHANNELS, CLASSES)
+    again = read_table_model(model.arrays(), "weights.npz", CHANNELS, CLASSES)
     assert np.array_equal(again.predict(features), model.predict(features))
     with pytest.raises(
         ModelError, match="holds the weights of another model, or of an older kind; train the model again"
     ):
-        table_model_of(model.forest.arrays(), "weights.npz", CHANNELS, CLASSES)
+        read_table_model(model.forest.arrays(), "weights.npz", CHANNELS, CLASSES)

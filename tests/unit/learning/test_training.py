@@ -13,7 +13,7 @@ from tcpipe.formats.weights import read_arrays
 from tcpipe.learning import fitting
 from tcpipe.learning.fitting import FitConfig
 from tcpipe.learning.models import HISTORY, WEIGHTS, load_model
-from tcpipe.learning.training import Variant, train, training_task, what_was_seen
+from tcpipe.learning.training import Variant, find_training_range, make_training_task, train
 from tcpipe.terrain.classes import NODATA_ID
 from tcpipe.terrain.layers import HEIGHT_NODATA
 
@@ -96,7 +96,7 @@ def test_the_rate_falls_where_nothing_gets_better_and_at_the_end(held, rate):
     history = [(number + 1, 1.0, float(loss)) for number, loss in enumerate(held)]
     progress = fitting.TrainingProgress("key", len(history), history=history)
     config = replace(CONFIG, epochs=20, patience=4, learning_rate=1.0)
-    assert fitting.learning_rate(config, progress) == pytest.approx(rate)
+    assert fitting.compute_learning_rate(config, progress) == pytest.approx(rate)
 
 
 def _stopped(monkeypatch, at, dataset, place, config, **options):
@@ -139,7 +139,7 @@ def test_short_epochs_share_a_checkpoint(dataset, tmp_path, monkeypatch):
     """As many as have 32 steps of 64 samples together, of a training set of a step or two."""
     epochs = []
     monkeypatch.setattr(fitting, "write_checkpoint", lambda _path, progress, _parts: epochs.append(progress.epoch))
-    monkeypatch.setattr(fitting, "_epoch", lambda *_, **__: 1.0)
+    monkeypatch.setattr(fitting, "_train_epoch", lambda *_, **__: 1.0)
     result = train(dataset, tmp_path / "model", config=replace(CONFIG, epochs=45, patience=99, batch=64))
     assert epochs == list(range(0, 46, 32 * 64 // result.samples["fitted"]))
 
@@ -147,7 +147,7 @@ def test_short_epochs_share_a_checkpoint(dataset, tmp_path, monkeypatch):
 def test_a_held_out_loss_that_is_no_number_is_gone_on_from(dataset, tmp_path, monkeypatch):
     config = replace(CONFIG, epochs=2)
     with monkeypatch.context() as patch:
-        patch.setattr(fitting, "held_loss", lambda *_, **__: float("nan"))
+        patch.setattr(fitting, "compute_held_loss", lambda *_, **__: float("nan"))
         _stopped(monkeypatch, 1, dataset, tmp_path / "model", config)
     assert train(dataset, tmp_path / "model", config=config).best_epoch == 2
 
@@ -173,7 +173,7 @@ def test_a_state_of_another_training_or_cut_short_is_told(dataset, tmp_path, mon
 
 def test_a_place_that_cannot_be_written_is_found_before_the_first_epoch(dataset, tmp_path, monkeypatch):
     (tmp_path / "file").touch()
-    monkeypatch.setattr(fitting, "_epoch", lambda *_, **__: pytest.fail("an epoch was trained"))
+    monkeypatch.setattr(fitting, "_train_epoch", lambda *_, **__: pytest.fail("an epoch was trained"))
     with pytest.raises(StoreError, match=r"model.checkpoint: cannot be written"):
         train(dataset, tmp_path / "file" / "model", config=CONFIG)
 
@@ -203,7 +203,7 @@ def test_weights_count_what_is_certain(dataset, tmp_path, monkeypatch):
 
 
 def test_a_variant_has_its_own_channels_classes_and_output(dataset):
-    task = training_task(open_dataset(dataset), 0, Variant(channels=("height",), classes=(4,), energy_only=True))
+    task = make_training_task(open_dataset(dataset), 0, Variant(channels=("height",), classes=(4,), energy_only=True))
     assert task.fit.channels == ("height",)
     assert set(task.fit.column("terrain_class")) == {4}
     assert task.outputs == ("energy_joule",)
@@ -215,7 +215,7 @@ def test_what_cannot_be_trained_on(dataset, tmp_path, monkeypatch):
     with pytest.raises(DatasetError, match="fold 9 of train leaves"):
         train(dataset, tmp_path / "model", config=replace(CONFIG, fold=9))
     with pytest.raises(DatasetError, match="no labelled samples in split train"):
-        training_task(open_dataset(dataset), 0, Variant(classes=(1,)))
+        make_training_task(open_dataset(dataset), 0, Variant(classes=(1,)))
     real = Split.weights.fget
     monkeypatch.setattr(Split, "weights", property(lambda split: real(split) * np.array([1.0, 0.0])))
     with pytest.raises(DatasetError, match="no sample has a standard deviation of velocity_mps to weigh it by"):
@@ -254,7 +254,7 @@ def test_a_damaged_model_is_trained_again_by_the_same_command(trained, dataset, 
 
 def test_pixels_without_data_are_not_seen(dataset, monkeypatch):
     split = open_dataset(dataset)["train"]
-    seen, real = what_was_seen(split), Split.layers
+    seen, real = find_training_range(split), Split.layers
 
     def with_a_hole(split, indices):
         layers = real(split, indices)
@@ -262,7 +262,7 @@ def test_pixels_without_data_are_not_seen(dataset, monkeypatch):
         return layers
 
     monkeypatch.setattr(Split, "layers", with_a_hole)
-    holed = what_was_seen(split)
+    holed = find_training_range(split)
     assert holed.pixel_classes == seen.pixel_classes
     assert holed.ranges["relief_m"] == pytest.approx(seen.ranges["relief_m"], abs=0.05)
 
@@ -274,5 +274,5 @@ def test_samples_without_a_label_are_left_out(dataset, monkeypatch):
         "labels",
         property(lambda split: np.where(split.column("terrain_class")[:, None] == 4, np.nan, real(split))),
     )
-    task = training_task(open_dataset(dataset), 1, Variant())
+    task = make_training_task(open_dataset(dataset), 1, Variant())
     assert 4 not in {*task.fit.column("terrain_class"), *task.held.column("terrain_class")}

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tcpipe.logs.conversions import imu_in_si
+from tcpipe.logs.conversions import convert_imu_to_si
 from tcpipe.logs.messages import Readings
 
 NAMES = (
@@ -27,6 +27,6 @@ NAMES = (
 def test_units(units, wanted):
     row = np.arange(2)
     readings = Readings(row, row, None, {name: np.ones(2) for name in NAMES})
-    found = imu_in_si(readings, units)
+    found = convert_imu_to_si(readings, units)
     assert [found.columns[name][1] for name in NAMES] == pytest.approx(wanted)
     assert found.row is row

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 
-from tcpipe.logs.topics import Topic, coverage, covering_little, silence_ns
+from tcpipe.logs.topics import Topic, compute_silence_ns, find_short_topics, format_coverage
 
 S = 1_000_000_000
 
@@ -21,12 +21,12 @@ S = 1_000_000_000
     ],
 )
 def test_silences_are_summed_where_they_are_no_period(spans_s, count, silent_s):
-    assert silence_ns([(first * S, last * S) for first, last in spans_s], count) == silent_s * S
+    assert compute_silence_ns([(first * S, last * S) for first, last in spans_s], count) == silent_s * S
 
 
 def test_a_topic_that_paused_for_most_of_the_drive_covers_little():
     whole = Topic("/odom", "nav_msgs/msg/Odometry", 600, 0, 60 * S, "cdr", "")
     paused = replace(whole, name="/wheel/odom", message_count=200, silent_ns=40 * S)
-    assert covering_little([whole, paused], [whole, paused]) == {"/wheel/odom"}
-    assert coverage(paused) == "200 messages over 60.0 s, silent for 40.0 s of them"
-    assert covering_little([replace(paused, silent_ns=20 * S)], [whole]) == frozenset()
+    assert find_short_topics([whole, paused], [whole, paused]) == {"/wheel/odom"}
+    assert format_coverage(paused) == "200 messages over 60.0 s, silent for 40.0 s of them"
+    assert find_short_topics([replace(paused, silent_ns=20 * S)], [whole]) == frozenset()

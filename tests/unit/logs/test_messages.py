@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from tcpipe.logs import roles
-from tcpipe.logs.messages import find_utc_offset, frames, read_messages
+from tcpipe.logs.messages import count_frames, find_utc_offset, read_messages
 
 S = 1_000_000_000
 N = 12
@@ -285,8 +285,8 @@ def test_twists_measured_and_commanded() -> None:
 def test_frames_lose_their_slash_and_the_most_frequent_leads() -> None:
     columns = odometry()
     columns["child_frame_id"] = np.array(["a"] * 4 + ["/base_link", "base_link"] * 4)
-    assert frames(columns, roles.ODOMETRY) == {"base_link": 8, "a": 4}
-    assert frames(columns, roles.TWIST_STAMPED) == {"sensor": N}
+    assert count_frames(columns, roles.ODOMETRY) == {"base_link": 8, "a": 4}
+    assert count_frames(columns, roles.TWIST_STAMPED) == {"sensor": N}
 
 
 def ground_twist(velocity, *diagonal) -> dict[str, np.ndarray]:

@@ -2,7 +2,7 @@
 
 import pytest
 
-from tcpipe.formats.robot_files import shipped_profiles
+from tcpipe.formats.robot_files import load_shipped_profiles
 from tcpipe.logs.robots import find_robot
 from tcpipe.logs.topics import Topic
 
@@ -23,6 +23,6 @@ from tcpipe.logs.topics import Topic
 )
 def test_a_clearpath_robot_is_known_by_its_namespace(namespace, name, why):
     topic = Topic(f"{namespace}/platform/mcu/status/power", "clearpath_platform_msgs/msg/Power", 1, 0, 0, "cdr", "")
-    robot, said = find_robot([topic], None, shipped_profiles().robots)
+    robot, said = find_robot([topic], None, load_shipped_profiles().robots)
     assert robot == name
     assert why in said

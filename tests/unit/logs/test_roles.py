@@ -3,7 +3,7 @@
 import pytest
 
 from tcpipe.errors import RecipeError
-from tcpipe.formats.robot_files import shipped_profiles
+from tcpipe.formats.robot_files import load_shipped_profiles
 from tcpipe.logs import roles
 from tcpipe.logs.roles import RoleAssignment
 from tcpipe.logs.topics import Topic
@@ -19,7 +19,7 @@ BATTERY, HUSKY, POWER = (
 
 
 def assign_roles(*given, **named):
-    return roles.assign_roles(*given, **named, known=shipped_profiles())
+    return roles.assign_roles(*given, **named, known=load_shipped_profiles())
 
 
 def topic(name: str, type_name: str, count: int | None = 101, problem: str | None = None) -> Topic:

@@ -1,19 +1,19 @@
 """Two robots are told from one robot with a camera that has sensors of its own."""
 
-from tcpipe.formats.robot_files import shipped_profiles
+from tcpipe.formats.robot_files import load_shipped_profiles
 from tcpipe.logs import roles
-from tcpipe.logs.robots import namespaces_of_robots
+from tcpipe.logs.robots import find_robot_namespaces
 from tcpipe.logs.topics import Topic
 
 KINDS = {"fix": "sensor_msgs/msg/NavSatFix", "imu": "sensor_msgs/msg/Imu", "odom": "nav_msgs/msg/Odometry"}
 
 
 def assign_roles(*given, **named):
-    return roles.assign_roles(*given, **named, known=shipped_profiles())
+    return roles.assign_roles(*given, **named, known=load_shipped_profiles())
 
 
 def test_three_roles_in_two_namespaces_are_two_robots():
-    found = namespaces_of_robots({name: [f"/a/{name}", f"/b/x/{name}"] for name in ("gnss", "imu", "power")})
+    found = find_robot_namespaces({name: [f"/a/{name}", f"/b/x/{name}"] for name in ("gnss", "imu", "power")})
     assert found == {"/a": ("gnss", "imu", "power"), "/b": ("gnss", "imu", "power")}
 
 
@@ -25,7 +25,7 @@ def test_a_camera_and_a_controller_are_no_robots():
         "command": ["/husky_velocity_controller/cmd_vel", "/platform/cmd_vel"],
         "gnss": ["/fix"],
     }
-    assert namespaces_of_robots(candidates) == {}
+    assert find_robot_namespaces(candidates) == {}
 
 
 def assign(namespace=None, chosen=None):

@@ -2,8 +2,8 @@
 
 import pytest
 
-from tcpipe.motion.remedies import find_losses, loss_code, losses_of
-from tcpipe.tables.bits import DropReason, Loss, name_of
+from tcpipe.motion.remedies import find_largest_losses, find_losses, make_loss_code
+from tcpipe.tables.bits import DropReason, Loss, flag_name
 from tcpipe.tables.catalogue import read_catalogue
 from tcpipe.tables.findings import Subject
 
@@ -12,7 +12,7 @@ RUN = Subject("run", "r")
 
 @pytest.mark.parametrize("reason", [*DropReason, *Loss])
 def test_the_catalogue_knows_every_reason(reason):
-    assert loss_code(name_of(reason)) in read_catalogue()
+    assert make_loss_code(flag_name(reason)) in read_catalogue()
 
 
 def test_losses_of_more_than_a_twentieth_are_findings_the_largest_first():
@@ -27,7 +27,7 @@ def test_a_robot_that_does_not_move_loses_nothing():
 
 
 def test_losses_of_several_runs_add_up():
-    losses = losses_of([{"kept": 50.0, "gap": 30.0, "standing": 0.01}, {"kept": 10.0, "gap": 10.0}])
+    losses = find_largest_losses([{"kept": 50.0, "gap": 30.0, "standing": 0.01}, {"kept": 10.0, "gap": 10.0}])
     assert [(of.reason, of.metres, of.runs) for of in losses] == [("gap", 40.0, 2)]
     assert losses[0].share == pytest.approx(40.0 / 100.01)
-    assert losses_of([]) == ()
+    assert find_largest_losses([]) == ()

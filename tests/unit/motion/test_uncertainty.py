@@ -3,13 +3,18 @@
 import numpy as np
 import pytest
 
-from tcpipe.motion.pieces import MotionRows
-from tcpipe.motion.uncertainty import along_std_m, between_durations_m, chord_ahead_std_m, displacement_std_m
+from tcpipe.motion.row_sections import MotionRows
+from tcpipe.motion.uncertainty import (
+    compute_along_std_m,
+    compute_chord_ahead_std_m,
+    compute_displacement_std_m,
+    interpolate_durations_m,
+)
 
 
 def std(velocity_std, duration, start, end, *, smoothed):
     one = np.atleast_1d
-    return displacement_std_m(
+    return compute_displacement_std_m(
         velocity_std_mps=one(velocity_std),
         duration_s=one(duration),
         start_std_m=one(start),
@@ -58,15 +63,15 @@ def test_between_told_durations_it_is_a_power_of_time():
     duration = np.array([0.2, 0.5, 0.8, 1.7, 2.0, 2.1, 1.5])
     told = 0.004 * np.sqrt(np.array(told_s)) * np.ones((7, 1))  # a random walk of the displacement
     told[6, 2] = np.nan  # the track ends before
-    got = between_durations_m(duration, told_s=told_s, told_std_m=told)
+    got = interpolate_durations_m(duration, told_s=told_s, told_std_m=told)
     assert got[1:5] == pytest.approx(0.004 * np.sqrt(duration[1:5]))
     assert got[0] == pytest.approx(0.004 * np.sqrt(0.5) * 0.2 / 0.5)  # a constant velocity error
     assert np.isnan(got[5:]).all()
 
 
 def test_along_a_course():
-    assert along_std_m(np.array([0.3]), np.array([0.1]), np.array([np.pi / 2]))[0] == pytest.approx(0.1)
-    assert along_std_m(np.array([0.3]), np.array([0.1]), np.array([0.0]))[0] == pytest.approx(0.3)
+    assert compute_along_std_m(np.array([0.3]), np.array([0.1]), np.array([np.pi / 2]))[0] == pytest.approx(0.1)
+    assert compute_along_std_m(np.array([0.3]), np.array([0.1]), np.array([0.0]))[0] == pytest.approx(0.3)
 
 
 def test_the_chord_ahead_sees_a_jump_before_it_comes():
@@ -74,7 +79,7 @@ def test_the_chord_ahead_sees_a_jump_before_it_comes():
     position_std = np.where(np.arange(count) < 100, 1.0, 0.02)
     nothing = np.full(count, np.nan)
     rows = MotionRows(np.full(count, 1.0), nothing, nothing, nothing, np.zeros(count, dtype=np.int64), 0.05)
-    got = chord_ahead_std_m(
+    got = compute_chord_ahead_std_m(
         rows,
         velocity_std_mps=np.full(count, 0.004),
         position_std_m=position_std,
@@ -94,5 +99,5 @@ def test_nothing_unknown_is_nothing_wrong():
 
 def test_each_duration_lies_between_its_own_neighbours():
     told = np.array([[0.001, 0.002, 0.032]] * 3)
-    got = between_durations_m(np.sqrt([0.5, 2.0, 1.0]), told_s=(0.5, 1.0, 2.0), told_std_m=told)
+    got = interpolate_durations_m(np.sqrt([0.5, 2.0, 1.0]), told_s=(0.5, 1.0, 2.0), told_std_m=told)
     assert got == pytest.approx([np.sqrt(0.001 * 0.002), np.sqrt(0.002 * 0.032), 0.002])

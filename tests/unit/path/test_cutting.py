@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from made_tracks import stamps
 
-from tcpipe.geometry.polyline import polyline
+from tcpipe.geometry.polyline import fit_polyline
 from tcpipe.path.cutting import cut_by_chord
 
 
@@ -14,7 +14,7 @@ def drive(course_rad, speed_mps=0.8, period_s=0.05):
     velocity = speed_mps * np.column_stack((np.cos(course_rad), np.sin(course_rad), 0 * course_rad))
     position = np.vstack((np.zeros(3), np.cumsum(0.5 * (velocity[1:] + velocity[:-1]) * fine, axis=0)))
     step = round(period_s / fine)
-    return polyline(stamps(len(position[::step])), position[::step], velocity[::step])
+    return fit_polyline(stamps(len(position[::step])), position[::step], velocity[::step])
 
 
 def test_a_straight_line_is_cut_without_gaps():
@@ -77,7 +77,7 @@ def test_a_stretch_shorter_than_a_chord_is_leftover():
 
 def test_a_path_of_whole_chords_leaves_nothing_and_a_straight_one_is_as_long_as_its_chord():
     t = np.arange(0.0, 5.0)
-    path = polyline((t * 1e9).astype(np.int64), np.outer(0.25 * t, [1, 0, 0]), np.tile([0.25, 0.0, 0.0], (5, 1)))
+    path = fit_polyline((t * 1e9).astype(np.int64), np.outer(0.25 * t, [1, 0, 0]), np.tile([0.25, 0.0, 0.0], (5, 1)))
     cut = cut_by_chord(path, chord_m=0.5, max_arc_to_chord=1.0)
     assert (cut.start_ns.tolist(), cut.end_ns.tolist()) == ([0, 2_000_000_000], [2_000_000_000, 4_000_000_000])
     assert len(cut.leftover_ns) == 0

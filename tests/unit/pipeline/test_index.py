@@ -12,7 +12,7 @@ from synthetic_store import add_run, commit_run, lanes, segments, supersede
 import tcpipe.store as stores
 from tcpipe.errors import StoreError
 from tcpipe.formats import stored_runs
-from tcpipe.formats.commits import Entries, Sighting
+from tcpipe.formats.commits import Entries, LogSnapshot
 from tcpipe.pipeline.dataset.runs import choose_runs
 from tcpipe.pipeline.log_writer import open_log
 from tcpipe.recipe import Recipe
@@ -39,7 +39,7 @@ def read(monkeypatch):
 
     for module in (stores, stored_runs):
         monkeypatch.setattr(module, "read_as_at", heard(module.read_as_at))
-    stored_runs._manifest.cache_clear()
+    stored_runs._read_manifest.cache_clear()
     return paths
 
 
@@ -113,7 +113,7 @@ def test_a_name_that_is_no_text_is_in_the_log_and_with_escapes_in_the_index(stor
     commit_run(store, "a")
     log = open_log(store)
     for number in range(70):  # so many that a snapshot is written
-        log.commit("seen", Entries(seen=(Sighting((odd,), ((number, 20),), "f" * 64),)))
+        log.commit("seen", Entries(seen=(LogSnapshot((odd,), ((number, 20),), "f" * 64),)))
     assert log.state.snapshot
     for state in (log.state, store.state()):
         assert next(iter(state.runs.values())).log.source.paths == (odd,)

@@ -9,12 +9,12 @@ from simulated_streams import log_of
 
 from tcpipe.pipeline import ingest_run as module
 from tcpipe.pipeline.ingest import ingest
-from tcpipe.simulation import tiny
+from tcpipe.simulation import make_tiny
 
 
 @pytest.mark.parametrize("number", [errno.EACCES, errno.EIO, errno.ENOSPC])
 def test_a_disk_that_fails_in_mid_write_is_told_with_the_output(tmp_path, monkeypatch, number):
-    scenario = tiny(seconds=16.0)
+    scenario = make_tiny(seconds=16.0)
     log, store = log_of(scenario, scenario.drives[0], tmp_path / "site"), tmp_path / "store"
 
     def fail(*_, **__):

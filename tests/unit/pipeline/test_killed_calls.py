@@ -22,11 +22,11 @@ from tcpipe.formats.commits import Begun, Entries
 from tcpipe.pipeline import ingest as ingest_module
 from tcpipe.pipeline import log_writer
 from tcpipe.pipeline import status as status_module
-from tcpipe.pipeline.begun_calls import begun_call, begun_calls
+from tcpipe.pipeline.begun_calls import commit_call, list_begun_calls
 from tcpipe.pipeline.ingest import ingest
-from tcpipe.pipeline.log_writer import open_log, this_process
+from tcpipe.pipeline.log_writer import identify_process, open_log
 from tcpipe.pipeline.problems import acknowledge
-from tcpipe.pipeline.status import status
+from tcpipe.pipeline.status import find_status
 from tcpipe.pipeline.verify import verify
 from tcpipe.recipe import ReadConfig, Recipe
 from tcpipe.store import open_store
@@ -71,14 +71,14 @@ def kill(logs, store, monkeypatch, **how):
         raise SystemExit
 
     with monkeypatch.context() as patch, suppress(SystemExit):
-        patch.setattr(ingest_module, "_results", died)
+        patch.setattr(ingest_module, "_iterate_results", died)
         patch.setattr(ingest_module, "gone_if_empty", lambda _: nullcontext())
-        patch.setattr(log_writer, "this_process", lambda: replace(this_process(), start="1"))
+        patch.setattr(log_writer, "identify_process", lambda: replace(identify_process(), start="1"))
         ingest([logs], store=store, **{"recipe": Recipe(), **how})
 
 
 def told(store, *logs, **how):
-    return status(logs, store=store, **{"recipe": Recipe(), **how})
+    return find_status(logs, store=store, **{"recipe": Recipe(), **how})
 
 
 def test_a_first_night_that_is_killed_is_a_problem_and_the_next_one_deals_with_it(tmp_path, logs):
@@ -103,7 +103,7 @@ def test_a_first_night_that_is_killed_is_a_problem_and_the_next_one_deals_with_i
 def test_a_call_that_runs_is_no_problem_and_one_with_nothing_to_do_writes_nothing(root, logs):
     assert ingest([logs], store=root, recipe=Recipe()).exit_code == 0
     store = open_store(root)
-    with begun_call(open_log(store), "ingest", [str(logs)]):
+    with commit_call(open_log(store), "ingest", [str(logs)]):
         found = told(root)
         assert (found.exit_code, [call.state for call in found.begun]) == (0, ["running"])
         assert "running: ingest of 20" in str(found)
@@ -120,11 +120,11 @@ def test_a_killed_call_is_told_until_the_same_work_is_done(root, logs, monkeypat
     ingest([logs / "one.mcap"], store=root, recipe=Recipe())
     ingest([logs], store=root, recipe=OTHER)
     ingest([logs], store=root, recipe=Recipe(), shard=(2, 2))
-    assert len(begun_calls(open_store(root).state())) == 1, "other logs, another recipe, a share: none is its work"
+    assert len(list_begun_calls(open_store(root).state())) == 1, "other logs, another recipe, a share: none is its work"
     kill(logs, root, monkeypatch, shard=(2, 2), force=True)
     assert told(root).exit_code == 3
     assert ingest([logs.parent / "logs"], store=root, recipe=Recipe()).exit_code == 0
-    assert [call.works_on for call in begun_calls(open_store(root).state())] == [(str(logs),)], "that of the share"
+    assert [call.works_on for call in list_begun_calls(open_store(root).state())] == [(str(logs),)], "that of the share"
     ingest([logs.parent / "logs"], store=root, recipe=Recipe(), shard=(2, 2))
     assert told(root).exit_code == 0
     kill(logs / "two.mcap", root, monkeypatch, force=True)
@@ -146,9 +146,9 @@ def test_a_killed_call_may_be_acknowledged_and_the_next_one_is_told_again(root, 
 def test_an_error_ends_a_call_and_an_interrupt_leaves_it(tmp_path):
     store = open_store(tmp_path, create=True)
     for error, left in ((StoreError("full"), 0), (KeyboardInterrupt(), 1)):
-        with suppress(StoreError, KeyboardInterrupt), begun_call(open_log(store), "ingest", ["/logs"]):
+        with suppress(StoreError, KeyboardInterrupt), commit_call(open_log(store), "ingest", ["/logs"]):
             raise error
-        assert len(begun_calls(store.state())) == left
+        assert len(list_begun_calls(store.state())) == left
 
 
 HERE = {"host": "lab", "machine": "m", "boot": "b", "namespace": "pid:[1]", "pid": os.getpid()}
@@ -172,13 +172,13 @@ HERE = {"host": "lab", "machine": "m", "boot": "b", "namespace": "pid:[1]", "pid
     ],
 )
 def test_a_call_that_runs_is_told_from_a_killed_one_as_far_as_can_be_seen(tmp_path, monkeypatch, other, age_s, state):
-    here = replace(this_process(), **HERE)
-    monkeypatch.setattr(log_writer, "this_process", lambda: here)
+    here = replace(identify_process(), **HERE)
+    monkeypatch.setattr(log_writer, "identify_process", lambda: here)
     begin = (datetime.now(UTC) - timedelta(seconds=age_s)).isoformat(timespec="milliseconds")
     store = open_store(tmp_path, create=True)
     begun = Begun("ingest", "0.9", ("/logs",), "", 1, begin, replace(here, **other))
     open_log(store).commit("begun", Entries(begun=(begun,)))
-    (call,) = begun_calls(store.state())
+    (call,) = list_begun_calls(store.state())
     assert call.state == state
     if state == "killed":
         assert call.problem.finding.code == ("call-lost" if "host" in other else "call-killed")
@@ -205,7 +205,7 @@ def test_logs_that_nobody_takes_in_for_more_than_two_nights_are_a_problem(tmp_pa
         ("log-waiting", str(logs / "new.mcap"), "pending"),
         ("log-waiting", str(logs / "future.mcap"), "growing"),
     }
-    with begun_call(open_log(open_store(store)), "ingest", [str(logs)]):
+    with commit_call(open_log(open_store(store)), "ingest", [str(logs)]):
         assert after(2).exit_code == 0, "somebody is at it"
     elsewhere = drive_at(tmp_path / "archive" / "old.mcap", seed=4)
     os.utime(elsewhere, ns=(10**18, 10**18))
@@ -227,6 +227,6 @@ def test_a_store_that_cannot_be_written_is_built_from_and_asked_as_ever(tmp_path
 
     for verb in ("put", "put_new", "delete"):
         monkeypatch.setattr(type(store.place), verb, refused)
-    with begun_call(open_log(store), "build-dataset", ["/out"]):
-        assert begun_calls(store.state()) == []
+    with commit_call(open_log(store), "build-dataset", ["/out"]):
+        assert list_begun_calls(store.state()) == []
     assert told(tmp_path / "store").exit_code == 0

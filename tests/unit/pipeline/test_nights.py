@@ -20,7 +20,7 @@ from tcpipe.pipeline.inspect import inspect
 from tcpipe.pipeline.log_writer import LogWriter
 from tcpipe.pipeline.problems import acknowledge
 from tcpipe.pipeline.prune import prune
-from tcpipe.pipeline.status import status
+from tcpipe.pipeline.status import find_status
 from tcpipe.pipeline.verify import verify
 from tcpipe.recipe import LabelConfig, Recipe
 from tcpipe.store import Store
@@ -220,7 +220,7 @@ def test_a_commit_that_is_not_as_it_was_written_is_a_problem_and_nothing_is_lost
     sha256 = run_id.rsplit("-", 1)[1].encode()
     contents = {"a digit": whole.replace(sha256, b"0" * 8), "half": whole[:40], "[]": b"[]", "nothing": b""}
     commit.write_bytes(contents[broken]) if broken in contents else commit.unlink()
-    found = status(store=store.root, recipe=Recipe(), min_age_s=0.0)
+    found = find_status(store=store.root, recipe=Recipe(), min_age_s=0.0)
     assert (found.exit_code, [of.code for of in found.problems]) == (
         3,
         ["commit-missing" if broken == "gone" else "commit-damaged"],
@@ -228,9 +228,11 @@ def test_a_commit_that_is_not_as_it_was_written_is_a_problem_and_nothing_is_lost
     assert any(str(commit) in line for line in verify(store.root).problems)
     assert [night()[0]["other.mcap"].status for _ in range(2)] == ["done", "unchanged"], "its manifest is found"
     assert counted(tmp_path) == {run_id}
-    assert status(store=store.root, recipe=Recipe(), min_age_s=0.0).exit_code == 3, "what else it held nobody knows"
+    assert find_status(store=store.root, recipe=Recipe(), min_age_s=0.0).exit_code == 3, (
+        "what else it held nobody knows"
+    )
     acknowledge([str(commit)], store=store.root)
-    assert status(store=store.root, recipe=Recipe(), min_age_s=0.0).exit_code == 0
+    assert find_status(store=store.root, recipe=Recipe(), min_age_s=0.0).exit_code == 0
 
 
 def test_what_is_there_already_needs_no_worker_and_no_reader(tmp_path, night, monkeypatch):
@@ -311,7 +313,7 @@ def test_a_night_asks_a_bucket_the_same_however_many_runs_there_are(tmp_path, mo
         in_environment(monkeypatch, environment, tmp_path / "cache")
         for number in range(4):
             drive_at(logs / f"{number}.mcap", seed=number, start_ns=START_NS + number * 10**13)
-            calls = {"new log": ingest, "nothing new": ingest, "status": status}
+            calls = {"new log": ingest, "nothing new": ingest, "status": find_status}
             for what, call in calls.items():
                 commits = Store(store).state().number
                 fetched.requests = 0

@@ -4,10 +4,17 @@ import numpy as np
 import pytest
 
 from tcpipe.logs.topics import Topic
-from tcpipe.motion.remedies import loss_code
-from tcpipe.pipeline.preflight import Promise, RoleTopic, _hourly_std, find_missing, find_slow, record_command
+from tcpipe.motion.remedies import make_loss_code
+from tcpipe.pipeline.preflight import (
+    ExpectedYield,
+    RoleTopic,
+    _compute_hourly_std,
+    find_missing,
+    find_slow,
+    record_command,
+)
 from tcpipe.recipe import ReadConfig
-from tcpipe.tables.bits import DropReason, Loss, name_of
+from tcpipe.tables.bits import DropReason, Loss, flag_name
 from tcpipe.tables.catalogue import read_catalogue
 from tcpipe.tables.facts import EnergyBudget
 
@@ -26,7 +33,7 @@ def test_the_command_records_what_is_read_and_a_simulations_clock():
 
 
 def promise(segments=50, budget=None):
-    return Promise(60.0, 70.0, segments, 3000.0, 100.0, 3100.0, {"kept": 50.0, "gap": 20.0}, {}, budget)
+    return ExpectedYield(60.0, 70.0, segments, 3000.0, 100.0, 3100.0, {"kept": 50.0, "gap": 20.0}, {}, budget)
 
 
 def test_what_is_slow_or_absent_for_most_of_the_time_is_found():
@@ -60,10 +67,10 @@ def test_a_missing_role_is_no_note_before_it_is_too_late_to_record_one():
 def test_the_deviation_of_a_count_is_that_of_its_windows():
     # Windows of ten seconds that hold 10, 0, 10, 0, 10, 0: each deviates by 5.48, their sum by 13.4, and a minute is a sixtieth of an hour.
     start_s = np.concatenate([np.arange(10) + begin for begin in (0, 20, 40)])
-    assert _hourly_std((start_s * 1e9).astype(np.int64), 60.0) == pytest.approx(60 * np.sqrt(6) * np.sqrt(30))
-    assert _hourly_std(np.zeros(0, np.int64), 60.0) == 0.0
-    assert _hourly_std(np.zeros(3, np.int64), 29.0) is None
+    assert _compute_hourly_std((start_s * 1e9).astype(np.int64), 60.0) == pytest.approx(60 * np.sqrt(6) * np.sqrt(30))
+    assert _compute_hourly_std(np.zeros(0, np.int64), 60.0) == 0.0
+    assert _compute_hourly_std(np.zeros(3, np.int64), 29.0) is None
 
 
 def test_every_loss_stands_in_the_catalogue():
-    assert {loss_code(name_of(bit)) for bit in (*DropReason, *Loss)} <= set(read_catalogue())
+    assert {make_loss_code(flag_name(bit)) for bit in (*DropReason, *Loss)} <= set(read_catalogue())

@@ -14,8 +14,8 @@ from tcpipe.formats.logs.log_file import open_log
 from tcpipe.pipeline.ingest import ingest
 from tcpipe.pipeline.maps import add_map
 from tcpipe.report.run_report import run_report
-from tcpipe.report.run_sensors import sensor_sections
-from tcpipe.simulation import Faults, simulate, tiny
+from tcpipe.report.run_sensors import make_sensor_sections
+from tcpipe.simulation import Faults, make_tiny, simulate
 from tcpipe.store import Store
 from tcpipe.tables.facts import AuditFacts, Disagreement
 from tcpipe.tables.findings import StageReport
@@ -25,7 +25,7 @@ from tcpipe.tables.findings import StageReport
 def store(tmp_path_factory):
     """A run of half a minute with all sensor faults, a map under it, and another that is damaged."""
     here = tmp_path_factory.mktemp("page")
-    site = simulate(here / "site", scenario=tiny(Faults.every(), seconds=40.0), seed=4)
+    site = simulate(here / "site", scenario=make_tiny(Faults.every(), seconds=40.0), seed=4)
     assert ingest(site.logs, store=here / "store").exit_code == 0
     add_map("site", store=here / "store", height=site.rasters["height"])
     add_map("damaged", store=here / "store", height=site.rasters["height"])
@@ -135,7 +135,7 @@ def test_where_sensors_disagree_with_the_track_is_on_the_page(store):
     each = Disagreement(start_ns + 10**10, start_ns + 2 * 10**10, "gnss", "position", 0.49, "m", 0.016, alone=False)
     facts = replace(info.report.facts, audit=AuditFacts((each,)))
     told = replace(run.manifest, info=replace(info, report=StageReport((), facts)))
-    (section,) = [s for s in sensor_sections(None, told, run.rejections()) if "disagree" in s.title]
+    (section,) = [s for s in make_sensor_sections(None, told, run.rejections()) if "disagree" in s.title]
     assert section.rows == [
         ("gnss", "position", "10 to 20 s", "0.49 m", "0.016 m", "deviations are raised, segments flagged")
     ]

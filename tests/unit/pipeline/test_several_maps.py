@@ -19,7 +19,7 @@ from tcpipe.formats.maps.map_files import open_map
 from tcpipe.pipeline.dataset import sampling as dataset_sampling
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.recipe import Recipe
-from tcpipe.report.pictures import joint_bounds_m, maps_overview
+from tcpipe.report.pictures import compute_joint_bounds_m, draw_maps
 from tcpipe.store import open_store
 
 
@@ -104,9 +104,9 @@ def test_the_card_names_the_maps_in_their_order_and_a_second_call_does_nothing(s
 def test_the_page_shows_all_maps_in_their_places(store, order):
     """Grey of the world at places of either map alone, in the CRS of the first; white outside both."""
     sources = [open_map(store.map_path(name)) for name in order]
-    picture = maps_overview(sources)
+    picture = draw_maps(sources)
     crs = sources[0].grid.crs
-    x_min, y_min, x_max, y_max = joint_bounds_m([(each.grid.crs, each.grid.bounds_m) for each in sources])
+    x_min, y_min, x_max, y_max = compute_joint_bounds_m([(each.grid.crs, each.grid.bounds_m) for each in sources])
     xy = np.array([(x, y) for x in (-15.0, -8.0, 0.0, 8.0, 15.0) for y in (-12.0, 3.0, 14.0)])
     x, y = pyproj.Transformer.from_crs(WORLD.crs, crs, always_xy=True).transform(
         WORLD.x_m + xy[:, 0], WORLD.y_m + xy[:, 1]

@@ -12,13 +12,13 @@ from wheel_drives import START_NS, drive_at
 from tcpipe import __version__
 from tcpipe.cli import cli
 from tcpipe.errors import UsageError
-from tcpipe.formats.commits import Call, Entries
-from tcpipe.pipeline import calls, ingest_task
+from tcpipe.formats.commits import CallRecord, Entries
+from tcpipe.pipeline import call_history, ingest_task
 from tcpipe.pipeline import plan as plan_module
 from tcpipe.pipeline.ingest import ingest
 from tcpipe.pipeline.log_writer import open_log
 from tcpipe.pipeline.problems import acknowledge
-from tcpipe.pipeline.status import status
+from tcpipe.pipeline.status import find_status
 from tcpipe.recipe import ReadConfig, Recipe
 from tcpipe.store import Store
 
@@ -49,7 +49,7 @@ def night(first_night, tmp_path):
 
 
 def where(root, *logs, **how):
-    return status(logs or [root / "logs"], store=root / "store", **{"recipe": Recipe(), **how})
+    return find_status(logs or [root / "logs"], store=root / "store", **{"recipe": Recipe(), **how})
 
 
 def states(found):
@@ -93,23 +93,23 @@ def test_losses_are_the_metres_of_all_manifests_the_largest_first(first_night):
 
 
 def test_without_logs_it_looks_where_ingest_was_told_to(first_night, tmp_path):
-    assert status(store=first_night / "store", recipe=Recipe()).counts == where(first_night).counts
+    assert find_status(store=first_night / "store", recipe=Recipe()).counts == where(first_night).counts
     with pytest.raises(UsageError, match="no call of ingest is remembered here; give the logs"):
-        status(store=tmp_path, recipe=Recipe())
+        find_status(store=tmp_path, recipe=Recipe())
 
 
 def test_a_log_that_is_gone_is_trouble_only_where_the_latest_call_was_given_it(first_night, tmp_path):
     stick = drive_at(tmp_path / "stick" / "one.mcap", seed=3)
     ingest([stick], store=tmp_path / "store", recipe=Recipe())
     stick.unlink()
-    found = status(store=tmp_path / "store", recipe=Recipe())
+    found = find_status(store=tmp_path / "store", recipe=Recipe())
     assert (found.exit_code, [of.code for of in found.problems], found.gone) == (3, ["log-missing"], ())
     shutil.copytree(first_night / "logs", tmp_path / "logs", ignore=lambda *_: {"cut.mcap", "junk.bag"})
     ingest([tmp_path / "logs"], store=tmp_path / "store", recipe=Recipe())
-    found = status(store=tmp_path / "store", recipe=Recipe())
+    found = find_status(store=tmp_path / "store", recipe=Recipe())
     assert (found.exit_code, found.problems, found.counts) == (0, (), {"done": 2})
     assert f"of earlier calls: {stick}: there is no such file or directory" in str(found)
-    assert status([stick], store=tmp_path / "store", recipe=Recipe()).exit_code == 3
+    assert find_status([stick], store=tmp_path / "store", recipe=Recipe()).exit_code == 3
 
 
 def test_new_changed_growing_passing_and_accepted_logs_are_told_apart(night):
@@ -130,8 +130,10 @@ def test_new_changed_growing_passing_and_accepted_logs_are_told_apart(night):
     shutil.copy(logs / "second.mcap", logs / "whole.mcap")
     os.utime(logs / "whole.mcap", ns=(OLD_NS, OLD_NS + 1))
     line = f"{logs / 'passing.mcap'}: No space left on device (28)"
-    call = Call("ingest", "0", 3, {"failed": 1}, failed={str(logs / "passing.mcap"): line})
-    open_log(Store(store)).commit("ended", Entries(calls=(calls.measure_call(calls.started(), call),)))
+    call = CallRecord("ingest", "0", 3, {"failed": 1}, failed={str(logs / "passing.mcap"): line})
+    open_log(Store(store)).commit(
+        "ended", Entries(calls=(call_history.measure_call(call_history.start_stopwatch(), call),))
+    )
     found = where(night)
     assert found.counts == {"done": 2, "quarantined": 1, "growing": 1, "pending": 2, "failed_transient": 1}
     told = {(group.state, group.cause): group.logs for group in found.groups}
@@ -206,7 +208,7 @@ def test_a_run_whose_log_s_document_is_gone_is_named_and_asked_for_again(first_n
     shutil.copytree(first_night / "store", tmp_path / "store", copy_function=shutil.copy2)
     (gone,) = (tmp_path / "store" / "runs").glob("whole-*/run-1.json")
     gone.unlink()
-    found = status([first_night / "logs"], store=tmp_path / "store", recipe=Recipe())
+    found = find_status([first_night / "logs"], store=tmp_path / "store", recipe=Recipe())
     (group,) = [group for group in found.groups if group.state == "pending"]
     assert (group.cause, group.logs) == (
         "files of its run are missing",
@@ -238,21 +240,21 @@ def test_a_dry_run_says_what_would_be_done_and_does_nothing(first_night, tmp_pat
 
 
 def test_an_estimate_is_what_the_like_took():
-    night = Call("ingest", "0", 0, {}, cpu_s=2_000.7, done_bytes=10**9, written_bytes=5 * 10**8)
+    night = CallRecord("ingest", "0", 0, {}, cpu_s=2_000.7, done_bytes=10**9, written_bytes=5 * 10**8)
     other = replace(night, cpu_s=1_000.7, done_bytes=5 * 10**8, written_bytes=10**8)
     quiet, build = replace(night, done_bytes=0, cpu_s=9.0), replace(night, command="build-dataset")
-    found = calls.estimate([night, other, quiet, build], "ingest", 10**9, jobs=4)
+    found = call_history.estimate([night, other, quiet, build], "ingest", 10**9, jobs=4)
     assert found.wall_s == pytest.approx(0.7 + 500.0, rel=0.01)
     assert found.written_bytes == pytest.approx(4e8, rel=0.01)
     assert str(found) == f"1 GB: about 8 min and {found.written_bytes / 1e6:.3g} MB (by 2 earlier calls)"
 
 
 def test_a_small_call_tells_little_of_a_million_samples():
-    small = Call("build-dataset", "0", 0, {"samples": 312}, cpu_s=2.3, written_bytes=2_900_000)
-    found = calls.estimate([small], "build-dataset", 1_000_000, jobs=1)
+    small = CallRecord("build-dataset", "0", 0, {"samples": 312}, cpu_s=2.3, written_bytes=2_900_000)
+    found = call_history.estimate([small], "build-dataset", 1_000_000, jobs=1)
     assert 100.0 < found.wall_s < 300.0, "185 s (docs/explanation/scale.md); 7,400 s in proportion"
     assert found.written_bytes < 5e9
-    assert calls.estimate([small], "build-dataset", 312, jobs=8).wall_s == pytest.approx(1.5, abs=0.1)
+    assert call_history.estimate([small], "build-dataset", 312, jobs=8).wall_s == pytest.approx(1.5, abs=0.1)
 
 
 def test_a_drive_without_a_segment_is_news_once_and_can_be_accepted(tmp_path):

@@ -15,13 +15,13 @@ from synthetic_store import WORLD, add_run, box, commit_run, lanes, put_map, reg
 
 from tcpipe.dataset import open_dataset
 from tcpipe.errors import DatasetError, UsageError
-from tcpipe.formats.commits import Entries, Sighting
+from tcpipe.formats.commits import Entries, LogSnapshot
+from tcpipe.formats.integrity import compute_checksum, find_broken_seal, seal_of, seal_page, write_sealed
 from tcpipe.formats.maps.map_facts import MapInputs
 from tcpipe.formats.maps.map_files import open_map
-from tcpipe.formats.numbered import read_as_at
+from tcpipe.formats.numbered_documents import read_as_at
 from tcpipe.formats.place import DirectoryPlace
 from tcpipe.formats.run_documents import MapDocument
-from tcpipe.formats.seals import broken_seal, file_checksum, seal_of, sealed_page, write_sealed
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.diff import diff
 from tcpipe.pipeline.explain import explain
@@ -30,7 +30,7 @@ from tcpipe.pipeline.log_writer import open_log
 from tcpipe.pipeline.report import report
 from tcpipe.pipeline.verify import verify
 from tcpipe.recipe import Recipe, SampleConfig
-from tcpipe.report.pictures import quick_look, write_quick_look
+from tcpipe.report.pictures import draw_quick_look, write_quick_look
 from tcpipe.store import Store
 from tcpipe.tables.levels import DATA_MODEL_VERSION, STREAMS, Sensor, Streams
 
@@ -77,15 +77,15 @@ def test_a_store_its_runs_and_its_map_verify(made):
 
 def dress(store):
     """Add what `ingest`, `add-map` and `report` also leave in a store."""
-    open_log(store).commit("seen", Entries(seen=(Sighting(("/logs/north.mcap",), (), "north"),)))
+    open_log(store).commit("seen", Entries(seen=(LogSnapshot(("/logs/north.mcap",), (), "north"),)))
     with store.new_map("site", after=1) as path:
         shutil.copytree(store.map_path("site"), path)
-        write_quick_look(path.with_suffix(".png"), quick_look(open_map(path)), seal_of(path))
+        write_quick_look(path.with_suffix(".png"), draw_quick_look(open_map(path)), seal_of(path))
     shutil.rmtree(store.map_path("site").parents[1] / replaced(store))
     (store.root / "maps" / "site-1.json").unlink()
     sensor = Sensor("/power", "x/msg/Power", "base", "the only one", None, None)
     for run in store.runs():
-        (Path(run.where) / "report.html").write_text(sealed_page("<p>\nwhat was driven\n</p>"))
+        (Path(run.where) / "report.html").write_text(seal_page("<p>\nwhat was driven\n</p>"))
         files = store.write_streams(
             run.run_id, Streams({"power": STREAMS["power"].empty()}, {"power": sensor}, "husky"), key="k"
         )
@@ -120,7 +120,7 @@ def test_a_changed_byte_anywhere_is_found_and_its_file_is_named(copy, name):
     for path in set(whole) - set(listed):
         for place in (0.0, *rng.random(8), 1.0):
             flip(path, place, bit=int(rng.integers(8)))
-            problems = broken_seal(path) if place else "".join(verify(directory).problems)
+            problems = find_broken_seal(path) if place else "".join(verify(directory).problems)
             assert str(path) in (problems or ""), (path, place)
             path.write_bytes(whole[path])
     assert verify(directory).problems == ()
@@ -179,7 +179,7 @@ def test_rows_that_are_joined_to_others_patches_are_found(copy, name):
     card = json.loads((directory / "dataset.json").read_text())
     path = directory / "samples.parquet"
     pq.write_table(pq.read_table(path).sort_by("start_ns"), path)
-    card["checksums"]["samples.parquet"] = asdict(file_checksum(path))
+    card["checksums"]["samples.parquet"] = asdict(compute_checksum(path))
     write_sealed(directory / "dataset.json", card)
     assert any("are not those of samples.parquet, in their order" in line for line in verify(directory).problems)
 

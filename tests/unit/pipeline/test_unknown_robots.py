@@ -7,7 +7,7 @@ from synthetic_store import add_run, add_world, commit_run, lanes, segments
 from tcpipe.dataset import open_dataset
 from tcpipe.errors import DatasetError
 from tcpipe.pipeline.dataset.build import build_dataset
-from tcpipe.pipeline.dataset.runs import alike
+from tcpipe.pipeline.dataset.runs import group_similar_runs
 from tcpipe.store import open_store
 from tcpipe.tables.levels import Sensor
 
@@ -34,7 +34,7 @@ ROVER = {"imu": sensor("/imu/data"), "gnss": sensor("/fix", "sensor_msgs/msg/Nav
     ],
 )
 def test_what_is_one_robot(other, groups):
-    found = alike({"a": ROVER, "b": other, "c": ROVER})
+    found = group_similar_runs({"a": ROVER, "b": other, "c": ROVER})
     assert len(found) == groups
     assert sorted(run for runs, _ in found for run in runs) == ["a", "b", "c"]
 

@@ -24,10 +24,10 @@ from tcpipe.errors import MapError, ModelError, UsageError
 from tcpipe.execution import Outcome
 from tcpipe.formats.bucket_directories import fetch_directory
 from tcpipe.pipeline.verify import verify
-from tcpipe.planning.cost_grid import blocks, grid_over
-from tcpipe.planning.cost_map import Cluster, cost_map_key, make_cost_map, open_cost_map, read_cost_map_card
+from tcpipe.planning.cost_grid import iterate_blocks, make_grid
+from tcpipe.planning.cost_map import Cluster, make_cost_map, make_cost_map_key, open_cost_map, read_cost_map_card
 from tcpipe.planning.courses import ANGLES_DEG
-from tcpipe.planning.reasons import Reason
+from tcpipe.planning.no_cost_reasons import Reason
 
 MODEL = PhysicsModel()
 
@@ -87,9 +87,9 @@ def test_every_tile_is_decoded_once(made):
 def test_blocks_hold_every_wanted_cell_once(monkeypatch, strip):
     monkeypatch.setattr("tcpipe.planning.cost_grid._STRIP_TILES", strip)
     source = plane(side_m=30.0)
-    grid = grid_over(source, 0.7)
+    grid = make_grid(source, 0.7)
     wanted = np.random.default_rng(0).random((grid.rows, grid.cols)) < 0.6
-    cells = np.concatenate(list(blocks(source, MODEL, grid, wanted)))
+    cells = np.concatenate(list(iterate_blocks(source, MODEL, grid, wanted)))
     assert sorted(cells) == np.flatnonzero(wanted).tolist()
 
 
@@ -232,7 +232,7 @@ def test_a_second_call_does_nothing_and_another_step_replaces_it(tmp_path: Path)
     assert (out / "cost-map.json").stat().st_mtime_ns == before
     assert make_cost_map(MODEL, source, out, step_m=3.0).card.grid.rows == 2
     assert (
-        cost_map_key(replace(MODEL, checksum="1" * 64), source, 3.0)
+        make_cost_map_key(replace(MODEL, checksum="1" * 64), source, 3.0)
         != json.loads((out / "cost-map.json").read_text())["key"]
     )
 

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from tcpipe.planning.courses import ANGLES_DEG, COURSES, DIRECTIONS, MAX_DETOUR, MOVES, touches
+from tcpipe.planning.courses import ANGLES_DEG, COURSES, DIRECTIONS, MAX_DETOUR, MOVES, find_crossed_cells
 
 
 def test_courses_rise_from_east_counter_clockwise_and_lead_to_16_cells():
@@ -22,12 +22,12 @@ def test_shares_are_the_lengths_of_the_step_in_each_cell(course):
     at = (np.arange(40_000) + 0.5)[:, None] / 40_000 * MOVES[course]
     cells, counts = np.unique(np.floor(at + 0.5).astype(int), axis=0, return_counts=True)
     walked = {tuple(cell): count / 40_000 for cell, count in zip(cells.tolist(), counts.tolist(), strict=True)}
-    found = {(touch.east, touch.north): touch.share for touch in touches(course)}
+    found = {(touch.east, touch.north): touch.share for touch in find_crossed_cells(course)}
     assert {cell: share for cell, share in found.items() if share} == pytest.approx(walked, abs=1e-3)
 
 
 def test_a_diagonal_step_touches_the_two_cells_beside_its_corner():
-    corners = {(touch.east, touch.north) for touch in touches(2) if not touch.share}
+    corners = {(touch.east, touch.north) for touch in find_crossed_cells(2) if not touch.share}
     assert corners == {(1, 0), (0, 1)}
 
 

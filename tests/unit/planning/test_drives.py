@@ -12,8 +12,8 @@ from tcpipe.dataset import open_dataset
 from tcpipe.errors import ModelError, UsageError
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.planning.drive_files import evaluate_drives
-from tcpipe.planning.drives import drive_cost, drive_in
-from tcpipe.planning.inputs import chosen_map
+from tcpipe.planning.drives import compute_drive_cost, find_drive
+from tcpipe.planning.inputs import choose_map
 from tcpipe.recipe import Recipe
 
 
@@ -24,13 +24,13 @@ def made(tmp_path_factory):
     store = small_store(here)
     region = region_file(here / "region.geojson", box(-18, 0, 18, 18))
     build_dataset(here / "dataset", store=store.root, split=region, recipe=Recipe())
-    return store, open_dataset(here / "dataset"), chosen_map(store.root, None)
+    return store, open_dataset(here / "dataset"), choose_map(store.root, None)
 
 
 def test_a_drive_that_was_held_back_is_summed_where_the_model_knows_the_ground(made):
     store, data, source = made
-    run = drive_in(store, "/logs/south.mcap")
-    found = drive_cost(PhysicsModel(), source, run, data, log="south.mcap")
+    run = find_drive(store, "/logs/south.mcap")
+    found = compute_drive_cost(PhysicsModel(), source, run, data, log="south.mcap")
     assert found.held_back
     assert found.samples_in_training == 0
     segments = run.segments()
@@ -51,8 +51,8 @@ def test_a_drive_that_was_held_back_is_summed_where_the_model_knows_the_ground(m
 def test_ground_that_was_not_met_is_named_and_left_out(made):
     store, data, source = made
     flat = replace(PhysicsModel(), seen=PhysicsModel().seen | {"slope_rad": (-1e-6, 1e-6)})
-    found = drive_cost(flat, source, drive_in(store, "south"), data, log="south")
-    known = drive_cost(PhysicsModel(), source, drive_in(store, "south"), data, log="south")
+    found = compute_drive_cost(flat, source, find_drive(store, "south"), data, log="south")
+    known = compute_drive_cost(PhysicsModel(), source, find_drive(store, "south"), data, log="south")
     assert found.rest_m["slope_not_seen"] > 0.0
     assert found.compared_m < known.compared_m
 
@@ -82,6 +82,6 @@ def test_what_cannot_be_compared_is_told(made):
     with pytest.raises(
         UsageError, match=r"elsewhere.mcap: no run of this log in .*; wanted its path or its run's name"
     ):
-        drive_in(store, "elsewhere.mcap")
+        find_drive(store, "elsewhere.mcap")
     with pytest.raises(ModelError, match="is of robot husky, model physics of jackal"):
-        drive_cost(PhysicsModel(robot="jackal"), source, drive_in(store, "south"), data, log="south")
+        compute_drive_cost(PhysicsModel(robot="jackal"), source, find_drive(store, "south"), data, log="south")

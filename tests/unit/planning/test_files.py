@@ -12,10 +12,10 @@ from physics_model import PhysicsModel
 from planning_worlds import lonlat, plane
 
 from tcpipe.errors import ModelError, PathError, UsageError
-from tcpipe.formats.geojson_lines import line_feature, read_line
+from tcpipe.formats.geojson_lines import make_line_feature, read_line
 from tcpipe.formats.json_files import write_json
 from tcpipe.planning.cost_map import make_cost_map
-from tcpipe.planning.path_files import predict_path, summary_path
+from tcpipe.planning.path_files import make_summary_path, predict_path
 from tcpipe.planning.plan_files import PlanRequest, plan
 
 MODEL = PhysicsModel()
@@ -42,7 +42,7 @@ def path(source, tmp_path: Path) -> Path:
 
 
 def _write_path(path: Path, points) -> None:
-    write_json(path, {"type": "FeatureCollection", "features": [line_feature(points, {})]})
+    write_json(path, {"type": "FeatureCollection", "features": [make_line_feature(points, {})]})
 
 
 @pytest.mark.parametrize("ending", ["csv", "parquet", "json"])
@@ -59,7 +59,7 @@ def test_the_table_is_the_same_in_every_format(source, path, ending):
     assert len(rows) == found.pieces == 18
     assert sum(row["energy_joule"] for row in rows) == pytest.approx(found.energy_joule, rel=1e-9)
     assert rows[0]["terrain_name"] == "grass"
-    assert json.loads(summary_path(out).read_text())["duration_s"] == found.duration_s
+    assert json.loads(make_summary_path(out).read_text())["duration_s"] == found.duration_s
 
 
 def test_parquet_says_units_and_what_the_bits_mean(source, path):

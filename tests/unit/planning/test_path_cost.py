@@ -8,8 +8,8 @@ from physics_model import PhysicsModel, energy_joule, made_residuals, velocity_m
 from planning_worlds import lonlat, plane
 
 from tcpipe.errors import ModelError, PathError
-from tcpipe.planning.path_cost import cost_of_path
-from tcpipe.planning.reasons import Reason
+from tcpipe.planning.no_cost_reasons import Reason
+from tcpipe.planning.path_cost import compute_path_cost
 from tcpipe.tables.facts import PhysicsFit, PhysicsTerm
 from tcpipe.terrain.classes import PAPER_CLASSES, ClassTable
 
@@ -20,7 +20,7 @@ SCALE = 1.0 / 0.9996
 
 
 def _cost(source, *points, model=MODEL):
-    return cost_of_path(model, source, lonlat(source, *points), where="path")
+    return compute_path_cost(model, source, lonlat(source, *points), where="path")
 
 
 def test_uphill_and_downhill_on_a_plane():
@@ -173,7 +173,7 @@ def test_bad_paths_are_one_line_each():
         assert len(error.value.problems) == 1
     swapped = lonlat(source, (4.0, 4.0), (12.0, 4.0))[:, ::-1]
     with pytest.raises(PathError, match="axes look swapped"):
-        cost_of_path(MODEL, source, swapped, where="path")
+        compute_path_cost(MODEL, source, swapped, where="path")
 
 
 def test_a_model_of_other_classes_or_layers_is_refused_at_once():

@@ -9,7 +9,7 @@ from physics_model import PhysicsModel, energy_joule, velocity_mps
 from planning_worlds import lonlat, plane
 
 from tcpipe.errors import PathError
-from tcpipe.planning.cost_grid import new_survey
+from tcpipe.planning.cost_grid import make_survey
 from tcpipe.planning.picture import draw_plans
 from tcpipe.planning.plan import OBJECTIVES, plan_path
 from tcpipe.terrain.classes import ClassTable, TerrainClass
@@ -19,7 +19,7 @@ MODEL = PhysicsModel()
 
 def _plan(source, start, goal, objective, *, model=MODEL, survey=None, **options):
     ends = lonlat(source, start, goal)
-    return plan_path(survey or new_survey(model, source, 1.0), ends[0], ends[1], objective, **options)
+    return plan_path(survey or make_survey(model, source, 1.0), ends[0], ends[1], objective, **options)
 
 
 def _wall(east, north):
@@ -55,7 +55,7 @@ def test_the_way_round_a_wall_keeps_off_it():
 
 def test_the_fast_road_is_taken_for_time_and_the_ellipse_grows_to_find_it():
     source = plane(36.0, classes=_road)
-    survey = new_survey(MODEL, source, 1.0)
+    survey = make_survey(MODEL, source, 1.0)
     slow, fast = float(velocity_mps(7, 0.0)), float(velocity_mps(4, 0.0))
     found = _plan(source, (3.0, 22.0), (33.0, 22.0), "time", survey=survey)
     assert found.xy_m[:, 1].max() > 5_200_000.0 - 36.0 + 24.0
@@ -69,10 +69,10 @@ def test_the_fast_road_is_taken_for_time_and_the_ellipse_grows_to_find_it():
 
 def test_looking_at_less_of_the_map_finds_the_same_path():
     source = plane(36.0, classes=_road, rise_east=0.05)
-    whole = new_survey(MODEL, source, 1.0)
+    whole = make_survey(MODEL, source, 1.0)
     whole.predict(np.ones_like(whole.predicted), lambda _, __: None)
     for objective in ("energy", "time"):
-        lazy = new_survey(MODEL, source, 1.0)
+        lazy = make_survey(MODEL, source, 1.0)
         one, other = (_plan(source, (4.0, 10.0), (16.0, 12.0), objective, survey=survey) for survey in (lazy, whole))
         np.testing.assert_array_equal(one.xy_m, other.xy_m)
         assert one.totals.predicted_cells < 0.7 * other.totals.predicted_cells
@@ -81,7 +81,7 @@ def test_looking_at_less_of_the_map_finds_the_same_path():
 def test_a_road_out_of_sight_is_found_without_a_cost_map(caplog):
     """It lies beyond all that the shortest way needs, and is worth the detour."""
     source = plane(72.0, pitch_m=0.2, classes=lambda _, north: np.where(np.abs(north - 36.0) < 2.0, 4, 7))
-    lazy, model = new_survey(replace(MODEL, patch_px=8), source, 1.0), replace(MODEL, patch_px=8)
+    lazy, model = make_survey(replace(MODEL, patch_px=8), source, 1.0), replace(MODEL, patch_px=8)
     with caplog.at_level("INFO", "tcpipe"):
         found = _plan(source, (6.0, 22.0), (66.0, 22.0), "energy", model=model, survey=lazy)
     straight, metres = energy_joule(7, 0.0) * 60.0, 60.0 / 0.9996
@@ -105,10 +105,10 @@ def test_ends_that_cannot_be_used_are_named_together():
     with pytest.raises(PathError, match=r"are 0\.\d+ m apart"):
         _plan(source, (4.0, 4.0), (4.3, 4.0), "time")
     with pytest.raises(PathError, match="lie in one cell of 5 m; choose a smaller --cell-size"):
-        _plan(source, (1.0, 4.0), (4.0, 4.0), "time", survey=new_survey(MODEL, source, 5.0))
+        _plan(source, (1.0, 4.0), (4.0, 4.0), "time", survey=make_survey(MODEL, source, 5.0))
     swapped = lonlat(source, (4.0, 4.0), (26.0, 4.0))[:, ::-1]
     with pytest.raises(PathError, match="axes look swapped") as error:
-        plan_path(new_survey(MODEL, source, 1.0), swapped[0], swapped[1], "time")
+        plan_path(make_survey(MODEL, source, 1.0), swapped[0], swapped[1], "time")
     assert len(error.value.problems) == 2
 
 
@@ -126,7 +126,7 @@ def test_no_way_says_what_would_open_one():
 
 def test_an_end_on_ground_that_is_not_known_says_so_before_all_the_map_is_looked_at():
     source = plane(40.0, classes=lambda east, _: np.where(east > 30.0, 5, 4))
-    survey = new_survey(replace(MODEL, class_counts={4: 100}, pixel_classes=(4,)), source, 1.0)
+    survey = make_survey(replace(MODEL, class_counts={4: 100}, pixel_classes=(4,)), source, 1.0)
     with pytest.raises(PathError, match=r"--to: .*class not seen.*--allow-extrapolation"):
         _plan(source, (22.0, 4.0), (33.0, 4.0), "time", survey=survey)
     assert survey.judged.mean() < 0.5
@@ -145,7 +145,7 @@ def test_a_model_that_takes_no_classes_keeps_to_what_the_map_s_own_allow():
 def test_a_model_of_heights_alone_needs_no_other_layer_and_its_plans_can_be_drawn(tmp_path):
     source = plane(30.0, rise_east=0.3)
     del source.arrays["ortho"], source.arrays["terrain"]
-    survey = new_survey(replace(MODEL, channels=("height",)), source, 2.0)
+    survey = make_survey(replace(MODEL, channels=("height",)), source, 2.0)
     plans = [_plan(source, (4.0, 4.0), (26.0, 20.0), objective, survey=survey) for objective in OBJECTIVES]
     for name in ("one.png", "two.png"):
         draw_plans(tmp_path / name, source, plans)

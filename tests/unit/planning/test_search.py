@@ -7,9 +7,9 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
 from tcpipe.planning.cost_grid import CostGrid
-from tcpipe.planning.courses import COURSES, MOVES, touches
-from tcpipe.planning.plan import could_be_better, probe_cells
-from tcpipe.planning.search import best_potential, least_cost_path, least_over_cells, steps_of
+from tcpipe.planning.courses import COURSES, MOVES, find_crossed_cells
+from tcpipe.planning.plan import find_possible_gain, probe_cells
+from tcpipe.planning.search import compute_least_costs, find_best_potential, find_least_cost_path, make_steps
 from tcpipe.terrain.grid import MapGrid
 
 METRES = np.ones(COURSES)
@@ -36,7 +36,7 @@ def _by_hand(costs, objective, open_, start):
         east, north = MOVES[course].tolist()
         for row in range(rows):
             for col in range(cols):
-                cells = [(row - t.north, col + t.east, t.share) for t in touches(course)]
+                cells = [(row - t.north, col + t.east, t.share) for t in find_crossed_cells(course)]
                 if all(0 <= r < rows and 0 <= c < cols and open_[course, r, c] for r, c, _ in cells):
                     cost = np.hypot(east, north) * sum(s * per_metre[course, r, c] for r, c, s in cells if s)
                     edges.append((row * cols + col, (row - north) * cols + col + east, cost))
@@ -59,7 +59,7 @@ def _by_hand(costs, objective, open_, start):
 def test_paths_are_as_cheap_as_can_be_round_any_obstacles(power, free):
     costs = _grid(power, 0.8, np.zeros((5, 6)))
     open_ = np.broadcast_to(free, (COURSES, 5, 6))
-    found = least_cost_path(steps_of(costs, "energy", open_, METRES), 30, 0, 29)
+    found = find_least_cost_path(make_steps(costs, "energy", open_, METRES), 30, 0, 29)
     best = _by_hand(costs, "energy", open_, 0)[29]
     if found is None:
         assert np.isinf(best)
@@ -72,8 +72,8 @@ def test_paths_are_as_cheap_as_can_be_round_any_obstacles(power, free):
 @given(arrays.arrays(float, (COURSES, 5, 6), elements=st.floats(20.0, 300.0)))
 def test_the_least_over_a_cell_is_the_way_there_and_on_from_there(power):
     costs, open_ = _grid(power, 0.8, np.zeros((5, 6))), np.ones((COURSES, 5, 6), bool)
-    steps = steps_of(costs, "energy", open_, METRES)
-    over = least_over_cells(steps, steps.cost, 30, 0, 29, limit=np.inf)
+    steps = make_steps(costs, "energy", open_, METRES)
+    over = compute_least_costs(steps, steps.cost, 30, 0, 29, limit=np.inf)
     there = _by_hand(costs, "energy", open_, 0)
     for cell in (3, 14, 29):
         assert over[cell] == pytest.approx(there[cell] + _by_hand(costs, "energy", open_, cell)[29], rel=1e-6)
@@ -86,15 +86,15 @@ def test_no_cell_of_a_better_path_is_left_out_and_the_rest_need_not_be_asked_abo
     class_id = np.where(rng.random((6, 5)) < 0.4, 5, 4).astype(np.uint8).repeat(4, axis=0).repeat(6, axis=1)
     power = np.where(class_id == 5, 150.0, 80.0) * rng.uniform(1.0, 1.02, (COURSES, *shape))
     open_, start, goal = np.ones((COURSES, *shape), bool), 10 * 30 + 4, 14 * 30 + 25
-    whole = steps_of(_grid(power, 1.0, np.zeros(shape)), "energy", open_, METRES)
-    best = least_cost_path(whole, class_id.size, start, goal)
+    whole = make_steps(_grid(power, 1.0, np.zeros(shape)), "energy", open_, METRES)
+    best = find_least_cost_path(whole, class_id.size, start, goal)
     predicted = probe_cells(class_id, open_[0])
     predicted[9:16, 3:27] = True
-    steps = steps_of(_grid(np.where(predicted, power, np.nan), 1.0, np.zeros(shape)), "energy", open_, METRES)
-    found = least_cost_path(
-        steps_of(_grid(power, 1.0, np.zeros(shape)), "energy", open_ & predicted, METRES), class_id.size, start, goal
+    steps = make_steps(_grid(np.where(predicted, power, np.nan), 1.0, np.zeros(shape)), "energy", open_, METRES)
+    found = find_least_cost_path(
+        make_steps(_grid(power, 1.0, np.zeros(shape)), "energy", open_ & predicted, METRES), class_id.size, start, goal
     )
-    over, better = could_be_better(steps, class_id, found, start, goal)
+    over, better = find_possible_gain(steps, class_id, found, start, goal)
     assert found.cost > best.cost
     unknown = best.cells[~predicted.reshape(-1)[best.cells]]
     assert unknown.size
@@ -116,23 +116,23 @@ def test_downhill_energy_that_comes_back_does_not_mislead_the_search():
     rng = np.random.default_rng(3)
     height = np.cumsum(np.cumsum(rng.normal(0.0, 0.06, (7, 8)), axis=0), axis=1)
     friction = rng.uniform(20.0, 60.0, (7, 8))
-    steps = steps_of(_grid(1.0, 1.0, height), "distance", np.ones((COURSES, 7, 8), bool), METRES)
+    steps = make_steps(_grid(1.0, 1.0, height), "distance", np.ones((COURSES, 7, 8), bool), METRES)
     middle = (friction.reshape(-1)[steps.begin] + friction.reshape(-1)[steps.end]) / 2.0
     cost = middle * steps.length_m + 600.0 * steps.rise_m
     assert cost.min() < 0.0
     steps = type(steps)(steps.begin, steps.end, cost, steps.length_m, steps.rise_m)
-    found = least_cost_path(steps, 56, 0, 55)
+    found = find_least_cost_path(steps, 56, 0, 55)
     best = np.full(56, np.inf)
     best[0] = 0.0
     for _ in range(56):
         np.minimum.at(best, steps.end, best[steps.begin] + cost)
     assert found.cost == pytest.approx(best[55], rel=1e-9)
     assert found.negative_steps == 0
-    assert best_potential(steps) == pytest.approx(600.0, rel=0.1)
+    assert find_best_potential(steps) == pytest.approx(600.0, rel=0.1)
 
 
 def test_what_gives_back_more_than_it_was_lifted_for_is_counted():
-    steps = steps_of(_grid(-50.0, 1.0, np.zeros((4, 4))), "energy", np.ones((COURSES, 4, 4), bool), METRES)
-    found = least_cost_path(steps, 16, 0, 15)
+    steps = make_steps(_grid(-50.0, 1.0, np.zeros((4, 4))), "energy", np.ones((COURSES, 4, 4), bool), METRES)
+    found = find_least_cost_path(steps, 16, 0, 15)
     assert found.negative_steps == steps.cost.size
     assert found.cost < 0.0

@@ -7,11 +7,11 @@ import pytest
 from physics_model import PhysicsModel
 from planning_worlds import lonlat, plane
 
-from tcpipe.planning.cost_grid import new_survey
-from tcpipe.planning.path_cost import cost_of_path
+from tcpipe.planning.cost_grid import make_survey
+from tcpipe.planning.path_cost import compute_path_cost
 from tcpipe.planning.plan import plan_path
-from tcpipe.planning.search import Steps, least_cost_path
-from tcpipe.planning.turning import least_turning_path, turning_of, turns_between
+from tcpipe.planning.search import Steps, find_least_cost_path
+from tcpipe.planning.turning import compute_turns, find_least_turning_path, find_turning
 from tcpipe.tables.facts import PhysicsFit, PhysicsTerm
 from tcpipe.terrain.classes import PAPER_CLASSES
 
@@ -24,7 +24,7 @@ def physics(**joule_per_rad):
 
 
 def cost(source, *points, fit=None):
-    return cost_of_path(replace(PhysicsModel(), physics=fit), source, lonlat(source, *points), where="path")
+    return compute_path_cost(replace(PhysicsModel(), physics=fit), source, lonlat(source, *points), where="path")
 
 
 CORNER = (4.0, 4.0), (14.0, 4.0), (14.0, 14.0)
@@ -58,15 +58,15 @@ def test_without_physics_nothing_is_said_of_turns():
     found = cost(plane(), *CORNER)
     assert found.totals.turn_energy_joule is None
     assert found.pieces["turn_energy_joule"].null_count == found.pieces.num_rows
-    assert turning_of(None, PAPER_CLASSES) is None
-    assert turning_of(physics(), PAPER_CLASSES) is None
+    assert find_turning(None, PAPER_CLASSES) is None
+    assert find_turning(physics(), PAPER_CLASSES) is None
 
 
 def test_a_circle_turns_once_round_however_fine_it_is_cut():
     for count in (24, 200):
         angle = np.linspace(0.0, 2.0 * np.pi, count + 1)
         points = np.column_stack([np.cos(angle), np.sin(angle)])
-        turned = turns_between(points[:-1], points[1:]).sum()
+        turned = compute_turns(points[:-1], points[1:]).sum()
         assert turned == pytest.approx(2.0 * np.pi * (1.0 - 1.0 / count))
 
 
@@ -87,8 +87,8 @@ def steps_on_open_ground(size, cost_per_cell=1.0):
 
 def test_free_turns_are_the_search_without_them():
     steps = steps_on_open_ground(12)
-    plain = least_cost_path(steps, 144, 0, 12 * 9 + 7)
-    turning = least_turning_path(steps, 12, 0, 12 * 9 + 7, np.zeros(144))
+    plain = find_least_cost_path(steps, 144, 0, 12 * 9 + 7)
+    turning = find_least_turning_path(steps, 12, 0, 12 * 9 + 7, np.zeros(144))
     assert turning.cost == pytest.approx(plain.cost, abs=1e-6)
 
 
@@ -104,8 +104,8 @@ def test_turns_add_up_along_the_path():
     open_ = np.array([b not in wall and e not in wall for b, e in zip(steps.begin, steps.end, strict=True)])
     steps = Steps(*(getattr(steps, name)[open_] for name in Steps.__slots__))
     start, goal = 0, size - 1
-    cheap = least_turning_path(steps, size, start, goal, np.full(size * size, 0.01))
-    dear = least_turning_path(steps, size, start, goal, np.full(size * size, 50.0))
+    cheap = find_least_turning_path(steps, size, start, goal, np.full(size * size, 0.01))
+    dear = find_least_turning_path(steps, size, start, goal, np.full(size * size, 50.0))
 
     def turned(found):
         row, col = np.divmod(found.cells, size)
@@ -128,10 +128,12 @@ def test_a_plan_that_pays_for_turns_turns_less():
     for name, fit in (("free", None), ("dear", physics(all=2000.0))):
         model = replace(PhysicsModel(), physics=fit)
         ends = lonlat(source, (2.0, 12.0), (28.0, 12.0))
-        found[name] = plan_path(new_survey(model, source, 1.0), ends[0], ends[1], "energy")
+        found[name] = plan_path(make_survey(model, source, 1.0), ends[0], ends[1], "energy")
     assert found["dear"].totals.turn_rad <= found["free"].totals.turn_rad
     # Judged alike, turns included, the plan that knew of them is no dearer.
     lines = {name: plan.lonlat_deg for name, plan in found.items()}
     judge = replace(PhysicsModel(), physics=physics(all=2000.0))
-    paid = {name: cost_of_path(judge, source, line, where="plan").totals.energy_joule for name, line in lines.items()}
+    paid = {
+        name: compute_path_cost(judge, source, line, where="plan").totals.energy_joule for name, line in lines.items()
+    }
     assert paid["dear"] <= paid["free"] * 1.001

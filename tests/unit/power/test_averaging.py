@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tcpipe.power.averaging import told_averaged
-from tcpipe.simulation import Faults, simulated_drive, tiny
+from tcpipe.power.averaging import is_stated_averaged
+from tcpipe.simulation import Faults, make_tiny, simulate_readings
 from tcpipe.simulation.sensors import Power
 
 FAULTS = Faults.only("wheel_slip", "wheel_noise", "power_noise")
@@ -15,14 +15,14 @@ FAULTS = Faults.only("wheel_slip", "wheel_noise", "power_noise")
 def test_a_mean_of_a_second_is_told_and_a_sample_never_taken_for_one():
     said = {}
     for averaged in (True, False):
-        site = tiny(FAULTS, seconds=200.0)
+        site = make_tiny(FAULTS, seconds=200.0)
         power = Power(rate_hz=1.0, averaged=averaged)
         drive = replace(site.drives[0], sensors=replace(site.drives[0].sensors, power=power))
-        _, readings = simulated_drive(replace(site, drives=(drive,)), seed=3)
+        _, readings = simulate_readings(replace(site, drives=(drive,)), seed=3)
         drawn, wheels = readings["power"], readings["wheels"]
         watt = drawn.values["voltage_volt"] * (drawn.values["left_amp"] + drawn.values["right_amp"])
         motion = (wheels.values["velocity_mps"], wheels.values["yaw_rate_radps"])
-        said[averaged] = told_averaged(drawn.stamp_ns, watt, wheels.stamp_ns, *motion)
+        said[averaged] = is_stated_averaged(drawn.stamp_ns, watt, wheels.stamp_ns, *motion)
     assert said[True] is True
     assert said[False] is not True
 
@@ -39,9 +39,9 @@ def drawn_by(late_s: float, width_s: float):
 
 @pytest.mark.parametrize(("late_s", "width_s", "wanted"), [(0.0, 1.0, True), (0.0, 0.0, False), (3.0, 0.0, None)])
 def test_by_a_formula(late_s, width_s, wanted):
-    assert told_averaged(*drawn_by(late_s, width_s)) is wanted
+    assert is_stated_averaged(*drawn_by(late_s, width_s)) is wanted
 
 
 def test_too_little_tells_nothing():
-    assert told_averaged(*(values[:40] for values in drawn_by(0.0, 1.0))) is None
-    assert told_averaged(*(values[:0] for values in drawn_by(0.0, 1.0))) is None
+    assert is_stated_averaged(*(values[:40] for values in drawn_by(0.0, 1.0))) is None
+    assert is_stated_averaged(*(values[:0] for values in drawn_by(0.0, 1.0))) is None

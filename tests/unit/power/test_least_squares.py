@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.optimize import nnls
 
 from tcpipe.power import signal_model
-from tcpipe.power.least_squares import non_negative
+from tcpipe.power.least_squares import solve_non_negative
 
 
 @given(st.integers(0, 2**32), st.integers(1, 10), st.floats(0.0, 1.0), st.booleans())
@@ -17,14 +17,17 @@ def test_as_scipy_of_what_a_signal_is_made_of(seed, spacings, noise, averaged):
     spacing = np.array(signal_model._SPACINGS[:spacings])
     taus = [*((tau, False) for tau in signal_model._ROUGH_TAU), *((tau, True) for tau in signal_model._SMOOTH_TAU)]
     made = np.stack(
-        [signal_model._expected(spacing, period_s, tau * period_s, smooth=s, averaged=averaged) for tau, s in taus]
+        [
+            signal_model._predict_second_differences(spacing, period_s, tau * period_s, smooth=s, averaged=averaged)
+            for tau, s in taus
+        ]
     )
     size = np.where(draw.random(len(taus)) < 0.3, draw.exponential(size=len(taus)), 0.0)
     seen = np.abs(size @ made * (1.0 + noise * draw.normal(size=spacings))) + 1e-6
     weight = np.sqrt(draw.integers(20, 5000, spacings)) / seen
     matrix, wanted = (made * weight).T, seen * weight
     theirs, residual = nnls(matrix, wanted)
-    ours = non_negative(matrix, wanted)
+    ours = solve_non_negative(matrix, wanted)
     assert ours.min() >= 0.0
     assert np.linalg.norm(matrix @ ours - wanted) == pytest.approx(residual, rel=1e-9, abs=1e-9)
     np.testing.assert_allclose(ours, theirs, rtol=1e-6, atol=1e-8 * theirs.max(initial=1.0))
@@ -34,7 +37,7 @@ def test_as_scipy_of_what_a_signal_is_made_of(seed, spacings, noise, averaged):
 def test_as_near_as_scipy_of_anything(seed, rows, columns):
     draw = np.random.default_rng(seed)
     made, seen = draw.normal(size=(rows, columns)), draw.normal(size=rows)
-    found = non_negative(made, seen)
+    found = solve_non_negative(made, seen)
     assert found.min() >= 0.0
     assert np.linalg.norm(made @ found - seen) == pytest.approx(nnls(made, seen)[1], rel=1e-9, abs=1e-9)
 
@@ -49,4 +52,4 @@ def test_as_near_as_scipy_of_anything(seed, rows, columns):
     ],
 )
 def test_by_hand(made, seen, size):
-    np.testing.assert_allclose(non_negative(np.array(made, float), np.array(seen, float)), size, atol=1e-12)
+    np.testing.assert_allclose(solve_non_negative(np.array(made, float), np.array(seen, float)), size, atol=1e-12)

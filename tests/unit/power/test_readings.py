@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tcpipe.formats.robot_files import shipped_profiles
+from tcpipe.formats.robot_files import load_shipped_profiles
 from tcpipe.power import readings
 from tcpipe.power.readings import PowerReadings
 from tcpipe.power.sources import BATTERY_STATE
@@ -20,7 +20,7 @@ AMP = 5.0 + np.cos(np.arange(N))
 
 
 def read_power(topics, robot: str, **options) -> PowerReadings:
-    known = shipped_profiles()
+    known = load_shipped_profiles()
     return readings.read_power(topics, known.power_sources, platform=known.robots[robot].platform, **options)
 
 

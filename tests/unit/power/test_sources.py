@@ -6,12 +6,12 @@ import pytest
 from tcpipe.power.sources import (
     LARGEST_AMP,
     RailReadings,
+    apply_sign,
+    find_quantity,
     find_rejection,
-    quantity,
-    rail_of,
+    make_rail_name,
     read_rails,
     sign_by_mean,
-    with_sign,
 )
 from tcpipe.robots.profiles import PowerSource
 
@@ -120,13 +120,13 @@ def test_a_sign_is_clear_where_more_than_eight_tenths_flow_one_way():
 
 
 def test_with_sign_turns_the_current_alone():
-    rail = with_sign(RailReadings("b", VARIED, VARIED), -1)
+    rail = apply_sign(RailReadings("b", VARIED, VARIED), -1)
     assert rail.current_amp.tolist() == [-5.0, -6.0]
     assert rail.voltage_volt.tolist() == [5.0, 6.0]
 
 
 def test_the_last_word_of_a_topic_tells_its_quantity_and_the_rest_its_rail():
-    assert quantity("/current_sensors/voltage") == "voltage"
-    assert quantity("/volt_meter/amps") == "current"
-    assert quantity("/power") is None
-    assert rail_of("/battery/voltage_corrected") == rail_of("/battery/current") == "/battery"
+    assert find_quantity("/current_sensors/voltage") == "voltage"
+    assert find_quantity("/volt_meter/amps") == "current"
+    assert find_quantity("/power") is None
+    assert make_rail_name("/battery/voltage_corrected") == make_rail_name("/battery/current") == "/battery"

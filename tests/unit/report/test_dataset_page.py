@@ -20,8 +20,8 @@ from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.report import report
 from tcpipe.pipeline.verify import verify
 from tcpipe.report import dataset_samples
-from tcpipe.report.dataset_report import dataset_report
-from tcpipe.report.dataset_samples import COLUMNS, nearest_train_m, samples_shown
+from tcpipe.report.dataset_report import render_dataset_report
+from tcpipe.report.dataset_samples import COLUMNS, find_nearest_train_m, select_samples
 from tcpipe.report.label_sections import QUALITY_WORDS
 from tcpipe.store import open_store
 from tcpipe.tables.bits import Quality
@@ -105,7 +105,7 @@ def patch_of(sheet, number, sheets):
 def test_pictures_of_all_patches_stand_beside_the_page_once_asked_for(built, tmp_path, monkeypatch):
     there = tmp_path / "dataset"
     shutil.copytree(built, there)
-    assert "img-src data: blob:;" in dataset_report(there)
+    assert "img-src data: blob:;" in render_dataset_report(there)
     assert report(there, patches=True)[0].changed
     html = (there / "report.html").read_text()
     data, sheets = data_of(html), data_of(html)["patches"]
@@ -134,19 +134,19 @@ def test_runs_lead_to_their_pages_in_the_store_beside(built, page):
     assert all(f'href="{href}"' in page for href in hrefs)
     assert "../store/report.html" not in page
     report(built.parent / "store", runs=False)
-    assert 'href="../store/report.html"' in dataset_report(built, built.parent)
+    assert 'href="../store/report.html"' in render_dataset_report(built, built.parent)
     (built.parent / "store/report.html").unlink()
 
 
 def test_the_same_dataset_has_the_same_page(built, page):
     assert not report(built)[0].changed
-    assert page.startswith(dataset_report(built, built.parent))
+    assert page.startswith(render_dataset_report(built, built.parent))
 
 
 def test_too_many_samples_become_means_that_keep_the_sums(built, monkeypatch):
     monkeypatch.setattr(dataset_samples, "MOST_SAMPLES", 30)
     card, table = open_dataset(built).card, pq.read_table(built / "samples.parquet", columns=list(COLUMNS))
-    shown = samples_shown(card, table)
+    shown = select_samples(card, table)
     told = shown.json["packed"]
     count = unpacked(told, "count").astype(float)
     assert len(count) <= 30
@@ -161,7 +161,7 @@ def test_too_many_samples_become_means_that_keep_the_sums(built, monkeypatch):
 @pytest.mark.parametrize("count", [0, 1])
 def test_few_samples_are_shown_as_well(built, count):
     card, table = open_dataset(built).card, pq.read_table(built / "samples.parquet", columns=list(COLUMNS))
-    shown = samples_shown(card, table.slice(0, count))
+    shown = select_samples(card, table.slice(0, count))
     assert shown.xy_m.shape == (count, 2)
     assert len(unpacked(shown.json["packed"], "energy")) == count
 
@@ -173,7 +173,7 @@ def test_a_damaged_dataset_says_so_on_its_page(built, tmp_path):
     for file in (tmp_path / "dataset/patches.zarr/ortho/c").rglob("*"):
         if file.is_file():
             file.write_bytes(b"\0" * file.stat().st_size)
-    html = dataset_report(tmp_path / "dataset")
+    html = render_dataset_report(tmp_path / "dataset")
     for words in ("overview.png is lost or damaged", "where to drive next cannot be shown", "no patch is shown"):
         assert words in html
     assert data_of(html)["patches"] is None
@@ -182,7 +182,7 @@ def test_a_damaged_dataset_says_so_on_its_page(built, tmp_path):
 def test_the_nearest_train_metre_is_the_nearest():
     chance = np.random.default_rng(1)
     xy_m, split = chance.uniform(0, 9, (60, 2)), chance.choice(["train", "test", "unseen", "buffer"], 60)
-    apart_m, nearest = nearest_train_m(xy_m, split)
+    apart_m, nearest = find_nearest_train_m(xy_m, split)
     train = np.flatnonzero(split == "train")
     for row in range(60):
         if split[row] in {"test", "unseen"}:

@@ -8,7 +8,7 @@ from html.parser import HTMLParser
 import numpy as np
 
 from tcpipe.report.page import Link, Number, Section, Shaded, render_page
-from tcpipe.report.plots import figures, histogram, new_plot, waterfall
+from tcpipe.report.plots import draw_histogram, draw_waterfall, make_plot, render_plots
 from tcpipe.report.verdict import show_verdict
 from tcpipe.tables.findings import Remedy, Subject, make_finding
 from tcpipe.tables.verdicts import judge
@@ -37,9 +37,9 @@ class Seen(HTMLParser):
 
 
 def drawn():
-    plot = new_plot("evil", alt=EVIL, axes=("x", EVIL), legend={EVIL: "#000000"})
+    plot = make_plot("evil", alt=EVIL, axes=("x", EVIL), legend={EVIL: "#000000"})
     plot.figure.scatter([1.0, 2.0], [3.0, 4.0])
-    return [plot, waterfall({"kept": 60.0, "standing": 40.0})]
+    return [plot, draw_waterfall({"kept": 60.0, "standing": 40.0})]
 
 
 evil = make_finding("no-segments", Subject("run", EVIL), names={"reason": EVIL}, driven_m=12.0, lost_m=10.0)
@@ -117,13 +117,13 @@ def test_a_recipe_that_fits_in_no_line_stands_below_its_finding():
 
 def test_what_waits_joins_what_is_drawn_first_and_names_the_axis_that_it_shares():
     def plot(name, **more):
-        made = new_plot(name, alt=name, axes=("x", "y"), **more)
+        made = make_plot(name, alt=name, axes=("x", "y"), **more)
         made.figure.line([0.0, 1.0], [0.0, 1.0])
         return made
 
     asked = plot("asked")
     every = [plot("beside", waits=True, beside=asked), asked, plot("alone", waits=True), plot("too")]
-    told, ids = figures(every)
+    told, ids = render_plots(every)
     first, later = told["first"]["roots"], told["later"]
     assert [[root["attributes"]["name"] for root in of] for of in (first, later)] == [
         ["asked", "too"],
@@ -133,12 +133,12 @@ def test_what_waits_joins_what_is_drawn_first_and_names_the_axis_that_it_shares(
     assert [placed[of.figure.name] for of in every] == ids
     assert len(set(ids)) == 4
     assert later[0]["attributes"]["x_range"] == {"id": first[0]["attributes"]["x_range"]["id"]}
-    assert figures([]) == (None, [])
+    assert render_plots([]) == (None, [])
 
 
 def test_the_same_page_is_the_same_bytes_whatever_was_drawn_before():
     first = page()
-    histogram("other", np.arange(9.0), label="x", of_what="y")
+    draw_histogram("other", np.arange(9.0), label="x", of_what="y")
     assert page() == first
 
 
@@ -154,7 +154,7 @@ def test_nothing_is_asked_of_the_network():
 
 
 def test_the_waterfall_ends_at_what_is_kept():
-    plot = waterfall({"kept": 60.0, "standing": 30.0, "gap": 10.0, "curved": 0.0})
+    plot = draw_waterfall({"kept": 60.0, "standing": 30.0, "gap": 10.0, "curved": 0.0})
     data = next(iter(plot.figure.renderers)).data_source.data
     assert data["name"] == ["driven", "standing", "gap", "kept"]
     assert list(zip(data["left"], data["right"], strict=True)) == [(0, 100), (70, 100), (60, 70), (0, 60)]

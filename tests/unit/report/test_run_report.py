@@ -10,7 +10,13 @@ from synthetic_store import add_run, driven, lanes, segments
 
 from tcpipe.report.run_plots import time_plots
 from tcpipe.report.run_report import run_report
-from tcpipe.report.run_series import gate_spans, rail_series, speed_series, thinned, timeline_of
+from tcpipe.report.run_series import (
+    downsample_columns,
+    find_mask_spans,
+    make_rail_series,
+    make_speed_series,
+    make_timeline,
+)
 from tcpipe.store import open_store
 from tcpipe.tables.bits import Quality
 from tcpipe.tables.facts import ClockStep, StageFacts
@@ -37,7 +43,7 @@ def test_thinning_keeps_every_peak_and_says_how_many_there_were():
     values = rng.normal(size=100_003)
     values[[17, 60_001]] = 40.0, -40.0
     values[500:900] = np.nan
-    shown = thinned("x", np.arange(len(values)) * 0.01, {"y": (6, values)}, most=2_000)
+    shown = downsample_columns("x", np.arange(len(values)) * 0.01, {"y": (6, values)}, most=2_000)
     kept = shown.columns["y"][1]
     assert len(kept) == len(shown.t_s) <= 2_000
     assert shown.of == len(values)
@@ -65,7 +71,7 @@ def test_a_span_ends_where_the_reason_or_the_track_does():
     without = pa.concat_tables(
         [track.slice(0, 40), track.slice(60)]
     )  # two seconds, a second is missing, three more standing
-    spans = gate_spans(without, timeline_of(without), 20.0)
+    spans = find_mask_spans(without, make_timeline(without), 20.0)
     assert spans.bits.tolist() == [2, 2, 0]
     assert spans.start_s == pytest.approx([-0.025, 2.975, 4.975])
     assert spans.end_s[:2] == pytest.approx([1.975, 4.975])
@@ -79,7 +85,7 @@ def test_rails_that_tell_current_and_voltage_in_turn_are_series_of_their_own():
         stamp_ns=stamps, log_time_ns=stamps, epoch=np.zeros(n, np.int16), rail=np.where(np.arange(n) < 6, "left", EVIL),
         voltage_volt=np.where(odd, 25.0, np.nan), current_amp=np.where(odd, np.nan, 4.0),
     )  # fmt: skip
-    found = {each.name: each for each in rail_series(table, timeline_of(driven(drive())))}
+    found = {each.name: each for each in make_rail_series(table, make_timeline(driven(drive())))}
     assert sorted(found) == sorted([f"{kind} {rail}" for kind in ("voltage", "current") for rail in ("left", EVIL)])
     assert found["current left"].t_s == pytest.approx([5.0, 5.2, 5.4])
     assert found["voltage left"].columns["voltage"][1] == pytest.approx([25.0] * 3)
@@ -96,7 +102,7 @@ def test_speed_of_a_sensor_that_tells_places_is_its_chord_over_a_second():
             "y_m": 3.0 * np.sin(t_s / 3),
         }
     )
-    shown = speed_series("pose", table, timeline_of(driven(drive())))
+    shown = make_speed_series("pose", table, make_timeline(driven(drive())))
     assert shown.columns["speed"][1] == pytest.approx(
         6.0 * np.sin(1 / 6), abs=1e-3
     )  # chord of a circle of 3 m at 1 m/s
@@ -150,10 +156,10 @@ def test_names_are_text(tmp_path):
 
 def test_a_step_of_the_clock_has_its_place_and_its_size():
     track, half = stepped(driven(drive()), 10**12)
-    axis = timeline_of(track)
+    axis = make_timeline(track)
     facts = StageFacts(clock_steps=(ClockStep(10**18, 1000.0, ("/gnss",)),))
     shown = time_plots(
-        axis, lines=[], spans=gate_spans(track, axis, 20.0), facts=facts, refused=REJECTIONS.empty(), labels=False
+        axis, lines=[], spans=find_mask_spans(track, axis, 20.0), facts=facts, refused=REJECTIONS.empty(), labels=False
     )
     (event,) = [drawn.data_source.data for drawn in shown.plots[0].figure.renderers if "text" in drawn.data_source.data]
     assert event["text"] == ("the clock steps by +1000.000 s",)
@@ -161,6 +167,6 @@ def test_a_step_of_the_clock_has_its_place_and_its_size():
 
 
 def test_what_is_short_is_carried_whole():
-    shown = thinned("x", np.arange(5.0), {"y": (2, np.array([1.0, np.nan, 3.0, 2.0, 5.0]))})
+    shown = downsample_columns("x", np.arange(5.0), {"y": (2, np.array([1.0, np.nan, 3.0, 2.0, 5.0]))})
     assert shown.columns["y"][1] == pytest.approx([1.0, np.nan, 3.0, 2.0, 5.0], nan_ok=True)
     assert shown.of == len(shown.t_s) == 5

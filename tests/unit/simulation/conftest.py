@@ -2,14 +2,14 @@
 
 import pytest
 
-from tcpipe.simulation import scenario, simulated_drive
+from tcpipe.simulation import find_scenario, simulate_readings
 
 
 @pytest.fixture(scope="session")
 def truth():
-    return simulated_drive(scenario("manoeuvres"))[0]
+    return simulate_readings(find_scenario("manoeuvres"))[0]
 
 
 @pytest.fixture(scope="session")
 def long_truth():
-    return simulated_drive(scenario("hills12"))[0]
+    return simulate_readings(find_scenario("hills12"))[0]

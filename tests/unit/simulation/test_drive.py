@@ -5,11 +5,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from tcpipe.errors import UsageError
-from tcpipe.simulation import true_cost
-from tcpipe.simulation.drive import drive
+from tcpipe.simulation import compute_true_cost
+from tcpipe.simulation.drive import simulate_drive
 from tcpipe.simulation.robot import GRAVITY_MPS2, GroundModel, SimulatedRobot
 from tcpipe.simulation.route import Leg, Pause, Turn
-from tcpipe.simulation.scenarios import small_world
+from tcpipe.simulation.scenarios import make_small_world
 from tcpipe.simulation.site import Site
 from tcpipe.simulation.world import GRASS, World
 
@@ -17,7 +17,7 @@ DT_S = 0.005
 
 
 def test_position_stands_on_the_surface_and_agrees_with_pyproj(truth):
-    world = small_world()
+    world = make_small_world()
     np.testing.assert_allclose(
         truth.alt_m, world.height_m(truth.x_map_m, truth.y_map_m) + world.site.geoid_m, atol=1e-9
     )
@@ -40,7 +40,7 @@ def test_distance_is_the_integral_of_the_horizontal_velocity(truth):
 
 
 def test_pose_lies_in_the_tangent_plane(truth):
-    world = small_world()
+    world = make_small_world()
     up = Rotation.from_quat(truth.quat_xyzw).apply([0.0, 0.0, 1.0])
     step = 0.2
     lon, lat = world.site.lonlat_deg(truth.x_map_m + step, truth.y_map_m)
@@ -105,7 +105,7 @@ def test_slope_slows_the_robot_and_costs_what_gravity_asks():
     flat, tilted = World(site, 600.0), World(site, 600.0, waves=small_tilt(rise))
     powers = {}
     for name, world in (("flat", flat), ("tilted", tilted)):
-        truth = drive(
+        truth = simulate_drive(
             world,
             [Pause(1.0), Leg(((70.0, 40.0),))],
             start_m=(40.0, 40.0),
@@ -139,7 +139,7 @@ def small_tilt(rise):
 
 def test_true_cost_against_a_plain_search(truth):
     start = truth.stamp_ns[::97] + 1_234_567
-    cost = true_cost(truth, start)
+    cost = compute_true_cost(truth, start)
     seconds = (truth.stamp_ns - truth.stamp_ns[0]) * 1e-9
     fine = np.arange(0.0, seconds[-1], 0.0005)
     east, north = (np.interp(fine, seconds, truth.enu_m[:, i]) for i in (0, 1))
@@ -160,12 +160,12 @@ def test_true_cost_against_a_plain_search(truth):
         assert cost.velocity_mps[i] == pytest.approx(1.0 / cost.duration_s[i])
         assert cost.arc_length_m[i] >= 1.0 - 1e-6
     assert checked > 35
-    assert np.isnan(true_cost(truth, np.array([truth.stamp_ns[0] - 1, truth.stamp_ns[-1]])).energy_joule).all()
+    assert np.isnan(compute_true_cost(truth, np.array([truth.stamp_ns[0] - 1, truth.stamp_ns[-1]])).energy_joule).all()
 
 
 def test_a_leg_too_short_to_stop_on_still_stops():
-    truth = drive(
-        small_world(),
+    truth = simulate_drive(
+        make_small_world(),
         [Leg(((14.4, 34.0),)), Pause(0.5)],
         start_m=(14.0, 34.0),
         robot=SimulatedRobot(),
@@ -177,12 +177,14 @@ def test_a_leg_too_short_to_stop_on_still_stops():
 
 def test_an_empty_plan_is_refused():
     with pytest.raises(UsageError, match="plan is empty"):
-        drive(small_world(), [], start_m=(14.0, 34.0), robot=SimulatedRobot(), rng=np.random.default_rng(0))
+        simulate_drive(
+            make_small_world(), [], start_m=(14.0, 34.0), robot=SimulatedRobot(), rng=np.random.default_rng(0)
+        )
 
 
 def test_turns_end_where_they_should():
-    truth = drive(
-        small_world(), [Pause(0.1), Turn(1.5), Turn(-0.05), Pause(0.1)], start_m=(14.0, 34.0), start_yaw_rad=0.3,
+    truth = simulate_drive(
+        make_small_world(), [Pause(0.1), Turn(1.5), Turn(-0.05), Pause(0.1)], start_m=(14.0, 34.0), start_yaw_rad=0.3,
         robot=SimulatedRobot(), rng=np.random.default_rng(0),
     )  # fmt: skip
     yaw = Rotation.from_quat(truth.quat_xyzw).as_euler("ZYX")[:, 0]

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tcpipe.simulation import Faults, scenario, true_cost
-from tcpipe.simulation.paper_site import paper_world
+from tcpipe.simulation import Faults, compute_true_cost, find_scenario
+from tcpipe.simulation.paper_site import make_paper_world
 from tcpipe.simulation.scenarios import SCENARIOS
 
 PAGE = (Path(__file__).parents[3] / "docs" / "reference" / "simulation.md").read_text(encoding="utf-8")
@@ -28,7 +28,7 @@ def test_the_references_example_runs():
 
 @pytest.mark.parametrize("name", sorted(SCENARIOS))
 def test_every_scenario_starts_on_free_ground_inside_its_site(name):
-    made = scenario(name)
+    made = find_scenario(name)
     for drive in made.drives:
         x, y = (
             np.array([offset + at])
@@ -40,7 +40,7 @@ def test_every_scenario_starts_on_free_ground_inside_its_site(name):
 
 
 def test_the_papers_site_is_as_high_and_large_as_the_papers():
-    world = paper_world()
+    world = make_paper_world()
     x = world.site.west_m + np.arange(0.5, 596.0)
     y = world.site.south_m + np.arange(0.5, 305.0)
     heights = world.height_m(x[None, :], y[:, None])
@@ -60,6 +60,6 @@ def test_hills12_is_twelve_hilly_minutes(long_truth):
 
 def test_a_metre_costs_what_the_paper_found(long_truth):
     steady = (long_truth.command_velocity_mps > 0.99) & (long_truth.forward_velocity_mps > 0.6)
-    cost = true_cost(long_truth, long_truth.stamp_ns[steady][::200])
+    cost = compute_true_cost(long_truth, long_truth.stamp_ns[steady][::200])
     assert np.nanmedian(cost.duration_s) == pytest.approx(1.2, abs=0.1)
     assert np.nanmean(cost.energy_joule) == pytest.approx(200, abs=30)

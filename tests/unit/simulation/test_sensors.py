@@ -12,11 +12,11 @@ from tcpipe.fusion.preparation import find_datum
 from tcpipe.geometry.datum import enu_from_geodetic
 from tcpipe.simulation.faults import Faults
 from tcpipe.simulation.robot import GRAVITY_MPS2
-from tcpipe.simulation.scenarios import HUSKY_ROS1, HUSKY_ROS2, small_world, tiny
+from tcpipe.simulation.scenarios import HUSKY_ROS1, HUSKY_ROS2, make_small_world, make_tiny
 from tcpipe.simulation.sensors import CLOCK_STEP_NS, Doppler, Noise, Power, Sensors, Visual, record
-from tcpipe.tables.columns import floats, integers
+from tcpipe.tables.columns import to_floats, to_integers
 
-SITE = small_world().site
+SITE = make_small_world().site
 
 
 def readings(truth, *names, sensors=None, seed=1):
@@ -235,23 +235,23 @@ def test_a_receivers_velocity_is_that_of_its_antenna_within_what_it_claims(conta
     """Through a log on disk: the mean of the fixes' way is the integral of the velocity, and its scatter is what is claimed."""
     quiet = Faults.only("gnss_noise", "gnss_lever_arm")
     recorder = HUSKY_ROS2 if container == "mcap" else HUSKY_ROS1
-    made = tiny(
+    made = make_tiny(
         quiet, container=container, recorder=recorder, sensors=replace(Sensors(), doppler=Doppler()), seconds=20.0
     )
     told = streams_of(log_of(made, made.drives[0], tmp_path))
     velocity, fixes = told.tables["gnss_velocity"], told.tables["gnss"]
     assert velocity["stamp_ns"].to_pylist() == fixes["stamp_ns"].to_pylist()  # one receiver
-    variance = floats(velocity, "east_var_m2ps2")
+    variance = to_floats(velocity, "east_var_m2ps2")
     assert variance == pytest.approx(np.full(variance.size, 0.03**2 + 0.04**2))
-    lonlatalt = [floats(fixes, name) for name in ("lon_deg", "lat_deg", "alt_m")]
+    lonlatalt = [to_floats(fixes, name) for name in ("lon_deg", "lat_deg", "alt_m")]
     place = enu_from_geodetic(*lonlatalt, datum_deg_m=find_datum(*lonlatalt))
-    at_s = (integers(fixes, "stamp_ns") - integers(fixes, "stamp_ns")[0]) * 1e-9
+    at_s = (to_integers(fixes, "stamp_ns") - to_integers(fixes, "stamp_ns")[0]) * 1e-9
     for axis, name in enumerate(("east", "north")):
-        way_m = cumulative_trapezoid(floats(velocity, f"{name}_velocity_mps"), at_s, initial=0.0)
+        way_m = cumulative_trapezoid(to_floats(velocity, f"{name}_velocity_mps"), at_s, initial=0.0)
         drift_m = way_m - (place[:, axis] - place[0, axis])
         assert np.abs(drift_m).max() < 4 * np.sqrt(variance[0] * 3.0 * at_s[-1])
         assert np.ptp(place[:, axis]) > 1.0
-    assert np.isfinite(floats(velocity, "up_velocity_mps")).all()
+    assert np.isfinite(to_floats(velocity, "up_velocity_mps")).all()
 
 
 def test_rates_are_as_given(truth):

@@ -14,15 +14,15 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from shapely.geometry import Point, shape
 
 from tcpipe.errors import UsageError
-from tcpipe.simulation import Faults, read_truth, scenario, simulate, simulated_drive, tiny
+from tcpipe.simulation import Faults, find_scenario, make_tiny, read_truth, simulate, simulate_readings
 from tcpipe.simulation.messages import Recorder
-from tcpipe.simulation.scenarios import HUSKY_ROS1, small_world
+from tcpipe.simulation.scenarios import HUSKY_ROS1, make_small_world
 from tcpipe.terrain.classes import PAPER_CLASSES
 
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory):
-    return simulate(tmp_path_factory.mktemp("site"), scenario=tiny(Faults.every(), seconds=20.0), seed=3)
+    return simulate(tmp_path_factory.mktemp("site"), scenario=make_tiny(Faults.every(), seconds=20.0), seed=3)
 
 
 def ros1_in_mcap(path: Path):
@@ -52,7 +52,7 @@ def stamps(rows):
 
 
 def test_rasters_equal_the_world_at_their_pixel_centres(site):
-    world = small_world()
+    world = make_small_world()
     for name in ("height", "ortho", "terrain"):
         with rasterio.open(site.rasters[name]) as raster:
             assert raster.crs.to_epsg() == 32633
@@ -97,13 +97,13 @@ def test_region_is_geojson_in_wgs84_and_covers_a_part(site):
     truth = read_truth(site.truths[0])
     assert polygon.contains(Point(truth.lon_deg[0], truth.lat_deg[0]))
     assert not polygon.contains(
-        Point(*(value[0] for value in small_world().site.lonlat_deg(np.array([697715.0]), np.array([5208440.0]))))
+        Point(*(value[0] for value in make_small_world().site.lonlat_deg(np.array([697715.0]), np.array([5208440.0]))))
     )
 
 
 def test_truth_file_gives_the_truth_back(site):
     kept = read_truth(site.truths[0])
-    truth, _ = simulated_drive(tiny(Faults.every(), seconds=20.0), seed=3)
+    truth, _ = simulate_readings(make_tiny(Faults.every(), seconds=20.0), seed=3)
     for name in ("stamp_ns", "lon_deg", "quat_xyzw", "energy_joule", "terrain_class", "velocity_enu_mps"):
         np.testing.assert_array_equal(getattr(kept, name), getattr(truth, name))
 
@@ -116,7 +116,7 @@ def test_world_file_tells_every_parameter(site):
 
 
 def test_mcap_holds_the_readings(site):
-    _, readings = simulated_drive(tiny(Faults.every(), seconds=20.0), seed=3)
+    _, readings = simulate_readings(make_tiny(Faults.every(), seconds=20.0), seed=3)
     found = messages(site.logs[0])
     imu = found["/a200_0000/sensors/imu_0/data"]
     order = np.argsort(readings["imu"].log_time_ns, kind="stable")
@@ -148,7 +148,7 @@ def test_mcap_is_indexed_and_its_checksums_hold(site):
 )
 def test_other_containers_hold_the_same_numbers(site, tmp_path, container, dialect):
     recorder = replace(HUSKY_ROS1, dialect=dialect)
-    drive = tiny(Faults.every(), container=container, recorder=recorder, seconds=20.0)
+    drive = make_tiny(Faults.every(), container=container, recorder=recorder, seconds=20.0)
     other = simulate(tmp_path, scenario=drive, seed=3)
     found = (ros1_in_mcap if (container, dialect) == ("mcap", "ros1") else messages)(other.logs[0])
     plain = messages(site.logs[0])
@@ -159,15 +159,15 @@ def test_other_containers_hold_the_same_numbers(site, tmp_path, container, diale
     status = found["/status" if dialect == "ros1" else "/a200_0000/platform/mcu/status/power"]
     assert status[0][1].__msgtype__ == "husky_msgs/msg/HuskyStatus"
     assert 24.0 < status[5][1].battery_voltage < 28.0
-    said = simulated_drive(drive, seed=3)[1]["power"].values["left_amp"]
+    said = simulate_readings(drive, seed=3)[1]["power"].values["left_amp"]
     np.testing.assert_allclose([m.left_driver_current for _, m in status], said, rtol=1e-6)
 
 
 def test_gga_sentences_tell_the_fixes(tmp_path):
     recorder = Recorder("ros1", "battery_state", gnss="nmea")
-    drive = tiny(container="bag", recorder=recorder, seconds=18.0)
+    drive = make_tiny(container="bag", recorder=recorder, seconds=18.0)
     found = messages(simulate(tmp_path, scenario=drive, seed=3).logs[0])
-    _, readings = simulated_drive(drive, seed=3)
+    _, readings = simulate_readings(drive, seed=3)
     fixes = readings["gnss"].values
     for i, (_, message) in enumerate(found["/nmea_sentence"]):
         body, checksum = message.sentence[1:].split("*")
@@ -190,7 +190,7 @@ def test_the_same_seed_gives_the_same_bytes(tmp_path):
         }
 
     def bag(container):
-        return tiny(
+        return make_tiny(
             Faults.every(),
             container=container,
             recorder=HUSKY_ROS1 if container == "bag" else Recorder("ros2", "battery_states"),
@@ -207,13 +207,13 @@ def test_the_same_seed_gives_the_same_bytes(tmp_path):
 
 def test_a_second_call_does_nothing_and_what_is_something_else_stays(tmp_path):
     out = tmp_path / "site"
-    assert not simulate(out, scenario=tiny(seconds=17.0)).unchanged
+    assert not simulate(out, scenario=make_tiny(seconds=17.0)).unchanged
     before = {path: path.stat().st_mtime_ns for path in out.rglob("*")}
-    assert simulate(out, scenario=tiny(seconds=17.0)).unchanged
+    assert simulate(out, scenario=make_tiny(seconds=17.0)).unchanged
     with pytest.raises(UsageError, match="is not this simulated site"):
-        simulate(out, scenario=tiny(seconds=17.0), seed=2)
+        simulate(out, scenario=make_tiny(seconds=17.0), seed=2)
     with pytest.raises(UsageError, match="is not this simulated site"):
-        simulate(tmp_path, scenario=tiny(seconds=17.0))
+        simulate(tmp_path, scenario=make_tiny(seconds=17.0))
     assert {path: path.stat().st_mtime_ns for path in out.rglob("*")} == before
     assert list(tmp_path.iterdir()) == [out]
 
@@ -221,7 +221,7 @@ def test_a_second_call_does_nothing_and_what_is_something_else_stays(tmp_path):
 def test_demo_drives_every_traversable_class_and_slope():
     classes, slopes = set(), []
     for index in range(2):
-        truth, _ = simulated_drive(scenario("demo"), index)
+        truth, _ = simulate_readings(find_scenario("demo"), index)
         fast = truth.forward_velocity_mps > 0.5
         classes |= set(np.unique(truth.terrain_class[fast]).tolist())
         slopes += [np.degrees(truth.slope_rad[fast]).min(), np.degrees(truth.slope_rad[fast]).max()]
@@ -231,9 +231,9 @@ def test_demo_drives_every_traversable_class_and_slope():
 
 
 def test_what_the_demo_shows_beside_the_small_world_changes_no_drive():
-    demo = scenario("demo")
+    demo = find_scenario("demo")
     for spec in demo.drives:
-        shown, plain = (spec.plan.plan(world, np.random.default_rng(1)) for world in (demo.world, small_world()))
+        shown, plain = (spec.plan.plan(world, np.random.default_rng(1)) for world in (demo.world, make_small_world()))
         assert shown == plain
 
 

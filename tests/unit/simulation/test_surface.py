@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from tcpipe.simulation.paper_site import hidden_as, paper_site, paper_surface
-from tcpipe.simulation.ripples import state
+from tcpipe.simulation.paper_site import make_paper_site, make_paper_surface, scale_hidden_variance
+from tcpipe.simulation.random_fields import state
 from tcpipe.simulation.world import GRASS, MUD, PAVED, UNPAVED
 
 RNG = np.random.default_rng(3)
@@ -16,7 +16,7 @@ def on(class_id):
 
 
 def test_wet_ground_is_darker_and_resists_where_its_class_says_so():
-    surface = paper_surface()
+    surface = make_paper_surface()
     wet = state(surface.wetness, U, V)
     assert np.corrcoef(wet, surface.shade(on(MUD), U, V))[0, 1] < -0.8
     assert np.corrcoef(wet, surface.resistance(on(MUD), U, V))[0, 1] > 0.99
@@ -25,13 +25,13 @@ def test_wet_ground_is_darker_and_resists_where_its_class_says_so():
 
 def test_resistance_keeps_within_its_sources_range():
     """Carvill's gravel, 0.01 to 0.04, and wetness: never beyond their sum."""
-    found = paper_surface().resistance(on(UNPAVED), U, V)
+    found = make_paper_surface().resistance(on(UNPAVED), U, V)
     assert np.abs(found).max() <= 0.7
     assert found.std() == pytest.approx(np.hypot(0.6, 0.1) / np.sqrt(3.0), rel=0.1)
 
 
 def test_relief_is_as_rough_as_its_class():
-    surface = paper_surface()
+    surface = make_paper_surface()
     swings = np.sqrt(1.0 + surface.swing**2 / 3.0)
     wanted = np.hypot(surface.looks[GRASS].bump_m, surface.looks[GRASS].ridge_m) * swings
     assert surface.relief_m(on(GRASS), U, V).std() == pytest.approx(wanted, rel=0.1)
@@ -39,7 +39,7 @@ def test_relief_is_as_rough_as_its_class():
 
 
 def test_the_pose_does_not_feel_what_the_raster_shows():
-    world = paper_site().world
+    world = make_paper_site().world
     x, y = world.site.west_m + U, world.site.south_m + V
     more = world.mapped_height_m(x, y) - world.height_m(x, y)
     assert 0.004 < more.std() < 0.03
@@ -47,6 +47,8 @@ def test_the_pose_does_not_feel_what_the_raster_shows():
 
 @pytest.mark.parametrize("factor", [0.5, 1.0, 2.0])
 def test_what_is_hidden_is_asked_for_by_its_variance(factor):
-    world = paper_site().world
-    squares = [sum(wave.amplitude**2 for wave in made.resistance) for made in (hidden_as(world, factor), world)]
+    world = make_paper_site().world
+    squares = [
+        sum(wave.amplitude**2 for wave in made.resistance) for made in (scale_hidden_variance(world, factor), world)
+    ]
     assert squares[0] == pytest.approx(factor * squares[1])

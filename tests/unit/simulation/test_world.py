@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from pyproj import Proj
 
-from tcpipe.simulation.scenarios import small_world
+from tcpipe.simulation.scenarios import make_small_world
 from tcpipe.simulation.site import Site
 from tcpipe.simulation.world import GRASS, MUD, PAVED, Band, Ellipse, Hill, World
 
@@ -22,7 +22,7 @@ def places(count=400, seed=0):
 
 
 def test_gradient_is_the_slope_of_the_height():
-    world = small_world()
+    world = make_small_world()
     x, y = places()
     step = 1e-4
     gx, gy = world.gradient(x, y)
@@ -37,7 +37,7 @@ def test_one_hill_by_hand():
 
 
 def test_rows_and_columns_give_the_same_as_points():
-    world = small_world()
+    world = make_small_world()
     x, y = SITE.west_m + np.arange(0.5, 120.0, 7.0), SITE.south_m + np.arange(0.5, 80.0, 7.0)
     flat_x, flat_y = (values.ravel() for values in np.meshgrid(x, y))
     for function in (world.height_m, world.terrain_class, world.mapped, world.resistance_factor):
@@ -61,11 +61,11 @@ def test_classes_by_hand_and_later_regions_win():
 def test_the_sun_shades_by_the_angle_that_it_falls_in():
     """Against the normal by differences of the height; level ground keeps its colour."""
     sun = np.array([0.48, -0.36, 0.8])
-    lit, (x, y) = replace(small_world(), sun=tuple(sun.tolist())), places(200, seed=4)
+    lit, (x, y) = replace(make_small_world(), sun=tuple(sun.tolist())), places(200, seed=4)
     east = (lit.height_m(x + 0.01, y) - lit.height_m(x - 0.01, y)) / 0.02
     north = (lit.height_m(x, y + 0.01) - lit.height_m(x, y - 0.01)) / 0.02
     normal = np.column_stack([-east, -north, np.ones(200)]) / np.sqrt(1 + east**2 + north**2)[:, None]
-    ratio = lit.ortho(x, y) / small_world().ortho(x, y)
+    ratio = lit.ortho(x, y) / make_small_world().ortho(x, y)
     np.testing.assert_allclose(ratio, np.repeat((normal @ sun / sun[2])[:, None], 3, axis=1), atol=1e-6)
     assert ratio.min() < 0.9
     assert ratio.max() > 1.1

@@ -6,7 +6,7 @@ import shapely
 from splits_squares import squares
 
 from tcpipe.splits.assignment import NO_FOLD, Assignment, assign_splits
-from tcpipe.splits.holdouts import draw_groups, runs_as_groups
+from tcpipe.splits.holdouts import draw_groups, group_by_run
 from tcpipe.splits.regions import Regions
 
 ROW = squares([(10.0 * i + 5.0, 5.0) for i in range(10)])
@@ -85,7 +85,7 @@ def test_a_sample_of_a_group_that_tests_keeps_what_it_was():
 
 def test_runs_are_drawn_by_their_names():
     run = np.arange(10)
-    groups, others = (runs_as_groups(run, [f"{before}{number}" for number in run]) for before in ("r", ""))
+    groups, others = (group_by_run(run, [f"{before}{number}" for number in run]) for before in ("r", ""))
     test, otherwise = (draw_groups(each, run, test_fraction=0.2, seed=0)[each.member] for each in (groups, others))
     assert (assigned(run=run, holdout="run").split == "test").tolist() == test.tolist()
     assert otherwise.tolist() != test.tolist()

@@ -3,7 +3,7 @@ import pytest
 from splits_squares import squares
 
 from tcpipe.splits.audit import audit_leakage
-from tcpipe.splits.neighbours import nearest_m
+from tcpipe.splits.neighbours import compute_nearest_m
 
 
 def audit(split, centres, run=None, start=None, **keywords):
@@ -45,5 +45,5 @@ def test_the_nearest_square_is_found_though_many_centres_are_nearer(count):
     centres[-1] = 3.1, 0.0
     course = np.append(np.zeros(count - 1), np.pi / 4)
     ours = squares([(0.0, 0.0)])
-    assert nearest_m(ours, squares(centres, course)) == pytest.approx([3.1 - np.sqrt(0.5) - 0.5])
-    assert nearest_m(ours, squares(centres[:-1])) == pytest.approx([2.0])
+    assert compute_nearest_m(ours, squares(centres, course)) == pytest.approx([3.1 - np.sqrt(0.5) - 0.5])
+    assert compute_nearest_m(ours, squares(centres[:-1])) == pytest.approx([2.0])

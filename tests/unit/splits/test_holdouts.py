@@ -3,7 +3,7 @@ import hashlib
 import numpy as np
 import pytest
 
-from tcpipe.splits.holdouts import UNDECIDED, Groups, blocks, draw_folds, draw_groups, draw_samples, runs_as_groups
+from tcpipe.splits.holdouts import UNDECIDED, Groups, assign_blocks, draw_folds, draw_groups, draw_samples, group_by_run
 from tcpipe.splits.ranking import hash_ranks, order_ranks
 
 IDS = [f"run-{i:05d}" for i in range(1000)]
@@ -63,7 +63,7 @@ def drawn(groups, arrival=None, **keywords):
 
 def test_blocks_that_are_far_apart_are_told_apart():
     cells = [(0, 1), (1, 0), (32, 0), (-32, 2), (2**20, -(2**20)), (-(2**20), 2**20)]
-    found = blocks(10.0 * np.array(cells) + 5.0, block_m=10.0)
+    found = assign_blocks(10.0 * np.array(cells) + 5.0, block_m=10.0)
     assert [found.names[member] for member in found.member] == [f"10:{column}:{row}" for column, row in cells]
 
 
@@ -96,9 +96,9 @@ def test_the_majority_decides_for_a_group_an_even_vote_trains_and_without_a_vote
 
 
 def test_a_cell_begins_at_its_border_and_holds_one_group_in_every_direction():
-    found = blocks(np.array([[10.0, 0.0], [9.999, 0.0], [-10.0, -0.001], [-0.001, -10.0]]), block_m=10.0)
+    found = assign_blocks(np.array([[10.0, 0.0], [9.999, 0.0], [-10.0, -0.001], [-0.001, -10.0]]), block_m=10.0)
     assert [found.names[member] for member in found.member] == ["10:1:0", "10:0:0", "10:-1:-1", "10:-1:-1"]
-    assert blocks(np.zeros((0, 2)), block_m=10.0).names == ()
+    assert assign_blocks(np.zeros((0, 2)), block_m=10.0).names == ()
 
 
 def test_more_kept_than_wanted_draws_no_more():
@@ -150,5 +150,5 @@ def test_folds_are_dealt_from_the_largest_on():
 
 
 def test_runs_are_groups_by_their_names():
-    found = runs_as_groups(np.array([3, 1, 3]), ["a", "b", "c", "d"])
+    found = group_by_run(np.array([3, 1, 3]), ["a", "b", "c", "d"])
     assert [found.names[member] for member in found.member] == ["d", "b", "d"]

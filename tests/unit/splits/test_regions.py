@@ -3,13 +3,13 @@ import pytest
 import shapely
 from splits_squares import squares
 
-from tcpipe.splits.regions import Regions, Side, project_regions, sides_of
+from tcpipe.splits.regions import Regions, Side, classify_footprints, project_regions
 
 FIELD = Regions(shapely.box(0, 0, 20, 10))
 
 
 def side(x, y, *, buffer_m):
-    return Side(int(sides_of(squares([(x, y)]), FIELD, buffer_m=buffer_m)[0]))
+    return Side(int(classify_footprints(squares([(x, y)]), FIELD, buffer_m=buffer_m)[0]))
 
 
 @pytest.mark.parametrize(("gap_m", "inside"), [(1.4141, False), (1.4143, True)])
@@ -59,7 +59,7 @@ def test_a_border_in_pieces_is_as_near_as_the_whole():
         through = shapely.intersects(borders, footprints) & ~shapely.touches(borders, footprints)
         for buffer_m in (0.0, 1.0, 2.5):
             wanted = through | (shapely.distance(borders, footprints) < buffer_m)
-            found = sides_of(corners, region, buffer_m=buffer_m)
+            found = classify_footprints(corners, region, buffer_m=buffer_m)
             excluded = shapely.covers(region.exclude, footprints)
             np.testing.assert_array_equal(found[~excluded] == Side.BUFFER, wanted[~excluded])
 
@@ -71,7 +71,7 @@ def test_a_region_of_very_many_vertices_is_one_of_few_edges_near_each_footprint(
     at = turns[::100]
     radius_m = np.where(np.arange(at.size) % 2 == 0, 990.0, 1010.0)
     middle = radius_m[:, None] * np.stack([np.cos(at), np.sin(at)], axis=1)
-    found = sides_of(middle[:, None] + np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]), circle, buffer_m=5.0)
+    found = classify_footprints(middle[:, None] + np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]), circle, buffer_m=5.0)
     np.testing.assert_array_equal(found, np.where(radius_m < 1000.0, Side.INSIDE, Side.UNSEEN))
-    found = sides_of(middle[:, None] + np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]), circle, buffer_m=20.0)
+    found = classify_footprints(middle[:, None] + np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]), circle, buffer_m=20.0)
     assert (found == Side.BUFFER).all()

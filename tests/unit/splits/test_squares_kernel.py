@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from splits_squares import squares
 
-from tcpipe.splits.neighbours import near_pairs, nearest_m, shared_fraction
+from tcpipe.splits.neighbours import compute_nearest_m, compute_shared_fraction, iterate_near_pairs
 from tcpipe.splits.squares_kernel import pair_distances, pair_overlaps
 
 
@@ -35,21 +35,21 @@ def test_squares_along_the_axes(centre, distance, area):
 
 def test_each_footprint_is_held_against_its_nearest_however_many_there_are():
     ours, theirs = squares([(0, 0), (50, 0)]), squares([(3 + i, 0) for i in range(40)])
-    assert nearest_m(ours, theirs) == pytest.approx([2.0, 7.0])
-    assert nearest_m(ours, theirs[:0]).size == 0
-    assert nearest_m(ours[:0], theirs).size == 0
+    assert compute_nearest_m(ours, theirs) == pytest.approx([2.0, 7.0])
+    assert compute_nearest_m(ours, theirs[:0]).size == 0
+    assert compute_nearest_m(ours[:0], theirs).size == 0
 
 
 def test_pairs_are_all_within_reach_and_in_order():
     ours, theirs = np.array([[0.0, 0.0], [9.0, 0.0], [3.0, 0.0]]), np.array([[1.0, 0.0], [0.0, 2.0], [50.0, 0.0]])
-    ((i, j),) = near_pairs(ours, theirs, within_m=2.0)
+    ((i, j),) = iterate_near_pairs(ours, theirs, within_m=2.0)
     assert list(zip(i.tolist(), j.tolist(), strict=True)) == [(0, 0), (0, 1), (2, 0)]
-    assert list(near_pairs(ours[:0], theirs, within_m=2.0)) == []
-    assert list(near_pairs(ours, theirs[:0], within_m=2.0)) == []
+    assert list(iterate_near_pairs(ours[:0], theirs, within_m=2.0)) == []
+    assert list(iterate_near_pairs(ours, theirs[:0], within_m=2.0)) == []
 
 
 def test_a_share_is_of_our_own_ground():
     ours, theirs = squares([(0, 0)], side_m=2.0), squares([(0, 0)])
     index = np.zeros(1, np.int64)
-    assert shared_fraction(ours, theirs, index, index) == pytest.approx([0.25])
-    assert shared_fraction(theirs, ours, index, index) == pytest.approx([1.0])
+    assert compute_shared_fraction(ours, theirs, index, index) == pytest.approx([0.25])
+    assert compute_shared_fraction(theirs, ours, index, index) == pytest.approx([1.0])

@@ -1,6 +1,6 @@
 """A lag of the fixes that only the path tells."""
 
-from tcpipe.stages.clock_doctor import with_lag_of_fixes
+from tcpipe.stages.clock_findings import add_gnss_time_offset
 from tcpipe.tables.facts import ClockFacts, ClockOffset
 from tcpipe.tables.findings import StageReport, Subject, make_finding
 
@@ -10,8 +10,8 @@ def test_a_lag_that_only_the_path_tells_is_said_and_costs_what_is_driven_in_it()
         "time-offset", Subject("role", "power"), offset_s=0.1, offset_2std_s=0.02, names={"reference": "imu"}
     )
     silent = StageReport((before,), ClockFacts(0, "imu", (), {}))
-    assert with_lag_of_fixes(silent, None) is silent
-    found = with_lag_of_fixes(silent, (0.12, 0.02))
+    assert add_gnss_time_offset(silent, None) is silent
+    found = add_gnss_time_offset(silent, (0.12, 0.02))
     assert found.facts.position_offset_s == 0.12
     assert found.facts.offsets["gnss"].noted
     assert not found.facts.offsets["gnss"].blamed
@@ -20,4 +20,4 @@ def test_a_lag_that_only_the_path_tells_is_said_and_costs_what_is_driven_in_it()
     assert found.findings[1].numbers == {"offset_s": 0.12, "offset_2std_s": 0.04, "apart_s": 0.12}
     told = ClockOffset(0.1, 0.01, True, None, None, False)
     by_signals = StageReport((), ClockFacts(0, "imu", (), {"gnss": told}))
-    assert with_lag_of_fixes(by_signals, (0.12, 0.02)) is by_signals
+    assert add_gnss_time_offset(by_signals, (0.12, 0.02)) is by_signals

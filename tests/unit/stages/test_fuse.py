@@ -13,7 +13,7 @@ from tcpipe.errors import FusionError
 from tcpipe.geometry.datum import enu_from_geodetic, geodetic_from_enu
 from tcpipe.recipe import FuseConfig
 from tcpipe.stages.fuse import fuse_run
-from tcpipe.tables.columns import floats, integers
+from tcpipe.tables.columns import to_floats, to_integers
 from tcpipe.tables.findings import Subject, make_finding
 from tcpipe.tables.levels import COMMAND, GNSS, IMU, POSE, POWER, VISUAL_ODOMETRY, WHEEL_ODOMETRY, Sensor, Streams
 
@@ -92,7 +92,7 @@ def track(streams):
 
 
 def truth_at(truth, table):
-    t = (integers(table, "stamp_ns") - drive.ZERO_NS) * 1e-9
+    t = (to_integers(table, "stamp_ns") - drive.ZERO_NS) * 1e-9
     return t, truth.at(truth.position, t), truth.slerp(t)
 
 
@@ -100,20 +100,20 @@ def test_the_track_is_the_drive(track, truth):
     table = track.table
     t, position, rotation = truth_at(truth, table)
     lon, lat, alt = geodetic_from_enu(position, datum_deg_m=SITE)
-    assert np.abs(np.radians(floats(table, "lat_deg") - lat) * 6.37e6).max() < 0.05
-    assert np.abs(np.radians(floats(table, "lon_deg") - lon) * 6.37e6 * np.cos(np.radians(47))).max() < 0.05
-    assert np.abs(floats(table, "alt_m") - alt).max() < 0.05
+    assert np.abs(np.radians(to_floats(table, "lat_deg") - lat) * 6.37e6).max() < 0.05
+    assert np.abs(np.radians(to_floats(table, "lon_deg") - lon) * 6.37e6 * np.cos(np.radians(47))).max() < 0.05
+    assert np.abs(to_floats(table, "alt_m") - alt).max() < 0.05
     roll_pitch_yaw = rotation.as_euler("xyz")
     for k, name in enumerate(("roll_rad", "pitch_rad", "yaw_rad")):
-        difference = np.angle(np.exp(1j * (floats(table, name) - roll_pitch_yaw[:, k])))
+        difference = np.angle(np.exp(1j * (to_floats(table, name) - roll_pitch_yaw[:, k])))
         assert np.sqrt(np.mean(difference**2)) < 0.005
-    assert np.abs(floats(table, "forward_velocity_mps") - np.interp(t, truth.t, truth.forward)).max() < 0.03
-    speed = np.stack([floats(table, f"{name}_velocity_mps") for name in ("east", "north", "up")], -1)
+    assert np.abs(to_floats(table, "forward_velocity_mps") - np.interp(t, truth.t, truth.forward)).max() < 0.03
+    speed = np.stack([to_floats(table, f"{name}_velocity_mps") for name in ("east", "north", "up")], -1)
     assert np.abs(speed - truth.at(truth.velocity, t)).max() < 0.04
 
 
 def test_stamps_are_multiples_of_the_period(track):
-    stamp = integers(track.table, "stamp_ns")
+    stamp = to_integers(track.table, "stamp_ns")
     assert (stamp % 50_000_000 == 0).all()
     assert (np.diff(stamp) == 50_000_000).all()
     assert stamp.size >= SECONDS * 20 - 3
@@ -125,22 +125,22 @@ def test_enu_and_geodetic_columns_agree_by_proj(track):
         "+proj=pipeline +step +proj=unitconvert +xy_in=deg +xy_out=rad +step +proj=cart +ellps=WGS84 "
         f"+step +proj=topocentric +ellps=WGS84 +lon_0={datum.lon_deg} +lat_0={datum.lat_deg} +h_0={datum.alt_m}"
     )
-    enu = pipeline.transform(*(floats(track.table, name) for name in ("lon_deg", "lat_deg", "alt_m")))
+    enu = pipeline.transform(*(to_floats(track.table, name) for name in ("lon_deg", "lat_deg", "alt_m")))
     for axis, values in zip("xyz", enu, strict=True):
-        assert floats(track.table, f"{axis}_m") == pytest.approx(values, abs=1e-7)
+        assert to_floats(track.table, f"{axis}_m") == pytest.approx(values, abs=1e-7)
 
 
 def test_power_command_and_wheels_stand_at_the_tracks_stamps(track, truth):
     t, _, _ = truth_at(truth, track.table)
     inside = t <= SECONDS - 0.05
     volt, amp = 24.0 + 0.01 * t, 5.0 + 0.1 * t
-    assert floats(track.table, "voltage_volt")[inside] == pytest.approx(volt[inside], abs=1e-9)
-    assert floats(track.table, "power_watt")[inside] == pytest.approx((volt * amp)[inside], abs=1e-6)
-    command = floats(track.table, "commanded_velocity_mps")
+    assert to_floats(track.table, "voltage_volt")[inside] == pytest.approx(volt[inside], abs=1e-9)
+    assert to_floats(track.table, "power_watt")[inside] == pytest.approx((volt * amp)[inside], abs=1e-6)
+    command = to_floats(track.table, "commanded_velocity_mps")
     assert np.isnan(command[t < 5.0]).all()
     assert (command[(t >= 5.0) & (t < 10.0)] == 1.0).all()
-    assert (floats(track.table, "commanded_yaw_rate_radps")[t >= 10.0] == 0.2).all()
-    wheel = floats(track.table, "wheel_velocity_mps") - np.interp(t, truth.t, truth.forward)
+    assert (to_floats(track.table, "commanded_yaw_rate_radps")[t >= 10.0] == 0.2).all()
+    wheel = to_floats(track.table, "wheel_velocity_mps") - np.interp(t, truth.t, truth.forward)
     assert np.median(np.abs(wheel)) < 0.06
 
 
@@ -162,7 +162,7 @@ def test_without_gnss_the_frame_is_local(streams):
     track = fuse_run(without(streams, "gnss"), FuseConfig(), run_id="r")
     assert track.info.datum is None
     assert track.table["lon_deg"].null_count == track.table.num_rows
-    assert abs(floats(track.table, "x_m")[0]) < 0.01
+    assert abs(to_floats(track.table, "x_m")[0]) < 0.01
 
 
 def test_without_power_and_commands_their_columns_are_null(streams):
@@ -182,7 +182,7 @@ def test_nothing_but_an_imu_is_no_motion(streams):
 
 def test_fixes_at_null_island_are_listed_as_invalid(streams):
     table = streams.tables["gnss"]
-    lon, lat = floats(table, "lon_deg").copy(), floats(table, "lat_deg").copy()
+    lon, lat = to_floats(table, "lon_deg").copy(), to_floats(table, "lat_deg").copy()
     lon[:3] = lat[:3] = 0.0
     broken = table.set_column(table.column_names.index("lon_deg"), GNSS.arrow().field("lon_deg"), pa.array(lon))
     broken = broken.set_column(table.column_names.index("lat_deg"), GNSS.arrow().field("lat_deg"), pa.array(lat))
@@ -198,18 +198,18 @@ def test_a_clock_step_makes_two_epochs_fused_apart(streams, truth):
     half = drive.ns(SECONDS / 2)
     tables = {}
     for role, table in streams.tables.items():
-        stamp = integers(table, "stamp_ns")
+        stamp = to_integers(table, "stamp_ns")
         epoch = (stamp >= half).astype(np.int16)
         shifted = stamp - epoch.astype(np.int64) * 30_000_000_000
         names, schema = table.column_names, table.schema
         moved = table.set_column(names.index("stamp_ns"), schema.field("stamp_ns"), pa.array(shifted))
         tables[role] = moved.set_column(names.index("epoch"), schema.field("epoch"), pa.array(epoch))
     table = fuse_run(replace(streams, tables=tables), FuseConfig(), run_id="r").table
-    epoch, stamp = integers(table, "epoch"), integers(table, "stamp_ns")
+    epoch, stamp = to_integers(table, "epoch"), to_integers(table, "stamp_ns")
     assert (np.diff(epoch) >= 0).all()
     assert set(epoch.tolist()) == {0, 1}
     t = (stamp + epoch * 30_000_000_000 - drive.ZERO_NS) * 1e-9
-    assert np.abs(floats(table, "forward_velocity_mps") - np.interp(t, truth.t, truth.forward)).max() < 0.05
+    assert np.abs(to_floats(table, "forward_velocity_mps") - np.interp(t, truth.t, truth.forward)).max() < 0.05
     for k in (0, 1):
         assert (np.diff(stamp[epoch == k]) == 50_000_000).all()
 
@@ -217,10 +217,10 @@ def test_a_clock_step_makes_two_epochs_fused_apart(streams, truth):
 def test_a_gap_of_all_motion_is_a_step_in_the_stamps(streams):
     tables = {}
     for role, table in streams.tables.items():
-        t = (integers(table, "stamp_ns") - drive.ZERO_NS) * 1e-9
+        t = (to_integers(table, "stamp_ns") - drive.ZERO_NS) * 1e-9
         tables[role] = table.filter(pa.array((t < 20.0) | (t > 23.0))) if role != "imu" else table
     table = fuse_run(replace(streams, tables=tables), FuseConfig(), run_id="r").table
-    step = np.diff(integers(table, "stamp_ns"))
+    step = np.diff(to_integers(table, "stamp_ns"))
     assert np.sum(step > 50_000_000) == 1
     assert step.max() == pytest.approx(3.05e9, abs=0.11e9)
 
@@ -228,11 +228,11 @@ def test_a_gap_of_all_motion_is_a_step_in_the_stamps(streams):
 def test_the_paper_estimator_and_another_rate_by_the_recipe(streams, truth):
     track = fuse_run(streams, FuseConfig(estimator="ukf", rate_hz=10.0), run_id="r")
     assert track.info.estimator == "ukf"
-    assert (np.diff(integers(track.table, "stamp_ns")) == 100_000_000).all()
+    assert (np.diff(to_integers(track.table, "stamp_ns")) == 100_000_000).all()
     t, position, _ = truth_at(truth, track.table)
     _, lat, _ = geodetic_from_enu(position, datum_deg_m=SITE)
     settled = t > 10.0
-    assert np.abs(np.radians(floats(track.table, "lat_deg") - lat)[settled] * 6.37e6).max() < 0.15
+    assert np.abs(np.radians(to_floats(track.table, "lat_deg") - lat)[settled] * 6.37e6).max() < 0.15
 
 
 def test_the_same_streams_give_the_same_track(streams, track):
@@ -254,7 +254,7 @@ def with_pose(streams, columns):
 def test_a_pose_in_a_frame_of_its_own_gives_the_same_drive_and_no_place(streams, track):
     fixes = streams.tables["gnss"]
     datum = track.info.datum
-    place = [floats(fixes, name) for name in ("lon_deg", "lat_deg", "alt_m")]
+    place = [to_floats(fixes, name) for name in ("lon_deg", "lat_deg", "alt_m")]
     enu = enu_from_geodetic(*place, datum_deg_m=(datum.lon_deg, datum.lat_deg, datum.alt_m)) + np.array(
         [50.0, -20.0, 3.0]
     )
@@ -266,8 +266,8 @@ def test_a_pose_in_a_frame_of_its_own_gives_the_same_drive_and_no_place(streams,
     assert local.info.datum is None
     assert local.table["lon_deg"].null_count == local.table.num_rows == track.table.num_rows
     for name in ("forward_velocity_mps", "yaw_rad", "x_std_m"):
-        np.testing.assert_allclose(floats(local.table, name), floats(track.table, name), atol=1e-3)
-    moved = [np.diff(floats(table, "x_m")) for table in (local.table, track.table)]
+        np.testing.assert_allclose(to_floats(local.table, name), to_floats(track.table, name), atol=1e-3)
+    moved = [np.diff(to_floats(table, "x_m")) for table in (local.table, track.table)]
     np.testing.assert_allclose(*moved, atol=1e-3)
 
 
@@ -276,4 +276,4 @@ def test_a_pose_in_a_crs_is_fused_as_the_fixes_are(streams, track):
     columns = dict(zip(("x_m", "y_m", "z_m"), place.values(), strict=True)) | place
     placed = fuse_run(with_pose(streams, columns), FuseConfig(), run_id="r")
     assert placed.info.datum == track.info.datum
-    np.testing.assert_array_equal(floats(placed.table, "lon_deg"), floats(track.table, "lon_deg"))
+    np.testing.assert_array_equal(to_floats(placed.table, "lon_deg"), to_floats(track.table, "lon_deg"))

@@ -6,7 +6,7 @@ from suggested_recipes import proposed
 
 from tcpipe.fusion.checks.audit import Tally
 from tcpipe.fusion.measurements import BodyVelocities, Measurements
-from tcpipe.stages.fuse_findings import audit_findings
+from tcpipe.stages.fuse_findings import make_audit_findings
 from tcpipe.stages.fuse_inputs import FusionInputs
 from tcpipe.stages.fuse_stretches import Fused
 from tcpipe.tables.facts import Disagreement, StretchFacts
@@ -29,13 +29,13 @@ def fused(*found, tallies=()):
 
 
 def test_nothing_is_said_where_nobody_disagrees():
-    told = audit_findings(fused(), *NOBODY)
+    told = make_audit_findings(fused(), *NOBODY)
     assert told.findings == ()
     assert (told.facts.disagreements, told.facts.undecided) == ((), ())
 
 
 def test_a_finding_holds_sensor_what_window_size_and_what_was_expected():
-    told = audit_findings(fused(off(110, 130, 0.2), off(160, 220, 0.49), off(150, 155, 9.0, alone=True)), *NOBODY)
+    told = make_audit_findings(fused(off(110, 130, 0.2), off(160, 220, 0.49), off(150, 155, 9.0, alone=True)), *NOBODY)
     shared, lone = told.findings
     assert (shared.code, shared.subject.name, shared.action) == ("position-disagrees", "gnss", "inflated")
     assert shared.numbers == {"off_m": 0.49, "expected_std_m": 0.02, "event_count": 2, "total_s": 80.0}
@@ -46,7 +46,7 @@ def test_a_finding_holds_sensor_what_window_size_and_what_was_expected():
 
 
 def test_a_run_that_no_third_decides_says_why_it_has_no_segments():
-    told = audit_findings(fused(tallies=[Tally("wheel_odometry", "displacement", 20, 15, 0)]), *NOBODY)
+    told = make_audit_findings(fused(tallies=[Tally("wheel_odometry", "displacement", 20, 15, 0)]), *NOBODY)
     assert told.facts.undecided == ("wheel_odometry",)
     (finding,) = told.findings
     assert (finding.code, finding.subject.name) == ("disagreement-undecided", "wheel_odometry")
@@ -68,8 +68,8 @@ def wheels_alone(speed_mps):
 
 
 def test_wheels_faster_than_any_command_bear_no_segment_where_nothing_else_tells_how_long_a_metre_is():
-    assert audit_findings(fused(), *wheels_alone(0.9)).facts.undecided == ()
-    told = audit_findings(fused(), *wheels_alone(1.25))
+    assert make_audit_findings(fused(), *wheels_alone(0.9)).facts.undecided == ()
+    told = make_audit_findings(fused(), *wheels_alone(1.25))
     assert told.facts.undecided == ("wheel_odometry",)
     (finding,) = told.findings
     assert (finding.code, finding.numbers) == ("faster-than-commanded", {"speed_ratio": pytest.approx(1.25)})

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tcpipe.fusion.measurements import InertialMeasurements, InitialState, Measurements, Positions
-from tcpipe.fusion.stretches import Stretch
+from tcpipe.fusion.track_sections import TrackSection
 from tcpipe.stages.fuse_findings import fuse_facts, fuse_findings
 from tcpipe.stages.fuse_inputs import FusionInputs
 from tcpipe.stages.fuse_stretches import stretch_facts
@@ -50,13 +50,13 @@ def test_a_stretch_says_where_it_lies_and_what_it_began_with():
     yaw = np.array([0.0, 0.0, np.sin(0.25), np.cos(0.25)])
     began = InitialState(np.zeros(3), np.ones(3), yaw, 0.1, 0.3, heading_from="orientation")
     found = SimpleNamespace(facts=stretch(), stamp_ns=np.arange(4))
-    told = stretch_facts(Stretch(2, 10, 20, heard), began, found)
+    told = stretch_facts(TrackSection(2, 10, 20, heard), began, found)
     assert (told.epoch, told.start_ns, told.end_ns, told.rows) == (2, 10, 20, 4)
     assert set(told.sensors) == {"gnss", "imu"}
     assert (told.gyro_noise_radps, told.accelerometer_noise_mps2) == (0.01, 0.1)
     assert told.initial_yaw_rad == pytest.approx(0.5)
     assert (told.initial_yaw_std_rad, told.heading_from) == (0.3, "orientation")
-    alone = stretch_facts(Stretch(2, 10, 20, Measurements(gnss=heard.gnss)), began, found)
+    alone = stretch_facts(TrackSection(2, 10, 20, Measurements(gnss=heard.gnss)), began, found)
     assert alone.gyro_noise_radps is None
     assert alone.accelerometer_noise_mps2 is None
 

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from made_tracks import make_track, power_streams, stamps, straight_track
 
-from tcpipe.cost.budget import CAUSES, in_words
+from tcpipe.cost.budget import CAUSES, format_budget
 from tcpipe.recipe import GateConfig, LabelConfig, SegmentConfig
-from tcpipe.stages.gate import gate_track
 from tcpipe.stages.label import label_segments
+from tcpipe.stages.mask import mask_track
 from tcpipe.stages.segment import segment_track
 from tcpipe.tables.bits import Quality
-from tcpipe.tables.columns import floats, integers
+from tcpipe.tables.columns import to_floats, to_integers
 from tcpipe.tables.facts import (
     AuditFacts,
     Disagreement,
@@ -30,7 +30,7 @@ SPEED = np.full(len(T), 0.8)
 
 
 def label(track, streams, *, config=None, voltage_range_volt=(20.0, 30.0)):
-    gated = gate_track(track, GateConfig(), max_velocity_mps=1.0, chord_m=1.0)
+    gated = mask_track(track, GateConfig(), max_velocity_mps=1.0, chord_m=1.0)
     return label_gated(gated, streams, config=config, voltage_range_volt=voltage_range_volt)
 
 
@@ -61,13 +61,15 @@ def codes_of(labelled):
 def test_constant_power_on_a_straight_line():
     labelled = label(straight_track(SPEED), power_streams({"drive": record()}))
     table = labelled.table
-    assert floats(table, "duration_s") == pytest.approx(1.25, abs=1e-8)
-    assert floats(table, "velocity_mps") == pytest.approx(0.8, abs=1e-8)
-    assert floats(table, "power_watt") == pytest.approx(144.0)
-    assert floats(table, "energy_joule") == pytest.approx(180.0)
-    assert set(integers(table, "power_samples")) == {25}
+    assert to_floats(table, "duration_s") == pytest.approx(1.25, abs=1e-8)
+    assert to_floats(table, "velocity_mps") == pytest.approx(0.8, abs=1e-8)
+    assert to_floats(table, "power_watt") == pytest.approx(144.0)
+    assert to_floats(table, "energy_joule") == pytest.approx(180.0)
+    assert set(to_integers(table, "power_samples")) == {25}
     assert (table["quality"].to_numpy() == int(Quality.NO_COMMAND)).all()
-    assert floats(table, "power_watt") * floats(table, "duration_s") == pytest.approx(floats(table, "energy_joule"))
+    assert to_floats(table, "power_watt") * to_floats(table, "duration_s") == pytest.approx(
+        to_floats(table, "energy_joule")
+    )
 
 
 def test_whole_run_energy_and_where_it_went():
@@ -99,14 +101,14 @@ def test_two_rails_with_voltage_and_current_from_different_topics():
         )
 
     labelled = label(straight_track(SPEED), power_streams({"left": rail(24.0, 3.0), "right": rail(25.0, 2.0)}))
-    assert floats(labelled.table, "power_watt") == pytest.approx(122.0)
+    assert to_floats(labelled.table, "power_watt") == pytest.approx(122.0)
 
 
 def test_a_current_that_changes_is_integrated_exactly_between_the_ends():
     labelled = label(straight_track(SPEED), power_streams({"drive": record(amp=lambda t: 6 + 2 * t)}))
-    start, end = ((integers(labelled.table, name) - ZERO) * 1e-9 for name in ("start_ns", "end_ns"))
+    start, end = ((to_integers(labelled.table, name) - ZERO) * 1e-9 for name in ("start_ns", "end_ns"))
     wanted = 24 * ((6 * end + end**2) - (6 * start + start**2))
-    assert floats(labelled.table, "energy_joule") == pytest.approx(wanted, rel=1e-9)
+    assert to_floats(labelled.table, "energy_joule") == pytest.approx(wanted, rel=1e-9)
 
 
 def test_the_papers_sum_is_late_by_half_a_period():
@@ -116,7 +118,7 @@ def test_the_papers_sum_is_late_by_half_a_period():
         config=LabelConfig(integration="right_endpoint"),
     )
     exact = label(straight_track(SPEED), power_streams({"drive": record(0.1, amp=lambda t: 6 + 2 * t)}))
-    more = floats(labelled.table, "power_watt") - floats(exact.table, "power_watt")
+    more = to_floats(labelled.table, "power_watt") - to_floats(exact.table, "power_watt")
     assert more.mean() == pytest.approx(24 * 2 * 0.05, rel=0.05)
 
 
@@ -126,9 +128,9 @@ def test_averaged_sources_are_right_endpoint_rectangles():
     mean_of_last_period = 6 + 2 * (t - 0.25)
     streams = power_streams({"drive": (stamp_ns, volt, mean_of_last_period)}, averaged=True)
     labelled = label(straight_track(SPEED), streams)
-    start, end = ((integers(labelled.table, name) - ZERO) * 1e-9 for name in ("start_ns", "end_ns"))
+    start, end = ((to_integers(labelled.table, name) - ZERO) * 1e-9 for name in ("start_ns", "end_ns"))
     wanted = 24 * ((6 * end + end**2) - (6 * start + start**2))
-    assert floats(labelled.table, "energy_joule") == pytest.approx(wanted, abs=24 * 2 * 0.5**2 / 4 + 1e-6)
+    assert to_floats(labelled.table, "energy_joule") == pytest.approx(wanted, abs=24 * 2 * 0.5**2 / 4 + 1e-6)
     assert labelled.info.report.facts.label.integration == "averaged"
     assert not flagged(labelled, Quality.LOW_POWER_RATE).any()
 
@@ -137,7 +139,7 @@ def test_a_run_without_power_has_null_labels():
     labelled = label(straight_track(SPEED), Streams({}, {}, "husky"))
     table = labelled.table
     assert table["energy_joule"].null_count == table["power_std_watt"].null_count == table.num_rows > 0
-    assert floats(table, "duration_s") == pytest.approx(1.25, abs=1e-8)
+    assert to_floats(table, "duration_s") == pytest.approx(1.25, abs=1e-8)
     assert labelled.info.report.facts.label.energy_joule is None
 
 
@@ -145,8 +147,8 @@ def test_segments_beyond_the_record_have_null_labels_and_a_warning():
     stamp_ns, volt, amp = record()
     short = stamp_ns < ZERO + 30_000_000_000
     labelled = label(straight_track(SPEED), power_streams({"drive": (stamp_ns[short], volt[short], amp[short])}))
-    unknown = np.isnan(floats(labelled.table, "energy_joule"))
-    assert unknown.tolist() == (integers(labelled.table, "end_ns") > stamp_ns[short][-1]).tolist()
+    unknown = np.isnan(to_floats(labelled.table, "energy_joule"))
+    assert unknown.tolist() == (to_integers(labelled.table, "end_ns") > stamp_ns[short][-1]).tolist()
     assert "segments-without-power" in codes_of(labelled)
 
 
@@ -164,7 +166,7 @@ def test_voltage_out_of_range_where_it_is():
     volt = lambda t: np.where((t > 20) & (t < 21), 19.0, 24.0)  # noqa: E731
     labelled = label(straight_track(SPEED), power_streams({"drive": record(volt=volt)}))
     found = flagged(labelled, Quality.VOLTAGE_OUT_OF_RANGE)
-    start, end = ((integers(labelled.table, name) - ZERO) * 1e-9 for name in ("start_ns", "end_ns"))
+    start, end = ((to_integers(labelled.table, name) - ZERO) * 1e-9 for name in ("start_ns", "end_ns"))
     assert found[(start < 20) & (end > 21)].all() or found[(start < 21) & (end > 20.1)].all()
     assert not found[(end < 19.9) | (start > 21.1)].any()
     none = label(straight_track(SPEED), power_streams({"drive": record(volt=volt)}), voltage_range_volt=None)
@@ -174,7 +176,7 @@ def test_voltage_out_of_range_where_it_is():
 def test_near_a_gap_within_a_chord():
     power = np.where((T > 30) & (T < 32), np.nan, 144.0)
     labelled = label(straight_track(SPEED, power_watt=power), power_streams({"drive": record()}))
-    start, end = (floats(labelled.table, f"{e}_x_m") for e in ("start", "end"))
+    start, end = (to_floats(labelled.table, f"{e}_x_m") for e in ("start", "end"))
     gap = 0.8 * T[np.isnan(power)][[0, -1]]
     near = (end > gap[0] - 1) & (start < gap[1] + 1)
     assert flagged(labelled, Quality.NEAR_GAP).tolist() == near.tolist()
@@ -184,7 +186,7 @@ def test_near_a_gap_within_a_chord():
 def test_slip_weak_position_curve_and_command():
     slipping = straight_track(SPEED, wheel_mps=np.where(T < 30, 0.85, 1.2), commanded_mps=np.ones(len(T)))
     labelled = label(slipping, power_streams({"drive": record()}))
-    late = integers(labelled.table, "start_ns") > ZERO + 30_000_000_000
+    late = to_integers(labelled.table, "start_ns") > ZERO + 30_000_000_000
     assert flagged(labelled, Quality.HIGH_SLIP)[late].all()
     assert not flagged(labelled, Quality.HIGH_SLIP)[~late][:-1].any()
     assert not flagged(labelled, Quality.NO_COMMAND).any()
@@ -210,8 +212,8 @@ def test_segments_that_touch_a_time_in_which_sensors_disagree_undecided_are_flag
     facts = replace(track.info.report.facts, audit=audit)
     told = replace(track, info=replace(track.info, report=StageReport((), facts)))
     labelled = label(told, power_streams({"drive": record()}))
-    touched = (integers(labelled.table, "start_ns") <= ZERO + 30e9) & (
-        integers(labelled.table, "end_ns") >= ZERO + 20e9
+    touched = (to_integers(labelled.table, "start_ns") <= ZERO + 30e9) & (
+        to_integers(labelled.table, "end_ns") >= ZERO + 20e9
     )
     assert flagged(labelled, Quality.SENSORS_DISAGREE).tolist() == touched.tolist()
     assert 8 <= touched.sum() <= 10
@@ -226,8 +228,8 @@ def test_segments_in_which_the_gate_of_the_fixes_reopened_are_flagged():
     facts = replace(track.info.report.facts, fuse=FuseFacts(0, (), {}, {}, {}, {}, 0.0, (stretch,)))
     told = replace(track, info=replace(track.info, report=StageReport((), facts)))
     labelled = label(told, power_streams({"drive": record()}))
-    touched = (integers(labelled.table, "start_ns") <= ZERO + 30e9) & (
-        integers(labelled.table, "end_ns") >= ZERO + 20e9
+    touched = (to_integers(labelled.table, "start_ns") <= ZERO + 30e9) & (
+        to_integers(labelled.table, "end_ns") >= ZERO + 20e9
     )
     assert flagged(labelled, Quality.SENSORS_DISAGREE).tolist() == touched.tolist()
 
@@ -235,14 +237,14 @@ def test_segments_in_which_the_gate_of_the_fixes_reopened_are_flagged():
 def test_not_at_the_limit_where_slower_than_full_speed_was_kept():
     commanded = np.where(T < 30, 1.0, 0.7)
     gate = GateConfig(require_full_speed=False)
-    gated = gate_track(straight_track(SPEED, commanded_mps=commanded), gate, max_velocity_mps=1.0, chord_m=1.0)
+    gated = mask_track(straight_track(SPEED, commanded_mps=commanded), gate, max_velocity_mps=1.0, chord_m=1.0)
     labelled = label_gated(gated, power_streams({"drive": record()}))
-    start, end = ((integers(labelled.table, name) - ZERO) * 1e-9 for name in ("start_ns", "end_ns"))
+    start, end = ((to_integers(labelled.table, name) - ZERO) * 1e-9 for name in ("start_ns", "end_ns"))
     slow = flagged(labelled, Quality.NOT_AT_LIMIT)
     assert slow[start > 30].all()
     assert slow.any()
     assert not slow[end < 30].any()
-    no_limit = gate_track(straight_track(SPEED, commanded_mps=commanded), gate, max_velocity_mps=None, chord_m=1.0)
+    no_limit = mask_track(straight_track(SPEED, commanded_mps=commanded), gate, max_velocity_mps=None, chord_m=1.0)
     assert not flagged(label_gated(no_limit, power_streams({"drive": record()})), Quality.NOT_AT_LIMIT).any()
 
 
@@ -250,12 +252,12 @@ def test_error_budget_adds_up_to_the_deviations():
     rough = lambda t: 6 + np.random.default_rng(0).normal(0, 1, len(t))  # noqa: E731
     labelled = label(straight_track(SPEED, std_m=1.0), power_streams({"drive": record(0.2, amp=rough)}))
     budget = labelled.info.report.facts.label.energy_budget
-    energy, std = floats(labelled.table, "energy_joule"), floats(labelled.table, "energy_std_joule")
+    energy, std = to_floats(labelled.table, "energy_joule"), to_floats(labelled.table, "energy_std_joule")
     assert budget.total == pytest.approx(np.sqrt(np.mean(std**2)) / energy.mean())
     assert budget.total**2 == pytest.approx(sum(getattr(budget, cause) ** 2 for cause in CAUSES))
     assert budget.position == pytest.approx(144 * 0.004 * 1.25 / 0.8 / 180, rel=0.05)
     assert budget.position < budget.at_20_hz < 0.7 * budget.total
-    assert "20 Hz" in in_words(budget)
+    assert "20 Hz" in format_budget(budget)
 
 
 def test_means_differ_when_samples_are_uneven():
@@ -290,7 +292,7 @@ def test_epochs_with_overlapping_stamps_keep_their_own_power():
 
     both = Streams({"power": pa.concat_tables([first.tables["power"], second.tables["power"]])}, {}, "husky")
     table = label(track, both).table
-    assert floats(table, "power_watt") == pytest.approx(np.where(integers(table, "epoch") == 0, 120.0, 216.0))
+    assert to_floats(table, "power_watt") == pytest.approx(np.where(to_integers(table, "epoch") == 0, 120.0, 216.0))
 
 
 def test_deviations_grow_with_their_causes():
@@ -298,11 +300,13 @@ def test_deviations_grow_with_their_causes():
     smooth = label(straight_track(SPEED, std_m=1.0), power_streams({"drive": record()})).table
     noisy = label(straight_track(SPEED, std_m=1.0), power_streams({"drive": record(amp=rough)})).table
     unsure = label(straight_track(SPEED, velocity_std_mps=0.02, std_m=1.0), power_streams({"drive": record()})).table
-    assert floats(smooth, "duration_std_s") == pytest.approx(0.004 * 1.25 / 0.8, rel=1e-3)
-    assert floats(smooth, "energy_std_joule") == pytest.approx(144 * 0.004 * 1.25 / 0.8, rel=1e-3)
-    assert floats(noisy, "energy_std_joule").mean() == pytest.approx(np.hypot(0.9, 24 * np.sqrt(25) * 0.05), rel=0.15)
-    assert floats(unsure, "duration_std_s") == pytest.approx(0.02 * 1.25 / 0.8, rel=1e-3)
-    assert floats(unsure, "velocity_std_mps") == pytest.approx(0.8 * 0.02 / 0.8, rel=1e-3)
+    assert to_floats(smooth, "duration_std_s") == pytest.approx(0.004 * 1.25 / 0.8, rel=1e-3)
+    assert to_floats(smooth, "energy_std_joule") == pytest.approx(144 * 0.004 * 1.25 / 0.8, rel=1e-3)
+    assert to_floats(noisy, "energy_std_joule").mean() == pytest.approx(
+        np.hypot(0.9, 24 * np.sqrt(25) * 0.05), rel=0.15
+    )
+    assert to_floats(unsure, "duration_std_s") == pytest.approx(0.02 * 1.25 / 0.8, rel=1e-3)
+    assert to_floats(unsure, "velocity_std_mps") == pytest.approx(0.8 * 0.02 / 0.8, rel=1e-3)
 
 
 def test_a_run_without_any_current_has_no_relative_deviation_and_divides_by_nothing():

@@ -9,12 +9,12 @@ from simulated_streams import log_of, streams_of
 
 from tcpipe.pipeline.run_stages import run_stages
 from tcpipe.recipe import Recipe
-from tcpipe.simulation import Faults, scenario
+from tcpipe.simulation import Faults, find_scenario
 from tcpipe.simulation.robot import GRAVITY_MPS2, SimulatedRobot
 from tcpipe.simulation.route import Wander
-from tcpipe.stages.label import with_physics
+from tcpipe.stages.label import add_physics
 from tcpipe.tables.bits import Quality
-from tcpipe.tables.columns import floats
+from tcpipe.tables.columns import to_floats
 
 USUAL = SimulatedRobot()
 ROBOT = replace(
@@ -28,7 +28,7 @@ ROBOT = replace(
 @pytest.fixture(scope="module")
 def stages(tmp_path_factory):
     """400 m over hills and all classes, without sensor faults, of a robot without slip whose torque is the same on every curve."""
-    hills = scenario("hills12")
+    hills = find_scenario("hills12")
     drive = replace(hills.drives[0], plan=Wander(400.0, (14.0, 34.0), climbing=0.5), faults=Faults(), robot=ROBOT)
     streams = streams_of(log_of(hills, drive, tmp_path_factory.mktemp("hills"), seed=3))
     return run_stages(streams, Recipe().ingest, run_id="run")
@@ -52,25 +52,25 @@ def test_the_fit_is_the_robot(stages):
 
 def test_the_prediction_stands_beside_the_label(stages):
     table = stages[2].table
-    power, predicted = floats(table, "power_watt"), floats(table, "physics_power_watt")
+    power, predicted = to_floats(table, "power_watt"), to_floats(table, "physics_power_watt")
     assert np.isfinite(predicted).all()
     assert 1 - np.var(power - predicted) / np.var(power) > 0.9  # the rest is terrain
 
 
 def test_an_odd_metre_is_flagged_and_changes_nothing_for_the_others(stages):
     labelled = stages[2]
-    power = floats(labelled.table, "power_watt").copy()
+    power = to_floats(labelled.table, "power_watt").copy()
     power[7] += 300.0
     odd = labelled.table.set_column(
         labelled.table.schema.get_field_index("power_watt"), labelled.table.schema.field("power_watt"), [power]
     )
-    table, facts = with_physics(odd, 14.0)
+    table, facts = add_physics(odd, 14.0)
     flagged = np.flatnonzero(table["quality"].to_numpy() & np.uint32(Quality.PHYSICS_OUTLIER))
     assert 7 in flagged
     assert facts.outliers == flagged.size <= 3
     others = np.delete(np.arange(table.num_rows), 7)
-    before = floats(labelled.table, "physics_power_watt")
-    assert np.abs(floats(table, "physics_power_watt") - before)[others].max() < 2.0
+    before = to_floats(labelled.table, "physics_power_watt")
+    assert np.abs(to_floats(table, "physics_power_watt") - before)[others].max() < 2.0
 
 
 def test_without_power_there_is_no_fit(stages):
@@ -79,6 +79,6 @@ def test_without_power_there_is_no_fit(stages):
     dark = labelled.table.set_column(
         labelled.table.schema.get_field_index("power_watt"), field, [np.full(labelled.table.num_rows, np.nan)]
     )
-    table, facts = with_physics(dark, np.nan)
+    table, facts = add_physics(dark, np.nan)
     assert facts.fitted is False
     assert table is dark

@@ -7,7 +7,7 @@ import pyarrow as pa
 import pytest
 from made_tracks import stamps
 
-from tcpipe.stages.label_motion import clock_doubtful, motion_flags
+from tcpipe.stages.label_motion import clock_doubtful, find_motion_flags
 from tcpipe.tables.bits import DropReason, Quality
 from tcpipe.tables.facts import (
     AuditFacts,
@@ -65,7 +65,7 @@ def info(**facts):
 
 
 def flags(segment, track=None, about=None):
-    found = motion_flags(
+    found = find_motion_flags(
         segment, rows() if track is None else track, about or info(), arc_to_chord=1.05, max_position_std_m=0.1
     )
     return {bit for bit, flagged in found.items() if flagged[0]}

@@ -12,12 +12,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from tcpipe.errors import RecipeError, RoleError
-from tcpipe.formats.robot_files import shipped_profiles
+from tcpipe.formats.robot_files import load_shipped_profiles
 from tcpipe.logs.topics import Topic
 from tcpipe.power.sources import RailReadings
 from tcpipe.recipe import Placement, ReadConfig
 from tcpipe.stages.read import read_run
-from tcpipe.stages.read_power import power_rows
+from tcpipe.stages.read_power import select_power_rows
 from tcpipe.tables.findings import select_findings
 from tcpipe.tables.levels import Streams
 
@@ -164,7 +164,7 @@ def husky(**more: tuple[str, pa.Table]) -> dict[str, tuple[str, pa.Table]]:
 
 
 def read(topics: Mapping[str, tuple[str, pa.Table]], /, robot: str | None = None, **config) -> Streams:
-    return read_run(MemoryLog(topics), ReadConfig(**config), robot=robot, known=shipped_profiles())
+    return read_run(MemoryLog(topics), ReadConfig(**config), robot=robot, known=load_shipped_profiles())
 
 
 def codes(found) -> set[str]:
@@ -223,7 +223,7 @@ def test_the_same_log_gives_the_same_bytes() -> None:
 def test_only_the_topics_of_roles_are_read_and_tf_only_where_it_is_needed() -> None:
     moving = transforms(("odom", "base_link", (1.0, 0.0, 0.0), Rotation.identity()))
     log = MemoryLog(husky(**{"/tf": moving, "/image": ("sensor_msgs/msg/Image", message_table(1, 1.0))}))
-    read_run(log, ReadConfig(), robot=None, known=shipped_profiles())
+    read_run(log, ReadConfig(), robot=None, known=load_shipped_profiles())
     assert "/image" not in log.read
     assert "/tf" not in log.read
     assert len(log.read) == len(set(log.read))
@@ -270,7 +270,7 @@ def test_topics_without_messages_play_no_part_even_where_the_index_cannot_tell()
     )
     log.topics = {name: replace(topic, message_count=None) for name, topic in log.topics.items()}
     recipe = ReadConfig(topics={"wheel_odometry": ["/odom"]})
-    assert set(read_run(log, recipe, robot=None, known=shipped_profiles()).tables) == {"wheel_odometry"}
+    assert set(read_run(log, recipe, robot=None, known=load_shipped_profiles()).tables) == {"wheel_odometry"}
 
 
 def test_nmea_sentences_play_gnss_on_their_own_time() -> None:
@@ -325,13 +325,16 @@ def test_a_receivers_twist_in_the_bodys_frame_stays_out_unless_the_recipe_names_
     assert (found.tables["gnss_velocity"].num_rows if rows else len(set(found.tables) - {"gnss"})) == rows
     assert ("velocity-not-over-ground" in codes(found)) == (not rows)
     named = ReadConfig(topics={"gnss_velocity": ["/gps/vel"]})
-    told = read_run(MemoryLog(topics), named, robot=None, known=shipped_profiles())
+    told = read_run(MemoryLog(topics), named, robot=None, known=load_shipped_profiles())
     assert told.tables["gnss_velocity"].num_rows == 50
 
 
 def test_a_topic_that_cannot_be_decoded_plays_no_part() -> None:
     found = read_run(
-        MemoryLog(husky(), undecodable=["/fix", "/left/battery"]), ReadConfig(), robot=None, known=shipped_profiles()
+        MemoryLog(husky(), undecodable=["/fix", "/left/battery"]),
+        ReadConfig(),
+        robot=None,
+        known=load_shipped_profiles(),
     )
     assert "gnss" not in found.tables
     assert "power" not in found.tables  # one side alone is not the robot's power
@@ -419,7 +422,7 @@ def test_a_step_of_all_clocks_divides_every_table() -> None:
 def test_rows_of_power_that_carry_nothing_are_counted() -> None:
     volt, amp = np.full(6, 26.0), np.full(6, 5.0)
     volt[3] = amp[3] = amp[5] = np.nan
-    found = power_rows({"log_time_ns": np.arange(6)}, [RailReadings("battery", volt, amp)])
+    found = select_power_rows({"log_time_ns": np.arange(6)}, [RailReadings("battery", volt, amp)])
     assert found.dropped == {"not_finite": 1}
     assert found.row.tolist() == [0, 1, 2, 4, 5]
 
@@ -547,7 +550,7 @@ def test_reading_takes_room_for_little_more_than_its_tables() -> None:
     def peak_and_tables(rows: int) -> tuple[int, int]:
         log = MemoryLog({"/imu/data": imu(rows), "/husky_velocity_controller/odom": odometry(rows)})
         tracemalloc.start()
-        found = read_run(log, ReadConfig(), robot=None, known=shipped_profiles())
+        found = read_run(log, ReadConfig(), robot=None, known=load_shipped_profiles())
         peak = tracemalloc.get_traced_memory()[1]
         tracemalloc.stop()
         return peak, sum(table.nbytes for table in found.tables.values())

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tcpipe.logs.clocks import Settled, Timeline
+from tcpipe.logs.clocks import AlignedClocks, Timeline
 from tcpipe.logs.messages import Readings
 from tcpipe.logs.roles import PlayedRole, RoleAssignment
 from tcpipe.logs.simulated_clock import SimulatedClock
@@ -33,7 +33,7 @@ def source(*, role="gnss", header=True, **said):
 def read(topic=None, clock=None, *, steps=(), power=None, findings=(), timelines=None, simulated=None):
     roles = {"gnss": PlayedRole("gnss", ("/fix",), SENSOR.type_name, "the only one")}
     assignment = RoleAssignment("husky", "its topics", roles, {"/other": "it is slower"}, findings=findings)
-    clocks = Settled({"/fix": clock or timeline()} if timelines is None else timelines, list(steps), simulated)
+    clocks = AlignedClocks({"/fix": clock or timeline()} if timelines is None else timelines, list(steps), simulated)
     return read_findings(
         assignment,
         [topic or source()],

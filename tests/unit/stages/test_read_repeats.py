@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 from made_tracks import power_streams, stamps
 
-from tcpipe.power.energy import energy_joule
-from tcpipe.power.noise import energy_noise, median_period_s
-from tcpipe.simulation import scenario, simulated_drive
+from tcpipe.power.energy import integrate_energy
+from tcpipe.power.noise import compute_median_period_s, estimate_energy_noise
+from tcpipe.simulation import find_scenario, simulate_readings
 from tcpipe.simulation.faults import Faults
-from tcpipe.simulation.scenarios import small_world
+from tcpipe.simulation.scenarios import make_small_world
 from tcpipe.simulation.sensors import Noise, Power, Sensors, record
-from tcpipe.stages.power_rails import rails_of
-from tcpipe.stages.read_power import find_repeats, without_repeats
+from tcpipe.stages.power_rails import make_rails
+from tcpipe.stages.read_power import find_repeats, remove_repeats
 from tcpipe.tables.levels import Streams
 
 COUNT = 4000
@@ -28,12 +28,14 @@ def drawn(seed, *, step=0.01, scale=2.0):
 
 
 def read(rails):
-    streams, repeats = without_repeats(power_streams(rails).tables)
-    return rails_of(Streams(streams, {}, "husky"), 0), repeats
+    streams, repeats = remove_repeats(power_streams(rails).tables)
+    return make_rails(Streams(streams, {}, "husky"), 0), repeats
 
 
 def rates_hz(rails):
-    return [round(1.0 / median_period_s(signal), 1) for each in rails for signal in (each.current, each.voltage)]
+    return [
+        round(1.0 / compute_median_period_s(signal), 1) for each in rails for signal in (each.current, each.voltage)
+    ]
 
 
 def test_voltage_and_current_may_be_read_at_rates_of_their_own():
@@ -78,7 +80,7 @@ def test_a_voltage_alone_on_its_topic_is_told_by_itself():
 )
 def test_a_signal_measured_for_every_message_stays_as_it_is(volt, amp):
     streams = power_streams({"battery": (STAMP_NS, volt, amp)}).tables
-    kept, repeats = without_repeats(streams)
+    kept, repeats = remove_repeats(streams)
     assert kept["power"] is streams["power"]
     assert not repeats
 
@@ -89,19 +91,19 @@ def test_clock_epochs_are_told_together_and_kept_apart():
     back_ns = np.where(epoch, STAMP_NS - 30_000_000_000, STAMP_NS)
     for name, values in (("epoch", epoch), ("stamp_ns", back_ns)):
         table = table.set_column(table.column_names.index(name), table.schema.field(name), [values])
-    streams, _ = without_repeats({"power": table})
-    assert [rates_hz(rails_of(Streams(streams, {}, "husky"), number))[0] for number in (0, 1)] == [1.0, 1.0]
+    streams, _ = remove_repeats({"power": table})
+    assert [rates_hz(make_rails(Streams(streams, {}, "husky"), number))[0] for number in (0, 1)] == [1.0, 1.0]
 
 
 @pytest.fixture(scope="module")
 def truth():
-    return simulated_drive(scenario("hills12"))[0]
+    return simulate_readings(find_scenario("hills12"))[0]
 
 
 @pytest.mark.parametrize("reading_hz", [1.0, 2.0, 4.0, 5.0])
 def test_energies_are_as_wrong_as_they_say(truth, reading_hz):
     faults, sensors = Faults.only("power_noise"), Sensors(power=Power(reading_hz=reading_hz))
-    reading = record(truth, small_world().site, sensors, faults, Noise(1, 0))["power"]
+    reading = record(truth, make_small_world().site, sensors, faults, Noise(1, 0))["power"]
     amp = reading.values["left_amp"] + reading.values["right_amp"]
     streams = power_streams({"drive": (reading.stamp_ns, reading.values["voltage_volt"], amp)}).tables
     start_ns = np.arange(truth.stamp_ns[0] + 10**10, truth.stamp_ns[-1] - 10**10, 1_200_000_000)
@@ -110,10 +112,10 @@ def test_energies_are_as_wrong_as_they_say(truth, reading_hz):
     start_ns, end_ns = start_ns[steady], end_ns[steady]
     true_joule = truth.at(end_ns).energy_joule - truth.at(start_ns).energy_joule
     inside, rms = {}, {}
-    for name, table in (("messages", streams), ("readings", without_repeats(streams)[0])):
-        rails = rails_of(Streams(table, {}, "husky"), 0)
-        error = energy_joule(rails, start_ns, end_ns, rule="exact") - true_joule
-        std = energy_noise(rails, start_ns, end_ns, np.empty((0, 2), np.int64)).std_joule()
+    for name, table in (("messages", streams), ("readings", remove_repeats(streams)[0])):
+        rails = make_rails(Streams(table, {}, "husky"), 0)
+        error = integrate_energy(rails, start_ns, end_ns, rule="exact") - true_joule
+        std = estimate_energy_noise(rails, start_ns, end_ns, np.empty((0, 2), np.int64)).std_joule()
         inside[name] = [float(np.mean(np.abs(error) <= k * std)) for k in (1, 2)]
         rms[name] = float(np.sqrt(np.mean(error**2)))
     assert inside["messages"][1] < 0.6

@@ -7,7 +7,7 @@ from map_worlds import ArrayMap, random_map, segment_table, segments_from
 
 from tcpipe.errors import TableError
 from tcpipe.recipe import SampleConfig
-from tcpipe.stages.sample import metres_lost, sample_segments
+from tcpipe.stages.sample import sample_segments, sum_losses
 from tcpipe.tables.bits import Loss
 from tcpipe.tables.findings import Subject
 from tcpipe.terrain.grid import MapGrid
@@ -50,7 +50,7 @@ def test_every_loss_has_its_reason_and_its_metres():
         Loss.NOT_TRAVERSABLE: 1.004,
         Loss.POSITION_UNCERTAIN: 1.004,
     }
-    assert metres_lost(segments.column("arc_length_m").to_numpy(), got.lost_by) == pytest.approx(metres)
+    assert sum_losses(segments.column("arc_length_m").to_numpy(), got.lost_by) == pytest.approx(metres)
 
 
 def test_a_recipe_may_allow_some_invalid_pixels():

@@ -6,7 +6,7 @@ from map_worlds import ArrayMap, random_map, segments_from
 
 from tcpipe.errors import MapError
 from tcpipe.recipe import SampleConfig
-from tcpipe.stages.sample import metres_lost, sample_on_maps, sample_segments
+from tcpipe.stages.sample import sample_on_maps, sample_segments, sum_losses
 from tcpipe.tables.bits import Loss
 from tcpipe.terrain.classes import PAPER_CLASSES, ClassTable
 from tcpipe.terrain.grid import MapGrid
@@ -55,7 +55,7 @@ def test_the_first_map_that_has_data_is_taken():
     np.testing.assert_array_equal(by_map(turned)[0][0], alone[1].kept)
     everywhere = [np.sort(each.kept).tolist() for each in (both, turned)]
     assert everywhere[0] == everywhere[1] == np.flatnonzero(both.lost_by == 0).tolist()
-    lost_m = metres_lost(segments.column("arc_length_m").to_numpy(), both.lost_by)
+    lost_m = sum_losses(segments.column("arc_length_m").to_numpy(), both.lost_by)
     assert sum(lost_m.values()) == pytest.approx(1.004 * (segments.num_rows - len(both.kept)))
 
 

@@ -6,21 +6,21 @@ import pytest
 from made_tracks import GRAZ, make_track, stamps, straight_track
 
 from tcpipe.recipe import GateConfig, SegmentConfig
-from tcpipe.stages.gate import gate_track
+from tcpipe.stages.mask import mask_track
 from tcpipe.stages.segment import segment_track
-from tcpipe.tables.columns import floats, integers
+from tcpipe.tables.columns import to_floats, to_integers
 from tcpipe.tables.findings import select_findings
 
 T = np.arange(0, 60, 0.05)
 
 
 def cut(track, *, gate=None, limit_mps=1.0):
-    gated = gate_track(track, gate or GateConfig(), max_velocity_mps=limit_mps, chord_m=1.0)
+    gated = mask_track(track, gate or GateConfig(), max_velocity_mps=limit_mps, chord_m=1.0)
     return segment_track(gated, SegmentConfig())
 
 
 def chord_error_m(table):
-    step = [floats(table, f"end_{axis}_m") - floats(table, f"start_{axis}_m") for axis in "xy"]
+    step = [to_floats(table, f"end_{axis}_m") - to_floats(table, f"start_{axis}_m") for axis in "xy"]
     return np.abs(np.hypot(*step) - 1.0)
 
 
@@ -31,21 +31,21 @@ def test_a_hill_is_cut_by_its_horizontal_chord():
     horizontal = 0.9 * np.cos(slope)
     assert table.num_rows == int(horizontal * T[-1])
     assert chord_error_m(table).max() < 1e-6
-    assert floats(table, "chord_m") == pytest.approx(1.0, abs=1e-6)
-    assert floats(table, "arc_length_m") == pytest.approx(1.0, abs=1e-6)
-    assert floats(table, "course_rad") == pytest.approx(course, abs=1e-9)
-    duration = (integers(table, "end_ns") - integers(table, "start_ns")) * 1e-9
+    assert to_floats(table, "chord_m") == pytest.approx(1.0, abs=1e-6)
+    assert to_floats(table, "arc_length_m") == pytest.approx(1.0, abs=1e-6)
+    assert to_floats(table, "course_rad") == pytest.approx(course, abs=1e-9)
+    duration = (to_integers(table, "end_ns") - to_integers(table, "start_ns")) * 1e-9
     assert duration == pytest.approx(1 / horizontal, abs=1e-8)
-    assert floats(table, "fused_velocity_mps") == pytest.approx(0.9)
-    rise = floats(table, "end_z_m") - floats(table, "start_z_m")
+    assert to_floats(table, "fused_velocity_mps") == pytest.approx(0.9)
+    rise = to_floats(table, "end_z_m") - to_floats(table, "start_z_m")
     assert rise == pytest.approx(np.tan(slope), abs=1e-6)
 
 
 def test_the_next_segment_starts_at_the_end_of_the_last():
     table = cut(straight_track(np.full(len(T), 0.83))).table
-    assert (integers(table, "start_ns")[1:] == integers(table, "end_ns")[:-1]).all()
+    assert (to_integers(table, "start_ns")[1:] == to_integers(table, "end_ns")[:-1]).all()
     for axis in "xyz":
-        assert (floats(table, f"start_{axis}_m")[1:] == floats(table, f"end_{axis}_m")[:-1]).all()
+        assert (to_floats(table, f"start_{axis}_m")[1:] == to_floats(table, f"end_{axis}_m")[:-1]).all()
     assert table["segment_id"][0].as_py() == f"run-0123abcd-{table['start_ns'][0].as_py()}"
 
 
@@ -59,8 +59,8 @@ def test_longitude_and_latitude_are_those_of_the_enu_position():
     to_geodetic = pyproj.Transformer.from_pipeline(chain)
     geod = pyproj.Geod(ellps="WGS84")
     for end in ("start", "end"):
-        lon, lat, _ = to_geodetic.transform(*(floats(table, f"{end}_{axis}_m") for axis in "xyz"))
-        got = floats(table, f"{end}_lon_deg"), floats(table, f"{end}_lat_deg")
+        lon, lat, _ = to_geodetic.transform(*(to_floats(table, f"{end}_{axis}_m") for axis in "xyz"))
+        got = to_floats(table, f"{end}_lon_deg"), to_floats(table, f"{end}_lat_deg")
         _, _, apart = geod.inv(lon, lat, *got)
         assert np.max(apart) < 1e-6
 
@@ -100,7 +100,7 @@ def test_the_ledger_accounts_for_every_metre_once(seed):
         *("kept", "gap", "standing", "stuck", "turning_in_place", "reversing", "accelerating", "below_limit"),
         *("curved", "leftover"),
     ]
-    assert ledger["kept"] == pytest.approx(floats(segments.table, "arc_length_m").sum(), rel=1e-12)
+    assert ledger["kept"] == pytest.approx(to_floats(segments.table, "arc_length_m").sum(), rel=1e-12)
     # Independent odometer: a fine polygon through every row's Hermite cubic, straight lines where stamps or epochs break.
     assert sum(ledger.values()) == pytest.approx(odometer_m(track.table), rel=1e-4)
     assert sum(ledger.values()) == pytest.approx(segments.info.report.facts.segment.odometer_m, rel=1e-12)
@@ -109,9 +109,9 @@ def test_the_ledger_accounts_for_every_metre_once(seed):
 
 
 def odometer_m(table):
-    stamp_ns, epoch = integers(table, "stamp_ns"), integers(table, "epoch")
-    xy = np.column_stack([floats(table, f"{axis}_m") for axis in "xy"])
-    velocity = np.column_stack([floats(table, f"{name}_velocity_mps") for name in ("east", "north")])
+    stamp_ns, epoch = to_integers(table, "stamp_ns"), to_integers(table, "epoch")
+    xy = np.column_stack([to_floats(table, f"{axis}_m") for axis in "xy"])
+    velocity = np.column_stack([to_floats(table, f"{name}_velocity_mps") for name in ("east", "north")])
     regular = (np.diff(stamp_ns) == 50_000_000) & (np.diff(epoch) == 0)
     u = np.linspace(0, 1, 51)[:, None, None]
     p0, p1, v0, v1 = xy[:-1], xy[1:], velocity[:-1] * 0.05, velocity[1:] * 0.05
@@ -125,13 +125,13 @@ def odometer_m(table):
 @pytest.mark.parametrize("seed", range(6))
 def test_no_segment_holds_a_dropped_row_a_hole_or_a_step_of_the_clock(seed):
     track = wandering(seed)
-    gated = gate_track(track, GateConfig(), max_velocity_mps=1.0, chord_m=1.0)
+    gated = mask_track(track, GateConfig(), max_velocity_mps=1.0, chord_m=1.0)
     table = segment_track(gated, SegmentConfig()).table
     assert chord_error_m(table).max() < 1e-6
-    stamp_ns, epoch = integers(gated.table, "stamp_ns"), integers(gated.table, "epoch")
+    stamp_ns, epoch = to_integers(gated.table, "stamp_ns"), to_integers(gated.table, "epoch")
     dropped = gated.table["dropped_by"].to_numpy() != 0
     for start, end, its_epoch in zip(
-        integers(table, "start_ns"), integers(table, "end_ns"), integers(table, "epoch"), strict=True
+        to_integers(table, "start_ns"), to_integers(table, "end_ns"), to_integers(table, "epoch"), strict=True
     ):
         mine = epoch == its_epoch
         inside = mine & (stamp_ns > start - 50_000_000) & (stamp_ns < end + 50_000_000)
@@ -143,16 +143,16 @@ def test_kept_backward_stretches_never_share_a_segment_with_forward_ones():
     speed = np.where(T < 30, 0.8, -0.8)
     track = straight_track(speed, forward_mps=speed)
     segments = cut(track, gate=GateConfig(keep_reversing=True, max_acceleration_mps2=50.0, ramp_acceleration_mps2=50.0))
-    fused = floats(segments.table, "fused_velocity_mps")
+    fused = to_floats(segments.table, "fused_velocity_mps")
     assert set(np.round(fused, 9)) == {0.8, -0.8}
 
 
 def test_mean_command_of_a_segment():
     commanded = np.where(T < 30, 1.0, np.nan)
     table = cut(straight_track(np.full(len(T), 0.9), commanded_mps=commanded)).table
-    mean = floats(table, "commanded_velocity_mps")
+    mean = to_floats(table, "commanded_velocity_mps")
     assert np.nanmax(np.abs(mean - 1)) < 1e-9
-    assert np.isnan(mean[integers(table, "end_ns") > integers(table, "start_ns")[0] + 31_000_000_000]).all()
+    assert np.isnan(mean[to_integers(table, "end_ns") > to_integers(table, "start_ns")[0] + 31_000_000_000]).all()
 
 
 def test_a_run_that_never_moves_says_so():

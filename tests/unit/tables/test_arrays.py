@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tcpipe.tables.arrays import column_of, number_column, numbers, rows_where, text_column, texts
+from tcpipe.tables.arrays import make_column, make_text_column, number_column, select_rows, to_numbers, to_texts
 
 KINDS = ("int8", "uint8", "int16", "uint32", "int64", "uint64", "float32", "float64", "bool")
 
@@ -19,17 +19,17 @@ def test_numbers_there_and_back(kind, values, first):
     array = np.array(values).astype(kind)
     column = number_column(array)
     assert column.equals(pa.array(array))
-    found = numbers(column.slice(min(first, len(array))))
+    found = to_numbers(column.slice(min(first, len(array))))
     assert found.dtype == array.dtype
     np.testing.assert_array_equal(found, array[first:])
-    np.testing.assert_array_equal(numbers(pa.chunked_array([column, column])), np.tile(array, 2))
+    np.testing.assert_array_equal(to_numbers(pa.chunked_array([column, column])), np.tile(array, 2))
 
 
 @pytest.mark.parametrize("kind", [pa.float32(), pa.float64(), pa.int16(), pa.bool_()])
 @pytest.mark.parametrize("rows", [slice(0, None), slice(2, 5), slice(9, None)])
 def test_null_is_nan(kind, rows):
     column = pa.array([None, 1, 0, None, 1, None, None, 1, 1, None, 0], pa.int8()).cast(kind)[rows]
-    found = numbers(column)
+    found = to_numbers(column)
     assert found.dtype == (np.float32 if kind == pa.float32() else np.float64)
     np.testing.assert_array_equal(found, [np.nan if value is None else float(value) for value in column.to_pylist()])
 
@@ -42,18 +42,18 @@ def test_nan_is_null_where_asked():
 
 @given(st.lists(st.text(st.characters(exclude_categories=["Cs"], exclude_characters="\0"))), st.integers(0, 3))
 def test_texts_there_and_back(values, first):
-    column = text_column(values)
+    column = make_text_column(values)
     column.validate(full=True)
     assert column.equals(pa.array(values, pa.string()))
-    assert texts(column.slice(min(first, len(values)))).tolist() == values[first:]
-    assert texts(pa.chunked_array([column, column])).tolist() == values * 2
+    assert to_texts(column.slice(min(first, len(values)))).tolist() == values[first:]
+    assert to_texts(pa.chunked_array([column, column])).tolist() == values * 2
 
 
 def test_rows_where():
     table = pa.table({"epoch": [0, 1, 0], "rail": ["a", "b", "b"]})
-    assert rows_where(table, "epoch", 0).to_pylist() == [table.to_pylist()[row] for row in (0, 2)]
-    assert rows_where(table, "rail", "b").to_pylist() == [table.to_pylist()[row] for row in (1, 2)]
-    assert rows_where(table, "rail", "c").num_rows == 0
+    assert select_rows(table, "epoch", 0).to_pylist() == [table.to_pylist()[row] for row in (0, 2)]
+    assert select_rows(table, "rail", "b").to_pylist() == [table.to_pylist()[row] for row in (1, 2)]
+    assert select_rows(table, "rail", "c").num_rows == 0
 
 
 def test_pandas_stays_where_it_is():
@@ -85,7 +85,7 @@ VALUES = st.none() | st.fixed_dictionaries({
 
 @given(st.lists(VALUES, max_size=9))
 def test_nested_values_are_as_arrow_makes_them(values):
-    made = column_of(values, NESTED)
+    made = make_column(values, NESTED)
     made.validate(full=True)
     pairs = [value and value | {"of": value["of"] and sorted(value["of"].items())} for value in values]
     assert made.equals(pa.array(pairs, NESTED))

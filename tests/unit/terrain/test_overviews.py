@@ -6,7 +6,7 @@ from map_worlds import ArrayMap
 
 from tcpipe.terrain.grid import MapGrid
 from tcpipe.terrain.layers import PAPER_LAYERS
-from tcpipe.terrain.overviews import coarser_levels, factor_for, overview_factors, overview_grid
+from tcpipe.terrain.overviews import choose_factor, iterate_levels, list_factors, make_overview_grid
 from tcpipe.terrain.patches import patch_frames
 from tcpipe.terrain.sampling import sample_patches
 
@@ -34,12 +34,12 @@ def blocks(values, factor):
     ],
 )
 def test_levels_end_at_a_metre_or_where_nothing_is_left(rows, cols, pitch_m, wanted):
-    assert overview_factors(grid_of(rows, cols, pitch_m)) == wanted
+    assert list_factors(grid_of(rows, cols, pitch_m)) == wanted
 
 
 def test_a_levels_pixel_centres_are_the_means_of_its_pixels_centres():
     grid = grid_of(21, 34)
-    level = overview_grid(grid, 4)
+    level = make_overview_grid(grid, 4)
     assert (level.rows, level.cols, level.pitch_m) == (5, 8, 0.2)
     j, i = np.meshgrid(np.arange(34.0), np.arange(21.0))
     fine = grid.xy_from_px(np.stack([j, i], -1))
@@ -52,11 +52,11 @@ def test_heights_and_grey_are_means_and_missing_where_a_part_is_missing():
     rng = np.random.default_rng(0)
     height = rng.normal(0.0, 1.0, (37, 50))
     height[rng.random(height.shape) < 0.01] = np.nan
-    for factor, level in coarser_levels(PAPER_LAYERS["height"], height, (1, 2, 4, 8)):
+    for factor, level in iterate_levels(PAPER_LAYERS["height"], height, (1, 2, 4, 8)):
         np.testing.assert_allclose(level, blocks(height, factor).mean(-1), atol=1e-12)
     grey = rng.integers(1, 256, (37, 50)).astype(np.uint8)
     grey[5, 9] = 0
-    found = dict(coarser_levels(PAPER_LAYERS["ortho"], grey, (1, 2, 4)))
+    found = dict(iterate_levels(PAPER_LAYERS["ortho"], grey, (1, 2, 4)))
     assert sorted(found) == [2, 4]
     for factor, level in found.items():
         wanted = blocks(grey.astype(float), factor).mean(-1)
@@ -69,12 +69,12 @@ def test_heights_and_grey_are_means_and_missing_where_a_part_is_missing():
 def test_classes_are_the_commonest_of_all_pixels_not_of_halves():
     rng = np.random.default_rng(1)
     ids = rng.integers(0, 4, (43, 66)).astype(np.uint8)
-    for factor, level in coarser_levels(PAPER_LAYERS["terrain"], ids, (1, 2, 4, 8)):
+    for factor, level in iterate_levels(PAPER_LAYERS["terrain"], ids, (1, 2, 4, 8)):
         votes = np.stack([(blocks(ids, factor) == k).sum(-1) for k in range(4)], -1)
         np.testing.assert_array_equal(level, votes.argmax(-1))  # ties go to the lower id
     halves = np.kron(np.array([[1, 2], [3, 3]]), np.array([[1, 1], [1, 1]])).astype(np.uint8)
     halves[0, 0] = halves[0, 2] = halves[1, 1] = 3
-    assert dict(coarser_levels(PAPER_LAYERS["terrain"], halves, (1, 2, 4)))[4].tolist() == [[3]]
+    assert dict(iterate_levels(PAPER_LAYERS["terrain"], halves, (1, 2, 4)))[4].tolist() == [[3]]
 
 
 @pytest.mark.parametrize(
@@ -82,7 +82,7 @@ def test_classes_are_the_commonest_of_all_pixels_not_of_halves():
     [(0.005, 1), (0.02, 1), (0.039, 1), (0.0398, 2), (0.04, 2), (0.079, 2), (0.08, 4), (0.16, 8), (5.0, 8)],
 )
 def test_the_level_nearest_below_the_patchs_pitch_is_taken(pitch_m, wanted):
-    assert factor_for((1, 2, 4, 8), 0.02, pitch_m) == wanted
+    assert choose_factor((1, 2, 4, 8), 0.02, pitch_m) == wanted
 
 
 class Levels(ArrayMap):
@@ -90,10 +90,10 @@ class Levels(ArrayMap):
 
     def at(self, factor):
         arrays = {
-            name: dict(coarser_levels(PAPER_LAYERS[name], layer, self.factors))[factor]
+            name: dict(iterate_levels(PAPER_LAYERS[name], layer, self.factors))[factor]
             for name, layer in self.arrays.items()
         }
-        return ArrayMap(overview_grid(self.grid, factor), arrays, self.tile_px, self.height_reference_m)
+        return ArrayMap(make_overview_grid(self.grid, factor), arrays, self.tile_px, self.height_reference_m)
 
 
 def test_a_patch_coarser_than_the_map_shows_means_not_every_nth_pixel():

@@ -6,7 +6,7 @@ from map_worlds import World
 
 from tcpipe.formats.maps.building import build_map
 from tcpipe.formats.maps.map_files import open_map
-from tcpipe.terrain.point_classes import OFF_THE_MAP, classes_at
+from tcpipe.terrain.point_classes import OFF_THE_MAP, find_classes_at
 
 WORLD = World("EPSG:32633", 533_000.0, 5_213_000.0, side_m=60.0)
 
@@ -25,7 +25,7 @@ def test_classes_are_those_of_the_pixels_under_the_points(source):
     centre = rng.integers((0, 0), (grid.cols, grid.rows), (5000, 2))
     px = centre + rng.uniform(-0.499, 0.499, (5000, 2))  # pixel coordinates count centres
     xy = grid.xy_from_px(px)
-    found = classes_at(source, xy)
+    found = find_classes_at(source, xy)
     whole = source.read("terrain", 0, grid.rows, 0, grid.cols)
     np.testing.assert_array_equal(found, whole[tuple(centre.T[::-1])])
     assert (
@@ -36,7 +36,7 @@ def test_classes_are_those_of_the_pixels_under_the_points(source):
 def test_off_the_map_and_nowhere(source):
     x_min, y_min, x_max, y_max = source.grid.bounds_m
     points = np.array([(x_min - 1, y_min + 5), (x_max + 1, y_max), (np.nan, y_min), (x_min + 5, y_min + 5)])
-    found = classes_at(source, points)
+    found = find_classes_at(source, points)
     np.testing.assert_array_equal(found[:3], OFF_THE_MAP)
     assert found[3] > 0
-    assert classes_at(source, np.zeros((0, 2))).shape == (0,)
+    assert find_classes_at(source, np.zeros((0, 2))).shape == (0,)

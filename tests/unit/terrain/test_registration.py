@@ -6,7 +6,7 @@ from map_worlds import ArrayMap
 
 from tcpipe.terrain.grid import MapGrid
 from tcpipe.terrain.layers import PAPER_LAYERS
-from tcpipe.terrain.overviews import coarser_levels, overview_grid
+from tcpipe.terrain.overviews import iterate_levels, make_overview_grid
 from tcpipe.terrain.registration import register_track
 
 SIDE, PITCH_M = 1000, 0.1
@@ -26,8 +26,8 @@ def site(ground=rolling, noise_m=0.01, factors=(1,), seed=0):
 
 class Levels(ArrayMap):
     def at(self, factor):
-        arrays = {"height": dict(coarser_levels(PAPER_LAYERS["height"], self.arrays["height"], self.factors))[factor]}
-        return ArrayMap(overview_grid(self.grid, factor), arrays, self.tile_px, self.height_reference_m)
+        arrays = {"height": dict(iterate_levels(PAPER_LAYERS["height"], self.arrays["height"], self.factors))[factor]}
+        return ArrayMap(make_overview_grid(self.grid, factor), arrays, self.tile_px, self.height_reference_m)
 
 
 def drive(count=6000, seed=1):

@@ -8,7 +8,7 @@ from scipy.ndimage import map_coordinates
 from tcpipe.terrain.grid import MapGrid
 from tcpipe.terrain.patches import map_px_from_patch, patch_frames
 from tcpipe.terrain.sampling import sample_patches
-from tcpipe.terrain.tiles import CACHED_TILES, TilePool, groups_by_tile, read_window
+from tcpipe.terrain.tiles import CACHED_TILES, TilePool, group_by_tile, read_window
 
 
 def frames_at(grid, count, seed=1, margin_m=1.5, chord_m=1.0):
@@ -185,7 +185,7 @@ def test_the_tile_pool_is_bounded_and_reads_again_what_it_let_go():
 def test_positions_are_grouped_by_tile_once_each():
     source = random_map(rows=200, cols=900, tile_px=16)
     px = np.random.default_rng(0).uniform(-5.0, 905.0, (5000, 2))
-    groups = list(groups_by_tile(px, source))
+    groups = list(group_by_tile(px, source))
     assert sorted(np.concatenate(groups).tolist()) == list(range(5000))
     cells = np.clip(px, 0, (899, 199)).astype(int) // 16
     assert all(len(np.unique(cells[group], axis=0)) == 1 for group in groups)

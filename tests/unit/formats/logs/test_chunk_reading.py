@@ -5,7 +5,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tcpipe.formats.logs.chunk_reading import GROUP_BYTES, by_place, copy_pieces, excerpt, groups, spans
+from tcpipe.formats.logs.chunk_reading import (
+    GROUP_BYTES,
+    copy_pieces,
+    group_chunks,
+    plan_chunk_spans,
+    read_excerpt,
+    sort_by_place,
+)
 from tcpipe.formats.logs.log_part import DamageError
 
 LEAST_BYTES = 4
@@ -30,7 +37,7 @@ def planned(chunks):
     order = np.random.default_rng(0).permutation(len(number))
     sizes = np.array([len(data) for data, _, _ in chunks], np.int64)
     stamps = 1000 * number + offsets
-    return sizes, *by_place(
+    return sizes, *sort_by_place(
         number[order], channels[order], offsets[order], stamps[order], sizes, least_bytes=LEAST_BYTES
     )
 
@@ -47,10 +54,10 @@ def test_an_excerpt_holds_the_bytes_of_every_wanted_message_and_of_no_other(chun
         if channel in wanted
     ]
     found, followed = [], []
-    for span in spans(entries, sizes, sound, wanted):
+    for span in plan_chunk_spans(entries, sizes, sound, wanted):
         followed += span.chunks
         assert span.compact or len(span.chunks) == 1
-        got = excerpt(
+        got = read_excerpt(
             span,
             span.entries,
             load=lambda number: memoryview(chunks[number][0]),
@@ -74,8 +81,8 @@ def test_a_chunk_that_is_lost_costs_no_other(chunks, broken):
             raise DamageError("broken")
         return memoryview(chunks[number][0])
 
-    for span in spans(entries, sizes, sound, [1, 2]):
-        got = excerpt(
+    for span in plan_chunk_spans(entries, sizes, sound, [1, 2]):
+        got = read_excerpt(
             span, span.entries, load=load, copy=lambda number, places, to: copy_pieces(load(number), places, to)
         )
         assert [number for number, _ in got.lost] == [number for number in span.chunks if number == broken]
@@ -90,7 +97,7 @@ def test_a_chunk_that_is_lost_costs_no_other(chunks, broken):
 def test_an_index_that_cannot_be_is_not_sound(offsets, why):
     number = np.array([0, 0, 0, 1])
     place = np.array([*offsets, 5])
-    entries, sound = by_place(
+    entries, sound = sort_by_place(
         number, np.zeros(4, np.int64), place, place, np.array([100, 100]), least_bytes=LEAST_BYTES
     )
     assert sound.tolist() == [False, True], why
@@ -100,8 +107,8 @@ def test_an_index_that_cannot_be_is_not_sound(offsets, why):
 def test_an_unsound_chunk_is_read_alone():
     number, place = np.array([0, 2]), np.array([10, 10])
     sizes = np.full(3, 1000)
-    entries, _ = by_place(number, np.array([7, 7]), place, place, sizes, least_bytes=LEAST_BYTES)
-    (before, alone, after) = spans(entries, sizes, np.array([True, False, True]), [8])
+    entries, _ = sort_by_place(number, np.array([7, 7]), place, place, sizes, least_bytes=LEAST_BYTES)
+    (before, alone, after) = plan_chunk_spans(entries, sizes, np.array([True, False, True]), [8])
     assert [span.chunks for span in (before, alone, after)] == [range(1), range(1, 2), range(2, 3)]
     assert alone.entries is None
     assert len(before.entries.chunk) == len(after.entries.chunk) == 0
@@ -109,6 +116,6 @@ def test_an_unsound_chunk_is_read_alone():
 
 @given(st.lists(st.integers(0, 2 * GROUP_BYTES), max_size=20))
 def test_groups_follow_one_another_and_are_bounded(sizes):
-    found = list(groups(sizes))
+    found = list(group_chunks(sizes))
     assert [number for group in found for number in group] == list(range(len(sizes)))
     assert all(sum(sizes[number] for number in group[:-1]) < GROUP_BYTES for group in found)

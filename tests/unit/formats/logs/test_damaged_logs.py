@@ -21,7 +21,7 @@ from random_messages import (
 from rosbags.rosbag1 import Writer as BagWriter
 
 from tcpipe.formats.logs.bag_file import BagPart
-from tcpipe.formats.logs.bag_records import indexed_messages
+from tcpipe.formats.logs.bag_records import read_indexed_messages
 from tcpipe.formats.logs.chunk_reading import Excerpt
 from tcpipe.formats.logs.log_file import open_log
 from tcpipe.formats.logs.mcap_records import OP_CHUNK, RECORD_HEAD, record_offsets
@@ -247,7 +247,7 @@ def test_the_index_of_an_intact_bag_is_used(tmp_path):
     assert len(entries.offset) == len(messages)
 
     def borne_out(offset, entries):
-        return indexed_messages(Excerpt(data, offset, entries, []))[1]
+        return read_indexed_messages(Excerpt(data, offset, entries, []))[1]
 
     assert borne_out(entries.offset, entries).all()
     for wrong in (

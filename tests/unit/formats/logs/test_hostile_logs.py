@@ -28,7 +28,7 @@ from rosbags.rosbag2 import CompressionMode
 
 from tcpipe.errors import LogError
 from tcpipe.formats.logs.log_file import open_log
-from tcpipe.formats.logs.log_part import DamageError, decompressed, is_bomb
+from tcpipe.formats.logs.log_part import DamageError, decompress, is_bomb
 from tcpipe.formats.logs.mcap_records import OP_CHUNK, RECORD_HEAD, record_offsets
 
 TYPES = ("std_msgs/msg/ColorRGBA",)
@@ -132,11 +132,11 @@ def test_a_bomb_of_a_chunk_is_refused_by_what_it_claims_and_by_what_it_holds(bou
     piece = bytes(1 << 24)
     bomb = compress(piece)
     with pytest.raises(DamageError):
-        decompressed(codec, memoryview(bomb), 1000)  # it claims little and holds much
+        decompress(codec, memoryview(bomb), 1000)  # it claims little and holds much
     if codec == "zstd":
         with pytest.raises(DamageError, match=f"it claims to hold {BOMB_BYTES} bytes in {len(bomb)}"):
-            decompressed(codec, memoryview(bomb), BOMB_BYTES)
-    assert len(decompressed(codec, memoryview(bomb), len(piece))) == len(piece)
+            decompress(codec, memoryview(bomb), BOMB_BYTES)
+    assert len(decompress(codec, memoryview(bomb), len(piece))) == len(piece)
 
 
 def test_less_is_believed_of_what_is_held_as_a_whole():

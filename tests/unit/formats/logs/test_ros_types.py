@@ -120,9 +120,9 @@ def test_a_definition_that_unfolds_without_bound_is_refused():
 
 
 def test_definitions_bundled_for_robots_are_found():
-    from tcpipe.formats.logs.ros_types import shipped_definitions
+    from tcpipe.formats.logs.ros_types import load_shipped_definitions
 
-    assert "husky_msgs/msg/HuskyStatus" in shipped_definitions()
-    for name in shipped_definitions():
+    assert "husky_msgs/msg/HuskyStatus" in load_shipped_definitions()
+    for name in load_shipped_definitions():
         for ros1 in (False, True):
             assert resolve("", name=name, ros1=ros1).wire.fields

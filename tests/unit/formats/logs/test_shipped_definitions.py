@@ -5,12 +5,12 @@ import struct
 import pytest
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from tcpipe.formats.logs.ros_types import shipped_definitions
+from tcpipe.formats.logs.ros_types import load_shipped_definitions
 
 
 def store(kind: Stores):
     found = get_typestore(kind)
-    for name, text in shipped_definitions().items():
+    for name, text in load_shipped_definitions().items():
         found.register(get_types_from_msg(text, name))
     return found
 
@@ -18,7 +18,7 @@ def store(kind: Stores):
 @pytest.mark.parametrize("kind", [Stores.ROS1_NOETIC, Stores.ROS2_HUMBLE])
 def test_they_parse_and_make_messages(kind: Stores) -> None:
     types = store(kind)
-    for name in shipped_definitions():
+    for name in load_shipped_definitions():
         assert types.generate_msgdef(name, ros_version=1 if kind is Stores.ROS1_NOETIC else 2)[0]
 
 

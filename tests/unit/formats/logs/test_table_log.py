@@ -6,19 +6,19 @@ import pytest
 from simulated_streams import log_of
 
 from tcpipe.errors import LogError, UsageError
-from tcpipe.formats.logs.joined import open_logs
 from tcpipe.formats.logs.log_file import open_log
+from tcpipe.formats.logs.log_joining import open_logs
 from tcpipe.formats.logs.table_log import TableLog
-from tcpipe.formats.robot_files import shipped_profiles
+from tcpipe.formats.robot_files import load_shipped_profiles
 from tcpipe.formats.toml_text import parse_toml
 from tcpipe.pipeline.ingest import ingest
 from tcpipe.pipeline.inspect import inspect
 from tcpipe.recipe import Recipe, TableMapping
 from tcpipe.recipe.checking import from_values
-from tcpipe.simulation.scenarios import tiny
+from tcpipe.simulation.scenarios import make_tiny
 from tcpipe.stages.read import read_run
 from tcpipe.stages.read_roles import find_read_config
-from tcpipe.tables.columns import floats, integers
+from tcpipe.tables.columns import to_floats, to_integers
 
 START_NS = 1_760_456_485 * 10**9
 
@@ -57,13 +57,13 @@ WHEELS = TableMapping("odom.csv", columns={"linear_x": "v", "angular_z": "w"})
 
 @pytest.fixture(scope="module")
 def bag(tmp_path_factory):
-    scenario = tiny(seconds=20.0)
+    scenario = make_tiny(seconds=20.0)
     return log_of(scenario, scenario.drives[0], tmp_path_factory.mktemp("site"))
 
 
 def test_what_a_bag_holds_is_the_same_as_tables(bag, tmp_path):
     with open_log(bag) as log:
-        wanted = read_run(log, Recipe().read, robot=None, known=shipped_profiles())
+        wanted = read_run(log, Recipe().read, robot=None, known=load_shipped_profiles())
     folder = tmp_path / "drive"
     folder.mkdir()
     for role, name in (
@@ -89,9 +89,12 @@ def test_what_a_bag_holds_is_the_same_as_tables(bag, tmp_path):
     recipe = Recipe(tables=SAME)
     with open_logs([folder], tables=recipe.tables) as log:
         assert (log.damage, log.remarks) == ([], [])
-        found = read_run(log, find_read_config(recipe, log.topics), robot=None, known=shipped_profiles())
+        found = read_run(log, find_read_config(recipe, log.topics), robot=None, known=load_shipped_profiles())
     for role in ("gnss", "imu", "wheel_odometry", "power"):
-        assert integers(found.tables[role], "stamp_ns").tolist() == integers(wanted.tables[role], "stamp_ns").tolist()
+        assert (
+            to_integers(found.tables[role], "stamp_ns").tolist()
+            == to_integers(wanted.tables[role], "stamp_ns").tolist()
+        )
     for role, names in (
         ("gnss", ("lon_deg", "lat_deg", "alt_m", "east_var_m2", "up_var_m2")),
         ("imu", ("angular_velocity_z_radps", "linear_acceleration_x_mps2")),
@@ -99,7 +102,9 @@ def test_what_a_bag_holds_is_the_same_as_tables(bag, tmp_path):
         ("power", ("voltage_volt", "current_amp")),
     ):
         for name in names:
-            np.testing.assert_allclose(floats(found.tables[role], name), floats(wanted.tables[role], name), rtol=1e-12)
+            np.testing.assert_allclose(
+                to_floats(found.tables[role], name), to_floats(wanted.tables[role], name), rtol=1e-12
+            )
 
 
 def test_all_that_a_mapping_names_in_vain_is_said_at_once(tmp_path):

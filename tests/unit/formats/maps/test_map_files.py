@@ -15,13 +15,13 @@ from storage_server import object_store
 from tcpipe.errors import MapError
 from tcpipe.formats.bucket import open_place
 from tcpipe.formats.bucket_directories import fetch_files
+from tcpipe.formats.integrity import compute_checksums, write_checksums
 from tcpipe.formats.maps.building import build_map
 from tcpipe.formats.maps.map_facts import MapFacts, MapInputs
 from tcpipe.formats.maps.map_files import SHARD_PX, MapWriter, open_map
-from tcpipe.formats.seals import file_checksums, write_checksums
 from tcpipe.terrain.classes import PAPER_SCHEME
 from tcpipe.terrain.grid import MapGrid
-from tcpipe.terrain.layers import paper_layers
+from tcpipe.terrain.layers import make_paper_layers
 
 FACTS = MapFacts(
     sources={},
@@ -108,7 +108,7 @@ def wide(tmp_path_factory):
     grid = MapGrid("EPSG:32633", 500_000.0, 5_200_000.0, 0.03, 2100, 2100)
     rng = np.random.default_rng(0)
     height, ids = rng.normal(600.0, 1.0, (2100, 2100)), rng.integers(1, 8, (2100, 2100)).astype(np.uint8)
-    layers = paper_layers(("height", "terrain"), PAPER_SCHEME.table)
+    layers = make_paper_layers(("height", "terrain"), PAPER_SCHEME.table)
     writer = MapWriter(path, name="m", grid=grid, scheme=PAPER_SCHEME, layers=layers)
     for row in (0, SHARD_PX):
         for col in (0, SHARD_PX):
@@ -132,7 +132,7 @@ def test_overviews_across_shards_have_no_seam(wide):
 def test_of_a_map_in_a_bucket_the_tiles_that_are_read_are_fetched(wide, tmp_path, monkeypatch):
     path, served = wide[0], tmp_path / "served" / "tests" / "m.zarr"
     shutil.copytree(path, served)
-    checksums = {f"m.zarr/{name}": of for name, of in file_checksums(path).items()}
+    checksums = {f"m.zarr/{name}": of for name, of in compute_checksums(path).items()}
     with object_store(tmp_path / "served") as (environment, fetched):
         in_environment(monkeypatch, environment, tmp_path / "cache")
         root, shards = fetch_files(open_place("s3://tests"), checksums, by_range=lambda name: "/c/" in name)

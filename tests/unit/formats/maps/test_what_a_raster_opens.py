@@ -13,7 +13,7 @@ from map_worlds import write_tif
 from rasterio import Affine
 
 from tcpipe.errors import MapError
-from tcpipe.formats.maps.geotiff import raster_files, read_tile
+from tcpipe.formats.maps.geotiff import list_raster_files, read_tile
 from tcpipe.formats.maps.mosaic import open_raster
 
 PLACE = Affine(1.0, 0.0, 560_000.0, 0.0, -1.0, 5_215_000.0)
@@ -85,7 +85,7 @@ def test_whatever_reaches_elsewhere_is_refused_in_one_line_and_nobody_is_called(
         assert len(caught.value.problems) == 1, name
         assert f"{site}/" in caught.value.problems[0], name
         with pytest.raises(MapError, match=wanted):
-            raster_files(path)
+            list_raster_files(path)
     assert capfd.readouterr().err == ""
 
 
@@ -150,7 +150,7 @@ def test_a_raster_keeps_its_tags_masks_and_overviews(folders):
     values, valid = read(site / "h.tif")
     np.testing.assert_array_equal(values, HEIGHTS[0])
     np.testing.assert_array_equal(valid, mask > 0)
-    assert [path.name for path in raster_files(site / "h.tif")] == ["h.tif", "h.tif.msk", "h.tif.ovr"]
+    assert [path.name for path in list_raster_files(site / "h.tif")] == ["h.tif", "h.tif.msk", "h.tif.ovr"]
 
 
 def test_comments_that_never_end_cost_nothing(tmp_path):

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tcpipe.fusion.checks.clock_offsets import Pair, _settled, find_clock_offsets
+from tcpipe.fusion.checks.clock_offsets import Pair, _solve_offsets, find_clock_offsets
 from tcpipe.fusion.measurements import BodyVelocities, InertialMeasurements, Measurements, Positions
 
 
@@ -14,7 +14,7 @@ def pair(late, against, offset_s, std_s=0.002, explained=0.9, *, by="speed"):
 
 
 def test_the_one_that_differs_is_the_one_that_is_late():
-    found = _settled((pair("gnss", "wheel_odometry", 0.25), pair("wheel_odometry", "imu", 0.001)))
+    found = _solve_offsets((pair("gnss", "wheel_odometry", 0.25), pair("wheel_odometry", "imu", 0.001)))
     assert found.reference == "imu"
     assert found.offsets["gnss"].offset_s == pytest.approx(0.251)
     assert {role: offset.noted for role, offset in found.offsets.items()} == {"wheel_odometry": False, "gnss": True}
@@ -22,7 +22,7 @@ def test_the_one_that_differs_is_the_one_that_is_late():
 
 def test_the_majority_rules_over_the_order():
     pairs = pair("wheel_odometry", "imu", 0.1), pair("visual_odometry", "imu", 0.1), pair("gnss", "wheel_odometry", 0.0)
-    found = _settled(pairs)
+    found = _solve_offsets(pairs)
     assert found.reference == "wheel_odometry"
     assert {role for role, offset in found.offsets.items() if offset.noted} == {"imu"}
     assert found.offsets["imu"].offset_s == pytest.approx(-0.1)
@@ -35,7 +35,7 @@ def test_a_doubtful_clock_is_no_reference():
         pair("visual_odometry", "imu", 0.1),
         pair("power", "wheel_odometry", -0.02, 0.035),
     )
-    found = _settled(pairs)
+    found = _solve_offsets(pairs)
     assert found.reference == "wheel_odometry"
     assert {role for role, offset in found.offsets.items() if offset.noted} == {"imu"}
 
@@ -47,7 +47,7 @@ def test_pairs_in_a_ring_are_weighed_by_their_variances():
         pair("wheel_odometry", "imu", 0.04, 0.01),
         pair("visual_odometry", "wheel_odometry", 0.10, 0.01),
     )
-    offset = _settled(ring).offsets["visual_odometry"]
+    offset = _solve_offsets(ring).offsets["visual_odometry"]
     assert offset.offset_s == pytest.approx(0.34 / 3)
     assert offset.std_s == pytest.approx(0.01 * (2 / 3) ** 0.5)
 
@@ -63,20 +63,20 @@ def test_pairs_in_a_ring_are_weighed_by_their_variances():
     ],
 )
 def test_what_is_not_known_well_is_not_spoken_of(offset_s, std_s, explained, determined):
-    found = _settled((pair("gnss", "wheel_odometry", offset_s, std_s, explained),))
+    found = _solve_offsets((pair("gnss", "wheel_odometry", offset_s, std_s, explained),))
     assert found.pairs[0].determined == determined
     assert bool(found.offsets) == determined
 
 
 def test_small_offsets_are_not_noted_and_power_may_be_off_by_more():
     pairs = pair("gnss", "wheel_odometry", 0.045), pair("power", "wheel_odometry", 0.075)
-    assert not any(offset.noted for offset in _settled(pairs).offsets.values())
+    assert not any(offset.noted for offset in _solve_offsets(pairs).offsets.values())
     pairs = pair("gnss", "wheel_odometry", -0.055), pair("power", "wheel_odometry", 0.085)
-    assert all(_settled(pairs).offsets[role].noted for role in ("gnss", "power"))
+    assert all(_solve_offsets(pairs).offsets[role].noted for role in ("gnss", "power"))
 
 
 def blamed(*pairs):
-    return {role for role, offset in _settled(pairs).offsets.items() if offset.blamed}
+    return {role for role, offset in _solve_offsets(pairs).offsets.items() if offset.blamed}
 
 
 def test_a_sensor_is_blamed_only_where_two_others_agree_against_it():
@@ -90,7 +90,7 @@ def test_a_sensor_is_blamed_only_where_two_others_agree_against_it():
 def test_a_yaw_rate_does_not_speak_for_a_speed():
     """A filter that smooths the speed and passes the gyroscope's rate on: the fixes seem early, and are not."""
     smoothed = pair("gnss", "wheel_odometry", -0.15), pair("wheel_odometry", "imu", 0.0, by="yaw rate")
-    found = _settled(smoothed)
+    found = _solve_offsets(smoothed)
     assert found.offsets["gnss"].noted
     assert blamed(*smoothed) == set()
     assert (
@@ -102,13 +102,13 @@ def test_what_the_clock_of_the_fixes_may_be_off_by_is_a_cost_of_positions():
     """Two clocks that differ by 0.1 s: either is right; three: 0.4 and 0.2 s apart, or not at all."""
     agreed = pair("visual_odometry", "wheel_odometry", 0.0)
     drifting = Pair("gnss", "wheel_odometry", "speed", 0.1, 0.002, 0.9, 0.36, 0.01)
-    assert _settled((drifting, agreed), 3600.0).position_offset_s == pytest.approx(0.1 + 0.18)
-    assert _settled((pair("gnss", "wheel_odometry", -0.1), agreed)).position_offset_s == pytest.approx(0.1)
-    assert _settled((pair("gnss", "wheel_odometry", -0.1),)).position_offset_s == pytest.approx(0.1 * 0.5**0.5)
-    three = _settled((pair("gnss", "wheel_odometry", 0.2), pair("wheel_odometry", "imu", 0.2, by="yaw rate")))
+    assert _solve_offsets((drifting, agreed), 3600.0).position_offset_s == pytest.approx(0.1 + 0.18)
+    assert _solve_offsets((pair("gnss", "wheel_odometry", -0.1), agreed)).position_offset_s == pytest.approx(0.1)
+    assert _solve_offsets((pair("gnss", "wheel_odometry", -0.1),)).position_offset_s == pytest.approx(0.1 * 0.5**0.5)
+    three = _solve_offsets((pair("gnss", "wheel_odometry", 0.2), pair("wheel_odometry", "imu", 0.2, by="yaw rate")))
     assert three.position_offset_s == pytest.approx(((0.4**2 + 0.2**2) / 3) ** 0.5)
-    assert _settled((pair("gnss", "wheel_odometry", 0.01),)).position_offset_s == 0.0
-    assert _settled((pair("imu", "wheel_odometry", 0.1),)).position_offset_s == 0.0
+    assert _solve_offsets((pair("gnss", "wheel_odometry", 0.01),)).position_offset_s == 0.0
+    assert _solve_offsets((pair("imu", "wheel_odometry", 0.1),)).position_offset_s == 0.0
 
 
 def test_a_gyroscope_that_is_a_little_late_is_a_matter_of_the_heading():
@@ -118,12 +118,12 @@ def test_a_gyroscope_that_is_a_little_late_is_a_matter_of_the_heading():
             pair("wheel_odometry", "imu", -offset_s, **turning),
             pair("visual_odometry", "imu", -offset_s, **turning),
         )
-        return _settled((*pairs, pair("visual_odometry", "wheel_odometry", 0.0)))
+        return _solve_offsets((*pairs, pair("visual_odometry", "wheel_odometry", 0.0)))
 
     assert found(0.1).heading_offset_s == pytest.approx(0.1)
     assert found(0.3).heading_offset_s == found(0.01).heading_offset_s == 0.0
     assert (
-        _settled((pair("wheel_odometry", "imu", -0.1, by="yaw rate"),)).heading_offset_s == 0.0
+        _solve_offsets((pair("wheel_odometry", "imu", -0.1, by="yaw rate"),)).heading_offset_s == 0.0
     )  # who is late is not known
 
 

@@ -5,9 +5,15 @@ import itertools
 import numpy as np
 import pytest
 
-from tcpipe.fusion.checks.distances import COMMAND, contradictions, far_scale, find_distances, path_of_fixes
+from tcpipe.fusion.checks.distances import (
+    COMMAND,
+    compare_path_of_fixes,
+    estimate_far_scale,
+    find_contradictions,
+    find_distances,
+)
 from tcpipe.fusion.checks.lags import GRID_NS, GRID_S
-from tcpipe.fusion.checks.windows import liveliest_ns, windows_ns
+from tcpipe.fusion.checks.windows import find_liveliest_window_ns, iterate_windows_ns
 from tcpipe.fusion.measurements import BodyVelocities, Measurements, Positions
 
 AT_NS = np.arange(0, 120_000_000_000, GRID_NS, dtype=np.int64)
@@ -28,7 +34,7 @@ def path(twist, *, std_m=0.02, scale=1.0, mirror=False):
 
 
 def judged(gnss, turning=NOBODY, **twists):
-    return contradictions(find_distances(gnss, twists, AT_NS), turning=turning)
+    return find_contradictions(find_distances(gnss, twists, AT_NS), turning=turning)
 
 
 def test_sensors_that_agree_are_let_be():
@@ -63,18 +69,18 @@ def test_wheels_that_turn_while_the_robot_stands_are_stuck_not_wrong():
 
 @pytest.mark.parametrize(("mirror", "how"), [(False, "alike"), (True, "mirrored")])
 def test_a_mirrored_path_shows_in_its_bends(mirror, how):
-    assert path_of_fixes(path(TWIST, mirror=mirror), TWIST * [1.1, 1.2], AT_NS) == how
+    assert compare_path_of_fixes(path(TWIST, mirror=mirror), TWIST * [1.1, 1.2], AT_NS) == how
     straight = TWIST * [1, 0]
-    assert path_of_fixes(path(straight, mirror=mirror), straight, AT_NS) is None
+    assert compare_path_of_fixes(path(straight, mirror=mirror), straight, AT_NS) is None
 
 
 def test_a_path_of_another_drive_is_unlike_but_slip_noise_and_a_late_clock_are_not():
     other = np.column_stack((TWIST[:, 0], 0.4 * np.cos(0.17 * T)))
-    assert path_of_fixes(path(TWIST), other, AT_NS) == "unlike"
+    assert compare_path_of_fixes(path(TWIST), other, AT_NS) == "unlike"
     slipping = TWIST * np.column_stack((1.2 + 0.2 * np.sin(T / 5), np.full(T.size, 1.4)))
-    assert path_of_fixes(path(TWIST), slipping, AT_NS) != "unlike"
-    assert path_of_fixes(path(TWIST, std_m=2.0), other, AT_NS) is None
-    assert path_of_fixes(path(np.roll(TWIST, 50, axis=0)), TWIST, AT_NS) != "unlike"
+    assert compare_path_of_fixes(path(TWIST), slipping, AT_NS) != "unlike"
+    assert compare_path_of_fixes(path(TWIST, std_m=2.0), other, AT_NS) is None
+    assert compare_path_of_fixes(path(np.roll(TWIST, 50, axis=0)), TWIST, AT_NS) != "unlike"
 
 
 def test_an_hour_of_standing_is_not_what_is_judged():
@@ -84,7 +90,7 @@ def test_an_hour_of_standing_is_not_what_is_judged():
     wheels = BodyVelocities(
         stamp_ns, np.column_stack((speed, nothing, nothing)), np.ones((speed.size, 3)), nothing, nothing
     )
-    at_ns = liveliest_ns(Measurements(wheels=wheels))
+    at_ns = find_liveliest_window_ns(Measurements(wheels=wheels))
     assert at_ns[0] >= 2.1 * 3600e9
     assert (at_ns[-1] - at_ns[0]) * 1e-9 == pytest.approx(1800.0, abs=0.1)
 
@@ -97,11 +103,11 @@ def wheels_at(at_s):
 
 def test_where_nothing_was_measured_for_years_there_are_no_windows():
     years = np.concatenate((np.arange(600), 10**9 + np.arange(600)))
-    assert len(list(windows_ns(Measurements(wheels=wheels_at(years)), 600 * 10**9))) == 4
+    assert len(list(iterate_windows_ns(Measurements(wheels=wheels_at(years)), 600 * 10**9))) == 4
 
 
 def test_windows_cover_all_of_the_time_once():
-    found = list(windows_ns(Measurements(wheels=wheels_at(np.arange(2501))), 600 * 10**9))
+    found = list(iterate_windows_ns(Measurements(wheels=wheels_at(np.arange(2501))), 600 * 10**9))
     assert len(found) == 4
     assert found[0][0] == 0
     assert all(abs(b[0] - a[-1]) <= GRID_NS for a, b in itertools.pairwise(found))
@@ -116,7 +122,7 @@ def test_coarse_fixes_contradict_an_odometry_over_longer_windows():
 @pytest.mark.parametrize("std_m", [0.02, 2.0])
 @pytest.mark.parametrize("factor", [0.25, 0.43, 1.6, 3.6])
 def test_a_scale_far_from_one_is_told_by_the_fixes_where_the_paths_are_alike(factor, std_m):
-    found, std = far_scale(path(TWIST, std_m=std_m), TWIST * [factor, 1], AT_NS)
+    found, std = estimate_far_scale(path(TWIST, std_m=std_m), TWIST * [factor, 1], AT_NS)
     assert found == pytest.approx(factor, rel=0.06)
     assert std < 0.05 * factor
 
@@ -124,7 +130,7 @@ def test_a_scale_far_from_one_is_told_by_the_fixes_where_the_paths_are_alike(fac
 def test_a_scale_near_one_or_out_of_reason_or_of_another_path_is_none():
     fixes = path(TWIST)
     for other in (TWIST, TWIST * [1.3, 1], TWIST * [57.3, 1], TWIST * [0.43, -4.0], TWIST * [0.0, 1], STILL):
-        assert far_scale(fixes, other, AT_NS) is None
+        assert estimate_far_scale(fixes, other, AT_NS) is None
     slips = np.where((T > 40) & (T < 80), 0.3, 0.9)[:, None]
-    assert far_scale(fixes, TWIST * np.column_stack((slips, np.ones_like(slips))), AT_NS) is None
-    assert far_scale(path(STILL, std_m=2.0), TWIST * [0.43, 1], AT_NS) is None
+    assert estimate_far_scale(fixes, TWIST * np.column_stack((slips, np.ones_like(slips))), AT_NS) is None
+    assert estimate_far_scale(path(STILL, std_m=2.0), TWIST * [0.43, 1], AT_NS) is None

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from rough_drive import ANTENNA_M, measured
 
-from tcpipe.fusion.checks.doppler import doubt_of_velocity
+from tcpipe.fusion.checks.doppler import check_ground_velocity
 from tcpipe.fusion.measurements import GroundVelocities
 
 STD_MPS = 0.05
@@ -28,16 +28,16 @@ def with_velocity(sensors, truth, change=lambda v: v, **how):
 
 def test_the_true_velocity_is_not_doubted_by_any_set_of_sensors(truth, sensors):
     whole = with_velocity(sensors, truth)
-    assert doubt_of_velocity(whole) is None
-    assert doubt_of_velocity(replace(whole, wheels=None, visual=None, imu=None)) is None
-    assert doubt_of_velocity(with_velocity(sensors, truth, hz=1)) is None
+    assert check_ground_velocity(whole) is None
+    assert check_ground_velocity(replace(whole, wheels=None, visual=None, imu=None)) is None
+    assert check_ground_velocity(with_velocity(sensors, truth, hz=1)) is None
 
 
 def test_fixes_of_metres_take_longer_windows_and_still_tell(truth):
     rough = with_velocity(measured(truth, 3, gnss_std=1.0), truth)
-    assert doubt_of_velocity(rough) is None
+    assert check_ground_velocity(rough) is None
     turned = replace(rough.doppler, velocity_enu_mps=rough.doppler.velocity_enu_mps[:, [1, 0, 2]])
-    assert doubt_of_velocity(replace(rough, doppler=turned)) is not None
+    assert check_ground_velocity(replace(rough, doppler=turned)) is not None
 
 
 @pytest.mark.parametrize(
@@ -50,7 +50,7 @@ def test_fixes_of_metres_take_longer_windows_and_still_tell(truth):
     ],
 )
 def test_what_lies_is_named(truth, sensors, change, code, said):
-    doubt = doubt_of_velocity(with_velocity(sensors, truth, change))
+    doubt = check_ground_velocity(with_velocity(sensors, truth, change))
     assert doubt is not None
     assert (doubt.code, doubt.names, doubt.late_s) == (code, said, None)
     assert doubt.numbers.get("distance_ratio", 3.6) == pytest.approx(3.6, rel=0.01)
@@ -58,7 +58,7 @@ def test_what_lies_is_named(truth, sensors, change, code, said):
 
 def test_stamps_that_are_not_of_the_fixes_time_are_said_and_nobody_is_blamed(truth, sensors):
     """On this drive the speed changes too slowly for the wheels to tell a lag; the course does not."""
-    doubt = doubt_of_velocity(with_velocity(sensors, truth, late_ns=300_000_000))
+    doubt = check_ground_velocity(with_velocity(sensors, truth, late_ns=300_000_000))
     assert doubt is not None
     assert doubt.late_s is None
     assert (doubt.code, doubt.names) == ("clocks-differ", {"reference": "gnss"})
@@ -66,11 +66,11 @@ def test_stamps_that_are_not_of_the_fixes_time_are_said_and_nobody_is_blamed(tru
 
 
 def test_where_nothing_confirms_it_stays_out(truth, sensors):
-    assert doubt_of_velocity(sensors) is None  # there is none
-    alone = doubt_of_velocity(replace(with_velocity(sensors, truth), gnss=None))
+    assert check_ground_velocity(sensors) is None  # there is none
+    alone = check_ground_velocity(replace(with_velocity(sensors, truth), gnss=None))
     assert alone is not None
     assert alone.code == "velocity-unverified"
     still = replace(sensors.gnss, position_enu_m=0.0 * sensors.gnss.position_enu_m)
-    unmoved = doubt_of_velocity(replace(with_velocity(sensors, truth), gnss=still))
+    unmoved = check_ground_velocity(replace(with_velocity(sensors, truth), gnss=still))
     assert unmoved is not None
     assert unmoved.code == "velocity-unverified"

@@ -10,16 +10,16 @@ from scipy.spatial.transform import Rotation
 from tcpipe.fusion.checks.mounting import (
     Tilt,
     TiltEvidence,
-    antenna_doubt,
-    arm_evidence,
-    lag_of,
-    levelled,
-    rearmed,
+    add_antenna_uncertainty,
+    collect_arm_evidence,
+    collect_tilt_evidence,
+    estimate_antenna_uncertainty,
+    level_imu,
+    make_unknown_arm,
+    move_antenna,
     solve_arm,
+    solve_lag,
     solve_tilt,
-    tilt_evidence,
-    unknown_arm,
-    with_antenna_doubt,
 )
 from tcpipe.fusion.measurements import Measurements
 
@@ -42,7 +42,7 @@ def track(truth):
 
 
 def arm_of(track, sensors, moved_m=NOWHERE, **known):
-    return solve_arm([arm_evidence(track, sensors)], moved_m, **known)
+    return solve_arm([collect_arm_evidence(track, sensors)], moved_m, **known)
 
 
 def deviations(arm):
@@ -68,11 +68,11 @@ def test_an_antenna_where_it_is_stated_is_left_there(track, sensors):
 
 def test_an_antenna_stated_elsewhere_is_found_and_stays_found(track, sensors):
     wrong = np.array([0.4, -0.3, 0.0])
-    off = replace(sensors, gnss=rearmed(sensors.gnss, wrong))
+    off = replace(sensors, gnss=move_antenna(sensors.gnss, wrong))
     assert off.gnss.lever_arm_m == pytest.approx((0.6, -0.4, 0.8))
     arm = arm_of(track, off, height_std_m=0.05)
     assert arm.error[:2] == pytest.approx(-wrong[:2], abs=0.05)
-    mended = replace(off, gnss=rearmed(off.gnss, arm.error[:3]))
+    mended = replace(off, gnss=move_antenna(off.gnss, arm.error[:3]))
     again = arm_of(track, mended, arm.error[:3], height_std_m=0.05)
     assert again.error == pytest.approx(arm.error, abs=1e-3)
 
@@ -88,10 +88,10 @@ def test_a_lag_is_told_from_an_antenna_further_back_by_the_changes_of_speed(trac
 def test_only_a_lag_that_is_sure_and_matters_is_believed(track, sensors):
     late_ns = round(0.2e9)
     late = replace(sensors.gnss, stamp_ns=sensors.gnss.stamp_ns + late_ns)
-    lag_s, std_s = lag_of([arm_evidence(track, replace(sensors, gnss=late))], NOWHERE)
+    lag_s, std_s = solve_lag([collect_arm_evidence(track, replace(sensors, gnss=late))], NOWHERE)
     assert lag_s == pytest.approx(0.2, abs=4 * std_s)
-    assert lag_of([arm_evidence(track, sensors)], NOWHERE) is None
-    assert lag_of([None], NOWHERE) is None
+    assert solve_lag([collect_arm_evidence(track, sensors)], NOWHERE) is None
+    assert solve_lag([None], NOWHERE) is None
 
 
 def test_a_wrong_fix_now_and_then_and_for_a_while_moves_no_antenna(track, sensors):
@@ -103,7 +103,7 @@ def test_a_wrong_fix_now_and_then_and_for_a_while_moves_no_antenna(track, sensor
 
 
 def test_what_only_two_windows_show_is_no_evidence(track, sensors):
-    told = arm_evidence(track, sensors)
+    told = collect_arm_evidence(track, sensors)
     two = replace(told, matrix=told.matrix[:2], vector=told.vector[:2])
     assert solve_arm([two], np.zeros(3)) is None
 
@@ -122,7 +122,7 @@ def test_what_no_turn_shows_stays_unknown(track, sensors):
     fix_s = (sensors.gnss.stamp_ns - track.stamp_ns[0]) * 1e-9
     gnss = replace(sensors.gnss, position_enu_m=np.outer(fix_s, [0.8, 0.0, 0.0]) + sensors.gnss.lever_arm_m)
     visual = replace(sensors.visual, velocity_mps=ahead, lever_arm_m=(0.0, 0.0, 0.0))
-    assert arm_evidence(straight, Measurements(gnss=gnss, visual=visual)) is None
+    assert collect_arm_evidence(straight, Measurements(gnss=gnss, visual=visual)) is None
 
 
 def test_an_axis_that_an_odometry_does_not_measure_moves_no_antenna(track, sensors):
@@ -137,24 +137,24 @@ def test_an_axis_that_an_odometry_does_not_measure_moves_no_antenna(track, senso
 def test_wheels_do_not_see_where_the_robot_turns_about(track, sensors):
     arm = arm_of(track, replace(sensors, visual=None))
     assert deviations(arm)[0] >= 0.03
-    assert arm_evidence(track, replace(sensors, visual=None, wheels=None)) is None
-    assert arm_evidence(track, replace(sensors, gnss=None)) is None
+    assert collect_arm_evidence(track, replace(sensors, visual=None, wheels=None)) is None
+    assert collect_arm_evidence(track, replace(sensors, gnss=None)) is None
     assert solve_arm([], NOWHERE) is None
 
 
 @pytest.mark.parametrize(("roll_deg", "pitch_deg"), [(0.0, 0.0), (0.0, 5.0), (4.0, -3.0)])
 def test_a_tilted_imu_is_found(track, sensors, roll_deg, pitch_deg):
     unit = tilted(sensors.imu, roll_deg, pitch_deg)
-    tilt = solve_tilt([tilt_evidence(track, replace(sensors, imu=unit))])
+    tilt = solve_tilt([collect_tilt_evidence(track, replace(sensors, imu=unit))])
     assert np.degrees(tilt.rad) == pytest.approx([roll_deg, pitch_deg], abs=1.0)
     assert (np.abs(np.degrees(tilt.rad) - [roll_deg, pitch_deg]) < 4 * np.degrees(tilt.std_rad)).all()
     assert np.degrees(tilt.std_rad).max() < 1.0
 
 
 def test_without_fixes_or_force_nothing_tells_a_tilt(track, sensors):
-    assert tilt_evidence(track, replace(sensors, gnss=None)) is None
-    assert tilt_evidence(track, replace(sensors, imu=None)) is None
-    assert tilt_evidence(track, replace(sensors, imu=replace(sensors.imu, accelerometer_usable=False))) is None
+    assert collect_tilt_evidence(track, replace(sensors, gnss=None)) is None
+    assert collect_tilt_evidence(track, replace(sensors, imu=None)) is None
+    assert collect_tilt_evidence(track, replace(sensors, imu=replace(sensors.imu, accelerometer_usable=False))) is None
     assert solve_tilt([]) is None
 
 
@@ -165,7 +165,7 @@ def test_what_is_not_known_of_an_arm_turns_with_the_robot(track, sensors):
         quat_xyzw=np.tile(Rotation.from_euler("z", 90, degrees=True).as_quat(), (track.stamp_ns.size, 1)),
         velocity_enu_mps=np.tile([0.0, 0.9, 0.0], (track.stamp_ns.size, 1)),
     )
-    doubted = with_antenna_doubt(north, np.diag([0.09, 0.0, 0.0]), sensors.gnss)
+    doubted = add_antenna_uncertainty(north, np.diag([0.09, 0.0, 0.0]), sensors.gnss)
     assert doubted.position_std_m[:, 0] == pytest.approx(0.01)
     assert doubted.position_std_m[:, 1] == pytest.approx(np.hypot(0.01, 0.3))
 
@@ -185,24 +185,24 @@ def test_an_arms_error_that_goes_round_with_the_robot_is_an_error_of_ways_and_sp
         forward_velocity_std_mps=zero,
     )
     fixes = replace(sensors.gnss, variance_m2=np.full_like(sensors.gnss.variance_m2, 1e-8))
-    doubted = with_antenna_doubt(round_, np.diag([0.0, 0.01, 0.0]), fixes)
+    doubted = add_antenna_uncertainty(round_, np.diag([0.0, 0.01, 0.0]), fixes)
     assert doubted.forward_velocity_std_mps == pytest.approx(np.full(at_s.size, 0.1 * turn_radps))
     expected = 0.1 * 2.0 * np.sin(turn_radps * np.array([0.5, 1.0, 2.0, 4.0]) / 2.0)
     assert doubted.displacement_std_m[:-100] == pytest.approx(np.tile(expected, (at_s.size - 100, 1)), rel=1e-5)
-    ahead = with_antenna_doubt(round_, np.diag([0.01, 0.0, 0.0]), fixes)
+    ahead = add_antenna_uncertainty(round_, np.diag([0.01, 0.0, 0.0]), fixes)
     assert ahead.displacement_std_m == pytest.approx(1e-4, abs=1e-9)
     metres = replace(sensors.gnss, variance_m2=np.full_like(sensors.gnss.variance_m2, 1.0))  # odometry tells the way
-    assert with_antenna_doubt(round_, np.diag([0.0, 0.01, 0.0]), metres).displacement_std_m == pytest.approx(
+    assert add_antenna_uncertainty(round_, np.diag([0.0, 0.01, 0.0]), metres).displacement_std_m == pytest.approx(
         1e-4, rel=1e-3
     )
 
 
 def test_a_tilt_that_is_known_so_well_moves_an_antenna_above_it():
-    assert antenna_doubt(None, None, (0.0, 0.0, 1.0)) is None
+    assert estimate_antenna_uncertainty(None, None, (0.0, 0.0, 1.0)) is None
     tilt = Tilt(np.array([0.09, -0.03]), np.array([0.02, 0.01]))
-    doubt = antenna_doubt(unknown_arm(), tilt, (0.0, 0.0, 0.9))
+    doubt = estimate_antenna_uncertainty(make_unknown_arm(), tilt, (0.0, 0.0, 0.9))
     assert np.diag(doubt) == pytest.approx([0.25 + 0.009**2, 0.25 + 0.018**2, 0.25])
-    rolled = antenna_doubt(
+    rolled = estimate_antenna_uncertainty(
         None, replace(tilt, rad=np.array([0.09, 0.0])), (0.0, 0.0, 0.9)
     )  # its pitch is as it is stated
     assert np.diag(rolled) == pytest.approx([0.0, 0.018**2, 0.0])
@@ -213,7 +213,7 @@ def test_a_roll_that_no_turn_shows_stays_nothing(track, sensors):
     at_s = (sensors.imu.stamp_ns - sensors.imu.stamp_ns[0]) * 1e-9
     drift = np.outer(np.sin(at_s / 60.0), [0.0, 0.03, 0.01])
     straight = replace(sensors.imu, angular_velocity_radps=drift)
-    tilt = solve_tilt([tilt_evidence(track, replace(sensors, imu=straight))])
+    tilt = solve_tilt([collect_tilt_evidence(track, replace(sensors, imu=straight))])
     assert tilt.rad[0] == 0.0
     assert np.degrees(tilt.std_rad[0]) == pytest.approx(1.0, rel=0.01)
     rows = np.full(60, 200.0)
@@ -222,6 +222,6 @@ def test_a_roll_that_no_turn_shows_stays_nothing(track, sensors):
 
 
 def test_levelling_undoes_a_tilt(sensors):
-    there_and_back = levelled(tilted(sensors.imu, 4.0, -3.0), np.radians([4.0, -3.0]))
+    there_and_back = level_imu(tilted(sensors.imu, 4.0, -3.0), np.radians([4.0, -3.0]))
     for name in ("angular_velocity_radps", "specific_force_mps2"):
         assert getattr(there_and_back, name) == pytest.approx(getattr(sensors.imu, name), abs=1e-9)

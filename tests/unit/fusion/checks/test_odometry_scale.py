@@ -5,7 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tcpipe.fusion.checks.odometry_scale import Scale, over_command, rescaled, solve_scales, way_ratios
+from tcpipe.fusion.checks.odometry_scale import (
+    Scale,
+    compute_command_ratio,
+    distance_ratios,
+    rescale_odometry,
+    solve_scales,
+)
 from tcpipe.fusion.measurements import BodyVelocities
 
 
@@ -14,7 +20,7 @@ def times(source, factor):
 
 
 def test_sensors_as_they_are_have_no_scale_to_mend(track, sensors):
-    ratios = way_ratios(track, sensors)
+    ratios = distance_ratios(track, sensors)
     assert np.median(ratios["visual_odometry"]) == pytest.approx(1.0, abs=0.005)
     assert np.median(ratios["wheel_odometry"]) == pytest.approx(1.02, abs=0.02)
     assert solve_scales([ratios]) == {}
@@ -23,25 +29,27 @@ def test_sensors_as_they_are_have_no_scale_to_mend(track, sensors):
 @pytest.mark.parametrize("factor", [0.7, 1.3])
 def test_a_scale_that_is_off_throughout_is_found_and_taken_out(track, sensors, factor):
     off = replace(sensors, visual=times(sensors.visual, factor), wheels=times(sensors.wheels, factor))
-    found = solve_scales([way_ratios(track, off)])
+    found = solve_scales([distance_ratios(track, off)])
     assert found["visual_odometry"].factor == pytest.approx(factor, rel=0.01)
     assert found["wheel_odometry"].factor == pytest.approx(1.02 * factor, rel=0.02)
-    mended = rescaled(off.visual, found["visual_odometry"].factor)
+    mended = rescale_odometry(off.visual, found["visual_odometry"].factor)
     assert mended.velocity_mps == pytest.approx(sensors.visual.velocity_mps, abs=0.03)
     assert (mended.variance_m2ps2 >= off.visual.variance_m2ps2).all()
-    again = way_ratios(track, replace(off, visual=mended, wheels=rescaled(off.wheels, found["wheel_odometry"].factor)))
+    again = distance_ratios(
+        track, replace(off, visual=mended, wheels=rescale_odometry(off.wheels, found["wheel_odometry"].factor))
+    )
     assert solve_scales([again]) == {}
 
 
 def test_slip_of_a_minute_is_no_scale(track, sensors):
     at_s = (sensors.wheels.stamp_ns - sensors.wheels.stamp_ns[0]) * 1e-9
     slips = np.where((at_s > 30) & (at_s < 80), 1.5, 1.0)[:, None]
-    assert solve_scales([way_ratios(track, replace(sensors, wheels=times(sensors.wheels, slips)))]) == {}
+    assert solve_scales([distance_ratios(track, replace(sensors, wheels=times(sensors.wheels, slips)))]) == {}
 
 
 def test_without_fix_and_camera_nothing_tells_a_scale(track, sensors):
-    assert way_ratios(track, replace(sensors, gnss=None, visual=None)) == {}
-    assert set(way_ratios(track, replace(sensors, gnss=None))) == {"wheel_odometry"}
+    assert distance_ratios(track, replace(sensors, gnss=None, visual=None)) == {}
+    assert set(distance_ratios(track, replace(sensors, gnss=None))) == {"wheel_odometry"}
 
 
 COMMAND_NS = np.arange(0, 120 * 10**9, 10**8, dtype=np.int64)
@@ -61,14 +69,14 @@ def driven(over, *, commanded):
 def test_a_robot_that_is_faster_than_its_command_has_other_wheels(over, found):
     jitter = np.random.default_rng(1).normal(0, 0.01, COMMAND_NS.size)
     commanded = np.where(COMMAND_NS % (30 * 10**9) < 24 * 10**9, 1.0 + jitter, 0.0)
-    told = over_command(driven(over, commanded=commanded), COMMAND_NS, commanded)
+    told = compute_command_ratio(driven(over, commanded=commanded), COMMAND_NS, commanded)
     assert told == (None if found is None else pytest.approx(found, abs=0.02))
 
 
 def test_a_command_that_is_not_what_drives_tells_nothing():
     moving = driven(1.2, commanded=np.ones(COMMAND_NS.size))
-    assert over_command(moving, COMMAND_NS, np.zeros(COMMAND_NS.size)) is None
-    assert over_command(moving, COMMAND_NS[:0], np.zeros(0)) is None
+    assert compute_command_ratio(moving, COMMAND_NS, np.zeros(COMMAND_NS.size)) is None
+    assert compute_command_ratio(moving, COMMAND_NS[:0], np.zeros(0)) is None
 
 
 def test_a_scale_that_is_found_after_another_was_taken_out_counts_with_it():

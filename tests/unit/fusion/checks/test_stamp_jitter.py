@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from unit.fusion import drive
 
-from tcpipe.fusion.checks.stamp_jitter import stamp_jitter_s, with_jitter
+from tcpipe.fusion.checks.stamp_jitter import add_jitter_variance, stamp_jitter_s
 
 
 def test_clean_fixes_show_none_also_with_outliers_slip_and_stops():
@@ -22,7 +22,7 @@ def test_late_fixes_are_seen_and_their_variance_raised_while_driving():
     gnss = replace(measurements.gnss, stamp_ns=late)
     jitter = stamp_jitter_s(gnss, measurements.wheels)
     assert np.median(jitter) == pytest.approx(0.10, abs=0.03)
-    raised = with_jitter(gnss, measurements.wheels, jitter)
+    raised = add_jitter_variance(gnss, measurements.wheels, jitter)
     speed = np.abs(np.interp(late, drive.ns(truth.t), truth.forward))
     assert (raised.variance_m2[speed > 0.7, 0] > 0.1**2).mean() > 0.9
     assert (raised.variance_m2[speed < 0.01, 0] < 0.05**2).mean() > 0.9

@@ -10,7 +10,7 @@ import pytest
 import shapely
 from synthetic_store import WORLD, add_run, add_world, box, lanes, region_file, segments
 
-from tcpipe.balance.cells import SLOPE_NAMES, slope_ranges
+from tcpipe.balance.cells import SLOPE_NAMES, find_slope_ranges
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.recipe import Recipe
 from tcpipe.store import open_store
@@ -48,7 +48,7 @@ def test_cells_hold_the_samples_that_are_in_use(built, balance):
     used = samples.filter(samples["split"].to_numpy() != np.array("buffer"))
     for cells in (balance["cells"], balance["by_class_and_slope"]):
         assert sum(sum(cell["samples"].values()) for cell in cells) == used.num_rows
-    names = np.array(SLOPE_NAMES)[slope_ranges(used["slope_rad"].to_numpy())]
+    names = np.array(SLOPE_NAMES)[find_slope_ranges(used["slope_rad"].to_numpy())]
     for cell in balance["by_class_and_slope"]:
         rows = (names == cell["slope"]) & (used["terrain_name"].to_numpy() == cell["class"])
         assert sum(cell["samples"].values()) == rows.sum()
@@ -81,7 +81,7 @@ def test_where_to_drive_next_is_geojson_that_a_gis_takes(built, balance):
     to_map = pyproj.Transformer.from_crs(4326, WORLD.crs, always_xy=True)
     samples = pq.read_table(built / "samples.parquet")
     rare = {(row["class"], row["slope"]) for row in balance["by_class_and_slope"] if row["rare"]}
-    names = np.array(SLOPE_NAMES)[slope_ranges(samples["slope_rad"].to_numpy())]
+    names = np.array(SLOPE_NAMES)[find_slope_ranges(samples["slope_rad"].to_numpy())]
     used = samples["split"].to_numpy() != np.array("buffer")
     closed = shapely.Polygon(np.add(CLOSED, (WORLD.x_m, WORLD.y_m))).buffer(np.sqrt(2.0))
     as_said = []

@@ -9,7 +9,7 @@ from synthetic_store import add_run, add_world, box, lanes, lonlat, region_file,
 from tcpipe.dataset import open_dataset
 from tcpipe.errors import DatasetError, MapError, RecipeError, RegionError, StoreError, UsageError
 from tcpipe.formats.dataset_card import KeptSplit
-from tcpipe.formats.recipe_toml import parse_recipe, recipe_id
+from tcpipe.formats.recipe_toml import make_recipe_id, parse_recipe
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.verify import verify
 from tcpipe.recipe import LabelConfig, Recipe, SplitConfig
@@ -109,7 +109,10 @@ def test_runs_of_another_recipe_are_left_out_and_named(store, tmp_path):
     add(store)
     result = build(store, tmp_path)
     (found,) = select_findings(result.findings, "run-ingested-otherwise")
-    assert (found.subject, found.names) == (Subject("run", "b"), {"what": "recipe", "has": recipe_id(other, "husky")})
+    assert (found.subject, found.names) == (
+        Subject("run", "b"),
+        {"what": "recipe", "has": make_recipe_id(other, "husky")},
+    )
     assert [of.command for of in found.remedies] == ["tcpipe ingest /logs/b.mcap"]
     assert (result.card.samples, result.exit_code) == (20, 3)
 

@@ -18,7 +18,7 @@ from tcpipe.errors import DatasetError
 from tcpipe.formats.dataset_files import read_card, read_samples
 from tcpipe.formats.json_files import to_json
 from tcpipe.pipeline.dataset.build import build_dataset
-from tcpipe.pipeline.dataset.redaction import PLANE, plane_per_chord, redact_findings, what_is_told
+from tcpipe.pipeline.dataset.redaction import PLANE, compute_plane_per_chord, find_leaks, redact_findings
 from tcpipe.pipeline.verify import verify
 from tcpipe.store import open_store
 from tcpipe.tables.catalogue import read_catalogue
@@ -170,11 +170,11 @@ def test_verify_says_that_it_is_redacted_and_finds_what_is_told_all_the_same(bui
     assert found.notes[0] == "It is redacted."
     assert verify(here / "told").notes == ()
     card, samples = read_card(here / "redacted"), read_samples(here / "redacted")
-    assert list(what_is_told(card, samples)) == []
-    assert len(list(what_is_told(card, read_samples(here / "told")))) == 7
-    found = list(what_is_told(replace(card, findings=(*card.findings, LEAKING[0])), samples))
+    assert list(find_leaks(card, samples)) == []
+    assert len(list(find_leaks(card, read_samples(here / "told")))) == 7
+    found = list(find_leaks(replace(card, findings=(*card.findings, LEAKING[0])), samples))
     assert found == ["it is said to be redacted, but a finding topic-not-used holds more than is public"]
-    assert list(what_is_told(replace(card, maps=read_card(here / "told").maps), samples))
+    assert list(find_leaks(replace(card, maps=read_card(here / "told").maps), samples))
 
 
 def test_no_text_of_a_log_is_in_anything_that_is_written(built):
@@ -238,7 +238,7 @@ def test_distances_do_not_tell_the_scale_of_the_plane(built):
     """The scale of UTM tells the distance from the central meridian: places against chords and courses, all segments together."""
     here, *_ = built
     redacted = read_samples(here / "redacted")
-    ratio, std, _ = plane_per_chord(redacted)
+    ratio, std, _ = compute_plane_per_chord(redacted)
     assert std < 5e-5
     assert abs(ratio - 1.0) < 3.0 * std
     length_m = np.hypot(
@@ -250,10 +250,10 @@ def test_distances_do_not_tell_the_scale_of_the_plane(built):
     for name in ("start_x_m", "start_y_m", "end_x_m", "end_y_m"):
         at = as_before.schema.get_field_index(name)
         as_before = as_before.set_column(at, name, [(redacted[name].to_numpy() * k / 0.01).round() * 0.01])
-    assert plane_per_chord(as_before)[0] == pytest.approx(k, abs=5 * std)
+    assert compute_plane_per_chord(as_before)[0] == pytest.approx(k, abs=5 * std)
     assert any(
         "the scale of the maps' plane tells the place" in line
-        for line in what_is_told(read_card(here / "redacted"), as_before)
+        for line in find_leaks(read_card(here / "redacted"), as_before)
     )
 
 

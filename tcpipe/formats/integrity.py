@@ -1,0 +1,238 @@
+"""Seals: what lets `tcpipe verify` find one changed byte in files that no list of checksums can name (ADR-28).
+
+A JSON document holds the sha256 of the rest of itself, a page that of all before its last line; a PNG brings its own checksums. What
+a sealed document lists, by path, size and sha256, is proved by it in turn.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+import zlib
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeVar
+
+from tcpipe.errors import StoreError
+from tcpipe.formats.json_files import Json, digest, parse_json, parse_typed, read_document, to_plain, write_json
+
+T = TypeVar("T")
+
+SEAL = "document_sha256"
+"""Key of a sealed document that holds the sha256 (hex) of its canonical JSON without this key."""
+
+MOST_PAGE_BYTES = 256 << 20
+"""A sealed page or picture is at most so large [byte]."""
+
+CHECKSUMS = "checksums.json"
+"""In a directory whose files cannot be listed elsewhere: a sealed document with the key ``checksums``."""
+
+_SEAL_LINE = re.compile(rb'^  "document_sha256": "([0-9a-f]{64})"(,?)\n', re.MULTILINE)
+"""The seal in canonical JSON: the text without this line is what it is the hash of."""
+
+_TELLS = "; 'tcpipe verify {}' tells what else is not as it was written"
+
+_PAGE_SEAL = "<!-- sha256 of the lines above: {} -->\n"
+_PNG_START = b"\x89PNG\r\n\x1a\n"
+
+
+@dataclass(frozen=True, slots=True)
+class Checksum:
+    """What a sealed document has of a file."""
+
+    size_bytes: int
+    sha256: str
+
+
+@dataclass(frozen=True, slots=True)
+class Checksums:
+    """The document ``checksums.json``: every file of its directory, by path."""
+
+    checksums: Mapping[str, Checksum]
+
+
+def write_sealed(path: Path, value: object) -> None:
+    """Write a JSON object with a seal, whole or not at all."""
+    write_json(path, seal_document(value))
+
+
+def seal_document(value: object) -> dict[str, Json]:
+    """Return a dataclass or a mapping as a JSON object with its seal."""
+    bare = {key: item for key, item in to_plain(value).items() if key != SEAL}
+    return {**bare, SEAL: digest(bare)}
+
+
+def read_sealed(path: Path, *, ours: Callable[[Mapping[str, Json]], bool] = lambda _: True) -> dict[str, Json]:
+    """Read a JSON object that `write_sealed` wrote, and prove it.
+
+    Parameters
+    ----------
+    path : the document.
+    ours : tells by kind and version whether it is of those that this version seals; what is not is returned unproved, for the caller to
+        refuse.
+
+    Raises
+    ------
+    StoreError : it cannot be read, or is not as it was written.
+    """
+    return verify_document(read_document(path), path, ours=ours)
+
+
+def verify_document(
+    data: bytes, where: Path | str, *, ours: Callable[[Mapping[str, Json]], bool] = lambda _: True
+) -> dict[str, Json]:
+    """Return the JSON object in the bytes of a document that lies at ``where``, proved; as `read_sealed`."""
+    found = parse_json(data, where)
+    if not ours(found):
+        return found
+    if not _is_whole_document(data):
+        raise StoreError(f"{describe_broken(where)}{_TELLS.format(str(where).rpartition('/')[0])}")
+    return found
+
+
+def read_sealed_as(path: Path, cls: type[T]) -> T:
+    """Read and prove a sealed JSON object, as a dataclass; `StoreError` as `read_sealed`."""
+    return parse_typed(read_sealed(path), cls, path)
+
+
+def prove_files(directory: Path, checksums: Mapping[str, Checksum], names: Iterable[str]) -> None:
+    """Compare files of a directory with what a sealed document has of them; `StoreError` names the first that differs."""
+    lines = list(find_broken_checksums(directory, {name: checksums.get(name) for name in names}))
+    if lines:
+        more = f", and {len(lines) - 1} more" if len(lines) > 1 else ""
+        raise StoreError(f"{lines[0]}{more}{_TELLS.format(directory)}")
+
+
+def write_checksums(directory: Path) -> None:
+    """Write ``checksums.json`` into a directory that is otherwise complete: every file below it."""
+    write_sealed(directory / CHECKSUMS, Checksums(compute_checksums(directory)))
+
+
+def read_checksums(directory: Path) -> Mapping[str, Checksum]:
+    """Return what ``checksums.json`` has of every file of its directory; `StoreError` as `read_sealed`."""
+    return read_sealed_as(directory / CHECKSUMS, Checksums).checksums
+
+
+def seal_page(html: str) -> str:
+    """Return a page with its seal as the last line."""
+    text = html if html.endswith("\n") else f"{html}\n"
+    return text + _PAGE_SEAL.format(hashlib.sha256(text.encode()).hexdigest())
+
+
+def describe_broken(path: Path | str) -> str:
+    """Return the line about a file that is not what its seal or its checksum says."""
+    return f"{path}: is not as it was written: its checksum does not agree"
+
+
+def find_broken_seal(path: Path) -> str | None:
+    """Return in one line why a sealed file (``.json``, ``.html``) or a ``.png`` is not as it was written, None if it is."""
+    try:
+        if path.stat().st_size > MOST_PAGE_BYTES:
+            return f"{path}: is larger than {MOST_PAGE_BYTES >> 20} MB, which no page or picture is"
+        return find_broken_seal_in(path.read_bytes(), path)
+    except OSError as error:
+        return f"{path}: cannot be read ({error.strerror})"
+
+
+def find_broken_seal_in(data: bytes | None, where: Path | str) -> str | None:
+    """Return the same of the bytes of a file that lies at ``where``; None: it is not there."""
+    if data is None:
+        return f"{where}: is gone"
+    whole = {".html": _is_whole_page, ".png": _is_whole_png}.get(Path(where).suffix, _is_whole_document)
+    return None if whole(data) else describe_broken(where)
+
+
+def find_broken_checksums(directory: Path, checksums: Mapping[str, Checksum | None]) -> Iterator[str]:
+    """Yield a line for every file below ``directory`` that is not what ``checksums`` has of it, by path; None: nothing."""
+    for name, wanted in checksums.items():
+        path = directory / name
+        if not path.is_file():
+            yield f"{path}: is gone"
+            continue
+        try:
+            size = path.stat().st_size
+            if wanted is not None and size != wanted.size_bytes:
+                yield f"{path}: has {size} bytes, wanted {wanted.size_bytes}"
+                continue
+            found = compute_checksum(path)
+        except OSError as error:
+            yield f"{path}: cannot be read ({error.strerror})"
+            continue
+        if wrong := find_wrong_checksum(path, found, wanted):
+            yield wrong
+
+
+def find_wrong_checksum(where: Path | str, found: Checksum | None, wanted: Checksum | None) -> str | None:
+    """Return in one line how a file differs from what a document has of it (None: nothing), None if it does not."""
+    if found is None:
+        return f"{where}: is gone"
+    if wanted is None:
+        return f"{where}: its sha256 is not on record"
+    if found == wanted:
+        return None
+    size = "" if found.size_bytes == wanted.size_bytes else f" ({found.size_bytes} bytes, wanted {wanted.size_bytes})"
+    return f"{where}: its sha256 is {found.sha256[:12]}…, wanted {wanted.sha256[:12]}…{size}"
+
+
+def compute_checksum(path: Path) -> Checksum:
+    """Return size and sha256 of a file."""
+    with path.open("rb") as stream:
+        return Checksum(path.stat().st_size, hashlib.file_digest(stream, "sha256").hexdigest())
+
+
+def compute_checksums(directory: Path) -> dict[str, Checksum]:
+    """Return size and sha256 of every file below ``directory``, by its path inside it."""
+    files = sorted(entry for entry in directory.rglob("*") if entry.is_file())
+    return {path.relative_to(directory).as_posix(): compute_checksum(path) for path in files}
+
+
+def seal_of(directory: Path) -> str:
+    """Return what tells the content of a directory with a ``checksums.json`` from any other; `StoreError` if that cannot be read."""
+    return str(read_sealed(directory / CHECKSUMS).get(SEAL))
+
+
+def read_picture_text(path: Path, key: str) -> str | None:
+    """Return a text that a PNG carries under a key (RFC 2083, section 4.2.3), None if it has none."""
+    try:
+        chunks = list(_iterate_png_chunks(path.read_bytes()))
+    except OSError:
+        return None
+    texts = (data.partition(b"\0") for kind, data, _ in chunks if kind == b"tEXt")
+    return next((text.decode("latin-1") for name, _, text in texts if name == key.encode("latin-1")), None)
+
+
+def _is_whole_document(data: bytes) -> bool:
+    seal = _SEAL_LINE.search(data)
+    if seal is None:
+        return False
+    before, after = data[: seal.start()], data[seal.end() :]
+    if not seal[2]:  # the last key: without it the one before has no comma
+        if not before.endswith(b",\n"):
+            return False
+        before = before[:-2] + b"\n"
+    return hashlib.sha256(before + after).hexdigest().encode() == seal[1]
+
+
+def _is_whole_page(data: bytes) -> bool:
+    end = data.rstrip(b"\n").rfind(b"\n") + 1
+    return data[end:] == _PAGE_SEAL.format(hashlib.sha256(data[:end]).hexdigest()).encode()
+
+
+def _is_whole_png(data: bytes) -> bool:
+    """Tell whether every chunk is as its CRC says, and the last is IEND."""
+    kind, end = b"", 0
+    for kind, content, end in _iterate_png_chunks(data):
+        if zlib.crc32(kind + content) != int.from_bytes(data[end - 4 : end], "big"):
+            return False
+    return kind == b"IEND" and end == len(data)
+
+
+def _iterate_png_chunks(data: bytes) -> Iterator[tuple[bytes, bytes, int]]:
+    """Yield type, data and end of every chunk of a PNG (RFC 2083, section 3.2: length, type, data, CRC of type and data)."""
+    at, kind = len(_PNG_START), b""
+    while data.startswith(_PNG_START) and kind != b"IEND" and at + 12 <= len(data):
+        end = at + 12 + int.from_bytes(data[at : at + 4], "big")
+        kind = data[at + 4 : at + 8]
+        yield kind, data[at + 8 : end - 4], end
+        at = end

@@ -1,0 +1,223 @@
+"""Several files of one drive read as one log: ROS 1 splits, power logged apart; and what a later part of a split lacks.
+
+`rosbag record --split` writes ``drive_0.bag``, ``drive_1.bag``, … (with the time of each before the number, unless that is left out), and
+latched messages only into the part in which they came: a part that is read alone takes its static transforms from an earlier one beside it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING, Self, TypeAlias
+
+import pyarrow as pa
+
+from tcpipe.errors import LogError
+from tcpipe.formats.logs.log_file import Log, open_log
+from tcpipe.formats.logs.rosbag2 import is_one_bag
+from tcpipe.formats.logs.table_folders import Mappings
+from tcpipe.logs.topics import Damage, Topic
+
+if TYPE_CHECKING:
+    from tcpipe.formats.logs.table_log import TableLog
+
+_PART = re.compile(r"(?P<name>.+)_(?P<number>[0-9]{1,6})\.bag(\.active)?")
+_DATE = re.compile(r"[0-9]{4}(-[0-9]{2}){5}")
+_STATIC = "tf_static"
+_GAP_NS = 5_000_000_000
+"""Parts of one recording follow one another within so much."""
+
+
+class JoinedLog:
+    """Logs behind one face: topics merged, tables in log-time order; with the static transforms of an ``earlier`` part."""
+
+    def __init__(self, logs: Sequence[Log | TableLog], earlier: Log | None) -> None:
+        self._logs, self._earlier = logs, earlier
+        self.topics = (_find_static_topics(earlier) if earlier else {}) | _merge_topics(logs)
+
+    @property
+    def damage(self) -> list[Damage]:
+        """Damage of every file."""
+        return [damage for log in self._logs for damage in log.damage]
+
+    @property
+    def remarks(self) -> list[str]:
+        """What is worth saying of every file, and costs nothing."""
+        found = [remark for log in self._logs for remark in log.remarks]
+        if self._earlier:
+            where = f"goes on where {self._earlier.path.name} ends, whose static transforms are taken: it has none"
+            found.append(f"{self._logs[0].path.name}: {where}")
+        return found
+
+    @property
+    def size_bytes(self) -> int:
+        """Size of all files together."""
+        return sum(log.size_bytes for log in self._logs)
+
+    @property
+    def outline(self) -> str:
+        """A hash of the indexes of all files; "" where one has none."""
+        outlines = [log.outline for log in self._logs]
+        if not all(outlines):
+            return ""
+        return outlines[0] if len(outlines) == 1 else hashlib.sha256("".join(outlines).encode()).hexdigest()
+
+    @property
+    def is_known_by_outline(self) -> bool:
+        """Whether `sha256` holds an outline."""
+        return any(log.is_known_by_outline for log in self._logs)
+
+    def sha256(self) -> str:
+        """Return the file's hash; of several, that of their hashes, in order. `LogError` when two files are the same recording."""
+        digests: dict[str, Log | TableLog] = {}
+        for log in self._logs:
+            twin = digests.setdefault(log.sha256(), log)
+            if twin is not log:
+                raise LogError(f"{log.path}: the same recording as {twin.path}; give each part once")
+        return hashlib.sha256("".join(digests).encode()).hexdigest() if len(digests) > 1 else next(iter(digests))
+
+    def tables(self, topics: Sequence[str]) -> dict[str, pa.Table]:
+        """Return each topic's table over all files, in log-time order."""
+        parts: dict[str, list[pa.Table]] = {}
+        for log in self._logs:
+            for name, table in log.tables([topic for topic in topics if topic in log.topics]).items():
+                parts.setdefault(name, []).append(table)
+        lent = [topic for topic in topics if not any(topic in log.topics for log in self._logs)]
+        of_earlier = self._earlier.tables(lent) if self._earlier and lent else {}
+        return {name: _join_tables(name, tables) for name, tables in parts.items()} | of_earlier
+
+    def batches(self, topics: Sequence[str]) -> Iterator[dict[str, pa.Table]]:
+        """Yield each topic's tables piece by piece, file after file."""
+        schemas: dict[str, pa.Schema] = {}
+        for log in self._logs:
+            for tables in log.batches([topic for topic in topics if topic in log.topics]):
+                for name, table in tables.items():
+                    _require_same_fields(name, schemas.setdefault(name, table.schema), table.schema)
+                yield tables
+        lent = [topic for topic in topics if not any(topic in log.topics for log in self._logs)]
+        if self._earlier and lent:
+            yield from self._earlier.batches(lent)
+
+    def __enter__(self) -> Self:
+        """Return self; the files are open already."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Close every file."""
+        with ExitStack() as stack:
+            for log in (*self._logs, *([self._earlier] if self._earlier else [])):
+                stack.push(log)
+            stack.pop_all().__exit__(kind, error, trace)
+
+
+def _join_tables(topic: str, tables: Sequence[pa.Table]) -> pa.Table:
+    if len(tables) == 1:  # in order already
+        return tables[0]
+    for table in tables[1:]:
+        _require_same_fields(topic, tables[0].schema, table.schema)
+    return pa.concat_tables(tables).sort_by("log_time_ns")
+
+
+def _require_same_fields(topic: str, first: pa.Schema, other: pa.Schema) -> None:
+    """Raise `LogError` where the messages of a topic have other fields in another file."""
+    if first != other:
+        odd = sorted({field.name for field in set(first) ^ set(other)})
+        raise LogError(
+            f"topic {topic}: its messages have other fields in one of the files given with --as-one ({', '.join(odd)}); "
+            "ingest them apart"
+        )
+
+
+AnyLog: TypeAlias = "Log | JoinedLog | TableLog"
+"""What a run is made of."""
+
+
+def open_logs(
+    paths: Sequence[Path | str], *, message_definitions: Path | None = None, tables: Mappings | None = None
+) -> AnyLog:
+    """Open one log, or several as one, by path or URL; `LogError` when a topic has different types in two of them.
+
+    A folder that is no bag is one of tables, where ``tables`` says what they hold.
+    """
+    with ExitStack() as stack:
+        logs: list[Log | TableLog] = []
+        for path in sorted(paths, key=Path):
+            logs.append(open_single_log(path, message_definitions=message_definitions, tables=tables))
+            stack.callback(logs[-1].close)
+        alone = logs[0] if len(logs) == 1 else None
+        earlier = _find_earlier_part(alone) if isinstance(alone, Log) and not _find_static_topics(alone) else None
+        if earlier:
+            stack.enter_context(earlier)
+        joined = JoinedLog(logs, earlier)
+        stack.pop_all()
+    return joined if earlier or len(logs) > 1 else logs[0]
+
+
+def open_single_log(path: Path | str, *, message_definitions: Path | None, tables: Mappings | None) -> Log | TableLog:
+    """Open one log: a folder that is no bag is one of tables, where ``tables`` says what they hold."""
+    if tables and isinstance(path, Path) and path.is_dir() and not is_one_bag(path):
+        from tcpipe.formats.logs.table_log import TableLog  # noqa: PLC0415  polars only where a table is read
+
+        return TableLog(path, tables)
+    return open_log(path, message_definitions=message_definitions)
+
+
+def _find_earlier_part(log: Log) -> Log | None:
+    """Return the nearest earlier part that has static transforms, open; None where the chain of parts breaks before."""
+    part: Log | None = log
+    while part is not None:
+        before = _find_part_before(part)
+        if part is not log:
+            part.close()
+        if before is not None and _find_static_topics(before):
+            return before
+        part = before
+    return None
+
+
+def _find_part_before(log: Log) -> Log | None:
+    """Return the part of the same recording that ends where this one begins, open."""
+    mine = _PART.fullmatch(log.path.name)
+    starts = [topic.start_ns for topic in log.topics.values() if topic.start_ns is not None]
+    if mine is None or not starts or log.path.is_dir():
+        return None
+    for path in sorted(log.path.parent.iterdir()):
+        other = _PART.fullmatch(path.name)
+        if (
+            other
+            and int(other["number"]) == int(mine["number"]) - 1
+            and _DATE.sub("", other["name"]) == _DATE.sub("", mine["name"])
+        ):
+            try:
+                found = open_log(path)
+            except (LogError, OSError):
+                continue
+            ends = [topic.end_ns for topic in found.topics.values() if topic.end_ns is not None]
+            if ends and abs(min(starts) - max(ends)) <= _GAP_NS:
+                return found
+            found.close()
+    return None
+
+
+def _merge_topics(logs: Sequence[Log | TableLog]) -> dict[str, Topic]:
+    merged: dict[str, Topic] = {}
+    for log in logs:
+        for name, topic in log.topics.items():
+            before = merged.get(name)
+            if before is not None and before.type_name != topic.type_name:
+                raise LogError(
+                    f"{log.path}: topic {name} is {topic.type_name} here and {before.type_name} in another of the files "
+                    f"given with --as-one; ingest them apart"
+                )
+            merged[name] = topic if before is None else before.joined(topic)
+    return merged
+
+
+def _find_static_topics(log: Log) -> dict[str, Topic]:
+    return {name: topic for name, topic in log.topics.items() if name.endswith(_STATIC)}

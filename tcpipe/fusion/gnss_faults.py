@@ -1,0 +1,250 @@
+"""Since when and until when fixes err together: a wrong ambiguity, a reflection; told by both ends.
+
+A filter that comes to a jump cannot know which side of it is wrong, and one that was led off by a ramp takes the return for the jump.
+Offline both sides are known. For each span in which the fixes may have erred the filter is run with an error of theirs in its state there
+and nowhere else, and never follows what it refuses. What contradicts the rest then shows in the squared normalised innovations of all
+that counts: fixes outside of the span, wheels and camera. The span with the least of it is taken; each span, and each second of it, costs
+a little, so that of two that explain as much the simpler is taken. Where one that shares little with the best explains about as much,
+nobody can tell.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Span = tuple[int, int]
+"""First and last stamp [ns]."""
+Spans = tuple[Span, ...]
+
+_LASTS_NS = 2_000_000_000
+_FEWEST = 5
+_TOGETHER_NS = 3_000_000_000
+_ALONE = 3
+_MOST = 3
+_A_SECOND, _A_SPAN, _SURELY = 2.0, 50.0, 100.0
+_SHARED = 0.5
+_MOST_OF = 0.6
+_REACH_NS = 60_000_000_000
+_RETURNS_NS = 180_000_000_000
+_LEADS_NS = (3_000_000_000, 10_000_000_000, 20_000_000_000)
+
+
+@dataclass(frozen=True, slots=True)
+class Innovations:
+    """What gates saw of the measurements of one role, in order of time.
+
+    Stamps [ns], squared normalised innovations, which were refused, the gate, and how far fixes are off, horizontally [m].
+    """
+
+    stamp_ns: NDArray[np.int64]
+    squared: NDArray[np.float64]
+    refused: NDArray[np.bool_]
+    gate: float
+    off_m: NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class FaultHypothesis:
+    """How much the sensors contradict each other if fixes err in ``spans``, and when fixes were refused all the same."""
+
+    spans: Spans
+    cost: float
+    refused: Spans
+    size_m: float
+    """By how far fixes were then off."""
+
+
+Try = Callable[[Spans], FaultHypothesis]
+
+
+def unexplained_innovation(
+    spans: Spans, fixes: Innovations, others: Sequence[Innovations], usual: float
+) -> FaultHypothesis:
+    """Return what a run in which the fixes err in ``spans`` leaves unexplained.
+
+    Parameters
+    ----------
+    spans : in which the error of the fixes was free.
+    fixes, others : what the gates saw.
+    usual : squared innovation of a fix that is right; single outliers count as much, and so do fixes inside the spans.
+    """
+    free = is_inside(fixes.stamp_ns, spans)
+    single = fixes.refused & ~_is_in_runs(fixes.refused, _ALONE)
+    squared = np.where(free | single, usual, np.minimum(fixes.squared, fixes.gate))
+    cost = float(squared.sum()) + sum(float(np.minimum(o.squared, o.gate).sum()) for o in others)
+    off = fixes.refused & ~free & ~single
+    size_m = float(np.median(fixes.off_m[off])) if off.any() else 0.0
+    return FaultHypothesis(spans, cost + _A_SECOND * _compute_length(spans), _find_rejected_spans(fixes, free), size_m)
+
+
+def is_inside(stamp_ns: NDArray[np.int64], spans: Spans) -> NDArray[np.bool_]:
+    """Return which stamps lie in a span."""
+    found = np.zeros(stamp_ns.size, np.bool_)
+    for first, last in spans:
+        found |= (stamp_ns >= first) & (stamp_ns < last)
+    return found
+
+
+def _find_runs(of: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Return first and one past the last index of each run of True, shape (R, 2)."""
+    edges = np.flatnonzero(np.diff(np.concatenate(([0], of.astype(np.int8), [0]))))
+    return edges.reshape(-1, 2)
+
+
+def _is_in_runs(of: NDArray[np.bool_], fewest: int) -> NDArray[np.bool_]:
+    found = np.zeros_like(of)
+    for first, end in _find_runs(of):
+        found[first:end] = end - first >= fewest
+    return found
+
+
+def _find_rejected_spans(fixes: Innovations, free: NDArray[np.bool_]) -> Spans:
+    """Return from when to when fixes were refused for seconds on end, in which few were heard."""
+    found: list[tuple[int, int, int]] = []
+    for first, end in _find_runs(_is_in_runs(fixes.refused & ~free, _ALONE)):
+        begin_ns, end_ns = int(fixes.stamp_ns[first]), int(fixes.stamp_ns[min(end, fixes.stamp_ns.size - 1)])
+        if found and begin_ns - found[-1][1] < _TOGETHER_NS:
+            begin_ns, _, count = found.pop()
+            found.append((begin_ns, end_ns, count + int(end - first)))
+        else:
+            found.append((begin_ns, end_ns, int(end - first)))
+    return tuple((a, b) for a, b, count in found if count >= _FEWEST and b - a >= _LASTS_NS)
+
+
+@dataclass(frozen=True, slots=True)
+class GnssFaults:
+    """When fixes err together, when they may as well have, as far as a minute from where they jump, and by how much [m]."""
+
+    spans: Spans
+    doubtful: Spans
+    size_m: float
+
+    def doubt_m2(self, stamp_ns: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Return the variance that stands for what nobody can tell, at each stamp [m²], east, north and up, shape (N, 3)."""
+        unsure = is_inside(stamp_ns, self.doubtful) & ~is_inside(stamp_ns, self.spans)
+        return np.asarray(unsure[:, None] * np.array([1.0, 1.0, 0.0]) * self.size_m**2)
+
+
+@dataclass(frozen=True, slots=True)
+class Jump:
+    """When fixes that were refused were followed at last, and by which way they were off, east and north [m]."""
+
+    stamp_ns: int
+    off_m: NDArray[np.float64]
+
+
+def find_returned_fixes(jumps: Sequence[Jump]) -> GnssFaults | None:
+    """Return from when to when fixes jumped and back, where nothing else carries the pose: which side is wrong, nobody can tell for sure.
+
+    Those in between are doubted: they are the fewer.
+    """
+    spans: list[Span] = []
+    size_m, rest = 0.0, list(jumps)
+    while len(rest) > 1:
+        first, second = rest[0], rest[1]
+        there, back = np.linalg.norm(first.off_m), np.linalg.norm(second.off_m)
+        soon = second.stamp_ns - first.stamp_ns < _RETURNS_NS
+        if soon and np.linalg.norm(first.off_m + second.off_m) < _SHARED * max(there, back):
+            spans.append((first.stamp_ns - _LEADS_NS[0], second.stamp_ns))
+            size_m = max(size_m, float(there), float(back))
+            rest.pop(0)
+        rest.pop(0)
+    return GnssFaults((), _merge_spans(tuple(spans)), size_m) if spans else None
+
+
+def find_wrong_fixes(tried: Try, whole: Span, known: Spans) -> GnssFaults | None:
+    """Return when the fixes were wrong, as all sensors together explain it best; None where that is no matter of spans.
+
+    Parameters
+    ----------
+    tried : runs the filter with the error of the fixes free in spans.
+    whole : of the stretch.
+    known : when fixes were seen to be off, in a run that follows them in the end.
+    """
+    plain = tried(())
+    events = _merge_spans((*plain.refused, *known))
+    if not events or _compute_length(events) > _MOST_OF * _compute_length((whole,)):
+        return None
+    found = [tried(spans) for spans in _iterate_candidates(events, whole)]
+    best = min(found, key=lambda each: _weight(each) + (_SURELY if _is_endless(each.spans, whole) else 0.0))
+    begun, alternatives = best, tuple(found)
+    for lead_ns in _LEADS_NS[1:]:
+        longer = tuple((max(whole[0], first - lead_ns + _LEADS_NS[0]), last) for first, last in begun.spans)
+        found.append(tried(_merge_spans(longer)))
+        best = found[-1] if _weight(found[-1]) < _weight(best) - _A_SPAN else best
+    if _weight(best) > _weight(plain) - _SURELY:
+        return None
+    doubtful = [
+        span
+        for other in alternatives
+        if _has_rival(other, best, alike=len(events) > 1)
+        for span in _iterate_near(other.spans, events)
+    ]
+    return GnssFaults(best.spans, _merge_spans(tuple(doubtful)), plain.size_m)
+
+
+def _weight(each: FaultHypothesis) -> float:
+    """Return what an explanation costs, each of its spans included."""
+    return each.cost + _A_SPAN * len(each.spans)
+
+
+def _is_endless(spans: Spans, whole: Span) -> bool:
+    """Return whether the fixes were not seen to be right before, or afterwards."""
+    return spans[0][0] <= whole[0] or spans[-1][1] >= whole[1]
+
+
+def _has_rival(other: FaultHypothesis, best: FaultHypothesis, *, alike: bool) -> bool:
+    """Return whether another explanation is about as good and shares little with the best.
+
+    Of what follows a single jump nothing tells when it ends: then one that is much longer is no more ``alike``, and which is the shorter
+    tells nothing. Nor is one span alike several short ones: a filter that nothing holds follows wrong fixes after seconds.
+    """
+    shared = sum(max(0, min(b, d) - max(a, c)) * 1e-9 for a, b in best.spans for c, d in other.spans)
+    longer = max(_compute_length(best.spans), _compute_length(other.spans))
+    whole = _compute_length(best.spans) if alike and len(best.spans) == 1 else longer
+    better = _weight(other) - _weight(best)
+    if not alike:
+        better -= _A_SECOND * (_compute_length(other.spans) - _compute_length(best.spans))
+    return better < _SURELY and shared < _SHARED * whole
+
+
+def _iterate_near(spans: Spans, events: Spans) -> Iterator[Span]:
+    """Yield what of the spans lies within a minute of where an event begins."""
+    for first, last in spans:
+        for at, _ in events:
+            begin, end = max(first, at - _REACH_NS), min(last, at + _REACH_NS)
+            if end > begin:
+                yield begin, end
+
+
+def _compute_length(spans: Spans) -> float:
+    return sum((last - first) * 1e-9 for first, last in spans)
+
+
+def _merge_spans(spans: Spans) -> Spans:
+    """Return spans in order of time, those that overlap or follow each other at once as one."""
+    found: list[Span] = []
+    for first, last in sorted(spans):
+        if found and first <= found[-1][1] + _TOGETHER_NS:
+            found[-1] = (found[-1][0], max(last, found[-1][1]))
+        else:
+            found.append((first, last))
+    return tuple(found)
+
+
+def _iterate_candidates(events: Spans, whole: Span) -> Iterator[Spans]:
+    """Yield in which spans fixes may err that were off at some times: in these, between two such times, or ever before or after one."""
+    longest = sorted(sorted(events, key=lambda span: span[0] - span[1])[:_MOST])
+    lead_ns = _LEADS_NS[0]
+    yield _merge_spans(tuple((max(whole[0], first - lead_ns), last) for first, last in longest))
+    for (first, _), (second, _) in combinations(longest, 2):
+        yield ((max(whole[0], first - lead_ns), second),)
+    for first, _ in longest:
+        yield ((max(whole[0], first - lead_ns), whole[1]),)
+        if first - lead_ns > whole[0]:
+            yield ((whole[0], first),)

@@ -1,0 +1,133 @@
+"""The errors that the simulator itself implies: those of a predictor that knows its plant and reads the world without error.
+
+It sees what a map shows along the chord of a sample, where the pipeline believes the chord to be, and how much the robot turned. Of a
+world without hidden resistance (`remove_hidden_variation`) it says what could be predicted at best: what remains is the labels' noise, that
+resistance, its fluctuation in time, and the lag of the wheels.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from tcpipe.dataset import Split
+from tcpipe.dataset.extra_features import read_extra_features
+from tcpipe.learning.curves import fit_curves
+from tcpipe.learning.metrics import Array, compute_costs
+from tcpipe.simulation.robot import SimulatedRobot
+from tcpipe.simulation.wheels import compute_rolling_resistance
+from tcpipe.simulation.world import World
+
+_STEP_M = 0.05
+
+
+def compute_true_costs(world: World, robot: SimulatedRobot, split: Split) -> dict[str, Array]:
+    """Return w, v, T, E of every sample as the plant has it on the flat truth, shape (N,) each.
+
+    Parameters
+    ----------
+    world, robot : what was simulated.
+    split : samples, by the ends of their chords and their turn.
+    """
+    ends = [split.column(f"{end}_{axis}_deg").astype(np.float64) for end in ("start", "end") for axis in ("lon", "lat")]
+    x0, y0 = world.site.map_xy_m(ends[0], ends[1])
+    x1, y1 = world.site.map_xy_m(ends[2], ends[3])
+    half = robot.wheelbase_m / 2.0
+    along = np.arange(-half, 1.0 + half + _STEP_M / 2.0, _STEP_M)
+    x = x0[:, None] + (x1 - x0)[:, None] * along
+    y = y0[:, None] + (y1 - y0)[:, None] * along
+    direction = np.arctan2(y1 - y0, x1 - x0)[:, None]
+    scale, _ = world.site.ground_from_map(x.ravel(), y.ravel(), (world.height_m(x, y) + world.site.geoid_m).ravel())
+    rise_x, rise_y = world.gradient(x, y)
+    slope = np.arctan((rise_x * np.cos(direction) + rise_y * np.sin(direction)) / np.reshape(scale, x.shape))
+    ground = robot.ground_table()[world.terrain_class(x, y)]
+    usual = [_mean_over(ground[..., column], round(robot.wheelbase_m / _STEP_M) + 1) for column in range(3)]
+    cut = slice((x.shape[1] - usual[0].shape[1]) // 2, (x.shape[1] + usual[0].shape[1]) // 2)
+    slope = slope[:, cut]
+    rolling = compute_rolling_resistance(world, robot, x[:, cut], y[:, cut], direction)
+    lost = 0.0 if robot.wheels is None else robot.wheels.slowdown * (rolling - usual[2])
+    wheel = robot.max_velocity_mps * robot.speed_factor(usual[0], np.sin(slope)) * (1.0 - lost)
+    velocity = wheel * (1.0 - robot.slip(usual[1], np.sin(slope))) * np.cos(slope)
+    turning = np.abs(np.nan_to_num(split.column("turn_rate_radps").astype(np.float64)))
+    mechanical = robot.wheel_power_watt(
+        wheel_velocity_mps=wheel,
+        acceleration_mps2=np.zeros_like(slope),
+        yaw_rate_radps=np.broadcast_to(turning[:, None], slope.shape),
+        slope_rad=slope,
+        rolling_resistance=rolling,
+    )
+    power = robot.propulsion_watt(mechanical, wheel)
+    seconds_per_m = np.mean(1.0 / velocity, axis=1)
+    joule_per_m = np.mean(power / velocity, axis=1)
+    return compute_costs(joule_per_m / seconds_per_m, 1.0 / seconds_per_m, 1.0)
+
+
+def remove_hidden_variation(world: World) -> World:
+    """Return a world without what nothing shows."""
+    return replace(world, resistance=())
+
+
+CLASS_AND_SLOPE, REST = "class and slope", "left: fluctuation in time, lag of the wheels, the labels' noise"
+
+
+def compute_variance_shares(world: World, robot: SimulatedRobot, split: Split, energy_joule: Array) -> dict[str, float]:
+    """Return the share of the variance of measured E, shape (N,), that each part of the simulated world makes.
+
+    That of class and slope is what a spline of each class explains; that of a part, what such splines leave of what changes where it
+    alone is missing; the rest, what they leave of what the plant with everything in it misses. A part's mean over a class and slope is thus
+    class and slope. They add up to one only as far as the parts are independent.
+    """
+    beside, known = read_extra_features(split), np.isfinite(energy_joule)
+    slope_rad, class_id = beside.slope_rad[known], beside.class_id[known]
+
+    def left(joule: Array) -> float:
+        values = joule[known][:, None]
+        return float(np.var(values - fit_curves("spline", slope_rad, class_id, values).predict(slope_rad, class_id)))
+
+    def energy(without: Callable[[World, SimulatedRobot], tuple[World, SimulatedRobot]] = _hide_nothing) -> Array:
+        return compute_true_costs(*without(world, robot), split)["E"]
+
+    whole, total = energy(), float(np.var(energy_joule[known]))
+    missing = {**{name: whole - energy(take) for name, take in _PARTS.items()}, REST: energy_joule - whole}
+    return {CLASS_AND_SLOPE: 1.0 - left(energy_joule) / total} | {
+        name: left(of) / total for name, of in missing.items()
+    }
+
+
+def _hide_nothing(world: World, robot: SimulatedRobot) -> tuple[World, SimulatedRobot]:
+    return world, robot
+
+
+def _remove_visible(world: World, robot: SimulatedRobot) -> tuple[World, SimulatedRobot]:
+    if world.surface is None:
+        return world, robot
+    looks = {
+        name: replace(look, wet_resistance=0.0, cover_resistance=0.0) for name, look in world.surface.looks.items()
+    }
+    return replace(world, surface=replace(world.surface, looks=looks)), robot
+
+
+def _remove_bumps(world: World, robot: SimulatedRobot) -> tuple[World, SimulatedRobot]:
+    return world, replace(robot, wheels=robot.wheels and replace(robot.wheels, bump_loss=0.0))
+
+
+def _remove_side_slope(world: World, robot: SimulatedRobot) -> tuple[World, SimulatedRobot]:
+    return world, replace(robot, wheels=robot.wheels and replace(robot.wheels, cornering_per_rad=np.inf))
+
+
+_PARTS: Mapping[str, Callable[[World, SimulatedRobot], tuple[World, SimulatedRobot]]] = {
+    "the orthophoto alone: wetness, cover": _remove_visible,
+    "heights within the patch: bumps and ridges under the wheels": _remove_bumps,
+    "heights within the patch: slope across": _remove_side_slope,
+    "the path: turning": lambda world, robot: (world, replace(robot, scrub_torque_nm=0.0)),
+    "nothing: hidden resistance": lambda world, robot: (remove_hidden_variation(world), robot),
+}
+"""What shows a part of the world, and the world and robot without it."""
+
+
+def _mean_over(values: Array, count: int) -> Array:
+    """Return the running mean of ``count`` neighbours, shape (N, K - count + 1)."""
+    sums = np.cumsum(np.pad(values, ((0, 0), (1, 0))), axis=1)
+    return np.asarray((sums[:, count:] - sums[:, :-count]) / count)

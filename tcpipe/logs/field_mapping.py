@@ -1,0 +1,272 @@
+"""What the recipe says of columns and of message types that are not known: their fields as those of the message a role usually has.
+
+One mapping serves tables (`[tables.<role>]`) and custom messages (`[read.fields]`): the fields here by their short names, each in its unit.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tcpipe.logs import roles
+from tcpipe.power.sources import BATTERY_STATE, FLOAT_TYPES, find_quantity
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class MappedField:
+    """A field of the message that a role usually has: its dotted name and unit; ``std_of`` is the row of a covariance whose root it is."""
+
+    message: str
+    unit: str
+    needed: bool = False
+    std_of: int | None = None
+
+
+def _map_vector(name: str, message: str, unit: str, *, needed: str = "") -> dict[str, MappedField]:
+    return {f"{name}_{axis}": MappedField(f"{message}.{axis}", unit, axis in needed) for axis in "xyz"}
+
+
+def _map_std(message: str, names: Sequence[str], size: int, unit: str = "m") -> dict[str, MappedField]:
+    """Return the deviations of a vector, the first three of the diagonal of a covariance of so many rows."""
+    return {f"{name}_std": MappedField(message, unit, std_of=row * (size + 1)) for row, name in enumerate(names)}
+
+
+def _map_orientation(message: str) -> dict[str, MappedField]:
+    return {f"orientation_{c}": MappedField(f"{message}.{c}", "1") for c in "xyzw"}
+
+
+def _map_pose(prefix: str, *, needed: str = "") -> dict[str, MappedField]:
+    place = {axis: MappedField(f"{prefix}.position.{axis}", "m", axis in needed) for axis in "xyz"}
+    return place | _map_orientation(f"{prefix}.orientation")
+
+
+_ODOMETRY = {
+    **_map_vector("linear", "twist.twist.linear", "m/s", needed="x"),
+    **_map_vector("angular", "twist.twist.angular", "rad/s"),
+    **_map_pose("pose.pose"),
+}
+
+MAPPED: dict[str, dict[str, MappedField]] = {
+    "gnss": {
+        "latitude": MappedField("latitude", "deg", needed=True),
+        "longitude": MappedField("longitude", "deg", needed=True),
+        "altitude": MappedField("altitude", "m"),
+        **_map_std("position_covariance", ("east", "north", "up"), 3),
+        "status": MappedField("status.status", "1"),
+    },
+    "gnss_velocity": {
+        **{
+            name: MappedField(f"twist.twist.linear.{axis}", "m/s", needed=axis != "z")
+            for name, axis in zip(("east", "north", "up"), "xyz", strict=True)
+        },
+        **_map_std("twist.covariance", ("east", "north", "up"), 6, "m/s"),
+    },
+    "imu": {
+        **_map_vector("angular_velocity", "angular_velocity", "rad/s", needed="xyz"),
+        **_map_vector("linear_acceleration", "linear_acceleration", "m/s2", needed="xyz"),
+        **_map_orientation("orientation"),
+    },
+    "wheel_odometry": _ODOMETRY,
+    "visual_odometry": _ODOMETRY,
+    "power": {"voltage": MappedField("voltage", "V"), "current": MappedField("current", "A")},
+    "command": {
+        **_map_vector("linear", "twist.linear", "m/s", needed="x"),
+        **_map_vector("angular", "twist.angular", "rad/s"),
+    },
+    "pose": {**_map_pose("pose.pose", needed="xy"), **_map_std("pose.covariance", ("x", "y", "z"), 6)},
+}
+"""Fields that can be mapped, by role and short name."""
+
+MAPPED_TYPES = {
+    "gnss": roles.NAV_SAT_FIX,
+    "gnss_velocity": roles.TWIST_WITH_COVARIANCE_STAMPED,
+    "imu": roles.IMU,
+    "wheel_odometry": roles.ODOMETRY,
+    "visual_odometry": roles.ODOMETRY,
+    "power": BATTERY_STATE,
+    "command": roles.TWIST_STAMPED,
+    "pose": roles.POSE_WITH_COVARIANCE_STAMPED,
+}
+"""The message as which a role's fields are read."""
+
+UNITS: dict[str, dict[str, float]] = {
+    "deg": {"deg": 1.0, "rad": 180.0 / np.pi, "1e-7 deg": 1e-7},
+    "m": {"m": 1.0, "cm": 0.01, "mm": 0.001, "km": 1000.0, "ft": 0.3048},
+    "m/s": {"m/s": 1.0, "cm/s": 0.01, "mm/s": 0.001, "km/h": 1 / 3.6, "mph": 0.44704},
+    "rad/s": {"rad/s": 1.0, "deg/s": np.pi / 180.0, "rpm": np.pi / 30.0},
+    "m/s2": {"m/s2": 1.0, "g": 9.80665},
+    "V": {"V": 1.0, "mV": 0.001},
+    "A": {"A": 1.0, "mA": 0.001},
+    "1": {"1": 1.0},
+}
+"""What one of a unit is in the field's own."""
+
+_NS_OF = {"ns": 1, "us": 1_000, "ms": 1_000_000, "s": 1_000_000_000}
+_YEARS_S = (3e8, 1e10)
+"""Seconds since 1970 from 1979 to 2286: what a stamp is told its unit by."""
+_LEAPS = ((1_341_100_800, 16), (1_435_708_800, 17), (1_483_228_800, 18))
+"""From when [s since 1970] GPS time is how far ahead of UTC [s] (IERS Bulletin C)."""
+
+_SOURCE = re.compile(r"\s*+([\w.]++)(?:\[(\d++)\])?\s*+(?:\*\s*+([-+.\w]++)\s*+)?")
+
+
+def find_mapping_problems(
+    where: str, role: str | None, columns: Mapping[str, str], units: Mapping[str, str]
+) -> Iterator[str]:
+    """Yield what is wrong with a mapping, whatever it is mapped to."""
+    if role not in MAPPED:
+        yield f"{where}: plays role {role!r}; wanted role = one of {', '.join(MAPPED)}"
+        return
+    known = MAPPED[role]
+    if unknown := [name for name in columns if name not in known]:
+        yield f"{where}.columns: {role} has no {', '.join(unknown)}; it has {', '.join(known)}"
+    if missing := [name for name, field in known.items() if field.needed and name not in columns]:
+        yield f"{where}.columns: {role} needs {', '.join(missing)}"
+    if role == "power" and not columns:
+        yield f"{where}.columns: power needs voltage, current or both"
+    for name, unit in units.items():
+        if name not in columns:
+            yield f"{where}.units: {name} is not in columns"
+        elif name in known and unit not in UNITS[known[name].unit]:
+            yield f"{where}.units: {name} is in {unit!r}; wanted one of {', '.join(UNITS[known[name].unit])}"
+
+
+def convert_units(role: str, values: Mapping[str, Floats], units: Mapping[str, str]) -> dict[str, Floats]:
+    """Return values in the units of their fields."""
+    factors = {name: UNITS[MAPPED[role][name].unit][unit] for name, unit in units.items()}
+    return {name: value * factors[name] if factors.get(name, 1.0) != 1.0 else value for name, value in values.items()}
+
+
+def make_message_fields(role: str, values: Mapping[str, Floats], rows: int) -> dict[str, NDArray[Any]]:
+    """Return the fields of the message that a role usually has, by dotted name, from those that are mapped.
+
+    What is not mapped is what the message has for unknown: no orientation, no covariance, no altitude (NaN), a fix, zero elsewhere.
+
+    Parameters
+    ----------
+    values : by short name, in the units of `MAPPED`, shape (N,).
+    rows : N.
+    """
+    zero = np.zeros(rows)
+    made: dict[str, NDArray[Any]] = {}
+    for name, field in MAPPED[role].items():
+        if field.std_of is not None:
+            if name in values:
+                made.setdefault(field.message, np.zeros((rows, 9 if role == "gnss" else 36)))
+                made[field.message][:, field.std_of] = values[name] ** 2
+        elif name in values:
+            made[field.message] = values[name]
+        elif (role, name) in {("gnss", "altitude"), ("gnss_velocity", "up")}:
+            made[field.message] = np.full(rows, np.nan)
+        elif name.startswith("orientation_"):
+            made[field.message] = zero if name[-1] != "w" else np.ones(rows)
+        elif role != "power":
+            made[field.message] = zero
+    return made | _collect_other_fields(role, values, made, rows)
+
+
+def _collect_other_fields(
+    role: str, values: Mapping[str, Floats], made: Mapping[str, NDArray[Any]], rows: int
+) -> dict[str, NDArray[Any]]:
+    """Return the fields of a role's message that no mapping names."""
+    if role == "gnss":
+        status = made["status.status"]
+        return {
+            "status.status": np.where(np.isfinite(status), status, -1).astype(np.int8),
+            "position_covariance_type": np.full(rows, 2 if "position_covariance" in made else 0, np.uint8),
+        }
+    if role == "gnss_velocity":
+        return {f"twist.twist.angular.{axis}": np.zeros(rows) for axis in "xyz"}
+    unoriented = role == "imu" and "orientation_w" not in values
+    return {"orientation_covariance": np.full((rows, 9), -1.0)} if unoriented else {}
+
+
+def find_topic(name: str, role: str, columns: Mapping[str, str]) -> tuple[str, str]:
+    """Return the topic and message type as which a table is read: a voltage or a current alone is a bare number, told by the name."""
+    if role != "power" or len(columns) == 2:
+        return f"/{name}", MAPPED_TYPES[role]
+    (alone,) = columns
+    return f"/{name}" if find_quantity(name) == alone else f"/{name}/{alone}", FLOAT_TYPES[1]
+
+
+def parse_stamps_ns(values: NDArray[Any], unit: str) -> NDArray[np.int64] | str:
+    """Return numbers as [ns], or what is in the way of that in words; unit auto tells it by their size, since 1979.
+
+    Parameters
+    ----------
+    values : finite stamps, whole or not, shape (N,).
+    unit : auto, s, ms, us or ns.
+    """
+    if unit == "auto":
+        middle = float(np.median(values)) if values.size else 0.0
+        fitting = [name for name, ns in _NS_OF.items() if _YEARS_S[0] < middle * ns / 1e9 < _YEARS_S[1]]
+        if not fitting:
+            return f"its stamps ({middle:.12g}) do not count from 1970; say what they count, one of {', '.join(_NS_OF)}"
+        unit = fitting[0]
+    factor = _NS_OF[unit]
+    if np.issubdtype(values.dtype, np.integer):
+        return np.asarray(values, np.int64) * factor
+    whole: Floats = np.floor(values)
+    found: NDArray[np.int64] = whole.astype(np.int64) * factor + np.round((values - whole) * factor).astype(np.int64)
+    return found
+
+
+def utc_from_gps_ns(stamp_ns: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return GPS time written as a date [ns since 1970] as UTC [ns]; from July 2012 on."""
+    since = np.array([(start + leap) * 1_000_000_000 for start, leap in _LEAPS])
+    leap_s = np.array([leap for _, leap in _LEAPS], np.int64)[np.searchsorted(since, stamp_ns, side="right") - 1]
+    found: NDArray[np.int64] = stamp_ns - leap_s * 1_000_000_000
+    return found
+
+
+def make_mapped_message(
+    role: str, columns: Mapping[str, NDArray[Any]], fields: Mapping[str, str]
+) -> dict[str, NDArray[Any]] | list[str]:
+    """Return a custom message's columns as those of the message that a role usually has, or what is wrong with the mapping.
+
+    Parameters
+    ----------
+    columns : the custom message's fields by dotted name, and its log time.
+    fields : by short name the field it is taken from: ``pvt.lat``, ``accel[0]``, ``lat * 1e-7``.
+    """
+    problems = list(find_mapping_problems(f"recipe read.fields.{role}", role, fields, {}))
+    values: dict[str, Floats] = {}
+    for name, text in fields.items():
+        found = _SOURCE.fullmatch(text)
+        try:
+            factor = float(found[3]) if found and found[3] else 1.0
+        except ValueError:
+            found = None
+        if found is None:
+            problems.append(
+                f'recipe read.fields.{role}.{name} is "{text}"; wanted a field, as "pvt.lat" or "lat * 1e-7"'
+            )
+        elif found[1] not in columns or (columns[found[1]].ndim == 2) != (found[2] is not None):
+            held = ", ".join(field for field in columns if not field.endswith("time_ns"))
+            problems.append(
+                f"recipe read.fields.{role}.{name} names {text}, which its messages do not hold; they hold {held}"
+            )
+        elif not np.issubdtype(columns[found[1]].dtype, np.number):
+            problems.append(f"recipe read.fields.{role}.{name} names {text}, which is text; wanted numbers")
+        elif found[2] is not None and int(found[2]) >= columns[found[1]].shape[1]:
+            problems.append(
+                f"recipe read.fields.{role}.{name} names {text}; the list has {columns[found[1]].shape[1]} elements"
+            )
+        else:
+            value = columns[found[1]] if found[2] is None else columns[found[1]][:, int(found[2])]
+            values[name] = value.astype(np.float64) * factor
+    if problems:
+        return problems
+    rows = len(columns["log_time_ns"])
+    stamps = {
+        name: columns.get(name, np.zeros(rows, np.int64)) for name in ("header.stamp.sec", "header.stamp.nanosec")
+    }
+    own = {name: columns[name] for name in ("log_time_ns", "header.frame_id", "child_frame_id") if name in columns}
+    return own | stamps | make_message_fields(role, values, rows)

@@ -1,0 +1,80 @@
+"""Where every metre of a track went: the stretches that are kept, and the reason of each interval that is not.
+
+The odometer is the horizontal length of the estimated track: Hermite arcs inside its pieces, straight lines across its holes. Where an
+estimate jumps to another place nobody drove: such a step counts as long as its speed makes it. Each interval between two rows belongs to
+one entry, so the ledger's sum is the odometer (docs/explanation/rulings.md, Marked, not deleted).
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tcpipe.geometry.polyline import fit_polyline
+from tcpipe.motion.row_sections import find_piece_spans, find_runs
+from tcpipe.tables.bits import DropReason, flag_name
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+
+def find_kept_spans(dropped_by: NDArray[np.uint32], piece: Ints) -> Ints:
+    """Return first and last row of every maximal run of kept rows inside one piece, shape (S, 2), two rows at least."""
+    kept = find_runs(dropped_by == 0, piece)
+    return kept[kept[:, 1] > kept[:, 0]]
+
+
+def find_interval_reason(dropped_by: NDArray[np.uint32], piece: Ints) -> NDArray[np.uint32]:
+    """Return one reason for each interval between rows, shape (N - 1,); 0 inside a stretch.
+
+    A hole is a gap. Otherwise the reasons of both ends apply, and of several the first in the order of `DropReason`.
+    """
+    both = (dropped_by[:-1] | dropped_by[1:]).astype(np.int64)
+    lowest = both & -both
+    return np.where(piece[:-1] == piece[1:], lowest, int(DropReason.GAP)).astype(np.uint32)
+
+
+JUMP_M = 1.0
+"""A step that differs by more than this from what its velocity explains is no driving [m]."""
+
+
+def compute_unexplained_m(stamp_ns: Ints, position_m: Floats, velocity_mps: Floats, piece: Ints) -> Floats:
+    """Return how far each interval's step lies horizontally off what the velocity explains, [m], shape (N - 1,); 0 across holes.
+
+    Parameters are `compute_interval_length_m`'s.
+    """
+    step_s = np.diff(stamp_ns).astype(np.float64) * 1e-9
+    explained = 0.5 * (velocity_mps[1:, :2] + velocity_mps[:-1, :2]) * step_s[:, None]
+    off = np.diff(position_m[:, :2], axis=0) - explained
+    return np.where(piece[:-1] == piece[1:], np.hypot(off[:, 0], off[:, 1]), 0.0)
+
+
+def compute_interval_length_m(stamp_ns: Ints, position_m: Floats, velocity_mps: Floats, piece: Ints) -> Floats:
+    """Return the odometer's share of every interval between rows, [m], shape (N - 1,).
+
+    Parameters
+    ----------
+    stamp_ns : [ns], shape (N,).
+    position_m, velocity_mps : [m], [m/s], shape (N, 3): east, north, up.
+    piece : shape (N,), numbers of the uninterrupted pieces.
+    """
+    step = np.diff(position_m, axis=0)
+    length: Floats = np.hypot(step[:, 0], step[:, 1])
+    for first, last in find_piece_spans(piece):
+        rows = slice(first, last + 1)
+        length[first:last] = np.diff(fit_polyline(stamp_ns[rows], position_m[rows], velocity_mps[rows]).length_m)
+    speed_mps = np.hypot(velocity_mps[:, 0], velocity_mps[:, 1])
+    driven = 0.5 * (speed_mps[1:] + speed_mps[:-1]) * np.diff(stamp_ns).astype(np.float64) * 1e-9
+    return np.where(compute_unexplained_m(stamp_ns, position_m, velocity_mps, piece) > JUMP_M, driven, length)
+
+
+def compute_interval_duration_s(stamp_ns: Ints, epoch: NDArray[np.integer[Any]]) -> Floats:
+    """Return the duration of every interval between rows, [s], shape (N - 1,); 0 across a clock epoch, whose step is no time."""
+    return np.where(np.diff(epoch) == 0, np.diff(stamp_ns) * 1e-9, 0.0)
+
+
+def sum_by_reason(reason: NDArray[np.uint32], amount: Floats) -> dict[str, float]:
+    """Return the sum of an amount an interval (metres, seconds, joules) by reason's name, every `DropReason` present."""
+    return {flag_name(bit): float(amount[reason == int(bit)].sum()) for bit in DropReason}

@@ -1,0 +1,140 @@
+"""What of each class and slope is in the dataset and what is not, over every metre driven; and whether that depends on the ground."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from tcpipe.formats.dataset_card import Removal
+from tcpipe.formats.maps.map_files import MapFile
+from tcpipe.formats.stored_runs import RunDirectory
+from tcpipe.motion.distance_breakdown import compute_interval_length_m, find_interval_reason
+from tcpipe.motion.row_sections import number_pieces
+from tcpipe.motion.selection_bias import Group, find_main_reason, find_uneven_groups, list_groups, sum_lengths_m
+from tcpipe.recipe import Recipe
+from tcpipe.tables.bits import DropReason, flag_name
+from tcpipe.tables.columns import to_floats, to_integers
+from tcpipe.tables.findings import Finding, Subject, SubjectKind, make_finding
+from tcpipe.terrain.point_classes import OFF_THE_MAP, find_classes_at
+from tcpipe.terrain.projection import Projection
+from tcpipe.terrain.tiles import find_map_projection
+
+_COLUMNS = (
+    *("stamp_ns", "epoch", "x_m", "y_m", "z_m", "east_velocity_mps", "north_velocity_mps", "up_velocity_mps"),
+    *("lon_deg", "lat_deg", "pitch_rad", "forward_velocity_mps", "dropped_by"),
+)
+_SLOPES_DEG = (-10.0, -5.0, -2.0, 2.0, 5.0, 10.0)
+_SLOPE_NAMES = ("below -10°", "-10° to -5°", "-5° to -2°", "-2° to 2°", "2° to 5°", "5° to 10°", "above 10°")
+_REASONS = ("in_samples", *(flag_name(bit) for bit in DropReason), "curved_or_leftover", "not_sampled")
+"""Reason of each metre of a track; what is lost at sampling or to the split's buffer is one entry."""
+_LEFT_OVER, _NOT_SAMPLED = len(_REASONS) - 2, len(_REASONS) - 1
+
+
+_Ground = tuple[MapFile, Projection]
+"""A map, and how places get onto it."""
+
+
+def find_removed_by_ground(
+    runs: Sequence[RunDirectory],
+    segments: pa.Table,
+    used: NDArray[np.int64],
+    sources: Sequence[MapFile],
+    recipe: Recipe,
+) -> tuple[Removal, tuple[Finding, ...]]:
+    """Return where the metres of all runs went, by the class under them and the slope along them, and where that is not even.
+
+    Parameters
+    ----------
+    runs : the runs of the dataset, with their tracks.
+    segments : all segments that could become samples.
+    used : rows of those that are train, test or unseen.
+    sources : the maps, the first ruling where they overlap; without a terrain layer there are no classes.
+    recipe : ``read.gnss_crs`` rules.
+    """
+    grounds = [
+        (source, find_map_projection(source, recipe.read.gnss_crs)) for source in sources if "terrain" in source.layers
+    ]
+    table = sources[0].classes
+    names = ["off the map", "no data", *table.names().tolist()[1:]]
+    spans = _Spans(segments, used)
+    by_class, by_slope = np.zeros((len(names), len(_REASONS))), np.zeros((len(_SLOPE_NAMES), len(_REASONS)))
+    for run in runs:
+        length_m, reason, slope, ground = _read_intervals(run, spans.of(run.run_id), grounds)
+        by_slope += sum_lengths_m(slope, reason, length_m, shape=by_slope.shape)
+        by_class += sum_lengths_m(ground - OFF_THE_MAP, reason, length_m, shape=by_class.shape)
+    slopes = list_groups(by_slope, _SLOPE_NAMES, _REASONS)
+    classes = list_groups(by_class, names, _REASONS) if grounds else ()
+    traversable = set(table.names()[table.traversable()].tolist())
+    findings = _find_bias([group for group in classes if group.name in traversable], "class")
+    return Removal(classes, slopes), (*findings, *_find_bias(slopes, "slope"))
+
+
+class _Spans:
+    """Start and end of every segment of a run, in order, and whether it is in use."""
+
+    def __init__(self, segments: pa.Table, used: NDArray[np.int64]) -> None:
+        is_used = np.zeros(segments.num_rows, np.bool_)
+        is_used[used] = True
+        runs = segments.column("run_id").combine_chunks().dictionary_encode()
+        self._code = {run_id: code for code, run_id in enumerate(runs.dictionary.to_pylist())}
+        code = runs.indices.to_numpy(zero_copy_only=False)
+        start, end = (to_integers(segments, f"{name}_ns") for name in ("start", "end"))
+        order = np.lexsort((start, code))
+        self._run, self._start, self._end, self._used = code[order], start[order], end[order], is_used[order]
+
+    def of(self, run_id: str) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]:
+        code = self._code.get(run_id, -1)
+        rows = slice(*np.searchsorted(self._run, [code, code + 1]))
+        return self._start[rows], self._end[rows], self._used[rows]
+
+
+def _read_intervals(
+    run: RunDirectory, spans: tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]], grounds: Sequence[_Ground]
+) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    """Return length [m], reason, slope and class (ids as `find_classes_at`) of every interval of a run's track."""
+    track = run.table("track", _COLUMNS)
+    stamp_ns, epoch = to_integers(track, "stamp_ns"), to_integers(track, "epoch")
+    piece = number_pieces(stamp_ns, epoch, period_ns=1e9 / run.manifest.info.rate_hz)
+    position = np.column_stack([to_floats(track, f"{axis}_m") for axis in "xyz"])
+    velocity = np.column_stack([to_floats(track, f"{name}_velocity_mps") for name in ("east", "north", "up")])
+    length_m = compute_interval_length_m(stamp_ns, position, velocity, piece)
+    dropped = find_interval_reason(track["dropped_by"].to_numpy(), piece)
+    reason = np.where(dropped > 0, np.log2(np.maximum(dropped, 1)).astype(np.int64) + 1, _LEFT_OVER)
+    start, end, used = spans
+    middle = stamp_ns[:-1] + np.diff(stamp_ns) // 2
+    row = np.searchsorted(start, middle, side="right") - 1
+    inside = (row >= 0) & (dropped == 0)
+    inside[inside] = middle[inside] < end[row[inside]]
+    reason[inside] = np.where(used[row[inside]], 0, _NOT_SAMPLED)
+    uphill = -np.degrees(to_floats(track, "pitch_rad")) * np.sign(to_floats(track, "forward_velocity_mps"))
+    slope = np.searchsorted(_SLOPES_DEG, 0.5 * (uphill[1:] + uphill[:-1]))
+    lonlat = np.stack([to_floats(track, "lon_deg"), to_floats(track, "lat_deg")], axis=1)
+    return length_m, reason, slope, _find_classes(grounds, 0.5 * (lonlat[1:] + lonlat[:-1]))
+
+
+def _find_classes(grounds: Sequence[_Ground], lonlat_deg: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Return the class id under each point on the first map that has one there, else as `find_classes_at`; 0 without maps."""
+    found = np.full(len(lonlat_deg), OFF_THE_MAP if grounds else 0, np.int64)
+    for source, projection in grounds:
+        open_yet = found <= 0
+        here = find_classes_at(source, projection.forward(lonlat_deg[open_yet]))
+        found[open_yet] = np.maximum(here, found[open_yet])
+    return found
+
+
+def _find_bias(groups: Sequence[Group], kind: SubjectKind) -> list[Finding]:
+    driven_m, used_m = sum(group.driven_m for group in groups), sum(group.used_m for group in groups)
+    return [
+        make_finding(
+            "selection-bias",
+            Subject(kind, group.name),
+            names={"reason": find_main_reason(group) or "none"},
+            used_fraction=group.used_share,
+            driven_m=group.driven_m,
+            overall_fraction=used_m / driven_m,
+        )
+        for group in find_uneven_groups(groups)
+    ]

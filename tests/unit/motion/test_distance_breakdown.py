@@ -1,0 +1,85 @@
+"""Every interval has one reason, and the sum is the odometer."""
+
+import numpy as np
+import pytest
+from made_tracks import stamps
+
+from tcpipe.motion.distance_breakdown import (
+    compute_interval_duration_s,
+    compute_interval_length_m,
+    compute_unexplained_m,
+    find_interval_reason,
+    find_kept_spans,
+    sum_by_reason,
+)
+from tcpipe.tables.bits import DropReason
+
+G, S, A = (int(bit) for bit in (DropReason.GAP, DropReason.STANDING, DropReason.ACCELERATING))
+
+
+def test_stretches_are_runs_of_two_kept_rows_inside_a_piece():
+    dropped = np.array([0, 0, S, 0, S, 0, 0, 0], dtype=np.uint32)
+    piece = np.array([0, 0, 0, 0, 0, 0, 0, 1])
+    assert find_kept_spans(dropped, piece).tolist() == [[0, 1], [5, 6]]
+
+
+def test_reason_is_the_first_of_both_ends_and_a_hole_is_a_gap():
+    dropped = np.array([0, 0, A, A | S, 0, 0], dtype=np.uint32)
+    piece = np.array([0, 0, 0, 0, 0, 1])
+    assert find_interval_reason(dropped, piece).tolist() == [0, A, S, S, G]
+
+
+def test_a_hole_counts_as_its_straight_line_and_no_metre_twice():
+    stamp_ns = stamps(6)
+    stamp_ns[3:] += 1_000_000_000
+    x = np.array([0.0, 0.05, 0.10, 3.10, 3.15, 3.20])
+    position = np.column_stack((x, 0 * x, 0 * x))
+    velocity = np.tile([1.0, 0.0, 0.0], (6, 1))
+    piece = np.array([0, 0, 0, 1, 1, 1])
+    length = compute_interval_length_m(stamp_ns, position, velocity, piece)
+    assert length == pytest.approx([0.05, 0.05, 3.0, 0.05, 0.05])
+    sums = sum_by_reason(find_interval_reason(np.array([0, 0, 0, S, S, 0], dtype=np.uint32), piece), length)
+    assert sums["gap"] == pytest.approx(3.0)
+    assert sums["standing"] == pytest.approx(0.1)
+    assert set(sums) == {str(bit.name).lower() for bit in DropReason}
+
+
+def test_a_clock_step_is_no_time():
+    assert compute_interval_duration_s(stamps(2) - [0, 10**12], np.array([0, 1])).tolist() == [0.0]
+
+
+def test_seconds_are_those_inside_an_epoch_whichever_way_its_clock_steps():
+    got = compute_interval_duration_s(stamps(4), np.array([0, 0, 1, 0]))
+    assert got == pytest.approx([0.05, 0.0, 0.0])
+
+
+VELOCITY = np.array([[1.0, 2.0, 9.0], [3.0, 4.0, 9.0], [3.0, 4.0, 9.0]])
+
+
+def test_what_the_velocity_does_not_explain_is_horizontal_and_inside_a_piece():
+    position = np.array([[0.0, 0.0, 0.0], [0.2, 0.5, 7.0], [9.0, 9.0, 9.0]])
+    got = compute_unexplained_m(stamps(3), position, VELOCITY, np.array([0, 0, 1]))
+    assert got == pytest.approx([np.hypot(0.2 - 0.1, 0.5 - 0.15), 0.0])
+    assert compute_unexplained_m(stamps(3), position[:, [1, 0, 2]], VELOCITY[:, [1, 0, 2]], np.zeros(3))[
+        0
+    ] == pytest.approx(got[0])
+
+
+def test_a_jump_counts_what_its_speed_makes_of_it():
+    position = np.array([[0.0, 0.0, 0.0], [30.0, 40.0, 0.0], [30.15, 40.2, 0.0]])
+    got = compute_interval_length_m(stamps(3), position, np.tile([3.0, 4.0, 7.0], (3, 1)), np.zeros(3, np.int64))
+    assert got == pytest.approx([5.0 * 0.05, 0.25])
+
+
+@pytest.mark.parametrize(("step_m", "counted_m"), [(1.0, 1.0), (1.01, 0.0)])
+def test_a_step_of_a_metre_is_no_jump_yet(step_m, counted_m):
+    position = np.array([[0.0, 0.0, 0.0], [step_m, 0.0, 0.0]])
+    got = compute_interval_length_m(stamps(2), position, np.zeros((2, 3)), np.zeros(2, np.int64))
+    assert got == pytest.approx([counted_m])
+
+
+def test_a_hole_is_measured_on_the_map_and_every_step_by_itself():
+    position = np.array([[0.0, 0.0, 0.0], [0.05, 0.0, 0.0], [0.15, 0.0, 0.0], [3.15, 4.0, 7.0]])
+    piece = np.array([0, 0, 0, 1])
+    got = compute_interval_length_m(stamps(4), position, np.tile([1.5, 0.0, 0.0], (4, 1)), piece)
+    assert got == pytest.approx([0.05, 0.1, 5.0], rel=0.01)
