@@ -51,7 +51,7 @@ def _as_command(run: Run) -> Run:
 
         from tcpipe.cli import cli
 
-        cli.add_command(Command("write", callback=run))
+        cli.commands = {"write": Command("write", callback=run)}  # in a process of its own
         command("write")()
 
     return called

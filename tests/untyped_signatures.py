@@ -15,28 +15,30 @@ Trees = dict[str, ast.Module]
 MAPPINGS = {"dict", "Mapping", "MutableMapping"}
 
 _BY_LIBRARY = {
-    "lightgbm": """learning/forest.py:forest_of learning/forest.py:_Nursery.plant learning/forest.py:_Nursery._add
+    "lightgbm": """learning/forest.py:read_forest learning/forest.py:_ForestBuilder.plant learning/forest.py:_ForestBuilder._add
         learning/forest.py:_load_lightgbm""",
-    "torch": """dataset/torch_data.py:TorchBatches.__iter__ dataset/torch_data.py:_tensors learning/losses.py:mean_loss
+    "torch": """dataset/torch_data.py:TorchBatches.__iter__ dataset/torch_data.py:_to_tensors learning/losses.py:mean_loss
         learning/network.py:Normed.forward learning/network.py:BasicBlock.forward learning/network.py:ResNet18.forward
-        learning/network.py:ResNet18._weights learning/network.py:device learning/network.py:on_device learning/network.py:_padded
-        learning/network.py:_file_order learning/trainer.py:Trainer._memory""",
-    "rasterio": """formats/maps/geotiff.py:RasterTiles._dataset formats/maps/geotiff.py:_grey formats/maps/geotiff.py:_open_as
-        formats/maps/geotiff.py:_refuse_unplaced formats/maps/geotiff.py:_choose_bands formats/maps/geotiff.py:_scaling
-        formats/maps/geotiff.py:_vertical_unit_m formats/maps/geotiff.py:_described""",
+        learning/network.py:ResNet18._weights learning/network.py:find_device
+        learning/network.py:move_to_device learning/network.py:_pad_images
+        learning/network.py:_reorder_axes learning/trainer.py:Trainer._memory""",
+    "rasterio": """formats/maps/geotiff.py:RasterTiles._dataset formats/maps/geotiff.py:_read_grey formats/maps/geotiff.py:_open_as
+        formats/maps/geotiff.py:_refuse_unplaced formats/maps/geotiff.py:_choose_bands formats/maps/geotiff.py:_read_scaling
+        formats/maps/geotiff.py:_find_vertical_unit_m formats/maps/geotiff.py:_describe_as_vrt""",
     "zarr": """formats/maps/map_files.py:_put formats/maps/map_files.py:_place formats/maps/map_files.py:_add_layer
         formats/maps/map_files.py:_add_axis formats/maps/map_files.py:MapWriter._add_level formats/zarr_arrays.py:add_array""",
-    "numcodecs": "formats/shards.py:_codec",
-    "ruamel.yaml": """formats/logs/rosbag2.py:_by_metadata formats/logs/rosbag2.py:_topic_counts
-        formats/logs/rosbag2.py:_bag_information""",
-    "rosbags": """formats/logs/ros_types.py:_typestore formats/logs/ros_types.py:TypeLibrary._known
+    "numcodecs": "formats/shards.py:_make_codec",
+    "ruamel.yaml": """formats/logs/rosbag2.py:_find_files_by_metadata formats/logs/rosbag2.py:_read_topic_counts
+        formats/logs/rosbag2.py:_read_bag_information""",
+    "rosbags": """formats/logs/ros_types.py:_make_typestore formats/logs/ros_types.py:TypeLibrary._known
         formats/logs/ros_types.py:TypeLibrary._fallback
-        formats/logs/ros_types.py:_Unfold.__init__ formats/logs/ros_types.py:_Unfold.wire_type formats/logs/ros_types.py:_parsed
-        formats/logs/ros_types.py:_parsed_msg formats/logs/ros_types.py:_described formats/logs/ros_types.py:_parsed_idl
-        formats/logs/ros_types.py:_bundled_by_rosbags formats/logs/ros_types.py:_bundled_by_tcpipe formats/logs/ros_types.py:_definitions_of
-        formats/logs/ros_types.py:_definitions_of_directory formats/logs/ros_types.py:_plain formats/logs/writing.py:_message
-        formats/logs/writing.py:_value formats/logs/writing.py:_elements formats/logs/writing.py:_place""",
-    "numba": """compiled.py:kernel compiled.py:_Announce.on_start compiled.py:_Announce.on_end""",
+        formats/logs/ros_types.py:_Unfold.__init__ formats/logs/ros_types.py:_Unfold.wire_type formats/logs/ros_types.py:_parse_definitions
+        formats/logs/ros_types.py:_parse_msg formats/logs/ros_types.py:_describe_field_type formats/logs/ros_types.py:_parse_idl
+        formats/logs/ros_types.py:_load_rosbags_definitions
+        formats/logs/ros_types.py:_load_own_definitions formats/logs/ros_types.py:_read_definitions
+        formats/logs/ros_types.py:_read_definitions_of_directory formats/logs/ros_types.py:_to_plain formats/logs/writing.py:_make_message
+        formats/logs/writing.py:_to_rosbags_value formats/logs/writing.py:_make_elements formats/logs/writing.py:_place""",
+    "numba": """compiled.py:compile_kernel compiled.py:_Announce.on_start compiled.py:_Announce.on_end""",
     "click": "cli/options.py:Place.convert cli/options.py:FloatRange.convert",
 }
 UNTYPED_LIBRARIES = {key: library for library, keys in _BY_LIBRARY.items() for key in keys.split()}

@@ -7,7 +7,7 @@ Gates recover. A sensor that has been refused many times in a row and for a long
 odometry 5 s, 0.3 s where nothing else tells velocity) is taken to be right and the filter wrong: the covariance is lifted by the
 innovation before that update, which the smoother sees as process noise. Until then a multipath jump or a slipping wheel costs nothing but
 listed refusals. Fixes that contradict the rest while it carries the pose are not followed: in a second round an error of theirs is part of
-the state, where both ends tell that they have one (`wrong_fixes`). Where fixes scatter far less than they claim, the rest of their error
+the state, where both ends tell that they have one (`gnss_faults`). Where fixes scatter far less than they claim, the rest of their error
 lasts (`fix_errors`): it is no noise that averages out.
 
 `error_state_pass` runs the kernels over a stretch, `error_state_results` says what they found. The kernels: `state_kernel` (state, errors

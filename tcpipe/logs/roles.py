@@ -595,12 +595,6 @@ def _find_motion_role(type_name: str) -> str | None:
 
 
 def _transform_topics(topics: Iterable[Topic], ignored: Sequence[str]) -> tuple[str, ...]:
-    names = [
-        topic.name
-        for topic in topics
-        if topic.type_name in TRANSFORMS
-        and topic.name not in ignored
-        and topic.problem is None
-        and topic.message_count != 0
-    ]
+    usable = [topic for topic in topics if topic.type_name in TRANSFORMS and topic.name not in ignored]
+    names = [topic.name for topic in usable if topic.problem is None and topic.message_count != 0]
     return tuple(sorted(names, key=lambda name: (not name.endswith("tf_static"), name)))

@@ -52,6 +52,12 @@ def make_waiting(source: LogSource, state: str) -> Problem:
     return Problem(finding, source.files_digest, source.origins)
 
 
+def make_missing(path: str, state: State) -> Problem:
+    """Return the problem that a path given to `ingest` holds no log; after the next call that is given the path it is a new one."""
+    latest = max((call.begin for call in state.calls if path in call.logs), default="")
+    return Problem(make_finding("log-missing", Subject("log", path)), f"{path} {latest}", (path,))
+
+
 def is_acknowledged(problems: Sequence[Problem], state: State) -> bool:
     """Return whether a person has acknowledged all of some problems."""
     return bool(problems) and all(problem.key in state.acknowledged for problem in problems)
@@ -90,6 +96,7 @@ def acknowledge(names: Sequence[str], *, store: str | Path = "tcpipe-store") -> 
         found = (
             _name_problems(name, known.values(), state)
             or _make_lost_problem(name, opened, state)
+            or _make_missing_problem(name, state)
             or _make_waiting_problem(name, state)
         )
         if len({problem.name for problem in found}) == 1:
@@ -122,6 +129,16 @@ def _name_problems(name: str, known: Iterable[Problem], state: State) -> list[Pr
 def _make_lost_problem(name: str, store: Store, state: State) -> list[Problem]:
     """Return the problem of a run of which files are missing: to acknowledge it is to give the run up."""
     return list(find_incomplete_runs(store.ingestions(name, state=state))) if state.find_rows(name) else []
+
+
+def _make_missing_problem(name: str, state: State) -> list[Problem]:
+    """Return the problem of a path that `ingest` was given and that holds no log."""
+    given = {log for call in state.calls for log in call.logs}
+    path = next((path for path in (name, str(Path(name).absolute())) if path in given), None)
+    if path is None:
+        return []
+    with make_scratch_directory() as staging:
+        return [make_missing(path, state)] if find_sources([path], as_one=False, staging=staging).problems else []
 
 
 def _make_waiting_problem(name: str, state: State) -> list[Problem]:

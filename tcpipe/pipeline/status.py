@@ -24,11 +24,11 @@ from tcpipe.pipeline.call_history import INGEST, Estimate, estimate, format_dura
 from tcpipe.pipeline.ingest_task import IngestTask
 from tcpipe.pipeline.log_sources import find_sources, make_definitions_key, recall_hash, select_shard
 from tcpipe.pipeline.plan import STANDINGS, TROUBLE, Standing, Step, plan
-from tcpipe.pipeline.problems import find_incomplete_runs, make_waiting
+from tcpipe.pipeline.problems import find_incomplete_runs, make_missing, make_waiting
 from tcpipe.pipeline.store_verdict import find_changes, judge_runs
 from tcpipe.recipe import Recipe
 from tcpipe.store import Store, open_store
-from tcpipe.tables.findings import Finding, Subject, make_finding
+from tcpipe.tables.findings import Finding
 from tcpipe.tables.verdicts import Verdict
 
 _MOST_NAMES = 3
@@ -165,20 +165,20 @@ def find_status(
         and all(is_below(_make_absolute(log), asked) for log in given)
     ):
         problems += _find_waiting(steps)
+    problems += [make_missing(path, state) for path in found.problems if path in lately]
     problems = [problem for problem in problems if problem.key not in state.acknowledged]
     acknowledged = {call.name for call in begun if call.problem.key in state.acknowledged}
-    missing = [make_finding("log-missing", Subject("log", path)) for path in found.problems if path in lately]
     groups, waiting = tuple(_iterate_groups(steps)), [step for step in steps if step.is_todo]
     current = [run.facts for run in runs.finished if run.facts.ingest_key == ingest_key(ruling)]
     by_code = group_findings((run.run_id, run.findings) for run in current)
-    trouble = problems or missing or any(group.state in TROUBLE for group in groups)
+    trouble = problems or any(group.state in TROUBLE for group in groups)
     return Status(
         store=str(opened.root),
         sources=tuple(sources),
         counts=dict(sum((Counter({group.state: len(group.logs)}) for group in groups), Counter())),
         groups=groups,
         to_do=estimate(state.calls, INGEST, sum(map(_sum_bytes, waiting)), jobs=jobs) if waiting else None,
-        problems=(*missing, *(problem.finding for problem in problems)),
+        problems=tuple(problem.finding for problem in problems),
         gone=tuple(chain(*(lines for path, lines in found.problems.items() if path not in lately))),
         superseded_runs=len(state.superseded),
         begun=tuple(call for call in begun if call.state != "killed" or call.name not in acknowledged),

@@ -54,7 +54,7 @@ def verify_dataset(directory: Path) -> Iterator[Finding]:
     if card.data_model_version not in READ_VERSIONS:
         yield (
             f"{directory / CARD}: of data model {card.data_model_version}, this version knows {DATA_MODEL_VERSION}; "
-            "verify it with the version that wrote it, or build it again"
+            "run 'tcpipe migrate' on it, verify it with the version that wrote it, or build it again"
         )
         return
     wrong = list(_verify_files(directory, card))

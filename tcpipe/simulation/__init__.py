@@ -2,7 +2,7 @@
 
 `simulate` writes a whole site. In pieces: a `scenarios.Scenario` holds a `world.World`, drives (`route` says where to, `faults` what goes
 wrong, `sensors` how strongly) and the rasters' grids; `simulate_readings` gives the truth and the readings of one drive in memory;
-`truth.true_cost` is the cost of the true metre that begins at any time.
+`truth.compute_true_cost` is the cost of the true metre that begins at any time.
 """
 
 from tcpipe.simulation.faults import Faults

@@ -260,8 +260,8 @@ def test_nobody_listening_is_no_reason_to_stop(logs: list[Path], tmp_path: Path)
 
 
 def test_debug_shows_where_an_error_comes_from_inside_workers_too(logs: list[Path], tmp_path: Path) -> None:
-    broken = "import tcpipe.stages.mask as gate\ndef broken(*_, **__): raise ZeroDivisionError('boom')\n"
-    env = _patched(tmp_path, f"{broken}gate.gate_track = broken\n")
+    broken = "import tcpipe.stages.mask as mask\ndef broken(*_, **__): raise ZeroDivisionError('boom')\n"
+    env = _patched(tmp_path, f"{broken}mask.mask_track = broken\n")
     shown = tcpipe("--debug", "ingest", *logs[1:], "--jobs", "2", cwd=tmp_path, env=env)
     assert shown.returncode == 1
     assert "run1.mcap: internal error, ZeroDivisionError: boom" in shown.stderr
@@ -480,9 +480,9 @@ def test_a_batch_that_is_ended_goes_on_where_it_was(number: signal.Signals, logs
 
 
 def test_a_worker_that_is_killed_costs_only_its_own_log(logs: list[Path], tmp_path: Path) -> None:
-    kill = "import os, tcpipe.stages.mask as gate\nfirst = gate.gate_track\n"
+    kill = "import os, tcpipe.stages.mask as mask\nfirst = mask.mask_track\n"
     kill += "def killing(track, *a, **k):\n    if 'run1' in track.info.run_id: os.kill(os.getpid(), 9)\n"
-    env = _patched(tmp_path, f"{kill}    return first(track, *a, **k)\ngate.gate_track = killing\n")
+    env = _patched(tmp_path, f"{kill}    return first(track, *a, **k)\nmask.mask_track = killing\n")
     done = tcpipe("ingest", *logs, "--jobs", "2", cwd=tmp_path, env=env)
     assert done.returncode == 3
     assert "run1.mcap: its worker process died" in plain_lines(done, 3, most=1)

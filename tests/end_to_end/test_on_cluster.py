@@ -28,7 +28,7 @@ def sound(outcome):
     if outcome.index == 1:
         os.kill(os.getpid(), signal.SIGKILL)
     return outcome.result
-sampling.sound, sampling._BATCH_ROWS = sound, int(sys.argv[2])
+sampling.unwrap_result, sampling._BATCH_ROWS = sound, int(sys.argv[2])
 build_dataset("far", store="there", cluster=sys.argv[1])
 """
 """A build that is killed when the second batch is there."""

@@ -19,7 +19,7 @@ from tcpipe.stages.read import read_run
 @pytest.fixture
 def every_message(monkeypatch):
     """Its messages repeat readings of 1 Hz twenty times each; the published sum counts each."""
-    monkeypatch.setattr(read, "without_repeats", lambda streams: (streams, []))
+    monkeypatch.setattr(read, "remove_repeats", lambda streams: (streams, []))
 
 
 @pytest.mark.usefixtures("every_message")

@@ -23,24 +23,24 @@ def homeless(*arguments, **options):
 numba.njit = homeless
 def double(x):
     return 2.0 * x
-print(compiled.kernel(double)(21.0), numba.config.CACHE_DIR)
+print(compiled.compile_kernel(double)(21.0), numba.config.CACHE_DIR)
 """
 
 CALLED = {
     "numbers_": "STEP, SCALE = 1.0, (1.0, 2.0)\n",
-    "inner": "from tcpipe.compiled import kernel\n\n@kernel\ndef more(x):\n    return x + 1.0\n",
+    "inner": "from tcpipe.compiled import compile_kernel\n\n@compile_kernel\ndef more(x):\n    return x + 1.0\n",
     "fields": "from typing import NamedTuple\n\nclass Pair(NamedTuple):\n    a: float\n    b: float\n",
     "outer": """
 from fields import Pair
 from inner import more
 from numbers_ import SCALE, STEP
-from tcpipe.compiled import kernel
+from tcpipe.compiled import compile_kernel
 
-@kernel
+@compile_kernel
 def between(x):
     return more(x) * STEP
 
-@kernel
+@compile_kernel
 def outermost(x, pair):
     return between(x) * SCALE[1] + pair.a
 """,

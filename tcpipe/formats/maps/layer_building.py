@@ -14,11 +14,11 @@ from tcpipe.errors import MapError
 from tcpipe.formats.maps.mosaic import Raster
 from tcpipe.tables.findings import Finding, Subject, make_finding
 from tcpipe.terrain.classes import ClassScheme
-from tcpipe.terrain.common_grid import LATTICE_STEP_PX, Georeference, compute_source_lattice
 from tcpipe.terrain.grid import MapGrid
 from tcpipe.terrain.layers import Layer, Pixels
 from tcpipe.terrain.projection import Projection
 from tcpipe.terrain.resampling_kernel import mean, resample_bilinear, resample_majority
+from tcpipe.terrain.target_grid import LATTICE_STEP_PX, Georeference, compute_source_lattice
 
 _BLOCK_PX = 1024
 _HIGHEST_M = 9_000.0

@@ -53,8 +53,8 @@ def test_a_failed_directory_leaves_the_old_one_and_nothing_else(tmp_path: Path) 
 
 def test_what_a_killed_process_left_goes_when_its_place_is_written_again(tmp_path: Path) -> None:
     program = (
-        "import os, signal, sys; from pathlib import Path; from tcpipe.formats.atomic import atomic_directory, atomic_file\n"
-        "with atomic_directory(Path(sys.argv[1]) / 'd') as d, atomic_file(Path(sys.argv[1]) / 'f') as f:\n"
+        "import os, signal, sys; from pathlib import Path; from tcpipe.formats.atomic import write_atomic_directory, write_atomic_file\n"
+        "with write_atomic_directory(Path(sys.argv[1]) / 'd') as d, write_atomic_file(Path(sys.argv[1]) / 'f') as f:\n"
         "    (d / 'half').touch(); f.write_text('half'); os.kill(os.getpid(), signal.SIGKILL)\n"
     )
     subprocess.run([sys.executable, "-c", program, tmp_path], check=False)
@@ -169,10 +169,10 @@ if swap == "in two steps":
 
 def write(text):
     if kind == "directory":
-        with atomic.atomic_directory(place) as directory:
+        with atomic.write_atomic_directory(place) as directory:
             (directory / "f").write_text(text)
     else:
-        with atomic.atomic_file(place) as path:
+        with atomic.write_atomic_file(place) as path:
             path.write_text(text)
 
 def read():
@@ -197,7 +197,7 @@ while killed_at(step):
     step += 1
     there = os.listdir(parent)
     left += len(there) > 1
-    assert len(atomic.left_beside(place)) == len(there) - place.exists(), there
+    assert len(atomic.find_leftovers(place)) == len(there) - place.exists(), there
     atomic.clear_beside(place)  # as a command does that finds nothing to do
     assert os.listdir(parent) == ["place"], os.listdir(parent)
     seen.add(read())

@@ -165,7 +165,7 @@ def test_many_writers_lose_nothing(tmp_path):
         "place, who = DirectoryPlace(Path(sys.argv[1])), Process('lab', 'm', 'b', 'n', int(sys.argv[2]), '')\n"
         "state = read_state(place)\n"
         "for n in range(30):\n"
-        "    of = Entries(seen=(Sighting((sys.argv[2],), ((n, 1),), '0'),))\n"
+        "    of = Entries(seen=(LogSnapshot((sys.argv[2],), ((n, 1),), '0'),))\n"
         "    state = put_commit(place, state, Stamp(who, ''), 'seen', lambda _, of=of: of)\n"
     )
     writers = [subprocess.Popen([sys.executable, "-c", program, str(tmp_path), str(by)]) for by in range(3)]

@@ -83,7 +83,7 @@ def test_threads_that_meet_a_document_at_once_all_read_it():
 import sys
 from concurrent.futures import ThreadPoolExecutor
 from threading import Barrier
-from tcpipe.formats.json_files import plain, typed
+from tcpipe.formats.json_files import parse_typed, to_plain
 from tcpipe.formats.run_documents import LogOrigin, RunJson
 
 sys.setswitchinterval(1e-6)
@@ -91,7 +91,7 @@ known, together = RunJson(LogOrigin(("a.mcap",), "b", 1)), Barrier(8)
 
 def read(_):
     together.wait()
-    return typed(plain(known), RunJson, "run-1.json")
+    return parse_typed(to_plain(known), RunJson, "run-1.json")
 
 with ThreadPoolExecutor(8) as pool:
     assert set(map(repr, pool.map(read, range(8)))) == {repr(known)}

@@ -15,9 +15,9 @@ pytest.importorskip("torch")
 STEPS = """
 import numpy as np
 from tcpipe.learning.architecture import Architecture
-from tcpipe.learning.network import resnet18
+from tcpipe.learning.network import make_resnet18
 from tcpipe.learning.trainer import Trainer
-trainer = Trainer(resnet18(Architecture(40, 1, 1, 16), seed=0, start=[0.5]), np.ones(1, np.float32))
+trainer = Trainer(make_resnet18(Architecture(40, 1, 1, 16), seed=0, start=[0.5]), np.ones(1, np.float32))
 rng = np.random.default_rng(0)
 for count in (11, 11, 35, 3) * 2:
     trainer.step(rng.random((count, 40, 40, 1), np.float32), *rng.random((2, count, 1), np.float32), 1e-3)

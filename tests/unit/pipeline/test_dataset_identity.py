@@ -43,7 +43,7 @@ def places(tmp_path_factory):
     add_world(store, directory)
     add_run(store, "a", segments("a", *lanes(np.array([-3.0, 3.0]), -8.0, 8.0)))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("tcpipe.pipeline.dataset.build.dataset_report", lambda *_: "<!doctype html>")
+        patch.setattr("tcpipe.pipeline.dataset.build.render_dataset_report", lambda *_: "<!doctype html>")
         build_dataset(directory / "usual", store=store.root, recipe=Recipe())
         yield directory, store
 

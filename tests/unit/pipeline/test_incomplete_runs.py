@@ -55,7 +55,7 @@ def made(tmp_path_factory):
 @pytest.fixture(params=["directory", "bucket"])
 def place(request, made, tmp_path, monkeypatch):
     """A copy of the store: where its files lie here, and what it is called."""
-    monkeypatch.setattr(building, "dataset_report", lambda *_: "<!doctype html>")
+    monkeypatch.setattr(building, "render_dataset_report", lambda *_: "<!doctype html>")
     files = tmp_path / "served" / "sets" / "store"
     shutil.copytree(made / "store", files, copy_function=shutil.copy2)
     if request.param == "directory":

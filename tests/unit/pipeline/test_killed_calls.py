@@ -72,7 +72,7 @@ def kill(logs, store, monkeypatch, **how):
 
     with monkeypatch.context() as patch, suppress(SystemExit):
         patch.setattr(ingest_module, "_iterate_results", died)
-        patch.setattr(ingest_module, "gone_if_empty", lambda _: nullcontext())
+        patch.setattr(ingest_module, "remove_if_empty", lambda _: nullcontext())
         patch.setattr(log_writer, "identify_process", lambda: replace(identify_process(), start="1"))
         ingest([logs], store=store, **{"recipe": Recipe(), **how})
 

@@ -57,7 +57,7 @@ def store(tmp_path_factory):
 def build(store, out, names, **keywords):
     """Build without the page, which takes nine tenths of the time; the last test draws it."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("tcpipe.pipeline.dataset.build.dataset_report", lambda *_: "<!doctype html>")
+        patch.setattr("tcpipe.pipeline.dataset.build.render_dataset_report", lambda *_: "<!doctype html>")
         return build_dataset(out, store=store.root, map_name=names, recipe=Recipe(), **keywords)
 
 

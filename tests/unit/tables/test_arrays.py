@@ -63,8 +63,8 @@ import sys
 import numpy as np, pyarrow as pa
 from tcpipe.tables.arrays import *
 column = number_column(np.array([1.0, np.nan]), nan_is_null=True)
-table = pa.Table.from_arrays([column, text_column(["a", "b"])], names=["x", "y"])
-numbers(table["x"]), texts(table["y"]), rows_where(table, "y", "b")
+table = pa.Table.from_arrays([column, make_text_column(["a", "b"])], names=["x", "y"])
+to_numbers(table["x"]), to_texts(table["y"]), select_rows(table, "y", "b")
 assert "pandas" not in sys.modules
 """
     subprocess.run([sys.executable, "-c", program], check=True, timeout=60)

@@ -45,7 +45,7 @@ def build(store, tmp_path, *, page=False, **keywords):
     """Build into ``out``; drawing the page is nine tenths of so small a build, so only datasets of an odd kind get one."""
     with pytest.MonkeyPatch.context() as patch:
         if not page:
-            patch.setattr("tcpipe.pipeline.dataset.build.dataset_report", lambda *_: "<!doctype html>")
+            patch.setattr("tcpipe.pipeline.dataset.build.render_dataset_report", lambda *_: "<!doctype html>")
         return build_dataset(tmp_path / "out", store=store.root, **{"recipe": Recipe(), **keywords})
 
 
