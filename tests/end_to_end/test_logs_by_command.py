@@ -140,11 +140,11 @@ def test_a_night_with_known_trouble_is_no_red_night(tmp_path):
 def test_each_log_is_told_as_it_ends(tmp_path):
     """The second log cannot end before the first has been told."""
     drive_at(tmp_path / "a.mcap")
-    stuck = "import tcpipe.stages.mask as gate, time, os\nfirst = gate.gate_track\n"
+    stuck = "import tcpipe.stages.mask as mask, time, os\nfirst = mask.mask_track\n"
     stuck += "def waiting(track, *a, **k):\n    while 'b-' in track.info.run_id and not os.path.exists('go'): time.sleep(0.02)\n"
     (tmp_path / "patch").mkdir()
     (tmp_path / "patch" / "sitecustomize.py").write_text(
-        stuck + "    return first(track, *a, **k)\ngate.gate_track = waiting\n"
+        stuck + "    return first(track, *a, **k)\nmask.mask_track = waiting\n"
     )
     drive_at(tmp_path / "b.mcap", seed=1)
     running = subprocess.Popen(

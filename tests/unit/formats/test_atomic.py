@@ -124,8 +124,8 @@ def test_a_disk_that_fails_at_the_end_names_the_place(
     def fail(*_: object, **__: object) -> None:
         raise OSError(errno.EIO, os.strerror(errno.EIO))
 
-    for name in ("replace", "rename", "_exchanged") if failing == "rename" else ("fsync",):
-        target: object = "tcpipe.formats.atomic._exchange_directories" if name == "_exchanged" else f"os.{name}"
+    for name in ("replace", "rename", "_exchange_directories") if failing == "rename" else ("fsync",):
+        target: object = f"tcpipe.formats.atomic.{name}" if name == "_exchange_directories" else f"os.{name}"
         monkeypatch.setattr(target, fail)
     path = tmp_path / "it"
     with (
@@ -165,7 +165,7 @@ from tcpipe.formats import atomic
 parent, kind, swap = Path(sys.argv[1]), sys.argv[2], sys.argv[3]
 place = parent / "place"
 if swap == "in two steps":
-    atomic._exchanged = lambda *_: False
+    atomic._exchange_directories = lambda *_: False
 
 def write(text):
     if kind == "directory":

@@ -84,7 +84,7 @@ def told(store, *logs, **how):
 def test_a_first_night_that_is_killed_is_a_problem_and_the_next_one_deals_with_it(tmp_path, logs):
     code = (
         "import os, signal, sys; from tcpipe.pipeline import ingest; from tcpipe.recipe import Recipe\n"
-        "ingest._results = lambda *_, **__: os.kill(os.getpid(), signal.SIGKILL)\n"
+        "ingest._iterate_results = lambda *_, **__: os.kill(os.getpid(), signal.SIGKILL)\n"
         "ingest.ingest([sys.argv[1]], store=sys.argv[2], recipe=Recipe())"
     )
     done = subprocess.run([sys.executable, "-c", code, logs, tmp_path / "store"], check=False)
