@@ -110,7 +110,7 @@ def killed(store, out, module, *, after):
         return outcome.result
 
     with pytest.MonkeyPatch.context() as patch, suppress(_Killed):
-        patch.setattr(module, "sound", sound)
+        patch.setattr(module, "unwrap_result", sound)
         build(store, out)
         pytest.fail("it was not killed")
     assert not out.exists()
