@@ -40,7 +40,7 @@ from tcpipe.formats.geoparquet import add_segments_metadata
 from tcpipe.formats.index_files import RunFacts, make_run_facts, read_known_log, write_index
 from tcpipe.formats.integrity import CHECKSUMS, Checksum, compute_checksums, seal_document
 from tcpipe.formats.json_files import parse_typed, parse_typed_json, to_compact_json, to_json, to_plain
-from tcpipe.formats.numbered_documents import digest_of, find_highest_numbers, name_of, put_next, read_as_at
+from tcpipe.formats.numbered_documents import find_highest_numbers, name_document, name_folder, put_next, read_as_at
 from tcpipe.formats.object_storage import is_bucket, is_url
 from tcpipe.formats.parquet import read_table
 from tcpipe.formats.place import DirectoryPlace, Place
@@ -113,7 +113,7 @@ class Store:
 
     def map_document(self, name: str) -> MapDocument:
         """Return where a map lies, and its files; `StoreError` where there is none, or its document is not as it was written."""
-        return read_as_at(self.place.below("maps"), name_of(name, self.map_number(name)), MapDocument)
+        return read_as_at(self.place.below("maps"), name_document(name, self.map_number(name)), MapDocument)
 
     def map_path(self, name: str) -> Path:
         """Return where a map lies on this machine; of one in a bucket only its descriptions do."""
@@ -147,12 +147,12 @@ class Store:
             with convert_run_errors(maps.where(name), directory):
                 yield directory / f"{name}.zarr"
             checksums = compute_checksums(directory)
-            prefix = f"{name}/{digest_of(checksums)}"
+            prefix = f"{name}/{name_folder(checksums)}"
             if free := self.map_number(name) == after:
                 maps.put_files(prefix, directory)
         told = DATA_MODEL_VERSION, f"{prefix}/{name}.zarr", f"{prefix}/{name}.png", subdirectory(prefix, checksums)
-        data, new = to_json(seal_document(MapDocument(*told))).encode(), name_of(name, after + 1)
-        same = free and after > 0 and maps.read(name_of(name, after)) == data
+        data, new = to_json(seal_document(MapDocument(*told))).encode(), name_document(name, after + 1)
+        same = free and after > 0 and maps.read(name_document(name, after)) == data
         put = same or (free and maps.put_new(new, data))
         if not put and not (after and maps.read(new) == data):  # the answer to one's own may be lost
             raise StoreError(f"map {name}: another process has written it meanwhile, and it stays; look at it first")
@@ -202,13 +202,15 @@ class Store:
         }
         last = find_highest_numbers(sizes)
         known = self.known_run(run_id, last)
-        about = {name: sizes[name] for stem in ("run", "tags") if stem in last for name in [name_of(stem, last[stem])]}
+        about = {
+            name: sizes[name] for stem in ("run", "tags") if stem in last for name in [name_document(stem, last[stem])]
+        }
         found = dict[str, RunFacts]()
         for stem, number in sorted(last.items()):
             recipe_id, _, kind = stem.partition("/")
             with suppress(StoreError):
                 if kind == "manifest" and known is not None:
-                    document, name = name_of(stem, number), name_of(kind, number)
+                    document, name = name_document(stem, number), name_document(kind, number)
                     manifest = read_as_at(place, document, Manifest)
                     if (manifest.run_id, manifest.recipe_id) != (run_id, recipe_id):
                         continue
@@ -274,7 +276,7 @@ class Store:
             if tags.tags == before:
                 return False
             data = to_json(seal_document(tags)).encode()
-            if self.runs_place.put_new(f"{run_id}/{name_of('tags', number + 1)}", data):
+            if self.runs_place.put_new(f"{run_id}/{name_document('tags', number + 1)}", data):
                 return True
 
     def _last(self, run_id: str, stem: str) -> int:
@@ -282,7 +284,7 @@ class Store:
 
     def _tags(self, run_id: str, number: int) -> Mapping[str, str] | None:
         """Return the tags in a document; None for number 0."""
-        return read_as_at(self.runs_place, f"{run_id}/{name_of('tags', number)}", Tags).tags if number else None
+        return read_as_at(self.runs_place, f"{run_id}/{name_document('tags', number)}", Tags).tags if number else None
 
     def run_json(self, run_id: str, last: Mapping[str, int] | None = None) -> RunJson | None:
         """Return what is known of a run's log, or None; `StoreError` if it is not as it was written, or another run's.
@@ -292,7 +294,7 @@ class Store:
         last = find_highest_numbers(self.runs_place.files(run_id)) if last is None else last
         if not last.get("run"):
             return None
-        name = f"{run_id}/{name_of('run', last['run'])}"
+        name = f"{run_id}/{name_document('run', last['run'])}"
         found = read_as_at(self.runs_place, name, RunJson)
         if not is_named_after(run_id, found.source.sha256):
             where = self.runs_place.where(name)

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from tcpipe.formats.numbered_documents import find_highest_numbers, name_of
+from tcpipe.formats.numbered_documents import find_highest_numbers, name_document
 from tcpipe.formats.stored_runs import RunDirectory
 from tcpipe.store import Store
 
@@ -10,7 +10,7 @@ from tcpipe.store import Store
 def last(directory: Path, stem: str) -> Path:
     """The document of the highest number in a directory."""
     number = find_highest_numbers(path.name for path in directory.iterdir())[stem]
-    return directory / name_of(stem, number)
+    return directory / name_document(stem, number)
 
 
 def manifest(run: RunDirectory) -> Path:

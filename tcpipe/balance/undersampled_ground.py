@@ -53,7 +53,7 @@ class MapGround:
         object.__setattr__(self, "up", find_slope_ranges(steepest).astype(np.int8))
         object.__setattr__(self, "down", find_slope_ranges(-steepest).astype(np.int8))
 
-    def cells_of(self, xy_m: Floats) -> tuple[Ints, Ints, NDArray[np.bool_]]:
+    def find_cells(self, xy_m: Floats) -> tuple[Ints, Ints, NDArray[np.bool_]]:
         """Return row and column of points, shape (N, 2) [m], and whether they lie on the map."""
         col = np.floor((xy_m[:, 0] - self.x_min_m) / self.cell_m).astype(np.int64)
         row = np.floor((self.y_max_m - xy_m[:, 1]) / self.cell_m).astype(np.int64)
@@ -91,7 +91,7 @@ def find_undersampled_ground(ground: MapGround, terrain_class: int, slope: int, 
     driven_xy_m : centres of the samples of that class and slope, shape (N, 2) [m].
     """
     free = cells_available(ground, terrain_class, slope)
-    row, col, on = ground.cells_of(driven_xy_m)
+    row, col, on = ground.find_cells(driven_xy_m)
     free[row[on], col[on]] = False
     for row, col in _find_largest_patches(free):
         yield _patch(ground, row, col, terrain_class, slope)

@@ -123,7 +123,7 @@ def fetch_directory(path: str | Path) -> Path:
     UsageError : there is no card at the URL.
     StoreError : it cannot be read, or a file is not as the card says.
     """
-    return Path(path) if not is_url(path) else _mirrored(str(path).rstrip("/"), lambda _: True)[0]
+    return Path(path) if not is_url(path) else _fetch_copy(str(path).rstrip("/"), lambda _: True)[0]
 
 
 @contextmanager
@@ -137,7 +137,7 @@ def fetch_unproved(url: str) -> Iterator[Path]:
     """
     card = require_card(url)
     with make_scratch_directory() as held:
-        root = _below(held, url)
+        root = _make_subdirectory(held, url)
 
         def bring(name: str) -> None:
             if (data := card.place.read(name)) is not None:
@@ -150,7 +150,9 @@ def fetch_unproved(url: str) -> Iterator[Path]:
 
 def fetch_directory_by_range(path: str | Path, *, by_range: Callable[[str], bool]) -> tuple[Path, FetchedShards | None]:
     """Return a directory as `fetch_directory`, without the files that are ``by_range``, and where these are read; None on this machine."""
-    return (Path(path), None) if not is_url(path) else _mirrored(str(path).rstrip("/"), lambda name: not by_range(name))
+    return (
+        (Path(path), None) if not is_url(path) else _fetch_copy(str(path).rstrip("/"), lambda name: not by_range(name))
+    )
 
 
 def has_card(url: str) -> bool:
@@ -191,10 +193,10 @@ def find_unlisted_files(url: str) -> list[str]:
     cards = [card for card in (find_newest(url, CARDS), _find_at(place, CARDS)) if card is not None]
     listed = {of.place.where(name) for of in cards for name in (*_read_checksums(of), *_UNLISTED, of.name)}
     others = [entry.name for entry in place.entries() if place.where(entry.name) not in listed]
-    return [place.where(name) for name in others if not _may_be_there(name, state)]
+    return [place.where(name) for name in others if not _is_expected(name, state)]
 
 
-def _may_be_there(name: str, state: State) -> bool:
+def _is_expected(name: str, state: State) -> bool:
     newest = state.generations[-1].folder if state.generations else None
     found = _GENERATION.match(name)
     is_of_others = found is not None and found[1] != newest and not is_left_over(name, state)
@@ -231,15 +233,15 @@ def _read_checksums(card: FoundCard) -> Mapping[str, Checksum]:
     return checksums
 
 
-def _mirrored(url: str, wanted: Callable[[str], bool]) -> tuple[Path, FetchedShards]:
+def _fetch_copy(url: str, wanted: Callable[[str], bool]) -> tuple[Path, FetchedShards]:
     card = require_card(url)
     checksums = _read_checksums(card)
-    root = _below(_kept(url, card.data), url)
+    root = _make_subdirectory(_make_copy_directory(url, card.data), url)
     (root / card.name).write_bytes(card.data)
     for unlisted in _UNLISTED:
         if (page := card.place.read(unlisted)) is not None:
             (root / unlisted).write_bytes(page)
-    return root, _brought(card.place, root, checksums, wanted)
+    return root, _fetch_wanted(card.place, root, checksums, wanted)
 
 
 def fetch_files(
@@ -251,34 +253,36 @@ def fetch_files(
     """
     if isinstance(place, DirectoryPlace):
         return place.root, None
-    root = _below(_kept(place.where(), repr(sorted(checksums.items())).encode()), place.where())
-    return root, _brought(place, root, checksums, lambda name: not by_range(name))
+    root = _make_subdirectory(
+        _make_copy_directory(place.where(), repr(sorted(checksums.items())).encode()), place.where()
+    )
+    return root, _fetch_wanted(place, root, checksums, lambda name: not by_range(name))
 
 
-def _brought(
+def _fetch_wanted(
     place: Place, root: Path, checksums: Mapping[str, Checksum], wanted: Callable[[str], bool]
 ) -> FetchedShards:
     """Bring what is wanted of a place's files below ``root``; return where the others are read."""
     absent = [(file, checksum) for file, checksum in checksums.items() if wanted(file) and not (root / file).exists()]
-    map_concurrently(place.where(), lambda of: _bring(place, *of, root / of[0]), absent)
+    map_concurrently(place.where(), lambda of: _fetch_one(place, *of, root / of[0]), absent)
     return FetchedShards(place, root, checksums)
 
 
 @cache
-def _kept(url: str, card: bytes) -> Path:
+def _make_copy_directory(url: str, card: bytes) -> Path:
     """Return a directory for a card at a URL, which goes when the process ends."""
     del url, card
     return make_lasting_scratch()
 
 
-def _below(directory: Path, url: str) -> Path:
+def _make_subdirectory(directory: Path, url: str) -> Path:
     """Return where a copy of what lies at a URL lies in a directory: so that lines about its files show where they are from."""
     path = directory.joinpath(*(part for part in url.split("/") if part not in ("", "..")))
     path.mkdir(parents=True, exist_ok=True)
     return path
 
 
-def _bring(place: Place, name: str, checksum: Checksum, to: Path) -> None:
+def _fetch_one(place: Place, name: str, checksum: Checksum, to: Path) -> None:
     """Link or copy the cached content of a file to where it is wanted; a cached copy that is not as it was goes and is fetched anew."""
     to.parent.mkdir(parents=True, exist_ok=True)
     for _ in range(2):

@@ -187,7 +187,7 @@ def compute_checksums(directory: Path) -> dict[str, Checksum]:
     return {path.relative_to(directory).as_posix(): compute_checksum(path) for path in files}
 
 
-def seal_of(directory: Path) -> str:
+def read_seal(directory: Path) -> str:
     """Return what tells the content of a directory with a ``checksums.json`` from any other; `StoreError` if that cannot be read."""
     return str(read_sealed(directory / CHECKSUMS).get(SEAL))
 

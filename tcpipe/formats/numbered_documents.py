@@ -21,7 +21,7 @@ _NUMBERED = re.compile(r"(.+)-([1-9]\d*)\.json")
 _DIGEST_HEX = 16
 
 
-def name_of(stem: str, number: int) -> str:
+def name_document(stem: str, number: int) -> str:
     """Return the name of a document."""
     return f"{stem}-{number}.json"
 
@@ -65,7 +65,7 @@ def put_next(place: Place, stem: str, value: T, *, after: int, settled: Callable
     data = to_json(seal_document(value)).encode()
     number = max(after, 1)
     while True:
-        name = name_of(stem, number)
+        name = name_document(stem, number)
         if number > after and place.put_new(name, data):
             return value
         try:
@@ -77,6 +77,6 @@ def put_next(place: Place, stem: str, value: T, *, after: int, settled: Callable
         number += 1
 
 
-def digest_of(checksums: Mapping[str, Checksum]) -> str:
+def name_folder(checksums: Mapping[str, Checksum]) -> str:
     """Return the name of a directory with these files."""
     return digest(dict(checksums))[:_DIGEST_HEX]

@@ -16,7 +16,7 @@ from tcpipe.errors import StoreError
 from tcpipe.formats.commits import State
 from tcpipe.formats.index_files import RunFacts
 from tcpipe.formats.integrity import Checksum, compute_checksum, compute_checksums, find_wrong_checksum
-from tcpipe.formats.numbered_documents import digest_of, read_as_at
+from tcpipe.formats.numbered_documents import name_folder, read_as_at
 from tcpipe.formats.parquet import read_highest, read_lowest, read_table, write_table
 from tcpipe.formats.place import DirectoryPlace, Place
 from tcpipe.formats.recipe_toml import read_key
@@ -213,7 +213,7 @@ def put_tables(place: Place, tables: Mapping[str, pa.Table], *, folder: str = ""
             for name, table in tables.items():
                 write_table(table, directory / f"{name}.parquet")
         checksums = compute_checksums(directory)
-        prefix = f"{folder}{digest_of(checksums)}"
+        prefix = f"{folder}{name_folder(checksums)}"
         place.put_files(prefix, directory)
     return subdirectory(prefix, checksums)
 

@@ -19,7 +19,7 @@ from tcpipe.motion.row_sections import (
     find_piece_bounds,
     find_runs,
     fit_slope,
-    mask_of,
+    make_mask,
 )
 
 
@@ -87,7 +87,7 @@ def find_ramps(rows: MotionRows, acceleration_mps2: Floats, halted: Mask, *, abo
     for changes in (speeding_up > above_mps2, speeding_up < -above_mps2):
         going_on = ~drop_short_runs(~(changes | halted), rows.piece, min_rows=rows.count(min_s))
         spans = find_runs(going_on, rows.piece)
-        found |= mask_of(spans[halts[spans[:, 1] + 1] > halts[spans[:, 0]]], len(halted))
+        found |= make_mask(spans[halts[spans[:, 1] + 1] > halts[spans[:, 0]]], len(halted))
     return found & ~halted
 
 
@@ -111,7 +111,7 @@ def find_command_changes(rows: MotionRows, *, step_mps: float, window_s: float, 
         for first, last in find_runs(changing, part)
         for begin, end in [_find_moment(command[first : last + 1], before[first], after[last], step_mps=step_mps)]
     ]
-    return mask_of(np.array(spans, dtype=np.int64).reshape(-1, 2), len(command))
+    return make_mask(np.array(spans, dtype=np.int64).reshape(-1, 2), len(command))
 
 
 def _estimate_jitter(command: Floats, part: NDArray[np.int64], window: int) -> Floats:

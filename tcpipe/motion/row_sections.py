@@ -65,7 +65,7 @@ def find_runs(mask: Mask, piece: Ints) -> Ints:
     return np.column_stack((first, last)).astype(np.int64)
 
 
-def mask_of(spans: Ints, size: int) -> Mask:
+def make_mask(spans: Ints, size: int) -> Mask:
     """Return the mask that is true on every span of rows (first, last), shape (size,)."""
     edges = np.zeros(size + 1, dtype=np.int64)
     np.add.at(edges, spans[:, 0], 1)
@@ -88,7 +88,7 @@ def find_piece_bounds(piece: Ints) -> tuple[Ints, Ints]:
 def drop_short_runs(mask: Mask, piece: Ints, *, min_rows: int) -> Mask:
     """Return the mask without runs of fewer than ``min_rows`` rows."""
     spans = find_runs(mask, piece)
-    return mask_of(spans[spans[:, 1] - spans[:, 0] + 1 >= min_rows], len(mask))
+    return make_mask(spans[spans[:, 1] - spans[:, 0] + 1 >= min_rows], len(mask))
 
 
 def dilate_mask(mask: Mask, piece: Ints, *, before: int, after: int) -> Mask:
@@ -97,7 +97,7 @@ def dilate_mask(mask: Mask, piece: Ints, *, before: int, after: int) -> Mask:
     low, high = find_piece_bounds(piece)
     spans[:, 0] = np.maximum(spans[:, 0] - before, low[spans[:, 0]])
     spans[:, 1] = np.minimum(spans[:, 1] + after, high[spans[:, 1]])
-    return mask_of(spans, len(mask))
+    return make_mask(spans, len(mask))
 
 
 def compute_window_mean(value: Floats, piece: Ints, *, before: int, after: int) -> Floats:

@@ -46,7 +46,7 @@ class _Spans:
     end_ns: NDArray[np.int64]
     robot: NDArray[np.str_]
 
-    def beside(self, index: int) -> list[int]:
+    def find_overlapping(self, index: int) -> list[int]:
         """Return which earlier runs of the same robot have segments at the time of one."""
         early = slice(0, index)
         apart_ns = np.maximum(self.start_ns[early], self.start_ns[index]) - np.minimum(
@@ -91,7 +91,7 @@ def remove_duplicates(runs: Sequence[RunDirectory], sha256_by_run: Mapping[str, 
             findings.append(_find_twice(run, run.facts.segments, [twin]))
             continue
         twice, others = np.zeros(run.facts.segments, np.bool_), []
-        for earlier in spans.beside(index):
+        for earlier in spans.find_overlapping(index):
             if earlier in kept:
                 shared = _find_shared(way(index), way(earlier))
                 twice |= shared

@@ -161,7 +161,7 @@ def _read(
     if before and before.message_definitions == task.definitions and not task.force:
         cached = store.read_streams(run_id, key=key)
         if cached is not None:
-            known = run_json_of(task, log, cached, sha256)
+            known = make_run_json(task, log, cached, sha256)
             return cached, replace(
                 known, damage=before.damage, remarks=before.remarks, streams=before.streams, streams_key=key
             )
@@ -171,11 +171,11 @@ def _read(
     if task.source.has_changed():
         raise LogError(f"{task.source.name}: changed while it was read")
     damage = tuple(str(damage) for damage in log.damage if damage.is_loss)
-    known = run_json_of(task, log, streams, sha256)
+    known = make_run_json(task, log, streams, sha256)
     return streams, replace(known, damage=damage, remarks=tuple(log.remarks), streams_key=key)
 
 
-def run_json_of(task: IngestTask, log: AnyLog, streams: Streams, sha256: str) -> RunJson:
+def make_run_json(task: IngestTask, log: AnyLog, streams: Streams, sha256: str) -> RunJson:
     """Return what is known of a log that was read; its damage, remarks and tags are to be added."""
     by_index = sha256 == log.outline or (log.is_known_by_outline and sha256 == log.sha256())
     return RunJson(

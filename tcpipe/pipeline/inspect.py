@@ -188,7 +188,7 @@ def _inspect_logs_at(
         raise UsageError(f"{path}: is no map, dataset, run or store, and holds no log")
     if len(logs) == 1:
         return ask(logs[0])
-    return InspectedLogs(path=str(path), logs=tuple(_inspect_one_of(entry, ask) for entry in logs))
+    return InspectedLogs(path=str(path), logs=tuple(_try_inspect(entry, ask) for entry in logs))
 
 
 def _inspect_one(
@@ -198,7 +198,7 @@ def _inspect_one(
         return replace(inspect_log(log, recipe, robot, full=full), path=format_path(path))
 
 
-def _inspect_one_of(path: Path | str, ask: Callable[[Path | str], InspectedLog]) -> InspectedLog:
+def _try_inspect(path: Path | str, ask: Callable[[Path | str], InspectedLog]) -> InspectedLog:
     try:
         return ask(path)
     except TcpipeError as error:

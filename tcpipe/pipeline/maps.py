@@ -13,7 +13,7 @@ from typing import Literal
 
 from tcpipe.errors import MapError, StoreError, UsageError, clean_lines
 from tcpipe.formats.finding_lines import format_findings
-from tcpipe.formats.integrity import compute_checksum, seal_of
+from tcpipe.formats.integrity import compute_checksum, read_seal
 from tcpipe.formats.maps.building import MoreLayers, OrthoBands, build_map
 from tcpipe.formats.maps.geotiff import list_raster_files
 from tcpipe.formats.maps.map_facts import MapInputs, MapSummary, map_lines
@@ -95,7 +95,7 @@ def run_add_map(options: AddMapOptions) -> AddedMap:
                     crs=options.crs,
                     inputs=inputs,
                 )
-                write_quick_look(path.with_suffix(".png"), draw_quick_look(open_map(path)), seal_of(path))
+                write_quick_look(path.with_suffix(".png"), draw_quick_look(open_map(path)), read_seal(path))
         except StoreError:
             if before or opened.map_number(name) == before:
                 raise

@@ -30,7 +30,13 @@ from tcpipe.formats.integrity import (
 )
 from tcpipe.formats.json_files import parse_typed
 from tcpipe.formats.maps.map_files import MapFile, open_map
-from tcpipe.formats.numbered_documents import find_highest_numbers, name_of, read_as_at, read_sealed_at, split_number
+from tcpipe.formats.numbered_documents import (
+    find_highest_numbers,
+    name_document,
+    read_as_at,
+    read_sealed_at,
+    split_number,
+)
 from tcpipe.formats.parquet import read_table
 from tcpipe.formats.place import DirectoryPlace, Place
 from tcpipe.formats.recipe_toml import ingest_key, make_recipe_id
@@ -130,11 +136,11 @@ def verify_run(store: Store, run_id: str, recipe: str | None = None) -> Iterator
     there, last, folders = _list_documents(place), find_highest_numbers(names), place.folders()
     yield from _verify_seals(place, sorted(there))
     if "run" not in last:
-        yield f"{place.where(name_of('run', 1))}: is gone"
+        yield f"{place.where(name_document('run', 1))}: is gone"
     known = None
     for number in range(1, last.get("run", 0) + 1):
         with suppress(StoreError):
-            known = read_as_at(place, name_of("run", number), RunJson)
+            known = read_as_at(place, name_document("run", number), RunJson)
             there |= set(known.streams)
     yield from _isolate_errors(_verify_streams(place, known))
     recipes = [name for name in folders if name != _STREAMS and find_highest_numbers(place.files(name)).get("manifest")]
@@ -163,7 +169,7 @@ def _verify_maps(store: Store) -> Iterator[Finding]:
     for name, last in find_highest_numbers(known).items():
         for number in range(1, last + 1):
             with suppress(StoreError):
-                known |= set(read_as_at(place, name_of(name, number), MapDocument).checksums)
+                known |= set(read_as_at(place, name_document(name, number), MapDocument).checksums)
         yield from _isolate_errors(_verify_stored_map(store, name))
     for entry in place.entries():
         if entry.name not in known:
@@ -269,7 +275,7 @@ def _make_ingestion(runs: Place, run_id: str, recipe_name: str) -> Iterator[Find
     """Compare what a run became under one recipe with its manifest."""
     yield "runs", 1
     place = runs.below(f"{run_id}/{recipe_name}")
-    last = name_of("manifest", find_highest_numbers(place.files())["manifest"])
+    last = name_document("manifest", find_highest_numbers(place.files())["manifest"])
     document, where = read_sealed_at(place, last), place.where(last)
     if document["data_model_version"] not in READ_VERSIONS:
         yield (

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import KW_ONLY, dataclass
+from dataclasses import KW_ONLY, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -94,4 +94,6 @@ class CostMapOptions:
     )
     speed_mps: float | None = option(None, SPEED)
     store: str = option("tcpipe-store", STORE)
-    cluster: str | None = option(None, CLUSTER)
+    cluster: str | None = option(
+        None, replace(CLUSTER, about="Dask scheduler whose workers do it, tcp://host:port (or TCPIPE_CLUSTER).")
+    )

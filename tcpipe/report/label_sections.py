@@ -121,7 +121,7 @@ def balance_sections(balance: Balance) -> list[Section]:
 def _make_class_section(balance: Balance) -> Section:
     cells = balance.by_class_and_slope
     text = (
-        f"Samples, and in brackets how many independent ones they are worth: neighbours are alike ({_format_alike(balance)}). "
+        f"Samples, and in brackets how many independent ones they are worth: neighbours are alike ({_format_correlation(balance)}). "
         f"{sum(cell['rare'] for cell in cells)} of {len(cells)} cells are worth fewer than {balance.enough_effective:g} and marked "
         "with * and a dashed border; – is ground of the map that nobody drove. drive-next.geojson holds where to drive for them."
     )
@@ -173,7 +173,7 @@ def _shaded(row: CellRow, most: int) -> Shaded:
     return Shaded(text, (count / max(most, 1)) ** 0.5, alarm=row["rare"])
 
 
-def _format_alike(balance: Balance) -> str:
+def _format_correlation(balance: Balance) -> str:
     found = [
         f"{_name(label)} over {entry.length_m:.1f} m, {100 * entry.share:.0f} % of its variance"
         for label, entry in balance.correlation.items()

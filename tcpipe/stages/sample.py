@@ -144,7 +144,7 @@ def sample_on_maps(
     ------
     TableError, MapError : as `sample_segments`; the maps have not the same layers or classes, or lie too far from one another.
     """
-    check_alike(sources)
+    check_same_layers(sources)
     lost_by = np.full(segments.num_rows, Loss.OUTSIDE_MAP, np.uint32)
     waiting = np.arange(segments.num_rows)
     parts: list[Sampled] = []
@@ -178,7 +178,7 @@ def _project_to_first_map(sampled: Sampled, source: MapReader, first: MapReader)
     return placed
 
 
-def check_alike(sources: Sequence[MapReader]) -> None:
+def check_same_layers(sources: Sequence[MapReader]) -> None:
     """Raise `MapError` if the maps have not the same layers and classes: their patches could not be learned from together."""
     first, problems = sources[0], []
     for other in sources[1:]:

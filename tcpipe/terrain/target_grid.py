@@ -69,7 +69,7 @@ class Georeference:
         """Return the middle of the raster in its CRS, shape (2,)."""
         return self.xy_from_px(np.array([self.cols / 2.0, self.rows / 2.0]))
 
-    def on_grid_of(self, crs: CRS) -> bool:
+    def is_square_in(self, crs: CRS) -> bool:
         """Return whether pixels are square and upright in ``crs``, so that a grid can coincide with them."""
         a, b, _, d, e, _ = self.affine
         upright = max(abs(b), abs(d)) < _TURN * abs(a)
@@ -119,7 +119,7 @@ def choose_grid(
     sides = [_compute_pixel_side(raster, crs) for raster in rasters]
     finest = int(np.argmin(sides)) if min(sides) < _FINER * sides[0] else 0
     base, pitch = rasters[finest], sides[finest]
-    coincide = base.on_grid_of(crs) and pitch_m in {None, pitch}
+    coincide = base.is_square_in(crs) and pitch_m in {None, pitch}
     if pitch_m is not None:
         pitch = pitch_m
     elif not coincide:
@@ -131,7 +131,7 @@ def choose_grid(
     if coincide:
         corners = base.outline()
         x_base, y_base = float(corners[:, 0].min()), float(corners[:, 1].max())
-    elif height.on_grid_of(crs):
+    elif height.is_square_in(crs):
         x_base, y_base = x_min, y_max
     _refuse_huge(height, (x_max - x_min, y_max - y_min), pitch)
     slack = 1e-3
@@ -154,7 +154,7 @@ def _refuse_huge(height: Georeference, sides_m: tuple[float, float], pitch_m: fl
 
 def _compute_pixel_side(raster: Georeference, crs: CRS) -> float:
     """Return the shorter side of the raster's middle pixel in the map's CRS [m]."""
-    if raster.on_grid_of(crs):
+    if raster.is_square_in(crs):
         return abs(raster.affine[0])
     middle = np.array([raster.cols / 2.0, raster.rows / 2.0])
     points = raster.xy_from_px(middle + np.array([(0.0, 0.0), (1.0, 0.0), (0.0, 1.0)]))

@@ -78,15 +78,15 @@ def patterns() -> Iterator[tuple[str, re.Pattern, set[str]]]:
         calls = [node for node in ast.walk(tree) if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute)]
         for call in calls:
             first = call.args[0] if call.args else None
-            if isinstance(first, ast.Constant) and name_of(call) == "re" and call.func.attr in METHODS:
+            if isinstance(first, ast.Constant) and name_document(call) == "re" and call.func.attr in METHODS:
                 yield f"{name}:{call.lineno}", re.compile(first.value), {call.func.attr}
         for held, value in vars(module).items():
             if isinstance(value, re.Pattern):
-                used = {call.func.attr for call in calls if name_of(call) == held}
+                used = {call.func.attr for call in calls if name_document(call) == held}
                 yield f"{name}.{held}", value, used & set(METHODS) or {"search"}
 
 
-def name_of(call: ast.Call) -> str | None:
+def name_document(call: ast.Call) -> str | None:
     return call.func.value.id if isinstance(call.func.value, ast.Name) else None
 
 

@@ -153,8 +153,8 @@ def test_a_raster_s_own_names_are_its_classes(site, tmp_path):
     named = tmp_path / "named.tif"
     with rasterio.open(named, "w", **profile) as raster:
         raster.write(values)
-    name_of = {7: "closed", 40: "open"}
-    categories = "".join(f"<Category>{name_of.get(value, '')}</Category>" for value in range(41))
+    name_document = {7: "closed", 40: "open"}
+    categories = "".join(f"<Category>{name_document.get(value, '')}</Category>" for value in range(41))
     (tmp_path / "named.tif.aux.xml").write_text(
         f'<PAMDataset><PAMRasterBand band="1"><CategoryNames>{categories}</CategoryNames></PAMRasterBand></PAMDataset>'
     )

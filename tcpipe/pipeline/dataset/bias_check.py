@@ -62,7 +62,7 @@ def find_removed_by_ground(
     spans = _Spans(segments, used)
     by_class, by_slope = np.zeros((len(names), len(_REASONS))), np.zeros((len(_SLOPE_NAMES), len(_REASONS)))
     for run in runs:
-        length_m, reason, slope, ground = _read_intervals(run, spans.of(run.run_id), grounds)
+        length_m, reason, slope, ground = _read_intervals(run, spans.find_segments(run.run_id), grounds)
         by_slope += sum_lengths_m(slope, reason, length_m, shape=by_slope.shape)
         by_class += sum_lengths_m(ground - OFF_THE_MAP, reason, length_m, shape=by_class.shape)
     slopes = list_groups(by_slope, _SLOPE_NAMES, _REASONS)
@@ -85,7 +85,7 @@ class _Spans:
         order = np.lexsort((start, code))
         self._run, self._start, self._end, self._used = code[order], start[order], end[order], is_used[order]
 
-    def of(self, run_id: str) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]:
+    def find_segments(self, run_id: str) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]:
         code = self._code.get(run_id, -1)
         rows = slice(*np.searchsorted(self._run, [code, code + 1]))
         return self._start[rows], self._end[rows], self._used[rows]

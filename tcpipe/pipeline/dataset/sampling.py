@@ -25,7 +25,7 @@ from tcpipe.formats.maps.map_files import MapFile, open_map
 from tcpipe.formats.place import Place
 from tcpipe.progress import Meter
 from tcpipe.recipe import SampleConfig
-from tcpipe.stages.sample import Sampled, check_alike, sample_on_maps
+from tcpipe.stages.sample import Sampled, check_same_layers, sample_on_maps
 from tcpipe.tables.columns import to_floats
 from tcpipe.tables.findings import Finding
 from tcpipe.tables.levels import PLACED_SEGMENTS
@@ -212,7 +212,7 @@ def sample_all_segments(
     TcpipeError : the map or the segments cannot be used.
     """
     sources = [open_map(*of) for of in maps()]
-    check_alike(sources)
+    check_same_layers(sources)
     rows = list(_iterate_batches(segments))
     layers = sort_layers(join_layers([source.layers for source in sources]))
     spool = Spool(workers.waiting.below("pixels"), layers, config.patch_px, kept=workers.cluster is not None)

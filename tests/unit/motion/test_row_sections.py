@@ -11,7 +11,7 @@ from tcpipe.motion.row_sections import (
     find_piece_spans,
     find_runs,
     fit_slope,
-    mask_of,
+    make_mask,
     number_pieces,
 )
 
@@ -57,7 +57,7 @@ def test_lasting_and_dilated():
 
 
 def test_mask_of_overlapping_spans():
-    assert text(mask_of(np.array([[0, 2], [1, 1], [4, 5]]), 6)) == "xxx.xx"
+    assert text(make_mask(np.array([[0, 2], [1, 1], [4, 5]]), 6)) == "xxx.xx"
 
 
 def test_window_mean_is_clipped_to_its_piece():

@@ -16,7 +16,7 @@ from synthetic_store import WORLD, add_run, box, commit_run, lanes, put_map, reg
 from tcpipe.dataset import open_dataset
 from tcpipe.errors import DatasetError, UsageError
 from tcpipe.formats.commits import Entries, LogSnapshot
-from tcpipe.formats.integrity import compute_checksum, find_broken_seal, seal_of, seal_page, write_sealed
+from tcpipe.formats.integrity import compute_checksum, find_broken_seal, read_seal, seal_page, write_sealed
 from tcpipe.formats.maps.map_facts import MapInputs
 from tcpipe.formats.maps.map_files import open_map
 from tcpipe.formats.numbered_documents import read_as_at
@@ -80,7 +80,7 @@ def dress(store):
     open_log(store).commit("seen", Entries(seen=(LogSnapshot(("/logs/north.mcap",), (), "north"),)))
     with store.new_map("site", after=1) as path:
         shutil.copytree(store.map_path("site"), path)
-        write_quick_look(path.with_suffix(".png"), draw_quick_look(open_map(path)), seal_of(path))
+        write_quick_look(path.with_suffix(".png"), draw_quick_look(open_map(path)), read_seal(path))
     shutil.rmtree(store.map_path("site").parents[1] / replaced(store))
     (store.root / "maps" / "site-1.json").unlink()
     sensor = Sensor("/power", "x/msg/Power", "base", "the only one", None, None)
