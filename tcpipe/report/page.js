@@ -155,7 +155,7 @@ const page = (() => {
     at("gallery-more").onclick = () => { most += 120; draw(); };
     draw();
   }
-  // Columns as `tcpipe.report.packed` wrote them.
+  // Columns as `tcpipe.report.column_packing` wrote them.
   async function unpack({ columns, data }) {
     const stream = new Blob([bytesOf(data)]).stream().pipeThrough(new DecompressionStream("deflate"));
     const buffer = await new Response(stream).arrayBuffer();

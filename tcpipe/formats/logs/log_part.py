@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import errno
 import hashlib
-import mmap
 import os
 import struct
 import threading
@@ -45,10 +44,6 @@ _LZ4_HEAD = struct.Struct("<4sBBQ")
 _LZ4_MAGIC, _LZ4_HAS_CONTENT_SIZE = b"\x04\x22\x4d\x18", 0x08
 _PEEK_BYTES = 1 << 13
 _LISTED = 5
-_GAP_BYTES = 1 << 15
-"""Pieces of a file that lie no further apart are read as one."""
-_MADV_POPULATE_READ = 22
-"""Linux 5.14 and newer: have these pages in memory now, or say that it cannot be. Python has no name for it."""
 
 Int64Array = NDArray[np.int64]
 
@@ -261,33 +256,6 @@ class ByteSource:
 
 def _make_unreadable_error(offset: int, error: OSError) -> DamageError:
     return DamageError(f"the disk does not give what lies at byte {offset} ({error.strerror})")
-
-
-def load_only(window: mmap.mmap, starts: Int64Array, ends: Int64Array) -> None:
-    """Have the system load these pieces of a mapped file, shape (N,), by rising start, and nothing between them but short gaps.
-
-    Raises
-    ------
-    DamageError : the disk does not give them, or the file has become shorter. Whoever looked at them would be ended by a signal (SIGBUS).
-    """
-    window.madvise(mmap.MADV_RANDOM)
-    if not len(starts):
-        return
-    ends = np.minimum(np.maximum.accumulate(ends), len(window))
-    apart = np.flatnonzero(starts[1:] - ends[:-1] > _GAP_BYTES)
-    first, last = starts[np.append(0, apart + 1)], ends[np.append(apart, len(ends) - 1)]
-    first -= first % mmap.PAGESIZE
-    pieces = [
-        (start, end - start) for start, end in zip(first.tolist(), last.tolist(), strict=True) if 0 <= start < end
-    ]
-    for start, size in pieces:
-        window.madvise(mmap.MADV_WILLNEED, start, size)
-    for start, size in pieces:
-        try:
-            window.madvise(_MADV_POPULATE_READ, start, size)
-        except OSError as error:
-            if error.errno != errno.EINVAL:  # which an older system says: it does not know this advice
-                raise _make_unreadable_error(start, error) from None
 
 
 def map_in_order(work: Callable[[_Piece], _Result], pieces: Iterable[_Piece], *, threads: int) -> Iterator[_Result]:
