@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
@@ -32,7 +31,9 @@ def cost_map(options: CostMapOptions, *, as_json: bool, quiet: bool) -> None:
 
     cluster = options.cluster
     if cluster is not None:  # its workers have another working directory
-        options = replace(options, model=_make_absolute(options.model), store=_make_absolute(options.store))
+        from tcpipe.formats.object_storage import make_absolute
+
+        options = replace(options, model=make_absolute(options.model), store=make_absolute(options.store))
     with show_progress("cost-map", quiet=quiet) as shown:
         result = make_cost_map(
             *_load_inputs(options),
@@ -43,12 +44,6 @@ def cost_map(options: CostMapOptions, *, as_json: bool, quiet: bool) -> None:
             cluster=None if cluster is None else Cluster(cluster, partial(_load_inputs, options)),
         )
     say_result(result, as_json=as_json)
-
-
-def _make_absolute(path: str) -> str:
-    from tcpipe.formats.object_storage import is_url
-
-    return path if is_url(path) else str(Path(path).absolute())
 
 
 def _load_inputs(options: CostMapOptions) -> tuple[CostModel, MapFile]:

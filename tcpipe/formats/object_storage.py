@@ -108,6 +108,11 @@ def is_url(text: str | Path) -> bool:
     return _URL.match(str(text)) is not None
 
 
+def make_absolute(place: str | Path) -> str:
+    """Return a path in full, or a URL as it is."""
+    return str(place) if is_url(place) else str(Path(place).absolute())
+
+
 def is_bucket(text: str | Path) -> bool:
     """Return whether a text is the URL of what lies in a bucket, which can be listed and written."""
     return str(text).rstrip("/").startswith(("s3://", "gs://", "az://"))

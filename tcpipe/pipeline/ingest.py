@@ -19,7 +19,7 @@ from tcpipe.formats.atomic import make_scratch_directory
 from tcpipe.formats.commit_log import keep_state_here, pause_garbage_collection
 from tcpipe.formats.commits import CallRecord, Entries, Failure, Kind, State
 from tcpipe.formats.index_files import RunFacts
-from tcpipe.formats.object_storage import is_presigned, is_url
+from tcpipe.formats.object_storage import is_presigned, is_url, make_absolute
 from tcpipe.formats.recipe_toml import ingest_key, resolve_recipe
 from tcpipe.formats.robot_files import load_profiles
 from tcpipe.formats.store_document import remove_if_empty
@@ -101,7 +101,8 @@ def run_ingest(options: IngestOptions) -> IngestSummary:
             raise (LogError if found.transient else UsageError)(*chain(*found.problems.values()) or [_NO_LOGS])
         opened = open_store(options.store, create=True)
         log = open_log(opened)
-        before, given = log.state.number, _make_absolute(logs)
+        before = log.state.number
+        given = tuple(make_absolute(path) for path in logs if not is_presigned(path))  # signed URLs are not stored
         mine = found.sources if shard is None else select_shard(found.sources, shard)
         root = opened.root
         message_definitions = None if options.message_definitions is None else Path(options.message_definitions)
@@ -143,11 +144,6 @@ def run_ingest(options: IngestOptions) -> IngestSummary:
 
 ingest = as_function(IngestOptions, run_ingest)
 """`tcpipe.ingest`: its keywords are the fields of `IngestOptions`."""
-
-
-def _make_absolute(logs: Iterable[str | Path]) -> tuple[str, ...]:
-    """Return logs and folders as they were given, in full; those whose URL is signed are not remembered."""
-    return tuple(str(of) if is_url(of) else str(Path(of).absolute()) for of in logs if not is_presigned(of))
 
 
 def find_broken(store: Store, state: State, tasks: Iterable[IngestTask]) -> set[tuple[str, str]]:

@@ -14,7 +14,7 @@ from tcpipe.formats.atomic import make_scratch_directory
 from tcpipe.formats.commit_log import pause_garbage_collection
 from tcpipe.formats.commits import CallRecord, Problem
 from tcpipe.formats.finding_lines import MOST_LINES, format_count, format_loss, format_verdict, group_findings
-from tcpipe.formats.object_storage import format_path, is_url
+from tcpipe.formats.object_storage import format_path, is_url, make_absolute
 from tcpipe.formats.recipe_toml import ingest_key, resolve_recipe
 from tcpipe.formats.stored_runs import Ingestions
 from tcpipe.formats.user_paths import check_local_output
@@ -162,7 +162,7 @@ def find_status(
     if (
         not create
         and all(call.state == "killed" for call in begun)
-        and all(is_below(_make_absolute(log), asked) for log in given)
+        and all(is_below(make_absolute(log), asked) for log in given)
     ):
         problems += _find_waiting(steps)
     problems += [make_missing(path, state) for path in found.problems if path in lately]
@@ -207,10 +207,6 @@ def _find_waiting(steps: Iterable[Step]) -> Iterator[Problem]:
     for step in steps:
         if step.standing in ("pending", "growing") and not step.has_failed and step.task.source.arrival_ns < before_ns:
             yield make_waiting(step.task.source, step.standing)
-
-
-def _make_absolute(log: str) -> str:
-    return log if is_url(log) else str(Path(log).absolute())
 
 
 def _iterate_groups(steps: Iterable[Step]) -> Iterator[Group]:

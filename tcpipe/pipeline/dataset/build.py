@@ -43,7 +43,7 @@ from tcpipe.formats.hub_card import format_hub_card
 from tcpipe.formats.integrity import Checksum, compute_checksum, compute_checksums, seal_page, write_sealed
 from tcpipe.formats.json_files import digest, write_json
 from tcpipe.formats.maps.map_files import MapFile
-from tcpipe.formats.object_storage import is_url
+from tcpipe.formats.object_storage import is_url, make_absolute
 from tcpipe.formats.parquet import ROWS_PER_GROUP, write_parquet_rows
 from tcpipe.formats.place import DirectoryPlace
 from tcpipe.formats.recipe_toml import resolve_recipe
@@ -165,7 +165,7 @@ def run_build_dataset(options: BuildDatasetOptions) -> BuildResult:
     covariates, map_name, keep_split = options.covariates, options.map_name, options.keep_split
     tables = (covariates,) if isinstance(covariates, str | Path) else tuple(covariates)
     earlier = None if keep_split is None else read_earlier_splits(keep_split)
-    keeps_own = keep_split is not None and _make_absolute(keep_split) == _make_absolute(place)
+    keeps_own = keep_split is not None and make_absolute(keep_split).rstrip("/") == make_absolute(place)
     marks = BuildOptions(ruling, regions, tags, options.file_format, options.redact, earlier, keeps_own)
     inputs = choose_inputs(
         opened,
@@ -200,7 +200,7 @@ def run_build_dataset(options: BuildDatasetOptions) -> BuildResult:
     else:
         _refuse_other_options(place, known, marks, inputs, force=options.force)
         whole = write_generation(place, CARD) if isinstance(place, str) else write_atomic_directory(place.absolute())
-        with commit_call(log, BUILD, [_make_absolute(place)]) as call:
+        with commit_call(log, BUILD, [make_absolute(place)]) as call:
             at_work = partial(_start_workers, jobs=options.jobs, cluster=options.cluster)
             with whole as directory, at_work(directory, opened, inputs.digest) as workers:
                 card = _build(directory, inputs, marks, workers)
@@ -260,9 +260,7 @@ def _end(opened: OpenCall, call: CallRecord, dataset: Dataset, known: DatasetCar
 
 
 def _describe_dataset(result: BuildResult, inputs: Inputs) -> Dataset:
-    return Dataset(
-        _make_absolute_place(result), inputs.digest, tuple((run.run_id, run.recipe_id) for run in inputs.runs)
-    )
+    return Dataset(make_absolute(result.path), inputs.digest, tuple((run.run_id, run.recipe_id) for run in inputs.runs))
 
 
 def _commit_references(log: LogWriter, dataset: Dataset) -> None:
@@ -272,15 +270,6 @@ def _commit_references(log: LogWriter, dataset: Dataset) -> None:
             log.commit("built", Entries(datasets=(dataset,)))
         except StoreError as error:
             logger.warning("%s; so 'tcpipe prune' does not know what this dataset refers to", error.problems[0])
-
-
-def _make_absolute_place(result: BuildResult) -> str:
-    """Return where a dataset lies, wherever that is asked from."""
-    return _make_absolute(result.path)
-
-
-def _make_absolute(place: Path | str) -> str:
-    return str(place).rstrip("/") if is_url(place) else str(Path(place).absolute())
 
 
 def _find_left_out(
