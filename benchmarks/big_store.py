@@ -20,13 +20,13 @@ from tcpipe.store import Store, open_store
 from tcpipe.tables.columns import to_floats
 from tcpipe.tables.levels import (
     DATA_MODEL_VERSION,
-    GATED_TRACK,
     LABELLED_SEGMENTS,
+    MASKED_TRACK,
     REJECTIONS,
     TRACK,
     Datum,
-    GatedTrack,
     LabelledSegments,
+    MaskedTrack,
     Track,
     TrackInfo,
 )
@@ -113,7 +113,7 @@ def _add_run(store: Store, number: int, rows: int) -> None:
     table = LABELLED_SEGMENTS.table(**given, **rest)
     info = TrackInfo(run_id, "husky", Datum(lon[0], lat[0], 600.0), 20.0, "smoother")
     recipe = Recipe()
-    ledger_m = {"kept": float(to_floats(table, "arc_length_m").sum())}
+    distance_by_reason_m = {"kept": float(to_floats(table, "arc_length_m").sum())}
     store.write_run_json(run_id, RunJson(LogOrigin((f"{run_id}.mcap",), f"{number:08x}".ljust(64, "0"), 1)))
     manifest = Manifest(
         run_id=run_id,
@@ -125,7 +125,7 @@ def _add_run(store: Store, number: int, rows: int) -> None:
         robot="husky",
         tags={},
         counts=Counts(rows),
-        ledger_m=ledger_m,
+        distance_by_reason_m=distance_by_reason_m,
         verdict=Verdict(),
         damage=(),
         info=info,
@@ -133,7 +133,7 @@ def _add_run(store: Store, number: int, rows: int) -> None:
     store.write_run(
         manifest,
         track=Track(TRACK.empty(), REJECTIONS.empty(), info),
-        gated=GatedTrack(GATED_TRACK.empty(), info),
-        labelled=LabelledSegments(table, info, ledger_m),
+        masked=MaskedTrack(MASKED_TRACK.empty(), info),
+        labelled=LabelledSegments(table, info, distance_by_reason_m),
     )
     open_log(store).commit("ingested", Entries(runs=tuple(store.read_rows(run_id).values())))

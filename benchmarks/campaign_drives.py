@@ -272,8 +272,8 @@ def _compared(labelled: LabelledSegments, read: Streams, drive: Drive, fault: Fa
     return Outcome(
         start_s=drive.seconds(start_ns).tolist(), error=error, claimed=claimed,
         bits=to_numbers(table["quality"]).tolist(), placed=placed.tolist(),
-        driven_m=sum(labelled.ledger_m.values()), true_m=float(drive.truth.distance_m[-1]), wheels_m=wheels_m(read),
-        kept_m=labelled.ledger_m.get("kept", 0.0), said=said_of(labelled.info.report.findings),
+        driven_m=sum(labelled.distance_by_reason_m.values()), true_m=float(drive.truth.distance_m[-1]), wheels_m=wheels_m(read),
+        kept_m=labelled.distance_by_reason_m.get("kept", 0.0), said=said_of(labelled.info.report.findings),
     )  # fmt: skip
 
 

@@ -16,8 +16,8 @@ from tcpipe.tables.bits import Quality
 
 OF_THE_DRIVE = (
     Quality.CURVED
-    | Quality.MEAN_POWER_DIFFERS
-    | Quality.NOT_AT_LIMIT
+    | Quality.POWER_MEAN_MISMATCH
+    | Quality.BELOW_FULL_SPEED
     | Quality.NO_COMMAND
     | Quality.LOW_POWER_RATE
     | Quality.PHYSICS_OUTLIER  # ground unlike the rest of the run's

@@ -186,7 +186,7 @@ def _make_logs(place: Path) -> None:
         shutil.copyfile(site.logs[0], place / "logs" / f"{name}.mcap")
         shutil.rmtree(place / "simulated")
     (place / "cut.mcap").write_bytes((place / "logs" / "tiny.mcap").read_bytes()[:-100_000])
-    (place / "other.toml").write_text("[gate]\nmax_acceleration_mps2 = 0.31\n")
+    (place / "other.toml").write_text("[mask]\nmax_acceleration_mps2 = 0.31\n")
     ingest([place / "logs" / "tiny.mcap"], store=place / "warm")
     shutil.rmtree(place / "warm")
 

@@ -126,7 +126,7 @@ def made_streams(seconds: float) -> Streams:
             "gnss": _gnss,
         }[role](t, turn, rng, np.interp(t, grid, yaw), np.stack([np.interp(t, grid, xy[:, k]) for k in (0, 1)], -1))
         stamp_ns = np.rint(t * 1e9).astype(np.int64) + 1_700_000_000_000_000_000
-        columns |= {"stamp_ns": stamp_ns, "log_time_ns": stamp_ns, "epoch": np.zeros(t.size, np.int16)}
+        columns |= {"stamp_ns": stamp_ns, "log_time_ns": stamp_ns, "clock_epoch": np.zeros(t.size, np.int16)}
         rest = {name: np.full(t.size, np.nan) for name in STREAMS[role].names() if name not in columns}
         tables[role] = STREAMS[role].table(**columns, **rest)
     sensors = {

@@ -262,7 +262,7 @@ def _recipe(text: str) -> Callable[[Path], list[Arguments]]:
 
 _EXTREMES = (
     "segment.chord_m = 1e300", "segment.chord_m = 1e-300", "segment.chord_m = nan", "segment.chord_m = -1",
-    "fuse.rate_hz = 1e300", "gate.acceleration_window_s = 1e300", "gate.min_event_s = 1e-300", "split.block_m = 1e-300",
+    "fuse.rate_hz = 1e300", "mask.acceleration_window_s = 1e300", "mask.min_event_s = 1e-300", "split.block_m = 1e-300",
     "sample.patch_px = 1000000", "sample.patch_m = 1e300",
 )  # fmt: skip
 

@@ -56,7 +56,7 @@ def figures(run: RunDirectory, truth: Truth) -> Iterator[tuple[str, str]]:
     yield "yaw of the kept track, RMS", f"{np.degrees(_rms(yaw[kept])):.2f} deg"
     yield "chords, largest departure from 1 m", f"{1e3 * np.abs(to_floats(segments, 'chord_m') - 1).max():.6f} mm"
     energy = run.manifest.info.report.facts.label.energy_joule
-    driven_m = sum(run.manifest.ledger_m.values())
+    driven_m = sum(run.manifest.distance_by_reason_m.values())
     yield "energy of the whole run", f"{energy / truth.energy_joule[-1] - 1:+.3%} of {truth.energy_joule[-1]:.0f} J"
     yield "odometer", f"{driven_m / truth.distance_m[-1] - 1:+.3%} of {truth.distance_m[-1]:.1f} m"
 
@@ -66,17 +66,17 @@ def above_standing(segments: pa.Table, truth: Truth) -> Iterator[tuple[str, str]
     still = (truth.wheel_velocity_mps == 0.0) & (np.abs(truth.angular_velocity_radps).max(axis=1) < 1e-6)
     standing = float(np.median(truth.power_watt[still]))
     true = compute_true_cost(truth, to_integers(segments, "start_ns"))
-    told, std = to_floats(segments, "standing_power_watt"), to_floats(segments, "standing_power_std_watt")
+    told, std = to_floats(segments, "idle_power_watt"), to_floats(segments, "idle_power_std_watt")
     yield "standing power", f"{told[0]:.2f} W, claimed deviation {std[0]:.2f} W; truth {standing:.2f} W"
     wanted = true.energy_joule - standing * true.duration_s
-    error = to_floats(segments, "energy_above_standing_joule") - wanted
-    std = to_floats(segments, "energy_above_standing_std_joule")
+    error = to_floats(segments, "net_energy_joule") - wanted
+    std = to_floats(segments, "net_energy_std_joule")
     within = [np.mean(np.abs(error) <= k * std) for k in (1, 2)]
     share, bias = np.abs(error).sum() / np.abs(wanted).sum(), error.sum() / np.abs(wanted).sum()
     claimed = (
         f"claimed deviation {std.mean():.3g} J: {within[0]:.0%} of the errors within one, {within[1]:.0%} within two"
     )
-    yield "energy_above_standing_joule: sum |error| / sum |truth|", f"{share:.2%} (bias {bias:+.2%}); {claimed}"
+    yield "net_energy_joule: sum |error| / sum |truth|", f"{share:.2%} (bias {bias:+.2%}); {claimed}"
 
 
 def _std_name(label: str) -> str:

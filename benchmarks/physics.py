@@ -66,13 +66,13 @@ def of_simulation(robot: SimulatedRobot, *, metres: float, seed: int) -> Sequenc
         ingest(made.logs, store=Path(directory) / "store")
         run = Store(Path(directory) / "store").runs()[0]
         segments = run.segments()
-    found = fit_and_validate_physics(with_terrain(segments, chosen.world), standing_watt=find_idle_power(segments))
+    found = fit_and_validate_physics(with_terrain(segments, chosen.world), idle_watt=find_idle_power(segments))
     assert found is not None
     lines = [describe_physics("simulated robot", found)]
     weight = robot.mass_kg * GRAVITY_MPS2 / robot.drive_efficiency
     ground = {name: robot.ground[k].rolling_resistance for k, name in NAMES.items()}
     true = {
-        "standing": robot.idle_watt,
+        "idle": robot.idle_watt,
         "drivetrain": robot.drivetrain_loss_newton / robot.drive_efficiency,
         "grade": weight,
         "turning": robot.scrub_torque_nm / robot.drive_efficiency,
@@ -94,7 +94,7 @@ def of_log(log: Path, recipe: Path | None) -> str:
     with tempfile.TemporaryDirectory() as directory:
         ingest([log], store=Path(directory) / "store", recipe=load_recipe(recipe))
         segments = Store(Path(directory) / "store").runs()[0].segments()
-    found = fit_and_validate_physics(make_fit_samples(segments), standing_watt=find_idle_power(segments))
+    found = fit_and_validate_physics(make_fit_samples(segments), idle_watt=find_idle_power(segments))
     return f"{log.name}: no fit" if found is None else describe_physics(log.stem, found)
 
 

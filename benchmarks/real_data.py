@@ -75,7 +75,7 @@ def recorded(log: str, recipe: str | None) -> Metre:
     metres = Metre(
         to_floats(found, "power_watt"), velocity,
         (to_floats(found, "end_z_m") - to_floats(found, "start_z_m")) / to_floats(found, "chord_m"),
-        to_floats(found, "turn_rate_radps") / velocity, np.where(np.isfinite(command), command, 1.0),
+        to_floats(found, "mean_abs_yaw_rate_radps") / velocity, np.where(np.isfinite(command), command, 1.0),
         to_floats(found, "duration_std_s"), to_floats(found, "energy_std_joule"), to_floats(found, "start_ns").astype(np.int64),
     )  # fmt: skip
     return metres.take(np.isfinite(metres.power + metres.velocity + metres.rise + metres.turn_radpm))
@@ -200,7 +200,7 @@ def _row(name: str, held_out: str, model: str, of: Errors, quantity: str) -> str
     unit, digits = UNITS[quantity]
     mape = "–" if of.mape_percent is None else f"{of.mape_percent:.1f} ({of.mape_count} of {of.count})"
     scores = (
-        ["–"] * 3 if of.nll is None else [f"{of.held_percent:.0f}", f"{of.nll:.2f}", f"{of.crps:.{digits}f} {unit}"]
+        ["–"] * 3 if of.nll is None else [f"{of.coverage_percent:.0f}", f"{of.nll:.2f}", f"{of.crps:.{digits}f} {unit}"]
     )
     return "| " + " | ".join([name, held_out, model, quantity, f"{of.rmse:.{digits}f} {unit}", mape, *scores]) + " |"
 

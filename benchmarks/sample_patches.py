@@ -143,7 +143,7 @@ def with_rasterio(datasets, frames):
 
 def files(source: MemoryMap, directory: Path) -> dict[str, Path]:
     """Write each layer as a deflated GeoTIFF in tiles."""
-    affine = (GRID.pitch_m, 0.0, GRID.x_min_m, 0.0, -GRID.pitch_m, GRID.y_max_m)
+    affine = (GRID.pixel_size_m, 0.0, GRID.x_min_m, 0.0, -GRID.pixel_size_m, GRID.y_max_m)
     for layer, values in source.arrays.items():
         write_geotiff(
             directory / f"{layer}.tif",

@@ -53,8 +53,8 @@ IN_DATASETS = 6
 RECIPES = {
     "ukf": '[fuse]\nestimator = "ukf"',
     "fused": '[label]\nvelocity = "fused"\nintegration = "right_endpoint"',
-    "any speed": "[gate]\nrequire_full_speed = false\nkeep_reversing = true\n[segment]\nchord_m = 2.0",
-    "wrong lever arm": "[read.placement.gnss]\nxyz_m = [0.6, 0.0, 0.9]",
+    "any speed": "[mask]\nrequire_full_speed = false\nkeep_reversing = true\n[segment]\nchord_m = 2.0",
+    "wrong lever arm": "[read.extrinsics.gnss]\nxyz_m = [0.6, 0.0, 0.9]",
 }
 OTHERWISE = {
     "ukf": ("all sensors", "no visual", "GNSS, IMU", "wrong fixes for 20 s", "warthog_grass_a/run.mcap"),

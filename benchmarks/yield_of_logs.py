@@ -47,14 +47,14 @@ def ladder(path: Path, robot: str | None) -> Ladder:
         _, _, labelled = run_stages(streams, recipe.ingest, run_id="run")
     except TcpipeError as error:
         return Ladder((np.nan, *[0.0] * (len(HEAD) - 1)), (*error.problems, *said_of(error.findings)))
-    table, ledger_m = labelled.table, labelled.ledger_m
+    table, distance_by_reason_m = labelled.table, labelled.distance_by_reason_m
     power = np.isfinite(to_floats(table, "energy_joule"))
     sure = (to_numbers(table["quality"]).astype(np.int64) & ~int(OF_THE_DRIVE)) == 0
     placed = np.isfinite(to_floats(table, "start_lon_deg"))
     placed &= to_floats(table, "position_std_m") <= recipe.sample.max_position_std_m
     arc_m = to_floats(table, "arc_length_m")
     chosen = (np.ones_like(power), power, sure, sure & placed)
-    steps_m = (wheels_m(streams), sum(ledger_m.values()), ledger_m.get("kept", 0.0))
+    steps_m = (wheels_m(streams), sum(distance_by_reason_m.values()), distance_by_reason_m.get("kept", 0.0))
     return Ladder(
         (*steps_m, *(float(arc_m[rows].sum()) for rows in chosen)), tuple(said_of(labelled.info.report.findings))
     )

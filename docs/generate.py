@@ -26,8 +26,8 @@ from tcpipe.tables.catalogue import Entry, read_catalogue, read_sections
 from tcpipe.tables.columns import Column, TableSchema
 from tcpipe.tables.levels import (
     DATA_MODEL_VERSION,
-    GATED_TRACK,
     LABELLED_SEGMENTS,
+    MASKED_TRACK,
     REJECTIONS,
     SAMPLES,
     STREAMS,
@@ -151,7 +151,7 @@ def _columns() -> str:
     common = [column for column in streams[0].columns if all(column in stream.columns for stream in streams)]
     parts.append(f"## Every stream (L1)\n\nEach of the streams below has these columns too.\n{_column_rows(common)}")
     own = [replace(stream, columns=tuple(c for c in stream.columns if c not in common)) for stream in streams]
-    tables = (*own, GATED_TRACK, REJECTIONS, LABELLED_SEGMENTS, SAMPLES, PIECES)
+    tables = (*own, MASKED_TRACK, REJECTIONS, LABELLED_SEGMENTS, SAMPLES, PIECES)
     parts += [_table(table, tables[:number]) for number, table in enumerate(tables)]
     return "\n".join(parts)
 
@@ -253,7 +253,7 @@ def _robots() -> str:
     found_by = "| robot | found by message types | found by words of topic names | platform |\n|---|---|---|---|\n"
     sizes = "\n| robot | width | length | maximum speed | voltage |\n|---|---|---|---|---|\n"
     for name, of in sorted(known.robots.items()):
-        found_by += f"| `{name}` | {', '.join(of.status_types)} | {', '.join(of.called)} | {of.platform or ''} |\n"
+        found_by += f"| `{name}` | {', '.join(of.status_types)} | {', '.join(of.topic_words)} | {of.platform or ''} |\n"
         volts = "not known" if of.voltage_range_volt is None else "{:g} V to {:g} V".format(*of.voltage_range_volt)
         measures = ((of.width_m, "m"), (of.length_m, "m"), (of.max_velocity_mps, "m/s"))
         cells = [f"{value:g} {unit}" if value is not None else "not known" for value, unit in measures]
@@ -261,7 +261,7 @@ def _robots() -> str:
     power = "| message type | for | voltage | current | averaged | drawn current | not known |\n|---|---|---|---|---|---|---|\n"
     refused = "".join(f"- `{name}` {why}.\n" for name, why in known.refusals().items())
     for source in known.power_sources:
-        if source.refused:
+        if source.unsupported_reason:
             continue
         only = (source.platform, source.topic and f"…{source.topic}", source.husky_power and f"`{source.husky_power}`")
         only += ("in place of those above" if source.fallback else None,)
@@ -269,11 +269,9 @@ def _robots() -> str:
         drawn = {"drawn_positive": "positive", "drawn_negative": "negative", "auto": "by the mean over the run"}[
             source.sign
         ]
-        fields = (
-            f"{source.voltage} | {counter or source.current}{', with ' + source.includes if source.includes else ''}"
-        )
+        fields = f"{source.voltage} | {counter or source.current}{', with ' + source.other_loads if source.other_loads else ''}"
         averaged = "found from motion" if source.averaging_unknown else "yes" if source.averaged else "no"
-        cells = (f"`{source.type}`", ", ".join(filter(None, only)), fields, averaged, drawn, source.unknown)
+        cells = (f"`{source.type}`", ", ".join(filter(None, only)), fields, averaged, drawn, source.open_questions)
         power += f"| {' | '.join(cells)} |\n"
     return (
         f"{_NOTE}\n# Robots and power messages\n\nBuilt-in profiles, from the TOML files in `tcpipe/robots/`, where each number has "

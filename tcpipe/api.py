@@ -131,7 +131,7 @@ def run_plan_path(options: PlanPathOptions) -> PlanResult:
     from tcpipe.planning.plan_files import PlanRequest, plan
     from tcpipe.recipe.checking import from_values
 
-    asked = {name: getattr(options, name) for name in ("objective", "step_m", "allow_unseen")}
+    asked = {name: getattr(options, name) for name in ("objective", "step_m", "allow_extrapolation")}
     asked |= {"start_deg": options.start, "goal_deg": options.goal}
     request = from_values(PlanRequest, asked, where="plan_path")
     if options.cost_map is not None:

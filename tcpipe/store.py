@@ -64,8 +64,8 @@ from tcpipe.tables.levels import (
     EARLIER_VERSIONS,
     READ_TABLES,
     READ_VERSIONS,
-    GatedTrack,
     LabelledSegments,
+    MaskedTrack,
     Streams,
     Track,
     add_metadata,
@@ -360,7 +360,7 @@ class Store:
         manifest: Manifest,
         *,
         track: Track,
-        gated: GatedTrack,
+        masked: MaskedTrack,
         labelled: LabelledSegments,
         settled: Callable[[Manifest], bool] = lambda _: False,
     ) -> Manifest:
@@ -370,7 +370,7 @@ class Store:
             "run_id": manifest.run_id, "recipe_id": manifest.recipe_id, "datum": to_plain(manifest.info.datum), "robot": manifest.robot,
         }  # fmt: skip
         tables = {
-            "track": gated.table,
+            "track": masked.table,
             "segments": add_segments_metadata(labelled.table, manifest.info.datum),
             "rejections": track.rejections,
         }

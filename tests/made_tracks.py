@@ -17,7 +17,7 @@ def make_track(
     velocity_mps,
     *,
     stamp_ns=None,
-    epoch=None,
+    clock_epoch=None,
     forward_mps=None,
     yaw_rate_radps=None,
     wheel_mps=None,
@@ -34,7 +34,7 @@ def make_track(
     forward = np.linalg.norm(velocity_mps, axis=1) if forward_mps is None else forward_mps
     table = TRACK.table(
         stamp_ns=stamps(n) if stamp_ns is None else stamp_ns,
-        epoch=np.zeros(n, dtype=np.int16) if epoch is None else epoch,
+        clock_epoch=np.zeros(n, dtype=np.int16) if clock_epoch is None else clock_epoch,
         **{f"{axis}_m": position_m[:, i] for i, axis in enumerate("xyz")},
         lon_deg=nothing,
         lat_deg=nothing,
@@ -70,7 +70,7 @@ def straight_track(speed_mps, *, course_rad=0.0, slope_rad=0.0, **options):
     return make_track(along[:, None] * direction, speed_mps[:, None] * direction, **options)
 
 
-def power_streams(rails, *, averaged=False, epoch=0, sensors=None, robot="husky"):
+def power_streams(rails, *, averaged=False, clock_epoch=0, sensors=None, robot="husky"):
     """Return streams with power alone; ``rails`` maps a name to (stamp_ns, volt, amp), NaN where a row lacks one."""
     parts = [
         (name, np.asarray(stamp), np.asarray(volt, float), np.asarray(amp, float))
@@ -80,7 +80,7 @@ def power_streams(rails, *, averaged=False, epoch=0, sensors=None, robot="husky"
     table = POWER.table(
         stamp_ns=stamp_ns,
         log_time_ns=stamp_ns,
-        epoch=np.full(len(stamp_ns), epoch, dtype=np.int16),
+        clock_epoch=np.full(len(stamp_ns), clock_epoch, dtype=np.int16),
         rail=[name for name, stamp, _, _ in parts for _ in stamp],
         voltage_volt=np.concatenate([part[2] for part in parts]),
         current_amp=np.concatenate([part[3] for part in parts]),

@@ -29,9 +29,9 @@ class World:
         u, v = x - self.x_m, y - self.y_m
         return 612.0 + 0.21 * u - 0.13 * v + 0.25 * np.sin(u / 1.3) * np.cos(v / 1.7)
 
-    def bilinear_bound_m(self, pitch_m):
+    def bilinear_bound_m(self, pixel_size_m):
         """Largest error of bilinear interpolation: pitch² / 8 times the largest second derivatives."""
-        return pitch_m**2 / 8.0 * 0.25 * (1.0 / 1.3**2 + 1.0 / 1.7**2)
+        return pixel_size_m**2 / 8.0 * 0.25 * (1.0 / 1.3**2 + 1.0 / 1.7**2)
 
     def grey(self, x, y):
         return 120.0 + 80.0 * np.sin((x - self.x_m) / 2.1) * np.sin((y - self.y_m) / 1.9)
@@ -42,16 +42,16 @@ class World:
         found = np.where(np.hypot(u - 9.0, v - 4.0) < 8.0, 5, found)
         return np.where(v - 0.5 * u > 14.0, 7, found)
 
-    def centres(self, pitch_m):
-        count = round(self.side_m / pitch_m)
-        offset = (np.arange(count) + 0.5) * pitch_m - self.side_m / 2.0
+    def centres(self, pixel_size_m):
+        count = round(self.side_m / pixel_size_m)
+        offset = (np.arange(count) + 0.5) * pixel_size_m - self.side_m / 2.0
         return np.meshgrid(self.x_m + offset, self.y_m - offset)
 
-    def write(self, directory: Path, pitch_m: float = 0.05) -> dict[str, Path]:
+    def write(self, directory: Path, pixel_size_m: float = 0.05) -> dict[str, Path]:
         """Write height (float32), ortho (RGB of equal grey) and terrain (ids) on one grid."""
-        x, y = self.centres(pitch_m)
+        x, y = self.centres(pixel_size_m)
         corner = (self.x_m - self.side_m / 2.0, self.y_m + self.side_m / 2.0)
-        transform = Affine(pitch_m, 0.0, corner[0], 0.0, -pitch_m, corner[1])
+        transform = Affine(pixel_size_m, 0.0, corner[0], 0.0, -pixel_size_m, corner[1])
         grey = np.rint(self.grey(x, y)).astype(np.uint8)
         layers = {
             "height": self.height(x, y).astype(np.float32)[None],
@@ -150,7 +150,7 @@ class ArrayMap:
         out[: part.shape[0], : part.shape[1]] = part
 
 
-def random_map(seed=0, rows=300, cols=260, pitch_m=0.05, tile_px=64) -> ArrayMap:
+def random_map(seed=0, rows=300, cols=260, pixel_size_m=0.05, tile_px=64) -> ArrayMap:
     """Rough random layers in UTM 33N, nothing missing."""
     rng = np.random.default_rng(seed)
     arrays = {
@@ -158,4 +158,4 @@ def random_map(seed=0, rows=300, cols=260, pitch_m=0.05, tile_px=64) -> ArrayMap
         "ortho": rng.integers(1, 256, (rows, cols)).astype(np.uint8),
         "terrain": rng.integers(4, 8, (rows, cols)).astype(np.uint8),
     }
-    return ArrayMap(MapGrid("EPSG:32633", 500_000.0, 5_200_000.0, pitch_m, rows, cols), arrays, tile_px)
+    return ArrayMap(MapGrid("EPSG:32633", 500_000.0, 5_200_000.0, pixel_size_m, rows, cols), arrays, tile_px)

@@ -9,10 +9,10 @@ from tcpipe.terrain.grid import MapGrid
 WEST_M, NORTH_M = 500_000.0, 5_200_000.0
 
 
-def plane(side_m=24.0, *, rise_east=0.0, rise_north=0.0, classes=None, pitch_m=0.1, tile_px=64):
+def plane(side_m=24.0, *, rise_east=0.0, rise_north=0.0, classes=None, pixel_size_m=0.1, tile_px=64):
     """Return a square map whose class is ``classes(east, north)`` (grass without it), east and north from the south-west corner [m]."""
-    count = round(side_m / pitch_m)
-    offset = (np.arange(count) + 0.5) * pitch_m
+    count = round(side_m / pixel_size_m)
+    offset = (np.arange(count) + 0.5) * pixel_size_m
     east, north = np.meshgrid(offset, offset[::-1])
     terrain = np.full(east.shape, 4) if classes is None else classes(east, north)
     arrays = {
@@ -20,7 +20,7 @@ def plane(side_m=24.0, *, rise_east=0.0, rise_north=0.0, classes=None, pitch_m=0
         "ortho": np.full(east.shape, 128, np.uint8),
         "terrain": terrain.astype(np.uint8),
     }
-    return ArrayMap(MapGrid("EPSG:32633", WEST_M, NORTH_M, pitch_m, count, count), arrays, tile_px)
+    return ArrayMap(MapGrid("EPSG:32633", WEST_M, NORTH_M, pixel_size_m, count, count), arrays, tile_px)
 
 
 def lonlat(source, *points):

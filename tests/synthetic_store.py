@@ -20,13 +20,13 @@ from tcpipe.tables.facts import PowerSign, StageFacts
 from tcpipe.tables.findings import StageReport
 from tcpipe.tables.levels import (
     DATA_MODEL_VERSION,
-    GATED_TRACK,
     LABELLED_SEGMENTS,
+    MASKED_TRACK,
     REJECTIONS,
     TRACK,
     Datum,
-    GatedTrack,
     LabelledSegments,
+    MaskedTrack,
     Track,
     TrackInfo,
 )
@@ -82,11 +82,11 @@ def segments(run_id, start_xy_m, end_xy_m, *, start_ns=0, powered=True, robot="h
         "energy_joule": power * 1.2 if powered else np.full(n, np.nan),
         "power_std_watt": np.ones(n) if powered else np.full(n, np.nan),
         "energy_std_joule": np.ones(n) if powered else np.full(n, np.nan),
-        "standing_power_watt": np.full(n, STANDING_WATT),
-        "power_above_standing_watt": power - STANDING_WATT if powered else np.full(n, np.nan),
-        "power_above_standing_std_watt": 1.0 + 0.1 * (np.arange(n) % 7) if powered else np.full(n, np.nan),
-        "energy_above_standing_joule": 1.2 * (power - STANDING_WATT) if powered else np.full(n, np.nan),
-        "energy_above_standing_std_joule": np.full(n, 1.2) if powered else np.full(n, np.nan),
+        "idle_power_watt": np.full(n, STANDING_WATT),
+        "net_power_watt": power - STANDING_WATT if powered else np.full(n, np.nan),
+        "net_power_std_watt": 1.0 + 0.1 * (np.arange(n) % 7) if powered else np.full(n, np.nan),
+        "net_energy_joule": 1.2 * (power - STANDING_WATT) if powered else np.full(n, np.nan),
+        "net_energy_std_joule": np.full(n, 1.2) if powered else np.full(n, np.nan),
     }
     rest = {}
     for column in LABELLED_SEGMENTS.columns:
@@ -97,12 +97,12 @@ def segments(run_id, start_xy_m, end_xy_m, *, start_ns=0, powered=True, robot="h
 
 
 def driven(table, *, powered=True):
-    """A gated track of 20 Hz through all segments of a table, one after the other, after five seconds of standing."""
+    """A masked track of 20 Hz through all segments of a table, one after the other, after five seconds of standing."""
     starts, ends = (table.column(f"{end}_ns").to_numpy() for end in ("start", "end"))
     stamps = np.arange(starts[0] - 5_000_000_000, ends[-1], 50_000_000)
     corner_s = (np.append(starts, ends[-1]) - stamps[0]) * 1e-9
     at_s = (stamps - stamps[0]) * 1e-9
-    given = {"stamp_ns": stamps, "dropped_by": np.where(stamps < starts[0], int(DropReason.STANDING), 0)}
+    given = {"stamp_ns": stamps, "dropped_by": np.where(stamps < starts[0], int(DropReason.STATIONARY), 0)}
     for axis in ("lon", "lat"):
         corners = np.append(table.column(f"start_{axis}_deg").to_numpy(), table.column(f"end_{axis}_deg")[-1].as_py())
         given[f"{axis}_deg"] = np.interp(at_s, corner_s, corners)
@@ -114,10 +114,10 @@ def driven(table, *, powered=True):
         given[name] = np.full(len(stamps), np.nan)
     rest = {
         column.name: np.full(len(stamps), 0 if pa.types.is_integer(column.dtype) else 0.02)
-        for column in GATED_TRACK.columns
+        for column in MASKED_TRACK.columns
         if column.name not in given
     }
-    return GATED_TRACK.table(**given, **rest)
+    return MASKED_TRACK.table(**given, **rest)
 
 
 def add_run(
@@ -127,14 +127,14 @@ def add_run(
     *,
     recipe=None,
     sha256=None,
-    ledger_m=None,
+    distance_by_reason_m=None,
     sensors=None,
     track=None,
     findings=(),
     tags=None,
     includes=(),
 ):
-    """Put a run with these segments, and this gated track, into the store, as ingestion would."""
+    """Put a run with these segments, and this masked track, into the store, as ingestion would."""
     recipe = recipe or Recipe()
     robot = table.column("robot")[0].as_py() if table.num_rows else "husky"
     power = PowerSign("drawn_positive", averaged=False, includes=includes)
@@ -142,7 +142,7 @@ def add_run(
     info = TrackInfo(run_id, robot, Datum(15.43, 47.07, 400.0), 20.0, "smoother", found)
     identity = make_recipe_id(recipe, robot)
     metres = float(np.sum(table.column("arc_length_m").to_numpy()))
-    ledger_m = ledger_m or {"kept": metres, "standing": 0.0, "accelerating": 2.5}
+    distance_by_reason_m = distance_by_reason_m or {"kept": metres, "stationary": 0.0, "accelerating": 2.5}
     store.write_run_json(
         run_id, RunJson(LogOrigin((f"/logs/{run_id}.mcap",), sha256 or run_id, 1), robot=None, sensors=sensors or {})
     )
@@ -156,7 +156,7 @@ def add_run(
         robot=robot,
         tags=tags or {},
         counts=Counts(table.num_rows),
-        ledger_m=ledger_m,
+        distance_by_reason_m=distance_by_reason_m,
         verdict=judge(findings),
         damage=(),
         info=info,
@@ -164,8 +164,8 @@ def add_run(
     store.write_run(
         manifest,
         track=Track(TRACK.empty(), REJECTIONS.empty(), info),
-        gated=GatedTrack(GATED_TRACK.empty() if track is None else track, info),
-        labelled=LabelledSegments(table, info, ledger_m),
+        masked=MaskedTrack(MASKED_TRACK.empty() if track is None else track, info),
+        labelled=LabelledSegments(table, info, distance_by_reason_m),
     )
     commit_run(store, run_id)
 
@@ -183,7 +183,7 @@ def supersede(store, run_id, by):
 def add_world(store, directory: Path, *, name="site", layers=("ortho", "terrain")):
     """Put the analytic map into the store."""
     directory.mkdir(parents=True, exist_ok=True)
-    rasters = WORLD.write(directory, pitch_m=0.1)
+    rasters = WORLD.write(directory, pixel_size_m=0.1)
     optional = {layer: rasters[layer] for layer in layers}
     put_map(store, name, height=rasters["height"], **optional)
 

@@ -70,9 +70,9 @@ def _listed(lines: list[str]) -> dg.MetadataValue:
     return dg.MetadataValue.md("\n".join(f"- {line}" for line in lines) or "none")
 
 
-def _ledger(ledger_m: Mapping[str, float]) -> dg.MetadataValue:
+def _ledger(distance_by_reason_m: Mapping[str, float]) -> dg.MetadataValue:
     """Return where every metre went, as a table."""
-    rows = sorted(ledger_m.items(), key=lambda row: -row[1])
+    rows = sorted(distance_by_reason_m.items(), key=lambda row: -row[1])
     return dg.MetadataValue.md(
         "| metres | |\n|---:|---|\n"
         + "\n".join(f"| {metres:.1f} | {name.replace('_', ' ')} |" for name, metres in rows if metres)
@@ -136,8 +136,8 @@ def run(context: dg.AssetExecutionContext) -> dg.MaterializeResult:
             "status": result["status"],
             "robot": made["robot"],
             "segments": made["segments"],
-            "driven_m": sum(made["ledger_m"].values()),
-            "in_segments_m": made["ledger_m"].get("kept", 0.0),
+            "driven_m": sum(made["distance_by_reason_m"].values()),
+            "in_segments_m": made["distance_by_reason_m"].get("kept", 0.0),
             **({"energy_floor": budget["total"]} if budget else {}),
         },
         check_results=[
@@ -175,7 +175,7 @@ def dataset() -> dg.MaterializeResult:
             "samples": card["samples"],
             **{f"{name}_samples": count for name, count in card["splits"].items()},
             **({"doubtful_share": card["doubtful"]["share"]} if card["doubtful"] else {}),
-            "where_every_metre_went": _ledger(card["ledger_m"]),
+            "where_every_metre_went": _ledger(card["distance_by_reason_m"]),
             "findings": _listed(list_findings(findings)),
             "page": dg.MetadataValue.path(str(Path(out).absolute() / "report.html")),
             **_picture(Path(out) / "overview.png"),

@@ -123,11 +123,11 @@ def _patch(ground: MapGround, row: Ints, col: Ints, terrain_class: int, slope: i
     return Patch(terrain_class, slope, len(row) * ground.cell_m**2, None if slope == LEVEL else _WINDS[wind], polygon)
 
 
-def fit_cell_gradients(height_m: Floats, pixels: int, pitch_m: float) -> Floats:
+def fit_cell_gradients(height_m: Floats, pixels: int, pixel_size_m: float) -> Floats:
     """Return the slope of a plane fitted to each square of ``pixels`` × ``pixels`` heights: metres up a metre east and north, (R, C, 2)."""
     rows, cols = height_m.shape[0] // pixels, height_m.shape[1] // pixels
     blocks = height_m[: rows * pixels, : cols * pixels].reshape(rows, pixels, cols, pixels)
-    offset_m = (np.arange(pixels) - (pixels - 1) / 2.0) * pitch_m
+    offset_m = (np.arange(pixels) - (pixels - 1) / 2.0) * pixel_size_m
     scale = pixels * (offset_m**2).sum()
     east, north = np.einsum("ricj,j->rc", blocks, offset_m), np.einsum("ricj,i->rc", blocks, -offset_m)
     return np.asarray(np.stack([east, north], axis=-1) / scale)

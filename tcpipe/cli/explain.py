@@ -14,7 +14,7 @@ from tcpipe.cli.options import SEALED, json_option, quiet_option, store_option
 @json_option
 @quiet_option
 def explain(sample_id: str, *, dataset: str, store: str, as_json: bool, quiet: bool) -> int:
-    """Trace SAMPLE_ID to its log, stamps, messages, gates nearby, map tiles and recipe, and make it again: exit code 1 if it differs."""
+    """Trace SAMPLE_ID to its log, stamps, messages, masked rows, map tiles and recipe, and make it again: exit code 1 if it differs."""
     from tcpipe.cli.output import say_result, show_progress
     from tcpipe.pipeline.explain import explain as run
 

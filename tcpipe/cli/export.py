@@ -66,6 +66,6 @@ def _print(exported: Exported, log: str, out: str) -> None:
             print_line(f"{of.messages:>9} messages  {of.topic}  {of.path}")
         if not exported.topics:
             print_line(f"nothing to export: {log} holds no topic")
-    for kind in ("damage", "remarks"):
+    for kind in ("damage", "notes"):
         for line in getattr(exported, kind):
             print_line(f"{kind.rstrip('s')}: {line}", err=True)

@@ -80,7 +80,7 @@ def ingest(options: IngestOptions, *, dry_run: bool, as_json: bool, quiet: bool)
             else:
                 for line in _list_outcome(result, options.store, several=several):
                     shown.result(line)
-            for problem in result.problems if result.is_news else ():
+            for problem in result.problems if result.is_new_problem else ():
                 shown.problem(problem)
 
         summary = run_ingest(replace(options, on_found=on_found, on_result=on_result))
@@ -109,7 +109,7 @@ def _list_outcome(result: IngestResult, store: Path | str, *, several: bool) -> 
         yield f"{result.status:<10} {result.log}{aside or known}"
     else:
         wrong = "damaged" if run.damage else "empty" if problems else ""
-        known = f" ({wrong}, known)" if wrong and not result.is_news else ""
+        known = f" ({wrong}, known)" if wrong and not result.is_new_problem else ""
         more = f", noise floor of E {100 * budget.total:.1f} %" if several and budget else ""
         more += f"; {format_verdict(result.verdict)}" if several and is_new and result.verdict else ""
         yield (
@@ -121,16 +121,16 @@ def _list_outcome(result: IngestResult, store: Path | str, *, several: bool) -> 
     if budget is not None and not several:
         yield f"  {format_budget(budget)}"
     yield from (f"  {note}" for note in result.notes)
-    if result.status == "failed" and result.is_news:
+    if result.status == "failed" and result.is_new_problem:
         yield from (f"  {line}" for line in format_findings(of for of in result.causes if of.code != "log-failed"))
     if run is None or result.verdict is None:
         return
-    yield from (f"  damage:  {line}" for line in run.damage if result.is_news or result.status == "damaged")
+    yield from (f"  damage:  {line}" for line in run.damage if result.is_new_problem or result.status == "damaged")
     if is_new and not several:
         yield f"  verdict: {format_verdict(result.verdict)}"
         where = f"tcpipe inspect {store}/runs/{run.run_id}"
         yield from (f"  {line}" for line in format_findings(result.findings, more=where))
-    elif is_new or result.is_news:
+    elif is_new or result.is_new_problem:
         yield from (f"  {describe_finding(of)} [{of.code}]" for of in problems if of.code != "log-damaged")
 
 
@@ -146,7 +146,7 @@ def _print_findings(summary: IngestSummary) -> None:
 
 def _print_sum(summary: IngestSummary) -> None:
     number = len(summary.results)
-    old = [result for result in summary.results if result.status == "failed" and not result.is_news]
+    old = [result for result in summary.results if result.status == "failed" and not result.is_new_problem]
     count = {
         status: sum(r.status == status for r in summary.results) - (len(old) if status == "failed" else 0)
         for status in ("done", "unchanged", "damaged", "empty", "failed", "waiting")

@@ -89,7 +89,7 @@ def _print_log(log: InspectedLog) -> None:
     for line in log.problems:
         print_line(f"  {line}")
     _print_findings(log.findings or ())
-    for kind, lines in (("damage", log.damage), ("remark", log.remarks)):
+    for kind, lines in (("damage", log.damage), ("note", log.notes)):
         for line in lines or ():
             print_line(f"{kind}: {line}")
 
@@ -132,8 +132,8 @@ def _print_clocks(log: InspectedLog) -> None:
 
 
 def _print_map(found: InspectedMap) -> None:
-    size = " x ".join(f"{pixels * found.pitch_m:.1f} m" for pixels in (found.cols, found.rows))
-    print_line(f"{found.path}: {size} at {found.pitch_m:g} m a pixel in {found.crs}")
+    size = " x ".join(f"{pixels * found.pixel_size_m:.1f} m" for pixels in (found.cols, found.rows))
+    print_line(f"{found.path}: {size} at {found.pixel_size_m:g} m a pixel in {found.crs}")
     print_line("")
     rows = [[layer, found.sources[layer], f"{found.covered[layer]:.1%}"] for layer in found.layers]
     _print_table(["layer", "made from", "covered"], rows)
@@ -203,10 +203,10 @@ def _print_run(found: InspectedRun) -> None:
     print_line(f"{found.run_id}: from {' + '.join(found.source.paths if found.source else ['an unknown log'])}")
     if found.tags:
         print_line("tags: " + ", ".join(f"{key}={value}" for key, value in sorted(found.tags.items())))
-    for line in found.remarks:
-        print_line(f"remark: {line}")
+    for line in found.notes:
+        print_line(f"note: {line}")
     for run in found.recipes:
-        ledger = run.ledger_m
+        ledger = run.distance_by_reason_m
         print_line("")
         print_line(f"recipe {run.recipe_id}: {run.counts.segments} segments of robot {run.robot}")
         lost = sorted(((metres, name) for name, metres in ledger.items() if metres >= 0.05), reverse=True)

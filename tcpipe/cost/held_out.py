@@ -17,7 +17,7 @@ _BLOCK = 10  # consecutive segments that are drawn together
 _DRAWS = 2000
 _SEED = 20260101
 _LEAST_JPM = 10.0  # a percentage of less says nothing, as in `tcpipe.learning.metrics`
-PHYSICS_UNITS = {"standing": "W", "drivetrain": "N", "rolling": "N", "grade": "N", "turning": "W s/rad"}
+PHYSICS_UNITS = {"idle": "W", "drivetrain": "N", "rolling": "N", "grade": "N", "turning": "W s/rad"}
 """Of the terms of physics."""
 
 
@@ -29,15 +29,15 @@ class _HeldOut:
     said: Floats
 
 
-def fit_and_validate_physics(metres: FitSamples, *, standing_watt: float | None) -> PhysicsFit | None:
+def fit_and_validate_physics(metres: FitSamples, *, idle_watt: float | None) -> PhysicsFit | None:
     """Fit a robot's metres, in the order of driving; None where nothing can be fitted, or no robot can be so.
 
     Parameters
     ----------
     metres : of one robot.
-    standing_watt : power while standing, None where the robot never stood.
+    idle_watt : power while standing, None where the robot never stood.
     """
-    found = fit_physics(metres, standing_watt=standing_watt)
+    found = fit_physics(metres, idle_watt=idle_watt)
     if found is None or not found.is_plausible():
         return None
     known = metres.take(np.isfinite(metres.power_watt + metres.velocity_mps + metres.rise))
@@ -45,8 +45,8 @@ def fit_and_validate_physics(metres: FitSamples, *, standing_watt: float | None)
     kinds = list(dict.fromkeys(term for term, _ in found.terms))
     whole = float(np.nansum(known.power_watt / known.velocity_mps))
     share = {kind: float(np.nansum(parts[:, [term == kind for term, _ in found.terms]])) / whole for kind in kinds}
-    scored = _predict_held_out(known, standing_watt, turning=True)
-    without = _predict_held_out(known, standing_watt, turning=False) if "turning" in kinds else None
+    scored = _predict_held_out(known, idle_watt, turning=True)
+    without = _predict_held_out(known, idle_watt, turning=False) if "turning" in kinds else None
     return PhysicsFit(
         segments=found.segments,
         terms=tuple(
@@ -63,25 +63,25 @@ def fit_and_validate_physics(metres: FitSamples, *, standing_watt: float | None)
         energy_share=share,
         held_out=None if scored is None else _score(scored),
         without_turning=None if without is None else _score(without),
-        usual_turn_radpm=_compute_mean_turn(known),
+        mean_turn_radpm=_compute_mean_turn(known),
         gain_of_turning=_compare_held_out(scored, without),
     )
 
 
 def _compute_mean_turn(metres: FitSamples) -> float:
     """Return how far a metre turns in the mean [rad/m]; 0 where no rate is known."""
-    turned = metres.turn_rate_radps / metres.velocity_mps
+    turned = metres.mean_abs_yaw_rate_radps / metres.velocity_mps
     return float(turned[np.isfinite(turned)].mean()) if np.isfinite(turned).any() else 0.0
 
 
-def _predict_held_out(metres: FitSamples, standing_watt: float | None, *, turning: bool) -> _HeldOut | None:
+def _predict_held_out(metres: FitSamples, idle_watt: float | None, *, turning: bool) -> _HeldOut | None:
     """Return energies of every fifth of the drive by a fit on the others; None where too few are left to fit."""
     count = len(metres.power_watt)
     fold = np.arange(count) * _FOLDS // max(count, 1)
     said = np.full(count, np.nan)
     for number in range(_FOLDS):
         mine = fold == number
-        found = fit_physics(metres.take(~mine), standing_watt=standing_watt, turning=turning)
+        found = fit_physics(metres.take(~mine), idle_watt=idle_watt, turning=turning)
         if found is None or mine.sum() < FEWEST // _FOLDS:
             return None
         here = metres.take(mine)

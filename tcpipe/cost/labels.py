@@ -79,38 +79,38 @@ class NetLabels:
 
     Attributes
     ----------
-    standing_power_watt : P0 [W].
-    power_above_standing_watt, energy_above_standing_joule : w - P0 [W], E - P0 T [J]; again E = w d / v.
+    idle_power_watt : P0 [W].
+    net_power_watt, net_energy_joule : w - P0 [W], E - P0 T [J]; again E = w d / v.
     *_std : their standard deviations as labels of the true metre, in the same units; that of P0 is one error of a whole run.
     """
 
-    standing_power_watt: Floats
-    standing_power_std_watt: Floats
-    power_above_standing_watt: Floats
-    power_above_standing_std_watt: Floats
-    energy_above_standing_joule: Floats
-    energy_above_standing_std_joule: Floats
+    idle_power_watt: Floats
+    idle_power_std_watt: Floats
+    net_power_watt: Floats
+    net_power_std_watt: Floats
+    net_energy_joule: Floats
+    net_energy_std_joule: Floats
 
 
 def subtract_idle_power(
-    cost: Labels, *, standing_watt: float, standing_std_watt: float, end_power_watt: Floats, energy_noise_joule: Floats
+    cost: Labels, *, idle_watt: float, idle_std_watt: float, end_power_watt: Floats, energy_noise_joule: Floats
 ) -> NetLabels:
     """Return the labels less what standing takes: E_true = E - P0 T - (P_end - P0) e / v_end, as in the head of this module.
 
     Parameters
     ----------
-    standing_watt, standing_std_watt : [W], P0 and its standard deviation; NaN where it is not known.
+    idle_watt, idle_std_watt : [W], P0 and its standard deviation; NaN where it is not known.
     end_power_watt, energy_noise_joule : as in `compute_labels`.
     """
-    noise_joule = np.hypot(energy_noise_joule, standing_std_watt * cost.duration_s)
-    energy_joule = cost.energy_joule - standing_watt * cost.duration_s
+    noise_joule = np.hypot(energy_noise_joule, idle_std_watt * cost.duration_s)
+    energy_joule = cost.energy_joule - idle_watt * cost.duration_s
     known = np.isfinite(energy_joule)
-    displaced_joule = (end_power_watt - standing_watt) * cost.duration_std_s
+    displaced_joule = (end_power_watt - idle_watt) * cost.duration_std_s
     return NetLabels(
-        standing_power_watt=np.where(known, standing_watt, np.nan),
-        standing_power_std_watt=np.where(known, standing_std_watt, np.nan),
-        power_above_standing_watt=cost.power_watt - standing_watt,
-        power_above_standing_std_watt=np.where(known, np.hypot(cost.power_std_watt, standing_std_watt), np.nan),
-        energy_above_standing_joule=energy_joule,
-        energy_above_standing_std_joule=np.where(known, np.hypot(displaced_joule, noise_joule), np.nan),
+        idle_power_watt=np.where(known, idle_watt, np.nan),
+        idle_power_std_watt=np.where(known, idle_std_watt, np.nan),
+        net_power_watt=cost.power_watt - idle_watt,
+        net_power_std_watt=np.where(known, np.hypot(cost.power_std_watt, idle_std_watt), np.nan),
+        net_energy_joule=energy_joule,
+        net_energy_std_joule=np.where(known, np.hypot(displaced_joule, noise_joule), np.nan),
     )

@@ -51,7 +51,7 @@ _PLAUSIBLE_RESISTANCE = 1.5  # coefficient of rolling resistance: tracks in deep
 _BLOCK, _FEWEST_BLOCKS = 20, 20  # consecutive segments that may err alike, and how many such blocks there are at least
 _MOST_ROWS = 20_000  # that are fitted, evenly taken of more: coefficients are sure to a few per mille by then
 
-_ALWAYS = ("standing", "drivetrain")  # are paid on any grade, and never given back
+_ALWAYS = ("idle", "drivetrain")  # are paid on any grade, and never given back
 
 ALL = "all"
 """The ground of a fit that knows no classes, and of classes with too few segments."""
@@ -64,14 +64,14 @@ class FitSamples:
     Attributes
     ----------
     power_watt, velocity_mps, rise : labels [W], horizontal speeds [m/s], tan of the slopes.
-    turn_rate_radps : mean of |yaw rate| [rad/s].
+    mean_abs_yaw_rate_radps : mean of |yaw rate| [rad/s].
     terrain : names of their classes.
     """
 
     power_watt: Floats
     velocity_mps: Floats
     rise: Floats
-    turn_rate_radps: Floats
+    mean_abs_yaw_rate_radps: Floats
     terrain: NDArray[np.str_]
 
     def take(self, rows: NDArray[np.int64] | NDArray[np.bool_]) -> FitSamples:
@@ -145,27 +145,27 @@ class Physics:
         return found
 
 
-def fit_physics(metres: FitSamples, *, standing_watt: float | None = None, turning: bool = True) -> Physics | None:
+def fit_physics(metres: FitSamples, *, idle_watt: float | None = None, turning: bool = True) -> Physics | None:
     """Fit the terms to labels; None for fewer than 20.
 
     Parameters
     ----------
     metres : rows with NaN are left out; without any turn rate there is no term for it.
-    standing_watt : power while standing, measured at halts; None fits it where the speeds vary enough.
+    idle_watt : power while standing, measured at halts; None fits it where the speeds vary enough.
     turning : whether turning is a term.
     """
-    turning = turning and bool(np.isfinite(metres.turn_rate_radps).any())
-    known = metres.power_watt + metres.velocity_mps + metres.rise + (metres.turn_rate_radps if turning else 0.0)
+    turning = turning and bool(np.isfinite(metres.mean_abs_yaw_rate_radps).any())
+    known = metres.power_watt + metres.velocity_mps + metres.rise + (metres.mean_abs_yaw_rate_radps if turning else 0.0)
     rows = np.flatnonzero(np.isfinite(known) & (metres.velocity_mps > 0.0))
     if rows.size < FEWEST:
         return None
     used = metres.take(rows[:: -(-rows.size // _MOST_ROWS)])
-    terms = _list_determined_terms(used, standing_watt=standing_watt, turning=turning)
-    found = _fit_robustly(used, terms, standing_watt)
-    for term in ("drivetrain", "standing"):
-        if not _is_told(found, term, used) and not (term == "standing" and standing_watt is not None):
+    terms = _list_determined_terms(used, idle_watt=idle_watt, turning=turning)
+    found = _fit_robustly(used, terms, idle_watt)
+    for term in ("drivetrain", "idle"):
+        if not _is_told(found, term, used) and not (term == "idle" and idle_watt is not None):
             terms = [known for known in terms if known[0] != term]
-            found = _fit_robustly(used, terms, standing_watt)
+            found = _fit_robustly(used, terms, idle_watt)
     off = used.power_watt - found.power_watt(used)
     spread = _NORMAL * float(np.median(np.abs(off - np.median(off))))
     return replace(
@@ -184,33 +184,33 @@ def _always(terms: Sequence[tuple[str, str]]) -> NDArray[np.bool_]:
     return np.array([term in _ALWAYS for term, _ in terms])
 
 
-def _list_determined_terms(metres: FitSamples, *, standing_watt: float | None, turning: bool) -> list[tuple[str, str]]:
+def _list_determined_terms(metres: FitSamples, *, idle_watt: float | None, turning: bool) -> list[tuple[str, str]]:
     """Return the coefficients that these metres can tell."""
     names, counts = np.unique(metres.terrain, return_counts=True)
     own = [str(name) for name, count in zip(names, counts, strict=True) if count >= FEWEST and name != ALL]
     classes = own if len(own) == len(names) else [*own, ALL]
     spread = float(np.std(metres.velocity_mps)) > _LEAST_SPEED * float(np.median(metres.velocity_mps))
-    terms = [("standing", ALL)] if standing_watt is not None or spread else []
+    terms = [("idle", ALL)] if idle_watt is not None or spread else []
     hilly = float(np.std(metres.rise)) >= _LEAST_SLOPE
     terms += [("drivetrain", ALL)] if hilly else []
     terms += [("rolling", name) for name in classes]
     terms += [("grade", ALL)] if hilly else []
     if not turning:
         return terms
-    groups = {name: metres.turn_rate_radps[metres.terrain == name] for name in own}
-    groups |= {ALL: metres.turn_rate_radps[~np.isin(metres.terrain, own)]} if ALL in classes else {}
-    least = _LEAST_TURNS * float(np.var(metres.turn_rate_radps))
+    groups = {name: metres.mean_abs_yaw_rate_radps[metres.terrain == name] for name in own}
+    groups |= {ALL: metres.mean_abs_yaw_rate_radps[~np.isin(metres.terrain, own)]} if ALL in classes else {}
+    least = _LEAST_TURNS * float(np.var(metres.mean_abs_yaw_rate_radps))
     return terms + [("turning", name) for name, rates in groups.items() if rates.size * np.var(rates) >= least]
 
 
 def _build_design_matrix(metres: FitSamples, terms: Sequence[tuple[str, str]]) -> Floats:
     """Return what each coefficient is multiplied with, shape (M, J)."""
     of = {
-        "standing": np.ones_like(metres.velocity_mps),
+        "idle": np.ones_like(metres.velocity_mps),
         "drivetrain": metres.velocity_mps * np.sqrt(1.0 + metres.rise**2),  # wheels run along the surface
         "rolling": metres.velocity_mps,
         "grade": metres.velocity_mps * metres.rise,
-        "turning": metres.turn_rate_radps,
+        "turning": metres.mean_abs_yaw_rate_radps,
     }
     own = {term: [name for kind, name in terms if kind == term and name != ALL] for term in of}
     columns = [
@@ -220,7 +220,7 @@ def _build_design_matrix(metres: FitSamples, terms: Sequence[tuple[str, str]]) -
     return np.column_stack(columns)
 
 
-def _fit_robustly(metres: FitSamples, terms: Sequence[tuple[str, str]], standing_watt: float | None) -> Physics:
+def _fit_robustly(metres: FitSamples, terms: Sequence[tuple[str, str]], idle_watt: float | None) -> Physics:
     """Return the coefficients by iteratively reweighted least squares on the force P / v; what is measured at halts is one row more.
 
     Of downhill metres force is a product of k and the coefficients: each step solves for both by its tangent (Gauss and Newton).
@@ -229,9 +229,9 @@ def _fit_robustly(metres: FitSamples, terms: Sequence[tuple[str, str]], standing
     design = _build_design_matrix(metres, terms) / metres.velocity_mps[:, None]
     force = metres.power_watt / metres.velocity_mps
     value, recovered = np.zeros(count), 0.0
-    prior = None if standing_watt is None else np.zeros(count + 1)
-    if prior is not None and standing_watt is not None:
-        prior[terms.index(("standing", ALL))] = 1.0 / max(_SURE * standing_watt, _SUREST_WATT)
+    prior = None if idle_watt is None else np.zeros(count + 1)
+    if prior is not None and idle_watt is not None:
+        prior[terms.index(("idle", ALL))] = 1.0 / max(_SURE * idle_watt, _SUREST_WATT)
     made, off, weight, scale = design, force, np.ones_like(force), 1.0
     for _ in range(_STEPS):
         wanted = design[:, ~always] @ value[~always]
@@ -247,8 +247,8 @@ def _fit_robustly(metres: FitSamples, terms: Sequence[tuple[str, str]], standing
         weight = clear * np.minimum(1.0, _HUBER * scale / np.maximum(np.abs(off), 1e-12))
         by = made * np.sqrt(weight)[:, None] / scale
         seen = (force + recovered * traction) * np.sqrt(weight) / scale
-        if prior is not None and standing_watt is not None:
-            by, seen = np.vstack([by, prior]), np.append(seen, prior.max() * standing_watt)
+        if prior is not None and idle_watt is not None:
+            by, seen = np.vstack([by, prior]), np.append(seen, prior.max() * idle_watt)
         q, r = np.linalg.qr(by)
         before, found = value, _fit_non_negative(r, q.T @ seen)
         value, recovered = found[:count], min(float(found[count]), 1.0)

@@ -8,7 +8,7 @@ from typing import Literal
 
 from tcpipe.errors import DatasetError
 
-EnergyName = Literal["total", "above_standing"]
+EnergyName = Literal["total", "net"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,11 +25,11 @@ class Energy:
 
 ENERGIES: Mapping[str, Energy] = {
     "total": Energy("power_watt", "power_std_watt", "energy_joule", "energy_std_joule", "all that was measured"),
-    "above_standing": Energy(
-        "power_above_standing_watt",
-        "power_above_standing_std_watt",
-        "energy_above_standing_joule",
-        "energy_above_standing_std_joule",
+    "net": Energy(
+        "net_power_watt",
+        "net_power_std_watt",
+        "net_energy_joule",
+        "net_energy_std_joule",
         "above what the robot draws while it stands",
     ),
 }

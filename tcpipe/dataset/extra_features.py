@@ -47,7 +47,7 @@ class ExtraFeature:
     """Smallest and largest."""
 
 
-COLUMNS = ("turn_rate_radps", "duration_s", "arc_length_m", "commanded_velocity_mps")
+COLUMNS = ("mean_abs_yaw_rate_radps", "duration_s", "arc_length_m", "commanded_velocity_mps")
 """Of samples.parquet, that the inputs are formed of."""
 
 

@@ -57,7 +57,7 @@ def open_dataset(path: str | Path, *, layers: Sequence[str] | None = None, label
     layers
         The tensor's channels, in this order; None: the paper's ``ortho``, ``terrain``, ``height``, those of them that are there.
     label
-        Which energy the labels are of: ``total``, all that the power source measured, or ``above_standing``, less what the robot draws
+        Which energy the labels are of: ``total``, all that the power source measured, or ``net``, less what the robot draws
         while it stands. T = d / v and E = w d / v hold for either.
 
     Returns

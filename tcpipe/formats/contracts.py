@@ -14,7 +14,7 @@ from tcpipe.recipe import Recipe
 from tcpipe.recipe.checking import describe
 from tcpipe.tables.bits import flag_name
 from tcpipe.tables.columns import Column, TableSchema
-from tcpipe.tables.levels import DATA_MODEL_VERSION, GATED_TRACK, LABELLED_SEGMENTS, REJECTIONS, SAMPLES, STREAMS
+from tcpipe.tables.levels import DATA_MODEL_VERSION, LABELLED_SEGMENTS, MASKED_TRACK, REJECTIONS, SAMPLES, STREAMS
 
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
 """Of every schema in ``schemas/``."""
@@ -31,7 +31,7 @@ def make_contracts(answers: Mapping[str, type]) -> dict[str, str]:
     ----------
     answers : the dataclasses of what commands print and of the documents of the upper floors, by the name of their schema.
     """
-    tables = (*STREAMS.values(), GATED_TRACK, REJECTIONS, LABELLED_SEGMENTS, SAMPLES)
+    tables = (*STREAMS.values(), MASKED_TRACK, REJECTIONS, LABELLED_SEGMENTS, SAMPLES)
     schemas = {table.name: _make_table_schema(table) for table in tables} | {"recipe": _make_recipe_schema()}
     documents = {**DOCUMENTS, **answers}
     pointers, definitions = describe(*documents.values(), file=f"{DEFINITIONS}.schema.json")

@@ -99,7 +99,7 @@ class Covariate:
 
 
 @dataclass(frozen=True, slots=True)
-class Doubtful:
+class FlaggedSamples:
     """Samples that carry a quality flag which not all of them carry: how many, their share of all (0 to 1); and samples by flag."""
 
     samples: int
@@ -135,7 +135,7 @@ class MapSource:
     crs: str
     x_min_m: float
     y_max_m: float
-    pitch_m: float
+    pixel_size_m: float
     rows: int
     cols: int
     sha256: str | None = None
@@ -156,7 +156,7 @@ class MapSource:
     @property
     def bounds_m(self) -> tuple[float, float, float, float]:
         """Least x and y, greatest x and y in its plane [m]."""
-        width_m, height_m = self.cols * self.pitch_m, self.rows * self.pitch_m
+        width_m, height_m = self.cols * self.pixel_size_m, self.rows * self.pixel_size_m
         return self.x_min_m, self.y_max_m - height_m, self.x_min_m + width_m, self.y_max_m
 
 
@@ -265,7 +265,7 @@ class DatasetCard:
     label: LabelColumns
     energy_budget: EnergyBudget | None = None
     split: SplitResult
-    ledger_m: Mapping[str, float]
+    distance_by_reason_m: Mapping[str, float]
     """Where every metre of the runs went [m]."""
     removal: Removal
     balance: Balance
@@ -273,7 +273,7 @@ class DatasetCard:
     run_tags: Mapping[str, str] | None = field(default=None, metadata=ABSENT)
     """The tags that a run had to carry; None in cards of before 0.9 and of a redacted dataset, which do not tell."""
     maps: tuple[MapSource, ...]
-    doubtful: Doubtful | None = None
+    flagged_samples: FlaggedSamples | None = None
     """How many samples carry a quality flag; None in cards of before data model 1.2."""
     findings: tuple[Finding, ...] = ()
     """Of the dataset itself: its choice of runs, sampling and splits. Runs and maps have their own."""

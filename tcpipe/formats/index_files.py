@@ -78,7 +78,7 @@ class RunFacts(Ingestion):
     """Size [byte] of the manifest, of the documents of the log and tags, and of the tables, by their name in the directory of the run."""
     commit: int = 0
     """Number of the commit that made it visible."""
-    standing_watt: float | None = None
+    idle_watt: float | None = None
     """What the robot draws while it stands."""
     physics: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     """Terms of the fit of power and their standard deviations, in SI, by ``term`` or, of one class of terrain, ``term on terrain``."""
@@ -111,7 +111,7 @@ def make_run_facts(manifest: Manifest, name: str, files: Mapping[str, int]) -> R
         segments_file=f"{place}/{named['segments.parquet']}",
         track_file=f"{place}/{named['track.parquet']}",
         files=files,
-        standing_watt=None if label is None else label.physics.standing_watt,
+        idle_watt=None if label is None else label.physics.idle_watt,
         physics={} if label is None or label.physics.fit is None else _read_terms(label.physics.fit),
     )
 

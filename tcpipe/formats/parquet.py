@@ -17,6 +17,7 @@ import pyarrow.parquet as pq
 
 from tcpipe.errors import StoreError
 from tcpipe.formats.atomic import write_atomic_file
+from tcpipe.tables.earlier_names import EARLIER_COLUMNS
 
 ROWS_PER_GROUP = 1 << 17
 """Rows of a group: what is decoded together."""
@@ -92,7 +93,7 @@ def _convert_damage(where: Path | str) -> Iterator[None]:
 
 
 def read_table(path: Path, columns: list[str] | None = None) -> pa.Table:
-    """Read a Parquet file with its schema metadata; `StoreError` names a file that cannot be read."""
+    """Read a Parquet file with its schema metadata, `EARLIER_COLUMNS` by their new names; `StoreError` names an unreadable file."""
     with _convert_damage(path), pa.memory_map(str(path)) as file:
         return _check_text_sizes(file.read_buffer(), columns)
 
@@ -109,6 +110,9 @@ def _check_text_sizes(data: pa.Buffer, columns: list[str] | None, group: int | N
     most = max(MOST_BYTES, MOST_TIMES * data.size)
     groups = [n for n in range(about.num_row_groups) if group in (None, n) and about.row_group(n).num_rows]
     schema = about.schema.to_arrow_schema()
+    if columns is not None:
+        own = {name: earlier for earlier, name in EARLIER_COLUMNS.items() if earlier in schema.names}
+        columns = [own.get(name, name) for name in columns]
     size, at_most = 0, dict.fromkeys((field.name for field in schema if pa.types.is_string(field.type)), 0)
     for name, least, longest in _iterate_column_sizes(
         memoryview(data), about, groups, None if columns is None else set(columns)
@@ -130,7 +134,7 @@ def _check_text_sizes(data: pa.Buffer, columns: list[str] | None, group: int | N
                 raise ValueError(f"its texts unfold to more than {most / 1e6:.0f} MB")
             plain = schema.field(field.name)
             table = table.set_column(at, plain, table.column(at).cast(plain.type))
-    return table
+    return table.rename_columns([EARLIER_COLUMNS.get(name, name) for name in table.column_names])
 
 
 def _count_text_bytes(chunk: pa.DictionaryArray) -> int:
@@ -222,8 +226,8 @@ def _read_varint(data: memoryview, at: int) -> tuple[int, int]:
 
 
 def read_column_names(path: Path) -> list[str]:
-    """Return the names of the columns of a Parquet file from its footer."""
-    return list(read_schema(path).names)
+    """Return the names of the columns of a Parquet file from its footer, as `read_table` gives them."""
+    return [EARLIER_COLUMNS.get(name, name) for name in read_schema(path).names]
 
 
 def read_schema(path: Path) -> pa.Schema:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass
@@ -16,6 +17,9 @@ from tcpipe.formats.toml_text import parse_toml
 from tcpipe.recipe import IngestSections, Recipe, TableMapping
 from tcpipe.recipe.checking import as_toml, describe, format_values, from_values, read_annotations
 from tcpipe.robots.profiles import PowerSource, Robot
+from tcpipe.tables.earlier_names import EARLIER_KEYS
+
+logger = logging.getLogger(__name__)
 
 FILE_NAME = "tcpipe.toml"
 _MOST_BYTES = 1_000_000
@@ -60,8 +64,33 @@ def resolve_recipe(given: Recipe | str | Path | None) -> Recipe:
 
 
 def parse_recipe(values: Mapping[str, Any], *, where: str) -> Recipe:
-    """Check recipe values; `RecipeError` carries one line for every wrong key."""
+    """Check recipe values; `RecipeError` carries one line for every wrong key. Keys by earlier names are read, with a note."""
+    renamed: dict[str, str] = {}
+    values = rename_earlier_keys(values, renamed)
+    if renamed:
+        logger.warning(
+            "%s: keys have new names: %s", where, ", ".join(f"{old} is {new}" for old, new in renamed.items())
+        )
     return from_values(Recipe, values, where=where)
+
+
+def rename_earlier_keys(values: Any, renamed: dict[str, str], path: str = "") -> Any:
+    """Return recipe values with `EARLIER_KEYS` by their names of today; ``renamed`` collects those that were found."""
+    if isinstance(values, list):
+        return [rename_earlier_keys(item, renamed, f"{path}.*") for item in values]
+    if not isinstance(values, Mapping):
+        return values
+    found = {}
+    for key, value in values.items():
+        below = f"{path}.{key}" if path else str(key)
+        below = f"{path}.*" if path == "robots" else "gate" if below == "mask" else below
+        name = EARLIER_KEYS.get(below, str(key))
+        if name in values:  # both are given: the earlier one is an unknown key
+            name = str(key)
+        elif name != key:
+            renamed[below] = name
+        found[name] = rename_earlier_keys(value, renamed, below)
+    return found
 
 
 def ingest_key(recipe: Recipe | Mapping[str, Json]) -> str:

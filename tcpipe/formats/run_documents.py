@@ -49,7 +49,7 @@ class RunJson:
     topics: tuple[TopicCount, ...] = ()
     sensors: Mapping[str, Sensor] = field(default_factory=dict)
     damage: tuple[str, ...] = ()
-    remarks: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
     message_definitions: str = ""
     """Hash of the definitions that were given for types which the log does not define; "" without."""
     report: StageReport[StageFacts] = NOTHING_FOUND
@@ -116,19 +116,19 @@ class Ingestion:
     robot_requested: str | None = None
     message_definitions: str = ""
     tags: Mapping[str, str]
-    ledger_m: Mapping[str, float]
+    distance_by_reason_m: Mapping[str, float]
     """Where every metre went [m], by entry."""
     damage: tuple[str, ...]
 
     @property
     def driven_m(self) -> float:
         """How far it drove [m]."""
-        return math.fsum(self.ledger_m.values())
+        return math.fsum(self.distance_by_reason_m.values())
 
     @property
     def kept_m(self) -> float:
         """How much of that is in segments [m]."""
-        return self.ledger_m.get(KEPT, 0.0)
+        return self.distance_by_reason_m.get(KEPT, 0.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

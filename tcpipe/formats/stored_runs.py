@@ -21,7 +21,7 @@ from tcpipe.formats.parquet import read_highest, read_lowest, read_table, write_
 from tcpipe.formats.place import DirectoryPlace, Place
 from tcpipe.formats.recipe_toml import read_key
 from tcpipe.formats.run_documents import Manifest
-from tcpipe.tables.levels import LABELLED_SEGMENTS, GatedTrack
+from tcpipe.tables.levels import LABELLED_SEGMENTS, MaskedTrack
 from tcpipe.tables.verdicts import judge_again
 
 FilesState: TypeAlias = tuple[tuple[int, int], ...]
@@ -84,9 +84,9 @@ class RunDirectory:
         """Read the labelled segments (schema LABELLED_SEGMENTS; columns that an earlier data model lacks are null)."""
         return LABELLED_SEGMENTS.completed(self.table("segments"))
 
-    def track(self) -> GatedTrack:
-        """Read the gated track as a checked level."""
-        return GatedTrack(self.table("track"), self.manifest.info)
+    def track(self) -> MaskedTrack:
+        """Read the masked track as a checked level."""
+        return MaskedTrack(self.table("track"), self.manifest.info)
 
     def rejections(self) -> pa.Table:
         """Read the measurements that the filter refused (schema REJECTIONS)."""

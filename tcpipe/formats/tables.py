@@ -33,7 +33,7 @@ _EDGES = re.compile(rb"^ | (?=\r?$)", re.MULTILINE)
 class Cells:
     """Columns that were read: numbers, NaN where there is none; ``stamp`` as it stands, or [ns since 1970] where it is a time in words.
 
-    ``texts`` says by column how many cells hold something that is no number, and the first with its row (from 1); ``remarks`` what the
+    ``texts`` says by column how many cells hold something that is no number, and the first with its row (from 1); ``notes`` what the
     file's form shows.
     """
 
@@ -42,7 +42,7 @@ class Cells:
     stamp_is_time: bool
     columns: dict[str, NDArray[np.float64]]
     texts: dict[str, tuple[int, int, str]]
-    remarks: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
 
 
 def read_column_names(path: Path) -> list[str]:

@@ -41,7 +41,7 @@ from tcpipe.fusion.stationary import find_stationary_intervals
 from tcpipe.fusion.timeline import EventTimeline, build_timeline
 from tcpipe.fusion.trajectory import Trajectory
 from tcpipe.geometry.rotation import quat_from_matrix
-from tcpipe.tables.facts import Reopening
+from tcpipe.tables.facts import GateReset
 from tcpipe.tables.findings import Subject, make_finding
 
 _MANY_FIXES = 50
@@ -157,14 +157,14 @@ def _find_gnss_faults(case: _FilterSection, timeline: EventTimeline) -> GnssFaul
 
 def _as_reopenings(
     wrong: GnssFaults, outputs: NDArray[np.float64], output_ns: NDArray[np.int64]
-) -> tuple[Reopening, ...]:
+) -> tuple[GateReset, ...]:
     """Return the spans in which the fixes were wrong, with how far they were off; then those of which nobody can tell."""
     off_m = np.linalg.norm(outputs[:, kernel.SAVED - 3 : kernel.SAVED - 1], axis=1)
     found = []
     for span in wrong.spans:
         within = off_m[is_inside(output_ns, (span,))]
-        found.append(Reopening(GNSS, *span, float(within.max()) if within.size else wrong.size_m))
-    return (*found, *(Reopening(GNSS, *span, wrong.size_m) for span in wrong.doubtful))
+        found.append(GateReset(GNSS, *span, float(within.max()) if within.size else wrong.size_m))
+    return (*found, *(GateReset(GNSS, *span, wrong.size_m) for span in wrong.doubtful))
 
 
 def _inflate_correlated_fixes(measurements: Measurements, errors: FixErrors | None, *, doubted: bool) -> Measurements:

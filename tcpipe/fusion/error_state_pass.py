@@ -30,7 +30,7 @@ from tcpipe.fusion.smoother_kernel import smooth_block
 from tcpipe.fusion.timeline import EventTimeline
 from tcpipe.fusion.trajectory import DISPLACEMENT_LAGS_S
 from tcpipe.geometry.rotation import matrix_from_quat
-from tcpipe.tables.facts import Reopening
+from tcpipe.tables.facts import GateReset
 
 _BLOCK = 2048
 _KEPT_BLOCKS = 12
@@ -97,7 +97,7 @@ class FilterPass:
         count = timeline.stamp_ns.size
         self.nis = np.full(count, np.nan)
         self.innovation = np.full((count, 3), np.nan)
-        self.wrong: tuple[Reopening, ...] = ()  # when the fixes erred together, as both ends tell
+        self.wrong: tuple[GateReset, ...] = ()  # when the fixes erred together, as both ends tell
         self.start_error_m2 = np.empty(0)  # of the fixes, where the state holds it
         self.kept_error, self.error_noise_m2 = np.ones(count), np.zeros((count, 3))
         self.error_level_m2 = np.zeros((count, 3))

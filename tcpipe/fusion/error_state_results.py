@@ -13,7 +13,7 @@ from tcpipe.fusion.process import GROUND, UNSEEN_TURN_RADPS
 from tcpipe.fusion.timeline import EventTimeline
 from tcpipe.fusion.trajectory import DISPLACEMENT_LAGS_S, Rejections, Trajectory
 from tcpipe.geometry.rotation import matrix_from_quat, quat_from_matrix, quat_from_rpy
-from tcpipe.tables.facts import Reopening, StretchFacts, make_vector
+from tcpipe.tables.facts import GateReset, StretchFacts, make_vector
 
 
 def make_trajectory(
@@ -112,8 +112,8 @@ def _make_rejections(timeline: EventTimeline, run: FilterPass) -> Rejections:
     )
 
 
-def find_gate_resets(timeline: EventTimeline, run: FilterPass) -> tuple[Reopening, ...]:
-    """Return each reopening of a gate: since when the sensor was refused, and how far it was off."""
+def find_gate_resets(timeline: EventTimeline, run: FilterPass) -> tuple[GateReset, ...]:
+    """Return each gate_reset of a gate: since when the sensor was refused, and how far it was off."""
     found = []
     for event in np.flatnonzero(run.verdict == kernel.REOPENED):
         same = np.flatnonzero(timeline.kind[:event] == timeline.kind[event])
@@ -123,8 +123,8 @@ def find_gate_resets(timeline: EventTimeline, run: FilterPass) -> tuple[Reopenin
         role = ROLES[int(timeline.kind[event])]
         if role == GNSS and any(w.start_ns <= timeline.stamp_ns[event] <= w.end_ns for w in run.wrong):
             continue  # known by both ends
-        found.append(Reopening(role, int(timeline.stamp_ns[first]), int(timeline.stamp_ns[event]), size))
-    return tuple(sorted((*run.wrong, *found), key=lambda reopening: reopening.start_ns))
+        found.append(GateReset(role, int(timeline.stamp_ns[first]), int(timeline.stamp_ns[event]), size))
+    return tuple(sorted((*run.wrong, *found), key=lambda gate_reset: gate_reset.start_ns))
 
 
 def _make_facts(timeline: EventTimeline, run: FilterPass) -> StretchFacts:
@@ -138,9 +138,9 @@ def _make_facts(timeline: EventTimeline, run: FilterPass) -> StretchFacts:
         rejected={role: int((of_kind & (run.verdict == kernel.REFUSED)).sum()) for role, of_kind in kinds.items()},
         reopened={role: int((of_kind & (run.verdict == kernel.REOPENED)).sum()) for role, of_kind in kinds.items()},
         events=int(timeline.stamp_ns.size),
-        standing_updates=int((timeline.kind == kernel.STANDING).sum()),
+        zero_velocity_updates=int((timeline.kind == kernel.STANDING).sum()),
         gnss_lasting_error_m=run.lasting_error_m(),
-        reopenings=find_gate_resets(timeline, run),
+        gate_resets=find_gate_resets(timeline, run),
         covariance_repairs=int(run.repairs),
         gyro_bias_radps=None if run.turn_scale_std else make_vector(x[9:12]),
         turn_scale=float(1 + x[11]) if run.turn_scale_std else None,

@@ -40,17 +40,17 @@ _GYRO_BIAS_STD_RADPS = 0.02
 _UNKNOWN_YAW_STD_RAD = 0.6  # the sigma points of a wider one would meet behind the robot
 
 
-def find_initial_state(measurements: Measurements, standing_ns: NDArray[np.int64], start_ns: int) -> InitialState:
+def find_initial_state(measurements: Measurements, stationary_ns: NDArray[np.int64], start_ns: int) -> InitialState:
     """Return the state at ``start_ns``, the first stamp of the stretch.
 
     Parameters
     ----------
     measurements : of one stretch.
-    standing_ns : [ns], shape (K, 2), when the robot stands.
+    stationary_ns : [ns], shape (K, 2), when the robot stands.
     start_ns : [ns].
     """
-    bias, bias_std = _estimate_gyro_bias(measurements.imu, standing_ns)
-    roll, pitch, tilt_std = _estimate_tilt(measurements.imu, standing_ns, start_ns)
+    bias, bias_std = _estimate_gyro_bias(measurements.imu, stationary_ns)
+    roll, pitch, tilt_std = _estimate_tilt(measurements.imu, stationary_ns, start_ns)
     path = _Path(measurements, start_ns, bias)
     yaw, yaw_std, heading_from = _estimate_yaw(measurements, path, start_ns, bias_std)
     quat = quat_from_rpy(roll, pitch, yaw)
@@ -70,10 +70,10 @@ def find_initial_state(measurements: Measurements, standing_ns: NDArray[np.int64
     )
 
 
-def _estimate_gyro_bias(imu: InertialMeasurements | None, standing_ns: NDArray[np.int64]) -> tuple[Floats, float]:
-    if imu is None or standing_ns.size == 0:
+def _estimate_gyro_bias(imu: InertialMeasurements | None, stationary_ns: NDArray[np.int64]) -> tuple[Floats, float]:
+    if imu is None or stationary_ns.size == 0:
         return np.zeros(3), _GYRO_BIAS_STD_RADPS
-    inside = (imu.stamp_ns >= standing_ns[0, 0]) & (imu.stamp_ns <= standing_ns[0, 1])
+    inside = (imu.stamp_ns >= stationary_ns[0, 0]) & (imu.stamp_ns <= stationary_ns[0, 1])
     if inside.sum() < 10:
         return np.zeros(3), _GYRO_BIAS_STD_RADPS
     mean: Floats = imu.angular_velocity_radps[inside].mean(0)
@@ -81,19 +81,19 @@ def _estimate_gyro_bias(imu: InertialMeasurements | None, standing_ns: NDArray[n
 
 
 def _estimate_tilt(
-    imu: InertialMeasurements | None, standing_ns: NDArray[np.int64], start_ns: int
+    imu: InertialMeasurements | None, stationary_ns: NDArray[np.int64], start_ns: int
 ) -> tuple[float, float, float]:
     """Roll and pitch [rad] at the start, and their standard deviation."""
     if imu is None or imu.stamp_ns.size == 0:
         return 0.0, 0.0, 0.2
-    stands = standing_ns.size > 0 and standing_ns[0, 0] < start_ns + 2_000_000_000
-    end = int(standing_ns[0, 1]) if stands else start_ns + 1_500_000_000
+    stands = stationary_ns.size > 0 and stationary_ns[0, 0] < start_ns + 2_000_000_000
+    end = int(stationary_ns[0, 1]) if stands else start_ns + 1_500_000_000
     oriented = np.flatnonzero(np.isfinite(imu.quat_xyzw).all(1) & (imu.stamp_ns >= start_ns) & (imu.stamp_ns <= end))
     own = rpy_from_quat(imu.quat_xyzw[oriented[0]]) if oriented.size else None
     if not imu.accelerometer_usable:
         return (0.0, 0.0, 0.2) if own is None else (float(own[0]), float(own[1]), 0.05)
     stamp_s = compute_seconds(imu.stamp_ns, start_ns)
-    span_s = np.array([(standing_ns[0, 0] if stands else start_ns) - start_ns, end - start_ns]) * 1e-9
+    span_s = np.array([(stationary_ns[0, 0] if stands else start_ns) - start_ns, end - start_ns]) * 1e-9
     fx, fy, fz = compute_interval_means(stamp_s, imu.specific_force_mps2, span_s[:1], span_s[1:])[0]
     roll, pitch = float(np.arctan2(fy, fz)), float(np.arctan2(-fx, np.hypot(fy, fz)))
     if own is not None and max(abs(own[0] - roll), abs(own[1] - pitch)) < _TILT_AGREES_RAD and not stands:

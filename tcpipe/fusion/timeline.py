@@ -80,19 +80,19 @@ class EventTimeline:
     output_has_gyro: NDArray[np.bool_]
 
 
-def build_timeline(measurements: Measurements, standing_ns: Ints, output_ns: Ints) -> EventTimeline:
+def build_timeline(measurements: Measurements, stationary_ns: Ints, output_ns: Ints) -> EventTimeline:
     """Merge measurements, constraints and wanted stamps.
 
     Parameters
     ----------
     measurements : of one stretch.
-    standing_ns : [ns], shape (K, 2), from `tcpipe.fusion.stationary.find_stationary_intervals`.
+    stationary_ns : [ns], shape (K, 2), from `tcpipe.fusion.stationary.find_stationary_intervals`.
     output_ns : [ns], shape (N,), increasing.
     """
     parts = _make_measured_parts(measurements)
     start = min(int(part[0][0]) for part in parts if part[0].size)
     end = max(int(part[0][-1]) for part in parts if part[0].size)
-    parts += _make_constraints(measurements, standing_ns, start, end)
+    parts += _make_constraints(measurements, stationary_ns, start, end)
     parts.append(_make_plain_part(output_ns, kernel.PREDICT))
     parts.append(_make_plain_part(_make_filler_stamps(np.concatenate([part[0] for part in parts])), kernel.PREDICT))
     stamp = np.concatenate([part[0] for part in parts])
@@ -185,7 +185,7 @@ def _estimate_white_variance(velocity_mps: Floats) -> float:
     return float(np.median(second[moving] ** 2) / (6 * _MEDIAN_OF_SQUARES)) if moving.sum() > 1 else 0.0
 
 
-def _make_constraints(measurements: Measurements, standing_ns: Ints, start: int, end: int) -> list[_Part]:
+def _make_constraints(measurements: Measurements, stationary_ns: Ints, start: int, end: int) -> list[_Part]:
     parts: list[_Part] = []
     if is_gliding(measurements):  # which way the body looks is not known
         return parts
@@ -197,8 +197,8 @@ def _make_constraints(measurements: Measurements, standing_ns: Ints, start: int,
     if imu is None or not imu.accelerometer_usable:
         grid = np.arange(start, end, _LEVEL_NS, dtype=np.int64)
         parts.append(_make_constant_part(grid, kernel.LEVEL, (*level_stds_rad(measurements), 1.0)))
-    if imu is not None and standing_ns.size:
-        grid = np.concatenate([np.arange(a, b, _STANDING_NS, dtype=np.int64) for a, b in standing_ns])
+    if imu is not None and stationary_ns.size:
+        grid = np.concatenate([np.arange(a, b, _STANDING_NS, dtype=np.int64) for a, b in stationary_ns])
         grid = grid[(grid >= start) & (grid <= end)]
         parts.append(_make_constant_part(grid, kernel.STANDING, (_STANDING_STD_MPS,) * 3))
         parts.append(_make_stationary_part(imu, grid))

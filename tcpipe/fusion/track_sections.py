@@ -22,7 +22,7 @@ _PAUSE_NS = 5_000_000_000
 class TrackSection:
     """One stretch: its clock epoch, first and last stamp [ns] of a motion measurement, and its measurements."""
 
-    epoch: int
+    clock_epoch: int
     start_ns: int
     end_ns: int
     measurements: Measurements

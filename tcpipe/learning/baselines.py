@@ -117,7 +117,7 @@ def _fit_curves(train: Split) -> Iterator[tuple[str, Predictor]]:
 def _fit_physics(train: Split, ours: Model) -> Predictor:
     del ours
     fitted = fit_physics_model(
-        read_extra_features(train), train.labels.astype(np.float64), standing_watt=find_idle_power(train)
+        read_extra_features(train), train.labels.astype(np.float64), idle_watt=find_idle_power(train)
     )
     return lambda split: fitted.predict(read_extra_features(split))
 

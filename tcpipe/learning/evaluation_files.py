@@ -52,8 +52,10 @@ class EvaluationResult:
             )
             lines.append(f"{split}: {part.samples} samples, MAPE (of so many labels) {', '.join(figures)}")
             energy = part.errors["E"][ALL]
-            if energy.held_percent is not None:
-                lines.append(f"{split}: 90 % intervals hold {energy.held_percent:.1f} % of E, CRPS {energy.crps:.2f} J")
+            if energy.coverage_percent is not None:
+                lines.append(
+                    f"{split}: 90 % intervals hold {energy.coverage_percent:.1f} % of E, CRPS {energy.crps:.2f} J"
+                )
             lines.append(f"{split}: {format_leakage(part.leakage)}")
         lines += describe_ratios(self.values.baselines)
         lines += [f"verdict: {format_verdict(self.values.verdict, PREDICTED)}", *format_findings(self.values.findings)]

@@ -62,7 +62,7 @@ def _find_baselines(found: Evaluation, subject: Subject) -> Iterator[Finding]:
 
 
 def _find_coverage(part: SplitErrors, subject: Subject) -> Iterator[Finding]:
-    percent = part.errors["E"][ALL].held_percent
+    percent = part.errors["E"][ALL].coverage_percent
     if percent is None:
         yield make_finding("no-intervals", subject)
     elif percent / 100.0 < read_threshold("energy-overconfident", "min_coverage_fraction"):

@@ -21,7 +21,7 @@ FLOORS = {"label_floor": "label noise alone", "simulation_floor": "simulation's 
 """What an error can hardly be less than, and what the page calls it."""
 
 MEASURES = {"rmse": "RMSE", "mape_percent": "MAPE"}
-SCORES = {"held_percent": "held by 90 %", "nll": "NLL", "crps": "CRPS"}
+SCORES = {"coverage_percent": "held by 90 %", "nll": "NLL", "crps": "CRPS"}
 """How well a model told its own errors (`tcpipe.learning.metrics`)."""
 
 COUNTED = (
@@ -122,7 +122,7 @@ def _format_figure(error: Errors | None, measure: str, quantity: str) -> str:
         return "–"
     if measure == "mape_percent":
         return f"{value:.2f} ({error.mape_count})"
-    return f"{value:.{1 if measure == 'held_percent' else 2 if measure == 'nll' else _DIGITS[quantity]}f}"
+    return f"{value:.{1 if measure == 'coverage_percent' else 2 if measure == 'nll' else _DIGITS[quantity]}f}"
 
 
 def _format_paper_figure(value: float | None) -> str:

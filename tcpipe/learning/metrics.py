@@ -48,7 +48,7 @@ class Errors:
     mape_percent: float | None
     mape_count: int
     """Samples whose label is large enough for a percentage."""
-    held_percent: float | None = field(default=None, metadata=ABSENT)
+    coverage_percent: float | None = field(default=None, metadata=ABSENT)
     """Of the labels, by 90 % intervals; None, as the next two, where no deviation is stated."""
     nll: float | None = field(default=None, metadata=ABSENT)
     """Mean negative log-likelihood, of labels in their unit."""

@@ -141,7 +141,7 @@ class Model:
 
     @property
     def label_energy(self) -> str:
-        """``total`` or ``above_standing``: which power and energy it predicts."""
+        """``total`` or ``net``: which power and energy it predicts."""
         return self.card.label_energy
 
     @property

@@ -37,7 +37,7 @@ class PhysicsModel:
     """N, shape ()."""
     recovered: Floats
     """Share of negative work that comes back, shape ()."""
-    usual_turn_radpm: Floats
+    mean_turn_radpm: Floats
     """Of the training samples: what a metre is taken to turn where nothing is known of it, shape ()."""
     rolling_newton: Floats
     """F by class id, shape (256,)."""
@@ -47,7 +47,7 @@ class PhysicsModel:
     def predict(self, beside: ExtraFeatures) -> Floats:
         """Return power [W] and velocity [m/s], shape (N, 2)."""
         velocity = np.maximum(self.speed.predict(beside.slope_rad, beside.class_id)[:, 0], LEAST_VELOCITY_MPS)
-        turn = np.where(np.isfinite(beside.turn_radpm), beside.turn_radpm, self.usual_turn_radpm)
+        turn = np.where(np.isfinite(beside.turn_radpm), beside.turn_radpm, self.mean_turn_radpm)
         force = self.rolling_newton[beside.class_id] + self.grade_newton * np.tan(beside.slope_rad)
         work = velocity * (force + self.turning_joule_per_rad[beside.class_id] * turn)
         always = self.no_load_watt + self.drivetrain_newton * velocity / np.cos(beside.slope_rad)
@@ -78,14 +78,14 @@ def read_physics_model(arrays: Mapping[str, NDArray[Any]], where: str) -> Physic
     return PhysicsModel(speed, **rest)
 
 
-def fit_physics_model(beside: ExtraFeatures, labels: Floats, *, standing_watt: float | None) -> PhysicsModel:
+def fit_physics_model(beside: ExtraFeatures, labels: Floats, *, idle_watt: float | None) -> PhysicsModel:
     """Fit it to samples.
 
     Parameters
     ----------
     beside : of N samples; without any turn it has no term for turning.
     labels : power [W] and velocity [m/s], finite, shape (N, 2).
-    standing_watt : what the robot was seen to draw while it stood; None where it was not.
+    idle_watt : what the robot was seen to draw while it stood; None where it was not.
 
     Raises
     ------
@@ -94,17 +94,17 @@ def fit_physics_model(beside: ExtraFeatures, labels: Floats, *, standing_watt: f
     names = np.where(beside.class_id > 0, beside.class_id.astype(np.str_), ALL)
     power, velocity = labels.T
     metres = FitSamples(power, velocity, np.tan(beside.slope_rad), beside.turn_radpm * velocity, names)
-    found = fit_physics(metres, standing_watt=standing_watt)
+    found = fit_physics(metres, idle_watt=idle_watt)
     if found is None:
         raise ModelError(f"{len(labels)} samples to fit physics to, wanted at least {FEWEST} that move")
     known = beside.turn_radpm[np.isfinite(beside.turn_radpm)]
     return PhysicsModel(
         speed=fit_curves("linear", beside.slope_rad, beside.class_id, labels[:, 1:]),
-        no_load_watt=_evaluate_all(found, "standing"),
+        no_load_watt=_evaluate_all(found, "idle"),
         drivetrain_newton=_evaluate_all(found, "drivetrain"),
         grade_newton=_evaluate_all(found, "grade"),
         recovered=np.array(found.recovered),
-        usual_turn_radpm=np.array(float(known.mean()) if known.size else 0.0),
+        mean_turn_radpm=np.array(float(known.mean()) if known.size else 0.0),
         rolling_newton=_collect_by_class(found, "rolling"),
         turning_joule_per_rad=_collect_by_class(found, "turning"),
     )
@@ -114,7 +114,7 @@ def find_idle_power(split: Split) -> float | None:
     """Return what the robot draws while it stands, of the power that a split's labels are of [W]; None where no run of it stood."""
     if split.energy is not ENERGIES["total"]:
         return 0.0
-    watt = split.column("standing_power_watt").astype(np.float64)
+    watt = split.column("idle_power_watt").astype(np.float64)
     return float(np.nanmean(watt)) if np.isfinite(watt).any() else None
 
 

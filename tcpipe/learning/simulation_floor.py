@@ -50,7 +50,7 @@ def compute_true_costs(world: World, robot: SimulatedRobot, split: Split) -> dic
     lost = 0.0 if robot.wheels is None else robot.wheels.slowdown * (rolling - usual[2])
     wheel = robot.max_velocity_mps * robot.speed_factor(usual[0], np.sin(slope)) * (1.0 - lost)
     velocity = wheel * (1.0 - robot.slip(usual[1], np.sin(slope))) * np.cos(slope)
-    turning = np.abs(np.nan_to_num(split.column("turn_rate_radps").astype(np.float64)))
+    turning = np.abs(np.nan_to_num(split.column("mean_abs_yaw_rate_radps").astype(np.float64)))
     mechanical = robot.wheel_power_watt(
         wheel_velocity_mps=wheel,
         acceleration_mps2=np.zeros_like(slope),

@@ -81,13 +81,13 @@ def _fit_trees(task: Task, labels: Floats, weights: Floats, patch_m: float, clas
 
 def _fit_physics(split: Split, labels: Floats) -> _FittedModel:
     """Fit physics to all, and to all but each fold."""
-    beside, folds, standing_watt = read_extra_features(split), split.column("fold"), find_idle_power(split)
+    beside, folds, idle_watt = read_extra_features(split), split.column("fold"), find_idle_power(split)
     held_out = np.empty_like(labels)
     for fold in np.unique(folds):
         held = folds == fold
-        fitted = fit_physics_model(beside.take(~held), labels[~held], standing_watt=standing_watt)
+        fitted = fit_physics_model(beside.take(~held), labels[~held], idle_watt=idle_watt)
         held_out[held] = fitted.predict(beside.take(held))
-    whole = fit_physics_model(beside, labels, standing_watt=standing_watt)
+    whole = fit_physics_model(beside, labels, idle_watt=idle_watt)
     return _FittedModel(whole.arrays(), whole.predict(beside), held_out, 1)
 
 

@@ -62,7 +62,7 @@ class TrainOptions:
         "total",
         Option(
             "Energy to train on: all that was measured, or less what the robot draws while it stands.",
-            kind=("total", "above_standing"),
+            kind=("total", "net"),
         ),
     )
     beside: bool = option(

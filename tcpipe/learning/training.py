@@ -37,7 +37,7 @@ _READ_TOGETHER = 1024
 FEW_SAMPLES = 20_000
 """Training samples below which a network is not expected to do better than a table (ADR-23)."""
 
-_CALLED = {"turn_radpm": "turn (turn_rate_radps)", "command_mps": "commanded speed (commanded_velocity_mps)"}
+_CALLED = {"turn_radpm": "turn (mean_abs_yaw_rate_radps)", "command_mps": "commanded speed (commanded_velocity_mps)"}
 
 
 @dataclass(frozen=True, slots=True)

@@ -69,7 +69,7 @@ class Timeline:
 
     row: Ints
     stamp_ns: Ints
-    epoch: NDArray[np.int16]
+    clock_epoch: NDArray[np.int16]
     source: Literal["header", "log"]
     why: str
     offset_s: float | None
@@ -210,7 +210,7 @@ class _Draft:
     why: str
     stamp_ns: Ints
     usable: Mask
-    epoch: Ints
+    clock_epoch: Ints
     offset_ns: dict[int, int]
     median_offset_ns: int | None
     replaced: int
@@ -336,12 +336,12 @@ def _find_clock_shifts(times: TopicTimes, draft: _Draft, reference: Sequence[int
 
 
 def _make_timeline(times: TopicTimes, draft: _Draft, moves: Sequence[int]) -> Timeline:
-    stamps = draft.stamp_ns + np.array(moves, np.int64)[draft.epoch] + times.offset_ns
-    late = _compute_lateness(stamps, draft.epoch, draft.usable)
+    stamps = draft.stamp_ns + np.array(moves, np.int64)[draft.clock_epoch] + times.offset_ns
+    late = _compute_lateness(stamps, draft.clock_epoch, draft.usable)
     keep = draft.usable & (late < LATE_NS)
     rows = np.flatnonzero(keep)
-    order = rows[np.lexsort((rows, stamps[rows], draft.epoch[rows]))]
-    again = _find_repeats(stamps[order], draft.epoch[order])
+    order = rows[np.lexsort((rows, stamps[rows], draft.clock_epoch[rows]))]
+    again = _find_repeats(stamps[order], draft.clock_epoch[order])
     same = np.zeros(len(order), bool)
     repeats = np.flatnonzero(again)
     pairs = ((column[order[repeats]], column[order[repeats - 1]]) for column in times.content)
@@ -357,7 +357,7 @@ def _make_timeline(times: TopicTimes, draft: _Draft, moves: Sequence[int]) -> Ti
     return Timeline(
         chosen,
         stamps[chosen],
-        draft.epoch[chosen].astype(np.int16),
+        draft.clock_epoch[chosen].astype(np.int16),
         draft.source,
         draft.why,
         None if draft.median_offset_ns is None else draft.median_offset_ns / SECOND_NS,

@@ -280,7 +280,7 @@ def find_utc_offset(readings: Readings) -> tuple[Finding, ...]:
     apart_s = float(np.median(own_time_ns[known] - stamps_ns[known])) / 1e9
     if abs(apart_s) <= read_threshold("utc-differs-from-header", "max_offset_s"):
         return ()
-    remedies = suggest("header", {"read.time": {"gnss": "header"}})
+    remedies = suggest("header", {"read.time_source": {"gnss": "header"}})
     return (make_finding("utc-differs-from-header", GNSS, offset_s=apart_s, remedies=remedies),)
 
 

@@ -51,7 +51,7 @@ def find_robot(topics: Iterable[Topic], name: str | None, robots: Mapping[str, R
 
 
 def _is_called(robot: Robot, topic: Topic) -> bool:
-    words = "|".join(map(re.escape, robot.called))
+    words = "|".join(map(re.escape, robot.topic_words))
     return bool(words) and re.search(rf"(?<![a-z])({words})(?![a-z])", topic.name.lower()) is not None
 
 

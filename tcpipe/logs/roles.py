@@ -132,7 +132,7 @@ def assign_roles(
     known: Profiles,
     namespace: str | None = None,
     mapped: Collection[str] = (),
-    pose_from: Collection[str] = (),
+    pose_sources: Collection[str] = (),
 ) -> RoleAssignment:
     """Return which topic plays which role, and why.
 
@@ -146,7 +146,7 @@ def assign_roles(
     known : robots, and message types that carry power.
     namespace : recipe key ``read.namespace``; topics elsewhere play no role unless they are chosen by name.
     mapped : roles whose fields the recipe maps (``read.fields``): a chosen topic may be of any type.
-    pose_from : recipe key ``read.pose_from``.
+    pose_sources : recipe key ``read.pose_sources``.
 
     Raises
     ------
@@ -169,7 +169,7 @@ def assign_roles(
     free = [topic for topic in listed.values() if topic.name not in taken and _is_usable(decided, topic, ignored)]
     settled = dict.fromkeys(wanted, "the recipe chooses what plays {role}")
     if "pose" in decided.roles:
-        _let_stand_in(decided, settled, pose_from)
+        _let_stand_in(decided, settled, pose_sources)
     found = {
         role: candidates
         for role, candidates in _iterate_candidates(decided, free, settled)
@@ -212,10 +212,10 @@ def _is_in(namespace: str | None, topic: Topic) -> bool:
     return below or (topic.type_name in TRANSFORMS and topic.name.count("/") == 1)
 
 
-def _let_stand_in(decided: _Decisions, settled: dict[str, str], pose_from: Collection[str]) -> None:
+def _let_stand_in(decided: _Decisions, settled: dict[str, str], pose_sources: Collection[str]) -> None:
     """Keep what the pose stands in for, and what it was made from, out of what is fused."""
     pose = decided.roles["pose"].topics[0]
-    for role in ("gnss", *pose_from):
+    for role in ("gnss", *pose_sources):
         if role in decided.roles:
             decided.problems.append(
                 f"recipe read.topics names {decided.roles[role].topics[0]} as {role} and {pose} as pose: the pose stands in for it; "

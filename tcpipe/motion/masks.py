@@ -23,10 +23,10 @@ from tcpipe.motion.row_sections import (
 )
 
 
-def find_stuck(rows: MotionRows, *, standing_velocity_mps: float, wheel_velocity_above_mps: float) -> Mask:
+def find_stuck(rows: MotionRows, *, stationary_velocity_mps: float, wheel_velocity_above_mps: float) -> Mask:
     """Return rows where the wheels turn but the ground speed is that of standing; never where the wheels are unknown."""
     turning_wheels = np.abs(np.nan_to_num(rows.wheel_velocity_mps)) > wheel_velocity_above_mps
-    return turning_wheels & (np.abs(rows.velocity_mps) < standing_velocity_mps)
+    return turning_wheels & (np.abs(rows.velocity_mps) < stationary_velocity_mps)
 
 
 def find_stationary(rows: MotionRows, *, below_velocity_mps: float, below_yaw_rate_radps: float) -> Mask:
@@ -51,9 +51,9 @@ def find_turning_in_place(
     return drop_short_runs(spot, rows.piece, min_rows=rows.count(min_s)) | (speed < min_radius_m * turn)
 
 
-def find_reversing(rows: MotionRows, *, standing_velocity_mps: float) -> Mask:
+def find_reversing(rows: MotionRows, *, stationary_velocity_mps: float) -> Mask:
     """Return rows driven backwards faster than standing."""
-    return rows.velocity_mps < -standing_velocity_mps
+    return rows.velocity_mps < -stationary_velocity_mps
 
 
 def estimate_forward_acceleration_mps2(rows: MotionRows, *, window_s: float) -> Floats:

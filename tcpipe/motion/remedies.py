@@ -16,7 +16,7 @@ _WORTH_M = 0.05
 
 
 def make_loss_code(reason: str) -> str:
-    """Return the code of the finding on metres that were lost for a reason, as ``below_limit``."""
+    """Return the code of the finding on metres that were lost for a reason, as ``below_full_speed``."""
     return f"lost-{reason.replace('_', '-')}"
 
 
@@ -49,9 +49,9 @@ class StoreLoss:
 def find_largest_losses(ledgers_m: Iterable[Mapping[str, float]]) -> tuple[StoreLoss, ...]:
     """Return the ten largest losses of runs, by their ledgers [m], the largest first."""
     metres, of_runs = Counter[str](), Counter[str]()
-    for ledger_m in ledgers_m:
-        metres.update(ledger_m)
-        of_runs.update(reason for reason, lost_m in ledger_m.items() if lost_m >= _WORTH_M)
+    for distance_by_reason_m in ledgers_m:
+        metres.update(distance_by_reason_m)
+        of_runs.update(reason for reason, lost_m in distance_by_reason_m.items() if lost_m >= _WORTH_M)
     total = sum(metres.values())
     lost = [(reason, lost_m) for reason, lost_m in metres.most_common() if reason != KEPT and of_runs[reason]]
     return tuple(StoreLoss(reason, lost_m, lost_m / total, of_runs[reason]) for reason, lost_m in lost[:_MOST_LOSSES])

@@ -221,7 +221,7 @@ def _map_causes(a: Mapping[str, MapSource], b: Mapping[str, MapSource]) -> Itera
 
 
 def _map_changes(a: MapSource, b: MapSource) -> Iterator[str]:
-    for key in ("crs", "pitch_m", "rows", "cols", "sources"):
+    for key in ("crs", "pixel_size_m", "rows", "cols", "sources"):
         if getattr(a, key) != getattr(b, key):
             yield f"{key} {_format_value(getattr(a, key))} → {_format_value(getattr(b, key))}"
     ours, theirs = ({} if entry.inputs is None else entry.inputs.files for entry in (a, b))

@@ -72,7 +72,7 @@ class MessageRange:
 
 
 @dataclass(frozen=True, slots=True)
-class NearbyGate:
+class NearbyMask:
     """A stretch of dropped track near a segment: why, and how far from its start or end."""
 
     why: tuple[str, ...]
@@ -126,8 +126,8 @@ class History:
     """The log that the run was read from; None where run.json is gone."""
     messages: Mapping[str, MessageRange]
     """By role."""
-    gates: tuple[NearbyGate, ...]
-    refused: tuple[NearbyRefusal, ...]
+    masks: tuple[NearbyMask, ...]
+    rejected: tuple[NearbyRefusal, ...]
     map: SampleMap
     recipe_differs_in: Mapping[str, Setting]
     """The recipe's keys that are not at their default."""
@@ -203,8 +203,8 @@ def _read_history(
         run=convert_record(run.manifest, Ingestion),
         source=known.source if known else None,
         messages={} if streams is None else dict(_find_messages(streams, *window)),
-        gates=tuple(_iterate_gates(run, *window)),
-        refused=tuple(_iterate_rejections(run, *window)),
+        masks=tuple(_iterate_masks(run, *window)),
+        rejected=tuple(_iterate_rejections(run, *window)),
         map=_map(source, sample, card.recipe),
         recipe_differs_in=_find_changed_keys(card.recipe),
         versions=Versions(card.tcpipe_version, __version__, card.data_model_version),
@@ -277,7 +277,7 @@ def _find_messages(streams: Streams, start_ns: int, end_ns: int) -> Iterator[tup
         )
 
 
-def _iterate_gates(run: RunDirectory, start_ns: int, end_ns: int) -> Iterator[NearbyGate]:
+def _iterate_masks(run: RunDirectory, start_ns: int, end_ns: int) -> Iterator[NearbyMask]:
     table = run.track().table
     stamps, bits = to_integers(table, "stamp_ns"), to_integers(table, "dropped_by")
     near = slice(*np.searchsorted(stamps, [start_ns - _NEARBY_NS, end_ns + _NEARBY_NS]))
@@ -287,7 +287,7 @@ def _iterate_gates(run: RunDirectory, start_ns: int, end_ns: int) -> Iterator[Ne
             names = flag_names(int(bits[part[0]]), DropReason)
             before = stamps[part[0]] < start_ns
             offset_ns = start_ns - stamps[part[-1]] if before else stamps[part[0]] - end_ns
-            yield NearbyGate(names, "before" if before else "after", float(offset_ns) / 1e9, len(part))
+            yield NearbyMask(names, "before" if before else "after", float(offset_ns) / 1e9, len(part))
 
 
 def _iterate_rejections(run: RunDirectory, start_ns: int, end_ns: int) -> Iterator[NearbyRefusal]:
@@ -327,7 +327,7 @@ def _sample_again(
 ) -> tuple[Mapping[str, Value], Patches] | str:
     """Return the segment and its patch as they come out now, or why they do not.
 
-    From the streams where the store has them: fused, gated, cut and labelled anew; else from the stored segments.
+    From the streams where the store has them: fused, masked, cut and labelled anew; else from the stored segments.
     """
     if streams is None:
         segments = run.segments()
@@ -427,10 +427,10 @@ def _iterate_lines(sample_id: str, facts: History, differences: Sequence[str]) -
         count = found.last - found.first + 1
         which = f"{found.first} to {found.last} ({count})" if count else "none"
         yield f"messages {role}: {found.topic}, {which} of {found.of} as read, by {found.time} time"
-    for gate in facts.gates:
-        yield f"gate     {gate.apart_s:.2f} s {gate.where}: {', '.join(gate.why)}, {gate.rows} rows"
-    for refused in facts.refused:
-        yield f"refused  {refused.count} of {refused.role} ({refused.reason}) within {_NEARBY_NS / 1e9:g} s"
+    for mask in facts.masks:
+        yield f"masked   {mask.apart_s:.2f} s {mask.where}: {', '.join(mask.why)}, {mask.rows} rows"
+    for rejected in facts.rejected:
+        yield f"rejected {rejected.count} of {rejected.role} ({rejected.reason}) within {_NEARBY_NS / 1e9:g} s"
     tiles = ", ".join(f"({col}, {row})" for col, row in ground.tiles_col_row)
     made_of = ", ".join(f"{layer} {name}" for layer, name in sorted(ground.sources.items()))
     yield f"map      {ground.name} in {ground.crs} from {made_of}; tiles (column, row) {tiles}"

@@ -51,7 +51,7 @@ class IndexEntry:
     rows: int
     made_from: ExportOrigin
     damage: tuple[str, ...]
-    remarks: tuple[str, ...]
+    notes: tuple[str, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,7 +80,7 @@ class Exported:
     status: Literal["done", "unchanged"]
     topics: tuple[ExportedTopic, ...]
     damage: tuple[str, ...]
-    remarks: tuple[str, ...]
+    notes: tuple[str, ...]
     exit_code: int
     """3 where the log had lost something."""
 
@@ -126,9 +126,9 @@ def export(
         rows = _write(log, {name: paths[name] for name in wanted}, threads)
         if wanted and not any(count is not None for count in rows.values()):
             raise LogError(f"{shown}: nothing to export: no topic can be read", *map(str, log.damage))
-        damage, remarks = tuple(str(damage) for damage in log.damage if damage.is_loss), tuple(log.remarks)
+        damage, notes = tuple(str(damage) for damage in log.damage if damage.is_loss), tuple(log.notes)
         if not wanted:
-            return Exported(shown, out, "done", (), damage, remarks, 3 if damage else 0)
+            return Exported(shown, out, "done", (), damage, notes, 3 if damage else 0)
         entries = {
             name: IndexEntry(
                 file=None if count is None else paths[name].name,
@@ -137,7 +137,7 @@ def export(
                 rows=count or 0,
                 made_from=made_from,
                 damage=damage,
-                remarks=remarks,
+                notes=notes,
             )
             for name, count in rows.items()
         }
@@ -222,8 +222,8 @@ def _make_exported(
     found = {name: entries[name] for name in wanted}
     files = tuple(ExportedTopic(name, of.type, out / of.file, of.rows) for name, of in found.items() if of.file)
     damage = dict.fromkeys(line for of in found.values() for line in of.damage)
-    remarks = dict.fromkeys(line for of in found.values() for line in of.remarks)
-    return Exported(log, out, status, files, tuple(damage), tuple(remarks), 3 if damage else 0)
+    notes = dict.fromkeys(line for of in found.values() for line in of.notes)
+    return Exported(log, out, status, files, tuple(damage), tuple(notes), 3 if damage else 0)
 
 
 def _write(log: Log, paths: Mapping[str, Path], threads: int) -> dict[str, int | None]:

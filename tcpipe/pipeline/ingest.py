@@ -66,7 +66,7 @@ class IngestSummary:
     @property
     def exit_code(self) -> int:
         """0 nothing is wrong, or nothing that is news; 1 all failed; 3 some failed, are damaged or empty."""
-        if not any(result.is_news for result in self.results):
+        if not any(result.is_new_problem for result in self.results):
             return 0
         return 1 if all(result.status == "failed" for result in self.results) else 3
 
@@ -196,7 +196,7 @@ def _iterate_finished(log: LogWriter, found: FoundLogs, steps: Sequence[Step]) -
                     causes=step.failure.findings,
                     sha256=source.sha256,
                     known=True,
-                    acknowledged=step.standing == "quarantined",
+                    acknowledged=step.state == "quarantined",
                 ),
             )
         elif made is not None:

@@ -1,4 +1,4 @@
-"""One log becomes a run of the store: read, fused, gated, cut and labelled, each file whole or not at all."""
+"""One log becomes a run of the store: read, fused, masked, cut and labelled, each file whole or not at all."""
 
 from __future__ import annotations
 
@@ -134,10 +134,10 @@ def _open_log(task: IngestTask, stack: ExitStack) -> AnyLog:
 
 
 def _fuse_and_label(store: Store, run_id: str, streams: Streams, known: RunJson, task: IngestTask) -> Manifest:
-    track, gated, labelled = run_stages(streams, task.recipe.ingest, run_id=run_id)
+    track, masked, labelled = run_stages(streams, task.recipe.ingest, run_id=run_id)
     manifest = make_manifest(task, known, streams, track, labelled)
     settled = (lambda _: False) if task.force else task.is_made_by
-    return store.write_run(manifest, track=track, gated=gated, labelled=labelled, settled=settled)
+    return store.write_run(manifest, track=track, masked=masked, labelled=labelled, settled=settled)
 
 
 def find_twin(known: RunJson | KnownLog | None, source: LogSource) -> str | None:
@@ -163,7 +163,7 @@ def _read(
         if cached is not None:
             known = make_run_json(task, log, cached, sha256)
             return cached, replace(
-                known, damage=before.damage, remarks=before.remarks, streams=before.streams, streams_key=key
+                known, damage=before.damage, notes=before.notes, streams=before.streams, streams_key=key
             )
     streams = read_run(
         log, find_read_config(task.recipe, log.topics), robot=task.robot, known=load_profiles(task.recipe)
@@ -172,11 +172,11 @@ def _read(
         raise LogError(f"{task.source.name}: changed while it was read")
     damage = tuple(str(damage) for damage in log.damage if damage.is_loss)
     known = make_run_json(task, log, streams, sha256)
-    return streams, replace(known, damage=damage, remarks=tuple(log.remarks), streams_key=key)
+    return streams, replace(known, damage=damage, notes=tuple(log.notes), streams_key=key)
 
 
 def make_run_json(task: IngestTask, log: AnyLog, streams: Streams, sha256: str) -> RunJson:
-    """Return what is known of a log that was read; its damage, remarks and tags are to be added."""
+    """Return what is known of a log that was read; its damage, notes and tags are to be added."""
     by_index = sha256 == log.outline or (log.is_known_by_outline and sha256 == log.sha256())
     return RunJson(
         source=LogOrigin(task.source.origins, sha256, log.size_bytes, "index" if by_index else "log"),
@@ -208,7 +208,7 @@ def make_manifest(
         robot=streams.robot,
         tags=known.tags,
         counts=Counts(count, track.table.num_rows, track.rejections.num_rows, messages),
-        ledger_m=labelled.ledger_m,
+        distance_by_reason_m=labelled.distance_by_reason_m,
         verdict=judge(info.report.findings),
         damage=known.damage,
         info=info,

@@ -96,7 +96,7 @@ class IngestResult:
         return self.run.findings if self.run else self.causes
 
     @property
-    def is_news(self) -> bool:
+    def is_new_problem(self) -> bool:
         """Whether something is wrong that nobody was told before, or acknowledged."""
         is_wrong = self.status == "failed" or bool(select_problems(self.findings))
         return is_wrong and not self.known and not self.acknowledged
@@ -107,7 +107,7 @@ class LogLine(IngestResult):
     """What became of one log, as ``ingest --json`` says it when the log ends."""
 
     kind: Literal["log"] = "log"
-    is_news: bool = False
+    is_new_problem: bool = False
 
 
 def make_result(source: LogSource, status: Status, made: RunFacts, sha256: str, *, same_as: str | None) -> IngestResult:

@@ -60,7 +60,7 @@ class InspectedRun:
     source: LogOrigin | None
     """None where run.json is gone."""
     tags: Mapping[str, str]
-    remarks: tuple[str, ...]
+    notes: tuple[str, ...]
     recipes: tuple[InspectedIngestion, ...]
 
 
@@ -213,7 +213,7 @@ def _run(path: Path | str, store: Store, runs: list[RunDirectory]) -> InspectedR
         run_id=run_id,
         source=known.source if known else None,
         tags=known.tags if known else {},
-        remarks=known.remarks if known else (),
+        notes=known.notes if known else (),
         recipes=tuple(
             convert_record(run.manifest, InspectedIngestion, findings=run.manifest.info.report.findings) for run in runs
         ),

@@ -105,7 +105,7 @@ class InspectedLog:
     """What is to be decided before it can be ingested, or why it cannot be read."""
     findings: tuple[Finding, ...] | None = field(default=None, metadata=ABSENT)
     damage: tuple[str, ...] | None = field(default=None, metadata=ABSENT)
-    remarks: tuple[str, ...] | None = field(default=None, metadata=ABSENT)
+    notes: tuple[str, ...] | None = field(default=None, metadata=ABSENT)
 
 
 def inspect_log(log: Log | TableLog, recipe: Recipe, robot: str | None, *, full: bool) -> InspectedLog:
@@ -148,7 +148,7 @@ def inspect_log(log: Log | TableLog, recipe: Recipe, robot: str | None, *, full:
         problems=tuple(cast.problems),
         findings=tuple(sort_findings(findings)),
         damage=damage,
-        remarks=tuple(log.remarks),
+        notes=tuple(log.notes),
     )
 
 

@@ -26,11 +26,13 @@ from tcpipe.formats.maps.map_files import open_map
 from tcpipe.formats.numbered_documents import read_sealed_at, split_number
 from tcpipe.formats.object_storage import is_url
 from tcpipe.formats.place import Place
+from tcpipe.formats.recipe_toml import rename_earlier_keys
 from tcpipe.formats.run_documents import Manifest, RunJson, StoreDocument
 from tcpipe.formats.store_document import MARK, is_outdated, read_layout
 from tcpipe.pipeline.log_writer import is_committed, open_log
 from tcpipe.recipe import SplitConfig
 from tcpipe.store import Store
+from tcpipe.tables.earlier_names import EARLIER_DOCUMENT_KEYS, rename_keys
 from tcpipe.tables.findings import Finding, Subject, SubjectKind, make_finding
 from tcpipe.tables.levels import DATA_MODEL_VERSION, EARLIER_VERSIONS
 from tcpipe.tables.verdicts import judge
@@ -41,6 +43,8 @@ Document = Mapping[str, Any]
 
 _KNOWN_VERSIONS = (*EARLIER_VERSIONS, DATA_MODEL_VERSION)
 _RECORDS, _INDEX = "records/", "index/"
+_WHOLLY_RENAMED = ("distance_by_reason_m", "flagged_samples", "removal", "physics")
+"""Parts of cards and manifests that no names of users are keys of."""
 _TOGETHER = 500
 """So many runs are one commit."""
 
@@ -184,7 +188,8 @@ def _bring_run(found: Document) -> Document:
     """Return what is known of a log, with ``findings`` as ``report``."""
     if "findings" not in found:
         return found
-    return {**_remove_keys(found, "findings"), "report": _convert_findings(found["findings"], "run", "")}
+    report = _convert_findings(rename_keys(found["findings"]), "run", "")
+    return {**_rename_top_keys(_remove_keys(found, "findings")), "report": report}
 
 
 def _bring_document(found: Document, where: str) -> Document:
@@ -196,8 +201,11 @@ def _bring_document(found: Document, where: str) -> Document:
         known = ", ".join(_KNOWN_VERSIONS)
         raise StoreError(f"{where}: of data model {version}, this version knows {known}; left as it is")
     document = {**_remove_keys(found, "warnings", "problems", "findings"), "data_model_version": DATA_MODEL_VERSION}
+    document = _rename_top_keys(document) | {"recipe": rename_earlier_keys(found["recipe"], {})}
+    document |= {name: rename_keys(document[name]) for name in _WHOLLY_RENAMED if name in document}
     if "info" in found:
-        report = _convert_findings({**found["info"]["findings"], "warnings": found["warnings"]}, "run", found["run_id"])
+        earlier = rename_keys(found["info"]["findings"])
+        report = _convert_findings({**earlier, "warnings": found["warnings"]}, "run", found["run_id"])
         findings = report["findings"]
         document |= {"info": {**_remove_keys(found["info"], "findings"), "report": report}}
         document |= {"counts": _bring_counts(found["counts"])}
@@ -208,7 +216,7 @@ def _bring_document(found: Document, where: str) -> Document:
             "findings": findings,
             "runs": [_convert_findings(run, "run", run["run_id"]) for run in found["runs"]],
         }
-        document |= {"maps": [_convert_findings(of, "map", of["name"]) for of in found["maps"]]}
+        document |= {"maps": [_convert_findings(_rename_top_keys(of), "map", of["name"]) for of in found["maps"]]}
         rules = {of.name for of in fields(SplitConfig)} - {"buffer_m"}  # the recipe has them
         document |= {"split": _remove_keys(found["split"], *rules)}
     return {**document, "verdict": to_plain(judge(parse_typed(findings, tuple[Finding, ...], where)))}
@@ -219,6 +227,10 @@ def _bring_counts(counts: Mapping[str, int]) -> dict[str, Any]:
     ending = "_messages"
     messages = {name.removesuffix(ending): of for name, of in counts.items() if name.endswith(ending)}
     return {**_remove_keys(counts, *(f"{role}{ending}" for role in messages)), "messages": messages}
+
+
+def _rename_top_keys(document: Document) -> dict[str, Any]:
+    return {EARLIER_DOCUMENT_KEYS.get(name, name): of for name, of in document.items()}
 
 
 def _remove_keys(document: Document, *names: str) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""A run as a log of its own, to lie beside the recording in a viewer: track, segments, gates and refusals on the recorder's clock.
+"""A run as a log of its own, to lie beside the recording in a viewer: track, segments, masked rows and rejections on the recorder's clock.
 
 ROS 2 messages in MCAP: Foxglove, Rerun and PlotJuggler all read them (ADR-2). The fields of the messages are the tables' columns.
 """
@@ -112,7 +112,7 @@ def _iterate_streams(store: Store, run: RunDirectory) -> Iterator[MessageStream]
     track, segments, refused = run.track(), run.segments().drop_columns([GEOMETRY]), run.rejections()
     rows = _add_bit_names(track.table, "dropped_by", DropReason, "reasons", "kept")
     cut = _add_bit_names(segments, "quality", Quality, "quality_names", "clean")
-    times = clock(_read_column(rows, "stamp_ns"), _read_column(rows, "epoch"))
+    times = clock(_read_column(rows, "stamp_ns"), _read_column(rows, "clock_epoch"))
     if track.info.datum is not None:
         yield _make_fixes(rows, times)
         if len(times):
@@ -126,7 +126,7 @@ def _iterate_streams(store: Store, run: RunDirectory) -> Iterator[MessageStream]
     yield from _iterate_messages("track", "stamp_ns", rows, times)
     yield from _iterate_masks(to_texts(rows.column("reasons")), times)
     yield from _iterate_messages(
-        "segment", "start_ns", cut, clock(_read_column(cut, "start_ns"), _read_column(cut, "epoch"))
+        "segment", "start_ns", cut, clock(_read_column(cut, "start_ns"), _read_column(cut, "clock_epoch"))
     )
     yield from _iterate_messages("refused", "stamp_ns", refused, clock(_read_column(refused, "stamp_ns"), None))
 
@@ -135,7 +135,7 @@ class _Clock:
     """When the recorder received what was measured at a time, by the messages of one role; in between the delay is interpolated."""
 
     def __init__(self, rows: pa.Table) -> None:
-        self._epoch, stamps = _read_column(rows, "epoch"), _read_column(rows, "stamp_ns")
+        self._epoch, stamps = _read_column(rows, "clock_epoch"), _read_column(rows, "stamp_ns")
         self._stamp_ns, self._behind_ns = stamps, (_read_column(rows, "log_time_ns") - stamps).astype(np.float64)
 
     def __call__(self, stamp_ns: Ints, epoch: Ints | None) -> Ints:
@@ -164,7 +164,7 @@ def _find_recorder_clock(store: Store, run: RunDirectory) -> _Clock:
     known = store.run_json(run.run_id)
     if known is None or known.streams_key != run.streams_key or not known.streams:
         raise StoreError(f"{run.where}: the streams it was made from are gone or were read anew; ingest the log again")
-    columns = ["stamp_ns", "log_time_ns", "epoch"]
+    columns = ["stamp_ns", "log_time_ns", "clock_epoch"]
     tables = (read_table(path, columns) for path in store.stream_files(run.run_id, known).values())
     return _Clock(max(tables, key=lambda table: table.num_rows))
 
@@ -210,7 +210,7 @@ def _iterate_masks(reasons: NDArray[np.str_], times: Ints) -> Iterator[MessageSt
     changes = np.flatnonzero(np.append(True, reasons[1:] != reasons[:-1])[: len(reasons)])
     for reason in np.unique(reasons):
         at = times[changes[reasons[changes] == reason]]
-        yield MessageStream(f"{OVERLAY}gate", "std_msgs/msg/String", at, {}, {"data": str(reason)})
+        yield MessageStream(f"{OVERLAY}mask", "std_msgs/msg/String", at, {}, {"data": str(reason)})
 
 
 def _iterate_messages(name: str, stamp: str, table: pa.Table, times: Ints) -> Iterator[MessageStream]:
@@ -254,11 +254,11 @@ _ENDS = ("start_lon_deg", "start_lat_deg", "end_lon_deg", "end_lat_deg")
 
 
 def _iterate_dropped_lines(rows: pa.Table) -> Iterator[dict[str, Any]]:
-    """Yield a GeoJSON line for each stretch of one gate, and why."""
+    """Yield a GeoJSON line for each stretch of masked rows with their reason."""
     reasons, bits, epoch = (
         to_texts(rows.column("reasons")),
         _read_column(rows, "dropped_by"),
-        _read_column(rows, "epoch"),
+        _read_column(rows, "clock_epoch"),
     )
     lonlat = np.stack([_read_column(rows, "lon_deg"), _read_column(rows, "lat_deg")], axis=-1)
     breaks = np.flatnonzero((np.diff(bits.astype(np.int64)) != 0) | (np.diff(epoch) != 0)) + 1
@@ -268,5 +268,5 @@ def _iterate_dropped_lines(rows: pa.Table) -> Iterator[dict[str, Any]]:
             yield _make_line(
                 lonlat[vertices].tolist(),
                 _DROPPED_COLOUR,
-                {"name": str(reasons[part[0]]), "gate": str(reasons[part[0]])},
+                {"name": str(reasons[part[0]]), "mask": str(reasons[part[0]])},
             )

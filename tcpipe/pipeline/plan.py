@@ -16,14 +16,14 @@ from tcpipe.pipeline.ingest_task import IngestTask, check_age
 from tcpipe.pipeline.problems import find_problems, is_acknowledged, make_failure
 from tcpipe.tables.findings import Finding
 
-Standing: TypeAlias = Literal[
+LogState: TypeAlias = Literal[
     "done", "partial", "empty", "pending", "outdated", "growing", "failed_permanent", "failed_transient", "quarantined", "superseded"
 ]  # fmt: skip
 
-STANDINGS: tuple[Standing, ...] = get_args(Standing)
-TO_DO: tuple[Standing, ...] = ("pending", "outdated", "failed_transient")
+LOG_STATES: tuple[LogState, ...] = get_args(LogState)
+TO_DO: tuple[LogState, ...] = ("pending", "outdated", "failed_transient")
 """What the next ingest works on."""
-TROUBLE: tuple[Standing, ...] = ("failed_permanent", "failed_transient", "partial", "empty")
+TROUBLE: tuple[LogState, ...] = ("failed_permanent", "failed_transient", "partial", "empty")
 """What somebody should look at."""
 
 
@@ -32,7 +32,7 @@ class Step:
     """What a log needs."""
 
     task: IngestTask
-    standing: Standing
+    state: LogState
     cause: str = ""
     made: RunFacts | None = None
     """The ingestion of the log as it would be made now, where there is one."""
@@ -46,7 +46,7 @@ class Step:
     @property
     def is_todo(self) -> bool:
         """Whether the next ingest works on it."""
-        return self.standing in TO_DO
+        return self.state in TO_DO
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,8 +95,8 @@ def _decide(task: IngestTask, known: _Known, now_ns: int) -> Step:
     if failed is not None:
         acknowledged = is_acknowledged([make_failure(failed.content, failed.log)], known.state)
         cause = _remove_name("".join(failed.problems[:1]), task)
-        standing: Standing = "quarantined" if acknowledged else "failed_permanent"
-        return Step(task, standing, cause, failure=failed, findings=failed.findings)
+        state: LogState = "quarantined" if acknowledged else "failed_permanent"
+        return Step(task, state, cause, failure=failed, findings=failed.findings)
     if check_age(task, now_ns):
         return Step(task, "growing", has_failed=_describe_content(task) in known.failures)
     if source.name in known.passing:

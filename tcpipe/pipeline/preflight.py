@@ -76,12 +76,12 @@ class RoleTopic:
     topic: str
     rate_hz: float | None
     wanted_hz: float | None
-    there: float
+    present_fraction: float
 
 
 @dataclass(frozen=True, slots=True)
 class ExpectedYield:
-    """What the excerpt gives; rates are an hour's, of recording and of driving (standing left out)."""
+    """What the excerpt gives; rates are an hour's, of recording and of driving (without stationary time)."""
 
     span_s: float
     driven_m: float
@@ -90,17 +90,17 @@ class ExpectedYield:
     segments_per_hour_std: float | None
     """By how windows of ten seconds differ; None of a log of fewer than three."""
     segments_per_driven_hour: float
-    ledger_m: Mapping[str, float]
+    distance_by_reason_m: Mapping[str, float]
     relative_std_median: Mapping[str, float | None]
     """One sigma of duration, velocity, power, energy, as a share [1]; None without segments or power."""
     energy_budget: EnergyBudget | None
 
     def lines(self) -> Iterator[str]:
         """Yield it in words."""
-        total = sum(self.ledger_m.values())
+        total = sum(self.distance_by_reason_m.values())
         shares = (
             (metres / total, name)
-            for name, metres in self.ledger_m.items()
+            for name, metres in self.distance_by_reason_m.items()
             if total and metres >= _WORTH_SAYING * total
         )
         where = ", ".join(f"{share:.0%} {name.replace('_', ' ')}" for share, name in sorted(shares, reverse=True))
@@ -127,7 +127,7 @@ class Preflight:
 
     log: str
     robot: str | None
-    promise: ExpectedYield | None
+    expected_yield: ExpectedYield | None
     """None where ingesting it would fail."""
     topics: tuple[RoleTopic, ...]
     problems: tuple[str, ...]
@@ -146,10 +146,13 @@ class Preflight:
 
     def __str__(self) -> str:
         """Return it as lines."""
-        said = [f"{self.log}: robot {self.robot or 'unknown'}", *(self.promise.lines() if self.promise else ())]
+        said = [
+            f"{self.log}: robot {self.robot or 'unknown'}",
+            *(self.expected_yield.lines() if self.expected_yield else ()),
+        ]
         said += [f"topic     {_rate(of)}" for of in self.topics]
         said += [f"fails     {line}" for line in self.problems]
-        said += [f"verdict   {format_verdict(self.verdict)}"] if self.promise else []
+        said += [f"verdict   {format_verdict(self.verdict)}"] if self.expected_yield else []
         said += format_findings(self.findings, more=f"tcpipe preflight {self.log} --json")
         said += [f"loss      {format_loss(loss)}" for loss in self.losses]
         said += [f"record    {self.record}"] if self.record else []
@@ -209,43 +212,43 @@ def _summarize(
     problems: tuple[str, ...],
 ) -> Preflight:
     report = labelled.info.report if labelled else NOTHING_FOUND
-    promise = _estimate_yield(labelled) if labelled else None
+    expected_yield = _estimate_yield(labelled) if labelled else None
     topics = tuple(_iterate_topics(report.facts, seen.duration_s or 0.0))
-    findings = [*missing, *find_slow(topics, promise, seen.duration_s or 0.0)]
+    findings = [*missing, *find_slow(topics, expected_yield, seen.duration_s or 0.0)]
     for more in (report.findings, seen.findings or ()):
         made = {(of.code, of.subject) for of in findings}
         findings += [of for of in more if (of.code, of.subject) not in made]
-    ready = promise is not None and promise.segments and all(of.severity == "note" for of in findings)
+    ready = expected_yield is not None and expected_yield.segments and all(of.severity == "note" for of in findings)
     return Preflight(
         log=seen.path,
         robot=seen.robot,
-        promise=promise,
+        expected_yield=expected_yield,
         topics=topics,
         problems=problems,
         findings=tuple(sort_findings(findings)),
         verdict=judge(findings),
-        losses=_find_largest_losses(promise),
+        losses=_find_largest_losses(expected_yield),
         record=record,
         large=large,
-        exit_code=0 if ready else 3 if promise else 1,
+        exit_code=0 if ready else 3 if expected_yield else 1,
     )
 
 
 def _estimate_yield(labelled: LabelledSegments) -> ExpectedYield:
-    facts, ledger_m = labelled.info.report.facts, labelled.ledger_m
+    facts, distance_by_reason_m = labelled.info.report.facts, labelled.distance_by_reason_m
     cut, label = facts.segment, facts.label
-    seconds = cut.ledger_s if cut else {}
+    seconds = cut.duration_by_reason_s if cut else {}
     span_s, count = math.fsum(seconds.values()), labelled.table.num_rows
     hourly = 3600.0 * count / span_s if span_s else 0.0
-    moving_s = span_s - seconds.get("standing", 0.0)
+    moving_s = span_s - seconds.get("stationary", 0.0)
     return ExpectedYield(
         span_s=span_s,
-        driven_m=math.fsum(ledger_m.values()),
+        driven_m=math.fsum(distance_by_reason_m.values()),
         segments=count,
         segments_per_hour=hourly,
         segments_per_hour_std=_compute_hourly_std(to_integers(labelled.table, "start_ns"), span_s),
         segments_per_driven_hour=3600.0 * count / moving_s if moving_s > 0.0 else 0.0,
-        ledger_m=ledger_m,
+        distance_by_reason_m=distance_by_reason_m,
         relative_std_median=label.relative_std_median if label and count else {},
         energy_budget=label.energy_budget if label else None,
     )
@@ -282,16 +285,16 @@ def find_missing(roles: Collection[str], read: ReadConfig) -> Iterator[Finding]:
             yield replace(found, severity="warning") if found.severity == "note" else found
 
 
-def find_slow(topics: Sequence[RoleTopic], promise: ExpectedYield | None, span_s: float) -> Iterator[Finding]:
+def find_slow(topics: Sequence[RoleTopic], expected_yield: ExpectedYield | None, span_s: float) -> Iterator[Finding]:
     """Yield what is too slow, too short or absent for a part of the time to record a day in this way."""
     for of in topics:
         subject, names = Subject("role", of.role), {"topic": of.topic}
         least_hz = read_threshold("rate-too-low", "min_rate_fraction") * (of.wanted_hz or 0.0)
         if of.rate_hz is not None and of.wanted_hz is not None and of.rate_hz < least_hz:
             yield make_finding("rate-too-low", subject, names=names, rate_hz=of.rate_hz, wanted_hz=of.wanted_hz)
-        if of.role != "command" and of.there < read_threshold("topic-incomplete", "min_present_fraction"):
-            yield make_finding("topic-incomplete", subject, names=names, present_fraction=of.there)
-    budget = promise.energy_budget if promise else None
+        if of.role != "command" and of.present_fraction < read_threshold("topic-incomplete", "min_present_fraction"):
+            yield make_finding("topic-incomplete", subject, names=names, present_fraction=of.present_fraction)
+    budget = expected_yield.energy_budget if expected_yield else None
     if budget is not None and _is_ruled_by_rate(budget):
         yield make_finding(
             "power-rate-dominates",
@@ -299,7 +302,7 @@ def find_slow(topics: Sequence[RoleTopic], promise: ExpectedYield | None, span_s
             total_fraction=budget.total,
             at_20_hz_fraction=budget.at_20_hz,
         )
-    if promise is not None and span_s < read_threshold("log-too-short", "min_span_s"):
+    if expected_yield is not None and span_s < read_threshold("log-too-short", "min_span_s"):
         yield make_finding("log-too-short", Subject("log", "log"), length_s=span_s)
 
 
@@ -309,8 +312,8 @@ def _is_ruled_by_rate(budget: EnergyBudget) -> bool:
     return budget.rate**2 > least_share * budget.total**2 and budget.at_20_hz < gain * budget.total
 
 
-def _find_largest_losses(promise: ExpectedYield | None) -> tuple[StoreLoss, ...]:
-    losses = find_largest_losses([promise.ledger_m] if promise else [])
+def _find_largest_losses(expected_yield: ExpectedYield | None) -> tuple[StoreLoss, ...]:
+    losses = find_largest_losses([expected_yield.distance_by_reason_m] if expected_yield else [])
     return tuple(loss for loss in losses if loss.share > _WORTH_SAYING)[:_MOST_LOSSES]
 
 

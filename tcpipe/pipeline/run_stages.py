@@ -5,12 +5,12 @@ from __future__ import annotations
 from tcpipe.formats.robot_files import load_profiles
 from tcpipe.progress import step
 from tcpipe.recipe import IngestSections
-from tcpipe.tables.levels import GatedTrack, LabelledSegments, Streams, Track
+from tcpipe.tables.levels import LabelledSegments, MaskedTrack, Streams, Track
 
 
 def run_stages(
     streams: Streams, sections: IngestSections, *, run_id: str
-) -> tuple[Track, GatedTrack, LabelledSegments]:
+) -> tuple[Track, MaskedTrack, LabelledSegments]:
     """Run fuse, gate, segment and label over the streams of one run.
 
     A stage gets its own section, and of the others nothing but the chord; no section that `recipe_id` is not the hash of is in reach.
@@ -24,13 +24,13 @@ def run_stages(
     step("fusing")
     track = fuse_run(streams, sections.fuse, run_id=run_id)
     step("cutting and labelling")
-    gated = mask_track(
+    masked = mask_track(
         track,
-        sections.gate,
+        sections.mask,
         max_velocity_mps=profile.max_velocity_mps,
         max_plausible_mps=profile.max_plausible_mps,
         chord_m=sections.segment.chord_m,
     )
-    segments = segment_track(gated, sections.segment)
-    labelled = label_segments(segments, gated, streams, sections.label, voltage_range_volt=profile.voltage_range_volt)
-    return track, gated, labelled
+    segments = segment_track(masked, sections.segment)
+    labelled = label_segments(segments, masked, streams, sections.label, voltage_range_volt=profile.voltage_range_volt)
+    return track, masked, labelled

@@ -23,7 +23,7 @@ from tcpipe.pipeline.begun_calls import BegunCall, is_below, list_begun_calls
 from tcpipe.pipeline.call_history import INGEST, Estimate, estimate, format_duration
 from tcpipe.pipeline.ingest_task import IngestTask
 from tcpipe.pipeline.log_sources import find_sources, make_definitions_key, recall_hash, select_shard
-from tcpipe.pipeline.plan import STANDINGS, TROUBLE, Standing, Step, plan
+from tcpipe.pipeline.plan import LOG_STATES, TROUBLE, LogState, Step, plan
 from tcpipe.pipeline.problems import find_incomplete_runs, make_missing, make_waiting
 from tcpipe.pipeline.store_verdict import find_changes, judge_runs
 from tcpipe.recipe import Recipe
@@ -34,7 +34,7 @@ from tcpipe.tables.verdicts import Verdict
 _MOST_NAMES = 3
 _MOST_CALLS = 7
 _TWO_NIGHTS_NS = 2 * 86_400 * 10**9
-_IN_WORDS: Mapping[Standing, str] = {
+_IN_WORDS: Mapping[LogState, str] = {
     "failed_permanent": "failed for what it holds",
     "failed_transient": "failed for now",
 }
@@ -44,7 +44,7 @@ _IN_WORDS: Mapping[Standing, str] = {
 class Group:
     """Logs that stand at one point for one reason."""
 
-    state: Standing
+    state: LogState
     cause: str
     logs: tuple[str, ...]
     size_bytes: int
@@ -63,7 +63,7 @@ class Status:
 
     store: str
     sources: tuple[str, ...]
-    counts: Mapping[Standing, int]
+    counts: Mapping[LogState, int]
     """Logs by state."""
     groups: tuple[Group, ...]
     """By state and cause."""
@@ -186,7 +186,7 @@ def find_status(
         verdict=judge_runs(current, find_changes(current)),
         runs=len(current),
         findings={of.code: len(of.of) for of in by_code if of.severity != "note"},
-        losses=find_largest_losses(run.ledger_m for run in current),
+        losses=find_largest_losses(run.distance_by_reason_m for run in current),
         exit_code=3 if trouble else 0,
     )
 
@@ -205,27 +205,27 @@ def _find_waiting(steps: Iterable[Step]) -> Iterator[Problem]:
     """
     before_ns = time.time_ns() - _TWO_NIGHTS_NS
     for step in steps:
-        if step.standing in ("pending", "growing") and not step.has_failed and step.task.source.arrival_ns < before_ns:
-            yield make_waiting(step.task.source, step.standing)
+        if step.state in ("pending", "growing") and not step.has_failed and step.task.source.arrival_ns < before_ns:
+            yield make_waiting(step.task.source, step.state)
 
 
 def _iterate_groups(steps: Iterable[Step]) -> Iterator[Group]:
-    """Yield logs of one standing with findings of the same codes on the same subjects; without findings, of the same cause."""
-    groups: dict[tuple[Standing, Hashable], list[Step]] = {}
+    """Yield logs of one state with findings of the same codes on the same subjects; without findings, of the same cause."""
+    groups: dict[tuple[LogState, Hashable], list[Step]] = {}
     for step in steps:
         alike = frozenset((of.code, None if of.subject.kind in ("log", "run") else of.subject) for of in step.findings)
-        groups.setdefault((step.standing, alike or step.cause), []).append(step)
-    for (standing, _), of in sorted(groups.items(), key=lambda item: (STANDINGS.index(item[0][0]), -len(item[1]))):
+        groups.setdefault((step.state, alike or step.cause), []).append(step)
+    for (state, _), of in sorted(groups.items(), key=lambda item: (LOG_STATES.index(item[0][0]), -len(item[1]))):
         causes = list(dict.fromkeys(step.cause for step in of))
         cause = causes[0] if len(causes) == 1 else f"{len(causes)} reasons, the first: {causes[0]}"
-        yield Group(standing, cause, tuple(step.task.source.name for step in of), sum(map(_sum_bytes, of)))
+        yield Group(state, cause, tuple(step.task.source.name for step in of), sum(map(_sum_bytes, of)))
 
 
 def _sum_bytes(step: Step) -> int:
     return sum(size for size, _ in step.task.source.files)
 
 
-def _format_words(state: Standing) -> str:
+def _format_words(state: LogState) -> str:
     return _IN_WORDS.get(state, state)
 
 

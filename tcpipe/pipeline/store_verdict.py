@@ -58,10 +58,10 @@ def _iterate_measures(run: RunFacts) -> Iterator[tuple[str, str, float]]:
         yield _USED, "%", _IN_PERCENT * run.kept_m / run.driven_m
     if run.energy_budget is not None:
         yield "noise floor of E", "%", _IN_PERCENT * run.energy_budget.total
-    if run.standing_watt is not None:
-        yield "standing power", PHYSICS_UNITS["standing"], run.standing_watt
+    if run.idle_watt is not None:
+        yield "idle power", PHYSICS_UNITS["idle"], run.idle_watt
     for term, (value, std) in run.physics.items():
-        if not term.startswith("standing") and abs(value) > read_threshold(_CHANGE, "min_scatter_ratio") * std:
+        if not term.startswith("idle") and abs(value) > read_threshold(_CHANGE, "min_scatter_ratio") * std:
             yield f"physics term {term}", PHYSICS_UNITS.get(term.partition(" ")[0], ""), value
 
 

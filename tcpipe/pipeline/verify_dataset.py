@@ -91,12 +91,14 @@ def _verify_samples(directory: Path, card: DatasetCard) -> Iterator[Finding]:
     yield from (f"{where}: {problem}" for problem in _find_wrong_joins(samples, card))
     for key, value in measure_samples(samples.select(CARD_COLUMNS), has_terrain="terrain" in card.layers).items():
         told = getattr(card, key)
-        if told != value and not (told is None and key == "doubtful"):  # before data model 1.2 nobody counted them
+        if told != value and not (
+            told is None and key == "flagged_samples"
+        ):  # before data model 1.2 nobody counted them
             yield f"{directory / CARD}: {key} is {to_plain(told)}, but the samples give {to_plain(value)}"
     yield from (f"{directory / CARD}: {problem}" for problem in _find_wrong_runs(samples, card))
     used_m = math.fsum(to_floats(samples, "arc_length_m")[samples.column("split").to_numpy() != "buffer"])
-    if not math.isclose(used_m, card.ledger_m[KEPT], rel_tol=1e-9, abs_tol=1e-6):
-        yield f"{directory / CARD}: the ledger keeps {card.ledger_m[KEPT]:.3f} m, the samples cover {used_m:.3f} m"
+    if not math.isclose(used_m, card.distance_by_reason_m[KEPT], rel_tol=1e-9, abs_tol=1e-6):
+        yield f"{directory / CARD}: the ledger keeps {card.distance_by_reason_m[KEPT]:.3f} m, the samples cover {used_m:.3f} m"
     if card.redaction is not None:
         yield from (f"{directory / CARD}: {problem}" for problem in find_leaks(card, samples))
     yield from _verify_patches(directory, card, samples)
@@ -135,10 +137,12 @@ def _find_wrong_runs(samples: pa.Table, card: DatasetCard) -> Iterator[str]:
             yield f"run {name} is of recipe {run.recipe_id}, the card's for robot {robot} is {wanted}"
         if not is_named_after(name, run.sha256):
             yield f"run {name} is of a log whose sha256 begins with {run.sha256[:8]}"
-    driven_m, ledger_m = [run.driven_m for run in card.runs], math.fsum(card.ledger_m.values())
+    driven_m, distance_by_reason_m = [run.driven_m for run in card.runs], math.fsum(card.distance_by_reason_m.values())
     known_m = [metres for metres in driven_m if metres is not None]
-    if len(known_m) == len(driven_m) and not math.isclose(math.fsum(known_m), ledger_m, rel_tol=1e-9, abs_tol=1e-6):
-        yield f"the ledger sums to {ledger_m:.3f} m, its runs drove {math.fsum(known_m):.3f} m"
+    if len(known_m) == len(driven_m) and not math.isclose(
+        math.fsum(known_m), distance_by_reason_m, rel_tol=1e-9, abs_tol=1e-6
+    ):
+        yield f"the ledger sums to {distance_by_reason_m:.3f} m, its runs drove {math.fsum(known_m):.3f} m"
     if pool_budgets(run.energy_budget for run in card.runs) != card.energy_budget:
         yield "its energy budget is not that of its runs"
 

@@ -47,11 +47,11 @@ from tcpipe.motion.remedies import KEPT
 from tcpipe.report.pictures import is_picture_of_map
 from tcpipe.store import Store
 from tcpipe.tables.columns import to_floats, to_integers
-from tcpipe.tables.levels import DATA_MODEL_VERSION, GATED_TRACK, LABELLED_SEGMENTS, READ_VERSIONS, REJECTIONS, STREAMS
+from tcpipe.tables.levels import DATA_MODEL_VERSION, LABELLED_SEGMENTS, MASKED_TRACK, READ_VERSIONS, REJECTIONS, STREAMS
 
 Finding = tuple[str, int] | str
 
-_TABLES = {"track": GATED_TRACK, "segments": LABELLED_SEGMENTS, "rejections": REJECTIONS}
+_TABLES = {"track": MASKED_TRACK, "segments": LABELLED_SEGMENTS, "rejections": REJECTIONS}
 _COUNTS = {"track": "track_rows", "segments": "segments", "rejections": "rejections"}
 _REPORT, _STREAMS = "report.html", "streams"
 _DIGEST = re.compile(r"[0-9a-f]{16}")
@@ -329,7 +329,10 @@ def _find_disagreements(run: RunDirectory, tables: Mapping[str, pa.Table]) -> It
         said = getattr(manifest.counts, count)
         if said not in (None, tables[name].num_rows):
             yield f"{count} is {said}, but {name}.parquet has {tables[name].num_rows} rows"
-    covered_m, kept_m = math.fsum(to_floats(tables["segments"], "arc_length_m")), manifest.ledger_m.get(KEPT, 0.0)
+    covered_m, kept_m = (
+        math.fsum(to_floats(tables["segments"], "arc_length_m")),
+        manifest.distance_by_reason_m.get(KEPT, 0.0),
+    )
     if not math.isclose(covered_m, kept_m, rel_tol=1e-9, abs_tol=1e-6):
         yield f"the ledger keeps {kept_m:.3f} m, the segments cover {covered_m:.3f} m"
     if manifest.run_id != run.run_id:

@@ -38,7 +38,7 @@ BARRED = NO_COST | Reason.OBSTACLE
 def make_grid(source: MapReader, step_m: float) -> MapGrid:
     """Return the grid of cells: from the map's north-west corner, as many as fit whole. `MapError`: the map is smaller than a cell."""
     grid = source.grid
-    cells = [int(size * grid.pitch_m / step_m + 1e-6) for size in (grid.rows, grid.cols)]
+    cells = [int(size * grid.pixel_size_m / step_m + 1e-6) for size in (grid.rows, grid.cols)]
     if min(cells) < 1:
         raise MapError(f"map {source.name}: is smaller than one cell of {step_m:g} m; choose a smaller --cell-size")
     return MapGrid(grid.crs, grid.x_min_m, grid.y_max_m, step_m, cells[0], cells[1])
@@ -69,9 +69,9 @@ class CostGrid:
         slowness = 1.0 / self.velocity_mps
         return np.asarray(self.power_watt * slowness if objective == "energy" else slowness)
 
-    def open_courses(self, *, allow_unseen: bool) -> NDArray[np.bool_]:
+    def open_courses(self, *, allow_extrapolation: bool) -> NDArray[np.bool_]:
         """Return where a course may be driven, shape (16, rows, cols): without obstacle, and on ground the model knows."""
-        forbidden = np.uint16(BARRED) if allow_unseen else np.uint16(0xFFFF)
+        forbidden = np.uint16(BARRED) if allow_extrapolation else np.uint16(0xFFFF)
         return np.asarray(self.reasons & forbidden == 0)
 
     def put(self, cells: Cells, found: SegmentPredictions) -> None:
@@ -111,9 +111,9 @@ def iterate_blocks(
     wanted : which cells, shape (rows, cols); None: all.
     """
     level = level_for(source, model.patch_m / model.patch_px)
-    side_m = level.tile_px * level.grid.pitch_m
+    side_m = level.tile_px * level.grid.pixel_size_m
     tile_of_row, tile_of_col = (
-        ((np.arange(count) + 0.5) * grid.pitch_m / side_m).astype(np.int64) for count in (grid.rows, grid.cols)
+        ((np.arange(count) + 0.5) * grid.pixel_size_m / side_m).astype(np.int64) for count in (grid.rows, grid.cols)
     )
     for first in range(0, int(tile_of_col[-1]) + 1, _STRIP_TILES):
         for i in np.unique(tile_of_row):

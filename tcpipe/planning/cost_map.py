@@ -108,7 +108,7 @@ class CostMapCard:
     origin_deg: tuple[float, float] | None = None
     """Longitude and latitude where the frame of the Nav2 maps begins; None where it is the CRS's own."""
     label_energy: str = "total"
-    """``total`` or ``above_standing``: which power and energy it is."""
+    """``total`` or ``net``: which power and energy it is."""
     kind: str = KIND
     version: str = VERSION
 
@@ -125,7 +125,7 @@ class CostMapResult:
     def __str__(self) -> str:
         """Return where it is and what it holds, as plain lines."""
         grid, cells = self.card.grid, self.card.cells
-        head = f"{self.path}: {grid.rows} x {grid.cols} cells of {grid.pitch_m:g} m, {COURSES} courses"
+        head = f"{self.path}: {grid.rows} x {grid.cols} cells of {grid.pixel_size_m:g} m, {COURSES} courses"
         if self.status == "unchanged":
             head += "; nothing to do: it is made from the same model, map and step"
         reasons = ", ".join(f"{name.replace('_', ' ')} {share:.1%}" for name, share in self.card.reason_share.items())
@@ -345,7 +345,7 @@ def _answer(task: _Task) -> list[SegmentPredictions] | TcpipeError:
     """Ask the model about the blocks of a task, on a worker."""
     try:
         model, source = task.inputs()
-        if make_cost_map_key(model, source, task.grid.pitch_m) != task.key:
+        if make_cost_map_key(model, source, task.grid.pixel_size_m) != task.key:
             raise UsageError(
                 f"a worker finds another map {source.name} or model {model.name} than the caller; wanted the same files under "
                 "the same names"
@@ -433,7 +433,7 @@ def _write(directory: Path, costs: CostGrid, origin_m: tuple[float, float]) -> d
     """Write all files but the card; return the scales of the Nav2 maps."""
     grid = costs.grid
     layout: dict[str, Any] = {"rows": grid.rows, "cols": grid.cols, "crs": grid.crs}
-    layout["affine"] = (grid.pitch_m, 0.0, grid.x_min_m, 0.0, -grid.pitch_m, grid.y_max_m)
+    layout["affine"] = (grid.pixel_size_m, 0.0, grid.x_min_m, 0.0, -grid.pixel_size_m, grid.y_max_m)
     for name, unit in _QUANTITIES.items():
         bands = [*((band, unit) for band in (*_BAND_NAMES, "min", "mean")), ("best course, ccw from grid east", "deg")]
         strip = _strip_of(costs, name)

@@ -72,7 +72,7 @@ class CostModel(Protocol):
 
     @property
     def label_energy(self) -> str:
-        """``total``: all that the power source measured; ``above_standing``: less what the robot draws while it stands."""
+        """``total``: all that the power source measured; ``net``: less what the robot draws while it stands."""
 
     @property
     def class_counts(self) -> Mapping[int, int]:

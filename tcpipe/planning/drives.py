@@ -151,7 +151,7 @@ def compute_drive_cost(model: CostModel, source: MapReader, run: RunDirectory, d
         (to_floats(segments, energy)[good], (said.power_watt * duration)[good]),
     )  # fmt: skip
     return DriveCost(
-        run_id=run.run_id, log=log, map=source.name, driven_m=float(sum(run.manifest.ledger_m.values())),
+        run_id=run.run_id, log=log, map=source.name, driven_m=float(sum(run.manifest.distance_by_reason_m.values())),
         segments_m=float(length_m.sum()), compared_m=float(length_m[good].sum()),
         rest_m={name: float(length_m[[name in why for why in reasons]].sum()) for name in named},
         samples_in_training=int((trained.column("run_id").astype(np.str_) == run.run_id).sum()),
@@ -167,7 +167,9 @@ def _predict_drive(model: CostModel, source: MapReader, segments: pa.Table, data
     projection = find_map_projection(source, data.card.recipe.read.gnss_crs)
     start, end = (projection.forward(read_lonlat_deg(segments, name)) for name in ("start", "end"))
     turn_radpm = (
-        to_floats(segments, "turn_rate_radps") * to_floats(segments, "duration_s") / to_floats(segments, "arc_length_m")
+        to_floats(segments, "mean_abs_yaw_rate_radps")
+        * to_floats(segments, "duration_s")
+        / to_floats(segments, "arc_length_m")
     )
     frames = patch_frames(start, end, to_floats(segments, "chord_m"))
     return join_predictions(predict_segments(model, source, iterate_batches(frames), turn_radpm=turn_radpm))
@@ -216,7 +218,7 @@ def format_drive(drive: DriveCost) -> list[str]:
         + (f", of them not compared: {rest}" if rest else ""),
         f"{drive.run_id}: {drive.near_training_percent:.0f} % of its segments are within {CLOSE:g} chords of a training sample",
     ]
-    above = ", above standing" if drive.label_energy == "above_standing" else ""
+    above = ", above standing" if drive.label_energy == "net" else ""
     for called, of, unit in (("time", drive.duration_s, "s"), (f"energy{above}", drive.energy_joule, "J")):
         if drive.compared_m:
             interval = (

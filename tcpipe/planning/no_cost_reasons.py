@@ -37,13 +37,13 @@ class Reason(IntFlag):
     """The class under most of the chord cannot be driven over; no cost."""
     NO_MOTION = 1 << 3
     """The model predicts no forward velocity; no cost."""
-    CLASS_NOT_SEEN = 1 << 4
+    CLASS_OUTSIDE_TRAINING = 1 << 4
     """The class under most of the chord, or that of some pixel, does not occur in training."""
-    SLOPE_NOT_SEEN = 1 << 5
+    SLOPE_OUTSIDE_TRAINING = 1 << 5
     """Steeper along travel, up or down, than any training sample."""
-    CROSS_SLOPE_NOT_SEEN = 1 << 6
+    CROSS_SLOPE_OUTSIDE_TRAINING = 1 << 6
     """Steeper across travel than any training sample."""
-    RELIEF_NOT_SEEN = 1 << 7
+    RELIEF_OUTSIDE_TRAINING = 1 << 7
     """The patch's largest height difference is outside the training samples'."""
     OBSTACLE = 1 << 8
     """More than 5 % of the strip that the robot drives over (0.7 m wide) cannot be driven over, though the middle can."""
@@ -75,9 +75,9 @@ def find_reasons(patches: Patches, on_map: NDArray[np.bool_], model: CostModel, 
     bits = np.zeros(on_map.size, np.uint16)
     bits[patches.valid_fraction < 1.0] |= np.uint16(Reason.NODATA)
     ranges = {
-        Reason.SLOPE_NOT_SEEN: (patches.slope_rad, "slope_rad"),
-        Reason.CROSS_SLOPE_NOT_SEEN: (patches.cross_slope_rad, "cross_slope_rad"),
-        Reason.RELIEF_NOT_SEEN: (compute_relief_m(patches.pixels["height"]), "relief_m"),
+        Reason.SLOPE_OUTSIDE_TRAINING: (patches.slope_rad, "slope_rad"),
+        Reason.CROSS_SLOPE_OUTSIDE_TRAINING: (patches.cross_slope_rad, "cross_slope_rad"),
+        Reason.RELIEF_OUTSIDE_TRAINING: (compute_relief_m(patches.pixels["height"]), "relief_m"),
     }
     for reason, (values, name) in ranges.items():
         low, high = model.seen[name]
@@ -105,6 +105,6 @@ def _find_class_reasons(patches: Patches, terrain: NDArray[np.uint8], model: Cos
     unknown, shut = np.empty(len(terrain), np.bool_), np.empty(len(terrain))
     blocked = (~traversable).astype(np.uint8)
     find_class_facts(terrain, known, blocked, int(lane[0]), int(lane[-1]) + 1, unknown, shut)
-    bits[~seen[patches.terrain_class] | unknown] |= np.uint16(Reason.CLASS_NOT_SEEN)
+    bits[~seen[patches.terrain_class] | unknown] |= np.uint16(Reason.CLASS_OUTSIDE_TRAINING)
     bits[shut > _STRAY] |= np.uint16(Reason.OBSTACLE)
     return bits

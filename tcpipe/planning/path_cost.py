@@ -100,7 +100,7 @@ def compute_path_cost(model: CostModel, source: MapReader, lonlat_deg: Floats, *
 
 def _turn_radpm(model: CostModel, planned_radpm: Floats) -> Floats:
     """Return how far metres turn: as planned, but NaN, as usual, where that is less: nobody drives as straight as a line is drawn."""
-    usual_radpm = 0.0 if model.physics is None else model.physics.usual_turn_radpm
+    usual_radpm = 0.0 if model.physics is None else model.physics.mean_turn_radpm
     return np.where(planned_radpm > usual_radpm, planned_radpm, np.nan)
 
 

@@ -30,7 +30,7 @@ class NamedTotals(PathTotals):
     map: str
     robot: str
     label_energy: str = "total"
-    """``total`` or ``above_standing``: which energy it is."""
+    """``total`` or ``net``: which energy it is."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -58,7 +58,7 @@ class PathResult(NamedTotals):
 
     def __str__(self) -> str:
         """Return the totals, their intervals, and findings, as plain lines."""
-        above = ", above standing" if self.label_energy == "above_standing" else ""
+        above = ", above standing" if self.label_energy == "net" else ""
         findings = format_findings(find_doubts(self, Subject("file", self.path.name)))
         return clean_lines((f"{self.path}: {format_cost(self)}{above}", *findings, *self._out_lines()))
 

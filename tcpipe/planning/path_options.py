@@ -59,7 +59,7 @@ class PlanPathOptions:
             earlier="--step",
         ),
     )
-    allow_unseen: bool = option(
+    allow_extrapolation: bool = option(
         False,
         Option(
             "Also cross ground unlike any that the model was trained on.",

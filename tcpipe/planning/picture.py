@@ -122,7 +122,7 @@ class _Backdrop:
         window = (int(row0), int(row1), int(col0), int(col1))
         layers = {layer: read_window(level, layer, *window)[::step, ::step] for layer in level.layers}
         self._height = layers["height"].astype(np.float64) + level.height_reference_m
-        pitch = level.grid.pitch_m * step
+        pitch = level.grid.pixel_size_m * step
         self._extent = (left, right, bottom, top)
         self._picture = _blend_picture(layers, _shade_relief(self._height, pitch))
         ids = np.unique(layers["terrain"]).tolist() if "terrain" in layers else []
@@ -162,9 +162,9 @@ def _choose_colour(class_id: int) -> str:
     return _TINTS[(class_id - 1) % len(_TINTS)]
 
 
-def _shade_relief(height_m: Array, pitch_m: float) -> Array:
+def _shade_relief(height_m: Array, pixel_size_m: float) -> Array:
     """Return light from the north-west at 40°, exaggerated to the relief there is, in [0, 1]; NaN without data."""
-    down, right = np.gradient(height_m, pitch_m)
+    down, right = np.gradient(height_m, pixel_size_m)
     steep = np.nanpercentile(np.hypot(down, right), 90.0) if np.isfinite(down).any() else 1.0
     exaggeration = np.clip(0.5 / max(float(steep), 1e-3), 1.0, 6.0)
     down, right = down * exaggeration, right * exaggeration

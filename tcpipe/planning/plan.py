@@ -90,7 +90,7 @@ def plan_path(
     goal_deg: Floats,
     objective: Objective,
     *,
-    allow_unseen: bool = False,
+    allow_extrapolation: bool = False,
     step: Callable[[int, int], None] = lambda _, __: None,
 ) -> Plan:
     """Return the least-cost path from a point to another.
@@ -100,7 +100,7 @@ def plan_path(
     survey : the map and the model, and what is known so far; it learns what it lacks.
     start_deg, goal_deg : longitude and latitude, WGS 84 [deg], shape (2,).
     objective : what is to be least.
-    allow_unseen : whether ground unlike any that the model was trained on may be crossed.
+    allow_extrapolation : whether ground unlike any that the model was trained on may be crossed.
     step : is told how many blocks of how many are looked at, or predicted, in each round.
 
     Raises
@@ -108,7 +108,7 @@ def plan_path(
     PathError : start or goal is off the map, cannot be stood on, or there is no way between them.
     """
     ends_xy_m = find_projection(survey.source).forward(np.stack([start_deg, goal_deg]))
-    search = _Search(survey, ends_xy_m, np.stack([start_deg, goal_deg]), allow_unseen, step)
+    search = _Search(survey, ends_xy_m, np.stack([start_deg, goal_deg]), allow_extrapolation, step)
     search.check_ends()
     bound_m, shortest = search.shortest()
     found = shortest if objective == "distance" else search.best(objective, bound_m)
@@ -131,7 +131,7 @@ class _Search:
     survey: LazyCostGrid
     ends_xy_m: Floats
     ends_deg: Floats
-    allow_unseen: bool
+    allow_extrapolation: bool
     step: Callable[[int, int], None]
 
     @property
@@ -170,9 +170,9 @@ class _Search:
                 f"{labels[0]} and {labels[1]} are {apart_m:.2f} m apart; wanted at least {self.survey.model.chord_m:g} m"
             )
         elif len(set(self._cells.tolist())) == 1:
-            pitch_m = self.survey.costs.grid.pitch_m
+            pixel_size_m = self.survey.costs.grid.pixel_size_m
             problems.append(
-                f"{labels[0]} and {labels[1]} lie in one cell of {pitch_m:g} m; choose a smaller --cell-size"
+                f"{labels[0]} and {labels[1]} lie in one cell of {pixel_size_m:g} m; choose a smaller --cell-size"
             )
         if problems:
             raise PathError(*problems)
@@ -181,12 +181,16 @@ class _Search:
         """Raise `PathError` for an end from which no course can be driven; both at once."""
         bits = self.survey.costs.reasons.reshape(len(self.survey.costs.reasons), -1)[:, self._cells]
         problems = []
-        for label, own in zip(("--from", "--to"), (bits & (BARRED if self.allow_unseen else 0xFFFF)).T, strict=True):
+        for label, own in zip(
+            ("--from", "--to"), (bits & (BARRED if self.allow_extrapolation else 0xFFFF)).T, strict=True
+        ):
             if own.all():
                 common = int(np.bitwise_and.reduce(own)) or int(np.bitwise_or.reduce(own))
                 words = ", ".join(name.replace("_", " ") for name in flag_names(common, Reason))
                 hint = (
-                    "" if self.allow_unseen or common & BARRED else ", or cross such ground with --allow-extrapolation"
+                    ""
+                    if self.allow_extrapolation or common & BARRED
+                    else ", or cross such ground with --allow-extrapolation"
                 )
                 problems.append(
                     f"{label}: no course can be driven from there on map {self.survey.source.name} ({words}); choose another point{hint}"
@@ -198,10 +202,10 @@ class _Search:
         """Return the cells over which a path from start to goal need not be longer than ``bound_m``, and those beside the ends."""
         grid = self.survey.costs.grid
         scale = self._metres().min()
-        x = grid.x_min_m + (np.arange(grid.cols) + 0.5) * grid.pitch_m
-        y = grid.y_max_m - (np.arange(grid.rows) + 0.5) * grid.pitch_m
+        x = grid.x_min_m + (np.arange(grid.cols) + 0.5) * grid.pixel_size_m
+        y = grid.y_max_m - (np.arange(grid.rows) + 0.5) * grid.pixel_size_m
         away = sum(np.hypot(x[None, :] - end[0], y[:, None] - end[1]) for end in self.ends_xy_m)
-        return np.asarray(away * scale <= bound_m + 4.0 * grid.pitch_m)
+        return np.asarray(away * scale <= bound_m + 4.0 * grid.pixel_size_m)
 
     def _metres(self) -> Floats:
         return self.survey.frames.metres(self._cells)
@@ -211,7 +215,7 @@ class _Search:
     ) -> LeastCostPath | None:
         """Return the best path over known cells; with their classes, that of least energy with its turns."""
         costs, (start, goal) = self.survey.costs, self._cells.tolist()
-        open_ = costs.open_courses(allow_unseen=self.allow_unseen) & known
+        open_ = costs.open_courses(allow_extrapolation=self.allow_extrapolation) & known
         if start == goal or not open_.any():
             return None
         steps = make_steps(costs, objective, open_, self._metres())
@@ -265,7 +269,9 @@ class _Search:
 
     def _maybe_open(self) -> NDArray[np.bool_]:
         """Return where a course may be driven as far as is known, shape (16, rows, cols)."""
-        return np.asarray(self.survey.costs.open_courses(allow_unseen=self.allow_unseen) | ~self.survey.judged)
+        return np.asarray(
+            self.survey.costs.open_courses(allow_extrapolation=self.allow_extrapolation) | ~self.survey.judged
+        )
 
     def _could_be_better(self, objective: Objective, found: LeastCostPath | None, class_id: NDArray[np.uint8]) -> Mask:
         """Return those cells to ask about next that are the likeliest of all that could lie on a better path."""
@@ -296,15 +302,17 @@ class _Search:
         row, col = np.divmod(found.cells, costs.grid.cols)
         points = np.stack([col, row], axis=1).astype(np.float64)
         points[[0, -1]] = costs.grid.px_from_xy(self.ends_xy_m)
-        open_ = costs.open_courses(allow_unseen=self.allow_unseen) & (objective == "distance" or self.survey.predicted)
+        open_ = costs.open_courses(allow_extrapolation=self.allow_extrapolation) & (
+            objective == "distance" or self.survey.predicted
+        )
         kept, cost = straighten_path(costs, objective, open_, self._metres(), points)
         return costs.grid.xy_from_px(kept), cost
 
     def _no_way(self) -> str:
         """Say why there is no way."""
         text = f"there is no way from start to goal on map {self.survey.source.name}"
-        if not self.allow_unseen:
-            other = _Search(self.survey, self.ends_xy_m, self.ends_deg, allow_unseen=True, step=self.step)
+        if not self.allow_extrapolation:
+            other = _Search(self.survey, self.ends_xy_m, self.ends_deg, allow_extrapolation=True, step=self.step)
             if other._found("distance", self.survey.judged) is not None:
                 return (
                     f"{text} but over ground unlike any that the model was trained on; --allow-extrapolation crosses it"

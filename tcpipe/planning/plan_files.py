@@ -39,7 +39,7 @@ class PlanRequest:
     goal_deg: tuple[float, float]
     objective: Objective = "energy"
     step_m: Annotated[float, Bounds(ge=0.05, le=1000)] = 1.0
-    allow_unseen: bool = False
+    allow_extrapolation: bool = False
     cost_map: Path | None = None
 
 
@@ -50,9 +50,9 @@ class PlannedPath(PlanTotals):
     model: str
     map: str
     robot: str
-    allow_unseen: bool
+    allow_extrapolation: bool
     label_energy: str = "total"
-    """``total`` or ``above_standing``: which energy it is."""
+    """``total`` or ``net``: which energy it is."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,7 +142,7 @@ def plan(
     check_model(model, source)
     drawn = picture is not None
     card = None if request.cost_map is None else _read_card(request.cost_map, model, source)
-    rules = replace(request, cost_map=None, step_m=card.grid.pitch_m if card else request.step_m)
+    rules = replace(request, cost_map=None, step_m=card.grid.pixel_size_m if card else request.step_m)
     made_from = {"model": model.checksum, "map": source.summary(), "request": rules, "drawn": drawn}
     key = digest({**made_from, "cost_map": card is not None, "version": VERSION})
     if (found := _read_plans(out, picture, key)) is not None:
@@ -150,7 +150,8 @@ def plan(
     survey = _open_survey(model, source, request, card)
     wanted = (request.objective, *(name for name in OBJECTIVES if drawn and name != request.objective))
     plans = {
-        name: plan_path(survey, start, goal, name, allow_unseen=request.allow_unseen, step=step) for name in wanted
+        name: plan_path(survey, start, goal, name, allow_extrapolation=request.allow_extrapolation, step=step)
+        for name in wanted
     }
     origin = PlanOrigin(key, {name: found.totals for name, found in plans.items()}, wanted)
     if picture is not None:
@@ -159,7 +160,12 @@ def plan(
         draw_plans(picture, source, [plans[name] for name in OBJECTIVES])
         origin = replace(origin, picture_sha256=compute_checksum(picture).sha256)
     asked = plans[request.objective]
-    who = {"model": model.name, "map": source.name, "robot": model.robot, "allow_unseen": request.allow_unseen}
+    who = {
+        "model": model.name,
+        "map": source.name,
+        "robot": model.robot,
+        "allow_extrapolation": request.allow_extrapolation,
+    }
     who["label_energy"] = model.label_energy
     path = make_line_feature(asked.lonlat_deg, convert_record(asked.totals, PlannedPath, **who))
     write_json(out, PlanFile((path,), origin))
@@ -180,7 +186,7 @@ def _read_card(path: Path, model: CostModel, source: MapFile) -> CostMapCard:
         if not (path / CARD).is_file():
             raise UsageError(f"{path}: not a cost map; make one with tcpipe cost-map")
         raise ModelError(f"{find_broken_seal(path / CARD)}; make one with tcpipe cost-map")
-    if card.key != make_cost_map_key(model, source, card.grid.pitch_m):
+    if card.key != make_cost_map_key(model, source, card.grid.pixel_size_m):
         raise ModelError(
             f"{path}: is made from another model or map than {model.name} and {source.name}; make it again with tcpipe cost-map"
         )

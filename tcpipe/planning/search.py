@@ -77,7 +77,7 @@ def make_steps(costs: CostGrid, objective: str, open_: NDArray[np.bool_], metres
     parts: list[tuple[NDArray[np.int64], NDArray[np.int64], Floats, Floats, Floats]] = []
     for course in range(COURSES):
         east, north = MOVES[course].tolist()
-        length_m = float(np.hypot(east, north)) * costs.grid.pitch_m * float(metres[course])
+        length_m = float(np.hypot(east, north)) * costs.grid.pixel_size_m * float(metres[course])
         row0, row1 = max(north, 0), rows + min(north, 0)  # rows run south
         col0, col1 = max(-east, 0), cols - max(east, 0)
         if row0 >= row1 or col0 >= col1:

@@ -35,7 +35,7 @@ def straighten_path(
     points_px : the path's points [cells], centres are integers, shape (P, 2).
     """
     per_metre = costs.per_metre(objective).astype(np.float32, copy=False)
-    angles, scale = np.radians(ANGLES_DEG), metres * costs.grid.pitch_m
+    angles, scale = np.radians(ANGLES_DEG), metres * costs.grid.pixel_size_m
     limit = np.array([costs.grid.cols, costs.grid.rows]) - 0.5 - 1e-9
     points, cost = np.clip(points_px, -0.5, limit), np.inf
     for _ in range(_PASSES):

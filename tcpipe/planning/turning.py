@@ -47,7 +47,7 @@ def find_turning(fit: PhysicsFit | None, classes: ClassTable) -> Turning | None:
     joule_per_rad = np.full(_CLASSES, found.get(_ALL, float(np.mean(list(found.values())))))
     for class_id, name in enumerate(classes.names().tolist()):
         joule_per_rad[class_id] = found.get(name, joule_per_rad[class_id])
-    return Turning(joule_per_rad, fit.usual_turn_radpm)
+    return Turning(joule_per_rad, fit.mean_turn_radpm)
 
 
 def compute_turns(start_xy_m: Floats, end_xy_m: Floats) -> Floats:

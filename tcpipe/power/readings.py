@@ -50,7 +50,7 @@ class PowerReadings:
     findings: tuple[Finding, ...] = ()
     current_sign: str | None = None
     """What a drawn current is counted as, and what tells it; None without power."""
-    includes: tuple[str, ...] = ()
+    other_loads: tuple[str, ...] = ()
     """What the currents feed besides the drives."""
 
     @property
@@ -107,14 +107,14 @@ def read_power(
     sign, of_sign, told_by = _sign(rails, log_times, sources, current_sign)
     if sign == 0:
         return PowerReadings(findings=of_sign)
-    includes = tuple(dict.fromkeys(of.includes for of in sources if of.includes))
-    loads = (make_finding("power-includes-loads", _POWER, names={"loads": name}) for name in includes)
+    other_loads = tuple(dict.fromkeys(of.other_loads for of in sources if of.other_loads))
+    loads = (make_finding("power-includes-loads", _POWER, names={"loads": name}) for name in other_loads)
     findings += [*of_sign, *odd, *loads]
     signed = {topic: [apply_sign(rail, sign) for rail in found] for topic, found in rails.items()}
     counts = any(of.energy for of in sources)
     unknown = any(of.averaging_unknown for of in sources) and not counts
     averaged = counts or any(of.averaged for of in sources)
-    return PowerReadings(signed, averaged, unknown, tuple(dict.fromkeys(findings)), told_by, includes)
+    return PowerReadings(signed, averaged, unknown, tuple(dict.fromkeys(findings)), told_by, other_loads)
 
 
 @dataclass(frozen=True, slots=True)

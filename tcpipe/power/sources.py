@@ -69,7 +69,7 @@ def find_sources(
     ]
     choices = [_select_most_specific([of for of in fitting if of.fallback is last]) for last in (False, True)]
     if choices := [choice for choice in choices if choice]:
-        is_refused = any(of.refused for of in choices[0])
+        is_refused = any(of.unsupported_reason for of in choices[0])
         return reject_power(topic, "no-battery-current", names={"type": type_name}) if is_refused else choices
     if type_name in FLOAT_TYPES:
         return _make_float_source(type_name, topic)

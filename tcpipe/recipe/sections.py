@@ -43,7 +43,7 @@ Scale = Annotated[float, Bounds(ge=0.01, le=100)]
 
 
 @dataclass(frozen=True, slots=True)
-class Placement:
+class Extrinsics:
     """Where a sensor sits: base_link_from_sensor."""
 
     xyz_m: tuple[Metres, Metres, Metres] = (0.0, 0.0, 0.0)
@@ -52,7 +52,7 @@ class Placement:
     """Rotation sensor to base_link as roll, pitch, yaw about fixed axes [rad]."""
 
     def __post_init__(self) -> None:
-        validate_fields(self, "placement")
+        validate_fields(self, "extrinsics")
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,15 +67,15 @@ class ReadConfig:
     """By role, where the fields of a message type of your own stand, as gnss.latitude = "pvt.lat * 1e-7"; its topic stands under topics."""
     pose_crs: str | None = field(default=None, metadata=LEFT_OUT)
     """Projected CRS of the pose's positions, as EPSG:2949; none leaves them in a frame of their own, which no map has."""
-    pose_from: list[MadeFrom] = field(default_factory=list, metadata=LEFT_OUT)
+    pose_sources: list[MadeFrom] = field(default_factory=list, metadata=LEFT_OUT)
     """Roles that the pose was made from (beside GNSS): they are not fused beside it, which would count them twice."""
     namespace: str | None = None
     """Of several robots in one log, the one whose topics lie below this name (for example "/husky_1"); none takes all topics."""
-    placement: dict[Role, Placement] = field(default_factory=dict)
-    """Sensor placement by role; overrides /tf_static."""
+    extrinsics: dict[Role, Extrinsics] = field(default_factory=dict)
+    """Sensor extrinsics by role; overrides /tf_static."""
     gnss_crs: str = "EPSG:4326"
     """Geographic CRS of the GNSS positions; RTK often comes in a national datum."""
-    time: dict[Role, Literal["auto", "header", "log"]] = field(default_factory=dict)
+    time_source: dict[Role, Literal["auto", "header", "log"]] = field(default_factory=dict)
     """Which stamp rules, by role; auto takes header.stamp when it is set and follows the log time."""
     time_offset_s: dict[Role, Offset] = field(default_factory=dict)
     """Added to the stamps of a role [s]."""
@@ -132,7 +132,7 @@ class FuseConfig:
 
 
 @dataclass(frozen=True, slots=True)
-class GateConfig:
+class MaskConfig:
     """What steady driving is; everything else is marked, never deleted."""
 
     max_acceleration_mps2: Limit = 0.3
@@ -159,10 +159,10 @@ class GateConfig:
     """The robot's maximum speed; none takes the profile's [m/s]."""
     max_plausible_mps: PlausibleSpeed | None = field(default=None, metadata=LEFT_OUT)
     """No label where the track is faster than this, and no run where most of a minute of driving is; none takes the profile's [m/s]."""
-    standing_velocity_mps: Limit = 0.05
+    stationary_velocity_mps: Limit = 0.05
     """Slower than this (and not turning) is standing [m/s]."""
-    standing_yaw_rate_radps: Limit = 0.05
-    """See `standing_velocity_mps` [rad/s]."""
+    stationary_yaw_rate_radps: Limit = 0.05
+    """See `stationary_velocity_mps` [rad/s]."""
     stuck_wheel_velocity_mps: Limit = 0.2
     """Wheels faster than this while the ground speed is that of standing are stuck [m/s]."""
     turning_velocity_mps: Limit = 0.10
@@ -177,7 +177,7 @@ class GateConfig:
     """A stretch whose position error over one chord would exceed this is a gap [m]."""
 
     def __post_init__(self) -> None:
-        validate_fields(self, "gate")
+        validate_fields(self, "mask")
 
 
 @dataclass(frozen=True, slots=True)
@@ -310,7 +310,7 @@ class IngestSections:
 
     read: ReadConfig
     fuse: FuseConfig
-    gate: GateConfig
+    mask: MaskConfig
     segment: SegmentConfig
     label: LabelConfig
     robots: dict[str, Robot] = field(default_factory=dict, metadata=LEFT_OUT)
@@ -326,7 +326,7 @@ class Recipe:
     """The robot's profile by name; none finds it by message types and topic names."""
     read: ReadConfig = field(default_factory=ReadConfig)
     fuse: FuseConfig = field(default_factory=FuseConfig)
-    gate: GateConfig = field(default_factory=GateConfig)
+    mask: MaskConfig = field(default_factory=MaskConfig)
     segment: SegmentConfig = field(default_factory=SegmentConfig)
     label: LabelConfig = field(default_factory=LabelConfig)
     sample: SampleConfig = field(default_factory=SampleConfig)
@@ -347,5 +347,5 @@ class Recipe:
     def ingest(self) -> IngestSections:
         """The sections that rule a run's files."""
         return IngestSections(
-            self.read, self.fuse, self.gate, self.segment, self.label, self.robots, self.power_sources, self.tables
+            self.read, self.fuse, self.mask, self.segment, self.label, self.robots, self.power_sources, self.tables
         )

@@ -17,12 +17,12 @@ UNUSED = "#8fd3bd"
 """Of what is kept, and in no segment."""
 REASON_COLOURS = {
     DropReason.GAP: "#cc79a7",
-    DropReason.STANDING: FAINT,
+    DropReason.STATIONARY: FAINT,
     DropReason.STUCK: "#6b4a1b",
     DropReason.TURNING_IN_PLACE: "#b8a200",
     DropReason.REVERSING: "#56b4e9",
     DropReason.ACCELERATING: DROPPED,
-    DropReason.BELOW_LIMIT: "#0072b2",
+    DropReason.BELOW_FULL_SPEED: "#0072b2",
 }
 """Why a row of the track is not used, on the map and over time; names stand beside them wherever it matters."""
 LINE_COLOURS = ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00", FAINT)

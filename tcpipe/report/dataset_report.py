@@ -67,7 +67,7 @@ def render_dataset_report(directory: Path, beside: Path | None = None, *, folder
             Section(
                 "Where every metre went",
                 "In samples and lost add up to the odometer.",
-                plots=[draw_waterfall(card.ledger_m)],
+                plots=[draw_waterfall(card.distance_by_reason_m)],
             ),
             *_make_removal_sections(card),
             *balance_sections(card.balance),
@@ -101,8 +101,12 @@ def _make_numbers(card: DatasetCard) -> list[Number]:
         Number(f"{card.samples}", "samples"),
         *(Number(f"{card.splits[split]}", split) for split in SPLIT_COLOURS),
         Number(f"{len(card.runs)}", "runs"),
-        Number(f"{sum(card.ledger_m.values()):.0f} m", "driven"),
-        *([] if card.doubtful is None else [Number(f"{100 * card.doubtful.share:.1f} %", "flagged samples")]),
+        Number(f"{sum(card.distance_by_reason_m.values()):.0f} m", "driven"),
+        *(
+            []
+            if card.flagged_samples is None
+            else [Number(f"{100 * card.flagged_samples.share:.1f} %", "flagged samples")]
+        ),
     ]
 
 
@@ -309,7 +313,7 @@ def _make_provenance_section(card: DatasetCard) -> Section:
         *(
             (
                 f"map {grid.name}",
-                f"{grid.cols} × {grid.rows} px of {1000 * grid.pitch_m:.0f} mm, {grid.crs}, sha256 {grid.sha256 or 'unknown'}",
+                f"{grid.cols} × {grid.rows} px of {1000 * grid.pixel_size_m:.0f} mm, {grid.crs}, sha256 {grid.sha256 or 'unknown'}",
             )
             for grid in card.maps
         ),

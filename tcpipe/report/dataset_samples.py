@@ -34,7 +34,7 @@ _STD = {
 }
 COLUMNS = (
     *("sample_id", "split", "run_id", "start_ns", "start_lon_deg", "start_lat_deg", "end_lon_deg", "end_lat_deg"),
-    *("terrain_class", "terrain_name", "slope_rad", "turn_rad", "physics_power_watt", "quality"),
+    *("terrain_class", "terrain_name", "slope_rad", "yaw_change_rad", "physics_power_watt", "quality"),
     *_LABELS.values(),
     *_STD.values(),
 )
@@ -105,7 +105,7 @@ def _read_values(card: DatasetCard, table: pa.Table, apart_m: Floats) -> dict[st
     found = {name: to_floats(table, column) for name, column in _LABELS.items()}
     found |= {f"{name}_std": to_floats(table, column) for name, column in _STD.items()}
     found["slope"] = np.degrees(to_floats(table, "slope_rad"))
-    found["turn"] = np.degrees(to_floats(table, "turn_rad"))
+    found["turn"] = np.degrees(to_floats(table, "yaw_change_rad"))
     if card.physics:
         found["residual"] = found["power"] - to_floats(table, "physics_power_watt")
     return found | {"apart": apart_m}

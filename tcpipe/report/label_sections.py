@@ -17,12 +17,12 @@ QUALITY_WORDS = {
     Quality.HIGH_SLIP: "wheels and ground differ by more than 20 %",
     Quality.WEAK_GNSS: "position is uncertain",
     Quality.CURVED: "the path bends",
-    Quality.MEAN_POWER_DIFFERS: "mean power and energy over time differ by more than 5 %",
+    Quality.POWER_MEAN_MISMATCH: "mean power and energy over time differ by more than 5 %",
     Quality.NO_COMMAND: "no command topic: full speed is not proved",
     Quality.VOLTAGE_OUT_OF_RANGE: "voltage leaves the robot's range",
     Quality.CLOCK_DOUBTFUL: "a clock is doubtful",
     Quality.PHYSICS_OUTLIER: "power is far from what physics predicts",
-    Quality.NOT_AT_LIMIT: "commanded below full speed",
+    Quality.BELOW_FULL_SPEED: "commanded below full speed",
     Quality.SENSORS_DISAGREE: "sensors disagree",
 }
 """What a bit says, in words."""

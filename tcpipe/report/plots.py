@@ -151,10 +151,12 @@ def say_of(plot: Plot, drawn: Any) -> None:
     plot.figure.add_tools(HoverTool(renderers=[drawn], tooltips=[("", "@text")]))
 
 
-def draw_waterfall(ledger_m: Mapping[str, float]) -> Plot:
+def draw_waterfall(distance_by_reason_m: Mapping[str, float]) -> Plot:
     """Return where every metre went: all that was driven, each loss taken away, the largest first, and what is left."""
-    losses = sorted(((n, m) for n, m in ledger_m.items() if n != "kept" and m > 0), key=lambda item: -item[1])
-    total, kept = sum(ledger_m.values()), ledger_m.get("kept", 0.0)
+    losses = sorted(
+        ((n, m) for n, m in distance_by_reason_m.items() if n != "kept" and m > 0), key=lambda item: -item[1]
+    )
+    total, kept = sum(distance_by_reason_m.values()), distance_by_reason_m.get("kept", 0.0)
     ends = total - np.cumsum([metres for _, metres in losses])
     names = ["driven", *(name.replace("_", " ") for name, _ in losses), "kept"]
     metres = [total, *(metres for _, metres in losses), kept]

@@ -19,12 +19,12 @@ from tcpipe.tables.facts import StageFacts
 
 REASON_WORDS = {
     DropReason.GAP: "no usable motion or power here: a gap of a sensor, a jump, or a position that is too uncertain",
-    DropReason.STANDING: "it stands",
+    DropReason.STATIONARY: "it stands",
     DropReason.STUCK: "the wheels turn, the robot does not move",
     DropReason.TURNING_IN_PLACE: "it turns on the spot, or nearly",
     DropReason.REVERSING: "it drives backwards",
     DropReason.ACCELERATING: "its speed is changing",
-    DropReason.BELOW_LIMIT: "it is commanded below full speed: the speed is not the terrain's limit",
+    DropReason.BELOW_FULL_SPEED: "it is commanded below full speed: the speed is not the terrain's limit",
 }
 """Why a row of the track is not used."""
 
@@ -178,14 +178,16 @@ def _iterate_events(timeline: Timeline, facts: StageFacts) -> Iterator[tuple[str
     """Yield what has a time: its row, beginning and end [s], and what is to be said."""
     for each in facts.audit.disagreements if facts.audit else ():
         role = each.sensor.replace("_", " ")
-        start_s, end_s = timeline.seconds(np.array([each.start_ns, each.end_ns]), np.full(2, each.epoch))
+        start_s, end_s = timeline.seconds(np.array([each.start_ns, each.end_ns]), np.full(2, each.clock_epoch))
         said = f"{role}: {each.what} off by {each.size:.2g} {each.unit}, {each.expected_std:.2g} expected"
         if np.isfinite(start_s):
             yield f"{role} disagrees", float(start_s), float(end_s), said
     for stretch in facts.fuse.stretches if facts.fuse else ():
-        for opened in stretch.reopenings:
+        for opened in stretch.gate_resets:
             role = opened.role.replace("_", " ")
-            start_s, end_s = timeline.seconds(np.array([opened.start_ns, opened.end_ns]), np.full(2, stretch.epoch))
+            start_s, end_s = timeline.seconds(
+                np.array([opened.start_ns, opened.end_ns]), np.full(2, stretch.clock_epoch)
+            )
             if np.isfinite(start_s):
                 yield (
                     f"{role} shut out",
@@ -237,7 +239,7 @@ def _draw_clocks(timeline: Timeline, first: Plot, facts: StageFacts) -> Iterator
     """Yield how late sensors' stamps are over the run, pair by pair, where that is determined."""
     found = facts.clock_offsets
     start_s = {each.number: each.start_s for each in timeline.epochs}
-    if found is None or found.epoch not in start_s:
+    if found is None or found.clock_epoch not in start_s:
         return
     pairs = [pair for pair in found.pairs if pair.determined and pair.windows]
     names = [f"{pair.late} against {pair.against} by {pair.by}".replace("_", " ") for pair in pairs]
@@ -247,7 +249,7 @@ def _draw_clocks(timeline: Timeline, first: Plot, facts: StageFacts) -> Iterator
     plot = _draw_panel("clocks", "late by [ms], ± σ", first, legend=colours)
     for pair, name in zip(pairs, names, strict=True):
         at_s, offset_s, std_s = np.array(pair.windows).T
-        at_s = at_s + start_s[found.epoch]
+        at_s = at_s + start_s[found.clock_epoch]
         plot.figure.segment(
             at_s, 1e3 * (offset_s - std_s), at_s, 1e3 * (offset_s + std_s), color=colours[name], line_width=2
         )

@@ -73,7 +73,7 @@ def run_report(store: Store, run: RunDirectory, of_maps: MutableMapping[str, Pic
     track, segments, manifest, refused = run.track().table, run.segments(), run.manifest, run.rejections()
     label = manifest.info.report.facts.label
     known = store.run_json(run.run_id)
-    ledger, total = manifest.ledger_m, sum(manifest.ledger_m.values())
+    ledger, total = manifest.distance_by_reason_m, sum(manifest.distance_by_reason_m.values())
     bits = to_integers(segments, "quality")
     quality = {flag_name(bit): int(((bits & int(bit)) != 0).sum()) for bit in Quality}
     drawn = _draw_run(store, run, track, segments, refused=refused, of_maps={} if of_maps is None else of_maps)
@@ -104,15 +104,17 @@ def run_report(store: Store, run: RunDirectory, of_maps: MutableMapping[str, Pic
     )
 
 
-def _make_losses_section(ledger_m: Mapping[str, float]) -> Section:
+def _make_losses_section(distance_by_reason_m: Mapping[str, float]) -> Section:
     """Return where the distance went, and how to lose less of it."""
     rows = [
         (loss.reason.replace("_", " "), f"{loss.metres:.1f}", f"{100 * loss.share:.1f} %", advise_on_loss(loss.reason))
-        for loss in find_largest_losses([ledger_m])
+        for loss in find_largest_losses([distance_by_reason_m])
     ]
     text = "Kept and dropped distances add up to the odometer."
     header = ("lost to", "metres", "of all", "to lose less")
-    return Section("Where every metre went", text, header=header, rows=rows, plots=[draw_waterfall(ledger_m)])
+    return Section(
+        "Where every metre went", text, header=header, rows=rows, plots=[draw_waterfall(distance_by_reason_m)]
+    )
 
 
 def _make_damage_sections(lines: Sequence[str]) -> list[Section]:
@@ -225,7 +227,7 @@ def _time_text(series: Sequence[Series], lines: Sequence[Line]) -> str:
 
 def _make_segments_data(segments: pa.Table, timeline: Timeline, ground: RunMap) -> Json:
     """Return what the page holds of each segment."""
-    epoch = to_integers(segments, "epoch")
+    epoch = to_integers(segments, "clock_epoch")
     columns: dict[str, Column] = {
         name: ("f32", timeline.seconds(to_integers(segments, f"{name}_ns"), epoch)) for name in ("start", "end")
     }

@@ -51,7 +51,7 @@ def _make_trust_sections(facts: StageFacts, rejections: pa.Table) -> list[Sectio
     """Return how many measurements each sensor gave, how many were refused and why, and how well the rest fitted."""
     counts, nis = (facts.fuse.measurements, facts.fuse.nis_mean) if facts.fuse else ({}, {})
     lost = Counter(zip(rejections.column("role").to_pylist(), rejections.column("reason").to_pylist(), strict=True))
-    checks = facts.sensor_checks.refused if facts.sensor_checks else {}
+    checks = facts.sensor_checks.excluded if facts.sensor_checks else {}
     rows = [
         (
             _name(role),

@@ -66,7 +66,7 @@ class Timeline:
 
 def make_timeline(track: pa.Table) -> Timeline:
     """Return the axis of a track that has rows."""
-    stamps, epochs = to_integers(track, "stamp_ns"), to_integers(track, "epoch")
+    stamps, epochs = to_integers(track, "stamp_ns"), to_integers(track, "clock_epoch")
     found: list[Epoch] = []
     start_s = 0.0
     for number in dict.fromkeys(epochs.tolist()):
@@ -166,7 +166,7 @@ def make_rail_series(power: pa.Table, timeline: Timeline) -> Iterator[Series]:
 
 
 def _compute_seconds(table: pa.Table, timeline: Timeline) -> Floats:
-    return timeline.seconds(to_integers(table, "stamp_ns"), to_integers(table, "epoch"))
+    return timeline.seconds(to_integers(table, "stamp_ns"), to_integers(table, "clock_epoch"))
 
 
 def make_speed_series(role: str, table: pa.Table, timeline: Timeline) -> Series | None:

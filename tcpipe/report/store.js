@@ -78,7 +78,7 @@ page.start(() => {
     }
     source.data = {
       run: points.map((run) => run.run), start_ms: numbers("start_ms"), fill: points.map((run) => colours.get(run.robot)),
-      used: numbers("used"), floor: numbers("floor"), standing: numbers("standing"), term: term(),
+      used: numbers("used"), floor: numbers("floor"), idle: numbers("idle"), term: term(),
     };
     source.selected.change.connect(() => {
       if (quiet) return;

@@ -32,7 +32,7 @@ def store_report(store: StoreFacts) -> str:
     """Return the HTML page of a store."""
     runs = sort_runs(store)
     current = [run for run in runs if run.is_current]
-    losses = find_largest_losses(run.facts.ledger_m for run in current if run.facts)
+    losses = find_largest_losses(run.facts.distance_by_reason_m for run in current if run.facts)
     return render_page(
         title=f"Store {store.where}",
         lead="All its runs. Sums, drift and losses are of the recipe that most runs are of, superseded runs left aside.",
@@ -98,8 +98,8 @@ def _make_drift_sections(runs: Sequence[StoredRun]) -> list[Section]:
         labels["used"] = "metres used [%]"
     if any(run.floor is not None for run in dated):
         labels["floor"] = "noise floor of E [%]"
-    if any(run.facts and run.facts.standing_watt is not None for run in dated):
-        labels["standing"] = "standing power [W]"
+    if any(run.facts and run.facts.idle_watt is not None for run in dated):
+        labels["idle"] = "idle power [W]"
     if any(run.facts and run.facts.physics for run in dated):
         labels["term"] = "term of physics"
     if not labels:
@@ -125,7 +125,7 @@ def _draw_over_time(name: str, label: str, colours: dict[str, str], drawn: Seque
         beside=drawn[0] if drawn else None,
     )
     # Corners, until the page's script has filled it.
-    ends = {"start_ms": [0.0, 1e12], **{measure: [0.0, 1.0] for measure in ("used", "floor", "standing", "term")}}
+    ends = {"start_ms": [0.0, 1e12], **{measure: [0.0, 1.0] for measure in ("used", "floor", "idle", "term")}}
     source = drawn[0].figure.renderers[0].data_source if drawn else {"run": [""] * 2, "fill": ["#ffffff"] * 2, **ends}
     plot.figure.scatter(
         "start_ms",
@@ -147,10 +147,10 @@ def _list_robots(runs: Sequence[StoredRun]) -> list[tuple[str, str]]:
 
 
 def _make_losses_sections(current: Sequence[StoredRun], losses: Sequence[StoreLoss]) -> list[Section]:
-    ledger_m = Counter[str]()
+    distance_by_reason_m = Counter[str]()
     for run in current:
-        ledger_m.update(run.facts.ledger_m if run.facts else {})
-    if not ledger_m:
+        distance_by_reason_m.update(run.facts.distance_by_reason_m if run.facts else {})
+    if not distance_by_reason_m:
         return []
     rows = [
         (
@@ -164,7 +164,9 @@ def _make_losses_sections(current: Sequence[StoredRun], losses: Sequence[StoreLo
     ]
     header = ("lost to", "metres", "of all", "runs", "to lose less")
     text = "The largest losses, and how to lose less; 'tcpipe status' lists the same."
-    return [Section("Where every metre went", text, header=header, rows=rows, plots=[draw_waterfall(ledger_m)])]
+    return [
+        Section("Where every metre went", text, header=header, rows=rows, plots=[draw_waterfall(distance_by_reason_m)])
+    ]
 
 
 def _make_findings_sections(store: StoreFacts, current: Sequence[StoredRun]) -> list[Section]:
@@ -210,7 +212,7 @@ def _describe_problem(facts: RunFacts) -> str:
 
 
 def _make_data(store: StoreFacts, runs: Sequence[StoredRun]) -> Json:
-    terms = sorted({term for run in runs if run.facts for term in run.facts.physics if not term.startswith("standing")})
+    terms = sorted({term for run in runs if run.facts for term in run.facts.physics if not term.startswith("idle")})
     return {
         "fields": list(FIELDS),
         "rows": [run.row(terms) for run in runs],

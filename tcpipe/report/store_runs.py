@@ -108,7 +108,7 @@ class StoredRun:
             sum(finding.severity != "note" for finding in of.findings),
             list(self.datasets),
             list(self.codes),
-            of.standing_watt,
+            of.idle_watt,
             [of.physics[term][0] if term in of.physics else None for term in terms],
         ]
 
@@ -128,7 +128,7 @@ FIELDS = (
         "floor",
         "verdict",
     ),
-    *("findings", "datasets", "codes", "standing", "terms"),
+    *("findings", "datasets", "codes", "idle", "terms"),
 )
 
 

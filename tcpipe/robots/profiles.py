@@ -61,7 +61,7 @@ class Robot:
     """The kind of robot by which power sources tell it apart (Clearpath's code, as A200)."""
     status_types: list[str] = field(default_factory=list)
     """Message types that only this robot publishes; a log that holds one is of it."""
-    called: list[str] = field(default_factory=list)
+    topic_words: list[str] = field(default_factory=list)
     """Words by which a topic's name tells this robot; whole words, in small letters."""
 
     def contradictions(self) -> Iterator[tuple[str, str]]:
@@ -104,11 +104,11 @@ class PowerSource:
     """Which sign a drawn current has; auto where robots disagree: the mean over the run tells."""
     propulsion: bool = True
     """Whether the current drives the wheels alone; such a source is taken before others."""
-    includes: str = ""
+    other_loads: str = ""
     """What the current feeds besides the drives; said in a warning."""
-    unknown: str = ""
+    open_questions: str = ""
     """What is not known of it; stands in the reference."""
-    refused: str = ""
+    unsupported_reason: str = ""
     """Why this type tells no power, and what would; then it plays no role, and no field is named."""
     rate_setting: str = ""
     """What sets its rate; said where it comes too slowly."""
@@ -132,9 +132,9 @@ class PowerSource:
         for key in ("voltage", "current", "energy"):
             if (text := getattr(self, key)) and not all(map(_FIELD.fullmatch, re.split(r"[+-]", text))):
                 yield key, "fields joined by + or -, for example status.left_amp + amps[1] or drivers[].amp"
-        if self.refused:
+        if self.unsupported_reason:
             if self.voltage or self.current or self.energy:
-                yield "refused", "no field beside it"
+                yield "unsupported_reason", "no field beside it"
         elif not self.voltage and not self.current:
             yield "current", "a voltage, a current or both"
         if self.energy and (self.current or not self.voltage):
@@ -151,13 +151,15 @@ class Profiles:
     def types(self, *, propulsion: bool = False) -> list[str]:
         """Return the message types that carry power, best first; with ``propulsion`` those that tell it apart for some robot."""
         return list(
-            dict.fromkeys(of.type for of in self.power_sources if (of.propulsion and not of.refused) or not propulsion)
+            dict.fromkeys(
+                of.type for of in self.power_sources if (of.propulsion and not of.unsupported_reason) or not propulsion
+            )
         )
 
     def refusals(self) -> dict[str, str]:
         """Return the message types that carry currents but tell no power, and why."""
-        telling = {of.type for of in self.power_sources if not of.refused}
-        return {of.type: of.refused for of in self.power_sources if of.type not in telling}
+        telling = {of.type for of in self.power_sources if not of.unsupported_reason}
+        return {of.type: of.unsupported_reason for of in self.power_sources if of.type not in telling}
 
     def before(self, others: Profiles) -> Profiles:
         """Return these and others: a robot's name and a message type that are here are not taken from there."""

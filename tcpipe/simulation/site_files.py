@@ -165,18 +165,18 @@ def _make_raster_paths(directory: Path) -> dict[str, Path]:
 def _write_raster(
     path: Path,
     world: World,
-    pitch_m: float,
+    pixel_size_m: float,
     shift_m: tuple[float, float],
     pixels: Callable[[World, NDArray[np.float64], NDArray[np.float64]], Pixels],
     **options: Any,
 ) -> None:
     site = world.site
-    rows, cols = round(site.height_m / pitch_m), round(site.width_m / pitch_m)
+    rows, cols = round(site.height_m / pixel_size_m), round(site.width_m / pixel_size_m)
     west, north = site.west_m + shift_m[0], site.south_m + site.height_m + shift_m[1]
-    x = (west + (np.arange(cols) + 0.5) * pitch_m).astype(np.float64)
+    x = (west + (np.arange(cols) + 0.5) * pixel_size_m).astype(np.float64)
 
     def strip(first: int, last: int) -> Pixels:
-        y = (north - (np.arange(first, last) + 0.5) * pitch_m).astype(np.float64)
+        y = (north - (np.arange(first, last) + 0.5) * pixel_size_m).astype(np.float64)
         return pixels(world, x[None, :], y[:, None])
 
     write_geotiff(
@@ -184,7 +184,7 @@ def _write_raster(
         strip,
         rows=rows,
         cols=cols,
-        affine=(pitch_m, 0.0, west, 0.0, -pitch_m, north),
+        affine=(pixel_size_m, 0.0, west, 0.0, -pixel_size_m, north),
         crs=f"EPSG:{site.epsg}",
         **options,
     )

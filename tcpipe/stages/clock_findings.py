@@ -88,7 +88,7 @@ def _find_offset(found: ClockOffsets, role: str, offset: RoleOffset, streams: St
 
 def _use_log_time(role: str, name: str, streams: Streams) -> tuple[Remedy, ...]:
     by_log = streams.sensors[role].time_source == "log"
-    return () if by_log else suggest("use_log_time", {"read.time": {name: "log"}})
+    return () if by_log else suggest("use_log_time", {"read.time_source": {name: "log"}})
 
 
 def _select_known(each: RoleOffset | Pair) -> dict[str, Any]:

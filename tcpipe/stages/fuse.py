@@ -85,7 +85,7 @@ def fuse_run(streams: Streams, config: FuseConfig, *, run_id: str) -> Track:
 
 def _drop_places(read: tuple[Finding, ...], fused: tuple[Finding, ...]) -> Iterator[Finding]:
     """Yield the findings of reading; one without extrinsics suggests none where fusing has estimated them."""
-    estimated = {role for finding in fused for of in finding.remedies for role in of.recipe.get("read.placement", ())}
+    estimated = {role for finding in fused for of in finding.remedies for role in of.recipe.get("read.extrinsics", ())}
     for finding in read:
         is_estimated = finding.code == "sensor-not-placed" and finding.subject.name in estimated
         yield replace(finding, remedies=()) if is_estimated else finding

@@ -18,7 +18,7 @@ from tcpipe.stages.fuse_mounting import compute_moved_m
 from tcpipe.stages.fuse_stretches import Fused
 from tcpipe.stages.read_pose import find_recipe_role
 from tcpipe.tables.catalogue import read_threshold
-from tcpipe.tables.facts import AuditFacts, Disagreement, FuseFacts, MountingFacts, Reopening, StretchFacts, make_vector
+from tcpipe.tables.facts import AuditFacts, Disagreement, FuseFacts, GateReset, MountingFacts, StretchFacts, make_vector
 from tcpipe.tables.findings import Finding, StageReport, Subject, make_finding
 from tcpipe.tables.levels import Sensor, Streams
 
@@ -49,7 +49,7 @@ def fuse_facts(inputs: FusionInputs, stretches: Sequence[StretchFacts], *, rows:
 def fuse_findings(inputs: FusionInputs, facts: FuseFacts, *, run: Subject, fixes: str = GNSS) -> tuple[Finding, ...]:
     """Return what was observed while fusing; ``fixes`` is the recipe's role of the positions."""
     gnss, first_ns = Subject("role", fixes), min((stretch.start_ns for stretch in facts.stretches), default=0)
-    findings = [finding for finding in inputs.findings if finding.subject.name not in inputs.refused]
+    findings = [finding for finding in inputs.findings if finding.subject.name not in inputs.excluded]
     if inputs.datum_deg_m is None and GNSS in inputs.counts:  # a log without any fix was found when it was read
         findings.append(make_finding("local-frame", gnss))
     elif inputs.datum_deg_m is not None:
@@ -61,7 +61,7 @@ def fuse_findings(inputs: FusionInputs, facts: FuseFacts, *, run: Subject, fixes
         findings += [
             make_finding(code, Subject("role", role), row_count=count[key])
             for role, count in inputs.counts.items()
-            if count[key] and role not in inputs.refused
+            if count[key] and role not in inputs.excluded
         ]
     if facts.skipped_s:
         findings.append(make_finding("sections-skipped", run, skipped_s=facts.skipped_s))
@@ -105,11 +105,11 @@ def _find_rejections(facts: FuseFacts, fixes: str) -> list[Finding]:
 def _find_reopenings(facts: FuseFacts, first_ns: int) -> list[Finding]:
     """Return by sensor how often it contradicted the others for seconds, and where most."""
     findings = []
-    reopenings = [reopening for stretch in facts.stretches for reopening in stretch.reopenings]
+    gate_resets = [gate_reset for stretch in facts.stretches for gate_reset in stretch.gate_resets]
     odometries = [role for role in (WHEELS, VISUAL) if role in facts.sensors]
-    for role in sorted({reopening.role for reopening in reopenings}):
-        of_role = [reopening for reopening in reopenings if reopening.role == role]
-        worst = max(of_role, key=lambda reopening: reopening.size)
+    for role in sorted({gate_reset.role for gate_reset in gate_resets}):
+        of_role = [gate_reset for gate_reset in gate_resets if gate_reset.role == role]
+        worst = max(of_role, key=lambda gate_reset: gate_reset.size)
         subject, span_s = Subject("role", role), _find_span_s(worst, first_ns)
         code, off = (
             ("gnss-contradicts-odometry", "off_m") if role == GNSS else ("odometry-contradicts-others", "off_mps")
@@ -120,7 +120,7 @@ def _find_reopenings(facts: FuseFacts, first_ns: int) -> list[Finding]:
     return findings
 
 
-def _find_span_s(each: StretchFacts | Reopening, first_ns: int) -> tuple[float, float]:
+def _find_span_s(each: StretchFacts | GateReset, first_ns: int) -> tuple[float, float]:
     return (each.start_ns - first_ns) / 1e9, (each.end_ns - first_ns) / 1e9
 
 

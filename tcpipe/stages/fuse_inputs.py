@@ -40,7 +40,7 @@ class FusionInputs:
     invalid_ns: dict[str, list[NDArray[np.int64]]] = field(default_factory=dict)
     counts: dict[str, dict[str, int]] = field(default_factory=dict)
     findings: list[Finding] = field(default_factory=list)
-    refused: frozenset[str] = frozenset()
+    excluded: frozenset[str] = frozenset()
     arm: Arm | None = None
     """What is known of the antenna's arm where it was mended or nobody stated it."""
     imu_tilt: Tilt | None = None
@@ -69,8 +69,8 @@ def prepare_inputs(streams: Streams, config: FuseConfig) -> FusionInputs:
     if config.estimator == "ukf" and tables.pop(DOPPLER, None) is not None:
         names = {"estimator": config.estimator}
         inputs.findings.append(make_finding("unused-by-estimator", Subject("role", DOPPLER), names=names))
-    for epoch in sorted({int(e) for table in tables.values() for e in pc.unique(table["epoch"]).to_pylist()}):
-        parts = {role: select_rows(table, "epoch", epoch) for role, table in tables.items()}
+    for epoch in sorted({int(e) for table in tables.values() for e in pc.unique(table["clock_epoch"]).to_pylist()}):
+        parts = {role: select_rows(table, "clock_epoch", epoch) for role, table in tables.items()}
         found = {role: _prepare(role, part, streams.sensors[role], config, inputs) for role, part in parts.items()}
         gnss, findings = smooth_stamps(found.get(GNSS), found.get(WHEELS) or found.get(VISUAL))
         inputs.findings += findings
@@ -149,13 +149,13 @@ def exclude_sensors(
     inputs: FusionInputs, before: StageReport[SensorChecks], refusals: Sequence[SensorExclusion], streams: Streams
 ) -> tuple[FusionInputs, StageReport[SensorChecks]]:
     """Return the inputs without refused sensors, the findings, and the codes of these by role."""
-    refused = inputs.refused | {refusal.role for refusal in refusals}
+    refused = inputs.excluded | {refusal.role for refusal in refusals}
     kept = {number: _without(refused, measurements) for number, measurements in inputs.measurements.items()}
-    codes = {**before.facts.refused, **{refusal.role: refusal.code for refusal in refusals}}
+    codes = {**before.facts.excluded, **{refusal.role: refusal.code for refusal in refusals}}
     findings = (*before.findings, *(_find_exclusion(refusal, streams) for refusal in refusals))
     datum = None if GNSS in refused else inputs.datum_deg_m
-    inputs = replace(inputs, datum_deg_m=datum, measurements=kept, refused=refused)
-    return inputs, StageReport(findings, replace(before.facts, refused=codes))
+    inputs = replace(inputs, datum_deg_m=datum, measurements=kept, excluded=refused)
+    return inputs, StageReport(findings, replace(before.facts, excluded=codes))
 
 
 def _without(refused: frozenset[str], m: Measurements) -> Measurements:
@@ -182,7 +182,7 @@ def read_command(streams: Streams, epoch: int) -> CommandedSpeed | None:
     """Return the commanded speed of a clock epoch; None without."""
     if "command" not in streams.tables:
         return None
-    table = select_rows(streams.tables["command"], "epoch", epoch)
+    table = select_rows(streams.tables["command"], "clock_epoch", epoch)
     return CommandedSpeed(to_integers(table, "stamp_ns"), to_floats(table, "forward_velocity_mps"))
 
 
@@ -229,5 +229,5 @@ def state_extrinsics(name: str, xyz_m: Sequence[float], turn: NDArray[np.float64
     """Return what states a sensor's lever arm [m] and its rotation to base_link, shape (3, 3)."""
     place, rpy_rad = (np.round(values, digits) + 0.0 for values, digits in ((xyz_m, 3), (rpy_from_matrix(turn), 4)))
     return suggest(
-        "state_extrinsics", {"read.placement": {name: {"xyz_m": place.tolist(), "rpy_rad": rpy_rad.tolist()}}}
+        "state_extrinsics", {"read.extrinsics": {name: {"xyz_m": place.tolist(), "rpy_rad": rpy_rad.tolist()}}}
     )

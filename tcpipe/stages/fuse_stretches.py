@@ -76,7 +76,7 @@ def fuse_stretches(inputs: FusionInputs, streams: Streams, config: FuseConfig) -
         trajectory = _add_mounting_uncertainty(trajectory, stretch, inputs)
         # 4. What came out is held against what went in.
         trajectory, audit = audit_trajectory(trajectory, stretch.measurements)
-        fused.disagreements += (replace(each, epoch=stretch.epoch) for each in audit.disagreements)
+        fused.disagreements += (replace(each, clock_epoch=stretch.clock_epoch) for each in audit.disagreements)
         fused.tallies += audit.tallies
         fused.windows, fused.astray = fused.windows + audit.windows, fused.astray + audit.astray
         fused.found.append(trajectory)
@@ -120,11 +120,11 @@ def _make_columns(
     stamp_ns, gap_ns, power_gap_ns = trajectory.stamp_ns, int(config.max_gap_s * 1e9), int(config.max_power_gap_s * 1e9)
     return {
         "stamp_ns": stamp_ns,
-        "epoch": np.full(stamp_ns.size, stretch.epoch, np.int16),
+        "clock_epoch": np.full(stamp_ns.size, stretch.clock_epoch, np.int16),
         **make_pose_columns(trajectory, inputs.datum_deg_m),
         "wheel_velocity_mps": make_wheel_column(stretch.measurements.wheels, stamp_ns, max_gap_ns=gap_ns),
-        **make_command_columns(streams, stretch.epoch, stamp_ns),
-        **make_power_columns(streams, stretch.epoch, stamp_ns, max_gap_ns=power_gap_ns),
+        **make_command_columns(streams, stretch.clock_epoch, stamp_ns),
+        **make_power_columns(streams, stretch.clock_epoch, stamp_ns, max_gap_ns=power_gap_ns),
     }
 
 
@@ -173,7 +173,7 @@ def make_command_columns(streams: Streams, epoch: int, at_ns: NDArray[np.int64])
     names = {"commanded_velocity_mps": "forward_velocity_mps", "commanded_yaw_rate_radps": "yaw_rate_radps"}
     if table is None:
         return {name: np.full(at_ns.size, np.nan) for name in names}
-    table = select_rows(table, "epoch", epoch)
+    table = select_rows(table, "clock_epoch", epoch)
     stamp_ns = to_integers(table, "stamp_ns")
     return {name: hold_last(stamp_ns, to_floats(table, source), at_ns) for name, source in names.items()}
 
@@ -207,7 +207,7 @@ def stretch_facts(stretch: TrackSection, initial: InitialState, found: Trajector
     m = stretch.measurements
     return replace(
         found.facts,
-        epoch=stretch.epoch,
+        clock_epoch=stretch.clock_epoch,
         start_ns=stretch.start_ns,
         end_ns=stretch.end_ns,
         rows=int(found.stamp_ns.size),

@@ -11,7 +11,7 @@ from tcpipe.fusion.trajectory import DISPLACEMENT_LAGS_S
 from tcpipe.motion.distance_breakdown import JUMP_M, compute_unexplained_m
 from tcpipe.motion.row_sections import Floats, Mask, MotionRows
 from tcpipe.motion.uncertainty import compute_along_std_m, compute_chord_ahead_std_m
-from tcpipe.recipe import GateConfig
+from tcpipe.recipe import MaskConfig
 from tcpipe.tables.catalogue import read_threshold
 from tcpipe.tables.columns import to_floats, to_integers
 from tcpipe.tables.findings import Finding, Subject, make_finding
@@ -42,7 +42,7 @@ class Gaps:
         return {name: int(getattr(self, name).sum()) for name in causes}
 
 
-def find_gaps(track: Track, rows: MotionRows, *, chord_m: float, config: GateConfig, max_plausible_mps: float) -> Gaps:
+def find_gaps(track: Track, rows: MotionRows, *, chord_m: float, config: MaskConfig, max_plausible_mps: float) -> Gaps:
     """Return the rows that bear no segment, by cause: no power in a run that has power, a moving row whose next chord is uncertain, a jump.
 
     An error of scale that all of a run has in common makes no segment worse than the next: it is left out of a chord's own uncertainty.
@@ -78,7 +78,7 @@ def find_gaps(track: Track, rows: MotionRows, *, chord_m: float, config: GateCon
     return Gaps(without_power, uncertain, jumps, contradicted, implausible, (*findings, *too_fast))
 
 
-def _compute_chord_std_m(track: Track, rows: MotionRows, chord_m: float, config: GateConfig) -> Floats:
+def _compute_chord_std_m(track: Track, rows: MotionRows, chord_m: float, config: MaskConfig) -> Floats:
     table = track.table
     course = np.arctan2(to_floats(table, "north_velocity_mps"), to_floats(table, "east_velocity_mps"))
     common_mps = _compute_common_std_mps(track)
@@ -98,12 +98,12 @@ def _compute_chord_std_m(track: Track, rows: MotionRows, chord_m: float, config:
 def _compute_common_std_mps(track: Track) -> Floats:
     """Return the part of each row's velocity deviation that its whole stretch has in common, since nothing tells how long a metre is."""
     table = track.table
-    stamp_ns, epoch = to_integers(table, "stamp_ns"), to_integers(table, "epoch")
+    stamp_ns, epoch = to_integers(table, "stamp_ns"), to_integers(table, "clock_epoch")
     speed_mps = np.linalg.norm([to_floats(table, f"{name}_velocity_mps") for name in ("east", "north", "up")], axis=0)
     scale_std = np.zeros(len(speed_mps))
     fuse = track.info.report.facts.fuse
     for stretch in fuse.stretches if fuse else ():
-        inside = (epoch == stretch.epoch) & (stamp_ns >= stretch.start_ns) & (stamp_ns <= stretch.end_ns)
+        inside = (epoch == stretch.clock_epoch) & (stamp_ns >= stretch.start_ns) & (stamp_ns <= stretch.end_ns)
         scale_std[inside] = stretch.common_scale_std or 0.0
     common_mps: Floats = scale_std * speed_mps
     return common_mps

@@ -31,10 +31,10 @@ from tcpipe.tables.bits import DropReason, Quality
 from tcpipe.tables.columns import read_lonlat_deg, to_floats, to_integers
 from tcpipe.tables.facts import PhysicsFacts
 from tcpipe.tables.levels import (
-    GATED_TRACK,
     LABELLED_SEGMENTS,
-    GatedTrack,
+    MASKED_TRACK,
     LabelledSegments,
+    MaskedTrack,
     Segments,
     Streams,
     TrackInfo,
@@ -45,7 +45,7 @@ from tcpipe.tables.wkb import make_lines
 
 def label_segments(
     segments: Segments,
-    gated: GatedTrack,
+    masked: MaskedTrack,
     streams: Streams,
     config: LabelConfig,
     *,
@@ -61,26 +61,26 @@ def label_segments(
     rule: Rule = "averaged" if streams.power_averaged else config.integration
     parts, joules = [LABELLED_SEGMENTS.empty()], Counter[str]()
     variance_j2: list[dict[str, NDArray[np.float64]]] = []
-    epochs: list[int] = np.unique(to_integers(gated.table, "epoch")).tolist()
+    epochs: list[int] = np.unique(to_integers(masked.table, "clock_epoch")).tolist()
     rails_by_epoch = {epoch: make_rails(streams, epoch) for epoch in epochs}
-    standing = find_idle_power(gated.table, rails_by_epoch, rate_hz=gated.info.rate_hz)
+    standing = find_idle_power(masked.table, rails_by_epoch, rate_hz=masked.info.rate_hz)
     for epoch, rails in rails_by_epoch.items():
-        rows, cut = (select_rows(table, "epoch", epoch) for table in (gated.table, segments.table))
-        joules.update(sum_energy_entries(rows, rails, rate_hz=gated.info.rate_hz, rule=rule))
+        rows, cut = (select_rows(table, "clock_epoch", epoch) for table in (masked.table, segments.table))
+        joules.update(sum_energy_entries(rows, rails, rate_hz=masked.info.rate_hz, rule=rule))
         if not cut.num_rows:
             continue
-        cost, above, causes = compute_segment_costs(cut, rows, rails, gated.info, rule=rule, standing=standing)
+        cost, above, causes = compute_segment_costs(cut, rows, rails, masked.info, rule=rule, standing=standing)
         variance_j2.append(causes)
         spans = to_integers(cut, "start_ns"), to_integers(cut, "end_ns")
         count, mean_watt = count_samples_inside(rails, *spans)
         flags = {
-            Quality.MEAN_POWER_DIFFERS: has_mean_mismatch(mean_watt, cost.power_watt),
-            Quality.CLOCK_DOUBTFUL: np.full(cut.num_rows, clock_doubtful(streams, gated.info)),
+            Quality.POWER_MEAN_MISMATCH: has_mean_mismatch(mean_watt, cost.power_watt),
+            Quality.CLOCK_DOUBTFUL: np.full(cut.num_rows, clock_doubtful(streams, masked.info)),
             **find_power_flags(cut, rails, range_volt=voltage_range_volt),
             **find_motion_flags(
                 cut,
                 rows,
-                gated.info,
+                masked.info,
                 arc_to_chord=config.flag_arc_to_chord,
                 max_position_std_m=config.flag_position_std_m,
             ),
@@ -88,7 +88,7 @@ def label_segments(
         parts.append(
             LABELLED_SEGMENTS.table(
                 **{name: cut[name] for name in cut.column_names},
-                **make_motion_columns(cut, rows, streams, gated.info, cost),
+                **make_motion_columns(cut, rows, streams, masked.info, cost),
                 **{name: getattr(cost, name) for name in Labels.__slots__},
                 **{name: getattr(above, name) for name in NetLabels.__slots__},
                 voltage_volt=mean_between(to_integers(rows, "stamp_ns"), to_floats(rows, "voltage_volt"), *spans),
@@ -99,15 +99,15 @@ def label_segments(
             )
         )
     table, physics = add_physics(pa.concat_tables(parts).combine_chunks(), standing.watt)
-    ledger_m, velocity = segments.ledger_m, config.velocity
+    distance_by_reason_m, velocity = segments.distance_by_reason_m, config.velocity
     facts = label_facts(
-        table, rails_by_epoch, joules, ledger_m, variance_j2, rule=rule, velocity=velocity, physics=physics
+        table, rails_by_epoch, joules, distance_by_reason_m, variance_j2, rule=rule, velocity=velocity, physics=physics
     )
     info = add_findings(segments.info, label_findings(facts), replace(segments.info.report.facts, label=facts))
-    return LabelledSegments(table, info, segments.ledger_m)
+    return LabelledSegments(table, info, segments.distance_by_reason_m)
 
 
-_DISPLACEMENTS = [c.name for c in GATED_TRACK.columns if c.name.startswith("displacement_std_")]
+_DISPLACEMENTS = [c.name for c in MASKED_TRACK.columns if c.name.startswith("displacement_std_")]
 _BETTER_HZ = 20.0
 
 
@@ -120,7 +120,7 @@ def compute_segment_costs(
 
     Parameters
     ----------
-    rows : the gated track's rows of that epoch.
+    rows : the masked track's rows of that epoch.
     """
     start_ns, end_ns, stamp_ns = to_integers(cut, "start_ns"), to_integers(cut, "end_ns"), to_integers(rows, "stamp_ns")
     spans = start_ns, end_ns, _find_stationary_ns(rows, info.rate_hz)
@@ -139,8 +139,8 @@ def compute_segment_costs(
     )
     above = subtract_idle_power(
         cost,
-        standing_watt=standing.watt,
-        standing_std_watt=standing.std_watt,
+        idle_watt=standing.watt,
+        idle_std_watt=standing.std_watt,
         end_power_watt=end_watt,
         energy_noise_joule=noise_joule,
     )
@@ -176,8 +176,8 @@ def _compute_displacement_std_m(cut: pa.Table, rows: pa.Table, *, smoothed: bool
 def _find_stationary_ns(rows: pa.Table, rate_hz: float) -> NDArray[np.int64]:
     """Return begin and end [ns] of every stretch in which the robot stands, shape (S, 2)."""
     stamp_ns = to_integers(rows, "stamp_ns")
-    piece = number_pieces(stamp_ns, to_integers(rows, "epoch"), period_ns=1e9 / rate_hz)
-    standing = (to_numbers(rows["dropped_by"]) & np.uint32(DropReason.STANDING)) != 0
+    piece = number_pieces(stamp_ns, to_integers(rows, "clock_epoch"), period_ns=1e9 / rate_hz)
+    standing = (to_numbers(rows["dropped_by"]) & np.uint32(DropReason.STATIONARY)) != 0
     return stamp_ns[find_runs(standing, piece)]
 
 
@@ -186,14 +186,14 @@ _EDGE_S = 0.3
 
 
 def find_idle_power(rows: pa.Table, rails: Mapping[int, list[Rail]], *, rate_hz: float) -> IdlePower:
-    """Return the power while standing, of all rows of a gated track, and how sure it is.
+    """Return the power while standing, of all rows of a masked track, and how sure it is.
 
     Parameters
     ----------
     rails : by clock epoch, for the step in which they tell currents.
     """
-    piece = number_pieces(to_integers(rows, "stamp_ns"), to_integers(rows, "epoch"), period_ns=1e9 / rate_hz)
-    standing = (to_numbers(rows["dropped_by"]) & np.uint32(DropReason.STANDING)) != 0
+    piece = number_pieces(to_integers(rows, "stamp_ns"), to_integers(rows, "clock_epoch"), period_ns=1e9 / rate_hz)
+    standing = (to_numbers(rows["dropped_by"]) & np.uint32(DropReason.STATIONARY)) != 0
     halt, edge = np.full(rows.num_rows, -1), round(_EDGE_S * rate_hz)
     for number, (first, last) in enumerate(find_runs(standing, piece).tolist()):
         halt[first + edge : max(last + 1 - edge, first + edge)] = number
@@ -213,25 +213,25 @@ def _step_watt(rails: Mapping[int, list[Rail]]) -> float:
     return float(np.linalg.norm(steps)) if steps else 0.0
 
 
-def add_physics(table: pa.Table, standing_watt: float) -> tuple[pa.Table, PhysicsFacts]:
+def add_physics(table: pa.Table, idle_watt: float) -> tuple[pa.Table, PhysicsFacts]:
     """Return the labelled segments with the power that standing, drivetrain, rolling, grade and turning predict, and the fit.
 
     Parameters
     ----------
     table : labelled segments of a run.
-    standing_watt : what the robot draws while it stands; NaN where that is not known.
+    idle_watt : what the robot draws while it stands; NaN where that is not known.
     """
     metres = FitSamples(
         power_watt=to_floats(table, "power_watt"),
         velocity_mps=to_floats(table, "velocity_mps"),
         rise=(to_floats(table, "end_z_m") - to_floats(table, "start_z_m")) / to_floats(table, "chord_m"),
-        turn_rate_radps=to_floats(table, "turn_rate_radps"),
+        mean_abs_yaw_rate_radps=to_floats(table, "mean_abs_yaw_rate_radps"),
         terrain=np.full(table.num_rows, ALL),
     )
-    watt = standing_watt if np.isfinite(standing_watt) else None
-    found = fit_physics(metres, standing_watt=watt)
+    watt = idle_watt if np.isfinite(idle_watt) else None
+    found = fit_physics(metres, idle_watt=watt)
     if found is None or not found.is_plausible():
-        return table, PhysicsFacts(fitted=False, standing_watt=watt)
+        return table, PhysicsFacts(fitted=False, idle_watt=watt)
     predicted = np.where(np.isfinite(metres.power_watt), found.power_watt(metres), np.nan)
     odd = found.is_outlier(metres.power_watt - predicted)
     quality = to_numbers(table["quality"]) | np.where(odd, np.uint32(Quality.PHYSICS_OUTLIER), np.uint32(0))
@@ -240,7 +240,7 @@ def add_physics(table: pa.Table, standing_watt: float) -> tuple[pa.Table, Physic
     resistance, rolling, drive = found.rolling_resistance(), found.of("rolling"), found.of("grade")
     return table, PhysicsFacts(
         fitted=True,
-        standing_watt=watt,
+        idle_watt=watt,
         weight_over_efficiency_newton=None if drive is None else drive[0],
         rolling_newton=None if rolling is None else rolling[0],
         rolling_resistance=None if resistance is None else resistance[0],
@@ -248,5 +248,5 @@ def add_physics(table: pa.Table, standing_watt: float) -> tuple[pa.Table, Physic
         residual_watt=found.residual_watt,
         segments=found.segments,
         outliers=int(odd.sum()),
-        fit=fit_and_validate_physics(metres, standing_watt=watt),
+        fit=fit_and_validate_physics(metres, idle_watt=watt),
     )

@@ -27,7 +27,7 @@ def label_facts(
     table: pa.Table,
     rails: Mapping[int, list[Rail]],
     energy_by_entry_joule: Mapping[str, float],
-    ledger_m: Mapping[str, float],
+    distance_by_reason_m: Mapping[str, float],
     energy_variance_j2: Sequence[Mapping[str, NDArray[np.float64]]],
     *,
     rule: Rule,
@@ -40,7 +40,7 @@ def label_facts(
     ----------
     rails : drive rails by clock epoch.
     energy_by_entry_joule : [J], what was recorded, by ledger entry.
-    ledger_m : [m], by entry; its sum is the distance.
+    distance_by_reason_m : [m], by entry; its sum is the distance.
     energy_variance_j2 : [J²], of the segments' energies by cause, epoch by epoch in the table's order.
     velocity : which velocity trains, ground or fused.
     """
@@ -48,7 +48,7 @@ def label_facts(
     quality = to_numbers(table["quality"])
     energy = to_floats(table, "energy_joule")
     return LabelFacts(
-        distance_m=sum(ledger_m.values()),
+        distance_m=sum(distance_by_reason_m.values()),
         energy_joule=sum(energy_by_entry_joule.values()) if powered else None,
         energy_by_entry_joule=dict(energy_by_entry_joule) if powered else None,
         integration=rule,
@@ -90,7 +90,7 @@ def label_findings(facts: LabelFacts) -> tuple[Finding, ...]:
     slips = facts.quality["high_slip"]
     if slips > read_threshold("wheels-slip", "min_segment_fraction") * facts.segments:
         findings.append(make_finding("wheels-slip", _WHEELS, segment_fraction=slips / facts.segments))
-    idle, driving = facts.physics.standing_watt, facts.median_power_watt
+    idle, driving = facts.physics.idle_watt, facts.median_power_watt
     least, few = (read_threshold("idle-power-high", name) for name in ("min_idle_fraction", "min_idle_watt"))
     if idle is not None and driving is not None and idle > max(least * driving, few):
         findings.append(make_finding("idle-power-high", _POWER, idle_watt=idle, driving_watt=driving))

@@ -33,12 +33,12 @@ def make_motion_columns(cut: pa.Table, rows: pa.Table, streams: Streams, info: T
 
     Parameters
     ----------
-    cut, rows : the epoch's segments, and its rows of the gated track.
+    cut, rows : the epoch's segments, and its rows of the masked track.
     streams : for the IMU's samples.
     cost : of the segments, for how sure their velocity is.
     """
-    epoch = int(to_integers(cut, "epoch")[0])
-    imu = select_rows(streams.tables["imu"], "epoch", epoch) if "imu" in streams.tables else None
+    epoch = int(to_integers(cut, "clock_epoch")[0])
+    imu = select_rows(streams.tables["imu"], "clock_epoch", epoch) if "imu" in streams.tables else None
     spans = to_integers(cut, "start_ns"), to_integers(cut, "end_ns")
     return {
         **_compute_turns(cut, rows, imu, info),
@@ -51,15 +51,15 @@ def make_motion_columns(cut: pa.Table, rows: pa.Table, streams: Streams, info: T
 def _compute_turns(cut: pa.Table, rows: pa.Table, imu: pa.Table | None, info: TrackInfo) -> Arrays:
     stamp_ns, start_ns, end_ns = to_integers(rows, "stamp_ns"), to_integers(cut, "start_ns"), to_integers(cut, "end_ns")
     yaw_rad = np.unwrap(to_floats(rows, "yaw_rad"))
-    turn_rad = interpolate(stamp_ns, yaw_rad, end_ns) - interpolate(stamp_ns, yaw_rad, start_ns)
+    yaw_change_rad = interpolate(stamp_ns, yaw_rad, end_ns) - interpolate(stamp_ns, yaw_rad, start_ns)
     duration_s, arc_m = (end_ns - start_ns) * 1e-9, to_floats(cut, "arc_length_m")
     std_rad = np.sqrt(_turn_density(cut, imu, info) * duration_s)
     return {
-        "turn_rad": turn_rad,
-        "turn_std_rad": std_rad,
-        "turn_rate_radps": mean_between(stamp_ns, np.abs(to_floats(rows, "yaw_rate_radps")), start_ns, end_ns),
-        "turn_rate_std_radps": std_rad / duration_s,
-        "curvature_radpm": turn_rad / arc_m,
+        "yaw_change_rad": yaw_change_rad,
+        "yaw_change_std_rad": std_rad,
+        "mean_abs_yaw_rate_radps": mean_between(stamp_ns, np.abs(to_floats(rows, "yaw_rate_radps")), start_ns, end_ns),
+        "mean_abs_yaw_rate_std_radps": std_rad / duration_s,
+        "curvature_radpm": yaw_change_rad / arc_m,
         "curvature_std_radpm": std_rad / arc_m,
     }
 
@@ -76,9 +76,9 @@ def _turn_density(cut: pa.Table, imu: pa.Table | None, info: TrackInfo) -> NDArr
     if imu is None or imu.num_rows < 2 or facts is None or info.estimator != "smoother":
         return density
     rate_hz = 1e9 / compute_median_period_ns(np.unique(to_integers(imu, "stamp_ns")))
-    epoch = int(to_integers(cut, "epoch")[0])
+    epoch = int(to_integers(cut, "clock_epoch")[0])
     for each in facts.stretches:
-        if each.epoch == epoch and IMU in each.sensors and each.gyro_noise_radps is not None:
+        if each.clock_epoch == epoch and IMU in each.sensors and each.gyro_noise_radps is not None:
             mine = (start_ns >= each.start_ns) & (start_ns <= each.end_ns)
             density[mine] = estimate_gyro_density(each.gyro_noise_radps, rate_hz)
     return density
@@ -136,11 +136,11 @@ def find_power_flags(cut: pa.Table, rails: list[Rail], *, range_volt: tuple[floa
 def find_motion_flags(
     cut: pa.Table, rows: pa.Table, info: TrackInfo, *, arc_to_chord: float, max_position_std_m: float
 ) -> Flags:
-    """Return the flags that the gated rows of one epoch give its segments.
+    """Return the flags that the masked rows of one epoch give its segments.
 
     Parameters
     ----------
-    info : the gated track's; it knows which command is full speed.
+    info : the masked track's; it knows which command is full speed.
     arc_to_chord : a segment more curved than this is flagged.
     max_position_std_m : [m], a segment with an end less certain than this is flagged.
     """
@@ -149,8 +149,8 @@ def find_motion_flags(
     wheel_mps = mean_between(stamp_ns, to_floats(rows, "wheel_velocity_mps"), start_ns, end_ns)
     driven_m = np.concatenate(([0.0], np.cumsum(np.hypot(*(np.diff(to_floats(rows, f"{axis}_m")) for axis in "xy")))))
     start_m, end_m = (interpolate(stamp_ns, driven_m, at_ns) for at_ns in (start_ns, end_ns))
-    gate, commanded_mps = info.report.facts.gate, to_floats(cut, "commanded_velocity_mps")
-    full_speed_mps = gate.full_speed_mps if gate else None
+    mask, commanded_mps = info.report.facts.mask, to_floats(cut, "commanded_velocity_mps")
+    full_speed_mps = mask.full_speed_mps if mask else None
     return {
         Quality.NEAR_GAP: spans_near(
             driven_m[_find_gap_edges(rows, info.rate_hz)], start_m, end_m, within_m=float(chord_m[0])
@@ -159,18 +159,20 @@ def find_motion_flags(
         Quality.WEAK_GNSS: to_floats(cut, "position_std_m") > max_position_std_m,
         Quality.CURVED: to_floats(cut, "arc_length_m") > arc_to_chord * chord_m,
         Quality.NO_COMMAND: np.isnan(commanded_mps),
-        Quality.NOT_AT_LIMIT: np.abs(commanded_mps) < (full_speed_mps or 0.0),
+        Quality.BELOW_FULL_SPEED: np.abs(commanded_mps) < (full_speed_mps or 0.0),
         Quality.SENSORS_DISAGREE: _find_disputed(cut, info),
     }
 
 
 def _find_disputed(cut: pa.Table, info: TrackInfo) -> NDArray[np.bool_]:
     """Return the segments of one epoch that touch a time in which a sensor disagrees with the track undecided, or fixes were off it."""
-    start_ns, end_ns, epoch = to_integers(cut, "start_ns"), to_integers(cut, "end_ns"), to_integers(cut, "epoch")
+    start_ns, end_ns, epoch = to_integers(cut, "start_ns"), to_integers(cut, "end_ns"), to_integers(cut, "clock_epoch")
     facts = info.report.facts
-    times = [(e.epoch, e.start_ns, e.end_ns) for e in (facts.audit.disagreements if facts.audit else ()) if not e.alone]
+    times = [
+        (e.clock_epoch, e.start_ns, e.end_ns) for e in (facts.audit.disagreements if facts.audit else ()) if not e.alone
+    ]
     for stretch in facts.fuse.stretches if facts.fuse else ():
-        times += [(stretch.epoch, r.start_ns, r.end_ns) for r in stretch.reopenings if r.role == GNSS]
+        times += [(stretch.clock_epoch, r.start_ns, r.end_ns) for r in stretch.gate_resets if r.role == GNSS]
     disputed = np.zeros(cut.num_rows, dtype=np.bool_)
     for of_epoch, first_ns, last_ns in times:
         disputed |= (epoch == of_epoch) & (start_ns <= last_ns) & (end_ns >= first_ns)
@@ -179,7 +181,7 @@ def _find_disputed(cut: pa.Table, info: TrackInfo) -> NDArray[np.bool_]:
 
 def _find_gap_edges(rows: pa.Table, rate_hz: float) -> NDArray[np.bool_]:
     """Return the rows that are in a gap, or beside a hole."""
-    piece = number_pieces(to_integers(rows, "stamp_ns"), to_integers(rows, "epoch"), period_ns=1e9 / rate_hz)
+    piece = number_pieces(to_integers(rows, "stamp_ns"), to_integers(rows, "clock_epoch"), period_ns=1e9 / rate_hz)
     hole = np.diff(piece) != 0
     edge: NDArray[np.bool_] = (to_numbers(rows["dropped_by"]) & np.uint32(DropReason.GAP)) != 0
     edge[:-1] |= hole

@@ -1,4 +1,4 @@
-"""Track to GatedTrack: mark what is not steady driving, and why; nothing is deleted."""
+"""Track to MaskedTrack: mark what is not steady driving, and why; nothing is deleted."""
 
 from __future__ import annotations
 
@@ -8,26 +8,26 @@ import numpy as np
 
 from tcpipe.motion import masks
 from tcpipe.motion.row_sections import Mask, MotionRows, number_pieces
-from tcpipe.recipe import GateConfig
+from tcpipe.recipe import MaskConfig
 from tcpipe.recipe.suggestions import suggest
 from tcpipe.robots.profiles import MAX_PLAUSIBLE_MPS
 from tcpipe.stages.gate_gaps import find_gaps
 from tcpipe.tables.bits import DropReason, flag_name
 from tcpipe.tables.catalogue import read_threshold
 from tcpipe.tables.columns import to_floats, to_integers
-from tcpipe.tables.facts import GateFacts
+from tcpipe.tables.facts import MaskFacts
 from tcpipe.tables.findings import Finding, Remedy, Subject, make_finding
-from tcpipe.tables.levels import GATED_TRACK, GatedTrack, Track, add_findings
+from tcpipe.tables.levels import MASKED_TRACK, MaskedTrack, Track, add_findings
 
 
 def mask_track(
     track: Track,
-    config: GateConfig,
+    config: MaskConfig,
     *,
     max_velocity_mps: float | None,
     chord_m: float,
     max_plausible_mps: float = MAX_PLAUSIBLE_MPS,
-) -> GatedTrack:
+) -> MaskedTrack:
     """Return the track with ``dropped_by``: every reason why a row is not steady driving at the terrain's limit.
 
     Parameters
@@ -46,7 +46,9 @@ def mask_track(
         yaw_rate_radps=to_floats(table, "yaw_rate_radps"),
         wheel_velocity_mps=to_floats(table, "wheel_velocity_mps"),
         commanded_mps=to_floats(table, "commanded_velocity_mps"),
-        piece=number_pieces(to_integers(table, "stamp_ns"), to_integers(table, "epoch"), period_ns=1e9 * period_s),
+        piece=number_pieces(
+            to_integers(table, "stamp_ns"), to_integers(table, "clock_epoch"), period_ns=1e9 * period_s
+        ),
         period_s=period_s,
     )
     gaps = find_gaps(
@@ -57,11 +59,11 @@ def mask_track(
     limit_mps = limit.limit_mps
     slowest = limit_mps and config.full_speed_fraction * limit_mps
     if slowest is not None and config.require_full_speed:
-        found[DropReason.BELOW_LIMIT] = masks.find_below_full_speed(
+        found[DropReason.BELOW_FULL_SPEED] = masks.find_below_full_speed(
             rows, limit_mps=slowest, window_s=config.command_window_s
         )
     dropped_by = np.bitwise_or.reduce([np.uint32(reason) * mask for reason, mask in found.items()])
-    facts = GateFacts(
+    facts = MaskFacts(
         rows=table.num_rows,
         rows_kept=int((dropped_by == 0).sum()),
         gap_rows=gaps.counts(),
@@ -69,19 +71,19 @@ def mask_track(
         max_velocity_mps=limit_mps,
         full_speed_mps=slowest,
     )
-    gated = GATED_TRACK.table(**{name: table[name] for name in table.column_names}, dropped_by=dropped_by)
+    masked = MASKED_TRACK.table(**{name: table[name] for name in table.column_names}, dropped_by=dropped_by)
     findings = (*gaps.findings, *find_limits(rows, dropped_by, limit, config))
-    return GatedTrack(gated, add_findings(track.info, findings, replace(track.info.report.facts, gate=facts)))
+    return MaskedTrack(masked, add_findings(track.info, findings, replace(track.info.report.facts, mask=facts)))
 
 
-def _find_motion_reasons(rows: MotionRows, config: GateConfig) -> dict[DropReason, Mask]:
+def _find_motion_reasons(rows: MotionRows, config: MaskConfig) -> dict[DropReason, Mask]:
     stuck = masks.find_stuck(
         rows,
-        standing_velocity_mps=config.standing_velocity_mps,
+        stationary_velocity_mps=config.stationary_velocity_mps,
         wheel_velocity_above_mps=config.stuck_wheel_velocity_mps,
     )
     standing = masks.find_stationary(
-        rows, below_velocity_mps=config.standing_velocity_mps, below_yaw_rate_radps=config.standing_yaw_rate_radps
+        rows, below_velocity_mps=config.stationary_velocity_mps, below_yaw_rate_radps=config.stationary_yaw_rate_radps
     )
     turning = masks.find_turning_in_place(
         rows,
@@ -90,9 +92,9 @@ def _find_motion_reasons(rows: MotionRows, config: GateConfig) -> dict[DropReaso
         min_radius_m=config.min_turn_radius_m,
         min_s=config.min_event_s,
     )
-    back = masks.find_reversing(rows, standing_velocity_mps=config.standing_velocity_mps)
+    back = masks.find_reversing(rows, stationary_velocity_mps=config.stationary_velocity_mps)
     return {
-        DropReason.STANDING: standing & ~stuck,
+        DropReason.STATIONARY: standing & ~stuck,
         DropReason.STUCK: stuck,
         DropReason.TURNING_IN_PLACE: turning & ~standing & ~stuck,
         DropReason.REVERSING: back & (not config.keep_reversing),
@@ -100,7 +102,7 @@ def _find_motion_reasons(rows: MotionRows, config: GateConfig) -> dict[DropReaso
     }
 
 
-def _find_accelerating(rows: MotionRows, halted: Mask, config: GateConfig) -> Mask:
+def _find_accelerating(rows: MotionRows, halted: Mask, config: MaskConfig) -> Mask:
     """Mark commanded changes where there are commands, lasting accelerations where there are none, and ramps beside halts."""
     slope = masks.estimate_forward_acceleration_mps2(rows, window_s=config.acceleration_window_s)
     lasting = masks.find_accelerating(
@@ -118,7 +120,7 @@ _MOST = 0.5
 
 
 _COMMAND = Subject("role", "command")
-_KEEP = suggest("keep", {"gate": {"require_full_speed": False}})
+_KEEP = suggest("keep", {"mask": {"require_full_speed": False}})
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,7 +133,7 @@ class SpeedLimit:
     findings: tuple[Finding, ...] = ()
 
 
-def find_speed_limit(rows: MotionRows, config: GateConfig, *, max_velocity_mps: float | None) -> SpeedLimit:
+def find_speed_limit(rows: MotionRows, config: MaskConfig, *, max_velocity_mps: float | None) -> SpeedLimit:
     """Return the limit of a run, of a robot whose profile says ``max_velocity_mps`` [m/s]; the recipe's goes first."""
     top, held = masks.find_top_command(
         rows,
@@ -154,7 +156,7 @@ def find_speed_limit(rows: MotionRows, config: GateConfig, *, max_velocity_mps: 
     return SpeedLimit(top, top, held, (found,))
 
 
-def find_limits(rows: MotionRows, dropped_by: Mask, limit: SpeedLimit, config: GateConfig) -> tuple[Finding, ...]:
+def find_limits(rows: MotionRows, dropped_by: Mask, limit: SpeedLimit, config: MaskConfig) -> tuple[Finding, ...]:
     """Return the findings on commands: that there are none, that no limit is known, that most was driven below it."""
     commanded, moving = np.isfinite(rows.commanded_mps), np.abs(rows.velocity_mps) > config.turning_velocity_mps
     if not commanded.any():
@@ -162,7 +164,7 @@ def find_limits(rows: MotionRows, dropped_by: Mask, limit: SpeedLimit, config: G
     if limit.limit_mps is None and config.require_full_speed:
         remedies = (*_state_limit(np.nanmax(rows.commanded_mps)), *_KEEP)
         return (make_finding("max-velocity-unknown", _COMMAND, remedies=remedies),)
-    slow = (dropped_by & DropReason.BELOW_LIMIT) != 0
+    slow = (dropped_by & DropReason.BELOW_FULL_SPEED) != 0
     if (
         limit.limit_mps
         and slow[moving].sum() > read_threshold("driven-below-limit", "min_slow_fraction") * moving.sum()
@@ -181,4 +183,4 @@ def find_limits(rows: MotionRows, dropped_by: Mask, limit: SpeedLimit, config: G
 
 
 def _state_limit(speed_mps: float) -> tuple[Remedy, ...]:
-    return suggest("state", {"gate": {"max_velocity_mps": round(float(speed_mps), 2)}})
+    return suggest("state", {"mask": {"max_velocity_mps": round(float(speed_mps), 2)}})

@@ -25,7 +25,7 @@ def make_rails(streams: Streams, epoch: int) -> list[Rail]:
         return []
     # Of the whole run: a rail that is silent in an epoch is not known there.
     names = sorted(pc.unique(table["rail"]).to_pylist())
-    table = select_rows(table, "epoch", epoch)
+    table = select_rows(table, "clock_epoch", epoch)
     rails = []
     for name in names:
         mine = select_rows(table, "rail", name)
@@ -53,7 +53,7 @@ def sum_energy_entries(rows: pa.Table, rails: list[Rail], *, rate_hz: float, rul
 
     Parameters
     ----------
-    rows : the gated track's rows of that epoch.
+    rows : the masked track's rows of that epoch.
     rate_hz : [Hz], of the track.
 
     Returns
@@ -62,7 +62,7 @@ def sum_energy_entries(rows: pa.Table, rails: list[Rail], *, rate_hz: float, rul
     before the track begins or after it ends).
     """
     stamp_ns = to_integers(rows, "stamp_ns")
-    piece = number_pieces(stamp_ns, to_integers(rows, "epoch"), period_ns=1e9 / rate_hz)
+    piece = number_pieces(stamp_ns, to_integers(rows, "clock_epoch"), period_ns=1e9 / rate_hz)
     reason = find_interval_reason(to_numbers(rows["dropped_by"]), piece)
     spent = integrate_recorded_energy(rails, stamp_ns[:-1], stamp_ns[1:], rule=rule)
     record = _integrate_whole_record(rails, rule)

@@ -93,7 +93,7 @@ def read_run(log: LogReader, config: ReadConfig, *, robot: str | None, known: Pr
 
 def _read_times(source: TopicReadings, config: ReadConfig) -> TopicTimes:
     readings = source.readings
-    prefer = config.time.get(source.role, "auto")
+    prefer = config.time_source.get(source.role, "auto")
     stamps = readings.header_ns if readings.own_time_ns is None or prefer == "header" else readings.own_time_ns
     return TopicTimes(
         readings.log_time_ns,
@@ -115,7 +115,7 @@ def make_role_table(
     if len(parts) == 1:  # in order already
         return STREAMS[role].table(**parts[0])
     columns = {name: np.concatenate([part.pop(name) for part in parts]) for name in list(parts[0])}
-    order = np.lexsort((columns["stamp_ns"], columns["epoch"]))
+    order = np.lexsort((columns["stamp_ns"], columns["clock_epoch"]))
     return STREAMS[role].table(**{name: columns.pop(name)[order] for name in list(columns)})
 
 
@@ -126,7 +126,7 @@ def _read_parts(source: TopicReadings, timeline: Timeline, power: PowerReadings)
     times: dict[str, NDArray[Any]] = {
         "stamp_ns": timeline.stamp_ns,
         "log_time_ns": source.readings.log_time_ns[timeline.row],
-        "epoch": timeline.epoch,
+        "clock_epoch": timeline.clock_epoch,
     }
     if source.role != "power":
         return [times | columns]

@@ -48,7 +48,7 @@ def read_findings(
         epochs=len(steps) + 1,
         clock_steps=tuple(steps),
         time_offset_s=offset_s,
-        power=None if power.current_sign is None else PowerSign(power.current_sign, power.averaged, power.includes),
+        power=None if power.current_sign is None else PowerSign(power.current_sign, power.averaged, power.other_loads),
     )
     return StageReport(tuple(dict.fromkeys(findings)), facts)
 
@@ -110,5 +110,5 @@ def _make_topic_facts(source: TopicReadings, timeline: Timeline) -> TopicFacts:
 
 def _rate_hz(timeline: Timeline) -> float | None:
     """Return one over the median period inside epochs [Hz]."""
-    period_ns = np.diff(timeline.stamp_ns)[np.diff(timeline.epoch) == 0]
+    period_ns = np.diff(timeline.stamp_ns)[np.diff(timeline.clock_epoch) == 0]
     return 1e9 / float(np.median(period_ns)) if len(period_ns) else None

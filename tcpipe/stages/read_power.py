@@ -94,7 +94,7 @@ def read_rail_power(
     voltage, current = (columns[name] for name in name_rail_columns(rail.name))
     if rail.counter is not None:
         energy, resets = (columns[name] for name in name_counter_columns(rail.name))
-        breaks = resets + times["epoch"] * (1 + np.max(resets, initial=0))
+        breaks = resets + times["clock_epoch"] * (1 + np.max(resets, initial=0))
         current = np.where(np.isnan(current), np.nan, Counter(energy, breaks).mean_amp(times["stamp_ns"], voltage))
     return voltage, current
 
@@ -108,14 +108,14 @@ def add_averaging(
         return replace(power, averaged=config.power_averaged == "yes"), ()
     if not power.averaging_unknown or "power" not in streams:
         return power, ()
-    table = select_rows(streams["power"], "epoch", 0)
+    table = select_rows(streams["power"], "clock_epoch", 0)
     rail = select_rows(table, "rail", table["rail"][0].as_py())
     power_ns, watt = _compute_power_at_currents(rail)
     period_s = float(np.median(np.diff(power_ns))) / 1e9 if len(power_ns) > 1 else np.inf
     if period_s < read_threshold(_ASSUMED, "min_period_s"):
         return power, ()
     motion = next((streams[role] for role in ("wheel_odometry", "visual_odometry") if role in streams), None)
-    told = None if motion is None else _test_by_motion(power_ns, watt, select_rows(motion, "epoch", 0))
+    told = None if motion is None else _test_by_motion(power_ns, watt, select_rows(motion, "clock_epoch", 0))
     averaged = power.averaged if told is None else told
     power = replace(power, averaged=averaged)
     if told is None and period_s < read_threshold(_ASSUMED, "min_unobserved_period_s"):
@@ -180,7 +180,7 @@ def remove_repeats(streams: Streams) -> tuple[Streams, list[Repeats]]:
     if power is None:
         return streams, []
     step_ns = np.where(
-        np.diff(to_integers(power, "epoch")) != 0, _BETWEEN_EPOCHS_NS, np.diff(to_integers(power, "stamp_ns"))
+        np.diff(to_integers(power, "clock_epoch")) != 0, _BETWEEN_EPOCHS_NS, np.diff(to_integers(power, "stamp_ns"))
     )
     at_ns = np.concatenate(([0], np.cumsum(step_ns)))
     values = {quantity: to_floats(power, column) for quantity, column in _QUANTITIES.items()}

@@ -42,7 +42,7 @@ def decide_roles(config: ReadConfig, topics: Iterable[Topic], robot: str | None,
         known=known,
         namespace=config.namespace,
         mapped=config.fields,
-        pose_from=config.pose_from,
+        pose_sources=config.pose_sources,
     )
     free = [topic for topic in topics if topic.name not in config.ignore_topics]
     findings = (*assignment.findings, *propose_roles(free, {*assignment.roles, *config.topics}))
@@ -62,9 +62,9 @@ def decide_roles(config: ReadConfig, topics: Iterable[Topic], robot: str | None,
 def _find_unused_keys(config: ReadConfig, assignment: RoleAssignment) -> Iterator[Finding]:
     """Yield a finding for each key of the recipe that is for a role without a topic."""
     for key, given in (
-        ("placement", config.placement),
+        ("extrinsics", config.extrinsics),
         ("odometry_scale", config.odometry_scale),
-        ("time", config.time),
+        ("time_source", config.time_source),
     ):
         for role in given:
             if role not in assignment.roles:

@@ -12,7 +12,7 @@ from tcpipe.geometry.rotation import quat_from_rpy
 from tcpipe.logs.clocks import Timeline
 from tcpipe.logs.extrinsics import IDENTITY, Pose, Tree, build_static_tree, find_base_link_from, is_base
 from tcpipe.logs.roles import RoleAssignment
-from tcpipe.recipe import Placement, ReadConfig, Role
+from tcpipe.recipe import Extrinsics, ReadConfig, Role
 from tcpipe.recipe.suggestions import suggest
 from tcpipe.stages.message_arrays import read_transforms
 from tcpipe.stages.protocols import LogReader
@@ -42,7 +42,7 @@ def place_sensors(
     open_frames = {
         frame
         for role, frame in frame_of.items()
-        if role not in config.placement and role not in _WITHOUT_PLACE and not is_base(frame)
+        if role not in config.extrinsics and role not in _WITHOUT_PLACE and not is_base(frame)
     }
     tree = _build_tree(log, tables, assignment, open_frames)
     sensors: dict[str, Sensor] = {}
@@ -55,7 +55,7 @@ def place_sensors(
             findings.append(make_finding("several-frames", subject, names=names, frames_count=len(several)))
         if placed_by == "assumed":
             names = {"frame": frame or "an unnamed frame", "topic": of_role[role][0].topic}
-            remedies = suggest("place", {"read.placement": {role: asdict(Placement())}})
+            remedies = suggest("place", {"read.extrinsics": {role: asdict(Extrinsics())}})
             findings.append(make_finding("sensor-not-placed", subject, names=names, remedies=remedies))
         sensors[role] = Sensor(
             topic=" + ".join(source.topic for source in of_role[role]),
@@ -86,8 +86,8 @@ def _build_tree(
 
 
 def _place(role: Role, frame: str, tree: Tree, config: ReadConfig) -> tuple[Pose, str]:
-    if role in config.placement:
-        given = config.placement[role]
+    if role in config.extrinsics:
+        given = config.extrinsics[role]
         return Pose(IDENTITY.xyz_m + given.xyz_m, quat_from_rpy(*given.rpy_rad)), "recipe"
     if role in _WITHOUT_PLACE:
         return IDENTITY, "not needed"

@@ -95,7 +95,7 @@ def read_sources(
 def _as_the_recipe_says(source: TopicReadings, config: ReadConfig) -> Readings:
     """Return a topic's readings in the units and scale that the recipe states."""
     readings, role = source.readings, source.role
-    if role == "gnss" and config.time.get(role) != "header":
+    if role == "gnss" and config.time_source.get(role) != "header":
         return replace(readings, findings=(*readings.findings, *find_utc_offset(readings)))
     if role == "imu":
         return convert_imu_to_si(readings, config.imu_units)

@@ -104,7 +104,7 @@ def sum_losses(arc_length_m: NDArray[np.float64], lost_by: NDArray[np.uint32]) -
 def _find_in_map(source: MapReader, config: SampleConfig, projection: Projection) -> tuple[Finding, ...]:
     """Return what is doubtful about a map whatever segments lie on it: its datum, and the size of its pixels."""
     subject, patch_pixel_m = Subject("map", source.name), config.patch_m / config.patch_px
-    map_pixel_m = level_for(source, patch_pixel_m).grid.pitch_m
+    map_pixel_m = level_for(source, patch_pixel_m).grid.pixel_size_m
     findings = projection.find_rough_shift(subject)
     if not has_other_pixels(patch_pixel_m, map_pixel_m):
         return findings

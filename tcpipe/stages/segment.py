@@ -1,4 +1,4 @@
-"""GatedTrack to Segments: cut every steady stretch by chord, and account for every metre of the track."""
+"""MaskedTrack to Segments: cut every steady stretch by chord, and account for every metre of the track."""
 
 from __future__ import annotations
 
@@ -29,16 +29,16 @@ from tcpipe.tables.catalogue import read_threshold
 from tcpipe.tables.columns import to_floats, to_integers
 from tcpipe.tables.facts import SegmentFacts
 from tcpipe.tables.findings import Finding, Subject, make_finding
-from tcpipe.tables.levels import SEGMENTS, Datum, GatedTrack, Segments, TrackInfo, add_findings
+from tcpipe.tables.levels import SEGMENTS, Datum, MaskedTrack, Segments, TrackInfo, add_findings
 
 ENTRIES = ("kept", *(flag_name(bit) for bit in (*DropReason, Loss.CURVED, Loss.LEFTOVER)))
 """Names of the ledger's entries, in order."""
 
 
-def segment_track(gated: GatedTrack, config: SegmentConfig) -> Segments:
+def segment_track(masked: MaskedTrack, config: SegmentConfig) -> Segments:
     """Return the segments of the track's steady stretches, and the ledger of all its metres: its sum is the odometer."""
-    table, info = gated.table, gated.info
-    stamp_ns, epoch = to_integers(table, "stamp_ns"), to_integers(table, "epoch")
+    table, info = masked.table, masked.info
+    stamp_ns, epoch = to_integers(table, "stamp_ns"), to_integers(table, "clock_epoch")
     position_m = np.column_stack([to_floats(table, f"{axis}_m") for axis in "xyz"])
     velocity_mps = np.column_stack([to_floats(table, f"{name}_velocity_mps") for name in ("east", "north", "up")])
     piece = number_pieces(stamp_ns, epoch, period_ns=1e9 / info.rate_hz)
@@ -60,7 +60,7 @@ def segment_track(gated: GatedTrack, config: SegmentConfig) -> Segments:
         if len(cut.start_ns):
             tables.append(_make_segments(table.slice(first, last + 1 - first), path, cut, info))
     segments = pa.concat_tables(tables).combine_chunks()
-    facts = SegmentFacts(segments.num_rows, len(spans), odometer_m=sum(metres.values()), ledger_s=seconds)
+    facts = SegmentFacts(segments.num_rows, len(spans), odometer_m=sum(metres.values()), duration_by_reason_s=seconds)
     findings = [] if segments.num_rows else [_find_why_none(metres, info.run_id)]
     findings += find_losses(metres, Subject("run", info.run_id))
     return Segments(segments, add_findings(info, findings, replace(info.report.facts, segment=facts)), metres)
@@ -74,7 +74,7 @@ def _make_segments(rows: pa.Table, path: Polyline, cut: Cut, info: TrackInfo) ->
         "segment_id": [f"{info.run_id}-{stamp}" for stamp in cut.start_ns],
         "run_id": [info.run_id] * count,
         "robot": [info.robot] * count,
-        "epoch": np.full(count, to_integers(rows, "epoch")[0]),
+        "clock_epoch": np.full(count, to_integers(rows, "clock_epoch")[0]),
         "start_ns": cut.start_ns,
         "end_ns": cut.end_ns,
         "chord_m": np.hypot(step_m[:, 0], step_m[:, 1]),

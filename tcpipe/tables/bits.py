@@ -23,7 +23,7 @@ class DropReason(IntFlag):
 
     GAP = 1 << 0
     """No usable motion or power estimate: sensor gap, power gap, clock epoch, a jump, or relative position error too large."""
-    STANDING = 1 << 1
+    STATIONARY = 1 << 1
     """|v| < 0.05 m/s and |yaw rate| < 0.05 rad/s."""
     STUCK = 1 << 2
     """The wheels turn but the ground speed is about zero."""
@@ -33,7 +33,7 @@ class DropReason(IntFlag):
     """Driving backwards."""
     ACCELERATING = 1 << 5
     """A commanded change of speed (2 s after it), or, without commands, |dv/dt| > 0.3 m/s² for 0.2 s; start and stop ramps."""
-    BELOW_LIMIT = 1 << 6
+    BELOW_FULL_SPEED = 1 << 6
     """Commanded below 0.95 of the robot's maximum: the speed is not the terrain's limit."""
 
 
@@ -50,7 +50,7 @@ class Quality(IntFlag):
     """Deviation of the horizontal position (DRMS, `position_std_m`) above `label.flag_position_std_m` at either end."""
     CURVED = 1 << 4
     """Arc over chord above 1.01."""
-    MEAN_POWER_DIFFERS = 1 << 5
+    POWER_MEAN_MISMATCH = 1 << 5
     """The plain mean of the power samples differs from energy / duration by more than 5 %."""
     NO_COMMAND = 1 << 6
     """No command topic: it cannot be known whether the robot was driven at its maximum."""
@@ -60,7 +60,7 @@ class Quality(IntFlag):
     """A clock of the segment's run stepped, drifts or seems off (an IMU's by more than 0.15 s), or the recorder's time had to be used."""
     PHYSICS_OUTLIER = 1 << 9
     """The power is more than four robust standard deviations from what physics, fitted on the run, predicts."""
-    NOT_AT_LIMIT = 1 << 10
+    BELOW_FULL_SPEED = 1 << 10
     """Commanded on average below `full_speed_fraction` of the robot's maximum: the speed is not the terrain's limit."""
     SENSORS_DISAGREE = 1 << 11
     """A sensor says another position, way or turn there than the track, beyond what both claim, and nothing tells which is right."""

@@ -89,7 +89,7 @@ class PowerSign:
 
 
 @dataclass(frozen=True, slots=True)
-class Reopening:
+class GateReset:
     """A sensor that its gate had refused since ``start_ns`` was heard again at ``end_ns``: it was off by ``size`` [m] or [m/s]."""
 
     role: str
@@ -113,9 +113,9 @@ class StretchFacts:
     recovered: Mapping[str, int] | None = field(default=None, metadata=LEFT_OUT)
     reopened: Mapping[str, int] | None = field(default=None, metadata=LEFT_OUT)
     events: int | None = field(default=None, metadata=LEFT_OUT)
-    standing_updates: int | None = field(default=None, metadata=LEFT_OUT)
+    zero_velocity_updates: int | None = field(default=None, metadata=LEFT_OUT)
     gnss_lasting_error_m: float | None = field(default=None, metadata=LEFT_OUT)
-    reopenings: tuple[Reopening, ...] = field(default=(), metadata=LEFT_OUT)
+    gate_resets: tuple[GateReset, ...] = field(default=(), metadata=LEFT_OUT)
     gyro_bias_radps: Vector | None = None
     turn_scale: float | None = None
     accelerometer_bias_mps2: Vector | None = field(default=None, metadata=LEFT_OUT)
@@ -125,7 +125,7 @@ class StretchFacts:
     visual_scale_std: float | None = field(default=None, metadata=LEFT_OUT)
     common_scale_std: float | None = field(default=None, metadata=LEFT_OUT)
     """How long a metre is, as far as nothing tells: one error of all ways, speeds and their labels, within their deviations."""
-    epoch: int = 0
+    clock_epoch: int = 0
     start_ns: int = 0
     end_ns: int = 0
     rows: int = 0
@@ -167,7 +167,7 @@ class SensorChecks:
     odometry and how sure it is, ``specific_force_median`` in the unit that the IMU tells.
     """
 
-    refused: Mapping[str, str] = field(default_factory=dict)
+    excluded: Mapping[str, str] = field(default_factory=dict)
     distance_m: Mapping[str, float] | None = field(default=None, metadata=LEFT_OUT)
     specific_force_median: float | None = field(default=None, metadata=LEFT_OUT)
     up: Vector | None = field(default=None, metadata=LEFT_OUT)
@@ -205,7 +205,7 @@ class Disagreement:
     unit: str
     expected_std: float
     alone: bool
-    epoch: int = 0
+    clock_epoch: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -256,7 +256,7 @@ class ClockFacts:
     ``heading_offset_s`` times the yaw rate, over a metre: the IMU's clock is off by that, and labels rest on the others'.
     """
 
-    epoch: int
+    clock_epoch: int
     reference: str
     pairs: tuple[ClockPair, ...]
     offsets: Mapping[str, ClockOffset]
@@ -265,7 +265,7 @@ class ClockFacts:
 
 
 @dataclass(frozen=True, slots=True)
-class GateFacts:
+class MaskFacts:
     """Rows kept, by reason dropped, and by cause in a gap; the speed that is the robot's limit, and from which on it drives at that."""
 
     rows: int
@@ -283,7 +283,7 @@ class SegmentFacts:
     segments: int
     stretches: int
     odometer_m: float
-    ledger_s: Mapping[str, float]
+    duration_by_reason_s: Mapping[str, float]
 
 
 @dataclass(frozen=True, slots=True)
@@ -360,7 +360,7 @@ class PhysicsFit:
     held_out: PhysicsScore | None
     """None where too few segments are left to fit."""
     without_turning: PhysicsScore | None
-    usual_turn_radpm: float
+    mean_turn_radpm: float
     """What a metre of the segments turns, both ways counted."""
     gain_of_turning: tuple[float, float] | None
     """By how much turning raises the held-out R²: 90 % interval over blocks of segments."""
@@ -371,7 +371,7 @@ class PhysicsFacts:
     """What physics explains of a run (`tcpipe.cost.physics`); where it could not be fitted, what is drawn while standing."""
 
     fitted: bool
-    standing_watt: float | None
+    idle_watt: float | None
     weight_over_efficiency_newton: float | None = None
     rolling_resistance: float | None = None
     rolling_newton: float | None = field(default=None, metadata=LEFT_OUT)
@@ -421,7 +421,7 @@ class StageFacts:
     mounting: MountingFacts | None = field(default=None, metadata=LEFT_OUT)
     audit: AuditFacts | None = field(default=None, metadata=LEFT_OUT)
     clock_offsets: ClockFacts | None = field(default=None, metadata=LEFT_OUT)
-    gate: GateFacts | None = field(default=None, metadata=LEFT_OUT)
+    mask: MaskFacts | None = field(default=None, metadata=LEFT_OUT)
     segment: SegmentFacts | None = field(default=None, metadata=LEFT_OUT)
     label: LabelFacts | None = field(default=None, metadata=LEFT_OUT)
 

@@ -6,7 +6,7 @@ level type                 holds
 L0    the recording        never touched
 L1    `Streams`            one table per role, SI units, in the sensor's own frame
 L2    `Track`              20 Hz: pose in the ENU plane of a datum, twist, deviations, voltage, current
-L3    `GatedTrack`         Track + ``dropped_by`` bits
+L3    `MaskedTrack`         Track + ``dropped_by`` bits
 L4    `Segments`           span, end states, chord, arc, course
 L5    `LabelledSegments`   power, velocity, duration, energy, their deviations, quality bits
 L6    `Samples`            split, map, terrain class, slope; patches are arrays in the same order
@@ -30,7 +30,7 @@ from tcpipe.tables.bits import DropReason, Quality
 from tcpipe.tables.columns import Column, TableSchema
 from tcpipe.tables.facts import NOTHING_FOUND, StageFacts
 from tcpipe.tables.findings import Finding, StageReport
-from tcpipe.tables.segment_columns import LINE_COLUMN, MOTION_COLUMNS, POINT_COLUMN, STANDING_COLUMNS
+from tcpipe.tables.segment_columns import LINE_COLUMN, MOTION_COLUMNS, NET_COLUMNS, POINT_COLUMN
 
 DATA_MODEL_VERSION = "3.0"
 """Version of every manifest and card that is written; its history stands in docs/reference/data-model.md."""
@@ -41,10 +41,10 @@ READ_VERSIONS = (DATA_MODEL_VERSION,)
 EARLIER_VERSIONS = ("2.0", "2.1")
 """Versions that `tcpipe migrate` brings to the current one."""
 
-TABLES_VERSION = "2.1"  # in which a table last changed
+TABLES_VERSION = "3.0"  # in which a table last changed
 
-READ_TABLES = ("2.0", TABLES_VERSION)
-"""Versions of tables that are read as they are."""
+READ_TABLES = (*EARLIER_VERSIONS, TABLES_VERSION)
+"""Versions of tables that are read as they are, but for `EARLIER_COLUMNS`."""
 
 _METADATA_KEY = b"tcpipe"
 
@@ -55,7 +55,10 @@ _ENU = ("east", "north", "up")
 _STAMP = Column("stamp_ns", _I64, "ns", "time of measurement, UTC, since 1970 (or since the epoch of simulated time)")
 _LOG_TIME = Column("log_time_ns", _I64, "ns", "time the recorder received the message")
 _EPOCH = Column(
-    "epoch", pa.int16(), "1", "clock epoch: a lasting step of the clock opens the next; nothing is integrated across it"
+    "clock_epoch",
+    pa.int16(),
+    "1",
+    "clock epoch: a lasting step of the clock opens the next; nothing is integrated across it",
 )
 
 
@@ -233,7 +236,7 @@ _TRACK_COLUMNS = (
 
 TRACK = TableSchema("track", "L2", "The fused track, 20 Hz, base_link.", _TRACK_COLUMNS)
 
-GATED_TRACK = TableSchema(
+MASKED_TRACK = TableSchema(
     "track",
     "L3",
     "The fused track with the reasons why rows are not used; nothing is deleted.",
@@ -286,7 +289,7 @@ _LABEL_COLUMNS = (
     Column("velocity_std_mps", _F64, "m/s", "standard deviation of the velocity, likewise"),
     _make_nullable("power_std_watt", "W", "standard deviation of the power, likewise; null without power"),
     _make_nullable("energy_std_joule", "J", "standard deviation of the energy, likewise; null without power"),
-    *STANDING_COLUMNS,
+    *NET_COLUMNS,
     _make_nullable(
         "physics_power_watt",
         "W",
@@ -447,7 +450,7 @@ class Track:
 
 
 @dataclass(frozen=True, slots=True)
-class GatedTrack:
+class MaskedTrack:
     """L3: the track with ``dropped_by``."""
 
     table: pa.Table
@@ -455,16 +458,16 @@ class GatedTrack:
 
     def __post_init__(self) -> None:
         """Check the table."""
-        GATED_TRACK.check(self.table)
+        MASKED_TRACK.check(self.table)
 
 
 @dataclass(frozen=True, slots=True)
 class Segments:
-    """L4: cut segments and where every metre of the track went (``ledger_m``: kept, then each loss by name)."""
+    """L4: cut segments and where every metre of the track went (``distance_by_reason_m``: kept, then each loss by name)."""
 
     table: pa.Table
     info: TrackInfo
-    ledger_m: Mapping[str, float]
+    distance_by_reason_m: Mapping[str, float]
 
     def __post_init__(self) -> None:
         """Check the table."""
@@ -477,7 +480,7 @@ class LabelledSegments:
 
     table: pa.Table
     info: TrackInfo
-    ledger_m: Mapping[str, float]
+    distance_by_reason_m: Mapping[str, float]
 
     def __post_init__(self) -> None:
         """Check the table."""

@@ -14,11 +14,13 @@ def _make_column(name: str, unit: str, doc: str, frame: str = "") -> Column:
 _UNSURE = "null without a gyroscope or a smoother"
 
 MOTION_COLUMNS = (
-    _make_column("turn_rad", "rad", "change of yaw from start to end, counter-clockwise", "enu"),
-    _make_column("turn_std_rad", "rad", f"standard deviation of turn_rad; {_UNSURE}", "enu"),
-    _make_column("turn_rate_radps", "rad/s", "time-mean of the absolute yaw rate", "base_link"),
-    _make_column("turn_rate_std_radps", "rad/s", f"standard deviation of turn_rate_radps; {_UNSURE}", "base_link"),
-    _make_column("curvature_radpm", "rad/m", "turn_rad over arc_length_m, positive to the left", "enu"),
+    _make_column("yaw_change_rad", "rad", "change of yaw from start to end, counter-clockwise", "enu"),
+    _make_column("yaw_change_std_rad", "rad", f"standard deviation of yaw_change_rad; {_UNSURE}", "enu"),
+    _make_column("mean_abs_yaw_rate_radps", "rad/s", "time-mean of the absolute yaw rate", "base_link"),
+    _make_column(
+        "mean_abs_yaw_rate_std_radps", "rad/s", f"standard deviation of mean_abs_yaw_rate_radps; {_UNSURE}", "base_link"
+    ),
+    _make_column("curvature_radpm", "rad/m", "yaw_change_rad over arc_length_m, positive to the left", "enu"),
     _make_column("curvature_std_radpm", "rad/m", f"standard deviation of curvature_radpm; {_UNSURE}", "enu"),
     _make_column("roll_rad", "rad", "measured roll in the middle of the segment's time", "enu"),
     _make_column("pitch_rad", "rad", "measured pitch there, positive nose down (REP-103)", "enu"),
@@ -42,20 +44,20 @@ MOTION_COLUMNS = (
     ),
 )
 
-STANDING_COLUMNS = (
+NET_COLUMNS = (
     _make_column("voltage_volt", "V", "time-mean of the voltage, over the rails; null without power"),
     _make_column(
-        "standing_power_watt", "W", "what the robot draws while it stands, of the run; null where it hardly stood"
+        "idle_power_watt", "W", "what the robot draws while it stands, of the run; null where it hardly stood"
     ),
     _make_column(
-        "standing_power_std_watt",
+        "idle_power_std_watt",
         "W",
-        "standard deviation of standing_power_watt: how it differs over the run, and how well it is measured",
+        "standard deviation of idle_power_watt: how it differs over the run, and how well it is measured",
     ),
-    _make_column("power_above_standing_watt", "W", "power_watt less standing_power_watt"),
-    _make_column("power_above_standing_std_watt", "W", "standard deviation of it, as a label of the true metre"),
-    _make_column("energy_above_standing_joule", "J", "energy_joule less standing_power_watt times duration_s"),
-    _make_column("energy_above_standing_std_joule", "J", "standard deviation of it, likewise"),
+    _make_column("net_power_watt", "W", "power_watt less idle_power_watt"),
+    _make_column("net_power_std_watt", "W", "standard deviation of it, as a label of the true metre"),
+    _make_column("net_energy_joule", "J", "energy_joule less idle_power_watt times duration_s"),
+    _make_column("net_energy_std_joule", "J", "standard deviation of it, likewise"),
 )
 
 GEOMETRY = "geometry"

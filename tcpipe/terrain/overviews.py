@@ -29,7 +29,7 @@ def list_factors(grid: MapGrid) -> tuple[int, ...]:
     factors = [1]
     while (
         (factor := 2 * factors[-1]) <= _WIDEST_FACTOR
-        and factor * grid.pitch_m <= COARSEST_M
+        and factor * grid.pixel_size_m <= COARSEST_M
         and min(grid.rows, grid.cols) // factor >= 2
     ):
         factors.append(factor)
@@ -38,12 +38,12 @@ def list_factors(grid: MapGrid) -> tuple[int, ...]:
 
 def make_overview_grid(grid: MapGrid, factor: int) -> MapGrid:
     """Return the grid of a level: the same corner, wider pixels; what does not fill one at the far edges is left out."""
-    return replace(grid, pitch_m=grid.pitch_m * factor, rows=grid.rows // factor, cols=grid.cols // factor)
+    return replace(grid, pixel_size_m=grid.pixel_size_m * factor, rows=grid.rows // factor, cols=grid.cols // factor)
 
 
-def choose_factor(factors: Sequence[int], map_pitch_m: float, pitch_m: float) -> int:
-    """Return the largest factor whose pixels are not wider than ``pitch_m``; the smallest where all are."""
-    return max((factor for factor in factors if factor * map_pitch_m <= _SLACK * pitch_m), default=min(factors))
+def choose_factor(factors: Sequence[int], map_pitch_m: float, pixel_size_m: float) -> int:
+    """Return the largest factor whose pixels are not wider than ``pixel_size_m``; the smallest where all are."""
+    return max((factor for factor in factors if factor * map_pitch_m <= _SLACK * pixel_size_m), default=min(factors))
 
 
 def iterate_levels(layer: Layer, values: Pixels, factors: Sequence[int]) -> Iterator[tuple[int, Pixels]]:

@@ -86,10 +86,10 @@ def map_px_from_patch(frames: PatchFrames, grid: MapGrid, *, patch_m: float, pat
     -------
     numpy.ndarray : shape (N, 6): x and y of patch pixel (0, 0); dx, dy for one column forward; dx, dy for one row to the right [map px].
     """
-    pitch_m = patch_m / patch_px
-    reach_m = (patch_m - pitch_m) / 2.0
+    pixel_size_m = patch_m / patch_px
+    reach_m = (patch_m - pixel_size_m) / 2.0
     first = frames.centre_xy_m - reach_m * frames.along_xy + reach_m * frames.left_xy
-    down = np.array([1.0, -1.0]) * (pitch_m / grid.pitch_m)
+    down = np.array([1.0, -1.0]) * (pixel_size_m / grid.pixel_size_m)
     return np.hstack([grid.px_from_xy(first), frames.along_xy * down, -frames.left_xy * down])
 
 
@@ -102,7 +102,7 @@ def sample_chord_px(frames: PatchFrames, grid: MapGrid, *, chord_m: FloatArray, 
     """
     step_m = chord_m[:, None] / points
     first = frames.centre_xy_m + frames.along_xy * (step_m - chord_m[:, None]) / 2.0
-    return np.hstack([grid.px_from_xy(first), frames.along_xy * step_m * np.array([1.0, -1.0]) / grid.pitch_m])
+    return np.hstack([grid.px_from_xy(first), frames.along_xy * step_m * np.array([1.0, -1.0]) / grid.pixel_size_m])
 
 
 def has_other_pixels(patch_pixel_m: float, map_pixel_m: float) -> bool:

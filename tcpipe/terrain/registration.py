@@ -147,7 +147,7 @@ def _thin_points(xy_m: FloatArray) -> NDArray[np.int64]:
 def _sample_heights(level: MapReader, xy_m: FloatArray, shift_m: FloatArray) -> FloatArray:
     """Return the map's heights at every point moved by every pair of shifts (north, east), shape (N, K, K); NaN without data."""
     px = level.grid.px_from_xy(xy_m)
-    offset_px = shift_m / level.grid.pitch_m
+    offset_px = shift_m / level.grid.pixel_size_m
     reach_px = int(np.ceil(offset_px[-1])) + 2
     found = np.empty((len(xy_m), shift_m.size, shift_m.size))
     for group in group_by_tile(px, level):

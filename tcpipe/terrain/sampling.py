@@ -84,8 +84,8 @@ def sample_patches(
     points = max(round(patch_px * float(np.median(chord_m)) / patch_m), 1) if chord_m.size else 1
     chords = sample_chord_px(frames, level.grid, chord_m=chord_m, points=points)
     boxes = _compute_boxes(pixels, patch_px, chords, points)
-    pitch_m, stacks = patch_m / patch_px, group_stacks(level.layers)
-    ground = Ground(boxes, pixels, chords, points, _place("terrain", stacks["classes"]), pitch_m, HEIGHT_STEP_M)
+    pixel_size_m, stacks = patch_m / patch_px, group_stacks(level.layers)
+    ground = Ground(boxes, pixels, chords, points, _place("terrain", stacks["classes"]), pixel_size_m, HEIGHT_STEP_M)
     shape = (chord_m.size, patch_px, patch_px)
     floats, greys, classes = (
         np.empty((len(stacks[stack]), *shape), STACKS[stack]) for stack in ("floats", "greys", "classes")

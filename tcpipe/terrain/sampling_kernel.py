@@ -47,7 +47,8 @@ class Ground(NamedTuple):
     ``boxes`` are the first row and column, last row and column (exclusive) of the map pixels that a patch and its chord touch, taps and a
     pixel all around included, (N, 4); ``frames`` and ``chords`` affine map pixel positions (`patches.map_px_from_patch`,
     `patches.chord_px`), (N, 6), (N, 4), with ``chord_points`` points on the chord to take the class at, which is that of layer
-    ``classed`` of the classes, -1 for none. ``pitch_m`` is the side of a patch pixel on the ground [m], ``step_m`` of a stored height [m].
+    ``classed`` of the classes, -1 for none. ``pixel_size_m`` is the side of a patch pixel on the ground [m], ``step_m`` the unit of stored
+    heights [m].
     """
 
     boxes: NDArray[np.int64]
@@ -55,7 +56,7 @@ class Ground(NamedTuple):
     chords: NDArray[np.float64]
     chord_points: int
     classed: int
-    pitch_m: float
+    pixel_size_m: float
     step_m: float
 
 
@@ -151,7 +152,7 @@ def sample_tiles(tiles: Tiles, ground: Ground, chosen: NDArray[np.int64], out: S
             entry, share = _find_class_under(under, width, box, ground.chords[n], ground.chord_points, votes)
         stats = out.stats[n]
         stats[0] = np.float64(reference) + np.float64(lowest)
-        stats[1], stats[2] = np.arctan(along / ground.pitch_m), np.arctan(left / ground.pitch_m)
+        stats[1], stats[2] = np.arctan(along / ground.pixel_size_m), np.arctan(left / ground.pixel_size_m)
         stats[3], stats[4] = count / whole_patch, clipped / max(count, 1)
         stats[5], stats[6] = entry, share
 

@@ -112,16 +112,16 @@ def choose_crs(height: Georeference, wanted: CRS | None) -> CRS:
 
 
 def choose_grid(
-    height: Georeference, others: Sequence[Georeference], crs: CRS, pitch_m: float | None = None
+    height: Georeference, others: Sequence[Georeference], crs: CRS, pixel_size_m: float | None = None
 ) -> MapGrid:
-    """Return the common grid in ``crs``; ``pitch_m`` overrides the finest raster's [m]."""
+    """Return the common grid in ``crs``; ``pixel_size_m`` overrides the finest raster's [m]."""
     rasters = [height, *others]
     sides = [_compute_pixel_side(raster, crs) for raster in rasters]
     finest = int(np.argmin(sides)) if min(sides) < _FINER * sides[0] else 0
     base, pitch = rasters[finest], sides[finest]
-    coincide = base.is_square_in(crs) and pitch_m in {None, pitch}
-    if pitch_m is not None:
-        pitch = pitch_m
+    coincide = base.is_square_in(crs) and pixel_size_m in {None, pitch}
+    if pixel_size_m is not None:
+        pitch = pixel_size_m
     elif not coincide:
         pitch = float(f"{pitch:.3g}")
     projection = find_projection(height, crs)
@@ -142,13 +142,13 @@ def choose_grid(
     return MapGrid(format_crs(crs), left, top, pitch, rows, cols)
 
 
-def _refuse_huge(height: Georeference, sides_m: tuple[float, float], pitch_m: float) -> None:
+def _refuse_huge(height: Georeference, sides_m: tuple[float, float], pixel_size_m: float) -> None:
     """Refuse a grid that no disk and no night would hold."""
-    cols, rows = (side_m / pitch_m if pitch_m > 0.0 else math.inf for side_m in sides_m)
+    cols, rows = (side_m / pixel_size_m if pixel_size_m > 0.0 else math.inf for side_m in sides_m)
     if not (max(cols, rows) <= MAX_SIDE_PX and cols * rows <= MAX_PIXELS):
         raise MapError(
-            f"{height.name}: the map would have {cols:.3g} x {rows:.3g} pixels of {pitch_m:.3g} m, at most {MAX_PIXELS:.2g} in all and "
-            f"{MAX_SIDE_PX} a side; cut out the site (gdal_translate -projwin ulx uly lrx lry in.tif out.tif) or give coarser rasters"
+            f"{height.name}: the map would have {cols:.3g} x {rows:.3g} pixels of {pixel_size_m:.3g} m, at most "
+            f"{MAX_PIXELS:.2g} in all and {MAX_SIDE_PX} a side; cut out the site (gdal_translate -projwin ulx uly lrx lry in.tif out.tif) or give coarser rasters"
         )
 
 

@@ -278,7 +278,7 @@ def _mentions_of_recipe(tree):
 
 def test_what_is_suggested_for_a_recipe_is_made_where_it_is_checked():
     assert _mentions_of_recipe(
-        ast.parse("""x = 'write [read.topics] imu = []', 'set gate.max_velocity_mps = 1'""")
+        ast.parse("""x = 'write [read.topics] imu = []', 'set mask.max_velocity_mps = 1'""")
     ) == [1, 1]
     assert not {
         path: lines

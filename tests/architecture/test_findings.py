@@ -155,7 +155,7 @@ def test_nothing_decides_on_a_finished_sentence():
 
     def is_sentence(node):
         node = node.value if isinstance(node, ast.Subscript) else node
-        is_field = isinstance(node, ast.Attribute) and node.attr in {"cause", "damage", "notes", "problems", "remarks"}
+        is_field = isinstance(node, ast.Attribute) and node.attr in {"cause", "damage", "notes", "problems"}
         return is_field or (isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id in makers)
 
     searches = {"startswith", "endswith", "split", "partition", "search", "match", "fullmatch", "sub"}

@@ -84,7 +84,7 @@ def fused(labelled: LabelledSegments) -> set[str]:
 
 
 def refused(labelled: LabelledSegments) -> set[str]:
-    return set(labelled.info.report.facts.sensor_checks.refused)
+    return set(labelled.info.report.facts.sensor_checks.excluded)
 
 
 def cure(labelled: LabelledSegments, role: str) -> ReadConfig:
@@ -93,7 +93,7 @@ def cure(labelled: LabelledSegments, role: str) -> ReadConfig:
 
 
 def exclusion(labelled: LabelledSegments, role: str) -> Finding:
-    code = labelled.info.report.facts.sensor_checks.refused[role]
+    code = labelled.info.report.facts.sensor_checks.excluded[role]
     (finding,) = [of for of in select_findings(labelled.info.report.findings, code) if of.subject.name == role]
     assert finding.action == "excluded"
     return finding
@@ -163,7 +163,7 @@ def test_gaps_of_an_imu_are_driven_as_without_it(drive, tmp_path, recipe, withou
 
     labelled = run(heard(drive.without(*without), "imu", when), tmp_path, recipe=recipe)
     assert "imu" in fused(labelled)
-    assert sum(labelled.ledger_m.values()) == pytest.approx(63.0, rel=0.06)
+    assert sum(labelled.distance_by_reason_m.values()) == pytest.approx(63.0, rel=0.06)
     assert_labels_hold(labelled, drive.truth, within=0.04)
 
 
@@ -193,7 +193,7 @@ def test_an_imu_that_leads_the_track_astray_is_left_out(drive, tmp_path, recipe,
     labelled = run(drive.without(*without).changed("imu", loosened), tmp_path, recipe=recipe)
     assert refused(labelled) == {"imu"}
     assert exclusion(labelled, "imu").code == "misleads-track"
-    assert sum(labelled.ledger_m.values()) == pytest.approx(63.0, rel=0.08)
+    assert sum(labelled.distance_by_reason_m.values()) == pytest.approx(63.0, rel=0.08)
     assert_labels_hold(labelled, drive.truth, within=0.04)
 
 
@@ -214,7 +214,7 @@ def test_an_imu_that_nothing_places_is_refused_and_its_mounting_proposed(tmp_pat
     places = [
         proposed(finding)
         for finding in labelled.info.report.findings
-        if any("read.placement" in of.recipe for of in finding.remedies)
+        if any("read.extrinsics" in of.recipe for of in finding.remedies)
     ]
     values = reduce(merged, places)
     assert values == reduce(merged, reversed(places))  # no two findings propose different values for one key
@@ -517,7 +517,7 @@ def test_wheels_that_go_too_short_a_way_and_tell_no_turn_rate_are_rescaled_by_co
     found = labelled.info.report
     assert fused(labelled) == {"gnss", "wheel_odometry"}
     assert found.facts.mounting.odometry_scale["wheel_odometry"] == pytest.approx(0.43, rel=0.2)
-    assert sum(labelled.ledger_m.values()) == pytest.approx(drive.truth.distance_m[-1], rel=0.15)
+    assert sum(labelled.distance_by_reason_m.values()) == pytest.approx(drive.truth.distance_m[-1], rel=0.15)
     (scale,) = select_findings(found.findings, "odometry-scale")
     assert scale.numbers["driven_m"] > 0.0
     assert select_findings(found.findings, "rate-from-orientation")
@@ -582,10 +582,10 @@ def test_an_offset_of_a_role_that_is_not_there_is_an_error_and_a_placement_a_war
     other = with_pose(drive)
     with pytest.raises(RoleError, match=r"read.time_offset_s.gnss: no topic of this log plays gnss.*are there: .*pose"):
         read(other, tmp_path, parse_recipe(merged(topics, {"read": {"time_offset_s": {"gnss": -0.3}}}), where="").read)
-    placed = {"read": {"placement": {"gnss": {"xyz_m": [0.1, 0.0, 0.5]}}}}
+    placed = {"read": {"extrinsics": {"gnss": {"xyz_m": [0.1, 0.0, 0.5]}}}}
     found = read(other, tmp_path, parse_recipe(merged(topics, placed), where="").read)
     (unused_key,) = select_findings(found.report.findings, "recipe-key-unused")
-    assert unused_key.names == {"key": "read.placement.gnss"}
+    assert unused_key.names == {"key": "read.extrinsics.gnss"}
 
 
 def test_currents_of_the_other_sign_are_cured_by_the_line_as_it_is_printed(drive, tmp_path):

@@ -138,8 +138,8 @@ def test_the_card_tells_the_truth(built, samples):
     assert statistics["mean"] == pytest.approx(power.mean())
     assert card["label"]["columns"] == ["power_watt", "velocity_mps"]
     assert sum(sum(counts.values()) for counts in card["terrain"].values()) == 448
-    assert sum(card["ledger_m"].values()) == pytest.approx(448 + 2 * 2.5)
-    assert card["ledger_m"]["split_buffer"] == pytest.approx(64)
+    assert sum(card["distance_by_reason_m"].values()) == pytest.approx(448 + 2 * 2.5)
+    assert card["distance_by_reason_m"]["split_buffer"] == pytest.approx(64)
     assert [run["run_id"] for run in card["runs"]] == ["north", "south"]
     assert card["runs"][0]["logs"] == ["north.mcap"]
     assert card["split"]["buffer_m"] == pytest.approx(np.sqrt(2))

@@ -202,7 +202,7 @@ def test_what_cannot_be_done_is_one_line_and_an_exit_code(
 
 def test_every_wrong_key_of_a_recipe_found_upward_is_named(log: Path, tmp_path: Path) -> None:
     (tmp_path / "a" / "b").mkdir(parents=True)
-    (tmp_path / "tcpipe.toml").write_text("[fuse]\nfoo = 1\n[gate]\nbar = 2\n[segment]\nchord_m = -1\n")
+    (tmp_path / "tcpipe.toml").write_text("[fuse]\nfoo = 1\n[mask]\nbar = 2\n[segment]\nchord_m = -1\n")
     told = plain_lines(tcpipe("ingest", log, cwd=tmp_path / "a" / "b"), 2)
     assert str(tmp_path / "tcpipe.toml") in told
     assert all(key in told for key in ("fuse.foo", "gate.bar", "segment.chord_m"))

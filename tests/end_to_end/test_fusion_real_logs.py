@@ -6,7 +6,7 @@ from shared_data import shared_data
 
 from tcpipe.formats.logs.log_file import open_log
 from tcpipe.formats.robot_files import load_shipped_profiles
-from tcpipe.recipe import FuseConfig, Placement, ReadConfig
+from tcpipe.recipe import Extrinsics, FuseConfig, ReadConfig
 from tcpipe.stages.fuse import fuse_run
 from tcpipe.stages.read import read_run
 from tcpipe.tables.columns import to_floats, to_integers
@@ -41,8 +41,8 @@ def test_warthog_on_grass_follows_fixes_that_come_late():
 
 
 def test_husky_with_an_imu_mounted_on_its_side_and_sbas():
-    mounting = Placement(xyz_m=(0.0, -0.3, 0.52), rpy_rad=(np.pi / 2, 0.0, -np.pi / 2))
-    streams, track = fused("robot_localization/test1.bag", ReadConfig(placement={"imu": mounting}))
+    mounting = Extrinsics(xyz_m=(0.0, -0.3, 0.52), rpy_rad=(np.pi / 2, 0.0, -np.pi / 2))
+    streams, track = fused("robot_localization/test1.bag", ReadConfig(extrinsics={"imu": mounting}))
     table = track.table
     gnss = streams.tables["gnss"]
     stamp = to_integers(table, "stamp_ns")

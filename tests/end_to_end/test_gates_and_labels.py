@@ -8,7 +8,7 @@ import pytest
 from tcpipe.formats.logs.log_file import open_log
 from tcpipe.formats.robot_files import load_shipped_profiles
 from tcpipe.geometry.rotation import rpy_from_quat
-from tcpipe.recipe import FuseConfig, GateConfig, LabelConfig, ReadConfig, SegmentConfig
+from tcpipe.recipe import FuseConfig, LabelConfig, MaskConfig, ReadConfig, SegmentConfig
 from tcpipe.simulation import Faults, compute_true_cost, find_scenario, make_tiny, read_truth, simulate
 from tcpipe.simulation.messages import Recorder
 from tcpipe.simulation.robot import SimulatedRobot
@@ -26,16 +26,16 @@ def run(site, *, config=None):
     with open_log(site.logs[0]) as log:
         streams = read_run(log, ReadConfig(), robot="husky", known=load_shipped_profiles())
     track = fuse_run(streams, FuseConfig(), run_id="run")
-    gated = mask_track(track, config or GateConfig(), max_velocity_mps=1.0, chord_m=1.0)
-    segments = segment_track(gated, SegmentConfig())
+    masked = mask_track(track, config or MaskConfig(), max_velocity_mps=1.0, chord_m=1.0)
+    segments = segment_track(masked, SegmentConfig())
     labelled = label_segments(
         segments,
-        gated,
+        masked,
         streams,
         LabelConfig(),
         voltage_range_volt=(20.0, 30.0),
     )
-    return gated, labelled, read_truth(site.truths[0])
+    return masked, labelled, read_truth(site.truths[0])
 
 
 @pytest.fixture(scope="module")
@@ -49,29 +49,29 @@ def manoeuvres(tmp_path_factory):
     return run(simulate(tmp_path_factory.mktemp("manoeuvres"), scenario=plan, seed=3))
 
 
-def row_truth(gated, truth):
-    return truth.at(to_integers(gated.table, "stamp_ns"))
+def row_truth(masked, truth):
+    return truth.at(to_integers(masked.table, "stamp_ns"))
 
 
-def dropped(gated, reason):
-    return (gated.table["dropped_by"].to_numpy() & np.uint32(reason)) != 0
+def dropped(masked, reason):
+    return (masked.table["dropped_by"].to_numpy() & np.uint32(reason)) != 0
 
 
 def test_each_manoeuvre_is_dropped_for_its_own_reason(manoeuvres):
-    gated, _, truth = manoeuvres
-    at = row_truth(gated, truth)
+    masked, _, truth = manoeuvres
+    at = row_truth(masked, truth)
     v, w = at.forward_velocity_mps, at.angular_velocity_radps[:, 2]
     kinds = {
         DropReason.STUCK: (at.wheel_velocity_mps > 0.35) & (np.abs(v) < 0.02),
-        DropReason.STANDING: (np.abs(v) < 0.01) & (np.abs(w) < 0.01) & (np.abs(at.wheel_velocity_mps) < 0.05),
+        DropReason.STATIONARY: (np.abs(v) < 0.01) & (np.abs(w) < 0.01) & (np.abs(at.wheel_velocity_mps) < 0.05),
         DropReason.TURNING_IN_PLACE: (np.abs(v) < 0.03) & (np.abs(w) > 0.2),
         DropReason.REVERSING: v < -0.1,
-        DropReason.BELOW_LIMIT: (at.command_velocity_mps < 0.9) & (v > 0.1),
+        DropReason.BELOW_FULL_SPEED: (at.command_velocity_mps < 0.9) & (v > 0.1),
     }
     for reason, truly in kinds.items():
         assert truly.sum() > 30
-        assert dropped(gated, reason)[truly].mean() > 0.95, reason
-        assert not dropped(gated, reason)[kept_by_truth(at)].any(), reason
+        assert dropped(masked, reason)[truly].mean() > 0.95, reason
+        assert not dropped(masked, reason)[kept_by_truth(at)].any(), reason
 
 
 def kept_by_truth(at):
@@ -82,10 +82,10 @@ def kept_by_truth(at):
 
 
 def test_steady_driving_is_kept(manoeuvres):
-    gated, labelled, truth = manoeuvres
-    steady = kept_by_truth(row_truth(gated, truth))
-    assert (gated.table["dropped_by"].to_numpy()[steady] == 0).mean() > 0.99
-    assert sum(labelled.ledger_m.values()) == pytest.approx(truth.distance_m[-1], rel=0.02)
+    masked, labelled, truth = manoeuvres
+    steady = kept_by_truth(row_truth(masked, truth))
+    assert (masked.table["dropped_by"].to_numpy()[steady] == 0).mean() > 0.99
+    assert sum(labelled.distance_by_reason_m.values()) == pytest.approx(truth.distance_m[-1], rel=0.02)
 
 
 def test_no_segment_contains_standing_or_turning_in_place(manoeuvres):
@@ -136,16 +136,16 @@ def test_what_is_above_standing_is_as_wrong_as_it_says(faulty):
     _, labelled, truth = faulty
     true, idle = compute_true_cost(truth, spans(labelled)[0]), SimulatedRobot().idle_watt
     for name, wanted in (
-        ("standing_power_watt", np.full(labelled.table.num_rows, idle)),
-        ("power_above_standing_watt", true.power_watt - idle),
-        ("energy_above_standing_joule", true.energy_joule - idle * true.duration_s),
+        ("idle_power_watt", np.full(labelled.table.num_rows, idle)),
+        ("net_power_watt", true.power_watt - idle),
+        ("net_energy_joule", true.energy_joule - idle * true.duration_s),
     ):
         quantity, unit = name.rsplit("_", 1)
         normalized = (to_floats(labelled.table, name) - wanted) / to_floats(labelled.table, f"{quantity}_std_{unit}")
         assert np.sqrt(np.mean(normalized**2)) < 1.5, name
-    assert to_floats(labelled.table, "standing_power_std_watt").max() < 2.0
-    identity = to_floats(labelled.table, "power_above_standing_watt") * to_floats(labelled.table, "duration_s")
-    assert to_floats(labelled.table, "energy_above_standing_joule") == pytest.approx(identity)
+    assert to_floats(labelled.table, "idle_power_std_watt").max() < 2.0
+    identity = to_floats(labelled.table, "net_power_watt") * to_floats(labelled.table, "duration_s")
+    assert to_floats(labelled.table, "net_energy_joule") == pytest.approx(identity)
     assert to_floats(labelled.table, "voltage_volt") == pytest.approx(
         meant(truth, truth.voltage_volt, labelled), abs=0.02
     )
@@ -161,8 +161,8 @@ def test_turns_attitude_slip_and_vibration_are_the_robots(faulty):
     wheel_mps = meant(truth, truth.wheel_velocity_mps, labelled)
     slip = 1 - meant(truth, truth.forward_velocity_mps, labelled) / (Wheels().scale * wheel_mps)
     for name, wanted in (
-        ("turn_rad", turn),
-        ("turn_rate_radps", turn_rate),
+        ("yaw_change_rad", turn),
+        ("mean_abs_yaw_rate_radps", turn_rate),
         ("curvature_radpm", turn / arc),
         ("slip_fraction", slip),
     ):

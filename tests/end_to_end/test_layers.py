@@ -35,7 +35,7 @@ def canopy(x, y):
 def site(tmp_path_factory):
     """Rasters of the 40 m world: the paper's three, colours, two layers of the user's, and a store with one run."""
     here = tmp_path_factory.mktemp("layers")
-    rasters = WORLD.write(here, pitch_m=0.1)
+    rasters = WORLD.write(here, pixel_size_m=0.1)
     x, y = WORLD.centres(PITCH_M)
     where = Affine(PITCH_M, 0, WORLD.x_m - 20.0, 0, -PITCH_M, WORLD.y_m + 20.0)
     write_tif(here / "moisture.tif", moisture(x, y).astype(np.float32)[None], WORLD.crs, where)

@@ -61,7 +61,7 @@ def test_what_has_no_checksum_and_which_clock_is_simulated_is_said(tmp_path):
     assert tcpipe("ingest", "run", cwd=tmp_path).returncode == 0
     found = run_json(tmp_path / "tcpipe-store")
     assert found["damage"] == []
-    assert ["unchecked: a .db3 carries no checksum" in line for line in found["remarks"]] == [True]
+    assert ["unchecked: a .db3 carries no checksum" in line for line in found["notes"]] == [True]
     assert "simulated-time" in {of["code"] for of in found["report"]["findings"]}
 
 
@@ -259,7 +259,7 @@ def test_fixes_of_no_ground_robot_make_no_run_and_no_promise(tmp_path):
     (tmp_path / "log" / "gnss.csv").write_text(f"t,lat,lon,alt,std\n{rows}")
     (tmp_path / "log" / "power.csv").write_text("t,v,i\n" + "".join(f"{1.7e9 + t:.1f},24.0,5.0\n" for t in at_s))
     tables = """
-[read.placement]
+[read.extrinsics]
 gnss = { xyz_m = [0.0, 0.0, 0.0] }
 [tables.gnss]
 file = "gnss.csv"
@@ -269,12 +269,12 @@ file = "power.csv"
 columns = { voltage = "v", current = "i" }
 """
     (tmp_path / "fast.toml").write_text(tables)
-    (tmp_path / "recipe.toml").write_text(tables + "[gate]\nmax_plausible_mps = 50.0\n")
+    (tmp_path / "recipe.toml").write_text(tables + "[mask]\nmax_plausible_mps = 50.0\n")
     (tmp_path / "robot.toml").write_text(tables + "[robots.racer]\nmax_plausible_mps = 50.0\n")
     refused = tcpipe("ingest", "log", "--recipe", "fast.toml", "--robot", "generic", cwd=tmp_path)
     assert refused.returncode == 1
     assert "[track-too-fast]" in refused.stderr + refused.stdout
-    assert "gate.max_plausible_mps" in refused.stderr + refused.stdout
+    assert "mask.max_plausible_mps" in refused.stderr + refused.stdout
     promise = tcpipe("preflight", "log", "--recipe", "fast.toml", "--robot", "generic", cwd=tmp_path)
     assert (promise.returncode, "promises" in promise.stdout) == (1, False)
     assert "[track-too-fast]" in promise.stdout

@@ -46,7 +46,7 @@ def card(site):
 
 @pytest.mark.parametrize("table", ["by_class", "by_slope"])
 def test_tables_add_up_to_the_ledger(card, table):
-    groups, ledger = card["removal"][table], card["ledger_m"]
+    groups, ledger = card["removal"][table], card["distance_by_reason_m"]
     assert sum(group["driven_m"] for group in groups) == pytest.approx(sum(ledger.values()), rel=1e-3)
     in_samples = ledger["kept"]
     assert sum(group["used_m"] for group in groups) == pytest.approx(in_samples, rel=1e-3)
@@ -81,4 +81,4 @@ def test_mud_that_is_only_crawled_over_is_warned_of(card):
     assert mud["used_share"] < 0.1
     biased = [of for of in card["findings"] if of["code"] == "selection-bias"]
     assert {"kind": "class", "name": "mud"} in [of["subject"] for of in biased]
-    assert {of["names"]["reason"] for of in biased if of["subject"]["name"] == "mud"} == {"below_limit"}
+    assert {of["names"]["reason"] for of in biased if of["subject"]["name"] == "mud"} == {"below_full_speed"}

@@ -126,12 +126,12 @@ def test_a_preflight_promises_what_ingesting_gives(work):
     manifest = json.loads(made.read_text())
     done = tcpipe("preflight", log, "--json", "--quiet", cwd=work)
     found = json.loads(done.stdout)
-    promise, label = found["promise"], manifest["info"]["report"]["facts"]["label"]
+    promise, label = found["expected_yield"], manifest["info"]["report"]["facts"]["label"]
     assert done.returncode == 3  # half a minute is too short for a prediction
     assert "log-too-short" in {finding["code"] for finding in found["findings"]}
     assert promise["segments"] == manifest["counts"]["segments"] == 10
     assert promise["segments_per_hour"] == pytest.approx(36000 / promise["span_s"])
-    assert promise["ledger_m"] == pytest.approx(manifest["ledger_m"])
+    assert promise["distance_by_reason_m"] == pytest.approx(manifest["distance_by_reason_m"])
     assert promise["relative_std_median"] == pytest.approx(label["relative_std_median"])
     sensors = (
         "sensors/gps_0/fix",

@@ -101,12 +101,12 @@ def test_whole_run_energy_and_odometer(site: SimulatedSite, run: RunDirectory) -
     truth = read_truth(site.truths[0])
     facts = run.manifest.info.report.facts
     assert facts.label.energy_joule == pytest.approx(truth.energy_joule[-1], rel=0.005)
-    assert sum(run.manifest.ledger_m.values()) == pytest.approx(truth.distance_m[-1], rel=0.005)
+    assert sum(run.manifest.distance_by_reason_m.values()) == pytest.approx(truth.distance_m[-1], rel=0.005)
 
 
 def test_every_metre_is_in_the_ledger_of_the_run_and_of_the_dataset(work: Path, run: RunDirectory) -> None:
     """The odometer here is a spline of SciPy through the track's rows."""
-    track, ledger_m = run.track().table, run.manifest.ledger_m
+    track, distance_by_reason_m = run.track().table, run.manifest.distance_by_reason_m
     seconds = (_column(track, "stamp_ns") - _column(track, "stamp_ns")[0]) * 1e-9
     pieces = np.split(np.arange(len(seconds)), np.flatnonzero(np.diff(seconds) > 0.075) + 1)
     metres = [
@@ -122,10 +122,10 @@ def test_every_metre_is_in_the_ledger_of_the_run_and_of_the_dataset(work: Path, 
             for axis, name in (("x", "east"), ("y", "north"))
         )
         metres.append(np.hypot(np.diff(x), np.diff(y)).sum())
-    assert sum(ledger_m.values()) == pytest.approx(sum(metres), rel=1e-3)
-    assert ledger_m["kept"] == pytest.approx(_column(run.segments(), "arc_length_m").sum(), rel=1e-9)
+    assert sum(distance_by_reason_m.values()) == pytest.approx(sum(metres), rel=1e-3)
+    assert distance_by_reason_m["kept"] == pytest.approx(_column(run.segments(), "arc_length_m").sum(), rel=1e-9)
     card = json.loads((work / "dataset" / "dataset.json").read_text())
-    assert sum(card["ledger_m"].values()) == pytest.approx(sum(ledger_m.values()), rel=1e-3)
+    assert sum(card["distance_by_reason_m"].values()) == pytest.approx(sum(distance_by_reason_m.values()), rel=1e-3)
 
 
 def test_labels_know_their_own_error(site: SimulatedSite, run: RunDirectory) -> None:
@@ -146,7 +146,7 @@ def test_steadily_driven_metres_become_segments(site: SimulatedSite, run: RunDir
     radius_m = np.abs(truth.forward_velocity_mps) / np.maximum(np.abs(truth.angular_velocity_radps[:, 2]), 1e-9)
     steady = settled & (truth.wheel_velocity_mps > 0.2) & (truth.forward_velocity_mps > 0.3) & (radius_m > 1.5)
     steady_m = np.diff(truth.distance_m, prepend=0.0)[steady].sum()
-    assert run.manifest.ledger_m["kept"] >= 0.90 * steady_m
+    assert run.manifest.distance_by_reason_m["kept"] >= 0.90 * steady_m
 
 
 def test_no_segment_contains_standing_or_turning_in_place(site: SimulatedSite, run: RunDirectory) -> None:

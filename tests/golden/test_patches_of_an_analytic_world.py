@@ -59,7 +59,7 @@ def test_patches_equal_the_world(site):
     patches = sampled.patches
 
     height = patches.height_min_m[:, None, None] + 0.0005 * patches.pixels["height"]
-    bound = 0.001 + world.bilinear_bound_m(source.grid.pitch_m)
+    bound = 0.001 + world.bilinear_bound_m(source.grid.pixel_size_m)
     assert np.abs(height - world.height(x, y)).max() < bound
     assert (patches.pixels["terrain"] == world.terrain(x, y)).mean() > 0.995
     assert np.abs(patches.pixels["ortho"] - world.grey(x, y)).max() < 1.1
@@ -191,7 +191,7 @@ def test_layers_of_three_resolutions_and_crss_show_one_world(tmp_path):
         tmp_path / "m.zarr", name="m", height=height, ortho=fine["ortho"], terrain=middle["terrain"], crs=world.crs
     )
     source = open_map(tmp_path / "m.zarr")
-    assert source.grid.pitch_m == 0.05
+    assert source.grid.pixel_size_m == 0.05
     segments = courses(world, "EPSG:4326")
     sampled = sample_segments(segments, source, CONFIG, gnss_crs="EPSG:4326")
     assert sampled.kept.size == 400

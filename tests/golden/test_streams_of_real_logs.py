@@ -13,7 +13,7 @@ import tcpipe
 from tcpipe.errors import RoleError
 from tcpipe.formats.logs.log_file import open_log
 from tcpipe.formats.robot_files import load_shipped_profiles
-from tcpipe.recipe import Placement, ReadConfig
+from tcpipe.recipe import Extrinsics, ReadConfig
 from tcpipe.stages.read import read_run
 from tcpipe.tables.findings import select_findings
 from tcpipe.tables.levels import Streams
@@ -58,7 +58,7 @@ def test_the_energy_of_a_real_warthog(robot: str | None) -> None:
 def test_a_real_husky_without_power() -> None:
     found = read(
         shared_data("robot_localization/test1.bag"),
-        placement={"imu": Placement((0.0, -0.3, 0.52), (np.pi / 2, 0.0, -np.pi / 2))},
+        extrinsics={"imu": Extrinsics((0.0, -0.3, 0.52), (np.pi / 2, 0.0, -np.pi / 2))},
     )
     assert found.robot == "husky"
     rows = {role: table.num_rows for role, table in found.tables.items()}

@@ -48,9 +48,9 @@ def track(streams):
 
 
 def after_fusion(track, streams, recipe):
-    gated = mask_track(track, recipe.gate, max_velocity_mps=1.0, chord_m=recipe.segment.chord_m)
-    segments = segment_track(gated, recipe.segment)
-    return label_segments(segments, gated, streams, recipe.label, voltage_range_volt=None)
+    masked = mask_track(track, recipe.mask, max_velocity_mps=1.0, chord_m=recipe.segment.chord_m)
+    segments = segment_track(masked, recipe.segment)
+    return label_segments(segments, masked, streams, recipe.label, voltage_range_volt=None)
 
 
 @pytest.mark.parametrize("key", keys())
@@ -96,12 +96,12 @@ def test_no_stage_breaks_at_the_ends_of_a_key(track, streams, key, value):
     recipe = with_value(Recipe(), key, value)
     fused = fuse_run(streams, recipe.fuse, run_id="run") if section(key) == "fuse" else track
     labelled = after_fusion(fused, streams, recipe)
-    assert sum(labelled.ledger_m.values()) > 1.0
+    assert sum(labelled.distance_by_reason_m.values()) > 1.0
 
 
-@pytest.mark.parametrize("value", [*other_values("read.placement")[2:6], None], ids=str)
+@pytest.mark.parametrize("value", [*other_values("read.extrinsics")[2:6], None], ids=str)
 def test_no_placement_and_no_offset_breaks_fusion(log, value):
-    config = replace(Recipe().read, **({"placement": value} if value else {"time_offset_s": {"gnss": 2e9}}))
+    config = replace(Recipe().read, **({"extrinsics": value} if value else {"time_offset_s": {"gnss": 2e9}}))
     streams = streams_of(log, config)
     with suppress(TcpipeError):  # a plain line is an answer
         after_fusion(fuse_run(streams, Recipe().fuse, run_id="run"), streams, Recipe())

@@ -142,7 +142,7 @@ def test_the_functions_give_what_the_commands_print(place, monkeypatch):
     assert (cost.energy_joule, cost.duration_s) == (said["energy_joule"], said["duration_s"])
 
     start, goal = ends = lonlat([(-12.0, -5.0), (-2.0, -4.0)]).round(9).tolist()
-    plan = tcpipe.plan_path("model", start, goal, objective="time", allow_unseen=True, store=store)
+    plan = tcpipe.plan_path("model", start, goal, objective="time", allow_extrapolation=True, store=store)
     asked = (
         "--from",
         "{},{}".format(*start),

@@ -112,7 +112,7 @@ def test_of_two_who_make_a_run_the_first_wins_and_what_replaces_it_is_a_new_numb
 
     def write(line: str, *, force: bool = False) -> object:
         made = replace(first.manifest, damage=(line,), checksums={})
-        levels = {"track": _Level(None, tables["rejections"]), "gated": _Level(tables["track"])}
+        levels = {"track": _Level(None, tables["rejections"]), "masked": _Level(tables["track"])}
         return store.write_run(made, **levels, labelled=_Level(tables["segments"]), settled=lambda _: not force).damage
 
     assert write("mine") == ()

@@ -178,7 +178,7 @@ class Log:
         return condense_damage(list(found))
 
     @property
-    def remarks(self) -> list[str]:
+    def notes(self) -> list[str]:
         """What is worth saying of what was read so far, and costs nothing: `damage` without loss, and what no checksum covers."""
         harmless = [str(damage) for damage in self.damage if not damage.is_loss]
         return [*harmless, *(f"{part.name}: unchecked: {part.unchecked}" for part in self._parts if part.unchecked)]

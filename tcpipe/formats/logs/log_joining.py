@@ -45,9 +45,9 @@ class JoinedLog:
         return [damage for log in self._logs for damage in log.damage]
 
     @property
-    def remarks(self) -> list[str]:
+    def notes(self) -> list[str]:
         """What is worth saying of every file, and costs nothing."""
-        found = [remark for log in self._logs for remark in log.remarks]
+        found = [note for log in self._logs for note in log.notes]
         if self._earlier:
             where = f"goes on where {self._earlier.path.name} ends, whose static transforms are taken: it has none"
             found.append(f"{self._logs[0].path.name}: {where}")

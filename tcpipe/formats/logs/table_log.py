@@ -44,7 +44,7 @@ class _Read:
     topic: Topic
     messages: pa.Table
     damage: tuple[Damage, ...]
-    remarks: tuple[str, ...]
+    notes: tuple[str, ...]
 
 
 class TableLog:
@@ -70,7 +70,7 @@ class TableLog:
         self.topics = {found.topic.name: found.topic for found in read}
         """Every mapped table by its topic's name."""
         self.damage = [damage for found in read for damage in found.damage]
-        self.remarks = [remark for found in read for remark in found.remarks]
+        self.notes = [note for found in read for note in found.notes]
         self._files = list_table_files(path)
 
     def __enter__(self) -> Self:
@@ -199,11 +199,11 @@ def _read_messages(
         }
     )
     span = (int(stamp_ns[0]), int(stamp_ns[-1]))
-    remarks = (
+    notes = (
         (f"{mapping.file}: {backward} stamps lie before the one above; its rows are put in order",) if backward else ()
     )
     found = Topic(topic, kind, stamp_ns.size, *span, "table", "")
-    return _Read(found, table, tuple(damage), (*cells.remarks, *remarks))
+    return _Read(found, table, tuple(damage), (*cells.notes, *notes))
 
 
 def _to_arrow(values: NDArray[np.float64]) -> pa.Array:

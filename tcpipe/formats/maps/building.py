@@ -78,7 +78,7 @@ def build_map(
     classes: Path | None = None,
     agreed: ClassScheme | None = None,
     crs: str | None = None,
-    pitch_m: float | None = None,
+    pixel_size_m: float | None = None,
     inputs: MapInputs | None = None,
 ) -> MapFacts:
     """Put rasters on one common grid and write them as a map; nothing is left behind if that fails.
@@ -94,7 +94,7 @@ def build_map(
         values, those names say which class each is.
     agreed : the classes of the store's other maps, which this one must share.
     crs : the map's CRS, projected and metric, and the CRS of rasters that carry none; None takes the height raster's, or its UTM zone.
-    pitch_m : side of a map pixel [m]; None takes the finest raster's.
+    pixel_size_m : side of a map pixel [m]; None takes the finest raster's.
     inputs : what the caller wants to know the map by later; kept in its facts.
 
     Raises
@@ -113,7 +113,7 @@ def build_map(
         footings = _place_all(rasters, crs)
         map_crs = choose_crs(footings["height"], wanted)
         others = [footings[role] for role in ("ortho", "terrain") if role in footings]
-        grid = choose_grid(footings["height"], others, map_crs, pitch_m)
+        grid = choose_grid(footings["height"], others, map_crs, pixel_size_m)
         layers: dict[str, LayerSource] = {
             role: RasterLayer(
                 _make_layer(raster, schemes),

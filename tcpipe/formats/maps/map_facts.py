@@ -50,7 +50,7 @@ class MapSummary(MapFacts):
     crs: str
     rows: int
     cols: int
-    pitch_m: float
+    pixel_size_m: float
     bounds_m: tuple[float, float, float, float]
     """West, south, east, north in the map's CRS."""
     layers: tuple[str, ...]
@@ -66,9 +66,11 @@ _SHARES = 5
 
 def map_lines(of: MapSummary) -> list[str]:
     """Return where a map lies and what each layer holds."""
-    rows, cols, pitch_m = of.rows, of.cols, of.pitch_m
+    rows, cols, pixel_size_m = of.rows, of.cols, of.pixel_size_m
     crs = of.crs if len(of.crs) < 20 else "a CRS of its own"
-    lines = [f"{cols} x {rows} px of {pitch_m:g} m ({cols * pitch_m:.0f} x {rows * pitch_m:.0f} m) in {crs}"]
+    lines = [
+        f"{cols} x {rows} px of {pixel_size_m:g} m ({cols * pixel_size_m:.0f} x {rows * pixel_size_m:.0f} m) in {crs}"
+    ]
     width = max(8, *(len(layer) for layer in of.layers))
     for layer in of.layers:
         line = f"{layer:{width}s} {_format_percent(of.covered[layer]):>5s} covered, from {of.sources[layer]}"

@@ -37,6 +37,7 @@ from tcpipe.formats.layer_descriptions import Description, describe_layer, make_
 from tcpipe.formats.maps.map_facts import MapFacts, MapSummary
 from tcpipe.formats.shards import DESCRIPTION, ShardedArray, ShardFetcher, open_sharded
 from tcpipe.formats.zarr_arrays import add_array, consolidate_metadata, create_group
+from tcpipe.tables.earlier_names import rename_keys
 from tcpipe.tables.facts import LEFT_OUT
 from tcpipe.terrain.classes import ClassScheme, ClassTable, TerrainClass
 from tcpipe.terrain.grid import MapGrid
@@ -103,7 +104,7 @@ class MapFile:
             crs=grid.crs,
             rows=grid.rows,
             cols=grid.cols,
-            pitch_m=grid.pitch_m,
+            pixel_size_m=grid.pixel_size_m,
             bounds_m=grid.bounds_m,
             layers=tuple(self.layers),
             overviews=self.factors[1:],
@@ -160,7 +161,7 @@ def open_map(path: Path, fetched: ShardFetcher | None = None, *, proved: bool = 
         version = found.get("version") if isinstance(found, dict) else None
         raise MapError(f"{path}: not a map of this version (got {version}, wanted {MAP_VERSION}); add it again")
     try:
-        kept = parse_typed(found, _Attributes, path)
+        kept = parse_typed(found | {"grid": rename_keys(found.get("grid"))}, _Attributes, path)
         described = {name: kept.described.get(name, {}) for name in kept.layers}
         layers = read_layers(described, kept.class_table, path)
         _refuse_sizes(kept, path)
@@ -184,10 +185,10 @@ def open_map(path: Path, fetched: ShardFetcher | None = None, *, proved: bool = 
 
 def _refuse_sizes(kept: _Attributes, path: Path) -> None:
     """Raise `StoreError` where a map says that it is larger than any, or cut otherwise than every map is."""
-    rows, cols, pitch_m = kept.grid.rows, kept.grid.cols, kept.grid.pitch_m
-    if not (0 < rows <= MAX_SIDE_PX and 0 < cols <= MAX_SIDE_PX and rows * cols <= MAX_PIXELS and pitch_m > 0):
+    rows, cols, pixel_size_m = kept.grid.rows, kept.grid.cols, kept.grid.pixel_size_m
+    if not (0 < rows <= MAX_SIDE_PX and 0 < cols <= MAX_SIDE_PX and rows * cols <= MAX_PIXELS and pixel_size_m > 0):
         raise StoreError(
-            f"{path}: says that it has {rows} x {cols} pixels of {pitch_m} m, at most {MAX_SIDE_PX} a side"
+            f"{path}: says that it has {rows} x {cols} pixels of {pixel_size_m} m, at most {MAX_SIDE_PX} a side"
         )
     wanted = (TILE_PX, list_factors(kept.grid))
     if (kept.tile_px, kept.factors) != wanted:
@@ -308,8 +309,8 @@ def _put(array: Any, row0: int, col0: int, values: Pixels) -> None:
 def _place(group: Any, grid: MapGrid, title: str) -> None:
     """Say where a group's pixels lie: coordinates, the grid mapping, and the same as attributes."""
     crs = CRS(grid.crs)
-    _add_axis(group, "x", grid.x_min_m + (np.arange(grid.cols) + 0.5) * grid.pitch_m)
-    _add_axis(group, "y", grid.y_max_m - (np.arange(grid.rows) + 0.5) * grid.pitch_m)
+    _add_axis(group, "x", grid.x_min_m + (np.arange(grid.cols) + 0.5) * grid.pixel_size_m)
+    _add_axis(group, "y", grid.y_max_m - (np.arange(grid.rows) + 0.5) * grid.pixel_size_m)
     mapping = add_array(
         group,
         "spatial_ref",
@@ -328,7 +329,7 @@ def _place(group: Any, grid: MapGrid, title: str) -> None:
             **({"proj:code": ":".join(authority)} if authority else {}),
             "proj:wkt2": crs.to_wkt(),
             "spatial:dimensions": ["y", "x"],
-            "spatial:transform": [grid.pitch_m, 0.0, grid.x_min_m, 0.0, -grid.pitch_m, grid.y_max_m],
+            "spatial:transform": [grid.pixel_size_m, 0.0, grid.x_min_m, 0.0, -grid.pixel_size_m, grid.y_max_m],
             "spatial:bbox": list(grid.bounds_m),
             "spatial:shape": [grid.rows, grid.cols],
         }

@@ -47,7 +47,7 @@ def write_nav2_map(
         f"# frame: x and y of {grid.crs if len(grid.crs) < 40 else 'the map CRS'} [m] less {origin_m[0]!r}, {origin_m[1]!r}",
         f"image: {picture.name}",
         "mode: scale",
-        f"resolution: {grid.pitch_m!r}",
+        f"resolution: {grid.pixel_size_m!r}",
         f"origin: [{x_min - origin_m[0]!r}, {y_min - origin_m[1]!r}, 0.0]",
         "negate: 0",
         f"occupied_thresh: {_OCCUPIED}",

@@ -64,14 +64,14 @@ class PolygonLayer:
 
     def shard(self, grid: MapGrid, row0: int, col0: int, rows: int, cols: int) -> Pixels:
         """Return class ids of a part of the map, shape (rows, cols); 0 where no polygon is."""
-        left, top = grid.x_min_m + col0 * grid.pitch_m, grid.y_max_m - row0 * grid.pitch_m
-        box = shapely.box(left, top - rows * grid.pitch_m, left + cols * grid.pitch_m, top)
+        left, top = grid.x_min_m + col0 * grid.pixel_size_m, grid.y_max_m - row0 * grid.pixel_size_m
+        box = shapely.box(left, top - rows * grid.pixel_size_m, left + cols * grid.pixel_size_m, top)
         drawn = np.sort(self._tree.query(box))
-        affine = (grid.pitch_m, 0.0, left, 0.0, -grid.pitch_m, top)
+        affine = (grid.pixel_size_m, 0.0, left, 0.0, -grid.pixel_size_m, top)
         polygons = self.polygons[drawn].copy()
         detailed = shapely.get_num_coordinates(polygons) > _DETAILED
         polygons[detailed] = shapely.intersection(
-            polygons[detailed], shapely.buffer(box, grid.pitch_m, join_style="mitre")
+            polygons[detailed], shapely.buffer(box, grid.pixel_size_m, join_style="mitre")
         )
         kept = ~shapely.is_empty(polygons)
         return burn_polygons(polygons[kept], self.ids[drawn][kept], affine=affine, rows=rows, cols=cols)

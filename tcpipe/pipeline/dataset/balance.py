@@ -210,13 +210,13 @@ def _read_ground(source: MapFile) -> MapGround:
     """Read the cells of a map from its coarsest level, strip by strip."""
     level = source.at(source.factors[-1]) if len(source.factors) > 1 else source
     grid = level.grid
-    pixels = max(2, round(CELL_M / grid.pitch_m))
+    pixels = max(2, round(CELL_M / grid.pixel_size_m))
     classes, gradients = [], []
     strip = max(pixels, level.tile_px // pixels * pixels)
     for row in range(0, grid.rows - pixels + 1, strip):
         last = min(row + strip, grid.rows)
         heights = level.read("height", row, last, 0, grid.cols)
-        gradient = fit_cell_gradients(heights.astype(np.float64), pixels, grid.pitch_m)
+        gradient = fit_cell_gradients(heights.astype(np.float64), pixels, grid.pixel_size_m)
         known = np.isfinite(gradient).all(axis=-1)
         kinds = np.zeros(known.shape, np.int16)
         if "terrain" in level.layers:
@@ -230,7 +230,7 @@ def _read_ground(source: MapFile) -> MapGround:
         np.concatenate([np.empty((*shape, 2)), *gradients]),
         grid.x_min_m,
         grid.y_max_m,
-        pixels * grid.pitch_m,
+        pixels * grid.pixel_size_m,
     )
 
 

@@ -23,7 +23,7 @@ from tcpipe.terrain.projection import Projection
 from tcpipe.terrain.tiles import find_map_projection
 
 _COLUMNS = (
-    *("stamp_ns", "epoch", "x_m", "y_m", "z_m", "east_velocity_mps", "north_velocity_mps", "up_velocity_mps"),
+    *("stamp_ns", "clock_epoch", "x_m", "y_m", "z_m", "east_velocity_mps", "north_velocity_mps", "up_velocity_mps"),
     *("lon_deg", "lat_deg", "pitch_rad", "forward_velocity_mps", "dropped_by"),
 )
 _SLOPES_DEG = (-10.0, -5.0, -2.0, 2.0, 5.0, 10.0)
@@ -96,7 +96,7 @@ def _read_intervals(
 ) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
     """Return length [m], reason, slope and class (ids as `find_classes_at`) of every interval of a run's track."""
     track = run.table("track", _COLUMNS)
-    stamp_ns, epoch = to_integers(track, "stamp_ns"), to_integers(track, "epoch")
+    stamp_ns, epoch = to_integers(track, "stamp_ns"), to_integers(track, "clock_epoch")
     piece = number_pieces(stamp_ns, epoch, period_ns=1e9 / run.manifest.info.rate_hz)
     position = np.column_stack([to_floats(track, f"{axis}_m") for axis in "xyz"])
     velocity = np.column_stack([to_floats(track, f"{name}_velocity_mps") for name in ("east", "north", "up")])

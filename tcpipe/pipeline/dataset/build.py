@@ -128,9 +128,9 @@ class BuildResult:
         head = f"{self.path}: {card.samples} samples ({counts})"
         if self.status == "unchanged":
             head += "; nothing to do: it is made from the same runs, map, region and recipe"
-        lost = [(name, metres) for name, metres in card.ledger_m.items() if metres >= 0.5 and name != KEPT]
+        lost = [(name, metres) for name, metres in card.distance_by_reason_m.items() if metres >= 0.5 and name != KEPT]
         lost.sort(key=lambda entry: (-entry[1], entry[0]))
-        ledger = f"{sum(card.ledger_m.values()):.0f} m driven: {card.ledger_m[KEPT]:.0f} m in samples"
+        ledger = f"{sum(card.distance_by_reason_m.values()):.0f} m driven: {card.distance_by_reason_m[KEPT]:.0f} m in samples"
         ledger += "".join(f", {metres:.0f} m {name.replace('_', ' ')}" for name, metres in lost)
         floor = [] if card.energy_budget is None else [format_budget(card.energy_budget)]
         judged = [] if card.verdict is None else [f"verdict: {format_verdict(card.verdict)}"]

@@ -19,7 +19,7 @@ from tcpipe.cost.physics import ALL, FitSamples
 from tcpipe.formats.dataset_card import (
     Balance,
     DatasetCard,
-    Doubtful,
+    FlaggedSamples,
     LabelColumns,
     LabelStatistics,
     MapRegistration,
@@ -64,7 +64,7 @@ class SampleFigures(TypedDict):
     folds_of_train: tuple[int, ...]
     terrain: dict[str, dict[str, int]]
     label_statistics_of_train: dict[str, LabelStatistics]
-    doubtful: Doubtful
+    flagged_samples: FlaggedSamples
 
 
 def make_dataset_card(
@@ -108,7 +108,7 @@ def make_dataset_card(
         split=SplitResult(
             drawn.buffer_m, None if regions is None else regions_to_json(regions), drawn.audit, drawn.kept
         ),
-        ledger_m=content.ledger_m,
+        distance_by_reason_m=content.distance_by_reason_m,
         removal=content.removal,
         balance=balance,
         runs=runs,
@@ -152,7 +152,7 @@ def measure_samples(samples: pa.Table, *, has_terrain: bool) -> SampleFigures:
         "folds_of_train": _fold_counts(samples),
         "terrain": _count_terrain(samples) if has_terrain else {},
         "label_statistics_of_train": _compute_statistics(samples),
-        "doubtful": count_flagged(samples.column("quality")),
+        "flagged_samples": count_flagged(samples.column("quality")),
     }
 
 
@@ -200,7 +200,7 @@ def _compute_statistics(samples: pa.Table) -> dict[str, LabelStatistics]:
     return found
 
 
-PHYSICS_COLUMNS = ("start_ns", "start_z_m", "end_z_m", "chord_m", "turn_rate_radps", "standing_power_watt")
+PHYSICS_COLUMNS = ("start_ns", "start_z_m", "end_z_m", "chord_m", "mean_abs_yaw_rate_radps", "idle_power_watt")
 """Columns of samples.parquet that the fit reads, beside those of the labels."""
 
 
@@ -214,7 +214,7 @@ def fit_physics_by_robot(samples: pa.Table) -> dict[str, PhysicsFit]:
     found = {}
     for robot in sorted(pc.unique(samples.column("robot")).to_pylist()):
         mine = samples.filter(pc.equal(samples.column("robot"), robot)).sort_by("start_ns")
-        fit = fit_and_validate_physics(make_fit_samples(mine), standing_watt=find_idle_power(mine))
+        fit = fit_and_validate_physics(make_fit_samples(mine), idle_watt=find_idle_power(mine))
         if fit is not None:
             found[robot] = fit
     return found
@@ -231,24 +231,24 @@ def make_fit_samples(samples: pa.Table) -> FitSamples:
         power_watt=to_floats(samples, "power_watt"),
         velocity_mps=to_floats(samples, "velocity_mps"),
         rise=(to_floats(samples, "end_z_m") - to_floats(samples, "start_z_m")) / to_floats(samples, "chord_m"),
-        turn_rate_radps=to_floats(samples, "turn_rate_radps"),
+        mean_abs_yaw_rate_radps=to_floats(samples, "mean_abs_yaw_rate_radps"),
         terrain=np.array(names, np.str_),
     )
 
 
 def find_idle_power(samples: pa.Table) -> float | None:
     """Return the power while standing [W], the mean over the samples of what their runs tell; None where none stood."""
-    watt = to_floats(samples, "standing_power_watt")
+    watt = to_floats(samples, "idle_power_watt")
     return float(np.nanmean(watt)) if np.isfinite(watt).any() else None
 
 
-def count_flagged(quality: pa.ChunkedArray) -> Doubtful:
+def count_flagged(quality: pa.ChunkedArray) -> FlaggedSamples:
     """Return how many samples carry a quality bit that not all of them carry, and how many each; ``quality`` is their column."""
     bits = quality.to_numpy().astype(np.int64)
     counts = {flag_name(bit): int(np.count_nonzero(bits & int(bit))) for bit in Quality}
     common = int(np.bitwise_and.reduce(bits)) if len(bits) > 1 else 0
     count = int(np.count_nonzero(bits & ~common))
-    return Doubtful(count, count / max(len(bits), 1), {name: of for name, of in counts.items() if of})
+    return FlaggedSamples(count, count / max(len(bits), 1), {name: of for name, of in counts.items() if of})
 
 
 def find_in_samples(card: DatasetCard) -> Iterator[Finding]:
@@ -265,7 +265,7 @@ def find_in_samples(card: DatasetCard) -> Iterator[Finding]:
 
 
 def _find_flagged(card: DatasetCard, dataset: Subject) -> Iterator[Finding]:
-    flagged = card.doubtful
+    flagged = card.flagged_samples
     if flagged is None or not flagged.samples:
         return
     by_bit = {name: count for name, count in flagged.by_bit.items() if count < card.samples} or flagged.by_bit

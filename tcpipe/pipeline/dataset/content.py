@@ -57,10 +57,10 @@ from tcpipe.terrain.projection import compute_area, parse_crs
 
 @dataclass(frozen=True, slots=True)
 class Pool:
-    """Segments with power and position, of all runs, mapped from a file; ``ledger_m`` sums to the runs' odometers."""
+    """Segments with power and position, of all runs, mapped from a file; ``distance_by_reason_m`` sums to the runs' odometers."""
 
     segments: pa.Table
-    ledger_m: Mapping[str, float]
+    distance_by_reason_m: Mapping[str, float]
     findings: tuple[Finding, ...]
 
 
@@ -75,8 +75,10 @@ def pool_segments(
     ------
     DatasetError : None can: the lines say what the runs lack.
     """
-    names = dict.fromkeys(name for run in runs for name in run.manifest.ledger_m)
-    ledger_m = {name: math.fsum(run.manifest.ledger_m.get(name, 0.0) for run in runs) for name in names}
+    names = dict.fromkeys(name for run in runs for name in run.manifest.distance_by_reason_m)
+    distance_by_reason_m = {
+        name: math.fsum(run.manifest.distance_by_reason_m.get(name, 0.0) for run in runs) for name in names
+    }
     path, counts = directory / "segments.arrow", list[_Count]()
     write_pieces(path, LABELLED_SEGMENTS.arrow(), _iterate_usable(runs, again or {}, counts))
     segments = map_table(path)
@@ -94,7 +96,7 @@ def pool_segments(
         Loss.OUTSIDE_MAP: math.fsum(count.no_place_m for count in counts),
         Loss.RECORDED_TWICE: math.fsum(count.again_m for count in counts),
     }
-    return Pool(segments, move_out(ledger_m, lost_m), tuple(_find_unusable(runs, counts)))
+    return Pool(segments, move_out(distance_by_reason_m, lost_m), tuple(_find_unusable(runs, counts)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,9 +137,9 @@ def _find_unusable(runs: Sequence[RunDirectory], counts: Sequence[_Count]) -> It
             yield make_finding("run-without-samples", Subject("run", run.run_id), names={"lacks": " and ".join(lacks)})
 
 
-def move_out(ledger_m: Mapping[str, float], lost_m: Mapping[Loss, float]) -> dict[str, float]:
+def move_out(distance_by_reason_m: Mapping[str, float], lost_m: Mapping[Loss, float]) -> dict[str, float]:
     """Return the ledger with metres moved from what is kept to losses [m]; its sum stays the odometer."""
-    moved = dict(ledger_m)
+    moved = dict(distance_by_reason_m)
     for loss, metres in lost_m.items():
         name = flag_name(loss)
         moved[name] = moved.get(name, 0.0) + float(metres)
@@ -263,7 +265,7 @@ class Content:
     """Where the pixels wait, and what the layers mean."""
     sources: tuple[MapFile, ...]
     drawn: SplitResult
-    ledger_m: Mapping[str, float]
+    distance_by_reason_m: Mapping[str, float]
     registrations: Sequence[tuple[MapRegistration, ...]]
     """How each map lies against each run's track."""
     covariates: tuple[Covariate, ...]
@@ -328,7 +330,7 @@ def gather_content(directory: Path, inputs: Inputs, options: BuildOptions, worke
         spool=spool,
         sources=sources,
         drawn=drawn,
-        ledger_m=move_out(pool.ledger_m, {**lost_m, **unused_m}),
+        distance_by_reason_m=move_out(pool.distance_by_reason_m, {**lost_m, **unused_m}),
         registrations=[of for of, _ in registered],
         covariates=added.covariates,
         removal=removal,

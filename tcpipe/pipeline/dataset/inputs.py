@@ -127,7 +127,7 @@ def _refuse_without_segments(runs: Sequence[RunDirectory]) -> None:
         return
     lost_m = Counter[str]()
     for run in runs:
-        lost_m.update(run.facts.ledger_m)
+        lost_m.update(run.facts.distance_by_reason_m)
     where = ", ".join(
         f"{metres:.0f} m {name.replace('_', ' ')}" for name, metres in lost_m.most_common(4) if metres > 0
     )

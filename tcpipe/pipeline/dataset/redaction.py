@@ -225,7 +225,7 @@ def redact_card(card: DatasetCard, redaction: Redaction) -> DatasetCard:
     )
 
 
-_KEPT_SECTIONS = ("fuse", "gate", "segment", "label", "sample", "split", "covariates", "dataset")
+_KEPT_SECTIONS = ("fuse", "mask", "segment", "label", "sample", "split", "covariates", "dataset")
 """Of the recipe: the others tell topics, files and robots by name."""
 
 

@@ -42,11 +42,11 @@ def test_rows_are_ordered_unique_and_accounted_for(*, topics: dict[str, TopicTim
         rows = len(topics[name].log_time_ns)
         assert len(np.unique(timeline.row)) == len(timeline.row)
         assert len(timeline.row) + sum(timeline.dropped.values()) == rows
-        assert len(timeline.stamp_ns) == len(timeline.epoch) == len(timeline.row)
-        assert np.all(np.diff(timeline.epoch) >= 0)
-        same_epoch = np.diff(timeline.epoch) == 0
+        assert len(timeline.stamp_ns) == len(timeline.clock_epoch) == len(timeline.row)
+        assert np.all(np.diff(timeline.clock_epoch) >= 0)
+        same_epoch = np.diff(timeline.clock_epoch) == 0
         assert np.all(np.diff(timeline.stamp_ns)[same_epoch] > 0)
-        assert np.all((timeline.epoch >= 0) & (timeline.epoch <= len(steps)))
+        assert np.all((timeline.clock_epoch >= 0) & (timeline.clock_epoch <= len(steps)))
 
 
 @settings(max_examples=60, deadline=None)
@@ -79,4 +79,4 @@ def test_a_step_is_found_where_it_is_whatever_the_jitter(step_ms: int, at_s: int
     found, steps = settled.timelines, settled.steps
     assert len(steps) == 1
     assert abs(steps[0].step_s - step_ms / 1000) < 0.1
-    np.testing.assert_array_equal(found["t"].epoch, after.astype(int))
+    np.testing.assert_array_equal(found["t"].clock_epoch, after.astype(int))

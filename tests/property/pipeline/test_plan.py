@@ -54,7 +54,7 @@ def make_row(row, task, sha256, kind):
     empty = make_finding("no-segments", subject, names={"reason": "gap"}, driven_m=80.0, lost_m=80.0)
     changes = {
         "damaged": {"damage": ("it was cut",), "findings": find_damage(("it was cut",), subject)},
-        "empty": {"segments": 0, "ledger_m": {"gap": 80.0}, "findings": (empty,)},
+        "empty": {"segments": 0, "distance_by_reason_m": {"gap": 80.0}, "findings": (empty,)},
     }
     return replace(made, **changes.get(kind, {}))
 
@@ -127,15 +127,15 @@ def compare(logs, store, worked, **how):
     before, worked[:] = Store(store).state(), []
     results = {result.log: result for result in ingest([logs], store=store, **how).results}
     after = Store(store).state()
-    assert set(worked) == {name for name, standing in predicted.items() if standing in TO_DO}
-    for name, standing in predicted.items():
+    assert set(worked) == {name for name, state in predicted.items() if state in TO_DO}
+    for name, state in predicted.items():
         result = results[name]
-        if standing in ("done", "partial", "empty", "superseded"):
+        if state in ("done", "partial", "empty", "superseded"):
             assert result.status == "unchanged"
-            assert not result.is_news
-        elif standing in ("failed_permanent", "quarantined"):
-            assert (result.status, result.known, result.acknowledged) == ("failed", True, standing == "quarantined")
-        elif standing == "growing":
+            assert not result.is_new_problem
+        elif state in ("failed_permanent", "quarantined"):
+            assert (result.status, result.known, result.acknowledged) == ("failed", True, state == "quarantined")
+        elif state == "growing":
             assert result.status == "waiting"
     if not worked:
         assert after == before, "a call with nothing to do writes nothing"

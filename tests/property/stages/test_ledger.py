@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from made_tracks import make_track, power_streams, stamps
 
-from tcpipe.recipe import GateConfig, LabelConfig, SegmentConfig
+from tcpipe.recipe import LabelConfig, MaskConfig, SegmentConfig
 from tcpipe.stages.label import label_segments
 from tcpipe.stages.mask import mask_track
 from tcpipe.stages.segment import segment_track
@@ -33,11 +33,11 @@ def drives(draw):
     position = np.concatenate((np.zeros((1, 3)), np.cumsum(0.5 * (velocity[1:] + velocity[:-1]) * fine_s, axis=0)))
     kept = np.sort(rng.permutation(len(t[::FINE]))[: draw(st.integers(len(t[::FINE]) // 2, len(t[::FINE])))])
     kept = np.arange(len(t[::FINE])) if draw(st.booleans()) else kept
-    epoch = (kept > draw(st.integers(0, 2 * len(t[::FINE])))).astype(np.int16)
+    clock_epoch = (kept > draw(st.integers(0, 2 * len(t[::FINE])))).astype(np.int16)
     rows = kept * FINE
     way = np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(position[:, :2], axis=0).T))))
     straight = np.hypot(*np.diff(position[rows, :2], axis=0).T)
-    whole = (np.diff(kept) == 1) & (np.diff(epoch) == 0)
+    whole = (np.diff(kept) == 1) & (np.diff(clock_epoch) == 0)
     true_m = np.where(whole, np.diff(way[rows]), straight).sum()
     if draw(st.booleans()) and whole.any():  # fixes that move elsewhere: nobody drove that
         position[rows[draw(st.sampled_from(np.flatnonzero(whole).tolist())) + 1] :] += (300.0, -40.0, 5.0)
@@ -45,7 +45,7 @@ def drives(draw):
         position[rows],
         velocity[rows],
         stamp_ns=stamps(len(t[::FINE]))[kept],
-        epoch=epoch,
+        clock_epoch=clock_epoch,
         forward_mps=speed[rows],
         yaw_rate_radps=turn[rows],
         wheel_mps=speed[rows] if draw(st.booleans()) else None,
@@ -56,13 +56,13 @@ def drives(draw):
 
 
 def labelled(track):
-    gated = mask_track(track, GateConfig(), max_velocity_mps=1.0, chord_m=1.0)
-    stamp_ns = gated.table["stamp_ns"].to_numpy()
+    masked = mask_track(track, MaskConfig(), max_velocity_mps=1.0, chord_m=1.0)
+    stamp_ns = masked.table["stamp_ns"].to_numpy()
     t_ns = np.arange(stamp_ns[0] - 10**9, stamp_ns[-1] + 10**9, 40_000_000)
     power = power_streams({"drive": (t_ns, np.full(len(t_ns), 24.0), np.full(len(t_ns), 6.0))})
     found = label_segments(
-        segment_track(gated, SegmentConfig()),
-        gated,
+        segment_track(masked, SegmentConfig()),
+        masked,
         power,
         LabelConfig(),
         voltage_range_volt=None,
@@ -76,13 +76,13 @@ def test_kept_and_lost_are_what_was_driven_and_drawn(given_drives):
     ledgers_m, driven_m = [], []
     for track, true_m in given_drives:
         found, drawn_joule = labelled(track)
-        entries = found.ledger_m
+        entries = found.distance_by_reason_m
         assert min(entries.values()) >= 0.0
         assert sum(entries.values()) == pytest.approx(true_m, rel=1e-3, abs=1e-3)
         assert entries["kept"] == pytest.approx(to_floats(found.table, "arc_length_m").sum(), rel=1e-9, abs=1e-9)
         facts = found.info.report.facts.label
         assert facts.distance_m == pytest.approx(sum(entries.values()), rel=1e-12)
-        if not track.table["epoch"].to_numpy().any():  # power is of the first epoch alone
+        if not track.table["clock_epoch"].to_numpy().any():  # power is of the first clock_epoch alone
             assert sum(facts.energy_by_entry_joule.values()) == pytest.approx(drawn_joule, rel=1e-3)
         ledgers_m.append(entries)
         driven_m.append(true_m)

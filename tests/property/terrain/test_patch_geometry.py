@@ -18,10 +18,10 @@ PLACES = st.tuples(st.floats(-4e5, 4e5), st.floats(-4e5, 4e5))
     chord_m=st.floats(0.5, 3.0),
     factor=st.floats(1.0, 2.0),
     patch_px=st.integers(2, 64),
-    pitch_m=st.floats(0.01, 1.0),
+    pixel_size_m=st.floats(0.01, 1.0),
 )
-def test_pixels_lie_where_the_ruling_says(*, start, angle, scale, chord_m, factor, patch_px, pitch_m):
-    grid = MapGrid("EPSG:32633", 12.5, 7.25, pitch_m, 10, 10)
+def test_pixels_lie_where_the_ruling_says(*, start, angle, scale, chord_m, factor, patch_px, pixel_size_m):
+    grid = MapGrid("EPSG:32633", 12.5, 7.25, pixel_size_m, 10, 10)
     patch_m = chord_m * factor
     p0 = np.array([start])
     direction = np.array([(np.cos(angle), np.sin(angle))])

@@ -12,14 +12,14 @@ from tcpipe.cost.held_out import _HeldOut, _score, fit_and_validate_physics
 
 def test_shares_and_scores_of_an_exact_robot():
     metres = made(7, 500)
-    fit = fit_and_validate_physics(metres, standing_watt=STANDING_WATT)
+    fit = fit_and_validate_physics(metres, idle_watt=STANDING_WATT)
     assert sum(fit.energy_share.values()) == pytest.approx(1.0, abs=1e-4)
     energy = metres.power_watt / metres.velocity_mps
-    assert fit.energy_share["standing"] == pytest.approx((14.0 / metres.velocity_mps).sum() / energy.sum(), rel=1e-3)
+    assert fit.energy_share["idle"] == pytest.approx((14.0 / metres.velocity_mps).sum() / energy.sum(), rel=1e-3)
     assert fit.held_out.r2 == pytest.approx(1.0, abs=1e-6)
     assert fit.held_out.mape < 1e-2
     assert fit.without_turning.r2 < 0.99
-    assert fit.usual_turn_radpm == pytest.approx((metres.turn_rate_radps / metres.velocity_mps).mean())
+    assert fit.mean_turn_radpm == pytest.approx((metres.mean_abs_yaw_rate_radps / metres.velocity_mps).mean())
     low, high = fit.gain_of_turning
     assert low < 1.0 - fit.without_turning.r2 < high
 
@@ -27,7 +27,7 @@ def test_shares_and_scores_of_an_exact_robot():
 def test_where_turning_costs_nothing_it_is_worth_nothing():
     metres = made(8, 500, noise_watt=15.0)
     fit = fit_and_validate_physics(
-        replace(metres, turn_rate_radps=np.random.default_rng(1).uniform(0, 0.4, 500)), standing_watt=STANDING_WATT
+        replace(metres, mean_abs_yaw_rate_radps=np.random.default_rng(1).uniform(0, 0.4, 500)), idle_watt=STANDING_WATT
     )
     low, high = fit.gain_of_turning
     assert low < 0.01
@@ -42,14 +42,14 @@ def test_a_metre_that_takes_nearly_nothing_is_in_no_percentage():
 
 def test_no_metres_no_fit():
     metres = made(9, 19)
-    assert fit_and_validate_physics(metres, standing_watt=STANDING_WATT) is None
-    assert fit_and_validate_physics(metres.take(np.arange(0)), standing_watt=STANDING_WATT) is None
+    assert fit_and_validate_physics(metres, idle_watt=STANDING_WATT) is None
+    assert fit_and_validate_physics(metres.take(np.arange(0)), idle_watt=STANDING_WATT) is None
 
 
 def test_many_metres_are_not_drawn_all_at_once():
     metres = made(10, 2000)
     tracemalloc.start()
-    fit_and_validate_physics(metres, standing_watt=STANDING_WATT)
+    fit_and_validate_physics(metres, idle_watt=STANDING_WATT)
     peak_bytes = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak_bytes < 2000 * 2000, "3.2 kB a metre are 6 GB of two million"

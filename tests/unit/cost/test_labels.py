@@ -45,14 +45,12 @@ def test_deviations_are_those_of_many_estimated_metres():
     assert got.velocity_std_mps[0] == pytest.approx((1 / duration).std(), rel=0.02)
     assert got.energy_std_joule[0] == pytest.approx(spent.std(), rel=0.01)
     assert got.power_std_watt[0] == pytest.approx((spent / duration).std(), rel=0.03)
-    above = subtract_idle_power(got, standing_watt=90.0, standing_std_watt=2.0, **ends)
+    above = subtract_idle_power(got, idle_watt=90.0, idle_std_watt=2.0, **ends)
     beside = spent - (90 + other) * duration
-    assert above.energy_above_standing_joule[0] == pytest.approx(got.energy_joule[0] - 90 * end_s)
-    assert above.energy_above_standing_std_joule[0] == pytest.approx(beside.std(), rel=0.02)
-    assert above.power_above_standing_std_watt[0] == pytest.approx((beside / duration).std(), rel=0.02)
-    assert above.energy_above_standing_joule[0] == pytest.approx(
-        above.power_above_standing_watt[0] / got.velocity_mps[0]
-    )
+    assert above.net_energy_joule[0] == pytest.approx(got.energy_joule[0] - 90 * end_s)
+    assert above.net_energy_std_joule[0] == pytest.approx(beside.std(), rel=0.02)
+    assert above.net_power_std_watt[0] == pytest.approx((beside / duration).std(), rel=0.02)
+    assert above.net_energy_joule[0] == pytest.approx(above.net_power_watt[0] / got.velocity_mps[0])
 
 
 def test_without_energy_there_is_none_of_its_deviations():
@@ -61,9 +59,9 @@ def test_without_energy_there_is_none_of_its_deviations():
     assert got.duration_std_s[0] == pytest.approx(0.01)
 
 
-@pytest.mark.parametrize(("standing_watt", "energy_joule"), [(np.nan, 200.0), (90.0, np.nan)])
-def test_above_standing_is_not_known_where_either_is_not(standing_watt, energy_joule):
+@pytest.mark.parametrize(("idle_watt", "energy_joule"), [(np.nan, 200.0), (90.0, np.nan)])
+def test_above_standing_is_not_known_where_either_is_not(idle_watt, energy_joule):
     ends = {"end_power_watt": np.array([150.0]), "energy_noise_joule": np.array([1.0])}
     cost = one(duration_s=1.2, energy_joule=energy_joule, end_velocity_mps=0.8, **ends)
-    got = subtract_idle_power(cost, standing_watt=standing_watt, standing_std_watt=2.0, **ends)
+    got = subtract_idle_power(cost, idle_watt=idle_watt, idle_std_watt=2.0, **ends)
     assert all(np.isnan(getattr(got, name)[0]) for name in got.__slots__)

@@ -29,7 +29,9 @@ def split_of(**columns):
 def test_a_turn_is_the_angle_of_a_metre():
     found = read_extra_features(
         split_of(
-            turn_rate_radps=np.array([0.2, np.nan]), duration_s=np.array([1.5, 1.0]), arc_length_m=np.array([1.2, 1.0])
+            mean_abs_yaw_rate_radps=np.array([0.2, np.nan]),
+            duration_s=np.array([1.5, 1.0]),
+            arc_length_m=np.array([1.2, 1.0]),
         )
     )
     assert found.turn_radpm == pytest.approx([0.25, np.nan], nan_ok=True)

@@ -54,16 +54,16 @@ def test_labels_are_power_and_velocity(path):
 
 
 def test_labels_above_standing_are_the_same_samples_less_what_standing_takes(path):
-    total, above = (open_dataset(path, label=name)["test"] for name in ("total", "above_standing"))
-    assert above.label_columns == ("power_above_standing_watt", "velocity_mps")
+    total, above = (open_dataset(path, label=name)["test"] for name in ("total", "net"))
+    assert above.label_columns == ("net_power_watt", "velocity_mps")
     np.testing.assert_allclose(above.labels[:, 0], total.labels[:, 0] - STANDING_WATT, rtol=1e-6)
     np.testing.assert_array_equal(above.labels[:, 1], total.labels[:, 1])
     np.testing.assert_array_equal(above.patches, total.patches)
     half = above.take(np.arange(len(above)) % 2 == 0)
     np.testing.assert_array_equal(half.labels, above.labels[::2])
-    variance = half.column("power_above_standing_std_watt") ** 2
+    variance = half.column("net_power_std_watt") ** 2
     np.testing.assert_allclose(half.weights[:, 0] * variance, (half.weights[:, 0] * variance)[0], rtol=1e-5)
-    assert set(above.clean(max_power_std_watt=1.25).column("power_above_standing_std_watt")) <= {1.0, 1.1, 1.2}
+    assert set(above.clean(max_power_std_watt=1.25).column("net_power_std_watt")) <= {1.0, 1.1, 1.2}
     with pytest.raises(DatasetError, match="label 'sum': wanted one of total, above_standing"):
         open_dataset(path, label="sum")
 

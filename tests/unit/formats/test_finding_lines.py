@@ -25,7 +25,7 @@ EMPTY = make_finding("no-segments", Subject("run", "a"), names={"reason": "gap"}
 
 def slow(fraction):
     numbers = {"slow_fraction": fraction, "limit_mps": 0.95, "top_mps": 0.6}
-    keep = Remedy("keep", recipe={"gate": {"require_full_speed": False}})
+    keep = Remedy("keep", recipe={"mask": {"require_full_speed": False}})
     return make_finding("driven-below-limit", COMMAND, remedies=[keep], **numbers)
 
 
@@ -45,7 +45,7 @@ def test_numbers_have_the_unit_of_their_suffix_and_three_digits(name, value, tex
 def test_a_line_says_what_was_observed_what_to_do_and_its_code():
     (line,) = format_findings([slow(0.7)])
     observed = "warning: 70 % of the moving track was commanded below 0.95 m/s; the top command was 0.6 m/s"
-    assert line == f"{observed}. To accept any speed: [gate] require_full_speed = false [driven-below-limit]"
+    assert line == f"{observed}. To accept any speed: [mask] require_full_speed = false [driven-below-limit]"
 
 
 def test_the_worst_comes_first_at_most_eight_and_notes_are_counted_apart():
@@ -77,7 +77,7 @@ def test_findings_of_several_runs_are_one_line_a_code():
     title = "Most of the drive was commanded below the robot's maximum speed"
     assert (
         format_group(groups[1], 3)
-        == f"2 of 3 runs: {title} (command; 60 % to 70 %). To accept any speed: [gate] require_full_speed = false [driven-below-limit]"
+        == f"2 of 3 runs: {title} (command; 60 % to 70 %). To accept any speed: [mask] require_full_speed = false [driven-below-limit]"
     )
     assert format_groups(groups, 3, more="tcpipe report STORE")[-1] == "and 1 note: tcpipe report STORE"
 

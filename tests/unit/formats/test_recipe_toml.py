@@ -18,7 +18,7 @@ from tcpipe.formats.recipe_toml import (
     parse_recipe,
     read_key,
 )
-from tcpipe.recipe import FuseConfig, Placement, ReadConfig, Recipe, SegmentConfig, SplitConfig
+from tcpipe.recipe import Extrinsics, FuseConfig, ReadConfig, Recipe, SegmentConfig, SplitConfig
 
 
 def test_commented_recipe_is_the_default_recipe(tmp_path: Path) -> None:
@@ -38,7 +38,7 @@ def test_uncommented_keys_parse_to_the_same_defaults(tmp_path: Path) -> None:
 
 
 def test_every_wrong_key_is_one_problem() -> None:
-    wrong = {"fuse": {"bogus": 1, "rate_hz": -1}, "read": {"placement": {"gnss": {"xyz": 1}}}, "zz": 2}
+    wrong = {"fuse": {"bogus": 1, "rate_hz": -1}, "read": {"extrinsics": {"gnss": {"xyz": 1}}}, "zz": 2}
     with pytest.raises(RecipeError) as caught:
         parse_recipe(wrong, where="r.toml")
     assert len(caught.value.problems) == 4
@@ -54,12 +54,12 @@ WRONG = {
     'read.topics.gnsss = ["/a"]': "unknown key read.topics.gnsss; known here: gnss, gnss_velocity, imu, wheel_odometry, visual_odometry",
     'read.topics.imu = "/a"': 'read.topics.imu is "/a"; expected a list',
     "read.topics.imu = [1]": "read.topics.imu.0 is 1; expected text in quotes",
-    "read.placement.imu.xyz_m = [1, 2]": "read.placement.imu.xyz_m is [1, 2]; expected 3 values",
-    "read.placement.imu.xyz_m = [1, 2, 3, 4]": "is [1, 2, 3, 4]; expected 3 values",
-    'read.placement.imu.xyz_m = [1, 2, "up"]': 'read.placement.imu.xyz_m is [1, 2, "up"]; expected 3 values in a list, each a number',
-    "read.placement.imu = 3": "read.placement.imu is 3; expected a table of keys",
+    "read.extrinsics.imu.xyz_m = [1, 2]": "read.extrinsics.imu.xyz_m is [1, 2]; expected 3 values",
+    "read.extrinsics.imu.xyz_m = [1, 2, 3, 4]": "is [1, 2, 3, 4]; expected 3 values",
+    'read.extrinsics.imu.xyz_m = [1, 2, "up"]': 'read.extrinsics.imu.xyz_m is [1, 2, "up"]; expected 3 values in a list, each a number',
+    "read.extrinsics.imu = 3": "read.extrinsics.imu is 3; expected a table of keys",
     "read.topics = 3": "read.topics is 3; expected a table",
-    "read.placement.imu.xyz_m = 3": "read.placement.imu.xyz_m is 3; expected 3 values in a list, each a number from -1000 to 1000",
+    "read.extrinsics.imu.xyz_m = 3": "read.extrinsics.imu.xyz_m is 3; expected 3 values in a list, each a number from -1000 to 1000",
     'read.imu_units = "kg"': 'read.imu_units is "kg"; expected one of deg, deg_g, g, si',
     "fuse.rate_hz = -1": "fuse.rate_hz is -1; expected a number from 1 to 500",
     "fuse.rate_hz = true": "fuse.rate_hz is true; expected a number",
@@ -75,9 +75,9 @@ WRONG = {
     "fuse.rate_hz = nan": "fuse.rate_hz is nan; expected a number from 1 to 500",
     "fuse.rate_hz = [1]": "fuse.rate_hz is [1]; expected a number",
     "fuse.gate_probability = 1": "fuse.gate_probability is 1; expected a number from 0.5 to 0.999999999",
-    "gate.full_speed_fraction = 1.2": "gate.full_speed_fraction is 1.2; expected a number from 0 to 1",
-    'gate.keep_reversing = "maybe"': "expected true or false",
-    "gate.keep_reversing = [1]": "expected true or false",
+    "mask.full_speed_fraction = 1.2": "mask.full_speed_fraction is 1.2; expected a number from 0 to 1",
+    'mask.keep_reversing = "maybe"': "expected true or false",
+    "mask.keep_reversing = [1]": "expected true or false",
     "sample.patch_px = 1": "sample.patch_px is 1; expected a whole number from 2 to 1024",
     "split.folds = 2.5": "split.folds is 2.5; expected a whole number",
     'split.seed = "x"': 'split.seed is "x"; expected a whole number',
@@ -113,14 +113,14 @@ def test_all_wrong_values_of_a_section_are_said_at_once_also_by_replace() -> Non
 
 
 def test_one_value_is_one_recipe_however_it_is_written() -> None:
-    plain = Recipe(segment=SegmentConfig(chord_m=2.0), read=ReadConfig(placement={"imu": Placement((0.0, 0.0, 1.0))}))
+    plain = Recipe(segment=SegmentConfig(chord_m=2.0), read=ReadConfig(extrinsics={"imu": Extrinsics((0.0, 0.0, 1.0))}))
     same = (
-        Recipe(segment=SegmentConfig(chord_m=2), read=ReadConfig(placement={"imu": {"xyz_m": [0, -0.0, 1]}})),  # type: ignore[dict-item]
+        Recipe(segment=SegmentConfig(chord_m=2), read=ReadConfig(extrinsics={"imu": {"xyz_m": [0, -0.0, 1]}})),  # type: ignore[dict-item]
         Recipe(
             segment=SegmentConfig(chord_m=np.float32(2)),  # type: ignore[arg-type]
-            read=ReadConfig(placement={"imu": Placement(np.array([0, 0, 1]))}),  # type: ignore[arg-type]
+            read=ReadConfig(extrinsics={"imu": Extrinsics(np.array([0, 0, 1]))}),  # type: ignore[arg-type]
         ),
-        parse_recipe({"segment": {"chord_m": 2}, "read": {"placement": {"imu": {"xyz_m": [0, 0, 1]}}}}, where="r"),
+        parse_recipe({"segment": {"chord_m": 2}, "read": {"extrinsics": {"imu": {"xyz_m": [0, 0, 1]}}}}, where="r"),
     )
     for other in same:
         assert other == plain
@@ -133,7 +133,7 @@ def test_names_of_recipes_are_those_of_0_8() -> None:
     own = {
         "robot": "husky",
         "fuse": {"rate_hz": 10},
-        "read": {"topics": {"imu": ["/a"]}, "placement": {"imu": {"xyz_m": [1, 0, -0.0]}}},
+        "read": {"topics": {"imu": ["/a"]}, "extrinsics": {"imu": {"xyz_m": [1, 0, -0.0]}}},
         "robots": {"r": {"width_m": 1, "voltage_range_volt": [20, 30]}},
         "power_sources": [{"type": "a/msg/B", "voltage": "v"}],
     }
@@ -147,7 +147,7 @@ def test_names_of_recipes_are_those_of_0_8() -> None:
 @pytest.mark.parametrize("value", [{1.0, 2.0, 3.0}, (0.0, float("nan"), 0.0), (0.0, 0.0, float("inf")), b"abc", "abc"])
 def test_no_value_of_another_kind_is_a_position(value: object) -> None:
     with pytest.raises(RecipeError, match=r"placement.xyz_m is .*; expected 3 values in a list, each a number"):
-        Placement(value)  # type: ignore[arg-type]
+        Extrinsics(value)  # type: ignore[arg-type]
 
 
 def test_a_recipe_does_not_change_with_the_lists_it_was_made_of() -> None:

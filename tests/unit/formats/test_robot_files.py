@@ -21,7 +21,7 @@ def test_a_robot_has_a_file_of_its_name_and_stands_in_the_recipe_that_init_write
 
 def test_what_is_shipped_can_be_told_apart_and_is_of_a_robots_size():
     robots = load_shipped_profiles().robots.values()
-    for key in ("platform", "status_types", "called"):
+    for key in ("platform", "status_types", "topic_words"):
         said = [value for of in robots for value in ([getattr(of, key)] if key == "platform" else getattr(of, key))]
         assert len(said) == len(set(said)), key
     for of in robots:
@@ -72,7 +72,7 @@ def test_everything_that_is_wrong_with_a_robot_is_said_at_once_by_its_key():
                     {"type": "a/msg/B"},
                     {"type": "a/msg/B", "voltage": "v", "sign": "plus"},
                     {"type": "a/msg/B", "energy": "e", "current": "i"},
-                    {"type": "a/msg/B", "voltage": "v", "refused": "tells phases"},
+                    {"type": "a/msg/B", "voltage": "v", "unsupported_reason": "tells phases"},
                 ],
             },
             where="tcpipe.toml",
@@ -89,7 +89,7 @@ def test_everything_that_is_wrong_with_a_robot_is_said_at_once_by_its_key():
         "power_sources.2.current",
         'power_sources.3.sign is "plus"; expected one of auto',
         'power_sources.4.energy is "e"; expected a voltage beside it, and no current',
-        'power_sources.5.refused is "tells phases"; expected no field beside it',
+        'power_sources.5.unsupported_reason is "tells phases"; expected no field beside it',
     ]
     assert len(said) == len(keys)
     assert all(line.startswith(key) for line, key in zip(said, keys, strict=True)), said

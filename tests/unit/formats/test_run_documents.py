@@ -58,7 +58,7 @@ def test_a_kept_document_is_read_whole_and_written_as_it_was(kept, pattern, cls)
     ("keys", "line"),
     [
         (("counts", "segments"), "counts.segments: wanted a whole number, got a list"),
-        (("ledger_m", "kept"), "ledger_m[...]: wanted a number, got a list"),
+        (("distance_by_reason_m", "kept"), "distance_by_reason_m[...]: wanted a number, got a list"),
         (
             ("info", "report", "facts", "fuse", "rows"),
             "info.report.facts.fuse.rows: wanted a whole number, got a list",

@@ -151,7 +151,7 @@ def test_fixes_that_err_together_move_neither_the_track_nor_what_it_claims(start
     off, most_m = normalized(found, first_s=5, last_s=145)
     assert most_m < 0.1
     assert np.mean(off < 2 * np.sqrt(2)) > 0.85
-    first = next(r for r in found.facts.reopenings if r.role == GNSS)
+    first = next(r for r in found.facts.gate_resets if r.role == GNSS)
     assert start_s - 5 < (first.start_ns - drive.ZERO_NS) * 1e-9 <= start_s  # with what leads up to it
     assert (first.end_ns - drive.ZERO_NS) * 1e-9 == pytest.approx(end_s, abs=0.5)
     if not ramp_s:
@@ -161,8 +161,8 @@ def test_fixes_that_err_together_move_neither_the_track_nor_what_it_claims(start
 
 def test_a_jump_that_stays_is_taken_for_an_error_of_the_fixes():
     found = fuse(displaced(drive.measure(truth(), 1), 70.0, 1e9, (3.0, 0.0, 0.0)))
-    (reopening,) = [r for r in found.facts.reopenings if r.role == GNSS]
-    assert reopening.size == pytest.approx(3.0, abs=0.1)
+    (gate_reset,) = [r for r in found.facts.gate_resets if r.role == GNSS]
+    assert gate_reset.size == pytest.approx(3.0, abs=0.1)
     off, most_m = normalized(found, first_s=5, last_s=145)
     assert most_m < 0.5
     assert np.mean(off < 2 * np.sqrt(2)) > 0.85
@@ -332,11 +332,11 @@ def test_a_receiver_whose_clock_is_off_is_trusted_less_rather_than_refused():
     shifted = replace(late.gnss, stamp_ns=late.gnss.stamp_ns + 250_000_000)
     found = fuse(replace(late, gnss=shifted))
     assert found.facts.rejected[GNSS] < 0.2 * found.facts.measurements[GNSS]
-    assert max(r.size for r in found.facts.reopenings) > 0.1
+    assert max(r.size for r in found.facts.gate_resets) > 0.1
     error = drive.errors(truth(), found, after_s=5.0)
     assert 0.1 < error["xy"] < 0.3  # a quarter of a second of way, but no more
     assert error["forward"] < 0.03
-    assert smoothed().facts.reopenings == ()
+    assert smoothed().facts.gate_resets == ()
 
 
 def test_two_fixes_close_together_say_nothing_of_how_long_a_metre_is():

@@ -28,7 +28,7 @@ def told(dataset):
 
 
 def _column(split, name):
-    if name == "turn_rate_radps":
+    if name == "mean_abs_yaw_rate_radps":
         return 0.01 * (real_column(split, "start_ns") // 1_200_000_000 % 7)
     if name == "commanded_velocity_mps":
         return np.where(real_column(split, "start_ns") // 1_200_000_000 % 2, 0.5, 1.0)
@@ -110,9 +110,10 @@ def test_an_older_dataset_cannot_tell_and_says_so(dataset, tmp_path, monkeypatch
     train(dataset, tmp_path / "model", config=config)
     assert "its samples have no commanded speed (commanded_velocity_mps): the model is not told it" in caplog.text
     assert [of.name for of in load_model(tmp_path / "model").card.beside] == ["turn_radpm"]
-    absent.add("turn_rate_radps")
+    absent.add("mean_abs_yaw_rate_radps")
     with pytest.raises(
-        DatasetError, match=r"no turn \(turn_rate_radps\) and no commanded speed .* or train without --extra-features"
+        DatasetError,
+        match=r"no turn \(mean_abs_yaw_rate_radps\) and no commanded speed .* or train without --extra-features",
     ):
         train(dataset, tmp_path / "other", config=config)
     train(dataset, tmp_path / "physics", config=FitConfig(model="physics"))

@@ -57,16 +57,16 @@ def test_a_damaged_one_is_told_or_as_it_was(tmp_path_factory, data):
     [
         {},
         {"best_loss": None},
-        {"epoch": 1},
-        {"epoch": 1, "history": [[1, 0.5]]},
-        {"epoch": 1, "history": [[2, 0.5, 0.5]]},
+        {"clock_epoch": 1},
+        {"clock_epoch": 1, "history": [[1, 0.5]]},
+        {"clock_epoch": 1, "history": [[2, 0.5, 0.5]]},
         {"best_epoch": 1},
         {"best_epoch": None},
         {"more": 1},
     ],
 )
 def test_a_foreign_one_is_told(tmp_path, state):
-    whole = {"key": "key", "epoch": 0, "best_epoch": 0, "best_loss": 1.0, "history": []}
+    whole = {"key": "key", "clock_epoch": 0, "best_epoch": 0, "best_loss": 1.0, "history": []}
     text = json.dumps({**whole, **state} if state else []).encode()
     write_arrays(tmp_path / "x.checkpoint", {"state": np.frombuffer(text, np.uint8)})
     with pytest.raises(ModelError, match=r"x.checkpoint: not a checkpoint; remove it, or start anew with --no-resume"):

@@ -81,10 +81,10 @@ def test_the_figures_are_the_arrays_own(evaluated, model, dataset):
 
 def test_a_model_of_what_is_above_standing_is_held_against_that(model, dataset, tmp_path):
     training = load_model(model).card.training
-    names = ("power_above_standing_watt", "velocity_mps")
-    made = made_model(tmp_path / "above", training=training, outputs=names, label_energy="above_standing")
+    names = ("net_power_watt", "velocity_mps")
+    made = made_model(tmp_path / "above", training=training, outputs=names, label_energy="net")
     values = run_evaluation(made, dataset, tmp_path / "evaluation", config=ONE_DRAW).values
-    assert values.model.label_energy == "above_standing"
+    assert values.model.label_energy == "net"
     unseen = open_dataset(dataset)["unseen"]
     said = _centred(made, unseen)
     energy, told = unseen.column("energy_joule") - 1.2 * STANDING_WATT, said[:, 0] / said[:, 1]
@@ -131,7 +131,7 @@ def test_every_prediction_is_kept_and_stands_in_the_page(evaluated, dataset):
         found = values.splits[split].errors["E"]["all"]
         assert np.sqrt(np.mean(off**2)) == pytest.approx(found.rmse, rel=1e-6)
         energy, low, high = (rows[f"energy_{of}joule"].to_numpy() for of in ("", "predicted_low_", "predicted_high_"))
-        assert 100.0 * np.mean((low <= energy) & (energy <= high)) == pytest.approx(found.held_percent)
+        assert 100.0 * np.mean((low <= energy) & (energy <= high)) == pytest.approx(found.coverage_percent)
     told = data_of((place / "evaluation.html").read_text())
     packed = told["samples"]
     assert unpacked(packed, "id") == table["sample_id"].to_pylist()

@@ -81,7 +81,7 @@ def test_a_model_that_does_not_beat_class_and_slope_is_usable_with_care(ratio):
     best = found["baseline-not-beaten"]
     assert best.numbers["rmse_fraction"] == ratio.value
     commands = [of.command for of in best.remedies]
-    assert commands == (["tcpipe train DATASET --model table"] if ratio.low > 1.0 else [])
+    assert commands == (["tcpipe train DATASET --model boosting"] if ratio.low > 1.0 else [])
 
 
 @pytest.mark.parametrize(
@@ -106,7 +106,7 @@ def test_too_few_groups_show_neither():
     ],
 )
 def test_intervals_are_compared_with_what_they_state(held, code, grade):
-    found = told(replace(GOOD, held_percent=held))
+    found = told(replace(GOOD, coverage_percent=held))
     assert set(found) == {code}
     assert judge(found.values()).energy == grade
 

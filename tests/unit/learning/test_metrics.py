@@ -96,7 +96,7 @@ def test_scores_are_those_of_their_definitions():
         crps.append(below + quad(lambda x, m=m, s=s: (norm.cdf(x, m, s) - 1.0) ** 2, y, m + 60.0)[0])
     assert found.crps == pytest.approx(np.mean(crps), rel=1e-6)
     assert found.nll == pytest.approx(-np.mean(norm.logpdf(measured, predicted, std)))
-    assert found.held_percent == 50.0
+    assert found.coverage_percent == 50.0
 
 
 def test_scores_of_classes_are_those_of_all_samples_and_absent_where_nothing_is_stated():
@@ -108,7 +108,7 @@ def test_scores_of_classes_are_those_of_all_samples_and_absent_where_nothing_is_
         "E"
     ]
     pooled = compute_errors(predicted, measured, LEAST["E"], spread)
-    for score in ("held_percent", "nll", "crps"):
+    for score in ("coverage_percent", "nll", "crps"):
         assert getattr(by_class[ALL], score) == pytest.approx(getattr(pooled, score))
     assert compute_errors(predicted, measured).nll is None
     assert combine_errors([pooled, compute_errors(predicted, measured)]).crps is None

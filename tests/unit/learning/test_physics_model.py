@@ -24,7 +24,7 @@ def drive(seed=0, count=COUNT):
 
 def test_a_robot_is_found_again():
     beside, labels = drive()
-    model = fit_physics_model(beside, labels, standing_watt=50.0)
+    model = fit_physics_model(beside, labels, idle_watt=50.0)
     assert model.no_load_watt == pytest.approx(50.0, rel=0.01)
     assert model.grade_newton == pytest.approx(400.0, rel=0.01)
     assert model.rolling_newton[[4, 6]] == pytest.approx([60.0, 30.0], rel=0.02)
@@ -40,7 +40,7 @@ def test_what_the_drives_take_without_a_load_is_found_where_halts_tell_less():
     velocity = labels[:, 1] * 0.0 + 0.9 - 0.3 * np.maximum(slope, 0.0)
     power = 14.0 + 62.0 * velocity / np.cos(slope) + np.maximum(velocity * (40.0 + 400.0 * np.tan(slope)), 0.0)
     moved, told = replace(beside, slope_rad=slope), np.column_stack([power, velocity])
-    model = fit_physics_model(moved, told, standing_watt=14.0)
+    model = fit_physics_model(moved, told, idle_watt=14.0)
     assert [model.no_load_watt, model.drivetrain_newton] == pytest.approx([14.0, 62.0], rel=0.01)
     assert np.abs(model.predict(moved)[:, 0] - power).mean() < 1.0
     arrays = model.arrays()
@@ -53,7 +53,7 @@ def test_what_the_drives_take_without_a_load_is_found_where_halts_tell_less():
 
 def test_what_is_not_known_is_as_usual():
     beside, labels = drive()
-    model = fit_physics_model(beside, labels, standing_watt=50.0)
+    model = fit_physics_model(beside, labels, idle_watt=50.0)
     unknown = replace(beside, turn_radpm=np.full(COUNT, np.nan))
     usual = replace(beside, turn_radpm=np.full(COUNT, np.mean(beside.turn_radpm)))
     assert model.predict(unknown) == pytest.approx(model.predict(usual))
@@ -65,12 +65,12 @@ def test_what_is_not_known_is_as_usual():
 def test_without_turns_in_the_data_there_is_no_term_for_them():
     beside, labels = drive()
     blind = replace(beside, turn_radpm=np.full(COUNT, np.nan))
-    assert not fit_physics_model(blind, labels, standing_watt=None).turning_joule_per_rad.any()
+    assert not fit_physics_model(blind, labels, idle_watt=None).turning_joule_per_rad.any()
 
 
 def test_arrays_there_and_back():
     beside, labels = drive()
-    model = fit_physics_model(beside, labels, standing_watt=50.0)
+    model = fit_physics_model(beside, labels, idle_watt=50.0)
     again = read_physics_model(model.arrays(), "weights.npz")
     assert again.predict(beside) == pytest.approx(model.predict(beside), abs=0.0)
     with pytest.raises(ModelError, match="weights of another model"):
@@ -80,4 +80,4 @@ def test_arrays_there_and_back():
 def test_too_few_samples_are_said():
     beside, labels = drive(count=19)
     with pytest.raises(ModelError, match="19 samples to fit physics to, wanted at least 20"):
-        fit_physics_model(beside, labels, standing_watt=None)
+        fit_physics_model(beside, labels, idle_watt=None)

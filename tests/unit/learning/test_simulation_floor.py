@@ -32,7 +32,7 @@ def test_without_hidden_effects_the_truth_is_what_it_says(surface):
     end = truth.at(cost.end_ns.astype(np.int64))
     chords = _Chords(
         start_lon_deg=truth.lon_deg[steady], start_lat_deg=truth.lat_deg[steady],
-        end_lon_deg=end.lon_deg, end_lat_deg=end.lat_deg, turn_rate_radps=np.zeros(len(steady)),
+        end_lon_deg=end.lon_deg, end_lat_deg=end.lat_deg, mean_abs_yaw_rate_radps=np.zeros(len(steady)),
     )  # fmt: skip
     told = compute_true_costs(world, robot, chords)
     assert len(start) > 40

@@ -69,12 +69,12 @@ def test_the_model_knows_what_it_was_trained_on(trained, dataset):
 
 @pytest.mark.parametrize("energy_only", [False, True])
 def test_what_is_above_standing_can_be_trained_on(energy_only, dataset, tmp_path):
-    config = replace(CONFIG, epochs=1, label="above_standing")
+    config = replace(CONFIG, epochs=1, label="net")
     train(dataset, tmp_path / "model", config=config, variant=Variant(energy_only=energy_only))
     card = load_model(tmp_path / "model").card
-    split = open_dataset(dataset, label="above_standing")["train"]
-    names = ("energy_above_standing_joule",) if energy_only else ("power_above_standing_watt", "velocity_mps")
-    assert (card.label_energy, card.outputs) == ("above_standing", names)
+    split = open_dataset(dataset, label="net")["train"]
+    names = ("net_energy_joule",) if energy_only else ("net_power_watt", "velocity_mps")
+    assert (card.label_energy, card.outputs) == ("net", names)
     assert card.scale == pytest.approx(tuple(float(split.column(name).max()) for name in names))
     assert "above what the robot draws while it stands" in (tmp_path / "model" / "MODEL.md").read_text()
 

@@ -104,7 +104,7 @@ def test_a_lasting_step_opens_an_epoch_for_every_topic() -> None:
     assert steps[0].step_s == 2.0
     assert steps[0].topics == ("gnss", "imu")
     for name, rows in (("imu", log), ("gnss", slow), ("command", log)):
-        np.testing.assert_array_equal(found[name].epoch, (rows >= at).astype(int))
+        np.testing.assert_array_equal(found[name].clock_epoch, (rows >= at).astype(int))
 
 
 def test_a_backward_step_keeps_every_row_and_orders_by_epoch_first() -> None:

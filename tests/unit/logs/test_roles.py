@@ -411,7 +411,7 @@ def test_other_poses_and_two_of_them_play_only_where_they_are_named(topics: list
 def test_what_a_pose_was_made_from_is_not_fused_again() -> None:
     topics = [topic(*WHEELS), topic("/imu", IMU), topic("/odometry/filtered", ODOMETRY)]
     chosen = {"pose": ["/odometry/filtered"]}
-    found = assign_roles(topics, chosen, pose_from=["wheel_odometry"])
+    found = assign_roles(topics, chosen, pose_sources=["wheel_odometry"])
     assert played(found) == {"imu": ("/imu",), "pose": ("/odometry/filtered",)}
     both = assign_roles([*topics, topic("/fix", FIX)], {**chosen, "gnss": ["/fix"]})
     assert "names /fix as gnss and /odometry/filtered as pose" in both.problems[0]

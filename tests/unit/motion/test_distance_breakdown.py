@@ -14,7 +14,7 @@ from tcpipe.motion.distance_breakdown import (
 )
 from tcpipe.tables.bits import DropReason
 
-G, S, A = (int(bit) for bit in (DropReason.GAP, DropReason.STANDING, DropReason.ACCELERATING))
+G, S, A = (int(bit) for bit in (DropReason.GAP, DropReason.STATIONARY, DropReason.ACCELERATING))
 
 
 def test_stretches_are_runs_of_two_kept_rows_inside_a_piece():
@@ -40,7 +40,7 @@ def test_a_hole_counts_as_its_straight_line_and_no_metre_twice():
     assert length == pytest.approx([0.05, 0.05, 3.0, 0.05, 0.05])
     sums = sum_by_reason(find_interval_reason(np.array([0, 0, 0, S, S, 0], dtype=np.uint32), piece), length)
     assert sums["gap"] == pytest.approx(3.0)
-    assert sums["standing"] == pytest.approx(0.1)
+    assert sums["stationary"] == pytest.approx(0.1)
     assert set(sums) == {str(bit.name).lower() for bit in DropReason}
 
 

@@ -36,7 +36,7 @@ def test_a_change_of_direction_stands_for_an_instant():
 
 
 def test_stuck_is_wheels_without_ground():
-    limits = {"standing_velocity_mps": 0.05, "wheel_velocity_above_mps": 0.2}
+    limits = {"stationary_velocity_mps": 0.05, "wheel_velocity_above_mps": 0.2}
     assert masks.find_stuck(rows([0.01] * 4, wheel=0.5), **limits).all()
     assert not masks.find_stuck(rows([0.3] * 4, wheel=0.5), **limits).any()
     assert not masks.find_stuck(rows([0.01] * 4), **limits).any()
@@ -146,21 +146,29 @@ def test_below_limit_follows_the_command_not_its_jitter():
 
 def test_reversing_at_full_speed_is_not_below_the_limit():
     assert not masks.find_below_full_speed(rows([-1.0] * 20, commanded=-1.0), limit_mps=0.95, window_s=0.5).any()
-    assert masks.find_reversing(rows([-0.06, -0.04, 0.3]), standing_velocity_mps=0.05).tolist() == [True, False, False]
+    assert masks.find_reversing(rows([-0.06, -0.04, 0.3]), stationary_velocity_mps=0.05).tolist() == [
+        True,
+        False,
+        False,
+    ]
 
 
 STANDING = {"below_velocity_mps": 0.05, "below_yaw_rate_radps": 0.05}
 
 
 def test_a_limit_itself_is_not_below_nor_above_it():
-    assert not masks.find_stuck(rows([0.05], wheel=0.5), standing_velocity_mps=0.05, wheel_velocity_above_mps=0.2).any()
-    assert not masks.find_stuck(rows([0.01], wheel=0.2), standing_velocity_mps=0.05, wheel_velocity_above_mps=0.2).any()
+    assert not masks.find_stuck(
+        rows([0.05], wheel=0.5), stationary_velocity_mps=0.05, wheel_velocity_above_mps=0.2
+    ).any()
+    assert not masks.find_stuck(
+        rows([0.01], wheel=0.2), stationary_velocity_mps=0.05, wheel_velocity_above_mps=0.2
+    ).any()
     assert not masks.find_stationary(rows([0.05]), **STANDING).any()
     assert not masks.find_stationary(rows([0.0], yaw_rate=0.05), **STANDING).any()
     assert not masks.find_turning_in_place(rows([0.1] * 9, yaw_rate=0.15), **TURNING).any()
     assert not masks.find_turning_in_place(rows([0.06] * 9, yaw_rate=0.1), **TURNING).any()
     assert not masks.find_turning_in_place(rows([0.5] * 9, yaw_rate=1.0), **TURNING).any()
-    assert not masks.find_reversing(rows([-0.05]), standing_velocity_mps=0.05).any()
+    assert not masks.find_reversing(rows([-0.05]), stationary_velocity_mps=0.05).any()
     acceleration = np.full(9, 0.25)
     assert not masks.find_accelerating(rows([0.5] * 9), acceleration, above_mps2=0.25, min_s=0.2, dilate_s=0.0).any()
     assert not masks.find_below_full_speed(rows([0.0] * 9, commanded=0.5), limit_mps=0.5, window_s=0.1).any()

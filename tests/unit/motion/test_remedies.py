@@ -23,11 +23,11 @@ def test_losses_of_more_than_a_twentieth_are_findings_the_largest_first():
 
 
 def test_a_robot_that_does_not_move_loses_nothing():
-    assert find_losses({"kept": 0.0, "standing": 4.9}, RUN) == []
+    assert find_losses({"kept": 0.0, "stationary": 4.9}, RUN) == []
 
 
 def test_losses_of_several_runs_add_up():
-    losses = find_largest_losses([{"kept": 50.0, "gap": 30.0, "standing": 0.01}, {"kept": 10.0, "gap": 10.0}])
+    losses = find_largest_losses([{"kept": 50.0, "gap": 30.0, "stationary": 0.01}, {"kept": 10.0, "gap": 10.0}])
     assert [(of.reason, of.metres, of.runs) for of in losses] == [("gap", 40.0, 2)]
     assert losses[0].share == pytest.approx(40.0 / 100.01)
     assert find_largest_losses([]) == ()

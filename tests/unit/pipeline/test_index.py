@@ -47,7 +47,7 @@ def test_the_log_says_what_the_documents_say(store):
     for run in store.ingestions().finished:
         made = run.manifest
         assert (run.facts.robot, run.facts.tags, run.facts.segments) == (made.robot, made.tags, 20)
-        assert run.facts.driven_m == pytest.approx(sum(made.ledger_m.values()))
+        assert run.facts.driven_m == pytest.approx(sum(made.distance_by_reason_m.values()))
         assert run.facts.log.source == store.run_json(run.run_id).source
         stamps = run.table("segments").column("start_ns").to_pylist()
         assert (run.facts.start_ns, run.facts.end_ns) == (min(stamps), max(stamps) + 1_200_000_000)

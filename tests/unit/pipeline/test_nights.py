@@ -183,7 +183,7 @@ def test_damage_is_news_once_and_accepted_trouble_is_counted_apart(tmp_path, nig
     junk.write_bytes(JUNK)
     copy_part(drive_at(tmp_path / "whole.mcap"), cut, 0.6)
     found, code = night()
-    assert (found["cut.mcap"].is_news, code) == (True, 3)
+    assert (found["cut.mcap"].is_new_problem, code) == (True, 3)
     assert (told(night, "cut.mcap"), told(night, "cut.mcap", force=True)) == (
         ("unchanged", True, 0),
         ("damaged", True, 3),  # junk.bag was tried again
@@ -372,7 +372,7 @@ def test_a_part_of_a_split_recording_takes_static_transforms_from_the_part_befor
     write_bag(second, wheel_drive(seed=1, start_ns=int(stream.log_time_ns[-1]) + 10**7))
     summary = ingest([tmp_path / "logs"], store=tmp_path / "store", recipe=Recipe())
     assert [result.status for result in summary.results] == ["done", "done"]
-    known = [Store(tmp_path / "store").run_json(result.run.run_id).remarks for result in summary.results]
+    known = [Store(tmp_path / "store").run_json(result.run.run_id).notes for result in summary.results]
     taken = [sum("run_0.bag ends, whose static transforms are taken" in line for line in lines) for lines in known]
     assert taken == [0, 1]
 

@@ -12,7 +12,7 @@ def clock(stamp_s, log_s, epoch):
     """A clock of rows; log times begin in 2026."""
     columns = {"stamp_ns": stamp_s, "log_time_ns": log_s}
     table = {name: pa.array((np.asarray(values) * SECOND).astype(np.int64)) for name, values in columns.items()}
-    return _Clock(pa.table({**table, "epoch": pa.array(epoch, pa.int16())}))
+    return _Clock(pa.table({**table, "clock_epoch": pa.array(epoch, pa.int16())}))
 
 
 def asked(of, stamp_s, epoch=None):
@@ -33,5 +33,5 @@ def test_simulated_time_that_runs_at_half_the_rate_is_stretched():
 
 def test_nanoseconds_of_today_are_kept():
     begin = 1_795_000_000_123_456_789
-    table = {"stamp_ns": [begin, begin + 1001], "log_time_ns": [begin + 7, begin + 1001 + 7], "epoch": [0, 0]}
+    table = {"stamp_ns": [begin, begin + 1001], "log_time_ns": [begin + 7, begin + 1001 + 7], "clock_epoch": [0, 0]}
     assert _Clock(pa.table(table))(np.array([begin + 500]), np.array([0]))[0] == begin + 507

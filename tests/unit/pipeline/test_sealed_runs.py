@@ -66,7 +66,7 @@ def robot(found):
 
 
 def ledger(found):
-    found["ledger_m"]["kept"] += 1.0
+    found["distance_by_reason_m"]["kept"] += 1.0
 
 
 def sha256(found):

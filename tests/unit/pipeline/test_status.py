@@ -78,7 +78,10 @@ def test_what_ingest_did_is_what_status_says_and_the_calls_are_remembered(first_
 
 def test_losses_are_the_metres_of_all_manifests_the_largest_first(first_night):
     found = where(first_night)
-    ledgers = [json.loads(path.read_text())["ledger_m"] for path in (first_night / "store").rglob("manifest-1.json")]
+    ledgers = [
+        json.loads(path.read_text())["distance_by_reason_m"]
+        for path in (first_night / "store").rglob("manifest-1.json")
+    ]
     assert len(ledgers) == 3
     driven_m = sum(sum(ledger.values()) for ledger in ledgers)
     for loss in found.losses:

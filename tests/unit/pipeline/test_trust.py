@@ -143,7 +143,7 @@ def test_a_card_that_says_something_else_is_found(copy, key, value):
     assert any(f"{key} is {value}, but the samples give" in problem for problem in verify(directory).problems)
 
 
-@pytest.mark.parametrize("key", ["runs", "maps", "checksums", "ledger_m", "layers", "format"])
+@pytest.mark.parametrize("key", ["runs", "maps", "checksums", "distance_by_reason_m", "layers", "format"])
 def test_a_card_that_lacks_something_is_one_problem_and_no_traceback(copy, key):
     directory = copy("parquet")
     card = json.loads((directory / "dataset.json").read_text())
@@ -224,7 +224,7 @@ def test_a_manifest_that_counts_otherwise_is_found(copy):
     path = manifest(Store(store).recipes_of("south")[0])
     found = json.loads(path.read_text())
     found["counts"]["segments"] += 1
-    found["ledger_m"]["kept"] += 1.0
+    found["distance_by_reason_m"]["kept"] += 1.0
     write_sealed(path, found)
     problems = verify(store).problems
     assert any("segments is 225, but segments.parquet has 224 rows" in problem for problem in problems)
@@ -312,7 +312,7 @@ def test_a_map_that_was_replaced_is_named_as_the_reason(made, copy, tmp_path):
     found = explain(sample, dataset=made / "zarr", store=store.root).differences
     assert "terrain: map site has no such layer any more" in found
     assert found[-1] == "map site was added anew since, from other files"
-    elsewhere = World(WORLD.crs, WORLD.x_m + 500.0, WORLD.y_m, side_m=20.0).write(tmp_path, pitch_m=0.2)
+    elsewhere = World(WORLD.crs, WORLD.x_m + 500.0, WORLD.y_m, side_m=20.0).write(tmp_path, pixel_size_m=0.2)
     put_map(
         store,
         "site",

@@ -72,7 +72,7 @@ def test_every_course_of_every_cell_costs_what_physics_says(made):
         np.testing.assert_allclose(costs.power_watt[:, row, col], power_watt(class_id, slope), rtol=4e-3)
         np.testing.assert_allclose(costs.velocity_mps[:, row, col], velocity_mps(class_id, slope), rtol=4e-3)
         assert (costs.reasons[:, row, col] == 0).all()
-    assert (costs.reasons[:, 5, 20] == Reason.NOT_TRAVERSABLE | Reason.OBSTACLE | Reason.CLASS_NOT_SEEN).all()
+    assert (costs.reasons[:, 5, 20] == Reason.NOT_TRAVERSABLE | Reason.OBSTACLE | Reason.CLASS_OUTSIDE_TRAINING).all()
     assert np.isnan(costs.power_watt[:, 5, 20]).all()
     assert costs.height_m[12, 12] == pytest.approx(50.0 + 0.2 * 12.5 + 0.1 * 11.5, abs=0.03)
 

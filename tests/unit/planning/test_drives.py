@@ -53,7 +53,7 @@ def test_ground_that_was_not_met_is_named_and_left_out(made):
     flat = replace(PhysicsModel(), seen=PhysicsModel().seen | {"slope_rad": (-1e-6, 1e-6)})
     found = compute_drive_cost(flat, source, find_drive(store, "south"), data, log="south")
     known = compute_drive_cost(PhysicsModel(), source, find_drive(store, "south"), data, log="south")
-    assert found.rest_m["slope_not_seen"] > 0.0
+    assert found.rest_m["slope_outside_training"] > 0.0
     assert found.compared_m < known.compared_m
 
 

@@ -64,14 +64,20 @@ def test_each_metre_has_the_class_under_it():
 @pytest.mark.parametrize(
     ("changes", "reason"),
     [
-        ({"class_counts": {5: 10}}, Reason.CLASS_NOT_SEEN),
-        ({"pixel_classes": (5, 6)}, Reason.CLASS_NOT_SEEN),
-        ({"seen": {"slope_rad": (-0.1, 0.1), "cross_slope_rad": (-1, 1), "relief_m": (0, 1)}}, Reason.SLOPE_NOT_SEEN),
+        ({"class_counts": {5: 10}}, Reason.CLASS_OUTSIDE_TRAINING),
+        ({"pixel_classes": (5, 6)}, Reason.CLASS_OUTSIDE_TRAINING),
+        (
+            {"seen": {"slope_rad": (-0.1, 0.1), "cross_slope_rad": (-1, 1), "relief_m": (0, 1)}},
+            Reason.SLOPE_OUTSIDE_TRAINING,
+        ),
         (
             {"seen": {"slope_rad": (-1, 1), "cross_slope_rad": (0.1, 1), "relief_m": (0, 1)}},
-            Reason.CROSS_SLOPE_NOT_SEEN,
+            Reason.CROSS_SLOPE_OUTSIDE_TRAINING,
         ),
-        ({"seen": {"slope_rad": (-1, 1), "cross_slope_rad": (-1, 1), "relief_m": (0, 0.1)}}, Reason.RELIEF_NOT_SEEN),
+        (
+            {"seen": {"slope_rad": (-1, 1), "cross_slope_rad": (-1, 1), "relief_m": (0, 0.1)}},
+            Reason.RELIEF_OUTSIDE_TRAINING,
+        ),
     ],
 )
 def test_ground_that_training_has_not_seen_is_marked_and_still_costed(changes, reason):
@@ -142,7 +148,7 @@ def test_a_model_that_takes_turns_is_told_those_of_the_path_and_none_is_paid_twi
     turn = told.pieces.column("turn_rad").to_numpy() / told.pieces.column("arc_length_m").to_numpy()
     more = told.pieces.column("power_watt").to_numpy() - plain.pieces.column("power_watt").to_numpy()
     assert turn.max() > 0.5
-    assert more == pytest.approx(np.where(turn > TURNS.usual_turn_radpm, 1000.0 * turn, 0.0), rel=1e-4, abs=1e-3)
+    assert more == pytest.approx(np.where(turn > TURNS.mean_turn_radpm, 1000.0 * turn, 0.0), rel=1e-4, abs=1e-3)
 
 
 class _EnergyAlone(PhysicsModel):

@@ -80,7 +80,7 @@ def test_looking_at_less_of_the_map_finds_the_same_path():
 
 def test_a_road_out_of_sight_is_found_without_a_cost_map(caplog):
     """It lies beyond all that the shortest way needs, and is worth the detour."""
-    source = plane(72.0, pitch_m=0.2, classes=lambda _, north: np.where(np.abs(north - 36.0) < 2.0, 4, 7))
+    source = plane(72.0, pixel_size_m=0.2, classes=lambda _, north: np.where(np.abs(north - 36.0) < 2.0, 4, 7))
     lazy, model = make_survey(replace(MODEL, patch_px=8), source, 1.0), replace(MODEL, patch_px=8)
     with caplog.at_level("INFO", "tcpipe"):
         found = _plan(source, (6.0, 22.0), (66.0, 22.0), "energy", model=model, survey=lazy)
@@ -120,8 +120,8 @@ def test_no_way_says_what_would_open_one():
     grass_only = replace(MODEL, class_counts={4: 100}, pixel_classes=(4,))
     with pytest.raises(PathError, match="--allow-extrapolation crosses it"):
         _plan(mud, (4.0, 4.0), (20.0, 4.0), "distance", model=grass_only)
-    found = _plan(mud, (4.0, 4.0), (20.0, 4.0), "time", model=grass_only, allow_unseen=True)
-    assert found.totals.reasons["class_not_seen"] >= 3
+    found = _plan(mud, (4.0, 4.0), (20.0, 4.0), "time", model=grass_only, allow_extrapolation=True)
+    assert found.totals.reasons["class_outside_training"] >= 3
 
 
 def test_an_end_on_ground_that_is_not_known_says_so_before_all_the_map_is_looked_at():

@@ -53,7 +53,7 @@ def test_its_numbers_are_the_cards(built, page):
     assert by_label["samples"] == str(card.samples)
     assert {name: by_label[name] for name in card.splits} == {name: str(n) for name, n in card.splits.items()}
     assert by_label["runs"] == "2"
-    assert by_label["driven"] == f"{sum(card.ledger_m.values()):.0f} m"
+    assert by_label["driven"] == f"{sum(card.distance_by_reason_m.values()):.0f} m"
     assert {of["name"]: of["count"] for of in data_of(page)["splits"]} == card.splits
     for part in card.split.audit:
         row = page.split(f"<td>{part.split}</td>")[1].split("</tr>")[0]

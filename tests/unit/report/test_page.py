@@ -39,7 +39,7 @@ class Seen(HTMLParser):
 def drawn():
     plot = make_plot("evil", alt=EVIL, axes=("x", EVIL), legend={EVIL: "#000000"})
     plot.figure.scatter([1.0, 2.0], [3.0, 4.0])
-    return [plot, draw_waterfall({"kept": 60.0, "standing": 40.0})]
+    return [plot, draw_waterfall({"kept": 60.0, "stationary": 40.0})]
 
 
 evil = make_finding("no-segments", Subject("run", EVIL), names={"reason": EVIL}, driven_m=12.0, lost_m=10.0)
@@ -90,7 +90,7 @@ def test_the_verdict_has_grades_then_reasons_the_worst_first_then_folded_notes()
         "no-segments", Subject("run", "a"), names={"reason": "gap"}, driven_m=12.0, lost_m=10.0, action="rejected"
     )
     speeds = {"slow_fraction": 0.7, "limit_mps": 0.95, "top_mps": 0.6}
-    keep = Remedy("keep", recipe={"gate": {"require_full_speed": False}})
+    keep = Remedy("keep", recipe={"mask": {"require_full_speed": False}})
     slow = make_finding("driven-below-limit", Subject("role", "command"), remedies=[keep], **speeds)
     note = make_finding("no-command", Subject("role", "command"))
     findings = [note, *[replace(slow, numbers={**slow.numbers, "top_mps": 0.1 * n}) for n in range(9)], empty]
@@ -102,7 +102,7 @@ def test_the_verdict_has_grades_then_reasons_the_worst_first_then_folded_notes()
     at_once = re.sub("<details>.*?</details>", "", box, flags=re.DOTALL)
     assert re.findall('<li class="([a-z]+)">', at_once) == ["error", *["warning"] * 7]
     assert "largest loss: gap, 10 m" in at_once
-    assert "To accept any speed: [gate] require_full_speed = false [driven-below-limit]" in at_once
+    assert "To accept any speed: [mask] require_full_speed = false [driven-below-limit]" in at_once
     assert re.findall("<summary>(.*?)</summary>", box) == ["2 more findings", "1 note"]
 
 
@@ -154,8 +154,8 @@ def test_nothing_is_asked_of_the_network():
 
 
 def test_the_waterfall_ends_at_what_is_kept():
-    plot = draw_waterfall({"kept": 60.0, "standing": 30.0, "gap": 10.0, "curved": 0.0})
+    plot = draw_waterfall({"kept": 60.0, "stationary": 30.0, "gap": 10.0, "curved": 0.0})
     data = next(iter(plot.figure.renderers)).data_source.data
-    assert data["name"] == ["driven", "standing", "gap", "kept"]
+    assert data["name"] == ["driven", "stationary", "gap", "kept"]
     assert list(zip(data["left"], data["right"], strict=True)) == [(0, 100), (70, 100), (60, 70), (0, 60)]
     assert data["share"] == [100, 30, 10, 60]

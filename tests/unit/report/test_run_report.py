@@ -59,11 +59,11 @@ def test_thinning_keeps_every_peak_and_says_how_many_there_were():
 
 
 def stepped(track, by_ns):
-    """The track with its second half an epoch later, its stamps ``by_ns`` off."""
+    """The track with its second half an clock_epoch later, its stamps ``by_ns`` off."""
     half, rows = track.num_rows // 2, np.arange(track.num_rows)
     stamps = track.column("stamp_ns").to_numpy() + np.where(rows >= half, by_ns, 0)
     track = track.set_column(0, track.schema.field("stamp_ns"), pa.array(stamps))
-    return track.set_column(1, track.schema.field("epoch"), pa.array((rows >= half).astype(np.int16))), half
+    return track.set_column(1, track.schema.field("clock_epoch"), pa.array((rows >= half).astype(np.int16))), half
 
 
 def test_a_span_ends_where_the_reason_or_the_track_does():
@@ -82,7 +82,7 @@ def test_rails_that_tell_current_and_voltage_in_turn_are_series_of_their_own():
     stamps = 10**18 + np.arange(n) * 10**8
     odd = np.arange(n) % 2 == 1
     table = POWER.table(
-        stamp_ns=stamps, log_time_ns=stamps, epoch=np.zeros(n, np.int16), rail=np.where(np.arange(n) < 6, "left", EVIL),
+        stamp_ns=stamps, log_time_ns=stamps, clock_epoch=np.zeros(n, np.int16), rail=np.where(np.arange(n) < 6, "left", EVIL),
         voltage_volt=np.where(odd, 25.0, np.nan), current_amp=np.where(odd, np.nan, 4.0),
     )  # fmt: skip
     found = {each.name: each for each in make_rail_series(table, make_timeline(driven(drive())))}
@@ -97,7 +97,7 @@ def test_speed_of_a_sensor_that_tells_places_is_its_chord_over_a_second():
     table = pa.table(
         {
             "stamp_ns": stamps,
-            "epoch": np.zeros(len(t_s), np.int16),
+            "clock_epoch": np.zeros(len(t_s), np.int16),
             "x_m": 3.0 * np.cos(t_s / 3),
             "y_m": 3.0 * np.sin(t_s / 3),
         }
@@ -127,7 +127,7 @@ def test_a_run_without_power_map_or_sensors_says_so(tmp_path):
 
 def test_a_run_without_track_or_segments_is_a_page_too(tmp_path):
     empty = make_finding("no-segments", Subject("run", "run"), names={"reason": "gap"}, driven_m=12.0, lost_m=12.0)
-    html = page_of(tmp_path, drive().slice(0, 0), ledger_m={"kept": 0.0, "gap": 12.0}, findings=(empty,))
+    html = page_of(tmp_path, drive().slice(0, 0), distance_by_reason_m={"kept": 0.0, "gap": 12.0}, findings=(empty,))
     assert "No track: the log holds nothing that could be fused." in html
     assert "no segments from 12 m driven; largest loss: gap, 12 m" in html
     assert "<td>gap</td>" in html

@@ -47,7 +47,7 @@ def store(tmp_path_factory):
         add(store, run_id, number, findings=found, tags={"site": EVIL})
     supersede(store, "d", "a")
     build_dataset(here / "dataset", store=store.root)
-    add(store, "c", 3, ledger_m={"kept": 20.0, "gap": 60.0, "standing": 5.0})
+    add(store, "c", 3, distance_by_reason_m={"kept": 20.0, "gap": 60.0, "stationary": 5.0})
     junk = Failure("1", "1" * 64, ("/logs/junk",), (f"/logs/junk: {EVIL} is no log",), "0")
     cut = Failure("2", "a", ("/logs/a.mcap",), ("/logs/a.mcap: was cut",), "0")
     failed = {"/logs/passing.mcap": "No space left on device", "/logs/b.mcap": "No space left on device"}
@@ -76,8 +76,10 @@ def test_each_run_is_there_as_its_documents_say(store):
         (run,) = store.recipes_of(run_id)
         made = run.manifest
         assert (row["robot"], row["segments"]) == (made.robot, made.counts.segments)
-        assert row["driven"] == pytest.approx(sum(made.ledger_m.values()), abs=0.05)
-        assert row["used"] == pytest.approx(100.0 * made.ledger_m["kept"] / sum(made.ledger_m.values()), abs=0.01)
+        assert row["driven"] == pytest.approx(sum(made.distance_by_reason_m.values()), abs=0.05)
+        assert row["used"] == pytest.approx(
+            100.0 * made.distance_by_reason_m["kept"] / sum(made.distance_by_reason_m.values()), abs=0.01
+        )
         assert row["start_ms"] == run.table("segments").column("start_ns").to_numpy().min() // 10**6
     assert [told["datasets"][n] for row in rows for n in row["datasets"]] == ["dataset"] * 2
     assert [row["codes"] for row in rows] == [[], [], [0], [], [0]]
@@ -103,11 +105,11 @@ def test_sums_are_of_the_ruling_recipe_without_superseded_runs(store):
         *manifests,
         next(run for run in store.recipes_of("b") if run.manifest.recipe == Recipe().ingest).manifest,
     ]
-    driven_m = sum(sum(made.ledger_m.values()) for made in current)
+    driven_m = sum(sum(made.distance_by_reason_m.values()) for made in current)
     assert f"<div><b>{driven_m:.0f} m</b><span>driven</span></div>" in html
     assert "<div><b>3</b><span>runs</span></div>" in html
     losses = html.split("<h2>Where every metre went</h2>")[1].split("</section>")[0]
-    assert losses.index("<td>gap</td>") < losses.index("<td>standing</td>")
+    assert losses.index("<td>gap</td>") < losses.index("<td>stationary</td>")
 
 
 def test_what_failed_is_named_until_its_content_gives_a_run_or_a_person_acknowledges_it(store):
@@ -189,7 +191,7 @@ def test_a_change_is_told_from_scatter():
 def test_a_change_from_run_to_run_is_a_finding_of_its_robot(tmp_path):
     store = open_store(tmp_path / "store", create=True)
     for number in range(16):
-        add(store, f"run{number}", number, ledger_m={"kept": 20.0, "gap": 20.0 if number > 11 else 1.0})
+        add(store, f"run{number}", number, distance_by_reason_m={"kept": 20.0, "gap": 20.0 if number > 11 else 1.0})
     (change,) = find_changes([run.facts for run in store.runs()])
     assert (change.code, change.severity, change.names["robot"]) == ("run-to-run-change", "note", "husky")
     assert change.numbers["before"] == pytest.approx(100 * 20 / 21)

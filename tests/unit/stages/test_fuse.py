@@ -28,7 +28,7 @@ def sensor(xyz=(0.0, 0.0, 0.0), quat=(0.0, 0.0, 0.0, 1.0)):
 
 def filled(schema, stamp, **known):
     """Make a table of a role: the given columns, the rest null or zero."""
-    columns = {"stamp_ns": stamp, "log_time_ns": stamp, "epoch": np.zeros(stamp.size, np.int16)} | known
+    columns = {"stamp_ns": stamp, "log_time_ns": stamp, "clock_epoch": np.zeros(stamp.size, np.int16)} | known
     for column in schema.columns:
         columns.setdefault(
             column.name, np.full(stamp.size, np.nan) if column.nullable else np.zeros(stamp.size, np.int8)
@@ -194,24 +194,24 @@ def test_fixes_at_null_island_are_listed_as_invalid(streams):
 
 
 def test_a_clock_step_makes_two_epochs_fused_apart(streams, truth):
-    """The clock jumps back by 30 s half-way: stamps of the second epoch overlap those of the first."""
+    """The clock jumps back by 30 s half-way: stamps of the second clock_epoch overlap those of the first."""
     half = drive.ns(SECONDS / 2)
     tables = {}
     for role, table in streams.tables.items():
         stamp = to_integers(table, "stamp_ns")
-        epoch = (stamp >= half).astype(np.int16)
-        shifted = stamp - epoch.astype(np.int64) * 30_000_000_000
+        clock_epoch = (stamp >= half).astype(np.int16)
+        shifted = stamp - clock_epoch.astype(np.int64) * 30_000_000_000
         names, schema = table.column_names, table.schema
         moved = table.set_column(names.index("stamp_ns"), schema.field("stamp_ns"), pa.array(shifted))
-        tables[role] = moved.set_column(names.index("epoch"), schema.field("epoch"), pa.array(epoch))
+        tables[role] = moved.set_column(names.index("clock_epoch"), schema.field("clock_epoch"), pa.array(clock_epoch))
     table = fuse_run(replace(streams, tables=tables), FuseConfig(), run_id="r").table
-    epoch, stamp = to_integers(table, "epoch"), to_integers(table, "stamp_ns")
-    assert (np.diff(epoch) >= 0).all()
-    assert set(epoch.tolist()) == {0, 1}
-    t = (stamp + epoch * 30_000_000_000 - drive.ZERO_NS) * 1e-9
+    clock_epoch, stamp = to_integers(table, "clock_epoch"), to_integers(table, "stamp_ns")
+    assert (np.diff(clock_epoch) >= 0).all()
+    assert set(clock_epoch.tolist()) == {0, 1}
+    t = (stamp + clock_epoch * 30_000_000_000 - drive.ZERO_NS) * 1e-9
     assert np.abs(to_floats(table, "forward_velocity_mps") - np.interp(t, truth.t, truth.forward)).max() < 0.05
     for k in (0, 1):
-        assert (np.diff(stamp[epoch == k]) == 50_000_000).all()
+        assert (np.diff(stamp[clock_epoch == k]) == 50_000_000).all()
 
 
 def test_a_gap_of_all_motion_is_a_step_in_the_stamps(streams):

@@ -67,7 +67,7 @@ def agreed(given):
 def test_sensors_that_agree_are_fused_once(fusing):
     tried = fusing({frozenset(ROLES): contradicted(2)})
     sensors, sanity = agreed(inputs())
-    assert (sensors, sanity.facts.refused, len(tried)) == (set(ROLES), {}, 1)
+    assert (sensors, sanity.facts.excluded, len(tried)) == (set(ROLES), {}, 1)
 
 
 def test_one_that_is_alone_in_most_of_the_way_is_left_out(fusing):
@@ -95,13 +95,13 @@ def test_the_one_without_which_the_others_agree_is_left_out(fusing):
     fusing({frozenset(ROLES) - {"imu"}: contradicted(1)})
     sensors, sanity = agreed(inputs())
     assert sensors == set(ROLES) - {"imu"}
-    assert list(sanity.facts.refused) == ["imu"]
+    assert list(sanity.facts.excluded) == ["imu"]
 
 
 def test_where_either_of_two_would_do_nobody_can_tell_and_none_is_left_out(fusing):
     fusing({frozenset(ROLES) - {role}: contradicted(1) for role in ("imu", "gnss")})
     sensors, sanity = agreed(inputs())
-    assert (sensors, sanity.facts.refused) == (set(ROLES), {})
+    assert (sensors, sanity.facts.excluded) == (set(ROLES), {})
 
 
 def test_of_several_it_is_the_one_whose_others_confirm_each_other_though_another_stands_alone(fusing):
@@ -118,7 +118,7 @@ def test_of_several_it_is_the_one_whose_others_confirm_each_other_though_another
     )
     sensors, sanity = agreed(inputs(visual=False))
     assert sensors == {"gnss", "wheel_odometry"}
-    assert list(sanity.facts.refused) == ["imu"]
+    assert list(sanity.facts.excluded) == ["imu"]
 
 
 def test_of_two_sensors_nobody_can_tell_and_nothing_is_tried(fusing):
@@ -134,7 +134,7 @@ def test_of_a_track_that_goes_astray_the_imu_is_tried_first(fusing, visual):
     fusing({roles: contradicted(0)}, lost=[roles])
     sensors, sanity = agreed(inputs(visual=visual))
     assert sensors == roles - {"imu"}
-    assert sanity.facts.refused == {"imu": "misleads-track"}
+    assert sanity.facts.excluded == {"imu": "misleads-track"}
 
 
 def test_a_track_that_goes_astray_without_its_imu_too_is_mended_by_the_only_other_that_does(fusing):

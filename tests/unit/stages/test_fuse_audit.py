@@ -61,7 +61,7 @@ def wheels_alone(speed_mps):
     nothing = np.full(stamp_ns.size, np.nan)
     wheels = BodyVelocities(stamp_ns, velocity, velocity, nothing, nothing)
     command = STREAMS["command"].table(
-        stamp_ns=stamp_ns, log_time_ns=stamp_ns, epoch=np.zeros(stamp_ns.size, np.int16),
+        stamp_ns=stamp_ns, log_time_ns=stamp_ns, clock_epoch=np.zeros(stamp_ns.size, np.int16),
         forward_velocity_mps=np.ones(stamp_ns.size), yaw_rate_radps=np.zeros(stamp_ns.size),
     )  # fmt: skip
     return FusionInputs(None, {0: Measurements(wheels=wheels)}), Streams({"command": command}, {}, "husky")

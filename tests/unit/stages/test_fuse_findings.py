@@ -10,7 +10,7 @@ from tcpipe.fusion.track_sections import TrackSection
 from tcpipe.stages.fuse_findings import fuse_facts, fuse_findings
 from tcpipe.stages.fuse_inputs import FusionInputs
 from tcpipe.stages.fuse_stretches import stretch_facts
-from tcpipe.tables.facts import Reopening, StretchFacts
+from tcpipe.tables.facts import GateReset, StretchFacts
 from tcpipe.tables.findings import Subject, make_finding
 
 PLACE = (15.0, 47.0, 400.0)
@@ -51,7 +51,7 @@ def test_a_stretch_says_where_it_lies_and_what_it_began_with():
     began = InitialState(np.zeros(3), np.ones(3), yaw, 0.1, 0.3, heading_from="orientation")
     found = SimpleNamespace(facts=stretch(), stamp_ns=np.arange(4))
     told = stretch_facts(TrackSection(2, 10, 20, heard), began, found)
-    assert (told.epoch, told.start_ns, told.end_ns, told.rows) == (2, 10, 20, 4)
+    assert (told.clock_epoch, told.start_ns, told.end_ns, told.rows) == (2, 10, 20, 4)
     assert set(told.sensors) == {"gnss", "imu"}
     assert (told.gyro_noise_radps, told.accelerometer_noise_mps2) == (0.01, 0.1)
     assert told.initial_yaw_rad == pytest.approx(0.5)
@@ -95,7 +95,7 @@ def test_a_track_without_a_place_is_a_finding():
 
 
 def test_a_heading_that_the_course_does_not_show_is_a_finding_where_the_track_has_a_place():
-    later = stretch(heading_from="the IMU", epoch=1, start_ns=2_000_000_000, end_ns=9_000_000_000)
+    later = stretch(heading_from="the IMU", clock_epoch=1, start_ns=2_000_000_000, end_ns=9_000_000_000)
     (finding,) = warned(FusionInputs(PLACE), stretch(), later)
     assert (finding.code, finding.names) == ("initial-yaw-uncertain", {"source": "the IMU"})
     assert finding.span_s == (2.0, 9.0)
@@ -119,13 +119,13 @@ def test_rows_that_were_set_aside_are_counted_but_not_those_of_a_sensor_that_was
 
 
 def test_a_sensor_that_left_the_path_is_one_finding_with_its_worst():
-    worst = Reopening("gnss", 30_000_000_000, 40_000_000_000, 2.5)
-    first = stretch(reopenings=(Reopening("gnss", 10, 20, 1.0), Reopening("wheel_odometry", 0, 2_000_000_000, 0.4)))
-    gnss, wheels = warned(FusionInputs(PLACE), first, stretch(reopenings=(worst,)))
+    worst = GateReset("gnss", 30_000_000_000, 40_000_000_000, 2.5)
+    first = stretch(gate_resets=(GateReset("gnss", 10, 20, 1.0), GateReset("wheel_odometry", 0, 2_000_000_000, 0.4)))
+    gnss, wheels = warned(FusionInputs(PLACE), first, stretch(gate_resets=(worst,)))
     assert (gnss.code, gnss.subject.name, gnss.span_s) == ("gnss-contradicts-odometry", "gnss", (30.0, 40.0))
     assert gnss.numbers == {"off_m": 2.5, "event_count": 2}
     assert gnss.names == {"suspect": "wheel_odometry"}
     assert (wheels.code, wheels.subject.name) == ("odometry-contradicts-others", "wheel_odometry")
     assert (wheels.numbers, wheels.span_s) == ({"off_mps": 0.4, "event_count": 1}, (0.0, 2.0))
-    third = stretch(reopenings=(worst,), sensors=(*ALL, "visual_odometry"))
+    third = stretch(gate_resets=(worst,), sensors=(*ALL, "visual_odometry"))
     assert warned(FusionInputs(PLACE), third)[0].names == {}

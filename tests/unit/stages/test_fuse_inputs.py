@@ -15,7 +15,7 @@ def streams():
     times = {
         "stamp_ns": STAMP_NS,
         "log_time_ns": STAMP_NS,
-        "epoch": np.zeros(4, np.int16),
+        "clock_epoch": np.zeros(4, np.int16),
         "fix_status": np.full(4, 2, np.int8),
     }
     unknown = np.full(4, np.nan)

@@ -57,7 +57,7 @@ def test_an_antenna_that_nobody_placed_is_put_where_the_turns_show_it_and_then_l
     (finding,) = told.findings
     assert (finding.code, finding.subject.name) == ("lever-arm-unknown", "gnss")
     assert finding.numbers["forward_m"] == pytest.approx(0.4, abs=0.01)
-    entry = proposed(finding)["read"]["placement"]["gnss"]
+    entry = proposed(finding)["read"]["extrinsics"]["gnss"]
     assert entry["xyz_m"] == pytest.approx([0.4, -0.2, 0.9], abs=0.01)
 
 
@@ -99,7 +99,7 @@ def test_a_tilted_imu_is_turned_and_what_is_left_added_until_nothing_is():
     (finding,) = told.findings
     assert finding.code == "imu-tilted"
     assert finding.numbers == {"roll_rad": pytest.approx(0.0), "pitch_rad": pytest.approx(0.08)}
-    entry = proposed(finding)["read"]["placement"]["imu"]
+    entry = proposed(finding)["read"]["extrinsics"]["imu"]
     assert entry == {"xyz_m": [0, 0.1, 0.2], "rpy_rad": pytest.approx([0.0, 0.08, 0.0], abs=1e-4)}
 
 

@@ -7,7 +7,7 @@ import pytest
 from made_tracks import make_track, power_streams, stamps, straight_track
 
 from tcpipe.cost.budget import CAUSES, format_budget
-from tcpipe.recipe import GateConfig, LabelConfig, SegmentConfig
+from tcpipe.recipe import LabelConfig, MaskConfig, SegmentConfig
 from tcpipe.stages.label import label_segments
 from tcpipe.stages.mask import mask_track
 from tcpipe.stages.segment import segment_track
@@ -17,7 +17,7 @@ from tcpipe.tables.facts import (
     AuditFacts,
     Disagreement,
     FuseFacts,
-    Reopening,
+    GateReset,
     StageFacts,
     StretchFacts,
 )
@@ -30,15 +30,15 @@ SPEED = np.full(len(T), 0.8)
 
 
 def label(track, streams, *, config=None, voltage_range_volt=(20.0, 30.0)):
-    gated = mask_track(track, GateConfig(), max_velocity_mps=1.0, chord_m=1.0)
-    return label_gated(gated, streams, config=config, voltage_range_volt=voltage_range_volt)
+    masked = mask_track(track, MaskConfig(), max_velocity_mps=1.0, chord_m=1.0)
+    return label_gated(masked, streams, config=config, voltage_range_volt=voltage_range_volt)
 
 
-def label_gated(gated, streams, *, config=None, voltage_range_volt=(20.0, 30.0)):
-    segments = segment_track(gated, SegmentConfig())
+def label_gated(masked, streams, *, config=None, voltage_range_volt=(20.0, 30.0)):
+    segments = segment_track(masked, SegmentConfig())
     return label_segments(
         segments,
-        gated,
+        masked,
         streams,
         config or LabelConfig(),
         voltage_range_volt=voltage_range_volt,
@@ -80,12 +80,12 @@ def test_whole_run_energy_and_where_it_went():
     assert facts.energy_joule == pytest.approx(144.0 * (stamp_ns[-1] - stamp_ns[0]) * 1e-9)
     entries = facts.energy_by_entry_joule
     assert sum(entries.values()) == pytest.approx(facts.energy_joule)
-    assert entries["standing"] == pytest.approx(144 * 15, rel=0.02)
-    seconds = labelled.info.report.facts.segment.ledger_s
-    for name in ("standing", "accelerating"):
+    assert entries["stationary"] == pytest.approx(144 * 15, rel=0.02)
+    seconds = labelled.info.report.facts.segment.duration_by_reason_s
+    for name in ("stationary", "accelerating"):
         assert entries[name] == pytest.approx(144 * seconds[name], rel=1e-9)
     assert entries["steady"] == pytest.approx(144 * sum(seconds[n] for n in ("kept", "curved", "leftover")), rel=1e-9)
-    assert facts.distance_m == pytest.approx(sum(labelled.ledger_m.values()))
+    assert facts.distance_m == pytest.approx(sum(labelled.distance_by_reason_m.values()))
 
 
 def test_two_rails_with_voltage_and_current_from_different_topics():
@@ -203,12 +203,12 @@ def test_slip_weak_position_curve_and_command():
 
 
 def test_segments_that_touch_a_time_in_which_sensors_disagree_undecided_are_flagged():
-    def between(begin_s, end_s, *, alone=False, epoch=0):
+    def between(begin_s, end_s, *, alone=False, clock_epoch=0):
         span = (int(ZERO + begin_s * 1e9), int(ZERO + end_s * 1e9))
-        return Disagreement(*span, "gnss", "position", 0.5, "m", 0.02, alone=alone, epoch=epoch)
+        return Disagreement(*span, "gnss", "position", 0.5, "m", 0.02, alone=alone, clock_epoch=clock_epoch)
 
     track = straight_track(SPEED)
-    audit = AuditFacts((between(20, 30), between(40, 50, alone=True), between(5, 10, epoch=1)))
+    audit = AuditFacts((between(20, 30), between(40, 50, alone=True), between(5, 10, clock_epoch=1)))
     facts = replace(track.info.report.facts, audit=audit)
     told = replace(track, info=replace(track.info, report=StageReport((), facts)))
     labelled = label(told, power_streams({"drive": record()}))
@@ -221,10 +221,10 @@ def test_segments_that_touch_a_time_in_which_sensors_disagree_undecided_are_flag
 
 def test_segments_in_which_the_gate_of_the_fixes_reopened_are_flagged():
     def refused(role, begin_s, end_s):
-        return Reopening(role, int(ZERO + begin_s * 1e9), int(ZERO + end_s * 1e9), 0.5)
+        return GateReset(role, int(ZERO + begin_s * 1e9), int(ZERO + end_s * 1e9), 0.5)
 
     track = straight_track(SPEED)
-    stretch = StretchFacts({}, {}, {}, 0, reopenings=(refused("gnss", 20, 30), refused("wheel_odometry", 40, 50)))
+    stretch = StretchFacts({}, {}, {}, 0, gate_resets=(refused("gnss", 20, 30), refused("wheel_odometry", 40, 50)))
     facts = replace(track.info.report.facts, fuse=FuseFacts(0, (), {}, {}, {}, {}, 0.0, (stretch,)))
     told = replace(track, info=replace(track.info, report=StageReport((), facts)))
     labelled = label(told, power_streams({"drive": record()}))
@@ -236,16 +236,16 @@ def test_segments_in_which_the_gate_of_the_fixes_reopened_are_flagged():
 
 def test_not_at_the_limit_where_slower_than_full_speed_was_kept():
     commanded = np.where(T < 30, 1.0, 0.7)
-    gate = GateConfig(require_full_speed=False)
-    gated = mask_track(straight_track(SPEED, commanded_mps=commanded), gate, max_velocity_mps=1.0, chord_m=1.0)
-    labelled = label_gated(gated, power_streams({"drive": record()}))
+    gate = MaskConfig(require_full_speed=False)
+    masked = mask_track(straight_track(SPEED, commanded_mps=commanded), gate, max_velocity_mps=1.0, chord_m=1.0)
+    labelled = label_gated(masked, power_streams({"drive": record()}))
     start, end = ((to_integers(labelled.table, name) - ZERO) * 1e-9 for name in ("start_ns", "end_ns"))
-    slow = flagged(labelled, Quality.NOT_AT_LIMIT)
+    slow = flagged(labelled, Quality.BELOW_FULL_SPEED)
     assert slow[start > 30].all()
     assert slow.any()
     assert not slow[end < 30].any()
     no_limit = mask_track(straight_track(SPEED, commanded_mps=commanded), gate, max_velocity_mps=None, chord_m=1.0)
-    assert not flagged(label_gated(no_limit, power_streams({"drive": record()})), Quality.NOT_AT_LIMIT).any()
+    assert not flagged(label_gated(no_limit, power_streams({"drive": record()})), Quality.BELOW_FULL_SPEED).any()
 
 
 def test_error_budget_adds_up_to_the_deviations():
@@ -266,9 +266,9 @@ def test_means_differ_when_samples_are_uneven():
     t = (stamp_ns - ZERO) * 1e-9
     amp = 6 + 4 * np.sin(2 * np.pi * t / 0.5)
     labelled = label(straight_track(SPEED), power_streams({"drive": (stamp_ns[keep], volt[keep], amp[keep])}))
-    assert flagged(labelled, Quality.MEAN_POWER_DIFFERS).any()
+    assert flagged(labelled, Quality.POWER_MEAN_MISMATCH).any()
     even = label(straight_track(SPEED), power_streams({"drive": (stamp_ns, volt, amp)}))
-    assert not flagged(even, Quality.MEAN_POWER_DIFFERS).any()
+    assert not flagged(even, Quality.POWER_MEAN_MISMATCH).any()
 
 
 @pytest.mark.parametrize(("role", "doubtful"), [("power", True), ("command", False)])
@@ -282,17 +282,19 @@ def test_clock_doubtful_when_the_recorder_stamped_what_counts(role, doubtful):
 
 def test_epochs_with_overlapping_stamps_keep_their_own_power():
     stamp_ns = np.concatenate((stamps(600), stamps(600)))
-    epoch = np.repeat(np.array([0, 1], dtype=np.int16), 600)
-    track = straight_track(SPEED, stamp_ns=stamp_ns, epoch=epoch)
+    clock_epoch = np.repeat(np.array([0, 1], dtype=np.int16), 600)
+    track = straight_track(SPEED, stamp_ns=stamp_ns, clock_epoch=clock_epoch)
     first, second = (
-        power_streams({"drive": record(amp=a)}, epoch=e)
+        power_streams({"drive": record(amp=a)}, clock_epoch=e)
         for e, a in ((0, lambda t: 5 + 0 * t), (1, lambda t: 9 + 0 * t))
     )
     import pyarrow as pa
 
     both = Streams({"power": pa.concat_tables([first.tables["power"], second.tables["power"]])}, {}, "husky")
     table = label(track, both).table
-    assert to_floats(table, "power_watt") == pytest.approx(np.where(to_integers(table, "epoch") == 0, 120.0, 216.0))
+    assert to_floats(table, "power_watt") == pytest.approx(
+        np.where(to_integers(table, "clock_epoch") == 0, 120.0, 216.0)
+    )
 
 
 def test_deviations_grow_with_their_causes():

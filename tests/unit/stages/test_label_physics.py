@@ -36,7 +36,7 @@ def stages(tmp_path_factory):
 
 def test_the_fit_is_the_robot(stages):
     facts = stages[2].info.report.facts.label.physics
-    assert facts.standing_watt == pytest.approx(ROBOT.idle_watt, rel=0.02)
+    assert facts.idle_watt == pytest.approx(ROBOT.idle_watt, rel=0.02)
     assert facts.weight_over_efficiency_newton == pytest.approx(
         ROBOT.mass_kg * GRAVITY_MPS2 / ROBOT.drive_efficiency, rel=0.05
     )

@@ -15,8 +15,8 @@ from tcpipe.tables.facts import (
     ClockOffset,
     Disagreement,
     FuseFacts,
-    GateFacts,
-    Reopening,
+    GateReset,
+    MaskFacts,
     StageFacts,
     StretchFacts,
 )
@@ -24,7 +24,7 @@ from tcpipe.tables.findings import StageReport
 from tcpipe.tables.levels import Sensor, Streams, TrackInfo
 
 STAMPS = stamps(200)  # at 20 Hz and 1 m/s: five centimetres a row
-GATED = GateFacts(200, 200, {}, {}, 1.0, 0.9)
+MASKED = MaskFacts(200, 200, {}, {}, 1.0, 0.9)
 
 
 def rows(*, dropped=(), late=None, reason=DropReason.GAP):
@@ -37,7 +37,7 @@ def rows(*, dropped=(), late=None, reason=DropReason.GAP):
     return pa.table(
         {
             "stamp_ns": stamp_ns,
-            "epoch": np.zeros(200, np.int16),
+            "clock_epoch": np.zeros(200, np.int16),
             "x_m": x_m,
             "y_m": np.zeros(200),
             "wheel_velocity_mps": np.ones(200),
@@ -50,7 +50,7 @@ def cut(count=1, **said):
     columns = {
         "start_ns": STAMPS[[100]],
         "end_ns": STAMPS[[120]],
-        "epoch": np.zeros(1, np.int16),
+        "clock_epoch": np.zeros(1, np.int16),
         "chord_m": [1.0],
         "arc_length_m": [1.0],
         "fused_velocity_mps": [1.0],
@@ -61,7 +61,7 @@ def cut(count=1, **said):
 
 
 def info(**facts):
-    return TrackInfo("run-0", "husky", None, 20.0, "smoother", StageReport((), StageFacts(**{"gate": GATED} | facts)))
+    return TrackInfo("run-0", "husky", None, 20.0, "smoother", StageReport((), StageFacts(**{"mask": MASKED} | facts)))
 
 
 def flags(segment, track=None, about=None):
@@ -80,8 +80,8 @@ def test_a_plain_segment_carries_no_bit():
     [
         ("position_std_m", 0.1, 0.1001, Quality.WEAK_GNSS),
         ("arc_length_m", 1.05, 1.0501, Quality.CURVED),
-        ("commanded_velocity_mps", 0.9, 0.8999, Quality.NOT_AT_LIMIT),
-        ("commanded_velocity_mps", -0.9, -0.8999, Quality.NOT_AT_LIMIT),
+        ("commanded_velocity_mps", 0.9, 0.8999, Quality.BELOW_FULL_SPEED),
+        ("commanded_velocity_mps", -0.9, -0.8999, Quality.BELOW_FULL_SPEED),
         ("commanded_velocity_mps", 1.0, np.nan, Quality.NO_COMMAND),
         ("fused_velocity_mps", 0.81, 0.79, Quality.HIGH_SLIP),
     ],
@@ -97,8 +97,8 @@ def test_a_curve_is_one_against_its_own_chord():
 
 
 def test_without_a_known_limit_no_command_is_below_it():
-    assert flags(cut(commanded_velocity_mps=[0.1]), about=info(gate=None)) == set()
-    assert flags(cut(commanded_velocity_mps=[0.1]), about=info(gate=replace(GATED, full_speed_mps=None))) == set()
+    assert flags(cut(commanded_velocity_mps=[0.1]), about=info(mask=None)) == set()
+    assert flags(cut(commanded_velocity_mps=[0.1]), about=info(mask=replace(MASKED, full_speed_mps=None))) == set()
 
 
 @pytest.mark.parametrize(("row", "near"), [(79, False), (80, True), (110, True), (140, True), (141, False)])
@@ -119,8 +119,10 @@ def test_a_hole_counts_by_the_rows_on_both_of_its_sides(late, near):
     assert (Quality.NEAR_GAP in flags(segment, track)) == near
 
 
-def disagreement(start_ns, end_ns, *, alone=False, epoch=0):
-    return AuditFacts((Disagreement(int(start_ns), int(end_ns), "gnss", "position", 1.0, "m", 0.1, alone, epoch),))
+def disagreement(start_ns, end_ns, *, alone=False, clock_epoch=0):
+    return AuditFacts(
+        (Disagreement(int(start_ns), int(end_ns), "gnss", "position", 1.0, "m", 0.1, alone, clock_epoch),)
+    )
 
 
 @pytest.mark.parametrize(
@@ -134,17 +136,17 @@ def test_a_disagreement_counts_where_it_touches_a_segment(before, behind, touche
 def test_a_disagreement_that_is_settled_or_of_another_epoch_is_none():
     span = STAMPS[100], STAMPS[120]
     assert flags(cut(), about=info(audit=disagreement(*span, alone=True))) == set()
-    assert flags(cut(), about=info(audit=disagreement(*span, epoch=1))) == set()
-    later = cut(epoch=np.ones(1, np.int16))
+    assert flags(cut(), about=info(audit=disagreement(*span, clock_epoch=1))) == set()
+    later = cut(clock_epoch=np.ones(1, np.int16))
     assert flags(later, about=info(audit=disagreement(*span))) == set()
-    assert flags(later, about=info(audit=disagreement(*span, epoch=1))) == {Quality.SENSORS_DISAGREE}
+    assert flags(later, about=info(audit=disagreement(*span, clock_epoch=1))) == {Quality.SENSORS_DISAGREE}
     assert flags(cut(), about=info(audit=disagreement(STAMPS[120] + 1, STAMPS[130]))) == set()
 
 
 @pytest.mark.parametrize(("role", "disputed"), [("gnss", True), ("wheel_odometry", False)])
 def test_fixes_that_were_off_dispute_a_segment(role, disputed):
-    off = Reopening(role, int(STAMPS[110]), int(STAMPS[115]), 1.0)
-    stretch = StretchFacts({}, {}, {}, 0, reopenings=(off,))
+    off = GateReset(role, int(STAMPS[110]), int(STAMPS[115]), 1.0)
+    stretch = StretchFacts({}, {}, {}, 0, gate_resets=(off,))
     fuse = FuseFacts(200, ("gnss",), {}, {}, {}, {}, 0.0, (stretch,))
     assert (flags(cut(), about=info(fuse=fuse)) == {Quality.SENSORS_DISAGREE}) == disputed
 

@@ -7,7 +7,7 @@ import pytest
 from made_tracks import make_track, stamps, straight_track
 
 from tcpipe.errors import FusionError
-from tcpipe.recipe import GateConfig, SegmentConfig
+from tcpipe.recipe import MaskConfig, SegmentConfig
 from tcpipe.stages.mask import mask_track
 from tcpipe.stages.segment import segment_track
 from tcpipe.tables.bits import DropReason
@@ -18,51 +18,51 @@ T = np.arange(0, 60, 0.05)
 
 
 def gate(track, *, config=None, limit_mps=1.0):
-    return mask_track(track, config or GateConfig(), max_velocity_mps=limit_mps, chord_m=1.0)
+    return mask_track(track, config or MaskConfig(), max_velocity_mps=limit_mps, chord_m=1.0)
 
 
-def rows_of(gated, reason):
-    return (gated.table["dropped_by"].to_numpy() & np.uint32(reason)) != 0
+def rows_of(masked, reason):
+    return (masked.table["dropped_by"].to_numpy() & np.uint32(reason)) != 0
 
 
 def start_and_stop(top=0.9, rate=1.0):
     return np.clip(np.minimum(rate * (T - 5), rate * (50 - T)), 0, top)
 
 
-def codes_of(gated):
-    return [finding.code for finding in gated.info.report.findings]
+def codes_of(masked):
+    return [finding.code for finding in masked.info.report.findings]
 
 
 def test_a_terrain_slowdown_under_a_constant_command_is_kept():
     speed = 0.9 - 0.6 * np.exp(-(((T - 30) / 1.0) ** 2))  # |dv/dt| up to 0.5 m/s²
-    gated = gate(straight_track(speed, commanded_mps=np.ones(len(T))))
-    assert (gated.table["dropped_by"].to_numpy() == 0).all()
+    masked = gate(straight_track(speed, commanded_mps=np.ones(len(T))))
+    assert (masked.table["dropped_by"].to_numpy() == 0).all()
     without = gate(straight_track(speed))
     assert rows_of(without, DropReason.ACCELERATING)[(T > 29) & (T < 31)].any()
 
 
 def test_start_and_stop_with_commands():
     commanded = np.where((T >= 5) & (T < 49.1), 1.0, 0.0)
-    gated = gate(straight_track(start_and_stop(), commanded_mps=commanded))
-    accelerating = rows_of(gated, DropReason.ACCELERATING)
-    kept = gated.table["dropped_by"].to_numpy() == 0
+    masked = gate(straight_track(start_and_stop(), commanded_mps=commanded))
+    accelerating = rows_of(masked, DropReason.ACCELERATING)
+    kept = masked.table["dropped_by"].to_numpy() == 0
     assert T[accelerating & (T < 20)].max() == pytest.approx(7.0)
     assert kept[(T > 7.05) & (T < 49.0)].all()
     assert not kept[(T < 7) | (T > 49.1)].any()
-    assert rows_of(gated, DropReason.STANDING)[(T < 5) | (T > 50.1)].all()
+    assert rows_of(masked, DropReason.STATIONARY)[(T < 5) | (T > 50.1)].all()
 
 
 def test_start_and_stop_without_commands():
-    gated = gate(straight_track(start_and_stop()))
-    kept = gated.table["dropped_by"].to_numpy() == 0
+    masked = gate(straight_track(start_and_stop()))
+    kept = masked.table["dropped_by"].to_numpy() == 0
     assert kept[(T > 6.5) & (T < 48.5)].all()
     assert not kept[(T < 5.9) | (T > 49.2)].any()
-    assert codes_of(gated) == ["no-command"]
+    assert codes_of(masked) == ["no-command"]
 
 
 def test_a_robot_that_coasts_to_a_halt_under_a_standing_command():
-    gated = gate(straight_track(start_and_stop(rate=0.4), commanded_mps=np.ones(len(T))))
-    kept = gated.table["dropped_by"].to_numpy() == 0
+    masked = gate(straight_track(start_and_stop(rate=0.4), commanded_mps=np.ones(len(T))))
+    kept = masked.table["dropped_by"].to_numpy() == 0
     assert not kept[(T < 7) | (T > 48)].any()
     assert kept[(T > 7.6) & (T < 47.4)].all()
 
@@ -70,12 +70,12 @@ def test_a_robot_that_coasts_to_a_halt_under_a_standing_command():
 @pytest.mark.parametrize(("share", "limit"), [(0.7, 0.7), (0.3, 1.0)])
 def test_the_top_command_of_a_run_is_its_limit_where_most_is_driven_at_it(share, limit):
     commanded = np.where(60 * share > T, 0.7, 0.35)
-    gated = gate(straight_track(commanded - 0.1, commanded_mps=commanded))
-    assert gated.info.report.facts.gate.max_velocity_mps == pytest.approx(limit)
-    below = rows_of(gated, DropReason.BELOW_LIMIT)
+    masked = gate(straight_track(commanded - 0.1, commanded_mps=commanded))
+    assert masked.info.report.facts.mask.max_velocity_mps == pytest.approx(limit)
+    below = rows_of(masked, DropReason.BELOW_FULL_SPEED)
     assert below[60 * share + 1 < T].all()
     assert below[60 * share - 1 > T].all() == (limit == 1.0)
-    (finding,) = gated.info.report.findings
+    (finding,) = masked.info.report.findings
     assert finding.code == ("limit-from-commands" if limit == 0.7 else "driven-below-limit")
     assert finding.numbers["top_mps"] == pytest.approx(0.7)
     assert finding.numbers.get("held_fraction", 0.7) == pytest.approx(0.7, abs=0.01)
@@ -84,20 +84,20 @@ def test_the_top_command_of_a_run_is_its_limit_where_most_is_driven_at_it(share,
 def test_below_the_limit_unless_it_is_unknown_or_allowed():
     speed, commanded = np.full(len(T), 0.6), np.full(len(T), 0.7)
     track = straight_track(speed, commanded_mps=commanded)
-    assert rows_of(gate(track, config=GateConfig(max_velocity_mps=1.0)), DropReason.BELOW_LIMIT).all()
-    assert not rows_of(gate(track, config=GateConfig(require_full_speed=False)), DropReason.BELOW_LIMIT).any()
+    assert rows_of(gate(track, config=MaskConfig(max_velocity_mps=1.0)), DropReason.BELOW_FULL_SPEED).all()
+    assert not rows_of(gate(track, config=MaskConfig(require_full_speed=False)), DropReason.BELOW_FULL_SPEED).any()
     unknown = gate(track, limit_mps=None)
-    assert not rows_of(unknown, DropReason.BELOW_LIMIT).any()
+    assert not rows_of(unknown, DropReason.BELOW_FULL_SPEED).any()
     (finding,) = unknown.info.report.findings
-    assert (finding.code, finding.remedies[0].recipe) == ("max-velocity-unknown", {"gate": {"max_velocity_mps": 0.7}})
-    assert not rows_of(gate(track, config=GateConfig(max_velocity_mps=0.7)), DropReason.BELOW_LIMIT).any()
+    assert (finding.code, finding.remedies[0].recipe) == ("max-velocity-unknown", {"mask": {"max_velocity_mps": 0.7}})
+    assert not rows_of(gate(track, config=MaskConfig(max_velocity_mps=0.7)), DropReason.BELOW_FULL_SPEED).any()
     assert gate(track).info.report.findings[0].numbers["held_fraction"] == 1.0
 
 
 def test_stuck_has_its_own_reason():
-    gated = gate(straight_track(np.full(len(T), 0.01), wheel_mps=np.where(T < 30, 0.0, 0.7)))
-    assert rows_of(gated, DropReason.STANDING).tolist() == (T < 30).tolist()
-    assert rows_of(gated, DropReason.STUCK).tolist() == (T >= 30).tolist()
+    masked = gate(straight_track(np.full(len(T), 0.01), wheel_mps=np.where(T < 30, 0.0, 0.7)))
+    assert rows_of(masked, DropReason.STATIONARY).tolist() == (T < 30).tolist()
+    assert rows_of(masked, DropReason.STUCK).tolist() == (T >= 30).tolist()
 
 
 def test_reversing_is_dropped_unless_kept():
@@ -105,7 +105,7 @@ def test_reversing_is_dropped_unless_kept():
     velocity = np.tile([-0.5, 0.0, 0.0], (len(T), 1))
     track = make_track(position, velocity, forward_mps=np.full(len(T), -0.5))
     assert rows_of(gate(track), DropReason.REVERSING).all()
-    assert (gate(track, config=GateConfig(keep_reversing=True)).table["dropped_by"].to_numpy() == 0).all()
+    assert (gate(track, config=MaskConfig(keep_reversing=True)).table["dropped_by"].to_numpy() == 0).all()
 
 
 def test_a_power_gap_is_a_gap_and_a_run_without_power_is_none():
@@ -125,20 +125,20 @@ def test_a_jump_is_a_gap_and_not_driven():
     position = np.column_stack([track.table[f"{axis}_m"].to_numpy() for axis in "xyz"])
     position[600:, 1] += 1e6
     velocity = np.tile([0.9, 0.0, 0.0], (len(T), 1))
-    gated = gate(make_track(position, velocity))
-    assert np.flatnonzero(rows_of(gated, DropReason.GAP)).tolist() == [599, 600]
-    assert gated.info.report.facts.gate.gap_rows == {
+    masked = gate(make_track(position, velocity))
+    assert np.flatnonzero(rows_of(masked, DropReason.GAP)).tolist() == [599, 600]
+    assert masked.info.report.facts.mask.gap_rows == {
         "without_power": 0,
         "uncertain": 0,
         "jumps": 2,
         "contradicted": 0,
         "implausible": 0,
     }
-    (finding,) = select_findings(gated.info.report.findings, "position-jumps")
+    (finding,) = select_findings(masked.info.report.findings, "position-jumps")
     assert finding.numbers == {"jump_m": pytest.approx(1e6), "jump_count": 1}
     assert finding.span_s[0] == pytest.approx(599 * 0.05)
-    segments = segment_track(gated, SegmentConfig())
-    assert sum(segments.ledger_m.values()) == pytest.approx(0.9 * T[-1], rel=1e-6)
+    segments = segment_track(masked, SegmentConfig())
+    assert sum(segments.distance_by_reason_m.values()) == pytest.approx(0.9 * T[-1], rel=1e-6)
     assert segments.table.num_rows == 52
 
 
@@ -166,18 +166,18 @@ def test_an_error_of_scale_that_a_run_has_in_common_makes_no_gap():
 def test_a_run_whose_sensors_contradict_each_other_undecided_is_all_gap():
     track = straight_track(np.full(200, 0.9))
     facts = replace(track.info.report.facts, audit=AuditFacts((), ("gnss",)))
-    gated = gate(replace(track, info=replace(track.info, report=StageReport((), facts))))
-    assert rows_of(gated, DropReason.GAP).all()
-    assert gated.info.report.facts.gate.gap_rows["contradicted"] == 200
+    masked = gate(replace(track, info=replace(track.info, report=StageReport((), facts))))
+    assert rows_of(masked, DropReason.GAP).all()
+    assert masked.info.report.facts.mask.gap_rows["contradicted"] == 200
 
 
 def test_rows_and_reasons_are_counted():
-    gated = gate(straight_track(start_and_stop(), commanded_mps=np.where((T >= 5) & (T < 49.1), 1.0, 0.0)))
-    facts = gated.info.report.facts.gate
-    dropped_by = gated.table["dropped_by"].to_numpy()
+    masked = gate(straight_track(start_and_stop(), commanded_mps=np.where((T >= 5) & (T < 49.1), 1.0, 0.0)))
+    facts = masked.info.report.facts.mask
+    dropped_by = masked.table["dropped_by"].to_numpy()
     assert facts.rows == len(T)
     assert facts.rows_kept == (dropped_by == 0).sum()
-    assert facts.rows_dropped["standing"] == rows_of(gated, DropReason.STANDING).sum()
+    assert facts.rows_dropped["stationary"] == rows_of(masked, DropReason.STATIONARY).sum()
 
 
 def test_an_empty_track_and_one_row():
@@ -188,16 +188,16 @@ def test_an_empty_track_and_one_row():
 
 def test_a_track_faster_than_plausible_bears_no_segment_there():
     speed = np.where((T > 20) & (T < 30), 40.0, 0.9)
-    gated = gate(straight_track(speed))
-    segments = segment_track(gated, SegmentConfig())
+    masked = gate(straight_track(speed))
+    segments = segment_track(masked, SegmentConfig())
     assert segments.table.num_rows > 30
     spans_s = (segments.table["end_ns"].to_numpy() - segments.table["start_ns"].to_numpy()) * 1e-9
     assert (segments.table["chord_m"].to_numpy() / spans_s).max() < 2.0
-    assert gated.info.report.facts.gate.gap_rows["implausible"] == pytest.approx(200, abs=3)
-    (finding,) = select_findings(gated.info.report.findings, "track-too-fast")
+    assert masked.info.report.facts.mask.gap_rows["implausible"] == pytest.approx(200, abs=3)
+    (finding,) = select_findings(masked.info.report.findings, "track-too-fast")
     assert (finding.severity, finding.numbers["limit_mps"]) == ("warning", 15.0)
     assert finding.numbers["fast_s"] == pytest.approx(10.0, abs=0.2)
-    assert not rows_of(gate(straight_track(speed), config=GateConfig(max_plausible_mps=50.0)), DropReason.GAP)[450]
+    assert not rows_of(gate(straight_track(speed), config=MaskConfig(max_plausible_mps=50.0)), DropReason.GAP)[450]
 
 
 def test_a_run_that_is_mostly_faster_than_plausible_is_refused():
@@ -208,7 +208,7 @@ def test_a_run_that_is_mostly_faster_than_plausible_is_refused():
     assert (finding.code, finding.severity, finding.action) == ("track-too-fast", "error", "rejected")
     assert finding.numbers["limit_mps"] == 15.0
     robot = {"max_velocity_mps": 1.0, "chord_m": 1.0}
-    assert mask_track(track, GateConfig(), **robot, max_plausible_mps=1e4).table.num_rows == T.size
+    assert mask_track(track, MaskConfig(), **robot, max_plausible_mps=1e4).table.num_rows == T.size
     with pytest.raises(FusionError) as error:  # the recipe's goes first
-        mask_track(track, GateConfig(max_plausible_mps=20.0), **robot, max_plausible_mps=1e4)
+        mask_track(track, MaskConfig(max_plausible_mps=20.0), **robot, max_plausible_mps=1e4)
     assert error.value.findings[0].numbers["limit_mps"] == 20.0

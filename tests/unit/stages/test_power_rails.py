@@ -6,7 +6,7 @@ from made_tracks import power_streams, stamps, straight_track
 
 from tcpipe.power.energy import integrate_energy
 from tcpipe.power.idle import IdlePower
-from tcpipe.recipe import GateConfig, SegmentConfig
+from tcpipe.recipe import MaskConfig, SegmentConfig
 from tcpipe.stages.fuse_stretches import make_power_columns
 from tcpipe.stages.label import compute_segment_costs
 from tcpipe.stages.mask import mask_track
@@ -33,11 +33,11 @@ def test_the_track_has_the_power_that_the_label_takes_at_a_segments_end(averaged
     streams = power_streams(
         {"drive": (stamp_ns, np.full(62, 30.0), np.where(np.arange(62) % 2, 10.0, 1.0))}, averaged=averaged
     )
-    gated = mask_track(straight_track(np.full(1200, 0.8)), GateConfig(), max_velocity_mps=1.0, chord_m=1.0)
-    cut = segment_track(gated, SegmentConfig()).table
+    masked = mask_track(straight_track(np.full(1200, 0.8)), MaskConfig(), max_velocity_mps=1.0, chord_m=1.0)
+    cut = segment_track(masked, SegmentConfig()).table
     rule = "averaged" if averaged else "exact"
     unknown, rails = IdlePower(np.nan, np.nan), make_rails(streams, 0)
-    cost, _, causes = compute_segment_costs(cut, gated.table, rails, gated.info, rule=rule, standing=unknown)
+    cost, _, causes = compute_segment_costs(cut, masked.table, rails, masked.info, rule=rule, standing=unknown)
     label_watt = np.sqrt(causes["position"]) / cost.duration_std_s
     assert cut.num_rows > 40
     assert label_watt == pytest.approx(track_watt(streams, to_integers(cut, "end_ns")))
@@ -53,9 +53,13 @@ def test_of_several_samples_at_one_stamp_all_take_the_first():
 def test_where_one_rail_is_silent_for_an_epoch_nobody_knows_the_power():
     both = power_streams({n: (seconds(0, 1), np.full(2, 10.0), np.ones(2)) for n in ("left", "right")})
     table = both.tables["power"]
-    epoch = np.array([0, 0, 1, 1], dtype=np.int16)  # the right rail has rows in epoch 1 alone
+    clock_epoch = np.array([0, 0, 1, 1], dtype=np.int16)  # the right rail has rows in clock_epoch 1 alone
     streams = Streams(
-        {"power": table.set_column(table.column_names.index("epoch"), table.schema.field("epoch"), [epoch])},
+        {
+            "power": table.set_column(
+                table.column_names.index("clock_epoch"), table.schema.field("clock_epoch"), [clock_epoch]
+            )
+        },
         {},
         "husky",
     )

@@ -15,7 +15,7 @@ from tcpipe.errors import RecipeError, RoleError
 from tcpipe.formats.robot_files import load_shipped_profiles
 from tcpipe.logs.topics import Topic
 from tcpipe.power.sources import RailReadings
-from tcpipe.recipe import Placement, ReadConfig
+from tcpipe.recipe import Extrinsics, ReadConfig
 from tcpipe.stages.read import read_run
 from tcpipe.stages.read_power import select_power_rows
 from tcpipe.tables.findings import select_findings
@@ -237,11 +237,11 @@ def test_a_latched_tf_places_what_tf_static_does_not() -> None:
     assert found.sensors["imu"].placed_by == "assumed"
     (unplaced,) = select_findings(found.report.findings, "sensor-not-placed")
     assert (unplaced.subject.name, unplaced.names["frame"]) == ("imu", "imu_link")
-    assert "xyz_m" in unplaced.remedies[0].recipe["read.placement"]["imu"]
+    assert "xyz_m" in unplaced.remedies[0].recipe["read.extrinsics"]["imu"]
 
 
 def test_the_recipe_places_over_tf() -> None:
-    found = read(husky(), placement={"gnss": Placement((1.0, 2.0, 3.0), (0.0, 0.0, np.pi / 2))})
+    found = read(husky(), extrinsics={"gnss": Extrinsics((1.0, 2.0, 3.0), (0.0, 0.0, np.pi / 2))})
     assert found.sensors["gnss"].xyz_m == (1.0, 2.0, 3.0)
     assert found.sensors["gnss"].placed_by == "recipe"
     np.testing.assert_allclose(found.sensors["gnss"].quat_xyzw, [0, 0, np.sqrt(0.5), np.sqrt(0.5)], atol=1e-12)
@@ -412,8 +412,8 @@ def test_a_step_of_all_clocks_divides_every_table() -> None:
     found = read(topics)
     assert found.report.facts.epochs == 2
     for role, table in found.tables.items():
-        epoch = table["epoch"].to_numpy()
-        np.testing.assert_array_equal(epoch == 1, table["log_time_ns"].to_numpy() >= START + 5 * S, err_msg=role)
+        clock_epoch = table["clock_epoch"].to_numpy()
+        np.testing.assert_array_equal(clock_epoch == 1, table["log_time_ns"].to_numpy() >= START + 5 * S, err_msg=role)
     (step,) = select_findings(found.report.findings, "clock-step")
     assert step.numbers["step_s"] == 7.0
     assert step.span_s == pytest.approx((5.0, 5.0), abs=0.1)
@@ -450,12 +450,12 @@ def test_a_counter_of_energy_is_power_by_the_stamps_that_rule(*, stepped: bool) 
         topics = {name: (kind, with_step(table)) for name, (kind, table) in topics.items()}
     found = read(topics)
     table = found.tables["power"]
-    stamp_s, epoch = table["stamp_ns"].to_numpy() / 1e9, table["epoch"].to_numpy()
+    stamp_s, clock_epoch = table["stamp_ns"].to_numpy() / 1e9, table["clock_epoch"].to_numpy()
     watt = table["voltage_volt"].to_numpy() * table["current_amp"].to_numpy(zero_copy_only=False)
-    first = np.flatnonzero(np.diff(epoch, prepend=-1))
+    first = np.flatnonzero(np.diff(clock_epoch, prepend=-1))
     assert np.flatnonzero(np.isnan(watt)).tolist() == first.tolist()
     assert len(first) == 1 + stepped
-    within = np.diff(epoch) == 0
+    within = np.diff(clock_epoch) == 0
     np.testing.assert_allclose((watt[1:] * np.diff(stamp_s))[within], np.diff(joule)[within], rtol=1e-5)
     assert found.power_averaged
     assert "power-values-excluded" not in codes(found)

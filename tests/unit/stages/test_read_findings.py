@@ -20,7 +20,7 @@ SENSOR = Sensor("/fix", "sensor_msgs/msg/NavSatFix", "gps", "the only one", plac
 
 def timeline(**said):
     stamp_ns = np.arange(COUNT, dtype=np.int64) * 100_000_000
-    told = {"row": np.arange(COUNT), "stamp_ns": stamp_ns, "epoch": np.zeros(COUNT, np.int16), "source": "header"}
+    told = {"row": np.arange(COUNT), "stamp_ns": stamp_ns, "clock_epoch": np.zeros(COUNT, np.int16), "source": "header"}
     return Timeline(**{**told, "why": "header-follows-log-time", "offset_s": 0.5, **said})
 
 
@@ -118,9 +118,9 @@ def test_steps_of_the_clock_divide_epochs_and_each_warning_comes_once():
 
 def test_a_rate_is_that_inside_epochs_and_unknown_of_one_row():
     stamp_ns = np.array([0, 100, 200, 5200, 5300]) * 1_000_000
-    two = timeline(stamp_ns=stamp_ns, epoch=np.array([0, 0, 0, 1, 1], np.int16))
+    two = timeline(stamp_ns=stamp_ns, clock_epoch=np.array([0, 0, 0, 1, 1], np.int16))
     assert read(clock=two).facts.roles["gnss"].topics["/fix"].rate_hz == pytest.approx(10.0)
-    single = timeline(stamp_ns=stamp_ns[:1], epoch=np.zeros(1, np.int16), row=np.arange(1))
+    single = timeline(stamp_ns=stamp_ns[:1], clock_epoch=np.zeros(1, np.int16), row=np.arange(1))
     assert read(clock=single).facts.roles["gnss"].topics["/fix"].rate_hz is None
 
 

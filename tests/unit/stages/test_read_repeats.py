@@ -87,9 +87,9 @@ def test_a_signal_measured_for_every_message_stays_as_it_is(volt, amp):
 
 def test_clock_epochs_are_told_together_and_kept_apart():
     table = power_streams({"battery": (STAMP_NS, drawn(1) + 20, held(drawn(2), 20))}).tables["power"]
-    epoch = (np.arange(COUNT) >= COUNT - 300).astype(np.int16)  # 15 readings are too few to tell by themselves
-    back_ns = np.where(epoch, STAMP_NS - 30_000_000_000, STAMP_NS)
-    for name, values in (("epoch", epoch), ("stamp_ns", back_ns)):
+    clock_epoch = (np.arange(COUNT) >= COUNT - 300).astype(np.int16)  # 15 readings are too few to tell by themselves
+    back_ns = np.where(clock_epoch, STAMP_NS - 30_000_000_000, STAMP_NS)
+    for name, values in (("clock_epoch", clock_epoch), ("stamp_ns", back_ns)):
         table = table.set_column(table.column_names.index(name), table.schema.field(name), [values])
     streams, _ = remove_repeats({"power": table})
     assert [rates_hz(make_rails(Streams(streams, {}, "husky"), number))[0] for number in (0, 1)] == [1.0, 1.0]

@@ -5,7 +5,7 @@ import pyproj
 import pytest
 from made_tracks import GRAZ, make_track, stamps, straight_track
 
-from tcpipe.recipe import GateConfig, SegmentConfig
+from tcpipe.recipe import MaskConfig, SegmentConfig
 from tcpipe.stages.mask import mask_track
 from tcpipe.stages.segment import segment_track
 from tcpipe.tables.columns import to_floats, to_integers
@@ -14,9 +14,9 @@ from tcpipe.tables.findings import select_findings
 T = np.arange(0, 60, 0.05)
 
 
-def cut(track, *, gate=None, limit_mps=1.0):
-    gated = mask_track(track, gate or GateConfig(), max_velocity_mps=limit_mps, chord_m=1.0)
-    return segment_track(gated, SegmentConfig())
+def cut(track, *, mask=None, limit_mps=1.0):
+    masked = mask_track(track, mask or MaskConfig(), max_velocity_mps=limit_mps, chord_m=1.0)
+    return segment_track(masked, SegmentConfig())
 
 
 def chord_error_m(table):
@@ -82,12 +82,18 @@ def wandering(seed):
     position = np.cumsum(velocity, axis=0) * 0.05 + rng.normal(0, 0.002, (count, 3))
     stamp_ns = stamps(count)
     stamp_ns[900:] += 2_000_000_000
-    epoch = np.zeros(count, dtype=np.int16)
+    clock_epoch = np.zeros(count, dtype=np.int16)
     stamp_ns[1700:] -= 30_000_000_000  # the clock goes back: stamps of both epochs overlap
-    epoch[1700:] = 1
+    clock_epoch[1700:] = 1
     power = np.where((t > 60) & (t < 63), np.nan, 150.0)
     return make_track(
-        position, velocity, stamp_ns=stamp_ns, epoch=epoch, forward_mps=speed, yaw_rate_radps=yaw_rate, power_watt=power
+        position,
+        velocity,
+        stamp_ns=stamp_ns,
+        clock_epoch=clock_epoch,
+        forward_mps=speed,
+        yaw_rate_radps=yaw_rate,
+        power_watt=power,
     )
 
 
@@ -95,24 +101,24 @@ def wandering(seed):
 def test_the_ledger_accounts_for_every_metre_once(seed):
     track = wandering(seed)
     segments = cut(track)
-    ledger = segments.ledger_m
+    ledger = segments.distance_by_reason_m
     assert list(ledger) == [
-        *("kept", "gap", "standing", "stuck", "turning_in_place", "reversing", "accelerating", "below_limit"),
+        *("kept", "gap", "stationary", "stuck", "turning_in_place", "reversing", "accelerating", "below_full_speed"),
         *("curved", "leftover"),
     ]
     assert ledger["kept"] == pytest.approx(to_floats(segments.table, "arc_length_m").sum(), rel=1e-12)
     # Independent odometer: a fine polygon through every row's Hermite cubic, straight lines where stamps or epochs break.
     assert sum(ledger.values()) == pytest.approx(odometer_m(track.table), rel=1e-4)
     assert sum(ledger.values()) == pytest.approx(segments.info.report.facts.segment.odometer_m, rel=1e-12)
-    seconds = segments.info.report.facts.segment.ledger_s
+    seconds = segments.info.report.facts.segment.duration_by_reason_s
     assert sum(seconds.values()) == pytest.approx(2398 * 0.05 + 2.0, rel=1e-9)  # all but the interval of the clock step
 
 
 def odometer_m(table):
-    stamp_ns, epoch = to_integers(table, "stamp_ns"), to_integers(table, "epoch")
+    stamp_ns, clock_epoch = to_integers(table, "stamp_ns"), to_integers(table, "clock_epoch")
     xy = np.column_stack([to_floats(table, f"{axis}_m") for axis in "xy"])
     velocity = np.column_stack([to_floats(table, f"{name}_velocity_mps") for name in ("east", "north")])
-    regular = (np.diff(stamp_ns) == 50_000_000) & (np.diff(epoch) == 0)
+    regular = (np.diff(stamp_ns) == 50_000_000) & (np.diff(clock_epoch) == 0)
     u = np.linspace(0, 1, 51)[:, None, None]
     p0, p1, v0, v1 = xy[:-1], xy[1:], velocity[:-1] * 0.05, velocity[1:] * 0.05
     points = (
@@ -125,15 +131,15 @@ def odometer_m(table):
 @pytest.mark.parametrize("seed", range(6))
 def test_no_segment_holds_a_dropped_row_a_hole_or_a_step_of_the_clock(seed):
     track = wandering(seed)
-    gated = mask_track(track, GateConfig(), max_velocity_mps=1.0, chord_m=1.0)
-    table = segment_track(gated, SegmentConfig()).table
+    masked = mask_track(track, MaskConfig(), max_velocity_mps=1.0, chord_m=1.0)
+    table = segment_track(masked, SegmentConfig()).table
     assert chord_error_m(table).max() < 1e-6
-    stamp_ns, epoch = to_integers(gated.table, "stamp_ns"), to_integers(gated.table, "epoch")
-    dropped = gated.table["dropped_by"].to_numpy() != 0
+    stamp_ns, clock_epoch = to_integers(masked.table, "stamp_ns"), to_integers(masked.table, "clock_epoch")
+    dropped = masked.table["dropped_by"].to_numpy() != 0
     for start, end, its_epoch in zip(
-        to_integers(table, "start_ns"), to_integers(table, "end_ns"), to_integers(table, "epoch"), strict=True
+        to_integers(table, "start_ns"), to_integers(table, "end_ns"), to_integers(table, "clock_epoch"), strict=True
     ):
-        mine = epoch == its_epoch
+        mine = clock_epoch == its_epoch
         inside = mine & (stamp_ns > start - 50_000_000) & (stamp_ns < end + 50_000_000)
         assert not dropped[inside].any()
         assert (np.diff(stamp_ns[inside]) == 50_000_000).all()
@@ -142,7 +148,7 @@ def test_no_segment_holds_a_dropped_row_a_hole_or_a_step_of_the_clock(seed):
 def test_kept_backward_stretches_never_share_a_segment_with_forward_ones():
     speed = np.where(T < 30, 0.8, -0.8)
     track = straight_track(speed, forward_mps=speed)
-    segments = cut(track, gate=GateConfig(keep_reversing=True, max_acceleration_mps2=50.0, ramp_acceleration_mps2=50.0))
+    segments = cut(track, mask=MaskConfig(keep_reversing=True, max_acceleration_mps2=50.0, ramp_acceleration_mps2=50.0))
     fused = to_floats(segments.table, "fused_velocity_mps")
     assert set(np.round(fused, 9)) == {0.8, -0.8}
 
@@ -175,4 +181,4 @@ def test_tiny_tracks_have_no_segments(count):
     nothing = np.zeros((count, 3))
     segments = cut(make_track(nothing, nothing, stamp_ns=stamps(count)))
     assert segments.table.num_rows == 0
-    assert sum(segments.ledger_m.values()) == 0
+    assert sum(segments.distance_by_reason_m.values()) == 0

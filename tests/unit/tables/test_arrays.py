@@ -50,8 +50,8 @@ def test_texts_there_and_back(values, first):
 
 
 def test_rows_where():
-    table = pa.table({"epoch": [0, 1, 0], "rail": ["a", "b", "b"]})
-    assert select_rows(table, "epoch", 0).to_pylist() == [table.to_pylist()[row] for row in (0, 2)]
+    table = pa.table({"clock_epoch": [0, 1, 0], "rail": ["a", "b", "b"]})
+    assert select_rows(table, "clock_epoch", 0).to_pylist() == [table.to_pylist()[row] for row in (0, 2)]
     assert select_rows(table, "rail", "b").to_pylist() == [table.to_pylist()[row] for row in (1, 2)]
     assert select_rows(table, "rail", "c").num_rows == 0
 

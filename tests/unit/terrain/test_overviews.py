@@ -11,8 +11,8 @@ from tcpipe.terrain.patches import patch_frames
 from tcpipe.terrain.sampling import sample_patches
 
 
-def grid_of(rows, cols, pitch_m=0.05):
-    return MapGrid("EPSG:32633", 500_000.0, 5_200_000.0, pitch_m, rows, cols)
+def grid_of(rows, cols, pixel_size_m=0.05):
+    return MapGrid("EPSG:32633", 500_000.0, 5_200_000.0, pixel_size_m, rows, cols)
 
 
 def blocks(values, factor):
@@ -23,7 +23,7 @@ def blocks(values, factor):
 
 
 @pytest.mark.parametrize(
-    ("rows", "cols", "pitch_m", "wanted"),
+    ("rows", "cols", "pixel_size_m", "wanted"),
     [
         (6100, 11920, 0.05, (1, 2, 4, 8, 16)),
         (1000, 1000, 0.01, (1, 2, 4, 8, 16, 32, 64)),
@@ -33,14 +33,14 @@ def blocks(values, factor):
         (50, 50, 30.0, (1,)),
     ],
 )
-def test_levels_end_at_a_metre_or_where_nothing_is_left(rows, cols, pitch_m, wanted):
-    assert list_factors(grid_of(rows, cols, pitch_m)) == wanted
+def test_levels_end_at_a_metre_or_where_nothing_is_left(rows, cols, pixel_size_m, wanted):
+    assert list_factors(grid_of(rows, cols, pixel_size_m)) == wanted
 
 
 def test_a_levels_pixel_centres_are_the_means_of_its_pixels_centres():
     grid = grid_of(21, 34)
     level = make_overview_grid(grid, 4)
-    assert (level.rows, level.cols, level.pitch_m) == (5, 8, 0.2)
+    assert (level.rows, level.cols, level.pixel_size_m) == (5, 8, 0.2)
     j, i = np.meshgrid(np.arange(34.0), np.arange(21.0))
     fine = grid.xy_from_px(np.stack([j, i], -1))
     mean = np.stack([blocks(fine[..., k], 4).mean(-1) for k in (0, 1)], -1)
@@ -78,11 +78,11 @@ def test_classes_are_the_commonest_of_all_pixels_not_of_halves():
 
 
 @pytest.mark.parametrize(
-    ("pitch_m", "wanted"),
+    ("pixel_size_m", "wanted"),
     [(0.005, 1), (0.02, 1), (0.039, 1), (0.0398, 2), (0.04, 2), (0.079, 2), (0.08, 4), (0.16, 8), (5.0, 8)],
 )
-def test_the_level_nearest_below_the_patchs_pitch_is_taken(pitch_m, wanted):
-    assert choose_factor((1, 2, 4, 8), 0.02, pitch_m) == wanted
+def test_the_level_nearest_below_the_patchs_pitch_is_taken(pixel_size_m, wanted):
+    assert choose_factor((1, 2, 4, 8), 0.02, pixel_size_m) == wanted
 
 
 class Levels(ArrayMap):

@@ -14,7 +14,7 @@ WORLD = World("EPSG:32633", 533_000.0, 5_213_000.0, side_m=60.0)
 @pytest.fixture(scope="module")
 def source(tmp_path_factory):
     directory = tmp_path_factory.mktemp("map")
-    rasters = WORLD.write(directory, pitch_m=0.1)
+    rasters = WORLD.write(directory, pixel_size_m=0.1)
     build_map(directory / "site.zarr", name="site", height=rasters["height"], terrain=rasters["terrain"])
     return open_map(directory / "site.zarr")
 

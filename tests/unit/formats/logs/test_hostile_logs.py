@@ -290,8 +290,8 @@ def test_what_no_checksum_covers_is_said(tmp_path):
         with open_log(path) as log:
             log.tables(log.topics)
             assert log.damage == []
-            assert len(log.remarks) == bool(said)
-            assert said in "".join(log.remarks)
+            assert len(log.notes) == bool(said)
+            assert said in "".join(log.notes)
 
 
 def test_what_costs_nothing_is_a_remark(tmp_path):
@@ -299,7 +299,7 @@ def test_what_costs_nothing_is_a_remark(tmp_path):
     with open_log(write_mcap(tmp_path / "a.mcap", odd)) as log:
         log.tables(log.topics)
         assert not any(finding.is_loss for finding in log.damage)
-        assert ["not UTF-8" in remark for remark in log.remarks] == [True]
+        assert ["not UTF-8" in note for note in log.notes] == [True]
 
 
 @pytest.mark.parametrize("count", [3, 40])

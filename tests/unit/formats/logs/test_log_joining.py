@@ -26,7 +26,7 @@ def static_of(path):
         assert (log.sha256(), log.damage) == (alone.sha256(), alone.damage)
         tables = log.tables([name for name in log.topics if name in ("/chatter", "/tf_static")])
         assert tables["/chatter"].equals(alone.table("/chatter"))
-        said = [line for line in log.remarks if "static transforms are taken" in line]
+        said = [line for line in log.notes if "static transforms are taken" in line]
         assert len(said) == ("/tf_static" in tables and "/tf_static" not in alone.topics)
         return tables["/tf_static"]["log_time_ns"].to_pylist() if "/tf_static" in tables else None
 

@@ -88,7 +88,7 @@ def test_what_a_bag_holds_is_the_same_as_tables(bag, tmp_path):
             frame.write_csv(folder / name, separator=separator, datetime_format="%Y-%m-%dT%H:%M:%S%.9f")
     recipe = Recipe(tables=SAME)
     with open_logs([folder], tables=recipe.tables) as log:
-        assert (log.damage, log.remarks) == ([], [])
+        assert (log.damage, log.notes) == ([], [])
         found = read_run(log, find_read_config(recipe, log.topics), robot=None, known=load_shipped_profiles())
     for role in ("gnss", "imu", "wheel_odometry", "power"):
         assert (
@@ -153,7 +153,7 @@ def test_what_cannot_be_read_of_a_row_is_damage_and_rows_are_put_in_order(tmp_pa
         "odom.csv, topic /wheel_odometry: rows have no stamp that can be read (1 messages lost)",
         "odom.csv, topic /wheel_odometry: column v holds text, first 'slow' in row 20 (1 messages lost)",
     ]
-    assert log.remarks == ["odom.csv: 1 stamps lie before the one above; its rows are put in order"]
+    assert log.notes == ["odom.csv: 1 stamps lie before the one above; its rows are put in order"]
     table = log.tables(["/wheel_odometry"])["/wheel_odometry"]
     stamps = table["log_time_ns"].to_numpy()
     assert len(stamps) == 49

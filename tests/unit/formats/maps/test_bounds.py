@@ -16,20 +16,20 @@ SMALL = Affine(1.0, 0.0, 560_000.0, 0.0, -1.0, 5_215_000.0)
 SQUARE = [[15.79, 47.08], [15.8, 47.08], [15.8, 47.09], [15.79, 47.09], [15.79, 47.08]]
 
 
-def sparse(path, rows, cols, pitch_m):
+def sparse(path, rows, cols, pixel_size_m):
     """A raster of any size in a few kilobytes."""
     profile = {"driver": "GTiff", "height": rows, "width": cols, "count": 1, "dtype": "float32", "crs": "EPSG:32633"}
-    affine = Affine(pitch_m, 0.0, 5e5, 0.0, -pitch_m, 5e6)
+    affine = Affine(pixel_size_m, 0.0, 5e5, 0.0, -pixel_size_m, 5e6)
     tiling = {"tiled": True, "blockxsize": 4096, "blockysize": 4096, "sparse_ok": True, "BIGTIFF": "YES"}
     with rasterio.open(path, "w", **profile, **tiling, transform=affine):
         return path
 
 
 @pytest.mark.parametrize(
-    ("rows", "cols", "pitch_m"), [(100_000, 100_000, 0.05), (16, 300_000, 0.05), (99_999, 99_999, 1e-9)]
+    ("rows", "cols", "pixel_size_m"), [(100_000, 100_000, 0.05), (16, 300_000, 0.05), (99_999, 99_999, 1e-9)]
 )
-def test_a_map_of_too_many_pixels_is_refused_before_one_is_read(tmp_path, rows, cols, pitch_m):
-    path = sparse(tmp_path / "h.tif", rows, cols, pitch_m)
+def test_a_map_of_too_many_pixels_is_refused_before_one_is_read(tmp_path, rows, cols, pixel_size_m):
+    path = sparse(tmp_path / "h.tif", rows, cols, pixel_size_m)
     with pytest.raises(
         MapError, match=r"h.tif: the map would have .* pixels of .*at most 4.3e\+09 in all and 262144 a side"
     ) as caught:

@@ -62,7 +62,7 @@ def test_a_map_like_its_raster_keeps_every_number(tmp_path):
     write_tif(tmp_path / "h.tif", values, WORLD.crs, NORTH_UP)
     summary, source = built(tmp_path, height=tmp_path / "h.tif")
     assert source.grid.crs == "EPSG:32633"
-    assert (source.grid.rows, source.grid.cols, source.grid.pitch_m) == (400, 400, 0.1)
+    assert (source.grid.rows, source.grid.cols, source.grid.pixel_size_m) == (400, 400, 0.1)
     assert source.grid.bounds_m == pytest.approx((LEFT, TOP - 40.0, LEFT + 40.0, TOP))
     np.testing.assert_allclose(heights(source), values[0].astype(float), atol=1e-5)
     assert summary.covered == {"height": 1.0 - 1.0 / 160_000.0}
@@ -122,7 +122,7 @@ def test_a_raster_that_is_not_metric_goes_to_its_utm_zone(tmp_path, crs):
     write_tif(tmp_path / "h.tif", np.full((1, 100, 100), 100.0, np.float32), crs, affine)
     _, source = built(tmp_path, height=tmp_path / "h.tif")
     assert source.grid.crs == "EPSG:32633"
-    assert source.grid.pitch_m == pytest.approx(0.4, rel=0.02)
+    assert source.grid.pixel_size_m == pytest.approx(0.4, rel=0.02)
 
 
 @pytest.mark.parametrize("west_deg", [179.9999, -180.0001])
@@ -173,7 +173,7 @@ def test_layers_on_other_grids_are_put_on_the_finest(tmp_path):
     other = Affine(0.25, 0.0, LEFT, 0.0, -0.25, TOP)
     write_tif(tmp_path / "t.tif", raster_of(WORLD.terrain, other, 160, 160, np.int32), WORLD.crs, other)
     summary, source = built(tmp_path, height=tmp_path / "h.tif", ortho=tmp_path / "o.tif", terrain=tmp_path / "t.tif")
-    assert source.grid.pitch_m == 0.1
+    assert source.grid.pixel_size_m == 0.1
     assert source.grid.bounds_m == pytest.approx((LEFT - 3.0, TOP - 43.0, LEFT + 43.0, TOP + 3.0))
     present = check_plane(source)
     assert not present[:2].any()  # within half a source pixel of the edge nothing is known
@@ -195,7 +195,7 @@ def test_a_finer_layer_is_averaged_and_classes_take_the_majority(tmp_path):
     write_tif(tmp_path / "o.tif", grey, WORLD.crs, fine)
     write_tif(tmp_path / "t.tif", terrain[None], WORLD.crs, fine)
     layers = {"height": tmp_path / "h.tif", "ortho": tmp_path / "o.tif", "terrain": tmp_path / "t.tif"}
-    _, source = built(tmp_path, **layers, pitch_m=0.5)
+    _, source = built(tmp_path, **layers, pixel_size_m=0.5)
 
     def cells(values):
         return values.reshape(80, 5, 80, 5).swapaxes(1, 2).reshape(80, 80, 25)
@@ -380,7 +380,7 @@ def test_two_builds_are_the_same_bytes_and_replace_each_other(tmp_path):
 def test_shards_meet_without_a_seam(tmp_path):
     affine = Affine(0.1, 0.0, LEFT, 0.0, -0.1, TOP)
     write_tif(tmp_path / "h.tif", raster_of(plane, affine, 60, 2300), "EPSG:32634", affine)
-    _, source = built(tmp_path, height=tmp_path / "h.tif", crs="EPSG:32634", pitch_m=0.07)
+    _, source = built(tmp_path, height=tmp_path / "h.tif", crs="EPSG:32634", pixel_size_m=0.07)
     found = heights(source)
     steps = np.diff(found[10:-10], axis=1)
     assert np.nanmax(np.abs(steps - 0.2 * 0.07)) < 1e-4
@@ -528,7 +528,7 @@ def test_the_map_of_a_real_site(tmp_path):
     site = shared_data("warthog_grass_a")
     layers = {name: site / f"{name}.tif" for name in ("height", "ortho", "terrain")}
     _, source = built(tmp_path, **layers)
-    assert (source.grid.crs, source.grid.pitch_m, source.grid.rows) == ("EPSG:32750", 0.25, 400)
+    assert (source.grid.crs, source.grid.pixel_size_m, source.grid.rows) == ("EPSG:32750", 0.25, 400)
     with rasterio.open(layers["height"]) as dataset:
         original = dataset.read(1, masked=True)
     np.testing.assert_allclose(heights(source), original.filled(np.nan), atol=1e-5)

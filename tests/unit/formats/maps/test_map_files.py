@@ -77,7 +77,7 @@ def test_an_open_map_knows_what_it_is(path):
     assert source.facts.sources == {"height": "height.tif", "ortho": "ortho.tif", "terrain": "terrain.tif"}
     assert source.read("height", 3, 5, 7, 11).shape == (2, 4)
     summary = source.summary()
-    assert (summary.crs, summary.rows, summary.pitch_m) == (WORLD.crs, 200, 0.1)
+    assert (summary.crs, summary.rows, summary.pixel_size_m) == (WORLD.crs, 200, 0.1)
     assert summary.covered == {"height": 1.0, "ortho": 1.0, "terrain": 1.0}
 
 
@@ -89,7 +89,7 @@ def test_overviews_are_maps_of_the_same_ground(path):
     for factor in (2, 8):
         level = source.at(factor)
         count = 200 // factor
-        assert (level.grid.rows, level.grid.pitch_m, level.layers) == (count, factor * 0.1, source.layers)
+        assert (level.grid.rows, level.grid.pixel_size_m, level.layers) == (count, factor * 0.1, source.layers)
         cells = fine.reshape(count, factor, count, factor).mean(axis=(1, 3))
         found = level.height_reference_m + level.read("height", 0, count, 0, count).astype(float)
         np.testing.assert_allclose(found, cells, atol=2e-6)

@@ -64,8 +64,8 @@ def layers_of(path):
     "options",
     [
         pytest.param({}, id="on its own grid"),
-        pytest.param({"pitch_m": 0.11}, id="interpolated across the seams"),
-        pytest.param({"pitch_m": 0.6}, id="averaged across the seams"),
+        pytest.param({"pixel_size_m": 0.11}, id="interpolated across the seams"),
+        pytest.param({"pixel_size_m": 0.6}, id="averaged across the seams"),
         pytest.param({"crs": "EPSG:31258"}, id="in another plane"),
     ],
 )
@@ -89,7 +89,7 @@ def test_interpolation_knows_no_seam(tmp_path):
         x = LEFT + PITCH_M * (SIDE * j + np.arange(SIDE) + 0.5)
         values = np.tile(100.0 + 0.5 * (x - LEFT), (1, SIDE, 1)).astype(np.float32)
         paths.append(write_tif(tmp_path / f"{j}.tif", values, "EPSG:32633", corner(SIDE * j, 0)))
-    build_map(tmp_path / "m.zarr", name="m", height=paths, pitch_m=0.1)
+    build_map(tmp_path / "m.zarr", name="m", height=paths, pixel_size_m=0.1)
     grid, layers = layers_of(tmp_path / "m.zarr")
     x = grid.xy_from_px(np.stack([np.arange(grid.cols), np.zeros(grid.cols)], axis=1))[:, 0]
     middle = layers["height"][grid.rows // 2] + open_map(tmp_path / "m.zarr").height_reference_m

@@ -144,10 +144,10 @@ def test_a_recording_that_overlaps_another_counts_once_where_it_does(store, tmp_
     starts_m = np.sort(pq.read_table(tmp_path / "out" / "samples.parquet")["start_lon_deg"].to_numpy())
     assert result.card.samples == 37
     assert np.diff(starts_m).min() > 0.9 * np.median(np.diff(starts_m))  # no metre of it twice
-    assert result.card.ledger_m["recorded_twice"] == pytest.approx(20)
+    assert result.card.distance_by_reason_m["recorded_twice"] == pytest.approx(20)
     second, first = sorted(names, reverse=True)
     assert twice(result) == [(second, first, 20, 30 if second == whole else 27)]
-    assert sum(result.card.ledger_m.values()) == pytest.approx(30 + 27 + 5)
+    assert sum(result.card.distance_by_reason_m.values()) == pytest.approx(30 + 27 + 5)
     assert verify(tmp_path / "out").problems == ()
 
 
@@ -167,8 +167,13 @@ def test_two_robots_at_one_time_and_one_robot_at_two_times_are_two_drives(store,
 
 
 def test_no_segments(store, tmp_path):
-    add_run(store, "a", segments("a", *lanes(0.0, 0.0, 1.0)).slice(0, 0), ledger_m={"kept": 0.0, "standing": 3.0})
-    assert "no segment in them: 3 m standing" in refused(store, tmp_path)
+    add_run(
+        store,
+        "a",
+        segments("a", *lanes(0.0, 0.0, 1.0)).slice(0, 0),
+        distance_by_reason_m={"kept": 0.0, "stationary": 3.0},
+    )
+    assert "no segment in them: 3 m stationary" in refused(store, tmp_path)
 
 
 def test_what_the_runs_and_the_maps_lack_is_said_at_once(tmp_path):
@@ -193,10 +198,10 @@ def test_no_power_is_no_sample(store, tmp_path):
     add(store, "b", (3.0,))
     result = build(store, tmp_path, page=True)
     assert result.card.samples == 20
-    assert result.card.ledger_m["no_power"] == pytest.approx(20)
+    assert result.card.distance_by_reason_m["no_power"] == pytest.approx(20)
     (found,) = select_findings(result.findings, "run-without-samples")
     assert (found.subject, found.names) == (Subject("run", "a"), {"lacks": "power"})
-    assert sum(result.card.ledger_m.values()) == pytest.approx(45)
+    assert sum(result.card.distance_by_reason_m.values()) == pytest.approx(45)
 
 
 def test_a_map_that_does_not_cover_the_runs(store, tmp_path):
@@ -221,8 +226,8 @@ def test_metres_off_the_map_are_in_the_ledger(store, tmp_path):
     add(store, x=(9.5, 29.5))
     result = build(store, tmp_path)
     assert result.card.samples == 10
-    assert result.card.ledger_m["outside_map"] == pytest.approx(10)
-    assert result.card.ledger_m["kept"] == pytest.approx(10)
+    assert result.card.distance_by_reason_m["outside_map"] == pytest.approx(10)
+    assert result.card.distance_by_reason_m["kept"] == pytest.approx(10)
 
 
 def test_a_region_elsewhere(store, tmp_path):
@@ -265,7 +270,7 @@ def test_an_exclude_region_takes_samples_out_of_the_dataset(store, tmp_path):
     region = region_file(tmp_path / "r.geojson", box(-20, -20, 20, 20), box(-5, -2, 5, 2), splits=(None, "exclude"))
     result = build(store, tmp_path, page=True, split=region)
     # 20 segments from -10 to 10: 10 lie in the exclude region, 1 m of gap to each border goes to the buffer
-    assert result.card.ledger_m["split_excluded"] == pytest.approx(10)
+    assert result.card.distance_by_reason_m["split_excluded"] == pytest.approx(10)
     assert result.card.splits["buffer"] == 4
     assert result.card.samples == 10
 

@@ -122,7 +122,7 @@ def test_they_stand_in_the_commands_answer_the_card_and_what_is_opened(built):
     assert "warning: 2 of 2 runs: Most of the drive was commanded below" in str(result)
     assert "verdict: time usable with care; position and energy usable" in str(result)
     card = open_dataset(place).card
-    assert (card.doubtful.samples, card.doubtful.share) == (5, 0.125)
+    assert (card.flagged_samples.samples, card.flagged_samples.share) == (5, 0.125)
     (flagged,) = select_findings(card.findings, "samples-flagged")
     assert (flagged.severity, flagged.names) == ("warning", {"flag": "weak_gnss"})
     assert card.findings_by_run == result.card.findings_by_run == {"a": (slow(0.6),), "b": (slow(0.7),)}

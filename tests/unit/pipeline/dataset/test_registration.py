@@ -11,7 +11,7 @@ from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.recipe import Recipe
 from tcpipe.store import open_store
 from tcpipe.tables.findings import Subject, select_findings
-from tcpipe.tables.levels import GATED_TRACK
+from tcpipe.tables.levels import MASKED_TRACK
 
 GEOID_M = 46.3
 
@@ -26,10 +26,10 @@ def track_at(xy_m, ground_xy_m, *, std_m=0.02, scale=1.0):
     given |= {"x_std_m": np.full(count, std_m), "y_std_m": np.full(count, std_m)}
     rest = {
         column.name: np.zeros(count, np.int64 if pa.types.is_integer(column.dtype) else np.float64)
-        for column in GATED_TRACK.columns
+        for column in MASKED_TRACK.columns
         if column.name not in given
     }
-    return GATED_TRACK.table(**given, **rest)
+    return MASKED_TRACK.table(**given, **rest)
 
 
 def winding(count=3000):
