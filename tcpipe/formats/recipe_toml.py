@@ -24,6 +24,12 @@ logger = logging.getLogger(__name__)
 FILE_NAME = "tcpipe.toml"
 _MOST_BYTES = 1_000_000
 _OWN_TABLES = ("robots", "power_sources", "tables")
+_EARLIER_OF_MASK = {path.replace("gate.", "mask."): name for path, name in EARLIER_KEYS.items() if "gate." in path}
+_EARLIEST_NAMES = {
+    f"{above.replace('gate', 'mask')}{dot}{name}": key
+    for (above, dot, key), name in ((path.rpartition("."), name) for path, name in EARLIER_KEYS.items())
+}
+"""By the path of a key of today."""
 
 
 def find_recipe(explicit: Path | None, directory: Path) -> Path | None:
@@ -65,8 +71,7 @@ def resolve_recipe(given: Recipe | str | Path | None) -> Recipe:
 
 def parse_recipe(values: Mapping[str, Any], *, where: str) -> Recipe:
     """Check recipe values; `RecipeError` carries one line for every wrong key. Keys by earlier names are read, with a note."""
-    renamed: dict[str, str] = {}
-    values = rename_earlier_keys(values, renamed)
+    values, renamed = rename_earlier_keys(values)
     if renamed:
         logger.warning(
             "%s: keys have new names: %s", where, ", ".join(f"{old} is {new}" for old, new in renamed.items())
@@ -74,22 +79,26 @@ def parse_recipe(values: Mapping[str, Any], *, where: str) -> Recipe:
     return from_values(Recipe, values, where=where)
 
 
-def rename_earlier_keys(values: Any, renamed: dict[str, str], path: str = "") -> Any:
-    """Return recipe values with `EARLIER_KEYS` by their names of today; ``renamed`` collects those that were found."""
+def rename_earlier_keys(values: Mapping[str, Any]) -> tuple[Mapping[str, Any], dict[str, str]]:
+    """Return recipe values with `EARLIER_KEYS` by their names of today, and those that were found."""
+    renamed: dict[str, str] = {}
+    return _rename(values, EARLIER_KEYS | _EARLIER_OF_MASK, renamed), renamed
+
+
+def _rename(values: Any, names: Mapping[str, str], renamed: dict[str, str], path: str = "") -> Any:
     if isinstance(values, list):
-        return [rename_earlier_keys(item, renamed, f"{path}.*") for item in values]
+        return [_rename(item, names, renamed, f"{path}.*") for item in values]
     if not isinstance(values, Mapping):
         return values
     found = {}
     for key, value in values.items():
-        below = f"{path}.{key}" if path else str(key)
-        below = f"{path}.*" if path == "robots" else "gate" if below == "mask" else below
-        name = EARLIER_KEYS.get(below, str(key))
-        if name in values:  # both are given: the earlier one is an unknown key
-            name = str(key)
+        below = f"{path}.*" if path == "robots" else f"{path}.{key}" if path else key
+        name = names.get(below, key)
+        if name != key and name in values:  # both are given: the earlier one stays, an unknown key
+            name = key
         elif name != key:
             renamed[below] = name
-        found[name] = rename_earlier_keys(value, renamed, below)
+        found[name] = _rename(value, names, renamed, below)
     return found
 
 
@@ -120,13 +129,18 @@ def _make_recipe_key(of: _Itself) -> str:
 
 def _hash_values(values: Mapping[str, Json]) -> str:
     names = [section.name for section in fields(IngestSections)]
-    return digest({name: values.get(name) for name in names if values.get(name) or name not in _OWN_TABLES})
+    return _digest({name: values.get(name) for name in names if values.get(name) or name not in _OWN_TABLES})
+
+
+def _digest(values: Any) -> str:
+    """Return the hash of recipe values by their earliest names: a recipe keeps its id when a key gets another name."""
+    return digest(_rename(to_plain(values), _EARLIEST_NAMES, {}))
 
 
 def read_key(recipe: Recipe | IngestSections, robot: str | None, *, definitions: str) -> str:
     """Return the hash (hex) of what rules the streams beside the log: the read section, the robot asked for, the definitions given."""
     own = {name: values for name in _OWN_TABLES if (values := getattr(recipe, name))}
-    return digest({"read": recipe.read, "robot": robot, "definitions": definitions, **own})
+    return _digest({"read": recipe.read, "robot": robot, "definitions": definitions, **own})
 
 
 def make_recipe_id(recipe: Recipe | Mapping[str, Json], robot: str) -> str:

@@ -148,7 +148,8 @@ def _refuse_huge(height: Georeference, sides_m: tuple[float, float], pixel_size_
     if not (max(cols, rows) <= MAX_SIDE_PX and cols * rows <= MAX_PIXELS):
         raise MapError(
             f"{height.name}: the map would have {cols:.3g} x {rows:.3g} pixels of {pixel_size_m:.3g} m, at most "
-            f"{MAX_PIXELS:.2g} in all and {MAX_SIDE_PX} a side; cut out the site (gdal_translate -projwin ulx uly lrx lry in.tif out.tif) or give coarser rasters"
+            f"{MAX_PIXELS:.2g} in all and {MAX_SIDE_PX} a side; cut out the site "
+            "(gdal_translate -projwin ulx uly lrx lry in.tif out.tif) or give coarser rasters"
         )
 
 

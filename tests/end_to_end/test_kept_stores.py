@@ -30,6 +30,7 @@ from tcpipe.pipeline.report import report
 from tcpipe.pipeline.verify import verify
 from tcpipe.recipe import Recipe
 from tcpipe.store import Store, open_store
+from tcpipe.tables.earlier_names import EARLIER_DOCUMENT_KEYS
 from tcpipe.tables.levels import DATA_MODEL_VERSION, SAMPLES
 
 DATA = Path(__file__).parents[1] / "data"
@@ -110,8 +111,13 @@ def test_a_card_is_migrated_once_and_nothing_else_changes(untouched, name):
     old, new = (json.loads(files[untouched / name / "dataset.json"]) for files in (before, after))
     changed = {key for key in {*old, *new} if new.get(key) != old.get(key)}
     assert changed <= {
-        "data_model_version", "document_sha256", "warnings", "problems", "findings", "runs", "split", "maps", "verdict"
+        "data_model_version", "document_sha256", "warnings", "problems", "findings", "runs", "split", "maps", "verdict",
+        "recipe", "removal", "ledger_m", "distance_by_reason_m", "doubtful", "flagged_samples",
     }  # fmt: skip
+    assert new["distance_by_reason_m"] == {
+        EARLIER_DOCUMENT_KEYS.get(key, key): of for key, of in old["ledger_m"].items()
+    }
+    assert new["recipe"]["mask"]["stationary_velocity_mps"] == old["recipe"]["gate"]["standing_velocity_mps"]
     assert old["split"].items() <= {**new["recipe"]["split"], **new["split"]}.items(), "nothing is lost with it"
     assert verify(untouched / name).problems == ()
     again = migrate(untouched / name)
@@ -185,7 +191,7 @@ WARNED = ("imu: 0.1 s late", "gnss: no placement")
 def test_sentences_of_manifests_and_cards_become_findings():
     manifest = {
         "data_model_version": "2.1", "run_id": "a", "warnings": list(WARNED),
-        "info": {"findings": {"warnings": [], "facts": {"n": 1}}, "datum": None}, "counts": {"segments": 3, "gnss_messages": 9},
+        "info": {"findings": {"warnings": [], "facts": {"n": 1}}, "datum": None}, "counts": {"segments": 3, "gnss_messages": 9}, "recipe": {},
     }  # fmt: skip
     brought = migrating._bring_document(manifest, "manifest-1.json")
     assert (brought["data_model_version"], brought["info"]["report"]["facts"]) == (DATA_MODEL_VERSION, {"n": 1})
@@ -197,7 +203,7 @@ def test_sentences_of_manifests_and_cards_become_findings():
     assert migrating._bring_document(brought, "manifest-1.json") is brought
     card = {
         "data_model_version": "2.1", "name": "d", "problems": [WARNED[0]], "warnings": [WARNED[1]], "findings": [{"example": "x"}],
-        "runs": [{"run_id": "a", "warnings": list(WARNED)}], "maps": [{"name": "m", "warnings": []}],
+        "runs": [{"run_id": "a", "warnings": list(WARNED)}], "maps": [{"name": "m", "warnings": []}], "recipe": {},
         "split": {"holdout": "block", "buffer_m": 1.4, "audit": []},
     }  # fmt: skip
     brought = migrating._bring_document(card, "dataset.json")

@@ -371,7 +371,7 @@ def test_visual_odometry_without_twist_keeps_its_pose() -> None:
 def test_settings_of_the_recipe_reach_their_role() -> None:
     found = read(
         husky(),
-        time={"imu": "log"},
+        time_source={"imu": "log"},
         time_offset_s={"gnss": 0.25},
         odometry_scale={"wheel_odometry": 0.5},
         current_sign="drawn_negative",
