@@ -31,7 +31,7 @@ def reproduce(
     paper is the pattern, not the figures. Writes reproduction.html, reproduction.json and everything behind them to DIR.
     """
     from tcpipe.cli.output import say_result, show_progress
-    from tcpipe.learning.reproduction import reproduce as run
+    from tcpipe.experiment.reproduction import reproduce as run
 
     with show_progress("reproduce", quiet=quiet):
         result = run(directory, quick=quick, seeds=seeds, jobs=jobs, hidden=hidden, baselines=baselines)

@@ -3,7 +3,7 @@
 import pytest
 from made_models import CARD
 
-from tcpipe.learning.claims import CLAIMS, check_claims
+from tcpipe.experiment.claims import CLAIMS, check_claims
 from tcpipe.learning.evaluation_facts import (
     BaselineResult,
     EvaluateConfig,

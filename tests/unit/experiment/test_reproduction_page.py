@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from tcpipe.learning.reproduction_page import DIFFERENCES
+from tcpipe.experiment.reproduction_page import DIFFERENCES
 
 PAGE = (Path(__file__).parents[3] / "docs" / "explanation" / "reproduction.md").read_text(encoding="utf-8")
 
