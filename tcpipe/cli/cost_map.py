@@ -49,7 +49,7 @@ def cost_map(options: CostMapOptions, *, as_json: bool, quiet: bool) -> None:
 def _load_inputs(options: CostMapOptions) -> tuple[CostModel, MapFile]:
     """Return the model and the map, wherever this is called."""
     from tcpipe.learning.models import choose_model
-    from tcpipe.planning.inputs import choose_map
+    from tcpipe.planning.path_files import choose_map
 
     source = choose_map(options.store, options.map_name)
     return choose_model(options.model, speed_mps=options.speed_mps), source

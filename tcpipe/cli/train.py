@@ -5,7 +5,7 @@ from __future__ import annotations
 import click
 
 from tcpipe.cli.options import add_options, json_option, quiet_option
-from tcpipe.learning.train_options import TrainOptions
+from tcpipe.learning.model_options import TrainOptions
 
 
 @click.command()

@@ -1,1 +1,1 @@
-"""The paper's experiment on a simulated site: `reproduction.reproduce` simulates, builds, trains, evaluates and checks the paper's claims."""
+"""The paper's experiment on a simulated site: simulate, build, train, evaluate, and check the paper's claims."""

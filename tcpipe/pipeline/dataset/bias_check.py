@@ -18,8 +18,8 @@ from tcpipe.recipe import Recipe
 from tcpipe.tables.bits import DropReason, flag_name
 from tcpipe.tables.columns import to_floats, to_integers
 from tcpipe.tables.findings import Finding, Subject, SubjectKind, make_finding
-from tcpipe.terrain.point_classes import OFF_THE_MAP, find_classes_at
 from tcpipe.terrain.projection import Projection
+from tcpipe.terrain.sampling import OFF_THE_MAP, find_classes_at
 from tcpipe.terrain.tiles import find_map_projection
 
 _COLUMNS = (

@@ -4,6 +4,7 @@ import pytest
 from made_models import CARD
 
 from tcpipe.experiment.claims import CLAIMS, check_claims
+from tcpipe.learning.baselines import PER_CLASS
 from tcpipe.learning.evaluation_facts import (
     BaselineResult,
     EvaluateConfig,
@@ -13,7 +14,6 @@ from tcpipe.learning.evaluation_facts import (
     SplitErrors,
 )
 from tcpipe.learning.metrics import Errors, Ratio
-from tcpipe.learning.wei_isler import PER_CLASS
 
 SURE = Ratio(0.8, 0.7, 0.9)
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from tcpipe.errors import ModelError
 from tcpipe.formats.weights import write_arrays
-from tcpipe.learning.checkpoint import TrainingProgress, read_checkpoint, write_checkpoint
+from tcpipe.learning.fitting import TrainingProgress, read_checkpoint, write_checkpoint
 
 PARTS = {part: {"a": np.arange(6.0), "b/c": np.ones((2, 3), np.float32)} for part in ("now", "best", "optimizer")}
 LOSSES = st.floats()  # infinite and not a number, too

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tcpipe.learning.losses import compute_loss_factors, mean_loss
+from tcpipe.learning.architecture import compute_loss_factors, mean_loss
 
 SCALE = (400.0, 1.0)
 LABELS = np.array([[150.0, 0.8], [200.0, 0.9]]) / SCALE

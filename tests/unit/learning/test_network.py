@@ -16,7 +16,7 @@ STEPS = """
 import numpy as np
 from tcpipe.learning.architecture import Architecture
 from tcpipe.learning.network import make_resnet18
-from tcpipe.learning.trainer import Trainer
+from tcpipe.learning.network import Trainer
 trainer = Trainer(make_resnet18(Architecture(40, 1, 1, 16), seed=0, start=[0.5]), np.ones(1, np.float32))
 rng = np.random.default_rng(0)
 for count in (11, 11, 35, 3) * 2:
@@ -52,8 +52,7 @@ def test_first_weights_are_he_s_of_the_seed():
 
 def test_a_batch_of_one_sample_of_one_pixel_is_trained_on():
     """The last stage sees a patch of 16 pixels as one, of which a batch normalisation has no deviation."""
-    from tcpipe.learning.network import make_resnet18
-    from tcpipe.learning.trainer import Trainer
+    from tcpipe.learning.network import Trainer, make_resnet18
 
     trainer = Trainer(make_resnet18(Architecture(16, 1, 1, 16), seed=0, start=[0.5]), np.ones(1, np.float32))
     patch, label = np.full((1, 16, 16, 1), 0.5, np.float32), np.array([[0.7]], np.float32)

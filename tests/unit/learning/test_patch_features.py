@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tcpipe.learning.patch_features import patch_features
+from tcpipe.learning.table_model import patch_features
 
 PX, PATCH_M = 40, 1.0
 ALONG, ACROSS = np.meshgrid(*[(np.arange(PX) + 0.5) / PX - 0.5] * 2)

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from tcpipe.errors import ModelError
-from tcpipe.learning.patch_features import find_slope_and_class
-from tcpipe.learning.table_model import fit_table, read_table_model
+from tcpipe.learning.table_model import find_slope_and_class, fit_table, read_table_model
 
 pytest.importorskip("lightgbm")
 

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from tcpipe.planning.courses import ANGLES_DEG, COURSES, DIRECTIONS, MAX_DETOUR, MOVES, find_crossed_cells
+from tcpipe.planning.cost_grid import ANGLES_DEG, COURSES, DIRECTIONS, MAX_DETOUR, MOVES, find_crossed_cells
 
 
 def test_courses_rise_from_east_counter_clockwise_and_lead_to_16_cells():

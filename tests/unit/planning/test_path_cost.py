@@ -8,8 +8,8 @@ from physics_model import PhysicsModel, energy_joule, made_residuals, velocity_m
 from planning_worlds import lonlat, plane
 
 from tcpipe.errors import ModelError, PathError
-from tcpipe.planning.no_cost_reasons import Reason
 from tcpipe.planning.path_cost import compute_path_cost
+from tcpipe.planning.segment_predictions import Reason
 from tcpipe.tables.facts import PhysicsFit, PhysicsTerm
 from tcpipe.terrain.classes import PAPER_CLASSES, ClassTable
 

@@ -6,8 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
-from tcpipe.planning.cost_grid import CostGrid
-from tcpipe.planning.courses import COURSES, MOVES, find_crossed_cells
+from tcpipe.planning.cost_grid import COURSES, MOVES, CostGrid, find_crossed_cells
 from tcpipe.planning.plan import find_possible_gain, probe_cells
 from tcpipe.planning.search import compute_least_costs, find_best_potential, find_least_cost_path, make_steps
 from tcpipe.terrain.grid import MapGrid

@@ -10,8 +10,7 @@ from planning_worlds import lonlat, plane
 from tcpipe.planning.cost_grid import make_survey
 from tcpipe.planning.path_cost import compute_path_cost
 from tcpipe.planning.plan import plan_path
-from tcpipe.planning.search import Steps, find_least_cost_path
-from tcpipe.planning.turning import compute_turns, find_least_turning_path, find_turning
+from tcpipe.planning.search import Steps, compute_turns, find_least_cost_path, find_least_turning_path, find_turning
 from tcpipe.tables.facts import PhysicsFit, PhysicsTerm
 from tcpipe.terrain.classes import PAPER_CLASSES
 
@@ -72,7 +71,7 @@ def test_a_circle_turns_once_round_however_fine_it_is_cut():
 
 def steps_on_open_ground(size, cost_per_cell=1.0):
     """Every step of 16 courses on a square grid without slopes."""
-    from tcpipe.planning.courses import MOVES
+    from tcpipe.planning.cost_grid import MOVES
 
     rows, cols = np.mgrid[:size, :size]
     parts = []

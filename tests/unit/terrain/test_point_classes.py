@@ -6,7 +6,7 @@ from map_worlds import World
 
 from tcpipe.formats.maps.building import build_map
 from tcpipe.formats.maps.map_files import open_map
-from tcpipe.terrain.point_classes import OFF_THE_MAP, find_classes_at
+from tcpipe.terrain.sampling import OFF_THE_MAP, find_classes_at
 
 WORLD = World("EPSG:32633", 533_000.0, 5_213_000.0, side_m=60.0)
 
