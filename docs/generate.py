@@ -102,11 +102,11 @@ def _describe_command(context: click.Context, shared: Mapping[str, str]) -> str:
 
 
 def _documents() -> str:
-    known = {**DOCUMENTS, **json_output_types()}
-    files = {name: cls for name, cls in known.items() if not name.endswith(".answer")}
-    told = {name: cls for name, cls in known.items() if name not in files}
-    head = "| schema | dataclass | holds |\n|---|---|---|\n"
-    parts = [_NOTE, _FILES, head + _rows(files), _ANSWERS, head + _rows(told)]
+    documents = {**DOCUMENTS, **json_output_types()}
+    files = {name: cls for name, cls in documents.items() if not name.endswith(".answer")}
+    answers = {name: cls for name, cls in documents.items() if name not in files}
+    head = "| schema | content |\n|---|---|\n"
+    parts = [_NOTE, _FILES, head + _rows(files), _ANSWERS, head + _rows(answers)]
     return "\n".join(parts)
 
 
@@ -128,14 +128,12 @@ A command that fails prints `exit_code` and `problems`.
 _PRINTED = "; ``str`` of it is what the command prints."
 
 
-def _rows(of: Mapping[str, type]) -> str:
+def _rows(documents: Mapping[str, type]) -> str:
     texts = {
-        name: str(inspect.getdoc(cls)).split("\n", 1)[0].removesuffix(_PRINTED) for name, cls in sorted(of.items())
+        name: str(inspect.getdoc(cls)).split("\n", 1)[0].removesuffix(_PRINTED)
+        for name, cls in sorted(documents.items())
     }
-    return "".join(
-        f"| [`{name}`](../../schemas/{name}.schema.json) | `{of[name].__module__}.{of[name].__qualname__}` | {text} |\n"
-        for name, text in texts.items()
-    )
+    return "".join(f"| [`{name}`](../../schemas/{name}.schema.json) | {text} |\n" for name, text in texts.items())
 
 
 _COLUMNS = f"""# Columns
@@ -211,7 +209,7 @@ page for the code, or for words such as dropout, lever arm, time offset, drift, 
 
 An **error** makes the labels that it affects not usable, a **warning** usable with care; a **note** changes no verdict. `tcpipe ingest`
 ends with exit code 3 for a **problem** until you acknowledge it (`tcpipe acknowledge`). `tcpipe inspect RUN` lists all findings of a run
-with their remedies and recipe keys; `--json` gives them as data.
+with their remedies, `--json` as data. Here … stands for the recipe line or command that the finding prints.
 """
 
 
@@ -231,11 +229,16 @@ def _finding(code: str, entry: Entry) -> str:
     more += ["problem"] if entry.is_problem else []
     lines = [f"### {entry.title} `[{code}]`\n"]
     lines += [f"*{', '.join(more)}.* {_sentence(entry.cause)}\n"]
-    remedies = [_sentence(text) for text in (entry.advice, *entry.remedies.values()) if text]
+    remedies = [
+        *([_sentence(entry.advice)] if entry.advice else []),
+        *(f"{text}: …" for text in entry.remedies.values()),
+    ]
     lines += [f"**Remedy:** {' '.join(remedies)}\n"] if remedies else []
     limits = ", ".join(f"`{name}` {format_number(name, value)}" for name, value in entry.thresholds.items())
     lines += [f"Thresholds: {limits}.\n"] if limits else []
-    lines += [f"*Search:* {', '.join(entry.words)}.\n"] if entry.words else []
+    above = "\n".join(lines).lower()
+    words = [word for word in entry.words if word.lower() not in above]
+    lines += [f"*Search:* {', '.join(words)}.\n"] if words else []
     return "\n".join(lines)
 
 
