@@ -139,7 +139,7 @@ def _rows(documents: Mapping[str, type]) -> str:
 _COLUMNS = f"""# Columns
 
 Data model {DATA_MODEL_VERSION}. Every file has the same unit, frame and meaning in its Arrow field metadata. A type with `?` allows null.
-A column marked *since 1.3* is null in files of earlier data models.
+A column marked *since 2.1* is null in files of 2.0.
 """
 
 
@@ -174,17 +174,53 @@ def _column_rows(columns: Sequence[Column]) -> str:
     """Return a table of columns; nothing of none."""
     head = "\n| column | type | unit, frame | meaning |\n|---|---|---|---|\n"
     rows = [
-        f"| `{c.name}` | {c.dtype}{'?' if c.nullable else ''} | {', '.join(filter(None, (c.unit, c.frame)))} | {c.doc}{_since(c)} |\n"
-        for c in columns
+        f"| {', '.join(f'`{c.name}`' for c in group)} | {group[0].dtype}{'?' if group[0].nullable else ''} "
+        f"| {', '.join(filter(None, (group[0].unit, group[0].frame)))} | {_join_texts(group)}{_since(group[0])} |\n"
+        for group in _group_columns(columns)
     ]
     return "".join((head, *rows)) if rows else ""
+
+
+def _group_columns(columns: Sequence[Column]) -> list[list[Column]]:
+    """Return runs of columns that differ only in their name and in one word of their meaning, such as the axis."""
+    groups: list[list[Column]] = []
+    for column in columns:
+        last = groups[-1] if groups else []
+        alike = last and replace(column, name="", doc="") == replace(last[0], name="", doc="")
+        if alike and len(_varying_words([*last, column])) == 1:
+            last.append(column)
+        else:
+            groups.append([column])
+    return groups
+
+
+def _varying_words(group: Sequence[Column]) -> list[int]:
+    """Return where the meanings of columns differ, by number of the word; all words where they are not alike."""
+    words = [column.doc.split() for column in group]
+    if len({len(each) for each in words}) > 1:
+        return list(range(max(map(len, words))))
+    return [number for number, each in enumerate(zip(*words, strict=True)) if len(set(each)) > 1]
+
+
+def _join_texts(group: Sequence[Column]) -> str:
+    """Return the meaning of a group; the word that varies has all its forms."""
+    words = [column.doc.split() for column in group]
+    return " ".join(
+        ", ".join(dict.fromkeys(form.rstrip(",;") for form in each)) + _end(each[0], each)
+        for each in zip(*words, strict=True)
+    )
+
+
+def _end(word: str, forms: Sequence[str]) -> str:
+    """Return the comma or semicolon after a word."""
+    return word[len(word.rstrip(",;")) :] if all(form[-1:] == word[-1:] for form in forms) else ""
 
 
 _SHARED_COLUMNS = 8
 
 
 def _since(column: Column) -> str:
-    return f"; *since {column.since}*" if column.since else ""
+    return f"; *since {column.since}*" if column.since and column.since >= "2.1" else ""
 
 
 def _bits(column: str, flags: type[IntFlag]) -> str:
