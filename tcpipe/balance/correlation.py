@@ -19,7 +19,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import nnls
+from scipy.spatial import cKDTree
 from scipy.spatial.distance import pdist
+from scipy.special import stdtrit
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -120,3 +122,105 @@ def compute_effective_size(xy_m: Floats, *found: Correlation) -> float:
     apart_m = pdist(xy_m[:_MOST_IN_CELL])
     alike = max(one.share * float(np.exp(apart_m / -one.length_m).mean()) for one in found)
     return count / (1.0 + (count - 1) * alike)
+
+
+NEAR = 0.25
+"""Footprints whose centres are at most so many chords apart are one place."""
+
+ALONG_RAD = np.radians(10.0)
+"""Courses that differ by at most so much are one direction [rad]; NEAR and this bound the two together, as an ellipsoid."""
+
+_BLOCK = 10.0
+"""Side of a jackknife block, in chords."""
+_FEWEST_BLOCKS = 5
+_CONFIDENCE = 0.95
+
+
+@dataclass(frozen=True, slots=True)
+class Floor:
+    """How well a label repeats itself, in the label's unit: the standard deviation of one pass, with its 95 % interval."""
+
+    pairs: int
+    places: int
+    """Blocks of ground that the pairs lie in."""
+    std: float
+    std_low: float | None
+    """None where there are too few places for an interval."""
+    std_high: float | None
+    share_of_variance: float
+    """Of the label's own variance; no model explains more than the rest."""
+
+
+def find_repeated_pairs(xy_m: Floats, course_rad: Floats, terrain_class: Ints, *, chord_m: float) -> Ints:
+    """Return pairs of samples that cover one place of one class in one direction, shape (P, 2); no sample is in two pairs.
+
+    Samples of one pass never qualify: they begin a chord apart. Of several passes the two nearest make the pair.
+
+    Parameters
+    ----------
+    xy_m : centres of the footprints [m], shape (N, 2).
+    course_rad : directions of travel [rad], shape (N,).
+    terrain_class : class ids, shape (N,); across a border between classes two footprints are not the same ground.
+    chord_m : segment length [m].
+    """
+    if len(xy_m) < 2:
+        return np.empty((0, 2), np.int64)
+    reach_m = NEAR * chord_m
+    turned_m = reach_m / (2.0 * np.sin(ALONG_RAD / 2.0))  # a circle on which ALONG_RAD apart is reach_m apart
+    points = np.column_stack([xy_m, turned_m * np.cos(course_rad), turned_m * np.sin(course_rad)])
+    rows = np.arange(len(points))
+    apart_m, near = cKDTree(points).query(points, k=2, distance_upper_bound=reach_m * (1.0 + 1e-9))
+    itself = near[:, 0] == rows
+    other, apart_m = np.where(itself, near[:, 1], near[:, 0]), np.where(itself, apart_m[:, 1], apart_m[:, 0])
+    found = np.isfinite(apart_m)
+    back = np.full(len(points) + 1, -1)
+    back[:-1][found] = other[found]
+    mutual = found & (back[other] == rows) & (rows < other)
+    pairs = np.column_stack([rows[mutual], other[mutual]]).astype(np.int64)
+    return np.asarray(pairs[terrain_class[pairs[:, 0]] == terrain_class[pairs[:, 1]]])
+
+
+def estimate_repeatability(
+    values: Floats, residual: Floats, pairs: Ints, xy_m: Floats, *, chord_m: float
+) -> Floor | None:
+    """Return how well a label repeats itself; None without pairs.
+
+    Parameters
+    ----------
+    values, residual : the label and its `correlation.residuals`, shape (N,).
+    pairs : of `find_repeated_pairs`, shape (P, 2).
+    xy_m : centres of the footprints [m], shape (N, 2).
+    chord_m : segment length [m].
+    """
+    if not len(pairs):
+        return None
+    half_squares = (residual[pairs[:, 0]] - residual[pairs[:, 1]]) ** 2 / 2.0
+    cells = np.floor(xy_m[pairs[:, 0]] / (_BLOCK * chord_m)).astype(np.int64)
+    block = np.unique(cells, axis=0, return_inverse=True)[1].reshape(-1)
+    variance = float(half_squares.mean())
+    low, high = _bootstrap_interval(half_squares, block)
+    own = float(values.var())
+    return Floor(
+        pairs=len(pairs),
+        places=int(block.max()) + 1,
+        std=float(np.sqrt(variance)),
+        std_low=low,
+        std_high=high,
+        share_of_variance=variance / own if own > 0 else 1.0,
+    )
+
+
+def _bootstrap_interval(half_squares: Floats, block: Ints) -> tuple[float | None, float | None]:
+    """Return both ends of the 95 % interval of the root of the mean: delete-one-block jackknife of its logarithm."""
+    sums, counts = np.bincount(block, half_squares), np.bincount(block)
+    blocks = len(sums)
+    if blocks < _FEWEST_BLOCKS or not half_squares.any():
+        return None, None
+    without = (sums.sum() - sums) / (counts.sum() - counts)
+    if not (without > 0.0).all():
+        return None, None
+    logs = np.log(without) / 2.0
+    error = np.sqrt((blocks - 1) / blocks * ((logs - logs.mean()) ** 2).sum())
+    reach = float(stdtrit(blocks - 1, 0.5 + _CONFIDENCE / 2.0)) * error
+    std = np.sqrt(half_squares.mean())
+    return float(std * np.exp(-reach)), float(std * np.exp(reach))

@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from tcpipe.formats.json_files import to_json_line
 from tcpipe.tables.columns import read_lonlat_deg
-from tcpipe.tables.levels import Datum
-from tcpipe.tables.segment_columns import GEOMETRY
+from tcpipe.tables.levels import GEOMETRY, Datum
 
 _WGS84 = "EPSG:4326"
 

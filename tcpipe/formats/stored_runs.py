@@ -21,8 +21,8 @@ from tcpipe.formats.parquet import read_highest, read_lowest, read_table, write_
 from tcpipe.formats.place import DirectoryPlace, Place
 from tcpipe.formats.recipe_toml import read_key
 from tcpipe.formats.run_documents import Manifest
+from tcpipe.tables.findings import judge_again
 from tcpipe.tables.levels import LABELLED_SEGMENTS, GatedTrack
-from tcpipe.tables.verdicts import judge_again
 
 FilesState: TypeAlias = tuple[tuple[int, int], ...]
 """Size [byte] and modification time [ns] of each file of an ingestion."""

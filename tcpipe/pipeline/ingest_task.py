@@ -20,8 +20,7 @@ from tcpipe.pipeline.log_findings import find_failure
 from tcpipe.pipeline.log_sources import LogSource
 from tcpipe.pipeline.transient_errors import is_transient
 from tcpipe.recipe import Recipe
-from tcpipe.tables.findings import Finding, select_problems
-from tcpipe.tables.verdicts import Verdict
+from tcpipe.tables.findings import Finding, Verdict, select_problems
 
 R = TypeVar("R")
 

@@ -31,9 +31,8 @@ from tcpipe.formats.store_document import MARK, is_outdated, read_layout
 from tcpipe.pipeline.log_writer import is_committed, open_log
 from tcpipe.recipe import SplitConfig
 from tcpipe.store import Store
-from tcpipe.tables.findings import Finding, Subject, SubjectKind, make_finding
+from tcpipe.tables.findings import Finding, Subject, SubjectKind, judge, make_finding
 from tcpipe.tables.levels import DATA_MODEL_VERSION, EARLIER_VERSIONS
-from tcpipe.tables.verdicts import judge
 
 T = TypeVar("T")
 

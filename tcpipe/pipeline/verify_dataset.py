@@ -11,7 +11,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
-from tcpipe.cost.budget import pool_budgets
+from tcpipe.cost.labels import pool_budgets
 from tcpipe.errors import DatasetError, TcpipeError
 from tcpipe.formats.bucket_directories import REPORT_PATCHES
 from tcpipe.formats.dataset_card import DatasetCard

@@ -13,18 +13,28 @@ from pyproj import CRS
 from shapely.geometry.base import BaseGeometry
 from shapely.geometry.polygon import orient
 
-from tcpipe.balance.cells import SLOPE_EDGES_DEG, SLOPE_NAMES, Cell, choose_speed_edges, count_cells, find_slope_ranges
-from tcpipe.balance.correlation import compute_slope_residuals, estimate_correlations
-from tcpipe.balance.repeatability import Floor, estimate_repeatability, find_repeated_pairs
-from tcpipe.balance.undersampled_ground import (
+from tcpipe.balance.cells import (
     CELL_M,
     CLOSED,
+    SLOPE_EDGES_DEG,
+    SLOPE_NAMES,
+    Cell,
     MapGround,
     Patch,
     cells_available,
+    choose_speed_edges,
+    count_cells,
     find_cell_classes,
+    find_slope_ranges,
     find_undersampled_ground,
     fit_cell_gradients,
+)
+from tcpipe.balance.correlation import (
+    Floor,
+    compute_slope_residuals,
+    estimate_correlations,
+    estimate_repeatability,
+    find_repeated_pairs,
 )
 from tcpipe.formats.dataset_card import Balance, CellRow
 from tcpipe.formats.geojson import Feature, FeatureCollection, PolygonGeometry
