@@ -1,4 +1,4 @@
-"""Cells of class, slope and speed, and how much a dataset knows of each."""
+"""Cells of class, slope and speed, how much a dataset knows of each, and ground of rare cells to drive next (ADR-19)."""
 
 from __future__ import annotations
 
@@ -26,14 +26,28 @@ SLOPE_NAMES = (
 )
 
 _SPEEDS = 5
-"""Ranges of speed that hold all but the fastest hundredth."""
+"""Ranges of speed below the 99 % quantile."""
+
+CELL_M = 4.0
+"""Side of a cell of ground [m]: a robot that is steered by GNSS hits it, and four segments fit in."""
+
+LEVEL = 4
+"""Range of slope (`SLOPE_NAMES`) that is the same in every direction."""
+
+_PATCHES_EACH = 20
+"""Largest patches of ground for each class and slope."""
+
+CLOSED = -1
+"""Class of ground that is closed or unknown."""
+
+_WINDS = ("E", "NE", "N", "NW", "W", "SW", "S", "SE")
 
 
 @dataclass(frozen=True, slots=True)
 class Cell:
-    """Samples of one class and range of slope, and of speed where ``speed`` says which.
+    """Samples of one class and range of slope, and of one range of speed unless ``speed`` is None.
 
-    ``effective`` is to how many independent samples they are worth, None where that cannot be told.
+    ``effective`` is the number of independent samples that they are worth, None if unknown.
     """
 
     terrain_class: int
@@ -47,10 +61,10 @@ class Cell:
     effective_train: float | None
 
     @property
-    def rare(self) -> bool:
-        """Whether it is worth few independent samples: with 30, its mean is known to 1/√30, a fifth, of its standard deviation."""
-        known = self.effective if self.effective is not None else sum(self.samples.values())
-        return known < read_threshold("thin-ground", "enough_count")
+    def is_undersampled(self) -> bool:
+        """Whether it has few independent samples: with 30, its mean is known to 1/√30, a fifth, of its standard deviation."""
+        count = self.effective if self.effective is not None else sum(self.samples.values())
+        return count < read_threshold("thin-ground", "enough_count")
 
 
 def find_slope_ranges(slope_rad: Floats) -> Ints:
@@ -80,10 +94,9 @@ def count_cells(
 
     Parameters
     ----------
-    keys : class ids and ranges of slope, and of speed where cells are to be cut by it too, each of shape (N,).
-    split : split of every sample, shape (N,).
-    xy_m : centres of the footprints [m], shape (N, 2).
-    correlations : of the labels; the one that leaves least counts.
+    keys : class ids, ranges of slope and, if cells have one, of speed, each of shape (N,).
+    split, xy_m : split and centre of every footprint [m], shape (N,) and (N, 2).
+    correlations : of the labels; the one with the smallest effective size counts.
     splits : the splits that count, ``train`` among them.
     """
     counted = np.flatnonzero(np.isin(split, splits))
@@ -106,21 +119,6 @@ def count_cells(
             )
         )
     return cells
-
-
-CELL_M = 4.0
-"""Side of a cell of ground [m]: a robot that is steered by GNSS hits it, and four segments fit in."""
-
-LEVEL = 4
-"""Range of slope (`cells.SLOPE_NAMES`) that is the same in every direction."""
-
-_PATCHES_EACH = 20
-"""Patches of ground that are told for each class and slope: the largest."""
-
-CLOSED = -1
-"""Class of ground that is not to be driven, or of which nothing is known."""
-
-_WINDS = ("E", "NE", "N", "NW", "W", "SW", "S", "SE")
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,8 +155,6 @@ class MapGround:
 class Patch:
     """Connected ground that offers one class and slope: its polygon in the map's plane, and the mean direction of travel there."""
 
-    terrain_class: int
-    slope: int
     area_m2: float
     towards: str | None
     """One of eight winds; None on level ground, where every direction will do."""
@@ -174,19 +170,15 @@ def cells_available(ground: MapGround, terrain_class: int, slope: int) -> NDArra
 
 
 def find_undersampled_ground(ground: MapGround, terrain_class: int, slope: int, driven_xy_m: Floats) -> Iterator[Patch]:
-    """Yield the patches of connected ground that offers a class and a range of slope and was not driven so, the largest first.
+    """Yield the patches of connected ground of a class and a range of slope without samples there, the largest first.
 
-    Parameters
-    ----------
-    ground : the map's cells.
-    terrain_class, slope : class id, and number of the range of slope.
-    driven_xy_m : centres of the samples of that class and slope, shape (N, 2) [m].
+    ``driven_xy_m`` are the centres of the samples of that class and slope [m], shape (N, 2).
     """
     free = cells_available(ground, terrain_class, slope)
     row, col, on = ground.find_cells(driven_xy_m)
     free[row[on], col[on]] = False
     for row, col in _find_largest_patches(free):
-        yield _patch(ground, row, col, terrain_class, slope)
+        yield _make_patch(ground, row, col, slope)
 
 
 def _sign(slope: int) -> int:
@@ -206,13 +198,13 @@ def _find_largest_patches(free: NDArray[np.bool_]) -> list[tuple[Ints, Ints]]:
     return [(part // free.shape[1], part % free.shape[1]) for part in parts]
 
 
-def _patch(ground: MapGround, row: Ints, col: Ints, terrain_class: int, slope: int) -> Patch:
+def _make_patch(ground: MapGround, row: Ints, col: Ints, slope: int) -> Patch:
     boxes = shapely.box(col, -row - 1, col + 1, -row)  # in whole cells: edges that meet are equal
     corner_m = np.array([ground.x_min_m, ground.y_max_m])
     polygon = shapely.transform(shapely.union_all(boxes), lambda cells: corner_m + cells * ground.cell_m)
     east_up, north_up = _sign(slope) * ground.gradient[row, col].sum(axis=0)
     wind = int(np.round(np.degrees(np.arctan2(north_up, east_up)) / 45.0)) % 8
-    return Patch(terrain_class, slope, len(row) * ground.cell_m**2, None if slope == LEVEL else _WINDS[wind], polygon)
+    return Patch(len(row) * ground.cell_m**2, None if slope == LEVEL else _WINDS[wind], polygon)
 
 
 def fit_cell_gradients(height_m: Floats, pixels: int, pitch_m: float) -> Floats:

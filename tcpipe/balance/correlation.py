@@ -1,14 +1,18 @@
-"""How alike the labels of near samples are, and to how many independent ones a set of samples is worth (ADR-19).
+"""What class and slope leave of a label: its correlation over distance, effective sample sizes, and how well it repeats (ADR-19).
 
-What is alike is not the label but its residual: what is left of it when class and slope have explained what they can. Its
-semivariogram γ(h), half the mean squared difference of residuals h apart, is fitted by c0 + c1 (1 - exp(-h / L)) (Cressie, *Statistics for
-Spatial Data*, 1993, sections 2.4 and 2.6): L is the correlation length, c1 / (c0 + c1) the share of variance that neighbours have in
-common. The mean of n samples then has the variance of the mean of
+**Correlation.** The semivariogram γ(h) of the residuals, half the mean squared difference of residuals h apart, is fitted by
+c0 + c1 (1 - exp(-h / L)) (Cressie, *Statistics for Spatial Data*, 1993, sections 2.4 and 2.6): L is the correlation length,
+c1 / (c0 + c1) the share of variance that neighbours have in common. The mean of n samples then has the variance of the mean of
 
     n_eff = n² / Σij ρ(hij) = n / (1 + (n - 1) m),   ρ(h) = c1 / (c0 + c1) exp(-h / L) for i ≠ j, ρ = 1 for i = j,
 
 independent ones, m being the mean of ρ over all pairs of two (Bayley and Hammersley, "The effective number of independent
 observations in an autocorrelated time series", 1946; Cressie 1993, section 1.3).
+
+**Repeatability.** A model that knows the ground alone cannot distinguish two passes. Two passes of one place and direction give
+s² = (r1 - r2)² / 2 of their residuals r; the mean over P pairs that share no sample is the variance of one pass. Its interval is a
+jackknife over blocks of ground, since the pairs of one block are not independent (Efron and Tibshirani, *An Introduction to the
+Bootstrap*, 1993, chapter 11). The offset between two footprints makes the figure rather too large than too small.
 """
 
 from __future__ import annotations
@@ -64,14 +68,9 @@ def compute_slope_residuals(values: Floats, terrain_class: Ints, slope_rad: Floa
 def estimate_correlations(
     residual_by_label: Mapping[str, Floats], xy_m: Floats, run: Ints, start_ns: Ints, *, chord_m: float
 ) -> dict[str, Correlation | None]:
-    """Return how the residuals of each label are correlated over distance; None where too few samples are near each other to say.
+    """Return the correlation of each label's residuals, shape (N,), over distance; None where too few samples are near each other.
 
-    Parameters
-    ----------
-    residual_by_label : of `compute_slope_residuals`, shape (N,) each.
-    xy_m : centres of the footprints [m], shape (N, 2).
-    run, start_ns : number of each sample's run, and its start [ns], shape (N,).
-    chord_m : segment length [m].
+    ``xy_m`` are centres of the footprints [m], shape (N, 2); ``run`` and ``start_ns`` [ns] order the samples, shape (N,).
     """
     rows = _draw_sections(run, start_ns)
     apart = pdist(xy_m[rows]) / chord_m
@@ -154,14 +153,8 @@ class Floor:
 def find_repeated_pairs(xy_m: Floats, course_rad: Floats, terrain_class: Ints, *, chord_m: float) -> Ints:
     """Return pairs of samples that cover one place of one class in one direction, shape (P, 2); no sample is in two pairs.
 
-    Samples of one pass never qualify: they begin a chord apart. Of several passes the two nearest make the pair.
-
-    Parameters
-    ----------
-    xy_m : centres of the footprints [m], shape (N, 2).
-    course_rad : directions of travel [rad], shape (N,).
-    terrain_class : class ids, shape (N,); across a border between classes two footprints are not the same ground.
-    chord_m : segment length [m].
+    Samples of one pass never qualify: they begin a chord apart. Of several passes the two nearest are the pair.
+    ``xy_m`` are centres of the footprints [m], shape (N, 2), ``course_rad`` their directions of travel [rad], shape (N,).
     """
     if len(xy_m) < 2:
         return np.empty((0, 2), np.int64)
@@ -183,14 +176,9 @@ def find_repeated_pairs(xy_m: Floats, course_rad: Floats, terrain_class: Ints, *
 def estimate_repeatability(
     values: Floats, residual: Floats, pairs: Ints, xy_m: Floats, *, chord_m: float
 ) -> Floor | None:
-    """Return how well a label repeats itself; None without pairs.
+    """Return how well a label repeats itself over ``pairs``, shape (P, 2); None without pairs.
 
-    Parameters
-    ----------
-    values, residual : the label and its `correlation.residuals`, shape (N,).
-    pairs : of `find_repeated_pairs`, shape (P, 2).
-    xy_m : centres of the footprints [m], shape (N, 2).
-    chord_m : segment length [m].
+    ``values`` and ``residual`` are the label and its `compute_slope_residuals`, shape (N,), ``xy_m`` centres of the footprints [m], (N, 2).
     """
     if not len(pairs):
         return None

@@ -1,4 +1,8 @@
-"""The split and the fold of every sample, from its footprint, its run and its id."""
+"""The split and the fold of every sample, from its footprint, its run and its id (docs/explanation/rulings.md, Split).
+
+A dataset grows, and a test sample must never become a training sample. So the draw of groups replays the arrival of the data: run by run,
+in the order of recording, groups may join test and none leaves it. Later runs cannot undo what earlier ones decided.
+"""
 
 from __future__ import annotations
 
@@ -14,11 +18,24 @@ from numpy.typing import NDArray
 
 from tcpipe.splits.regions import Regions, Side, classify_footprints
 
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Names = NDArray[np.str_]
 Mask = NDArray[np.bool_]
+Ranks = NDArray[np.uint64]
 Holdout = Literal["block", "sample", "run", "tag"]
 
+SPLITS = ("train", "test", "unseen", "buffer")
+"""Values of the column ``split``."""
+
+EXCLUDED = "excluded"
+"""Assigned to samples of an exclude region; they do not enter the dataset."""
+
 UNDECIDED = -1
-"""A group of which nothing is known yet."""
+"""A group or sample without a decision yet."""
+
+NO_FOLD = UNDECIDED
+"""Fold of a sample that is neither train nor test."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,12 +46,7 @@ class Groups:
     names: tuple[str, ...]
 
     def decided(self, values: Ints) -> Ints:
-        """Return for each group the value that most of its samples have, `UNDECIDED` where none has one, (G,).
-
-        Parameters
-        ----------
-        values : a small number for each sample, or `UNDECIDED`, shape (N,).
-        """
+        """Return for each group the value of most of its samples, shape (G,); ``values`` are small numbers or `UNDECIDED`, shape (N,)."""
         kinds = int(values.max(initial=UNDECIDED)) + 1
         if kinds == 0:
             return np.full(len(self.names), UNDECIDED)
@@ -53,20 +65,15 @@ def assign_blocks(centres_xy_m: Floats, *, block_m: float) -> Groups:
 
 
 def draw_samples(ranks: NDArray[np.uint64], arrival: Ints, *, test_fraction: float, kept: Ints | None = None) -> Mask:
-    """Mark ceil(test_fraction · n) samples as test: those of lowest rank of every arrival, as many as make up the share so far.
+    """Mark ceil(test_fraction · n) samples as test, shape (N,): of every arrival those of lowest rank, to make up the share so far.
 
-    What comes later moves none of those before, and where something comes in between, every later arrival changes by one sample at most.
+    A later arrival moves no earlier sample; one in between changes every later arrival by at most one sample.
 
     Parameters
     ----------
     ranks : rank of each sample, shape (N,).
-    arrival : when each came: the number of its run in the order of recording, shape (N,).
-    test_fraction : wanted share.
-    kept : 1 for samples that test whatever their rank, 0 for those that do not, `UNDECIDED` for the others, shape (N,).
-
-    Returns
-    -------
-    Whether each sample tests, shape (N,).
+    arrival : number of each sample's run in the order of recording, shape (N,).
+    kept : 1 for fixed test samples, 0 for fixed training samples, else `UNDECIDED`, shape (N,).
     """
     exact = Fraction(str(test_fraction))  # 0.2 * 35 is 7.000000000000001 in binary
     kept = np.full(len(ranks), UNDECIDED) if kept is None else kept
@@ -88,22 +95,15 @@ def draw_samples(ranks: NDArray[np.uint64], arrival: Ints, *, test_fraction: flo
 def draw_groups(
     groups: Groups, arrival: Ints, *, test_fraction: float, seed: int, kept: Ints | None = None
 ) -> NDArray[np.bool_]:
-    """Mark whole groups as test, nearest to a share of ``test_fraction``.
+    """Mark whole groups as test, shape (G,), nearest to a share ``test_fraction`` of the samples.
 
-    After each arrival the groups seen so far are gone through by rank; one that does not test yet joins if it brings the share nearer to
-    the wanted one. Two groups or more always leave something to test and something to train; a single group cannot be divided and trains.
+    After each arrival the groups so far are visited by rank; a training group joins test if that brings the share nearer to
+    ``test_fraction``. Two or more groups always leave something to test and to train; a single group trains.
 
     Parameters
     ----------
-    groups : the samples' groups.
-    arrival : when each sample came: the number of its run in the order of recording, shape (N,).
-    test_fraction : wanted share of the samples.
-    seed : the recipe's ``split.seed``.
-    kept : 1 for groups that test, 0 for those that train, `UNDECIDED` for the others, shape (G,).
-
-    Returns
-    -------
-    Whether each group tests, shape (G,).
+    arrival : number of each sample's run in the order of recording, shape (N,).
+    kept : 1 for fixed test groups, 0 for fixed training groups, else `UNDECIDED`, shape (G,).
     """
     count = len(groups.names)
     kept = np.full(count, UNDECIDED) if kept is None else kept
@@ -116,7 +116,7 @@ def draw_groups(
 
 
 def _take(tests: Mask, free: Ints, sizes: Ints, *, wanted: float) -> None:
-    """Let groups in ``free``, which are by rank, join ``tests`` while that brings their share nearer."""
+    """Let groups in ``free``, which are sorted by rank, join ``tests`` while that brings their share nearer to ``wanted``."""
     seen = sizes > 0
     taken, left = int(sizes[tests].sum()), int((seen & ~tests).sum())
     for group in free[~tests[free]].tolist():
@@ -128,17 +128,9 @@ def _take(tests: Mask, free: Ints, sizes: Ints, *, wanted: float) -> None:
 
 
 def draw_folds(groups: Groups, arrival: Ints, *, folds: int, seed: int, kept: Ints | None = None) -> Ints:
-    """Deal groups to folds of cross-validation, each to the smallest fold when it first appears; a fold once given stays.
+    """Deal groups to folds of cross-validation, shape (G,), from 0 on: each to the smallest fold when it first appears.
 
-    Parameters
-    ----------
-    groups, arrival, seed : as `draw_groups`.
-    folds : how many.
-    kept : fold of groups that have one, `UNDECIDED` for the others, shape (G,).
-
-    Returns
-    -------
-    Fold of each group from 0 on, shape (G,).
+    ``arrival`` is as in `draw_groups`; ``kept`` has the fixed fold of a group or `UNDECIDED`, shape (G,).
     """
     fold = np.full(len(groups.names), UNDECIDED) if kept is None else kept.copy()
     order = sort_by_rank(groups.names, seed=seed, purpose="fold")
@@ -166,20 +158,6 @@ def group_by_run(run: Ints, names: Sequence[str]) -> Groups:
     """Return runs as groups: the number of each sample's run, shape (N,), and the runs' names by number."""
     used, member = np.unique(run, return_inverse=True)
     return Groups(member.astype(np.int64).reshape(len(run)), tuple(names[number] for number in used.tolist()))
-
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
-Names = NDArray[np.str_]
-
-SPLITS = ("train", "test", "unseen", "buffer")
-"""Values of the column ``split``."""
-
-EXCLUDED = "excluded"
-"""Assigned to samples of an exclude region; they do not enter the dataset."""
-
-NO_FOLD = UNDECIDED
-"""Fold of a sample that is neither train nor test."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -213,15 +191,13 @@ def assign_splits(
     ranks : rank of each sample's id for the draw of test, shape (N,).
     run, run_names : number of each sample's run in the order of recording, shape (N,), and the runs' ids by number.
     corners_xy_m : corners of the patch footprints in the map's metric plane [m], shape (N, 4, 2).
-    regions : in the same plane; without regions every sample is inside.
-    holdout : ``sample`` draws ceil(test_fraction · n) samples, of each run those of lowest rank; the others keep groups whole.
+    regions : in the same plane; None: every sample is inside.
+    holdout : ``sample`` draws single samples; the others keep groups whole.
     test_fraction : share of test among the inside samples, after every drop and buffer.
     block_m : side of a spatial block [m].
     buffer_m : a footprint nearer than this to a region's border is in no split [m].
-    folds : number of folds; blocks (runs, tags, with the holdout ``run``, ``tag``) stay whole in them.
-    seed : seed of the ranks.
-    kept : what an earlier dataset decided, "" and `NO_FOLD` where it knew nothing: none of its samples moves, but for those that a region
-        excludes now.
+    folds : number of folds; blocks (with the holdout ``run`` or ``tag`` runs or values) stay whole in them.
+    kept : assignment of an earlier dataset, "" and `NO_FOLD` for new samples: its samples move only where a region excludes them now.
     tagged : with the holdout ``tag``: number of each sample's value of the tag, shape (N,), and the values by number.
     """
     n = len(ranks)
@@ -250,21 +226,11 @@ def assign_splits(
     return Assignment(split, fold)
 
 
-Ranks = NDArray[np.uint64]
-
-
 def hash_ranks(names: Sequence[str], *, seed: int, purpose: str) -> Ranks:
-    """Return a number for each name, uniform over 64 bits.
+    """Return a rank for each name, uniform over 64 bits, shape (N,): the same on every machine, whatever other names there are.
 
-    Parameters
-    ----------
-    names : what is ranked: sample ids, run ids or block keys.
-    seed : the recipe's ``split.seed``.
-    purpose : salt: ranks for two purposes are independent, so that the row order says nothing of the holdout.
-
-    Returns
-    -------
-    Ranks, shape (N,): the first 8 bytes, big-endian, of blake2b over ``seed:name`` with ``purpose`` as person string.
+    It is the first 8 bytes, big-endian, of blake2b over ``seed:name`` with ``purpose`` as person string: ranks for two purposes are
+    independent, so that the row order does not depend on the holdout.
     """
     person = purpose.encode()[:16]
     digests = b"".join(blake2b(f"{seed}:{name}".encode(), digest_size=8, person=person).digest() for name in names)

@@ -1,4 +1,4 @@
-"""Pairs of footprints that are near each other, by their corners in one metric plane, in bounded memory."""
+"""Near pairs of square footprints, by their corners in one metric plane, in bounded memory; compiled for millions of pairs."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _CHUNK = 16_384
 """Footprints looked at together."""
 
 CLOSE = 1.05
-"""Chords between the middles of what is told to be met in training: consecutive samples are one apart."""
+"""Ground nearer than so many chords to a training sample counts as covered: consecutive samples are one chord apart."""
 
 PLACES = ("start_lon_deg", "start_lat_deg", "end_lon_deg", "end_lat_deg")
 """Columns of a chord's ends."""
@@ -68,9 +68,7 @@ def compute_shared_fraction(ours: Floats, theirs: Floats, i: Ints, j: Ints) -> F
 def compute_nearest_m(ours: Floats, theirs: Floats) -> Floats:
     """Return the distance from each of ``ours`` to the nearest of ``theirs`` [m], (N,); empty if either is.
 
-    Parameters
-    ----------
-    ours, theirs : corners of squares of one size, shape (N, 4, 2) and (M, 4, 2).
+    Both are corners of squares of one size, shape (N, 4, 2) and (M, 4, 2).
     """
     if len(ours) == 0 or len(theirs) == 0:
         return np.empty(0)

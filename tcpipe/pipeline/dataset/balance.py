@@ -160,7 +160,7 @@ def _make_row(cell: Cell, names: Mapping[int, str], edges: Sequence[float]) -> C
         "samples": cell.samples,
         "effective": cell.effective,
         "effective_train": cell.effective_train,
-        "rare": cell.rare,
+        "rare": cell.is_undersampled,
     }
     if cell.speed is not None:
         ends = ("0", *(f"{edge:g}" for edge in edges))
@@ -258,7 +258,7 @@ def _count_by_ground(
             if area_m2 == 0.0 and (kind, slope) not in driven:
                 continue
             rows.append({**_make_row(cell, names, ()), "offered_m2": area_m2})
-            if cell.rare and area_m2 > 0.0:
+            if cell.is_undersampled and area_m2 > 0.0:
                 here = samples.xy_m[(samples.terrain == kind) & (slopes == slope) & (samples.split != "buffer")]
                 thin += [(cell, patch, lonlat) for part in grounds for patch, lonlat in part.patches(kind, slope, here)]
     thin.sort(key=lambda found: (found[0].effective or 0.0, found[0].terrain_class, found[0].slope, -found[1].area_m2))
