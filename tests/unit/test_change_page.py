@@ -51,7 +51,7 @@ CHANGES = {
         APPEND,
         '\n[mine]\ntitle = "Mine"\ntemplate = "{subject}: mine"\nseverity = "note"\ncause = "A test."\n',
     ),
-    "command": ("_COMMANDS", REPLACE, '    "demo":', '    "mine": "My command",\n    "demo":'),
+    "command": ("_COMMANDS", REPLACE, '    "demo":', '    "mine": ("mine", "My command"),\n    "demo":'),
     "command option": (
         "IngestOptions",
         REPLACE,
