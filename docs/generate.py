@@ -19,8 +19,7 @@ from tcpipe.cli import cli
 from tcpipe.cli.json_output import json_output_types
 from tcpipe.formats.contracts import DOCUMENTS
 from tcpipe.formats.finding_lines import format_number
-from tcpipe.formats.recipe_toml import format_commented_toml
-from tcpipe.formats.robot_files import load_shipped_profiles
+from tcpipe.formats.recipe_toml import format_commented_toml, load_shipped_profiles
 from tcpipe.planning.path_cost import PIECES
 from tcpipe.tables.catalogue import Entry, read_catalogue, read_sections
 from tcpipe.tables.columns import Column, TableSchema

@@ -52,7 +52,7 @@ ROOMS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
             "tests/unit/stages/test_fuse_mounting.py",
         ),
     ),
-    "verify": (("tcpipe/pipeline/verify_dataset.py",), ("tests/unit/pipeline/test_trust.py",)),
+    "verify": (("tcpipe/pipeline/verify.py",), ("tests/unit/pipeline/test_trust.py",)),
 }
 """What is changed, and the tests that are to notice, the quick ones first."""
 THOROUGH = ("motion", "path", "splits")

@@ -18,7 +18,7 @@ from tcpipe.dataset import Dataset, Split, open_dataset
 from tcpipe.dataset.energies import ENERGIES, Energy
 from tcpipe.errors import DatasetError
 from tcpipe.formats.dataset_card import DatasetCard
-from tcpipe.formats.robot_files import load_shipped_profiles
+from tcpipe.formats.recipe_toml import load_shipped_profiles
 from tcpipe.learning.baselines import compare_baselines
 from tcpipe.learning.evaluation_facts import (
     SPLITS,

@@ -251,7 +251,7 @@ print(*sorted({name.split(".")[0] for name in sys.modules}))
     assert not set(done.stdout.split()) & HEAVY
 
 
-WRITES_RECIPES = {"recipe/suggestions.py", "formats/recipe_toml.py", "pipeline/table_proposal.py"}
+WRITES_RECIPES = {"recipe/suggestions.py", "formats/recipe_toml.py", "pipeline/inspect.py"}
 """Modules that write lines of recipes: what messages suggest, `tcpipe init`, and the tables of a folder."""
 RECIPE_CALLS = {"suggest", "recipe_key", "RecipeFragment"}
 

@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 
 from tcpipe.errors import DatasetError, TcpipeError
 from tcpipe.execution import run_all, unwrap_result
-from tcpipe.formats.arrow_file import map_table, read_table_bytes, write_pieces, write_table_bytes
 from tcpipe.formats.dataset_card import Covariate, MapRegistration, Removal, Shard, group_dataset_findings
 from tcpipe.formats.dataset_files import (
     Drawer,
@@ -29,10 +28,10 @@ from tcpipe.formats.dataset_files import (
     make_zarr_writers,
 )
 from tcpipe.formats.finding_lines import format_mixed_groups
-from tcpipe.formats.geoparquet import add_geo_metadata
 from tcpipe.formats.maps.map_files import MapFile, open_map
+from tcpipe.formats.parquet import add_geo_metadata, map_table, read_table_bytes, write_pieces, write_table_bytes
 from tcpipe.formats.place import DirectoryPlace, Place
-from tcpipe.formats.robot_files import load_profiles
+from tcpipe.formats.recipe_toml import load_profiles
 from tcpipe.formats.stored_runs import RunDirectory
 from tcpipe.formats.zarr_arrays import Compression
 from tcpipe.motion.remedies import KEPT
