@@ -39,8 +39,7 @@ from tcpipe.store import Store, open_store
 from tcpipe.tables.bits import flag_names
 from tcpipe.tables.catalogue import read_threshold
 from tcpipe.tables.columns import read_lonlat_deg, to_floats
-from tcpipe.tables.findings import Finding, Subject, make_finding
-from tcpipe.tables.verdicts import PREDICTED, Verdict, judge
+from tcpipe.tables.findings import PREDICTED, Finding, Subject, Verdict, judge, make_finding
 from tcpipe.terrain.patches import patch_frames
 from tcpipe.terrain.tiles import MapReader, find_map_projection
 

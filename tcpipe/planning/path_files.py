@@ -14,7 +14,7 @@ from tcpipe.cost.prediction_errors import COVERAGE
 from tcpipe.errors import MapError, ModelError, StoreError, UsageError, clean_lines
 from tcpipe.formats.atomic import clear_beside
 from tcpipe.formats.finding_lines import format_findings
-from tcpipe.formats.geojson_lines import LineFeature, check_lonlat, make_line_feature, read_line
+from tcpipe.formats.geojson import LineFeature, check_lonlat, make_line_feature, read_line
 from tcpipe.formats.integrity import compute_checksum, find_broken_seal, read_sealed_as, write_sealed
 from tcpipe.formats.json_files import convert_record, digest, read_as, write_json
 from tcpipe.formats.maps.map_files import MapFile, open_map

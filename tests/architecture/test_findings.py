@@ -27,7 +27,7 @@ PRINTERS = {
     "tcpipe/pipeline/plan.py",
     "tcpipe/pipeline/preflight.py",
     "tcpipe/pipeline/status.py",
-    "tcpipe/pipeline/store_facts.py",
+    "tcpipe/pipeline/report.py",
     "tcpipe/planning/drives.py",
     "tcpipe/planning/path_files.py",
 }
