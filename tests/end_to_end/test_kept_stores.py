@@ -191,7 +191,8 @@ WARNED = ("imu: 0.1 s late", "gnss: no placement")
 def test_sentences_of_manifests_and_cards_become_findings():
     manifest = {
         "data_model_version": "2.1", "run_id": "a", "warnings": list(WARNED),
-        "info": {"findings": {"warnings": [], "facts": {"n": 1}}, "datum": None}, "counts": {"segments": 3, "gnss_messages": 9}, "recipe": {},
+        "info": {"findings": {"warnings": [], "facts": {"n": 1}}, "datum": None}, "counts": {"segments": 3, "gnss_messages": 9},
+        "recipe": {},
     }  # fmt: skip
     brought = migrating._bring_document(manifest, "manifest-1.json")
     assert (brought["data_model_version"], brought["info"]["report"]["facts"]) == (DATA_MODEL_VERSION, {"n": 1})

@@ -215,12 +215,12 @@ def test_the_commented_recipe_is_toml_whatever_its_docstrings_say() -> None:
 
 
 EARLIER = """
-[gate]
-standing_velocity_mps = 0.1
+[mask]
+stationary_velocity_mps = 0.1
 [read]
 time = {imu = "log"}
 placement = {imu = {xyz_m = [1.0, 0.0, 0.0]}}
-pose_from = ["imu"]
+pose_sources = ["imu"]
 [robots.scout]
 called = ["scout"]
 [[power_sources]]
