@@ -108,7 +108,7 @@ def read_power(
     if sign == 0:
         return PowerReadings(findings=of_sign)
     other_loads = tuple(dict.fromkeys(of.other_loads for of in sources if of.other_loads))
-    loads = (make_finding("power-other_loads-loads", _POWER, names={"loads": name}) for name in other_loads)
+    loads = (make_finding("power-includes-loads", _POWER, names={"loads": name}) for name in other_loads)
     findings += [*of_sign, *odd, *loads]
     signed = {topic: [apply_sign(rail, sign) for rail in found] for topic, found in rails.items()}
     counts = any(of.energy for of in sources)

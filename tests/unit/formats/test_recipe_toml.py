@@ -212,39 +212,3 @@ def test_the_commented_recipe_is_toml_whatever_its_docstrings_say() -> None:
     text = format_commented_toml()
     assert parse_recipe(tomllib.loads(text), where="init") == Recipe()
     assert all(line.startswith(("#", "[")) for line in text.splitlines() if line)
-
-
-EARLIER = """
-[mask]
-stationary_velocity_mps = 0.1
-[read]
-time = {imu = "log"}
-placement = {imu = {xyz_m = [1.0, 0.0, 0.0]}}
-pose_sources = ["imu"]
-[robots.scout]
-called = ["scout"]
-[[power_sources]]
-type = "a/msg/B"
-voltage = "v"
-includes = "the arm"
-unknown = "its sign"
-"""
-
-
-def test_keys_of_0_8_are_read_with_one_note(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    path = tmp_path / "tcpipe.toml"
-    path.write_text(EARLIER)
-    recipe = load_recipe(path)
-    assert recipe.mask.stationary_velocity_mps == 0.1
-    assert (recipe.read.time_source, recipe.read.pose_sources) == ({"imu": "log"}, ["imu"])
-    assert recipe.read.extrinsics["imu"].xyz_m == (1.0, 0.0, 0.0)
-    assert recipe.robots["scout"].topic_words == ["scout"]
-    assert (recipe.power_sources[0].other_loads, recipe.power_sources[0].open_questions) == ("the arm", "its sign")
-    (note,) = caplog.messages
-    assert "gate is mask" in note
-    assert "read.time is time_source" in note
-
-
-def test_a_key_by_both_names_is_an_error() -> None:
-    with pytest.raises(RecipeError, match="unknown key gate; known here"):
-        parse_recipe({"gate": {}, "mask": {}}, where="r")
