@@ -15,7 +15,7 @@ from tcpipe.pipeline.plan import list_transient_failures
 from tcpipe.pipeline.problems import find_problems, is_acknowledged, make_failure
 from tcpipe.pipeline.prune import is_replaced
 from tcpipe.pipeline.store_verdict import find_changes, judge_runs
-from tcpipe.report.store_runs import FailedLog, StoredDataset, StoreFacts, find_recipe_key
+from tcpipe.report.store_report import FailedLog, StoredDataset, StoreFacts, find_recipe_key
 from tcpipe.store import Store
 
 
