@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.balance.cells import SLOPE_NAMES
-from tcpipe.cost.budget import format_budget
+from tcpipe.cost.labels import format_budget
 from tcpipe.formats.dataset_card import Balance, CellRow
 from tcpipe.formats.finding_lines import advise_on_loss
 from tcpipe.motion.remedies import find_largest_losses

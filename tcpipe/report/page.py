@@ -24,8 +24,7 @@ from tcpipe.formats.json_files import Json
 from tcpipe.report import plots
 from tcpipe.report.plots import Plot
 from tcpipe.tables.catalogue import AFFECTED, Affected, Severity
-from tcpipe.tables.findings import Finding, sort_findings
-from tcpipe.tables.verdicts import Grade, Verdict
+from tcpipe.tables.findings import Finding, Grade, Verdict, sort_findings
 
 _INVISIBLE = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\xad\u061c\u200b-\u200f\u2028-\u202e\u2060-\u206f\ufeff]")
 """Characters that cannot be seen in a page, or turn its text round: a name may hold them."""

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from tcpipe.cost.held_out import PHYSICS_UNITS
+from tcpipe.cost.physics import PHYSICS_UNITS
 from tcpipe.formats.finding_lines import FindingGroup, describe_finding, format_group
 from tcpipe.formats.index_files import RunFacts
 from tcpipe.formats.json_files import Json
@@ -21,8 +21,7 @@ from tcpipe.report.colours import CLASS_COLOURS
 from tcpipe.report.label_sections import make_losses_sections
 from tcpipe.report.page import Link, Number, Section, render_page, show_verdict
 from tcpipe.report.plots import Plot, make_plot
-from tcpipe.tables.findings import Finding, select_problems
-from tcpipe.tables.verdicts import Verdict
+from tcpipe.tables.findings import Finding, Verdict, select_problems
 
 _PAGE = "report.html"
 MOST_ROWS = 200
