@@ -57,7 +57,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as name:
         directory = Path(name)
         source, model = prepared(directory, side_m, width)
-        costs = make_cost_map(model, source, directory / "warm", step_m=1.0).card.cells
+        costs = make_cost_map(model, source, directory / "warm", cell_size_m=1.0).card.cells
         survey = make_survey(model, source, 1.0)
         survey.predict(np.ones_like(survey.predicted), lambda _, __: None)
         patches = int(np.count_nonzero(np.isfinite(survey.costs.velocity_mps)))
@@ -73,7 +73,7 @@ def main() -> None:
 
         spent = []
         for number in range(ROUNDS):
-            mapped = timed(lambda n=number: make_cost_map(model, source, directory / f"map{n}", step_m=1.0))
+            mapped = timed(lambda n=number: make_cost_map(model, source, directory / f"map{n}", cell_size_m=1.0))
             spent.append((mapped, timed(forward), timed(judged)))
     print(f"{costs.with_cost} cells with a cost, {patches} predictions, ResNet-18 of width {width}")
     for at, kind in enumerate(("clock", "CPU time")):

@@ -39,7 +39,7 @@ class Case:
     before: tuple[Run, ...] = ()
     wants: frozenset[str] = frozenset()
     url: str = ""
-    beside: Run | None = None
+    extra_features: Run | None = None
     """What else is done at the same time where two things are; None: the same."""
 
 
@@ -114,8 +114,8 @@ CASES = (
     Case("ingest", _RUN, wants=_LOG),
     Case("ingest --force", command("ingest", LOG, "--force", "--quiet"), (_RUN,), _LOG),
     Case("ingest by another recipe", command("ingest", LOG, "--recipe", f"{INPUTS}/other.toml", "-q"), (_RUN,), _LOG),
-    Case("ingest beside build-dataset", _RUN, wants=_LOG | _WORLD, beside=command(*_BUILD)),
-    Case("ingest beside prune", _OTHER_RUN, (_RUN,), _LOG, beside=command("prune")),
+    Case("ingest beside build-dataset", _RUN, wants=_LOG | _WORLD, extra_features=command(*_BUILD)),
+    Case("ingest beside prune", _OTHER_RUN, (_RUN,), _LOG, extra_features=command("prune")),
     Case("prune", command("prune", *_AT_ONCE), (_OTHER_RUN, _RUN), _LOG),
     Case("migrate elsewhere", command(*_MIGRATE, "tcpipe-store"), wants=_OLD),
     Case("ingest into a bucket", _RUN_THERE, wants=_LOG, url=URL),

@@ -148,7 +148,7 @@ def struck(plain: Undisturbed, work: Path, fault: Fault) -> list[str]:
 def together(plain: Undisturbed, work: Path, turn: int) -> list[str]:
     """Run a case and what is beside it at once, each again, and compare with one after the other."""
     case = plain.case
-    runs = [case.run, case.beside or case.run]
+    runs = [case.run, case.extra_features or case.run]
     trees = []
     for at_once in (False, True):
         _restore(plain.state, work)

@@ -70,7 +70,9 @@ def compare(data: Dataset, network: Predict, table: Predict, called: str) -> Non
             for predict in (network, table)
         )
         rules = {"block_m": data.card.recipe.split.block_m, "seed": 0}
-        row = next(of for of in compare_with_baseline("table", name, part, ours, theirs, **rules) if of.quantity == "E")
+        row = next(
+            of for of in compare_with_baseline("boosting", name, part, ours, theirs, **rules) if of.quantity == "E"
+        )
         rmse = float(np.sqrt(np.mean(np.square(ours["E"] - part.costs["E"]))))
         print(
             f"{called:>12} {name:6}: network {rmse:6.2f} J, table {row.errors.rmse:6.2f} J, ratio {row.rmse_ratio}",

@@ -33,9 +33,11 @@ def run_train(options: TrainOptions) -> TrainResult:
     from tcpipe.recipe.checking import from_values
 
     given = {of.name: value for of in fields(FitConfig) if (value := getattr(options, of.name)) is not None}
-    is_network = bool(given.keys() - {"model", "loss", "weights", "label", "beside"})
+    is_network = bool(given.keys() - {"model", "loss", "inverse_variance_weights", "label", "extra_features"})
     given["model"] = options.model or ("resnet18" if is_network else model_for(options.dataset))
-    return run(options.dataset, options.out, config=from_values(FitConfig, given, where="train"), fresh=options.fresh)
+    return run(
+        options.dataset, options.out, config=from_values(FitConfig, given, where="train"), no_resume=options.no_resume
+    )
 
 
 train = as_function(TrainOptions, run_train)
@@ -51,9 +53,9 @@ class Evaluate(Protocol):
         dataset: str | Path,
         out: str | Path = "evaluation",
         *,
-        draws: int = 5,
+        noise_draws: int = 5,
         baselines: bool = True,
-        retrain: bool = False,
+        retrain_ablation: bool = False,
         seed: int = 0,
     ) -> EvaluationResult: ...
     @overload
@@ -110,7 +112,7 @@ def run_predict_path(options: PredictPathOptions) -> PathResult:
     from tcpipe.planning.path_files import predict_path as run
 
     source = choose_map(options.store, options.map_name)
-    asked = choose_model(options.model, physics=options.physics, speed_mps=options.speed_mps)
+    asked = choose_model(options.model, physics=options.physics_from, speed_mps=options.speed_mps)
     return run(asked, source, Path(options.path), None if options.out is None else Path(options.out))
 
 
@@ -128,14 +130,14 @@ def run_plan_path(options: PlanPathOptions) -> PlanResult:
     from tcpipe.planning.path_files import PlanRequest, choose_map, plan
     from tcpipe.recipe.checking import from_values
 
-    asked = {name: getattr(options, name) for name in ("objective", "step_m", "allow_extrapolation")}
+    asked = {name: getattr(options, name) for name in ("objective", "cell_size_m", "allow_extrapolation")}
     asked |= {"start_deg": options.start, "goal_deg": options.goal}
     request = from_values(PlanRequest, asked, where="plan_path")
     if options.cost_map is not None:
         request = replace(request, cost_map=fetch_directory(options.cost_map))
     source = choose_map(options.store, options.map_name)
     return plan(
-        choose_model(options.model, physics=options.physics, speed_mps=options.speed_mps),
+        choose_model(options.model, physics=options.physics_from, speed_mps=options.speed_mps),
         source,
         request,
         out=Path(options.out),

@@ -31,7 +31,7 @@ CARD = ModelCard(
     label_velocity="ground",
     robot="husky",
     classes=PAPER_CLASSES.classes,
-    seen=TrainingRange(
+    training_range=TrainingRange(
         {4: 60, 6: 25, 7: 15},
         (4, 6, 7),
         {"slope_rad": (-0.3, 0.3), "cross_slope_rad": (-0.25, 0.25), "relief_m": (0.0, 0.5)},

@@ -61,7 +61,7 @@ class PhysicsModel:
     label_energy: str = "total"
     class_counts: dict = field(default_factory=lambda: dict.fromkeys(CLASSES_SEEN, 100))
     pixel_classes: tuple = CLASSES_SEEN
-    seen: dict = field(
+    training_range: dict = field(
         default_factory=lambda: {"slope_rad": (-0.5, 0.5), "cross_slope_rad": (-0.5, 0.5), "relief_m": (0.0, 1.0)}
     )
     residuals: dict = field(default_factory=made_residuals)

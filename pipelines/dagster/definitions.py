@@ -191,7 +191,7 @@ def dataset() -> dg.MaterializeResult:
 def model() -> dg.MaterializeResult:
     """Trees on features of the dataset's patches."""
     data, out = _place("TCPIPE_DATASET", "dataset"), _place("TCPIPE_MODEL", "model")
-    (trained,) = _answers("train", data, out, "--model", "table")
+    (trained,) = _answers("train", data, out, "--model", "boosting")
     return dg.MaterializeResult(metadata={"model": dg.MetadataValue.json(dict(trained))})
 
 

@@ -66,7 +66,7 @@ def evaluate(options: EvaluateOptions, *, as_json: bool, quiet: bool) -> None:
 @click.option("--seeds", default=1, type=click.IntRange(1, 100), help="Trainings; claims compare their means.")
 @jobs_option("Logs read")
 @click.option(
-    "--hidden-variance", "hidden", cls=RenamedOption, earlier="--hidden", default=1.0, type=click.FloatRange(0.0, 10.0), metavar="FACTOR",
+    "--hidden-variance", cls=RenamedOption, earlier="--hidden", default=1.0, type=click.FloatRange(0.0, 10.0), metavar="FACTOR",
     help="Variance of the resistance that nothing shows, over that of the frozen site.",
 )  # fmt: skip
 @click.option(
@@ -76,7 +76,15 @@ def evaluate(options: EvaluateOptions, *, as_json: bool, quiet: bool) -> None:
 @json_option
 @quiet_option
 def reproduce(
-    directory: str, *, quick: bool, seeds: int, jobs: int, hidden: float, baselines: bool, as_json: bool, quiet: bool
+    directory: str,
+    *,
+    quick: bool,
+    seeds: int,
+    jobs: int,
+    hidden_variance: float,
+    baselines: bool,
+    as_json: bool,
+    quiet: bool,
 ) -> None:
     """Simulate the paper's site, drive it, build the dataset, train, evaluate, and say which of the paper's claims hold.
 
@@ -86,7 +94,9 @@ def reproduce(
     from tcpipe.experiment.reproduction import reproduce as run
 
     with show_progress("reproduce", quiet=quiet):
-        result = run(directory, quick=quick, seeds=seeds, jobs=jobs, hidden=hidden, baselines=baselines)
+        result = run(
+            directory, quick=quick, seeds=seeds, jobs=jobs, hidden_variance=hidden_variance, baselines=baselines
+        )
     print_result(result, as_json=as_json)
 
 
@@ -129,7 +139,7 @@ def cost_map(options: CostMapOptions, *, as_json: bool, quiet: bool) -> None:
         result = make_cost_map(
             *_load_inputs(options),
             options.out,
-            step_m=options.step_m,
+            cell_size_m=options.cell_size_m,
             origin_deg=options.origin_deg,
             step=shown.count,
             cluster=None if cluster is None else Cluster(cluster, partial(_load_inputs, options)),

@@ -19,6 +19,7 @@ from click.shell_completion import CompletionItem
 from tcpipe.errors import TcpipeError, UsageError
 from tcpipe.formats import user_paths
 from tcpipe.tables import options
+from tcpipe.tables.earlier_names import EARLIER_CHOICES
 
 if TYPE_CHECKING:
     from tcpipe.store import Store
@@ -70,6 +71,15 @@ class LonLat(click.ParamType[tuple[float, float]]):
         if not (isfinite(lon) and isfinite(lat)):
             self.fail(f"{value!r}: wanted LON,LAT in degrees, as 15.45,47.07", param, ctx)
         return lon, lat
+
+
+class _Choice(click.Choice[str]):
+    """One of several values, each also by its earlier name."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Return the value by its name of today."""
+        name = EARLIER_CHOICES.get(value, value)
+        return super().convert(name if name in self.choices else value, param, ctx)
 
 
 class RenamedOption(click.Option):
@@ -246,7 +256,7 @@ def make_click_option(name: str, default: Any, shown: options.Option) -> Option:
         case options.Range(least, most, is_open):
             settings["type"] = FloatRange(least, most, min_open=is_open)
         case tuple(choices):
-            settings["type"] = click.Choice(choices)
+            settings["type"] = _Choice(choices)
         case kind if kind:
             settings |= KINDS[kind]
     if shown.shown is not None or default not in (MISSING, None, ()):

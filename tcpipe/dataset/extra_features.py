@@ -43,7 +43,7 @@ class ExtraFeature:
     """Greater than 0."""
     usual: float
     """What a metre has of which it is not known: the mean, unless the user says what."""
-    seen: tuple[float, float]
+    training_range: tuple[float, float]
     """Smallest and largest."""
 
 
@@ -64,11 +64,11 @@ def empty_extra_features(count: int) -> ExtraFeatures:
     return ExtraFeatures(np.zeros(count, np.int64), unknown, unknown, unknown)
 
 
-def available_features(beside: ExtraFeatures) -> tuple[ExtraFeature, ...]:
+def available_features(extra_features: ExtraFeatures) -> tuple[ExtraFeature, ...]:
     """Return the inputs that these samples tell: those that are known of any of them."""
     found = []
     for name in ("turn_radpm", "command_mps"):
-        values = getattr(beside, name)
+        values = getattr(extra_features, name)
         if (known := values[np.isfinite(values)]).size:
             mean = float(known.mean())
             found.append(
@@ -77,9 +77,9 @@ def available_features(beside: ExtraFeatures) -> tuple[ExtraFeature, ...]:
     return tuple(found)
 
 
-def standardize_features(inputs: Sequence[ExtraFeature], beside: ExtraFeatures) -> Floats:
+def standardize_features(inputs: Sequence[ExtraFeature], extra_features: ExtraFeatures) -> Floats:
     """Return what a model takes beside N patches, in units of its deviation from its mean, shape (N, inputs)."""
-    return _scale_values(inputs, {"turn_radpm": beside.turn_radpm, "command_mps": beside.command_mps})
+    return _scale_values(inputs, {"turn_radpm": extra_features.turn_radpm, "command_mps": extra_features.command_mps})
 
 
 def standardize_columns(inputs: Sequence[ExtraFeature], columns: NDArray[np.floating]) -> Floats:

@@ -49,11 +49,13 @@ class Experiment:
     evaluating: EvaluateConfig
 
 
-FULL = Experiment("paper", FitConfig(epochs=40, patience=8), EvaluateConfig(draws=5))
+FULL = Experiment("paper", FitConfig(epochs=40, patience=8), EvaluateConfig(noise_draws=5))
 """The paper's size: fits 90 minutes on two cores."""
 
 QUICK = Experiment(
-    "paper_quick", FitConfig(epochs=4, patience=4, batch=32, learning_rate=1e-3, width=16), EvaluateConfig(draws=2)
+    "paper_quick",
+    FitConfig(epochs=4, patience=4, batch_size=32, learning_rate=1e-3, width=16),
+    EvaluateConfig(noise_draws=2),
 )
 """Two minutes on two cores: everything runs, and nothing is learned well enough to believe a figure."""
 
@@ -78,7 +80,7 @@ class ReproductionSummary:
     simulated: bool = True
     scenario: str
     plan: Experiment
-    hidden: float
+    hidden_variance: float
     """Variance of the hidden resistance, over that of the frozen site."""
     counts: SampleCounts
     variance_shares: Mapping[str, float]
@@ -126,7 +128,7 @@ def reproduce(
     quick: bool = False,
     seeds: int = 1,
     jobs: int = 1,
-    hidden: float = 1.0,
+    hidden_variance: float = 1.0,
     baselines: bool = True,
 ) -> Reproduction:
     """Simulate the paper's site, build the dataset, train, evaluate, and compare with the paper's claims.
@@ -137,7 +139,7 @@ def reproduce(
     quick : a small one, to see it run.
     seeds : trainings; figures are compared by their means.
     jobs : logs read side by side.
-    hidden : variance of the resistance that nothing shows, over that of the frozen site.
+    hidden_variance : variance of the resistance that nothing shows, over that of the frozen site.
     baselines : train the networks of Wei and Isler; without them what is claimed of them is not measured.
 
     Raises
@@ -150,7 +152,7 @@ def reproduce(
     if place.exists() and (not place.is_dir() or (any(place.iterdir()) and not (place / "site").exists())):
         raise UsageError(f"{place}: exists and is no reproduction; give another DIR")
     frozen, result = find_scenario(plan.scenario), Reproduction(place, plan.scenario)
-    made = replace(frozen, world=scale_hidden_variance(frozen.world, hidden))
+    made = replace(frozen, world=scale_hidden_variance(frozen.world, hidden_variance))
     with _measure_time(result, "simulate"):
         site = simulate(place / "site", scenario=made, seed=SIMULATION_SEED)
     with _measure_time(result, "ingest and build"):
@@ -161,7 +163,7 @@ def reproduce(
     for seed in range(seeds):
         result.runs.append(_train_and_evaluate(place, made, plan, seed, result))
     result.claims = check_claims(result.runs)
-    _write(result, plan, hidden)
+    _write(result, plan, hidden_variance)
     return result
 
 
@@ -206,12 +208,12 @@ def _train_and_evaluate(place: Path, made: Scenario, plan: Experiment, seed: int
         return run_evaluation(here / "model", dataset, here / "evaluation", config=config, plant=known).values
 
 
-def _write(result: Reproduction, plan: Experiment, hidden: float) -> None:
+def _write(result: Reproduction, plan: Experiment, hidden_variance: float) -> None:
     """Write the page, and the same as JSON."""
     summary = ReproductionSummary(
         scenario=result.scenario,
         plan=plan,
-        hidden=hidden,
+        hidden_variance=hidden_variance,
         counts=result.counts,
         variance_shares=result.variance_shares,
         claims=tuple(result.claims),
@@ -227,7 +229,7 @@ def _write(result: Reproduction, plan: Experiment, hidden: float) -> None:
             splits=result.counts.splits,
             terrain=result.counts.terrain,
             shares=result.variance_shares,
-            hidden=hidden,
+            hidden_variance=hidden_variance,
             quick=plan.scenario == QUICK.scenario,
         ),
     )

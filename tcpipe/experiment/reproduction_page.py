@@ -28,7 +28,7 @@ def render_reproduction_page(
     splits: Mapping[str, int],
     terrain: Mapping[str, Mapping[str, int]],
     shares: Mapping[str, float],
-    hidden: float,
+    hidden_variance: float,
     quick: bool,
 ) -> str:
     """Return the HTML page.
@@ -46,7 +46,7 @@ def render_reproduction_page(
         before=[
             _make_claims_section(claims, format_audit(runs[0])),
             _make_floor_section(runs[0]),
-            _make_variance_section(shares, hidden),
+            _make_variance_section(shares, hidden_variance),
             _make_drives_section(splits, terrain),
             *_make_seed_sections(runs),
             _make_fidelity_section(runs[0]),
@@ -87,7 +87,7 @@ def _make_floor_section(run: Evaluation) -> Section:
     return Section("How far above the floor", text, header=header, rows=rows, figures_from=2)
 
 
-def _make_variance_section(shares: Mapping[str, float], hidden: float) -> Section:
+def _make_variance_section(shares: Mapping[str, float], hidden_variance: float) -> Section:
     """Return what E's variance is made of, and what of the rest that class and slope leave."""
     left = sum(share for name, share in shares.items() if name != CLASS_AND_SLOPE)
     rows = [
@@ -101,7 +101,7 @@ def _make_variance_section(shares: Mapping[str, float], hidden: float) -> Sectio
     text = (
         "Of measured E on the unseen area: what a spline over the slope of each class explains; then what such splines leave of what "
         "changes where a part of the simulated world is taken out. They add up to one only as far as they are independent. "
-        f"The hidden resistance has {hidden:g} times the variance of the frozen site."
+        f"The hidden resistance has {hidden_variance:g} times the variance of the frozen site."
     )
     header = ("what shows it", "of the variance of E", "of what is not class and slope")
     return Section("What E's variance is made of", text, header=header, rows=rows, figures_from=1)

@@ -79,8 +79,8 @@ def compute_variance_shares(world: World, robot: SimulatedRobot, split: Split, e
     alone is missing; the rest, what they leave of what the plant with everything in it misses. A part's mean over a class and slope is thus
     class and slope. They add up to one only as far as the parts are independent.
     """
-    beside, known = read_extra_features(split), np.isfinite(energy_joule)
-    slope_rad, class_id = beside.slope_rad[known], beside.class_id[known]
+    extra_features, known = read_extra_features(split), np.isfinite(energy_joule)
+    slope_rad, class_id = extra_features.slope_rad[known], extra_features.class_id[known]
 
     def left(joule: Array) -> float:
         values = joule[known][:, None]

@@ -28,7 +28,7 @@ class Architecture:
     outputs: int = 2
     width: int = 64
     """Filters of the first stage, a multiple of `BLOCK`; 64 is ResNet-18, less is a narrower copy for quick runs, 0 no network."""
-    beside: int = 0
+    extra_features: int = 0
     """Numbers that it takes beside a patch, each as a channel of one value."""
 
 
@@ -45,7 +45,7 @@ def weight_forms(shape: Architecture) -> dict[str, ArrayForm]:
         forms[f"{name}_convolution/kernel"] = size, size, depth, filters
         forms.update({f"{name}_norm/{of}": (filters,) for of in ("gamma", "beta", "moving_mean", "moving_variance")})
 
-    add("stem", shape.depth + shape.beside, shape.width, 7)
+    add("stem", shape.depth + shape.extra_features, shape.width, 7)
     depth = shape.width
     for stage in range(4):
         for block in range(2):
@@ -67,8 +67,10 @@ def check_trainable(shape: Architecture) -> None:
         raise ModelError(
             f"a network of width {shape.width}: wanted a multiple of {BLOCK}, from {BLOCK} to {_MOST_WIDTH}"
         )
-    if not (0 < shape.depth + shape.beside <= _MOST_INPUTS and 0 < shape.outputs <= _MOST_INPUTS):
-        raise ModelError(f"a network of {shape.depth} channels, {shape.beside} numbers and {shape.outputs} outputs")
+    if not (0 < shape.depth + shape.extra_features <= _MOST_INPUTS and 0 < shape.outputs <= _MOST_INPUTS):
+        raise ModelError(
+            f"a network of {shape.depth} channels, {shape.extra_features} numbers and {shape.outputs} outputs"
+        )
 
 
 Loss = Literal["nrmse", "paper_eq4"]

@@ -67,7 +67,7 @@ def compare_baselines(
     seed : of the bootstrap.
     """
     kind = ours.card.training.config.model
-    own = {"table": TREES, "physics": PHYSICS}.get(kind)
+    own = {"boosting": TREES, "physics": PHYSICS}.get(kind)
     train = _select_fitted_samples(data["train"], ours)
     if not len(train):
         names = {"error": "the dataset has no labelled samples in split train"}
@@ -108,9 +108,9 @@ def _fit_baselines(train: Split, ours: Model, wanted: Sequence[str]) -> tuple[di
 
 
 def _fit_curves(train: Split) -> Iterator[tuple[str, Predictor]]:
-    labels, beside = train.labels.astype(np.float64), read_extra_features(train)
+    labels, extra_features = train.labels.astype(np.float64), read_extra_features(train)
     for form, name in CURVES.items():
-        curves = fit_curves(form, beside.slope_rad, beside.class_id, labels)
+        curves = fit_curves(form, extra_features.slope_rad, extra_features.class_id, labels)
 
         def predict(split: Split, curves: Curves = curves) -> Array:
             there = read_extra_features(split)
@@ -276,7 +276,7 @@ def make_energy_table(
 def _fit_networks(ours: Model, trained: Trained) -> dict[int, Model]:
     """Return a network for every class with enough samples, by class id."""
     found = {}
-    for class_id in (class_id for class_id, count in ours.card.seen.class_counts.items() if count >= FEWEST):
+    for class_id in (class_id for class_id, count in ours.card.training_range.class_counts.items() if count >= FEWEST):
         try:
             variant = Variant(channels=("height",), classes=(class_id,), energy_only=True)
             found[class_id] = trained(f"wei_isler_class_{class_id}", variant)

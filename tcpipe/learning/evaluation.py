@@ -127,7 +127,9 @@ def evaluate(
     def trained(name: str, variant: Variant) -> Model:
         place = out / NETWORKS / name
         few = len(make_training_task(data, fitting.fold, variant).fit)
-        longer = np.ceil(fitted / fitting.batch) / np.ceil(few / fitting.batch)  # as many steps, not as many epochs
+        longer = np.ceil(fitted / fitting.batch_size) / np.ceil(
+            few / fitting.batch_size
+        )  # as many steps, not as many epochs
         rules = replace(fitting, epochs=round(longer * fitting.epochs), patience=round(longer * fitting.patience))
         train(dataset, place, config=rules, variant=variant, disposable=True)
         return load_model(place)
@@ -194,11 +196,11 @@ def _iterate_ablation(ours: Model, sets: Sets, config: EvaluateConfig, trained: 
                 _compute_errors(
                     predict_costs(ours, found.split, noise=noise, seed=(config.seed, number, at, draw)), found, ours
                 )
-                for draw in range(config.draws if noise else 1)
+                for draw in range(config.noise_draws if noise else 1)
             ]
             by_split[name] = {quantity: mean_of_draws(draw[quantity] for draw in draws) for quantity in draws[0]}
         yield AblationRow(letters, "noise", **by_split)
-        if config.retrain and noise:
+        if config.retrain_ablation and noise:
             anew = trained("ablation_" + "".join(letters), Variant(channels=left))
             by_split = {
                 name: _compute_errors(predict_costs(anew, found.split), found, anew) for name, found in sets.items()
@@ -352,7 +354,7 @@ def _find_baselines(found: Evaluation, subject: Subject) -> Iterator[Finding]:
             yield make_finding(f"{name}-no-better-than-curves", subject)
         if quantity == "E" and not of.beats_all:
             best, ratio = of.best.baseline, of.best.rmse_ratio.value or 0.0
-            kind = {TREES: "table", PHYSICS: "physics", **dict.fromkeys(CURVES.values(), "table")}[best]
+            kind = {TREES: "boosting", PHYSICS: "physics", **dict.fromkeys(CURVES.values(), "boosting")}[best]
             is_other = of.is_worse and kind != found.model.training.config.model
             remedies = [Remedy("train", command=f"tcpipe train DATASET --model {kind}")] if is_other else []
             names = {"baseline": best}

@@ -27,11 +27,11 @@ ErrorsByClass: TypeAlias = Mapping[str, Mapping[str, Errors]]
 class EvaluateConfig:
     """How much is evaluated."""
 
-    draws: Annotated[int, Bounds(ge=1, le=1000)] = 5
+    noise_draws: Annotated[int, Bounds(ge=1, le=1000)] = 5
     """Draws of noise that each ablated input set is the mean of."""
     baselines: bool = True
     """Train the networks of Wei & Isler."""
-    retrain: bool = False
+    retrain_ablation: bool = False
     """Train a network for each input set of the ablation, too."""
     seed: Seed = 0
     """Of the noise."""

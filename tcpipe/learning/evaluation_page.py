@@ -264,7 +264,7 @@ def _make_ablation_section(found: Evaluation) -> Section:
             ]
             rows.append((said, split, "", *figures))
     header = ("layers", "", "", *(f"{q} {(MEASURES | SCORES)[m]} [{_find_unit(m, q)}]" for q, m in _ABLATION_COLUMNS))
-    draws = found.config.draws
+    draws = found.config.noise_draws
     text = f"Layers not named are replaced by noise, mean of {draws} draws; retrained: a network that never had them. {COUNTED}"
     text += format_audit(found)
     return Section("Table III: ablation", text, header=header, rows=rows, figures_from=3)

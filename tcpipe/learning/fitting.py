@@ -86,7 +86,7 @@ def _read_progress(found: Any) -> TrainingProgress:
 
 logger = logging.getLogger("tcpipe")
 
-ModelKind = Literal["resnet18", "table", "physics"]
+ModelKind = Literal["resnet18", "boosting", "physics"]
 """The paper's network on patches, boosted trees on features of them, or coefficients of physics."""
 
 Seed = Annotated[int, Bounds(ge=0, le=2**32 - 1)]
@@ -119,7 +119,7 @@ class FitConfig:
     """At most."""
     patience: Annotated[int, Bounds(ge=1, le=100_000)] = 12
     """Epochs without a better loss of the held-out fold before training stops."""
-    batch: Annotated[int, Bounds(ge=1, le=65_536)] = 64
+    batch_size: Annotated[int, Bounds(ge=1, le=65_536)] = 64
     learning_rate: Annotated[float, Bounds(gt=0, le=1)] = 1e-4
     seed: Seed = 0
     """Of weights, shuffles and mirrors."""
@@ -127,13 +127,13 @@ class FitConfig:
     """Of train, that training is stopped by; the rest is fitted."""
     mirror: bool = True
     """Mirror every other patch across its direction of travel."""
-    weights: bool = False
+    inverse_variance_weights: bool = False
     """Weigh each label by its inverse variance."""
     width: Annotated[int, Bounds(ge=16, le=512)] = 64
     """Filters of the first stage, a multiple of 16."""
     label: EnergyName = "total"
-    """Which energy is trained on: all that was measured, or what is above standing."""
-    beside: bool = False
+    """Which energy is trained on: all that was measured, or net of idle power."""
+    extra_features: bool = False
     """Whether it is told the turn and the commanded speed of each metre."""
 
 
@@ -147,7 +147,7 @@ class Task:
     held: Split
     outputs: tuple[str, ...]
     """The split's label columns, or its energy alone."""
-    beside: tuple[ExtraFeature, ...] = ()
+    extra_features: tuple[ExtraFeature, ...] = ()
     """What it is told beside a patch."""
 
 
@@ -177,7 +177,7 @@ class Fitted:
     said: NDArray[np.floating]
     """What it predicted of them, in the labels' units, shape (N, outputs)."""
     progress: TrainingProgress
-    spent: TrainingTimes
+    training_times_s: TrainingTimes
     device: str
 
 
@@ -205,26 +205,39 @@ def fit(task: Task, config: FitConfig, *, name: str, key: str, checkpoint: Path)
         logger.info("%s: goes on after epoch %d", name, progress.epoch)
     else:  # a place that cannot be written is found now, not after an epoch
         write_checkpoint(checkpoint, progress, _state(trainer, best))
-    spent = TrainingTimes()
+    training_times_s = TrainingTimes()
     while progress.epoch < config.epochs and progress.epoch - progress.best_epoch < config.patience:
-        loss = _train_epoch(trainer, task, config, scale=np.array(scale, np.float32), progress=progress, spent=spent)
-        held = compute_held_loss(network, task, scale, factors, weighted=config.weights)
+        loss = _train_epoch(
+            trainer,
+            task,
+            config,
+            scale=np.array(scale, np.float32),
+            progress=progress,
+            training_times_s=training_times_s,
+        )
+        held = compute_held_loss(network, task, scale, factors, weighted=config.inverse_variance_weights)
         progress.epoch += 1
         progress.history.append((progress.epoch, loss, held))
         if held < progress.best_loss:
             progress.best_loss, progress.best_epoch, best = held, progress.epoch, network.arrays()
-        if progress.epoch % max(_STEPS_BETWEEN * config.batch // len(task.fit), 1) == 0:
+        if progress.epoch % max(_STEPS_BETWEEN * config.batch_size // len(task.fit), 1) == 0:
             write_checkpoint(checkpoint, progress, _state(trainer, best))
-        _say(name, progress, config, spent)
+        _say(name, progress, config, training_times_s)
     network.set_arrays(best, str(checkpoint))
-    return Fitted(best, scale, task.held, predict_split(network, task, task.held, scale), progress, spent, device)
+    return Fitted(
+        best, scale, task.held, predict_split(network, task, task.held, scale), progress, training_times_s, device
+    )
 
 
 def _make_trainer(task: Task, config: FitConfig, scale: Sequence[float], factors: Floats) -> tuple[Trainer, str]:
     """Return an untrained network with its optimiser, and what it runs on."""
     start = collect_labels(task.fit, task.outputs).mean(axis=0) / scale
     shape = Architecture(
-        task.fit.view.stored.files.patch_px, task.fit.view.form.depth, len(scale), config.width, len(task.beside)
+        task.fit.view.stored.files.patch_px,
+        task.fit.view.form.depth,
+        len(scale),
+        config.width,
+        len(task.extra_features),
     )
     check_trainable(shape)
     from tcpipe.learning.network import (  # noqa: PLC0415  torch takes seconds and half a gigabyte
@@ -244,7 +257,7 @@ def label_scale(task: Task) -> tuple[float, ...]:
 def predict_split(network: ResNet18, task: Task, split: Split, scale: Sequence[float]) -> Floats:
     """Return what a network says of all samples of a split, in the labels' units, shape (N, outputs)."""
     numbers, found, first = (
-        standardize_features(task.beside, read_extra_features(split)),
+        standardize_features(task.extra_features, read_extra_features(split)),
         [np.empty((0, len(scale)), np.float32)],
         0,
     )
@@ -286,29 +299,35 @@ def collect_labels(split: Split, outputs: Sequence[str]) -> Floats:
 
 
 def _train_epoch(
-    trainer: Trainer, task: Task, config: FitConfig, *, scale: Floats, progress: TrainingProgress, spent: TrainingTimes
+    trainer: Trainer,
+    task: Task,
+    config: FitConfig,
+    *,
+    scale: Floats,
+    progress: TrainingProgress,
+    training_times_s: TrainingTimes,
 ) -> float:
     """Train on every sample once; return the mean loss."""
     energy = len(task.outputs) == 1
-    rules: dict[str, Any] = {"features": task.outputs} if energy else {"weights": config.weights}
-    if task.beside:
+    rules: dict[str, Any] = {"features": task.outputs} if energy else {"weights": config.inverse_variance_weights}
+    if task.extra_features:
         rules["features"] = COLUMNS
-    batches = task.fit.batches(config.batch, shuffle=True, seed=config.seed, mirror=config.mirror, **rules)
+    batches = task.fit.batches(config.batch_size, shuffle=True, seed=config.seed, mirror=config.mirror, **rules)
     rate = compute_learning_rate(config, progress)
     total, count, began = 0.0, 0, time.perf_counter()
     feed: Iterator[Any] = batches.epoch(progress.epoch)
     asked = began
     while (batch := next(feed, None)) is not None:
         patches, labels = batch[0] if energy else batch[:2]
-        if task.beside:
-            patches = append_planes(patches[0], standardize_columns(task.beside, patches[1]))
+        if task.extra_features:
+            patches = append_planes(patches[0], standardize_columns(task.extra_features, patches[1]))
         weights = batch[2] if len(batch) == 3 else np.ones_like(labels)
-        spent.feeding_s += time.perf_counter() - asked
+        training_times_s.feeding_s += time.perf_counter() - asked
         total += trainer.step(patches, labels / scale, weights, rate) * len(patches)
         count += len(patches)
         asked = time.perf_counter()
-    spent.total_s += time.perf_counter() - began
-    spent.samples += count
+    training_times_s.total_s += time.perf_counter() - began
+    training_times_s.samples += count
     if not np.isfinite(total):
         raise ModelError(
             f"training diverged in epoch {progress.epoch + 1} (the loss is {total}); try a smaller --learning-rate"
@@ -330,10 +349,10 @@ def _restore(trainer: Trainer, parts: dict[str, Arrays], where: str) -> None:
     trainer.remember(parts["optimizer"], where)
 
 
-def _say(name: str, progress: TrainingProgress, config: FitConfig, spent: TrainingTimes) -> None:
+def _say(name: str, progress: TrainingProgress, config: FitConfig, training_times_s: TrainingTimes) -> None:
     epoch, loss, held = progress.history[-1]
     logger.info(
         "%s: epoch %d of at most %d: loss %.4f, held-out fold %.4f (best %.4f in epoch %d); %.0f samples/s, %.1f %% of the time feeding",
         name, epoch, config.epochs, loss, held, progress.best_loss, progress.best_epoch,
-        spent.samples / max(spent.total_s, 1e-9), 100.0 * spent.feeding_share,
+        training_times_s.samples / max(training_times_s.total_s, 1e-9), 100.0 * training_times_s.feeding_share,
     )  # fmt: skip

@@ -16,7 +16,7 @@ from tcpipe.terrain.classes import TerrainClass
 
 KIND = "tcpipe model"
 
-SCHEMA_VERSION = 2
+SCHEMA_VERSION, EARLIER_SCHEMA_VERSION = 3, 2
 """Of model.json and the files beside it."""
 
 
@@ -70,7 +70,7 @@ class ModelCard:
     channels: tuple[str, ...]
     outputs: tuple[str, ...]
     """Columns that it predicts, in order: w, v (or E for a baseline)."""
-    beside: tuple[ExtraFeature, ...] = ()
+    extra_features: tuple[ExtraFeature, ...] = ()
     """What it takes beside a patch."""
     scale: tuple[float, ...]
     """Largest label of train in each output's unit: what the network gives is multiplied by it."""
@@ -82,12 +82,12 @@ class ModelCard:
     label_velocity: str
     """ground or fused: which velocity v is."""
     label_energy: EnergyName = "total"
-    """total or above_standing: which power w is, and so which energy E."""
+    """total or net: which power w is, and so which energy E."""
     label_includes: tuple[str, ...] = ()
     """What the power that was measured feeds besides the drives, as the dataset's card has it."""
     robot: str
     classes: tuple[TerrainClass, ...]
-    seen: TrainingRange
+    training_range: TrainingRange
     physics: PhysicsFit | None = field(default=None, metadata=LEFT_OUT)
     """Of the robot, by the dataset: the planner takes what turns cost from it."""
     dataset: TrainedOn

@@ -29,7 +29,7 @@ class TrainOptions:
             "The paper's network; boosted trees on features of patches; or physics. The last two take seconds and heed --loss, "
             "--inverse-variance-weights, --label and --extra-features alone (default: a table of fewer than 20000 samples, "
             "else, and with the network's own options, the network).",
-            kind=("resnet18", "table", "physics"),
+            kind=("resnet18", "boosting", "physics"),
         ),
     )  # fmt: skip
     loss: Loss = option(
@@ -43,7 +43,7 @@ class TrainOptions:
     patience: int | None = option(
         None, Option("Epochs without a better held-out loss.", kind=Range(1, 100_000), shown=12)
     )
-    batch: int | None = option(
+    batch_size: int | None = option(
         None, Option("Samples in a batch.", ("--batch-size",), Range(1, 65_536), shown=64, earlier="--batch")
     )
     learning_rate: float | None = option(None, Option(kind=Range(0.0, 1.0, is_open=True), shown=1e-4))
@@ -51,7 +51,7 @@ class TrainOptions:
     mirror: bool | None = option(
         None, Option("Mirror every other patch across its travel.", ("--mirror/--no-mirror",), shown=True)
     )
-    weights: bool = option(
+    inverse_variance_weights: bool = option(
         False,
         Option("Weigh each label by its inverse variance.", ("--inverse-variance-weights",), earlier="--weights"),
     )
@@ -66,7 +66,7 @@ class TrainOptions:
             kind=("total", "net"),
         ),
     )
-    beside: bool = option(
+    extra_features: bool = option(
         False,
         Option(
             "Give the model the turn and the commanded speed of each segment besides its patch; the paper does not.",
@@ -74,7 +74,7 @@ class TrainOptions:
         ),
     )  # fmt: skip
     seed: int | None = option(None, Option("Of weights, shuffles and mirrors.", kind=SEED, shown=0))
-    fresh: bool = option(
+    no_resume: bool = option(
         False, Option("Do not go on from where an earlier training was stopped.", ("--no-resume",), earlier="--fresh")
     )
 
@@ -88,7 +88,7 @@ class EvaluateOptions:
     """Of drives the one that the model was trained on."""
     out: str | Path = option("evaluation", Option(kind="published", metavar="[OUT]", is_argument=True))
     _: KW_ONLY
-    draws: int = option(
+    noise_draws: int = option(
         5, Option("Draws of noise for each ablated input set.", ("--noise-draws",), Range(1, 1000), earlier="--draws")
     )
     baselines: bool = option(
@@ -98,7 +98,7 @@ class EvaluateOptions:
             ("--baselines/--no-baselines",),
         ),
     )
-    retrain: bool = option(
+    retrain_ablation: bool = option(
         False,
         Option(
             "Train a network for each input set of the ablation, too (six more).",

@@ -27,13 +27,14 @@ from tcpipe.formats.atomic import write_atomic_directory, write_text
 from tcpipe.formats.bucket_directories import fetch_directory, fetch_directory_by_range
 from tcpipe.formats.dataset_files import is_shard, read_card
 from tcpipe.formats.integrity import compute_checksums, find_broken_checksums, read_sealed, seal_document, write_sealed
-from tcpipe.formats.json_files import digest, parse_typed
+from tcpipe.formats.json_files import Json, digest, parse_typed
 from tcpipe.formats.parquet import read_table, write_table
 from tcpipe.formats.weights import read_arrays, write_arrays
 from tcpipe.learning.architecture import check_trainable, weight_forms
 from tcpipe.learning.metrics import LEAST_VELOCITY_MPS
-from tcpipe.learning.model_card import KIND, SCHEMA_VERSION, ModelCard, is_current
+from tcpipe.learning.model_card import EARLIER_SCHEMA_VERSION, KIND, SCHEMA_VERSION, ModelCard, is_current
 from tcpipe.learning.physics_model import PhysicsModel, list_physics_arrays, read_physics_model
+from tcpipe.tables.earlier_names import EARLIER_CHOICES, EARLIER_MODEL_KEYS, rename_keys
 from tcpipe.tables.facts import PhysicsFit
 from tcpipe.terrain.classes import ClassTable
 
@@ -102,7 +103,7 @@ class Model:
     @property
     def takes_turns(self) -> bool:
         """Whether it is told how far a metre turns, and its predictions hold what that costs."""
-        return any(of.name == "turn_radpm" for of in self.card.beside)
+        return any(of.name == "turn_radpm" for of in self.card.extra_features)
 
     @property
     def classes(self) -> ClassTable:
@@ -157,45 +158,45 @@ class Model:
     @property
     def class_counts(self) -> Mapping[int, int]:
         """Training samples by terrain class."""
-        return self.card.seen.class_counts
+        return self.card.training_range.class_counts
 
     @property
     def pixel_classes(self) -> tuple[int, ...]:
         """Classes of which any pixel occurs in training."""
-        return self.card.seen.pixel_classes
+        return self.card.training_range.pixel_classes
 
     @property
-    def seen(self) -> Mapping[str, tuple[float, float]]:
+    def training_range(self) -> Mapping[str, tuple[float, float]]:
         """Smallest and largest slope_rad, cross_slope_rad, relief_m in training."""
-        return self.card.seen.ranges
+        return self.card.training_range.ranges
 
-    def predict(self, patches: Floats, beside: ExtraFeatures | None = None) -> Floats:
+    def predict(self, patches: Floats, extra_features: ExtraFeatures | None = None) -> Floats:
         """Return power [W] and velocity [m/s], shape (N, 2), of patches in [0, 1], shape (N, px, px, depth).
 
-        ``beside`` holds what is known of the N segments besides their patches (`tcpipe.dataset.extra_features.read_extra_features` of a
-        split). Physics needs it; other models take what they were trained with, and their usual values where it is not given.
+        ``extra_features`` are those of the N segments (`tcpipe.dataset.extra_features.read_extra_features` of a split).
+        Physics needs them; other models take what they were trained with, and their usual values where it is not given.
         """
         wanted = (self.patch_px, self.patch_px, self.card.architecture.depth)
         if patches.shape[1:] != wanted:
             raise ModelError(
                 f"{self.name}: patches of shape {patches.shape[1:]}, wanted {wanted}: {', '.join(self.channels)}"
             )
-        out = self.outputs(patches, beside)
+        out = self.outputs(patches, extra_features)
         if "velocity_mps" in self._short_outputs:
             column = self._short_outputs.index("velocity_mps")
             out[:, column] = np.maximum(out[:, column], np.float32(LEAST_VELOCITY_MPS))
         return out
 
-    def outputs(self, patches: Floats, beside: ExtraFeatures | None = None) -> Floats:
+    def outputs(self, patches: Floats, extra_features: ExtraFeatures | None = None) -> Floats:
         """Return what the model gives, in the units of its outputs, shape (N, outputs)."""
         kind = self.card.training.config.model
         if kind == "physics":
-            if beside is None:
+            if extra_features is None:
                 raise ModelError(
                     f"{self.name}: physics needs the slope and class of each patch: predict(patches, beside)"
                 )
-            return self.physics_model.predict(beside).astype(np.float32)
-        numbers = standardize_features(self.card.beside, beside or empty_extra_features(len(patches)))
+            return self.physics_model.predict(extra_features).astype(np.float32)
+        numbers = standardize_features(self.card.extra_features, extra_features or empty_extra_features(len(patches)))
         if kind == "resnet18":
             return self.network.predict(append_planes(patches, numbers)) * np.array(self.card.scale, np.float32)
         from tcpipe.learning.table_model import patch_features  # noqa: PLC0415  where it is needed, as is the next
@@ -257,18 +258,20 @@ def choose_model(path: str | Path, *, physics: str | Path | None = None, speed_m
 
 def set_speed(model: Model, speed_mps: float) -> Model:
     """Return the model asked for a commanded speed [m/s] instead of the usual one; `UsageError` if it knows no such speed."""
-    command = next((of for of in model.card.beside if of.name == "command_mps"), None)
+    command = next((of for of in model.card.extra_features if of.name == "command_mps"), None)
     if command is None:
         raise UsageError(
             f"{model.name}: takes no commanded speed; leave out --speed, or train it with --extra-features"
         )
-    low, high = command.seen
+    low, high = command.training_range
     if not low - _SPEED_MARGIN_MPS <= speed_mps <= high + _SPEED_MARGIN_MPS:
         raise UsageError(
             f"--speed {speed_mps:g}: {model.name} was trained at commanded speeds of {low:.3g} to {high:.3g} m/s; give one of these"
         )
-    beside = tuple(replace(of, usual=speed_mps) if of is command else of for of in model.card.beside)
-    return replace(model, card=replace(model.card, beside=beside), checksum=digest([model.checksum, speed_mps]))
+    extra_features = tuple(replace(of, usual=speed_mps) if of is command else of for of in model.card.extra_features)
+    return replace(
+        model, card=replace(model.card, extra_features=extra_features), checksum=digest([model.checksum, speed_mps])
+    )
 
 
 def set_physics(model: Model, dataset: str | Path) -> Model:
@@ -294,9 +297,10 @@ def read_model_card(place: Path) -> ModelCard:
     if not where.is_file():
         raise UsageError(f"{place}: not a model: it has no {CARD}")
     try:
-        found = read_sealed(where, ours=is_current)
+        found = read_sealed(where, ours=lambda of: is_current(of) or of.get("schema_version") == EARLIER_SCHEMA_VERSION)
         if found.get("kind") != KIND:
             raise ModelError(f"{where}: not the card of a tcpipe model (kind is {found.get('kind')!r})")
+        found = _bring_card(found)
         if not is_current(found):
             version = found.get("schema_version")
             raise ModelError(
@@ -306,6 +310,17 @@ def read_model_card(place: Path) -> ModelCard:
     except StoreError as error:
         reason = error.problems[0].removesuffix("; remove it and run the command again")
         raise ModelError(f"{reason}; remove the folder and train the model again") from None
+
+
+def _bring_card(found: Mapping[str, Json]) -> dict[str, Json]:
+    """Return a card of tcpipe 0.8 as this version writes it, and others as they are."""
+    if found.get("schema_version") != EARLIER_SCHEMA_VERSION:
+        return dict(found)
+    card = rename_keys(found, EARLIER_MODEL_KEYS)
+    config = card["training"]["config"]
+    config |= {name: EARLIER_CHOICES.get(config[name], config[name]) for name in ("model", "label")}
+    energy = EARLIER_CHOICES.get(card["label_energy"], card["label_energy"])
+    return {**card, "schema_version": SCHEMA_VERSION, "label_energy": energy}
 
 
 def compute_card_checksum(card: ModelCard) -> str:

@@ -68,7 +68,7 @@ class ResNet18(nn.Module):
 
     def __init__(self, shape: Architecture) -> None:
         super().__init__()
-        self.stem = Normed(shape.depth + shape.beside, shape.width, 7, 2)
+        self.stem = Normed(shape.depth + shape.extra_features, shape.width, 7, 2)
         depth = shape.width
         for stage in range(4):
             for block in range(2):

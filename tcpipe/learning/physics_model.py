@@ -37,20 +37,22 @@ class PhysicsModel:
     """N, shape ()."""
     recovered: Floats
     """Share of negative work that comes back, shape ()."""
-    mean_turn_radpm: Floats
+    usual_turn_radpm: Floats
     """Of the training samples: what a metre is taken to turn where nothing is known of it, shape ()."""
     rolling_newton: Floats
     """F by class id, shape (256,)."""
     turning_joule_per_rad: Floats
     """M by class id, shape (256,)."""
 
-    def predict(self, beside: ExtraFeatures) -> Floats:
+    def predict(self, extra_features: ExtraFeatures) -> Floats:
         """Return power [W] and velocity [m/s], shape (N, 2)."""
-        velocity = np.maximum(self.speed.predict(beside.slope_rad, beside.class_id)[:, 0], LEAST_VELOCITY_MPS)
-        turn = np.where(np.isfinite(beside.turn_radpm), beside.turn_radpm, self.mean_turn_radpm)
-        force = self.rolling_newton[beside.class_id] + self.grade_newton * np.tan(beside.slope_rad)
-        work = velocity * (force + self.turning_joule_per_rad[beside.class_id] * turn)
-        always = self.no_load_watt + self.drivetrain_newton * velocity / np.cos(beside.slope_rad)
+        velocity = np.maximum(
+            self.speed.predict(extra_features.slope_rad, extra_features.class_id)[:, 0], LEAST_VELOCITY_MPS
+        )
+        turn = np.where(np.isfinite(extra_features.turn_radpm), extra_features.turn_radpm, self.usual_turn_radpm)
+        force = self.rolling_newton[extra_features.class_id] + self.grade_newton * np.tan(extra_features.slope_rad)
+        work = velocity * (force + self.turning_joule_per_rad[extra_features.class_id] * turn)
+        always = self.no_load_watt + self.drivetrain_newton * velocity / np.cos(extra_features.slope_rad)
         return np.column_stack([always + np.where(work > 0.0, 1.0, self.recovered) * work, velocity])
 
     def arrays(self) -> dict[str, NDArray[np.generic]]:
@@ -78,12 +80,12 @@ def read_physics_model(arrays: Mapping[str, NDArray[Any]], where: str) -> Physic
     return PhysicsModel(speed, **rest)
 
 
-def fit_physics_model(beside: ExtraFeatures, labels: Floats, *, idle_watt: float | None) -> PhysicsModel:
+def fit_physics_model(extra_features: ExtraFeatures, labels: Floats, *, idle_watt: float | None) -> PhysicsModel:
     """Fit it to samples.
 
     Parameters
     ----------
-    beside : of N samples; without any turn it has no term for turning.
+    extra_features : of N samples; without any turn it has no term for turning.
     labels : power [W] and velocity [m/s], finite, shape (N, 2).
     idle_watt : what the robot was seen to draw while it stood; None where it was not.
 
@@ -91,20 +93,20 @@ def fit_physics_model(beside: ExtraFeatures, labels: Floats, *, idle_watt: float
     ------
     ModelError : there are fewer than 20 samples.
     """
-    names = np.where(beside.class_id > 0, beside.class_id.astype(np.str_), ALL)
+    names = np.where(extra_features.class_id > 0, extra_features.class_id.astype(np.str_), ALL)
     power, velocity = labels.T
-    metres = FitSamples(power, velocity, np.tan(beside.slope_rad), beside.turn_radpm * velocity, names)
+    metres = FitSamples(power, velocity, np.tan(extra_features.slope_rad), extra_features.turn_radpm * velocity, names)
     found = fit_physics(metres, idle_watt=idle_watt)
     if found is None:
         raise ModelError(f"{len(labels)} samples to fit physics to, wanted at least {FEWEST} that move")
-    known = beside.turn_radpm[np.isfinite(beside.turn_radpm)]
+    known = extra_features.turn_radpm[np.isfinite(extra_features.turn_radpm)]
     return PhysicsModel(
-        speed=fit_curves("linear", beside.slope_rad, beside.class_id, labels[:, 1:]),
+        speed=fit_curves("linear", extra_features.slope_rad, extra_features.class_id, labels[:, 1:]),
         no_load_watt=_evaluate_all(found, "idle"),
         drivetrain_newton=_evaluate_all(found, "drivetrain"),
         grade_newton=_evaluate_all(found, "grade"),
         recovered=np.array(found.recovered),
-        mean_turn_radpm=np.array(float(known.mean()) if known.size else 0.0),
+        usual_turn_radpm=np.array(float(known.mean()) if known.size else 0.0),
         rolling_newton=_collect_by_class(found, "rolling"),
         turning_joule_per_rad=_collect_by_class(found, "turning"),
     )

@@ -96,17 +96,17 @@ def predict_costs(
     rng = np.random.default_rng(list(seed))
     replaced = [model.channels.index(name) for name in noise]
     parts = [np.empty((0, len(model.card.outputs)), np.float32)]
-    beside, first = read_extra_features(split), 0
+    extra_features, first = read_extra_features(split), 0
     for patches in _iterate_patches(chosen):
         for channel in replaced:
             patches[..., channel] = rng.random(patches.shape[:3], np.float32)
-        parts.append(model.predict(patches, beside.take(slice(first, first + len(patches)))))
+        parts.append(model.predict(patches, extra_features.take(slice(first, first + len(patches)))))
         first += len(patches)
     said = np.concatenate(parts).astype(np.float64)
     if said.shape[1] == 1:
         return {"E": said[:, 0]}
     shown = "terrain" in model.channels and "terrain" not in noise
-    class_id = beside.class_id if shown else np.zeros(len(said), np.int64)
+    class_id = extra_features.class_id if shown else np.zeros(len(said), np.int64)
     power, velocity = fit_bias_correction(model.residuals).apply(said[:, 0], said[:, 1], class_id)
     return compute_costs(power, np.maximum(velocity, LEAST_VELOCITY_MPS), model.chord_m)
 

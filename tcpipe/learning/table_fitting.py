@@ -57,7 +57,7 @@ def fit_at_once(task: Task, config: FitConfig, *, name: str, key: str, patch_m: 
     """
     split, scale, began = task.train, label_scale(task), time.perf_counter()
     labels = collect_labels(split, task.outputs).astype(np.float64)
-    weighed = config.weights and split.weights.shape == labels.shape
+    weighed = config.inverse_variance_weights and split.weights.shape == labels.shape
     weights = split.weights.astype(np.float64) if weighed else np.ones_like(labels)
     logger.info("%s: %d samples, each predicted by the other folds", name, len(split))
     made = (
@@ -68,14 +68,14 @@ def fit_at_once(task: Task, config: FitConfig, *, name: str, key: str, patch_m: 
     factors, over = compute_loss_factors(config.loss, scale), np.array(scale)
     loss, held = (float(mean_loss(said / over, labels / over, factors, weights)) for said in (made.said, made.held_out))
     progress = TrainingProgress(key, made.rounds, made.rounds, held, [(made.rounds, loss, held)])
-    spent = TrainingTimes(time.perf_counter() - began, made.fed_s, len(split))
-    return Fitted(made.weights, (1.0,) * labels.shape[1], split, made.held_out, progress, spent, "cpu")
+    training_times_s = TrainingTimes(time.perf_counter() - began, made.fed_s, len(split))
+    return Fitted(made.weights, (1.0,) * labels.shape[1], split, made.held_out, progress, training_times_s, "cpu")
 
 
 def _fit_trees(task: Task, labels: Floats, weights: Floats, patch_m: float, class_count: int) -> _FittedModel:
     """Grow trees, as many as the folds are told best by."""
     split, began = task.train, time.perf_counter()
-    numbers = standardize_features(task.beside, read_extra_features(split))
+    numbers = standardize_features(task.extra_features, read_extra_features(split))
     features = np.column_stack([compute_features(split, patch_m, class_count), numbers])
     fed_s = time.perf_counter() - began
     model, held_out = fit_table(
@@ -87,14 +87,14 @@ def _fit_trees(task: Task, labels: Floats, weights: Floats, patch_m: float, clas
 
 def _fit_physics(split: Split, labels: Floats) -> _FittedModel:
     """Fit physics to all, and to all but each fold."""
-    beside, folds, idle_watt = read_extra_features(split), split.column("fold"), find_idle_power(split)
+    extra_features, folds, idle_watt = read_extra_features(split), split.column("fold"), find_idle_power(split)
     held_out = np.empty_like(labels)
     for fold in np.unique(folds):
         held = folds == fold
-        fitted = fit_physics_model(beside.take(~held), labels[~held], idle_watt=idle_watt)
-        held_out[held] = fitted.predict(beside.take(held))
-    whole = fit_physics_model(beside, labels, idle_watt=idle_watt)
-    return _FittedModel(whole.arrays(), whole.predict(beside), held_out, 1)
+        fitted = fit_physics_model(extra_features.take(~held), labels[~held], idle_watt=idle_watt)
+        held_out[held] = fitted.predict(extra_features.take(held))
+    whole = fit_physics_model(extra_features, labels, idle_watt=idle_watt)
+    return _FittedModel(whole.arrays(), whole.predict(extra_features), held_out, 1)
 
 
 def compute_features(split: Split, patch_m: float, class_count: int) -> Floats:

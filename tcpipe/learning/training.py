@@ -75,7 +75,7 @@ class TrainResult:
     best_epoch: int
     held_out_loss: float
     device: str
-    spent: TrainingTimes
+    training_times_s: TrainingTimes
     feeding_share: float
     """Share of the time in which the network waited for batches."""
 
@@ -87,14 +87,18 @@ class TrainResult:
         if self.model == "physics":
             return (
                 f"{self.path}: physics of {fitted} samples, each predicted by the other folds\n"
-                f"held-out loss {self.held_out_loss:.4f}; {self.spent.total_s:.1f} s"
+                f"held-out loss {self.held_out_loss:.4f}; {self.training_times_s.total_s:.1f} s"
             )
-        if self.model == "table":
+        if self.model == "boosting":
+            features = f"{100.0 * self.feeding_share:.0f} % of it for features"
             return (
                 f"{self.path}: {self.best_epoch} trees a label of {fitted} samples, each predicted by the other folds\n"
-                f"held-out loss {self.held_out_loss:.4f}; {self.spent.total_s:.1f} s, {100.0 * self.feeding_share:.0f} % of it for features"
+                f"held-out loss {self.held_out_loss:.4f}; {self.training_times_s.total_s:.1f} s, {features}"
             )
-        speed, share = self.spent.samples / max(self.spent.total_s, 1e-9), 100.0 * self.feeding_share
+        speed, share = (
+            self.training_times_s.samples / max(self.training_times_s.total_s, 1e-9),
+            100.0 * self.feeding_share,
+        )
         return (
             f"{self.path}: trained on {fitted} samples, stopped by {held}; best of {self.epochs} epochs is {self.best_epoch}\n"
             f"held-out loss {self.held_out_loss:.4f}; {speed:.0f} samples/s on {self.device}, {share:.1f} % of the time feeding"
@@ -104,15 +108,11 @@ class TrainResult:
 def model_for(dataset: str | Path) -> ModelKind:
     """Return the kind of model that a dataset of this size is best served by, and say so."""
     count = read_card(fetch_directory_by_range(dataset, by_range=is_shard)[0]).splits.get("train", 0)
-    kind: ModelKind = "table" if count < FEW_SAMPLES else "resnet18"
-    than, other = ("fewer than", "resnet18") if kind == "table" else ("not fewer than", "table")
+    kind: ModelKind = "boosting" if count < FEW_SAMPLES else "resnet18"
+    than, other = ("fewer than", "resnet18") if kind == "boosting" else ("not fewer than", "boosting")
     logger.info(
-        "%d training samples are %s %d: a %s is trained; --model %s is the other choice",
-        count,
-        than,
-        FEW_SAMPLES,
-        kind,
-        other,
+        "%d training samples, %s %d: tcpipe trains a model of kind %s; to train the other kind: --model %s",
+        *(count, than, FEW_SAMPLES, kind, other),
     )
     return kind
 
@@ -123,7 +123,7 @@ def train(
     *,
     config: FitConfig | None = None,
     variant: Variant | None = None,
-    fresh: bool = False,
+    no_resume: bool = False,
     disposable: bool = False,
 ) -> TrainResult:
     """Train the paper's network on a dataset and write the model folder ``out``, whole or not at all.
@@ -136,7 +136,7 @@ def train(
         ``<out>.checkpoint``, and gone on from.
     config : how.
     variant : on what, where it is not the paper's network.
-    fresh : leave an earlier state aside.
+    no_resume : leave an earlier state aside.
     disposable : leave aside a state that is cut short or of another training, and say so: whoever asks for this network can make it again.
 
     Raises
@@ -154,14 +154,19 @@ def train(
     place = Path(out)
     clear_beside(place)
     checkpoint = _find_checkpoint_path(place)
-    if (known := _read_known_card(place)) is not None and known.training.key == key and not fresh and _is_whole(place):
+    if (
+        (known := _read_known_card(place)) is not None
+        and known.training.key == key
+        and not no_resume
+        and _is_whole(place)
+    ):
         _drop_what_is_done(checkpoint, key)
         return _make_unchanged_result(place, known.training)
     task = _add_extra_features(make_training_task(data, rules.fold, other), rules, data)
     _refuse_strangers(place)
-    if rules.weights and not other.energy_only:
+    if rules.inverse_variance_weights and not other.energy_only:
         _refuse_without_deviations(task, data)
-    if fresh or (disposable and checkpoint.exists() and not _is_of(checkpoint, key)):
+    if no_resume or (disposable and checkpoint.exists() and not _is_of(checkpoint, key)):
         checkpoint.unlink(missing_ok=True)
     fitted = _fit_model(task, rules, data, name=str(place), key=key, checkpoint=checkpoint)
     card = _make_card(data, task, rules, fitted, key)
@@ -181,8 +186,8 @@ def train(
         progress.best_epoch,
         progress.best_loss,
         fitted.device,
-        fitted.spent,
-        fitted.spent.feeding_share,
+        fitted.training_times_s,
+        fitted.training_times_s.feeding_share,
     )
 
 
@@ -248,7 +253,7 @@ def make_training_task(data: Dataset, fold: int, variant: Variant) -> Task:
 
 def _add_extra_features(task: Task, rules: FitConfig, data: Dataset) -> Task:
     """Return the task with what its model is told beside a patch; physics takes the turn in any case, a network of energy alone nothing."""
-    if rules.model != "physics" and (not rules.beside or len(task.outputs) == 1):
+    if rules.model != "physics" and (not rules.extra_features or len(task.outputs) == 1):
         return task
     wanted = ("turn_radpm",) if rules.model == "physics" else ("turn_radpm", "command_mps")
     found = tuple(of for of in available_features(read_extra_features(task.fit)) if of.name in wanted)
@@ -260,7 +265,7 @@ def _add_extra_features(task: Task, rules: FitConfig, data: Dataset) -> Task:
         )
     if lacking:
         logger.warning("%s: its samples have no %s: the model is not told it", data.path, " and no ".join(lacking))
-    return replace(task, beside=found)
+    return replace(task, extra_features=found)
 
 
 def find_training_range(split: Split) -> TrainingRange:
@@ -374,12 +379,12 @@ def _make_card(data: Dataset, task: Task, config: FitConfig, fitted: Fitted, key
             form.depth,
             len(fitted.scale),
             config.width if config.model == "resnet18" else 0,
-            len(task.beside),
+            len(task.extra_features),
         ),
         channels=task.fit.channels,
         outputs=task.outputs,
         scale=fitted.scale,
-        beside=task.beside,
+        extra_features=task.extra_features,
         patch_m=card.patch_m,
         chord_m=card.recipe.segment.chord_m,
         max_arc_to_chord=card.recipe.segment.max_arc_to_chord,
@@ -388,7 +393,9 @@ def _make_card(data: Dataset, task: Task, config: FitConfig, fitted: Fitted, key
         label_includes=card.label.includes,
         robot=", ".join(card.robots),
         classes=read_class_table(card).classes,
-        seen=find_training_range((task.fit if config.model == "resnet18" else task.train).with_channels(*card.layers)),
+        training_range=find_training_range(
+            (task.fit if config.model == "resnet18" else task.train).with_channels(*card.layers)
+        ),
         physics=card.physics.get(card.robots[0]) if len(card.robots) == 1 else None,
         dataset=TrainedOn(card.name, compute_dataset_checksum(card), card.data_model_version, card.splits),
         training=_describe_training(task, config, fitted, key),
@@ -400,7 +407,7 @@ def read_class_table(card: DatasetCard) -> ClassTable:
     return ClassTable(card.classes) if card.classes else PAPER_CLASSES
 
 
-_OPTIMIZERS: Mapping[ModelKind, str] = {"resnet18": "Adam", "table": "LightGBM", "physics": "robust least squares"}
+_OPTIMIZERS: Mapping[ModelKind, str] = {"resnet18": "Adam", "boosting": "LightGBM", "physics": "robust least squares"}
 
 
 def _describe_training(task: Task, config: FitConfig, fitted: Fitted, key: str) -> Training:

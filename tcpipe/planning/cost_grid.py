@@ -1,7 +1,7 @@
 """The cost of a metre along 16 courses at the cells of a coarse grid over a map: which cells, where they lie, what is known of them.
 
-A cell is a square of ``step_m`` map metres; its cost along a course is that of the metre of ground whose middle is the cell's, driven that
-way.
+A cell is a square of ``cell_size_m`` map metres; its cost along a course is that of the metre of ground whose
+middle is the cell's, driven that way.
 """
 
 from __future__ import annotations
@@ -91,13 +91,15 @@ BARRED = NO_COST | Reason.OBSTACLE
 """Ground that a planner never crosses."""
 
 
-def make_grid(source: MapReader, step_m: float) -> MapGrid:
+def make_grid(source: MapReader, cell_size_m: float) -> MapGrid:
     """Return the grid of cells: from the map's north-west corner, as many as fit whole. `MapError`: the map is smaller than a cell."""
     grid = source.grid
-    cells = [int(size * grid.pixel_size_m / step_m + 1e-6) for size in (grid.rows, grid.cols)]
+    cells = [int(size * grid.pixel_size_m / cell_size_m + 1e-6) for size in (grid.rows, grid.cols)]
     if min(cells) < 1:
-        raise MapError(f"map {source.name}: is smaller than one cell of {step_m:g} m; choose a smaller --cell-size")
-    return MapGrid(grid.crs, grid.x_min_m, grid.y_max_m, step_m, cells[0], cells[1])
+        raise MapError(
+            f"map {source.name}: is smaller than one cell of {cell_size_m:g} m; choose a smaller --cell-size"
+        )
+    return MapGrid(grid.crs, grid.x_min_m, grid.y_max_m, cell_size_m, cells[0], cells[1])
 
 
 @dataclass(frozen=True, slots=True)
@@ -252,9 +254,9 @@ class LazyCostGrid:
             step(number, len(todo))
 
 
-def make_survey(model: CostModel, source: MapReader, step_m: float) -> LazyCostGrid:
+def make_survey(model: CostModel, source: MapReader, cell_size_m: float) -> LazyCostGrid:
     """Return a survey of which nothing is known."""
-    grid = make_grid(source, step_m)
+    grid = make_grid(source, cell_size_m)
     known = np.zeros((2, grid.rows, grid.cols), np.bool_)
     return LazyCostGrid(
         model, source, make_empty_grid(grid), known[0], known[1], CellFrames(grid, where=f"map {source.name}")

@@ -146,9 +146,9 @@ class CostMapResult:
         )
 
 
-def make_cost_map_key(model: CostModel, source: MapFile, step_m: float) -> str:
+def make_cost_map_key(model: CostModel, source: MapFile, cell_size_m: float) -> str:
     """Return what a cost map is made from, as a digest."""
-    return digest({"model": model.checksum, "map": source.summary(), "step_m": step_m, "version": VERSION})
+    return digest({"model": model.checksum, "map": source.summary(), "cell_size_m": cell_size_m, "version": VERSION})
 
 
 def make_cost_map(
@@ -156,7 +156,7 @@ def make_cost_map(
     source: MapFile,
     out: Path | str,
     *,
-    step_m: float,
+    cell_size_m: float,
     origin_deg: tuple[float, float] | None = None,
     step: Step = lambda _, __: None,
     cluster: Cluster | None = None,
@@ -168,7 +168,7 @@ def make_cost_map(
     model, source : who predicts, and the map.
     out : its directory: new, empty, or a cost map, which is replaced unless it is made from the same; or a URL in a bucket, where it
         becomes the newest generation, and an interrupted call begins anew.
-    step_m : side of a cell in the map's plane [m].
+    cell_size_m : side of a cell in the map's plane [m].
     origin_deg : longitude and latitude where the frame of the Nav2 maps has x = y = 0, its axes those of the map's CRS; the CRS's own
         without.
     step : is told how many blocks of how many are done.
@@ -182,13 +182,13 @@ def make_cost_map(
     check_model(model, source)
     if is_url(out):
         return _map_into_bucket(
-            model, source, str(out), step_m=step_m, origin_deg=origin_deg, step=step, cluster=cluster
+            model, source, str(out), cell_size_m=cell_size_m, origin_deg=origin_deg, step=step, cluster=cluster
         )
     out = Path(out)
     clear_beside(out)
     grid, key, origin_m = (
-        make_grid(source, step_m),
-        make_cost_map_key(model, source, step_m),
+        make_grid(source, cell_size_m),
+        make_cost_map_key(model, source, cell_size_m),
         _find_origin_m(source, origin_deg),
     )
     if out.exists() and not (out / CARD).is_file() and (not out.is_dir() or any(out.iterdir())):
@@ -216,17 +216,22 @@ def _map_into_bucket(
     source: MapFile,
     url: str,
     *,
-    step_m: float,
+    cell_size_m: float,
     origin_deg: tuple[float, float] | None,
     step: Step,
     cluster: Cluster | None,
 ) -> CostMapResult:
     """Make it on this machine, and put it to a URL."""
     known = read_cost_map_card(fetch_directory(url)) if has_card(url) else None
-    if known is not None and (known.key, known.origin_deg) == (make_cost_map_key(model, source, step_m), origin_deg):
+    if known is not None and (known.key, known.origin_deg) == (
+        make_cost_map_key(model, source, cell_size_m),
+        origin_deg,
+    ):
         return CostMapResult(url, "unchanged", known)
     with write_generation(url, CARD) as place:
-        made = make_cost_map(model, source, place, step_m=step_m, origin_deg=origin_deg, step=step, cluster=cluster)
+        made = make_cost_map(
+            model, source, place, cell_size_m=cell_size_m, origin_deg=origin_deg, step=step, cluster=cluster
+        )
     return replace(made, path=url)
 
 

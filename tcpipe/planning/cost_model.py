@@ -83,7 +83,7 @@ class CostModel(Protocol):
         """Classes of which any pixel occurred in training."""
 
     @property
-    def seen(self) -> Mapping[str, tuple[float, float]]:
+    def training_range(self) -> Mapping[str, tuple[float, float]]:
         """Smallest and largest ``slope_rad``, ``cross_slope_rad`` [rad] and ``relief_m`` [m] of the training patches."""
 
     @property
@@ -102,7 +102,7 @@ class CostModel(Protocol):
     def takes_turns(self) -> bool:
         """Whether it is told how far a metre turns: its predictions hold what that costs."""
 
-    def predict(self, patches: NDArray[np.float32], beside: ExtraFeatures) -> NDArray[np.float32]:
+    def predict(self, patches: NDArray[np.float32], extra_features: ExtraFeatures) -> NDArray[np.float32]:
         """Return power [W] and velocity [m/s], shape (N, 2), of tensors of shape (N, px, px, channels), and what is known beside them."""
 
 
@@ -152,9 +152,9 @@ def predict_patches(
     pixels = {layer: patches.pixels[layer] for layer in form.layers}
     out, unknown = np.full((asked.size, 2), np.nan), np.full(asked.size, np.nan)
     turns = unknown if turn_radpm is None else turn_radpm
-    beside = ExtraFeatures(patches.terrain_class.astype(np.int64), patches.slope_rad, turns, unknown)
+    extra_features = ExtraFeatures(patches.terrain_class.astype(np.int64), patches.slope_rad, turns, unknown)
     for rows in _iterate_batches(np.flatnonzero(asked)):
-        said = model.predict(form.form(pixels, rows), beside.take(rows))
+        said = model.predict(form.form(pixels, rows), extra_features.take(rows))
         if said.shape != (rows.size, 2):
             raise ModelError(
                 f"{model.name}: gives {said.shape[-1]} numbers a patch, wanted two: power and velocity; train it on both labels"

@@ -235,7 +235,7 @@ def format_drive(drive: DriveCost) -> list[str]:
         + (f", of them not compared: {rest}" if rest else ""),
         f"{drive.run_id}: {drive.near_training_percent:.0f} % of its segments are within {CLOSE:g} chords of a training sample",
     ]
-    above = ", above standing" if drive.label_energy == "net" else ""
+    above = ", net" if drive.label_energy == "net" else ""
     for called, of, unit in (("time", drive.duration_s, "s"), (f"energy{above}", drive.energy_joule, "J")):
         if drive.compared_m:
             interval = (

@@ -87,7 +87,7 @@ class PathResult(NamedTotals):
 
     def __str__(self) -> str:
         """Return the totals, their intervals, and findings, as plain lines."""
-        above = ", above standing" if self.label_energy == "net" else ""
+        above = ", net" if self.label_energy == "net" else ""
         findings = format_findings(find_doubts(self, Subject("file", self.path.name)))
         return clean_lines((f"{self.path}: {format_cost(self)}{above}", *findings, *self._out_lines()))
 
@@ -192,7 +192,7 @@ class PlanRequest:
     start_deg: tuple[float, float]
     goal_deg: tuple[float, float]
     objective: Objective = "energy"
-    step_m: Annotated[float, Bounds(ge=0.05, le=1000)] = 1.0
+    cell_size_m: Annotated[float, Bounds(ge=0.05, le=1000)] = 1.0
     allow_extrapolation: bool = False
     cost_map: Path | None = None
 
@@ -296,7 +296,7 @@ def plan(
     check_model(model, source)
     drawn = picture is not None
     card = None if request.cost_map is None else _read_card(request.cost_map, model, source)
-    rules = replace(request, cost_map=None, step_m=card.grid.pixel_size_m if card else request.step_m)
+    rules = replace(request, cost_map=None, cell_size_m=card.grid.pixel_size_m if card else request.cell_size_m)
     made_from = {"model": model.checksum, "map": source.summary(), "request": rules, "drawn": drawn}
     key = digest({**made_from, "cost_map": card is not None, "version": _PLAN_VERSION})
     if (found := _read_plans(out, picture, key)) is not None:
@@ -350,7 +350,7 @@ def _read_card(path: Path, model: CostModel, source: MapFile) -> CostMapCard:
 def _open_survey(model: CostModel, source: MapFile, request: PlanRequest, card: CostMapCard | None) -> LazyCostGrid:
     """Return what a cost map knows, or nothing yet."""
     if request.cost_map is None or card is None:
-        return make_survey(model, source, request.step_m)
+        return make_survey(model, source, request.cell_size_m)
     return read_survey(model, source, open_cost_map(request.cost_map, card))
 
 

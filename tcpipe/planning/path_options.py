@@ -24,7 +24,7 @@ class PredictPathOptions:
     out: str | Path | None = option(
         None, Option("Write the table of pieces: .csv, .parquet or .json.", (), "output_file", "FILE")
     )
-    physics: str | Path | None = option(None, PHYSICS)
+    physics_from: str | Path | None = option(None, PHYSICS)
     speed_mps: float | None = option(None, SPEED)
     store: str | Path = option("tcpipe-store", STORE)
 
@@ -49,7 +49,7 @@ class PlanPathOptions:
         None,
         Option("A cost map of this model and map; without one only what is needed is predicted.", (), "sealed", "DIR"),
     )
-    step_m: float = option(
+    cell_size_m: float = option(
         1.0,
         Option(
             "Side of a cell; that of --cost-map rules.",
@@ -66,7 +66,7 @@ class PlanPathOptions:
             ("--allow-extrapolation",), earlier="--allow-unseen",
         ),
     )  # fmt: skip
-    physics: str | Path | None = option(None, PHYSICS)
+    physics_from: str | Path | None = option(None, PHYSICS)
     speed_mps: float | None = option(None, SPEED)
     store: str | Path = option("tcpipe-store", STORE)
     on_step: Callable[[int, int], None] | None = None
@@ -81,7 +81,7 @@ class CostMapOptions:
     out: str = option("cost-map", Option(kind="published", metavar="[OUT]", is_argument=True))
     _: KW_ONLY
     map_name: str | None = option(None, MAP)
-    step_m: float = option(
+    cell_size_m: float = option(
         1.0, Option("Side of a cell.", ("--cell-size",), Range(0.05, 1000.0), "METRES", earlier="--step")
     )
     origin_deg: tuple[float, float] | None = option(

@@ -120,7 +120,7 @@ def find_reasons(patches: Patches, on_map: NDArray[np.bool_], model: CostModel, 
         Reason.RELIEF_OUTSIDE_TRAINING: (compute_relief_m(patches.pixels["height"]), "relief_m"),
     }
     for reason, (values, name) in ranges.items():
-        low, high = model.seen[name]
+        low, high = model.training_range[name]
         bits[~((values >= low) & (values <= high))] |= np.uint16(reason)
     if "terrain" in patches.pixels:
         bits |= _find_class_reasons(patches, patches.pixels["terrain"], model, source)

@@ -99,7 +99,11 @@ def _make_numbers(card: DatasetCard) -> list[Number]:
         *(Number(f"{card.splits[split]}", split) for split in SPLIT_COLOURS),
         Number(f"{len(card.runs)}", "runs"),
         Number(f"{sum(card.distance_by_reason_m.values()):.0f} m", "driven"),
-        *([] if card.flagged_samples is None else [Number(f"{100 * card.flagged_samples.share:.1f} %", "flagged samples")]),
+        *(
+            []
+            if card.flagged_samples is None
+            else [Number(f"{100 * card.flagged_samples.share:.1f} %", "flagged samples")]
+        ),
     ]
 
 

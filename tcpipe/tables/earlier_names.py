@@ -55,13 +55,24 @@ EARLIER_DOCUMENT_KEYS = {
 """Keys of manifests and cards; `tcpipe migrate` renames them."""
 
 
-def rename_keys(document: Any) -> Any:
-    """Return a document, or a part of one, with `EARLIER_DOCUMENT_KEYS` by their names of today."""
+EARLIER_MODEL_KEYS = {
+    "beside": "extra_features",
+    "seen": "training_range",
+    "batch": "batch_size",
+    "weights": "inverse_variance_weights",
+    "usual_turn_radpm": "mean_turn_radpm",
+    "standing": "idle",
+}
+"""Keys of model.json."""
+
+
+def rename_keys(document: Any, names: Mapping[str, str] = EARLIER_DOCUMENT_KEYS) -> Any:
+    """Return a document, or a part of one, with keys by their names of today."""
     if isinstance(document, list):
-        return [rename_keys(item) for item in document]
+        return [rename_keys(item, names) for item in document]
     if not isinstance(document, Mapping):
         return document
-    return {EARLIER_DOCUMENT_KEYS.get(key, key): rename_keys(value) for key, value in document.items()}
+    return {names.get(key, key): rename_keys(value, names) for key, value in document.items()}
 
 
 EARLIER_CHOICES = {"table": "boosting", "above_standing": "net"}

@@ -5,18 +5,20 @@ import pytest
 from tcpipe.cli import cli
 
 EARLIER = [
-    ("train", ["--batch", "32"], "batch", 32),
-    ("train", ["--weights"], "weights", True),
-    ("train", ["--beside"], "beside", True),
-    ("train", ["--fresh"], "fresh", True),
-    ("evaluate", ["--draws", "2"], "draws", 2),
-    ("evaluate", ["--retrain"], "retrain", True),
-    ("predict-path", ["--physics", "."], "physics", "."),
-    ("plan-path", ["--physics", "."], "physics", "."),
-    ("plan-path", ["--step", "2"], "step_m", 2.0),
-    ("plan-path", ["--allow-unseen"], "allow_unseen", True),
-    ("cost-map", ["--step", "2"], "step_m", 2.0),
-    ("reproduce", ["--hidden", "2"], "hidden", 2.0),
+    ("train", ["--batch", "32"], "batch_size", 32),
+    ("train", ["--weights"], "inverse_variance_weights", True),
+    ("train", ["--beside"], "extra_features", True),
+    ("train", ["--fresh"], "no_resume", True),
+    ("train", ["--model", "table"], "model", "boosting"),
+    ("train", ["--label", "above_standing"], "label", "net"),
+    ("evaluate", ["--draws", "2"], "noise_draws", 2),
+    ("evaluate", ["--retrain"], "retrain_ablation", True),
+    ("predict-path", ["--physics", "."], "physics_from", "."),
+    ("plan-path", ["--physics", "."], "physics_from", "."),
+    ("plan-path", ["--step", "2"], "cell_size_m", 2.0),
+    ("plan-path", ["--allow-unseen"], "allow_extrapolation", True),
+    ("cost-map", ["--step", "2"], "cell_size_m", 2.0),
+    ("reproduce", ["--hidden", "2"], "hidden_variance", 2.0),
 ]
 
 
@@ -25,4 +27,4 @@ def test_an_earlier_name_is_read_and_not_shown(name: str, given: list[str], para
     command = cli.commands[name]
     context = command.make_context(name, [*given], resilient_parsing=True)
     assert context.params[parameter] == value
-    assert not {given[0], f"{given[0]},"} & set(command.get_help(context).split())
+    assert value in ("boosting", "net") or not {given[0], f"{given[0]},"} & set(command.get_help(context).split())

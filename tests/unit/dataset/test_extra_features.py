@@ -39,9 +39,9 @@ def test_a_turn_is_the_angle_of_a_metre():
 
 
 def test_inputs_are_those_that_any_sample_tells():
-    beside = ExtraFeatures(np.zeros(3, int), np.zeros(3), np.array([0.1, 0.3, np.nan]), np.full(3, np.nan))
-    (turn,) = available_features(beside)
-    assert (turn.name, turn.mean, turn.usual, turn.seen) == (
+    extra_features = ExtraFeatures(np.zeros(3, int), np.zeros(3), np.array([0.1, 0.3, np.nan]), np.full(3, np.nan))
+    (turn,) = available_features(extra_features)
+    assert (turn.name, turn.mean, turn.usual, turn.training_range) == (
         "turn_radpm",
         pytest.approx(0.2),
         pytest.approx(0.2),
@@ -52,11 +52,13 @@ def test_inputs_are_those_that_any_sample_tells():
 
 
 def test_numbers_are_deviations_and_what_is_not_known_is_usual():
-    beside = ExtraFeatures(np.zeros(2, int), np.zeros(2), np.array([0.2, np.nan]), np.array([np.nan, 0.6]))
-    assert standardize_features([TURN, SPEED], beside) == pytest.approx(np.array([[2.0, 0.5], [0.0, -1.0]]))
+    extra_features = ExtraFeatures(np.zeros(2, int), np.zeros(2), np.array([0.2, np.nan]), np.array([np.nan, 0.6]))
+    assert standardize_features([TURN, SPEED], extra_features) == pytest.approx(np.array([[2.0, 0.5], [0.0, -1.0]]))
     columns = np.array([[0.2, 1.0, 1.0, np.nan], [np.nan, 1.0, 1.0, 0.6]])
-    assert standardize_columns([TURN, SPEED], columns) == pytest.approx(standardize_features([TURN, SPEED], beside))
-    assert standardize_features([], beside).shape == (2, 0)
+    assert standardize_columns([TURN, SPEED], columns) == pytest.approx(
+        standardize_features([TURN, SPEED], extra_features)
+    )
+    assert standardize_features([], extra_features).shape == (2, 0)
 
 
 def test_each_number_is_a_channel_of_one_value():

@@ -64,7 +64,7 @@ def test_labels_above_standing_are_the_same_samples_less_what_standing_takes(pat
     variance = half.column("net_power_std_watt") ** 2
     np.testing.assert_allclose(half.weights[:, 0] * variance, (half.weights[:, 0] * variance)[0], rtol=1e-5)
     assert set(above.clean(max_power_std_watt=1.25).column("net_power_std_watt")) <= {1.0, 1.1, 1.2}
-    with pytest.raises(DatasetError, match="label 'sum': wanted one of total, above_standing"):
+    with pytest.raises(DatasetError, match="label 'sum': wanted one of total, net"):
         open_dataset(path, label="sum")
 
 

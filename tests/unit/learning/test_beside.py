@@ -36,33 +36,35 @@ def _column(split, name):
 
 
 def _labels(split):
-    beside = read_extra_features(split)
-    return (real_labels(split) + np.column_stack([400.0 * beside.turn_radpm, 1.0 * beside.command_mps])).astype(
-        np.float32
-    )
+    extra_features = read_extra_features(split)
+    return (
+        real_labels(split) + np.column_stack([400.0 * extra_features.turn_radpm, 1.0 * extra_features.command_mps])
+    ).astype(np.float32)
 
 
-@pytest.mark.parametrize("kind", ["table", "resnet18"])
+@pytest.mark.parametrize("kind", ["boosting", "resnet18"])
 def test_what_is_told_beside_a_patch_is_heeded(told, tmp_path, kind):
-    pytest.importorskip("lightgbm" if kind == "table" else "torch")
-    config = FitConfig(model=kind, beside=True, epochs=1, width=16, batch=32)
+    pytest.importorskip("lightgbm" if kind == "boosting" else "torch")
+    config = FitConfig(model=kind, extra_features=True, epochs=1, width=16, batch_size=32)
     train(told, tmp_path / "model", config=config)
     model, split = load_model(tmp_path / "model"), open_dataset(told)["test"]
-    assert [of.name for of in model.card.beside] == ["turn_radpm", "command_mps"]
-    assert model.card.beside[1].seen == (0.5, 1.0)
+    assert [of.name for of in model.card.extra_features] == ["turn_radpm", "command_mps"]
+    assert model.card.extra_features[1].training_range == (0.5, 1.0)
     assert model.takes_turns
-    beside = read_extra_features(split)
-    said = model.predict(split.patches, beside)
+    extra_features = read_extra_features(split)
+    said = model.predict(split.patches, extra_features)
     assert predict_costs(replace(model, residuals={}), split)["w"] == pytest.approx(said[:, 0])  # not centred
     usual = model.predict(split.patches)
     straight = replace(
-        beside, turn_radpm=np.full(len(split), model.card.beside[0].usual), command_mps=np.full(len(split), np.nan)
+        extra_features,
+        turn_radpm=np.full(len(split), model.card.extra_features[0].usual),
+        command_mps=np.full(len(split), np.nan),
     )
     assert model.predict(split.patches, straight) == pytest.approx(usual, rel=1e-5)
     assert np.abs(said - usual).max() > 0.0
     full, half = (set_speed(model, mps).predict(split.patches)[:, 1] for mps in (1.0, 0.5))
     assert np.abs(full - half).max() > 0.0
-    if kind == "table":
+    if kind == "boosting":
         assert 0.35 < (full - half).mean() < 0.6  # 0.5 was put in
         assert np.std(said[:, 0] - split.labels[:, 0]) < np.std(usual[:, 0] - split.labels[:, 0])
     assert "usually" in (tmp_path / "model" / "MODEL.md").read_text()
@@ -92,7 +94,7 @@ def test_physics_is_a_model_like_the_others(told, tmp_path):
 
 def test_a_speed_that_nobody_drove_is_refused(told, tmp_path):
     pytest.importorskip("lightgbm")
-    train(told, tmp_path / "model", config=FitConfig(model="table", beside=True))
+    train(told, tmp_path / "model", config=FitConfig(model="boosting", extra_features=True))
     with pytest.raises(
         UsageError, match=r"--speed 2: .* trained at commanded speeds of 0\.5 to 1 m/s; give one of these"
     ):
@@ -106,10 +108,10 @@ def test_an_older_dataset_cannot_tell_and_says_so(dataset, tmp_path, monkeypatch
         Split, "column", lambda split, name: np.full(len(split), np.nan) if name in absent else real_column(split, name)
     )
     monkeypatch.setattr(Split, "labels", property(real_labels))
-    config = FitConfig(model="table", beside=True)
+    config = FitConfig(model="boosting", extra_features=True)
     train(dataset, tmp_path / "model", config=config)
     assert "its samples have no commanded speed (commanded_velocity_mps): the model is not told it" in caplog.text
-    assert [of.name for of in load_model(tmp_path / "model").card.beside] == ["turn_radpm"]
+    assert [of.name for of in load_model(tmp_path / "model").card.extra_features] == ["turn_radpm"]
     absent.add("mean_abs_yaw_rate_radps")
     with pytest.raises(
         DatasetError,

@@ -38,7 +38,7 @@ from tcpipe.terrain.classes import PAPER_CLASSES
 
 pytest.importorskip("torch")
 
-CONFIG, ONE_DRAW = (EvaluateConfig(draws=draws, baselines=False) for draws in (2, 1))
+CONFIG, ONE_DRAW = (EvaluateConfig(noise_draws=draws, baselines=False) for draws in (2, 1))
 
 
 @pytest.fixture(scope="module")

@@ -23,8 +23,8 @@ def drive(seed=0, count=COUNT):
 
 
 def test_a_robot_is_found_again():
-    beside, labels = drive()
-    model = fit_physics_model(beside, labels, idle_watt=50.0)
+    extra_features, labels = drive()
+    model = fit_physics_model(extra_features, labels, idle_watt=50.0)
     assert model.no_load_watt == pytest.approx(50.0, rel=0.01)
     assert model.grade_newton == pytest.approx(400.0, rel=0.01)
     assert model.rolling_newton[[4, 6]] == pytest.approx([60.0, 30.0], rel=0.02)
@@ -35,11 +35,11 @@ def test_a_robot_is_found_again():
 
 def test_what_the_drives_take_without_a_load_is_found_where_halts_tell_less():
     """14 W at halts, 62 N more as soon as it moves, seen where slopes drive the robot; a model before 0.7 has no such term."""
-    beside, labels = drive()
-    slope = beside.slope_rad - 0.15
+    extra_features, labels = drive()
+    slope = extra_features.slope_rad - 0.15
     velocity = labels[:, 1] * 0.0 + 0.9 - 0.3 * np.maximum(slope, 0.0)
     power = 14.0 + 62.0 * velocity / np.cos(slope) + np.maximum(velocity * (40.0 + 400.0 * np.tan(slope)), 0.0)
-    moved, told = replace(beside, slope_rad=slope), np.column_stack([power, velocity])
+    moved, told = replace(extra_features, slope_rad=slope), np.column_stack([power, velocity])
     model = fit_physics_model(moved, told, idle_watt=14.0)
     assert [model.no_load_watt, model.drivetrain_newton] == pytest.approx([14.0, 62.0], rel=0.01)
     assert np.abs(model.predict(moved)[:, 0] - power).mean() < 1.0
@@ -52,10 +52,10 @@ def test_what_the_drives_take_without_a_load_is_found_where_halts_tell_less():
 
 
 def test_what_is_not_known_is_as_usual():
-    beside, labels = drive()
-    model = fit_physics_model(beside, labels, idle_watt=50.0)
-    unknown = replace(beside, turn_radpm=np.full(COUNT, np.nan))
-    usual = replace(beside, turn_radpm=np.full(COUNT, np.mean(beside.turn_radpm)))
+    extra_features, labels = drive()
+    model = fit_physics_model(extra_features, labels, idle_watt=50.0)
+    unknown = replace(extra_features, turn_radpm=np.full(COUNT, np.nan))
+    usual = replace(extra_features, turn_radpm=np.full(COUNT, np.mean(extra_features.turn_radpm)))
     assert model.predict(unknown) == pytest.approx(model.predict(usual))
     elsewhere = model.predict(ExtraFeatures(np.array([2]), np.array([0.0]), np.array([0.0]), np.array([np.nan])))[0]
     assert 50.0 + 30.0 * 0.7 < elsewhere[0] < 50.0 + 60.0 * 1.0
@@ -63,21 +63,21 @@ def test_what_is_not_known_is_as_usual():
 
 
 def test_without_turns_in_the_data_there_is_no_term_for_them():
-    beside, labels = drive()
-    blind = replace(beside, turn_radpm=np.full(COUNT, np.nan))
+    extra_features, labels = drive()
+    blind = replace(extra_features, turn_radpm=np.full(COUNT, np.nan))
     assert not fit_physics_model(blind, labels, idle_watt=None).turning_joule_per_rad.any()
 
 
 def test_arrays_there_and_back():
-    beside, labels = drive()
-    model = fit_physics_model(beside, labels, idle_watt=50.0)
+    extra_features, labels = drive()
+    model = fit_physics_model(extra_features, labels, idle_watt=50.0)
     again = read_physics_model(model.arrays(), "weights.npz")
-    assert again.predict(beside) == pytest.approx(model.predict(beside), abs=0.0)
+    assert again.predict(extra_features) == pytest.approx(model.predict(extra_features), abs=0.0)
     with pytest.raises(ModelError, match="weights of another model"):
         read_physics_model({"feature": np.zeros(3)}, "weights.npz")
 
 
 def test_too_few_samples_are_said():
-    beside, labels = drive(count=19)
+    extra_features, labels = drive(count=19)
     with pytest.raises(ModelError, match="19 samples to fit physics to, wanted at least 20"):
-        fit_physics_model(beside, labels, idle_watt=None)
+        fit_physics_model(extra_features, labels, idle_watt=None)

@@ -20,7 +20,7 @@ from tcpipe.planning.cost_model import predict_patches
 
 pytest.importorskip("lightgbm")
 
-CONFIG = FitConfig(model="table")
+CONFIG = FitConfig(model="boosting")
 
 
 @pytest.fixture(scope="module")
@@ -67,14 +67,14 @@ def test_one_layer_one_output_and_weights(dataset, tmp_path):
     model = load_model(tmp_path / "height")
     said = model.outputs(open_dataset(dataset)["train"].with_channels("height").patches)
     assert said.shape[1] == 1
-    train(dataset, tmp_path / "weighed", config=replace(CONFIG, weights=True))
+    train(dataset, tmp_path / "weighed", config=replace(CONFIG, inverse_variance_weights=True))
     with pytest.raises(DatasetError, match="no labelled samples in split train"):
         train(dataset, tmp_path / "none", config=CONFIG, variant=Variant(classes=(1,)))
 
 
 def test_it_is_a_command_and_answers_planning(trained, dataset, tmp_path):
-    done = tcpipe("train", dataset, "model", "--model", "table", "--json", cwd=tmp_path)
-    assert json.loads(done.stdout)["model"] == "table"
+    done = tcpipe("train", dataset, "model", "--model", "boosting", "--json", cwd=tmp_path)
+    assert json.loads(done.stdout)["model"] == "boosting"
     assert (tmp_path / "model" / WEIGHTS).read_bytes() == (trained[0] / WEIGHTS).read_bytes()
     model, split = load_model(tmp_path / "model"), open_dataset(dataset)["train"]
     pixels = split.layers(np.arange(20))
@@ -86,6 +86,6 @@ def test_it_is_a_command_and_answers_planning(trained, dataset, tmp_path):
 
 
 def test_it_is_evaluated_without_networks(trained, dataset, tmp_path):
-    found, _ = evaluate(trained[0], dataset, tmp_path / "evaluation", EvaluateConfig(draws=1), key="key")
+    found, _ = evaluate(trained[0], dataset, tmp_path / "evaluation", EvaluateConfig(noise_draws=1), key="key")
     assert list(found.energy) == ["ours"]
     assert not (tmp_path / "evaluation").exists()

@@ -48,7 +48,7 @@ def test_it_learns_and_says_how(trained):
     assert result.best_epoch == 1 + int(np.argmin(held))
     assert result.held_out_loss == pytest.approx(min(held))
     assert float(history[-1]["loss"]) < float(history[0]["loss"])
-    assert 0.0 < result.spent.feeding_share < 1.0
+    assert 0.0 < result.training_times_s.feeding_share < 1.0
     assert not list(place.parent.glob("*.checkpoint"))
 
 
@@ -58,10 +58,10 @@ def test_the_model_knows_what_it_was_trained_on(trained, dataset):
     ids, counts = np.unique(fit.column("terrain_class"), return_counts=True)
     assert model.class_counts == dict(zip(ids.tolist(), counts.tolist(), strict=True))
     slopes = fit.column("slope_rad")
-    assert model.seen["slope_rad"] == (slopes.min(), slopes.max())
+    assert model.training_range["slope_rad"] == (slopes.min(), slopes.max())
     heights = fit.layers(np.arange(len(fit)))["height"].astype(float) * 0.0005
     reliefs = heights.max(axis=(1, 2)) - heights.min(axis=(1, 2))
-    assert model.seen["relief_m"] == pytest.approx((reliefs.min(), reliefs.max()))
+    assert model.training_range["relief_m"] == pytest.approx((reliefs.min(), reliefs.max()))
     assert model.card.scale == pytest.approx(tuple(open_dataset(dataset)["train"].labels.max(axis=0)))
     assert sorted(model.residuals["sample_id"]) == sorted(held.column("sample_id"))
     order = np.argsort(np.argsort(held.column("sample_id")))
@@ -71,7 +71,7 @@ def test_the_model_knows_what_it_was_trained_on(trained, dataset):
 
 
 @pytest.mark.parametrize("energy_only", [False, True])
-def test_what_is_above_standing_can_be_trained_on(energy_only, dataset, tmp_path):
+def test_net_energy_can_be_trained_on(energy_only, dataset, tmp_path):
     config = replace(CONFIG, epochs=1, label="net")
     train(dataset, tmp_path / "model", config=config, variant=Variant(energy_only=energy_only))
     card = load_model(tmp_path / "model").card
@@ -143,7 +143,7 @@ def test_short_epochs_share_a_checkpoint(dataset, tmp_path, monkeypatch):
     epochs = []
     monkeypatch.setattr(fitting, "write_checkpoint", lambda _path, progress, _parts: epochs.append(progress.epoch))
     monkeypatch.setattr(fitting, "_train_epoch", lambda *_, **__: 1.0)
-    result = train(dataset, tmp_path / "model", config=replace(CONFIG, epochs=45, patience=99, batch=64))
+    result = train(dataset, tmp_path / "model", config=replace(CONFIG, epochs=45, patience=99, batch_size=64))
     assert epochs == list(range(0, 46, 32 * 64 // result.samples["fitted"]))
 
 
@@ -192,7 +192,7 @@ def test_weights_count_what_is_certain(dataset, tmp_path, monkeypatch):
     train(dataset, tmp_path / "plain", config=config)
     real = Split.weights.fget
     monkeypatch.setattr(Split, "weights", property(lambda split: np.ones_like(real(split))))
-    train(dataset, tmp_path / "alike", config=replace(config, weights=True))
+    train(dataset, tmp_path / "alike", config=replace(config, inverse_variance_weights=True))
     assert _same(_weights(tmp_path / "plain"), _weights(tmp_path / "alike"))
     monkeypatch.setattr(
         Split,
@@ -201,7 +201,7 @@ def test_weights_count_what_is_certain(dataset, tmp_path, monkeypatch):
             lambda split: np.where(split.column("terrain_class")[:, None] == 4, [1.0, 1.0], 0.01).astype(np.float32)
         ),
     )
-    train(dataset, tmp_path / "unlike", config=replace(config, weights=True))
+    train(dataset, tmp_path / "unlike", config=replace(config, inverse_variance_weights=True))
     assert not _same(_weights(tmp_path / "plain"), _weights(tmp_path / "unlike"))
 
 
@@ -222,7 +222,7 @@ def test_what_cannot_be_trained_on(dataset, tmp_path, monkeypatch):
     real = Split.weights.fget
     monkeypatch.setattr(Split, "weights", property(lambda split: real(split) * np.array([1.0, 0.0])))
     with pytest.raises(DatasetError, match="no sample has a standard deviation of velocity_mps to weigh it by"):
-        train(dataset, tmp_path / "model", config=replace(CONFIG, weights=True))
+        train(dataset, tmp_path / "model", config=replace(CONFIG, inverse_variance_weights=True))
 
 
 @pytest.mark.parametrize(

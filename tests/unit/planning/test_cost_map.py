@@ -59,7 +59,7 @@ def made(tmp_path_factory):
     """A cost map of a slope with mud, grass and trees, and the map."""
     source = _map(rise_east=0.2, rise_north=0.1, classes=_trees)
     out = tmp_path_factory.mktemp("costs") / "cost-map"
-    return source, make_cost_map(MODEL, source, out, step_m=1.0)
+    return source, make_cost_map(MODEL, source, out, cell_size_m=1.0)
 
 
 def test_every_course_of_every_cell_costs_what_physics_says(made):
@@ -152,11 +152,11 @@ class _Asked(PhysicsModel):
     patches: list = None
     most: int = 10**9
 
-    def predict(self, patches, beside):
+    def predict(self, patches, extra_features):
         if len(self.patches) == self.most:
             raise KeyboardInterrupt
         self.patches.append(len(patches))
-        return super().predict(patches, beside)
+        return super().predict(patches, extra_features)
 
 
 def test_an_interrupted_map_goes_on_where_it_was_and_ends_the_same(made, tmp_path: Path, monkeypatch):
@@ -165,9 +165,9 @@ def test_an_interrupted_map_goes_on_where_it_was_and_ends_the_same(made, tmp_pat
     monkeypatch.setattr("tcpipe.planning.cost_map._BLOCKS_KEPT", 1)
     stopped, going_on = _Asked(patches=[], most=4), _Asked(patches=[])
     with pytest.raises(KeyboardInterrupt):
-        make_cost_map(stopped, source, tmp_path / "cost-map", step_m=1.0)
+        make_cost_map(stopped, source, tmp_path / "cost-map", cell_size_m=1.0)
     assert not (tmp_path / "cost-map").exists()
-    again = make_cost_map(going_on, source, tmp_path / "cost-map", step_m=1.0)
+    again = make_cost_map(going_on, source, tmp_path / "cost-map", cell_size_m=1.0)
     asked = int(np.count_nonzero(~np.isnan(open_cost_map(Path(again.path), again.card).velocity_mps)))
     assert sum(stopped.patches) + sum(going_on.patches) == asked
     assert again.card.key == whole.card.key
@@ -201,7 +201,7 @@ def test_a_cluster_makes_the_same_bytes(made, sent, tmp_path):
     source, whole = made
     source = replace(source, reads=Counter())
     result = make_cost_map(
-        MODEL, source, tmp_path / "costs", step_m=1.0, cluster=Cluster("tcp://nowhere:1", partial(_sloping, 0.2))
+        MODEL, source, tmp_path / "costs", cell_size_m=1.0, cluster=Cluster("tcp://nowhere:1", partial(_sloping, 0.2))
     )
     assert len(sent) > 2
     for path in sorted(Path(whole.path).iterdir()):
@@ -215,7 +215,7 @@ def test_a_worker_that_finds_another_model_is_refused(made, sent, tmp_path):
             other,
             replace(made[0], reads=Counter()),
             tmp_path / "costs",
-            step_m=1.0,
+            cell_size_m=1.0,
             cluster=Cluster("tcp://nowhere:1", _sloping),
         )
     assert len(sent) == 1
@@ -223,13 +223,13 @@ def test_a_worker_that_finds_another_model_is_refused(made, sent, tmp_path):
 
 def test_a_second_call_does_nothing_and_another_step_replaces_it(tmp_path: Path):
     source, out = _map(side_m=6.0), tmp_path / "c"
-    assert make_cost_map(MODEL, source, out, step_m=2.0).status == "done"
+    assert make_cost_map(MODEL, source, out, cell_size_m=2.0).status == "done"
     before = (out / "cost-map.json").stat().st_mtime_ns
-    second = make_cost_map(MODEL, source, out, step_m=2.0)
+    second = make_cost_map(MODEL, source, out, cell_size_m=2.0)
     assert second.status == "unchanged"
     assert "nothing to do" in str(second)
     assert (out / "cost-map.json").stat().st_mtime_ns == before
-    assert make_cost_map(MODEL, source, out, step_m=3.0).card.grid.rows == 2
+    assert make_cost_map(MODEL, source, out, cell_size_m=3.0).card.grid.rows == 2
     assert (
         make_cost_map_key(replace(MODEL, checksum="1" * 64), source, 3.0)
         != json.loads((out / "cost-map.json").read_text())["key"]
@@ -238,7 +238,7 @@ def test_a_second_call_does_nothing_and_another_step_replaces_it(tmp_path: Path)
 
 def test_a_damaged_file_is_named_by_verify_and_by_who_reads_it_and_a_second_call_mends_it(tmp_path: Path):
     source, out = _map(side_m=6.0), tmp_path / "c"
-    card = make_cost_map(MODEL, source, out, step_m=2.0).card
+    card = make_cost_map(MODEL, source, out, cell_size_m=2.0).card
     assert (verify(out).kind, verify(out).problems) == ("cost map", ())
     (out / "energy.tif.aux.xml").write_text("statistics that a viewer left")
     data = bytearray((out / "power.tif").read_bytes())
@@ -248,41 +248,41 @@ def test_a_damaged_file_is_named_by_verify_and_by_who_reads_it_and_a_second_call
     assert str(out / "power.tif") in problem
     with pytest.raises(MapError, match=r"power\.tif: its sha256 is"):
         open_cost_map(out, card)
-    assert make_cost_map(MODEL, source, out, step_m=2.0).status == "done"
+    assert make_cost_map(MODEL, source, out, cell_size_m=2.0).status == "done"
     (out / "cost-map.json").write_text((out / "cost-map.json").read_text().replace("16", "17"))
     assert "not as it was written" in verify(out).problems[0]
     assert read_cost_map_card(out) is None
-    assert make_cost_map(MODEL, source, out, step_m=2.0).status == "done"
+    assert make_cost_map(MODEL, source, out, cell_size_m=2.0).status == "done"
     assert verify(out).problems == ()
 
 
 def test_what_cannot_be_mapped_is_one_line(tmp_path: Path):
     source = _map(side_m=6.0)
     with pytest.raises(MapError, match="smaller than one cell"):
-        make_cost_map(MODEL, source, tmp_path / "c", step_m=7.0)
+        make_cost_map(MODEL, source, tmp_path / "c", cell_size_m=7.0)
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "mine.txt").write_text("mine")
     with pytest.raises(UsageError, match="is no cost map"):
-        make_cost_map(MODEL, source, tmp_path / "full", step_m=1.0)
+        make_cost_map(MODEL, source, tmp_path / "full", cell_size_m=1.0)
     del source.arrays["terrain"]
     with pytest.raises(ModelError, match="has no terrain"):
-        make_cost_map(MODEL, source, tmp_path / "c", step_m=1.0)
+        make_cost_map(MODEL, source, tmp_path / "c", cell_size_m=1.0)
 
 
 def test_the_nav2_frame_begins_at_the_robots_datum_and_nothing_is_predicted_anew(made, tmp_path):
     source, out = replace(made[0], reads=Counter()), tmp_path / "cost-map"  # what is read here is not counted there
-    plain = make_cost_map(MODEL, source, out, step_m=2.0)
+    plain = make_cost_map(MODEL, source, out, cell_size_m=2.0)
     datum = (500_003.0, 5_199_990.0)
     lonlat = pyproj.Transformer.from_crs("EPSG:32633", "EPSG:4326", always_xy=True).transform(*datum)
     never_asked = _Asked(patches=[], most=0)
-    moved = make_cost_map(never_asked, source, out, step_m=2.0, origin_deg=lonlat)
+    moved = make_cost_map(never_asked, source, out, cell_size_m=2.0, origin_deg=lonlat)
     assert (plain.status, moved.status) == ("done", "done")
     about = YAML(typ="safe").load((out / "energy.yaml").read_text())
     assert about["origin"] == pytest.approx([-3.0, -14.0, 0.0], abs=1e-3)
     assert moved.card.checksums["energy.tif"] == plain.card.checksums["energy.tif"]
-    assert make_cost_map(MODEL, source, out, step_m=2.0, origin_deg=lonlat).status == "unchanged"
+    assert make_cost_map(MODEL, source, out, cell_size_m=2.0, origin_deg=lonlat).status == "unchanged"
     with pytest.raises(UsageError, match=r"km from map .*; give LON,LAT \(longitude first\)"):
-        make_cost_map(MODEL, source, out, step_m=2.0, origin_deg=lonlat[::-1])
+        make_cost_map(MODEL, source, out, cell_size_m=2.0, origin_deg=lonlat[::-1])
 
 
 def test_a_cost_map_goes_to_a_bucket_and_another_one_is_the_next_generation(made, tmp_path, monkeypatch):
@@ -291,11 +291,11 @@ def test_a_cost_map_goes_to_a_bucket_and_another_one_is_the_next_generation(made
     (tmp_path / "served" / "maps").mkdir(parents=True)
     with object_store(tmp_path / "served") as (environment, _):
         in_environment(monkeypatch, environment, tmp_path / "cache")
-        told = make_cost_map(MODEL, source, "s3://maps/of a site", step_m=1.0)
+        told = make_cost_map(MODEL, source, "s3://maps/of a site", cell_size_m=1.0)
         assert (told.path, told.status, told.card.checksums) == ("s3://maps/of a site", "done", result.card.checksums)
         there = open_cost_map(fetch_directory("s3://maps/of a site"), told.card)
         np.testing.assert_array_equal(there.power_watt, open_cost_map(Path(result.path), result.card).power_watt)
-        assert make_cost_map(MODEL, source, "s3://maps/of a site", step_m=1.0).status == "unchanged"
-        other = make_cost_map(MODEL, source, "s3://maps/of a site", step_m=2.0)
+        assert make_cost_map(MODEL, source, "s3://maps/of a site", cell_size_m=1.0).status == "unchanged"
+        other = make_cost_map(MODEL, source, "s3://maps/of a site", cell_size_m=2.0)
         assert other.status == "done"
         assert read_cost_map_card(fetch_directory("s3://maps/of a site")) == other.card

@@ -49,7 +49,7 @@ def test_a_drive_that_was_held_back_is_summed_where_the_model_knows_the_ground(m
 
 def test_ground_that_was_not_met_is_named_and_left_out(made):
     store, data, source = made
-    flat = replace(PhysicsModel(), seen=PhysicsModel().seen | {"slope_rad": (-1e-6, 1e-6)})
+    flat = replace(PhysicsModel(), training_range=PhysicsModel().training_range | {"slope_rad": (-1e-6, 1e-6)})
     found = compute_drive_cost(flat, source, find_drive(store, "south"), data, log="south")
     known = compute_drive_cost(PhysicsModel(), source, find_drive(store, "south"), data, log="south")
     assert found.rest_m["slope_outside_training"] > 0.0

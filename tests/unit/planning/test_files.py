@@ -96,7 +96,7 @@ def _request(source, **options) -> PlanRequest:
 
 def test_a_plan_is_found_once_and_again_when_its_picture_is_gone(source, tmp_path):
     out, picture = tmp_path / "plan.geojson", tmp_path / "plan.png"
-    request = _request(source, objective="distance", step_m=2.0)
+    request = _request(source, objective="distance", cell_size_m=2.0)
     first = plan(MODEL, source, request, out=out, picture=picture)
     assert list(first.plans) == ["distance", "energy", "time"]
     assert len(read_line(out)) == 2
@@ -106,7 +106,7 @@ def test_a_plan_is_found_once_and_again_when_its_picture_is_gone(source, tmp_pat
     assert "nothing to do" in str(second)
     picture.unlink()
     assert plan(MODEL, source, request, out=out, picture=picture).status == "done"
-    other = _request(source, objective="time", step_m=2.0)
+    other = _request(source, objective="time", cell_size_m=2.0)
     assert plan(MODEL, source, other, out=out, picture=None).status == "done"
     found = json.loads(out.read_text())["features"][0]["properties"]
     assert found["objective"] == "time"
@@ -114,7 +114,7 @@ def test_a_plan_is_found_once_and_again_when_its_picture_is_gone(source, tmp_pat
 
 
 def test_a_plan_that_another_beats_says_so(source, tmp_path):
-    request = _request(source, step_m=2.0)
+    request = _request(source, cell_size_m=2.0)
     found = plan(MODEL, source, request, out=tmp_path / "plan.geojson", picture=tmp_path / "plan.png")
     assert "objective-missed" not in str(found)
     energy = found.plans["energy"]
@@ -126,9 +126,9 @@ def test_a_plan_that_another_beats_says_so(source, tmp_path):
 
 def test_a_cost_map_gives_the_same_plan_and_one_of_another_model_is_refused(source, tmp_path):
     costs = tmp_path / "costs"
-    make_cost_map(MODEL, source, costs, step_m=2.0)
+    make_cost_map(MODEL, source, costs, cell_size_m=2.0)
     plans = [
-        plan(MODEL, source, _request(source, step_m=2.0, cost_map=given), out=tmp_path / name, picture=None)
+        plan(MODEL, source, _request(source, cell_size_m=2.0, cost_map=given), out=tmp_path / name, picture=None)
         for name, given in (("with.geojson", costs), ("without.geojson", None))
     ]
     ours, theirs = (found.plans["energy"] for found in plans)
@@ -148,8 +148,8 @@ def test_a_cost_map_gives_the_same_plan_and_one_of_another_model_is_refused(sour
 def test_a_cost_map_of_other_cells_gives_another_plan_and_a_damaged_one_is_refused(source, tmp_path):
     costs, out = tmp_path / "costs", tmp_path / "plan.geojson"
     request = _request(source, cost_map=costs)
-    for step_m in (2.0, 3.0):
-        make_cost_map(MODEL, source, costs, step_m=step_m)
+    for cell_size_m in (2.0, 3.0):
+        make_cost_map(MODEL, source, costs, cell_size_m=cell_size_m)
         assert plan(MODEL, source, request, out=out, picture=None).status == "done"
         assert plan(MODEL, source, request, out=out, picture=None).status == "unchanged"
     (costs / "cost-map.json").write_text("{}")
@@ -160,7 +160,7 @@ def test_a_cost_map_of_other_cells_gives_another_plan_and_a_damaged_one_is_refus
 def test_files_of_the_user_are_left_alone(source, path):
     before = path.read_bytes()
     with pytest.raises(UsageError, match="is no plan; it is left alone"):
-        plan(MODEL, source, _request(source, step_m=2.0), out=path, picture=None)
+        plan(MODEL, source, _request(source, cell_size_m=2.0), out=path, picture=None)
     mine = path.rename(path.with_suffix(".json"))
     with pytest.raises(UsageError, match="is the path itself"):
         predict_path(MODEL, source, mine, mine)

@@ -69,15 +69,15 @@ def test_each_metre_has_the_class_under_it():
         ({"class_counts": {5: 10}}, Reason.CLASS_OUTSIDE_TRAINING),
         ({"pixel_classes": (5, 6)}, Reason.CLASS_OUTSIDE_TRAINING),
         (
-            {"seen": {"slope_rad": (-0.1, 0.1), "cross_slope_rad": (-1, 1), "relief_m": (0, 1)}},
+            {"training_range": {"slope_rad": (-0.1, 0.1), "cross_slope_rad": (-1, 1), "relief_m": (0, 1)}},
             Reason.SLOPE_OUTSIDE_TRAINING,
         ),
         (
-            {"seen": {"slope_rad": (-1, 1), "cross_slope_rad": (0.1, 1), "relief_m": (0, 1)}},
+            {"training_range": {"slope_rad": (-1, 1), "cross_slope_rad": (0.1, 1), "relief_m": (0, 1)}},
             Reason.CROSS_SLOPE_OUTSIDE_TRAINING,
         ),
         (
-            {"seen": {"slope_rad": (-1, 1), "cross_slope_rad": (-1, 1), "relief_m": (0, 0.1)}},
+            {"training_range": {"slope_rad": (-1, 1), "cross_slope_rad": (-1, 1), "relief_m": (0, 0.1)}},
             Reason.RELIEF_OUTSIDE_TRAINING,
         ),
     ],
@@ -94,9 +94,9 @@ def test_what_cannot_be_driven_has_no_cost_and_the_lane_beside_it_is_marked():
     assert 1 <= through.totals.pieces_without_cost <= 3
     assert through.totals.pieces_without_cost == through.totals.reasons["not_traversable"]
     assert not through.totals.complete
-    beside = _cost(source, (4.0, 13.1), (20.0, 13.1))
-    assert beside.totals.complete
-    assert beside.totals.reasons["obstacle"] == beside.pieces.num_rows
+    extra_features = _cost(source, (4.0, 13.1), (20.0, 13.1))
+    assert extra_features.totals.complete
+    assert extra_features.totals.reasons["obstacle"] == extra_features.pieces.num_rows
 
 
 def test_holes_and_the_map_s_edge_are_told_apart():
@@ -126,8 +126,8 @@ def test_without_held_out_samples_there_are_no_intervals():
 
 
 class _Stuck(PhysicsModel):
-    def predict(self, patches, beside):
-        said = super().predict(patches, beside)
+    def predict(self, patches, extra_features):
+        said = super().predict(patches, extra_features)
         said[3:5, 1] = 0.0, np.nan
         return said
 
@@ -135,9 +135,9 @@ class _Stuck(PhysicsModel):
 class _Told(PhysicsModel):
     """Takes 1000 W more for a radian a metre."""
 
-    def predict(self, patches, beside):
-        return super().predict(patches, beside) + np.column_stack(
-            [1000.0 * np.nan_to_num(beside.turn_radpm), 0.0 * beside.slope_rad]
+    def predict(self, patches, extra_features):
+        return super().predict(patches, extra_features) + np.column_stack(
+            [1000.0 * np.nan_to_num(extra_features.turn_radpm), 0.0 * extra_features.slope_rad]
         )
 
 
@@ -154,8 +154,8 @@ def test_a_model_that_takes_turns_is_told_those_of_the_path_and_none_is_paid_twi
 
 
 class _EnergyAlone(PhysicsModel):
-    def predict(self, patches, beside):
-        return super().predict(patches, beside)[:, :1]
+    def predict(self, patches, extra_features):
+        return super().predict(patches, extra_features)[:, :1]
 
 
 def test_where_the_model_says_that_nothing_moves_there_is_no_cost():

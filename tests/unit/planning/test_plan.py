@@ -127,7 +127,7 @@ def test_no_way_says_what_would_open_one():
 def test_an_end_on_ground_that_is_not_known_says_so_before_all_the_map_is_looked_at():
     source = plane(40.0, classes=lambda east, _: np.where(east > 30.0, 5, 4))
     survey = make_survey(replace(MODEL, class_counts={4: 100}, pixel_classes=(4,)), source, 1.0)
-    with pytest.raises(PathError, match=r"--to: .*class not seen.*--allow-extrapolation"):
+    with pytest.raises(PathError, match=r"--to: .*class outside training.*--allow-extrapolation"):
         _plan(source, (22.0, 4.0), (33.0, 4.0), "time", survey=survey)
     assert survey.judged.mean() < 0.5
     assert not survey.predicted.any()
