@@ -57,6 +57,7 @@ def export(
 
 def _print(exported: Exported, log: str, out: str) -> None:
     from tcpipe.cli.output import print_line
+    from tcpipe.formats.finding_lines import describe_finding
 
     if exported.status == "unchanged":
         count = len(exported.topics)
@@ -66,6 +67,6 @@ def _print(exported: Exported, log: str, out: str) -> None:
             print_line(f"{of.messages:>9} messages  {of.topic}  {of.path}")
         if not exported.topics:
             print_line(f"nothing to export: {log} holds no topic")
-    for kind in ("damage", "remarks"):
-        for line in getattr(exported, kind):
-            print_line(f"{kind.rstrip('s')}: {line}", err=True)
+    for kind, findings in (("damage", exported.damage), ("remark", exported.remarks)):
+        for finding in findings:
+            print_line(f"{kind}: {describe_finding(finding)} [{finding.code}]", err=True)

@@ -108,8 +108,7 @@ def _list_outcome(result: IngestResult, store: Path | str, *, several: bool) -> 
         known = " (known, not tried again)" if result.known else ""
         yield f"{result.status:<10} {result.log}{aside or known}"
     else:
-        wrong = "damaged" if run.damage else "empty" if problems else ""
-        known = f" ({wrong}, known)" if wrong and not result.is_news else ""
+        known = f" ({run.defect}, known)" if run.defect and not result.is_news else ""
         more = f", noise floor of E {100 * budget.total:.1f} %" if several and budget else ""
         more += f"; {format_verdict(result.verdict)}" if several and is_new and result.verdict else ""
         yield (
@@ -125,7 +124,8 @@ def _list_outcome(result: IngestResult, store: Path | str, *, several: bool) -> 
         yield from (f"  {line}" for line in format_findings(of for of in result.causes if of.code != "log-failed"))
     if run is None or result.verdict is None:
         return
-    yield from (f"  damage:  {line}" for line in run.damage if result.is_news or result.status == "damaged")
+    if result.is_news or result.status == "damaged":
+        yield from (f"  damage:  {describe_finding(of)} [{of.code}]" for of in run.damage)
     if is_new and not several:
         yield f"  verdict: {format_verdict(result.verdict)}"
         where = f"tcpipe inspect {store}/runs/{run.run_id}"

@@ -11,7 +11,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from tcpipe.errors import StoreError, TableError
-from tcpipe.formats.finding_lines import advise_on_loss
+from tcpipe.formats.finding_lines import advise_on_loss, describe_finding
 from tcpipe.formats.json_files import Json
 from tcpipe.formats.parquet import read_table
 from tcpipe.formats.run_documents import Manifest, RunJson
@@ -44,6 +44,7 @@ from tcpipe.store import Store
 from tcpipe.tables.bits import Quality, flag_name
 from tcpipe.tables.columns import to_floats, to_integers
 from tcpipe.tables.facts import PhysicsFacts
+from tcpipe.tables.findings import Finding
 
 _PAGE = "report.html"
 _STEP_M = 0.05
@@ -115,8 +116,8 @@ def _make_losses_section(ledger_m: Mapping[str, float]) -> Section:
     return Section("Where every metre went", text, header=header, rows=rows, plots=[draw_waterfall(ledger_m)])
 
 
-def _make_damage_sections(lines: Sequence[str]) -> list[Section]:
-    rows = [(line,) for line in lines]
+def _make_damage_sections(damage: Sequence[Finding]) -> list[Section]:
+    rows = [(describe_finding(finding),) for finding in damage]
     text = "Where messages are lost or may be."
     return [Section("Damage of the log", text, header=("what",), rows=rows, folded=True)] if rows else []
 

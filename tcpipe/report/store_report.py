@@ -193,7 +193,7 @@ def _make_problem_sections(store: StoreFacts, runs: Sequence[StoredRun]) -> list
     """Return the logs without a run, and the runs that are damaged or cannot be read."""
     rows = [(of.log, of.state, of.why) for of in store.failed]
     for run in runs:
-        if run.facts is None or (run.is_current and (run.facts.damage or run.facts.is_empty)):
+        if run.facts is None or (run.is_current and run.facts.defect):
             line = store.found.damaged.get((run.run_id, run.recipe_id), "ingest its log again")
             rows.append((run.run_id, run.state, _describe_problem(run.facts) if run.facts else line))
     if not rows:
@@ -206,7 +206,7 @@ def _make_problem_sections(store: StoreFacts, runs: Sequence[StoredRun]) -> list
 
 
 def _describe_problem(facts: RunFacts) -> str:
-    return next(iter(facts.damage), "") or describe_finding(select_problems(facts.findings)[0])
+    return describe_finding((*facts.damage, *select_problems(facts.findings))[0])
 
 
 def _make_data(store: StoreFacts, runs: Sequence[StoredRun]) -> Json:

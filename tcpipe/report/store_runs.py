@@ -175,8 +175,7 @@ def _state(facts: RunFacts, ruling: str | None, *, acknowledged: bool) -> str:
         return "superseded"
     if facts.ingest_key != ruling:
         return "of another recipe"
-    wrong = "damaged" if facts.damage else "empty" if facts.is_empty else ""
-    return f"{wrong}{', acknowledged' * acknowledged}" if wrong else "current"
+    return f"{facts.defect}{', acknowledged' * acknowledged}" if facts.defect else "current"
 
 
 def _compute_percent(share: float | None) -> float | None:
