@@ -28,10 +28,9 @@ PRINTERS = {
     "tcpipe/pipeline/plan.py",
     "tcpipe/pipeline/preflight.py",
     "tcpipe/pipeline/status.py",
-    "tcpipe/pipeline/store_facts.py",
-    "tcpipe/planning/drive_files.py",
+    "tcpipe/pipeline/report.py",
+    "tcpipe/planning/drives.py",
     "tcpipe/planning/path_files.py",
-    "tcpipe/planning/plan_files.py",
 }
 """Modules beside cli/ and report/ that print an answer, or group findings for a page."""
 

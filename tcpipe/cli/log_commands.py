@@ -1,0 +1,353 @@
+"""Commands on logs and runs."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, cast
+
+import click
+
+from tcpipe.cli.options import (
+    LOG,
+    ONE_OF_SEVERAL,
+    OUTPUT_FILE,
+    SEALED,
+    add_options,
+    complete_runs,
+    dry_run_option,
+    json_option,
+    min_age_option,
+    msgdef_option,
+    quiet_option,
+    recipe_option,
+    robot_option,
+    store_option,
+)
+from tcpipe.cli.output import (
+    print_json,
+    print_json_line,
+    print_line,
+    print_lines,
+    print_result,
+    resolve_recipe_with_source,
+    show_progress,
+)
+from tcpipe.errors import UsageError
+from tcpipe.pipeline.ingest_options import IngestOptions
+
+if TYPE_CHECKING:
+    from tcpipe.pipeline.ingest import IngestSummary
+    from tcpipe.pipeline.ingest_task import IngestResult
+
+
+@click.command()
+@add_options(IngestOptions)
+@dry_run_option
+@click.option("--json", "as_json", is_flag=True, help="Print a JSON object for each log as it ends, and one of all.")
+@quiet_option
+def ingest(options: IngestOptions, *, dry_run: bool, as_json: bool, quiet: bool) -> int:
+    """Read logs, fuse the sensors, gate, cut into 1 m segments, and label each with power, velocity, time and energy.
+
+    A LOG is a .mcap, a .bag, a .db3, a ROS 2 bag directory, or a folder of such, searched downward, or the s3:// URL of
+    one. What is in the store already (same content, same recipe) is left alone, and what failed for its content is not
+    tried again. A line is printed as each log ends; of several logs, findings follow by code.
+
+    Exit code 3: some logs failed, are damaged, or give no segment though the robot drove, and that is news: it was not
+    told before, and not acknowledged (tcpipe acknowledge).
+    """
+    from tcpipe.formats.json_files import convert_record
+    from tcpipe.pipeline.ingest import SummaryLine, run_ingest
+    from tcpipe.pipeline.ingest_task import LogLine
+
+    ruling, source = resolve_recipe_with_source(cast("str | None", options.recipe))
+    options = replace(options, recipe=ruling)
+    if not as_json:
+        print_line(f"recipe: {source}")
+    if dry_run:
+        from tcpipe.pipeline.status import find_status
+
+        planned = find_status(
+            options.logs,
+            store=options.store,
+            recipe=ruling,
+            robot=options.robot,
+            as_one=options.as_one,
+            shard=options.shard,
+            min_age_s=options.min_age_s,
+            message_definitions=Path(options.message_definitions) if options.message_definitions else None,
+            force=options.force,
+            retry_failed=options.retry_failed,
+            jobs=options.jobs,
+            create=True,
+        )
+        print_result(replace(planned, history=()), as_json=as_json)
+        return 0
+    with show_progress("ingest", quiet=quiet, as_json=as_json) as shown:
+        several = False
+
+        def on_found(sizes: Mapping[str, int]) -> None:
+            nonlocal several
+            several = len(sizes) > 1
+            shown.expect(sizes)
+
+        def on_result(result: IngestResult) -> None:
+            shown.end(
+                result.log,
+                worked=result.status in ("done", "damaged", "empty") or not (result.known or result.transient),
+            )
+            if as_json:
+                print_json_line(convert_record(result, LogLine))
+            else:
+                for line in _list_outcome(result, options.store, several=several):
+                    shown.result(line)
+            for problem in result.problems if result.is_news else ():
+                shown.problem(problem)
+
+        summary = run_ingest(replace(options, on_found=on_found, on_result=on_result))
+    if as_json:
+        made = str(summary.store) if isinstance(summary.store, str) or summary.store.is_dir() else None
+        print_json_line(SummaryLine(source, made, summary.exit_code, summary.results))
+    else:
+        if several:
+            _print_findings(summary)
+        _print_sum(summary)
+    return summary.exit_code
+
+
+def _list_outcome(result: IngestResult, store: Path | str, *, several: bool) -> Iterator[str]:
+    """Yield what became of a log: of one alone with its findings, of several one line each, and what is broken."""
+    from tcpipe.cost.labels import format_budget
+    from tcpipe.formats.finding_lines import describe_finding, format_findings, format_verdict
+    from tcpipe.tables.findings import select_problems
+
+    aside = " (acknowledged)" if result.acknowledged else ""
+    is_new, run = result.status != "unchanged", result.run
+    budget = run.energy_budget if run and is_new else None
+    problems = select_problems(result.findings)
+    if run is None:
+        known = " (known, not tried again)" if result.known else ""
+        yield f"{result.status:<10} {result.log}{aside or known}"
+    else:
+        known = f" ({run.defect}, known)" if run.defect and not result.is_news else ""
+        more = f", noise floor of E {100 * budget.total:.1f} %" if several and budget else ""
+        more += f"; {format_verdict(result.verdict)}" if several and is_new and result.verdict else ""
+        yield (
+            f"{result.status:<10} {run.run_id}/{run.recipe_id}: {run.segments} segments "
+            f"from {run.kept_m:.1f} of {run.driven_m:.1f} m, robot {run.robot}{more}{aside or known}"
+        )
+    if result.same_as:
+        yield f"  {result.log} is the same recording as {result.same_as}: one run"
+    if budget is not None and not several:
+        yield f"  {format_budget(budget)}"
+    yield from (f"  {note}" for note in result.notes)
+    if result.status == "failed" and result.is_news:
+        yield from (f"  {line}" for line in format_findings(of for of in result.causes if of.code != "log-failed"))
+    if run is None or result.verdict is None:
+        return
+    if result.is_news or result.status == "damaged":
+        yield from (f"  damage:  {describe_finding(of)} [{of.code}]" for of in run.damage)
+    if is_new and not several:
+        yield f"  verdict: {format_verdict(result.verdict)}"
+        where = f"tcpipe inspect {store}/runs/{run.run_id}"
+        yield from (f"  {line}" for line in format_findings(result.findings, more=where))
+    elif is_new or result.is_news:
+        yield from (f"  {describe_finding(of)} [{of.code}]" for of in problems if of.code != "log-damaged")
+
+
+def _print_findings(summary: IngestSummary) -> None:
+    """Print the findings of several runs by code."""
+    from tcpipe.formats.finding_lines import format_groups, group_findings
+
+    made = [result.run for result in summary.results if result.run and result.status != "unchanged"]
+    groups = group_findings((run.run_id, run.findings) for run in made)
+    for line in format_groups(groups, len(made), more=f"tcpipe report {summary.store}"):
+        print_line(line)
+
+
+def _print_sum(summary: IngestSummary) -> None:
+    number = len(summary.results)
+    old = [result for result in summary.results if result.status == "failed" and not result.is_news]
+    count = {
+        status: sum(r.status == status for r in summary.results) - (len(old) if status == "failed" else 0)
+        for status in ("done", "unchanged", "damaged", "empty", "failed", "waiting")
+    }
+    if not number:
+        print_line("nothing to do: this shard holds none of the logs")
+    elif count["unchanged"] + len(old) == number:
+        print_line(f"nothing to do: {count['unchanged']} of {number} logs are in {summary.store} already")
+    elif count["failed"] == number:
+        print_line(f"no run came into {summary.store}: {number} of {number} logs failed")
+    else:
+        said = ", ".join(f"{of} {status}" for status, of in count.items() if of)
+        print_line(f"{summary.store}: {said}")
+    _print_known(summary)
+
+
+def _print_known(summary: IngestSummary) -> None:
+    """Count what is wrong and no news."""
+    acknowledged = sum(result.acknowledged for result in summary.results)
+    known = [result for result in summary.results if result.known and not result.acknowledged]
+    failed = sum(result.status == "failed" for result in known)
+    if failed:
+        tried = "tries them" if failed > 1 else "tries it"
+        print_line(f"{failed} known failure{'s' * (failed > 1)}, not tried again; --retry-failed {tried}")
+    if len(known) > failed:
+        print_line(
+            f"{len(known) - failed} known to be damaged or empty; 'tcpipe acknowledge RUN' when it has been looked at"
+        )
+    if acknowledged:
+        print_line(f"{acknowledged} with acknowledged problems")
+
+
+@click.command()
+@click.argument("paths", nargs=-1, type=ONE_OF_SEVERAL, metavar="[STORE] [LOG...]")
+@store_option
+@recipe_option
+@robot_option("Robot profile that ingest is given.")
+@min_age_option("10m", "A log that was written to since (90, 90s, 10m, 2h, 1d) is growing.")
+@json_option
+def status(
+    paths: tuple[str, ...], *, store: str, recipe: str | None, robot: str | None, min_age_s: float, as_json: bool
+) -> int:
+    """Say of every log whether it is in the store, is still to be ingested, failed or grows, and why; and what the latest calls did.
+
+    Without LOG: of the logs and folders that the latest calls of ingest were given. Nothing of a log is read.
+
+    Exit code 3: a log failed, is damaged or gave no segment, a call was killed, a log waits for more than two nights, files of a run or
+    a commit are missing, and nobody acknowledged that (tcpipe acknowledge).
+    """
+    from tcpipe.formats.finding_lines import format_finding
+    from tcpipe.formats.object_storage import is_url
+    from tcpipe.pipeline.status import find_status as run
+    from tcpipe.store import is_store
+
+    if paths and is_store(paths[0]):
+        store, paths = paths[0], paths[1:]
+    elif paths and not is_url(store) and not Path(store).exists():
+        raise UsageError(f"{paths[0]}: there is no store here, nor one at {store}; name it with --store")
+    found = run(paths, store=store, recipe=resolve_recipe_with_source(recipe)[0], robot=robot, min_age_s=min_age_s)
+    if as_json:
+        print_json(found)
+        return found.exit_code
+    print_lines(found)
+    for finding in found.problems:
+        print_line(f"tcpipe: {format_finding(finding)}", err=True)
+    return found.exit_code
+
+
+@click.command()
+@click.argument("log", type=LOG, metavar="LOG")
+@robot_option()
+@recipe_option
+@msgdef_option
+@json_option
+@quiet_option
+def preflight(
+    log: str, *, robot: str | None, recipe: str | None, msgdef: str | None, as_json: bool, quiet: bool
+) -> int:
+    """Predict from LOG, a minute or more as it will be driven, what a day of such recording gives, and what to correct before.
+
+    Segments an hour, where the metres go, the deviations of labels, the verdict, findings with their remedies, and the command that
+    records what is needed. Nothing is written.
+
+    Exit codes: 0 ready; 3 there are warnings, errors or no segments; 1 ingesting it would fail.
+    """
+    from tcpipe.pipeline.preflight import preflight as run
+
+    with show_progress("preflight", quiet=quiet):
+        found = run(
+            log,
+            recipe=resolve_recipe_with_source(recipe)[0],
+            robot=robot,
+            message_definitions=Path(msgdef) if msgdef else None,
+        )
+    print_result(found, as_json=as_json)
+    return found.exit_code
+
+
+@click.command()
+@click.argument("names", nargs=-1, required=True, metavar="RUN|LOG|CALL...", shell_complete=complete_runs)
+@store_option
+@json_option
+def acknowledge(names: tuple[str, ...], *, store: str, as_json: bool) -> int:
+    """Acknowledge problems that somebody has looked at: damaged logs, runs without segments, failed logs. ingest reports them no more.
+
+    Acknowledge a call that was killed by the name that status prints, a log that waits and a damaged commit by its path.
+
+    A run of which files are missing is given up: the store no longer expects it.
+
+    This holds for this problem of this content: another problem, or other content, is reported.
+    """
+    from tcpipe.formats.finding_lines import describe_title
+    from tcpipe.pipeline.problems import acknowledge as run
+
+    found = run(names, store=store)
+    if as_json:
+        print_json(found)
+        return 0
+    for word, problems in (("acknowledged", found.acknowledged), ("acknowledged before", found.before)):
+        for problem in problems:
+            print_line(f"{word}: {problem.name}: {describe_title(problem.finding)} [{problem.finding.code}]")
+    if not found.acknowledged:
+        print_line("nothing to do: these problems are already acknowledged")
+    return 0
+
+
+@click.command()
+@store_option
+@recipe_option
+@click.option(
+    "--keep",
+    multiple=True,
+    metavar="RUN|RECIPE",
+    shell_complete=complete_runs,
+    help="Nothing of this run or recipe goes; repeatable.",
+)
+@click.option(
+    "--forget", multiple=True, metavar="DATASET", help="This dataset is gone; what it referred to may go; repeatable."
+)
+@min_age_option("1d", "What killed calls left is removed when it is so old (90, 90s, 10m, 2h, 1d).")
+@click.option("--dry-run", is_flag=True, help="Say what would be removed; do nothing.")
+@json_option
+def prune(
+    *,
+    store: str,
+    recipe: str | None,
+    keep: tuple[str, ...],
+    forget: tuple[str, ...],
+    min_age_s: float,
+    dry_run: bool,
+    as_json: bool,
+) -> int:
+    """Remove results of older recipes where the ruling one has its own, superseded runs, and what killed calls left.
+
+    Nothing goes that a dataset refers to, built from this store wherever it lies now, nor a directory that holds a file of somebody else.
+    """
+    from tcpipe.pipeline.prune import prune as run
+
+    found = run(
+        store=store,
+        recipe=resolve_recipe_with_source(recipe)[0],
+        keep=keep,
+        forget=forget,
+        min_age_s=min_age_s,
+        dry_run=dry_run,
+    )
+    print_result(found, as_json=as_json)
+    return 0
+
+
+@click.command()
+@click.argument("run", type=SEALED, metavar="RUN")
+@click.argument("out", type=OUTPUT_FILE, metavar="OUT.mcap")
+@json_option
+def overlay(run: str, out: str, *, as_json: bool) -> None:
+    """Write OUT.mcap from RUN (STORE/runs/ID), on the clock of its log: open both together in Foxglove, or OUT in Rerun or PlotJuggler.
+
+    It holds the fused track, segments with labels, what was dropped and why, and the measurements that were refused.
+    """
+    from tcpipe.pipeline.overlay import write_overlay as write
+
+    print_result(write(run, Path(out)), as_json=as_json)
