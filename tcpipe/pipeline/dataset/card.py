@@ -24,7 +24,6 @@ from tcpipe.formats.dataset_card import (
     MapRegistration,
     MapSource,
     Shard,
-    SplitResult,
     judge_dataset,
 )
 from tcpipe.formats.json_files import convert_record
@@ -32,7 +31,6 @@ from tcpipe.formats.layer_descriptions import describe_layer
 from tcpipe.formats.maps.map_files import MapFile
 from tcpipe.pipeline.dataset.content import Content
 from tcpipe.pipeline.dataset.inputs import BuildOptions, Inputs
-from tcpipe.pipeline.dataset.splitting import regions_to_json
 from tcpipe.recipe import Recipe
 from tcpipe.recipe.suggestions import suggest
 from tcpipe.splits.assignment import SPLITS
@@ -76,8 +74,7 @@ def make_dataset_card(
     shards: Sequence[Shard],
 ) -> DatasetCard:
     """Return the card without checksums; ``samples`` has the `CARD_COLUMNS` of every sample, and `physics.PHYSICS_COLUMNS`."""
-    recipe, drawn, classes = options.recipe, content.drawn, content.sources[0].classes
-    about, regions = recipe.dataset, options.regions
+    recipe, about, classes = options.recipe, options.recipe.dataset, content.sources[0].classes
     layers, has_terrain = content.spool.layers, "terrain" in content.spool.layers
     runs = tuple(replace(run, samples=_count(samples, "run_id", run.run_id)) for run in inputs.sources)
     card = DatasetCard(
@@ -104,9 +101,7 @@ def make_dataset_card(
         classes=classes.classes if has_terrain else (),
         label=_label(recipe, inputs),
         energy_budget=pool_budgets(run.energy_budget for run in inputs.sources),
-        split=SplitResult(
-            drawn.buffer_m, None if regions is None else regions_to_json(regions), drawn.audit, drawn.kept
-        ),
+        split=content.split,
         ledger_m=content.ledger_m,
         removal=content.removal,
         balance=balance,
