@@ -365,7 +365,7 @@ LABELLED_SEGMENTS = TableSchema(
     ),
 )
 
-PLACED_SEGMENTS = LABELLED_SEGMENTS.only(
+PLACED_SEGMENTS = LABELLED_SEGMENTS.select_columns(
     *(f"{end}_{axis}_deg" for end in ("start", "end") for axis in ("lon", "lat")),
     *("chord_m", "arc_length_m", "position_std_m"),
 )

@@ -99,8 +99,10 @@ def _make_tag_columns(run_ids: pa.ChunkedArray, runs: Sequence[RunSource]) -> tu
         different = {text for text in texts if text is not None}
         words = sorted(text for text in different if not _NUMBER.fullmatch(text.strip()))
         if words and len(words) < len(different):
-            counts = {"odd_count": len(words), "value_count": len(different)}
-            findings.append(make_finding("column-is-text", Subject("tag", key), names={"example": words[0]}, **counts))
+            subject, names, count = Subject("tag", key), {"example": words[0]}, len(different)
+            findings.append(
+                make_finding("column-is-text", subject, names=names, odd_count=len(words), value_count=count)
+            )
         numbers = None if words else [None if text is None else float(text) for text in texts]
         values = pa.array(texts, pa.string()) if numbers is None else pa.array(numbers, pa.float64())
         columns.append(values.take(place))

@@ -47,11 +47,11 @@ def test_deviations_are_those_of_many_estimated_metres():
     assert got.power_std_watt[0] == pytest.approx((spent / duration).std(), rel=0.03)
     above = subtract_idle_power(got, standing_watt=90.0, standing_std_watt=2.0, **ends)
     beside = spent - (90 + other) * duration
-    assert above.energy_above_standing_joule[0] == pytest.approx(got.energy_joule[0] - 90 * end_s)
-    assert above.energy_above_standing_std_joule[0] == pytest.approx(beside.std(), rel=0.02)
-    assert above.power_above_standing_std_watt[0] == pytest.approx((beside / duration).std(), rel=0.02)
-    assert above.energy_above_standing_joule[0] == pytest.approx(
-        above.power_above_standing_watt[0] / got.velocity_mps[0]
+    assert above["energy_above_standing_joule"][0] == pytest.approx(got.energy_joule[0] - 90 * end_s)
+    assert above["energy_above_standing_std_joule"][0] == pytest.approx(beside.std(), rel=0.02)
+    assert above["power_above_standing_std_watt"][0] == pytest.approx((beside / duration).std(), rel=0.02)
+    assert above["energy_above_standing_joule"][0] == pytest.approx(
+        above["power_above_standing_watt"][0] / got.velocity_mps[0]
     )
 
 
@@ -66,4 +66,4 @@ def test_above_standing_is_not_known_where_either_is_not(standing_watt, energy_j
     ends = {"end_power_watt": np.array([150.0]), "energy_noise_joule": np.array([1.0])}
     cost = one(duration_s=1.2, energy_joule=energy_joule, end_velocity_mps=0.8, **ends)
     got = subtract_idle_power(cost, standing_watt=standing_watt, standing_std_watt=2.0, **ends)
-    assert all(np.isnan(getattr(got, name)[0]) for name in got.__slots__)
+    assert all(np.isnan(values[0]) for values in got.values())
