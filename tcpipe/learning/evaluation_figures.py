@@ -16,7 +16,7 @@ from tcpipe.dataset import Dataset
 from tcpipe.formats.json_files import Json
 from tcpipe.learning.evaluation_facts import Plotted
 from tcpipe.learning.metrics import QUANTITIES, UNITS
-from tcpipe.learning.predicted_samples import (
+from tcpipe.learning.predictions import (
     LEVELS,
     compute_calibration,
     compute_errors_joule,

@@ -7,12 +7,11 @@ from dataclasses import astuple, fields
 from typing import Literal
 
 from tcpipe.learning import paper_tables as paper
-from tcpipe.learning.baselines import describe_ratios
+from tcpipe.learning.baselines import GRASS_ONLY, OURS, PER_CLASS, describe_ratios
 from tcpipe.learning.evaluation import EXPECTED
 from tcpipe.learning.evaluation_facts import SPLITS, ErrorsByClass, Evaluation, Leakage
 from tcpipe.learning.evaluation_figures import EvaluatedSamples, draw_paper_figures, make_page_data, sample_sections
 from tcpipe.learning.metrics import ALL, LEAST, QUANTITIES, UNITS, Errors
-from tcpipe.learning.wei_isler import GRASS_ONLY, OURS, PER_CLASS
 from tcpipe.report.page import Number, Section, render_page
 from tcpipe.report.verdict import show_verdict
 from tcpipe.tables.findings import PREDICTED, judge_again
