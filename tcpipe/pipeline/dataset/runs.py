@@ -50,7 +50,10 @@ def choose_runs(
     mine = [run for run in found.finished if run.facts.ingest_key == key]
     if not mine:
         raise DatasetError(*_describe_no_runs(store, found))
-    runs, logs, damaged = _verify_runs(store, _select_one_robot(store, _select_tagged(store, mine, tags), robot))
+    candidates = _select_one_robot(store, _select_tagged(store, mine, tags), robot)
+    damaged = store.prove(candidates)
+    logs = {run.run_id: run.facts.log.source for run in candidates if run.facts.log and run.run_id not in damaged}
+    runs = [run for run in candidates if run.run_id in logs]
     known = {run.run_id for run in mine}
     for (run_id, recipe_id), line in found.damaged.items():
         if run_id not in known and _is_selected(found.rows[run_id, recipe_id], robot, tags):
@@ -61,17 +64,21 @@ def choose_runs(
         )
     if robot is None:
         _refuse_unlike(store, [run for run in runs if run.facts.robot == GENERIC])
-    settled = {*known, *damaged}
-    others = {run.run_id: run.recipe_id for run in found.finished if _is_selected(run.facts, robot, tags)}
-    older = {name: str(of.data_model_version) for name, of in found.outdated.items() if _is_selected(of, robot, tags)}
-    others, older = ({name: of for name, of in each.items() if name not in settled} for each in (others, older))
-    left_out = {*damaged, *others, *older}
-    otherwise = {run_id: {"what": "recipe", "has": of} for run_id, of in others.items()}
-    otherwise |= {run_id: {"what": "data_model", "has": of} for run_id, of in older.items()}
+    otherwise = {
+        run.run_id: {"what": "recipe", "has": run.recipe_id}
+        for run in found.finished
+        if _is_selected(run.facts, robot, tags)
+    }
+    otherwise |= {
+        run_id: {"what": "data_model", "has": str(outdated.data_model_version)}
+        for run_id, outdated in found.outdated.items()
+        if _is_selected(outdated, robot, tags)
+    }
+    otherwise = {run_id: names for run_id, names in otherwise.items() if run_id not in {*known, *damaged}}
     nothing: dict[str, str] = {}
     missing = tuple(_find_left_out(found, "run-ingested-otherwise", otherwise))
     broken = tuple(_find_left_out(found, "run-damaged", dict.fromkeys(damaged, nothing), force=True))
-    excluded = frozenset(left_out | found.superseded.keys())
+    excluded = frozenset({*damaged, *otherwise, *found.superseded})
     superseded = tuple(
         make_finding("run-superseded", Subject("run", run_id), names={"by": by})
         for run_id, by in found.superseded.items()
@@ -137,18 +144,6 @@ def _describe_no_runs(store: Store, found: Ingestions) -> list[str]:
             "ingest their logs again"
         )
     return [*([f"{store.root}: {head}"] if head else []), *dict.fromkeys(found.damaged.values())]
-
-
-def _verify_runs(
-    store: Store, runs: Sequence[RunDirectory]
-) -> tuple[list[RunDirectory], dict[str, LogOrigin], dict[str, str]]:
-    """Return the intact runs, their logs, and by run a line on the damage of the others."""
-    damaged = store.prove(runs)
-    logs = dict[str, LogOrigin]()
-    for run in runs:
-        if run.facts.log is not None and run.run_id not in damaged:
-            logs[run.run_id] = run.facts.log.source
-    return [run for run in runs if run.run_id in logs], logs, damaged
 
 
 def _is_selected(known: RunFacts | RunSource, robot: str | None, tags: Mapping[str, str]) -> bool:
