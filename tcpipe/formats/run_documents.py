@@ -11,10 +11,10 @@ from dataclasses import dataclass, field, replace
 from typing import Literal
 
 from tcpipe.formats.integrity import Checksum
-from tcpipe.motion.remedies import KEPT
+from tcpipe.motion.distance_breakdown import KEPT
 from tcpipe.recipe import IngestSections
-from tcpipe.tables.facts import LEFT_OUT, NOTHING_FOUND, StageFacts
-from tcpipe.tables.findings import StageReport
+from tcpipe.tables.facts import NOTHING_FOUND, StageFacts
+from tcpipe.tables.findings import LEFT_OUT, StageReport
 from tcpipe.tables.levels import TABLES_VERSION, Sensor, TrackInfo
 from tcpipe.tables.verdicts import Verdict
 

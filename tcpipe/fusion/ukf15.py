@@ -25,7 +25,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.fusion import ukf15_kernel as kernel
-from tcpipe.fusion.gates import find_chi_square_threshold
 from tcpipe.fusion.measurements import (
     GNSS,
     IMU,
@@ -36,7 +35,7 @@ from tcpipe.fusion.measurements import (
     InitialState,
     Measurements,
 )
-from tcpipe.fusion.signals import is_covered
+from tcpipe.fusion.signals import find_chi_square_threshold, is_covered
 from tcpipe.fusion.trajectory import DISPLACEMENT_LAGS_S, Rejections, Trajectory
 from tcpipe.fusion.ukf15_events import ACCEPTED, NOT_RUN, RECOVERED, REJECTED, Events, FilterState, Outputs, Sources
 from tcpipe.geometry.rotation import invert, quat_from_rpy, rotate, rpy_from_quat

@@ -33,7 +33,7 @@ from tcpipe.formats.integrity import find_broken_checksums, find_broken_seal
 from tcpipe.formats.json_files import to_plain
 from tcpipe.formats.parquet import read_table
 from tcpipe.formats.recipe_toml import make_recipe_id
-from tcpipe.motion.remedies import KEPT
+from tcpipe.motion.distance_breakdown import KEPT
 from tcpipe.pipeline.dataset.card import CARD_COLUMNS, measure_samples
 from tcpipe.pipeline.dataset.redaction import find_leaks
 from tcpipe.store import is_named_after

@@ -43,7 +43,7 @@ from tcpipe.formats.recipe_toml import ingest_key, make_recipe_id
 from tcpipe.formats.run_documents import Manifest, MapDocument, RunJson
 from tcpipe.formats.store_document import MARK, SPOOL
 from tcpipe.formats.stored_runs import RunDirectory
-from tcpipe.motion.remedies import KEPT
+from tcpipe.motion.distance_breakdown import KEPT
 from tcpipe.report.pictures import is_picture_of_map
 from tcpipe.store import Store
 from tcpipe.tables.columns import to_floats, to_integers

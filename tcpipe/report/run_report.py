@@ -16,7 +16,7 @@ from tcpipe.formats.json_files import Json
 from tcpipe.formats.parquet import read_table
 from tcpipe.formats.run_documents import Manifest, RunJson
 from tcpipe.formats.stored_runs import RunDirectory
-from tcpipe.motion.remedies import find_largest_losses
+from tcpipe.motion.distance_breakdown import find_largest_losses
 from tcpipe.report.colours import DOUBTED, FAINT, KEPT, UNUSED
 from tcpipe.report.column_packing import Column, make_shown_column, pack_columns
 from tcpipe.report.label_sections import (

@@ -12,7 +12,7 @@ from tcpipe.cost.held_out import PHYSICS_UNITS
 from tcpipe.formats.finding_lines import advise_on_loss, describe_finding, format_group
 from tcpipe.formats.index_files import RunFacts
 from tcpipe.formats.json_files import Json
-from tcpipe.motion.remedies import StoreLoss, find_largest_losses
+from tcpipe.motion.distance_breakdown import StoreLoss, find_largest_losses
 from tcpipe.report.colours import CLASS_COLOURS
 from tcpipe.report.page import Link, Number, Section, render_page
 from tcpipe.report.plots import Plot, draw_waterfall, make_plot

@@ -14,11 +14,9 @@ from tcpipe.fusion.checks.mounting import solve_lag
 from tcpipe.fusion.measurements import GNSS, IMU
 from tcpipe.power.rails import compute_power_at
 from tcpipe.recipe.suggestions import suggest
-from tcpipe.stages.fuse_inputs import FusionInputs, find_longest_epoch
-from tcpipe.stages.fuse_mounting import compute_moved_m
+from tcpipe.stages.fuse_inputs import FusionInputs, compute_moved_m, find_longest_epoch, find_recipe_role
 from tcpipe.stages.fuse_stretches import Fused
-from tcpipe.stages.power_rails import make_rails
-from tcpipe.stages.read_pose import find_recipe_role
+from tcpipe.stages.message_arrays import make_rails
 from tcpipe.tables.columns import to_floats
 from tcpipe.tables.facts import ClockFacts, ClockOffset, ClockPair
 from tcpipe.tables.findings import Finding, Remedy, StageReport, Subject, make_finding

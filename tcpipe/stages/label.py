@@ -18,14 +18,13 @@ from tcpipe.fusion.trajectory import DISPLACEMENT_LAGS_S
 from tcpipe.geometry.piecewise_linear import interpolate, mean_between
 from tcpipe.motion.row_sections import find_runs, number_pieces
 from tcpipe.motion.uncertainty import compute_along_std_m, compute_displacement_std_m, interpolate_durations_m
-from tcpipe.power.energy import Rule, count_samples_inside, integrate_energy
-from tcpipe.power.idle import IdlePower, estimate_idle_power
+from tcpipe.power.energy import IdlePower, Rule, count_samples_inside, estimate_idle_power, integrate_energy
 from tcpipe.power.noise import estimate_energy_noise, estimate_resolution
 from tcpipe.power.rails import Rail, compute_power_watt
 from tcpipe.recipe import LabelConfig
-from tcpipe.stages.label_facts import label_facts, label_findings
+from tcpipe.stages.label_facts import label_facts, label_findings, sum_energy_entries
 from tcpipe.stages.label_motion import clock_doubtful, find_motion_flags, find_power_flags, make_motion_columns
-from tcpipe.stages.power_rails import make_rails, sum_energy_entries
+from tcpipe.stages.message_arrays import make_rails
 from tcpipe.tables.arrays import select_rows, to_numbers
 from tcpipe.tables.bits import DropReason, Quality
 from tcpipe.tables.columns import read_lonlat_deg, to_floats, to_integers

@@ -31,10 +31,15 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.fusion.gates import find_chi_square_threshold
 from tcpipe.fusion.measurements import DOPPLER, GNSS, IMU, VISUAL, WHEELS, BodyVelocities, Measurements, Positions
 from tcpipe.fusion.process import DOPPLER_LASTS_S, VISUAL_SCALE_STD, WHEEL_SCALE_STD
-from tcpipe.fusion.signals import compute_interval_means, compute_median_period_ns, compute_seconds, is_in_gap
+from tcpipe.fusion.signals import (
+    compute_interval_means,
+    compute_median_period_ns,
+    compute_seconds,
+    find_chi_square_threshold,
+    is_in_gap,
+)
 from tcpipe.fusion.trajectory import DISPLACEMENT_LAGS_S, Trajectory
 from tcpipe.geometry.rotation import matrix_from_quat, quat_from_matrix, rotation_vector_from_quat
 from tcpipe.tables.facts import Disagreement

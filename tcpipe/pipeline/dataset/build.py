@@ -49,7 +49,7 @@ from tcpipe.formats.place import DirectoryPlace
 from tcpipe.formats.recipe_toml import resolve_recipe
 from tcpipe.formats.store_document import SPOOL
 from tcpipe.formats.user_paths import check_local_output
-from tcpipe.motion.remedies import KEPT
+from tcpipe.motion.distance_breakdown import KEPT
 from tcpipe.pipeline.begun_calls import OpenCall, commit_call
 from tcpipe.pipeline.call_history import BUILD, Estimate, estimate, measure_call, start_stopwatch
 from tcpipe.pipeline.dataset.added_columns import read_all_covariates

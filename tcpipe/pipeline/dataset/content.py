@@ -35,7 +35,7 @@ from tcpipe.formats.place import DirectoryPlace, Place
 from tcpipe.formats.robot_files import load_profiles
 from tcpipe.formats.stored_runs import RunDirectory
 from tcpipe.formats.zarr_arrays import Compression
-from tcpipe.motion.remedies import KEPT
+from tcpipe.motion.distance_breakdown import KEPT
 from tcpipe.pipeline.dataset.added_columns import find_narrow_patches, make_added_columns, tag_of_each
 from tcpipe.pipeline.dataset.bias_check import find_removed_by_ground
 from tcpipe.pipeline.dataset.inputs import BuildOptions, Inputs

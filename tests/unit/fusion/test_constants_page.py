@@ -12,16 +12,12 @@ WHOLLY = (
     "process",
     "initial",
     "course",
-    "fix_errors",
     "gnss_faults",
-    "stationary",
     "preparation",
-    "track_sections",
     "checks.audit",
     "checks.doppler",
     "checks.mounting",
     "checks.odometry_scale",
-    "pose_increments",
 )
 """Modules of which every number is listed."""
 UNLISTED = {"_MAX_GAP_NS", "_GRAVITY_BAND_MPS2"}  # the recipe's default beside the recipe; a band, told in words
