@@ -58,19 +58,14 @@ def run_error_state(
     gate_probability: float = 0.999,
     smooth: bool = True,
 ) -> Trajectory:
-    """Filter and smooth one stretch.
+    """Filter one section and, unless ``smooth`` is False, smooth it; return the states of base_link in ENU at ``output_ns``.
 
     Parameters
     ----------
     measurements : at least one of GNSS, wheels and visual odometry.
     initial : state at the first measurement.
-    output_ns : [ns], shape (N,), increasing: the wanted stamps.
-    gate_probability : a measurement less likely than 1 minus this is refused.
-    smooth : False gives the forward filter.
-
-    Returns
-    -------
-    States at ``output_ns``, base_link in ENU.
+    output_ns : [ns], shape (N,), increasing.
+    gate_probability : a measurement less likely than 1 minus this is rejected.
 
     Raises
     ------

@@ -85,14 +85,7 @@ class _Memory:
 
 
 class FilterPass:
-    """One timeline with its constants and what the gates said.
-
-    Parameters
-    ----------
-    timeline, measurements : the events, and what they are made of.
-    gate_probability : a measurement less likely than 1 minus this is refused.
-    lags : [rows of the wanted stamps], over which displacements are judged, see `compute_lag_rows`.
-    """
+    """One timeline with its constants and what the gates decided; ``lags`` are rows of the wanted stamps (`compute_lag_rows`)."""
 
     def __init__(
         self, timeline: EventTimeline, measurements: Measurements, gate_probability: float, *, lags: Sequence[int]

@@ -77,13 +77,10 @@ Try = Callable[[Spans], FaultHypothesis]
 def unexplained_innovation(
     spans: Spans, fixes: Innovations, others: Sequence[Innovations], usual: float
 ) -> FaultHypothesis:
-    """Return what a run in which the fixes err in ``spans`` leaves unexplained.
+    """Return what a run leaves unexplained in which the fixes err in ``spans``.
 
-    Parameters
-    ----------
-    spans : in which the error of the fixes was free.
-    fixes, others : what the gates saw.
-    usual : squared innovation of a fix that is right; single outliers count as much, and so do fixes inside the spans.
+    ``fixes`` and ``others`` are what the gates saw. ``usual`` is the squared innovation of a right fix: single outliers count as much, and
+    so do fixes inside the spans.
     """
     free = is_inside(fixes.stamp_ns, spans)
     single = fixes.refused & ~_is_in_runs(fixes.refused, _ALONE)
@@ -170,13 +167,10 @@ def find_returned_fixes(jumps: Sequence[Jump]) -> GnssFaults | None:
 
 
 def find_wrong_fixes(tried: Try, whole: Span, known: Spans) -> GnssFaults | None:
-    """Return when the fixes were wrong, as all sensors together explain it best; None where that is no matter of spans.
+    """Return the spans in which fixes were wrong, as all sensors together explain it best; None where no spans explain it.
 
-    Parameters
-    ----------
-    tried : runs the filter with the error of the fixes free in spans.
-    whole : of the stretch.
-    known : when fixes were seen to be off, in a run that follows them in the end.
+    ``tried`` runs the filter with the error of the fixes free in spans; ``known`` are spans in which fixes were off in a run that follows
+    them in the end.
     """
     plain = tried(())
     events = _merge_spans((*plain.refused, *known))
@@ -213,8 +207,8 @@ def _is_endless(spans: Spans, whole: Span) -> bool:
 def _has_rival(other: FaultHypothesis, best: FaultHypothesis, *, alike: bool) -> bool:
     """Return whether another explanation is about as good and shares little with the best.
 
-    Of what follows a single jump nothing tells when it ends: then one that is much longer is no more ``alike``, and which is the shorter
-    tells nothing. Nor is one span alike several short ones: a filter that nothing holds follows wrong fixes after seconds.
+    The innovations after a single jump do not show when it ends: then one that is much longer is no more ``alike``. Nor is one span alike
+    several short ones: a filter without other position sensors follows wrong fixes after seconds.
     """
     shared = sum(max(0, min(b, d) - max(a, c)) * 1e-9 for a, b in best.spans for c, d in other.spans)
     longer = max(_compute_length(best.spans), _compute_length(other.spans))

@@ -44,14 +44,7 @@ _UNKNOWN_YAW_STD_RAD = 0.6  # the sigma points of a wider one would meet behind 
 
 
 def find_initial_state(measurements: Measurements, standing_ns: NDArray[np.int64], start_ns: int) -> InitialState:
-    """Return the state at ``start_ns``, the first stamp of the stretch.
-
-    Parameters
-    ----------
-    measurements : of one stretch.
-    standing_ns : [ns], shape (K, 2), when the robot stands.
-    start_ns : [ns].
-    """
+    """Return the state at ``start_ns`` [ns], the first stamp of a section; ``standing_ns`` [ns], shape (K, 2), are its stops."""
     bias, bias_std = _estimate_gyro_bias(measurements.imu, standing_ns)
     roll, pitch, tilt_std = _estimate_tilt(measurements.imu, standing_ns, start_ns)
     path = _Path(measurements, start_ns, bias)
@@ -292,11 +285,9 @@ _MARGIN_NS = 150_000_000
 
 
 def find_stationary_intervals(measurements: Measurements) -> NDArray[np.int64]:
-    """Return when the robot stands for certain.
+    """Return when the robot is stationary for certain: first and last stamp of each stay of at least 0.3 s [ns], shape (K, 2), in order.
 
-    Returns
-    -------
-    [ns], shape (K, 2), int64: first and last stamp of each stay of at least 0.3 s, in order. Empty without wheels or without gyroscope.
+    Empty without wheels or without gyroscope.
     """
     wheels, imu = measurements.wheels, measurements.imu
     if wheels is None or imu is None or wheels.stamp_ns.size == 0 or imu.stamp_ns.size == 0:

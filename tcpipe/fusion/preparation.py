@@ -130,18 +130,11 @@ def prepare_body_velocities(
     default_std_mps: float,
     only_forward: bool,
 ) -> tuple[BodyVelocities, Prepared]:
-    """Prepare an odometry (columns of the roles wheel_odometry and visual_odometry).
+    """Prepare an odometry (columns of the roles wheel_odometry and visual_odometry), whose child frame has the extrinsics given.
 
-    Its twist is taken where it has one. One that is forward empty, or zero throughout while the poses move, is none: the velocity is then
-    that of the increment from pose to pose, in the middle of the two stamps, in the axes half-way between the two. One that is surely
-    along the axes of the pose's frame is turned by the pose.
-
-    Parameters
-    ----------
-    stamp_ns : [ns], shape (N,). columns : by name, null as NaN.
-    xyz_m, quat_xyzw : base_link_from_sensor of the child frame.
-    default_std_mps : [m/s], where the variance is unknown.
-    only_forward : wheels measure only the velocity along base_link's x.
+    Its twist is used where it has one. One that has no forward velocity, or is zero throughout while the poses move, is none: the velocity
+    is then that of the increment from pose to pose, in the middle of the two stamps, in the axes half-way between the two. One that is
+    surely along the axes of the pose's frame is turned by the pose. Of wheels ``only_forward`` velocity, along base_link's x, is measured.
     """
     pose = _make_rotation_matrix(columns, ("x_m", "y_m", "z_m"))
     velocity = _make_rotation_matrix(columns, [f"velocity_{axis}_mps" for axis in "xyz"])
@@ -238,10 +231,9 @@ def prepare_imu(
     gyro_std_radps: float,
     accelerometer_std_mps2: float,
 ) -> tuple[InertialMeasurements, Prepared]:
-    """Prepare an IMU (columns of the role imu): turned into base_link axes, its specific force checked for being one.
+    """Prepare an IMU (columns of the role imu): turned into base_link axes, moved to base_link, its specific force checked for being one.
 
-    The specific force is moved to base_link: what the unit feels beyond base_link, since it sits off it and the robot turns, is taken
-    off. The noise is the one given or, where that is larger, what the samples show: motion too fast for the unit's rate counts as noise.
+    The noise is the one given or, where that is larger, that of the samples: motion too fast for the unit's rate counts as noise.
     """
     rate = _make_rotation_matrix(columns, [f"angular_velocity_{axis}_radps" for axis in "xyz"])
     force = _make_rotation_matrix(columns, [f"linear_acceleration_{axis}_mps2" for axis in "xyz"])
@@ -299,10 +291,10 @@ def _read_orientations(columns: Columns, usable: Ints, quat_xyzw: tuple[float, f
 
 
 def _move_to_base_link(stamp_ns: Ints, turn_radps: Floats, force_mps2: Floats, lever_m: Floats) -> None:
-    """Take off the acceleration of the unit against base_link, dw x l + w x (w x l) [m/s²], in base_link axes.
+    """Subtract the acceleration of the unit relative to base_link, dw x l + w x (w x l) [m/s²], in base_link axes.
 
-    The angular acceleration dw is the slope of a line through five samples (Savitzky and Golay 1964): its noise, added over time,
-    cancels out, as that of any derivative.
+    The angular acceleration dw is the slope of a line through five samples (Savitzky and Golay 1964): its noise, added over time, cancels
+    out.
     """
     if stamp_ns.size < 5 or not lever_m.any():
         return
@@ -399,17 +391,10 @@ def compute_increments(
 def compute_orientation_rates(
     stamp_ns: NDArray[np.int64], rate_radps: Floats, quat_xyzw: Floats
 ) -> tuple[Floats, NDArray[np.bool_]]:
-    """Return angular velocities, by the orientation about every axis about which it turns while they are missing or zero throughout.
+    """Return angular velocities, shape (N, 3), and which axes of them are by the orientation, shape (3,).
 
-    Parameters
-    ----------
-    stamp_ns : [ns], shape (N,), not decreasing.
-    rate_radps : in the child frame, shape (N, 3), NaN where not measured.
-    quat_xyzw : shape (N, 4), NaN without.
-
-    Returns
-    -------
-    Angular velocities, shape (N, 3), and which axes are the orientation's, shape (3,).
+    Those are the axes about which it turns while ``rate_radps``, in the child frame, is missing or zero throughout. ``stamp_ns`` does not
+    decrease; NaN is not measured.
     """
     zero = (np.nan_to_num(rate_radps) == 0.0).all(axis=0)
     known = np.flatnonzero(np.isfinite(quat_xyzw).all(axis=1))
@@ -431,9 +416,7 @@ def compute_orientation_rates(
 def is_along_pose_axes(stamp_ns: NDArray[np.int64], velocity_mps: Floats, pose_m: Floats, quat_xyzw: Floats) -> bool:
     """Return whether velocities are surely along the axes of the pose's frame: its increments fit them so, and not turned by the pose.
 
-    Parameters
-    ----------
-    stamp_ns : [ns], shape (N,). velocity_mps : shape (N, 3), NaN where an axis is not told. pose_m, quat_xyzw : shapes (N, 3), (N, 4).
+    Velocities [m/s] have shape (N, 3), NaN where an axis is not measured.
     """
     known = np.isfinite(velocity_mps[:, :2]).all(1) & np.isfinite(pose_m).all(1) & np.isfinite(quat_xyzw).all(1)
     stamp, place, quat = stamp_ns[known], pose_m[known, :2], quat_xyzw[known]

@@ -19,17 +19,9 @@ def compute_seconds(stamp_ns: Ints | int, zero_ns: int) -> Floats:
 
 
 def integrate_signal(stamp_s: Floats, values: Floats, at_s: Floats) -> Floats:
-    """Return the integral, from the first sample on, of the piecewise-linear signal through the samples.
+    """Return the integral [u s], shape (M, k), from the first sample on to ``at_s``, of the linear interpolation [u] of (N, k) samples.
 
-    Parameters
-    ----------
-    stamp_s : [s], shape (N,), increasing, N >= 1.
-    values : [u], shape (N, k). Before the first and after the last sample they are held.
-    at_s : [s], shape (M,).
-
-    Returns
-    -------
-    [u s], shape (M, k).
+    Stamps [s] increase, N >= 1; before the first and after the last sample values are held.
     """
     step = np.diff(stamp_s)
     index = np.clip(np.searchsorted(stamp_s, at_s, "right") - 1, 0, stamp_s.size - 1)

@@ -81,14 +81,7 @@ class EventTimeline:
 
 
 def build_timeline(measurements: Measurements, standing_ns: Ints, output_ns: Ints) -> EventTimeline:
-    """Merge measurements, constraints and wanted stamps.
-
-    Parameters
-    ----------
-    measurements : of one stretch.
-    standing_ns : [ns], shape (K, 2), from `tcpipe.fusion.initial.find_stationary_intervals`.
-    output_ns : [ns], shape (N,), increasing.
-    """
+    """Merge measurements of one section, constraints and wanted stamps [ns]; ``standing_ns`` [ns], shape (K, 2), are stops."""
     parts = _make_measured_parts(measurements)
     start = min(int(part[0][0]) for part in parts if part[0].size)
     end = max(int(part[0][-1]) for part in parts if part[0].size)

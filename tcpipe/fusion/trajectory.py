@@ -113,10 +113,10 @@ def cut_stretches(measurements: Mapping[int, Measurements]) -> list[TrackSection
 
 
 def track_stamps(stretch: TrackSection, *, period_ns: int, max_gap_ns: int) -> NDArray[np.int64]:
-    """Return the multiples of the period inside a stretch [ns], those left out that lie in a gap of motion measurements.
+    """Return the multiples of the period inside a section [ns], without those in a gap.
 
     A gap is a time without any of GNSS, wheels and visual odometry longer than ``max_gap_ns`` and than 2.5 times their usual spacing:
-    the IMU alone does not bear a track. A gap is a step in the stamps.
+    the IMU alone does not determine a track. A gap is a step in the stamps.
     """
     first = -(-stretch.start_ns // period_ns) * period_ns
     stamp = np.arange(first, stretch.end_ns + 1, period_ns, dtype=np.int64)

@@ -61,13 +61,9 @@ def compute_unexplained_m(stamp_ns: Ints, position_m: Floats, velocity_mps: Floa
 
 
 def compute_interval_length_m(stamp_ns: Ints, position_m: Floats, velocity_mps: Floats, piece: Ints) -> Floats:
-    """Return the odometer's share of every interval between rows, [m], shape (N - 1,).
+    """Return the odometer's share of every interval between rows [m], shape (N - 1,).
 
-    Parameters
-    ----------
-    stamp_ns : [ns], shape (N,).
-    position_m, velocity_mps : [m], [m/s], shape (N, 3): east, north, up.
-    piece : shape (N,), numbers of the uninterrupted pieces.
+    ``position_m`` [m] and ``velocity_mps`` [m/s] have shape (N, 3): east, north, up.
     """
     step = np.diff(position_m, axis=0)
     length: Floats = np.hypot(step[:, 0], step[:, 1])

@@ -27,12 +27,7 @@ Rule = Literal["exact", "averaged", "right_endpoint"]
 
 
 def integrate_energy(rails: list[Rail], start_ns: Ints, end_ns: Ints, *, rule: Rule) -> Floats:
-    """Return the energy of all rails over each span, [J], shape (M,); NaN where any rail is not known throughout, or there is none.
-
-    Parameters
-    ----------
-    start_ns, end_ns : [ns], shape (M,).
-    """
+    """Return the energy of all rails over each span [J], shape (M,); NaN where any rail is unknown in part of it, or there is none."""
     total = np.full(len(start_ns), np.nan if not rails else 0.0)
     for each in rails:
         energy = np.full(len(start_ns), np.nan)
@@ -57,11 +52,9 @@ def integrate_recorded_energy(rails: list[Rail], start_ns: Ints, end_ns: Ints, *
 
 
 def count_samples_inside(rails: list[Rail], start_ns: Ints, end_ns: Ints) -> tuple[Ints, Floats]:
-    """Return how many current samples lie in (start, end], the fewest of any rail, and the plain mean power of the samples there.
+    """Return the number of current samples in (start, end], the fewest of any rail, and the plain mean power of the samples there [W].
 
-    Returns
-    -------
-    [1], shape (M,), 0 without rails; [W], shape (M,), sum over rails of the mean of V·I at the union's stamps, NaN where it has none.
+    Both have shape (M,); 0 and NaN without rails, the mean NaN also where a rail has no sample.
     """
     count = np.zeros(len(start_ns), dtype=np.int64)
     mean = np.full(len(start_ns), np.nan if not rails else 0.0)
@@ -97,13 +90,7 @@ which stands once for seconds, gives 12 % of that more while driving than the dr
 
 @dataclass(frozen=True, slots=True)
 class IdlePower:
-    """Power of the standing robot over a run.
-
-    Attributes
-    ----------
-    watt : median of the means of seconds [W]; NaN where the robot hardly stood.
-    std_watt : how far it may lie from what the robot would draw standing, over any second of the run [W]; NaN likewise.
-    """
+    """Idle power of a run: the median of the means of seconds [W], and its standard deviation for any second of the run; NaN if unknown."""
 
     watt: float
     std_watt: float
@@ -112,14 +99,14 @@ class IdlePower:
 def estimate_idle_power(
     power_watt: Floats, halt: NDArray[np.int64], *, window_rows: int, step_watt: float
 ) -> IdlePower:
-    """Return the power while standing. A second is about as long as a segment takes, and its mean is finer than the record's step.
+    """Return the idle power. A second is about as long as a segment takes, and its mean is finer than the record's step.
 
     Parameters
     ----------
-    power_watt : [W], shape (N,), while the robot stands, in order of time; NaN where it is not known.
-    halt : shape (N,), which halt a row is of, increasing; negative at the edges of a halt, where motors still or already draw.
+    power_watt : [W], shape (N,), while the robot is stationary, in order of time; NaN where unknown.
+    halt : shape (N,), number of the row's halt, increasing; negative at the edges of a halt, where motors still or already draw.
     window_rows : rows of a second.
-    step_watt : [W], step in which power is told; while it stays on one level, nothing else tells how far that is off.
+    step_watt : [W], resolution of power; a record that stays on one level has an error of up to half of it.
     """
     known = np.isfinite(power_watt)
     if np.count_nonzero(known) < FEWEST_ROWS:

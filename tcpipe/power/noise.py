@@ -37,13 +37,9 @@ _SETTLED_S = 0.2  # after a stop and before a start the motors still draw
 
 @dataclass(frozen=True, slots=True)
 class EnergyNoise:
-    """Variances of each span's energy by cause, [J²], shape (M,), independent of each other; 0 without rails.
+    """Variances of each span's energy by cause [J²], shape (M,), independent of each other; 0 without rails.
 
-    Attributes
-    ----------
-    rate : what the current did between its samples.
-    current : noise and rounding of the current.
-    voltage : all of the voltage's.
+    ``rate`` is of the current between its samples, ``current`` of its noise and rounding, ``voltage`` all of the voltage's.
     """
 
     rate: Floats
@@ -58,13 +54,12 @@ class EnergyNoise:
 def estimate_energy_noise(
     rails: list[Rail], start_ns: Stamps, end_ns: Stamps, still_ns: Stamps, *, rate_hz: float | None = None
 ) -> EnergyNoise:
-    """Return how uncertain each span's energy is from sampling, noise and quantisation.
+    """Return the uncertainty of each span's energy from sampling, noise and quantisation.
 
     Parameters
     ----------
-    rails : voltage and current of the drive.
-    start_ns, end_ns : [ns], shape (M,), the spans of steady driving that a label is wanted of, in time order.
-    still_ns : [ns], shape (S, 2), begin and end of every stretch in which the robot stands.
+    start_ns, end_ns : [ns], shape (M,), the spans of steady driving of the labels, in order of time.
+    still_ns : [ns], shape (S, 2), begin and end of every span in which the robot is stationary.
     rate_hz : [Hz], as if power had been sampled so; None as it was.
     """
     rate, current, voltage = np.zeros((3, len(start_ns)))
@@ -304,13 +299,10 @@ class SignalModel:
 
 
 def fit_signal_model(signal: Samples, steady: Mask, still: Mask, *, averaged: bool) -> SignalModel:
-    """Return what the signal is made of where it counts.
+    """Return the model of a signal by its ``steady`` samples, shape (N,).
 
-    Parameters
-    ----------
-    steady : shape (N,), the samples that count.
-    still : shape (N,), the samples of a robot that stands, where all scatter is error.
-    averaged : whether a sample is the mean since the one before it.
+    ``still`` are the samples of a stationary robot, shape (N,), where all scatter is error. Of ``averaged`` signals a sample is the mean
+    since the one before it.
     """
     period_s = float(np.median(np.diff(signal.stamp_ns))) * _NS
     spacing, seen, weight = _compute_second_differences(signal, steady, period_s)
@@ -378,10 +370,10 @@ def _fit_sizes(made: Floats, seen: Floats, weight: Floats) -> list[float]:
 
 
 def _estimate_stationary_error(signal: Samples, still: Mask) -> float | None:
-    """Return the variance of a sample while the robot stands, in the signal's unit squared; None where it hardly does.
+    """Return the variance of a sample while the robot is stationary, in the signal's unit squared; None where it hardly is.
 
-    From the squared differences of following samples, without those that a motor makes which starts or stops among them: what lies
-    beyond four deviations is left out, again and again. A median, from which this begins, is a multiple of the record's resolution.
+    It is that of the squared differences of successive samples without those beyond four deviations, which a motor makes that starts or
+    stops; repeated from their median, which is a multiple of the record's resolution.
     """
     if still.sum() <= _FEWEST_STILL:
         return None

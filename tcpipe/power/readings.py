@@ -68,12 +68,8 @@ def read_power(
 ) -> PowerReadings:
     """Return the rails of all power topics, with every current positive when drawn.
 
-    Parameters
-    ----------
-    topics : message type and columns by topic.
-    known : what message types tell of power.
-    platform : of the robot.
-    husky_power, current_sign : recipe keys.
+    ``topics`` are message type and columns by topic, ``known`` the tables of message types, ``platform`` is the robot's; the others are
+    recipe keys.
     """
     rails: dict[str, list[RailReadings]] = {}
     sources: list[PowerSource] = []
@@ -325,17 +321,11 @@ _FEWEST = 20
 
 
 def find_wrap(current_amp: Floats) -> float | None:
-    """Return what is to be subtracted from the upper values of a current [A], None where it never wrapped.
+    """Return what is to be subtracted from the upper values of a current [A], shape (N,), NaN where unknown; None where it never wrapped.
 
     A Warthog's motor controllers send a signed number of 1/16 A as unsigned (norlab-ulaval/warthog_sevcon_fix), AgileX's did with 0.1 A
-    until 2024 (agilexrobotics/ugv_sdk, 7769abf): -2 A reads as 4094 A, or as 6551.6 A.
-
-    It did where all values lie on the grid of a number of 16 bits, some in its upper quarter, and none in the two quarters between: no
-    current passes from one to the other without a value there.
-
-    Parameters
-    ----------
-    current_amp : [A], shape (N,), NaN where there is none.
+    until 2024 (agilexrobotics/ugv_sdk, 7769abf): -2 A reads as 4094 A, or as 6551.6 A. So it is where all values are on the grid of a
+    number of 16 bits, some in its upper quarter, and none in the two quarters between, which no current crosses without a value there.
     """
     known = current_amp[np.isfinite(current_amp)]
     if known.size < _FEWEST or known.min() < 0.0:

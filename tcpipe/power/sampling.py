@@ -34,12 +34,8 @@ _JUMPING_SHARE = 0.1
 def find_readings(stamp_ns: Stamps, values: Floats) -> NDArray[np.int64] | None:
     """Return the rows on which new readings arrived, shape (R,); None where messages do not surely repeat readings.
 
-    A reading that equals the one before it shows no change: its row is the one at which it is expected.
-
-    Parameters
-    ----------
-    stamp_ns : [ns], shape (N,), not decreasing, of which most differ.
-    values : shape (N, K), quantities that are read together, finite.
+    A reading that equals the one before it shows no change: its row is the one at which it is expected. ``stamp_ns`` [ns], shape (N,), does
+    not decrease; ``values``, shape (N, K), are quantities that are read together, finite.
     """
     changed = np.flatnonzero((values[1:] != values[:-1]).any(axis=1)) + 1
     if changed.size <= _FEWEST_INTERVALS or not _has_jumps(values[changed]):
@@ -111,10 +107,10 @@ _CLEARLY = 0.9
 def is_stated_averaged(
     power_ns: Stamps, power_watt: Floats, motion_ns: Stamps, forward_mps: Floats, yaw_rate_radps: Floats
 ) -> bool | None:
-    """Return whether each value is the mean since the one before it (True) or sampled (False); None where motion tells neither.
+    """Return whether each value is the mean since the one before it (True) or sampled (False); None where motion shows neither.
 
-    Power is fitted by standing, speed, its square, turning and the gain of speed, as means over one period about a time that lies so and so
-    long before each stamp; which delay fits best tells, unless that is neither's, or hardly better than the other.
+    Power is fitted by a constant, speed, its square, turning and the gain of speed, as means over one period about a time that is a delay
+    before each stamp. The delay that fits best decides, unless it is neither's, or hardly better than the other.
 
     Parameters
     ----------

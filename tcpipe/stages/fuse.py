@@ -49,20 +49,14 @@ from tcpipe.tables.levels import TRACK, Datum, Streams, Track, TrackInfo
 
 
 def fuse_run(streams: Streams, config: FuseConfig, *, run_id: str) -> Track:
-    """Return the track of a run.
+    """Return the track of a run; rows are in order of clock epoch and stamp.
 
-    Each clock epoch, and each stretch between long pauses, is fused for itself; rows stand in order of epoch and stamp. Stamps are
-    multiples of the track's period; where no sensor tells motion for ``max_gap_s`` there are no rows, so a gap is a step in the stamps.
-
-    Parameters
-    ----------
-    streams : what `read_run` made of a log.
-    config : estimator, rate and noise.
-    run_id : stands in the track's info.
+    Each clock epoch, and each section between long pauses, is fused for itself. Stamps are multiples of the track's period; where no sensor
+    measures motion for ``max_gap_s`` there are no rows, so a gap is a step in the stamps.
 
     Raises
     ------
-    FusionError : nothing tells motion, or the estimate breaks down.
+    FusionError : no sensor measures motion, or the estimate breaks down.
     """
     # 1. A pose made elsewhere is what the fixes are.
     #    Streams become measurements: one frame, one set of units, usable variances; sensors that cannot be right are left out.
@@ -121,32 +115,28 @@ Judged = tuple[FusionInputs, StageReport[SensorChecks]]
 def fuse_agreeing(
     inputs: FusionInputs, sanity: StageReport[SensorChecks], streams: Streams, config: FuseConfig, *, run: Subject
 ) -> tuple[FusionInputs, StageReport[SensorChecks], Fused]:
-    """Fuse each stretch; where sensors contradict each other in most of the way, again without the one that is at fault.
+    """Fuse each section; where sensors contradict each other over most of the distance, again without the one that is at fault.
 
     The sensor that differs from the others is not always the wrong one: an IMU whose bias has jumped leads the track and the odometries
-    away from the fixes. So each sensor is left out for a trial. So it is where the track goes astray.
-    What a track that they led showed of mountings and scales is forgotten then.
+    away from the fixes. So each sensor is excluded for a trial, also where the track contradicts every sensor. Corrections of extrinsics
+    and scales that such a track showed are discarded.
 
     Raises
     ------
-    FusionError : the track goes astray whichever sensor is left out.
+    FusionError : the track contradicts every sensor, whichever is excluded.
     """
     found, fused = fuse_mounted(inputs, streams, config)
-    lone, astray = find_isolated_sensors(fused.tallies), _is_astray(fused)
+    lone, astray = find_isolated_sensors(fused.tallies), is_astray(fused.windows, fused.astray)
     if lone or astray or find_undecided_sensors(fused.tallies):
         lone = _find_fault(inputs, sanity, streams, config, astray=astray) or lone
         if lone:
             inputs, sanity = _without(lone, inputs, sanity, streams, astray=astray)
             found, fused = fuse_mounted(inputs, streams, config)
-    if _is_astray(fused):
+    if is_astray(fused.windows, fused.astray):
         astray_fraction = fused.astray / fused.windows
         finding = make_finding("track-contradicts-sensors", run, astray_fraction=astray_fraction)
         raise FusionError("the track contradicts every sensor", findings=(finding, *sanity.findings))
     return found, sanity, fused
-
-
-def _is_astray(fused: Fused) -> bool:
-    return is_astray(fused.windows, fused.astray)
 
 
 def _without(
@@ -161,10 +151,10 @@ def _without(
 def _find_fault(
     inputs: FusionInputs, sanity: StageReport[SensorChecks], streams: Streams, config: FuseConfig, *, astray: bool
 ) -> tuple[str, ...]:
-    """Return the one sensor without which the others agree; of several that whose others confirm each other most, none of two equals.
+    """Return the one sensor without which the others agree; of several the one whose others confirm each other most, none of two equals.
 
-    Of two sensors either would do: nobody can tell. Of a track that goes ``astray`` it is the IMU, of which the process is made, if the
-    track does not without it; else the only sensor without which it does not.
+    Where the track is ``astray``, it is the IMU, of which the process is made, if the track recovers without it; else the only sensor
+    without which it recovers.
     """
     roles = sorted({role for m in inputs.measurements.values() for role in m.sensors()})
     if len(roles) <= 2 and not astray:
@@ -177,7 +167,7 @@ def _find_fault(
             tried = fuse_stretches(rest, streams, config)
             if tried.tallies and is_consistent(tried.tallies):
                 agreeing[role] = count_confirmations(tried.tallies)
-            if tried.found and not _is_astray(tried):
+            if tried.found and not is_astray(tried.windows, tried.astray):
                 following.append(role)
     best = [role for role, confirmed in agreeing.items() if confirmed == max(agreeing.values())]
     if astray and (len(best) != 1 or best[0] not in following):
@@ -239,11 +229,9 @@ def _find_tilt(inputs: FusionInputs, fused: Fused) -> Tilt | None:
 def _find_lever_arm(
     inputs: FusionInputs, fused: Fused, streams: Streams, *, trusted: bool
 ) -> tuple[Arm | None, NDArray[np.float64]]:
-    """Return the antenna's arm and by how much to move it; None and nothing where it stays.
+    """Return the antenna's arm and by how much to move it; None and zeros where it stays.
 
-    Parameters
-    ----------
-    trusted : whether the track's attitude is; otherwise a stated arm is not judged by it.
+    A stated arm is judged only by a track whose attitude is ``trusted``.
     """
     nothing = np.zeros(3)
     if inputs.datum_deg_m is None or GNSS not in streams.sensors:

@@ -174,11 +174,8 @@ def _without(refused: frozenset[str], m: Measurements) -> Measurements:
 
 def find_longest_epoch(inputs: FusionInputs) -> int:
     """Return the clock epoch with most measurements."""
-    return max(inputs.measurements, key=lambda epoch: _count_rows(inputs.measurements[epoch]))
-
-
-def _count_rows(measurements: Measurements) -> int:
-    return sum(sensor.stamp_ns.size for sensor in measurements.sensors().values())
+    counts = {epoch: sum(of.stamp_ns.size for of in m.sensors().values()) for epoch, m in inputs.measurements.items()}
+    return max(counts, key=lambda epoch: counts[epoch])
 
 
 def read_command(streams: Streams, epoch: int) -> CommandedSpeed | None:

@@ -50,12 +50,9 @@ def label_segments(
     *,
     voltage_range_volt: tuple[float, float] | None,
 ) -> LabelledSegments:
-    """Return the segments with w, v, T, E, their standard deviations as costs of the true metre, and quality bits.
+    """Return the segments with w, v, T, E, their standard deviations, and quality bits.
 
-    Parameters
-    ----------
-    streams : for its power; without it, or where it does not reach, power and energy are null.
-    voltage_range_volt : [V], of the robot's profile; beyond it a label is flagged; no range, no flag.
+    Power and energy are null where ``streams`` has no power. A label beyond ``voltage_range_volt`` [V], of the robot's profile, is flagged.
     """
     rule: Rule = "averaged" if streams.power_averaged else config.integration
     parts, joules = [LABELLED_SEGMENTS.empty()], Counter[str]()
@@ -113,13 +110,9 @@ _BETTER_HZ = 20.0
 def compute_segment_costs(
     cut: pa.Table, rows: pa.Table, rails: list[Rail], info: TrackInfo, *, rule: Rule, standing: IdlePower
 ) -> tuple[Labels, NetLabels, dict[str, NDArray[np.float64]]]:
-    """Return the labels of one epoch's segments, those above standing, and the variances of their energies by cause [J²].
+    """Return the labels of one epoch's segments, the net labels, and the variances of their energies by cause of `tcpipe.cost.budget` [J²].
 
-    The causes are those of `tcpipe.cost.budget`.
-
-    Parameters
-    ----------
-    rows : the gated track's rows of that epoch.
+    ``cut`` and ``rows`` are the epoch's segments and rows of the gated track.
     """
     start_ns, end_ns, stamp_ns = to_integers(cut, "start_ns"), to_integers(cut, "end_ns"), to_integers(rows, "stamp_ns")
     spans = start_ns, end_ns, _find_stationary_ns(rows, info.rate_hz)
@@ -185,12 +178,7 @@ _EDGE_S = 0.3
 
 
 def find_idle_power(rows: pa.Table, rails: Mapping[int, list[Rail]], *, rate_hz: float) -> IdlePower:
-    """Return the power while standing, of all rows of a gated track, and how sure it is.
-
-    Parameters
-    ----------
-    rails : by clock epoch, for the step in which they tell currents.
-    """
+    """Return the idle power of all rows of a gated track, and its standard deviation; ``rails`` (by clock epoch) show the resolution."""
     piece = number_pieces(to_integers(rows, "stamp_ns"), to_integers(rows, "epoch"), period_ns=1e9 / rate_hz)
     standing = (to_numbers(rows["dropped_by"]) & np.uint32(DropReason.STANDING)) != 0
     halt, edge = np.full(rows.num_rows, -1), round(_EDGE_S * rate_hz)
@@ -213,12 +201,9 @@ def _step_watt(rails: Mapping[int, list[Rail]]) -> float:
 
 
 def add_physics(table: pa.Table, standing_watt: float) -> tuple[pa.Table, PhysicsFacts]:
-    """Return the labelled segments with the power that standing, drivetrain, rolling, grade and turning predict, and the fit.
+    """Return the labelled segments of a run with the power that the physical model predicts, and the fit.
 
-    Parameters
-    ----------
-    table : labelled segments of a run.
-    standing_watt : what the robot draws while it stands; NaN where that is not known.
+    The model has idle power ``standing_watt`` (NaN where unknown), drivetrain, rolling, grade and turning.
     """
     metres = FitSamples(
         power_watt=to_floats(table, "power_watt"),

@@ -41,8 +41,7 @@ def label_facts(
     Parameters
     ----------
     rails : drive rails by clock epoch.
-    energy_by_entry_joule : [J], what was recorded, by ledger entry.
-    ledger_m : [m], by entry; its sum is the distance.
+    energy_by_entry_joule, ledger_m : [J] and [m], by entry of the distance breakdown.
     energy_variance_j2 : [J²], of the segments' energies by cause, epoch by epoch in the table's order.
     velocity : which velocity trains, ground or fused.
     """
@@ -134,17 +133,10 @@ def _describe_signal(signal: Samples) -> SignalFacts:
 
 
 def sum_energy_entries(rows: pa.Table, rails: list[Rail], *, rate_hz: float, rule: Rule) -> dict[str, float]:
-    """Return the energy of one epoch by ledger entry, [J]; their sum is all that was recorded.
+    """Return the energy of one epoch's rows by entry of the breakdown [J]; their sum is all that was recorded.
 
-    Parameters
-    ----------
-    rows : the gated track's rows of that epoch.
-    rate_hz : [Hz], of the track.
-
-    Returns
-    -------
-    Every `DropReason` by name; ``steady`` (the stretches that were cut: kept, curved and leftover); ``outside_track`` (recorded
-    before the track begins or after it ends).
+    Entries are every `DropReason` by name, ``steady`` (kept, curved and leftover), and ``outside_track`` (recorded before the track begins
+    or after it ends). ``rate_hz`` is the track's.
     """
     stamp_ns = to_integers(rows, "stamp_ns")
     piece = number_pieces(stamp_ns, to_integers(rows, "epoch"), period_ns=1e9 / rate_hz)

@@ -35,9 +35,10 @@ def mask_track(
 
     Parameters
     ----------
-    max_velocity_mps : [m/s], the robot profile's maximum; the recipe's goes first. With neither, no row is dropped as below the limit.
+    max_velocity_mps, max_plausible_mps : [m/s], of the robot's profile; the recipe's take precedence. Without a maximum, no row is
+        dropped as
+        below the limit.
     chord_m : [m], length of a segment, over which the relative position error counts.
-    max_plausible_mps : [m/s], the robot profile's; the recipe's goes first.
 
     Raises
     ------
@@ -52,10 +53,10 @@ def mask_track(
         piece=number_pieces(to_integers(table, "stamp_ns"), to_integers(table, "epoch"), period_ns=1e9 * period_s),
         period_s=period_s,
     )
-    gaps = find_gaps(
+    gaps, gap_findings = find_gaps(
         track, rows, chord_m=chord_m, config=config, max_plausible_mps=config.max_plausible_mps or max_plausible_mps
     )
-    found = {DropReason.GAP: gaps.rows, **_find_motion_reasons(rows, config)}
+    found = {DropReason.GAP: np.logical_or.reduce([*gaps.values()]), **_find_motion_reasons(rows, config)}
     limit = find_speed_limit(rows, config, max_velocity_mps=max_velocity_mps)
     limit_mps = limit.limit_mps
     slowest = limit_mps and config.full_speed_fraction * limit_mps
@@ -67,13 +68,13 @@ def mask_track(
     facts = GateFacts(
         rows=table.num_rows,
         rows_kept=int((dropped_by == 0).sum()),
-        gap_rows=gaps.counts(),
+        gap_rows={cause: int(mask.sum()) for cause, mask in gaps.items()},
         rows_dropped={flag_name(reason): int((dropped_by & reason != 0).sum()) for reason in DropReason},
         max_velocity_mps=limit_mps,
         full_speed_mps=slowest,
     )
     gated = GATED_TRACK.table(**{name: table[name] for name in table.column_names}, dropped_by=dropped_by)
-    findings = (*gaps.findings, *find_limits(rows, dropped_by, limit, config))
+    findings = (*gap_findings, *find_limits(rows, dropped_by, limit, config))
     return GatedTrack(gated, add_findings(track.info, findings, replace(track.info.report.facts, gate=facts)))
 
 
@@ -190,40 +191,22 @@ def _state_limit(speed_mps: float) -> tuple[Remedy, ...]:
 _DISPLACEMENTS = [c.name for c in TRACK.columns if c.name.startswith("displacement_std_")]
 
 
-@dataclass(frozen=True, slots=True)
-class Gaps:
-    """Rows in a gap by cause, and the findings."""
+def find_gaps(
+    track: Track, rows: MotionRows, *, chord_m: float, config: GateConfig, max_plausible_mps: float
+) -> tuple[dict[str, Mask], tuple[Finding, ...]]:
+    """Return the rows that are in a gap by cause, and the findings; a row may have several causes.
 
-    without_power: Mask
-    uncertain: Mask
-    jumps: Mask
-    contradicted: Mask
-    implausible: Mask
-    findings: tuple[Finding, ...]
-
-    @property
-    def rows(self) -> Mask:
-        """All of them."""
-        return self.without_power | self.uncertain | self.jumps | self.contradicted | self.implausible
-
-    def counts(self) -> dict[str, int]:
-        """Return the number of rows by cause; a row may have several."""
-        causes = ("without_power", "uncertain", "jumps", "contradicted", "implausible")
-        return {name: int(getattr(self, name).sum()) for name in causes}
-
-
-def find_gaps(track: Track, rows: MotionRows, *, chord_m: float, config: GateConfig, max_plausible_mps: float) -> Gaps:
-    """Return the rows that bear no segment, by cause: no power in a run that has power, a moving row whose next chord is uncertain, a jump.
-
-    An error of scale that all of a run has in common makes no segment worse than the next: it is left out of a chord's own uncertainty.
-    Where its sensors contradict each other in most of the way undecided, they are all rows of the run. Rows faster than
-    ``max_plausible_mps`` [m/s] are no driving; see `find_implausible`.
+    An error of scale that all of a run has in common makes no segment worse than the next: it is not part of a chord's own uncertainty.
+    All rows are contradicted where sensors contradict each other over most of the distance and no third decides.
     """
     power = to_floats(track.table, "power_watt")
     without_power = np.isnan(power) & bool(np.isfinite(power).any())
     moving = np.abs(rows.velocity_mps) >= config.turning_velocity_mps
     uncertain = moving & (_compute_chord_std_m(track, rows, chord_m, config) > config.max_relative_position_std_m)
-    off_m = _compute_unexplained_m(track, rows)
+    table, stamp_ns = track.table, to_integers(track.table, "stamp_ns")
+    position_m = np.column_stack([to_floats(table, f"{axis}_m") for axis in "xyz"])
+    velocity_mps = np.column_stack([to_floats(table, f"{name}_velocity_mps") for name in ("east", "north", "up")])
+    off_m = np.append(compute_unexplained_m(stamp_ns, position_m, velocity_mps, rows.piece), 0.0)
     jumps = np.zeros(len(moving), dtype=np.bool_)
     steps = np.flatnonzero(off_m > config.max_relative_position_std_m)
     jumps[steps] = jumps[steps + 1] = True
@@ -238,14 +221,15 @@ def find_gaps(track: Track, rows: MotionRows, *, chord_m: float, config: GateCon
             make_finding("distance-uncertain", run, lost_fraction=share, chord_m=chord_m, max_std_m=limit_m)
         )
     if far := int((off_m > JUMP_M).sum()):
-        stamp_ns, furthest = to_integers(track.table, "stamp_ns"), int(np.argmax(off_m))
+        furthest = int(np.argmax(off_m))
         at_s = (int(stamp_ns[furthest]) - int(stamp_ns[0])) / 1e9
         jump_m = float(off_m.max())
         findings.append(make_finding("position-jumps", run, span_s=(at_s, at_s), jump_m=jump_m, jump_count=far))
     audit = track.info.report.facts.audit
     contradicted = np.full(len(moving), bool(audit and audit.undecided))
     implausible, too_fast = find_implausible(track, rows, jumps, max_plausible_mps)
-    return Gaps(without_power, uncertain, jumps, contradicted, implausible, (*findings, *too_fast))
+    gaps = {"without_power": without_power, "uncertain": uncertain, "jumps": jumps, "contradicted": contradicted}
+    return {**gaps, "implausible": implausible}, (*findings, *too_fast)
 
 
 def _compute_chord_std_m(track: Track, rows: MotionRows, chord_m: float, config: GateConfig) -> Floats:
@@ -284,24 +268,12 @@ def _subtract_variance(std: Floats, part: Floats) -> Floats:
     return np.sqrt(np.maximum(std**2 - part**2, 0.0))
 
 
-def _compute_unexplained_m(track: Track, rows: MotionRows) -> Floats:
-    table = track.table
-    position_m = np.column_stack([to_floats(table, f"{axis}_m") for axis in "xyz"])
-    velocity_mps = np.column_stack([to_floats(table, f"{name}_velocity_mps") for name in ("east", "north", "up")])
-    return np.append(compute_unexplained_m(to_integers(table, "stamp_ns"), position_m, velocity_mps, rows.piece), 0.0)
-
-
 _WINDOW_S = 60.0
 _DRIVES_MPS = 0.1
 
 
 def find_implausible(track: Track, rows: MotionRows, jumps: Mask, limit_mps: float) -> tuple[Mask, tuple[Finding, ...]]:
-    """Return the rows faster than a limit, by velocity or by the step between two rows, and the finding of them.
-
-    Parameters
-    ----------
-    jumps : rows beside a jump of the position, shape (N,): a jump is no speed.
-    limit_mps : [m/s].
+    """Return the rows faster than a limit [m/s], by velocity or by the step between two rows, and the finding; a jump is not a speed.
 
     Raises
     ------

@@ -39,8 +39,7 @@ class LogReader(Protocol):
 def make_message_arrays(table: pa.Table, in_lists: Collection[str] = ()) -> dict[str, NDArray[Any]]:
     """Return a table's columns: numbers as they are, texts as str, lists of numbers as (N, k) with NaN where a row is shorter.
 
-    Columns of other kinds (lists of messages, null) are left out, but for the numbers inside lists of messages that ``in_lists`` names
-    (``drivers[].current``): those are (N, k) as well.
+    Of lists of messages only the numbers are read that ``in_lists`` names, as ``drivers[].current``: those are (N, k) as well.
     """
     found: dict[str, NDArray[Any]] = {}
     for name in table.column_names:
@@ -131,17 +130,10 @@ _PUBLISH_TIME = "publish_time_ns"
 def gather_messages(
     batches: Iterable[Mapping[str, pa.Table]], played: Mapping[str, Collection[str]]
 ) -> tuple[dict[str, Arrays], dict[str, pa.Table]]:
-    """Return the messages of a log by topic, in the order of log time.
+    """Return the messages of a log by topic, in order of log time: ``played`` topics as arrays, others as tables.
 
-    Parameters
-    ----------
-    batches : tables by topic, piece after piece, as a log gives them.
-    played : topics whose messages are wanted as arrays, each with the numbers inside lists of messages (see `make_message_arrays`).
-
-    Returns
-    -------
-    arrays : of the topics that are played; columns that never change are read-only and take the room of one row.
-    tables : of the other topics.
+    ``batches`` are tables by topic, piece after piece; ``played`` names with each topic the numbers inside lists of messages (see
+    `make_message_arrays`). Columns that never change are read-only and need the memory of one row.
     """
     pieces: dict[str, list[Arrays]] = {}
     others: dict[str, list[pa.Table]] = {}

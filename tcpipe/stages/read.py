@@ -24,7 +24,7 @@ from tcpipe.stages.read_power import add_averaging, find_repeats, read_rail_powe
 from tcpipe.stages.read_roles import decide_roles, find_power_candidates
 from tcpipe.stages.read_sources import TopicReadings, place_pose, place_sensors, read_sources
 from tcpipe.tables.catalogue import Severity, read_threshold
-from tcpipe.tables.facts import ClockStep, PowerSign, RobotChoice, RoleFacts, StageFacts, TopicClock, TopicFacts
+from tcpipe.tables.facts import PowerSign, RobotChoice, RoleFacts, StageFacts, TopicClock, TopicFacts
 from tcpipe.tables.findings import Finding, StageReport, Subject, make_finding
 from tcpipe.tables.levels import STREAMS, Sensor, Streams
 
@@ -34,14 +34,12 @@ def read_run(log: LogReader, config: ReadConfig, *, robot: str | None, known: Pr
 
     Parameters
     ----------
-    log : the opened log.
-    config : topics, placements, clocks and power, where the log does not say.
+    config : topics, extrinsics, clocks and power, where the log does not say.
     robot : profile name; None finds it by message types and topic names.
-    known : robots, and what message types tell of power.
 
     Raises
     ------
-    RoleError : a role cannot be decided, or nothing in the log tells motion.
+    RoleError : a role cannot be decided, or no topic measures motion.
     RecipeError : no profile has the robot's name.
     """
     # 1. Which topic plays which role, from the topic list alone.
@@ -160,7 +158,10 @@ def read_findings(
         if source.key in timelines:
             findings += _find_clock(source, timelines[source.key], is_simulated=clocks.simulated is not None)
     start_ns = min((int(of.readings.log_time_ns[0]) for of in sources if len(of.readings.row)), default=0)
-    findings += [_find_step(step, start_ns) for step in steps]
+    for step in steps:
+        at_s, names = (step.log_time_ns - start_ns) / 1e9, {"topics": ", ".join(step.topics)}
+        numbers = {"step_s": step.step_s, "at_s": at_s}
+        findings.append(make_finding("clock-step", LOG_CLOCK, span_s=(at_s, at_s), names=names, **numbers))
     facts = StageFacts(
         robot=RobotChoice(assignment.robot, assignment.robot_why),
         roles={role: _make_role_facts(role, assignment, sources, timelines, sensors[role]) for role in sensors},
@@ -198,12 +199,6 @@ def _find_clock(source: TopicReadings, timeline: Timeline, *, is_simulated: bool
             yield make_finding("topic-clock-offset", role, names=names, moved_s=moved_s, clock_epoch=epoch)
 
 
-def _find_step(step: ClockStep, start_ns: int) -> Finding:
-    at_s = (step.log_time_ns - start_ns) / 1e9
-    names = {"topics": ", ".join(step.topics)}
-    return make_finding("clock-step", LOG_CLOCK, span_s=(at_s, at_s), names=names, step_s=step.step_s, at_s=at_s)
-
-
 def _make_role_facts(
     role: str,
     assignment: RoleAssignment,
@@ -217,18 +212,13 @@ def _make_role_facts(
 
 
 def _make_topic_facts(source: TopicReadings, timeline: Timeline) -> TopicFacts:
+    period_ns = np.diff(timeline.stamp_ns)[np.diff(timeline.epoch) == 0]
     return TopicFacts(
         type=source.type_name,
         messages=source.messages,
         rows=len(timeline.row),
-        rate_hz=_rate_hz(timeline),
+        rate_hz=1e9 / float(np.median(period_ns)) if len(period_ns) else None,
         dropped=source.readings.dropped | timeline.dropped,
         notes={name: count for name, count in source.readings.notes.items() if count} | timeline.notes,
         time=TopicClock(timeline.source, timeline.why, timeline.offset_s, timeline.moved_s),
     )
-
-
-def _rate_hz(timeline: Timeline) -> float | None:
-    """Return one over the median period inside epochs [Hz]."""
-    period_ns = np.diff(timeline.stamp_ns)[np.diff(timeline.epoch) == 0]
-    return 1e9 / float(np.median(period_ns)) if len(period_ns) else None

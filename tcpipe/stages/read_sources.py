@@ -59,13 +59,9 @@ def read_sources(
     *,
     known: Profiles,
 ) -> tuple[list[TopicReadings], PowerReadings, list[Finding]]:
-    """Read the messages of every topic that plays a role; they are taken out of ``messages``, so that no log is held twice.
+    """Return one `TopicReadings` a topic in the order of the roles, the power rails, and findings on topics that cannot be decoded.
 
-    Returns
-    -------
-    sources : one a topic, in the order of the roles.
-    power : the rails, empty where there is no power or it was refused.
-    findings : topics that play a role but cannot be decoded.
+    Messages are removed from ``messages`` as they are read, so that no log is in memory twice.
 
     Raises
     ------
@@ -148,7 +144,7 @@ def place_sensors(
     /tf is read only where /tf_static leaves a frame unplaced: it is large, and constant only in logs that lack the other.
     """
     of_role = {role: [source for source in sources if source.role == role] for role in get_args(Role)}
-    frame_of = {role: _find_frame(found) for role, found in of_role.items() if found}
+    frame_of = {role: next(iter(found[0].frames), "") for role, found in of_role.items() if found}
     open_frames = {
         frame
         for role, frame in frame_of.items()
@@ -178,10 +174,6 @@ def place_sensors(
             time_source=timelines[of_role[role][0].key].source,
         )
     return sensors, findings
-
-
-def _find_frame(sources: Sequence[TopicReadings]) -> str:
-    return next(iter(sources[0].frames), "")
 
 
 def _build_tree(

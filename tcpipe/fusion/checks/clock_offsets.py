@@ -177,12 +177,9 @@ class ClockOffsets:
 
 
 def find_clock_offsets(measurements: Measurements, power: PowerSignal | None) -> ClockOffsets:
-    """Return the offsets between the stamps of a clock epoch's sensors, and how they drift.
+    """Return the offsets between the stamps of a clock epoch's sensors, and their drift; ``power`` is the sum over the drive rails.
 
-    Parameters
-    ----------
-    measurements : of one clock epoch; mountings need not be right, since a yaw rate is compared with all three axes of a gyroscope.
-    power : sum over the drive rails; None without.
+    Extrinsics need not be right, since a yaw rate is compared with all three axes of a gyroscope.
     """
     span = find_span_ns(measurements)
     if span is None:
@@ -469,15 +466,10 @@ def smooth_stamps(
 
 
 def stamp_jitter_s(gnss: Positions, odometry: BodyVelocities) -> NDArray[np.float64]:
-    """Return the standard deviation of the stamps around each fix [s], shape (N,); 0 where it does not matter or cannot be known.
+    """Return the standard deviation of the stamps around each fix [s], shape (N,); 0 where it does not matter or is unknown.
 
-    It matters above 0.05 s and where it moves the fix by more than twice its claimed deviation. While the robot stands nothing can be
-    known: the value of the nearest motion is held.
-
-    Parameters
-    ----------
-    gnss : fixes of one clock epoch.
-    odometry : wheels or visual odometry over the same time; its forward velocity is used.
+    It matters above 0.05 s and where it moves the fix by more than twice its claimed deviation. While the robot is stationary it is
+    unknown: the value of the nearest motion is held. Of the odometry the forward velocity is used.
     """
     zero = int(gnss.stamp_ns[0])
     stamp_s = compute_seconds(gnss.stamp_ns, zero)
@@ -505,8 +497,8 @@ def stamp_jitter_s(gnss: Positions, odometry: BodyVelocities) -> NDArray[np.floa
 def add_jitter_variance(gnss: Positions, odometry: BodyVelocities, jitter_s: NDArray[np.float64]) -> Positions:
     """Return the fixes with horizontal variances raised by (2 speed jitter)².
 
-    Twice, since such fixes are late and never early, by about as much on average as they spread, and one late fix follows another: they
-    err together, which the filter, to which they are white, must not average away.
+    Twice, since such fixes are late and never early, by about as much on average as they scatter, and one late fix follows another: the
+    filter, for which errors are white, must not average them away.
     """
     zero = int(gnss.stamp_ns[0])
     speed = np.abs(odometry.velocity_mps[:, 0])

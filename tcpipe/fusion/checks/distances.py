@@ -77,14 +77,7 @@ class Distances:
 
 
 def find_distances(gnss: Positions | None, twists: Mapping[str, Floats], at_ns: NDArray[np.int64]) -> Distances:
-    """Return the distances by every source that tells any.
-
-    Parameters
-    ----------
-    gnss : None without.
-    twists : by name, forward velocity [m/s] and yaw rate [rad/s] on the grid, shape (M, 2).
-    at_ns : the grid's stamps, shape (M,).
-    """
+    """Return the distances of all sources; ``twists`` are forward velocity [m/s] and yaw rate [rad/s] on the grid, shape (M, 2)."""
     places = {name: _dead_reckon(twist) for name, twist in twists.items()}
     least_m = _FAR_M
     if gnss is not None:
@@ -97,11 +90,9 @@ def find_distances(gnss: Positions | None, twists: Mapping[str, Floats], at_ns: 
 
 
 def find_contradictions(found: Distances, *, turning: frozenset[str]) -> dict[str, SensorExclusion]:
-    """Return the refusals by sensor: of two that differ the one that fewer others agree with, or both.
+    """Return the excluded sensors: of two that differ the one that fewer others agree with, or both.
 
-    Parameters
-    ----------
-    turning : sensors whose yaw rate the gyroscope confirms: the robot does drive when they say so.
+    Of ``turning`` sensors the gyroscope confirms the yaw rate: the robot does drive when they say so.
     """
     sensors = [name for name in found.chord_m if name != COMMAND]
     heard = {name: [other for other in found.chord_m if other != name and found.agree(name, other)] for name in sensors}

@@ -87,17 +87,10 @@ def compute_moving_mean(values: Floats, width_s: float) -> Floats:
 
 
 def find_lag(target: Floats, regressors: Floats) -> Lag | None:
-    """Return how late the target's stamps are against the regressors', or None where nothing can be said.
+    """Return how late the target's stamps are against the regressors', or None where that is unknown.
 
-    Parameters
-    ----------
-    target : shape (M,), on a grid of `GRID_S`, NaN where unknown.
-    regressors : shape (M, k), likewise.
-
-    Returns
-    -------
-    None where too little is known, where the best lag lies at the end of the search or another is as good, or where a constant explains
-    the target.
+    ``target``, shape (M,), and ``regressors``, shape (M, k), are on a grid of `GRID_S`, NaN where unknown. The lag is unknown where few
+    values are, where the best lag is at the end of the search or another is as good, or where a constant explains the target.
     """
     products = compute_lag_products(target, regressors)
     return None if products is None else estimate_lag([products])

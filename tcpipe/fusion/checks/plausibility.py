@@ -78,10 +78,8 @@ class YawAxis:
 def find_yaw_axis(yaw_rate_radps: Floats, rate: Floats) -> YawAxis | None:
     """Return the axis of a gyroscope about which the robot yaws, or None where its rates do not explain the yaw rate.
 
-    Parameters
-    ----------
-    yaw_rate_radps : [rad/s], of another sensor on the grid of `lags`, NaN where unknown, shape (M,).
-    rate : the gyroscope's, in whatever unit and axes, shape (M, 3).
+    ``yaw_rate_radps`` [rad/s], shape (M,), is another sensor's on the grid of `lags`, NaN where unknown; ``rate``, shape (M, 3), has any
+    unit and axes.
     """
     lag = find_lag(yaw_rate_radps, rate)
     if lag is None or lag.explained < _MIN_EXPLAINED:
@@ -114,16 +112,9 @@ def compute_levelling_rotation(up: Floats) -> Floats:
 def find_forward_yaw_rad(twist: Floats, level_force_mps2: Floats, late_s: float) -> tuple[float, float] | None:
     """Return the yaw of a levelled IMU in base_link [rad] and its standard deviation, or None where acceleration does not show it.
 
-    Parameters
-    ----------
-    twist : forward velocity [m/s] and yaw rate [rad/s], on the grid, shape (M, 2).
-    level_force_mps2 : specific force with z up, shape (M, 3).
-    late_s : how late the twist's stamps are against the IMU's [s].
-
-    Notes
-    -----
-    In base_link a = dv/dt forward and v w to the left; the unit feels a turned by minus its yaw. With both as complex numbers the yaw is
-    the angle of the sum of a times the conjugate of what is felt (the plane case of Wahba's problem, 1965).
+    In base_link a = dv/dt forward and v w to the left; the unit measures a turned by minus its yaw. With both as complex numbers the yaw is
+    the angle of the sum of a times the conjugate of the measured (the planar case of Wahba's problem, 1965). ``twist`` is forward velocity
+    [m/s] and yaw rate [rad/s] on the grid, shape (M, 2), ``late_s`` [s] behind the IMU; the force has z up, shape (M, 3).
     """
     smooth = compute_moving_mean(twist, _SMOOTH_S)
     driven = np.gradient(smooth[:, 0], GRID_S) + 1j * smooth[:, 0] * smooth[:, 1]

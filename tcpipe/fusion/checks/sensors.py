@@ -96,10 +96,9 @@ def check_sensors(
 
     Parameters
     ----------
-    measurements : in base_link axes, by the mountings in use.
-    command : None without.
-    stated : by role, whether somebody stated the mounting (recipe, transforms, message in base_link); otherwise it is assumed.
-    felt : median size of the specific force as the IMU told it, before its lever arm was taken out; NaN without an IMU.
+    measurements : in base_link axes, by the extrinsics in use.
+    stated : by role, whether the extrinsics are stated (recipe, transforms, message in base_link) rather than assumed.
+    felt : median size of the specific force as the IMU measured it, before its lever arm was taken out; NaN without an IMU.
     """
     checks = Checks()
     slow = None if measurements.imu is None else _refuse_slow(measurements.imu)
