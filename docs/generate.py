@@ -19,8 +19,7 @@ from tcpipe.cli import cli
 from tcpipe.cli.json_output import json_output_types
 from tcpipe.formats.contracts import DOCUMENTS
 from tcpipe.formats.finding_lines import format_number
-from tcpipe.formats.recipe_toml import format_commented_toml
-from tcpipe.formats.robot_files import load_shipped_profiles
+from tcpipe.formats.recipe_toml import format_commented_toml, load_shipped_profiles
 from tcpipe.planning.path_cost import PIECES
 from tcpipe.tables.catalogue import Entry, read_catalogue, read_sections
 from tcpipe.tables.columns import Column, TableSchema
@@ -243,7 +242,8 @@ _TROUBLESHOOTING = """# Findings: troubleshooting
 What tcpipe reports about logs, maps, runs and datasets. Each line of a report ends with a code in brackets, as `[no-gnss]`; search this
 page for the code, or for words such as dropout, lever arm, time offset, drift, multipath, no power.
 
-An **error** makes the labels that it affects not usable, a **warning** usable with care; a **note** changes no verdict. `tcpipe ingest`
+An **error** makes the labels that it affects not usable, a **warning** usable with care; a **note** changes no verdict. Data are kept
+unless the line states corrected, inflated (larger σ), excluded (the sensor or run) or rejected (the measurement). `tcpipe ingest`
 ends with exit code 3 for a **problem** until you acknowledge it (`tcpipe acknowledge`). `tcpipe inspect RUN` lists all findings of a run
 with their remedies, `--json` as data. Here … stands for the recipe line or command that the finding prints.
 """
@@ -259,7 +259,7 @@ def _findings() -> str:
 
 
 def _finding(code: str, entry: Entry) -> str:
-    more: list[str] = [entry.severity, entry.action]
+    more: list[str] = [entry.severity, *([entry.action] if entry.action != "kept" else [])]
     more += [f"affects {', '.join(entry.affects)}"] if entry.affects else []
     more += [f"quality bit `{entry.flag}`"] if entry.flag else []
     more += ["problem"] if entry.is_problem else []

@@ -12,10 +12,9 @@ from tcpipe.cli.options import LOG, json_option, msgdef_option, recipe_option, r
 from tcpipe.cli.output import print_json, print_line, resolve_recipe_with_source
 
 if TYPE_CHECKING:
-    from tcpipe.pipeline.inspect import InspectedLogs, InspectedRun, InspectedStore
+    from tcpipe.pipeline.inspect import InspectedLogs, InspectedRun, InspectedStore, InspectedTables
     from tcpipe.pipeline.inspected import InspectedDataset, InspectedMap
     from tcpipe.pipeline.log_inspection import InspectedLog, InspectedTopic
-    from tcpipe.pipeline.table_proposal import InspectedTables
     from tcpipe.tables.findings import Finding
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from tcpipe.cost.budget import estimate_energy_budget, find_noise
+from tcpipe.cost.labels import estimate_energy_budget, find_noise
 from tcpipe.cost.quality import find_wanted_rate
 from tcpipe.motion.distance_breakdown import find_interval_reason, sum_by_reason
 from tcpipe.motion.row_sections import number_pieces

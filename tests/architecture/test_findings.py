@@ -27,7 +27,7 @@ PRINTERS = {
     "tcpipe/pipeline/plan.py",
     "tcpipe/pipeline/preflight.py",
     "tcpipe/pipeline/status.py",
-    "tcpipe/pipeline/store_facts.py",
+    "tcpipe/pipeline/report.py",
     "tcpipe/planning/drive_files.py",
     "tcpipe/planning/path_files.py",
     "tcpipe/planning/plan_files.py",
