@@ -160,8 +160,8 @@ def read_findings(
     start_ns = min((int(of.readings.log_time_ns[0]) for of in sources if len(of.readings.row)), default=0)
     for step in steps:
         at_s, names = (step.log_time_ns - start_ns) / 1e9, {"topics": ", ".join(step.topics)}
-        numbers = {"step_s": step.step_s, "at_s": at_s}
-        findings.append(make_finding("clock-step", LOG_CLOCK, span_s=(at_s, at_s), names=names, **numbers))
+        span_s, step_s = (at_s, at_s), step.step_s
+        findings.append(make_finding("clock-step", LOG_CLOCK, span_s=span_s, names=names, step_s=step_s, at_s=at_s))
     facts = StageFacts(
         robot=RobotChoice(assignment.robot, assignment.robot_why),
         roles={role: _make_role_facts(role, assignment, sources, timelines, sensors[role]) for role in sensors},
