@@ -46,7 +46,7 @@ from tcpipe.formats.run_documents import (
     split_number,
 )
 from tcpipe.formats.stored_runs import RunDirectory
-from tcpipe.motion.remedies import KEPT
+from tcpipe.motion.distance_breakdown import KEPT
 from tcpipe.report.pictures import is_picture_of_map
 from tcpipe.store import Store
 from tcpipe.tables.columns import to_floats, to_integers

@@ -46,7 +46,7 @@ from tcpipe.formats.place import DirectoryPlace
 from tcpipe.formats.recipe_toml import resolve_recipe
 from tcpipe.formats.run_documents import SPOOL
 from tcpipe.formats.user_paths import check_local_output
-from tcpipe.motion.remedies import KEPT
+from tcpipe.motion.distance_breakdown import KEPT
 from tcpipe.pipeline.calls import (
     BUILD,
     Estimate,

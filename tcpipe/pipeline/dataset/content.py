@@ -41,7 +41,7 @@ from tcpipe.formats.place import DirectoryPlace, Place
 from tcpipe.formats.recipe_toml import load_profiles
 from tcpipe.formats.stored_runs import RunDirectory
 from tcpipe.formats.zarr_arrays import Compression
-from tcpipe.motion.remedies import KEPT
+from tcpipe.motion.distance_breakdown import KEPT
 from tcpipe.pipeline.dataset.added_columns import find_narrow_patches, make_added_columns, read_tags
 from tcpipe.pipeline.dataset.inputs import BuildOptions, Inputs
 from tcpipe.pipeline.dataset.map_checks import find_removed_by_ground, register_runs

@@ -13,9 +13,16 @@ from tcpipe.formats.dataset_card import MapRegistration, Removal
 from tcpipe.formats.json_files import convert_record
 from tcpipe.formats.maps.map_files import MapFile
 from tcpipe.formats.stored_runs import RunDirectory
-from tcpipe.motion.distance_breakdown import compute_interval_length_m, find_interval_reason
+from tcpipe.motion.distance_breakdown import (
+    Group,
+    compute_interval_length_m,
+    find_interval_reason,
+    find_main_reason,
+    find_uneven_groups,
+    list_groups,
+    sum_lengths_m,
+)
 from tcpipe.motion.row_sections import number_pieces
-from tcpipe.motion.selection_bias import Group, find_main_reason, find_uneven_groups, list_groups, sum_lengths_m
 from tcpipe.recipe import Recipe
 from tcpipe.tables.bits import DropReason, flag_name
 from tcpipe.tables.catalogue import read_threshold
