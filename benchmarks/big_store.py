@@ -17,7 +17,9 @@ from tcpipe.recipe import Recipe
 from tcpipe.simulation.scenarios import find_scenario
 from tcpipe.simulation.site_files import write_rasters
 from tcpipe.store import Store, open_store
+from tcpipe.tables.arrays import make_lines
 from tcpipe.tables.columns import to_floats
+from tcpipe.tables.findings import Verdict
 from tcpipe.tables.levels import (
     DATA_MODEL_VERSION,
     GATED_TRACK,
@@ -30,8 +32,6 @@ from tcpipe.tables.levels import (
     Track,
     TrackInfo,
 )
-from tcpipe.tables.verdicts import Verdict
-from tcpipe.tables.wkb import make_lines
 
 RUN_ROWS = 3_300
 SMALL = 500

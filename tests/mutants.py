@@ -31,7 +31,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 ROOMS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "motion": (("tcpipe/motion",), ("tests/unit/motion",)),
-    "path": (("tcpipe/path",), ("tests/unit/path",)),
+    "path": (("tcpipe/path.py",), ("tests/unit/test_path.py",)),
     "splits": (("tcpipe/splits",), ("tests/unit/splits", "tests/property/test_splits.py")),
     "power": (("tcpipe/power",), ("tests/unit/power",)),
     "cost": (("tcpipe/cost",), ("tests/unit/cost", "tests/unit/stages/test_label.py")),

@@ -118,7 +118,7 @@ def ingest(options: IngestOptions, *, dry_run: bool, as_json: bool, quiet: bool)
 
 def _list_outcome(result: IngestResult, store: Path | str, *, several: bool) -> Iterator[str]:
     """Yield what became of a log: of one alone with its findings, of several one line each, and what is broken."""
-    from tcpipe.cost.budget import format_budget
+    from tcpipe.cost.labels import format_budget
     from tcpipe.formats.finding_lines import describe_finding, format_findings, format_verdict
     from tcpipe.tables.findings import select_problems
 

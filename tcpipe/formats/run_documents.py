@@ -24,9 +24,8 @@ from tcpipe.formats.place import Place
 from tcpipe.motion.remedies import KEPT
 from tcpipe.recipe import IngestSections
 from tcpipe.tables.facts import LEFT_OUT, NOTHING_FOUND, StageFacts
-from tcpipe.tables.findings import StageReport
+from tcpipe.tables.findings import StageReport, Verdict
 from tcpipe.tables.levels import DATA_MODEL_VERSION, TABLES_VERSION, Sensor, TrackInfo
-from tcpipe.tables.verdicts import Verdict
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,8 +20,8 @@ from tcpipe.formats.parquet import read_highest, read_lowest, read_table, write_
 from tcpipe.formats.place import DirectoryPlace, Place
 from tcpipe.formats.recipe_toml import read_key
 from tcpipe.formats.run_documents import Manifest, name_folder, read_as_at
+from tcpipe.tables.findings import judge_again
 from tcpipe.tables.levels import LABELLED_SEGMENTS, GatedTrack, Streams
-from tcpipe.tables.verdicts import judge_again
 
 FilesState: TypeAlias = tuple[tuple[int, int], ...]
 """Size [byte] and modification time [ns] of each file of an ingestion."""

@@ -39,8 +39,7 @@ from tcpipe.stages.sample import Sampled, sample_segments
 from tcpipe.store import Store, open_store
 from tcpipe.tables.bits import DropReason, Quality, flag_names
 from tcpipe.tables.columns import to_integers
-from tcpipe.tables.levels import PLACED_SEGMENTS, Streams
-from tcpipe.tables.segment_columns import GEOMETRY
+from tcpipe.tables.levels import GEOMETRY, PLACED_SEGMENTS, Streams
 from tcpipe.terrain.sampling import Patches
 
 _NEARBY_NS = 5_000_000_000

@@ -26,9 +26,8 @@ from tcpipe.progress import set_task, step
 from tcpipe.recipe import IngestSections
 from tcpipe.store import Store
 from tcpipe.tables.catalogue import read_threshold
-from tcpipe.tables.findings import Finding, Subject, make_finding
+from tcpipe.tables.findings import Finding, Subject, judge, make_finding
 from tcpipe.tables.levels import DATA_MODEL_VERSION, GatedTrack, LabelledSegments, Streams, Track, add_findings
-from tcpipe.tables.verdicts import judge
 
 _M_MMAP_THRESHOLD = -3
 

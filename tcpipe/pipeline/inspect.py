@@ -27,8 +27,7 @@ from tcpipe.recipe import Recipe
 from tcpipe.recipe.checking import as_toml
 from tcpipe.store import Store, is_store, run_at
 from tcpipe.tables.catalogue import AFFECTED
-from tcpipe.tables.findings import Finding
-from tcpipe.tables.verdicts import Grade, Verdict
+from tcpipe.tables.findings import Finding, Grade, Verdict
 
 if TYPE_CHECKING:
     from tcpipe.pipeline.inspected import InspectedDataset, InspectedMap

@@ -22,9 +22,8 @@ from tcpipe.formats.geopackage import VIRIDIS, VectorLayer, make_classes_style, 
 from tcpipe.formats.object_storage import is_url
 from tcpipe.report.colours import SPLIT_COLOURS
 from tcpipe.store import Store, find_store_above, is_store, run_at
-from tcpipe.tables.arrays import to_texts
+from tcpipe.tables.arrays import make_lines, to_texts
 from tcpipe.tables.columns import read_lonlat_deg, to_floats
-from tcpipe.tables.wkb import make_lines
 from tcpipe.terrain.patches import compute_footprints, patch_frames
 from tcpipe.terrain.projection import Projection, compute_area, parse_crs
 

@@ -32,9 +32,8 @@ from tcpipe.stages.read_roles import decide_roles, find_read_config
 from tcpipe.tables.catalogue import read_threshold
 from tcpipe.tables.columns import to_integers
 from tcpipe.tables.facts import NOTHING_FOUND, EnergyBudget, StageFacts
-from tcpipe.tables.findings import Finding, Subject, make_finding, sort_findings
+from tcpipe.tables.findings import Finding, Subject, Verdict, judge, make_finding, sort_findings
 from tcpipe.tables.levels import LabelledSegments
-from tcpipe.tables.verdicts import Verdict, judge
 
 MISSING: Mapping[Role, str] = {
     "gnss": "no-gnss",

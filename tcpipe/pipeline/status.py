@@ -35,8 +35,7 @@ from tcpipe.pipeline.problems import find_incomplete_runs, make_missing, make_wa
 from tcpipe.pipeline.store_verdict import find_changes, judge_runs
 from tcpipe.recipe import Recipe
 from tcpipe.store import Store, open_store
-from tcpipe.tables.findings import Finding
-from tcpipe.tables.verdicts import Verdict
+from tcpipe.tables.findings import Finding, Verdict
 
 _MOST_NAMES = 3
 _MOST_CALLS = 7

@@ -13,7 +13,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
-from tcpipe.cost.budget import pool_budgets
+from tcpipe.cost.labels import pool_budgets
 from tcpipe.errors import DatasetError, TcpipeError, UsageError, clean_lines
 from tcpipe.formats.atomic import find_leftovers
 from tcpipe.formats.bucket import open_place

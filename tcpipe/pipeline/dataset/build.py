@@ -14,7 +14,7 @@ from pathlib import Path
 import pyarrow as pa
 
 from tcpipe import __version__
-from tcpipe.cost.budget import format_budget
+from tcpipe.cost.labels import format_budget
 from tcpipe.errors import DatasetError, RecipeError, StoreError, UsageError, clean_lines
 from tcpipe.formats.atomic import clear_beside, write_atomic_directory, write_text
 from tcpipe.formats.bucket import open_place
@@ -65,7 +65,7 @@ from tcpipe.pipeline.dataset.balance import BALANCE_COLUMNS, measure_balance
 from tcpipe.pipeline.dataset.build_dataset_options import BuildDatasetOptions
 from tcpipe.pipeline.dataset.card import CARD_COLUMNS, PHYSICS_COLUMNS, VELOCITY_COLUMN, is_whole, make_dataset_card
 from tcpipe.pipeline.dataset.content import gather_content, write_patches
-from tcpipe.pipeline.dataset.inputs import BuildOptions, Inputs, choose_inputs, read_earlier_splits
+from tcpipe.pipeline.dataset.inputs import BuildOptions, Inputs, choose_inputs, find_other_options, read_earlier_splits
 from tcpipe.pipeline.dataset.redaction import (
     make_redaction,
     redact_card,
@@ -73,7 +73,6 @@ from tcpipe.pipeline.dataset.redaction import (
     redact_features,
     redact_inputs,
 )
-from tcpipe.pipeline.dataset.replacing import find_other_options
 from tcpipe.pipeline.dataset.runs import CHOICE_CODES, find_gone_runs
 from tcpipe.pipeline.dataset.sampling import Workers
 from tcpipe.pipeline.generations import read_generations, write_generation

@@ -1,0 +1,233 @@
+"""``tcpipe reproduce``: the paper's experiment from a simulated site to its claims; every stage is gone on from where it was stopped."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from tcpipe.dataset import Split, open_dataset
+from tcpipe.errors import DatasetError, UsageError, clean_lines
+from tcpipe.experiment.claims import Claim, check_claims
+from tcpipe.experiment.reproduction_page import render_reproduction_page
+from tcpipe.experiment.simulation_floor import compute_true_costs, compute_variance_shares, remove_hidden_variation
+from tcpipe.formats.atomic import clear, write_text
+from tcpipe.formats.json_files import write_json
+from tcpipe.learning.evaluation_facts import EvaluateConfig, Evaluation, SplitErrors
+from tcpipe.learning.evaluation_files import read_evaluated_samples, run_evaluation
+from tcpipe.learning.fitting import FitConfig
+from tcpipe.learning.training import train
+from tcpipe.pipeline.dataset.build import build_dataset
+from tcpipe.pipeline.ingest import ingest
+from tcpipe.pipeline.maps import add_map
+from tcpipe.recipe import Recipe
+from tcpipe.simulation import Scenario, SimulatedSite, find_scenario, simulate
+from tcpipe.simulation.paper_site import scale_hidden_variance
+
+logger = logging.getLogger("tcpipe")
+
+JSON, PAGE = "reproduction.json", "reproduction.html"
+SIMULATION_SEED = 1
+
+_ENOUGH = 2000
+"""Samples that tell the shares of a variance."""
+
+
+@dataclass(frozen=True, slots=True)
+class Experiment:
+    """How large an experiment is."""
+
+    scenario: str
+    fitting: FitConfig
+    evaluating: EvaluateConfig
+
+
+FULL = Experiment("paper", FitConfig(epochs=40, patience=8), EvaluateConfig(draws=5))
+"""The paper's size: fits 90 minutes on two cores."""
+
+QUICK = Experiment(
+    "paper_quick", FitConfig(epochs=4, patience=4, batch=32, learning_rate=1e-3, width=16), EvaluateConfig(draws=2)
+)
+"""Two minutes on two cores: everything runs, and nothing is learned well enough to believe a figure."""
+
+RECIPE = replace(Recipe(), robot="husky", split=replace(Recipe().split, holdout="sample"))
+"""The defaults with the paper's random test samples."""
+
+
+@dataclass(frozen=True, slots=True)
+class SampleCounts:
+    """What was driven: samples by split, by class of each split, and all."""
+
+    splits: Mapping[str, int] = field(default_factory=dict)
+    terrain: Mapping[str, Mapping[str, int]] = field(default_factory=dict)
+    segments: int = 0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ReproductionSummary:
+    """All of reproduction.json."""
+
+    kind: str = "tcpipe reproduction"
+    simulated: bool = True
+    scenario: str
+    plan: Experiment
+    hidden: float
+    """Variance of the hidden resistance, over that of the frozen site."""
+    counts: SampleCounts
+    variance_shares: Mapping[str, float]
+    """Of measured E on the unseen area, by what makes it."""
+    claims: tuple[Claim, ...]
+    seeds: tuple[Mapping[str, SplitErrors], ...]
+    """Errors by split, of each training."""
+
+
+@dataclass(slots=True)
+class Reproduction:
+    """What was found; ``str`` of it is what the command prints."""
+
+    directory: Path
+    scenario: str
+    claims: list[Claim] = field(default_factory=list)
+    runs: list[Evaluation] = field(default_factory=list)
+    """One a training."""
+    counts: SampleCounts = field(default_factory=SampleCounts)
+    variance_shares: dict[str, float] = field(default_factory=dict)
+    """Of measured E on the unseen area, by what makes it."""
+    seconds: dict[str, float] = field(default_factory=dict)
+    """Of the stages, of this call."""
+
+    def __str__(self) -> str:
+        """Return every claim and how it stands, as plain lines."""
+        verdicts = Counter(claim.verdict for claim in self.claims)
+        shares = (f"{100.0 * share:.2f} % of the variance of E: {name}" for name, share in self.variance_shares.items())
+        spent = ", ".join(f"{name} {seconds:.0f} s" for name, seconds in self.seconds.items())
+        return clean_lines(
+            (
+                "the data are simulated: what is compared with the paper is the pattern, not the figures",
+                *shares,
+                *(str(claim) for claim in self.claims),
+                f"of {len(self.claims)} claims: " + ", ".join(f"{count} {name}" for name, count in verdicts.items()),
+                f"spent: {spent}",
+                f"open {self.directory / PAGE}",
+            )
+        )
+
+
+def reproduce(
+    directory: str | Path,
+    *,
+    quick: bool = False,
+    seeds: int = 1,
+    jobs: int = 1,
+    hidden: float = 1.0,
+    baselines: bool = True,
+) -> Reproduction:
+    """Simulate the paper's site, build the dataset, train, evaluate, and compare with the paper's claims.
+
+    Parameters
+    ----------
+    directory : where everything goes: new, empty, or an earlier reproduction of the same size, which is gone on from.
+    quick : a small one, to see it run.
+    seeds : trainings; figures are compared by their means.
+    jobs : logs read side by side.
+    hidden : variance of the resistance that nothing shows, over that of the frozen site.
+    baselines : train the networks of Wei and Isler; without them what is claimed of them is not measured.
+
+    Raises
+    ------
+    UsageError : ``directory`` holds something else.
+    """
+    place, plan = Path(directory), QUICK if quick else FULL
+    plan = replace(plan, evaluating=replace(plan.evaluating, baselines=baselines))
+    clear(place)
+    if place.exists() and (not place.is_dir() or (any(place.iterdir()) and not (place / "site").exists())):
+        raise UsageError(f"{place}: exists and is no reproduction; give another DIR")
+    frozen, result = find_scenario(plan.scenario), Reproduction(place, plan.scenario)
+    made = replace(frozen, world=scale_hidden_variance(frozen.world, hidden))
+    with _measure_time(result, "simulate"):
+        site = simulate(place / "site", scenario=made, seed=SIMULATION_SEED)
+    with _measure_time(result, "ingest and build"):
+        _build(place, site, jobs)
+    data = open_dataset(place / "dataset")
+    result.counts = SampleCounts(data.card.splits, data.card.terrain, data.card.samples)
+    result.variance_shares = _compute_variance_shares(data["unseen"], made)
+    for seed in range(seeds):
+        result.runs.append(_train_and_evaluate(place, made, plan, seed, result))
+    result.claims = check_claims(result.runs)
+    _write(result, plan, hidden)
+    return result
+
+
+def _compute_variance_shares(split: Split, made: Scenario) -> dict[str, float]:
+    some = split.take(np.arange(min(len(split), _ENOUGH)))  # rows stand in random order
+    return compute_variance_shares(
+        made.world, made.drives[0].robot, some, some.column("energy_joule").astype(np.float64)
+    )
+
+
+@contextmanager
+def _measure_time(result: Reproduction, stage: str) -> Iterator[None]:
+    began = time.perf_counter()
+    yield
+    result.seconds[stage] = result.seconds.get(stage, 0.0) + time.perf_counter() - began
+
+
+def _build(place: Path, site: SimulatedSite, jobs: int) -> None:
+    """Read the logs, add the map and build the dataset, as a user would."""
+    store = place / "store"
+    ingested = ingest(site.logs, store=store, recipe=RECIPE, jobs=jobs, force=True)
+    problems = [
+        problem
+        for result in ingested.results
+        for problem in (*result.problems, *(result.run.damage if result.run else ()))
+    ]
+    if problems:
+        raise DatasetError(*problems)
+    height, ortho, terrain, classes = (site.rasters[name] for name in ("height", "ortho", "terrain", "classes"))
+    add_map("site", height=height, ortho=ortho, terrain=terrain, classes=classes, store=store)
+    built = build_dataset(place / "dataset", store=store, split=site.region, recipe=RECIPE, jobs=jobs, force=True)
+    logger.info("%s", str(built).splitlines()[0])
+
+
+def _train_and_evaluate(place: Path, made: Scenario, plan: Experiment, seed: int, result: Reproduction) -> Evaluation:
+    here, dataset = place / f"seed-{seed}", place / "dataset"
+    with _measure_time(result, "train"):
+        train(dataset, here / "model", config=replace(plan.fitting, seed=seed), disposable=True)
+    with _measure_time(result, "evaluate"):
+        known = partial(compute_true_costs, remove_hidden_variation(made.world), made.drives[0].robot)
+        config = replace(plan.evaluating, seed=seed)
+        return run_evaluation(here / "model", dataset, here / "evaluation", config=config, plant=known).values
+
+
+def _write(result: Reproduction, plan: Experiment, hidden: float) -> None:
+    """Write the page, and the same as JSON."""
+    summary = ReproductionSummary(
+        scenario=result.scenario,
+        plan=plan,
+        hidden=hidden,
+        counts=result.counts,
+        variance_shares=result.variance_shares,
+        claims=tuple(result.claims),
+        seeds=tuple(run.splits for run in result.runs),
+    )
+    write_json(result.directory / JSON, summary)
+    write_text(
+        result.directory / PAGE,
+        render_reproduction_page(
+            result.runs,
+            read_evaluated_samples(result.directory / "seed-0" / "evaluation", result.directory / "dataset"),
+            result.claims,
+            splits=result.counts.splits,
+            terrain=result.counts.terrain,
+            shares=result.variance_shares,
+            hidden=hidden,
+            quick=plan.scenario == QUICK.scenario,
+        ),
+    )

@@ -1,0 +1,117 @@
+"""The options of the commands ``train`` and ``evaluate`` and of the functions of the same names."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import KW_ONLY, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from tcpipe.tables.options import MAP, MODEL, SEED, STORE, Option, Range, option, required
+
+if TYPE_CHECKING:
+    from tcpipe.dataset.energies import EnergyName
+    from tcpipe.learning.architecture import Loss
+    from tcpipe.learning.fitting import ModelKind
+
+
+@dataclass(frozen=True, slots=True)
+class TrainOptions:
+    """What is trained on what, and how; None of the network's own options is the default of `tcpipe.learning.fitting.FitConfig`."""
+
+    dataset: str | Path = required(Option(kind="sealed", metavar="DATASET", is_argument=True))
+    out: str | Path = option("model", Option(kind="published", metavar="[OUT]", is_argument=True))
+    """The same dataset and options are not trained again."""
+    _: KW_ONLY
+    model: ModelKind | None = option(
+        None,
+        Option(
+            "The paper's network; boosted trees on features of patches; or physics. The last two take seconds and heed --loss, "
+            "--inverse-variance-weights, --label and --extra-features alone (default: a table of fewer than 20000 samples, "
+            "else, and with the network's own options, the network).",
+            kind=("resnet18", "table", "physics"),
+        ),
+    )  # fmt: skip
+    loss: Loss = option(
+        "nrmse",
+        Option(
+            "paper_eq4 is the paper's equation 4 as printed; nrmse makes both errors dimensionless.",
+            kind=("nrmse", "paper_eq4"),
+        ),
+    )
+    epochs: int | None = option(None, Option("At most.", kind=Range(1, 100_000), shown=100))
+    patience: int | None = option(
+        None, Option("Epochs without a better held-out loss.", kind=Range(1, 100_000), shown=12)
+    )
+    batch: int | None = option(
+        None, Option("Samples in a batch.", ("--batch-size",), Range(1, 65_536), shown=64, earlier="--batch")
+    )
+    learning_rate: float | None = option(None, Option(kind=Range(0.0, 1.0, is_open=True), shown=1e-4))
+    fold: int | None = option(None, Option("Fold of train to stop early by.", kind=Range(0, 99), shown=0))
+    mirror: bool | None = option(
+        None, Option("Mirror every other patch across its travel.", ("--mirror/--no-mirror",), shown=True)
+    )
+    weights: bool = option(
+        False,
+        Option("Weigh each label by its inverse variance.", ("--inverse-variance-weights",), earlier="--weights"),
+    )
+    width: int | None = option(
+        None,
+        Option("Filters of the first stage, a multiple of 16; 64 is ResNet-18.", kind=Range(16, 512), shown=64),
+    )
+    label: EnergyName = option(
+        "total",
+        Option(
+            "Energy to train on: all that was measured, or less what the robot draws while it stands.",
+            kind=("total", "above_standing"),
+        ),
+    )
+    beside: bool = option(
+        False,
+        Option(
+            "Give the model the turn and the commanded speed of each segment besides its patch; the paper does not.",
+            ("--extra-features",), earlier="--beside",
+        ),
+    )  # fmt: skip
+    seed: int | None = option(None, Option("Of weights, shuffles and mirrors.", kind=SEED, shown=0))
+    fresh: bool = option(
+        False, Option("Do not go on from where an earlier training was stopped.", ("--no-resume",), earlier="--fresh")
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class EvaluateOptions:
+    """Which model is measured on which dataset or drives, and how much of it."""
+
+    model: str | Path = required(MODEL)
+    dataset: str | Path = required(Option(kind="sealed", metavar="DATASET", is_argument=True))
+    """Of drives the one that the model was trained on."""
+    out: str | Path = option("evaluation", Option(kind="published", metavar="[OUT]", is_argument=True))
+    _: KW_ONLY
+    draws: int = option(
+        5, Option("Draws of noise for each ablated input set.", ("--noise-draws",), Range(1, 1000), earlier="--draws")
+    )
+    baselines: bool = option(
+        True,
+        Option(
+            "Train the height-only networks of Wei and Isler: one of grass, one a class.",
+            ("--baselines/--no-baselines",),
+        ),
+    )
+    retrain: bool = option(
+        False,
+        Option(
+            "Train a network for each input set of the ablation, too (six more).",
+            ("--retrain-ablation",), earlier="--retrain",
+        ),
+    )  # fmt: skip
+    seed: int = option(0, Option("Of the noise.", kind=SEED))
+    drives: Sequence[str | Path] = option(
+        (),
+        Option(
+            "Measure MODEL on a whole drive instead: an ingested log, by its path or its run's name; may be repeated.",
+            ("--drive",), metavar="LOG", repeatable=True,
+        ),
+    )  # fmt: skip
+    map_name: str | None = option(None, MAP)
+    store: str | Path = option("tcpipe-store", STORE)

@@ -1,0 +1,241 @@
+"""Do map and tracks lie on each other? Heights under every run's track against the map's, run by run."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from tcpipe.errors import MapError
+from tcpipe.formats.dataset_card import MapRegistration, Removal
+from tcpipe.formats.json_files import convert_record
+from tcpipe.formats.maps.map_files import MapFile
+from tcpipe.formats.stored_runs import RunDirectory
+from tcpipe.motion.distance_breakdown import compute_interval_length_m, find_interval_reason
+from tcpipe.motion.row_sections import number_pieces
+from tcpipe.motion.selection_bias import Group, find_main_reason, find_uneven_groups, list_groups, sum_lengths_m
+from tcpipe.recipe import Recipe
+from tcpipe.tables.bits import DropReason, flag_name
+from tcpipe.tables.catalogue import read_threshold
+from tcpipe.tables.columns import to_floats, to_integers
+from tcpipe.tables.findings import Finding, Subject, SubjectKind, make_finding
+from tcpipe.terrain.projection import Projection
+from tcpipe.terrain.registration import Registration, register_track
+from tcpipe.terrain.sampling import OFF_THE_MAP, find_classes_at
+from tcpipe.terrain.tiles import find_map_projection
+
+_COLUMNS = ["lon_deg", "lat_deg", "alt_m", "x_std_m", "y_std_m", "z_std_m"]
+
+
+def register_runs(
+    runs: Sequence[RunDirectory], source: MapFile, recipe: Recipe
+) -> tuple[tuple[MapRegistration, ...], list[Finding]]:
+    """Return how the map lies against each run that crosses enough of it, and findings on those that are off.
+
+    Parameters
+    ----------
+    runs : the runs whose tracks are compared: rows that are certain enough to be sampled.
+    source : the map.
+    recipe : ``read.gnss_crs`` and ``sample.max_position_std_m`` rule.
+
+    Raises
+    ------
+    MapError : the map's heights are in feet.
+    """
+    projection = find_map_projection(source, recipe.read.gnss_crs)
+    registrations, findings = list[MapRegistration](), list[Finding]()
+    for run in runs:
+        registration, expected_m = _register(run, source, projection, max_std_m=recipe.sample.max_position_std_m)
+        if registration is None:
+            continue
+        if registration.scale.is_feet():
+            raise MapError(_describe_feet(registration, run.run_id, source.name))
+        registrations.append(_describe(run.run_id, registration, expected_m))
+        findings += _find_shift(registration, run.run_id, source.name)
+        findings += _find_other_heights(registration, expected_m, run.run_id, source.name)
+    return tuple(registrations), findings
+
+
+def _register(
+    run: RunDirectory, source: MapFile, projection: Projection, *, max_std_m: float
+) -> tuple[Registration | None, float]:
+    """Return how the map lies against a run, and the misfit that is to be expected [m]."""
+    track = run.table("track", _COLUMNS)
+    lon, lat, height_m, x_std_m, y_std_m, z_std_m = (to_floats(track, name) for name in _COLUMNS)
+    sure: NDArray[np.bool_] = np.hypot(x_std_m, y_std_m) <= max_std_m
+    lonlat = np.stack([lon, lat], axis=1)[sure]
+    map_error_m = read_threshold("map-heights-differ", "map_error_m")
+    expected_m = float(np.hypot(np.sqrt(np.mean(z_std_m[sure] ** 2)), map_error_m)) if sure.any() else map_error_m
+    return register_track(source, projection.forward(lonlat), height_m[sure]), expected_m
+
+
+def _describe_feet(found: Registration, run_id: str, name: str) -> str:
+    return (
+        f"map {name}: where run {run_id} rises by 1 m, its heights rise by {1 / found.scale.value:.2f}: they are in feet and were read "
+        f"as metres; say so in the file (gdal_edit -units ft FILE) and add the map again (tcpipe add-map {name} --height FILE ... --force)"
+    )
+
+
+def _find_shift(found: Registration, run_id: str, name: str) -> tuple[Finding, ...]:
+    """Return the finding, if any, that the map is shifted against the track."""
+    if not found.significant or found.shift_m <= read_threshold("map-shifted", "min_shift_m"):
+        return ()
+    east_m, north_m = found.shift_xy_m
+    finding = make_finding(
+        "map-shifted",
+        Subject("run", run_id),
+        severity="error" if found.shift_m >= read_threshold("map-shifted", "error_shift_m") else None,
+        names={"map": name},
+        shift_m=found.shift_m,
+        std_m=found.shift_std_m,
+        east_m=east_m,
+        north_m=north_m,
+        misfit_m=found.misfit_m,
+        shifted_misfit_m=found.shifted_misfit_m,
+    )
+    return (finding,)
+
+
+def _find_other_heights(found: Registration, expected_m: float, run_id: str, name: str) -> tuple[Finding, ...]:
+    """Return the finding, if any, that heights of map and track differ by more than they may."""
+    subject, names = Subject("run", run_id), {"map": name}
+    if found.scale.is_off():
+        return (make_finding("map-height-scale", subject, names=names, map_rise_m=1 / found.scale.value),)
+    misfit_m = found.shifted_misfit_m if found.significant else found.misfit_m
+    if misfit_m <= read_threshold("map-heights-differ", "max_misfit_ratio") * expected_m:
+        return ()
+    return (make_finding("map-heights-differ", subject, names=names, misfit_m=misfit_m, expected_m=expected_m),)
+
+
+def _describe(run_id: str, found: Registration, expected_m: float) -> MapRegistration:
+    """Return what the card says: no shift where the ground cannot tell one."""
+    untold = {} if np.isfinite(found.shift_std_m) else dict.fromkeys(("shift_xy_m", "shift_std_m", "shifted_misfit_m"))
+    return convert_record(
+        found,
+        MapRegistration,
+        **untold,
+        run_id=run_id,
+        height_scale=found.scale.value if found.scale.is_known else None,
+        height_scale_std=found.scale.std if found.scale.is_known else None,
+        expected_misfit_m=expected_m,
+    )
+
+
+_TRACK_COLUMNS = (
+    *("stamp_ns", "epoch", "x_m", "y_m", "z_m", "east_velocity_mps", "north_velocity_mps", "up_velocity_mps"),
+    *("lon_deg", "lat_deg", "pitch_rad", "forward_velocity_mps", "dropped_by"),
+)
+_SLOPES_DEG = (-10.0, -5.0, -2.0, 2.0, 5.0, 10.0)
+_SLOPE_NAMES = ("below -10°", "-10° to -5°", "-5° to -2°", "-2° to 2°", "2° to 5°", "5° to 10°", "above 10°")
+_REASONS = ("in_samples", *(flag_name(bit) for bit in DropReason), "curved_or_leftover", "not_sampled")
+"""Reason of each metre of a track; what is lost at sampling or to the split's buffer is one entry."""
+_LEFT_OVER, _NOT_SAMPLED = len(_REASONS) - 2, len(_REASONS) - 1
+
+
+_Ground = tuple[MapFile, Projection]
+"""A map, and how places get onto it."""
+
+
+def find_removed_by_ground(
+    runs: Sequence[RunDirectory],
+    segments: pa.Table,
+    used: NDArray[np.int64],
+    sources: Sequence[MapFile],
+    recipe: Recipe,
+) -> tuple[Removal, tuple[Finding, ...]]:
+    """Return where the metres of all runs went, by the class under them and the slope along them, and where that is not even.
+
+    Parameters
+    ----------
+    runs : the runs of the dataset, with their tracks.
+    segments : all segments that could become samples.
+    used : rows of those that are train, test or unseen.
+    sources : the maps, the first ruling where they overlap; without a terrain layer there are no classes.
+    recipe : ``read.gnss_crs`` rules.
+    """
+    grounds = [
+        (source, find_map_projection(source, recipe.read.gnss_crs)) for source in sources if "terrain" in source.layers
+    ]
+    table = sources[0].classes
+    names = ["off the map", "no data", *table.names().tolist()[1:]]
+    spans = _Spans(segments, used)
+    by_class, by_slope = np.zeros((len(names), len(_REASONS))), np.zeros((len(_SLOPE_NAMES), len(_REASONS)))
+    for run in runs:
+        length_m, reason, slope, ground = _read_intervals(run, spans.find_segments(run.run_id), grounds)
+        by_slope += sum_lengths_m(slope, reason, length_m, shape=by_slope.shape)
+        by_class += sum_lengths_m(ground - OFF_THE_MAP, reason, length_m, shape=by_class.shape)
+    slopes = list_groups(by_slope, _SLOPE_NAMES, _REASONS)
+    classes = list_groups(by_class, names, _REASONS) if grounds else ()
+    traversable = set(table.names()[table.traversable()].tolist())
+    findings = _find_bias([group for group in classes if group.name in traversable], "class")
+    return Removal(classes, slopes), (*findings, *_find_bias(slopes, "slope"))
+
+
+class _Spans:
+    """Start and end of every segment of a run, in order, and whether it is in use."""
+
+    def __init__(self, segments: pa.Table, used: NDArray[np.int64]) -> None:
+        is_used = np.zeros(segments.num_rows, np.bool_)
+        is_used[used] = True
+        runs = segments.column("run_id").combine_chunks().dictionary_encode()
+        self._code = {run_id: code for code, run_id in enumerate(runs.dictionary.to_pylist())}
+        code = runs.indices.to_numpy(zero_copy_only=False)
+        start, end = (to_integers(segments, f"{name}_ns") for name in ("start", "end"))
+        order = np.lexsort((start, code))
+        self._run, self._start, self._end, self._used = code[order], start[order], end[order], is_used[order]
+
+    def find_segments(self, run_id: str) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]:
+        code = self._code.get(run_id, -1)
+        rows = slice(*np.searchsorted(self._run, [code, code + 1]))
+        return self._start[rows], self._end[rows], self._used[rows]
+
+
+def _read_intervals(
+    run: RunDirectory, spans: tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]], grounds: Sequence[_Ground]
+) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    """Return length [m], reason, slope and class (ids as `find_classes_at`) of every interval of a run's track."""
+    track = run.table("track", _TRACK_COLUMNS)
+    stamp_ns, epoch = to_integers(track, "stamp_ns"), to_integers(track, "epoch")
+    piece = number_pieces(stamp_ns, epoch, period_ns=1e9 / run.manifest.info.rate_hz)
+    position = np.column_stack([to_floats(track, f"{axis}_m") for axis in "xyz"])
+    velocity = np.column_stack([to_floats(track, f"{name}_velocity_mps") for name in ("east", "north", "up")])
+    length_m = compute_interval_length_m(stamp_ns, position, velocity, piece)
+    dropped = find_interval_reason(track["dropped_by"].to_numpy(), piece)
+    reason = np.where(dropped > 0, np.log2(np.maximum(dropped, 1)).astype(np.int64) + 1, _LEFT_OVER)
+    start, end, used = spans
+    middle = stamp_ns[:-1] + np.diff(stamp_ns) // 2
+    row = np.searchsorted(start, middle, side="right") - 1
+    inside = (row >= 0) & (dropped == 0)
+    inside[inside] = middle[inside] < end[row[inside]]
+    reason[inside] = np.where(used[row[inside]], 0, _NOT_SAMPLED)
+    uphill = -np.degrees(to_floats(track, "pitch_rad")) * np.sign(to_floats(track, "forward_velocity_mps"))
+    slope = np.searchsorted(_SLOPES_DEG, 0.5 * (uphill[1:] + uphill[:-1]))
+    lonlat = np.stack([to_floats(track, "lon_deg"), to_floats(track, "lat_deg")], axis=1)
+    return length_m, reason, slope, _find_classes(grounds, 0.5 * (lonlat[1:] + lonlat[:-1]))
+
+
+def _find_classes(grounds: Sequence[_Ground], lonlat_deg: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Return the class id under each point on the first map that has one there, else as `find_classes_at`; 0 without maps."""
+    found = np.full(len(lonlat_deg), OFF_THE_MAP if grounds else 0, np.int64)
+    for source, projection in grounds:
+        open_yet = found <= 0
+        here = find_classes_at(source, projection.forward(lonlat_deg[open_yet]))
+        found[open_yet] = np.maximum(here, found[open_yet])
+    return found
+
+
+def _find_bias(groups: Sequence[Group], kind: SubjectKind) -> list[Finding]:
+    driven_m, used_m = sum(group.driven_m for group in groups), sum(group.used_m for group in groups)
+    return [
+        make_finding(
+            "selection-bias",
+            Subject(kind, group.name),
+            names={"reason": find_main_reason(group) or "none"},
+            used_fraction=group.used_share,
+            driven_m=group.driven_m,
+            overall_fraction=used_m / driven_m,
+        )
+        for group in find_uneven_groups(groups)
+    ]

@@ -1,0 +1,185 @@
+"""Putting a raster on a map's grid: bilinear where it is as coarse or coarser, mean or majority where it is finer, nearest for classes.
+
+Strict about missing data: a bilinear tap or a part of a mean without data leaves the pixel without data, instead of leaning on what is
+left. A tap of weight zero does not count, so that a raster that lies on the grid already passes unchanged.
+
+All take a *lattice* of positions: source pixel coordinates (centres are integers) of every ``step``-th pixel of the grid, beginning one
+step outside; positions between are interpolated.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tcpipe.compiled import compile_kernel
+from tcpipe.terrain.grid import MapGrid
+from tcpipe.terrain.layers import Layer, Pixels
+
+SNAP_PX = 1e-4
+"""A position nearer than this to a source pixel's centre is at the centre [source px]."""
+
+
+@compile_kernel
+def _position(lattice: NDArray[np.float64], step: int, row: float, col: float) -> tuple[float, float]:
+    i, j = row / step + 1.0, col / step + 1.0
+    a, b = min(int(i), lattice.shape[0] - 2), min(int(j), lattice.shape[1] - 2)
+    v, u = i - a, j - b
+    x = (1 - v) * ((1 - u) * lattice[a, b, 0] + u * lattice[a, b + 1, 0]) + v * (
+        (1 - u) * lattice[a + 1, b, 0] + u * lattice[a + 1, b + 1, 0]
+    )
+    y = (1 - v) * ((1 - u) * lattice[a, b, 1] + u * lattice[a, b + 1, 1]) + v * (
+        (1 - u) * lattice[a + 1, b, 1] + u * lattice[a + 1, b + 1, 1]
+    )
+    return x, y
+
+
+@compile_kernel
+def resample_bilinear(
+    source: NDArray[np.float64], lattice: NDArray[np.float64], step: int, out: NDArray[np.float64]
+) -> None:
+    """Interpolate ``source`` (NaN: no data), shape (H, W), at every pixel of ``out``; NaN where a tap has no data or lies outside."""
+    rows, cols = source.shape
+    for i in range(out.shape[0]):
+        for j in range(out.shape[1]):
+            x, y = _position(lattice, step, i, j)
+            near_x, near_y = np.floor(x + 0.5), np.floor(y + 0.5)
+            x = near_x if abs(x - near_x) < SNAP_PX else x
+            y = near_y if abs(y - near_y) < SNAP_PX else y
+            if not (0.0 <= x <= cols - 1 and 0.0 <= y <= rows - 1):
+                out[i, j] = np.nan
+                continue
+            a, b = int(y), int(x)
+            v, u = y - a, x - b
+            right, below = min(b + 1, cols - 1), min(a + 1, rows - 1)
+            upper, lower = source[a, b], source[below, b]
+            if u > 0.0:
+                upper += u * (source[a, right] - upper)
+                lower += u * (source[below, right] - lower)
+            out[i, j] = upper + v * (lower - upper) if v > 0.0 else upper
+
+
+@compile_kernel
+def mean(
+    source: NDArray[np.float64], lattice: NDArray[np.float64], step: int, parts: int, out: NDArray[np.float64]
+) -> None:
+    """Average ``source`` (NaN: no data) over every pixel of ``out``, taken at parts x parts points; NaN where any has no data."""
+    rows, cols = source.shape
+    for i in range(out.shape[0]):
+        for j in range(out.shape[1]):
+            total = 0.0
+            for p in range(parts):
+                for q in range(parts):
+                    x, y = _position(lattice, step, i + (p + 0.5) / parts - 0.5, j + (q + 0.5) / parts - 0.5)
+                    a, b = int(np.floor(y + 0.5)), int(np.floor(x + 0.5))
+                    total += source[a, b] if 0 <= a < rows and 0 <= b < cols else np.nan
+            out[i, j] = total / (parts * parts)
+
+
+@compile_kernel
+def resample_majority(
+    source: NDArray[np.uint8], lattice: NDArray[np.float64], step: int, parts: int, out: NDArray[np.uint8]
+) -> None:
+    """Take the commonest class over every pixel of ``out`` at parts x parts points (1: nearest); 0 is no data and votes; ties go low."""
+    rows, cols = source.shape
+    votes = np.zeros(256, np.int64)
+    for i in range(out.shape[0]):
+        for j in range(out.shape[1]):
+            best = 0
+            for p in range(parts):
+                for q in range(parts):
+                    x, y = _position(lattice, step, i + (p + 0.5) / parts - 0.5, j + (q + 0.5) / parts - 0.5)
+                    a, b = int(np.floor(y + 0.5)), int(np.floor(x + 0.5))
+                    found = int(source[a, b]) if 0 <= a < rows and 0 <= b < cols else 0
+                    votes[found] += 1
+                    if votes[found] > votes[best] or (votes[found] == votes[best] and found < best) or p + q == 0:
+                        best = found
+            out[i, j] = best
+            if parts == 1:
+                votes[best] = 0
+            else:
+                votes[:] = 0
+
+
+@compile_kernel
+def reduce_majority(ids: NDArray[np.uint8], factor: int, out: NDArray[np.uint8]) -> None:
+    """Take the commonest class of every whole ``factor`` x ``factor`` block of ``ids``; 0 is no data and votes; ties go low."""
+    votes = np.zeros(256, np.int64)
+    for i in range(out.shape[0]):
+        for j in range(out.shape[1]):
+            best = ids[i * factor, j * factor]
+            for a in range(i * factor, (i + 1) * factor):
+                for b in range(j * factor, (j + 1) * factor):
+                    found = ids[a, b]
+                    votes[found] += 1
+                    if votes[found] > votes[best] or (votes[found] == votes[best] and found < best):
+                        best = found
+            out[i, j] = best
+            for a in range(i * factor, (i + 1) * factor):
+                for b in range(j * factor, (j + 1) * factor):
+                    votes[ids[a, b]] = 0
+
+
+COARSEST_M = 1.0
+"""No level has wider pixels than this, the length of a segment [m]."""
+
+_WIDEST_FACTOR = 1024
+_SLACK = 1.01
+
+
+def list_factors(grid: MapGrid) -> tuple[int, ...]:
+    """Return the factors of a map's levels, rising: 1, 2, 4 … while pixels stay below `COARSEST_M` and two remain each way."""
+    factors = [1]
+    while (
+        (factor := 2 * factors[-1]) <= _WIDEST_FACTOR
+        and factor * grid.pitch_m <= COARSEST_M
+        and min(grid.rows, grid.cols) // factor >= 2
+    ):
+        factors.append(factor)
+    return tuple(factors)
+
+
+def make_overview_grid(grid: MapGrid, factor: int) -> MapGrid:
+    """Return the grid of a level: the same corner, wider pixels; what does not fill one at the far edges is left out."""
+    return replace(grid, pitch_m=grid.pitch_m * factor, rows=grid.rows // factor, cols=grid.cols // factor)
+
+
+def choose_factor(factors: Sequence[int], map_pitch_m: float, pitch_m: float) -> int:
+    """Return the largest factor whose pixels are not wider than ``pitch_m``; the smallest where all are."""
+    return max((factor for factor in factors if factor * map_pitch_m <= _SLACK * pitch_m), default=min(factors))
+
+
+def iterate_levels(layer: Layer, values: Pixels, factors: Sequence[int]) -> Iterator[tuple[int, Pixels]]:
+    """Yield each factor above 1 and the layer at it.
+
+    Parameters
+    ----------
+    layer : what it is.
+    values : pixels of the map, shape (R, C): floats with NaN, or bytes with 0, as no data.
+    factors : powers of two, rising, as `list_factors` gives them.
+    """
+    if layer.kind == "categorical":
+        for factor in factors[1:]:
+            out = np.empty((values.shape[0] // factor, values.shape[1] // factor), np.uint8)
+            reduce_majority(values, factor, out)
+            yield factor, out
+        return
+    grey = layer.stack == "greys"
+    means = np.where(values == 0, np.float32(np.nan), values.astype(np.float32)) if grey else values
+    for factor in factors[1:]:
+        means = _halve(means)
+        yield factor, _to_grey(means) if grey else means
+
+
+def _halve(values: Pixels) -> Pixels:
+    """Return means of 2 x 2 pixels; an odd last row or column is left out."""
+    even = values[: values.shape[0] // 2 * 2, : values.shape[1] // 2 * 2]
+    rows = even[0::2] + even[1::2]
+    return np.asarray((rows[:, 0::2] + rows[:, 1::2]) * rows.dtype.type(0.25))
+
+
+def _to_grey(means: Pixels) -> NDArray[np.uint8]:
+    return np.where(np.isfinite(means), np.rint(means), 0.0).astype(np.uint8)

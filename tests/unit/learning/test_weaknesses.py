@@ -1,0 +1,118 @@
+"""What the figures of an evaluation show of a model, as findings and a verdict."""
+
+from dataclasses import replace
+
+import pytest
+from made_models import CARD
+
+from tcpipe.learning.evaluation import find_weaknesses
+from tcpipe.learning.evaluation_facts import (
+    BaselineResult,
+    EvaluateConfig,
+    EvaluatedDataset,
+    EvaluatedModel,
+    Evaluation,
+    Leakage,
+    SplitErrors,
+)
+from tcpipe.learning.fitting import FitConfig
+from tcpipe.learning.metrics import Errors, Ratio
+from tcpipe.tables.findings import judge
+
+GOOD = Errors(500, 12.0, 6.0, 500, 90.0, 3.0, 6.0)
+BETTER = Ratio(0.8, 0.7, 0.9)
+
+
+def told(
+    energy=GOOD,
+    ratio=BETTER,
+    *,
+    split="unseen",
+    floor=1.0,
+    near=0.0,
+    baseline="class and slope, spline",
+    kind="resnet18",
+):
+    """The findings on an evaluation of one split by code, from its own figures and those of the best baseline."""
+    floors = {"E": {"all": Errors(500, floor, 1.0, 500)}}
+    part = SplitErrors(
+        energy.count,
+        {},
+        (),
+        {"E": {"all": energy}, "T": {"all": GOOD}},
+        floors,
+        leakage=Leakage("sample", 1.05, near, None),
+    )
+    row = BaselineResult(
+        baseline=baseline,
+        split=split,
+        quantity="E",
+        errors=GOOD,
+        rmse_ratio=ratio,
+        mape_ratio=ratio,
+        groups=20,
+        drawn_by="runs",
+    )
+    training = replace(CARD.training, config=FitConfig(model=kind))
+    found = Evaluation(
+        tcpipe_version="", key="", model=EvaluatedModel("", "", training), dataset=EvaluatedDataset("", "", {}),
+        config=EvaluateConfig(), splits={split: part}, ablation=(), energy={}, time={}, baselines=(row,), repeatability={},
+        plots={},
+    )  # fmt: skip
+    return {of.code: of for of in find_weaknesses(found)}
+
+
+def test_a_model_that_is_better_and_calibrated_has_no_findings():
+    assert told() == {}
+
+
+def test_errors_of_half_and_more_make_a_model_not_usable():
+    found = told(replace(GOOD, mape_percent=95.2))
+    assert found["energy-far-off"].numbers == {"error_fraction": pytest.approx(0.952)}
+    verdict = judge(found.values())
+    assert (verdict.energy, verdict.time) == ("not usable", "usable")
+
+
+@pytest.mark.parametrize("ratio", [Ratio(1.01, 0.95, 1.08), Ratio(1.2, 1.1, 1.3)])
+def test_a_model_that_does_not_beat_class_and_slope_is_usable_with_care(ratio):
+    found = told(ratio=ratio)
+    assert judge(found.values()).energy == "usable with care"
+    assert found["energy-no-better-than-curves"].subject.name == "unseen"
+    best = found["baseline-not-beaten"]
+    assert best.numbers["rmse_fraction"] == ratio.value
+    commands = [of.command for of in best.remedies]
+    assert commands == (["tcpipe train DATASET --model table"] if ratio.low > 1.0 else [])
+
+
+@pytest.mark.parametrize(
+    ("kind", "baseline"), [("table", "class and slope, spline"), ("table", "gradient boosting"), ("physics", "physics")]
+)
+def test_nobody_is_told_to_train_what_was_evaluated(kind, baseline):
+    best = told(ratio=Ratio(1.2, 1.1, 1.3), baseline=baseline, kind=kind)["baseline-not-beaten"]
+    assert best.names == {"baseline": baseline}
+    assert best.remedies == ()
+
+
+def test_too_few_groups_show_neither():
+    assert set(told(ratio=Ratio(1.2, None, None))) == {"baseline-not-beaten"}
+
+
+@pytest.mark.parametrize(
+    ("held", "code", "grade"),
+    [
+        (60.0, "energy-overconfident", "usable with care"),
+        (99.0, "underconfident", "usable"),
+        (None, "no-intervals", "usable"),
+    ],
+)
+def test_intervals_are_compared_with_what_they_state(held, code, grade):
+    found = told(replace(GOOD, held_percent=held))
+    assert set(found) == {code}
+    assert judge(found.values()).energy == grade
+
+
+def test_few_samples_near_training_are_named():
+    found = told(replace(GOOD, count=40), split="test", near=98.0, floor=11.0)
+    assert set(found) == {"few-samples", "split-leakage", "split-empty"}
+    assert found["split-leakage"].numbers == {"overlapping_count": 39.0, "sample_count": 40.0}
+    assert found["split-empty"].severity == "note"
