@@ -47,7 +47,8 @@ def validate_fields(made: Any, section: str) -> None:
     RecipeError : one line for every wrong value.
     """
     problems: list[str] = []
-    for name, kind in read_annotations(type(made)).items():
+    cls: type = type(made)
+    for name, kind in read_annotations(cls).items():
         object.__setattr__(made, name, _check_value(kind, getattr(made, name), _join_key(section, name), problems))
     if problems:
         raise RecipeError(*(f"recipe: {problem}" for problem in problems))
