@@ -11,13 +11,15 @@ from tcpipe.formats.commits import Entries
 from tcpipe.formats.maps.map_files import open_map
 from tcpipe.formats.recipe_toml import ingest_key, make_recipe_id
 from tcpipe.formats.run_documents import Counts, LogOrigin, Manifest, RunJson
-from tcpipe.pipeline.log_writer import open_log
+from tcpipe.pipeline.calls import open_log
 from tcpipe.pipeline.maps import add_map
 from tcpipe.recipe import Recipe
 from tcpipe.simulation.scenarios import find_scenario
 from tcpipe.simulation.site_files import write_rasters
 from tcpipe.store import Store, open_store
+from tcpipe.tables.arrays import make_lines
 from tcpipe.tables.columns import to_floats
+from tcpipe.tables.findings import Verdict
 from tcpipe.tables.levels import (
     DATA_MODEL_VERSION,
     GATED_TRACK,
@@ -30,8 +32,6 @@ from tcpipe.tables.levels import (
     Track,
     TrackInfo,
 )
-from tcpipe.tables.verdicts import Verdict
-from tcpipe.tables.wkb import make_lines
 
 RUN_ROWS = 3_300
 SMALL = 500

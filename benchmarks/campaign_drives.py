@@ -19,10 +19,10 @@ import pyproj
 from tcpipe.errors import TcpipeError
 from tcpipe.formats.finding_lines import format_finding
 from tcpipe.formats.logs.writing import MessageStream
-from tcpipe.formats.robot_files import load_shipped_profiles
+from tcpipe.formats.recipe_toml import load_shipped_profiles
 from tcpipe.logs.messages import list_needed_fields
 from tcpipe.logs.topics import Topic
-from tcpipe.pipeline.run_stages import run_stages
+from tcpipe.pipeline.ingest_run import run_stages
 from tcpipe.recipe import Recipe
 from tcpipe.simulation import Faults, Truth, compute_true_cost, simulate_readings
 from tcpipe.simulation.messages import Recorder, make_streams

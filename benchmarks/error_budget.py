@@ -17,8 +17,8 @@ from campaign import LENGTH_M
 from campaign_drives import FIRST_SEED, log_of, simulated
 from campaign_faults import FAULTS
 
-from tcpipe.formats.robot_files import load_shipped_profiles
-from tcpipe.pipeline.run_stages import run_stages
+from tcpipe.formats.recipe_toml import load_shipped_profiles
+from tcpipe.pipeline.ingest_run import run_stages
 from tcpipe.recipe import Recipe
 from tcpipe.simulation.sensors import Power, Sensors
 from tcpipe.stages.read import read_run

@@ -29,7 +29,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from tcpipe.formats.logs.log_file import open_log
-from tcpipe.formats.robot_files import load_shipped_profiles
+from tcpipe.formats.recipe_toml import load_shipped_profiles
 from tcpipe.fusion.error_state import run_error_state
 from tcpipe.fusion.initial import find_initial_state
 from tcpipe.fusion.stationary import find_stationary_intervals

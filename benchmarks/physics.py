@@ -16,8 +16,7 @@ import numpy as np
 import pyarrow as pa
 
 from tcpipe import ingest
-from tcpipe.cost.held_out import fit_and_validate_physics
-from tcpipe.cost.physics import FitSamples
+from tcpipe.cost.physics import FitSamples, fit_and_validate_physics
 from tcpipe.formats.recipe_toml import load_recipe
 from tcpipe.pipeline.dataset.card import find_idle_power, make_fit_samples
 from tcpipe.report.label_sections import describe_physics

@@ -20,8 +20,8 @@ from campaign_figures import OF_THE_DRIVE
 
 from tcpipe.errors import TcpipeError
 from tcpipe.formats.logs.log_file import open_log
-from tcpipe.formats.robot_files import load_shipped_profiles
-from tcpipe.pipeline.run_stages import run_stages
+from tcpipe.formats.recipe_toml import load_shipped_profiles
+from tcpipe.pipeline.ingest_run import run_stages
 from tcpipe.recipe import Recipe
 from tcpipe.stages.read import read_run
 from tcpipe.tables.arrays import to_numbers

@@ -19,8 +19,7 @@ from tcpipe.cli import cli
 from tcpipe.cli.json_output import json_output_types
 from tcpipe.formats.contracts import DOCUMENTS
 from tcpipe.formats.finding_lines import format_number
-from tcpipe.formats.recipe_toml import format_commented_toml
-from tcpipe.formats.robot_files import load_shipped_profiles
+from tcpipe.formats.recipe_toml import format_commented_toml, load_shipped_profiles
 from tcpipe.planning.path_cost import PIECES
 from tcpipe.tables.catalogue import Entry, read_catalogue, read_sections
 from tcpipe.tables.columns import Column, TableSchema
@@ -102,11 +101,11 @@ def _describe_command(context: click.Context, shared: Mapping[str, str]) -> str:
 
 
 def _documents() -> str:
-    known = {**DOCUMENTS, **json_output_types()}
-    files = {name: cls for name, cls in known.items() if not name.endswith(".answer")}
-    told = {name: cls for name, cls in known.items() if name not in files}
-    head = "| schema | dataclass | holds |\n|---|---|---|\n"
-    parts = [_NOTE, _FILES, head + _rows(files), _ANSWERS, head + _rows(told)]
+    documents = {**DOCUMENTS, **json_output_types()}
+    files = {name: cls for name, cls in documents.items() if not name.endswith(".answer")}
+    answers = {name: cls for name, cls in documents.items() if name not in files}
+    head = "| schema | content |\n|---|---|\n"
+    parts = [_NOTE, _FILES, head + _rows(files), _ANSWERS, head + _rows(answers)]
     return "\n".join(parts)
 
 
@@ -128,20 +127,18 @@ A command that fails prints `exit_code` and `problems`.
 _PRINTED = "; ``str`` of it is what the command prints."
 
 
-def _rows(of: Mapping[str, type]) -> str:
+def _rows(documents: Mapping[str, type]) -> str:
     texts = {
-        name: str(inspect.getdoc(cls)).split("\n", 1)[0].removesuffix(_PRINTED) for name, cls in sorted(of.items())
+        name: str(inspect.getdoc(cls)).split("\n", 1)[0].removesuffix(_PRINTED)
+        for name, cls in sorted(documents.items())
     }
-    return "".join(
-        f"| [`{name}`](../../schemas/{name}.schema.json) | `{of[name].__module__}.{of[name].__qualname__}` | {text} |\n"
-        for name, text in texts.items()
-    )
+    return "".join(f"| [`{name}`](../../schemas/{name}.schema.json) | {text} |\n" for name, text in texts.items())
 
 
 _COLUMNS = f"""# Columns
 
 Data model {DATA_MODEL_VERSION}. Every file has the same unit, frame and meaning in its Arrow field metadata. A type with `?` allows null.
-A column marked *since 1.3* is null in files of earlier data models.
+A column marked *since 2.1* is null in files of 2.0.
 """
 
 
@@ -176,17 +173,53 @@ def _column_rows(columns: Sequence[Column]) -> str:
     """Return a table of columns; nothing of none."""
     head = "\n| column | type | unit, frame | meaning |\n|---|---|---|---|\n"
     rows = [
-        f"| `{c.name}` | {c.dtype}{'?' if c.nullable else ''} | {', '.join(filter(None, (c.unit, c.frame)))} | {c.doc}{_since(c)} |\n"
-        for c in columns
+        f"| {', '.join(f'`{c.name}`' for c in group)} | {group[0].dtype}{'?' if group[0].nullable else ''} "
+        f"| {', '.join(filter(None, (group[0].unit, group[0].frame)))} | {_join_texts(group)}{_since(group[0])} |\n"
+        for group in _group_columns(columns)
     ]
     return "".join((head, *rows)) if rows else ""
+
+
+def _group_columns(columns: Sequence[Column]) -> list[list[Column]]:
+    """Return runs of columns that differ only in their name and in one word of their meaning, such as the axis."""
+    groups: list[list[Column]] = []
+    for column in columns:
+        last = groups[-1] if groups else []
+        alike = last and replace(column, name="", doc="") == replace(last[0], name="", doc="")
+        if alike and len(_varying_words([*last, column])) == 1:
+            last.append(column)
+        else:
+            groups.append([column])
+    return groups
+
+
+def _varying_words(group: Sequence[Column]) -> list[int]:
+    """Return where the meanings of columns differ, by number of the word; all words where they are not alike."""
+    words = [column.doc.split() for column in group]
+    if len({len(each) for each in words}) > 1:
+        return list(range(max(map(len, words))))
+    return [number for number, each in enumerate(zip(*words, strict=True)) if len(set(each)) > 1]
+
+
+def _join_texts(group: Sequence[Column]) -> str:
+    """Return the meaning of a group; the word that varies has all its forms."""
+    words = [column.doc.split() for column in group]
+    return " ".join(
+        ", ".join(dict.fromkeys(form.rstrip(",;") for form in each)) + _end(each[0], each)
+        for each in zip(*words, strict=True)
+    )
+
+
+def _end(word: str, forms: Sequence[str]) -> str:
+    """Return the comma or semicolon after a word."""
+    return word[len(word.rstrip(",;")) :] if all(form[-1:] == word[-1:] for form in forms) else ""
 
 
 _SHARED_COLUMNS = 8
 
 
 def _since(column: Column) -> str:
-    return f"; *since {column.since}*" if column.since else ""
+    return f"; *since {column.since}*" if column.since and column.since >= "2.1" else ""
 
 
 def _bits(column: str, flags: type[IntFlag]) -> str:
@@ -209,9 +242,10 @@ _TROUBLESHOOTING = """# Findings: troubleshooting
 What tcpipe reports about logs, maps, runs and datasets. Each line of a report ends with a code in brackets, as `[no-gnss]`; search this
 page for the code, or for words such as dropout, lever arm, time offset, drift, multipath, no power.
 
-An **error** makes the labels that it affects not usable, a **warning** usable with care; a **note** changes no verdict. `tcpipe ingest`
+An **error** makes the labels that it affects not usable, a **warning** usable with care; a **note** changes no verdict. Data are kept
+unless the line states corrected, inflated (larger σ), excluded (the sensor or run) or rejected (the measurement). `tcpipe ingest`
 ends with exit code 3 for a **problem** until you acknowledge it (`tcpipe acknowledge`). `tcpipe inspect RUN` lists all findings of a run
-with their remedies and recipe keys; `--json` gives them as data.
+with their remedies, `--json` as data. Here … stands for the recipe line or command that the finding prints.
 """
 
 
@@ -225,17 +259,22 @@ def _findings() -> str:
 
 
 def _finding(code: str, entry: Entry) -> str:
-    more: list[str] = [entry.severity, entry.action]
+    more: list[str] = [entry.severity, *([entry.action] if entry.action != "kept" else [])]
     more += [f"affects {', '.join(entry.affects)}"] if entry.affects else []
     more += [f"quality bit `{entry.flag}`"] if entry.flag else []
     more += ["problem"] if entry.is_problem else []
     lines = [f"### {entry.title} `[{code}]`\n"]
     lines += [f"*{', '.join(more)}.* {_sentence(entry.cause)}\n"]
-    remedies = [_sentence(text) for text in (entry.advice, *entry.remedies.values()) if text]
+    remedies = [
+        *([_sentence(entry.advice)] if entry.advice else []),
+        *(f"{text}: …" for text in entry.remedies.values()),
+    ]
     lines += [f"**Remedy:** {' '.join(remedies)}\n"] if remedies else []
     limits = ", ".join(f"`{name}` {format_number(name, value)}" for name, value in entry.thresholds.items())
     lines += [f"Thresholds: {limits}.\n"] if limits else []
-    lines += [f"*Search:* {', '.join(entry.words)}.\n"] if entry.words else []
+    above = "\n".join(lines).lower()
+    words = [word for word in entry.words if word.lower() not in above]
+    lines += [f"*Search:* {', '.join(words)}.\n"] if words else []
     return "\n".join(lines)
 
 

@@ -36,16 +36,29 @@ from tcpipe.formats.bucket import open_place
 from tcpipe.formats.bucket_directories import FetchedShards, fetch_files
 from tcpipe.formats.commit_log import Stamp, pause_garbage_collection, put_commit, read_state
 from tcpipe.formats.commits import Entries, Kind, State
-from tcpipe.formats.geoparquet import add_segments_metadata
 from tcpipe.formats.index_files import RunFacts, make_run_facts, read_known_log, write_index
 from tcpipe.formats.integrity import CHECKSUMS, Checksum, compute_checksums, seal_document
 from tcpipe.formats.json_files import parse_typed, parse_typed_json, to_compact_json, to_json, to_plain
-from tcpipe.formats.numbered_documents import find_highest_numbers, name_document, name_folder, put_next, read_as_at
 from tcpipe.formats.object_storage import is_bucket, is_url
-from tcpipe.formats.parquet import read_table
+from tcpipe.formats.parquet import add_segments_metadata, read_table
 from tcpipe.formats.place import DirectoryPlace, Place
-from tcpipe.formats.run_documents import Manifest, MapDocument, RunJson, StreamInfo, Tags, tell_the_same
-from tcpipe.formats.store_document import MARK, is_outdated, mark_store, read_layout
+from tcpipe.formats.run_documents import (
+    MARK,
+    Manifest,
+    MapDocument,
+    RunJson,
+    StreamInfo,
+    Tags,
+    find_highest_numbers,
+    is_outdated,
+    mark_store,
+    name_document,
+    name_folder,
+    put_next,
+    read_as_at,
+    read_layout,
+    tell_the_same,
+)
 from tcpipe.formats.stored_runs import (
     FilesState,
     Ingestions,

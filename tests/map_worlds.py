@@ -9,8 +9,8 @@ import pyproj
 import rasterio
 from rasterio import Affine
 
+from tcpipe.tables.arrays import make_lines
 from tcpipe.tables.levels import LABELLED_SEGMENTS
-from tcpipe.tables.wkb import make_lines
 from tcpipe.terrain.classes import PAPER_CLASSES, ClassTable
 from tcpipe.terrain.grid import MapGrid
 from tcpipe.terrain.layers import find_no_data_value, make_paper_layers

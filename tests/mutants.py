@@ -31,7 +31,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 ROOMS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "motion": (("tcpipe/motion",), ("tests/unit/motion",)),
-    "path": (("tcpipe/path",), ("tests/unit/path",)),
+    "path": (("tcpipe/path.py",), ("tests/unit/test_path.py",)),
     "splits": (("tcpipe/splits",), ("tests/unit/splits", "tests/property/test_splits.py")),
     "power": (("tcpipe/power",), ("tests/unit/power",)),
     "cost": (("tcpipe/cost",), ("tests/unit/cost", "tests/unit/stages/test_label.py")),
@@ -52,7 +52,7 @@ ROOMS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
             "tests/unit/stages/test_fuse_mounting.py",
         ),
     ),
-    "verify": (("tcpipe/pipeline/verify_dataset.py",), ("tests/unit/pipeline/test_trust.py",)),
+    "verify": (("tcpipe/pipeline/verify.py",), ("tests/unit/pipeline/test_trust.py",)),
 }
 """What is changed, and the tests that are to notice, the quick ones first."""
 THOROUGH = ("motion", "path", "splits")

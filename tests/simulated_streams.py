@@ -4,7 +4,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from tcpipe.formats.logs.log_file import open_log
-from tcpipe.formats.robot_files import load_shipped_profiles
+from tcpipe.formats.recipe_toml import load_shipped_profiles
 from tcpipe.recipe import ReadConfig
 from tcpipe.simulation import simulate
 from tcpipe.simulation.scenarios import DriveSpec, RasterSpec, Scenario

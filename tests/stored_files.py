@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from tcpipe.formats.numbered_documents import find_highest_numbers, name_document
+from tcpipe.formats.run_documents import find_highest_numbers, name_document
 from tcpipe.formats.stored_runs import RunDirectory
 from tcpipe.store import Store
 

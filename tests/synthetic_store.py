@@ -12,12 +12,13 @@ from tcpipe.formats.commits import Entries, Superseded
 from tcpipe.formats.maps.building import build_map
 from tcpipe.formats.recipe_toml import ingest_key, make_recipe_id
 from tcpipe.formats.run_documents import Counts, LogOrigin, Manifest, RunJson
-from tcpipe.pipeline.log_writer import open_log
+from tcpipe.pipeline.calls import open_log
 from tcpipe.recipe import Recipe
 from tcpipe.store import Store, open_store
+from tcpipe.tables.arrays import make_lines
 from tcpipe.tables.bits import DropReason
 from tcpipe.tables.facts import PowerSign, StageFacts
-from tcpipe.tables.findings import StageReport
+from tcpipe.tables.findings import StageReport, judge
 from tcpipe.tables.levels import (
     DATA_MODEL_VERSION,
     GATED_TRACK,
@@ -30,8 +31,6 @@ from tcpipe.tables.levels import (
     Track,
     TrackInfo,
 )
-from tcpipe.tables.verdicts import judge
-from tcpipe.tables.wkb import make_lines
 
 STANDING_WATT = 90.0
 WORLD = World("EPSG:32633", 533_000.0, 5_213_000.0, side_m=40.0)

@@ -1,14 +1,18 @@
-"""How alike the labels of near samples are, and to how many independent ones a set of samples is worth (ADR-19).
+"""What class and slope leave of a label: its correlation over distance, effective sample sizes, and how well it repeats (ADR-19).
 
-What is alike is not the label but its residual: what is left of it when class and slope have explained what they can. Its
-semivariogram γ(h), half the mean squared difference of residuals h apart, is fitted by c0 + c1 (1 - exp(-h / L)) (Cressie, *Statistics for
-Spatial Data*, 1993, sections 2.4 and 2.6): L is the correlation length, c1 / (c0 + c1) the share of variance that neighbours have in
-common. The mean of n samples then has the variance of the mean of
+**Correlation.** The semivariogram γ(h) of the residuals, half the mean squared difference of residuals h apart, is fitted by
+c0 + c1 (1 - exp(-h / L)) (Cressie, *Statistics for Spatial Data*, 1993, sections 2.4 and 2.6): L is the correlation length,
+c1 / (c0 + c1) the share of variance that neighbours have in common. The mean of n samples then has the variance of the mean of
 
     n_eff = n² / Σij ρ(hij) = n / (1 + (n - 1) m),   ρ(h) = c1 / (c0 + c1) exp(-h / L) for i ≠ j, ρ = 1 for i = j,
 
 independent ones, m being the mean of ρ over all pairs of two (Bayley and Hammersley, "The effective number of independent
 observations in an autocorrelated time series", 1946; Cressie 1993, section 1.3).
+
+**Repeatability.** A model that knows the ground alone cannot distinguish two passes. Two passes of one place and direction give
+s² = (r1 - r2)² / 2 of their residuals r; the mean over P pairs that share no sample is the variance of one pass. Its interval is a
+jackknife over blocks of ground, since the pairs of one block are not independent (Efron and Tibshirani, *An Introduction to the
+Bootstrap*, 1993, chapter 11). The offset between two footprints makes the figure rather too large than too small.
 """
 
 from __future__ import annotations
@@ -19,7 +23,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import nnls
+from scipy.spatial import cKDTree
 from scipy.spatial.distance import pdist
+from scipy.special import stdtrit
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -62,14 +68,9 @@ def compute_slope_residuals(values: Floats, terrain_class: Ints, slope_rad: Floa
 def estimate_correlations(
     residual_by_label: Mapping[str, Floats], xy_m: Floats, run: Ints, start_ns: Ints, *, chord_m: float
 ) -> dict[str, Correlation | None]:
-    """Return how the residuals of each label are correlated over distance; None where too few samples are near each other to say.
+    """Return the correlation of each label's residuals, shape (N,), over distance; None where too few samples are near each other.
 
-    Parameters
-    ----------
-    residual_by_label : of `compute_slope_residuals`, shape (N,) each.
-    xy_m : centres of the footprints [m], shape (N, 2).
-    run, start_ns : number of each sample's run, and its start [ns], shape (N,).
-    chord_m : segment length [m].
+    ``xy_m`` are centres of the footprints [m], shape (N, 2); ``run`` and ``start_ns`` [ns] order the samples, shape (N,).
     """
     rows = _draw_sections(run, start_ns)
     apart = pdist(xy_m[rows]) / chord_m
@@ -120,3 +121,94 @@ def compute_effective_size(xy_m: Floats, *found: Correlation) -> float:
     apart_m = pdist(xy_m[:_MOST_IN_CELL])
     alike = max(one.share * float(np.exp(apart_m / -one.length_m).mean()) for one in found)
     return count / (1.0 + (count - 1) * alike)
+
+
+NEAR = 0.25
+"""Footprints whose centres are at most so many chords apart are one place."""
+
+ALONG_RAD = np.radians(10.0)
+"""Courses that differ by at most so much are one direction [rad]; NEAR and this bound the two together, as an ellipsoid."""
+
+_BLOCK = 10.0
+"""Side of a jackknife block, in chords."""
+_FEWEST_BLOCKS = 5
+_CONFIDENCE = 0.95
+
+
+@dataclass(frozen=True, slots=True)
+class Floor:
+    """How well a label repeats itself, in the label's unit: the standard deviation of one pass, with its 95 % interval."""
+
+    pairs: int
+    places: int
+    """Blocks of ground that the pairs lie in."""
+    std: float
+    std_low: float | None
+    """None where there are too few places for an interval."""
+    std_high: float | None
+    share_of_variance: float
+    """Of the label's own variance; no model explains more than the rest."""
+
+
+def find_repeated_pairs(xy_m: Floats, course_rad: Floats, terrain_class: Ints, *, chord_m: float) -> Ints:
+    """Return pairs of samples that cover one place of one class in one direction, shape (P, 2); no sample is in two pairs.
+
+    Samples of one pass never qualify: they begin a chord apart. Of several passes the two nearest are the pair.
+    ``xy_m`` are centres of the footprints [m], shape (N, 2), ``course_rad`` their directions of travel [rad], shape (N,).
+    """
+    if len(xy_m) < 2:
+        return np.empty((0, 2), np.int64)
+    reach_m = NEAR * chord_m
+    turned_m = reach_m / (2.0 * np.sin(ALONG_RAD / 2.0))  # a circle on which ALONG_RAD apart is reach_m apart
+    points = np.column_stack([xy_m, turned_m * np.cos(course_rad), turned_m * np.sin(course_rad)])
+    rows = np.arange(len(points))
+    apart_m, near = cKDTree(points).query(points, k=2, distance_upper_bound=reach_m * (1.0 + 1e-9))
+    itself = near[:, 0] == rows
+    other, apart_m = np.where(itself, near[:, 1], near[:, 0]), np.where(itself, apart_m[:, 1], apart_m[:, 0])
+    found = np.isfinite(apart_m)
+    back = np.full(len(points) + 1, -1)
+    back[:-1][found] = other[found]
+    mutual = found & (back[other] == rows) & (rows < other)
+    pairs = np.column_stack([rows[mutual], other[mutual]]).astype(np.int64)
+    return np.asarray(pairs[terrain_class[pairs[:, 0]] == terrain_class[pairs[:, 1]]])
+
+
+def estimate_repeatability(
+    values: Floats, residual: Floats, pairs: Ints, xy_m: Floats, *, chord_m: float
+) -> Floor | None:
+    """Return how well a label repeats itself over ``pairs``, shape (P, 2); None without pairs.
+
+    ``values`` and ``residual`` are the label and its `compute_slope_residuals`, shape (N,), ``xy_m`` centres of the footprints [m], (N, 2).
+    """
+    if not len(pairs):
+        return None
+    half_squares = (residual[pairs[:, 0]] - residual[pairs[:, 1]]) ** 2 / 2.0
+    cells = np.floor(xy_m[pairs[:, 0]] / (_BLOCK * chord_m)).astype(np.int64)
+    block = np.unique(cells, axis=0, return_inverse=True)[1].reshape(-1)
+    variance = float(half_squares.mean())
+    low, high = _bootstrap_interval(half_squares, block)
+    own = float(values.var())
+    return Floor(
+        pairs=len(pairs),
+        places=int(block.max()) + 1,
+        std=float(np.sqrt(variance)),
+        std_low=low,
+        std_high=high,
+        share_of_variance=variance / own if own > 0 else 1.0,
+    )
+
+
+def _bootstrap_interval(half_squares: Floats, block: Ints) -> tuple[float | None, float | None]:
+    """Return both ends of the 95 % interval of the root of the mean: delete-one-block jackknife of its logarithm."""
+    sums, counts = np.bincount(block, half_squares), np.bincount(block)
+    blocks = len(sums)
+    if blocks < _FEWEST_BLOCKS or not half_squares.any():
+        return None, None
+    without = (sums.sum() - sums) / (counts.sum() - counts)
+    if not (without > 0.0).all():
+        return None, None
+    logs = np.log(without) / 2.0
+    error = np.sqrt((blocks - 1) / blocks * ((logs - logs.mean()) ** 2).sum())
+    reach = float(stdtrit(blocks - 1, 0.5 + _CONFIDENCE / 2.0)) * error
+    std = np.sqrt(half_squares.mean())
+    return float(std * np.exp(-reach)), float(std * np.exp(reach))

@@ -1,4 +1,4 @@
-"""The command line, one file a command. Only click is imported here; everything else waits inside the commands."""
+"""The command line. Only click is imported here; modules of commands are imported when a command is asked for."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from typing import Any, NoReturn, TypeVar
 import click
 
 from tcpipe import __version__
-from tcpipe.cli.output import print_traceback, say_failure, write_debug_log
+from tcpipe.cli.output import print_failure, print_traceback, write_debug_log
 from tcpipe.cli.process import NOTHING_HALF, Terminated, prepare_process, terminate_on_signal
 from tcpipe.errors import TcpipeError, UsageError, hide_secrets
 
@@ -29,33 +29,33 @@ C = TypeVar("C", bound=Callable[..., Any])
 
 
 _COMMANDS = {
-    "demo": "See everything work on a simulated site",
-    "init": "Write a commented recipe",
-    "inspect": "What is in a log, map, dataset or store",
-    "preflight": "What a minute of recording promises",
-    "ingest": "Logs to labelled 1 m segments",
-    "status": "Where every log stands",
-    "acknowledge": "Do not report known problems again",
-    "prune": "Remove what a store no longer needs",
-    "add-map": "Rasters of a site into the store",
-    "build-dataset": "Segments and map to a dataset",
-    "train": "Train a model on a dataset",
-    "evaluate": "Measure a model, beside the paper's tables",
-    "reproduce": "The paper's experiment, on a simulated site",
-    "predict-path": "Time and energy of a path",
-    "cost-map": "Directional cost maps of a whole map",
-    "plan-path": "The path of least energy, time or distance",
-    "report": "HTML page of a run, dataset or store",
-    "overlay": "A run as MCAP, to see beside its log",
-    "export": "Topics as Parquet; a dataset for QGIS",
-    "explain": "Where a sample came from; make it again",
-    "verify": "Re-read everything, compare counts and checksums",
-    "migrate": "Bring a store, map or dataset to this data model",
-    "diff": "What changed between two datasets, by cause",
-    "schemas": "The contracts as JSON Schema",
-    "simulate": "A simulated site with its truth",
+    "demo": ("site_commands", "See everything work on a simulated site"),
+    "init": ("site_commands", "Write a commented recipe"),
+    "inspect": ("inspect", "What is in a log, map, dataset or store"),
+    "preflight": ("log_commands", "What a minute of recording promises"),
+    "ingest": ("log_commands", "Logs to labelled 1 m segments"),
+    "status": ("log_commands", "Where every log stands"),
+    "acknowledge": ("log_commands", "Do not report known problems again"),
+    "prune": ("log_commands", "Remove what a store no longer needs"),
+    "add-map": ("dataset_commands", "Rasters of a site into the store"),
+    "build-dataset": ("dataset_commands", "Segments and map to a dataset"),
+    "train": ("model_commands", "Train a model on a dataset"),
+    "evaluate": ("model_commands", "Measure a model, beside the paper's tables"),
+    "reproduce": ("model_commands", "The paper's experiment, on a simulated site"),
+    "predict-path": ("model_commands", "Time and energy of a path"),
+    "cost-map": ("model_commands", "Directional cost maps of a whole map"),
+    "plan-path": ("model_commands", "The path of least energy, time or distance"),
+    "report": ("dataset_commands", "HTML page of a run, dataset or store"),
+    "overlay": ("log_commands", "A run as MCAP, to see beside its log"),
+    "export": ("dataset_commands", "Topics as Parquet; a dataset for QGIS"),
+    "explain": ("dataset_commands", "Where a sample came from; make it again"),
+    "verify": ("dataset_commands", "Re-read everything, compare counts and checksums"),
+    "migrate": ("dataset_commands", "Bring a store, map or dataset to this data model"),
+    "diff": ("dataset_commands", "What changed between two datasets, by cause"),
+    "schemas": ("site_commands", "The contracts as JSON Schema"),
+    "simulate": ("site_commands", "A simulated site with its truth"),
 }
-"""What each command is for, in the order a user meets them; a command NAME-X is the function of that name in ``NAME_X.py`` here."""
+"""The module and the purpose of each command, in the order a user meets them; the command NAME-X is the function NAME_X there."""
 
 _OLD_NAMES = {"accept": "acknowledge"}
 """Before data model 3.0."""
@@ -69,7 +69,7 @@ class _Commands(Mapping[str, click.Command]):
             command = copy(self[_OLD_NAMES[name]])
             command.hidden = True
             return command
-        return _load(name, _COMMANDS[name])
+        return _load(name, *_COMMANDS[name])
 
     def __iter__(self) -> Iterator[str]:
         return chain(_COMMANDS, _OLD_NAMES)
@@ -79,9 +79,8 @@ class _Commands(Mapping[str, click.Command]):
 
 
 @cache
-def _load(name: str, about: str) -> click.Command:
-    function = name.replace("-", "_")
-    command: click.Command = getattr(import_module(f"tcpipe.cli.{function}"), function)
+def _load(name: str, module: str, about: str) -> click.Command:
+    command: click.Command = getattr(import_module(f"tcpipe.cli.{module}"), name.replace("-", "_"))
     command.short_help = about
     return _debug_option(hidden=True)(command)
 
@@ -98,7 +97,7 @@ class _Group(click.Group):
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:  # noqa: ARG002  click's signature
         with formatter.section("Commands"):
-            formatter.write_dl(list(_COMMANDS.items()))
+            formatter.write_dl([(name, about) for name, (_, about) in _COMMANDS.items()])
 
 
 def _begin_debugging(context: click.Context, _: click.Parameter, wanted: bool) -> None:  # noqa: FBT001  click's signature
@@ -201,7 +200,7 @@ def _fail(problems: Sequence[str], code: int) -> NoReturn:
     if "--debug" in sys.argv:
         print_traceback()
     try:
-        say_failure(problems, code, as_json="--json" in sys.argv)
+        print_failure(problems, code, as_json="--json" in sys.argv)
         sys.stdout.flush()
     except OSError:
         _drop_stdout()

@@ -9,13 +9,12 @@ from typing import TYPE_CHECKING
 import click
 
 from tcpipe.cli.options import LOG, json_option, msgdef_option, recipe_option, robot_option
-from tcpipe.cli.output import print_line
+from tcpipe.cli.output import print_json, print_line, resolve_recipe_with_source
 
 if TYPE_CHECKING:
-    from tcpipe.pipeline.inspect import InspectedLogs, InspectedRun, InspectedStore
+    from tcpipe.pipeline.inspect import InspectedLogs, InspectedRun, InspectedStore, InspectedTables
     from tcpipe.pipeline.inspected import InspectedDataset, InspectedMap
     from tcpipe.pipeline.log_inspection import InspectedLog, InspectedTopic
-    from tcpipe.pipeline.table_proposal import InspectedTables
     from tcpipe.tables.findings import Finding
 
 
@@ -28,7 +27,6 @@ if TYPE_CHECKING:
 @json_option
 def inspect(path: str, *, full: bool, robot: str | None, recipe: str | None, msgdef: str | None, as_json: bool) -> int:
     """Show what PATH holds: a log's topics, types, rates, and which topic plays which role and why; a map; a dataset; a run; a store."""
-    from tcpipe.cli.output import print_json, resolve_recipe_with_source
     from tcpipe.pipeline.inspect import inspect as run
 
     ruling, _ = resolve_recipe_with_source(recipe)

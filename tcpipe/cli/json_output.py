@@ -28,7 +28,7 @@ _ANSWERS = {
     "inspect-map.answer": "pipeline.inspected.InspectedMap",
     "inspect-run.answer": "pipeline.inspect.InspectedRun",
     "inspect-store.answer": "pipeline.inspect.InspectedStore",
-    "inspect-tables.answer": "pipeline.table_proposal.InspectedTables",
+    "inspect-tables.answer": "pipeline.inspect.InspectedTables",
     "migrate.answer": "pipeline.migrate.Migrated",
     "overlay.answer": "pipeline.overlay.Overlay",
     "plan-path.answer": "planning.plan_files.PlanResult",

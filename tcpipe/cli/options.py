@@ -102,8 +102,7 @@ def _complete_names(names: Callable[[click.Context], Iterable[str]]) -> Complete
 
 
 def _list_robots(context: click.Context) -> Iterable[str]:
-    from tcpipe.formats.recipe_toml import resolve_recipe
-    from tcpipe.formats.robot_files import load_profiles
+    from tcpipe.formats.recipe_toml import load_profiles, resolve_recipe
 
     return sorted(load_profiles(resolve_recipe(context.params.get("recipe"))).robots)
 

@@ -176,18 +176,18 @@ def print_line(text: str, *, err: bool = False) -> None:
     click.echo(clean_line(text), err=err)
 
 
-def say_lines(result: object) -> None:
+def print_lines(result: object) -> None:
     """Print a result that tells itself in lines of text on stdout."""
     for line in str(result).split("\n"):
         print_line(line)
 
 
-def say_result(result: object, *, as_json: bool) -> None:
+def print_result(result: object, *, as_json: bool) -> None:
     """Print a result on stdout: one JSON object, or the lines that it tells itself in."""
     if as_json:
         print_json(result)
     else:
-        say_lines(result)
+        print_lines(result)
 
 
 def print_json(value: Any) -> None:
@@ -213,7 +213,7 @@ def print_traceback() -> None:
     click.echo(hide_secrets(traceback.format_exc()), err=True, nl=False)
 
 
-def say_failure(problems: Sequence[str], exit_code: int, *, as_json: bool) -> None:
+def print_failure(problems: Sequence[str], exit_code: int, *, as_json: bool) -> None:
     """Say on stderr what went wrong, and print it on stdout as a JSON object if that is wanted."""
     with suppress(OSError):
         for problem in problems:

@@ -12,7 +12,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from tcpipe.cli.output import say_failure
+from tcpipe.cli.output import print_failure
 
 NOTHING_HALF = "nothing is half-written; run the same command again"
 _LATEST_S = 4.0
@@ -73,7 +73,7 @@ def _watch(heard: int) -> None:
         if not ending and told[0] in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             end, ending = time.monotonic() + _LATEST_S, told[0]
         left_s = max(0.0, end - time.monotonic()) if ending else None
-    say_failure([f"{Terminated(ending)}; {NOTHING_HALF}"], 128 + ending, as_json="--json" in sys.argv)
+    print_failure([f"{Terminated(ending)}; {NOTHING_HALF}"], 128 + ending, as_json="--json" in sys.argv)
     os._exit(128 + ending)
 
 

@@ -8,7 +8,6 @@
 A split is a map-style torch dataset as it is: ``torch.utils.data.DataLoader(train, batch_size=64, shuffle=True)``.
 """
 
-from tcpipe.dataset.opening import Dataset, open_dataset
-from tcpipe.dataset.split import Split
+from tcpipe.dataset.split import Dataset, Split, open_dataset
 
 __all__ = ["Dataset", "Split", "open_dataset"]

@@ -6,8 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import NotRequired, TypedDict
 
-from tcpipe.balance.correlation import Correlation
-from tcpipe.balance.repeatability import Floor
+from tcpipe.balance.correlation import Correlation, Floor
 from tcpipe.formats.finding_lines import FindingGroup, group_findings
 from tcpipe.formats.geojson import PolygonGeometry
 from tcpipe.formats.integrity import Checksum
@@ -17,8 +16,7 @@ from tcpipe.motion.selection_bias import Group
 from tcpipe.recipe import Recipe
 from tcpipe.splits.audit import HeldOut
 from tcpipe.tables.facts import ABSENT, EnergyBudget, PhysicsFit
-from tcpipe.tables.findings import LEFT_OUT, Finding
-from tcpipe.tables.verdicts import Verdict, judge_by_code
+from tcpipe.tables.findings import LEFT_OUT, Finding, Verdict, judge_by_code
 from tcpipe.terrain.classes import TerrainClass
 
 KIND = "tcpipe dataset"

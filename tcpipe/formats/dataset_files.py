@@ -23,13 +23,13 @@ from numpy.typing import NDArray
 
 from tcpipe.errors import DatasetError, RecipeError, StoreError, UsageError
 from tcpipe.formats.bucket_directories import FetchedShards
+from tcpipe.formats.content_cache import find_wrong_files
 from tcpipe.formats.dataset_card import KIND, DatasetCard, Shard
 from tcpipe.formats.integrity import prove_files, read_sealed
 from tcpipe.formats.json_files import parse_typed
 from tcpipe.formats.layer_descriptions import make_cf_attributes, read_layers
 from tcpipe.formats.parquet import read_column_names, read_row_count, read_row_group, read_table, write_parquet_bytes
 from tcpipe.formats.place import DirectoryPlace, Place
-from tcpipe.formats.proved_content import find_wrong_files
 from tcpipe.formats.shards import DESCRIPTION, ShardedArray, decode_chunk, open_sharded
 from tcpipe.formats.zarr_arrays import Compression, add_array, consolidate_metadata, create_group
 from tcpipe.splits.assignment import SPLITS

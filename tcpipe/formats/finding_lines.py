@@ -12,8 +12,7 @@ import numpy as np
 from tcpipe.motion.remedies import StoreLoss, make_loss_code
 from tcpipe.recipe.suggestions import RecipeFragment
 from tcpipe.tables.catalogue import AFFECTED, Affected, Entry, Severity, rank_severity, read_catalogue
-from tcpipe.tables.findings import Finding, Remedy, sort_findings
-from tcpipe.tables.verdicts import GRADES, Verdict
+from tcpipe.tables.findings import GRADES, Finding, Remedy, Verdict, sort_findings
 
 K = TypeVar("K", bound=Hashable)
 

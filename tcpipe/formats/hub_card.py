@@ -1,19 +1,21 @@
-"""README.md of a dataset: its card on the Hugging Face Hub, by which ``datasets.load_dataset`` knows configs, splits and columns.
+"""Descriptions of a dataset for hubs: README.md for the Hugging Face Hub, croissant.json (Croissant 1.1 metadata, MLCommons).
 
-The YAML head is https://github.com/huggingface/hub-docs/blob/main/datasetcard.md?plain=1.
+By the README, ``datasets.load_dataset`` finds configurations, splits and columns. Its YAML head is
+https://github.com/huggingface/hub-docs/blob/main/datasetcard.md?plain=1.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 import pyarrow as pa
 
 from tcpipe.errors import clean_line
 from tcpipe.formats.dataset_card import DatasetCard
 from tcpipe.formats.finding_lines import format_verdict
-from tcpipe.formats.json_files import Json
+from tcpipe.formats.integrity import Checksum
+from tcpipe.formats.json_files import Json, to_json
 
 _LICENCES = {
     "apache-2.0", "mit", "bsd-3-clause", "cc0-1.0", "cc-by-2.0", "cc-by-3.0", "cc-by-4.0", "cc-by-sa-3.0", "cc-by-sa-4.0",
@@ -176,3 +178,156 @@ def _format_bibtex(card: DatasetCard) -> Iterator[str]:
         yield f"  author = {{{braced(card.creator)}}},"
     yield f"  note = {{{card.samples} samples, version {card.data_model_version}.0+{card.inputs[:12]}}},"
     yield "}"
+
+
+_TERMS = (
+    *("annotation", "arrayShape", "citeAs", "column", "containedIn", "equivalentProperty", "excludes", "extract"),
+    *("field", "fileObject", "fileProperty", "fileSet", "format", "includes", "isArray", "isLiveDataset", "jsonPath"),
+    *("key", "md5", "parentField", "path", "readLines", "recordSet", "references", "regex", "repeated", "replace"),
+    *("samplingRate", "sdVersion", "separator", "source", "subField", "transform", "unArchive", "value"),
+)
+_CONTEXT: Json = {
+    "@language": "en",
+    "@vocab": "https://schema.org/",
+    "cr": "http://mlcommons.org/croissant/",
+    "dct": "http://purl.org/dc/terms/",
+    "prov": "http://www.w3.org/ns/prov#",
+    "rai": "http://mlcommons.org/croissant/RAI/",
+    "sc": "https://schema.org/",
+    "data": {"@id": "cr:data", "@type": "@json"},
+    "dataType": {"@id": "cr:dataType", "@type": "@vocab"},
+    "examples": {"@id": "cr:examples", "@type": "@json"},
+    "conformsTo": "dct:conformsTo",
+    **{name: f"cr:{name}" for name in _TERMS},
+}
+
+_ENCODING_BY_SUFFIX = {
+    ".json": "application/json",
+    ".parquet": "application/x-parquet",
+    ".html": "text/html",
+    ".md": "text/markdown",
+    ".png": "image/png",
+    ".geojson": "application/geo+json",
+}
+
+
+def format_croissant(
+    *,
+    name: str,
+    description: str,
+    licence: str,
+    creator: str,
+    files: Mapping[str, Checksum],
+    samples_file: str,
+    samples: pa.Schema,
+    version: str,
+    shards: str | None = None,
+    layers: Mapping[str, tuple[int, str]] | None = None,
+) -> str:
+    """Return the document as text.
+
+    Parameters
+    ----------
+    name, description, licence, creator : as the recipe says; an empty one is left out.
+    files : size [byte] and sha256 (hex) of every file by its path inside the dataset.
+    samples_file : which of them holds the samples.
+    samples : its Arrow schema; the fields' metadata give their meanings.
+    version : of the dataset.
+    shards, layers : pattern of the Parquet files that hold the patches, and of each layer how many values a patch has and of which kind
+        (numpy's letter); None where patches are no Parquet.
+
+    Returns
+    -------
+    JSON-LD.
+    """
+    samples_source = {"fileObject": {"@id": samples_file}}
+    records = [
+        _describe_records("samples", "One record a sample, in the order of the patches.", samples, samples_source)
+    ]
+    sets = []
+    if shards is not None and layers is not None:
+        sets.append(
+            {
+                "@type": "cr:FileSet",
+                "@id": "shards",
+                "name": "shards",
+                "encodingFormat": _ENCODING_BY_SUFFIX[".parquet"],
+                "includes": shards,
+            }
+        )
+        columns = pa.schema(
+            [
+                samples.field("sample_id"),
+                samples.field("split"),
+                *(_patch_field(layer, *values) for layer, values in layers.items()),
+            ]
+        )
+        about = "One record a sample with its patch, split by split: rows of the patch one after another."
+        records.append(_describe_records("patches", about, columns, {"fileSet": {"@id": "shards"}}))
+    document = {
+        "@context": _CONTEXT,
+        "@type": "sc:Dataset",
+        "conformsTo": "http://mlcommons.org/croissant/1.1",
+        "name": name,
+        "description": description,
+        "license": licence,
+        "creator": {"@type": "sc:Person", "name": creator} if creator else None,
+        "version": version,
+        "distribution": [*(_describe_file_object(path, files[path]) for path in sorted(files)), *sets],
+        "recordSet": records,
+    }
+    return to_json({key: value for key, value in document.items() if value})
+
+
+def _describe_file_object(path: str, file: Checksum) -> Json:
+    suffix = path[path.rfind(".") :] if "." in path.rsplit("/", 1)[-1] else ""
+    return {
+        "@type": "cr:FileObject",
+        "@id": path,
+        "name": path,
+        "contentUrl": path,
+        "contentSize": f"{file.size_bytes} B",
+        "encodingFormat": _ENCODING_BY_SUFFIX.get(suffix, "application/octet-stream"),
+        "sha256": file.sha256,
+    }
+
+
+def _describe_records(name: str, about: str, columns: pa.Schema, source: Mapping[str, Json]) -> Json:
+    return {
+        "@type": "cr:RecordSet",
+        "@id": name,
+        "name": name,
+        "description": about,
+        "key": {"@id": f"{name}/sample_id"},
+        # Croissant has no type for binary columns.
+        "field": [_describe_field(name, field, source) for field in columns if not pa.types.is_binary(field.type)],
+    }
+
+
+def _patch_field(layer: str, values: int, kind: str) -> pa.Field:
+    return pa.field(
+        layer,
+        pa.list_(pa.float32() if kind == "f" else pa.uint16(), values),
+        metadata={"doc": f"layer {layer} as stored; dataset.json says how to decode it"},
+    )
+
+
+def _describe_field(records: str, field: pa.Field, source: Mapping[str, Json]) -> Json:
+    metadata = {key.decode(): value.decode() for key, value in (field.metadata or {}).items()}
+    unit = f" [{metadata['unit']}]" if metadata.get("unit") else ""
+    many = pa.types.is_fixed_size_list(field.type)
+    return {
+        "@type": "cr:Field",
+        "@id": f"{records}/{field.name}",
+        "name": field.name,
+        "description": metadata.get("doc", "") + unit,
+        "dataType": _find_data_type(field.type.value_type if many else field.type),
+        **({"isArray": True, "arrayShape": str(field.type.list_size)} if many else {}),
+        "source": {**source, "extract": {"column": field.name}},
+    }
+
+
+def _find_data_type(dtype: pa.DataType) -> str:
+    if pa.types.is_integer(dtype):
+        return "sc:Integer"
+    return "sc:Float" if pa.types.is_floating(dtype) else "sc:Text"

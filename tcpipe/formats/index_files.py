@@ -21,8 +21,7 @@ from tcpipe.formats.run_documents import Ingestion, LogOrigin, Manifest, RunJson
 from tcpipe.tables.arrays import make_column
 from tcpipe.tables.catalogue import AFFECTED
 from tcpipe.tables.facts import EnergyBudget, PhysicsFit
-from tcpipe.tables.findings import Finding, select_findings
-from tcpipe.tables.verdicts import Verdict, judge
+from tcpipe.tables.findings import Finding, Verdict, judge, select_findings
 
 RUNS = "runs.parquet"
 

@@ -1,4 +1,4 @@
-"""Parquet, written so that the same table gives the same bytes, and read back with its metadata.
+"""Tables in files: Parquet with GeoParquet metadata, and Arrow files; the same table gives the same bytes.
 
 Every page carries a checksum that is proved when it is read: damage is an error, never a number. Before a page is decoded, the headers of
 all pages say how large the table becomes: one that is out of proportion to its file is refused (`MOST_BYTES`, `MOST_TIMES`).
@@ -9,14 +9,19 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
+from numpy.typing import NDArray
 
 from tcpipe.errors import StoreError
 from tcpipe.formats.atomic import write_atomic_file
+from tcpipe.formats.json_files import to_json_line
+from tcpipe.tables.columns import read_lonlat_deg
+from tcpipe.tables.levels import GEOMETRY, Datum
 
 ROWS_PER_GROUP = 1 << 17
 """Rows of a group: what is decoded together."""
@@ -258,3 +263,63 @@ def _read_statistics(path: Path, column: str) -> list[tuple[int, int]]:
     if not found or not all(of is not None and of.has_min_max for of in found):
         raise StoreError(f"{path}: has no statistics of {column}")
     return [(int(of.min), int(of.max)) for of in found]
+
+
+_WGS84 = "EPSG:4326"
+
+
+def add_segments_metadata(table: pa.Table, datum: Datum | None) -> pa.Table:
+    """Return a table of segments which says where it lies; ``datum`` is the track's."""
+    ends = np.concatenate([read_lonlat_deg(table, "start"), read_lonlat_deg(table, "end")])
+    return add_geo_metadata(table, "LineString", ends, crs=_WGS84 if datum is None else datum.crs)
+
+
+def add_geo_metadata(
+    table: pa.Table, kind: Literal["LineString", "Point"], points_deg: NDArray[np.float64], *, crs: str = _WGS84
+) -> pa.Table:
+    """Return a table whose metadata says what its column ``geometry`` holds.
+
+    Parameters
+    ----------
+    table : with the column.
+    kind : of all its geometries.
+    points_deg : longitude and latitude of all their points, shape (N, 2), NaN where not known.
+    crs : geographic CRS of the coordinates, of which longitude is the first whatever the CRS says.
+    """
+    known = points_deg[np.isfinite(points_deg).all(axis=1)]
+    column: dict[str, Any] = {"encoding": "WKB", "geometry_types": [kind]}
+    if crs != _WGS84:  # without the key it is OGC:CRS84: WGS 84, longitude first
+        from pyproj import CRS  # noqa: PLC0415  few stores need it
+
+        column["crs"] = CRS.from_user_input(crs).to_json_dict()
+    if len(known):
+        column["bbox"] = [*known.min(axis=0), *known.max(axis=0)]
+    geo = {"version": "1.1.0", "primary_column": GEOMETRY, "columns": {GEOMETRY: column}}
+    return table.replace_schema_metadata({**(table.schema.metadata or {}), b"geo": to_json_line(geo).encode()})
+
+
+def write_pieces(path: Path, schema: pa.Schema, pieces: Iterable[pa.Table]) -> None:
+    """Write tables of one schema one after another."""
+    with pa.OSFile(str(path), "wb") as sink, pa.ipc.new_file(sink, schema) as writer:
+        for piece in pieces:
+            writer.write_table(piece)
+
+
+def map_table(path: Path) -> pa.Table:
+    """Return the whole table as a view of the file, which must outlive it."""
+    with pa.memory_map(str(path)) as source:
+        return pa.ipc.open_file(source).read_all()
+
+
+def write_table_bytes(table: pa.Table) -> bytes:
+    """Return a table as bytes, schema and all; `read_table_bytes` is the way back."""
+    sink = pa.BufferOutputStream()
+    with pa.ipc.new_stream(sink, table.schema) as writer:
+        writer.write_table(table)
+    return bytes(sink.getvalue())
+
+
+def read_table_bytes(data: bytes) -> pa.Table:
+    """Return the table in bytes of `write_table_bytes`."""
+    with pa.ipc.open_stream(data) as reader:
+        return reader.read_all()

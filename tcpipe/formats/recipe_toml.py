@@ -1,21 +1,21 @@
-"""The recipe as TOML: found, read and checked (all errors at once), written with comments, described as JSON Schema."""
+"""TOML files: recipes, found, read, checked (all errors at once) and written with comments; the robot profiles of the package."""
 
 from __future__ import annotations
 
 import os
+import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass
-from functools import lru_cache
+from functools import cache, lru_cache
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
 from tcpipe.errors import RecipeError
 from tcpipe.formats.json_files import Json, digest, to_plain
-from tcpipe.formats.robot_files import load_shipped_profiles
-from tcpipe.formats.toml_text import parse_toml
 from tcpipe.recipe import IngestSections, Recipe, TableMapping
 from tcpipe.recipe.checking import as_toml, describe, format_values, from_values, read_annotations
-from tcpipe.robots.profiles import PowerSource, Robot
+from tcpipe.robots.profiles import GENERIC, PowerSource, Profiles, Robot
 
 FILE_NAME = "tcpipe.toml"
 _MOST_BYTES = 1_000_000
@@ -154,3 +154,33 @@ def _iterate_key_lines(schema: Mapping[str, Any], name: str, value: Any, usual: 
         yield f"# {name} ={note}"
     else:
         yield f"{'# ' if value == usual else ''}{name} = {as_toml(value)}{note}"
+
+
+@cache
+def load_shipped_profiles() -> Profiles:
+    """Return what the package knows."""
+    known = Profiles({GENERIC: Robot()})
+    for file in sorted(files("tcpipe.robots").iterdir(), key=lambda file: file.name):
+        if file.name.endswith(".toml"):
+            known = known.before(from_values(Profiles, parse_toml(file.read_text(encoding="utf-8")), where=file.name))
+    return known
+
+
+def load_profiles(recipe: Recipe | IngestSections) -> Profiles:
+    """Return what a recipe knows, and beyond that the package."""
+    return Profiles(recipe.robots, recipe.power_sources).before(load_shipped_profiles())
+
+
+_MOST_DOTS = 1000
+"""On one line: the time of a key grows with the square of its parts."""
+
+
+def parse_toml(text: str) -> dict[str, Any]:
+    """Return the values of a TOML document; `ValueError` where it is none, is nested too deep, or a line has too many dots."""
+    for number, line in enumerate(text.splitlines(), 1):
+        if (dots := line.count(".")) > _MOST_DOTS:
+            raise ValueError(f"line {number} has {dots} dots, at most {_MOST_DOTS}")
+    try:
+        return tomllib.loads(text)
+    except RecursionError:
+        raise ValueError("its values are nested too deep") from None

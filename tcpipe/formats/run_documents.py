@@ -1,22 +1,31 @@
-"""The JSON documents of a run: run.json on its log, and manifest.json on what became of it under a recipe.
+"""The JSON documents of a store: ``store.json``, and numbered ones on runs, their tags and maps.
 
-A key with a default may be missing: documents of data model 1.0 have been written without it.
+A numbered document ``<stem>-<n>.json`` never changes, and the highest number holds (ADR-28). A writer first puts the files that the
+document names, each under a name that follows from its content, then the document under the next free number: a reader sees a complete
+document or the one before, and of two writers one learns that it came second. A key with a default may be missing.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+import re
+import shutil
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
-from typing import Literal
+from pathlib import Path
+from typing import Literal, TypeVar
 
-from tcpipe.formats.integrity import Checksum
+from tcpipe.errors import StoreError
+from tcpipe.formats.integrity import Checksum, seal_document, verify_document
+from tcpipe.formats.json_files import Json, digest, parse_typed, to_json
+from tcpipe.formats.object_storage import is_url
+from tcpipe.formats.place import Place
 from tcpipe.motion.remedies import KEPT
 from tcpipe.recipe import IngestSections
 from tcpipe.tables.facts import LEFT_OUT, NOTHING_FOUND, StageFacts
-from tcpipe.tables.findings import StageReport
-from tcpipe.tables.levels import TABLES_VERSION, Sensor, TrackInfo
-from tcpipe.tables.verdicts import Verdict
+from tcpipe.tables.findings import StageReport, Verdict
+from tcpipe.tables.levels import DATA_MODEL_VERSION, TABLES_VERSION, Sensor, TrackInfo
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,3 +163,128 @@ class StreamInfo:
     report: StageReport[StageFacts]
     sensor: Sensor
     data_model_version: str = TABLES_VERSION
+
+
+T = TypeVar("T")
+
+_NUMBERED = re.compile(r"(.+)-([1-9]\d*)\.json")
+_DIGEST_HEX = 16
+
+
+def name_document(stem: str, number: int) -> str:
+    """Return the name of a document."""
+    return f"{stem}-{number}.json"
+
+
+def split_number(name: str) -> tuple[str, int] | None:
+    """Return what a document's name says; None for any other name."""
+    found = _NUMBERED.fullmatch(name)
+    return (found[1], int(found[2])) if found else None
+
+
+def find_highest_numbers(names: Iterable[str]) -> dict[str, int]:
+    """Return, by stem, the highest number among names."""
+    found: dict[str, int] = {}
+    documents = (split_number(name) for name in names if name.endswith(".json"))
+    for stem, number in filter(None, documents):
+        found[stem] = max(number, found.get(stem, 0))
+    return found
+
+
+def read_sealed_at(
+    place: Place, name: str, *, ours: Callable[[Mapping[str, Json]], bool] = lambda _: True
+) -> dict[str, Json]:
+    """Read and prove a sealed document; `StoreError` where it is gone, or not as it was written."""
+    data = place.read(name)
+    if data is None:
+        raise StoreError(f"{place.where(name)}: is gone")
+    return verify_document(data, place.where(name), ours=ours)
+
+
+def read_as_at(place: Place, name: str, cls: type[T]) -> T:
+    """Read and prove a sealed document as a dataclass; `StoreError` as `read_sealed_at`."""
+    return parse_typed(read_sealed_at(place, name), cls, place.where(name))
+
+
+def put_next(place: Place, stem: str, value: T, *, after: int, settled: Callable[[T], bool] = lambda _: False) -> T:
+    """Write a document under the first free number from ``after`` + 1 on, and return it.
+
+    The one of number ``after`` is returned instead if it has the same bytes, and so is one that others put there meanwhile if it is
+    ``settled``: what this call would write. One that is not as it was written is passed over.
+    """
+    data = to_json(seal_document(value)).encode()
+    number = max(after, 1)
+    while True:
+        name = name_document(stem, number)
+        if number > after and place.put_new(name, data):
+            return value
+        try:
+            found = read_as_at(place, name, type(value))
+        except StoreError:
+            found = None
+        if found is not None and (place.read(name) == data or (number > after and settled(found))):
+            return found
+        number += 1
+
+
+def name_folder(checksums: Mapping[str, Checksum]) -> str:
+    """Return the name of a directory with these files."""
+    return digest(dict(checksums))[:_DIGEST_HEX]
+
+
+MARK = "store.json"
+"""Is written first where a store is new, and last where one is brought over."""
+SPOOL = "spool"
+"""Where pixels wait until a dataset is written, in its directory or, for a cluster, in the store; they go in the end."""
+
+
+def is_outdated(place: Place) -> bool:
+    """Tell whether runs or maps lie here, but not the mark of a store."""
+    if place.size(MARK) is not None:
+        return False
+    return any(name.endswith(".zarr") for name in place.folders("maps")) or any(
+        name.startswith("run") and name.endswith(".json")
+        for run_id in place.folders("runs")[:10]
+        for name in place.files(f"runs/{run_id}")
+    )
+
+
+def read_layout(place: Place) -> str | None:
+    """Return the data model of a store, None where there is none; `StoreError` where its mark is not as it was written."""
+    where, data = place.where(MARK), place.read(MARK)
+    return None if data is None else parse_typed(verify_document(data, where), StoreDocument, where).data_model_version
+
+
+def mark_store(place: Place, *, found: bool = False) -> None:
+    """Make a place a store; `StoreError` where it cannot be written, or does not keep what is there from being overwritten."""
+    data = to_json(seal_document(StoreDocument(DATA_MODEL_VERSION))).encode()
+    try:
+        new = place.put_new(MARK, data)
+        keeps = not (new and (found or place.put_new(MARK, data)))
+    except StoreError as error:
+        raise StoreError(f"{error.problems[0]}; name another with --store") from None
+    if not keeps:
+        raise StoreError(
+            f"{place.where()}: this object store overwrites what is there although asked not to (put-if-absent), so that two writers "
+            "would mix; name another with --store"
+        )
+
+
+@contextmanager
+def remove_if_empty(place: str | Path) -> Iterator[None]:
+    """Remove what was made for a store on this machine when no run or map came into it, what is remembered of failures too."""
+    if is_url(place):
+        yield
+        return
+    store = Path(place)
+    made = [path for path in (store, *store.absolute().parents) if not path.exists()]
+    try:
+        yield
+    finally:
+        if made and not any(store.glob("runs/*")) and not any(store.glob("maps/*-*.json")):
+            for own in ("log", "index"):
+                shutil.rmtree(store / own, ignore_errors=True)
+            (store / MARK).unlink(missing_ok=True)
+            for path in (store / "runs", store / "maps", *made):
+                with suppress(OSError):
+                    path.rmdir()

@@ -16,13 +16,12 @@ from tcpipe.errors import StoreError
 from tcpipe.formats.commits import State
 from tcpipe.formats.index_files import RunFacts
 from tcpipe.formats.integrity import Checksum, compute_checksum, compute_checksums, find_wrong_checksum
-from tcpipe.formats.numbered_documents import name_folder, read_as_at
 from tcpipe.formats.parquet import read_highest, read_lowest, read_table, write_table
 from tcpipe.formats.place import DirectoryPlace, Place
 from tcpipe.formats.recipe_toml import read_key
-from tcpipe.formats.run_documents import Manifest
-from tcpipe.tables.levels import LABELLED_SEGMENTS, GatedTrack
-from tcpipe.tables.verdicts import judge_again
+from tcpipe.formats.run_documents import Manifest, name_folder, read_as_at
+from tcpipe.tables.findings import judge_again
+from tcpipe.tables.levels import LABELLED_SEGMENTS, GatedTrack, Streams
 
 FilesState: TypeAlias = tuple[tuple[int, int], ...]
 """Size [byte] and modification time [ns] of each file of an ingestion."""
@@ -233,3 +232,48 @@ def fetch_local_file(place: Place, name: str, wanted: Checksum) -> Path:
     if wrong:
         raise StoreError(f"{wrong}; 'tcpipe verify {place.where()}' tells what else is not as it was written")
     return path
+
+
+_LENT = ("imu", "wheel_odometry", "visual_odometry")
+
+
+class _LentTables(Mapping[str, pa.Table]):
+    """Tables by role: some held, the others read from their files each time they are asked for."""
+
+    def __init__(self, held: Mapping[str, pa.Table], files: Mapping[str, Path]) -> None:
+        self._held, self._files = held, files
+
+    def __getitem__(self, role: str) -> pa.Table:
+        """Return a role's table."""
+        if role in self._held:
+            return self._held[role]
+        return read_table(self._files[role]).replace_schema_metadata(None)
+
+    def __contains__(self, role: object) -> bool:
+        """Tell whether there is such a role; nothing is read for that."""
+        return role in self._held or role in self._files
+
+    def __iter__(self) -> Iterator[str]:
+        """Yield the roles."""
+        return iter([*self._held, *self._files])
+
+    def __len__(self) -> int:
+        """Return how many roles there are."""
+        return len(self._held) + len(self._files)
+
+
+def lend_streams(place: Place, streams: Streams, stored: Mapping[str, Checksum]) -> Streams:
+    """Return L1 with the tables that a long log fills read whenever they are asked for: nobody holds them in between.
+
+    In a bucket they are held: each time they would be fetched.
+
+    Parameters
+    ----------
+    place : of the run.
+    stored : the files of L1 in it.
+    """
+    if not isinstance(place, DirectoryPlace):
+        return streams
+    files = {PurePosixPath(name).stem: place.local(name, of) for name, of in stored.items()}
+    held = {role: table for role, table in streams.tables.items() if role not in _LENT}
+    return replace(streams, tables=_LentTables(held, {role: path for role, path in files.items() if role in _LENT}))

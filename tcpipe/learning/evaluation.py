@@ -12,13 +12,13 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from tcpipe import __version__
-from tcpipe.balance.repeatability import Floor
+from tcpipe.balance.correlation import Floor
 from tcpipe.cost.prediction_errors import fit_bias_correction
 from tcpipe.dataset import Dataset, Split, open_dataset
 from tcpipe.dataset.energies import ENERGIES, Energy
 from tcpipe.errors import DatasetError
 from tcpipe.formats.dataset_card import DatasetCard
-from tcpipe.formats.robot_files import load_shipped_profiles
+from tcpipe.formats.recipe_toml import load_shipped_profiles
 from tcpipe.learning.baselines import compare_baselines
 from tcpipe.learning.evaluation_facts import (
     SPLITS,
@@ -50,8 +50,7 @@ from tcpipe.learning.training import Variant, compute_dataset_checksum, make_tra
 from tcpipe.learning.wei_isler import OURS, PER_CLASS, Trained, make_energy_table
 from tcpipe.robots.profiles import Robot
 from tcpipe.splits.neighbours import CLOSE, PLACES, are_near, compute_middles_deg
-from tcpipe.tables.findings import Finding, Subject, make_finding
-from tcpipe.tables.verdicts import judge
+from tcpipe.tables.findings import Finding, Subject, judge, make_finding
 from tcpipe.terrain.classes import NODATA_ID
 
 logger = logging.getLogger("tcpipe")

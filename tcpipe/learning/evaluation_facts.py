@@ -6,15 +6,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Annotated, Literal, TypeAlias, TypedDict
 
-from tcpipe.balance.repeatability import Floor
+from tcpipe.balance.correlation import Floor
 from tcpipe.dataset.energies import EnergyName
 from tcpipe.learning.fitting import Seed
 from tcpipe.learning.metrics import Errors, Ratio
 from tcpipe.learning.model_card import Training
 from tcpipe.tables.bounds import Bounds
 from tcpipe.tables.facts import ABSENT
-from tcpipe.tables.findings import Finding
-from tcpipe.tables.verdicts import Verdict
+from tcpipe.tables.findings import Finding, Verdict
 
 KIND = "tcpipe evaluation"
 

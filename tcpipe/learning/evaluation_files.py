@@ -28,7 +28,7 @@ from tcpipe.learning.metrics import ALL, QUANTITIES
 from tcpipe.learning.models import read_model_card
 from tcpipe.learning.training import compute_dataset_checksum
 from tcpipe.pipeline.generations import write_generation
-from tcpipe.tables.verdicts import PREDICTED
+from tcpipe.tables.findings import PREDICTED
 
 SIMULATED = "The data are simulated: what can be compared with the paper is the pattern, not the figures."
 

@@ -15,7 +15,7 @@ from tcpipe.learning.metrics import ALL, LEAST, QUANTITIES, UNITS, Errors
 from tcpipe.learning.wei_isler import GRASS_ONLY, OURS, PER_CLASS
 from tcpipe.report.page import Number, Section, render_page
 from tcpipe.report.verdict import show_verdict
-from tcpipe.tables.verdicts import PREDICTED, judge_again
+from tcpipe.tables.findings import PREDICTED, judge_again
 
 FLOORS = {"label_floor": "label noise alone", "simulation_floor": "simulation's own floor"}
 """What an error can hardly be less than, and what the page calls it."""

@@ -33,14 +33,13 @@ from tcpipe.formats.maps.map_files import MapFile, open_map
 from tcpipe.formats.parquet import ROWS_PER_GROUP, read_row_group
 from tcpipe.formats.run_documents import Ingestion, LogOrigin
 from tcpipe.formats.stored_runs import RunDirectory
-from tcpipe.pipeline.run_stages import run_stages
+from tcpipe.pipeline.ingest_run import run_stages
 from tcpipe.recipe import Recipe
 from tcpipe.stages.sample import Sampled, sample_segments
 from tcpipe.store import Store, open_store
 from tcpipe.tables.bits import DropReason, Quality, flag_names
 from tcpipe.tables.columns import to_integers
-from tcpipe.tables.levels import PLACED_SEGMENTS, Streams
-from tcpipe.tables.segment_columns import GEOMETRY
+from tcpipe.tables.levels import GEOMETRY, PLACED_SEGMENTS, Streams
 from tcpipe.terrain.sampling import Patches
 
 _NEARBY_NS = 5_000_000_000

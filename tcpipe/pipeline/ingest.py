@@ -6,44 +6,55 @@ import logging
 import time
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, closing, nullcontext
+from contextlib import AbstractContextManager, closing, nullcontext, suppress
 from dataclasses import dataclass, field, fields, replace
 from itertools import chain
 from pathlib import Path
 from typing import Literal
+
+import numpy as np
+import pyarrow as pa
 
 from tcpipe import __version__
 from tcpipe.errors import LogError, StoreError, UsageError, clean_line
 from tcpipe.execution import run_all
 from tcpipe.formats.atomic import make_scratch_directory
 from tcpipe.formats.commit_log import keep_state_here, pause_garbage_collection
-from tcpipe.formats.commits import CallRecord, Entries, Failure, Kind, State
+from tcpipe.formats.commits import CallRecord, Entries, Failure, Kind, State, Superseded
 from tcpipe.formats.index_files import RunFacts
 from tcpipe.formats.object_storage import is_presigned, is_url, make_absolute
-from tcpipe.formats.recipe_toml import ingest_key, resolve_recipe
-from tcpipe.formats.robot_files import load_profiles
-from tcpipe.formats.store_document import remove_if_empty
+from tcpipe.formats.parquet import read_table
+from tcpipe.formats.recipe_toml import ingest_key, load_profiles, resolve_recipe
+from tcpipe.formats.run_documents import remove_if_empty
 from tcpipe.formats.stored_runs import look_at_files
-from tcpipe.pipeline.begun_calls import commit_call, find_settled_calls, make_call
-from tcpipe.pipeline.call_history import INGEST, measure_call, start_stopwatch, stored_bytes
+from tcpipe.pipeline.calls import (
+    INGEST,
+    LogWriter,
+    commit_call,
+    find_settled_calls,
+    make_call,
+    measure_call,
+    open_log,
+    start_stopwatch,
+    stored_bytes,
+)
 from tcpipe.pipeline.ingest_options import IngestOptions
 from tcpipe.pipeline.ingest_run import Ingested, find_twin, ingest_one
 from tcpipe.pipeline.ingest_task import IngestResult, IngestTask, check_age, make_died_result, make_result
-from tcpipe.pipeline.log_findings import find_failure
 from tcpipe.pipeline.log_sources import (
     FoundLogs,
     LogSource,
     add_hashes,
+    find_failure,
     find_sources,
+    is_there,
     make_definitions_key,
     plan_rounds,
     recall_hash,
     select_shard,
 )
-from tcpipe.pipeline.log_writer import LogWriter, open_log
 from tcpipe.pipeline.plan import Step, plan
 from tcpipe.pipeline.problems import find_problems, is_acknowledged, make_failure
-from tcpipe.pipeline.supersession import find_superseded
 from tcpipe.store import Store, open_store
 from tcpipe.tables.findings import select_problems
 from tcpipe.tables.options import as_function
@@ -313,3 +324,80 @@ def _place_for_stand_ins(logs: Iterable[str | Path]) -> AbstractContextManager[P
     """Return a temporary directory, where a log is named by its URL."""
     remote = any(is_url(log) for log in logs)
     return make_scratch_directory() if remote else nullcontext(Path())
+
+
+_CONTAINED = 0.9
+"""Where so large a share of an older run's measurements is in the newer one, it is the same recording, and loses nothing."""
+
+
+def find_superseded(
+    store: Store, state: State, source: LogSource, run_id: str, sha256: str
+) -> tuple[list[Superseded], list[str]]:
+    """Return which runs the content of a log supersedes, and a line about every run that was made from the same path before.
+
+    A run counts again when its recording is seen again, wherever that is. A log that is as it was is looked at only where its run
+    has a part in that.
+    """
+    found, notes, gone, parties = list[Superseded](), list[str](), state.superseded, state.parties
+    if run_id in gone:
+        found.append(Superseded(run_id, None))
+        notes.append(f"run {run_id} counts again: its recording is back")
+    seen = {sighting.sha256 for sighting in state.seen.get(source.lineage, ())}
+    new = sha256 not in seen
+    earlier = seen - {sha256} if new or run_id in parties else ()
+    for older in sorted(filter(None, map(state.find_run, earlier))):
+        if older != run_id and older not in gone and (new or older in parties):
+            share = _compute_shared_fraction(store, older, run_id)
+            elsewhere = _describe_elsewhere(state, older, source) if share >= _CONTAINED else ""
+            if share >= _CONTAINED and not elsewhere:
+                found.append(Superseded(older, run_id))
+                notes.append(f"run {older}, made from this path before, is superseded: this log holds what it held")
+            elif new:
+                held = f"this log holds {share:.0%} of it" if share else "that was another recording"
+                why = f"its recording lies at {elsewhere}" if elsewhere else held
+                notes.append(f"run {older}, made from this path before, stays: {why}")
+    return found, notes
+
+
+def _describe_elsewhere(state: State, run_id: str, source: LogSource) -> str:
+    """Return where else a run's recording lies, "" where it is gone."""
+    contents = {row.log.source.sha256 for row in state.find_rows(run_id) if row.log}
+    for lineage, sightings in state.seen.items():
+        for sighting in sightings if lineage != source.lineage else ():
+            if sighting.sha256 in contents and sighting.size_and_time and is_there(sighting):
+                return " + ".join(sighting.log)
+    return ""
+
+
+def _compute_shared_fraction(store: Store, older: str, newer: str) -> float:
+    """Return the share of a run's measurements that another has too."""
+    shared = every = 0
+    mine_of, theirs_of = _find_stream_files(store, older), _find_stream_files(store, newer)
+    for role, path in mine_of.items():
+        try:
+            mine, theirs = read_table(path), read_table(theirs_of[role]) if role in theirs_of else None
+        except StoreError:
+            continue
+        every += mine.num_rows
+        shared += 0 if theirs is None else _count_shared_rows(mine, theirs)
+    return shared / every if every else 0.0
+
+
+def _find_stream_files(store: Store, run_id: str) -> Mapping[str, Path]:
+    with suppress(StoreError):
+        known = store.run_json(run_id)
+        return store.stream_files(run_id, known) if known else {}
+    return {}
+
+
+def _count_shared_rows(mine: pa.Table, theirs: pa.Table) -> int:
+    """Count the rows of one table that are in the other: recorded at one instant with the same values."""
+    floating = [field.name for field in mine.schema if pa.types.is_floating(field.type)]
+    names = ["log_time_ns", *(name for name in floating if name in theirs.column_names)]
+    others = set(_read_rows(theirs, names))
+    return sum(row in others for row in _read_rows(mine, names))
+
+
+def _read_rows(table: pa.Table, names: Sequence[str]) -> list[bytes]:
+    columns = [np.asarray(table.column(name)).view(np.int64) for name in names]
+    return [row.tobytes() for row in np.column_stack(columns)]

@@ -15,22 +15,19 @@ from tcpipe.errors import LogError
 from tcpipe.formats.commit_log import read_state_here
 from tcpipe.formats.commits import State
 from tcpipe.formats.index_files import KnownLog, RunFacts
-from tcpipe.formats.lent_tables import lend_streams
 from tcpipe.formats.logs.log_joining import AnyLog, open_logs
-from tcpipe.formats.recipe_toml import ingest_key, make_recipe_id, read_key
-from tcpipe.formats.robot_files import load_profiles
+from tcpipe.formats.recipe_toml import ingest_key, load_profiles, make_recipe_id, read_key
 from tcpipe.formats.run_documents import Counts, LogOrigin, Manifest, RunJson, TopicCount
+from tcpipe.formats.stored_runs import lend_streams
+from tcpipe.pipeline.calls import is_committed
 from tcpipe.pipeline.ingest_task import IngestResult, IngestTask, check_age, make_result, mark_reported
-from tcpipe.pipeline.log_findings import find_damage
-from tcpipe.pipeline.log_sources import LogSource
-from tcpipe.pipeline.log_writer import is_committed
-from tcpipe.pipeline.run_stages import run_stages
+from tcpipe.pipeline.log_sources import LogSource, find_damage
 from tcpipe.progress import set_task, step
+from tcpipe.recipe import IngestSections
 from tcpipe.store import Store
 from tcpipe.tables.catalogue import read_threshold
-from tcpipe.tables.findings import Finding, Subject, make_finding
-from tcpipe.tables.levels import DATA_MODEL_VERSION, LabelledSegments, Streams, Track, add_findings
-from tcpipe.tables.verdicts import judge
+from tcpipe.tables.findings import Finding, Subject, judge, make_finding
+from tcpipe.tables.levels import DATA_MODEL_VERSION, GatedTrack, LabelledSegments, Streams, Track, add_findings
 
 _M_MMAP_THRESHOLD = -3
 
@@ -220,3 +217,31 @@ def make_manifest(
 def _find_few_segments(count: int, subject: Subject) -> tuple[Finding, ...]:
     few = 0 < count < read_threshold("few-segments", "min_segments_count")
     return (make_finding("few-segments", subject, segments_count=count),) if few else ()
+
+
+def run_stages(
+    streams: Streams, sections: IngestSections, *, run_id: str
+) -> tuple[Track, GatedTrack, LabelledSegments]:
+    """Run fuse, gate, segment and label over the streams of one run.
+
+    A stage gets its own section, and of the others nothing but the chord; no section that `recipe_id` is not the hash of is in reach.
+    """
+    from tcpipe.stages.fuse import fuse_run  # noqa: PLC0415  kernels load only when there is work
+    from tcpipe.stages.label import label_segments  # noqa: PLC0415
+    from tcpipe.stages.mask import mask_track  # noqa: PLC0415
+    from tcpipe.stages.segment import segment_track  # noqa: PLC0415
+
+    profile = load_profiles(sections).robots[streams.robot]
+    step("fusing")
+    track = fuse_run(streams, sections.fuse, run_id=run_id)
+    step("cutting and labelling")
+    gated = mask_track(
+        track,
+        sections.gate,
+        max_velocity_mps=profile.max_velocity_mps,
+        max_plausible_mps=profile.max_plausible_mps,
+        chord_m=sections.segment.chord_m,
+    )
+    segments = segment_track(gated, sections.segment)
+    labelled = label_segments(segments, gated, streams, sections.label, voltage_range_volt=profile.voltage_range_volt)
+    return track, gated, labelled

@@ -16,12 +16,9 @@ from tcpipe.formats.index_files import RunFacts
 from tcpipe.formats.json_files import digest
 from tcpipe.formats.recipe_toml import ingest_key
 from tcpipe.formats.run_documents import Manifest
-from tcpipe.pipeline.log_findings import find_failure
-from tcpipe.pipeline.log_sources import LogSource
-from tcpipe.pipeline.transient_errors import is_transient
+from tcpipe.pipeline.log_sources import LogSource, find_failure, is_transient
 from tcpipe.recipe import Recipe
-from tcpipe.tables.findings import Finding, select_problems
-from tcpipe.tables.verdicts import Verdict
+from tcpipe.tables.findings import Finding, Verdict, select_problems
 
 R = TypeVar("R")
 

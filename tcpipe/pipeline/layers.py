@@ -18,14 +18,12 @@ from tcpipe.formats.bucket_directories import fetch_directory
 from tcpipe.formats.dataset_card import DatasetCard, MapSource
 from tcpipe.formats.dataset_files import CARD, DRIVE_NEXT, read_current_card, read_samples
 from tcpipe.formats.geojson import read_polygons
-from tcpipe.formats.geopackage import VectorLayer, write_geopackage
+from tcpipe.formats.geopackage import VIRIDIS, VectorLayer, make_classes_style, make_ranges_style, write_geopackage
 from tcpipe.formats.object_storage import is_url
-from tcpipe.formats.qgis_styles import VIRIDIS, make_classes_style, make_ranges_style
 from tcpipe.report.colours import SPLIT_COLOURS
 from tcpipe.store import Store, find_store_above, is_store, run_at
-from tcpipe.tables.arrays import to_texts
+from tcpipe.tables.arrays import make_lines, to_texts
 from tcpipe.tables.columns import read_lonlat_deg, to_floats
-from tcpipe.tables.wkb import make_lines
 from tcpipe.terrain.patches import compute_footprints, patch_frames
 from tcpipe.terrain.projection import Projection, compute_area, parse_crs
 

@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 
 from tcpipe.cost.quality import find_wanted_rate, is_too_slow
 from tcpipe.formats.logs.log_file import Log
-from tcpipe.formats.robot_files import load_profiles
+from tcpipe.formats.recipe_toml import load_profiles
 from tcpipe.logs.clocks import SECOND_NS, Timeline, TopicTimes, settle_clocks
 from tcpipe.logs.roles import RoleAssignment
 from tcpipe.logs.simulated_clock import CLOCK, LOG_CLOCK, SIMULATED_NS
 from tcpipe.logs.topics import Topic
-from tcpipe.pipeline.log_findings import find_damage
+from tcpipe.pipeline.log_sources import find_damage
 from tcpipe.power.sources import find_sources
 from tcpipe.recipe import Recipe
 from tcpipe.robots.profiles import Profiles

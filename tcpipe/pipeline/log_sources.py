@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import hashlib
 import os
+import sqlite3
 import stat
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from tcpipe.errors import LogError, TcpipeError, clean_line
+from tcpipe.errors import LogError, StoreError, TcpipeError, clean_line
 from tcpipe.formats.commits import LogSnapshot, find_lineage
 from tcpipe.formats.json_files import digest
 from tcpipe.formats.logs.log_file import LOG_SUFFIXES, find_logs, is_log_file, list_logs_below
@@ -18,7 +19,7 @@ from tcpipe.formats.logs.log_joining import open_logs
 from tcpipe.formats.logs.rosbag2 import STORAGE_SUFFIXES, is_one_bag, list_storage_files
 from tcpipe.formats.logs.table_folders import Mappings, find_table_folders, list_table_files
 from tcpipe.formats.object_storage import format_path, is_url, make_stand_ins, split_url
-from tcpipe.pipeline.transient_errors import is_transient
+from tcpipe.tables.findings import Finding, Subject, make_finding
 
 _LONGEST_STEM_BYTES = 200
 
@@ -302,3 +303,48 @@ def _hash_source(source: LogSource) -> LogSource:
             return replace(source, sha256=log.sha256())
     except (TcpipeError, OSError):  # told when it is ingested
         return source
+
+
+def find_damage(damage: Sequence[str], subject: Subject) -> tuple[Finding, ...]:
+    """Return the finding that a log is damaged, by its lines of damage."""
+    return (make_finding("log-damaged", subject, damage_count=len(damage)),) if damage else ()
+
+
+def find_failure(log: str, error: str) -> tuple[Finding, ...]:
+    """Return the finding that a log gave no run; ``error`` is the class of the error."""
+    return (make_finding("log-failed", Subject("log", log), names={"error": error}),)
+
+
+_PASSING_SQLITE = {
+    sqlite3.SQLITE_BUSY,
+    sqlite3.SQLITE_LOCKED,
+    sqlite3.SQLITE_NOMEM,
+    sqlite3.SQLITE_READONLY,
+    sqlite3.SQLITE_IOERR,
+    sqlite3.SQLITE_FULL,
+    sqlite3.SQLITE_CANTOPEN,
+    sqlite3.SQLITE_PERM,
+}
+_PRIMARY_CODE = 0xFF
+
+
+def is_transient(error: BaseException) -> bool:
+    """Tell whether an error, or what it was raised from, may be gone when the same is tried again."""
+    return any(_is_transient(cause) for cause in _iterate_causes(error))
+
+
+def _iterate_causes(error: BaseException | None) -> Iterator[BaseException]:
+    while error is not None:
+        yield error
+        error = error.__cause__ or error.__context__
+
+
+def _is_transient(error: BaseException) -> bool:
+    if isinstance(error, MemoryError | StoreError | ImportError):
+        return True
+    if isinstance(error, OSError):  # decompressors raise it, too, without a number
+        return error.errno is not None
+    if isinstance(error, sqlite3.Error):
+        return getattr(error, "sqlite_errorcode", 0) & _PRIMARY_CODE in _PASSING_SQLITE
+    # The network, credentials; its home loads it when it is needed.
+    return type(error).__module__.partition(".")[0] == "obstore"

@@ -23,17 +23,23 @@ from tcpipe.formats.dataset_files import CARD
 from tcpipe.formats.integrity import seal_document
 from tcpipe.formats.json_files import Json, parse_typed, to_json, to_plain
 from tcpipe.formats.maps.map_files import open_map
-from tcpipe.formats.numbered_documents import read_sealed_at, split_number
 from tcpipe.formats.object_storage import is_url
 from tcpipe.formats.place import Place
-from tcpipe.formats.run_documents import Manifest, RunJson, StoreDocument
-from tcpipe.formats.store_document import MARK, is_outdated, read_layout
-from tcpipe.pipeline.log_writer import is_committed, open_log
+from tcpipe.formats.run_documents import (
+    MARK,
+    Manifest,
+    RunJson,
+    StoreDocument,
+    is_outdated,
+    read_layout,
+    read_sealed_at,
+    split_number,
+)
+from tcpipe.pipeline.calls import is_committed, open_log
 from tcpipe.recipe import SplitConfig
 from tcpipe.store import Store
-from tcpipe.tables.findings import Finding, Subject, SubjectKind, make_finding
+from tcpipe.tables.findings import Finding, Subject, SubjectKind, judge, make_finding
 from tcpipe.tables.levels import DATA_MODEL_VERSION, EARLIER_VERSIONS
-from tcpipe.tables.verdicts import judge
 
 T = TypeVar("T")
 

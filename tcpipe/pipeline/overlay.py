@@ -26,7 +26,7 @@ from tcpipe.logs.roles import NAV_SAT_FIX, OVERLAY, POSE_STAMPED
 from tcpipe.store import Store, run_at
 from tcpipe.tables.arrays import make_text_column, to_numbers, to_texts
 from tcpipe.tables.bits import DropReason, Quality, flag_names
-from tcpipe.tables.segment_columns import GEOMETRY
+from tcpipe.tables.levels import GEOMETRY
 
 GEOJSON = "foxglove_msgs/msg/GeoJSON"
 _FRAME = "tcpipe_enu"

@@ -18,23 +18,22 @@ from tcpipe.errors import TcpipeError, clean_lines
 from tcpipe.formats.finding_lines import format_findings, format_loss, format_verdict
 from tcpipe.formats.logs.log_joining import open_single_log
 from tcpipe.formats.object_storage import format_path, is_url
-from tcpipe.formats.robot_files import load_profiles
+from tcpipe.formats.recipe_toml import load_profiles
 from tcpipe.logs.roles import OVERLAY
 from tcpipe.logs.simulated_clock import CLOCK
 from tcpipe.logs.topics import Topic
 from tcpipe.motion.remedies import StoreLoss, find_largest_losses
 from tcpipe.motion.vibration import LEAST_RATE_HZ
+from tcpipe.pipeline.ingest_run import run_stages
 from tcpipe.pipeline.log_inspection import InspectedLog, inspect_log
-from tcpipe.pipeline.run_stages import run_stages
 from tcpipe.recipe import ReadConfig, Recipe, Role
 from tcpipe.stages.read import read_run
 from tcpipe.stages.read_roles import decide_roles, find_read_config
 from tcpipe.tables.catalogue import read_threshold
 from tcpipe.tables.columns import to_integers
 from tcpipe.tables.facts import NOTHING_FOUND, EnergyBudget, StageFacts
-from tcpipe.tables.findings import Finding, Subject, make_finding, sort_findings
+from tcpipe.tables.findings import Finding, Subject, Verdict, judge, make_finding, sort_findings
 from tcpipe.tables.levels import LabelledSegments
-from tcpipe.tables.verdicts import Verdict, judge
 
 MISSING: Mapping[Role, str] = {
     "gnss": "no-gnss",

@@ -11,9 +11,8 @@ from tcpipe.formats.atomic import make_scratch_directory
 from tcpipe.formats.commits import Entries, Problem, State, find_lineage
 from tcpipe.formats.index_files import RunFacts
 from tcpipe.formats.stored_runs import Ingestions
-from tcpipe.pipeline.begun_calls import list_begun_calls
+from tcpipe.pipeline.calls import LogWriter, list_begun_calls
 from tcpipe.pipeline.log_sources import LogSource, find_sources
-from tcpipe.pipeline.log_writer import LogWriter
 from tcpipe.store import Store, open_store
 from tcpipe.tables.findings import Finding, Subject, make_finding, select_problems
 

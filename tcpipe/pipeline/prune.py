@@ -16,13 +16,11 @@ from tcpipe.formats.atomic import TEMPORARY_PREFIX, clear, clear_scratch, is_aba
 from tcpipe.formats.commits import Dataset, Entries, State
 from tcpipe.formats.dataset_files import CARD, read_card
 from tcpipe.formats.index_files import RunFacts
-from tcpipe.formats.numbered_documents import find_highest_numbers, read_sealed_at, split_number
 from tcpipe.formats.place import DirectoryPlace, Entry, Place
 from tcpipe.formats.recipe_toml import ingest_key, resolve_recipe
-from tcpipe.formats.store_document import SPOOL
+from tcpipe.formats.run_documents import SPOOL, find_highest_numbers, read_sealed_at, split_number
 from tcpipe.formats.stored_runs import Ingestions
-from tcpipe.pipeline.call_history import format_bytes
-from tcpipe.pipeline.log_writer import LogWriter
+from tcpipe.pipeline.calls import LogWriter, format_bytes
 from tcpipe.pipeline.verify_store import find_strangers
 from tcpipe.recipe import Recipe
 from tcpipe.store import Store, open_store

@@ -19,8 +19,15 @@ from tcpipe.formats.recipe_toml import ingest_key, resolve_recipe
 from tcpipe.formats.stored_runs import Ingestions
 from tcpipe.formats.user_paths import check_local_output
 from tcpipe.motion.remedies import StoreLoss, find_largest_losses
-from tcpipe.pipeline.begun_calls import BegunCall, is_below, list_begun_calls
-from tcpipe.pipeline.call_history import INGEST, Estimate, estimate, format_duration
+from tcpipe.pipeline.calls import (
+    INGEST,
+    BegunCall,
+    Estimate,
+    estimate,
+    format_duration,
+    is_below,
+    list_begun_calls,
+)
 from tcpipe.pipeline.ingest_task import IngestTask
 from tcpipe.pipeline.log_sources import find_sources, make_definitions_key, recall_hash, select_shard
 from tcpipe.pipeline.plan import STANDINGS, TROUBLE, Standing, Step, plan
@@ -28,8 +35,7 @@ from tcpipe.pipeline.problems import find_incomplete_runs, make_missing, make_wa
 from tcpipe.pipeline.store_verdict import find_changes, judge_runs
 from tcpipe.recipe import Recipe
 from tcpipe.store import Store, open_store
-from tcpipe.tables.findings import Finding
-from tcpipe.tables.verdicts import Verdict
+from tcpipe.tables.findings import Finding, Verdict
 
 _MOST_NAMES = 3
 _MOST_CALLS = 7

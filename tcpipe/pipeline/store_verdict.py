@@ -7,11 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tcpipe.cost.held_out import PHYSICS_UNITS
+from tcpipe.cost.physics import PHYSICS_UNITS
 from tcpipe.formats.index_files import RunFacts
 from tcpipe.tables.catalogue import Severity, read_threshold
-from tcpipe.tables.findings import Finding, Subject, make_finding
-from tcpipe.tables.verdicts import Verdict, judge_by_code
+from tcpipe.tables.findings import Finding, Subject, Verdict, judge_by_code, make_finding
 
 _CHANGE = "run-to-run-change"
 _IN_PERCENT = 100.0

@@ -30,18 +30,21 @@ from tcpipe.formats.integrity import (
 )
 from tcpipe.formats.json_files import parse_typed
 from tcpipe.formats.maps.map_files import MapFile, open_map
-from tcpipe.formats.numbered_documents import (
+from tcpipe.formats.parquet import read_table
+from tcpipe.formats.place import DirectoryPlace, Place
+from tcpipe.formats.recipe_toml import ingest_key, make_recipe_id
+from tcpipe.formats.run_documents import (
+    MARK,
+    SPOOL,
+    Manifest,
+    MapDocument,
+    RunJson,
     find_highest_numbers,
     name_document,
     read_as_at,
     read_sealed_at,
     split_number,
 )
-from tcpipe.formats.parquet import read_table
-from tcpipe.formats.place import DirectoryPlace, Place
-from tcpipe.formats.recipe_toml import ingest_key, make_recipe_id
-from tcpipe.formats.run_documents import Manifest, MapDocument, RunJson
-from tcpipe.formats.store_document import MARK, SPOOL
 from tcpipe.formats.stored_runs import RunDirectory
 from tcpipe.motion.remedies import KEPT
 from tcpipe.report.pictures import is_picture_of_map
@@ -49,7 +52,7 @@ from tcpipe.store import Store
 from tcpipe.tables.columns import to_floats, to_integers
 from tcpipe.tables.levels import DATA_MODEL_VERSION, GATED_TRACK, LABELLED_SEGMENTS, READ_VERSIONS, REJECTIONS, STREAMS
 
-Finding = tuple[str, int] | str
+CheckResult = tuple[str, int] | str
 
 _TABLES = {"track": GATED_TRACK, "segments": LABELLED_SEGMENTS, "rejections": REJECTIONS}
 _COUNTS = {"track": "track_rows", "segments": "segments", "rejections": "rejections"}
@@ -58,7 +61,7 @@ _DIGEST = re.compile(r"[0-9a-f]{16}")
 _INDEX = "index"
 
 
-def verify_store(store: Store) -> Iterator[Finding]:
+def verify_store(store: Store) -> Iterator[CheckResult]:
     """Yield what was read of all maps and runs, and a line for everything that is not as it was written."""
     place = store.place
     yield find_broken_seal_in(place.read(MARK), place.where(MARK)) or ("files", 1)
@@ -79,7 +82,7 @@ def verify_store(store: Store) -> Iterator[Finding]:
         yield from _find_left_behind(place.root)
 
 
-def verify_log(log: Place) -> Iterator[Finding]:
+def verify_log(log: Place) -> Iterator[CheckResult]:
     """Yield counts and problems of every commit, and of every snapshot, which has to say what the commits to its number say."""
     state, last, whole = State(), 0, True
     for name in log.files():
@@ -103,7 +106,7 @@ def verify_log(log: Place) -> Iterator[Finding]:
         yield from _verify_snapshot(log, state) if whole else ()
 
 
-def _verify_snapshot(log: Place, state: State) -> Iterator[Finding]:
+def _verify_snapshot(log: Place, state: State) -> Iterator[CheckResult]:
     name = make_snapshot_name(state.number)
     if log.size(name) is None:
         return
@@ -116,7 +119,7 @@ def _verify_snapshot(log: Place, state: State) -> Iterator[Finding]:
     yield ("files", 1) if same else f"{log.where(name)}: does not say what the commits say; remove it"
 
 
-def _verify_runs(store: Store) -> Iterator[Finding]:
+def _verify_runs(store: Store) -> Iterator[CheckResult]:
     """Yield the same of all runs, of those that the log names and of which files are gone, and of ingestions that no commit names."""
     wrong, found = set[str](), store.ingestions()
     for run_id in store.run_ids():
@@ -129,7 +132,7 @@ def _verify_runs(store: Store) -> Iterator[Finding]:
     yield from (line for (run_id, _), line in found.damaged.items() if run_id not in wrong)
 
 
-def verify_run(store: Store, run_id: str, recipe: str | None = None) -> Iterator[Finding]:
+def verify_run(store: Store, run_id: str, recipe: str | None = None) -> Iterator[CheckResult]:
     """Yield the same of one run: its log's description, its streams, and what became of it under every recipe, or one."""
     place = store.runs_place.below(run_id)
     names = [entry.name for entry in place.entries()]
@@ -157,12 +160,12 @@ def _list_documents(place: Place) -> set[str]:
     return {name for name in place.files() if split_number(name) or name == _REPORT}
 
 
-def _verify_seals(place: Place, names: Iterable[str]) -> Iterator[Finding]:
+def _verify_seals(place: Place, names: Iterable[str]) -> Iterator[CheckResult]:
     for name in names:
         yield find_broken_seal_in(place.read(name), place.where(name)) or ("files", 1)
 
 
-def _verify_maps(store: Store) -> Iterator[Finding]:
+def _verify_maps(store: Store) -> Iterator[CheckResult]:
     place = store.place.below("maps")
     known = _list_documents(place)
     yield from _verify_seals(place, sorted(known))
@@ -176,7 +179,7 @@ def _verify_maps(store: Store) -> Iterator[Finding]:
             yield _describe_stranger(place, entry.name)
 
 
-def _verify_stored_map(store: Store, name: str) -> Iterator[Finding]:
+def _verify_stored_map(store: Store, name: str) -> Iterator[CheckResult]:
     yield "maps", 1
     place, document = store.place.below("maps"), store.map_document(name)
     wrong = list(_find_wrong_files(place, document.checksums))
@@ -216,7 +219,7 @@ def find_strangers(place: Place) -> Iterator[str]:
     yield from (place.where(name) for name, last in names if last not in known and not split_number(last))
 
 
-def verify_map(path: Path) -> Iterator[Finding]:
+def verify_map(path: Path) -> Iterator[CheckResult]:
     """Yield the same of one map: every file, and every tile of every layer and level decoded."""
     yield "maps", 1
     checksums = yield from _verify_listed(path)
@@ -225,7 +228,7 @@ def verify_map(path: Path) -> Iterator[Finding]:
     yield from _verify_tiles(path)
 
 
-def _verify_tiles(path: Path, fetched: FetchedShards | None = None) -> Iterator[Finding]:
+def _verify_tiles(path: Path, fetched: FetchedShards | None = None) -> Iterator[CheckResult]:
     source = open_map(path, fetched, proved=False)
     for factor in source.factors:
         level = source if factor == 1 else source.at(factor)
@@ -233,7 +236,7 @@ def _verify_tiles(path: Path, fetched: FetchedShards | None = None) -> Iterator[
             yield from _verify_layer(path, level, layer, None if factor > 1 else source.facts.covered[layer])
 
 
-def _isolate_errors(findings: Iterator[Finding]) -> Iterator[Finding]:
+def _isolate_errors(findings: Iterator[CheckResult]) -> Iterator[CheckResult]:
     """Turn an error into problems, so that one damaged run or map does not hide the others."""
     try:
         yield from findings
@@ -257,7 +260,7 @@ def _verify_listed(directory: Path) -> Any:
     return checksums
 
 
-def _verify_streams(place: Place, known: RunJson | None) -> Iterator[Finding]:
+def _verify_streams(place: Place, known: RunJson | None) -> Iterator[CheckResult]:
     checksums = known.streams if known else {}
     wrong = list(_find_wrong_files(place, checksums))
     yield from wrong
@@ -271,7 +274,7 @@ def _verify_streams(place: Place, known: RunJson | None) -> Iterator[Finding]:
         yield "rows", table.num_rows
 
 
-def _make_ingestion(runs: Place, run_id: str, recipe_name: str) -> Iterator[Finding]:
+def _make_ingestion(runs: Place, run_id: str, recipe_name: str) -> Iterator[CheckResult]:
     """Compare what a run became under one recipe with its manifest."""
     yield "runs", 1
     place = runs.below(f"{run_id}/{recipe_name}")
@@ -295,7 +298,7 @@ def _make_ingestion(runs: Place, run_id: str, recipe_name: str) -> Iterator[Find
     yield from _verify_tables(run, where) if not wrong else ()
 
 
-def _verify_others(place: Place, manifest: Manifest) -> Iterator[Finding]:
+def _verify_others(place: Place, manifest: Manifest) -> Iterator[CheckResult]:
     """Yield what is wrong with the documents beside a manifest, and what no manifest knows."""
     documents = _list_documents(place)
     yield from _verify_seals(place, sorted(documents))
@@ -308,7 +311,7 @@ def _verify_others(place: Place, manifest: Manifest) -> Iterator[Finding]:
             yield _describe_stranger(place, entry.name)
 
 
-def _verify_tables(run: RunDirectory, where: str) -> Iterator[Finding]:
+def _verify_tables(run: RunDirectory, where: str) -> Iterator[CheckResult]:
     tables = {}
     for name, schema in _TABLES.items():
         tables[name] = schema.completed(run.table(name))
@@ -353,7 +356,7 @@ def _find_wrong_joins(run: RunDirectory, tables: Mapping[str, pa.Table]) -> Iter
         yield "its segments begin before the track or end after it"
 
 
-def _verify_layer(path: Path, level: MapFile, layer: str, covered: float | None) -> Iterator[Finding]:
+def _verify_layer(path: Path, level: MapFile, layer: str, covered: float | None) -> Iterator[CheckResult]:
     """Decode every tile of a layer; compare its coverage with what was recorded, and its classes with the table."""
     grid, side, kind, with_data, highest = level.grid, level.tile_px, level.layers[layer], 0, 0
     for row in range(0, grid.rows, side):

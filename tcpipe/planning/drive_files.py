@@ -25,8 +25,7 @@ from tcpipe.report.plots import Plot, make_plot
 from tcpipe.report.verdict import show_verdict
 from tcpipe.store import open_store
 from tcpipe.tables.catalogue import read_threshold
-from tcpipe.tables.findings import Finding, Subject, make_finding
-from tcpipe.tables.verdicts import PREDICTED, Verdict, judge
+from tcpipe.tables.findings import PREDICTED, Finding, Subject, Verdict, judge, make_finding
 from tcpipe.terrain.tiles import MapReader
 
 JSON, PAGE = "drives.json", "drives.html"

@@ -11,7 +11,7 @@ from tcpipe.cost.prediction_errors import COVERAGE
 from tcpipe.errors import StoreError, UsageError, clean_lines
 from tcpipe.formats.atomic import clear_beside
 from tcpipe.formats.finding_lines import format_findings
-from tcpipe.formats.geojson_lines import read_line
+from tcpipe.formats.geojson import read_line
 from tcpipe.formats.integrity import compute_checksum, read_sealed_as, write_sealed
 from tcpipe.formats.json_files import convert_record, digest
 from tcpipe.formats.maps.map_files import MapFile

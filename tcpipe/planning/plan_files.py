@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from tcpipe.errors import ModelError, StoreError, UsageError, clean_lines
 from tcpipe.formats.atomic import clear_beside
 from tcpipe.formats.finding_lines import format_findings
-from tcpipe.formats.geojson_lines import LineFeature, check_lonlat, make_line_feature
+from tcpipe.formats.geojson import LineFeature, check_lonlat, make_line_feature
 from tcpipe.formats.integrity import compute_checksum, find_broken_seal
 from tcpipe.formats.json_files import convert_record, digest, read_as, write_json
 from tcpipe.formats.maps.map_files import MapFile

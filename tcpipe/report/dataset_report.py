@@ -13,7 +13,7 @@ from tcpipe.formats.dataset_card import DatasetCard, RunSource, group_dataset_fi
 from tcpipe.formats.dataset_files import read_current_card, read_samples
 from tcpipe.formats.finding_lines import format_group, group_findings
 from tcpipe.formats.json_files import Json
-from tcpipe.formats.store_document import MARK
+from tcpipe.formats.run_documents import MARK
 from tcpipe.report.colours import CLASS_COLOURS, DROPPED, FAINT, KEPT, SPLIT_COLOURS, find_class_colour
 from tcpipe.report.dataset_map import map_plots
 from tcpipe.report.dataset_patches import PER_SHEET, make_patches_data

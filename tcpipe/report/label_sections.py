@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 from tcpipe.balance.cells import SLOPE_NAMES
-from tcpipe.cost.budget import format_budget
+from tcpipe.cost.labels import format_budget
 from tcpipe.formats.dataset_card import Balance, CellRow
 from tcpipe.report.page import Section, Shaded
 from tcpipe.tables.bits import Quality, flag_name

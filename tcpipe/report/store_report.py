@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from tcpipe.cost.held_out import PHYSICS_UNITS
+from tcpipe.cost.physics import PHYSICS_UNITS
 from tcpipe.formats.finding_lines import advise_on_loss, describe_finding, format_group
 from tcpipe.formats.index_files import RunFacts
 from tcpipe.formats.json_files import Json

@@ -12,8 +12,7 @@ from tcpipe.formats.finding_lines import FindingGroup
 from tcpipe.formats.index_files import RunFacts
 from tcpipe.formats.json_files import Json
 from tcpipe.formats.stored_runs import Ingestions
-from tcpipe.tables.findings import Finding
-from tcpipe.tables.verdicts import Verdict
+from tcpipe.tables.findings import Finding, Verdict
 
 _PAGE = "report.html"
 

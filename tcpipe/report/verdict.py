@@ -8,8 +8,7 @@ from typing import TypeVar
 
 from tcpipe.formats.finding_lines import MOST_LINES, FindingGroup, format_finding, format_group, format_remedy_blocks
 from tcpipe.tables.catalogue import AFFECTED, Affected, Severity
-from tcpipe.tables.findings import Finding, sort_findings
-from tcpipe.tables.verdicts import Grade, Verdict
+from tcpipe.tables.findings import Finding, Grade, Verdict, sort_findings
 
 K = TypeVar("K", bound=Hashable)
 

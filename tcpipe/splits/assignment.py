@@ -1,27 +1,29 @@
-"""The split and the fold of every sample, from its footprint, its run and its id."""
+"""The split and the fold of every sample, from its footprint, its run and its id (docs/explanation/rulings.md, Split).
+
+A dataset grows, and a test sample must never become a training sample. So the draw of groups replays the arrival of the data: run by run,
+in the order of recording, groups may join test and none leaves it. Later runs cannot undo what earlier ones decided.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from fractions import Fraction
+from hashlib import blake2b
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.splits.holdouts import (
-    UNDECIDED,
-    Holdout,
-    assign_blocks,
-    draw_folds,
-    draw_groups,
-    draw_samples,
-    group_by_run,
-)
 from tcpipe.splits.regions import Regions, Side, classify_footprints
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Names = NDArray[np.str_]
+Mask = NDArray[np.bool_]
+Ranks = NDArray[np.uint64]
+Holdout = Literal["block", "sample", "run", "tag"]
 
 SPLITS = ("train", "test", "unseen", "buffer")
 """Values of the column ``split``."""
@@ -29,8 +31,133 @@ SPLITS = ("train", "test", "unseen", "buffer")
 EXCLUDED = "excluded"
 """Assigned to samples of an exclude region; they do not enter the dataset."""
 
+UNDECIDED = -1
+"""A group or sample without a decision yet."""
+
 NO_FOLD = UNDECIDED
 """Fold of a sample that is neither train nor test."""
+
+
+@dataclass(frozen=True, slots=True)
+class Groups:
+    """Samples in groups that stay whole: ``member`` numbers each sample's group, (N,); ``names`` name the G groups."""
+
+    member: Ints
+    names: tuple[str, ...]
+
+    def decided(self, values: Ints) -> Ints:
+        """Return for each group the value of most of its samples, shape (G,); ``values`` are small numbers or `UNDECIDED`, shape (N,)."""
+        kinds = int(values.max(initial=UNDECIDED)) + 1
+        if kinds == 0:
+            return np.full(len(self.names), UNDECIDED)
+        known = values != UNDECIDED
+        ballots = self.member[known] * kinds + values[known]
+        votes = np.bincount(ballots, minlength=len(self.names) * kinds).reshape(-1, kinds)
+        return np.where(votes.any(axis=1), votes.argmax(axis=1), UNDECIDED)
+
+
+def assign_blocks(centres_xy_m: Floats, *, block_m: float) -> Groups:
+    """Return the spatial block of each footprint's centre: square cells of ``block_m`` [m] on the plane's own origin."""
+    cells = np.floor(centres_xy_m / block_m).astype(np.int64)
+    codes, first, member = np.unique((cells[:, 0] << 32) + cells[:, 1], return_index=True, return_inverse=True)
+    names = tuple(f"{block_m:g}:{column}:{row}" for column, row in cells[first].tolist())
+    return Groups(member.astype(np.int64).reshape(len(cells)), names if len(codes) else ())
+
+
+def draw_samples(ranks: NDArray[np.uint64], arrival: Ints, *, test_fraction: float, kept: Ints | None = None) -> Mask:
+    """Mark ceil(test_fraction · n) samples as test, shape (N,): of every arrival those of lowest rank, to make up the share so far.
+
+    A later arrival moves no earlier sample; one in between changes every later arrival by at most one sample.
+
+    Parameters
+    ----------
+    ranks : rank of each sample, shape (N,).
+    arrival : number of each sample's run in the order of recording, shape (N,).
+    kept : 1 for fixed test samples, 0 for fixed training samples, else `UNDECIDED`, shape (N,).
+    """
+    exact = Fraction(str(test_fraction))  # 0.2 * 35 is 7.000000000000001 in binary
+    kept = np.full(len(ranks), UNDECIDED) if kept is None else kept
+    test: Mask = kept == 1
+    order = np.lexsort((ranks, arrival))
+    ends: list[int] = [*(np.flatnonzero(np.diff(arrival[order])) + 1).tolist(), len(order)]
+    missing, first = -int(test.sum()), 0
+    for end in ends:
+        missing += math.ceil(exact * end) - math.ceil(exact * first)
+        free = order[first:end][kept[order[first:end]] == UNDECIDED]
+        chosen = free[: max(missing, 0)]
+        test[chosen] = True
+        missing, first = missing - len(chosen), end
+    rest = np.flatnonzero((kept == UNDECIDED) & ~test)
+    test[rest[np.argsort(ranks[rest], kind="stable")][: max(missing, 0)]] = True
+    return test
+
+
+def draw_groups(
+    groups: Groups, arrival: Ints, *, test_fraction: float, seed: int, kept: Ints | None = None
+) -> NDArray[np.bool_]:
+    """Mark whole groups as test, shape (G,), nearest to a share ``test_fraction`` of the samples.
+
+    After each arrival the groups so far are visited by rank; a training group joins test if that brings the share nearer to
+    ``test_fraction``. Two or more groups always leave something to test and to train; a single group trains.
+
+    Parameters
+    ----------
+    arrival : number of each sample's run in the order of recording, shape (N,).
+    kept : 1 for fixed test groups, 0 for fixed training groups, else `UNDECIDED`, shape (G,).
+    """
+    count = len(groups.names)
+    kept = np.full(count, UNDECIDED) if kept is None else kept
+    tests: Mask = kept == 1
+    order = sort_by_rank(groups.names, seed=seed, purpose="test")
+    for sizes in _iterate_sizes(groups, arrival):
+        free = order[(kept[order] == UNDECIDED) & (sizes[order] > 0)]
+        _take(tests, free, sizes, wanted=test_fraction * float(sizes.sum()))
+    return tests
+
+
+def _take(tests: Mask, free: Ints, sizes: Ints, *, wanted: float) -> None:
+    """Let groups in ``free``, which are sorted by rank, join ``tests`` while that brings their share nearer to ``wanted``."""
+    seen = sizes > 0
+    taken, left = int(sizes[tests].sum()), int((seen & ~tests).sum())
+    for group in free[~tests[free]].tolist():
+        if left > 1 and abs(taken + sizes[group] - wanted) < abs(taken - wanted):
+            tests[group] = True
+            taken, left = taken + int(sizes[group]), left - 1
+    if wanted > 0 and not tests[seen].any() and seen.sum() > 1 and len(free):
+        tests[free[np.argmin(np.abs(sizes[free] - wanted))]] = True
+
+
+def draw_folds(groups: Groups, arrival: Ints, *, folds: int, seed: int, kept: Ints | None = None) -> Ints:
+    """Deal groups to folds of cross-validation, shape (G,), from 0 on: each to the smallest fold when it first appears.
+
+    ``arrival`` is as in `draw_groups`; ``kept`` has the fixed fold of a group or `UNDECIDED`, shape (G,).
+    """
+    fold = np.full(len(groups.names), UNDECIDED) if kept is None else kept.copy()
+    order = sort_by_rank(groups.names, seed=seed, purpose="fold")
+    for sizes in _iterate_sizes(groups, arrival):
+        new = order[(fold[order] == UNDECIDED) & (sizes[order] > 0)]
+        known = fold != UNDECIDED
+        filled = np.bincount(fold[known], weights=sizes[known], minlength=folds)
+        for group in new[np.argsort(-sizes[new], kind="stable")].tolist():
+            fold[group] = int(np.argmin(filled[:folds]))
+            filled[fold[group]] += sizes[group]
+    return fold
+
+
+def _iterate_sizes(groups: Groups, arrival: Ints) -> Iterator[Ints]:
+    """Yield the sizes of the groups, (G,), after each arrival."""
+    sizes = np.zeros(len(groups.names), np.int64)
+    order = np.argsort(arrival, kind="stable")
+    for part in np.split(order, np.flatnonzero(np.diff(arrival[order])) + 1):
+        if len(part):
+            sizes = sizes + np.bincount(groups.member[part], minlength=len(sizes))
+            yield sizes
+
+
+def group_by_run(run: Ints, names: Sequence[str]) -> Groups:
+    """Return runs as groups: the number of each sample's run, shape (N,), and the runs' names by number."""
+    used, member = np.unique(run, return_inverse=True)
+    return Groups(member.astype(np.int64).reshape(len(run)), tuple(names[number] for number in used.tolist()))
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,15 +191,13 @@ def assign_splits(
     ranks : rank of each sample's id for the draw of test, shape (N,).
     run, run_names : number of each sample's run in the order of recording, shape (N,), and the runs' ids by number.
     corners_xy_m : corners of the patch footprints in the map's metric plane [m], shape (N, 4, 2).
-    regions : in the same plane; without regions every sample is inside.
-    holdout : ``sample`` draws ceil(test_fraction · n) samples, of each run those of lowest rank; the others keep groups whole.
+    regions : in the same plane; None: every sample is inside.
+    holdout : ``sample`` draws single samples; the others keep groups whole.
     test_fraction : share of test among the inside samples, after every drop and buffer.
     block_m : side of a spatial block [m].
     buffer_m : a footprint nearer than this to a region's border is in no split [m].
-    folds : number of folds; blocks (runs, tags, with the holdout ``run``, ``tag``) stay whole in them.
-    seed : seed of the ranks.
-    kept : what an earlier dataset decided, "" and `NO_FOLD` where it knew nothing: none of its samples moves, but for those that a region
-        excludes now.
+    folds : number of folds; blocks (with the holdout ``run`` or ``tag`` runs or values) stay whole in them.
+    kept : assignment of an earlier dataset, "" and `NO_FOLD` for new samples: its samples move only where a region excludes them now.
     tagged : with the holdout ``tag``: number of each sample's value of the tag, shape (N,), and the values by number.
     """
     n = len(ranks)
@@ -99,3 +224,28 @@ def assign_splits(
     dealt = draw_folds(groups, run[inside], folds=folds, seed=seed, kept=groups.decided(old_fold))
     fold[inside] = np.where(old_fold == NO_FOLD, dealt[groups.member], old_fold)
     return Assignment(split, fold)
+
+
+def hash_ranks(names: Sequence[str], *, seed: int, purpose: str) -> Ranks:
+    """Return a rank for each name, uniform over 64 bits, shape (N,): the same on every machine, whatever other names there are.
+
+    It is the first 8 bytes, big-endian, of blake2b over ``seed:name`` with ``purpose`` as person string: ranks for two purposes are
+    independent, so that the row order does not depend on the holdout.
+    """
+    person = purpose.encode()[:16]
+    digests = b"".join(blake2b(f"{seed}:{name}".encode(), digest_size=8, person=person).digest() for name in names)
+    return np.frombuffer(digests, dtype=">u8").astype(np.uint64)
+
+
+def sort_by_rank(names: Sequence[str], *, seed: int, purpose: str) -> NDArray[np.int64]:
+    """Return the indices that sort ``names`` by their rank, names themselves breaking a tie; shape (N,)."""
+    ranks = hash_ranks(names, seed=seed, purpose=purpose)
+    order = np.argsort(ranks, kind="stable")
+    if (np.diff(ranks[order]) == 0).any():
+        order = np.lexsort((np.asarray(names, dtype=np.str_), ranks))
+    return order.astype(np.int64, copy=False)
+
+
+def order_ranks(sample_ids: Sequence[str], *, seed: int) -> Ranks:
+    """Return the rank of each sample in the seeded shuffle of the dataset's rows, shape (N,)."""
+    return hash_ranks(sample_ids, seed=seed, purpose="order")

@@ -1,4 +1,4 @@
-"""The leakage audit: how much of what tests has been seen in training, measured on the ground."""
+"""The leakage audit: how much ground of test and unseen samples training has, too."""
 
 from __future__ import annotations
 
@@ -41,18 +41,13 @@ class HeldOut:
 def audit_leakage(
     split: NDArray[np.str_], run: Ints, start_ns: Ints, corners_xy_m: Floats, *, chord_m: float
 ) -> tuple[HeldOut, ...]:
-    """Measure test and unseen against train.
+    """Return one entry for ``test`` and one for ``unseen``, each against train.
 
     Parameters
     ----------
-    split, run : split of each sample, and the number of its run, shape (N,).
-    start_ns : start of each sample's segment [ns], shape (N,).
+    split, run, start_ns : split of each sample, number of its run, and start of its segment [ns], shape (N,).
     corners_xy_m : corners of the footprints [m], shape (N, 4, 2).
-    chord_m : segment length: samples follow one another if their centres are at most 1.5 chords apart [m].
-
-    Returns
-    -------
-    One entry for ``test`` and one for ``unseen``.
+    chord_m : segment length [m]; samples follow one another if their centres are at most 1.5 chords apart.
     """
     follows = _find_consecutive(run, start_ns, corners_xy_m.mean(axis=1), chord_m=chord_m)
     return tuple(_audit_split(name, split, run, follows, corners_xy_m) for name in ("test", "unseen"))
@@ -71,7 +66,8 @@ def _audit_split(name: str, split: NDArray[np.str_], run: Ints, follows: Ints, c
     held, train = np.flatnonzero(split == name), np.flatnonzero(split == "train")
     ours, theirs = corners_xy_m[held], corners_xy_m[train]
     pairs, overlaps, repeated = 0, np.zeros(len(held), np.bool_), np.zeros(len(held), np.bool_)
-    for i, j in iterate_near_pairs(ours.mean(axis=1), theirs.mean(axis=1), within_m=_compute_diagonal_m(corners_xy_m)):
+    diagonal_m = float(np.linalg.norm(corners_xy_m[:, 2] - corners_xy_m[:, 0], axis=1).max(initial=0.0))
+    for i, j in iterate_near_pairs(ours.mean(axis=1), theirs.mean(axis=1), within_m=diagonal_m):
         real = compute_shared_fraction(ours, theirs, i, j) > _CONTACT_FRACTION
         pairs += int(real.sum())
         overlaps[i[real]] = True
@@ -88,8 +84,3 @@ def _audit_split(name: str, split: NDArray[np.str_], run: Ints, follows: Ints, c
         nearest_train_min_m=float(apart_m.min()) if len(apart_m) else None,
         nearest_train_median_m=float(np.median(apart_m)) if len(apart_m) else None,
     )
-
-
-def _compute_diagonal_m(corners_xy_m: Floats) -> float:
-    """Return the longest diagonal: centres farther apart share no ground."""
-    return float(np.linalg.norm(corners_xy_m[:, 2] - corners_xy_m[:, 0], axis=1).max(initial=0.0))

@@ -56,17 +56,13 @@ class Regions:
 
 
 def project_regions(regions: Regions, project: Project, *, window_deg: tuple[float, float, float, float]) -> Regions:
-    """Carry regions from lon/lat into a metric plane.
+    """Return regions in a metric plane [m]; their edges are straight in lon/lat (RFC 7946).
 
     Parameters
     ----------
     regions : in WGS84 lon/lat [deg].
-    project : takes lon and lat [deg], shape (N, 2), and returns x and y [m], shape (N, 2).
-    window_deg : West, south, east, north of what matters: regions are cut to it, since a projection is sound only near its zone.
-
-    Returns
-    -------
-    The regions in the plane of ``project`` [m], their edges followed as straight in lon/lat (RFC 7946).
+    project : from lon and lat [deg], shape (N, 2), to x and y [m], shape (N, 2).
+    window_deg : west, south, east, north to which regions are cut, since a projection is valid only near its zone.
     """
 
     def carry(geometry: BaseGeometry) -> BaseGeometry:
@@ -78,22 +74,16 @@ def project_regions(regions: Regions, project: Project, *, window_deg: tuple[flo
 
 
 def classify_footprints(corners_xy_m: Floats, regions: Regions, *, buffer_m: float) -> NDArray[np.uint8]:
-    """Return the `Side` of every footprint.
+    """Return the `Side` of every footprint, shape (N,).
 
     Parameters
     ----------
     corners_xy_m : corners of the footprints in order around each square [m], shape (N, 4, 2).
     regions : in the same plane [m].
-    buffer_m : a footprint nearer than this to any border goes to `Side.BUFFER` [m].
-
-    Returns
-    -------
-    Sides, shape (N,).
+    buffer_m : a footprint nearer than this to any border is in the buffer [m].
     """
-    usable, borders = (
-        shapely.difference(regions.train_test, regions.exclude),
-        shapely.STRtree(_cut_lines(regions.borders())),
-    )
+    usable = shapely.difference(regions.train_test, regions.exclude)
+    borders = shapely.STRtree(_cut_lines(regions.borders()))
     for geometry in (usable, regions.exclude):
         shapely.prepare(geometry)
     sides = np.full(len(corners_xy_m), Side.UNSEEN, np.uint8)
@@ -108,7 +98,7 @@ def classify_footprints(corners_xy_m: Floats, regions: Regions, *, buffer_m: flo
 
 
 def _cut_lines(borders: BaseGeometry) -> NDArray[np.object_]:
-    """Return lines in pieces of a few edges, so that a square is held against those near it, not against a whole border."""
+    """Return lines in pieces of a few edges, so that a square is compared with near edges only."""
     lines = shapely.get_parts(borders)
     xy_m, line = shapely.get_coordinates(lines, return_index=True)
     begins = np.flatnonzero(np.diff(line, prepend=-1))

@@ -10,9 +10,8 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from tcpipe.cost.held_out import fit_and_validate_physics
 from tcpipe.cost.labels import Labels, NetLabels, compute_labels, subtract_idle_power
-from tcpipe.cost.physics import ALL, FitSamples, fit_physics
+from tcpipe.cost.physics import ALL, FitSamples, fit_and_validate_physics, fit_physics
 from tcpipe.cost.quality import combine_flags, has_mean_mismatch
 from tcpipe.fusion.trajectory import DISPLACEMENT_LAGS_S
 from tcpipe.geometry.piecewise_linear import interpolate, mean_between
@@ -26,7 +25,7 @@ from tcpipe.recipe import LabelConfig
 from tcpipe.stages.label_facts import label_facts, label_findings
 from tcpipe.stages.label_motion import clock_doubtful, find_motion_flags, find_power_flags, make_motion_columns
 from tcpipe.stages.power_rails import make_rails, sum_energy_entries
-from tcpipe.tables.arrays import select_rows, to_numbers
+from tcpipe.tables.arrays import make_lines, select_rows, to_numbers
 from tcpipe.tables.bits import DropReason, Quality
 from tcpipe.tables.columns import read_lonlat_deg, to_floats, to_integers
 from tcpipe.tables.facts import PhysicsFacts
@@ -40,7 +39,6 @@ from tcpipe.tables.levels import (
     TrackInfo,
     add_findings,
 )
-from tcpipe.tables.wkb import make_lines
 
 
 def label_segments(
@@ -116,7 +114,7 @@ def compute_segment_costs(
 ) -> tuple[Labels, NetLabels, dict[str, NDArray[np.float64]]]:
     """Return the labels of one epoch's segments, those above standing, and the variances of their energies by cause [J²].
 
-    The causes are those of `tcpipe.cost.budget`.
+    The causes are those of `tcpipe.cost.labels`.
 
     Parameters
     ----------

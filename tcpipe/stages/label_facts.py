@@ -8,7 +8,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from tcpipe.cost.budget import estimate_energy_budget, find_noise
+from tcpipe.cost.labels import estimate_energy_budget, find_noise
 from tcpipe.cost.quality import find_wanted_rate
 from tcpipe.power.energy import Rule
 from tcpipe.power.rails import Rail

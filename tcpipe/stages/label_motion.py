@@ -29,7 +29,7 @@ _GRAVITY_BAND_MPS2 = (8.0, 12.0)
 
 
 def make_motion_columns(cut: pa.Table, rows: pa.Table, streams: Streams, info: TrackInfo, cost: Labels) -> Arrays:
-    """Return the columns `tcpipe.tables.segment_columns.MOTION_COLUMNS` of one epoch's segments, shape (M,) each.
+    """Return the columns `tcpipe.tables.levels.MOTION_COLUMNS` of one epoch's segments, shape (M,) each.
 
     Parameters
     ----------

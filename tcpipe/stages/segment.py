@@ -21,7 +21,7 @@ from tcpipe.motion.distance_breakdown import (
 )
 from tcpipe.motion.remedies import find_losses
 from tcpipe.motion.row_sections import number_pieces
-from tcpipe.path.cutting import Cut, cut_by_chord
+from tcpipe.path import Cut, cut_by_chord
 from tcpipe.recipe import SegmentConfig
 from tcpipe.tables.arrays import to_numbers
 from tcpipe.tables.bits import DropReason, Loss, flag_name

@@ -30,7 +30,6 @@ from tcpipe.tables.bits import DropReason, Quality
 from tcpipe.tables.columns import Column, TableSchema
 from tcpipe.tables.facts import NOTHING_FOUND, StageFacts
 from tcpipe.tables.findings import Finding, StageReport
-from tcpipe.tables.segment_columns import LINE_COLUMN, MOTION_COLUMNS, POINT_COLUMN, STANDING_COLUMNS
 
 DATA_MODEL_VERSION = "3.0"
 """Version of every manifest and card that is written; its history stands in docs/reference/data-model.md."""
@@ -45,6 +44,9 @@ TABLES_VERSION = "2.1"  # in which a table last changed
 
 READ_TABLES = ("2.0", TABLES_VERSION)
 """Versions of tables that are read as they are."""
+
+GEOMETRY = "geometry"
+"""Column that tells other tools where a row lies (GeoParquet)."""
 
 _METADATA_KEY = b"tcpipe"
 
@@ -63,9 +65,13 @@ def _make_stream_schema(name: str, doc: str, *columns: Column) -> TableSchema:
     return TableSchema(name, "L1", doc, (_STAMP, _LOG_TIME, _EPOCH, *columns))
 
 
-def _make_nullable(name: str, unit: str, doc: str, frame: str = "") -> Column:
+def _make_nullable(name: str, unit: str, doc: str, frame: str = "", since: str = "") -> Column:
     """Return a column of numbers that are not always known."""
-    return Column(name, _F64, unit, doc, frame, nullable=True)
+    return Column(name, _F64, unit, doc, frame, nullable=True, since=since)
+
+
+def _make_geometry(doc: str, frame: str) -> Column:
+    return Column(GEOMETRY, pa.binary(), "", f"{doc}; WKB, longitude first", frame, nullable=True, since="2.1")
 
 
 def _make_xyz(
@@ -277,6 +283,59 @@ _SEGMENT_COLUMNS = (
 
 SEGMENTS = TableSchema("segments", "L4", "Steady, straight pieces of one chord each.", _SEGMENT_COLUMNS)
 
+_GAPS = "null where the IMU has gaps or is below 50 Hz"
+_UNSURE = "null without a gyroscope or a smoother"
+
+MOTION_COLUMNS = tuple(
+    _make_nullable(name, unit, doc, frame, since="1.3")
+    for name, unit, doc, frame in (
+        ("turn_rad", "rad", "change of yaw from start to end, counter-clockwise", "enu"),
+        ("turn_std_rad", "rad", f"standard deviation of turn_rad; {_UNSURE}", "enu"),
+        ("turn_rate_radps", "rad/s", "time-mean of the absolute yaw rate", "base_link"),
+        ("turn_rate_std_radps", "rad/s", f"standard deviation of turn_rate_radps; {_UNSURE}", "base_link"),
+        ("curvature_radpm", "rad/m", "turn_rad over arc_length_m, positive to the left", "enu"),
+        ("curvature_std_radpm", "rad/m", f"standard deviation of curvature_radpm; {_UNSURE}", "enu"),
+        ("roll_rad", "rad", "measured roll in the middle of the segment's time", "enu"),
+        ("pitch_rad", "rad", "measured pitch there, positive nose down (REP-103)", "enu"),
+        (
+            "slip_fraction",
+            "1",
+            "1 - mean speed over ground / mean speed of the wheels as they tell it, both along the body; null without wheels",
+            "base_link",
+        ),
+        (
+            "slip_std_fraction",
+            "1",
+            "standard deviation of slip_fraction from the speed over ground: a wrong wheel radius is not in it, it counts as slip",
+            "base_link",
+        ),
+        (
+            "vibration_mps2",
+            "m/s2",
+            f"root mean square of the specific force between 3 and 20 Hz, three axes together; {_GAPS}",
+            "sensor",
+        ),
+    )
+)
+"""How the robot moves over a segment."""
+
+_NET_COLUMNS = tuple(
+    _make_nullable(name, unit, doc, since="1.3")
+    for name, unit, doc in (
+        ("voltage_volt", "V", "time-mean of the voltage, over the rails; null without power"),
+        ("standing_power_watt", "W", "what the robot draws while it stands, of the run; null where it hardly stood"),
+        (
+            "standing_power_std_watt",
+            "W",
+            "standard deviation of standing_power_watt: how it differs over the run, and how well it is measured",
+        ),
+        ("power_above_standing_watt", "W", "power_watt less standing_power_watt"),
+        ("power_above_standing_std_watt", "W", "standard deviation of it, as a label of the true metre"),
+        ("energy_above_standing_joule", "J", "energy_joule less standing_power_watt times duration_s"),
+        ("energy_above_standing_std_joule", "J", "standard deviation of it, likewise"),
+    )
+)
+
 _LABEL_COLUMNS = (
     Column("duration_s", _F64, "s", "T: time from start to end"),
     Column("velocity_mps", _F64, "m/s", "v: chord / duration"),
@@ -286,7 +345,7 @@ _LABEL_COLUMNS = (
     Column("velocity_std_mps", _F64, "m/s", "standard deviation of the velocity, likewise"),
     _make_nullable("power_std_watt", "W", "standard deviation of the power, likewise; null without power"),
     _make_nullable("energy_std_joule", "J", "standard deviation of the energy, likewise; null without power"),
-    *STANDING_COLUMNS,
+    *_NET_COLUMNS,
     _make_nullable(
         "physics_power_watt",
         "W",
@@ -300,7 +359,10 @@ LABELLED_SEGMENTS = TableSchema(
     "segments",
     "L5",
     "Segments with the cost of the metre each one covers.",
-    (*_SEGMENT_COLUMNS, *MOTION_COLUMNS, *_LABEL_COLUMNS, LINE_COLUMN),
+    (
+        *(*_SEGMENT_COLUMNS, *MOTION_COLUMNS, *_LABEL_COLUMNS),
+        _make_geometry("LineString from start to end; null in a local frame", "gnss_crs"),
+    ),
 )
 
 PLACED_SEGMENTS = LABELLED_SEGMENTS.only(
@@ -348,7 +410,7 @@ SAMPLES = TableSchema(
             "1",
             "share of pixels more than 1 m above the smallest, clipped in the tensor",
         ),
-        POINT_COLUMN,
+        _make_geometry("Point in the centre of the patch", "WGS 84"),
     ),
 )
 

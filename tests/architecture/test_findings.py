@@ -17,20 +17,20 @@ MAKERS = {"make_finding": 0, "threshold": 0, "select_findings": 1}
 """Functions that take codes, and the argument from which on these stand."""
 
 PRINTERS = {
-    "formats/dataset_card.py",
-    "formats/hub_card.py",
-    "learning/evaluation_files.py",
-    "pipeline/dataset/build.py",
-    "pipeline/dataset/content.py",
-    "pipeline/diff.py",
-    "pipeline/maps.py",
-    "pipeline/plan.py",
-    "pipeline/preflight.py",
-    "pipeline/status.py",
-    "pipeline/store_facts.py",
-    "planning/drive_files.py",
-    "planning/path_files.py",
-    "planning/plan_files.py",
+    "tcpipe/formats/dataset_card.py",
+    "tcpipe/formats/hub_card.py",
+    "tcpipe/learning/evaluation_files.py",
+    "tcpipe/pipeline/dataset/build.py",
+    "tcpipe/pipeline/dataset/content.py",
+    "tcpipe/pipeline/diff.py",
+    "tcpipe/pipeline/maps.py",
+    "tcpipe/pipeline/plan.py",
+    "tcpipe/pipeline/preflight.py",
+    "tcpipe/pipeline/status.py",
+    "tcpipe/pipeline/report.py",
+    "tcpipe/planning/drive_files.py",
+    "tcpipe/planning/path_files.py",
+    "tcpipe/planning/plan_files.py",
 }
 """Modules beside cli/ and report/ that print an answer, or group findings for a page."""
 
@@ -136,12 +136,12 @@ def test_every_line_is_short_with_typical_values():
 
 def test_nothing_but_what_prints_makes_sentences():
     importers = {
-        path
+        f"tcpipe/{path}"
         for path, nodes in read_nodes().items()
         for node in nodes
         if isinstance(node, ast.ImportFrom) and node.module == LINES
     }
-    others = {path for path in importers if not path.startswith(("cli/", "report/"))}
+    others = {path for path in importers if not path.startswith(("tcpipe/cli/", "tcpipe/report/"))}
     assert others == PRINTERS
 
 

@@ -14,10 +14,9 @@ from suggested_recipes import merged, proposed, recipe_that_follows
 from tcpipe.errors import FusionError, RoleError
 from tcpipe.formats.logs.log_file import open_log
 from tcpipe.formats.logs.writing import MessageStream, write_mcap
-from tcpipe.formats.recipe_toml import parse_recipe
-from tcpipe.formats.robot_files import load_shipped_profiles
+from tcpipe.formats.recipe_toml import load_shipped_profiles, parse_recipe
+from tcpipe.pipeline.ingest_run import run_stages
 from tcpipe.pipeline.preflight import preflight
-from tcpipe.pipeline.run_stages import run_stages
 from tcpipe.recipe import FuseConfig, ReadConfig, Recipe
 from tcpipe.simulation import Truth, compute_true_cost
 from tcpipe.simulation.route import Pause

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from tcpipe.formats.logs.log_file import open_log
-from tcpipe.formats.robot_files import load_shipped_profiles
+from tcpipe.formats.recipe_toml import load_shipped_profiles
 from tcpipe.geometry.angles import wrap_to_pi
 from tcpipe.geometry.rotation import rpy_from_quat
 from tcpipe.recipe import FuseConfig, ReadConfig

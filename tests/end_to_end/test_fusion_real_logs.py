@@ -5,7 +5,7 @@ import pytest
 from shared_data import shared_data
 
 from tcpipe.formats.logs.log_file import open_log
-from tcpipe.formats.robot_files import load_shipped_profiles
+from tcpipe.formats.recipe_toml import load_shipped_profiles
 from tcpipe.recipe import FuseConfig, Placement, ReadConfig
 from tcpipe.stages.fuse import fuse_run
 from tcpipe.stages.read import read_run

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tcpipe.formats.logs.log_file import open_log
-from tcpipe.formats.robot_files import load_shipped_profiles
+from tcpipe.formats.recipe_toml import load_shipped_profiles
 from tcpipe.geometry.rotation import rpy_from_quat
 from tcpipe.recipe import FuseConfig, GateConfig, LabelConfig, ReadConfig, SegmentConfig
 from tcpipe.simulation import Faults, compute_true_cost, find_scenario, make_tiny, read_truth, simulate

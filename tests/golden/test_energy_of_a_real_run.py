@@ -7,7 +7,7 @@ import pytest
 from shared_data import shared_data
 
 from tcpipe.formats.logs.log_file import open_log
-from tcpipe.formats.robot_files import load_shipped_profiles
+from tcpipe.formats.recipe_toml import load_shipped_profiles
 from tcpipe.power.energy import integrate_recorded_energy
 from tcpipe.power.rails import make_rail, make_samples
 from tcpipe.recipe import ReadConfig

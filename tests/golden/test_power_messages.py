@@ -9,7 +9,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from tcpipe.formats.logs.log_file import open_log
 from tcpipe.formats.logs.ros_types import load_shipped_definitions
-from tcpipe.formats.robot_files import load_profiles, load_shipped_profiles
+from tcpipe.formats.recipe_toml import load_profiles, load_shipped_profiles
 from tcpipe.power.readings import PowerReadings, read_power
 from tcpipe.power.sources import list_power_lists
 from tcpipe.recipe import Recipe

@@ -12,7 +12,7 @@ from shared_data import shared_data
 import tcpipe
 from tcpipe.errors import RoleError
 from tcpipe.formats.logs.log_file import open_log
-from tcpipe.formats.robot_files import load_shipped_profiles
+from tcpipe.formats.recipe_toml import load_shipped_profiles
 from tcpipe.recipe import Placement, ReadConfig
 from tcpipe.stages.read import read_run
 from tcpipe.tables.findings import select_findings

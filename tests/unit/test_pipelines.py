@@ -10,8 +10,7 @@ import polars as pl
 
 from tcpipe.cli import cli
 from tcpipe.formats.logs.table_log import TableLog
-from tcpipe.formats.recipe_toml import ingest_key, load_recipe
-from tcpipe.formats.robot_files import load_profiles
+from tcpipe.formats.recipe_toml import ingest_key, load_profiles, load_recipe
 from tcpipe.logs.topics import Topic
 from tcpipe.recipe import Recipe
 from tcpipe.stages.read_roles import decide_roles, find_read_config

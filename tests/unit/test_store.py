@@ -188,7 +188,7 @@ def test_what_a_killed_call_left_on_this_machine_goes_when_a_store_is_opened(tmp
 
 def test_a_store_of_a_later_layout_is_refused(tmp_path, monkeypatch):
     with monkeypatch.context() as later:
-        later.setattr("tcpipe.formats.store_document.DATA_MODEL_VERSION", "4.0")
+        later.setattr("tcpipe.formats.run_documents.DATA_MODEL_VERSION", "4.0")
         open_store(tmp_path / "store", create=True)
     with pytest.raises(StoreError, match=r"is of data model 4\.0, this version knows 3\.0"):
         open_store(tmp_path / "store")

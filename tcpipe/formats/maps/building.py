@@ -19,7 +19,7 @@ from tcpipe.formats.maps.map_facts import MapFacts, MapInputs
 from tcpipe.formats.maps.map_files import SHARD_PX, MapWriter
 from tcpipe.formats.maps.mosaic import Raster, open_raster
 from tcpipe.formats.maps.terrain_polygons import is_drawn, place_polygons
-from tcpipe.formats.toml_text import parse_toml
+from tcpipe.formats.recipe_toml import parse_toml
 from tcpipe.tables.catalogue import read_threshold
 from tcpipe.tables.findings import Finding, Subject, make_finding
 from tcpipe.terrain.classes import (

@@ -13,18 +13,28 @@ from pyproj import CRS
 from shapely.geometry.base import BaseGeometry
 from shapely.geometry.polygon import orient
 
-from tcpipe.balance.cells import SLOPE_EDGES_DEG, SLOPE_NAMES, Cell, choose_speed_edges, count_cells, find_slope_ranges
-from tcpipe.balance.correlation import compute_slope_residuals, estimate_correlations
-from tcpipe.balance.repeatability import Floor, estimate_repeatability, find_repeated_pairs
-from tcpipe.balance.undersampled_ground import (
+from tcpipe.balance.cells import (
     CELL_M,
     CLOSED,
+    SLOPE_EDGES_DEG,
+    SLOPE_NAMES,
+    Cell,
     MapGround,
     Patch,
     cells_available,
+    choose_speed_edges,
+    count_cells,
     find_cell_classes,
+    find_slope_ranges,
     find_undersampled_ground,
     fit_cell_gradients,
+)
+from tcpipe.balance.correlation import (
+    Floor,
+    compute_slope_residuals,
+    estimate_correlations,
+    estimate_repeatability,
+    find_repeated_pairs,
 )
 from tcpipe.formats.dataset_card import Balance, CellRow
 from tcpipe.formats.geojson import Feature, FeatureCollection, PolygonGeometry
@@ -150,7 +160,7 @@ def _make_row(cell: Cell, names: Mapping[int, str], edges: Sequence[float]) -> C
         "samples": cell.samples,
         "effective": cell.effective,
         "effective_train": cell.effective_train,
-        "rare": cell.rare,
+        "rare": cell.is_undersampled,
     }
     if cell.speed is not None:
         ends = ("0", *(f"{edge:g}" for edge in edges))
@@ -248,7 +258,7 @@ def _count_by_ground(
             if area_m2 == 0.0 and (kind, slope) not in driven:
                 continue
             rows.append({**_make_row(cell, names, ()), "offered_m2": area_m2})
-            if cell.rare and area_m2 > 0.0:
+            if cell.is_undersampled and area_m2 > 0.0:
                 here = samples.xy_m[(samples.terrain == kind) & (slopes == slope) & (samples.split != "buffer")]
                 thin += [(cell, patch, lonlat) for part in grounds for patch, lonlat in part.patches(kind, slope, here)]
     thin.sort(key=lambda found: (found[0].effective or 0.0, found[0].terrain_class, found[0].slope, -found[1].area_m2))

@@ -14,13 +14,12 @@ from pathlib import Path
 import pyarrow as pa
 
 from tcpipe import __version__
-from tcpipe.cost.budget import format_budget
+from tcpipe.cost.labels import format_budget
 from tcpipe.errors import DatasetError, RecipeError, StoreError, UsageError, clean_lines
 from tcpipe.formats.atomic import clear_beside, write_atomic_directory, write_text
 from tcpipe.formats.bucket import open_place
 from tcpipe.formats.bucket_directories import fetch_directory_by_range, find_newest
 from tcpipe.formats.commits import CallRecord, Dataset, Entries, State
-from tcpipe.formats.croissant import format_croissant
 from tcpipe.formats.dataset_card import DatasetCard, group_dataset_findings
 from tcpipe.formats.dataset_files import (
     CARD,
@@ -39,7 +38,7 @@ from tcpipe.formats.dataset_files import (
 )
 from tcpipe.formats.finding_lines import format_mixed_groups, format_verdict
 from tcpipe.formats.geojson import read_regions
-from tcpipe.formats.hub_card import format_hub_card
+from tcpipe.formats.hub_card import format_croissant, format_hub_card
 from tcpipe.formats.integrity import Checksum, compute_checksum, compute_checksums, seal_page, write_sealed
 from tcpipe.formats.json_files import digest, write_json
 from tcpipe.formats.maps.map_files import MapFile
@@ -47,17 +46,26 @@ from tcpipe.formats.object_storage import is_url, make_absolute
 from tcpipe.formats.parquet import ROWS_PER_GROUP, write_parquet_rows
 from tcpipe.formats.place import DirectoryPlace
 from tcpipe.formats.recipe_toml import resolve_recipe
-from tcpipe.formats.store_document import SPOOL
+from tcpipe.formats.run_documents import SPOOL
 from tcpipe.formats.user_paths import check_local_output
 from tcpipe.motion.remedies import KEPT
-from tcpipe.pipeline.begun_calls import OpenCall, commit_call
-from tcpipe.pipeline.call_history import BUILD, Estimate, estimate, measure_call, start_stopwatch
+from tcpipe.pipeline.calls import (
+    BUILD,
+    Estimate,
+    LogWriter,
+    OpenCall,
+    commit_call,
+    estimate,
+    measure_call,
+    open_log,
+    start_stopwatch,
+)
 from tcpipe.pipeline.dataset.added_columns import read_all_covariates
 from tcpipe.pipeline.dataset.balance import BALANCE_COLUMNS, measure_balance
 from tcpipe.pipeline.dataset.build_dataset_options import BuildDatasetOptions
 from tcpipe.pipeline.dataset.card import CARD_COLUMNS, PHYSICS_COLUMNS, VELOCITY_COLUMN, is_whole, make_dataset_card
 from tcpipe.pipeline.dataset.content import gather_content, write_patches
-from tcpipe.pipeline.dataset.inputs import BuildOptions, Inputs, choose_inputs, read_earlier_splits
+from tcpipe.pipeline.dataset.inputs import BuildOptions, Inputs, choose_inputs, find_other_options, read_earlier_splits
 from tcpipe.pipeline.dataset.redaction import (
     make_redaction,
     redact_card,
@@ -65,11 +73,9 @@ from tcpipe.pipeline.dataset.redaction import (
     redact_features,
     redact_inputs,
 )
-from tcpipe.pipeline.dataset.replacing import find_other_options
 from tcpipe.pipeline.dataset.runs import CHOICE_CODES, find_gone_runs
 from tcpipe.pipeline.dataset.sampling import Workers
 from tcpipe.pipeline.generations import read_generations, write_generation
-from tcpipe.pipeline.log_writer import LogWriter, open_log
 from tcpipe.recipe import Recipe
 from tcpipe.report.dataset_report import render_dataset_report
 from tcpipe.report.pictures import draw_classes, draw_maps, draw_relief, write_overview

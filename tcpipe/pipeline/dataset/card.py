@@ -13,9 +13,8 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from tcpipe import __version__
-from tcpipe.cost.budget import pool_budgets
-from tcpipe.cost.held_out import fit_and_validate_physics
-from tcpipe.cost.physics import ALL, FitSamples
+from tcpipe.cost.labels import pool_budgets
+from tcpipe.cost.physics import ALL, FitSamples, fit_and_validate_physics
 from tcpipe.formats.dataset_card import (
     Balance,
     DatasetCard,

@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 
 from tcpipe.errors import DatasetError, TcpipeError
 from tcpipe.execution import run_all, unwrap_result
-from tcpipe.formats.arrow_file import map_table, read_table_bytes, write_pieces, write_table_bytes
 from tcpipe.formats.dataset_card import Covariate, MapRegistration, Removal, Shard, group_dataset_findings
 from tcpipe.formats.dataset_files import (
     Drawer,
@@ -29,29 +28,27 @@ from tcpipe.formats.dataset_files import (
     make_zarr_writers,
 )
 from tcpipe.formats.finding_lines import format_mixed_groups
-from tcpipe.formats.geoparquet import add_geo_metadata
 from tcpipe.formats.maps.map_files import MapFile, open_map
+from tcpipe.formats.parquet import add_geo_metadata, map_table, read_table_bytes, write_pieces, write_table_bytes
 from tcpipe.formats.place import DirectoryPlace, Place
-from tcpipe.formats.robot_files import load_profiles
+from tcpipe.formats.recipe_toml import load_profiles
 from tcpipe.formats.stored_runs import RunDirectory
 from tcpipe.formats.zarr_arrays import Compression
 from tcpipe.motion.remedies import KEPT
 from tcpipe.pipeline.dataset.added_columns import find_narrow_patches, make_added_columns, tag_of_each
-from tcpipe.pipeline.dataset.bias_check import find_removed_by_ground
 from tcpipe.pipeline.dataset.inputs import BuildOptions, Inputs
-from tcpipe.pipeline.dataset.registration import register_runs
+from tcpipe.pipeline.dataset.map_checks import find_removed_by_ground, register_runs
 from tcpipe.pipeline.dataset.sampling import Spool, Workers, sample_all_segments
 from tcpipe.pipeline.dataset.splitting import SplitResult, draw_splits
 from tcpipe.recipe import Recipe
 from tcpipe.recipe.suggestions import format_recipe_key
-from tcpipe.splits.assignment import EXCLUDED, NO_FOLD, Assignment
-from tcpipe.splits.ranking import order_ranks
+from tcpipe.splits.assignment import EXCLUDED, NO_FOLD, Assignment, order_ranks
 from tcpipe.stages.sample import Sampled, sum_losses
+from tcpipe.tables.arrays import make_points
 from tcpipe.tables.bits import Loss, flag_name
 from tcpipe.tables.columns import to_floats
 from tcpipe.tables.findings import Finding, Subject, make_finding
 from tcpipe.tables.levels import LABELLED_SEGMENTS, SAMPLES
-from tcpipe.tables.wkb import make_points
 from tcpipe.terrain.projection import compute_area, parse_crs
 
 

@@ -18,9 +18,8 @@ from tcpipe.formats.dataset_card import KeptSplit
 from tcpipe.formats.geojson import PolygonGeometry
 from tcpipe.recipe import Recipe
 from tcpipe.recipe.suggestions import format_recipe_key
-from tcpipe.splits.assignment import EXCLUDED, NO_FOLD, Assignment, assign_splits
+from tcpipe.splits.assignment import EXCLUDED, NO_FOLD, Assignment, assign_splits, hash_ranks
 from tcpipe.splits.audit import HeldOut, audit_leakage
-from tcpipe.splits.ranking import hash_ranks
 from tcpipe.splits.regions import Regions, project_regions
 from tcpipe.stages.sample import Sampled
 from tcpipe.tables.columns import to_integers

@@ -21,7 +21,7 @@ from tcpipe.pipeline import ingest as ingest_module
 from tcpipe.pipeline.ingest import ingest
 from tcpipe.pipeline.ingest_run import Ingested
 from tcpipe.pipeline.ingest_task import IngestResult, check_age, make_result
-from tcpipe.pipeline.log_findings import find_damage
+from tcpipe.pipeline.log_sources import find_damage
 from tcpipe.pipeline.plan import TO_DO
 from tcpipe.pipeline.problems import acknowledge
 from tcpipe.pipeline.status import find_status

@@ -48,12 +48,12 @@ def test_cells_count_every_sample_once_and_are_worth_what_the_least_label_says()
                 compute_effective_size(xy[rows & (split == "train")], labels[1])
             )
             assert cell.effective <= rows.sum() + 1e-9
-            assert cell.rare
+            assert cell.is_undersampled
 
 
 def test_where_likeness_cannot_be_told_the_number_of_samples_decides():
     cells = count_cells(
         (np.repeat([1, 2], [29, 30]), np.zeros(59, int)), np.full(59, "test"), np.zeros((59, 2)), (), splits=SPLITS
     )
-    assert [(cell.effective, cell.rare) for cell in cells] == [(None, True), (None, False)]
+    assert [(cell.effective, cell.is_undersampled) for cell in cells] == [(None, True), (None, False)]
     assert count_cells((np.zeros(3, int),) * 2, np.full(3, "buffer"), np.zeros((3, 2)), (), splits=SPLITS) == []

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tcpipe.balance.repeatability import ALONG_RAD, NEAR, estimate_repeatability, find_repeated_pairs
+from tcpipe.balance.correlation import ALONG_RAD, NEAR, estimate_repeatability, find_repeated_pairs
 
 
 def wrapped(angle):

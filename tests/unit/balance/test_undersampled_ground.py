@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import shapely
 
-from tcpipe.balance.cells import SLOPE_NAMES
-from tcpipe.balance.undersampled_ground import (
+from tcpipe.balance.cells import (
     CLOSED,
+    SLOPE_NAMES,
     MapGround,
     cells_available,
     find_cell_classes,

@@ -5,7 +5,7 @@ from dataclasses import asdict
 import numpy as np
 import pytest
 
-from tcpipe.cost.budget import CAUSES, estimate_energy_budget, find_noise, format_budget, pool_budgets
+from tcpipe.cost.labels import CAUSES, estimate_energy_budget, find_noise, format_budget, pool_budgets
 from tcpipe.tables.findings import Subject
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from skid_steered import STANDING_WATT, made
 
-from tcpipe.cost.held_out import _HeldOut, _score, fit_and_validate_physics
+from tcpipe.cost.physics import _HeldOut, _score, fit_and_validate_physics
 
 
 def test_shares_and_scores_of_an_exact_robot():

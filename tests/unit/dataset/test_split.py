@@ -8,7 +8,7 @@ import pytest
 from synthetic_store import STANDING_WATT, box, region_file, small_store
 
 from tcpipe.dataset import batches as batches_module
-from tcpipe.dataset import open_dataset, pixels
+from tcpipe.dataset import open_dataset
 from tcpipe.dataset.tensor import make_tensor_layout
 from tcpipe.errors import DatasetError, UsageError
 from tcpipe.pipeline.dataset.build import build_dataset
@@ -94,8 +94,8 @@ def test_one_sample_and_a_batch_are_rows_of_the_whole(path):
 
 def test_pieces_read_on_demand_are_the_same_as_all_in_memory(path, monkeypatch):
     whole = open_dataset(path)["unseen"].patches
-    monkeypatch.setattr(pixels, "IN_MEMORY_BYTES", 0)
-    monkeypatch.setattr(pixels, "CACHED_PIECES", 1)
+    monkeypatch.setattr(batches_module, "IN_MEMORY_BYTES", 0)
+    monkeypatch.setattr(batches_module, "CACHED_PIECES", 1)
     lazy = open_dataset(path)["unseen"]
     order = np.random.default_rng(0).permutation(len(lazy))
     np.testing.assert_array_equal(lazy.batch(order)[0], whole[order])

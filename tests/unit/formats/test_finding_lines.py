@@ -15,8 +15,7 @@ from tcpipe.formats.finding_lines import (
     group_findings,
     list_findings,
 )
-from tcpipe.tables.findings import Remedy, Subject, make_finding
-from tcpipe.tables.verdicts import Verdict, judge, judge_again
+from tcpipe.tables.findings import Remedy, Subject, Verdict, judge, judge_again, make_finding
 
 COMMAND = Subject("role", "command")
 NOTE = make_finding("no-command", COMMAND)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from tcpipe.errors import PathError
-from tcpipe.formats.geojson_lines import make_line_feature, read_line
+from tcpipe.formats.geojson import make_line_feature, read_line
 from tcpipe.formats.json_files import write_json
 
 LINE = {"type": "LineString", "coordinates": [[15.0, 47.0], [15.1, 47.1, 350.0]]}

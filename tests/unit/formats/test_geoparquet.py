@@ -6,8 +6,8 @@ import numpy as np
 import pyarrow as pa
 from pyproj import CRS
 
-from tcpipe.formats.geoparquet import add_geo_metadata
-from tcpipe.tables.wkb import make_points
+from tcpipe.formats.parquet import add_geo_metadata
+from tcpipe.tables.arrays import make_points
 
 POINTS = np.array([[15.5, 47.0], [np.nan, np.nan], [15.25, 47.5]])
 

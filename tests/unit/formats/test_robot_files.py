@@ -6,8 +6,7 @@ import pytest
 
 from tcpipe.errors import RecipeError
 from tcpipe.formats.json_files import to_plain
-from tcpipe.formats.recipe_toml import format_commented_toml, parse_recipe
-from tcpipe.formats.robot_files import load_profiles, load_shipped_profiles
+from tcpipe.formats.recipe_toml import format_commented_toml, load_profiles, load_shipped_profiles, parse_recipe
 from tcpipe.recipe import Recipe
 from tcpipe.robots.profiles import GENERIC, FieldPath, PowerSource, Robot, parse_fields
 

@@ -17,7 +17,7 @@ from tcpipe.learning.evaluation_facts import (
 from tcpipe.learning.evaluation_findings import find_weaknesses
 from tcpipe.learning.fitting import FitConfig
 from tcpipe.learning.metrics import Errors, Ratio
-from tcpipe.tables.verdicts import judge
+from tcpipe.tables.findings import judge
 
 GOOD = Errors(500, 12.0, 6.0, 500, 90.0, 3.0, 6.0)
 BETTER = Ratio(0.8, 0.7, 0.9)

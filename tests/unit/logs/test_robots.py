@@ -2,7 +2,7 @@
 
 import pytest
 
-from tcpipe.formats.robot_files import load_shipped_profiles
+from tcpipe.formats.recipe_toml import load_shipped_profiles
 from tcpipe.logs.robots import find_robot
 from tcpipe.logs.topics import Topic
 

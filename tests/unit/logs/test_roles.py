@@ -3,7 +3,7 @@
 import pytest
 
 from tcpipe.errors import RecipeError
-from tcpipe.formats.robot_files import load_shipped_profiles
+from tcpipe.formats.recipe_toml import load_shipped_profiles
 from tcpipe.logs import roles
 from tcpipe.logs.roles import RoleAssignment
 from tcpipe.logs.topics import Topic

@@ -1,6 +1,6 @@
 """Two robots are told from one robot with a camera that has sensors of its own."""
 
-from tcpipe.formats.robot_files import load_shipped_profiles
+from tcpipe.formats.recipe_toml import load_shipped_profiles
 from tcpipe.logs import roles
 from tcpipe.logs.robots import find_robot_namespaces
 from tcpipe.logs.topics import Topic

@@ -12,9 +12,9 @@ from synthetic_store import add_run, add_world, commit_run, lanes, segments
 from tcpipe.dataset import open_dataset
 from tcpipe.errors import DatasetError, StoreError
 from tcpipe.formats.commits import Entries
+from tcpipe.pipeline.calls import open_log
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.inspect import inspect
-from tcpipe.pipeline.log_writer import open_log
 from tcpipe.pipeline.prune import prune
 from tcpipe.pipeline.report import report
 from tcpipe.recipe import ReadConfig, Recipe

@@ -13,8 +13,8 @@ import tcpipe.store as stores
 from tcpipe.errors import StoreError
 from tcpipe.formats import stored_runs
 from tcpipe.formats.commits import Entries, LogSnapshot
+from tcpipe.pipeline.calls import open_log
 from tcpipe.pipeline.dataset.runs import choose_runs
-from tcpipe.pipeline.log_writer import open_log
 from tcpipe.recipe import Recipe
 from tcpipe.store import Store
 

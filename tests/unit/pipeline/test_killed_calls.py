@@ -19,12 +19,11 @@ from wheel_drives import START_NS, drive_at
 from tcpipe.cli import cli
 from tcpipe.errors import StoreError, UsageError
 from tcpipe.formats.commits import Begun, Entries
+from tcpipe.pipeline import calls
 from tcpipe.pipeline import ingest as ingest_module
-from tcpipe.pipeline import log_writer
 from tcpipe.pipeline import status as status_module
-from tcpipe.pipeline.begun_calls import commit_call, list_begun_calls
+from tcpipe.pipeline.calls import commit_call, identify_process, list_begun_calls, open_log
 from tcpipe.pipeline.ingest import ingest
-from tcpipe.pipeline.log_writer import identify_process, open_log
 from tcpipe.pipeline.problems import acknowledge
 from tcpipe.pipeline.status import find_status
 from tcpipe.pipeline.verify import verify
@@ -73,7 +72,7 @@ def kill(logs, store, monkeypatch, **how):
     with monkeypatch.context() as patch, suppress(SystemExit):
         patch.setattr(ingest_module, "_iterate_results", died)
         patch.setattr(ingest_module, "remove_if_empty", lambda _: nullcontext())
-        patch.setattr(log_writer, "identify_process", lambda: replace(identify_process(), start="1"))
+        patch.setattr(calls, "identify_process", lambda: replace(identify_process(), start="1"))
         ingest([logs], store=store, **{"recipe": Recipe(), **how})
 
 
@@ -173,7 +172,7 @@ HERE = {"host": "lab", "machine": "m", "boot": "b", "namespace": "pid:[1]", "pid
 )
 def test_a_call_that_runs_is_told_from_a_killed_one_as_far_as_can_be_seen(tmp_path, monkeypatch, other, age_s, state):
     here = replace(identify_process(), **HERE)
-    monkeypatch.setattr(log_writer, "identify_process", lambda: here)
+    monkeypatch.setattr(calls, "identify_process", lambda: here)
     begin = (datetime.now(UTC) - timedelta(seconds=age_s)).isoformat(timespec="milliseconds")
     store = open_store(tmp_path, create=True)
     begun = Begun("ingest", "0.9", ("/logs",), "", 1, begin, replace(here, **other))

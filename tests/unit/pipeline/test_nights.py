@@ -15,9 +15,9 @@ from tcpipe.formats.logs.writing import MessageStream, write_bag
 from tcpipe.formats.run_documents import LogOrigin, RunJson
 from tcpipe.pipeline import ingest as ingest_module
 from tcpipe.pipeline import ingest_task
+from tcpipe.pipeline.calls import LogWriter
 from tcpipe.pipeline.ingest import ingest
 from tcpipe.pipeline.inspect import inspect
-from tcpipe.pipeline.log_writer import LogWriter
 from tcpipe.pipeline.problems import acknowledge
 from tcpipe.pipeline.prune import prune
 from tcpipe.pipeline.status import find_status

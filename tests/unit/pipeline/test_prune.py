@@ -11,8 +11,8 @@ from synthetic_store import add_run, lanes, segments, supersede
 from tcpipe.errors import UsageError
 from tcpipe.formats.commits import Dataset, Entries
 from tcpipe.formats.place import DirectoryPlace
-from tcpipe.formats.store_document import SPOOL
-from tcpipe.pipeline.log_writer import open_log
+from tcpipe.formats.run_documents import SPOOL
+from tcpipe.pipeline.calls import open_log
 from tcpipe.pipeline.prune import prune
 from tcpipe.pipeline.verify import verify
 from tcpipe.recipe import ReadConfig, Recipe

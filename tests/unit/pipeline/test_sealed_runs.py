@@ -11,9 +11,9 @@ from synthetic_store import add_run, add_world, box, commit_run, lanes, region_f
 from tcpipe.dataset import open_dataset
 from tcpipe.errors import DatasetError, StoreError
 from tcpipe.formats.commits import Entries
+from tcpipe.pipeline.calls import open_log
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.inspect import inspect
-from tcpipe.pipeline.log_writer import open_log
 from tcpipe.pipeline.problems import acknowledge
 from tcpipe.pipeline.report import report
 from tcpipe.recipe import LabelConfig, Recipe, SplitConfig

@@ -13,10 +13,10 @@ from tcpipe import __version__
 from tcpipe.cli import cli
 from tcpipe.errors import UsageError
 from tcpipe.formats.commits import CallRecord, Entries
-from tcpipe.pipeline import call_history, ingest_task
+from tcpipe.pipeline import calls, ingest_task
 from tcpipe.pipeline import plan as plan_module
+from tcpipe.pipeline.calls import open_log
 from tcpipe.pipeline.ingest import ingest
-from tcpipe.pipeline.log_writer import open_log
 from tcpipe.pipeline.problems import acknowledge
 from tcpipe.pipeline.status import find_status
 from tcpipe.recipe import ReadConfig, Recipe
@@ -133,9 +133,7 @@ def test_new_changed_growing_passing_and_accepted_logs_are_told_apart(night):
     os.utime(logs / "whole.mcap", ns=(OLD_NS, OLD_NS + 1))
     line = f"{logs / 'passing.mcap'}: No space left on device (28)"
     call = CallRecord("ingest", "0", 3, {"failed": 1}, failed={str(logs / "passing.mcap"): line})
-    open_log(Store(store)).commit(
-        "ended", Entries(calls=(call_history.measure_call(call_history.start_stopwatch(), call),))
-    )
+    open_log(Store(store)).commit("ended", Entries(calls=(calls.measure_call(calls.start_stopwatch(), call),)))
     found = where(night)
     assert found.counts == {"done": 2, "quarantined": 1, "growing": 1, "pending": 2, "failed_transient": 1}
     told = {(group.state, group.cause): group.logs for group in found.groups}
@@ -245,7 +243,7 @@ def test_an_estimate_is_what_the_like_took():
     night = CallRecord("ingest", "0", 0, {}, cpu_s=2_000.7, done_bytes=10**9, written_bytes=5 * 10**8)
     other = replace(night, cpu_s=1_000.7, done_bytes=5 * 10**8, written_bytes=10**8)
     quiet, build = replace(night, done_bytes=0, cpu_s=9.0), replace(night, command="build-dataset")
-    found = call_history.estimate([night, other, quiet, build], "ingest", 10**9, jobs=4)
+    found = calls.estimate([night, other, quiet, build], "ingest", 10**9, jobs=4)
     assert found.wall_s == pytest.approx(0.7 + 500.0, rel=0.01)
     assert found.written_bytes == pytest.approx(4e8, rel=0.01)
     assert str(found) == f"1 GB: about 8 min and {found.written_bytes / 1e6:.3g} MB (by 2 earlier calls)"
@@ -253,10 +251,10 @@ def test_an_estimate_is_what_the_like_took():
 
 def test_a_small_call_tells_little_of_a_million_samples():
     small = CallRecord("build-dataset", "0", 0, {"samples": 312}, cpu_s=2.3, written_bytes=2_900_000)
-    found = call_history.estimate([small], "build-dataset", 1_000_000, jobs=1)
+    found = calls.estimate([small], "build-dataset", 1_000_000, jobs=1)
     assert 100.0 < found.wall_s < 300.0, "185 s (docs/explanation/scale.md); 7,400 s in proportion"
     assert found.written_bytes < 5e9
-    assert call_history.estimate([small], "build-dataset", 312, jobs=8).wall_s == pytest.approx(1.5, abs=0.1)
+    assert calls.estimate([small], "build-dataset", 312, jobs=8).wall_s == pytest.approx(1.5, abs=0.1)
 
 
 def test_a_drive_without_a_segment_is_news_once_and_can_be_accepted(tmp_path):

@@ -19,14 +19,13 @@ from tcpipe.formats.commits import Entries, LogSnapshot
 from tcpipe.formats.integrity import compute_checksum, find_broken_seal, read_seal, seal_page, write_sealed
 from tcpipe.formats.maps.map_facts import MapInputs
 from tcpipe.formats.maps.map_files import open_map
-from tcpipe.formats.numbered_documents import read_as_at
 from tcpipe.formats.place import DirectoryPlace
-from tcpipe.formats.run_documents import MapDocument
+from tcpipe.formats.run_documents import MapDocument, read_as_at
+from tcpipe.pipeline.calls import open_log
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.diff import diff
 from tcpipe.pipeline.explain import explain
 from tcpipe.pipeline.inspect import inspect
-from tcpipe.pipeline.log_writer import open_log
 from tcpipe.pipeline.report import report
 from tcpipe.pipeline.verify import verify
 from tcpipe.recipe import Recipe, SampleConfig

@@ -12,7 +12,7 @@ from physics_model import PhysicsModel
 from planning_worlds import lonlat, plane
 
 from tcpipe.errors import ModelError, PathError, UsageError
-from tcpipe.formats.geojson_lines import make_line_feature, read_line
+from tcpipe.formats.geojson import make_line_feature, read_line
 from tcpipe.formats.json_files import write_json
 from tcpipe.planning.cost_map import make_cost_map
 from tcpipe.planning.path_files import make_summary_path, predict_path

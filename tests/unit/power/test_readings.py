@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tcpipe.formats.robot_files import load_shipped_profiles
+from tcpipe.formats.recipe_toml import load_shipped_profiles
 from tcpipe.power import readings
 from tcpipe.power.readings import PowerReadings
 from tcpipe.power.sources import BATTERY_STATE

@@ -10,8 +10,7 @@ import numpy as np
 from tcpipe.report.page import Link, Number, Section, Shaded, render_page
 from tcpipe.report.plots import draw_histogram, draw_waterfall, make_plot, render_plots
 from tcpipe.report.verdict import show_verdict
-from tcpipe.tables.findings import Remedy, Subject, make_finding
-from tcpipe.tables.verdicts import judge
+from tcpipe.tables.findings import Remedy, Subject, judge, make_finding
 
 EVIL = "</script><script>alert(1)</script>\x1b[31m\u202e$$x$$ \\(y\\) \"'&"
 """Ends a script, colours a terminal, turns its text round, reads as two formulas, leaves an attribute."""

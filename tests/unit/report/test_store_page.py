@@ -10,9 +10,9 @@ from synthetic_store import add_run, add_world, lanes, segments, supersede
 from tcpipe.errors import StoreError, UsageError
 from tcpipe.formats.bucket import open_place
 from tcpipe.formats.commits import CallRecord, Entries, Failure
-from tcpipe.pipeline import call_history
+from tcpipe.pipeline import calls
+from tcpipe.pipeline.calls import open_log
 from tcpipe.pipeline.dataset.build import build_dataset
-from tcpipe.pipeline.log_writer import open_log
 from tcpipe.pipeline.problems import acknowledge
 from tcpipe.pipeline.report import report
 from tcpipe.pipeline.store_verdict import find_changes, find_shift
@@ -51,9 +51,7 @@ def store(tmp_path_factory):
     junk = Failure("1", "1" * 64, ("/logs/junk",), (f"/logs/junk: {EVIL} is no log",), "0")
     cut = Failure("2", "a", ("/logs/a.mcap",), ("/logs/a.mcap: was cut",), "0")
     failed = {"/logs/passing.mcap": "No space left on device", "/logs/b.mcap": "No space left on device"}
-    call = call_history.measure_call(
-        call_history.start_stopwatch(), CallRecord("ingest", "0", 3, {"failed": 1}, failed=failed)
-    )
+    call = calls.measure_call(calls.start_stopwatch(), CallRecord("ingest", "0", 3, {"failed": 1}, failed=failed))
     open_log(store).commit("ended", Entries(failed=(junk, cut), calls=(call,)))
     return store
 

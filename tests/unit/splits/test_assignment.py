@@ -5,8 +5,7 @@ import pytest
 import shapely
 from splits_squares import squares
 
-from tcpipe.splits.assignment import NO_FOLD, Assignment, assign_splits
-from tcpipe.splits.holdouts import draw_groups, group_by_run
+from tcpipe.splits.assignment import NO_FOLD, Assignment, assign_splits, draw_groups, group_by_run
 from tcpipe.splits.regions import Regions
 
 ROW = squares([(10.0 * i + 5.0, 5.0) for i in range(10)])

@@ -3,8 +3,17 @@ import hashlib
 import numpy as np
 import pytest
 
-from tcpipe.splits.holdouts import UNDECIDED, Groups, assign_blocks, draw_folds, draw_groups, draw_samples, group_by_run
-from tcpipe.splits.ranking import hash_ranks, order_ranks
+from tcpipe.splits.assignment import (
+    UNDECIDED,
+    Groups,
+    assign_blocks,
+    draw_folds,
+    draw_groups,
+    draw_samples,
+    group_by_run,
+    hash_ranks,
+    order_ranks,
+)
 
 IDS = [f"run-{i:05d}" for i in range(1000)]
 

@@ -4,8 +4,13 @@ import numpy as np
 import pytest
 from splits_squares import squares
 
-from tcpipe.splits.neighbours import compute_nearest_m, compute_shared_fraction, iterate_near_pairs
-from tcpipe.splits.squares_kernel import pair_distances, pair_overlaps
+from tcpipe.splits.neighbours import (
+    compute_nearest_m,
+    compute_shared_fraction,
+    iterate_near_pairs,
+    pair_distances,
+    pair_overlaps,
+)
 
 
 def both(a, b):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from made_tracks import make_track, power_streams, stamps, straight_track
 
-from tcpipe.cost.budget import CAUSES, format_budget
+from tcpipe.cost.labels import CAUSES, format_budget
 from tcpipe.recipe import GateConfig, LabelConfig, SegmentConfig
 from tcpipe.stages.label import label_segments
 from tcpipe.stages.mask import mask_track

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from simulated_streams import log_of, streams_of
 
-from tcpipe.pipeline.run_stages import run_stages
+from tcpipe.pipeline.ingest_run import run_stages
 from tcpipe.recipe import Recipe
 from tcpipe.simulation import Faults, find_scenario
 from tcpipe.simulation.robot import GRAVITY_MPS2, SimulatedRobot

@@ -12,7 +12,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from tcpipe.errors import RecipeError, RoleError
-from tcpipe.formats.robot_files import load_shipped_profiles
+from tcpipe.formats.recipe_toml import load_shipped_profiles
 from tcpipe.logs.topics import Topic
 from tcpipe.power.sources import RailReadings
 from tcpipe.recipe import Placement, ReadConfig

@@ -4,7 +4,7 @@ import numpy as np
 import pyarrow as pa
 import shapely
 
-from tcpipe.tables.wkb import make_lines, make_points
+from tcpipe.tables.arrays import make_lines, make_points
 
 NAN = float("nan")
 

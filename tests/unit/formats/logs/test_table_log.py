@@ -9,8 +9,7 @@ from tcpipe.errors import LogError, UsageError
 from tcpipe.formats.logs.log_file import open_log
 from tcpipe.formats.logs.log_joining import open_logs
 from tcpipe.formats.logs.table_log import TableLog
-from tcpipe.formats.robot_files import load_shipped_profiles
-from tcpipe.formats.toml_text import parse_toml
+from tcpipe.formats.recipe_toml import load_shipped_profiles, parse_toml
 from tcpipe.pipeline.ingest import ingest
 from tcpipe.pipeline.inspect import inspect
 from tcpipe.recipe import Recipe, TableMapping

@@ -5,7 +5,7 @@ import pytest
 from made_tracks import stamps
 
 from tcpipe.geometry.polyline import fit_polyline
-from tcpipe.path.cutting import cut_by_chord
+from tcpipe.path import cut_by_chord
 
 
 def drive(course_rad, speed_mps=0.8, period_s=0.05):

@@ -1,15 +1,40 @@
-"""``tcpipe ingest``: logs to labelled segments in the store."""
+"""Commands on logs and runs."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
 import click
 
-from tcpipe.cli.options import add_options, dry_run_option, quiet_option
-from tcpipe.cli.output import print_line
+from tcpipe.cli.options import (
+    LOG,
+    ONE_OF_SEVERAL,
+    OUTPUT_FILE,
+    SEALED,
+    add_options,
+    complete_runs,
+    dry_run_option,
+    json_option,
+    min_age_option,
+    msgdef_option,
+    quiet_option,
+    recipe_option,
+    robot_option,
+    store_option,
+)
+from tcpipe.cli.output import (
+    print_json,
+    print_json_line,
+    print_line,
+    print_lines,
+    print_result,
+    resolve_recipe_with_source,
+    show_progress,
+)
+from tcpipe.errors import UsageError
 from tcpipe.pipeline.ingest_options import IngestOptions
 
 if TYPE_CHECKING:
@@ -32,9 +57,6 @@ def ingest(options: IngestOptions, *, dry_run: bool, as_json: bool, quiet: bool)
     Exit code 3: some logs failed, are damaged, or give no segment though the robot drove, and that is news: it was not
     told before, and not acknowledged (tcpipe acknowledge).
     """
-    from dataclasses import replace
-
-    from tcpipe.cli.output import print_json_line, resolve_recipe_with_source, say_result, show_progress
     from tcpipe.formats.json_files import convert_record
     from tcpipe.pipeline.ingest import SummaryLine, run_ingest
     from tcpipe.pipeline.ingest_task import LogLine
@@ -60,7 +82,7 @@ def ingest(options: IngestOptions, *, dry_run: bool, as_json: bool, quiet: bool)
             jobs=options.jobs,
             create=True,
         )
-        say_result(replace(planned, history=()), as_json=as_json)
+        print_result(replace(planned, history=()), as_json=as_json)
         return 0
     with show_progress("ingest", quiet=quiet, as_json=as_json) as shown:
         several = False
@@ -96,7 +118,7 @@ def ingest(options: IngestOptions, *, dry_run: bool, as_json: bool, quiet: bool)
 
 def _list_outcome(result: IngestResult, store: Path | str, *, several: bool) -> Iterator[str]:
     """Yield what became of a log: of one alone with its findings, of several one line each, and what is broken."""
-    from tcpipe.cost.budget import format_budget
+    from tcpipe.cost.labels import format_budget
     from tcpipe.formats.finding_lines import describe_finding, format_findings, format_verdict
     from tcpipe.tables.findings import select_problems
 
@@ -177,3 +199,155 @@ def _print_known(summary: IngestSummary) -> None:
         )
     if acknowledged:
         print_line(f"{acknowledged} with acknowledged problems")
+
+
+@click.command()
+@click.argument("paths", nargs=-1, type=ONE_OF_SEVERAL, metavar="[STORE] [LOG...]")
+@store_option
+@recipe_option
+@robot_option("Robot profile that ingest is given.")
+@min_age_option("10m", "A log that was written to since (90, 90s, 10m, 2h, 1d) is growing.")
+@json_option
+def status(
+    paths: tuple[str, ...], *, store: str, recipe: str | None, robot: str | None, min_age_s: float, as_json: bool
+) -> int:
+    """Say of every log whether it is in the store, is still to be ingested, failed or grows, and why; and what the latest calls did.
+
+    Without LOG: of the logs and folders that the latest calls of ingest were given. Nothing of a log is read.
+
+    Exit code 3: a log failed, is damaged or gave no segment, a call was killed, a log waits for more than two nights, files of a run or
+    a commit are missing, and nobody acknowledged that (tcpipe acknowledge).
+    """
+    from tcpipe.formats.finding_lines import format_finding
+    from tcpipe.formats.object_storage import is_url
+    from tcpipe.pipeline.status import find_status as run
+    from tcpipe.store import is_store
+
+    if paths and is_store(paths[0]):
+        store, paths = paths[0], paths[1:]
+    elif paths and not is_url(store) and not Path(store).exists():
+        raise UsageError(f"{paths[0]}: there is no store here, nor one at {store}; name it with --store")
+    found = run(paths, store=store, recipe=resolve_recipe_with_source(recipe)[0], robot=robot, min_age_s=min_age_s)
+    if as_json:
+        print_json(found)
+        return found.exit_code
+    print_lines(found)
+    for finding in found.problems:
+        print_line(f"tcpipe: {format_finding(finding)}", err=True)
+    return found.exit_code
+
+
+@click.command()
+@click.argument("log", type=LOG, metavar="LOG")
+@robot_option()
+@recipe_option
+@msgdef_option
+@json_option
+@quiet_option
+def preflight(
+    log: str, *, robot: str | None, recipe: str | None, msgdef: str | None, as_json: bool, quiet: bool
+) -> int:
+    """Predict from LOG, a minute or more as it will be driven, what a day of such recording gives, and what to correct before.
+
+    Segments an hour, where the metres go, the deviations of labels, the verdict, findings with their remedies, and the command that
+    records what is needed. Nothing is written.
+
+    Exit codes: 0 ready; 3 there are warnings, errors or no segments; 1 ingesting it would fail.
+    """
+    from tcpipe.pipeline.preflight import preflight as run
+
+    with show_progress("preflight", quiet=quiet):
+        found = run(
+            log,
+            recipe=resolve_recipe_with_source(recipe)[0],
+            robot=robot,
+            message_definitions=Path(msgdef) if msgdef else None,
+        )
+    print_result(found, as_json=as_json)
+    return found.exit_code
+
+
+@click.command()
+@click.argument("names", nargs=-1, required=True, metavar="RUN|LOG|CALL...", shell_complete=complete_runs)
+@store_option
+@json_option
+def acknowledge(names: tuple[str, ...], *, store: str, as_json: bool) -> int:
+    """Acknowledge problems that somebody has looked at: damaged logs, runs without segments, failed logs. ingest reports them no more.
+
+    Acknowledge a call that was killed by the name that status prints, a log that waits and a damaged commit by its path.
+
+    A run of which files are missing is given up: the store no longer expects it.
+
+    This holds for this problem of this content: another problem, or other content, is reported.
+    """
+    from tcpipe.formats.finding_lines import describe_title
+    from tcpipe.pipeline.problems import acknowledge as run
+
+    found = run(names, store=store)
+    if as_json:
+        print_json(found)
+        return 0
+    for word, problems in (("acknowledged", found.acknowledged), ("acknowledged before", found.before)):
+        for problem in problems:
+            print_line(f"{word}: {problem.name}: {describe_title(problem.finding)} [{problem.finding.code}]")
+    if not found.acknowledged:
+        print_line("nothing to do: these problems are already acknowledged")
+    return 0
+
+
+@click.command()
+@store_option
+@recipe_option
+@click.option(
+    "--keep",
+    multiple=True,
+    metavar="RUN|RECIPE",
+    shell_complete=complete_runs,
+    help="Nothing of this run or recipe goes; repeatable.",
+)
+@click.option(
+    "--forget", multiple=True, metavar="DATASET", help="This dataset is gone; what it referred to may go; repeatable."
+)
+@min_age_option("1d", "What killed calls left is removed when it is so old (90, 90s, 10m, 2h, 1d).")
+@click.option("--dry-run", is_flag=True, help="Say what would be removed; do nothing.")
+@json_option
+def prune(
+    *,
+    store: str,
+    recipe: str | None,
+    keep: tuple[str, ...],
+    forget: tuple[str, ...],
+    min_age_s: float,
+    dry_run: bool,
+    as_json: bool,
+) -> int:
+    """Remove results of older recipes where the ruling one has its own, superseded runs, and what killed calls left.
+
+    Nothing goes that a dataset refers to, built from this store wherever it lies now, nor a directory that holds a file of somebody else.
+    """
+    from tcpipe.pipeline.prune import prune as run
+
+    found = run(
+        store=store,
+        recipe=resolve_recipe_with_source(recipe)[0],
+        keep=keep,
+        forget=forget,
+        min_age_s=min_age_s,
+        dry_run=dry_run,
+    )
+    print_result(found, as_json=as_json)
+    return 0
+
+
+@click.command()
+@click.argument("run", type=SEALED, metavar="RUN")
+@click.argument("out", type=OUTPUT_FILE, metavar="OUT.mcap")
+@json_option
+def overlay(run: str, out: str, *, as_json: bool) -> None:
+    """Write OUT.mcap from RUN (STORE/runs/ID), on the clock of its log: open both together in Foxglove, or OUT in Rerun or PlotJuggler.
+
+    It holds the fused track, segments with labels, what was dropped and why, and the measurements that were refused.
+    """
+    from tcpipe.pipeline.overlay import write_overlay as write
+
+    print_result(write(run, Path(out)), as_json=as_json)

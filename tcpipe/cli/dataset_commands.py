@@ -1,0 +1,225 @@
+"""Commands on maps, datasets and stores."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, cast
+
+import click
+
+from tcpipe.cli.options import (
+    GEOPACKAGE,
+    LOG,
+    OUTPUT_EXPORT,
+    PUBLISHED,
+    SEALED,
+    add_options,
+    json_option,
+    msgdef_option,
+    quiet_option,
+    store_option,
+)
+from tcpipe.cli.output import (
+    print_json,
+    print_line,
+    print_lines,
+    print_result,
+    resolve_recipe_with_source,
+    show_progress,
+)
+from tcpipe.errors import UsageError
+from tcpipe.pipeline.add_map_options import AddMapOptions
+from tcpipe.pipeline.dataset.build_dataset_options import BuildDatasetOptions
+
+if TYPE_CHECKING:
+    from tcpipe.pipeline.export import Exported
+
+
+@click.command("add-map")
+@add_options(AddMapOptions)
+@click.argument("strays", nargs=-1, metavar="")
+@json_option
+@quiet_option
+def add_map(options: AddMapOptions, *, strays: tuple[str, ...], as_json: bool, quiet: bool) -> None:
+    """Put rasters that need not share grid, resolution or CRS on one common grid, and add them to the store as NAME.
+
+    A raster is a GeoTIFF, JPEG 2000 or ERDAS Imagine file. One in many tiles is given as a pattern in quotes, --height 'dem/*.tif', or by
+    repeating the option; where tiles overlap, the last lies on top.
+    """
+    from tcpipe.pipeline.maps import run_add_map
+
+    if strays:
+        raise UsageError(f"{strays[0]}: belongs to no option; is a pattern without quotes? wanted --height 'dem/*.tif'")
+    with show_progress(f"map {options.name}", quiet=quiet):
+        added = run_add_map(options)
+    print_result(added, as_json=as_json)
+
+
+@click.command("build-dataset")
+@add_options(BuildDatasetOptions)
+@json_option
+@quiet_option
+def build_dataset(options: BuildDatasetOptions, *, as_json: bool, quiet: bool) -> int:
+    """Sample a rotated patch for every segment, split by region, and write the dataset to OUT (default: dataset).
+
+    A dataset that is there is built again from the runs of today if its options are the same; with others it is refused
+    unless --force is given.
+
+    Exit code 3: runs that belong in are left out or gone, or a split that was asked for is empty; each is a line with its remedy.
+    """
+    from tcpipe.pipeline.dataset.build import run_build_dataset
+
+    ruling, source = resolve_recipe_with_source(cast("str | None", options.recipe))
+    if not as_json:
+        print_line(f"recipe: {source}")
+    with show_progress("build-dataset", quiet=quiet) as shown:
+        result = run_build_dataset(replace(options, recipe=ruling))
+        shown.problem(*result.problem_lines())
+    if as_json:
+        print_json(replace(result, recipe=source))
+    else:
+        print_lines(result.without_problems())
+    return result.exit_code
+
+
+@click.command()
+@click.argument("path", type=SEALED, metavar="PATH")
+@click.option(
+    "--no-runs", is_flag=True, help="Of a store: its own page alone, which leads to those of the runs that are there."
+)
+@click.option(
+    "--patches",
+    is_flag=True,
+    help="Of a dataset: pictures of all its patches in a folder beside the page, which shows them.",
+)
+def report(path: str, *, no_runs: bool, patches: bool) -> None:
+    """Write report.html for PATH: a run directory, a dataset, or a store and each of its runs; and print the physics of each robot.
+
+    The page needs no network.
+    """
+    from tcpipe.pipeline.report import report as run
+
+    written = run(path, runs=not no_runs, patches=patches)
+    for page in written:
+        print_line(page.path)
+        for line in page.physics:
+            print_line(f"  {line}")
+    if not any(page.changed for page in written):
+        print_line("nothing to do: the pages are there as they would be written")
+
+
+@click.command()
+@click.argument("log", type=LOG, metavar="LOG|DATASET|STORE|RUN")
+@click.argument("names", nargs=-1, metavar="[TOPIC]...")
+@click.argument("out", type=OUTPUT_EXPORT, metavar="OUT")
+@click.option("--topics", multiple=True, metavar="NAME[,NAME]", help="Only these topics; repeatable (default: all).")
+@msgdef_option
+@json_option
+def export(
+    log: str, out: str, *, names: tuple[str, ...], topics: tuple[str, ...], msgdef: str | None, as_json: bool
+) -> int:
+    """Write topics of LOG to OUT as Parquet, one file a topic, one row a message, columns by dotted field name.
+
+    Units of columns and the definition of the message stand in the files' metadata. What OUT holds already of the same
+    log is left alone.
+
+    Of a dataset, a store or a run OUT is a GeoPackage (a name that ends in .gpkg; needs the extra gis): samples, footprints,
+    regions and where to drive next, or segments, with styles for QGIS.
+    """
+    import resource
+
+    if out.endswith(GEOPACKAGE):
+        from tcpipe.pipeline.layers import export_layers
+
+        if names or topics:
+            raise UsageError(f"{out}: a GeoPackage holds no topics; give a directory for them")
+        print_result(export_layers(log, Path(out)), as_json=as_json)
+        return 0
+    from tcpipe.pipeline.export import export as run
+
+    most = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
+    resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))  # the file of every topic is open at once
+    exported = run(log, Path(out), topics=(*topics, *names), message_definitions=Path(msgdef) if msgdef else None)
+    if as_json:
+        print_json(exported)
+    else:
+        _print(exported, log, out)
+    return exported.exit_code
+
+
+def _print(exported: Exported, log: str, out: str) -> None:
+
+    if exported.status == "unchanged":
+        count = len(exported.topics)
+        print_line(f"nothing to do: {count} of {count} topics of {log} are in {out} already")
+    else:
+        for of in exported.topics:
+            print_line(f"{of.messages:>9} messages  {of.topic}  {of.path}")
+        if not exported.topics:
+            print_line(f"nothing to export: {log} holds no topic")
+    for kind in ("damage", "remarks"):
+        for line in getattr(exported, kind):
+            print_line(f"{kind.rstrip('s')}: {line}", err=True)
+
+
+@click.command()
+@click.argument("sample_id", metavar="SAMPLE_ID")
+@click.option("--dataset", default="dataset", type=SEALED, metavar="DIR", help="The dataset that holds it.")
+@store_option
+@json_option
+@quiet_option
+def explain(sample_id: str, *, dataset: str, store: str, as_json: bool, quiet: bool) -> int:
+    """Trace SAMPLE_ID to its log, stamps, messages, gates nearby, map tiles and recipe, and make it again: exit code 1 if it differs."""
+    from tcpipe.pipeline.explain import explain as run
+
+    with show_progress("explain", quiet=quiet):
+        found = run(sample_id, dataset=dataset, store=store)
+    print_result(found, as_json=as_json)
+    return 1 if found.differences else 0
+
+
+@click.command()
+@click.argument("path", type=SEALED, metavar="PATH")
+@json_option
+def verify(path: str, *, as_json: bool) -> int:
+    """Re-read the dataset, run, store, map, model or cost map at PATH: compare counts, checksums, contracts.
+
+    Exit code 1: something is not as it was written.
+    """
+    from tcpipe.pipeline.verify import verify as run
+
+    found = run(path)
+    print_result(found, as_json=as_json)
+    return 1 if found.problems else 0
+
+
+@click.command()
+@click.argument("path", type=SEALED, metavar="PATH")
+@click.argument("to", type=PUBLISHED, required=False, metavar="[TO]")
+@json_option
+def migrate(path: str, to: str | None, *, as_json: bool) -> int:
+    """Bring the store, map or dataset at PATH from an earlier data model to this one, or a store to another place.
+
+    With TO, a directory or URL, the store at PATH stays as it is, and TO is one of this data model with the same content.
+
+    What is of this data model is left alone. A call that was killed is gone on with by calling it again.
+    """
+    from tcpipe.pipeline.migrate import migrate as run
+
+    found = run(path, to)
+    print_result(found, as_json=as_json)
+    return found.exit_code
+
+
+@click.command()
+@click.argument("a", type=SEALED, metavar="A")
+@click.argument("b", type=SEALED, metavar="B")
+@json_option
+def diff(a: str, b: str, *, as_json: bool) -> int:
+    """Name what changed from A to B and why (log, recipe key, map, region, code), with the labels' shift; exit code 1 if they differ."""
+    from tcpipe.pipeline.diff import diff as run
+
+    found = run(a, b)
+    print_result(found, as_json=as_json)
+    return 0 if found.same else 1

@@ -1,0 +1,164 @@
+"""Commands on models."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+from typing import TYPE_CHECKING
+
+import click
+
+from tcpipe.cli.options import OUTPUT_DIRECTORY, RenamedOption, add_options, jobs_option, json_option, quiet_option
+from tcpipe.cli.output import print_json, print_lines, print_result, show_progress
+from tcpipe.learning.evaluate_options import EvaluateOptions
+from tcpipe.learning.train_options import TrainOptions
+from tcpipe.planning.path_options import CostMapOptions, PlanPathOptions, PredictPathOptions
+
+if TYPE_CHECKING:
+    from tcpipe.formats.maps.map_files import MapFile
+    from tcpipe.planning.cost_model import CostModel
+
+
+@click.command()
+@add_options(TrainOptions)
+@json_option
+@quiet_option
+def train(options: TrainOptions, *, as_json: bool, quiet: bool) -> None:
+    """Train ResNet-18, stopped early by a fold of train, or a table on DATASET's patches and labels, and write the model folder OUT.
+
+    Needs an extra: pip install 'tcpipe[train]', or 'tcpipe[tables]' for a table. A network runs on a GPU when there is one; its training
+    goes on where it was stopped.
+    """
+    from tcpipe.api import run_train
+
+    with show_progress("train", quiet=quiet):
+        result = run_train(options)
+    print_result(result, as_json=as_json)
+
+
+@click.command()
+@add_options(EvaluateOptions)
+@json_option
+@quiet_option
+def evaluate(options: EvaluateOptions, *, as_json: bool, quiet: bool) -> None:
+    """Measure MODEL on DATASET's test samples and unseen area, and write evaluation.json, .csv and .html to OUT.
+
+    RMSE and MAPE of power, velocity, time and energy by terrain class; the ablation of the input layers; the baselines of Wei and
+    Isler and the expected time; what the labels' own noise allows; each beside the paper's own figures. Networks that it trains are
+    kept in OUT and used again; predictions.parquet holds every prediction. OUT may be a URL in a bucket, where each evaluation is a
+    generation.
+
+    With --drive: time and energy of whole drives, measured against predicted on the store's map, with intervals and figures, in
+    drives.json and drives.html of OUT; DATASET, that MODEL was trained on, tells whether a drive was held back.
+    """
+    from tcpipe.api import run_evaluate
+
+    with show_progress("evaluate", quiet=quiet):
+        result = run_evaluate(options)
+    if as_json:
+        print_json(result.values)
+    else:
+        print_lines(result)
+
+
+@click.command()
+@click.argument("directory", default="tcpipe-reproduction", type=OUTPUT_DIRECTORY, metavar="[DIR]")
+@click.option("--quick", is_flag=True, help="Minutes: a small site and a narrow network, to see it run.")
+@click.option("--seeds", default=1, type=click.IntRange(1, 100), help="Trainings; claims compare their means.")
+@jobs_option("Logs read")
+@click.option(
+    "--hidden-variance", "hidden", cls=RenamedOption, earlier="--hidden", default=1.0, type=click.FloatRange(0.0, 10.0), metavar="FACTOR",
+    help="Variance of the resistance that nothing shows, over that of the frozen site.",
+)  # fmt: skip
+@click.option(
+    "--baselines/--no-baselines", default=True,
+    help="Train the height-only networks of Wei and Isler, which take most of the time.",
+)  # fmt: skip
+@json_option
+@quiet_option
+def reproduce(
+    directory: str, *, quick: bool, seeds: int, jobs: int, hidden: float, baselines: bool, as_json: bool, quiet: bool
+) -> None:
+    """Simulate the paper's site, drive it, build the dataset, train, evaluate, and say which of the paper's claims hold.
+
+    Takes up to an hour and a half on two cores, and goes on from where it was stopped. The data are simulated: what is compared with the
+    paper is the pattern, not the figures. Writes reproduction.html, reproduction.json and everything behind them to DIR.
+    """
+    from tcpipe.learning.reproduction import reproduce as run
+
+    with show_progress("reproduce", quiet=quiet):
+        result = run(directory, quick=quick, seeds=seeds, jobs=jobs, hidden=hidden, baselines=baselines)
+    print_result(result, as_json=as_json)
+
+
+@click.command("predict-path")
+@add_options(PredictPathOptions)
+@json_option
+@quiet_option
+def predict_path(options: PredictPathOptions, *, as_json: bool, quiet: bool) -> int:
+    """Cut a path into pieces of a metre and predict the time and energy of each and of all, with intervals.
+
+    Pieces on ground where MODEL has no business (a class, slope or relief not seen in training, off the map, no data, not
+    traversable) are marked and counted. Exit code 3: some pieces have no cost.
+    """
+    from tcpipe.api import run_predict_path
+
+    with show_progress("predict-path", quiet=quiet):
+        result = run_predict_path(options)
+    print_result(result, as_json=as_json)
+    return result.exit_code
+
+
+@click.command("cost-map")
+@add_options(CostMapOptions)
+@json_option
+@quiet_option
+def cost_map(options: CostMapOptions, *, as_json: bool, quiet: bool) -> None:
+    """Predict power, velocity, time and energy a metre along 16 courses in every cell of a map.
+
+    Writes to OUT (default: cost-map) Cloud-Optimised GeoTIFFs with a band a course, the reasons where MODEL has no business, and
+    maps for Nav2. An interrupted call goes on where it was; OUT may be a URL in a bucket, where each map is a generation.
+    """
+    from tcpipe.planning.cost_map import Cluster, make_cost_map
+
+    cluster = options.cluster
+    if cluster is not None:  # its workers have another working directory
+        from tcpipe.formats.object_storage import make_absolute
+
+        options = replace(options, model=make_absolute(options.model), store=make_absolute(options.store))
+    with show_progress("cost-map", quiet=quiet) as shown:
+        result = make_cost_map(
+            *_load_inputs(options),
+            options.out,
+            step_m=options.step_m,
+            origin_deg=options.origin_deg,
+            step=shown.count,
+            cluster=None if cluster is None else Cluster(cluster, partial(_load_inputs, options)),
+        )
+    print_result(result, as_json=as_json)
+
+
+def _load_inputs(options: CostMapOptions) -> tuple[CostModel, MapFile]:
+    """Return the model and the map, wherever this is called."""
+    from tcpipe.learning.models import choose_model
+    from tcpipe.planning.inputs import choose_map
+
+    source = choose_map(options.store, options.map_name)
+    return choose_model(options.model, speed_mps=options.speed_mps), source
+
+
+@click.command("plan-path")
+@add_options(PlanPathOptions)
+@json_option
+@quiet_option
+def plan_path(options: PlanPathOptions, *, as_json: bool, quiet: bool) -> int:
+    """Find the path of least energy, time or distance between two points, over costs that depend on the direction of travel.
+
+    Exit code 3: some of the path has no cost, because --cell-size is large.
+    """
+    from tcpipe.api import run_plan_path
+
+    with show_progress("plan-path", quiet=quiet) as shown:
+        result = run_plan_path(replace(options, on_step=shown.count))
+    print_result(result, as_json=as_json)
+    return result.exit_code

@@ -1,0 +1,89 @@
+"""Commands that need no data: the demo, simulated sites, a recipe, the schemas."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from tcpipe.cli.options import OUTPUT_DIRECTORY, complete_scenarios, json_option, quiet_option, seed_option
+from tcpipe.cli.output import print_json, print_line, print_lines, show_progress
+from tcpipe.errors import UsageError
+
+
+@click.command()
+@click.argument("directory", default="tcpipe-demo", type=OUTPUT_DIRECTORY, metavar="[DIR]")
+@seed_option
+@quiet_option
+def demo(directory: str, *, seed: int, quiet: bool) -> None:
+    """Simulate a small site and two drives, run the whole pipeline on them, and say what to open.
+
+    Writes to DIR (default: tcpipe-demo): real .mcap and .bag logs, real GeoTIFFs, a store, a dataset and its report.
+    """
+    from tcpipe.pipeline.demo import run_demo
+
+    with show_progress("demo", quiet=quiet) as shown:
+        result = run_demo(Path(directory), seed=seed, say=shown.line)
+    print_lines(result)
+
+
+@click.command()
+@click.argument("directory", default=".", type=OUTPUT_DIRECTORY, metavar="[DIR]")
+def init(directory: str) -> None:
+    """Write tcpipe.toml, the recipe: every key with its default and its meaning, commented out."""
+    from tcpipe.formats.atomic import clear_beside, write_text
+    from tcpipe.formats.recipe_toml import FILE_NAME, format_commented_toml
+
+    path = Path(directory) / FILE_NAME
+    clear_beside(path)
+    if not path.exists():
+        write_text(path, format_commented_toml())
+        print_line(f"wrote {path}")
+    elif path.is_file() and path.read_bytes() == format_commented_toml().encode():
+        print_line(f"nothing to do: {path} is there already")
+    else:
+        raise UsageError(f"{path}: is there already and holds something else; it is never overwritten")
+
+
+@click.command()
+@click.argument("out", type=OUTPUT_DIRECTORY, metavar="OUT")
+@click.option(
+    "--scenario",
+    default="demo",
+    metavar="NAME",
+    shell_complete=complete_scenarios,
+    help="demo, hills12, paper, paper_quick, manoeuvres, tiny; see docs/reference/simulation.md.",
+)
+@seed_option
+@json_option
+@quiet_option
+def simulate(out: str, *, scenario: str, seed: int, as_json: bool, quiet: bool) -> None:
+    """Write a simulated site to OUT: real .mcap and .bag logs, real GeoTIFFs, and the truth behind them."""
+    from tcpipe.simulation import simulate as run
+
+    with show_progress("simulate", quiet=quiet):
+        site = run(Path(out), scenario=scenario, seed=seed)
+    if as_json:
+        print_json(site)
+    else:
+        for path in (*site.logs, *site.rasters.values(), site.region, *site.truths):
+            print_line(str(path))
+        if site.unchanged:
+            print_line(f"nothing to do: the site is in {out} already")
+
+
+@click.command()
+@click.argument("out", type=OUTPUT_DIRECTORY, metavar="OUT")
+def schemas(out: str) -> None:
+    """Write the contract of every table, document and --json answer, and of the recipe, as JSON Schema, one file each, to OUT."""
+    from tcpipe.cli.json_output import collect_contracts
+    from tcpipe.formats.atomic import clear, write_text
+
+    clear(Path(out))
+    wanted = {Path(out) / name: text for name, text in collect_contracts().items()}
+    missing = {path: text for path, text in wanted.items() if not path.is_file() or path.read_bytes() != text.encode()}
+    for path, text in missing.items():
+        write_text(path, text)
+    print_line(
+        f"wrote {len(missing)} schemas to {out}" if missing else f"nothing to do: {len(wanted)} schemas are in {out}"
+    )

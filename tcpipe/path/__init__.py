@@ -1,1 +1,0 @@
-"""Cutting a driven path into segments of one chord each."""

@@ -1,0 +1,194 @@
+"""docs/how-to/change-tcpipe.md: each row's places exist, and a small change there, in a copy of the package, has the stated effect."""
+
+import ast
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+ROWS = [
+    [cell.strip() for cell in line.strip("|").split(" | ")]
+    for line in (ROOT / "docs/how-to/change-tcpipe.md").read_text(encoding="utf-8").splitlines()
+    if re.match(r"\| .*\*\*", line)
+]
+PLACES = {
+    re.findall(r"\*\*(.+?)\*\*", row[0])[0]: re.findall(r"`(tcpipe/[\w/.]+)(?:: (\w+))?`", row[2]) for row in ROWS
+}
+NEW = {"tcpipe/robots/NAME.toml", "tcpipe/cli/NAME.py"}
+
+FIRST, REPLACE, APPEND, CREATE = "first statement", "replace", "append", "create"
+CHANGES = {
+    "threshold": ("FuseConfig", REPLACE, "= 0.999\n", "= 0.99\n"),
+    "outlier gate": ("find_chi_square_threshold", FIRST, "probability = 0.5"),
+    "check of a sensor": ("check_sensors", FIRST, "return 'mine'"),
+    "mask": ("mask_track", FIRST, "return 'mine'"),
+    "w, v, T, E and their σ": ("compute_labels", FIRST, "displacement_std_m = 2 * displacement_std_m"),
+    "column of segments": (
+        "LABELLED_SEGMENTS",
+        REPLACE,
+        "*MOTION_COLUMNS, *_LABEL_COLUMNS, LINE",
+        'Column("mine", _F64, "m", "mine"), *MOTION_COLUMNS, *_LABEL_COLUMNS, LINE',
+    ),
+    "column of samples": ("SAMPLES", REPLACE, 'Column("split",', 'Column("mine", _F64, "m", "mine"), Column("split",'),
+    "label flag": ("Quality", REPLACE, "    LOW_POWER_RATE =", "    MINE = 1 << 30\n    LOW_POWER_RATE ="),
+    "split's buffer": ("classify_footprints", FIRST, "buffer_m = 3.0"),
+    "layer": ("LAYERS", REPLACE, '"height")', '"height", "mine")'),
+    "robot": ("tcpipe/robots/NAME.toml", CREATE, "[robots.mine]\nmax_velocity_mps = 3.0\n"),
+    "power message": (
+        "tcpipe/robots/power_sources.toml",
+        APPEND,
+        '\n[[power_sources]]\ntype = "my_msgs/msg/Battery"\nvoltage = "volts"\ncurrent = "amps"\n',
+    ),
+    "log container": ("open_part", FIRST, "raise LogError('mine')"),
+    "finding": (
+        "tcpipe/tables/catalogue.toml",
+        APPEND,
+        '\n[mine]\ntitle = "Mine"\ntemplate = "{subject}: mine"\nseverity = "note"\ncause = "A test."\n',
+    ),
+    "command": ("_COMMANDS", REPLACE, '    "demo":', '    "mine": ("mine", "My command"),\n    "demo":'),
+    "command option": (
+        "IngestOptions",
+        REPLACE,
+        "    as_one: bool",
+        '    mine: bool = option(False, Option("Mine."))\n    as_one: bool',
+    ),
+    "plot of a page": ("time_plots", FIRST, "return 'mine'"),
+}
+"""By row: the name (or file) that is changed, and how."""
+
+EFFECTS = """
+import inspect, json
+from pathlib import Path
+import numpy as np, shapely
+from click.testing import CliRunner
+import tcpipe
+from tcpipe.cli import cli
+from tcpipe.cost.labels import compute_labels
+from tcpipe.errors import LogError
+from tcpipe.formats.robot_files import load_shipped_profiles
+from tcpipe.fusion.checks.sensors import check_sensors
+from tcpipe.fusion.gates import find_chi_square_threshold
+from tcpipe.recipe import Recipe
+from tcpipe.report.run_plots import time_plots
+from tcpipe.splits.regions import Regions, Side, classify_footprints
+from tcpipe.stages.mask import mask_track
+from tcpipe.tables.bits import Quality, flag_names
+from tcpipe.tables.catalogue import read_catalogue
+from tcpipe.tables.levels import LABELLED_SEGMENTS, SAMPLES
+from tcpipe.terrain.layers import LAYERS
+
+def call(function):
+    parameters = inspect.signature(function).parameters.values()
+    required = [parameter for parameter in parameters if parameter.default is parameter.empty]
+    return function(*[None for p in required if p.kind != p.KEYWORD_ONLY], **{p.name: None for p in required if p.kind == p.KEYWORD_ONLY})
+
+
+one = np.ones(1)
+labels = compute_labels(
+    chord_m=one, duration_s=one, energy_joule=one, end_velocity_mps=one, end_power_watt=one, displacement_std_m=one, energy_noise_joule=one
+)
+square = np.array([[[2.0, 2.0], [3.0, 2.0], [3.0, 3.0], [2.0, 3.0]]])
+Path("a.mcap").write_bytes(b"\\x89MCAP0\\r\\n" + bytes(100))
+try:
+    tcpipe.read_log("a.mcap")
+except LogError as error:
+    read = str(error)
+profiles = load_shipped_profiles()
+print(json.dumps({
+    "threshold": Recipe().fuse.gate_probability == 0.99,
+    "outlier gate": find_chi_square_threshold(1, 0.999) < 1.0,
+    "check of a sensor": call(check_sensors) == "mine",
+    "mask": call(mask_track) == "mine",
+    "w, v, T, E and their σ": bool(labels.duration_std_s[0] == 2.0),
+    "column of segments": "mine" in LABELLED_SEGMENTS.names(),
+    "column of samples": "mine" in SAMPLES.names(),
+    "label flag": flag_names(1 << 30, Quality) == ("mine",),
+    "split's buffer": int(classify_footprints(square, Regions(shapely.box(0, 0, 50, 50)), buffer_m=1.0)[0]) == int(Side.BUFFER),
+    "layer": "mine" in LAYERS,
+    "robot": profiles.robots["mine"].max_velocity_mps == 3.0,
+    "power message": profiles.power_sources[-1].type == "my_msgs/msg/Battery",
+    "log container": read == "mine",
+    "finding": read_catalogue()["mine"].title == "Mine",
+    "command": CliRunner().invoke(cli, ["mine"]).output == "mine\\n",
+    "command option": "--mine" in CliRunner().invoke(cli, ["ingest", "--help"]).output,
+    "plot of a page": call(time_plots) == "mine",
+}))
+"""
+
+
+def _edit(file: Path, name: str, kind: str, *texts: str) -> None:
+    """Make one change in a file of the copy."""
+    text = file.read_text(encoding="utf-8") if kind != CREATE else ""
+    if kind == FIRST:
+        (function,) = (
+            node for node in ast.walk(ast.parse(text)) if isinstance(node, ast.FunctionDef) and node.name == name
+        )
+        body = function.body[1] if ast.get_docstring(function) else function.body[0]
+        lines = text.splitlines(keepends=True)
+        lines.insert(body.lineno - 1, f"{' ' * body.col_offset}{texts[0]}\n")
+        text = "".join(lines)
+    elif kind == REPLACE:
+        assert text.count(texts[0]) == 1, f"{file}: {texts[0]!r} is there {text.count(texts[0])} times"
+        text = text.replace(*texts)
+    else:
+        text += texts[0]
+    file.write_text(text, encoding="utf-8")
+
+
+@pytest.fixture(scope="module")
+def effects(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bool]:
+    """What a changed copy of the package does, by row."""
+    directory = tmp_path_factory.mktemp("changed")
+    shutil.copytree(ROOT / "tcpipe", directory / "tcpipe", ignore=shutil.ignore_patterns("__pycache__"))
+    for row, (name, kind, *texts) in CHANGES.items():
+        file = next(file for file, known in PLACES[row] if name in (file, known))
+        _edit(directory / file.replace("NAME", "mine"), name, kind, *texts)
+    command = "import click\n\n\n@click.command()\ndef mine():\n    click.echo('mine')\n"
+    _edit(directory / "tcpipe/cli/mine.py", "", CREATE, command)
+    environment = os.environ | {"PYTHONPATH": str(directory), "NUMBA_DISABLE_JIT": "1"}
+    run = subprocess.run(
+        [sys.executable, "-c", EFFECTS], cwd=directory, env=environment, capture_output=True, text=True, check=False
+    )
+    assert run.returncode == 0, run.stderr
+    printed: dict[str, bool] = json.loads(run.stdout)
+    return printed
+
+
+@pytest.mark.parametrize("row", PLACES)
+def test_row_names_what_exists(row: str) -> None:
+    assert PLACES[row]
+    for file, name in PLACES[row]:
+        if file in NEW:
+            continue
+        assert (ROOT / file).exists(), file
+        if name:
+            nodes = list(ast.walk(ast.parse((ROOT / file).read_text(encoding="utf-8"))))
+            defined = {node.name for node in nodes if isinstance(node, ast.FunctionDef | ast.ClassDef)}
+            assigned = {node.id for node in nodes if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store)}
+            assert name in defined | assigned, f"{file}: {name}"
+
+
+@pytest.mark.parametrize("row", PLACES)
+def test_change_of_a_row_has_its_effect(row: str, effects: dict[str, bool]) -> None:
+    assert effects[row]
+
+
+def test_tests_of_the_rows_exist() -> None:
+    named = [path for row in ROWS for path in re.findall(r"`(tests/[\w/.]+)`", row[3])]
+    assert len(named) >= len(ROWS)
+    assert not [path for path in named if not (ROOT / path).exists()]
+
+
+def test_architecture_names_the_same_places() -> None:
+    page = (ROOT / "ARCHITECTURE.md").read_text(encoding="utf-8")
+    section = page.split("## Where do I change", 1)[1].split("\n## ", 1)[0]
+    places = set(re.findall(r"`([\w/.]+\.\w+)(?:: [\w, ]+)?`", section))
+    known = {file.removeprefix("tcpipe/") for row in PLACES.values() for file, _ in row}
+    assert len(places) >= 10
+    assert places <= known
