@@ -78,11 +78,15 @@ def test_even_a_quick_network_learns_that_slope_costs_time(reproduced):
 def test_again_is_nothing_to_do(reproduced):
     here, first = reproduced
     before = (here / "here" / "reproduction.json").read_bytes()
-    again = tcpipe("reproduce", "here", "--quick", cwd=here, env=ENV)
+    again = tcpipe(
+        "reproduce", "here", "--quick", "--seeds", "1", "--hidden-variance", "1", "--jobs", "2", cwd=here, env=ENV
+    )
     assert again.returncode == 0
     assert "epoch" not in again.stderr
     assert (here / "here" / "reproduction.json").read_bytes() == before
     assert again.stdout.splitlines()[:-2] == first.stdout.splitlines()[:-2]
+    as_json = tcpipe("reproduce", "here", "--quick", "--json", "--quiet", cwd=here, env=ENV)
+    assert json.loads(as_json.stdout)["claims"] == json.loads(before)["claims"]
 
 
 def test_without_baselines_their_claims_are_not_measured(reproduced, tmp_path):
