@@ -21,8 +21,7 @@ import pyproj
 from tcpipe import ingest
 from tcpipe.formats.recipe_toml import load_recipe
 from tcpipe.formats.stored_runs import RunDirectory
-from tcpipe.geometry.angles import wrap_to_pi
-from tcpipe.geometry.rotation import rpy_from_quat
+from tcpipe.geometry.rotation import rpy_from_quat, wrap_to_pi
 from tcpipe.simulation import Truth, compute_true_cost, read_truth, simulate
 from tcpipe.store import Store
 from tcpipe.tables.columns import to_floats, to_integers

@@ -26,7 +26,6 @@ from tcpipe import ingest
 from tcpipe.cost.physics import ALL, FitSamples, fit_physics
 from tcpipe.cost.prediction_errors import fit_bias_correction, fit_errors
 from tcpipe.formats.recipe_toml import load_recipe
-from tcpipe.learning.forest import grow
 from tcpipe.learning.metrics import (
     LEAST,
     LEAST_VELOCITY_MPS,
@@ -36,6 +35,7 @@ from tcpipe.learning.metrics import (
     compute_errors,
     label_floor,
 )
+from tcpipe.learning.table_model import grow
 from tcpipe.simulation import find_scenario
 from tcpipe.store import Store
 from tcpipe.tables.columns import to_floats

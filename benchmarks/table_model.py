@@ -12,8 +12,7 @@ import time
 
 import numpy as np
 
-from tcpipe.learning.patch_features import patch_features
-from tcpipe.learning.table_model import fit_table
+from tcpipe.learning.table_model import fit_table, patch_features
 
 WANTED_S, WANTED_A_SECOND = 20.0, 200_000
 TOGETHER, TOLD = 1_000, 100_000

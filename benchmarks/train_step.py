@@ -15,10 +15,8 @@ import numpy as np
 import torch
 
 from tcpipe.dataset import open_dataset
-from tcpipe.learning.architecture import Architecture
-from tcpipe.learning.losses import compute_loss_factors
-from tcpipe.learning.network import make_resnet18
-from tcpipe.learning.trainer import Trainer
+from tcpipe.learning.architecture import Architecture, compute_loss_factors
+from tcpipe.learning.network import Trainer, make_resnet18
 from tcpipe.learning.training import Variant, make_training_task
 
 STEPS, BATCH = 10, 64

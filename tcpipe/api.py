@@ -10,17 +10,15 @@ from dataclasses import fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol, cast, overload
 
-from tcpipe.learning.evaluate_options import EvaluateOptions
-from tcpipe.learning.train_options import TrainOptions
+from tcpipe.learning.model_options import EvaluateOptions, TrainOptions
 from tcpipe.planning.path_options import PlanPathOptions, PredictPathOptions
 from tcpipe.tables.options import as_function
 
 if TYPE_CHECKING:
     from tcpipe.learning.evaluation_files import EvaluationResult
     from tcpipe.learning.training import TrainResult
-    from tcpipe.planning.drive_files import DrivesResult
-    from tcpipe.planning.path_files import PathResult
-    from tcpipe.planning.plan_files import PlanResult
+    from tcpipe.planning.drives import DrivesResult
+    from tcpipe.planning.path_files import PathResult, PlanResult
 
 
 def run_train(options: TrainOptions) -> TrainResult:
@@ -83,8 +81,8 @@ def run_evaluate(options: EvaluateOptions) -> EvaluationResult | DrivesResult:
         from tcpipe.dataset import open_dataset
         from tcpipe.learning.models import load_model
         from tcpipe.learning.predictions import check_origin
-        from tcpipe.planning.drive_files import evaluate_drives
-        from tcpipe.planning.inputs import choose_map
+        from tcpipe.planning.drives import evaluate_drives
+        from tcpipe.planning.path_files import choose_map
 
         loaded, data = load_model(model), open_dataset(dataset)
         check_origin(loaded.card, data, str(model))
@@ -108,7 +106,7 @@ def run_predict_path(options: PredictPathOptions) -> PathResult:
     prints. Raises `PathError`, `ModelError`, `MapError`, `StoreError` or `UsageError` where an input cannot be used.
     """
     from tcpipe.learning.models import choose_model
-    from tcpipe.planning.inputs import choose_map
+    from tcpipe.planning.path_files import choose_map
     from tcpipe.planning.path_files import predict_path as run
 
     source = choose_map(options.store, options.map_name)
@@ -127,8 +125,7 @@ def run_plan_path(options: PlanPathOptions) -> PlanResult:
     """
     from tcpipe.formats.bucket_directories import fetch_directory
     from tcpipe.learning.models import choose_model
-    from tcpipe.planning.inputs import choose_map
-    from tcpipe.planning.plan_files import PlanRequest, plan
+    from tcpipe.planning.path_files import PlanRequest, choose_map, plan
     from tcpipe.recipe.checking import from_values
 
     asked = {name: getattr(options, name) for name in ("objective", "step_m", "allow_unseen")}

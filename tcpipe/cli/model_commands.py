@@ -10,8 +10,7 @@ import click
 
 from tcpipe.cli.options import OUTPUT_DIRECTORY, RenamedOption, add_options, jobs_option, json_option, quiet_option
 from tcpipe.cli.output import print_json, print_lines, print_result, show_progress
-from tcpipe.learning.evaluate_options import EvaluateOptions
-from tcpipe.learning.train_options import TrainOptions
+from tcpipe.learning.model_options import EvaluateOptions, TrainOptions
 from tcpipe.planning.path_options import CostMapOptions, PlanPathOptions, PredictPathOptions
 
 if TYPE_CHECKING:
@@ -84,7 +83,7 @@ def reproduce(
     Takes up to an hour and a half on two cores, and goes on from where it was stopped. The data are simulated: what is compared with the
     paper is the pattern, not the figures. Writes reproduction.html, reproduction.json and everything behind them to DIR.
     """
-    from tcpipe.learning.reproduction import reproduce as run
+    from tcpipe.experiment.reproduction import reproduce as run
 
     with show_progress("reproduce", quiet=quiet):
         result = run(directory, quick=quick, seeds=seeds, jobs=jobs, hidden=hidden, baselines=baselines)
@@ -141,7 +140,7 @@ def cost_map(options: CostMapOptions, *, as_json: bool, quiet: bool) -> None:
 def _load_inputs(options: CostMapOptions) -> tuple[CostModel, MapFile]:
     """Return the model and the map, wherever this is called."""
     from tcpipe.learning.models import choose_model
-    from tcpipe.planning.inputs import choose_map
+    from tcpipe.planning.path_files import choose_map
 
     source = choose_map(options.store, options.map_name)
     return choose_model(options.model, speed_mps=options.speed_mps), source

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from tcpipe.fusion import ukf15_kernel as kernel
 from tcpipe.fusion.ukf15_events import ACCEPTED, RECOVERED, REJECTED, Events, FilterState, Outputs, Sources
-from tcpipe.geometry.angles import wrap_to_pi
+from tcpipe.geometry.rotation import wrap_to_pi
 
 _ANGLE_ENTRIES = (kernel.ROLL, kernel.PITCH, kernel.YAW)
 _Array = NDArray[np.float64]

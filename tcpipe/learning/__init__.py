@@ -1,5 +1,5 @@
-"""What a dataset is for: the paper's network, its training, its evaluation, and the paper's whole experiment (extra ``train``).
+"""A reference trainer for datasets: models, their training and their evaluation (extras ``train`` and ``tables``).
 
-`training.train` makes a model folder, `models.load_model` reads it, `evaluation.evaluate` measures it, `reproduction.reproduce` does all
-from a simulated site on. Torch is imported when a network is made or asked, never before.
+`training.train` writes a model folder, `models.load_model` reads it, `evaluation.evaluate` measures it. Torch is imported only where a
+network is created or used.
 """

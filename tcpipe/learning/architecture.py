@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
 
 from tcpipe.errors import ModelError
 from tcpipe.formats.weights import ArrayForm
@@ -64,3 +69,20 @@ def check_trainable(shape: Architecture) -> None:
         )
     if not (0 < shape.depth + shape.beside <= _MOST_INPUTS and 0 < shape.outputs <= _MOST_INPUTS):
         raise ModelError(f"a network of {shape.depth} channels, {shape.beside} numbers and {shape.outputs} outputs")
+
+
+Loss = Literal["nrmse", "paper_eq4"]
+Floats = NDArray[np.float32]
+
+_SMALLEST = 1e-12
+"""Under the root, so that a perfect sample has a slope."""
+
+
+def compute_loss_factors(loss: Loss, scale: Sequence[float]) -> Floats:
+    """Return the factor of each output's squared error over its maximum, shape (outputs,)."""
+    return np.array(scale, np.float32) if loss == "paper_eq4" else np.ones(len(scale), np.float32)
+
+
+def mean_loss(predicted: Any, labels: Any, factors: Any, weights: Any) -> Any:
+    """Return the loss of predictions, arrays or torch's tensors of shape (N, outputs), but for ``factors``, (outputs,)."""
+    return ((((predicted - labels) ** 2 * factors * weights).sum(1) + _SMALLEST) ** 0.5).mean()

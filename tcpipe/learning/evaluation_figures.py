@@ -16,7 +16,7 @@ from tcpipe.dataset import Dataset
 from tcpipe.formats.json_files import Json
 from tcpipe.learning.evaluation_facts import Plotted
 from tcpipe.learning.metrics import QUANTITIES, UNITS
-from tcpipe.learning.predicted_samples import (
+from tcpipe.learning.predictions import (
     LEVELS,
     compute_calibration,
     compute_errors_joule,
@@ -278,7 +278,7 @@ def _draw_by_patch(told: Plotted, quantity: str, label: str) -> list[Plot]:
     )  # fmt: skip
     errors = make_plot(
         f"patch errors {quantity}", alt="Their absolute error in percent.", axes=("", "absolute error [%]"),
-        tools="xpan,xwheel_zoom,reset,save", tooltips=tips, beside=values, waits=True,
+        tools="xpan,xwheel_zoom,reset,save", tooltips=tips, x_range=values.figure.x_range, waits=True,
     )  # fmt: skip
     for name, colour in legend.items():
         values.figure.line("patch", name, source=source, color=colour, line_width=1.5)

@@ -198,7 +198,7 @@ class Model:
         numbers = standardize_features(self.card.beside, beside or empty_extra_features(len(patches)))
         if kind == "resnet18":
             return self.network.predict(append_planes(patches, numbers)) * np.array(self.card.scale, np.float32)
-        from tcpipe.learning.patch_features import patch_features  # noqa: PLC0415  where it is needed, as is the next
+        from tcpipe.learning.table_model import patch_features  # noqa: PLC0415  where it is needed, as is the next
 
         out = np.empty((len(patches), len(self.card.scale)), np.float32)
         for first in range(0, len(patches), _TOGETHER):

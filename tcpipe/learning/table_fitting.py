@@ -11,12 +11,18 @@ from numpy.typing import NDArray
 
 from tcpipe.dataset import Split
 from tcpipe.dataset.extra_features import read_extra_features, standardize_features
-from tcpipe.learning.checkpoint import TrainingProgress
-from tcpipe.learning.fitting import FitConfig, Fitted, Task, TrainingTimes, collect_labels, label_scale
-from tcpipe.learning.losses import compute_loss_factors, mean_loss
-from tcpipe.learning.patch_features import Floats, patch_features
+from tcpipe.learning.architecture import compute_loss_factors, mean_loss
+from tcpipe.learning.fitting import (
+    FitConfig,
+    Fitted,
+    Task,
+    TrainingProgress,
+    TrainingTimes,
+    collect_labels,
+    label_scale,
+)
 from tcpipe.learning.physics_model import find_idle_power, fit_physics_model
-from tcpipe.learning.table_model import fit_table
+from tcpipe.learning.table_model import Floats, fit_table, patch_features
 
 logger = logging.getLogger("tcpipe")
 

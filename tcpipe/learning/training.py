@@ -21,14 +21,22 @@ from tcpipe.formats.dataset_files import is_shard, read_card
 from tcpipe.formats.json_files import digest, read_json
 from tcpipe.formats.object_storage import is_url
 from tcpipe.learning.architecture import Architecture
-from tcpipe.learning.checkpoint import read_checkpoint
-from tcpipe.learning.fitting import FitConfig, Fitted, ModelKind, Task, TrainingTimes, collect_labels, fit
+from tcpipe.learning.fitting import (
+    FitConfig,
+    Fitted,
+    ModelKind,
+    Task,
+    TrainingTimes,
+    collect_labels,
+    fit,
+    read_checkpoint,
+)
 from tcpipe.learning.model_card import KIND, ModelCard, TrainedOn, Training, TrainingRange, is_current
 from tcpipe.learning.model_readme import model_readme
 from tcpipe.learning.models import CARD, FILES, load_model, read_model_card, write_model
 from tcpipe.pipeline.generations import write_generation
 from tcpipe.terrain.classes import NODATA_ID, PAPER_CLASSES, ClassTable
-from tcpipe.terrain.relief import compute_relief_m
+from tcpipe.terrain.sampling import compute_relief_m
 
 logger = logging.getLogger("tcpipe")
 

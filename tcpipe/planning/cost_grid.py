@@ -6,6 +6,7 @@ way.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
@@ -14,14 +15,69 @@ from numpy.typing import NDArray
 
 from tcpipe.errors import MapError
 from tcpipe.planning.cost_model import CostModel
-from tcpipe.planning.courses import COURSES, DIRECTIONS
-from tcpipe.planning.no_cost_reasons import NO_COST, Bits, Reason
-from tcpipe.planning.segment_predictions import BATCH, SegmentPredictions, predict_segments
+from tcpipe.planning.segment_predictions import BATCH, NO_COST, Bits, Reason, SegmentPredictions, predict_segments
 from tcpipe.terrain.grid import MapGrid
 from tcpipe.terrain.patches import PatchFrames
-from tcpipe.terrain.point_classes import find_classes_at
 from tcpipe.terrain.projection import make_metres_from_plane, parse_crs
+from tcpipe.terrain.sampling import find_classes_at
 from tcpipe.terrain.tiles import CACHED_TILES, MapReader, level_for
+
+COURSES = 16
+
+MAX_DETOUR = 1.0 / math.cos(math.atan2(1.0, 2.0) / 2.0)
+"""How much longer than the straight line a path of steps can be, at most, on open ground."""
+
+_FIRST_QUARTER = ((1, 0), (2, 1), (1, 1), (1, 2))
+"""East and north in cells."""
+
+
+def _list_moves() -> NDArray[np.int64]:
+    moves = np.array(_FIRST_QUARTER)
+    quarters = [moves]
+    for _ in range(3):
+        moves = np.stack([-moves[:, 1], moves[:, 0]], axis=1)
+        quarters.append(moves)
+    return np.concatenate(quarters)
+
+
+MOVES = _list_moves()
+"""East and north of each course's step, in cells, shape (16, 2)."""
+
+DIRECTIONS = MOVES / np.linalg.norm(MOVES, axis=1)[:, None]
+"""Unit vectors of the courses in the grid's plane, shape (16, 2)."""
+
+ANGLES_DEG = np.degrees(np.arctan2(DIRECTIONS[:, 1], DIRECTIONS[:, 0])) % 360.0
+"""Counter-clockwise from the grid's east [deg], shape (16,)."""
+
+
+@dataclass(frozen=True, slots=True)
+class CrossedCell:
+    """A cell that a step touches: east and north of where it begins, in cells, and the share of the step that lies in it.
+
+    A share of 0 is a corner: the step only touches it, but a robot has a width.
+    """
+
+    east: int
+    north: int
+    share: float
+
+
+def find_crossed_cells(course: int) -> tuple[CrossedCell, ...]:
+    """Return the cells that a step along a course touches, the first and the last included."""
+    east, north = MOVES[course].tolist()
+    side_e, side_n = (east > 0) - (east < 0), (north > 0) - (north < 0)
+    if abs(east) + abs(north) == 1:
+        return CrossedCell(0, 0, 0.5), CrossedCell(east, north, 0.5)
+    if abs(east) == abs(north):
+        return (
+            CrossedCell(0, 0, 0.5),
+            CrossedCell(side_e, 0, 0.0),
+            CrossedCell(0, side_n, 0.0),
+            CrossedCell(east, north, 0.5),
+        )
+    middle = CrossedCell(side_e, 0, 0.25) if abs(east) == 2 else CrossedCell(0, side_n, 0.25)
+    return CrossedCell(0, 0, 0.25), middle, CrossedCell(side_e, side_n, 0.25), CrossedCell(east, north, 0.25)
+
 
 Floats32 = NDArray[np.float32]
 Cells = NDArray[np.int64]

@@ -38,12 +38,20 @@ from tcpipe.formats.maps.map_files import MapFile
 from tcpipe.formats.maps.nav2 import HIGHEST, LETHAL, write_nav2_map
 from tcpipe.formats.object_storage import is_url
 from tcpipe.pipeline.generations import write_generation
-from tcpipe.planning.cost_grid import BARRED, CellFrames, Cells, CostGrid, iterate_blocks, make_empty_grid, make_grid
+from tcpipe.planning.cost_grid import (
+    ANGLES_DEG,
+    BARRED,
+    COURSES,
+    CellFrames,
+    Cells,
+    CostGrid,
+    iterate_blocks,
+    make_empty_grid,
+    make_grid,
+)
 from tcpipe.planning.cost_model import CostModel, check_model
-from tcpipe.planning.courses import ANGLES_DEG, COURSES
-from tcpipe.planning.no_cost_reasons import Reason
 from tcpipe.planning.path_cost import find_projection
-from tcpipe.planning.segment_predictions import SegmentPredictions, predict_segments
+from tcpipe.planning.segment_predictions import Reason, SegmentPredictions, predict_segments
 from tcpipe.tables.bits import flag_name
 from tcpipe.terrain.grid import MapGrid
 

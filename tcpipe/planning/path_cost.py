@@ -19,11 +19,17 @@ from tcpipe.errors import PathError, UsageError
 from tcpipe.formats.atomic import write_atomic_file
 from tcpipe.formats.json_files import write_json
 from tcpipe.formats.parquet import write_table
-from tcpipe.geometry.angles import wrap_to_pi
+from tcpipe.geometry.rotation import wrap_to_pi
 from tcpipe.planning.cost_model import CostModel, check_model
-from tcpipe.planning.no_cost_reasons import Reason, count_reasons
-from tcpipe.planning.segment_predictions import SegmentPredictions, iterate_batches, join_predictions, predict_segments
-from tcpipe.planning.turning import compute_turns, find_turning
+from tcpipe.planning.search import compute_turns, find_turning
+from tcpipe.planning.segment_predictions import (
+    Reason,
+    SegmentPredictions,
+    count_reasons,
+    iterate_batches,
+    join_predictions,
+    predict_segments,
+)
 from tcpipe.tables.bits import flag_names
 from tcpipe.tables.columns import Column, TableSchema
 from tcpipe.terrain.patches import PatchFrames, compute_footprints, count_corners_on, patch_frames

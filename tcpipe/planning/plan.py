@@ -19,9 +19,7 @@ from numpy.typing import NDArray
 
 from tcpipe.errors import PathError
 from tcpipe.formats.json_files import convert_record
-from tcpipe.planning.cost_grid import BARRED, LazyCostGrid, Mask
-from tcpipe.planning.courses import COURSES
-from tcpipe.planning.no_cost_reasons import Reason
+from tcpipe.planning.cost_grid import BARRED, COURSES, LazyCostGrid, Mask
 from tcpipe.planning.path_cost import PathCost, PathTotals, compute_path_cost, describe_off_map, find_projection
 from tcpipe.planning.search import (
     LeastCostPath,
@@ -29,13 +27,15 @@ from tcpipe.planning.search import (
     compute_least_costs,
     find_best_potential,
     find_least_cost_path,
+    find_least_turning_path,
+    find_turning,
     make_steps,
 )
+from tcpipe.planning.segment_predictions import Reason
 from tcpipe.planning.shortcuts import straighten_path
-from tcpipe.planning.turning import find_least_turning_path, find_turning
 from tcpipe.tables.bits import flag_names
 from tcpipe.terrain.classes import NODATA_ID
-from tcpipe.terrain.point_classes import find_classes_at
+from tcpipe.terrain.sampling import find_classes_at
 
 logger = logging.getLogger("tcpipe")
 

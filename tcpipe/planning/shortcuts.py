@@ -7,12 +7,88 @@ never costs more than the steps, and crosses no cell that they could not.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.planning.cost_grid import CostGrid
-from tcpipe.planning.courses import ANGLES_DEG
-from tcpipe.planning.straight_kernel import SAMPLES_A_CELL, find_best_lines
+from tcpipe.compiled import compile_kernel
+from tcpipe.planning.cost_grid import ANGLES_DEG, CostGrid
+
+SAMPLES_A_CELL = 4
+
+
+@compile_kernel
+def find_best_lines(  # noqa: PLR0917
+    per_metre: NDArray[np.float32],
+    open_: NDArray[np.bool_],
+    angles: NDArray[np.float64],
+    metres: NDArray[np.float64],
+    points: NDArray[np.float64],
+    window: int,
+    so_far: NDArray[np.float64],
+    before: NDArray[np.int64],
+) -> None:
+    """Find, for each point of a path, the earlier one from which a straight line to it makes the path so far cheapest.
+
+    Parameters
+    ----------
+    per_metre, open_
+        Cost a metre, and whether it may be driven, shape (16, rows, cols).
+    angles, metres
+        Directions of the courses, counter-clockwise from the grid's east [rad], rising from 0, and ground metres a cell along each, (16,).
+    points
+        x along columns, y along rows [cells], centres are integers, shape (P, 2).
+    window
+        How many points back a line may begin.
+    so_far, before
+        Out, shape (P,): cost from the first point, and the point that the last line begins at. A line between neighbours is always
+        allowed: it is a step of the path.
+    """
+    so_far[0], before[0] = 0.0, 0
+    for j in range(1, points.shape[0]):
+        so_far[j] = np.inf
+        for i in range(max(j - window, 0), j):
+            cost = so_far[i] + _compute_line_cost(per_metre, open_, angles, metres, points[i], points[j], i == j - 1)
+            if cost < so_far[j] - 1e-9 * abs(so_far[j]) or (so_far[j] == np.inf and cost < np.inf):
+                so_far[j], before[j] = cost, i
+
+
+@compile_kernel
+def _compute_line_cost(  # noqa: PLR0917
+    per_metre: Any, open_: Any, angles: Any, metres: Any, begin: Any, end: Any, is_step: Any
+) -> float:
+    """Return the cost of a straight line, of its course by interpolation between the two nearest; infinite where it may not be driven."""
+    east, north = end[0] - begin[0], begin[1] - end[1]
+    length = np.hypot(east, north)
+    if length == 0.0:
+        return 0.0
+    angle = np.arctan2(north, east) % (2.0 * np.pi)
+    low = np.searchsorted(angles, angle, side="right") - 1
+    high = (low + 1) % angles.size
+    gap = (angles[high] - angles[low]) % (2.0 * np.pi)
+    share = ((angle - angles[low]) % (2.0 * np.pi)) / gap
+    count = int(np.ceil(length * SAMPLES_A_CELL))
+    total = 0.0
+    for k in range(count):
+        t = (k + 0.5) / count
+        col = int(np.floor(begin[0] + t * east + 0.5))
+        row = int(np.floor(begin[1] - t * north + 0.5))
+        if not is_step and (
+            (share < 0.999 and not open_[low, row, col]) or (share > 0.001 and not open_[high, row, col])
+        ):
+            return np.inf
+        a, b = per_metre[low, row, col], per_metre[high, row, col]
+        if a != a:  # not known  # noqa: PLR0124
+            a = b
+        if b != b:  # noqa: PLR0124
+            b = a
+        total += (1.0 - share) * a + share * b
+    if total != total:  # a step from ground of which nothing is known  # noqa: PLR0124
+        return np.inf
+    scale = (1.0 - share) * metres[low] + share * metres[high]
+    return float(total / count * length * scale)
+
 
 _MOST_SAMPLES = 3e8
 _PASSES = 4

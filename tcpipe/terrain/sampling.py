@@ -10,10 +10,31 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tcpipe.compiled import compile_kernel
 from tcpipe.terrain.layers import HEIGHT_STEP_M, STACKS, group_stacks
 from tcpipe.terrain.patches import PatchFrames, map_px_from_patch, sample_chord_px
-from tcpipe.terrain.sampling_kernel import Ground, Stacks, sample_tiles
-from tcpipe.terrain.tiles import MapReader, TilePool, group_by_tile, level_for
+from tcpipe.terrain.sampling_kernel import HEIGHT_NODATA, Ground, Stacks, sample_tiles
+from tcpipe.terrain.tiles import MapReader, TilePool, group_by_tile, level_for, read_window
+
+
+def compute_relief_m(height: NDArray[np.uint16]) -> NDArray[np.float64]:
+    """Return the largest difference of the stored heights of patches, shape (N, px, px), without data left out [m], shape (N,)."""
+    steps = np.empty(len(height), np.uint16)
+    _find_relief_steps(height, steps)
+    return steps.astype(np.float64) * HEIGHT_STEP_M
+
+
+@compile_kernel
+def _find_relief_steps(height: NDArray[np.uint16], out: NDArray[np.uint16]) -> None:
+    """Write the largest stored height of each patch, shape (N, px, px), to ``out``, (N,): they are above its lowest pixel."""
+    flat = height.reshape(height.shape[0], -1)
+    for n in range(flat.shape[0]):
+        most = np.uint16(0)
+        for k in range(flat.shape[1]):
+            value = flat[n, k] if flat[n, k] != HEIGHT_NODATA else np.uint16(0)
+            most = max(most, value)
+        out[n] = most
+
 
 _MOVED_ROWS = 128
 """Patches moved at once: they stay in the processor's cache on the way."""
@@ -126,3 +147,28 @@ def _compute_boxes(
     touched = np.stack([first, first + along, first + down, first + along + down, begin, end])[..., ::-1]
     low, high = np.floor(touched.min(axis=0)) - 1, np.floor(touched.max(axis=0)) + 3
     return np.hstack([low, high]).astype(np.int64)
+
+
+OFF_THE_MAP = -1
+"""Instead of a class id where a point is not on the map."""
+
+
+def find_classes_at(source: MapReader, xy_m: NDArray[np.float64]) -> NDArray[np.int16]:
+    """Return the class id under each point, 0 without data, `OFF_THE_MAP` where the map ends, shape (N,).
+
+    Parameters
+    ----------
+    source : a map with a terrain layer.
+    xy_m : points in the map's CRS [m], shape (N, 2); what is not finite is off the map.
+    """
+    found = np.full(len(xy_m), OFF_THE_MAP, np.int16)
+    finite = np.flatnonzero(np.isfinite(xy_m).all(axis=1))
+    on = finite[source.grid.contains(xy_m[finite])]
+    px = source.grid.px_from_xy(xy_m[on])
+    for group in group_by_tile(px, source):
+        col, row = np.floor(px[group] + 0.5).astype(np.int64).T
+        col, row = np.clip(col, 0, source.grid.cols - 1), np.clip(row, 0, source.grid.rows - 1)
+        top, left = int(row.min()), int(col.min())
+        window = read_window(source, "terrain", top, int(row.max()) + 1, left, int(col.max()) + 1)
+        found[on[group]] = window[row - top, col - left]
+    return found

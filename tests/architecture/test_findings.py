@@ -28,9 +28,8 @@ PRINTERS = {
     "tcpipe/pipeline/preflight.py",
     "tcpipe/pipeline/status.py",
     "tcpipe/pipeline/report.py",
-    "tcpipe/planning/drive_files.py",
+    "tcpipe/planning/drives.py",
     "tcpipe/planning/path_files.py",
-    "tcpipe/planning/plan_files.py",
 }
 """Modules beside cli/ and report/ that print an answer, or group findings for a page."""
 

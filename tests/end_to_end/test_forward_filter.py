@@ -5,8 +5,7 @@ import pytest
 
 from tcpipe.formats.logs.log_file import open_log
 from tcpipe.formats.recipe_toml import load_shipped_profiles
-from tcpipe.geometry.angles import wrap_to_pi
-from tcpipe.geometry.rotation import rpy_from_quat
+from tcpipe.geometry.rotation import rpy_from_quat, wrap_to_pi
 from tcpipe.recipe import FuseConfig, ReadConfig
 from tcpipe.simulation import Faults, make_tiny, read_truth, simulate
 from tcpipe.stages.fuse import fuse_run

@@ -15,8 +15,7 @@ from scipy.interpolate import CubicHermiteSpline
 
 import tcpipe as package
 from tcpipe.formats.stored_runs import RunDirectory
-from tcpipe.geometry.angles import wrap_to_pi
-from tcpipe.geometry.rotation import rpy_from_quat
+from tcpipe.geometry.rotation import rpy_from_quat, wrap_to_pi
 from tcpipe.simulation import SimulatedSite, compute_true_cost, find_scenario, read_truth, simulate
 from tcpipe.store import Store
 from tcpipe.tables.bits import DropReason

@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 
 from tcpipe.errors import ModelError
-from tcpipe.learning.architecture import Architecture
-from tcpipe.learning.losses import compute_loss_factors
+from tcpipe.learning.architecture import Architecture, compute_loss_factors
 
 pytest.importorskip("torch")
 
@@ -34,8 +33,7 @@ def _drawn(rng, name, shape):
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: f"{case['patch_px']}px")
 def test_it_is_the_network_of_keras(case):
-    from tcpipe.learning.network import make_resnet18
-    from tcpipe.learning.trainer import Trainer
+    from tcpipe.learning.network import Trainer, make_resnet18
 
     px, depth, outputs = case["patch_px"], case["depth"], case["outputs"]
     rng, predicted = np.random.default_rng(px), np.array(case["predicted"])

@@ -17,7 +17,7 @@ from tcpipe.terrain.classes import ClassScheme
 from tcpipe.terrain.grid import MapGrid
 from tcpipe.terrain.layers import Layer, Pixels
 from tcpipe.terrain.projection import Projection
-from tcpipe.terrain.resampling_kernel import mean, resample_bilinear, resample_majority
+from tcpipe.terrain.resampling import mean, resample_bilinear, resample_majority
 from tcpipe.terrain.target_grid import LATTICE_STEP_PX, Georeference, compute_source_lattice
 
 _BLOCK_PX = 1024

@@ -13,7 +13,7 @@ x, y         float64  pixel centres in the map's CRS [m]
 spatial_ref  int64    CF grid mapping: the CRS as WKT, and GDAL's GeoTransform
 ===========  =======  ==========================================================================
 
-The groups ``overviews/2``, ``overviews/4`` … hold the same arrays at coarser levels (`tcpipe.terrain.overviews`). Attributes follow
+The groups ``overviews/2``, ``overviews/4`` … hold the same arrays at coarser levels (`tcpipe.terrain.resampling`). Attributes follow
 CF (``grid_mapping``, ``flag_values``) and GeoZarr (``proj:``, ``spatial:``), so that xarray opens map and overviews as they are, and
 so does GDAL from 3.13 on, the first that reads shards.
 """
@@ -41,7 +41,7 @@ from tcpipe.tables.facts import LEFT_OUT
 from tcpipe.terrain.classes import ClassScheme, ClassTable, TerrainClass
 from tcpipe.terrain.grid import MapGrid
 from tcpipe.terrain.layers import LAYERS, PAPER_LAYERS, Layer, Pixels, find_no_data_value
-from tcpipe.terrain.overviews import iterate_levels, list_factors, make_overview_grid
+from tcpipe.terrain.resampling import iterate_levels, list_factors, make_overview_grid
 from tcpipe.terrain.target_grid import MAX_PIXELS, MAX_SIDE_PX
 
 TILE_PX = 512

@@ -21,9 +21,9 @@ from tcpipe.tables.bits import DropReason, flag_name
 from tcpipe.tables.catalogue import read_threshold
 from tcpipe.tables.columns import to_floats, to_integers
 from tcpipe.tables.findings import Finding, Subject, SubjectKind, make_finding
-from tcpipe.terrain.point_classes import OFF_THE_MAP, find_classes_at
 from tcpipe.terrain.projection import Projection
 from tcpipe.terrain.registration import Registration, register_track
+from tcpipe.terrain.sampling import OFF_THE_MAP, find_classes_at
 from tcpipe.terrain.tiles import find_map_projection
 
 _COLUMNS = ["lon_deg", "lat_deg", "alt_m", "x_std_m", "y_std_m", "z_std_m"]

@@ -9,8 +9,7 @@ from rough_drive import drive, initial, measured
 from tcpipe.fusion.measurements import GNSS, IMU, VISUAL, WHEELS, Measurements
 from tcpipe.fusion.ukf15 import collect_sources, run_ukf15
 from tcpipe.fusion.ukf15_kernel import SELECT
-from tcpipe.geometry.angles import wrap_to_pi
-from tcpipe.geometry.rotation import invert, rotate, rpy_from_matrix, rpy_from_quat
+from tcpipe.geometry.rotation import invert, rotate, rpy_from_matrix, rpy_from_quat, wrap_to_pi
 
 SETTLED = 100  # rows, 5 s: the start is wrong on purpose
 

@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from tcpipe.geometry import rotation
-from tcpipe.geometry.angles import wrap_to_pi
+from tcpipe.geometry.rotation import wrap_to_pi
 
 QUAT = Rotation.random(200, rng=np.random.default_rng(1)).as_quat(canonical=True)
 OTHER = Rotation.random(200, rng=np.random.default_rng(2)).as_quat(canonical=True)

@@ -8,7 +8,39 @@ import numpy as np
 import pytest
 
 from tcpipe.errors import ModelError
-from tcpipe.learning.architecture import Architecture, check_trainable
+from tcpipe.learning.architecture import Architecture, check_trainable, compute_loss_factors, mean_loss
+
+SCALE = (400.0, 1.0)
+LABELS = np.array([[150.0, 0.8], [200.0, 0.9]]) / SCALE
+PREDICTED = np.array([[154.0, 0.77], [188.0, 0.94]]) / SCALE
+
+
+def test_nrmse_divides_by_the_maxima_squared():
+    by_hand = np.mean([np.hypot(4.0 / 400.0, 0.03), np.hypot(12.0 / 400.0, 0.04)])
+    assert mean_loss(PREDICTED, LABELS, compute_loss_factors("nrmse", SCALE), 1.0) == pytest.approx(by_hand, rel=1e-6)
+
+
+def test_equation_4_as_printed_divides_by_the_maxima():
+    by_hand = np.mean([np.sqrt(4.0**2 / 400.0 + 0.03**2), np.sqrt(12.0**2 / 400.0 + 0.04**2)])
+    assert mean_loss(PREDICTED, LABELS, compute_loss_factors("paper_eq4", SCALE), 1.0) == pytest.approx(
+        by_hand, rel=1e-6
+    )
+
+
+@pytest.mark.parametrize("loss", ["nrmse", "paper_eq4"])
+def test_weights_count_and_torch_s_tensors_have_the_same_loss_and_its_slope(loss):
+    torch = pytest.importorskip("torch")
+    factors, weights = compute_loss_factors(loss, SCALE), np.array([[1.0, 2.0], [0.5, 1.0]])
+    errors = PREDICTED - LABELS
+    lengths = np.sqrt((errors**2 * factors * weights).sum(axis=1))
+    assert mean_loss(PREDICTED, LABELS, factors, weights) == pytest.approx(lengths.mean(), rel=1e-6)
+    said = torch.from_numpy(PREDICTED).requires_grad_()
+    told = mean_loss(said, *map(torch.from_numpy, (LABELS, factors, weights)))
+    told.backward()
+    assert told.item() == pytest.approx(lengths.mean(), rel=1e-6)
+    slope = errors * factors * weights / lengths[:, None] / len(LABELS)
+    assert said.grad.numpy() == pytest.approx(slope, rel=1e-6)
+
 
 pytest.importorskip("torch")
 
@@ -16,7 +48,7 @@ STEPS = """
 import numpy as np
 from tcpipe.learning.architecture import Architecture
 from tcpipe.learning.network import make_resnet18
-from tcpipe.learning.trainer import Trainer
+from tcpipe.learning.network import Trainer
 trainer = Trainer(make_resnet18(Architecture(40, 1, 1, 16), seed=0, start=[0.5]), np.ones(1, np.float32))
 rng = np.random.default_rng(0)
 for count in (11, 11, 35, 3) * 2:
@@ -52,8 +84,7 @@ def test_first_weights_are_he_s_of_the_seed():
 
 def test_a_batch_of_one_sample_of_one_pixel_is_trained_on():
     """The last stage sees a patch of 16 pixels as one, of which a batch normalisation has no deviation."""
-    from tcpipe.learning.network import make_resnet18
-    from tcpipe.learning.trainer import Trainer
+    from tcpipe.learning.network import Trainer, make_resnet18
 
     trainer = Trainer(make_resnet18(Architecture(16, 1, 1, 16), seed=0, start=[0.5]), np.ones(1, np.float32))
     patch, label = np.full((1, 16, 16, 1), 0.5, np.float32), np.array([[0.7]], np.float32)

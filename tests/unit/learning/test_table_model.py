@@ -4,8 +4,96 @@ import numpy as np
 import pytest
 
 from tcpipe.errors import ModelError
-from tcpipe.learning.patch_features import find_slope_and_class
-from tcpipe.learning.table_model import fit_table, read_table_model
+from tcpipe.learning import table_model as forest
+from tcpipe.learning.table_model import find_slope_and_class, fit_table, patch_features, read_table_model
+
+PX, PATCH_M = 40, 1.0
+ALONG, ACROSS = np.meshgrid(*[(np.arange(PX) + 0.5) / PX - 0.5] * 2)
+
+
+def _of_height(height_m):
+    patches = np.asarray(height_m, np.float32)[None, ..., None]
+    return patch_features(patches, channels=("height",), class_count=7, patch_m=PATCH_M)[0]
+
+
+def test_a_paraboloid_has_its_slopes_and_curvatures_and_no_roughness():
+    found = _of_height(0.4 + 0.2 * ALONG - 0.1 * ACROSS + 0.15 * ALONG**2 - 0.05 * ACROSS**2)
+    assert found[:5] == pytest.approx([np.arctan(0.2), np.arctan(0.1), 0.3, -0.1, 0.0], abs=1e-5)
+    assert found[5] == pytest.approx(np.ptp(0.2 * ALONG - 0.1 * ACROSS + 0.15 * ALONG**2 - 0.05 * ACROSS**2), abs=1e-6)
+
+
+def test_roughness_is_the_deviation_from_the_paraboloid():
+    rough = 0.01 * np.where(
+        (np.indices((PX, PX)).sum(axis=0)) % 2, 1.0, -1.0
+    )  # a chessboard, which no paraboloid resembles
+    assert _of_height(0.5 + rough)[4] == pytest.approx(0.01, rel=1e-3)
+    assert _of_height(0.5 + 0.1 * ALONG + rough)[4] == pytest.approx(0.01, rel=1e-3)
+
+
+def test_shares_of_classes_and_the_picture():
+    patch = np.zeros((1, PX, PX, 3), np.float32)
+    patch[0, :, :10, 1], patch[0, :, 10:, 1] = 3 / 6, 6 / 6
+    patch[0, :, ::2, 0] = 0.5
+    patch[..., 2] = 0.25
+    found = patch_features(patch, channels=("ortho", "terrain", "roots"), class_count=7, patch_m=PATCH_M)[0]
+    assert found == pytest.approx([0.25, 0.25, 0.5, 0, 0, 0, 0.25, 0, 0, 0.75, 0.25, 0, 0])
+
+
+def test_a_mirror_changes_nothing():
+    patches = np.random.default_rng(0).random((5, PX, PX, 3), np.float32)
+    patches[..., 1] = np.rint(patches[..., 1] * 6) / 6
+    rules = {"channels": ("ortho", "terrain", "height"), "class_count": 7, "patch_m": PATCH_M}
+    assert patch_features(patches[:, ::-1], **rules) == pytest.approx(patch_features(patches, **rules), abs=1e-5)
+    assert patch_features(patches[:0], **rules).shape == (0, 16)
+
+
+RULES = {**forest._RULES}
+
+
+def _drawn(count, seed=0):
+    rng = np.random.default_rng(seed)
+    features = rng.normal(size=(count, 4))
+    labels = np.column_stack([100.0 + 20.0 * features[:, 0], 0.8 + 0.1 * np.tanh(features[:, 1])])
+    return features, labels + rng.normal(size=labels.shape) * [5.0, 0.02], rng.integers(0, 5, count)
+
+
+def test_trees_by_hand():
+    """Two trees of the first output, a stump and one leaf; of the second a tree of two steps."""
+    made = forest.Forest(
+        feature=np.array([1, 0, 0, 0, 0, 0, 1, 0, 0], np.uint32),
+        threshold=np.array([0.5, 0.0, 0.0, 0.0, 2.0, 0.0, -1.0, 0.0, 0.0]),
+        child=np.array([[1, 2], [1, 1], [2, 2], [3, 3], [5, 6], [5, 5], [7, 8], [7, 7], [8, 8]], np.uint32),
+        value=np.array([0.0, 1.0, 2.0, 10.0, 0.0, 3.0, 0.0, 4.0, 5.0]),
+        root=np.array([0, 3, 4], np.uint32),
+        depth=np.array([1, 0, 2], np.uint32),
+        output=np.array([0, 0, 1], np.uint32),
+    )
+    features = np.array([[0.0, 0.5], [3.0, 0.6], [3.0, -1.0], [2.0, 0.0]])
+    assert made.predict(features).tolist() == [[11.0, 3.0], [12.0, 5.0], [11.0, 4.0], [11.0, 3.0]]
+    assert made.predict(np.tile(features, (200, 1)))[796:].tolist() == made.predict(features).tolist()
+    assert forest.read_forest(made.arrays(), "here").predict(features[:1]).tolist() == [[11.0, 3.0]]
+    with pytest.raises(ModelError, match="here: holds the weights of another model"):
+        forest.read_forest({"head/bias": np.zeros(2)}, "here")
+
+
+def test_they_say_what_lightgbm_says():
+    lightgbm = pytest.importorskip("lightgbm")
+    features, labels, folds = _drawn(600)
+    grown = forest.grow(features, labels, np.ones_like(labels), folds)
+    for number, label in enumerate(labels.T):
+        rounds = int((grown.forest.output == number).sum())
+        booster = lightgbm.train(RULES, lightgbm.Dataset(features, label), rounds)
+        assert grown.forest.predict(features)[:, number] == pytest.approx(booster.predict(features), rel=1e-12)
+    assert np.std(grown.held_out - labels, axis=0) == pytest.approx([5.0, 0.02], rel=0.25)
+    again = forest.grow(features, labels, np.ones_like(labels), folds)
+    assert all(np.array_equal(array, again.forest.arrays()[name]) for name, array in grown.forest.arrays().items())
+
+
+def test_without_lightgbm_there_is_one_line(monkeypatch):
+    monkeypatch.setitem(__import__("sys").modules, "lightgbm", None)
+    with pytest.raises(ModelError, match=r"lightgbm not installed, .* pip install 'tcpipe\[tables\]'"):
+        forest.grow(*_drawn(9)[:2], np.ones((9, 2)), np.arange(9) % 3)
+
 
 pytest.importorskip("lightgbm")
 

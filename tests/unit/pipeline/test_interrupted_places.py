@@ -2,7 +2,7 @@
 
 import pytest
 
-from tcpipe.learning import reproduction
+from tcpipe.experiment import reproduction
 from tcpipe.pipeline import demo
 
 

@@ -24,10 +24,9 @@ from tcpipe.errors import MapError, ModelError, UsageError
 from tcpipe.execution import Outcome
 from tcpipe.formats.bucket_directories import fetch_directory
 from tcpipe.pipeline.verify import verify
-from tcpipe.planning.cost_grid import iterate_blocks, make_grid
+from tcpipe.planning.cost_grid import ANGLES_DEG, iterate_blocks, make_grid
 from tcpipe.planning.cost_map import Cluster, make_cost_map, make_cost_map_key, open_cost_map, read_cost_map_card
-from tcpipe.planning.courses import ANGLES_DEG
-from tcpipe.planning.no_cost_reasons import Reason
+from tcpipe.planning.segment_predictions import Reason
 
 MODEL = PhysicsModel()
 

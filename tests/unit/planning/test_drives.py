@@ -11,9 +11,8 @@ from synthetic_store import box, region_file, small_store
 from tcpipe.dataset import open_dataset
 from tcpipe.errors import ModelError, UsageError
 from tcpipe.pipeline.dataset.build import build_dataset
-from tcpipe.planning.drive_files import evaluate_drives
-from tcpipe.planning.drives import compute_drive_cost, find_drive
-from tcpipe.planning.inputs import choose_map
+from tcpipe.planning.drives import compute_drive_cost, evaluate_drives, find_drive
+from tcpipe.planning.path_files import choose_map
 from tcpipe.recipe import Recipe
 
 

@@ -15,8 +15,7 @@ from tcpipe.errors import ModelError, PathError, UsageError
 from tcpipe.formats.geojson import make_line_feature, read_line
 from tcpipe.formats.json_files import write_json
 from tcpipe.planning.cost_map import make_cost_map
-from tcpipe.planning.path_files import make_summary_path, predict_path
-from tcpipe.planning.plan_files import PlanRequest, plan
+from tcpipe.planning.path_files import PlanRequest, make_summary_path, plan, predict_path
 
 MODEL = PhysicsModel()
 

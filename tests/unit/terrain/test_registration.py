@@ -6,8 +6,8 @@ from map_worlds import ArrayMap
 
 from tcpipe.terrain.grid import MapGrid
 from tcpipe.terrain.layers import PAPER_LAYERS
-from tcpipe.terrain.overviews import iterate_levels, make_overview_grid
 from tcpipe.terrain.registration import register_track
+from tcpipe.terrain.resampling import iterate_levels, make_overview_grid
 
 SIDE, PITCH_M = 1000, 0.1
 

@@ -5,7 +5,7 @@ import pyarrow as pa
 import pytest
 from scipy.stats import norm
 
-from tcpipe.learning.predicted_samples import LEVELS, compute_calibration, find_worst_rows, make_column_name
+from tcpipe.learning.predictions import LEVELS, compute_calibration, find_worst_rows, make_column_name
 
 
 def table(label, said, std=None, split=None):

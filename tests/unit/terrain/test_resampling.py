@@ -6,8 +6,8 @@ from map_worlds import ArrayMap
 
 from tcpipe.terrain.grid import MapGrid
 from tcpipe.terrain.layers import PAPER_LAYERS
-from tcpipe.terrain.overviews import choose_factor, iterate_levels, list_factors, make_overview_grid
 from tcpipe.terrain.patches import patch_frames
+from tcpipe.terrain.resampling import choose_factor, iterate_levels, list_factors, make_overview_grid
 from tcpipe.terrain.sampling import sample_patches
 
 

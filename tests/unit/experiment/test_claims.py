@@ -1,9 +1,13 @@
 """Claims hold by figures alone."""
 
+from pathlib import Path
+
 import pytest
 from made_models import CARD
 
-from tcpipe.learning.claims import CLAIMS, check_claims
+from tcpipe.experiment.claims import CLAIMS, check_claims
+from tcpipe.experiment.reproduction_page import DIFFERENCES
+from tcpipe.learning.baselines import PER_CLASS
 from tcpipe.learning.evaluation_facts import (
     BaselineResult,
     EvaluateConfig,
@@ -13,7 +17,6 @@ from tcpipe.learning.evaluation_facts import (
     SplitErrors,
 )
 from tcpipe.learning.metrics import Errors, Ratio
-from tcpipe.learning.wei_isler import PER_CLASS
 
 SURE = Ratio(0.8, 0.7, 0.9)
 
@@ -76,3 +79,10 @@ def test_several_trainings_have_the_mean_ratio_and_the_widest_interval():
 def test_what_was_not_measured_in_one_training_is_not_measured():
     claim = check_claims([_run(), _run(**{PER_CLASS: Ratio(None, None, None)})])[0]
     assert str(claim) == "not measured: one net beats a net per class, unseen: RMSE of E – of its (0.81 in the paper)"
+
+
+PAGE = (Path(__file__).parents[3] / "docs" / "explanation" / "reproduction.md").read_text(encoding="utf-8")
+
+
+def test_the_documentation_has_every_difference_in_the_same_words():
+    assert [row for row in DIFFERENCES if f"| {' | '.join(row)} |" not in PAGE] == []

@@ -1,17 +1,18 @@
-"""The options of ``tcpipe train`` and `tcpipe.train`."""
+"""The options of the commands ``train`` and ``evaluate`` and of the functions of the same names."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from tcpipe.tables.options import SEED, Option, Range, option, required
+from tcpipe.tables.options import MAP, MODEL, SEED, STORE, Option, Range, option, required
 
 if TYPE_CHECKING:
     from tcpipe.dataset.energies import EnergyName
+    from tcpipe.learning.architecture import Loss
     from tcpipe.learning.fitting import ModelKind
-    from tcpipe.learning.losses import Loss
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,3 +77,41 @@ class TrainOptions:
     fresh: bool = option(
         False, Option("Do not go on from where an earlier training was stopped.", ("--no-resume",), earlier="--fresh")
     )
+
+
+@dataclass(frozen=True, slots=True)
+class EvaluateOptions:
+    """Which model is measured on which dataset or drives, and how much of it."""
+
+    model: str | Path = required(MODEL)
+    dataset: str | Path = required(Option(kind="sealed", metavar="DATASET", is_argument=True))
+    """Of drives the one that the model was trained on."""
+    out: str | Path = option("evaluation", Option(kind="published", metavar="[OUT]", is_argument=True))
+    _: KW_ONLY
+    draws: int = option(
+        5, Option("Draws of noise for each ablated input set.", ("--noise-draws",), Range(1, 1000), earlier="--draws")
+    )
+    baselines: bool = option(
+        True,
+        Option(
+            "Train the height-only networks of Wei and Isler: one of grass, one a class.",
+            ("--baselines/--no-baselines",),
+        ),
+    )
+    retrain: bool = option(
+        False,
+        Option(
+            "Train a network for each input set of the ablation, too (six more).",
+            ("--retrain-ablation",), earlier="--retrain",
+        ),
+    )  # fmt: skip
+    seed: int = option(0, Option("Of the noise.", kind=SEED))
+    drives: Sequence[str | Path] = option(
+        (),
+        Option(
+            "Measure MODEL on a whole drive instead: an ingested log, by its path or its run's name; may be repeated.",
+            ("--drive",), metavar="LOG", repeatable=True,
+        ),
+    )  # fmt: skip
+    map_name: str | None = option(None, MAP)
+    store: str | Path = option("tcpipe-store", STORE)

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tcpipe.learning.simulation_floor import compute_true_costs
+from tcpipe.experiment.simulation_floor import compute_true_costs
 from tcpipe.simulation.drive import simulate_drive
 from tcpipe.simulation.paper_site import make_paper_site, make_paper_surface
 from tcpipe.simulation.route import Leg, Pause

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 
-from tcpipe.learning.claims import Claim
+from tcpipe.experiment.claims import Claim
+from tcpipe.experiment.simulation_floor import CLASS_AND_SLOPE
 from tcpipe.learning.evaluation_facts import Evaluation
 from tcpipe.learning.evaluation_figures import EvaluatedSamples
 from tcpipe.learning.evaluation_files import SIMULATED
 from tcpipe.learning.evaluation_page import format_audit, render_evaluation_page
 from tcpipe.learning.metrics import ALL, LEAST, QUANTITIES, UNITS
-from tcpipe.learning.simulation_floor import CLASS_AND_SLOPE
 from tcpipe.report.page import Section
 from tcpipe.simulation.paper_site import read_paper_parameters
 

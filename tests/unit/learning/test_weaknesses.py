@@ -5,6 +5,7 @@ from dataclasses import replace
 import pytest
 from made_models import CARD
 
+from tcpipe.learning.evaluation import find_weaknesses
 from tcpipe.learning.evaluation_facts import (
     BaselineResult,
     EvaluateConfig,
@@ -14,7 +15,6 @@ from tcpipe.learning.evaluation_facts import (
     Leakage,
     SplitErrors,
 )
-from tcpipe.learning.evaluation_findings import find_weaknesses
 from tcpipe.learning.fitting import FitConfig
 from tcpipe.learning.metrics import Errors, Ratio
 from tcpipe.tables.findings import judge

@@ -12,10 +12,9 @@ from typing import Literal
 import numpy as np
 
 from tcpipe.learning import paper_tables as paper
-from tcpipe.learning.baselines import CURVES, TREES
+from tcpipe.learning.baselines import CURVES, OURS, PER_CLASS, TREES
 from tcpipe.learning.evaluation_facts import SPLITS, BaselineResult, Evaluation
 from tcpipe.learning.metrics import Ratio
-from tcpipe.learning.wei_isler import OURS, PER_CLASS
 
 Verdict = Literal["held", "open", "NOT held", "not measured"]
 
