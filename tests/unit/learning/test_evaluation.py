@@ -236,7 +236,7 @@ def test_a_card_that_does_not_say_how_it_was_trained(dataset, tmp_path):
 
 
 def test_samples_without_a_label_are_counted(model, dataset, tmp_path, monkeypatch):
-    real = Split.labels.fget
+    real = Split.labels.func
     monkeypatch.setattr(
         Split,
         "labels",
