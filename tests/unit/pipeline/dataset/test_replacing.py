@@ -21,11 +21,6 @@ from tcpipe.recipe import DatasetConfig, Recipe, SampleConfig
 from tcpipe.store import open_store
 
 
-@pytest.fixture(autouse=True)
-def no_page(monkeypatch):
-    monkeypatch.setattr(building, "render_dataset_report", lambda *_: "<!doctype html>")
-
-
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
     """Two maps, a run of each weather, and the dataset of the dry one."""
@@ -40,9 +35,7 @@ def made(tmp_path_factory):
     region_file(here / "region.geojson", box(-20, -20, 2, 20))
     region_file(here / "other.geojson", box(-20, -20, 3, 20))
     (here / "soil.csv").write_text("time,moisture\n1970-01-01T00:00:00Z,0.2\n1970-01-01T00:01:00Z,0.3\n")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(building, "render_dataset_report", lambda *_: "<!doctype html>")
-        build_dataset(here / "dataset", **usual(here))
+    build_dataset(here / "dataset", **usual(here))
     return here
 
 
