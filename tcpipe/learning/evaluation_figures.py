@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pyarrow as pa
@@ -168,44 +168,33 @@ def _draw_errors_by_slope(table: pa.Table, split: str, audit: str) -> Section:
     part = table.filter(pc.and_(pc.equal(table.column("split"), split), pc.is_valid(table.column("slope_rad"))))
     off, ranges = compute_errors_joule(part), find_slope_ranges(to_floats(part, "slope_rad"))
     energy, low, high = (to_floats(part, make_column_name("E", of)) for of in ("", "predicted_low", "predicted_high"))
-    classes = to_texts(part.column("terrain_name"))
-    names = [
-        name for _, name in sorted(set(zip(part.column("terrain_class").to_pylist(), classes.tolist(), strict=True)))
-    ]
-    met = np.unique(ranges)
-    cells = {
-        (name, at): off[here]
-        for name in names
-        for at in met
-        if (here := (classes == name) & (ranges == at) & np.isfinite(off)).any()
-    }
-    rmse = {key: float(np.sqrt(np.mean(of**2))) for key, of in cells.items()}
+    is_outside, classes = (energy < low) | (energy > high), to_texts(part.column("terrain_name"))
+    ids = sorted(set(zip(part.column("terrain_class").to_pylist(), classes.tolist(), strict=True)))
+    columns = np.unique(ranges)
+    cells = {(name, at): (classes == name) & (ranges == at) for _, name in ids for at in columns}
+    errors = {cell: off[rows & np.isfinite(off)] for cell, rows in cells.items()}
+    rmse = {cell: float(np.sqrt(np.mean(part**2))) for cell, part in errors.items() if len(part)}
     most = max(rmse.values(), default=1.0) or 1.0
     digits = 0 if most >= _WHOLE_JOULE else 2
     enough, least = (
         read_threshold("energy-overconfident", f"min_cell_{name}") for name in ("count", "coverage_fraction")
     )
-    rows: list[list[str | Shaded]] = []
-    for name in names:
-        row: list[str | Shaded] = [name]
-        for at in met:
-            here = (classes == name) & (ranges == at)
-            if (name, at) not in cells:
-                row.append("–")
-                continue
-            outside = float(np.mean((energy[here] < low[here]) | (energy[here] > high[here])))
-            doubted = len(cells[name, at]) >= enough and outside > 1.0 - least
-            mean = float(cells[name, at].mean())
-            text = f"{rmse[name, at]:.{digits}f}, {mean:+.{digits}f} ({len(cells[name, at])}){'*' if doubted else ''}"
-            row.append(Shaded(text, rmse[name, at] / most, alarm=doubted))
-        rows.append(row)
+
+    def shade(cell: tuple[str, Any]) -> str | Shaded:
+        if cell not in rmse:
+            return "–"
+        count, mean = len(errors[cell]), float(errors[cell].mean())
+        is_doubtful = count >= enough and bool(is_outside[cells[cell]].mean() > 1.0 - least)
+        text = f"{rmse[cell]:.{digits}f}, {mean:+.{digits}f} ({count}){'*' if is_doubtful else ''}"
+        return Shaded(text, rmse[cell] / most, alarm=is_doubtful)
+
     text = (
         "RMSE of E [J], mean error (predicted less measured), and in brackets of how many metres; darker is worse. * and a dashed border: "
         f"90 % intervals hold fewer than {100 * least:.0f} % of {enough:.0f} labels or more there: do not rely on them. {audit}"
     )
-    return Section(
-        f"Error by class and slope, {split}", text, header=["class", *(SLOPE_NAMES[at] for at in met)], rows=rows
-    )
+    header = ["class", *(SLOPE_NAMES[at] for at in columns)]
+    table_rows = [[name, *(shade((name, at)) for at in columns)] for _, name in ids]
+    return Section(f"Error by class and slope, {split}", text, header=header, rows=table_rows)
 
 
 def _draw_calibration(table: pa.Table) -> Section:
@@ -256,30 +245,28 @@ def draw_paper_figures(plots: Mapping[str, Plotted]) -> Iterator[Section]:
             yield Section(f"{label}, {split}: measured and predicted", text, plots=drawn, stacked=True)
 
 
-def _draw_by_patch(told: Plotted, quantity: str, label: str) -> list[Plot]:
-    measured, predicted = (
-        np.asarray(told["E_measured" if quantity == "E" else "T_measured"], np.float64),
-        np.asarray(told["E_predicted" if quantity == "E" else "T_predicted"], np.float64),
-    )
-    number, classes = np.arange(1, len(measured) + 1), np.asarray(told["class"], np.str_)
+def _draw_by_patch(plotted: Plotted, quantity: Literal["E", "T"], label: str) -> list[Plot]:
+    keys: tuple[Literal["E_measured", "T_measured"], Literal["E_predicted", "T_predicted"]]
+    keys = ("E_measured", "E_predicted") if quantity == "E" else ("T_measured", "T_predicted")
+    measured, predicted = (np.asarray(plotted[key], np.float64) for key in keys)
+    number, classes = np.arange(1, len(measured) + 1), np.asarray(plotted["class"], np.str_)
     with np.errstate(divide="ignore", invalid="ignore"):
         percent = 100.0 * np.abs(predicted - measured) / np.abs(measured)
     source = {"patch": number, "class": classes, "measured": measured, "predicted": predicted, "percent": percent}
-    tips = [
-        ("", "@class, patch @patch"),
-        ("measured", "@measured{0.00}"),
-        ("predicted", "@predicted{0.00}"),
-        ("error", "@percent{0.0} %"),
-    ]
+    settings: dict[str, Any] = {
+        "tools": "xpan,xwheel_zoom,reset,save",
+        "tooltips": [
+            ("", "@class, patch @patch"),
+            *((name, f"@{name}{{0.00}}") for name in ("measured", "predicted")),
+            ("error", "@percent{0.0} %"),
+        ],
+        "waits": True,
+    }
     legend = {"measured": MEASURED, "predicted": PREDICTED}
-    values = make_plot(
-        f"patches {quantity}", alt=f"Measured and predicted {label} of some patches of every class.", axes=("", label),
-        legend=legend, tools="xpan,xwheel_zoom,reset,save", tooltips=tips, waits=True,
-    )  # fmt: skip
-    errors = make_plot(
-        f"patch errors {quantity}", alt="Their absolute error in percent.", axes=("", "absolute error [%]"),
-        tools="xpan,xwheel_zoom,reset,save", tooltips=tips, x_range=values.figure.x_range, waits=True,
-    )  # fmt: skip
+    alt = f"Measured and predicted {label} of some patches of every class."
+    values = make_plot(f"patches {quantity}", alt=alt, axes=("", label), legend=legend, **settings)
+    alt, axes = "Their absolute error in percent.", ("", "absolute error [%]")
+    errors = make_plot(f"patch errors {quantity}", alt=alt, axes=axes, x_range=values.figure.x_range, **settings)
     for name, colour in legend.items():
         values.figure.line("patch", name, source=source, color=colour, line_width=1.5)
         values.figure.scatter("patch", name, source=source, color=colour, size=4)

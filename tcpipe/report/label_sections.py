@@ -18,6 +18,14 @@ from tcpipe.report.plots import draw_waterfall
 from tcpipe.tables.bits import Quality, flag_name
 from tcpipe.tables.facts import EnergyBudget, PhysicsFit, PhysicsTerm
 
+LABELS = {
+    "power": ("power_watt", "power_std_watt", 1),
+    "velocity": ("velocity_mps", "velocity_std_mps", 3),
+    "duration": ("duration_s", "duration_std_s", 3),
+    "energy": ("energy_joule", "energy_std_joule", 1),
+}
+"""Column, column of the standard deviation and decimals of each label on a page."""
+
 QUALITY_WORDS = {
     Quality.LOW_POWER_RATE: "power was sampled too slowly",
     Quality.NEAR_GAP: "a gap in the data is less than a chord away",

@@ -20,6 +20,7 @@ from tcpipe.formats.stored_runs import RunDirectory
 from tcpipe.report.colours import DOUBTED, FAINT, KEPT, UNUSED
 from tcpipe.report.column_packing import Column, make_shown_column, pack_columns
 from tcpipe.report.label_sections import (
+    LABELS,
     QUALITY_WORDS,
     find_distinguishing_bits,
     make_budget_sections,
@@ -53,13 +54,6 @@ _PAGE = "report.html"
 _DAMAGE = "Where messages are lost or may be."
 _STEP_M = 0.05
 """Places of the track that are nearer are one on the map."""
-
-_LABELS = {
-    "power": ("power_watt", "power_std_watt", 1),
-    "velocity": ("velocity_mps", "velocity_std_mps", 3),
-    "duration": ("duration_s", "duration_std_s", 3),
-    "energy": ("energy_joule", "energy_std_joule", 1),
-}
 
 
 def run_report(store: Store, run: RunDirectory, pictures_by_map: MutableMapping[str, Pictures] | None = None) -> str:
@@ -217,7 +211,7 @@ def _make_segments_data(segments: pa.Table, timeline: Timeline, run_map: RunMap)
     }
     for number, end in enumerate(run_map.ends_xy_m):
         columns |= {f"{axis}{number}": ("steps", end[:, place]) for place, axis in enumerate("xy")}
-    for name, (value, std, digits) in _LABELS.items():
+    for name, (value, std, digits) in LABELS.items():
         columns[name], columns[f"{name}_std"] = (
             make_shown_column(digits, to_floats(segments, value)),
             ("half", to_floats(segments, std)),
