@@ -158,10 +158,10 @@ _MOST_SHARDS = 100_000
 
 def parse_duration(context: click.Context, parameter: click.Parameter, value: str) -> float:
     """Turn ``90``, ``90s``, ``10m``, ``2h``, ``1d`` into seconds."""
-    found = re.fullmatch(r"(\d{1,9}(?:\.\d{1,9})?)\s*([smhd]?)", value.strip())
-    if found is None:
+    match = re.fullmatch(r"(\d{1,9}(?:\.\d{1,9})?)\s*([smhd]?)", value.strip())
+    if match is None:
         raise click.BadParameter(f"{value!r}: wanted a time: 90 or 90s, 10m, 2h, 1d", ctx=context, param=parameter)
-    return float(found[1]) * _SECONDS[found[2]]
+    return float(match[1]) * _SECONDS[match[2]]
 
 
 def parse_shard(context: click.Context, parameter: click.Parameter, value: str | None) -> tuple[int, int] | None:
@@ -202,12 +202,12 @@ def class_table_values(_: click.Context, __: click.Parameter, values: tuple[str,
 
 
 def _parse_named_files(option: str, given: tuple[str, ...], hint: str) -> dict[str, str]:
-    found: dict[str, str] = {}
+    files: dict[str, str] = {}
     for name, _, file in (text.partition("=") for text in given):
-        if name in found:
+        if name in files:
             raise UsageError(f"{option} {name}: is given twice; {hint}")
-        found[name] = file
-    return found
+        files[name] = file
+    return files
 
 
 def parse_holdout(context: click.Context, parameter: click.Parameter, value: str | None) -> str | None:
@@ -266,7 +266,9 @@ def add_options(cls: type[Any]) -> Option:
 
     What is not given has the default of the dataclass, which may be another than the one that is shown.
     """
-    declared = {of.name: (of.default, of.metadata["option"]) for of in fields(cls) if "option" in of.metadata}
+    declared = {
+        field.name: (field.default, field.metadata["option"]) for field in fields(cls) if "option" in field.metadata
+    }
 
     def decorate(run: Callable[..., Any]) -> Callable[..., Any]:
         @click.pass_context

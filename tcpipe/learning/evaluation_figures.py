@@ -59,9 +59,9 @@ class EvaluatedSamples:
 
 def select_evaluated_samples(table: pa.Table, data: Dataset) -> EvaluatedSamples:
     """Return what a page shows of the samples of ``table``, with patches of the dataset that they are of."""
-    rows, every = find_worst_rows(table, _WORST), to_texts(table.column("split"))
-    first = [np.flatnonzero(every == name)[:_MOST_SHOWN] for name in dict.fromkeys(every.tolist())]
-    shown, split = np.unique(np.concatenate([*first, rows])), every[rows]
+    rows, splits = find_worst_rows(table, _WORST), to_texts(table.column("split"))
+    first = [np.flatnonzero(splits == name)[:_MOST_SHOWN] for name in dict.fromkeys(splits.tolist())]
+    shown, split = np.unique(np.concatenate([*first, rows])), splits[rows]
     parts: list[dict[str, NDArray[np.generic]]] = []
     for name in dict.fromkeys(split.tolist()):
         ids = table.column("sample_id").take(pa.array(rows[split == name]))
@@ -78,24 +78,24 @@ def select_evaluated_samples(table: pa.Table, data: Dataset) -> EvaluatedSamples
 def make_page_data(samples: EvaluatedSamples) -> Json:
     """Return what the page's script is told."""
     table = samples.table.take(pa.array(samples.shown))
-    split, name = (to_texts(table.column(of)) for of in ("split", "terrain_name"))
+    split, name = (to_texts(table.column(column)) for column in ("split", "terrain_name"))
     splits, class_id = list(dict.fromkeys(split.tolist())), table.column("terrain_class").to_numpy()
     columns: dict[str, Column] = {
         "id": ("text", to_texts(table.column("sample_id"))),
-        "split": ("u8", np.array([splits.index(of) for of in split.tolist()], np.int64)),
+        "split": ("u8", np.array([splits.index(part) for part in split.tolist()], np.int64)),
         "class": ("u8", class_id),
         "slope": ("half", np.degrees(to_floats(table, "slope_rad"))),
     }
     for q in QUANTITIES:
-        said = to_floats(table, make_column_name(q, "predicted"))
+        predicted = to_floats(table, make_column_name(q, "predicted"))
         columns[q] = make_shown_column(_DIGITS[q], to_floats(table, make_column_name(q)))
-        columns[f"{q} predicted"] = make_shown_column(_DIGITS[q], said)
+        columns[f"{q} predicted"] = make_shown_column(_DIGITS[q], predicted)
         columns[f"{q} std"] = ("half", to_floats(table, make_column_name(q, "std")))
         for end in ("low", "high"):
-            columns[f"{q} {end}"] = ("half", to_floats(table, make_column_name(q, f"predicted_{end}")) - said)
+            columns[f"{q} {end}"] = ("half", to_floats(table, make_column_name(q, f"predicted_{end}")) - predicted)
     return {
         "samples": pack_columns(columns),
-        "splits": [{"name": of, "colour": SPLIT_COLOURS[of]} for of in splits],
+        "splits": [{"name": part, "colour": SPLIT_COLOURS[part]} for part in splits],
         "classes": [
             {"id": int(number), "name": str(name[class_id == number][0]), "colour": find_class_colour(int(number))}
             for number in np.unique(class_id)
@@ -241,8 +241,8 @@ def draw_paper_figures(plots: Mapping[str, Plotted]) -> Iterator[Section]:
             text = (
                 f"As the paper's figures. Below: the absolute percentage error; its axis ends at {MOST_PERCENT:.0f} %."
             )
-            drawn = _draw_by_patch(plots[split], quantity, label)
-            yield Section(f"{label}, {split}: measured and predicted", text, plots=drawn, stacked=True)
+            figures = _draw_by_patch(plots[split], quantity, label)
+            yield Section(f"{label}, {split}: measured and predicted", text, plots=figures, stacked=True)
 
 
 def _draw_by_patch(plotted: Plotted, quantity: Literal["E", "T"], label: str) -> list[Plot]:
@@ -287,7 +287,7 @@ def _mark_classes(classes: NDArray[np.str_], plots: Sequence[Plot]) -> None:
             x0=[rows[0] - 0.5 for rows in odd], x1=[rows[-1] + 0.5 for rows in odd], color=FAINT, alpha=0.15
         )
         strip.level = "underlay"
-        plot.figure.hover.renderers = [of for of in plot.figure.renderers if of is not strip]
+        plot.figure.hover.renderers = [renderer for renderer in plot.figure.renderers if renderer is not strip]
         plot.figure.xaxis.ticker = [int(rows.mean()) for rows in spans.values()]
         plot.figure.xaxis.major_label_overrides = {int(rows.mean()): name for name, rows in spans.items()}
         plot.figure.xaxis.major_label_orientation = 0.6

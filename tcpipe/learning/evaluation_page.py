@@ -43,11 +43,11 @@ def render_evaluation_page(
 ) -> str:
     """Return the HTML page of what `evaluate` found; ``before`` and ``warnings`` come first."""
     audits = {split: format_leakage(found.splits[split].leakage) for split in found.ordered_splits}
-    drawn = sample_sections(samples, audits)
+    sample_parts = sample_sections(samples, audits)
     sections = [
         *before,
         _make_baselines_section(found),
-        *drawn,
+        *sample_parts,
         *_make_class_sections(found),
         _make_ablation_section(found),
         _make_energy_section(found),
@@ -68,8 +68,8 @@ def render_evaluation_page(
         verdict=show_verdict(judge_again(found.verdict, found.findings), found.findings, labels=PREDICTED),
         warnings=warnings,
         sections=[section for section in sections if section.rows or section.text],
-        script="evaluation.js" if drawn else "",
-        data=make_page_data(samples) if drawn else None,
+        script="evaluation.js" if sample_parts else "",
+        data=make_page_data(samples) if sample_parts else None,
     )
 
 

@@ -73,7 +73,7 @@ def render_dataset_report(directory: Path, beside: Path | None = None, *, folder
             _make_provenance_section(card),
         ],
         script="dataset.js" if samples.num_rows else "",
-        data=_make_data(card, samples, shown, patches=patches, drawn=plots[0], hrefs=hrefs) | {"folder": folder},
+        data=_make_data(card, samples, shown, patches=patches, map_plot=plots[0], hrefs=hrefs) | {"folder": folder},
         reads_pictures=bool(folder),
     )
 
@@ -116,9 +116,15 @@ def _make_map_section(shown: SamplesShown, plots: list[Plot]) -> Section:
 
 
 def _make_data(
-    card: DatasetCard, samples: pa.Table, shown: SamplesShown, *, patches: Json, drawn: Plot, hrefs: Mapping[str, str]
+    card: DatasetCard,
+    samples: pa.Table,
+    shown: SamplesShown,
+    *,
+    patches: Json,
+    map_plot: Plot,
+    hrefs: Mapping[str, str],
 ) -> dict[str, Json]:
-    names = [renderer.name or "" for renderer in drawn.figure.renderers]
+    names = [renderer.name or "" for renderer in map_plot.figure.renderers]
     return {
         "count": card.samples,
         "per_sheet": PER_SHEET,

@@ -104,14 +104,14 @@ _ASIDE = {"grade": "weight over efficiency"}
 
 def describe_physics(robot: str, fit: PhysicsFit) -> str:
     """Return the fit as a few sentences: the numbers that a roboticist wants first, each with its standard deviation."""
-    grounds = list(dict.fromkeys(of.terrain for of in fit.terms if of.term in {"rolling", "turning"}))
-    values = {(of.term, of.terrain): of for of in fit.terms}
+    grounds = list(dict.fromkeys(term.terrain for term in fit.terms if term.term in {"rolling", "turning"}))
+    values = {(term.term, term.terrain): term for term in fit.terms}
     everywhere = [
-        f"{_format_with_std(of)} {of.unit} {_ASIDE.get(of.term, of.term)}"
-        for of in fit.terms
-        if of.term not in {"rolling", "turning"}
+        f"{_format_with_std(term)} {term.unit} {_ASIDE.get(term.term, term.term)}"
+        for term in fit.terms
+        if term.term not in {"rolling", "turning"}
     ]
-    said = [", ".join((f"{robot}: {everywhere[0]}", *everywhere[1:]) if everywhere else (f"{robot}",))]
+    parts_of_text = [", ".join((f"{robot}: {everywhere[0]}", *everywhere[1:]) if everywhere else (f"{robot}",))]
     for ground in grounds:
         parts = []
         if ground in fit.rolling_resistance:
@@ -121,9 +121,9 @@ def describe_physics(robot: str, fit: PhysicsFit) -> str:
             parts.append(f"rolling {_format_with_std(rolling)} N")
         if (turning := values.get(("turning", ground))) is not None:
             parts.append(f"{_format_with_std(turning)} W per rad/s of turning")
-        said.append(f"on {'all ground' if ground == 'all' else ground}: {', '.join(parts)}")
+        parts_of_text.append(f"on {'all ground' if ground == 'all' else ground}: {', '.join(parts)}")
     share = ", ".join(f"{name} {100.0 * part:.0f} %" for name, part in fit.energy_share.items())
-    text = f"{'; '.join(said)}. Of all energy: {share} ({fit.segments} segments)."
+    text = f"{'; '.join(parts_of_text)}. Of all energy: {share} ({fit.segments} segments)."
     if fit.held_out is not None:
         text += f" On held-out fifths it explains {fit.held_out.r2:.2f} of the variance of E (R²), "
         text += f"mean error {100 * fit.held_out.mape:.0f} % where it is 10 J and more"
@@ -135,9 +135,9 @@ def describe_physics(robot: str, fit: PhysicsFit) -> str:
     return text
 
 
-def _format_with_std(of: PhysicsTerm) -> str:
-    digits = 0 if of.std >= 1.0 else 1
-    return f"{of.value:.{digits}f} ± {of.std:.{digits}f}"
+def _format_with_std(term: PhysicsTerm) -> str:
+    digits = 0 if term.std >= 1.0 else 1
+    return f"{term.value:.{digits}f} ± {term.std:.{digits}f}"
 
 
 def make_physics_sections(fits: Mapping[str, PhysicsFit]) -> list[Section]:

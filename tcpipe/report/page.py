@@ -93,9 +93,9 @@ def show_verdict(
     labels: Sequence[Affected] = AFFECTED,
 ) -> VerdictBox:
     """Return a verdict: the grades of ``labels``, findings with their remedies, and ``groups`` of one code as `format_group` takes them."""
-    lines = [(of.severity, format_finding(of), [of]) for of in sort_findings(findings)]
+    lines = [(part.severity, format_finding(part), [part]) for part in sort_findings(findings)]
     lines += [(group.severity, format_group(group, total, noun), group.findings) for group, total, noun in groups]
-    shown = [ShownFinding(severity, text, "\n".join(format_remedy_blocks(of))) for severity, text, of in lines]
+    shown = [ShownFinding(severity, text, "\n".join(format_remedy_blocks(part))) for severity, text, part in lines]
     problems = [line for severity in ("error", "warning") for line in shown if line.severity == severity]
     return VerdictBox(
         grades=tuple((name, getattr(verdict, name)) for name in labels),

@@ -107,7 +107,7 @@ def make_map_plot(
 def lay_picture(plot: Plot, name: str, uri: str, bounds_m: tuple[float, float, float, float], *, visible: bool) -> None:
     """Lay a picture over ``bounds_m`` (least x and y, greatest x and y) under all else, as ``layer <name>``."""
     x_min_m, y_min_m, x_max_m, y_max_m = bounds_m
-    drawn = plot.figure.image_url(
+    renderer = plot.figure.image_url(
         url=[uri],
         x=x_min_m,
         y=y_max_m,
@@ -116,8 +116,8 @@ def lay_picture(plot: Plot, name: str, uri: str, bounds_m: tuple[float, float, f
         anchor="top_left",
         name=f"layer {name}",
     )
-    drawn.level = "image"
-    drawn.visible = visible
+    renderer.level = "image"
+    renderer.visible = visible
 
 
 def add_cursor(plot: Plot) -> None:
@@ -211,9 +211,11 @@ def render_plots(plots: Sequence[Plot]) -> tuple[Json, list[str]]:
     with whole.models.freeze():  # else every root that is added looks through all others again
         for plot in ordered:
             whole.add_root(plot.figure)
-    told = cast("dict[str, Json]", _make_plot_json(cast("Json", whole.to_json(deferred=False)), ids))
-    roots, soon = cast("list[Json]", told["roots"]), sum(not plot.waits for plot in plots)
-    return {"first": {**told, "roots": roots[:soon]}, "later": roots[soon:]}, [ids[plot.figure.id] for plot in plots]
+    document = cast("dict[str, Json]", _make_plot_json(cast("Json", whole.to_json(deferred=False)), ids))
+    roots, soon = cast("list[Json]", document["roots"]), sum(not plot.waits for plot in plots)
+    return {"first": {**document, "roots": roots[:soon]}, "later": roots[soon:]}, [
+        ids[plot.figure.id] for plot in plots
+    ]
 
 
 def _make_plot_json(value: Json, ids: dict[str, str]) -> Json:

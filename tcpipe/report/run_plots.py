@@ -78,13 +78,13 @@ class Timeline:
 def make_timeline(track: pa.Table) -> Timeline:
     """Return the axis of a track that has rows."""
     stamps, epochs = to_integers(track, "stamp_ns"), to_integers(track, "epoch")
-    found: list[Epoch] = []
+    timeline_epochs: list[Epoch] = []
     start_s = 0.0
     for number in dict.fromkeys(epochs.tolist()):
-        mine = stamps[epochs == number]
-        found.append(Epoch(number, int(mine.min()), int(mine.max()), start_s))
-        start_s += (found[-1].last_ns - found[-1].first_ns) * 1e-9 + _BETWEEN_EPOCHS_S
-    return Timeline(tuple(found))
+        stamps_in_epoch = stamps[epochs == number]
+        timeline_epochs.append(Epoch(number, int(stamps_in_epoch.min()), int(stamps_in_epoch.max()), start_s))
+        start_s += (timeline_epochs[-1].last_ns - timeline_epochs[-1].first_ns) * 1e-9 + _BETWEEN_EPOCHS_S
+    return Timeline(tuple(timeline_epochs))
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,9 +153,9 @@ def make_rail_series(power: pa.Table, timeline: Timeline) -> Iterator[Series]:
     """Yield voltage and current of each rail as they were told."""
     rails = to_texts(power.column("rail"))
     for rail in dict.fromkeys(rails.tolist()):
-        mine = power.filter(pa.array(rails == rail))
+        rail_power = power.filter(pa.array(rails == rail))
         for name, column, digits in (("voltage", "voltage_volt", 2), ("current", "current_amp", 3)):
-            values, t_s = to_floats(mine, column), _compute_seconds(mine, timeline)
+            values, t_s = to_floats(rail_power, column), _compute_seconds(rail_power, timeline)
             known = np.isfinite(values) & np.isfinite(t_s)
             if known.any():
                 columns = {name: (digits, values[known])}
@@ -348,9 +348,9 @@ def _draw_panel(name: str, label: str, first: Plot, *, legend: Mapping[str, str]
 
 def _draw_masks(timeline: Timeline, spans: Spans, facts: StageFacts) -> Plot:
     """Return the plot of what is kept and why the rest is not, and of what was found at a time; its axis is everyone's."""
-    found = list(_iterate_events(timeline, facts))
-    there = [bit for bit in DropReason if (spans.bits & int(bit)).any()]
-    rows = ["kept", *(flag_name(bit).replace("_", " ") for bit in there), *dict.fromkeys(row for row, *_ in found)]
+    events = list(_iterate_events(timeline, facts))
+    reasons = [bit for bit in DropReason if (spans.bits & int(bit)).any()]
+    rows = ["kept", *(flag_name(bit).replace("_", " ") for bit in reasons), *dict.fromkeys(row for row, *_ in events)]
     plot = make_plot(
         "gates",
         alt="What of the drive is kept, by which gates the rest is dropped, and when sensors were refused or disagreed.",
@@ -363,8 +363,8 @@ def _draw_masks(timeline: Timeline, spans: Spans, facts: StageFacts) -> Plot:
     figure = plot.figure
     bars = {"left": [0.0], "right": [1.0], "row": ["kept"], "colour": [KEPT]}
     figure.hbar(y="row", left="left", right="right", height=0.75, color="colour", source=bars, name="gates bars")
-    if found:
-        source = dict(zip(("row", "left", "right", "text"), zip(*found, strict=True), strict=True))
+    if events:
+        source = dict(zip(("row", "left", "right", "text"), zip(*events, strict=True), strict=True))
         show_text(plot, figure.hbar(y="row", left="left", right="right", height=0.75, color=DROPPED, source=source))
     figure.ygrid.visible = False
     return plot
@@ -448,8 +448,8 @@ def _draw_labels(first: Plot) -> Plot:
     )
     ends = [0.0, 1.0]
     empty = {"t": ends, "y": ends, "low": ends, "high": ends, "colour": [KEPT] * 2}
-    drawn = plot.figure.segment("t", "low", "t", "high", color="colour", line_width=1.5, source=empty)
-    plot.figure.scatter("t", "y", size=5, color="colour", source=drawn.data_source, name="labels")
+    bars = plot.figure.segment("t", "low", "t", "high", color="colour", line_width=1.5, source=empty)
+    plot.figure.scatter("t", "y", size=5, color="colour", source=bars.data_source, name="labels")
     return plot
 
 
