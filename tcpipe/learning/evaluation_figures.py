@@ -235,7 +235,8 @@ def _draw_calibration(table: pa.Table) -> Section:
 
 def draw_paper_figures(plots: Mapping[str, Plotted]) -> Iterator[Section]:
     """Yield the paper's pictures: E of test samples and T of the unseen area, some of every class, each with its error."""
-    for split, quantity in (("test", "E"), ("unseen", "T")):
+    quantities: dict[str, Literal["E", "T"]] = {"test": "E", "unseen": "T"}
+    for split, quantity in quantities.items():
         if split in plots:
             label = f"{_CALLED[quantity]} [{UNITS[quantity]}]"
             text = (
