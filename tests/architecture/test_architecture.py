@@ -156,7 +156,7 @@ def test_no_module_has_a_name_that_says_nothing():
 def test_stages_are_thin():
     lengths = {path.name: len(path.read_text().splitlines()) for path in (PACKAGE / "stages").glob("*.py")}
     assert lengths
-    assert not {name: length for name, length in lengths.items() if length > 300}
+    assert not {name: length for name, length in lengths.items() if length > 350}
 
 
 def test_no_file_is_longer_than_one_can_read():

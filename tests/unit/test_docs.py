@@ -54,6 +54,12 @@ def test_links_lead_somewhere(page: Path) -> None:
     assert not lost
 
 
+def test_the_pages_stay_short() -> None:
+    assert sum(len(page.read_text(encoding="utf-8").split()) for page in (ROOT / "docs").rglob("*.md")) <= 65_000
+    below_first_screen = (ROOT / "README.md").read_text(encoding="utf-8").split("\n## ", 1)[1]
+    assert len(below_first_screen.split()) <= 600
+
+
 def test_every_decision_stands_once_in_the_index() -> None:
     decisions = ROOT / "docs/adr"
     listed = re.findall(

@@ -86,6 +86,9 @@ def test_what_lies_there_and_is_no_dataset_is_left_alone(made, bucket):
     with pytest.raises(UsageError, match=r"s3://sets: holds notes.txt and no dataset.json; it is left alone"):
         build_dataset("s3://sets", store=made / "store", recipe=Recipe())
     assert files(bucket[0]) == {"notes.txt": b"mine"}
+    shutil.copytree(made / "store", bucket[0] / "st")
+    with pytest.raises(UsageError, match=r"s3://sets/st: holds index and no dataset.json; it is left alone"):
+        build_dataset("s3://sets/st", store=made / "store", recipe=Recipe())
 
 
 def folders(bucket, name="by name/ds"):
@@ -109,14 +112,6 @@ def test_a_second_night_builds_there_and_readers_see_it_while_an_earlier_one_fin
     assert len(diff(f"{URL}/{GENERATIONS}/{first.name}", URL).causes) > 0, (
         "the folder of a generation is a dataset itself"
     )
-
-
-def test_what_was_made_with_other_options_is_replaced_with_force(made, bucket):
-    build_dataset(URL, store=made / "store", recipe=Recipe())
-    with pytest.raises(UsageError, match="was made with other options, and stays"):
-        build_dataset(URL, store=made / "store", recipe=Recipe(), seed=7)
-    assert build_dataset(URL, store=made / "store", recipe=Recipe(), seed=7, force=True).status == "done"
-    assert [folder.name[:10] for folder in folders(bucket)] == ["0000000001", "0000000002"]
 
 
 def test_what_0_8_or_a_copy_put_there_is_read_and_the_next_build_is_beside_it(made, bucket):
@@ -151,12 +146,6 @@ def test_a_redacted_dataset_names_no_machine_in_its_log(made, bucket):
     text = b"".join(path.read_bytes() for path in (bucket[0] / "by name" / "ds" / "log").iterdir()).decode()
     assert "generations/0000000001-" in text
     assert not [name for name in (socket.gethostname(), str(made), getpass.getuser()) if name in text]
-
-
-def test_a_store_is_left_alone(made, bucket):
-    shutil.copytree(made / "store", bucket[0] / "st")
-    with pytest.raises(UsageError, match=r"s3://sets/st: holds index and no dataset.json; it is left alone"):
-        build_dataset("s3://sets/st", store=made / "store", recipe=Recipe())
 
 
 def test_verify_names_what_is_of_no_generation_and_what_is_wrong_with_the_log(made, bucket):
