@@ -103,7 +103,7 @@ _READ_HEADER = ["read", "gaps", "longest gap [s]", "time", "offset [s]", "stamps
 
 
 def _read_cells(topic: InspectedTopic) -> list[str]:
-    """Return what reading everything found of a topic, in the order of the header."""
+    """Return the cells of a topic that was read completely, in the order of `_READ_HEADER`."""
     if (stamps := topic.stamps) is None:
         return [""] * len(_READ_HEADER)
     odd = {

@@ -37,7 +37,7 @@ def resolve_recipe_with_source(explicit: str | None) -> tuple[Recipe, str]:
 
 @contextmanager
 def show_progress(what: str, *, quiet: bool, as_json: bool = False) -> Iterator[Progress]:
-    """Show progress on stderr: bars on a terminal, else plain lines, nothing with ``quiet``; with ``--debug`` its log says all."""
+    """Show progress on stderr: bars on a terminal, else plain lines, nothing with ``quiet``; with ``--debug`` only its log."""
     logger = logging.getLogger("tcpipe")
     debugging = logger.isEnabledFor(logging.DEBUG)
     shown = Progress(what, quiet=quiet, console=None if quiet or debugging else _open_terminal(as_json=as_json))
@@ -72,14 +72,14 @@ _LONGEST_NAME = 40
 
 @dataclass(slots=True)
 class _Row:
-    """The bar of a log under way, None where there are too many, and its share that is done."""
+    """A log under way: its bar, None where there are too many, and the share that is done."""
 
     bar: TaskID | None
     share: float = 0.0
 
 
 class Progress:
-    """Lines on stderr; on a terminal ``console`` a bar of all, and below it one of each log under way, which go at the end."""
+    """Lines on stderr; on a terminal ``console`` a bar of all logs and one of each log under way, until the end."""
 
     def __init__(self, what: str, *, quiet: bool, console: Console | None) -> None:
         self._what = what
@@ -173,7 +173,7 @@ class Progress:
         self._draw_rate(bars)
 
     def end(self, task: str, *, worked: bool) -> None:
-        """Count a log that is done; where nothing had to be ``worked`` on, it tells nothing of the rate."""
+        """Count a log that is done; one that needed no work does not count for the rate."""
         if self._bars is None:
             return
         row, size = self._rows.pop(task, None), self._sizes.get(task, 0)
@@ -201,7 +201,7 @@ def _format_megabytes(size_bytes: float) -> str:
 
 
 class _Lines(logging.Handler):
-    """Sends what the pipeline says to the progress display."""
+    """Sends messages of the pipeline to the progress display."""
 
     def __init__(self, shown: Progress) -> None:
         super().__init__()
@@ -217,7 +217,7 @@ class _Lines(logging.Handler):
 
 @contextmanager
 def write_debug_log() -> Iterator[None]:
-    """Say on stderr what is done and when, and what is behind each error."""
+    """Log every step with its time to stderr, and the cause of each error."""
     logger, handler = logging.getLogger("tcpipe"), _DebugLog()
     before = logger.level
     logger.addHandler(handler)
@@ -246,13 +246,13 @@ def print_line(text: str, *, err: bool = False) -> None:
 
 
 def print_lines(result: object) -> None:
-    """Print a result that tells itself in lines of text on stdout."""
+    """Print the text of a result on stdout."""
     for line in str(result).split("\n"):
         print_line(line)
 
 
 def print_result(result: object, *, as_json: bool) -> None:
-    """Print a result on stdout: one JSON object, or the lines that it tells itself in."""
+    """Print a result on stdout, as one JSON object or as text."""
     if as_json:
         print_json(result)
     else:
@@ -260,7 +260,7 @@ def print_result(result: object, *, as_json: bool) -> None:
 
 
 def print_json(value: Any) -> None:
-    """Print one JSON object on stdout, what no terminal should see as escapes of JSON."""
+    """Print one JSON object on stdout, with unprintable characters as JSON escapes."""
     from tcpipe.formats.json_files import to_json
 
     click.echo(_format_value(to_json(value)), nl=False)
@@ -283,7 +283,7 @@ def print_traceback() -> None:
 
 
 def print_failure(problems: Sequence[str], exit_code: int, *, as_json: bool) -> None:
-    """Say on stderr what went wrong, and print it on stdout as a JSON object if that is wanted."""
+    """Print problems on stderr, and on stdout as a JSON object if that is requested."""
     with suppress(OSError):
         for problem in problems:
             print_line(f"tcpipe: {problem}", err=True)

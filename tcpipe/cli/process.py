@@ -20,7 +20,7 @@ _LATEST_S = 4.0
 
 
 class Terminated(BaseException):
-    """A signal asks this process to end; raised where it runs, so that workers end and temporaries go."""
+    """A signal asks this process to end; raised where it runs, so that workers and temporary files are cleaned up."""
 
     def __init__(self, number: int) -> None:
         super().__init__(f"ended by {signal.Signals(number).name}")
@@ -51,7 +51,7 @@ def prepare_process() -> None:
 
 @contextmanager
 def terminate_on_signal() -> Iterator[None]:
-    """Have a signal that asks this process to end do so, whatever library it is in; what it leaves then, the next call removes."""
+    """End this process on a signal even inside a library that ignores it; the next call removes what remains."""
     read_end, write_end = os.pipe()
     os.set_blocking(write_end, False)
     before = signal.set_wakeup_fd(write_end, warn_on_full_buffer=False)

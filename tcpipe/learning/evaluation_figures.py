@@ -40,25 +40,25 @@ _CALLED = {"w": "power w", "v": "velocity v", "T": "time T", "E": "energy E"}
 _DIGITS = {"w": 1, "v": 3, "T": 3, "E": 1}
 _COLOURS = dict(zip(QUANTITIES, CLASS_COLOURS, strict=False))
 _MOST_SHOWN = 20_000
-"""Samples of a split that can each be clicked: the first, which stand in random order."""
+"""Samples of a split that can be clicked: the first ones, in random order."""
 _WORST = 30
 """Of each split, with their patches."""
 _WHOLE_JOULE = 10.0
-"""Error of E from which on whole joules tell enough: nine ranges of slope fit beside each other."""
+"""Error of E from which whole joules suffice, so that nine ranges of slope fit."""
 
 
 @dataclass(frozen=True, slots=True)
 class EvaluatedSamples:
-    """What the page shows of samples: ``predictions.parquet`` and sheets of the worst metres' patches, None without any."""
+    """Samples of the page: ``predictions.parquet``, and sheets of the worst samples' patches, if any."""
 
     table: pa.Table
     shown: NDArray[np.int64]
-    """The rows that the page holds, rising: the first of each split, and the worst."""
+    """The rows on the page, rising: the first of each split, and the worst."""
     patches: Json
 
 
 def select_evaluated_samples(table: pa.Table, data: Dataset) -> EvaluatedSamples:
-    """Return what a page shows of the samples of ``table``, with patches of the dataset that they are of."""
+    """Return the samples that a page shows, with patches from their dataset."""
     rows, splits = find_worst_rows(table, _WORST), to_texts(table.column("split"))
     first = [np.flatnonzero(splits == name)[:_MOST_SHOWN] for name in dict.fromkeys(splits.tolist())]
     shown, split = np.unique(np.concatenate([*first, rows])), splits[rows]
@@ -76,7 +76,7 @@ def select_evaluated_samples(table: pa.Table, data: Dataset) -> EvaluatedSamples
 
 
 def make_page_data(samples: EvaluatedSamples) -> Json:
-    """Return what the page's script is told."""
+    """Return the data of the page's script."""
     table = samples.table.take(pa.array(samples.shown))
     split, name = (to_texts(table.column(column)) for column in ("split", "terrain_name"))
     splits, class_id = list(dict.fromkeys(split.tolist())), table.column("terrain_class").to_numpy()
@@ -108,7 +108,7 @@ def make_page_data(samples: EvaluatedSamples) -> Json:
 
 
 def sample_sections(samples: EvaluatedSamples, audits: Mapping[str, str]) -> list[Section]:
-    """Return the sections on single samples; nothing where none was predicted. ``audits`` say of each split how near training it is."""
+    """Return the sections on single samples, if any; ``audits`` describe how near to training each split is."""
     if not samples.table.num_rows:
         return []
     worst = (
@@ -198,7 +198,7 @@ def _draw_errors_by_slope(table: pa.Table, split: str, audit: str) -> Section:
 
 
 def _draw_calibration(table: pa.Table) -> Section:
-    """Return how many labels lie below what the model states, for every share that it may state."""
+    """Return the share of labels below each quantile that the model states."""
     plots = []
     for split in pc.unique(table.column("split")).to_pylist():
         part = table.filter(pc.equal(table.column("split"), split))

@@ -1,4 +1,4 @@
-"""The page of an evaluation: a verdict, its samples to be asked one by one, and every table of the paper beside its own."""
+"""The page of an evaluation: a verdict, its samples, and its tables beside those of the paper."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from tcpipe.report.page import Number, Section, render_page, show_verdict
 from tcpipe.tables.findings import PREDICTED, judge_again
 
 FLOORS = {"label_floor": "label noise alone", "simulation_floor": "simulation's own floor"}
-"""What an error can hardly be less than, and what the page calls it."""
+"""Lower bounds of errors, and their names on the page."""
 
 MEASURES = {"rmse": "RMSE", "mape_percent": "MAPE"}
 SCORES = {"held_percent": "held by 90 %", "nll": "NLL", "crps": "CRPS"}
@@ -168,7 +168,7 @@ def _make_class_sections(found: Evaluation) -> list[Section]:
 
 
 def _iterate_class_rows(found: Evaluation, split: str, quantity: str) -> Iterator[tuple[str, ...]]:
-    """Yield the rows of a quantity in table I or II: measures beside the paper's and what they can hardly be less than, then scores."""
+    """Yield the rows of a quantity in table I or II: measures beside the paper's and their lower bounds, then scores."""
     part = found.splits[split]
     classes = [*part.class_order, ALL]
 
@@ -193,7 +193,7 @@ def _iterate_class_rows(found: Evaluation, split: str, quantity: str) -> Iterato
 
 
 def _describe_error_samples(found: Evaluation) -> str:
-    """Return what samples the model knows its own errors by, in words."""
+    """Return which samples the stated errors of the model rest on, in words."""
     training = found.model.training
     count = training.samples["held out"]
     if training.config.model == "resnet18":
@@ -205,12 +205,12 @@ def _describe_error_samples(found: Evaluation) -> str:
 
 
 def format_audit(found: Evaluation) -> str:
-    """Return how much of each split was met in training, in words."""
+    """Return how near to training each split is, in words."""
     return " ".join(f"{split}: {format_leakage(found.splits[split].leakage)}" for split in found.ordered_splits)
 
 
 def format_leakage(leakage: Leakage | None) -> str:
-    """Return how much of a split was met in training, in words."""
+    """Return how near to training a split is, in words."""
     if leakage is None:
         return "Nothing is known of its distance from training."
     sharing = "" if leakage.sharing_percent is None else f"; {leakage.sharing_percent:.0f} % share ground with one"

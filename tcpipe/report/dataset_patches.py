@@ -1,4 +1,4 @@
-"""Some hundred patches inside a dataset's page, of every split, class and range of slope; and all of them in a folder beside it."""
+"""Patches on a dataset's page: some hundred of every split, class and slope inside it, and all of them in a folder beside it."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _PX = 48
 """Side of a patch in the page; larger ones are thinned."""
 
 _MOST_PIECES = 24
-"""Pieces of the files that are read: patches lie in random order, so a few hold all kinds."""
+"""Pieces of the files that are read: the order of patches is random, so a few pieces contain all kinds."""
 
 PER_SHEET = 10 * ACROSS
 """Patches in a picture of that folder."""
@@ -33,7 +33,7 @@ PER_SHEET = 10 * ACROSS
 
 @dataclass(frozen=True, slots=True)
 class _Patches:
-    """A dataset's patches: by row of its samples where each lies in the files, and in which piece, (T,); ``step`` thins the pixels."""
+    """Patches of a dataset; for each sample its place in the files and the piece of it, (T,); ``step`` thins the pixels."""
 
     files: PatchFiles
     place: NDArray[np.int64]
@@ -115,13 +115,13 @@ def _join_colours(pixels: Mapping[str, NDArray[Any]]) -> Mapping[str, NDArray[An
 
 
 def find_picture_folder(card: DatasetCard) -> tuple[str, int]:
-    """Return where the pictures of all of this dataset's patches lie from its page, and how many there are."""
+    """Return the folder of the pictures of all patches, relative to the page, and their number."""
     layers = len(card.layers) - (len(COLOURS) if set(COLOURS) <= set(card.layers) else 0)
     return f"{REPORT_PATCHES}/{card.inputs[:16]}", layers * -(-card.samples // PER_SHEET)
 
 
 def iterate_pictures(directory: Path, card: DatasetCard) -> Iterator[tuple[str, bytes]]:
-    """Yield the pictures of all patches, in the order of the samples, and what each is called in its folder.
+    """Yield file name and content of the pictures of all patches, in the order of the samples.
 
     Raises
     ------
@@ -139,7 +139,7 @@ def iterate_pictures(directory: Path, card: DatasetCard) -> Iterator[tuple[str, 
 
 
 def _find_range(stack: NDArray[np.generic]) -> tuple[float, float]:
-    """Return between which values most pixels lie."""
+    """Return the range that contains most pixels."""
     low, high = np.percentile(stack.astype(np.float64), (1, 99))
     return float(low), float(high)
 

@@ -1,4 +1,4 @@
-"""The samples inside a dataset's page: columns that can be clicked, or their means over small cells where there are too many."""
+"""Samples on a dataset's page: each as a point, or means over small cells where there are too many."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ Ints = NDArray[np.int64]
 
 @dataclass(frozen=True, slots=True)
 class SamplesShown:
-    """What the page holds: a row a sample, or one a cell.
+    """Rows of the page: a sample each, or a cell each.
 
     ``xy_m`` are middles in the first map's plane, (N, 2); ``row_of`` is where each sample of the table went, ``apart_m`` how far its
     nearest train sample lies, NaN of those that are not held out, (T,) each.
@@ -50,7 +50,7 @@ class SamplesShown:
 
 
 def find_nearest_train_m(xy_m: Floats, split: NDArray[np.str_]) -> tuple[Floats, Ints]:
-    """Return how far the nearest middle of a train sample lies from every held-out one [m], NaN elsewhere, and its row, shape (N,)."""
+    """Return distance [m] and row of the nearest training sample, by middles, of each held-out sample, shape (N,); NaN elsewhere."""
     apart, nearest = np.full(len(xy_m), np.nan), np.zeros(len(xy_m), np.int64)
     held, train = np.flatnonzero(np.isin(split, ("test", "unseen"))), np.flatnonzero(split == "train")
     if len(held) and len(train):
@@ -60,7 +60,7 @@ def find_nearest_train_m(xy_m: Floats, split: NDArray[np.str_]) -> tuple[Floats,
 
 
 def select_samples(card: DatasetCard, table: pa.Table) -> SamplesShown:
-    """Return what the page holds of the samples."""
+    """Return the samples of the page."""
     to_map = Transformer.from_crs(card.recipe.read.gnss_crs, card.maps[0].crs, always_xy=True)
     middle_deg = 0.5 * (read_lonlat_deg(table, "start") + read_lonlat_deg(table, "end"))
     xy_m = np.column_stack(to_map.transform(*middle_deg.T)).reshape(-1, 2)

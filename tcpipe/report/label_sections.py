@@ -40,7 +40,7 @@ QUALITY_WORDS = {
     Quality.NOT_AT_LIMIT: "commanded below full speed",
     Quality.SENSORS_DISAGREE: "sensors disagree",
 }
-"""What a bit says, in words."""
+"""Meaning of each bit."""
 
 
 def make_losses_sections(ledgers_m: Sequence[Mapping[str, float]], text: str, *, names_runs: bool) -> list[Section]:
@@ -65,7 +65,7 @@ def make_losses_sections(ledgers_m: Sequence[Mapping[str, float]], text: str, *,
 
 
 def find_distinguishing_bits(bits: NDArray[np.integer]) -> int:
-    """Return the quality bits that some labels carry and others do not: a bit of all of them says nothing on a map."""
+    """Return the quality bits that some but not all labels have; only these are useful on a map."""
     bits = bits.astype(np.int64)
     return int(np.bitwise_or.reduce(bits, initial=0) & ~np.bitwise_and.reduce(bits)) if len(bits) else 0
 
@@ -141,7 +141,7 @@ def _format_with_std(term: PhysicsTerm) -> str:
 
 
 def make_physics_sections(fits: Mapping[str, PhysicsFit]) -> list[Section]:
-    """Return a section of the fits by robot; none where there are none."""
+    """Return the section on the fits by robot, if any."""
     text = " ".join(describe_physics(robot, fit) for robot, fit in fits.items())
     return [Section("What a metre costs: standing, drivetrain, rolling, grade, turning", text)] if fits else []
 

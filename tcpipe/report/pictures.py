@@ -41,7 +41,7 @@ def encode_picture(pixels: Bytes, *, exact: bool = False) -> bytes:
 
 
 def read_picture(path: Path) -> Bytes | None:
-    """Return a picture in colour, shape (R, C, 3); None where there is none that can be read."""
+    """Return a picture in colour, shape (R, C, 3); None if it cannot be read."""
     try:
         with Image.open(path) as picture:
             return np.asarray(picture.convert("RGB"), np.uint8)
@@ -210,7 +210,7 @@ def write_overview(path: Path, picture: NDArray[np.uint8], *, texts: Mapping[str
 
 
 _SHOWS = "tcpipe map"
-"""Key of the text in a quick look that tells which map it shows: the seal of the map's checksums."""
+"""Key of the text in a quick look that identifies its map: the seal of the map's checksums."""
 
 
 def write_quick_look(picture: Path, look: NDArray[np.uint8], seal: str) -> None:

@@ -1,4 +1,4 @@
-"""The page of one ingested run: where it drove, what its sensors told over time, what was used, and what each metre cost."""
+"""The page of a run: map, sensors over time, use of the distance, labels, and how far each sensor agrees."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ from tcpipe.tables.findings import Finding, select_findings
 _PAGE = "report.html"
 _DAMAGE = "Where messages are lost or may be."
 _STEP_M = 0.05
-"""Places of the track that are nearer are one on the map."""
+"""Positions of the track that are nearer become one on the map."""
 
 
 def run_report(store: Store, run: RunDirectory, pictures_by_map: MutableMapping[str, Pictures] | None = None) -> str:
@@ -189,7 +189,7 @@ def _read_series(store: Store, run: RunDirectory, timeline: Timeline) -> tuple[l
 
 
 def _describe_series(series: Sequence[Series], lines: Sequence[Line]) -> str:
-    """Return what the plots show, and which series are thinned."""
+    """Return the text above the plots over time, with the series that are thinned."""
     text = (
         "Shaded: not used, in the colour of the reason. Draw a box to zoom, double-click for the whole run; every plot follows. "
         "Where many values share a pixel, the line goes through the lowest and the highest of them."
@@ -206,7 +206,7 @@ def _describe_series(series: Sequence[Series], lines: Sequence[Line]) -> str:
 
 
 def _make_segments_data(segments: pa.Table, timeline: Timeline, run_map: RunMap) -> Json:
-    """Return what the page holds of each segment."""
+    """Return the columns of segments on the page."""
     epoch = to_integers(segments, "epoch")
     columns: dict[str, Column] = {
         name: ("f32", timeline.seconds(to_integers(segments, f"{name}_ns"), epoch)) for name in ("start", "end")
@@ -316,7 +316,7 @@ def _make_trust_sections(facts: StageFacts, rejections: pa.Table) -> list[Sectio
 
 
 def _make_disagreement_sections(facts: StageFacts) -> list[Section]:
-    """Return when sensors and track disagree, by what and how much; where they never do, nothing."""
+    """Return when sensors and track disagree, in which quantity and by how much, if they do."""
     disagreements = facts.audit.disagreements if facts.audit else ()
     if not disagreements:
         return []
@@ -338,7 +338,7 @@ def _make_disagreement_sections(facts: StageFacts) -> list[Section]:
 
 
 def _make_clock_sections(facts: StageFacts, findings: Sequence[Finding]) -> list[Section]:
-    """Return how late each sensor's stamps are; where nothing could be compared, nothing."""
+    """Return the time offset of each sensor, if any could be compared."""
     clock_offsets = facts.clock_offsets
     steps = [f"{step.step_s:+.3f} s at log time {step.log_time_ns} ns" for step in facts.clock_steps]
     offsets = clock_offsets.offsets if clock_offsets else {}
@@ -365,7 +365,7 @@ def _make_clock_sections(facts: StageFacts, findings: Sequence[Finding]) -> list
 
 
 def _format_correction(role: str, findings: Sequence[Finding]) -> str:
-    """Return what corrects a sensor's clock, as the findings on it propose."""
+    """Return the correction of a sensor's clock that its findings propose."""
     clocks = select_findings(findings, "time-offset", "clock-drift", "clocks-differ")
     role_findings = [finding for finding in clocks if finding.subject.name == role]
     remedies = [describe_remedy(finding, remedy) for finding in role_findings for remedy in finding.remedies]
@@ -379,7 +379,7 @@ def _format_drift(offset: ClockOffset) -> str:
 
 
 def _make_provenance_section(run: RunDirectory, manifest: Manifest, run_json: RunJson | None) -> Section:
-    """Return what the run is made from: enough to make it again."""
+    """Return the inputs from which the run can be made again."""
     rows = [
         ("made by", f"tcpipe {manifest.tcpipe_version}, data model {manifest.data_model_version}"),
         ("recipe", run.recipe_id),

@@ -1,4 +1,4 @@
-"""The page of a store: all its runs, what is drifting over the nights, what was lost, and what is in which dataset."""
+"""The page of a store: all runs, changes over time, losses, findings, datasets and failed logs."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class StoredDataset:
 
 @dataclass(frozen=True, slots=True)
 class FailedLog:
-    """A log that gave no run: why, and how that stands."""
+    """A log without a run: reason and state."""
 
     log: str
     why: str
@@ -55,7 +55,7 @@ class FailedLog:
 
 @dataclass(frozen=True, slots=True)
 class StoreFacts:
-    """What the page of a store is made of."""
+    """The content of a store's page."""
 
     where: str
     found: Ingestions
@@ -67,7 +67,7 @@ class StoreFacts:
     verdict: Verdict
     """On the current runs together."""
     changes: tuple[Finding, ...]
-    """What the latest of them have changed."""
+    """Changes in the latest of them."""
     groups: tuple[FindingGroup[str], ...]
     """Findings of the current runs by code, the worst first."""
     failed: tuple[FailedLog, ...]
@@ -75,7 +75,7 @@ class StoreFacts:
 
 @dataclass(frozen=True, slots=True)
 class StoredRun:
-    """A row of the page: what the index has of an ingestion, how it stands, its page, its datasets and codes of findings."""
+    """A row of the page: an ingestion with its state, page, datasets and codes of findings."""
 
     run_id: str
     recipe_id: str
@@ -104,7 +104,7 @@ class StoredRun:
         return self.facts.energy_budget.total if self.facts and self.facts.energy_budget else None
 
     def row(self, terms: Sequence[str]) -> list[Json]:
-        """Return what the page's script is told, in the order of `_FIELDS`."""
+        """Return the values of `_FIELDS` for the page's script."""
         facts = self.facts
         if facts is None:
             return [self.run_id, self.href, None, "", self.state, "", "", *[None] * 4, "", None, [], [], None, []]
@@ -136,7 +136,7 @@ _FIELDS = (
 
 
 def sort_runs(store: StoreFacts) -> list[StoredRun]:
-    """Return every ingestion, what began last first; then those without a segment, and those that cannot be read."""
+    """Return every ingestion, the latest first; then those without a segment, and those that cannot be read."""
     found, ruling = store.found, find_recipe_key(store.found)
     members, codes = dict[tuple[str, str], list[int]](), dict[str, list[int]]()
     for number, dataset in enumerate(store.datasets):
@@ -187,7 +187,7 @@ def _compute_percent(share: float | None) -> float | None:
 
 
 def name_datasets(datasets: Sequence[StoredDataset]) -> list[str]:
-    """Return what each dataset is called: the last part of its path, all of it where two would be called the same."""
+    """Return a unique name of each dataset: the last part of its path, or the whole path."""
     short = [PurePosixPath(dataset.out).name for dataset in datasets]
     return [name if short.count(name) == 1 else dataset.out for name, dataset in zip(short, datasets, strict=True)]
 
