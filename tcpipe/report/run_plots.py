@@ -66,7 +66,7 @@ class Timeline:
         return last.start_s + (last.last_ns - last.first_ns) * 1e-9
 
     def seconds(self, stamp_ns: Ints, epoch: Ints | None = None) -> Floats:
-        """Return times of stamps [s], shape (N,), NaN of an epoch that the track lacks; without epochs by the first that contains a stamp."""
+        """Return times of stamps [s], shape (N,), NaN outside the track; without ``epoch`` by the first epoch that contains a stamp."""
         t_s = np.full(len(stamp_ns), np.nan)
         for part in self.epochs:
             within = np.isnan(t_s) & (stamp_ns >= part.first_ns) & (stamp_ns <= part.last_ns)
