@@ -24,7 +24,7 @@ def compute_course_rate(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return how fast the course over ground turns: stamps [s] from ``zero_ns`` on, twice a second at most, and rates [rad/s].
 
-    The course is that of the way over a second, or over as many as it takes to be longer than the fixes are noisy; in between it turns
+    The course is that of the displacement over a second, or over as many as it takes to exceed the noise of the fixes; in between it turns
     evenly. Where the odometry goes backwards, the body looks the other way. Single wild fixes are bridged.
     """
     stamp_s = compute_seconds(gnss.stamp_ns, zero_ns)

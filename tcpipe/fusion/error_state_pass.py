@@ -12,9 +12,15 @@ from numpy.typing import NDArray
 
 from tcpipe.fusion import state_kernel as kernel
 from tcpipe.fusion.error_state_kernel import OFF_M, SURELY, filter_block, find_largest_drift
-from tcpipe.fusion.fix_errors import FixErrors
-from tcpipe.fusion.gates import find_chi_square_threshold
-from tcpipe.fusion.gnss_faults import FaultHypothesis, Innovations, Jump, Spans, is_inside, unexplained_innovation
+from tcpipe.fusion.gnss_faults import (
+    FaultHypothesis,
+    FixErrors,
+    Innovations,
+    Jump,
+    Spans,
+    is_inside,
+    unexplained_innovation,
+)
 from tcpipe.fusion.measurements import DOPPLER, GNSS, VISUAL, WHEELS, InitialState, Measurements
 from tcpipe.fusion.process import (
     SLOPE_RAD,
@@ -25,7 +31,7 @@ from tcpipe.fusion.process import (
     scale_stds,
     turn_scale_std,
 )
-from tcpipe.fusion.signals import compute_median_period_ns
+from tcpipe.fusion.signals import compute_median_period_ns, find_chi_square_threshold
 from tcpipe.fusion.smoother_kernel import smooth_block
 from tcpipe.fusion.timeline import EventTimeline
 from tcpipe.fusion.trajectory import DISPLACEMENT_LAGS_S
@@ -79,14 +85,7 @@ class _Memory:
 
 
 class FilterPass:
-    """One timeline with its constants and what the gates said.
-
-    Parameters
-    ----------
-    timeline, measurements : the events, and what they are made of.
-    gate_probability : a measurement less likely than 1 minus this is refused.
-    lags : [rows of the wanted stamps], over which displacements are judged, see `compute_lag_rows`.
-    """
+    """One timeline with its constants and what the gates decided; ``lags`` are rows of the wanted stamps (`compute_lag_rows`)."""
 
     def __init__(
         self, timeline: EventTimeline, measurements: Measurements, gate_probability: float, *, lags: Sequence[int]

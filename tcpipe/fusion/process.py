@@ -125,10 +125,10 @@ def turn_scale_std(measurements: Measurements) -> float:
 
 
 def scale_stds(measurements: Measurements) -> tuple[float, float]:
-    """Return how far the scales of wheels and visual odometry may be off, to be found; 0 where nothing tells: it stays 1.
+    """Return the standard deviations of the scales of wheels and visual odometry; 0 where a scale is unobservable: it stays 1.
 
-    Only fixes tell how long a metre is. Without any, one odometry is the measure: the camera where there is one, else the wheels. An
-    accelerometer does not tell: what it adds up to over a minute is its tilt and its bias.
+    Only fixes make a scale observable. Without any, one odometry is the measure: the camera where there is one, else the wheels. What an
+    accelerometer adds up to over a minute is its tilt and its bias.
     """
     if measurements.gnss is not None:
         return WHEEL_SCALE_STD, VISUAL_SCALE_STD
@@ -138,9 +138,8 @@ def scale_stds(measurements: Measurements) -> tuple[float, float]:
 def process_noise(measurements: Measurements) -> NDArray[np.float64]:
     """Return the process noise by mode, shape (4, 20), as `tcpipe.fusion.prediction_kernel.predict` takes it.
 
-    Somewhat more than the IMU's white noise stands for its scale and alignment errors. Biases and scales wander: their densities are
-    what such sensors do in a second. Slip comes and goes, so the wheels' scale returns to one; where only the wheels and the camera
-    tell speed, neither is known to be right on average, and it wanders freely.
+    It includes the scale and alignment errors of the IMU. Biases and scales wander. Slip comes and goes, so the wheels' scale returns to
+    one; where only the wheels and the camera measure speed, neither is known to be right on average, and it wanders freely.
     """
     density = np.zeros((4, kernel.N + 4))
     density[:, 0:3] = _DRIFT

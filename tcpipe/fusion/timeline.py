@@ -11,7 +11,7 @@ Constraints are events of our own making:
   small deviation: that locks GNSS out. Its information is that of 0.15 m/s ten times a second, whatever the wheels' rate; so is that of
   the wheels themselves, as far as they claim a larger variance than they scatter by: such an error, slip, lasts as well.
 - a receiver's own velocity errs alike for a while (its filter, multipath): it counts once in three seconds, whatever its rate.
-- standing (`tcpipe.fusion.stationary`): zero velocity, and the gyroscope shows its bias, five times a second.
+- standing (`tcpipe.fusion.initial`): zero velocity, and the gyroscope shows its bias, five times a second.
 - level, where no accelerometer tells up from down: roll and pitch are small. A slope lasts, so 20° are counted once in four seconds: as 40°
   once a second.
 """
@@ -81,14 +81,7 @@ class EventTimeline:
 
 
 def build_timeline(measurements: Measurements, standing_ns: Ints, output_ns: Ints) -> EventTimeline:
-    """Merge measurements, constraints and wanted stamps.
-
-    Parameters
-    ----------
-    measurements : of one stretch.
-    standing_ns : [ns], shape (K, 2), from `tcpipe.fusion.stationary.find_stationary_intervals`.
-    output_ns : [ns], shape (N,), increasing.
-    """
+    """Merge measurements of one section, constraints and wanted stamps [ns]; ``standing_ns`` [ns], shape (K, 2), are stops."""
     parts = _make_measured_parts(measurements)
     start = min(int(part[0][0]) for part in parts if part[0].size)
     end = max(int(part[0][-1]) for part in parts if part[0].size)

@@ -12,7 +12,7 @@ from tcpipe.balance.cells import SLOPE_NAMES
 from tcpipe.cost.labels import format_budget
 from tcpipe.formats.dataset_card import Balance, CellRow
 from tcpipe.formats.finding_lines import advise_on_loss
-from tcpipe.motion.remedies import find_largest_losses
+from tcpipe.motion.distance_breakdown import find_largest_losses
 from tcpipe.report.page import Section, Shaded
 from tcpipe.report.plots import draw_waterfall
 from tcpipe.tables.bits import Quality, flag_name

@@ -31,10 +31,15 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.fusion.gates import find_chi_square_threshold
 from tcpipe.fusion.measurements import DOPPLER, GNSS, IMU, VISUAL, WHEELS, BodyVelocities, Measurements, Positions
 from tcpipe.fusion.process import DOPPLER_LASTS_S, VISUAL_SCALE_STD, WHEEL_SCALE_STD
-from tcpipe.fusion.signals import compute_interval_means, compute_median_period_ns, compute_seconds, is_in_gap
+from tcpipe.fusion.signals import (
+    compute_interval_means,
+    compute_median_period_ns,
+    compute_seconds,
+    find_chi_square_threshold,
+    is_in_gap,
+)
 from tcpipe.fusion.trajectory import DISPLACEMENT_LAGS_S, Trajectory
 from tcpipe.geometry.rotation import matrix_from_quat, quat_from_matrix, rotation_vector_from_quat
 from tcpipe.tables.facts import Disagreement
@@ -124,10 +129,9 @@ class Tally:
 
 @dataclass(frozen=True, slots=True)
 class Audit:
-    """What the audit of one stretch found: disagreements in order of time, and how much of the way each sensor disagrees.
+    """The audit of one section: disagreements in order of time, and over how much of the distance each sensor disagrees.
 
-    ``windows``: those in which a sensor tells the robot's way; ``astray``: those in which the track's is far from what every such sensor
-    says.
+    In ``windows`` a sensor measures the robot's distance; in those ``astray`` the track's is far from that of every such sensor.
     """
 
     disagreements: tuple[Disagreement, ...]
@@ -137,13 +141,7 @@ class Audit:
 
 
 def audit_trajectory(found: Trajectory, measurements: Measurements) -> tuple[Trajectory, Audit]:
-    """Return the trajectory with deviations raised where sensors disagree with it, and what was found.
-
-    Parameters
-    ----------
-    found : of one stretch.
-    measurements : what fed it.
-    """
+    """Return the trajectory of one section with standard deviations inflated where sensors disagree with it, and what was found."""
     windows = _find_windows(found.stamp_ns)
     if not windows.size:
         return found, Audit((), ())
@@ -442,10 +440,9 @@ def _find_disagreements(
 
 
 def _compute_distance_error_m(compared: Sequence[Comparison], fixes: Iterable[Comparison], windows: int) -> Floats:
-    """Return how far the track's way in each window is off what every sensor says of it [m], shape (W,).
+    """Return how far the track's distance in each window is off that of every sensor [m], shape (W,); 0 where one agrees, NaN without any.
 
-    0 where one holds with it, NaN where none tells. What the track claims and what the gate refused does not count: an estimate that has
-    lost the robot refuses what is right, and believes itself.
+    The track's uncertainty and its outlier gate do not count: an estimate that has lost the robot rejects what is right.
     """
     ways = [one for one in compared if one.what == "displacement" and one.sensor != GNSS]
     off_m = np.full(windows, np.nan)

@@ -12,11 +12,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.fusion.checks.clock_offsets import select_speed_changes
-from tcpipe.fusion.checks.frozen import refuse_frozen
-from tcpipe.fusion.checks.lags import Floats, Lag, compute_moving_mean, find_lag
-from tcpipe.fusion.checks.refusals import SensorExclusion
-from tcpipe.fusion.checks.resampled_motion import FIXES_S, compute_fix_velocity, resample_signal, resample_twist
-from tcpipe.fusion.checks.windows import find_liveliest_window_ns
+from tcpipe.fusion.checks.distances import refuse_frozen
+from tcpipe.fusion.checks.lags import (
+    FIXES_S,
+    Floats,
+    Lag,
+    compute_fix_velocity,
+    compute_moving_mean,
+    find_lag,
+    find_liveliest_window_ns,
+    resample_signal,
+    resample_twist,
+)
+from tcpipe.fusion.checks.plausibility import SensorExclusion
 from tcpipe.fusion.measurements import DOPPLER, GNSS, GroundVelocities, Measurements, Positions
 from tcpipe.fusion.signals import compute_median_period_ns, compute_seconds, integrate_signal, is_in_gap
 

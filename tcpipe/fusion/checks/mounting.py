@@ -58,12 +58,9 @@ _LEAST_WAY_M = 1e-3
 
 @dataclass(frozen=True, slots=True)
 class ArmEvidence:
-    """Normal equations of an arm's error [m] and the lag of the fixes [s], one for each of W windows, weighted by what is left.
+    """Normal equations of an arm's error [m] and the lag of the fixes [s] in W windows, (W, 4, 4) and (W, 4), weighted by the residuals.
 
-    Attributes
-    ----------
-    matrix, vector : shapes (W, 4, 4) and (W, 4).
-    unseen_std_m : how far ahead of base_link the odometry's own turning point may be.
+    The odometry's own turning point may be up to ``unseen_std_m`` [m] ahead of base_link.
     """
 
     matrix: Floats
@@ -179,16 +176,11 @@ def _make_orthonormal_basis(columns: Floats) -> Floats:
 
 
 def solve_arm(told: Sequence[ArmEvidence | None], moved_m: Floats, *, height_std_m: float = ARM_STD_M) -> Arm | None:
-    """Return the error of the arm by all stretches, and how well it is known; None without evidence of three windows.
+    """Return the error of the arm by the evidence of all sections, and its covariance; None without evidence of three windows.
 
     Fixes of one window err together: by how windows scatter more than their fixes claim (Huber's sandwich), they count as fewer. No
-    deviation is beyond what is known beforehand.
-
-    Parameters
-    ----------
-    told : of each stretch.
-    moved_m : [m], shape (3,), by how much the arm was mended already; it is part of the error that is returned.
-    height_std_m : how well the antenna's height is known beforehand.
+    standard deviation exceeds the prior's, which for the antenna's height is ``height_std_m``. The error includes ``moved_m`` [m], shape
+    (3,), by which the arm was corrected already.
     """
     evidence = [each for each in told if each is not None]
     if not evidence:

@@ -123,13 +123,9 @@ def rescale_odometries(m: Measurements, scales: Mapping[str, Scale]) -> Measurem
 
 
 def compute_command_ratio(wheels: BodyVelocities, command_ns: NDArray[np.int64], commanded_mps: Floats) -> float | None:
-    """Return how many times as fast as it is told to a robot goes by its wheels, where that is surely too fast; None where it is not.
+    """Return the ratio of the wheels' speed to the commanded speed, where that is surely too fast; else None.
 
-    Only times count in which a command has stood for three seconds: a robot that brakes is faster than its command.
-
-    Parameters
-    ----------
-    command_ns, commanded_mps : stamps [ns] and forward velocities [m/s], shape (N,), in order of time.
+    Only times count in which a command has been constant for three seconds: a robot that brakes is faster than its command.
     """
     if command_ns.size == 0:
         return None
