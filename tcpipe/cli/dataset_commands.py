@@ -155,8 +155,8 @@ def _print(exported: Exported, log: str, out: str) -> None:
         count = len(exported.topics)
         print_line(f"nothing to do: {count} of {count} topics of {log} are in {out} already")
     else:
-        for of in exported.topics:
-            print_line(f"{of.messages:>9} messages  {of.topic}  {of.path}")
+        for topic in exported.topics:
+            print_line(f"{topic.messages:>9} messages  {topic.topic}  {topic.path}")
         if not exported.topics:
             print_line(f"nothing to export: {log} holds no topic")
     for kind, findings in (("damage", exported.damage), ("remark", exported.remarks)):

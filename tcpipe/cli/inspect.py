@@ -109,7 +109,7 @@ _READ_HEADER = ["read", "gaps", "longest gap [s]", "time", "offset [s]", "stamps
 
 
 def _read_cells(topic: InspectedTopic) -> list[str]:
-    """Return what reading everything found of a topic, in the order of the header."""
+    """Return the cells of a topic that was read completely, in the order of `_READ_HEADER`."""
     if (stamps := topic.stamps) is None:
         return [""] * len(_READ_HEADER)
     odd = {
@@ -163,7 +163,7 @@ def _print_dataset(found: InspectedDataset) -> None:
         f"format {found.format}, data model {found.data_model_version}"
     )
     print_line("")
-    names = [entry.name for entry in found.classes if any(entry.name in of for of in found.terrain.values())]
+    names = [entry.name for entry in found.classes if any(entry.name in counts for counts in found.terrain.values())]
     rows = [
         [split, str(found.splits[split]), *(str(found.terrain.get(split, {}).get(name, 0)) for name in names)]
         for split in ("train", "test", "unseen", "buffer")
@@ -212,9 +212,9 @@ def _print_run(found: InspectedRun) -> None:
         ledger = run.ledger_m
         print_line("")
         print_line(f"recipe {run.recipe_id}: {run.counts.segments} segments of robot {run.robot}")
-        lost = sorted(((metres, name) for name, metres in ledger.items() if metres >= 0.05), reverse=True)
-        said = ", ".join(f"{metres:.1f} m {name.replace('_', ' ')}" for metres, name in lost)
-        print_line(f"{run.driven_m:.1f} m driven: {said}" if said else "not driven")
+        ordered = sorted(((metres, name) for name, metres in ledger.items() if metres >= 0.05), reverse=True)
+        losses = ", ".join(f"{metres:.1f} m {name.replace('_', ' ')}" for metres, name in ordered)
+        print_line(f"{run.driven_m:.1f} m driven: {losses}" if losses else "not driven")
         print_line(f"verdict: {format_verdict(run.verdict)}")
         _print_findings(run.findings)
         _print_damage("damage", run.damage)
