@@ -75,11 +75,11 @@ def build_dataset(options: BuildDatasetOptions, *, as_json: bool, quiet: bool) -
         print_line(f"recipe: {source}")
     with show_progress("build-dataset", quiet=quiet) as shown:
         result = run_build_dataset(replace(options, recipe=ruling))
-        shown.problem(*result.problem_lines())
+        shown.problem(*result.finding_lines(problems=True))
     if as_json:
         print_json(replace(result, recipe=source))
     else:
-        print_lines(result.without_problems())
+        print_lines(result.format())
     return result.exit_code
 
 
@@ -149,18 +149,19 @@ def export(
 
 
 def _print(exported: Exported, log: str, out: str) -> None:
+    from tcpipe.formats.finding_lines import describe_finding
 
     if exported.status == "unchanged":
         count = len(exported.topics)
         print_line(f"nothing to do: {count} of {count} topics of {log} are in {out} already")
     else:
-        for of in exported.topics:
-            print_line(f"{of.messages:>9} messages  {of.topic}  {of.path}")
+        for topic in exported.topics:
+            print_line(f"{topic.messages:>9} messages  {topic.topic}  {topic.path}")
         if not exported.topics:
             print_line(f"nothing to export: {log} holds no topic")
-    for kind in ("damage", "notes"):
-        for line in getattr(exported, kind):
-            print_line(f"{kind.rstrip('s')}: {line}", err=True)
+    for kind, findings in (("damage", exported.damage), ("remark", exported.notes)):
+        for finding in findings:
+            print_line(f"{kind}: {describe_finding(finding)} [{finding.code}]", err=True)
 
 
 @click.command()

@@ -195,7 +195,8 @@ def _bring_run(found: Document) -> Document:
     if "findings" not in found:
         return found
     report = _convert_findings(rename_keys(found["findings"]), "run", "")
-    return {**_rename_top_keys(_remove_keys(found, "findings")), "report": report}
+    texts = {key: _read_earlier(found.get(key, ()), "log", "") for key in ("damage", "remarks")}
+    return {**_rename_top_keys({**_remove_keys(found, "findings"), **texts}), "report": report}
 
 
 def _bring_document(found: Document, where: str) -> Document:
@@ -215,6 +216,7 @@ def _bring_document(found: Document, where: str) -> Document:
         findings = report["findings"]
         document |= {"info": {**_remove_keys(found["info"], "findings"), "report": report}}
         document |= {"counts": _bring_counts(found["counts"])}
+        document |= {"damage": _read_earlier(found["damage"], "run", found["run_id"])}
     else:
         own = chain(found.get("problems", ()), found.get("warnings", ()))
         findings = _read_earlier(own, "dataset", str(found.get("name", "")))

@@ -21,7 +21,7 @@ from tcpipe.pipeline import ingest as ingest_module
 from tcpipe.pipeline.ingest import ingest
 from tcpipe.pipeline.ingest_run import Ingested
 from tcpipe.pipeline.ingest_task import IngestResult, check_age, make_result
-from tcpipe.pipeline.log_sources import find_damage
+from tcpipe.pipeline.log_sources import find_damaged_log
 from tcpipe.pipeline.plan import TO_DO
 from tcpipe.pipeline.problems import acknowledge
 from tcpipe.pipeline.status import find_status
@@ -52,8 +52,9 @@ def make_row(row, task, sha256, kind):
     )
     subject = Subject("run", name)
     empty = make_finding("no-segments", subject, names={"reason": "gap"}, driven_m=80.0, lost_m=80.0)
+    damage = (make_finding("file-cut", Subject("file", name)),)
     changes = {
-        "damaged": {"damage": ("it was cut",), "findings": find_damage(("it was cut",), subject)},
+        "damaged": {"damage": damage, "findings": find_damaged_log(damage, subject)},
         "empty": {"segments": 0, "distance_by_reason_m": {"gap": 80.0}, "findings": (empty,)},
     }
     return replace(made, **changes.get(kind, {}))
@@ -127,15 +128,15 @@ def compare(logs, store, worked, **how):
     before, worked[:] = Store(store).state(), []
     results = {result.log: result for result in ingest([logs], store=store, **how).results}
     after = Store(store).state()
-    assert set(worked) == {name for name, state in predicted.items() if state in TO_DO}
-    for name, state in predicted.items():
+    assert set(worked) == {name for name, standing in predicted.items() if standing in TO_DO}
+    for name, standing in predicted.items():
         result = results[name]
-        if state in ("done", "partial", "empty", "superseded"):
+        if standing in ("done", "partial", "empty", "superseded"):
             assert result.status == "unchanged"
             assert not result.is_new_problem
-        elif state in ("failed_permanent", "quarantined"):
-            assert (result.status, result.known, result.acknowledged) == ("failed", True, state == "quarantined")
-        elif state == "growing":
+        elif standing in ("failed_permanent", "quarantined"):
+            assert (result.status, result.known, result.acknowledged) == ("failed", True, standing == "quarantined")
+        elif standing == "growing":
             assert result.status == "waiting"
     if not worked:
         assert after == before, "a call with nothing to do writes nothing"
