@@ -20,8 +20,8 @@ from tcpipe.formats.recipe_toml import ingest_key, load_profiles, make_recipe_id
 from tcpipe.formats.run_documents import Counts, LogOrigin, Manifest, RunJson, TopicCount
 from tcpipe.formats.stored_runs import lend_streams
 from tcpipe.pipeline.calls import is_committed
-from tcpipe.pipeline.ingest_task import IngestResult, IngestTask, check_age, make_result, mark_reported
 from tcpipe.pipeline.log_sources import LogSource, find_damage
+from tcpipe.pipeline.plan import IngestResult, IngestTask, check_age, make_result, mark_reported
 from tcpipe.progress import set_task, step
 from tcpipe.recipe import IngestSections
 from tcpipe.store import Store
