@@ -79,14 +79,14 @@ def test_trees_by_hand():
 def test_they_say_what_lightgbm_says():
     lightgbm = pytest.importorskip("lightgbm")
     features, labels, folds = _drawn(600)
-    grown = forest.grow(features, labels, np.ones_like(labels), folds)
+    made, held_out = forest.grow(features, labels, np.ones_like(labels), folds)
     for number, label in enumerate(labels.T):
-        rounds = int((grown.forest.output == number).sum())
+        rounds = int((made.output == number).sum())
         booster = lightgbm.train(RULES, lightgbm.Dataset(features, label), rounds)
-        assert grown.forest.predict(features)[:, number] == pytest.approx(booster.predict(features), rel=1e-12)
-    assert np.std(grown.held_out - labels, axis=0) == pytest.approx([5.0, 0.02], rel=0.25)
-    again = forest.grow(features, labels, np.ones_like(labels), folds)
-    assert all(np.array_equal(array, again.forest.arrays()[name]) for name, array in grown.forest.arrays().items())
+        assert made.predict(features)[:, number] == pytest.approx(booster.predict(features), rel=1e-12)
+    assert np.std(held_out - labels, axis=0) == pytest.approx([5.0, 0.02], rel=0.25)
+    again, _ = forest.grow(features, labels, np.ones_like(labels), folds)
+    assert all(np.array_equal(array, again.arrays()[name]) for name, array in made.arrays().items())
 
 
 def test_without_lightgbm_there_is_one_line(monkeypatch):
