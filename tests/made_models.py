@@ -80,6 +80,6 @@ def made_evaluation(**changes) -> Evaluation:
     """An evaluation without any figure; ``changes`` replace its fields."""
     empty = Evaluation(
         tcpipe_version="", key="", model=EvaluatedModel("", "", CARD.training), dataset=EvaluatedDataset("", "", {}),
-        config=EvaluateConfig(), splits={}, ablation=(), energy={}, time={}, baselines=(), repeatability={}, warnings=(), plots={},
+        config=EvaluateConfig(), splits={}, ablation=(), energy={}, time={}, repeatability={}, plots={},
     )  # fmt: skip
     return replace(empty, **changes)

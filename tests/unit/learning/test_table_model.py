@@ -5,7 +5,7 @@ import pytest
 
 from tcpipe.errors import ModelError
 from tcpipe.learning import table_model as forest
-from tcpipe.learning.table_model import find_slope_and_class, fit_table, patch_features, read_table_model
+from tcpipe.learning.table_model import fit_table, patch_features, read_table_model
 
 PX, PATCH_M = 40, 1.0
 ALONG, ACROSS = np.meshgrid(*[(np.arange(PX) + 0.5) / PX - 0.5] * 2)
@@ -115,17 +115,6 @@ def ground(count=900, steepest=0.2, seed=0):
 def fitted():
     features, labels, folds = ground()
     return fit_table(features, labels, np.ones_like(labels), folds, channels=CHANNELS, class_count=CLASSES)
-
-
-def test_slope_and_class_stand_where_the_channels_say():
-    features, _, _ = ground(5)
-    slope, class_id = find_slope_and_class(features, CHANNELS, CLASSES)
-    assert slope.tolist() == features[:, 8].tolist()
-    assert set(class_id.tolist()) <= {4, 5}
-    height_first, _ = find_slope_and_class(features, ("height", "ortho"), CLASSES)
-    assert height_first.tolist() == features[:, 0].tolist()
-    nothing = find_slope_and_class(features[:, :3], ("ortho",), CLASSES)
-    assert not np.any(nothing)
 
 
 def test_steeper_ground_than_any_goes_on_straight_and_texture_is_heeded(fitted):
