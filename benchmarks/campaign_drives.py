@@ -29,7 +29,7 @@ from tcpipe.simulation.messages import Recorder, make_streams
 from tcpipe.simulation.route import Leg, Manoeuvre, Pause, Wander
 from tcpipe.simulation.scenarios import DriveSpec, RasterSpec, Scenario, make_small_world
 from tcpipe.simulation.sensors import Noise, Reading, Sensors, record
-from tcpipe.simulation.site import Site
+from tcpipe.simulation.world import Site
 from tcpipe.stages.read import read_run
 from tcpipe.tables.arrays import to_numbers
 from tcpipe.tables.bits import Quality, flag_name

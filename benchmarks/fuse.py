@@ -25,8 +25,7 @@ from pathlib import Path
 import numpy as np
 
 from tcpipe.fusion.error_state import run_error_state
-from tcpipe.fusion.initial import find_initial_state
-from tcpipe.fusion.stationary import find_stationary_intervals
+from tcpipe.fusion.initial import find_initial_state, find_stationary_intervals
 from tcpipe.fusion.ukf15 import PROCESS_VARIANCE, SensorRows, filter_forward
 from tcpipe.fusion.ukf15_kernel import ANTENNA, SELECT
 from tcpipe.geometry.datum import geodetic_from_enu

@@ -20,7 +20,7 @@ import subprocess
 import sys
 import tempfile
 from code import InteractiveConsole
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 _DOCS = Path(__file__).resolve().parent
@@ -31,11 +31,11 @@ _MARK = "\x01"
 
 @functools.cache
 def rerun(page: Path, directory: Path) -> str:
-    """Return a page's text with the output of its blocks as it is today; they run in the page's own place in ``directory``."""
+    """Return a page's text with the output of its blocks replaced; they run in the page's own directory below ``directory``."""
     text, console = page.read_text(encoding="utf-8"), InteractiveConsole(locals={})
     for other in sorted(_DOCS.rglob("*.md")):
-        made = _HOME.search(other.read_text(encoding="utf-8"))
-        if made and f"../{made[1]}/" in text:
+        match = _HOME.search(other.read_text(encoding="utf-8"))
+        if match and f"../{match[1]}/" in text:
             rerun(other, directory)
     own = _HOME.search(text)
     home = directory / (own[1] if own else page.stem)
@@ -48,69 +48,74 @@ def rerun(page: Path, directory: Path) -> str:
                 with (home / "tcpipe.toml").open("a", encoding="utf-8") as recipe:
                     recipe.write(body)
             return found[0]
-        said = _shell(body, home) if kind == "console" else _python(body, home, console)
-        return f"```{kind}\n{said.replace(str(directory), '~')}```"
+        output = _run_shell(body, home) if kind == "console" else _run_python(body, home, console)
+        return f"```{kind}\n{output.replace(str(directory), '~')}```"
 
     return _BLOCK.sub(block, text)
 
 
-def inputs(body: str, prompt: str, goes_on: Callable[[str, str], bool]) -> list[str]:
-    """Return what is typed in a block, each input with its further lines; outputs are left out.
+def find_inputs(body: str, prompt: str, continues: Callable[[str, str], bool]) -> list[str]:
+    """Return the inputs of a block, each with its further lines, without outputs.
 
-    ``goes_on(line_before, line)`` tells whether a line belongs to the input before it.
+    ``continues(line_before, line)`` tells whether a line belongs to the input before it.
     """
-    typed: list[list[str]] = []
+    inputs: list[list[str]] = []
     inside = False
     for line in body.splitlines():
-        if inside and goes_on(typed[-1][-1], line):
-            typed[-1].append(line)
+        if inside and continues(inputs[-1][-1], line):
+            inputs[-1].append(line)
         elif inside := line.startswith(prompt):
-            typed.append([line])
-    return ["\n".join(lines) for lines in typed]
+            inputs.append([line])
+    return ["\n".join(lines) for lines in inputs]
 
 
-def _shell(body: str, directory: Path) -> str:
-    shown = inputs(body, "$ ", lambda before, _: before.endswith("\\"))
+def _run_shell(body: str, directory: Path) -> str:
+    inputs = find_inputs(body, "$ ", lambda before, _: before.endswith("\\"))
     # The exit code of a command stays readable as $? in the next one.
-    script = "".join(f"{line.removeprefix('$ ')}\nlast=$?; printf '\\001'; (exit $last)\n" for line in shown)
+    script = "".join(f"{line.removeprefix('$ ')}\nlast=$?; printf '\\001'; (exit $last)\n" for line in inputs)
     here = Path(sys.executable).parent
     clean = {key: value for key, value in os.environ.items() if not key.startswith("TCPIPE_")}
-    env = {**clean, "PATH": f"{here}{os.pathsep}{os.environ['PATH']}", "DATA": str(_data())}
-    done = subprocess.run(
+    env = {**clean, "PATH": f"{here}{os.pathsep}{os.environ['PATH']}", "DATA": str(_test_data())}
+    printed = run_script(script, cwd=directory, env=env)
+    outputs = printed.split(_MARK)
+    if len(outputs) != len(inputs) + 1:
+        raise RuntimeError(f"commands did not all end: {printed}")
+    return "".join(
+        f"{line}\n{_trim_output(output)}" for line, output in zip(inputs, outputs[:-1], strict=True)
+    ).replace(str(_test_data()), "$DATA")
+
+
+def run_script(script: str, *, cwd: Path, env: Mapping[str, str]) -> str:
+    """Return what a bash script prints; the test of the pages puts its own in place of this function."""
+    return subprocess.run(
         ["bash", "-c", script],  # the pages are ours
-        cwd=directory, env=env, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, timeout=3600, check=False,
-    )  # fmt: skip
-    outputs = done.stdout.split(_MARK)
-    if len(outputs) != len(shown) + 1:
-        raise RuntimeError(f"commands did not all end: {done.stdout}")
-    return "".join(f"{line}\n{_whole(said)}" for line, said in zip(shown, outputs[:-1], strict=True)).replace(
-        str(_data()), "$DATA"
-    )
+        cwd=cwd, env=env, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, timeout=3600, check=False,
+    ).stdout  # fmt: skip
 
 
-def _whole(said: str) -> str:
-    """Return output without blanks at line ends, whole lines only, and without what is said once in an installation's life."""
+def _trim_output(output: str) -> str:
+    """Return output as whole lines without trailing blanks, and without the one-time line about compiling."""
     lines = [
-        line.rstrip() for line in said.strip("\n").splitlines() if not line.startswith("compiling numeric kernels")
+        line.rstrip() for line in output.strip("\n").splitlines() if not line.startswith("compiling numeric kernels")
     ]
     return "".join(f"{line}\n" for line in lines)
 
 
-def _python(body: str, directory: Path, console: InteractiveConsole) -> str:
-    shown = []
+def _run_python(body: str, directory: Path, console: InteractiveConsole) -> str:
+    transcript = []
     with contextlib.chdir(directory):
-        for block in inputs(body, ">>> ", lambda _, line: line.startswith("...")):
-            said = io.StringIO()
-            with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
+        for block in find_inputs(body, ">>> ", lambda _, line: line.startswith("...")):
+            output = io.StringIO()
+            with contextlib.redirect_stdout(output), contextlib.redirect_stderr(output):
                 for line in block.splitlines():
                     more = console.push(line[4:])
                 if more:
                     console.push("")
-            shown.append(f"{block}\n{_whole(said.getvalue())}")
-    return "".join(shown)
+            transcript.append(f"{block}\n{_trim_output(output.getvalue())}")
+    return "".join(transcript)
 
 
-def _data() -> Path:
+def _test_data() -> Path:
     return Path(os.environ.get("TCPIPE_TEST_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"))
 
 

@@ -1,4 +1,4 @@
-"""A model folder without training: a narrow network with random weights, and residuals that were drawn; evaluations without any."""
+"""A model folder without training: a narrow network with random weights, and residuals that were drawn; evaluations without figures."""
 
 from dataclasses import replace
 from pathlib import Path

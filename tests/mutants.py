@@ -39,7 +39,7 @@ ROOMS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "findings": (
         (
             "tcpipe/tables/facts.py",
-            "tcpipe/stages/read_findings.py",
+            "tcpipe/stages/read.py",
             "tcpipe/stages/fuse_findings.py",
             "tcpipe/stages/label_motion.py",
         ),

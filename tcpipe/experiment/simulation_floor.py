@@ -16,8 +16,7 @@ from tcpipe.dataset import Split
 from tcpipe.dataset.extra_features import read_extra_features
 from tcpipe.learning.curves import fit_curves
 from tcpipe.learning.metrics import Array, compute_costs
-from tcpipe.simulation.robot import SimulatedRobot
-from tcpipe.simulation.wheels import compute_rolling_resistance
+from tcpipe.simulation.robot import SimulatedRobot, compute_rolling_resistance
 from tcpipe.simulation.world import World
 
 _STEP_M = 0.05

@@ -12,7 +12,7 @@ from tcpipe.formats.geojson import PolygonGeometry
 from tcpipe.formats.integrity import Checksum
 from tcpipe.formats.layer_descriptions import Description
 from tcpipe.formats.maps.map_facts import MapInputs
-from tcpipe.motion.selection_bias import Group
+from tcpipe.motion.distance_breakdown import Group
 from tcpipe.recipe import Recipe
 from tcpipe.splits.audit import HeldOut
 from tcpipe.tables.facts import ABSENT, EnergyBudget, PhysicsFit

@@ -9,7 +9,7 @@ from typing import Generic, TypeVar
 
 import numpy as np
 
-from tcpipe.motion.remedies import StoreLoss, make_loss_code
+from tcpipe.motion.distance_breakdown import StoreLoss, make_loss_code
 from tcpipe.recipe.suggestions import RecipeFragment
 from tcpipe.tables.catalogue import AFFECTED, Affected, Entry, Severity, rank_severity, read_catalogue
 from tcpipe.tables.findings import GRADES, Finding, Remedy, Verdict, sort_findings

@@ -21,7 +21,7 @@ from tcpipe.formats.integrity import Checksum, seal_document, verify_document
 from tcpipe.formats.json_files import Json, digest, parse_typed, to_json
 from tcpipe.formats.object_storage import is_url
 from tcpipe.formats.place import Place
-from tcpipe.motion.remedies import KEPT
+from tcpipe.motion.distance_breakdown import KEPT
 from tcpipe.recipe import IngestSections
 from tcpipe.tables.facts import LEFT_OUT, NOTHING_FOUND, StageFacts
 from tcpipe.tables.findings import StageReport, Verdict

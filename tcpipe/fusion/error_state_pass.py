@@ -12,9 +12,15 @@ from numpy.typing import NDArray
 
 from tcpipe.fusion import state_kernel as kernel
 from tcpipe.fusion.error_state_kernel import OFF_M, SURELY, filter_block, find_largest_drift
-from tcpipe.fusion.fix_errors import FixErrors
-from tcpipe.fusion.gates import find_chi_square_threshold
-from tcpipe.fusion.gnss_faults import FaultHypothesis, Innovations, Jump, Spans, is_inside, unexplained_innovation
+from tcpipe.fusion.gnss_faults import (
+    FaultHypothesis,
+    FixErrors,
+    Innovations,
+    Jump,
+    Spans,
+    is_inside,
+    unexplained_innovation,
+)
 from tcpipe.fusion.measurements import DOPPLER, GNSS, VISUAL, WHEELS, InitialState, Measurements
 from tcpipe.fusion.process import (
     SLOPE_RAD,
@@ -25,7 +31,7 @@ from tcpipe.fusion.process import (
     scale_stds,
     turn_scale_std,
 )
-from tcpipe.fusion.signals import compute_median_period_ns
+from tcpipe.fusion.signals import compute_median_period_ns, find_chi_square_threshold
 from tcpipe.fusion.smoother_kernel import smooth_block
 from tcpipe.fusion.timeline import EventTimeline
 from tcpipe.fusion.trajectory import DISPLACEMENT_LAGS_S
@@ -46,12 +52,12 @@ ROLES = {
 }
 DOF = {kernel.GNSS_POSITION: 3, kernel.WHEEL_VELOCITY: 1, kernel.VISUAL_VELOCITY: 3, kernel.STANDING: 3}
 DOF |= {kernel.STANDING_RATE: 3, kernel.SIDEWAYS: 2, kernel.LEVEL: 2, kernel.GNSS_VELOCITY: 3}
-_LEAST_ERROR_M = 1e-4
+_LEAST_ERROR_M = 1e-4  # smallest modelled GNSS error
 _NO_ERROR = np.empty(0)
 _ANY_YAW_STD_RAD = np.pi / np.sqrt(3.0)
 _NEVER = 1e18
 _FIXED = 1e-6
-_CARRIED_M = 0.5
+_CARRIED_M = 0.5  # σ of fixes that odometry improves for a minute
 _LOCK_OUT = {
     kernel.GNSS_POSITION: (5.0, 15.0, 5.0),
     kernel.WHEEL_VELOCITY: (5.0, 5.0, 0.3),
@@ -79,14 +85,7 @@ class _Memory:
 
 
 class FilterPass:
-    """One timeline with its constants and what the gates said.
-
-    Parameters
-    ----------
-    timeline, measurements : the events, and what they are made of.
-    gate_probability : a measurement less likely than 1 minus this is refused.
-    lags : [rows of the wanted stamps], over which displacements are judged, see `compute_lag_rows`.
-    """
+    """One timeline with its constants and what the gates decided; ``lags`` are rows of the wanted stamps (`compute_lag_rows`)."""
 
     def __init__(
         self, timeline: EventTimeline, measurements: Measurements, gate_probability: float, *, lags: Sequence[int]

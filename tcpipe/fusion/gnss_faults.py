@@ -6,6 +6,14 @@ and nowhere else, and never follows what it refuses. What contradicts the rest t
 that counts: fixes outside of the span, wheels and camera. The span with the least of it is taken; each span, and each second of it, costs
 a little, so that of two that explain as much the simpler is taken. Where one that shares little with the best explains about as much,
 nobody can tell.
+
+`find_fix_errors` estimates the part of a fix's error that scatters from one to the next, and the part that lasts. A receiver's covariance
+is one number for both; the part that scatters averages out, the part that lasts (a float solution's ambiguities, satellite-based
+corrections, multipath) moves a track with it. Fixes are laid, over twenty seconds, on the path that odometry and gyroscope draw, by
+rotation, scale and the bend of a gyroscope's bias. Second differences of the residual are the white part. Where it is a quarter of the
+claimed variance or less, the rest of the claim lasts; where it is far more, it counts instead. A residual that is far larger than claimed
+is an error that lasts and was not claimed. Where a receiver claims nothing, the scatter is the white part, and nothing lasts except where
+the fixes bend off the path by more than an odometry does in twenty seconds.
 """
 
 from __future__ import annotations
@@ -17,20 +25,26 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
+from tcpipe.fusion.measurements import Measurements, Positions
+from tcpipe.fusion.process import turn_sources
+from tcpipe.fusion.signals import compute_median_period_ns, compute_seconds, integrate_signal
+
 Span = tuple[int, int]
 """First and last stamp [ns]."""
 Spans = tuple[Span, ...]
 
-_LASTS_NS = 2_000_000_000
-_FEWEST = 5
-_TOGETHER_NS = 3_000_000_000
-_ALONE = 3
-_MOST = 3
-_A_SECOND, _A_SPAN, _SURELY = 2.0, 50.0, 100.0
-_SHARED = 0.5
-_MOST_OF = 0.6
-_REACH_NS = 60_000_000_000
-_RETURNS_NS = 180_000_000_000
+_LASTS_NS = 2_000_000_000  # shorter rejections are outliers
+_FEWEST = 5  # fewer rejections are outliers
+_TOGETHER_NS = 3_000_000_000  # rejections this close are one event
+_ALONE = 3  # fewer rejections in a row explain nothing
+_MOST = 3  # events tried, longest first
+_A_SECOND = 2.0  # cost of a second of a span
+_A_SPAN = 50.0  # cost of a span
+_SURELY = 100.0  # certain improvement; a wrong fix costs hundreds
+_SHARED = 0.5  # overlap below which two explanations differ
+_MOST_OF = 0.6  # share of a run that is no span
+_REACH_NS = 60_000_000_000  # inflated on both sides of an unplaced jump; judged
+_RETURNS_NS = 180_000_000_000  # a receiver corrects a wrong ambiguity until then; judged
 _LEADS_NS = (3_000_000_000, 10_000_000_000, 20_000_000_000)
 
 
@@ -65,13 +79,10 @@ Try = Callable[[Spans], FaultHypothesis]
 def unexplained_innovation(
     spans: Spans, fixes: Innovations, others: Sequence[Innovations], usual: float
 ) -> FaultHypothesis:
-    """Return what a run in which the fixes err in ``spans`` leaves unexplained.
+    """Return what a run leaves unexplained in which the fixes err in ``spans``.
 
-    Parameters
-    ----------
-    spans : in which the error of the fixes was free.
-    fixes, others : what the gates saw.
-    usual : squared innovation of a fix that is right; single outliers count as much, and so do fixes inside the spans.
+    ``fixes`` and ``others`` are what the gates saw. ``usual`` is the squared innovation of a right fix: single outliers count as much, and
+    so do fixes inside the spans.
     """
     free = is_inside(fixes.stamp_ns, spans)
     single = fixes.refused & ~_is_in_runs(fixes.refused, _ALONE)
@@ -158,13 +169,10 @@ def find_returned_fixes(jumps: Sequence[Jump]) -> GnssFaults | None:
 
 
 def find_wrong_fixes(tried: Try, whole: Span, known: Spans) -> GnssFaults | None:
-    """Return when the fixes were wrong, as all sensors together explain it best; None where that is no matter of spans.
+    """Return the spans in which fixes were wrong, as all sensors together explain it best; None where no spans explain it.
 
-    Parameters
-    ----------
-    tried : runs the filter with the error of the fixes free in spans.
-    whole : of the stretch.
-    known : when fixes were seen to be off, in a run that follows them in the end.
+    ``tried`` runs the filter with the error of the fixes free in spans; ``known`` are spans in which fixes were off in a run that follows
+    them in the end.
     """
     plain = tried(())
     events = _merge_spans((*plain.refused, *known))
@@ -201,8 +209,8 @@ def _is_endless(spans: Spans, whole: Span) -> bool:
 def _has_rival(other: FaultHypothesis, best: FaultHypothesis, *, alike: bool) -> bool:
     """Return whether another explanation is about as good and shares little with the best.
 
-    Of what follows a single jump nothing tells when it ends: then one that is much longer is no more ``alike``, and which is the shorter
-    tells nothing. Nor is one span alike several short ones: a filter that nothing holds follows wrong fixes after seconds.
+    The innovations after a single jump do not show when it ends: then one that is much longer is no more ``alike``. Nor is one span alike
+    several short ones: a filter without other position sensors follows wrong fixes after seconds.
     """
     shared = sum(max(0, min(b, d) - max(a, c)) * 1e-9 for a, b in best.spans for c, d in other.spans)
     longer = max(_compute_length(best.spans), _compute_length(other.spans))
@@ -248,3 +256,143 @@ def _iterate_candidates(events: Spans, whole: Span) -> Iterator[Spans]:
         yield ((max(whole[0], first - lead_ns), whole[1]),)
         if first - lead_ns > whole[0]:
             yield ((whole[0], first),)
+
+
+Floats = NDArray[np.float64]
+
+_BLOCK_S = 20.0  # span of fitting fixes to the drawn path
+_FEWEST_FIXES = 15
+_WINDOW_S = 6.0  # window of the scatter
+_LITTLE = 0.25  # variance ratio below which the rest lasts
+_FAR_MORE = 6.0  # variance ratio above which scatter replaces the claim
+_UNCLAIMED = 3.0  # σ beyond which an error was not claimed
+_DRAWN_HOLDS_M = 0.15  # bend of a drawn path in 20 s
+_SHARE_SEEN = 6.0  # ratio of a two-minute error to 20 s
+_BENDS_M = 0.09  # bend above that of clean drives (0.02 to 0.06 m)
+_LEAST_M = 0.01  # no fix is better (`fuse.gnss_std_floor_m`)
+_FLOAT_M = 0.5  # float solutions are better
+_LASTS_S = 45.0  # correlation time of a float solution
+_METRES_LAST_S = 120.0  # correlation time of metre-size errors
+_LARGE_M = 0.03  # smaller lasting errors go into σ
+_SQUARES_OF_TWO = 1.3863  # median of χ², two degrees of freedom
+_SQUARES_OF_ONE = 0.4549  # median of χ², one degree
+
+
+@dataclass(frozen=True, slots=True)
+class FixErrors:
+    """Errors of fixes: variances [m²] of the white part and of the part that lasts, shape (N, 3), and how long that lasts [s], (N,)."""
+
+    white_m2: Floats
+    lasting_m2: Floats
+    lasts_s: Floats
+
+    @property
+    def matters(self) -> bool:
+        """Whether the part that lasts is larger anywhere than what odometry holds over seconds, and is not one of metres throughout."""
+        return bool((self.lasting_m2[:, :2] > _LARGE_M**2).any()) and not self.of_metres
+
+    @property
+    def of_metres(self) -> bool:
+        """Whether an error of half a metre or more lasts most of the time."""
+        return float(np.median(self.lasting_m2[:, 0])) > _FLOAT_M**2
+
+
+def find_fix_errors(measurements: Measurements) -> FixErrors | None:
+    """Return the errors of the fixes; None without any."""
+    gnss = measurements.gnss
+    if gnss is None or gnss.stamp_ns.size == 0:
+        return None
+    claimed = gnss.variance_m2
+    white, lasting = claimed.copy(), np.zeros_like(claimed)
+    drawn = _draw_path(measurements, gnss)
+    left = _compute_residual_path(gnss, drawn)
+    scatter = np.empty_like(claimed)
+    second = _compute_second_differences(left)
+    scatter[:, 0] = scatter[:, 1] = _compute_rolling_median(gnss, second) / (6 * _SQUARES_OF_TWO)
+    scatter[:, 2] = _compute_rolling_median(gnss, _compute_second_differences(gnss.position_enu_m[:, 2])) / (
+        6 * _SQUARES_OF_ONE
+    )
+    least = np.minimum(np.maximum(0.01 * claimed, _LEAST_M**2), claimed)  # a robot that stands does not show it
+    little = scatter < _LITTLE * claimed
+    white[little] = np.maximum(scatter, least)[little]
+    lasting[little] = np.minimum(claimed - scatter, 0.99 * claimed)[little]
+    if drawn is not None and gnss.unclaimed is not None:
+        unclaimed = gnss.unclaimed & np.isfinite(scatter).all(1)
+        white[unclaimed] = np.maximum(scatter, _LEAST_M**2)[unclaimed]
+        lasting[unclaimed] = _compute_bends(gnss, np.abs(left) ** 2)[unclaimed]
+    if drawn is not None:
+        much = scatter > _FAR_MORE * claimed
+        white[much] = scatter[much]
+        wander_m2 = float(np.nanmedian(np.abs(left) ** 2)) / _SQUARES_OF_TWO if np.isfinite(left).any() else 0.0
+        if wander_m2 > max(_UNCLAIMED**2 * float(np.median(claimed[:, 0])), _DRAWN_HOLDS_M**2):
+            white = np.maximum(scatter, least)
+            lasting[:] = np.maximum(lasting, _SHARE_SEEN**2 * wander_m2)
+    lasts_s = np.where(lasting[:, 0] > _FLOAT_M**2, _METRES_LAST_S, _LASTS_S)
+    return FixErrors(white, lasting, lasts_s)
+
+
+def _compute_bends(gnss: Positions, left_m2: Floats) -> Floats:
+    """Return what lasts of fixes that claim nothing: where they bend off the drawn path by more than an odometry does, shape (N, 3)."""
+    wander_m2 = _compute_rolling_median(gnss, left_m2, _BLOCK_S) / _SQUARES_OF_TWO
+    seen = np.where(wander_m2 > _BENDS_M**2, _SHARE_SEEN**2 * wander_m2, 0.0)
+    return np.asarray(seen[:, None] * np.array([1.0, 1.0, 4.0]))
+
+
+def _draw_path(measurements: Measurements, gnss: Positions) -> NDArray[np.complex128] | None:
+    """Return the antenna's places as odometry and turn rates draw them, from any yaw; None where they do not."""
+    odometries = list(measurements.odometries().values())
+    imu, sources = measurements.imu, turn_sources(measurements)
+    if not odometries or (imu is None and not sources):
+        return None
+    zero = int(gnss.stamp_ns[0])
+    source = odometries[-1]
+    if imu is not None:
+        turn_s, turn = compute_seconds(imu.stamp_ns, zero), imu.angular_velocity_radps[:, 2:]
+    else:
+        known = np.isfinite(sources[-1].yaw_rate_radps)
+        turn_s, turn = compute_seconds(sources[-1].stamp_ns[known], zero), sources[-1].yaw_rate_radps[known, None]
+    at_s, driven_s = compute_seconds(gnss.stamp_ns, zero), compute_seconds(source.stamp_ns, zero)
+    yaw = integrate_signal(turn_s, turn, driven_s)[:, 0]
+    velocity = source.velocity_mps[:, :1] * np.stack((np.cos(yaw), np.sin(yaw)), -1)
+    places = integrate_signal(driven_s, velocity, at_s) @ np.array([1.0, 1j])
+    lever = complex(*gnss.lever_arm_m[:2])
+    return np.asarray(places + lever * np.exp(1j * integrate_signal(turn_s, turn, at_s)[:, 0]), np.complex128)
+
+
+def _compute_residual_path(gnss: Positions, drawn: NDArray[np.complex128] | None) -> NDArray[np.complex128]:
+    """Return what is left of the fixes, east and i times north [m], when the drawn path is laid on them block by block; NaN in between."""
+    places = gnss.position_enu_m[:, :2] @ np.array([1.0, 1j])
+    at_s = compute_seconds(gnss.stamp_ns, int(gnss.stamp_ns[0]))
+    length_s = max(_BLOCK_S, _FEWEST_FIXES * 1e-9 * compute_median_period_ns(gnss.stamp_ns))
+    left = np.full(places.size, np.nan + 0j)
+    for first_s in np.arange(0.0, at_s[-1], length_s):
+        rows = slice(*np.searchsorted(at_s, (first_s, first_s + length_s)))
+        if rows.stop - rows.start < _FEWEST_FIXES:
+            continue
+        block = places[rows] - np.mean(places[rows])
+        if drawn is not None:
+            step = np.diff(drawn[rows], prepend=drawn[rows][:1])
+            bent = np.cumsum(1j * (at_s[rows] - first_s) * step)  # by a gyroscope's bias
+            columns = np.column_stack((np.ones(block.size), drawn[rows] - drawn[rows][0], bent))
+            block = block - columns @ np.linalg.lstsq(columns, block, rcond=1e-6)[0]
+        left[rows] = block
+    return left
+
+
+def _compute_second_differences(values: NDArray[np.complex128] | Floats) -> Floats:
+    """Return the squared size of each second difference, NaN at the ends and beside NaN, shape (N,)."""
+    squared = np.full(values.size, np.nan)
+    squared[1:-1] = np.abs(np.diff(values, n=2)) ** 2
+    return squared
+
+
+def _compute_rolling_median(gnss: Positions, values: Floats, window_s: float = _WINDOW_S) -> Floats:
+    """Return the median of the known values over some seconds around each fix, shape (N,); where none is known, that of all."""
+    count = max(_FEWEST_FIXES, round(window_s * 1e9 / compute_median_period_ns(gnss.stamp_ns)))
+    known = np.flatnonzero(np.isfinite(values))
+    if known.size < count:
+        return np.full(values.size, np.nan)
+    windows = np.lib.stride_tricks.sliding_window_view(values[known], count)[:: max(1, count // 6)]
+    medians = np.median(windows, axis=1)
+    centres = known[count // 2 :][:: max(1, count // 6)][: medians.size]
+    return np.asarray(np.interp(np.arange(values.size), centres, medians))

@@ -6,6 +6,9 @@ by the rotation that fits best (the planar case of Wahba's problem: the angle of
 sign, a run may start in reverse; since the path is drawn, it may start with a turn. Roll and pitch come from the specific force,
 or from the unit's own orientation where the two agree.
 
+The robot is stationary where the wheels do not turn and the gyroscope is quiet; wheels at rest on a robot that slides, or a gyroscope at
+rest on a straight, are not enough. It gives two more measurements (zero velocity, and the gyroscope's bias) and the initial bias.
+
 Source: B. K. P. Horn, "Closed-form solution of absolute orientation using unit quaternions", JOSA A 4 (4), 1987 (section 2.B, planar).
 """
 
@@ -30,25 +33,18 @@ from tcpipe.geometry.rotation import quat_from_rpy, rotate, rpy_from_quat
 
 Floats = NDArray[np.float64]
 
-_MIN_COURSE_M = 5.0
-_MIN_COURSE_STD = 10.0
-_MIN_SPEED_MPS = 0.2
-_MAX_WINDOW_NS = 120_000_000_000
-_WINDOW_STEP_NS = 2_000_000_000
-_TILT_AGREES_RAD = 0.2
-_GYRO_BIAS_STD_RADPS = 0.02
+_MIN_COURSE_M = 5.0  # driven before course gives yaw (ruling)
+_MIN_COURSE_STD = 10.0  # distance over σ of fixes: yaw to 6°
+_MIN_SPEED_MPS = 0.2  # slower rows do not count (ruling)
+_MAX_WINDOW_NS = 120_000_000_000  # longest search for the start
+_WINDOW_STEP_NS = 2_000_000_000  # growth of that window
+_TILT_AGREES_RAD = 0.2  # agreement of IMU attitude and gravity
+_GYRO_BIAS_STD_RADPS = 0.02  # turn-on bias of a MEMS gyroscope, 1°/s
 _UNKNOWN_YAW_STD_RAD = 0.6  # the sigma points of a wider one would meet behind the robot
 
 
 def find_initial_state(measurements: Measurements, standing_ns: NDArray[np.int64], start_ns: int) -> InitialState:
-    """Return the state at ``start_ns``, the first stamp of the stretch.
-
-    Parameters
-    ----------
-    measurements : of one stretch.
-    standing_ns : [ns], shape (K, 2), when the robot stands.
-    start_ns : [ns].
-    """
+    """Return the state at ``start_ns`` [ns], the first stamp of a section; ``standing_ns`` [ns], shape (K, 2), are its stops."""
     bias, bias_std = _estimate_gyro_bias(measurements.imu, standing_ns)
     roll, pitch, tilt_std = _estimate_tilt(measurements.imu, standing_ns, start_ns)
     path = _Path(measurements, start_ns, bias)
@@ -276,3 +272,60 @@ def _position(gnss: Positions | None, path: _Path, quat: Floats, yaw: float) -> 
     std: Floats = 3 * np.sqrt(np.median(gnss.variance_m2[few], axis=0))
     std += np.array([0.1, 0.1, 0.2]) * max(driven, 1.0)
     return position, std
+
+
+_WINDOW_NS = 500_000_000  # window of means and scatter
+_MAX_WHEEL_MPS = 0.02  # mean over the window; single samples are noisy
+_MAX_WHEEL_SPREAD_MPS = 0.06  # encoders at rest; judged
+_MAX_SAMPLE_MPS = 0.2  # no stationary sample is faster
+_MAX_BIAS_RADPS = 0.05  # a gyroscope at rest may show this much
+_MIN_SPREAD_RADPS = 0.012  # gyroscope noise at rest; judged
+_MIN_LENGTH_NS = 600_000_000  # shorter stops do not count
+_MARGIN_NS = 150_000_000  # removed at both ends: rocking
+
+
+def find_stationary_intervals(measurements: Measurements) -> NDArray[np.int64]:
+    """Return when the robot is stationary for certain: first and last stamp of each stay of at least 0.3 s [ns], shape (K, 2), in order.
+
+    Empty without wheels or without gyroscope.
+    """
+    wheels, imu = measurements.wheels, measurements.imu
+    if wheels is None or imu is None or wheels.stamp_ns.size == 0 or imu.stamp_ns.size == 0:
+        return np.empty((0, 2), np.int64)
+    stamp = wheels.stamp_ns
+    # Clipped, so that a single wild sample does not wake the robot.
+    clipped = np.clip(wheels.velocity_mps[:, :1], -_MAX_SAMPLE_MPS, _MAX_SAMPLE_MPS)
+    mean, spread = _compute_window_statistics(stamp, stamp, clipped)
+    still = (np.abs(mean[:, 0]) < _MAX_WHEEL_MPS) & (spread[:, 0] < _MAX_WHEEL_SPREAD_MPS)
+    mean, spread = _compute_window_statistics(stamp, imu.stamp_ns, imu.angular_velocity_radps)
+    quiet = max(_MIN_SPREAD_RADPS, 4 * imu.gyro_std_radps)
+    still &= (np.abs(mean) < _MAX_BIAS_RADPS).all(1) & (spread < quiet).all(1)
+    return _find_intervals(stamp, still)
+
+
+def _compute_window_statistics(
+    at_ns: NDArray[np.int64], stamp_ns: NDArray[np.int64], values: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Mean and standard deviation of (N, k) values within half a window of each stamp; NaN where there are none."""
+    first = np.searchsorted(stamp_ns, at_ns - _WINDOW_NS // 2, "left")
+    last = np.searchsorted(stamp_ns, at_ns + _WINDOW_NS // 2, "right")
+    count = np.where(last > first, last - first, 1)
+    mean, spread = np.empty((2, at_ns.size, values.shape[1]))
+    total = np.zeros(stamp_ns.size + 1)
+    for k, value in enumerate(values.T):  # one by one: a long signal takes room
+        np.cumsum(value, out=total[1:])
+        mean[:, k] = (total[last] - total[first]) / count
+        np.cumsum(value**2, out=total[1:])
+        spread[:, k] = np.sqrt(np.maximum((total[last] - total[first]) / count - mean[:, k] ** 2, 0.0))
+    mean[last == first] = spread[last == first] = np.nan
+    return mean, spread
+
+
+def _find_intervals(stamp_ns: NDArray[np.int64], still: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Find runs of True, not bridged over gaps of half a second, shortened at both ends, the short ones left out."""
+    joined = still[1:] & still[:-1] & (np.diff(stamp_ns) < _WINDOW_NS)
+    first = np.flatnonzero(still & ~np.concatenate(([False], joined)))
+    last = np.flatnonzero(still & ~np.concatenate((joined, [False])))
+    found = np.stack((stamp_ns[first], stamp_ns[last]), -1)
+    long = found[found[:, 1] - found[:, 0] >= _MIN_LENGTH_NS]
+    return np.stack((long[:, 0] + _MARGIN_NS, long[:, 1] - _MARGIN_NS), -1)

@@ -115,11 +115,11 @@ def predict(
 ) -> None:
     """Advance x and P by dt.
 
-    q holds 17 noise densities [unit²/s], of which that of v is left out: it is ``q_v`` in all directions, or where the body velocity is
-    kept ``q_v`` forward, and sideways and upward what stands there and SLIDING times ``q_v``. Then come the rate at which
-    s_w decays (DECAY), how much the noise of the turn grows with its square (TURNING), whether b_g are scale errors (SCALED, 0 or 1),
-    and by how much roll and pitch stray on a metre of ground [rad²/m] (GROUND).
-    F, shape (12, 9), becomes what the first 12 errors turn into of those in `MOVED`; a F of no rows is left alone.
+    q holds 17 noise densities [unit²/s]; that of v is ``q_v`` in all directions, or where the body velocity is kept ``q_v`` forward, and
+    sideways and upward its own and SLIDING times ``q_v``. Then come the rate at which s_w decays (DECAY), how much the noise of the turn
+    grows with its square (TURNING), whether b_g are scale errors (SCALED, 0 or 1), and by how much roll and pitch stray on a metre of
+    ground [rad²/m] (GROUND). F, shape (12, 9), becomes the part of the first 12 errors that depends on those in `MOVED`; a F of no rows is
+    left alone.
     """
     U, D, d, moved, middle, shifted, centre, turn, tally = work
     n = P.shape[0]

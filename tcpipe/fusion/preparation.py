@@ -3,6 +3,9 @@
 Rows that say nothing (no velocity and no pose to make one from, a fix at 0, 0, a sample beyond any sensor's range) are left out and
 returned, so that they can be listed. A variance that is unknown, zero, negative or not finite is replaced by the recipe's, one that is
 too good to be true is raised to a floor: a zero covariance is not trust.
+
+By nav_msgs/Odometry a twist is along the axes of its child frame, the robot's. Some drivers write it along those of the pose's frame, as
+the derivative of the position is: then the velocity of a robot that only drives forward turns with its yaw.
 """
 
 from __future__ import annotations
@@ -22,16 +25,9 @@ from tcpipe.fusion.measurements import (
     InertialMeasurements,
     Positions,
 )
-from tcpipe.fusion.pose_increments import (
-    compute_increments,
-    compute_orientation_rates,
-    has_twist,
-    is_along_pose_axes,
-    rotate_to_child_axes,
-)
 from tcpipe.fusion.signals import compute_median_period_ns, estimate_white_noise
 from tcpipe.geometry.datum import enu_from_geodetic
-from tcpipe.geometry.rotation import invert, matrix_from_quat, multiply, normalize, rotate
+from tcpipe.geometry.rotation import invert, matrix_from_quat, multiply, normalize, rotate, rotation_vector_from_quat
 from tcpipe.tables.findings import Finding, Subject, make_finding
 
 Floats = NDArray[np.float64]
@@ -44,21 +40,21 @@ Columns = Mapping[str, Floats]
 _IMU = Subject("role", IMU)
 _NO_TRUST = 1e6
 """Larger variances, of a kilometre or a kilometre a second, are cut to this: as little trust, and differences keep their digits."""
-_VELOCITY_FLOOR_MPS = 0.02
-_YAW_RATE_STD_RADPS = 0.1
-_YAW_RATE_FLOOR_RADPS = 0.02
-_MAX_VELOCITY_MPS = 50.0
-_MAX_RATE_RADPS = 100.0
-_MAX_FORCE_MPS2 = 1000.0
+_VELOCITY_FLOOR_MPS = 0.02  # no odometry is better
+_YAW_RATE_STD_RADPS = 0.1  # default of an odometry without one
+_YAW_RATE_FLOOR_RADPS = 0.02  # no odometry is better
+_MAX_VELOCITY_MPS = 50.0  # no robot is faster
+_MAX_RATE_RADPS = 100.0  # no gyroscope measures more
+_MAX_FORCE_MPS2 = 1000.0  # no accelerometer measures more
 _GRAVITY_BAND_MPS2 = (8.0, 12.0)
-_DATUM_FIXES = 10
-_NOISE_WINDOW_S = 2.0
-_TURNS_INTO = 0.1
+_DATUM_FIXES = 10  # the ENU origin is their median
+_NOISE_WINDOW_S = 2.0  # window of noise around each sample
+_TURNS_INTO = 0.1  # cosine: an unmeasured axis affects another, 6°
 _PIECE = 1 << 16
-_FEWEST_ROWS = 20
+_FEWEST_ROWS = 20  # second differences for velocity scatter
 _SCATTERS_MORE = 3.0
 """Than is claimed: a speed by counts that come only with every other message does, a rough road does not."""
-_MEAN_S = 0.5
+_MEAN_S = 0.5  # averaging of such a velocity
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,18 +130,11 @@ def prepare_body_velocities(
     default_std_mps: float,
     only_forward: bool,
 ) -> tuple[BodyVelocities, Prepared]:
-    """Prepare an odometry (columns of the roles wheel_odometry and visual_odometry).
+    """Prepare an odometry (columns of the roles wheel_odometry and visual_odometry), whose child frame has the extrinsics given.
 
-    Its twist is taken where it has one. One that is forward empty, or zero throughout while the poses move, is none: the velocity is then
-    that of the increment from pose to pose, in the middle of the two stamps, in the axes half-way between the two. One that is surely
-    along the axes of the pose's frame is turned by the pose.
-
-    Parameters
-    ----------
-    stamp_ns : [ns], shape (N,). columns : by name, null as NaN.
-    xyz_m, quat_xyzw : base_link_from_sensor of the child frame.
-    default_std_mps : [m/s], where the variance is unknown.
-    only_forward : wheels measure only the velocity along base_link's x.
+    Its twist is used where it has one. One that has no forward velocity, or is zero throughout while the poses move, is none: the velocity
+    is then that of the increment from pose to pose, in the middle of the two stamps, in the axes half-way between the two. One that is
+    surely along the axes of the pose's frame is turned by the pose. Of wheels ``only_forward`` velocity, along base_link's x, is measured.
     """
     pose = _make_rotation_matrix(columns, ("x_m", "y_m", "z_m"))
     velocity = _make_rotation_matrix(columns, [f"velocity_{axis}_mps" for axis in "xyz"])
@@ -242,10 +231,9 @@ def prepare_imu(
     gyro_std_radps: float,
     accelerometer_std_mps2: float,
 ) -> tuple[InertialMeasurements, Prepared]:
-    """Prepare an IMU (columns of the role imu): turned into base_link axes, its specific force checked for being one.
+    """Prepare an IMU (columns of the role imu): turned into base_link axes, moved to base_link, its specific force checked for being one.
 
-    The specific force is moved to base_link: what the unit feels beyond base_link, since it sits off it and the robot turns, is taken
-    off. The noise is the one given or, where that is larger, what the samples show: motion too fast for the unit's rate counts as noise.
+    The noise is the one given or, where that is larger, that of the samples: motion too fast for the unit's rate counts as noise.
     """
     rate = _make_rotation_matrix(columns, [f"angular_velocity_{axis}_radps" for axis in "xyz"])
     force = _make_rotation_matrix(columns, [f"linear_acceleration_{axis}_mps2" for axis in "xyz"])
@@ -303,10 +291,10 @@ def _read_orientations(columns: Columns, usable: Ints, quat_xyzw: tuple[float, f
 
 
 def _move_to_base_link(stamp_ns: Ints, turn_radps: Floats, force_mps2: Floats, lever_m: Floats) -> None:
-    """Take off the acceleration of the unit against base_link, dw x l + w x (w x l) [m/s²], in base_link axes.
+    """Subtract the acceleration of the unit relative to base_link, dw x l + w x (w x l) [m/s²], in base_link axes.
 
-    The angular acceleration dw is the slope of a line through five samples (Savitzky and Golay 1964): its noise, added over time,
-    cancels out, as that of any derivative.
+    The angular acceleration dw is the slope of a line through five samples (Savitzky and Golay 1964): its noise, added over time, cancels
+    out.
     """
     if stamp_ns.size < 5 or not lever_m.any():
         return
@@ -367,3 +355,108 @@ __all__ = [
     "prepare_imu",
     "prepare_positions",
 ]
+
+
+_MAX_INCREMENT_S = 1.0  # longer increments give no velocity
+_MOVED_M = 0.1  # smaller moves may be stationary
+_FEWEST = 20  # increments that identify the twist's axes
+_MOVES_MPS = 0.2  # slower increments have no direction
+_FITS, _FITS_NOT = 0.1, 0.3  # largest residual share along its axes (18°); smallest along other axes (33°)
+_TURNED_RAD = 0.2  # a larger turn contradicts a zero rate
+
+
+def has_twist(velocity_mps: Floats, pose_m: Floats) -> bool:
+    """Whether the velocities are measurements: finite somewhere, and not zero throughout while the poses move."""
+    known = np.isfinite(velocity_mps).any(1)
+    if not known.any():
+        return False
+    posed = pose_m[np.isfinite(pose_m).all(1)]
+    moves = posed.size > 0 and float(np.ptp(posed, axis=0).max()) > _MOVED_M
+    return bool(np.nansum(np.abs(velocity_mps[known])) > 0) or not moves
+
+
+def compute_increments(
+    stamp_ns: NDArray[np.int64], pose_m: Floats, quat_xyzw: Floats
+) -> tuple[NDArray[np.int64], Floats, Floats]:
+    """Return stamps, velocity and angular velocity in the child frame, in the middle of each two successive poses."""
+    stamp, position, quat = _select_posed_rows(stamp_ns, pose_m, quat_xyzw)
+    step_ns = np.diff(stamp)
+    step_s = np.asarray(step_ns, np.float64)[:, None] * 1e-9
+    turn = rotation_vector_from_quat(multiply(invert(quat[:-1]), quat[1:]))
+    velocity = rotate(invert(_interpolate_half_way(quat[:-1], quat[1:])), np.diff(position, axis=0)) / step_s
+    near = step_s[:, 0] <= _MAX_INCREMENT_S
+    return stamp[:-1][near] + step_ns[near] // 2, velocity[near], (turn / step_s)[near]
+
+
+def compute_orientation_rates(
+    stamp_ns: NDArray[np.int64], rate_radps: Floats, quat_xyzw: Floats
+) -> tuple[Floats, NDArray[np.bool_]]:
+    """Return angular velocities, shape (N, 3), and which axes of them are by the orientation, shape (3,).
+
+    Those are the axes about which it turns while ``rate_radps``, in the child frame, is missing or zero throughout. ``stamp_ns`` does not
+    decrease; NaN is not measured.
+    """
+    zero = (np.nan_to_num(rate_radps) == 0.0).all(axis=0)
+    known = np.flatnonzero(np.isfinite(quat_xyzw).all(axis=1))
+    known = known[np.concatenate(([True], np.diff(stamp_ns[known]) > 0))] if known.size else known
+    if not zero.any() or known.size < _FEWEST:
+        return rate_radps, np.zeros(3, np.bool_)
+    stamp, quat = stamp_ns[known], quat_xyzw[known]
+    turned_rad = np.cumsum(rotation_vector_from_quat(multiply(invert(quat[:-1]), quat[1:])), axis=0)
+    turns = zero & (np.ptp(turned_rad, axis=0) > _TURNED_RAD)
+    # Over two steps, so that the rate is that in the middle, at the stamp itself.
+    step_s = (stamp[2:] - stamp[:-2])[:, None] * 1e-9
+    rate = rotation_vector_from_quat(multiply(invert(quat[:-2]), quat[2:])) / step_s
+    inner, near = known[1:-1], step_s[:, 0] <= _MAX_INCREMENT_S
+    rates = np.where(turns, np.nan, rate_radps)
+    rates[inner[near]] = np.where(turns, rate[near], rate_radps[inner[near]])
+    return rates, turns
+
+
+def is_along_pose_axes(stamp_ns: NDArray[np.int64], velocity_mps: Floats, pose_m: Floats, quat_xyzw: Floats) -> bool:
+    """Return whether velocities are surely along the axes of the pose's frame: its increments fit them so, and not turned by the pose.
+
+    Velocities [m/s] have shape (N, 3), NaN where an axis is not measured.
+    """
+    known = np.isfinite(velocity_mps[:, :2]).all(1) & np.isfinite(pose_m).all(1) & np.isfinite(quat_xyzw).all(1)
+    stamp, place, quat = stamp_ns[known], pose_m[known, :2], quat_xyzw[known]
+    told = np.nan_to_num(velocity_mps[known])
+    step_s = np.diff(stamp) * 1e-9
+    good = (step_s > 0) & (step_s <= _MAX_INCREMENT_S)
+    way = np.diff(place, axis=0)[good] / step_s[good, None]
+    moving = np.linalg.norm(way, axis=1) > _MOVES_MPS
+    if moving.sum() < _FEWEST:
+        return False
+    turned = rotate(quat, told)
+    as_told, as_turned = (_compute_misfit((v[1:] + v[:-1])[good, :2] / 2.0, way, moving) for v in (told, turned))
+    return as_told < _FITS and as_turned > _FITS_NOT
+
+
+def rotate_to_child_axes(velocity_mps: Floats, quat_xyzw: Floats) -> Floats:
+    """Return velocities (N, 3) that are along the pose's axes along those of the child frame; NaN where the pose is none."""
+    turned = rotate(invert(quat_xyzw), np.nan_to_num(velocity_mps))
+    turned[np.isnan(velocity_mps)] = np.nan
+    return np.where(np.isfinite(quat_xyzw).all(1, keepdims=True), turned, np.nan)
+
+
+def _compute_misfit(said: Floats, way: Floats, moving: NDArray[np.bool_]) -> float:
+    """Return the share of the squares of a way that a velocity, whatever its scale, leaves unexplained (medians: poses may jump)."""
+    size = np.linalg.norm(way[moving], axis=1)
+    scale = np.median(np.linalg.norm(said[moving], axis=1) / size)
+    return float(np.median(np.sum((said[moving] - scale * way[moving]) ** 2, axis=1) / (scale * size) ** 2))
+
+
+def _select_posed_rows(
+    stamp_ns: NDArray[np.int64], pose_m: Floats, quat_xyzw: Floats
+) -> tuple[NDArray[np.int64], Floats, Floats]:
+    """Return the rows with a pose, in order of time, one a stamp."""
+    posed = np.flatnonzero(np.isfinite(pose_m).all(1) & np.isfinite(quat_xyzw).all(1))
+    _, first = np.unique(stamp_ns[posed], return_index=True)
+    rows = posed[first]
+    return stamp_ns[rows], pose_m[rows], quat_xyzw[rows]
+
+
+def _interpolate_half_way(a: Floats, b: Floats) -> Floats:
+    """Rotation half-way between two: the normalised sum of the quaternions of one hemisphere."""
+    sign = np.where(np.sum(a * b, axis=-1, keepdims=True) < 0, -1.0, 1.0)
+    return normalize(a + sign * b)

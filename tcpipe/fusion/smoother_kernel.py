@@ -3,7 +3,7 @@ r"""Smoother of the error-state unscented filter.
 The unscented Rauch-Tung-Striebel smoother (Särkkä 2008) in the form of Bryson and Frazier (Bierman 1973), which inverts no
 covariance and smooths only where an estimate is wanted. The sigma points of a prediction and of an update are, to second moments, those
 of the linear maps F = C' P⁻¹ with C = cov(dx_k, dx_{k+1}⁻), and H = (P⁻⁻¹ cov(dx⁻, z))'. With K, S and the innovation y of each update,
-and J, which carries errors over to the axes that the update has turned (`update_kernel._reset`), back in time::
+and J, which carries errors over to the axes that the update has turned (`error_state_kernel._reset`), back in time::
 
     l ← J' l, L ← J' L J    l ← (I - K H)' l - H' S⁻¹ y,  L ← (I - K H)' L (I - K H) + H' S⁻¹ H    l ← F' l, L ← F' L F
     x^s = x ⊞ (-P l)    P^s = P - P L P    cov(dx_j, dx_k) = P_j (product of all J (I - K H) F from j to k)' (I - L_k P_k),  j < k

@@ -11,7 +11,7 @@ Constraints are events of our own making:
   small deviation: that locks GNSS out. Its information is that of 0.15 m/s ten times a second, whatever the wheels' rate; so is that of
   the wheels themselves, as far as they claim a larger variance than they scatter by: such an error, slip, lasts as well.
 - a receiver's own velocity errs alike for a while (its filter, multipath): it counts once in three seconds, whatever its rate.
-- standing (`tcpipe.fusion.stationary`): zero velocity, and the gyroscope shows its bias, five times a second.
+- standing (`tcpipe.fusion.initial`): zero velocity, and the gyroscope shows its bias, five times a second.
 - level, where no accelerometer tells up from down: roll and pitch are small. A slope lasts, so 20° are counted once in four seconds: as 40°
   once a second.
 """
@@ -39,14 +39,14 @@ from tcpipe.fusion.signals import compute_interval_means, compute_median_period_
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-_MAX_STEP_NS = 50_000_000
-_NONHOLONOMIC_HZ = 10.0
-_MOVING_MPS = 0.05
-_UNSEEN_TURN_S = 1.0
+_MAX_STEP_NS = 50_000_000  # longest step: one row
+_NONHOLONOMIC_HZ = 10.0  # rate of the sideways constraint
+_MOVING_MPS = 0.05  # slower is stationary (ruling)
+_UNSEEN_TURN_S = 1.0  # duration of `process.UNSEEN_TURN_RADPS`
 _MEDIAN_OF_SQUARES = 0.4549  # of a normal variable of variance 1
-_STANDING_NS = 200_000_000
-_STANDING_STD_MPS = 0.01
-_LEVEL_NS = 1_000_000_000
+_STANDING_NS = 200_000_000  # spacing of stationary updates
+_STANDING_STD_MPS = 0.01  # rocking of a stationary robot
+_LEVEL_NS = 1_000_000_000  # spacing of level updates without sensors
 _PIECE = 1 << 15
 
 
@@ -81,14 +81,7 @@ class EventTimeline:
 
 
 def build_timeline(measurements: Measurements, standing_ns: Ints, output_ns: Ints) -> EventTimeline:
-    """Merge measurements, constraints and wanted stamps.
-
-    Parameters
-    ----------
-    measurements : of one stretch.
-    standing_ns : [ns], shape (K, 2), from `tcpipe.fusion.stationary.find_stationary_intervals`.
-    output_ns : [ns], shape (N,), increasing.
-    """
+    """Merge measurements of one section, constraints and wanted stamps [ns]; ``standing_ns`` [ns], shape (K, 2), are stops."""
     parts = _make_measured_parts(measurements)
     start = min(int(part[0][0]) for part in parts if part[0].size)
     end = max(int(part[0][-1]) for part in parts if part[0].size)

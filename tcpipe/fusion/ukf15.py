@@ -25,7 +25,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.fusion import ukf15_kernel as kernel
-from tcpipe.fusion.gates import find_chi_square_threshold
 from tcpipe.fusion.measurements import (
     GNSS,
     IMU,
@@ -36,7 +35,7 @@ from tcpipe.fusion.measurements import (
     InitialState,
     Measurements,
 )
-from tcpipe.fusion.signals import is_covered
+from tcpipe.fusion.signals import find_chi_square_threshold, is_covered
 from tcpipe.fusion.trajectory import DISPLACEMENT_LAGS_S, Rejections, Trajectory
 from tcpipe.fusion.ukf15_events import ACCEPTED, NOT_RUN, RECOVERED, REJECTED, Events, FilterState, Outputs, Sources
 from tcpipe.geometry.rotation import invert, quat_from_rpy, rotate, rpy_from_quat
@@ -94,14 +93,11 @@ class SensorRows:
 
 @dataclass(frozen=True, slots=True)
 class ForwardResult:
-    """What the filter made of its sources.
+    """Result of the filter.
 
-    Attributes
-    ----------
-    x, variance : states and their variances at the wanted stamps, shape (K, 15).
-    final : state, shape (15,), and covariance, shape (15, 15), at the last of them.
-    nis, outcome : per source, normalised innovation squared and what became of each measurement.
-    repairs : how often the covariance lost its positive definiteness.
+    ``x`` and ``variance`` are states and variances at the wanted stamps, (K, 15); ``final`` the last state, (15,), and covariance, (15,
+    15); ``nis`` and ``outcome``, by source, the normalised innovation squared and what became of each measurement; ``repairs`` counts
+    losses of positive definiteness.
     """
 
     x: NDArray[np.float64]
@@ -120,19 +116,14 @@ def run_ukf15(
     gate_probability: float,
     engine: Literal["compiled", "filterpy"],
 ) -> Trajectory:
-    """Estimate base_link's trajectory with the paper's forward filter.
+    """Return base_link's trajectory at ``output_ns`` by the paper's forward filter; each state uses the measurements up to its stamp.
 
     Parameters
     ----------
-    measurements : one stretch of a run.
-    initial : where it starts, at its first measurement.
-    output_ns : wanted stamps [ns], shape (K,), increasing.
-    gate_probability : a measurement less likely than this is refused (chi-square on its normalised innovation squared).
+    measurements, initial : one section of a run, and its state at the first measurement.
+    output_ns : [ns], shape (K,), increasing.
+    gate_probability : a measurement less likely than this is rejected (χ² on its normalised innovation squared).
     engine : ``compiled`` or ``filterpy``.
-
-    Returns
-    -------
-    Trajectory : at ``output_ns``; each state uses the measurements up to its stamp.
     """
     sources = collect_sources(measurements, initial, end_ns=int(output_ns[-1]))
     gates = [_find_gate(source, gate_probability) for source in sources]
@@ -173,17 +164,12 @@ def filter_forward(
 
     Parameters
     ----------
-    sources : what is measured. Of measurements with one stamp, the earlier source comes first.
+    sources : the measurements; of those with one stamp, the earlier source comes first.
     gates : per source, the largest normalised innovation squared that is fused.
-    x, P : state, shape (15,), and covariance, shape (15, 15), at ``start_ns``.
+    x, P : state, shape (15,), and covariance, shape (15, 15), at ``start_ns`` [ns]; nothing may be older.
     q : variance that each state gains in a second, shape (15,).
-    start_ns : stamp of the belief [ns]; nothing may be older.
-    output_ns : wanted stamps [ns], shape (K,), increasing.
+    output_ns : [ns], shape (K,), increasing.
     engine : ``compiled`` or ``filterpy``.
-
-    Returns
-    -------
-    Forward
     """
     belief = FilterState(
         np.zeros(kernel.ROW), np.zeros((kernel.STATES, kernel.ROW)), np.zeros(1), np.zeros((len(sources), 2))
@@ -223,16 +209,9 @@ def _run_of(engine: Literal["compiled", "filterpy"]) -> Callable[..., int]:
 
 
 def collect_sources(measurements: Measurements, initial: InitialState, *, end_ns: int) -> list[SensorRows]:
-    """Return what the filter fuses of a stretch: its sensors, the ground, and priors for what no sensor shows.
+    """Return what the filter fuses of a section: its sensors, the ground, and priors for unobservable states; constraints up to ``end_ns``.
 
-    Parameters
-    ----------
-    measurements, initial : see `run_ukf15`.
-    end_ns : the constraints go on until here [ns].
-
-    Returns
-    -------
-    list of SensorRows : in the order in which measurements of one stamp are fused.
+    Measurements of one stamp are fused in this order.
     """
     imu = measurements.imu
     sensors = (

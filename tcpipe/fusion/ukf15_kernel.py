@@ -140,25 +140,10 @@ def _process(x: NDArray[np.float64], C: NDArray[np.float64], dt: float, out: NDA
 def predict(
     x: NDArray[np.float64], P: NDArray[np.float64], q: NDArray[np.float64], dt: float, work: NDArray[np.float64]
 ) -> bool:
-    """Move state and covariance by one step, in place.
+    """Move state x, (16,) with a last 0, and covariance P, (15, 16) with a last column of 0, by a step of ``dt`` [s], in place.
 
-    Parameters
-    ----------
-    x
-        State, shape (16,), the last entry 0.
-    P
-        Covariance, shape (15, 16), the last column 0.
-    q
-        Variance that each state gains in a second, shape (15,).
-    dt
-        Step [s].
-    work
-        Scratch, shape (48, 16).
-
-    Returns
-    -------
-    bool
-        False where the covariance was not positive definite; state and covariance are then untouched.
+    ``q``, (15,), is the variance that each state gains in a second; ``work``, (48, 16), is scratch. Return False, with both untouched,
+    where P was not positive definite.
     """
     L = work[0:16]
     D = work[16:38]  # deviations: 12 points, 9 linear pairs, the mean
@@ -343,29 +328,17 @@ def update(
     gate: float,
     work: NDArray[np.float64],
 ) -> float:
-    """Fuse one measurement in place unless its gate refuses it.
+    """Fuse one measurement in place unless its gate rejects it; return the normalised innovation squared.
+
+    It is infinite where the covariance was not positive definite; above ``gate`` nothing has changed.
 
     Parameters
     ----------
-    x, P
-        State, shape (16,), and covariance, shape (15, 16).
-    kind
-        `SELECT`, `ANTENNA`, `SPECIFIC_FORCE` or `SENSOR_VELOCITY`.
-    index
-        Which states (`SELECT`), or which of the sensor's three entries, are measured, shape (m,), m ≤ 6.
-    lever
-        Position of the sensor in base_link [m], shape (3,).
-    z, variance
-        Measurement and its variance, shape (m,).
-    gate
-        Largest normalised innovation squared that is fused.
-    work
-        Scratch, shape (48, 16).
-
-    Returns
-    -------
-    float
-        The normalised innovation squared; infinite where the covariance was not positive definite. Above ``gate`` nothing has changed.
+    x, P, work : as `predict`.
+    kind : `SELECT`, `ANTENNA`, `SPECIFIC_FORCE` or `SENSOR_VELOCITY`.
+    index : which states (`SELECT`), or which of the sensor's three entries, are measured, shape (m,), m ≤ 6.
+    lever : position of the sensor in base_link [m], shape (3,).
+    z, variance : measurement and its variance, shape (m,).
     """
     size = index.size
     C = work[38:44]
@@ -491,26 +464,11 @@ def is_locked_out(count: float, since_s: float, now_s: float) -> bool:
 
 @compile_kernel
 def run(belief: FilterState, q: NDArray[np.float64], events: Events, sources: Sources, outputs: Outputs) -> int:
-    """Filter forward through all events up to the last output; events after it belong to the next call.
+    """Filter forward through all events up to the last output; return how often the covariance was repaired. ``belief`` moves in place.
 
-    When a gate has refused every measurement of a source for 5 s (and five of them), it guards a wrong belief: the states that the
-    source measures are opened up by the innovation, the measurement is fused, and its outcome is `RECOVERED`.
-
-    Parameters
-    ----------
-    belief
-        Where to start; moved in place to the last output.
-    q
-        Variance that each state gains in a second, shape (15,).
-    events, sources
-        The measurements.
-    outputs
-        Written in place; its times are read.
-
-    Returns
-    -------
-    int
-        How often the covariance lost its positive definiteness and was repaired.
+    When a gate has rejected every measurement of a source for 5 s (and five of them), the estimate is wrong: the variance of the states
+    that the source measures is inflated by the innovation, the measurement is fused, and its outcome is `RECOVERED`. ``q`` is the variance
+    that each state gains in a second; ``outputs`` are written in place; its times are read.
     """
     x, P, refused = belief.x, belief.P, belief.refused
     work = np.zeros((48, ROW))

@@ -278,7 +278,7 @@ def _draw_by_patch(told: Plotted, quantity: str, label: str) -> list[Plot]:
     )  # fmt: skip
     errors = make_plot(
         f"patch errors {quantity}", alt="Their absolute error in percent.", axes=("", "absolute error [%]"),
-        tools="xpan,xwheel_zoom,reset,save", tooltips=tips, beside=values, waits=True,
+        tools="xpan,xwheel_zoom,reset,save", tooltips=tips, x_range=values.figure.x_range, waits=True,
     )  # fmt: skip
     for name, colour in legend.items():
         values.figure.line("patch", name, source=source, color=colour, line_width=1.5)

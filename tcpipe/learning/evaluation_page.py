@@ -12,8 +12,7 @@ from tcpipe.learning.evaluation import EXPECTED
 from tcpipe.learning.evaluation_facts import SPLITS, ErrorsByClass, Evaluation, Leakage
 from tcpipe.learning.evaluation_figures import EvaluatedSamples, draw_paper_figures, make_page_data, sample_sections
 from tcpipe.learning.metrics import ALL, LEAST, QUANTITIES, UNITS, Errors
-from tcpipe.report.page import Number, Section, render_page
-from tcpipe.report.verdict import show_verdict
+from tcpipe.report.page import Number, Section, render_page, show_verdict
 from tcpipe.tables.findings import PREDICTED, judge_again
 
 FLOORS = {"label_floor": "label noise alone", "simulation_floor": "simulation's own floor"}
@@ -65,7 +64,7 @@ def render_evaluation_page(
             for name in found.ordered_splits
             for quantity in ("E", "T")
         ],
-        verdict=show_verdict(judge_again(found.verdict, found.findings), found.findings, PREDICTED),
+        verdict=show_verdict(judge_again(found.verdict, found.findings), found.findings, labels=PREDICTED),
         warnings=warnings,
         sections=[section for section in sections if section.rows or section.text],
         script="evaluation.js" if drawn else "",

@@ -2,11 +2,18 @@
 
 The odometer is the horizontal length of the estimated track: Hermite arcs inside its pieces, straight lines across its holes. Where an
 estimate jumps to another place nobody drove: such a step counts as long as its speed makes it. Each interval between two rows belongs to
-one entry, so the ledger's sum is the odometer (docs/explanation/rulings.md, Marked, not deleted).
+one entry, so their sum is the odometer (docs/explanation/rulings.md, Marked, not deleted).
+
+The catalogue of findings says how to avoid each large loss (``lost-...``). `find_uneven_groups` finds losses that depend on the ground: a
+dataset whose mud metres are mostly dropped shows the easy mud. Neighbouring metres are lost together, so that a share has the uncertainty
+of as many independent draws as there are stretches.
 """
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -15,6 +22,8 @@ from numpy.typing import NDArray
 from tcpipe.geometry.polyline import fit_polyline
 from tcpipe.motion.row_sections import find_piece_spans, find_runs
 from tcpipe.tables.bits import DropReason, flag_name
+from tcpipe.tables.catalogue import read_threshold
+from tcpipe.tables.findings import Finding, Subject, make_finding
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -52,13 +61,9 @@ def compute_unexplained_m(stamp_ns: Ints, position_m: Floats, velocity_mps: Floa
 
 
 def compute_interval_length_m(stamp_ns: Ints, position_m: Floats, velocity_mps: Floats, piece: Ints) -> Floats:
-    """Return the odometer's share of every interval between rows, [m], shape (N - 1,).
+    """Return the odometer's share of every interval between rows [m], shape (N - 1,).
 
-    Parameters
-    ----------
-    stamp_ns : [ns], shape (N,).
-    position_m, velocity_mps : [m], [m/s], shape (N, 3): east, north, up.
-    piece : shape (N,), numbers of the uninterrupted pieces.
+    ``position_m`` [m] and ``velocity_mps`` [m/s] have shape (N, 3): east, north, up.
     """
     step = np.diff(position_m, axis=0)
     length: Floats = np.hypot(step[:, 0], step[:, 1])
@@ -78,3 +83,114 @@ def compute_interval_duration_s(stamp_ns: Ints, epoch: NDArray[np.integer[Any]])
 def sum_by_reason(reason: NDArray[np.uint32], amount: Floats) -> dict[str, float]:
     """Return the sum of an amount an interval (metres, seconds, joules) by reason's name, every `DropReason` present."""
     return {flag_name(bit): float(amount[reason == int(bit)].sum()) for bit in DropReason}
+
+
+KEPT = "kept"
+"""The entry of metres that are in use."""
+_MOST_LOSSES = 10
+_WORTH_M = 0.05
+
+
+def make_loss_code(reason: str) -> str:
+    """Return the code of the finding on metres that were lost for a reason, as ``below_limit``."""
+    return f"lost-{reason.replace('_', '-')}"
+
+
+def find_losses(breakdown_m: Mapping[str, float], subject: Subject) -> list[Finding]:
+    """Return the findings on losses of more than a twentieth of the distance [m], the largest first; none of a robot that did not move."""
+    total_m = sum(breakdown_m.values())
+    if total_m < read_threshold("no-segments", "min_driven_m"):
+        return []
+    least_m = read_threshold("lost-gap", "min_lost_fraction") * total_m
+    lost = sorted(breakdown_m.items(), key=lambda item: -item[1])
+    return [
+        make_finding(make_loss_code(reason), subject, lost_m=lost_m, lost_fraction=lost_m / total_m)
+        for reason, lost_m in lost
+        if reason != KEPT and lost_m > least_m
+    ]
+
+
+@dataclass(frozen=True, slots=True)
+class StoreLoss:
+    """Metres that are in no segment for one reason."""
+
+    reason: str
+    metres: float
+    share: float
+    """Of all metres driven [1]."""
+    runs: int
+    """Runs that lost metres so."""
+
+
+def find_largest_losses(ledgers_m: Iterable[Mapping[str, float]]) -> tuple[StoreLoss, ...]:
+    """Return the ten largest losses of runs, by their ledgers [m], the largest first."""
+    metres, of_runs = Counter[str](), Counter[str]()
+    for ledger_m in ledgers_m:
+        metres.update(ledger_m)
+        of_runs.update(reason for reason, lost_m in ledger_m.items() if lost_m >= _WORTH_M)
+    total = sum(metres.values())
+    lost = [(reason, lost_m) for reason, lost_m in metres.most_common() if reason != KEPT and of_runs[reason]]
+    return tuple(StoreLoss(reason, lost_m, lost_m / total, of_runs[reason]) for reason, lost_m in lost[:_MOST_LOSSES])
+
+
+_STRETCH_M = 5.0
+_BIAS = "selection-bias"
+
+
+@dataclass(frozen=True, slots=True)
+class Group:
+    """Metres of one class or range of slopes: driven, in use, and removed by reason (those of zero left out) [m]."""
+
+    name: str
+    driven_m: float
+    used_m: float
+    removed_m: Mapping[str, float]
+    used_share: float
+
+
+def sum_lengths_m(
+    group: NDArray[np.int64], reason: NDArray[np.int64], length_m: NDArray[np.float64], *, shape: tuple[int, int]
+) -> NDArray[np.float64]:
+    """Return the metres of every group and reason, ``shape``; group, reason and length [m] of every piece of a drive, shape (N,)."""
+    cells = np.bincount(group * shape[1] + reason, weights=length_m, minlength=shape[0] * shape[1])
+    return cells.astype(np.float64).reshape(shape)
+
+
+def list_groups(tally: NDArray[np.float64], names: Sequence[str], reasons: Sequence[str]) -> tuple[Group, ...]:
+    """Return the groups that were driven at all, in order; ``tally`` is of `sum_lengths_m`, reason 0 is being in use."""
+    return tuple(
+        Group(
+            name,
+            float(row.sum()),
+            float(row[0]),
+            {reasons[i]: float(row[i]) for i in range(1, len(reasons)) if row[i] > 0},
+            float(row[0]) / float(row.sum()),
+        )
+        for name, row in zip(names, tally, strict=True)
+        if row.sum() > 0
+    )
+
+
+def find_uneven_groups(groups: Sequence[Group]) -> list[Group]:
+    """Return the groups whose share in use differs from that of all others by more than the catalogue's ``selection-bias`` and than chance.
+
+    Chance: so many standard deviations of a share over stretches of 5 m.
+    """
+    least_m, sigmas = read_threshold(_BIAS, "min_driven_m"), read_threshold(_BIAS, "min_sigmas")
+    apart = read_threshold(_BIAS, "min_difference_fraction")
+    driven_m, used_m = sum(g.driven_m for g in groups), sum(g.used_m for g in groups)
+    found = []
+    for group in groups:
+        rest_m = driven_m - group.driven_m
+        if min(group.driven_m, rest_m) < least_m:
+            continue
+        others = (used_m - group.used_m) / rest_m
+        variance = used_m / driven_m * (1 - used_m / driven_m) * _STRETCH_M * (1 / group.driven_m + 1 / rest_m)
+        if abs(group.used_share - others) > max(apart, sigmas * float(np.sqrt(variance))):
+            found.append(group)
+    return found
+
+
+def find_main_reason(group: Group) -> str:
+    """Return the reason that removed most of a group, ``""`` where nothing was removed."""
+    return max(group.removed_m, key=lambda name: group.removed_m[name], default="")

@@ -74,12 +74,8 @@ def find_ramps(rows: MotionRows, acceleration_mps2: Floats, halted: Mask, *, abo
     """Return the rows beside halted ones over which the speed still grows after, or already falls before, the halt.
 
     A ramp ends where the speed changes by less than ``above_mps2`` for ``min_s`` [s]. It is marked with and without commands: a robot
-    whose commands simply end (dead man's switch, emergency stop) coasts to a halt while its last command stands.
-
-    Parameters
-    ----------
-    acceleration_mps2 : [m/s²], shape (N,), slope of the forward velocity.
-    halted : shape (N,), rows that stand or turn in place.
+    whose commands simply end (dead man's switch, emergency stop) coasts to a halt while its last command stands. ``halted`` rows are
+    stationary or turn in place.
     """
     speeding_up = np.sign(rows.velocity_mps) * acceleration_mps2
     halts = np.concatenate(([0], np.cumsum(halted)))

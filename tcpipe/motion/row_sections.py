@@ -46,11 +46,7 @@ class MotionRows:
 def number_pieces(stamp_ns: Ints, epoch: NDArray[np.integer[Any]], *, period_ns: float) -> Ints:
     """Return for each row the number of its uninterrupted piece, 0 upward, shape (N,).
 
-    Parameters
-    ----------
-    stamp_ns : [ns], shape (N,).
-    epoch : shape (N,), clock epoch.
-    period_ns : [ns], the track's period; a step that differs from it by half or more is a hole.
+    A piece ends at a clock epoch, and at a step that differs from ``period_ns`` by half of it or more.
     """
     broken = (np.abs(np.diff(stamp_ns) - period_ns) >= 0.5 * period_ns) | (np.diff(epoch) != 0)
     return np.concatenate((np.zeros(min(len(stamp_ns), 1), dtype=np.int64), np.cumsum(broken)))

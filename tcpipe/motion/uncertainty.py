@@ -25,14 +25,10 @@ from tcpipe.motion.row_sections import Floats, MotionRows, find_piece_bounds
 def compute_displacement_std_m(
     *, velocity_std_mps: Floats, duration_s: Floats, start_std_m: Floats, end_std_m: Floats, smoothed: bool
 ) -> Floats:
-    """Return the standard deviation of the displacement between two estimated positions, [m], shape (M,).
+    """Return the standard deviation of the displacement between two estimated positions [m], shape (M,).
 
-    Parameters
-    ----------
-    velocity_std_mps : [m/s], shape (M,), of the velocity along the displacement.
-    duration_s : [s], shape (M,).
-    start_std_m, end_std_m : [m], shape (M,), of either position along the displacement.
-    smoothed : whether the positions come from a fixed-interval smoother rather than a forward filter.
+    ``velocity_std_mps`` and ``start_std_m``, ``end_std_m`` are along the displacement; ``smoothed`` positions come from a fixed-interval
+    smoother rather than a forward filter.
     """
     change = np.abs(end_std_m - start_std_m)
     if not smoothed:
@@ -44,15 +40,10 @@ def compute_displacement_std_m(
 
 
 def interpolate_durations_m(duration_s: Floats, *, told_s: Sequence[float], told_std_m: Floats) -> Floats:
-    """Return the displacement error over each duration from what is told for some, [m], shape (M,); NaN where that is not told.
+    """Return the displacement error over each duration [s] from that over some, [m], shape (M,); NaN where that is unknown.
 
-    Between two durations it is taken as a power of time, below the shortest as that of a constant velocity error.
-
-    Parameters
-    ----------
-    duration_s : [s], shape (M,), > 0.
-    told_s : [s], L durations, increasing.
-    told_std_m : [m], shape (M, L), > 0 or NaN.
+    Between two durations it is a power of time, below the shortest that of a constant velocity error. ``told_s`` [s] are L durations,
+    increasing; ``told_std_m`` [m], shape (M, L), is above 0 or NaN.
     """
     known = np.array(told_s)
     after = np.clip(np.searchsorted(known, duration_s), 1, len(known) - 1)
@@ -84,17 +75,10 @@ def compute_chord_ahead_std_m(
     told_s: Sequence[float],
     told_std_m: Floats,
 ) -> Floats:
-    """Return for each row the displacement error over the next chord at the row's speed, [m], shape (N,).
+    """Return for each row the displacement error over the next chord at the row's speed [m], shape (N,).
 
-    As the smoother tells it (`interpolate_durations_m`), elsewhere as the row's deviations allow (`compute_displacement_std_m`).
-
-    Parameters
-    ----------
-    velocity_std_mps : [m/s], shape (N,), standard deviation of the forward velocity.
-    position_std_m : [m], shape (N,), of the position along the direction of travel.
-    chord_m : [m].
-    slowest_mps : [m/s], rows slower than this are taken as this fast.
-    told_s, told_std_m : [s], L durations, and [m], shape (N, L), the displacement error over them, NaN where it is not told.
+    It is the smoother's (`interpolate_durations_m`), elsewhere as the row's deviations allow (`compute_displacement_std_m`): of the forward
+    velocity, and of the position along the direction of travel. Rows slower than ``slowest_mps`` [m/s] are taken as this fast.
     """
     _, high = find_piece_bounds(rows.piece)
     duration_s = chord_m / np.maximum(np.abs(rows.velocity_mps), slowest_mps)

@@ -22,15 +22,11 @@ _NS = 1e-9
 
 
 def compute_vibration_mps2(stamp_ns: Stamps, specific_force_mps2: Floats, start_ns: Stamps, end_ns: Stamps) -> Floats:
-    """Return the root mean square over each span of the band-passed specific force, its axes together, [m/s²], shape (M,).
+    """Return the root mean square over each span of the band-passed specific force, its axes together [m/s²], shape (M,).
 
     NaN where the sensor is slower than 50 Hz, has a gap of more than three periods in the span or near it, or does not reach over it.
-
-    Parameters
-    ----------
-    stamp_ns : [ns], shape (N,), of one clock epoch, in any order; of several at one stamp the first counts.
-    specific_force_mps2 : [m/s²], shape (N, 3), finite, in the axes of the sensor.
-    start_ns, end_ns : [ns], shape (M,).
+    Samples are of one clock epoch, in any order; of several at one stamp the first counts. The force, shape (N, 3), is finite, in the
+    sensor's axes.
     """
     unknown = np.full(len(start_ns), np.nan)
     if (np.diff(stamp_ns) <= 0).any():

@@ -22,7 +22,7 @@ from tcpipe.formats.recipe_toml import load_profiles
 from tcpipe.logs.roles import OVERLAY
 from tcpipe.logs.simulated_clock import CLOCK
 from tcpipe.logs.topics import Topic
-from tcpipe.motion.remedies import StoreLoss, find_largest_losses
+from tcpipe.motion.distance_breakdown import StoreLoss, find_largest_losses
 from tcpipe.motion.vibration import LEAST_RATE_HZ
 from tcpipe.pipeline.ingest_run import run_stages
 from tcpipe.pipeline.log_inspection import InspectedLog, inspect_log

@@ -25,10 +25,9 @@ from tcpipe.report.dataset_patches import find_picture_folder, iterate_pictures
 from tcpipe.report.dataset_report import render_dataset_report
 from tcpipe.report.dataset_samples import MOST_SAMPLES
 from tcpipe.report.label_sections import describe_physics
-from tcpipe.report.run_map import Pictures
+from tcpipe.report.maps import Pictures
 from tcpipe.report.run_report import run_report
-from tcpipe.report.store_report import store_report
-from tcpipe.report.store_runs import FailedLog, StoredDataset, StoreFacts, find_recipe_key
+from tcpipe.report.store_report import FailedLog, StoredDataset, StoreFacts, find_recipe_key, store_report
 from tcpipe.store import Store, find_store_above, is_store, run_at
 
 _PAGE = "report.html"
@@ -72,8 +71,8 @@ def report(path: Path | str, *, runs: bool = True, patches: bool = False) -> lis
         there = is_url(path) or Path(path).exists()
         what = "is no dataset, run or store" if there else "there is no such directory"
         raise UsageError(f"{path}: {what}; give a dataset, a run of a store, or a store")
-    of_maps: dict[str, Pictures] = {}
-    return [_report_run(found[0], run, of_maps) for run in found[1]]
+    pictures_by_map: dict[str, Pictures] = {}
+    return [_report_run(found[0], run, pictures_by_map) for run in found[1]]
 
 
 def _report_store(store: Store, *, runs: bool) -> list[Page]:
@@ -81,10 +80,10 @@ def _report_store(store: Store, *, runs: bool) -> list[Page]:
     found = store.ingestions()
     facts = store_facts(store, found, will_be=found.finished if runs else ())
     page, pages, problems = _write(store.place, store_report(facts), ()), list[Page](), list[str]()
-    of_maps: dict[str, Pictures] = {}
+    pictures_by_map: dict[str, Pictures] = {}
     for run in found.finished if runs else ():
         try:
-            pages.append(_report_run(store, run, of_maps))
+            pages.append(_report_run(store, run, pictures_by_map))
         except StoreError as error:
             problems += error.problems
     if problems:
@@ -93,8 +92,8 @@ def _report_store(store: Store, *, runs: bool) -> list[Page]:
     return [page, *pages]
 
 
-def _report_run(store: Store, run: RunDirectory, of_maps: dict[str, Pictures]) -> Page:
-    return _write(run.place, run_report(store, run, of_maps), _describe_physics(run))
+def _report_run(store: Store, run: RunDirectory, pictures_by_map: dict[str, Pictures]) -> Page:
+    return _write(run.place, run_report(store, run, pictures_by_map), _describe_physics(run))
 
 
 def _report_dataset(path: Path | str, *, patches: bool) -> Page:

@@ -18,7 +18,7 @@ from tcpipe.formats.object_storage import format_path, is_url, make_absolute
 from tcpipe.formats.recipe_toml import ingest_key, resolve_recipe
 from tcpipe.formats.stored_runs import Ingestions
 from tcpipe.formats.user_paths import check_local_output
-from tcpipe.motion.remedies import StoreLoss, find_largest_losses
+from tcpipe.motion.distance_breakdown import StoreLoss, find_largest_losses
 from tcpipe.pipeline.calls import (
     INGEST,
     BegunCall,

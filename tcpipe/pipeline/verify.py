@@ -39,7 +39,7 @@ from tcpipe.formats.json_files import to_plain
 from tcpipe.formats.object_storage import is_bucket, is_url
 from tcpipe.formats.parquet import read_table
 from tcpipe.formats.recipe_toml import make_recipe_id
-from tcpipe.motion.remedies import KEPT
+from tcpipe.motion.distance_breakdown import KEPT
 from tcpipe.pipeline.dataset.card import CARD_COLUMNS, measure_samples
 from tcpipe.pipeline.dataset.redaction import find_leaks
 from tcpipe.pipeline.verify_store import CheckResult, verify_log, verify_map, verify_run, verify_store

@@ -46,7 +46,7 @@ from tcpipe.formats.run_documents import (
     split_number,
 )
 from tcpipe.formats.stored_runs import RunDirectory
-from tcpipe.motion.remedies import KEPT
+from tcpipe.motion.distance_breakdown import KEPT
 from tcpipe.report.pictures import is_picture_of_map
 from tcpipe.store import Store
 from tcpipe.tables.columns import to_floats, to_integers
@@ -314,7 +314,7 @@ def _verify_others(place: Place, manifest: Manifest) -> Iterator[CheckResult]:
 def _verify_tables(run: RunDirectory, where: str) -> Iterator[CheckResult]:
     tables = {}
     for name, schema in _TABLES.items():
-        tables[name] = schema.completed(run.table(name))
+        tables[name] = schema.add_missing_columns(run.table(name))
         try:
             schema.check(tables[name])
         except TcpipeError as error:

@@ -31,9 +31,8 @@ from tcpipe.planning.segment_predictions import (
     predict_segments,
 )
 from tcpipe.report.colours import DROPPED, SPLIT_COLOURS
-from tcpipe.report.page import Number, Section, render_page
+from tcpipe.report.page import Number, Section, render_page, show_verdict
 from tcpipe.report.plots import Plot, make_plot
-from tcpipe.report.verdict import show_verdict
 from tcpipe.splits.neighbours import CLOSE, PLACES, are_near, compute_middles_deg
 from tcpipe.store import Store, open_store
 from tcpipe.tables.bits import flag_names
@@ -336,7 +335,7 @@ def _render_page(values: Drives) -> str:
             for called, of in (("time", values.duration_s), ("energy", values.energy_joule))
             if of.measured
         ],
-        verdict=show_verdict(values.verdict, values.findings, PREDICTED),
+        verdict=show_verdict(values.verdict, values.findings, labels=PREDICTED),
         sections=[
             Section(
                 drive.run_id,
@@ -382,7 +381,7 @@ def _draw_sums(number: int, drive: DriveCost) -> Iterator[Plot]:
             alt=f"{label} of {drive.run_id} so far over the distance driven, measured and predicted, with its 90 % interval.",
             axes=("distance driven in segments [m]", label),
             legend={"measured": DROPPED, "predicted, with its interval": SPLIT_COLOURS["train"]},
-            beside=first,
+            **({} if first is None else {"x_range": first.figure.x_range}),
             tooltips=[
                 ("at", "@metres{0.0} m"),
                 ("measured", "@measured{0.0}"),

@@ -11,6 +11,7 @@ Every rule is prorated at both ends of a span. Negative power (regeneration) cou
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -26,12 +27,7 @@ Rule = Literal["exact", "averaged", "right_endpoint"]
 
 
 def integrate_energy(rails: list[Rail], start_ns: Ints, end_ns: Ints, *, rule: Rule) -> Floats:
-    """Return the energy of all rails over each span, [J], shape (M,); NaN where any rail is not known throughout, or there is none.
-
-    Parameters
-    ----------
-    start_ns, end_ns : [ns], shape (M,).
-    """
+    """Return the energy of all rails over each span [J], shape (M,); NaN where any rail is unknown in part of it, or there is none."""
     total = np.full(len(start_ns), np.nan if not rails else 0.0)
     for each in rails:
         energy = np.full(len(start_ns), np.nan)
@@ -56,11 +52,9 @@ def integrate_recorded_energy(rails: list[Rail], start_ns: Ints, end_ns: Ints, *
 
 
 def count_samples_inside(rails: list[Rail], start_ns: Ints, end_ns: Ints) -> tuple[Ints, Floats]:
-    """Return how many current samples lie in (start, end], the fewest of any rail, and the plain mean power of the samples there.
+    """Return the number of current samples in (start, end], the fewest of any rail, and the plain mean power of the samples there [W].
 
-    Returns
-    -------
-    [1], shape (M,), 0 without rails; [W], shape (M,), sum over rails of the mean of V·I at the union's stamps, NaN where it has none.
+    Both have shape (M,); 0 and NaN without rails, the mean NaN also where a rail has no sample.
     """
     count = np.zeros(len(start_ns), dtype=np.int64)
     mean = np.full(len(start_ns), np.nan if not rails else 0.0)
@@ -84,3 +78,63 @@ def _integrate_to(each: Rail, at_ns: Ints, rule: Rule) -> Floats:
     if rule == "exact":
         return integrate_product_to(each.stamp_ns, each.voltage_volt, each.current_amp, at_ns)
     return integrate_held_to(each.stamp_ns, each.voltage_volt * each.current_amp, at_ns)
+
+
+FEWEST_ROWS = 40
+"""Rows of a standing robot that tell its power."""
+_QUARTERS = 4
+_UNSEEN_SHARE = 0.1
+"""Of the power: how far one second of standing may lie from the rest of the run, which only further seconds tell. The pack of FoMo's robot,
+which stands once for seconds, gives 12 % of that more while driving than the drives take (docs/explanation/real-data.md)."""
+
+
+@dataclass(frozen=True, slots=True)
+class IdlePower:
+    """Idle power of a run: the median of the means of seconds [W], and its standard deviation for any second of the run; NaN if unknown."""
+
+    watt: float
+    std_watt: float
+
+
+def estimate_idle_power(
+    power_watt: Floats, halt: NDArray[np.int64], *, window_rows: int, step_watt: float
+) -> IdlePower:
+    """Return the idle power. A second is about as long as a segment takes, and its mean is finer than the record's step.
+
+    Parameters
+    ----------
+    power_watt : [W], shape (N,), while the robot is stationary, in order of time; NaN where unknown.
+    halt : shape (N,), number of the row's halt, increasing; negative at the edges of a halt, where motors still or already draw.
+    window_rows : rows of a second.
+    step_watt : [W], resolution of power; a record that stays on one level has an error of up to half of it.
+    """
+    known = np.isfinite(power_watt)
+    if np.count_nonzero(known) < FEWEST_ROWS:
+        return IdlePower(np.nan, np.nan)
+    settled = known & (halt >= 0)
+    used = settled if settled.any() else known
+    halts = [power_watt[used & (halt == number)] for number in np.unique(halt[used]).tolist()]
+    seconds = _split_halts(halts, window_rows)
+    means = np.array([each.mean() for each in seconds])
+    watt = float(np.median(means))
+    scatter = float(np.mean((means - watt) ** 2))
+    lasting = max(scatter - _estimate_noise_variance(seconds), 0.0)
+    levels = 1 + np.count_nonzero(np.diff(power_watt[used]))
+    unseen = _UNSEEN_SHARE * watt / means.size
+    return IdlePower(watt, float(np.sqrt(lasting + scatter / means.size + step_watt**2 / 12.0 / levels + unseen**2)))
+
+
+def _split_halts(halts: list[Floats], rows: int) -> list[Floats]:
+    """Return halts in parts of so many rows or somewhat more; those of less than half are left out where there are others."""
+    parts = [part for each in halts for part in np.array_split(each, max(each.size // rows, 1))]
+    return [part for part in parts if 2 * part.size >= rows] or parts
+
+
+def _estimate_noise_variance(seconds: list[Floats]) -> float:
+    """Return the variance [W²] that noise gives the mean of a second: the means of its quarters tell, however rows hang together."""
+    found = [
+        float(np.var([quarter.mean() for quarter in np.array_split(each, _QUARTERS)], ddof=1)) / _QUARTERS
+        for each in seconds
+        if each.size >= _QUARTERS
+    ]
+    return float(np.mean(found)) if found else 0.0

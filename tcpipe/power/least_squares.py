@@ -12,19 +12,10 @@ Floats = NDArray[np.float64]
 
 
 def solve_non_negative(made: Floats, seen: Floats) -> Floats:
-    """Return the sizes, none negative, with which the columns of ``made`` add up nearest to what is seen.
+    """Return the sizes, none negative, shape (J,), with which the columns of ``made`` (S, J) add up nearest to ``seen`` (S,).
 
     Lawson and Hanson, Solving Least Squares Problems (1974), algorithm 23.10 (NNLS): columns that would lessen the residual most become
     free one by one; what would become negative stops at zero.
-
-    Parameters
-    ----------
-    made : shape (S, J).
-    seen : shape (S,).
-
-    Returns
-    -------
-    ndarray : shape (J,).
     """
     size, free, vain = np.zeros(made.shape[1]), np.zeros(made.shape[1], np.bool_), np.zeros(made.shape[1], np.bool_)
     rounding = 10.0 * np.finfo(np.float64).eps * np.linalg.norm(made, axis=0) * np.linalg.norm(seen)

@@ -142,7 +142,7 @@ def _interpolate_known(signal: Samples, at_ns: Stamps, *, averaged: bool, max_ga
 
 
 def _interpolate_ns(stamp_ns: Stamps, value: Floats, at_ns: Stamps) -> Floats:
-    """Return what `interpolate` does, reckoned in nanoseconds: in seconds the last digits of every track would be others."""
+    """Return what `interpolate` does, computed in nanoseconds: in seconds the last digits of every track would be others."""
     zero = stamp_ns[0]
     between: Floats = np.interp((at_ns - zero).astype(np.float64), (stamp_ns - zero).astype(np.float64), value)
     return between

@@ -14,7 +14,6 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.power.counters import Counter, count_energy
 from tcpipe.robots.profiles import FieldPath, PowerSource, parse_fields
 from tcpipe.tables.catalogue import read_threshold
 from tcpipe.tables.findings import Finding, Subject, make_finding
@@ -144,8 +143,7 @@ def read_rails(
     ----------
     columns : ``log_time_ns`` and the message's fields by dotted name; lists as shape (N, k), rows padded with NaN.
     sources : from `find_sources`.
-    topic : its name; a rail without a name of its own is called so.
-    known : every table, for those that would fit.
+    known : every table, for the platforms that would fit.
     """
     for source in sources:
         if found := _find_misfit(columns, source, topic, known):
@@ -264,19 +262,10 @@ _UNAMBIGUOUS = read_threshold(REJECTED, "min_net_fraction")  # of the charge mov
 
 
 def sign_by_mean(current_amp: Floats, weight_s: Floats) -> tuple[int, float]:
-    """Return the sign that makes the robot draw power over the run, and how one-sided its current is.
+    """Return the sign that makes the robot draw power over the run (0 where that is unclear), and ∫I dt / ∫|I| dt, in [-1, 1].
 
-    A driving robot draws more than it feeds back, so the mean of its whole current tells how it is counted.
-
-    Parameters
-    ----------
-    current_amp : [A], shape (N,), the sum of all rails as recorded.
-    weight_s : [s], shape (N,), the time each row stands for.
-
-    Returns
-    -------
-    sign : +1 or -1 where |∫I dt| > 0.8 ∫|I| dt, else 0.
-    one_sidedness : ∫I dt / ∫|I| dt, in [-1, 1]; 0 where there is no current.
+    A driving robot draws more than it feeds back, so the mean of its whole current shows the sign. ``current_amp`` [A], shape (N,), is the
+    sum of all rails as recorded; ``weight_s`` [s] the time of each row.
     """
     whole = float(np.nansum(np.abs(current_amp) * weight_s))
     ratio = float(np.nansum(current_amp * weight_s)) / whole if whole > 0 else 0.0
@@ -287,3 +276,52 @@ def apply_sign(rail: RailReadings, sign: int) -> RailReadings:
     """Return the rail with its current positive when drawn."""
     counter = None if rail.counter is None else rail.counter.times(sign)
     return replace(rail, current_amp=sign * rail.current_amp, counter=counter)
+
+
+Stamps = NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True)
+class Counter:
+    """A counter row by row: energy since the first row [J], shape (N,), NaN where a row tells none, and how often it was reset before."""
+
+    energy_joule: Floats
+    resets: NDArray[np.int64]
+
+    def times(self, factor: int) -> Counter:
+        """Return the counter with its energy multiplied."""
+        return replace(self, energy_joule=factor * self.energy_joule)
+
+    def mean_amp(self, stamp_ns: Stamps, voltage_volt: Floats) -> Floats:
+        """Return the mean current since the row before [A], at the row's voltage [V], shape (N,); stamps in [ns].
+
+        So voltage times current, held backwards from each stamp as of any source that averages, is what was counted. NaN on the first row,
+        after a reset, and where time stands still.
+        """
+        amp = np.full(len(stamp_ns), np.nan)
+        row = np.flatnonzero(np.isfinite(self.energy_joule) & (voltage_volt > 0.0))
+        passed_s = np.diff(stamp_ns[row]) / 1e9
+        whole = (np.diff(self.resets[row]) == 0) & (passed_s > 0.0)
+        joule = np.diff(self.energy_joule[row])
+        amp[row[1:][whole]] = joule[whole] / passed_s[whole] / voltage_volt[row[1:]][whole]
+        return amp
+
+
+def count_energy(parts: Sequence[tuple[float, Floats]], *, wraps: float | None) -> Counter:
+    """Return what counters that only rise counted together.
+
+    ``parts`` are the energy of each counter's unit [J], negative where it is subtracted, and its readings, shape (N,). It begins at zero
+    again at ``wraps``, in its own unit; a fall that no wrap explains is a reset.
+    """
+    energy = np.zeros(len(parts[0][1]))
+    resets = np.zeros(len(energy), np.int64)
+    for unit_joule, reading in parts:
+        row = np.flatnonzero(np.isfinite(reading))
+        rise = np.diff(reading[row])
+        if wraps is not None:
+            rise = np.where((rise < 0.0) & (rise + wraps < wraps / 2), rise + wraps, rise)
+        fell = rise < 0.0
+        energy[np.setdiff1d(np.arange(len(energy)), row)] = np.nan
+        energy[row[1:]] += unit_joule * np.cumsum(np.where(fell, 0.0, rise))
+        resets[row[1:]] += np.cumsum(fell)
+    return Counter(energy, resets)

@@ -9,27 +9,26 @@ import numpy as np
 import pyarrow as pa
 
 from tcpipe.errors import DatasetError
-from tcpipe.formats.dataset_card import DatasetCard, RunSource, group_dataset_findings, judge_dataset
+from tcpipe.formats.dataset_card import DatasetCard, group_dataset_findings, judge_dataset
 from tcpipe.formats.dataset_files import read_current_card, read_samples
 from tcpipe.formats.finding_lines import format_group, group_findings
 from tcpipe.formats.json_files import Json
 from tcpipe.formats.run_documents import MARK
 from tcpipe.report.colours import CLASS_COLOURS, DROPPED, FAINT, KEPT, SPLIT_COLOURS, find_class_colour
-from tcpipe.report.dataset_map import map_plots
 from tcpipe.report.dataset_patches import PER_SHEET, make_patches_data
 from tcpipe.report.dataset_samples import COLUMNS, MOST_SAMPLES, SamplesShown, find_first_starts_ns, select_samples
 from tcpipe.report.label_sections import (
     QUALITY_WORDS,
-    balance_sections,
+    find_distinguishing_bits,
+    make_balance_sections,
     make_budget_sections,
     make_physics_sections,
-    make_quality_sections,
+    make_quality_section,
 )
-from tcpipe.report.page import Link, Number, Section, render_page
+from tcpipe.report.maps import draw_dataset_map
+from tcpipe.report.page import Link, Number, Section, VerdictBox, render_page, show_verdict
 from tcpipe.report.plots import Plot, draw_waterfall, label_histograms, make_plot
-from tcpipe.report.verdict import VerdictBox, show_mixed_groups
 from tcpipe.tables.arrays import to_texts
-from tcpipe.tables.bits import Quality, flag_name
 
 _PAGE = "report.html"
 
@@ -43,40 +42,38 @@ def render_dataset_report(directory: Path, beside: Path | None = None, *, folder
     """
     card, samples = read_current_card(directory), read_samples(directory, COLUMNS)
     shown = select_samples(card, samples)
-    plots, lost = map_plots(directory, card, shown)
+    plots, lost = draw_dataset_map(directory, card, len(shown.xy_m))
+    quality = samples.column("quality").to_numpy()
     try:
         patches = make_patches_data(directory, card, samples, shown.row_of)
     except DatasetError as error:
         patches, lost = None, [*lost, f"no patch is shown: {error.problems[0]}"]
-    hrefs = {} if beside is None else _run_pages(beside, card)
+    waterfall = draw_waterfall(card.ledger_m)
+    hrefs = {} if beside is None else _find_run_pages(beside, card)
     return render_page(
         title=f"Dataset {card.name}",
         lead=card.description or f"{card.format} format, data model {card.data_model_version}",
         verdict=_make_verdict(card),
         numbers=_make_numbers(card),
-        links=[] if beside is None else _store_pages(beside, hrefs),
+        links=[] if beside is None else _list_store_pages(beside, hrefs),
         warnings=lost,
         sections=[
-            _map_section(shown, plots),
+            _make_map_section(shown, plots),
             *([] if patches is None else [_GALLERY]),
-            *_label_sections(samples),
-            *make_quality_sections(_count_quality(samples), "samples"),
+            *_make_label_sections(samples),
+            make_quality_section(quality, "samples"),
             *_make_finding_sections(card),
             *make_physics_sections(dict(card.physics)),
             *make_budget_sections(card.energy_budget),
-            Section(
-                "Where every metre went",
-                "In samples and lost add up to the odometer.",
-                plots=[draw_waterfall(card.ledger_m)],
-            ),
+            Section("Where every metre went", "In samples and lost add up to the odometer.", plots=[waterfall]),
             *_make_removal_sections(card),
-            *balance_sections(card.balance),
+            *make_balance_sections(card.balance),
             _make_audit_section(card, samples, shown),
             *_make_table_sections(card, hrefs),
             _make_provenance_section(card),
         ],
         script="dataset.js" if samples.num_rows else "",
-        data={**_make_data(card, samples, shown, patches=patches, drawn=plots[0], hrefs=hrefs), "folder": folder},
+        data=_make_data(card, samples, shown, patches=patches, drawn=plots[0], hrefs=hrefs) | {"folder": folder},
         reads_pictures=bool(folder),
     )
 
@@ -86,7 +83,7 @@ def _make_verdict(card: DatasetCard) -> VerdictBox | None:
     if card.verdict is None:
         return None
     groups = group_dataset_findings(card.findings, card.findings_by_run, card.findings_by_map)
-    return show_mixed_groups(judge_dataset(card.findings, card.runs, card.maps), groups)
+    return show_verdict(judge_dataset(card.findings, card.runs, card.maps), groups=groups)
 
 
 _GALLERY = Section(
@@ -106,7 +103,7 @@ def _make_numbers(card: DatasetCard) -> list[Number]:
     ]
 
 
-def _map_section(shown: SamplesShown, plots: list[Plot]) -> Section:
+def _make_map_section(shown: SamplesShown, plots: list[Plot]) -> Section:
     text = "Where each sample lies; dashed: the split's region. The buffer is in no split. A box in the plot chooses on the map."
     if shown.cell_m is not None:
         text += (
@@ -139,17 +136,11 @@ def _make_data(
         "unknown": FAINT,
         "clean": KEPT,
         "flagged": DROPPED,
-        "flags": _find_distinguishing_bits(samples),
+        "flags": find_distinguishing_bits(samples.column("quality").to_numpy()),
     }
 
 
-def _find_distinguishing_bits(samples: pa.Table) -> int:
-    """Return the quality bits that some samples carry and others do not: a bit of all of them says nothing on a map."""
-    bits = samples.column("quality").to_numpy().astype(np.int64)
-    return int(np.bitwise_or.reduce(bits, initial=0) & ~np.bitwise_and.reduce(bits)) if len(bits) else 0
-
-
-def _run_pages(beside: Path, card: DatasetCard) -> dict[str, str]:
+def _find_run_pages(beside: Path, card: DatasetCard) -> dict[str, str]:
     """Return where each run's page lies from the dataset's, for runs of a store that lies ``beside`` it."""
     stores = sorted(mark.parent for mark in beside.glob(f"*/{MARK}"))
     return {
@@ -160,48 +151,37 @@ def _run_pages(beside: Path, card: DatasetCard) -> dict[str, str]:
     }
 
 
-def _store_pages(beside: Path, hrefs: Mapping[str, str]) -> list[Link]:
-    """Return the pages, where there are, of the stores that the runs' pages (`_run_pages`) lie in."""
+def _list_store_pages(beside: Path, hrefs: Mapping[str, str]) -> list[Link]:
+    """Return the pages, where there are, of the stores that the runs' pages (`_find_run_pages`) lie in."""
     stores = sorted({href.split("/")[1] for href in hrefs.values()})
     return [Link(f"All runs of {name}", f"../{name}/{_PAGE}") for name in stores if (beside / name / _PAGE).is_file()]
 
 
-def _label_sections(samples: pa.Table) -> list[Section]:
-    return (
-        [Section("Labels", "One value a sample.", plots=label_histograms(samples, "samples"))]
-        if samples.num_rows
-        else []
-    )
-
-
-def _count_quality(samples: pa.Table) -> dict[str, int]:
-    quality = samples.column("quality").to_numpy()
-    return {flag_name(bit): int(((quality & int(bit)) != 0).sum()) for bit in Quality}
+def _make_label_sections(samples: pa.Table) -> list[Section]:
+    plots = label_histograms(samples, "samples") if samples.num_rows else []
+    return [Section("Labels", "One value a sample.", plots=plots)] if samples.num_rows else []
 
 
 def _draw_distances(samples: pa.Table, shown: SamplesShown) -> Iterator[Plot]:
-    """Yield how far what tests lies from what trains, where every sample is shown and both are there."""
+    """Yield the distances of held-out samples to the nearest training sample, unless cells are shown in their place."""
     split = to_texts(samples.column("split"))
-    if shown.cell_m is not None:
-        return
-    there = [name for name in ("test", "unseen") if np.isfinite(shown.apart_m[split == name]).any()]
-    if not there:
+    distances_m = {name: np.sort(shown.apart_m[split == name]) for name in ("test", "unseen")}
+    distances_m = {name: part for name, part in distances_m.items() if np.isfinite(part).any()}
+    if shown.cell_m is not None or not distances_m:
         return
     plot = make_plot(
         "apart",
         alt="Share of held-out samples whose nearest train sample is no further than this; the table below has the counts.",
         axes=("middle to nearest train middle [m]", "share of samples"),
-        legend={name: SPLIT_COLOURS[name] for name in there},
+        legend={name: SPLIT_COLOURS[name] for name in distances_m},
         height_px=240,
         tools="save",
         waits=True,
     )
-    for name in there:
-        sorted_m = np.sort(shown.apart_m[split == name])
+    for name, sorted_m in distances_m.items():
         kept = np.unique(np.linspace(0, len(sorted_m) - 1, 400).astype(int))
-        plot.figure.step(
-            sorted_m[kept], (kept + 1) / len(sorted_m), mode="after", color=SPLIT_COLOURS[name], line_width=2
-        )
+        shares = (kept + 1) / len(sorted_m)
+        plot.figure.step(sorted_m[kept], shares, mode="after", color=SPLIT_COLOURS[name], line_width=2)
     yield plot
 
 
@@ -213,20 +193,15 @@ def _make_audit_section(card: DatasetCard, samples: pa.Table, shown: SamplesShow
             part.overlapping_samples,
             part.same_track_pairs,
             part.repeated_place_samples,
-            "none" if part.nearest_train_min_m is None else f"{part.nearest_train_min_m:.1f} m",
-            "none" if part.nearest_train_median_m is None else f"{part.nearest_train_median_m:.1f} m",
+            *(
+                "none" if distance_m is None else f"{distance_m:.1f} m"
+                for distance_m in (part.nearest_train_min_m, part.nearest_train_median_m)
+            ),
         )
         for part in card.split.audit
     ]
-    header = (
-        "split",
-        "samples",
-        "overlap train",
-        "neighbours of train",
-        "places train knows",
-        "nearest train",
-        "median",
-    )
+    counts = ("samples", "overlap train", "neighbours of train", "places train knows")
+    header = ("split", *counts, "nearest train", "median")
     text = "How much of what tests has been seen in training. On the map: colour by the way to the nearest train metre, or tick its lines."
     return Section("Leakage audit", text, header=header, rows=rows, plots=list(_draw_distances(samples, shown)))
 
@@ -243,28 +218,19 @@ def _make_finding_sections(card: DatasetCard) -> list[Section]:
 
 
 def _make_removal_sections(card: DatasetCard) -> list[Section]:
-    """Return what of each class and slope is in samples; nothing for datasets of before, and where nothing was driven."""
-    found = []
+    """Return how much of each class and slope is in samples; none where nothing was driven."""
+    sections = []
+    text = "Where the shares differ, what is removed depends on the ground."
     for groups, what in ((card.removal.by_class, "class"), (card.removal.by_slope, "slope along travel")):
-        rows = [
-            (
-                group.name,
-                f"{group.driven_m:.0f}",
-                f"{100 * group.used_share:.0f} %",
-                ", ".join(f"{name.replace('_', ' ')} {metres:.0f}" for name, metres in _find_largest(group.removed_m)),
-            )
-            for group in groups
-        ]
-        if rows:
-            text = "Where the shares differ, what is removed depends on the ground."
-            header = (what, "driven [m]", "in samples", "removed by [m]")
-            found.append(Section(f"Metres in use by {what}", text, header=header, rows=rows))
-    return found
-
-
-def _find_largest(metres: Mapping[str, float]) -> list[tuple[str, float]]:
-    """Return the three largest entries of half a metre or more."""
-    return sorted(((n, m) for n, m in metres.items() if m >= 0.5), key=lambda item: (-item[1], item[0]))[:3]
+        rows = []
+        for group in groups:
+            removed = ((name, metres) for name, metres in group.removed_m.items() if metres >= 0.5)
+            largest = sorted(removed, key=lambda item: (-item[1], item[0]))[:3]
+            reasons = ", ".join(f"{name.replace('_', ' ')} {metres:.0f}" for name, metres in largest)
+            rows.append((group.name, f"{group.driven_m:.0f}", f"{100 * group.used_share:.0f} %", reasons))
+        header = (what, "driven [m]", "in samples", "removed by [m]")
+        sections.append(Section(f"Metres in use by {what}", text, header=header, rows=rows))
+    return [section for section in sections if section.rows]
 
 
 def _make_table_sections(card: DatasetCard, hrefs: Mapping[str, str]) -> list[Section]:
@@ -279,19 +245,15 @@ def _make_table_sections(card: DatasetCard, hrefs: Mapping[str, str]) -> list[Se
             run.robot,
             ", ".join(run.logs),
             f"{run.samples}",
-            _format_floor(run),
+            "none" if run.energy_budget is None else f"{100 * run.energy_budget.total:.1f} %",
         )
         for run in card.runs
     ]
-    led = "Each leads to the run's own page, once 'tcpipe report STORE' has written it."
-    text = (
-        led
-        if hrefs
-        else "'tcpipe report DATASET' makes them lead to the runs' pages, where the store lies beside the dataset."
-    )
+    text = "'tcpipe report DATASET' makes them lead to the runs' pages, where the store lies beside the dataset."
+    if hrefs:
+        text = "Each leads to the run's own page, once 'tcpipe report STORE' has written it."
     header = ("run", "robot", "log", "samples", "noise floor of E")
-    sections.append(Section("Runs", text, header=header, rows=runs, figures_from=3))
-    return sections
+    return [*sections, Section("Runs", text, header=header, rows=runs, figures_from=3)]
 
 
 def _make_provenance_section(card: DatasetCard) -> Section:
@@ -301,10 +263,7 @@ def _make_provenance_section(card: DatasetCard) -> Section:
         ("made by", f"tcpipe {card.tcpipe_version}, data model {card.data_model_version}, {card.format} format"),
         ("inputs", card.inputs),
         ("recipe of ingest", ", ".join(sorted({run.recipe_id for run in card.runs}))),
-        (
-            "split",
-            f"held out by {rules.holdout}, test fraction {rules.test_fraction:g}, seed {rules.seed}",
-        ),
+        ("split", f"held out by {rules.holdout}, test fraction {rules.test_fraction:g}, seed {rules.seed}"),
         ("patches", f"{card.patch_m:g} m, {card.patch_px} px: {', '.join(card.layers)}"),
         *(
             (
@@ -319,7 +278,3 @@ def _make_provenance_section(card: DatasetCard) -> Section:
     ]
     text = "The same inputs make the same dataset; its recipe and every file's checksum stand in dataset.json."
     return Section("Provenance", text, header=("what", "is"), rows=rows, folded=True)
-
-
-def _format_floor(run: RunSource) -> str:
-    return "none" if run.energy_budget is None else f"{100 * run.energy_budget.total:.1f} %"

@@ -1,13 +1,20 @@
-"""Sections on labels: quality bits, error budget, physics of the robot, and how samples are spread over ground, slope and speed."""
+"""Sections on labels: losses, quality bits, error budget, physics of the robot, and balance over class, slope and speed."""
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
 
 from tcpipe.balance.cells import SLOPE_NAMES
 from tcpipe.cost.labels import format_budget
 from tcpipe.formats.dataset_card import Balance, CellRow
+from tcpipe.formats.finding_lines import advise_on_loss
+from tcpipe.motion.distance_breakdown import find_largest_losses
 from tcpipe.report.page import Section, Shaded
+from tcpipe.report.plots import draw_waterfall
 from tcpipe.tables.bits import Quality, flag_name
 from tcpipe.tables.facts import EnergyBudget, PhysicsFit, PhysicsTerm
 
@@ -28,22 +35,44 @@ QUALITY_WORDS = {
 """What a bit says, in words."""
 
 
-def make_quality_sections(counts: Mapping[str, int], of_what: str) -> list[Section]:
-    """Return the table of the bits that any label carries; ``counts`` are by the bit's name."""
-    rows = [(flag_name(bit).replace("_", " "), count) for bit in Quality if (count := counts.get(flag_name(bit), 0))]
-    if not rows:
-        return [Section("Quality flags", f"None: all {of_what} are clean.")] if counts else []
-    return [
-        Section(
-            "Quality flags",
-            "A label may carry several; docs/reference/columns.md says what each means.",
-            header=("flag", of_what),
-            rows=rows,
+def make_losses_sections(ledgers_m: Sequence[Mapping[str, float]], text: str, *, names_runs: bool) -> list[Section]:
+    """Return where the distance of runs went, and how to lose less of it; none without a run."""
+    if not ledgers_m:
+        return []
+    rows = [
+        (
+            loss.reason.replace("_", " "),
+            f"{loss.metres:.{0 if names_runs else 1}f}",
+            f"{100 * loss.share:.1f} %",
+            *([loss.runs] if names_runs else []),
+            advise_on_loss(loss.reason),
         )
+        for loss in find_largest_losses(ledgers_m)
     ]
+    header = ("lost to", "metres", "of all", *(["runs"] if names_runs else []), "to lose less")
+    total_m = Counter[str]()
+    for ledger_m in ledgers_m:
+        total_m.update(ledger_m)
+    return [Section("Where every metre went", text, header=header, rows=rows, plots=[draw_waterfall(total_m)])]
 
 
-_ROWS = {
+def find_distinguishing_bits(bits: NDArray[np.integer]) -> int:
+    """Return the quality bits that some labels carry and others do not: a bit of all of them says nothing on a map."""
+    bits = bits.astype(np.int64)
+    return int(np.bitwise_or.reduce(bits, initial=0) & ~np.bitwise_and.reduce(bits)) if len(bits) else 0
+
+
+def make_quality_section(bits: NDArray[np.integer], noun: str) -> Section:
+    """Return how many labels carry each quality bit."""
+    counts = {flag_name(bit).replace("_", " "): int(((bits & int(bit)) != 0).sum()) for bit in Quality}
+    rows = [item for item in counts.items() if item[1]]
+    if not rows:
+        return Section("Quality flags", f"None: all {noun} are clean.")
+    text = "A label may carry several; docs/reference/columns.md says what each means."
+    return Section("Quality flags", text, header=("flag", noun), rows=rows)
+
+
+_BUDGET_ROWS = {
     "position": "position of both ends",
     "rate": "what the current did between two samples",
     "current": "noise and rounding of the current",
@@ -57,10 +86,9 @@ def make_budget_sections(budget: EnergyBudget | None) -> list[Section]:
     """Return the section on the noise floor of E; none where no segment has an energy."""
     if budget is None:
         return []
-    rows = [(text, f"{100 * getattr(budget, name):.2f} %") for name, text in _ROWS.items()]
-    return [
-        Section("How wrong a label may be", format_budget(budget), header=("from", "of E"), rows=rows, figures_from=1)
-    ]
+    rows = [(text, f"{100 * getattr(budget, name):.2f} %") for name, text in _BUDGET_ROWS.items()]
+    title = "How wrong a label may be"
+    return [Section(title, format_budget(budget), header=("from", "of E"), rows=rows, figures_from=1)]
 
 
 _ASIDE = {"grade": "weight over efficiency"}
@@ -104,7 +132,7 @@ def _format_with_std(of: PhysicsTerm) -> str:
     return f"{of.value:.{digits}f} ± {of.std:.{digits}f}"
 
 
-def make_physics_sections(fits: dict[str, PhysicsFit]) -> list[Section]:
+def make_physics_sections(fits: Mapping[str, PhysicsFit]) -> list[Section]:
     """Return a section of the fits by robot; none where there are none."""
     text = " ".join(describe_physics(robot, fit) for robot, fit in fits.items())
     return [Section("What a metre costs: standing, drivetrain, rolling, grade, turning", text)] if fits else []
@@ -113,64 +141,46 @@ def make_physics_sections(fits: dict[str, PhysicsFit]) -> list[Section]:
 _UNITS = {"watt": "W", "mps": "m/s", "s": "s", "joule": "J"}
 
 
-def balance_sections(balance: Balance) -> list[Section]:
-    """Return the sections."""
-    return [_make_class_section(balance), _make_speed_section(balance), _make_repeatability_section(balance)]
-
-
-def _make_class_section(balance: Balance) -> Section:
-    cells = balance.by_class_and_slope
+def make_balance_sections(balance: Balance) -> list[Section]:
+    """Return how samples are spread over class, slope and speed, and how well labels repeat themselves."""
+    by_slope, by_speed = balance.by_class_and_slope, balance.cells
     text = (
         f"Samples, and in brackets how many independent ones they are worth: neighbours are alike ({_format_correlation(balance)}). "
-        f"{sum(cell['rare'] for cell in cells)} of {len(cells)} cells are worth fewer than {balance.enough_effective:g} and marked "
-        "with * and a dashed border; – is ground of the map that nobody drove. drive-next.geojson holds where to drive for them."
+        f"{sum(cell['rare'] for cell in by_slope)} of {len(by_slope)} cells are worth fewer than {balance.enough_effective:g} and "
+        "marked with * and a dashed border; – is ground of the map that nobody drove. drive-next.geojson holds where to drive for them."
     )
-    header, rows = _table(cells, "class", [(cell["class"] or "any",) for cell in cells])
-    return Section("Balance of class and slope", text, header=header, rows=rows)
+    header, rows = _make_cell_table(by_slope, "class", [(cell["class"] or "any",) for cell in by_slope])
+    slope_section = Section("Balance of class and slope", text, header=header, rows=rows)
+    keys = [(cell["class"] or "any", cell["speed_mps"]) for cell in by_speed]
+    header, rows = _make_cell_table(by_speed, "class, speed [m/s]", keys)
+    text = "The same by the velocity that is the label."
+    speed_section = Section("Balance of class, slope and speed", text, header=header, rows=rows, folded=True)
+    return [slope_section, speed_section, _make_repeatability_section(balance)]
 
 
-def _make_speed_section(balance: Balance) -> Section:
-    cells = balance.cells
-    keys = [(cell["class"] or "any", cell["speed_mps"]) for cell in cells]
-    header, rows = _table(cells, "class, speed [m/s]", keys)
-    return Section(
-        "Balance of class, slope and speed",
-        "The same by the velocity that is the label.",
-        header=header,
-        rows=rows,
-        folded=True,
-    )
-
-
-def _table(
+def _make_cell_table(
     cells: Sequence[CellRow], name: str, keys: Sequence[tuple[str, ...]]
 ) -> tuple[list[str], list[list[str | Shaded]]]:
-    """Return header and rows: one row a key, in order of appearance, one column a range of slope."""
-    seen = {cell["slope"] for cell in cells}
-    slopes = [slope for slope in SLOPE_NAMES if slope in seen]
+    """Return header and rows: a row a key, classes as they come and under each its speeds, rising; a column a range of slope."""
+    names = {cell["slope"] for cell in cells}
+    slopes = [slope for slope in SLOPE_NAMES if slope in names]
     most = max((sum(cell["samples"].values()) for cell in cells), default=0)
-    texts = {(key, cell["slope"]): _shaded(cell, most) for key, cell in zip(keys, cells, strict=True)}
-    return [name, *slopes], [
-        [", ".join(key), *(texts.get((key, slope), "") for slope in slopes)] for key in _sort_keys(keys)
-    ]
-
-
-def _sort_keys(keys: Sequence[tuple[str, ...]]) -> list[tuple[str, ...]]:
-    """Return each key once: classes as they come, which is by id, and under each its ranges of speed, rising."""
+    texts = {(key, cell["slope"]): _shade_cell(cell, most) for key, cell in zip(keys, cells, strict=True)}
     classes = list(dict.fromkeys(key[0] for key in keys))
-    return sorted(dict.fromkeys(keys), key=lambda key: (classes.index(key[0]), *map(_lower_end, key[1:])))
+    ordered = sorted(dict.fromkeys(keys), key=lambda key: (classes.index(key[0]), *map(_find_lower_end, key[1:])))
+    return [name, *slopes], [[", ".join(key), *(texts.get((key, slope), "") for slope in slopes)] for key in ordered]
 
 
-def _lower_end(speeds: str) -> tuple[float, bool]:
+def _find_lower_end(speeds: str) -> tuple[float, bool]:
     words = speeds.split()
     return float(words[-1] if words[0] == "above" else words[0]), words[0] == "above"
 
 
-def _shaded(row: CellRow, most: int) -> Shaded:
-    count = sum(row["samples"].values())
-    worth = "" if row["effective"] is None else f" ({row['effective']:.0f})"
-    text = f"{count}{worth}{'*' if row['rare'] else ''}" if count else "–"
-    return Shaded(text, (count / max(most, 1)) ** 0.5, alarm=row["rare"])
+def _shade_cell(cell: CellRow, most: int) -> Shaded:
+    count = sum(cell["samples"].values())
+    worth = "" if cell["effective"] is None else f" ({cell['effective']:.0f})"
+    text = f"{count}{worth}{'*' if cell['rare'] else ''}" if count else "–"
+    return Shaded(text, (count / max(most, 1)) ** 0.5, alarm=cell["rare"])
 
 
 def _format_correlation(balance: Balance) -> str:

@@ -1,7 +1,7 @@
-"""The frame of every page: one self-contained HTML file from plain values, which asks for nothing and can be read without a mouse.
+"""The frame of every page: one self-contained HTML file, which loads nothing and works without a mouse.
 
-Figures are `tcpipe.report.plots.Plot`; BokehJS stands in a page once, and only where there is one. A page's own script is a file
-beside this one that finds its data as ``page.data`` and its figures with ``page.model(name)`` (``page.js``).
+A page with figures (`tcpipe.report.plots.Plot`) contains BokehJS once. A page's own script is a file beside this one, which reads
+``page.data`` and finds figures by ``page.model(name)`` (``page.js``).
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 import html
 import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib.resources import files
 from typing import Any
@@ -19,12 +19,14 @@ from jinja2 import Environment, StrictUndefined
 
 from tcpipe import __version__
 from tcpipe.errors import clean_line
+from tcpipe.formats.finding_lines import MOST_LINES, FindingGroup, format_finding, format_group, format_remedy_blocks
 from tcpipe.formats.json_files import Json
 from tcpipe.report import plots
 from tcpipe.report.plots import Plot
-from tcpipe.report.verdict import VerdictBox
+from tcpipe.tables.catalogue import AFFECTED, Affected, Severity
+from tcpipe.tables.findings import Finding, Grade, Verdict, sort_findings
 
-_UNSEEN = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\xad\u061c\u200b-\u200f\u2028-\u202e\u2060-\u206f\ufeff]")
+_INVISIBLE = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\xad\u061c\u200b-\u200f\u2028-\u202e\u2060-\u206f\ufeff]")
 """Characters that cannot be seen in a page, or turn its text round: a name may hold them."""
 
 _SCRIPTS = "<!-- scripts -->"
@@ -65,6 +67,45 @@ class Shaded:
 
 
 @dataclass(frozen=True, slots=True)
+class ShownFinding:
+    """A finding, or those of one code, as a line, with the recipe that fits in no line below it."""
+
+    severity: Severity
+    text: str
+    recipe: str
+
+
+@dataclass(frozen=True, slots=True)
+class VerdictBox:
+    """What a page shows at its top: ``shown`` in full, ``more`` and ``notes`` folded."""
+
+    grades: tuple[tuple[str, Grade], ...]
+    shown: tuple[ShownFinding, ...]
+    more: tuple[ShownFinding, ...]
+    notes: tuple[ShownFinding, ...]
+
+
+def show_verdict(
+    verdict: Verdict,
+    findings: Iterable[Finding] = (),
+    groups: Iterable[tuple[FindingGroup[Any], int | None, str]] = (),
+    *,
+    labels: Sequence[Affected] = AFFECTED,
+) -> VerdictBox:
+    """Return a verdict: the grades of ``labels``, findings with their remedies, and ``groups`` of one code as `format_group` takes them."""
+    lines = [(of.severity, format_finding(of), [of]) for of in sort_findings(findings)]
+    lines += [(group.severity, format_group(group, total, noun), group.findings) for group, total, noun in groups]
+    shown = [ShownFinding(severity, text, "\n".join(format_remedy_blocks(of))) for severity, text, of in lines]
+    problems = [line for severity in ("error", "warning") for line in shown if line.severity == severity]
+    return VerdictBox(
+        grades=tuple((name, getattr(verdict, name)) for name in labels),
+        shown=tuple(problems[:MOST_LINES]),
+        more=tuple(problems[MOST_LINES:]),
+        notes=tuple(line for line in shown if line.severity == "note"),
+    )
+
+
+@dataclass(frozen=True, slots=True)
 class Section:
     """A heading with a sentence, figures, controls and a table, each optional."""
 
@@ -100,24 +141,15 @@ def render_page(
 
     Parameters
     ----------
-    title, lead, verdict, numbers, warnings
-        What stands at the top, in this order.
-    sections
-        In the order of the page; the table of contents is made of their titles.
-    links
-        Pages that belong to it.
-    script
-        File beside this one that runs when all figures are drawn.
-    data
-        What it is told.
-    reads_pictures
-        Whether it may show pictures that lie beside it; it asks for nothing else, ever.
-
+    title, lead, verdict, numbers, warnings : the top of the page, in this order.
+    sections : in the order of the page; their titles form the table of contents.
+    links : pages that belong to it.
+    script, data : file beside this one that runs when all figures are drawn, and its data.
+    reads_pictures : whether the page may load pictures beside it; it never loads anything else.
     """
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True)
     environment.filters["cell"] = _format_cell
-    every = [plot for section in sections for plot in section.plots]
-    drawn, ids = plots.render_plots(every)
+    figures, ids = plots.render_plots([plot for section in sections for plot in section.plots])
     names = iter(ids)
     page = environment.from_string(_read_file("page.html.j2")).render(
         title=title,
@@ -139,11 +171,11 @@ def render_page(
         style=_read_file("page.css"),
         scripts=_SCRIPTS,
     )
-    seen = _UNSEEN.sub(lambda found: clean_line(found[0]), page)
-    blocks = [_format_json("page-data", _clean_data(data)), _format_json("page-figures", drawn)]
-    code = [plots.make_script()] if every else []
+    visible = _INVISIBLE.sub(lambda match: clean_line(match[0]), page)
+    blocks = [_format_json("page-data", _clean_data(data)), _format_json("page-figures", figures)]
+    code = [plots.read_bokeh_script()] if ids else []
     code += [_read_file("page.js"), *([_read_file(script)] if script else [])]
-    return seen.replace(_SCRIPTS, "\n".join(blocks + [f"<script>\n{part}\n</script>" for part in code]), 1)
+    return visible.replace(_SCRIPTS, "\n".join(blocks + [f"<script>\n{part}\n</script>" for part in code]), 1)
 
 
 def _read_file(name: str) -> str:

@@ -1,4 +1,4 @@
-"""Plots of pages that can be zoomed and asked: the one house of Bokeh.
+"""Interactive plots of pages: the only module that imports Bokeh.
 
 A page makes a plot, calls the glyph methods of ``plot.figure``, and hands it to a section (`tcpipe.report.page.Section`)::
 
@@ -20,7 +20,7 @@ import bokeh
 import numpy as np
 import pyarrow as pa
 from bokeh.document import Document
-from bokeh.models import DataRange1d, FactorRange, HoverTool, Range1d
+from bokeh.models import HoverTool
 from bokeh.models.annotations.geometry import Span
 from bokeh.plotting import figure
 from numpy.typing import NDArray
@@ -55,48 +55,21 @@ def make_plot(
     height_px: int = 300,
     tools: str = "pan,wheel_zoom,box_zoom,reset,save",
     drag: str | None = None,
-    tooltips: Sequence[tuple[str, str]] = (),
-    names: Sequence[str] = (),
-    true_to_scale: bool = False,
-    over_time: bool = False,
-    beside: Plot | None = None,
-    ends: tuple[float, float] | None = None,
     waits: bool = False,
+    **settings: Any,
 ) -> Plot:
     """Return an empty plot as wide as the page.
 
     Parameters
     ----------
-    name
-        Of the figure, one of its kind on a page.
-    alt
-        What it shows, in a sentence.
-    axes
-        What the axes hold, with unit.
-    legend
-        Colours by name; written below the plot, where it has room on a phone.
-    height_px
-        Its height.
-    tools, drag
-        Bokeh's tools, and which one a drag moves at first; none lets a finger scroll the page.
-    tooltips
-        Label and ``@column`` of what hovering shows.
-    names
-        What stands along the vertical axis instead of numbers, from below.
-    true_to_scale
-        A metre is as long across as along.
-    over_time
-        The horizontal axis holds UTC, in milliseconds since 1970.
-    beside
-        A plot whose horizontal axis moves together with this one's.
-    ends
-        Of the horizontal axis; it follows what is drawn without.
-    waits
-        It is drawn when the page answers already.
-
+    name, alt : of the figure, unique on its page; what it shows, in a sentence.
+    axes : quantities of the axes, with unit.
+    legend : colours by name, written below the plot.
+    tools, drag : Bokeh's tools, and which one a drag uses at first; without one a finger scrolls the page.
+    waits : whether it is drawn after the page answers.
+    settings : more of `bokeh.plotting.figure`, as ``tooltips``, ``x_range`` or ``match_aspect``.
     """
-    own = DataRange1d() if ends is None else Range1d(start=ends[0], end=ends[1])
-    drawn = figure(
+    new_figure = figure(
         name=name,
         x_axis_label=axes[0],
         y_axis_label=axes[1],
@@ -109,19 +82,26 @@ def make_plot(
         background_fill_alpha=0.0,
         border_fill_alpha=0.0,
         outline_line_color=None,
-        match_aspect=true_to_scale,
-        x_axis_type="datetime" if over_time else "auto",
-        x_range=own if beside is None else beside.figure.x_range,
-        y_range=FactorRange(factors=list(names)) if names else DataRange1d(),
+        **settings,
     )
-    drawn.toolbar.logo = None
-    drawn.axis.axis_label_text_font_style = "normal"
-    drawn.axis.axis_label_text_font_size = "13px"
-    drawn.axis.major_label_text_font_size = "12px"
-    drawn.axis.minor_tick_line_color = None
-    if tooltips:
-        drawn.add_tools(HoverTool(tooltips=list(tooltips)))
-    return Plot(drawn, alt, legend or {}, waits)
+    new_figure.toolbar.logo = None
+    new_figure.axis.axis_label_text_font_style = "normal"
+    new_figure.axis.axis_label_text_font_size = "13px"
+    new_figure.axis.major_label_text_font_size = "12px"
+    new_figure.axis.minor_tick_line_color = None
+    return Plot(new_figure, alt, legend or {}, waits)
+
+
+def make_map_plot(
+    *, alt: str, axes: tuple[str, str], height_px: float, tools: str = "pan,wheel_zoom,box_zoom,reset,save"
+) -> Plot:
+    """Return an empty map, true to scale, of a height between 330 and 600 pixels."""
+    height = int(np.clip(height_px, 330, 600))
+    plot = make_plot("map", alt=alt, axes=axes, height_px=height, tools=tools, drag="pan", match_aspect=True)
+    plot.figure.xgrid.visible = plot.figure.ygrid.visible = False
+    plot.figure.axis.formatter.use_scientific = False
+    plot.figure.axis.ticker.desired_num_ticks = 4
+    return plot
 
 
 def lay_picture(plot: Plot, name: str, uri: str, bounds_m: tuple[float, float, float, float], *, visible: bool) -> None:
@@ -146,9 +126,9 @@ def add_cursor(plot: Plot) -> None:
     plot.figure.add_layout(Span(dimension="height", location=np.nan, line_color=CURSOR, line_width=1.5, name=name))
 
 
-def say_of(plot: Plot, drawn: Any) -> None:
-    """Show the column ``text`` of what was drawn where the mouse is on it."""
-    plot.figure.add_tools(HoverTool(renderers=[drawn], tooltips=[("", "@text")]))
+def show_text(plot: Plot, renderer: Any) -> None:
+    """Show the column ``text`` of a renderer where the mouse is on it."""
+    plot.figure.add_tools(HoverTool(renderers=[renderer], tooltips=[("", "@text")]))
 
 
 def draw_waterfall(ledger_m: Mapping[str, float]) -> Plot:
@@ -164,7 +144,7 @@ def draw_waterfall(ledger_m: Mapping[str, float]) -> Plot:
         axes=("metres", ""),
         height_px=90 + 26 * len(names),
         tools="save",
-        names=names[::-1],
+        y_range=names[::-1],
         tooltips=[("", "@name"), ("metres", "@metres{0.0}"), ("share", "@share{0.0} %")],
         waits=True,
     )
@@ -213,8 +193,8 @@ def label_histograms(rows: pa.Table, of_what: str, *, prefix: str = "") -> list[
     ]
 
 
-def make_script() -> str:
-    """Return BokehJS: what a page needs of it."""
+def read_bokeh_script() -> str:
+    """Return the part of BokehJS that a page needs."""
     return (Path(bokeh.__file__).parent / "server/static/js/bokeh.min.js").read_text(encoding="utf-8")
 
 

@@ -1,21 +1,230 @@
-"""A run over time: one axis of seconds under every plot, one cursor through all, what is not used shaded. The page's script fills them."""
+"""A run over time: one axis of seconds and one cursor for all plots. The page's script fills them with the series of this module."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
 import numpy as np
 import pyarrow as pa
+from numpy.typing import NDArray
 
 from tcpipe.formats.json_files import Json
+from tcpipe.geometry.datum import enu_from_geodetic
 from tcpipe.report.colours import DROPPED, KEPT, LINE_COLOURS, REASON_COLOURS
-from tcpipe.report.plots import Plot, add_cursor, make_plot, say_of
-from tcpipe.report.run_series import Floats, Series, Spans, Timeline, downsample_columns
+from tcpipe.report.column_packing import Column, make_shown_column, pack_columns
+from tcpipe.report.plots import Plot, add_cursor, make_plot, show_text
 from tcpipe.tables.arrays import to_texts
 from tcpipe.tables.bits import DropReason, flag_name
 from tcpipe.tables.columns import to_floats, to_integers
 from tcpipe.tables.facts import StageFacts
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+MOST_VALUES = 80_000
+"""Of a series; longer ones are thinned."""
+
+_GAP_PERIODS = 10
+"""A line is not drawn over so many periods without a value."""
+
+_BETWEEN_EPOCHS_S = 1.0
+
+_TRACK_COLUMNS = {
+    "power": "power_watt",
+    "speed": "forward_velocity_mps",
+    "wheels": "wheel_velocity_mps",
+    "commanded": "commanded_velocity_mps",
+    "height": "z_m",
+    "height_std": "z_std_m",
+    "chord_std": "displacement_std_1s_m",
+}
+_TRACK_DIGITS = {"power": 1, "chord_std": 4}
+"""Decimals that the page shows, where these are not 3."""
+
+
+@dataclass(frozen=True, slots=True)
+class Epoch:
+    """A clock epoch of the track: its stamps, and where it begins on the page's axis."""
+
+    number: int
+    first_ns: int
+    last_ns: int
+    start_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class Timeline:
+    """The page's axis: seconds since the track began; after a step of the clock the next epoch follows a second later."""
+
+    epochs: tuple[Epoch, ...]
+
+    @property
+    def end_s(self) -> float:
+        """Where the track ends."""
+        last = self.epochs[-1]
+        return last.start_s + (last.last_ns - last.first_ns) * 1e-9
+
+    def seconds(self, stamp_ns: Ints, epoch: Ints | None = None) -> Floats:
+        """Return where stamps lie [s], shape (N,), NaN of an epoch that the track lacks; without epochs the first that holds a stamp."""
+        t_s = np.full(len(stamp_ns), np.nan)
+        for part in self.epochs:
+            within = np.isnan(t_s) & (stamp_ns >= part.first_ns) & (stamp_ns <= part.last_ns)
+            rows = within if epoch is None else epoch == part.number
+            t_s[rows] = part.start_s + (stamp_ns[rows] - part.first_ns) * 1e-9
+        return t_s
+
+
+def make_timeline(track: pa.Table) -> Timeline:
+    """Return the axis of a track that has rows."""
+    stamps, epochs = to_integers(track, "stamp_ns"), to_integers(track, "epoch")
+    found: list[Epoch] = []
+    start_s = 0.0
+    for number in dict.fromkeys(epochs.tolist()):
+        mine = stamps[epochs == number]
+        found.append(Epoch(number, int(mine.min()), int(mine.max()), start_s))
+        start_s += (found[-1].last_ns - found[-1].first_ns) * 1e-9 + _BETWEEN_EPOCHS_S
+    return Timeline(tuple(found))
+
+
+@dataclass(frozen=True, slots=True)
+class Series:
+    """Columns that share their times, and how many values stand for how many."""
+
+    name: str
+    t_s: Floats
+    columns: Mapping[str, Column]
+    gap_s: float
+    value_count: int
+    """Before thinning."""
+
+    def to_json(self) -> Json:
+        """Return the series as the page's script reads it."""
+        times: dict[str, Column] = {"t": ("f32", self.t_s)}
+        return {"packed": pack_columns(times | dict(self.columns)), "gap_s": self.gap_s}
+
+
+def downsample_columns(
+    name: str,
+    t_s: Floats,
+    values: Mapping[str, tuple[int, Floats]],
+    *,
+    sampled: Mapping[str, Column] | None = None,
+    most: int = MOST_VALUES,
+) -> Series:
+    """Return columns with their decimals by name; of more than ``most`` values the lowest and highest of every bin stay.
+
+    The two keep their order; their times are the bin's beginning and middle. Columns that are ``sampled`` keep the values there.
+    """
+    count = len(t_s)
+    per_bin = -(-2 * count // most) if count > most else 1
+    rows = np.arange(count)
+    if per_bin > 1:
+        begin = np.arange(0, count, per_bin)
+        rows = np.stack([begin, np.minimum(begin + per_bin // 2, count - 1)], axis=1).ravel()
+    kept = {key: make_shown_column(digits, _find_extremes(part, per_bin)) for key, (digits, part) in values.items()}
+    kept |= {key: (kind, part[rows]) for key, (kind, part) in (sampled or {}).items()}
+    period_s = float(np.median(np.diff(t_s))) if count > 1 else 1.0
+    return Series(name, t_s[rows], kept, max(_GAP_PERIODS * period_s, per_bin * period_s * 2.0, 0.3), count)
+
+
+def _find_extremes(values: Floats, per_bin: int) -> Floats:
+    """Return the lowest and the highest of every bin in the order they occur; NaN where it holds none."""
+    if per_bin == 1:
+        return values
+    bins = np.append(values, np.full(-len(values) % per_bin, np.nan)).reshape(-1, per_bin)
+    known = np.isfinite(bins)
+    ends = np.stack(
+        [np.where(known, bins, np.inf).argmin(axis=1), np.where(known, bins, -np.inf).argmax(axis=1)], axis=1
+    )
+    return np.take_along_axis(bins, np.sort(ends, axis=1), axis=1).ravel()
+
+
+def make_track_series(track: pa.Table, timeline: Timeline, xy_m: Floats) -> Series:
+    """Return the fused track with its places in the plane of the map (N, 2); columns without a value are left out."""
+    values = {name: to_floats(track, column) for name, column in _TRACK_COLUMNS.items()}
+    values["position_std"] = np.hypot(to_floats(track, "x_std_m"), to_floats(track, "y_std_m"))
+    columns = {name: (_TRACK_DIGITS.get(name, 3), part) for name, part in values.items() if np.isfinite(part).any()}
+    places: dict[str, Column] = {axis: ("steps", xy_m[:, number]) for number, axis in enumerate("xy")}
+    return downsample_columns("track", _compute_seconds(track, timeline), columns, sampled=places)
+
+
+def make_rail_series(power: pa.Table, timeline: Timeline) -> Iterator[Series]:
+    """Yield voltage and current of each rail as they were told."""
+    rails = to_texts(power.column("rail"))
+    for rail in dict.fromkeys(rails.tolist()):
+        mine = power.filter(pa.array(rails == rail))
+        for name, column, digits in (("voltage", "voltage_volt", 2), ("current", "current_amp", 3)):
+            values, t_s = to_floats(mine, column), _compute_seconds(mine, timeline)
+            known = np.isfinite(values) & np.isfinite(t_s)
+            if known.any():
+                columns = {name: (digits, values[known])}
+                yield downsample_columns(f"{name} {rail}", t_s[known], columns, most=MOST_VALUES // 2)
+
+
+def _compute_seconds(table: pa.Table, timeline: Timeline) -> Floats:
+    return timeline.seconds(to_integers(table, "stamp_ns"), to_integers(table, "epoch"))
+
+
+def make_speed_series(role: str, table: pa.Table, timeline: Timeline) -> Series | None:
+    """Return what a sensor says of the speed [m/s]: its own, else chords over a second of its places; None without either."""
+    t_s = _compute_seconds(table, timeline)
+    table, t_s = table.filter(pa.array(np.isfinite(t_s))), t_s[np.isfinite(t_s)]
+    speed = _read_speed(table)
+    if not np.isfinite(speed).any():
+        t_s, speed = _compute_chord_speed(table, t_s)
+    known = np.isfinite(speed)
+    if not known.any():
+        return None
+    return downsample_columns(role, t_s[known], {"speed": (3, speed[known])}, most=MOST_VALUES // 2)
+
+
+def _read_speed(table: pa.Table) -> Floats:
+    if "east_velocity_mps" in table.column_names:
+        return np.hypot(to_floats(table, "east_velocity_mps"), to_floats(table, "north_velocity_mps"))
+    if "velocity_x_mps" in table.column_names:
+        return to_floats(table, "velocity_x_mps")
+    return np.full(table.num_rows, np.nan)
+
+
+def _compute_chord_speed(table: pa.Table, t_s: Floats) -> tuple[Floats, Floats]:
+    """Return times in the middle of a second, and how fast the place moved over it [m/s]."""
+    if "x_m" in table.column_names:
+        xy_m = np.column_stack([to_floats(table, "x_m"), to_floats(table, "y_m")])
+    else:
+        lon, lat, alt = (to_floats(table, name) for name in ("lon_deg", "lat_deg", "alt_m"))
+        first = (float(lon[0]), float(lat[0]), float(alt[0])) if len(lon) else (0.0, 0.0, 0.0)
+        xy_m = enu_from_geodetic(lon, lat, alt, datum_deg_m=first)[:, :2]
+    known = np.isfinite(xy_m).all(axis=1)
+    xy_m, t_s = xy_m[known], t_s[known]
+    rows = np.unique(np.searchsorted(t_s, np.arange(t_s[0], t_s[-1], 1.0))) if len(t_s) else np.arange(0)
+    apart_s = np.diff(t_s[rows])
+    near = (apart_s > 0.5) & (apart_s < 2.0)
+    chord_m = np.hypot(*np.diff(xy_m[rows], axis=0).T)
+    return (t_s[rows][:-1] + apart_s / 2)[near], chord_m[near] / apart_s[near]
+
+
+@dataclass(frozen=True, slots=True)
+class Spans:
+    """Stretches of the track whose rows are dropped for the same reasons: beginning, end [s] and bits, shape (M,) each."""
+
+    start_s: Floats
+    end_s: Floats
+    bits: Ints
+
+    def to_json(self) -> Json:
+        """Return the spans as the page's script reads them."""
+        return pack_columns({"start": ("f32", self.start_s), "end": ("f32", self.end_s), "bits": ("u16", self.bits)})
+
+
+def find_mask_spans(track: pa.Table, timeline: Timeline, rate_hz: float) -> Spans:
+    """Return the stretches, kept ones (bits 0) too; a row lasts a period of the track, and where rows are missing no stretch is."""
+    t_s, bits = _compute_seconds(track, timeline), to_integers(track, "dropped_by")
+    period_s = 1.0 / rate_hz
+    begin = np.flatnonzero(np.r_[True, (np.diff(bits) != 0) | (np.diff(t_s) > 1.5 * period_s)])
+    last = np.r_[begin[1:], len(t_s)] - 1
+    return Spans(t_s[begin] - period_s / 2, t_s[last] + period_s / 2, bits[begin])
+
 
 REASON_WORDS = {
     DropReason.GAP: "no usable motion or power here: a gap of a sensor, a jump, or a position that is too uncertain",
@@ -48,14 +257,8 @@ class Line:
     series: str
     column: str
 
-    def told(self, colour: str) -> Json:
-        """Return it as the page's script reads it."""
-        return {
-            "plot": self.plot, "name": self.name, "series": self.series, "column": self.column, "colour": colour, "unit": _UNITS[self.plot],
-        }  # fmt: skip
 
-
-_OF_TRACK = (
+_TRACK_LINES = (
     Line("power", "", "track", "power"),
     Line("speed", "fused", "track", "speed"),
     Line("speed", "wheels", "track", "wheels"),
@@ -69,45 +272,44 @@ _OF_TRACK = (
 
 def make_lines(series: Sequence[Series]) -> list[Line]:
     """Return what can be drawn, in the order of the page."""
-    there = {(each.name, column) for each in series for column in each.columns}
-    lines = [line for line in _OF_TRACK if (line.series, line.column) in there]
-    for each in series:
-        kind, _, rail = each.name.partition(" ")
+    columns = {(part.name, column) for part in series for column in part.columns}
+    lines = [line for line in _TRACK_LINES if (line.series, line.column) in columns]
+    for part in series:
+        kind, _, rail = part.name.partition(" ")
         if kind in {"voltage", "current"}:
-            lines.append(Line(kind, rail, each.name, kind))
-        elif each.name in _SPEEDS:
-            lines.append(Line("speed", _SPEEDS[each.name], each.name, "speed"))
+            lines.append(Line(kind, rail, part.name, kind))
+        elif part.name in _SPEEDS:
+            lines.append(Line("speed", _SPEEDS[part.name], part.name, "speed"))
     return sorted(lines, key=lambda line: list(_UNITS).index(line.plot))
 
 
-@dataclass(frozen=True, slots=True)
-class TimePlots:
-    """The plots, one below the other, and the lines as the page's script reads them."""
-
-    plots: tuple[Plot, ...]
-    lines: tuple[Json, ...]
-
-
 def time_plots(
-    timeline: Timeline, *, lines: Sequence[Line], spans: Spans, facts: StageFacts, refused: pa.Table, labels: bool
-) -> TimePlots:
-    """Return the plots; ``labels`` is whether the run has segments."""
+    timeline: Timeline,
+    *,
+    lines: Sequence[Line],
+    spans: Spans,
+    facts: StageFacts,
+    rejections: pa.Table,
+    has_labels: bool,
+) -> tuple[list[Plot], list[Json]]:
+    """Return the plots, one below the other, and the lines as the page's script reads them."""
     first = _draw_masks(timeline, spans, facts)
     plots = [first]
-    told: list[Json] = []
+    lines_json: list[Json] = []
     for name in dict.fromkeys(line.plot for line in lines):
-        mine = [line for line in lines if line.plot == name]
-        coloured = {line: LINE_COLOURS[number % len(LINE_COLOURS)] for number, line in enumerate(mine)}
-        legend = {line.name: colour for line, colour in coloured.items()} if len(mine) > 1 else {}
+        colours = _choose_colours([line.name for line in lines if line.plot == name])
+        legend = colours if len(colours) > 1 else {}
         plot = _draw_panel(name, f"{name} [{_UNITS[name]}]", first, legend=legend)
-        at = [f"line {len(told) + number}" for number in range(len(mine))]
-        for place, colour in reversed(list(zip(at, coloured.values(), strict=True))):  # the first lies on top
+        places = [f"line {len(lines_json) + number}" for number in range(len(colours))]
+        for place, colour in reversed(list(zip(places, colours.values(), strict=True))):  # the first lies on top
             ends = {"t": [0.0, 1.0], "y": [0.0, 1.0]}  # until the page's script has unpacked the series
             plot.figure.line("t", "y", color=colour, line_width=1.3, source=ends, name=place)
-        told += [line.told(colour) for line, colour in coloured.items()]
+        lines_json += [
+            asdict(line) | {"colour": colours[line.name], "unit": _UNITS[name]} for line in lines if line.plot == name
+        ]
         plots.append(plot)
-    plots += [*_draw_rejections(timeline, first, refused), *_draw_clocks(timeline, first, facts)]
-    if labels:
+    plots += [*_draw_rejections(timeline, first, rejections), *_draw_clocks(timeline, first, facts)]
+    if has_labels:
         plots.append(_draw_labels(first))
     for plot in plots[1:-1]:
         plot.figure.xaxis.visible = False
@@ -119,16 +321,17 @@ def time_plots(
         figure.min_border_left = 112
         figure.min_border_right = 12
         shade = {"x0": [0.0], "x1": [0.0], "colour": [KEPT]}
-        figure.vstrip(
-            "x0", "x1", color="colour", alpha=0.13, source=shade, level="underlay", name=f"shade {figure.name}"
-        )
+        name = f"shade {figure.name}"
+        figure.vstrip("x0", "x1", color="colour", alpha=0.13, source=shade, level="underlay", name=name)
         add_cursor(plot)
-    return TimePlots(tuple(plots), tuple(told))
+    return plots, lines_json
 
 
-def _draw_panel(
-    name: str, label: str, first: Plot | None, *, legend: Mapping[str, str] | None = None, alt: str = ""
-) -> Plot:
+def _choose_colours(names: Sequence[str]) -> dict[str, str]:
+    return {name: LINE_COLOURS[number % len(LINE_COLOURS)] for number, name in enumerate(names)}
+
+
+def _draw_panel(name: str, label: str, first: Plot, *, legend: Mapping[str, str] | None = None, alt: str = "") -> Plot:
     plot = make_plot(
         name,
         alt=alt or f"{label} over time; zoom and cursor are those of all plots here.",
@@ -136,7 +339,7 @@ def _draw_panel(
         legend=legend,
         height_px=130,
         tools="xbox_zoom",
-        beside=first,
+        x_range=first.figure.x_range,
         waits=True,
     )
     plot.figure.yaxis.ticker.desired_num_ticks = 4
@@ -154,63 +357,49 @@ def _draw_masks(timeline: Timeline, spans: Spans, facts: StageFacts) -> Plot:
         axes=("", ""),
         height_px=40 + 22 * len(rows),
         tools="xbox_zoom",
-        names=rows[::-1],
-        ends=(0.0, max(timeline.end_s, 1.0)),
+        y_range=rows[::-1],
+        x_range=(0.0, max(timeline.end_s, 1.0)),
     )
     figure = plot.figure
     bars = {"left": [0.0], "right": [1.0], "row": ["kept"], "colour": [KEPT]}
     figure.hbar(y="row", left="left", right="right", height=0.75, color="colour", source=bars, name="gates bars")
     if found:
-        events = figure.hbar(
-            y="row",
-            left="left",
-            right="right",
-            height=0.75,
-            color=DROPPED,
-            source=dict(zip(("row", "left", "right", "text"), zip(*found, strict=True), strict=True)),
-        )
-        say_of(plot, events)
+        source = dict(zip(("row", "left", "right", "text"), zip(*found, strict=True), strict=True))
+        show_text(plot, figure.hbar(y="row", left="left", right="right", height=0.75, color=DROPPED, source=source))
     figure.ygrid.visible = False
     return plot
 
 
 def _iterate_events(timeline: Timeline, facts: StageFacts) -> Iterator[tuple[str, float, float, str]]:
-    """Yield what has a time: its row, beginning and end [s], and what is to be said."""
-    for each in facts.audit.disagreements if facts.audit else ():
-        role = each.sensor.replace("_", " ")
-        start_s, end_s = timeline.seconds(np.array([each.start_ns, each.end_ns]), np.full(2, each.epoch))
-        said = f"{role}: {each.what} off by {each.size:.2g} {each.unit}, {each.expected_std:.2g} expected"
-        if np.isfinite(start_s):
-            yield f"{role} disagrees", float(start_s), float(end_s), said
+    """Yield what has a time: its row, beginning and end [s], and its text."""
+    events = []
+    for part in facts.audit.disagreements if facts.audit else ():
+        role = part.sensor.replace("_", " ")
+        text = f"{role}: {part.what} off by {part.size:.2g} {part.unit}, {part.expected_std:.2g} expected"
+        events.append((f"{role} disagrees", part.start_ns, part.end_ns, part.epoch, text))
     for stretch in facts.fuse.stretches if facts.fuse else ():
         for opened in stretch.reopenings:
             role = opened.role.replace("_", " ")
-            start_s, end_s = timeline.seconds(np.array([opened.start_ns, opened.end_ns]), np.full(2, stretch.epoch))
-            if np.isfinite(start_s):
-                yield (
-                    f"{role} shut out",
-                    float(start_s),
-                    float(end_s),
-                    f"{role} was refused all this time, and off by {opened.size:.2g}",
-                )
-    for number, epoch in enumerate(timeline.epochs[1:]):
+            text = f"{role} was refused all this time, and off by {opened.size:.2g}"
+            events.append((f"{role} shut out", opened.start_ns, opened.end_ns, stretch.epoch, text))
+    for row, start_ns, end_ns, epoch, text in events:
+        start_s, end_s = timeline.seconds(np.array([start_ns, end_ns]), np.full(2, epoch)).tolist()
+        if np.isfinite(start_s):
+            yield row, start_s, end_s, text
+    for number, later in enumerate(timeline.epochs[1:]):
         steps = facts.clock_steps[number : number + 1]
-        yield (
-            "clock step",
-            epoch.start_s - 1.0,
-            epoch.start_s,
-            f"the clock steps by {steps[0].step_s:+.3f} s" if steps else "the clock steps",
-        )
+        text = f"the clock steps by {steps[0].step_s:+.3f} s" if steps else "the clock steps"
+        yield "clock step", later.start_s - 1.0, later.start_s, text
 
 
-def _draw_rejections(timeline: Timeline, first: Plot, refused: pa.Table) -> Iterator[Plot]:
-    """Yield how far off refused measurements are; those without a χ² stand at 1."""
-    if not refused.num_rows:
+def _draw_rejections(timeline: Timeline, first: Plot, rejections: pa.Table) -> Iterator[Plot]:
+    """Yield how far off rejected measurements are; those without a χ² stand at 1."""
+    if not rejections.num_rows:
         return
-    roles, t_s = to_texts(refused.column("role")), timeline.seconds(to_integers(refused, "stamp_ns"))
-    ratio = to_floats(refused, "normalized_innovation_squared") / to_floats(refused, "threshold")
-    names = sorted(set(roles.tolist()))
-    colours = {role: LINE_COLOURS[number % len(LINE_COLOURS)] for number, role in enumerate(names)}
+    roles, t_s = to_texts(rejections.column("role")), timeline.seconds(to_integers(rejections, "stamp_ns"))
+    ratio = to_floats(rejections, "normalized_innovation_squared") / to_floats(rejections, "threshold")
+    times_allowed = np.sqrt(np.where(np.isfinite(ratio), ratio, 1.0))
+    colours = _choose_colours(sorted(set(roles.tolist())))
     plot = _draw_panel(
         "refused",
         "√(χ²/gate)",
@@ -219,38 +408,32 @@ def _draw_rejections(timeline: Timeline, first: Plot, refused: pa.Table) -> Iter
         alt="Measurements that the filter refused: how many times as far off as its gate allows. The table below counts them.",
     )
     for role, colour in colours.items():
-        mine = (roles == role) & np.isfinite(t_s)
-        if mine.any():
-            shown = downsample_columns(role, t_s[mine], {"y": (6, _compute_allowed(ratio[mine]))}, most=_MOST_REFUSED)
-            plot.figure.scatter(
-                shown.t_s.astype(np.float32), shown.columns["y"][1].astype(np.float32), size=5, color=colour, alpha=0.7
-            )
+        rows = (roles == role) & np.isfinite(t_s)
+        if rows.any():
+            shown = downsample_columns(role, t_s[rows], {"y": (6, times_allowed[rows])}, most=_MOST_REFUSED)
+            x, y = shown.t_s.astype(np.float32), shown.columns["y"][1].astype(np.float32)
+            plot.figure.scatter(x, y, size=5, color=colour, alpha=0.7)
     plot.figure.y_range.start = 0
     yield plot
 
 
-def _compute_allowed(ratio: Floats) -> Floats:
-    return np.sqrt(np.where(np.isfinite(ratio), ratio, 1.0))
-
-
 def _draw_clocks(timeline: Timeline, first: Plot, facts: StageFacts) -> Iterator[Plot]:
     """Yield how late sensors' stamps are over the run, pair by pair, where that is determined."""
-    found = facts.clock_offsets
-    start_s = {each.number: each.start_s for each in timeline.epochs}
-    if found is None or found.epoch not in start_s:
+    offsets = facts.clock_offsets
+    start_s = {epoch.number: epoch.start_s for epoch in timeline.epochs}
+    if offsets is None or offsets.epoch not in start_s:
         return
-    pairs = [pair for pair in found.pairs if pair.determined and pair.windows]
-    names = [f"{pair.late} against {pair.against} by {pair.by}".replace("_", " ") for pair in pairs]
-    colours = {name: LINE_COLOURS[number % len(LINE_COLOURS)] for number, name in enumerate(names)}
+    pairs = [pair for pair in offsets.pairs if pair.determined and pair.windows]
     if not pairs:
         return
+    names = [f"{pair.late} against {pair.against} by {pair.by}".replace("_", " ") for pair in pairs]
+    colours = _choose_colours(names)
     plot = _draw_panel("clocks", "late by [ms], ± σ", first, legend=colours)
     for pair, name in zip(pairs, names, strict=True):
         at_s, offset_s, std_s = np.array(pair.windows).T
-        at_s = at_s + start_s[found.epoch]
-        plot.figure.segment(
-            at_s, 1e3 * (offset_s - std_s), at_s, 1e3 * (offset_s + std_s), color=colours[name], line_width=2
-        )
+        at_s = at_s + start_s[offsets.epoch]
+        low_ms, high_ms = 1e3 * (offset_s - std_s), 1e3 * (offset_s + std_s)
+        plot.figure.segment(at_s, low_ms, at_s, high_ms, color=colours[name], line_width=2)
         plot.figure.scatter(at_s, 1e3 * offset_s, size=6, color=colours[name])
     yield plot
 

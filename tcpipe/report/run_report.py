@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, MutableMapping, Sequence
-from dataclasses import dataclass, replace
+from collections import Counter
+from collections.abc import Iterator, MutableMapping, Sequence
+from dataclasses import replace
 from pathlib import PurePosixPath
 
 import numpy as np
@@ -11,41 +12,45 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from tcpipe.errors import StoreError, TableError
-from tcpipe.formats.finding_lines import advise_on_loss
+from tcpipe.formats.finding_lines import describe_remedy
 from tcpipe.formats.json_files import Json
 from tcpipe.formats.parquet import read_table
-from tcpipe.formats.run_documents import Manifest, RunJson
+from tcpipe.formats.run_documents import Counts, Manifest, RunJson
 from tcpipe.formats.stored_runs import RunDirectory
-from tcpipe.motion.remedies import find_largest_losses
 from tcpipe.report.colours import DOUBTED, FAINT, KEPT, UNUSED
 from tcpipe.report.column_packing import Column, make_shown_column, pack_columns
 from tcpipe.report.label_sections import (
     QUALITY_WORDS,
+    find_distinguishing_bits,
     make_budget_sections,
+    make_losses_sections,
     make_physics_sections,
-    make_quality_sections,
+    make_quality_section,
 )
-from tcpipe.report.page import Link, Number, Section, render_page
-from tcpipe.report.plots import Plot, draw_histogram, draw_waterfall, label_histograms, make_plot
-from tcpipe.report.run_map import Pictures, RunMap, run_map
-from tcpipe.report.run_plots import SPEED_ROLES, Line, make_lines, make_reasons_data, time_plots
-from tcpipe.report.run_sensors import make_sensor_sections
-from tcpipe.report.run_series import (
+from tcpipe.report.maps import Pictures, RunMap, draw_run_map
+from tcpipe.report.page import Link, Number, Section, render_page, show_verdict
+from tcpipe.report.plots import Plot, draw_histogram, label_histograms, make_plot
+from tcpipe.report.run_plots import (
+    SPEED_ROLES,
+    Line,
     Series,
     Timeline,
     find_mask_spans,
+    make_lines,
     make_rail_series,
+    make_reasons_data,
     make_speed_series,
     make_timeline,
-    track_series,
+    make_track_series,
+    time_plots,
 )
-from tcpipe.report.verdict import show_verdict
 from tcpipe.store import Store
-from tcpipe.tables.bits import Quality, flag_name
 from tcpipe.tables.columns import to_floats, to_integers
-from tcpipe.tables.facts import PhysicsFacts
+from tcpipe.tables.facts import ClockOffset, PhysicsFacts, StageFacts
+from tcpipe.tables.findings import Finding, select_findings
 
 _PAGE = "report.html"
+_DAMAGE = "Where messages are lost or may be."
 _STEP_M = 0.05
 """Places of the track that are nearer are one on the map."""
 
@@ -57,29 +62,30 @@ _LABELS = {
 }
 
 
-@dataclass(frozen=True, slots=True)
-class _Drawn:
-    """The interactive part of the page."""
-
-    sections: tuple[Section, ...] = ()
-    data: Json = None
-
-
-def run_report(store: Store, run: RunDirectory, of_maps: MutableMapping[str, Pictures] | None = None) -> str:
+def run_report(store: Store, run: RunDirectory, pictures_by_map: MutableMapping[str, Pictures] | None = None) -> str:
     """Return the HTML page of a run of the store; a map of the store that lies under the run is its background.
 
-    ``of_maps`` keeps pictures of maps by name, for who writes the pages of many runs.
+    ``pictures_by_map`` keeps pictures of maps for the pages of further runs.
     """
-    track, segments, manifest, refused = run.track().table, run.segments(), run.manifest, run.rejections()
+    track, segments, manifest, rejections = run.track().table, run.segments(), run.manifest, run.rejections()
     label = manifest.info.report.facts.label
-    known = store.run_json(run.run_id)
+    run_json = store.run_json(run.run_id)
     ledger, total = manifest.ledger_m, sum(manifest.ledger_m.values())
-    bits = to_integers(segments, "quality")
-    quality = {flag_name(bit): int(((bits & int(bit)) != 0).sum()) for bit in Quality}
-    drawn = _draw_run(store, run, track, segments, refused=refused, of_maps={} if of_maps is None else of_maps)
+    drive, data = _draw_run(
+        store,
+        run,
+        track,
+        segments,
+        rejections=rejections,
+        pictures_by_map={} if pictures_by_map is None else pictures_by_map,
+    )
+    source = "source unknown"
+    if run_json is not None:
+        source = f"from {', '.join(run_json.source.paths)} ({run_json.source.size_bytes / 1e6:.1f} MB)"
+    damage = [(line,) for line in manifest.damage]
     return render_page(
         title=f"Run {run.run_id}",
-        lead=f"Robot {manifest.robot}, recipe {run.recipe_id}, {_format_source(known)}",
+        lead=f"Robot {manifest.robot}, recipe {run.recipe_id}, {source}",
         verdict=show_verdict(manifest.verdict, manifest.info.report.findings),
         numbers=[
             Number(f"{total:.0f} m", "driven"),
@@ -90,41 +96,18 @@ def run_report(store: Store, run: RunDirectory, of_maps: MutableMapping[str, Pic
         ],
         links=[Link("All runs of the store", f"../../../{_PAGE}")] if store.place.size(_PAGE) is not None else [],
         sections=[
-            *drawn.sections,
-            _make_losses_section(ledger),
-            *_label_sections(segments, label.physics if label else None, manifest.robot),
-            *(make_quality_sections(quality, "segments") if segments.num_rows else []),
+            *drive,
+            *make_losses_sections([ledger], "Kept and dropped distances add up to the odometer.", names_runs=False),
+            *_make_label_sections(segments, label.physics if label else None, manifest.robot),
+            *([make_quality_section(to_integers(segments, "quality"), "segments")] if segments.num_rows else []),
             *make_budget_sections(run.facts.energy_budget),
-            *make_sensor_sections(known, manifest, refused),
-            *_make_damage_sections(manifest.damage),
-            _make_provenance_section(run, manifest, known),
+            *make_sensor_sections(run_json, manifest, rejections),
+            *([Section("Damage of the log", _DAMAGE, header=("what",), rows=damage, folded=True)] if damage else []),
+            _make_provenance_section(run, manifest, run_json),
         ],
-        script="run.js" if drawn.data is not None else "",
-        data=drawn.data,
+        script="run.js" if data is not None else "",
+        data=data,
     )
-
-
-def _make_losses_section(ledger_m: Mapping[str, float]) -> Section:
-    """Return where the distance went, and how to lose less of it."""
-    rows = [
-        (loss.reason.replace("_", " "), f"{loss.metres:.1f}", f"{100 * loss.share:.1f} %", advise_on_loss(loss.reason))
-        for loss in find_largest_losses([ledger_m])
-    ]
-    text = "Kept and dropped distances add up to the odometer."
-    header = ("lost to", "metres", "of all", "to lose less")
-    return Section("Where every metre went", text, header=header, rows=rows, plots=[draw_waterfall(ledger_m)])
-
-
-def _make_damage_sections(lines: Sequence[str]) -> list[Section]:
-    rows = [(line,) for line in lines]
-    text = "Where messages are lost or may be."
-    return [Section("Damage of the log", text, header=("what",), rows=rows, folded=True)] if rows else []
-
-
-def _format_source(known: RunJson | None) -> str:
-    if known is None:
-        return "source unknown"
-    return f"from {', '.join(known.source.paths)} ({known.source.size_bytes / 1e6:.1f} MB)"
 
 
 def _mean(segments: pa.Table, name: str, unit: str, *, digits: int = 0) -> str:
@@ -138,63 +121,66 @@ def _draw_run(
     track: pa.Table,
     segments: pa.Table,
     *,
-    refused: pa.Table,
-    of_maps: MutableMapping[str, Pictures],
-) -> _Drawn:
-    """Return map and plots over time with what their script needs; what cannot be drawn is said."""
+    rejections: pa.Table,
+    pictures_by_map: MutableMapping[str, Pictures],
+) -> tuple[list[Section], Json]:
+    """Return map and plots over time, and the data of their script; None of a run without a track."""
     if not track.num_rows:
-        return _Drawn((Section("The drive", "No track: the log holds nothing that could be fused."),))
+        return [Section("The drive", "No track: the log holds nothing that could be fused.")], None
     info = run.manifest.info
     timeline = make_timeline(track)
-    ground = run_map(store, run, track, segments, located=info.datum is not None, of_maps=of_maps)
-    told, lost = _read_series(store, run, timeline)
-    series = [track_series(track, timeline, ground.track_xy_m), *told]
+    has_datum = info.datum is not None
+    run_map = draw_run_map(store, run, track, segments, has_datum=has_datum, pictures_by_map=pictures_by_map)
+    sensor_series, lost = _read_series(store, run, timeline)
+    series = [make_track_series(track, timeline, run_map.track_xy_m), *sensor_series]
     lines, spans = make_lines(series), find_mask_spans(track, timeline, info.rate_hz)
-    over_time = time_plots(
-        timeline, lines=lines, spans=spans, facts=info.report.facts, refused=refused, labels=bool(segments.num_rows)
+    over_time, lines_json = time_plots(
+        timeline,
+        lines=lines,
+        spans=spans,
+        facts=info.report.facts,
+        rejections=rejections,
+        has_labels=bool(segments.num_rows),
     )
     data: dict[str, Json] = {
         "run": run.run_id,
         "first_s": 0.0,
         "last_s": max(timeline.end_s, 1.0),
-        "epochs": [[each.start_s, str(each.first_ns)] for each in timeline.epochs],
-        "series": {each.name: each.json for each in series},
-        "lines": over_time.lines,
-        "spans": spans.json,
-        "segments": _make_segments_data(segments, timeline, ground),
+        "epochs": [[epoch.start_s, str(epoch.first_ns)] for epoch in timeline.epochs],
+        "series": {part.name: part.to_json() for part in series},
+        "lines": lines_json,
+        "spans": spans.to_json(),
+        "segments": _make_segments_data(segments, timeline, run_map),
         "starts": [str(stamp) for stamp in to_integers(segments, "start_ns").tolist()],
         "reasons": make_reasons_data(),
         "quality": [[int(bit), words] for bit, words in QUALITY_WORDS.items()],
-        "flags": _find_distinguishing_bits(to_integers(segments, "quality")),
-        "ground": list(ground.ground),
+        "flags": find_distinguishing_bits(to_integers(segments, "quality")),
+        "ground": list(run_map.ground),
         "step_m": _STEP_M,
         "kept": KEPT,
         "doubted": DOUBTED,
         "unused": UNUSED,
-        "tall_by_wide": float(np.divide(*np.maximum(np.ptp(ground.track_xy_m, axis=0), 1.0)[::-1])),
+        "tall_by_wide": float(np.divide(*np.maximum(np.ptp(run_map.track_xy_m, axis=0), 1.0)[::-1])),
     }
     text = "Colour shows what the distance is used for, or why it is not; click on the track or in a plot below for details."
-    over = " ".join([_time_text(series, lines), *lost])
-    sections = (
-        Section("The drive", " ".join([text, *ground.missing]), controls="run.html", plots=[ground.plot]),
-        Section("Over time", over, controls="run_time.html", plots=over_time.plots, stacked=True),
-    )
-    return _Drawn(sections, data)
-
-
-def _find_distinguishing_bits(bits: NDArray[np.int64]) -> int:
-    """Return the quality bits that some segments carry and others do not: a bit of all of them says nothing on a map."""
-    return int(np.bitwise_or.reduce(bits, initial=0) & ~np.bitwise_and.reduce(bits)) if len(bits) else 0
+    over = " ".join([_describe_series(series, lines), *lost])
+    sections = [
+        Section("The drive", " ".join([text, *run_map.missing]), controls="run.html", plots=[run_map.plot]),
+        Section("Over time", over, controls="run_time.html", plots=over_time, stacked=True),
+    ]
+    return sections, data
 
 
 def _read_series(store: Store, run: RunDirectory, timeline: Timeline) -> tuple[list[Series], list[str]]:
-    """Return what sensors told, from the streams, and in words what of it is lost."""
+    """Return power and speeds of the run's streams, and in words which of them are lost."""
     try:
-        known = store.run_json(run.run_id)
-        there = known.streams if known is not None and known.streams_key == run.streams_key else {}
-        wanted = {name: of for name, of in there.items() if PurePosixPath(name).stem in ("power", *SPEED_ROLES)}
-        files = store.stream_files(run.run_id, replace(known, streams=wanted)) if known is not None else {}
-        tables = {role: read_table(path) for role, path in files.items()}
+        run_json = store.run_json(run.run_id)
+        tables = {}
+        if run_json is not None:
+            streams = run_json.streams if run_json.streams_key == run.streams_key else {}
+            streams = {name: of for name, of in streams.items() if PurePosixPath(name).stem in ("power", *SPEED_ROLES)}
+            files = store.stream_files(run.run_id, replace(run_json, streams=streams))
+            tables = {role: read_table(path) for role, path in files.items()}
     except (StoreError, TableError) as error:
         return [], [f"What sensors told cannot be drawn: {error.problems[0]}."]
     if not tables and run.manifest.counts.messages.get("gnss"):
@@ -206,7 +192,7 @@ def _read_series(store: Store, run: RunDirectory, timeline: Timeline) -> tuple[l
     return [*series, *(each for each in speeds if each is not None)], []
 
 
-def _time_text(series: Sequence[Series], lines: Sequence[Line]) -> str:
+def _describe_series(series: Sequence[Series], lines: Sequence[Line]) -> str:
     """Return what the plots show, and which series are thinned."""
     text = (
         "Shaded: not used, in the colour of the reason. Draw a box to zoom, double-click for the whole run; every plot follows. "
@@ -214,22 +200,22 @@ def _time_text(series: Sequence[Series], lines: Sequence[Line]) -> str:
     )
     if not any(line.plot == "power" for line in lines):
         text += " There is no power."
-    for each in series:
-        if len(each.t_s) < each.of:
+    for part in series:
+        if len(part.t_s) < part.value_count:
             text += (
-                f" {each.name.replace('_', ' ')}: {each.of} values; the page carries the lowest and the highest of every "
-                f"{-(-2 * each.of // len(each.t_s))}."
+                f" {part.name.replace('_', ' ')}: {part.value_count} values; the page carries the lowest and the highest of every "
+                f"{-(-2 * part.value_count // len(part.t_s))}."
             )
     return text
 
 
-def _make_segments_data(segments: pa.Table, timeline: Timeline, ground: RunMap) -> Json:
+def _make_segments_data(segments: pa.Table, timeline: Timeline, run_map: RunMap) -> Json:
     """Return what the page holds of each segment."""
     epoch = to_integers(segments, "epoch")
     columns: dict[str, Column] = {
         name: ("f32", timeline.seconds(to_integers(segments, f"{name}_ns"), epoch)) for name in ("start", "end")
     }
-    for number, end in enumerate(ground.ends_xy_m):
+    for number, end in enumerate(run_map.ends_xy_m):
         columns |= {f"{axis}{number}": ("steps", end[:, place]) for place, axis in enumerate("xy")}
     for name, (value, std, digits) in _LABELS.items():
         columns[name], columns[f"{name}_std"] = (
@@ -245,7 +231,7 @@ def _make_segments_data(segments: pa.Table, timeline: Timeline, ground: RunMap) 
     return pack_columns(columns | {"quality": ("u16", to_integers(segments, "quality"))})
 
 
-def _label_sections(segments: pa.Table, physics: PhysicsFacts | None, robot: str) -> Iterator[Section]:
+def _make_label_sections(segments: pa.Table, physics: PhysicsFacts | None, robot: str) -> Iterator[Section]:
     if not segments.num_rows:
         return
     yield Section("Labels", "One value a segment.", plots=label_histograms(segments, "segments", prefix="of "))
@@ -280,16 +266,129 @@ def _draw_physics(segments: pa.Table) -> Iterator[Plot]:
     yield plot
 
 
-def _make_provenance_section(run: RunDirectory, manifest: Manifest, known: RunJson | None) -> Section:
+def make_sensor_sections(run_json: RunJson | None, manifest: Manifest, rejections: pa.Table) -> list[Section]:
+    """Return the sections on topics, rejections, disagreements and clocks; ``run_json`` is None where it is lost."""
+    facts = manifest.info.report.facts
+    return [
+        *([] if run_json is None else [_make_topics_section(run_json, manifest.counts)]),
+        *_make_trust_sections(facts, rejections),
+        *_make_disagreement_sections(facts),
+        *_make_clock_sections(facts, manifest.info.report.findings),
+    ]
+
+
+def _name(role: str) -> str:
+    return role.replace("_", " ")
+
+
+def _make_topics_section(run_json: RunJson, counts: Counts) -> Section:
+    rows = [
+        (
+            *(_name(role), sensor.topic, sensor.type_name, counts.messages.get(role, 0)),
+            *(sensor.time_source, sensor.placed_by, sensor.why),
+        )
+        for role, sensor in sorted(run_json.sensors.items())
+    ]
+    header = ("role", "topic", "type", "messages", "stamp", "placed by", "why this topic")
+    return Section("Sensors", "Which topic played which role.", header=header, rows=rows)
+
+
+def _make_trust_sections(facts: StageFacts, rejections: pa.Table) -> list[Section]:
+    """Return how many measurements each sensor gave, how many were refused and why, and how well the rest fitted."""
+    counts, nis = (facts.fuse.measurements, facts.fuse.nis_mean) if facts.fuse else ({}, {})
+    lost = Counter(zip(rejections.column("role").to_pylist(), rejections.column("reason").to_pylist(), strict=True))
+    checks = facts.sensor_checks.refused if facts.sensor_checks else {}
+    rows = [
+        (
+            _name(role),
+            counts.get(role, 0),
+            ", ".join(f"{count} {why}" for (name, why), count in sorted(lost.items()) if name == role),
+            "" if (mean := nis.get(role)) is None else f"{mean:.2f}",
+            checks.get(role, ""),
+        )
+        for role in sorted({*counts, *checks, *(role for role, _ in lost)})
+    ]
+    if not rows:
+        return []
+    text = (
+        "Refused: by the χ² gate, or unusable (rejections.parquet lists each). NIS is the mean squared innovation over its "
+        "variance and dimension, of what was taken: 1 fits its claimed error; far above, the sensor is worse than it says; "
+        "far below, better."
+    )
+    header = ("sensor", "measurements", "refused", "NIS", "not fused, since")
+    return [Section("How far each sensor was believed", text, header=header, rows=rows)]
+
+
+def _make_disagreement_sections(facts: StageFacts) -> list[Section]:
+    """Return when sensors and track disagree, by what and how much; where they never do, nothing."""
+    found = facts.audit.disagreements if facts.audit else ()
+    if not found:
+        return []
+    start_ns = min((stretch.start_ns for stretch in facts.fuse.stretches), default=0) if facts.fuse else 0
+    rows = [
+        (
+            _name(each.sensor),
+            each.what,
+            f"{(each.start_ns - start_ns) * 1e-9:.0f} to {(each.end_ns - start_ns) * 1e-9:.0f} s",
+            f"{each.size:.2g} {each.unit}",
+            f"{each.expected_std:.2g} {each.unit}",
+            "it is alone, the track is believed" if each.alone else "deviations are raised, segments flagged",
+        )
+        for each in found
+    ]
+    text = "The track held against each sensor that fed it, in windows of five seconds: where they differ beyond what both claim."
+    header = ("sensor", "what", "in the run", "off by", "expected (1σ)", "so")
+    return [Section("Where sensors disagree with the track", text, header=header, rows=rows)]
+
+
+def _make_clock_sections(facts: StageFacts, findings: Sequence[Finding]) -> list[Section]:
+    """Return how late each sensor's stamps are; where nothing could be compared, nothing."""
+    found = facts.clock_offsets
+    steps = [f"{step.step_s:+.3f} s at log time {step.log_time_ns} ns" for step in facts.clock_steps]
+    offsets = found.offsets if found else {}
+    if not offsets and not steps:
+        return []
+    rows = [
+        (
+            _name(role),
+            f"{1e3 * (each.offset_s or 0.0):+.0f} ms",
+            f"{2e3 * (each.std_s or 0.0):.0f} ms",
+            _format_drift(each),
+            _format_correction(role, findings),
+        )
+        for role, each in sorted(offsets.items())
+    ]
+    text = ""
+    if found and rows:
+        text = f"How late stamps are against {_name(found.reference)}, by what the sensors say of the same motion. Nothing is corrected."
+    if steps:
+        text += f" The clock steps: {'; '.join(steps)}."
+    header = ("sensor", "late by", "± (2σ)", "drift", "correction")
+    return [Section("Clocks", text.strip(), header=header, rows=rows)]
+
+
+def _format_correction(role: str, findings: Sequence[Finding]) -> str:
+    """Return what corrects a sensor's clock, as the findings on it propose."""
+    clocks = select_findings(findings, "time-offset", "clock-drift", "clocks-differ")
+    found = [finding for finding in clocks if finding.subject.name == role]
+    remedies = [describe_remedy(finding, remedy) for finding in found for remedy in finding.remedies]
+    return "; ".join(remedies) or ", ".join(finding.code.replace("-", " ") for finding in found)
+
+
+def _format_drift(offset: ClockOffset) -> str:
+    if offset.drift_s_per_h is None or offset.drift_std_s_per_h is None:
+        return ""
+    return f"{1e3 * offset.drift_s_per_h:+.0f} ± {2e3 * offset.drift_std_s_per_h:.0f} ms/h"
+
+
+def _make_provenance_section(run: RunDirectory, manifest: Manifest, run_json: RunJson | None) -> Section:
     """Return what the run is made from: enough to make it again."""
-    tags: Mapping[str, str] = manifest.tags
     rows = [
         ("made by", f"tcpipe {manifest.tcpipe_version}, data model {manifest.data_model_version}"),
         ("recipe", run.recipe_id),
         ("estimator", manifest.info.estimator),
-        ("tags", ", ".join(f"{key}={value}" for key, value in tags.items()) or "none"),
-        *((("log", f"sha256 {known.source.sha256}"),) if known is not None else ()),
+        ("tags", ", ".join(f"{key}={value}" for key, value in manifest.tags.items()) or "none"),
+        *((("log", f"sha256 {run_json.source.sha256}"),) if run_json is not None else ()),
     ]
-    return Section(
-        "Provenance", "The same log and recipe make the same run.", header=("what", "is"), rows=rows, folded=True
-    )
+    text = "The same log and recipe make the same run."
+    return Section("Provenance", text, header=("what", "is"), rows=rows, folded=True)

@@ -5,46 +5,220 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import PurePosixPath
+from typing import Any
 
 import numpy as np
 
 from tcpipe.cost.physics import PHYSICS_UNITS
-from tcpipe.formats.finding_lines import advise_on_loss, describe_finding, format_group
+from tcpipe.formats.finding_lines import FindingGroup, describe_finding, format_group
 from tcpipe.formats.index_files import RunFacts
 from tcpipe.formats.json_files import Json
-from tcpipe.motion.remedies import StoreLoss, find_largest_losses
+from tcpipe.formats.stored_runs import Ingestions
 from tcpipe.report.colours import CLASS_COLOURS
-from tcpipe.report.page import Link, Number, Section, render_page
-from tcpipe.report.plots import Plot, draw_waterfall, make_plot
-from tcpipe.report.store_runs import FIELDS, StoredRun, StoreFacts, format_day, name_datasets, sort_runs
-from tcpipe.report.verdict import show_groups
-from tcpipe.tables.findings import select_problems
+from tcpipe.report.label_sections import make_losses_sections
+from tcpipe.report.page import Link, Number, Section, render_page, show_verdict
+from tcpipe.report.plots import Plot, make_plot
+from tcpipe.tables.findings import Finding, Verdict, select_problems
 
+_PAGE = "report.html"
 MOST_ROWS = 200
 """Runs that can be read without scripts: with them, all."""
 _MOST_LISTED = 500
 
-_COLUMNS = ("run", "began (UTC)", "robot", "state", "in datasets", "tags", "segments", "driven [m]", "used [%]")
-_MORE_COLUMNS = ("noise floor of E [%]", "verdict", "findings")
+_COLUMNS = (
+    *("run", "began (UTC)", "robot", "state", "in datasets", "tags", "segments", "driven [m]", "used [%]"),
+    *("noise floor of E [%]", "verdict", "findings"),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class StoredDataset:
+    """A dataset that was built of the store: where, of which ingestions, whether it is still that one, and its page from the store's."""
+
+    out: str
+    runs: tuple[tuple[str, str], ...]
+    there: bool
+    page: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class FailedLog:
+    """A log that gave no run: why, and how that stands."""
+
+    log: str
+    why: str
+    state: str
+
+
+@dataclass(frozen=True, slots=True)
+class StoreFacts:
+    """What the page of a store is made of."""
+
+    where: str
+    found: Ingestions
+    acknowledged: frozenset[str]
+    """Runs whose problems a person has acknowledged."""
+    pages: frozenset[tuple[str, str]]
+    """Ingestions, by run and recipe, that have a page."""
+    datasets: tuple[StoredDataset, ...]
+    verdict: Verdict
+    """On the current runs together."""
+    changes: tuple[Finding, ...]
+    """What the latest of them have changed."""
+    groups: tuple[FindingGroup[str], ...]
+    """Findings of the current runs by code, the worst first."""
+    failed: tuple[FailedLog, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class StoredRun:
+    """A row of the page: what the index has of an ingestion, how it stands, its page, its datasets and codes of findings."""
+
+    run_id: str
+    recipe_id: str
+    state: str
+    facts: RunFacts | None
+    href: str
+    datasets: tuple[int, ...]
+    codes: tuple[int, ...]
+    """Places in `StoreFacts.groups`."""
+    is_current: bool = False
+    """Whether it counts: it is of the ruling recipe, and nothing has taken its place."""
+
+    @property
+    def begin_ns(self) -> int:
+        """Return when its first segment begins [ns since 1970]; 0 where that is not known."""
+        return (self.facts and self.facts.start_ns) or 0
+
+    @property
+    def used_share(self) -> float | None:
+        """Return the share of the metres driven that are in segments."""
+        return self.facts.kept_m / self.facts.driven_m if self.facts and self.facts.driven_m > 0 else None
+
+    @property
+    def floor(self) -> float | None:
+        """Return the noise floor of E, a share."""
+        return self.facts.energy_budget.total if self.facts and self.facts.energy_budget else None
+
+    def row(self, terms: Sequence[str]) -> list[Json]:
+        """Return what the page's script is told, in the order of `_FIELDS`."""
+        of = self.facts
+        if of is None:
+            return [self.run_id, self.href, None, "", self.state, "", "", *[None] * 4, "", None, [], [], None, []]
+        return [
+            self.run_id,
+            self.href,
+            None if of.start_ns is None else of.start_ns // 10**6,
+            of.robot,
+            self.state,
+            of.superseded_by,
+            ", ".join(f"{key}={value}" for key, value in of.tags.items()),
+            of.segments,
+            round(of.driven_m, 1),
+            _compute_percent(self.used_share),
+            _compute_percent(self.floor),
+            of.verdict.worst,
+            sum(finding.severity != "note" for finding in of.findings),
+            list(self.datasets),
+            list(self.codes),
+            of.standing_watt,
+            [of.physics[term][0] if term in of.physics else None for term in terms],
+        ]
+
+
+_FIELDS = (
+    *("run", "href", "start_ms", "robot", "state", "superseded_by", "tags", "segments", "driven", "used", "floor"),
+    *("verdict", "findings", "datasets", "codes", "standing", "terms"),
+)
+
+
+def sort_runs(store: StoreFacts) -> list[StoredRun]:
+    """Return every ingestion, what began last first; then those without a segment, and those that cannot be read."""
+    found, ruling = store.found, find_recipe_key(store.found)
+    members, codes = dict[tuple[str, str], list[int]](), dict[str, list[int]]()
+    for number, dataset in enumerate(store.datasets):
+        for part in dataset.runs if dataset.there else ():
+            members.setdefault(part, []).append(number)
+    for number, group in enumerate(store.groups):
+        for run_id in group.of:
+            codes.setdefault(run_id, []).append(number)
+    rows = [
+        StoredRun(
+            run_id,
+            recipe_id,
+            _state(facts, ruling, acknowledged=run_id in store.acknowledged),
+            facts,
+            f"runs/{run_id}/{recipe_id}/{_PAGE}" if (run_id, recipe_id) in store.pages else "",
+            tuple(members.get((run_id, recipe_id), ())),
+            tuple(codes.get(run_id, ())) if facts.ingest_key == ruling else (),
+            is_current=facts.ingest_key == ruling and not facts.superseded_by,
+        )
+        for (run_id, recipe_id), facts in found.rows.items()
+    ]
+    rows.sort(key=lambda run: (-run.begin_ns, run.run_id, not run.is_current, run.recipe_id))
+    rows += [StoredRun(*part, "not as it was written", None, "", (), ()) for part in found.damaged]
+    return rows + [
+        StoredRun(name, "", f"of data model {head.data_model_version}", None, "", (), ())
+        for name, head in found.outdated.items()
+    ]
+
+
+def find_recipe_key(found: Ingestions) -> str | None:
+    """Return the key of the recipe that most runs are of; of two that the latest run is of."""
+    keys = Counter(run.facts.ingest_key for run in found.finished)
+    latest = {run.facts.ingest_key: max(0, run.facts.start_ns or 0) for run in found.finished}
+    return max(keys, key=lambda key: (keys[key], latest[key], key), default=None)
+
+
+def _state(facts: RunFacts, ruling: str | None, *, acknowledged: bool) -> str:
+    if facts.superseded_by:
+        return "superseded"
+    if facts.ingest_key != ruling:
+        return "of another recipe"
+    wrong = "damaged" if facts.damage else "empty" if facts.is_empty else ""
+    return f"{wrong}{', acknowledged' * acknowledged}" if wrong else "current"
+
+
+def _compute_percent(share: float | None) -> float | None:
+    return None if share is None else round(100.0 * share, 2)
+
+
+def name_datasets(datasets: Sequence[StoredDataset]) -> list[str]:
+    """Return what each dataset is called: the last part of its path, all of it where two would be called the same."""
+    short = [PurePosixPath(of.out).name for of in datasets]
+    return [name if short.count(name) == 1 else of.out for name, of in zip(short, datasets, strict=True)]
+
+
+def format_day(facts: RunFacts | None) -> str:
+    """Return when the first segment of a run begins, to the minute, UTC; "" where that is not known."""
+    if facts is None or facts.start_ns is None:
+        return ""
+    return f"{datetime.fromtimestamp(facts.start_ns // 10**9, UTC):%Y-%m-%d %H:%M}"
 
 
 def store_report(store: StoreFacts) -> str:
     """Return the HTML page of a store."""
     runs = sort_runs(store)
     current = [run for run in runs if run.is_current]
-    losses = find_largest_losses(run.facts.ledger_m for run in current if run.facts)
+    groups = [(group, len(current), "runs") for group in store.groups]
+    problem = "No run can be used. 'tcpipe ingest LOG' adds runs; 'tcpipe preflight LOG' checks a log."
     return render_page(
         title=f"Store {store.where}",
         lead="All its runs. Sums, drift and losses are of the recipe that most runs are of, superseded runs left aside.",
-        verdict=show_groups(store.verdict, store.groups, len(current), findings=store.changes) if current else None,
+        verdict=show_verdict(store.verdict, store.changes, groups) if current else None,
         numbers=_make_numbers(store, current),
-        warnings=[]
-        if current
-        else ["No run can be used. 'tcpipe ingest LOG' adds runs; 'tcpipe preflight LOG' checks a log."],
+        warnings=[] if current else [problem],
         sections=[
             *_make_table_section(store, runs),
             *_make_drift_sections(runs),
-            *_make_losses_sections(current, losses),
+            *make_losses_sections(
+                [run.facts.ledger_m for run in current if run.facts],
+                "The largest losses, and how to lose less; 'tcpipe status' lists the same.",
+                names_runs=True,
+            ),
             *_make_findings_sections(store, current),
             *_make_datasets_sections(store, runs),
             *_make_problem_sections(store, runs),
@@ -87,84 +261,57 @@ def _make_table_section(store: StoreFacts, runs: Sequence[StoredRun]) -> list[Se
     text = "A click on a head sorts; what is chosen in the plots below stands alone here."
     if len(runs) > MOST_ROWS:
         text += f" Without scripts the first {MOST_ROWS} of {len(runs)} stand here."
-    return [Section("All runs", text, header=(*_COLUMNS, *_MORE_COLUMNS), rows=rows, controls="store.html")]
+    return [Section("All runs", text, header=_COLUMNS, rows=rows, controls="store.html")]
 
 
 def _make_drift_sections(runs: Sequence[StoredRun]) -> list[Section]:
     """Return the plots over time; the page's script fills them."""
     dated = [run for run in runs if run.facts and run.facts.start_ns is not None]
-    labels = {}
-    if any(run.used_share is not None for run in dated):
-        labels["used"] = "metres used [%]"
-    if any(run.floor is not None for run in dated):
-        labels["floor"] = "noise floor of E [%]"
-    if any(run.facts and run.facts.standing_watt is not None for run in dated):
-        labels["standing"] = "standing power [W]"
-    if any(run.facts and run.facts.physics for run in dated):
-        labels["term"] = "term of physics"
-    if not labels:
+    is_known = {
+        "metres used [%]": ("used", any(run.used_share is not None for run in dated)),
+        "noise floor of E [%]": ("floor", any(run.floor is not None for run in dated)),
+        "standing power [W]": ("standing", any(run.facts and run.facts.standing_watt is not None for run in dated)),
+        "term of physics": ("term", any(run.facts and run.facts.physics for run in dated)),
+    }
+    names = {name: label for label, (name, known) in is_known.items() if known}
+    if not names:
         return []
-    plots = list[Plot]()
-    for name, label in labels.items():
-        plots.append(_draw_over_time(name, label, dict(_list_robots(runs)), plots))
+    corners = {name: [0.0, 1.0] for name in ("used", "floor", "standing", "term")}  # until the page's script fills it
+    source: Any = {"run": [""] * 2, "fill": ["#ffffff"] * 2, "start_ms": [0.0, 1e12], **corners}
+    plots: list[Plot] = []
+    for name, label in names.items():
+        plot = make_plot(
+            f"drift {name}",
+            alt=f"{label} of every run over the time at which it began; the table has the same figures.",
+            axes=("", label),
+            legend=dict(_list_robots(runs)),
+            height_px=260,
+            tools="box_select,tap,pan,wheel_zoom,reset,save",
+            drag="box_select",
+            tooltips=[("", "@run"), (label, f"@{name}{{0.00}}")],
+            x_axis_type="datetime",
+            **({"x_range": plots[0].figure.x_range} if plots else {}),
+        )
+        points = plot.figure.scatter(
+            "start_ms",
+            name,
+            size=7,
+            fill_color="fill",
+            line_color=None,
+            nonselection_fill_alpha=0.12,
+            source=source,
+            name=name,
+        )
+        source = points.data_source
+        plots.append(plot)
     text = "A point is a run. A box drawn here chooses runs in the table, and the table's filters choose here."
-    return [Section("Over the nights", text, plots=plots, controls="store-drift.html" if "term" in labels else "")]
-
-
-def _draw_over_time(name: str, label: str, colours: dict[str, str], drawn: Sequence[Plot]) -> Plot:
-    plot = make_plot(
-        f"drift {name}",
-        alt=f"{label} of every run over the time at which it began; the table has the same figures.",
-        axes=("", label),
-        legend=colours,
-        height_px=260,
-        tools="box_select,tap,pan,wheel_zoom,reset,save",
-        drag="box_select",
-        tooltips=[("", "@run"), (label, f"@{name}{{0.00}}")],
-        over_time=True,
-        beside=drawn[0] if drawn else None,
-    )
-    # Corners, until the page's script has filled it.
-    ends = {"start_ms": [0.0, 1e12], **{measure: [0.0, 1.0] for measure in ("used", "floor", "standing", "term")}}
-    source = drawn[0].figure.renderers[0].data_source if drawn else {"run": [""] * 2, "fill": ["#ffffff"] * 2, **ends}
-    plot.figure.scatter(
-        "start_ms",
-        name,
-        size=7,
-        fill_color="fill",
-        line_color=None,
-        nonselection_fill_alpha=0.12,
-        source=source,
-        name=name,
-    )
-    return plot
+    return [Section("Over the nights", text, plots=plots, controls="store-drift.html" if "term" in names else "")]
 
 
 def _list_robots(runs: Sequence[StoredRun]) -> list[tuple[str, str]]:
     """Return the robots with their colours, those of most runs first."""
     counts = Counter(run.facts.robot for run in runs if run.facts)
     return [(robot, CLASS_COLOURS[n % len(CLASS_COLOURS)]) for n, (robot, _) in enumerate(counts.most_common())]
-
-
-def _make_losses_sections(current: Sequence[StoredRun], losses: Sequence[StoreLoss]) -> list[Section]:
-    ledger_m = Counter[str]()
-    for run in current:
-        ledger_m.update(run.facts.ledger_m if run.facts else {})
-    if not ledger_m:
-        return []
-    rows = [
-        (
-            loss.reason.replace("_", " "),
-            f"{loss.metres:.0f}",
-            f"{100 * loss.share:.1f} %",
-            loss.runs,
-            advise_on_loss(loss.reason),
-        )
-        for loss in losses
-    ]
-    header = ("lost to", "metres", "of all", "runs", "to lose less")
-    text = "The largest losses, and how to lose less; 'tcpipe status' lists the same."
-    return [Section("Where every metre went", text, header=header, rows=rows, plots=[draw_waterfall(ledger_m)])]
 
 
 def _make_findings_sections(store: StoreFacts, current: Sequence[StoredRun]) -> list[Section]:
@@ -212,7 +359,7 @@ def _describe_problem(facts: RunFacts) -> str:
 def _make_data(store: StoreFacts, runs: Sequence[StoredRun]) -> Json:
     terms = sorted({term for run in runs if run.facts for term in run.facts.physics if not term.startswith("standing")})
     return {
-        "fields": list(FIELDS),
+        "fields": list(_FIELDS),
         "rows": [run.row(terms) for run in runs],
         "robots": [list(of) for of in _list_robots(runs)],
         "datasets": name_datasets(store.datasets),

@@ -13,7 +13,7 @@ import numpy as np
 
 from tcpipe.errors import UsageError
 from tcpipe.geometry.rotation import invert, multiply, quat_from_matrix, rotation_vector_from_quat
-from tcpipe.simulation.robot import SimulatedRobot, drive_along, make_correlated_noise
+from tcpipe.simulation.robot import SimulatedRobot, compute_rolling_resistance, drive_along, make_correlated_noise
 from tcpipe.simulation.route import (
     PATH_GRID_M,
     Leg,
@@ -27,10 +27,8 @@ from tcpipe.simulation.route import (
     make_leg_path,
     make_straight_path,
 )
-from tcpipe.simulation.site import Float
 from tcpipe.simulation.truth import Truth
-from tcpipe.simulation.wheels import compute_rolling_resistance
-from tcpipe.simulation.world import World
+from tcpipe.simulation.world import Float, World
 
 STEP_NS = 5_000_000
 _DT_S = STEP_NS * 1e-9

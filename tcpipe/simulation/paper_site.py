@@ -10,13 +10,27 @@ from typing import Any
 
 import numpy as np
 
-from tcpipe.simulation.random_fields import Wave, draw_waves
 from tcpipe.simulation.robot import GroundModel, SimulatedRobot, Wheels
 from tcpipe.simulation.route import AlongRoad, Wander
 from tcpipe.simulation.sensors import Gnss, Power, Sensors
-from tcpipe.simulation.site import Site
-from tcpipe.simulation.surface import Surface, SurfaceEffect
-from tcpipe.simulation.world import GRASS, MUD, OBSTACLE, PAVED, TREE, UNPAVED, VEGETATION, Band, Ellipse, Hill, World
+from tcpipe.simulation.world import (
+    GRASS,
+    MUD,
+    OBSTACLE,
+    PAVED,
+    TREE,
+    UNPAVED,
+    VEGETATION,
+    Band,
+    Ellipse,
+    Hill,
+    Site,
+    Surface,
+    SurfaceEffect,
+    Wave,
+    World,
+    draw_waves,
+)
 
 _GROUNDS = {"grass": GRASS, "mud": MUD, "unpaved_road": UNPAVED, "paved_road": PAVED}
 

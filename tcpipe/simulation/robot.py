@@ -1,4 +1,4 @@
-"""What the simulated robot can do, and what it costs: speed limits, slip, rolling resistance, grade, battery.
+"""What the simulated robot can do, and what it costs: speed limits, slip, rolling resistance, grade, battery, and what its wheels meet.
 
 The plant is deliberately plain, but every effect that a label should carry is in it: the terrain slows a robot that is commanded at full
 speed, rolling resistance depends on the class (and on what no map shows), grade costs and gives back, turning scrubs, the battery sags.
@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.compiled import compile_kernel
-from tcpipe.simulation.site import Float
-from tcpipe.simulation.world import GRASS, MUD, PAVED, UNPAVED
+from tcpipe.simulation.world import GRASS, MUD, PAVED, UNPAVED, Float, World
 from tcpipe.tables.facts import ABSENT
 
 GRAVITY_MPS2 = 9.80665
@@ -208,3 +207,48 @@ def make_correlated_noise(white: NDArray[np.float64], correlation: float) -> NDA
         state = white[0] if i == 0 else correlation * state + gain * white[i]
         out[i] = state
     return out
+
+
+Heading = tuple[Float, Float]
+"""Cosine and sine of the direction from the map's x axis."""
+
+
+def compute_rolling_resistance(world: World, robot: SimulatedRobot, x: Float, y: Float, yaw_map_rad: Float) -> Float:
+    """Return the traction force over the normal force at poses in the map, any shapes that broadcast.
+
+    Without `Wheels` it is the mean along the wheelbase, under the middle; with them the mean of four contacts.
+    """
+    ahead = robot.wheelbase_m / 2.0
+    if robot.wheels is None:
+        places = [(at, 0.0) for at in np.linspace(-ahead, ahead, 5)]
+    else:
+        aside = robot.wheels.track_m / 2.0
+        places = [(at, side) for at in (-ahead, ahead) for side in (-aside, aside)]
+    cos, sin = np.cos(yaw_map_rad), np.sin(yaw_map_rad)
+    found = [
+        _evaluate_at_contact(world, robot, x + at * cos - side * sin, y + at * sin + side * cos, (cos, sin))
+        for at, side in places
+    ]
+    mean = np.mean(found, axis=0)
+    return np.asarray(
+        mean if robot.wheels is None else mean + _compute_side_drag(world, robot.wheels, x, y, (cos, sin))
+    )
+
+
+def _evaluate_at_contact(world: World, robot: SimulatedRobot, x: Float, y: Float, heading: Heading) -> Float:
+    cos, sin = heading
+    classes = world.terrain_class(x, y)
+    usual = robot.ground_table()[:, 2][classes] * world.resistance_factor(x, y)
+    if robot.wheels is None or world.surface is None:
+        return np.asarray(usual)
+    half = robot.wheels.contact_m / 2.0
+    u, v = x - world.site.west_m, y - world.site.south_m
+    higher, lower = (world.surface.relief_m(classes, u + at * cos, v + at * sin) for at in (half, -half))
+    return np.asarray(usual + 0.5 * robot.wheels.bump_loss * np.abs(higher - lower) / robot.wheels.contact_m)
+
+
+def _compute_side_drag(world: World, wheels: Wheels, x: Float, y: Float, heading: Heading) -> Float:
+    """Return the drag of running sidelong: of a side force sin(slope across) at the slip angle that gives it."""
+    rise_x, rise_y = world.gradient(x, y)
+    across = rise_y * heading[0] - rise_x * heading[1]
+    return np.asarray(across**2 / (1.0 + across**2) / wheels.cornering_per_rad)

@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
-from tcpipe.simulation.site import Float
-from tcpipe.simulation.world import GRASS, Band, World
+from tcpipe.simulation.world import GRASS, Band, Float, World
 
 PATH_GRID_M = 0.01
 _SMOOTH_M = 0.5

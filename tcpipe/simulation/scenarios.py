@@ -12,12 +12,23 @@ from tcpipe.errors import UsageError
 from tcpipe.simulation.faults import Faults
 from tcpipe.simulation.messages import Recorder
 from tcpipe.simulation.paper_site import make_paper_site, make_paper_surface
-from tcpipe.simulation.random_fields import draw_waves
 from tcpipe.simulation.robot import SimulatedRobot
 from tcpipe.simulation.route import AlongRoad, Leg, Manoeuvre, Pause, Reverse, Stuck, Turn, Wander
 from tcpipe.simulation.sensors import Imu, Sensors, Visual
-from tcpipe.simulation.site import Site
-from tcpipe.simulation.world import MUD, OBSTACLE, PAVED, TREE, UNPAVED, VEGETATION, Band, Ellipse, Hill, World
+from tcpipe.simulation.world import (
+    MUD,
+    OBSTACLE,
+    PAVED,
+    TREE,
+    UNPAVED,
+    VEGETATION,
+    Band,
+    Ellipse,
+    Hill,
+    Site,
+    World,
+    draw_waves,
+)
 
 HUSKY_ROS2 = Recorder("ros2", "clearpath_power")
 HUSKY_ROS1 = Recorder("ros1", "husky_status")

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from tcpipe.geometry.rotation import invert, multiply, quat_from_rotation_vector, quat_from_rpy, rotate, rpy_from_quat
 from tcpipe.simulation.faults import Faults
 from tcpipe.simulation.robot import GRAVITY_MPS2, make_correlated_noise
-from tcpipe.simulation.site import Float, Site
 from tcpipe.simulation.truth import Truth
+from tcpipe.simulation.world import Float, Site
 
 CLOCK_STEP_NS = 2_500_000_000
 """How far header stamps jump with the fault ``clock_step``."""

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from tcpipe.compiled import compile_kernel
 from tcpipe.geometry.rotation import normalize, rpy_from_quat
-from tcpipe.simulation.site import Float
+from tcpipe.simulation.world import Float
 
 _COMPONENTS = {
     "enu_m": ("east_m", "north_m", "up_m"),

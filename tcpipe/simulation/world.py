@@ -1,24 +1,223 @@
-"""A world that is known exactly at every point: height, slope, terrain class, colour.
+"""A world that is known exactly at every point: place on Earth, height, slope, terrain class, colour, and what its ground costs.
 
 Height is a sum of smooth hills and waves, classes are bands (roads) and ellipses (mud, trees, a pond) on grass, colour follows the class
 with soft borders and a band-limited texture. Every function takes map coordinates of any shapes that broadcast; hills are separable,
-so that a raster costs an outer product.
-
-Classes are the ids of `tcpipe.terrain.classes.PAPER_CLASSES`; the last four are traversable.
+so that a raster costs an outer product. Classes are the ids of `tcpipe.terrain.classes.PAPER_CLASSES`; the last four are traversable.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import astuple, dataclass, field
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
+from pyproj import Transformer
+from scipy.special import erf
 
-from tcpipe.simulation.random_fields import Wave, sum_waves
-from tcpipe.simulation.site import Float, Site
-from tcpipe.simulation.surface import Surface
 from tcpipe.tables.facts import ABSENT
+
+Float = NDArray[np.float64]
+
+_SEMI_MAJOR_M = 6378137.0
+_ECCENTRICITY2 = 0.0066943799901413165
+_STEP_M = 10.0
+
+
+@dataclass(frozen=True)
+class Site:
+    """A rectangle of a projected CRS, and how high the geoid lies above the ellipsoid there.
+
+    A map metre is no ground metre, and grid north is not north: both follow from pyproj's projection by differences, without any formula
+    of the pipeline, so that the truth is independent of what it judges.
+
+    The default lies at 17.6° E, 47° N in UTM zone 33, where grid north is 1.9° off true north.
+    """
+
+    epsg: int = 32633
+    west_m: float = 697600.0
+    south_m: float = 5208400.0
+    width_m: float = 120.0
+    height_m: float = 80.0
+    geoid_m: float = 45.7
+
+    @cached_property
+    def _to_wgs84(self) -> Transformer:
+        return Transformer.from_crs(f"EPSG:{self.epsg}", "EPSG:4326", always_xy=True)
+
+    @cached_property
+    def datum(self) -> tuple[float, float, float]:
+        """Origin of the local plane: longitude [deg], latitude [deg], ellipsoidal height [m] (the site's middle, at the geoid)."""
+        lon, lat = self._to_wgs84.transform(self.west_m + self.width_m / 2, self.south_m + self.height_m / 2)
+        return float(lon), float(lat), self.geoid_m
+
+    @cached_property
+    def _to_enu(self) -> Transformer:
+        lon, lat, alt = self.datum
+        steps = f"+step +proj=cart +ellps=WGS84 +step +proj=topocentric +ellps=WGS84 +lon_0={lon!r} +lat_0={lat!r} +h_0={alt!r}"
+        return Transformer.from_pipeline(f"+proj=pipeline +step +proj=unitconvert +xy_in=deg +xy_out=rad {steps}")
+
+    def lonlat_deg(self, x_map_m: Float, y_map_m: Float) -> tuple[Float, Float]:
+        """Return longitude and latitude [deg] of map coordinates [m]."""
+        lon, lat = self._to_wgs84.transform(x_map_m, y_map_m)
+        return np.asarray(lon), np.asarray(lat)
+
+    def map_xy_m(self, lon_deg: Float, lat_deg: Float) -> tuple[Float, Float]:
+        """Return map coordinates [m] of longitude and latitude [deg]."""
+        x, y = self._to_wgs84.transform(lon_deg, lat_deg, direction="INVERSE")
+        return np.asarray(x), np.asarray(y)
+
+    def enu_m(self, lon_deg: Float, lat_deg: Float, alt_m: Float) -> Float:
+        """Return east, north, up of the datum [m], shape (N, 3)."""
+        return np.stack(self._to_enu.transform(lon_deg, lat_deg, alt_m), axis=-1)
+
+    def lonlatalt(self, enu_m: Float) -> tuple[Float, Float, Float]:
+        """Return longitude, latitude [deg] and ellipsoidal height [m] of points of the local plane, shape (N, 3)."""
+        lon, lat, alt = self._to_enu.transform(enu_m[..., 0], enu_m[..., 1], enu_m[..., 2], direction="INVERSE")
+        return np.asarray(lon), np.asarray(lat), np.asarray(alt)
+
+    def ground_from_map(self, x_map_m: Float, y_map_m: Float, alt_m: Float) -> tuple[Float, Float]:
+        """Return ground metres per map metre, and the true direction of the map's x axis from east [rad].
+
+        Ground metres are horizontal metres at the height ``alt_m`` above the ellipsoid.
+        """
+        lon0, lat0 = self.lonlat_deg(x_map_m - _STEP_M / 2, y_map_m)
+        lon1, lat1 = self.lonlat_deg(x_map_m + _STEP_M / 2, y_map_m)
+        lat = np.radians((lat0 + lat1) / 2)
+        curvature = 1.0 - _ECCENTRICITY2 * np.sin(lat) ** 2
+        prime_vertical_m = _SEMI_MAJOR_M / np.sqrt(curvature)
+        meridian_m = prime_vertical_m * (1.0 - _ECCENTRICITY2) / curvature
+        east = np.radians(lon1 - lon0) * (prime_vertical_m + alt_m) * np.cos(lat)
+        north = np.radians(lat1 - lat0) * (meridian_m + alt_m)
+        return np.hypot(east, north) / _STEP_M, np.arctan2(north, east)
+
+
+@dataclass(frozen=True, slots=True)
+class Wave:
+    """A plane wave: amplitude in the unit of what it ripples."""
+
+    amplitude: float
+    wavelength_m: float
+    direction_rad: float
+    phase_rad: float
+
+
+def draw_waves(
+    seed: int,
+    *,
+    count: int,
+    total: float,
+    wavelength_m: tuple[float, float],
+    direction_rad: tuple[float, float] = (0.0, np.pi),
+) -> tuple[Wave, ...]:
+    """Return plane waves of random direction and phase, log-uniform wavelength, and amplitudes that sum in square to ``total``²."""
+    rng = np.random.default_rng(seed)
+    amplitude = total * np.sqrt(2.0 / count)
+    return tuple(
+        Wave(
+            amplitude,
+            float(np.exp(rng.uniform(*np.log(wavelength_m)))),
+            float(rng.uniform(*direction_rad)),
+            float(rng.uniform(0.0, 2.0 * np.pi)),
+        )
+        for _ in range(count)
+    )
+
+
+def sum_waves(waves: Sequence[Wave], u: Float, v: Float) -> Float:
+    """Sum the waves; sin(a + b) is expanded, so that row and column vectors meet in outer products only."""
+    total = np.zeros(np.broadcast_shapes(np.shape(u), np.shape(v)))
+    for wave in waves:
+        k = 2.0 * np.pi / wave.wavelength_m
+        a = k * np.cos(wave.direction_rad) * u + wave.phase_rad
+        b = k * np.sin(wave.direction_rad) * v
+        total += wave.amplitude * (np.sin(a) * np.cos(b) + np.cos(a) * np.sin(b))
+    return total
+
+
+def evaluate_field(waves: Sequence[Wave], u: Float, v: Float) -> Float:
+    """Sum many waves: a row and a column meet in one product of matrices, anything else wave by wave."""
+    if np.ndim(u) == np.ndim(v) == 2 and np.shape(u)[0] == np.shape(v)[1] == 1:
+        amplitude, length, direction, phase = np.array([astuple(wave) for wave in waves]).T
+        a = 2.0 * np.pi / length * np.cos(direction) * u.T + phase
+        b = 2.0 * np.pi / length * np.sin(direction) * v
+        return np.asarray((amplitude * np.cos(b)) @ np.sin(a).T + (amplitude * np.sin(b)) @ np.cos(a).T)
+    total = np.zeros(np.broadcast_shapes(np.shape(u), np.shape(v)))
+    for wave in waves:
+        k = 2.0 * np.pi / wave.wavelength_m
+        total += wave.amplitude * np.sin(
+            k * np.cos(wave.direction_rad) * u + k * np.sin(wave.direction_rad) * v + wave.phase_rad
+        )
+    return total
+
+
+def state(waves: Sequence[Wave], u: Float, v: Float) -> Float:
+    """Return a field that is spread evenly over -1 … 1, of waves whose squares sum to 1."""
+    return np.asarray(erf(evaluate_field(waves, u, v) / np.sqrt(2.0)))
+
+
+@dataclass(frozen=True, slots=True)
+class SurfaceEffect:
+    """What the states do to one class of ground, where they are 1; where they are -1 the opposite."""
+
+    wet_shade: float = 0.0
+    """Brightness taken away, as a fraction."""
+    wet_resistance: float = 0.0
+    """Rolling resistance added, as a fraction; so with cover."""
+    cover_resistance: float = 0.0
+    grain: float = 0.0
+    """Deviation of the brightness from pixel to pixel where cover is 0, as a fraction."""
+    bump_m: float = 0.0
+    """Deviation of the height by bumps where roughness is 0; so with ridges."""
+    ridge_m: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Surface:
+    """The states of a site's ground; the waves of each have a deviation of 1 together."""
+
+    looks: dict[int, SurfaceEffect]
+    """By class id; a class that is not named has none."""
+    wetness: tuple[Wave, ...]
+    cover: tuple[Wave, ...]
+    roughness: tuple[Wave, ...]
+    grain: tuple[Wave, ...]
+    bumps: tuple[Wave, ...]
+    ridges: tuple[Wave, ...]
+    noise: tuple[Wave, ...]
+    map_noise_std_m: float
+    """Of the height raster, which costs nothing."""
+    swing: float
+    """By how much grain, bumps and ridges grow where their state is 1, as a fraction."""
+
+    def shade(self, classes: NDArray[np.uint8], u: Float, v: Float) -> Float:
+        """Return what the brightness is multiplied with, at offsets from the site's corner [m]."""
+        grain = 1.0 + self.swing * state(self.cover, u, v)
+        grain *= self._by_class("grain")[classes] * evaluate_field(self.grain, u, v)
+        return np.asarray((1.0 - self._by_class("wet_shade")[classes] * state(self.wetness, u, v)) * (1.0 + grain))
+
+    def resistance(self, classes: NDArray[np.uint8], u: Float, v: Float) -> Float:
+        """Return the rolling resistance that is added, as a fraction of the class's."""
+        wet = self._by_class("wet_resistance")[classes] * state(self.wetness, u, v)
+        return np.asarray(wet + self._by_class("cover_resistance")[classes] * state(self.cover, u, v))
+
+    def relief_m(self, classes: NDArray[np.uint8], u: Float, v: Float) -> Float:
+        """Return the height of bumps and ridges [m]."""
+        relief = self._by_class("bump_m")[classes] * evaluate_field(self.bumps, u, v)
+        relief += self._by_class("ridge_m")[classes] * evaluate_field(self.ridges, u, v)
+        return np.asarray(relief * (1.0 + self.swing * state(self.roughness, u, v)))
+
+    def map_noise_m(self, u: Float, v: Float) -> Float:
+        """Return what the height raster errs by [m]."""
+        return self.map_noise_std_m * evaluate_field(self.noise, u, v)
+
+    def _by_class(self, name: str) -> Float:
+        """Return one number of every class's look, by class id."""
+        table = np.zeros(256)
+        table[list(self.looks)] = [getattr(look, name) for look in self.looks.values()]
+        return table
+
 
 OBSTACLE, TREE, VEGETATION, GRASS, MUD, UNPAVED, PAVED = range(1, 8)
 

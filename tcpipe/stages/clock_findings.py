@@ -14,14 +14,12 @@ from tcpipe.fusion.checks.mounting import solve_lag
 from tcpipe.fusion.measurements import GNSS, IMU
 from tcpipe.power.rails import compute_power_at
 from tcpipe.recipe.suggestions import suggest
-from tcpipe.stages.fuse_inputs import FusionInputs, find_longest_epoch
-from tcpipe.stages.fuse_mounting import compute_moved_m
+from tcpipe.stages.fuse_inputs import FusionInputs, compute_moved_m, find_longest_epoch, find_recipe_role
 from tcpipe.stages.fuse_stretches import Fused
-from tcpipe.stages.power_rails import make_rails
-from tcpipe.stages.read_pose import find_recipe_role
+from tcpipe.stages.message_arrays import make_rails
 from tcpipe.tables.columns import to_floats
 from tcpipe.tables.facts import ClockFacts, ClockOffset, ClockPair
-from tcpipe.tables.findings import Finding, Remedy, StageReport, Subject, make_finding
+from tcpipe.tables.findings import Finding, StageReport, Subject, make_finding
 from tcpipe.tables.levels import Streams
 
 _MAX_GAP_NS = 300_000_000
@@ -50,7 +48,8 @@ def clock_findings(streams: Streams, inputs: FusionInputs) -> StageReport[ClockF
 def _find_offset(found: ClockOffsets, role: str, offset: RoleOffset, streams: Streams) -> Finding:
     """Return the finding on a clock: which is off where two others agree, else that two differ."""
     name = find_recipe_role(role, streams)
-    subject, names = Subject("role", name), {"reference": found.reference, "by": _describe_comparison(found, role)}
+    compared = dict.fromkeys(p.by for p in found.pairs if p.determined and role in {p.late, p.against})
+    subject, names = Subject("role", name), {"reference": found.reference, "by": ", ".join(compared)}
     offset_s, offset_2std_s = offset.offset_s, 2 * offset.std_s
     hours = found.span_s / 3600
     drift_s, drift_2std_s = offset.drift_s_per_h * hours, 2 * offset.drift_std_s_per_h * hours
@@ -67,7 +66,8 @@ def _find_offset(found: ClockOffsets, role: str, offset: RoleOffset, streams: St
             drift_2std_s=drift_2std_s,
         )
     if offset.drifts:
-        remedies = _use_log_time(role, name, streams)
+        by_log = streams.sensors[role].time_source == "log"
+        remedies = () if by_log else suggest("use_log_time", {"read.time": {name: "log"}})
         return make_finding(
             "clock-drift", subject, names=names, remedies=remedies, drift_s=drift_s, drift_2std_s=drift_2std_s
         )
@@ -86,19 +86,9 @@ def _find_offset(found: ClockOffsets, role: str, offset: RoleOffset, streams: St
     )
 
 
-def _use_log_time(role: str, name: str, streams: Streams) -> tuple[Remedy, ...]:
-    by_log = streams.sensors[role].time_source == "log"
-    return () if by_log else suggest("use_log_time", {"read.time": {name: "log"}})
-
-
 def _select_known(each: RoleOffset | Pair) -> dict[str, Any]:
     """Return the fields by name, None for what is not known."""
     return {name: None if isinstance(v, float) and not math.isfinite(v) else v for name, v in asdict(each).items()}
-
-
-def _describe_comparison(found: ClockOffsets, role: str) -> str:
-    """Return by what the role was compared."""
-    return ", ".join(dict.fromkeys(p.by for p in found.pairs if p.determined and role in {p.late, p.against}))
 
 
 def add_offset_uncertainty(track: pa.Table, clocks: ClockFacts) -> pa.Table:

@@ -13,10 +13,16 @@ from tcpipe.fusion.checks.odometry_scale import Scale, compute_command_ratio
 from tcpipe.fusion.measurements import GNSS, IMU, VISUAL, WHEELS
 from tcpipe.geometry.rotation import matrix_from_quat, quat_from_rpy
 from tcpipe.recipe.suggestions import suggest
-from tcpipe.stages.fuse_inputs import FusionInputs, exclude_role, find_longest_epoch, read_command, state_extrinsics
-from tcpipe.stages.fuse_mounting import compute_moved_m
+from tcpipe.stages.fuse_inputs import (
+    FusionInputs,
+    compute_moved_m,
+    exclude_role,
+    find_longest_epoch,
+    find_recipe_role,
+    read_command,
+    state_extrinsics,
+)
 from tcpipe.stages.fuse_stretches import Fused
-from tcpipe.stages.read_pose import find_recipe_role
 from tcpipe.tables.catalogue import read_threshold
 from tcpipe.tables.facts import AuditFacts, Disagreement, FuseFacts, MountingFacts, Reopening, StretchFacts, make_vector
 from tcpipe.tables.findings import Finding, StageReport, Subject, make_finding

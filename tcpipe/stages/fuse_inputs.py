@@ -1,4 +1,7 @@
-"""Measurements by clock epoch, without sensors that contradict physics or the other sensors; findings name the remedy."""
+"""Measurements by clock epoch, without sensors that contradict physics or the other sensors; findings name the remedy.
+
+A pose that another program estimated becomes the fixes of a GNSS.
+"""
 
 from __future__ import annotations
 
@@ -12,23 +15,23 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from tcpipe.fusion import preparation
+from tcpipe.fusion.checks.clock_offsets import smooth_stamps
 from tcpipe.fusion.checks.doppler import check_ground_velocity
 from tcpipe.fusion.checks.mounting import Arm, Tilt
 from tcpipe.fusion.checks.odometry_scale import Scale, rescale_odometries
-from tcpipe.fusion.checks.refusals import SensorExclusion
+from tcpipe.fusion.checks.plausibility import SensorExclusion
 from tcpipe.fusion.checks.sensors import CommandedSpeed, check_sensors
-from tcpipe.fusion.checks.stamp_jitter import smooth_stamps
 from tcpipe.fusion.measurements import DOPPLER, GNSS, IMU, VISUAL, WHEELS, Measurements
 from tcpipe.fusion.preparation import Prepared
+from tcpipe.geometry.datum import geodetic_from_enu
 from tcpipe.geometry.rotation import matrix_from_quat, rpy_from_matrix
 from tcpipe.recipe import FuseConfig
 from tcpipe.recipe.suggestions import suggest
-from tcpipe.stages.read_pose import find_recipe_role
 from tcpipe.tables.arrays import select_rows
 from tcpipe.tables.columns import FloatColumns, to_floats, to_integers
 from tcpipe.tables.facts import SensorChecks
 from tcpipe.tables.findings import Finding, Remedy, StageReport, Subject, make_finding
-from tcpipe.tables.levels import Sensor, Streams
+from tcpipe.tables.levels import STREAMS, Sensor, Streams
 
 
 @dataclass(slots=True)
@@ -171,11 +174,8 @@ def _without(refused: frozenset[str], m: Measurements) -> Measurements:
 
 def find_longest_epoch(inputs: FusionInputs) -> int:
     """Return the clock epoch with most measurements."""
-    return max(inputs.measurements, key=lambda epoch: _count_rows(inputs.measurements[epoch]))
-
-
-def _count_rows(measurements: Measurements) -> int:
-    return sum(sensor.stamp_ns.size for sensor in measurements.sensors().values())
+    counts = {epoch: sum(of.stamp_ns.size for of in m.sensors().values()) for epoch, m in inputs.measurements.items()}
+    return max(counts, key=lambda epoch: counts[epoch])
 
 
 def read_command(streams: Streams, epoch: int) -> CommandedSpeed | None:
@@ -231,3 +231,39 @@ def state_extrinsics(name: str, xyz_m: Sequence[float], turn: NDArray[np.float64
     return suggest(
         "state_extrinsics", {"read.placement": {name: {"xyz_m": place.tolist(), "rpy_rad": rpy_rad.tolist()}}}
     )
+
+
+POSE = "pose"
+_ANYWHERE_DEG_M = (0.0, 45.0, 0.0)
+"""Where a frame that is nowhere on the earth is taken to lie while its positions are fused: east, north and up stay what they are."""
+
+
+def find_recipe_role(role: str, streams: Streams) -> str:
+    """Return the role by which the recipe knows what is fused as ``role``: a pose that stands in for GNSS is a pose there."""
+    roles = streams.report.facts.roles
+    return POSE if role == GNSS and POSE in roles and GNSS not in roles else role
+
+
+def convert_pose_to_fixes(streams: Streams) -> tuple[Streams, bool]:
+    """Return the streams with the pose as the fixes of a GNSS, and whether these lie in a frame that is nowhere on the earth."""
+    pose = streams.tables.get(POSE)
+    if pose is None:
+        return streams, False
+    lon, lat, alt = (to_floats(pose, name) for name in ("lon_deg", "lat_deg", "alt_m"))
+    local = bool(np.isnan(lon).any())
+    if local:
+        place = np.column_stack([to_floats(pose, f"{axis}_m") for axis in "xyz"])
+        lon, lat, alt = geodetic_from_enu(place, datum_deg_m=_ANYWHERE_DEG_M)
+    kept = {name: pose[name] for name in pose.column_names if name in STREAMS[GNSS].names()}
+    fixes = STREAMS[GNSS].table(
+        **kept | {"lon_deg": lon, "lat_deg": lat, "alt_m": alt, "fix_status": np.zeros(pose.num_rows, np.int8)}
+    )
+    tables = {role: table for role, table in streams.tables.items() if role != POSE} | {GNSS: fixes}
+    sensors = {role: sensor for role, sensor in streams.sensors.items() if role != POSE} | {GNSS: streams.sensors[POSE]}
+    return replace(streams, tables=tables, sensors=sensors), local
+
+
+def compute_moved_m(inputs: FusionInputs, streams: Streams) -> NDArray[np.float64]:
+    """Return by how much the arm in use differs from the one that was read [m], shape (3,)."""
+    arms = [m.gnss.lever_arm_m for m in inputs.measurements.values() if m.gnss is not None]
+    return np.asarray(arms[0]) - np.asarray(streams.sensors[GNSS].xyz_m) if arms else np.zeros(3)

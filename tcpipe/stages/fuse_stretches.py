@@ -21,18 +21,16 @@ from tcpipe.fusion.checks.mounting import (
 )
 from tcpipe.fusion.checks.odometry_scale import distance_ratios
 from tcpipe.fusion.error_state import run_error_state
-from tcpipe.fusion.initial import find_initial_state
+from tcpipe.fusion.initial import find_initial_state, find_stationary_intervals
 from tcpipe.fusion.measurements import BodyVelocities, InitialState
 from tcpipe.fusion.signals import compute_median_period_ns, compute_seconds, hold_last, is_in_gap
-from tcpipe.fusion.stationary import find_stationary_intervals
-from tcpipe.fusion.track_sections import TrackSection, cut_stretches, track_stamps
-from tcpipe.fusion.trajectory import DISPLACEMENT_LAGS_S, Trajectory
+from tcpipe.fusion.trajectory import DISPLACEMENT_LAGS_S, TrackSection, Trajectory, cut_stretches, track_stamps
 from tcpipe.geometry.datum import geodetic_from_enu
 from tcpipe.geometry.rotation import matrix_from_quat, rpy_from_matrix, rpy_from_quat
 from tcpipe.power.rails import compute_power_at
 from tcpipe.recipe import FuseConfig
 from tcpipe.stages.fuse_inputs import FusionInputs
-from tcpipe.stages.power_rails import make_rails
+from tcpipe.stages.message_arrays import make_rails
 from tcpipe.tables.arrays import select_rows
 from tcpipe.tables.columns import to_floats, to_integers
 from tcpipe.tables.facts import Disagreement, StretchFacts

@@ -10,21 +10,20 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from tcpipe.cost.labels import Labels, NetLabels, compute_labels, subtract_idle_power
+from tcpipe.cost.labels import Labels, compute_labels, subtract_idle_power
 from tcpipe.cost.physics import ALL, FitSamples, fit_and_validate_physics, fit_physics
 from tcpipe.cost.quality import combine_flags, has_mean_mismatch
 from tcpipe.fusion.trajectory import DISPLACEMENT_LAGS_S
 from tcpipe.geometry.piecewise_linear import interpolate, mean_between
 from tcpipe.motion.row_sections import find_runs, number_pieces
 from tcpipe.motion.uncertainty import compute_along_std_m, compute_displacement_std_m, interpolate_durations_m
-from tcpipe.power.energy import Rule, count_samples_inside, integrate_energy
-from tcpipe.power.idle import IdlePower, estimate_idle_power
+from tcpipe.power.energy import IdlePower, Rule, count_samples_inside, estimate_idle_power, integrate_energy
 from tcpipe.power.noise import estimate_energy_noise, estimate_resolution
 from tcpipe.power.rails import Rail, compute_power_watt
 from tcpipe.recipe import LabelConfig
-from tcpipe.stages.label_facts import label_facts, label_findings
+from tcpipe.stages.label_facts import label_facts, label_findings, sum_energy_entries
 from tcpipe.stages.label_motion import clock_doubtful, find_motion_flags, find_power_flags, make_motion_columns
-from tcpipe.stages.power_rails import make_rails, sum_energy_entries
+from tcpipe.stages.message_arrays import make_rails
 from tcpipe.tables.arrays import make_lines, select_rows, to_numbers
 from tcpipe.tables.bits import DropReason, Quality
 from tcpipe.tables.columns import read_lonlat_deg, to_floats, to_integers
@@ -49,12 +48,9 @@ def label_segments(
     *,
     voltage_range_volt: tuple[float, float] | None,
 ) -> LabelledSegments:
-    """Return the segments with w, v, T, E, their standard deviations as costs of the true metre, and quality bits.
+    """Return the segments with w, v, T, E, their standard deviations, and quality bits.
 
-    Parameters
-    ----------
-    streams : for its power; without it, or where it does not reach, power and energy are null.
-    voltage_range_volt : [V], of the robot's profile; beyond it a label is flagged; no range, no flag.
+    Power and energy are null where ``streams`` has no power. A label beyond ``voltage_range_volt`` [V], of the robot's profile, is flagged.
     """
     rule: Rule = "averaged" if streams.power_averaged else config.integration
     parts, joules = [LABELLED_SEGMENTS.empty()], Counter[str]()
@@ -67,7 +63,7 @@ def label_segments(
         joules.update(sum_energy_entries(rows, rails, rate_hz=gated.info.rate_hz, rule=rule))
         if not cut.num_rows:
             continue
-        cost, above, causes = compute_segment_costs(cut, rows, rails, gated.info, rule=rule, standing=standing)
+        cost, net, causes = compute_segment_costs(cut, rows, rails, gated.info, rule=rule, standing=standing)
         variance_j2.append(causes)
         spans = to_integers(cut, "start_ns"), to_integers(cut, "end_ns")
         count, mean_watt = count_samples_inside(rails, *spans)
@@ -88,7 +84,7 @@ def label_segments(
                 **{name: cut[name] for name in cut.column_names},
                 **make_motion_columns(cut, rows, streams, gated.info, cost),
                 **{name: getattr(cost, name) for name in Labels.__slots__},
-                **{name: getattr(above, name) for name in NetLabels.__slots__},
+                **net,
                 voltage_volt=mean_between(to_integers(rows, "stamp_ns"), to_floats(rows, "voltage_volt"), *spans),
                 physics_power_watt=np.full(cut.num_rows, np.nan),
                 power_samples=count,
@@ -111,14 +107,10 @@ _BETTER_HZ = 20.0
 
 def compute_segment_costs(
     cut: pa.Table, rows: pa.Table, rails: list[Rail], info: TrackInfo, *, rule: Rule, standing: IdlePower
-) -> tuple[Labels, NetLabels, dict[str, NDArray[np.float64]]]:
-    """Return the labels of one epoch's segments, those above standing, and the variances of their energies by cause [J²].
+) -> tuple[Labels, dict[str, NDArray[np.float64]], dict[str, NDArray[np.float64]]]:
+    """Return the labels of one epoch's segments, the net labels, and the variances of their energies by cause [J²].
 
-    The causes are those of `tcpipe.cost.labels`.
-
-    Parameters
-    ----------
-    rows : the gated track's rows of that epoch.
+    ``cut`` and ``rows`` are the epoch's segments and rows of the gated track.
     """
     start_ns, end_ns, stamp_ns = to_integers(cut, "start_ns"), to_integers(cut, "end_ns"), to_integers(rows, "stamp_ns")
     spans = start_ns, end_ns, _find_stationary_ns(rows, info.rate_hz)
@@ -135,7 +127,7 @@ def compute_segment_costs(
         displacement_std_m=_compute_displacement_std_m(cut, rows, smoothed=info.estimator == "smoother"),
         energy_noise_joule=noise_joule,
     )
-    above = subtract_idle_power(
+    net = subtract_idle_power(
         cost,
         standing_watt=standing.watt,
         standing_std_watt=standing.std_watt,
@@ -144,7 +136,7 @@ def compute_segment_costs(
     )
     position = (end_watt * cost.duration_std_s) ** 2
     causes = {"position": position, "rate": noise.rate, "current": noise.current, "voltage": noise.voltage}
-    return cost, above, {**causes, "at_20_hz": position + np.minimum(better.std_joule(), noise_joule) ** 2}
+    return cost, net, {**causes, "at_20_hz": position + np.minimum(better.std_joule(), noise_joule) ** 2}
 
 
 def _compute_displacement_std_m(cut: pa.Table, rows: pa.Table, *, smoothed: bool) -> NDArray[np.float64]:
@@ -184,12 +176,7 @@ _EDGE_S = 0.3
 
 
 def find_idle_power(rows: pa.Table, rails: Mapping[int, list[Rail]], *, rate_hz: float) -> IdlePower:
-    """Return the power while standing, of all rows of a gated track, and how sure it is.
-
-    Parameters
-    ----------
-    rails : by clock epoch, for the step in which they tell currents.
-    """
+    """Return the idle power of all rows of a gated track, and its standard deviation; ``rails`` (by clock epoch) show the resolution."""
     piece = number_pieces(to_integers(rows, "stamp_ns"), to_integers(rows, "epoch"), period_ns=1e9 / rate_hz)
     standing = (to_numbers(rows["dropped_by"]) & np.uint32(DropReason.STANDING)) != 0
     halt, edge = np.full(rows.num_rows, -1), round(_EDGE_S * rate_hz)
@@ -212,12 +199,9 @@ def _step_watt(rails: Mapping[int, list[Rail]]) -> float:
 
 
 def add_physics(table: pa.Table, standing_watt: float) -> tuple[pa.Table, PhysicsFacts]:
-    """Return the labelled segments with the power that standing, drivetrain, rolling, grade and turning predict, and the fit.
+    """Return the labelled segments of a run with the power that the physical model predicts, and the fit.
 
-    Parameters
-    ----------
-    table : labelled segments of a run.
-    standing_watt : what the robot draws while it stands; NaN where that is not known.
+    The model has idle power ``standing_watt`` (NaN where unknown), drivetrain, rolling, grade and turning.
     """
     metres = FitSamples(
         power_watt=to_floats(table, "power_watt"),

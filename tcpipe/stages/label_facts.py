@@ -1,4 +1,4 @@
-"""What labelling noticed: the run's energy by entry, the noise floor, the count of every quality bit, and findings."""
+"""Facts and findings of labelling: the run's energy by entry, the noise floor, the count of every quality bit."""
 
 from __future__ import annotations
 
@@ -10,14 +10,16 @@ from numpy.typing import NDArray
 
 from tcpipe.cost.labels import estimate_energy_budget, find_noise
 from tcpipe.cost.quality import find_wanted_rate
-from tcpipe.power.energy import Rule
-from tcpipe.power.rails import Rail
-from tcpipe.stages.power_rails import describe_rail
+from tcpipe.motion.distance_breakdown import find_interval_reason, sum_by_reason
+from tcpipe.motion.row_sections import number_pieces
+from tcpipe.power.energy import Rule, integrate_recorded_energy
+from tcpipe.power.noise import compute_median_period_s, estimate_resolution
+from tcpipe.power.rails import Rail, Samples
 from tcpipe.tables.arrays import to_numbers
 from tcpipe.tables.bits import Quality, flag_name
 from tcpipe.tables.catalogue import read_threshold
-from tcpipe.tables.columns import to_floats
-from tcpipe.tables.facts import EnergyBudget, LabelFacts, PhysicsFacts
+from tcpipe.tables.columns import to_floats, to_integers
+from tcpipe.tables.facts import EnergyBudget, LabelFacts, PhysicsFacts, RailFacts, SignalFacts
 from tcpipe.tables.findings import Finding, Subject, make_finding
 
 _POWER, _WHEELS = Subject("role", "power"), Subject("role", "wheel_odometry")
@@ -39,8 +41,7 @@ def label_facts(
     Parameters
     ----------
     rails : drive rails by clock epoch.
-    energy_by_entry_joule : [J], what was recorded, by ledger entry.
-    ledger_m : [m], by entry; its sum is the distance.
+    energy_by_entry_joule, ledger_m : [J] and [m], by entry of the distance breakdown.
     energy_variance_j2 : [J²], of the segments' energies by cause, epoch by epoch in the table's order.
     velocity : which velocity trains, ground or fused.
     """
@@ -117,3 +118,38 @@ def _compute_share(part: NDArray[np.float64], whole: NDArray[np.float64]) -> NDA
 def _compute_median(values: NDArray[np.float64]) -> float | None:
     known = values[np.isfinite(values)]
     return float(np.median(np.abs(known))) if len(known) else None
+
+
+def describe_rail(each: Rail) -> RailFacts:
+    """Return counts, rates and resolutions of a rail's samples."""
+    return RailFacts(each.name, *(_describe_signal(signal) for signal in (each.voltage, each.current)))
+
+
+def _describe_signal(signal: Samples) -> SignalFacts:
+    period_s = compute_median_period_s(signal)
+    return SignalFacts(
+        len(signal.value), 1.0 / period_s if np.isfinite(period_s) else None, estimate_resolution(signal)
+    )
+
+
+def sum_energy_entries(rows: pa.Table, rails: list[Rail], *, rate_hz: float, rule: Rule) -> dict[str, float]:
+    """Return the energy of one epoch's rows by entry of the breakdown [J]; their sum is all that was recorded.
+
+    Entries are every `DropReason` by name, ``steady`` (kept, curved and leftover), and ``outside_track`` (recorded before the track begins
+    or after it ends). ``rate_hz`` is the track's.
+    """
+    stamp_ns = to_integers(rows, "stamp_ns")
+    piece = number_pieces(stamp_ns, to_integers(rows, "epoch"), period_ns=1e9 / rate_hz)
+    reason = find_interval_reason(to_numbers(rows["dropped_by"]), piece)
+    spent = integrate_recorded_energy(rails, stamp_ns[:-1], stamp_ns[1:], rule=rule)
+    record = _integrate_whole_record(rails, rule)
+    steady = float(spent[reason == 0].sum())
+    return sum_by_reason(reason, spent) | {"steady": steady, "outside_track": record - float(spent.sum())}
+
+
+def _integrate_whole_record(rails: list[Rail], rule: Rule) -> float:
+    stamps: list[NDArray[np.int64]] = [each.stamp_ns[[0, -1]] for each in rails if len(each.stamp_ns)]
+    if not stamps:
+        return 0.0
+    ends = np.sort(np.concatenate(stamps))
+    return float(integrate_recorded_energy(rails, ends[:1], ends[-1:], rule=rule)[0])

@@ -29,20 +29,18 @@ _GRAVITY_BAND_MPS2 = (8.0, 12.0)
 
 
 def make_motion_columns(cut: pa.Table, rows: pa.Table, streams: Streams, info: TrackInfo, cost: Labels) -> Arrays:
-    """Return the columns `tcpipe.tables.levels.MOTION_COLUMNS` of one epoch's segments, shape (M,) each.
+    """Return the columns `tcpipe.tables.levels.MOTION_COLUMNS` of one epoch's segments ``cut``, shape (M,) each.
 
-    Parameters
-    ----------
-    cut, rows : the epoch's segments, and its rows of the gated track.
-    streams : for the IMU's samples.
-    cost : of the segments, for how sure their velocity is.
+    ``rows`` are the epoch's rows of the gated track, ``streams`` hold the IMU's samples, ``cost`` the uncertainty of the segments'
+    velocity.
     """
     epoch = int(to_integers(cut, "epoch")[0])
     imu = select_rows(streams.tables["imu"], "epoch", epoch) if "imu" in streams.tables else None
     spans = to_integers(cut, "start_ns"), to_integers(cut, "end_ns")
+    stamp_ns, middle_ns = to_integers(rows, "stamp_ns"), spans[0] + (spans[1] - spans[0]) // 2
     return {
         **_compute_turns(cut, rows, imu, info),
-        **_compute_attitude(rows, spans[0] + (spans[1] - spans[0]) // 2),
+        **{name: interpolate(stamp_ns, to_floats(rows, name), middle_ns) for name in ("roll_rad", "pitch_rad")},
         **_compute_slip(cut, rows, cost),
         "vibration_mps2": _compute_vibration(imu, *spans),
     }
@@ -65,11 +63,9 @@ def _compute_turns(cut: pa.Table, rows: pa.Table, imu: pa.Table | None, info: Tr
 
 
 def _turn_density(cut: pa.Table, imu: pa.Table | None, info: TrackInfo) -> NDArray[np.float64]:
-    """Return how fast the variance of a turn grows [rad²/s], shape (M,): over a metre the gyroscope alone tells it.
+    """Return how fast the variance of a yaw change grows [rad²/s], shape (M,): over a metre the gyroscope alone determines it.
 
     NaN without a gyroscope, and in a forward filter, whose yaw moves with every measurement.
-
-    Positions and odometry hold the yaw itself; of how it changes within a second they tell far less.
     """
     start_ns, density = to_integers(cut, "start_ns"), np.full(cut.num_rows, np.nan)
     facts = info.report.facts.fuse
@@ -82,11 +78,6 @@ def _turn_density(cut: pa.Table, imu: pa.Table | None, info: TrackInfo) -> NDArr
             mine = (start_ns >= each.start_ns) & (start_ns <= each.end_ns)
             density[mine] = estimate_gyro_density(each.gyro_noise_radps, rate_hz)
     return density
-
-
-def _compute_attitude(rows: pa.Table, middle_ns: NDArray[np.int64]) -> Arrays:
-    stamp_ns = to_integers(rows, "stamp_ns")
-    return {name: interpolate(stamp_ns, to_floats(rows, name), middle_ns) for name in ("roll_rad", "pitch_rad")}
 
 
 def _compute_slip(cut: pa.Table, rows: pa.Table, cost: Labels) -> Arrays:
@@ -120,12 +111,7 @@ Flags = dict[Quality, NDArray[np.bool_]]
 
 
 def find_power_flags(cut: pa.Table, rails: list[Rail], *, range_volt: tuple[float, float] | None) -> Flags:
-    """Return the flags that the power samples of one epoch give its segments.
-
-    Parameters
-    ----------
-    range_volt : [V], of the robot's profile; None flags nothing.
-    """
+    """Return the flags that the power samples of one epoch give its segments; without a range of voltages [V] none is out of it."""
     spans = to_integers(cut, "start_ns"), to_integers(cut, "end_ns")
     return {
         Quality.LOW_POWER_RATE: np.full(cut.num_rows, has_low_power_rate(rails)),
@@ -138,11 +124,7 @@ def find_motion_flags(
 ) -> Flags:
     """Return the flags that the gated rows of one epoch give its segments.
 
-    Parameters
-    ----------
-    info : the gated track's; it knows which command is full speed.
-    arc_to_chord : a segment more curved than this is flagged.
-    max_position_std_m : [m], a segment with an end less certain than this is flagged.
+    A segment is flagged that is more curved than ``arc_to_chord`` or has an end less certain than ``max_position_std_m`` [m].
     """
     stamp_ns, start_ns, end_ns = to_integers(rows, "stamp_ns"), to_integers(cut, "start_ns"), to_integers(cut, "end_ns")
     chord_m = to_floats(cut, "chord_m")
@@ -188,10 +170,9 @@ def _find_gap_edges(rows: pa.Table, rate_hz: float) -> NDArray[np.bool_]:
 
 
 def clock_doubtful(streams: Streams, info: TrackInfo) -> bool:
-    """Return whether a clock of the run stepped or is noted as off, or motion or power had to be stamped with the time of the recorder.
+    """Return whether a clock of the run stepped or has an offset, or motion or power has the recorder's time.
 
-    What an IMU's little offset costs is in the positions' deviations.
-    Commands are left out: they mostly have no stamp of their own, and a label does not depend on theirs.
+    Commands mostly have no stamp of their own, and labels do not depend on it. A small offset of an IMU is in the positions' deviations.
     """
     recorder = any(s.time_source == "log" for role, s in streams.sensors.items() if role != "command")
     clocks = info.report.facts.clock_offsets

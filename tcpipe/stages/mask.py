@@ -1,4 +1,4 @@
-"""Track to GatedTrack: mark what is not steady driving, and why; nothing is deleted."""
+"""Track to GatedTrack: mark rows that are not steady driving or not usable, with the reason; nothing is deleted."""
 
 from __future__ import annotations
 
@@ -6,18 +6,21 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from tcpipe.errors import FusionError
+from tcpipe.fusion.trajectory import DISPLACEMENT_LAGS_S
 from tcpipe.motion import masks
-from tcpipe.motion.row_sections import Mask, MotionRows, number_pieces
+from tcpipe.motion.distance_breakdown import JUMP_M, compute_unexplained_m
+from tcpipe.motion.row_sections import Floats, Mask, MotionRows, number_pieces
+from tcpipe.motion.uncertainty import compute_along_std_m, compute_chord_ahead_std_m
 from tcpipe.recipe import GateConfig
 from tcpipe.recipe.suggestions import suggest
 from tcpipe.robots.profiles import MAX_PLAUSIBLE_MPS
-from tcpipe.stages.gate_gaps import find_gaps
 from tcpipe.tables.bits import DropReason, flag_name
 from tcpipe.tables.catalogue import read_threshold
 from tcpipe.tables.columns import to_floats, to_integers
 from tcpipe.tables.facts import GateFacts
 from tcpipe.tables.findings import Finding, Remedy, Subject, make_finding
-from tcpipe.tables.levels import GATED_TRACK, GatedTrack, Track, add_findings
+from tcpipe.tables.levels import GATED_TRACK, TRACK, GatedTrack, Track, add_findings
 
 
 def mask_track(
@@ -32,9 +35,10 @@ def mask_track(
 
     Parameters
     ----------
-    max_velocity_mps : [m/s], the robot profile's maximum; the recipe's goes first. With neither, no row is dropped as below the limit.
+    max_velocity_mps, max_plausible_mps : [m/s], of the robot's profile; the recipe's take precedence. Without a maximum, no row is
+        dropped as
+        below the limit.
     chord_m : [m], length of a segment, over which the relative position error counts.
-    max_plausible_mps : [m/s], the robot profile's; the recipe's goes first.
 
     Raises
     ------
@@ -49,10 +53,10 @@ def mask_track(
         piece=number_pieces(to_integers(table, "stamp_ns"), to_integers(table, "epoch"), period_ns=1e9 * period_s),
         period_s=period_s,
     )
-    gaps = find_gaps(
+    gaps, gap_findings = find_gaps(
         track, rows, chord_m=chord_m, config=config, max_plausible_mps=config.max_plausible_mps or max_plausible_mps
     )
-    found = {DropReason.GAP: gaps.rows, **_find_motion_reasons(rows, config)}
+    found = {DropReason.GAP: np.logical_or.reduce([*gaps.values()]), **_find_motion_reasons(rows, config)}
     limit = find_speed_limit(rows, config, max_velocity_mps=max_velocity_mps)
     limit_mps = limit.limit_mps
     slowest = limit_mps and config.full_speed_fraction * limit_mps
@@ -64,13 +68,13 @@ def mask_track(
     facts = GateFacts(
         rows=table.num_rows,
         rows_kept=int((dropped_by == 0).sum()),
-        gap_rows=gaps.counts(),
+        gap_rows={cause: int(mask.sum()) for cause, mask in gaps.items()},
         rows_dropped={flag_name(reason): int((dropped_by & reason != 0).sum()) for reason in DropReason},
         max_velocity_mps=limit_mps,
         full_speed_mps=slowest,
     )
     gated = GATED_TRACK.table(**{name: table[name] for name in table.column_names}, dropped_by=dropped_by)
-    findings = (*gaps.findings, *find_limits(rows, dropped_by, limit, config))
+    findings = (*gap_findings, *find_limits(rows, dropped_by, limit, config))
     return GatedTrack(gated, add_findings(track.info, findings, replace(track.info.report.facts, gate=facts)))
 
 
@@ -182,3 +186,113 @@ def find_limits(rows: MotionRows, dropped_by: Mask, limit: SpeedLimit, config: G
 
 def _state_limit(speed_mps: float) -> tuple[Remedy, ...]:
     return suggest("state", {"gate": {"max_velocity_mps": round(float(speed_mps), 2)}})
+
+
+_DISPLACEMENTS = [c.name for c in TRACK.columns if c.name.startswith("displacement_std_")]
+
+
+def find_gaps(
+    track: Track, rows: MotionRows, *, chord_m: float, config: GateConfig, max_plausible_mps: float
+) -> tuple[dict[str, Mask], tuple[Finding, ...]]:
+    """Return the rows that are in a gap by cause, and the findings; a row may have several causes.
+
+    An error of scale that all of a run has in common makes no segment worse than the next: it is not part of a chord's own uncertainty.
+    All rows are contradicted where sensors contradict each other over most of the distance and no third decides.
+    """
+    power = to_floats(track.table, "power_watt")
+    without_power = np.isnan(power) & bool(np.isfinite(power).any())
+    moving = np.abs(rows.velocity_mps) >= config.turning_velocity_mps
+    uncertain = moving & (_compute_chord_std_m(track, rows, chord_m, config) > config.max_relative_position_std_m)
+    table, stamp_ns = track.table, to_integers(track.table, "stamp_ns")
+    position_m = np.column_stack([to_floats(table, f"{axis}_m") for axis in "xyz"])
+    velocity_mps = np.column_stack([to_floats(table, f"{name}_velocity_mps") for name in ("east", "north", "up")])
+    off_m = np.append(compute_unexplained_m(stamp_ns, position_m, velocity_mps, rows.piece), 0.0)
+    jumps = np.zeros(len(moving), dtype=np.bool_)
+    steps = np.flatnonzero(off_m > config.max_relative_position_std_m)
+    jumps[steps] = jumps[steps + 1] = True
+    run, findings = Subject("run", track.info.run_id), []
+    share = float(without_power[moving].mean()) if moving.any() else 0.0
+    if share > read_threshold("power-gaps", "min_lost_fraction"):
+        findings.append(make_finding("power-gaps", Subject("role", "power"), lost_fraction=share))
+    share = float(uncertain[moving].mean()) if moving.any() else 0.0
+    if share > read_threshold("distance-uncertain", "min_lost_fraction"):
+        limit_m = config.max_relative_position_std_m
+        findings.append(
+            make_finding("distance-uncertain", run, lost_fraction=share, chord_m=chord_m, max_std_m=limit_m)
+        )
+    if far := int((off_m > JUMP_M).sum()):
+        furthest = int(np.argmax(off_m))
+        at_s = (int(stamp_ns[furthest]) - int(stamp_ns[0])) / 1e9
+        jump_m = float(off_m.max())
+        findings.append(make_finding("position-jumps", run, span_s=(at_s, at_s), jump_m=jump_m, jump_count=far))
+    audit = track.info.report.facts.audit
+    contradicted = np.full(len(moving), bool(audit and audit.undecided))
+    implausible, too_fast = find_implausible(track, rows, jumps, max_plausible_mps)
+    gaps = {"without_power": without_power, "uncertain": uncertain, "jumps": jumps, "contradicted": contradicted}
+    return {**gaps, "implausible": implausible}, (*findings, *too_fast)
+
+
+def _compute_chord_std_m(track: Track, rows: MotionRows, chord_m: float, config: GateConfig) -> Floats:
+    table = track.table
+    course = np.arctan2(to_floats(table, "north_velocity_mps"), to_floats(table, "east_velocity_mps"))
+    common_mps = _compute_common_std_mps(track)
+    told_m = np.column_stack([to_floats(table, name) for name in _DISPLACEMENTS])
+    return compute_chord_ahead_std_m(
+        rows,
+        velocity_std_mps=_subtract_variance(to_floats(table, "forward_velocity_std_mps"), common_mps),
+        position_std_m=compute_along_std_m(to_floats(table, "x_std_m"), to_floats(table, "y_std_m"), course),
+        chord_m=chord_m,
+        slowest_mps=config.turning_velocity_mps,
+        smoothed=track.info.estimator == "smoother",
+        told_s=DISPLACEMENT_LAGS_S,
+        told_std_m=_subtract_variance(told_m, common_mps[:, None] * DISPLACEMENT_LAGS_S),
+    )
+
+
+def _compute_common_std_mps(track: Track) -> Floats:
+    """Return the part of each row's velocity deviation that its whole stretch has in common, since nothing tells how long a metre is."""
+    table = track.table
+    stamp_ns, epoch = to_integers(table, "stamp_ns"), to_integers(table, "epoch")
+    speed_mps = np.linalg.norm([to_floats(table, f"{name}_velocity_mps") for name in ("east", "north", "up")], axis=0)
+    scale_std = np.zeros(len(speed_mps))
+    fuse = track.info.report.facts.fuse
+    for stretch in fuse.stretches if fuse else ():
+        inside = (epoch == stretch.epoch) & (stamp_ns >= stretch.start_ns) & (stamp_ns <= stretch.end_ns)
+        scale_std[inside] = stretch.common_scale_std or 0.0
+    common_mps: Floats = scale_std * speed_mps
+    return common_mps
+
+
+def _subtract_variance(std: Floats, part: Floats) -> Floats:
+    """Return a deviation less a part of it; NaN where it is not known."""
+    return np.sqrt(np.maximum(std**2 - part**2, 0.0))
+
+
+_WINDOW_S = 60.0
+_DRIVES_MPS = 0.1
+
+
+def find_implausible(track: Track, rows: MotionRows, jumps: Mask, limit_mps: float) -> tuple[Mask, tuple[Finding, ...]]:
+    """Return the rows faster than a limit [m/s], by velocity or by the step between two rows, and the finding; a jump is not a speed.
+
+    Raises
+    ------
+    FusionError : the moving median of the speed, over a minute of driving, exceeds the limit.
+    """
+    table = track.table
+    speed_mps = np.hypot(to_floats(table, "east_velocity_mps"), to_floats(table, "north_velocity_mps"))
+    step_mps = np.hypot(*(np.diff(to_floats(table, f"{axis}_m")) for axis in "xy")) / rows.period_s
+    step_mps = np.where((np.diff(rows.piece) == 0) & ~(jumps[1:] & jumps[:-1]), step_mps, 0.0)
+    speed_mps = np.maximum(speed_mps, np.maximum(np.append(step_mps, 0.0), np.append(0.0, step_mps)))
+    implausible: Mask = speed_mps > limit_mps
+    if not implausible.any():
+        return implausible, ()
+    driving_mps = speed_mps[speed_mps > _DRIVES_MPS]
+    window = min(driving_mps.size, rows.count(_WINDOW_S))
+    faster = np.concatenate(([0], np.cumsum(driving_mps > limit_mps)))
+    run, median_mps = Subject("run", track.info.run_id), float(np.median(driving_mps))
+    numbers = {"fast_s": implausible.sum() * rows.period_s, "limit_mps": limit_mps, "median_mps": median_mps}
+    if 2 * int((faster[window:] - faster[:-window]).max()) > window:
+        finding = make_finding("track-too-fast", run, severity="error", action="rejected", **numbers)
+        raise FusionError("the track is faster than plausible", findings=(finding, *track.info.report.findings))
+    return implausible, (make_finding("track-too-fast", run, **numbers),)

@@ -1,9 +1,9 @@
-"""Tables of messages as numpy arrays, for the pure packages."""
+"""The log as stages see it (`LogReader`), and its tables as numpy arrays and power rails, for the domain packages."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping
-from typing import Any
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from typing import Any, Protocol
 
 import numpy as np
 import pyarrow as pa
@@ -12,14 +12,34 @@ from numpy.typing import NDArray
 
 from tcpipe.logs.extrinsics import Transforms
 from tcpipe.logs.messages import LOG_TIME
-from tcpipe.tables.arrays import to_numbers, to_texts
+from tcpipe.logs.topics import Topic
+from tcpipe.power.rails import Rail, make_rail, make_samples
+from tcpipe.tables.arrays import select_rows, to_numbers, to_texts
+from tcpipe.tables.columns import to_floats, to_integers
+from tcpipe.tables.levels import Streams
+
+
+class LogReader(Protocol):
+    """A log: its topics by name, and their tables in one pass."""
+
+    @property
+    def topics(self) -> Mapping[str, Topic]:
+        """Every topic by name, as the log's index tells."""
+
+    def tables(self, topics: Sequence[str]) -> dict[str, pa.Table]:
+        """Return a table a topic: one row a message in the order of log time, ``log_time_ns``, ``publish_time_ns``, fields by dotted name.
+
+        A topic that cannot be decoded is missing from the result.
+        """
+
+    def batches(self, topics: Sequence[str]) -> Iterator[Mapping[str, pa.Table]]:
+        """Yield the same piece by piece: each the next rows of some topics; a message that lies far behind its time comes later."""
 
 
 def make_message_arrays(table: pa.Table, in_lists: Collection[str] = ()) -> dict[str, NDArray[Any]]:
     """Return a table's columns: numbers as they are, texts as str, lists of numbers as (N, k) with NaN where a row is shorter.
 
-    Columns of other kinds (lists of messages, null) are left out, but for the numbers inside lists of messages that ``in_lists`` names
-    (``drivers[].current``): those are (N, k) as well.
+    Of lists of messages only the numbers are read that ``in_lists`` names, as ``drivers[].current``: those are (N, k) as well.
     """
     found: dict[str, NDArray[Any]] = {}
     for name in table.column_names:
@@ -110,17 +130,10 @@ _PUBLISH_TIME = "publish_time_ns"
 def gather_messages(
     batches: Iterable[Mapping[str, pa.Table]], played: Mapping[str, Collection[str]]
 ) -> tuple[dict[str, Arrays], dict[str, pa.Table]]:
-    """Return the messages of a log by topic, in the order of log time.
+    """Return the messages of a log by topic, in order of log time: ``played`` topics as arrays, others as tables.
 
-    Parameters
-    ----------
-    batches : tables by topic, piece after piece, as a log gives them.
-    played : topics whose messages are wanted as arrays, each with the numbers inside lists of messages (see `make_message_arrays`).
-
-    Returns
-    -------
-    arrays : of the topics that are played; columns that never change are read-only and take the room of one row.
-    tables : of the other topics.
+    ``batches`` are tables by topic, piece after piece; ``played`` names with each topic the numbers inside lists of messages (see
+    `make_message_arrays`). Columns that never change are read-only and need the memory of one row.
     """
     pieces: dict[str, list[Arrays]] = {}
     others: dict[str, list[pa.Table]] = {}
@@ -180,3 +193,21 @@ def _sort_columns(columns: Arrays) -> Arrays:
         return columns
     order = np.argsort(log_time_ns, kind="stable")
     return {name: values if _is_constant(values) else values[order] for name, values in columns.items()}
+
+
+def make_rails(streams: Streams, epoch: int) -> list[Rail]:
+    """Return the drive rails of one clock epoch, for all who ask for power, in the order of their names; none without power."""
+    table = streams.tables.get("power")
+    if table is None:
+        return []
+    # Of the whole run: a rail that is silent in an epoch is not known there.
+    names = sorted(pc.unique(table["rail"]).to_pylist())
+    table = select_rows(table, "epoch", epoch)
+    rails = []
+    for name in names:
+        mine = select_rows(table, "rail", name)
+        signals = (
+            make_samples(to_integers(mine, "stamp_ns"), to_floats(mine, c)) for c in ("voltage_volt", "current_amp")
+        )
+        rails.append(make_rail(name, *signals, averaged=streams.power_averaged))
+    return rails

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -11,24 +11,22 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from tcpipe.errors import RoleError
-from tcpipe.logs.clocks import Timeline, TopicTimes, settle_clocks
+from tcpipe.logs.clocks import RECIPE, AlignedClocks, Timeline, TopicTimes, settle_clocks
 from tcpipe.logs.role_findings import find_missing_roles
-from tcpipe.logs.roles import MOTION_ROLES
-from tcpipe.logs.simulated_clock import CLOCK
+from tcpipe.logs.roles import MOTION_ROLES, RoleAssignment
+from tcpipe.logs.simulated_clock import CLOCK, LOG_CLOCK
 from tcpipe.power.readings import PowerReadings
 from tcpipe.power.sources import list_power_lists
 from tcpipe.recipe import ReadConfig
 from tcpipe.robots.profiles import Profiles
-from tcpipe.stages.message_arrays import gather_messages
-from tcpipe.stages.protocols import LogReader
-from tcpipe.stages.read_findings import read_findings
-from tcpipe.stages.read_pose import place_pose
+from tcpipe.stages.message_arrays import LogReader, gather_messages
 from tcpipe.stages.read_power import add_averaging, find_repeats, read_rail_power, remove_repeats
 from tcpipe.stages.read_roles import decide_roles, find_power_candidates
-from tcpipe.stages.read_sensors import place_sensors
-from tcpipe.stages.read_sources import TopicReadings, read_sources
-from tcpipe.tables.findings import StageReport
-from tcpipe.tables.levels import STREAMS, Streams
+from tcpipe.stages.read_sources import TopicReadings, place_pose, place_sensors, read_sources
+from tcpipe.tables.catalogue import Severity, read_threshold
+from tcpipe.tables.facts import PowerSign, RobotChoice, RoleFacts, StageFacts, TopicClock, TopicFacts
+from tcpipe.tables.findings import Finding, StageReport, Subject, make_finding
+from tcpipe.tables.levels import STREAMS, Sensor, Streams
 
 
 def read_run(log: LogReader, config: ReadConfig, *, robot: str | None, known: Profiles) -> Streams:
@@ -36,14 +34,12 @@ def read_run(log: LogReader, config: ReadConfig, *, robot: str | None, known: Pr
 
     Parameters
     ----------
-    log : the opened log.
-    config : topics, placements, clocks and power, where the log does not say.
+    config : topics, extrinsics, clocks and power, where the log does not say.
     robot : profile name; None finds it by message types and topic names.
-    known : robots, and what message types tell of power.
 
     Raises
     ------
-    RoleError : a role cannot be decided, or nothing in the log tells motion.
+    RoleError : a role cannot be decided, or no topic measures motion.
     RecipeError : no profile has the robot's name.
     """
     # 1. Which topic plays which role, from the topic list alone.
@@ -137,3 +133,92 @@ def _read_parts(source: TopicReadings, timeline: Timeline, power: PowerReadings)
         values = {**times, "rail": np.full(len(known), rail.name), "voltage_volt": voltage, "current_amp": current}
         parts.append({name: value[known] for name, value in values.items()})
     return parts
+
+
+_EXPECTED = frozenset({"not_gga", "no_velocity"})
+"""Reasons why messages of a topic are of no use to a role: sentences of other kinds."""
+
+
+def read_findings(
+    assignment: RoleAssignment,
+    sources: Sequence[TopicReadings],
+    clocks: AlignedClocks,
+    *,
+    power: PowerReadings,
+    sensors: Mapping[str, Sensor],
+    offset_s: Mapping[str, float],
+) -> StageReport[StageFacts]:
+    """Return the findings and facts of a read log; ``offset_s`` [s] is what the recipe adds to a role's stamps."""
+    timelines, steps = clocks.timelines, clocks.steps
+    findings = [*assignment.findings, *power.findings]
+    findings += clocks.simulated.find_simulated_time() if clocks.simulated else ()
+    for source in sources:
+        findings += source.readings.findings
+        findings += _find_unused(source, timelines.get(source.key))
+        if source.key in timelines:
+            findings += _find_clock(source, timelines[source.key], is_simulated=clocks.simulated is not None)
+    start_ns = min((int(of.readings.log_time_ns[0]) for of in sources if len(of.readings.row)), default=0)
+    for step in steps:
+        at_s, names = (step.log_time_ns - start_ns) / 1e9, {"topics": ", ".join(step.topics)}
+        span_s, step_s = (at_s, at_s), step.step_s
+        findings.append(make_finding("clock-step", LOG_CLOCK, span_s=span_s, names=names, step_s=step_s, at_s=at_s))
+    facts = StageFacts(
+        robot=RobotChoice(assignment.robot, assignment.robot_why),
+        roles={role: _make_role_facts(role, assignment, sources, timelines, sensors[role]) for role in sensors},
+        left_out=assignment.left_out,
+        epochs=len(steps) + 1,
+        clock_steps=tuple(steps),
+        time_offset_s=offset_s,
+        power=None if power.current_sign is None else PowerSign(power.current_sign, power.averaged, power.includes),
+    )
+    return StageReport(tuple(dict.fromkeys(findings)), facts)
+
+
+def _find_unused(source: TopicReadings, timeline: Timeline | None) -> Iterator[Finding]:
+    """Yield the finding that many messages are not used; the numbers count them by reason."""
+    dropped = source.readings.dropped | (timeline.dropped if timeline is not None else {})
+    counts = {f"{reason}_count": count for reason, count in dropped.items() if reason not in _EXPECTED}
+    unused, messages = sum(counts.values()), source.messages
+    if unused > read_threshold("messages-unused", "min_unused_fraction") * messages:
+        numbers: dict[str, Any] = {"unused_fraction": unused / messages, "messages_count": messages, **counts}
+        names = {"topic": source.topic, "reasons": ", ".join(name.removesuffix("_count") for name in counts)}
+        yield make_finding("messages-unused", Subject("role", source.role), names=names, **numbers)
+
+
+def _find_clock(source: TopicReadings, timeline: Timeline, *, is_simulated: bool) -> Iterator[Finding]:
+    """Yield the findings on a topic's stamps: that log time is used, that some were replaced, that all were moved."""
+    role, names = Subject("role", source.role), {"topic": source.topic}
+    by_simulation = is_simulated and timeline.source == "log" and any(timeline.moved_s)
+    if timeline.source == "log" and (by_simulation or source.readings.header_ns is not None):
+        severity: Severity | None = "note" if timeline.why == RECIPE else None
+        yield make_finding("log-time-used", role, severity=severity, names=names | {"reason": timeline.why})
+    if count := timeline.notes.get("stamps_replaced"):
+        yield make_finding("stamps-replaced", role, names=names, stamps_count=count)
+    for epoch, moved_s in enumerate(timeline.moved_s):
+        if moved_s and not by_simulation:
+            yield make_finding("topic-clock-offset", role, names=names, moved_s=moved_s, clock_epoch=epoch)
+
+
+def _make_role_facts(
+    role: str,
+    assignment: RoleAssignment,
+    sources: Sequence[TopicReadings],
+    timelines: Mapping[str, Timeline],
+    sensor: Sensor,
+) -> RoleFacts:
+    played = [source for source in sources if source.role == role and source.key in timelines]
+    topics = {source.topic: _make_topic_facts(source, timelines[source.key]) for source in played}
+    return RoleFacts(assignment.roles[role].why, sensor.frame_id, sensor.placed_by, topics)
+
+
+def _make_topic_facts(source: TopicReadings, timeline: Timeline) -> TopicFacts:
+    period_ns = np.diff(timeline.stamp_ns)[np.diff(timeline.epoch) == 0]
+    return TopicFacts(
+        type=source.type_name,
+        messages=source.messages,
+        rows=len(timeline.row),
+        rate_hz=1e9 / float(np.median(period_ns)) if len(period_ns) else None,
+        dropped=source.readings.dropped | timeline.dropped,
+        notes={name: count for name, count in source.readings.notes.items() if count} | timeline.notes,
+        time=TopicClock(timeline.source, timeline.why, timeline.offset_s, timeline.moved_s),
+    )

@@ -13,11 +13,9 @@ from numpy.typing import NDArray
 
 from tcpipe.logs.messages import LOG_TIME, Readings, read_header_ns
 from tcpipe.logs.roles import RoleAssignment
-from tcpipe.power.averaging import is_stated_averaged
-from tcpipe.power.counters import Counter
 from tcpipe.power.readings import PowerReadings, read_power
-from tcpipe.power.repeats import find_readings
-from tcpipe.power.sources import RailReadings, reject_power
+from tcpipe.power.sampling import find_readings, is_stated_averaged
+from tcpipe.power.sources import Counter, RailReadings, reject_power
 from tcpipe.recipe import ReadConfig
 from tcpipe.recipe.suggestions import suggest
 from tcpipe.robots.profiles import Profiles

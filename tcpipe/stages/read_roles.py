@@ -16,8 +16,7 @@ from tcpipe.power.sources import FLOAT_TYPES, LARGEST_AMP, LARGEST_VOLT, find_qu
 from tcpipe.recipe import ReadConfig, Recipe, Role
 from tcpipe.recipe.suggestions import TomlValue, suggest
 from tcpipe.robots.profiles import Profiles
-from tcpipe.stages.message_arrays import make_message_arrays
-from tcpipe.stages.protocols import LogReader
+from tcpipe.stages.message_arrays import LogReader, make_message_arrays
 from tcpipe.tables.findings import Finding, Subject, make_finding
 
 

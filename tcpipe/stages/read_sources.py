@@ -1,25 +1,37 @@
-"""The topics that play a role, each with its messages as arrays and its usable readings."""
+"""The topics that are used as a role: their messages as arrays, usable readings, and the extrinsics of their sensors.
+
+A sensor's extrinsics come from the recipe, from static transforms, or are assumed, with a finding. A pose that another program estimated
+(SLAM, post-processing) gets longitude and latitude where the recipe states its CRS; it is used as GNSS.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
-from typing import Any, cast
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any, cast, get_args
 
+import pyarrow as pa
 from numpy.typing import NDArray
 
-from tcpipe.errors import RoleError
+from tcpipe.errors import MapError, RecipeError, RoleError
+from tcpipe.geometry.rotation import quat_from_rpy
+from tcpipe.logs.clocks import Timeline
 from tcpipe.logs.conversions import convert_imu_to_si, scale_odometry, select_ground_velocity
+from tcpipe.logs.extrinsics import IDENTITY, Pose, Tree, build_static_tree, find_base_link_from, is_base
 from tcpipe.logs.field_mapping import MAPPED_TYPES, make_mapped_message
 from tcpipe.logs.messages import LOG_TIME, Readings, count_frames, find_utc_offset, list_needed_fields, read_messages
 from tcpipe.logs.role_findings import make_topic_not_decoded
 from tcpipe.logs.roles import RoleAssignment
 from tcpipe.logs.topics import Topic
 from tcpipe.power.readings import PowerReadings
-from tcpipe.recipe import ReadConfig, Role
+from tcpipe.recipe import Placement, ReadConfig, Role
+from tcpipe.recipe.suggestions import suggest
 from tcpipe.robots.profiles import Profiles
+from tcpipe.stages.message_arrays import LogReader, read_transforms
 from tcpipe.stages.read_power import read_power_of_topics, select_power_rows
+from tcpipe.tables.columns import to_floats
 from tcpipe.tables.findings import Finding, Subject, make_finding
+from tcpipe.tables.levels import STREAMS, Sensor
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,13 +59,9 @@ def read_sources(
     *,
     known: Profiles,
 ) -> tuple[list[TopicReadings], PowerReadings, list[Finding]]:
-    """Read the messages of every topic that plays a role; they are taken out of ``messages``, so that no log is held twice.
+    """Return one `TopicReadings` a topic in the order of the roles, the power rails, and findings on topics that cannot be decoded.
 
-    Returns
-    -------
-    sources : one a topic, in the order of the roles.
-    power : the rails, empty where there is no power or it was refused.
-    findings : topics that play a role but cannot be decoded.
+    Messages are removed from ``messages`` as they are read, so that no log is in memory twice.
 
     Raises
     ------
@@ -116,3 +124,114 @@ def _read_fields(columns: dict[str, NDArray[Any]], role: Role, config: ReadConfi
     if isinstance(mapped, list):
         raise RoleError(*mapped)
     return mapped
+
+
+_WITHOUT_PLACE = ("power", "command", "gnss_velocity")
+"""A receiver's velocity is that of its antenna, which the fixes place."""
+
+
+def place_sensors(
+    log: LogReader,
+    tables: Mapping[str, pa.Table],
+    assignment: RoleAssignment,
+    sources: Sequence[TopicReadings],
+    timelines: Mapping[str, Timeline],
+    *,
+    config: ReadConfig,
+) -> tuple[dict[str, Sensor], list[Finding]]:
+    """Return each role's sensor, and findings: frames that nothing places, topics with several frames.
+
+    /tf is read only where /tf_static leaves a frame unplaced: it is large, and constant only in logs that lack the other.
+    """
+    of_role = {role: [source for source in sources if source.role == role] for role in get_args(Role)}
+    frame_of = {role: next(iter(found[0].frames), "") for role, found in of_role.items() if found}
+    open_frames = {
+        frame
+        for role, frame in frame_of.items()
+        if role not in config.placement and role not in _WITHOUT_PLACE and not is_base(frame)
+    }
+    tree = _build_tree(log, tables, assignment, open_frames)
+    sensors: dict[str, Sensor] = {}
+    findings: list[Finding] = []
+    for role, frame in frame_of.items():
+        pose, placed_by = _place(role, frame, tree, config)
+        subject, several = Subject("role", role), of_role[role][0].frames
+        if role not in _WITHOUT_PLACE and len(several) > 1:
+            names = {"frame": frame, "frames": ", ".join(several)}
+            findings.append(make_finding("several-frames", subject, names=names, frames_count=len(several)))
+        if placed_by == "assumed":
+            names = {"frame": frame or "an unnamed frame", "topic": of_role[role][0].topic}
+            remedies = suggest("place", {"read.placement": {role: asdict(Placement())}})
+            findings.append(make_finding("sensor-not-placed", subject, names=names, remedies=remedies))
+        sensors[role] = Sensor(
+            topic=" + ".join(source.topic for source in of_role[role]),
+            type_name=of_role[role][0].type_name,
+            frame_id=frame,
+            why=assignment.roles[role].why,
+            xyz_m=(float(pose.xyz_m[0]), float(pose.xyz_m[1]), float(pose.xyz_m[2])),
+            quat_xyzw=tuple(float(component) for component in pose.quat_xyzw),  # type: ignore[arg-type]
+            placed_by=placed_by,
+            time_source=timelines[of_role[role][0].key].source,
+        )
+    return sensors, findings
+
+
+def _build_tree(
+    log: LogReader, tables: Mapping[str, pa.Table], assignment: RoleAssignment, open_frames: set[str]
+) -> Tree:
+    static = [read_transforms(tables[topic]) for topic in assignment.transforms if topic in tables]
+    tree = build_static_tree(static)
+    moving = [topic for topic in assignment.transforms if topic not in tables]
+    if moving and any(find_base_link_from(frame, tree) is None for frame in open_frames):
+        tree = build_static_tree([*static, *(read_transforms(table) for table in log.tables(moving).values())])
+    return tree
+
+
+def _place(role: Role, frame: str, tree: Tree, config: ReadConfig) -> tuple[Pose, str]:
+    if role in config.placement:
+        given = config.placement[role]
+        return Pose(IDENTITY.xyz_m + given.xyz_m, quat_from_rpy(*given.rpy_rad)), "recipe"
+    if role in _WITHOUT_PLACE:
+        return IDENTITY, "not needed"
+    found = find_base_link_from(frame, tree)
+    if frame.rsplit("/", 1)[-1] == "base_link":
+        return IDENTITY, "same frame"
+    if found is not None and frame in tree:
+        return found, "tf_static"
+    return IDENTITY, "same frame" if is_base(frame) else "assumed"
+
+
+_POSE = "pose"
+_POSE_ROLE = Subject("role", _POSE)
+
+
+def place_pose(
+    streams: Mapping[str, pa.Table], assignment: RoleAssignment, config: ReadConfig
+) -> tuple[dict[str, pa.Table], str, tuple[Finding, ...]]:
+    """Return the streams with the pose in longitude and latitude, the CRS of these, and findings.
+
+    Raises
+    ------
+    RecipeError : `read.pose_crs` is no projected CRS.
+    """
+    if _POSE not in streams:
+        return dict(streams), config.gnss_crs, ()
+    found = make_finding("pose-used-as-gnss", _POSE_ROLE, names={"topic": assignment.roles[_POSE].topics[0]})
+    if config.pose_crs is None:
+        return dict(streams), config.gnss_crs, (found, make_finding("pose-not-georeferenced", _POSE_ROLE))
+    from pyproj import Transformer  # noqa: PLC0415  only where a pose is placed
+
+    from tcpipe.terrain.projection import format_crs, parse_crs  # noqa: PLC0415
+
+    try:
+        crs = parse_crs(config.pose_crs, where="recipe read.pose_crs")
+    except MapError as error:
+        raise RecipeError(*error.problems) from None
+    if not crs.is_projected or crs.geodetic_crs is None:
+        raise RecipeError(f"recipe read.pose_crs: {crs.name} is not projected (metres); positions in degrees play gnss")
+    pose = streams[_POSE]
+    lon, lat = Transformer.from_crs(crs, crs.geodetic_crs, always_xy=True).transform(
+        to_floats(pose, "x_m"), to_floats(pose, "y_m")
+    )
+    columns = {name: pose[name] for name in pose.column_names} | {"lon_deg": lon, "lat_deg": lat, "alt_m": pose["z_m"]}
+    return {**streams, _POSE: STREAMS[_POSE].table(**columns)}, format_crs(crs.geodetic_crs.to_2d()), (found,)

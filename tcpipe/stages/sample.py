@@ -29,7 +29,7 @@ class Sampled:
     """L6 before the split: N patches of M segments, from one map or several.
 
     ``kept`` are the rows of the segments that have a patch, (N,), rising on each map; all else of N is in that order. ``map_index`` says
-    which map each lies on. Footprints are counter-clockwise from rear right, (N, 4, 2): in the first map's CRS [m], and as WGS 84 lon, lat
+    which map each is on. Footprints are counter-clockwise from rear right, (N, 4, 2): in the first map's CRS [m], and as WGS 84 lon, lat
     [deg]. ``lost_by`` is each segment's `Loss`, 0 if kept, (M,). Where pixels wait in files, those of ``patches`` are empty.
     """
 
@@ -45,11 +45,12 @@ class Sampled:
 def sample_segments(
     segments: pa.Table, source: MapReader, config: SampleConfig, *, gnss_crs: str, pool: TilePool | None = None
 ) -> Sampled:
-    """Return the patches of all segments that lie on the map.
+    """Return the patches of all segments that are on the map.
 
     Parameters
     ----------
-    segments : L5 of any runs, or `PLACED_SEGMENTS` of it; reasons rule in the order position uncertain, off the map, nodata, untraversable.
+    segments : L5 of any runs, or `PLACED_SEGMENTS` of it; of several reasons the first counts: position uncertain, off the map, nodata,
+        untraversable.
     source, pool : the map, and its tiles as `sample_patches` takes them.
     gnss_crs : geographic CRS of the segments' longitudes and latitudes.
 
@@ -131,18 +132,13 @@ def sample_on_maps(
     gnss_crs: str,
     pools: Sequence[TilePool | None] | None = None,
 ) -> Sampled:
-    """Return the patches of all segments that lie on one of the maps, map by map.
+    """Return the patches of all segments that are on one of the maps; where maps overlap, the earlier one counts.
 
-    Parameters
-    ----------
-    segments : as `sample_segments`.
-    sources : the maps; where they overlap, the earlier one is taken.
-    gnss_crs : geographic CRS of the segments' longitudes and latitudes.
-    pools : as `sample_patches`, one a map.
+    Parameters as `sample_segments`; ``pools`` has one a map.
 
     Raises
     ------
-    TableError, MapError : as `sample_segments`; the maps have not the same layers or classes, or lie too far from one another.
+    TableError, MapError : as `sample_segments`; the maps have not the same layers or classes, or are too far apart.
     """
     check_same_layers(sources)
     lost_by = np.full(segments.num_rows, Loss.OUTSIDE_MAP, np.uint32)

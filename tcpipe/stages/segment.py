@@ -17,9 +17,9 @@ from tcpipe.motion.distance_breakdown import (
     compute_interval_length_m,
     find_interval_reason,
     find_kept_spans,
+    find_losses,
     sum_by_reason,
 )
-from tcpipe.motion.remedies import find_losses
 from tcpipe.motion.row_sections import number_pieces
 from tcpipe.path import Cut, cut_by_chord
 from tcpipe.recipe import SegmentConfig

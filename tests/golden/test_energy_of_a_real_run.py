@@ -12,7 +12,7 @@ from tcpipe.power.energy import integrate_recorded_energy
 from tcpipe.power.rails import make_rail, make_samples
 from tcpipe.recipe import ReadConfig
 from tcpipe.stages import read
-from tcpipe.stages.power_rails import make_rails
+from tcpipe.stages.message_arrays import make_rails
 from tcpipe.stages.read import read_run
 
 

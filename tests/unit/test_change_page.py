@@ -20,9 +20,10 @@ ROWS = [
 PLACES = {
     re.findall(r"\*\*(.+?)\*\*", row[0])[0]: re.findall(r"`(tcpipe/[\w/.]+)(?:: (\w+))?`", row[2]) for row in ROWS
 }
-NEW = {"tcpipe/robots/NAME.toml", "tcpipe/cli/NAME.py"}
+NEW = {"tcpipe/robots/NAME.toml"}
 
-FIRST, REPLACE, APPEND, CREATE = "first statement", "replace", "append", "create"
+FIRST, LAST, REPLACE, APPEND, CREATE = "first statement", "last statement", "replace", "append", "create"
+COLUMN = "dataclasses.replace({0}, columns=(*{0}.columns, Column('mine', pa.float64(), 'm', 'mine')))"
 CHANGES = {
     "threshold": ("FuseConfig", REPLACE, "= 0.999\n", "= 0.99\n"),
     "outlier gate": ("find_chi_square_threshold", FIRST, "probability = 0.5"),
@@ -31,14 +32,13 @@ CHANGES = {
     "w, v, T, E and their σ": ("compute_labels", FIRST, "displacement_std_m = 2 * displacement_std_m"),
     "column of segments": (
         "LABELLED_SEGMENTS",
-        REPLACE,
-        "*MOTION_COLUMNS, *_LABEL_COLUMNS, LINE",
-        'Column("mine", _F64, "m", "mine"), *MOTION_COLUMNS, *_LABEL_COLUMNS, LINE',
+        APPEND,
+        f"\nimport dataclasses\nLABELLED_SEGMENTS = {COLUMN.format('LABELLED_SEGMENTS')}\n",
     ),
-    "column of samples": ("SAMPLES", REPLACE, 'Column("split",', 'Column("mine", _F64, "m", "mine"), Column("split",'),
-    "label flag": ("Quality", REPLACE, "    LOW_POWER_RATE =", "    MINE = 1 << 30\n    LOW_POWER_RATE ="),
+    "column of samples": ("SAMPLES", APPEND, f"\nSAMPLES = {COLUMN.format('SAMPLES')}\n"),
+    "label flag": ("Quality", LAST, "MINE = 1 << 30"),
     "split's buffer": ("classify_footprints", FIRST, "buffer_m = 3.0"),
-    "layer": ("LAYERS", REPLACE, '"height")', '"height", "mine")'),
+    "layer": ("LAYERS", APPEND, "\nLAYERS = (*LAYERS, 'mine')\n"),
     "robot": ("tcpipe/robots/NAME.toml", CREATE, "[robots.mine]\nmax_velocity_mps = 3.0\n"),
     "power message": (
         "tcpipe/robots/power_sources.toml",
@@ -51,17 +51,18 @@ CHANGES = {
         APPEND,
         '\n[mine]\ntitle = "Mine"\ntemplate = "{subject}: mine"\nseverity = "note"\ncause = "A test."\n',
     ),
-    "command": ("_COMMANDS", REPLACE, '    "demo":', '    "mine": ("mine", "My command"),\n    "demo":'),
-    "command option": (
-        "IngestOptions",
-        REPLACE,
-        "    as_one: bool",
-        '    mine: bool = option(False, Option("Mine."))\n    as_one: bool',
-    ),
+    "command": ("_COMMANDS", APPEND, "\n_COMMANDS['mine'] = ('mine', 'My command')\n"),
+    "command option": ("IngestOptions", LAST, "mine: bool = option(False, Option('Mine.'))"),
     "plot of a page": ("time_plots", FIRST, "return 'mine'"),
 }
 """By row: the name (or file) that is changed, and how."""
 
+IMPORTS = "".join(
+    f"from {file.removesuffix('.py').replace('/', '.')} import {name}\n"
+    for places in PLACES.values()
+    for file, name in places
+    if name and name != "take"
+)
 EFFECTS = """
 import inspect, json
 from pathlib import Path
@@ -69,19 +70,13 @@ import numpy as np, shapely
 from click.testing import CliRunner
 import tcpipe
 from tcpipe.cli import cli
-from tcpipe.cost.labels import compute_labels
 from tcpipe.errors import LogError
-from tcpipe.formats.robot_files import load_shipped_profiles
-from tcpipe.fusion.checks.sensors import check_sensors
-from tcpipe.fusion.gates import find_chi_square_threshold
+from tcpipe.formats.recipe_toml import load_shipped_profiles
 from tcpipe.recipe import Recipe
-from tcpipe.report.run_plots import time_plots
-from tcpipe.splits.regions import Regions, Side, classify_footprints
-from tcpipe.stages.mask import mask_track
-from tcpipe.tables.bits import Quality, flag_names
+from tcpipe.splits.regions import Regions, Side
+from tcpipe.tables.bits import flag_names
 from tcpipe.tables.catalogue import read_catalogue
-from tcpipe.tables.levels import LABELLED_SEGMENTS, SAMPLES
-from tcpipe.terrain.layers import LAYERS
+
 
 def call(function):
     parameters = inspect.signature(function).parameters.values()
@@ -125,13 +120,16 @@ print(json.dumps({
 def _edit(file: Path, name: str, kind: str, *texts: str) -> None:
     """Make one change in a file of the copy."""
     text = file.read_text(encoding="utf-8") if kind != CREATE else ""
-    if kind == FIRST:
-        (function,) = (
-            node for node in ast.walk(ast.parse(text)) if isinstance(node, ast.FunctionDef) and node.name == name
+    if kind in (FIRST, LAST):
+        (definition,) = (
+            node
+            for node in ast.walk(ast.parse(text))
+            if isinstance(node, ast.FunctionDef | ast.ClassDef) and node.name == name
         )
-        body = function.body[1] if ast.get_docstring(function) else function.body[0]
-        lines = text.splitlines(keepends=True)
-        lines.insert(body.lineno - 1, f"{' ' * body.col_offset}{texts[0]}\n")
+        lines, body = text.splitlines(keepends=True), definition.body
+        first = body[1] if ast.get_docstring(definition) else body[0]
+        number = first.lineno - 1 if kind == FIRST else body[-1].end_lineno
+        lines.insert(number, f"{' ' * first.col_offset}{texts[0]}\n")
         text = "".join(lines)
     elif kind == REPLACE:
         assert text.count(texts[0]) == 1, f"{file}: {texts[0]!r} is there {text.count(texts[0])} times"
@@ -153,7 +151,12 @@ def effects(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bool]:
     _edit(directory / "tcpipe/cli/mine.py", "", CREATE, command)
     environment = os.environ | {"PYTHONPATH": str(directory), "NUMBA_DISABLE_JIT": "1"}
     run = subprocess.run(
-        [sys.executable, "-c", EFFECTS], cwd=directory, env=environment, capture_output=True, text=True, check=False
+        [sys.executable, "-c", IMPORTS + EFFECTS],
+        cwd=directory,
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
     )
     assert run.returncode == 0, run.stderr
     printed: dict[str, bool] = json.loads(run.stdout)

@@ -54,6 +54,12 @@ def test_links_lead_somewhere(page: Path) -> None:
     assert not lost
 
 
+def test_the_pages_stay_short() -> None:
+    assert sum(len(page.read_text(encoding="utf-8").split()) for page in (ROOT / "docs").rglob("*.md")) <= 65_000
+    below_first_screen = (ROOT / "README.md").read_text(encoding="utf-8").split("\n## ", 1)[1]
+    assert len(below_first_screen.split()) <= 600
+
+
 def test_every_decision_stands_once_in_the_index() -> None:
     decisions = ROOT / "docs/adr"
     listed = re.findall(
@@ -78,6 +84,26 @@ def test_references_to_decisions_lead_somewhere() -> None:
         wrong += [(path.name, hit) for hit in re.findall(r"\[ADR-(\d+)\]\((?!(?:\S*/)?0*\1-)", text)]
     assert not wrong
     assert named > 20
+
+
+def test_files_and_modules_that_pages_name_exist() -> None:
+    wrong = []
+    for page in PAGES:
+        if page.name == "CHANGELOG.md":
+            continue
+        text = page.read_text(encoding="utf-8")
+        paths = re.findall(r"\b((?:tcpipe|tests|benchmarks|pipelines)/[\w/.-]+\.(?:py|toml|md|sbatch))\b", text)
+        wrong += [f"{page.name}: {path}" for path in paths if "NAME" not in path and not (ROOT / path).exists()]
+        for dotted in re.findall(r"(?:`|from |import )(tcpipe(?:\.(?!toml)[a-z_]\w*)+)", text):
+            parent, _, name = dotted.rpartition(".")
+            places = [
+                ROOT / dotted.replace(".", "/"),
+                *(ROOT / f"{stem.replace('.', '/')}.py" for stem in (dotted, parent)),
+            ]
+            source = places[-1] if places[-1].exists() else ROOT / parent.replace(".", "/") / "__init__.py"
+            if not any(place.exists() for place in places[:2]) and not (source.exists() and name in source.read_text()):
+                wrong.append(f"{page.name}: {dotted}")
+    assert not wrong
 
 
 def _command_lines(page: Path) -> Iterator[str]:

@@ -14,10 +14,9 @@ from tcpipe.errors import MapError
 from tcpipe.formats.atomic import write_atomic_directory
 from tcpipe.formats.integrity import write_checksums
 from tcpipe.formats.maps.geotiff import USES, Use
-from tcpipe.formats.maps.layer_building import LayerSource, RasterLayer, iterate_shards
+from tcpipe.formats.maps.layer_building import LayerSource, Raster, RasterLayer, iterate_shards, open_raster
 from tcpipe.formats.maps.map_facts import MapFacts, MapInputs
 from tcpipe.formats.maps.map_files import SHARD_PX, MapWriter
-from tcpipe.formats.maps.mosaic import Raster, open_raster
 from tcpipe.formats.maps.terrain_polygons import is_drawn, place_polygons
 from tcpipe.formats.recipe_toml import parse_toml
 from tcpipe.tables.catalogue import read_threshold

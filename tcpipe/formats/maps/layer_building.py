@@ -1,17 +1,26 @@
-"""One layer of a map being made: a raster or polygons put on the map's grid shard by shard, with a tally of what was seen."""
+"""One layer of a map: its raster (one file, or many tiles on one grid) or polygons, put on the map's grid shard by shard, and counted.
+
+Tiles share CRS, type, bands and grid (to a twentieth of a pixel). Where they overlap, the later file lies on top wherever it has data, as
+with gdalwarp; what no tile covers has no data. A few files are open at one time, however many there are.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Protocol
+from pathlib import Path
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+from pyproj import CRS
+from pyproj.exceptions import CRSError
 
 from tcpipe.errors import MapError
-from tcpipe.formats.maps.mosaic import Raster
+from tcpipe.formats.maps.geotiff import RasterTiles, Tile, Use, open_raster_tiles, read_tile
 from tcpipe.tables.findings import Finding, Subject, make_finding
 from tcpipe.terrain.classes import ClassScheme
 from tcpipe.terrain.grid import MapGrid
@@ -19,6 +28,200 @@ from tcpipe.terrain.layers import Layer, Pixels
 from tcpipe.terrain.projection import Projection
 from tcpipe.terrain.resampling import mean, resample_bilinear, resample_majority
 from tcpipe.terrain.target_grid import LATTICE_STEP_PX, Georeference, compute_source_lattice
+
+MAX_FILES = 100_000
+"""Of one layer."""
+
+_OFF_GRID_PX = 0.05
+"""Tiles whose corners are farther from the pixels of the rest do not lie on one grid [px]."""
+
+_SHOWN = 4
+
+
+@dataclass(frozen=True, slots=True)
+class Raster:
+    """Tiles that play a role together; ``affine``, ``crs`` and ``names`` as of `tcpipe.formats.maps.geotiff.Tile`."""
+
+    label: str
+    """What it is called in a message: the path, and how many more there are."""
+    role: str
+    unit: str
+    crs: str
+    affine: tuple[float, float, float, float, float, float]
+    rows: int
+    cols: int
+    findings: tuple[Finding, ...]
+    """One a code, of the first tile that has it."""
+    names: Mapping[int, str]
+    tiles: tuple[Tile, ...]
+    _corners: NDArray[np.int64] = field(repr=False)
+    """First row, last row (not included), first column, last column of each tile, shape (T, 4)."""
+    _pool: RasterTiles = field(repr=False)
+
+    @property
+    def name(self) -> str:
+        """The label without its folder."""
+        return _label([tile.path for tile in self.tiles], of=lambda path: path.name)
+
+    def read(self, row0: int, row1: int, col0: int, col1: int) -> tuple[NDArray[Any], NDArray[np.bool_]]:
+        """Return a window, and which of its pixels have data, as `tcpipe.formats.maps.geotiff.RasterTiles.read` does of one tile."""
+        low = np.maximum(self._corners[:, ::2], (row0, col0))
+        high = np.minimum(self._corners[:, 1::2], (row1, col1))
+        values = np.zeros((row1 - row0, col1 - col0), self.tiles[0].dtype)
+        valid = np.zeros(values.shape, np.bool_)
+        for n in np.flatnonzero((low < high).all(axis=1)).tolist():
+            (top, left), (bottom, right) = low[n].tolist(), high[n].tolist()
+            row, _, col, _ = self._corners[n].tolist()
+            part, there = self._pool.read(self.tiles[n], top - row, bottom - row, left - col, right - col)
+            if part.shape == values.shape and len(self.tiles) == 1:
+                return part, there
+            window = slice(top - row0, bottom - row0), slice(left - col0, right - col0)
+            np.copyto(values[window], part, where=there)
+            valid[window] |= there
+        return values, valid
+
+
+@contextmanager
+def open_raster(paths: Sequence[Path], role: str, use: Use | None = None) -> Iterator[Raster]:
+    """Open the tiles of a role, in the order in which they are laid, the last on top; ``use`` as `read_tile`.
+
+    Raises
+    ------
+    MapError : one of them cannot play the role, or they are not of one kind and one grid.
+    """
+    if len(paths) > MAX_FILES:
+        raise MapError(
+            f"{_label(paths)}: {len(paths)} files for {role}, at most {MAX_FILES}; join some: gdalwarp part*.tif joined.tif"
+        )
+    tiles: list[Tile] = []
+    problems: list[str] = []
+    for path in paths:
+        try:
+            tiles.append(read_tile(path, role, use))
+        except MapError as error:
+            problems += error.problems
+    if problems:
+        raise MapError(*_shorten_list(problems))
+    _refuse_odd(tiles, "CRS", _find_crs_keys(tiles), "gdalwarp -t_srs EPSG:n in.tif out.tif")
+    _refuse_odd(tiles, "type and bands", [tile.kind for tile in tiles], "gdal_translate -ot T -b n in.tif out.tif")
+    affine, corners = _lay_out_tiles(tiles)
+    with open_raster_tiles() as pool:
+        yield Raster(
+            label=_label(paths),
+            role=role,
+            unit=tiles[0].unit,
+            crs=tiles[0].crs,
+            affine=affine,
+            rows=int(corners[:, 1].max()),
+            cols=int(corners[:, 3].max()),
+            findings=tuple({of.code: of for tile in reversed(tiles) for of in reversed(tile.findings)}.values()),
+            names=_join_value_names(tiles),
+            tiles=tuple(tiles),
+            _corners=corners,
+            _pool=pool,
+        )
+
+
+def _label(paths: Sequence[Path], of: Callable[[Path], str] = str) -> str:
+    return of(paths[0]) if len(paths) == 1 else f"{of(paths[0])} … {paths[-1].name} ({len(paths)} files)"
+
+
+def _shorten_list(lines: list[str]) -> list[str]:
+    return [*lines[:_SHOWN], f"… and {len(lines) - _SHOWN} more"] if len(lines) > _SHOWN + 1 else lines
+
+
+def _find_crs_keys(tiles: Sequence[Tile]) -> list[str]:
+    """Return by tile the first WKT that says the same as its own."""
+    first: dict[str, str] = {}
+    for text in dict.fromkeys(tile.crs for tile in tiles):
+        first[text] = next((known for known in first.values() if _is_same_crs(known, text)), text)
+    return [first[tile.crs] for tile in tiles]
+
+
+def _is_same_crs(one: str, other: str) -> bool:
+    try:
+        return bool(one and other) and CRS(one).equals(CRS(other), ignore_axis_order=True)
+    except CRSError:
+        return False
+
+
+def _is_geographic(text: str) -> bool:
+    try:
+        return bool(text) and bool(CRS(text).is_geographic)
+    except CRSError:
+        return False
+
+
+def _refuse_odd(tiles: Sequence[Tile], what: str, keys: Sequence[str], mended: str) -> None:
+    """Refuse tiles that differ from the most of them, and name these."""
+    usual = Counter(keys).most_common(1)[0][0]
+    odd = [(tile, key) for tile, key in zip(tiles, keys, strict=True) if key != usual]
+    if odd:
+        names = ", ".join(_shorten_list([str(tile.path) for tile, _ in odd]))
+        got, wanted = (_shorten_crs(key) for key in (odd[0][1], usual))
+        raise MapError(
+            f"{tiles[0].role}: {len(odd)} of {len(tiles)} files have another {what} than the rest ({got}, wanted {wanted}): {names}; "
+            f"write them like the rest: {mended}"
+        )
+
+
+def _shorten_crs(key: str) -> str:
+    """Return a CRS by its name, anything else as it is."""
+    try:
+        return CRS(key).name if "[" in key else key or "none"
+    except CRSError:
+        return key[:40]
+
+
+def _lay_out_tiles(tiles: Sequence[Tile]) -> tuple[tuple[float, float, float, float, float, float], NDArray[np.int64]]:
+    """Return the affine of all tiles together, and where each lies in it: first row, last row, first column, last column."""
+    pixels = [tuple(f"{tile.affine[n]:.6g}" for n in (0, 1, 3, 4)) for tile in tiles]
+    base = pixels.index(Counter(pixels).most_common(1)[0][0])
+    at, off = _find_grid_positions(tiles, base)
+    if off.sum() > len(tiles) / 2:  # it is the odd one itself
+        base = next((n for n in np.flatnonzero(off).tolist() if pixels[n] == pixels[base]), base)
+        at, off = _find_grid_positions(tiles, base)
+    odd = [tile for tile, far in zip(tiles, off, strict=True) if far]
+    if odd:
+        got, wanted = (f"{abs(tile.affine[0]):.6g} x {abs(tile.affine[4]):.6g}" for tile in (odd[0], tiles[base]))
+        raise MapError(
+            f"{tiles[0].role}: {len(odd)} of {len(tiles)} files do not lie on the pixels of the rest "
+            f"({got}, the rest {wanted}): {', '.join(_shorten_list([str(tile.path) for tile in odd]))}; "
+            "put all on one grid: gdalwarp -r bilinear *.tif joined.tif"
+        )
+    a, b, x, d, e, y = tiles[base].affine
+    col, row = at.min(axis=0).tolist()
+    first = (at - at.min(axis=0)).astype(np.int64)
+    last = first + [(tile.cols, tile.rows) for tile in tiles]
+    corners = np.stack([first[:, 1], last[:, 1], first[:, 0], last[:, 0]], axis=1)
+    return (a, b, x + a * col + b * row, d, e, y + d * col + e * row), corners
+
+
+def _find_grid_positions(tiles: Sequence[Tile], base: int) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Return the column and row of every tile's first pixel on the grid of one of them, shape (T, 2), and which do not lie on it."""
+    affines = np.array([tile.affine for tile in tiles], np.float64).reshape(-1, 2, 3)
+    sizes = np.array([(tile.cols, tile.rows) for tile in tiles])
+    starts = affines[:, :, 2] - affines[base, :, 2]
+    if _is_geographic(tiles[base].crs):  # tiles across the antimeridian count on beyond 180°
+        starts[:, 0] -= 360.0 * np.round(starts[:, 0] / 360.0)
+    ends = starts + np.einsum("nij,nj->ni", affines[:, :, :2], sizes)
+    first, last = (np.linalg.solve(affines[base, :, :2], xy.T).T for xy in (starts, ends))
+    at = np.rint(first).astype(np.float64)
+    far = np.maximum(np.abs(first - at), np.abs(last - (at + sizes))).max(axis=1)
+    return at, ~(far <= _OFF_GRID_PX)
+
+
+def _join_value_names(tiles: Sequence[Tile]) -> dict[int, str]:
+    """Return what the tiles' values are called; `MapError` if two call one value otherwise."""
+    names: dict[int, str] = {}
+    for tile in tiles:
+        for value, name in tile.names.items():
+            if names.setdefault(value, name) != name:
+                raise MapError(
+                    f"{tile.path}: value {value} is {name!r}, but {names[value]!r} in the files before; name it with --classes"
+                )
+    return names
+
 
 _BLOCK_PX = 1024
 _HIGHEST_M = 9_000.0

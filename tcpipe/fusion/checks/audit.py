@@ -31,10 +31,15 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.fusion.gates import find_chi_square_threshold
 from tcpipe.fusion.measurements import DOPPLER, GNSS, IMU, VISUAL, WHEELS, BodyVelocities, Measurements, Positions
 from tcpipe.fusion.process import DOPPLER_LASTS_S, VISUAL_SCALE_STD, WHEEL_SCALE_STD
-from tcpipe.fusion.signals import compute_interval_means, compute_median_period_ns, compute_seconds, is_in_gap
+from tcpipe.fusion.signals import (
+    compute_interval_means,
+    compute_median_period_ns,
+    compute_seconds,
+    find_chi_square_threshold,
+    is_in_gap,
+)
 from tcpipe.fusion.trajectory import DISPLACEMENT_LAGS_S, Trajectory
 from tcpipe.geometry.rotation import matrix_from_quat, quat_from_matrix, rotation_vector_from_quat
 from tcpipe.tables.facts import Disagreement
@@ -45,21 +50,21 @@ What = Literal["position", "displacement", "turn"]
 
 UNITS: Mapping[str, str] = {"position": "m", "displacement": "m", "turn": "rad"}
 
-_WINDOW_S = 5.0
-_CHANCE = 0.01
-_FEWEST_FIXES = 5
+_WINDOW_S = 5.0  # about four chords; longer than odometry's gate
+_CHANCE = 0.01  # chance of a false window in a hundred runs
+_FEWEST_FIXES = 5  # for a robust median
 _MAX_GAP_NS = 500_000_000
-_MOVES_M = 0.5
-_STANDS_MPS = 0.1
-_MOSTLY = 0.5
-_LITTLE = 0.1
-_NO_ARM_M = 1.0
-_FEWEST_WINDOWS = 4
+_MOVES_M = 0.5  # distance in a window with motion
+_STANDS_MPS = 0.1  # slower is stationary; faster wheels are stuck
+_MOSTLY = 0.5  # share that counts as most
+_LITTLE = 0.1  # share that agreeing sensors may disagree
+_NO_ARM_M = 1.0  # no lever arm is off by more
+_FEWEST_WINDOWS = 4  # fewer say nothing about a run
 _SCALES = (0.5, 2.0)
-_ASTRAY_M = 1.0
-_SURELY = 4.0
+_ASTRAY_M = 1.0  # a larger difference in 5 s is divergence
+_SURELY = 4.0  # and by this many σ of the sensor
 _MEDIAN_OF_SQUARES = 0.4549  # of a normal variable of variance 1
-_LASTING_MPS = 0.02
+_LASTING_MPS = 0.02  # lasting odometry error (`preparation._VELOCITY_FLOOR_MPS`)
 _SCALE_STD = {WHEELS: WHEEL_SCALE_STD, VISUAL: VISUAL_SCALE_STD}
 _TURN_SCALE_STD = {WHEELS: 0.3, VISUAL: 0.03, IMU: 0.01}
 _LASTING_RADPS = {WHEELS: 0.02, VISUAL: 0.004, IMU: 0.003}
@@ -124,10 +129,9 @@ class Tally:
 
 @dataclass(frozen=True, slots=True)
 class Audit:
-    """What the audit of one stretch found: disagreements in order of time, and how much of the way each sensor disagrees.
+    """The audit of one section: disagreements in order of time, and over how much of the distance each sensor disagrees.
 
-    ``windows``: those in which a sensor tells the robot's way; ``astray``: those in which the track's is far from what every such sensor
-    says.
+    In ``windows`` a sensor measures the robot's distance; in those ``astray`` the track's is far from that of every such sensor.
     """
 
     disagreements: tuple[Disagreement, ...]
@@ -137,13 +141,7 @@ class Audit:
 
 
 def audit_trajectory(found: Trajectory, measurements: Measurements) -> tuple[Trajectory, Audit]:
-    """Return the trajectory with deviations raised where sensors disagree with it, and what was found.
-
-    Parameters
-    ----------
-    found : of one stretch.
-    measurements : what fed it.
-    """
+    """Return the trajectory of one section with standard deviations inflated where sensors disagree with it, and what was found."""
     windows = _find_windows(found.stamp_ns)
     if not windows.size:
         return found, Audit((), ())
@@ -442,10 +440,9 @@ def _find_disagreements(
 
 
 def _compute_distance_error_m(compared: Sequence[Comparison], fixes: Iterable[Comparison], windows: int) -> Floats:
-    """Return how far the track's way in each window is off what every sensor says of it [m], shape (W,).
+    """Return how far the track's distance in each window is off that of every sensor [m], shape (W,); 0 where one agrees, NaN without any.
 
-    0 where one holds with it, NaN where none tells. What the track claims and what the gate refused does not count: an estimate that has
-    lost the robot refuses what is right, and believes itself.
+    The track's uncertainty and its outlier gate do not count: an estimate that has lost the robot rejects what is right.
     """
     ways = [one for one in compared if one.what == "displacement" and one.sensor != GNSS]
     off_m = np.full(windows, np.nan)

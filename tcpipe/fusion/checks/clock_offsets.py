@@ -7,6 +7,11 @@ and in windows of ten minutes, through which a line tells the drift; the pairs t
 of them share. A sensor is blamed only where two others agree against it and no pair contradicts; else two differ, and nobody knows which
 is off. Nothing is corrected here: a person decides. The course of the fixes is not held against the gyroscope: an antenna that sits
 ahead of the turning point by l leads the body's course by l / v, 0.1 s for 10 cm.
+
+Stamps of fixes may jitter: receivers and localisation nodes that stamp a fix when they send it, some tenths of a second after they
+measured it, make positions that stand still and then leap, whatever variance they claim. Over each pair of successive fixes the distance
+between them is compared with the distance driven by the odometry (times the local ratio of the two, so that slip does not count). What
+this residual spreads beyond the claimed noise, divided by the speed, is the jitter.
 """
 
 from __future__ import annotations
@@ -18,20 +23,32 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.fusion.checks.lags import GRID_S, Floats, compute_lag_products, compute_moving_mean, estimate_lag
-from tcpipe.fusion.checks.resampled_motion import FIXES_S, compute_fix_velocity, resample_signal, resample_twist
-from tcpipe.fusion.checks.windows import find_span_ns, iterate_windows_ns
+from tcpipe.fusion.checks.lags import (
+    FIXES_S,
+    GRID_S,
+    Floats,
+    compute_fix_velocity,
+    compute_lag_products,
+    compute_moving_mean,
+    estimate_lag,
+    find_span_ns,
+    iterate_windows_ns,
+    resample_signal,
+    resample_twist,
+)
 from tcpipe.fusion.measurements import (
     GNSS,
     IMU,
     VISUAL,
     WHEELS,
+    BodyVelocities,
     InertialMeasurements,
     Measurements,
     Positions,
     select_measurements,
 )
-from tcpipe.fusion.signals import compute_median_period_ns
+from tcpipe.fusion.signals import compute_median_period_ns, compute_seconds, integrate_signal
+from tcpipe.tables.findings import Finding, Subject, make_finding
 
 POWER = "power"
 ROLES = (IMU, WHEELS, VISUAL, GNSS, POWER)
@@ -160,12 +177,9 @@ class ClockOffsets:
 
 
 def find_clock_offsets(measurements: Measurements, power: PowerSignal | None) -> ClockOffsets:
-    """Return the offsets between the stamps of a clock epoch's sensors, and how they drift.
+    """Return the offsets between the stamps of a clock epoch's sensors, and their drift; ``power`` is the sum over the drive rails.
 
-    Parameters
-    ----------
-    measurements : of one clock epoch; mountings need not be right, since a yaw rate is compared with all three axes of a gyroscope.
-    power : sum over the drive rails; None without.
+    Extrinsics need not be right, since a yaw rate is compared with all three axes of a gyroscope.
     """
     span = find_span_ns(measurements)
     if span is None:
@@ -424,3 +438,77 @@ def _solve_network(
     return {reference: (0.0, 0.0)} | dict(
         zip(free, zip(solved.tolist(), deviations.tolist(), strict=True), strict=True)
     )
+
+
+_MIN_SPEED_MPS = 0.3
+_MAX_INTERVAL_S = 2.0
+_PAIRS = 41
+_MIN_JITTER_S = 0.05
+
+
+def smooth_stamps(
+    gnss: Positions | None, odometry: BodyVelocities | None
+) -> tuple[Positions | None, tuple[Finding, ...]]:
+    """Return the fixes with the variance of those raised whose stamps jitter against the odometry, and the finding of it."""
+    if gnss is None or odometry is None:
+        return gnss, ()
+    jitter_s = stamp_jitter_s(gnss, odometry)
+    jumpy = jitter_s > 0
+    if not jumpy.any():
+        return gnss, ()
+    finding = make_finding(
+        "stamp-jitter",
+        Subject("role", GNSS),
+        jitter_fraction=float(jumpy.mean()),
+        jitter_s=float(np.median(jitter_s[jumpy])),
+    )
+    return add_jitter_variance(gnss, odometry, jitter_s), (finding,)
+
+
+def stamp_jitter_s(gnss: Positions, odometry: BodyVelocities) -> NDArray[np.float64]:
+    """Return the standard deviation of the stamps around each fix [s], shape (N,); 0 where it does not matter or is unknown.
+
+    It matters above 0.05 s and where it moves the fix by more than twice its claimed deviation. While the robot is stationary it is
+    unknown: the value of the nearest motion is held. Of the odometry the forward velocity is used.
+    """
+    zero = int(gnss.stamp_ns[0])
+    stamp_s = compute_seconds(gnss.stamp_ns, zero)
+    speed = np.abs(odometry.velocity_mps[:, :1])
+    driven_m = np.diff(integrate_signal(compute_seconds(odometry.stamp_ns, zero), speed, stamp_s), axis=0)[:, 0]
+    interval_s = np.diff(stamp_s)
+    moved_m = np.hypot(*np.diff(gnss.position_enu_m[:, :2], axis=0).T)
+    moving = (driven_m > _MIN_SPEED_MPS * interval_s) & (interval_s < _MAX_INTERVAL_S)
+    if moving.sum() < _PAIRS:
+        return np.zeros(stamp_s.size)
+    driven_m, moved_m, mean_speed = driven_m[moving], moved_m[moving], driven_m[moving] / interval_s[moving]
+    # A median: neither slip nor an outlying fix is jitter.
+    ratio = np.median(_make_windows(moved_m / driven_m), axis=1)
+    residual_s = (moved_m - ratio * driven_m) / mean_speed
+    claimed_s2 = (gnss.variance_m2[:-1, :2].mean(1) + gnss.variance_m2[1:, :2].mean(1))[moving] / 2 / mean_speed**2
+    # One outlying fix spoils two pairs: the fourth fifth bears one in ten, yet sees tails that the median does not.
+    spread_s = np.quantile(_make_windows(np.abs(residual_s)), 0.8, axis=1) / 1.2816
+    claimed_s2 = _make_windows(claimed_s2).mean(1)
+    excess_s2 = spread_s**2 / 2 - claimed_s2
+    matters = excess_s2 > np.maximum(_MIN_JITTER_S**2, 4 * claimed_s2)
+    middle_s = (0.5 * (stamp_s[1:] + stamp_s[:-1]))[moving]
+    return np.interp(stamp_s, middle_s, np.sqrt(np.where(matters, excess_s2, 0.0)))
+
+
+def add_jitter_variance(gnss: Positions, odometry: BodyVelocities, jitter_s: NDArray[np.float64]) -> Positions:
+    """Return the fixes with horizontal variances raised by (2 speed jitter)².
+
+    Twice, since such fixes are late and never early, by about as much on average as they scatter, and one late fix follows another: the
+    filter, for which errors are white, must not average them away.
+    """
+    zero = int(gnss.stamp_ns[0])
+    speed = np.abs(odometry.velocity_mps[:, 0])
+    speed = np.interp(compute_seconds(gnss.stamp_ns, zero), compute_seconds(odometry.stamp_ns, zero), speed)
+    variance = gnss.variance_m2.copy()
+    variance[:, :2] += ((2 * speed * jitter_s) ** 2)[:, None]
+    return replace(gnss, variance_m2=variance)
+
+
+def _make_windows(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return a window centred on each value, shape (N, 41), the signal mirrored at its ends."""
+    padded = np.pad(values, _PAIRS // 2, mode="reflect")
+    return np.lib.stride_tricks.sliding_window_view(padded, _PAIRS)

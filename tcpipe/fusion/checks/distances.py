@@ -3,6 +3,8 @@
 Distances are chords over ten seconds, or thirty where fixes are coarse, so that the noise of fixes does not count as driving: of fixes
 their difference, of an odometry what its own velocity and yaw rate add up to. A command is a voice where two sensors differ, though a
 robot may be slower than it is told.
+
+A sensor that repeats one value to the last digit while the others show motion is frozen: a driver that died, a cable that is out.
 """
 
 from __future__ import annotations
@@ -15,10 +17,9 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.fusion.checks.lags import GRID_S, Floats
-from tcpipe.fusion.checks.refusals import SensorExclusion
-from tcpipe.fusion.checks.resampled_motion import resample_fixes
-from tcpipe.fusion.measurements import GNSS, WHEELS, Positions
+from tcpipe.fusion.checks.lags import GRID_S, Floats, resample_fixes
+from tcpipe.fusion.checks.plausibility import SensorExclusion
+from tcpipe.fusion.measurements import GNSS, IMU, WHEELS, Measurements, Positions
 
 COMMAND = "command"
 """The command's name among the distances; it is never refused."""
@@ -76,14 +77,7 @@ class Distances:
 
 
 def find_distances(gnss: Positions | None, twists: Mapping[str, Floats], at_ns: NDArray[np.int64]) -> Distances:
-    """Return the distances by every source that tells any.
-
-    Parameters
-    ----------
-    gnss : None without.
-    twists : by name, forward velocity [m/s] and yaw rate [rad/s] on the grid, shape (M, 2).
-    at_ns : the grid's stamps, shape (M,).
-    """
+    """Return the distances of all sources; ``twists`` are forward velocity [m/s] and yaw rate [rad/s] on the grid, shape (M, 2)."""
     places = {name: _dead_reckon(twist) for name, twist in twists.items()}
     least_m = _FAR_M
     if gnss is not None:
@@ -96,11 +90,9 @@ def find_distances(gnss: Positions | None, twists: Mapping[str, Floats], at_ns: 
 
 
 def find_contradictions(found: Distances, *, turning: frozenset[str]) -> dict[str, SensorExclusion]:
-    """Return the refusals by sensor: of two that differ the one that fewer others agree with, or both.
+    """Return the excluded sensors: of two that differ the one that fewer others agree with, or both.
 
-    Parameters
-    ----------
-    turning : sensors whose yaw rate the gyroscope confirms: the robot does drive when they say so.
+    Of ``turning`` sensors the gyroscope confirms the yaw rate: the robot does drive when they say so.
     """
     sensors = [name for name in found.chord_m if name != COMMAND]
     heard = {name: [other for other in found.chord_m if other != name and found.agree(name, other)] for name in sensors}
@@ -218,3 +210,49 @@ def _compute_chords_m(place_m: NDArray[np.complex128], window: int) -> Floats:
     first = np.arange(0, place_m.size - window, _STEP)
     whole = lost[first + window + 1] == lost[first]
     return np.where(whole, np.abs(place_m[first + window] - place_m[first]), np.nan)
+
+
+_FEWEST_ROWS = 20
+_APART = 0.5
+_FEWEST_FROZEN_WINDOWS = 2
+
+
+def find_frozen_sensors(m: Measurements, found: Distances) -> dict[str, SensorExclusion]:
+    """Return the refusals by sensor; ``found`` tells how far the others went."""
+    refusals = {}
+    if m.gnss is not None and _is_one_value(m.gnss.position_enu_m) and _is_contradicted(GNSS, found):
+        refusals[GNSS] = refuse_frozen(GNSS, "position", m.gnss.stamp_ns.size)
+    for role, source in m.odometries().items():
+        if _is_contradicted(role, found) and _is_one_value(source.velocity_mps):
+            refusals[role] = refuse_frozen(role, "velocity", source.stamp_ns.size)
+    if m.imu is not None and any(np.nanmax(chord, initial=0.0) > found.least_m for chord in found.chord_m.values()):
+        for what, values in (
+            ("angular_velocity", m.imu.angular_velocity_radps),
+            ("acceleration", m.imu.specific_force_mps2),
+        ):
+            if _is_one_value(values):
+                refusals[IMU] = refuse_frozen(IMU, what, m.imu.stamp_ns.size)
+    return refusals
+
+
+def refuse_frozen(role: str, quantity: str, messages: int) -> SensorExclusion:
+    """Return the refusal of a sensor that repeats one value."""
+    return SensorExclusion(role, "frozen", {"quantity": quantity}, {"message_count": messages})
+
+
+def _is_one_value(values: Floats) -> bool:
+    """Return whether all rows of (N, k) are the same to the last digit, and enough of them."""
+    return values.shape[0] >= _FEWEST_ROWS and bool(
+        np.array_equal(values, np.broadcast_to(values[0], values.shape), equal_nan=True)
+    )
+
+
+def _is_contradicted(role: str, found: Distances) -> bool:
+    """Return whether another sensor goes clearly further, or less far, in some windows."""
+    mine = found.chord_m.get(role)
+    for name, chord in found.chord_m.items():
+        if name != role and mine is not None:
+            apart = np.abs(chord - mine) > np.maximum(found.least_m, _APART * np.fmax(chord, mine))
+            if apart.sum() >= _FEWEST_FROZEN_WINDOWS:
+                return True
+    return False

@@ -10,13 +10,20 @@ nearly as high, nothing is said.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.fusion.signals import compute_seconds, integrate_signal, is_in_gap
+from tcpipe.fusion.measurements import BodyVelocities, Measurements, Positions
+from tcpipe.fusion.signals import (
+    compute_median_of_five,
+    compute_median_period_ns,
+    compute_seconds,
+    integrate_signal,
+    is_in_gap,
+)
 
 GRID_S = 0.02
 """Spacing of the grid [s]."""
@@ -80,17 +87,10 @@ def compute_moving_mean(values: Floats, width_s: float) -> Floats:
 
 
 def find_lag(target: Floats, regressors: Floats) -> Lag | None:
-    """Return how late the target's stamps are against the regressors', or None where nothing can be said.
+    """Return how late the target's stamps are against the regressors', or None where that is unknown.
 
-    Parameters
-    ----------
-    target : shape (M,), on a grid of `GRID_S`, NaN where unknown.
-    regressors : shape (M, k), likewise.
-
-    Returns
-    -------
-    None where too little is known, where the best lag lies at the end of the search or another is as good, or where a constant explains
-    the target.
+    ``target``, shape (M,), and ``regressors``, shape (M, k), are on a grid of `GRID_S`, NaN where unknown. The lag is unknown where few
+    values are, where the best lag is at the end of the search or another is as good, or where a constant explains the target.
     """
     products = compute_lag_products(target, regressors)
     return None if products is None else estimate_lag([products])
@@ -194,3 +194,135 @@ def _find_peak(explained: Floats) -> float:
     curvature = before - 2 * at + after
     shift = 0.5 * (before - after) / curvature if curvature < 0 else 0.0
     return float((best - explained.size // 2 + shift) * GRID_S)
+
+
+Ints = NDArray[np.int64]
+
+_SECOND_NS = 1_000_000_000
+_LONGEST_NS = 1800 * _SECOND_NS
+_STEP_NS = 300 * _SECOND_NS
+_PLACES_NS = 10 * _SECOND_NS
+
+
+def iterate_windows_ns(m: Measurements, length_ns: int) -> Iterator[Ints]:
+    """Yield grids [ns] of about ``length_ns`` that follow each other over the time of a set, wherever it has measurements."""
+    span = find_span_ns(m)
+    if span is None:
+        return
+    count = max(1, round((span[1] - span[0]) / length_ns))
+    edges = np.linspace(*span, count + 1).astype(np.int64)
+    stamps = [sensor.stamp_ns for sensor in m.sensors().values()]
+    heard = np.unique(np.concatenate([np.searchsorted(edges, stamp, side="right") - 1 for stamp in stamps]))
+    for window in np.unique(np.clip(np.concatenate((heard - 1, heard, heard + 1)), 0, count - 1)):
+        yield make_grid_ns(int(edges[window]), int(edges[window + 1]))
+
+
+def find_span_ns(m: Measurements) -> tuple[int, int] | None:
+    """Return first and last stamp of a set's measurements; None where no sensor has two."""
+    stamps = [sensor.stamp_ns for sensor in m.sensors().values() if sensor.stamp_ns.size > 1]
+    return (min(int(s[0]) for s in stamps), max(int(s[-1]) for s in stamps)) if stamps else None
+
+
+def find_liveliest_window_ns(m: Measurements) -> Ints | None:
+    """Return the grid [ns] of the half hour in which the robot drives most; None without measurements."""
+    span = find_span_ns(m)
+    if span is None:
+        return None
+    first_ns, last_ns = span
+    begin = np.arange(first_ns, max(last_ns - _LONGEST_NS, first_ns) + 1, _STEP_NS, dtype=np.int64)
+    way_m = _compute_driven_m(m, np.concatenate((begin, begin + _LONGEST_NS)))
+    best = int(begin[np.argmax(way_m[begin.size :] - way_m[: begin.size])])
+    return make_grid_ns(best, min(last_ns, best + _LONGEST_NS))
+
+
+def _compute_driven_m(m: Measurements, at_ns: Ints) -> NDArray[np.float64]:
+    """Return the distance driven before each time [m], by the first sensor that tells one."""
+    source = m.wheels or m.visual
+    if source is not None:
+        stamp_ns, speed_mps = source.stamp_ns, np.nan_to_num(np.abs(source.velocity_mps[:, 0]))
+        steps_m = speed_mps[1:] * np.diff(compute_seconds(stamp_ns, int(stamp_ns[0])))
+    elif m.gnss is not None:
+        stamp_ns = np.arange(m.gnss.stamp_ns[0], m.gnss.stamp_ns[-1] + 1, _PLACES_NS, dtype=np.int64)
+        places = [np.interp(stamp_ns, m.gnss.stamp_ns, axis) for axis in m.gnss.position_enu_m[:, :2].T]
+        steps_m = np.hypot(*np.diff(places, axis=1))
+    else:
+        return np.zeros(at_ns.size)
+    way_m: NDArray[np.float64] = np.interp(at_ns, stamp_ns, np.concatenate(([0.0], np.cumsum(steps_m))))
+    return way_m
+
+
+FIXES_S = 0.5
+"""A velocity is made of fixes averaged over, and taken apart by, this long [s]."""
+
+_MAX_GAP_NS = 500_000_000
+_STRAY_M = 0.3
+_STRAY = 6.0
+_COURSE_MPS = 0.3
+
+
+def resample_signal(stamp_ns: NDArray[np.int64], values: Floats, at_ns: NDArray[np.int64]) -> Floats:
+    """Return a signal (N, k) on the grid, shape (M, k); NaN in gaps of half a second or three periods."""
+    return average_on_grid(
+        stamp_ns, values, at_ns, longest_gap_ns=max(_MAX_GAP_NS, 3 * compute_median_period_ns(stamp_ns))
+    )
+
+
+def resample_twist(source: BodyVelocities, at_ns: NDArray[np.int64]) -> Floats:
+    """Return forward velocity and yaw rate, shape (M, 2), single wild samples bridged; the yaw rate 0 where the source gives none."""
+    forward, yaw_rate = source.velocity_mps[:, 0], source.yaw_rate_radps
+    if not np.isfinite(yaw_rate).any():
+        yaw_rate = np.zeros_like(forward)
+    known = np.isfinite(forward + yaw_rate) & ~_find_strays(forward) & ~_find_strays(yaw_rate)
+    if known.sum() < 2:
+        return np.full((at_ns.size, 2), np.nan)
+    return resample_signal(source.stamp_ns[known], np.column_stack((forward, yaw_rate))[known], at_ns)
+
+
+def resample_fixes(gnss: Positions, at_ns: NDArray[np.int64]) -> NDArray[np.complex128]:
+    """Return the antenna's places [m], east and i times north, averaged over half a second, shape (M,); wild fixes are bridged."""
+    place = gnss.position_enu_m[:, :2]
+    wild = np.zeros(place.shape[0], np.bool_)
+    for axis in place.T:
+        off = _compute_neighbour_distance(axis)
+        wild |= off > _STRAY_M + _STRAY * float(np.median(off))
+    if (~wild).sum() < 2:
+        return np.full(at_ns.size, np.nan + 0j)
+    smooth = compute_moving_mean(resample_signal(gnss.stamp_ns[~wild], place[~wild], at_ns), FIXES_S)
+    return smooth[:, 0] + 1j * smooth[:, 1]
+
+
+def compute_fix_velocity(gnss: Positions, at_ns: NDArray[np.int64]) -> NDArray[np.complex128]:
+    """Return the antenna's velocity [m/s], east and i times north, shape (M,); wild fixes are bridged, NaN in gaps."""
+    velocity = np.full(at_ns.size, np.nan + 0j)
+    half = round(FIXES_S / 2 / GRID_S)
+    if at_ns.size > 2 * half:
+        place = resample_fixes(gnss, at_ns)
+        velocity[half:-half] = (place[2 * half :] - place[: -2 * half]) / (2 * half * GRID_S)
+    return velocity
+
+
+def compute_course_rate(velocity_mps: NDArray[np.complex128]) -> Floats:
+    """Return how fast the direction of travel turns [rad/s], shape (M,), NaN below 0.3 m/s.
+
+    An antenna ahead of the turning point by l leads the body's course by l / v: good for a sign, not for a clock.
+    """
+    half = round(FIXES_S / 2 / GRID_S)
+    rate = np.full(velocity_mps.size, np.nan)
+    if velocity_mps.size <= 2 * half:
+        return rate
+    quick = np.abs(velocity_mps) > _COURSE_MPS
+    turned = np.angle(velocity_mps[2 * half :] * np.conj(velocity_mps[: -2 * half]))
+    rate[half:-half] = np.where(quick[2 * half :] & quick[: -2 * half], turned / (2 * half * GRID_S), np.nan)
+    return rate
+
+
+def _find_strays(values: Floats) -> NDArray[np.bool_]:
+    """Return which samples lie far off the median of their neighbours."""
+    off = _compute_neighbour_distance(values)
+    stray: NDArray[np.bool_] = off > _STRAY * max(float(np.nanpercentile(off, 90)), 1e-9)
+    return stray
+
+
+def _compute_neighbour_distance(values: Floats) -> Floats:
+    """Return each sample's distance from the median of the five around it; 0 for fewer than five samples."""
+    return np.abs(values - compute_median_of_five(values))

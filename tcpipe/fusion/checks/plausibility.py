@@ -8,13 +8,52 @@ whole run, after the lag between the two sensors has been taken out.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.fusion.checks.lags import GRID_S, Floats, compute_moving_mean, find_lag
+from tcpipe.fusion.measurements import GNSS
 from tcpipe.geometry.rotation import matrix_from_quat, quat_from_rotation_vector
+
+
+@dataclass(frozen=True, slots=True)
+class SensorExclusion:
+    """A sensor that is not to be fused.
+
+    Attributes
+    ----------
+    code : of the finding (`tcpipe.tables.catalogue`).
+    names, numbers : of the finding; the name ``suspect`` is the other role that may be wrong instead.
+    units : value of the recipe's ``imu_units`` that sets it right.
+    turned_by : rotation (3, 3) from what the extrinsics in use make of the sensor to base_link.
+    late_s : time offset of its stamps [s] that the recipe can correct.
+    is_suspect_excludable : whether excluding the suspect instead sets it right.
+    """
+
+    role: str
+    code: str
+    names: Mapping[str, str] = field(default_factory=dict)
+    numbers: Mapping[str, float] = field(default_factory=dict)
+    units: str | None = None
+    turned_by: NDArray[np.float64] | None = None
+    late_s: float | None = None
+    is_suspect_excludable: bool = False
+
+
+def refuse_fixes(code: str, odometries: Collection[str], names: Mapping[str, str] | None = None) -> SensorExclusion:
+    """Return the refusal of fixes that odometries contradict; a single odometry is suspect, whoever confirms how it turns."""
+    if len(odometries) != 1:
+        return SensorExclusion(GNSS, code, names or {})
+    return SensorExclusion(GNSS, code, {**(names or {}), "suspect": next(iter(odometries))}, is_suspect_excludable=True)
+
+
+def join_names(roles: Collection[str]) -> str:
+    """Return several roles as one name of a finding."""
+    return ", ".join(roles)
+
 
 _MIN_EXPLAINED = 0.5
 _SLOW_S = 4.0
@@ -39,10 +78,8 @@ class YawAxis:
 def find_yaw_axis(yaw_rate_radps: Floats, rate: Floats) -> YawAxis | None:
     """Return the axis of a gyroscope about which the robot yaws, or None where its rates do not explain the yaw rate.
 
-    Parameters
-    ----------
-    yaw_rate_radps : [rad/s], of another sensor on the grid of `lags`, NaN where unknown, shape (M,).
-    rate : the gyroscope's, in whatever unit and axes, shape (M, 3).
+    ``yaw_rate_radps`` [rad/s], shape (M,), is another sensor's on the grid of `lags`, NaN where unknown; ``rate``, shape (M, 3), has any
+    unit and axes.
     """
     lag = find_lag(yaw_rate_radps, rate)
     if lag is None or lag.explained < _MIN_EXPLAINED:
@@ -75,16 +112,9 @@ def compute_levelling_rotation(up: Floats) -> Floats:
 def find_forward_yaw_rad(twist: Floats, level_force_mps2: Floats, late_s: float) -> tuple[float, float] | None:
     """Return the yaw of a levelled IMU in base_link [rad] and its standard deviation, or None where acceleration does not show it.
 
-    Parameters
-    ----------
-    twist : forward velocity [m/s] and yaw rate [rad/s], on the grid, shape (M, 2).
-    level_force_mps2 : specific force with z up, shape (M, 3).
-    late_s : how late the twist's stamps are against the IMU's [s].
-
-    Notes
-    -----
-    In base_link a = dv/dt forward and v w to the left; the unit feels a turned by minus its yaw. With both as complex numbers the yaw is
-    the angle of the sum of a times the conjugate of what is felt (the plane case of Wahba's problem, 1965).
+    In base_link a = dv/dt forward and v w to the left; the unit measures a turned by minus its yaw. With both as complex numbers the yaw is
+    the angle of the sum of a times the conjugate of the measured (the planar case of Wahba's problem, 1965). ``twist`` is forward velocity
+    [m/s] and yaw rate [rad/s] on the grid, shape (M, 2), ``late_s`` [s] behind the IMU; the force has z up, shape (M, 3).
     """
     smooth = compute_moving_mean(twist, _SMOOTH_S)
     driven = np.gradient(smooth[:, 0], GRID_S) + 1j * smooth[:, 0] * smooth[:, 1]

@@ -20,11 +20,21 @@ from tcpipe.fusion.checks.distances import (
     estimate_far_scale,
     find_contradictions,
     find_distances,
+    find_frozen_sensors,
 )
-from tcpipe.fusion.checks.frozen import find_frozen_sensors
-from tcpipe.fusion.checks.lags import GRID_S, Floats, compute_moving_mean
+from tcpipe.fusion.checks.lags import (
+    GRID_S,
+    Floats,
+    compute_course_rate,
+    compute_fix_velocity,
+    compute_moving_mean,
+    find_liveliest_window_ns,
+    resample_signal,
+    resample_twist,
+)
 from tcpipe.fusion.checks.odometry_scale import Scale
 from tcpipe.fusion.checks.plausibility import (
+    SensorExclusion,
     YawAxis,
     compute_agreement,
     compute_levelling_rotation,
@@ -32,15 +42,9 @@ from tcpipe.fusion.checks.plausibility import (
     find_nearest_mounting,
     find_up_axis,
     find_yaw_axis,
+    join_names,
+    refuse_fixes,
 )
-from tcpipe.fusion.checks.refusals import SensorExclusion, join_names, refuse_fixes
-from tcpipe.fusion.checks.resampled_motion import (
-    compute_course_rate,
-    compute_fix_velocity,
-    resample_signal,
-    resample_twist,
-)
-from tcpipe.fusion.checks.windows import find_liveliest_window_ns
 from tcpipe.fusion.measurements import GNSS, IMU, VISUAL, WHEELS, InertialMeasurements, Measurements, Positions
 from tcpipe.fusion.signals import hold_last
 from tcpipe.tables.facts import AxisFacts, SensorChecks, make_vector
@@ -92,10 +96,9 @@ def check_sensors(
 
     Parameters
     ----------
-    measurements : in base_link axes, by the mountings in use.
-    command : None without.
-    stated : by role, whether somebody stated the mounting (recipe, transforms, message in base_link); otherwise it is assumed.
-    felt : median size of the specific force as the IMU told it, before its lever arm was taken out; NaN without an IMU.
+    measurements : in base_link axes, by the extrinsics in use.
+    stated : by role, whether the extrinsics are stated (recipe, transforms, message in base_link) rather than assumed.
+    felt : median size of the specific force as the IMU measured it, before its lever arm was taken out; NaN without an IMU.
     """
     checks = Checks()
     slow = None if measurements.imu is None else _refuse_slow(measurements.imu)

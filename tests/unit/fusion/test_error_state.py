@@ -11,11 +11,10 @@ from unit.fusion import drive
 from tcpipe.errors import FusionError
 from tcpipe.fusion.error_state import run_error_state
 from tcpipe.fusion.error_state_pass import FilterPass, compute_lag_rows
-from tcpipe.fusion.fix_errors import find_fix_errors
-from tcpipe.fusion.initial import find_initial_state
+from tcpipe.fusion.gnss_faults import find_fix_errors
+from tcpipe.fusion.initial import find_initial_state, find_stationary_intervals
 from tcpipe.fusion.measurements import GNSS, VISUAL, WHEELS
 from tcpipe.fusion.process import WHEEL_SCALE_STD, estimate_slope_std_rad
-from tcpipe.fusion.stationary import find_stationary_intervals
 from tcpipe.fusion.timeline import build_timeline
 from tcpipe.geometry.rotation import matrix_from_quat
 

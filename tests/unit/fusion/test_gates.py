@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.special import chdtri
 
-from tcpipe.fusion.gates import find_chi_square_threshold
+from tcpipe.fusion.signals import find_chi_square_threshold
 
 
 @given(st.integers(1, 9), st.floats(1e-3, 1.0 - 1e-9))

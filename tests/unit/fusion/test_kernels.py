@@ -5,11 +5,10 @@ import pytest
 from unit.fusion import dense_reference, drive
 from unit.fusion.dense_reference import FORCE, LEVER, RATE, P, X
 
-from tcpipe.fusion import error_state_pass, prediction_kernel, state_kernel, update_kernel
-from tcpipe.fusion.fix_errors import FixErrors
-from tcpipe.fusion.initial import find_initial_state
+from tcpipe.fusion import error_state_kernel, error_state_pass, prediction_kernel, state_kernel
+from tcpipe.fusion.gnss_faults import FixErrors
+from tcpipe.fusion.initial import find_initial_state, find_stationary_intervals
 from tcpipe.fusion.measurements import select_measurements
-from tcpipe.fusion.stationary import find_stationary_intervals
 from tcpipe.fusion.timeline import build_timeline
 
 
@@ -59,8 +58,8 @@ def test_update_is_the_unscented_transform(kind):
     if kind in {state_kernel.SIDEWAYS, state_kernel.LEVEL}:
         z[2] = 0.0
     x, covariance = X.copy(), P.copy()
-    nis = update_kernel.compute_innovation(kind, x, covariance, z, r, RATE, LEVER, 1.0, work, gain)
-    update_kernel.correct(x, covariance, work, gain, np.zeros((3, 3)))
+    nis = error_state_kernel.compute_innovation(kind, x, covariance, z, r, RATE, LEVER, 1.0, work, gain)
+    error_state_kernel.correct(x, covariance, work, gain, np.zeros((3, 3)))
     wanted = dense_reference.update(kind, X, P, z, r, RATE, LEVER)
     assert np.allclose(x, wanted[0], atol=1e-13)
     assert np.allclose(covariance, wanted[1], atol=1e-9)

@@ -3,8 +3,12 @@
 import numpy as np
 import pytest
 
-from tcpipe.fusion.pose_increments import compute_orientation_rates, is_along_pose_axes, rotate_to_child_axes
-from tcpipe.fusion.preparation import prepare_body_velocities
+from tcpipe.fusion.preparation import (
+    compute_orientation_rates,
+    is_along_pose_axes,
+    prepare_body_velocities,
+    rotate_to_child_axes,
+)
 from tcpipe.geometry.rotation import quat_from_rpy
 
 SPEED, RATE = 1.5, 0.3

@@ -3,7 +3,7 @@
 import numpy as np
 from unit.fusion import drive
 
-from tcpipe.fusion.stationary import find_stationary_intervals
+from tcpipe.fusion.initial import find_stationary_intervals
 
 
 def test_every_interval_is_standing_and_long_stays_are_found():

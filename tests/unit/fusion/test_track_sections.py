@@ -3,7 +3,7 @@
 import numpy as np
 
 from tcpipe.fusion.measurements import BodyVelocities, InertialMeasurements, Measurements, Positions
-from tcpipe.fusion.track_sections import cut_stretches, track_stamps
+from tcpipe.fusion.trajectory import cut_stretches, track_stamps
 
 S = 1_000_000_000
 

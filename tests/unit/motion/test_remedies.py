@@ -2,7 +2,7 @@
 
 import pytest
 
-from tcpipe.motion.remedies import find_largest_losses, find_losses, make_loss_code
+from tcpipe.motion.distance_breakdown import find_largest_losses, find_losses, make_loss_code
 from tcpipe.tables.bits import DropReason, Loss, flag_name
 from tcpipe.tables.catalogue import read_catalogue
 from tcpipe.tables.findings import Subject

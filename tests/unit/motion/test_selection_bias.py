@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tcpipe.motion.selection_bias import Group, find_main_reason, find_uneven_groups, list_groups, sum_lengths_m
+from tcpipe.motion.distance_breakdown import Group, find_main_reason, find_uneven_groups, list_groups, sum_lengths_m
 
 REASONS = ("in_samples", "gap", "stuck")
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from tcpipe.logs.topics import Topic
-from tcpipe.motion.remedies import make_loss_code
+from tcpipe.motion.distance_breakdown import make_loss_code
 from tcpipe.pipeline.preflight import (
     ExpectedYield,
     RoleTopic,

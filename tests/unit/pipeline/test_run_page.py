@@ -13,8 +13,7 @@ from stored_files import run_document
 from tcpipe.formats.logs.log_file import open_log
 from tcpipe.pipeline.ingest import ingest
 from tcpipe.pipeline.maps import add_map
-from tcpipe.report.run_report import run_report
-from tcpipe.report.run_sensors import make_sensor_sections
+from tcpipe.report.run_report import make_sensor_sections, run_report
 from tcpipe.simulation import Faults, make_tiny, simulate
 from tcpipe.store import Store
 from tcpipe.tables.facts import AuditFacts, Disagreement

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tcpipe.power.averaging import is_stated_averaged
+from tcpipe.power.sampling import is_stated_averaged
 from tcpipe.simulation import Faults, make_tiny, simulate_readings
 from tcpipe.simulation.sensors import Power
 

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from tcpipe.power.counters import count_energy
 from tcpipe.power.energy import integrate_energy
 from tcpipe.power.rails import make_rail, make_samples
+from tcpipe.power.sources import count_energy
 
 N = 200
 STAMP_NS = np.cumsum(np.random.default_rng(3).integers(10_000_000, 90_000_000, N))

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tcpipe.power.idle import estimate_idle_power
+from tcpipe.power.energy import estimate_idle_power
 
 
 def halts(*watts, rows=60):

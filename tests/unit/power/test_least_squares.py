@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import nnls
 
-from tcpipe.power import signal_model
+from tcpipe.power import noise as energy_noise
 from tcpipe.power.least_squares import solve_non_negative
 
 
@@ -14,11 +14,11 @@ from tcpipe.power.least_squares import solve_non_negative
 def test_as_scipy_of_what_a_signal_is_made_of(seed, spacings, noise, averaged):
     draw = np.random.default_rng(seed)
     period_s = draw.choice([0.02, 0.1, 1.0])
-    spacing = np.array(signal_model._SPACINGS[:spacings])
-    taus = [*((tau, False) for tau in signal_model._ROUGH_TAU), *((tau, True) for tau in signal_model._SMOOTH_TAU)]
+    spacing = np.array(energy_noise._SPACINGS[:spacings])
+    taus = [*((tau, False) for tau in energy_noise._ROUGH_TAU), *((tau, True) for tau in energy_noise._SMOOTH_TAU)]
     made = np.stack(
         [
-            signal_model._predict_second_differences(spacing, period_s, tau * period_s, smooth=s, averaged=averaged)
+            energy_noise._predict_second_differences(spacing, period_s, tau * period_s, smooth=s, averaged=averaged)
             for tau, s in taus
         ]
     )

@@ -14,10 +14,10 @@ from tcpipe.power.noise import (
     compute_median_period_s,
     estimate_energy_noise,
     estimate_resolution,
+    fit_signal_model,
     sum_squared_weights,
 )
 from tcpipe.power.rails import Rail, Samples, make_rail, make_samples
-from tcpipe.power.signal_model import fit_signal_model
 
 ZERO = stamps(1)[0]
 STARTS = ZERO + (np.arange(5, 595, 1.3) * 1e9).astype(np.int64)

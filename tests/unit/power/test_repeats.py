@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tcpipe.power.repeats import find_readings
+from tcpipe.power.sampling import find_readings
 
 COUNT = 6000
 AT_NS = 1_700_000_000_000_000_000 + 50_000_000 * np.arange(COUNT, dtype=np.int64)

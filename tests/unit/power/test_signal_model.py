@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from tcpipe.power.rails import Samples
-from tcpipe.power.signal_model import (
+from tcpipe.power.noise import (
     SignalModel,
     _compute_second_differences,
     _estimate_stationary_error,
@@ -14,6 +13,7 @@ from tcpipe.power.signal_model import (
     estimate_local_scale,
     fit_signal_model,
 )
+from tcpipe.power.rails import Samples
 
 ZIGZAG = np.arange(100) % 2.0
 

@@ -7,9 +7,8 @@ from html.parser import HTMLParser
 
 import numpy as np
 
-from tcpipe.report.page import Link, Number, Section, Shaded, render_page
+from tcpipe.report.page import Link, Number, Section, Shaded, render_page, show_verdict
 from tcpipe.report.plots import draw_histogram, draw_waterfall, make_plot, render_plots
-from tcpipe.report.verdict import show_verdict
 from tcpipe.tables.findings import Remedy, Subject, judge, make_finding
 
 EVIL = "</script><script>alert(1)</script>\x1b[31m\u202e$$x$$ \\(y\\) \"'&"
@@ -121,7 +120,7 @@ def test_what_waits_joins_what_is_drawn_first_and_names_the_axis_that_it_shares(
         return made
 
     asked = plot("asked")
-    every = [plot("beside", waits=True, beside=asked), asked, plot("alone", waits=True), plot("too")]
+    every = [plot("beside", waits=True, x_range=asked.figure.x_range), asked, plot("alone", waits=True), plot("too")]
     told, ids = render_plots(every)
     first, later = told["first"]["roots"], told["later"]
     assert [[root["attributes"]["name"] for root in of] for of in (first, later)] == [

@@ -8,15 +8,15 @@ import pytest
 from page_reading import data_of, unpacked
 from synthetic_store import add_run, driven, lanes, segments
 
-from tcpipe.report.run_plots import time_plots
-from tcpipe.report.run_report import run_report
-from tcpipe.report.run_series import (
+from tcpipe.report.run_plots import (
     downsample_columns,
     find_mask_spans,
     make_rail_series,
     make_speed_series,
     make_timeline,
+    time_plots,
 )
+from tcpipe.report.run_report import run_report
 from tcpipe.store import open_store
 from tcpipe.tables.bits import Quality
 from tcpipe.tables.facts import ClockStep, StageFacts
@@ -46,7 +46,7 @@ def test_thinning_keeps_every_peak_and_says_how_many_there_were():
     shown = downsample_columns("x", np.arange(len(values)) * 0.01, {"y": (6, values)}, most=2_000)
     kept = shown.columns["y"][1]
     assert len(kept) == len(shown.t_s) <= 2_000
-    assert shown.of == len(values)
+    assert shown.value_count == len(values)
     assert (np.nanmax(kept), np.nanmin(kept)) == (40.0, -40.0)
     per_bin = -(-2 * len(values) // 2_000)
     for number in (0, 7, len(kept) // 2 - 1):
@@ -158,10 +158,9 @@ def test_a_step_of_the_clock_has_its_place_and_its_size():
     track, half = stepped(driven(drive()), 10**12)
     axis = make_timeline(track)
     facts = StageFacts(clock_steps=(ClockStep(10**18, 1000.0, ("/gnss",)),))
-    shown = time_plots(
-        axis, lines=[], spans=find_mask_spans(track, axis, 20.0), facts=facts, refused=REJECTIONS.empty(), labels=False
-    )
-    (event,) = [drawn.data_source.data for drawn in shown.plots[0].figure.renderers if "text" in drawn.data_source.data]
+    spans, rejections = find_mask_spans(track, axis, 20.0), REJECTIONS.empty()
+    plots, _ = time_plots(axis, lines=[], spans=spans, facts=facts, rejections=rejections, has_labels=False)
+    (event,) = [drawn.data_source.data for drawn in plots[0].figure.renderers if "text" in drawn.data_source.data]
     assert event["text"] == ("the clock steps by +1000.000 s",)
     assert event["right"][0] == pytest.approx((half - 1) * 0.05 + 1.0)
 
@@ -169,4 +168,4 @@ def test_a_step_of_the_clock_has_its_place_and_its_size():
 def test_what_is_short_is_carried_whole():
     shown = downsample_columns("x", np.arange(5.0), {"y": (2, np.array([1.0, np.nan, 3.0, 2.0, 5.0]))})
     assert shown.columns["y"][1] == pytest.approx([1.0, np.nan, 3.0, 2.0, 5.0], nan_ok=True)
-    assert shown.of == len(shown.t_s) == 5
+    assert shown.value_count == len(shown.t_s) == 5

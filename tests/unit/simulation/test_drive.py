@@ -10,8 +10,7 @@ from tcpipe.simulation.drive import simulate_drive
 from tcpipe.simulation.robot import GRAVITY_MPS2, GroundModel, SimulatedRobot
 from tcpipe.simulation.route import Leg, Pause, Turn
 from tcpipe.simulation.scenarios import make_small_world
-from tcpipe.simulation.site import Site
-from tcpipe.simulation.world import GRASS, World
+from tcpipe.simulation.world import GRASS, Site, World
 
 DT_S = 0.005
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tcpipe.simulation.random_fields import draw_waves, evaluate_field, state, sum_waves
+from tcpipe.simulation.world import draw_waves, evaluate_field, state, sum_waves
 
 
 def test_rows_and_columns_are_a_product_of_matrices_with_the_same_values():

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from tcpipe.simulation.paper_site import make_paper_site, make_paper_surface, scale_hidden_variance
-from tcpipe.simulation.random_fields import state
-from tcpipe.simulation.world import GRASS, MUD, PAVED, UNPAVED
+from tcpipe.simulation.world import GRASS, MUD, PAVED, UNPAVED, state
 
 RNG = np.random.default_rng(3)
 U, V = RNG.uniform(0, 500, 20000), RNG.uniform(0, 300, 20000)

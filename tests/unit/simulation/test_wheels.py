@@ -6,11 +6,8 @@ import numpy as np
 import pytest
 
 from tcpipe.simulation.paper_site import make_paper_site, make_paper_surface
-from tcpipe.simulation.random_fields import Wave
-from tcpipe.simulation.site import Site
-from tcpipe.simulation.surface import SurfaceEffect
-from tcpipe.simulation.wheels import compute_rolling_resistance
-from tcpipe.simulation.world import GRASS, PAVED, Band, World
+from tcpipe.simulation.robot import compute_rolling_resistance
+from tcpipe.simulation.world import GRASS, PAVED, Band, Site, SurfaceEffect, Wave, World
 
 SITE = Site()
 ROBOT = make_paper_site().robot

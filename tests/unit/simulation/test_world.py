@@ -7,8 +7,7 @@ import pytest
 from pyproj import Proj
 
 from tcpipe.simulation.scenarios import make_small_world
-from tcpipe.simulation.site import Site
-from tcpipe.simulation.world import GRASS, MUD, PAVED, Band, Ellipse, Hill, World
+from tcpipe.simulation.world import GRASS, MUD, PAVED, Band, Ellipse, Hill, Site, World
 
 SITE = Site()
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tcpipe.fusion.measurements import InertialMeasurements, InitialState, Measurements, Positions
-from tcpipe.fusion.track_sections import TrackSection
+from tcpipe.fusion.trajectory import TrackSection
 from tcpipe.stages.fuse_findings import fuse_facts, fuse_findings
 from tcpipe.stages.fuse_inputs import FusionInputs
 from tcpipe.stages.fuse_stretches import stretch_facts

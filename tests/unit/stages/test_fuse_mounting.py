@@ -9,7 +9,7 @@ from suggested_recipes import proposed
 
 from tcpipe.fusion.checks.mounting import Arm, ArmEvidence, Tilt, TiltEvidence
 from tcpipe.fusion.measurements import BodyVelocities, InertialMeasurements, Measurements, Positions
-from tcpipe.stages import fuse_mounting
+from tcpipe.stages import fuse
 from tcpipe.stages.fuse_findings import make_mounting_findings
 from tcpipe.stages.fuse_inputs import FusionInputs
 from tcpipe.stages.fuse_stretches import Fused
@@ -48,10 +48,10 @@ def slope_that_shows(roll_rad, pitch_rad):
 
 def test_an_antenna_that_nobody_placed_is_put_where_the_turns_show_it_and_then_left():
     log, taken = streams("assumed"), inputs()
-    first = fuse_mounting._correct_mounting(taken, Fused(arms=[turns_that_show(TRUE)]), log)
+    first = fuse._correct_mounting(taken, Fused(arms=[turns_that_show(TRUE)]), log)
     assert first.measurements[0].gnss.lever_arm_m == pytest.approx((0.4, -0.2, 0.9), abs=1e-3)
     moved_m = np.asarray(first.measurements[0].gnss.lever_arm_m) - ARM_M
-    assert fuse_mounting._correct_mounting(first, Fused(arms=[turns_that_show(TRUE, moved_m=moved_m)]), log) is None
+    assert fuse._correct_mounting(first, Fused(arms=[turns_that_show(TRUE, moved_m=moved_m)]), log) is None
     told = make_mounting_findings(first, log)
     assert told.facts.antenna_moved_m == pytest.approx(moved_m)
     (finding,) = told.findings
@@ -62,7 +62,7 @@ def test_an_antenna_that_nobody_placed_is_put_where_the_turns_show_it_and_then_l
 
 
 def test_an_antenna_that_nobody_placed_and_nothing_shows_is_unknown_by_a_robots_size():
-    found = fuse_mounting._correct_mounting(inputs(), Fused(), streams("assumed"))
+    found = fuse._correct_mounting(inputs(), Fused(), streams("assumed"))
     assert found.measurements[0].gnss.lever_arm_m == pytest.approx(ARM_M)
     assert np.sqrt(np.diag(found.arm.covariance))[:3] == pytest.approx([0.5, 0.5, 0.5])
 
@@ -70,8 +70,8 @@ def test_an_antenna_that_nobody_placed_and_nothing_shows_is_unknown_by_a_robots_
 def test_a_stated_antenna_is_moved_only_where_the_turns_surely_contradict():
     log = streams("tf_static")
     for agrees in (turns_that_show(0.05 * TRUE), turns_that_show(TRUE, std_m=0.5)):
-        assert fuse_mounting._correct_mounting(inputs(), Fused(arms=[agrees]), log) is None
-    found = fuse_mounting._correct_mounting(inputs(), Fused(arms=[turns_that_show(TRUE)]), log)
+        assert fuse._correct_mounting(inputs(), Fused(arms=[agrees]), log) is None
+    found = fuse._correct_mounting(inputs(), Fused(arms=[turns_that_show(TRUE)]), log)
     (finding,) = make_mounting_findings(found, log).findings
     assert (finding.code, finding.subject.name) == ("lever-arm-contradicted", "gnss")
     assert finding.names == {"placed_by": "tf_static"}
@@ -79,18 +79,18 @@ def test_a_stated_antenna_is_moved_only_where_the_turns_surely_contradict():
 
 def test_while_the_imu_is_being_turned_a_stated_antenna_is_not_judged():
     evidence = Fused(arms=[turns_that_show(TRUE)], tilts=[slope_that_shows(0.0, 0.08)])
-    found = fuse_mounting._correct_mounting(inputs(), evidence, streams("tf_static"))
+    found = fuse._correct_mounting(inputs(), evidence, streams("tf_static"))
     assert found.measurements[0].gnss.lever_arm_m == pytest.approx(ARM_M)
     assert found.imu_tilt.rad == pytest.approx([0.0, 0.08])
 
 
 def test_a_tilted_imu_is_turned_and_what_is_left_added_until_nothing_is():
     log = streams("tf_static")
-    assert fuse_mounting._correct_mounting(inputs(), Fused(tilts=[slope_that_shows(0.01, 0.01)]), log) is None
-    first = fuse_mounting._correct_mounting(inputs(), Fused(tilts=[slope_that_shows(0.0, 0.07)]), log)
-    second = fuse_mounting._correct_mounting(first, Fused(tilts=[slope_that_shows(0.01, 0.01)]), log)
+    assert fuse._correct_mounting(inputs(), Fused(tilts=[slope_that_shows(0.01, 0.01)]), log) is None
+    first = fuse._correct_mounting(inputs(), Fused(tilts=[slope_that_shows(0.0, 0.07)]), log)
+    second = fuse._correct_mounting(first, Fused(tilts=[slope_that_shows(0.01, 0.01)]), log)
     assert second.imu_tilt.rad == pytest.approx([0.0, 0.08])
-    assert fuse_mounting._correct_mounting(second, Fused(tilts=[slope_that_shows(0.01, 0.002)]), log) is None
+    assert fuse._correct_mounting(second, Fused(tilts=[slope_that_shows(0.01, 0.002)]), log) is None
     turned = Rotation.from_euler("xyz", [0.0, 0.08, 0.0])
     felt = second.measurements[0].imu.specific_force_mps2
     assert felt == pytest.approx(np.tile(turned.apply([0.0, 0.0, 9.8]), (5, 1)), abs=0.01)
@@ -121,7 +121,7 @@ def test_a_scale_that_is_off_throughout_is_taken_out_and_the_recipe_line_states_
     log = streams("tf_static")
     given = replace(log.report, facts=replace(log.report.facts, odometry_scale={"wheel_odometry": 0.5}))
     evidence = Fused(ratios=[{"wheel_odometry": np.linspace(1.29, 1.31, 21)}])
-    found = fuse_mounting._correct_mounting(FusionInputs(None, {0: Measurements(wheels=wheels)}), evidence, log)
+    found = fuse._correct_mounting(FusionInputs(None, {0: Measurements(wheels=wheels)}), evidence, log)
     assert found.measurements[0].wheels.velocity_mps == pytest.approx(np.ones((5, 3)))
     told = make_mounting_findings(found, replace(log, report=given))
     assert told.facts.odometry_scale == {"wheel_odometry": pytest.approx(1.3)}

@@ -4,13 +4,12 @@ import numpy as np
 import pytest
 from made_tracks import power_streams, stamps, straight_track
 
-from tcpipe.power.energy import integrate_energy
-from tcpipe.power.idle import IdlePower
+from tcpipe.power.energy import IdlePower, integrate_energy
 from tcpipe.recipe import GateConfig, SegmentConfig
 from tcpipe.stages.fuse_stretches import make_power_columns
 from tcpipe.stages.label import compute_segment_costs
 from tcpipe.stages.mask import mask_track
-from tcpipe.stages.power_rails import make_rails
+from tcpipe.stages.message_arrays import make_rails
 from tcpipe.stages.segment import segment_track
 from tcpipe.tables.columns import to_integers
 from tcpipe.tables.levels import Streams

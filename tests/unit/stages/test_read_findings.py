@@ -8,7 +8,7 @@ from tcpipe.logs.messages import Readings
 from tcpipe.logs.roles import PlayedRole, RoleAssignment
 from tcpipe.logs.simulated_clock import SimulatedClock
 from tcpipe.power.readings import PowerReadings
-from tcpipe.stages.read_findings import read_findings
+from tcpipe.stages.read import read_findings
 from tcpipe.stages.read_sources import TopicReadings
 from tcpipe.tables.facts import ClockStep, PowerSign
 from tcpipe.tables.findings import Subject, make_finding

@@ -10,7 +10,7 @@ from tcpipe.simulation import find_scenario, simulate_readings
 from tcpipe.simulation.faults import Faults
 from tcpipe.simulation.scenarios import make_small_world
 from tcpipe.simulation.sensors import Noise, Power, Sensors, record
-from tcpipe.stages.power_rails import make_rails
+from tcpipe.stages.message_arrays import make_rails
 from tcpipe.stages.read_power import find_repeats, remove_repeats
 from tcpipe.tables.levels import Streams
 

@@ -12,8 +12,8 @@ from rasterio import Affine
 from tcpipe.errors import MapError
 from tcpipe.formats.maps import geotiff
 from tcpipe.formats.maps.building import build_map
+from tcpipe.formats.maps.layer_building import open_raster
 from tcpipe.formats.maps.map_files import open_map
-from tcpipe.formats.maps.mosaic import open_raster
 
 LEFT, TOP, PITCH_M = 560_000.0, 5_215_000.0, 0.25
 SIDE, STEP = 48, 40

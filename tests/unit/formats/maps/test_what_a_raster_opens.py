@@ -14,7 +14,7 @@ from rasterio import Affine
 
 from tcpipe.errors import MapError
 from tcpipe.formats.maps.geotiff import list_raster_files, read_tile
-from tcpipe.formats.maps.mosaic import open_raster
+from tcpipe.formats.maps.layer_building import open_raster
 
 PLACE = Affine(1.0, 0.0, 560_000.0, 0.0, -1.0, 5_215_000.0)
 HEIGHTS = np.arange(64 * 64, dtype=np.float32).reshape(1, 64, 64) / 64

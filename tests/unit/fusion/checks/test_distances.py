@@ -12,8 +12,7 @@ from tcpipe.fusion.checks.distances import (
     find_contradictions,
     find_distances,
 )
-from tcpipe.fusion.checks.lags import GRID_NS, GRID_S
-from tcpipe.fusion.checks.windows import find_liveliest_window_ns, iterate_windows_ns
+from tcpipe.fusion.checks.lags import GRID_NS, GRID_S, find_liveliest_window_ns, iterate_windows_ns
 from tcpipe.fusion.measurements import BodyVelocities, Measurements, Positions
 
 AT_NS = np.arange(0, 120_000_000_000, GRID_NS, dtype=np.int64)

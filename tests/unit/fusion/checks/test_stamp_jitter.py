@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from unit.fusion import drive
 
-from tcpipe.fusion.checks.stamp_jitter import add_jitter_variance, stamp_jitter_s
+from tcpipe.fusion.checks.clock_offsets import add_jitter_variance, stamp_jitter_s
 
 
 def test_clean_fixes_show_none_also_with_outliers_slip_and_stops():

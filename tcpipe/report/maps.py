@@ -1,0 +1,262 @@
+"""Maps of pages: the samples of a dataset with the plot beside it, and the track of a run over a map of the store."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, MutableMapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import shapely
+from numpy.typing import NDArray
+from pyproj import Transformer
+
+from tcpipe.errors import TcpipeError, clean_line
+from tcpipe.formats.dataset_card import DatasetCard
+from tcpipe.formats.dataset_files import CLASSES, DRIVE_NEXT, OVERVIEW, RELIEF
+from tcpipe.formats.geojson import PolygonGeometry, read_polygons
+from tcpipe.formats.maps.map_files import MapFile, open_map
+from tcpipe.formats.stored_runs import RunDirectory
+from tcpipe.report.colours import CURSOR
+from tcpipe.report.pictures import (
+    Bounds,
+    compute_joint_bounds_m,
+    draw_classes,
+    draw_ortho,
+    draw_relief,
+    make_picture_uri,
+    read_picture,
+)
+from tcpipe.report.plots import Plot, lay_picture, make_map_plot, make_plot
+from tcpipe.store import Store
+from tcpipe.tables.columns import read_lonlat_deg, to_floats
+
+Floats = NDArray[np.float64]
+Pictures = MutableMapping[str, str]
+"""Pictures of a map by name, as data URIs; the first is visible."""
+
+_MOST_PLACES = 200
+"""Places to drive next that are drawn, the most wanted first."""
+_LEAST_SHARE = 0.5
+"""Of a track that lies on a map, for the map to be its background."""
+
+
+def draw_dataset_map(directory: Path, card: DatasetCard, sample_count: int) -> tuple[list[Plot], list[str]]:
+    """Return the map of the samples and the plot beside it, and which parts of the map are lost."""
+    bounds = compute_joint_bounds_m([(grid.crs, grid.bounds_m) for grid in card.maps])
+    tools = "box_select,lasso_select,tap"
+    plot = make_map_plot(
+        alt=f"Map of {sample_count} points, coloured by what is chosen above; the tables below hold the counts.",
+        axes=("easting [m]", "northing [m]"),
+        height_px=110 + 500 * (bounds[3] - bounds[1]) / max(bounds[2] - bounds[0], 1e-9),
+        tools=f"pan,wheel_zoom,{tools},reset,save",
+    )
+    lost = _lay_dataset_pictures(plot, directory, card, bounds)
+    lost += _draw_places(plot, directory, card)
+    figure = plot.figure
+    ends = {end: np.empty(0) for end in ("x0", "y0", "x1", "y1")}
+    leaks = figure.segment(source=ends, color=CURSOR, line_width=1.5, name="leaks", visible=False)
+    leaks.level = "overlay"  # above the points that they join
+    rings = _project_rings(card.split.region, Transformer.from_crs("EPSG:4326", card.maps[0].crs, always_xy=True))
+    xs, ys = ([ring[:, axis] for ring in rings] for axis in (0, 1))
+    figure.multi_line(xs, ys, color="#b3202a", line_width=2, line_dash="dashed")
+    corners = {
+        "x": [*bounds[::2]],
+        "y": [*bounds[1::2]],
+        "fill": ["#ffffff"] * 2,
+        "across": [0.0, 1.0],
+        "up": [0.0, 1.0],
+    }
+    points = figure.scatter(
+        "x",
+        "y",
+        size=7,
+        fill_color="fill",
+        line_color="#ffffff",
+        line_width=0.4,
+        nonselection_fill_alpha=0.3,
+        nonselection_line_alpha=0.0,
+        selection_line_color="#000000",
+        selection_line_width=1.2,
+        source=corners,  # until the page's script has unpacked the samples
+        name="samples",
+    )
+    brush = make_plot(
+        "brush",
+        alt="Points of the map as a plot of what is chosen above it; a box drawn here chooses them on the map.",
+        axes=("slope along travel [°]", "power w [W]"),
+        height_px=figure.height,
+        tools=f"{tools},pan,wheel_zoom,reset,save",
+        drag="box_select",
+    )
+    brush.figure.scatter(
+        "across",
+        "up",
+        size=5,
+        fill_color="fill",
+        line_color=None,
+        fill_alpha=0.8,
+        nonselection_fill_alpha=0.08,
+        source=points.data_source,
+    )
+    return [plot, brush], lost
+
+
+def _lay_dataset_pictures(plot: Plot, directory: Path, card: DatasetCard, bounds: Bounds) -> list[str]:
+    has_ortho = any("ortho" in grid.layers for grid in card.maps)
+    files = {"orthophoto" if has_ortho else "hillshade": OVERVIEW, "hillshade ": RELIEF, "classes": CLASSES}
+    lost = []
+    for number, (name, file) in enumerate(files.items()):
+        if file != OVERVIEW and file not in card.checksums:
+            continue
+        pixels = read_picture(directory / file)
+        if pixels is None:
+            lost.append(f"{file} is lost or damaged: the map has no {name.strip()}")
+            continue
+        lay_picture(plot, name.strip(), make_picture_uri(pixels, exact=file == CLASSES), bounds, visible=number == 0)
+    return lost
+
+
+def _draw_places(plot: Plot, directory: Path, card: DatasetCard) -> list[str]:
+    """Draw where to drive next, hidden at first; return why that is not possible."""
+    if DRIVE_NEXT not in card.checksums:
+        return []
+    try:
+        features, problems = read_polygons(directory / DRIVE_NEXT)
+    except TcpipeError as error:
+        return [f"where to drive next cannot be shown: {error.problems[0]}"]
+    to_map = Transformer.from_crs("EPSG:4326", card.maps[0].crs, always_xy=True)
+    rings, texts = [], []
+    for feature in features[:_MOST_PLACES]:
+        fields = feature.properties
+        text = (
+            f"{fields.get('rank')}: {fields.get('class') or 'any ground'}, {fields.get('slope')}, "
+            f"drive {fields.get('drive_towards')}"
+        )
+        for polygon in feature.polygons:
+            rings.append(np.column_stack(to_map.transform(*shapely.get_coordinates(polygon.exterior).T)))
+            texts.append(text)
+    plot.figure.patches(
+        "xs",
+        "ys",
+        source={"xs": [ring[:, 0] for ring in rings], "ys": [ring[:, 1] for ring in rings], "text": texts},
+        fill_color="#00e5ff",
+        fill_alpha=0.25,
+        line_color="#00e5ff",
+        line_width=2,
+        name="drive next",
+        visible=False,
+    )
+    return list(problems)
+
+
+def _project_rings(region: Mapping[str, PolygonGeometry] | None, to_map: Transformer) -> list[Floats]:
+    """Return every ring of every polygon of the region in the map's plane [m], each of shape (M, 2)."""
+    rings = []
+    for geometry in (region or {}).values():
+        polygons = (geometry.coordinates,) if geometry.type == "Polygon" else geometry.coordinates
+        rings += [np.array(ring, dtype=float)[:, :2] for polygon in polygons for ring in polygon]
+    return [np.column_stack(to_map.transform(ring[:, 0], ring[:, 1])) for ring in rings]
+
+
+@dataclass(frozen=True, slots=True)
+class RunMap:
+    """The map of a run, which the page's script fills, and the places in its plane."""
+
+    plot: Plot
+    track_xy_m: Floats
+    """Shape (N, 2)."""
+    ends_xy_m: tuple[Floats, Floats]
+    """Start and end of each segment, shape (M, 2) each."""
+    ground: tuple[str, ...]
+    """Names of the pictures below the track."""
+    missing: tuple[str, ...]
+    """Why there is no picture, in words."""
+
+
+def draw_run_map(
+    store: Store,
+    run: RunDirectory,
+    track: pa.Table,
+    segments: pa.Table,
+    *,
+    has_datum: bool,
+    pictures_by_map: MutableMapping[str, Pictures],
+) -> RunMap:
+    """Return the map; ``has_datum`` is whether the track has a place on Earth, ``pictures_by_map`` keeps pictures for further runs."""
+    lonlat = np.column_stack([to_floats(track, "lon_deg"), to_floats(track, "lat_deg")])
+    ground, missing = _find_ground(store, run, lonlat, pictures_by_map) if has_datum else (None, [])
+    if ground is None:
+        start, end = (
+            np.column_stack([to_floats(segments, f"{end}_{axis}_m") for axis in "xy"]) for end in ("start", "end")
+        )
+        xy_m = np.column_stack([to_floats(track, "x_m"), to_floats(track, "y_m")])
+        plot = _draw_track(("east [m]", "north [m]"), xy_m)
+        missing = missing or [_explain_no_map(store, has_datum=has_datum)]
+        return RunMap(plot, xy_m, (start, end), (), tuple(missing))
+    to_map, bounds_m, pictures = ground
+    xy_m = to_map(lonlat)
+    plot = _draw_track(("easting [m]", "northing [m]"), xy_m)
+    for number, (name, uri) in enumerate(pictures.items()):
+        lay_picture(plot, name, uri, bounds_m, visible=number == 0)
+    ends_xy_m = to_map(read_lonlat_deg(segments, "start")), to_map(read_lonlat_deg(segments, "end"))
+    return RunMap(plot, xy_m, ends_xy_m, tuple(pictures), tuple(missing))
+
+
+def _explain_no_map(store: Store, *, has_datum: bool) -> str:
+    if not has_datum:
+        return "No fix of a GNSS: the track lies in a plane of its own, and no map can be laid under it."
+    return "No map of the store lies under the track." if store.maps() else "The store has no map ('tcpipe add-map')."
+
+
+def _find_ground(
+    store: Store, run: RunDirectory, lonlat: Floats, pictures_by_map: MutableMapping[str, Pictures]
+) -> tuple[tuple[Callable[[Floats], Floats], Bounds, Pictures] | None, list[str]]:
+    """Return projection, bounds and pictures of the first map that holds most of the track, and which maps cannot be read."""
+    lost: list[str] = []
+    for name in store.maps():
+        try:
+            source = open_map(*store.map_files(name))
+            transformer = Transformer.from_crs(run.manifest.recipe.read.gnss_crs, source.grid.crs, always_xy=True)
+
+            def to_map(places_deg: Floats, transformer: Transformer = transformer) -> Floats:
+                return np.column_stack(transformer.transform(*places_deg.T)).reshape(-1, 2)
+
+            if source.grid.contains(to_map(lonlat)).mean() > _LEAST_SHARE:
+                if name not in pictures_by_map:
+                    pictures_by_map[name] = _draw_pictures(source)
+                return (to_map, source.grid.bounds_m, pictures_by_map[name]), lost
+        except (TcpipeError, OSError) as error:
+            lost.append(f"Map {name} cannot be shown: {clean_line(str(error))}.")
+    return None, lost
+
+
+def _draw_track(axes: tuple[str, str], xy_m: Floats) -> Plot:
+    low, high = xy_m.min(axis=0), xy_m.max(axis=0)
+    width, height = np.maximum(high - low, 0.1 * np.max(high - low, initial=10.0))
+    plot = make_map_plot(
+        alt="Map of the track: segments, and where and why the rest is not used; the waterfall below holds the metres.",
+        axes=axes,
+        height_px=110 + 900 * height / width,
+    )
+    figure = plot.figure
+    corners = {"xs": [[low[0], high[0]]], "ys": [[low[1], high[1]]], "colour": ["#00000000"]}
+    track = figure.multi_line("xs", "ys", color="colour", line_width=3, source=corners, name="track")
+    ends = {end: list[float]() for end in ("x0", "y0", "x1", "y1", "colour")}
+    figure.segment("x0", "y0", "x1", "y1", color="colour", line_width=6, line_cap="butt", source=ends, name="segments")
+    cursor = {"x": list[float](), "y": list[float]()}
+    figure.scatter("x", "y", size=15, fill_alpha=0.0, line_color=CURSOR, line_width=3, source=cursor, name="here")
+    figure.x_range.renderers = figure.y_range.renderers = [track]
+    return plot
+
+
+def _draw_pictures(source: MapFile) -> Pictures:
+    layers = source.layers
+    draw: dict[str, Callable[[MapFile], NDArray[np.uint8]]] = {}
+    if any(name.startswith("ortho") for name in layers):
+        draw["orthophoto"] = draw_ortho
+    draw["hillshade"] = draw_relief
+    if "terrain" in layers:
+        draw["classes"] = draw_classes
+    return {name: make_picture_uri(look(source), exact=name == "classes") for name, look in draw.items()}
