@@ -31,8 +31,7 @@ from tcpipe.learning.fitting import (
     fit,
     read_checkpoint,
 )
-from tcpipe.learning.model_card import KIND, ModelCard, TrainedOn, Training, TrainingRange, is_current
-from tcpipe.learning.model_readme import model_readme
+from tcpipe.learning.model_card import KIND, ModelCard, TrainedOn, Training, TrainingRange, format_readme, is_current
 from tcpipe.learning.models import CARD, FILES, load_model, read_model_card, write_model
 from tcpipe.pipeline.generations import write_generation
 from tcpipe.terrain.classes import NODATA_ID, PAPER_CLASSES, ClassTable
@@ -165,7 +164,7 @@ def train(
     history = "".join(f"{epoch},{loss!r},{held!r}\n" for epoch, loss, held in fitted.progress.history)
     write_model(
         place, card=card, weights=fitted.weights, residuals=_make_residuals_table(fitted, task.outputs),
-        history="epoch,loss,held_out_loss\n" + history, readme=model_readme(card),
+        history="epoch,loss,held_out_loss\n" + history, readme=format_readme(card),
     )  # fmt: skip
     checkpoint.unlink(missing_ok=True)
     progress = fitted.progress
