@@ -1,4 +1,4 @@
-"""A model folder without training: a narrow network with random weights, and residuals that were drawn; evaluations without any."""
+"""A model folder without training: a narrow network with random weights, and residuals that were drawn; evaluations without figures."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -80,6 +80,6 @@ def made_evaluation(**changes) -> Evaluation:
     """An evaluation without any figure; ``changes`` replace its fields."""
     empty = Evaluation(
         tcpipe_version="", key="", model=EvaluatedModel("", "", CARD.training), dataset=EvaluatedDataset("", "", {}),
-        config=EvaluateConfig(), splits={}, ablation=(), energy={}, time={}, baselines=(), repeatability={}, warnings=(), plots={},
+        config=EvaluateConfig(), splits={}, ablation=(), energy={}, time={}, repeatability={}, plots={},
     )  # fmt: skip
     return replace(empty, **changes)

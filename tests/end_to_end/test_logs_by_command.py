@@ -61,7 +61,7 @@ def test_what_has_no_checksum_and_which_clock_is_simulated_is_said(tmp_path):
     assert tcpipe("ingest", "run", cwd=tmp_path).returncode == 0
     found = run_json(tmp_path / "tcpipe-store")
     assert found["damage"] == []
-    assert ["unchecked: a .db3 carries no checksum" in line for line in found["remarks"]] == [True]
+    assert [of["code"] for of in found["remarks"]] == ["no-checksum"]
     assert "simulated-time" in {of["code"] for of in found["report"]["findings"]}
 
 
@@ -224,16 +224,16 @@ def test_definitions_that_a_log_lacks_can_be_given(undefined):
 
 
 @pytest.mark.parametrize(
-    ("directory", "code", "said"),
+    ("command", "directory", "code", "said"),
     [
-        ("broken", 1, "its definition cannot be parsed"),
-        ("none", 1, "no .msg or .idl file below it"),
-        ("nowhere", 2, "no such directory"),
-        ("a.mcap", 2, "is a file"),
+        ("inspect", "broken", 1, "its definition cannot be parsed"),
+        ("ingest", "none", 1, "no .msg or .idl file below it"),
+        ("preflight", "nowhere", 2, "no such directory"),
+        ("inspect", "a.mcap", 2, "is a file"),
     ],
 )
-def test_definitions_that_cannot_be_used_are_refused(undefined, directory, code, said):
-    assert said in plain_lines(tcpipe("inspect", "a.mcap", "--msgdef", directory, cwd=undefined), code)
+def test_definitions_that_cannot_be_used_are_refused(undefined, command, directory, code, said):
+    assert said in plain_lines(tcpipe(command, "a.mcap", "--msgdef", directory, cwd=undefined), code)
 
 
 def test_export_says_what_it_did_and_that_nothing_is_left_to_do(tmp_path):

@@ -7,7 +7,9 @@ import socket
 
 import numpy as np
 import pytest
+from object_gateway import in_environment
 from storage_server import object_store
+from stored_files import read_files as files
 from synthetic_store import add_run, lanes, segments, small_store
 
 import tcpipe
@@ -33,11 +35,9 @@ def made(tmp_path_factory):
     """A store, a dataset in a directory, and the same in Parquet."""
     directory = tmp_path_factory.mktemp("made")
     store = small_store(directory)
-    with pytest.MonkeyPatch.context() as patch:  # drawing the page is nine tenths of so small a build
-        patch.setattr("tcpipe.pipeline.dataset.build.render_dataset_report", lambda *_: "<!doctype html>")
-        for kind in ("zarr", "parquet"):
-            build_dataset(directory / kind, store=store.root, recipe=Recipe(), file_format=kind)
-        yield directory
+    for kind in ("zarr", "parquet"):
+        build_dataset(directory / kind, store=store.root, recipe=Recipe(), file_format=kind)
+    return directory
 
 
 @pytest.fixture
@@ -46,21 +46,12 @@ def bucket(tmp_path, monkeypatch):
     root = tmp_path / "served" / "sets"
     root.mkdir(parents=True)
     with object_store(tmp_path / "served") as (environment, fetched):
-        for name in ("HTTP_PROXY", "http_proxy"):
-            monkeypatch.delenv(name, raising=False)
-        for name, value in {**environment, "TCPIPE_CACHE": str(tmp_path / "cache")}.items():
-            monkeypatch.setenv(name, value)
+        in_environment(monkeypatch, environment, tmp_path / "cache")
         yield root, fetched
 
 
 def put(made, bucket, kind="zarr"):
     shutil.copytree(made / kind, bucket[0] / "by name" / "ds")
-
-
-def files(directory):
-    return {
-        path.relative_to(directory).as_posix(): path.read_bytes() for path in directory.rglob("*") if path.is_file()
-    }
 
 
 def test_a_dataset_that_is_built_into_a_bucket_is_the_same_as_on_disk(made, bucket):

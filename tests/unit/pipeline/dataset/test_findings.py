@@ -19,6 +19,8 @@ from tcpipe.store import open_store
 from tcpipe.tables.bits import Quality
 from tcpipe.tables.findings import Finding, Subject, make_finding, select_findings
 
+DRAWS_DATASET_PAGES = True
+
 ROLE = Subject("role", "command")
 
 
