@@ -87,9 +87,8 @@ def _print_log(log: InspectedLog) -> None:
     for line in log.problems:
         print_line(f"  {line}")
     _print_findings(log.findings or ())
-    for kind, lines in (("damage", log.damage), ("remark", log.remarks)):
-        for line in lines or ():
-            print_line(f"{kind}: {line}")
+    _print_damage("damage", log.damage or ())
+    _print_damage("remark", log.remarks or ())
 
 
 def _print_findings(findings: Iterable[Finding]) -> None:
@@ -97,6 +96,13 @@ def _print_findings(findings: Iterable[Finding]) -> None:
 
     for line in list_findings(findings):
         print_line(line)
+
+
+def _print_damage(kind: str, findings: Iterable[Finding]) -> None:
+    from tcpipe.formats.finding_lines import describe_finding
+
+    for finding in findings:
+        print_line(f"{kind}: {describe_finding(finding)} [{finding.code}]")
 
 
 _READ_HEADER = ["read", "gaps", "longest gap [s]", "time", "offset [s]", "stamps"]
@@ -201,8 +207,7 @@ def _print_run(found: InspectedRun) -> None:
     print_line(f"{found.run_id}: from {' + '.join(found.source.paths if found.source else ['an unknown log'])}")
     if found.tags:
         print_line("tags: " + ", ".join(f"{key}={value}" for key, value in sorted(found.tags.items())))
-    for line in found.remarks:
-        print_line(f"remark: {line}")
+    _print_damage("remark", found.remarks)
     for run in found.recipes:
         ledger = run.ledger_m
         print_line("")
@@ -212,8 +217,7 @@ def _print_run(found: InspectedRun) -> None:
         print_line(f"{run.driven_m:.1f} m driven: {losses}" if losses else "not driven")
         print_line(f"verdict: {format_verdict(run.verdict)}")
         _print_findings(run.findings)
-        for line in run.damage:
-            print_line(f"damage: {line}")
+        _print_damage("damage", run.damage)
 
 
 def _print_tables(found: InspectedTables) -> None:

@@ -39,7 +39,7 @@ from tcpipe.pipeline.ingest_options import IngestOptions
 
 if TYPE_CHECKING:
     from tcpipe.pipeline.ingest import IngestSummary
-    from tcpipe.pipeline.ingest_task import IngestResult
+    from tcpipe.pipeline.plan import IngestResult
 
 
 @click.command()
@@ -59,7 +59,7 @@ def ingest(options: IngestOptions, *, dry_run: bool, as_json: bool, quiet: bool)
     """
     from tcpipe.formats.json_files import convert_record
     from tcpipe.pipeline.ingest import SummaryLine, run_ingest
-    from tcpipe.pipeline.ingest_task import LogLine
+    from tcpipe.pipeline.plan import LogLine
 
     ruling, source = resolve_recipe_with_source(cast("str | None", options.recipe))
     options = replace(options, recipe=ruling)
@@ -130,8 +130,7 @@ def _list_outcome(result: IngestResult, store: Path | str, *, several: bool) -> 
         known = " (known, not tried again)" if result.known else ""
         yield f"{result.status:<10} {result.log}{aside or known}"
     else:
-        wrong = "damaged" if run.damage else "empty" if problems else ""
-        known = f" ({wrong}, known)" if wrong and not result.is_news else ""
+        known = f" ({run.defect}, known)" if run.defect and not result.is_news else ""
         more = f", noise floor of E {100 * budget.total:.1f} %" if several and budget else ""
         more += f"; {format_verdict(result.verdict)}" if several and is_new and result.verdict else ""
         yield (
@@ -150,7 +149,8 @@ def _list_outcome(result: IngestResult, store: Path | str, *, several: bool) -> 
         )
     if run is None or result.verdict is None:
         return
-    yield from (f"  damage:  {line}" for line in run.damage if result.is_news or result.status == "damaged")
+    if result.is_news or result.status == "damaged":
+        yield from (f"  damage:  {describe_finding(of)} [{of.code}]" for of in run.damage)
     if is_new and not several:
         yield f"  verdict: {format_verdict(result.verdict)}"
         where = f"tcpipe inspect {store}/runs/{run.run_id}"

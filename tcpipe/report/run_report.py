@@ -12,7 +12,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from tcpipe.errors import StoreError, TableError
-from tcpipe.formats.finding_lines import describe_remedy
+from tcpipe.formats.finding_lines import describe_finding, describe_remedy
 from tcpipe.formats.json_files import Json
 from tcpipe.formats.parquet import read_table
 from tcpipe.formats.run_documents import Counts, Manifest, RunJson
@@ -76,7 +76,7 @@ def run_report(store: Store, run: RunDirectory, pictures_by_map: MutableMapping[
     source = "source unknown"
     if run_json is not None:
         source = f"from {', '.join(run_json.source.paths)} ({run_json.source.size_bytes / 1e6:.1f} MB)"
-    damage = [(line,) for line in manifest.damage]
+    damage = [(describe_finding(finding),) for finding in manifest.damage]
     return render_page(
         title=f"Run {run.run_id}",
         lead=f"Robot {manifest.robot}, recipe {run.recipe_id}, {source}",

@@ -178,8 +178,7 @@ def _state(facts: RunFacts, ruling: str | None, *, acknowledged: bool) -> str:
         return "superseded"
     if facts.ingest_key != ruling:
         return "of another recipe"
-    wrong = "damaged" if facts.damage else "empty" if facts.is_empty else ""
-    return f"{wrong}{', acknowledged' * acknowledged}" if wrong else "current"
+    return f"{facts.defect}{', acknowledged' * acknowledged}" if facts.defect else "current"
 
 
 def _compute_percent(share: float | None) -> float | None:
@@ -346,7 +345,7 @@ def _make_problem_sections(store: StoreFacts, runs: Sequence[StoredRun]) -> list
     """Return the logs without a run, and the runs that are damaged or cannot be read."""
     rows = [(log.log, log.state, log.why) for log in store.failed]
     for run in runs:
-        if run.facts is None or (run.is_current and (run.facts.damage or run.facts.is_empty)):
+        if run.facts is None or (run.is_current and run.facts.defect):
             line = store.found.damaged.get((run.run_id, run.recipe_id), "ingest its log again")
             rows.append((run.run_id, run.state, _describe_problem(run.facts) if run.facts else line))
     if not rows:
@@ -359,7 +358,7 @@ def _make_problem_sections(store: StoreFacts, runs: Sequence[StoredRun]) -> list
 
 
 def _describe_problem(facts: RunFacts) -> str:
-    return next(iter(facts.damage), "") or describe_finding(select_problems(facts.findings)[0])
+    return describe_finding((*facts.damage, *select_problems(facts.findings))[0])
 
 
 def _make_data(store: StoreFacts, runs: Sequence[StoredRun]) -> Json:
