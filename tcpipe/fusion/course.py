@@ -8,15 +8,15 @@ from numpy.typing import NDArray
 from tcpipe.fusion.measurements import BodyVelocities, Positions
 from tcpipe.fusion.signals import compute_interval_means, compute_seconds
 
-_GRID_S = 0.5
+_GRID_S = 0.5  # grid of the course
 _WINDOWS_S = (1.0, 2.0, 4.0, 8.0, 16.0)
-_CLEARLY = 3.0
-_MOVING_M = 0.3
-_MOVING_MPS = 0.2
-_OFTEN = 0.3
-_STEP_S = 1e-6
-_WILD = 5.0
-_TURNS_MPS2 = 2.0
+_CLEARLY = 3.0  # σ of fixes that a baseline needs
+_MOVING_M = 0.3  # shorter baselines show no course
+_MOVING_MPS = 0.2  # slower motion shows no course
+_OFTEN = 0.3  # share of usable baselines before longer ones
+_STEP_S = 1e-6  # step between two rates
+_WILD = 5.0  # σ off its neighbours' line: fix is bridged
+_TURNS_MPS2 = 2.0  # largest bend of that line in a turn
 
 
 def compute_course_rate(

@@ -110,7 +110,7 @@ class LogLine(IngestResult):
 def make_result(source: LogSource, status: Status, made: RunFacts, sha256: str, *, same_as: str | None) -> IngestResult:
     """Return what became of a log whose run is in the store."""
     if status == "done":
-        status = "damaged" if made.damage else "empty" if made.is_empty else status
+        status = made.defect or status
     return IngestResult(source.name, status, made, made.verdict, same_as=same_as, sha256=sha256)
 
 

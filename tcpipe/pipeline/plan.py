@@ -122,9 +122,9 @@ def _stand(task: IngestTask, made: RunFacts, state: State) -> Step:
     if not problems:
         return Step(task, "done", made=made)
     if is_acknowledged(problems, state):
-        return Step(task, "done", f"{'damaged' if made.damage else 'empty'}, acknowledged", made)
+        return Step(task, "done", f"{made.defect}, acknowledged", made)
     findings = tuple(problem.finding for problem in problems)
-    cause = made.damage[0] if made.damage else describe_finding(findings[0])
+    cause = describe_finding((*made.damage, *findings)[0])
     return Step(task, "empty" if made.is_empty else "partial", cause, made, findings=findings)
 
 

@@ -11,7 +11,7 @@ from wheel_drives import START_NS, drive_at, wheel_drive
 
 import tcpipe.pipeline.ingest_run as ingestion
 from tcpipe.errors import UsageError
-from tcpipe.formats.logs.writing import MessageStream, write_bag
+from tcpipe.formats.logs.writing import MessageStream, write_bag, write_rosbag2
 from tcpipe.formats.run_documents import LogOrigin, RunJson
 from tcpipe.pipeline import ingest as ingest_module
 from tcpipe.pipeline import ingest_task
@@ -373,8 +373,19 @@ def test_a_part_of_a_split_recording_takes_static_transforms_from_the_part_befor
     summary = ingest([tmp_path / "logs"], store=tmp_path / "store", recipe=Recipe())
     assert [result.status for result in summary.results] == ["done", "done"]
     known = [Store(tmp_path / "store").run_json(result.run.run_id).remarks for result in summary.results]
-    taken = [sum("run_0.bag ends, whose static transforms are taken" in line for line in lines) for lines in known]
-    assert taken == [0, 1]
+    assert [[of.names["earlier"] for of in notes if "earlier" in of.names] for notes in known] == [[], ["run_0.bag"]]
+
+
+def test_damage_that_leaves_no_message_is_the_cause_and_no_sensor_is_missing(tmp_path):
+    write_rosbag2(tmp_path / "run", wheel_drive(rows=1000))
+    path = tmp_path / "cut.db3"
+    path.write_bytes((tmp_path / "run" / "run.db3").read_bytes()[:28672])
+    (result,) = ingest([path], store=tmp_path / "store", recipe=Recipe()).results
+    assert result.status == "failed"
+    assert [of.code for of in result.causes] == ["log-failed", "file-cut", "database-damaged"]
+    inspected = inspect(path, recipe=Recipe())
+    assert inspected.problems == ("the log is damaged, and no message can be read",)
+    assert {of.code for of in inspected.findings} == {"log-damaged"}
 
 
 def test_a_log_that_was_lost_is_written_again_from_the_runs(tmp_path, night):

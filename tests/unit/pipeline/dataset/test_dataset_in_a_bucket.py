@@ -7,7 +7,9 @@ import socket
 
 import numpy as np
 import pytest
+from object_gateway import in_environment
 from storage_server import object_store
+from stored_files import read_files as files
 from synthetic_store import add_run, lanes, segments, small_store
 
 import tcpipe
@@ -44,21 +46,12 @@ def bucket(tmp_path, monkeypatch):
     root = tmp_path / "served" / "sets"
     root.mkdir(parents=True)
     with object_store(tmp_path / "served") as (environment, fetched):
-        for name in ("HTTP_PROXY", "http_proxy"):
-            monkeypatch.delenv(name, raising=False)
-        for name, value in {**environment, "TCPIPE_CACHE": str(tmp_path / "cache")}.items():
-            monkeypatch.setenv(name, value)
+        in_environment(monkeypatch, environment, tmp_path / "cache")
         yield root, fetched
 
 
 def put(made, bucket, kind="zarr"):
     shutil.copytree(made / kind, bucket[0] / "by name" / "ds")
-
-
-def files(directory):
-    return {
-        path.relative_to(directory).as_posix(): path.read_bytes() for path in directory.rglob("*") if path.is_file()
-    }
 
 
 def test_a_dataset_that_is_built_into_a_bucket_is_the_same_as_on_disk(made, bucket):

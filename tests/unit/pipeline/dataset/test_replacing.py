@@ -9,6 +9,7 @@ import pytest
 from click.testing import CliRunner
 from object_gateway import in_environment
 from storage_server import object_store
+from stored_files import read_files as tree
 from synthetic_store import add_run, add_world, box, commit_run, lanes, region_file, segments
 
 from tcpipe.cli import cli
@@ -47,10 +48,6 @@ def usual(here: Path, **how: object) -> dict[str, object]:
 def here(made, tmp_path):
     shutil.copytree(made, tmp_path / "here", copy_function=shutil.copy2)
     return tmp_path / "here"
-
-
-def tree(directory: Path) -> dict[str, bytes]:
-    return {str(path.relative_to(directory)): path.read_bytes() for path in directory.rglob("*") if path.is_file()}
 
 
 def refused(here: Path, **how: object) -> tuple[str, ...]:
