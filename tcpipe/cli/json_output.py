@@ -20,7 +20,7 @@ _ANSWERS = {
     "explain.answer": "pipeline.explain.Explained",
     "export.answer": "pipeline.export.Exported",
     "export-layers.answer": "pipeline.layers.ExportedLayers",
-    "ingest-log.answer": "pipeline.ingest_task.LogLine",
+    "ingest-log.answer": "pipeline.plan.LogLine",
     "ingest-summary.answer": "pipeline.ingest.SummaryLine",
     "inspect-dataset.answer": "pipeline.inspected.InspectedDataset",
     "inspect-log.answer": "pipeline.log_inspection.InspectedLog",
