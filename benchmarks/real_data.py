@@ -123,7 +123,7 @@ def by_trees(of: Metre) -> Predictor:
         return np.column_stack([there.rise, there.turn_radpm, there.command])
 
     labels = np.column_stack([of.power, of.velocity])
-    forest = grow(features(of), labels, np.ones_like(labels), _folds(len(labels))).forest
+    forest, _ = grow(features(of), labels, np.ones_like(labels), _folds(len(labels)))
     return lambda there: np.maximum(forest.predict(features(there)), [-np.inf, LEAST_VELOCITY_MPS])
 
 

@@ -110,7 +110,7 @@ def _begin_debugging(context: click.Context, _: click.Parameter, wanted: bool) -
 
 
 def _debug_option(*, hidden: bool) -> Callable[[C], C]:
-    """Return ``--debug``, which stands before or after the command's name."""
+    """Return ``--debug``, which is accepted before and after the command's name."""
     about = "Say what is done and when, and where an error comes from; also after COMMAND."
     return click.option(
         "--debug", is_flag=True, is_eager=True, expose_value=False, callback=_begin_debugging, hidden=hidden, help=about
@@ -182,7 +182,7 @@ def _list_causes(error: TcpipeError) -> list[str]:
 
 
 def _describe_unforeseen(error: Exception) -> str:
-    """Return what to say of a package that only an extra brings, or of a bug."""
+    """Return the message for a package that only an extra installs, or for a bug."""
     lacking = str(error.name).partition(".")[0] if isinstance(error, ModuleNotFoundError) else ""
     if extra := _EXTRAS.get(lacking):
         return f"{lacking} not installed, wanted by this command: pip install 'tcpipe[{extra}]'"
@@ -196,7 +196,7 @@ def _refuse_empty(arguments: list[str]) -> None:
 
 
 def _fail(problems: Sequence[str], code: int) -> NoReturn:
-    """Say what went wrong, with ``--json`` as an object on stdout too, and exit."""
+    """Print the problems, with ``--json`` as an object on stdout too, and exit."""
     if "--debug" in sys.argv:
         print_traceback()
     try:
@@ -208,5 +208,5 @@ def _fail(problems: Sequence[str], code: int) -> NoReturn:
 
 
 def _drop_stdout() -> None:
-    """Let what nobody can read go nowhere."""
+    """Discard output that nobody can read."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -20,7 +20,7 @@ _ANSWERS = {
     "explain.answer": "pipeline.explain.Explained",
     "export.answer": "pipeline.export.Exported",
     "export-layers.answer": "pipeline.layers.ExportedLayers",
-    "ingest-log.answer": "pipeline.ingest_task.LogLine",
+    "ingest-log.answer": "pipeline.plan.LogLine",
     "ingest-summary.answer": "pipeline.ingest.SummaryLine",
     "inspect-dataset.answer": "pipeline.inspected.InspectedDataset",
     "inspect-log.answer": "pipeline.log_inspection.InspectedLog",
@@ -53,5 +53,5 @@ def collect_contracts() -> dict[str, str]:
 
 def json_output_types() -> dict[str, type]:
     """Return the dataclass of every such answer and document, by the name of its contract."""
-    homes = {name: f"tcpipe.{of}".rpartition(".") for name, of in _ANSWERS.items()}
+    homes = {name: f"tcpipe.{path}".rpartition(".") for name, path in _ANSWERS.items()}
     return {name: getattr(import_module(module), cls) for name, (module, _, cls) in homes.items()}

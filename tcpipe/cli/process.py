@@ -20,7 +20,7 @@ _LATEST_S = 4.0
 
 
 class Terminated(BaseException):
-    """A signal asks this process to end; raised where it runs, so that workers end and temporaries go."""
+    """A signal asks this process to end; raised where it runs, so that workers and temporary files are cleaned up."""
 
     def __init__(self, number: int) -> None:
         super().__init__(f"ended by {signal.Signals(number).name}")
@@ -51,27 +51,27 @@ def prepare_process() -> None:
 
 @contextmanager
 def terminate_on_signal() -> Iterator[None]:
-    """Have a signal that asks this process to end do so, whatever library it is in; what it leaves then, the next call removes."""
-    heard, said = os.pipe()
-    os.set_blocking(said, False)
-    before = signal.set_wakeup_fd(said, warn_on_full_buffer=False)
-    threading.Thread(target=_watch, args=(heard,), daemon=True).start()
+    """End this process on a signal even inside a library that ignores it; the next call removes what remains."""
+    read_end, write_end = os.pipe()
+    os.set_blocking(write_end, False)
+    before = signal.set_wakeup_fd(write_end, warn_on_full_buffer=False)
+    threading.Thread(target=_watch, args=(read_end,), daemon=True).start()
     try:
         yield
     finally:
         signal.set_wakeup_fd(before)
-        os.close(said)
+        os.close(write_end)
 
 
-def _watch(heard: int) -> None:
+def _watch(read_end: int) -> None:
     """Wait for a signal, and then for the other end to be closed, but not too long."""
     end, ending, left_s = 0.0, 0, None
-    while select.select([heard], [], [], left_s)[0]:
-        if not (told := os.read(heard, 1)):
-            os.close(heard)
+    while select.select([read_end], [], [], left_s)[0]:
+        if not (received := os.read(read_end, 1)):
+            os.close(read_end)
             return
-        if not ending and told[0] in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-            end, ending = time.monotonic() + _LATEST_S, told[0]
+        if not ending and received[0] in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            end, ending = time.monotonic() + _LATEST_S, received[0]
         left_s = max(0.0, end - time.monotonic()) if ending else None
     print_failure([f"{Terminated(ending)}; {NOTHING_HALF}"], 128 + ending, as_json="--json" in sys.argv)
     os._exit(128 + ending)

@@ -1,4 +1,4 @@
-"""The page of a dataset: what it holds, metre by metre, what was learned and lost, and what to do next."""
+"""The page of a dataset: its samples on the map, labels, losses, balance, leakage, and where to drive next."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def render_dataset_report(directory: Path, beside: Path | None = None, *, folder
             _make_provenance_section(card),
         ],
         script="dataset.js" if samples.num_rows else "",
-        data=_make_data(card, samples, shown, patches=patches, drawn=plots[0], hrefs=hrefs) | {"folder": folder},
+        data=_make_data(card, samples, shown, patches=patches, map_plot=plots[0], hrefs=hrefs) | {"folder": folder},
         reads_pictures=bool(folder),
     )
 
@@ -116,9 +116,15 @@ def _make_map_section(shown: SamplesShown, plots: list[Plot]) -> Section:
 
 
 def _make_data(
-    card: DatasetCard, samples: pa.Table, shown: SamplesShown, *, patches: Json, drawn: Plot, hrefs: Mapping[str, str]
+    card: DatasetCard,
+    samples: pa.Table,
+    shown: SamplesShown,
+    *,
+    patches: Json,
+    map_plot: Plot,
+    hrefs: Mapping[str, str],
 ) -> dict[str, Json]:
-    names = [renderer.name or "" for renderer in drawn.figure.renderers]
+    names = [renderer.name or "" for renderer in map_plot.figure.renderers]
     return {
         "count": card.samples,
         "per_sheet": PER_SHEET,
@@ -141,7 +147,7 @@ def _make_data(
 
 
 def _find_run_pages(beside: Path, card: DatasetCard) -> dict[str, str]:
-    """Return where each run's page lies from the dataset's, for runs of a store that lies ``beside`` it."""
+    """Return the relative address of each run's page, for runs of a store in ``beside``."""
     stores = sorted(mark.parent for mark in beside.glob(f"*/{MARK}"))
     return {
         run.run_id: f"../{place.relative_to(beside).as_posix()}/{_PAGE}"
@@ -152,7 +158,7 @@ def _find_run_pages(beside: Path, card: DatasetCard) -> dict[str, str]:
 
 
 def _list_store_pages(beside: Path, hrefs: Mapping[str, str]) -> list[Link]:
-    """Return the pages, where there are, of the stores that the runs' pages (`_find_run_pages`) lie in."""
+    """Return the existing pages of the stores of these runs' pages (`_find_run_pages`)."""
     stores = sorted({href.split("/")[1] for href in hrefs.values()})
     return [Link(f"All runs of {name}", f"../{name}/{_PAGE}") for name in stores if (beside / name / _PAGE).is_file()]
 
@@ -207,7 +213,7 @@ def _make_audit_section(card: DatasetCard, samples: pa.Table, shown: SamplesShow
 
 
 def _make_finding_sections(card: DatasetCard) -> list[Section]:
-    """Return the findings of ingest by code; nothing where there is none."""
+    """Return the findings of ingest by code, if any."""
     samples = {run.run_id: run.samples for run in card.runs}
     rows = [
         (format_group(group, len(card.runs)), ", ".join(group.of), sum(samples[run_id] for run_id in group.of))
@@ -257,7 +263,7 @@ def _make_table_sections(card: DatasetCard, hrefs: Mapping[str, str]) -> list[Se
 
 
 def _make_provenance_section(card: DatasetCard) -> Section:
-    """Return what the dataset is made from: enough to make it again."""
+    """Return the inputs from which the dataset can be built again."""
     rules = card.recipe.split
     rows = [
         ("made by", f"tcpipe {card.tcpipe_version}, data model {card.data_model_version}, {card.format} format"),

@@ -1,4 +1,4 @@
-"""The samples inside a dataset's page: columns that can be clicked, or their means over small cells where there are too many."""
+"""Samples on a dataset's page: each as a point, or means over small cells where there are too many."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from scipy.spatial import cKDTree
 from tcpipe.formats.dataset_card import DatasetCard
 from tcpipe.formats.json_files import Json
 from tcpipe.report.column_packing import Column, make_shown_column, pack_columns
+from tcpipe.report.label_sections import LABELS
 from tcpipe.splits.assignment import SPLITS
 from tcpipe.tables.arrays import to_texts
 from tcpipe.tables.columns import read_lonlat_deg, to_floats
@@ -22,21 +23,10 @@ from tcpipe.tables.columns import read_lonlat_deg, to_floats
 MOST_SAMPLES = 100_000
 """Samples that can each be clicked; more are means over cells."""
 
-_LABELS = {"power": "power_watt", "velocity": "velocity_mps", "duration": "duration_s", "energy": "energy_joule"}
-_DIGITS = {"power": 1, "velocity": 3, "duration": 3, "energy": 1}
-"""Decimals that the page shows."""
-
-_STD = {
-    "power": "power_std_watt",
-    "velocity": "velocity_std_mps",
-    "duration": "duration_std_s",
-    "energy": "energy_std_joule",
-}
 COLUMNS = (
     *("sample_id", "split", "run_id", "start_ns", "start_lon_deg", "start_lat_deg", "end_lon_deg", "end_lat_deg"),
     *("terrain_class", "terrain_name", "slope_rad", "turn_rad", "physics_power_watt", "quality"),
-    *_LABELS.values(),
-    *_STD.values(),
+    *(column for *columns, _ in LABELS.values() for column in columns),
 )
 """Of samples.parquet that the page needs."""
 
@@ -46,7 +36,7 @@ Ints = NDArray[np.int64]
 
 @dataclass(frozen=True, slots=True)
 class SamplesShown:
-    """What the page holds: a row a sample, or one a cell.
+    """Rows of the page: a sample each, or a cell each.
 
     ``xy_m`` are middles in the first map's plane, (N, 2); ``row_of`` is where each sample of the table went, ``apart_m`` how far its
     nearest train sample lies, NaN of those that are not held out, (T,) each.
@@ -59,15 +49,8 @@ class SamplesShown:
     json: Json
 
 
-def compute_middles_m(card: DatasetCard, table: pa.Table) -> Floats:
-    """Return the middle of every sample's chord in the first map's plane [m], shape (N, 2)."""
-    to_map = Transformer.from_crs(card.recipe.read.gnss_crs, card.maps[0].crs, always_xy=True)
-    middle_deg = 0.5 * (read_lonlat_deg(table, "start") + read_lonlat_deg(table, "end"))
-    return np.column_stack(to_map.transform(*middle_deg.T)).reshape(-1, 2)
-
-
 def find_nearest_train_m(xy_m: Floats, split: NDArray[np.str_]) -> tuple[Floats, Ints]:
-    """Return how far the nearest middle of a train sample lies from every held-out one [m], NaN elsewhere, and its row, shape (N,)."""
+    """Return distance [m] and row of the nearest training sample, by middles, of each held-out sample, shape (N,); NaN elsewhere."""
     apart, nearest = np.full(len(xy_m), np.nan), np.zeros(len(xy_m), np.int64)
     held, train = np.flatnonzero(np.isin(split, ("test", "unseen"))), np.flatnonzero(split == "train")
     if len(held) and len(train):
@@ -77,68 +60,61 @@ def find_nearest_train_m(xy_m: Floats, split: NDArray[np.str_]) -> tuple[Floats,
 
 
 def select_samples(card: DatasetCard, table: pa.Table) -> SamplesShown:
-    """Return what the page holds of the samples."""
-    xy_m = compute_middles_m(card, table)
+    """Return the samples of the page."""
+    to_map = Transformer.from_crs(card.recipe.read.gnss_crs, card.maps[0].crs, always_xy=True)
+    middle_deg = 0.5 * (read_lonlat_deg(table, "start") + read_lonlat_deg(table, "end"))
+    xy_m = np.column_stack(to_map.transform(*middle_deg.T)).reshape(-1, 2)
     split = to_texts(table.column("split"))
     apart_m, nearest = find_nearest_train_m(xy_m, split)
     values = _read_values(card, table, apart_m) | {"x": xy_m[:, 0], "y": xy_m[:, 1], "count": np.ones(len(xy_m))}
     cell_m, row_of = None, np.arange(table.num_rows)
-    keys = {"split": _split_numbers(split), "class": np.nan_to_num(to_floats(table, "terrain_class")).astype(np.int64)}
-    keys |= {"quality": table.column("quality").to_numpy().astype(np.int64), "run": _run_numbers(card, table)}
+    run_ids = [run.run_id for run in card.runs]
+    keys = {
+        "split": _find_indices(table, "split", SPLITS),
+        "class": np.nan_to_num(to_floats(table, "terrain_class")).astype(np.int64),
+    }
+    keys |= {
+        "quality": table.column("quality").to_numpy().astype(np.int64),
+        "run": _find_indices(table, "run_id", run_ids),
+    }
     if table.num_rows > MOST_SAMPLES:
         values, keys, row_of, cell_m = _average_in_cells(values, keys)
         xy_m = np.column_stack([values["x"], values["y"]])
     columns: dict[str, Column] = {"x": ("steps", values["x"]), "y": ("steps", values["y"])}
-    columns |= {name: make_shown_column(digits, values[name]) for name, digits in _DIGITS.items()}
+    columns |= {name: make_shown_column(digits, values[name]) for name, (*_, digits) in LABELS.items()}
     columns |= {name: ("half", part) for name, part in values.items() if name not in {*columns, "count"}}
     columns |= {"split": ("u8", keys["split"]), "class": ("u8", keys["class"]), "quality": ("u16", keys["quality"])}
     columns |= {"run": ("u16", keys["run"]), "count": ("u32", values["count"])}
     if cell_m is None:
-        columns |= _read_starts(card, table)
+        after = table.column("start_ns").to_numpy() - np.array(find_first_starts_ns(card, table), np.int64)[keys["run"]]
+        columns |= {"after_s": ("u32", after // 10**9), "after_ns": ("u32", after % 10**9)}
         near = apart_m < np.sqrt(2.0) * card.patch_m
         columns["nearest"] = ("u32", np.where(near, nearest, np.arange(len(near))))
-    told: dict[str, Json] = {"packed": pack_columns(columns), "cell_m": cell_m, "ids": _find_odd_ids(table)}
-    return SamplesShown(xy_m, row_of, apart_m, cell_m, told)
+    json: dict[str, Json] = {"packed": pack_columns(columns), "cell_m": cell_m, "ids": _find_odd_ids(table)}
+    return SamplesShown(xy_m, row_of, apart_m, cell_m, json)
 
 
 def _read_values(card: DatasetCard, table: pa.Table, apart_m: Floats) -> dict[str, Floats]:
-    found = {name: to_floats(table, column) for name, column in _LABELS.items()}
-    found |= {f"{name}_std": to_floats(table, column) for name, column in _STD.items()}
-    found["slope"] = np.degrees(to_floats(table, "slope_rad"))
-    found["turn"] = np.degrees(to_floats(table, "turn_rad"))
+    values = {name: to_floats(table, column) for name, (column, *_) in LABELS.items()}
+    values |= {f"{name}_std": to_floats(table, column) for name, (_, column, _) in LABELS.items()}
+    values |= {name: np.degrees(to_floats(table, f"{name}_rad")) for name in ("slope", "turn")}
     if card.physics:
-        found["residual"] = found["power"] - to_floats(table, "physics_power_watt")
-    return found | {"apart": apart_m}
+        values["residual"] = values["power"] - to_floats(table, "physics_power_watt")
+    return values | {"apart": apart_m}
 
 
-def _split_numbers(split: NDArray[np.str_]) -> Ints:
-    numbers = np.zeros(len(split), np.int64)
-    for number, name in enumerate(SPLITS):
-        numbers[split == name] = number
-    return numbers
-
-
-def _run_numbers(card: DatasetCard, table: pa.Table) -> Ints:
-    known = pa.array([run.run_id for run in card.runs], pa.string())
-    encoded = pc.index_in(table.column("run_id").combine_chunks(), value_set=known)
-    numbers: Ints = encoded.fill_null(0).to_numpy().astype(np.int64)
-    return numbers
+def _find_indices(table: pa.Table, column: str, names: Sequence[str]) -> Ints:
+    """Return the place of each row's name among ``names``, shape (N,); 0 of an unknown one."""
+    indices = pc.index_in(table.column(column).combine_chunks(), value_set=pa.array(names, pa.string()))
+    return np.asarray(indices.fill_null(0).to_numpy(), np.int64)
 
 
 def find_first_starts_ns(card: DatasetCard, table: pa.Table) -> list[int]:
     """Return when each run's first sample begins [ns]; 0 where it has none."""
-    runs, starts = _run_numbers(card, table), table.column("start_ns").to_numpy()
-    first = np.full(len(card.runs), np.iinfo(np.int64).max)
-    np.minimum.at(first, runs, starts)
-    return [int(stamp) if stamp != np.iinfo(np.int64).max else 0 for stamp in first]
-
-
-def _read_starts(card: DatasetCard, table: pa.Table) -> Mapping[str, Column]:
-    after = (
-        table.column("start_ns").to_numpy()
-        - np.array(find_first_starts_ns(card, table), np.int64)[_run_numbers(card, table)]
-    )
-    return {"after_s": ("u32", after // 10**9), "after_ns": ("u32", after % 10**9)}
+    runs = _find_indices(table, "run_id", [run.run_id for run in card.runs])
+    first, last = np.full(len(card.runs), np.iinfo(np.int64).max), np.iinfo(np.int64).max
+    np.minimum.at(first, runs, table.column("start_ns").to_numpy())
+    return [int(stamp) if stamp != last else 0 for stamp in first]
 
 
 def _find_odd_ids(table: pa.Table) -> Sequence[str] | None:

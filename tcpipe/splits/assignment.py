@@ -244,8 +244,3 @@ def sort_by_rank(names: Sequence[str], *, seed: int, purpose: str) -> NDArray[np
     if (np.diff(ranks[order]) == 0).any():
         order = np.lexsort((np.asarray(names, dtype=np.str_), ranks))
     return order.astype(np.int64, copy=False)
-
-
-def order_ranks(sample_ids: Sequence[str], *, seed: int) -> Ranks:
-    """Return the rank of each sample in the seeded shuffle of the dataset's rows, shape (N,)."""
-    return hash_ranks(sample_ids, seed=seed, purpose="order")

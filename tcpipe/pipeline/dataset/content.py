@@ -49,7 +49,7 @@ from tcpipe.pipeline.dataset.sampling import Spool, Workers, sample_all_segments
 from tcpipe.pipeline.dataset.splitting import draw_splits
 from tcpipe.recipe import Recipe
 from tcpipe.recipe.suggestions import format_recipe_key
-from tcpipe.splits.assignment import EXCLUDED, NO_FOLD, Assignment, order_ranks
+from tcpipe.splits.assignment import EXCLUDED, NO_FOLD, Assignment, hash_ranks
 from tcpipe.stages.sample import Sampled, sum_losses
 from tcpipe.tables.arrays import make_points
 from tcpipe.tables.bits import Loss, flag_name
@@ -333,7 +333,7 @@ def _read_tags(segments: pa.Table, inputs: Inputs, recipe: Recipe) -> dict[str, 
 def _rank_segments(segments: pa.Table, *, seed: int) -> NDArray[np.uint64]:
     """Return the rank of every segment in the dataset's order, (M,); `DatasetError` where an id occurs twice."""
     column = segments.column("segment_id")
-    ranks = np.concatenate([order_ranks(chunk.to_pylist(), seed=seed) for chunk in column.chunks])
+    ranks = np.concatenate([hash_ranks(chunk.to_pylist(), seed=seed, purpose="order") for chunk in column.chunks])
     rising = np.sort(ranks)
     equal = rising[1:][np.diff(rising) == 0]
     if len(equal):  # with 64 bits, equal ranks mean equal names
