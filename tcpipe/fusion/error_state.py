@@ -106,7 +106,7 @@ def run_error_state(
 
 @dataclass(frozen=True, slots=True)
 class _FilterSection:
-    """A stretch that is filtered, more than once where its fixes contradict the rest; with ``errors`` that of the fixes is in the state."""
+    """A section that is filtered, more than once where its fixes contradict the rest; with ``errors`` that of the fixes is in the state."""
 
     measurements: Measurements
     initial: InitialState

@@ -1,4 +1,4 @@
-"""Where a stretch starts: position, attitude and gyroscope bias, found offline from all that follows.
+"""Where a section starts: position, attitude and gyroscope bias, found offline from all that follows.
 
 Yaw comes from the course over ground: the path that the odometry and the gyroscope draw from an arbitrary yaw is laid over the GNSS fixes
 by the rotation that fits best (the planar case of Wahba's problem: the angle of the sum of products of complex numbers). At least

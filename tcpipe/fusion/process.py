@@ -124,7 +124,7 @@ def turn_scale_std(measurements: Measurements) -> float:
     return _VISUAL_TURN_SCALE_STD if sources[-1] is measurements.visual else _WHEEL_TURN_SCALE_STD
 
 
-def scale_stds(measurements: Measurements) -> tuple[float, float]:
+def find_scale_stds(measurements: Measurements) -> tuple[float, float]:
     """Return the standard deviations of the scales of wheels and visual odometry; 0 where a scale is unobservable: it stays 1.
 
     Only fixes make a scale observable. Without any, one odometry is the measure: the camera where there is one, else the wheels. What an
@@ -135,7 +135,7 @@ def scale_stds(measurements: Measurements) -> tuple[float, float]:
     return (0.0 if measurements.visual is None else WHEEL_SCALE_STD), 0.0
 
 
-def process_noise(measurements: Measurements) -> NDArray[np.float64]:
+def make_process_noise(measurements: Measurements) -> NDArray[np.float64]:
     """Return the process noise by mode, shape (4, 20), as `tcpipe.fusion.prediction_kernel.predict` takes it.
 
     It includes the scale and alignment errors of the IMU. Biases and scales wander. Slip comes and goes, so the wheels' scale returns to
@@ -152,7 +152,7 @@ def process_noise(measurements: Measurements) -> NDArray[np.float64]:
     density[:, 15] = 2 * WHEEL_SCALE_STD**2 / _WHEEL_SCALE_TIME_S
     density[:, 16] = 0.002**2
     density[:, kernel.DECAY] = 1 / _WHEEL_SCALE_TIME_S
-    density[:, 15:17] *= np.square(scale_stds(measurements)) > 0
+    density[:, 15:17] *= np.square(find_scale_stds(measurements)) > 0
     _fill_turn_noise(measurements, density)
     imu = measurements.imu
     if imu is not None:

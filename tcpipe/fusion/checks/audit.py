@@ -210,7 +210,7 @@ def _is_most(windows: int, moving: int) -> bool:
 
 
 def _sum_tallies(tallies: Iterable[Tally]) -> list[Tally]:
-    """Return the tallies of all stretches, one by sensor and thing."""
+    """Return the tallies of all sections, one by sensor and thing."""
     total: dict[tuple[str, What], Tally] = {}
     for each in tallies:
         had = total.get((each.sensor, each.what), Tally(each.sensor, each.what, 0, 0, 0))

@@ -452,7 +452,7 @@ def smooth_stamps(
     """Return the fixes with the variance of those raised whose stamps jitter against the odometry, and the finding of it."""
     if gnss is None or odometry is None:
         return gnss, ()
-    jitter_s = stamp_jitter_s(gnss, odometry)
+    jitter_s = estimate_stamp_jitter_s(gnss, odometry)
     jumpy = jitter_s > 0
     if not jumpy.any():
         return gnss, ()
@@ -465,7 +465,7 @@ def smooth_stamps(
     return add_jitter_variance(gnss, odometry, jitter_s), (finding,)
 
 
-def stamp_jitter_s(gnss: Positions, odometry: BodyVelocities) -> NDArray[np.float64]:
+def estimate_stamp_jitter_s(gnss: Positions, odometry: BodyVelocities) -> NDArray[np.float64]:
     """Return the standard deviation of the stamps around each fix [s], shape (N,); 0 where it does not matter or is unknown.
 
     It matters above 0.05 s and where it moves the fix by more than twice its claimed deviation. While the robot is stationary it is

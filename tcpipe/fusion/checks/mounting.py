@@ -95,7 +95,7 @@ class Tilt:
 
 
 def collect_arm_evidence(found: Trajectory, m: Measurements) -> ArmEvidence | None:
-    """Return what one stretch tells of the antenna's arm; None without fixes or odometry."""
+    """Return what one section tells of the antenna's arm; None without fixes or odometry."""
     role, source = (VISUAL, m.visual) if m.visual is not None else (WHEELS, m.wheels)
     if m.gnss is None or source is None or found.stamp_ns.size < _FEWEST:
         return None
@@ -234,7 +234,7 @@ def make_unknown_arm() -> Arm:
 
 
 def collect_tilt_evidence(found: Trajectory, m: Measurements) -> TiltEvidence | None:
-    """Return what one stretch tells of the IMU's roll and pitch; None without fixes, which tell the slope, or a usable IMU."""
+    """Return what one section tells of the IMU's roll and pitch; None without fixes, which tell the slope, or a usable IMU."""
     if m.imu is None or m.gnss is None or not m.imu.accelerometer_usable or found.stamp_ns.size < _FEWEST:
         return None
     zero = int(found.stamp_ns[0])
@@ -274,7 +274,7 @@ def _compute_climb_mps(gnss: Positions, stamp_ns: NDArray[np.int64]) -> tuple[Fl
 
 
 def solve_tilt(told: Sequence[TiltEvidence | None]) -> Tilt | None:
-    """Return roll and pitch of the IMU by all stretches, with deviations from how blocks of ten seconds scatter; None if nothing tells.
+    """Return roll and pitch of the IMU by all sections, with deviations from how blocks of ten seconds scatter; None if nothing tells.
 
     A roll that no turn shows stays at what is known beforehand: none.
     """

@@ -56,7 +56,7 @@ class Scale:
         return self if before is None else Scale(before.factor * self.factor, before.factor * self.std, before.driven_m)
 
 
-def distance_ratios(found: Trajectory, m: Measurements) -> Mapping[str, Floats]:
+def compute_distance_ratios(found: Trajectory, m: Measurements) -> Mapping[str, Floats]:
     """Return by odometry how many times as far as the track it goes in each window that tells, where something else tells the scale."""
     measures = (m.gnss is not None) + (m.visual is not None)
     told = {WHEELS: measures > 0, VISUAL: m.gnss is not None}
@@ -93,7 +93,7 @@ def _compute_ratios(found: Trajectory, source: BodyVelocities) -> Floats:
 
 
 def solve_scales(told: Sequence[Mapping[str, Floats]]) -> Mapping[str, Scale]:
-    """Return by odometry the scale that it surely has in all of a run, told by each stretch; those that are as usual are left out."""
+    """Return by odometry the scale that it surely has in all of a run, told by each section; those that are as usual are left out."""
     found = {}
     for role in dict.fromkeys(role for each in told for role in each):
         ratios = np.concatenate([each[role] for each in told if role in each])

@@ -9,7 +9,7 @@ from suggested_recipes import proposed
 
 from tcpipe.recipe import FuseConfig, ReadConfig
 from tcpipe.simulation import find_scenario
-from tcpipe.stages.clock_findings import add_offset_uncertainty, clock_findings
+from tcpipe.stages.clock_findings import add_offset_uncertainty, check_clocks
 from tcpipe.stages.fuse_inputs import prepare_inputs
 from tcpipe.tables.facts import ClockFacts
 from tcpipe.tables.findings import Subject
@@ -28,7 +28,7 @@ def drive_log(tmp_path, index, seed, *late):
 
 def doctor(log, config=None):
     streams = streams_of(log, config)
-    return clock_findings(streams, prepare_inputs(streams, FuseConfig()))
+    return check_clocks(streams, prepare_inputs(streams, FuseConfig()))
 
 
 @pytest.mark.parametrize("seed", [31, 33])

@@ -8,7 +8,7 @@ from tcpipe.fusion.checks.audit import Tally
 from tcpipe.fusion.measurements import BodyVelocities, Measurements
 from tcpipe.stages.fuse_findings import make_audit_findings
 from tcpipe.stages.fuse_inputs import FusionInputs
-from tcpipe.stages.fuse_stretches import Fused
+from tcpipe.stages.fuse_sections import Fused
 from tcpipe.tables.facts import Disagreement, StretchFacts
 from tcpipe.tables.levels import STREAMS, Streams
 

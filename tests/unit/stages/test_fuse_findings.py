@@ -7,9 +7,9 @@ import pytest
 
 from tcpipe.fusion.measurements import InertialMeasurements, InitialState, Measurements, Positions
 from tcpipe.fusion.trajectory import TrackSection
-from tcpipe.stages.fuse_findings import fuse_facts, fuse_findings
+from tcpipe.stages.fuse_findings import find_fuse_findings, make_fuse_facts
 from tcpipe.stages.fuse_inputs import FusionInputs
-from tcpipe.stages.fuse_stretches import stretch_facts
+from tcpipe.stages.fuse_sections import make_section_facts
 from tcpipe.tables.facts import Reopening, StretchFacts
 from tcpipe.tables.findings import Subject, make_finding
 
@@ -23,7 +23,9 @@ def stretch(*, sensors=ALL, heading_from="course over ground", **said):
 
 
 def warned(inputs, *stretches, skipped_s=0.0):
-    return fuse_findings(inputs, fuse_facts(inputs, stretches, rows=7, skipped_s=skipped_s), run=Subject("run", "r"))
+    return find_fuse_findings(
+        inputs, make_fuse_facts(inputs, stretches, rows=7, skipped_s=skipped_s), run=Subject("run", "r")
+    )
 
 
 def counts(**said):
@@ -34,7 +36,7 @@ def test_stretches_add_up_and_their_innovations_are_averaged_by_count():
     first = stretch(nis_mean={"gnss": 1.0, "imu": None}, measurements={"gnss": 30, "imu": 5}, rejected={"gnss": 3})
     second = stretch(nis_mean={"gnss": 2.0}, measurements={"gnss": 10}, rejected={"gnss": 4}, sensors=("gnss",))
     inputs = FusionInputs(PLACE, counts={"gnss": counts(invalid=2)})
-    facts = fuse_facts(inputs, [first, second], rows=7, skipped_s=1.5)
+    facts = make_fuse_facts(inputs, [first, second], rows=7, skipped_s=1.5)
     assert facts.measurements == {"gnss": 40, "imu": 5}
     assert facts.rejected == {"gnss": 7, "imu": 0}
     assert facts.nis_mean == {"gnss": pytest.approx(1.25)}
@@ -50,13 +52,13 @@ def test_a_stretch_says_where_it_lies_and_what_it_began_with():
     yaw = np.array([0.0, 0.0, np.sin(0.25), np.cos(0.25)])
     began = InitialState(np.zeros(3), np.ones(3), yaw, 0.1, 0.3, heading_from="orientation")
     found = SimpleNamespace(facts=stretch(), stamp_ns=np.arange(4))
-    told = stretch_facts(TrackSection(2, 10, 20, heard), began, found)
+    told = make_section_facts(TrackSection(2, 10, 20, heard), began, found)
     assert (told.epoch, told.start_ns, told.end_ns, told.rows) == (2, 10, 20, 4)
     assert set(told.sensors) == {"gnss", "imu"}
     assert (told.gyro_noise_radps, told.accelerometer_noise_mps2) == (0.01, 0.1)
     assert told.initial_yaw_rad == pytest.approx(0.5)
     assert (told.initial_yaw_std_rad, told.heading_from) == (0.3, "orientation")
-    alone = stretch_facts(TrackSection(2, 10, 20, Measurements(gnss=heard.gnss)), began, found)
+    alone = make_section_facts(TrackSection(2, 10, 20, Measurements(gnss=heard.gnss)), began, found)
     assert alone.gyro_noise_radps is None
     assert alone.accelerometer_noise_mps2 is None
 

@@ -7,7 +7,7 @@ import pyarrow as pa
 import pytest
 from made_tracks import stamps
 
-from tcpipe.stages.label_motion import clock_doubtful, find_motion_flags
+from tcpipe.stages.label_motion import find_motion_flags, is_clock_doubtful
 from tcpipe.tables.bits import DropReason, Quality
 from tcpipe.tables.facts import (
     AuditFacts,
@@ -160,15 +160,15 @@ def clocks(role, *, noted=False, drifts=False, heading_offset_s=None):
 
 
 def test_a_clock_is_doubtful_that_steps_or_is_the_recorders():
-    assert not clock_doubtful(streams(gnss="header", command="log"), info())
-    assert clock_doubtful(streams(gnss="log"), info())
-    assert clock_doubtful(streams(epochs=2, gnss="header"), info())
+    assert not is_clock_doubtful(streams(gnss="header", command="log"), info())
+    assert is_clock_doubtful(streams(gnss="log"), info())
+    assert is_clock_doubtful(streams(epochs=2, gnss="header"), info())
 
 
 def test_a_clock_is_doubtful_that_is_off_unless_the_heading_carries_it():
     good = streams(gnss="header")
-    assert not clock_doubtful(good, clocks("imu"))
-    assert clock_doubtful(good, clocks("imu", noted=True))
-    assert clock_doubtful(good, clocks("imu", drifts=True))
-    assert not clock_doubtful(good, clocks("imu", noted=True, heading_offset_s=0.01))
-    assert clock_doubtful(good, clocks("gnss", noted=True, heading_offset_s=0.01))
+    assert not is_clock_doubtful(good, clocks("imu"))
+    assert is_clock_doubtful(good, clocks("imu", noted=True))
+    assert is_clock_doubtful(good, clocks("imu", drifts=True))
+    assert not is_clock_doubtful(good, clocks("imu", noted=True, heading_offset_s=0.01))
+    assert is_clock_doubtful(good, clocks("gnss", noted=True, heading_offset_s=0.01))

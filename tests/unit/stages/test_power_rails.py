@@ -6,7 +6,7 @@ from made_tracks import power_streams, stamps, straight_track
 
 from tcpipe.power.energy import IdlePower, integrate_energy
 from tcpipe.recipe import GateConfig, SegmentConfig
-from tcpipe.stages.fuse_stretches import make_power_columns
+from tcpipe.stages.fuse_sections import make_power_columns
 from tcpipe.stages.label import compute_segment_costs
 from tcpipe.stages.mask import mask_track
 from tcpipe.stages.message_arrays import make_rails
