@@ -76,10 +76,6 @@ class PolygonLayer:
         kept = ~shapely.is_empty(polygons)
         return burn_polygons(polygons[kept], self.ids[drawn][kept], affine=affine, rows=rows, cols=cols)
 
-    def nothing(self) -> str | None:
-        """No reason of its own: `place_polygons` has seen that they reach the map."""
-        return None
-
     def list_findings(self) -> tuple[Finding, ...]:
         """Return what was observed when they were placed."""
         return self.findings

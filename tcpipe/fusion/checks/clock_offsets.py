@@ -210,7 +210,7 @@ def _iterate_signals(m: Measurements, power: PowerSignal | None, at_ns: NDArray[
     for role, twist in twists.items():
         if m.gnss is not None:
             seen = compute_moving_mean(
-                compute_moving_mean(_compute_antenna_speed(twist, m.gnss.lever_arm_m), FIXES_S), FIXES_S
+                compute_moving_mean(compute_antenna_speed(twist, m.gnss.lever_arm_m), FIXES_S), FIXES_S
             )
             yield GNSS, role, SPEED, *select_speed_changes(np.abs(compute_fix_velocity(m.gnss, at_ns))[:, None], seen)
     if power is not None and twists:
@@ -327,7 +327,8 @@ def _remove_slow_parts(values: Floats) -> Floats:
     return values - compute_moving_mean(values, _SLOW_S)
 
 
-def _compute_antenna_speed(twist: Floats, lever_arm_m: tuple[float, float, float]) -> Floats:
+def compute_antenna_speed(twist: Floats, lever_arm_m: tuple[float, float, float]) -> Floats:
+    """Return the antenna's speed by forward velocity and yaw rate, shape (M, 2), of an odometry [m/s], shape (M, 1)."""
     forward, yaw_rate = twist.T
     speed: Floats = np.hypot(forward - yaw_rate * lever_arm_m[1], yaw_rate * lever_arm_m[0])
     return speed[:, None]
