@@ -1,9 +1,8 @@
-"""How far the robot strays from what the process holds: noise densities, most of them read from the sensors themselves.
+"""Process noise of the filters: noise densities, most of them estimated from the sensors themselves.
 
-White noise of standard deviation s at f Hz has the density s²/f. What of it changes along the drive is one number an event, the density
-of the velocity's noise: with an accelerometer that of its noise, which vibration multiplies while the robot moves; without one, where the
-body velocity is held, how fast the forward velocity changes there, since a robot that is taken to brake all the time is one of which
-nothing is known.
+White noise of standard deviation s at f Hz has the density s²/f. What changes along the drive is the density of the velocity's noise, one
+number an event. With an accelerometer it is that of its noise, which vibration multiplies while the robot moves. Without one, where the
+body velocity is held, it follows how fast the forward velocity changes there.
 """
 
 from __future__ import annotations

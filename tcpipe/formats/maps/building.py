@@ -87,21 +87,19 @@ def build_map(
 
     Parameters
     ----------
-    out_path : where the Zarr directory goes; one that is there is replaced once the new one is complete.
-    name : the map's name.
-    height, ortho, terrain : rasters in any CRS on the earth, grid and resolution, each in one file or in tiles of one grid (`mosaic`);
-        terrain also as GeoJSON polygons (`terrain_polygons`).
+    out_path : the Zarr directory; an existing one is replaced once the new one is complete.
+    height, ortho, terrain : rasters in any CRS on the earth, grid and resolution, each in one file or in tiles of one grid
+        (`layer_building`); terrain also as GeoJSON polygons (`terrain_polygons`).
     more : other layers, put on the grid of these three.
-    classes : class table (CSV or TOML); None takes ``agreed``, else the paper's seven classes, and where the terrain raster names its
-        values, those names say which class each is.
-    agreed : the classes of the store's other maps, which this one must share.
+    classes : class table (CSV or TOML); None takes ``agreed``, the classes of the store's other maps, else the paper's seven classes. Where
+        the terrain raster names its values, those names say which class each is.
     crs : the map's CRS, projected and metric, and the CRS of rasters that carry none; None takes the height raster's, or its UTM zone.
     pitch_m : side of a map pixel [m]; None takes the finest raster's.
     inputs : what the caller wants to know the map by later; kept in its facts.
 
     Raises
     ------
-    MapError : a raster cannot be placed or read, or holds nothing here; the class table is not the store's: one line each.
+    MapError : a raster has no CRS, cannot be read, or holds nothing here; the class table is not the store's: one line each.
     StoreError : the map cannot be written.
     """
     given = {"height": height, "ortho": ortho, "terrain": terrain, **more.files}

@@ -1,8 +1,8 @@
-"""How many times as far as the track an odometry goes: a scale that is off throughout is calibration, one that comes and goes is slip.
+"""Estimate the scale of an odometry against the track: one that is off throughout is calibration, one that comes and goes is slip.
 
-The scale is told by windows of five seconds in which the robot drives, wherever something else tells how long a metre is: the fixes, or
-for wheels a camera. It is surely wrong where its median is further from 1 than twice what is known of such odometries beforehand, and
-most windows say so alike. Where nothing else tells it, a command still does: no robot drives faster than it is told to.
+Windows of five seconds count in which the robot drives and the scale is observable: by the fixes, or for wheels by a camera. The scale is
+surely wrong where its median is further from 1 than twice the prior's standard deviation, and most windows agree. Where no sensor makes it
+observable, a command does: no robot drives faster than commanded.
 """
 
 from __future__ import annotations
