@@ -20,7 +20,7 @@ import subprocess
 import sys
 import tempfile
 from code import InteractiveConsole
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 _DOCS = Path(__file__).resolve().parent
@@ -76,16 +76,21 @@ def _run_shell(body: str, directory: Path) -> str:
     here = Path(sys.executable).parent
     clean = {key: value for key, value in os.environ.items() if not key.startswith("TCPIPE_")}
     env = {**clean, "PATH": f"{here}{os.pathsep}{os.environ['PATH']}", "DATA": str(_test_data())}
-    process = subprocess.run(
-        ["bash", "-c", script],  # the pages are ours
-        cwd=directory, env=env, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, timeout=3600, check=False,
-    )  # fmt: skip
-    outputs = process.stdout.split(_MARK)
+    printed = run_script(script, cwd=directory, env=env)
+    outputs = printed.split(_MARK)
     if len(outputs) != len(inputs) + 1:
-        raise RuntimeError(f"commands did not all end: {process.stdout}")
+        raise RuntimeError(f"commands did not all end: {printed}")
     return "".join(
         f"{line}\n{_trim_output(output)}" for line, output in zip(inputs, outputs[:-1], strict=True)
     ).replace(str(_test_data()), "$DATA")
+
+
+def run_script(script: str, *, cwd: Path, env: Mapping[str, str]) -> str:
+    """Return what a bash script prints; the test of the pages puts its own in place of this function."""
+    return subprocess.run(
+        ["bash", "-c", script],  # the pages are ours
+        cwd=cwd, env=env, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, timeout=3600, check=False,
+    ).stdout  # fmt: skip
 
 
 def _trim_output(output: str) -> str:

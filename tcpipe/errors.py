@@ -1,22 +1,6 @@
-"""Every error a user can meet, as one tree.
+"""Every error a user can meet: subclasses of `TcpipeError`, exit code 1, or 2 of `UsageError` and `RecipeError`.
 
-::
-
-    TcpipeError                exit 1   something the user gave could not be used
-    ├── UsageError             exit 2   the command line asks for something impossible
-    │   └── RecipeError        exit 2   the recipe is wrong (all its errors at once)
-    ├── LogError               exit 1   a file is not a log, or nothing in it can be used
-    │   └── RoleError          exit 1   a role cannot be decided, or nothing plays it
-    ├── FusionError            exit 1   the sensors do not determine a track
-    ├── MapError               exit 1   a raster cannot be placed, or a map cannot be read
-    ├── RegionError            exit 1   a split region cannot be used
-    ├── StoreError             exit 1   the store cannot be read or written
-    ├── DatasetError           exit 1   a dataset cannot be built or read
-    ├── ModelError             exit 1   a trained model cannot be read, or does not fit what it is asked about
-    ├── PathError              exit 1   a path cannot be used, or there is none
-    └── TableError             exit 1   a table breaks its contract (tcpipe.tables)
-
-Each carries one or more *problems*: plain lines that say what, where, got, wanted and what to do.
+Each carries one or more *problems*: plain lines that say what, where, got, expected and what to do.
 The command line prints them; a traceback is a bug.
 """
 
@@ -32,7 +16,7 @@ _CLOSING = ")]}'\",;:."
 
 
 def hide_secrets(text: str) -> str:
-    """Return ``text`` without the user info, query and fragment of each URL in it: what any URL is shown and stored as."""
+    """Return ``text`` without the user info, query and fragment of each URL in it."""
 
     def hide(url: re.Match[str]) -> str:
         public, query = split_secrets(url[1], url[2])
@@ -59,7 +43,7 @@ def split_secrets(scheme: str, rest: str) -> tuple[str, str]:
 
 
 def clean_line(text: str) -> str:
-    """Return ``text`` as one line that every terminal can show, without secrets: what cannot be printed as escapes."""
+    """Return ``text`` as one line without secrets, with escapes for unprintable characters."""
     text = hide_secrets(text)
     if text.isprintable():
         return text
@@ -104,7 +88,7 @@ class LogError(TcpipeError):
 
 
 class RoleError(LogError):
-    """A role cannot be decided among several topics, or no topic plays it."""
+    """A role cannot be decided among several topics, or no topic has it."""
 
 
 class FusionError(TcpipeError):
@@ -123,12 +107,24 @@ class StoreError(TcpipeError):
     """The store cannot be read or written."""
 
 
+class MissingFileError(StoreError):
+    """A file that the store should have is gone; ``where`` is its path or URL."""
+
+    def __init__(self, where: str, findings: Iterable[Any] = ()) -> None:
+        super().__init__(f"{where}: is gone", findings=findings)
+        self.where = where
+
+    def __reduce__(self) -> tuple[type[TcpipeError], tuple[str, ...], dict[str, tuple[Any, ...]]]:
+        """Pickle with the path rather than the line made of it."""
+        return type(self), (self.where,), {"findings": self.findings}
+
+
 class DatasetError(TcpipeError):
     """A dataset cannot be built or read."""
 
 
 class ModelError(TcpipeError):
-    """A trained model cannot be read, or does not fit what it is asked about."""
+    """A trained model cannot be read, or does not fit the question."""
 
 
 class PathError(TcpipeError):

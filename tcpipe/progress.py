@@ -1,4 +1,4 @@
-"""How far work is, told as records of the log, so that worker processes and clusters pass it on with whatever else they say."""
+"""Progress as log records, so that worker processes and clusters forward it with their other records."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from contextvars import ContextVar
 from dataclasses import dataclass, field
 
 STEP = 15
-"""The level of such records: below INFO, so that only a display asks for them."""
+"""Level of progress records: below INFO, so that only a display shows them."""
 
 _LONGEST_NAME = 200
 _TEXT = "%s: %s, %d of %d"
@@ -20,18 +20,18 @@ _task: ContextVar[str] = ContextVar("task", default="")
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """How far a task is: its name ("" of the command itself), its stage, and how much of that is done (of a log: bytes)."""
+    """Progress of a task ("" is the command itself): its stage, and how much of that is done (bytes of a log)."""
 
     task: str
     stage: str
     done: int
     total: int
-    """0 where it is not known."""
+    """0 if unknown."""
 
 
 @contextmanager
 def set_task(task: str) -> Iterator[None]:
-    """Let what is told inside be of this task."""
+    """Attribute progress inside the context to this task."""
     before = _task.set(task[-_LONGEST_NAME:])
     try:
         yield
@@ -40,18 +40,18 @@ def set_task(task: str) -> Iterator[None]:
 
 
 def step(stage: str, done: int = 0, total: int = 0) -> None:
-    """Tell how far the task is that this thread works on."""
+    """Log the progress of this thread's task."""
     _logger.log(STEP, _TEXT, _task.get(), stage, done, total)
 
 
 def step_of(record: logging.LogRecord) -> Step | None:
-    """Return what a record tells; None of any other."""
+    """Return the progress in a record, None in any other."""
     return Step(*record.args) if record.levelno == STEP and isinstance(record.args, tuple) else None  # type: ignore[arg-type]
 
 
 @dataclass(slots=True)
 class Meter:
-    """Tells how far one stage is, hundredth by hundredth."""
+    """Logs the progress of one stage, percent by percent."""
 
     stage: str
     total: int

@@ -1,6 +1,10 @@
 """Random tests draw the same examples on every machine; ``pytest --hypothesis-profile explore`` draws new ones."""
 
+import gc
 import os
+import resource
+import tomllib
+from pathlib import Path
 
 import pytest
 from hypothesis import settings
@@ -10,8 +14,20 @@ settings.register_profile("explore", deadline=None, max_examples=500)
 settings.load_profile("fixed")
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # tests run side by side: threads of one would wait for those of another
+gc.set_threshold(50_000)  # as the command does
+
+RATCHETS = Path(__file__).parent / "architecture/ratchets.toml"
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Of the random order (pytest-randomly), the files that take longest come first: two workers end at about the same time."""
     items.sort(key=lambda item: "end_to_end" not in item.path.parts)
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    """Print the CPU time of all tests, with a warning where it is above its ratchet."""
+    used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+    cpu_s = sum(each.ru_utime + each.ru_stime for each in used)
+    limit_s = tomllib.loads(RATCHETS.read_text())["make_test"]["cpu_s"]
+    warning = f"; WARNING: above the {limit_s} s of {RATCHETS.name}" if cpu_s > limit_s else ""
+    terminalreporter.write_line(f"CPU time of the tests: {cpu_s:.0f} s{warning}")

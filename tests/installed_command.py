@@ -8,11 +8,12 @@ tests start `COMMAND`, the installed one.
 import json
 import os
 import signal
+import socket
 import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator, Mapping
-from contextlib import chdir, contextmanager
+from contextlib import chdir, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -34,10 +35,58 @@ def tcpipe(*arguments: str | Path, cwd: Path, env: Mapping[str, str] | None = No
         done = subprocess.run(command, cwd=cwd, env=clean, capture_output=True, text=True, timeout=HANGS_S, check=False)
         return _as_promised(done)
     with tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as err:
-        with chdir(cwd), patch.dict(os.environ, clean, clear=True), _standard_files(out.fileno(), err.fileno()):
-            code = _exit_code(command)
+        code = _run_here(command, Path(cwd), clean, out.fileno(), err.fileno())
         printed = [os.pread(stream.fileno(), os.fstat(stream.fileno()).st_size, 0).decode() for stream in (out, err)]
     return _as_promised(subprocess.CompletedProcess(command, code, *printed))
+
+
+def run_script(script: str, *, cwd: Path, env: Mapping[str, str]) -> str:
+    """Run a bash script of which each ``tcpipe`` is done in this process; return what all of it printed."""
+    with tempfile.TemporaryDirectory() as place, socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as server:
+        client = Path(place, "tcpipe")
+        client.write_text(_CLIENT.format(python=sys.executable, address=f"{place}/socket"))
+        client.chmod(0o755)
+        server.bind(f"{place}/socket")
+        server.listen()
+        server.settimeout(0.01)
+        path = f"{place}{os.pathsep}{env['PATH']}"
+        with tempfile.TemporaryFile() as printed:
+            with subprocess.Popen(
+                ["bash", "-c", script], cwd=cwd, env={**env, "PATH": path}, stdout=printed, stderr=subprocess.STDOUT
+            ) as running:
+                while running.poll() is None:
+                    with suppress(TimeoutError):
+                        _serve(server.accept()[0])
+            return os.pread(printed.fileno(), os.fstat(printed.fileno()).st_size, 0).decode()
+
+
+_CLIENT = """#!{python} -IS
+import json, os, socket, sys
+with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as server:
+    server.connect({address!r})
+    call = json.dumps([sys.argv, os.getcwd(), dict(os.environ)]).encode()
+    socket.send_fds(server, [call], [1, 2])
+    code = server.recv(1)[0]
+sys.exit(code)
+"""
+
+
+def _serve(client: socket.socket) -> None:
+    """Do what one ``tcpipe`` of a script asks for, with its directory, environment and files."""
+    with client:
+        call, (out, err), _, _ = socket.recv_fds(client, 1 << 17, 2)
+        command, cwd, env = json.loads(call)
+        code = 1
+        with suppress(BrokenPipeError):  # a reader, as head, that has seen enough
+            code = _run_here(command, Path(cwd), env, out, err)
+        for file in (out, err):
+            os.close(file)
+        client.send(bytes([code]))
+
+
+def _run_here(command: list[str], cwd: Path, env: Mapping[str, str], out: int, err: int) -> int:
+    with chdir(cwd), patch.dict(os.environ, env, clear=True), _standard_files(out, err):
+        return _exit_code(command)
 
 
 @contextmanager

@@ -35,3 +35,9 @@ def tables(store: Path, name: str = "segments") -> list[Path]:
 def only_run(store: Path) -> RunDirectory:
     (run,) = Store(store).runs()
     return run
+
+
+def read_files(directory: Path) -> dict[str, bytes]:
+    """The content of every file below a directory, by its path there."""
+    files = (path for path in directory.rglob("*") if path.is_file())
+    return {path.relative_to(directory).as_posix(): path.read_bytes() for path in files}

@@ -75,11 +75,11 @@ def build_dataset(options: BuildDatasetOptions, *, as_json: bool, quiet: bool) -
         print_line(f"recipe: {source}")
     with show_progress("build-dataset", quiet=quiet) as shown:
         result = run_build_dataset(replace(options, recipe=ruling))
-        shown.problem(*result.problem_lines())
+        shown.problem(*result.finding_lines(problems=True))
     if as_json:
         print_json(replace(result, recipe=source))
     else:
-        print_lines(result.without_problems())
+        print_lines(result.format())
     return result.exit_code
 
 

@@ -1,4 +1,4 @@
-"""w, v, T, E of a metre, and how wrong each may be as the cost of the *true* metre (paper, section IV; docs/explanation/rulings.md).
+"""w, v, T, E of a segment, their σ for the *true* metre, and the error budget of E (paper, section IV; docs/explanation/rulings.md).
 
 The truth of a label is the cost of the true metre that begins where and when the segment does. If the estimated ends are 1 m apart
 but the true ones 1 m + e, the true metre ends e / v_end earlier than the segment, with v_end and P_end the speed and power there::
@@ -53,15 +53,15 @@ def compute_labels(
     displacement_std_m: Floats,
     energy_noise_joule: Floats,
 ) -> Labels:
-    """Return w, v, T, E with T = d / v and E = w d / v as identities, and their standard deviations.
+    """Return w, v, T, E with T = d / v and E = w d / v as identities, and their standard deviations; every array has shape (M,).
 
     Parameters
     ----------
-    chord_m, duration_s : [m], [s], shape (M,), both > 0.
-    energy_joule : [J], shape (M,); NaN without power.
-    end_velocity_mps, end_power_watt : [m/s], [W], shape (M,), at the segment's end; a speed below a tenth of the mean is taken as that.
-    displacement_std_m : [m], shape (M,), of the displacement between both estimated ends, their correlation counted.
-    energy_noise_joule : [J], shape (M,), from sampling, noise and quantisation of the power, independent of the displacement.
+    chord_m, duration_s : [m], [s], both > 0.
+    energy_joule : [J]; NaN without power.
+    end_velocity_mps, end_power_watt : [m/s], [W], at the segment's end; the speed counts as at least a tenth of the mean.
+    displacement_std_m : [m], of the displacement between both estimated ends, their correlation counted.
+    energy_noise_joule : [J], from sampling, noise and quantisation of the power, independent of the displacement.
     """
     velocity_mps, power_watt = chord_m / duration_s, energy_joule / duration_s
     end_power_watt = np.where(np.isfinite(energy_joule), end_power_watt, np.nan)
@@ -78,62 +78,38 @@ def compute_labels(
     )
 
 
-@dataclass(frozen=True, slots=True)
-class NetLabels:
-    """What of each segment's cost is not what the robot draws while it stands, all of shape (M,); NaN where either is not known.
-
-    Attributes
-    ----------
-    standing_power_watt : P0 [W].
-    power_above_standing_watt, energy_above_standing_joule : w - P0 [W], E - P0 T [J]; again E = w d / v.
-    *_std : their standard deviations as labels of the true metre, in the same units; that of P0 is one error of a whole run.
-    """
-
-    standing_power_watt: Floats
-    standing_power_std_watt: Floats
-    power_above_standing_watt: Floats
-    power_above_standing_std_watt: Floats
-    energy_above_standing_joule: Floats
-    energy_above_standing_std_joule: Floats
-
-
 def subtract_idle_power(
     cost: Labels, *, standing_watt: float, standing_std_watt: float, end_power_watt: Floats, energy_noise_joule: Floats
-) -> NetLabels:
-    """Return the labels less what standing takes: E_true = E - P0 T - (P_end - P0) e / v_end, as in the head of this module.
+) -> dict[str, Floats]:
+    """Return the columns of net labels, shape (M,): E_true = E - P0 T - (P_end - P0) e / v_end, as in the head of this module.
 
-    Parameters
-    ----------
-    standing_watt, standing_std_watt : [W], P0 and its standard deviation; NaN where it is not known.
-    end_power_watt, energy_noise_joule : as in `compute_labels`.
+    ``standing_watt`` is P0, the idle power, NaN if unknown; the error of P0 is one error of a whole run. Again E = w d / v. The other
+    parameters are those of `compute_labels`.
     """
     noise_joule = np.hypot(energy_noise_joule, standing_std_watt * cost.duration_s)
     energy_joule = cost.energy_joule - standing_watt * cost.duration_s
     known = np.isfinite(energy_joule)
     displaced_joule = (end_power_watt - standing_watt) * cost.duration_std_s
-    return NetLabels(
-        standing_power_watt=np.where(known, standing_watt, np.nan),
-        standing_power_std_watt=np.where(known, standing_std_watt, np.nan),
-        power_above_standing_watt=cost.power_watt - standing_watt,
-        power_above_standing_std_watt=np.where(known, np.hypot(cost.power_std_watt, standing_std_watt), np.nan),
-        energy_above_standing_joule=energy_joule,
-        energy_above_standing_std_joule=np.where(known, np.hypot(displaced_joule, noise_joule), np.nan),
-    )
+    return {
+        "standing_power_watt": np.where(known, standing_watt, np.nan),
+        "standing_power_std_watt": np.where(known, standing_std_watt, np.nan),
+        "power_above_standing_watt": cost.power_watt - standing_watt,
+        "power_above_standing_std_watt": np.where(known, np.hypot(cost.power_std_watt, standing_std_watt), np.nan),
+        "energy_above_standing_joule": energy_joule,
+        "energy_above_standing_std_joule": np.where(known, np.hypot(displaced_joule, noise_joule), np.nan),
+    }
 
 
 CAUSES = ("position", "rate", "current", "voltage")
-"""Displacement of both ends; what the current did between samples; noise and rounding of the current; the voltage's."""
+"""Displacement of both ends; the current between samples; noise and rounding of the current; those of the voltage."""
 
 
 def estimate_energy_budget(
     energy_joule: NDArray[np.float64], variance_j2: Mapping[str, NDArray[np.float64]]
 ) -> EnergyBudget | None:
-    """Return the noise floor of E; None without energies.
+    """Return the noise floor of E, shape (M,) [J], NaN without a label; None without energies.
 
-    Parameters
-    ----------
-    energy_joule : [J], shape (M,); NaN where there is no label.
-    variance_j2 : [J²], shape (M,), by name: the `CAUSES`, which are independent and add up, and ``at_20_hz``.
+    ``variance_j2`` has variances, shape (M,) [J²], of the `CAUSES`, which are independent and add up, and of ``at_20_hz``.
     """
     known = np.isfinite(energy_joule)
     mean_joule = float(np.abs(energy_joule[known]).mean()) if known.any() else 0.0
@@ -170,7 +146,7 @@ def find_noise(budget: EnergyBudget | None, subject: Subject) -> tuple[Finding, 
 
 
 def format_budget(budget: EnergyBudget) -> str:
-    """Return the budget as a sentence: the floor, its causes from the largest, and what power at 20 Hz would leave where that is less."""
+    """Return the budget as a sentence: the floor, its causes from the largest, and the floor with power at 20 Hz if that is lower."""
     names = {"position": "position", "rate": "power rate", "current": "current noise", "voltage": "voltage"}
     shares = {cause: getattr(budget, cause) for cause in CAUSES}
     causes = ", ".join(

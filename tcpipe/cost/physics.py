@@ -1,4 +1,4 @@
-"""What physics explains of a robot's power, fitted to its labels: standing, drivetrain, rolling, grade, turning, and how much each takes.
+"""A physics model of a robot's power, fitted to its labels (idle, drivetrain, rolling, grade, turning), and its error on held-out blocks.
 
 On a slope that rises by tan(s) a robot of weight m g at horizontal speed v does the mechanical work
 
@@ -52,7 +52,16 @@ _PLAUSIBLE_RESISTANCE = 1.5  # coefficient of rolling resistance: tracks in deep
 _BLOCK, _FEWEST_BLOCKS = 20, 20  # consecutive segments that may err alike, and how many such blocks there are at least
 _MOST_ROWS = 20_000  # that are fitted, evenly taken of more: coefficients are sure to a few per mille by then
 
+_FOLDS = 5  # contiguous: neighbours of a held-out metre are held out, too
+_DRAWN_TOGETHER = 10  # consecutive segments
+_DRAWS = 2000
+_SEED = 20260101
+_LEAST_JPM = 10.0  # a percentage of less says nothing, as in `tcpipe.learning.metrics`
+
 _ALWAYS = ("standing", "drivetrain")  # are paid on any grade, and never given back
+
+PHYSICS_UNITS = {"standing": "W", "drivetrain": "N", "rolling": "N", "grade": "N", "turning": "W s/rad"}
+"""Of the terms of physics."""
 
 ALL = "all"
 """The ground of a fit that knows no classes, and of classes with too few segments."""
@@ -102,10 +111,10 @@ class Physics:
     segments: int
 
     def of(self, term: str, terrain: str = ALL) -> tuple[float, float] | None:
-        """Return a coefficient and its standard deviation, that of all ground where the class has none; None where there is neither."""
-        for at, known in enumerate(self.terms):
-            if known == (term, terrain):
-                return float(self.value[at]), float(np.sqrt(self.covariance[at, at]))
+        """Return a coefficient and its standard deviation, that of all ground if the class has none; None without either."""
+        if (term, terrain) in self.terms:
+            at = self.terms.index((term, terrain))
+            return float(self.value[at]), float(np.sqrt(self.covariance[at, at]))
         return None if terrain == ALL else self.of(term)
 
     def rolling_resistance(self, terrain: str = ALL) -> tuple[float, float] | None:
@@ -118,12 +127,12 @@ class Physics:
         return rolling / grade, float(np.sqrt(slope @ self.covariance[np.ix_(places, places)] @ slope))
 
     def is_driven(self, metres: FitSamples) -> NDArray[np.bool_]:
-        """Return where motors drive the robot rather than the slope, shape (M,)."""
+        """Return where motors, not the slope, drive the robot, shape (M,)."""
         always = _always(self.terms)
         return np.asarray(_build_design_matrix(metres, self.terms)[:, ~always] @ self.value[~always] > 0.0)
 
     def parts_watt(self, metres: FitSamples) -> Floats:
-        """Return what each coefficient adds to the predicted power [W], shape (M, J)."""
+        """Return the part of each coefficient in the predicted power [W], shape (M, J)."""
         gain = np.where(_always(self.terms) | self.is_driven(metres)[:, None], 1.0, self.recovered)
         return np.asarray(_build_design_matrix(metres, self.terms) * gain * self.value)
 
@@ -132,7 +141,7 @@ class Physics:
         return np.asarray(self.parts_watt(metres).sum(axis=1))
 
     def is_plausible(self) -> bool:
-        """Return whether a robot can be so: it rolls, no heavier than tracks in deep sand, and climbing costs it something."""
+        """Return whether the fit is possible: rolling costs power, at most as tracks in deep sand, and so does climbing."""
         rolling = [at for at, (term, _) in enumerate(self.terms) if term in {"rolling", "drivetrain"}]
         resistances = [self.rolling_resistance(name) for term, name in self.terms if term == "rolling"]
         climb = self.of("grade")
@@ -164,7 +173,7 @@ def fit_physics(metres: FitSamples, *, standing_watt: float | None = None, turni
     terms = _list_determined_terms(used, standing_watt=standing_watt, turning=turning)
     found = _fit_robustly(used, terms, standing_watt)
     for term in ("drivetrain", "standing"):
-        if not _is_told(found, term, used) and not (term == "standing" and standing_watt is not None):
+        if not _is_significant(found, term, used) and not (term == "standing" and standing_watt is not None):
             terms = [known for known in terms if known[0] != term]
             found = _fit_robustly(used, terms, standing_watt)
     off = used.power_watt - found.power_watt(used)
@@ -174,8 +183,8 @@ def fit_physics(metres: FitSamples, *, standing_watt: float | None = None, turni
     )
 
 
-def _is_told(found: Physics, term: str, metres: FitSamples) -> bool:
-    """Return whether a term is sure to be there: what nothing tells from rolling is rolling's."""
+def _is_significant(found: Physics, term: str, metres: FitSamples) -> bool:
+    """Return whether a term is significant; otherwise rolling includes it."""
     value, std = found.of(term) or (np.inf, 0.0)
     bend = (~found.is_driven(metres)).sum() >= _FEWEST_DOWNHILL and found.recovered < _MOST_RECOVERED
     return bool(value > 2.0 * std and (bend or term != "drivetrain"))
@@ -286,30 +295,18 @@ def _estimate_covariance(
     return out
 
 
-_FOLDS = 5  # contiguous: neighbours of a held-out metre are held out, too
-_DRAWN_TOGETHER = 10  # consecutive segments
-_DRAWS = 2000
-_SEED = 20260101
-_LEAST_JPM = 10.0  # a percentage of less says nothing, as in `tcpipe.learning.metrics`
-PHYSICS_UNITS = {"standing": "W", "drivetrain": "N", "rolling": "N", "grade": "N", "turning": "W s/rad"}
-"""Of the terms of physics."""
-
-
 @dataclass(frozen=True, slots=True)
 class _HeldOut:
-    """Energy a metre of known metres [J/m], and what fits on the other folds say of it, shape (M,)."""
+    """Energy per metre [J/m], and its prediction by fits on the other folds, shape (M,)."""
 
     true: Floats
-    said: Floats
+    predicted: Floats
 
 
 def fit_and_validate_physics(metres: FitSamples, *, standing_watt: float | None) -> PhysicsFit | None:
-    """Fit a robot's metres, in the order of driving; None where nothing can be fitted, or no robot can be so.
+    """Fit the segments of one robot, in the order of driving; None without a plausible fit.
 
-    Parameters
-    ----------
-    metres : of one robot.
-    standing_watt : power while standing, None where the robot never stood.
+    ``standing_watt`` is the idle power, None if the robot was never stationary.
     """
     found = fit_physics(metres, standing_watt=standing_watt)
     if found is None or not found.is_plausible():
@@ -343,30 +340,30 @@ def fit_and_validate_physics(metres: FitSamples, *, standing_watt: float | None)
 
 
 def _compute_mean_turn(metres: FitSamples) -> float:
-    """Return how far a metre turns in the mean [rad/m]; 0 where no rate is known."""
+    """Return the mean turn of a metre [rad/m]; 0 without known rates."""
     turned = metres.turn_rate_radps / metres.velocity_mps
     return float(turned[np.isfinite(turned)].mean()) if np.isfinite(turned).any() else 0.0
 
 
 def _predict_held_out(metres: FitSamples, standing_watt: float | None, *, turning: bool) -> _HeldOut | None:
-    """Return energies of every fifth of the drive by a fit on the others; None where too few are left to fit."""
+    """Return energies of every fifth of the drive by a fit on the others; None with too few segments to fit."""
     count = len(metres.power_watt)
     fold = np.arange(count) * _FOLDS // max(count, 1)
-    said = np.full(count, np.nan)
+    predicted = np.full(count, np.nan)
     for number in range(_FOLDS):
         mine = fold == number
         found = fit_physics(metres.take(~mine), standing_watt=standing_watt, turning=turning)
         if found is None or mine.sum() < FEWEST // _FOLDS:
             return None
         here = metres.take(mine)
-        said[mine] = found.power_watt(here) / here.velocity_mps
+        predicted[mine] = found.power_watt(here) / here.velocity_mps
     true = metres.power_watt / metres.velocity_mps
-    told = np.isfinite(true + said)
-    return _HeldOut(true[told], said[told])
+    known = np.isfinite(true + predicted)
+    return _HeldOut(true[known], predicted[known])
 
 
 def _score(held: _HeldOut) -> PhysicsScore:
-    off = held.true - held.said
+    off = held.true - held.predicted
     spread = float(np.square(held.true - held.true.mean()).sum())
     r2 = 1.0 - float(np.square(off).sum()) / spread if spread > 0.0 else 0.0
     enough = np.abs(held.true) >= _LEAST_JPM
@@ -375,11 +372,13 @@ def _score(held: _HeldOut) -> PhysicsScore:
 
 
 def _compare_held_out(scored: _HeldOut | None, without: _HeldOut | None) -> tuple[float, float] | None:
-    """Return the 90 % interval of how much R² rises by turning: blocks of consecutive metres drawn again (Künsch 1989)."""
+    """Return the 90 % interval of the gain in R² by turning: block bootstrap of consecutive segments (Künsch 1989)."""
     if scored is None or without is None or len(scored.true) != len(without.true):
         return None
     starts = np.arange(0, len(scored.true), _DRAWN_TOGETHER)
-    better = np.add.reduceat(np.square(without.true - without.said) - np.square(scored.true - scored.said), starts)
+    better = np.add.reduceat(
+        np.square(without.true - without.predicted) - np.square(scored.true - scored.predicted), starts
+    )
     spread = np.add.reduceat(np.square(scored.true - scored.true.mean()), starts)
     rng, gain = np.random.default_rng(_SEED), np.empty(_DRAWS)
     for turn in range(_DRAWS):  # one after the other: all at once are 3 kB a metre

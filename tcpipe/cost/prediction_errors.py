@@ -1,6 +1,6 @@
-"""How wrong a model's time and energy are, of a metre and of a path, from how wrong it was on samples that it did not learn from.
+"""Errors of a model's time and energy for a metre and for a path, estimated from held-out samples (ADR-25).
 
-Held-out samples have a label and a prediction. Of them are taken, in this order (ADR-25):
+Estimated are, in this order:
 
 * the **bias** of each terrain class: what all its metres took over what was said of them, less one, as far as it is beyond chance. With
   b the ratio of a class, b0 that of all and s its standard error over blocks of the drives, b0 + (b - b0) max(0, 1 - s² / (b - b0)²)
@@ -123,7 +123,7 @@ class Errors:
 
 @dataclass(frozen=True, slots=True)
 class BiasCorrection:
-    """What power and velocity are corrected by, so that time and energy of a class's metres are right on average."""
+    """Correction of power and velocity, so that time and energy of a class are unbiased."""
 
     duration: Bias
     energy: Bias
@@ -134,38 +134,38 @@ class BiasCorrection:
         return np.asarray(power_watt * more / slower), np.asarray(velocity_mps / slower)
 
 
-_NOTHING = Bias(np.zeros(_CLASSES), np.zeros(_CLASSES))
+_NO_BIAS = Bias(np.zeros(_CLASSES), np.zeros(_CLASSES))
 
 
 def fit_bias_correction(residuals: Residuals) -> BiasCorrection:
-    """Return by what a model's power and velocity are centred; by nothing with fewer than `FEWEST` held-out samples of both."""
-    held = _Held.of(residuals)
-    if held is None:
-        return BiasCorrection(_NOTHING, _NOTHING)
+    """Return the correction of a model's power and velocity: none with fewer than `FEWEST` held-out samples of both."""
+    held = _Held.collect(residuals)
+    return BiasCorrection(_NO_BIAS, _NO_BIAS) if held is None else _fit_bias_correction(held)
+
+
+def _fit_bias_correction(held: _Held) -> BiasCorrection:
     return BiasCorrection(*(_fit_bias(held.said[name], held.true[name], held) for name in ("duration", "energy")))
 
 
 def fit_errors(residuals: Residuals) -> dict[str, Errors] | None:
     """Return the errors of ``power``, ``velocity``, ``duration`` and ``energy`` a metre; None with fewer than `FEWEST` held-out samples.
 
-    Parameters
-    ----------
-    residuals : one row a held-out sample: run_id, start_ns, terrain_class, power_watt, velocity_mps, and both as predicted.
+    ``residuals`` has a row for each of them: run_id, start_ns, terrain_class, power_watt, velocity_mps, and both as predicted.
     """
-    held = _Held.of(residuals)
+    held = _Held.collect(residuals)
     if held is None:
         return None
-    centring = BiasCorrection(*(_fit_bias(held.said[name], held.true[name], held) for name in ("duration", "energy")))
-    power, velocity = centring.apply(held.said["power"], held.said["velocity"], held.class_id)
+    correction = _fit_bias_correction(held)
+    power, velocity = correction.apply(held.said["power"], held.said["velocity"], held.class_id)
     said = {"power": power, "velocity": velocity, "duration": 1.0 / velocity, "energy": power / velocity}
-    std = {"duration": centring.duration.std, "energy": centring.energy.std}
+    std = {"duration": correction.duration.std, "energy": correction.energy.std}
     nothing = np.zeros(_CLASSES)
     return {name: _fit_class_errors(of, held.true[name], held, std.get(name, nothing)) for name, of in said.items()}
 
 
 @dataclass(frozen=True, slots=True)
 class _Held:
-    """Held-out samples in the order of driving: what was true and said of each quantity, shape (N,), and where."""
+    """Held-out samples in the order of driving: label and prediction of each quantity, shape (N,), and their place."""
 
     true: Mapping[str, Floats]
     said: Mapping[str, Floats]
@@ -175,7 +175,7 @@ class _Held:
     """Along its run."""
 
     @classmethod
-    def of(cls, residuals: Residuals) -> _Held | None:
+    def collect(cls, residuals: Residuals) -> _Held | None:
         names = ("power_watt", "velocity_mps", "power_predicted_watt", "velocity_predicted_mps")
         if not set(names) <= residuals.keys():
             return None

@@ -1,11 +1,11 @@
-"""Batches of a split, epoch by epoch: numpy arrays for Keras, JAX, torch or any loop."""
+"""Stored layers of a split, from memory or piece by piece, and its batches: numpy arrays for Keras, JAX, torch or any loop."""
 
 from __future__ import annotations
 
 import itertools
 from collections import OrderedDict
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -14,6 +14,9 @@ from numpy.typing import NDArray
 from tcpipe.dataset.tensor import TensorLayout
 from tcpipe.formats.dataset_files import PatchFiles
 
+Floats = NDArray[np.float32]
+Ints = NDArray[np.int64]
+Batch = tuple[Floats | tuple[Floats, Floats], ...]
 Pixels = dict[str, NDArray[np.uint8 | np.uint16 | np.float32]]
 
 IN_MEMORY_BYTES = 2 << 30
@@ -21,6 +24,12 @@ IN_MEMORY_BYTES = 2 << 30
 
 CACHED_PIECES = 64
 """Pieces kept for reading at random from a split that is not in memory."""
+
+_FLIPPED = ("cross_slope_rad",)
+"""Columns whose sign changes when a sample is mirrored across its direction of travel."""
+
+_POOL_PIECES = 16
+"""Pieces whose samples are shuffled among each other: 4096 samples of a Zarr dataset, 26 MB."""
 
 
 class StoredPixels:
@@ -62,25 +71,10 @@ class StoredPixels:
     def pools(
         self, at: Ints, layers: Sequence[str], *, pieces: int, spare: int, rng: np.random.Generator | None
     ) -> Iterator[tuple[Pixels, Ints, Ints]]:
-        """Yield the samples ``at`` in pools of so many pieces, each piece decoded once.
+        """Yield the samples ``at``, shape (M,), in pools of ``pieces`` pieces, each piece decoded once.
 
-        Parameters
-        ----------
-        at
-            Samples, shape (M,).
-        layers
-            Which layers.
-        pieces
-            Pieces in a pool.
-        spare
-            Rows at the head of the pool's arrays that are left to the caller, from one pool to the next.
-        rng
-            Shuffles the pieces, and the samples within each pool; None keeps the order of the files.
-
-        Yields
-        ------
-        Arrays of the pool, which the next one overwrites; rows in them, and which of ``at`` these are, both (B,).
-
+        Yielded are arrays of the pool, which the next one overwrites; rows in them, and which of ``at`` these are, both (B,). The first
+        ``spare`` rows are the caller's. ``rng`` shuffles the pieces and the samples within each pool; None keeps the order of the files.
         """
         files, rows, piece_of = self.files, self.rows[at], self.pieces_of(at)
         order = np.argsort(piece_of, kind="stable")
@@ -137,31 +131,21 @@ class SampleView:
     form: TensorLayout
 
 
-Floats = NDArray[np.float32]
-Ints = NDArray[np.int64]
-Batch = tuple[Floats | tuple[Floats, Floats], ...]
+@dataclass(eq=False, repr=False, kw_only=True)
+class Batches:
+    """Batches of one split; iterating again is the next epoch, with its own shuffle.
 
-_FLIPPED = ("cross_slope_rad",)
-"""Columns whose sign changes when a sample is mirrored across its direction of travel."""
-
-_POOL_PIECES = 16
-"""Pieces whose samples are shuffled among each other: 4096 samples of a Zarr dataset, 26 MB."""
-
-
-@dataclass(frozen=True, slots=True)
-class BatchContent:
-    """What batches are made of, sample by sample: pixels, labels, shape (N, 2), weights (N, 2) and named columns (N,) if wanted."""
+    Each batch is ``(patches, labels)``, or ``(patches, labels, weights)`` with ``weights``, a weight for each label; with ``features``,
+    patches are replaced by ``(patches, features)``.
+    """
 
     view: SampleView
     labels: Floats
+    """Shape (N, 2)."""
     weights: Floats | None
-    features: tuple[tuple[str, NDArray[np.generic]], ...]
-
-
-@dataclass(frozen=True, slots=True)
-class BatchRules:
-    """How batches are made: what `Split.batches` was given."""
-
+    """Shape (N, 2)."""
+    features: Sequence[tuple[str, NDArray[np.generic]]]
+    """Names and values of columns, shape (N,)."""
     size: int
     shuffle: bool
     seed: int
@@ -170,31 +154,23 @@ class BatchRules:
     from_disk: bool
     shard: tuple[int, int] = (0, 1)
     """Number of this part of the split and of all its parts."""
+    _next: int = field(default=0, init=False)
+    _samples: Ints = field(init=False)
 
-
-class Batches:
-    """Batches of one split; iterating again is the next epoch, with its own shuffle.
-
-    Each batch is ``(patches, labels)``, or ``(patches, labels, weights)`` with ``weights``, a weight for each label; with ``features``,
-    patches are replaced by ``(patches, features)``.
-    """
-
-    def __init__(self, content: BatchContent, rules: BatchRules) -> None:
-        self._content = content
-        self._rules = rules
-        self._next = 0
-        number, count = rules.shard
-        self._samples: Ints = np.arange(len(content.view.at))
-        if count > 1 and rules.from_disk:
-            piece_of = content.view.stored.pieces_of(content.view.at)
+    def __post_init__(self) -> None:
+        """Find the samples of this part."""
+        number, count = self.shard
+        self._samples = np.arange(len(self.view.at))
+        if count > 1 and self.from_disk:
+            piece_of = self.view.stored.pieces_of(self.view.at)
             self._samples = np.flatnonzero(np.isin(piece_of, np.unique(piece_of)[number::count]))
         elif count > 1:
             self._samples = self._samples[number::count]
 
     def __len__(self) -> int:
         """Return the number of batches in an epoch."""
-        n, size = len(self._samples), self._rules.size
-        return n // size if self._rules.drop_last else -(-n // size)
+        n = len(self._samples)
+        return n // self.size if self.drop_last else -(-n // self.size)
 
     def __iter__(self) -> Iterator[Batch]:
         """Iterate over the next epoch."""
@@ -203,7 +179,7 @@ class Batches:
 
     def part(self, number: int, count: int) -> Batches:
         """Return the batches of one of ``count`` parts of the split, for processes that divide it among them."""
-        return Batches(self._content, replace(self._rules, shard=(number, count)))
+        return replace(self, shard=(number, count))
 
     def forever(self) -> Iterator[Batch]:
         """Iterate over epoch after epoch without an end; Keras wants ``steps_per_epoch=len(batches)`` with it."""
@@ -212,44 +188,42 @@ class Batches:
 
     def epoch(self, number: int) -> Iterator[Batch]:
         """Iterate over one epoch; the same number gives the same batches."""
-        rules = self._rules
-        mirrors = np.random.default_rng([rules.seed, number, 1])
-        for pixels, rows, samples in self._full(np.random.default_rng([rules.seed, number])):
-            for first in range(0, len(rows), rules.size):
-                cut = slice(first, first + rules.size)
+        mirrors = np.random.default_rng([self.seed, number, 1])
+        for pixels, rows, samples in self._iterate_full(np.random.default_rng([self.seed, number])):
+            for first in range(0, len(rows), self.size):
+                cut = slice(first, first + self.size)
                 yield self._batch(pixels, rows[cut], samples[cut], mirrors)
 
-    def _full(self, rng: np.random.Generator) -> Iterator[tuple[Pixels, Ints, Ints]]:
+    def _iterate_full(self, rng: np.random.Generator) -> Iterator[tuple[Pixels, Ints, Ints]]:
         """Yield pixels, rows in them and the samples that these are: whole batches, but for the last ones of the epoch."""
-        rules, view, mine = self._rules, self._content.view, self._samples
+        view, mine = self.view, self._samples
         layers = view.form.layers
-        if not rules.from_disk:
-            order = mine[rng.permutation(len(mine))] if rules.shuffle else mine
-            samples = order[: len(self) * rules.size]
+        if not self.from_disk:
+            order = mine[rng.permutation(len(mine))] if self.shuffle else mine
+            samples = order[: len(self) * self.size]
             yield view.stored.in_memory(layers), view.at[samples], samples
             return
         pool: Pixels = {}
         left = np.empty(0, np.int64)  # samples that wait at the head of the pool for their batch to fill
-        shuffler = rng if rules.shuffle else None
+        shuffler = rng if self.shuffle else None
         for pool, found, which in view.stored.pools(
-            view.at[mine], layers, pieces=_POOL_PIECES, spare=rules.size, rng=shuffler
+            view.at[mine], layers, pieces=_POOL_PIECES, spare=self.size, rng=shuffler
         ):
             rows, samples = np.append(np.arange(len(left)), found), np.append(left, mine[which])
-            full = len(rows) // rules.size * rules.size
+            full = len(rows) // self.size * self.size
             yield pool, rows[:full], samples[:full]
             left = samples[full:]
             for pixels in pool.values():
                 pixels[: len(left)] = pixels[rows[full:]]
-        if len(left) and not rules.drop_last:
+        if len(left) and not self.drop_last:
             yield pool, np.arange(len(left)), left
 
     def _batch(self, pixels: Pixels, rows: Ints, samples: Ints, mirrors: np.random.Generator) -> Batch:
-        content = self._content
-        mirrored = mirrors.random(len(rows)) < 0.5 if self._rules.mirror else np.zeros(len(rows), np.bool_)
-        patches = content.view.form.form(pixels, rows, mirrored)
-        given = (patches, _compute_features(content.features, samples, mirrored)) if content.features else patches
-        batch = (given, content.labels[samples])
-        return batch if content.weights is None else (*batch, content.weights[samples])
+        mirrored = mirrors.random(len(rows)) < 0.5 if self.mirror else np.zeros(len(rows), np.bool_)
+        patches = self.view.form.form(pixels, rows, mirrored)
+        inputs = (patches, _compute_features(self.features, samples, mirrored)) if self.features else patches
+        batch = (inputs, self.labels[samples])
+        return batch if self.weights is None else (*batch, self.weights[samples])
 
 
 def _compute_features(

@@ -1,4 +1,4 @@
-"""The two energies of a metre, either of which can be trained on: all that the power source measured, and what of it is above standing."""
+"""The two energies of a segment, either of which can be trained on: total, and net of the robot's idle power."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ EnergyName = Literal["total", "above_standing"]
 
 @dataclass(frozen=True, slots=True)
 class Energy:
-    """The columns of one of them: power [W] and energy [J], E = w d / v, and their standard deviations."""
+    """Columns of power [W] and energy [J], E = w d / v, and their standard deviations."""
 
     power: str
     power_std: str
     energy: str
     energy_std: str
     words: str
-    """What it is, for people."""
+    """Description for pages."""
 
 
 ENERGIES: Mapping[str, Energy] = {

@@ -1,4 +1,4 @@
-"""What is known of metres of ground beside their patches: numbers that a model may take, and that a planner knows, too."""
+"""Extra features of segments beside their patches: numbers that a model may take and a planner knows, too."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class ExtraFeatures:
-    """Of N metres, shape (N,) each."""
+    """Extra features of N segments, shape (N,) each."""
 
     class_id: NDArray[np.int64]
-    """Terrain class under the chord; 0 where it is not known."""
+    """Terrain class under the chord; 0 if unknown."""
     slope_rad: Floats
     """Along travel, uphill positive."""
     turn_radpm: Floats
-    """How far a metre of them turns, both ways counted; NaN where it is not known."""
+    """Turned angle per metre, both ways counted; NaN if unknown."""
     command_mps: Floats
-    """Commanded speed; NaN where it is not known."""
+    """Commanded speed; NaN if unknown."""
 
     def take(self, rows: NDArray[np.int64] | NDArray[np.bool_] | slice) -> ExtraFeatures:
         """Return some of them."""
@@ -35,37 +35,37 @@ class ExtraFeatures:
 
 @dataclass(frozen=True, slots=True)
 class ExtraFeature:
-    """A number that a model takes beside a patch, and what it was among the training samples."""
+    """A number that a model takes beside a patch, with its distribution over the training samples."""
 
     name: Literal["turn_radpm", "command_mps"]
     mean: float
     deviation: float
     """Greater than 0."""
     usual: float
-    """What a metre has of which it is not known: the mean, unless the user says what."""
+    """Value where it is unknown: the mean, unless the user gives one."""
     seen: tuple[float, float]
     """Smallest and largest."""
 
 
 COLUMNS = ("turn_rate_radps", "duration_s", "arc_length_m", "commanded_velocity_mps")
-"""Of samples.parquet, that the inputs are formed of."""
+"""Columns of samples.parquet that the features are computed from."""
 
 
 def read_extra_features(split: Split) -> ExtraFeatures:
-    """Return what the samples of a split have beside their patches; what an older dataset lacks is NaN."""
+    """Return the extra features of a split; columns that an older dataset lacks are NaN."""
     turn, command = _form_values([split.column(name).astype(np.float64) for name in COLUMNS])
     class_id = np.nan_to_num(split.column("terrain_class").astype(np.float64), nan=0.0).astype(np.int64)
     return ExtraFeatures(class_id, split.column("slope_rad").astype(np.float64), turn, command)
 
 
 def empty_extra_features(count: int) -> ExtraFeatures:
-    """Return that nothing is known of so many metres."""
+    """Return unknown features of ``count`` segments."""
     unknown = np.full(count, np.nan)
     return ExtraFeatures(np.zeros(count, np.int64), unknown, unknown, unknown)
 
 
 def available_features(beside: ExtraFeatures) -> tuple[ExtraFeature, ...]:
-    """Return the inputs that these samples tell: those that are known of any of them."""
+    """Return the features that are known for at least one of these samples."""
     found = []
     for name in ("turn_radpm", "command_mps"):
         values = getattr(beside, name)
@@ -78,12 +78,12 @@ def available_features(beside: ExtraFeatures) -> tuple[ExtraFeature, ...]:
 
 
 def standardize_features(inputs: Sequence[ExtraFeature], beside: ExtraFeatures) -> Floats:
-    """Return what a model takes beside N patches, in units of its deviation from its mean, shape (N, inputs)."""
+    """Return a model's features of N segments as (value - mean) / deviation, shape (N, inputs)."""
     return _scale_values(inputs, {"turn_radpm": beside.turn_radpm, "command_mps": beside.command_mps})
 
 
 def standardize_columns(inputs: Sequence[ExtraFeature], columns: NDArray[np.floating]) -> Floats:
-    """Return the same of `COLUMNS`, shape (N, 4)."""
+    """Return the same from `COLUMNS`, shape (N, 4)."""
     turn, command = _form_values(list(columns.T.astype(np.float64)))
     return _scale_values(inputs, {"turn_radpm": turn, "command_mps": command})
 

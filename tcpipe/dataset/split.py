@@ -1,9 +1,10 @@
-"""One split: the paper's patches and labels as arrays, as batches, and as a map-style dataset for any trainer."""
+"""A dataset as a mapping of its splits: patches and labels as arrays, as batches, and as a map-style dataset for any trainer."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,7 +12,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import ArrayLike, NDArray
 
-from tcpipe.dataset.batches import BatchContent, Batches, BatchRules, SampleView, StoredPixels
+from tcpipe.dataset.batches import Batches, SampleView, StoredPixels
 from tcpipe.dataset.energies import ENERGIES, Energy, find_energy
 from tcpipe.dataset.tensor import make_tensor_layout
 from tcpipe.errors import DatasetError
@@ -63,31 +64,22 @@ class SampleColumns:
         return read_samples(self.directory).take(pa.array(self.rows))
 
 
+@dataclass(eq=False, repr=False)
 class Split:
     """Samples of one split, in the dataset's order; every method that narrows it returns another one over the same files.
 
     Attributes
     ----------
-    name
-        ``train``, ``test``, ``unseen`` or ``buffer``.
-    view
-        Where its pixels come from.
-    energy
-        Which of the two energies its labels are of.
-
+    name : ``train``, ``test``, ``unseen`` or ``buffer``.
+    view : its samples among the stored pixels.
+    energy : which of the two energies its labels are of.
     """
 
-    def __init__(
-        self, name: str, card: DatasetCard, columns: SampleColumns, view: SampleView, energy: Energy = ENERGIES["total"]
-    ) -> None:
-        self.name = name
-        self.view = view
-        self.energy = energy
-        self._card = card
-        self._columns = columns
-        self._labels: Floats | None = None
-        self._weights: Floats | None = None
-        self._patches: Floats | None = None
+    name: str
+    _card: DatasetCard
+    _columns: SampleColumns
+    view: SampleView
+    energy: Energy = ENERGIES["total"]
 
     def __len__(self) -> int:
         """Return the number of samples."""
@@ -117,7 +109,7 @@ class Split:
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave formed tensors behind when a loader's worker process receives the split."""
-        return {**self.__dict__, "_patches": None}
+        return {name: value for name, value in self.__dict__.items() if name != "patches"}
 
     @property
     def channels(self) -> tuple[str, ...]:
@@ -134,30 +126,21 @@ class Split:
         """Columns of samples.parquet that train: the power of its energy, and the velocity that the card says."""
         return self.energy.power, self._card.label.columns[1]
 
-    @property
+    @cached_property
     def labels(self) -> Floats:
         """Power [W] and velocity [m/s], float32, shape (N, 2): its `label_columns`."""
-        if self._labels is None:
-            columns = [self.column(name) for name in self.label_columns]
-            self._labels = np.column_stack(columns).astype(np.float32)
-        return self._labels
+        return np.column_stack([self.column(name) for name in self.label_columns]).astype(np.float32)
 
-    @property
+    @cached_property
     def weights(self) -> Floats:
-        """Inverse variance of each label over its mean, float32, shape (N, 2): how much it says of the ground; 0 where it is not known."""
-        if self._weights is None:
-            std = np.column_stack([self.column(name) for name in (self.energy.power_std, "velocity_std_mps")])
-            self._weights = np.column_stack([_compute_inverse_variance_weights(column) for column in std.T]).astype(
-                np.float32
-            )
-        return self._weights
+        """Inverse variance of each label over its mean, float32, shape (N, 2); 0 where the variance is unknown."""
+        std = np.column_stack([self.column(name) for name in (self.energy.power_std, "velocity_std_mps")])
+        return np.column_stack([_compute_inverse_variance_weights(column) for column in std.T]).astype(np.float32)
 
-    @property
+    @cached_property
     def patches(self) -> Floats:
         """The tensor of all samples, float32 in [0, 1], shape (N, px, px, channels); formed once, then kept."""
-        if self._patches is None:
-            self._patches = self._tensor(np.arange(len(self)))
-        return self._patches
+        return self._form_tensor(np.arange(len(self)))
 
     def column(self, name: str) -> NDArray[np.generic]:
         """Return a column of samples.parquet, shape (N,)."""
@@ -171,17 +154,17 @@ class Split:
         """Return patches, shape (B, px, px, channels), and labels, shape (B, 2), of the samples ``indices``."""
         at = np.asarray(indices, dtype=np.int64)
         at = np.where(at < 0, at + len(self), at)
-        patches = self._tensor(at) if self._patches is None else self._patches[at]
+        patches = self.patches[at] if "patches" in self.__dict__ else self._form_tensor(at)
         return patches, self.labels[at]
 
     def with_channels(self, *channels: str) -> Split:
         """Return the split with these channels: layers by name, or ``terrain_one_hot`` (a channel a class; of any categorical layer)."""
         form = make_tensor_layout(channels, self.view.stored.files.layers)
-        return self._with(replace(self.view, form=form))
+        return replace(self, view=replace(self.view, form=form))
 
     def take(self, chosen: ArrayLike) -> Split:
         """Return some samples: their indices, or a mask of shape (N,)."""
-        return self._with(replace(self.view, at=self.view.at[np.asarray(chosen)]))
+        return replace(self, view=replace(self.view, at=self.view.at[np.asarray(chosen)]))
 
     def clean(
         self,
@@ -194,11 +177,8 @@ class Split:
 
         Parameters
         ----------
-        without
-            Names of quality bits (``near_gap``, ``high_slip`` …); samples with any of them are left out.
-        max_power_std_watt, max_velocity_std_mps
-            Samples with a larger standard deviation are left out [W], [m/s].
-
+        without : names of quality bits (``near_gap``, ``high_slip`` …); samples with any of them are left out.
+        max_power_std_watt, max_velocity_std_mps : samples with a larger standard deviation are left out [W], [m/s].
         """
         named = {flag_name(bit): int(bit) for bit in Quality}
         unknown = [name for name in without if name not in named]
@@ -232,21 +212,13 @@ class Split:
 
         Parameters
         ----------
-        size
-            Samples in a batch, 1 or more.
-        shuffle, seed
-            Another order every epoch, drawn from the seed; from disk, samples are shuffled within pools of shuffled chunks.
-        mirror
-            Mirror every other sample across its direction of travel, at random: rows of the patch are reversed, its labels stay true.
-        weights
-            Third element of each batch: `weights`.
-        features
-            Columns of samples.parquet that go beside the patches: ``slope_rad``, ``cross_slope_rad`` (its sign follows the mirror) ….
-        drop_last
-            Leave out a last batch that is not full.
-        from_disk
-            Decode chunk by chunk instead of keeping the split in memory; None decides by its size.
-
+        size : samples in a batch, 1 or more.
+        shuffle, seed : another order every epoch, drawn from the seed; from disk, samples are shuffled within pools of shuffled chunks.
+        mirror : mirror every other sample across its direction of travel, at random: rows of the patch are reversed, its labels stay true.
+        weights : third element of each batch: `weights`.
+        features : columns of samples.parquet beside the patches: ``slope_rad``, ``cross_slope_rad`` (its sign follows the mirror) ….
+        drop_last : leave out a last batch that is not full.
+        from_disk : decode chunk by chunk instead of keeping the split in memory; None decides by its size.
         """
         if size < 1:
             raise DatasetError(f"batches of {size} samples: wanted 1 or more")
@@ -255,8 +227,18 @@ class Split:
         if textual:
             raise DatasetError(f"features {', '.join(textual)}: wanted columns of numbers")
         disk = not self.view.stored.fit(self.view.form.layers) if from_disk is None else from_disk
-        content = BatchContent(self.view, self.labels, self.weights if weights else None, columns)
-        return Batches(content, BatchRules(size, shuffle, seed, mirror, drop_last, disk))
+        return Batches(
+            view=self.view,
+            labels=self.labels,
+            weights=self.weights if weights else None,
+            features=columns,
+            size=size,
+            shuffle=shuffle,
+            seed=seed,
+            mirror=mirror,
+            drop_last=drop_last,
+            from_disk=disk,
+        )
 
     def torch_iterable(self, size: int, **rules: Any) -> TorchBatches:
         """Return `batches` as an iterable torch dataset, for ``DataLoader(…, batch_size=None, num_workers=n)``; imports torch."""
@@ -264,10 +246,7 @@ class Split:
 
         return TorchBatches(self.batches(size, **rules))
 
-    def _with(self, view: SampleView) -> Split:
-        return Split(self.name, self._card, self._columns, view, self.energy)
-
-    def _tensor(self, indices: Ints) -> Floats:
+    def _form_tensor(self, indices: Ints) -> Floats:
         layers = self.view.form.layers
         if self.view.stored.fit(layers):
             return self.view.form.form(self.view.stored.in_memory(layers), self.view.at[indices])
@@ -284,13 +263,13 @@ def _compute_inverse_variance_weights(std: NDArray[np.float64]) -> NDArray[np.fl
     return np.asarray(weights / weights.mean())
 
 
+@dataclass(eq=False, repr=False)
 class Dataset(Mapping[str, Split]):
     """The splits ``train``, ``test``, ``unseen`` and ``buffer`` by name (a split may be empty), and the card."""
 
-    def __init__(self, path: Path, card: DatasetCard, splits: Mapping[str, Split]) -> None:
-        self.path = path
-        self.card = card
-        self._splits = dict(splits)
+    path: Path
+    card: DatasetCard
+    _splits: Mapping[str, Split]
 
     def __getitem__(self, name: str) -> Split:
         """Return one split."""
@@ -318,23 +297,14 @@ def open_dataset(path: str | Path, *, layers: Sequence[str] | None = None, label
 
     Parameters
     ----------
-    path
-        Its directory, of either format, or the URL of one in a bucket (``s3://…``): patches are fetched when they are read, and cached.
-    layers
-        The tensor's channels, in this order; None: the paper's ``ortho``, ``terrain``, ``height``, those of them that are there.
-    label
-        Which energy the labels are of: ``total``, all that the power source measured, or ``above_standing``, less what the robot draws
+    path : its directory, of either format, or the URL of one in a bucket (``s3://…``): patches are fetched when they are read, and cached.
+    layers : the tensor's channels, in this order; None: the paper's ``ortho``, ``terrain``, ``height``, as far as the dataset has them.
+    label : which energy the labels are of: ``total``, all that the power source measured, or ``above_standing``, less what the robot draws
         while it stands. T = d / v and E = w d / v hold for either.
-
-    Returns
-    -------
-    A mapping from ``train``, ``test``, ``unseen``, ``buffer`` to `Split`; patches are read when they are asked for.
 
     Raises
     ------
-    DatasetError
-        There is no dataset, it is of another data model, or its samples do not fit its card, or it has no such layer or label.
-
+    DatasetError : no dataset, another data model, samples that do not fit the card, or no such layer or label.
     """
     energy = find_energy(label)
     directory, fetched = fetch_directory_by_range(path, by_range=is_shard)
@@ -344,24 +314,18 @@ def open_dataset(path: str | Path, *, layers: Sequence[str] | None = None, label
         raise DatasetError(
             f"{directory}: samples.parquet has {len(split)} rows, its card says {card.samples}; build it again"
         )
-    _refuse_without(energy, directory, card)
-    files = open_patches(directory, card, fetched)
-    asked = [name for name in LAYERS if name in files.layers] if layers is None else layers
-    form = make_tensor_layout(asked, files.layers)
-    parts = {}
-    for name, rows in find_rows_in_files(card, split).items():
-        columns = SampleColumns(directory, np.flatnonzero(split == name))
-        parts[name] = Split(
-            name, card, columns, SampleView(StoredPixels(files, rows), np.arange(len(rows)), form), energy
-        )
-    return Dataset(directory, card, parts)
-
-
-def _refuse_without(energy: Energy, directory: Path, card: DatasetCard) -> None:
-    """Raise an error if no sample of the dataset has the label."""
     column = read_samples(directory, [energy.power]).column(energy.power)
     if card.samples and column.null_count == len(column):
         raise DatasetError(
             f"{directory}: no sample has {energy.power}: its robot hardly stood in any run, or they were ingested before data model 1.3; "
             "ingest the logs and build it again, or take the label total"
         )
+    files = open_patches(directory, card, fetched)
+    asked = [name for name in LAYERS if name in files.layers] if layers is None else layers
+    form = make_tensor_layout(asked, files.layers)
+    parts = {}
+    for name, rows in find_rows_in_files(card, split).items():
+        columns = SampleColumns(directory, np.flatnonzero(split == name))
+        view = SampleView(StoredPixels(files, rows), np.arange(len(rows)), form)
+        parts[name] = Split(name, card, columns, view, energy)
+    return Dataset(directory, card, parts)

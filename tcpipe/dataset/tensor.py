@@ -46,17 +46,9 @@ class TensorLayout:
         return 1 if layer.name == channel else round(layer.high)
 
     def form(self, pixels: Pixels, rows: NDArray[np.int64], mirrored: NDArray[np.bool_] | None = None) -> Floats:
-        """Return the tensor of ``rows`` of the stored layers, float32, shape (B, px, px, depth).
+        """Return the tensor of ``rows``, shape (B,), of stored layers, (N, px, px) each: float32, shape (B, px, px, depth).
 
-        Parameters
-        ----------
-        pixels
-            Stored layers, each of shape (N, px, px).
-        rows
-            Which of them, shape (B,).
-        mirrored
-            Whether each is mirrored across its direction of travel, shape (B,).
-
+        ``mirrored`` tells which of them are mirrored across their direction of travel, shape (B,).
         """
         from tcpipe.dataset.tensor_kernel import form_bytes, form_numbers, form_paper_tensor  # noqa: PLC0415  numba loads with the first batch
 
@@ -85,7 +77,7 @@ class TensorLayout:
 
 
 def make_tensor_layout(channels: Sequence[str], known: Mapping[str, Layer]) -> TensorLayout:
-    """Return the form with these channels; `DatasetError` names those that the stored layers cannot give."""
+    """Return the layout with these channels; `DatasetError` names those that the stored layers cannot give."""
     possible = [*known, *(f"{name}{ONE_HOT}" for name, layer in known.items() if layer.kind == "categorical")]
     unknown = [channel for channel in channels if channel not in possible]
     if unknown or not channels:

@@ -12,7 +12,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
-from tcpipe.errors import StoreError
+from tcpipe.errors import MissingFileError, StoreError
 from tcpipe.formats.atomic import make_scratch_directory
 from tcpipe.formats.content_cache import fetch_cached
 from tcpipe.formats.integrity import Checksum
@@ -220,4 +220,4 @@ def _convert_missing(where: str) -> Iterator[None]:
     try:
         yield
     except FileNotFoundError:
-        raise StoreError(f"{where}: is gone") from None
+        raise MissingFileError(where) from None

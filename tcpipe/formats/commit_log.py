@@ -27,7 +27,7 @@ from tcpipe.formats.commits import Commit, Entries, Kind, Problem, Process, Stat
 from tcpipe.formats.integrity import SEAL, seal_document, verify_document
 from tcpipe.formats.json_files import parse_json, parse_typed, parse_typed_json, to_compact_json, to_json
 from tcpipe.formats.place import Place
-from tcpipe.tables.findings import Subject, make_finding
+from tcpipe.tables.findings import Finding, Subject, make_finding
 
 logger = logging.getLogger("tcpipe")
 
@@ -51,6 +51,16 @@ class Stamp:
 
     who: Process
     at: str
+
+
+@dataclass(frozen=True, slots=True)
+class _Snapshot:
+    """A snapshot as it is written: a commit whose runs have no findings, and these apart, each once, as runs share most of them."""
+
+    commit: Commit
+    findings: tuple[Finding, ...]
+    by_run: tuple[tuple[int, ...], ...]
+    """Which of the findings each run has."""
 
 
 @contextmanager
@@ -195,8 +205,11 @@ def _list_snapshots(log: Place) -> list[str]:
 
 
 def _encode_snapshot(state: State, stamp: Stamp) -> bytes:
-    commit = Commit(state.number, state.digest, "snapshot", stamp.who, stamp.at, compact_state(state))
-    text = to_compact_json(commit)
+    entries, numbers = compact_state(state), dict[Finding, int]()
+    by_run = tuple(tuple(numbers.setdefault(of, len(numbers)) for of in row.findings) for row in entries.runs)
+    entries = replace(entries, runs=tuple(replace(row, findings=()) for row in entries.runs))
+    commit = Commit(state.number, state.digest, "snapshot", stamp.who, stamp.at, entries)
+    text = to_compact_json(_Snapshot(commit, tuple(numbers), by_run))
     sink = pa.BufferOutputStream()
     with pa.CompressedOutputStream(sink, "zstd") as stream:
         stream.write(hashlib.sha256(text).hexdigest().encode() + b"\n")
@@ -220,9 +233,14 @@ def read_snapshot(log: Place, name: str) -> Commit:
     if hashlib.sha256(text).hexdigest().encode() != seal:
         raise StoreError(f"{where}: is not as it was written")
     try:
-        return parse_typed_json(text, Commit, where)
+        found = parse_typed_json(text, _Snapshot, where)
     except StoreError:
-        return parse_typed(parse_json(bytes(text), where), Commit, where)
+        found = parse_typed(parse_json(bytes(text), where), _Snapshot, where)
+    for row, numbers in zip(found.commit.entries.runs, found.by_run, strict=True):
+        object.__setattr__(
+            row, "findings", tuple([found.findings[number] for number in numbers])
+        )  # nobody else has the row yet
+    return found.commit
 
 
 _HERE: dict[Place, State] = {}

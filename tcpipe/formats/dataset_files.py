@@ -304,7 +304,7 @@ def read_samples(directory: Path, columns: Sequence[str] | None = None) -> pa.Ta
     try:
         absent = later.intersection(asked).difference(read_column_names(directory / SAMPLES))
         there = None if columns is None else [name for name in columns if name not in absent]
-        return SAMPLES_SCHEMA.only(*asked).completed(read_table(directory / SAMPLES, there))
+        return SAMPLES_SCHEMA.select_columns(*asked).add_missing_columns(read_table(directory / SAMPLES, there))
     except StoreError as error:
         raise DatasetError(*error.problems) from None
 

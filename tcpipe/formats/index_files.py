@@ -10,12 +10,14 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from operator import attrgetter
 from pathlib import PurePosixPath
+from typing import TypeAlias
 
 import pyarrow as pa
+import pyarrow.compute as pc
 
 from tcpipe.errors import StoreError
 from tcpipe.formats.json_files import convert_record
-from tcpipe.formats.parquet import write_parquet_rows
+from tcpipe.formats.parquet import read_parquet_bytes, write_parquet_bytes
 from tcpipe.formats.place import Place
 from tcpipe.formats.run_documents import Ingestion, LogOrigin, Manifest, RunJson
 from tcpipe.tables.arrays import make_column
@@ -27,8 +29,7 @@ RUNS = "runs.parquet"
 
 _TOGETHER = 2_000
 """So many rows are written at once."""
-_ABOUT = b"tcpipe_index"
-_VERSION = b"6"
+_VERSION = b"7"
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,6 +126,9 @@ def read_known_log(known: RunJson) -> KnownLog:
     return KnownLog(known.source, known.tags, sensors, known.outline)
 
 
+Rows: TypeAlias = Mapping[tuple[str, str], RunFacts]
+"""By run and recipe."""
+
 _TEXT, _TEXTS = pa.string(), pa.list_(pa.string())
 _SCHEMA = pa.schema({
     "run_id": _TEXT, "recipe_id": _TEXT, "data_model_version": _TEXT, "tcpipe_version": _TEXT, "robot": _TEXT,
@@ -148,19 +152,48 @@ _CELLS: Mapping[str, Callable[[RunFacts], object]] = {
 """How a column is made that is no field of a row."""
 
 
-def write_index(place: Place, rows: Iterable[RunFacts]) -> None:
-    """Write ``runs.parquet``, unless that cannot be: it is written again after the next commit."""
-    rows, schema = list(rows), _SCHEMA.with_metadata({_ABOUT: _VERSION})
-    with suppress(StoreError), place.workshop() as directory:
-        with write_parquet_rows(directory / RUNS, schema) as write:
-            for start in range(0, len(rows), _TOGETHER):
-                write(_make_table(rows[start : start + _TOGETHER], schema))
-        place.put(RUNS, (directory / RUNS).read_bytes())
+def write_index(
+    place: Place, rows: Rows, digest: str, *, before: Rows | None = None, digest_before: str | None = None
+) -> None:
+    """Write ``runs.parquet``; where that cannot be, the next commit writes it.
+
+    Parameters
+    ----------
+    rows, digest : the rows of a state of the log, by run and recipe, and its digest.
+    before, digest_before : the same of an earlier state: of its table only the rows that have changed are made anew.
+    """
+    before = before or {}
+    table = None if digest_before is None else _read_index(place, digest_before)
+    changed = [key for key, row in rows.items() if table is None or before.get(key) is not row]
+    tables = [
+        _make_table([rows[key] for key in changed[at : at + _TOGETHER]]) for at in range(0, len(changed), _TOGETHER)
+    ]
+    if table is not None:
+        outdated = {*changed, *(before.keys() - rows.keys())}
+        keys = zip(*(table.column(name).to_pylist() for name in ("run_id", "recipe_id")), strict=True)
+        tables.append(table.filter(make_column([key not in outdated for key in keys], pa.bool_())))
+    table = pa.concat_tables(tables or [_SCHEMA.empty_table()])
+    table = table.take(pc.sort_indices(table, [("run_id", "ascending"), ("recipe_id", "ascending")]))
+    with suppress(StoreError):
+        place.put(RUNS, write_parquet_bytes(table.replace_schema_metadata(_describe_state(digest))))
 
 
-def _make_table(rows: Sequence[RunFacts], schema: pa.Schema) -> pa.Table:
-    cells = (map(_CELLS.get(of.name, attrgetter(of.name)), rows) for of in schema)
-    return pa.table([_to_column([*of], field.type) for of, field in zip(cells, schema, strict=True)], schema=schema)
+def _read_index(place: Place, digest: str) -> pa.Table | None:
+    """Return the table of the state of a digest; None where there is another, or none that can be read."""
+    with suppress(StoreError):
+        if (data := place.read(RUNS)) is not None:
+            table = read_parquet_bytes(data, place.where(RUNS))
+            return table.replace_schema_metadata(None) if table.schema.metadata == _describe_state(digest) else None
+    return None
+
+
+def _describe_state(digest: str) -> dict[bytes, bytes]:
+    return {b"tcpipe_index": _VERSION, b"log": digest.encode()}
+
+
+def _make_table(rows: Sequence[RunFacts]) -> pa.Table:
+    cells = (map(_CELLS.get(of.name, attrgetter(of.name)), rows) for of in _SCHEMA)
+    return pa.table([_to_column([*of], field.type) for of, field in zip(cells, _SCHEMA, strict=True)], schema=_SCHEMA)
 
 
 def _to_column(values: list[object], kind: pa.DataType) -> pa.Array:

@@ -47,7 +47,7 @@ def write_parquet_rows(path: Path, schema: pa.Schema) -> Iterator[Callable[[pa.T
         yield lambda table: writer.write_table(table.combine_chunks(), row_group_size=ROWS_PER_GROUP)
 
 
-def write_parquet_bytes(table: pa.Table, *, rows_per_group: int) -> bytes:
+def write_parquet_bytes(table: pa.Table, *, rows_per_group: int = ROWS_PER_GROUP) -> bytes:
     """Return the file that `write_table` writes, in groups of so many rows."""
     sink = pa.BufferOutputStream()
     with _open_writer(sink, table.schema) as writer:
@@ -100,6 +100,12 @@ def read_table(path: Path, columns: list[str] | None = None) -> pa.Table:
     """Read a Parquet file with its schema metadata; `StoreError` names a file that cannot be read."""
     with _convert_damage(path), pa.memory_map(str(path)) as file:
         return _check_text_sizes(file.read_buffer(), columns)
+
+
+def read_parquet_bytes(data: bytes, where: str) -> pa.Table:
+    """Return the table in the bytes of a file that lies at ``where``, as `read_table`."""
+    with _convert_damage(where):
+        return _check_text_sizes(pa.py_buffer(data), None)
 
 
 def read_row_group(path: Path, group: int, columns: list[str]) -> pa.Table:

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import NamedTuple, Protocol
 
-from tcpipe.errors import StoreError
+from tcpipe.errors import MissingFileError, StoreError
 from tcpipe.formats.atomic import TEMPORARY_PREFIX, clear, make_working_directory, put_directory, put_file
 from tcpipe.formats.integrity import Checksum, compute_checksum
 
@@ -247,6 +247,6 @@ def _convert_os_errors(where: str, what: str) -> Iterator[None]:
     try:
         yield
     except (FileNotFoundError, NotADirectoryError):
-        raise StoreError(f"{where}: is gone") from None
+        raise MissingFileError(where) from None
     except OSError as error:
         raise StoreError(f"{where}: cannot be {what} ({error.strerror or error})") from error

@@ -138,10 +138,11 @@ def _iterate_toml_lines(recipe: Recipe, definitions: Mapping[str, Any]) -> Itera
 
 def _iterate_table_lines(head: str, here: Any, default: Any, definitions: Mapping[str, Any]) -> Iterator[str]:
     """Yield a table of the recipe; one that it does not have is shown behind two #, since its keys alone would be another's."""
-    definition = definitions[type(default).__name__]
+    cls: type = type(default)
+    definition = definitions[cls.__name__]
     told = (f"# {line}" for line in definition["description"].splitlines() if line)
     yield from ("", *told, head if here else f"## {head}")
-    for name, kind in read_annotations(type(default)).items():
+    for name, kind in read_annotations(cls).items():
         value, usual = getattr(here or default, name), getattr(default, name)
         for line in _iterate_key_lines(definition["properties"][name], name, value, usual, format_values(kind)):
             yield line if here else f"#{line}"

@@ -81,7 +81,7 @@ class RunDirectory:
 
     def segments(self) -> pa.Table:
         """Read the labelled segments (schema LABELLED_SEGMENTS; columns that an earlier data model lacks are null)."""
-        return LABELLED_SEGMENTS.completed(self.table("segments"))
+        return LABELLED_SEGMENTS.add_missing_columns(self.table("segments"))
 
     def track(self) -> GatedTrack:
         """Read the gated track as a checked level."""

@@ -112,7 +112,7 @@ def run_ingest(options: IngestOptions) -> IngestSummary:
             raise (LogError if found.transient else UsageError)(*chain(*found.problems.values()) or [_NO_LOGS])
         opened = open_store(options.store, create=True)
         log = open_log(opened)
-        before = log.state.number
+        before = log.state
         given = tuple(make_absolute(path) for path in logs if not is_presigned(path))  # signed URLs are not stored
         mine = found.sources if shard is None else select_shard(found.sources, shard)
         root = opened.root
@@ -148,8 +148,8 @@ def run_ingest(options: IngestOptions) -> IngestSummary:
                 call.end = Entries(calls=(measure_call(watch, _call_of(opened, summary, given, tasks, options.jobs)),))
         else:
             log.commit("ended", Entries(ended=tuple(find_settled_calls(log.state, make_call(*begin)))))
-        if log.state.number != before and log.state.runs:
-            opened.write_index(log.state)
+        if log.state.number != before.number and log.state.runs:
+            opened.write_index(log.state, before=before)
         return summary
 
 

@@ -89,7 +89,7 @@ def prune(
     """
     ruling = resolve_recipe(recipe)
     opened = open_store(store)
-    log = LogWriter(opened, opened.state())
+    log = LogWriter(opened, before := opened.state())
     _forget(log, forget, dry_run=dry_run)
     found = opened.ingestions(state=log.state)
     unknown = set(keep) - {name for key in found.rows for name in key}
@@ -126,7 +126,7 @@ def prune(
         clear_scratch()
         _remove_empty(opened, min_age_s)
     if removed and not dry_run:
-        opened.write_index(log.state)
+        opened.write_index(log.state, before=before)
     return Pruned(str(opened.root), dry_run, tuple(removed), tuple(kept), sum(each.size_bytes for each in removed))
 
 
@@ -229,11 +229,15 @@ def _iterate_replaced(store: Store, state: State, min_age_s: float, unread: str 
     by_run: dict[str, list[RunFacts]] = {}
     for row in state.runs.values():
         by_run.setdefault(row.run_id, []).append(row)
-    for run_id in (None, *store.run_ids()):
+    found: dict[str | None, list[Entry]] = {None: store.place.below("maps").entries()}
+    for entry in store.runs_place.entries():  # of all runs at once: in a bucket each listing is a request
+        run, _, name = entry.name.partition("/")
+        found.setdefault(run, []).append(entry._replace(name=name))
+    for run_id, entries in found.items():
         place = store.place.below("maps") if run_id is None else store.runs_place.below(run_id)
-        entries, rows = place.entries(), by_run.get(run_id or "", [])
+        rows = by_run.get(run_id or "", [])
         try:
-            named = set(_iterate_named(place, [entry.name for entry in entries], rows))
+            named = set(_iterate_named(place, {entry.name: entry.size_bytes for entry in entries}, rows))
             why = unread
         except StoreError as error:
             named, why = set(), error.problems[0]
@@ -255,16 +259,18 @@ def _find_uncommitted(last: Mapping[str, int], rows: Sequence[RunFacts]) -> set[
     return {recipe for recipe, _, kind in parted if kind == "manifest"} - {row.recipe_id for row in rows}
 
 
-def _iterate_named(place: Place, names: Sequence[str], rows: Sequence[RunFacts]) -> Iterator[str]:
+def _iterate_named(place: Place, sizes: Mapping[str, int], rows: Sequence[RunFacts]) -> Iterator[str]:
     """Yield the files that the log names, those that their documents name, and the same of what no commit names but the last document."""
-    last, committed = find_highest_numbers(names), {name for row in rows for name in row.files}
+    last, committed = find_highest_numbers(sizes), {name: size for row in rows for name, size in row.files.items()}
     recipes = {row.recipe_id for row in rows}
-    for name in names:
+    for name, size in sizes.items():
         of = split_number(name)
         if of is None:
             continue
         is_last = of[1] == last[of[0]]
-        if name in committed or (is_last and (not rows or name.partition("/")[0] not in recipes)):
+        if committed.get(name) == size and of[0].endswith("/manifest"):  # the log names its tables too
+            yield name
+        elif name in committed or (is_last and (not rows or name.partition("/")[0] not in recipes)):
             yield from (name, *_iterate_named_by(place, name))
     yield from committed
 

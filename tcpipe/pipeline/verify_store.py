@@ -314,7 +314,7 @@ def _verify_others(place: Place, manifest: Manifest) -> Iterator[CheckResult]:
 def _verify_tables(run: RunDirectory, where: str) -> Iterator[CheckResult]:
     tables = {}
     for name, schema in _TABLES.items():
-        tables[name] = schema.completed(run.table(name))
+        tables[name] = schema.add_missing_columns(run.table(name))
         try:
             schema.check(tables[name])
         except TcpipeError as error:

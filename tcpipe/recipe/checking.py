@@ -13,6 +13,7 @@ import json
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import MISSING, asdict, fields, is_dataclass
+from functools import cache
 from itertools import pairwise
 from math import isfinite
 from textwrap import dedent
@@ -43,7 +44,8 @@ def validate_fields(made: Any, section: str) -> None:
     RecipeError : one line for every wrong value.
     """
     problems: list[str] = []
-    for name, kind in read_annotations(type(made)).items():
+    cls: type = type(made)
+    for name, kind in read_annotations(cls).items():
         object.__setattr__(made, name, _check_value(kind, getattr(made, name), _join_key(section, name), problems))
     if problems:
         raise RecipeError(*(f"recipe: {problem}" for problem in problems))
@@ -63,7 +65,8 @@ def from_values(cls: type[T], values: Mapping[str, Any], *, where: str) -> T:
     return made
 
 
-def read_annotations(cls: type) -> dict[str, Any]:
+@cache
+def read_annotations(cls: type) -> Mapping[str, Any]:
     """Return the annotation of every field of a dataclass."""
     hints = get_type_hints(cls, include_extras=True)
     return {of.name: hints[of.name] for of in fields(cls)}

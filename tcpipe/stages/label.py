@@ -10,7 +10,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from tcpipe.cost.labels import Labels, NetLabels, compute_labels, subtract_idle_power
+from tcpipe.cost.labels import Labels, compute_labels, subtract_idle_power
 from tcpipe.cost.physics import ALL, FitSamples, fit_and_validate_physics, fit_physics
 from tcpipe.cost.quality import combine_flags, has_mean_mismatch
 from tcpipe.fusion.trajectory import DISPLACEMENT_LAGS_S
@@ -63,7 +63,7 @@ def label_segments(
         joules.update(sum_energy_entries(rows, rails, rate_hz=gated.info.rate_hz, rule=rule))
         if not cut.num_rows:
             continue
-        cost, above, causes = compute_segment_costs(cut, rows, rails, gated.info, rule=rule, standing=standing)
+        cost, net, causes = compute_segment_costs(cut, rows, rails, gated.info, rule=rule, standing=standing)
         variance_j2.append(causes)
         spans = to_integers(cut, "start_ns"), to_integers(cut, "end_ns")
         count, mean_watt = count_samples_inside(rails, *spans)
@@ -84,7 +84,7 @@ def label_segments(
                 **{name: cut[name] for name in cut.column_names},
                 **make_motion_columns(cut, rows, streams, gated.info, cost),
                 **{name: getattr(cost, name) for name in Labels.__slots__},
-                **{name: getattr(above, name) for name in NetLabels.__slots__},
+                **net,
                 voltage_volt=mean_between(to_integers(rows, "stamp_ns"), to_floats(rows, "voltage_volt"), *spans),
                 physics_power_watt=np.full(cut.num_rows, np.nan),
                 power_samples=count,
@@ -107,8 +107,8 @@ _BETTER_HZ = 20.0
 
 def compute_segment_costs(
     cut: pa.Table, rows: pa.Table, rails: list[Rail], info: TrackInfo, *, rule: Rule, standing: IdlePower
-) -> tuple[Labels, NetLabels, dict[str, NDArray[np.float64]]]:
-    """Return the labels of one epoch's segments, the net labels, and the variances of their energies by cause of `tcpipe.cost.labels` [J²].
+) -> tuple[Labels, dict[str, NDArray[np.float64]], dict[str, NDArray[np.float64]]]:
+    """Return the labels of one epoch's segments, the net labels, and the variances of their energies by cause [J²].
 
     ``cut`` and ``rows`` are the epoch's segments and rows of the gated track.
     """
@@ -127,7 +127,7 @@ def compute_segment_costs(
         displacement_std_m=_compute_displacement_std_m(cut, rows, smoothed=info.estimator == "smoother"),
         energy_noise_joule=noise_joule,
     )
-    above = subtract_idle_power(
+    net = subtract_idle_power(
         cost,
         standing_watt=standing.watt,
         standing_std_watt=standing.std_watt,
@@ -136,7 +136,7 @@ def compute_segment_costs(
     )
     position = (end_watt * cost.duration_std_s) ** 2
     causes = {"position": position, "rate": noise.rate, "current": noise.current, "voltage": noise.voltage}
-    return cost, above, {**causes, "at_20_hz": position + np.minimum(better.std_joule(), noise_joule) ** 2}
+    return cost, net, {**causes, "at_20_hz": position + np.minimum(better.std_joule(), noise_joule) ** 2}
 
 
 def _compute_displacement_std_m(cut: pa.Table, rows: pa.Table, *, smoothed: bool) -> NDArray[np.float64]:

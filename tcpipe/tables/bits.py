@@ -1,7 +1,4 @@
-"""The bits of ``dropped_by`` (track rows), of ``quality`` (segments), and the ledger's entries.
-
-A bit, once released, keeps its value: files on disk carry it.
-"""
+"""Bits of ``dropped_by`` (track rows) and ``quality`` (segments), entries of the distance breakdown; released bits keep their value."""
 
 from __future__ import annotations
 
@@ -14,7 +11,7 @@ def flag_name(bit: IntFlag) -> str:
 
 
 def flag_names(bits: int, flags: type[IntFlag]) -> tuple[str, ...]:
-    """Return the names of the flags that are set in a number, in their order."""
+    """Return the names of the set flags of a number, in order."""
     return tuple(flag_name(bit) for bit in flags if int(bits) & bit)
 
 

@@ -24,7 +24,7 @@ from tcpipe.tables.bits import flag_name
 class Column:
     """One column: name (its suffix is the unit), Arrow type, unit, meaning, frame, whether null is allowed, flag bits.
 
-    ``since`` is the data model that added it, empty for the first: tables of an earlier one lack it (`TableSchema.completed`).
+    ``since`` is the data model that added it, empty for the first: tables of an earlier one lack it (`TableSchema.add_missing_columns`).
     """
 
     name: str
@@ -81,7 +81,7 @@ class TableSchema:
         """Return the table without rows."""
         return pa.Table.from_batches([], self.arrow())
 
-    def completed(self, table: pa.Table) -> pa.Table:
+    def add_missing_columns(self, table: pa.Table) -> pa.Table:
         """Return a table of an earlier data model with the columns added since, null; of this one, as it is.
 
         A data model is earlier if it lacks all columns of a later one: a table that lacks some of them is damaged, and stays so.
@@ -95,8 +95,8 @@ class TableSchema:
         mine = [name for name in self.names() if name in table.column_names]
         return table.select([*mine, *(name for name in table.column_names if name not in mine)]) if added else table
 
-    def only(self, *names: str) -> TableSchema:
-        """Return the contract of some of the columns."""
+    def select_columns(self, *names: str) -> TableSchema:
+        """Return the schema of some of the columns."""
         return replace(self, columns=tuple(column for column in self.columns if column.name in names))
 
     def check(self, table: pa.Table, *, more: bool = False) -> None:
@@ -139,7 +139,7 @@ def read_lonlat_deg(table: pa.Table, end: str) -> NDArray[np.float64]:
 
 
 class FloatColumns(Mapping[str, NDArray[np.float64]]):
-    """A table's columns of numbers by name, as `to_floats` gives them, made on demand: a long log has many that nobody needs."""
+    """Floating-point columns of a table by name, as `to_floats`, converted on access."""
 
     def __init__(self, table: pa.Table) -> None:
         self._table = table

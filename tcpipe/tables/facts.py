@@ -1,6 +1,6 @@
-"""What each stage noticed, as dataclasses: JSON holds them under the same names, in run.json those of reading, in manifest.json all.
+"""Facts that each stage records: run.json has those of reading, manifest.json all, under the same names.
 
-Counts and metres are by the names of roles, of reasons or of the ledger's entries. A number that is None is not known.
+Counts and metres are by role, by reason or by entry of the distance breakdown. A number that is None is unknown.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from tcpipe.tables.findings import LEFT_OUT as LEFT_OUT  # noqa: PLC0414  facts 
 from tcpipe.tables.findings import StageReport
 
 ABSENT: Mapping[str, tuple[object, ...]] = {"json": (None,)}
-"""Metadata of a field which, while it is None, is no key of the JSON object."""
+"""Metadata of a field that JSON omits if it is None."""
 
 Vector = tuple[float, float, float]
 
@@ -28,7 +28,7 @@ def make_vector(values: NDArray[np.float64]) -> Vector:
 
 @dataclass(frozen=True, slots=True)
 class RobotChoice:
-    """Which robot profile rules, and why."""
+    """The robot profile in use, and why."""
 
     name: str
     why: str
@@ -36,7 +36,7 @@ class RobotChoice:
 
 @dataclass(frozen=True, slots=True)
 class TopicClock:
-    """Which stamp of a topic is used and the reason, the median of header minus log time, and what was added to its stamps by epoch [s]."""
+    """Source of a topic's stamps and why, the median of header minus log time, and the correction of stamps by clock epoch [s]."""
 
     source: str
     why: str
@@ -46,7 +46,7 @@ class TopicClock:
 
 @dataclass(frozen=True, slots=True)
 class TopicFacts:
-    """What became of a topic's messages: rows, and by reason what was dropped and what was set aside inside used rows."""
+    """Messages and rows of a topic, counts of dropped messages by reason, and of unusable values inside used rows."""
 
     type: str
     messages: int
@@ -59,7 +59,7 @@ class TopicFacts:
 
 @dataclass(frozen=True, slots=True)
 class RoleFacts:
-    """Why a role went to its topics, and the frame of its sensor and what placed that."""
+    """Why a role uses its topics, the frame of its sensor, and the source of its extrinsics."""
 
     why: str
     frame: str
@@ -69,7 +69,7 @@ class RoleFacts:
 
 @dataclass(frozen=True, slots=True)
 class ClockStep:
-    """A step of header minus log time: at which log time [ns], how far [s], and on which topics."""
+    """A step of header minus log time: its log time [ns], size [s] and topics."""
 
     log_time_ns: int
     step_s: float
@@ -78,9 +78,9 @@ class ClockStep:
 
 @dataclass(frozen=True, slots=True)
 class PowerSign:
-    """Which sign a drawn current has and what tells it; whether the source averages over its message period.
+    """Sign of a drawn current and its source; whether the power source averages over its message period.
 
-    ``includes``: what the currents feed besides the drives, as far as the tables of power messages know (computers, payload).
+    ``includes``: known loads besides the drives (computers, payload).
     """
 
     current_sign: str
@@ -90,7 +90,7 @@ class PowerSign:
 
 @dataclass(frozen=True, slots=True)
 class Reopening:
-    """A sensor that its gate had refused since ``start_ns`` was heard again at ``end_ns``: it was off by ``size`` [m] or [m/s]."""
+    """A gate reset: rejected since ``start_ns``, accepted again at ``end_ns``, with an error of ``size`` [m] or [m/s]."""
 
     role: str
     start_ns: int
@@ -100,9 +100,9 @@ class Reopening:
 
 @dataclass(frozen=True, slots=True)
 class StretchFacts:
-    """One stretch that was fused for itself: what the filter counted and settled on, and then where the stretch lies and began.
+    """One section that was fused in one pass: counts and estimates of the filter, then its span and initial state.
 
-    ``nis_mean`` is the normalised innovation squared over degrees of freedom, refused measurements left out; ``reopened`` and all from
+    ``nis_mean`` is the normalised innovation squared over degrees of freedom, without rejected measurements; ``reopened`` and all from
     ``events`` on are the error-state filter's, ``recovered`` is the 15-state filter's.
     """
 
@@ -124,7 +124,7 @@ class StretchFacts:
     visual_scale: float | None = field(default=None, metadata=LEFT_OUT)
     visual_scale_std: float | None = field(default=None, metadata=LEFT_OUT)
     common_scale_std: float | None = field(default=None, metadata=LEFT_OUT)
-    """How long a metre is, as far as nothing tells: one error of all ways, speeds and their labels, within their deviations."""
+    """σ of the unobservable common odometry scale, included in σ of distances, speeds and labels."""
     epoch: int = 0
     start_ns: int = 0
     end_ns: int = 0
@@ -139,7 +139,7 @@ class StretchFacts:
 
 @dataclass(frozen=True, slots=True)
 class FuseFacts:
-    """All stretches together, and each; ``set_aside`` counts by role and reason, ``skipped_s`` is time that holds too little to fuse."""
+    """All sections together, and each; ``set_aside`` counts by role and reason, ``skipped_s`` is time with too few measurements to fuse."""
 
     rows: int
     sensors: tuple[str, ...]
@@ -153,7 +153,7 @@ class FuseFacts:
 
 @dataclass(frozen=True, slots=True)
 class AxisFacts:
-    """About which axis of the IMU another sensor turns, and how many times as fast."""
+    """Axis of the IMU about which another sensor turns, and the ratio of their yaw rates."""
 
     axis: Vector
     scale: float
@@ -161,10 +161,10 @@ class AxisFacts:
 
 @dataclass(frozen=True, slots=True)
 class SensorChecks:
-    """What the sensors were held against, and the codes of the findings on those that are not fused.
+    """Plausibility checks of the sensors, and the codes of the findings on excluded ones.
 
     ``distance_m`` are median chords over ten seconds, ``up`` is gravity in the robot's axes, ``looks_rad`` the yaw of the IMU by each
-    odometry and how sure it is, ``specific_force_median`` in the unit that the IMU tells.
+    odometry with σ, ``specific_force_median`` in the IMU's own unit.
     """
 
     refused: Mapping[str, str] = field(default_factory=dict)
@@ -177,10 +177,7 @@ class SensorChecks:
 
 @dataclass(frozen=True, slots=True)
 class MountingFacts:
-    """What was mended: by how much the antenna was moved in base_link, how well its place is known, roll and pitch of the IMU.
-
-    ``odometry_scale`` is by odometry how many times as far as the track it went, which is taken out.
-    """
+    """Corrections: shift of the antenna in base_link and its σ, roll and pitch of the IMU, scale of each odometry against the track."""
 
     antenna_moved_m: Vector | None = field(default=None, metadata=LEFT_OUT)
     antenna_std_m: Vector | None = field(default=None, metadata=LEFT_OUT)
@@ -190,11 +187,11 @@ class MountingFacts:
 
 @dataclass(frozen=True, slots=True)
 class Disagreement:
-    """A time in which a sensor says other than the track, beyond what both claim (`tcpipe.fusion.checks.audit`).
+    """A span in which a sensor differs from the track beyond both uncertainties (`tcpipe.fusion.checks.audit`).
 
-    ``what`` is position, displacement or turn; ``size`` the largest difference over a window in ``unit`` (m or rad), and
-    ``expected_std`` what it was expected to be there. ``alone``: two other sensors contradict this one, so the track is believed; otherwise
-    its deviations are raised, and segments there carry the bit sensors_disagree.
+    ``what`` is position, displacement or turn; ``size`` the largest difference over a window in ``unit`` (m or rad), ``expected_std`` its
+    expected σ. ``alone``: two other sensors contradict this one, so the track stays; otherwise its σ is inflated, and segments there are
+    flagged sensors_disagree.
     """
 
     start_ns: int
@@ -210,7 +207,7 @@ class Disagreement:
 
 @dataclass(frozen=True, slots=True)
 class AuditFacts:
-    """The estimate held against what fed it: where they disagree, and which sensors contradict each other in most of the way undecided."""
+    """Disagreements of track and sensors, and sensors that contradict each other over most of the distance without a decision."""
 
     disagreements: tuple[Disagreement, ...] = ()
     undecided: tuple[str, ...] = ()
@@ -218,7 +215,7 @@ class AuditFacts:
 
 @dataclass(frozen=True, slots=True)
 class ClockPair:
-    """Two sensors' clocks compared (`tcpipe.fusion.checks.clock_offsets.Pair`), and whether that tells their offset."""
+    """Two sensors' clocks compared (`tcpipe.fusion.checks.clock_offsets.Pair`), and whether that determines their offset."""
 
     late: str
     against: str
@@ -234,10 +231,7 @@ class ClockPair:
 
 @dataclass(frozen=True, slots=True)
 class ClockOffset:
-    """How late a sensor's stamps are (`tcpipe.fusion.checks.clock_offsets.RoleOffset`).
-
-    Where it is not ``blamed``, only that it and the reference differ is known.
-    """
+    """Delay of a sensor's stamps (`tcpipe.fusion.checks.clock_offsets.RoleOffset`); ``blamed``: the sensor, not the reference, is off."""
 
     offset_s: float | None
     std_s: float | None
@@ -250,10 +244,10 @@ class ClockOffset:
 
 @dataclass(frozen=True, slots=True)
 class ClockFacts:
-    """The sensors' clocks in one epoch: all pairs compared, and by role each one's offset from the reference.
+    """The sensors' clocks in one clock epoch: all pairs compared, and each role's offset from the reference.
 
-    ``position_offset_s`` times the velocity is in the track's position deviations: by so much the fixes' clock may be off [s]. So is
-    ``heading_offset_s`` times the yaw rate, over a metre: the IMU's clock is off by that, and labels rest on the others'.
+    ``position_offset_s``, a possible time offset of GNSS [s], times the velocity is included in the track's position σ;
+    ``heading_offset_s``, the time offset of the IMU [s], times the yaw rate is included over a metre.
     """
 
     epoch: int
@@ -266,7 +260,7 @@ class ClockFacts:
 
 @dataclass(frozen=True, slots=True)
 class GateFacts:
-    """Rows kept, by reason dropped, and by cause in a gap; the speed that is the robot's limit, and from which on it drives at that."""
+    """Rows kept, dropped by reason, and in a gap by cause; the robot's maximum speed, and the least speed that counts as maximum."""
 
     rows: int
     rows_kept: int
@@ -278,7 +272,7 @@ class GateFacts:
 
 @dataclass(frozen=True, slots=True)
 class SegmentFacts:
-    """How many segments were cut from how many steady stretches; the track's length, and its time by ledger entry."""
+    """Counts of segments and of steady sections; length of the track, and its time by reason."""
 
     segments: int
     stretches: int
@@ -288,7 +282,7 @@ class SegmentFacts:
 
 @dataclass(frozen=True, slots=True)
 class SignalFacts:
-    """Samples of a voltage [V] or a current [A], their rate, and the step in which they are told."""
+    """Samples of a voltage [V] or a current [A], their rate and resolution."""
 
     samples: int
     rate_hz: float | None
@@ -297,7 +291,7 @@ class SignalFacts:
 
 @dataclass(frozen=True, slots=True)
 class RailFacts:
-    """The record of one rail in one clock epoch."""
+    """Signals of one rail in one clock epoch."""
 
     name: str
     voltage: SignalFacts
@@ -319,7 +313,7 @@ class EnergyBudget:
     current: float
     voltage: float
     at_20_hz: float
-    """What power at 20 Hz would leave of the total."""
+    """The total with power at 20 Hz."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -337,7 +331,7 @@ class PhysicsTerm:
 
 @dataclass(frozen=True, slots=True)
 class PhysicsScore:
-    """How well energies a metre are predicted on fifths of the drive that were held out."""
+    """Accuracy of predicted energies per metre on held-out fifths of the drive."""
 
     r2: float
     """Share of their variance."""
@@ -347,28 +341,28 @@ class PhysicsScore:
 
 @dataclass(frozen=True, slots=True)
 class PhysicsFit:
-    """What standing, drivetrain, rolling, grade and turning take of a robot's power (`tcpipe.cost.physics`)."""
+    """Physics model of a robot's power: standing, drivetrain, rolling, grade and turning (`tcpipe.cost.physics`)."""
 
     segments: int
     terms: tuple[PhysicsTerm, ...]
     rolling_resistance: Mapping[str, tuple[float, float]]
-    """Coefficient by class, with its standard deviation; empty where the slopes do not vary."""
+    """Coefficient by class, with its standard deviation; empty if the slopes do not vary."""
     recovered_downhill: float
     residual_watt: float
     energy_share: Mapping[str, float]
-    """Share of all energy by term; grade takes nearly none where as much is driven up as down."""
+    """Share of all energy by term."""
     held_out: PhysicsScore | None
-    """None where too few segments are left to fit."""
+    """None with too few segments to fit."""
     without_turning: PhysicsScore | None
     usual_turn_radpm: float
-    """What a metre of the segments turns, both ways counted."""
+    """Mean turn per metre, both ways counted."""
     gain_of_turning: tuple[float, float] | None
-    """By how much turning raises the held-out R²: 90 % interval over blocks of segments."""
+    """Gain of the held-out R² by turning: 90 % interval over blocks of segments."""
 
 
 @dataclass(frozen=True, slots=True)
 class PhysicsFacts:
-    """What physics explains of a run (`tcpipe.cost.physics`); where it could not be fitted, what is drawn while standing."""
+    """Physics model of a run (`tcpipe.cost.physics`); without a fit, the idle power."""
 
     fitted: bool
     standing_watt: float | None
@@ -384,7 +378,7 @@ class PhysicsFacts:
 
 @dataclass(frozen=True, slots=True)
 class LabelFacts:
-    """The run's whole energy and where it went, the record of its power by epoch, and how sure and how clean its labels are."""
+    """The run's energy by entry of the distance breakdown, its power rails by clock epoch, and uncertainty and flags of its labels."""
 
     distance_m: float
     energy_joule: float | None
@@ -403,18 +397,18 @@ class LabelFacts:
 
 @dataclass(frozen=True, slots=True)
 class StageFacts:
-    """The facts of a run: those of reading, and under its name those of each stage that it has come through."""
+    """The facts of a run: those of reading, and those of each later stage under its name."""
 
     robot: RobotChoice | None = None
     roles: Mapping[str, RoleFacts] = field(default_factory=dict)
     left_out: Mapping[str, str] = field(default_factory=dict)
-    """Why topics that could play a role do not."""
+    """By unused topic that fits a role: why it is unused."""
     epochs: int = 1
     clock_steps: tuple[ClockStep, ...] = ()
     time_offset_s: Mapping[str, float] = field(default_factory=dict)
-    """What the recipe adds to a role's stamps."""
+    """Correction of a role's stamps by the recipe."""
     odometry_scale: Mapping[str, float] | None = field(default=None, metadata=LEFT_OUT)
-    """What the recipe multiplies a role's ways and velocities with."""
+    """Factor of a role's distances and velocities in the recipe."""
     power: PowerSign | None = field(default=None, metadata=LEFT_OUT)
     fuse: FuseFacts | None = field(default=None, metadata=LEFT_OUT)
     sensor_checks: SensorChecks | None = field(default=None, metadata=LEFT_OUT)

@@ -1,4 +1,4 @@
-"""Findings: what tcpipe observed in a log, a map or a run, as data. The catalogue (`tcpipe.tables.catalogue`) says what each code means.
+"""Findings: observations in a log, a map or a run, as data (codes: `tcpipe.tables.catalogue`), and verdicts, judged from findings alone.
 
 An error, a warning, the reason for a verdict and the cause of an exit code are all a `Finding`. Code that decides anything about a run
 reads findings; only the command line and the pages turn them into sentences.

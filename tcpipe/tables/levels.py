@@ -1,18 +1,6 @@
-"""The levels of data, L1 to L6: the contract of every table, and the types that stages hand to each other.
+"""The levels of data L1 to L6 (ARCHITECTURE.md): the schema of every table, and the types that stages exchange.
 
-===== ==================== ==========================================================================
-level type                 holds
-===== ==================== ==========================================================================
-L0    the recording        never touched
-L1    `Streams`            one table per role, SI units, in the sensor's own frame
-L2    `Track`              20 Hz: pose in the ENU plane of a datum, twist, deviations, voltage, current
-L3    `GatedTrack`         Track + ``dropped_by`` bits
-L4    `Segments`           span, end states, chord, arc, course
-L5    `LabelledSegments`   power, velocity, duration, energy, their deviations, quality bits
-L6    `Samples`            split, map, terrain class, slope; patches are arrays in the same order
-===== ==================== ==========================================================================
-
-A level is checked when it is made: an invalid Track cannot exist, and one error names every wrong column.
+A level is checked when it is created: an invalid Track cannot exist, and one error names every wrong column.
 Frames follow REP-103 and REP-105: base_link is x forward, y left, z up; the track's plane is east, north, up of its datum.
 """
 
@@ -74,12 +62,6 @@ def _make_geometry(doc: str, frame: str) -> Column:
     return Column(GEOMETRY, pa.binary(), "", f"{doc}; WKB, longitude first", frame, nullable=True, since="2.1")
 
 
-def _make_xyz(
-    prefix: str, suffix: str, unit: str, doc: str, frame: str, *, nullable: bool = False
-) -> tuple[Column, ...]:
-    return tuple(Column(f"{prefix}_{axis}_{suffix}", _F64, unit, f"{doc}, {axis}", frame, nullable) for axis in "xyz")
-
-
 GNSS = _make_stream_schema(
     "gnss",
     "Antenna positions, fixes only.",
@@ -95,8 +77,11 @@ GNSS = _make_stream_schema(
 IMU = _make_stream_schema(
     "imu",
     "Inertial measurements in the sensor's frame.",
-    *_make_xyz("angular_velocity", "radps", "rad/s", "angular velocity", "sensor"),
-    *_make_xyz("linear_acceleration", "mps2", "m/s2", "specific force (gravity included)", "sensor"),
+    *(Column(f"angular_velocity_{c}_radps", _F64, "rad/s", f"angular velocity, {c}", "sensor") for c in "xyz"),
+    *(
+        Column(f"linear_acceleration_{c}_mps2", _F64, "m/s2", f"specific force (gravity included), {c}", "sensor")
+        for c in "xyz"
+    ),
     *(
         _make_nullable(f"quat_{c}", "1", f"orientation world_from_sensor, {c}; null where absent", "world")
         for c in "xyzw"
@@ -116,24 +101,14 @@ def _make_odometry_schema(name: str, doc: str) -> TableSchema:
     return _make_stream_schema(
         name,
         doc,
-        *_make_xyz(
-            "velocity", "mps", "m/s", "body velocity; null where the source does not measure it", "child", nullable=True
-        ),
-        *_make_xyz(
-            "angular_velocity",
-            "radps",
-            "rad/s",
-            "body angular velocity; null where not measured",
-            "child",
-            nullable=True,
-        ),
-        *_make_xyz(
-            "velocity_var",
-            "m2ps2",
-            "m2/s2",
-            "variance of the body velocity; null where unknown",
-            "child",
-            nullable=True,
+        *(
+            _make_nullable(f"{prefix}_{axis}_{suffix}", unit, f"{text}, {axis}", "child")
+            for prefix, suffix, unit, text in (
+                ("velocity", "mps", "m/s", "body velocity; null where the source does not measure it"),
+                ("angular_velocity", "radps", "rad/s", "body angular velocity; null where not measured"),
+                ("velocity_var", "m2ps2", "m2/s2", "variance of the body velocity; null where unknown"),
+            )
+            for axis in "xyz"
         ),
         _make_nullable("yaw_rate_var", "rad2/s2", "variance of the yaw rate; null where unknown", "child"),
         *(
@@ -365,7 +340,7 @@ LABELLED_SEGMENTS = TableSchema(
     ),
 )
 
-PLACED_SEGMENTS = LABELLED_SEGMENTS.only(
+PLACED_SEGMENTS = LABELLED_SEGMENTS.select_columns(
     *(f"{end}_{axis}_deg" for end in ("start", "end") for axis in ("lon", "lat")),
     *("chord_m", "arc_length_m", "position_std_m"),
 )

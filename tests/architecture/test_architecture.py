@@ -12,15 +12,13 @@ from pathlib import Path
 
 import grimp
 import pytest
+from package_source import PACKAGE, read_trees
 
 from tcpipe.recipe import Recipe
 from tcpipe.tables import levels
 from tcpipe.tables.columns import TableSchema
 
-ROOT = Path(__file__).parents[2]
-PACKAGE = ROOT / "tcpipe"
-MODULES = sorted(PACKAGE.rglob("*.py"))
-TREES = {path.relative_to(PACKAGE).as_posix(): ast.parse(path.read_text()) for path in MODULES}
+ROOT = PACKAGE.parent
 PAGE = (ROOT / "ARCHITECTURE.md").read_text()
 FLOORS = next(
     contract["layers"]
@@ -141,7 +139,9 @@ def test_each_file_format_has_the_home_that_the_page_gives():
     assert {"rosbags", "mcap", "rasterio", "zarr", "msgspec", "pyarrow.parquet", "numba", "torch"} <= set(homes)
     importers = {
         name: {
-            path for path, tree in TREES.items() if any(f"{used}.".startswith(f"{name}.") for used in _imported(tree))
+            path
+            for path, tree in read_trees().items()
+            if any(f"{used}.".startswith(f"{name}.") for used in _imported(tree))
         }
         for name in homes
     }
@@ -149,7 +149,7 @@ def test_each_file_format_has_the_home_that_the_page_gives():
 
 
 def test_no_module_has_a_name_that_says_nothing():
-    names = {part for path in TREES for part in Path(path).with_suffix("").parts}
+    names = {part for path in read_trees() for part in Path(path).with_suffix("").parts}
     assert not {name for name in names if set(name.split("_")) & VAGUE_NAMES}
 
 
@@ -159,15 +159,10 @@ def test_stages_are_thin():
     assert not {name: length for name, length in lengths.items() if length > 350}
 
 
-def test_no_file_is_longer_than_one_can_read():
-    lengths = {path.relative_to(ROOT).as_posix(): len(path.read_text().splitlines()) for path in MODULES}
-    assert not {name: length for name, length in lengths.items() if length > 600}
-
-
 def test_nothing_below_the_pipeline_reads_the_wall_clock_or_global_randomness():
     found = [
         f"{path}:{line} {name}"
-        for path, tree in TREES.items()
+        for path, tree in read_trees().items()
         if not path.startswith(ABOVE_PURITY)
         for name, bare, line in _used(tree)
         if name in WALL_CLOCK
@@ -222,7 +217,7 @@ def test_every_column_ends_in_its_unit(table):
 
 def test_everything_public_is_explained():
     silent = []
-    for path, tree in TREES.items():
+    for path, tree in read_trees().items():
         if ast.get_docstring(tree) is None and tree.body:
             silent.append(path)
         holders = [
@@ -282,14 +277,14 @@ def test_what_is_suggested_for_a_recipe_is_made_where_it_is_checked():
     ) == [1, 1]
     assert not {
         path: lines
-        for path, tree in TREES.items()
+        for path, tree in read_trees().items()
         if path not in WRITES_RECIPES and (lines := _mentions_of_recipe(tree))
     }
 
 
 def test_nouns_know_of_the_recipe_what_they_suggest_alone():
     nouns = ("logs/", "fusion/", "motion/", "path.py", "cost/", "terrain/", "splits/", "balance/", "power/")
-    known = {name for path, tree in TREES.items() if path.startswith(nouns) for name in _imported(tree)}
+    known = {name for path, tree in read_trees().items() if path.startswith(nouns) for name in _imported(tree)}
     assert {name for name in known if name.startswith("tcpipe.recipe") and ".suggestions." not in name} == set()
 
 
@@ -302,7 +297,7 @@ PRINTING = {
 def test_only_one_module_prints_so_that_every_name_is_escaped():
     printing = {
         path
-        for path, tree in TREES.items()
+        for path, tree in read_trees().items()
         for node in ast.walk(tree)
         if isinstance(node, ast.Call) and ast.unparse(node.func) in PRINTING
     }

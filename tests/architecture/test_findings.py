@@ -1,15 +1,15 @@
 """Findings are data: each code stands in the catalogue and is made, and nothing decides on a finished sentence."""
 
 import ast
-from pathlib import Path
+from functools import cache
+
+from package_source import read_nodes
 
 from tcpipe.formats.finding_lines import describe_finding
 from tcpipe.tables.bits import Quality, flag_name
 from tcpipe.tables.catalogue import AFFECTED, SEVERITIES, read_catalogue, read_sections
 from tcpipe.tables.findings import Finding, Subject
 
-ROOT = Path(__file__).parents[2]
-TREES = {path.relative_to(ROOT).as_posix(): ast.parse(path.read_text()) for path in (ROOT / "tcpipe").rglob("*.py")}
 LONGEST = 100
 LINES = "tcpipe.formats.finding_lines"
 
@@ -34,16 +34,16 @@ PRINTERS = {
 """Modules beside cli/ and report/ that print an answer, or group findings for a page."""
 
 
-NODES = {path: list(ast.walk(tree)) for path, tree in TREES.items()}
-TEXTS = {
-    path: {node.value for node in nodes if isinstance(node, ast.Constant) and isinstance(node.value, str)}
-    for path, nodes in NODES.items()
-}
+@cache
+def list_texts():
+    """Return every string of the package."""
+    nodes = (node for of in read_nodes().values() for node in of)
+    return {node.value for node in nodes if isinstance(node, ast.Constant) and isinstance(node.value, str)}
 
 
 def calls(*names):
     """Yield path and node of each call of a function by its plain name."""
-    for path, nodes in NODES.items():
+    for path, nodes in read_nodes().items():
         for node in nodes:
             if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id in names:
                 yield path, node
@@ -97,7 +97,7 @@ def test_every_threshold_that_is_named_stands_in_the_catalogue():
 
 def is_computed(code):
     """Tell whether an f-string makes a code, as ``lost-{reason}``."""
-    joined = (node.values for nodes in NODES.values() for node in nodes if isinstance(node, ast.JoinedStr))
+    joined = (node.values for nodes in read_nodes().values() for node in nodes if isinstance(node, ast.JoinedStr))
     ends = [(values[0], values[-1]) for values in joined if len(values) == 2]
     begin = (of.value for of, _ in ends if isinstance(of, ast.Constant) and of.value.endswith("-"))
     finish = (of.value for _, of in ends if isinstance(of, ast.Constant) and of.value.startswith("-"))
@@ -105,12 +105,12 @@ def is_computed(code):
 
 
 def test_every_code_of_the_catalogue_is_made_somewhere():
-    named = set().union(*TEXTS.values())
+    named = list_texts()
     assert not {code for code in read_catalogue() if code not in named and not is_computed(code)}
 
 
 def test_every_remedy_of_the_catalogue_is_used():
-    named = set().union(*TEXTS.values())
+    named = list_texts()
     assert not {
         (code, name) for code, entry in read_catalogue().items() for name in entry.remedies if name not in named
     }
@@ -135,8 +135,8 @@ def test_every_line_is_short_with_typical_values():
 
 def test_nothing_but_what_prints_makes_sentences():
     importers = {
-        path
-        for path, nodes in NODES.items()
+        f"tcpipe/{path}"
+        for path, nodes in read_nodes().items()
         for node in nodes
         if isinstance(node, ast.ImportFrom) and node.module == LINES
     }
@@ -148,7 +148,7 @@ def test_nothing_decides_on_a_finished_sentence():
     """Nobody compares, splits or searches what `finding_lines` returns, or a field that holds finished sentences."""
     makers = {
         node.name
-        for node in NODES["tcpipe/formats/finding_lines.py"]
+        for node in read_nodes()["formats/finding_lines.py"]
         if isinstance(node, ast.FunctionDef) and node.name.startswith(("format_", "describe_", "list_"))
     }
 
@@ -158,8 +158,8 @@ def test_nothing_decides_on_a_finished_sentence():
         return is_field or (isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id in makers)
 
     searches = {"startswith", "endswith", "split", "partition", "search", "match", "fullmatch", "sub"}
-    for path, nodes in NODES.items():
-        for node in nodes if path != "tcpipe/formats/finding_lines.py" else ():
+    for path, nodes in read_nodes().items():
+        for node in nodes if path != "formats/finding_lines.py" else ():
             looked_at = [node.left, *node.comparators] if isinstance(node, ast.Compare) else []
             if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and node.func.attr in searches:
                 looked_at = [node.func.value, *node.args]

@@ -405,10 +405,11 @@ def test_everything_can_be_inspected_and_a_second_call_of_anything_does_nothing(
     commands = [
         ["add-map", "site", *(str(x) for name in ("height", "ortho") for x in (f"--{name}", site.rasters[name]))],
         ["build-dataset", "--holdout", "sample"],
+        ["report", "tcpipe-store", "--no-runs"],
         ["report", "tcpipe-store"],
         ["init"],
         ["schemas", "schemas"],
-        ["simulate", "site", "--scenario", "tiny"],
+        ["simulate", "site", "--scenario", "tiny", "--quiet"],
     ]
     for command in commands:
         _run(*command, "--seed", "3", cwd=tmp_path) if command[0] == "simulate" else _run(*command, cwd=tmp_path)

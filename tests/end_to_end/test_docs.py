@@ -5,6 +5,7 @@ import re
 from pathlib import Path
 
 import pytest
+from installed_command import run_script
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 PAGES = (*(f"tutorials/{page.name}" for page in sorted((DOCS / "tutorials").glob("*.md"))), "how-to/damaged-logs.md")
@@ -25,6 +26,7 @@ def rerun():
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
+    module.run_script = run_script
     return module.rerun
 
 

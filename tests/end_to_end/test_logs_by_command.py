@@ -224,16 +224,16 @@ def test_definitions_that_a_log_lacks_can_be_given(undefined):
 
 
 @pytest.mark.parametrize(
-    ("directory", "code", "said"),
+    ("command", "directory", "code", "said"),
     [
-        ("broken", 1, "its definition cannot be parsed"),
-        ("none", 1, "no .msg or .idl file below it"),
-        ("nowhere", 2, "no such directory"),
-        ("a.mcap", 2, "is a file"),
+        ("inspect", "broken", 1, "its definition cannot be parsed"),
+        ("ingest", "none", 1, "no .msg or .idl file below it"),
+        ("preflight", "nowhere", 2, "no such directory"),
+        ("inspect", "a.mcap", 2, "is a file"),
     ],
 )
-def test_definitions_that_cannot_be_used_are_refused(undefined, directory, code, said):
-    assert said in plain_lines(tcpipe("inspect", "a.mcap", "--msgdef", directory, cwd=undefined), code)
+def test_definitions_that_cannot_be_used_are_refused(undefined, command, directory, code, said):
+    assert said in plain_lines(tcpipe(command, "a.mcap", "--msgdef", directory, cwd=undefined), code)
 
 
 def test_export_says_what_it_did_and_that_nothing_is_left_to_do(tmp_path):

@@ -43,7 +43,7 @@ def _run(*arguments: str | Path, cwd: Path, code: int = 0) -> str:
 
 def test_a_path_is_costed_and_its_pieces_add_up(place: Path):
     command = ("predict-path", "model", "--path", "path.geojson", "--out", "pieces.csv")
-    said = json.loads(_run(*command, "--json", cwd=place))
+    said = json.loads(_run(*command, "--json", "--quiet", cwd=place))
     table = pyarrow.csv.read_csv(place / "pieces.csv")
     assert table.num_rows == said["pieces"] == 19
     for name in ("duration_s", "energy_joule"):
@@ -58,7 +58,7 @@ def test_a_plan_over_a_cost_map_costs_what_predict_path_says_of_it(place: Path):
     assert "cells with a cost" in _run("cost-map", "model", "costs", "--cell-size", "2", cwd=place)
     plan = ("plan-path", "model", "--from", _FROM, "--to", _TO, "--objective", "time", "--cost-map", "costs")
     outputs = ("--out", "plan.geojson", "--picture", "plan.png")
-    said = json.loads(_run(*plan, *outputs, "--json", cwd=place))
+    said = json.loads(_run(*plan, *outputs, "--json", "--quiet", cwd=place))
     assert said["objective"] == "time"
     assert set(said["plans"]) == {"time", "energy", "distance"}
     assert (place / "plan.png").read_bytes().startswith(b"\x89PNG")
@@ -82,6 +82,10 @@ def test_a_plan_over_a_cost_map_costs_what_predict_path_says_of_it(place: Path):
         (("plan-path", "model", "--from", _FROM, "--to", "200,46.9"), 1, "no lon, lat"),
         (("cost-map", "model", "--map", "other"), 1, "no map 'other'"),
         (("cost-map", "model", "--cell-size", "0"), 2, "--cell-size"),
+        (("cost-map", "model", "--speed", "0.5"), 2, "takes no commanded speed"),
+        (("predict-path", "model", "--path", "path.geojson", "--speed", "0.5"), 2, "takes no commanded speed"),
+        (("plan-path", "model", "--from", _FROM, "--to", _TO, "--speed", "0.5"), 2, "takes no commanded speed"),
+        (("predict-path", "model", "--path", "path.geojson", "--physics-from", "none"), 2, "no such directory"),
     ],
 )
 def test_bad_input_is_one_line(place: Path, arguments, code, words):

@@ -131,9 +131,9 @@ def test_the_functions_give_what_the_commands_print(place, monkeypatch):
 
     found = tcpipe.evaluate("model", "dataset", draws=2, baselines=False)
     assert found.values.config == EvaluateConfig(draws=2, baselines=False)
-    said = _said(here, "evaluate", "model", "dataset", "again", "--noise-draws", "2", "--no-baselines")
+    said = _said(here, "evaluate", "model", "dataset", "again", "--noise-draws", "2", "--no-baselines", "--quiet")
     assert said["splits"]["test"]["errors"]["E"]["all"]["rmse"] == found.values.splits["test"].errors["E"]["all"].rmse
-    drives = tcpipe.evaluate("model", "dataset", "drives", drives=["north"], store=store)
+    drives = tcpipe.evaluate("model", "dataset", "drives", drives=["north"], map_name="site", store=store)
     (drive,) = drives.values.drives
     assert drive.run_id == "north"
 

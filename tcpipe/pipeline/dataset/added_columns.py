@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -26,18 +25,9 @@ if TYPE_CHECKING:
     from tcpipe.formats.covariates import CovariateTable
 
 TAG = "tag_"
-"""What the column of a tag is called before the tag's name."""
+"""Prefix of a tag's column."""
 
 _NUMBER = re.compile(r"[+-]?(\d++\.?\d*+|\.\d++)([eE][+-]?\d{1,3})?")
-
-
-@dataclass(frozen=True, slots=True)
-class Added:
-    """Columns beside those of SAMPLES, a row a segment, and what the card says of them."""
-
-    table: pa.Table
-    covariates: tuple[Covariate, ...]
-    findings: tuple[Finding, ...]
 
 
 def read_all_covariates(paths: Sequence[Path], config: CovariateConfig) -> tuple[CovariateTable, ...]:
@@ -62,51 +52,36 @@ def make_added_columns(
     config: CovariateConfig,
     *,
     layers: Sequence[str],
-) -> Added:
-    """Return the added columns of all segments.
+) -> tuple[pa.Table, tuple[Covariate, ...], list[Finding]]:
+    """Return the added columns of all segments, M rows, the covariates for the card, and findings.
 
-    Parameters
-    ----------
-    segments : with ``run_id`` and ``start_ns``, M rows; a covariate is that of a segment's start.
-    kept : rows that are samples, (N,): what is counted.
-    runs : for their tags.
-    tables, config : covariates, and how they are joined.
-    layers : names of the patches' layers, which no column may have.
-
-    Raises
-    ------
-    DatasetError : two columns would have one name.
+    A covariate is that of a segment's start; ``kept`` are the rows that are samples, (N,). `DatasetError` if a column has the name of
+    another one or of one of ``layers``.
     """
     table, findings = _make_tag_columns(segments.column("run_id"), runs)
-    told = list[Covariate]()
-    for covariates in tables:
-        found, reached = covariates.join(to_integers(segments, "start_ns"), max_age_s=config.max_age_s)
-        without = {name: int(found.column(name).take(pa.array(kept)).null_count) for name in found.column_names}
-        told.append(
-            Covariate(
-                covariates.name,
-                covariates.checksum,
-                covariates.rows.height,
-                covariates.time_column,
-                *covariates.span,
-                without,
-            )
+    covariates = list[Covariate]()
+    for source in tables:
+        joined, reached = source.join(to_integers(segments, "start_ns"), max_age_s=config.max_age_s)
+        without = {name: int(joined.column(name).take(pa.array(kept)).null_count) for name in joined.column_names}
+        covariate = Covariate(
+            source.name, source.checksum, source.rows.height, source.time_column, *source.span, without
         )
-        findings += (*covariates.findings, *_find_missing(told[-1], int((~reached[kept]).sum()), len(kept)))
-        for field in found.schema:
-            table = table.append_column(field, found.column(field.name))
+        covariates.append(covariate)
+        findings += (*source.findings, *_find_missing(covariate, int((~reached[kept]).sum()), len(kept)))
+        for field in joined.schema:
+            table = table.append_column(field, joined.column(field.name))
     names = [*SAMPLES.names(), *layers, *table.column_names]
     if twice := sorted({name for name in names if names.count(name) > 1}):
         raise DatasetError(
             f"columns {', '.join(twice)} would be there twice; rename the file of covariates, or its columns"
         )
-    return Added(table, tuple(told), tuple(findings))
+    return table, tuple(covariates), findings
 
 
-def _find_missing(told: Covariate, unreached: int, samples: int) -> list[Finding]:
-    """Return the finding that no row reaches some samples, and one for each column that lacks values beyond that."""
-    missing = {Subject("file", told.name): unreached}
-    missing |= {Subject("column", name): count - unreached for name, count in told.samples_without.items()}
+def _find_missing(covariate: Covariate, unreached: int, samples: int) -> list[Finding]:
+    """Return the finding that no row is near some samples, and one for each column with more missing values."""
+    missing = {Subject("file", covariate.name): unreached}
+    missing |= {Subject("column", name): count - unreached for name, count in covariate.samples_without.items()}
     return [
         make_finding("covariates-missing", subject, missing_count=count, sample_count=samples)
         for subject, count in missing.items()
@@ -115,28 +90,21 @@ def _find_missing(told: Covariate, unreached: int, samples: int) -> list[Finding
 
 
 def _make_tag_columns(run_ids: pa.ChunkedArray, runs: Sequence[RunSource]) -> tuple[pa.Table, list[Finding]]:
-    """Return a column a tag: numbers where every run that carries it has one, else text; null for runs without it."""
+    """Return a column for each tag: numbers if all its values are, else text; null for runs without the tag."""
     tags = {run.run_id: run.tags or {} for run in runs}
     place = pc.index_in(run_ids, value_set=pa.array(list(tags), pa.string()))
     columns, fields, findings = list[pa.Array](), list[pa.Field](), list[Finding]()
     for key in sorted({key for of in tags.values() for key in of}):
-        told = [of.get(key) for of in tags.values()]
-        words = sorted({text for text in told if text is not None and not _NUMBER.fullmatch(text.strip())})
-        different = len({text for text in told if text is not None})
-        if words and len(words) < different:
-            finding = make_finding(
-                "column-is-text",
-                Subject("tag", key),
-                names={"example": words[0]},
-                odd_count=len(words),
-                value_count=different,
+        texts = [of.get(key) for of in tags.values()]
+        different = {text for text in texts if text is not None}
+        words = sorted(text for text in different if not _NUMBER.fullmatch(text.strip()))
+        if words and len(words) < len(different):
+            subject, names, count = Subject("tag", key), {"example": words[0]}, len(different)
+            findings.append(
+                make_finding("column-is-text", subject, names=names, odd_count=len(words), value_count=count)
             )
-            findings.append(finding)
-        values = (
-            pa.array(told, pa.string())
-            if words
-            else pa.array([None if text is None else float(text) for text in told], pa.float64())
-        )
+        numbers = None if words else [None if text is None else float(text) for text in texts]
+        values = pa.array(texts, pa.string()) if numbers is None else pa.array(numbers, pa.float64())
         columns.append(values.take(place))
         fields.append(pa.field(f"{TAG}{key}", values.type, metadata={"unit": "", "doc": f"tag {key} of the run"}))
     if not fields:
@@ -144,7 +112,7 @@ def _make_tag_columns(run_ids: pa.ChunkedArray, runs: Sequence[RunSource]) -> tu
     return pa.table(columns, schema=pa.schema(fields)), findings
 
 
-def tag_of_each(run_ids: Sequence[str], runs: Sequence[RunSource], key: str) -> list[str]:
+def read_tags(run_ids: Sequence[str], runs: Sequence[RunSource], key: str) -> list[str]:
     """Return a tag's value for each run of a list; `DatasetError` that names the runs without it."""
     tags = {run.run_id: (run.tags or {}).get(key) for run in runs}
     missing = [run_id for run_id in run_ids if tags[run_id] is None]
@@ -157,7 +125,7 @@ def tag_of_each(run_ids: Sequence[str], runs: Sequence[RunSource], key: str) -> 
 
 
 def find_narrow_patches(robots: Sequence[str], known: Mapping[str, Robot], *, patch_m: float) -> list[Finding]:
-    """Return a finding for each robot that is wider than a patch, or of which no width is known."""
+    """Return a finding for each robot that is wider than a patch, or of unknown width."""
     findings = []
     for robot in sorted(set(robots)):
         width_m = known[robot].width_m if robot in known else None

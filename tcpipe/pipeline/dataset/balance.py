@@ -1,4 +1,4 @@
-"""What a dataset covers and where it is thin: cells of class, slope and speed, the repeatability floor, and where to drive next."""
+"""Balance of a dataset: cells of class, slope and speed, repeatability, and undersampled ground to drive next."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ Ints = NDArray[np.int64]
 
 @dataclass(frozen=True, slots=True)
 class _Samples:
-    """What is asked of every sample, (N,) each; ``xy_m`` is its footprint's centre in the first map's plane, (N, 2)."""
+    """Columns of N samples, (N,) each; ``xy_m`` is the footprint's centre in the first map's plane, (N, 2)."""
 
     split: NDArray[np.str_]
     run: Ints
@@ -85,16 +85,14 @@ def measure_balance(
     regions: Regions | None,
     buffer_m: float,
 ) -> tuple[Balance, FeatureCollection]:
-    """Measure what the samples cover, and where to drive next.
+    """Return the balance of the samples, and polygons of ground to drive next.
 
     Parameters
     ----------
     table : `BALANCE_COLUMNS` of the samples, in the dataset's order, which is random.
     xy_m : centres of their footprints in the first map's plane [m], shape (N, 2).
-    sources : the maps, the first ruling where they overlap.
-    velocity_column : the velocity that is the label.
-    chord_m : segment length [m].
-    regions, buffer_m : of the split, in WGS84 lon/lat [deg] and [m]: what they exclude, and what lies in the buffer, is not worth driving.
+    sources : the maps; the first counts where they overlap.
+    regions, buffer_m : of the split, in WGS84 lon/lat [deg] and [m]: excluded ground and the buffer are not worth driving.
     """
     samples = _collect_samples(table, xy_m, velocity_column)
     left = {
@@ -170,7 +168,7 @@ def _make_row(cell: Cell, names: Mapping[int, str], edges: Sequence[float]) -> C
 
 
 class _OpenGround:
-    """The ground of one map that is worth driving: not what an earlier map covers, a region excludes, or the buffer takes."""
+    """Ground of one map that is worth driving: outside earlier maps, excluded regions and the buffer."""
 
     def __init__(
         self, source: MapFile, earlier: Sequence[MapFile], first: MapFile, regions: Regions | None, buffer_m: float
@@ -187,7 +185,7 @@ class _OpenGround:
         _close(self.ground, taken)
 
     def area_m2(self, terrain_class: int, slope: int) -> float:
-        """Return how much ground offers a class and a range of slope."""
+        """Return the area of ground of a class and a range of slope."""
         return float(cells_available(self.ground, terrain_class, slope).sum()) * self.ground.cell_m**2
 
     def patches(self, terrain_class: int, slope: int, driven_xy_m: Floats) -> Iterator[tuple[Patch, BaseGeometry]]:
@@ -247,7 +245,7 @@ def _read_ground(source: MapFile) -> MapGround:
 def _count_by_ground(
     pairs: Sequence[Cell], grounds: Sequence[_OpenGround], samples: _Samples, slopes: Ints, names: Mapping[int, str]
 ) -> tuple[list[CellRow], list[Feature]]:
-    """Return a row for each class and slope that was driven or that the maps offer, and the features of where to drive next."""
+    """Return a row for each class and slope that was driven or that the maps offer, and the polygons to drive next."""
     driven = {(cell.terrain_class, cell.slope): cell for cell in pairs}
     kinds = {int(kind) for part in grounds for kind in np.unique(part.ground.terrain_class)} - {CLOSED}
     rows, thin = list[CellRow](), []

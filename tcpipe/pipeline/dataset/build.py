@@ -1,4 +1,4 @@
-"""From labelled segments and a map to a dataset: sample, split, audit, write; whole or not at all."""
+"""Building a dataset from labelled segments and maps: sample, split, audit, write; complete or not at all."""
 
 from __future__ import annotations
 
@@ -11,15 +11,13 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
-import pyarrow as pa
-
 from tcpipe import __version__
 from tcpipe.cost.labels import format_budget
-from tcpipe.errors import DatasetError, RecipeError, StoreError, UsageError, clean_lines
+from tcpipe.errors import DatasetError, MissingFileError, RecipeError, StoreError, UsageError, clean_lines
 from tcpipe.formats.atomic import clear_beside, write_atomic_directory, write_text
 from tcpipe.formats.bucket import open_place
 from tcpipe.formats.bucket_directories import fetch_directory_by_range, find_newest
-from tcpipe.formats.commits import CallRecord, Dataset, Entries, State
+from tcpipe.formats.commits import CallRecord, Dataset, Entries
 from tcpipe.formats.dataset_card import DatasetCard, group_dataset_findings
 from tcpipe.formats.dataset_files import (
     CARD,
@@ -39,7 +37,7 @@ from tcpipe.formats.dataset_files import (
 from tcpipe.formats.finding_lines import format_mixed_groups, format_verdict
 from tcpipe.formats.geojson import read_regions
 from tcpipe.formats.hub_card import format_croissant, format_hub_card
-from tcpipe.formats.integrity import Checksum, compute_checksum, compute_checksums, seal_page, write_sealed
+from tcpipe.formats.integrity import compute_checksum, compute_checksums, seal_page, write_sealed
 from tcpipe.formats.json_files import digest, write_json
 from tcpipe.formats.maps.map_files import MapFile
 from tcpipe.formats.object_storage import is_url, make_absolute
@@ -53,7 +51,6 @@ from tcpipe.pipeline.calls import (
     BUILD,
     Estimate,
     LogWriter,
-    OpenCall,
     commit_call,
     estimate,
     measure_call,
@@ -90,36 +87,33 @@ logger = logging.getLogger("tcpipe")
 
 @dataclass(frozen=True, slots=True)
 class BuildResult:
-    """What became of a dataset; ``str`` of it is what the command prints."""
+    """Result of a build; the command prints its ``str``."""
 
     path: str
     """Its directory, or its URL in a bucket."""
     status: str
     """``done``, ``unchanged``, or, of a dry run, ``planned``."""
     findings: tuple[Finding, ...]
-    """Of the dataset itself: runs that belong in and are left out and splits that are empty, too."""
+    """Of the dataset itself, with excluded runs and empty splits."""
     card: DatasetCard | None = None
-    """None of a dry run."""
+    """None for a dry run."""
     exit_code: int = 0
-    """3 if the dataset is not what it should be."""
+    """3 if a finding is a problem."""
     recipe: str = ""
-    """Which recipe ruled, as a command found it."""
+    """The recipe's source, as a command found it."""
     estimate: Estimate | None = None
-    """What a dry run expects of the work: of all segments, as if each became a sample."""
+    """Estimate of a dry run, as if each segment became a sample."""
 
     def __str__(self) -> str:
-        """Return counts, where the metres went, how wrong a label may be, the verdict and findings, as plain lines."""
-        return clean_lines((*self._facts(), *self.problem_lines(), *self._lines(problems=False), *self._closing()))
+        """Return counts, distance breakdown, noise floor, verdict and findings, as plain lines."""
+        return self.format(self.finding_lines(problems=True))
 
-    def without_problems(self) -> str:
-        """Return the same without the lines of problems, which a command prints as errors."""
-        return clean_lines((*self._facts(), *self._lines(problems=False), *self._closing()))
+    def format(self, problem_lines: Sequence[str] = ()) -> str:
+        """Return the lines of ``str``; a command prints problems as errors instead."""
+        return clean_lines((*self._facts(), *problem_lines, *self.finding_lines(problems=False), *self._closing()))
 
-    def problem_lines(self) -> list[str]:
-        """Return a line for each code that makes the exit code 3."""
-        return self._lines(problems=True)
-
-    def _lines(self, *, problems: bool) -> list[str]:
+    def finding_lines(self, *, problems: bool) -> list[str]:
+        """Return a line for each code that makes the exit code 3, or for each other code."""
         own = [finding for finding in self.findings if is_problem(finding) == problems]
         by_run = self.card.findings_by_run if self.card else {}
         by_map = self.card.findings_by_map if self.card and not problems else {}
@@ -134,13 +128,12 @@ class BuildResult:
         head = f"{self.path}: {card.samples} samples ({counts})"
         if self.status == "unchanged":
             head += "; nothing to do: it is made from the same runs, map, region and recipe"
-        lost = [(name, metres) for name, metres in card.ledger_m.items() if metres >= 0.5 and name != KEPT]
-        lost.sort(key=lambda entry: (-entry[1], entry[0]))
+        lost = [(-metres, name) for name, metres in card.ledger_m.items() if metres >= 0.5 and name != KEPT]
         ledger = f"{sum(card.ledger_m.values()):.0f} m driven: {card.ledger_m[KEPT]:.0f} m in samples"
-        ledger += "".join(f", {metres:.0f} m {name.replace('_', ' ')}" for name, metres in lost)
+        ledger += "".join(f", {-metres:.0f} m {name.replace('_', ' ')}" for metres, name in sorted(lost))
         floor = [] if card.energy_budget is None else [format_budget(card.energy_budget)]
-        judged = [] if card.verdict is None else [f"verdict: {format_verdict(card.verdict)}"]
-        return [head, ledger, *floor, *judged]
+        verdict = [] if card.verdict is None else [f"verdict: {format_verdict(card.verdict)}"]
+        return [head, ledger, *floor, *verdict]
 
     def _closing(self) -> list[str]:
         if self.card is None or self.card.redaction is None:
@@ -152,8 +145,8 @@ class BuildResult:
 def run_build_dataset(options: BuildDatasetOptions) -> BuildResult:
     """Sample a rotated patch for every segment, split by region, and write the dataset to ``out``.
 
-    Runs that are not as they were written are left out; those, runs that have to be ingested again, runs of the dataset that is replaced
-    that are gone, and empty splits are findings that make the exit code 3. The bytes do not depend on ``jobs`` and ``cluster``.
+    Findings on damaged runs (which are excluded), runs to be ingested again, runs that only the replaced dataset has, and empty splits make
+    the exit code 3. The bytes do not depend on ``jobs`` and ``cluster``.
 
     Raises `DatasetError`, `RegionError`, `MapError`, `StoreError`, `RecipeError` or `UsageError`; nothing is written then.
     """
@@ -191,35 +184,35 @@ def run_build_dataset(options: BuildDatasetOptions) -> BuildResult:
         min_runs=options.min_runs,
     )
     inputs = replace(inputs, findings=(*left_out, *inputs.findings))
-    if (
-        proved
-        and known is not None
-        and known.inputs == inputs.digest
-        and (isinstance(place, str) or is_whole(place, known))
-    ):
+    is_same = proved and known is not None and known.inputs == inputs.digest
+    if is_same and known is not None and (isinstance(place, str) or is_whole(place, known)):
         result = _make_result(place, "unchanged", known, left_out)
-    elif dry_run:
-        _refuse_other_options(place, known, marks, inputs, force=options.force)
+        _commit_references(log, _describe_dataset(result, inputs))
+        return result
+    _refuse_other_options(place, known, marks, inputs, force=options.force)
+    if dry_run:
         if isinstance(place, str):
             read_generations(open_place(place), CARD)
-        return _plan_result(place, log.state, inputs, jobs=options.jobs)
-    else:
-        _refuse_other_options(place, known, marks, inputs, force=options.force)
-        whole = write_generation(place, CARD) if isinstance(place, str) else write_atomic_directory(place.absolute())
-        with commit_call(log, BUILD, [make_absolute(place)]) as call:
-            at_work = partial(_start_workers, jobs=options.jobs, cluster=options.cluster)
-            with whole as directory, at_work(directory, opened, inputs.digest) as workers:
-                card = _build(directory, inputs, marks, workers)
-                _refuse_others_since(place, {known.inputs if known else None, inputs.digest})
-            for entry in workers.waiting.entries():
-                workers.waiting.delete(entry.name)
-            result = _make_result(place, "done", card, left_out)
-            counts = {"runs": len(inputs.runs), "samples": card.samples}
-            written = sum(of.size_bytes for of in card.checksums.values())
-            took = CallRecord(BUILD, __version__, result.exit_code, counts, options.jobs, written_bytes=written)
-            _end(call, measure_call(watch, took), _describe_dataset(result, inputs), known)
-    if result.status == "unchanged":
-        _commit_references(log, _describe_dataset(result, inputs))
+        most = sum(run.facts.segments - int(inputs.again[run.run_id].sum()) for run in inputs.runs)
+        expected = estimate(log.state.calls, BUILD, most, jobs=options.jobs)
+        code = 3 if select_problems(inputs.findings) else 0
+        return BuildResult(str(place), "planned", inputs.findings, exit_code=code, estimate=expected)
+    output = write_generation(place, CARD) if isinstance(place, str) else write_atomic_directory(place.absolute())
+    with commit_call(log, BUILD, [make_absolute(place)]) as call:
+        start_workers = partial(_start_workers, jobs=options.jobs, cluster=options.cluster)
+        with output as directory, start_workers(directory, opened, inputs.digest) as workers:
+            card = _build(directory, inputs, marks, workers)
+            _refuse_others_since(place, {known.inputs if known else None, inputs.digest})
+        for entry in workers.waiting.entries():
+            workers.waiting.delete(entry.name)
+        result = _make_result(place, "done", card, left_out)
+        counts = {"runs": len(inputs.runs), "samples": card.samples}
+        written = sum(of.size_bytes for of in card.checksums.values())
+        took = CallRecord(BUILD, __version__, result.exit_code, counts, options.jobs, written_bytes=written)
+        dataset = _describe_dataset(result, inputs)
+        replaced = () if known is None or known.inputs == dataset.inputs else (Dataset(dataset.out, known.inputs),)
+        call.kind = "built"
+        call.end = Entries(datasets=(dataset,), forgotten=replaced, calls=(measure_call(watch, took),))
     return result
 
 
@@ -230,7 +223,7 @@ build_dataset = as_function(BuildDatasetOptions, run_build_dataset)
 def _refuse_other_options(
     place: Path | str, known: DatasetCard | None, options: BuildOptions, inputs: Inputs, *, force: bool
 ) -> None:
-    """Raise `UsageError`, a line for each difference, where a dataset of other options would be replaced unasked."""
+    """Raise `UsageError`, a line for each difference, unless a dataset with other options may be replaced."""
     if known is None or known.inputs == inputs.digest or force:
         return
     if others := find_other_options(known, options, inputs):
@@ -251,26 +244,12 @@ def _refuse_others_since(place: Path | str, expected: Container[str | None]) -> 
         )
 
 
-def _plan_result(place: Path | str, state: State, inputs: Inputs, *, jobs: int) -> BuildResult:
-    """Return what is to be expected of a build."""
-    most = sum(run.facts.segments - int(inputs.again[run.run_id].sum()) for run in inputs.runs)
-    expected = estimate(state.calls, BUILD, most, jobs=jobs)
-    code = 3 if select_problems(inputs.findings) else 0
-    return BuildResult(str(place), "planned", inputs.findings, exit_code=code, estimate=expected)
-
-
-def _end(opened: OpenCall, call: CallRecord, dataset: Dataset, known: DatasetCard | None) -> None:
-    """Let the last commit of the call say which dataset was built, for what it refers to stays, and what the call took."""
-    before = () if known is None or known.inputs == dataset.inputs else (Dataset(dataset.out, known.inputs),)
-    opened.kind, opened.end = "built", Entries(datasets=(dataset,), forgotten=before, calls=(call,))
-
-
 def _describe_dataset(result: BuildResult, inputs: Inputs) -> Dataset:
     return Dataset(make_absolute(result.path), inputs.digest, tuple((run.run_id, run.recipe_id) for run in inputs.runs))
 
 
 def _commit_references(log: LogWriter, dataset: Dataset) -> None:
-    """Commit what a dataset refers to that was built before, where the log does not say so."""
+    """Commit the runs of an earlier dataset unless the log has them: ``tcpipe prune`` keeps what a dataset refers to."""
     if log.state.datasets.get((dataset.out, dataset.inputs)) != dataset:
         try:
             log.commit("built", Entries(datasets=(dataset,)))
@@ -281,7 +260,7 @@ def _commit_references(log: LogWriter, dataset: Dataset) -> None:
 def _find_left_out(
     inputs: Inputs, known: DatasetCard | None, *, robot: str | None, tags: Mapping[str, str], min_runs: int | None
 ) -> tuple[Finding, ...]:
-    """Return what is wrong with the choice of runs, as notes where ``min_runs`` are enough; `DatasetError` where there are too few."""
+    """Return findings on excluded runs, as notes if ``min_runs`` are enough; `DatasetError` if there are too few."""
     chosen = inputs.chosen
     fewer = (*chosen.missing, *(() if known is None else find_gone_runs(known.runs, chosen, robot=robot, tags=tags)))
     if min_runs is None:
@@ -294,7 +273,7 @@ def _find_left_out(
 
 
 def _read_card_in_bucket(url: str) -> tuple[DatasetCard | None, bool]:
-    """Return the card of the dataset that lies at a URL, if one does, and whether all of it is there and can be read."""
+    """Return the card of the dataset at a URL, if there is one, and whether all of it can be read."""
     open_place(url).check()
     if find_newest(url, [CARD]) is None:
         return None, False
@@ -304,14 +283,13 @@ def _read_card_in_bucket(url: str) -> tuple[DatasetCard | None, bool]:
 
 
 def _make_result(place: Path | str, status: str, card: DatasetCard, left_out: Sequence[Finding]) -> BuildResult:
-    """Return what became of a dataset: runs that are left out are those of now, whatever the card has of them."""
-    lasting = (finding for finding in card.findings if finding.code not in CHOICE_CODES)
-    findings = (*left_out, *lasting)
+    """Return the result, with today's findings on excluded runs in place of the card's."""
+    findings = (*left_out, *(finding for finding in card.findings if finding.code not in CHOICE_CODES))
     return BuildResult(str(place), status, findings, card, 3 if select_problems(findings) else 0)
 
 
 def _merge_recipe(recipe: Recipe | str | Path | None, *, holdout: str | None, seed: int | None) -> Recipe:
-    """Return the recipe with the command's own choices in it."""
+    """Return the recipe with the options ``--holdout`` and ``--seed`` in it."""
     recipe = resolve_recipe(recipe)
     kind, _, tag = (holdout or recipe.split.holdout).partition(":")
     rules = replace(
@@ -328,7 +306,7 @@ def _merge_recipe(recipe: Recipe | str | Path | None, *, holdout: str | None, se
 
 
 def _read_card_in_place(place: Path) -> tuple[DatasetCard | None, bool]:
-    """Return the card of the dataset that is there, if one is, and whether it is as it was written; `DatasetError` for anything else."""
+    """Return the card of the dataset in a directory, if there is one, and whether it is intact; `DatasetError` for anything else."""
     if not place.exists() or (place.is_dir() and not any(place.iterdir())):
         return None, False
     if not place.is_dir():
@@ -355,15 +333,15 @@ def _read_card_in_place(place: Path) -> tuple[DatasetCard | None, bool]:
 
 @contextmanager
 def _start_workers(directory: Path, store: Store, inputs: str, *, jobs: int, cluster: str | None) -> Iterator[Workers]:
-    """Yield who samples and writes; what waits lies in the directory that is made, or in the store, which a cluster's workers see."""
+    """Yield the workers; their spool is in the new directory, or in the store, which a cluster's workers see."""
     if cluster is None:
         yield Workers(jobs, None, DirectoryPlace(directory / SPOOL), DirectoryPlace(directory))
         return
     waiting = store.place.below(f"{SPOOL}/{inputs}")
     try:
         yield Workers(1, cluster, waiting, waiting.below("files"))
-    except StoreError as error:
-        if f"/{SPOOL}/{inputs}/" not in str(error) or "is gone" not in str(error):
+    except MissingFileError as error:
+        if not error.where.startswith(waiting.where()):
             raise
         raise StoreError(
             f"{waiting.where()}: another build of the same was first, and took away what both used; run the same command again"
@@ -392,7 +370,7 @@ def _build(directory: Path, inputs: Inputs, options: BuildOptions, workers: Work
         velocity_column=VELOCITY_COLUMN[recipe.label.velocity],
         chord_m=recipe.segment.chord_m,
         regions=options.regions,
-        buffer_m=content.drawn.buffer_m,
+        buffer_m=content.split.buffer_m,
     )
     write_json(directory / DRIVE_NEXT, drive_next if redaction is None else redact_features(drive_next, redaction))
     samples = read_samples(directory, (*CARD_COLUMNS, *PHYSICS_COLUMNS))
@@ -406,7 +384,19 @@ def _build(directory: Path, inputs: Inputs, options: BuildOptions, workers: Work
     )
     files = {**files, HUB_CARD: compute_checksum(directory / HUB_CARD)}
     patches = {name: (spool.patch_px**2, layer.stored.kind) for name, layer in spool.layers.items()} if shards else None
-    write_text(directory / CROISSANT, _make_croissant(files, recipe, inputs.digest, patches, samples=schema))
+    croissant = format_croissant(
+        name=card.name,
+        description=card.description,
+        licence=card.licence,
+        creator=card.creator,
+        files=files,
+        samples_file=SAMPLES,
+        samples=schema,
+        version=f"{DATA_MODEL_VERSION}.0+{inputs.digest[:12]}",
+        shards=None if patches is None else f"{SHARDS}/*.parquet",
+        layers=patches,
+    )
+    write_text(directory / CROISSANT, croissant)
     card = replace(card, checksums={**files, CROISSANT: compute_checksum(directory / CROISSANT)})
     write_sealed(directory / CARD, card)
     write_text(directory / REPORT, seal_page(render_dataset_report(directory)))
@@ -414,33 +404,10 @@ def _build(directory: Path, inputs: Inputs, options: BuildOptions, workers: Work
 
 
 def _write_overviews(directory: Path, sources: Sequence[MapFile]) -> None:
-    """Write what the page shows of the maps: photograph (or relief), relief and classes, as far as there are any."""
+    """Write the page's pictures of the maps: photograph (or relief), relief and classes, as far as the maps have them."""
     write_overview(directory / OVERVIEW, draw_maps(sources))
     layers = {layer for source in sources for layer in source.layers}
     if "ortho" in layers:
         write_overview(directory / RELIEF, draw_maps(sources, draw_relief))
     if "terrain" in layers:
         write_overview(directory / CLASSES, draw_maps(sources, draw_classes))
-
-
-def _make_croissant(
-    files: Mapping[str, Checksum],
-    recipe: Recipe,
-    inputs: str,
-    patches: Mapping[str, tuple[int, str]] | None,
-    *,
-    samples: pa.Schema,
-) -> str:
-    about = recipe.dataset
-    return format_croissant(
-        name=about.name,
-        description=about.description,
-        licence=about.licence,
-        creator=about.creator,
-        files=files,
-        samples_file=SAMPLES,
-        samples=samples,
-        version=f"{DATA_MODEL_VERSION}.0+{inputs[:12]}",
-        shards=None if patches is None else f"{SHARDS}/*.parquet",
-        layers=patches,
-    )

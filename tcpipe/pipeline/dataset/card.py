@@ -1,4 +1,4 @@
-"""The card of a dataset, ``dataset.json``: everything needed to use it, to cite it, and to check it, with findings on its samples."""
+"""The card of a dataset (``dataset.json``), and findings on its samples."""
 
 from __future__ import annotations
 
@@ -24,7 +24,6 @@ from tcpipe.formats.dataset_card import (
     MapRegistration,
     MapSource,
     Shard,
-    SplitResult,
     judge_dataset,
 )
 from tcpipe.formats.json_files import convert_record
@@ -32,7 +31,6 @@ from tcpipe.formats.layer_descriptions import describe_layer
 from tcpipe.formats.maps.map_files import MapFile
 from tcpipe.pipeline.dataset.content import Content
 from tcpipe.pipeline.dataset.inputs import BuildOptions, Inputs
-from tcpipe.pipeline.dataset.splitting import regions_to_json
 from tcpipe.recipe import Recipe
 from tcpipe.recipe.suggestions import suggest
 from tcpipe.splits.assignment import SPLITS
@@ -55,7 +53,7 @@ CARD_COLUMNS = ("run_id", "robot", "split", "fold", "terrain_name", "quality", *
 
 
 class SampleFigures(TypedDict):
-    """What the card says of the samples by their `CARD_COLUMNS` alone."""
+    """Fields of the card that `CARD_COLUMNS` determine."""
 
     samples: int
     robots: tuple[str, ...]
@@ -75,9 +73,8 @@ def make_dataset_card(
     balance: Balance,
     shards: Sequence[Shard],
 ) -> DatasetCard:
-    """Return the card without checksums; ``samples`` has the `CARD_COLUMNS` of every sample, and `physics.PHYSICS_COLUMNS`."""
-    recipe, drawn, classes = options.recipe, content.drawn, content.sources[0].classes
-    about, regions = recipe.dataset, options.regions
+    """Return the card without checksums; ``samples`` has `CARD_COLUMNS` and `PHYSICS_COLUMNS`."""
+    recipe, about, classes = options.recipe, options.recipe.dataset, content.sources[0].classes
     layers, has_terrain = content.spool.layers, "terrain" in content.spool.layers
     runs = tuple(replace(run, samples=_count(samples, "run_id", run.run_id)) for run in inputs.sources)
     card = DatasetCard(
@@ -104,9 +101,7 @@ def make_dataset_card(
         classes=classes.classes if has_terrain else (),
         label=_label(recipe, inputs),
         energy_budget=pool_budgets(run.energy_budget for run in inputs.sources),
-        split=SplitResult(
-            drawn.buffer_m, None if regions is None else regions_to_json(regions), drawn.audit, drawn.kept
-        ),
+        split=content.split,
         ledger_m=content.ledger_m,
         removal=content.removal,
         balance=balance,
@@ -124,41 +119,36 @@ def make_dataset_card(
 
 
 def _label(recipe: Recipe, inputs: Inputs) -> LabelColumns:
-    told = (run.manifest.info.report.facts.power for run in inputs.runs)
-    includes = tuple(sorted({what for power in told if power is not None for what in power.includes}))
+    powers = (run.manifest.info.report.facts.power for run in inputs.runs)
+    includes = tuple(sorted({load for power in powers if power is not None for load in power.includes}))
     velocity = recipe.label.velocity
     return LabelColumns(("power_watt", VELOCITY_COLUMN[velocity]), velocity, includes)
 
 
 def _describe_formula(layer: Layer) -> str:
-    """Return what becomes of a layer that is not the paper's where it is asked for in the tensor."""
+    """Return the formula of a layer other than the paper's in the tensor."""
     if layer.kind == "categorical":
         return f"(C - 1) / ({layer.high:g} - 1)"
     return "O / 255" if layer.stack == "greys" else f"(X - {layer.low!r}) / ({layer.high!r} - {layer.low!r})"
 
 
 def _map_source(source: MapFile, sha256: str, registration: tuple[MapRegistration, ...]) -> MapSource:
-    told = {"name": source.name, "layers": tuple(source.layers), "sha256": sha256, "registration": registration}
-    return convert_record(source.facts, MapSource, **told, **asdict(source.grid))
+    named = {"name": source.name, "layers": tuple(source.layers), "sha256": sha256, "registration": registration}
+    return convert_record(source.facts, MapSource, **named, **asdict(source.grid))
 
 
 def measure_samples(samples: pa.Table, *, has_terrain: bool) -> SampleFigures:
-    """Return what the card says of the samples by their `CARD_COLUMNS` alone: it can be measured again at any time."""
+    """Return the fields of the card that `CARD_COLUMNS` of the samples determine."""
+    split = samples.column("split").to_numpy()
     return {
         "samples": samples.num_rows,
         "robots": tuple(sorted(pc.unique(samples.column("robot")).to_pylist())),
-        "splits": split_counts(samples),
+        "splits": {name: int((split == name).sum()) for name in SPLITS},
         "folds_of_train": _fold_counts(samples),
         "terrain": _count_terrain(samples) if has_terrain else {},
         "label_statistics_of_train": _compute_statistics(samples),
         "doubtful": count_flagged(samples.column("quality")),
     }
-
-
-def split_counts(samples: pa.Table) -> dict[str, int]:
-    """Return the number of samples of every split, in the splits' order."""
-    split = samples.column("split").to_numpy()
-    return {name: int((split == name).sum()) for name in SPLITS}
 
 
 def _fold_counts(samples: pa.Table) -> tuple[int, ...]:
@@ -204,12 +194,7 @@ PHYSICS_COLUMNS = ("start_ns", "start_z_m", "end_z_m", "chord_m", "turn_rate_rad
 
 
 def fit_physics_by_robot(samples: pa.Table) -> dict[str, PhysicsFit]:
-    """Return the fit of each robot's samples, whatever their split; robots for which none can be are left out.
-
-    Parameters
-    ----------
-    samples : with `PHYSICS_COLUMNS`, labels, robot and terrain.
-    """
+    """Return the fit of each robot's samples of all splits, for robots that can be fitted."""
     found = {}
     for robot in sorted(pc.unique(samples.column("robot")).to_pylist()):
         mine = samples.filter(pc.equal(samples.column("robot"), robot)).sort_by("start_ns")
@@ -220,7 +205,7 @@ def fit_physics_by_robot(samples: pa.Table) -> dict[str, PhysicsFit]:
 
 
 def make_fit_samples(samples: pa.Table) -> FitSamples:
-    """Return samples, or segments, as physics takes them; the rise is that of the track, which every segment has."""
+    """Return samples or segments as input of the fit; the rise is that of the track."""
     names = (
         samples.column("terrain_name").fill_null(ALL).to_pylist()
         if "terrain_name" in samples.column_names
@@ -236,13 +221,13 @@ def make_fit_samples(samples: pa.Table) -> FitSamples:
 
 
 def find_idle_power(samples: pa.Table) -> float | None:
-    """Return the power while standing [W], the mean over the samples of what their runs tell; None where none stood."""
+    """Return the idle power [W], the mean over the samples; None if no run was stationary."""
     watt = to_floats(samples, "standing_power_watt")
     return float(np.nanmean(watt)) if np.isfinite(watt).any() else None
 
 
 def count_flagged(quality: pa.ChunkedArray) -> Doubtful:
-    """Return how many samples carry a quality bit that not all of them carry, and how many each; ``quality`` is their column."""
+    """Return the count of samples with a quality bit that not all have, and counts by bit."""
     bits = quality.to_numpy().astype(np.int64)
     counts = {flag_name(bit): int(np.count_nonzero(bits & int(bit))) for bit in Quality}
     common = int(np.bitwise_and.reduce(bits)) if len(bits) > 1 else 0
@@ -251,7 +236,7 @@ def count_flagged(quality: pa.ChunkedArray) -> Doubtful:
 
 
 def find_in_samples(card: DatasetCard) -> Iterator[Finding]:
-    """Yield what the samples of a dataset show: too few, flagged ones, empty splits, leakage, thin ground, no repetitions."""
+    """Yield findings on samples: too few, flagged ones, empty splits, leakage, undersampled ground, no repetitions."""
     dataset = Subject("dataset", card.name)
     if card.samples < read_threshold("few-samples", "min_sample_count"):
         yield make_finding("few-samples", dataset, sample_count=card.samples)
@@ -278,7 +263,7 @@ def _find_flagged(card: DatasetCard, dataset: Subject) -> Iterator[Finding]:
 
 
 def _find_empty_splits(card: DatasetCard) -> Iterator[Finding]:
-    """Yield a finding for each split that was asked for and holds no sample."""
+    """Yield a finding for each requested split without samples."""
     rules = card.recipe.split
     if not card.splits["train"]:
         yield make_finding(

@@ -1,4 +1,4 @@
-"""What a dataset holds: usable segments of all runs, samples in their order with their patches, and where every metre went."""
+"""Content of a dataset: usable segments of all runs, samples in order with their patches, and the distance breakdown."""
 
 from __future__ import annotations
 
@@ -18,7 +18,14 @@ from numpy.typing import NDArray
 
 from tcpipe.errors import DatasetError, TcpipeError
 from tcpipe.execution import run_all, unwrap_result
-from tcpipe.formats.dataset_card import Covariate, MapRegistration, Removal, Shard, group_dataset_findings
+from tcpipe.formats.dataset_card import (
+    Covariate,
+    MapRegistration,
+    Removal,
+    Shard,
+    SplitResult,
+    group_dataset_findings,
+)
 from tcpipe.formats.dataset_files import (
     Drawer,
     FileFormat,
@@ -35,11 +42,11 @@ from tcpipe.formats.recipe_toml import load_profiles
 from tcpipe.formats.stored_runs import RunDirectory
 from tcpipe.formats.zarr_arrays import Compression
 from tcpipe.motion.distance_breakdown import KEPT
-from tcpipe.pipeline.dataset.added_columns import find_narrow_patches, make_added_columns, tag_of_each
+from tcpipe.pipeline.dataset.added_columns import find_narrow_patches, make_added_columns, read_tags
 from tcpipe.pipeline.dataset.inputs import BuildOptions, Inputs
 from tcpipe.pipeline.dataset.map_checks import find_removed_by_ground, register_runs
 from tcpipe.pipeline.dataset.sampling import Spool, Workers, sample_all_segments
-from tcpipe.pipeline.dataset.splitting import SplitResult, draw_splits
+from tcpipe.pipeline.dataset.splitting import draw_splits
 from tcpipe.recipe import Recipe
 from tcpipe.recipe.suggestions import format_recipe_key
 from tcpipe.splits.assignment import EXCLUDED, NO_FOLD, Assignment, order_ranks
@@ -52,35 +59,22 @@ from tcpipe.tables.levels import LABELLED_SEGMENTS, SAMPLES
 from tcpipe.terrain.projection import compute_area, parse_crs
 
 
-@dataclass(frozen=True, slots=True)
-class Pool:
-    """Segments with power and position, of all runs, mapped from a file; ``ledger_m`` sums to the runs' odometers."""
+def _pool_segments(
+    runs: Sequence[RunDirectory], directory: Path, *, again: Mapping[str, NDArray[np.bool_]]
+) -> tuple[pa.Table, dict[str, float], list[Finding]]:
+    """Return the segments that can become samples, mapped from a file in ``directory``, and metres by reason, which sum to the odometers.
 
-    segments: pa.Table
-    ledger_m: Mapping[str, float]
-    findings: tuple[Finding, ...]
-
-
-def pool_segments(
-    runs: Sequence[RunDirectory], directory: Path, *, again: Mapping[str, NDArray[np.bool_]] | None = None
-) -> Pool:
-    """Gather the segments that can become samples, run by run, in a file in ``directory``.
-
-    ``again`` marks, by run, the segments that another run has too, in the order of the run's file.
-
-    Raises
-    ------
-    DatasetError : None can: the lines say what the runs lack.
+    ``again`` marks, by run, the segments that another run has too, in the order of the run's file. `DatasetError` tells what the runs
+    lack where no segment can become a sample.
     """
     names = dict.fromkeys(name for run in runs for name in run.manifest.ledger_m)
     ledger_m = {name: math.fsum(run.manifest.ledger_m.get(name, 0.0) for run in runs) for name in names}
     path, counts = directory / "segments.arrow", list[_Count]()
-    write_pieces(path, LABELLED_SEGMENTS.arrow(), _iterate_usable(runs, again or {}, counts))
+    write_pieces(path, LABELLED_SEGMENTS.arrow(), _iterate_usable(runs, again, counts))
     segments = map_table(path)
     if segments.num_rows == 0:
-        every, powered, located = (
-            sum(getattr(count, name) for count in counts) for name in ("every", "powered", "located")
-        )
+        every = sum(count.every for count in counts)
+        powered, located = any(count.powered for count in counts), any(count.located for count in counts)
         lack = "power where there is GNSS" if powered and located else "GNSS" if powered else "power"
         raise DatasetError(
             f"{len(runs)} runs, {every} segments, but none with {lack}: "
@@ -91,12 +85,12 @@ def pool_segments(
         Loss.OUTSIDE_MAP: math.fsum(count.no_place_m for count in counts),
         Loss.RECORDED_TWICE: math.fsum(count.again_m for count in counts),
     }
-    return Pool(segments, move_out(ledger_m, lost_m), tuple(_find_unusable(runs, counts)))
+    return segments, _move_losses(ledger_m, lost_m), list(_find_unusable(runs, counts))
 
 
 @dataclass(frozen=True, slots=True)
 class _Count:
-    """What the segments of a run have: how many, and the metres of those that lack power, or else a place, or else are another run's."""
+    """Segments of a run: all, with power, with position; metres without power, else without position, else of another run."""
 
     every: int
     powered: int
@@ -109,7 +103,7 @@ class _Count:
 def _iterate_usable(
     runs: Sequence[RunDirectory], again: Mapping[str, NDArray[np.bool_]], counts: list[_Count]
 ) -> Iterator[pa.Table]:
-    """Yield each run's segments that can become samples; ``counts`` gets an entry a run."""
+    """Yield each run's segments that can become samples; append an entry for each run to ``counts``."""
     for run in runs:
         segments = run.segments()
         powered: NDArray[np.bool_] = np.isfinite(to_floats(segments, "power_watt"))
@@ -132,8 +126,8 @@ def _find_unusable(runs: Sequence[RunDirectory], counts: Sequence[_Count]) -> It
             yield make_finding("run-without-samples", Subject("run", run.run_id), names={"lacks": " and ".join(lacks)})
 
 
-def move_out(ledger_m: Mapping[str, float], lost_m: Mapping[Loss, float]) -> dict[str, float]:
-    """Return the ledger with metres moved from what is kept to losses [m]; its sum stays the odometer."""
+def _move_losses(ledger_m: Mapping[str, float], lost_m: Mapping[Loss, float]) -> dict[str, float]:
+    """Return the breakdown with metres moved from kept to losses [m]; its sum stays the odometer."""
     moved = dict(ledger_m)
     for loss, metres in lost_m.items():
         name = flag_name(loss)
@@ -147,24 +141,24 @@ def move_out(ledger_m: Mapping[str, float], lost_m: Mapping[Loss, float]) -> dic
 logger = logging.getLogger("tcpipe")
 
 _ROWS = 1 << 17
-"""Whose centres are looked for at once."""
+"""Rows whose centres are computed together."""
 
 
 class Redactor(Protocol):
-    """What redacts samples (`tcpipe.pipeline.dataset.redaction.Redaction`)."""
+    """Methods of `tcpipe.pipeline.dataset.redaction.Redaction`."""
 
     def table(self, samples: pa.Table) -> pa.Table:
-        """Return samples with the places and names that are told."""
+        """Return samples with public places and names."""
 
     def segment_id(self, name: str, run_id: str) -> str:
-        """Return what a run's segment is called."""
+        """Return the public id of a run's segment."""
 
 
 @dataclass(frozen=True, slots=True)
 class SampleTable:
-    """The samples in the dataset's order, made piece by piece: their segments are mapped from a file, not held.
+    """The samples in the dataset's order, made piece by piece: their segments are mapped from a file, not in memory.
 
-    Row i is patch ``patch[i]`` of ``sampled``, whose pixels wait in ``slot`` of the spool; ``assigned`` is in the patches' order.
+    Row i is patch ``patch[i]`` of ``sampled``, whose pixels are in ``slot`` of the spool; ``assigned`` is in the patches' order.
     """
 
     segments: pa.Table
@@ -178,11 +172,11 @@ class SampleTable:
     added: pa.Table
     """Columns beyond SAMPLES, in the segments' order."""
     redaction: Redactor | None = None
-    """How names and places are told; None: as they are."""
+    """None: names and places are public."""
 
     @property
     def schema(self) -> pa.Schema:
-        """The samples' columns, and where they lie."""
+        """The samples' columns, with the extent of their places."""
         bare = pa.schema([*SAMPLES.arrow(), *self.added.schema]).empty_table()
         pieces = (self._centres_deg(self.patch[first : first + _ROWS]) for first in range(0, len(self), _ROWS))
         return add_geo_metadata(bare, "Point", np.concatenate([np.empty((0, 2)), *pieces])).schema
@@ -220,8 +214,7 @@ class SampleTable:
         )
         for field in self.added.schema:
             table = table.append_column(field, self.added.column(field.name).take(rows_of_segments))
-        told = table if self.redaction is None else self.redaction.table(table)
-        return add_geo_metadata(told, "Point", centres)
+        return add_geo_metadata(table if self.redaction is None else self.redaction.table(table), "Point", centres)
 
     def pieces(self, rows: int) -> Iterator[pa.Table]:
         """Yield the table in pieces of so many rows; at least one, which may be empty."""
@@ -231,11 +224,11 @@ class SampleTable:
     def ids(self, first: int, last: int) -> list[str]:
         """Return the ids of rows ``first:last``."""
         rows = pa.array(self.sampled.kept[self.patch[first:last]])
-        found: list[str] = self.segments.column("segment_id").take(rows).to_pylist()
+        ids: list[str] = self.segments.column("segment_id").take(rows).to_pylist()
         if self.redaction is None:
-            return found
+            return ids
         runs = self.segments.column("run_id").take(rows).to_pylist()
-        return [self.redaction.segment_id(name, run_id) for name, run_id in zip(found, runs, strict=True)]
+        return [self.redaction.segment_id(name, run_id) for name, run_id in zip(ids, runs, strict=True)]
 
     def centres_xy_m(self) -> NDArray[np.float64]:
         """Return the centre of every footprint in the first map's plane [m], shape (N, 2)."""
@@ -247,98 +240,94 @@ class SampleTable:
         return self.assigned.split[self.patch]
 
     def slots(self) -> NDArray[np.int64]:
-        """Return where the pixels of every sample wait in the spool, shape (N,)."""
+        """Return the slot of every sample's pixels in the spool, shape (N,)."""
         return self.slot[self.patch]
 
 
 @dataclass(frozen=True, slots=True)
 class Content:
-    """Samples in the dataset's order, what their layers mean, and where every metre went."""
+    """Samples in the dataset's order, their pixels and layers, and the distance breakdown."""
 
     samples: SampleTable
     spool: Spool
-    """Where the pixels wait, and what the layers mean."""
     sources: tuple[MapFile, ...]
-    drawn: SplitResult
+    split: SplitResult
     ledger_m: Mapping[str, float]
     registrations: Sequence[tuple[MapRegistration, ...]]
-    """How each map lies against each run's track."""
+    """By map, one for each run."""
     covariates: tuple[Covariate, ...]
     removal: Removal
-    """What of each class and slope is in samples."""
     findings: tuple[Finding, ...]
 
 
 def gather_content(directory: Path, inputs: Inputs, options: BuildOptions, workers: Workers) -> Content:
-    """Sample, split and order; segments wait in files in ``directory``, which must be empty, pixels where ``workers`` see them.
+    """Sample, split and order; segments are kept in files in ``directory``, which must be empty, pixels where ``workers`` see them.
 
     Raises
     ------
-    DatasetError, MapError : nothing comes of it: no segment, none on the map, none inside the region.
+    DatasetError, MapError : no segment, none on the map, or none inside the region.
     """
     recipe = options.recipe
-    pool = pool_segments(inputs.runs, directory, again=inputs.again)
-    logger.info("sampling %d segments of %d runs", pool.segments.num_rows, len(inputs.runs))
-    ranks = _rank_segments(pool.segments, seed=recipe.split.seed)
-    gnss_crs = recipe.read.gnss_crs
+    segments, ledger_m, unusable = _pool_segments(inputs.runs, directory, again=inputs.again)
+    logger.info("sampling %d segments of %d runs", segments.num_rows, len(inputs.runs))
+    ranks = _rank_segments(segments, seed=recipe.split.seed)
     sampled, slot, spool = sample_all_segments(
-        pool.segments, ranks, inputs.maps, recipe.sample, gnss_crs=gnss_crs, workers=workers
+        segments, ranks, inputs.maps, recipe.sample, gnss_crs=recipe.read.gnss_crs, workers=workers
     )
     sources = tuple(open_map(*of) for of in inputs.maps())
-    lost_m = sum_losses(to_floats(pool.segments, "arc_length_m"), sampled.lost_by)
+    lost_m = sum_losses(to_floats(segments, "arc_length_m"), sampled.lost_by)
     if len(sampled.kept) == 0:
         raise DatasetError(
-            _describe_nothing_sampled(pool.segments, lost_m, sources),
-            *_describe_uncertainty(pool.segments, lost_m, inputs, recipe),
+            _describe_nothing_sampled(segments, lost_m, sources),
+            *_describe_uncertainty(segments, lost_m, inputs, recipe),
         )
-    tags = _read_tags(pool.segments, inputs, recipe)
-    drawn = draw_splits(
-        pool.segments, sampled, sources[0].grid, options.regions, recipe, earlier=options.earlier, tags=tags
+    tags = _read_tags(segments, inputs, recipe)
+    assigned, result = draw_splits(
+        segments, sampled, sources[0].grid, options.regions, recipe, earlier=options.earlier, tags=tags
     )
-    split = drawn.assigned.split
-    arc_m = to_floats(pool.segments, "arc_length_m")[sampled.kept]
+    split = assigned.split
+    arc_m = to_floats(segments, "arc_length_m")[sampled.kept]
     unused_m = {Loss.SPLIT_BUFFER: arc_m[split == "buffer"].sum(), Loss.SPLIT_EXCLUDED: arc_m[split == EXCLUDED].sum()}
     registered = [register_runs(inputs.runs, source, recipe) for source in sources]
     shifted = [finding for _, findings in registered for finding in findings]
     in_use = sampled.kept[(split != "buffer") & (split != EXCLUDED)]
-    removal, biased = find_removed_by_ground(inputs.runs, pool.segments, in_use, sources, recipe)
+    removal, biased = find_removed_by_ground(inputs.runs, segments, in_use, sources, recipe)
     kept = np.flatnonzero(split != EXCLUDED)
     order = kept[np.argsort(ranks[sampled.kept[kept]], kind="stable")]
-    covariates, rows = inputs.covariates, sampled.kept[order]
-    added = make_added_columns(
-        pool.segments, rows, inputs.sources, covariates, recipe.covariates, layers=tuple(spool.layers)
+    added, covariates, incomplete = make_added_columns(
+        segments, sampled.kept[order], inputs.sources, inputs.covariates, recipe.covariates, layers=tuple(spool.layers)
     )
     robots = [run.robot for run in inputs.sources]
     narrow = find_narrow_patches(robots, load_profiles(recipe).robots, patch_m=recipe.sample.patch_m)
     return Content(
         samples=SampleTable(
-            pool.segments,
+            segments,
             sampled,
             slot,
             "terrain" in spool.layers,
-            drawn.assigned,
+            assigned,
             inputs.map_names,
             sources[0].classes.names(),
             order,
-            added.table,
+            added,
         ),
         spool=spool,
         sources=sources,
-        drawn=drawn,
-        ledger_m=move_out(pool.ledger_m, {**lost_m, **unused_m}),
+        split=result,
+        ledger_m=_move_losses(ledger_m, {**lost_m, **unused_m}),
         registrations=[of for of, _ in registered],
-        covariates=added.covariates,
+        covariates=covariates,
         removal=removal,
-        findings=(*inputs.findings, *pool.findings, *shifted, *sampled.findings, *narrow, *biased, *added.findings),
+        findings=(*inputs.findings, *unusable, *shifted, *sampled.findings, *narrow, *biased, *incomplete),
     )
 
 
 def _read_tags(segments: pa.Table, inputs: Inputs, recipe: Recipe) -> dict[str, str] | None:
-    """Return the value of the holdout's tag by run, None where another holdout rules."""
+    """Return the value of the holdout's tag by run, None with another holdout."""
     if recipe.split.holdout != "tag":
         return None
     run_ids: list[str] = pc.unique(segments.column("run_id")).to_pylist()
-    return dict(zip(run_ids, tag_of_each(run_ids, inputs.sources, recipe.split.holdout_tag), strict=True))
+    return dict(zip(run_ids, read_tags(run_ids, inputs.sources, recipe.split.holdout_tag), strict=True))
 
 
 def _rank_segments(segments: pa.Table, *, seed: int) -> NDArray[np.uint64]:
@@ -347,7 +336,7 @@ def _rank_segments(segments: pa.Table, *, seed: int) -> NDArray[np.uint64]:
     ranks = np.concatenate([order_ranks(chunk.to_pylist(), seed=seed) for chunk in column.chunks])
     rising = np.sort(ranks)
     equal = rising[1:][np.diff(rising) == 0]
-    if len(equal):  # 64 bits: two names with one rank are one name
+    if len(equal):  # with 64 bits, equal ranks mean equal names
         name = column[int(np.flatnonzero(ranks == equal[0])[0])].as_py()
         times = int((ranks == equal[0]).sum())
         raise DatasetError(f"segment {name} is in the store {times} times; ingest its run again with --force")
@@ -355,7 +344,7 @@ def _rank_segments(segments: pa.Table, *, seed: int) -> NDArray[np.uint64]:
 
 
 def _describe_nothing_sampled(segments: pa.Table, lost_m: Mapping[Loss, float], sources: Sequence[MapFile]) -> str:
-    """Say where the segments went instead, and where maps and runs lie."""
+    """Return metres by reason, and the places of maps and runs."""
     lost = sorted(((metres, flag_name(loss)) for loss, metres in lost_m.items() if metres > 0.0), reverse=True)
     where = ", ".join(f"{metres:.0f} m {name.replace('_', ' ')}" for metres, name in lost)
     lon, lat = (float(np.mean(to_floats(segments, f"start_{axis}_deg"))) for axis in ("lon", "lat"))
@@ -369,19 +358,17 @@ def _describe_nothing_sampled(segments: pa.Table, lost_m: Mapping[Loss, float], 
 def _describe_uncertainty(
     segments: pa.Table, lost_m: Mapping[Loss, float], inputs: Inputs, recipe: Recipe
 ) -> list[str]:
-    """Return how well positions are known, and what ingest found, where that is what most is lost to."""
+    """Return the positions' uncertainty and findings of ingest, where uncertain positions are the main loss."""
     uncertain_m = lost_m.get(Loss.POSITION_UNCERTAIN, 0.0)
     if uncertain_m == 0.0 or uncertain_m < max(lost_m.values()):
         return []
     known_m = float(np.median(to_floats(segments, "position_std_m")))
-    how_sure = (
+    line = (
         f"positions are known to {known_m:.2f} m (median standard deviation), wanted {recipe.sample.max_position_std_m:g} m: mend what "
         f"follows, or accept patches that lie so far off ({format_recipe_key('sample.max_position_std_m')})"
     )
-    return [
-        how_sure,
-        *format_mixed_groups(group_dataset_findings((), {run.run_id: run.findings for run in inputs.sources})),
-    ]
+    groups = group_dataset_findings((), {run.run_id: run.findings for run in inputs.sources})
+    return [line, *format_mixed_groups(groups)]
 
 
 def _describe_coverage(source: MapFile, *, alone: bool) -> str:
@@ -392,7 +379,7 @@ def _describe_coverage(source: MapFile, *, alone: bool) -> str:
 def write_patches(
     directory: Path, content: Content, file_format: FileFormat, workers: Workers, *, compression: Compression
 ) -> list[Shard]:
-    """Have the layers written, shard by shard; return the shards, where the format has any."""
+    """Write the layers, shard by shard; return the shards if the format has any."""
     samples, spool = content.samples, content.spool
     pixels = Pixels(spool.layers, spool.patch_px, samples.slots(), spool.read)
     if file_format == "parquet":
@@ -402,15 +389,15 @@ def write_patches(
         drawers = make_zarr_writers(
             directory, workers.out, pixels, samples.ids, compression=compression, threads=workers.jobs
         )
-    with closing(run_all(_fill, drawers, jobs=1, cluster=workers.cluster)) as outcomes:
+    with closing(run_all(_write_shard, drawers, jobs=1, cluster=workers.cluster)) as outcomes:
         for outcome in outcomes:
             unwrap_result(outcome)
-    _bring(workers.out, directory)
+    _copy_shards(workers.out, directory)
     return [drawer.shard for drawer in drawers if isinstance(drawer, ParquetShardWriter)]
 
 
 def _spool_rows(waiting: Place, samples: SampleTable, rows: NDArray[np.int64]) -> Callable[[], pa.Table]:
-    """Put rows of the samples where whoever writes them sees them; return what gives them there."""
+    """Put rows of the samples into the spool; return a picklable function that reads them there."""
     name = f"rows/{rows[0]}"
     waiting.put(name, write_table_bytes(samples.take(rows)))
     return partial(_read_rows_at, waiting, name)
@@ -420,7 +407,7 @@ def _read_rows_at(waiting: Place, name: str) -> pa.Table:
     return read_table_bytes(waiting.read(name) or b"")
 
 
-def _fill(drawer: Drawer) -> TcpipeError | None:
+def _write_shard(drawer: Drawer) -> TcpipeError | None:
     try:
         drawer.write()
     except TcpipeError as error:
@@ -428,8 +415,8 @@ def _fill(drawer: Drawer) -> TcpipeError | None:
     return None
 
 
-def _bring(out: Place, directory: Path) -> None:
-    """Bring the files into the directory that is made, one at a time, where they were written elsewhere."""
+def _copy_shards(out: Place, directory: Path) -> None:
+    """Copy the shards into the new directory, one at a time, if workers wrote them elsewhere."""
     if out == DirectoryPlace(directory):
         return
     for entry in out.entries():

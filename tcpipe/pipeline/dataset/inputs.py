@@ -1,4 +1,4 @@
-"""What a dataset is made from: which runs and which map of a store, and one hash over all of it."""
+"""Inputs of a dataset: runs and maps of a store, one hash over all, and how they differ from an earlier dataset's."""
 
 from __future__ import annotations
 
@@ -41,10 +41,9 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class BuildOptions:
-    """What a user chooses for a dataset, beside its runs and what the maps and tables hold."""
+    """A user's choices for a dataset besides its runs, maps and tables; ``recipe`` includes holdout and seed of the call."""
 
     recipe: Recipe
-    """The one that rules, with holdout and seed of the call."""
     regions: Regions | None
     tags: Mapping[str, str]
     file_format: FileFormat
@@ -52,23 +51,23 @@ class BuildOptions:
     earlier: pa.Table | None
     """Samples of an earlier dataset, which keep their split."""
     keeps_own_split: bool
-    """Whether that is the dataset that is replaced, which may be asked for at any time."""
+    """Whether that is the replaced dataset itself."""
 
 
 @dataclass(frozen=True, slots=True)
 class Inputs:
-    """Runs by id and what the card says of each, the maps, the hash over all inputs, and what was noticed on the way."""
+    """Runs, their entries of the card, the maps, the hash over all inputs, and findings."""
 
     runs: tuple[RunDirectory, ...]
     sources: tuple[RunSource, ...]
     map_names: tuple[str, ...]
     """In order of priority where maps overlap."""
     maps: Callable[[], tuple[tuple[Path, FetchedShards | None], ...]]
-    """What `open_map` takes, on the machine that asks."""
+    """Returns arguments of `open_map`, on any machine."""
     map_sha256: tuple[str, ...]
     """Over the checksums of each map's files."""
     again: Mapping[str, NDArray[np.bool_]]
-    """By run: which of its segments another run has too."""
+    """By run: segments that another run has too."""
     digest: str
     chosen: SelectedRuns
     findings: tuple[Finding, ...]
@@ -86,7 +85,7 @@ def choose_inputs(
     region: bytes | None,
     covariates: tuple[CovariateTable, ...],
 ) -> Inputs:
-    """Return the runs of one robot ingested with this recipe and the maps, or raise `DatasetError` that lists the candidates."""
+    """Return the runs of one robot ingested with this recipe, and the maps; `DatasetError` lists the candidates."""
     problems = list[str]()
     try:
         chosen = choose_runs(store, options.recipe, state=state, robot=robot, tags=options.tags)
@@ -144,7 +143,7 @@ def _map_files(store: Store, maps: Sequence[MapDocument]) -> tuple[tuple[Path, F
 
 
 def _map_digest(name: str, path: Path) -> str:
-    """Return one hash over a map's files; `MapError` if they are not as they were written: a lost one would read as no data."""
+    """Return one hash over a map's files; `MapError` if one was changed or lost, which would read as no data."""
     found, wrong = compute_checksums(path), list[str]()
     try:
         recorded = read_checksums(path)
@@ -169,7 +168,7 @@ def _digest_of(files: Mapping[str, Checksum], below: str = "") -> str:
 
 
 def read_earlier_splits(dataset: str | Path) -> pa.Table:
-    """Return ``sample_id``, ``split`` and, where there is one, ``fold`` of a dataset of any data model; `DatasetError` if it is none."""
+    """Return ``sample_id``, ``split`` and, if it has one, ``fold`` of a dataset of any data model; `DatasetError` if it is none."""
     directory, _ = fetch_directory_by_range(dataset, by_range=is_shard)
     if read_card(directory).redaction is not None:
         raise DatasetError(
@@ -183,7 +182,7 @@ def read_earlier_splits(dataset: str | Path) -> pa.Table:
 
 
 def choose_maps(store: Store, names: Sequence[str]) -> tuple[str, ...]:
-    """Return the maps to sample: those named, in their order, or the only one."""
+    """Return the maps to sample: the named ones in their order, or the only one."""
     maps = store.maps()
     if not maps:
         raise DatasetError(f"{store.root}: no map in the store; add one: tcpipe add-map NAME --height FILE")
@@ -199,7 +198,7 @@ def choose_maps(store: Store, names: Sequence[str]) -> tuple[str, ...]:
 
 
 def run_source(run: RunDirectory, log: LogOrigin) -> RunSource:
-    """Return what the card says of a run: its log, by name and sha256, its recipe, robot, tags, metres, findings and error budget."""
+    """Return the card's entry of a run."""
     named = {"run_id": run.run_id, "recipe_id": run.recipe_id, "sha256": log.sha256}
     return convert_record(run.facts, RunSource, logs=tuple(Path(path).name for path in log.paths), **named)
 
@@ -216,14 +215,7 @@ _LONGEST_VALUE = 80
 
 
 def find_other_options(card: DatasetCard, options: BuildOptions, inputs: Inputs) -> list[str]:
-    """Return each option that differs from those of a dataset, by its name, with both values; empty where none does.
-
-    Parameters
-    ----------
-    card : of the dataset that is there, of any data model.
-    options : of the build that would replace it.
-    inputs : what that build chose: its maps, its runs and their robot, its tables of covariates.
-    """
+    """Return a line with both values for each option of a build that differs from those of the dataset it would replace."""
     if card.redaction is not None or options.redact:
         if bool(card.redaction) != options.redact:
             return [_format_difference("--redact", bool(card.redaction), options.redact)]
@@ -252,9 +244,9 @@ def _iterate_options(card: DatasetCard, options: BuildOptions, inputs: Inputs) -
 
 
 def _find_chosen_tags(card: DatasetCard, wanted: Mapping[str, str], inputs: Inputs) -> dict[str, str]:
-    """Return the tags that a dataset was chosen by.
+    """Return the tags that selected the runs of a dataset.
 
-    A card of before 0.9 does not tell: then those that all of its runs share, and that are wanted or not shared by the runs now.
+    For a card of before 0.9, which lacks them: tags that all its runs share and that are requested or not shared by today's runs.
     """
     if card.run_tags is not None:
         return dict(card.run_tags)
@@ -269,7 +261,7 @@ def _find_shared(tags: Iterable[Mapping[str, str]]) -> dict[str, str]:
 
 
 def _format_region(region: Mapping[str, object] | None) -> str | None:
-    """Return the kinds of a region's polygons and what tells them from others."""
+    """Return the kinds of a region's polygons and a digest of them."""
     return None if region is None else f"{' and '.join(region)} ({digest(to_plain(region))[:8]})"
 
 

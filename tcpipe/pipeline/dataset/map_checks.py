@@ -1,4 +1,4 @@
-"""Do map and tracks lie on each other? Heights under every run's track against the map's, run by run."""
+"""Runs against maps: the map's registration by heights, and the share of metres in samples by class and slope."""
 
 from __future__ import annotations
 
@@ -34,22 +34,26 @@ from tcpipe.terrain.sampling import OFF_THE_MAP, find_classes_at
 from tcpipe.terrain.tiles import find_map_projection
 
 _COLUMNS = ["lon_deg", "lat_deg", "alt_m", "x_std_m", "y_std_m", "z_std_m"]
+_TRACK_COLUMNS = (
+    *("stamp_ns", "epoch", "x_m", "y_m", "z_m", "east_velocity_mps", "north_velocity_mps", "up_velocity_mps"),
+    *("lon_deg", "lat_deg", "pitch_rad", "forward_velocity_mps", "dropped_by"),
+)
+_SLOPES_DEG = (-10.0, -5.0, -2.0, 2.0, 5.0, 10.0)
+_SLOPE_NAMES = ("below -10°", "-10° to -5°", "-5° to -2°", "-2° to 2°", "2° to 5°", "5° to 10°", "above 10°")
+_REASONS = ("in_samples", *(flag_name(bit) for bit in DropReason), "curved_or_leftover", "not_sampled")
+"""Reason of each metre of a track; losses at sampling and to the split's buffer are one entry."""
+_LEFT_OVER, _NOT_SAMPLED = len(_REASONS) - 2, len(_REASONS) - 1
+
+_Ground = tuple[MapFile, Projection]
+"""A map, and the projection of places onto it."""
 
 
 def register_runs(
     runs: Sequence[RunDirectory], source: MapFile, recipe: Recipe
 ) -> tuple[tuple[MapRegistration, ...], list[Finding]]:
-    """Return how the map lies against each run that crosses enough of it, and findings on those that are off.
+    """Return the map's registration against each run that crosses enough of it, and findings on misfits.
 
-    Parameters
-    ----------
-    runs : the runs whose tracks are compared: rows that are certain enough to be sampled.
-    source : the map.
-    recipe : ``read.gnss_crs`` and ``sample.max_position_std_m`` rule.
-
-    Raises
-    ------
-    MapError : the map's heights are in feet.
+    Rows of a track count that are certain enough to be sampled. `MapError` if the map's heights are in feet.
     """
     projection = find_map_projection(source, recipe.read.gnss_crs)
     registrations, findings = list[MapRegistration](), list[Finding]()
@@ -59,7 +63,7 @@ def register_runs(
             continue
         if registration.scale.is_feet():
             raise MapError(_describe_feet(registration, run.run_id, source.name))
-        registrations.append(_describe(run.run_id, registration, expected_m))
+        registrations.append(_make_map_registration(run.run_id, registration, expected_m))
         findings += _find_shift(registration, run.run_id, source.name)
         findings += _find_other_heights(registration, expected_m, run.run_id, source.name)
     return tuple(registrations), findings
@@ -68,14 +72,14 @@ def register_runs(
 def _register(
     run: RunDirectory, source: MapFile, projection: Projection, *, max_std_m: float
 ) -> tuple[Registration | None, float]:
-    """Return how the map lies against a run, and the misfit that is to be expected [m]."""
+    """Return the map's registration against a run, and the expected misfit [m]."""
     track = run.table("track", _COLUMNS)
     lon, lat, height_m, x_std_m, y_std_m, z_std_m = (to_floats(track, name) for name in _COLUMNS)
-    sure: NDArray[np.bool_] = np.hypot(x_std_m, y_std_m) <= max_std_m
-    lonlat = np.stack([lon, lat], axis=1)[sure]
+    certain: NDArray[np.bool_] = np.hypot(x_std_m, y_std_m) <= max_std_m
+    lonlat = np.stack([lon, lat], axis=1)[certain]
     map_error_m = read_threshold("map-heights-differ", "map_error_m")
-    expected_m = float(np.hypot(np.sqrt(np.mean(z_std_m[sure] ** 2)), map_error_m)) if sure.any() else map_error_m
-    return register_track(source, projection.forward(lonlat), height_m[sure]), expected_m
+    expected_m = float(np.hypot(np.sqrt(np.mean(z_std_m[certain] ** 2)), map_error_m)) if certain.any() else map_error_m
+    return register_track(source, projection.forward(lonlat), height_m[certain]), expected_m
 
 
 def _describe_feet(found: Registration, run_id: str, name: str) -> str:
@@ -106,7 +110,7 @@ def _find_shift(found: Registration, run_id: str, name: str) -> tuple[Finding, .
 
 
 def _find_other_heights(found: Registration, expected_m: float, run_id: str, name: str) -> tuple[Finding, ...]:
-    """Return the finding, if any, that heights of map and track differ by more than they may."""
+    """Return the finding, if any, that heights of map and track differ too much."""
     subject, names = Subject("run", run_id), {"map": name}
     if found.scale.is_off():
         return (make_finding("map-height-scale", subject, names=names, map_rise_m=1 / found.scale.value),)
@@ -116,33 +120,18 @@ def _find_other_heights(found: Registration, expected_m: float, run_id: str, nam
     return (make_finding("map-heights-differ", subject, names=names, misfit_m=misfit_m, expected_m=expected_m),)
 
 
-def _describe(run_id: str, found: Registration, expected_m: float) -> MapRegistration:
-    """Return what the card says: no shift where the ground cannot tell one."""
-    untold = {} if np.isfinite(found.shift_std_m) else dict.fromkeys(("shift_xy_m", "shift_std_m", "shifted_misfit_m"))
+def _make_map_registration(run_id: str, found: Registration, expected_m: float) -> MapRegistration:
+    """Return the registration for the card: no shift where the ground cannot determine one."""
+    unknown = {} if np.isfinite(found.shift_std_m) else dict.fromkeys(("shift_xy_m", "shift_std_m", "shifted_misfit_m"))
     return convert_record(
         found,
         MapRegistration,
-        **untold,
+        **unknown,
         run_id=run_id,
         height_scale=found.scale.value if found.scale.is_known else None,
         height_scale_std=found.scale.std if found.scale.is_known else None,
         expected_misfit_m=expected_m,
     )
-
-
-_TRACK_COLUMNS = (
-    *("stamp_ns", "epoch", "x_m", "y_m", "z_m", "east_velocity_mps", "north_velocity_mps", "up_velocity_mps"),
-    *("lon_deg", "lat_deg", "pitch_rad", "forward_velocity_mps", "dropped_by"),
-)
-_SLOPES_DEG = (-10.0, -5.0, -2.0, 2.0, 5.0, 10.0)
-_SLOPE_NAMES = ("below -10°", "-10° to -5°", "-5° to -2°", "-2° to 2°", "2° to 5°", "5° to 10°", "above 10°")
-_REASONS = ("in_samples", *(flag_name(bit) for bit in DropReason), "curved_or_leftover", "not_sampled")
-"""Reason of each metre of a track; what is lost at sampling or to the split's buffer is one entry."""
-_LEFT_OVER, _NOT_SAMPLED = len(_REASONS) - 2, len(_REASONS) - 1
-
-
-_Ground = tuple[MapFile, Projection]
-"""A map, and how places get onto it."""
 
 
 def find_removed_by_ground(
@@ -152,15 +141,10 @@ def find_removed_by_ground(
     sources: Sequence[MapFile],
     recipe: Recipe,
 ) -> tuple[Removal, tuple[Finding, ...]]:
-    """Return where the metres of all runs went, by the class under them and the slope along them, and where that is not even.
+    """Return metres of all runs by reason, for each class and slope, and findings where the used share is uneven.
 
-    Parameters
-    ----------
-    runs : the runs of the dataset, with their tracks.
-    segments : all segments that could become samples.
-    used : rows of those that are train, test or unseen.
-    sources : the maps, the first ruling where they overlap; without a terrain layer there are no classes.
-    recipe : ``read.gnss_crs`` rules.
+    ``used`` are the rows of ``segments`` that are train, test or unseen. Of overlapping ``sources`` the first counts; maps without a
+    terrain layer give no classes.
     """
     grounds = [
         (source, find_map_projection(source, recipe.read.gnss_crs)) for source in sources if "terrain" in source.layers
@@ -181,7 +165,7 @@ def find_removed_by_ground(
 
 
 class _Spans:
-    """Start and end of every segment of a run, in order, and whether it is in use."""
+    """Start and end of every segment of a run, in order, and whether it is used."""
 
     def __init__(self, segments: pa.Table, used: NDArray[np.int64]) -> None:
         is_used = np.zeros(segments.num_rows, np.bool_)
@@ -224,13 +208,13 @@ def _read_intervals(
 
 
 def _find_classes(grounds: Sequence[_Ground], lonlat_deg: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Return the class id under each point on the first map that has one there, else as `find_classes_at`; 0 without maps."""
-    found = np.full(len(lonlat_deg), OFF_THE_MAP if grounds else 0, np.int64)
+    """Return the class id under each point on the first map with one there, else as `find_classes_at`; 0 without maps."""
+    class_id = np.full(len(lonlat_deg), OFF_THE_MAP if grounds else 0, np.int64)
     for source, projection in grounds:
-        open_yet = found <= 0
-        here = find_classes_at(source, projection.forward(lonlat_deg[open_yet]))
-        found[open_yet] = np.maximum(here, found[open_yet])
-    return found
+        unknown = class_id <= 0
+        on_map = find_classes_at(source, projection.forward(lonlat_deg[unknown]))
+        class_id[unknown] = np.maximum(on_map, class_id[unknown])
+    return class_id
 
 
 def _find_bias(groups: Sequence[Group], kind: SubjectKind) -> list[Finding]:

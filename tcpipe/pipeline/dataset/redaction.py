@@ -1,4 +1,4 @@
-"""A dataset for the public: no names of logs, topics, paths, hosts or users, and everything moved by one offset that is kept nowhere."""
+"""Redacted datasets: no names of logs, topics, paths, hosts or users, and all places moved by one offset that is stored nowhere."""
 
 from __future__ import annotations
 
@@ -27,61 +27,64 @@ from tcpipe.tables.columns import read_lonlat_deg, to_floats
 from tcpipe.tables.findings import Finding, Subject
 
 PLANE = "+proj=tmerc +lat_0=0 +lon_0=0 +k=1 +x_0=0 +y_0=0 +datum=WGS84 +type=crs"
-"""Where a redacted dataset lies: the plane of its maps, laid down at 0° N 0° E with its grid north up."""
+"""Plane of a redacted dataset: that of its maps, moved to 0° N 0° E with grid north up."""
 
 REACH_DEG = 5.0
-"""No redacted dataset lies further from there."""
+"""Greatest distance of a redacted dataset from there."""
 
 _PLACE_M, _PLACE_DIGITS_DEG = 0.01, 7
-"""Places are told to a centimetre: finer, their distances would tell the scale of the maps' plane."""
+"""Places are rounded to a centimetre: finer, their distances would reveal the scale of the maps' plane."""
 
 _REDACTED_WITHIN_M = 0.1
-"""Of lon and lat lie x and y of a redacted dataset."""
+"""Greatest distance of x and y from lon and lat."""
 
 _SCALE_VARIES = 2e-5
-"""With height and place, about the mean that all are divided by."""
+"""Variation of the scale with height and place."""
 
 _MOST_SCALE = 0.005
-"""Of a metre of the maps' plane to one of the ground, from 1: beyond, the maps' own pixels would tell it."""
+"""Greatest deviation of the scale of the maps' plane from 1: beyond, the maps' own pixels would reveal it."""
 
 _ENDS, _AXES = ("start", "end"), ("lon", "lat")
 _KEPT_SUBJECTS = ("role", "class", "layer", "slope", "split")
 """Kinds of subjects whose names a redacted dataset has anyway."""
+
+_KEPT_SECTIONS = ("fuse", "gate", "segment", "label", "sample", "split", "covariates", "dataset")
+"""Sections of the recipe that name no topics, files or robots."""
 
 Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
 class Redaction:
-    """How runs, maps and places are told."""
+    """Public names and places of runs and maps."""
 
     gnss_crs: str
     map_crs: str
     origin_xy_m: tuple[float, float]
-    """Of the maps' plane: it becomes 0, 0."""
+    """Place in the maps' plane that becomes 0, 0."""
     scale: float
-    """Metres of the maps' plane to a metre of ``chord_m``, which has none of its plane."""
+    """Metres of the maps' plane to a metre of ``chord_m``."""
     height_m: float
-    """What is taken from heights of the maps."""
+    """Subtracted from heights of the maps."""
     runs: Mapping[str, str]
     maps: Mapping[str, str]
 
     def in_plane(self, lonlat_deg: Floats) -> Floats:
-        """Return where places (lon, lat) [deg], shape (..., 2), lie from the new origin, along the maps' grid, in metres of ground."""
+        """Return places (lon, lat) [deg], shape (..., 2), from the new origin along the maps' grid, in metres of ground."""
         return (_project_to_map(lonlat_deg, self.gnss_crs, self.map_crs) - self.origin_xy_m) / self.scale
 
     def placed(self, lonlat_deg: Floats) -> Floats:
-        """Return where places (lon, lat) [deg], shape (..., 2), are said to lie."""
+        """Return the public lon, lat [deg] of places (lon, lat) [deg], shape (..., 2)."""
         return _move_to_origin(self.in_plane(lonlat_deg))
 
     def segment_id(self, name: str, run_id: str) -> str:
-        """Return what a run's segment is called."""
+        """Return the public id of a run's segment."""
         return self.runs[run_id] + name[len(run_id) :]
 
     def table(self, samples: pa.Table) -> pa.Table:
-        """Return samples with the places and names that are told; courses and x, y are along the maps' grid.
+        """Return samples with public places and names; courses and x, y are along the maps' grid.
 
-        In its run's own frame x is towards the east: against the grid that would tell the meridian's convergence, and so the latitude.
+        In a run's own frame x is towards the east: against the grid that would reveal the meridian's convergence, and so the latitude.
         """
         ends = {end: self.in_plane(read_lonlat_deg(samples, end)) for end in _ENDS}
         columns: dict[str, Any] = {
@@ -118,12 +121,10 @@ def _project_to_map(lonlat_deg: Floats, gnss_crs: str, map_crs: str) -> Floats:
     return np.stack(to_map.transform(lonlat_deg[..., 0], lonlat_deg[..., 1]), axis=-1)
 
 
-def _scale(samples: SampleTable, gnss_crs: str, map_crs: str) -> float:
-    """Return how long a metre of chords is in the maps' plane, by least squares over all samples.
+def _estimate_scale(samples: SampleTable, gnss_crs: str, map_crs: str) -> float:
+    """Return the length of a metre of chords in the maps' plane, by least squares over all samples.
 
-    Raises
-    ------
-    DatasetError : so far from 1 that the extent of the maps in pixels would tell it.
+    `DatasetError` if it is so far from 1 that the extent of the maps in pixels would reveal it.
     """
     plane_chord = chord_chord = 0.0
     for piece in samples.pieces(ROWS_PER_GROUP):
@@ -147,7 +148,7 @@ def _move_to_origin(xy_m: Floats) -> Floats:
 
 
 def make_redaction(content: Content, inputs: Inputs, recipe: Recipe) -> Redaction:
-    """Return how a dataset is redacted; `DatasetError` where its maps lie in different planes, of which one offset makes none."""
+    """Return the redaction of a dataset; `DatasetError` if its maps have different CRS."""
     planes = {source.grid.crs for source in content.sources}
     if len(planes) > 1:
         raise DatasetError(
@@ -158,7 +159,7 @@ def make_redaction(content: Content, inputs: Inputs, recipe: Recipe) -> Redactio
     return Redaction(
         gnss_crs=gnss_crs,
         map_crs=map_crs,
-        scale=_scale(content.samples, gnss_crs, map_crs),
+        scale=_estimate_scale(content.samples, gnss_crs, map_crs),
         origin_xy_m=tuple(content.samples.centres_xy_m().mean(axis=0).tolist()),
         height_m=float(math.floor(np.min(heights_m))),
         runs={run.run_id: f"run{number:04}-{run.sha256[:8]}" for number, run in enumerate(inputs.sources, 1)},
@@ -167,10 +168,10 @@ def make_redaction(content: Content, inputs: Inputs, recipe: Recipe) -> Redactio
 
 
 def redact_content(content: Content, redaction: Redaction) -> Content:
-    """Return content whose samples have the names and places that are told."""
+    """Return content whose samples have public names and places."""
     sampled = content.samples.sampled
     footprints = replace(redaction, gnss_crs="EPSG:4326").placed(sampled.footprint_lonlat_deg)
-    added = content.samples.added  # the meanings of its columns name files
+    added = content.samples.added  # descriptions of its columns name files
     bare = pa.schema([field.with_metadata({"unit": "", "doc": ""}) for field in added.schema])
     sampled = replace(sampled, footprint_lonlat_deg=footprints)
     samples = replace(content.samples, sampled=sampled, added=added.cast(bare), redaction=redaction)
@@ -178,13 +179,13 @@ def redact_content(content: Content, redaction: Redaction) -> Content:
 
 
 def redact_inputs(inputs: Inputs, redaction: Redaction) -> Inputs:
-    """Return inputs whose runs are called as is told, without what their logs are called."""
+    """Return inputs whose runs have public names, without names of logs."""
     runs = tuple(replace(run, run_id=redaction.runs[run.run_id], logs=(), tags=None) for run in inputs.sources)
     return replace(inputs, sources=runs)
 
 
 def redact_findings(findings: Iterable[Finding]) -> tuple[Finding, ...]:
-    """Return findings with what the catalogue calls public alone: other numbers and names, subjects and remedies may name anything."""
+    """Return findings with the fields that the catalogue calls public."""
     return tuple(map(_redact_finding, findings))
 
 
@@ -202,18 +203,18 @@ def _redact_finding(finding: Finding) -> Finding:
 
 
 def redact_card(card: DatasetCard, redaction: Redaction) -> DatasetCard:
-    """Return a card, made from redacted inputs and samples, without what is left in it of names and places."""
+    """Return a card, made from redacted inputs and samples, without other names and places."""
     region = card.split.region
-    told = None if region is None else {kind: _move_polygon(of, redaction) for kind, of in region.items()}
+    moved = None if region is None else {kind: _move_polygon(of, redaction) for kind, of in region.items()}
     bare = replace(Recipe(), **{name: getattr(card.recipe, name) for name in _KEPT_SECTIONS})
-    findings, maps = redact_findings(card.findings), tuple(_map(source, redaction) for source in card.maps)
+    findings, maps = redact_findings(card.findings), tuple(_redact_map(source, redaction) for source in card.maps)
     runs = tuple(replace(run, findings=redact_findings(run.findings)) for run in card.runs)
     return replace(
         card,
         recipe=bare,
         run_tags=None,
         split=replace(
-            card.split, region=told, audit=tuple(_convert_distances(of, redaction.scale) for of in card.split.audit)
+            card.split, region=moved, audit=tuple(_convert_distances(of, redaction.scale) for of in card.split.audit)
         ),
         label=replace(card.label, includes=()),
         runs=runs,
@@ -225,17 +226,13 @@ def redact_card(card: DatasetCard, redaction: Redaction) -> DatasetCard:
     )
 
 
-_KEPT_SECTIONS = ("fuse", "gate", "segment", "label", "sample", "split", "covariates", "dataset")
-"""Of the recipe: the others tell topics, files and robots by name."""
-
-
 def _convert_distances(held: HeldOut, scale: float) -> HeldOut:
-    """Return what the audit found with its distances in metres of ground."""
+    """Return an entry of the audit with distances in metres of ground."""
     names = [of.name for of in fields(held) if of.name.endswith("_m") and getattr(held, of.name) is not None]
     return replace(held, **{name: getattr(held, name) / scale for name in names})
 
 
-def _map(source: MapSource, redaction: Redaction) -> MapSource:
+def _redact_map(source: MapSource, redaction: Redaction) -> MapSource:
     low, high = source.height_min_m, source.height_max_m
     x_m, y_m = redaction.origin_xy_m
     return replace(
@@ -259,7 +256,7 @@ def _move_polygon(polygon: PolygonGeometry, redaction: Redaction) -> PolygonGeom
 
 
 def redact_features(collection: FeatureCollection, redaction: Redaction) -> FeatureCollection:
-    """Return polygons (WGS84) where they are said to lie: whole cells of the maps' plane, which divided would tell its scale."""
+    """Return polygons (WGS84) at public places: whole cells of the maps' plane, since a scale would reveal itself."""
     redaction = replace(redaction, scale=1.0)
     features = (replace(of, geometry=_move_polygon(of.geometry, redaction)) for of in collection.features)
     return replace(collection, features=tuple(features))
@@ -273,45 +270,36 @@ def move_coordinates(coordinates: Any, move: Callable[[Floats], Floats]) -> Any:
 
 
 def find_leaks(card: DatasetCard, samples: pa.Table) -> Iterator[str]:
-    """Yield a line for each thing that a redacted dataset tells and should not; ``samples`` has where their ends lie."""
+    """Yield a line for each secret that a redacted dataset reveals."""
+    return (f"it is said to be redacted, but {leak}" for leak in _iterate_leaks(card, samples))
+
+
+def _iterate_leaks(card: DatasetCard, samples: pa.Table) -> Iterator[str]:
     for end in _ENDS:
         lon, lat, x_m, y_m = (to_floats(samples, f"{end}_{name}") for name in ("lon_deg", "lat_deg", "x_m", "y_m"))
         plane_x_m, plane_y_m = _make_transformer("EPSG:4326", PLANE).transform(lon, lat)
         if (np.hypot(x_m - plane_x_m, y_m - plane_y_m) > _REDACTED_WITHIN_M).any():
-            yield (
-                f"it is said to be redacted, but {end}_x_m and {end}_y_m are not along its lon and lat: their angle tells the latitude; "
-                "build it again"
-            )
-        for axis in _AXES:
-            if (np.abs(to_floats(samples, f"{end}_{axis}_deg")) > REACH_DEG).any():
-                yield f"it is said to be redacted, but {end}_{axis}_deg is beyond {REACH_DEG:g} degrees"
-    elsewhere = [source for source in card.maps if source.crs != PLANE]
-    yield from (f"it is said to be redacted, but map {source.name} has the CRS {source.crs}" for source in elsewhere)
+            yield f"{end}_x_m and {end}_y_m are not along its lon and lat: their angle tells the latitude; build it again"
+        for axis, degrees in zip(_AXES, (lon, lat), strict=True):
+            if (np.abs(degrees) > REACH_DEG).any():
+                yield f"{end}_{axis}_deg is beyond {REACH_DEG:g} degrees"
+    yield from (f"map {source.name} has the CRS {source.crs}" for source in card.maps if source.crs != PLANE)
     named = [run.run_id for run in card.runs if run.logs or not re.fullmatch(r"run\d{4,}-[0-9a-f]+", run.run_id)]
-    yield from (f"it is said to be redacted, but tells what the log of run {name} is called" for name in named)
-    yield from _find_revealed_scale(samples)
-    texts = [text for text in (*card.label.includes, *card.added_columns.values()) if text]
-    yield from (f"it is said to be redacted, but tells {text!r}" for text in texts)
+    yield from (f"tells what the log of run {name} is called" for name in named)
+    ratio, _, most = compute_plane_per_chord(samples)
+    if abs(ratio - 1.0) > max(most, _SCALE_VARIES):
+        yield f"distances are {ratio:.6f} of chord_m: the scale of the maps' plane tells the place; build it again"
+    yield from (f"tells {text!r}" for text in (*card.label.includes, *card.added_columns.values()) if text)
     reasons = card.verdict.reasons if card.verdict else ()
     every = (card.findings, reasons, *card.findings_by_run.values(), *card.findings_by_map.values())
     revealing = [finding.code for findings in every for finding in findings if _redact_finding(finding) != finding]
-    yield from (f"it is said to be redacted, but a finding {code} holds more than is public" for code in revealing)
-
-
-def _find_revealed_scale(samples: pa.Table) -> Iterator[str]:
-    """Yield a line where distances of ends are not those of the chords, beyond what rounding places leaves."""
-    ratio, _, most = compute_plane_per_chord(samples)
-    if abs(ratio - 1.0) > max(most, _SCALE_VARIES):
-        yield (
-            f"it is said to be redacted, but distances are {ratio:.6f} of chord_m: the scale of the maps' plane tells the place; "
-            "build it again"
-        )
+    yield from (f"a finding {code} holds more than is public" for code in revealing)
 
 
 def compute_plane_per_chord(samples: pa.Table) -> tuple[float, float, float]:
-    """Return how long a metre of ``chord_m`` is in x and y, the standard deviation that rounding leaves, and the most; without samples inf.
+    """Return the length of a metre of ``chord_m`` in x and y, its standard and its greatest error from rounding; inf without samples.
 
-    Segments that follow one another are added up: only their two outer ends are rounded.
+    Consecutive segments are added up: only their two outer ends are rounded.
     """
     samples = samples.sort_by([("run_id", "ascending"), ("start_ns", "ascending")])
     if not samples.num_rows:

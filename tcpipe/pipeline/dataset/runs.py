@@ -1,4 +1,4 @@
-"""Which runs of a store a dataset is made of: those of one robot and recipe that are as they were written, and what is left out and why."""
+"""The runs of a dataset: intact runs of one robot and recipe, and findings on excluded ones."""
 
 from __future__ import annotations
 
@@ -22,35 +22,38 @@ from tcpipe.tables.findings import Finding, Remedy, Subject, make_finding
 from tcpipe.tables.levels import DATA_MODEL_VERSION, Sensor
 
 CHOICE_CODES = frozenset({"run-damaged", "run-gone", "run-ingested-otherwise"})
-"""Findings on runs that belong in a dataset and are left out."""
+"""Findings on runs that are excluded though they belong in a dataset."""
 
 
 @dataclass(frozen=True, slots=True)
 class SelectedRuns:
-    """Runs of one robot and recipe, and what belongs to them but cannot be used."""
+    """Runs of one robot and recipe, and findings on excluded ones."""
 
     runs: tuple[RunDirectory, ...]
     logs: Mapping[str, LogOrigin]
-    """By run, what its run.json says of its log."""
+    """By run, its log in run.json."""
     missing: tuple[Finding, ...]
-    """On each run that belongs in and has no ingestion that could be used."""
+    """On each matching run without a usable ingestion."""
     damaged: tuple[Finding, ...]
-    """On each run that is not as it was written."""
+    """On each run whose files were changed or lost."""
     left_out: frozenset[str]
-    """The runs that those findings are about, and those that others have taken the place of."""
+    """Runs of those findings, and superseded runs."""
     findings: tuple[Finding, ...]
-    """On runs that nobody expects in the dataset: unfinished and superseded ones."""
+    """On superseded runs."""
 
 
 def choose_runs(
     store: Store, recipe: Recipe, *, state: State | None = None, robot: str | None, tags: Mapping[str, str]
 ) -> SelectedRuns:
-    """Return the runs to pool, those that carry all of the tags, each proved; two robots are never pooled unasked."""
+    """Return the runs with all of the tags, each verified; two robots are pooled only on request."""
     found, key = store.ingestions(state=state), ingest_key(recipe)
     mine = [run for run in found.finished if run.facts.ingest_key == key]
     if not mine:
         raise DatasetError(*_describe_no_runs(store, found))
-    runs, logs, damaged = _verify_runs(store, _select_one_robot(store, _select_tagged(store, mine, tags), robot))
+    candidates = _select_one_robot(store, _select_tagged(store, mine, tags), robot)
+    damaged = store.prove(candidates)
+    logs = {run.run_id: run.facts.log.source for run in candidates if run.facts.log and run.run_id not in damaged}
+    runs = [run for run in candidates if run.run_id in logs]
     known = {run.run_id for run in mine}
     for (run_id, recipe_id), line in found.damaged.items():
         if run_id not in known and _is_selected(found.rows[run_id, recipe_id], robot, tags):
@@ -61,30 +64,32 @@ def choose_runs(
         )
     if robot is None:
         _refuse_unlike(store, [run for run in runs if run.facts.robot == GENERIC])
-    settled = {*known, *damaged}
-    others = {run.run_id: run.recipe_id for run in found.finished if _is_selected(run.facts, robot, tags)}
-    older = {name: str(of.data_model_version) for name, of in found.outdated.items() if _is_selected(of, robot, tags)}
-    others, older = ({name: of for name, of in each.items() if name not in settled} for each in (others, older))
-    left_out = {*damaged, *others, *older}
-    otherwise = {run_id: {"what": "recipe", "has": of} for run_id, of in others.items()}
-    otherwise |= {run_id: {"what": "data_model", "has": of} for run_id, of in older.items()}
+    otherwise = {
+        run.run_id: {"what": "recipe", "has": run.recipe_id}
+        for run in found.finished
+        if _is_selected(run.facts, robot, tags)
+    }
+    otherwise |= {
+        run_id: {"what": "data_model", "has": str(outdated.data_model_version)}
+        for run_id, outdated in found.outdated.items()
+        if _is_selected(outdated, robot, tags)
+    }
+    otherwise = {run_id: names for run_id, names in otherwise.items() if run_id not in {*known, *damaged}}
     nothing: dict[str, str] = {}
     missing = tuple(_find_left_out(found, "run-ingested-otherwise", otherwise))
     broken = tuple(_find_left_out(found, "run-damaged", dict.fromkeys(damaged, nothing), force=True))
-    superseded = frozenset(left_out | found.superseded.keys())
-    return SelectedRuns(tuple(runs), logs, missing, broken, superseded, tuple(_find_expected(found)))
-
-
-def _find_expected(found: Ingestions) -> Iterator[Finding]:
-    """Yield a finding on each run that another has taken the place of."""
-    for run_id, by in found.superseded.items():
-        yield make_finding("run-superseded", Subject("run", run_id), names={"by": by})
+    excluded = frozenset({*damaged, *otherwise, *found.superseded})
+    superseded = tuple(
+        make_finding("run-superseded", Subject("run", run_id), names={"by": by})
+        for run_id, by in found.superseded.items()
+    )
+    return SelectedRuns(tuple(runs), logs, missing, broken, excluded, superseded)
 
 
 def _find_left_out(
     found: Ingestions, code: str, names: Mapping[str, Mapping[str, str]], *, force: bool = False
 ) -> Iterator[Finding]:
-    """Yield a finding on each run, of which ``names`` holds what the finding names, with the command that ingests their logs again."""
+    """Yield a finding on each run of ``names``, with the command that ingests their logs again."""
     command = f"tcpipe ingest {_suggest_logs(found, names)}{' --force' if force else ''}" if names else ""
     for run_id in sorted(names):
         subject, remedy = Subject("run", run_id), Remedy("ingest", command=command)
@@ -102,7 +107,7 @@ def _select_one_robot(store: Store, runs: list[RunDirectory], robot: str | None)
 
 
 def _refuse_unlike(store: Store, runs: Iterable[RunDirectory]) -> None:
-    """Raise an error where runs of a robot that no profile knows are of robots whose sensors differ."""
+    """Raise an error if runs of the generic robot have different sensors."""
     groups = group_similar_runs({run.run_id: run.facts.log.sensors if run.facts.log else {} for run in runs})
     if len(groups) > 1:
         raise DatasetError(
@@ -113,7 +118,7 @@ def _refuse_unlike(store: Store, runs: Iterable[RunDirectory]) -> None:
 
 
 def _select_tagged(store: Store, runs: list[RunDirectory], tags: Mapping[str, str]) -> list[RunDirectory]:
-    """Return the runs that carry all of the tags; `DatasetError` with the tags there are where none does."""
+    """Return the runs with all of the tags; `DatasetError` lists all tags if there is none."""
     chosen = [run for run in runs if tags.items() <= run.facts.tags.items()]
     if not chosen:
         wanted = " ".join(f"{key}={value}" for key, value in tags.items())
@@ -123,7 +128,7 @@ def _select_tagged(store: Store, runs: list[RunDirectory], tags: Mapping[str, st
 
 
 def _describe_no_runs(store: Store, found: Ingestions) -> list[str]:
-    """Say why no run of the store can be used."""
+    """Return why no run of the store can be used."""
     if not (found.finished or found.outdated or found.damaged):
         return [f"{store.root}: no runs in the store; ingest one: tcpipe ingest LOG"]
     head = ""
@@ -141,20 +146,8 @@ def _describe_no_runs(store: Store, found: Ingestions) -> list[str]:
     return [*([f"{store.root}: {head}"] if head else []), *dict.fromkeys(found.damaged.values())]
 
 
-def _verify_runs(
-    store: Store, runs: Sequence[RunDirectory]
-) -> tuple[list[RunDirectory], dict[str, LogOrigin], dict[str, str]]:
-    """Return the runs that are as they were written, what is known of their logs, and by run what is wrong with the others."""
-    damaged = store.prove(runs)
-    logs = dict[str, LogOrigin]()
-    for run in runs:
-        if run.facts.log is not None and run.run_id not in damaged:
-            logs[run.run_id] = run.facts.log.source
-    return [run for run in runs if run.run_id in logs], logs, damaged
-
-
 def _is_selected(known: RunFacts | RunSource, robot: str | None, tags: Mapping[str, str]) -> bool:
-    """Tell whether a run is of the robot and the tags that were asked for, as far as is known."""
+    """Return whether a run has the requested robot and tags, as far as they are known."""
     its_robot = robot is None or known.robot == robot
     return its_robot and (known.tags is None or tags.items() <= known.tags.items())
 
@@ -166,7 +159,7 @@ def _format_names(run_ids: Iterable[str], most: int = 3) -> str:
 
 
 def _suggest_logs(found: Ingestions, run_ids: Iterable[str]) -> str:
-    """Return what to give to `tcpipe ingest` for the logs of runs: their folder, where they have one in common."""
+    """Return an argument of `tcpipe ingest` for the logs of runs: their common folder, or LOG..."""
     names = set(run_ids)
     logs = [row.log.source for row in found.rows.values() if row.log and row.run_id in names]
     paths = [path for log in logs for path in log.paths]
@@ -180,24 +173,20 @@ def _suggest_logs(found: Ingestions, run_ids: Iterable[str]) -> str:
 def find_gone_runs(
     before: Sequence[RunSource], chosen: SelectedRuns, *, robot: str | None, tags: Mapping[str, str]
 ) -> tuple[Finding, ...]:
-    """Return a finding on each run of the dataset that is replaced which the store no longer has, if it was not left out by choice."""
+    """Return a finding on each matching run of the replaced dataset that the store no longer has."""
     here = {run.run_id for run in chosen.runs} | chosen.left_out
     gone = [run.run_id for run in before if run.run_id not in here and _is_selected(run, robot, tags)]
     return tuple(make_finding("run-gone", Subject("run", run_id)) for run_id in sorted(gone))
 
 
 Seen = dict[str, tuple[str, str, str]]
-"""By role: a sensor's topic, its type and its frame, as far as a run shows them."""
+"""By role: topic, type and frame of a sensor."""
 
 
 def group_similar_runs(sensors: Mapping[str, Mapping[str, Sensor | KnownSensor]]) -> list[tuple[list[str], Seen]]:
-    """Return groups of runs, and what is seen of each, so that all sensors within one agree in type, frame and namespace.
+    """Return groups of runs whose sensors, by run and role, agree in type, frame and namespace, and the sensors of each group.
 
     A run belongs to the first group with which it shares a role and differs in none: a sensor may be off for a drive.
-
-    Parameters
-    ----------
-    sensors : by run and role, what its run.json says of the sensor.
     """
     groups: list[tuple[list[str], Seen]] = []
     seen = {run_id: _seen(of) for run_id, of in sensors.items()}
@@ -214,7 +203,7 @@ def group_similar_runs(sensors: Mapping[str, Mapping[str, Sensor | KnownSensor]]
 
 
 def format_robot(seen: Seen) -> str:
-    """Return what is seen of a robot as one line."""
+    """Return the sensors of a robot as one line."""
     parts = (f"{role} {topic} ({kind}, frame {frame or 'none'})" for role, (topic, kind, frame) in sorted(seen.items()))
     return ", ".join(parts) or "no sensor is known"
 
@@ -228,6 +217,6 @@ def _is_similar(one: tuple[str, str, str], other: tuple[str, str, str]) -> bool:
 
 
 def _is_in_two_namespaces(one: str, other: str) -> bool:
-    """Return whether two topics are one but for what their names begin with: /imu, /rover1/imu and /rover2/imu."""
+    """Return whether two topics differ only in their namespace, as /imu, /rover1/imu and /rover2/imu."""
     a, b = one.strip("/").split("/"), other.strip("/").split("/")
     return a != b and (a[1:] == b or a == b[1:] or (a[1:] == b[1:] and len(a) > 1))

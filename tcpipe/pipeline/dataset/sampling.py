@@ -1,7 +1,8 @@
-"""Segments of all runs to patches in one file a layer: batch by batch, each batch a patch of ground, side by side."""
+"""Sampling segments of all runs: batches of near segments in parallel, their pixels in a spool until the dataset is written."""
 
 from __future__ import annotations
 
+import itertools
 import logging
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -43,7 +44,7 @@ _ROW_BITS = 32
 _ROW_MASK = (1 << _ROW_BITS) - 1
 
 _CELL_DEG = 1e-4
-"""Batches follow a space-filling curve over cells of this size, so that a map tile is decoded for few of them."""
+"""Batches follow a space-filling curve over cells of this size, so that few batches decode a map tile."""
 
 _PLACING = ("map_index", "footprint_xy_m", "footprint_lonlat_deg")
 _SAMPLED = ("kept", "lost_by", *_PLACING)
@@ -53,89 +54,82 @@ _SIZE_BYTES = 8
 _HELD_MAPS = 2
 """Maps that a process keeps open, with their tiles, from batch to batch: 0.3 GB."""
 
-
 MapPlaces = Callable[[], tuple[tuple[Path, FetchedShards | None], ...]]
-"""What `open_map` takes on the machine that asks, in order of priority; picklable."""
+"""Returns arguments of `open_map` on any machine, in order of priority; picklable."""
 
 
 @dataclass(frozen=True, slots=True)
 class Workers:
-    """Who samples and writes: processes side by side, or the workers of the Dask scheduler at an address."""
+    """Local processes, or the workers of the Dask scheduler at an address; they see both places."""
 
     jobs: int
     cluster: str | None
     waiting: Place
-    """Where pixels wait, and what else a dataset is put together from; a cluster's workers see it."""
+    """The spool."""
     out: Place
-    """Where shards are written; they see that, too."""
+    """For shards."""
 
 
 @dataclass(frozen=True, slots=True)
 class Spool:
-    """Pixels that wait for their place in the dataset: one file a batch, one layer after another, in the order of the dataset.
+    """Pixels of sampled batches: one file a batch, one layer after another, in the order of the dataset.
 
-    What is read together, a stretch of the dataset, is then one stretch of every file: shuffled on disk, never held in memory, and in a
-    bucket as good as in a directory. A slot is the number of a batch (upper 32 bits) and a row of its file.
+    A span of the dataset is then one span of every file: shuffled on disk, never in memory, in a bucket as in a directory. A slot is the
+    number of a batch (upper 32 bits) and a row of its file.
 
-    Where the spool is ``kept``, what else is said of a batch stands behind its pixels, then the size of that (8 bytes). Of two workers that
-    sample one batch the first is believed, and after a killed build the next one goes on with what is there.
+    In a ``kept`` spool the other results of a batch follow its pixels, then their size (8 bytes). Of two workers that sample one batch the
+    first one's file stays; after a killed build the next one continues.
     """
 
     place: Place
     layers: Mapping[str, Layer]
     patch_px: int
     kept: bool = False
-    """Whether it outlives a build that is killed."""
+    """Whether it survives a killed build."""
     counts: tuple[int, ...] = ()
     """Patches by batch."""
 
     def write(self, batch: int, order: NDArray[np.intp], sampled: Sampled) -> Sampled:
-        """Write the patches of a batch, in an order of its rows, (n,); return what is said of them, without their pixels."""
+        """Write the patches of a batch in an order of its rows, (n,); return the results without pixels."""
         pixels, bare = sampled.patches.pixels, replace(sampled, patches=replace(sampled.patches, pixels={}))
         waiting = [np.ascontiguousarray(pixels[layer][order]).data for layer in self.layers]
         if not self.kept:
             self.place.put(f"{batch}", b"".join(waiting), lasting=False)
             return bare
-        said = _as_bytes(bare)
-        self.place.put_new(f"{batch}", b"".join((*waiting, said, len(said).to_bytes(_SIZE_BYTES, "little"))))
-        return self.found(batch) or bare
+        results = _as_bytes(bare)
+        self.place.put_new(f"{batch}", b"".join((*waiting, results, len(results).to_bytes(_SIZE_BYTES, "little"))))
+        return self.find(batch) or bare
 
-    def found(self, batch: int) -> Sampled | None:
-        """Return what is said of a batch that lies here whole; one of which a part is here goes."""
+    def find(self, batch: int) -> Sampled | None:
+        """Return the results of a complete batch in the spool; delete an incomplete one."""
         name = f"{batch}"
         size = self.place.size(name) if self.kept else None
         if size is None:
             return None
         end = max(size - _SIZE_BYTES, 0)
-        said = int.from_bytes(self.place.read_range(name, end, _SIZE_BYTES), "little")
+        more = int.from_bytes(self.place.read_range(name, end, _SIZE_BYTES), "little")
         try:
-            sampled = _read_sampled(self.place.read_range(name, max(end - said, 0), min(said, end)))
+            sampled = _read_sampled(self.place.read_range(name, max(end - more, 0), min(more, end)))
         except (ValueError, OSError, EOFError, KeyError, BadZipFile):
             sampled = None
-        if sampled is None or size != len(sampled.kept) * sum(map(self._patch_bytes, self.layers)) + said + _SIZE_BYTES:
+        if sampled is None or size != len(sampled.kept) * sum(map(self._patch_bytes, self.layers)) + more + _SIZE_BYTES:
             self.place.delete(name)
             return None
         return sampled
 
     def read(self, layer: str, slots: NDArray[np.int64]) -> LayerPixels:
-        """Return the patches in ``slots``, shape (n, px, px); of each batch one stretch is read."""
-        dtype, made = self.layers[layer].stored, np.empty((len(slots), *self._shape), self.layers[layer].stored)
+        """Return the patches in ``slots``, shape (n, px, px); one span is read of each batch."""
+        dtype, shape, each = self.layers[layer].stored, (self.patch_px, self.patch_px), self._patch_bytes(layer)
+        patches = np.empty((len(slots), *shape), dtype)
+        before = sum(self._patch_bytes(name) for name in itertools.takewhile(lambda name: name != layer, self.layers))
         order = np.argsort(slots, kind="stable")
         batches, rows = slots[order] >> _ROW_BITS, slots[order] & _ROW_MASK
-        for stretch in np.split(np.arange(len(slots)), np.flatnonzero(np.diff(batches)) + 1) if len(slots) else []:
-            batch, first, last = int(batches[stretch[0]]), int(rows[stretch[0]]), int(rows[stretch[-1]])
-            each = self._patch_bytes(layer)
-            start = self.counts[batch] * sum(self._patch_bytes(name) for name in self._before(layer)) + first * each
+        for span in np.split(np.arange(len(slots)), np.flatnonzero(np.diff(batches)) + 1) if len(slots) else []:
+            batch, first, last = int(batches[span[0]]), int(rows[span[0]]), int(rows[span[-1]])
+            start = self.counts[batch] * before + first * each
             data = self.place.read_range(f"{batch}", start, (last - first + 1) * each)
-            made[order[stretch]] = np.frombuffer(data, dtype).reshape(-1, *self._shape)[rows[stretch] - first]
-        return made
-
-    @property
-    def _shape(self) -> tuple[int, int]:
-        return self.patch_px, self.patch_px
-
-    def _before(self, layer: str) -> Sequence[str]:
-        return list(self.layers)[: list(self.layers).index(layer)]
+            patches[order[span]] = np.frombuffer(data, dtype).reshape(-1, *shape)[rows[span] - first]
+        return patches
 
     def _patch_bytes(self, layer: str) -> int:
         return self.patch_px**2 * self.layers[layer].stored.itemsize
@@ -159,16 +153,16 @@ class _HeldMap:
 
 
 _held: OrderedDict[Path, _HeldMap] = OrderedDict()
-"""Of this process, while it samples."""
+"""Maps of this process, while it samples."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Batches(Sequence[_Batch]):
-    """The batches, each made when it is asked for, so that one copy of its segments exists at a time."""
+    """Batches that are made on access, so that one copy of their segments exists at a time."""
 
     rows: Sequence[NDArray[np.int64]]
     whole: _Batch
-    """All segments, as if they were one."""
+    """All segments as one batch."""
 
     def __len__(self) -> int:
         """Return the number of batches."""
@@ -196,28 +190,18 @@ def sample_all_segments(
     gnss_crs: str,
     workers: Workers,
 ) -> tuple[Sampled, NDArray[np.int64], Spool]:
-    """Sample every segment from the first map that has data for it; pixels go to files where they wait, the rest is returned.
+    """Sample each of M segments from the first map with data for it; return the results, slots in the order of ``kept``, and the spool.
 
-    Beside it, in the order of its ``kept``, which rises: the slots of the spool.
-
-    Parameters
-    ----------
-    segments : M segments, of any runs.
-    ranks : their ranks in the dataset's order, uniform over 64 bits, shape (M,).
-    maps, config, gnss_crs : what is sampled, in order of priority, how, and the CRS of the segments' positions.
-    workers : who samples; they see the maps.
-
-    Raises
-    ------
-    TcpipeError : the map or the segments cannot be used.
+    ``ranks`` give the dataset's order, uniform over 64 bits, shape (M,); ``gnss_crs`` is the CRS of the segments' positions.
+    `TcpipeError` if the map or the segments cannot be used.
     """
     sources = [open_map(*of) for of in maps()]
     check_same_layers(sources)
     rows = list(_iterate_batches(segments))
     layers = sort_layers(join_layers([source.layers for source in sources]))
     spool = Spool(workers.waiting.below("pixels"), layers, config.patch_px, kept=workers.cluster is not None)
-    if there := len(spool.place.files()):
-        logger.info("going on where it was: %d of %d batches are sampled", there, len(rows))
+    if count := len(spool.place.files()):
+        logger.info("going on where it was: %d of %d batches are sampled", count, len(rows))
     placed = segments.select(PLACED_SEGMENTS.names())
     batches = _Batches(rows, _Batch(0, ranks, placed, maps, config, gnss_crs, spool))
     lost_by, slots = np.zeros(segments.num_rows, np.uint32), np.zeros(segments.num_rows, np.int64)
@@ -268,7 +252,7 @@ def _sort_rows(ranks: NDArray[np.uint64]) -> NDArray[np.intp]:
 
 
 def _make_columns(sampled: Sampled) -> dict[str, NDArray[Any]]:
-    """Return what is said of the patches, an array each."""
+    """Return the columns of the patches by name."""
     return {**sampled.patches.columns(), **{name: getattr(sampled, name) for name in _PLACING}}
 
 
@@ -281,10 +265,10 @@ def _iterate_batches(segments: pa.Table) -> Iterator[NDArray[np.int64]]:
 
 
 def _sample_batch(batch: _Batch) -> Sampled | TcpipeError:
-    """Sample one batch; its pixels go to its file of the spool."""
+    """Sample one batch; write its pixels to the spool."""
     try:
-        if (found := batch.spool.found(batch.number)) is not None:
-            return found
+        if (sampled := batch.spool.find(batch.number)) is not None:
+            return sampled
         held = [_reuse_map(*of, batch.config) for of in batch.maps()]
         sources, pools = [each.source for each in held], [each.tiles for each in held]
         sampled = sample_on_maps(batch.segments, sources, batch.config, gnss_crs=batch.gnss_crs, pools=pools)
@@ -294,7 +278,7 @@ def _sample_batch(batch: _Batch) -> Sampled | TcpipeError:
 
 
 def _reuse_map(path: Path, fetched: FetchedShards | None, config: SampleConfig) -> _HeldMap:
-    """Return a map as this process's last batch left it: the next one lies beside it and wants the same tiles."""
+    """Return a map with the tiles of this process's last batch: the next batch is near and needs the same ones."""
     held = _held.pop(path, None)
     if held is None:
         source = open_map(path, fetched)

@@ -1,10 +1,9 @@
-"""The split of sampled patches: regions carried into the map's plane, the holdout drawn, leakage measured."""
+"""The split of sampled patches: regions in the map's plane, the holdout, the leakage audit."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 import numpy as np
 import pyarrow as pa
@@ -14,12 +13,12 @@ from numpy.typing import NDArray
 from pyproj import CRS
 
 from tcpipe.errors import DatasetError
-from tcpipe.formats.dataset_card import KeptSplit
+from tcpipe.formats.dataset_card import KeptSplit, SplitResult
 from tcpipe.formats.geojson import PolygonGeometry
 from tcpipe.recipe import Recipe
 from tcpipe.recipe.suggestions import format_recipe_key
 from tcpipe.splits.assignment import EXCLUDED, NO_FOLD, Assignment, assign_splits, hash_ranks
-from tcpipe.splits.audit import HeldOut, audit_leakage
+from tcpipe.splits.audit import audit_leakage
 from tcpipe.splits.regions import Regions, project_regions
 from tcpipe.stages.sample import Sampled
 from tcpipe.tables.columns import to_integers
@@ -27,18 +26,7 @@ from tcpipe.terrain.grid import MapGrid
 from tcpipe.terrain.projection import Projection, compute_area, parse_crs
 
 _MARGIN_DEG = 0.05
-"""Regions are followed this far around the samples (3 km or more below 60° latitude)."""
-
-
-@dataclass(frozen=True, slots=True)
-class SplitResult:
-    """Split and fold of every patch, the buffer that was kept [m], the audit, and what an earlier dataset decided."""
-
-    assigned: Assignment
-    buffer_m: float
-    audit: tuple[HeldOut, ...]
-    kept: KeptSplit | None
-    """Samples whose split is an earlier dataset's, and those of it that are gone; None where none was to be kept."""
+"""Regions are cut this far around the samples (3 km or more below 60° latitude)."""
 
 
 def draw_splits(
@@ -50,22 +38,11 @@ def draw_splits(
     *,
     earlier: pa.Table | None = None,
     tags: Mapping[str, str] | None = None,
-) -> SplitResult:
-    """Assign every patch to a split by its whole footprint, and audit the result.
+) -> tuple[Assignment, SplitResult]:
+    """Assign every patch of ``sampled`` to a split by its whole footprint, and audit the result.
 
-    Parameters
-    ----------
-    segments : all segments that were sampled.
-    sampled : what became of them.
-    grid : the map's grid, for its CRS.
-    regions : in WGS84 lon/lat; None: everything is train and test.
-    recipe : its sections ``split`` and ``segment`` rule.
-    earlier : ``sample_id``, ``split`` and ``fold`` of a dataset whose samples keep their split.
-    tags : with the holdout ``tag``: its value by run.
-
-    Raises
-    ------
-    DatasetError : no footprint lies inside the region.
+    ``regions`` are in WGS84 lon/lat; None: everything is train and test. ``earlier`` has ``sample_id``, ``split`` and ``fold`` of a dataset
+    whose samples keep their split; ``tags`` the holdout's tag by run. `DatasetError` if no footprint lies inside the region.
     """
     rules, chord_m = recipe.split, recipe.segment.chord_m
     buffer_m = math.sqrt(2.0) * chord_m if rules.buffer_m is None else rules.buffer_m
@@ -97,7 +74,8 @@ def draw_splits(
     if kept is not None and earlier is not None:
         found = int((kept.split != "").sum())
         counts = KeptSplit(found, earlier.num_rows - found)
-    return SplitResult(assigned, buffer_m, audit, counts)
+    region = None if regions is None else regions_to_json(regions)
+    return assigned, SplitResult(buffer_m, region, audit, counts)
 
 
 def _number_runs(segments: pa.Table, starts_ns: NDArray[np.int64]) -> tuple[NDArray[np.int64], list[str]]:
@@ -120,7 +98,7 @@ def _number_values(run: NDArray[np.int64], values: list[str]) -> tuple[NDArray[n
 
 
 def _read_earlier_assignment(ids: pa.ChunkedArray, earlier: pa.Table) -> Assignment:
-    """Return what an earlier dataset says of each sample."""
+    """Return each sample's split and fold in an earlier dataset."""
     at = pc.index_in(ids, value_set=earlier.column("sample_id").combine_chunks())
     row = at.to_numpy(zero_copy_only=False)  # NaN where it is not there
     known = np.isfinite(row)
@@ -133,7 +111,7 @@ def _read_earlier_assignment(ids: pa.ChunkedArray, earlier: pa.Table) -> Assignm
 
 
 def regions_to_json(regions: Regions) -> dict[str, PolygonGeometry]:
-    """Return the regions as GeoJSON geometries by kind, as the card keeps them."""
+    """Return the regions as GeoJSON geometries by kind."""
     kinds = {"train_test": regions.train_test, "unseen": regions.unseen, "exclude": regions.exclude}
     return {
         kind: PolygonGeometry(**shapely.geometry.mapping(area))
@@ -145,17 +123,13 @@ def regions_to_json(regions: Regions) -> dict[str, PolygonGeometry]:
 def _project_regions(regions: Regions, grid: MapGrid, footprint_lonlat_deg: NDArray[np.float64]) -> Regions:
     crs = parse_crs(grid.crs, where="map")
     projection = Projection(CRS.from_epsg(4326), crs, compute_area(crs, grid.bounds_m))
-    return project_regions(regions, projection.forward, window_deg=_compute_window_deg(footprint_lonlat_deg))
-
-
-def _compute_window_deg(lonlat_deg: NDArray[np.float64]) -> tuple[float, float, float, float]:
-    west, south = lonlat_deg.min(axis=(0, 1)) - _MARGIN_DEG
-    east, north = lonlat_deg.max(axis=(0, 1)) + _MARGIN_DEG
-    return float(west), float(south), float(east), float(north)
+    west, south = (footprint_lonlat_deg.min(axis=(0, 1)) - _MARGIN_DEG).tolist()
+    east, north = (footprint_lonlat_deg.max(axis=(0, 1)) + _MARGIN_DEG).tolist()
+    return project_regions(regions, projection.forward, window_deg=(west, south, east, north))
 
 
 def _describe_nothing_inside(regions: Regions, lonlat_deg: NDArray[np.float64], split: NDArray[np.str_]) -> str:
-    """Say why no sample is inside, and what may be wrong with the region."""
+    """Return why no sample is inside the region, and what to change."""
     points = shapely.multipoints(lonlat_deg.mean(axis=1))
     lon, lat = lonlat_deg.mean(axis=(0, 1))
     near, excluded = int((split == "buffer").sum()), int((split == EXCLUDED).sum())

@@ -135,7 +135,7 @@ def test_what_cannot_be_read_is_said_in_one_line(path, tmp_path, name, error):
 
 def numbered(split):
     """The split with the samples' numbers for labels."""
-    split._labels = np.column_stack([np.arange(len(split))] * 2).astype(np.float32)
+    split.labels = np.column_stack([np.arange(len(split))] * 2).astype(np.float32)
     return split
 
 

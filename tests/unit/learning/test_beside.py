@@ -15,7 +15,7 @@ from tcpipe.learning.predictions import predict_costs
 from tcpipe.learning.training import train
 from tcpipe.pipeline.verify import verify
 
-real_column, real_labels = Split.column, Split.labels.fget
+real_column, real_labels = Split.column, Split.labels.func
 
 
 @pytest.fixture(scope="module")

@@ -12,6 +12,7 @@ import numpy as np
 import pyarrow.compute as pc
 import pyproj
 import pytest
+from installed_command import tcpipe
 from made_models import CARD, made_model
 from object_gateway import in_environment
 from page_reading import data_of, unpacked
@@ -235,7 +236,7 @@ def test_a_card_that_does_not_say_how_it_was_trained(dataset, tmp_path):
 
 
 def test_samples_without_a_label_are_counted(model, dataset, tmp_path, monkeypatch):
-    real = Split.labels.fget
+    real = Split.labels.func
     monkeypatch.setattr(
         Split,
         "labels",
@@ -322,3 +323,19 @@ def test_a_network_of_energy_alone_is_no_model_to_evaluate(dataset, tmp_path):
     )
     with pytest.raises(ModelError, match="it predicts energy_joule alone, wanted power_watt and velocity_mps"):
         run_evaluation(place, dataset, tmp_path / "evaluation", config=CONFIG)
+
+
+def test_the_ablation_can_be_retrained(model, dataset, tmp_path):
+    options = ("--retrain-ablation", "--no-baselines", "--noise-draws", "1", "--json", "--quiet")
+    done = tcpipe("evaluate", model, dataset, "evaluation", *options, cwd=tmp_path, env={"OMP_NUM_THREADS": "1"})
+    assert done.returncode in {0, 3}, done.stderr
+    rows = json.loads(done.stdout)["ablation"]
+    assert sorted("".join(row["layers"]) for row in rows if row["how"] == "retrained") == [
+        "C",
+        "CH",
+        "H",
+        "O",
+        "OC",
+        "OH",
+    ]
+    assert all(row["test"]["w"]["rmse"] > 0.0 for row in rows)

@@ -21,7 +21,7 @@ from tcpipe.store import open_store
 pytest.importorskip("lightgbm")
 
 CONFIG = EvaluateConfig(draws=1, baselines=False)
-real_column, real_labels = Split.column, Split.labels.fget
+real_column, real_labels = Split.column, Split.labels.func
 
 
 @pytest.fixture(scope="module")

@@ -190,7 +190,7 @@ def test_weights_count_what_is_certain(dataset, tmp_path, monkeypatch):
     """With all deviations alike weights change nothing; with one class's a hundred times larger they do."""
     config = replace(CONFIG, epochs=1)
     train(dataset, tmp_path / "plain", config=config)
-    real = Split.weights.fget
+    real = Split.weights.func
     monkeypatch.setattr(Split, "weights", property(lambda split: np.ones_like(real(split))))
     train(dataset, tmp_path / "alike", config=replace(config, weights=True))
     assert _same(_weights(tmp_path / "plain"), _weights(tmp_path / "alike"))
@@ -219,7 +219,7 @@ def test_what_cannot_be_trained_on(dataset, tmp_path, monkeypatch):
         train(dataset, tmp_path / "model", config=replace(CONFIG, fold=9))
     with pytest.raises(DatasetError, match="no labelled samples in split train"):
         make_training_task(open_dataset(dataset), 0, Variant(classes=(1,)))
-    real = Split.weights.fget
+    real = Split.weights.func
     monkeypatch.setattr(Split, "weights", property(lambda split: real(split) * np.array([1.0, 0.0])))
     with pytest.raises(DatasetError, match="no sample has a standard deviation of velocity_mps to weigh it by"):
         train(dataset, tmp_path / "model", config=replace(CONFIG, weights=True))
@@ -271,7 +271,7 @@ def test_pixels_without_data_are_not_seen(dataset, monkeypatch):
 
 
 def test_samples_without_a_label_are_left_out(dataset, monkeypatch):
-    real = Split.labels.fget
+    real = Split.labels.func
     monkeypatch.setattr(
         Split,
         "labels",

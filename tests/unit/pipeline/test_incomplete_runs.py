@@ -11,7 +11,6 @@ from synthetic_store import add_run, add_world, commit_run, lanes, segments, sup
 from wheel_drives import START_NS, drive_at
 
 from tcpipe.pipeline import report as reporting
-from tcpipe.pipeline.dataset import build as building
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.ingest import ingest
 from tcpipe.pipeline.inspect import inspect
@@ -55,7 +54,6 @@ def made(tmp_path_factory):
 @pytest.fixture(params=["directory", "bucket"])
 def place(request, made, tmp_path, monkeypatch):
     """A copy of the store: where its files lie here, and what it is called."""
-    monkeypatch.setattr(building, "render_dataset_report", lambda *_: "<!doctype html>")
     files = tmp_path / "served" / "sets" / "store"
     shutil.copytree(made / "store", files, copy_function=shutil.copy2)
     if request.param == "directory":
@@ -84,7 +82,11 @@ def lose(files: Path, pattern: str) -> Callable[[], None]:
     return put_back
 
 
-@pytest.mark.parametrize("lost", LOST)
+@pytest.mark.parametrize(
+    ("place", "lost"),
+    [*(("directory", lost) for lost in LOST), ("bucket", "the only manifest"), ("bucket", "a run")],
+    indirect=["place"],
+)
 def test_what_a_run_lost_is_a_problem_to_every_command_until_it_is_back(place, tmp_path, lost):
     files, root = place
     before, new = Store(root).state(), tmp_path / "new.mcap"

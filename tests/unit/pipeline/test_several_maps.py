@@ -19,6 +19,7 @@ from tcpipe.formats.maps.map_files import open_map
 from tcpipe.pipeline.dataset import sampling as dataset_sampling
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.recipe import Recipe
+from tcpipe.report.dataset_report import render_dataset_report
 from tcpipe.report.pictures import compute_joint_bounds_m, draw_maps
 from tcpipe.store import open_store
 
@@ -55,10 +56,7 @@ def store(tmp_path_factory):
 
 
 def build(store, out, names, **keywords):
-    """Build without the page, which takes nine tenths of the time; the last test draws it."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("tcpipe.pipeline.dataset.build.render_dataset_report", lambda *_: "<!doctype html>")
-        return build_dataset(out, store=store.root, map_name=names, recipe=Recipe(), **keywords)
+    return build_dataset(out, store=store.root, map_name=names, recipe=Recipe(), **keywords)
 
 
 @pytest.mark.parametrize("order", [("west", "east"), ("east", "west")])
@@ -156,7 +154,8 @@ def test_maps_are_held_open_only_while_samples_are_taken(store, tmp_path, monkey
     assert not dataset_sampling._held
 
 
-def test_the_option_may_be_repeated(store, tmp_path):
+def test_the_option_may_be_repeated(store, tmp_path, monkeypatch):
+    monkeypatch.setattr("tcpipe.pipeline.dataset.build.render_dataset_report", render_dataset_report)
     arguments = ["build-dataset", str(tmp_path / "out"), "--store", str(store.root), "--map", "west", "--map", "east"]
     result = CliRunner().invoke(cli, [*arguments, "--quiet", "--json"], catch_exceptions=False)
     assert result.exit_code == 0

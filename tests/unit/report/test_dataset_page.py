@@ -26,6 +26,8 @@ from tcpipe.report.label_sections import QUALITY_WORDS
 from tcpipe.store import open_store
 from tcpipe.tables.bits import Quality
 
+DRAWS_DATASET_PAGES = True
+
 
 @pytest.fixture(scope="module")
 def built(tmp_path_factory):

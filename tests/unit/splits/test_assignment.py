@@ -1,11 +1,26 @@
 """Who trains and who tests, on rows of footprints short enough to decide by hand."""
 
+import hashlib
+
 import numpy as np
 import pytest
 import shapely
 from splits_squares import squares
 
-from tcpipe.splits.assignment import NO_FOLD, Assignment, assign_splits, draw_groups, group_by_run
+from tcpipe.splits.assignment import (
+    NO_FOLD,
+    UNDECIDED,
+    Assignment,
+    Groups,
+    assign_blocks,
+    assign_splits,
+    draw_folds,
+    draw_groups,
+    draw_samples,
+    group_by_run,
+    hash_ranks,
+    order_ranks,
+)
 from tcpipe.splits.regions import Regions
 
 ROW = squares([(10.0 * i + 5.0, 5.0) for i in range(10)])
@@ -88,3 +103,151 @@ def test_runs_are_drawn_by_their_names():
     test, otherwise = (draw_groups(each, run, test_fraction=0.2, seed=0)[each.member] for each in (groups, others))
     assert (assigned(run=run, holdout="run").split == "test").tolist() == test.tolist()
     assert otherwise.tolist() != test.tolist()
+
+
+IDS = [f"run-{i:05d}" for i in range(1000)]
+
+
+def test_a_rank_is_the_hash_of_seed_and_name_and_nothing_else():
+    expected = hashlib.blake2b(b"7:run-00003", digest_size=8, person=b"test").digest()
+    assert int(hash_ranks(IDS, seed=7, purpose="test")[3]) == int.from_bytes(expected, "big")
+
+
+def ranks(names, seed=0):
+    return hash_ranks(names, seed=seed, purpose="test")
+
+
+@pytest.mark.parametrize(("n", "tests"), [(6428, 1286), (5, 1), (6, 2), (35, 7), (1, 1), (0, 0)])
+def test_test_is_the_ceiling_of_its_share(n, tests):  # 6428 is the paper's area A, 1286 its test set
+    for arrival in (np.zeros(n, int), np.arange(n) // 37, np.arange(n)[::-1] // 400):
+        assert draw_samples(ranks([str(i) for i in range(n)]), arrival, test_fraction=0.2).sum() == tests
+
+
+def test_test_holds_the_lowest_ranks_of_every_run():
+    found, run = ranks(IDS, seed=3), np.arange(1000) % 3
+    test = draw_samples(found, run, test_fraction=0.2)
+    for number in range(3):
+        assert found[test & (run == number)].max() < found[~test & (run == number)].min()
+        assert (test & (run == number)).sum() in (66, 67)
+
+
+def test_samples_that_are_kept_stay_and_the_rest_fills_up():
+    kept = np.full(1000, UNDECIDED)
+    kept[:150], kept[150:300] = 1, 0
+    for arrival in (np.zeros(1000, int), np.arange(1000) // 100, -np.arange(1000) // 100):
+        test = draw_samples(ranks(IDS), arrival, test_fraction=0.2, kept=kept)
+        assert test[:150].all()
+        assert not test[150:300].any()
+        assert test.sum() == 200
+
+
+def test_row_order_says_nothing_of_the_holdout():
+    order = np.argsort(order_ranks(IDS, seed=0))
+    test = draw_samples(ranks(IDS), np.zeros(1000, int), test_fraction=0.5)[order]
+    first = test[:500].sum()
+    assert 190 < first < 310  # 250 ± 4 sigma; equal salts would give 0 or 500
+    assert sorted(order.tolist()) == list(range(1000))
+
+
+def grouped(sizes):
+    """Groups of so many samples each."""
+    return Groups(np.repeat(np.arange(len(sizes)), sizes), tuple(f"g{i}" for i in range(len(sizes))))
+
+
+def drawn(groups, arrival=None, **keywords):
+    """Whether each sample tests."""
+    arrival = np.zeros(len(groups.member), int) if arrival is None else arrival
+    return draw_groups(groups, arrival, **{"test_fraction": 0.2, "seed": 0, **keywords})[groups.member]
+
+
+def test_blocks_that_are_far_apart_are_told_apart():
+    cells = [(0, 1), (1, 0), (32, 0), (-32, 2), (2**20, -(2**20)), (-(2**20), 2**20)]
+    found = assign_blocks(10.0 * np.array(cells) + 5.0, block_m=10.0)
+    assert [found.names[member] for member in found.member] == [f"10:{column}:{row}" for column, row in cells]
+
+
+def test_a_group_that_would_overshoot_is_passed_over():
+    for seed in range(20):
+        assert drawn(grouped([60, 20, 20]), seed=seed).sum() == 20
+
+
+def test_kept_groups_stay_as_they_are():
+    groups = grouped([10] * 20)
+    kept = np.full(20, UNDECIDED)
+    kept[:3], kept[3:] = 1, 0
+    assert drawn(groups, kept=kept).sum() == 30
+
+
+def test_a_fold_once_given_stays():
+    groups = grouped([7] * 30)
+    arrival = groups.member // 10
+    early = arrival == 0
+    first = draw_folds(Groups(groups.member[early], groups.names[:10]), arrival[early], folds=3, seed=0)
+    assert draw_folds(groups, arrival, folds=3, seed=0)[:10].tolist() == first.tolist()
+
+
+def test_the_majority_decides_for_a_group_an_even_vote_trains_and_without_a_vote_nothing_is_decided():
+    votes = np.array([1, 0, 1, UNDECIDED, 0, UNDECIDED, UNDECIDED])
+    assert grouped([3, 2, 2]).decided(votes).tolist() == [1, 0, UNDECIDED]
+    groups = grouped([2, 4])
+    assert groups.decided(np.array([1, 0, 2, 2, 1, 0])).tolist() == [0, 2]
+    assert groups.decided(np.full(6, UNDECIDED)).tolist() == [UNDECIDED, UNDECIDED]
+
+
+def test_a_cell_begins_at_its_border_and_holds_one_group_in_every_direction():
+    found = assign_blocks(np.array([[10.0, 0.0], [9.999, 0.0], [-10.0, -0.001], [-0.001, -10.0]]), block_m=10.0)
+    assert [found.names[member] for member in found.member] == ["10:1:0", "10:0:0", "10:-1:-1", "10:-1:-1"]
+    assert assign_blocks(np.zeros((0, 2)), block_m=10.0).names == ()
+
+
+def test_more_kept_than_wanted_draws_no_more():
+    kept = np.array([1, 1, 1, UNDECIDED, UNDECIDED])
+    assert (
+        draw_samples(np.arange(5)[::-1], np.zeros(5, int), test_fraction=0.2, kept=kept).tolist()
+        == [True] * 3 + [False] * 2
+    )
+    two_runs = np.array([0, 0, 0, 1, 1])
+    assert draw_samples(np.arange(5), two_runs, test_fraction=0.2, kept=kept).sum() == 3
+
+
+def test_what_a_run_cannot_give_the_lowest_ranks_of_all_make_up():
+    kept = np.array([UNDECIDED, UNDECIDED, UNDECIDED, 0, 0, 0])
+    test = draw_samples(np.array([2, 0, 1, 3, 4, 5]), np.array([0, 0, 0, 1, 1, 1]), test_fraction=0.5, kept=kept)
+    assert test.tolist() == [True, True, True, False, False, False]
+
+
+def test_a_group_that_brings_the_share_no_nearer_trains():
+    kept = np.array([1, UNDECIDED, UNDECIDED])
+    for seed in range(4):  # 10 test of 100, 20 are wanted: with 20 more it would be 30
+        assert drawn(grouped([10, 20, 70]), kept=kept, seed=seed).sum() == 10
+
+
+def test_at_least_one_tests_the_nearest_in_size_and_one_trains():
+    for seed in range(4):
+        assert drawn(grouped([60, 50, 90]), test_fraction=0.01, seed=seed).sum() == 50
+        assert drawn(grouped([1, 1, 1]), test_fraction=0.1, seed=seed).sum() == 1
+        assert drawn(grouped([10, 10, 10]), test_fraction=0.99, seed=seed).sum() == 20
+        assert drawn(grouped([50, 40]), seed=seed).sum() == 40
+    assert not drawn(grouped([10, 10]), kept=np.zeros(2, int), seed=0).any()
+    assert not drawn(grouped([5] * 10), test_fraction=0.0).any()
+    assert not drawn(grouped([9])).any()
+
+
+def test_a_run_counts_once_it_came():
+    arrival = np.repeat([0, 1], [30, 30])
+    test = drawn(grouped([15, 15, 15, 15]), arrival, test_fraction=0.5)
+    assert (test[:30].sum(), test[30:].sum()) == (15, 15)
+
+
+def test_folds_are_dealt_from_the_largest_on():
+    groups = grouped([1, 3, 5, 3])
+    fold = draw_folds(groups, np.zeros(12, int), folds=2, seed=0)
+    assert np.bincount(fold, weights=[1, 3, 5, 3]).tolist() == [6, 6]
+    assert (fold[2], fold[1], fold[3], fold[0]) == (0, 1, 1, 0)
+    kept = np.array([UNDECIDED, UNDECIDED, 1, UNDECIDED])
+    assert draw_folds(groups, np.zeros(12, int), folds=2, seed=0, kept=kept).tolist() == [1, 0, 1, 0]
+
+
+def test_runs_are_groups_by_their_names():
+    found = group_by_run(np.array([3, 1, 3]), ["a", "b", "c", "d"])
+    assert [found.names[member] for member in found.member] == ["d", "b", "d"]

@@ -37,9 +37,7 @@ def store(tmp_path_factory):
 
 
 def build(store, out, **keywords):
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("tcpipe.pipeline.dataset.build.render_dataset_report", lambda *_: "<!doctype html>")
-        return build_dataset(out, store=store.root, **{"recipe": Recipe(), **keywords})
+    return build_dataset(out, store=store.root, **{"recipe": Recipe(), **keywords})
 
 
 def weather(path, days=4):

@@ -15,6 +15,8 @@ from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.recipe import Recipe
 from tcpipe.store import open_store
 
+DRAWS_DATASET_PAGES = True
+
 CLOSED = box(-19, -19, -5, 19)
 NOISE_WATT = 7.0
 

@@ -1,7 +1,6 @@
 """Findings reach the dataset: those of runs by code, its own, and one verdict; the page shows the worst first."""
 
 import re
-from dataclasses import replace
 
 import numpy as np
 import pyarrow as pa
@@ -18,7 +17,9 @@ from tcpipe.pipeline.diff import diff
 from tcpipe.recipe import Recipe
 from tcpipe.store import open_store
 from tcpipe.tables.bits import Quality
-from tcpipe.tables.findings import Finding, Subject, is_problem, make_finding, select_findings
+from tcpipe.tables.findings import Finding, Subject, make_finding, select_findings
+
+DRAWS_DATASET_PAGES = True
 
 ROLE = Subject("role", "command")
 
@@ -77,13 +78,6 @@ def test_a_bit_that_every_sample_carries_is_not_counted():
     assert (found.samples, found.share, found.by_bit) == (1, 0.25, {"no_command": 4, "curved": 1})
     nothing = count_flagged(pa.chunked_array([pa.array([], pa.uint16())]))
     assert (nothing.samples, nothing.share, nothing.by_bit) == (0, 0.0, {})
-
-
-def test_a_problem_is_one_unless_it_was_made_a_note():
-    gone = make_finding("run-gone", Subject("run", "a"))
-    assert is_problem(gone)
-    assert not is_problem(replace(gone, severity="note"))
-    assert not is_problem(slow(0.6))
 
 
 def test_where_no_position_is_sure_enough_it_is_said_how_sure_and_what_ingest_found(tmp_path):

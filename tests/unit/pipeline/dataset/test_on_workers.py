@@ -7,7 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from object_gateway import in_environment
 from storage_server import object_store
+from stored_files import read_files as files
 from synthetic_store import add_run, add_world, lanes, segments
 
 from tcpipe import execution
@@ -41,7 +43,6 @@ def many_tasks():
         patch.setattr(sampling, "_BATCH_ROWS", BATCH_ROWS)
         patch.setattr(dataset_files, "SHARD_ROWS", SHARD_ROWS)
         patch.setattr(execution, "_run_on_cluster", elsewhere)
-        patch.setattr("tcpipe.pipeline.dataset.build.render_dataset_report", lambda *_: "<!doctype html>")
         yield
 
 
@@ -64,12 +65,6 @@ def store(made, tmp_path):
     return open_store(tmp_path / "store")
 
 
-def files(directory):
-    return {
-        path.relative_to(directory).as_posix(): path.read_bytes() for path in directory.rglob("*") if path.is_file()
-    }
-
-
 def build(store, out, **keywords):
     return build_dataset(out, store=store, recipe=Recipe(), cluster="tcp://nowhere:1", **keywords)
 
@@ -86,10 +81,7 @@ def test_workers_make_the_bytes_of_this_machine_and_leave_no_spool(made, store, 
 def test_workers_of_a_store_in_a_bucket_make_them_too(made, tmp_path, monkeypatch):
     shutil.copytree(made / "store", tmp_path / "served" / "bucket" / "store")
     with object_store(tmp_path / "served") as (environment, _):
-        for name in ("HTTP_PROXY", "http_proxy"):
-            monkeypatch.delenv(name, raising=False)
-        for name, value in {**environment, "TCPIPE_CACHE": str(tmp_path / "cache")}.items():
-            monkeypatch.setenv(name, value)
+        in_environment(monkeypatch, environment, tmp_path / "cache")
         build("s3://bucket/store", tmp_path / "far")
     assert files(tmp_path / "far") == files(made / "zarr")
     assert not [path for path in (tmp_path / "served").rglob("spool/**/*") if path.is_file()]
@@ -123,7 +115,7 @@ def test_a_killed_build_goes_on_and_what_is_half_written_does_not_count(made, st
     (spool,) = (store.root / "spool").iterdir()
     batches = sorted((spool / "pixels").iterdir())
     assert len(batches) == len(sampled) == 4
-    for path, size in zip(batches, (0, 5, path_size(batches[2]) - 1), strict=False):
+    for path, size in zip(batches, (0, 5, batches[2].stat().st_size - 1), strict=False):
         path.write_bytes(path.read_bytes()[:size])
     killed(store.root, tmp_path / "out", content, after=1)
     assert len(sampled) == 4 + 3 + (BATCHES - 4)
@@ -136,10 +128,6 @@ def test_a_killed_build_goes_on_and_what_is_half_written_does_not_count(made, st
     assert len(sampled) == BATCHES + 3, "nothing is sampled that was there"
     assert files(tmp_path / "out") == files(made / "zarr")
     assert not (store.root / "spool").exists()
-
-
-def path_size(path):
-    return path.stat().st_size
 
 
 def test_who_ends_second_on_one_spool_is_told(store, tmp_path, monkeypatch):

@@ -24,6 +24,8 @@ from tcpipe.store import open_store
 from tcpipe.tables.catalogue import read_catalogue
 from tcpipe.tables.findings import Finding, Remedy, Subject, SubjectKind, make_finding, select_findings
 
+DRAWS_DATASET_PAGES = True
+
 NAMES = ("gnss_roof", "robotlab7", "imu_link_b", "anna.field", "nas03", "frame-left.07", "übung")
 """A topic without a slash, bare hosts, frames, a user, in no form that a pattern could find."""
 LEAKING = tuple(

@@ -38,6 +38,14 @@ def winding(count=3000):
     return np.stack([14.0 * np.sin(s), 13.0 * np.cos(1.5 * s)], 1)
 
 
+def build_with(directory, track):
+    """Build a dataset of one run with this track."""
+    store = open_store(directory / "store", create=True)
+    add_world(store, directory)
+    add_run(store, "a", segments("a", *lanes([0.0], -10.0, 10.0)), track=track)
+    return build_dataset(directory / "out", store=store.root, recipe=Recipe())
+
+
 HEIGHTS = ("map-heights-differ", "map-height-scale")
 
 
@@ -69,7 +77,7 @@ def test_a_run_whose_ground_lies_elsewhere_on_the_map_is_a_warning(built):
 
 
 def test_the_card_keeps_every_runs_registration(built):
-    _, card = built
+    result, card = built
     found = {entry.run_id: entry for entry in card.maps[0].registration}
     assert sorted(found) == ["fits", "off"]  # the third is never sure enough of its place
     assert found["fits"].shift_xy_m == pytest.approx([0.0, 0.0], abs=0.03)
@@ -77,11 +85,6 @@ def test_the_card_keeps_every_runs_registration(built):
     assert found["off"].shift_xy_m == pytest.approx([-1.5, 0.8], abs=0.03)
     assert found["off"].height_offset_m == pytest.approx(GEOID_M, abs=0.02)
     assert found["off"].misfit_m > 3.0 * found["off"].shifted_misfit_m
-
-
-def test_how_the_heights_rise_and_what_they_miss_is_on_the_card(built):
-    result, card = built
-    found = {entry.run_id: entry for entry in card.maps[0].registration}
     assert found["fits"].height_scale == pytest.approx(1.0, abs=0.01)
     assert found["fits"].expected_misfit_m == pytest.approx(0.1)  # the tracks claim no error of height
     assert not [of for of in select_findings(result.findings, *HEIGHTS) if of.subject.name == "fits"]
@@ -89,33 +92,24 @@ def test_how_the_heights_rise_and_what_they_miss_is_on_the_card(built):
 
 @pytest.mark.parametrize(("scale", "wrong"), [(0.3048, "in feet"), (1.4, "")])
 def test_a_map_that_rises_otherwise_than_the_track_is_refused_or_named(tmp_path, scale, wrong):
-    store = open_store(tmp_path / "store", create=True)
-    add_world(store, tmp_path)
-    xy = winding()
-    start, end = lanes([0.0], -10.0, 10.0)
-    add_run(store, "a", segments("a", start, end), track=track_at(xy, xy, scale=scale))
+    track = track_at(winding(), winding(), scale=scale)
     if scale < 1.0:
         with pytest.raises(MapError, match=wrong) as caught:
-            build_dataset(tmp_path / "out", store=store.root, recipe=Recipe())
+            build_with(tmp_path, track)
         assert "gdal_edit -units ft" in caught.value.problems[0]
         assert not (tmp_path / "out").exists()
     else:
-        found = build_dataset(tmp_path / "out", store=store.root, recipe=Recipe())
+        found = build_with(tmp_path, track)
         (scaled,) = select_findings(found.findings, *HEIGHTS)
         assert (scaled.code, scaled.numbers["map_rise_m"]) == ("map-height-scale", pytest.approx(0.71, abs=0.005))
 
 
 def test_ground_that_is_not_the_maps_is_a_warning(tmp_path):
     """Heights of 1.5 m of brushwood that the map has not."""
-    store = open_store(tmp_path / "store", create=True)
-    add_world(store, tmp_path)
-    xy = winding()
-    track = track_at(xy, xy)
-    bumps = 1.5 * np.sin(np.arange(len(xy)) / 15.0)
+    track = track_at(winding(), winding())
+    bumps = 1.5 * np.sin(np.arange(track.num_rows) / 15.0)
     place = track.column_names.index("alt_m")
     track = track.set_column(place, track.schema.field("alt_m"), pa.array(track.column("alt_m").to_numpy() + bumps))
-    start, end = lanes([0.0], -10.0, 10.0)
-    add_run(store, "a", segments("a", start, end), track=track)
-    found = build_dataset(tmp_path / "out", store=store.root, recipe=Recipe())
+    found = build_with(tmp_path, track)
     (other,) = select_findings(found.findings, *HEIGHTS)
     assert (other.code, other.numbers["expected_m"]) == ("map-heights-differ", pytest.approx(0.1, abs=0.001))

@@ -9,6 +9,7 @@ import pytest
 from click.testing import CliRunner
 from object_gateway import in_environment
 from storage_server import object_store
+from stored_files import read_files as tree
 from synthetic_store import add_run, add_world, box, commit_run, lanes, region_file, segments
 
 from tcpipe.cli import cli
@@ -18,11 +19,6 @@ from tcpipe.pipeline.dataset import build as building
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.recipe import DatasetConfig, Recipe, SampleConfig
 from tcpipe.store import open_store
-
-
-@pytest.fixture(autouse=True)
-def no_page(monkeypatch):
-    monkeypatch.setattr(building, "render_dataset_report", lambda *_: "<!doctype html>")
 
 
 @pytest.fixture(scope="module")
@@ -39,9 +35,7 @@ def made(tmp_path_factory):
     region_file(here / "region.geojson", box(-20, -20, 2, 20))
     region_file(here / "other.geojson", box(-20, -20, 3, 20))
     (here / "soil.csv").write_text("time,moisture\n1970-01-01T00:00:00Z,0.2\n1970-01-01T00:01:00Z,0.3\n")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(building, "render_dataset_report", lambda *_: "<!doctype html>")
-        build_dataset(here / "dataset", **usual(here))
+    build_dataset(here / "dataset", **usual(here))
     return here
 
 
@@ -54,10 +48,6 @@ def usual(here: Path, **how: object) -> dict[str, object]:
 def here(made, tmp_path):
     shutil.copytree(made, tmp_path / "here", copy_function=shutil.copy2)
     return tmp_path / "here"
-
-
-def tree(directory: Path) -> dict[str, bytes]:
-    return {str(path.relative_to(directory)): path.read_bytes() for path in directory.rglob("*") if path.is_file()}
 
 
 def refused(here: Path, **how: object) -> tuple[str, ...]:

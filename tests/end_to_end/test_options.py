@@ -1,0 +1,100 @@
+"""Options that no other test gives to the command, each seen in what the command answers or writes."""
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from installed_command import plain_lines, tcpipe
+from synthetic_store import add_run, box, lanes, region_file, segments, small_store
+
+from tcpipe.recipe import ReadConfig, Recipe
+from tcpipe.store import open_store
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A directory with a store of a map and two runs, and a dataset of it."""
+    here = tmp_path_factory.mktemp("options")
+    small_store(here)
+    region_file(here / "region.geojson", box(-18, -18, 6, 18))
+    answer("build-dataset", "dataset", "--store", "store", "--split", "region.geojson", cwd=here)
+    return here
+
+
+def answer(*arguments: str | Path, cwd: Path) -> dict:
+    done = tcpipe(*arguments, "--json", cwd=cwd)
+    assert done.returncode in {0, 3}, done.stderr
+    return json.loads(done.stdout)
+
+
+def test_every_option_of_train_is_in_the_card_of_the_model(place: Path) -> None:
+    pytest.importorskip("torch")
+    from tcpipe.learning.fitting import FitConfig
+    from tcpipe.learning.models import load_model
+
+    options = (
+        *(
+            "--model",
+            "resnet18",
+            "--loss",
+            "paper_eq4",
+            "--label",
+            "above_standing",
+            "--epochs",
+            "1",
+            "--patience",
+            "2",
+        ),
+        *("--batch-size", "32", "--learning-rate", "0.001", "--fold", "1", "--width", "16", "--seed", "5"),
+        *("--no-mirror", "--inverse-variance-weights", "--no-resume", "--quiet"),
+    )
+    assert answer("train", "dataset", "model", *options, cwd=place)["status"] == "done"
+    wanted = FitConfig(
+        loss="paper_eq4", label="above_standing", epochs=1, patience=2, batch=32, learning_rate=0.001, fold=1, width=16, seed=5,
+        mirror=False, weights=True,
+    )  # fmt: skip
+    assert load_model(place / "model").card.training.config == wanted
+
+
+def test_a_map_a_store_and_a_cell_are_what_planning_takes(place: Path) -> None:
+    answer("train", "dataset", "physics", "--model", "physics", cwd=place)
+    where = ("--map", "site", "--store", "store")
+    costs = ("cost-map", "physics", "costs", *where, "--cell-size", "4", "--origin", "15.4335,47.0701")
+    assert answer(*costs, cwd=place)["status"] == "done"
+    again = answer("evaluate", "physics", "dataset", "evaluated", "--seed", "3", "--no-baselines", cwd=place)
+    assert again["config"]["seed"] == 3
+
+
+def test_prune_keeps_and_forgets_what_it_is_told(tmp_path: Path) -> None:
+    store = open_store(tmp_path / "store", create=True)
+    for recipe in (replace(Recipe(), read=ReadConfig(ignore_topics=["/none"])), Recipe()):
+        add_run(store, "a", segments("a", *lanes(0.0, -10.0, 10.0)), recipe=recipe)
+    (tmp_path / "ruling.toml").touch()
+    prune = ("prune", "--store", "store", "--recipe", "ruling.toml", "--min-age", "1d")
+    assert answer(*prune, "--keep", "a", cwd=tmp_path)["removed"] == []
+    planned = answer(*prune, "--dry-run", cwd=tmp_path)["removed"]
+    assert len(planned) == 1
+    assert "gone" in plain_lines(tcpipe(*prune, "--forget", "gone", cwd=tmp_path), 2, most=1)
+    assert answer(*prune, cwd=tmp_path)["removed"] == planned
+
+
+def test_robot_recipe_and_age_are_heard(place: Path, tmp_path: Path) -> None:
+    (tmp_path / "recipe.toml").write_text('[read]\nignore_topics = ["/none"]\n')
+    (tmp_path / "new.mcap").write_bytes(b"still written")
+    common = ("--robot", "husky", "--recipe", "recipe.toml")
+    inspected = tcpipe("inspect", "new.mcap", *common, cwd=tmp_path)
+    assert "new.mcap" in plain_lines(inspected, inspected.returncode, most=1)
+    shutil.copytree(place / "store", tmp_path / "tcpipe-store")
+    groups = answer("status", "new.mcap", *common, "--min-age", "1h", cwd=tmp_path)["groups"]
+    assert [group["state"] for group in groups if group["logs"]] == ["growing"]
+
+
+def test_patches_of_a_report_lie_beside_it_and_other_answers_are_json(place: Path) -> None:
+    before = set(place.rglob("*"))
+    done = tcpipe("report", "dataset", "--patches", cwd=place)
+    assert done.returncode == 0, done.stderr
+    assert {path.parent for path in place.rglob("*") if path.is_file()} - {path.parent for path in before}
+    assert answer("diff", "dataset", "dataset", cwd=place)["same"]
+    assert answer("migrate", "store", cwd=place)["migrated"] == []
