@@ -16,7 +16,7 @@ from typing import cast
 import click
 
 from tcpipe.cli import cli
-from tcpipe.cli.json_output import json_output_types
+from tcpipe.cli.site_commands import json_output_types
 from tcpipe.formats.contracts import DOCUMENTS
 from tcpipe.formats.finding_lines import format_number
 from tcpipe.formats.recipe_toml import format_commented_toml, load_shipped_profiles

@@ -95,7 +95,8 @@ def _check(name: str, problems: list[str], *, warn: bool = False, **more: int | 
 def _judged(result: Answer) -> dg.AssetCheckResult:
     """Return whether position, time and energy of a run are usable; the reasons are the problems, the worst first."""
     verdict = parse_typed(result["verdict"], Verdict, "tcpipe ingest --json")
-    lines = [*map(format_finding, verdict.reasons), *result["run"]["damage"]]
+    damage = parse_typed(result["run"]["damage"], tuple[Finding, ...], "tcpipe ingest --json")
+    lines = [*map(format_finding, verdict.reasons), *map(format_finding, damage)]
     grades = {name: getattr(verdict, name) for name in AFFECTED}
     return _check("usable", lines, warn=verdict.worst != "not usable", **grades)
 

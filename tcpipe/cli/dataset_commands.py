@@ -149,18 +149,19 @@ def export(
 
 
 def _print(exported: Exported, log: str, out: str) -> None:
+    from tcpipe.formats.finding_lines import describe_finding
 
     if exported.status == "unchanged":
         count = len(exported.topics)
         print_line(f"nothing to do: {count} of {count} topics of {log} are in {out} already")
     else:
-        for of in exported.topics:
-            print_line(f"{of.messages:>9} messages  {of.topic}  {of.path}")
+        for topic in exported.topics:
+            print_line(f"{topic.messages:>9} messages  {topic.topic}  {topic.path}")
         if not exported.topics:
             print_line(f"nothing to export: {log} holds no topic")
-    for kind in ("damage", "remarks"):
-        for line in getattr(exported, kind):
-            print_line(f"{kind.rstrip('s')}: {line}", err=True)
+    for kind, findings in (("damage", exported.damage), ("remark", exported.remarks)):
+        for finding in findings:
+            print_line(f"{kind}: {describe_finding(finding)} [{finding.code}]", err=True)
 
 
 @click.command()

@@ -87,9 +87,8 @@ def _print_log(log: InspectedLog) -> None:
     for line in log.problems:
         print_line(f"  {line}")
     _print_findings(log.findings or ())
-    for kind, lines in (("damage", log.damage), ("remark", log.remarks)):
-        for line in lines or ():
-            print_line(f"{kind}: {line}")
+    _print_damage("damage", log.damage or ())
+    _print_damage("remark", log.remarks or ())
 
 
 def _print_findings(findings: Iterable[Finding]) -> None:
@@ -99,11 +98,18 @@ def _print_findings(findings: Iterable[Finding]) -> None:
         print_line(line)
 
 
+def _print_damage(kind: str, findings: Iterable[Finding]) -> None:
+    from tcpipe.formats.finding_lines import describe_finding
+
+    for finding in findings:
+        print_line(f"{kind}: {describe_finding(finding)} [{finding.code}]")
+
+
 _READ_HEADER = ["read", "gaps", "longest gap [s]", "time", "offset [s]", "stamps"]
 
 
 def _read_cells(topic: InspectedTopic) -> list[str]:
-    """Return what reading everything found of a topic, in the order of the header."""
+    """Return the cells of a topic that was read completely, in the order of `_READ_HEADER`."""
     if (stamps := topic.stamps) is None:
         return [""] * len(_READ_HEADER)
     odd = {
@@ -157,7 +163,7 @@ def _print_dataset(found: InspectedDataset) -> None:
         f"format {found.format}, data model {found.data_model_version}"
     )
     print_line("")
-    names = [entry.name for entry in found.classes if any(entry.name in of for of in found.terrain.values())]
+    names = [entry.name for entry in found.classes if any(entry.name in counts for counts in found.terrain.values())]
     rows = [
         [split, str(found.splits[split]), *(str(found.terrain.get(split, {}).get(name, 0)) for name in names)]
         for split in ("train", "test", "unseen", "buffer")
@@ -201,19 +207,17 @@ def _print_run(found: InspectedRun) -> None:
     print_line(f"{found.run_id}: from {' + '.join(found.source.paths if found.source else ['an unknown log'])}")
     if found.tags:
         print_line("tags: " + ", ".join(f"{key}={value}" for key, value in sorted(found.tags.items())))
-    for line in found.remarks:
-        print_line(f"remark: {line}")
+    _print_damage("remark", found.remarks)
     for run in found.recipes:
         ledger = run.ledger_m
         print_line("")
         print_line(f"recipe {run.recipe_id}: {run.counts.segments} segments of robot {run.robot}")
-        lost = sorted(((metres, name) for name, metres in ledger.items() if metres >= 0.05), reverse=True)
-        said = ", ".join(f"{metres:.1f} m {name.replace('_', ' ')}" for metres, name in lost)
-        print_line(f"{run.driven_m:.1f} m driven: {said}" if said else "not driven")
+        ordered = sorted(((metres, name) for name, metres in ledger.items() if metres >= 0.05), reverse=True)
+        losses = ", ".join(f"{metres:.1f} m {name.replace('_', ' ')}" for metres, name in ordered)
+        print_line(f"{run.driven_m:.1f} m driven: {losses}" if losses else "not driven")
         print_line(f"verdict: {format_verdict(run.verdict)}")
         _print_findings(run.findings)
-        for line in run.damage:
-            print_line(f"damage: {line}")
+        _print_damage("damage", run.damage)
 
 
 def _print_tables(found: InspectedTables) -> None:

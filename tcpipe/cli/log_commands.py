@@ -39,7 +39,7 @@ from tcpipe.pipeline.ingest_options import IngestOptions
 
 if TYPE_CHECKING:
     from tcpipe.pipeline.ingest import IngestSummary
-    from tcpipe.pipeline.ingest_task import IngestResult
+    from tcpipe.pipeline.plan import IngestResult
 
 
 @click.command()
@@ -59,7 +59,7 @@ def ingest(options: IngestOptions, *, dry_run: bool, as_json: bool, quiet: bool)
     """
     from tcpipe.formats.json_files import convert_record
     from tcpipe.pipeline.ingest import SummaryLine, run_ingest
-    from tcpipe.pipeline.ingest_task import LogLine
+    from tcpipe.pipeline.plan import LogLine
 
     ruling, source = resolve_recipe_with_source(cast("str | None", options.recipe))
     options = replace(options, recipe=ruling)
@@ -130,8 +130,7 @@ def _list_outcome(result: IngestResult, store: Path | str, *, several: bool) -> 
         known = " (known, not tried again)" if result.known else ""
         yield f"{result.status:<10} {result.log}{aside or known}"
     else:
-        wrong = "damaged" if run.damage else "empty" if problems else ""
-        known = f" ({wrong}, known)" if wrong and not result.is_news else ""
+        known = f" ({run.defect}, known)" if run.defect and not result.is_news else ""
         more = f", noise floor of E {100 * budget.total:.1f} %" if several and budget else ""
         more += f"; {format_verdict(result.verdict)}" if several and is_new and result.verdict else ""
         yield (
@@ -144,16 +143,22 @@ def _list_outcome(result: IngestResult, store: Path | str, *, several: bool) -> 
         yield f"  {format_budget(budget)}"
     yield from (f"  {note}" for note in result.notes)
     if result.status == "failed" and result.is_news:
-        yield from (f"  {line}" for line in format_findings(of for of in result.causes if of.code != "log-failed"))
+        yield from (
+            f"  {line}"
+            for line in format_findings(finding for finding in result.causes if finding.code != "log-failed")
+        )
     if run is None or result.verdict is None:
         return
-    yield from (f"  damage:  {line}" for line in run.damage if result.is_news or result.status == "damaged")
+    if result.is_news or result.status == "damaged":
+        yield from (f"  damage:  {describe_finding(of)} [{of.code}]" for of in run.damage)
     if is_new and not several:
         yield f"  verdict: {format_verdict(result.verdict)}"
         where = f"tcpipe inspect {store}/runs/{run.run_id}"
         yield from (f"  {line}" for line in format_findings(result.findings, more=where))
     elif is_new or result.is_news:
-        yield from (f"  {describe_finding(of)} [{of.code}]" for of in problems if of.code != "log-damaged")
+        yield from (
+            f"  {describe_finding(finding)} [{finding.code}]" for finding in problems if finding.code != "log-damaged"
+        )
 
 
 def _print_findings(summary: IngestSummary) -> None:
@@ -180,8 +185,10 @@ def _print_sum(summary: IngestSummary) -> None:
     elif count["failed"] == number:
         print_line(f"no run came into {summary.store}: {number} of {number} logs failed")
     else:
-        said = ", ".join(f"{of} {status}" for status, of in count.items() if of)
-        print_line(f"{summary.store}: {said}")
+        counts_text = ", ".join(
+            f"{number_of_logs} {status}" for status, number_of_logs in count.items() if number_of_logs
+        )
+        print_line(f"{summary.store}: {counts_text}")
     _print_known(summary)
 
 
@@ -283,14 +290,14 @@ def acknowledge(names: tuple[str, ...], *, store: str, as_json: bool) -> int:
     from tcpipe.formats.finding_lines import describe_title
     from tcpipe.pipeline.problems import acknowledge as run
 
-    found = run(names, store=store)
+    result = run(names, store=store)
     if as_json:
-        print_json(found)
+        print_json(result)
         return 0
-    for word, problems in (("acknowledged", found.acknowledged), ("acknowledged before", found.before)):
+    for word, problems in (("acknowledged", result.acknowledged), ("acknowledged before", result.before)):
         for problem in problems:
             print_line(f"{word}: {problem.name}: {describe_title(problem.finding)} [{problem.finding.code}]")
-    if not found.acknowledged:
+    if not result.acknowledged:
         print_line("nothing to do: these problems are already acknowledged")
     return 0
 

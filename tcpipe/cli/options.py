@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 
 class Place(click.ParamType[str]):
-    """A path in the command line: looked at before the command begins; what it cannot be is a usage error (exit code 2)."""
+    """A path on the command line, checked before the command begins; a wrong one is a usage error (exit code 2)."""
 
     name = "path"
 
@@ -91,7 +91,7 @@ Complete: TypeAlias = Callable[[click.Context, click.Parameter, str], list[str]]
 
 
 def _complete_names(names: Callable[[click.Context], Iterable[str]]) -> Complete:
-    """Return what offers the names that go on as typed; what is broken offers none."""
+    """Return a function that lists the names with a given beginning; none if they cannot be read."""
 
     def complete(context: click.Context, _: click.Parameter, typed: str) -> list[str]:
         with suppress(TcpipeError, OSError):
@@ -149,7 +149,7 @@ PUBLISHED = Place(user_paths.check_output_directory, written=True, urls=True)
 LOG = Place(user_paths.check_input_path, urls=True)
 """A log, here or in object storage."""
 ONE_OF_SEVERAL = Place(str)
-"""A log or raster, by pattern or address: the command looks at each for itself, and tells of all at once."""
+"""A log or raster, by pattern or address; the command checks each one and reports all problems at once."""
 
 
 _SECONDS = {"": 1.0, "s": 1.0, "m": 60.0, "h": 3600.0, "d": 86400.0}
@@ -158,10 +158,10 @@ _MOST_SHARDS = 100_000
 
 def parse_duration(context: click.Context, parameter: click.Parameter, value: str) -> float:
     """Turn ``90``, ``90s``, ``10m``, ``2h``, ``1d`` into seconds."""
-    found = re.fullmatch(r"(\d{1,9}(?:\.\d{1,9})?)\s*([smhd]?)", value.strip())
-    if found is None:
+    match = re.fullmatch(r"(\d{1,9}(?:\.\d{1,9})?)\s*([smhd]?)", value.strip())
+    if match is None:
         raise click.BadParameter(f"{value!r}: wanted a time: 90 or 90s, 10m, 2h, 1d", ctx=context, param=parameter)
-    return float(found[1]) * _SECONDS[found[2]]
+    return float(match[1]) * _SECONDS[match[2]]
 
 
 def parse_shard(context: click.Context, parameter: click.Parameter, value: str | None) -> tuple[int, int] | None:
@@ -202,16 +202,16 @@ def class_table_values(_: click.Context, __: click.Parameter, values: tuple[str,
 
 
 def _parse_named_files(option: str, given: tuple[str, ...], hint: str) -> dict[str, str]:
-    found: dict[str, str] = {}
+    files: dict[str, str] = {}
     for name, _, file in (text.partition("=") for text in given):
-        if name in found:
+        if name in files:
             raise UsageError(f"{option} {name}: is given twice; {hint}")
-        found[name] = file
-    return found
+        files[name] = file
+    return files
 
 
 def parse_holdout(context: click.Context, parameter: click.Parameter, value: str | None) -> str | None:
-    """Let pass what draws test; anything else is a usage error."""
+    """Return a valid kind of holdout; anything else is a usage error."""
     if value is not None and re.fullmatch(r"block|sample|run|tag:.+", value) is None:
         raise click.BadParameter(f"{value!r}: wanted block, sample, run, or tag:NAME", ctx=context, param=parameter)
     return value
@@ -234,7 +234,7 @@ KINDS: dict[str, dict[str, Any]] = {
     "shard": {"callback": parse_shard},
     "holdout": {"callback": parse_holdout},
 }
-"""What click has to know of a declared option, by its kind."""
+"""Click's settings of a declared option, by its kind."""
 
 
 def make_click_option(name: str, default: Any, shown: options.Option) -> Option:
@@ -262,11 +262,13 @@ def make_click_option(name: str, default: Any, shown: options.Option) -> Option:
 
 
 def add_options(cls: type[Any]) -> Option:
-    """Return what gives a command the options that a dataclass declares; it takes them as one such object.
+    """Return a decorator that adds the options of a dataclass to a command, which receives them as one object.
 
     What is not given has the default of the dataclass, which may be another than the one that is shown.
     """
-    declared = {of.name: (of.default, of.metadata["option"]) for of in fields(cls) if "option" in of.metadata}
+    declared = {
+        field.name: (field.default, field.metadata["option"]) for field in fields(cls) if "option" in field.metadata
+    }
 
     def decorate(run: Callable[..., Any]) -> Callable[..., Any]:
         @click.pass_context

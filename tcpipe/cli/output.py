@@ -5,9 +5,11 @@ from __future__ import annotations
 import json
 import logging
 import sys
+import time
 import traceback
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
@@ -18,7 +20,10 @@ from tcpipe.errors import clean_line, hide_secrets
 from tcpipe.progress import STEP, Step, step_of
 
 if TYPE_CHECKING:
-    from tcpipe.cli.bars import Bars
+    import rich.progress
+    from rich.console import Console
+    from rich.progress import TaskID
+
     from tcpipe.recipe import Recipe
 
 
@@ -32,10 +37,10 @@ def resolve_recipe_with_source(explicit: str | None) -> tuple[Recipe, str]:
 
 @contextmanager
 def show_progress(what: str, *, quiet: bool, as_json: bool = False) -> Iterator[Progress]:
-    """Show progress on stderr: bars on a terminal, else plain lines, nothing with ``quiet``; with ``--debug`` its log says all."""
+    """Show progress on stderr: bars on a terminal, else plain lines, nothing with ``quiet``; with ``--debug`` only its log."""
     logger = logging.getLogger("tcpipe")
     debugging = logger.isEnabledFor(logging.DEBUG)
-    shown = Progress(what, quiet=quiet, bars=None if quiet or debugging else _make_bars(what, as_json=as_json))
+    shown = Progress(what, quiet=quiet, console=None if quiet or debugging else _open_terminal(as_json=as_json))
     handler = _Lines(shown)
     before = logger.level
     if not debugging:
@@ -49,29 +54,54 @@ def show_progress(what: str, *, quiet: bool, as_json: bool = False) -> Iterator[
         logger.setLevel(before)
 
 
-def _make_bars(what: str, *, as_json: bool) -> Bars | None:
-    """Return bars where stderr is a terminal that can draw them, and no JSON goes to it."""
+def _open_terminal(*, as_json: bool) -> Console | None:
+    """Return stderr where it is a terminal that can draw bars, and no JSON goes to it."""
     if not sys.stderr.isatty() or (as_json and sys.stdout.isatty()):
         return None
     from rich.console import Console
 
-    from tcpipe.cli.bars import Bars
-
     console = Console(stderr=True)
-    return Bars(what, console) if console.is_terminal and not console.is_dumb_terminal else None
+    return console if console.is_terminal and not console.is_dumb_terminal else None
+
+
+_SHARES = {"hashing": (0.0, 0.03), "reading": (0.03, 0.2), "fusing": (0.2, 0.95), "cutting and labelling": (0.95, 1.0)}
+"""Where in the time that a log takes its stages begin and end, as a share; roughly, cameras shift it."""
+_MOST_ROWS = 8
+_LONGEST_NAME = 40
+
+
+@dataclass(slots=True)
+class _Row:
+    """A log under way: its bar, None where there are too many, and the share that is done."""
+
+    bar: TaskID | None
+    share: float = 0.0
 
 
 class Progress:
-    """Bars, lines, or silence; ``line`` says something on stderr, ``result`` on stdout."""
+    """Lines on stderr; on a terminal ``console`` a bar of all logs and one of each log under way, until the end."""
 
-    def __init__(self, what: str, *, quiet: bool, bars: Bars | None) -> None:
+    def __init__(self, what: str, *, quiet: bool, console: Console | None) -> None:
         self._what = what
         self._quiet = quiet
-        self._bars = bars
         self._stages: dict[str, str] = {}
+        self._rows: dict[str, _Row] = {}
+        self._sizes: Mapping[str, int] = {}
+        self._waiting, self._done, self._begun_s = 0, 0, time.monotonic()
+        self._bars: rich.progress.Progress | None = None
+        if console is None:
+            return
+        from rich import progress as bars
+
+        texts = (bars.TextColumn(f"{{task.{name}}}", markup=False) for name in ("description", "fields[said]"))
+        columns = (next(texts), bars.BarColumn(24), *texts)
+        self._bars = bars.Progress(
+            *columns, console=console, transient=True, redirect_stdout=False, refresh_per_second=4
+        )
+        self._all = self._bars.add_task(clean_line(what), total=None, said="")
 
     def __enter__(self) -> Self:
-        """Start the bars."""
+        """Show the bars."""
         if self._bars is not None:
             self._bars.start()
         return self
@@ -82,57 +112,96 @@ class Progress:
             self._bars.stop()
 
     def line(self, text: str) -> None:
-        """Say one line."""
+        """Print one line."""
         if not self._quiet:
-            self._say(text)
+            self._print(text)
 
     def problem(self, *lines: str) -> None:
-        """Say what went wrong, also where progress is not wanted."""
+        """Print what went wrong, also where progress is not wanted."""
         for text in lines:
-            self._say(f"tcpipe: {text}")
+            self._print(f"tcpipe: {text}")
 
     def result(self, text: str) -> None:
-        """Say a line of the result on stdout, above the bars where both are on one terminal."""
+        """Print a line of the result on stdout, above the bars where both are on one terminal."""
         if self._bars is not None and sys.stdout.isatty():
-            self._bars.print(clean_line(text))
+            self._print(text)
         else:
             print_line(text)
 
-    def _say(self, text: str) -> None:
+    def _print(self, text: str) -> None:
         with suppress(OSError):  # nobody listening is no reason to stop
             if self._bars is not None:
-                self._bars.print(clean_line(text))
+                self._bars.console.print(clean_line(text), markup=False, highlight=False, soft_wrap=True)
             else:
                 print_line(text, err=True)
 
     def expect(self, sizes: Mapping[str, int]) -> None:
         """Begin with logs of these sizes [byte]."""
         if self._bars is not None:
-            self._bars.expect(sizes)
+            self._sizes, self._waiting = sizes, sum(sizes.values())
+            self._bars.update(self._all, total=len(sizes), said=f"0/{len(sizes)}")
 
-    def end(self, task: str, *, worked: bool) -> None:
-        """Count a log that is done, and whether there was something to do."""
+    def count(self, done: int, total: int, stage: str = "") -> None:
+        """Show how many of how many are done: lines come at every tenth."""
         if self._bars is not None:
-            self._bars.end(task, worked=worked)
-
-    def count(self, done: int, total: int) -> None:
-        """Say how many of how many are done: lines come at every tenth."""
-        if self._bars is not None:
-            self._bars.count(done, total)
+            text = f"{stage} {100 * done // max(total, 1)} %"
+            self._bars.update(self._all, total=total, completed=done, said=text)
         elif done * 10 // total > (done - 1) * 10 // total:
             self.line(f"{self._what}: {100 * done // total} %")
 
     def step(self, step: Step) -> None:
-        """Show how far a task is; without bars a line at each stage of a log."""
-        if self._bars is not None:
-            self._bars.step(step)
-        elif step.task and self._stages.get(step.task) != step.stage:
+        """Show how far a log is; without bars a line at each of its stages."""
+        if self._bars is not None and step.task:
+            self._draw_step(self._bars, step)
+        elif self._bars is not None and step.total:
+            self.count(step.done, step.total, step.stage)
+        elif self._bars is None and step.task and self._stages.get(step.task) != step.stage:
             self._stages[step.task] = step.stage
             self.line(f"{step.task}: {step.stage}")
 
+    def _draw_step(self, bars: rich.progress.Progress, step: Step) -> None:
+        row = self._rows.get(step.task)
+        if row is None:
+            has_room = sum(other.bar is not None for other in self._rows.values()) < _MOST_ROWS
+            name = clean_line(step.task.rsplit("/", 1)[-1])[-_LONGEST_NAME:]
+            row = self._rows[step.task] = _Row(bars.add_task(f"  {name}", total=1.0, said="") if has_room else None)
+        start, end = _SHARES.get(step.stage, (row.share, row.share))
+        row.share = max(row.share, start + (end - start) * step.done / max(step.total, 1))
+        if row.bar is not None:
+            size = f" {_format_megabytes(step.done)} of {_format_megabytes(step.total)} MB" if step.total else ""
+            bars.update(row.bar, completed=row.share, said=step.stage + size)
+        self._draw_rate(bars)
+
+    def end(self, task: str, *, worked: bool) -> None:
+        """Count a log that is done; one that needed no work does not count for the rate."""
+        if self._bars is None:
+            return
+        row, size = self._rows.pop(task, None), self._sizes.get(task, 0)
+        if row is not None and row.bar is not None:
+            self._bars.remove_task(row.bar)
+        self._waiting -= size
+        self._done += size if worked else 0
+        self._bars.advance(self._all)
+        self._draw_rate(self._bars)
+
+    def _draw_rate(self, bars: rich.progress.Progress) -> None:
+        """Show how many logs are done, how fast, and how long the others will take at that."""
+        under_way = sum(self._sizes.get(task, 0) * row.share for task, row in self._rows.items())
+        done, took_s = self._done + under_way, time.monotonic() - self._begun_s
+        text = f"{round(bars.tasks[0].completed)}/{len(self._sizes)}"
+        if done and took_s > 0:
+            left = divmod(round((self._waiting - under_way) / done * took_s), 60)
+            text += f", {_format_megabytes(done / took_s)} MB/s, {left[0]}:{left[1]:02d} left"
+        hidden = sum(row.bar is None for row in self._rows.values())
+        bars.update(self._all, said=text + (f", {hidden} more under way" if hidden else ""))
+
+
+def _format_megabytes(size_bytes: float) -> str:
+    return f"{size_bytes / 1e6:.1f}"
+
 
 class _Lines(logging.Handler):
-    """Sends what the pipeline says to the progress display."""
+    """Sends messages of the pipeline to the progress display."""
 
     def __init__(self, shown: Progress) -> None:
         super().__init__()
@@ -148,7 +217,7 @@ class _Lines(logging.Handler):
 
 @contextmanager
 def write_debug_log() -> Iterator[None]:
-    """Say on stderr what is done and when, and what is behind each error."""
+    """Log every step with its time to stderr, and the cause of each error."""
     logger, handler = logging.getLogger("tcpipe"), _DebugLog()
     before = logger.level
     logger.addHandler(handler)
@@ -177,13 +246,13 @@ def print_line(text: str, *, err: bool = False) -> None:
 
 
 def print_lines(result: object) -> None:
-    """Print a result that tells itself in lines of text on stdout."""
+    """Print the text of a result on stdout."""
     for line in str(result).split("\n"):
         print_line(line)
 
 
 def print_result(result: object, *, as_json: bool) -> None:
-    """Print a result on stdout: one JSON object, or the lines that it tells itself in."""
+    """Print a result on stdout, as one JSON object or as text."""
     if as_json:
         print_json(result)
     else:
@@ -191,7 +260,7 @@ def print_result(result: object, *, as_json: bool) -> None:
 
 
 def print_json(value: Any) -> None:
-    """Print one JSON object on stdout, what no terminal should see as escapes of JSON."""
+    """Print one JSON object on stdout, with unprintable characters as JSON escapes."""
     from tcpipe.formats.json_files import to_json
 
     click.echo(_format_value(to_json(value)), nl=False)
@@ -214,7 +283,7 @@ def print_traceback() -> None:
 
 
 def print_failure(problems: Sequence[str], exit_code: int, *, as_json: bool) -> None:
-    """Say on stderr what went wrong, and print it on stdout as a JSON object if that is wanted."""
+    """Print problems on stderr, and on stdout as a JSON object if that is requested."""
     with suppress(OSError):
         for problem in problems:
             print_line(f"tcpipe: {problem}", err=True)

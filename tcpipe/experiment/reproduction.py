@@ -183,12 +183,7 @@ def _build(place: Path, site: SimulatedSite, jobs: int) -> None:
     """Read the logs, add the map and build the dataset, as a user would."""
     store = place / "store"
     ingested = ingest(site.logs, store=store, recipe=RECIPE, jobs=jobs, force=True)
-    problems = [
-        problem
-        for result in ingested.results
-        for problem in (*result.problems, *(result.run.damage if result.run else ()))
-    ]
-    if problems:
+    if problems := [problem for result in ingested.results for problem in result.problems]:
         raise DatasetError(*problems)
     height, ortho, terrain, classes = (site.rasters[name] for name in ("height", "ortho", "terrain", "classes"))
     add_map("site", height=height, ortho=ortho, terrain=terrain, classes=classes, store=store)

@@ -71,7 +71,7 @@ def _make_claims_section(claims: Sequence[Claim], audit: str) -> Section:
 
 
 def _make_floor_section(run: Evaluation) -> Section:
-    """Return how far errors lie above those of a predictor that knows the simulator."""
+    """Return errors above those of a predictor that knows the simulator."""
     rows = []
     for split, part in run.splits.items():
         for quantity, by_class in (part.simulation_floor or {}).items():
@@ -88,7 +88,7 @@ def _make_floor_section(run: Evaluation) -> Section:
 
 
 def _make_variance_section(shares: Mapping[str, float], hidden: float) -> Section:
-    """Return what E's variance is made of, and what of the rest that class and slope leave."""
+    """Return the parts of E's variance, and their shares of what class and slope leave."""
     left = sum(share for name, share in shares.items() if name != CLASS_AND_SLOPE)
     rows = [
         (
@@ -124,7 +124,7 @@ def _make_drives_section(splits: Mapping[str, int], terrain: Mapping[str, Mappin
 
 
 def _make_seed_sections(runs: Sequence[Evaluation]) -> list[Section]:
-    """Return the spread between trainings, where there are several."""
+    """Return the errors of each training, if there are several."""
     if len(runs) < 2:
         return []
     rows = []
@@ -176,11 +176,11 @@ DIFFERENCES = (
     ("Wei and Isler: samples", "all", "table IV has all rows on the samples whose class has a net of its own"),
     ("test samples", "random, 80 / 20", "random, 80 / 20: most lie within a patch of a training sample"),
 )  # fmt: skip
-"""What, in the paper, here."""
+"""Subject, the paper, tcpipe."""
 
 
 def list_differences(found: Evaluation) -> Iterator[tuple[str, str, str]]:
-    """Yield them, and what every MAPE of an evaluation leaves out, with counts."""
+    """Yield `DIFFERENCES`, and the number of labels that each MAPE leaves out."""
     yield from DIFFERENCES
     for split, part in found.splits.items():
         left = {

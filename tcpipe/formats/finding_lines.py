@@ -19,11 +19,15 @@ K = TypeVar("K", bound=Hashable)
 _UNITS: Mapping[str, tuple[str, float]] = {
     "_mps2": (" m/s²", 1.0), "_mps": (" m/s", 1.0), "_radps": (" °/s", 180.0 / np.pi), "_rad": ("°", 180.0 / np.pi), "_hz": (" Hz", 1.0),
     "_volt": (" V", 1.0), "_amp": (" A", 1.0), "_watt": (" W", 1.0), "_joule": (" J", 1.0), "_fraction": (" %", 100.0),
-    "_m2": (" m²", 1.0), "_bytes": (" bytes", 1.0), "_px": (" px", 1.0), "_deg": ("°", 1.0), "_m": (" m", 1.0), "_s": (" s", 1.0),
+    "_m2": (" m²", 1.0), "_bytes": (" MB", 1e-6), "_px": (" px", 1.0), "_deg": ("°", 1.0), "_m": (" m", 1.0), "_s": (" s", 1.0),
 }  # fmt: skip
 """Unit as people read it, and the factor to it, by the suffix of a number's name; the first that fits counts."""
 MOST_LINES = 8
 """Findings that a command prints; 'tcpipe inspect' lists all."""
+_DAMAGE: Mapping[str, str] = {
+    "places_count": "{} places", "first_offset": "at byte {}", "lost_messages_count": "{} messages lost", "lost_bytes": "{} lost"
+}  # fmt: skip
+"""Numbers that follow a line in brackets, where they are more than zero and the template lacks them."""
 _MOST_SUBJECTS = 3
 _DIGITS = 3
 _LARGEST_PLAIN = 1e6
@@ -32,8 +36,8 @@ _SHORT_S = 2.0
 
 
 def format_number(name: str, value: float) -> str:
-    """Return a number with the unit of its name's suffix, with three significant digits; one that ends in ``_count`` as a whole number."""
-    if name.endswith("_count"):
+    """Return a number with the unit of its name's suffix, with three significant digits; counts and offsets as whole numbers."""
+    if name.endswith(("_count", "_offset")):
         return f"{value:.0f}"
     unit, factor = next((of for suffix, of in _UNITS.items() if name.endswith(suffix)), ("", 1.0))
     value *= factor
@@ -55,7 +59,10 @@ def describe_finding(finding: Finding) -> str:
         digits = 0 if end_s - begin_s >= _SHORT_S else 1
         values["span"] = f"{begin_s:.{digits}f} to {end_s:.{digits}f} s"
     missing = dict.fromkeys(entry.fields, "?")  # a redacted finding keeps only what is public
-    return entry.template.format(**{**missing, **values, **finding.names, "subject": finding.subject.name})
+    line = entry.template.format(**{**missing, **values, **finding.names, "subject": finding.subject.name})
+    numbers = finding.numbers.keys() - entry.fields
+    damage = [text.format(values[name]) for name, text in _DAMAGE.items() if name in numbers and finding.numbers[name]]
+    return f"{line} ({', '.join(damage)})" if damage else line
 
 
 def describe_title(finding: Finding) -> str:

@@ -10,7 +10,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from operator import attrgetter
 from pathlib import PurePosixPath
-from typing import TypeAlias
+from typing import Literal, TypeAlias
 
 import pyarrow as pa
 import pyarrow.compute as pc
@@ -93,6 +93,11 @@ class RunFacts(Ingestion):
         """Whether there is no segment though the robot drove."""
         return bool(select_findings(self.findings, "no-segments"))
 
+    @property
+    def defect(self) -> Literal["damaged", "empty", ""]:
+        """What is wrong with it, in one word."""
+        return "damaged" if self.damage else "empty" if self.is_empty else ""
+
 
 def make_run_facts(manifest: Manifest, name: str, files: Mapping[str, int]) -> RunFacts:
     """Return the row of an ingestion; ``name`` is that of its manifest, ``files`` as in the row."""
@@ -146,6 +151,7 @@ def _pick(record: object, names: Iterable[str]) -> dict[str, object]:
 
 _CELLS: Mapping[str, Callable[[RunFacts], object]] = {
     "findings": lambda row: [_pick(of, ("code", "severity")) for of in row.findings],
+    "damage": lambda row: [of.code for of in row.damage],
     "verdict": lambda row: _pick(row.verdict, AFFECTED),
     "log": lambda row: row.log and {"source": _pick(row.log.source, ("paths", "sha256", "size_bytes"))},
 }

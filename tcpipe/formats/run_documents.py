@@ -24,7 +24,7 @@ from tcpipe.formats.place import Place
 from tcpipe.motion.distance_breakdown import KEPT
 from tcpipe.recipe import IngestSections
 from tcpipe.tables.facts import LEFT_OUT, NOTHING_FOUND, StageFacts
-from tcpipe.tables.findings import StageReport, Verdict
+from tcpipe.tables.findings import Finding, StageReport, Verdict
 from tcpipe.tables.levels import DATA_MODEL_VERSION, TABLES_VERSION, Sensor, TrackInfo
 
 
@@ -57,8 +57,8 @@ class RunJson:
     tags: Mapping[str, str] = field(default_factory=dict)
     topics: tuple[TopicCount, ...] = ()
     sensors: Mapping[str, Sensor] = field(default_factory=dict)
-    damage: tuple[str, ...] = ()
-    remarks: tuple[str, ...] = ()
+    damage: tuple[Finding, ...] = ()
+    remarks: tuple[Finding, ...] = ()
     message_definitions: str = ""
     """Hash of the definitions that were given for types which the log does not define; "" without."""
     report: StageReport[StageFacts] = NOTHING_FOUND
@@ -127,7 +127,7 @@ class Ingestion:
     tags: Mapping[str, str]
     ledger_m: Mapping[str, float]
     """Where every metre went [m], by entry."""
-    damage: tuple[str, ...]
+    damage: tuple[Finding, ...]
 
     @property
     def driven_m(self) -> float:

@@ -44,9 +44,10 @@ from tcpipe.geometry.rotation import matrix_from_quat, quat_from_matrix, quat_fr
 from tcpipe.tables.facts import Reopening, StretchFacts, make_vector
 from tcpipe.tables.findings import Subject, make_finding
 
-_MANY_FIXES = 50
-_LEVELLING_NS = 60_000_000_000
-_ODOMETRY_HOLDS_M, _LASTS_S = 0.1, 30.0
+_MANY_FIXES = 50  # fewest fixes for an average
+_LEVELLING_NS = 60_000_000_000  # first pass for roll and pitch without IMU
+_ODOMETRY_HOLDS_M = 0.1  # odometry drift in `_LASTS_S`
+_LASTS_S = 30.0  # spacing of fixes whose metre-size error lasts
 
 
 def run_error_state(

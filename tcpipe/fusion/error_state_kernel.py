@@ -228,7 +228,9 @@ _ANEW = 0.1
 OFF_M = 0.5
 """What fixes that contradict the rest may be off by, at least."""
 _KNOWN_M = 0.1
-_MEAN_OF, SURELY, _WILD = 10, 2.5, 4.0
+_MEAN_OF = 10
+SURELY = 2.5  # times the gate; clean drives stay below 2
+_WILD = 4.0
 
 
 @compile_kernel

@@ -52,12 +52,12 @@ ROLES = {
 }
 DOF = {kernel.GNSS_POSITION: 3, kernel.WHEEL_VELOCITY: 1, kernel.VISUAL_VELOCITY: 3, kernel.STANDING: 3}
 DOF |= {kernel.STANDING_RATE: 3, kernel.SIDEWAYS: 2, kernel.LEVEL: 2, kernel.GNSS_VELOCITY: 3}
-_LEAST_ERROR_M = 1e-4
+_LEAST_ERROR_M = 1e-4  # smallest modelled GNSS error
 _NO_ERROR = np.empty(0)
 _ANY_YAW_STD_RAD = np.pi / np.sqrt(3.0)
 _NEVER = 1e18
 _FIXED = 1e-6
-_CARRIED_M = 0.5
+_CARRIED_M = 0.5  # σ of fixes that odometry improves for a minute
 _LOCK_OUT = {
     kernel.GNSS_POSITION: (5.0, 15.0, 5.0),
     kernel.WHEEL_VELOCITY: (5.0, 5.0, 0.3),

@@ -33,16 +33,18 @@ Span = tuple[int, int]
 """First and last stamp [ns]."""
 Spans = tuple[Span, ...]
 
-_LASTS_NS = 2_000_000_000
-_FEWEST = 5
-_TOGETHER_NS = 3_000_000_000
-_ALONE = 3
-_MOST = 3
-_A_SECOND, _A_SPAN, _SURELY = 2.0, 50.0, 100.0
-_SHARED = 0.5
-_MOST_OF = 0.6
-_REACH_NS = 60_000_000_000
-_RETURNS_NS = 180_000_000_000
+_LASTS_NS = 2_000_000_000  # shorter rejections are outliers
+_FEWEST = 5  # fewer rejections are outliers
+_TOGETHER_NS = 3_000_000_000  # rejections this close are one event
+_ALONE = 3  # fewer rejections in a row explain nothing
+_MOST = 3  # events tried, longest first
+_A_SECOND = 2.0  # cost of a second of a span
+_A_SPAN = 50.0  # cost of a span
+_SURELY = 100.0  # certain improvement; a wrong fix costs hundreds
+_SHARED = 0.5  # overlap below which two explanations differ
+_MOST_OF = 0.6  # share of a run that is no span
+_REACH_NS = 60_000_000_000  # inflated on both sides of an unplaced jump; judged
+_RETURNS_NS = 180_000_000_000  # a receiver corrects a wrong ambiguity until then; judged
 _LEADS_NS = (3_000_000_000, 10_000_000_000, 20_000_000_000)
 
 
@@ -258,20 +260,22 @@ def _iterate_candidates(events: Spans, whole: Span) -> Iterator[Spans]:
 
 Floats = NDArray[np.float64]
 
-_BLOCK_S = 20.0
+_BLOCK_S = 20.0  # span of fitting fixes to the drawn path
 _FEWEST_FIXES = 15
-_WINDOW_S = 6.0
-_LITTLE = 0.25
-_FAR_MORE = 6.0
-_UNCLAIMED = 3.0
-_DRAWN_HOLDS_M = 0.15
-_SHARE_SEEN = 6.0
-_BENDS_M, _LEAST_M = 0.09, 0.01
-_FLOAT_M = 0.5
-_LASTS_S, _METRES_LAST_S = 45.0, 120.0
-_LARGE_M = 0.03
-_SQUARES_OF_TWO = 1.3863
-_SQUARES_OF_ONE = 0.4549
+_WINDOW_S = 6.0  # window of the scatter
+_LITTLE = 0.25  # variance ratio below which the rest lasts
+_FAR_MORE = 6.0  # variance ratio above which scatter replaces the claim
+_UNCLAIMED = 3.0  # σ beyond which an error was not claimed
+_DRAWN_HOLDS_M = 0.15  # bend of a drawn path in 20 s
+_SHARE_SEEN = 6.0  # ratio of a two-minute error to 20 s
+_BENDS_M = 0.09  # bend above that of clean drives (0.02 to 0.06 m)
+_LEAST_M = 0.01  # no fix is better (`fuse.gnss_std_floor_m`)
+_FLOAT_M = 0.5  # float solutions are better
+_LASTS_S = 45.0  # correlation time of a float solution
+_METRES_LAST_S = 120.0  # correlation time of metre-size errors
+_LARGE_M = 0.03  # smaller lasting errors go into σ
+_SQUARES_OF_TWO = 1.3863  # median of χ², two degrees of freedom
+_SQUARES_OF_ONE = 0.4549  # median of χ², one degree
 
 
 @dataclass(frozen=True, slots=True)

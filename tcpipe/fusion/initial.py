@@ -32,13 +32,13 @@ from tcpipe.geometry.rotation import quat_from_rpy, rotate, rpy_from_quat
 
 Floats = NDArray[np.float64]
 
-_MIN_COURSE_M = 5.0
-_MIN_COURSE_STD = 10.0
-_MIN_SPEED_MPS = 0.2
-_MAX_WINDOW_NS = 120_000_000_000
-_WINDOW_STEP_NS = 2_000_000_000
-_TILT_AGREES_RAD = 0.2
-_GYRO_BIAS_STD_RADPS = 0.02
+_MIN_COURSE_M = 5.0  # driven before course gives yaw (ruling)
+_MIN_COURSE_STD = 10.0  # distance over σ of fixes: yaw to 6°
+_MIN_SPEED_MPS = 0.2  # slower rows do not count (ruling)
+_MAX_WINDOW_NS = 120_000_000_000  # longest search for the start
+_WINDOW_STEP_NS = 2_000_000_000  # growth of that window
+_TILT_AGREES_RAD = 0.2  # agreement of IMU attitude and gravity
+_GYRO_BIAS_STD_RADPS = 0.02  # turn-on bias of a MEMS gyroscope, 1°/s
 _UNKNOWN_YAW_STD_RAD = 0.6  # the sigma points of a wider one would meet behind the robot
 
 
@@ -273,14 +273,14 @@ def _position(gnss: Positions | None, path: _Path, quat: Floats, yaw: float) -> 
     return position, std
 
 
-_WINDOW_NS = 500_000_000
+_WINDOW_NS = 500_000_000  # window of means and scatter
 _MAX_WHEEL_MPS = 0.02  # mean over the window; single samples are noisy
-_MAX_WHEEL_SPREAD_MPS = 0.06
-_MAX_SAMPLE_MPS = 0.2
+_MAX_WHEEL_SPREAD_MPS = 0.06  # encoders at rest; judged
+_MAX_SAMPLE_MPS = 0.2  # no stationary sample is faster
 _MAX_BIAS_RADPS = 0.05  # a gyroscope at rest may show this much
-_MIN_SPREAD_RADPS = 0.012
-_MIN_LENGTH_NS = 600_000_000
-_MARGIN_NS = 150_000_000
+_MIN_SPREAD_RADPS = 0.012  # gyroscope noise at rest; judged
+_MIN_LENGTH_NS = 600_000_000  # shorter stops do not count
+_MARGIN_NS = 150_000_000  # removed at both ends: rocking
 
 
 def find_stationary_intervals(measurements: Measurements) -> NDArray[np.int64]:
@@ -330,15 +330,15 @@ def _find_intervals(stamp_ns: NDArray[np.int64], still: NDArray[np.bool_]) -> ND
     return np.stack((long[:, 0] + _MARGIN_NS, long[:, 1] - _MARGIN_NS), -1)
 
 
-_GRID_S = 0.5
+_GRID_S = 0.5  # grid of the course
 _WINDOWS_S = (1.0, 2.0, 4.0, 8.0, 16.0)
-_CLEARLY = 3.0
-_MOVING_M = 0.3
-_MOVING_MPS = 0.2
-_OFTEN = 0.3
-_STEP_S = 1e-6
-_WILD = 5.0
-_TURNS_MPS2 = 2.0
+_CLEARLY = 3.0  # σ of fixes that a baseline needs
+_MOVING_M = 0.3  # shorter baselines show no course
+_MOVING_MPS = 0.2  # slower motion shows no course
+_OFTEN = 0.3  # share of usable baselines before longer ones
+_STEP_S = 1e-6  # step between two rates
+_WILD = 5.0  # σ off its neighbours' line: fix is bridged
+_TURNS_MPS2 = 2.0  # largest bend of that line in a turn
 
 
 def compute_course_rate(

@@ -40,21 +40,21 @@ Columns = Mapping[str, Floats]
 _IMU = Subject("role", IMU)
 _NO_TRUST = 1e6
 """Larger variances, of a kilometre or a kilometre a second, are cut to this: as little trust, and differences keep their digits."""
-_VELOCITY_FLOOR_MPS = 0.02
-_YAW_RATE_STD_RADPS = 0.1
-_YAW_RATE_FLOOR_RADPS = 0.02
-_MAX_VELOCITY_MPS = 50.0
-_MAX_RATE_RADPS = 100.0
-_MAX_FORCE_MPS2 = 1000.0
+_VELOCITY_FLOOR_MPS = 0.02  # no odometry is better
+_YAW_RATE_STD_RADPS = 0.1  # default of an odometry without one
+_YAW_RATE_FLOOR_RADPS = 0.02  # no odometry is better
+_MAX_VELOCITY_MPS = 50.0  # no robot is faster
+_MAX_RATE_RADPS = 100.0  # no gyroscope measures more
+_MAX_FORCE_MPS2 = 1000.0  # no accelerometer measures more
 _GRAVITY_BAND_MPS2 = (8.0, 12.0)
-_DATUM_FIXES = 10
-_NOISE_WINDOW_S = 2.0
-_TURNS_INTO = 0.1
+_DATUM_FIXES = 10  # the ENU origin is their median
+_NOISE_WINDOW_S = 2.0  # window of noise around each sample
+_TURNS_INTO = 0.1  # cosine: an unmeasured axis affects another, 6°
 _PIECE = 1 << 16
-_FEWEST_ROWS = 20
+_FEWEST_ROWS = 20  # second differences for velocity scatter
 _SCATTERS_MORE = 3.0
 """Than is claimed: a speed by counts that come only with every other message does, a rough road does not."""
-_MEAN_S = 0.5
+_MEAN_S = 0.5  # averaging of such a velocity
 
 
 @dataclass(frozen=True, slots=True)
@@ -357,12 +357,12 @@ __all__ = [
 ]
 
 
-_MAX_INCREMENT_S = 1.0
-_MOVED_M = 0.1
-_FEWEST = 20
-_MOVES_MPS = 0.2
-_FITS, _FITS_NOT = 0.1, 0.3
-_TURNED_RAD = 0.2
+_MAX_INCREMENT_S = 1.0  # longer increments give no velocity
+_MOVED_M = 0.1  # smaller moves may be stationary
+_FEWEST = 20  # increments that identify the twist's axes
+_MOVES_MPS = 0.2  # slower increments have no direction
+_FITS, _FITS_NOT = 0.1, 0.3  # largest residual share along its axes (18°); smallest along other axes (33°)
+_TURNED_RAD = 0.2  # a larger turn contradicts a zero rate
 
 
 def has_twist(velocity_mps: Floats, pose_m: Floats) -> bool:

@@ -24,17 +24,18 @@ from tcpipe.fusion.signals import (
 )
 
 WHEEL_SCALE_STD = 0.12  # a skid-steered robot on grass slips by so much
-VISUAL_SCALE_STD = 0.05
-_WHEEL_SCALE_TIME_S = 60.0
-_WHEEL_TURN_SCALE_STD, _VISUAL_TURN_SCALE_STD = 0.2, 0.03
-_TURN_SCALE_TIME_S = 60.0
+VISUAL_SCALE_STD = 0.05  # stereo calibration
+_WHEEL_SCALE_TIME_S = 60.0  # correlation time of slip
+_WHEEL_TURN_SCALE_STD = 0.2  # turn rate of skidding wheels
+_VISUAL_TURN_SCALE_STD = 0.03  # turn rate of a camera
+_TURN_SCALE_TIME_S = 60.0  # correlation time, as wheel scale
 SLOPE_RAD = 0.1  # of ground, where nothing shows it
 DOPPLER_LASTS_S = 3.0  # what a correlation that fades in 1.5 s weighs
 UNSEEN_TURN_RADPS = 0.07  # roll and pitch of a robot on uneven ground
 GROUND = 2e-3  # rad²/m: how fast the ground's slope changes under a robot: 2.6° over a metre
-_ACCELERATION_WINDOW_S = 0.6
-_SLIDE_WINDOW_S = 1.0
-_ACCELERATION_LASTS_S = 0.05
+_ACCELERATION_WINDOW_S = 0.6  # window of odometry's slope
+_SLIDE_WINDOW_S = 1.0  # window of sideways and upward velocity
+_ACCELERATION_LASTS_S = 0.05  # correlation time of acceleration: one row
 _COURSE_TURN = 0.02  # rad²/s: 8° in a second, of a turn that only the course over ground tells
 _DRIFT = 5e-7  # rad²/s: a tenth of a degree in a second
 _MAX_GAP_NS = 300_000_000
@@ -42,10 +43,14 @@ _STEADY = 1e-4  # m²/s³: 1 cm/s in a second
 _SLIDE = 1e-4  # m²/s³
 _UNSEEN_SLIDE = 4e-4  # m²/s³
 _FIXES, _FIX_WINDOW_S, _UNSEEN_LASTS_S, _UNSEEN_STEADY = 5, 1.0, 0.2, 1e-3  # the last in m²/s³
-_SHOWS_COURSE_MPS = 0.2
+_SHOWS_COURSE_MPS = 0.2  # worse velocity of fixes shows no course
 _UNSEEN_MPS = 0.5  # of a velocity told by fixes: more, and they do not show how it changes
-_LEVEL_STD_RAD, _HELD_STD_RAD = 0.7, 0.05
-_CHORD_S, _CHORD_M, _STEEPEST, _SLOPE_LASTS_M = 4.0, 1.0, 0.6, 10.0
+_LEVEL_STD_RAD = 0.7  # roll and pitch are small to this σ
+_HELD_STD_RAD = 0.05  # the same where only the course gives turns
+_CHORD_S = 4.0  # baseline of slope from fixes
+_CHORD_M = 1.0  # shorter baselines give no slope
+_STEEPEST = 0.6  # rad: no robot climbs more
+_SLOPE_LASTS_M = 10.0  # length of one slope
 _UNKNOWN = 0.3  # m²/s³: a robot of which only positions are known
 
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-_MIN_INPUT_GAP_NS = 100_000_000
+_MIN_INPUT_GAP_NS = 100_000_000  # shorter IMU gaps are interpolated
 
 
 def compute_seconds(stamp_ns: Ints | int, zero_ns: int) -> Floats:

@@ -32,7 +32,7 @@ from tcpipe.compiled import compile_kernel
 N = 17
 NX = 23
 SAVED = 33
-GRAVITY_MPS2 = 9.80665
+GRAVITY_MPS2 = 9.80665  # standard gravity (CGPM 1901)
 CENTRE_WEIGHT = 2.0
 
 KINDS = 9

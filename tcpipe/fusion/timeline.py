@@ -39,14 +39,14 @@ from tcpipe.fusion.signals import compute_interval_means, compute_median_period_
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-_MAX_STEP_NS = 50_000_000
-_NONHOLONOMIC_HZ = 10.0
-_MOVING_MPS = 0.05
-_UNSEEN_TURN_S = 1.0
+_MAX_STEP_NS = 50_000_000  # longest step: one row
+_NONHOLONOMIC_HZ = 10.0  # rate of the sideways constraint
+_MOVING_MPS = 0.05  # slower is stationary (ruling)
+_UNSEEN_TURN_S = 1.0  # duration of `process.UNSEEN_TURN_RADPS`
 _MEDIAN_OF_SQUARES = 0.4549  # of a normal variable of variance 1
-_STANDING_NS = 200_000_000
-_STANDING_STD_MPS = 0.01
-_LEVEL_NS = 1_000_000_000
+_STANDING_NS = 200_000_000  # spacing of stationary updates
+_STANDING_STD_MPS = 0.01  # rocking of a stationary robot
+_LEVEL_NS = 1_000_000_000  # spacing of level updates without sensors
 _PIECE = 1 << 15
 
 

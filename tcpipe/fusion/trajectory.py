@@ -80,7 +80,7 @@ class Trajectory:
     facts: StretchFacts
 
 
-_PAUSE_NS = 5_000_000_000
+_PAUSE_NS = 5_000_000_000  # a longer pause begins a new section
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,4 +1,4 @@
-"""Curves over the slope, one a terrain class: the fewest numbers that a model of a metre's cost can do with.
+"""Curves over the slope, one a terrain class: the model of a metre's cost with the fewest parameters.
 
 A curve is a sum of few functions of the slope; its numbers are found by least squares, in closed form. Where a class has few samples its
 curve lies near that of all ground: the difference counts as if as many samples as it has numbers had told that there is none.
@@ -29,7 +29,7 @@ Those of the spline are Harrell's (Regression Modeling Strategies, 2015, 2.4.6).
 
 @dataclass(frozen=True, slots=True)
 class Curves:
-    """What least squares found, as arrays."""
+    """Fitted curves, as arrays."""
 
     form: Form
     knots_rad: Floats
@@ -68,7 +68,7 @@ def list_curve_arrays(outputs: int) -> dict[str, ArrayForm]:
 
 
 def read_curves(form: Form, arrays: Mapping[str, NDArray[Any]], where: str) -> tuple[Curves, dict[str, NDArray[Any]]]:
-    """Return the curves that `Curves.arrays` told of, and what else is there; `ModelError` if they are not there."""
+    """Return the curves of `Curves.arrays` and the other arrays; `ModelError` without valid curves."""
     rest = dict(arrays)
     try:
         curves = Curves(form, *(rest.pop(f"{_STORED}{name}") for name in _ARRAYS))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pyarrow as pa
@@ -40,28 +40,28 @@ _CALLED = {"w": "power w", "v": "velocity v", "T": "time T", "E": "energy E"}
 _DIGITS = {"w": 1, "v": 3, "T": 3, "E": 1}
 _COLOURS = dict(zip(QUANTITIES, CLASS_COLOURS, strict=False))
 _MOST_SHOWN = 20_000
-"""Samples of a split that can each be clicked: the first, which stand in random order."""
+"""Samples of a split that can be clicked: the first ones, in random order."""
 _WORST = 30
 """Of each split, with their patches."""
 _WHOLE_JOULE = 10.0
-"""Error of E from which on whole joules tell enough: nine ranges of slope fit beside each other."""
+"""Error of E from which whole joules suffice, so that nine ranges of slope fit."""
 
 
 @dataclass(frozen=True, slots=True)
 class EvaluatedSamples:
-    """What the page shows of samples: ``predictions.parquet`` and sheets of the worst metres' patches, None without any."""
+    """Samples of the page: ``predictions.parquet``, and sheets of the worst samples' patches, if any."""
 
     table: pa.Table
     shown: NDArray[np.int64]
-    """The rows that the page holds, rising: the first of each split, and the worst."""
+    """The rows on the page, rising: the first of each split, and the worst."""
     patches: Json
 
 
 def select_evaluated_samples(table: pa.Table, data: Dataset) -> EvaluatedSamples:
-    """Return what a page shows of the samples of ``table``, with patches of the dataset that they are of."""
-    rows, every = find_worst_rows(table, _WORST), to_texts(table.column("split"))
-    first = [np.flatnonzero(every == name)[:_MOST_SHOWN] for name in dict.fromkeys(every.tolist())]
-    shown, split = np.unique(np.concatenate([*first, rows])), every[rows]
+    """Return the samples that a page shows, with patches from their dataset."""
+    rows, splits = find_worst_rows(table, _WORST), to_texts(table.column("split"))
+    first = [np.flatnonzero(splits == name)[:_MOST_SHOWN] for name in dict.fromkeys(splits.tolist())]
+    shown, split = np.unique(np.concatenate([*first, rows])), splits[rows]
     parts: list[dict[str, NDArray[np.generic]]] = []
     for name in dict.fromkeys(split.tolist()):
         ids = table.column("sample_id").take(pa.array(rows[split == name]))
@@ -76,26 +76,26 @@ def select_evaluated_samples(table: pa.Table, data: Dataset) -> EvaluatedSamples
 
 
 def make_page_data(samples: EvaluatedSamples) -> Json:
-    """Return what the page's script is told."""
+    """Return the data of the page's script."""
     table = samples.table.take(pa.array(samples.shown))
-    split, name = (to_texts(table.column(of)) for of in ("split", "terrain_name"))
+    split, name = (to_texts(table.column(column)) for column in ("split", "terrain_name"))
     splits, class_id = list(dict.fromkeys(split.tolist())), table.column("terrain_class").to_numpy()
     columns: dict[str, Column] = {
         "id": ("text", to_texts(table.column("sample_id"))),
-        "split": ("u8", np.array([splits.index(of) for of in split.tolist()], np.int64)),
+        "split": ("u8", np.array([splits.index(part) for part in split.tolist()], np.int64)),
         "class": ("u8", class_id),
         "slope": ("half", np.degrees(to_floats(table, "slope_rad"))),
     }
     for q in QUANTITIES:
-        said = to_floats(table, make_column_name(q, "predicted"))
+        predicted = to_floats(table, make_column_name(q, "predicted"))
         columns[q] = make_shown_column(_DIGITS[q], to_floats(table, make_column_name(q)))
-        columns[f"{q} predicted"] = make_shown_column(_DIGITS[q], said)
+        columns[f"{q} predicted"] = make_shown_column(_DIGITS[q], predicted)
         columns[f"{q} std"] = ("half", to_floats(table, make_column_name(q, "std")))
         for end in ("low", "high"):
-            columns[f"{q} {end}"] = ("half", to_floats(table, make_column_name(q, f"predicted_{end}")) - said)
+            columns[f"{q} {end}"] = ("half", to_floats(table, make_column_name(q, f"predicted_{end}")) - predicted)
     return {
         "samples": pack_columns(columns),
-        "splits": [{"name": of, "colour": SPLIT_COLOURS[of]} for of in splits],
+        "splits": [{"name": part, "colour": SPLIT_COLOURS[part]} for part in splits],
         "classes": [
             {"id": int(number), "name": str(name[class_id == number][0]), "colour": find_class_colour(int(number))}
             for number in np.unique(class_id)
@@ -108,7 +108,7 @@ def make_page_data(samples: EvaluatedSamples) -> Json:
 
 
 def sample_sections(samples: EvaluatedSamples, audits: Mapping[str, str]) -> list[Section]:
-    """Return the sections on single samples; nothing where none was predicted. ``audits`` say of each split how near training it is."""
+    """Return the sections on single samples, if any; ``audits`` describe how near to training each split is."""
     if not samples.table.num_rows:
         return []
     worst = (
@@ -168,48 +168,37 @@ def _draw_errors_by_slope(table: pa.Table, split: str, audit: str) -> Section:
     part = table.filter(pc.and_(pc.equal(table.column("split"), split), pc.is_valid(table.column("slope_rad"))))
     off, ranges = compute_errors_joule(part), find_slope_ranges(to_floats(part, "slope_rad"))
     energy, low, high = (to_floats(part, make_column_name("E", of)) for of in ("", "predicted_low", "predicted_high"))
-    classes = to_texts(part.column("terrain_name"))
-    names = [
-        name for _, name in sorted(set(zip(part.column("terrain_class").to_pylist(), classes.tolist(), strict=True)))
-    ]
-    met = np.unique(ranges)
-    cells = {
-        (name, at): off[here]
-        for name in names
-        for at in met
-        if (here := (classes == name) & (ranges == at) & np.isfinite(off)).any()
-    }
-    rmse = {key: float(np.sqrt(np.mean(of**2))) for key, of in cells.items()}
+    is_outside, classes = (energy < low) | (energy > high), to_texts(part.column("terrain_name"))
+    ids = sorted(set(zip(part.column("terrain_class").to_pylist(), classes.tolist(), strict=True)))
+    columns = np.unique(ranges)
+    cells = {(name, at): (classes == name) & (ranges == at) for _, name in ids for at in columns}
+    errors = {cell: off[rows & np.isfinite(off)] for cell, rows in cells.items()}
+    rmse = {cell: float(np.sqrt(np.mean(part**2))) for cell, part in errors.items() if len(part)}
     most = max(rmse.values(), default=1.0) or 1.0
     digits = 0 if most >= _WHOLE_JOULE else 2
     enough, least = (
         read_threshold("energy-overconfident", f"min_cell_{name}") for name in ("count", "coverage_fraction")
     )
-    rows: list[list[str | Shaded]] = []
-    for name in names:
-        row: list[str | Shaded] = [name]
-        for at in met:
-            here = (classes == name) & (ranges == at)
-            if (name, at) not in cells:
-                row.append("–")
-                continue
-            outside = float(np.mean((energy[here] < low[here]) | (energy[here] > high[here])))
-            doubted = len(cells[name, at]) >= enough and outside > 1.0 - least
-            mean = float(cells[name, at].mean())
-            text = f"{rmse[name, at]:.{digits}f}, {mean:+.{digits}f} ({len(cells[name, at])}){'*' if doubted else ''}"
-            row.append(Shaded(text, rmse[name, at] / most, alarm=doubted))
-        rows.append(row)
+
+    def shade(cell: tuple[str, Any]) -> str | Shaded:
+        if cell not in rmse:
+            return "–"
+        count, mean = len(errors[cell]), float(errors[cell].mean())
+        is_doubtful = count >= enough and bool(is_outside[cells[cell]].mean() > 1.0 - least)
+        text = f"{rmse[cell]:.{digits}f}, {mean:+.{digits}f} ({count}){'*' if is_doubtful else ''}"
+        return Shaded(text, rmse[cell] / most, alarm=is_doubtful)
+
     text = (
         "RMSE of E [J], mean error (predicted less measured), and in brackets of how many metres; darker is worse. * and a dashed border: "
         f"90 % intervals hold fewer than {100 * least:.0f} % of {enough:.0f} labels or more there: do not rely on them. {audit}"
     )
-    return Section(
-        f"Error by class and slope, {split}", text, header=["class", *(SLOPE_NAMES[at] for at in met)], rows=rows
-    )
+    header = ["class", *(SLOPE_NAMES[at] for at in columns)]
+    table_rows = [[name, *(shade((name, at)) for at in columns)] for _, name in ids]
+    return Section(f"Error by class and slope, {split}", text, header=header, rows=table_rows)
 
 
 def _draw_calibration(table: pa.Table) -> Section:
-    """Return how many labels lie below what the model states, for every share that it may state."""
+    """Return the share of labels below each quantile that the model states."""
     plots = []
     for split in pc.unique(table.column("split")).to_pylist():
         part = table.filter(pc.equal(table.column("split"), split))
@@ -246,40 +235,39 @@ def _draw_calibration(table: pa.Table) -> Section:
 
 def draw_paper_figures(plots: Mapping[str, Plotted]) -> Iterator[Section]:
     """Yield the paper's pictures: E of test samples and T of the unseen area, some of every class, each with its error."""
-    for split, quantity in (("test", "E"), ("unseen", "T")):
+    quantities: dict[str, Literal["E", "T"]] = {"test": "E", "unseen": "T"}
+    for split, quantity in quantities.items():
         if split in plots:
             label = f"{_CALLED[quantity]} [{UNITS[quantity]}]"
             text = (
                 f"As the paper's figures. Below: the absolute percentage error; its axis ends at {MOST_PERCENT:.0f} %."
             )
-            drawn = _draw_by_patch(plots[split], quantity, label)
-            yield Section(f"{label}, {split}: measured and predicted", text, plots=drawn, stacked=True)
+            figures = _draw_by_patch(plots[split], quantity, label)
+            yield Section(f"{label}, {split}: measured and predicted", text, plots=figures, stacked=True)
 
 
-def _draw_by_patch(told: Plotted, quantity: str, label: str) -> list[Plot]:
-    measured, predicted = (
-        np.asarray(told["E_measured" if quantity == "E" else "T_measured"], np.float64),
-        np.asarray(told["E_predicted" if quantity == "E" else "T_predicted"], np.float64),
-    )
-    number, classes = np.arange(1, len(measured) + 1), np.asarray(told["class"], np.str_)
+def _draw_by_patch(plotted: Plotted, quantity: Literal["E", "T"], label: str) -> list[Plot]:
+    keys: tuple[Literal["E_measured", "T_measured"], Literal["E_predicted", "T_predicted"]]
+    keys = ("E_measured", "E_predicted") if quantity == "E" else ("T_measured", "T_predicted")
+    measured, predicted = (np.asarray(plotted[key], np.float64) for key in keys)
+    number, classes = np.arange(1, len(measured) + 1), np.asarray(plotted["class"], np.str_)
     with np.errstate(divide="ignore", invalid="ignore"):
         percent = 100.0 * np.abs(predicted - measured) / np.abs(measured)
     source = {"patch": number, "class": classes, "measured": measured, "predicted": predicted, "percent": percent}
-    tips = [
-        ("", "@class, patch @patch"),
-        ("measured", "@measured{0.00}"),
-        ("predicted", "@predicted{0.00}"),
-        ("error", "@percent{0.0} %"),
-    ]
+    settings: dict[str, Any] = {
+        "tools": "xpan,xwheel_zoom,reset,save",
+        "tooltips": [
+            ("", "@class, patch @patch"),
+            *((name, f"@{name}{{0.00}}") for name in ("measured", "predicted")),
+            ("error", "@percent{0.0} %"),
+        ],
+        "waits": True,
+    }
     legend = {"measured": MEASURED, "predicted": PREDICTED}
-    values = make_plot(
-        f"patches {quantity}", alt=f"Measured and predicted {label} of some patches of every class.", axes=("", label),
-        legend=legend, tools="xpan,xwheel_zoom,reset,save", tooltips=tips, waits=True,
-    )  # fmt: skip
-    errors = make_plot(
-        f"patch errors {quantity}", alt="Their absolute error in percent.", axes=("", "absolute error [%]"),
-        tools="xpan,xwheel_zoom,reset,save", tooltips=tips, x_range=values.figure.x_range, waits=True,
-    )  # fmt: skip
+    alt = f"Measured and predicted {label} of some patches of every class."
+    values = make_plot(f"patches {quantity}", alt=alt, axes=("", label), legend=legend, **settings)
+    alt, axes = "Their absolute error in percent.", ("", "absolute error [%]")
+    errors = make_plot(f"patch errors {quantity}", alt=alt, axes=axes, x_range=values.figure.x_range, **settings)
     for name, colour in legend.items():
         values.figure.line("patch", name, source=source, color=colour, line_width=1.5)
         values.figure.scatter("patch", name, source=source, color=colour, size=4)
@@ -300,7 +288,7 @@ def _mark_classes(classes: NDArray[np.str_], plots: Sequence[Plot]) -> None:
             x0=[rows[0] - 0.5 for rows in odd], x1=[rows[-1] + 0.5 for rows in odd], color=FAINT, alpha=0.15
         )
         strip.level = "underlay"
-        plot.figure.hover.renderers = [of for of in plot.figure.renderers if of is not strip]
+        plot.figure.hover.renderers = [renderer for renderer in plot.figure.renderers if renderer is not strip]
         plot.figure.xaxis.ticker = [int(rows.mean()) for rows in spans.values()]
         plot.figure.xaxis.major_label_overrides = {int(rows.mean()): name for name, rows in spans.items()}
         plot.figure.xaxis.major_label_orientation = 0.6

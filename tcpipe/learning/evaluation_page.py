@@ -1,8 +1,8 @@
-"""The page of an evaluation: a verdict, its samples to be asked one by one, and every table of the paper beside its own."""
+"""The page of an evaluation: a verdict, its samples, and its tables beside those of the paper."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import astuple, fields
 from typing import Literal
 
@@ -16,11 +16,12 @@ from tcpipe.report.page import Number, Section, render_page, show_verdict
 from tcpipe.tables.findings import PREDICTED, judge_again
 
 FLOORS = {"label_floor": "label noise alone", "simulation_floor": "simulation's own floor"}
-"""What an error can hardly be less than, and what the page calls it."""
+"""Lower bounds of errors, and their names on the page."""
 
 MEASURES = {"rmse": "RMSE", "mape_percent": "MAPE"}
 SCORES = {"held_percent": "held by 90 %", "nll": "NLL", "crps": "CRPS"}
-"""How well a model told its own errors (`tcpipe.learning.metrics`)."""
+"""How well a model states its own errors (`tcpipe.learning.metrics`)."""
+_ALL_MEASURES = MEASURES | SCORES
 
 COUNTED = (
     "Beside a MAPE stands of how many labels it is: those of at least "
@@ -42,15 +43,15 @@ def render_evaluation_page(
 ) -> str:
     """Return the HTML page of what `evaluate` found; ``before`` and ``warnings`` come first."""
     audits = {split: format_leakage(found.splits[split].leakage) for split in found.ordered_splits}
-    drawn = sample_sections(samples, audits)
+    sample_parts = sample_sections(samples, audits)
     sections = [
         *before,
         _make_baselines_section(found),
-        *drawn,
+        *sample_parts,
         *_make_class_sections(found),
         _make_ablation_section(found),
         _make_energy_section(found),
-        _time(found),
+        _make_time_section(found),
         *draw_paper_figures(found.plots),
     ]
     return render_page(
@@ -67,51 +68,43 @@ def render_evaluation_page(
         verdict=show_verdict(judge_again(found.verdict, found.findings), found.findings, labels=PREDICTED),
         warnings=warnings,
         sections=[section for section in sections if section.rows or section.text],
-        script="evaluation.js" if drawn else "",
-        data=make_page_data(samples) if drawn else None,
+        script="evaluation.js" if sample_parts else "",
+        data=make_page_data(samples) if sample_parts else None,
     )
 
 
 def list_evaluation_rows(found: Evaluation) -> list[tuple[str | int | float | None, ...]]:
-    """Return every figure as one row: table, split, what, quantity, unit, class, then the fields of `Errors`."""
-    rows = (*_iterate_class_rows(found), *_iterate_ablation_rows(found), *_iterate_comparison_rows(found))
-    return [(*keys[:4], UNITS[keys[3]], keys[4], *astuple(error)) for keys, error in rows]
+    """Return every figure as one row of `COLUMNS`."""
+    return [
+        (table, split, what, quantity, UNITS[quantity], name, *astuple(error))
+        for table, split, what, errors in _iterate_tables(found)
+        for quantity, by_class in errors.items()
+        for name, error in by_class.items()
+    ]
 
 
-_Row = tuple[tuple[str, str, str, str, str], Errors]
-
-
-def _iterate_class_rows(found: Evaluation) -> Iterator[_Row]:
+def _iterate_tables(found: Evaluation) -> Iterator[tuple[str, str, str, ErrorsByClass]]:
     for split, part in found.splits.items():
-        for what, by_quantity in {"errors": part.errors, **part.floors}.items():
-            for quantity, by_class in by_quantity.items():
-                for name, error in by_class.items():
-                    yield ("by class", split, what, quantity, name), error
-    for quantity, by_class in (found.blocks or {}).items():
-        for name, error in by_class.items():
-            yield ("by class", "held out", "blocks", quantity, name), error
-
-
-def _iterate_ablation_rows(found: Evaluation) -> Iterator[_Row]:
+        for what, errors in {"errors": part.errors, **part.floors}.items():
+            yield "by class", split, what, errors
+    yield "by class", "held out", "blocks", found.blocks or {}
     for row in found.ablation:
         for split in found.splits:
-            for quantity, error in row.on(split).items():
-                yield ("ablation", split, f"{'+'.join(row.layers)} {row.how}", quantity, ALL), error
-
-
-def _iterate_comparison_rows(found: Evaluation) -> Iterator[_Row]:
+            errors = {quantity: {ALL: error} for quantity, error in row.on(split).items()}
+            yield "ablation", split, f"{'+'.join(row.layers)} {row.how}", errors
     for table, quantity, by_predictor in (("energy", "E", found.energy), ("time", "T", found.time)):
         for what, by_split in by_predictor.items():
             for split, error in by_split.items():
-                yield (table, split, what, quantity, ALL), error
-    for row in found.baselines:
-        yield ("baselines", row.split, row.baseline, row.quantity, ALL), row.errors
+                yield table, split, what, {quantity: {ALL: error}}
+    for result in found.baselines:
+        yield "baselines", result.split, result.baseline, {result.quantity: {ALL: result.errors}}
 
 
-ERRORS = tuple(of.name for of in fields(Errors))
-
-COLUMNS = ("table", "split", "what", "quantity", "unit", "class", "count", *ERRORS[1:])
+COLUMNS = ("table", "split", "what", "quantity", "unit", "class", *(field.name for field in fields(Errors)))
 """Of `list_evaluation_rows`."""
+
+_BLANK = [""] * len(SCORES)
+"""The cells of scores, where none is known."""
 
 
 def _format_figure(error: Errors | None, measure: str, quantity: str) -> str:
@@ -123,91 +116,84 @@ def _format_figure(error: Errors | None, measure: str, quantity: str) -> str:
     return f"{value:.{1 if measure == 'held_percent' else 2 if measure == 'nll' else _DIGITS[quantity]}f}"
 
 
+def _format_figures(error: Errors | None, quantity: str, measures: Iterable[str] = _ALL_MEASURES) -> list[str]:
+    return [_format_figure(error, measure, quantity) for measure in measures]
+
+
 def _format_paper_figure(value: float | None) -> str:
     return "–" if value is None else f"{value:.2f}"
 
 
-def _find_unit(measure: str, quantity: str) -> str:
-    return "%" if measure.endswith("percent") else "nat" if measure == "nll" else UNITS[quantity]
+def _format_measure(measure: str, quantity: str) -> str:
+    """Return the name of a measure with its unit."""
+    unit = "%" if measure.endswith("percent") else "nat" if measure == "nll" else UNITS[quantity]
+    return f"{_ALL_MEASURES[measure]} [{unit}]"
 
 
 def _make_baselines_section(found: Evaluation) -> Section:
-    """Return the model beside what is simplest, with the ratio to the best of these before it."""
+    """Return the model and the baselines, with the ratio of their errors."""
+    title = "Beside what is simplest"
+    if not found.baselines:
+        return Section(title)
     rows = []
     for split in found.ordered_splits:
         for quantity in QUANTITIES:
-            ours = found.splits[split].errors[quantity][ALL]
-            rows.append(
-                (
-                    split,
-                    quantity,
-                    "the model",
-                    *(_format_figure(ours, measure, quantity) for measure in (*MEASURES, *SCORES)),
-                    "",
-                    "",
-                )
-            )
+            errors = found.splits[split].errors[quantity][ALL]
+            rows.append((split, quantity, "the model", *_format_figures(errors, quantity), "", ""))
             for row in found.baselines:
                 if (row.split, row.quantity) == (split, quantity):
-                    figures = (_format_figure(row.errors, measure, quantity) for measure in MEASURES)
-                    blank = [""] * len(SCORES)
-                    rows.append(("", "", row.baseline, *figures, *blank, str(row.rmse_ratio), str(row.mape_ratio)))
+                    figures = [*_format_figures(row.errors, quantity, MEASURES), *_BLANK]
+                    rows.append(("", "", row.baseline, *figures, str(row.rmse_ratio), str(row.mape_ratio)))
     header = ("", "", "", "RMSE", "MAPE [%]", "held by 90 % [%]", "NLL", "CRPS", "ratio of RMSE", "ratio of MAPE")
     text = (
         "Fitted on the samples that the model was fitted on, measured on the same as it. Ratios are the model's error over the "
         "baseline's, with their 95 % interval (paired bootstrap over runs or blocks): below 1 the model is better. Physics and boosting "
-        "are told the turn of each metre, too. "
+        f"are told the turn of each metre, too. {COUNTED}{'. '.join(describe_ratios(found.baselines))}. {format_audit(found)}"
     )
-    text += f"{COUNTED}{'. '.join(describe_ratios(found.baselines))}. {format_audit(found)}"
-    if not found.baselines:
-        return Section("Beside what is simplest")
-    return Section("Beside what is simplest", text, header=header, rows=rows, figures_from=3)
+    return Section(title, text, header=header, rows=rows, figures_from=3)
 
 
 def _make_class_sections(found: Evaluation) -> list[Section]:
     """Return tables I and II."""
     sections = []
-    for number, name in zip(("I", "II"), SPLITS, strict=True):
-        if name not in found.splits:
+    for number, split in zip(("I", "II"), SPLITS, strict=True):
+        if split not in found.splits:
             continue
-        part = found.splits[name]
-        classes = [*part.class_order, ALL]
-        rows = []
-        for quantity in QUANTITIES:
-            for measure, called in MEASURES.items():
-                ours = [_format_figure(part.errors[quantity].get(entry), measure, quantity) for entry in classes]
-                rows.append((f"{quantity}, {called} [{_find_unit(measure, quantity)}]", "here", *ours))
-                told = dict(zip(paper.CLASSES, paper.BY_CLASS[name, quantity, measure], strict=True))
-                rows.append(("", "the paper", *(_format_paper_figure(told.get(entry)) for entry in classes)))
-                if name == "test" and found.blocks is not None:
-                    blocks = [_format_figure(found.blocks[quantity].get(entry), measure, quantity) for entry in classes]
-                    rows.append(("", "held-out blocks of train", *blocks))
-                for said, floors in _iterate_floors(found, name):
-                    noise = [_format_figure(floors[quantity].get(entry), measure, quantity) for entry in classes]
-                    rows.append(("", said, *noise))
-                repeats = found.repeatability[quantity]
-                if measure == "rmse" and repeats is not None:
-                    blank = [""] * len(part.classes)
-                    rows.append(("", "repeats to, driven again", *blank, f"{repeats.std:.{_DIGITS[quantity]}f}"))
-            if part.errors[quantity][ALL].nll is not None:
-                for score, called in SCORES.items():
-                    ours = [_format_figure(part.errors[quantity].get(entry), score, quantity) for entry in classes]
-                    rows.append((f"{quantity}, {called} [{_find_unit(score, quantity)}]", "here", *ours))
-        header = ("", "", *(f"{entry} ({part.classes[entry]})" for entry in part.class_order), f"all ({part.samples})")
-        sections.append(
-            Section(
-                f"Table {number}: {_CALLED[name]}",
-                f"{_TEXT[name]} {_describe_error_samples(found)}{COUNTED}{format_leakage(part.leakage)}",
-                header=header,
-                rows=rows,
-                figures_from=2,
-            )
-        )
+        part = found.splits[split]
+        rows = [row for quantity in QUANTITIES for row in _iterate_class_rows(found, split, quantity)]
+        header = ("", "", *(f"{name} ({part.classes[name]})" for name in part.class_order), f"all ({part.samples})")
+        text = f"{_TEXT[split]} {_describe_error_samples(found)}{COUNTED}{format_leakage(part.leakage)}"
+        sections.append(Section(f"Table {number}: {_CALLED[split]}", text, header=header, rows=rows, figures_from=2))
     return sections
 
 
+def _iterate_class_rows(found: Evaluation, split: str, quantity: str) -> Iterator[tuple[str, ...]]:
+    """Yield the rows of a quantity in table I or II: measures beside the paper's and their lower bounds, then scores."""
+    part = found.splits[split]
+    classes = [*part.class_order, ALL]
+
+    def make_row(first: str, second: str, by_class: Mapping[str, Errors], measure: str) -> tuple[str, ...]:
+        return first, second, *(_format_figure(by_class.get(name), measure, quantity) for name in classes)
+
+    for measure in MEASURES:
+        yield make_row(f"{quantity}, {_format_measure(measure, quantity)}", "here", part.errors[quantity], measure)
+        of_paper = dict(zip(paper.CLASSES, paper.BY_CLASS[split, quantity, measure], strict=True))
+        yield ("", "the paper", *(_format_paper_figure(of_paper.get(name)) for name in classes))
+        if split == "test" and found.blocks is not None:
+            yield make_row("", "held-out blocks of train", found.blocks[quantity], measure)
+        for floor, errors in part.floors.items():
+            yield make_row("", FLOORS[floor], errors[quantity], measure)
+        repeats = found.repeatability[quantity]
+        if measure == "rmse" and repeats is not None:
+            blank = [""] * len(part.classes)
+            yield ("", "repeats to, driven again", *blank, f"{repeats.std:.{_DIGITS[quantity]}f}")
+    if part.errors[quantity][ALL].nll is not None:
+        for score in SCORES:
+            yield make_row(f"{quantity}, {_format_measure(score, quantity)}", "here", part.errors[quantity], score)
+
+
 def _describe_error_samples(found: Evaluation) -> str:
-    """Return what samples the model knows its own errors by, in words."""
+    """Return which samples the stated errors of the model rest on, in words."""
     training = found.model.training
     count = training.samples["held out"]
     if training.config.model == "resnet18":
@@ -219,12 +205,12 @@ def _describe_error_samples(found: Evaluation) -> str:
 
 
 def format_audit(found: Evaluation) -> str:
-    """Return how much of each split was met in training, in words."""
+    """Return how near to training each split is, in words."""
     return " ".join(f"{split}: {format_leakage(found.splits[split].leakage)}" for split in found.ordered_splits)
 
 
 def format_leakage(leakage: Leakage | None) -> str:
-    """Return how much of a split was met in training, in words."""
+    """Return how near to training a split is, in words."""
     if leakage is None:
         return "Nothing is known of its distance from training."
     sharing = "" if leakage.sharing_percent is None else f"; {leakage.sharing_percent:.0f} % share ground with one"
@@ -243,88 +229,62 @@ _TEXT = {
 
 def _make_ablation_section(found: Evaluation) -> Section:
     """Return table III."""
-    splits = found.ordered_splits
+    columns = (*paper.ABLATION_COLUMNS, *(("E", score) for score in SCORES))
+
+    def format_row(errors: Mapping[str, Errors]) -> list[str]:
+        return [_format_figure(errors[quantity], measure, quantity) for quantity, measure in columns]
+
     rows = []
     for row in found.ablation:
-        key = row.layers
-        called, how = "{" + ", ".join(key) + "}", "retrained" if row.how == "retrained" else "here"
-        for split in splits:
-            figures = [
-                _format_figure(row.on(split)[quantity], measure, quantity) for quantity, measure in _ABLATION_COLUMNS
-            ]
-            rows.append((called, split, how, *figures))
-            if row.how == "noise" and key in paper.ABLATION:
-                told = paper.ABLATION[key][SPLITS.index(split)]
-                blank = [""] * len(SCORES)
-                rows.append(("", "", "the paper", *(_format_paper_figure(value) for value in told), *blank))
-    for split in splits:
-        for said, floors in _iterate_floors(found, split):
-            figures = [
-                _format_figure(floors[quantity][ALL], measure, quantity) for quantity, measure in _ABLATION_COLUMNS
-            ]
-            rows.append((said, split, "", *figures))
-    header = ("layers", "", "", *(f"{q} {(MEASURES | SCORES)[m]} [{_find_unit(m, q)}]" for q, m in _ABLATION_COLUMNS))
-    draws = found.config.draws
-    text = f"Layers not named are replaced by noise, mean of {draws} draws; retrained: a network that never had them. {COUNTED}"
-    text += format_audit(found)
+        layers, how = f"{{{', '.join(row.layers)}}}", "retrained" if row.how == "retrained" else "here"
+        for split in found.ordered_splits:
+            rows.append((layers, split, how, *format_row(row.on(split))))
+            if row.how == "noise" and row.layers in paper.ABLATION:
+                of_paper = map(_format_paper_figure, paper.ABLATION[row.layers][SPLITS.index(split)])
+                rows.append(("", "", "the paper", *of_paper, *_BLANK))
+    for split in found.ordered_splits:
+        for floor, errors in found.splits[split].floors.items():
+            by_quantity = {quantity: by_class[ALL] for quantity, by_class in errors.items()}
+            rows.append((FLOORS[floor], split, "", *format_row(by_quantity)))
+    header = ("layers", "", "", *(f"{quantity} {_format_measure(measure, quantity)}" for quantity, measure in columns))
+    text = (
+        f"Layers not named are replaced by noise, mean of {found.config.draws} draws; retrained: a network that never had them. "
+        f"{COUNTED}{format_audit(found)}"
+    )
     return Section("Table III: ablation", text, header=header, rows=rows, figures_from=3)
-
-
-_ABLATION_COLUMNS = (*paper.ABLATION_COLUMNS, *(("E", score) for score in SCORES))
-
-
-def _iterate_floors(found: Evaluation, split: str) -> Iterator[tuple[str, ErrorsByClass]]:
-    """Yield what errors on a split can hardly be less than: its name, and errors by quantity and class."""
-    yield from ((FLOORS[floor], errors) for floor, errors in found.splits[split].floors.items())
 
 
 def _make_comparison_section(
     title: str,
     text: str,
     found: Evaluation,
-    told: Mapping[str, Sequence[tuple[float, float]]],
+    of_paper: Mapping[str, Sequence[tuple[float, float]]],
     quantity: Literal["E", "T"],
 ) -> Section:
-    """Return table IV or V, beside what is told in the paper."""
+    """Return table IV or V, beside the paper's."""
     table = found.energy if quantity == "E" else found.time
     splits = found.ordered_splits
-    rows = []
-    for what, by_split in ((what, table[what]) for what in (OURS, GRASS_ONLY, PER_CLASS, EXPECTED) if what in table):
-        cells = [
-            _format_figure(by_split[split], measure, quantity) for split in splits for measure in (*MEASURES, *SCORES)
-        ]
-        rows.append((what, "here", *cells))
-        if what in told:
-            blank = [""] * len(SCORES)
-            figures = [
-                cell
-                for split in splits
-                for cell in (*map(_format_paper_figure, told[what][SPLITS.index(split)]), *blank)
-            ]
-            rows.append(("", "the paper", *figures))
-    for floors in zip(*(_iterate_floors(found, split) for split in splits), strict=True):
-        cells = [
-            _format_figure(floor[quantity][ALL], measure, quantity)
-            for _, floor in floors
-            for measure in (*MEASURES, *SCORES)
-        ]
-        rows.append((floors[0][0], "", *cells))
+    rows: list[tuple[str, ...]] = []
+
+    def add(first: str, second: str, by_split: Mapping[str, Errors]) -> None:
+        rows.append((first, second, *(cell for split in splits for cell in _format_figures(by_split[split], quantity))))
+
+    for what in (OURS, GRASS_ONLY, PER_CLASS, EXPECTED):
+        if what not in table:
+            continue
+        add(what, "here", table[what])
+        if what in of_paper:
+            cells = [[*map(_format_paper_figure, of_paper[what][SPLITS.index(split)]), *_BLANK] for split in splits]
+            rows.append(("", "the paper", *(cell for part in cells for cell in part)))
+    for floor in found.splits[splits[0]].floors if splits else ():
+        add(FLOORS[floor], "", {split: found.splits[split].floors[floor][quantity][ALL] for split in splits})
     repeats = found.repeatability[quantity]
     if repeats is not None:
-        rows.append(
-            ("repeats to, driven again", "", *([f"{repeats.std:.{_DIGITS[quantity]}f}", "", "", "", ""] * len(splits)))
-        )
-    header = (
-        "",
-        "",
-        *(
-            f"{split}, {called} [{_find_unit(m, quantity)}]"
-            for split in splits
-            for m, called in (MEASURES | SCORES).items()
-        ),
-    )
+        cells = [[f"{repeats.std:.{_DIGITS[quantity]}f}", "", *_BLANK]] * len(splits)
+        rows.append(("repeats to, driven again", "", *(cell for part in cells for cell in part)))
+    measures = (f"{split}, {_format_measure(measure, quantity)}" for split in splits for measure in _ALL_MEASURES)
     text += f" {COUNTED}{format_audit(found)}"
-    return Section(title, text, header=header, rows=rows, figures_from=2)
+    return Section(title, text, header=("", "", *measures), rows=rows, figures_from=2)
 
 
 def _make_energy_section(found: Evaluation) -> Section:
@@ -341,6 +301,6 @@ def _make_energy_section(found: Evaluation) -> Section:
     return _make_comparison_section("Table IV: energy against Wei and Isler", text, found, paper.ENERGY, "E")
 
 
-def _time(found: Evaluation) -> Section:
+def _make_time_section(found: Evaluation) -> Section:
     text = "The expected time is d / v at the robot's greatest speed."
     return _make_comparison_section("Table V: time against the expected time", text, found, paper.TIME, "T")

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import accumulate
+from typing import Any
 
-MAX_DAMAGE = 1000
-"""So many findings are told one by one."""
+from tcpipe.tables.findings import Finding, Subject, make_finding
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,45 +47,67 @@ class Topic:
 
 @dataclass(frozen=True, slots=True)
 class Damage:
-    """One thing that is wrong with a log: where (file and byte), on which topic, what, and what it cost where that is known.
+    """A damaged place of a log, and what it cost where that is known.
 
-    ``start_ns`` and ``end_ns`` bound the log times of what was lost, where known.
+    Attributes
+    ----------
+    cause : code in the catalogue of findings.
+    file : the file; of a directory its name and that of the file.
+    offset : byte of the file.
+    places : how many there are, where they are counted together.
+    reason : what the template of the cause needs beside numbers.
     """
 
-    where: str
-    what: str
+    cause: str
+    file: str
+    offset: int | None = None
     topic: str | None = None
     messages_lost: int | None = None
     bytes_lost: int | None = None
-    start_ns: int | None = None
-    end_ns: int | None = None
+    places: int = 1
+    reason: str = ""
 
     @property
     def is_loss(self) -> bool:
-        """Whether something is or may be lost; what is known to cost no message is only worth saying."""
+        """Whether something is or may be lost."""
         return self.messages_lost != 0 or bool(self.bytes_lost)
 
-    def __str__(self) -> str:
-        """Return one plain line."""
-        topic = f", topic {self.topic}" if self.topic else ""
-        lost = [
-            f"{count} {unit}" for count, unit in ((self.messages_lost, "messages"), (self.bytes_lost, "bytes")) if count
-        ]
-        return f"{self.where}{topic}: {self.what}" + (f" ({', '.join(lost)} lost)" if lost else "")
+
+def find_damage(damage: Iterable[Damage]) -> list[Finding]:
+    """Return a finding for each cause and file or topic: counts add up, the first reason counts, and without a loss it is a note."""
+    groups: dict[tuple[str, Subject], list[Damage]] = {}
+    for place in dict.fromkeys(damage):
+        subject = Subject("topic", place.topic) if place.topic else Subject("file", place.file)
+        groups.setdefault((place.cause, subject), []).append(place)
+    return [_merge_damage(subject, places) for (_, subject), places in groups.items()]
 
 
-def condense_damage(damage: Sequence[Damage]) -> list[Damage]:
-    """Return the first thousand findings, and one that sums up the others: a log that is made to be broken has one for some bytes of it."""
-    rest = damage[MAX_DAMAGE:]
-    if not rest:
-        return list(damage)
-    lost = [
-        sum(count or 0 for count in counts)
-        for counts in zip(*((of.messages_lost, of.bytes_lost) for of in rest), strict=True)
-    ]
-    unknown = any(of.is_loss for of in rest) and not any(lost)
-    what = f"{len(rest)} more findings like these"
-    return [*damage[:MAX_DAMAGE], Damage(rest[0].where, what, None, None if unknown else lost[0], lost[1] or None)]
+def _merge_damage(subject: Subject, places: Sequence[Damage]) -> Finding:
+    first, count = places[0], sum(place.places for place in places)
+    numbers: dict[str, Any] = {
+        "places_count": count if count > 1 else None,
+        "first_offset": first.offset,
+        "lost_messages_count": _add_known(place.messages_lost for place in places),
+        "lost_bytes": _add_known(place.bytes_lost for place in places),
+    }
+    return make_finding(
+        first.cause,
+        subject,
+        severity="warning" if any(place.is_loss for place in places) else "note",
+        names={"reason": first.reason} if first.reason else None,
+        **{name: number for name, number in numbers.items() if number is not None},
+    )
+
+
+def split_notes(findings: Iterable[Finding]) -> tuple[tuple[Finding, ...], tuple[Finding, ...]]:
+    """Return the findings that tell of a loss, and the notes."""
+    found = list(findings)
+    return tuple(of for of in found if of.severity != "note"), tuple(of for of in found if of.severity == "note")
+
+
+def _add_known(counts: Iterable[int | None]) -> int | None:
+    known = [count for count in counts if count is not None]
+    return sum(known) if known else None
 
 
 def normalize_type_name(name: str) -> str:

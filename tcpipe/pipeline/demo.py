@@ -70,12 +70,7 @@ def run_demo(directory: Path, *, seed: int, say: Callable[[str], None]) -> DemoR
     for path in site.logs:
         say(f"$ tcpipe ingest {path}")
     ingested = ingest(site.logs, store=store_path, recipe=Recipe())
-    problems = [
-        problem
-        for result in ingested.results
-        for problem in (*result.problems, *(result.run.damage if result.run else ()))
-    ]
-    if problems:
+    if problems := [problem for result in ingested.results for problem in result.problems]:
         raise DatasetError(*problems)
     height, ortho, terrain, classes = (site.rasters[name] for name in ("height", "ortho", "terrain", "classes"))
     say(

@@ -19,9 +19,11 @@ from tcpipe.formats.json_files import parse_typed, read_json, write_json
 from tcpipe.formats.logs.log_file import Log, open_log
 from tcpipe.formats.object_storage import format_path, is_url
 from tcpipe.formats.parquet import make_storable, read_schema, write_parquet_rows
+from tcpipe.logs.topics import split_notes
 from tcpipe.pipeline.log_sources import make_definitions_key
 from tcpipe.power.sources import find_bare_unit
 from tcpipe.store import find_store_above, is_store
+from tcpipe.tables.findings import Finding
 from tcpipe.tables.levels import add_metadata, read_metadata
 
 INDEX = "export.json"
@@ -50,8 +52,8 @@ class IndexEntry:
     type: str
     rows: int
     made_from: ExportOrigin
-    damage: tuple[str, ...]
-    remarks: tuple[str, ...]
+    damage: tuple[Finding, ...]
+    remarks: tuple[Finding, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,8 +81,8 @@ class Exported:
     out: Path
     status: Literal["done", "unchanged"]
     topics: tuple[ExportedTopic, ...]
-    damage: tuple[str, ...]
-    remarks: tuple[str, ...]
+    damage: tuple[Finding, ...]
+    remarks: tuple[Finding, ...]
     exit_code: int
     """3 where the log had lost something."""
 
@@ -125,8 +127,8 @@ def export(
             return _make_exported("unchanged", index, wanted, shown, out)
         rows = _write(log, {name: paths[name] for name in wanted}, threads)
         if wanted and not any(count is not None for count in rows.values()):
-            raise LogError(f"{shown}: nothing to export: no topic can be read", *map(str, log.damage))
-        damage, remarks = tuple(str(damage) for damage in log.damage if damage.is_loss), tuple(log.remarks)
+            raise LogError(f"{shown}: nothing to export: no topic can be read", findings=log.findings)
+        damage, remarks = split_notes(log.findings)
         if not wanted:
             return Exported(shown, out, "done", (), damage, remarks, 3 if damage else 0)
         entries = {
@@ -221,8 +223,8 @@ def _make_exported(
 ) -> Exported:
     found = {name: entries[name] for name in wanted}
     files = tuple(ExportedTopic(name, of.type, out / of.file, of.rows) for name, of in found.items() if of.file)
-    damage = dict.fromkeys(line for of in found.values() for line in of.damage)
-    remarks = dict.fromkeys(line for of in found.values() for line in of.remarks)
+    damage = dict.fromkeys(finding for of in found.values() for finding in of.damage)
+    remarks = dict.fromkeys(finding for of in found.values() for finding in of.remarks)
     return Exported(log, out, status, files, tuple(damage), tuple(remarks), 3 if damage else 0)
 
 

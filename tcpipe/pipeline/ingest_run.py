@@ -19,9 +19,10 @@ from tcpipe.formats.logs.log_joining import AnyLog, open_logs
 from tcpipe.formats.recipe_toml import ingest_key, load_profiles, make_recipe_id, read_key
 from tcpipe.formats.run_documents import Counts, LogOrigin, Manifest, RunJson, TopicCount
 from tcpipe.formats.stored_runs import lend_streams
+from tcpipe.logs.topics import split_notes
 from tcpipe.pipeline.calls import is_committed
-from tcpipe.pipeline.ingest_task import IngestResult, IngestTask, check_age, make_result, mark_reported
-from tcpipe.pipeline.log_sources import LogSource, find_damage
+from tcpipe.pipeline.log_sources import LogSource, find_damaged_log, find_total_loss
+from tcpipe.pipeline.plan import IngestResult, IngestTask, check_age, make_result, mark_reported
 from tcpipe.progress import set_task, step
 from tcpipe.recipe import IngestSections
 from tcpipe.store import Store
@@ -162,14 +163,17 @@ def _read(
             return cached, replace(
                 known, damage=before.damage, remarks=before.remarks, streams=before.streams, streams_key=key
             )
+    damage, _ = split_notes(log.findings)
+    if lost := find_total_loss(log.topics.values(), damage):
+        raise LogError(*lost, findings=damage)
     streams = read_run(
         log, find_read_config(task.recipe, log.topics), robot=task.robot, known=load_profiles(task.recipe)
     )
     if task.source.has_changed():
         raise LogError(f"{task.source.name}: changed while it was read")
-    damage = tuple(str(damage) for damage in log.damage if damage.is_loss)
+    damage, remarks = split_notes(log.findings)
     known = make_run_json(task, log, streams, sha256)
-    return streams, replace(known, damage=damage, remarks=tuple(log.remarks), streams_key=key)
+    return streams, replace(known, damage=damage, remarks=remarks, streams_key=key)
 
 
 def make_run_json(task: IngestTask, log: AnyLog, streams: Streams, sha256: str) -> RunJson:
@@ -192,7 +196,7 @@ def make_manifest(
     """Return what became of a run; ``known`` gives tags and damage."""
     info, count = labelled.info, labelled.table.num_rows
     subject = Subject("run", info.run_id)
-    found = (*find_damage(known.damage, subject), *_find_few_segments(count, subject))
+    found = (*find_damaged_log(known.damage, subject), *_find_few_segments(count, subject))
     info = add_findings(info, found, info.report.facts)
     messages = {role: table.num_rows for role, table in streams.tables.items()}
     return Manifest(

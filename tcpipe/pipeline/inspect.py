@@ -61,7 +61,7 @@ class InspectedRun:
     source: LogOrigin | None
     """None where run.json is gone."""
     tags: Mapping[str, str]
-    remarks: tuple[str, ...]
+    remarks: tuple[Finding, ...]
     recipes: tuple[InspectedIngestion, ...]
 
 

@@ -17,8 +17,8 @@ from tcpipe.formats.recipe_toml import load_profiles
 from tcpipe.logs.clocks import SECOND_NS, Timeline, TopicTimes, settle_clocks
 from tcpipe.logs.roles import RoleAssignment
 from tcpipe.logs.simulated_clock import CLOCK, LOG_CLOCK, SIMULATED_NS
-from tcpipe.logs.topics import Topic
-from tcpipe.pipeline.log_sources import find_damage
+from tcpipe.logs.topics import Topic, split_notes
+from tcpipe.pipeline.log_sources import find_damaged_log, find_total_loss
 from tcpipe.power.sources import find_sources
 from tcpipe.recipe import Recipe
 from tcpipe.robots.profiles import Profiles
@@ -104,8 +104,8 @@ class InspectedLog:
     problems: tuple[str, ...] = ()
     """What is to be decided before it can be ingested, or why it cannot be read."""
     findings: tuple[Finding, ...] | None = field(default=None, metadata=ABSENT)
-    damage: tuple[str, ...] | None = field(default=None, metadata=ABSENT)
-    remarks: tuple[str, ...] | None = field(default=None, metadata=ABSENT)
+    damage: tuple[Finding, ...] | None = field(default=None, metadata=ABSENT)
+    remarks: tuple[Finding, ...] | None = field(default=None, metadata=ABSENT)
 
 
 def inspect_log(log: Log | TableLog, recipe: Recipe, robot: str | None, *, full: bool) -> InspectedLog:
@@ -124,13 +124,14 @@ def inspect_log(log: Log | TableLog, recipe: Recipe, robot: str | None, *, full:
     )
     if full:
         topics, steps = _read(log, topics)
-    damage = tuple(str(damage) for damage in log.damage if damage.is_loss)
+    damage, remarks = split_notes(log.findings)
+    lost = find_total_loss(log.topics.values(), damage)
     findings = (
-        *cast.findings,
+        *(() if lost else cast.findings),
         *find_power_candidates(log, cast, config),
         *_find_simulated_time(log.topics.values()),
         *_find_slow_power(log, cast, recipe, known),
-        *find_damage(damage, Subject("log", str(log.path))),
+        *find_damaged_log(damage, Subject("log", str(log.path))),
     )
     starts = [topic.start_ns for topic in log.topics.values() if topic.start_ns is not None]
     ends = [topic.end_ns for topic in log.topics.values() if topic.end_ns is not None]
@@ -145,10 +146,10 @@ def inspect_log(log: Log | TableLog, recipe: Recipe, robot: str | None, *, full:
         topics=topics,
         clock_epochs=None if steps is None else len(steps) + 1,
         clock_steps=steps,
-        problems=tuple(cast.problems),
+        problems=lost or tuple(cast.problems),
         findings=tuple(sort_findings(findings)),
         damage=damage,
-        remarks=tuple(log.remarks),
+        remarks=remarks,
     )
 
 

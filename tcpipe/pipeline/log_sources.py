@@ -19,6 +19,7 @@ from tcpipe.formats.logs.log_joining import open_logs
 from tcpipe.formats.logs.rosbag2 import STORAGE_SUFFIXES, is_one_bag, list_storage_files
 from tcpipe.formats.logs.table_folders import Mappings, find_table_folders, list_table_files
 from tcpipe.formats.object_storage import format_path, is_url, make_stand_ins, split_url
+from tcpipe.logs.topics import Topic
 from tcpipe.tables.findings import Finding, Subject, make_finding
 
 _LONGEST_STEM_BYTES = 200
@@ -305,9 +306,16 @@ def _hash_source(source: LogSource) -> LogSource:
         return source
 
 
-def find_damage(damage: Sequence[str], subject: Subject) -> tuple[Finding, ...]:
-    """Return the finding that a log is damaged, by its lines of damage."""
-    return (make_finding("log-damaged", subject, damage_count=len(damage)),) if damage else ()
+def find_damaged_log(damage: Sequence[Finding], subject: Subject) -> tuple[Finding, ...]:
+    """Return the finding that a log is damaged, which decides exit codes and is acknowledged, whatever the damage is called."""
+    places = sum(finding.numbers.get("places_count", 1) for finding in damage)
+    return (make_finding("log-damaged", subject, damage_count=places),) if damage else ()
+
+
+def find_total_loss(topics: Iterable[Topic], damage: Sequence[Finding]) -> tuple[str, ...]:
+    """Return the problem that damage leaves no message of any topic, if so: then no sensor is missing, but the file is cut."""
+    is_lost = damage and all(topic.message_count == 0 for topic in topics)
+    return ("the log is damaged, and no message can be read",) if is_lost else ()
 
 
 def find_failure(log: str, error: str) -> tuple[Finding, ...]:

@@ -190,7 +190,9 @@ def _bring_run(found: Document) -> Document:
     """Return what is known of a log, with ``findings`` as ``report``."""
     if "findings" not in found:
         return found
-    return {**_remove_keys(found, "findings"), "report": _convert_findings(found["findings"], "run", "")}
+    report = _convert_findings(found["findings"], "run", "")
+    texts = {key: _read_earlier(found.get(key, ()), "log", "") for key in ("damage", "remarks")}
+    return {**_remove_keys(found, "findings"), **texts, "report": report}
 
 
 def _bring_document(found: Document, where: str) -> Document:
@@ -207,6 +209,7 @@ def _bring_document(found: Document, where: str) -> Document:
         findings = report["findings"]
         document |= {"info": {**_remove_keys(found["info"], "findings"), "report": report}}
         document |= {"counts": _bring_counts(found["counts"])}
+        document |= {"damage": _read_earlier(found["damage"], "run", found["run_id"])}
     else:
         own = chain(found.get("problems", ()), found.get("warnings", ()))
         findings = _read_earlier(own, "dataset", str(found.get("name", "")))

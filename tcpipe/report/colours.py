@@ -1,10 +1,9 @@
-"""The colours of pages and pictures: told apart with any colour vision, on white and on dark ground."""
+"""Colours of pages and pictures, which differ for any colour vision, on light and dark backgrounds."""
 
 from __future__ import annotations
 
 from tcpipe.tables.bits import DropReason
 
-INK = "#22303c"
 FAINT = "#8a97a3"
 KEPT = "#009e73"
 DROPPED = "#d55e00"
@@ -14,7 +13,7 @@ CLASS_COLOURS = ("#aa3377", "#228833", "#66ccee", "#ccbb44", "#ee6677", "#4477aa
 CURSOR = "#ff2d95"
 DOUBTED = "#e69f00"
 UNUSED = "#8fd3bd"
-"""Of what is kept, and in no segment."""
+"""Kept rows that belong to no segment."""
 REASON_COLOURS = {
     DropReason.GAP: "#cc79a7",
     DropReason.STANDING: FAINT,
@@ -24,9 +23,9 @@ REASON_COLOURS = {
     DropReason.ACCELERATING: DROPPED,
     DropReason.BELOW_LIMIT: "#0072b2",
 }
-"""Why a row of the track is not used, on the map and over time; names stand beside them wherever it matters."""
+"""Reasons why a row of the track is not used, on the map and over time."""
 LINE_COLOURS = ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00", FAINT)
-"""Of lines in one plot, the first for what the pipeline goes on with."""
+"""Lines in one plot; the first is the fused value."""
 
 
 def find_class_colour(number: int) -> str:

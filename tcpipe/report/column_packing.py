@@ -35,14 +35,14 @@ _WHOLE = {"u8": "<u1", "u16": "<u2", "u32": "<u4"}
 
 def pack_columns(columns: Mapping[str, Column]) -> Json:
     """Return columns by name, each of shape (N,), as JSON."""
-    told: list[Json] = []
+    described: list[Json] = []
     blob = bytearray()
     for name, (kind, values) in columns.items():
         low, step = _scale(values) if kind == "steps" else (0.0, 1.0)
         data = _to_bytes(kind, values, low, step)
-        told.append({"name": name, "kind": kind, "at": len(blob), "bytes": len(data), "low": low, "step": step})
+        described.append({"name": name, "kind": kind, "at": len(blob), "bytes": len(data), "low": low, "step": step})
         blob += data
-    return {"columns": told, "data": base64.b64encode(zlib.compress(bytes(blob), 6)).decode("ascii")}
+    return {"columns": described, "data": base64.b64encode(zlib.compress(bytes(blob), 6)).decode("ascii")}
 
 
 def make_shown_column(digits: int, values: NDArray[np.float64]) -> Column:

@@ -5,9 +5,6 @@ page.start(async () => {
   const told = page.data;
   const { at, make, fillSelect, pairs, ramp } = page;
 
-  const below = [at("chosen"), at("stepping")];
-  at("chosen").closest("section").append(...below);
-
   const c = await unpacked;
   const n = c.x.length;
   const source = page.model("samples").data_source;
@@ -120,7 +117,7 @@ page.start(async () => {
     at("row").value = i + 1;
     const left = make("div"), right = make("div");
     if (chosen.length > 1) {
-      const mean = (name) => { const known = chosen.map((k) => c[name][k]).filter(Number.isFinite); return known.reduce((a, b) => a + b, 0) / known.length; };
+      const mean = (name) => page.mean(chosen.map((k) => c[name][k]).filter(Number.isFinite));
       const by = told.splits.map((s, k) => [s.name, chosen.filter((j) => c.split[j] === k).length]).filter(([, count]) => count);
       left.append(make("b", `${chosen.length} chosen`), pairs([
         ...["power", "velocity", "energy", "slope"].map((name) => [`mean ${kinds[name][0]}`, digits(mean(name), name)]),
@@ -140,14 +137,8 @@ page.start(async () => {
     }
     box.append(left, right);
   }
-  const choose = (rows) => { source.selected.indices = rows; };
-  source.selected.change.connect(() => show(source.selected.indices));
-  const step = (by) => { const i = ((source.selected.indices[0] ?? -by) + by + n) % n; if (n) choose([i]); };
-  at("before").onclick = () => step(-1);
-  at("after").onclick = () => step(1);
-  at("clear").onclick = () => choose([]);
+  const choose = page.chooseSamples(source, () => n, show);
   at("row").max = n;
-  at("row").onchange = () => { const i = at("row").valueAsNumber - 1; if (i >= 0 && i < n) choose([i]); };
   show([]);
 
   if (sheets) {

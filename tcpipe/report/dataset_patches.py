@@ -1,7 +1,8 @@
-"""Some hundred patches inside a dataset's page, of every split, class and range of slope; and all of them in a folder beside it."""
+"""Patches on a dataset's page: some hundred of every split, class and slope inside it, and all of them in a folder beside it."""
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,9 +24,8 @@ MOST_PATCHES = 500
 _PX = 48
 """Side of a patch in the page; larger ones are thinned."""
 
-_PIECES = 24
-"""Pieces of the files that are read: patches lie in random order, so a few hold all kinds."""
-
+_MOST_PIECES = 24
+"""Pieces of the files that are read: the order of patches is random, so a few pieces contain all kinds."""
 
 PER_SHEET = 10 * ACROSS
 """Patches in a picture of that folder."""
@@ -33,31 +33,51 @@ PER_SHEET = 10 * ACROSS
 
 @dataclass(frozen=True, slots=True)
 class _Patches:
-    """A dataset's patches: by row of its samples where each lies in the files, and in which piece, (T,); ``step`` thins the pixels."""
+    """Patches of a dataset; for each sample its place in the files and the piece of it, (T,); ``step`` thins the pixels."""
 
     files: PatchFiles
     place: NDArray[np.int64]
     piece: NDArray[np.int64]
     step: int
 
-    def read(self, rows: NDArray[np.int64]) -> dict[str, NDArray[np.generic]]:
-        return _read(self.files, self.place[rows], self.piece[rows], self.step)
+    def read(self, rows: NDArray[np.int64]) -> Mapping[str, NDArray[Any]]:
+        """Return thinned patches of these rows by layer, (N, px, px), or (N, px, px, 3) of an orthophoto in colour."""
+        place, piece = self.place[rows], self.piece[rows]
+        layers = list(self.files.layers)
+        stacks: dict[str, list[NDArray[np.generic]]] = {layer: [] for layer in layers}
+        order = np.argsort(piece, kind="stable")
+        for number in np.unique(piece).tolist():
+            pixels = self.files.read(number, layers)
+            indices = place[order][piece[order] == number] - self.files.starts[number]
+            for layer in layers:
+                stacks[layer].append(pixels[layer][indices][:, :: self.step, :: self.step])
+        back = np.argsort(order, kind="stable")
+        return _join_colours({layer: np.concatenate(parts)[back] for layer, parts in stacks.items()})
 
-    def some(self, samples: pa.Table) -> NDArray[np.int64]:
-        """Return up to `MOST_PATCHES` rows of all kinds, rising."""
-        near = np.flatnonzero(np.isin(self.piece, _select_rows(np.unique(self.piece))))
-        return near[_select_stratified(samples.take(near))]
+    def select(self, samples: pa.Table) -> NDArray[np.int64]:
+        """Return up to `MOST_PATCHES` rows, rising, taken in turn from each split, class and 5° of slope: always the same ones."""
+        pieces = np.unique(self.piece)
+        pieces = pieces[np.unique(np.linspace(0, len(pieces) - 1, _MOST_PIECES).astype(int))]
+        rows = np.flatnonzero(np.isin(self.piece, pieces))
+        near = samples.take(rows)
+        slope = np.floor(np.degrees(to_floats(near, "slope_rad")) / 5.0).tolist()
+        names = (near.column(name).to_pylist() for name in ("split", "terrain_name"))
+        turns = Counter[object]()
+        order = []
+        for row, key in zip(rows.tolist(), zip(*names, slope, strict=True), strict=True):
+            turns[key] += 1
+            order.append((turns[key], row))
+        return np.sort(np.array([row for _, row in sorted(order)[:MOST_PATCHES]], np.int64))
 
 
-def _read_patches(directory: Path, card: DatasetCard, samples: pa.Table) -> _Patches:
+def _open_patches(directory: Path, card: DatasetCard, samples: pa.Table) -> _Patches:
     files = open_patches(directory, card)
     splits = samples.column("split").to_numpy(zero_copy_only=False)
     place = np.empty(samples.num_rows, dtype=np.int64)
     for name, rows in find_rows_in_files(card, splits).items():
         place[splits == name] = rows
-    return _Patches(
-        files, place, np.searchsorted(files.starts, place, side="right") - 1, choose_thinning(card.patch_px)
-    )
+    piece = np.searchsorted(files.starts, place, side="right") - 1
+    return _Patches(files, place, piece, choose_thinning(card.patch_px))
 
 
 def make_patches_data(directory: Path, card: DatasetCard, samples: pa.Table, row_of: NDArray[np.int64]) -> Json:
@@ -67,9 +87,9 @@ def make_patches_data(directory: Path, card: DatasetCard, samples: pa.Table, row
     """
     if not samples.num_rows:
         return None
-    every = _read_patches(directory, card, samples)
-    chosen = every.some(samples)
-    return make_sheets(row_of[chosen].tolist(), every.read(chosen), every.files)
+    patches = _open_patches(directory, card, samples)
+    rows = patches.select(samples)
+    return make_sheets(row_of[rows].tolist(), patches.read(rows), patches.files)
 
 
 def choose_thinning(patch_px: int) -> int:
@@ -79,13 +99,11 @@ def choose_thinning(patch_px: int) -> int:
 
 def make_sheets(rows: Sequence[int], pixels: Mapping[str, NDArray[Any]], files: PatchFiles) -> Json:
     """Return thinned patches, (N, px, px) by layer, as a sheet for each layer, and the rows of the page that they belong to."""
-    pixels = _join_colours(pixels)
-    return {
-        "rows": rows,
-        "px": next(iter(pixels.values())).shape[1],
-        "across": ACROSS,
-        "layers": [{"name": name, "uri": _make_uri(name, stack, files)} for name, stack in pixels.items()],
-    }
+    layers: list[Json] = []
+    for name, stack in _join_colours(pixels).items():
+        sheet, exact = _make_sheet(name, stack, files, _find_range(stack))
+        layers.append({"name": name, "uri": make_picture_uri(sheet, exact=exact)})
+    return {"rows": rows, "px": next(iter(pixels.values())).shape[1], "across": ACROSS, "layers": layers}
 
 
 def _join_colours(pixels: Mapping[str, NDArray[Any]]) -> Mapping[str, NDArray[Any]]:
@@ -96,78 +114,37 @@ def _join_colours(pixels: Mapping[str, NDArray[Any]]) -> Mapping[str, NDArray[An
     return {name: colour if name == "ortho" else stack for name, stack in pixels.items() if name not in COLOURS}
 
 
-def _make_uri(name: str, stack: NDArray[np.generic], files: PatchFiles) -> str:
-    pixels, exact = _make_picture(name, stack, files, _find_range(stack))
-    return make_picture_uri(pixels, exact=exact)
-
-
 def find_picture_folder(card: DatasetCard) -> tuple[str, int]:
-    """Return where the pictures of all of this dataset's patches lie from its page, and how many there are."""
+    """Return the folder of the pictures of all patches, relative to the page, and their number."""
     layers = len(card.layers) - (len(COLOURS) if set(COLOURS) <= set(card.layers) else 0)
     return f"{REPORT_PATCHES}/{card.inputs[:16]}", layers * -(-card.samples // PER_SHEET)
 
 
 def iterate_pictures(directory: Path, card: DatasetCard) -> Iterator[tuple[str, bytes]]:
-    """Yield the pictures of all patches, in the order of the samples, and what each is called in its folder.
+    """Yield file name and content of the pictures of all patches, in the order of the samples.
 
     Raises
     ------
     DatasetError : they cannot be read.
     """
     samples = read_samples(directory, ("split", "terrain_name", "slope_rad"))
-    every = _read_patches(directory, card, samples)
-    ranges = (
-        {name: _find_range(stack) for name, stack in _join_colours(every.read(every.some(samples))).items()}
-        if samples.num_rows
-        else {}
-    )
+    patches = _open_patches(directory, card, samples)
+    selected = patches.read(patches.select(samples)) if samples.num_rows else {}
+    ranges = {name: _find_range(stack) for name, stack in selected.items()}
     for number, first in enumerate(range(0, samples.num_rows, PER_SHEET)):
-        stacks = _join_colours(every.read(np.arange(first, min(first + PER_SHEET, samples.num_rows))))
+        stacks = patches.read(np.arange(first, min(first + PER_SHEET, samples.num_rows)))
         for layer, (name, stack) in enumerate(stacks.items()):
-            pixels, exact = _make_picture(name, stack, every.files, ranges[name])
+            pixels, exact = _make_sheet(name, stack, patches.files, ranges[name])
             yield f"{layer}-{number}.webp", encode_picture(pixels, exact=exact)
 
 
-def _select_rows(pieces: NDArray[np.int64]) -> NDArray[np.int64]:
-    return np.asarray(pieces[np.unique(np.linspace(0, len(pieces) - 1, _PIECES).astype(int))])
-
-
-def _select_stratified(samples: pa.Table) -> NDArray[np.int64]:
-    """Return rows, rising, taken in turn from each split, class and 5° of slope: the same dataset shows the same ones."""
-    slope = np.floor(np.degrees(to_floats(samples, "slope_rad")) / 5.0).tolist()
-    keys = list(
-        zip(samples.column("split").to_pylist(), samples.column("terrain_name").to_pylist(), slope, strict=True)
-    )
-    turn: dict[object, int] = {}
-    order = []
-    for row, key in enumerate(keys):
-        turn[key] = turn.get(key, 0) + 1
-        order.append((turn[key], row))
-    return np.sort(np.array([row for _, row in sorted(order)[:MOST_PATCHES]], np.int64))
-
-
-def _read(
-    files: PatchFiles, place: NDArray[np.int64], piece: NDArray[np.int64], step: int
-) -> dict[str, NDArray[np.generic]]:
-    layers = list(files.layers)
-    stacks: dict[str, list[NDArray[np.generic]]] = {layer: [] for layer in layers}
-    order = np.argsort(piece, kind="stable")
-    for number in np.unique(piece).tolist():
-        pixels = files.read(number, layers)
-        here = place[order][piece[order] == number] - files.starts[number]
-        for layer in layers:
-            stacks[layer].append(pixels[layer][here][:, ::step, ::step])
-    back = np.argsort(order, kind="stable")
-    return {layer: np.concatenate(parts)[back] for layer, parts in stacks.items()}
-
-
 def _find_range(stack: NDArray[np.generic]) -> tuple[float, float]:
-    """Return between which values most pixels lie."""
+    """Return the range that contains most pixels."""
     low, high = np.percentile(stack.astype(np.float64), (1, 99))
     return float(low), float(high)
 
 
-def _make_picture(
+def _make_sheet(
     name: str, stack: NDArray[np.generic], files: PatchFiles, shown: tuple[float, float]
 ) -> tuple[NDArray[np.uint8], bool]:
     """Return patches of a layer as one sheet, and whether every pixel counts; a photograph is shown over a range of its values."""

@@ -4,7 +4,6 @@ const unpacked = page.unpack(page.data.samples);
 page.start(async () => {
   const told = page.data;
   const { at, make, fillSelect, pairs } = page;
-  at("chosen").closest("section").append(at("chosen"), at("stepping"));
   const c = await unpacked;
   const kinds = Object.fromEntries(told.quantities.map((one) => [one.key, one]));
   const classes = new Map(told.classes.map((one) => [one.id, one]));
@@ -65,7 +64,7 @@ page.start(async () => {
     at("row").value = places[0] + 1;
     const left = make("div"), right = make("div");
     if (places.length > 1) {
-      const errors = places.map((place) => off(shown[place], key)), mean = (values) => values.reduce((a, b) => a + b, 0) / values.length;
+      const errors = places.map((place) => off(shown[place], key)), { mean } = page;
       const kind = told.classes.map((one) => [one.name, places.filter((place) => c.class[shown[place]] === one.id).length]).filter(([, count]) => count);
       left.append(make("b", `${places.length} chosen`), pairs([
         ["mean error", `${mean(errors).toFixed(digits)} ${unit}`], ["RMSE", `${Math.sqrt(mean(errors.map((e) => e * e))).toFixed(digits)} ${unit}`],
@@ -75,13 +74,7 @@ page.start(async () => {
     right.append(...(cell.has(i) ? page.patches(told.patches, cell.get(i)) : [make("p", "The page carries patches of the worst metres of E alone.", { className: "note" })]));
     box.append(left, right);
   }
-  const choose = (places) => { source.selected.indices = places; };
-  source.selected.change.connect(() => show([...source.selected.indices].sort((a, b) => a - b)));
-  const step = (by) => { const n = shown.length; if (n) choose([((source.selected.indices[0] ?? (by > 0 ? -1 : 0)) + by + n) % n]); };
-  at("before").onclick = () => step(-1);
-  at("after").onclick = () => step(1);
-  at("clear").onclick = () => choose([]);
-  at("row").onchange = () => { const place = at("row").valueAsNumber - 1; if (place >= 0 && place < shown.length) choose([place]); };
+  const choose = page.chooseSamples(source, () => shown.length, (places) => show([...places].sort((a, b) => a - b)));
   for (const id of ["split", "quantity", "colour"]) at(id).onchange = () => { draw(); show([]); };
   draw();
   show([]);

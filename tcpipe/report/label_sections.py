@@ -18,6 +18,14 @@ from tcpipe.report.plots import draw_waterfall
 from tcpipe.tables.bits import Quality, flag_name
 from tcpipe.tables.facts import EnergyBudget, PhysicsFit, PhysicsTerm
 
+LABELS = {
+    "power": ("power_watt", "power_std_watt", 1),
+    "velocity": ("velocity_mps", "velocity_std_mps", 3),
+    "duration": ("duration_s", "duration_std_s", 3),
+    "energy": ("energy_joule", "energy_std_joule", 1),
+}
+"""Column, column of the standard deviation and decimals of each label on a page."""
+
 QUALITY_WORDS = {
     Quality.LOW_POWER_RATE: "power was sampled too slowly",
     Quality.NEAR_GAP: "a gap in the data is less than a chord away",
@@ -32,7 +40,7 @@ QUALITY_WORDS = {
     Quality.NOT_AT_LIMIT: "commanded below full speed",
     Quality.SENSORS_DISAGREE: "sensors disagree",
 }
-"""What a bit says, in words."""
+"""Meaning of each bit."""
 
 
 def make_losses_sections(ledgers_m: Sequence[Mapping[str, float]], text: str, *, names_runs: bool) -> list[Section]:
@@ -57,7 +65,7 @@ def make_losses_sections(ledgers_m: Sequence[Mapping[str, float]], text: str, *,
 
 
 def find_distinguishing_bits(bits: NDArray[np.integer]) -> int:
-    """Return the quality bits that some labels carry and others do not: a bit of all of them says nothing on a map."""
+    """Return the quality bits that some but not all labels have; only these are useful on a map."""
     bits = bits.astype(np.int64)
     return int(np.bitwise_or.reduce(bits, initial=0) & ~np.bitwise_and.reduce(bits)) if len(bits) else 0
 
@@ -96,14 +104,14 @@ _ASIDE = {"grade": "weight over efficiency"}
 
 def describe_physics(robot: str, fit: PhysicsFit) -> str:
     """Return the fit as a few sentences: the numbers that a roboticist wants first, each with its standard deviation."""
-    grounds = list(dict.fromkeys(of.terrain for of in fit.terms if of.term in {"rolling", "turning"}))
-    values = {(of.term, of.terrain): of for of in fit.terms}
+    grounds = list(dict.fromkeys(term.terrain for term in fit.terms if term.term in {"rolling", "turning"}))
+    values = {(term.term, term.terrain): term for term in fit.terms}
     everywhere = [
-        f"{_format_with_std(of)} {of.unit} {_ASIDE.get(of.term, of.term)}"
-        for of in fit.terms
-        if of.term not in {"rolling", "turning"}
+        f"{_format_with_std(term)} {term.unit} {_ASIDE.get(term.term, term.term)}"
+        for term in fit.terms
+        if term.term not in {"rolling", "turning"}
     ]
-    said = [", ".join((f"{robot}: {everywhere[0]}", *everywhere[1:]) if everywhere else (f"{robot}",))]
+    parts_of_text = [", ".join((f"{robot}: {everywhere[0]}", *everywhere[1:]) if everywhere else (f"{robot}",))]
     for ground in grounds:
         parts = []
         if ground in fit.rolling_resistance:
@@ -113,9 +121,9 @@ def describe_physics(robot: str, fit: PhysicsFit) -> str:
             parts.append(f"rolling {_format_with_std(rolling)} N")
         if (turning := values.get(("turning", ground))) is not None:
             parts.append(f"{_format_with_std(turning)} W per rad/s of turning")
-        said.append(f"on {'all ground' if ground == 'all' else ground}: {', '.join(parts)}")
+        parts_of_text.append(f"on {'all ground' if ground == 'all' else ground}: {', '.join(parts)}")
     share = ", ".join(f"{name} {100.0 * part:.0f} %" for name, part in fit.energy_share.items())
-    text = f"{'; '.join(said)}. Of all energy: {share} ({fit.segments} segments)."
+    text = f"{'; '.join(parts_of_text)}. Of all energy: {share} ({fit.segments} segments)."
     if fit.held_out is not None:
         text += f" On held-out fifths it explains {fit.held_out.r2:.2f} of the variance of E (R²), "
         text += f"mean error {100 * fit.held_out.mape:.0f} % where it is 10 J and more"
@@ -127,13 +135,13 @@ def describe_physics(robot: str, fit: PhysicsFit) -> str:
     return text
 
 
-def _format_with_std(of: PhysicsTerm) -> str:
-    digits = 0 if of.std >= 1.0 else 1
-    return f"{of.value:.{digits}f} ± {of.std:.{digits}f}"
+def _format_with_std(term: PhysicsTerm) -> str:
+    digits = 0 if term.std >= 1.0 else 1
+    return f"{term.value:.{digits}f} ± {term.std:.{digits}f}"
 
 
 def make_physics_sections(fits: Mapping[str, PhysicsFit]) -> list[Section]:
-    """Return a section of the fits by robot; none where there are none."""
+    """Return the section on the fits by robot, if any."""
     text = " ".join(describe_physics(robot, fit) for robot, fit in fits.items())
     return [Section("What a metre costs: standing, drivetrain, rolling, grade, turning", text)] if fits else []
 

@@ -39,7 +39,7 @@ Pictures = MutableMapping[str, str]
 _MOST_PLACES = 200
 """Places to drive next that are drawn, the most wanted first."""
 _LEAST_SHARE = 0.5
-"""Of a track that lies on a map, for the map to be its background."""
+"""Smallest share of the track on a map that becomes its background."""
 
 
 def draw_dataset_map(directory: Path, card: DatasetCard, sample_count: int) -> tuple[list[Plot], list[str]]:
@@ -172,7 +172,7 @@ class RunMap:
     ground: tuple[str, ...]
     """Names of the pictures below the track."""
     missing: tuple[str, ...]
-    """Why there is no picture, in words."""
+    """Reasons why pictures are missing."""
 
 
 def draw_run_map(
@@ -213,7 +213,7 @@ def _explain_no_map(store: Store, *, has_datum: bool) -> str:
 def _find_ground(
     store: Store, run: RunDirectory, lonlat: Floats, pictures_by_map: MutableMapping[str, Pictures]
 ) -> tuple[tuple[Callable[[Floats], Floats], Bounds, Pictures] | None, list[str]]:
-    """Return projection, bounds and pictures of the first map that holds most of the track, and which maps cannot be read."""
+    """Return projection, bounds and pictures of the first map that contains most of the track, and the maps that cannot be read."""
     lost: list[str] = []
     for name in store.maps():
         try:

@@ -155,6 +155,23 @@ const page = (() => {
     at("gallery-more").onclick = () => { most += 120; draw(); };
     draw();
   }
+  // What is chosen, below the figures, and the buttons that go through `count()` rows; `current(by)` is the row from which a step goes.
+  function stepThrough(count, current, choose) {
+    at("chosen").closest("section").append(at("chosen"), at("stepping"));
+    const step = (by) => { const n = count(); if (n) choose((current(by) + by + n) % n); };
+    at("before").onclick = () => step(-1);
+    at("after").onclick = () => step(1);
+    at("row").onchange = () => { const i = at("row").valueAsNumber - 1; if (i >= 0 && i < count()) choose(i); };
+  }
+  // Points of a source that are chosen by a click, a box or these buttons; `show(rows)` says what they are.
+  function chooseSamples(source, count, show) {
+    const choose = (rows) => { source.selected.indices = rows; };
+    source.selected.change.connect(() => show(source.selected.indices));
+    stepThrough(count, (by) => source.selected.indices[0] ?? (by > 0 ? -1 : 0), (i) => choose([i]));
+    at("clear").onclick = () => choose([]);
+    return choose;
+  }
+  const mean = (values) => values.reduce((a, b) => a + b, 0) / values.length;
   // Columns as `tcpipe.report.column_packing` wrote them.
   async function unpack({ columns, data }) {
     const stream = new Blob([bytesOf(data)]).stream().pipeThrough(new DecompressionStream("deflate"));
@@ -173,7 +190,7 @@ const page = (() => {
     }));
   }
   return {
-    at, make, fillSelect, pairs, patches, legend, ramp, ends, scale, clock, explain, chooseGround, gallery, unpack,
+    at, make, fillSelect, pairs, patches, legend, ramp, ends, scale, clock, explain, chooseGround, chooseSamples, gallery, mean, stepThrough, unpack,
     data: read("page-data"),
     // What a page's own script does when the figures that it asks for are drawn; what it returns is called with the view of each that follows.
     start: (of) => { work = of; },

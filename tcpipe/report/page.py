@@ -27,7 +27,7 @@ from tcpipe.tables.catalogue import AFFECTED, Affected, Severity
 from tcpipe.tables.findings import Finding, Grade, Verdict, sort_findings
 
 _INVISIBLE = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\xad\u061c\u200b-\u200f\u2028-\u202e\u2060-\u206f\ufeff]")
-"""Characters that cannot be seen in a page, or turn its text round: a name may hold them."""
+"""Invisible characters and those that reverse the direction of text; a name may contain them."""
 
 _SCRIPTS = "<!-- scripts -->"
 
@@ -42,7 +42,7 @@ class Number:
 
 @dataclass(frozen=True, slots=True)
 class Link:
-    """Another page: its text, and where it lies from this one (a relative path, not yet quoted)."""
+    """Another page: text and relative path, not yet quoted."""
 
     text: str
     path: str
@@ -77,7 +77,7 @@ class ShownFinding:
 
 @dataclass(frozen=True, slots=True)
 class VerdictBox:
-    """What a page shows at its top: ``shown`` in full, ``more`` and ``notes`` folded."""
+    """The verdict at the top of a page: findings ``shown`` in full, ``more`` and ``notes`` folded."""
 
     grades: tuple[tuple[str, Grade], ...]
     shown: tuple[ShownFinding, ...]
@@ -93,9 +93,9 @@ def show_verdict(
     labels: Sequence[Affected] = AFFECTED,
 ) -> VerdictBox:
     """Return a verdict: the grades of ``labels``, findings with their remedies, and ``groups`` of one code as `format_group` takes them."""
-    lines = [(of.severity, format_finding(of), [of]) for of in sort_findings(findings)]
+    lines = [(part.severity, format_finding(part), [part]) for part in sort_findings(findings)]
     lines += [(group.severity, format_group(group, total, noun), group.findings) for group, total, noun in groups]
-    shown = [ShownFinding(severity, text, "\n".join(format_remedy_blocks(of))) for severity, text, of in lines]
+    shown = [ShownFinding(severity, text, "\n".join(format_remedy_blocks(part))) for severity, text, part in lines]
     problems = [line for severity in ("error", "warning") for line in shown if line.severity == severity]
     return VerdictBox(
         grades=tuple((name, getattr(verdict, name)) for name in labels),
@@ -114,14 +114,14 @@ class Section:
     header: Sequence[str] = field(default_factory=tuple)
     rows: Sequence[Sequence[Any]] = field(default_factory=tuple)
     figures_from: int | None = None
-    """First column of figures that are written out already: these stand to the right, as numbers do."""
+    """First column of formatted figures, which are aligned to the right as numbers are."""
     plots: Sequence[Plot] = ()
     controls: str = ""
-    """File beside this one with the HTML that stands above the figures."""
+    """File beside this one with the HTML above the figures."""
     folded: bool = False
     """Whether the table waits behind a line to click."""
     stacked: bool = False
-    """Whether the figures stand one below the other on wide pages too, as those of one axis do."""
+    """Whether the figures are one below the other on wide pages too, as those with one axis are."""
 
 
 def render_page(

@@ -41,7 +41,7 @@ def encode_picture(pixels: Bytes, *, exact: bool = False) -> bytes:
 
 
 def read_picture(path: Path) -> Bytes | None:
-    """Return a picture in colour, shape (R, C, 3); None where there is none that can be read."""
+    """Return a picture in colour, shape (R, C, 3); None if it cannot be read."""
     try:
         with Image.open(path) as picture:
             return np.asarray(picture.convert("RGB"), np.uint8)
@@ -101,11 +101,11 @@ Bounds = tuple[float, float, float, float]
 def compute_joint_bounds_m(places: Sequence[tuple[str, Bounds]]) -> Bounds:
     """Return the bounds of all maps, each given with its CRS, in the CRS of the first."""
     first = places[0][0]
-    every = [
+    projected = [
         bounds if crs == first else Transformer.from_crs(crs, first, always_xy=True).transform_bounds(*bounds)
         for crs, bounds in places
     ]
-    low, high = np.min(every, axis=0), np.max(every, axis=0)
+    low, high = np.min(projected, axis=0), np.max(projected, axis=0)
     return float(low[0]), float(low[1]), float(high[2]), float(high[3])
 
 
@@ -139,17 +139,17 @@ def draw_maps(
         return look(sources[0])
     crs = sources[0].grid.crs
     x_min_m, y_min_m, x_max_m, y_max_m = compute_joint_bounds_m(
-        [(each.grid.crs, each.grid.bounds_m) for each in sources]
+        [(source.grid.crs, source.grid.bounds_m) for source in sources]
     )
     step_m = max(x_max_m - x_min_m, y_max_m - y_min_m) / _SIDE_PX
     x_m, y_m = np.meshgrid(
         np.arange(x_min_m + step_m / 2, x_max_m, step_m), np.arange(y_max_m - step_m / 2, y_min_m, -step_m)
     )
     whole = np.full((*x_m.shape, 3), 255, np.uint8)
-    for each in reversed(sources):
-        picture, (left, bottom, right, top) = look(each), each.grid.bounds_m
-        to_map = Transformer.from_crs(crs, each.grid.crs, always_xy=True)
-        x, y = (x_m, y_m) if each.grid.crs == crs else to_map.transform(x_m, y_m)
+    for source in reversed(sources):
+        picture, (left, bottom, right, top) = look(source), source.grid.bounds_m
+        to_map = Transformer.from_crs(crs, source.grid.crs, always_xy=True)
+        x, y = (x_m, y_m) if source.grid.crs == crs else to_map.transform(x_m, y_m)
         col = np.floor((x - left) / (right - left) * picture.shape[1]).astype(np.int64)
         row = np.floor((top - y) / (top - bottom) * picture.shape[0]).astype(np.int64)
         inside = (col >= 0) & (col < picture.shape[1]) & (row >= 0) & (row < picture.shape[0])
@@ -210,7 +210,7 @@ def write_overview(path: Path, picture: NDArray[np.uint8], *, texts: Mapping[str
 
 
 _SHOWS = "tcpipe map"
-"""Key of the text in a quick look that tells which map it shows: the seal of the map's checksums."""
+"""Key of the text in a quick look that identifies its map: the seal of the map's checksums."""
 
 
 def write_quick_look(picture: Path, look: NDArray[np.uint8], seal: str) -> None:

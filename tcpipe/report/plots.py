@@ -37,13 +37,13 @@ _UNREAD = "\u2060"
 
 @dataclass(frozen=True, slots=True)
 class Plot:
-    """A figure, what it shows for who cannot see it, and its colours by name; ``figure.name`` finds it in the page's scripts."""
+    """A figure with a description for screen readers and its colours by name; the page's scripts find it by ``figure.name``."""
 
     figure: Any
     alt: str
     legend: Mapping[str, str] = field(default_factory=dict)
     waits: bool = False
-    """Whether it is drawn when the page answers already; the page's script is told of each (``page.js``)."""
+    """Whether it is drawn after the page answers; the page's script receives each such view (``page.js``)."""
 
 
 def make_plot(
@@ -107,7 +107,7 @@ def make_map_plot(
 def lay_picture(plot: Plot, name: str, uri: str, bounds_m: tuple[float, float, float, float], *, visible: bool) -> None:
     """Lay a picture over ``bounds_m`` (least x and y, greatest x and y) under all else, as ``layer <name>``."""
     x_min_m, y_min_m, x_max_m, y_max_m = bounds_m
-    drawn = plot.figure.image_url(
+    renderer = plot.figure.image_url(
         url=[uri],
         x=x_min_m,
         y=y_max_m,
@@ -116,12 +116,12 @@ def lay_picture(plot: Plot, name: str, uri: str, bounds_m: tuple[float, float, f
         anchor="top_left",
         name=f"layer {name}",
     )
-    drawn.level = "image"
-    drawn.visible = visible
+    renderer.level = "image"
+    renderer.visible = visible
 
 
 def add_cursor(plot: Plot) -> None:
-    """Add a line across, ``cursor <name>``, which is nowhere until the page's script says where."""
+    """Add a vertical line, ``cursor <name>``, invisible until the page's script places it."""
     name = f"cursor {plot.figure.name}"
     plot.figure.add_layout(Span(dimension="height", location=np.nan, line_color=CURSOR, line_width=1.5, name=name))
 
@@ -132,7 +132,7 @@ def show_text(plot: Plot, renderer: Any) -> None:
 
 
 def draw_waterfall(ledger_m: Mapping[str, float]) -> Plot:
-    """Return where every metre went: all that was driven, each loss taken away, the largest first, and what is left."""
+    """Return a waterfall of distances: driven, each loss with the largest first, and kept."""
     losses = sorted(((n, m) for n, m in ledger_m.items() if n != "kept" and m > 0), key=lambda item: -item[1])
     total, kept = sum(ledger_m.values()), ledger_m.get("kept", 0.0)
     ends = total - np.cumsum([metres for _, metres in losses])
@@ -170,7 +170,7 @@ def draw_waterfall(ledger_m: Mapping[str, float]) -> Plot:
 
 
 def draw_histogram(name: str, values: NDArray[np.float64], *, label: str, of_what: str) -> Plot:
-    """Return how often values occur; what is not finite is left out, and said."""
+    """Return a histogram of the finite values; ``alt`` states how many others there are."""
     finite = values[np.isfinite(values)]
     lost = len(values) - len(finite)
     alt = f"Histogram of {label} of {len(finite)} {of_what}" + (f"; {lost} have none" if lost else "")
@@ -199,7 +199,7 @@ def read_bokeh_script() -> str:
 
 
 def render_plots(plots: Sequence[Plot]) -> tuple[Json, list[str]]:
-    """Return what a page draws, and the id of each plot; the same plots have the same ids, whatever was drawn before in this process.
+    """Return Bokeh's JSON and the id of each plot; the same plots have the same ids, whatever this process drew before.
 
     ``first`` is a Bokeh document of all plots that do not wait. ``later`` are the roots that join it, in the order of the page; what
     they share with plots before them, as an axis, is named there and told once.
@@ -211,9 +211,11 @@ def render_plots(plots: Sequence[Plot]) -> tuple[Json, list[str]]:
     with whole.models.freeze():  # else every root that is added looks through all others again
         for plot in ordered:
             whole.add_root(plot.figure)
-    told = cast("dict[str, Json]", _make_plot_json(cast("Json", whole.to_json(deferred=False)), ids))
-    roots, soon = cast("list[Json]", told["roots"]), sum(not plot.waits for plot in plots)
-    return {"first": {**told, "roots": roots[:soon]}, "later": roots[soon:]}, [ids[plot.figure.id] for plot in plots]
+    document = cast("dict[str, Json]", _make_plot_json(cast("Json", whole.to_json(deferred=False)), ids))
+    roots, soon = cast("list[Json]", document["roots"]), sum(not plot.waits for plot in plots)
+    return {"first": {**document, "roots": roots[:soon]}, "later": roots[soon:]}, [
+        ids[plot.figure.id] for plot in plots
+    ]
 
 
 def _make_plot_json(value: Json, ids: dict[str, str]) -> Json:

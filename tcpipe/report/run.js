@@ -206,16 +206,10 @@ page.start(async () => {
     right.append(make("b", `${t.toFixed(2)} s`), pairs([["time", clock(t)], ...values(t)]));
     at("chosen").replaceChildren(left, right);
   }
-  const step = (by) => {
-    if (!n) return;
-    const i = segmentAt(chosen ?? first), k = i >= 0 ? (i + by + n) % n : by > 0 ? after(s.start, chosen ?? first) % n : (after(s.start, chosen ?? first) - 1 + n) % n;
-    pick(k);
-  };
   const pick = (k) => choose((s.start[k] + s.end[k]) / 2);
-  at("before").onclick = () => step(-1);
-  at("after").onclick = () => step(1);
+  const current = (by) => { const t = chosen ?? first, i = segmentAt(t); return i >= 0 ? i : after(s.start, t) - (by > 0 ? 1 : 0); };
+  page.stepThrough(() => n, current, pick);
   at("row").max = n;
-  at("row").onchange = () => { const k = at("row").valueAsNumber - 1; if (k >= 0 && k < n) pick(k); };
   [at("time").min, at("time").max] = [first, last];
   at("time").oninput = () => choose(at("time").valueAsNumber);
   if (!n) for (const id of ["before", "after", "row"]) at(id).disabled = true;
@@ -259,8 +253,6 @@ page.start(async () => {
 
   const wide = at(model("map").id).clientWidth;
   if (wide < 600) model("map").height = Math.round(Math.min(600, Math.max(240, 90 + (wide - 100) * told.tall_by_wide)));
-  const below = [at("chosen"), at("stepping")];
-  at("chosen").closest("section").append(...below);
   paint();
   if (n) pick(0);
   else choose(first);

@@ -66,7 +66,7 @@ class Timeline:
         return last.start_s + (last.last_ns - last.first_ns) * 1e-9
 
     def seconds(self, stamp_ns: Ints, epoch: Ints | None = None) -> Floats:
-        """Return where stamps lie [s], shape (N,), NaN of an epoch that the track lacks; without epochs the first that holds a stamp."""
+        """Return times of stamps [s], shape (N,), NaN outside the track; without ``epoch`` by the first epoch that contains a stamp."""
         t_s = np.full(len(stamp_ns), np.nan)
         for part in self.epochs:
             within = np.isnan(t_s) & (stamp_ns >= part.first_ns) & (stamp_ns <= part.last_ns)
@@ -78,18 +78,18 @@ class Timeline:
 def make_timeline(track: pa.Table) -> Timeline:
     """Return the axis of a track that has rows."""
     stamps, epochs = to_integers(track, "stamp_ns"), to_integers(track, "epoch")
-    found: list[Epoch] = []
+    timeline_epochs: list[Epoch] = []
     start_s = 0.0
     for number in dict.fromkeys(epochs.tolist()):
-        mine = stamps[epochs == number]
-        found.append(Epoch(number, int(mine.min()), int(mine.max()), start_s))
-        start_s += (found[-1].last_ns - found[-1].first_ns) * 1e-9 + _BETWEEN_EPOCHS_S
-    return Timeline(tuple(found))
+        stamps_in_epoch = stamps[epochs == number]
+        timeline_epochs.append(Epoch(number, int(stamps_in_epoch.min()), int(stamps_in_epoch.max()), start_s))
+        start_s += (timeline_epochs[-1].last_ns - timeline_epochs[-1].first_ns) * 1e-9 + _BETWEEN_EPOCHS_S
+    return Timeline(tuple(timeline_epochs))
 
 
 @dataclass(frozen=True, slots=True)
 class Series:
-    """Columns that share their times, and how many values stand for how many."""
+    """Columns that share their times, thinned where they are long."""
 
     name: str
     t_s: Floats
@@ -129,7 +129,7 @@ def downsample_columns(
 
 
 def _find_extremes(values: Floats, per_bin: int) -> Floats:
-    """Return the lowest and the highest of every bin in the order they occur; NaN where it holds none."""
+    """Return the lowest and the highest of every bin in the order they occur; NaN of an empty bin."""
     if per_bin == 1:
         return values
     bins = np.append(values, np.full(-len(values) % per_bin, np.nan)).reshape(-1, per_bin)
@@ -150,12 +150,12 @@ def make_track_series(track: pa.Table, timeline: Timeline, xy_m: Floats) -> Seri
 
 
 def make_rail_series(power: pa.Table, timeline: Timeline) -> Iterator[Series]:
-    """Yield voltage and current of each rail as they were told."""
+    """Yield voltage and current of each rail as measured."""
     rails = to_texts(power.column("rail"))
     for rail in dict.fromkeys(rails.tolist()):
-        mine = power.filter(pa.array(rails == rail))
+        rail_power = power.filter(pa.array(rails == rail))
         for name, column, digits in (("voltage", "voltage_volt", 2), ("current", "current_amp", 3)):
-            values, t_s = to_floats(mine, column), _compute_seconds(mine, timeline)
+            values, t_s = to_floats(rail_power, column), _compute_seconds(rail_power, timeline)
             known = np.isfinite(values) & np.isfinite(t_s)
             if known.any():
                 columns = {name: (digits, values[known])}
@@ -167,7 +167,7 @@ def _compute_seconds(table: pa.Table, timeline: Timeline) -> Floats:
 
 
 def make_speed_series(role: str, table: pa.Table, timeline: Timeline) -> Series | None:
-    """Return what a sensor says of the speed [m/s]: its own, else chords over a second of its places; None without either."""
+    """Return the speed [m/s] of a sensor: measured, else by chords over a second of its positions; None without either."""
     t_s = _compute_seconds(table, timeline)
     table, t_s = table.filter(pa.array(np.isfinite(t_s))), t_s[np.isfinite(t_s)]
     speed = _read_speed(table)
@@ -271,7 +271,7 @@ _TRACK_LINES = (
 
 
 def make_lines(series: Sequence[Series]) -> list[Line]:
-    """Return what can be drawn, in the order of the page."""
+    """Return the lines of these series, in the order of the page."""
     columns = {(part.name, column) for part in series for column in part.columns}
     lines = [line for line in _TRACK_LINES if (line.series, line.column) in columns]
     for part in series:
@@ -347,10 +347,10 @@ def _draw_panel(name: str, label: str, first: Plot, *, legend: Mapping[str, str]
 
 
 def _draw_masks(timeline: Timeline, spans: Spans, facts: StageFacts) -> Plot:
-    """Return the plot of what is kept and why the rest is not, and of what was found at a time; its axis is everyone's."""
-    found = list(_iterate_events(timeline, facts))
-    there = [bit for bit in DropReason if (spans.bits & int(bit)).any()]
-    rows = ["kept", *(flag_name(bit).replace("_", " ") for bit in there), *dict.fromkeys(row for row, *_ in found)]
+    """Return the plot of kept rows, reasons for dropping the others, and events; all plots share its time axis."""
+    events = list(_iterate_events(timeline, facts))
+    reasons = [bit for bit in DropReason if (spans.bits & int(bit)).any()]
+    rows = ["kept", *(flag_name(bit).replace("_", " ") for bit in reasons), *dict.fromkeys(row for row, *_ in events)]
     plot = make_plot(
         "gates",
         alt="What of the drive is kept, by which gates the rest is dropped, and when sensors were refused or disagreed.",
@@ -363,15 +363,15 @@ def _draw_masks(timeline: Timeline, spans: Spans, facts: StageFacts) -> Plot:
     figure = plot.figure
     bars = {"left": [0.0], "right": [1.0], "row": ["kept"], "colour": [KEPT]}
     figure.hbar(y="row", left="left", right="right", height=0.75, color="colour", source=bars, name="gates bars")
-    if found:
-        source = dict(zip(("row", "left", "right", "text"), zip(*found, strict=True), strict=True))
+    if events:
+        source = dict(zip(("row", "left", "right", "text"), zip(*events, strict=True), strict=True))
         show_text(plot, figure.hbar(y="row", left="left", right="right", height=0.75, color=DROPPED, source=source))
     figure.ygrid.visible = False
     return plot
 
 
 def _iterate_events(timeline: Timeline, facts: StageFacts) -> Iterator[tuple[str, float, float, str]]:
-    """Yield what has a time: its row, beginning and end [s], and its text."""
+    """Yield events: row, start and end [s], and text."""
     events = []
     for part in facts.audit.disagreements if facts.audit else ():
         role = part.sensor.replace("_", " ")
@@ -393,7 +393,7 @@ def _iterate_events(timeline: Timeline, facts: StageFacts) -> Iterator[tuple[str
 
 
 def _draw_rejections(timeline: Timeline, first: Plot, rejections: pa.Table) -> Iterator[Plot]:
-    """Yield how far off rejected measurements are; those without a χ² stand at 1."""
+    """Yield the plot of rejected measurements; those without a χ² are at 1."""
     if not rejections.num_rows:
         return
     roles, t_s = to_texts(rejections.column("role")), timeline.seconds(to_integers(rejections, "stamp_ns"))
@@ -448,8 +448,8 @@ def _draw_labels(first: Plot) -> Plot:
     )
     ends = [0.0, 1.0]
     empty = {"t": ends, "y": ends, "low": ends, "high": ends, "colour": [KEPT] * 2}
-    drawn = plot.figure.segment("t", "low", "t", "high", color="colour", line_width=1.5, source=empty)
-    plot.figure.scatter("t", "y", size=5, color="colour", source=drawn.data_source, name="labels")
+    bars = plot.figure.segment("t", "low", "t", "high", color="colour", line_width=1.5, source=empty)
+    plot.figure.scatter("t", "y", size=5, color="colour", source=bars.data_source, name="labels")
     return plot
 
 

@@ -1,4 +1,4 @@
-"""The page of one ingested run: where it drove, what its sensors told over time, what was used, and what each metre cost."""
+"""The page of a run: map, sensors over time, use of the distance, labels, and how far each sensor agrees."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from tcpipe.errors import StoreError, TableError
-from tcpipe.formats.finding_lines import describe_remedy
+from tcpipe.formats.finding_lines import describe_finding, describe_remedy
 from tcpipe.formats.json_files import Json
 from tcpipe.formats.parquet import read_table
 from tcpipe.formats.run_documents import Counts, Manifest, RunJson
@@ -20,6 +20,7 @@ from tcpipe.formats.stored_runs import RunDirectory
 from tcpipe.report.colours import DOUBTED, FAINT, KEPT, UNUSED
 from tcpipe.report.column_packing import Column, make_shown_column, pack_columns
 from tcpipe.report.label_sections import (
+    LABELS,
     QUALITY_WORDS,
     find_distinguishing_bits,
     make_budget_sections,
@@ -52,14 +53,7 @@ from tcpipe.tables.findings import Finding, select_findings
 _PAGE = "report.html"
 _DAMAGE = "Where messages are lost or may be."
 _STEP_M = 0.05
-"""Places of the track that are nearer are one on the map."""
-
-_LABELS = {
-    "power": ("power_watt", "power_std_watt", 1),
-    "velocity": ("velocity_mps", "velocity_std_mps", 3),
-    "duration": ("duration_s", "duration_std_s", 3),
-    "energy": ("energy_joule", "energy_std_joule", 1),
-}
+"""Positions of the track that are nearer become one on the map."""
 
 
 def run_report(store: Store, run: RunDirectory, pictures_by_map: MutableMapping[str, Pictures] | None = None) -> str:
@@ -82,7 +76,7 @@ def run_report(store: Store, run: RunDirectory, pictures_by_map: MutableMapping[
     source = "source unknown"
     if run_json is not None:
         source = f"from {', '.join(run_json.source.paths)} ({run_json.source.size_bytes / 1e6:.1f} MB)"
-    damage = [(line,) for line in manifest.damage]
+    damage = [(describe_finding(finding),) for finding in manifest.damage]
     return render_page(
         title=f"Run {run.run_id}",
         lead=f"Robot {manifest.robot}, recipe {run.recipe_id}, {source}",
@@ -178,7 +172,9 @@ def _read_series(store: Store, run: RunDirectory, timeline: Timeline) -> tuple[l
         tables = {}
         if run_json is not None:
             streams = run_json.streams if run_json.streams_key == run.streams_key else {}
-            streams = {name: of for name, of in streams.items() if PurePosixPath(name).stem in ("power", *SPEED_ROLES)}
+            streams = {
+                name: digest for name, digest in streams.items() if PurePosixPath(name).stem in ("power", *SPEED_ROLES)
+            }
             files = store.stream_files(run.run_id, replace(run_json, streams=streams))
             tables = {role: read_table(path) for role, path in files.items()}
     except (StoreError, TableError) as error:
@@ -189,11 +185,11 @@ def _read_series(store: Store, run: RunDirectory, timeline: Timeline) -> tuple[l
     if "gnss_velocity" in tables:
         tables.pop("gnss", None)
     speeds = [make_speed_series(role, table, timeline) for role, table in tables.items()]
-    return [*series, *(each for each in speeds if each is not None)], []
+    return [*series, *(part for part in speeds if part is not None)], []
 
 
 def _describe_series(series: Sequence[Series], lines: Sequence[Line]) -> str:
-    """Return what the plots show, and which series are thinned."""
+    """Return the text above the plots over time, with the series that are thinned."""
     text = (
         "Shaded: not used, in the colour of the reason. Draw a box to zoom, double-click for the whole run; every plot follows. "
         "Where many values share a pixel, the line goes through the lowest and the highest of them."
@@ -210,14 +206,14 @@ def _describe_series(series: Sequence[Series], lines: Sequence[Line]) -> str:
 
 
 def _make_segments_data(segments: pa.Table, timeline: Timeline, run_map: RunMap) -> Json:
-    """Return what the page holds of each segment."""
+    """Return the columns of segments on the page."""
     epoch = to_integers(segments, "epoch")
     columns: dict[str, Column] = {
         name: ("f32", timeline.seconds(to_integers(segments, f"{name}_ns"), epoch)) for name in ("start", "end")
     }
     for number, end in enumerate(run_map.ends_xy_m):
         columns |= {f"{axis}{number}": ("steps", end[:, place]) for place, axis in enumerate("xy")}
-    for name, (value, std, digits) in _LABELS.items():
+    for name, (value, std, digits) in LABELS.items():
         columns[name], columns[f"{name}_std"] = (
             make_shown_column(digits, to_floats(segments, value)),
             ("half", to_floats(segments, std)),
@@ -320,21 +316,21 @@ def _make_trust_sections(facts: StageFacts, rejections: pa.Table) -> list[Sectio
 
 
 def _make_disagreement_sections(facts: StageFacts) -> list[Section]:
-    """Return when sensors and track disagree, by what and how much; where they never do, nothing."""
-    found = facts.audit.disagreements if facts.audit else ()
-    if not found:
+    """Return when sensors and track disagree, in which quantity and by how much, if they do."""
+    disagreements = facts.audit.disagreements if facts.audit else ()
+    if not disagreements:
         return []
     start_ns = min((stretch.start_ns for stretch in facts.fuse.stretches), default=0) if facts.fuse else 0
     rows = [
         (
-            _name(each.sensor),
-            each.what,
-            f"{(each.start_ns - start_ns) * 1e-9:.0f} to {(each.end_ns - start_ns) * 1e-9:.0f} s",
-            f"{each.size:.2g} {each.unit}",
-            f"{each.expected_std:.2g} {each.unit}",
-            "it is alone, the track is believed" if each.alone else "deviations are raised, segments flagged",
+            _name(part.sensor),
+            part.what,
+            f"{(part.start_ns - start_ns) * 1e-9:.0f} to {(part.end_ns - start_ns) * 1e-9:.0f} s",
+            f"{part.size:.2g} {part.unit}",
+            f"{part.expected_std:.2g} {part.unit}",
+            "it is alone, the track is believed" if part.alone else "deviations are raised, segments flagged",
         )
-        for each in found
+        for part in disagreements
     ]
     text = "The track held against each sensor that fed it, in windows of five seconds: where they differ beyond what both claim."
     header = ("sensor", "what", "in the run", "off by", "expected (1σ)", "so")
@@ -342,25 +338,26 @@ def _make_disagreement_sections(facts: StageFacts) -> list[Section]:
 
 
 def _make_clock_sections(facts: StageFacts, findings: Sequence[Finding]) -> list[Section]:
-    """Return how late each sensor's stamps are; where nothing could be compared, nothing."""
-    found = facts.clock_offsets
+    """Return the time offset of each sensor, if any could be compared."""
+    clock_offsets = facts.clock_offsets
     steps = [f"{step.step_s:+.3f} s at log time {step.log_time_ns} ns" for step in facts.clock_steps]
-    offsets = found.offsets if found else {}
+    offsets = clock_offsets.offsets if clock_offsets else {}
     if not offsets and not steps:
         return []
     rows = [
         (
             _name(role),
-            f"{1e3 * (each.offset_s or 0.0):+.0f} ms",
-            f"{2e3 * (each.std_s or 0.0):.0f} ms",
-            _format_drift(each),
+            f"{1e3 * (offset.offset_s or 0.0):+.0f} ms",
+            f"{2e3 * (offset.std_s or 0.0):.0f} ms",
+            _format_drift(offset),
             _format_correction(role, findings),
         )
-        for role, each in sorted(offsets.items())
+        for role, offset in sorted(offsets.items())
     ]
     text = ""
-    if found and rows:
-        text = f"How late stamps are against {_name(found.reference)}, by what the sensors say of the same motion. Nothing is corrected."
+    if clock_offsets and rows:
+        reference = _name(clock_offsets.reference)
+        text = f"How late stamps are against {reference}, by what the sensors say of the same motion. Nothing is corrected."
     if steps:
         text += f" The clock steps: {'; '.join(steps)}."
     header = ("sensor", "late by", "± (2σ)", "drift", "correction")
@@ -368,11 +365,11 @@ def _make_clock_sections(facts: StageFacts, findings: Sequence[Finding]) -> list
 
 
 def _format_correction(role: str, findings: Sequence[Finding]) -> str:
-    """Return what corrects a sensor's clock, as the findings on it propose."""
+    """Return the correction of a sensor's clock that its findings propose."""
     clocks = select_findings(findings, "time-offset", "clock-drift", "clocks-differ")
-    found = [finding for finding in clocks if finding.subject.name == role]
-    remedies = [describe_remedy(finding, remedy) for finding in found for remedy in finding.remedies]
-    return "; ".join(remedies) or ", ".join(finding.code.replace("-", " ") for finding in found)
+    role_findings = [finding for finding in clocks if finding.subject.name == role]
+    remedies = [describe_remedy(finding, remedy) for finding in role_findings for remedy in finding.remedies]
+    return "; ".join(remedies) or ", ".join(finding.code.replace("-", " ") for finding in role_findings)
 
 
 def _format_drift(offset: ClockOffset) -> str:
@@ -382,7 +379,7 @@ def _format_drift(offset: ClockOffset) -> str:
 
 
 def _make_provenance_section(run: RunDirectory, manifest: Manifest, run_json: RunJson | None) -> Section:
-    """Return what the run is made from: enough to make it again."""
+    """Return the inputs from which the run can be made again."""
     rows = [
         ("made by", f"tcpipe {manifest.tcpipe_version}, data model {manifest.data_model_version}"),
         ("recipe", run.recipe_id),

@@ -1,4 +1,4 @@
-"""The page of a store: all its runs, what is drifting over the nights, what was lost, and what is in which dataset."""
+"""The page of a store: all runs, changes over time, losses, findings, datasets and failed logs."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class StoredDataset:
 
 @dataclass(frozen=True, slots=True)
 class FailedLog:
-    """A log that gave no run: why, and how that stands."""
+    """A log without a run: reason and state."""
 
     log: str
     why: str
@@ -55,7 +55,7 @@ class FailedLog:
 
 @dataclass(frozen=True, slots=True)
 class StoreFacts:
-    """What the page of a store is made of."""
+    """The content of a store's page."""
 
     where: str
     found: Ingestions
@@ -67,7 +67,7 @@ class StoreFacts:
     verdict: Verdict
     """On the current runs together."""
     changes: tuple[Finding, ...]
-    """What the latest of them have changed."""
+    """Changes in the latest of them."""
     groups: tuple[FindingGroup[str], ...]
     """Findings of the current runs by code, the worst first."""
     failed: tuple[FailedLog, ...]
@@ -75,7 +75,7 @@ class StoreFacts:
 
 @dataclass(frozen=True, slots=True)
 class StoredRun:
-    """A row of the page: what the index has of an ingestion, how it stands, its page, its datasets and codes of findings."""
+    """A row of the page: an ingestion with its state, page, datasets and codes of findings."""
 
     run_id: str
     recipe_id: str
@@ -104,28 +104,28 @@ class StoredRun:
         return self.facts.energy_budget.total if self.facts and self.facts.energy_budget else None
 
     def row(self, terms: Sequence[str]) -> list[Json]:
-        """Return what the page's script is told, in the order of `_FIELDS`."""
-        of = self.facts
-        if of is None:
+        """Return the values of `_FIELDS` for the page's script."""
+        facts = self.facts
+        if facts is None:
             return [self.run_id, self.href, None, "", self.state, "", "", *[None] * 4, "", None, [], [], None, []]
         return [
             self.run_id,
             self.href,
-            None if of.start_ns is None else of.start_ns // 10**6,
-            of.robot,
+            None if facts.start_ns is None else facts.start_ns // 10**6,
+            facts.robot,
             self.state,
-            of.superseded_by,
-            ", ".join(f"{key}={value}" for key, value in of.tags.items()),
-            of.segments,
-            round(of.driven_m, 1),
+            facts.superseded_by,
+            ", ".join(f"{key}={value}" for key, value in facts.tags.items()),
+            facts.segments,
+            round(facts.driven_m, 1),
             _compute_percent(self.used_share),
             _compute_percent(self.floor),
-            of.verdict.worst,
-            sum(finding.severity != "note" for finding in of.findings),
+            facts.verdict.worst,
+            sum(finding.severity != "note" for finding in facts.findings),
             list(self.datasets),
             list(self.codes),
-            of.standing_watt,
-            [of.physics[term][0] if term in of.physics else None for term in terms],
+            facts.standing_watt,
+            [facts.physics[term][0] if term in facts.physics else None for term in terms],
         ]
 
 
@@ -136,7 +136,7 @@ _FIELDS = (
 
 
 def sort_runs(store: StoreFacts) -> list[StoredRun]:
-    """Return every ingestion, what began last first; then those without a segment, and those that cannot be read."""
+    """Return every ingestion, the latest first; then those without a segment, and those that cannot be read."""
     found, ruling = store.found, find_recipe_key(store.found)
     members, codes = dict[tuple[str, str], list[int]](), dict[str, list[int]]()
     for number, dataset in enumerate(store.datasets):
@@ -178,8 +178,7 @@ def _state(facts: RunFacts, ruling: str | None, *, acknowledged: bool) -> str:
         return "superseded"
     if facts.ingest_key != ruling:
         return "of another recipe"
-    wrong = "damaged" if facts.damage else "empty" if facts.is_empty else ""
-    return f"{wrong}{', acknowledged' * acknowledged}" if wrong else "current"
+    return f"{facts.defect}{', acknowledged' * acknowledged}" if facts.defect else "current"
 
 
 def _compute_percent(share: float | None) -> float | None:
@@ -187,9 +186,9 @@ def _compute_percent(share: float | None) -> float | None:
 
 
 def name_datasets(datasets: Sequence[StoredDataset]) -> list[str]:
-    """Return what each dataset is called: the last part of its path, all of it where two would be called the same."""
-    short = [PurePosixPath(of.out).name for of in datasets]
-    return [name if short.count(name) == 1 else of.out for name, of in zip(short, datasets, strict=True)]
+    """Return a unique name of each dataset: the last part of its path, or the whole path."""
+    short = [PurePosixPath(dataset.out).name for dataset in datasets]
+    return [name if short.count(name) == 1 else dataset.out for name, dataset in zip(short, datasets, strict=True)]
 
 
 def format_day(facts: RunFacts | None) -> str:
@@ -230,15 +229,18 @@ def store_report(store: StoreFacts) -> str:
 
 def _make_numbers(store: StoreFacts, current: Sequence[StoredRun]) -> list[Number]:
     facts = [run.facts for run in current if run.facts]
-    driven_m, kept_m = math.fsum(of.driven_m for of in facts), math.fsum(of.kept_m for of in facts)
+    driven_m, kept_m = (
+        math.fsum(run_facts.driven_m for run_facts in facts),
+        math.fsum(run_facts.kept_m for run_facts in facts),
+    )
     floors = [run.floor for run in current if run.floor is not None]
     return [
         Number(f"{len(current)}", "runs"),
-        Number(f"{sum(of.segments for of in facts)}", "segments"),
+        Number(f"{sum(run_facts.segments for run_facts in facts)}", "segments"),
         Number(f"{driven_m:.0f} m", "driven"),
         *([Number(f"{100 * kept_m / driven_m:.0f} %", "of the metres used")] if driven_m > 0 else []),
         *([Number(f"{100 * float(np.median(floors)):.1f} %", "noise floor of E, median")] if floors else []),
-        Number(f"{sum(of.there for of in store.datasets)}", "datasets"),
+        Number(f"{sum(dataset.there for dataset in store.datasets)}", "datasets"),
         *([Number(f"{len(store.failed)}", "logs without a run")] if store.failed else []),
     ]
 
@@ -315,22 +317,25 @@ def _list_robots(runs: Sequence[StoredRun]) -> list[tuple[str, str]]:
 
 
 def _make_findings_sections(store: StoreFacts, current: Sequence[StoredRun]) -> list[Section]:
-    rows = [(of.severity, format_group(of, len(current)), len(of.of), ", ".join([*of.of][:3])) for of in store.groups]
+    rows = [
+        (group.severity, format_group(group, len(current)), len(group.of), ", ".join([*group.of][:3]))
+        for group in store.groups
+    ]
     header = ("severity", "finding", "runs", "such as")
     text = "Of the current runs, by code, the worst first; each run's own page has all of its own."
     return [Section("Findings by code", text, header=header, rows=rows)] if rows else []
 
 
 def _make_datasets_sections(store: StoreFacts, runs: Sequence[StoredRun]) -> list[Section]:
-    here = {(run.run_id, run.recipe_id) for run in runs if run.is_current}
+    current_runs = {(run.run_id, run.recipe_id) for run in runs if run.is_current}
     rows = [
         (
-            Link(of.out, of.page) if of.page else of.out,
-            len(of.runs),
-            len(here.difference(of.runs)) if of.there else "",
-            "" if of.there else "another dataset lies there now",
+            Link(dataset.out, dataset.page) if dataset.page else dataset.out,
+            len(dataset.runs),
+            len(current_runs.difference(dataset.runs)) if dataset.there else "",
+            "" if dataset.there else "another dataset lies there now",
         )
-        for of in store.datasets[-_MOST_LISTED:]
+        for dataset in store.datasets[-_MOST_LISTED:]
     ]
     header = ("dataset", "runs in it", "runs not in it", "")
     return [Section("Datasets", "Those that were built of this store.", header=header, rows=rows)] if rows else []
@@ -338,9 +343,9 @@ def _make_datasets_sections(store: StoreFacts, runs: Sequence[StoredRun]) -> lis
 
 def _make_problem_sections(store: StoreFacts, runs: Sequence[StoredRun]) -> list[Section]:
     """Return the logs without a run, and the runs that are damaged or cannot be read."""
-    rows = [(of.log, of.state, of.why) for of in store.failed]
+    rows = [(log.log, log.state, log.why) for log in store.failed]
     for run in runs:
-        if run.facts is None or (run.is_current and (run.facts.damage or run.facts.is_empty)):
+        if run.facts is None or (run.is_current and run.facts.defect):
             line = store.found.damaged.get((run.run_id, run.recipe_id), "ingest its log again")
             rows.append((run.run_id, run.state, _describe_problem(run.facts) if run.facts else line))
     if not rows:
@@ -353,7 +358,7 @@ def _make_problem_sections(store: StoreFacts, runs: Sequence[StoredRun]) -> list
 
 
 def _describe_problem(facts: RunFacts) -> str:
-    return next(iter(facts.damage), "") or describe_finding(select_problems(facts.findings)[0])
+    return describe_finding((*facts.damage, *select_problems(facts.findings))[0])
 
 
 def _make_data(store: StoreFacts, runs: Sequence[StoredRun]) -> Json:
@@ -361,8 +366,8 @@ def _make_data(store: StoreFacts, runs: Sequence[StoredRun]) -> Json:
     return {
         "fields": list(_FIELDS),
         "rows": [run.row(terms) for run in runs],
-        "robots": [list(of) for of in _list_robots(runs)],
+        "robots": [list(robot) for robot in _list_robots(runs)],
         "datasets": name_datasets(store.datasets),
-        "codes": [f"{of.severity}: {of.code.replace('-', ' ')}" for of in store.groups],
+        "codes": [f"{group.severity}: {group.code.replace('-', ' ')}" for group in store.groups],
         "terms": [f"{term} [{PHYSICS_UNITS.get(term.partition(' ')[0], '')}]" for term in terms],
     }

@@ -13,12 +13,13 @@ from tcpipe.tables.findings import Finding, Subject
 LONGEST = 100
 LINES = "tcpipe.formats.finding_lines"
 
-MAKERS = {"make_finding": 0, "threshold": 0, "select_findings": 1}
+MAKERS = {"make_finding": 0, "Damage": 0, "DamageError": 0, "threshold": 0, "select_findings": 1}
 """Functions that take codes, and the argument from which on these stand."""
 
 PRINTERS = {
     "tcpipe/formats/dataset_card.py",
     "tcpipe/formats/hub_card.py",
+    "tcpipe/formats/logs/log_file.py",
     "tcpipe/learning/evaluation_files.py",
     "tcpipe/pipeline/dataset/build.py",
     "tcpipe/pipeline/dataset/content.py",
@@ -154,7 +155,7 @@ def test_nothing_decides_on_a_finished_sentence():
 
     def is_sentence(node):
         node = node.value if isinstance(node, ast.Subscript) else node
-        is_field = isinstance(node, ast.Attribute) and node.attr in {"cause", "damage", "notes", "problems", "remarks"}
+        is_field = isinstance(node, ast.Attribute) and node.attr in {"cause", "notes", "problems"}
         return is_field or (isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id in makers)
 
     searches = {"startswith", "endswith", "split", "partition", "search", "match", "fullmatch", "sub"}

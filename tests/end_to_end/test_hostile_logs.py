@@ -32,7 +32,7 @@ def most_bytes():  # getrusage's would hold what the parent had before this prog
 def read(path):
     with tcpipe.read_log(path) as log:
         rows = sum(table.num_rows for table in log.tables(log.topics).values())
-        return [str(finding) for finding in log.damage][:5], rows
+        return log.damage[:5], rows
 
 for path in sys.argv[1:]:
     for what, run in {

@@ -184,7 +184,7 @@ WARNED = ("imu: 0.1 s late", "gnss: no placement")
 
 def test_sentences_of_manifests_and_cards_become_findings():
     manifest = {
-        "data_model_version": "2.1", "run_id": "a", "warnings": list(WARNED),
+        "data_model_version": "2.1", "run_id": "a", "warnings": list(WARNED), "damage": ["cut"],
         "info": {"findings": {"warnings": [], "facts": {"n": 1}}, "datum": None}, "counts": {"segments": 3, "gnss_messages": 9},
     }  # fmt: skip
     brought = migrating._bring_document(manifest, "manifest-1.json")
@@ -193,6 +193,7 @@ def test_sentences_of_manifests_and_cards_become_findings():
         (of["code"], of["subject"]["name"], of["names"]["text"]) for of in brought["info"]["report"]["findings"]
     ] == [("earlier-warning", "a", line) for line in WARNED]
     assert brought["verdict"]["position"] == "usable", "a note changes no verdict"
+    assert [of["names"]["text"] for of in brought["damage"]] == ["cut"]
     assert brought["counts"] == {"segments": 3, "messages": {"gnss": 9}}
     assert migrating._bring_document(brought, "manifest-1.json") is brought
     card = {

@@ -61,7 +61,7 @@ def test_what_has_no_checksum_and_which_clock_is_simulated_is_said(tmp_path):
     assert tcpipe("ingest", "run", cwd=tmp_path).returncode == 0
     found = run_json(tmp_path / "tcpipe-store")
     assert found["damage"] == []
-    assert ["unchecked: a .db3 carries no checksum" in line for line in found["remarks"]] == [True]
+    assert [of["code"] for of in found["remarks"]] == ["no-checksum"]
     assert "simulated-time" in {of["code"] for of in found["report"]["findings"]}
 
 

@@ -259,7 +259,8 @@ def test_a_damaged_log_costs_only_itself(demo: Demo, tmp_path: Path) -> None:
     results = told(done)["results"]
     assert [result["status"] for result in results] == ["damaged", "failed", "done"]
     assert results[0]["run"]["segments"] > 50
-    assert "broken.mcap" in results[0]["run"]["damage"][0]
+    assert [of["code"] for of in results[0]["run"]["damage"]] == ["index-missing", "file-cut"]
+    assert results[0]["run"]["damage"][0]["subject"] == {"kind": "file", "name": "broken.mcap"}
     assert "garbage.bag" in results[1]["problems"][0]
 
 

@@ -33,6 +33,7 @@ from tcpipe.formats.logs.arrow_columns import TopicTable
 from tcpipe.formats.logs.log_file import Log, open_log
 from tcpipe.formats.logs.log_part import MessageBlock
 from tcpipe.formats.logs.ros_types import DefinitionError, MessageType, RowError, TypeLibrary
+from tcpipe.tables.findings import Finding
 
 TYPES = (
     "std_msgs/msg/ColorRGBA",
@@ -70,7 +71,7 @@ def read_container(data: bytes) -> None:
                 for tables in log.batches(names, batch_bytes=1 << 12, threads=2):
                     for name, table in tables.items():
                         rows[name] = rows.get(name, 0) + table.num_rows
-                lines = {str(one) for one in log.damage if "behind their time" not in one.what}
+                lines = {of for of in log.findings if of.code != "messages-unordered"}
             assert (rows, lines) == whole
             with open_log(path) as log:
                 _told(log, names[:1])
@@ -78,14 +79,14 @@ def read_container(data: bytes) -> None:
             return
 
 
-def _told(log: Log, names: list[str]) -> tuple[dict[str, int], set[str]]:
-    """Return the number of rows of topics and the lines about damage."""
+def _told(log: Log, names: list[str]) -> tuple[dict[str, int], set[Finding]]:
+    """Return the number of rows of topics and the findings."""
     tables = log.tables(names)
     for name, table in tables.items():
         table.validate(full=True)
         stamps = table["log_time_ns"].to_numpy()
         assert (stamps[1:] >= stamps[:-1]).all(), name
-    lines = {str(one) for one in log.damage}
+    lines = set(log.findings)
     return {name: table.num_rows for name, table in tables.items()}, lines
 
 
@@ -136,7 +137,7 @@ def read_messages(data: bytes) -> None:
     table.add(_block(payloads))
     found = table.take()
     found.validate(full=True)
-    assert found.num_rows + sum(table.undecodable.values()) == len(payloads)
+    assert found.num_rows + table.undecodable == len(payloads)
     rows = found.drop_columns(["publish_time_ns"]).to_pylist()
     for row in rows:
         try:

@@ -411,10 +411,10 @@ def judged(clean: Clean, data: bytes, touched: set[int], wanted: str | None = No
             return "refused", str(error)
         except Exception as error:  # noqa: BLE001  whatever it is, it is a finding
             return "silent", f"{type(error).__name__}: {error}"
-    said = "; ".join(map(str, damage))
+    said = "; ".join(damage)
     if found == expected:
         return "same", said
-    if any(one.is_loss for one in damage):
+    if damage:
         return "told", said
     lost, new = expected - found, found - expected
     mine = frozenset().union(*(clean.own[byte] for byte in touched if byte < len(clean.own)))

@@ -51,7 +51,7 @@ def test_every_field_is_what_rosbags_reads(name):
     expected = rosbags_rows(path)
     with open_log(path) as log:
         tables = log.tables(log.topics)
-        assert [damage for damage in log.damage if damage.messages_lost != 0] == []
+        assert log.damage == []
     assert {topic for topic, table in tables.items() if table.num_rows} == expected.keys()
     for topic, rows in expected.items():
         assert tables[topic]["log_time_ns"].to_pylist() == [stamp for stamp, _ in rows]
@@ -74,7 +74,7 @@ def test_compressed_and_split_bags_of_old_recorders():
         with open_log(base / name) as log:
             counts[name] = sum(table.num_rows for table in log.tables(log.topics).values())
             assert counts[name] == sum(topic.message_count for topic in log.topics.values())
-            assert all("metadata.yaml is missing" in damage.what for damage in log.damage)
+            assert {finding.code for finding in log.findings} <= {"file-unlisted", "no-checksum"}
     assert counts == {"multiple_files": 52, "file_compression": 775, "message_compression": 1127}
 
 
@@ -120,11 +120,10 @@ def test_what_cannot_be_decoded_is_named_and_counted():
     bag = shared_data("peers/rosbag2/rosbag2_tests/resources/mcap/wrong_rmw_test")
     with open_log(bag) as log:
         assert log.tables(log.topics) == {}
-        assert {(damage.topic, damage.messages_lost) for damage in log.damage} == {
-            ("/array_topic", 4),
-            ("/test_topic", 3),
-        }
-        assert all("wrong_format" in damage.what for damage in log.damage)
+        lost = [finding for finding in log.findings if finding.code == "messages-not-decoded"]
+    found = {(finding.subject.name, finding.numbers["lost_messages_count"]) for finding in lost}
+    assert found == {("/array_topic", 4), ("/test_topic", 3)}
+    assert all("wrong_format" in finding.names["reason"] for finding in lost)
 
 
 def test_the_events_of_a_service_are_read_by_the_services_definition():
@@ -175,7 +174,7 @@ def message_set(path):
     """Every message of a log, one hashable line each."""
     with open_log(path) as log:
         tables = without_sequence(log.tables(sorted(log.topics)))
-        damage = log.damage
+        damage = log.findings
     lines = Counter(f"{name} {row}" for name, table in tables.items() for row in table.to_pylist())
     return lines, damage
 
@@ -205,7 +204,7 @@ def test_every_intact_message_of_a_damaged_log_is_read_and_no_other(
     assert found.total() == count
     assert found - clean_messages == Counter()
     assert damage
-    assert lost is None or lost in [finding.messages_lost for finding in damage]
+    assert lost is None or lost in [finding.numbers.get("lost_messages_count") for finding in damage]
     if lost is not None:
         assert count + lost == HUSKY_MESSAGES
 

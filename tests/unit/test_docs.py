@@ -86,6 +86,26 @@ def test_references_to_decisions_lead_somewhere() -> None:
     assert named > 20
 
 
+def test_files_and_modules_that_pages_name_exist() -> None:
+    wrong = []
+    for page in PAGES:
+        if page.name == "CHANGELOG.md":
+            continue
+        text = page.read_text(encoding="utf-8")
+        paths = re.findall(r"\b((?:tcpipe|tests|benchmarks|pipelines)/[\w/.-]+\.(?:py|toml|md|sbatch))\b", text)
+        wrong += [f"{page.name}: {path}" for path in paths if "NAME" not in path and not (ROOT / path).exists()]
+        for dotted in re.findall(r"(?:`|from |import )(tcpipe(?:\.(?!toml)[a-z_]\w*)+)", text):
+            parent, _, name = dotted.rpartition(".")
+            places = [
+                ROOT / dotted.replace(".", "/"),
+                *(ROOT / f"{stem.replace('.', '/')}.py" for stem in (dotted, parent)),
+            ]
+            source = places[-1] if places[-1].exists() else ROOT / parent.replace(".", "/") / "__init__.py"
+            if not any(place.exists() for place in places[:2]) and not (source.exists() and name in source.read_text()):
+                wrong.append(f"{page.name}: {dotted}")
+    assert not wrong
+
+
 def _command_lines(page: Path) -> Iterator[str]:
     """Yield every ``tcpipe …`` command in the page's plain and console blocks, and in its inline code."""
     text = page.read_text(encoding="utf-8").replace("\\\n", " ")

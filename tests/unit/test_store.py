@@ -21,6 +21,7 @@ from tcpipe.pipeline.inspect import inspect
 from tcpipe.pipeline.verify import verify
 from tcpipe.recipe import Recipe
 from tcpipe.store import Store, open_store
+from tcpipe.tables.findings import Subject, make_finding
 
 RUN = "north"
 
@@ -110,18 +111,19 @@ def test_of_two_who_make_a_run_the_first_wins_and_what_replaces_it_is_a_new_numb
         def __init__(self, table: object, rejections: object = None) -> None:
             self.table, self.rejections = table, rejections
 
-    def write(line: str, *, force: bool = False) -> object:
-        made = replace(first.manifest, damage=(line,), checksums={})
+    def write(file: str, *, force: bool = False) -> object:
+        made = replace(first.manifest, damage=(make_finding("file-cut", Subject("file", file)),), checksums={})
         levels = {"track": _Level(None, tables["rejections"]), "gated": _Level(tables["track"])}
-        return store.write_run(made, **levels, labelled=_Level(tables["segments"]), settled=lambda _: not force).damage
+        made = store.write_run(made, **levels, labelled=_Level(tables["segments"]), settled=lambda _: not force)
+        return [of.subject.name for of in made.damage]
 
-    assert write("mine") == ()
-    assert write("mine", force=True) == ("mine",)
-    assert write("mine", force=True) == ("mine",)
+    assert write("mine") == []
+    assert write("mine", force=True) == ["mine"]
+    assert write("mine", force=True) == ["mine"]
     assert store.runs()[0].manifest.damage == (), "no commit names the new one yet"
     commit_run(store, RUN)
     assert store.runs()[0].place.files() == ["manifest-1.json", "manifest-2.json"]
-    assert store.runs()[0].manifest.damage == ("mine",)
+    assert [of.subject.name for of in store.runs()[0].manifest.damage] == ["mine"]
 
 
 def test_tags_of_two_writers_are_both_kept(root, monkeypatch):

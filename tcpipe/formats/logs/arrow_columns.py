@@ -11,7 +11,6 @@ import itertools
 import json
 import math
 import mmap
-import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
@@ -70,7 +69,6 @@ MAX_SHAPE_BYTES = 1 << 27
 MAX_CONTIGUOUS_BYTES = 1 << 30
 """A larger table stays in pieces: Arrow's lists and strings count their values in 31 bits."""
 
-_NUMBER = re.compile(r"\d+")
 _TIMES_BYTES = 24
 _ALIGNED_BYTES = 64
 _OWN_BYTES = 1 << 17
@@ -123,9 +121,8 @@ class TopicTable:
         self.schema = make_arrow_schema(message_type.wire)
         self._in_pieces = in_pieces
         self._fields = pa.schema(list(self.schema)[2:])
-        self.undecodable: dict[str, int] = {}
-        """Messages left out by reason; those that differ in numbers only go by the first."""
-        self._first_reason: dict[str, str] = {}
+        self.undecodable, self.undecodable_reason = 0, ""
+        """How many messages were left out, and why the first was."""
         self.replaced_texts = 0
         self.late = 0
         """Messages that came after a table for later times was taken."""
@@ -396,9 +393,8 @@ class TopicTable:
         self._add_part(np.array(kept, np.int64), columns)
 
     def _leave_out(self, reason: str, count: int) -> None:
-        kind = _NUMBER.sub("#", reason)  # else a broken topic would give as many reasons as messages
-        first = self._first_reason.setdefault(kind, reason)
-        self.undecodable[first] = self.undecodable.get(first, 0) + count
+        self.undecodable += count
+        self.undecodable_reason = self.undecodable_reason or reason
 
     def _add_part(self, rows: _Int64, columns: list[pa.Array]) -> None:
         if len(rows):

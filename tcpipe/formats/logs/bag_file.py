@@ -44,7 +44,6 @@ from tcpipe.formats.logs.log_part import (
     MessageBlock,
     decompress,
     decompress_prefix,
-    format_numbered,
     outline_of,
 )
 from tcpipe.logs.topics import Damage, compute_silence_ns, normalize_type_name
@@ -92,12 +91,13 @@ class BagPart:
 
     def __init__(self, path: Path, name: str, fetched: FetchedFile | None = None) -> None:
         self.name = name
-        self.damage: dict[Damage, None] = {}
+        self.damage: list[Damage] = []
         self.outline = ""
         self._bytes = ByteSource(path, fetched)
         self._connections: dict[int, _Connection] = {}
         self._chunks: list[_Chunk] = []
-        self._without_checksum = False
+        self.is_unchecked = False
+        """Whether chunks were read that carry no checksum: all but those of bz2."""
         self._index_heads: dict[int, tuple[int, int, int, bytes]] = {}
         self._bounds = Bounds(path, self._bytes.size)
         try:
@@ -111,7 +111,7 @@ class BagPart:
         try:
             self._read_index()
         except DamageError as error:
-            self._note(self._bytes.size, f"{error}; it is read record by record")
+            self.damage.append(Damage(error.cause, self.name, self._bytes.size, reason=error.reason))
             self._bytes.whole()
             self._connections, self._chunks = {}, []
             self._walk()
@@ -119,11 +119,6 @@ class BagPart:
     def close(self) -> None:
         """Close the file."""
         self._bytes.close()
-
-    @property
-    def unchecked(self) -> str:
-        """What was read that no checksum covers."""
-        return "chunks of a .bag carry no checksum, unless they are bz2" if self._without_checksum else ""
 
     def blocks(self, wanted: frozenset[int], *, threads: int = 1) -> Iterator[MessageBlock]:
         """Yield the messages of the wanted connections, chunk by chunk, or some chunks at once where little of them is wanted."""
@@ -191,18 +186,16 @@ class BagPart:
 
     def _contradictions(self, chunk: _Chunk, walked: ChunkRecords, size: int) -> list[Damage]:
         """Return what is wrong with a chunk of ``size`` bytes of which each record was looked at."""
-        found, where = [], f"{self.name}, byte {chunk.offset}"
+        found = []
         if walked.end < size and not chunk.cut:
-            found.append(Damage(where, "the records of a chunk end before it does", bytes_lost=size - walked.end))
-        if unknown := sorted(walked.offsets.keys() - self._connections.keys()):
+            found.append(Damage("record-damaged", self.name, chunk.offset, bytes_lost=size - walked.end))
+        if unknown := walked.offsets.keys() - self._connections.keys():
             lost = sum(len(walked.offsets[number]) for number in unknown)
-            what = f"messages of {format_numbered('connection', unknown)}, which nothing declares"
-            found.append(Damage(where, what, messages_lost=lost))
+            found.append(Damage("channel-undeclared", self.name, chunk.offset, messages_lost=lost))
         counts = {number: len(offsets) for number, offsets in walked.offsets.items()}
         if chunk.counts is not None and counts != chunk.counts:
             lost = max(sum(chunk.counts.values()) - sum(counts.values()), 0)
-            what = "the bag's index counts other messages than a chunk holds, which are read"
-            found.append(Damage(where, what, messages_lost=lost or None))
+            found.append(Damage("chunk-index-damaged", self.name, chunk.offset, messages_lost=lost or None))
         return found
 
     def entries(self, chunks: list[_Chunk], sizes: Int64Array) -> tuple[Entries, NDArray[np.bool_]]:
@@ -236,14 +229,14 @@ class BagPart:
         """Return each connection's entries in the index behind a chunk; `DamageError` where it has none, or a broken one."""
         counts = chunk.counts
         if counts is None or chunk.cut or chunk.record is None:
-            raise DamageError("only the chunk's records tell what it holds")
+            raise DamageError("chunk-index-damaged")
         found, position = [], chunk.record.end
         for _ in counts:
             connection, start, size = self._index_record(position)
             found.append((connection, self._bytes.peek(start, size)))
             position = start + size
         if {connection: len(entries) // _INDEX_ENTRY_BYTES for connection, entries in found} != counts:
-            raise DamageError("a chunk's index does not hold what the summary counts")
+            raise DamageError("chunk-index-damaged")
         return found
 
     def _index_record(self, position: int) -> tuple[int, int, int]:
@@ -262,7 +255,7 @@ class BagPart:
                 return connection, position + 8 + length, size
         record = self._record(position)
         if record.opcode != OP_INDEX or record.data_bytes % 12:
-            raise DamageError("an index record is not where it should be")
+            raise DamageError("chunk-index-damaged")
         if len(record.fields.get(b"conn", b"")) == len(record.fields.get(b"count", b"")) == 4:
             header = self._bytes.peek(position + 4, length)
             low, high = sorted(places := (header.find(b"conn=") + 5, header.find(b"count=") + 6))
@@ -275,7 +268,7 @@ class BagPart:
         if record is None or record.opcode != OP_CHUNK or record.codec != "none":
             copy_pieces(self.load(chunk), places, to)
             return
-        self._without_checksum = True
+        self.is_unchecked = True
         self._bytes.read_pieces(
             [(record.data_offset + start, to[at : at + stop - start]) for start, stop, at in places]
         )
@@ -285,18 +278,17 @@ class BagPart:
         record = chunk.record or self._record(chunk.offset)
         codec = record.codec
         if codec != "bz2":
-            self._without_checksum = True
+            self.is_unchecked = True
         size = record.number(b"size")
         if record.opcode != OP_CHUNK:
-            raise DamageError("no chunk is where the index says")
+            raise DamageError("record-damaged")
         if chunk.cut:
             data = self._bytes.read(record.data_offset, self._bytes.size - record.data_offset)
             kept = data if codec == "none" else decompress_prefix(codec, data, size)
-            what = f"the file ends inside a chunk; {len(kept)} bytes of it are read, unchecked"
-            self._note(chunk.offset, what, bytes_lost=size - len(kept))
+            self.damage.append(Damage("file-cut", self.name, chunk.offset, bytes_lost=size - len(kept)))
             return kept
         if record.end > self._bytes.size:
-            raise DamageError("it runs past the file's end")
+            raise DamageError("file-cut")
         if codec == "none":
             return self._bytes.read(record.data_offset, record.data_bytes)
         return decompress(codec, self._bytes.read_once(record.data_offset, record.data_bytes), size)
@@ -305,12 +297,10 @@ class BagPart:
         """Read the connections and chunk summaries at the file's end; `DamageError` when they cannot be used."""
         header = self._record(len(MAGIC))
         if header.opcode != OP_HEADER:
-            raise DamageError("the bag's header record is missing")
+            raise DamageError("index-damaged")
         position = header.number(b"index_pos")
-        if not position:
-            raise DamageError("the bag has no index (it was not closed)")
-        if position > self._bytes.size:
-            raise DamageError("the bag's index is missing (the file is cut)")
+        if not position or position > self._bytes.size:
+            raise DamageError("index-missing")
         start, index_bytes = position, self._bytes.size - position
         self._bytes.expect([(start, min(index_bytes, _EXPECTED_BYTES))])
         while position < self._bytes.size:
@@ -320,12 +310,12 @@ class BagPart:
             elif record.opcode == OP_CHUNK_INFO:
                 self._take_chunk_info(record)
             else:
-                raise DamageError(f"the bag's index holds a record of opcode {record.opcode}")
+                raise DamageError("index-damaged")
             position = record.end
         if (len(self._connections), len(self._chunks)) != (header.number(b"conn_count"), header.number(b"chunk_count")):
-            raise DamageError("the bag's index does not hold what its header counts")
+            raise DamageError("index-damaged")
         if len({chunk.offset for chunk in self._chunks}) < len(self._chunks):
-            raise DamageError("the bag's index names a chunk twice")
+            raise DamageError("index-damaged")
         self._chunks.sort(key=lambda chunk: chunk.offset)
         self.outline = outline_of(self._bytes.size, self._bytes.read(start, index_bytes)) if self._chunks else ""
 
@@ -333,7 +323,7 @@ class BagPart:
         data = self._bytes.read(record.data_offset, record.data_bytes)
         counts = dict(struct.iter_unpack("<II", data[: len(data) // 8 * 8]))
         if len(data) != 8 * len(counts) or len(counts) != record.number(b"count"):
-            raise DamageError("the bag's index contradicts itself")
+            raise DamageError("index-damaged")
         chunk = _Chunk(
             record.number(b"chunk_pos"),
             stamp_ns(record.fields, b"start_time"),
@@ -341,7 +331,7 @@ class BagPart:
             counts,
         )
         if chunk.offset >= self._bytes.size or not counts.keys() <= self._connections.keys():
-            raise DamageError("the bag's index points outside the file")
+            raise DamageError("index-damaged")
         self._chunks.append(chunk)
         self._bounds.count(len(self._chunks), 0)
         for connection, count in counts.items():
@@ -368,7 +358,9 @@ class BagPart:
                 position = self._take_record(position)
             except DamageError as error:
                 after = self._next_chunk(position + 1)
-                self._note(position, str(error), bytes_lost=after - position)
+                self.damage.append(
+                    Damage(error.cause, self.name, position, bytes_lost=after - position, reason=error.reason)
+                )
                 position = after
 
     def _take_record(self, position: int) -> int:
@@ -377,30 +369,30 @@ class BagPart:
         if record.opcode == OP_CHUNK:
             self._walk_chunk(position, record)
         elif record.end > self._bytes.size:
-            raise DamageError("the file ends inside a record")
+            raise DamageError("file-cut")
         elif record.opcode == OP_CONNECTION:
             self._take_connection(record, self._bytes.read(record.data_offset, record.data_bytes))
         elif record.opcode not in (OP_HEADER, OP_INDEX, OP_CHUNK_INFO):
-            raise DamageError(f"no record begins with opcode {record.opcode}")
+            raise DamageError("record-damaged")
         return record.end
 
     def _walk_chunk(self, position: int, record: BagRecord) -> None:
         """Load a chunk for its connections and counts."""
         cut = record.end > self._bytes.size
         if cut and self._next_chunk(position + 1) < self._bytes.size:
-            raise DamageError("the head of a chunk contradicts what follows")
+            raise DamageError("record-damaged")
         chunk = _Chunk(position, cut=cut)
         try:
             data = self.load(chunk)
         except DamageError as error:
-            self.damage[self.lost(chunk, str(error))] = None
+            self.damage.append(self.lost(chunk, error))
             return
         found = self._walked(chunk, data)
         for connection in found.connections:
             self._take_connection(connection, data[connection.data_offset : connection.end])
         self._chunks.append(chunk)
         self._bounds.count(len(self._chunks), 0)
-        self.damage.update(dict.fromkeys(self._contradictions(chunk, found, len(data))))
+        self.damage += self._contradictions(chunk, found, len(data))
         for number in found.offsets.keys() & self._connections.keys():
             stamps_ns = found.stamps[number]
             self._tally(number, len(stamps_ns), min(stamps_ns), max(stamps_ns))
@@ -446,10 +438,10 @@ class BagPart:
         head = self._bytes.peek(position, 4)
         length = int.from_bytes(head, "little")
         if len(head) < 4 or length > MAX_HEADER_BYTES:
-            raise DamageError("no record begins here")
+            raise DamageError("record-damaged")
         header = self._bytes.peek(position + 4, length + 4)
         if len(header) < length + 4:
-            raise DamageError("the file ends inside a record")
+            raise DamageError("file-cut")
         return BagRecord(
             parse_header_fields(header[:length]), position + 8 + length, int.from_bytes(header[length:], "little")
         )
@@ -460,19 +452,10 @@ class BagPart:
         tally.starts.append(start_ns)
         tally.ends.append(end_ns)
 
-    def _note(self, offset: int, what: str, *, messages_lost: int | None = None, bytes_lost: int | None = None) -> None:
-        where = f"{self.name}, byte {offset}"
-        self.damage[Damage(where, what, messages_lost=messages_lost, bytes_lost=bytes_lost)] = None
-
-    def lost(self, chunk: _Chunk, why: str) -> Damage:
-        """Return what to say of a chunk that is lost as a whole, counted by the bag's index."""
-        return Damage(
-            f"{self.name}, byte {chunk.offset}",
-            f"a chunk is lost: {why}",
-            messages_lost=sum(chunk.counts.values()) if chunk.counts else None,
-            start_ns=chunk.start_ns or None,
-            end_ns=chunk.end_ns or None,
-        )
+    def lost(self, chunk: _Chunk, error: DamageError) -> Damage:
+        """Return the damage of a chunk that is lost as a whole, counted by the bag's index."""
+        lost = sum(chunk.counts.values()) if chunk.counts else None
+        return Damage(error.cause, self.name, chunk.offset, messages_lost=lost, reason=error.reason)
 
 
 def _find_needed_bytes(offset: int, record: BagRecord) -> tuple[int, int]:

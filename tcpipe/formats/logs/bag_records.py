@@ -47,7 +47,7 @@ class BagRecord:
     def number(self, name: bytes) -> int:
         """Return a little-endian integer field; `DamageError` where it is missing."""
         if name not in self.fields:
-            raise DamageError(f"a record lacks the field {name.decode()!r}")
+            raise DamageError("record-damaged")
         return int.from_bytes(self.fields[name], "little")
 
 
@@ -120,7 +120,7 @@ def parse_header_fields(header: bytes | memoryview) -> dict[bytes, bytes]:
         end = position + 4 + int.from_bytes(header[position : position + 4], "little")
         name, equals, value = header[position + 4 : end].partition(b"=")
         if end > len(header) or not equals:
-            raise DamageError("a record's header is broken")
+            raise DamageError("record-damaged")
         fields[name] = value
         position = end
     return fields
@@ -130,7 +130,7 @@ def stamp_ns(fields: dict[bytes, bytes], name: bytes) -> int:
     """Return a time field in nanoseconds."""
     value = fields.get(name, b"")
     if len(value) != 8:
-        raise DamageError(f"a record lacks the time {name.decode()!r}")
+        raise DamageError("record-damaged")
     seconds, nanoseconds = _TIME.unpack(value)
     return seconds * NS + nanoseconds  # type: ignore[no-any-return]
 

@@ -144,7 +144,7 @@ class ChunkedFile(Protocol[AnyChunk]):
     """A file of chunks: what `read_chunk_blocks` asks of it. `DamageError` where a chunk is lost."""
 
     name: str
-    damage: dict[Damage, None]
+    damage: list[Damage]
 
     def chunks_with(self, wanted: frozenset[int]) -> list[tuple[int, AnyChunk]]:
         """Return the chunks that may hold wanted channels, each with the number of bytes in all chunks before it."""
@@ -170,8 +170,8 @@ class ChunkedFile(Protocol[AnyChunk]):
     def needs_index(self, chunk: AnyChunk) -> bool:
         """Tell whether a broken index of this chunk is worth a word."""
 
-    def lost(self, chunk: AnyChunk, why: str) -> Damage:
-        """Return what to say of a chunk that is lost as a whole."""
+    def lost(self, chunk: AnyChunk, error: DamageError) -> Damage:
+        """Return the damage of a chunk that is lost as a whole."""
 
 
 def read_chunk_blocks(file: ChunkedFile[AnyChunk], wanted: frozenset[int], *, threads: int) -> Iterator[MessageBlock]:
@@ -182,7 +182,7 @@ def read_chunk_blocks(file: ChunkedFile[AnyChunk], wanted: frozenset[int], *, th
         return list(_read_span_blocks(file, *planned, wanted, noted)), noted
 
     for blocks, noted in map_in_order(read, _plan_spans(file, wanted), threads=threads):
-        file.damage.update(dict.fromkeys(noted))
+        file.damage += noted
         yield from blocks
 
 
@@ -215,7 +215,7 @@ def _read_span_blocks(
             load=lambda number: file.load(members[number][1]),
             copy=lambda number, places, to: file.copy(members[number][1], places, to),
         )
-        noted += [file.lost(members[number][1], str(error)) for number, error in found.lost]
+        noted += [file.lost(members[number][1], error) for number, error in found.lost]
         messages, true = file.indexed(found)
         ordinal = np.array([base for base, _ in members], np.int64)[found.entries.chunk] + found.entries.offset
         doubtful = np.unique(found.entries.chunk[~true]).tolist()
@@ -228,7 +228,7 @@ def _read_span_blocks(
         try:
             data = file.load(chunk)
         except DamageError as error:
-            noted.append(file.lost(chunk, str(error)))
+            noted.append(file.lost(chunk, error))
         else:
             messages = file.walked(chunk, data, wanted, noted)
             entries = None if span.entries is None else span.entries.of_chunk(number)
@@ -240,7 +240,7 @@ def _split_in_time(name: str, messages: Messages, ordinal: Int64Array, noted: li
     """Return messages as blocks, without those whose time is past what 63 bits hold."""
     times = (messages.log_time_ns >= 0) & (messages.publish_time_ns >= 0)
     if not times.all():
-        noted.append(Damage(name, "messages of times after the year 2262", messages_lost=int((~times).sum())))
+        noted.append(Damage("time-invalid", name, messages_lost=int((~times).sum())))
         messages, ordinal = messages.at(times), ordinal[times]
     return messages.blocks(ordinal)
 
@@ -248,8 +248,8 @@ def _split_in_time(name: str, messages: Messages, ordinal: Int64Array, noted: li
 def _find_index_disagreement(
     file: ChunkedFile[AnyChunk], chunk: AnyChunk, messages: Messages, entries: Entries | None
 ) -> list[Damage]:
-    """Return what to say where a chunk's index is broken, or names other messages than its records hold."""
-    what, lost = "the index of a chunk is broken; its messages are read without it", 0
+    """Return the damage where a chunk's index is broken, or names other messages than its records hold."""
+    lost = 0
     if entries is None and (chunk.size > MAX_PLANNED_BYTES or not file.needs_index(chunk)):
         return []
     if entries is not None:
@@ -257,10 +257,12 @@ def _find_index_disagreement(
         mine = np.stack([held.offset, held.channel, held.log_time_ns])
         if np.array_equal(mine, np.stack([entries.offset, entries.channel, entries.log_time_ns])):
             return []
-        what = "the index of a chunk names other messages than the chunk holds, which are read"
         lost = max(len(entries.offset) - len(held.offset), 0)
-    where = f"{file.name}, byte {chunk.offset}"
-    return [Damage(where, what, messages_lost=0 if file.is_proved(chunk) else lost or None)]
+    return [
+        Damage(
+            "chunk-index-damaged", file.name, chunk.offset, messages_lost=0 if file.is_proved(chunk) else lost or None
+        )
+    ]
 
 
 def group_chunks(sizes: Iterable[int]) -> Iterator[range]:

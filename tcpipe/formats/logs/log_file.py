@@ -17,6 +17,7 @@ from typing import Self
 import pyarrow as pa
 
 from tcpipe.errors import LogError
+from tcpipe.formats.finding_lines import describe_finding
 from tcpipe.formats.logs.arrow_columns import TopicTable
 from tcpipe.formats.logs.fetched_file import FetchedFile
 from tcpipe.formats.logs.log_container import WANTED, find_container, open_part
@@ -24,8 +25,9 @@ from tcpipe.formats.logs.log_part import Channel, LogPart, MessageBlock
 from tcpipe.formats.logs.ros_types import DefinitionError, MessageType, TypeLibrary
 from tcpipe.formats.logs.rosbag2 import METADATA, STORAGE_SUFFIXES, decompress_blocks, find_rosbag2_files, is_one_bag
 from tcpipe.formats.object_storage import StoredObject, is_url, lay_out_objects
-from tcpipe.logs.topics import Damage, Topic, condense_damage
+from tcpipe.logs.topics import Damage, Topic, find_damage, split_notes
 from tcpipe.progress import Meter
+from tcpipe.tables.findings import Finding
 
 _READ_BY_RANGE = (".mcap", ".bag")
 LOG_SUFFIXES = (".mcap", ".bag", ".bag.active", ".db3", ".mcap.zstd", ".db3.zstd")
@@ -136,24 +138,18 @@ class Log:
         """``mcap``, ``bag`` or ``rosbag2``."""
         self._files, self._parts, self._types, self._stack = opened.files, opened.parts, types, stack
         self._fetched = tuple(opened.fetched.values())
-        self._damage: dict[Damage, None] = dict.fromkeys(opened.damage)
+        self._damage = list(opened.damage)
         self.topics = self._merged_topics()
         """Every topic by name, as the index tells."""
         self._compare_counts(opened)
 
     def _compare_counts(self, opened: _OpenFiles) -> None:
-        """Note where metadata.yaml counts more messages than the files hold, in all or of a topic."""
+        """Note where metadata.yaml counts more messages than the files hold, in all or of topics."""
         held = {name: topic.message_count or 0 for name, topic in self.topics.items()}
-        short = {
-            name: (count, held.get(name, 0)) for name, count in opened.topic_counts.items() if held.get(name, 0) < count
-        }
-        found = sum(held.values())
-        every = opened.message_count if opened.message_count is not None else found
-        lost = max(every - found, sum(count - there for count, there in short.values()))
+        of_topics = sum(max(count - held.get(name, 0), 0) for name, count in opened.topic_counts.items())
+        lost = max((opened.message_count or 0) - sum(held.values()), of_topics)
         if lost > 0:
-            of = ", ".join(f"{name} {there} of {count}" for name, (count, there) in list(short.items())[:_LISTED])
-            what = f"metadata.yaml counts {every} messages, the files hold {found}{f': of {of}' if of else ''}"
-            self._damage[Damage(self.path.name, what, messages_lost=lost)] = None
+            self._damage.append(Damage("messages-miscounted", self.path.name, messages_lost=lost))
 
     def __enter__(self) -> Self:
         """Return the log, which is open already."""
@@ -170,18 +166,15 @@ class Log:
         self._stack.close()
 
     @property
-    def damage(self) -> list[Damage]:
-        """What was found broken so far; tables that are read later may find more."""
-        found = dict(self._damage)
-        for part in self._parts:
-            found.update(part.damage)
-        return condense_damage(list(found))
+    def findings(self) -> list[Finding]:
+        """Damage that was found so far, and, as notes, what costs nothing; tables that are read later may add some."""
+        unchecked = [Damage("no-checksum", part.name, messages_lost=0) for part in self._parts if part.is_unchecked]
+        return find_damage([*self._damage, *(damage for part in self._parts for damage in part.damage), *unchecked])
 
     @property
-    def remarks(self) -> list[str]:
-        """What is worth saying of what was read so far, and costs nothing: `damage` without loss, and what no checksum covers."""
-        harmless = [str(damage) for damage in self.damage if not damage.is_loss]
-        return [*harmless, *(f"{part.name}: unchecked: {part.unchecked}" for part in self._parts if part.unchecked)]
+    def damage(self) -> list[str]:
+        """The findings but for notes, a line each."""
+        return [describe_finding(finding) for finding in split_notes(self.findings)[0]]
 
     @property
     def size_bytes(self) -> int:
@@ -259,8 +252,7 @@ class Log:
         """Return one topic's messages; `LogError` where the topic is unknown or cannot be decoded."""
         tables = self.tables([topic])
         if topic not in tables:
-            reasons = [damage.what for damage in self.damage if damage.topic == topic]
-            raise LogError(f"{self.path}: topic {topic} cannot be read: {'; '.join(reasons)}")
+            raise LogError(f"{self.path}: topic {topic} cannot be read: {self._message_type(topic)}")
         return tables[topic]
 
     def tables(self, topics: Iterable[str], *, threads: int = 1) -> dict[str, pa.Table]:
@@ -269,7 +261,7 @@ class Log:
         Parameters
         ----------
         topics
-            Names of topics. One that cannot be decoded is missing from the result and listed in `damage`.
+            Names of topics. One that cannot be decoded is missing from the result and named in `findings`.
         threads
             How many threads read and decompress; the result does not depend on it.
 
@@ -292,13 +284,13 @@ class Log:
         """Yield the tables of several topics piece by piece, read in one pass, in memory that does not grow with the log.
 
         Each dict holds the next rows of some topics (those that hold most); the last one names every topic. Rows are in the order of
-        log time, also from piece to piece, as long as no message lies in the log further than half a piece behind its time; `damage`
-        counts those that do.
+        log time, also from piece to piece, as long as no message lies in the log further than half a piece behind its time;
+        `findings` counts those that do.
 
         Parameters
         ----------
         topics
-            Names of topics. One that cannot be decoded is missing and listed in `damage`.
+            Names of topics. One that cannot be decoded is missing and named in `findings`.
         batch_bytes
             How much is gathered over all topics before some is yielded; None yields everything at once.
         threads
@@ -340,10 +332,14 @@ class Log:
             raise LogError(
                 *(f"{self.path}: there is no topic {name}; it has {_format_list(self.topics)}" for name in unknown)
             )
-        types, columns = {}, 0
+        types, columns = dict[str, MessageType](), 0
         for name in wanted:
-            types[name] = of = self._message_type(name)
-            columns += of.wire.leaves if of is not None else 0
+            found = self._message_type(name)
+            if isinstance(found, DefinitionError):
+                self._note_undecoded(self.path.name, name, self.topics[name].message_count, str(found))
+                continue
+            types[name] = found
+            columns += found.wire.leaves
             if columns > MAX_COLUMNS:
                 raise LogError(
                     f"{self.path}: its topics unfold to more than {MAX_COLUMNS} columns; read fewer of them at once"
@@ -356,7 +352,6 @@ class Log:
                 in_pieces=in_pieces,
             )
             for name, of in types.items()
-            if of is not None
         }
 
     def _blocks(
@@ -369,8 +364,8 @@ class Log:
                 if self._agrees(channel):
                     channels[number] = collected[channel.topic]
                 else:
-                    what = f"the topic changes its type to {channel.type_name} ({channel.encoding}); these messages are left out"
-                    self._damage[Damage(part.name, what, channel.topic, channel.message_count)] = None
+                    reason = f"the topic changes its type to {channel.type_name} ({channel.encoding})"
+                    self._note_undecoded(part.name, channel.topic, channel.message_count, reason)
         if channels:
             for block in decompress_blocks(part, frozenset(channels), threads=threads):
                 later = replace(block, ordinal=block.ordinal + (index << 48)) if index else block
@@ -383,17 +378,14 @@ class Log:
         if channel.definition in ("", topic.definition):
             return True
         mine, theirs = self._message_type(topic.name), self._resolved(channel)
-        return isinstance(theirs, MessageType) and mine is not None and mine.wire == theirs.wire
+        return isinstance(theirs, MessageType) and isinstance(mine, MessageType) and mine.wire == theirs.wire
 
-    def _message_type(self, name: str) -> MessageType | None:
-        """Return a topic's type; None, and a line in `damage`, where it has none."""
-        channel = self._channel_of[name]
-        topic = self.topics[name]
-        found = DefinitionError(topic.problem) if topic.problem else self._resolved(channel)
-        if isinstance(found, MessageType):
-            return found
-        self._damage[Damage(self.path.name, str(found), name, topic.message_count)] = None
-        return None
+    def _message_type(self, name: str) -> MessageType | DefinitionError:
+        problem = self.topics[name].problem
+        return DefinitionError(problem) if problem else self._resolved(self._channel_of[name])
+
+    def _note_undecoded(self, file: str, topic: str, count: int | None, reason: str) -> None:
+        self._damage.append(Damage("messages-not-decoded", file, topic=topic, messages_lost=count, reason=reason))
 
     def _resolved(self, channel: Channel) -> MessageType | DefinitionError:
         try:
@@ -407,22 +399,15 @@ class Log:
             return error
 
     def _note_losses(self, name: str, topic_table: TopicTable, rows: int) -> None:
-        missing = (self.topics[name].message_count or 0) - rows - sum(topic_table.undecodable.values())
-        if missing > 0 and not self.damage:
-            what = f"the index counts {missing} messages more than the file holds"
-            self._damage[Damage(self.path.name, what, name, missing)] = None
-        if missing < 0 and not self.damage:
-            what = f"the file holds {-missing} messages more than its index counts; they may be another topic's"
-            self._damage[Damage(self.path.name, what, name)] = None
-        for reason, count in topic_table.undecodable.items():
-            what = f"messages do not fit their definition: {reason}"
-            self._damage[Damage(self.path.name, what, name, count)] = None
-        if topic_table.late:
-            what = f"{topic_table.late} messages lie in the log far behind their time; they are read where they lie"
-            self._damage[Damage(self.path.name, what, name, 0)] = None
-        if topic_table.replaced_texts:
-            what = f"{topic_table.replaced_texts} texts are not UTF-8; what is no character in them was replaced"
-            self._damage[Damage(self.path.name, what, name, 0)] = None
+        missing = (self.topics[name].message_count or 0) - rows - topic_table.undecodable
+        if missing and not self._damage and not any(part.damage for part in self._parts):
+            lost = missing if missing > 0 else None  # messages too many may be another topic's
+            self._damage.append(Damage("messages-miscounted", self.path.name, topic=name, messages_lost=lost))
+        if topic_table.undecodable:
+            self._note_undecoded(self.path.name, name, topic_table.undecodable, topic_table.undecodable_reason)
+        for cause, count in (("messages-unordered", topic_table.late), ("text-not-utf8", topic_table.replaced_texts)):
+            if count:
+                self._damage.append(Damage(cause, self.path.name, topic=name, messages_lost=0, places=count))
 
     def _merged_topics(self) -> dict[str, Topic]:
         """Merge the channels of all files by topic; where types differ, the one with most messages holds."""
@@ -485,7 +470,7 @@ def _open_directory(directory: Path, stack: ExitStack, fetched: Mapping[Path, Fe
             parts.append(open_part(file, f"{directory.name}/{file.name}", stack, fetched.get(file)))
         except LogError as error:
             errors.append(error)
-            damage.append(Damage(f"{directory.name}/{file.name}", f"a file of the bag is lost: {error}"))
+            damage.append(Damage("data-unreadable", f"{directory.name}/{file.name}", reason=str(error)))
     if not parts:
         raise LogError(*(problem for error in errors for problem in error.problems))
     counts = found.message_count, found.topic_counts

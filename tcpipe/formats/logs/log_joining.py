@@ -20,7 +20,8 @@ from tcpipe.errors import LogError
 from tcpipe.formats.logs.log_file import Log, open_log
 from tcpipe.formats.logs.rosbag2 import is_one_bag
 from tcpipe.formats.logs.table_folders import Mappings
-from tcpipe.logs.topics import Damage, Topic
+from tcpipe.logs.topics import Topic
+from tcpipe.tables.findings import Finding, Subject, make_finding
 
 if TYPE_CHECKING:
     from tcpipe.formats.logs.table_log import TableLog
@@ -40,17 +41,12 @@ class JoinedLog:
         self.topics = (_find_static_topics(earlier) if earlier else {}) | _merge_topics(logs)
 
     @property
-    def damage(self) -> list[Damage]:
-        """Damage of every file."""
-        return [damage for log in self._logs for damage in log.damage]
-
-    @property
-    def remarks(self) -> list[str]:
-        """What is worth saying of every file, and costs nothing."""
-        found = [remark for log in self._logs for remark in log.remarks]
+    def findings(self) -> list[Finding]:
+        """Damage and notes of every file."""
+        found = [finding for log in self._logs for finding in log.findings]
         if self._earlier:
-            where = f"goes on where {self._earlier.path.name} ends, whose static transforms are taken: it has none"
-            found.append(f"{self._logs[0].path.name}: {where}")
+            subject, names = Subject("file", self._logs[0].path.name), {"earlier": self._earlier.path.name}
+            found.append(make_finding("static-transforms-borrowed", subject, names=names))
         return found
 
     @property

@@ -43,7 +43,6 @@ _LZ4_HEAD = struct.Struct("<4sBBQ")
 """An LZ4 frame's first fields: magic, flags, block size, size of the content."""
 _LZ4_MAGIC, _LZ4_HAS_CONTENT_SIZE = b"\x04\x22\x4d\x18", 0x08
 _PEEK_BYTES = 1 << 13
-_LISTED = 5
 
 Int64Array = NDArray[np.int64]
 
@@ -52,7 +51,11 @@ _Result = TypeVar("_Result")
 
 
 class DamageError(Exception):
-    """A piece of a file cannot be used; the text says why, plainly."""
+    """A piece of a file cannot be used; arguments are as of `Damage`, the cause "" where nothing is damaged."""
+
+    def __init__(self, cause: str = "", reason: str = "") -> None:
+        super().__init__(cause, reason)
+        self.cause, self.reason = cause, reason
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,15 +132,16 @@ class LogPart(Protocol):
     """One file of a log, open for reading."""
 
     name: str
-    damage: dict[Damage, None]
+    damage: list[Damage]
+    """What was found damaged so far; the same place may be in it twice."""
 
     @property
     def channels(self) -> Mapping[int, Channel]:
         """Return every channel by its number."""
 
     @property
-    def unchecked(self) -> str:
-        """What of that which was read no checksum covers, in plain words; "" where there is nothing."""
+    def is_unchecked(self) -> bool:
+        """Return whether no checksum covers some of what was read."""
 
     @property
     def outline(self) -> str:
@@ -165,19 +169,19 @@ class ByteSource:
     def read(self, offset: int, size: int) -> memoryview:
         """Return ``size`` bytes at ``offset``; raise `DamageError` where the file ends before."""
         if size < 0 or offset + size > self.size:
-            raise DamageError(f"the file ends at byte {self.size}, inside a piece of {size} bytes")
+            raise DamageError("file-cut")
         data = self._some(offset, size)
         while len(data) < size:
             more = self._some(offset + len(data), size - len(data))
             if not more:
-                raise DamageError(f"the file became shorter while it was read (byte {offset + len(data)})")
+                raise DamageError("file-cut")
             data += more
         return memoryview(data)
 
     def read_once(self, offset: int, size: int) -> memoryview:
         """Return bytes as `read` does, valid only until this thread reads again: their memory, still in the cache, is used again."""
         if size < 0 or offset + size > self.size:
-            raise DamageError(f"the file ends at byte {self.size}, inside a piece of {size} bytes")
+            raise DamageError("file-cut")
         held = getattr(self._scratch, "held", b"")
         if len(held) < size:
             held = self._scratch.held = bytearray(size)
@@ -240,7 +244,7 @@ class ByteSource:
         try:
             return os.pread(self._file.fileno(), size, offset)
         except OSError as error:
-            raise _make_unreadable_error(offset, error) from None
+            raise DamageError("data-unreadable", str(error.strerror)) from None
 
     def _fill(self, view: memoryview, offset: int) -> bool:
         """Read the bytes at ``offset`` into a view; return whether there were enough."""
@@ -251,11 +255,7 @@ class ByteSource:
         try:
             return os.preadv(self._file.fileno(), [view], offset) == len(view)
         except OSError as error:
-            raise _make_unreadable_error(offset, error) from None
-
-
-def _make_unreadable_error(offset: int, error: OSError) -> DamageError:
-    return DamageError(f"the disk does not give what lies at byte {offset} ({error.strerror})")
+            raise DamageError("data-unreadable", str(error.strerror)) from None
 
 
 def map_in_order(work: Callable[[_Piece], _Result], pieces: Iterable[_Piece], *, threads: int) -> Iterator[_Result]:
@@ -280,14 +280,6 @@ def map_in_order(work: Callable[[_Piece], _Result], pieces: Iterable[_Piece], *,
 def outline_of(size: int, index: bytes | memoryview) -> str:
     """Return a hash (hex) of a file's size [byte] and its index, which holds where its chunks lie and when they were recorded."""
     return hashlib.sha256(size.to_bytes(8, "little") + bytes(index)).hexdigest()
-
-
-def format_numbered(what: str, numbers: Sequence[int]) -> str:
-    """Return a short list of numbered things: ``topic 3``, ``2 topics (3, 7)``."""
-    if len(numbers) == 1:
-        return f"{what} {numbers[0]}"
-    shown = ", ".join(map(str, numbers[:_LISTED]))
-    return f"{len(numbers)} {what}s ({shown}{', …' if len(numbers) > _LISTED else ''})"
 
 
 def describe_full_disk(error: Exception) -> str:
@@ -367,10 +359,8 @@ def decompress(codec: str, data: memoryview, size: int, *, checked: bool = False
     ------
     DamageError : the bytes do not decompress, or not to ``size``.
     """
-    if size > MAX_CHUNK_BYTES:
-        raise DamageError(f"it claims to hold {size} bytes, more than {MAX_CHUNK_BYTES}")
-    if is_bomb(len(data), size, whole=True):
-        raise DamageError(f"it claims to hold {size} bytes in {len(data)}")
+    if size > MAX_CHUNK_BYTES or is_bomb(len(data), size, whole=True):
+        raise DamageError("record-damaged")
     _refuse_unknown(codec)
     try:
         if codec == "zstd" or (codec == "lz4" and (checked or _read_lz4_content_size(data) == size)):
@@ -378,16 +368,16 @@ def decompress(codec: str, data: memoryview, size: int, *, checked: bool = False
         with pa.CompressedInputStream(pa.BufferReader(pa.py_buffer(data)), codec) as stream:
             found = stream.read_buffer(size)
             more = stream.read(1)  # also brings the reading to the end, where checksums are compared
-    except OSError as error:
-        raise DamageError(f"it does not decompress ({error})") from None
+    except OSError:
+        raise DamageError("chunk-damaged") from None
     if len(found) != size or more:
-        raise DamageError(f"it holds {'more' if more else f'{len(found)} bytes'}, not the {size} bytes it claims")
+        raise DamageError("chunk-damaged")
     return memoryview(found).cast("B")
 
 
 def _refuse_unknown(codec: str) -> None:
     if codec not in ("lz4", "zstd", "bz2"):
-        raise DamageError(f"its compression {codec!r} is unknown (lz4, zstd and bz2 are read)")
+        raise DamageError("chunk-damaged")
 
 
 def _read_lz4_content_size(frame: memoryview) -> int:

@@ -37,7 +37,6 @@ from tcpipe.formats.logs.log_part import (
     MessageBlock,
     decompress,
     decompress_prefix,
-    format_numbered,
     gather_integers,
     group_by_key,
 )
@@ -89,12 +88,11 @@ class McapPart:
 
     def __init__(self, path: Path, name: str, fetched: FetchedFile | None = None) -> None:
         self.name = name
-        self.damage: dict[Damage, None] = {}
+        self.damage: list[Damage] = []
         self._bytes = ByteSource(path, fetched)
         self._tallies: dict[int, _Tally] = {}
         self._untimed = 0
         self._complete = False
-        self._read_chunks: set[int] = set()
         self._without_crc: set[int] = set()
         self._bounds = Bounds(path, self._bytes.size)
         try:
@@ -110,14 +108,14 @@ class McapPart:
         """Read the summary, or, where it cannot be used, walk the file."""
         try:
             if self._bytes.peek(0, len(MAGIC)) != MAGIC:
-                self._note(0, "the file's first bytes are not those of an MCAP file", messages_lost=0)
+                self._note("record-damaged", 0, messages_lost=0)
             self._contents = read_summary(self._bytes)
             if not self._contents.chunks:
                 self._bytes.whole()
             self._bounds.claim(chunk.size for chunk in self._contents.chunks)
         except DamageError as error:
-            if str(error):
-                self._note(self._bytes.size, f"{error}; it is read record by record")
+            if error.cause:
+                self._note(error.cause, self._bytes.size, reason=error.reason)
             self._bytes.whole()
             self._contents = Contents()
             if not self._walk(self._contents, len(MAGIC), self._bytes.size):
@@ -136,11 +134,9 @@ class McapPart:
         return self._contents.outline
 
     @property
-    def unchecked(self) -> str:
-        """What was read that no checksum covers."""
-        if not self._without_crc:
-            return ""
-        return f"{len(self._without_crc)} of {len(self._read_chunks)} chunks read carry no CRC"
+    def is_unchecked(self) -> bool:
+        """Whether chunks were read that carry no CRC."""
+        return bool(self._without_crc)
 
     def blocks(self, wanted: frozenset[int], *, threads: int = 1) -> Iterator[MessageBlock]:
         """Yield the messages of the wanted channels, chunk by chunk, or some chunks at once where little of them is wanted."""
@@ -180,16 +176,15 @@ class McapPart:
         records, end = self._records(chunk, data)
         messages, _ = read_messages_at(data, find_message_offsets(data, records))
         every = int((np.frombuffer(data, np.uint8)[records] == OP_MESSAGE).sum()) if len(records) else 0
-        where = f"{self.name}, byte {chunk.offset}"
         if lost := every - len(messages.offset):
-            noted.append(Damage(where, "messages without times", messages_lost=lost))
+            noted.append(Damage("time-invalid", self.name, chunk.offset, messages_lost=lost))
         if end < len(data) and not chunk.cut:
-            noted.append(Damage(where, "the records of a chunk end before it does", bytes_lost=len(data) - end))
+            noted.append(Damage("record-damaged", self.name, chunk.offset, bytes_lost=len(data) - end))
         unknown = [n for n in np.unique(messages.channel).tolist() if n not in self._contents.channels]
         counted = chunk.headless or (chunk.index is None and not self._contents.statistics)  # when the file was opened
         if unknown and not counted:
-            what = f"messages of {format_numbered('channel', unknown)}, which nothing declares"
-            noted.append(Damage(where, what, messages_lost=int(np.isin(messages.channel, unknown).sum())))
+            lost = int(np.isin(messages.channel, unknown).sum())
+            noted.append(Damage("channel-undeclared", self.name, chunk.offset, messages_lost=lost))
         return messages.at(np.isin(messages.channel, sorted(wanted)))
 
     def is_proved(self, chunk: Chunk) -> bool:
@@ -205,7 +200,7 @@ class McapPart:
         if chunk.compression or self._crc(chunk):
             copy_pieces(self.load(chunk, once=True), places, to)
             return
-        self._note_read(chunk, checked=False)
+        self._without_crc.add(chunk.offset)
         self._bytes.read_pieces([(chunk.data_offset + start, to[at : at + stop - start]) for start, stop, at in places])
 
     def _crc(self, chunk: Chunk) -> int:
@@ -223,7 +218,7 @@ class McapPart:
             twin = heads.setdefault((chunk.start_ns, chunk.end_ns, chunk.uncompressed_bytes), chunk)
             with suppress(DamageError):
                 if twin is not chunk and self._crc(chunk) and self._crc(chunk) == self._crc(twin):
-                    self._note(chunk.offset, f"a chunk holds the same as the one at byte {twin.offset}")
+                    self._note("chunk-suspect", chunk.offset)
 
     def _note_odd_ones_without_crc(self) -> None:
         """Note the chunks that were read without a CRC where others of the file have one: it may have been overwritten."""
@@ -231,16 +226,11 @@ class McapPart:
         others = [chunk for chunk in self._contents.chunks if chunk.offset not in self._without_crc] if odd else []
         if any(self._any_crc(others[first : first + _AT_ONCE]) for first in range(0, len(others), _AT_ONCE)):
             for chunk in odd:
-                self._note(chunk.offset, "a chunk has no CRC, others of the file have one; it is read unchecked")
+                self._note("chunk-suspect", chunk.offset)
 
     def _any_crc(self, chunks: Sequence[Chunk]) -> bool:
         self._bytes.expect([(chunk.offset, RECORD_HEAD + CHUNK_HEAD) for chunk in chunks])
         return any(self._crc(chunk) for chunk in chunks)
-
-    def _note_read(self, chunk: Chunk, *, checked: bool) -> None:
-        self._read_chunks.add(chunk.offset)
-        if not checked:
-            self._without_crc.add(chunk.offset)
 
     def load(self, chunk: Chunk, *, once: bool = False) -> memoryview:
         """Return the chunk's records, its CRC checked; of a chunk that the file's end cuts, what can still be had.
@@ -248,7 +238,8 @@ class McapPart:
         With ``once`` they may be overwritten when this thread reads again.
         """
         crc = self._crc(chunk)
-        self._note_read(chunk, checked=bool(crc))
+        if not crc:
+            self._without_crc.add(chunk.offset)
         if chunk.cut:
             return self._load_cut(chunk, self._bytes.read(chunk.data_offset, chunk.data_bytes))
         if chunk.compression:
@@ -257,15 +248,12 @@ class McapPart:
         else:
             data = (self._bytes.read_once if once else self._bytes.read)(chunk.data_offset, chunk.data_bytes)
         if crc and crc32(data) != crc:
-            raise DamageError("its CRC does not match")
+            raise DamageError("chunk-damaged")
         return data
 
     def _load_cut(self, chunk: Chunk, data: memoryview) -> memoryview:
         kept = decompress_prefix(chunk.compression, data, chunk.uncompressed_bytes) if chunk.compression else data
-        lost = chunk.uncompressed_bytes - len(kept)
-        self._note(
-            chunk.offset, f"the file ends inside a chunk; {len(kept)} bytes of it are read, unchecked", bytes_lost=lost
-        )
+        self._note("file-cut", chunk.offset, bytes_lost=chunk.uncompressed_bytes - len(kept))
         return kept
 
     def entries(self, chunks: list[Chunk], sizes: Int64Array) -> tuple[Entries, NDArray[np.bool_]]:
@@ -316,7 +304,7 @@ class McapPart:
     def _index_record(self, offset: int) -> memoryview:
         length = int.from_bytes(self._bytes.peek(offset, RECORD_HEAD)[1:], "little")
         if offset + RECORD_HEAD + length > self._bytes.size:
-            raise DamageError("a message index runs past the file's end")
+            raise DamageError("chunk-index-damaged")
         return self._bytes.read(offset, RECORD_HEAD + length)
 
     def _fill_gaps(self) -> None:
@@ -340,7 +328,7 @@ class McapPart:
         for start in range(0, end, _LOOSE_BYTES):
             found = crc32(self._bytes.read_once(start, min(_LOOSE_BYTES, end - start)), found)
         if found != crc:
-            self._note(end, "the CRC of the data does not match; messages outside chunks may be wrong or missing")
+            self._note("chunk-damaged", end)
 
     def _walk(self, contents: Contents, start: int, end: int) -> bool:
         """Step from record to record; after one that cannot be, search for the next chunk. Return whether the data's end was met."""
@@ -379,7 +367,7 @@ class McapPart:
     def _stepped_over(self, contents: Contents, position: int, end: int, error: DamageError) -> int:
         """Note what cannot be at ``position``; return where the next chunk begins."""
         after = self._next_chunk(position + 1, end)
-        self._note(position, str(error), bytes_lost=after - position)
+        self._note(error.cause, position, bytes_lost=after - position, reason=error.reason)
         self._distrust_last_index(contents)
         return after
 
@@ -390,9 +378,9 @@ class McapPart:
         elif opcode == OP_MESSAGE and after <= end:
             self._untimed += 1
         elif not 1 <= opcode <= OP_LAST:
-            raise DamageError(f"no record begins with opcode {opcode}")
+            raise DamageError("record-damaged")
         elif after > end:
-            raise DamageError(f"a record (opcode {opcode}) of {after - position} bytes runs past the end")
+            raise DamageError("file-cut")
         elif opcode in (OP_SCHEMA, OP_CHANNEL):
             contents.note(opcode, self._bytes.read(position + RECORD_HEAD, after - position - RECORD_HEAD))
         elif opcode == OP_MESSAGE_INDEX and contents.chunks and not contents.chunks[-1].headless:
@@ -400,19 +388,18 @@ class McapPart:
 
     def _walked_chunk(self, position: int, after: int) -> Chunk:
         chunk = parse_chunk_head(self._bytes.peek(position + RECORD_HEAD, CHUNK_HEAD + 4), position)
-        if chunk.compression not in ("", "lz4", "zstd") or chunk.end != after:
-            raise DamageError("the head of a chunk contradicts itself")
-        if chunk.uncompressed_bytes > MAX_CHUNK_BYTES:
-            raise DamageError(f"a chunk claims to hold {chunk.uncompressed_bytes} bytes")
+        is_whole = chunk.end == after and chunk.uncompressed_bytes <= MAX_CHUNK_BYTES
+        if not is_whole or chunk.compression not in ("", "lz4", "zstd"):
+            raise DamageError("record-damaged")
         if after > self._bytes.size:
             if self._next_chunk(position + 1, self._bytes.size) < self._bytes.size:
-                raise DamageError("the head of a chunk contradicts what follows")
+                raise DamageError("record-damaged")
             return replace(chunk, data_bytes=self._bytes.size - chunk.data_offset, cut=True)
         return chunk
 
     def _take_message_index(self, contents: Contents, position: int, after: int) -> None:
         if after - position < RECORD_HEAD + 6:
-            raise DamageError("a message index contradicts itself")
+            raise DamageError("chunk-index-damaged")
         channel = int.from_bytes(self._bytes.peek(position + RECORD_HEAD, 2), "little")
         self._index_entries(position, channel)
         chunk = contents.chunks[-1]
@@ -454,7 +441,7 @@ class McapPart:
                 try:
                     entries = self._index_entries(offset, channel)
                 except DamageError as error:
-                    self._note(offset, str(error))
+                    self._note(error.cause, offset, reason=error.reason)
                     continue
                 if len(entries):
                     self._tally(channel, len(entries), int(entries[:, 0].min()), int(entries[:, 0].max()))
@@ -463,18 +450,15 @@ class McapPart:
     def _note_odd_messages(self) -> None:
         """Note messages outside chunks, or in an index, that are of no channel or have no times."""
         if self._untimed:
-            self._note(0, "messages without times", messages_lost=self._untimed)
-        if unknown := sorted(self._tallies.keys() - self._contents.channels.keys()):
-            lost = sum(self._tallies[channel].count for channel in unknown)
-            self._note(
-                0, f"messages of {format_numbered('channel', unknown)}, which nothing declares", messages_lost=lost
-            )
+            self._note("time-invalid", 0, messages_lost=self._untimed)
+        if unknown := self._tallies.keys() - self._contents.channels.keys():
+            self._note("channel-undeclared", 0, messages_lost=sum(self._tallies[channel].count for channel in unknown))
 
     def _declare_and_count(self, chunk: Chunk) -> None:
         try:
             data = self.load(chunk)
         except DamageError as error:
-            self.damage[self.lost(chunk, str(error))] = None
+            self.damage.append(self.lost(chunk, error))
             return
         records, _ = self._records(chunk, data)
         self._declare(chunk, data, records)
@@ -488,7 +472,7 @@ class McapPart:
                 try:
                     self._contents.note(data[offset], data[offset + RECORD_HEAD : offset + RECORD_HEAD + length])
                 except DamageError as error:
-                    self._note(chunk.offset, f"a schema or channel in this chunk is broken: {error}")
+                    self._note(error.cause, chunk.offset)
 
     def _channel(self, number: int) -> Channel:
         channel = self._contents.channels[number]
@@ -541,23 +525,28 @@ class McapPart:
             stamps = gather_integers(data, messages[of] + RECORD_HEAD + 6, "i8")
             self._tally(channel, len(stamps), int(stamps.min()), int(stamps.max()))
 
-    def _note(self, offset: int, what: str, *, messages_lost: int | None = None, bytes_lost: int | None = None) -> None:
-        where = f"{self.name}, byte {offset}"
-        self.damage[Damage(where, what, messages_lost=messages_lost, bytes_lost=bytes_lost)] = None
+    def _note(
+        self,
+        cause: str,
+        offset: int,
+        *,
+        messages_lost: int | None = None,
+        bytes_lost: int | None = None,
+        reason: str = "",
+    ) -> None:
+        self.damage.append(
+            Damage(cause, self.name, offset, messages_lost=messages_lost, bytes_lost=bytes_lost, reason=reason)
+        )
 
-    def lost(self, chunk: Chunk, why: str) -> Damage:
-        """Return what to say of a chunk that is lost as a whole, counted by the message index beside it."""
+    def lost(self, chunk: Chunk, error: DamageError) -> Damage:
+        """Return the damage of a chunk that is lost as a whole, counted by the message index beside it."""
         try:
             lost = sum(len(self._index_entries(at, channel)) for channel, at in (chunk.index or {}).items())
         except DamageError:
             lost = 0
+        size = chunk.uncompressed_bytes
         return Damage(
-            f"{self.name}, byte {chunk.offset}",
-            f"a chunk is lost: {why}",
-            messages_lost=lost or None,
-            bytes_lost=chunk.uncompressed_bytes,
-            start_ns=chunk.start_ns,
-            end_ns=chunk.end_ns,
+            error.cause, self.name, chunk.offset, messages_lost=lost or None, bytes_lost=size, reason=error.reason
         )
 
 

@@ -118,7 +118,7 @@ class FieldReader:
         try:
             values = struct.unpack_from("<" + form, self._content, self._position)
         except struct.error:
-            raise DamageError("a record ends before its fields do") from None
+            raise DamageError("record-damaged") from None
         self._position += struct.calcsize("<" + form)
         return values
 
@@ -126,7 +126,7 @@ class FieldReader:
         """Return a length-prefixed run of bytes."""
         (size,) = self.take("I")
         if self._position + size > len(self._content):
-            raise DamageError("a text runs past its record")
+            raise DamageError("record-damaged")
         self._position += size
         return bytes(self._content[self._position - size : self._position])
 
@@ -134,7 +134,7 @@ class FieldReader:
         """Return a map of ``size`` bytes from channel to number."""
         whole = size - size % 10
         if self._position + whole > len(self._content):
-            raise DamageError("a record ends before its fields do")
+            raise DamageError("record-damaged")
         found = self._content[self._position : self._position + whole]
         self._position += whole
         return dict(_CHANNEL_OFFSET.iter_unpack(found))
@@ -179,10 +179,10 @@ def parse_chunk_index(content: bytes | memoryview) -> Chunk:
         compression = bytes(content[at - name_bytes : at]).decode(errors="backslashreplace")
         size, uncompressed = _CHUNK_INDEX_TAIL.unpack_from(content, at)
     except struct.error:
-        raise DamageError("a record ends before its fields do") from None
+        raise DamageError("record-damaged") from None
     data_offset = offset + RECORD_HEAD + CHUNK_HEAD + name_bytes
     if data_offset + size != offset + length:
-        raise DamageError("a chunk index contradicts itself")
+        raise DamageError("index-damaged")
     return Chunk(offset, data_offset, size, compression, uncompressed, start_ns, end_ns, index or None, index_bytes)
 
 
@@ -196,12 +196,10 @@ def parse_statistics(content: bytes | memoryview) -> Statistics:
 def index_entries(record: bytes | memoryview, channel: int) -> Int64Array:
     """Return a channel's message index as (log time, offset), shape (N, 2)."""
     if len(record) < _INDEX_HEAD.size:
-        raise DamageError("a message index is not where it should be")
+        raise DamageError("chunk-index-damaged")
     opcode, _, named, size = _INDEX_HEAD.unpack_from(record)
-    if opcode != OP_MESSAGE_INDEX or len(record) < _INDEX_HEAD.size + size:
-        raise DamageError("a message index is not where it should be")
-    if size % 16 or named != channel:
-        raise DamageError("a message index contradicts itself")
+    if opcode != OP_MESSAGE_INDEX or len(record) < _INDEX_HEAD.size + size or size % 16 or named != channel:
+        raise DamageError("chunk-index-damaged")
     return np.frombuffer(record, "<i8", size // 8, RECORD_HEAD + 6).reshape(-1, 2)
 
 
@@ -308,23 +306,22 @@ class Contents:
 
 
 def read_summary(source: ByteSource) -> Contents:
-    """Read the summary section; `DamageError` (without text where there simply is none) when it cannot be used."""
+    """Read the summary section; `DamageError` (without a cause where the writer made none) when it cannot be used."""
     tail_bytes = RECORD_HEAD + FOOTER + len(MAGIC)
     source.expect([(0, len(MAGIC)), (max(source.size - _SUMMARY_BYTES, 0), _SUMMARY_BYTES)])
     tail = bytes(source.read(max(source.size - tail_bytes, 0), min(tail_bytes, source.size)))
     if not tail.endswith(MAGIC) or tail[0] != OP_FOOTER or int.from_bytes(tail[1:9], "little") != FOOTER:
-        raise DamageError("the file is not closed (no footer)")
+        raise DamageError("index-missing")
     start, crc = int.from_bytes(tail[9:17], "little"), int.from_bytes(tail[25:29], "little")
     if not start:
         raise DamageError
     end = source.size - tail_bytes
-    if not len(MAGIC) <= start <= end:
-        raise DamageError("the footer points outside the file")
-    if source.peek(start - _DATA_END, RECORD_HEAD) != bytes([OP_DATA_END, _DATA_END - RECORD_HEAD, *bytes(7)]):
-        raise DamageError("the footer does not point behind the data")
+    data_end = bytes([OP_DATA_END, _DATA_END - RECORD_HEAD, *bytes(7)])
+    if not len(MAGIC) <= start <= end or source.peek(start - _DATA_END, RECORD_HEAD) != data_end:
+        raise DamageError("index-damaged")
     section = source.read(start, end - start + RECORD_HEAD + 16)
     if crc and crc32(section) != crc:
-        raise DamageError("the summary's CRC does not match")
+        raise DamageError("index-damaged")
     contents = _parsed(section[: end - start])
     _check(contents, source.size)
     if contents.chunks:
@@ -333,28 +330,29 @@ def read_summary(source: ByteSource) -> Contents:
 
 
 def _check(contents: Contents, file_bytes: int) -> None:
-    """Raise `DamageError` when the summary does not name what a reader needs."""
+    """Raise `DamageError` when the summary does not name what a reader needs, with a cause where it contradicts the file."""
     indexed = {channel for chunk in contents.chunks for channel in chunk.index or ()}
     counted = contents.statistics.messages_by_channel if contents.statistics else {}
-    if not (indexed | counted.keys()) <= contents.channels.keys() or not contents.channels:
+    if (
+        not contents.channels
+        or not (indexed | counted.keys()) <= contents.channels.keys()
+        or any(channel.schema and channel.schema not in contents.schemas for channel in contents.channels.values())
+        or contents.statistics is None
+        or contents.statistics.chunks != len(contents.chunks)
+        or contents.statistics.messages != sum(counted.values())  # a writer need not count them by channel
+    ):
         raise DamageError
-    if any(channel.schema and channel.schema not in contents.schemas for channel in contents.channels.values()):
-        raise DamageError
-    if contents.statistics is None or contents.statistics.chunks != len(contents.chunks):
-        raise DamageError
-    if contents.statistics.messages != sum(counted.values()):  # a writer need not count them by channel
-        raise DamageError
-    if any(chunk.end > file_bytes or chunk.offset < len(MAGIC) for chunk in contents.chunks):
-        raise DamageError("the summary points outside the file")
-    if any(later.offset < chunk.end for chunk, later in itertools.pairwise(contents.chunks)):
-        raise DamageError("the summary names a chunk twice")
+    if any(chunk.end > file_bytes or chunk.offset < len(MAGIC) for chunk in contents.chunks) or any(
+        later.offset < chunk.end for chunk, later in itertools.pairwise(contents.chunks)
+    ):
+        raise DamageError("index-damaged")
 
 
 def _parsed(section: memoryview) -> Contents:
     contents = Contents()
     records, end = record_offsets(section, len(section))
     if end < len(section):
-        raise DamageError("the summary contradicts itself")
+        raise DamageError("index-damaged")
     for offset in records.tolist():
         length = int.from_bytes(section[offset + 1 : offset + RECORD_HEAD], "little")
         content = section[offset + RECORD_HEAD : offset + RECORD_HEAD + length]

@@ -76,8 +76,7 @@ def _find_files_by_name(directory: Path, present: tuple[Path, ...]) -> Rosbag2Fi
             f"{directory}: not a ROS 2 bag: {METADATA} {what}, and its files are not named as parts of one ({names}); "
             "give one of them"
         )
-    why = f"{METADATA} {what}; files are read in the order of their names"
-    return Rosbag2Files(present, (Damage(directory.name, why, messages_lost=0),))
+    return Rosbag2Files(present, (Damage("file-unlisted", directory.name, messages_lost=0),))
 
 
 def _find_files_by_metadata(directory: Path, present: tuple[Path, ...], information: Mapping[str, Any]) -> Rosbag2Files:
@@ -92,17 +91,15 @@ def _find_files_by_metadata(directory: Path, present: tuple[Path, ...], informat
     extra = [p for p in present if p not in taken and p.with_name(p.name.removesuffix(".zstd")) not in taken]
     paths += extra
     count = information.get("message_count")
-    lost: list[tuple[str, str, int | None]]
-    if missing and len(missing) == len(extra) and _is_count(count):  # renamed: the count tells whether anything is lost
-        lost = [(path.name, f"{METADATA} calls this file {name}", 0) for path, name in zip(extra, missing, strict=True)]
-    else:
-        lost = [(name, f"{METADATA} names this file, but it is not there", None) for name in missing]
-        lost += [(path.name, f"{METADATA} does not name this file; it is read all the same", 0) for path in extra]
-    damage = tuple(Damage(f"{directory.name}/{name}", what, messages_lost=cost) for name, what, cost in lost)
+    damage = [Damage("file-unlisted", f"{directory.name}/{path.name}", messages_lost=0) for path in extra]
+    if len(missing) != len(extra) or not _is_count(count):  # else renamed: the count tells whether anything is lost
+        damage += [Damage("file-missing", f"{directory.name}/{name}") for name in missing]
     if not paths:
         names = ", ".join(listed[:_LISTED]) + (", …" if len(listed) > _LISTED else "")
         raise LogError(f"{directory}: not a ROS 2 bag: no file that {METADATA} names is there ({names or 'none'})")
-    return Rosbag2Files(tuple(paths), damage, count if _is_count(count) else None, _read_topic_counts(information))
+    return Rosbag2Files(
+        tuple(paths), tuple(damage), count if _is_count(count) else None, _read_topic_counts(information)
+    )
 
 
 def _is_file(path: Path) -> bool:
@@ -191,7 +188,7 @@ def _decompress_block(block: MessageBlock, part: LogPart) -> MessageBlock:
     lost = len(block.offsets) - len(kept)
     if lost:
         topic = part.channels[block.channel].topic
-        part.damage[Damage(part.name, "messages do not decompress", topic=topic, messages_lost=lost)] = None
+        part.damage.append(Damage("chunk-damaged", part.name, topic=topic, messages_lost=lost))
     lengths = np.fromiter(map(len, payloads), np.int64, len(payloads))
     rows = np.array(kept, np.int64)
     return MessageBlock(

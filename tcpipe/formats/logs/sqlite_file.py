@@ -25,7 +25,6 @@ from tcpipe.formats.logs.log_part import (
     Channel,
     MessageBlock,
     describe_full_disk,
-    format_numbered,
     group_by_key,
 )
 from tcpipe.logs.topics import Damage, normalize_type_name
@@ -52,9 +51,9 @@ class SqlitePart:
 
     def __init__(self, path: Path, name: str) -> None:
         self.name = name
-        self.damage: dict[Damage, None] = {}
+        self.damage: list[Damage] = []
         self.outline = ""
-        self.unchecked = "a .db3 carries no checksum"
+        self.is_unchecked = True
         self._opened = ExitStack()
         self._is_cut = False
         try:
@@ -116,7 +115,7 @@ class SqlitePart:
         has_journal = size >= wanted and journal.exists() and journal.stat().st_size > 0
         if size < wanted:
             self._is_cut = True
-            self._note(f"the file ends at byte {size} of {wanted}", bytes_lost=wanted - size)
+            self.damage.append(Damage("file-cut", self.name, size, bytes_lost=wanted - size))
         if has_journal or (self._is_cut and size % page_bytes):
             copy = self._opened.enter_context(make_scratch_directory()) / path.name
             shutil.copyfile(path, copy)
@@ -149,7 +148,7 @@ class SqlitePart:
         channels = {}
         for number, topic, type_name, encoding in rows:
             if not isinstance(number, int):
-                self._note(f"topic {topic} has no number")
+                self.damage.append(Damage("record-damaged", self.name))
                 continue
             channels[number] = Channel(
                 str(topic),
@@ -158,9 +157,9 @@ class SqlitePart:
                 *definitions.get(type_name, ("", "")),
                 *spans.get(number, (0, None, None)),
             )
-        if unknown := sorted(spans.keys() - channels.keys()):
+        if unknown := spans.keys() - channels.keys():
             lost = sum(spans[number][0] for number in unknown)
-            self._note(f"messages of {format_numbered('topic', unknown)}, which nothing declares", messages_lost=lost)
+            self.damage.append(Damage("channel-undeclared", self.name, messages_lost=lost))
         return channels
 
     def _definitions(self) -> dict[str, tuple[str, str]]:
@@ -194,8 +193,7 @@ class SqlitePart:
                     count, first, last = spans.get(topic, (0, stamp, stamp))
                     spans[topic] = count + 1, min(first, stamp), max(last, stamp)
         if lost:
-            what = "rows that are no messages: a number, a time or the data is missing or of another kind"
-            self._note(what, messages_lost=lost)
+            self.damage.append(Damage("record-damaged", self.name, messages_lost=lost))
         return spans
 
     def _message_columns(self) -> tuple[str, str]:
@@ -225,10 +223,9 @@ class SqlitePart:
                     broken = _describe_error(error)
             if not broken:
                 return
-            start = "the beginning" if row is None else f"message {low}"
+            reason = broken if row is None else f"after message {low}: {broken}"
+            self.damage.append(Damage("database-damaged", self.name, reason=reason))
             row = self._first_behind(query, max(int(low), 0))
-            end = "the end" if row is None else f"message {row[0]}"
-            self._note(f"messages between {start} and {end} cannot be read ({broken})")
             if row is None:
                 return
             if row[0] > low:
@@ -268,10 +265,7 @@ class SqlitePart:
         except _BROKEN as error:
             found = _describe_error(error)
         if found != "ok" and " value in " not in found:  # a value that is none is the row's own trouble, and counted
-            self._note(f"its pages contradict one another ({found.splitlines()[-1]}); rows may be missing or wrong")
-
-    def _note(self, what: str, *, messages_lost: int | None = None, bytes_lost: int | None = None) -> None:
-        self.damage[Damage(self.name, what, messages_lost=messages_lost, bytes_lost=bytes_lost)] = None
+            self.damage.append(Damage("database-damaged", self.name, reason=found.splitlines()[-1]))
 
 
 def _describe_error(error: Exception) -> str:

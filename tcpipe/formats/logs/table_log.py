@@ -27,7 +27,7 @@ from tcpipe.logs.field_mapping import (
     parse_stamps_ns,
     utc_from_gps_ns,
 )
-from tcpipe.logs.topics import Damage, Topic
+from tcpipe.logs.topics import Damage, Topic, find_damage
 from tcpipe.power.sources import FLOAT_TYPES
 from tcpipe.recipe import TableMapping
 from tcpipe.tables.arrays import number_column
@@ -39,12 +39,11 @@ _HASH_BYTES = 1 << 20
 
 @dataclass(frozen=True, slots=True)
 class _Read:
-    """A table that was read: its topic, messages, what is broken in it and what is to be said of it."""
+    """A table that was read: its topic, messages, and what is damaged in it."""
 
     topic: Topic
     messages: pa.Table
-    damage: tuple[Damage, ...]
-    remarks: tuple[str, ...]
+    damage: list[Damage]
 
 
 class TableLog:
@@ -69,8 +68,7 @@ class TableLog:
         self._tables = {found.topic.name: found.messages for found in read}
         self.topics = {found.topic.name: found.topic for found in read}
         """Every mapped table by its topic's name."""
-        self.damage = [damage for found in read for damage in found.damage]
-        self.remarks = [remark for found in read for remark in found.remarks]
+        self.findings = find_damage(damage for found in read for damage in found.damage)
         self._files = list_table_files(path)
 
     def __enter__(self) -> Self:
@@ -173,15 +171,16 @@ def _read_messages(
     """Return a table as the messages of its topic and type, in order of time, and what of it is lost."""
     topic, kind = read_as
     lost = int(np.count_nonzero(~cells.stamp_known))
-    damage = [Damage(mapping.file, "rows have no stamp that can be read", topic, lost)] if lost else []
+    damage = [Damage("time-invalid", mapping.file, messages_lost=lost)] if lost else []
     damage += [
-        Damage(mapping.file, f"column {column} holds text, first {text!r} in row {row}", topic, count)
+        Damage("table-cells", mapping.file, messages_lost=count, reason=f"column {column}, row {row}: {text!r}")
         for column, (count, row, text) in cells.texts.items()
     ]
+    damage += [Damage("table-cells", mapping.file, messages_lost=0, reason=remark) for remark in cells.remarks]
     values = {field: cells.columns[column] for field, column in mapping.columns.items()}
     order = slice(None) if not lost else np.flatnonzero(cells.stamp_known)
-    backward = int(np.count_nonzero(np.diff(stamp_ns) < 0))
-    if backward:
+    if backward := int(np.count_nonzero(np.diff(stamp_ns) < 0)):
+        damage.append(Damage("messages-unordered", mapping.file, messages_lost=0, places=backward))
         by_time = np.argsort(stamp_ns, kind="stable")
         order, stamp_ns = np.flatnonzero(cells.stamp_known)[by_time], stamp_ns[by_time]
     values = convert_units(role, {field: value[order] for field, value in values.items()}, mapping.units)
@@ -199,11 +198,7 @@ def _read_messages(
         }
     )
     span = (int(stamp_ns[0]), int(stamp_ns[-1]))
-    remarks = (
-        (f"{mapping.file}: {backward} stamps lie before the one above; its rows are put in order",) if backward else ()
-    )
-    found = Topic(topic, kind, stamp_ns.size, *span, "table", "")
-    return _Read(found, table, tuple(damage), (*cells.remarks, *remarks))
+    return _Read(Topic(topic, kind, stamp_ns.size, *span, "table", ""), table, damage)
 
 
 def _to_arrow(values: NDArray[np.float64]) -> pa.Array:

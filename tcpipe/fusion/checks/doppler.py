@@ -28,12 +28,15 @@ from tcpipe.fusion.measurements import DOPPLER, GNSS, GroundVelocities, Measurem
 from tcpipe.fusion.signals import compute_median_period_ns, compute_seconds, integrate_signal, is_in_gap
 
 _WINDOWS_S = (4.0, 8.0, 16.0, 32.0, 64.0)
-_FEWEST_WINDOWS = 3
-_CLEARLY = 4.0
-_MOVES_M = 1.0
-_OFF = 0.25
-_STANDS = 0.1
-_LATE_S, _SURE, _MAX_STD_S, _MIN_EXPLAINED = 0.05, 4.0, 0.03, 0.5
+_FEWEST_WINDOWS = 3  # windows in which fixes show motion
+_CLEARLY = 4.0  # σ of fixes that a distance needs
+_MOVES_M = 1.0  # shorter distances do not count; windows 4 to 64 s
+_OFF = 0.25  # allowed share of disagreement in the right frame
+_STANDS = 0.1  # a velocity with less distance is frozen
+_LATE_S = 0.05  # smallest reported offset: 2 cm/s at 0.5 rad/s
+_SURE = 4.0  # σ
+_MAX_STD_S = 0.03  # of a reported offset
+_MIN_EXPLAINED = 0.5  # variance shared by two speeds
 _MAX_GAP_NS = 1_000_000_000
 
 
@@ -122,7 +125,7 @@ def _refuse_late(code: str, reference: str, lag: Lag, *, late_s: float | None = 
     return SensorExclusion(DOPPLER, code, {"reference": reference}, numbers, late_s=late_s)
 
 
-_SMOOTH_S = 0.3
+_SMOOTH_S = 0.3  # averaging of speeds
 
 
 def _is_known(lag: Lag) -> bool:

@@ -37,23 +37,23 @@ ARM_STD_M = 0.5
 LATE_STD_S = 0.1
 """What is known beforehand of the lag of its stamps."""
 
-_SURELY_LATE, _LATE_S = 4.0, 0.06
-_GRAVITY_MPS2 = 9.80665
-_WINDOW_S = 40.0
-_FEWEST = 20
+_SURELY_LATE, _LATE_S = 4.0, 0.06  # σ of a reported time offset; a shorter one costs less than a fix's σ
+_GRAVITY_MPS2 = 9.80665  # as `state_kernel.GRAVITY_MPS2`
+_WINDOW_S = 40.0  # odometry drifts little, a robot turns
+_FEWEST = 20  # fixes for nine unknowns
 _FEWEST_WINDOWS = 3
 """Errors of the fixes last: how far windows disagree is not told by fewer."""
-_WILD = 5.0
-_LEAST_TURN_RAD = 1.0
-_TURNS_RADPS = 0.1
+_WILD = 5.0  # medians off: left to the gate
+_LEAST_TURN_RAD = 1.0  # with less turning the arm is constant
+_TURNS_RADPS = 0.1  # slower turns are noise
 _TURNING_POINT_STD_M = {WHEELS: 0.03, VISUAL: 0.01}
-_MOVES_MPS = 0.3
-_BLOCK_S = 10.0
-_HELD_S = 30.0
-_CLIMB_S = 4.0
-_LEAST_TILT_STD_RAD = 0.004
-_STATED_TILT_STD_RAD = 0.0175
-_LEAST_WAY_M = 1e-3
+_MOVES_MPS = 0.3  # slower travel has no direction
+_BLOCK_S = 10.0  # blocks that give σ
+_HELD_S = 30.0  # odometry is accurate for this long
+_CLIMB_S = 4.0  # spacing of fixes that give slope
+_LEAST_TILT_STD_RAD = 0.004  # accelerometer bias of 0.04 m/s²
+_STATED_TILT_STD_RAD = 0.0175  # extrinsics are stated to a degree
+_LEAST_WAY_M = 1e-3  # shorter distances have no direction
 
 
 @dataclass(frozen=True, slots=True)

@@ -27,16 +27,16 @@ from tcpipe.geometry.rotation import matrix_from_quat
 
 Floats = NDArray[np.float64]
 
-_WINDOW_NS = 5_000_000_000
+_WINDOW_NS = 5_000_000_000  # as in the audit
 _MAX_GAP_NS = 500_000_000
-_MOVES_M = 1.5
-_FEWEST_WINDOWS = 8
-_MIN_SIGNIFICANCE_SIGMA = 2.0
-_ALIKE = 0.25
-_HELD_NS = 3_000_000_000
-_STEP_MPS = 0.1
-_DRIVES_MPS = 0.3
-_FASTER = 1.03
+_MOVES_M = 1.5  # shorter distances give no scale
+_FEWEST_WINDOWS = 8  # fewer may be one place of slip
+_MIN_SIGNIFICANCE_SIGMA = 2.0  # times the prior of a scale
+_ALIKE = 0.25  # scatter over offset of the median: more is slip
+_HELD_NS = 3_000_000_000  # a command this long is reached
+_STEP_MPS = 0.1  # smaller steps are jitter (`gate.command_step_mps`)
+_DRIVES_MPS = 0.3  # motors round slower commands
+_FASTER = 1.03  # of a command: no controller overshoots more
 _SCALE_STD = {WHEELS: WHEEL_SCALE_STD, VISUAL: VISUAL_SCALE_STD}
 
 

@@ -20,9 +20,8 @@ from tcpipe.formats.run_documents import LogOrigin
 from tcpipe.pipeline import ingest as ingest_module
 from tcpipe.pipeline.ingest import ingest
 from tcpipe.pipeline.ingest_run import Ingested
-from tcpipe.pipeline.ingest_task import IngestResult, check_age, make_result
-from tcpipe.pipeline.log_sources import find_damage
-from tcpipe.pipeline.plan import TO_DO
+from tcpipe.pipeline.log_sources import find_damaged_log
+from tcpipe.pipeline.plan import TO_DO, IngestResult, check_age, make_result
 from tcpipe.pipeline.problems import acknowledge
 from tcpipe.pipeline.status import find_status
 from tcpipe.recipe import ReadConfig, Recipe
@@ -52,8 +51,9 @@ def make_row(row, task, sha256, kind):
     )
     subject = Subject("run", name)
     empty = make_finding("no-segments", subject, names={"reason": "gap"}, driven_m=80.0, lost_m=80.0)
+    damage = (make_finding("file-cut", Subject("file", name)),)
     changes = {
-        "damaged": {"damage": ("it was cut",), "findings": find_damage(("it was cut",), subject)},
+        "damaged": {"damage": damage, "findings": find_damaged_log(damage, subject)},
         "empty": {"segments": 0, "ledger_m": {"gap": 80.0}, "findings": (empty,)},
     }
     return replace(made, **changes.get(kind, {}))

@@ -1,16 +1,23 @@
 """What a command says while it works."""
 
+import io
 import logging
+import re
+from itertools import count
+from types import SimpleNamespace
 
 import pytest
 from installed_command import tcpipe
+from rich.console import Console
 
 from tcpipe import __version__
 from tcpipe.cli import output
-from tcpipe.cli.output import show_progress, write_debug_log
-from tcpipe.progress import Meter, set_task, step
+from tcpipe.cli.output import Progress, show_progress, write_debug_log
+from tcpipe.progress import Meter, Step, set_task, step
 
 LOGGER = logging.getLogger("tcpipe")
+HOSTILE = "/logs/[red]a\x1b]0;owned\x07\x1b[31m\u202e.bag"
+MB = 1_000_000
 
 
 @pytest.fixture(autouse=True)
@@ -56,9 +63,9 @@ def test_bars_are_drawn_where_no_json_goes_to_the_terminal(as_json, of_stdout, d
     monkeypatch.setenv("TERM", "xterm")
     monkeypatch.setattr(output.sys.stderr, "isatty", lambda: True, raising=False)
     monkeypatch.setattr(output.sys.stdout, "isatty", lambda: of_stdout, raising=False)
-    assert (output._make_bars("ingest", as_json=as_json) is not None) is drawn
+    assert (output._open_terminal(as_json=as_json) is not None) is drawn
     monkeypatch.setenv("TERM", "dumb")
-    assert output._make_bars("ingest", as_json=as_json) is None
+    assert output._open_terminal(as_json=as_json) is None
 
 
 @pytest.mark.parametrize("words", [("--debug", "inspect", "nothing"), ("inspect", "nothing", "--debug")])
@@ -97,3 +104,54 @@ def test_the_debug_log_says_when_and_takes_the_place_of_progress(capsys):
     lines = capsys.readouterr().err.splitlines()
     assert [line.split(" ", 1)[1] for line in lines] == ["a.bag: reading", "which topic is what"]
     assert all(line[2] == line[5] == ":" for line in lines)
+
+
+@pytest.fixture
+def screen(monkeypatch):
+    """Bars on a terminal of memory, whose clock goes on by a second each time it is read; and what is on it."""
+    ticks = count()
+    monkeypatch.setattr(output, "time", SimpleNamespace(monotonic=lambda: float(next(ticks))))
+    console = Console(file=io.StringIO(), force_terminal=True, width=140, color_system=None)
+    shown = Progress("ingest", quiet=False, console=console)
+    return shown, lambda: "\n".join(_drawn(shown))
+
+
+def _drawn(shown):
+    console = Console(file=io.StringIO(), width=140, color_system=None)
+    console.print(shown._bars.get_renderable())
+    return console.file.getvalue().splitlines()
+
+
+def test_a_log_under_way_has_its_name_stage_and_bytes_and_all_have_a_count_rate_and_time_left(screen):
+    shown, drawn = screen
+    shown.expect({"/logs/a.bag": 60 * MB, "/logs/b.bag": 40 * MB})
+    shown.step(Step("/logs/a.bag", "reading", 30 * MB, 60 * MB))
+    assert re.search(r"a\.bag .* reading 30\.0 of 60\.0 MB", drawn())
+    shown.end("/logs/a.bag", worked=True)  # 60 of 100 MB, at the second second
+    assert "1/2, 30.0 MB/s, 0:01 left" in drawn()
+    assert "a.bag" not in drawn()
+
+
+def test_what_needed_no_work_says_nothing_of_the_rate(screen):
+    shown, drawn = screen
+    shown.expect({"a": 600 * MB, "b": 40 * MB})
+    shown.end("a", worked=False)
+    assert "1/2" in drawn()
+    assert "MB/s" not in drawn()
+
+
+def test_more_logs_than_there_is_room_for_are_counted(screen):
+    shown, drawn = screen
+    shown.expect({f"{n}.bag": MB for n in range(12)})
+    for n in range(12):
+        shown.step(Step(f"{n}.bag", "fusing", 0, 0))
+    assert drawn().count("fusing") == 8
+    assert "4 more under way" in drawn()
+
+
+def test_a_name_is_shown_as_text(screen):
+    shown, drawn = screen
+    shown.expect({HOSTILE: MB})
+    shown.step(Step(HOSTILE, "fusing", 0, 0))
+    assert all(c.isprintable() or c == "\n" for c in drawn())
+    assert "[red]a\\x1b" in drawn()

@@ -178,7 +178,7 @@ def test_topics_of_which_none_can_be_read_are_an_error(tmp_path):
     path = of_one_message(tmp_path / "a.mcap", "acme_msgs/msg/Thing", "", b"\0\1\0\0")
     with pytest.raises(LogError, match="no topic can be read") as refused:
         export(path, tmp_path / "out")
-    assert "type acme_msgs/msg/Thing is unknown" in refused.value.problems[1]
+    assert "type acme_msgs/msg/Thing is unknown" in refused.value.findings[0].names["reason"]
     assert not (tmp_path / "out").exists()
 
 

@@ -19,7 +19,7 @@ from tcpipe.pipeline.status import find_status
 from tcpipe.pipeline.verify import verify
 from tcpipe.recipe import Recipe
 from tcpipe.store import Store, open_store
-from tcpipe.tables.findings import select_findings
+from tcpipe.tables.findings import Subject, make_finding, select_findings
 
 LOST = {
     "the only manifest": "runs/b/*/manifest-1.json",
@@ -45,7 +45,9 @@ def made(tmp_path_factory):
             add_run(store, run_id, segments(run_id, *lanes(3.0 * number, -10.0, 9.0 + more)))
             known = store.run_json(run_id)
             if more:
-                store.write_run_json(run_id, type(known)(known.source, damage=("cut",)))
+                store.write_run_json(
+                    run_id, type(known)(known.source, damage=(make_finding("file-cut", Subject("file", "cut")),))
+                )
     store.tag_run("twice", {"weather": "dry"})
     commit_run(store, "twice")
     return here

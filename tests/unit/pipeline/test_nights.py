@@ -11,10 +11,10 @@ from wheel_drives import START_NS, drive_at, wheel_drive
 
 import tcpipe.pipeline.ingest_run as ingestion
 from tcpipe.errors import UsageError
-from tcpipe.formats.logs.writing import MessageStream, write_bag
+from tcpipe.formats.logs.writing import MessageStream, write_bag, write_rosbag2
 from tcpipe.formats.run_documents import LogOrigin, RunJson
 from tcpipe.pipeline import ingest as ingest_module
-from tcpipe.pipeline import ingest_task
+from tcpipe.pipeline import plan as plan_module
 from tcpipe.pipeline.calls import LogWriter
 from tcpipe.pipeline.ingest import ingest
 from tcpipe.pipeline.inspect import inspect
@@ -156,7 +156,7 @@ def test_a_failure_is_news_once_until_something_is_another(tmp_path, night, monk
     assert told(night, "junk.bag") == again
     junk.write_bytes(JUNK + b"!")
     assert [told(night, "junk.bag") for _ in range(2)] == [once, again]
-    monkeypatch.setattr(ingest_task, "__version__", "9.9.9")
+    monkeypatch.setattr(plan_module, "__version__", "9.9.9")
     assert [told(night, "junk.bag") for _ in range(2)] == [once, again]
     (tmp_path / "tcpipe.toml").write_text("[segment]\nchord_m = 2.0\n")
     summaries = [ingest([junk], store=tmp_path / "store", recipe=tmp_path / "tcpipe.toml") for _ in range(2)]
@@ -373,8 +373,19 @@ def test_a_part_of_a_split_recording_takes_static_transforms_from_the_part_befor
     summary = ingest([tmp_path / "logs"], store=tmp_path / "store", recipe=Recipe())
     assert [result.status for result in summary.results] == ["done", "done"]
     known = [Store(tmp_path / "store").run_json(result.run.run_id).remarks for result in summary.results]
-    taken = [sum("run_0.bag ends, whose static transforms are taken" in line for line in lines) for lines in known]
-    assert taken == [0, 1]
+    assert [[of.names["earlier"] for of in notes if "earlier" in of.names] for notes in known] == [[], ["run_0.bag"]]
+
+
+def test_damage_that_leaves_no_message_is_the_cause_and_no_sensor_is_missing(tmp_path):
+    write_rosbag2(tmp_path / "run", wheel_drive(rows=1000))
+    path = tmp_path / "cut.db3"
+    path.write_bytes((tmp_path / "run" / "run.db3").read_bytes()[:28672])
+    (result,) = ingest([path], store=tmp_path / "store", recipe=Recipe()).results
+    assert result.status == "failed"
+    assert [of.code for of in result.causes] == ["log-failed", "file-cut", "database-damaged"]
+    inspected = inspect(path, recipe=Recipe())
+    assert inspected.problems == ("the log is damaged, and no message can be read",)
+    assert {of.code for of in inspected.findings} == {"log-damaged"}
 
 
 def test_a_log_that_was_lost_is_written_again_from_the_runs(tmp_path, night):

@@ -73,10 +73,10 @@ def test_rows_swapped_nearby_are_sorted_and_rows_far_behind_are_counted(tmp_path
     late = [*messages[10:], *messages[:10]]
     with open_log(write_mcap(tmp_path / "far.mcap", late, chunk_bytes=2048)) as log:
         parts = [piece["/ColorRGBA"] for piece in log.batches(["/ColorRGBA"], batch_bytes=20_000)]
-        (finding,) = log.damage
+        (finding,) = log.findings
     assert sum(part.num_rows for part in parts) == len(messages)
-    assert "10 messages lie in the log far behind their time" in finding.what
-    assert finding.messages_lost == 0
+    assert (finding.code, finding.severity) == ("messages-unordered", "note")
+    assert finding.numbers["places_count"] == 10
 
 
 def test_a_topic_of_few_messages_is_not_cut_into_crumbs(tmp_path):
@@ -94,7 +94,7 @@ def test_messages_that_fit_no_definition_leave_pieces_without_rows(tmp_path):
     with open_log(write_mcap(tmp_path / "a.mcap", broken, chunk_bytes=512)) as log:
         pieces = list(log.batches(["/a"], batch_bytes=500))
         assert sum(piece["/a"].num_rows for piece in pieces) == 0
-        assert sum(finding.messages_lost for finding in log.damage) == 60
+        assert sum(finding.numbers["lost_messages_count"] for finding in log.findings) == 60
 
 
 def test_export_writes_the_tables_row_group_by_row_group(tmp_path, monkeypatch):

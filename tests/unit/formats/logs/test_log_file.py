@@ -194,8 +194,9 @@ def test_an_unknown_type_costs_only_its_own_topic(tmp_path):
     with open_log(path) as log:
         tables = log.tables(log.topics)
         assert list(tables) == ["/Imu"]
-        assert [(damage.topic, damage.messages_lost) for damage in log.damage] == [("/ColorRGBA", 10)]
-        assert "acme_msgs/msg/Secret" in log.damage[0].what
+        (finding,) = log.findings
+        assert (finding.subject.name, finding.numbers["lost_messages_count"]) == ("/ColorRGBA", 10)
+        assert "acme_msgs/msg/Secret" in finding.names["reason"]
         with pytest.raises(LogError, match="/ColorRGBA cannot be read: type acme_msgs/msg/Secret is unknown"):
             log.table("/ColorRGBA")
     definitions = tmp_path / "acme_msgs" / "msg"
@@ -214,7 +215,7 @@ def test_messages_that_do_not_fit_are_counted_and_the_others_kept(tmp_path):
     with open_log(write_mcap(tmp_path / "run.mcap", broken)) as log:
         table = log.table("/Imu")
         assert table.num_rows == 8
-        assert sum(damage.messages_lost or 0 for damage in log.damage) == 2
+        assert [finding.numbers["lost_messages_count"] for finding in log.findings] == [2]
     whole = [m for i, m in enumerate(messages) if i not in (3, 7)]
     assert_same(table, expected_columns(whole, "/Imu"))
 
@@ -229,9 +230,9 @@ def test_a_topic_that_changes_its_type_keeps_the_larger_part(tmp_path):
     shutil.copy(write_mcap(tmp_path / "b.mcap", renamed), bag / "run_1.mcap")
     with open_log(bag) as log:
         assert_same(log.table("/ColorRGBA"), expected_columns(first, "/ColorRGBA"))
-        changed = [damage for damage in log.damage if damage.topic == "/ColorRGBA"]
-    assert [damage.messages_lost for damage in changed] == [4]
-    assert "changes its type to sensor_msgs/msg/Imu" in changed[0].what
+        (changed,) = [finding for finding in log.findings if finding.subject.name == "/ColorRGBA"]
+    assert changed.numbers["lost_messages_count"] == 4
+    assert "changes its type to sensor_msgs/msg/Imu" in changed.names["reason"]
 
 
 def test_rows_are_in_the_order_of_log_time(tmp_path):
@@ -340,9 +341,8 @@ def test_a_file_of_a_bag_that_is_missing_or_broken_costs_only_itself(tmp_path):
     (bag / "run_2.db3").write_bytes(b"")
     with open_log(bag) as log:
         assert_same(log.table("/Imu"), expected_columns(messages, "/Imu"))
-        said = [str(damage) for damage in log.damage]
-    assert any("run_1.db3" in line and "not there" in line for line in said)
-    assert any("run_2.db3" in line and "is empty" in line for line in said)
+        assert any("run_1.db3" in line and "missing" in line for line in log.damage)
+        assert any("run_2.db3" in line and "is empty" in line for line in log.damage)
 
 
 def test_a_renamed_file_of_a_bag_is_no_damage_unless_messages_are_missing(tmp_path):
@@ -351,12 +351,12 @@ def test_a_renamed_file_of_a_bag_is_no_damage_unless_messages_are_missing(tmp_pa
     next(bag.glob("*.db3")).rename(bag / "mine.db3")
     with open_log(bag) as log:
         assert_same(log.table("/Imu"), expected_columns(messages, "/Imu"))
-        assert [damage.is_loss for damage in log.damage] == [False] * len(log.damage)
-        assert "mine.db3: metadata.yaml calls this file run.db3" in str(log.damage[0])
+        assert log.damage == []
+        assert (log.findings[0].code, log.findings[0].subject.name) == ("file-unlisted", "run/mine.db3")
     counted = (bag / "metadata.yaml").read_text()
     (bag / "metadata.yaml").write_text(counted.replace("message_count: 20", "message_count: 21"))
     with open_log(bag) as log:
-        assert any(damage.is_loss for damage in log.damage)
+        assert log.damage
 
 
 def test_an_open_db3_with_a_journal_is_read_whole(tmp_path):

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from tcpipe.formats.logs.sqlite_file import SqlitePart
+from tcpipe.logs.topics import Damage
 
 SCHEMA = (
     "CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT NOT NULL, type TEXT NOT NULL, serialization_format TEXT NOT NULL)",
@@ -145,7 +146,7 @@ def rows_of_part(path):
             )
         }
         assert sum(len(block.ordinal) for block in blocks) == len(found)
-        return found, [damage.what for damage in part.damage]
+        return found, part.damage
 
 
 @pytest.mark.parametrize(("page_bytes", "sizes"), [(512, None), (4096, (60, 330, 9000))])
@@ -158,7 +159,7 @@ def test_of_a_cut_file_the_rows_that_are_left_are_read(tmp_path, page_bytes, siz
         cut = data[: int(share * len(data))]
         found, damage = rows_of(path, cut)
         assert all(expected[number] == payload for number, payload in found.items())
-        assert damage[0] == f"the file ends at byte {len(cut)} of {len(data)}"
+        assert damage[0] == Damage("file-cut", "a.db3", len(cut), bytes_lost=len(data) - len(cut))
         assert (share - 0.05) * len(expected) < len(found) < len(expected)
 
 
@@ -173,7 +174,7 @@ def test_rows_between_damaged_pages_are_read(tmp_path):
     found, damage = rows_of(path, bytes(data))
     assert 0.9 * len(expected) < len(found) < 0.97 * len(expected)
     assert all(expected[number] == payload for number, payload in found.items())
-    assert sum("cannot be read" in line for line in damage) == len(leaves[10::20])
+    assert len({place for place in damage if place.reason.startswith("after message")}) == len(leaves[10::20])
 
 
 @pytest.mark.parametrize("child", ["itself", 0, 1 << 31, 1])
@@ -217,4 +218,4 @@ def test_of_a_cut_file_no_row_comes_back_that_was_taken_out(tmp_path, change):
     data = path.read_bytes()
     found, damage = rows_of(path, data[: int(0.7 * len(data))])
     assert all(expected[number] == payload for number, payload in found.items())
-    assert any("cannot be read" in line for line in damage)
+    assert any(place.cause == "database-damaged" for place in damage)

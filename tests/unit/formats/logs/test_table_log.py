@@ -6,6 +6,7 @@ import pytest
 from simulated_streams import log_of
 
 from tcpipe.errors import LogError, UsageError
+from tcpipe.formats.finding_lines import describe_finding
 from tcpipe.formats.logs.log_file import open_log
 from tcpipe.formats.logs.log_joining import open_logs
 from tcpipe.formats.logs.table_log import TableLog
@@ -87,7 +88,7 @@ def test_what_a_bag_holds_is_the_same_as_tables(bag, tmp_path):
             frame.write_csv(folder / name, separator=separator, datetime_format="%Y-%m-%dT%H:%M:%S%.9f")
     recipe = Recipe(tables=SAME)
     with open_logs([folder], tables=recipe.tables) as log:
-        assert (log.damage, log.remarks) == ([], [])
+        assert log.findings == []
         found = read_run(log, find_read_config(recipe, log.topics), robot=None, known=load_shipped_profiles())
     for role in ("gnss", "imu", "wheel_odometry", "power"):
         assert (
@@ -148,11 +149,12 @@ def test_what_cannot_be_read_of_a_row_is_damage_and_rows_are_put_in_order(tmp_pa
     lines[3], lines[4], lines[10], lines[20] = lines[4], lines[3], "later,1,1", lines[20].split(",")[0] + ",slow,0.1"
     folder = folder_with(tmp_path, odom="\n".join(lines))
     log = TableLog(folder, {"wheel_odometry": WHEELS})
-    assert [str(damage) for damage in log.damage] == [
-        "odom.csv, topic /wheel_odometry: rows have no stamp that can be read (1 messages lost)",
-        "odom.csv, topic /wheel_odometry: column v holds text, first 'slow' in row 20 (1 messages lost)",
+    assert [describe_finding(finding) for finding in log.findings] == [
+        "odom.csv: messages or rows have no valid time (1 messages lost)",
+        "odom.csv: not read as numbers: column v, row 20: 'slow' (1 messages lost)",
+        "odom.csv: messages are not stored in the order of their time",
     ]
-    assert log.remarks == ["odom.csv: 1 stamps lie before the one above; its rows are put in order"]
+    assert [finding.severity for finding in log.findings] == ["warning", "warning", "note"]
     table = log.tables(["/wheel_odometry"])["/wheel_odometry"]
     stamps = table["log_time_ns"].to_numpy()
     assert len(stamps) == 49
