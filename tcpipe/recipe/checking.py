@@ -35,12 +35,9 @@ _TYPES = {
 
 
 def validate_fields(made: Any, section: str) -> None:
-    """Check every field of a dataclass and keep it as a plain value; its ``__post_init__``.
+    """Check every field of a frozen dataclass and keep it as a plain value; its ``__post_init__``.
 
-    Parameters
-    ----------
-    made : a frozen dataclass.
-    section : what its keys are called before the dot; "" where they have none.
+    ``section`` is the name of its keys before the dot, "" where they have none.
 
     Raises
     ------
@@ -78,10 +75,7 @@ def read_annotations(cls: type) -> Mapping[str, Any]:
 def describe(*kinds: Any, file: str = "") -> tuple[list[dict[str, Any]], dict[str, dict[str, Any]]]:
     """Return the JSON Schema of each annotation, and the definitions they refer to; docstrings describe dataclasses and their keys.
 
-    Parameters
-    ----------
-    kinds : the annotations.
-    file : that holds the definitions; "" is the file of the schema itself.
+    ``file`` holds the definitions; "" is the file of the schema itself.
     """
     template, text = f"{file}#/$defs/{{name}}", {"type": "string"}
     schemas, definitions = msgspec.json.schema_components(kinds, schema_hook=lambda _: text, ref_template=template)
