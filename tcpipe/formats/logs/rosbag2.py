@@ -37,7 +37,7 @@ class Rosbag2Files:
     """The storage files of a bag in order, what is wrong with their list, and how many messages metadata.yaml counts, also by topic."""
 
     paths: tuple[Path, ...]
-    damage: tuple[Damage, ...]
+    damage: tuple[Damage, ...] = ()
     message_count: int | None = None
     topic_counts: Mapping[str, int] = field(default_factory=dict)
 

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from tcpipe.logs.conversions import convert_imu_to_si
-from tcpipe.logs.messages import Readings
+from tcpipe.logs.messages import Readings, convert_imu_to_si
 
 NAMES = (
     "angular_velocity_z_radps",
