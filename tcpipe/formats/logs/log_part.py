@@ -16,15 +16,17 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol, TypeVar
+from typing import TYPE_CHECKING, Protocol, TypeVar
 
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
 from tcpipe.errors import LogError
-from tcpipe.formats.object_storage import StoredObject
 from tcpipe.logs.topics import Damage
+
+if TYPE_CHECKING:
+    from tcpipe.formats.object_storage import StoredObject
 
 MAX_CHUNK_BYTES = 1 << 29
 """A chunk that claims to hold more than this is taken for damaged: it is held as a whole. Writers make chunks of some megabytes."""
