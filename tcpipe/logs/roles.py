@@ -341,13 +341,9 @@ _HUMAN_OR_PLANNER = re.compile(r"joy|teleop|nav|move|interactive|marker|key|web|
 _SIDES = frozenset({"left", "right", "front", "rear", "back", "l", "r", "fl", "fr", "rl", "rr"})
 
 
-def _split_words(name: str) -> list[str]:
-    return [word for word in re.split(r"[/_\-.]+", name.lower()) if word]
-
-
 def _find_role_word(pattern: re.Pattern[str], name: str) -> str | None:
     """Return the first word of a topic's name that the pattern matches from its start."""
-    return next((word for word in _split_words(name) if pattern.match(word)), None)
+    return next((word for word in re.split(r"[/_\-.]+", name.lower()) if word and pattern.match(word)), None)
 
 
 Ranked = list[tuple[tuple[int, ...], str, Topic]]
@@ -494,11 +490,13 @@ def _decide(decided: _Decisions, role: str, candidates: Ranked) -> None:
     taken = set(names)
     others = [topic for _, _, topic in candidates if topic.name not in taken]
     thin = find_short_topics(others, topics, of_power=role == "power")
+    # Bare numbers share a rail, other topics are one each.
+    rails = tuple(dict.fromkeys(make_rail_name(t.name) if t.type_name in FLOAT_TYPES else t.name for t in topics))
     if len(first) == 1:
         better = "it covers more" if thin and len(thin) == len(others) else "it fits better"
         better = f"{better} than {format_topic_names(others)}" if others else f"the only {topics[0].type_name}"
         why = first[0][0] or better
-    elif role == "power" and _are_sides(rails := _name_rails(topics)):
+    elif role == "power" and _are_sides(rails):
         why = f"{len(rails)} sides of one robot, summed" if len(rails) > 1 else "voltage and current on two topics"
     else:
         decided.ambiguous.append(
@@ -527,11 +525,6 @@ def _select_best(role: str, candidates: Ranked) -> list[tuple[str, Topic]]:
     ample = [entry for entry in candidates if entry[2].name not in thin] or candidates
     best = min(rank for rank, _, _ in ample)
     return [(why, topic) for rank, why, topic in (candidates if role == "power" else ample) if rank == best]
-
-
-def _name_rails(topics: Iterable[Topic]) -> tuple[str, ...]:
-    """Return the rails' names: bare numbers share one, other topics are one each."""
-    return tuple(dict.fromkeys(make_rail_name(t.name) if t.type_name in FLOAT_TYPES else t.name for t in topics))
 
 
 def _are_sides(names: Sequence[str]) -> bool:

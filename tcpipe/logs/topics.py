@@ -176,7 +176,13 @@ def find_short_topics(topics: Iterable[Topic], rivals: Iterable[Topic], *, of_po
     little_span = _LITTLE_SPAN_OF_POWER if of_power else _LITTLE_SPAN
     least_s = little_span * max((_compute_covered_s(rival) or 0.0 for rival in listed), default=0.0)
     least = _LITTLE_COUNT * max((rival.message_count or 0 for rival in listed), default=0)
-    return frozenset(topic.name for topic in topics if _is_little(topic, least_s, least))
+    spans = ((topic, _compute_covered_s(topic)) for topic in topics)
+    return frozenset(
+        topic.name
+        for topic, span_s in spans
+        if (span_s is not None and span_s < least_s)
+        or (topic.message_count is not None and topic.message_count < least)
+    )
 
 
 def compute_silence_ns(spans_ns: Sequence[tuple[int, int]], count: int | None) -> int:
@@ -191,11 +197,6 @@ def compute_silence_ns(spans_ns: Sequence[tuple[int, int]], count: int | None) -
     least_ns = max(_SILENCE_NS, _SILENT_PERIODS * (ends[-1] - rising[0][0]) // count)
     pauses = (start - end for (start, _), end in zip(rising[1:], ends, strict=False))
     return sum(pause for pause in pauses if pause > least_ns)
-
-
-def _is_little(topic: Topic, least_s: float, least: float) -> bool:
-    span_s, count = _compute_covered_s(topic), topic.message_count
-    return (span_s is not None and span_s < least_s) or (count is not None and count < least)
 
 
 def format_coverage(topic: Topic) -> str:

@@ -43,10 +43,6 @@ class Entries:
         of = (self.chunk, self.channel, self.offset, self.end, self.log_time_ns)
         return Entries(*(values[chosen] for values in of))
 
-    def of_chunk(self, number: int) -> Entries:
-        """Return those of one chunk."""
-        return self.at(self.chunk == number)
-
 
 @dataclass(frozen=True, slots=True)
 class Span:
@@ -238,7 +234,7 @@ def _read_span_blocks(
             noted.append(file.lost(chunk, error))
         else:
             messages = file.walked(chunk, data, wanted, noted)
-            entries = None if span.entries is None else span.entries.of_chunk(number)
+            entries = None if span.entries is None else span.entries.at(span.entries.chunk == number)
             noted += _find_index_disagreement(file, chunk, messages, entries)
             yield from _split_in_time(file.name, messages, base + messages.offset, noted)
 

@@ -72,16 +72,16 @@ def open_log(path: Path | str, *, message_definitions: Path | None = None) -> Lo
         if is_url(path):
             path, stored = stack.enter_context(lay_out_objects(str(path), wanted=is_log_file, by_range=_READ_BY_RANGE))
         path = Path(path)
-        _refuse_what_is_no_file(path)
+        _refuse_what_is_not_there(path)
+        if not path.is_file() and not path.is_dir():
+            raise LogError(f"{path}: it is a pipe or a device; {WANTED}")
         fetched = {file: FetchedFile(of, file) for file, of in stored.items()}
-        opened = _open_directory(path, stack, fetched) if path.is_dir() else _open_file(path, stack, fetched)
+        if path.is_dir():
+            opened = _open_directory(path, stack, fetched)
+        else:
+            part, kind = open_part(path, path.name, stack, fetched.get(path)), find_container(path, fetched.get(path))
+            opened = _OpenFiles(kind, Rosbag2Files((path,)), (part,), fetched)
         return Log(path, opened, TypeLibrary(message_definitions), stack.pop_all())
-
-
-def _refuse_what_is_no_file(path: Path) -> None:
-    _refuse_what_is_not_there(path)
-    if not path.is_file() and not path.is_dir():
-        raise LogError(f"{path}: it is a pipe or a device; {WANTED}")
 
 
 def _refuse_what_is_not_there(path: Path) -> None:
@@ -460,11 +460,6 @@ def _make_topic(channel: Channel, types: TypeLibrary) -> Topic:
         problem,
         channel.silent_ns,
     )
-
-
-def _open_file(path: Path, stack: ExitStack, fetched: Mapping[Path, FetchedFile]) -> _OpenFiles:
-    part = open_part(path, path.name, stack, fetched.get(path))
-    return _OpenFiles(find_container(path, fetched.get(path)), Rosbag2Files((path,)), (part,), fetched)
 
 
 def _open_directory(directory: Path, stack: ExitStack, fetched: Mapping[Path, FetchedFile]) -> _OpenFiles:
