@@ -15,8 +15,7 @@ Trees = dict[str, ast.Module]
 MAPPINGS = {"dict", "Mapping", "MutableMapping"}
 
 _BY_LIBRARY = {
-    "lightgbm": """learning/table_model.py:read_forest learning/table_model.py:_ForestBuilder.plant
-        learning/table_model.py:_ForestBuilder._add
+    "lightgbm": """learning/table_model.py:read_forest learning/table_model.py:_make_forest
         learning/table_model.py:_load_lightgbm""",
     "torch": """dataset/torch_data.py:TorchBatches.__iter__ dataset/torch_data.py:_to_tensors
         learning/architecture.py:mean_loss

@@ -39,7 +39,7 @@ from tcpipe.pipeline.ingest_options import IngestOptions
 
 if TYPE_CHECKING:
     from tcpipe.pipeline.ingest import IngestSummary
-    from tcpipe.pipeline.ingest_task import IngestResult
+    from tcpipe.pipeline.plan import IngestResult
 
 
 @click.command()
@@ -59,7 +59,7 @@ def ingest(options: IngestOptions, *, dry_run: bool, as_json: bool, quiet: bool)
     """
     from tcpipe.formats.json_files import convert_record
     from tcpipe.pipeline.ingest import SummaryLine, run_ingest
-    from tcpipe.pipeline.ingest_task import LogLine
+    from tcpipe.pipeline.plan import LogLine
 
     ruling, source = resolve_recipe_with_source(cast("str | None", options.recipe))
     options = replace(options, recipe=ruling)

@@ -216,7 +216,11 @@ def _sum_along(
     def sums(quantity: str, measured: Floats, predicted: Floats) -> tuple[IntervalComparison, ...]:
         found = []
         for end in ends:
-            low, high = (None, None) if errors is None else errors[quantity].of_sum(predicted[:end], class_id[:end])
+            low, high = (
+                (None, None)
+                if errors is None
+                else errors[quantity].compute_sum_interval(predicted[:end], class_id[:end])
+            )
             found.append(IntervalComparison(float(measured[:end].sum()), float(predicted[:end].sum()), low, high))
         return tuple(found)
 

@@ -64,16 +64,16 @@ def _find_consecutive(run: Ints, start_ns: Ints, centres_xy_m: Floats, *, chord_
 
 def _audit_split(name: str, split: NDArray[np.str_], run: Ints, follows: Ints, corners_xy_m: Floats) -> HeldOut:
     held, train = np.flatnonzero(split == name), np.flatnonzero(split == "train")
-    ours, theirs = corners_xy_m[held], corners_xy_m[train]
+    queries, references = corners_xy_m[held], corners_xy_m[train]
     pairs, overlaps, repeated = 0, np.zeros(len(held), np.bool_), np.zeros(len(held), np.bool_)
     diagonal_m = float(np.linalg.norm(corners_xy_m[:, 2] - corners_xy_m[:, 0], axis=1).max(initial=0.0))
-    for i, j in iterate_near_pairs(ours.mean(axis=1), theirs.mean(axis=1), within_m=diagonal_m):
-        real = compute_shared_fraction(ours, theirs, i, j) > _CONTACT_FRACTION
+    for i, j in iterate_near_pairs(queries.mean(axis=1), references.mean(axis=1), within_m=diagonal_m):
+        real = compute_shared_fraction(queries, references, i, j) > _CONTACT_FRACTION
         pairs += int(real.sum())
         overlaps[i[real]] = True
         repeated[i[real & (run[held[i]] != run[train[j]])]] = True
     crossing = (split[follows] == name).any(axis=1) & (split[follows] == "train").any(axis=1)
-    apart_m = compute_nearest_m(ours, theirs)
+    apart_m = compute_nearest_m(queries, references)
     return HeldOut(
         split=name,
         samples=len(held),

@@ -32,60 +32,62 @@ def compute_middles_deg(ends: Mapping[str, NDArray[np.generic]]) -> Floats:
     return np.column_stack([(x0 + x1) / 2.0, (y0 + y1) / 2.0])
 
 
-def are_near(ours_deg: Floats, theirs_deg: Floats, *, within_m: float) -> NDArray[np.bool_]:
-    """Return which of ``ours``, lon, lat [deg], shape (N, 2), are at most so far from one of ``theirs``; NaN is near nothing."""
-    scale = _M_A_DEG * np.array([np.cos(np.radians(np.nanmean(ours_deg[:, 1]))) if len(ours_deg) else 1.0, 1.0])
-    known, others = np.isfinite(ours_deg).all(axis=1), theirs_deg[np.isfinite(theirs_deg).all(axis=1)]
-    found = np.zeros(len(ours_deg), np.bool_)
+def are_near(queries_deg: Floats, references_deg: Floats, *, within_m: float) -> NDArray[np.bool_]:
+    """Return which of ``queries``, lon, lat [deg], shape (N, 2), are at most so far from one of ``references``; NaN is near nothing."""
+    scale = _M_A_DEG * np.array([np.cos(np.radians(np.nanmean(queries_deg[:, 1]))) if len(queries_deg) else 1.0, 1.0])
+    known, others = np.isfinite(queries_deg).all(axis=1), references_deg[np.isfinite(references_deg).all(axis=1)]
+    found = np.zeros(len(queries_deg), np.bool_)
     if known.any() and len(others):
         origin = others[0]
         tree = cKDTree((others - origin) * scale)
-        apart_m, _ = tree.query((ours_deg[known] - origin) * scale, distance_upper_bound=within_m)
+        apart_m, _ = tree.query((queries_deg[known] - origin) * scale, distance_upper_bound=within_m)
         found[known] = np.isfinite(apart_m)
     return found
 
 
-def iterate_near_pairs(ours_xy_m: Floats, theirs_xy_m: Floats, *, within_m: float) -> Iterator[tuple[Ints, Ints]]:
-    """Yield the index pairs of points at most ``within_m`` apart [m]: ``ours`` (N, 2) against ``theirs`` (M, 2), chunk by chunk of ours."""
-    if len(ours_xy_m) == 0 or len(theirs_xy_m) == 0:
+def iterate_near_pairs(
+    queries_xy_m: Floats, references_xy_m: Floats, *, within_m: float
+) -> Iterator[tuple[Ints, Ints]]:
+    """Yield index pairs of points at most ``within_m`` apart [m]: ``queries`` (N, 2) and ``references`` (M, 2), by chunk of queries."""
+    if len(queries_xy_m) == 0 or len(references_xy_m) == 0:
         return
-    tree = cKDTree(theirs_xy_m)
-    for first in range(0, len(ours_xy_m), _CHUNK):
-        mine = cKDTree(ours_xy_m[first : first + _CHUNK])
-        found = mine.sparse_distance_matrix(tree, within_m, output_type="ndarray")
+    tree = cKDTree(references_xy_m)
+    for first in range(0, len(queries_xy_m), _CHUNK):
+        part = cKDTree(queries_xy_m[first : first + _CHUNK])
+        found = part.sparse_distance_matrix(tree, within_m, output_type="ndarray")
         order = np.lexsort((found["j"], found["i"]))
         yield found["i"][order] + first, found["j"][order]
 
 
-def compute_shared_fraction(ours: Floats, theirs: Floats, i: Ints, j: Ints) -> Floats:
-    """Return the share of the ground of ``ours[i]`` that ``theirs[j]`` covers too, (P,); corners counter-clockwise, (N, 4, 2)."""
+def compute_shared_fraction(queries: Floats, references: Floats, i: Ints, j: Ints) -> Floats:
+    """Return the share of the ground of ``queries[i]`` that ``references[j]`` covers too, (P,); corners counter-clockwise, (N, 4, 2)."""
     shared_m2 = np.empty(len(i))
-    pair_overlaps(ours, theirs, i, j, shared_m2)
-    side_m = np.linalg.norm(ours[:, 1] - ours[:, 0], axis=1)
+    pair_overlaps(queries, references, i, j, shared_m2)
+    side_m = np.linalg.norm(queries[:, 1] - queries[:, 0], axis=1)
     return np.asarray(shared_m2 / side_m[i] ** 2)
 
 
-def compute_nearest_m(ours: Floats, theirs: Floats) -> Floats:
-    """Return the distance from each of ``ours`` to the nearest of ``theirs`` [m], (N,); empty if either is.
+def compute_nearest_m(queries: Floats, references: Floats) -> Floats:
+    """Return the distance from each of ``queries`` to the nearest of ``references`` [m], (N,); empty if either is.
 
     Both are corners of squares of one size, shape (N, 4, 2) and (M, 4, 2).
     """
-    if len(ours) == 0 or len(theirs) == 0:
+    if len(queries) == 0 or len(references) == 0:
         return np.empty(0)
-    tree = cKDTree(theirs.mean(axis=1))
-    reach_m = _compute_half_diagonal_m(ours) + _compute_half_diagonal_m(theirs)
-    best_m = np.full(len(ours), np.inf)
-    pending = [(rows, 8) for rows in _split_points(np.arange(len(ours)), _CHUNK)]
+    tree = cKDTree(references.mean(axis=1))
+    reach_m = _compute_half_diagonal_m(queries) + _compute_half_diagonal_m(references)
+    best_m = np.full(len(queries), np.inf)
+    pending = [(rows, 8) for rows in _split_points(np.arange(len(queries)), _CHUNK)]
     while pending:
         rows, count = pending.pop()
-        asked = min(count, len(theirs))
-        distances_m, j = tree.query(ours[rows].mean(axis=1), k=np.arange(1, asked + 1))
+        asked = min(count, len(references))
+        distances_m, j = tree.query(queries[rows].mean(axis=1), k=np.arange(1, asked + 1))
         apart_m = np.empty(j.size)
-        pair_distances(ours, theirs, np.repeat(rows, asked), j.reshape(-1).astype(np.int64), apart_m)
+        pair_distances(queries, references, np.repeat(rows, asked), j.reshape(-1).astype(np.int64), apart_m)
         best_m[rows] = apart_m.reshape(-1, asked).min(axis=1)
         # squares are nearer than their centres by at most two half diagonals: what is farther still cannot win
         doubtful = rows[(best_m[rows] > np.asarray(distances_m)[:, -1] - reach_m) & (best_m[rows] > 0.0)]
-        if asked < len(theirs):
+        if asked < len(references):
             pending += [(part, 4 * count) for part in _split_points(doubtful, max(_CHUNK * 2 // count, 1))]
     return best_m
 
@@ -100,21 +102,23 @@ def _compute_half_diagonal_m(corners: Floats) -> float:
 
 
 @compile_kernel
-def pair_distances(ours: Floats, theirs: Floats, i: NDArray[np.int64], j: NDArray[np.int64], out: Floats) -> None:
-    """Write the distance between squares ``ours[i]`` and ``theirs[j]`` to ``out``, (P,); 0 where they touch; corners are (N, 4, 2)."""
+def pair_distances(
+    queries: Floats, references: Floats, i: NDArray[np.int64], j: NDArray[np.int64], out: Floats
+) -> None:
+    """Write the distance between squares ``queries[i]`` and ``references[j]`` to ``out``, (P,), 0 if they touch; corners (N, 4, 2)."""
     for pair in range(i.size):
-        a, b = ours[i[pair]], theirs[j[pair]]
+        a, b = queries[i[pair]], references[j[pair]]
         out[pair] = (
             0.0 if _touch(a, b) else np.sqrt(min(_compute_corner_distance(a, b), _compute_corner_distance(b, a)))
         )
 
 
 @compile_kernel
-def pair_overlaps(ours: Floats, theirs: Floats, i: NDArray[np.int64], j: NDArray[np.int64], out: Floats) -> None:
-    """Write the area that squares ``ours[i]`` and ``theirs[j]`` share to ``out``, (P,); corners run counter-clockwise."""
+def pair_overlaps(queries: Floats, references: Floats, i: NDArray[np.int64], j: NDArray[np.int64], out: Floats) -> None:
+    """Write the area that squares ``queries[i]`` and ``references[j]`` share to ``out``, (P,); corners run counter-clockwise."""
     polygon, clipped = np.empty((8, 2)), np.empty((8, 2))
     for pair in range(i.size):
-        a, b = ours[i[pair]], theirs[j[pair]]
+        a, b = queries[i[pair]], references[j[pair]]
         for k in range(4):  # not as slices, see `tcpipe.fusion.state_kernel.copy_values`
             polygon[k, 0], polygon[k, 1] = a[k, 0], a[k, 1]
         corners = 4

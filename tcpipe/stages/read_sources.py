@@ -104,11 +104,11 @@ def read_sources(
             continue
         seen_frames = count_frames(columns, types[topic])
         source = TopicReadings(topic, role, types[topic], len(columns[LOG_TIME]), seen_frames, readings)
-        sources.append(replace(source, readings=_as_the_recipe_says(source, config)))
+        sources.append(replace(source, readings=_apply_recipe(source, config)))
     return sources, power, findings
 
 
-def _as_the_recipe_says(source: TopicReadings, config: ReadConfig) -> Readings:
+def _apply_recipe(source: TopicReadings, config: ReadConfig) -> Readings:
     """Return a topic's readings in the units and scale that the recipe states."""
     readings, role = source.readings, source.role
     if role == "gnss" and config.time.get(role) != "header":

@@ -133,6 +133,12 @@ def test_a_night_with_known_trouble_is_no_red_night(tmp_path):
         True,
         True,
     )
+    assert (
+        json.loads(tcpipe("acknowledge", run_id, "--json", "--store", "tcpipe-store", cwd=tmp_path).stdout)[
+            "acknowledged"
+        ]
+        == []
+    )
     retried = tcpipe("ingest", "logs", "--retry-failed", cwd=tmp_path)
     assert (retried.returncode, retried.stdout.splitlines()[-1]) == (0, "2 with acknowledged problems")
 
