@@ -42,7 +42,7 @@ def figures(run: RunDirectory, truth: Truth) -> Iterator[tuple[str, str]]:
         bias = error.sum() / np.abs(getattr(true, label)).sum()
         claimed = f"claimed deviation {std.mean():.3g} {unit}: {within[0]:.0%} of the errors within one, {within[1]:.0%} within two"
         yield f"{label}: sum |error| / sum |truth|", f"{share:.2%} (bias {bias:+.2%}); {claimed}"
-    yield from above_standing(segments, truth)
+    yield from describe_net_labels(segments, truth)
     there = truth.at(start_ns)
     lon, lat = to_floats(segments, "start_lon_deg"), to_floats(segments, "start_lat_deg")
     _, _, apart_m = pyproj.Geod(ellps="WGS84").inv(lon, lat, there.lon_deg, there.lat_deg)
@@ -60,7 +60,7 @@ def figures(run: RunDirectory, truth: Truth) -> Iterator[tuple[str, str]]:
     yield "odometer", f"{driven_m / truth.distance_m[-1] - 1:+.3%} of {truth.distance_m[-1]:.1f} m"
 
 
-def above_standing(segments: pa.Table, truth: Truth) -> Iterator[tuple[str, str]]:
+def describe_net_labels(segments: pa.Table, truth: Truth) -> Iterator[tuple[str, str]]:
     """Yield the same of what is above standing; the truth's standing power is that of steps in which nothing moves."""
     still = (truth.wheel_velocity_mps == 0.0) & (np.abs(truth.angular_velocity_radps).max(axis=1) < 1e-6)
     standing = float(np.median(truth.power_watt[still]))

@@ -123,7 +123,7 @@ def by_trees(of: Metre) -> Predictor:
         return np.column_stack([there.rise, there.turn_radpm, there.command])
 
     labels = np.column_stack([of.power, of.velocity])
-    forest = grow(features(of), labels, np.ones_like(labels), _folds(len(labels))).forest
+    forest, _ = grow(features(of), labels, np.ones_like(labels), _folds(len(labels)))
     return lambda there: np.maximum(forest.predict(features(there)), [-np.inf, LEAST_VELOCITY_MPS])
 
 
@@ -156,7 +156,7 @@ def told(fit: Callable[[Metre], Predictor], known: Metre, there: Metre) -> Told:
     assert found is not None, "fewer than 20 segments"
     said = compute_costs(*fit_bias_correction(residuals).apply(*fit(known)(there).T, nowhere), 1.0)
     spread = {
-        name: Spread(found[of].spread(said[name], nowhere), *found[of].of_pieces(said[name], nowhere))
+        name: Spread(found[of].compute_std(said[name], nowhere), *found[of].compute_intervals(said[name], nowhere))
         for name, of in QUANTITIES.items()
     }
     return Told({name: said[name] for name in QUANTITIES}, spread)

@@ -1,4 +1,4 @@
-"""A model folder without training: a narrow network with random weights, and residuals that were drawn."""
+"""A model folder without training: a narrow network with random weights, and residuals that were drawn; evaluations without figures."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -7,7 +7,15 @@ import numpy as np
 import pyarrow as pa
 
 from tcpipe.learning.architecture import Architecture
+from tcpipe.learning.evaluation_facts import (
+    BaselineResult,
+    EvaluateConfig,
+    EvaluatedDataset,
+    EvaluatedModel,
+    Evaluation,
+)
 from tcpipe.learning.fitting import FitConfig
+from tcpipe.learning.metrics import Errors, Ratio
 from tcpipe.learning.model_card import ModelCard, TrainedOn, Training, TrainingRange
 from tcpipe.learning.models import write_model
 from tcpipe.terrain.classes import PAPER_CLASSES
@@ -56,3 +64,22 @@ def made_model(directory: Path, *, seed: int = 0, rows: int = 60, **changes) -> 
         directory, card=card, weights=network.arrays(), residuals=residuals, history="epoch,loss\n", readme="made\n"
     )
     return directory
+
+
+def made_comparison(
+    baseline: str, ratio: Ratio, *, quantity="E", split="unseen", rmse=5.0, groups=34
+) -> BaselineResult:
+    """A model beside a baseline, whose errors are ``ratio`` of the baseline's."""
+    return BaselineResult(
+        baseline=baseline, split=split, quantity=quantity, errors=Errors(50, rmse, 5.0, 50), rmse_ratio=ratio, mape_ratio=ratio,
+        groups=groups, drawn_by="runs",
+    )  # fmt: skip
+
+
+def made_evaluation(**changes) -> Evaluation:
+    """An evaluation without any figure; ``changes`` replace its fields."""
+    empty = Evaluation(
+        tcpipe_version="", key="", model=EvaluatedModel("", "", CARD.training), dataset=EvaluatedDataset("", "", {}),
+        config=EvaluateConfig(), splits={}, ablation=(), energy={}, time={}, repeatability={}, plots={},
+    )  # fmt: skip
+    return replace(empty, **changes)

@@ -1,4 +1,4 @@
-"""Quality bits: what a user may want to know of a label before trusting it; none of them removes a segment."""
+"""Quality bits of labels; none of them removes a segment."""
 
 from __future__ import annotations
 
@@ -58,31 +58,17 @@ def touches_voltage_outside(
 ) -> NDArray[np.bool_]:
     """Return the spans that touch a voltage sample outside the range [V], shape (M,); none without a range."""
     outside = np.zeros(len(start_ns), dtype=np.bool_)
-    if range_volt is not None:
-        for each in rails:
-            outside |= _touches_outside(each.voltage, start_ns, end_ns, range_volt)
+    low, high = range_volt or (-np.inf, np.inf)
+    for voltage in (rail.voltage for rail in rails):
+        bad = np.concatenate(([0], np.cumsum((voltage.value < low) | (voltage.value > high))))
+        first = np.maximum(np.searchsorted(voltage.stamp_ns, start_ns, side="right") - 1, 0)
+        last = np.minimum(np.searchsorted(voltage.stamp_ns, end_ns, side="left") + 1, len(voltage.value))
+        outside |= bad[last] > bad[first]
     return outside
 
 
-def _touches_outside(
-    voltage: Samples, start_ns: NDArray[np.int64], end_ns: NDArray[np.int64], range_volt: tuple[float, float]
-) -> NDArray[np.bool_]:
-    low, high = range_volt
-    bad = np.concatenate(([0], np.cumsum((voltage.value < low) | (voltage.value > high))))
-    first = np.maximum(np.searchsorted(voltage.stamp_ns, start_ns, side="right") - 1, 0)
-    last = np.minimum(np.searchsorted(voltage.stamp_ns, end_ns, side="left") + 1, len(voltage.value))
-    return bad[last] > bad[first]
-
-
 def spans_near(position_m: Floats, start_m: Floats, end_m: Floats, *, within_m: float) -> NDArray[np.bool_]:
-    """Return the spans of path length that have one of the positions inside or within a distance of either end, shape (M,).
-
-    Parameters
-    ----------
-    position_m : [m], shape (G,), path lengths at which gaps begin or end.
-    start_m, end_m : [m], shape (M,), path lengths of the spans.
-    within_m : [m].
-    """
+    """Return which spans of path length [m], shape (M,), have one of the positions [m], shape (G,), inside or nearer than ``within_m``."""
     ordered = np.sort(position_m)
     first = np.searchsorted(ordered, start_m - within_m, side="left")
     last = np.searchsorted(ordered, end_m + within_m, side="right")
@@ -90,11 +76,9 @@ def spans_near(position_m: Floats, start_m: Floats, end_m: Floats, *, within_m: 
 
 
 def has_slip(wheel_mps: Floats, ground_mps: Floats, *, above: float = 0.2) -> NDArray[np.bool_]:
-    """Return where wheel and body speed along the ground differ by more than a share of the wheel speed; not where it is unknown.
+    """Return where wheel and body speed differ by more than a share of the wheel speed, shape (M,); not where it is unknown.
 
-    Parameters
-    ----------
-    wheel_mps, ground_mps : [m/s], shape (M,), means over the segment along the body's x axis: both along the slope, not horizontal.
+    Both are means over the segment along the body's x axis [m/s]: along the slope, not horizontal.
     """
     return np.abs(wheel_mps - ground_mps) > above * np.abs(wheel_mps)
 

@@ -85,18 +85,15 @@ def compute_variance_shares(world: World, robot: SimulatedRobot, split: Split, e
         values = joule[known][:, None]
         return float(np.var(values - fit_curves("spline", slope_rad, class_id, values).predict(slope_rad, class_id)))
 
-    def energy(without: Callable[[World, SimulatedRobot], tuple[World, SimulatedRobot]] = _hide_nothing) -> Array:
-        return compute_true_costs(*without(world, robot), split)["E"]
+    def energy(world: World, robot: SimulatedRobot) -> Array:
+        return compute_true_costs(world, robot, split)["E"]
 
-    whole, total = energy(), float(np.var(energy_joule[known]))
-    missing = {**{name: whole - energy(take) for name, take in _PARTS.items()}, REST: energy_joule - whole}
+    whole, total = energy(world, robot), float(np.var(energy_joule[known]))
+    missing = {name: whole - energy(*remove(world, robot)) for name, remove in _PARTS.items()}
+    missing[REST] = energy_joule - whole
     return {CLASS_AND_SLOPE: 1.0 - left(energy_joule) / total} | {
         name: left(of) / total for name, of in missing.items()
     }
-
-
-def _hide_nothing(world: World, robot: SimulatedRobot) -> tuple[World, SimulatedRobot]:
-    return world, robot
 
 
 def _remove_visible(world: World, robot: SimulatedRobot) -> tuple[World, SimulatedRobot]:
@@ -108,18 +105,20 @@ def _remove_visible(world: World, robot: SimulatedRobot) -> tuple[World, Simulat
     return replace(world, surface=replace(world.surface, looks=looks)), robot
 
 
-def _remove_bumps(world: World, robot: SimulatedRobot) -> tuple[World, SimulatedRobot]:
-    return world, replace(robot, wheels=robot.wheels and replace(robot.wheels, bump_loss=0.0))
-
-
-def _remove_side_slope(world: World, robot: SimulatedRobot) -> tuple[World, SimulatedRobot]:
-    return world, replace(robot, wheels=robot.wheels and replace(robot.wheels, cornering_per_rad=np.inf))
+def _change_wheels(robot: SimulatedRobot, **changes: float) -> SimulatedRobot:
+    return replace(robot, wheels=robot.wheels and replace(robot.wheels, **changes))
 
 
 _PARTS: Mapping[str, Callable[[World, SimulatedRobot], tuple[World, SimulatedRobot]]] = {
     "the orthophoto alone: wetness, cover": _remove_visible,
-    "heights within the patch: bumps and ridges under the wheels": _remove_bumps,
-    "heights within the patch: slope across": _remove_side_slope,
+    "heights within the patch: bumps and ridges under the wheels": lambda world, robot: (
+        world,
+        _change_wheels(robot, bump_loss=0.0),
+    ),
+    "heights within the patch: slope across": lambda world, robot: (
+        world,
+        _change_wheels(robot, cornering_per_rad=np.inf),
+    ),
     "the path: turning": lambda world, robot: (world, replace(robot, scrub_torque_nm=0.0)),
     "nothing: hidden resistance": lambda world, robot: (remove_hidden_variation(world), robot),
 }

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -235,14 +235,6 @@ FEWEST = 20
 Trained = Callable[[str, Variant], Model]
 
 
-@dataclass(slots=True)
-class EnergyTable:
-    """Errors of E by predictor and split, and the model's over theirs."""
-
-    errors: dict[str, dict[str, Errors]] = field(default_factory=dict)
-    compared: list[BaselineResult] = field(default_factory=list)
-
-
 def make_energy_table(
     ours: Model,
     data: Dataset,
@@ -251,26 +243,28 @@ def make_energy_table(
     trained: Trained | None,
     *,
     seed: int,
-) -> EnergyTable:
-    """Return table IV, of the samples whose class has a network of its own; of all where none is trained (``trained`` is None)."""
+) -> tuple[dict[str, dict[str, Errors]], list[BaselineResult]]:
+    """Return errors of E by predictor and split, and the baselines' results (table IV).
+
+    They are of the samples whose class has a network of its own; of all samples where ``trained`` is None.
+    """
     networks = {} if trained is None or "height" not in data.card.layers else _fit_networks(ours, trained)
     grass = next((entry.id for entry in ours.classes.classes if entry.name == "grass" and entry.id in networks), None)
-    found, block_m = EnergyTable(), data.card.recipe.split.block_m
+    errors, results = dict[str, dict[str, Errors]](), list[BaselineResult]()
     for split, part in sets.items():
         rows = np.flatnonzero(np.isin(part.class_ids, list(networks)) | (not networks))
         same, mine = part.take(rows), {"E": said[split]["E"][rows]}
-        found.errors.setdefault(OURS, {})[split] = _compute_error(
-            mine, same, predict_spreads(ours, mine, same.class_ids)
-        )
+        errors.setdefault(OURS, {})[split] = _compute_error(mine, same, predict_spreads(ours, mine, same.class_ids))
         if not networks or not len(rows):
             continue
         theirs = {PER_CLASS: _predict_by_class_network(networks, same)}
         if grass is not None:
             theirs[GRASS_ONLY] = predict_costs(networks[grass], same.split)["E"]
         for name, energy in theirs.items():
-            found.errors.setdefault(name, {})[split] = _compute_error({"E": energy}, same)
-            found.compared += compare_with_baseline(name, split, same, mine, {"E": energy}, block_m=block_m, seed=seed)
-    return found
+            errors.setdefault(name, {})[split] = _compute_error({"E": energy}, same)
+            block_m = data.card.recipe.split.block_m
+            results += compare_with_baseline(name, split, same, mine, {"E": energy}, block_m=block_m, seed=seed)
+    return errors, results
 
 
 def _fit_networks(ours: Model, trained: Trained) -> dict[int, Model]:

@@ -63,7 +63,7 @@ from tcpipe.learning.predictions import (
 )
 from tcpipe.learning.training import Variant, compute_dataset_checksum, make_training_task, train
 from tcpipe.robots.profiles import Robot
-from tcpipe.splits.neighbours import CLOSE, PLACES, are_near, compute_middles_deg
+from tcpipe.splits.audit import CLOSE, PLACES, are_near, compute_middles_deg
 from tcpipe.tables.catalogue import read_threshold
 from tcpipe.tables.findings import Finding, Remedy, Subject, judge, make_finding
 from tcpipe.terrain.classes import NODATA_ID
@@ -136,7 +136,7 @@ def evaluate(
 
     ablation = list(_iterate_ablation(ours, sets, config, trained))
     with_networks = config.baselines and fitting.model == "resnet18"
-    energy = make_energy_table(ours, data, sets, said, trained if with_networks else None, seed=config.seed)
+    energy, networks = make_energy_table(ours, data, sets, said, trained if with_networks else None, seed=config.seed)
     baselines, lacking = compare_baselines(ours, data, sets, said, seed=config.seed)
     evaluation = Evaluation(
         tcpipe_version=__version__,
@@ -146,15 +146,15 @@ def evaluate(
         config=config,
         splits={name: _split_errors(data, part, said[name], spreads[name], plant) for name, part in sets.items()},
         ablation=tuple(ablation),
-        energy=energy.errors,
-        networks=tuple(energy.compared),
+        energy=energy,
+        networks=tuple(networks),
         time=_time(ours, sets, said, max_velocity_mps=_find_fastest_mps(ours.robot, data)),
         baselines=tuple(baselines),
         blocks=compute_block_errors(ours, names),
         repeatability=_estimate_repeatability(data.card, ENERGIES[ours.label_energy]),
         plots={name: _select_plotted(part, said[name], config.plotted) for name, part in sets.items()},
     )
-    findings = (*lacking, *_find_mismatches(ours, data, sets, energy.errors), *find_weaknesses(evaluation))
+    findings = (*lacking, *_find_mismatches(ours, data, sets, energy), *find_weaknesses(evaluation))
     evaluation = replace(evaluation, findings=findings, verdict=judge(findings))
     return evaluation, make_predictions_table(sets, said, spreads)
 

@@ -97,7 +97,8 @@ def predict_costs(
     replaced = [model.channels.index(name) for name in noise]
     parts = [np.empty((0, len(model.card.outputs)), np.float32)]
     extra_features, first = read_extra_features(split), 0
-    for patches in _iterate_patches(chosen):
+    while first < len(chosen):
+        patches = chosen.batch(np.arange(first, min(first + _TOGETHER, len(chosen))))[0].copy()
         for channel in replaced:
             patches[..., channel] = rng.random(patches.shape[:3], np.float32)
         parts.append(model.predict(patches, extra_features.take(slice(first, first + len(patches)))))
@@ -120,14 +121,9 @@ def predict_spreads(model: Model, said: Mapping[str, Array], class_ids: NDArray[
     found = {}
     for quantity, costs_of in said.items():
         errors, d = stated[CALLED[quantity]], scale[quantity]
-        low, high = errors.of_pieces(costs_of / d, class_ids)
-        found[quantity] = Spread(d * errors.spread(costs_of / d, class_ids), d * low, d * high)
+        low, high = errors.compute_intervals(costs_of / d, class_ids)
+        found[quantity] = Spread(d * errors.compute_std(costs_of / d, class_ids), d * low, d * high)
     return found
-
-
-def _iterate_patches(split: Split) -> Iterator[NDArray[np.float32]]:
-    for first in range(0, len(split), _TOGETHER):
-        yield split.batch(np.arange(first, min(first + _TOGETHER, len(split))))[0].copy()
 
 
 def check_origin(card: ModelCard, data: Dataset, name: str) -> None:

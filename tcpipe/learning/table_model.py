@@ -154,16 +154,8 @@ def read_forest(arrays: Mapping[str, NDArray[Any]], where: str) -> Forest:
     return made
 
 
-@dataclass(frozen=True, slots=True)
-class CrossFittedForest:
-    """Trees of all samples, and what those of the other folds said of each sample, shape (N, outputs)."""
-
-    forest: Forest
-    held_out: Floats
-
-
-def grow(features: Floats, labels: Floats, weights: Floats, folds: NDArray[np.generic]) -> CrossFittedForest:
-    """Fit trees of every output, as many as are best where each fold is predicted by the others.
+def grow(features: Floats, labels: Floats, weights: Floats, folds: NDArray[np.generic]) -> tuple[Forest, Floats]:
+    """Fit trees of every output, as many as are best where each fold is predicted by the others; return these predictions, too.
 
     Parameters
     ----------
@@ -180,7 +172,7 @@ def grow(features: Floats, labels: Floats, weights: Floats, folds: NDArray[np.ge
         LightGBM is not installed, or cannot be loaded.
 
     """
-    lightgbm, planted, held_out = _load_lightgbm(), _ForestBuilder(), np.empty(labels.shape)
+    lightgbm, held_out, trees = _load_lightgbm(), np.empty(labels.shape), list[tuple[Mapping[str, Any], int]]()
     for number, (label, weight) in enumerate(zip(labels.T, weights.T, strict=True)):
         errors, by_fold = np.zeros(MOST_ROUNDS), []
         for fold in np.unique(folds):
@@ -197,41 +189,31 @@ def grow(features: Floats, labels: Floats, weights: Floats, folds: NDArray[np.ge
         for held, booster in by_fold:
             held_out[held, number] = booster.predict(features[held], num_iteration=rounds)
         whole = lightgbm.train(_RULES, lightgbm.Dataset(features, label, weight=weight), rounds)
-        for tree in whole.dump_model()["tree_info"]:
-            planted.plant(tree["tree_structure"], number)
-    return CrossFittedForest(planted.forest(), held_out)
+        trees += [(tree["tree_structure"], number) for tree in whole.dump_model()["tree_info"]]
+    return _make_forest(trees), held_out
 
 
-class _ForestBuilder:
-    """Nodes and trees so far."""
+def _make_forest(trees: Sequence[tuple[Mapping[str, Any], int]]) -> Forest:
+    """Return trees of LightGBM's dump, each with its output, as arrays."""
+    nodes: list[tuple[int, float, tuple[int, int], float]] = []
 
-    def __init__(self) -> None:
-        self._nodes: list[tuple[int, float, tuple[int, int], float]] = []
-        self._trees: list[tuple[int, int, int]] = []
-
-    def plant(self, tree: Mapping[str, Any], output: int) -> None:
-        """Add a tree of LightGBM's dump."""
-        root = len(self._nodes)
-        self._trees.append((root, self._add(tree), output))
-
-    def forest(self) -> Forest:
-        """Return everything as arrays."""
-        feature, threshold, child, value = zip(*self._nodes, strict=True)
-        root, depth, output = (np.array(values, np.uint32) for values in zip(*self._trees, strict=True))
-        as_indices = (np.array(values, np.uint32) for values in (feature, child))
-        return Forest(next(as_indices), np.array(threshold), next(as_indices), np.array(value), root, depth, output)
-
-    def _add(self, node: Mapping[str, Any]) -> int:
+    def add_node(node: Mapping[str, Any]) -> int:
         """Append a node and all below it; return how many steps that goes down."""
-        at = len(self._nodes)
-        self._nodes.append((0, 0.0, (at, at), float(node.get("leaf_value", 0.0))))
+        at = len(nodes)
+        nodes.append((0, 0.0, (at, at), float(node.get("leaf_value", 0.0))))
         if "leaf_value" in node:
             return 0
-        below = self._add(node["left_child"])
-        second = len(self._nodes)
-        below = max(below, self._add(node["right_child"]))
-        self._nodes[at] = int(node["split_feature"]), float(node["threshold"]), (at + 1, second), 0.0
+        below = add_node(node["left_child"])
+        second = len(nodes)
+        below = max(below, add_node(node["right_child"]))
+        nodes[at] = int(node["split_feature"]), float(node["threshold"]), (at + 1, second), 0.0
         return 1 + below
+
+    roots = [(len(nodes), add_node(tree), output) for tree, output in trees]
+    feature, threshold, child, value = zip(*nodes, strict=True)
+    root, depth, output = np.array(roots, np.uint32).T.copy()
+    indices = np.array(feature, np.uint32), np.array(child, np.uint32)
+    return Forest(indices[0], np.array(threshold), indices[1], np.array(value), root, depth, output)
 
 
 def _load_lightgbm() -> Any:
@@ -330,6 +312,6 @@ def fit_table(
         held = folds == fold
         others = fit_curves("linear", slope_rad[~held], class_id[~held], labels[~held])
         told[held] = others.predict(slope_rad[held], class_id[held])
-    grown = grow(features, labels - told, weights, folds)
+    forest, held_out = grow(features, labels - told, weights, folds)
     curves = fit_curves("linear", slope_rad, class_id, labels)
-    return TableModel(curves, grown.forest, tuple(channels), class_count), told + grown.held_out
+    return TableModel(curves, forest, tuple(channels), class_count), told + held_out

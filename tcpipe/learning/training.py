@@ -47,6 +47,9 @@ FEW_SAMPLES = 20_000
 _CALLED = {"turn_radpm": "turn (mean_abs_yaw_rate_radps)", "command_mps": "commanded speed (commanded_velocity_mps)"}
 
 
+_OPTIMIZERS: Mapping[ModelKind, str] = {"resnet18": "Adam", "boosting": "LightGBM", "physics": "robust least squares"}
+
+
 @dataclass(frozen=True, slots=True)
 class Variant:
     """What another network than the paper's is trained on: its baselines, and its ablation when it is trained anew."""
@@ -109,10 +112,8 @@ def model_for(dataset: str | Path) -> ModelKind:
     count = read_card(fetch_directory_by_range(dataset, by_range=is_shard)[0]).splits.get("train", 0)
     kind: ModelKind = "boosting" if count < FEW_SAMPLES else "resnet18"
     than, other = ("fewer than", "resnet18") if kind == "boosting" else ("not fewer than", "boosting")
-    logger.info(
-        "%d training samples, %s %d: tcpipe trains a model of kind %s; to train the other kind: --model %s",
-        *(count, than, FEW_SAMPLES, kind, other),
-    )
+    message = "%d training samples are %s %d: a %s is trained; --model %s is the other choice"
+    logger.info(message, count, than, FEW_SAMPLES, kind, other)
     return kind
 
 
@@ -282,13 +283,10 @@ def find_training_range(split: Split) -> TrainingRange:
     ranges = {name: (float(np.min(of)), float(np.max(of))) for name, of in slopes.items()}
     if reliefs_m:
         ranges["relief_m"] = (min(reliefs_m), max(reliefs_m))
-    return TrainingRange(_count_classes(split), tuple(sorted(pixel_classes)), ranges)
-
-
-def _count_classes(split: Split) -> dict[int, int]:
-    found = split.column("terrain_class").astype(np.float64)
-    ids, counts = np.unique(found[np.isfinite(found)].astype(int), return_counts=True)
-    return dict(zip(ids.tolist(), counts.tolist(), strict=True))
+    class_ids = split.column("terrain_class").astype(np.float64)
+    ids, counts = np.unique(class_ids[np.isfinite(class_ids)].astype(int), return_counts=True)
+    class_counts = dict(zip(ids.tolist(), counts.tolist(), strict=True))
+    return TrainingRange(class_counts, tuple(sorted(pixel_classes)), ranges)
 
 
 def _read_known_card(place: Path) -> ModelCard | None:
@@ -372,6 +370,7 @@ def _make_unchanged_result(place: Path | str, told: Training) -> TrainResult:
 
 def _make_card(data: Dataset, task: Task, config: FitConfig, fitted: Fitted, key: str) -> ModelCard:
     card, form = data.card, task.fit.view.form
+    used = task.fit if config.model == "resnet18" else task.train
     return ModelCard(
         architecture=Architecture(
             card.patch_px,
@@ -392,36 +391,25 @@ def _make_card(data: Dataset, task: Task, config: FitConfig, fitted: Fitted, key
         label_includes=card.label.includes,
         robot=", ".join(card.robots),
         classes=read_class_table(card).classes,
-        training_range=find_training_range(
-            (task.fit if config.model == "resnet18" else task.train).with_channels(*card.layers)
-        ),
+        training_range=find_training_range(used.with_channels(*card.layers)),
         physics=card.physics.get(card.robots[0]) if len(card.robots) == 1 else None,
         dataset=TrainedOn(card.name, compute_dataset_checksum(card), card.data_model_version, card.splits),
-        training=_describe_training(task, config, fitted, key),
+        training=Training(
+            key=key,
+            config=config,
+            optimizer=_OPTIMIZERS[config.model],
+            samples={"fitted": len(used), "held out": len(fitted.held)},
+            epochs=fitted.progress.epoch,
+            best_epoch=fitted.progress.best_epoch,
+            held_out_loss=fitted.progress.best_loss,
+            device=fitted.device,
+        ),
     )
 
 
 def read_class_table(card: DatasetCard) -> ClassTable:
     """Return a dataset's class table; one without a terrain layer has the paper's."""
     return ClassTable(card.classes) if card.classes else PAPER_CLASSES
-
-
-_OPTIMIZERS: Mapping[ModelKind, str] = {"resnet18": "Adam", "boosting": "LightGBM", "physics": "robust least squares"}
-
-
-def _describe_training(task: Task, config: FitConfig, fitted: Fitted, key: str) -> Training:
-    """Return what a model card tells of its training."""
-    progress = fitted.progress
-    return Training(
-        key=key,
-        config=config,
-        optimizer=_OPTIMIZERS[config.model],
-        samples={"fitted": len(task.fit if config.model == "resnet18" else task.train), "held out": len(fitted.held)},
-        epochs=progress.epoch,
-        best_epoch=progress.best_epoch,
-        held_out_loss=progress.best_loss,
-        device=fitted.device,
-    )
 
 
 def _make_residuals_table(fitted: Fitted, outputs: tuple[str, ...]) -> pa.Table:

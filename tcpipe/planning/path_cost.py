@@ -12,7 +12,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 from pyarrow import csv
-from pyproj import CRS, Geod
+from pyproj import Geod
 
 from tcpipe.cost.prediction_errors import COVERAGE, fit_errors
 from tcpipe.errors import PathError, UsageError
@@ -98,16 +98,12 @@ def compute_path_cost(model: CostModel, source: MapReader, lonlat_deg: Floats, *
     frames = pieces.frames(model.chord_m)
     if not count_corners_on(source.grid, compute_footprints(frames, model.patch_m)).any():
         raise PathError(describe_off_map(source, where, lonlat_deg))
-    turn_radpm = _turn_radpm(model, compute_turns(pieces.start_xy_m, pieces.end_xy_m) / pieces.arc_m)
+    turn_radpm = compute_turns(pieces.start_xy_m, pieces.end_xy_m) / pieces.arc_m
+    usual_radpm = 0.0 if model.physics is None else model.physics.mean_turn_radpm
+    turn_radpm[turn_radpm <= usual_radpm] = np.nan  # as usual: nobody drives as straight as a line is drawn
     said = join_predictions(predict_segments(model, source, iterate_batches(frames), turn_radpm=turn_radpm))
     said.reasons[pieces.arc_m > model.max_arc_to_chord * pieces.chord_m] |= np.uint16(Reason.CURVED)
     return _sum_costs(model, source, pieces, said)
-
-
-def _turn_radpm(model: CostModel, planned_radpm: Floats) -> Floats:
-    """Return how far metres turn: as planned, but NaN, as usual, where that is less: nobody drives as straight as a line is drawn."""
-    usual_radpm = 0.0 if model.physics is None else model.physics.mean_turn_radpm
-    return np.where(planned_radpm > usual_radpm, planned_radpm, np.nan)
 
 
 def cut_into_pieces(source: MapReader, lonlat_deg: Floats, *, chord_m: float, where: str) -> Pieces:
@@ -117,7 +113,7 @@ def cut_into_pieces(source: MapReader, lonlat_deg: Floats, *, chord_m: float, wh
     if not np.isfinite(xy_m).all():
         raise PathError(f"{where}: points of it lie outside the area where the CRS of map {source.name} is defined")
     length_m = float(np.linalg.norm(np.diff(xy_m, axis=0), axis=1).sum()) if len(xy_m) > 1 else 0.0
-    scale = compute_ground_scale(projection.target, xy_m)
+    scale = float(np.mean(np.sqrt(np.abs(np.linalg.det(make_metres_from_plane(projection.target, xy_m))))))
     if not length_m:
         raise PathError(f"{where}: is one point; wanted a path of at least {chord_m:g} m")
     pieces = cut_path(xy_m, chord_m=chord_m, scale=scale)
@@ -139,9 +135,12 @@ def _sum_costs(model: CostModel, source: MapReader, pieces: Pieces, said: Segmen
     turn_joule = np.where(np.isfinite(energy), turn_joule, np.nan)
     (fast, slow), (least, most), sums = (nothing, nothing), (nothing, nothing), None
     if errors is not None:
-        fast, slow = errors["duration"].of_pieces(duration, class_id)
-        least, most = errors["energy"].of_pieces(energy, class_id)
-        sums = errors["duration"].of_sum(duration, class_id), errors["energy"].of_sum(energy, class_id)
+        fast, slow = errors["duration"].compute_intervals(duration, class_id)
+        least, most = errors["energy"].compute_intervals(energy, class_id)
+        sums = (
+            errors["duration"].compute_sum_interval(duration, class_id),
+            errors["energy"].compute_sum_interval(energy, class_id),
+        )
     table = PIECES.table(
         piece=np.arange(len(bits)),
         **_locate_pieces(source, pieces),
@@ -296,11 +295,6 @@ class Pieces:
         along = (self.end_xy_m - self.start_xy_m) / np.linalg.norm(self.end_xy_m - self.start_xy_m, axis=1)[:, None]
         start = self.end_xy_m - along * (chord_m / self.scale)
         return patch_frames(start, self.end_xy_m, np.full(len(start), chord_m))
-
-
-def compute_ground_scale(crs: CRS, xy_m: Floats) -> float:
-    """Return metres of ground a metre of the map's plane, the mean over points of shape (N, 2)."""
-    return float(np.mean(np.sqrt(np.abs(np.linalg.det(make_metres_from_plane(crs, xy_m))))))
 
 
 def cut_path(xy_m: Floats, *, chord_m: float, scale: float) -> Pieces:

@@ -75,7 +75,8 @@ def make_steps(costs: CostGrid, objective: str, open_: NDArray[np.bool_], metres
     """
     rows, cols = costs.grid.rows, costs.grid.cols
     per_metre = costs.per_metre(objective)
-    height = np.nan_to_num(costs.height_m.astype(np.float64), nan=_compute_middle(costs))
+    known_m = costs.height_m[np.isfinite(costs.height_m)]
+    height = np.nan_to_num(costs.height_m.astype(np.float64), nan=float(np.median(known_m)) if known_m.size else 0.0)
     parts: list[tuple[NDArray[np.int64], NDArray[np.int64], Floats, Floats, Floats]] = []
     for course in range(COURSES):
         east, north = MOVES[course].tolist()
@@ -97,11 +98,6 @@ def make_steps(costs: CostGrid, objective: str, open_: NDArray[np.bool_], metres
         rise = height.reshape(-1)[end] - height.reshape(-1)[begin]
         parts.append((begin, end, mean[i, j] * length_m, np.full(i.size, length_m), rise))
     return Steps(*(np.concatenate(column) for column in zip(*parts, strict=True)))
-
-
-def _compute_middle(costs: CostGrid) -> float:
-    known = costs.height_m[np.isfinite(costs.height_m)]
-    return float(np.median(known)) if known.size else 0.0
 
 
 def find_best_potential(steps: Steps) -> float:
@@ -138,7 +134,8 @@ def find_least_cost_path(steps: Steps, cells: int, start: int, goal: int) -> Lea
     while path[-1] != start:
         path.append(int(before[path[-1]]))
     order = np.array(path[::-1])
-    return LeastCostPath(order, float(sum_path_cost(steps, order, cells)), float(cost[goal]), k, negative)
+    taken = np.isin(steps.begin * cells + steps.end, order[:-1] * cells + order[1:])
+    return LeastCostPath(order, float(steps.cost[taken].sum()), float(cost[goal]), k, negative)
 
 
 def compute_least_costs(steps: Steps, reduced: Floats, cells: int, start: int, goal: int, *, limit: float) -> Floats:
@@ -156,12 +153,6 @@ def compute_least_costs(steps: Steps, reduced: Floats, cells: int, start: int, g
 
 def _build_graph(steps: Steps, reduced: Floats, cells: int) -> csr_array:
     return csr_array((np.maximum(reduced, _LEAST), (steps.begin, steps.end)), shape=(cells, cells))
-
-
-def sum_path_cost(steps: Steps, path: NDArray[np.int64], cells: int) -> float:
-    """Return the summed cost of the steps of a path."""
-    taken = np.isin(steps.begin * cells + steps.end, path[:-1] * cells + path[1:])
-    return float(steps.cost[taken].sum())
 
 
 _CLASSES = 256
@@ -227,9 +218,10 @@ def find_least_turning_path(
     start, goal : flat indices of cells.
     joule_per_rad : what a turn costs in each cell, shape (cells,).
     """
-    cells, first, end = _number_nodes(steps, start, goal)
-    if cells is None:
+    cells, place = np.unique(np.concatenate([steps.begin, steps.end]), return_inverse=True)
+    if not np.isin([start, goal], cells).all():
         return None
+    first, end = np.split(place, 2)
     k = find_best_potential(steps)
     reduced = steps.cost - k * steps.rise_m
     course = _find_courses(steps, cols)
@@ -257,13 +249,6 @@ def find_least_turning_path(
     taken = np.isin(steps.begin * len(joule_per_rad) + steps.end, order[:-1] * len(joule_per_rad) + order[1:])
     total = float(cost[last] + k * steps.rise_m[taken].sum())
     return LeastCostPath(order, total, float(cost[last]), k, int(np.count_nonzero(reduced < 0.0)))
-
-
-def _number_nodes(steps: Steps, start: int, goal: int) -> tuple[Ints | None, Ints, Ints]:
-    """Return the cells that steps begin or end in, rising, and the place of each step's ends among them; None where an end is not one."""
-    cells, place = np.unique(np.concatenate([steps.begin, steps.end]), return_inverse=True)
-    first, end = place[: len(steps.begin)], place[len(steps.begin) :]
-    return (cells if np.isin([start, goal], cells).all() else None), first, end
 
 
 def _find_courses(steps: Steps, cols: int) -> Ints:

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.compiled import compile_kernel
 from tcpipe.cost.prediction_errors import BiasCorrection, fit_bias_correction
 from tcpipe.planning.cost_model import CostModel, predict_patches
 from tcpipe.tables.bits import flag_name
@@ -20,44 +19,6 @@ from tcpipe.terrain.layers import HEIGHT_STEP_M
 from tcpipe.terrain.patches import PatchFrames, compute_footprints, count_corners_on
 from tcpipe.terrain.sampling import Patches, compute_relief_m, sample_patches
 from tcpipe.terrain.tiles import MapReader, TilePool, level_for
-
-
-@compile_kernel
-def find_class_facts(  # noqa: PLR0917
-    terrain: NDArray[np.uint8],
-    known: NDArray[np.uint8],
-    blocked: NDArray[np.uint8],
-    lane_first: int,
-    lane_last: int,
-    out_unknown: NDArray[np.bool_],
-    out_blocked: NDArray[np.float64],
-) -> None:
-    """Tell whether a patch has a pixel of a class that is not ``known``, and which share of its lane is ``blocked``.
-
-    Parameters
-    ----------
-    terrain
-        Class ids, shape (N, px, px).
-    known, blocked
-        1 or 0 by class id, shape (256,).
-    lane_first, lane_last
-        First row of the lane, and the one after its last.
-    out_unknown, out_blocked
-        Shape (N,).
-    """
-    px = terrain.shape[1]
-    for n in range(terrain.shape[0]):
-        count = 0
-        for r in range(px):
-            for c in range(px):
-                count += known[terrain[n, r, c]]
-        out_unknown[n] = count < px * px
-        shut = 0
-        for r in range(lane_first, lane_last):
-            for c in range(px):
-                shut += blocked[terrain[n, r, c]]
-        out_blocked[n] = shut / ((lane_last - lane_first) * px)
-
 
 LANE_M = 0.7
 """Width of the strip that a robot needs, about the paper's Husky (0.67 m) [m]."""
@@ -135,18 +96,20 @@ def _find_class_reasons(patches: Patches, terrain: NDArray[np.uint8], model: Cos
     bits = np.zeros(len(terrain), np.uint16)
     bits[~traversable[patches.terrain_class]] |= np.uint16(Reason.NOT_TRAVERSABLE)
     bits[patches.terrain_class == NODATA_ID] |= np.uint16(Reason.NODATA)
-    seen, known = np.zeros(256, np.bool_), np.zeros(256, np.uint8)
+    seen, known = np.zeros(256, np.bool_), np.zeros(256, np.bool_)
     seen[[class_id for class_id, count in model.class_counts.items() if count > 0]] = True
-    known[list(model.pixel_classes)] = 1
+    known[list(model.pixel_classes)] = True
     if model.classes != source.classes:
-        seen[:], known[:] = True, 1
+        seen[:], known[:] = True, True
     px = terrain.shape[1]
     lane = np.flatnonzero(np.abs((np.arange(px) + 0.5) / px - 0.5) * model.patch_m <= LANE_M / 2.0)
-    unknown, shut = np.empty(len(terrain), np.bool_), np.empty(len(terrain))
-    blocked = (~traversable).astype(np.uint8)
-    find_class_facts(terrain, known, blocked, int(lane[0]), int(lane[-1]) + 1, unknown, shut)
+    of_pixels = (
+        (~known + 2 * ~traversable).astype(np.uint8).take(terrain)
+    )  # 1: unknown, 2: blocked; one pass over the pixels
+    unknown = (of_pixels & 1).any(axis=(1, 2))
+    blocked = np.count_nonzero(of_pixels[:, lane[0] : lane[-1] + 1] & 2, axis=(1, 2)) / (lane.size * px)
     bits[~seen[patches.terrain_class] | unknown] |= np.uint16(Reason.CLASS_OUTSIDE_TRAINING)
-    bits[shut > _STRAY] |= np.uint16(Reason.OBSTACLE)
+    bits[blocked > _STRAY] |= np.uint16(Reason.OBSTACLE)
     return bits
 
 

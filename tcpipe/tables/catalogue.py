@@ -9,12 +9,12 @@ from functools import cache
 from hashlib import sha256
 from importlib.resources import files
 from string import Formatter
-from typing import Literal, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 Severity: TypeAlias = Literal["error", "warning", "note"]
 Affected: TypeAlias = Literal["position", "time", "energy"]
 Action: TypeAlias = Literal["kept", "corrected", "inflated", "excluded", "rejected"]
-"""What tcpipe did with the subject of a finding: inflated means that its standard deviations were raised."""
+"""What tcpipe did with the subject of a finding; inflated: raised its standard deviations."""
 
 SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")
 AFFECTED: tuple[Affected, ...] = ("position", "time", "energy")
@@ -64,7 +64,11 @@ class Entry:
 @cache
 def read_catalogue() -> Mapping[str, Entry]:
     """Return the entries by code, in the order of the file."""
-    return {code: _make_entry(values) for code, values in tomllib.loads(_read_text()).items()}
+    entries = dict[str, Entry]()
+    for code, values in tomllib.loads(_read_text()).items():
+        fields: dict[str, Any] = {name: tuple(of) if isinstance(of, list) else of for name, of in values.items()}
+        entries[code] = Entry(**fields)
+    return entries
 
 
 def read_sections() -> dict[str, list[str]]:
@@ -77,10 +81,6 @@ def read_sections() -> dict[str, list[str]]:
         elif line.startswith("[") and "." not in line:
             codes.append(line.strip("[]"))
     return sections
-
-
-def _make_entry(values: Mapping[str, object]) -> Entry:
-    return Entry(**{name: tuple(of) if isinstance(of, list) else of for name, of in values.items()})  # type: ignore[arg-type]
 
 
 @cache

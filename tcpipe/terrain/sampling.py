@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.compiled import compile_kernel
 from tcpipe.terrain.layers import HEIGHT_STEP_M, STACKS, group_stacks
 from tcpipe.terrain.patches import PatchFrames, map_px_from_patch, sample_chord_px
 from tcpipe.terrain.sampling_kernel import HEIGHT_NODATA, Ground, Stacks, sample_tiles
@@ -19,21 +18,8 @@ from tcpipe.terrain.tiles import MapReader, TilePool, group_by_tile, level_for, 
 
 def compute_relief_m(height: NDArray[np.uint16]) -> NDArray[np.float64]:
     """Return the largest difference of the stored heights of patches, shape (N, px, px), without data left out [m], shape (N,)."""
-    steps = np.empty(len(height), np.uint16)
-    _find_relief_steps(height, steps)
-    return steps.astype(np.float64) * HEIGHT_STEP_M
-
-
-@compile_kernel
-def _find_relief_steps(height: NDArray[np.uint16], out: NDArray[np.uint16]) -> None:
-    """Write the largest stored height of each patch, shape (N, px, px), to ``out``, (N,): they are above its lowest pixel."""
-    flat = height.reshape(height.shape[0], -1)
-    for n in range(flat.shape[0]):
-        most = np.uint16(0)
-        for k in range(flat.shape[1]):
-            value = flat[n, k] if flat[n, k] != HEIGHT_NODATA else np.uint16(0)
-            most = max(most, value)
-        out[n] = most
+    steps = np.where(height == HEIGHT_NODATA, np.uint16(0), height).max(axis=(1, 2), initial=np.uint16(0))
+    return np.asarray(steps * HEIGHT_STEP_M)
 
 
 _MOVED_ROWS = 128

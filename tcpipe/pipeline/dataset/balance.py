@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import pyarrow as pa
@@ -30,7 +29,6 @@ from tcpipe.balance.cells import (
     fit_cell_gradients,
 )
 from tcpipe.balance.correlation import (
-    Floor,
     compute_slope_residuals,
     estimate_correlations,
     estimate_repeatability,
@@ -41,6 +39,7 @@ from tcpipe.formats.geojson import Feature, FeatureCollection, PolygonGeometry
 from tcpipe.formats.maps.map_files import MapFile
 from tcpipe.splits.assignment import SPLITS
 from tcpipe.splits.regions import Regions
+from tcpipe.tables.arrays import to_texts
 from tcpipe.tables.catalogue import read_threshold
 from tcpipe.tables.columns import to_floats, to_integers
 from tcpipe.terrain.projection import Projection, compute_area, parse_crs
@@ -59,20 +58,6 @@ _USED = tuple(name for name in SPLITS if name != "buffer")
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
-
-
-@dataclass(frozen=True, slots=True)
-class _Samples:
-    """Columns of N samples, (N,) each; ``xy_m`` is the footprint's centre in the first map's plane, (N, 2)."""
-
-    split: NDArray[np.str_]
-    run: Ints
-    start_ns: Ints
-    course_rad: Floats
-    terrain: Ints
-    slope: Floats
-    labels: Mapping[str, Floats]
-    xy_m: Floats
 
 
 def measure_balance(
@@ -94,60 +79,43 @@ def measure_balance(
     sources : the maps; the first counts where they overlap.
     regions, buffer_m : of the split, in WGS84 lon/lat [deg] and [m]: excluded ground and the buffer are not worth driving.
     """
-    samples = _collect_samples(table, xy_m, velocity_column)
-    left = {
-        name: compute_slope_residuals(values, samples.terrain, samples.slope) for name, values in samples.labels.items()
-    }
-    alike = estimate_correlations(
-        {name: left[name] for name in ("power_watt", velocity_column)},
+    split, slope = to_texts(table.column("split")), to_floats(table, "slope_rad")
+    terrain = table.column("terrain_class").fill_null(0).to_numpy().astype(np.int64)
+    labels = {name: to_floats(table, name) for name in ("power_watt", velocity_column, "duration_s", "energy_joule")}
+    residuals = {name: compute_slope_residuals(values, terrain, slope) for name, values in labels.items()}
+    run = table.column("run_id").combine_chunks().dictionary_encode().indices.to_numpy().astype(np.int64)
+    correlations = estimate_correlations(
+        {name: residuals[name] for name in ("power_watt", velocity_column)},
         xy_m,
-        samples.run,
-        samples.start_ns,
+        run,
+        to_integers(table, "start_ns"),
         chord_m=chord_m,
     )
-    known = [found for found in alike.values() if found is not None]
-    slopes, edges = find_slope_ranges(samples.slope), choose_speed_edges(samples.labels[velocity_column])
-    speeds = np.searchsorted(edges, samples.labels[velocity_column], side="right").astype(np.int64)
-    pairs = count_cells((samples.terrain, slopes), samples.split, xy_m, known, splits=_USED)
-    cells = count_cells((samples.terrain, slopes, speeds), samples.split, xy_m, known, splits=_USED)
+    known = [correlation for correlation in correlations.values() if correlation is not None]
+    slopes, edges = find_slope_ranges(slope), choose_speed_edges(labels[velocity_column])
+    speeds = np.searchsorted(edges, labels[velocity_column], side="right").astype(np.int64)
+    pairs = count_cells((terrain, slopes), split, xy_m, known, splits=_USED)
+    cells = count_cells((terrain, slopes, speeds), split, xy_m, known, splits=_USED)
     grounds = [
         _OpenGround(source, sources[:number], sources[0], regions, buffer_m) for number, source in enumerate(sources)
     ]
     names = dict(enumerate(sources[0].classes.names().tolist()))
-    rows, features = _count_by_ground(pairs, grounds, samples, slopes, names)
+    used = split != "buffer"
+    rows, features = _count_by_ground(pairs, grounds, (terrain[used], slopes[used], xy_m[used]), names)
+    repeated = find_repeated_pairs(xy_m, to_floats(table, "course_rad"), terrain, chord_m=chord_m)
     balance = Balance(
         slope_edges_deg=SLOPE_EDGES_DEG,
         speed_edges_mps=tuple(edges),
         enough_effective=read_threshold("thin-ground", "enough_count"),
-        correlation=alike,
+        correlation=correlations,
         by_class_and_slope=tuple(rows),
         cells=tuple(_make_row(cell, names, edges) for cell in cells),
-        repeatability=dict(_iterate_floors(samples, left, chord_m)),
+        repeatability={
+            name: estimate_repeatability(values, residuals[name], repeated, xy_m, chord_m=chord_m)
+            for name, values in labels.items()
+        },
     )
     return balance, FeatureCollection(tuple(features))
-
-
-def _collect_samples(table: pa.Table, xy_m: Floats, velocity_column: str) -> _Samples:
-    labels = ("power_watt", velocity_column, "duration_s", "energy_joule")
-    splits, runs = (table.column(name).combine_chunks().dictionary_encode() for name in ("split", "run_id"))
-    return _Samples(
-        split=np.array(splits.dictionary.to_pylist(), np.str_)[splits.indices.to_numpy()],
-        run=runs.indices.to_numpy().astype(np.int64),
-        start_ns=to_integers(table, "start_ns"),
-        course_rad=to_floats(table, "course_rad"),
-        terrain=table.column("terrain_class").fill_null(0).to_numpy().astype(np.int64),
-        slope=to_floats(table, "slope_rad"),
-        labels={name: to_floats(table, name) for name in labels},
-        xy_m=xy_m,
-    )
-
-
-def _iterate_floors(
-    samples: _Samples, left: Mapping[str, Floats], chord_m: float
-) -> Iterator[tuple[str, Floor | None]]:
-    pairs = find_repeated_pairs(samples.xy_m, samples.course_rad, samples.terrain, chord_m=chord_m)
-    for name, values in samples.labels.items():
-        yield name, estimate_repeatability(values, left[name], pairs, samples.xy_m, chord_m=chord_m)
 
 
 def _make_row(cell: Cell, names: Mapping[int, str], edges: Sequence[float]) -> CellRow:
@@ -243,9 +211,16 @@ def _read_ground(source: MapFile) -> MapGround:
 
 
 def _count_by_ground(
-    pairs: Sequence[Cell], grounds: Sequence[_OpenGround], samples: _Samples, slopes: Ints, names: Mapping[int, str]
+    pairs: Sequence[Cell],
+    grounds: Sequence[_OpenGround],
+    driven_by: tuple[Ints, Ints, Floats],
+    names: Mapping[int, str],
 ) -> tuple[list[CellRow], list[Feature]]:
-    """Return a row for each class and slope that was driven or that the maps offer, and the polygons to drive next."""
+    """Return a row for each class and slope that was driven or that the maps offer, and the polygons to drive next.
+
+    ``driven_by`` has class, range of slope and place [m] of each sample outside the buffer.
+    """
+    terrain, slopes, xy_m = driven_by
     driven = {(cell.terrain_class, cell.slope): cell for cell in pairs}
     kinds = {int(kind) for part in grounds for kind in np.unique(part.ground.terrain_class)} - {CLOSED}
     rows, thin = list[CellRow](), []
@@ -257,8 +232,8 @@ def _count_by_ground(
                 continue
             rows.append({**_make_row(cell, names, ()), "offered_m2": area_m2})
             if cell.is_undersampled and area_m2 > 0.0:
-                here = samples.xy_m[(samples.terrain == kind) & (slopes == slope) & (samples.split != "buffer")]
-                thin += [(cell, patch, lonlat) for part in grounds for patch, lonlat in part.patches(kind, slope, here)]
+                near = xy_m[(terrain == kind) & (slopes == slope)]
+                thin += [(cell, patch, lonlat) for part in grounds for patch, lonlat in part.patches(kind, slope, near)]
     thin.sort(key=lambda found: (found[0].effective or 0.0, found[0].terrain_class, found[0].slope, -found[1].area_m2))
     features = [
         _make_feature(rank, cell, patch, lonlat, names) for rank, (cell, patch, lonlat) in enumerate(thin, start=1)

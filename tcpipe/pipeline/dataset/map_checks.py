@@ -47,6 +47,9 @@ _LEFT_OVER, _NOT_SAMPLED = len(_REASONS) - 2, len(_REASONS) - 1
 _Ground = tuple[MapFile, Projection]
 """A map, and the projection of places onto it."""
 
+_Spans = tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]
+"""Start and end [ns] of segments, in order, and whether each is used."""
+
 
 def register_runs(
     runs: Sequence[RunDirectory], source: MapFile, recipe: Recipe
@@ -151,10 +154,12 @@ def find_removed_by_ground(
     ]
     table = sources[0].classes
     names = ["off the map", "no data", *table.names().tolist()[1:]]
-    spans = _Spans(segments, used)
+    spans, none = _list_spans(segments, used), np.empty(0, np.int64)
     by_class, by_slope = np.zeros((len(names), len(_REASONS))), np.zeros((len(_SLOPE_NAMES), len(_REASONS)))
     for run in runs:
-        length_m, reason, slope, ground = _read_intervals(run, spans.find_segments(run.run_id), grounds)
+        length_m, reason, slope, ground = _read_intervals(
+            run, spans.get(run.run_id, (none, none, none.astype(np.bool_))), grounds
+        )
         by_slope += sum_lengths_m(slope, reason, length_m, shape=by_slope.shape)
         by_class += sum_lengths_m(ground - OFF_THE_MAP, reason, length_m, shape=by_class.shape)
     slopes = list_groups(by_slope, _SLOPE_NAMES, _REASONS)
@@ -164,27 +169,23 @@ def find_removed_by_ground(
     return Removal(classes, slopes), (*findings, *_find_bias(slopes, "slope"))
 
 
-class _Spans:
-    """Start and end of every segment of a run, in order, and whether it is used."""
-
-    def __init__(self, segments: pa.Table, used: NDArray[np.int64]) -> None:
-        is_used = np.zeros(segments.num_rows, np.bool_)
-        is_used[used] = True
-        runs = segments.column("run_id").combine_chunks().dictionary_encode()
-        self._code = {run_id: code for code, run_id in enumerate(runs.dictionary.to_pylist())}
-        code = runs.indices.to_numpy(zero_copy_only=False)
-        start, end = (to_integers(segments, f"{name}_ns") for name in ("start", "end"))
-        order = np.lexsort((start, code))
-        self._run, self._start, self._end, self._used = code[order], start[order], end[order], is_used[order]
-
-    def find_segments(self, run_id: str) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]:
-        code = self._code.get(run_id, -1)
-        rows = slice(*np.searchsorted(self._run, [code, code + 1]))
-        return self._start[rows], self._end[rows], self._used[rows]
+def _list_spans(segments: pa.Table, used: NDArray[np.int64]) -> dict[str, _Spans]:
+    """Return by run start and end of its segments, in order, and whether each is used."""
+    is_used = np.zeros(segments.num_rows, np.bool_)
+    is_used[used] = True
+    runs = segments.column("run_id").combine_chunks().dictionary_encode()
+    code = runs.indices.to_numpy(zero_copy_only=False)
+    start, end = (to_integers(segments, f"{name}_ns") for name in ("start", "end"))
+    order = np.lexsort((start, code))
+    parts = np.split(order, np.searchsorted(code[order], np.arange(1, len(runs.dictionary))))
+    return {
+        run_id: (start[rows], end[rows], is_used[rows])
+        for run_id, rows in zip(runs.dictionary.to_pylist(), parts, strict=True)
+    }
 
 
 def _read_intervals(
-    run: RunDirectory, spans: tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]], grounds: Sequence[_Ground]
+    run: RunDirectory, spans: _Spans, grounds: Sequence[_Ground]
 ) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
     """Return length [m], reason, slope and class (ids as `find_classes_at`) of every interval of a run's track."""
     track = run.table("track", _TRACK_COLUMNS)

@@ -10,7 +10,7 @@ from contextlib import closing
 from dataclasses import dataclass, replace
 from io import BytesIO
 from pathlib import Path
-from typing import Any, overload
+from typing import Any
 from zipfile import BadZipFile
 
 import numpy as np
@@ -168,14 +168,8 @@ class _Batches(Sequence[_Batch]):
         """Return the number of batches."""
         return len(self.rows)
 
-    @overload
-    def __getitem__(self, index: int) -> _Batch: ...
-    @overload
-    def __getitem__(self, index: slice) -> Sequence[_Batch]: ...
-    def __getitem__(self, index: int | slice) -> _Batch | Sequence[_Batch]:
-        """Return one batch, or some."""
-        if isinstance(index, slice):
-            return replace(self, rows=self.rows[index])
+    def __getitem__(self, index: int) -> _Batch:  # type: ignore[override]  # nobody asks for slices
+        """Return one batch."""
         rows = self.rows[index]
         segments = self.whole.segments.take(pa.array(rows))
         return replace(self.whole, number=index, ranks=self.whole.ranks[rows], segments=segments)

@@ -3,38 +3,27 @@
 from pathlib import Path
 
 import pytest
-from made_models import CARD
+from made_models import made_comparison, made_evaluation
 
 from tcpipe.experiment.claims import CLAIMS, check_claims
 from tcpipe.experiment.reproduction_page import DIFFERENCES
 from tcpipe.learning.baselines import PER_CLASS
-from tcpipe.learning.evaluation_facts import (
-    BaselineResult,
-    EvaluateConfig,
-    EvaluatedDataset,
-    EvaluatedModel,
-    Evaluation,
-    SplitErrors,
-)
-from tcpipe.learning.metrics import Errors, Ratio
+from tcpipe.learning.evaluation_facts import SplitErrors
+from tcpipe.learning.metrics import Ratio
 
 SURE = Ratio(0.8, 0.7, 0.9)
 
 
 def _run(**ratios):
     rows = [
-        BaselineResult(
-            baseline=name, split="unseen", quantity=quantity, errors=Errors(10, 1.0, 1.0, 10),
-            rmse_ratio=ratios.get(name, SURE) if quantity == "E" else Ratio(9.0, 8.0, 10.0), mape_ratio=SURE, groups=9, drawn_by="blocks",
-        )
-        for name in CLAIMS for quantity in ("w", "E")
-    ]  # fmt: skip
-    return Evaluation(
-        tcpipe_version="", key="", model=EvaluatedModel("", "", CARD.training), dataset=EvaluatedDataset("", "", {}),
-        config=EvaluateConfig(), splits={"unseen": SplitErrors(10, {}, (), {}, {})}, ablation=(), energy={}, time={},
-        networks=tuple(row for row in rows if row.baseline == PER_CLASS),
-        baselines=tuple(row for row in rows if row.baseline != PER_CLASS), repeatability={}, plots={},
-    )  # fmt: skip
+        made_comparison(name, ratios.get(name, SURE) if quantity == "E" else Ratio(9.0, 8.0, 10.0), quantity=quantity)
+        for name in CLAIMS
+        for quantity in ("w", "E")
+    ]
+    networks = tuple(row for row in rows if row.baseline == PER_CLASS)
+    baselines = tuple(row for row in rows if row.baseline != PER_CLASS)
+    splits = {"unseen": SplitErrors(10, {}, (), {}, {})}
+    return made_evaluation(splits=splits, networks=networks, baselines=baselines)
 
 
 def _verdicts(runs):

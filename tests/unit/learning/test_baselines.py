@@ -4,13 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from made_models import CARD
+from made_models import CARD, made_comparison
 
 from tcpipe.dataset import Split, open_dataset
 from tcpipe.learning.baselines import SIMPLEST_FIRST, _group_samples, compare_baselines, describe_ratios, rank_model
-from tcpipe.learning.evaluation_facts import BaselineResult
 from tcpipe.learning.fitting import FitConfig
-from tcpipe.learning.metrics import Errors, Ratio, compute_costs
+from tcpipe.learning.metrics import Ratio, compute_costs
 from tcpipe.learning.models import Model
 from tcpipe.learning.predictions import collect_measured
 
@@ -86,34 +85,25 @@ def test_what_cannot_be_fitted_is_said(sets, monkeypatch):
     assert compare_baselines(model_of(), data, parts, {}, seed=0)[0] == []
 
 
-def row(baseline, rmse, ratio, quantity="E"):
-    return BaselineResult(
-        baseline=baseline, split="unseen", quantity=quantity, errors=Errors(50, rmse, 5.0, 50), rmse_ratio=ratio,
-        mape_ratio=ratio, groups=34, drawn_by="runs",
-    )  # fmt: skip
-
-
 def test_the_best_baseline_is_named_with_the_ratio_and_its_interval():
-    mean, linear = (
-        row("mean per class", 9.0, Ratio(0.5, 0.4, 0.6)),
-        row("class and slope, linear", 5.0, Ratio(0.9, 0.8, 0.97)),
-    )
+    mean = made_comparison("mean per class", Ratio(0.5, 0.4, 0.6), rmse=9.0)
+    linear = made_comparison("class and slope, linear", Ratio(0.9, 0.8, 0.97))
     assert describe_ratios([mean, linear]) == [
         "unseen, energy E: RMSE ratio to 'class and slope, linear', the best baseline, 0.90 (95 % CI 0.80 to 0.97, 34 runs)"
     ]
     assert rank_model([mean, linear], "unseen", "E").beats_all
-    trees = row("gradient boosting", 4.0, Ratio(1.25, 1.1, 1.4))
+    trees = made_comparison("gradient boosting", Ratio(1.25, 1.1, 1.4), rmse=4.0)
     worse = rank_model([mean, linear, trees], "unseen", "E")
     assert (worse.best, worse.beats_all, worse.beats_curves, worse.is_worse) == (trees, False, True, True)
-    alike = row("class and slope, spline", 4.5, Ratio(1.02, 0.95, 1.1))
+    alike = made_comparison("class and slope, spline", Ratio(1.02, 0.95, 1.1), rmse=4.5)
     same = rank_model([mean, alike], "unseen", "E")
     assert (same.beats_all, same.beats_curves, same.is_worse) == (False, False, False)
-    rounded = row("physics", 4.5, Ratio(1.0001, 1.00005, 1.0002))
+    rounded = made_comparison("physics", Ratio(1.0001, 1.00005, 1.0002), rmse=4.5)
     assert not rank_model([mean, rounded], "unseen", "E").is_worse
-    few = row("physics", 5.0, Ratio(0.5, None, None))
+    few = made_comparison("physics", Ratio(0.5, None, None), rmse=5.0)
     assert "34 runs are too few" in describe_ratios([few])[0]
     assert rank_model([few], "unseen", "E").beats_curves is None
-    assert describe_ratios([row("physics", 5.0, Ratio(None, None, None))]) == []
+    assert describe_ratios([made_comparison("physics", Ratio(None, None, None), rmse=5.0)]) == []
 
 
 class Places:

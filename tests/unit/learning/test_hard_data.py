@@ -42,10 +42,10 @@ def test_one_run_left_to_train_wants_another_or_blocks(bare, tmp_path):
     """Of two runs one tests; the other is one fold, of whatever length."""
     build_dataset(tmp_path / "dataset", store=bare / "store", holdout="run", recipe=Recipe())
     with pytest.raises(DatasetError, match="they are of whole runs: drive once more, or build it with --holdout block"):
-        train(tmp_path / "dataset", tmp_path / "model", config=FitConfig(model="table"))
+        train(tmp_path / "dataset", tmp_path / "model", config=FitConfig(model="boosting"))
 
 
-@pytest.mark.parametrize("kind", ["table", "physics"])
+@pytest.mark.parametrize("kind", ["boosting", "physics"])
 def test_heights_alone_are_enough(bare, tmp_path, kind):
     train(bare / "dataset", tmp_path / "model", config=FitConfig(model=kind))
     model = load_model(tmp_path / "model")
@@ -66,7 +66,7 @@ def test_heights_alone_are_enough(bare, tmp_path, kind):
         assert "is not on map site" in lines
 
 
-@pytest.mark.parametrize("kind", ["table", "physics"])
+@pytest.mark.parametrize("kind", ["boosting", "physics"])
 def test_three_samples_of_a_class_are_enough_to_be_told_something(dataset, tmp_path, kind, monkeypatch):
     three = real_column(open_dataset(dataset)["train"], "sample_id")[:3]
 
@@ -81,7 +81,7 @@ def test_three_samples_of_a_class_are_enough_to_be_told_something(dataset, tmp_p
     assert np.isfinite([row.errors.rmse for row in values.baselines]).all()
 
 
-@pytest.mark.parametrize("kind", ["table", "physics"])
+@pytest.mark.parametrize("kind", ["boosting", "physics"])
 def test_labels_that_are_all_equal_are_predicted_and_compared_with_nothing(dataset, tmp_path, kind, monkeypatch):
     monkeypatch.setattr(Split, "labels", property(lambda split: np.full((len(split), 2), [150.0, 0.8], np.float32)))
     train(dataset, tmp_path / "model", config=FitConfig(model=kind))
@@ -90,7 +90,7 @@ def test_labels_that_are_all_equal_are_predicted_and_compared_with_nothing(datas
     assert np.isfinite([row.errors.rmse for row in values.baselines]).all()
 
 
-@pytest.mark.parametrize("kind", ["table", "physics"])
+@pytest.mark.parametrize("kind", ["boosting", "physics"])
 def test_samples_without_a_label_are_left_out_and_counted(dataset, tmp_path, kind, monkeypatch, caplog):
     def labels(split):
         some = real_column(split, "start_ns") // 1_200_000_000 % 40 == 0
@@ -108,7 +108,7 @@ def test_samples_without_a_label_are_left_out_and_counted(dataset, tmp_path, kin
 
 def test_a_small_dataset_gets_a_table_and_is_told_so(dataset, tmp_path):
     done = tcpipe("train", dataset, "model", cwd=tmp_path)
-    assert load_model(tmp_path / "model").card.training.config.model == "table"
+    assert load_model(tmp_path / "model").card.training.config.model == "boosting"
     assert (
         "training samples are fewer than 20000: a table is trained; --model resnet18 is the other choice" in done.stderr
     )

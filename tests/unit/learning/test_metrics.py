@@ -14,11 +14,9 @@ from tcpipe.learning.metrics import (
     Spread,
     combine_errors,
     compare_errors,
-    compute_costs,
     compute_errors,
     compute_errors_by_class,
     label_floor,
-    mean_of_draws,
 )
 
 _VALUES = st.floats(20.0, 500.0)
@@ -62,17 +60,6 @@ def test_the_papers_own_all_is_its_classes_combined():
         assert combine_errors(parts).mape_percent == pytest.approx(mape[4], rel=0.1)
 
 
-def test_nothing_combined_is_no_number():
-    assert combine_errors([]).rmse is None
-    assert combine_errors([]).mape_percent is None
-
-
-def test_draws_are_averaged():
-    draws = [compute_errors(np.array([100.0 + d]), np.array([100.0])) for d in (1.0, 3.0)]
-    assert mean_of_draws(draws).rmse == pytest.approx(2.0)
-    assert mean_of_draws(draws).mape_percent == pytest.approx(2.0)
-
-
 def test_the_labels_floor_is_what_a_perfect_prediction_would_show():
     rng = np.random.default_rng(5)
     truth, sigma = rng.uniform(100.0, 300.0, 200_000), rng.uniform(2.0, 9.0, 200_000)
@@ -113,12 +100,6 @@ def test_scores_of_classes_are_those_of_all_samples_and_absent_where_nothing_is_
         assert getattr(by_class[ALL], score) == pytest.approx(getattr(pooled, score))
     assert compute_errors(predicted, measured).nll is None
     assert combine_errors([pooled, compute_errors(predicted, measured)]).crps is None
-
-
-def test_time_and_energy_follow_from_power_and_velocity():
-    found = compute_costs(np.array([150.0]), np.array([0.75]), 1.5)
-    assert found["T"][0] == pytest.approx(2.0)
-    assert found["E"][0] == pytest.approx(300.0)
 
 
 def test_a_ratio_by_hand():

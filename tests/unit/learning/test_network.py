@@ -15,16 +15,16 @@ LABELS = np.array([[150.0, 0.8], [200.0, 0.9]]) / SCALE
 PREDICTED = np.array([[154.0, 0.77], [188.0, 0.94]]) / SCALE
 
 
-def test_nrmse_divides_by_the_maxima_squared():
-    by_hand = np.mean([np.hypot(4.0 / 400.0, 0.03), np.hypot(12.0 / 400.0, 0.04)])
-    assert mean_loss(PREDICTED, LABELS, compute_loss_factors("nrmse", SCALE), 1.0) == pytest.approx(by_hand, rel=1e-6)
-
-
-def test_equation_4_as_printed_divides_by_the_maxima():
-    by_hand = np.mean([np.sqrt(4.0**2 / 400.0 + 0.03**2), np.sqrt(12.0**2 / 400.0 + 0.04**2)])
-    assert mean_loss(PREDICTED, LABELS, compute_loss_factors("paper_eq4", SCALE), 1.0) == pytest.approx(
-        by_hand, rel=1e-6
-    )
+@pytest.mark.parametrize(
+    ("loss", "lengths"),
+    [
+        ("nrmse", [np.hypot(4.0 / 400.0, 0.03), np.hypot(12.0 / 400.0, 0.04)]),
+        ("paper_eq4", [np.sqrt(4.0**2 / 400.0 + 0.03**2), np.sqrt(12.0**2 / 400.0 + 0.04**2)]),
+    ],
+)
+def test_both_readings_of_equation_4_by_hand(loss, lengths):
+    found = mean_loss(PREDICTED, LABELS, compute_loss_factors(loss, SCALE), 1.0)
+    assert found == pytest.approx(np.mean(lengths), rel=1e-6)
 
 
 @pytest.mark.parametrize("loss", ["nrmse", "paper_eq4"])

@@ -5,7 +5,7 @@ import pytest
 
 from tcpipe.errors import ModelError
 from tcpipe.learning import table_model as forest
-from tcpipe.learning.table_model import find_slope_and_class, fit_table, patch_features, read_table_model
+from tcpipe.learning.table_model import fit_table, patch_features, read_table_model
 
 PX, PATCH_M = 40, 1.0
 ALONG, ACROSS = np.meshgrid(*[(np.arange(PX) + 0.5) / PX - 0.5] * 2)
@@ -79,14 +79,14 @@ def test_trees_by_hand():
 def test_they_say_what_lightgbm_says():
     lightgbm = pytest.importorskip("lightgbm")
     features, labels, folds = _drawn(600)
-    grown = forest.grow(features, labels, np.ones_like(labels), folds)
+    made, held_out = forest.grow(features, labels, np.ones_like(labels), folds)
     for number, label in enumerate(labels.T):
-        rounds = int((grown.forest.output == number).sum())
+        rounds = int((made.output == number).sum())
         booster = lightgbm.train(RULES, lightgbm.Dataset(features, label), rounds)
-        assert grown.forest.predict(features)[:, number] == pytest.approx(booster.predict(features), rel=1e-12)
-    assert np.std(grown.held_out - labels, axis=0) == pytest.approx([5.0, 0.02], rel=0.25)
-    again = forest.grow(features, labels, np.ones_like(labels), folds)
-    assert all(np.array_equal(array, again.forest.arrays()[name]) for name, array in grown.forest.arrays().items())
+        assert made.predict(features)[:, number] == pytest.approx(booster.predict(features), rel=1e-12)
+    assert np.std(held_out - labels, axis=0) == pytest.approx([5.0, 0.02], rel=0.25)
+    again, _ = forest.grow(features, labels, np.ones_like(labels), folds)
+    assert all(np.array_equal(array, again.arrays()[name]) for name, array in made.arrays().items())
 
 
 def test_without_lightgbm_there_is_one_line(monkeypatch):
@@ -115,17 +115,6 @@ def ground(count=900, steepest=0.2, seed=0):
 def fitted():
     features, labels, folds = ground()
     return fit_table(features, labels, np.ones_like(labels), folds, channels=CHANNELS, class_count=CLASSES)
-
-
-def test_slope_and_class_stand_where_the_channels_say():
-    features, _, _ = ground(5)
-    slope, class_id = find_slope_and_class(features, CHANNELS, CLASSES)
-    assert slope.tolist() == features[:, 8].tolist()
-    assert set(class_id.tolist()) <= {4, 5}
-    height_first, _ = find_slope_and_class(features, ("height", "ortho"), CLASSES)
-    assert height_first.tolist() == features[:, 0].tolist()
-    nothing = find_slope_and_class(features[:, :3], ("ortho",), CLASSES)
-    assert not np.any(nothing)
 
 
 def test_steeper_ground_than_any_goes_on_straight_and_texture_is_heeded(fitted):

@@ -181,11 +181,6 @@ def test_a_place_that_cannot_be_written_is_found_before_the_first_epoch(dataset,
         train(dataset, tmp_path / "file" / "model", config=CONFIG)
 
 
-def test_another_seed_is_another_model(trained, dataset, tmp_path):
-    train(dataset, tmp_path / "model", config=replace(CONFIG, seed=1, epochs=1))
-    assert not _same(_weights(trained[0]), _weights(tmp_path / "model"))
-
-
 def test_weights_count_what_is_certain(dataset, tmp_path, monkeypatch):
     """With all deviations alike weights change nothing; with one class's a hundred times larger they do."""
     config = replace(CONFIG, epochs=1)
@@ -268,17 +263,6 @@ def test_pixels_without_data_are_not_seen(dataset, monkeypatch):
     holed = find_training_range(split)
     assert holed.pixel_classes == seen.pixel_classes
     assert holed.ranges["relief_m"] == pytest.approx(seen.ranges["relief_m"], abs=0.05)
-
-
-def test_samples_without_a_label_are_left_out(dataset, monkeypatch):
-    real = Split.labels.func
-    monkeypatch.setattr(
-        Split,
-        "labels",
-        property(lambda split: np.where(split.column("terrain_class")[:, None] == 4, np.nan, real(split))),
-    )
-    task = make_training_task(open_dataset(dataset), 1, Variant())
-    assert 4 not in {*task.fit.column("terrain_class"), *task.held.column("terrain_class")}
 
 
 PARTS = {part: {"a": np.arange(6.0), "b/c": np.ones((2, 3), np.float32)} for part in ("now", "best", "optimizer")}

@@ -1,6 +1,5 @@
 """Least-cost paths, against Bellman-Ford over steps that are found by hand."""
 
-import math
 from dataclasses import replace
 
 import numpy as np
@@ -12,7 +11,6 @@ from physics_model import PhysicsModel
 from planning_worlds import lonlat, plane
 
 from tcpipe.planning.cost_grid import (
-    ANGLES_DEG,
     COURSES,
     DIRECTIONS,
     MAX_DETOUR,
@@ -36,14 +34,6 @@ from tcpipe.planning.search import (
 from tcpipe.tables.facts import PhysicsFit, PhysicsTerm
 from tcpipe.terrain.classes import PAPER_CLASSES
 from tcpipe.terrain.grid import MapGrid
-
-
-def test_courses_rise_from_east_counter_clockwise_and_lead_to_16_cells():
-    assert len({tuple(move) for move in MOVES.tolist()}) == COURSES
-    assert (np.diff(ANGLES_DEG) > 18.0).all()
-    assert ANGLES_DEG[0] == 0.0
-    assert MOVES[4].tolist() == [0, 1]
-    assert all(math.gcd(east, north) == 1 for east, north in MOVES.tolist())
 
 
 @pytest.mark.parametrize("course", range(COURSES))

@@ -19,7 +19,6 @@ from tcpipe.splits.assignment import (
     draw_samples,
     group_by_run,
     hash_ranks,
-    order_ranks,
 )
 from tcpipe.splits.regions import Regions
 
@@ -142,7 +141,7 @@ def test_samples_that_are_kept_stay_and_the_rest_fills_up():
 
 
 def test_row_order_says_nothing_of_the_holdout():
-    order = np.argsort(order_ranks(IDS, seed=0))
+    order = np.argsort(hash_ranks(IDS, seed=0, purpose="order"))
     test = draw_samples(ranks(IDS), np.zeros(1000, int), test_fraction=0.5)[order]
     first = test[:500].sum()
     assert 190 < first < 310  # 250 ± 4 sigma; equal salts would give 0 or 500
