@@ -52,20 +52,13 @@ _FILE_SYSTEMS_OWN = ("lost+found",)
 
 
 def open_log(path: Path | str, *, message_definitions: Path | None = None) -> Log:
-    """Open a log, whatever its container.
+    """Open a log, whatever its container; `LogError` says what was found where the path is no log.
 
     Parameters
     ----------
-    path
-        A .mcap, .bag or .db3 file (told by content, not by name), or a ROS 2 bag directory; or the URL of one (``s3://…``): of an
-        .mcap or .bag with an index only what is asked for is fetched, anything else is copied until the log is closed.
-    message_definitions
-        A directory of .msg files for types that the log does not define.
-
-    Raises
-    ------
-    LogError
-        The path is no log: one line with what was found there and what was wanted.
+    path : a .mcap, .bag or .db3 file (told by content, not by name), or a ROS 2 bag directory; or the URL of one (``s3://…``): of an .mcap
+        or .bag with an index only what is asked for is fetched, anything else is copied until the log is closed.
+    message_definitions : a directory of .msg files for types that the log does not define.
     """
     with ExitStack() as stack:
         stored: dict[Path, StoredObject] = {}
@@ -99,12 +92,7 @@ def is_log_file(name: str) -> bool:
 def find_logs(path: Path) -> list[Path]:
     """Return the logs at or below a path, in a fixed order; a ROS 2 bag directory is one log, hidden files are skipped.
 
-    A directory that cannot be read stands in the list itself: whoever opens it says why.
-
-    Raises
-    ------
-    LogError
-        There is no log.
+    A directory that cannot be read stands in the list itself: whoever opens it says why. `LogError`: there is no log.
     """
     path = Path(path)
     _refuse_what_is_not_there(path)
@@ -222,12 +210,7 @@ class Log:
     def sha256(self) -> str:
         """Return the SHA-256 of the file; of a bag directory, of its storage files one after the other, by name.
 
-        Of a log in object storage that is read by its index it is that of the index, the `outline`.
-
-        Raises
-        ------
-        LogError
-            The disk does not give all of it.
+        Of a log in object storage that is read by its index it is that of the index, the `outline`. `LogError`: the disk fails.
         """
         if self.is_known_by_outline:
             return self.outline
@@ -270,24 +253,10 @@ class Log:
         return tables[topic]
 
     def tables(self, topics: Iterable[str], *, threads: int = 1) -> dict[str, pa.Table]:
-        """Return the tables of several topics, read in one pass.
+        """Return the tables of several topics, read in one pass; the result does not depend on ``threads``.
 
-        Parameters
-        ----------
-        topics
-            Names of topics. One that cannot be decoded is missing from the result and named in `findings`.
-        threads
-            How many threads read and decompress; the result does not depend on it.
-
-        Returns
-        -------
-        dict of pyarrow.Table
-            One row a message in the order of log time: ``log_time_ns``, ``publish_time_ns``, then the fields by dotted name.
-
-        Raises
-        ------
-        LogError
-            A topic is not in the log.
+        A table has one row a message in the order of log time: ``log_time_ns``, ``publish_time_ns``, then the fields by dotted name.
+        A topic that cannot be decoded is missing and named in `findings`. `LogError`: a topic is not in the log.
         """
         (tables,) = self.batches(topics, batch_bytes=None, threads=threads)
         return tables
@@ -295,25 +264,11 @@ class Log:
     def batches(
         self, topics: Iterable[str], *, batch_bytes: int | None = BATCH_BYTES, threads: int = 1
     ) -> Iterator[dict[str, pa.Table]]:
-        """Yield the tables of several topics piece by piece, read in one pass, in memory that does not grow with the log.
+        """Yield the tables of several topics piece by piece, as `tables`, in memory that does not grow with the log.
 
         Each dict holds the next rows of some topics (those that hold most); the last one names every topic. Rows are in the order of
-        log time, also from piece to piece, as long as no message lies in the log further than half a piece behind its time;
-        `findings` counts those that do.
-
-        Parameters
-        ----------
-        topics
-            Names of topics. One that cannot be decoded is missing and named in `findings`.
-        batch_bytes
-            How much is gathered over all topics before some is yielded; None yields everything at once.
-        threads
-            How many threads read and decompress; the pieces do not depend on it.
-
-        Raises
-        ------
-        LogError
-            A topic is not in the log.
+        log time, also from piece to piece, as long as no message lies in the log further than half a piece behind its time; `findings`
+        counts those that do. Some is yielded when more than ``batch_bytes`` are gathered over all topics; None yields everything at once.
         """
         collected = self._collectors(topics, in_pieces=batch_bytes is not None)
         most = math.inf if batch_bytes is None else batch_bytes

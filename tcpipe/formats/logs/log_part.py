@@ -351,13 +351,7 @@ def is_bomb(compressed_bytes: int, size: int, *, whole: bool = False) -> bool:
 
 
 class Bounds:
-    """What one file may hold, by its size: `LogError` where it holds more, since it was made to take all memory or time.
-
-    Parameters
-    ----------
-    path : the file.
-    size : its size [byte].
-    """
+    """What one file may hold, by its size [byte]: `LogError` where it holds more, since it was made to take all memory or time."""
 
     def __init__(self, path: Path, size: int) -> None:
         self._path, self._size = path, size
@@ -390,18 +384,12 @@ class Bounds:
 
 
 def decompress(codec: str, data: memoryview, size: int, *, checked: bool = False) -> memoryview:
-    """Return the ``size`` bytes that ``data`` holds.
+    """Return the ``size`` bytes that ``data`` holds; `DamageError` where it does not decompress, or not to ``size``.
 
     Parameters
     ----------
     codec : ``lz4`` (frames), ``zstd`` or ``bz2``.
-    data : the compressed bytes.
-    size : how many bytes they hold.
     checked : a checksum of the result is compared afterwards.
-
-    Raises
-    ------
-    DamageError : the bytes do not decompress, or not to ``size``.
     """
     if size > MAX_CHUNK_BYTES or is_bomb(len(data), size, whole=True):
         raise DamageError("record-damaged")

@@ -43,13 +43,7 @@ class Rosbag2Files:
 
 
 def find_rosbag2_files(directory: Path) -> Rosbag2Files:
-    """Return the storage files of a bag directory, by metadata.yaml, or by their names where it is missing.
-
-    Raises
-    ------
-    LogError
-        The directory holds no ROS 2 bag, or cannot be read.
-    """
+    """Return the storage files of a bag, by metadata.yaml, or by their names where it is missing; `LogError` where it is no bag."""
     try:
         present = list_storage_files(directory)
     except OSError as error:
