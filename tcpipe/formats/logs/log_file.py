@@ -19,7 +19,7 @@ from tcpipe.errors import LogError
 from tcpipe.formats.finding_lines import describe_finding
 from tcpipe.formats.logs.arrow_columns import TopicTable
 from tcpipe.formats.logs.log_container import WANTED, find_container, open_part
-from tcpipe.formats.logs.log_part import Channel, FetchedFile, LogPart, MessageBlock
+from tcpipe.formats.logs.log_part import FetchedFile, LogPart, MessageBlock
 from tcpipe.formats.logs.ros_types import DefinitionError, MessageType, TypeLibrary
 from tcpipe.formats.logs.rosbag2 import (
     METADATA,
@@ -329,19 +329,19 @@ class Log:
         """Yield one file's blocks, each with its topic's table; channels that differ from their topic's type are set aside."""
         part, channels = self._parts[index], {}
         for number, channel in part.channels.items():
-            if channel.topic in collected:
+            if channel.name in collected:
                 if self._agrees(channel):
-                    channels[number] = collected[channel.topic]
+                    channels[number] = collected[channel.name]
                 else:
                     reason = f"the topic changes its type to {channel.type_name} ({channel.encoding})"
-                    self._note_undecoded(part.name, channel.topic, channel.message_count, reason)
+                    self._note_undecoded(part.name, channel.name, channel.message_count, reason)
         if channels:
             for block in decompress_blocks(part, frozenset(channels), threads=threads):
                 later = replace(block, ordinal=block.ordinal + (index << 48)) if index else block
                 yield channels[block.channel], later
 
-    def _agrees(self, channel: Channel) -> bool:
-        topic = self.topics[channel.topic]
+    def _agrees(self, channel: Topic) -> bool:
+        topic = self.topics[channel.name]
         if (channel.type_name, channel.encoding) != (topic.type_name, topic.encoding):
             return False
         if channel.definition in ("", topic.definition):
@@ -356,7 +356,7 @@ class Log:
     def _note_undecoded(self, file: str, topic: str, count: int | None, reason: str) -> None:
         self._damage.append(Damage("messages-not-decoded", file, topic=topic, messages_lost=count, reason=reason))
 
-    def _resolved(self, channel: Channel) -> MessageType | DefinitionError:
+    def _resolved(self, channel: Topic) -> MessageType | DefinitionError:
         try:
             return self._types.message_type(
                 channel.type_name,
@@ -380,41 +380,31 @@ class Log:
 
     def _merged_topics(self) -> dict[str, Topic]:
         """Merge the channels of all files by topic; where types differ, the one with most messages holds."""
-        self._channel_of: dict[str, Channel] = {}
+        self._channel_of: dict[str, Topic] = {}
         topics: dict[str, Topic] = {}
         channels = [channel for part in self._parts for channel in part.channels.values()]
-        for channel in sorted(channels, key=lambda c: (c.topic, -(c.message_count or 0), not c.definition)):
-            topic = _make_topic(channel, self._types)
-            first = self._channel_of.setdefault(channel.topic, channel)
+        for channel in sorted(channels, key=lambda c: (c.name, -(c.message_count or 0), not c.definition)):
+            topic = replace(channel, problem=_find_problem(channel, self._types))
+            first = self._channel_of.setdefault(channel.name, channel)
             if channel is first:
-                topics[channel.topic] = topic
+                topics[channel.name] = topic
                 if len(topics) > MAX_TOPICS:
                     raise LogError(f"{self.path}: it holds more than {MAX_TOPICS} topics; no such log is read")
             elif (channel.type_name, channel.encoding) == (first.type_name, first.encoding):
-                topics[channel.topic] = topics[channel.topic].joined(topic)
+                topics[channel.name] = topics[channel.name].joined(topic)
         return topics
 
 
-def _make_topic(channel: Channel, types: TypeLibrary) -> Topic:
-    problem = None
+def _find_problem(channel: Topic, types: TypeLibrary) -> str | None:
+    """Return why messages cannot be decoded; a definition that cannot be used is found when they are read."""
     if channel.encoding not in ("cdr", "ros1"):
-        problem = f"its messages are encoded as {channel.encoding or 'nothing known'}; cdr and ros1 are read"
-    elif not channel.type_name:
-        problem = "the log does not say of which type its messages are"
-    elif not channel.definition.strip() and not types.knows(channel.type_name):
-        where = "the log holds no definition of it, and none is bundled"
-        problem = f"type {channel.type_name} is unknown: {where}; give its .msg files with --msgdef DIR"
-    return Topic(
-        channel.topic,
-        channel.type_name,
-        channel.message_count,
-        channel.start_ns,
-        channel.end_ns,
-        channel.encoding,
-        channel.definition,
-        problem,
-        channel.silent_ns,
-    )
+        return f"its messages are encoded as {channel.encoding or 'nothing known'}; cdr and ros1 are read"
+    if not channel.type_name:
+        return "the log does not say of which type its messages are"
+    if channel.definition.strip() or types.knows(channel.type_name):
+        return None
+    where = "the log holds no definition of it, and none is bundled"
+    return f"type {channel.type_name} is unknown: {where}; give its .msg files with --msgdef DIR"
 
 
 def _open_directory(directory: Path, stack: ExitStack, fetched: Mapping[Path, FetchedFile]) -> _OpenFiles:

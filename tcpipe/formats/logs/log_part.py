@@ -23,7 +23,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from tcpipe.errors import LogError
-from tcpipe.logs.topics import Damage
+from tcpipe.logs.topics import Damage, Topic
 
 if TYPE_CHECKING:
     from tcpipe.formats.object_storage import StoredObject
@@ -69,21 +69,6 @@ class DamageError(Exception):
 
 
 @dataclass(frozen=True, slots=True)
-class Channel:
-    """One source of messages in a file: a connection, channel or topic row. None where the index does not say."""
-
-    topic: str
-    type_name: str
-    encoding: str
-    schema_encoding: str
-    definition: str
-    message_count: int | None = None
-    start_ns: int | None = None
-    end_ns: int | None = None
-    silent_ns: int = 0
-
-
-@dataclass(frozen=True, slots=True)
 class MessageBlock:
     """Messages of one channel inside one buffer; arrays have shape (N,). ``ordinal`` is their order within the file.
 
@@ -116,8 +101,8 @@ class LogPart(Protocol):
     """What was found damaged so far; the same place may be in it twice."""
 
     @property
-    def channels(self) -> Mapping[int, Channel]:
-        """Return every channel by its number."""
+    def channels(self) -> Mapping[int, Topic]:
+        """Return every source of messages (a connection, channel or topic row) by its number."""
 
     @property
     def is_unchecked(self) -> bool:

@@ -183,7 +183,7 @@ def _decompress_block(block: MessageBlock, part: LogPart) -> MessageBlock:
             kept.append(row)
     lost = len(block.offsets) - len(kept)
     if lost:
-        topic = part.channels[block.channel].topic
+        topic = part.channels[block.channel].name
         part.damage.append(Damage("chunk-damaged", part.name, topic=topic, messages_lost=lost))
     lengths = np.fromiter(map(len, payloads), np.int64, len(payloads))
     rows = np.array(kept, np.int64)
