@@ -5,7 +5,6 @@ A `LogPart` is one file of a log. `tcpipe.formats.logs.log_file` joins the parts
 
 from __future__ import annotations
 
-import errno
 import hashlib
 import os
 import struct
@@ -16,17 +15,15 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol, TypeVar
+from typing import Protocol, TypeVar
 
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
 from tcpipe.errors import LogError
+from tcpipe.formats.object_storage import StoredObject
 from tcpipe.logs.topics import Damage, Topic
-
-if TYPE_CHECKING:
-    from tcpipe.formats.object_storage import StoredObject
 
 MAX_CHUNK_BYTES = 1 << 29
 """A chunk that claims to hold more than this is taken for damaged: it is held as a whole. Writers make chunks of some megabytes."""
@@ -321,12 +318,6 @@ def map_in_order(work: Callable[[_Piece], _Result], pieces: Iterable[_Piece], *,
 def outline_of(size: int, index: bytes | memoryview) -> str:
     """Return a hash (hex) of a file's size [byte] and its index, which holds where its chunks lie and when they were recorded."""
     return hashlib.sha256(size.to_bytes(8, "little") + bytes(index)).hexdigest()
-
-
-def describe_full_disk(error: Exception) -> str:
-    """Say that there is no room for a copy of a log, where that is the error; else nothing."""
-    full = isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-    return "no room for a copy here; TMPDIR names a place that has some" if full else ""
 
 
 def is_bomb(compressed_bytes: int, size: int, *, whole: bool = False) -> bool:

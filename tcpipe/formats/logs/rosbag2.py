@@ -14,7 +14,8 @@ import numpy as np
 import pyarrow as pa
 
 from tcpipe.errors import LogError
-from tcpipe.formats.logs.log_part import MAX_CHUNK_BYTES, LogPart, MessageBlock, describe_full_disk, is_bomb
+from tcpipe.formats.atomic import describe_full_disk
+from tcpipe.formats.logs.log_part import MAX_CHUNK_BYTES, LogPart, MessageBlock, is_bomb
 from tcpipe.logs.topics import Damage
 
 METADATA = "metadata.yaml"

@@ -18,12 +18,11 @@ from urllib.parse import quote
 import numpy as np
 
 from tcpipe.errors import LogError
-from tcpipe.formats.atomic import make_scratch_directory
+from tcpipe.formats.atomic import describe_full_disk, make_scratch_directory
 from tcpipe.formats.logs.log_part import (
     MAX_CHANNELS,
     Bounds,
     MessageBlock,
-    describe_full_disk,
     group_by_key,
 )
 from tcpipe.logs.topics import Damage, Topic, normalize_type_name
