@@ -19,7 +19,7 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True, slots=True)
 class MotionRows:
-    """What tells how a robot moves: one value for each row of a regular track.
+    """Motion of a robot: one value for each row of a regular track.
 
     Attributes
     ----------
