@@ -29,7 +29,7 @@ from tcpipe.terrain.layers import Layer, Pixels, make_paper_layers
 from tcpipe.terrain.projection import Projection, compute_area
 
 PROPERTY = "class"
-"""The property that tells a polygon's class, in any case."""
+"""The property with a polygon's class, in any case."""
 
 SUFFIXES = (".geojson", ".json")
 """A terrain file that ends so is polygons."""
@@ -40,10 +40,10 @@ _EDGE_STEP_DEG = 0.001
 _TERRAIN = Subject("layer", "terrain")
 
 _LOOKED_AT = 5_000_000
-"""Vertices of pairs of polygons that are held against each other to tell how they overlap."""
+"""Most vertices of pairs of polygons that are compared for overlaps."""
 
 _TOGETHER = 32
-"""Polygons that are held against all others at one time."""
+"""Polygons that are compared with all others at one time."""
 
 _DETAILED = 10_000
 """A polygon of more vertices is cut to the part of the map that it is burnt into: each row of pixels looks at every edge."""
