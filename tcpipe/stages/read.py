@@ -11,10 +11,9 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from tcpipe.errors import RoleError
-from tcpipe.logs.clocks import RECIPE, AlignedClocks, Timeline, TopicTimes, settle_clocks
-from tcpipe.logs.role_findings import find_missing_roles
+from tcpipe.logs.clocks import CLOCK, LOG_CLOCK, RECIPE, AlignedClocks, Timeline, TopicTimes, settle_clocks
 from tcpipe.logs.roles import MOTION_ROLES, RoleAssignment
-from tcpipe.logs.simulated_clock import CLOCK, LOG_CLOCK
+from tcpipe.logs.topics import find_missing_roles
 from tcpipe.power.readings import PowerReadings
 from tcpipe.power.sources import list_power_lists
 from tcpipe.recipe import ReadConfig

@@ -3,10 +3,9 @@
 import numpy as np
 import pytest
 
-from tcpipe.logs.clocks import AlignedClocks, Timeline
+from tcpipe.logs.clocks import AlignedClocks, SimulatedClock, Timeline
 from tcpipe.logs.messages import Readings
 from tcpipe.logs.roles import PlayedRole, RoleAssignment
-from tcpipe.logs.simulated_clock import SimulatedClock
 from tcpipe.power.readings import PowerReadings
 from tcpipe.stages.read import make_read_report
 from tcpipe.stages.read_sources import TopicReadings
