@@ -16,13 +16,14 @@ MAPPINGS = {"dict", "Mapping", "MutableMapping"}
 
 _BY_LIBRARY = {
     "lightgbm": """learning/table_model.py:read_forest learning/table_model.py:_make_forest
+        learning/table_model.py:_make_forest.add_node
         learning/table_model.py:_load_lightgbm""",
     "torch": """dataset/torch_data.py:TorchBatches.__iter__ dataset/torch_data.py:_to_tensors
         learning/architecture.py:mean_loss
         learning/network.py:Normed.forward learning/network.py:BasicBlock.forward learning/network.py:ResNet18.forward
         learning/network.py:ResNet18._weights learning/network.py:find_device
         learning/network.py:move_to_device learning/network.py:_pad_images
-        learning/network.py:_reorder_axes learning/network.py:Trainer._memory""",
+        learning/network.py:_reorder_axes learning/network.py:Trainer._list_state""",
     "rasterio": """formats/maps/geotiff.py:RasterTiles._dataset formats/maps/geotiff.py:_read_grey formats/maps/geotiff.py:_open_as
         formats/maps/geotiff.py:_refuse_unplaced formats/maps/geotiff.py:_choose_bands formats/maps/geotiff.py:_read_scaling
         formats/maps/geotiff.py:_find_vertical_unit_m formats/maps/geotiff.py:_describe_as_vrt""",

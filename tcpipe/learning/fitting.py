@@ -1,4 +1,4 @@
-"""Fitting a network to one part of a dataset and stopping early by another, epoch by epoch, from where a checkpoint stands."""
+"""Fitting a network with early stopping on a held-out fold; checkpoints (one file) let a killed training continue unchanged."""
 
 from __future__ import annotations
 
@@ -191,7 +191,7 @@ def fit(task: Task, config: FitConfig, *, name: str, key: str, checkpoint: Path)
     key : of dataset and options, kept in the checkpoint.
     checkpoint : written before the first epoch and after every one, or every so many short ones, and gone on from where it is.
     """
-    scale = label_scale(task)
+    scale = find_label_scale(task)
     factors = compute_loss_factors(config.loss, scale)
     trainer, device = _make_trainer(task, config, scale, factors)
     network = trainer.network
@@ -236,7 +236,7 @@ def _make_trainer(task: Task, config: FitConfig, scale: Sequence[float], factors
     return Trainer(make_resnet18(shape, seed=config.seed, start=start.tolist()), factors), find_device_name()
 
 
-def label_scale(task: Task) -> tuple[float, ...]:
+def find_label_scale(task: Task) -> tuple[float, ...]:
     """Return the largest label of each output among all of train: what labels are divided by."""
     return tuple(float(value) for value in collect_labels(task.train, task.outputs).max(axis=0))
 
@@ -318,7 +318,7 @@ def _train_epoch(
 
 def _state(trainer: Trainer, best: Arrays) -> dict[str, Arrays]:
     """Return all arrays of a checkpoint."""
-    return {"now": trainer.network.arrays(), "best": best, "optimizer": trainer.memory()}
+    return {"now": trainer.network.arrays(), "best": best, "optimizer": trainer.copy_optimizer_state()}
 
 
 def _restore(trainer: Trainer, parts: dict[str, Arrays], where: str) -> None:
@@ -327,7 +327,7 @@ def _restore(trainer: Trainer, parts: dict[str, Arrays], where: str) -> None:
         raise ModelError(f"{where}: not a checkpoint; remove it, or start anew with --no-resume")
     for part in ("best", "now"):
         trainer.network.set_arrays(parts[part], where)
-    trainer.remember(parts["optimizer"], where)
+    trainer.load_optimizer_state(parts["optimizer"], where)
 
 
 def _say(name: str, progress: TrainingProgress, config: FitConfig, spent: TrainingTimes) -> None:

@@ -103,7 +103,7 @@ class TrainResult:
         )
 
 
-def model_for(dataset: str | Path) -> ModelKind:
+def choose_model_kind(dataset: str | Path) -> ModelKind:
     """Return the kind of model that a dataset of this size is best served by, and say so."""
     count = read_card(fetch_directory_by_range(dataset, by_range=is_shard)[0]).splits.get("train", 0)
     kind: ModelKind = "table" if count < FEW_SAMPLES else "resnet18"

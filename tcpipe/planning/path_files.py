@@ -1,4 +1,4 @@
-"""`tcpipe predict-path`: a path from a file to its cost, and the table of its pieces to another."""
+"""The files of `tcpipe predict-path` (a table of path segments and its totals) and `tcpipe plan-path` (GeoJSON and a picture)."""
 
 from __future__ import annotations
 
