@@ -389,7 +389,8 @@ def _draw_sums(number: int, drive: DriveCost) -> Iterator[Plot]:
                 ("90 %", "@low{0.0} to @high{0.0}"),
             ],
         )
-        columns = dict(zip(("measured", "predicted", "low", "high"), _collect_columns(sums), strict=True))
+        names = ("measured", "predicted", "low", "high")
+        columns = {name: np.array([getattr(of, name) for of in sums], np.float64) for name in names}
         source = {"metres": distance_m, **columns}
         plot.figure.varea("metres", "low", "high", source=source, color=SPLIT_COLOURS["train"], alpha=0.2)
         plot.figure.hover.renderers = [
@@ -400,10 +401,3 @@ def _draw_sums(number: int, drive: DriveCost) -> Iterator[Plot]:
         plot.figure.yaxis.formatter.use_scientific = False
         first = plot
         yield plot
-
-
-def _collect_columns(sums: Sequence[IntervalComparison]) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
-    """Return measured, predicted, low, high, shape (4, N)."""
-    return np.array(
-        [[np.nan if v is None else v for v in (of.measured, of.predicted, of.low, of.high)] for of in sums]
-    ).T

@@ -29,9 +29,9 @@ def find_best_lines(  # noqa: PLR0917
 ) -> None:
     """Write the cost from the first point to each point of a path, and where its last line begins, to ``so_far`` and ``before``, (P,).
 
-    ``per_metre`` and ``open_`` have shape (16, rows, cols). ``angles``, (16,), are the courses, counter-clockwise from the grid's east [rad],
-    rising from 0; ``metres``, (16,), the ground metres a cell along each. ``points`` [cells] are as in `straighten_path`. A line begins at
-    most ``window`` points earlier; a line between neighbours is a step of the path and always allowed.
+    ``per_metre`` and ``open_`` have shape (16, rows, cols). ``angles``, (16,), are the courses [rad], counter-clockwise from the grid's
+    east, rising from 0; ``metres``, (16,), the ground metres a cell along each. ``points`` [cells] are as in `straighten_path`. A line
+    begins at most ``window`` points earlier; a line between neighbours is a step of the path and always allowed.
     """
     so_far[0], before[0] = 0.0, 0
     for j in range(1, points.shape[0]):
