@@ -32,7 +32,7 @@ from tcpipe.formats.logs.log_file import open_log
 from tcpipe.formats.recipe_toml import load_shipped_profiles
 from tcpipe.fusion.error_state import run_error_state
 from tcpipe.fusion.initial import find_initial_state, find_stationary_intervals
-from tcpipe.fusion.trajectory import cut_stretches, track_stamps
+from tcpipe.fusion.trajectory import cut_sections, make_track_stamps
 from tcpipe.geometry.datum import geodetic_from_enu
 from tcpipe.geometry.rotation import invert, multiply, rotate, rotation_vector_from_quat
 from tcpipe.recipe import FuseConfig, ReadConfig
@@ -101,18 +101,18 @@ class Errors:
 
 
 def errors(streams: Streams, truth: Truth, *, smooth: bool) -> Errors:
-    """Fuse and compare, over every stretch."""
+    """Fuse and compare, over every section."""
     config = FuseConfig()
     inputs, _ = drop_implausible_sensors(prepare_inputs(streams, config), streams)
     parts = []
-    for stretch in cut_stretches(inputs.measurements):
-        output_ns = track_stamps(stretch, period_ns=50_000_000, max_gap_ns=int(config.max_gap_s * 1e9))
+    for section in cut_sections(inputs.measurements):
+        output_ns = make_track_stamps(section, period_ns=50_000_000, max_gap_ns=int(config.max_gap_s * 1e9))
         output_ns = output_ns[(output_ns > truth.stamp_ns[0]) & (output_ns < truth.stamp_ns[-1])]
         initial = find_initial_state(
-            stretch.measurements, find_stationary_intervals(stretch.measurements), stretch.start_ns
+            section.measurements, find_stationary_intervals(section.measurements), section.start_ns
         )
         found = run_error_state(
-            stretch.measurements, initial, output_ns=output_ns, smooth=smooth,
+            section.measurements, initial, output_ns=output_ns, smooth=smooth,
             gate_probability=config.gate_probability,
         )  # fmt: skip
         at = truth.at(output_ns)
@@ -125,7 +125,7 @@ def errors(streams: Streams, truth: Truth, *, smooth: bool) -> Errors:
             )
         else:
             position_error = np.full_like(position, np.nan)
-        parts.append(_compared(found, at, position_error, _in_outage(stretch.measurements.gnss, output_ns)))
+        parts.append(_compared(found, at, position_error, _in_outage(section.measurements.gnss, output_ns)))
     return Errors(*(np.concatenate([getattr(part, name) for part in parts]) for name in Errors.__dataclass_fields__))
 
 

@@ -139,9 +139,12 @@ def held(errors: dict[str, Errors], said: dict[str, Floats], of: Drive) -> Itera
     for name in QUANTITIES:
         for metres in LENGTHS:
             first = range(0, len(of.block) - metres + 1, metres)
-            ends = [errors[name].of_sum(said[name][k : k + metres], of.class_id[k : k + metres]) for k in first]
+            ends = [
+                errors[name].compute_sum_interval(said[name][k : k + metres], of.class_id[k : k + metres])
+                for k in first
+            ]
             if metres == 1:
-                ends = list(zip(*errors[name].of_pieces(said[name], of.class_id), strict=True))
+                ends = list(zip(*errors[name].compute_intervals(said[name], of.class_id), strict=True))
             measured = np.add.reduceat(true[name], first)[: len(ends)]
             measured[-1] = true[name][first[-1] : first[-1] + metres].sum()
             low, high = np.array(ends).T

@@ -156,7 +156,7 @@ def told(fit: Callable[[Metre], Predictor], known: Metre, there: Metre) -> Told:
     assert found is not None, "fewer than 20 segments"
     said = compute_costs(*fit_bias_correction(residuals).apply(*fit(known)(there).T, nowhere), 1.0)
     spread = {
-        name: Spread(found[of].spread(said[name], nowhere), *found[of].of_pieces(said[name], nowhere))
+        name: Spread(found[of].compute_std(said[name], nowhere), *found[of].compute_intervals(said[name], nowhere))
         for name, of in QUANTITIES.items()
     }
     return Told({name: said[name] for name in QUANTITIES}, spread)

@@ -16,7 +16,7 @@ from typing import cast
 import click
 
 from tcpipe.cli import cli
-from tcpipe.cli.json_output import json_output_types
+from tcpipe.cli.site_commands import json_output_types
 from tcpipe.formats.contracts import DOCUMENTS
 from tcpipe.formats.finding_lines import format_number
 from tcpipe.formats.recipe_toml import format_commented_toml, load_shipped_profiles
@@ -62,7 +62,7 @@ def _cli() -> str:
     return "\n".join(parts)
 
 
-_COMMON = "`Also:` below a command lists which of these it takes.\n"
+_COMMON = "Every command has `--help`; `Also:` lists which of the others it has.\n"
 
 
 def _shared_options(contexts: Sequence[click.Context]) -> dict[str, str]:
@@ -95,8 +95,10 @@ def _describe_command(context: click.Context, shared: Mapping[str, str]) -> str:
     if own := [record for record in records if record not in shared.items()]:
         with formatter.section("Options"):
             formatter.write_dl(own)
-    long_names = [next(word for word in names.split() if word.startswith("--")) for names in also]
-    body = f"{formatter.getvalue().rstrip()}\n\nAlso: {', '.join(long_names)}"
+    long_names = [
+        next(word for word in names.split() if word.startswith("--")) for names in also if "--help" not in names
+    ]
+    body = formatter.getvalue().rstrip() + (f"\n\nAlso: {', '.join(long_names)}" if long_names else "")
     return f"## tcpipe {context.info_name}\n\n```\n{body}\n```\n"
 
 

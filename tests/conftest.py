@@ -15,6 +15,7 @@ settings.load_profile("fixed")
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # tests run side by side: threads of one would wait for those of another
 gc.set_threshold(50_000)  # as the command does
+os.fsync = lambda _: None  # a process that is killed loses nothing that it wrote, and no test cuts the power
 
 RATCHETS = Path(__file__).parent / "architecture/ratchets.toml"
 

@@ -19,7 +19,7 @@ from typing import Any
 from unittest.mock import patch
 
 from tcpipe.cli import main
-from tcpipe.cli.json_output import json_output_types
+from tcpipe.cli.site_commands import json_output_types
 from tcpipe.formats.json_files import parse_typed, to_plain
 
 COMMAND = Path(sys.executable).parent / "tcpipe"

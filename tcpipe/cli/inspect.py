@@ -128,11 +128,13 @@ def _print_clocks(log: InspectedLog) -> None:
         print_line(f"clock step: {step.step_s:+.3f} s at log time {step.log_time_ns} ns on {', '.join(step.topics)}")
     for topic in log.topics or ():
         if topic.simulated_time:
-            print_line(f"simulated time: the headers of {topic.name} are not the wall clock's")
+            print_line(f"simulated time: the header stamps of {topic.name} are not wall-clock time")
         for moved_s in topic.moved_s or ():
-            print_line(f"another clock: the stamps of {topic.name} lie {-moved_s:+.3f} s off those of most topics")
+            print_line(
+                f"another clock: the stamps of {topic.name} differ by {-moved_s:+.3f} s from those of most topics"
+            )
         if topic.time == "log":
-            print_line(f"log time rules on {topic.name}: {topic.time_why}")
+            print_line(f"log time is used for {topic.name}: {topic.time_why}")
 
 
 def _print_map(found: InspectedMap) -> None:
@@ -194,7 +196,7 @@ def _print_store(found: InspectedStore) -> None:
     header = ["run", "recipe", "robot", "segments", "metres", "position", "time", "energy", "findings", "damage"]
     _print_table(header, rows)
     for run_id, version in found.outdated.items():
-        print_line(f"of another data model ({version}): {run_id}; ingest its log again")
+        print_line(f"{run_id} has data model {version}; ingest its log again")
     for line in dict.fromkeys(found.damaged_runs.values()):
         print_line(f"damaged: {line}")
     for run_id, by in found.superseded.items():

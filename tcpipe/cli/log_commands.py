@@ -39,7 +39,7 @@ from tcpipe.pipeline.ingest_options import IngestOptions
 
 if TYPE_CHECKING:
     from tcpipe.pipeline.ingest import IngestSummary
-    from tcpipe.pipeline.ingest_task import IngestResult
+    from tcpipe.pipeline.plan import IngestResult
 
 
 @click.command()
@@ -59,7 +59,7 @@ def ingest(options: IngestOptions, *, dry_run: bool, as_json: bool, quiet: bool)
     """
     from tcpipe.formats.json_files import convert_record
     from tcpipe.pipeline.ingest import SummaryLine, run_ingest
-    from tcpipe.pipeline.ingest_task import LogLine
+    from tcpipe.pipeline.plan import LogLine
 
     ruling, source = resolve_recipe_with_source(cast("str | None", options.recipe))
     options = replace(options, recipe=ruling)
@@ -138,7 +138,7 @@ def _list_outcome(result: IngestResult, store: Path | str, *, several: bool) -> 
             f"from {run.kept_m:.1f} of {run.driven_m:.1f} m, robot {run.robot}{more}{aside or known}"
         )
     if result.same_as:
-        yield f"  {result.log} is the same recording as {result.same_as}: one run"
+        yield f"  {result.log} is a duplicate of {result.same_as}: one run"
     if budget is not None and not several:
         yield f"  {format_budget(budget)}"
     yield from (f"  {note}" for note in result.notes)
@@ -183,7 +183,7 @@ def _print_sum(summary: IngestSummary) -> None:
     elif count["unchanged"] + len(old) == number:
         print_line(f"nothing to do: {count['unchanged']} of {number} logs are in {summary.store} already")
     elif count["failed"] == number:
-        print_line(f"no run came into {summary.store}: {number} of {number} logs failed")
+        print_line(f"{'all ' if number > 1 else ''}{_count_logs(number)} failed; no run was added to {summary.store}")
     else:
         counts_text = ", ".join(
             f"{number_of_logs} {status}" for status, number_of_logs in count.items() if number_of_logs
@@ -192,17 +192,22 @@ def _print_sum(summary: IngestSummary) -> None:
     _print_known(summary)
 
 
+def _count_logs(number: int) -> str:
+    return f"{number} log{'s' * (number != 1)}"
+
+
 def _print_known(summary: IngestSummary) -> None:
-    """Count what is wrong and no news."""
+    """Print how many problems are known."""
     acknowledged = sum(result.acknowledged for result in summary.results)
     known = [result for result in summary.results if result.known and not result.acknowledged]
     failed = sum(result.status == "failed" for result in known)
     if failed:
-        tried = "tries them" if failed > 1 else "tries it"
-        print_line(f"{failed} known failure{'s' * (failed > 1)}, not tried again; --retry-failed {tried}")
-    if len(known) > failed:
+        were, them = ("were", "them") if failed > 1 else ("was", "it")
+        print_line(f"{_count_logs(failed)} failed before and {were} skipped; --retry-failed tries {them} again")
+    if rest := len(known) - failed:
+        them = "them" if rest > 1 else "it"
         print_line(
-            f"{len(known) - failed} known to be damaged or empty; 'tcpipe acknowledge RUN' when it has been looked at"
+            f"{_count_logs(rest)} known as damaged or empty; 'tcpipe acknowledge RUN' after you have checked {them}"
         )
     if acknowledged:
         print_line(f"{acknowledged} with acknowledged problems")

@@ -156,34 +156,30 @@ _SECONDS = {"": 1.0, "s": 1.0, "m": 60.0, "h": 3600.0, "d": 86400.0}
 _MOST_SHARDS = 100_000
 
 
-def parse_duration(context: click.Context, parameter: click.Parameter, value: str) -> float:
+def parse_duration(_: click.Context, __: click.Parameter, value: str) -> float:
     """Turn ``90``, ``90s``, ``10m``, ``2h``, ``1d`` into seconds."""
     match = re.fullmatch(r"(\d{1,9}(?:\.\d{1,9})?)\s*([smhd]?)", value.strip())
     if match is None:
-        raise click.BadParameter(f"{value!r}: wanted a time: 90 or 90s, 10m, 2h, 1d", ctx=context, param=parameter)
+        raise click.BadParameter(f"{value!r}: wanted a time: 90 or 90s, 10m, 2h, 1d")
     return float(match[1]) * _SECONDS[match[2]]
 
 
-def parse_shard(context: click.Context, parameter: click.Parameter, value: str | None) -> tuple[int, int] | None:
+def parse_shard(_: click.Context, __: click.Parameter, value: str | None) -> tuple[int, int] | None:
     """Turn ``I/N`` into two numbers, I from 1 to N."""
     if value is None:
         return None
-    found = re.fullmatch(r"(\d{1,6})/(\d{1,6})", value.strip())
-    index, count = (int(found[1]), int(found[2])) if found else (0, 0)
+    match = re.fullmatch(r"(\d{1,6})/(\d{1,6})", value.strip())
+    index, count = (int(match[1]), int(match[2])) if match else (0, 0)
     if not 1 <= index <= count <= _MOST_SHARDS:
-        raise click.BadParameter(
-            f"{value!r}: wanted I/N, I from 1 to N, N at most {_MOST_SHARDS}, for example 1/8",
-            ctx=context,
-            param=parameter,
-        )
+        raise click.BadParameter(f"{value!r}: wanted I/N, I from 1 to N, N at most {_MOST_SHARDS}, for example 1/8")
     return index, count
 
 
-def tag_values(context: click.Context, parameter: click.Parameter, values: tuple[str, ...]) -> dict[str, str]:
+def tag_values(_: click.Context, __: click.Parameter, values: tuple[str, ...]) -> dict[str, str]:
     """Turn ``K=V`` pairs into a dict; a pair without key or '=' is a usage error."""
     for value in values:
         if value.find("=") < 1:
-            raise click.BadParameter(f"{value!r}: wanted KEY=VALUE", ctx=context, param=parameter)
+            raise click.BadParameter(f"{value!r}: wanted KEY=VALUE")
     return dict(value.split("=", 1) for value in values)
 
 
@@ -210,10 +206,10 @@ def _parse_named_files(option: str, given: tuple[str, ...], hint: str) -> dict[s
     return files
 
 
-def parse_holdout(context: click.Context, parameter: click.Parameter, value: str | None) -> str | None:
+def parse_holdout(_: click.Context, __: click.Parameter, value: str | None) -> str | None:
     """Return a valid kind of holdout; anything else is a usage error."""
     if value is not None and re.fullmatch(r"block|sample|run|tag:.+", value) is None:
-        raise click.BadParameter(f"{value!r}: wanted block, sample, run, or tag:NAME", ctx=context, param=parameter)
+        raise click.BadParameter(f"{value!r}: wanted block, sample, run, or tag:NAME")
     return value
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from importlib import import_module
 from pathlib import Path
 
 import click
@@ -76,14 +77,60 @@ def simulate(out: str, *, scenario: str, seed: int, as_json: bool, quiet: bool) 
 @click.argument("out", type=OUTPUT_DIRECTORY, metavar="OUT")
 def schemas(out: str) -> None:
     """Write the contract of every table, document and --json answer, and of the recipe, as JSON Schema, one file each, to OUT."""
-    from tcpipe.cli.json_output import collect_contracts
     from tcpipe.formats.atomic import clear, write_text
+    from tcpipe.formats.contracts import make_contracts
 
     clear(Path(out))
-    wanted = {Path(out) / name: text for name, text in collect_contracts().items()}
+    wanted = {Path(out) / name: text for name, text in make_contracts(json_output_types()).items()}
     missing = {path: text for path, text in wanted.items() if not path.is_file() or path.read_bytes() != text.encode()}
     for path, text in missing.items():
         write_text(path, text)
     print_line(
         f"wrote {len(missing)} schemas to {out}" if missing else f"nothing to do: {len(wanted)} schemas are in {out}"
     )
+
+
+_ANSWERS = {
+    "model": "learning.model_card.ModelCard",
+    "cost-map": "planning.cost_map.CostMapCard",
+    "evaluation": "learning.evaluation_facts.Evaluation",
+    "path-totals": "planning.path_files.TableTotals",
+    "plan": "planning.path_files.PlanFile",
+    "reproduction": "experiment.reproduction.ReproductionSummary",
+    "acknowledge.answer": "pipeline.problems.Acknowledged",
+    "add-map.answer": "pipeline.maps.AddedMap",
+    "build-dataset.answer": "pipeline.dataset.build.BuildResult",
+    "cost-map.answer": "planning.cost_map.CostMapResult",
+    "diff.answer": "pipeline.diff.Difference",
+    "evaluate-drives.answer": "planning.drives.Drives",
+    "explain.answer": "pipeline.explain.Explained",
+    "export.answer": "pipeline.export.Exported",
+    "export-layers.answer": "pipeline.layers.ExportedLayers",
+    "ingest-log.answer": "pipeline.plan.LogLine",
+    "ingest-summary.answer": "pipeline.ingest.SummaryLine",
+    "inspect-dataset.answer": "pipeline.inspected.InspectedDataset",
+    "inspect-log.answer": "pipeline.log_inspection.InspectedLog",
+    "inspect-logs.answer": "pipeline.inspect.InspectedLogs",
+    "inspect-map.answer": "pipeline.inspected.InspectedMap",
+    "inspect-run.answer": "pipeline.inspect.InspectedRun",
+    "inspect-store.answer": "pipeline.inspect.InspectedStore",
+    "inspect-tables.answer": "pipeline.inspect.InspectedTables",
+    "migrate.answer": "pipeline.migrate.Migrated",
+    "overlay.answer": "pipeline.overlay.Overlay",
+    "plan-path.answer": "planning.path_files.PlanResult",
+    "predict-path.answer": "planning.path_files.PathResult",
+    "preflight.answer": "pipeline.preflight.Preflight",
+    "prune.answer": "pipeline.prune.Pruned",
+    "reproduce.answer": "experiment.reproduction.Reproduction",
+    "simulate.answer": "simulation.SimulatedSite",
+    "status.answer": "pipeline.status.Status",
+    "train.answer": "learning.training.TrainResult",
+    "verify.answer": "pipeline.verify.Verified",
+}
+"""The dataclass of each document and of each answer of ``--json``, by the name of its schema."""
+
+
+def json_output_types() -> dict[str, type]:
+    """Return the dataclass of every document and answer of ``--json``, by the name of its schema."""
+    homes = {name: f"tcpipe.{path}".rpartition(".") for name, path in _ANSWERS.items()}
+    return {name: getattr(import_module(module), cls) for name, (module, _, cls) in homes.items()}

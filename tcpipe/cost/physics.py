@@ -9,12 +9,12 @@ a second, and a skid-steered one drags its wheels sideways with a torque that ha
 
     P = P0 + D v / cos(s) + g(F v + N v tan(s) + M |yaw rate|),   g(x) = x for x > 0, k x for x < 0
 
-P0 is what is drawn while the robot stands, D [N] what motors and gears take as soon as they turn, on any grade and by the way along the
-surface (of rolling the cosine cancels), N = m g / efficiency [N], F = N c [N] and M [W per rad/s] are of a terrain class, or of all ground
-where classes are not known. All are sizes, none negative. D is told from F by where the slope begins to drive the robot, and is a term only
-where that is seen; else F holds it. They are fitted to the force P / v with Huber's weights (Huber 1964; k = 1.345), so that a minority of
-odd metres bends nothing. Their deviations count that neighbours err alike (White's sandwich over blocks of consecutive segments; Cameron
-and Miller, J. Human Resources 50, 2015).
+P0 is the idle power, D [N] the loss of motors and gears as soon as they turn, on any grade and per metre along the surface (of rolling
+the cosine cancels), N = m g / efficiency [N]; F = N c [N] and M [W per rad/s] belong to a terrain class, or to all ground without classes.
+None is negative. The onset of downhill driving distinguishes D from F, and D is a term only where it is observed; else F includes it. They
+are fitted to the force P / v with Huber's weights (Huber 1964; k = 1.345), so that a minority of outliers has little effect. Their standard
+deviations account for correlated neighbours (White's sandwich over blocks of consecutive segments; Cameron and Miller, J. Human Resources
+50, 2015).
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ from tcpipe.tables.facts import PhysicsFit, PhysicsScore, PhysicsTerm
 Floats = NDArray[np.float64]
 
 FEWEST = 20  # segments to fit on, and of a class to have coefficients of its own
-_LEAST_SLOPE = 0.02  # standard deviation of the rises: on flatter ground weight and rolling cannot be told apart
-_LEAST_SPEED = 0.1  # of the median: with less variation standing and rolling cannot be told apart
+_LEAST_SLOPE = 0.02  # standard deviation of the rises: on flatter ground weight and rolling cannot be distinguished
+_LEAST_SPEED = 0.1  # of the median: with less variation standing and rolling cannot be distinguished
 _LEAST_TURNS = (
     5.0  # metres that vary as all turns do: a class whose own vary by less says nothing of what turning on it takes
 )
@@ -256,11 +256,11 @@ def _fit_robustly(metres: FitSamples, terms: Sequence[tuple[str, str]], standing
         scale = max(_NORMAL * float(np.median(np.abs(off))), 1e-9)
         weight = clear * np.minimum(1.0, _HUBER * scale / np.maximum(np.abs(off), 1e-12))
         by = made * np.sqrt(weight)[:, None] / scale
-        seen = (force + recovered * traction) * np.sqrt(weight) / scale
+        target = (force + recovered * traction) * np.sqrt(weight) / scale
         if prior is not None and standing_watt is not None:
-            by, seen = np.vstack([by, prior]), np.append(seen, prior.max() * standing_watt)
+            by, target = np.vstack([by, prior]), np.append(target, prior.max() * standing_watt)
         q, r = np.linalg.qr(by)
-        before, found = value, _fit_non_negative(r, q.T @ seen)
+        before, found = value, _fit_non_negative(r, q.T @ target)
         value, recovered = found[:count], min(float(found[count]), 1.0)
         if np.abs(value - before).max() < 1e-7 * np.abs(value).max():
             break
@@ -269,10 +269,10 @@ def _fit_robustly(metres: FitSamples, terms: Sequence[tuple[str, str]], standing
     return Physics(tuple(terms), value, covariance, recovered, 0.0, len(force))
 
 
-def _fit_non_negative(made: Floats, seen: Floats) -> Floats:
+def _fit_non_negative(made: Floats, target: Floats) -> Floats:
     """Return what fits best with no size below zero: mostly no bound holds, and the plain solution is it."""
-    plain = np.asarray(np.linalg.lstsq(made, seen, rcond=None)[0], np.float64)
-    return plain if (plain >= 0.0).all() else solve_non_negative(made, seen)
+    plain = np.asarray(np.linalg.lstsq(made, target, rcond=None)[0], np.float64)
+    return plain if (plain >= 0.0).all() else solve_non_negative(made, target)
 
 
 def _estimate_covariance(
@@ -287,8 +287,8 @@ def _estimate_covariance(
     few = len(starts) / max(len(starts) - rows.shape[1], 1.0)
     bread, meat = (rows * weight[:, None]).T @ rows, left.T @ left * few
     if prior is not None:
-        told = np.outer(prior[free], prior[free])
-        bread, meat = bread + told, meat + told
+        information = np.outer(prior[free], prior[free])
+        bread, meat = bread + information, meat + information
     inverse = np.linalg.pinv(bread, hermitian=True)
     out = np.zeros((len(free), len(free)))
     out[np.ix_(free, free)] = inverse @ meat @ inverse

@@ -2,7 +2,7 @@
 
 Estimated are, in this order:
 
-* the **bias** of each terrain class: what all its metres took over what was said of them, less one, as far as it is beyond chance. With
+* the **bias** of each terrain class: the ratio of its metres' true and predicted sums, less one, as far as it is beyond chance. With
   b the ratio of a class, b0 that of all and s its standard error over blocks of the drives, b0 + (b - b0) max(0, 1 - s² / (b - b0)²)
   (James and Stein's positive part; Efron and Morris, JASA 70, 1975). Predictions are multiplied by it, so that they are centred.
 * the **spread** of one metre, a + c |prediction|, with a factor of the class that few samples hardly move from 1.
@@ -33,7 +33,7 @@ COVERAGE = 0.9
 """Share of drives that an interval is to hold."""
 
 FEWEST = 20
-"""Held-out samples without which nothing is said of errors, and of a class without which its bias is that of all."""
+"""Fewest held-out samples for errors, and of a class for a bias of its own."""
 
 _TAIL = (1.0 - COVERAGE) / 2.0
 _Z = 1.6448536269514722
@@ -70,7 +70,7 @@ class Errors:
     low, high : 5 % and 95 % quantiles of the errors over their spread.
     bias_std : standard error of the class's bias, of the prediction, shape (256,).
     lag_m, correlation : of two metres so far apart on one run, from each lag to the next.
-    of_run : the last of them, each run's own, raised for how few runs told it.
+    of_run : the last of them, each run's own, raised for the small number of runs.
     runs, samples : that were held out.
     """
 
@@ -86,25 +86,25 @@ class Errors:
     runs: int
     samples: int
 
-    def spread(self, predicted: Floats, class_id: NDArray[np.integer]) -> Floats:
+    def compute_std(self, predicted: Floats, class_id: NDArray[np.integer]) -> Floats:
         """Return the standard deviation of each prediction, shape (N,)."""
         return np.asarray((self.floor + self.share * np.abs(predicted)) * self.of_class[class_id])
 
-    def of_pieces(self, predicted: Floats, class_id: NDArray[np.integer]) -> tuple[Floats, Floats]:
+    def compute_intervals(self, predicted: Floats, class_id: NDArray[np.integer]) -> tuple[Floats, Floats]:
         """Return the interval of each piece, shape (N,) each."""
-        spread = self.spread(predicted, class_id)
+        spread = self.compute_std(predicted, class_id)
         return predicted + self.low * spread, predicted + self.high * spread
 
-    def of_sum(self, predicted: Floats, class_id: NDArray[np.integer]) -> tuple[float, float]:
+    def compute_sum_interval(self, predicted: Floats, class_id: NDArray[np.integer]) -> tuple[float, float]:
         """Return the interval of the sum over pieces of about a metre, in order along the path; shape (N,), NaN counts as none."""
         known = np.isfinite(predicted)
-        said = np.where(known, predicted, 0.0)
-        spread = np.where(known, self.spread(said, class_id), 0.0)
-        middle, alone = float(said.sum()), float((spread**2).sum())
+        values = np.where(known, predicted, 0.0)
+        spread = np.where(known, self.compute_std(values, class_id), 0.0)
+        middle, alone = float(values.sum()), float((spread**2).sum())
         if not alone:
             return middle, middle
         variance = max(self._variance(spread), alone / spread.size)
-        common = float((np.abs(said) * self.bias_std[class_id]).sum())
+        common = float((np.abs(values) * self.bias_std[class_id]).sum())
         # Errors of a single metre are no normal ones, sums nearly.
         like_one = min(variance / float(spread.sum()) ** 2, 1.0)
         ends = (np.array([self.low, self.high]) * like_one + np.array([-_Z, _Z]) * (1.0 - like_one)) / _Z
@@ -144,7 +144,7 @@ def fit_bias_correction(residuals: Residuals) -> BiasCorrection:
 
 
 def _fit_bias_correction(held: _Held) -> BiasCorrection:
-    return BiasCorrection(*(_fit_bias(held.said[name], held.true[name], held) for name in ("duration", "energy")))
+    return BiasCorrection(*(_fit_bias(held.predicted[name], held.true[name], held) for name in ("duration", "energy")))
 
 
 def fit_errors(residuals: Residuals) -> dict[str, Errors] | None:
@@ -156,11 +156,13 @@ def fit_errors(residuals: Residuals) -> dict[str, Errors] | None:
     if held is None:
         return None
     correction = _fit_bias_correction(held)
-    power, velocity = correction.apply(held.said["power"], held.said["velocity"], held.class_id)
-    said = {"power": power, "velocity": velocity, "duration": 1.0 / velocity, "energy": power / velocity}
+    power, velocity = correction.apply(held.predicted["power"], held.predicted["velocity"], held.class_id)
+    predicted = {"power": power, "velocity": velocity, "duration": 1.0 / velocity, "energy": power / velocity}
     std = {"duration": correction.duration.std, "energy": correction.energy.std}
     nothing = np.zeros(_CLASSES)
-    return {name: _fit_class_errors(of, held.true[name], held, std.get(name, nothing)) for name, of in said.items()}
+    return {
+        name: _fit_class_errors(of, held.true[name], held, std.get(name, nothing)) for name, of in predicted.items()
+    }
 
 
 @dataclass(frozen=True, slots=True)
@@ -168,7 +170,7 @@ class _Held:
     """Held-out samples in the order of driving: label and prediction of each quantity, shape (N,), and their place."""
 
     true: Mapping[str, Floats]
-    said: Mapping[str, Floats]
+    predicted: Mapping[str, Floats]
     class_id: Ints
     run: Ints
     way_m: Floats
@@ -179,8 +181,8 @@ class _Held:
         names = ("power_watt", "velocity_mps", "power_predicted_watt", "velocity_predicted_mps")
         if not set(names) <= residuals.keys():
             return None
-        power, velocity, said_power, said_velocity = (residuals[name].astype(np.float64) for name in names)
-        usable = np.isfinite(power + said_power) & (velocity > 0.0) & (said_velocity > 0.0)
+        power, velocity, predicted_power, predicted_velocity = (residuals[name].astype(np.float64) for name in names)
+        usable = np.isfinite(power + predicted_power) & (velocity > 0.0) & (predicted_velocity > 0.0)
         if np.count_nonzero(usable) < FEWEST:
             return None
         run = np.unique(residuals["run_id"], return_inverse=True)[1].reshape(-1)
@@ -191,26 +193,26 @@ class _Held:
         # A segment's pace is its chord over its time: neighbours are a chord apart.
         step_m = pace[:-1] * np.diff(start_ns[rows]) * 1e-9
         way_m = np.concatenate([[0.0], np.cumsum(np.where(np.diff(of_run) == 0, step_m, 0.0))])
-        true, said = (
+        true, predicted = (
             {"power": p[rows], "velocity": v[rows], "duration": 1.0 / v[rows], "energy": p[rows] / v[rows]}
-            for p, v in ((power, velocity), (said_power, said_velocity))
+            for p, v in ((power, velocity), (predicted_power, predicted_velocity))
         )
         class_id = np.nan_to_num(residuals["terrain_class"][rows].astype(np.float64)).astype(np.int64)
-        return cls(true, said, class_id, of_run, way_m)
+        return cls(true, predicted, class_id, of_run, way_m)
 
 
-def _fit_bias(said: Floats, true: Floats, held: _Held) -> Bias:
+def _fit_bias(predicted: Floats, true: Floats, held: _Held) -> Bias:
     """Return the bias of all ground, and of each class as far as it is beyond chance."""
     block = held.run
     if np.unique(block).size < _ENOUGH_RUNS:
-        block = np.cumsum(np.r_[True, np.diff(held.run) != 0] | (np.arange(said.size) % _BLOCK == 0)) - 1
-    everywhere, error = _estimate_ratio(said, true, block)
+        block = np.cumsum(np.r_[True, np.diff(held.run) != 0] | (np.arange(predicted.size) % _BLOCK == 0)) - 1
+    everywhere, error = _estimate_ratio(predicted, true, block)
     everywhere *= max(0.0, 1.0 - (error / everywhere) ** 2) if everywhere else 0.0
     value, std = np.full(_CLASSES, everywhere), np.full(_CLASSES, error)
     numbers, counts = np.unique(held.class_id, return_counts=True)
     for number in numbers[counts >= FEWEST].tolist():  # fewer lie in a block or two, which tell no chance
         own = held.class_id == number
-        found, chance = _estimate_ratio(said[own], true[own], block[own])
+        found, chance = _estimate_ratio(predicted[own], true[own], block[own])
         beyond = found - everywhere
         kept = max(0.0, 1.0 - (chance / beyond) ** 2) if beyond else 0.0
         value[number] = everywhere + kept * beyond
@@ -218,22 +220,24 @@ def _fit_bias(said: Floats, true: Floats, held: _Held) -> Bias:
     return Bias(np.clip(value, -_MOST_BIAS, _MOST_BIAS), std)
 
 
-def _estimate_ratio(said: Floats, true: Floats, block: Ints) -> tuple[float, float]:
-    """Return what was true over what was said, less one, and its standard error over blocks; a single block tells no error but itself."""
-    whole = float(np.abs(said).sum())
+def _estimate_ratio(predicted: Floats, true: Floats, block: Ints) -> tuple[float, float]:
+    """Return the ratio of true and predicted sums, less one, and its standard error over blocks; of a single block the ratio itself."""
+    whole = float(np.abs(predicted).sum())
     if not whole:
         return 0.0, 0.0
-    found = float((true - said).sum()) / whole
-    of_block = np.bincount(np.unique(block, return_inverse=True)[1], weights=true - said - found * np.abs(said))
+    found = float((true - predicted).sum()) / whole
+    of_block = np.bincount(
+        np.unique(block, return_inverse=True)[1], weights=true - predicted - found * np.abs(predicted)
+    )
     several = of_block.size
     if several < 2:
         return found, abs(found)
     return found, float(np.sqrt((of_block**2).sum() * several / (several - 1.0))) / whole
 
 
-def _fit_class_errors(said: Floats, true: Floats, held: _Held, bias_std: Floats) -> Errors:
-    error = true - said
-    design = np.column_stack([np.ones_like(said), np.abs(said)])
+def _fit_class_errors(predicted: Floats, true: Floats, held: _Held, bias_std: Floats) -> Errors:
+    error = true - predicted
+    design = np.column_stack([np.ones_like(predicted), np.abs(predicted)])
     (floor, share), _ = nnls(design, np.abs(error))
     plain = np.maximum(design @ [floor, share], 1e-12)
     scale = max(float(np.sqrt(np.mean((error / plain) ** 2))), 1e-9)

@@ -64,11 +64,11 @@ def empty_extra_features(count: int) -> ExtraFeatures:
     return ExtraFeatures(np.zeros(count, np.int64), unknown, unknown, unknown)
 
 
-def available_features(beside: ExtraFeatures) -> tuple[ExtraFeature, ...]:
+def available_features(features: ExtraFeatures) -> tuple[ExtraFeature, ...]:
     """Return the features that are known for at least one of these samples."""
     found = []
     for name in ("turn_radpm", "command_mps"):
-        values = getattr(beside, name)
+        values = getattr(features, name)
         if (known := values[np.isfinite(values)]).size:
             mean = float(known.mean())
             found.append(
@@ -77,9 +77,9 @@ def available_features(beside: ExtraFeatures) -> tuple[ExtraFeature, ...]:
     return tuple(found)
 
 
-def standardize_features(inputs: Sequence[ExtraFeature], beside: ExtraFeatures) -> Floats:
+def standardize_features(inputs: Sequence[ExtraFeature], features: ExtraFeatures) -> Floats:
     """Return a model's features of N segments as (value - mean) / deviation, shape (N, inputs)."""
-    return _scale_values(inputs, {"turn_radpm": beside.turn_radpm, "command_mps": beside.command_mps})
+    return _scale_values(inputs, {"turn_radpm": features.turn_radpm, "command_mps": features.command_mps})
 
 
 def standardize_columns(inputs: Sequence[ExtraFeature], columns: NDArray[np.floating]) -> Floats:

@@ -13,6 +13,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -71,6 +72,18 @@ MOST_SAMPLES = 10_000_000
 
 MOST_PX = 1024
 """Side of a patch in pixels."""
+
+
+@contextmanager
+def _convert_errors(remedy: str = "") -> Iterator[None]:
+    """Raise a `StoreError` as `DatasetError`, ``remedy`` added to its lines."""
+    try:
+        yield
+    except StoreError as error:
+        raise DatasetError(*(f"{problem}{remedy}" for problem in error.problems)) from None
+
+
+_AGAIN = "; build the dataset again"
 
 
 @dataclass(frozen=True, slots=True)
@@ -248,10 +261,8 @@ def read_card(directory: Path, *, proved: bool = True) -> DatasetCard:
         raise UsageError(f"{directory}: is a file, wanted the directory of a dataset")
     if not (directory / CARD).is_file():
         raise UsageError(f"{directory}: not a dataset: it has no {CARD}")
-    try:
+    with _convert_errors():
         found = read_sealed(directory / CARD, ours=lambda found: proved and _is_current(found))
-    except StoreError as error:
-        raise DatasetError(*error.problems) from None
     if found.get("kind") != KIND:
         raise DatasetError(f"{directory / CARD}: not the card of a tcpipe dataset (kind is {found.get('kind')!r})")
     if not _is_current(found) or "verdict" not in found:  # before data model 3.0 its findings were sentences
@@ -287,10 +298,8 @@ def read_current_card(directory: Path) -> DatasetCard:
     if card.data_model_version not in READ_VERSIONS:
         raise DatasetError(_describe_outdated(directory, card.data_model_version))
     described = [name for name in card.checksums if Path(name).name == DESCRIPTION]
-    try:
+    with _convert_errors():
         prove_files(directory, card.checksums, [SAMPLES, *described])
-    except StoreError as error:
-        raise DatasetError(*error.problems) from None
     return card
 
 
@@ -301,28 +310,22 @@ def read_samples(directory: Path, columns: Sequence[str] | None = None) -> pa.Ta
     """
     later = {column.name for column in SAMPLES_SCHEMA.columns if column.since}
     asked = SAMPLES_SCHEMA.names() if columns is None else list(columns)
-    try:
+    with _convert_errors():
         absent = later.intersection(asked).difference(read_column_names(directory / SAMPLES))
         there = None if columns is None else [name for name in columns if name not in absent]
         return SAMPLES_SCHEMA.select_columns(*asked).add_missing_columns(read_table(directory / SAMPLES, there))
-    except StoreError as error:
-        raise DatasetError(*error.problems) from None
 
 
 def sample_count(directory: Path) -> int:
     """Return the rows of a dataset's samples table, from its footer; `DatasetError` if that cannot be read."""
-    try:
+    with _convert_errors():
         return read_row_count(directory / SAMPLES)
-    except StoreError as error:
-        raise DatasetError(*error.problems) from None
 
 
 def sample_columns(directory: Path) -> list[str]:
     """Return the names of the columns of a dataset's samples table; `DatasetError` if it cannot be read."""
-    try:
+    with _convert_errors():
         return read_column_names(directory / SAMPLES)
-    except StoreError as error:
-        raise DatasetError(*error.problems) from None
 
 
 @dataclass(frozen=True, slots=True)
@@ -351,11 +354,9 @@ class PatchFiles:
     def expect(self, pieces: Iterable[int], layers: Iterable[str]) -> None:
         """Have pieces brought here that are read soon, where they lie in a bucket."""
         if self.fetched is not None and self.arrays:
-            try:
+            with _convert_errors(_AGAIN):
                 for layer in layers:
                     self.arrays[layer].expect((piece, 0, 0) for piece in pieces)
-            except StoreError as error:
-                raise DatasetError(*(f"{problem}; build the dataset again" for problem in error.problems)) from None
 
     def read(
         self, piece: int, layers: Iterable[str], out: Mapping[str, NDArray[Any]] | None = None
@@ -425,10 +426,8 @@ def open_patches(
         _refuse_others(find_wrong_files(DirectoryPlace(directory), card.checksums, shards), directory)
     if card.format == "parquet":
         return replace(_open_sharded_patches(directory, layers, px, card), fetched=fetched)
-    try:
+    with _convert_errors(_AGAIN):
         arrays = {name: _open_layer_array(directory, layer, samples, px, fetched) for name, layer in layers.items()}
-    except StoreError as error:
-        raise DatasetError(*(f"{problem}; build the dataset again" for problem in error.problems)) from None
     starts = np.append(np.arange(0, samples, CHUNK_ROWS), samples)
     return PatchFiles(directory, layers, px, starts, arrays, fetched=fetched)
 

@@ -115,14 +115,9 @@ def read_polygons(path: Path) -> tuple[list[PolygonFeature], list[str]]:
     """
     features: list[PolygonFeature] = []
     problems: list[str] = []
-    for where, properties, geometry in _iterate_features(path, _parse_document(path)):
+    for where, properties, geometry in _iterate_features(path):
         features.append(PolygonFeature(where, properties, tuple(_iterate_polygons(where, geometry, problems))))
     return features, problems
-
-
-def read_features(path: Path) -> Iterator[tuple[str, Mapping[str, Json], Json]]:
-    """Yield where, properties and geometry object of every feature of a file; `RegionError` if it is not GeoJSON in WGS84."""
-    yield from _iterate_features(path, _parse_document(path))
 
 
 def shorten_value(value: object) -> str:
@@ -161,8 +156,9 @@ def _parse_document(path: Path) -> Mapping[str, Json]:
     return document
 
 
-def _iterate_features(path: Path, document: Mapping[str, Json]) -> Iterator[tuple[str, Mapping[str, Json], Json]]:
-    """Yield where, properties and geometry object of every feature."""
+def _iterate_features(path: Path) -> Iterator[tuple[str, Mapping[str, Json], Json]]:
+    """Yield where, properties and geometry object of every feature of a file; `RegionError` if it is not GeoJSON in WGS84."""
+    document = _parse_document(path)
     name, listed = document["type"], document.get("features")
     features: Sequence[Json]
     if name == "FeatureCollection" and isinstance(listed, list):
@@ -290,7 +286,7 @@ def read_line(path: Path) -> NDArray[np.float64]:
     PathError : not GeoJSON, in another CRS, no line or several, a line of one point, coordinates that are no lon/lat.
     """
     try:
-        features = list(read_features(path))
+        features = list(_iterate_features(path))
     except RegionError as error:
         raise PathError(*error.problems) from None
     if not features:

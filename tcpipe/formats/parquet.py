@@ -249,18 +249,13 @@ def read_row_count(path: Path) -> int:
         return int(pq.read_metadata(path).num_rows)
 
 
-def read_lowest(path: Path, column: str) -> int:
-    """Return the lowest value of a column of whole numbers, from the statistics in the footer; `StoreError` where they lack."""
-    return min(_read_statistics(path, column))[0]
+def read_range(path: Path, column: str) -> tuple[int, int]:
+    """Return the lowest and the highest value of a column of whole numbers, from the statistics in the footer.
 
-
-def read_highest(path: Path, column: str) -> int:
-    """Return the highest value of a column of whole numbers, as `read_lowest`."""
-    return max(of[1] for of in _read_statistics(path, column))
-
-
-def _read_statistics(path: Path, column: str) -> list[tuple[int, int]]:
-    """Return the lowest and the highest value of a column in every row group that has rows."""
+    Raises
+    ------
+    StoreError : the file cannot be read, or has no such statistics.
+    """
     with _convert_damage(path):
         about = pq.read_metadata(path)
         groups = [about.row_group(index) for index in range(about.num_row_groups)]
@@ -268,7 +263,7 @@ def _read_statistics(path: Path, column: str) -> list[tuple[int, int]]:
         found = [group.column(at).statistics for group in groups if at >= 0 and group.num_rows]
     if not found or not all(of is not None and of.has_min_max for of in found):
         raise StoreError(f"{path}: has no statistics of {column}")
-    return [(int(of.min), int(of.max)) for of in found]
+    return min(int(of.min) for of in found), max(int(of.max) for of in found)
 
 
 _WGS84 = "EPSG:4326"

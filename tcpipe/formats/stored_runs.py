@@ -16,7 +16,7 @@ from tcpipe.errors import StoreError
 from tcpipe.formats.commits import State
 from tcpipe.formats.index_files import RunFacts
 from tcpipe.formats.integrity import Checksum, compute_checksum, compute_checksums, find_wrong_checksum
-from tcpipe.formats.parquet import read_highest, read_lowest, read_table, write_table
+from tcpipe.formats.parquet import read_range, read_table, write_table
 from tcpipe.formats.place import DirectoryPlace, Place
 from tcpipe.formats.recipe_toml import read_key
 from tcpipe.formats.run_documents import Manifest, name_folder, read_as_at
@@ -192,7 +192,7 @@ def add_span(row: RunFacts, place: Place, manifest: Manifest) -> RunFacts:
     with suppress(StoreError):
         if row.segments:
             path = place.local(name, manifest.checksums[name])
-            return replace(row, start_ns=read_lowest(path, "start_ns"), end_ns=read_highest(path, "end_ns"))
+            return replace(row, start_ns=read_range(path, "start_ns")[0], end_ns=read_range(path, "end_ns")[1])
     return row
 
 

@@ -23,7 +23,6 @@ from numpy.typing import NDArray
 
 from tcpipe.errors import FusionError
 from tcpipe.fusion import state_kernel as kernel
-from tcpipe.fusion.course import compute_course
 from tcpipe.fusion.error_state_pass import DOF, ROLES, FilterPass, compute_lag_rows
 from tcpipe.fusion.gnss_faults import (
     FaultHypothesis,
@@ -35,7 +34,7 @@ from tcpipe.fusion.gnss_faults import (
     find_wrong_fixes,
     is_inside,
 )
-from tcpipe.fusion.initial import find_stationary_intervals
+from tcpipe.fusion.initial import compute_course, find_stationary_intervals
 from tcpipe.fusion.measurements import GNSS, InitialState, Measurements, select_measurements
 from tcpipe.fusion.process import GROUND, UNSEEN_TURN_RADPS, VISUAL_SCALE_STD, WHEEL_SCALE_STD
 from tcpipe.fusion.signals import compute_median_period_ns
@@ -107,7 +106,7 @@ def run_error_state(
 
 @dataclass(frozen=True, slots=True)
 class _FilterSection:
-    """A stretch that is filtered, more than once where its fixes contradict the rest; with ``errors`` that of the fixes is in the state."""
+    """A section that is filtered, more than once where its fixes contradict the rest; with ``errors`` that of the fixes is in the state."""
 
     measurements: Measurements
     initial: InitialState

@@ -1,4 +1,4 @@
-"""One pass of the error-state filter over a stretch, and the smoother's way back over it, in blocks of bounded memory."""
+"""One pass of the error-state filter over a section, and the smoother's way back over it, in blocks of bounded memory."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ from tcpipe.fusion.gnss_faults import (
     Innovations,
     Jump,
     Spans,
+    compute_unexplained_innovation,
     is_inside,
-    unexplained_innovation,
 )
 from tcpipe.fusion.measurements import DOPPLER, GNSS, VISUAL, WHEELS, InitialState, Measurements
 from tcpipe.fusion.process import (
     SLOPE_RAD,
     estimate_slope_std_rad,
+    find_scale_stds,
     is_gliding,
     is_turned_by_course,
-    process_noise,
-    scale_stds,
+    make_process_noise,
     turn_scale_std,
 )
 from tcpipe.fusion.signals import compute_median_period_ns, find_chi_square_threshold
@@ -107,7 +107,7 @@ class FilterPass:
         for kind in (*ROLES, kernel.STANDING, kernel.STANDING_RATE):
             self.gates[kind] = find_chi_square_threshold(DOF[kind], gate_probability)
         self._levers = _collect_lever_arms(measurements)
-        self._densities = process_noise(measurements)
+        self._densities = make_process_noise(measurements)
         self._lock_out = _lock_out(measurements)
         gnss, carriers = measurements.gnss, _has_dead_reckoning(measurements)
         self._tilt_known = measurements.imu is not None
@@ -126,7 +126,7 @@ class FilterPass:
         if measurements.imu is None and not measurements.odometries():
             self.unseen_yaw_std = _ANY_YAW_STD_RAD
         self.turn_scale_std = turn_scale_std(measurements)
-        self.scale_stds = scale_stds(measurements)
+        self.find_scale_stds = find_scale_stds(measurements)
         self.last: _Memory
 
     def doubt_fixes(self, errors: FixErrors | None, wrong: Spans = (), *, follows: bool = True) -> None:
@@ -182,7 +182,7 @@ class FilterPass:
         """Return what remains unexplained if the fixes err in ``spans``; ``usual`` is the squared innovation of a fix that is right."""
         fixes = self._innovations(kernel.GNSS_POSITION)
         others = [self._innovations(kind) for kind in _WITHOUT_PLACE]
-        return unexplained_innovation(spans, fixes, others, usual)
+        return compute_unexplained_innovation(spans, fixes, others, usual)
 
     def usual(self) -> float:
         """Return the mean squared normalised innovation of the fixes that the gate took."""
@@ -199,7 +199,7 @@ class FilterPass:
         """Forward states at the wanted stamps, rows as `state_kernel.saved` fills them; ``keep`` what `smooth` wants."""
         outputs = np.full((self.timeline.output.max() + 1, kernel.SAVED), np.nan)
         blocks = self._blocks()
-        memory = _start(initial, self.scale_stds, self.turn_scale_std, self.start_error_m2)
+        memory = _start(initial, self.find_scale_stds, self.turn_scale_std, self.start_error_m2)
         self._checkpoints, self._kept = [], {}
         for index, (first, last) in enumerate(blocks):
             self._checkpoints.append(memory.copy())
@@ -221,7 +221,7 @@ class FilterPass:
         outputs = np.full((self.timeline.output.max() + 1, kernel.SAVED), np.nan)
         memory = other._checkpoints[first // _BLOCK].copy()
         if first == 0:  # the fixes' error at the start may be another, too
-            memory = _start(initial, self.scale_stds, self.turn_scale_std, self.start_error_m2)
+            memory = _start(initial, self.find_scale_stds, self.turn_scale_std, self.start_error_m2)
         self._forward(first, count, memory, outputs, None)
 
     def smoothed(self, initial: InitialState) -> NDArray[np.float64]:
@@ -371,7 +371,7 @@ def _allocate_links(lags: Sequence[int], n: int) -> tuple[NDArray[Any], ...]:
 
 def _start(
     initial: InitialState,
-    scale_stds: tuple[float, float],
+    find_scale_stds: tuple[float, float],
     turn_scale_std: float = 0.0,
     fix_error_m2: NDArray[np.float64] = _NO_ERROR,
 ) -> _Memory:
@@ -393,7 +393,7 @@ def _start(
             np.full(3, 0.15**2),
             np.full(3, initial.velocity_std_mps**2),
             initial.position_std_m**2,
-            np.square(np.maximum(scale_stds, _FIXED)),
+            np.square(np.maximum(find_scale_stds, _FIXED)),
             fix_error_m2,
         )
     )

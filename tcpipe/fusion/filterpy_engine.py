@@ -16,7 +16,7 @@ from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter
 from numpy.typing import NDArray
 
 from tcpipe.fusion import ukf15_kernel as kernel
-from tcpipe.fusion.ukf15_events import ACCEPTED, RECOVERED, REJECTED, Events, FilterState, Outputs, Sources
+from tcpipe.fusion.ukf15_kernel import ACCEPTED, RECOVERED, REJECTED, Events, FilterState, Outputs, Sources
 from tcpipe.geometry.rotation import wrap_to_pi
 
 _ANGLE_ENTRIES = (kernel.ROLL, kernel.PITCH, kernel.YAW)

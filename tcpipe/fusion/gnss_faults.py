@@ -76,7 +76,7 @@ class FaultHypothesis:
 Try = Callable[[Spans], FaultHypothesis]
 
 
-def unexplained_innovation(
+def compute_unexplained_innovation(
     spans: Spans, fixes: Innovations, others: Sequence[Innovations], usual: float
 ) -> FaultHypothesis:
     """Return what a run leaves unexplained in which the fixes err in ``spans``.

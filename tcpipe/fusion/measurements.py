@@ -120,7 +120,7 @@ class InertialMeasurements:
 
 @dataclass(frozen=True, slots=True)
 class Measurements:
-    """All measurements of one stretch of one clock epoch without a long gap; a role that the log lacks is None.
+    """All measurements of one section of one clock epoch without a long gap; a role that the log lacks is None.
 
     At least one of ``gnss``, ``wheels`` and ``visual`` is there. ``nonholonomic_std_mps``: sideways and vertical body velocity are
     zero to within this. ``doppler`` goes with ``gnss``, whose antenna it is of.
@@ -146,7 +146,7 @@ class Measurements:
 
 @dataclass(frozen=True, slots=True)
 class InitialState:
-    """Where a stretch starts, found offline from all of its data (`tcpipe.fusion.initial`).
+    """Where a section starts, found offline from all of its data (`tcpipe.fusion.initial`).
 
     Attributes
     ----------

@@ -109,8 +109,8 @@ def prepare_ground_velocities(
     stamp_ns: Ints, columns: Columns, *, default_std_mps: float
 ) -> tuple[GroundVelocities, Prepared]:
     """Prepare a receiver's velocities (columns of the role gnss_velocity); unknown variances: ``default_std_mps``, twice that for up."""
-    velocity = _make_rotation_matrix(columns, [f"{axis}_velocity_mps" for axis in ("east", "north", "up")])
-    variance = _make_rotation_matrix(columns, [f"{axis}_var_m2ps2" for axis in ("east", "north", "up")])
+    velocity = _stack_columns(columns, [f"{axis}_velocity_mps" for axis in ("east", "north", "up")])
+    variance = _stack_columns(columns, [f"{axis}_var_m2ps2" for axis in ("east", "north", "up")])
     measured = np.asarray(np.isfinite(velocity[:, :2]).all(1) & ~(np.abs(velocity) >= _MAX_VELOCITY_MPS).any(1))
     usable, repeated = _select_usable_rows(stamp_ns, measured)
     velocity, variance = velocity[usable], variance[usable]
@@ -136,13 +136,13 @@ def prepare_body_velocities(
     is then that of the increment from pose to pose, in the middle of the two stamps, in the axes half-way between the two. One that is
     surely along the axes of the pose's frame is turned by the pose. Of wheels ``only_forward`` velocity, along base_link's x, is measured.
     """
-    pose = _make_rotation_matrix(columns, ("x_m", "y_m", "z_m"))
-    velocity = _make_rotation_matrix(columns, [f"velocity_{axis}_mps" for axis in "xyz"])
-    rate = _make_rotation_matrix(columns, [f"angular_velocity_{axis}_radps" for axis in "xyz"])
-    variance = _make_rotation_matrix(columns, [f"velocity_var_{axis}_m2ps2" for axis in "xyz"])
+    pose = _stack_columns(columns, ("x_m", "y_m", "z_m"))
+    velocity = _stack_columns(columns, [f"velocity_{axis}_mps" for axis in "xyz"])
+    rate = _stack_columns(columns, [f"angular_velocity_{axis}_radps" for axis in "xyz"])
+    variance = _stack_columns(columns, [f"velocity_var_{axis}_m2ps2" for axis in "xyz"])
     subject = Subject("role", WHEELS if only_forward else VISUAL)
     findings: list[Finding] = []
-    quat = normalize(_make_rotation_matrix(columns, [f"quat_{c}" for c in "xyzw"]))
+    quat = normalize(_stack_columns(columns, [f"quat_{c}" for c in "xyzw"]))
     rotation = matrix_from_quat(quat_xyzw)
     if not has_twist(_rotate_vectors(rotation, velocity)[:, :1], pose):
         stamp_ns, velocity, rate = compute_increments(stamp_ns, pose, quat)
@@ -235,13 +235,13 @@ def prepare_imu(
 
     The noise is the one given or, where that is larger, that of the samples: motion too fast for the unit's rate counts as noise.
     """
-    rate = _make_rotation_matrix(columns, [f"angular_velocity_{axis}_radps" for axis in "xyz"])
-    force = _make_rotation_matrix(columns, [f"linear_acceleration_{axis}_mps2" for axis in "xyz"])
+    rate = _stack_columns(columns, [f"angular_velocity_{axis}_radps" for axis in "xyz"])
+    force = _stack_columns(columns, [f"linear_acceleration_{axis}_mps2" for axis in "xyz"])
     of_orientation = np.zeros(3, np.bool_)
     if (np.nan_to_num(rate) == 0.0).all(0).any() and np.nan_to_num(
         np.diff(force, axis=0)
     ).any():  # a dead IMU stays dead
-        quat = normalize(_make_rotation_matrix(columns, [f"quat_{c}" for c in "xyzw"]))
+        quat = normalize(_stack_columns(columns, [f"quat_{c}" for c in "xyzw"]))
         rate, of_orientation = compute_orientation_rates(stamp_ns, rate, quat)
     # NaN compares false.
     good: Mask = np.all(np.abs(rate) < _MAX_RATE_RADPS, 1) & np.all(np.abs(force) < _MAX_FORCE_MPS2, 1)
@@ -321,7 +321,7 @@ def _estimate_local_noise(stamp_ns: Ints, values: Floats) -> Floats:
     return np.asarray(np.sqrt(largest / np.maximum(last - first, 1)))
 
 
-def _make_rotation_matrix(columns: Columns, names: list[str] | tuple[str, ...]) -> Floats:
+def _stack_columns(columns: Columns, names: list[str] | tuple[str, ...]) -> Floats:
     return np.stack([columns[name] for name in names], -1)
 
 

@@ -1,9 +1,8 @@
-"""How far the robot strays from what the process holds: noise densities, most of them read from the sensors themselves.
+"""Process noise of the filters: noise densities, most of them estimated from the sensors themselves.
 
-White noise of standard deviation s at f Hz has the density s²/f. What of it changes along the drive is one number an event, the density
-of the velocity's noise: with an accelerometer that of its noise, which vibration multiplies while the robot moves; without one, where the
-body velocity is held, how fast the forward velocity changes there, since a robot that is taken to brake all the time is one of which
-nothing is known.
+White noise of standard deviation s at f Hz has the density s²/f. What changes along the drive is the density of the velocity's noise, one
+number an event. With an accelerometer it is that of its noise, which vibration multiplies while the robot moves. Without one, where the
+body velocity is held, it follows how fast the forward velocity changes there.
 """
 
 from __future__ import annotations
@@ -129,7 +128,7 @@ def turn_scale_std(measurements: Measurements) -> float:
     return _VISUAL_TURN_SCALE_STD if sources[-1] is measurements.visual else _WHEEL_TURN_SCALE_STD
 
 
-def scale_stds(measurements: Measurements) -> tuple[float, float]:
+def find_scale_stds(measurements: Measurements) -> tuple[float, float]:
     """Return the standard deviations of the scales of wheels and visual odometry; 0 where a scale is unobservable: it stays 1.
 
     Only fixes make a scale observable. Without any, one odometry is the measure: the camera where there is one, else the wheels. What an
@@ -140,7 +139,7 @@ def scale_stds(measurements: Measurements) -> tuple[float, float]:
     return (0.0 if measurements.visual is None else WHEEL_SCALE_STD), 0.0
 
 
-def process_noise(measurements: Measurements) -> NDArray[np.float64]:
+def make_process_noise(measurements: Measurements) -> NDArray[np.float64]:
     """Return the process noise by mode, shape (4, 20), as `tcpipe.fusion.prediction_kernel.predict` takes it.
 
     It includes the scale and alignment errors of the IMU. Biases and scales wander. Slip comes and goes, so the wheels' scale returns to
@@ -157,7 +156,7 @@ def process_noise(measurements: Measurements) -> NDArray[np.float64]:
     density[:, 15] = 2 * WHEEL_SCALE_STD**2 / _WHEEL_SCALE_TIME_S
     density[:, 16] = 0.002**2
     density[:, kernel.DECAY] = 1 / _WHEEL_SCALE_TIME_S
-    density[:, 15:17] *= np.square(scale_stds(measurements)) > 0
+    density[:, 15:17] *= np.square(find_scale_stds(measurements)) > 0
     _fill_turn_noise(measurements, density)
     imu = measurements.imu
     if imu is not None:

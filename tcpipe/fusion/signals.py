@@ -53,7 +53,7 @@ def interpolate_signal(stamp_s: Floats, values: Floats, at_s: Floats) -> Floats:
 
 
 def is_in_gap(stamp_ns: Ints, start_ns: Ints, end_ns: Ints, *, longest_ns: int) -> NDArray[np.bool_]:
-    """Return whether each interval touches a stretch between samples longer than ``longest_ns``, or lies outside the samples.
+    """Return whether each interval touches a span between samples longer than ``longest_ns``, or lies outside the samples.
 
     Half that long outside the first and last sample is still inside.
     """

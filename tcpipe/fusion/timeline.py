@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.fusion import state_kernel as kernel
-from tcpipe.fusion.course import compute_course_rate
+from tcpipe.fusion.initial import compute_course_rate
 from tcpipe.fusion.measurements import BodyVelocities, InertialMeasurements, Measurements
 from tcpipe.fusion.process import (
     DOPPLER_LASTS_S,

@@ -85,7 +85,7 @@ _PAUSE_NS = 5_000_000_000  # a longer pause begins a new section
 
 @dataclass(frozen=True, slots=True)
 class TrackSection:
-    """One stretch: its clock epoch, first and last stamp [ns] of a motion measurement, and its measurements."""
+    """One section: its clock epoch, first and last stamp [ns] of a motion measurement, and its measurements."""
 
     epoch: int
     start_ns: int
@@ -93,8 +93,8 @@ class TrackSection:
     measurements: Measurements
 
 
-def cut_stretches(measurements: Mapping[int, Measurements]) -> list[TrackSection]:
-    """Return the stretches of measurements given by clock epoch, in order of epoch and time; those without motion are left out."""
+def cut_sections(measurements: Mapping[int, Measurements]) -> list[TrackSection]:
+    """Return the sections of measurements given by clock epoch, in order of epoch and time; those without motion are left out."""
     found = []
     for epoch in sorted(measurements):
         whole = measurements[epoch]
@@ -112,15 +112,15 @@ def cut_stretches(measurements: Mapping[int, Measurements]) -> list[TrackSection
     return found
 
 
-def track_stamps(stretch: TrackSection, *, period_ns: int, max_gap_ns: int) -> NDArray[np.int64]:
+def make_track_stamps(section: TrackSection, *, period_ns: int, max_gap_ns: int) -> NDArray[np.int64]:
     """Return the multiples of the period inside a section [ns], without those in a gap.
 
     A gap is a time without any of GNSS, wheels and visual odometry longer than ``max_gap_ns`` and than 2.5 times their usual spacing:
     the IMU alone does not determine a track. A gap is a step in the stamps.
     """
-    first = -(-stretch.start_ns // period_ns) * period_ns
-    stamp = np.arange(first, stretch.end_ns + 1, period_ns, dtype=np.int64)
-    motion = _make_stamps(stretch.measurements, with_imu=False)
+    first = -(-section.start_ns // period_ns) * period_ns
+    stamp = np.arange(first, section.end_ns + 1, period_ns, dtype=np.int64)
+    motion = _make_stamps(section.measurements, with_imu=False)
     longest = max(max_gap_ns, int(2.5 * compute_median_period_ns(motion)))
     return stamp[~is_in_gap(motion, stamp, stamp, longest_ns=longest)]
 

@@ -37,7 +37,7 @@ from tcpipe.fusion.measurements import (
 )
 from tcpipe.fusion.signals import find_chi_square_threshold, is_covered
 from tcpipe.fusion.trajectory import DISPLACEMENT_LAGS_S, Rejections, Trajectory
-from tcpipe.fusion.ukf15_events import ACCEPTED, NOT_RUN, RECOVERED, REJECTED, Events, FilterState, Outputs, Sources
+from tcpipe.fusion.ukf15_kernel import ACCEPTED, NOT_RUN, RECOVERED, REJECTED, Events, FilterState, Outputs, Sources
 from tcpipe.geometry.rotation import invert, quat_from_rpy, rotate, rpy_from_quat
 from tcpipe.tables.facts import StretchFacts
 
@@ -75,7 +75,7 @@ class SensorRows:
     Attributes
     ----------
     role : whose measurements these are; constraints have roles of their own and are in no table.
-    kind : `SELECT`, `ANTENNA`, `SPECIFIC_FORCE` or `SENSOR_VELOCITY` of `tcpipe.fusion.ukf15_events`.
+    kind : `SELECT`, `ANTENNA`, `SPECIFIC_FORCE` or `SENSOR_VELOCITY` of `tcpipe.fusion.ukf15_kernel`.
     entries : which states (`SELECT`), or which of the sensor's three entries, are measured; at most six.
     stamp_ns : [ns], shape (N,), increasing.
     z, variance : shape (N, m), finite.

@@ -121,8 +121,8 @@ def predict_spreads(model: Model, said: Mapping[str, Array], class_ids: NDArray[
     found = {}
     for quantity, costs_of in said.items():
         errors, d = stated[CALLED[quantity]], scale[quantity]
-        low, high = errors.of_pieces(costs_of / d, class_ids)
-        found[quantity] = Spread(d * errors.spread(costs_of / d, class_ids), d * low, d * high)
+        low, high = errors.compute_intervals(costs_of / d, class_ids)
+        found[quantity] = Spread(d * errors.compute_std(costs_of / d, class_ids), d * low, d * high)
     return found
 
 

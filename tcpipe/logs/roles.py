@@ -14,11 +14,13 @@ from functools import partial
 from typing import TypeVar
 
 from tcpipe.logs.robots import ask_which_robot, find_robot, find_robot_namespaces
-from tcpipe.logs.role_findings import find_left_out, find_missing_roles, find_undecodable
 from tcpipe.logs.topics import (
     LISTED,
     Topic,
+    find_left_out,
+    find_missing_roles,
     find_short_topics,
+    find_undecodable,
     format_coverage,
     format_topic_names,
     format_topics,
@@ -244,9 +246,8 @@ _NO_FIXES = "it goes with the fixes of its receiver, and no topic plays gnss"
 def _decide_velocity(decided: _Decisions, candidates: Ranked) -> None:
     """Let the velocity play that comes from the receiver of the fixes; one that nobody can tell to be of it stays out, and is said."""
     fixes = decided.roles["gnss"].topics[0] if "gnss" in decided.roles else ""
-    near = [
-        (rank, why, topic) for rank, why, topic in candidates if _find_receiver(topic.name) == _find_receiver(fixes)
-    ]
+    receiver = fixes.rpartition("/")[0]
+    near = [(rank, why, topic) for rank, why, topic in candidates if topic.name.rpartition("/")[0] == receiver]
     best = _select_best("gnss_velocity", near or candidates) if candidates and fixes else []
     why = best[0][0] if best else ""
     if len(best) == 1:
@@ -270,10 +271,6 @@ def _collect_nmea_topics(decided: _Decisions, topics: Iterable[Topic], ignored: 
     rank = (ROLE_TYPES["gnss_velocity"].index(NMEA_SENTENCE),)
     of_type = [topic for topic in topics if topic.type_name == NMEA_SENTENCE]
     return [(rank, "", topic) for topic in of_type if _is_usable(decided, topic, ignored)]
-
-
-def _find_receiver(name: str) -> str:
-    return name.rpartition("/")[0]
 
 
 def _take_chosen(
@@ -328,6 +325,7 @@ _FUSED = re.compile(
     r"filtered|fused|fusion|ekf|ukf|kalman|icp|truth|groundtruth|gazebo|amcl|locali[sz]|loam|lio|lidar|laser|scan|"
     r"cartographer|hector|slam$|slam_toolbox|map$|mapping|global|world|gt$|kf$"
 )
+_FUSED_FIXES = re.compile(r"filtered|fused|fusion|ekf|ukf|truth")
 _SLAM = re.compile(r"icp$|slam|loam|lego_?loam|(fast)?_?lio|liosam|cartographer|hector$|kiss$")
 """Poses from a laser, matched scan by scan: what is told by nothing else in the log."""
 _OF_GNSS = re.compile(r"gps|gnss|navsat|fix$|utm|ublox|novatel|septentrio|rtk")
@@ -343,13 +341,9 @@ _HUMAN_OR_PLANNER = re.compile(r"joy|teleop|nav|move|interactive|marker|key|web|
 _SIDES = frozenset({"left", "right", "front", "rear", "back", "l", "r", "fl", "fr", "rl", "rr"})
 
 
-def _split_words(name: str) -> list[str]:
-    return [word for word in re.split(r"[/_\-.]+", name.lower()) if word]
-
-
 def _find_role_word(pattern: re.Pattern[str], name: str) -> str | None:
     """Return the first word of a topic's name that the pattern matches from its start."""
-    return next((word for word in _split_words(name) if pattern.match(word)), None)
+    return next((word for word in re.split(r"[/_\-.]+", name.lower()) if word and pattern.match(word)), None)
 
 
 Ranked = list[tuple[tuple[int, ...], str, Topic]]
@@ -383,16 +377,10 @@ def _iterate_candidates(
 Sorted = tuple[str | None, tuple[int, ...], str]
 
 
-def _sort_gnss(topic: Topic) -> Sorted:
-    if word := _find_role_word(re.compile(r"filtered|fused|fusion|ekf|ukf|truth"), topic.name):
+def _sort_gnss(topic: Topic, *, role: str, fused: re.Pattern[str]) -> Sorted:
+    if word := _find_role_word(fused, topic.name):
         return None, (), f"its name ({word}) says that it is another estimator's output"
-    return "gnss", (ROLE_TYPES["gnss"].index(topic.type_name),), ""
-
-
-def _sort_gps_fix(topic: Topic) -> Sorted:
-    if word := _find_role_word(_FUSED, topic.name):
-        return None, (), f"its name ({word}) says that it is another estimator's output"
-    return "gnss_velocity", (ROLE_TYPES["gnss_velocity"].index(topic.type_name),), ""
+    return role, (ROLE_TYPES[role].index(topic.type_name),), ""
 
 
 def _sort_imu(topic: Topic) -> Sorted:
@@ -483,8 +471,8 @@ def _find_bare_power(decided: _Decisions, topics: Iterable[Topic]) -> Ranked:
 
 
 _SORTERS: dict[str, Callable[[Topic], Sorted]] = {
-    **dict.fromkeys(ROLE_TYPES["gnss"], _sort_gnss),
-    **dict.fromkeys(GPS_FIXES, _sort_gps_fix),
+    **dict.fromkeys(ROLE_TYPES["gnss"], partial(_sort_gnss, role="gnss", fused=_FUSED_FIXES)),
+    **dict.fromkeys(GPS_FIXES, partial(_sort_gnss, role="gnss_velocity", fused=_FUSED)),
     **dict.fromkeys(ROLE_TYPES["command"], _sort_command),
     **dict.fromkeys(ROLE_TYPES["imu"], _sort_imu),
     **dict.fromkeys((POSE_STAMPED, POSE_WITH_COVARIANCE_STAMPED), _sort_pose),
@@ -501,12 +489,14 @@ def _decide(decided: _Decisions, role: str, candidates: Ranked) -> None:
     names = tuple(topic.name for topic in topics)
     taken = set(names)
     others = [topic for _, _, topic in candidates if topic.name not in taken]
-    thin = _thin(role, others, topics)
+    thin = find_short_topics(others, topics, of_power=role == "power")
+    # Bare numbers share a rail, other topics are one each.
+    rails = tuple(dict.fromkeys(make_rail_name(t.name) if t.type_name in FLOAT_TYPES else t.name for t in topics))
     if len(first) == 1:
         better = "it covers more" if thin and len(thin) == len(others) else "it fits better"
         better = f"{better} than {format_topic_names(others)}" if others else f"the only {topics[0].type_name}"
         why = first[0][0] or better
-    elif role == "power" and _are_sides(rails := _name_rails(topics)):
+    elif role == "power" and _are_sides(rails):
         why = f"{len(rails)} sides of one robot, summed" if len(rails) > 1 else "voltage and current on two topics"
     else:
         decided.ambiguous.append(
@@ -531,19 +521,10 @@ def _select_best(role: str, candidates: Ranked) -> list[tuple[str, Topic]]:
     Of power all of a rank are taken, since sides are summed: one that fell silent is still a side.
     """
     topics = [topic for _, _, topic in candidates]
-    thin = _thin(role, topics, topics)
+    thin = find_short_topics(topics, topics, of_power=role == "power")
     ample = [entry for entry in candidates if entry[2].name not in thin] or candidates
     best = min(rank for rank, _, _ in ample)
     return [(why, topic) for rank, why, topic in (candidates if role == "power" else ample) if rank == best]
-
-
-def _thin(role: str, topics: Sequence[Topic], rivals: Sequence[Topic]) -> frozenset[str]:
-    return find_short_topics(topics, rivals, of_power=role == "power")
-
-
-def _name_rails(topics: Iterable[Topic]) -> tuple[str, ...]:
-    """Return the rails' names: bare numbers share one, other topics are one each."""
-    return tuple(dict.fromkeys(make_rail_name(t.name) if t.type_name in FLOAT_TYPES else t.name for t in topics))
 
 
 def _are_sides(names: Sequence[str]) -> bool:
@@ -575,23 +556,24 @@ def _find_no_motion(decided: _Decisions, topics: Sequence[Topic]) -> tuple[list[
         return [], []
     findings = []
     lines = ["nothing in the log tells motion: no topic plays wheel_odometry, visual_odometry or gnss"]
-    able = {of.name: _find_motion_role(of.type_name) for of in topics if of.message_count != 0}
-    could = {name: why for name, why in decided.left_out.items() if able.get(name)}
+    able = {
+        topic.name: role
+        for role in reversed(MOTION_ROLES)
+        for topic in topics
+        if topic.message_count != 0 and topic.type_name in ROLE_TYPES[role]
+    }
+    could = {name: why for name, why in decided.left_out.items() if name in able}
     if could:
         reasons = "; ".join(f"{name} since {why}" for name, why in list(could.items())[:LISTED])
         readable = {of.name for of in topics if of.problem is None and not of.name.startswith(OVERLAY)}
         name = next((name for name in could if name in readable), "")
         lines.append(f"left out: {reasons}")
         if name:
-            role = str(able[name])
+            role = able[name]
             names, remedies = {"role": role, "reason": "name"}, suggest("use", {"read.topics": {role: [name]}})
             subject = Subject("topic", name)
             findings.append(make_finding("topic-left-out", subject, severity="warning", names=names, remedies=remedies))
     return [*lines, *list_undecodable(topics), f"the log holds {format_topics(topics)}"], findings
-
-
-def _find_motion_role(type_name: str) -> str | None:
-    return next((role for role in MOTION_ROLES if type_name in ROLE_TYPES[role]), None)
 
 
 def _transform_topics(topics: Iterable[Topic], ignored: Sequence[str]) -> tuple[str, ...]:

@@ -1,12 +1,13 @@
-"""What a log says of itself: its topics, in data and in words, how much of a drive they cover, and what is damaged in it."""
+"""What a log says of itself: its topics, in data and in words, how much of a drive they cover; findings on them, and on its damage."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import accumulate
 from typing import Any
 
+from tcpipe.tables.catalogue import Severity
 from tcpipe.tables.findings import Finding, Subject, make_finding
 
 
@@ -175,7 +176,13 @@ def find_short_topics(topics: Iterable[Topic], rivals: Iterable[Topic], *, of_po
     little_span = _LITTLE_SPAN_OF_POWER if of_power else _LITTLE_SPAN
     least_s = little_span * max((_compute_covered_s(rival) or 0.0 for rival in listed), default=0.0)
     least = _LITTLE_COUNT * max((rival.message_count or 0 for rival in listed), default=0)
-    return frozenset(topic.name for topic in topics if _is_little(topic, least_s, least))
+    spans = ((topic, _compute_covered_s(topic)) for topic in topics)
+    return frozenset(
+        topic.name
+        for topic, span_s in spans
+        if (span_s is not None and span_s < least_s)
+        or (topic.message_count is not None and topic.message_count < least)
+    )
 
 
 def compute_silence_ns(spans_ns: Sequence[tuple[int, int]], count: int | None) -> int:
@@ -190,11 +197,6 @@ def compute_silence_ns(spans_ns: Sequence[tuple[int, int]], count: int | None) -
     least_ns = max(_SILENCE_NS, _SILENT_PERIODS * (ends[-1] - rising[0][0]) // count)
     pauses = (start - end for (start, _), end in zip(rising[1:], ends, strict=False))
     return sum(pause for pause in pauses if pause > least_ns)
-
-
-def _is_little(topic: Topic, least_s: float, least: float) -> bool:
-    span_s, count = _compute_covered_s(topic), topic.message_count
-    return (span_s is not None and span_s < least_s) or (count is not None and count < least)
 
 
 def format_coverage(topic: Topic) -> str:
@@ -214,3 +216,31 @@ def _compute_span_s(topic: Topic) -> float | None:
     if topic.start_ns is None or topic.end_ns is None:
         return None
     return (topic.end_ns - topic.start_ns) / 1e9
+
+
+_MISSING = {"no-gnss": "gnss", "no-power": "power", "no-imu": "imu", "no-wheel-odometry": "wheel_odometry"}
+
+
+def find_missing_roles(roles: Collection[str]) -> tuple[Finding, ...]:
+    """Return a finding for each role that is not among ``roles`` and without which labels or checks are missing."""
+    present = {*roles, "gnss"} if "pose" in roles else roles
+    return tuple(make_finding(code, Subject("role", role)) for code, role in _MISSING.items() if role not in present)
+
+
+def find_left_out(reasons: Mapping[tuple[str, str], str]) -> Iterator[Finding]:
+    """Yield a finding for each topic that is not used, by role and topic and with the reason."""
+    for (role, name), reason in reasons.items():
+        yield make_finding("topic-left-out", Subject("topic", name), names={"role": role, "reason": reason})
+
+
+def find_undecodable(topics: Iterable[Topic], types: Collection[str]) -> Iterator[Finding]:
+    """Yield a finding for each topic that holds data that cannot be decoded: a warning where its type can be used as a role."""
+    for topic in topics:
+        if topic.problem is not None and topic.message_count != 0:
+            yield make_topic_not_decoded(topic, severity="warning" if topic.type_name in types else "note")
+
+
+def make_topic_not_decoded(topic: Topic, *, severity: Severity = "warning") -> Finding:
+    """Return the finding that a topic's messages cannot be decoded."""
+    names = {"type": topic.type_name or "?", "encoding": topic.encoding or "?"}
+    return make_finding("topic-not-decoded", Subject("topic", topic.name), severity=severity, names=names)

@@ -19,7 +19,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.geometry.polyline import fit_polyline
 from tcpipe.motion.row_sections import find_piece_spans, find_runs
 from tcpipe.tables.bits import DropReason, flag_name
 from tcpipe.tables.catalogue import read_threshold
@@ -65,6 +64,8 @@ def compute_interval_length_m(stamp_ns: Ints, position_m: Floats, velocity_mps: 
 
     ``position_m`` [m] and ``velocity_mps`` [m/s] have shape (N, 3): east, north, up.
     """
+    from tcpipe.geometry.polyline import fit_polyline  # noqa: PLC0415  numba loads only where a track is cut
+
     step = np.diff(position_m, axis=0)
     length: Floats = np.hypot(step[:, 0], step[:, 1])
     for first, last in find_piece_spans(piece):

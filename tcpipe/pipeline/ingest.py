@@ -40,7 +40,6 @@ from tcpipe.pipeline.calls import (
 )
 from tcpipe.pipeline.ingest_options import IngestOptions
 from tcpipe.pipeline.ingest_run import Ingested, find_twin, ingest_one
-from tcpipe.pipeline.ingest_task import IngestResult, IngestTask, check_age, make_died_result, make_result
 from tcpipe.pipeline.log_sources import (
     FoundLogs,
     LogSource,
@@ -53,7 +52,7 @@ from tcpipe.pipeline.log_sources import (
     recall_hash,
     select_shard,
 )
-from tcpipe.pipeline.plan import Step, plan
+from tcpipe.pipeline.plan import IngestResult, IngestTask, Step, check_age, make_died_result, make_result, plan
 from tcpipe.pipeline.problems import find_problems, is_acknowledged, make_failure
 from tcpipe.store import Store, open_store
 from tcpipe.tables.findings import select_problems

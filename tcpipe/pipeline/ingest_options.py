@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from tcpipe.tables.options import CLUSTER, MESSAGE_DEFINITIONS, RECIPE, STORE, Option, jobs, option, required, tags
 
 if TYPE_CHECKING:
-    from tcpipe.pipeline.ingest_task import IngestResult
+    from tcpipe.pipeline.plan import IngestResult
     from tcpipe.recipe import Recipe
 
 

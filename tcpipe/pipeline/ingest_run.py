@@ -21,8 +21,8 @@ from tcpipe.formats.run_documents import Counts, LogOrigin, Manifest, RunJson, T
 from tcpipe.formats.stored_runs import lend_streams
 from tcpipe.logs.topics import split_notes
 from tcpipe.pipeline.calls import is_committed
-from tcpipe.pipeline.ingest_task import IngestResult, IngestTask, check_age, make_result, mark_reported
 from tcpipe.pipeline.log_sources import LogSource, find_damaged_log, find_total_loss
+from tcpipe.pipeline.plan import IngestResult, IngestTask, check_age, make_result, mark_reported
 from tcpipe.progress import set_task, step
 from tcpipe.recipe import IngestSections
 from tcpipe.store import Store

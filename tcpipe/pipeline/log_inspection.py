@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 from tcpipe.cost.quality import find_wanted_rate, is_too_slow
 from tcpipe.formats.logs.log_file import Log
 from tcpipe.formats.recipe_toml import load_profiles
-from tcpipe.logs.clocks import SECOND_NS, Timeline, TopicTimes, settle_clocks
+from tcpipe.logs.clocks import CLOCK, LOG_CLOCK, SECOND_NS, SIMULATED_NS, Timeline, TopicTimes, settle_clocks
 from tcpipe.logs.roles import RoleAssignment
-from tcpipe.logs.simulated_clock import CLOCK, LOG_CLOCK, SIMULATED_NS
 from tcpipe.logs.topics import Topic, split_notes
 from tcpipe.pipeline.log_sources import find_damaged_log, find_total_loss
 from tcpipe.power.sources import find_sources

@@ -19,8 +19,8 @@ from tcpipe.formats.finding_lines import format_findings, format_loss, format_ve
 from tcpipe.formats.logs.log_joining import open_single_log
 from tcpipe.formats.object_storage import format_path, is_url
 from tcpipe.formats.recipe_toml import load_profiles
+from tcpipe.logs.clocks import CLOCK
 from tcpipe.logs.roles import OVERLAY
-from tcpipe.logs.simulated_clock import CLOCK
 from tcpipe.logs.topics import Topic
 from tcpipe.motion.distance_breakdown import StoreLoss, find_largest_losses
 from tcpipe.motion.vibration import LEAST_RATE_HZ

@@ -20,10 +20,9 @@ from tcpipe.formats.stored_runs import Ingestions, RunDirectory
 from tcpipe.pipeline.plan import list_transient_failures
 from tcpipe.pipeline.problems import find_problems, is_acknowledged, make_failure
 from tcpipe.pipeline.prune import is_replaced
-from tcpipe.pipeline.store_verdict import find_changes, judge_runs
+from tcpipe.pipeline.status import find_changes, judge_runs
 from tcpipe.report.dataset_patches import find_picture_folder, iterate_pictures
-from tcpipe.report.dataset_report import render_dataset_report
-from tcpipe.report.dataset_samples import MOST_SAMPLES
+from tcpipe.report.dataset_report import MOST_SAMPLES, render_dataset_report
 from tcpipe.report.label_sections import describe_physics
 from tcpipe.report.maps import Pictures
 from tcpipe.report.run_report import run_report

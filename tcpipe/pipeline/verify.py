@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -34,7 +34,7 @@ from tcpipe.formats.dataset_files import (
     sample_columns,
     sample_count,
 )
-from tcpipe.formats.integrity import Checksums, find_broken_checksums, find_broken_seal, read_sealed_as
+from tcpipe.formats.integrity import Checksum, Checksums, find_broken_checksums, find_broken_seal, read_sealed_as
 from tcpipe.formats.json_files import to_plain
 from tcpipe.formats.object_storage import is_bucket, is_url
 from tcpipe.formats.parquet import read_table
@@ -153,14 +153,9 @@ def _find_kind(path: Path) -> tuple[str, Iterator[CheckResult]]:
 
 
 def _verify_sealed_directory(directory: Path, card: str) -> Iterator[CheckResult]:
-    """Compare every file with what the card has of it; name those that it does not know."""
     checksums = read_sealed_as(directory / card, Checksums).checksums
-    yield from find_broken_checksums(directory, checksums)
+    yield from _verify_files(directory, checksums, [card], kind=_SEALED_CARDS[card])
     yield "files", len(checksums) + 1
-    there = {path.relative_to(directory).as_posix() for path in directory.rglob("*") if not path.is_dir()}
-    for name in sorted(there - {*checksums, card}):
-        if not name.endswith(_BESIDE):
-            yield f"{directory / name}: is no file of this {_SEALED_CARDS[card]}"
 
 
 def verify_dataset(directory: Path) -> Iterator[CheckResult]:
@@ -175,7 +170,7 @@ def verify_dataset(directory: Path) -> Iterator[CheckResult]:
             "run 'tcpipe migrate' on it, verify it with the version that wrote it, or build it again"
         )
         return
-    wrong = list(_verify_files(directory, card))
+    wrong = list(_verify_files(directory, card.checksums, [CARD, REPORT], kind="dataset"))
     yield from wrong
     yield "files", len(card.checksums)
     if any(line.startswith(f"{directory / SAMPLES}: ") for line in wrong):
@@ -186,13 +181,15 @@ def verify_dataset(directory: Path) -> Iterator[CheckResult]:
     yield from _verify_samples(directory, card)
 
 
-def _verify_files(directory: Path, card: DatasetCard) -> Iterator[str]:
+def _verify_files(
+    directory: Path, checksums: Mapping[str, Checksum], unlisted: Sequence[str], *, kind: str
+) -> Iterator[str]:
     """Compare every file with the checksum that the card has of it; name those that it does not know."""
-    yield from find_broken_checksums(directory, card.checksums)
+    yield from find_broken_checksums(directory, checksums)
     there = {path.relative_to(directory).as_posix() for path in directory.rglob("*") if not path.is_dir()}
-    for name in sorted(there - {*card.checksums, CARD, REPORT}):
-        if not name.startswith(f"{REPORT_PATCHES}/"):
-            yield f"{directory / name}: is no file of this dataset"
+    for name in sorted(there - {*checksums, *unlisted}):
+        if not (name.startswith(f"{REPORT_PATCHES}/") if kind == "dataset" else name.endswith(_BESIDE)):
+            yield f"{directory / name}: is no file of this {kind}"
 
 
 def _verify_samples(directory: Path, card: DatasetCard) -> Iterator[CheckResult]:

@@ -33,7 +33,7 @@ from tcpipe.planning.segment_predictions import (
 from tcpipe.report.colours import DROPPED, SPLIT_COLOURS
 from tcpipe.report.page import Number, Section, render_page, show_verdict
 from tcpipe.report.plots import Plot, make_plot
-from tcpipe.splits.neighbours import CLOSE, PLACES, are_near, compute_middles_deg
+from tcpipe.splits.audit import CLOSE, PLACES, are_near, compute_middles_deg
 from tcpipe.store import Store, open_store
 from tcpipe.tables.bits import flag_names
 from tcpipe.tables.catalogue import read_threshold
@@ -216,7 +216,11 @@ def _sum_along(
     def sums(quantity: str, measured: Floats, predicted: Floats) -> tuple[IntervalComparison, ...]:
         found = []
         for end in ends:
-            low, high = (None, None) if errors is None else errors[quantity].of_sum(predicted[:end], class_id[:end])
+            low, high = (
+                (None, None)
+                if errors is None
+                else errors[quantity].compute_sum_interval(predicted[:end], class_id[:end])
+            )
             found.append(IntervalComparison(float(measured[:end].sum()), float(predicted[:end].sum()), low, high))
         return tuple(found)
 

@@ -135,9 +135,12 @@ def _sum_costs(model: CostModel, source: MapReader, pieces: Pieces, said: Segmen
     turn_joule = np.where(np.isfinite(energy), turn_joule, np.nan)
     (fast, slow), (least, most), sums = (nothing, nothing), (nothing, nothing), None
     if errors is not None:
-        fast, slow = errors["duration"].of_pieces(duration, class_id)
-        least, most = errors["energy"].of_pieces(energy, class_id)
-        sums = errors["duration"].of_sum(duration, class_id), errors["energy"].of_sum(energy, class_id)
+        fast, slow = errors["duration"].compute_intervals(duration, class_id)
+        least, most = errors["energy"].compute_intervals(energy, class_id)
+        sums = (
+            errors["duration"].compute_sum_interval(duration, class_id),
+            errors["energy"].compute_sum_interval(energy, class_id),
+        )
     table = PIECES.table(
         piece=np.arange(len(bits)),
         **_locate_pieces(source, pieces),

@@ -11,7 +11,7 @@ import ast
 import inspect
 import json
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import MISSING, asdict, fields, is_dataclass
 from functools import cache
 from itertools import pairwise
@@ -35,12 +35,9 @@ _TYPES = {
 
 
 def validate_fields(made: Any, section: str) -> None:
-    """Check every field of a dataclass and keep it as a plain value; its ``__post_init__``.
+    """Check every field of a frozen dataclass and keep it as a plain value; its ``__post_init__``.
 
-    Parameters
-    ----------
-    made : a frozen dataclass.
-    section : what its keys are called before the dot; "" where they have none.
+    ``section`` is the name of its keys before the dot, "" where they have none.
 
     Raises
     ------
@@ -78,10 +75,7 @@ def read_annotations(cls: type) -> Mapping[str, Any]:
 def describe(*kinds: Any, file: str = "") -> tuple[list[dict[str, Any]], dict[str, dict[str, Any]]]:
     """Return the JSON Schema of each annotation, and the definitions they refer to; docstrings describe dataclasses and their keys.
 
-    Parameters
-    ----------
-    kinds : the annotations.
-    file : that holds the definitions; "" is the file of the schema itself.
+    ``file`` holds the definitions; "" is the file of the schema itself.
     """
     template, text = f"{file}#/$defs/{{name}}", {"type": "string"}
     schemas, definitions = msgspec.json.schema_components(kinds, schema_hook=lambda _: text, ref_template=template)
@@ -90,7 +84,7 @@ def describe(*kinds: Any, file: str = "") -> tuple[list[dict[str, Any]], dict[st
             definition["description"] = inspect.cleandoc(definition["description"])
     for cls in _find_dataclasses(kinds, set()):
         properties = definitions.get(cls.__name__, {}).get("properties", {})
-        for name, docstring in _iterate_key_docstrings(cls):
+        for name, docstring in _read_key_docstrings(cls).items():
             properties.get(name, {})["description"] = docstring
     return [*schemas], definitions
 
@@ -113,13 +107,16 @@ def _find_dataclasses(kind: Any, found: set[type]) -> set[type]:
     return found
 
 
-def _iterate_key_docstrings(cls: type) -> Iterator[tuple[str, str]]:
-    """Yield the fields of a dataclass with the docstring that stands below each."""
+@cache
+def _read_key_docstrings(cls: type) -> Mapping[str, str]:
+    """Return the docstring that stands below each field of a dataclass."""
     body = cast("ast.ClassDef", ast.parse(dedent(inspect.getsource(cls))).body[0]).body
+    found = {}
     for of, text in pairwise(body):
         match of, text:
             case ast.AnnAssign(target=ast.Name(id=name)), ast.Expr(value=ast.Constant(value=str() as docstring)):
-                yield name, docstring
+                found[name] = docstring
+    return found
 
 
 def _format_range(schema: Mapping[str, Any]) -> str:

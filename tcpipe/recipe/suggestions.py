@@ -67,12 +67,9 @@ def _format_lines(keys: Keys) -> list[str]:
 
 
 def suggest(name: str, tables: Mapping[str, Keys | Sequence[Keys]]) -> tuple[Remedy, ...]:
-    """Return a remedy that changes keys of the recipe; none where the recipe would refuse them.
+    """Return a remedy that changes keys of the recipe; none where the recipe would reject them.
 
-    Parameters
-    ----------
-    name : key in the catalogue's ``remedies`` of the finding's code.
-    tables : as those of `RecipeFragment`.
+    ``name`` is a key in the catalogue's ``remedies`` of the finding's code; ``tables`` are as those of `RecipeFragment`.
     """
     try:
         RecipeFragment(tables)

@@ -51,14 +51,11 @@ class SimulatedSite:
 
 
 def simulate(out: Path, *, scenario: str | Scenario = "demo", seed: int = 1) -> SimulatedSite:
-    """Write a simulated site to ``out``, whole or not at all: the same scenario and seed give the same bytes.
-
-    Where the same site is already, nothing is done.
+    """Write a simulated site to ``out``, whole or not at all: the same scenario and seed give the same bytes. An identical site is kept.
 
     Raises
     ------
-    UsageError
-        The scenario is unknown, or ``out`` holds something else.
+    UsageError : the scenario is unknown, or ``out`` holds something else.
     """
     chosen = scenario_by_name(scenario) if isinstance(scenario, str) else scenario
     about = {"seed": seed, "datum": chosen.world.site.datum, "scenario": chosen, "tcpipe_version": __version__}

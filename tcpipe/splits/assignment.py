@@ -117,13 +117,13 @@ def draw_groups(
 
 def _take(tests: Mask, free: Ints, sizes: Ints, *, wanted: float) -> None:
     """Let groups in ``free``, which are sorted by rank, join ``tests`` while that brings their share nearer to ``wanted``."""
-    seen = sizes > 0
-    taken, left = int(sizes[tests].sum()), int((seen & ~tests).sum())
+    has_samples = sizes > 0
+    taken, left = int(sizes[tests].sum()), int((has_samples & ~tests).sum())
     for group in free[~tests[free]].tolist():
         if left > 1 and abs(taken + sizes[group] - wanted) < abs(taken - wanted):
             tests[group] = True
             taken, left = taken + int(sizes[group]), left - 1
-    if wanted > 0 and not tests[seen].any() and seen.sum() > 1 and len(free):
+    if wanted > 0 and not tests[has_samples].any() and has_samples.sum() > 1 and len(free):
         tests[free[np.argmin(np.abs(sizes[free] - wanted))]] = True
 
 

@@ -1,19 +1,33 @@
-"""The leakage audit: how much ground of test and unseen samples training has, too."""
+"""The leakage audit: ground that test and unseen samples share with training, by near pairs of footprints in one metric plane."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
-from tcpipe.splits.neighbours import compute_nearest_m, compute_shared_fraction, iterate_near_pairs
+from tcpipe.compiled import compile_kernel
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 _CONTACT_FRACTION = 1e-3
 """Footprints that share less of their area than this touch; consecutive segments always do."""
+
+_CHUNK = 16_384
+"""Footprints looked at together."""
+
+CLOSE = 1.05
+"""Ground nearer than so many chords to a training sample counts as covered: consecutive samples are one chord apart."""
+
+PLACES = ("start_lon_deg", "start_lat_deg", "end_lon_deg", "end_lat_deg")
+"""Columns of a chord's ends."""
+
+_M_A_DEG = 111_195.0  # of a great circle: to half a per cent
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,16 +78,16 @@ def _find_consecutive(run: Ints, start_ns: Ints, centres_xy_m: Floats, *, chord_
 
 def _audit_split(name: str, split: NDArray[np.str_], run: Ints, follows: Ints, corners_xy_m: Floats) -> HeldOut:
     held, train = np.flatnonzero(split == name), np.flatnonzero(split == "train")
-    ours, theirs = corners_xy_m[held], corners_xy_m[train]
+    queries, references = corners_xy_m[held], corners_xy_m[train]
     pairs, overlaps, repeated = 0, np.zeros(len(held), np.bool_), np.zeros(len(held), np.bool_)
     diagonal_m = float(np.linalg.norm(corners_xy_m[:, 2] - corners_xy_m[:, 0], axis=1).max(initial=0.0))
-    for i, j in iterate_near_pairs(ours.mean(axis=1), theirs.mean(axis=1), within_m=diagonal_m):
-        real = compute_shared_fraction(ours, theirs, i, j) > _CONTACT_FRACTION
+    for i, j in iterate_near_pairs(queries.mean(axis=1), references.mean(axis=1), within_m=diagonal_m):
+        real = compute_shared_fraction(queries, references, i, j) > _CONTACT_FRACTION
         pairs += int(real.sum())
         overlaps[i[real]] = True
         repeated[i[real & (run[held[i]] != run[train[j]])]] = True
     crossing = (split[follows] == name).any(axis=1) & (split[follows] == "train").any(axis=1)
-    apart_m = compute_nearest_m(ours, theirs)
+    apart_m = compute_nearest_m(queries, references)
     return HeldOut(
         split=name,
         samples=len(held),
@@ -84,3 +98,161 @@ def _audit_split(name: str, split: NDArray[np.str_], run: Ints, follows: Ints, c
         nearest_train_min_m=float(apart_m.min()) if len(apart_m) else None,
         nearest_train_median_m=float(np.median(apart_m)) if len(apart_m) else None,
     )
+
+
+def compute_middles_deg(ends: Mapping[str, NDArray[np.generic]]) -> Floats:
+    """Return lon, lat [deg] of the middles of chords, shape (N, 2), by the columns `PLACES`."""
+    x0, y0, x1, y1 = (ends[name].astype(np.float64) for name in PLACES)
+    return np.column_stack([(x0 + x1) / 2.0, (y0 + y1) / 2.0])
+
+
+def are_near(queries_deg: Floats, references_deg: Floats, *, within_m: float) -> NDArray[np.bool_]:
+    """Return which of ``queries``, lon, lat [deg], shape (N, 2), are at most so far from one of ``references``; NaN is near nothing."""
+    scale = _M_A_DEG * np.array([np.cos(np.radians(np.nanmean(queries_deg[:, 1]))) if len(queries_deg) else 1.0, 1.0])
+    known, others = np.isfinite(queries_deg).all(axis=1), references_deg[np.isfinite(references_deg).all(axis=1)]
+    found = np.zeros(len(queries_deg), np.bool_)
+    if known.any() and len(others):
+        origin = others[0]
+        tree = cKDTree((others - origin) * scale)
+        apart_m, _ = tree.query((queries_deg[known] - origin) * scale, distance_upper_bound=within_m)
+        found[known] = np.isfinite(apart_m)
+    return found
+
+
+def iterate_near_pairs(
+    queries_xy_m: Floats, references_xy_m: Floats, *, within_m: float
+) -> Iterator[tuple[Ints, Ints]]:
+    """Yield index pairs of points at most ``within_m`` apart [m]: ``queries`` (N, 2) and ``references`` (M, 2), by chunk of queries."""
+    if len(queries_xy_m) == 0 or len(references_xy_m) == 0:
+        return
+    tree = cKDTree(references_xy_m)
+    for first in range(0, len(queries_xy_m), _CHUNK):
+        part = cKDTree(queries_xy_m[first : first + _CHUNK])
+        found = part.sparse_distance_matrix(tree, within_m, output_type="ndarray")
+        order = np.lexsort((found["j"], found["i"]))
+        yield found["i"][order] + first, found["j"][order]
+
+
+def compute_shared_fraction(queries: Floats, references: Floats, i: Ints, j: Ints) -> Floats:
+    """Return the share of the ground of ``queries[i]`` that ``references[j]`` covers too, (P,); corners counter-clockwise, (N, 4, 2)."""
+    shared_m2 = np.empty(len(i))
+    pair_overlaps(queries, references, i, j, shared_m2)
+    side_m = np.linalg.norm(queries[:, 1] - queries[:, 0], axis=1)
+    return np.asarray(shared_m2 / side_m[i] ** 2)
+
+
+def compute_nearest_m(queries: Floats, references: Floats) -> Floats:
+    """Return the distance from each of ``queries`` to the nearest of ``references`` [m], (N,); empty if either is.
+
+    Both are corners of squares of one size, shape (N, 4, 2) and (M, 4, 2).
+    """
+    if len(queries) == 0 or len(references) == 0:
+        return np.empty(0)
+    tree = cKDTree(references.mean(axis=1))
+    reach_m = _compute_half_diagonal_m(queries) + _compute_half_diagonal_m(references)
+    best_m = np.full(len(queries), np.inf)
+    pending = [(rows, 8) for rows in _split_points(np.arange(len(queries)), _CHUNK)]
+    while pending:
+        rows, count = pending.pop()
+        asked = min(count, len(references))
+        distances_m, j = tree.query(queries[rows].mean(axis=1), k=np.arange(1, asked + 1))
+        apart_m = np.empty(j.size)
+        pair_distances(queries, references, np.repeat(rows, asked), j.reshape(-1).astype(np.int64), apart_m)
+        best_m[rows] = apart_m.reshape(-1, asked).min(axis=1)
+        # squares are nearer than their centres by at most two half diagonals: what is farther still cannot win
+        doubtful = rows[(best_m[rows] > np.asarray(distances_m)[:, -1] - reach_m) & (best_m[rows] > 0.0)]
+        if asked < len(references):
+            pending += [(part, 4 * count) for part in _split_points(doubtful, max(_CHUNK * 2 // count, 1))]
+    return best_m
+
+
+def _split_points(rows: Ints, size: int) -> list[Ints]:
+    return [rows[first : first + size] for first in range(0, len(rows), size)]
+
+
+def _compute_half_diagonal_m(corners: Floats) -> float:
+    across: Floats = corners[:, 2] - corners[:, 0]
+    return float(np.hypot(across[:, 0], across[:, 1]).max()) / 2.0
+
+
+@compile_kernel
+def pair_distances(
+    queries: Floats, references: Floats, i: NDArray[np.int64], j: NDArray[np.int64], out: Floats
+) -> None:
+    """Write the distance between squares ``queries[i]`` and ``references[j]`` to ``out``, (P,), 0 if they touch; corners (N, 4, 2)."""
+    for pair in range(i.size):
+        a, b = queries[i[pair]], references[j[pair]]
+        out[pair] = (
+            0.0 if _touch(a, b) else np.sqrt(min(_compute_corner_distance(a, b), _compute_corner_distance(b, a)))
+        )
+
+
+@compile_kernel
+def pair_overlaps(queries: Floats, references: Floats, i: NDArray[np.int64], j: NDArray[np.int64], out: Floats) -> None:
+    """Write the area that squares ``queries[i]`` and ``references[j]`` share to ``out``, (P,); corners run counter-clockwise."""
+    polygon, clipped = np.empty((8, 2)), np.empty((8, 2))
+    for pair in range(i.size):
+        a, b = queries[i[pair]], references[j[pair]]
+        for k in range(4):  # not as slices, see `tcpipe.fusion.state_kernel.copy_values`
+            polygon[k, 0], polygon[k, 1] = a[k, 0], a[k, 1]
+        corners = 4
+        for edge in range(4):
+            corners = _clip(polygon, corners, b[edge], b[(edge + 1) % 4], clipped)
+            polygon, clipped = clipped, polygon
+        area = 0.0
+        for k in range(corners):
+            px, py = polygon[k, 0] - polygon[0, 0], polygon[k, 1] - polygon[0, 1]
+            qx, qy = polygon[(k + 1) % corners, 0] - polygon[0, 0], polygon[(k + 1) % corners, 1] - polygon[0, 1]
+            area += px * qy - py * qx
+        out[pair] = area / 2.0
+
+
+@compile_kernel
+def _compute_side(p: Floats, q: Floats, x: float, y: float) -> Any:
+    """Return twice the signed area of p, q and (x, y): positive to the left of p → q."""
+    return (q[0] - p[0]) * (y - p[1]) - (q[1] - p[1]) * (x - p[0])
+
+
+@compile_kernel
+def _touch(a: Floats, b: Floats) -> bool:
+    """Tell whether no edge of either square has the other wholly to its right."""
+    for one, other in ((a, b), (b, a)):
+        for edge in range(4):
+            apart = True
+            for k in range(4):
+                if _compute_side(one[edge], one[(edge + 1) % 4], other[k, 0], other[k, 1]) >= 0.0:
+                    apart = False
+            if apart:
+                return False
+    return True
+
+
+@compile_kernel
+def _compute_corner_distance(a: Floats, b: Floats) -> float:
+    """Return the smallest squared distance from a corner of ``a`` to an edge of ``b``."""
+    best = np.inf
+    for k in range(4):
+        for edge in range(4):
+            p, q = b[edge], b[(edge + 1) % 4]
+            dx, dy = q[0] - p[0], q[1] - p[1]
+            ex, ey = a[k, 0] - p[0], a[k, 1] - p[1]
+            t = min(max((ex * dx + ey * dy) / (dx * dx + dy * dy), 0.0), 1.0)
+            best = min(best, (ex - t * dx) ** 2 + (ey - t * dy) ** 2)
+    return best
+
+
+@compile_kernel
+def _clip(polygon: Floats, corners: int, p: Floats, q: Floats, out: Floats) -> int:
+    """Keep what lies to the left of p → q (Sutherland and Hodgman 1974); return its corners."""
+    kept = 0
+    for k in range(corners):
+        a, b = polygon[k], polygon[(k + 1) % corners]
+        left, right = _compute_side(p, q, a[0], a[1]), _compute_side(p, q, b[0], b[1])
+        if left >= 0.0:
+            out[kept, 0], out[kept, 1] = a[0], a[1]
+            kept += 1
+        if left * right < 0.0:
+            for c in range(2):
+                out[kept, c] = a[c] + (b[c] - a[c]) * (left / (left - right))
+            kept += 1
+    return kept

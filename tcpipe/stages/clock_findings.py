@@ -15,7 +15,7 @@ from tcpipe.fusion.measurements import GNSS, IMU
 from tcpipe.power.rails import compute_power_at
 from tcpipe.recipe.suggestions import suggest
 from tcpipe.stages.fuse_inputs import FusionInputs, compute_moved_m, find_longest_epoch, find_recipe_role
-from tcpipe.stages.fuse_stretches import Fused
+from tcpipe.stages.fuse_sections import Fused
 from tcpipe.stages.message_arrays import make_rails
 from tcpipe.tables.columns import to_floats
 from tcpipe.tables.facts import ClockFacts, ClockOffset, ClockPair
@@ -27,7 +27,7 @@ _FINE_S = 0.004
 _TURNED_OVER_M = 1.0
 
 
-def clock_findings(streams: Streams, inputs: FusionInputs) -> StageReport[ClockFacts]:
+def check_clocks(streams: Streams, inputs: FusionInputs) -> StageReport[ClockFacts]:
     """Return the offsets between the sensors' clocks in the longest clock epoch; nothing is corrected.
 
     The remedy that would correct an offset includes what the recipe adds already.

@@ -31,8 +31,8 @@ from tcpipe.fusion.checks.odometry_scale import Scale, rescale_odometries, solve
 from tcpipe.fusion.checks.plausibility import SensorExclusion, refuse_fixes
 from tcpipe.fusion.measurements import GNSS, IMU, Measurements
 from tcpipe.recipe import FuseConfig
-from tcpipe.stages.clock_findings import add_lag_on_path, add_offset_uncertainty, clock_findings
-from tcpipe.stages.fuse_findings import fuse_facts, fuse_findings, make_audit_findings, make_mounting_findings
+from tcpipe.stages.clock_findings import add_lag_on_path, add_offset_uncertainty, check_clocks
+from tcpipe.stages.fuse_findings import find_fuse_findings, make_audit_findings, make_fuse_facts, make_mounting_findings
 from tcpipe.stages.fuse_inputs import (
     FusionInputs,
     compute_moved_m,
@@ -42,7 +42,7 @@ from tcpipe.stages.fuse_inputs import (
     find_recipe_role,
     prepare_inputs,
 )
-from tcpipe.stages.fuse_stretches import Fused, fuse_stretches, make_rejections_table
+from tcpipe.stages.fuse_sections import Fused, fuse_sections, make_rejections_table
 from tcpipe.tables.facts import SensorChecks
 from tcpipe.tables.findings import Finding, StageReport, Subject, make_finding
 from tcpipe.tables.levels import TRACK, Datum, Streams, Track, TrackInfo
@@ -63,7 +63,7 @@ def fuse_run(streams: Streams, config: FuseConfig, *, run_id: str) -> Track:
     streams, local = convert_pose_to_fixes(streams)
     run = Subject("run", run_id)
     inputs, sanity = drop_implausible_sensors(prepare_inputs(streams, config), streams)
-    # 2. Each stretch for itself: where it starts, filter and smoother; again where that shows other mountings, or a sensor to be alone.
+    # 2. Each section for itself: where it starts, filter and smoother; again where that shows other mountings, or a sensor to be alone.
     inputs, sanity, fused = fuse_agreeing(inputs, sanity, streams, config, run=run)
     if not fused.found:
         raise FusionError("no motion to fuse", findings=(_find_nothing(streams, inputs, run), *sanity.findings))
@@ -73,13 +73,13 @@ def fuse_run(streams: Streams, config: FuseConfig, *, run_id: str) -> Track:
     table = TRACK.table(**columns)
     datum = None if local or inputs.datum_deg_m is None else Datum(*inputs.datum_deg_m, crs=streams.gnss_crs)
     # 3. What was left out, where sensors disagree with the track, and whether their clocks agree.
-    summary = fuse_facts(inputs, fused.facts, rows=table.num_rows, skipped_s=fused.skipped_s)
-    clocks = add_lag_on_path(clock_findings(streams, inputs), fused, inputs, streams)
+    summary = make_fuse_facts(inputs, fused.facts, rows=table.num_rows, skipped_s=fused.skipped_s)
+    clocks = add_lag_on_path(check_clocks(streams, inputs), fused, inputs, streams)
     table = add_offset_uncertainty(table, clocks.facts)
     mounting, audit = make_mounting_findings(inputs, streams), make_audit_findings(fused, inputs, streams)
     found = (sanity, mounting, audit, clocks)
     findings = (
-        *fuse_findings(inputs, summary, run=run, fixes=find_recipe_role(GNSS, streams)),
+        *find_fuse_findings(inputs, summary, run=run, fixes=find_recipe_role(GNSS, streams)),
         *(finding for each in found for finding in each.findings),
     )
     facts = replace(
@@ -164,7 +164,7 @@ def _find_fault(
     for role in roles:
         rest, _ = _without([role], inputs, sanity, streams, astray=astray)
         if any(m.gnss is not None or m.odometries() for m in rest.measurements.values()):
-            tried = fuse_stretches(rest, streams, config)
+            tried = fuse_sections(rest, streams, config)
             if tried.tallies and is_consistent(tried.tallies):
                 agreeing[role] = count_confirmations(tried.tallies)
             if tried.found and not is_astray(tried.windows, tried.astray):
@@ -188,13 +188,13 @@ _ANTENNA = slice(0, 2)  # what the turns show: forward and left
 
 
 def fuse_mounted(inputs: FusionInputs, streams: Streams, config: FuseConfig) -> tuple[FusionInputs, Fused]:
-    """Fuse each stretch, and again as long as that shows an antenna or an IMU to be mounted, or an odometry to be scaled, otherwise."""
-    fused = fuse_stretches(inputs, streams, config)
+    """Fuse each section, and again as long as that shows an antenna or an IMU to be mounted, or an odometry to be scaled, otherwise."""
+    fused = fuse_sections(inputs, streams, config)
     for _ in range(_ROUNDS):
         mended = _correct_mounting(inputs, fused, streams)
         if mended is None:
             break
-        inputs, fused = mended, fuse_stretches(mended, streams, config)
+        inputs, fused = mended, fuse_sections(mended, streams, config)
     return inputs, fused
 
 

@@ -22,7 +22,7 @@ from tcpipe.stages.fuse_inputs import (
     read_command,
     state_extrinsics,
 )
-from tcpipe.stages.fuse_stretches import Fused
+from tcpipe.stages.fuse_sections import Fused
 from tcpipe.tables.catalogue import read_threshold
 from tcpipe.tables.facts import AuditFacts, Disagreement, FuseFacts, MountingFacts, Reopening, StretchFacts, make_vector
 from tcpipe.tables.findings import Finding, StageReport, Subject, make_finding
@@ -31,30 +31,34 @@ from tcpipe.tables.levels import Sensor, Streams
 _COURSE = "course over ground"
 
 
-def fuse_facts(inputs: FusionInputs, stretches: Sequence[StretchFacts], *, rows: int, skipped_s: float) -> FuseFacts:
-    """Return the facts of the run: counts by role over all stretches, what was set aside, and each stretch."""
-    roles = sorted({role for stretch in stretches for role in stretch.measurements})
+def make_fuse_facts(
+    inputs: FusionInputs, sections: Sequence[StretchFacts], *, rows: int, skipped_s: float
+) -> FuseFacts:
+    """Return the facts of the run: counts by role over all sections, what was set aside, and each section."""
+    roles = sorted({role for section in sections for role in section.measurements})
     nis: dict[str, float | None] = {}
     for role in roles:
-        means = [(s.nis_mean.get(role), s.measurements[role]) for s in stretches if role in s.measurements]
+        means = [(s.nis_mean.get(role), s.measurements[role]) for s in sections if role in s.measurements]
         known = [(mean, count) for mean, count in means if mean is not None]
         if known:
             nis[role] = float(np.average([mean for mean, _ in known], weights=[count for _, count in known]))
     return FuseFacts(
         rows=rows,
-        sensors=tuple(sorted({role for stretch in stretches for role in stretch.sensors})),
-        measurements={role: sum(stretch.measurements.get(role, 0) for stretch in stretches) for role in roles},
-        rejected={role: sum(stretch.rejected.get(role, 0) for stretch in stretches) for role in roles},
+        sensors=tuple(sorted({role for section in sections for role in section.sensors})),
+        measurements={role: sum(section.measurements.get(role, 0) for section in sections) for role in roles},
+        rejected={role: sum(section.rejected.get(role, 0) for section in sections) for role in roles},
         nis_mean=nis,
         set_aside=inputs.counts,
         skipped_s=skipped_s,
-        stretches=tuple(stretches),
+        stretches=tuple(sections),
     )
 
 
-def fuse_findings(inputs: FusionInputs, facts: FuseFacts, *, run: Subject, fixes: str = GNSS) -> tuple[Finding, ...]:
+def find_fuse_findings(
+    inputs: FusionInputs, facts: FuseFacts, *, run: Subject, fixes: str = GNSS
+) -> tuple[Finding, ...]:
     """Return what was observed while fusing; ``fixes`` is the recipe's role of the positions."""
-    gnss, first_ns = Subject("role", fixes), min((stretch.start_ns for stretch in facts.stretches), default=0)
+    gnss, first_ns = Subject("role", fixes), min((section.start_ns for section in facts.stretches), default=0)
     findings = [finding for finding in inputs.findings if finding.subject.name not in inputs.refused]
     if inputs.datum_deg_m is None and GNSS in inputs.counts:  # a log without any fix was found when it was read
         findings.append(make_finding("local-frame", gnss))
@@ -74,14 +78,14 @@ def fuse_findings(inputs: FusionInputs, facts: FuseFacts, *, run: Subject, fixes
     return tuple(findings)
 
 
-def _find_initial_yaw(stretch: StretchFacts, first_ns: int, gnss: Subject) -> Finding:
-    names = {"source": stretch.heading_from}
-    return make_finding("initial-yaw-uncertain", gnss, span_s=_find_span_s(stretch, first_ns), names=names)
+def _find_initial_yaw(section: StretchFacts, first_ns: int, gnss: Subject) -> Finding:
+    names = {"source": section.heading_from}
+    return make_finding("initial-yaw-uncertain", gnss, span_s=_find_span_s(section, first_ns), names=names)
 
 
 def _find_scale(inputs: FusionInputs, facts: FuseFacts) -> list[Finding]:
     """Return the finding that nothing shows well how long a metre of odometry is."""
-    std = max((stretch.common_scale_std or 0.0 for stretch in facts.stretches), default=0.0)
+    std = max((section.common_scale_std or 0.0 for section in facts.stretches), default=0.0)
     if std <= read_threshold("odometry-scale-unobservable", "min_scale_std_fraction"):
         return []
     role = WHEELS if WHEELS in facts.sensors or VISUAL not in facts.sensors else VISUAL
@@ -111,7 +115,7 @@ def _find_rejections(facts: FuseFacts, fixes: str) -> list[Finding]:
 def _find_reopenings(facts: FuseFacts, first_ns: int) -> list[Finding]:
     """Return by sensor how often it contradicted the others for seconds, and where most."""
     findings = []
-    reopenings = [reopening for stretch in facts.stretches for reopening in stretch.reopenings]
+    reopenings = [reopening for section in facts.stretches for reopening in section.reopenings]
     odometries = [role for role in (WHEELS, VISUAL) if role in facts.sensors]
     for role in sorted({reopening.role for reopening in reopenings}):
         of_role = [reopening for reopening in reopenings if reopening.role == role]
@@ -138,7 +142,7 @@ def make_audit_findings(fused: Fused, inputs: FusionInputs, streams: Streams) ->
     """Return every disagreement, the sensors that contradict each other over most of the distance, and the findings of both."""
     undecided = find_undecided_sensors(fused.tallies)
     found = fused.disagreements
-    first_ns = min((stretch.start_ns for stretch in fused.facts), default=0)
+    first_ns = min((section.start_ns for section in fused.facts), default=0)
     kinds = dict.fromkeys((each.sensor, each.what, each.alone) for each in found)
     findings = [
         _find_disagreement([e for e in found if (e.sensor, e.what, e.alone) == kind], first_ns) for kind in kinds

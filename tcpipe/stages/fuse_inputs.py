@@ -138,7 +138,7 @@ def drop_implausible_sensors(inputs: FusionInputs, streams: Streams) -> tuple[Fu
         inputs.measurements[epoch],
         command=read_command(streams, epoch),
         stated=stated,
-        felt=_median_specific_force(streams),
+        felt=_compute_median_specific_force(streams),
     )
     if checks.scales:
         measured = {number: rescale_odometries(m, checks.scales) for number, m in inputs.measurements.items()}
@@ -186,7 +186,7 @@ def read_command(streams: Streams, epoch: int) -> CommandedSpeed | None:
     return CommandedSpeed(to_integers(table, "stamp_ns"), to_floats(table, "forward_velocity_mps"))
 
 
-def _median_specific_force(streams: Streams) -> float:
+def _compute_median_specific_force(streams: Streams) -> float:
     """Return the median size of the specific force."""
     if IMU not in streams.tables:
         return float("nan")

@@ -21,8 +21,8 @@ from tcpipe.power.energy import IdlePower, Rule, count_samples_inside, estimate_
 from tcpipe.power.noise import estimate_energy_noise, estimate_resolution
 from tcpipe.power.rails import Rail, compute_power_watt
 from tcpipe.recipe import LabelConfig
-from tcpipe.stages.label_facts import label_facts, label_findings, sum_energy_entries
-from tcpipe.stages.label_motion import clock_doubtful, find_motion_flags, find_power_flags, make_motion_columns
+from tcpipe.stages.label_facts import find_label_findings, make_label_facts, sum_energy_entries
+from tcpipe.stages.label_motion import find_motion_flags, find_power_flags, is_clock_doubtful, make_motion_columns
 from tcpipe.stages.message_arrays import make_rails
 from tcpipe.tables.arrays import make_lines, select_rows, to_numbers
 from tcpipe.tables.bits import DropReason, Quality
@@ -69,7 +69,7 @@ def label_segments(
         count, mean_watt = count_samples_inside(rails, *spans)
         flags = {
             Quality.MEAN_POWER_DIFFERS: has_mean_mismatch(mean_watt, cost.power_watt),
-            Quality.CLOCK_DOUBTFUL: np.full(cut.num_rows, clock_doubtful(streams, gated.info)),
+            Quality.CLOCK_DOUBTFUL: np.full(cut.num_rows, is_clock_doubtful(streams, gated.info)),
             **find_power_flags(cut, rails, range_volt=voltage_range_volt),
             **find_motion_flags(
                 cut,
@@ -94,10 +94,10 @@ def label_segments(
         )
     table, physics = add_physics(pa.concat_tables(parts).combine_chunks(), standing.watt)
     ledger_m, velocity = segments.ledger_m, config.velocity
-    facts = label_facts(
+    facts = make_label_facts(
         table, rails_by_epoch, joules, ledger_m, variance_j2, rule=rule, velocity=velocity, physics=physics
     )
-    info = add_findings(segments.info, label_findings(facts), replace(segments.info.report.facts, label=facts))
+    info = add_findings(segments.info, find_label_findings(facts), replace(segments.info.report.facts, label=facts))
     return LabelledSegments(table, info, segments.ledger_m)
 
 
@@ -164,7 +164,7 @@ def _compute_displacement_std_m(cut: pa.Table, rows: pa.Table, *, smoothed: bool
 
 
 def _find_stationary_ns(rows: pa.Table, rate_hz: float) -> NDArray[np.int64]:
-    """Return begin and end [ns] of every stretch in which the robot stands, shape (S, 2)."""
+    """Return begin and end [ns] of every section in which the robot stands, shape (S, 2)."""
     stamp_ns = to_integers(rows, "stamp_ns")
     piece = number_pieces(stamp_ns, to_integers(rows, "epoch"), period_ns=1e9 / rate_hz)
     standing = (to_numbers(rows["dropped_by"]) & np.uint32(DropReason.STANDING)) != 0

@@ -25,7 +25,7 @@ from tcpipe.tables.findings import Finding, Subject, make_finding
 _POWER, _WHEELS = Subject("role", "power"), Subject("role", "wheel_odometry")
 
 
-def label_facts(
+def make_label_facts(
     table: pa.Table,
     rails: Mapping[int, list[Rail]],
     energy_by_entry_joule: Mapping[str, float],
@@ -80,7 +80,7 @@ def _make_budget(
     )
 
 
-def label_findings(facts: LabelFacts) -> tuple[Finding, ...]:
+def find_label_findings(facts: LabelFacts) -> tuple[Finding, ...]:
     """Return what was observed while labelling."""
     findings = []
     if facts.quality["low_power_rate"] and facts.segments_without_power < facts.segments:

@@ -151,8 +151,8 @@ def _find_disputed(cut: pa.Table, info: TrackInfo) -> NDArray[np.bool_]:
     start_ns, end_ns, epoch = to_integers(cut, "start_ns"), to_integers(cut, "end_ns"), to_integers(cut, "epoch")
     facts = info.report.facts
     times = [(e.epoch, e.start_ns, e.end_ns) for e in (facts.audit.disagreements if facts.audit else ()) if not e.alone]
-    for stretch in facts.fuse.stretches if facts.fuse else ():
-        times += [(stretch.epoch, r.start_ns, r.end_ns) for r in stretch.reopenings if r.role == GNSS]
+    for section in facts.fuse.stretches if facts.fuse else ():
+        times += [(section.epoch, r.start_ns, r.end_ns) for r in section.reopenings if r.role == GNSS]
     disputed = np.zeros(cut.num_rows, dtype=np.bool_)
     for of_epoch, first_ns, last_ns in times:
         disputed |= (epoch == of_epoch) & (start_ns <= last_ns) & (end_ns >= first_ns)
@@ -169,7 +169,7 @@ def _find_gap_edges(rows: pa.Table, rate_hz: float) -> NDArray[np.bool_]:
     return edge
 
 
-def clock_doubtful(streams: Streams, info: TrackInfo) -> bool:
+def is_clock_doubtful(streams: Streams, info: TrackInfo) -> bool:
     """Return whether a clock of the run stepped or has an offset, or motion or power has the recorder's time.
 
     Commands mostly have no stamp of their own, and labels do not depend on it. A small offset of an IMU is in the positions' deviations.

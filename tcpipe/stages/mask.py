@@ -250,15 +250,15 @@ def _compute_chord_std_m(track: Track, rows: MotionRows, chord_m: float, config:
 
 
 def _compute_common_std_mps(track: Track) -> Floats:
-    """Return the part of each row's velocity deviation that its whole stretch has in common, since nothing tells how long a metre is."""
+    """Return the part of each row's velocity deviation that its whole section has in common, since nothing tells how long a metre is."""
     table = track.table
     stamp_ns, epoch = to_integers(table, "stamp_ns"), to_integers(table, "epoch")
     speed_mps = np.linalg.norm([to_floats(table, f"{name}_velocity_mps") for name in ("east", "north", "up")], axis=0)
     scale_std = np.zeros(len(speed_mps))
     fuse = track.info.report.facts.fuse
-    for stretch in fuse.stretches if fuse else ():
-        inside = (epoch == stretch.epoch) & (stamp_ns >= stretch.start_ns) & (stamp_ns <= stretch.end_ns)
-        scale_std[inside] = stretch.common_scale_std or 0.0
+    for section in fuse.stretches if fuse else ():
+        inside = (epoch == section.epoch) & (stamp_ns >= section.start_ns) & (stamp_ns <= section.end_ns)
+        scale_std[inside] = section.common_scale_std or 0.0
     common_mps: Floats = scale_std * speed_mps
     return common_mps
 

@@ -11,10 +11,9 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from tcpipe.errors import RoleError
-from tcpipe.logs.clocks import RECIPE, AlignedClocks, Timeline, TopicTimes, settle_clocks
-from tcpipe.logs.role_findings import find_missing_roles
+from tcpipe.logs.clocks import CLOCK, LOG_CLOCK, RECIPE, AlignedClocks, Timeline, TopicTimes, settle_clocks
 from tcpipe.logs.roles import MOTION_ROLES, RoleAssignment
-from tcpipe.logs.simulated_clock import CLOCK, LOG_CLOCK
+from tcpipe.logs.topics import find_missing_roles
 from tcpipe.power.readings import PowerReadings
 from tcpipe.power.sources import list_power_lists
 from tcpipe.recipe import ReadConfig
@@ -68,7 +67,7 @@ def read_run(log: LogReader, config: ReadConfig, *, robot: str | None, known: Pr
     sensors, unplaced = place_sensors(log, tables, assignment, sources, timelines, config=config)
     power, assumed = add_averaging(power, streams, config)
     offset_s = {str(role): offset for role, offset in config.time_offset_s.items()}
-    report = read_findings(assignment, every, clocks, power=power, sensors=sensors, offset_s=offset_s)
+    report = make_read_report(assignment, every, clocks, power=power, sensors=sensors, offset_s=offset_s)
     scale = {str(role): factor for role, factor in config.odometry_scale.items()} or None
     findings = (
         *report.findings,
@@ -139,7 +138,7 @@ _EXPECTED = frozenset({"not_gga", "no_velocity"})
 """Reasons why messages of a topic are of no use to a role: sentences of other kinds."""
 
 
-def read_findings(
+def make_read_report(
     assignment: RoleAssignment,
     sources: Sequence[TopicReadings],
     clocks: AlignedClocks,

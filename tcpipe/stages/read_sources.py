@@ -16,13 +16,21 @@ from numpy.typing import NDArray
 from tcpipe.errors import MapError, RecipeError, RoleError
 from tcpipe.geometry.rotation import quat_from_rpy
 from tcpipe.logs.clocks import Timeline
-from tcpipe.logs.conversions import convert_imu_to_si, scale_odometry, select_ground_velocity
 from tcpipe.logs.extrinsics import IDENTITY, Pose, Tree, build_static_tree, find_base_link_from, is_base
 from tcpipe.logs.field_mapping import MAPPED_TYPES, make_mapped_message
-from tcpipe.logs.messages import LOG_TIME, Readings, count_frames, find_utc_offset, list_needed_fields, read_messages
-from tcpipe.logs.role_findings import make_topic_not_decoded
+from tcpipe.logs.messages import (
+    LOG_TIME,
+    Readings,
+    convert_imu_to_si,
+    count_frames,
+    find_utc_offset,
+    list_needed_fields,
+    read_messages,
+    scale_odometry,
+    select_ground_velocity,
+)
 from tcpipe.logs.roles import RoleAssignment
-from tcpipe.logs.topics import Topic
+from tcpipe.logs.topics import Topic, make_topic_not_decoded
 from tcpipe.power.readings import PowerReadings
 from tcpipe.recipe import Placement, ReadConfig, Role
 from tcpipe.recipe.suggestions import suggest
@@ -96,11 +104,11 @@ def read_sources(
             continue
         seen_frames = count_frames(columns, types[topic])
         source = TopicReadings(topic, role, types[topic], len(columns[LOG_TIME]), seen_frames, readings)
-        sources.append(replace(source, readings=_as_the_recipe_says(source, config)))
+        sources.append(replace(source, readings=_apply_recipe(source, config)))
     return sources, power, findings
 
 
-def _as_the_recipe_says(source: TopicReadings, config: ReadConfig) -> Readings:
+def _apply_recipe(source: TopicReadings, config: ReadConfig) -> Readings:
     """Return a topic's readings in the units and scale that the recipe states."""
     readings, role = source.readings, source.role
     if role == "gnss" and config.time.get(role) != "header":

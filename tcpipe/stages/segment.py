@@ -1,4 +1,4 @@
-"""GatedTrack to Segments: cut every steady stretch by chord, and account for every metre of the track."""
+"""GatedTrack to Segments: cut every steady section by chord, and account for every metre of the track."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ ENTRIES = ("kept", *(flag_name(bit) for bit in (*DropReason, Loss.CURVED, Loss.L
 
 
 def segment_track(gated: GatedTrack, config: SegmentConfig) -> Segments:
-    """Return the segments of the track's steady stretches, and the ledger of all its metres: its sum is the odometer."""
+    """Return the segments of the track's steady sections, and the ledger of all its metres: its sum is the odometer."""
     table, info = gated.table, gated.info
     stamp_ns, epoch = to_integers(table, "stamp_ns"), to_integers(table, "epoch")
     position_m = np.column_stack([to_floats(table, f"{axis}_m") for axis in "xyz"])
@@ -67,7 +67,7 @@ def segment_track(gated: GatedTrack, config: SegmentConfig) -> Segments:
 
 
 def _make_segments(rows: pa.Table, path: Polyline, cut: Cut, info: TrackInfo) -> pa.Table:
-    """Return the segments of one stretch."""
+    """Return the segments of one section."""
     start_m, end_m = path.position_at(cut.start_ns), path.position_at(cut.end_ns)
     step_m, count = end_m - start_m, len(cut.start_ns)
     columns: dict[str, Any] = {

@@ -306,7 +306,7 @@ def test_one_recording_is_one_run_under_any_name(log: Path, tmp_path: Path) -> N
     again = tcpipe("ingest", "logs/below", cwd=tmp_path)
     assert again.returncode == 0
     assert "nothing to do: 4 of 4 logs" in again.stdout
-    assert "new\\nline.mcap is the same recording as" in again.stdout
+    assert "new\\nline.mcap is a duplicate of" in again.stdout
     assert len(list((tmp_path / "tcpipe-store" / "runs").iterdir())) == 1
 
 

@@ -162,7 +162,7 @@ HOSTILE = {
     "a chunk of 1 GB": (mcap(chunk("lz4", 1 << 30, lz4.frame.compress(bytes(1 << 28)))), "claims to hold"),
     "many chunks of 64 MB": (mcap(chunk("zstd", 1 << 26, zstandard.compress(bytes(1 << 26))) * 40), BOMB),
     "indexes of every channel": (mcap(chunk("", 0, b""), *(record(7, struct.pack("<HI", n, 0)) for n in range(1 << 16))), ""),
-    "channels": (mcap(*(channel(n, 1, f"/t{n}") + message(n) for n in range(2, 20_000))), "more than 10000 topics"),
+    "channels": (mcap(*(channel(n, 1, f"/t{n}") + message(n) for n in range(2, 10_100))), "more than 10000 topics"),
     "columns": (mcap(*(schema(n, WIDE) + channel(n, n, f"/t{n}") for n in range(2, 40))), "200000 columns"),
     "a definition of 6 MB": (one_topic("int8 x\n" * 900_000, b""), "bytes, more than"),
     "lists of lists": (one_topic(LISTS, b"\0\1\0\0" + struct.pack("<I", 100_000) + bytes(400_000)), ""),

@@ -47,7 +47,7 @@ def test_what_cannot_be_ingested_leaves_no_store(tmp_path, content, store):
     (tmp_path / "a.bag").write_bytes(content)
     done = tcpipe("ingest", "a.bag", "--store", store, cwd=tmp_path)
     plain_lines(done, 1)
-    assert done.stdout.splitlines()[-1] == f"no run came into {store}: 1 of 1 logs failed"
+    assert done.stdout.splitlines()[-1] == f"1 log failed; no run was added to {store}"
     assert [path.name for path in tmp_path.iterdir()] == ["a.bag"]
     found = told(tcpipe("ingest", "a.bag", "--store", store, "--json", cwd=tmp_path))
     assert (found["store"], found["exit_code"], found["results"][0]["status"]) == (None, 1, "failed")
@@ -121,8 +121,8 @@ def test_a_night_with_known_trouble_is_no_red_night(tmp_path):
     assert (again.returncode, again.stderr) == (0, "")
     assert again.stdout.splitlines()[-3:] == [
         "nothing to do: 2 of 3 logs are in tcpipe-store already",
-        "1 known failure, not tried again; --retry-failed tries it",
-        "1 known to be damaged or empty; 'tcpipe acknowledge RUN' when it has been looked at",
+        "1 log failed before and was skipped; --retry-failed tries it again",
+        "1 log known as damaged or empty; 'tcpipe acknowledge RUN' after you have checked it",
     ]
     (run_id,) = {path.name for path in (tmp_path / "tcpipe-store" / "runs").glob("cut-*")}
     refused = plain_lines(tcpipe("acknowledge", run_id, "nosuch", cwd=tmp_path), 2, most=1)
@@ -132,6 +132,12 @@ def test_a_night_with_known_trouble_is_no_red_night(tmp_path):
         0,
         True,
         True,
+    )
+    assert (
+        json.loads(tcpipe("acknowledge", run_id, "--json", "--store", "tcpipe-store", cwd=tmp_path).stdout)[
+            "acknowledged"
+        ]
+        == []
     )
     retried = tcpipe("ingest", "logs", "--retry-failed", cwd=tmp_path)
     assert (retried.returncode, retried.stdout.splitlines()[-1]) == (0, "2 with acknowledged problems")

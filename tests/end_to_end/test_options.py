@@ -1,7 +1,6 @@
 """Options that no other test gives to the command, each seen in what the command answers or writes."""
 
 import json
-import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -86,8 +85,8 @@ def test_robot_recipe_and_age_are_heard(place: Path, tmp_path: Path) -> None:
     common = ("--robot", "husky", "--recipe", "recipe.toml")
     inspected = tcpipe("inspect", "new.mcap", *common, cwd=tmp_path)
     assert "new.mcap" in plain_lines(inspected, inspected.returncode, most=1)
-    shutil.copytree(place / "store", tmp_path / "tcpipe-store")
-    groups = answer("status", "new.mcap", *common, "--min-age", "1h", cwd=tmp_path)["groups"]
+    status = ("status", "new.mcap", "--store", place / "store")
+    groups = answer(*status, *common, "--min-age", "1h", cwd=tmp_path)["groups"]
     assert [group["state"] for group in groups if group["logs"]] == ["growing"]
 
 

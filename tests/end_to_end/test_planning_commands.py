@@ -86,6 +86,7 @@ def test_a_plan_over_a_cost_map_costs_what_predict_path_says_of_it(place: Path):
         (("predict-path", "model", "--path", "path.geojson", "--speed", "0.5"), 2, "takes no commanded speed"),
         (("plan-path", "model", "--from", _FROM, "--to", _TO, "--speed", "0.5"), 2, "takes no commanded speed"),
         (("predict-path", "model", "--path", "path.geojson", "--physics-from", "none"), 2, "no such directory"),
+        (("plan-path", "model", "--from", _FROM, "--to", _TO, "--physics-from", "none"), 2, "no such directory"),
     ],
 )
 def test_bad_input_is_one_line(place: Path, arguments, code, words):

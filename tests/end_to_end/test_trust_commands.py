@@ -66,7 +66,7 @@ def test_verify_names_what_is_wrong_one_line_each_and_fails(work):
 
 
 def test_a_sample_is_traced_to_its_log_and_made_again_bit_for_bit(work, ids):
-    done = tcpipe("explain", ids[0], "--quiet", cwd=work)
+    done = tcpipe("explain", ids[0], "--dataset", "dataset", "--store", "tcpipe-store", "--quiet", cwd=work)
     assert done.returncode == 0, done.stdout
     lines = done.stdout.splitlines()
     assert lines[-1] == "made again from the streams: equal, bit for bit"

@@ -4,8 +4,19 @@ import numpy as np
 import pytest
 
 from tcpipe.fusion import filterpy_engine, ukf15_kernel
-from tcpipe.fusion.ukf15_events import ACCEPTED, RECOVERED, REJECTED, Events, FilterState, Outputs, Sources
-from tcpipe.fusion.ukf15_kernel import ANTENNA, SELECT, SENSOR_VELOCITY, SPECIFIC_FORCE
+from tcpipe.fusion.ukf15_kernel import (
+    ACCEPTED,
+    ANTENNA,
+    RECOVERED,
+    REJECTED,
+    SELECT,
+    SENSOR_VELOCITY,
+    SPECIFIC_FORCE,
+    Events,
+    FilterState,
+    Outputs,
+    Sources,
+)
 
 Q = np.array([0.05, 0.05, 0.06, 0.03, 0.03, 0.06, 0.025, 0.025, 0.04, 0.01, 0.01, 0.02, 0.3, 0.3, 0.3])
 ENGINES = (ukf15_kernel.run, filterpy_engine.run)

@@ -8,8 +8,7 @@ from hypothesis import strategies as st
 from splits_squares import squares
 
 from tcpipe.splits.assignment import NO_FOLD, Assignment, Groups, assign_splits, draw_groups, hash_ranks
-from tcpipe.splits.audit import audit_leakage
-from tcpipe.splits.neighbours import compute_nearest_m, compute_shared_fraction, iterate_near_pairs
+from tcpipe.splits.audit import audit_leakage, compute_nearest_m, compute_shared_fraction, iterate_near_pairs
 from tcpipe.splits.regions import Regions, Side, classify_footprints
 
 coordinate = st.floats(-30, 30, allow_nan=False)

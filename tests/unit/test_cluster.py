@@ -108,6 +108,7 @@ def test_a_scheduler_that_is_not_there_is_one_line(monkeypatch):
 
 
 def test_a_scheduler_without_workers_is_one_line(tmp_path, monkeypatch):
+    monkeypatch.setattr(execution, "_ANSWER_S", 4)
     monkeypatch.setattr(execution, "_ALONE_S", 1)
     with dask_cluster(tmp_path, workers=0) as lonely, pytest.raises(UsageError, match="the scheduler has no workers"):
         list(run_all(where, [1], jobs=1, cluster=lonely.address))

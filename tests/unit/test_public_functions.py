@@ -138,7 +138,7 @@ def test_the_functions_give_what_the_commands_print(place, monkeypatch):
     assert drive.run_id == "north"
 
     cost = tcpipe.predict_path("model", "path.geojson", store=store)
-    said = _said(here, "predict-path", "model", "--path", "path.geojson", "--store", store)
+    said = _said(here, "predict-path", "model", "--path", "path.geojson", "--map", "site", "--store", store)
     assert (cost.energy_joule, cost.duration_s) == (said["energy_joule"], said["duration_s"])
 
     start, goal = ends = lonlat([(-12.0, -5.0), (-2.0, -4.0)]).round(9).tolist()
@@ -151,6 +151,7 @@ def test_the_functions_give_what_the_commands_print(place, monkeypatch):
         "--objective",
         "time",
         "--allow-extrapolation",
+        *("--map", "site", "--cell-size", "1"),
     )
     said = _said(here, "plan-path", "model", *asked, "--store", store, "--out", "again.geojson")
     assert plan.plans["time"].duration_s == pytest.approx(said["plans"]["time"]["duration_s"])

@@ -11,6 +11,5 @@ The way from a path to a table, each step importing only those below it::
     mcap_file, bag_file, sqlite_file    a file: its index, else a walk; what is lost
     mcap_records, bag_records    bytes
     chunk_reading   which of a chunk's bytes to read, and whether its index is borne out
-    log_part        what all give and use: channels, blocks of messages, bytes by position
-    fetched_file    a file in object storage, piece by piece
+    log_part        what all give and use: channels, blocks of messages, bytes by position, also of files in object storage
 """

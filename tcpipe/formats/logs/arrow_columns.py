@@ -165,17 +165,12 @@ class TopicTable:
         places = zip(block.offsets[:_FEW].tolist(), block.lengths[:_FEW].tolist(), strict=True)
         payloads = [bytes(block.buffer[start : start + length]) for start, length in places]
         forms = {form: convert_wide_texts(self._type.wire, form) for form in WIDE_FORMS}
-        fitting = {form: sum(self._fits(of, payload) for payload in payloads) for form, of in forms.items()}
+        fitting = {
+            form: sum(self._find_layout(of, payload) is not None for payload in payloads) for form, of in forms.items()
+        }
         best = max(fitting, key=fitting.__getitem__)
         self._wire = forms[best]
         self._wide_open = len(set(fitting.values())) == 1
-
-    def _fits(self, of: Record, payload: bytes) -> bool:
-        try:
-            walk_layout(of, payload, encoding=self._encoding)
-        except (LayoutError, RaggedError):
-            return False
-        return True
 
     def _add_alike(self, rows: _Int64, buffer: memoryview, offsets: _Int64, length: int) -> None:
         """Add messages of equal length."""
@@ -272,7 +267,9 @@ class TopicTable:
         misses = 0
         while len(rows):
             worthwhile = len(rows) >= MIN_GROUP or self._seen < MIN_GROUP
-            fresh = self._new_layout(payloads[0].tobytes()) if worthwhile and len(known) < MAX_SHAPES else None
+            fresh = (
+                self._find_layout(self._wire, payloads[0].tobytes()) if worthwhile and len(known) < MAX_SHAPES else None
+            )
             if fresh is None or misses > MAX_MISSES:
                 self._add_ragged(rows, *_join_payloads(payloads))
                 return
@@ -285,9 +282,9 @@ class TopicTable:
                 self._add_ragged(rows[fits], *_join_payloads(payloads[fits]))
             rows, payloads = rows[~fits], payloads[~fits]
 
-    def _new_layout(self, payload: bytes) -> Layout | None:
+    def _find_layout(self, of: Record, payload: bytes) -> Layout | None:
         try:
-            return walk_layout(self._wire, payload, encoding=self._encoding)
+            return walk_layout(of, payload, encoding=self._encoding)
         except (LayoutError, RaggedError):
             return None
 

@@ -33,13 +33,13 @@ from tcpipe.formats.logs.bag_records import (
     walk_chunk,
 )
 from tcpipe.formats.logs.chunk_reading import Entries, Excerpt, Messages, copy_pieces, read_chunk_blocks, sort_by_place
-from tcpipe.formats.logs.fetched_file import FetchedFile
 from tcpipe.formats.logs.log_part import (
     MAX_CHUNK_BYTES,
     Bounds,
     ByteSource,
     Channel,
     DamageError,
+    FetchedFile,
     Int64Array,
     MessageBlock,
     decompress,

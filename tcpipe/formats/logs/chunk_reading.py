@@ -13,7 +13,7 @@ from typing import Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.formats.logs.log_part import DamageError, Int64Array, MessageBlock, map_in_order, split_by_channel
+from tcpipe.formats.logs.log_part import DamageError, Int64Array, MessageBlock, map_in_order
 from tcpipe.logs.topics import Damage
 
 GROUP_BYTES = 1 << 23
@@ -42,10 +42,6 @@ class Entries:
         """Return some of them."""
         of = (self.chunk, self.channel, self.offset, self.end, self.log_time_ns)
         return Entries(*(values[chosen] for values in of))
-
-    def of_chunk(self, number: int) -> Entries:
-        """Return those of one chunk."""
-        return self.at(self.chunk == number)
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,19 +106,26 @@ class Messages:
 
     def blocks(self, ordinal: Int64Array) -> list[MessageBlock]:
         """Return them as one block a channel; ``ordinal`` is their order within the file, shape (N,)."""
-        found = self
         if (self.channel[1:] < self.channel[:-1]).any():
             order = np.argsort(self.channel, kind="stable")
-            found, ordinal = self.at(order), ordinal[order]
-        return split_by_channel(
-            found.data,
-            found.channel,
-            found.payload,
-            found.length,
-            log_time_ns=found.log_time_ns,
-            publish_time_ns=found.publish_time_ns,
-            ordinals=ordinal,
-        )
+            return self.at(order).blocks(ordinal[order])
+        if not len(self.channel):
+            return []
+        starts = [0, *((self.channel[1:] != self.channel[:-1]).nonzero()[0] + 1).tolist()]
+        least, most = (of.reduceat(self.length, starts).tolist() for of in (np.minimum, np.maximum))
+        return [
+            MessageBlock(
+                int(self.channel[a]),
+                self.data,
+                self.payload[a:b],
+                self.length[a:b],
+                self.log_time_ns[a:b],
+                self.publish_time_ns[a:b],
+                ordinal[a:b],
+                low if low == high else None,
+            )
+            for a, b, low, high in zip(starts, [*starts[1:], len(self.channel)], least, most, strict=True)
+        ]
 
 
 class PlacedChunk(Protocol):
@@ -231,7 +234,7 @@ def _read_span_blocks(
             noted.append(file.lost(chunk, error))
         else:
             messages = file.walked(chunk, data, wanted, noted)
-            entries = None if span.entries is None else span.entries.of_chunk(number)
+            entries = None if span.entries is None else span.entries.at(span.entries.chunk == number)
             noted += _find_index_disagreement(file, chunk, messages, entries)
             yield from _split_in_time(file.name, messages, base + messages.offset, noted)
 

@@ -9,8 +9,7 @@ from tcpipe.errors import LogError
 from tcpipe.formats.atomic import make_scratch_directory
 from tcpipe.formats.logs import bag_records, mcap_records, sqlite_file
 from tcpipe.formats.logs.bag_file import BagPart
-from tcpipe.formats.logs.fetched_file import FetchedFile
-from tcpipe.formats.logs.log_part import LogPart
+from tcpipe.formats.logs.log_part import FetchedFile, LogPart
 from tcpipe.formats.logs.mcap_file import McapPart
 from tcpipe.formats.logs.rosbag2 import ZSTD_MAGIC, decompress_file
 from tcpipe.formats.logs.sqlite_file import SqlitePart

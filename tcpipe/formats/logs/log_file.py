@@ -8,8 +8,7 @@ import os
 import resource
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass, field, replace
-from itertools import islice
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -19,11 +18,17 @@ import pyarrow as pa
 from tcpipe.errors import LogError
 from tcpipe.formats.finding_lines import describe_finding
 from tcpipe.formats.logs.arrow_columns import TopicTable
-from tcpipe.formats.logs.fetched_file import FetchedFile
 from tcpipe.formats.logs.log_container import WANTED, find_container, open_part
-from tcpipe.formats.logs.log_part import Channel, LogPart, MessageBlock
+from tcpipe.formats.logs.log_part import Channel, FetchedFile, LogPart, MessageBlock
 from tcpipe.formats.logs.ros_types import DefinitionError, MessageType, TypeLibrary
-from tcpipe.formats.logs.rosbag2 import METADATA, STORAGE_SUFFIXES, decompress_blocks, find_rosbag2_files, is_one_bag
+from tcpipe.formats.logs.rosbag2 import (
+    METADATA,
+    STORAGE_SUFFIXES,
+    Rosbag2Files,
+    decompress_blocks,
+    find_rosbag2_files,
+    is_one_bag,
+)
 from tcpipe.formats.object_storage import StoredObject, is_url, lay_out_objects
 from tcpipe.logs.topics import Damage, Topic, find_damage, split_notes
 from tcpipe.progress import Meter
@@ -67,16 +72,16 @@ def open_log(path: Path | str, *, message_definitions: Path | None = None) -> Lo
         if is_url(path):
             path, stored = stack.enter_context(lay_out_objects(str(path), wanted=is_log_file, by_range=_READ_BY_RANGE))
         path = Path(path)
-        _refuse_what_is_no_file(path)
+        _refuse_what_is_not_there(path)
+        if not path.is_file() and not path.is_dir():
+            raise LogError(f"{path}: it is a pipe or a device; {WANTED}")
         fetched = {file: FetchedFile(of, file) for file, of in stored.items()}
-        opened = _open_directory(path, stack, fetched) if path.is_dir() else _open_file(path, stack, fetched)
+        if path.is_dir():
+            opened = _open_directory(path, stack, fetched)
+        else:
+            part, kind = open_part(path, path.name, stack, fetched.get(path)), find_container(path, fetched.get(path))
+            opened = _OpenFiles(kind, Rosbag2Files((path,)), (part,), fetched)
         return Log(path, opened, TypeLibrary(message_definitions), stack.pop_all())
-
-
-def _refuse_what_is_no_file(path: Path) -> None:
-    _refuse_what_is_not_there(path)
-    if not path.is_file() and not path.is_dir():
-        raise LogError(f"{path}: it is a pipe or a device; {WANTED}")
 
 
 def _refuse_what_is_not_there(path: Path) -> None:
@@ -112,21 +117,30 @@ def find_logs(path: Path) -> list[Path]:
 
 
 def list_logs_below(directory: Path) -> list[Path]:
-    """Return the logs in a directory as `find_logs` does; none where there is none."""
-    return list(_iterate_logs_below(directory))
+    """Return the logs in a directory as `find_logs` does; none where there is none. A directory is looked at once, whatever links to it."""
+    found, seen, waiting = list[Path](), set[tuple[int, int]](), [(directory, True)]
+    while waiting:
+        path, is_directory = waiting.pop()
+        try:
+            state = path.stat() if is_directory else None
+            if state is None:
+                found.append(path)
+            elif (state.st_dev, state.st_ino) not in seen:
+                seen.add((state.st_dev, state.st_ino))
+                waiting += reversed(_list_entries(path))
+        except OSError:
+            found.append(path)
+    return found
 
 
 @dataclass(frozen=True, slots=True)
 class _OpenFiles:
-    """The files of a log, open; ``message_count`` is what metadata.yaml says they hold, ``topic_counts`` what of each topic."""
+    """The files of a log, open, and what metadata.yaml says of them."""
 
     container: str
-    files: tuple[Path, ...]
+    listed: Rosbag2Files
     parts: tuple[LogPart, ...]
     fetched: Mapping[Path, FetchedFile]
-    damage: tuple[Damage, ...] = ()
-    message_count: int | None = None
-    topic_counts: Mapping[str, int] = field(default_factory=dict)
 
 
 class Log:
@@ -136,18 +150,18 @@ class Log:
         self.path = path
         self.container = opened.container
         """``mcap``, ``bag`` or ``rosbag2``."""
-        self._files, self._parts, self._types, self._stack = opened.files, opened.parts, types, stack
+        self._files, self._parts, self._types, self._stack = opened.listed.paths, opened.parts, types, stack
         self._fetched = tuple(opened.fetched.values())
-        self._damage = list(opened.damage)
+        self._damage = list(opened.listed.damage)
         self.topics = self._merged_topics()
         """Every topic by name, as the index tells."""
-        self._compare_counts(opened)
+        self._compare_counts(opened.listed)
 
-    def _compare_counts(self, opened: _OpenFiles) -> None:
+    def _compare_counts(self, listed: Rosbag2Files) -> None:
         """Note where metadata.yaml counts more messages than the files hold, in all or of topics."""
         held = {name: topic.message_count or 0 for name, topic in self.topics.items()}
-        of_topics = sum(max(count - held.get(name, 0), 0) for name, count in opened.topic_counts.items())
-        lost = max((opened.message_count or 0) - sum(held.values()), of_topics)
+        of_topics = sum(max(count - held.get(name, 0), 0) for name, count in listed.topic_counts.items())
+        lost = max((listed.message_count or 0) - sum(held.values()), of_topics)
         if lost > 0:
             self._damage.append(Damage("messages-miscounted", self.path.name, messages_lost=lost))
 
@@ -448,17 +462,12 @@ def _make_topic(channel: Channel, types: TypeLibrary) -> Topic:
     )
 
 
-def _open_file(path: Path, stack: ExitStack, fetched: Mapping[Path, FetchedFile]) -> _OpenFiles:
-    part = open_part(path, path.name, stack, fetched.get(path))
-    return _OpenFiles(find_container(path, fetched.get(path)), (path,), (part,), fetched)
-
-
 def _open_directory(directory: Path, stack: ExitStack, fetched: Mapping[Path, FetchedFile]) -> _OpenFiles:
     """Open the files of a ROS 2 bag; one that cannot be opened costs only itself."""
     try:
         found = find_rosbag2_files(directory)
     except LogError as error:
-        below = [str(path) for path in islice(_iterate_logs_below(directory), _LISTED + 1) if path.parent != directory]
+        below = [str(path) for path in list_logs_below(directory) if path.parent != directory]
         if not below:
             raise
         names = ", ".join(below[:_LISTED]) + (" and more" if len(below) > _LISTED else "")
@@ -473,8 +482,7 @@ def _open_directory(directory: Path, stack: ExitStack, fetched: Mapping[Path, Fe
             damage.append(Damage("data-unreadable", f"{directory.name}/{file.name}", reason=str(error)))
     if not parts:
         raise LogError(*(problem for error in errors for problem in error.problems))
-    counts = found.message_count, found.topic_counts
-    return _OpenFiles("rosbag2", found.paths, tuple(parts), fetched, tuple(damage), *counts)
+    return _OpenFiles("rosbag2", replace(found, damage=tuple(damage)), tuple(parts), fetched)
 
 
 def _allow_files(count: int) -> None:
@@ -484,23 +492,6 @@ def _allow_files(count: int) -> None:
     if soft != resource.RLIM_INFINITY and soft < wanted:
         most = wanted if hard == resource.RLIM_INFINITY else min(wanted, hard)
         resource.setrlimit(resource.RLIMIT_NOFILE, (most, hard))
-
-
-def _iterate_logs_below(directory: Path) -> Iterator[Path]:
-    """Yield the logs in and below a directory; each directory is looked at once, whatever links lead to it."""
-    seen: set[tuple[int, int]] = set()
-    waiting = [(directory, True)]
-    while waiting:
-        path, is_directory = waiting.pop()
-        try:
-            found = path.stat() if is_directory else None
-            if found is None:
-                yield path
-            elif (found.st_dev, found.st_ino) not in seen:
-                seen.add((found.st_dev, found.st_ino))
-                waiting += reversed(_list_entries(path))
-        except OSError:
-            yield path
 
 
 def _list_entries(directory: Path) -> list[tuple[Path, bool]]:

@@ -10,20 +10,23 @@ import hashlib
 import os
 import struct
 import threading
-from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections import OrderedDict, deque
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol, TypeVar
+from typing import TYPE_CHECKING, Protocol, TypeVar
 
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
 from tcpipe.errors import LogError
-from tcpipe.formats.logs.fetched_file import FetchedFile
 from tcpipe.logs.topics import Damage
+
+if TYPE_CHECKING:
+    from tcpipe.formats.object_storage import StoredObject
 
 MAX_CHUNK_BYTES = 1 << 29
 """A chunk that claims to hold more than this is taken for damaged: it is held as a whole. Writers make chunks of some megabytes."""
@@ -37,12 +40,19 @@ MAX_CHANNELS = 1 << 16
 _FEW_RECORDS, _LEAST_RECORD_BYTES = 1 << 20, 4
 """A file that holds more records than the first, and than one for so many of its bytes, is a bomb: a message alone has two times."""
 _PLAUSIBLE_TOTAL = 1 << 30
-SEARCH_BYTES = 1 << 20
+_SEARCH_BYTES = 1 << 20
 
 _LZ4_HEAD = struct.Struct("<4sBBQ")
 """An LZ4 frame's first fields: magic, flags, block size, size of the content."""
 _LZ4_MAGIC, _LZ4_HAS_CONTENT_SIZE = b"\x04\x22\x4d\x18", 0x08
 _PEEK_BYTES = 1 << 13
+
+_BLOCK_BYTES = 1 << 13
+"""What is fetched begins and ends at multiples of this."""
+_HELD_BLOCKS = (1 << 26) // _BLOCK_BYTES
+"""So much is held: more than a group of chunks that is planned at once."""
+_GAP_BLOCKS = 4
+"""Blocks no further apart are fetched as one piece: a request costs as much as some."""
 
 Int64Array = NDArray[np.int64]
 
@@ -90,36 +100,6 @@ class MessageBlock:
     length: int | None
 
 
-def split_by_channel(
-    buffer: memoryview,
-    channels: Int64Array,
-    offsets: Int64Array,
-    lengths: Int64Array,
-    *,
-    log_time_ns: Int64Array,
-    publish_time_ns: Int64Array,
-    ordinals: Int64Array,
-) -> list[MessageBlock]:
-    """Return messages as one block a channel; each channel's must lie in one piece. All arrays have shape (N,)."""
-    if not len(channels):
-        return []
-    starts = [0, *((channels[1:] != channels[:-1]).nonzero()[0] + 1).tolist()]
-    least, most = np.minimum.reduceat(lengths, starts).tolist(), np.maximum.reduceat(lengths, starts).tolist()
-    return [
-        MessageBlock(
-            int(channels[a]),
-            buffer,
-            offsets[a:b],
-            lengths[a:b],
-            log_time_ns[a:b],
-            publish_time_ns[a:b],
-            ordinals[a:b],
-            low if low == high else None,
-        )
-        for a, b, low, high in zip(starts, [*starts[1:], len(channels)], least, most, strict=True)
-    ]
-
-
 def group_by_key(keys: Int64Array) -> Iterator[tuple[int, Int64Array]]:
     """Yield each key, rising, and where it stands, shape (M,) each: at the cost of one sort, however many keys there are."""
     order = np.argsort(keys, kind="stable")
@@ -155,6 +135,79 @@ class LogPart(Protocol):
 
     def close(self) -> None:
         """Close the file."""
+
+
+class FetchedFile:
+    """A file in object storage with its stand-in on this machine; safe to use by several threads."""
+
+    def __init__(self, stored: StoredObject, stand_in: Path) -> None:
+        self._stored, self._stand_in = stored, stand_in
+        self._held: OrderedDict[int, memoryview] = OrderedDict()
+        self._lock = threading.Lock()
+        self.is_whole = False
+        """Whether the stand-in holds all of the file by now."""
+        self.fetched_bytes = 0
+        """How much was fetched so far."""
+
+    def read(self, offset: int, size: int) -> bytes:
+        """Return ``size`` bytes at ``offset``, fewer where the file ends before."""
+        stop = min(offset + size, self._stored.size_bytes)
+        if offset >= stop:
+            return b""
+        blocks = range(offset // _BLOCK_BYTES, -(-stop // _BLOCK_BYTES))
+        found = self._blocks(blocks)
+        first = offset - blocks.start * _BLOCK_BYTES
+        return b"".join(found[number] for number in blocks)[first : first + stop - offset]
+
+    def expect(self, pieces: Iterable[tuple[int, int]]) -> None:
+        """Fetch pieces (offset, size) that are read soon, side by side."""
+        most = -(-self._stored.size_bytes // _BLOCK_BYTES)
+        wanted = {
+            number
+            for offset, size in pieces
+            for number in range(offset // _BLOCK_BYTES, min(-(-(offset + size) // _BLOCK_BYTES), most))
+        }
+        self._blocks(wanted)
+
+    def whole(self) -> None:
+        """Fetch all of the file to its stand-in, which holds nothing before."""
+        if not self.is_whole:
+            self._stored.copy(self._stand_in)
+            self.fetched_bytes += self._stored.size_bytes
+            self.is_whole = True
+            self._held.clear()
+
+    def _blocks(self, numbers: Collection[int]) -> dict[int, memoryview]:
+        """Return blocks by number; those that are not held are fetched."""
+        with self._lock:
+            found = {number: self._held[number] for number in numbers if number in self._held}
+            for number in found:
+                self._held.move_to_end(number)
+        runs = _find_runs(sorted(set(numbers) - found.keys()))
+        size = self._stored.size_bytes
+        spans = [(run.start * _BLOCK_BYTES, min(run.stop * _BLOCK_BYTES, size)) for run in runs]
+        for run, data in zip(runs, self._stored.ranges(spans) if spans else (), strict=True):
+            found |= {
+                number: data[(number - run.start) * _BLOCK_BYTES : (number + 1 - run.start) * _BLOCK_BYTES]
+                for number in run
+            }
+        with self._lock:
+            self.fetched_bytes += sum(stop - start for start, stop in spans)
+            self._held.update(found)
+            while len(self._held) > _HELD_BLOCKS:
+                self._held.popitem(last=False)
+        return found
+
+
+def _find_runs(numbers: Sequence[int]) -> list[range]:
+    """Return rising numbers as runs, short gaps filled."""
+    runs: list[range] = []
+    for number in numbers:
+        if runs and number - runs[-1].stop <= _GAP_BLOCKS:
+            runs[-1] = range(runs[-1].start, number + 1)
+        else:
+            runs.append(range(number, number + 1))
+    return runs
 
 
 class ByteSource:
@@ -206,13 +259,16 @@ class ByteSource:
         return held[offset - at : offset - at + size]
 
     def windows(self, start: int, end: int, overlap: int) -> Iterator[tuple[int, int, memoryview]]:
-        """Yield (start, size to search, bytes) of pieces to search one after the other; what cannot be read is left out."""
-        for piece_start, size, read_bytes in search_windows(start, end, overlap):
-            try:
-                piece = self.read(piece_start, read_bytes)
-            except DamageError:
-                continue
-            yield piece_start, size, piece
+        """Yield (start, size to search, bytes) of pieces to search one after the other; what cannot be read is left out.
+
+        The first are small: a search that succeeds soon stays cheap, however many there are in a file that is made to need them.
+        """
+        size = 1 << 12
+        while start < end:
+            size = min(size, end - start)
+            with suppress(DamageError):
+                yield start, size, self.read(start, min(size + overlap, end - start))
+            start, size = start + size, min(2 * size, _SEARCH_BYTES)
 
     def skips(self) -> None:
         """Tell the system that this file is read in pieces: what follows a piece need not be read ahead."""
@@ -331,18 +387,6 @@ class Bounds:
 
     def _bomb(self, why: str) -> LogError:
         return LogError(f"{self._path}: {why}; it is taken for a bomb, not a log")
-
-
-def search_windows(start: int, end: int, overlap: int) -> Iterator[tuple[int, int, int]]:
-    """Yield (start, size to search, size to read) of pieces to search one after the other, small at first.
-
-    A search that succeeds soon stays cheap, however many there are in a file that is made to need them.
-    """
-    size = 1 << 12
-    while start < end:
-        size = min(size, end - start)
-        yield start, size, min(size + overlap, end - start)
-        start, size = start + size, min(2 * size, SEARCH_BYTES)
 
 
 def decompress(codec: str, data: memoryview, size: int, *, checked: bool = False) -> memoryview:

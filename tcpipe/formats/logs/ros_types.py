@@ -25,19 +25,22 @@ from rosbags.typesys.base import normalize_fieldname
 from rosbags.typesys.store import Typestore
 
 from tcpipe.errors import LogError
-from tcpipe.logs.msg_text import BASE_TYPES, FieldType, MsgTextError, parse_msg
 from tcpipe.logs.topics import normalize_type_name
 from tcpipe.logs.wire_types import (
+    BASE_TYPES,
     MAX_COLUMNS,
     MAX_FIXED_ELEMENTS,
     WIDE_FORMS,
     Array,
+    FieldType,
+    MsgTextError,
     Record,
     Scalar,
     Text,
     WireType,
     count_fixed_elements,
     is_boundless,
+    parse_msg,
     record,
 )
 

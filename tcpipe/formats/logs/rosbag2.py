@@ -37,7 +37,7 @@ class Rosbag2Files:
     """The storage files of a bag in order, what is wrong with their list, and how many messages metadata.yaml counts, also by topic."""
 
     paths: tuple[Path, ...]
-    damage: tuple[Damage, ...]
+    damage: tuple[Damage, ...] = ()
     message_count: int | None = None
     topic_counts: Mapping[str, int] = field(default_factory=dict)
 
@@ -174,7 +174,9 @@ def decompress_blocks(part: LogPart, wanted: frozenset[int], *, threads: int) ->
     compressed: dict[int, bool] = {}
     for block in part.blocks(wanted, threads=threads):
         if block.channel not in compressed:
-            compressed[block.channel] = part.channels[block.channel].encoding == "cdr" and _is_compressed(block)
+            start = block.offsets[0] if len(block.offsets) else len(block.buffer)
+            is_frame = bytes(block.buffer[start : start + 4]) == ZSTD_MAGIC  # as no CDR message begins
+            compressed[block.channel] = is_frame and part.channels[block.channel].encoding == "cdr"
         yield _decompress_block(block, part) if compressed[block.channel] else block
 
 
@@ -201,11 +203,6 @@ def _decompress_block(block: MessageBlock, part: LogPart) -> MessageBlock:
         block.ordinal[rows],
         None,
     )
-
-
-def _is_compressed(block: MessageBlock) -> bool:
-    """Return whether the first message begins like a zstd frame, as no CDR message can."""
-    return bool(len(block.offsets)) and bytes(block.buffer[block.offsets[0] : block.offsets[0] + 4]) == ZSTD_MAGIC
 
 
 def _decompress_frame(frame: memoryview) -> bytes | None:

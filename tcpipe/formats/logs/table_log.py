@@ -50,6 +50,9 @@ class TableLog:
     """A folder of mapped tables, read. It has no file open."""
 
     container = "tables"
+    outline = ""
+    """Tables have no index, and are hashed."""
+    is_known_by_outline = False
 
     def __init__(self, path: Path, mappings: Mappings) -> None:
         """Read the tables; `LogError` has a line for each thing in which the mapping and the folder do not agree."""
@@ -87,16 +90,6 @@ class TableLog:
     def size_bytes(self) -> int:
         """Size of the folder's tables together, mapped or not."""
         return sum(file.stat().st_size for file in self._files)
-
-    @property
-    def outline(self) -> str:
-        """Tables have no index."""
-        return ""
-
-    @property
-    def is_known_by_outline(self) -> bool:
-        """Tables lie on this machine, and are hashed."""
-        return False
 
     def sha256(self) -> str:
         """Return the SHA-256 of all tables of the folder, mapped or not, one after the other, by name."""

@@ -174,25 +174,23 @@ def _place(message: Any, name: str, dtype: np.dtype[Any], serialize: Callable[[]
 
 def _find_leaf_dtype(store: Typestore, type_name: str, name: str) -> str:
     """Return the type of a number, or of the numbers of an array."""
-    parent, _, leaf = name.rpartition(".")
-    owner = _find_type(store, type_name, parent) if parent else type_name
-    fields: dict[str, Any] = dict(store.fielddefs[owner][1])
-    kind, argument = fields[leaf]
+    *parents, leaf = name.split(".")
+    kind, argument = _list_fields(store, type_name, parents)[leaf]
     base = str(argument[0] if kind == Nodetype.BASE else argument[0][1][0])
     return {"octet": "uint8", "char": "uint8"}.get(base, base)
 
 
-def _find_type(store: Typestore, type_name: str, name: str) -> str:
-    for part in name.split("."):
+def _list_fields(store: Typestore, type_name: str, parents: Sequence[str]) -> dict[str, Any]:
+    """Return kind and argument of each field of a message, or of the message that ``parents`` lead to in it."""
+    for part in parents:
         type_name = str(dict(store.fielddefs[type_name][1])[part][1])
-    return type_name
+    return dict(store.fielddefs[type_name][1])
 
 
 def _has_field(store: Typestore, type_name: str, name: str) -> bool:
     """Say whether the dialect has the field: ``header.seq`` is ROS 1 only."""
-    parent, _, leaf = name.rpartition(".")
-    owner = _find_type(store, type_name, parent) if parent else type_name
-    return leaf in dict(store.fielddefs[owner][1])
+    *parents, leaf = name.split(".")
+    return leaf in _list_fields(store, type_name, parents)
 
 
 def _nest_fields(flat: Mapping[str, Any]) -> dict[str, Any]:

@@ -14,10 +14,10 @@ from tcpipe.errors import MapError
 from tcpipe.formats.atomic import write_atomic_directory
 from tcpipe.formats.integrity import write_checksums
 from tcpipe.formats.maps.geotiff import USES, Use
-from tcpipe.formats.maps.layer_building import LayerSource, Raster, RasterLayer, iterate_shards, open_raster
+from tcpipe.formats.maps.layer_building import Raster, RasterLayer, iterate_shards, open_raster
 from tcpipe.formats.maps.map_facts import MapFacts, MapInputs
 from tcpipe.formats.maps.map_files import SHARD_PX, MapWriter
-from tcpipe.formats.maps.terrain_polygons import is_drawn, place_polygons
+from tcpipe.formats.maps.terrain_polygons import PolygonLayer, is_drawn, place_polygons
 from tcpipe.formats.recipe_toml import parse_toml
 from tcpipe.tables.catalogue import read_threshold
 from tcpipe.tables.findings import Finding, Subject, make_finding
@@ -44,6 +44,9 @@ from tcpipe.terrain.target_grid import Georeference, choose_crs, choose_grid, fi
 
 Files = Path | Sequence[Path]
 """One file of a layer, or all; the last lies on top."""
+
+LayerSource = RasterLayer | PolygonLayer
+"""What becomes a layer of a map."""
 
 OrthoBands = Literal["grey", "rgb"]
 
@@ -84,21 +87,19 @@ def build_map(
 
     Parameters
     ----------
-    out_path : where the Zarr directory goes; one that is there is replaced once the new one is complete.
-    name : the map's name.
-    height, ortho, terrain : rasters in any CRS on the earth, grid and resolution, each in one file or in tiles of one grid (`mosaic`);
-        terrain also as GeoJSON polygons (`terrain_polygons`).
+    out_path : the Zarr directory; an existing one is replaced once the new one is complete.
+    height, ortho, terrain : rasters in any CRS on the earth, grid and resolution, each in one file or in tiles of one grid
+        (`layer_building`); terrain also as GeoJSON polygons (`terrain_polygons`).
     more : other layers, put on the grid of these three.
-    classes : class table (CSV or TOML); None takes ``agreed``, else the paper's seven classes, and where the terrain raster names its
-        values, those names say which class each is.
-    agreed : the classes of the store's other maps, which this one must share.
+    classes : class table (CSV or TOML); None takes ``agreed``, the classes of the store's other maps, else the paper's seven classes. Where
+        the terrain raster names its values, those names say which class each is.
     crs : the map's CRS, projected and metric, and the CRS of rasters that carry none; None takes the height raster's, or its UTM zone.
     pitch_m : side of a map pixel [m]; None takes the finest raster's.
     inputs : what the caller wants to know the map by later; kept in its facts.
 
     Raises
     ------
-    MapError : a raster cannot be placed or read, or holds nothing here; the class table is not the store's: one line each.
+    MapError : a raster has no CRS, cannot be read, or holds nothing here; the class table is not the store's: one line each.
     StoreError : the map cannot be written.
     """
     given = {"height": height, "ortho": ortho, "terrain": terrain, **more.files}
@@ -154,7 +155,7 @@ def _write_layers(writer: MapWriter, layers: Mapping[str, LayerSource], grid: Ma
     for role, layer in layers.items():
         for row0, col0, rows, cols in iterate_shards(grid, SHARD_PX):
             shard = layer.shard(grid, row0, col0, rows, cols)
-            if layer.tally.count(layer, shard):
+            if layer.tally.count(layer.layer, layer.label, shard):
                 writer.write(role, row0, col0, shard)
 
 
@@ -248,7 +249,8 @@ def _refuse_empty(layers: Mapping[str, LayerSource]) -> None:
             problems.append(f"{layer.label}: every pixel is nodata")
         else:
             over = layers["height"].name
-            problems.append(layer.nothing() or f"{layer.label}: has no data anywhere on the height raster {over}")
+            unnamed = layer.explain_no_class() if isinstance(layer, RasterLayer) else None
+            problems.append(unnamed or f"{layer.label}: has no data anywhere on the height raster {over}")
     if problems:
         raise MapError(*problems)
 

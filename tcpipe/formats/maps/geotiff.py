@@ -502,8 +502,7 @@ def write_geotiff(
 ) -> None:
     """Write a tiled, deflated GeoTIFF strip by strip, whole or not at all.
 
-    ``strip(first_row, last_row)`` returns (bands, rows, cols); ``affine`` is of pixel corners, as in `Raster`; four bands are RGB
-    and alpha.
+    ``strip(first_row, last_row)`` returns (bands, rows, cols); ``affine`` is of pixel corners; four bands are RGB and alpha.
     """
     profile = {
         "driver": "GTiff",

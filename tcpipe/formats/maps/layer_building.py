@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -244,21 +244,21 @@ class Tally:
     unnamed: set[int] = field(default_factory=set)
     unnamed_pixels: int = 0
 
-    def count(self, layer: LayerSource, shard: Pixels) -> bool:
+    def count(self, layer: Layer, label: str, shard: Pixels) -> bool:
         """Count the pixels of a shard and return whether any has data; `MapError` if heights are not metres of dry land."""
-        if layer.layer.kind == "categorical":
+        if layer.kind == "categorical":
             found = np.bincount(shard.reshape(-1), minlength=256)
             self.by_class += found
             self.pixels += int(found[1:].sum())
             return bool(found[1:].any())
-        present = shard[layer.layer.has_data(shard)]
+        present = shard[layer.has_data(shard)]
         self.pixels += present.size
-        if layer.layer.stack != "greys" and present.size:
+        if layer.stack != "greys" and present.size:
             self.low, self.high = min(self.low, float(present.min())), max(self.high, float(present.max()))
-            if layer.layer.kind == "relative" and (self.high > _HIGHEST_M or self.low < _DEEPEST_M):
+            if layer.kind == "relative" and (self.high > _HIGHEST_M or self.low < _DEEPEST_M):
                 wrong = self.low if self.low < _DEEPEST_M else self.high
                 raise MapError(
-                    f"{layer.label}: heights from {self.low:.6g} to {self.high:.6g} are not metres of dry land; say in the file that "
+                    f"{label}: heights from {self.low:.6g} to {self.high:.6g} are not metres of dry land; say in the file that "
                     f"{wrong:.6g} is no data (gdal_edit -a_nodata {wrong:.9g}), or that they are centimetres (gdal_edit -scale 0.01)"
                 )
         return bool(present.size)
@@ -268,35 +268,6 @@ class Tally:
         if values.size:
             self.unnamed_pixels += values.size
             self.unnamed.update(int(value) for value in np.unique(values)[: 4 * _LISTED])
-
-
-class LayerSource(Protocol):
-    """What becomes a layer of a map."""
-
-    @property
-    def layer(self) -> Layer:
-        """The layer that it becomes."""
-
-    @property
-    def label(self) -> str:
-        """The files it comes from, for messages."""
-
-    @property
-    def name(self) -> str:
-        """The same without their folder."""
-
-    @property
-    def tally(self) -> Tally:
-        """What has been seen of it so far."""
-
-    def shard(self, grid: MapGrid, row0: int, col0: int, rows: int, cols: int) -> Pixels:
-        """Return a part of the map, shape (rows, cols): metres with NaN, or bytes with 0, as no data."""
-
-    def nothing(self) -> str | None:
-        """Return why it has no data, where a reason of its own is known."""
-
-    def list_findings(self) -> tuple[Finding, ...]:
-        """Return what was observed while it was placed and written."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -332,8 +303,8 @@ class RasterLayer:
             return np.where(np.isfinite(shard), np.clip(np.rint(shard), 1.0, 255.0), 0.0).astype(np.uint8)
         return shard
 
-    def nothing(self) -> str | None:
-        """Say that none of its values is a class."""
+    def explain_no_class(self) -> str | None:
+        """Return the problem that none of its values is a class; None where some are."""
         if not self.tally.unnamed or self.scheme is None:
             return None
         option = "--classes" if self.layer.name == "terrain" else f"--categorical {self.layer.name}=FILE"

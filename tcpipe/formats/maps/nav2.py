@@ -27,15 +27,10 @@ _OCCUPIED = 0.995
 def write_nav2_map(
     path: Path, cost: NDArray[np.uint8], grid: MapGrid, *, origin_m: tuple[float, float], meaning: str
 ) -> None:
-    """Write ``path`` (.yaml) and the picture beside it.
+    """Write ``path`` (.yaml) and the picture of the same name beside it.
 
-    Parameters
-    ----------
-    path : where the description goes; the picture takes the same name.
-    cost : from 0 to `HIGHEST`, or `LETHAL`, shape (rows, cols), north first.
-    grid : where the cells lie; the frame's axes are those of its CRS.
-    origin_m : x and y in that CRS where the frame's own are zero.
-    meaning : one line that says what a cost is.
+    ``cost`` is from 0 to `HIGHEST`, or `LETHAL`, shape (rows, cols), north first; ``grid`` places the cells in the frame, whose zero is at
+    ``origin_m`` in the grid's CRS; ``meaning`` is one line that says what a cost is.
     """
     grey = np.where(cost == LETHAL, 0.0, np.rint(255.0 * (1.0 - _OCCUPIED * cost / 100.0))).astype(np.uint8)
     picture = path.with_suffix(".pgm")

@@ -76,10 +76,6 @@ class PolygonLayer:
         kept = ~shapely.is_empty(polygons)
         return burn_polygons(polygons[kept], self.ids[drawn][kept], affine=affine, rows=rows, cols=cols)
 
-    def nothing(self) -> str | None:
-        """No reason of its own: `place_polygons` has seen that they reach the map."""
-        return None
-
     def list_findings(self) -> tuple[Finding, ...]:
         """Return what was observed when they were placed."""
         return self.findings
@@ -97,17 +93,11 @@ def is_drawn(paths: Sequence[Path]) -> bool:
 def place_polygons(
     paths: Sequence[Path], scheme: ClassScheme, crs: CRS, bounds_m: tuple[float, float, float, float]
 ) -> PolygonLayer:
-    """Read terrain polygons and carry them into a map's CRS.
-
-    Parameters
-    ----------
-    paths : the GeoJSON files; the features of a later one lie on top.
-    scheme : the class table, and the values that stand for its ids.
-    crs, bounds_m : the map's CRS, and x min, y min, x max, y max in it.
+    """Read terrain polygons and project them to a CRS; ``bounds_m`` are x min, y min, x max, y max of the map; later features lie on top.
 
     Raises
     ------
-    MapError : not GeoJSON, another CRS, unsound geometry, a class that the table does not have, or nothing on the map: all problems at
+    MapError : not GeoJSON, another CRS, invalid geometry, a class that the table does not have, or nothing on the map: all problems at
         once.
     """
     features, problems = _read_all(paths)

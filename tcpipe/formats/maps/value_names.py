@@ -14,13 +14,7 @@ _NAME_TITLES = ("class name", "classname", "class names", "class", "name", "labe
 
 
 def read_value_names(vrt: str, band: int) -> dict[int, str]:
-    """Return names by value from a VRT document that GDAL wrote of a raster; those of the attribute table come first.
-
-    Parameters
-    ----------
-    vrt : the document.
-    band : which band, from 1.
-    """
+    """Return names by value of a band, from 1, by a VRT document that GDAL wrote of a raster; those of the attribute table come first."""
     root = fromstring(vrt)  # noqa: S314  GDAL wrote it
     described = root.find(f"./VRTRasterBand[@band='{band}']")
     if described is None:

@@ -1,24 +1,24 @@
-"""The audit: in windows, the estimate is held against each sensor that fed it, before anyone believes its deviations.
+"""Compare the track with each sensor that fed it, in windows, before its standard deviations are used.
 
-Every comparison has one form: what a sensor says that the robot did in a window, less what the track says, beside what both claim of it.
+Each comparison is the sensor's motion in a window less the track's, with the uncertainty that both claim.
 
 ============ ============================================ =====================================================
 what         the sensor's                                 the track's
 ============ ============================================ =====================================================
-position     median place of the fixes, east and north    antenna at their stamps
+position     median position of the fixes, east and north antenna at their stamps
 displacement median of its later fixes less the earlier   the same of the antenna
-displacement integral of an odometry's velocity           way along its own axes (wheels: forward only)
+displacement integral of an odometry's velocity           distance along its own axes (wheels: forward only)
 displacement integral of the receiver's own velocity      the same of the antenna
 turn         integral of a rate about the vertical axis   change of attitude about it
 ============ ============================================ =====================================================
 
-A claim counts as an error that lasts through the window: the deviation of a fix is not divided by the root of their number, an odometry
-may be off by its scale and by a little velocity all the while, a gyroscope by how far its bias wanders. What is constant over the whole
-run, and told by others, is no disagreement: the scale of an odometry where fixes show it, the bias of a rate. A window disagrees where
-the squared difference over both variances passes the chi-square bound at which one window in a hundred runs would by chance, as many
-as there are. Where two other sensors of the same thing hold with each other, and both exclude what the one says, that one is alone:
-a track that does not follow it is believed. So are fixes that lie further off than an antenna could, where two others hold with the
-track. Otherwise the track's deviations are raised, there, by the size of the disagreement.
+A claimed error lasts through the window: the standard deviation of fixes is not divided by the root of their number, an odometry may be
+off by its scale and a little velocity throughout, a gyroscope by the wander of its bias. What is constant over the run and observable by
+other sensors is no disagreement: the scale of an odometry where fixes show it, the bias of a rate. A window disagrees where the squared
+difference over both variances exceeds the χ² bound that one window in a hundred runs would exceed by chance. A sensor is alone where two
+others of the same quantity agree with each other and exclude it: the track is kept. So it is with fixes that are further off than an
+antenna could be, where two other sensors agree with the track. Otherwise the track's standard deviations are inflated there by the size
+of the disagreement.
 """
 
 from __future__ import annotations
@@ -210,7 +210,7 @@ def _is_most(windows: int, moving: int) -> bool:
 
 
 def _sum_tallies(tallies: Iterable[Tally]) -> list[Tally]:
-    """Return the tallies of all stretches, one by sensor and thing."""
+    """Return the tallies of all sections, one by sensor and thing."""
     total: dict[tuple[str, What], Tally] = {}
     for each in tallies:
         had = total.get((each.sensor, each.what), Tally(each.sensor, each.what, 0, 0, 0))

@@ -210,7 +210,7 @@ def _iterate_signals(m: Measurements, power: PowerSignal | None, at_ns: NDArray[
     for role, twist in twists.items():
         if m.gnss is not None:
             seen = compute_moving_mean(
-                compute_moving_mean(_compute_antenna_speed(twist, m.gnss.lever_arm_m), FIXES_S), FIXES_S
+                compute_moving_mean(compute_antenna_speed(twist, m.gnss.lever_arm_m), FIXES_S), FIXES_S
             )
             yield GNSS, role, SPEED, *select_speed_changes(np.abs(compute_fix_velocity(m.gnss, at_ns))[:, None], seen)
     if power is not None and twists:
@@ -327,7 +327,8 @@ def _remove_slow_parts(values: Floats) -> Floats:
     return values - compute_moving_mean(values, _SLOW_S)
 
 
-def _compute_antenna_speed(twist: Floats, lever_arm_m: tuple[float, float, float]) -> Floats:
+def compute_antenna_speed(twist: Floats, lever_arm_m: tuple[float, float, float]) -> Floats:
+    """Return the antenna's speed by forward velocity and yaw rate, shape (M, 2), of an odometry [m/s], shape (M, 1)."""
     forward, yaw_rate = twist.T
     speed: Floats = np.hypot(forward - yaw_rate * lever_arm_m[1], yaw_rate * lever_arm_m[0])
     return speed[:, None]
@@ -452,7 +453,7 @@ def smooth_stamps(
     """Return the fixes with the variance of those raised whose stamps jitter against the odometry, and the finding of it."""
     if gnss is None or odometry is None:
         return gnss, ()
-    jitter_s = stamp_jitter_s(gnss, odometry)
+    jitter_s = estimate_stamp_jitter_s(gnss, odometry)
     jumpy = jitter_s > 0
     if not jumpy.any():
         return gnss, ()
@@ -465,7 +466,7 @@ def smooth_stamps(
     return add_jitter_variance(gnss, odometry, jitter_s), (finding,)
 
 
-def stamp_jitter_s(gnss: Positions, odometry: BodyVelocities) -> NDArray[np.float64]:
+def estimate_stamp_jitter_s(gnss: Positions, odometry: BodyVelocities) -> NDArray[np.float64]:
     """Return the standard deviation of the stamps around each fix [s], shape (N,); 0 where it does not matter or is unknown.
 
     It matters above 0.05 s and where it moves the fix by more than twice its claimed deviation. While the robot is stationary it is

@@ -11,11 +11,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.fusion.checks.clock_offsets import select_speed_changes
+from tcpipe.fusion.checks.clock_offsets import compute_antenna_speed, select_speed_changes
 from tcpipe.fusion.checks.distances import refuse_frozen
 from tcpipe.fusion.checks.lags import (
     FIXES_S,
-    Floats,
     Lag,
     compute_fix_velocity,
     compute_moving_mean,
@@ -107,9 +106,10 @@ def _check_time_offset(m: Measurements) -> SensorExclusion | None:
     if at_ns is None or m.doppler is None or m.gnss is None:
         return None
     velocity = resample_signal(m.doppler.stamp_ns, m.doppler.velocity_enu_mps[:, :2], at_ns)
-    for role in list(m.odometries())[:1]:
+    for role, odometry in list(m.odometries().items())[:1]:
         speed = compute_moving_mean(np.linalg.norm(velocity, axis=1)[:, None], _SMOOTH_S)
-        lag = find_lag(*select_speed_changes(speed, compute_moving_mean(_compute_antenna_speed(m, at_ns), _SMOOTH_S)))
+        of_odometry = compute_antenna_speed(resample_twist(odometry, at_ns), m.gnss.lever_arm_m)
+        lag = find_lag(*select_speed_changes(speed, compute_moving_mean(of_odometry, _SMOOTH_S)))
         if lag is not None and _is_known(lag):
             return _refuse_late("time-offset", role, lag, late_s=lag.offset_s) if _is_off(lag) else None
     seen = compute_fix_velocity(m.gnss, at_ns)
@@ -126,13 +126,6 @@ def _refuse_late(code: str, reference: str, lag: Lag, *, late_s: float | None = 
 
 
 _SMOOTH_S = 0.3  # averaging of speeds
-
-
-def _compute_antenna_speed(m: Measurements, at_ns: NDArray[np.int64]) -> Floats:
-    """Return the antenna's speed by the first odometry [m/s], shape (M, 1)."""
-    forward, yaw_rate = resample_twist(next(iter(m.odometries().values())), at_ns).T
-    ahead, left, _ = (0.0, 0.0, 0.0) if m.gnss is None else m.gnss.lever_arm_m
-    return np.asarray(np.hypot(forward - yaw_rate * left, yaw_rate * ahead)[:, None])
 
 
 def _is_known(lag: Lag) -> bool:

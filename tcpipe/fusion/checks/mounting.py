@@ -1,14 +1,14 @@
-"""How antenna and IMU are really mounted, by what a first track and the sensors say of the same motion.
+"""Estimate the lever arm of the antenna and the tilt of the IMU from a first track and the sensors.
 
-An antenna that sits off where it is thought to be goes round with the robot. In windows of 40 s the fixes, less the path that an odometry
-draws with the track's attitude, are a place, a scale and a turn of that path, and the arm's error turned by the attitude; the first three
-are each window's own, the last is that of the run. So is a lag of the fixes, which at one speed looks like an antenna further back, and is
-told from it where the speed changes. What the turns do not show stays at what is known beforehand. Wheels do not see the robot slide aside
-while it turns, and a turning point ahead of base_link looks like an antenna behind it: so much stays unknown.
+The error of a lever arm turns with the robot. In windows of 40 s the fixes less the path by odometry and the track's attitude are a
+position, a scale and a rotation of that path, each the window's own, and the arm's error turned by the attitude, common to the run. So is
+a time offset of the fixes, which at constant speed looks like an antenna further back; changes of speed separate them. What the turns do
+not show stays at its prior. Wheels do not measure how the robot slides sideways while it turns, and a turning point ahead of base_link
+looks like an antenna behind it: that uncertainty remains.
 
-An IMU that is pitched against the robot feels a slope that the robot does not climb: its forward specific force, less acceleration, over
-gravity, against the rise of the fixes. One that is rolled sees a part of every turn about its y axis: on any plane a robot turns about its
-own z axis, so the rate about y follows the rate about z.
+A pitched IMU measures a slope that the robot does not climb: its forward specific force less acceleration, over gravity, differs from the
+rise of the fixes. A rolled IMU measures a part of every turn about its y axis: on any plane a robot turns about its own z axis, so the
+rate about y is proportional to the rate about z.
 """
 
 from __future__ import annotations
@@ -95,7 +95,7 @@ class Tilt:
 
 
 def collect_arm_evidence(found: Trajectory, m: Measurements) -> ArmEvidence | None:
-    """Return what one stretch tells of the antenna's arm; None without fixes or odometry."""
+    """Return what one section shows of the antenna's lever arm; None without fixes or odometry."""
     role, source = (VISUAL, m.visual) if m.visual is not None else (WHEELS, m.wheels)
     if m.gnss is None or source is None or found.stamp_ns.size < _FEWEST:
         return None
@@ -234,7 +234,7 @@ def make_unknown_arm() -> Arm:
 
 
 def collect_tilt_evidence(found: Trajectory, m: Measurements) -> TiltEvidence | None:
-    """Return what one stretch tells of the IMU's roll and pitch; None without fixes, which tell the slope, or a usable IMU."""
+    """Return what one section shows of the IMU's roll and pitch; None without fixes, which show the slope, or a usable IMU."""
     if m.imu is None or m.gnss is None or not m.imu.accelerometer_usable or found.stamp_ns.size < _FEWEST:
         return None
     zero = int(found.stamp_ns[0])
@@ -274,7 +274,7 @@ def _compute_climb_mps(gnss: Positions, stamp_ns: NDArray[np.int64]) -> tuple[Fl
 
 
 def solve_tilt(told: Sequence[TiltEvidence | None]) -> Tilt | None:
-    """Return roll and pitch of the IMU by all stretches, with deviations from how blocks of ten seconds scatter; None if nothing tells.
+    """Return roll and pitch of the IMU by all sections, with deviations from how blocks of ten seconds scatter; None if nothing tells.
 
     A roll that no turn shows stays at what is known beforehand: none.
     """

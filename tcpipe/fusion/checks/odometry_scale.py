@@ -1,8 +1,8 @@
-"""How many times as far as the track an odometry goes: a scale that is off throughout is calibration, one that comes and goes is slip.
+"""Estimate the scale of an odometry against the track: one that is off throughout is calibration, one that comes and goes is slip.
 
-The scale is told by windows of five seconds in which the robot drives, wherever something else tells how long a metre is: the fixes, or
-for wheels a camera. It is surely wrong where its median is further from 1 than twice what is known of such odometries beforehand, and
-most windows say so alike. Where nothing else tells it, a command still does: no robot drives faster than it is told to.
+Windows of five seconds count in which the robot drives and the scale is observable: by the fixes, or for wheels by a camera. The scale is
+surely wrong where its median is further from 1 than twice the prior's standard deviation, and most windows agree. Where no sensor makes it
+observable, a command does: no robot drives faster than commanded.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class Scale:
         return self if before is None else Scale(before.factor * self.factor, before.factor * self.std, before.driven_m)
 
 
-def distance_ratios(found: Trajectory, m: Measurements) -> Mapping[str, Floats]:
+def compute_distance_ratios(found: Trajectory, m: Measurements) -> Mapping[str, Floats]:
     """Return by odometry how many times as far as the track it goes in each window that tells, where something else tells the scale."""
     measures = (m.gnss is not None) + (m.visual is not None)
     told = {WHEELS: measures > 0, VISUAL: m.gnss is not None}
@@ -93,7 +93,7 @@ def _compute_ratios(found: Trajectory, source: BodyVelocities) -> Floats:
 
 
 def solve_scales(told: Sequence[Mapping[str, Floats]]) -> Mapping[str, Scale]:
-    """Return by odometry the scale that it surely has in all of a run, told by each stretch; those that are as usual are left out."""
+    """Return by odometry the scale that it surely has in all of a run, told by each section; those that are as usual are left out."""
     found = {}
     for role in dict.fromkeys(role for each in told for role in each):
         ratios = np.concatenate([each[role] for each in told if role in each])

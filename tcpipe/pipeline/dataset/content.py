@@ -58,6 +58,11 @@ from tcpipe.tables.findings import Finding, Subject, make_finding
 from tcpipe.tables.levels import LABELLED_SEGMENTS, SAMPLES
 from tcpipe.terrain.projection import compute_area, parse_crs
 
+logger = logging.getLogger("tcpipe")
+
+_ROWS = 1 << 17
+"""Rows whose centres are computed together."""
+
 
 def _pool_segments(
     runs: Sequence[RunDirectory], directory: Path, *, again: Mapping[str, NDArray[np.bool_]]
@@ -69,41 +74,34 @@ def _pool_segments(
     """
     names = dict.fromkeys(name for run in runs for name in run.manifest.ledger_m)
     ledger_m = {name: math.fsum(run.manifest.ledger_m.get(name, 0.0) for run in runs) for name in names}
-    path, counts = directory / "segments.arrow", list[_Count]()
-    write_pieces(path, LABELLED_SEGMENTS.arrow(), _iterate_usable(runs, again, counts))
+    path, lacks = directory / "segments.arrow", dict[str, list[str]]()
+    lost = {loss: list[float]() for loss in (Loss.NO_POWER, Loss.OUTSIDE_MAP, Loss.RECORDED_TWICE)}
+    write_pieces(path, LABELLED_SEGMENTS.arrow(), _iterate_usable(runs, again, lacks, lost))
     segments = map_table(path)
     if segments.num_rows == 0:
-        every = sum(count.every for count in counts)
-        powered, located = any(count.powered for count in counts), any(count.located for count in counts)
-        lack = "power where there is GNSS" if powered and located else "GNSS" if powered else "power"
+        powered, located = (any(name not in lack for lack in lacks.values()) for name in ("power", "gnss"))
+        missing = "power where there is GNSS" if powered and located else "GNSS" if powered else "power"
         raise DatasetError(
-            f"{len(runs)} runs, {every} segments, but none with {lack}: "
+            f"{len(runs)} runs, {sum(run.facts.segments for run in runs)} segments, but none with {missing}: "
             "there is nothing to learn from; ingest runs that have it"
         )
-    lost_m = {
-        Loss.NO_POWER: math.fsum(count.no_power_m for count in counts),
-        Loss.OUTSIDE_MAP: math.fsum(count.no_place_m for count in counts),
-        Loss.RECORDED_TWICE: math.fsum(count.again_m for count in counts),
-    }
-    return segments, _move_losses(ledger_m, lost_m), list(_find_unusable(runs, counts))
-
-
-@dataclass(frozen=True, slots=True)
-class _Count:
-    """Segments of a run: all, with power, with position; metres without power, else without position, else of another run."""
-
-    every: int
-    powered: int
-    located: int
-    no_power_m: float
-    no_place_m: float
-    again_m: float
+    findings = [
+        make_finding(
+            "run-without-samples", Subject("run", run.run_id), names={"lacks": " and ".join(lacks[run.run_id])}
+        )
+        for run in runs
+        if run.facts.segments and lacks[run.run_id]
+    ]
+    return segments, _move_losses(ledger_m, {loss: math.fsum(metres) for loss, metres in lost.items()}), findings
 
 
 def _iterate_usable(
-    runs: Sequence[RunDirectory], again: Mapping[str, NDArray[np.bool_]], counts: list[_Count]
+    runs: Sequence[RunDirectory],
+    again: Mapping[str, NDArray[np.bool_]],
+    lacks: dict[str, list[str]],
+    lost: Mapping[Loss, list[float]],
 ) -> Iterator[pa.Table]:
-    """Yield each run's segments that can become samples; append an entry for each run to ``counts``."""
+    """Yield each run's segments that can become samples; add what no segment of it has to ``lacks``, and lost metres to ``lost``."""
     for run in runs:
         segments = run.segments()
         powered: NDArray[np.bool_] = np.isfinite(to_floats(segments, "power_watt"))
@@ -112,18 +110,11 @@ def _iterate_usable(
         arc_m = to_floats(segments, "arc_length_m")
         usable = powered & located
         twice = usable & again.get(run.run_id, np.zeros(len(usable), np.bool_))
-        lost_m = (float(arc_m[lost].sum()) for lost in (~powered, powered & ~located, twice))
-        counts.append(_Count(len(powered), int(powered.sum()), int(located.sum()), *lost_m))
+        for loss, rows in zip(lost, (~powered, powered & ~located, twice), strict=True):
+            lost[loss].append(float(arc_m[rows].sum()))
+        lacks[run.run_id] = [name for name, has in (("power", powered), ("gnss", located)) if not has.any()]
         usable &= ~twice
         yield segments if usable.all() else segments.filter(pa.array(usable))
-
-
-def _find_unusable(runs: Sequence[RunDirectory], counts: Sequence[_Count]) -> Iterator[Finding]:
-    """Yield a finding for every run that lacks power or positions everywhere."""
-    for run, count in zip(runs, counts, strict=True):
-        lacks = [name for name, has in (("power", count.powered), ("gnss", count.located)) if not has]
-        if count.every and lacks:
-            yield make_finding("run-without-samples", Subject("run", run.run_id), names={"lacks": " and ".join(lacks)})
 
 
 def _move_losses(ledger_m: Mapping[str, float], lost_m: Mapping[Loss, float]) -> dict[str, float]:
@@ -136,12 +127,6 @@ def _move_losses(ledger_m: Mapping[str, float], lost_m: Mapping[Loss, float]) ->
     left = moved.get(KEPT, 0.0) - total
     moved[KEPT] = left if left > 1e-9 * total else 0.0  # nothing left but rounding
     return moved
-
-
-logger = logging.getLogger("tcpipe")
-
-_ROWS = 1 << 17
-"""Rows whose centres are computed together."""
 
 
 class Redactor(Protocol):

@@ -113,7 +113,7 @@ def _refuse_unlike(store: Store, runs: Iterable[RunDirectory]) -> None:
         raise DatasetError(
             f"{store.root}: the runs of robot {GENERIC} are not all of one robot: their sensors differ; wanted one: tag each "
             "(tcpipe ingest LOG --tag robot=NAME) and choose it with --tag robot=NAME, or pool them with --robot generic",
-            *(f"{_format_names(names)}: {format_robot(seen)}" for names, seen in groups),
+            *(f"{_format_names(names)}: {format_robot(sensors)}" for names, sensors in groups),
         )
 
 
@@ -179,36 +179,42 @@ def find_gone_runs(
     return tuple(make_finding("run-gone", Subject("run", run_id)) for run_id in sorted(gone))
 
 
-Seen = dict[str, tuple[str, str, str]]
+SensorsByRole = dict[str, tuple[str, str, str]]
 """By role: topic, type and frame of a sensor."""
 
 
-def group_similar_runs(sensors: Mapping[str, Mapping[str, Sensor | KnownSensor]]) -> list[tuple[list[str], Seen]]:
+def group_similar_runs(
+    sensors: Mapping[str, Mapping[str, Sensor | KnownSensor]],
+) -> list[tuple[list[str], SensorsByRole]]:
     """Return groups of runs whose sensors, by run and role, agree in type, frame and namespace, and the sensors of each group.
 
     A run belongs to the first group with which it shares a role and differs in none: a sensor may be off for a drive.
     """
-    groups: list[tuple[list[str], Seen]] = []
-    seen = {run_id: _seen(of) for run_id, of in sensors.items()}
-    for run_id, mine in sorted(seen.items(), key=lambda item: (-len(item[1]), item[0])):
-        for runs, theirs in groups:
-            shared = mine.keys() & theirs.keys()
-            if all(_is_similar(mine[role], theirs[role]) for role in shared) and (shared or not (mine or theirs)):
+    groups: list[tuple[list[str], SensorsByRole]] = []
+    sensors_by_run = {run_id: _describe_sensors(of) for run_id, of in sensors.items()}
+    for run_id, own_sensors in sorted(sensors_by_run.items(), key=lambda item: (-len(item[1]), item[0])):
+        for runs, group_sensors in groups:
+            shared = own_sensors.keys() & group_sensors.keys()
+            if all(_is_similar(own_sensors[role], group_sensors[role]) for role in shared) and (
+                shared or not (own_sensors or group_sensors)
+            ):
                 runs.append(run_id)
-                theirs.update({role: of for role, of in mine.items() if role not in theirs})
+                group_sensors.update({role: of for role, of in own_sensors.items() if role not in group_sensors})
                 break
         else:
-            groups.append(([run_id], mine))
+            groups.append(([run_id], own_sensors))
     return groups
 
 
-def format_robot(seen: Seen) -> str:
+def format_robot(sensors: SensorsByRole) -> str:
     """Return the sensors of a robot as one line."""
-    parts = (f"{role} {topic} ({kind}, frame {frame or 'none'})" for role, (topic, kind, frame) in sorted(seen.items()))
+    parts = (
+        f"{role} {topic} ({kind}, frame {frame or 'none'})" for role, (topic, kind, frame) in sorted(sensors.items())
+    )
     return ", ".join(parts) or "no sensor is known"
 
 
-def _seen(sensors: Mapping[str, Sensor | KnownSensor]) -> Seen:
+def _describe_sensors(sensors: Mapping[str, Sensor | KnownSensor]) -> SensorsByRole:
     return {role: (of.topic, of.type_name, of.frame_id.strip("/")) for role, of in sensors.items()}
 
 

@@ -20,9 +20,8 @@ from tcpipe.formats.run_documents import LogOrigin
 from tcpipe.pipeline import ingest as ingest_module
 from tcpipe.pipeline.ingest import ingest
 from tcpipe.pipeline.ingest_run import Ingested
-from tcpipe.pipeline.ingest_task import IngestResult, check_age, make_result
 from tcpipe.pipeline.log_sources import find_damaged_log
-from tcpipe.pipeline.plan import TO_DO
+from tcpipe.pipeline.plan import TO_DO, IngestResult, check_age, make_result
 from tcpipe.pipeline.problems import acknowledge
 from tcpipe.pipeline.status import find_status
 from tcpipe.recipe import ReadConfig, Recipe

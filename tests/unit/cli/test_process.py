@@ -8,15 +8,15 @@ import threading
 
 import pytest
 
-from tcpipe.cli import process
-from tcpipe.cli.process import terminate_on_signal
+import tcpipe.cli
+from tcpipe.cli import terminate_on_signal
 
 
 @pytest.fixture
 def ended(monkeypatch):
     """An event, and the exit codes by which the process would have ended."""
     event, codes = threading.Event(), []
-    monkeypatch.setattr(process, "_LATEST_S", 0.05)
+    monkeypatch.setattr(tcpipe.cli, "_LATEST_S", 0.05)
     monkeypatch.setattr(os, "_exit", lambda code: (codes.append(code), event.set()))
     before = signal.signal(signal.SIGTERM, lambda *_: None)  # as a library that lets no exception through
     yield event, codes
@@ -45,7 +45,7 @@ def test_who_ends_in_time_and_other_signals_are_left_alone(ended):
 
 
 def test_linear_algebra_has_one_thread_unless_the_environment_says_otherwise():
-    told = "import os, sys, tcpipe.cli.process as p; p.prepare_process(); print(os.environ['OPENBLAS_NUM_THREADS'], 'numpy' in sys.modules)"
+    told = "import os, sys, tcpipe.cli as c; c.prepare_process(); print(os.environ['OPENBLAS_NUM_THREADS'], 'numpy' in sys.modules)"
     for given, wanted in (({}, "1 False\n"), ({"OPENBLAS_NUM_THREADS": "3"}, "3 False\n")):
         environment = {key: value for key, value in os.environ.items() if key != "OPENBLAS_NUM_THREADS"} | given
         found = subprocess.run(

@@ -10,13 +10,13 @@ _GRASS = np.uint8(4)
 
 
 def _width(errors, count):
-    low, high = errors.of_sum(np.full(count, 100.0), np.full(count, _GRASS))
+    low, high = errors.compute_sum_interval(np.full(count, 100.0), np.full(count, _GRASS))
     return (high - low) / (100.0 * count)
 
 
 def test_one_piece_has_the_quantiles_of_the_held_out_errors():
     found = fit_errors(made_residuals(4000, sigma=0.1))["energy"]
-    low, high = found.of_pieces(np.array([200.0]), np.array([_GRASS]))
+    low, high = found.compute_intervals(np.array([200.0]), np.array([_GRASS]))
     assert low[0] == pytest.approx(200.0 * (1.0 - 1.645 * 0.1), rel=0.01)
     assert high[0] == pytest.approx(200.0 * (1.0 + 1.645 * 0.1), rel=0.01)
 
@@ -40,7 +40,7 @@ def test_a_model_that_is_off_on_average_is_centred_and_lies_in_its_interval():
     assert power == pytest.approx(120.0, rel=0.003)
     assert velocity == pytest.approx(0.8)
     energy = power / velocity
-    low, high = fit_errors(residuals)["energy"].of_sum(energy, np.full(50, _GRASS))
+    low, high = fit_errors(residuals)["energy"].compute_sum_interval(energy, np.full(50, _GRASS))
     assert 0.97 * energy.sum() < low < energy.sum() < high < 1.03 * energy.sum()
 
 
@@ -97,7 +97,7 @@ def test_a_class_with_enough_held_out_samples_has_errors_of_its_own():
         residuals["terrain_class"] == 5, 150.0 + 6.0 * (residuals["power_watt"] - 150.0), residuals["power_watt"]
     )
     errors = fit_errors(residuals)["energy"]
-    ends = [errors.of_pieces(np.array([100.0]), np.array([number], np.uint8)) for number in (4, 5, 7)]
+    ends = [errors.compute_intervals(np.array([100.0]), np.array([number], np.uint8)) for number in (4, 5, 7)]
     grass, mud, other = ((high - low)[0] for low, high in ends)
     assert grass < other < mud
     assert mud > 4.0 * grass
@@ -105,7 +105,7 @@ def test_a_class_with_enough_held_out_samples_has_errors_of_its_own():
 
 def test_pieces_without_a_cost_add_nothing():
     errors = fit_errors(made_residuals(1000))["energy"]
-    some = errors.of_sum(np.array([100.0, np.nan, 100.0]), np.full(3, _GRASS))
+    some = errors.compute_sum_interval(np.array([100.0, np.nan, 100.0]), np.full(3, _GRASS))
     assert np.isfinite(some).all()
     assert some[0] < 200.0 < some[1]
 

@@ -7,9 +7,9 @@ from tcpipe.fusion.gnss_faults import (
     FaultHypothesis,
     Innovations,
     Jump,
+    compute_unexplained_innovation,
     find_returned_fixes,
     find_wrong_fixes,
-    unexplained_innovation,
 )
 
 S = 1_000_000_000
@@ -27,12 +27,12 @@ def test_a_cost_is_what_stays_unexplained_capped_and_a_price_for_each_second():
     refused = np.zeros(20, bool)
     refused[[2, 10, 11, 12, 13, 14, 15]] = True  # one alone, and six in a row
     fixes = innovations(np.where(refused, 400.0, 2.0), refused)
-    nothing = unexplained_innovation((), fixes, [innovations([1.0, 30.0], [False, True])], usual=3.0)
+    nothing = compute_unexplained_innovation((), fixes, [innovations([1.0, 30.0], [False, True])], usual=3.0)
     # 13 taken, one outlier at the usual, six at the gate, and the odometry's 1 and 16.
     assert nothing.cost == pytest.approx(13 * 2 + 3 + 6 * 16 + 17)
     assert nothing.refused == ((10 * S, 16 * S),)
     assert nothing.size_m == pytest.approx(0.4)
-    freed = unexplained_innovation(((10 * S, 16 * S),), fixes, [], usual=3.0)
+    freed = compute_unexplained_innovation(((10 * S, 16 * S),), fixes, [], usual=3.0)
     assert freed.cost == pytest.approx(13 * 2 + 3 + 6 * 3 + 6 * 2.0)
     assert freed.refused == ()
 

@@ -15,7 +15,7 @@ from tcpipe.fusion.process import (
     estimate_shake_density,
     estimate_slope_std_rad,
     is_turned_by_course,
-    process_noise,
+    make_process_noise,
     turn_scale_std,
 )
 
@@ -59,8 +59,8 @@ def test_a_turn_rate_of_an_odometry_has_a_scale_to_be_found():
     with_imu, without = measured(), measured(imu=False)
     assert turn_scale_std(with_imu) == 0.0
     assert turn_scale_std(without) > 0.1
-    assert process_noise(with_imu)[:, kernel.SCALED].max() == 0.0
-    assert process_noise(without)[kernel.FLAT_TURN, kernel.SCALED] == 1.0
+    assert make_process_noise(with_imu)[:, kernel.SCALED].max() == 0.0
+    assert make_process_noise(without)[kernel.FLAT_TURN, kernel.SCALED] == 1.0
     found = fuse(without)
     assert found.facts.turn_scale == pytest.approx(0.75, abs=0.03)  # these wheels say 0.8 of a turn: w (1 + 0.25)
     assert found.facts.gyro_bias_radps is None

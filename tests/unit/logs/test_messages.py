@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from tcpipe.logs import roles
-from tcpipe.logs.messages import count_frames, find_utc_offset, read_messages
+from tcpipe.logs.messages import Readings, convert_imu_to_si, count_frames, find_utc_offset, read_messages
 
 S = 1_000_000_000
 N = 12
@@ -351,3 +351,29 @@ def test_vtg_takes_the_time_of_the_fix_that_came_with_it() -> None:
     assert found.row.tolist() == [0, 2]
     assert found.own_time_ns.tolist() == [day + 36_805 * S, day + 36_806 * S]
     assert found.dropped == {"no_velocity": 2}
+
+
+SI_NAMES = (
+    "angular_velocity_z_radps",
+    "angular_velocity_var",
+    "linear_acceleration_x_mps2",
+    "linear_acceleration_var",
+    "quat_w",
+)
+
+
+@pytest.mark.parametrize(
+    ("units", "wanted"),
+    [
+        ("si", (1.0, 1.0, 1.0, 1.0, 1.0)),
+        ("deg", (0.0174532925, 0.000304617419, 1.0, 1.0, 1.0)),
+        ("g", (1.0, 1.0, 9.80665, 96.1703842, 1.0)),
+        ("deg_g", (0.0174532925, 0.000304617419, 9.80665, 96.1703842, 1.0)),
+    ],
+)
+def test_imu_units_become_si(units, wanted):
+    row = np.arange(2)
+    readings = Readings(row, row, None, {name: np.ones(2) for name in SI_NAMES})
+    found = convert_imu_to_si(readings, units)
+    assert [found.columns[name][1] for name in SI_NAMES] == pytest.approx(wanted)
+    assert found.row is row

@@ -4,7 +4,7 @@ import pytest
 from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from tcpipe.logs.msg_text import BASE_TYPES, FieldType, MsgTextError, parse_msg
+from tcpipe.logs.wire_types import BASE_TYPES, FieldType, MsgTextError, parse_msg
 
 
 def described(of):

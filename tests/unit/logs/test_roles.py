@@ -1,12 +1,15 @@
 """Which topic plays which role, from the topic list alone."""
 
+from dataclasses import replace
+
 import pytest
 
 from tcpipe.errors import RecipeError
 from tcpipe.formats.recipe_toml import load_shipped_profiles
 from tcpipe.logs import roles
+from tcpipe.logs.robots import find_robot, find_robot_namespaces
 from tcpipe.logs.roles import RoleAssignment
-from tcpipe.logs.topics import Topic
+from tcpipe.logs.topics import Topic, compute_silence_ns, find_short_topics, format_coverage
 from tcpipe.tables.findings import select_findings
 
 FIX, IMU = "sensor_msgs/msg/NavSatFix", "sensor_msgs/msg/Imu"
@@ -473,3 +476,94 @@ def test_of_two_receivers_that_of_the_fixes_is_taken_and_without_fixes_none() ->
     alone = assign(*topics)
     assert "gnss_velocity" not in played(alone)
     assert "no topic plays gnss" in alone.left_out["/rear/fix_velocity"]
+
+
+KINDS = {"fix": "sensor_msgs/msg/NavSatFix", "imu": "sensor_msgs/msg/Imu", "odom": "nav_msgs/msg/Odometry"}
+
+
+def test_three_roles_in_two_namespaces_are_two_robots():
+    found = find_robot_namespaces({name: [f"/a/{name}", f"/b/x/{name}"] for name in ("gnss", "imu", "power")})
+    assert found == {"/a": ("gnss", "imu", "power"), "/b": ("gnss", "imu", "power")}
+
+
+def test_a_camera_and_a_controller_are_no_robots():
+    candidates = {
+        "imu": ["/imu/data", "/zed2/imu/data"],
+        "visual_odometry": ["/zed2/zed_node/odom"],
+        "wheel_odometry": ["/husky_velocity_controller/odom", "/platform/odom"],
+        "command": ["/husky_velocity_controller/cmd_vel", "/platform/cmd_vel"],
+        "gnss": ["/fix"],
+    }
+    assert find_robot_namespaces(candidates) == {}
+
+
+def assign_two_robots(namespace=None, chosen=None):
+    names = [f"/{robot}/{name}" for robot in ("anna", "bert") for name in KINDS]
+    topics = [Topic(name, KINDS[name.rsplit("/", 1)[1]], 9, 0, 10, "cdr", "") for name in [*names]]
+    return assign_roles(topics, chosen or {}, namespace=namespace)
+
+
+def test_the_namespace_answers_the_question():
+    question = assign_two_robots().problems
+    assert question[0].startswith("the log holds 2 robots")
+    assert question[-1].startswith('namespace = "/anna"')
+    for name in ("/bert", "bert", "/bert/"):
+        found = assign_two_robots(name)
+        assert found.problems == ()
+        assert {topic for role in found.roles.values() for topic in role.topics} == {f"/bert/{kind}" for kind in KINDS}
+
+
+def test_topics_chosen_by_name_need_no_namespace():
+    chosen = {"gnss": ["/anna/fix"], "imu": ["/bert/imu"], "wheel_odometry": ["/anna/odom"]}
+    assert assign_two_robots(chosen=chosen).problems == ()
+
+
+def test_a_namespace_that_holds_nothing_is_a_mistake():
+    assert "no topic lies below /carl" in assign_two_robots("/carl").problems[0]
+
+
+@pytest.mark.parametrize(
+    ("namespace", "name", "why"),
+    [
+        ("/a200_0123", "husky", "is called so"),
+        ("/j100_0001", "jackal", "is called so"),
+        ("/w200_0001", "warthog", "is called so"),
+        ("/do150_0001", "dingo", "is called so"),
+        ("/r100-0001", "ridgeback", "is called so"),
+        ("/a300_0001", "husky_a300", "is called so"),
+        ("/x400_0001", "generic", "the platform X400, which no profile knows"),
+        ("", "husky", "nothing names another platform"),
+        ("/room100_0001", "husky", "nothing names another platform"),
+    ],
+)
+def test_a_clearpath_robot_is_known_by_its_namespace(namespace, name, why):
+    status = Topic(f"{namespace}/platform/mcu/status/power", "clearpath_platform_msgs/msg/Power", 1, 0, 0, "cdr", "")
+    robot, said = find_robot([status], None, load_shipped_profiles().robots)
+    assert robot == name
+    assert why in said
+
+
+S = 1_000_000_000
+
+
+@pytest.mark.parametrize(
+    ("spans_s", "count", "silent_s"),
+    [
+        ([(0, 10), (10, 20), (50, 60)], 1000, 30),
+        ([(50, 60), (0, 20), (10, 15)], 1000, 30),  # in any order, one inside another
+        ([(0, 10), (14, 20)], 1000, 0),  # a short pause
+        ([(0, 1), (30, 31), (60, 61)], 3, 0),  # one message in 20 s: its period
+        ([(0, 60)], 1000, 0),
+        ([], 0, 0),
+    ],
+)
+def test_silences_are_summed_where_they_are_no_period(spans_s, count, silent_s):
+    assert compute_silence_ns([(first * S, last * S) for first, last in spans_s], count) == silent_s * S
+
+
+def test_a_topic_that_paused_for_most_of_the_drive_covers_little():
+    whole = Topic("/odom", "nav_msgs/msg/Odometry", 600, 0, 60 * S, "cdr", "")
+    paused = replace(whole, name="/wheel/odom", message_count=200, silent_ns=40 * S)
+    assert find_short_topics([whole, paused], [whole, paused]) == {"/wheel/odom"}
+    assert format_coverage(paused) == "200 messages over 60.0 s, silent for 40.0 s of them"
+    assert find_short_topics([replace(paused, silent_ns=20 * S)], [whole]) == frozenset()

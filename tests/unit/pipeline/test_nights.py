@@ -14,7 +14,7 @@ from tcpipe.errors import UsageError
 from tcpipe.formats.logs.writing import MessageStream, write_bag, write_rosbag2
 from tcpipe.formats.run_documents import LogOrigin, RunJson
 from tcpipe.pipeline import ingest as ingest_module
-from tcpipe.pipeline import ingest_task
+from tcpipe.pipeline import plan as plan_module
 from tcpipe.pipeline.calls import LogWriter
 from tcpipe.pipeline.ingest import ingest
 from tcpipe.pipeline.inspect import inspect
@@ -156,7 +156,7 @@ def test_a_failure_is_news_once_until_something_is_another(tmp_path, night, monk
     assert told(night, "junk.bag") == again
     junk.write_bytes(JUNK + b"!")
     assert [told(night, "junk.bag") for _ in range(2)] == [once, again]
-    monkeypatch.setattr(ingest_task, "__version__", "9.9.9")
+    monkeypatch.setattr(plan_module, "__version__", "9.9.9")
     assert [told(night, "junk.bag") for _ in range(2)] == [once, again]
     (tmp_path / "tcpipe.toml").write_text("[segment]\nchord_m = 2.0\n")
     summaries = [ingest([junk], store=tmp_path / "store", recipe=tmp_path / "tcpipe.toml") for _ in range(2)]

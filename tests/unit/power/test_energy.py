@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from made_tracks import stamps
 
-from tcpipe.power.energy import count_samples_inside, integrate_energy, integrate_recorded_energy
+from tcpipe.power.energy import count_samples_inside, estimate_idle_power, integrate_energy, integrate_recorded_energy
 from tcpipe.power.rails import compute_power_watt, make_rail, make_samples
 
 ZERO = stamps(1)[0]
@@ -71,3 +71,85 @@ def test_a_record_counts_from_its_first_sample_to_its_last():
     assert integrate_recorded_energy([source], seconds(0.0), seconds(5.0), rule="exact") == pytest.approx([10 + 20])
     assert integrate_energy([source], seconds(1.0), seconds(3.0), rule="exact") == pytest.approx([30])
     assert np.isnan(integrate_energy([source], seconds(1.0), seconds(3.5), rule="exact")).all()
+
+
+def halts(*watts, rows=60):
+    """Halts of three seconds at 20 Hz."""
+    return np.repeat(np.array(watts, float), rows), np.repeat(np.arange(len(watts)), rows)
+
+
+def test_halts_that_differ_tell_how_unsure_it_is():
+    power, halt = halts(80.0, 90.0, 100.0)
+    found = estimate_idle_power(power, halt, window_rows=20, step_watt=0.0)
+    assert found.watt == 90.0
+    assert found.std_watt == pytest.approx(np.sqrt(200 / 3 * (1 + 1 / 9) + (0.1 * 90.0 / 9) ** 2))
+
+
+def test_one_second_does_not_tell_what_another_would():
+    found = estimate_idle_power(np.full(40, 390.0), np.zeros(40, int), window_rows=40, step_watt=0.0)
+    assert (found.watt, found.std_watt) == (390.0, pytest.approx(39.0))
+
+
+def test_noise_of_samples_is_not_held_against_the_robot():
+    rng, wrong, told = np.random.default_rng(0), [], []
+    for _ in range(300):
+        lasting = rng.normal(14.0, 0.5, 12)
+        power, halt = halts(*lasting)
+        found = estimate_idle_power(power + rng.normal(0.0, 3.0, power.size), halt, window_rows=20, step_watt=0.0)
+        wrong.append(found.watt - rng.normal(14.0, 0.5))  # what it draws at another time
+        told.append(found.std_watt)
+    assert np.sqrt(np.mean(np.square(told))) == pytest.approx(np.std(wrong), rel=0.15)
+
+
+def test_short_halts_are_noisier_and_do_not_count_as_change():
+    rng, told = np.random.default_rng(2), []
+    sizes = np.array([60, 12, 5, 51, 4, 71, 3, 15, 6, 38])
+    for _ in range(100):
+        halt = np.repeat(np.arange(sizes.size), sizes)
+        power = 14.0 + rng.normal(0.0, 3.0, halt.size)
+        told.append(estimate_idle_power(power, halt, window_rows=20, step_watt=0.0).std_watt)
+    assert np.median(told) < 0.45  # 3 W of 265 rows are 0.2 W
+
+
+def test_rows_between_two_samples_are_as_noisy_as_these():
+    rng, told = np.random.default_rng(3), []
+    for _ in range(100):
+        power, halt = halts(*[14.0] * 10)
+        noisy = power + rng.normal(0.0, 3.0, power.size)
+        between = 0.5 * (noisy + np.roll(noisy, 1))
+        told.append(estimate_idle_power(between, halt, window_rows=20, step_watt=0.0).std_watt)
+    assert np.median(told) < 0.35  # 3 W of 600 rows are 0.12 W, of a second 0.67 W
+
+
+def test_a_mean_is_finer_than_the_step_of_the_record():
+    rng = np.random.default_rng(1)
+    power, halt = halts(*[14.0] * 20)
+    told = np.round((power + rng.normal(0.0, 2.0, power.size)) / 1.3) * 1.3
+    found = estimate_idle_power(told, halt, window_rows=20, step_watt=1.3)
+    assert found.watt == pytest.approx(14.0, abs=0.2)
+    assert np.median(told) == pytest.approx(14.3)
+    assert found.std_watt < 0.3
+
+
+def test_a_record_that_stays_on_one_level_is_unsure_by_its_step():
+    power, halt = halts(14.0, 14.0)
+    assert estimate_idle_power(power, halt, window_rows=20, step_watt=1.2).std_watt == pytest.approx(
+        np.hypot(1.2 / np.sqrt(12), 1.4 / 6)
+    )
+
+
+def test_motors_at_the_edges_of_a_halt_are_left_out_where_anything_else_is_known():
+    power, halt = halts(14.0, 14.0)
+    halt[:6] = halt[54:66] = halt[-6:] = -1
+    power[halt < 0] = 60.0
+    assert estimate_idle_power(power, halt, window_rows=20, step_watt=0.0).watt == 14.0
+    edges = estimate_idle_power(np.full(50, 20.0), np.full(50, -1), window_rows=20, step_watt=0.0)
+    assert edges.watt == 20.0
+
+
+@pytest.mark.parametrize("known", [0, 39])
+def test_a_robot_that_hardly_stood_has_none(known):
+    power, halt = halts(14.0)
+    power[known:] = np.nan
+    found = estimate_idle_power(power, halt, window_rows=20, step_watt=0.0)
+    assert np.isnan([found.watt, found.std_watt]).all()

@@ -19,9 +19,8 @@ from tcpipe.errors import UsageError
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.report import report
 from tcpipe.pipeline.verify import verify
-from tcpipe.report import dataset_samples
-from tcpipe.report.dataset_report import render_dataset_report
-from tcpipe.report.dataset_samples import COLUMNS, find_nearest_train_m, select_samples
+from tcpipe.report import dataset_report
+from tcpipe.report.dataset_report import SAMPLE_COLUMNS, find_nearest_train_m, render_dataset_report, select_samples
 from tcpipe.report.label_sections import QUALITY_WORDS
 from tcpipe.store import open_store
 from tcpipe.tables.bits import Quality
@@ -146,8 +145,8 @@ def test_the_same_dataset_has_the_same_page(built, page):
 
 
 def test_too_many_samples_become_means_that_keep_the_sums(built, monkeypatch):
-    monkeypatch.setattr(dataset_samples, "MOST_SAMPLES", 30)
-    card, table = open_dataset(built).card, pq.read_table(built / "samples.parquet", columns=list(COLUMNS))
+    monkeypatch.setattr(dataset_report, "MOST_SAMPLES", 30)
+    card, table = open_dataset(built).card, pq.read_table(built / "samples.parquet", columns=list(SAMPLE_COLUMNS))
     shown = select_samples(card, table)
     told = shown.json["packed"]
     count = unpacked(told, "count").astype(float)
@@ -162,7 +161,7 @@ def test_too_many_samples_become_means_that_keep_the_sums(built, monkeypatch):
 
 @pytest.mark.parametrize("count", [0, 1])
 def test_few_samples_are_shown_as_well(built, count):
-    card, table = open_dataset(built).card, pq.read_table(built / "samples.parquet", columns=list(COLUMNS))
+    card, table = open_dataset(built).card, pq.read_table(built / "samples.parquet", columns=list(SAMPLE_COLUMNS))
     shown = select_samples(card, table.slice(0, count))
     assert shown.xy_m.shape == (count, 2)
     assert len(unpacked(shown.json["packed"], "energy")) == count

@@ -15,7 +15,7 @@ from tcpipe.pipeline.calls import open_log
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.problems import acknowledge
 from tcpipe.pipeline.report import report
-from tcpipe.pipeline.store_verdict import find_changes, find_shift
+from tcpipe.pipeline.status import find_changes, find_shift
 from tcpipe.pipeline.verify import verify
 from tcpipe.recipe import ReadConfig, Recipe
 from tcpipe.store import open_store

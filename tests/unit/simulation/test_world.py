@@ -6,8 +6,26 @@ import numpy as np
 import pytest
 from pyproj import Proj
 
+from tcpipe.simulation.paper_site import make_paper_site, make_paper_surface, scale_hidden_variance
+from tcpipe.simulation.robot import compute_rolling_resistance
 from tcpipe.simulation.scenarios import make_small_world
-from tcpipe.simulation.world import GRASS, MUD, PAVED, Band, Ellipse, Hill, Site, World
+from tcpipe.simulation.world import (
+    GRASS,
+    MUD,
+    PAVED,
+    UNPAVED,
+    Band,
+    Ellipse,
+    Hill,
+    Site,
+    SurfaceEffect,
+    Wave,
+    World,
+    draw_waves,
+    evaluate_field,
+    state,
+    sum_waves,
+)
 
 SITE = Site()
 
@@ -94,3 +112,105 @@ def test_local_plane_is_metric_and_returns():
     back = SITE.lonlatalt(enu)
     np.testing.assert_allclose(back[0], lon, atol=1e-12)
     np.testing.assert_allclose(back[2], SITE.datum[2], atol=1e-7)
+
+
+def test_rows_and_columns_are_a_product_of_matrices_with_the_same_values():
+    made = draw_waves(5, count=7, total=0.3, wavelength_m=(0.5, 9.0))
+    u, v = np.arange(0.0, 20.0, 0.7)[None, :], np.arange(0.0, 9.0, 0.9)[:, None]
+    points = (values.ravel() for values in np.broadcast_arrays(u, v))
+    grid = evaluate_field(made, u, v)
+    np.testing.assert_allclose(grid, sum_waves(made, u, v), atol=1e-12)
+    np.testing.assert_allclose(grid.ravel(), evaluate_field(made, *points), atol=1e-12)
+
+
+def test_a_state_is_spread_evenly_between_its_ends():
+    made = draw_waves(6, count=40, total=1.0, wavelength_m=(1.0, 5.0))
+    rng = np.random.default_rng(0)
+    values = state(made, rng.uniform(0, 2000, 20000), rng.uniform(0, 2000, 20000))
+    quantiles = np.quantile(values, [0.1, 0.25, 0.5, 0.75, 0.9])
+    assert quantiles == pytest.approx([-0.8, -0.5, 0.0, 0.5, 0.8], abs=0.06)
+
+
+RNG = np.random.default_rng(3)
+U, V = RNG.uniform(0, 500, 20000), RNG.uniform(0, 300, 20000)
+
+
+def on(class_id):
+    return np.full(U.size, class_id, np.uint8)
+
+
+def test_wet_ground_is_darker_and_resists_where_its_class_says_so():
+    surface = make_paper_surface()
+    wet = state(surface.wetness, U, V)
+    assert np.corrcoef(wet, surface.shade(on(MUD), U, V))[0, 1] < -0.8
+    assert np.corrcoef(wet, surface.resistance(on(MUD), U, V))[0, 1] > 0.99
+    assert abs(np.corrcoef(wet, surface.resistance(on(PAVED), U, V))[0, 1]) < 0.05  # dark, and costs nothing
+
+
+def test_resistance_keeps_within_its_sources_range():
+    """Carvill's gravel, 0.01 to 0.04, and wetness: never beyond their sum."""
+    found = make_paper_surface().resistance(on(UNPAVED), U, V)
+    assert np.abs(found).max() <= 0.7
+    assert found.std() == pytest.approx(np.hypot(0.6, 0.1) / np.sqrt(3.0), rel=0.1)
+
+
+def test_relief_is_as_rough_as_its_class():
+    surface = make_paper_surface()
+    swings = np.sqrt(1.0 + surface.swing**2 / 3.0)
+    wanted = np.hypot(surface.looks[GRASS].bump_m, surface.looks[GRASS].ridge_m) * swings
+    assert surface.relief_m(on(GRASS), U, V).std() == pytest.approx(wanted, rel=0.1)
+    assert surface.map_noise_m(U, V).std() == pytest.approx(surface.map_noise_std_m, rel=0.1)
+
+
+def test_the_pose_does_not_feel_what_the_raster_shows():
+    world = make_paper_site().world
+    x, y = world.site.west_m + U, world.site.south_m + V
+    more = world.mapped_height_m(x, y) - world.height_m(x, y)
+    assert 0.004 < more.std() < 0.03
+
+
+@pytest.mark.parametrize("factor", [0.5, 1.0, 2.0])
+def test_what_is_hidden_is_asked_for_by_its_variance(factor):
+    world = make_paper_site().world
+    squares = [
+        sum(wave.amplitude**2 for wave in made.resistance) for made in (scale_hidden_variance(world, factor), world)
+    ]
+    assert squares[0] == pytest.approx(factor * squares[1])
+
+
+ROBOT = make_paper_site().robot
+X, Y = SITE.west_m + np.linspace(20.0, 60.0, 4001), np.full(4001, SITE.south_m + 40.0)
+
+
+def test_even_ground_costs_its_class():
+    assert compute_rolling_resistance(World(SITE, 600.0), ROBOT, X, Y, np.zeros(1)) == pytest.approx(
+        ROBOT.ground[GRASS].rolling_resistance
+    )
+
+
+def test_a_wheel_on_the_road_and_one_beside_it():
+    """The road's border runs under the robot's middle: two contacts of four on each."""
+    world = World(SITE, 600.0, regions=(Band(PAVED, 0.0, 42.0, 0.0, 4.0),))
+    wanted = (ROBOT.ground[GRASS].rolling_resistance + ROBOT.ground[PAVED].rolling_resistance) / 2.0
+    assert compute_rolling_resistance(world, ROBOT, X, Y, np.zeros(1)) == pytest.approx(wanted)
+
+
+@pytest.mark.parametrize(("yaw_rad", "share"), [(0.0, 1.0), (np.pi / 2, 0.0)])
+def test_ridges_cost_those_who_cross_them(yaw_rad, share):
+    """z = a sin(k x): over contacts of length c it climbs 4 a sin(k c / 2) / wavelength / (k c / 2) a metre; half of that is uphill."""
+    height_m, wavelength_m = 0.02, 0.6
+    ridges = (Wave(1.0, wavelength_m, 0.0, 0.0),)
+    surface = replace(make_paper_surface(), looks={GRASS: SurfaceEffect(ridge_m=height_m)}, ridges=ridges, swing=0.0)
+    half = np.pi * ROBOT.wheels.contact_m / wavelength_m
+    climbed = 0.5 * 4.0 * height_m / wavelength_m * np.sin(half) / half
+    found = compute_rolling_resistance(World(SITE, 600.0, surface=surface), ROBOT, X, Y, np.array([yaw_rad]))
+    more = np.mean(found) - ROBOT.ground[GRASS].rolling_resistance
+    assert more == pytest.approx(share * ROBOT.wheels.bump_loss * climbed, rel=0.01, abs=1e-9)
+
+
+@pytest.mark.parametrize(("yaw_rad", "share"), [(0.0, 1.0), (np.pi / 2, 0.0)])
+def test_a_slope_across_drags_by_its_square(yaw_rad, share):
+    tilt = (Wave(0.3 * 40000.0 / (2 * np.pi), 40000.0, np.pi / 2, 0.0),)  # rises to the north by 0.3
+    found = compute_rolling_resistance(World(SITE, 600.0, waves=tilt), ROBOT, X, Y, np.array([yaw_rad]))
+    wanted = np.sin(np.arctan(0.3)) ** 2 / ROBOT.wheels.cornering_per_rad
+    assert found - ROBOT.ground[GRASS].rolling_resistance == pytest.approx(share * wanted, rel=1e-3, abs=1e-9)

@@ -9,7 +9,7 @@ from tcpipe.fusion.measurements import BodyVelocities, InertialMeasurements, Mea
 from tcpipe.recipe import FuseConfig
 from tcpipe.stages import fuse as stage
 from tcpipe.stages.fuse_inputs import FusionInputs
-from tcpipe.stages.fuse_stretches import Fused
+from tcpipe.stages.fuse_sections import Fused
 from tcpipe.tables.facts import SensorChecks
 from tcpipe.tables.findings import Remedy, StageReport, Subject
 from tcpipe.tables.levels import Sensor, Streams
@@ -52,7 +52,7 @@ def fusing(monkeypatch):
             astray = 12 if tried[-1] in lost else 0
             return Fused(found=[None], tallies=tallies, windows=20, astray=astray)
 
-        monkeypatch.setattr(stage, "fuse_stretches", fuse)
+        monkeypatch.setattr(stage, "fuse_sections", fuse)
         monkeypatch.setattr(stage, "fuse_mounted", lambda given, *rest: (given, fuse(given, *rest)))
         return tried
 

@@ -4,14 +4,18 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from suggested_recipes import proposed
 
-from tcpipe.fusion.measurements import InertialMeasurements, InitialState, Measurements, Positions
+from tcpipe.fusion.checks.audit import Tally
+from tcpipe.fusion.measurements import BodyVelocities, InertialMeasurements, InitialState, Measurements, Positions
 from tcpipe.fusion.trajectory import TrackSection
-from tcpipe.stages.fuse_findings import fuse_facts, fuse_findings
-from tcpipe.stages.fuse_inputs import FusionInputs
-from tcpipe.stages.fuse_stretches import stretch_facts
-from tcpipe.tables.facts import Reopening, StretchFacts
+from tcpipe.recipe import FuseConfig
+from tcpipe.stages.fuse_findings import find_fuse_findings, make_audit_findings, make_fuse_facts
+from tcpipe.stages.fuse_inputs import FusionInputs, prepare_inputs
+from tcpipe.stages.fuse_sections import Fused, make_section_facts
+from tcpipe.tables.facts import Disagreement, Reopening, StretchFacts
 from tcpipe.tables.findings import Subject, make_finding
+from tcpipe.tables.levels import STREAMS, Sensor, Streams
 
 PLACE = (15.0, 47.0, 400.0)
 ALL = ("gnss", "imu", "wheel_odometry")
@@ -23,7 +27,9 @@ def stretch(*, sensors=ALL, heading_from="course over ground", **said):
 
 
 def warned(inputs, *stretches, skipped_s=0.0):
-    return fuse_findings(inputs, fuse_facts(inputs, stretches, rows=7, skipped_s=skipped_s), run=Subject("run", "r"))
+    return find_fuse_findings(
+        inputs, make_fuse_facts(inputs, stretches, rows=7, skipped_s=skipped_s), run=Subject("run", "r")
+    )
 
 
 def counts(**said):
@@ -34,7 +40,7 @@ def test_stretches_add_up_and_their_innovations_are_averaged_by_count():
     first = stretch(nis_mean={"gnss": 1.0, "imu": None}, measurements={"gnss": 30, "imu": 5}, rejected={"gnss": 3})
     second = stretch(nis_mean={"gnss": 2.0}, measurements={"gnss": 10}, rejected={"gnss": 4}, sensors=("gnss",))
     inputs = FusionInputs(PLACE, counts={"gnss": counts(invalid=2)})
-    facts = fuse_facts(inputs, [first, second], rows=7, skipped_s=1.5)
+    facts = make_fuse_facts(inputs, [first, second], rows=7, skipped_s=1.5)
     assert facts.measurements == {"gnss": 40, "imu": 5}
     assert facts.rejected == {"gnss": 7, "imu": 0}
     assert facts.nis_mean == {"gnss": pytest.approx(1.25)}
@@ -50,13 +56,13 @@ def test_a_stretch_says_where_it_lies_and_what_it_began_with():
     yaw = np.array([0.0, 0.0, np.sin(0.25), np.cos(0.25)])
     began = InitialState(np.zeros(3), np.ones(3), yaw, 0.1, 0.3, heading_from="orientation")
     found = SimpleNamespace(facts=stretch(), stamp_ns=np.arange(4))
-    told = stretch_facts(TrackSection(2, 10, 20, heard), began, found)
+    told = make_section_facts(TrackSection(2, 10, 20, heard), began, found)
     assert (told.epoch, told.start_ns, told.end_ns, told.rows) == (2, 10, 20, 4)
     assert set(told.sensors) == {"gnss", "imu"}
     assert (told.gyro_noise_radps, told.accelerometer_noise_mps2) == (0.01, 0.1)
     assert told.initial_yaw_rad == pytest.approx(0.5)
     assert (told.initial_yaw_std_rad, told.heading_from) == (0.3, "orientation")
-    alone = stretch_facts(TrackSection(2, 10, 20, Measurements(gnss=heard.gnss)), began, found)
+    alone = make_section_facts(TrackSection(2, 10, 20, Measurements(gnss=heard.gnss)), began, found)
     assert alone.gyro_noise_radps is None
     assert alone.accelerometer_noise_mps2 is None
 
@@ -129,3 +135,105 @@ def test_a_sensor_that_left_the_path_is_one_finding_with_its_worst():
     assert (wheels.numbers, wheels.span_s) == ({"off_mps": 0.4, "event_count": 1}, (0.0, 2.0))
     third = stretch(reopenings=(worst,), sensors=(*ALL, "visual_odometry"))
     assert warned(FusionInputs(PLACE), third)[0].names == {}
+
+
+SECOND_NS = 1_000_000_000
+
+
+def off(begin_s, end_s, size, *, sensor="gnss", what="position", alone=False):
+    return Disagreement(begin_s * SECOND_NS, end_s * SECOND_NS, sensor, what, size, "m", 0.02, alone)
+
+
+NOBODY = FusionInputs(None), Streams({}, {}, "husky")
+
+
+def fused(*found, tallies=()):
+    return Fused(
+        facts=[StretchFacts({}, {}, {}, 0, start_ns=100 * SECOND_NS)], disagreements=list(found), tallies=list(tallies)
+    )
+
+
+def test_nothing_is_said_where_nobody_disagrees():
+    told = make_audit_findings(fused(), *NOBODY)
+    assert told.findings == ()
+    assert (told.facts.disagreements, told.facts.undecided) == ((), ())
+
+
+def test_a_finding_holds_sensor_what_window_size_and_what_was_expected():
+    told = make_audit_findings(fused(off(110, 130, 0.2), off(160, 220, 0.49), off(150, 155, 9.0, alone=True)), *NOBODY)
+    shared, lone = told.findings
+    assert (shared.code, shared.subject.name, shared.action) == ("position-disagrees", "gnss", "inflated")
+    assert shared.numbers == {"off_m": 0.49, "expected_std_m": 0.02, "event_count": 2, "total_s": 80.0}
+    assert shared.span_s == (60.0, 120.0)
+    assert (lone.code, lone.severity, lone.action) == ("position-disagrees", "note", "kept")
+    assert (lone.numbers["off_m"], lone.span_s) == (9.0, (50.0, 55.0))
+    assert len(told.facts.disagreements) == 3
+
+
+def test_a_run_that_no_third_decides_says_why_it_has_no_segments():
+    told = make_audit_findings(fused(tallies=[Tally("wheel_odometry", "displacement", 20, 15, 0)]), *NOBODY)
+    assert told.facts.undecided == ("wheel_odometry",)
+    (finding,) = told.findings
+    assert (finding.code, finding.subject.name) == ("disagreement-undecided", "wheel_odometry")
+    assert (finding.severity, finding.names) == ("error", {"quantity": "displacement"})
+    assert proposed(finding) == {"read": {"topics": {"wheel_odometry": []}}}
+
+
+def wheels_alone(speed_mps):
+    """Wheels of one speed that nothing else is held against, and a command of 1 m/s."""
+    stamp_ns = np.arange(0, 100 * SECOND_NS, SECOND_NS // 10, dtype=np.int64)
+    velocity = np.column_stack((np.full(stamp_ns.size, speed_mps), np.full((stamp_ns.size, 2), np.nan)))
+    nothing = np.full(stamp_ns.size, np.nan)
+    wheels = BodyVelocities(stamp_ns, velocity, velocity, nothing, nothing)
+    command = STREAMS["command"].table(
+        stamp_ns=stamp_ns, log_time_ns=stamp_ns, epoch=np.zeros(stamp_ns.size, np.int16),
+        forward_velocity_mps=np.ones(stamp_ns.size), yaw_rate_radps=np.zeros(stamp_ns.size),
+    )  # fmt: skip
+    return FusionInputs(None, {0: Measurements(wheels=wheels)}), Streams({"command": command}, {}, "husky")
+
+
+def test_wheels_faster_than_any_command_bear_no_segment_where_nothing_else_tells_how_long_a_metre_is():
+    assert make_audit_findings(fused(), *wheels_alone(0.9)).facts.undecided == ()
+    told = make_audit_findings(fused(), *wheels_alone(1.25))
+    assert told.facts.undecided == ("wheel_odometry",)
+    (finding,) = told.findings
+    assert (finding.code, finding.numbers) == ("faster-than-commanded", {"speed_ratio": pytest.approx(1.25)})
+    assert proposed(finding) == {"read": {"odometry_scale": {"wheel_odometry": 0.8}}}
+    assert proposed(finding, alternative=1) == {"read": {"topics": {"command": []}}}
+
+
+STAMP_NS = 1_700_000_000_000_000_000 + np.arange(4, dtype=np.int64) * 1_000_000_000
+
+
+@pytest.fixture
+def streams():
+    times = {
+        "stamp_ns": STAMP_NS,
+        "log_time_ns": STAMP_NS,
+        "epoch": np.zeros(4, np.int16),
+        "fix_status": np.full(4, 2, np.int8),
+    }
+    unknown = np.full(4, np.nan)
+    place = {"lon_deg": 15.0 + np.arange(4) * 1e-5, "lat_deg": np.full(4, 47.0), "alt_m": np.full(4, 400.0)}
+    axes = ("east", "north", "up")
+    fixes = STREAMS["gnss"].table(**times, **place, **{f"{axis}_var_m2": np.full(4, 1e-4) for axis in axes})
+    velocity = dict(
+        zip([f"{axis}_velocity_mps" for axis in axes], (np.full(4, 0.76), np.zeros(4), unknown), strict=True)
+    )
+    told = STREAMS["gnss_velocity"].table(**times, **velocity, **{f"{axis}_var_m2ps2": unknown for axis in axes})
+    roles = ("gnss", "gnss_velocity")
+    sensors = {role: Sensor(f"/{role}", "x/msg/Y", "gps", "why", (0.1, 0.0, 0.9), placed_by="recipe") for role in roles}
+    return Streams(dict(zip(roles, (fixes, told), strict=True)), sensors, "husky")
+
+
+def test_what_no_receiver_claims_is_the_recipes(streams):
+    (found,) = prepare_inputs(streams, FuseConfig(gnss_velocity_std_mps=0.2)).measurements.values()
+    assert set(found.sensors()) == {"gnss", "gnss_velocity"}
+    assert found.doppler.velocity_enu_mps[0].tolist() == [0.76, 0.0, 0.0]
+    assert found.doppler.variance_m2ps2[0] == pytest.approx([0.04, 0.04, 1e6])
+
+
+def test_the_forward_filter_says_that_it_does_not_use_it(streams):
+    inputs = prepare_inputs(streams, FuseConfig(estimator="ukf"))
+    assert [set(m.sensors()) for m in inputs.measurements.values()] == [{"gnss"}]
+    assert [(of.code, of.subject.name) for of in inputs.findings] == [("unused-by-estimator", "gnss_velocity")]

@@ -12,7 +12,7 @@ from tcpipe.fusion.measurements import BodyVelocities, InertialMeasurements, Mea
 from tcpipe.stages import fuse
 from tcpipe.stages.fuse_findings import make_mounting_findings
 from tcpipe.stages.fuse_inputs import FusionInputs
-from tcpipe.stages.fuse_stretches import Fused
+from tcpipe.stages.fuse_sections import Fused
 from tcpipe.tables.levels import Sensor, Streams
 
 ARM_M = (0.1, 0.0, 0.9)

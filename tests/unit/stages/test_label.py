@@ -1,15 +1,24 @@
 """Labels of segments whose cost is known in closed form, and the bits that they carry."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from made_tracks import make_track, power_streams, stamps, straight_track
+from simulated_streams import log_of, streams_of
 
 from tcpipe.cost.labels import CAUSES, format_budget
-from tcpipe.recipe import GateConfig, LabelConfig, SegmentConfig
-from tcpipe.stages.label import label_segments
+from tcpipe.pipeline.ingest_run import run_stages
+from tcpipe.power.energy import IdlePower, integrate_energy
+from tcpipe.recipe import GateConfig, LabelConfig, Recipe, SegmentConfig
+from tcpipe.simulation import Faults, find_scenario
+from tcpipe.simulation.robot import GRAVITY_MPS2, SimulatedRobot
+from tcpipe.simulation.route import Wander
+from tcpipe.stages.fuse_sections import make_power_columns
+from tcpipe.stages.label import add_physics, compute_segment_costs, label_segments
 from tcpipe.stages.mask import mask_track
+from tcpipe.stages.message_arrays import make_rails
 from tcpipe.stages.segment import segment_track
 from tcpipe.tables.bits import Quality
 from tcpipe.tables.columns import to_floats, to_integers
@@ -315,3 +324,116 @@ def test_a_run_without_any_current_has_no_relative_deviation_and_divides_by_noth
     told = labelled.info.report.facts.label.relative_std_median
     assert (told["power"], told["energy"]) == (None, None)
     assert told["duration"] > 0.0
+
+
+USUAL = SimulatedRobot()
+ROBOT = replace(
+    USUAL,
+    ground={name: replace(of, slip=0.0) for name, of in USUAL.ground.items()},
+    slope_slip=0.0,
+    scrub_half_radius_m=math.inf,
+)
+
+
+@pytest.fixture(scope="module")
+def stages(tmp_path_factory):
+    """400 m over hills and all classes, without sensor faults, of a robot without slip whose torque is the same on every curve."""
+    hills = find_scenario("hills12")
+    drive = replace(hills.drives[0], plan=Wander(400.0, (14.0, 34.0), climbing=0.5), faults=Faults(), robot=ROBOT)
+    streams = streams_of(log_of(hills, drive, tmp_path_factory.mktemp("hills"), seed=3))
+    return run_stages(streams, Recipe().ingest, run_id="run")
+
+
+def test_the_fit_is_the_robot(stages):
+    facts = stages[2].info.report.facts.label.physics
+    assert facts.standing_watt == pytest.approx(ROBOT.idle_watt, rel=0.02)
+    assert facts.weight_over_efficiency_newton == pytest.approx(
+        ROBOT.mass_kg * GRAVITY_MPS2 / ROBOT.drive_efficiency, rel=0.05
+    )
+    assert 0.115 < facts.rolling_resistance < 0.22  # of all classes together
+    assert facts.recovered_downhill == pytest.approx(ROBOT.drive_efficiency * ROBOT.regeneration_efficiency, abs=0.15)
+    values = {of.term: of for of in facts.fit.terms}
+    torque = ROBOT.scrub_torque_nm / ROBOT.drive_efficiency
+    assert abs(values["turning"].value - torque) < max(0.05 * torque, 2.0 * values["turning"].std)
+    assert values["turning"].std < 0.1 * torque
+    assert facts.fit.held_out.r2 > 0.9
+    assert sum(facts.fit.energy_share.values()) == pytest.approx(1.0, abs=0.03)
+
+
+def test_the_prediction_stands_beside_the_label(stages):
+    table = stages[2].table
+    power, predicted = to_floats(table, "power_watt"), to_floats(table, "physics_power_watt")
+    assert np.isfinite(predicted).all()
+    assert 1 - np.var(power - predicted) / np.var(power) > 0.9  # the rest is terrain
+
+
+def test_an_odd_metre_is_flagged_and_changes_nothing_for_the_others(stages):
+    labelled = stages[2]
+    power = to_floats(labelled.table, "power_watt").copy()
+    power[7] += 300.0
+    odd = labelled.table.set_column(
+        labelled.table.schema.get_field_index("power_watt"), labelled.table.schema.field("power_watt"), [power]
+    )
+    table, facts = add_physics(odd, 14.0)
+    flagged = np.flatnonzero(table["quality"].to_numpy() & np.uint32(Quality.PHYSICS_OUTLIER))
+    assert 7 in flagged
+    assert facts.outliers == flagged.size <= 3
+    others = np.delete(np.arange(table.num_rows), 7)
+    before = to_floats(labelled.table, "physics_power_watt")
+    assert np.abs(to_floats(table, "physics_power_watt") - before)[others].max() < 2.0
+
+
+def test_without_power_there_is_no_fit(stages):
+    labelled = stages[2]
+    field = labelled.table.schema.field("power_watt")
+    dark = labelled.table.set_column(
+        labelled.table.schema.get_field_index("power_watt"), field, [np.full(labelled.table.num_rows, np.nan)]
+    )
+    table, facts = add_physics(dark, np.nan)
+    assert facts.fitted is False
+    assert table is dark
+
+
+def seconds(*values):
+    return ZERO + np.round(np.array(values) * 1e9).astype(np.int64)
+
+
+def track_watt(streams, at_ns):
+    return make_power_columns(streams, 0, at_ns, max_gap_ns=300_000_000)["power_watt"]
+
+
+@pytest.mark.parametrize("averaged", [True, False])
+def test_the_track_has_the_power_that_the_label_takes_at_a_segments_end(averaged):
+    # At 1 Hz 30 W and 300 W in turns: between two samples an interpolated value is up to ten times one held back.
+    stamp_ns = seconds(*range(-1, 61)) + 700_000_000
+    streams = power_streams(
+        {"drive": (stamp_ns, np.full(62, 30.0), np.where(np.arange(62) % 2, 10.0, 1.0))}, averaged=averaged
+    )
+    gated = mask_track(straight_track(np.full(1200, 0.8)), GateConfig(), max_velocity_mps=1.0, chord_m=1.0)
+    cut = segment_track(gated, SegmentConfig()).table
+    rule = "averaged" if averaged else "exact"
+    unknown, rails = IdlePower(np.nan, np.nan), make_rails(streams, 0)
+    cost, _, causes = compute_segment_costs(cut, gated.table, rails, gated.info, rule=rule, standing=unknown)
+    label_watt = np.sqrt(causes["position"]) / cost.duration_std_s
+    assert cut.num_rows > 40
+    assert label_watt == pytest.approx(track_watt(streams, to_integers(cut, "end_ns")))
+    assert averaged == (set(np.round(label_watt, 6)) == {30.0, 300.0})
+
+
+def test_of_several_samples_at_one_stamp_all_take_the_first():
+    streams = power_streams({"drive": (seconds(0, 1, 1, 2), np.full(4, 10.0), np.array([1.0, 2.0, 30.0, 1.0]))})
+    assert track_watt(streams, seconds(0.5, 1.0)) == pytest.approx([15.0, 20.0])
+    assert integrate_energy(make_rails(streams, 0), seconds(0.0), seconds(2.0), rule="exact") == pytest.approx([30.0])
+
+
+def test_where_one_rail_is_silent_for_an_epoch_nobody_knows_the_power():
+    both = power_streams({n: (seconds(0, 1), np.full(2, 10.0), np.ones(2)) for n in ("left", "right")})
+    table = both.tables["power"]
+    epoch = np.array([0, 0, 1, 1], dtype=np.int16)  # the right rail has rows in epoch 1 alone
+    streams = Streams(
+        {"power": table.set_column(table.column_names.index("epoch"), table.schema.field("epoch"), [epoch])},
+        {},
+        "husky",
+    )
+    assert np.isnan(track_watt(streams, seconds(0.5))).all()
+    assert np.isnan(integrate_energy(make_rails(streams, 0), seconds(0.0), seconds(1.0), rule="exact")).all()

@@ -3,12 +3,11 @@
 import numpy as np
 import pytest
 
-from tcpipe.logs.clocks import AlignedClocks, Timeline
+from tcpipe.logs.clocks import AlignedClocks, SimulatedClock, Timeline
 from tcpipe.logs.messages import Readings
 from tcpipe.logs.roles import PlayedRole, RoleAssignment
-from tcpipe.logs.simulated_clock import SimulatedClock
 from tcpipe.power.readings import PowerReadings
-from tcpipe.stages.read import read_findings
+from tcpipe.stages.read import make_read_report
 from tcpipe.stages.read_sources import TopicReadings
 from tcpipe.tables.facts import ClockStep, PowerSign
 from tcpipe.tables.findings import Subject, make_finding
@@ -34,7 +33,7 @@ def read(topic=None, clock=None, *, steps=(), power=None, findings=(), timelines
     roles = {"gnss": PlayedRole("gnss", ("/fix",), SENSOR.type_name, "the only one")}
     assignment = RoleAssignment("husky", "its topics", roles, {"/other": "it is slower"}, findings=findings)
     clocks = AlignedClocks({"/fix": clock or timeline()} if timelines is None else timelines, list(steps), simulated)
-    return read_findings(
+    return make_read_report(
         assignment,
         [topic or source()],
         clocks,

@@ -19,8 +19,8 @@ from storage_server import object_store
 from wheel_drives import drive_at
 
 from tcpipe.errors import LogError
-from tcpipe.formats.logs.fetched_file import FetchedFile
 from tcpipe.formats.logs.log_file import open_log
+from tcpipe.formats.logs.log_part import FetchedFile
 from tcpipe.pipeline.ingest import ingest
 from tcpipe.pipeline.inspect import inspect
 from tcpipe.recipe import Recipe

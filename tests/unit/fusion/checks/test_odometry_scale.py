@@ -8,7 +8,7 @@ import pytest
 from tcpipe.fusion.checks.odometry_scale import (
     Scale,
     compute_command_ratio,
-    distance_ratios,
+    compute_distance_ratios,
     rescale_odometry,
     solve_scales,
 )
@@ -20,7 +20,7 @@ def times(source, factor):
 
 
 def test_sensors_as_they_are_have_no_scale_to_mend(track, sensors):
-    ratios = distance_ratios(track, sensors)
+    ratios = compute_distance_ratios(track, sensors)
     assert np.median(ratios["visual_odometry"]) == pytest.approx(1.0, abs=0.005)
     assert np.median(ratios["wheel_odometry"]) == pytest.approx(1.02, abs=0.02)
     assert solve_scales([ratios]) == {}
@@ -29,13 +29,13 @@ def test_sensors_as_they_are_have_no_scale_to_mend(track, sensors):
 @pytest.mark.parametrize("factor", [0.7, 1.3])
 def test_a_scale_that_is_off_throughout_is_found_and_taken_out(track, sensors, factor):
     off = replace(sensors, visual=times(sensors.visual, factor), wheels=times(sensors.wheels, factor))
-    found = solve_scales([distance_ratios(track, off)])
+    found = solve_scales([compute_distance_ratios(track, off)])
     assert found["visual_odometry"].factor == pytest.approx(factor, rel=0.01)
     assert found["wheel_odometry"].factor == pytest.approx(1.02 * factor, rel=0.02)
     mended = rescale_odometry(off.visual, found["visual_odometry"].factor)
     assert mended.velocity_mps == pytest.approx(sensors.visual.velocity_mps, abs=0.03)
     assert (mended.variance_m2ps2 >= off.visual.variance_m2ps2).all()
-    again = distance_ratios(
+    again = compute_distance_ratios(
         track, replace(off, visual=mended, wheels=rescale_odometry(off.wheels, found["wheel_odometry"].factor))
     )
     assert solve_scales([again]) == {}
@@ -44,12 +44,12 @@ def test_a_scale_that_is_off_throughout_is_found_and_taken_out(track, sensors, f
 def test_slip_of_a_minute_is_no_scale(track, sensors):
     at_s = (sensors.wheels.stamp_ns - sensors.wheels.stamp_ns[0]) * 1e-9
     slips = np.where((at_s > 30) & (at_s < 80), 1.5, 1.0)[:, None]
-    assert solve_scales([distance_ratios(track, replace(sensors, wheels=times(sensors.wheels, slips)))]) == {}
+    assert solve_scales([compute_distance_ratios(track, replace(sensors, wheels=times(sensors.wheels, slips)))]) == {}
 
 
 def test_without_fix_and_camera_nothing_tells_a_scale(track, sensors):
-    assert distance_ratios(track, replace(sensors, gnss=None, visual=None)) == {}
-    assert set(distance_ratios(track, replace(sensors, gnss=None))) == {"wheel_odometry"}
+    assert compute_distance_ratios(track, replace(sensors, gnss=None, visual=None)) == {}
+    assert set(compute_distance_ratios(track, replace(sensors, gnss=None))) == {"wheel_odometry"}
 
 
 COMMAND_NS = np.arange(0, 120 * 10**9, 10**8, dtype=np.int64)

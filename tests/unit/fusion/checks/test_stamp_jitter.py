@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from unit.fusion import drive
 
-from tcpipe.fusion.checks.clock_offsets import add_jitter_variance, stamp_jitter_s
+from tcpipe.fusion.checks.clock_offsets import add_jitter_variance, estimate_stamp_jitter_s
 
 
 def test_clean_fixes_show_none_also_with_outliers_slip_and_stops():
     measurements = drive.measure(drive.make_drive(150.0), 8)
-    assert np.mean(stamp_jitter_s(measurements.gnss, measurements.wheels) > 0) < 0.02
+    assert np.mean(estimate_stamp_jitter_s(measurements.gnss, measurements.wheels) > 0) < 0.02
 
 
 def test_late_fixes_are_seen_and_their_variance_raised_while_driving():
@@ -20,7 +20,7 @@ def test_late_fixes_are_seen_and_their_variance_raised_while_driving():
     stamp = measurements.gnss.stamp_ns
     late = stamp + (np.random.default_rng(9).uniform(0, 0.35, stamp.size) * 1e9).astype(np.int64)  # deviation 0.10 s
     gnss = replace(measurements.gnss, stamp_ns=late)
-    jitter = stamp_jitter_s(gnss, measurements.wheels)
+    jitter = estimate_stamp_jitter_s(gnss, measurements.wheels)
     assert np.median(jitter) == pytest.approx(0.10, abs=0.03)
     raised = add_jitter_variance(gnss, measurements.wheels, jitter)
     speed = np.abs(np.interp(late, drive.ns(truth.t), truth.forward))

@@ -1,4 +1,4 @@
-"""Each stretch of a run from its start to its track: where it begins, filter and smoother, and what else is known at its stamps."""
+"""Each section of a run from its start to its track: where it begins, filter and smoother, and what else is known at its stamps."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from tcpipe.fusion.checks.mounting import (
     collect_tilt_evidence,
     estimate_antenna_uncertainty,
 )
-from tcpipe.fusion.checks.odometry_scale import distance_ratios
+from tcpipe.fusion.checks.odometry_scale import compute_distance_ratios
 from tcpipe.fusion.error_state import run_error_state
 from tcpipe.fusion.initial import find_initial_state, find_stationary_intervals
 from tcpipe.fusion.measurements import BodyVelocities, InitialState
 from tcpipe.fusion.signals import compute_median_period_ns, compute_seconds, hold_last, is_in_gap
-from tcpipe.fusion.trajectory import DISPLACEMENT_LAGS_S, TrackSection, Trajectory, cut_stretches, track_stamps
+from tcpipe.fusion.trajectory import DISPLACEMENT_LAGS_S, TrackSection, Trajectory, cut_sections, make_track_stamps
 from tcpipe.geometry.datum import geodetic_from_enu
 from tcpipe.geometry.rotation import matrix_from_quat, rpy_from_matrix, rpy_from_quat
 from tcpipe.power.rails import compute_power_at
@@ -39,7 +39,7 @@ from tcpipe.tables.levels import REJECTIONS, Streams
 
 @dataclass(slots=True)
 class Fused:
-    """Every stretch's trajectory, facts and columns, its audit, what it tells of mountings; how long no track could be placed [s]."""
+    """Every section's trajectory, facts and columns, its audit, what it tells of mountings; how long no track could be placed [s]."""
 
     found: list[Trajectory] = field(default_factory=list)
     facts: list[StretchFacts] = field(default_factory=list)
@@ -54,75 +54,75 @@ class Fused:
     skipped_s: float = 0.0
 
 
-def fuse_stretches(inputs: FusionInputs, streams: Streams, config: FuseConfig) -> Fused:
-    """Fuse each stretch for itself, in order of epoch and stamp."""
+def fuse_sections(inputs: FusionInputs, streams: Streams, config: FuseConfig) -> Fused:
+    """Fuse each section for itself, in order of epoch and stamp."""
     fused = Fused()
     period_ns, max_gap_ns = round(1e9 / config.rate_hz), int(config.max_gap_s * 1e9)
-    for stretch in cut_stretches(inputs.measurements):
-        output_ns = track_stamps(stretch, period_ns=period_ns, max_gap_ns=max_gap_ns)
-        if output_ns.size == 0 or (inputs.datum_deg_m is not None and stretch.measurements.gnss is None):
-            fused.skipped_s += (stretch.end_ns - stretch.start_ns) * 1e-9
+    for section in cut_sections(inputs.measurements):
+        output_ns = make_track_stamps(section, period_ns=period_ns, max_gap_ns=max_gap_ns)
+        if output_ns.size == 0 or (inputs.datum_deg_m is not None and section.measurements.gnss is None):
+            fused.skipped_s += (section.end_ns - section.start_ns) * 1e-9
             continue
-        # 1. Where it starts; a local frame goes on from where the last stretch ended.
-        initial = _make_initial_state(stretch, fused.found[-1] if fused.found and inputs.datum_deg_m is None else None)
+        # 1. Where it starts; a local frame goes on from where the last section ended.
+        initial = _make_initial_state(section, fused.found[-1] if fused.found and inputs.datum_deg_m is None else None)
         # 2. Filter and smoother.
-        trajectory = _estimate(stretch, initial, output_ns, config)
+        trajectory = _estimate(section, initial, output_ns, config)
         # 3. What it tells of how antenna and IMU are mounted and odometries scaled, and what nobody knows of it.
-        fused.arms.append(collect_arm_evidence(trajectory, stretch.measurements))
-        fused.tilts.append(collect_tilt_evidence(trajectory, stretch.measurements))
-        fused.ratios.append(distance_ratios(trajectory, stretch.measurements))
-        trajectory = _add_mounting_uncertainty(trajectory, stretch, inputs)
+        fused.arms.append(collect_arm_evidence(trajectory, section.measurements))
+        fused.tilts.append(collect_tilt_evidence(trajectory, section.measurements))
+        fused.ratios.append(compute_distance_ratios(trajectory, section.measurements))
+        trajectory = _add_mounting_uncertainty(trajectory, section, inputs)
         # 4. What came out is held against what went in.
-        trajectory, audit = audit_trajectory(trajectory, stretch.measurements)
-        fused.disagreements += (replace(each, epoch=stretch.epoch) for each in audit.disagreements)
+        trajectory, audit = audit_trajectory(trajectory, section.measurements)
+        fused.disagreements += (replace(each, epoch=section.epoch) for each in audit.disagreements)
         fused.tallies += audit.tallies
         fused.windows, fused.astray = fused.windows + audit.windows, fused.astray + audit.astray
         fused.found.append(trajectory)
-        fused.facts.append(stretch_facts(stretch, initial, trajectory))
+        fused.facts.append(make_section_facts(section, initial, trajectory))
         # 5. What else is known at the track's stamps.
-        fused.columns.append(_make_columns(stretch, trajectory, inputs, streams, config))
+        fused.columns.append(_make_columns(section, trajectory, inputs, streams, config))
     return fused
 
 
-def _add_mounting_uncertainty(found: Trajectory, stretch: TrackSection, inputs: FusionInputs) -> Trajectory:
+def _add_mounting_uncertainty(found: Trajectory, section: TrackSection, inputs: FusionInputs) -> Trajectory:
     """Return the trajectory with what is not known of a mended or unstated mounting."""
-    gnss = stretch.measurements.gnss
+    gnss = section.measurements.gnss
     covariance = None if gnss is None else estimate_antenna_uncertainty(inputs.arm, inputs.imu_tilt, gnss.lever_arm_m)
     return found if gnss is None or covariance is None else add_antenna_uncertainty(found, covariance, gnss)
 
 
-def _make_initial_state(stretch: TrackSection, last: Trajectory | None) -> InitialState:
-    m = stretch.measurements
-    initial = find_initial_state(m, find_stationary_intervals(m), stretch.start_ns)
+def _make_initial_state(section: TrackSection, last: Trajectory | None) -> InitialState:
+    m = section.measurements
+    initial = find_initial_state(m, find_stationary_intervals(m), section.start_ns)
     if last is None:
         return initial
     return replace(initial, position_enu_m=last.position_enu_m[-1], quat_xyzw=last.quat_xyzw[-1])
 
 
 def _estimate(
-    stretch: TrackSection, initial: InitialState, output_ns: NDArray[np.int64], config: FuseConfig
+    section: TrackSection, initial: InitialState, output_ns: NDArray[np.int64], config: FuseConfig
 ) -> Trajectory:
     gate = config.gate_probability
     if config.estimator == "ukf":
         from tcpipe.fusion.ukf15 import run_ukf15  # noqa: PLC0415  its kernels load only when it is asked for
 
         return run_ukf15(
-            stretch.measurements, initial, output_ns=output_ns, gate_probability=gate, engine=config.engine
+            section.measurements, initial, output_ns=output_ns, gate_probability=gate, engine=config.engine
         )
-    return run_error_state(stretch.measurements, initial, output_ns=output_ns, gate_probability=gate)
+    return run_error_state(section.measurements, initial, output_ns=output_ns, gate_probability=gate)
 
 
 def _make_columns(
-    stretch: TrackSection, trajectory: Trajectory, inputs: FusionInputs, streams: Streams, config: FuseConfig
+    section: TrackSection, trajectory: Trajectory, inputs: FusionInputs, streams: Streams, config: FuseConfig
 ) -> dict[str, NDArray[Any]]:
     stamp_ns, gap_ns, power_gap_ns = trajectory.stamp_ns, int(config.max_gap_s * 1e9), int(config.max_power_gap_s * 1e9)
     return {
         "stamp_ns": stamp_ns,
-        "epoch": np.full(stamp_ns.size, stretch.epoch, np.int16),
+        "epoch": np.full(stamp_ns.size, section.epoch, np.int16),
         **make_pose_columns(trajectory, inputs.datum_deg_m),
-        "wheel_velocity_mps": make_wheel_column(stretch.measurements.wheels, stamp_ns, max_gap_ns=gap_ns),
-        **make_command_columns(streams, stretch.epoch, stamp_ns),
-        **make_power_columns(streams, stretch.epoch, stamp_ns, max_gap_ns=power_gap_ns),
+        "wheel_velocity_mps": make_wheel_column(section.measurements.wheels, stamp_ns, max_gap_ns=gap_ns),
+        **make_command_columns(streams, section.epoch, stamp_ns),
+        **make_power_columns(streams, section.epoch, stamp_ns, max_gap_ns=power_gap_ns),
     }
 
 
@@ -200,14 +200,14 @@ def make_rejections_table(inputs: FusionInputs, found: list[Trajectory]) -> pa.T
     return REJECTIONS.table(**{name: values[order] for name, values in joined.items()})
 
 
-def stretch_facts(stretch: TrackSection, initial: InitialState, found: Trajectory) -> StretchFacts:
-    """Return the facts of one stretch: the filter's, and where it lies and began."""
-    m = stretch.measurements
+def make_section_facts(section: TrackSection, initial: InitialState, found: Trajectory) -> StretchFacts:
+    """Return the facts of one section: the filter's, and where it lies and began."""
+    m = section.measurements
     return replace(
         found.facts,
-        epoch=stretch.epoch,
-        start_ns=stretch.start_ns,
-        end_ns=stretch.end_ns,
+        epoch=section.epoch,
+        start_ns=section.start_ns,
+        end_ns=section.end_ns,
         rows=int(found.stamp_ns.size),
         sensors=tuple(m.sensors()),
         gyro_noise_radps=None if m.imu is None else m.imu.gyro_std_radps,
