@@ -67,7 +67,7 @@ class MapReader(Protocol):
     def expect(self, tiles: Sequence[tuple[int, int]]) -> None:
         """Have tiles (row, column) of all layers at hand that are read soon, where that takes long."""
 
-    def read_tile(self, layer: str, i: int, j: int, out: NDArray[Any]) -> None:
+    def read_tile(self, layer: str, i: int, j: int, out: NDArray[np.generic]) -> None:
         """Put the tile in row i and column j into ``out``, contiguous, `tile_px` each way; beyond the map it holds no data."""
 
 
