@@ -317,7 +317,7 @@ def open_dataset(path: str | Path, *, layers: Sequence[str] | None = None, label
     column = read_samples(directory, [energy.power]).column(energy.power)
     if card.samples and column.null_count == len(column):
         raise DatasetError(
-            f"{directory}: no sample has {energy.power}: its robot hardly stood in any run, or they were ingested before data model 1.3; "
+            f"{directory}: no sample has {energy.power}: its robot was hardly stationary in any run, or the data model is older than 1.3; "
             "ingest the logs and build it again, or take the label total"
         )
     files = open_patches(directory, card, fetched)

@@ -37,19 +37,20 @@ def render_reproduction_page(
     of the variance of E, and ``hidden`` is the variance of the hidden resistance over the frozen site's.
     """
     verdicts = Counter(claim.verdict for claim in claims)
-    told = ", ".join(f"{count} {name}" for name, count in verdicts.items())
+    differences = [*DIFFERENCES, *_count_labels_without_mape(runs[0])]
+    counts = ", ".join(f"{count} {name}" for name, count in verdicts.items())
     return render_evaluation_page(
         runs[0],
         samples,
         title="The paper's experiment on a simulated site",
-        lead=f"Of {len(claims)} claims: {told}; {len(runs)} training{'s' if len(runs) > 1 else ''}.",
+        lead=f"Of {len(claims)} claims: {counts}; {len(runs)} training{'s' if len(runs) > 1 else ''}.",
         before=[
             _make_claims_section(claims, format_audit(runs[0])),
             _make_floor_section(runs[0]),
             _make_variance_section(shares, hidden),
             _make_drives_section(splits, terrain),
             *_make_seed_sections(runs),
-            _make_fidelity_section(runs[0]),
+            Section("Where this differs from the paper", header=("", "the paper", "here"), rows=differences),
             _make_sources_section(quick=quick),
         ],
         warnings=[SIMULATED, *([_QUICK] if quick else [])],
@@ -89,15 +90,11 @@ def _make_floor_section(run: Evaluation) -> Section:
 
 def _make_variance_section(shares: Mapping[str, float], hidden: float) -> Section:
     """Return the parts of E's variance, and their shares of what class and slope leave."""
-    left = sum(share for name, share in shares.items() if name != CLASS_AND_SLOPE)
-    rows = [
-        (
-            name,
-            f"{100.0 * share:.2f} %",
-            "–" if name == CLASS_AND_SLOPE else f"{100.0 * share / left if left else float('nan'):.0f} %",
-        )
-        for name, share in shares.items()
-    ]
+    rest = sum(share for name, share in shares.items() if name != CLASS_AND_SLOPE)
+    rows = []
+    for name, share in shares.items():
+        of_rest = "–" if name == CLASS_AND_SLOPE else f"{100.0 * share / rest if rest else float('nan'):.0f} %"
+        rows.append((name, f"{100.0 * share:.2f} %", of_rest))
     text = (
         "Of measured E on the unseen area: what a spline over the slope of each class explains; then what such splines leave of what "
         "changes where a part of the simulated world is taken out. They add up to one only as far as they are independent. "
@@ -105,11 +102,6 @@ def _make_variance_section(shares: Mapping[str, float], hidden: float) -> Sectio
     )
     header = ("what shows it", "of the variance of E", "of what is not class and slope")
     return Section("What E's variance is made of", text, header=header, rows=rows, figures_from=1)
-
-
-def _make_fidelity_section(run: Evaluation) -> Section:
-    header = ("", "the paper", "here")
-    return Section("Where this differs from the paper", header=header, rows=list(list_differences(run)))
 
 
 def _make_drives_section(splits: Mapping[str, int], terrain: Mapping[str, Mapping[str, int]]) -> Section:
@@ -179,16 +171,11 @@ DIFFERENCES = (
 """Subject, the paper, tcpipe."""
 
 
-def list_differences(found: Evaluation) -> Iterator[tuple[str, str, str]]:
-    """Yield `DIFFERENCES`, and the number of labels that each MAPE leaves out."""
-    yield from DIFFERENCES
+def _count_labels_without_mape(found: Evaluation) -> Iterator[tuple[str, str, str]]:
     for split, part in found.splits.items():
-        left = {
-            quantity: errors[ALL].count - errors[ALL].mape_count
+        counts = ", ".join(
+            f"{quantity} {errors[ALL].count - errors[ALL].mape_count} (below {LEAST[quantity]:g} {UNITS[quantity]})"
             for quantity, errors in part.errors.items()
             if ALL in errors
-        }
-        told = ", ".join(
-            f"{quantity} {count} (below {LEAST[quantity]:g} {UNITS[quantity]})" for quantity, count in left.items()
         )
-        yield f"MAPE, {split}", "of all samples; labels near nothing not told", f"left out of {part.samples}: {told}"
+        yield f"MAPE, {split}", "of all samples; labels near nothing not told", f"left out of {part.samples}: {counts}"

@@ -79,7 +79,7 @@ def draw_plans(path: Path, source: MapReader, plans: Sequence[Plan]) -> None:
             line = _draw_path(axes, plan, values, scale)
             _draw_ends(axes, plan)
             _draw_title(axes, plan, plans)
-        _scale_bar(panels[0], bounds)
+        _draw_scale_bar(panels[0], bounds)
         bar = figure.colorbar(line, ax=panels, shrink=0.7, pad=0.008, aspect=28)
         bar.set_label("energy a metre along the path [J/m]")
         bar.outline.set_visible(False)
@@ -91,6 +91,11 @@ def draw_plans(path: Path, source: MapReader, plans: Sequence[Plan]) -> None:
             )  # fmt: skip
         with write_atomic_file(path) as temporary:
             figure.savefig(temporary, format="png", dpi=130, metadata={"Software": None})
+
+
+def _compute_distance(xy_m: Array) -> Array:
+    """Return the distance along a line at each of its points [m], shape (N,)."""
+    return np.asarray(np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(xy_m, axis=0), axis=1))])
 
 
 def _compute_cost_per_metre(plan: Plan) -> Array:
@@ -196,7 +201,7 @@ def _blend_picture(layers: dict[str, Array], light: Array) -> Array:
 def _draw_path(axes: Axes, plan: Plan, values: Array, scale: Normalize) -> LineCollection:
     """Draw the path, coloured by what its metres cost; return the coloured line."""
     points = plan.xy_m
-    length = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))]
+    length = _compute_distance(points)
     ends = np.r_[to_floats(plan.cost.pieces, "distance_m"), plan.totals.length_m]
     at = ends / ends[-1] * length[-1]
     cuts = np.stack([np.interp(at, length, points[:, axis]) for axis in (0, 1)], axis=1)
@@ -213,17 +218,13 @@ def _draw_ends(axes: Axes, plan: Plan) -> None:
     axes.plot(x0, y0, "o", ms=11, color="white", mec=_INK, mew=2.2, zorder=5)
     axes.plot(x1, y1, "*", ms=19, color="white", mec=_INK, mew=1.6, zorder=5)
     for x, y, name in ((x0, y0, "start"), (x1, y1, "goal")):
-        offset = (0, 11)
-        axes.annotate(
-            name,
-            (x, y),
-            offset,
-            textcoords="offset points",
-            ha="center",
-            fontsize=9,
-            weight="bold",
-            path_effects=_WHITE,
-        )
+        _write_above(axes, name, x, y, 11, weight="bold")
+
+
+def _write_above(axes: Axes, text: str, x: float, y: float, points: float, *, weight: str = "normal") -> None:
+    axes.annotate(
+        text, (x, y), (0, points), textcoords="offset points", ha="center", fontsize=9, weight=weight, path_effects=_WHITE
+    )  # fmt: skip
 
 
 def _draw_title(axes: Axes, plan: Plan, plans: Sequence[Plan]) -> None:
@@ -242,23 +243,18 @@ _SHOWN = ("energy_joule", "duration_s", "length_m")
 
 
 def _format_number(name: str, value: float, best: float) -> str:
-    text = {"energy_joule": f"{value / 1000.0:.2f} kJ", "duration_s": f"{value:.0f} s", "length_m": f"{value:.0f} m"}[
-        name
-    ]
+    texts = {"energy_joule": f"{value / 1000.0:.2f} kJ", "duration_s": f"{value:.0f} s", "length_m": f"{value:.0f} m"}
     more = value / best - 1.0 if best > 0.0 else 0.0
-    return f"{text} (+{more:.1%})" if more >= 0.0005 else text
+    return f"{texts[name]} (+{more:.1%})" if more >= 0.0005 else texts[name]
 
 
-def _scale_bar(axes: Axes, bounds: tuple[float, float, float, float]) -> None:
+def _draw_scale_bar(axes: Axes, bounds: tuple[float, float, float, float]) -> None:
     left, bottom, right, top = bounds
     length = _round_nicely((right - left) / 4.0)
     x, y = left + 0.04 * (right - left), bottom + 0.05 * (top - bottom)
     axes.plot((x, x + length), (y, y), color="white", lw=6, solid_capstyle="butt")
     axes.plot((x, x + length), (y, y), color=_INK, lw=3, solid_capstyle="butt")
-    axes.annotate(
-        f"{length:g} m", (x + length / 2.0, y), (0, 6), textcoords="offset points", ha="center", fontsize=9,
-        path_effects=_WHITE,
-    )  # fmt: skip
+    _write_above(axes, f"{length:g} m", x + length / 2.0, y, 6)
 
 
 def _round_nicely(value: float) -> float:
@@ -270,7 +266,7 @@ def _round_nicely(value: float) -> float:
 def _draw_profiles(axes: Axes, backdrop: _Backdrop, plans: Sequence[Plan]) -> None:
     """Draw height over distance along every path."""
     for plan in plans:
-        length = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(plan.xy_m, axis=0), axis=1))]
+        length = _compute_distance(plan.xy_m)
         at = np.linspace(0.0, length[-1], max(int(length[-1] * 2.0), 2))
         height = backdrop.height_at(np.stack([np.interp(at, length, plan.xy_m[:, axis]) for axis in (0, 1)], axis=1))
         colour, style = _COLOURS[plan.totals.objective], _LINES[plan.totals.objective]

@@ -109,7 +109,7 @@ def sum_losses(arc_length_m: NDArray[np.float64], lost_by: NDArray[np.uint32]) -
 
 
 def _find_in_map(source: MapReader, config: SampleConfig, projection: Projection) -> tuple[Finding, ...]:
-    """Return what is doubtful about a map whatever segments lie on it: its datum, and the size of its pixels."""
+    """Return the findings on a map itself: its datum, and the size of its pixels."""
     subject, patch_pixel_m = Subject("map", source.name), config.patch_m / config.patch_px
     map_pixel_m = choose_level(source, patch_pixel_m).grid.pitch_m
     findings = projection.find_rough_shift(subject)
@@ -127,7 +127,7 @@ def _find_in_map(source: MapReader, config: SampleConfig, projection: Projection
 
 
 _ELSEWHERE = (Loss.OUTSIDE_MAP, Loss.NODATA)
-"""What is lost so on one map may be found on the next; what is not traversable, or nobody knows where, is lost on all."""
+"""A segment lost so on one map may be on the next; one on untraversable ground or of uncertain position is lost on all."""
 
 
 def sample_on_maps(

@@ -39,7 +39,7 @@ def read_all_covariates(paths: Sequence[Path], config: CovariateConfig) -> tuple
     names = [path.stem for path in paths]
     if twice := sorted({name for name in names if names.count(name) > 1}):
         raise DatasetError(
-            f"--covariates: {twice[0]} is given twice; columns are called by the file's name: give each its own"
+            f"--covariates: {twice[0]} is given twice; columns are named after the file: give each its own name"
         )
     return tuple(read_covariates(path, time_column=config.time_column, time_unit=config.time_unit) for path in paths)
 
@@ -73,7 +73,7 @@ def make_added_columns(
     names = [*SAMPLES.names(), *layers, *table.column_names]
     if twice := sorted({name for name in names if names.count(name) > 1}):
         raise DatasetError(
-            f"columns {', '.join(twice)} would be there twice; rename the file of covariates, or its columns"
+            f"columns {', '.join(twice)} would occur twice; rename the file of covariates, or its columns"
         )
     return table, tuple(covariates), findings
 
@@ -118,7 +118,7 @@ def read_tags(run_ids: Sequence[str], runs: Sequence[RunSource], key: str) -> li
     missing = [run_id for run_id in run_ids if tags[run_id] is None]
     if missing:
         raise DatasetError(
-            f"holdout by tag {key}: {len(missing)} of {len(run_ids)} runs do not carry it ({', '.join(missing[:3])}); "
+            f"holdout by tag {key}: {len(missing)} of {len(run_ids)} runs do not have it ({', '.join(missing[:3])}); "
             f"ingest their logs again with --tag {key}=VALUE"
         )
     return [str(tags[run_id]) for run_id in run_ids]

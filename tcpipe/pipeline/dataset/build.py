@@ -138,7 +138,7 @@ class BuildResult:
     def _closing(self) -> list[str]:
         if self.card is None or self.card.redaction is None:
             return []
-        publish = f"to publish it: hf upload OWNER/NAME {shlex.quote(self.path)} . --repo-type dataset"
+        publish = f"publish it with: hf upload OWNER/NAME {shlex.quote(self.path)} . --repo-type dataset"
         return [*self.card.redaction.lines(), publish]
 
 
@@ -227,7 +227,7 @@ def _refuse_other_options(
     if known is None or known.inputs == inputs.digest or force:
         return
     if others := find_other_options(known, options, inputs):
-        what = "it was made with other options, and stays; give another OUT, or replace it with --force"
+        what = "it was made with other options and is kept; give another OUT, or replace it with --force"
         raise UsageError(f"{place}: {what}", *(f"{place}: {line}" for line in others))
 
 
@@ -240,7 +240,7 @@ def _refuse_others_since(place: Path | str, expected: Container[str | None]) -> 
         known = read_card(place, proved=False)
     if known is not None and known.inputs not in expected:
         raise StoreError(
-            f"{place}: another call has built a dataset here meanwhile, which stays; run the command again"
+            f"{place}: another call has built a dataset here meanwhile and it is kept; run the command again"
         )
 
 
@@ -254,7 +254,7 @@ def _commit_references(log: LogWriter, dataset: Dataset) -> None:
         try:
             log.commit("built", Entries(datasets=(dataset,)))
         except StoreError as error:
-            logger.warning("%s; so 'tcpipe prune' does not know what this dataset refers to", error.problems[0])
+            logger.warning("%s; so 'tcpipe prune' does not know the runs of this dataset", error.problems[0])
 
 
 def _find_left_out(
@@ -312,11 +312,11 @@ def _read_card_in_place(place: Path) -> tuple[DatasetCard | None, bool]:
     if not place.is_dir():
         raise UsageError(f"{place}: is a file, wanted a directory for the dataset; give another OUT")
     if not (place / CARD).is_file():
-        raise UsageError(f"{place}: exists and is no dataset (it has no {CARD}); it is left alone; give another OUT")
+        raise UsageError(f"{place}: exists and is not a dataset (it has no {CARD}); it is left alone; give another OUT")
     try:
         card, proved = read_card(place, proved=False), True
     except DatasetError as error:
-        left = f"{place}: is left alone, since nobody can tell what it was made of; move it away or give another OUT"
+        left = f"{place}: is left alone, since its inputs are unknown; move it away or give another OUT"
         raise DatasetError(*error.problems, left) from None
     try:
         read_current_card(place)
@@ -344,7 +344,7 @@ def _start_workers(directory: Path, store: Store, inputs: str, *, jobs: int, clu
         if not error.where.startswith(waiting.where()):
             raise
         raise StoreError(
-            f"{waiting.where()}: another build of the same was first, and took away what both used; run the same command again"
+            f"{waiting.where()}: another build of the same dataset was first and removed the shared spool; run the same command again"
         ) from None
 
 

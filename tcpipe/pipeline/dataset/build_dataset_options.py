@@ -28,7 +28,7 @@ class BuildDatasetOptions:
     map_name: str | Sequence[str] | None = option(
         None,
         Option(
-            "Map to sample from (default: the only one in the store); repeat it for several, the first rules where they overlap.",
+            "Map to sample from (default: the only one in the store); repeat it for several; the first has priority where they overlap.",
             ("--map",), "map", "NAME", repeatable=True,
         ),
     )  # fmt: skip
@@ -43,7 +43,7 @@ class BuildDatasetOptions:
     holdout: str | None = option(
         None,
         Option(
-            "How test is drawn: block, sample, run, or tag:NAME, which holds out values of a tag (default: the recipe's).",
+            "How test samples are drawn: block, sample, run, or tag:NAME, which holds out values of a tag (default: the recipe's).",
             (), "holdout", "HOW",
         ),
     )  # fmt: skip
@@ -61,13 +61,15 @@ class BuildDatasetOptions:
     min_runs: int | None = option(
         None,
         Option(
-            "Build nothing from fewer runs; so many are enough: that others are left out or gone is a note then.",
+            "Fail with fewer runs; with enough, excluded or missing runs are notes.",
             (), Range(1, 1_000_000), "N",
         ),
     )  # fmt: skip
     redact: bool = option(
         False,
-        Option("For the public: moved to 0 N 0 E as a whole, and no log, run, topic, path, host or user is named."),
+        Option(
+            "For publication: move everything to 0 N 0 E and omit names of logs, runs, topics, paths, hosts and users."
+        ),
     )
     force: bool = option(
         False,

@@ -82,8 +82,7 @@ def _pool_segments(
         powered, located = (any(name not in lack for lack in lacks.values()) for name in ("power", "gnss"))
         missing = "power where there is GNSS" if powered and located else "GNSS" if powered else "power"
         raise DatasetError(
-            f"{len(runs)} runs, {sum(run.facts.segments for run in runs)} segments, but none with {missing}: "
-            "there is nothing to learn from; ingest runs that have it"
+            f"{len(runs)} runs, {sum(run.facts.segments for run in runs)} segments, but none with {missing}; ingest runs that have it"
         )
     findings = [
         make_finding(
@@ -349,8 +348,8 @@ def _describe_uncertainty(
         return []
     known_m = float(np.median(to_floats(segments, "position_std_m")))
     line = (
-        f"positions are known to {known_m:.2f} m (median standard deviation), wanted {recipe.sample.max_position_std_m:g} m: mend what "
-        f"follows, or accept patches that lie so far off ({format_recipe_key('sample.max_position_std_m')})"
+        f"positions are known to {known_m:.2f} m (median standard deviation), expected {recipe.sample.max_position_std_m:g} m: solve "
+        f"the problems below, or accept patches with such an offset ({format_recipe_key('sample.max_position_std_m')})"
     )
     groups = group_dataset_findings((), {run.run_id: run.findings for run in inputs.sources})
     return [line, *format_mixed_groups(groups)]

@@ -134,7 +134,7 @@ def _refuse_without_segments(runs: Sequence[RunDirectory]) -> None:
     )
     raise DatasetError(
         f"{len(runs)} runs, but no segment in them: {where or 'the robot did not move'} "
-        "('tcpipe status' says what wins metres back)"
+        "('tcpipe status' lists remedies)"
     )
 
 
@@ -191,8 +191,8 @@ def choose_maps(store: Store, names: Sequence[str]) -> tuple[str, ...]:
         raise DatasetError(f"{store.root}: no map {unknown[0]!r} in the store; there are {', '.join(maps)}")
     if not names and len(maps) > 1:
         raise DatasetError(
-            f"{store.root}: {len(maps)} maps in the store ({', '.join(maps)}); name one with --map, or several, the first to rule "
-            "where they overlap"
+            f"{store.root}: {len(maps)} maps in the store ({', '.join(maps)}); name one with --map, or several; the first has "
+            "priority where they overlap"
         )
     return tuple(dict.fromkeys(names)) or (maps[0],)
 
@@ -219,9 +219,7 @@ def find_other_options(card: DatasetCard, options: BuildOptions, inputs: Inputs)
     if card.redaction is not None or options.redact:
         if bool(card.redaction) != options.redact:
             return [_format_difference("--redact", bool(card.redaction), options.redact)]
-        return [
-            "--redact: a redacted dataset does not tell its maps, region, tags and recipe, so that nothing can be compared"
-        ]
+        return ["--redact: a redacted dataset omits its maps, region, tags and recipe, so that they cannot be compared"]
     return [
         _format_difference(name, was, now) for name, was, now in _iterate_options(card, options, inputs) if was != now
     ]

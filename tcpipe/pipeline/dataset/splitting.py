@@ -135,7 +135,7 @@ def _describe_nothing_inside(regions: Regions, lonlat_deg: NDArray[np.float64], 
     near, excluded = int((split == "buffer").sum()), int((split == EXCLUDED).sum())
     if excluded:
         return (
-            f"the region (--split) leaves nothing to train on: {excluded} of {len(split)} samples lie in its exclude polygons, "
+            f"the region (--split) leaves no training sample: {excluded} of {len(split)} samples lie in its exclude polygons, "
             f"{near} on a border or nearer to one than the buffer; redraw them"
         )
     if near:

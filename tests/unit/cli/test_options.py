@@ -15,17 +15,17 @@ def test_a_time(text, seconds):
     assert parse_duration(CONTEXT, PARAMETER, text) == seconds
 
 
-@pytest.mark.parametrize("text", ["", "-1", "nan", "inf", "1e3", "10 weeks", "9" * 10, "m"])
-def test_what_is_no_time(text):
-    with pytest.raises(click.BadParameter, match="wanted a time"):
-        parse_duration(CONTEXT, PARAMETER, text)
-
-
 def test_a_share():
     assert [parse_shard(CONTEXT, PARAMETER, text) for text in (None, "1/1", "3/8")] == [None, (1, 1), (3, 8)]
 
 
-@pytest.mark.parametrize("text", ["0/2", "3/2", "1", "a/b", "1/100001", "-1/2", "1/2/3", ""])
-def test_what_is_no_share(text):
-    with pytest.raises(click.BadParameter, match="wanted I/N"):
-        parse_shard(CONTEXT, PARAMETER, text)
+@pytest.mark.parametrize(
+    ("parse", "text", "wanted"),
+    [
+        *((parse_duration, text, "a time") for text in ("", "-1", "nan", "inf", "1e3", "10 weeks", "9" * 10, "m")),
+        *((parse_shard, text, "I/N") for text in ("0/2", "3/2", "1", "a/b", "1/100001", "-1/2", "1/2/3", "")),
+    ],
+)
+def test_what_is_neither(parse, text, wanted):
+    with pytest.raises(click.BadParameter, match=f"wanted {wanted}"):
+        parse(CONTEXT, PARAMETER, text)

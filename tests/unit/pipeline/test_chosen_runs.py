@@ -129,7 +129,7 @@ def test_a_dataset_of_a_store_that_cannot_be_written_says_that_it_leaves_no_comm
     for _ in range(2):
         build_dataset(tmp_path / "out", store=store.root, recipe=Recipe())
     assert "so the store does not know how this call ended" in caplog.text
-    assert "so 'tcpipe prune' does not know what this dataset refers to" in caplog.text
+    assert "so 'tcpipe prune' does not know the runs of this dataset" in caplog.text
 
 
 def test_a_build_with_nothing_new_asks_a_bucket_the_same_however_many_runs_there_are(store, tmp_path, monkeypatch):

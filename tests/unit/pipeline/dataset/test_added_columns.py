@@ -98,7 +98,7 @@ def test_another_table_of_the_same_name_makes_another_dataset(store, tmp_path):
 def test_columns_of_one_name_are_refused(store, tmp_path):
     path = weather(tmp_path / "tag.csv")
     path.write_text(path.read_text().replace("ground", "season"))
-    with pytest.raises(DatasetError, match="columns tag_season would be there twice"):
+    with pytest.raises(DatasetError, match="columns tag_season would occur twice"):
         build(store, tmp_path / "out", covariates=path)
     with pytest.raises(DatasetError, match="tag is given twice"):
         build(store, tmp_path / "out", covariates=[path, path])
@@ -135,7 +135,7 @@ def test_a_tag_is_held_out_whole(store, tmp_path):
 
 
 def test_a_holdout_wants_a_tag_that_all_runs_carry(store, tmp_path):
-    with pytest.raises(DatasetError, match=r"1 of 4 runs do not carry it \(a\)"):
+    with pytest.raises(DatasetError, match=r"1 of 4 runs do not have it \(a\)"):
         build(store, tmp_path / "out", holdout="tag:driver")
     with pytest.raises(RecipeError, match=r"wanted split\.holdout_tag too"):
         build(store, tmp_path / "out", holdout="tag")

@@ -127,7 +127,7 @@ def test_a_build_of_another_call_meanwhile_stays(made, bucket, monkeypatch):
         return draw(*how, **more)
 
     monkeypatch.setattr(building, "write_patches", while_the_first_draws)
-    with pytest.raises(StoreError, match="another call has built a dataset here meanwhile, which stays"):
+    with pytest.raises(StoreError, match="another call has built a dataset here meanwhile and it is kept"):
         build_dataset(URL, store=made / "store", recipe=Recipe())
     assert len(folders(bucket)) == 1
 

@@ -137,7 +137,7 @@ def test_who_ends_second_on_one_spool_is_told(store, tmp_path, monkeypatch):
 
     write = build_module.write_patches
     monkeypatch.setattr(build_module, "write_patches", first)
-    with pytest.raises(StoreError, match=r"another build of the same was first, .* run the same command again"):
+    with pytest.raises(StoreError, match=r"another build of the same dataset was first .* run the same command again"):
         build(store.root, tmp_path / "out")
     monkeypatch.undo()
     assert build(store.root, tmp_path / "out").card.samples == ROWS

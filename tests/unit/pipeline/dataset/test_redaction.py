@@ -261,7 +261,7 @@ def test_distances_do_not_tell_the_scale_of_the_plane(built):
 
 def test_the_line_that_publishes_it_is_printed_and_a_second_build_has_nothing_to_do(built):
     here, told, redacted = built
-    assert f"to publish it: hf upload OWNER/NAME {here}/redacted . --repo-type dataset" in str(redacted)
+    assert f"publish it with: hf upload OWNER/NAME {here}/redacted . --repo-type dataset" in str(redacted)
     assert "hf upload" not in str(told)
     how = {"store": here / "store", "split": here / "region.geojson", "file_format": "parquet"}
     how["covariates"] = here / "secretstation.csv"

@@ -58,7 +58,7 @@ def refused(here: Path, **how: object) -> tuple[str, ...]:
             build_dataset(here / "dataset", **usual(here, dry_run=dry_run, **how))
         problems.append(caught.value.problems)
     assert problems[0] == problems[1]
-    assert "made with other options, and stays; give another OUT, or replace it with --force" in problems[0][0]
+    assert "made with other options and is kept; give another OUT, or replace it with --force" in problems[0][0]
     assert tree(here / "dataset") == before
     return tuple(line.partition("dataset: ")[2] for line in problems[0][1:])
 
@@ -153,15 +153,15 @@ def test_a_redacted_dataset_does_not_tell_its_options(here):
     assert read_card(out).run_tags is None
     assert build_dataset(out, **usual(here, redact=True)).status == "unchanged"
     (line,) = refused(here, redact=True, map_name="yard")
-    assert line.startswith("--redact: a redacted dataset does not tell")
+    assert line.startswith("--redact: a redacted dataset omits its")
     assert refused(here) == ("--redact: yes in the dataset, no now",)
 
 
 @pytest.mark.parametrize("force", [False, True])
 def test_what_is_no_dataset_is_left_alone_with_force_too(here, force):
     for name, error, text in (
-        ("notes.txt", UsageError, "exists and is no dataset"),
-        ("dataset.json", DatasetError, "is left alone, since nobody can tell what it was made of; move it away"),
+        ("notes.txt", UsageError, "exists and is not a dataset"),
+        ("dataset.json", DatasetError, "is left alone, since its inputs are unknown; move it away"),
     ):
         (here / "folder").mkdir(exist_ok=True)
         (here / "folder" / name).write_text("{}")
@@ -178,7 +178,7 @@ def test_in_a_bucket_the_differences_are_named_too_and_force_builds_the_next_gen
         in_environment(monkeypatch, environment, here / "cache")
         with pytest.raises(UsageError) as caught:
             build_dataset("s3://sets/ds", **usual(here, map_name="yard"))
-        assert "was made with other options, and stays" in caught.value.problems[0]
+        assert "was made with other options and is kept" in caught.value.problems[0]
         assert caught.value.problems[1:] == (f"s3://sets/ds: {OTHER['map_name'][1]}",)
         assert build_dataset("s3://sets/ds", **usual(here)).status == "unchanged"
         assert tree(here / "served" / "sets" / "ds") == tree(here / "dataset")
@@ -198,7 +198,7 @@ def test_what_another_call_builds_there_meanwhile_stays(here, monkeypatch):
 
     add_run(open_store(here / "store"), "dry", segments("dry", *lanes(1.0, -10.0, 10.0)))
     monkeypatch.setattr(building, "write_patches", while_the_first_draws)
-    with pytest.raises(StoreError, match="another call has built a dataset here meanwhile, which stays"):
+    with pytest.raises(StoreError, match="another call has built a dataset here meanwhile and it is kept"):
         build_dataset(out, **usual(here))
     assert [entry.name for entry in read_card(out).maps] == ["yard"]
 
