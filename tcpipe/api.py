@@ -28,13 +28,13 @@ def run_train(options: TrainOptions) -> TrainResult:
     else; `DatasetError` or `ModelError` where the dataset cannot be trained on, or the interrupted training is another one.
     """
     from tcpipe.learning.fitting import FitConfig
-    from tcpipe.learning.training import model_for
+    from tcpipe.learning.training import choose_model_kind
     from tcpipe.learning.training import train as run
     from tcpipe.recipe.checking import from_values
 
     given = {of.name: value for of in fields(FitConfig) if (value := getattr(options, of.name)) is not None}
     is_network = bool(given.keys() - {"model", "loss", "weights", "label", "beside"})
-    given["model"] = options.model or ("resnet18" if is_network else model_for(options.dataset))
+    given["model"] = options.model or ("resnet18" if is_network else choose_model_kind(options.dataset))
     return run(options.dataset, options.out, config=from_values(FitConfig, given, where="train"), fresh=options.fresh)
 
 
