@@ -29,7 +29,7 @@ from tcpipe.formats.maps.map_files import open_map
 from tcpipe.terrain.classes import PAPER_CLASSES, ClassTable
 from tcpipe.terrain.grid import MapGrid
 from tcpipe.terrain.layers import make_paper_layers
-from tcpipe.terrain.patches import map_px_from_patch, patch_frames
+from tcpipe.terrain.patches import make_patch_frames, map_px_from_patch
 from tcpipe.terrain.sampling import sample_patches
 from tcpipe.terrain.tiles import TilePool, group_by_tile
 
@@ -181,7 +181,7 @@ def main() -> None:
     count = int(sys.argv[1]) if len(sys.argv) > 1 else 10_886
     source = world()
     chord_m = np.ones(count)
-    placed = patch_frames(*segments(source, count), chord_m)
+    placed = make_patch_frames(*segments(source, count), chord_m)
     frames = map_px_from_patch(placed, GRID, patch_m=1.0, patch_px=PX)
     outs = [np.empty((count, PX, PX), dtype) for dtype in (np.uint16, np.uint8, np.uint8)]
     flat = [source.arrays[layer].reshape(-1) for layer in LAYERS]

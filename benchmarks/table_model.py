@@ -12,7 +12,7 @@ import time
 
 import numpy as np
 
-from tcpipe.learning.table_model import fit_table, patch_features
+from tcpipe.learning.table_model import compute_patch_features, fit_table
 
 WANTED_S, WANTED_A_SECOND = 20.0, 200_000
 TOGETHER, TOLD = 1_000, 100_000
@@ -25,7 +25,7 @@ def main() -> None:
     patches[..., 1] = np.rint(patches[..., 1] * 6.0) / 6.0
     began = time.process_time()
     for _ in range(0, count, TOGETHER):
-        patch_features(patches, channels=CHANNELS, class_count=CLASSES, patch_m=1.0)
+        compute_patch_features(patches, channels=CHANNELS, class_count=CLASSES, patch_m=1.0)
     seen_s = time.process_time() - began
     features = rng.normal(size=(count, 16))
     ground = np.column_stack(

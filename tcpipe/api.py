@@ -28,13 +28,13 @@ def run_train(options: TrainOptions) -> TrainResult:
     else; `DatasetError` or `ModelError` where the dataset cannot be trained on, or the interrupted training is another one.
     """
     from tcpipe.learning.fitting import FitConfig
-    from tcpipe.learning.training import model_for
+    from tcpipe.learning.training import choose_model_kind
     from tcpipe.learning.training import train as run
     from tcpipe.recipe.checking import from_values
 
     given = {of.name: value for of in fields(FitConfig) if (value := getattr(options, of.name)) is not None}
     is_network = bool(given.keys() - {"model", "loss", "inverse_variance_weights", "label", "extra_features"})
-    given["model"] = options.model or ("resnet18" if is_network else model_for(options.dataset))
+    given["model"] = options.model or ("resnet18" if is_network else choose_model_kind(options.dataset))
     return run(
         options.dataset, options.out, config=from_values(FitConfig, given, where="train"), no_resume=options.no_resume
     )
@@ -94,7 +94,7 @@ def run_evaluate(options: EvaluateOptions) -> EvaluationResult | DrivesResult:
     from tcpipe.learning.evaluation_files import run_evaluation
     from tcpipe.recipe.checking import from_values
 
-    asked = {name: getattr(options, name) for name in ("draws", "baselines", "retrain", "seed")}
+    asked = {name: getattr(options, name) for name in ("noise_draws", "baselines", "retrain_ablation", "seed")}
     return run_evaluation(model, dataset, out, config=from_values(EvaluateConfig, asked, where="evaluate"))
 
 

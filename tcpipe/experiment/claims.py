@@ -1,6 +1,6 @@
-"""What the paper says (section V) and a reviewer would ask, as far as the simulated site leaves it open: ratios of errors that may fall.
+"""Claims of the paper (section V) that the simulated site can refute, as ratios of errors.
 
-That height, class, several classes and slow ground matter is built into the site (docs/reference/simulation.md), and no claim.
+The importance of height, class, several classes and slow ground is built into the site (docs/reference/simulation.md) and is no claim.
 """
 
 from __future__ import annotations
@@ -44,12 +44,12 @@ class Claim:
 
 
 def check_claims(runs: Sequence[Evaluation]) -> list[Claim]:
-    """Return every claim as it stands after all runs (one evaluation a seed): mean ratios, within the widest of their intervals."""
+    """Return every claim with its verdict over all trainings (one evaluation a seed): mean ratios with the widest interval."""
     found = []
     for split in runs[0].splits:
         for baseline, says in CLAIMS.items():
-            ratio = _select_all_classes([_compute_ratio(run, baseline, split) for run in runs])
-            found.append(Claim(says, split, ratio, _read_paper_value(baseline, split), _describe_rank(ratio)))
+            ratio = _combine_ratios([_compute_ratio(run, baseline, split) for run in runs])
+            found.append(Claim(says, split, ratio, _read_paper_value(baseline, split), _find_verdict(ratio)))
     return found
 
 
@@ -59,7 +59,7 @@ def _compute_ratio(run: Evaluation, baseline: str, split: str) -> Ratio:
     return next(mine, Ratio(None, None, None))
 
 
-def _select_all_classes(ratios: Sequence[Ratio]) -> Ratio:
+def _combine_ratios(ratios: Sequence[Ratio]) -> Ratio:
     values, lows, highs = ([getattr(ratio, end) for ratio in ratios] for end in ("value", "low", "high"))
     if None in values:
         return Ratio(None, None, None)
@@ -67,7 +67,7 @@ def _select_all_classes(ratios: Sequence[Ratio]) -> Ratio:
     return Ratio(mean, None, None) if None in lows else Ratio(mean, min(lows), max(highs))
 
 
-def _describe_rank(ratio: Ratio) -> Verdict:
+def _find_verdict(ratio: Ratio) -> Verdict:
     if ratio.value is None:
         return "not measured"
     if ratio.low is None or ratio.high is None or ratio.low <= 1.0 <= ratio.high:

@@ -362,3 +362,9 @@ def _sync_directory(path: Path) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
+
+
+def describe_full_disk(error: Exception) -> str:
+    """Say that there is no room for a copy of a log, where that is the error; else nothing."""
+    full = isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+    return "no room for a copy here; TMPDIR names a place that has some" if full else ""

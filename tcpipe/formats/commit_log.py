@@ -181,12 +181,9 @@ def put_commit(store: Place, state: State, stamp: Stamp, kind: Kind, make: Calla
             log.put_new(commit_name(number), data) or log.read(commit_name(number)) == data
         ):  # the answer to one's own may be lost
             state = _follow(state, (parse_typed(document, Commit, log.where()), str(document[SEAL]), len(data)), log)
-            return _keep_snapshot(log, state, stamp) if _is_due(state) else state
+            is_due = state.number - state.snapshot >= _EVERY or state.tail_bytes >= _EVERY_BYTES
+            return _keep_snapshot(log, state, stamp) if is_due else state
         state = refresh(store, state)
-
-
-def _is_due(state: State) -> bool:
-    return state.number - state.snapshot >= _EVERY or state.tail_bytes >= _EVERY_BYTES
 
 
 def _keep_snapshot(log: Place, state: State, stamp: Stamp) -> State:

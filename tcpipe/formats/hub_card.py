@@ -37,7 +37,9 @@ def format_hub_card(card: DatasetCard, samples: pa.Schema, *, samples_file: str,
     samples_file, picture : where that table and an overview lie in the dataset.
     """
     text = "\n".join(_iterate_lines(card, picture))
-    return f"---\n{_format_yaml(_make_head(card, samples, samples_file))}---\n\n{text}\n"
+    head = _make_head(card, samples, samples_file)
+    yaml = "".join(f"{key}: {json.dumps(value, ensure_ascii=True)}\n" for key, value in head.items())
+    return f"---\n{yaml}---\n\n{text}\n"
 
 
 def _make_head(card: DatasetCard, samples: pa.Schema, samples_file: str) -> dict[str, Json]:
@@ -90,11 +92,6 @@ def _name_of(dtype: pa.DataType) -> str:
     if pa.types.is_dictionary(dtype):
         return _name_of(dtype.value_type)
     return _DTYPES.get(str(dtype), str(dtype))
-
-
-def _format_yaml(head: dict[str, Json]) -> str:
-    """Return the head as YAML: a key a line, its value as JSON, which YAML holds as it is."""
-    return "".join(f"{key}: {json.dumps(value, ensure_ascii=True)}\n" for key, value in head.items())
 
 
 def _escape_markdown(value: str) -> str:

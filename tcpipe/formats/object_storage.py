@@ -17,8 +17,7 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import unquote
 
 from tcpipe.errors import LogError, TcpipeError, UsageError, split_secrets
-from tcpipe.formats.atomic import make_scratch_directory
-from tcpipe.formats.logs.log_part import describe_full_disk
+from tcpipe.formats.atomic import describe_full_disk, make_scratch_directory
 
 if TYPE_CHECKING:
     from obstore import GetOptions, ObjectMeta

@@ -145,7 +145,10 @@ def _check_text_sizes(data: pa.Buffer, columns: list[str] | None, group: int | N
                 raise ValueError(f"its texts unfold to more than {most / 1e6:.0f} MB")
             plain = schema.field(field.name)
             table = table.set_column(at, plain, table.column(at).cast(plain.type))
-    return table.rename_columns([EARLIER_COLUMNS.get(name, name) for name in table.column_names])
+    if EARLIER_COLUMNS.keys().isdisjoint(table.column_names):
+        return table
+    named = [field.with_name(EARLIER_COLUMNS.get(field.name, field.name)) for field in table.schema]
+    return pa.Table.from_arrays(table.columns, schema=pa.schema(named, table.schema.metadata))
 
 
 def _count_text_bytes(chunk: pa.DictionaryArray) -> int:

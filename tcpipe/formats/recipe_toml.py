@@ -6,8 +6,8 @@ import logging
 import os
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields, is_dataclass
-from functools import cache, lru_cache
+from dataclasses import fields, is_dataclass
+from functools import cache
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -104,27 +104,18 @@ def _rename(values: Any, names: Mapping[str, str], renamed: dict[str, str], path
 
 def ingest_key(recipe: Recipe | Mapping[str, Json]) -> str:
     """Return the hash (hex) of what rules a run's files in a recipe or in what a manifest holds of one; the dataset's sections do not."""
-    if isinstance(recipe, Recipe):
-        return _make_recipe_key(_Itself(recipe))
-    return _hash_values(recipe)
+    if not isinstance(recipe, Recipe):
+        return _hash_values(recipe)
+    known = _KEYS.get(id(recipe))
+    if known is None:
+        known = recipe, _hash_values(to_plain(recipe.ingest))
+        _KEYS.clear()
+        _KEYS[id(recipe)] = known
+    return known[1]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Itself:
-    """One recipe, equal to itself alone: a thousand logs ask for the key of the same one."""
-
-    recipe: Recipe
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Itself) and other.recipe is self.recipe
-
-    def __hash__(self) -> int:
-        return id(self.recipe)
-
-
-@lru_cache(maxsize=4)
-def _make_recipe_key(of: _Itself) -> str:
-    return _hash_values(to_plain(of.recipe.ingest))
+_KEYS: dict[int, tuple[Recipe, str]] = {}
+"""The last recipe and its key: a thousand logs ask for the key of the same one. The recipe is kept, so that no other has its id."""
 
 
 def _hash_values(values: Mapping[str, Json]) -> str:

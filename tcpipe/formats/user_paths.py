@@ -26,53 +26,47 @@ def check_local_output(path: str | Path) -> Path:
 
 def check_output_directory(path: str | Path) -> Path:
     """Return where a directory is written; `UsageError` if a file or a URL is in the way."""
-    place = check_local_output(path)
-    if _find_kind(place) == "file":
-        raise UsageError(f"{path}: is a file, wanted a directory; give another")
-    return _check_parent(place)
+    return _check_output(path, "file", "is a file, wanted a directory; give another")
 
 
 def check_output_file(path: str | Path) -> Path:
     """Return where a file is written; `UsageError` if a directory or a URL is in the way."""
+    return _check_output(path, "directory", "is a directory, wanted the name of a file")
+
+
+def _check_output(path: str | Path, wrong: str, problem: str) -> Path:
     place = check_local_output(path)
-    if _find_kind(place) == "directory":
-        raise UsageError(f"{path}: is a directory, wanted the name of a file")
-    return _check_parent(place)
-
-
-def check_input_path(path: str | Path) -> Path:
-    """Return a file or directory that is there; `UsageError` else."""
-    return _check_exists(path, "file or directory")
-
-
-def check_input_file(path: str | Path) -> Path:
-    """Return a file that is there; `UsageError` else."""
-    place = _check_exists(path, "file")
-    if _find_kind(place) != "file":
-        raise UsageError(f"{path}: is a directory, wanted a file")
-    return place
-
-
-def check_input_directory(path: str | Path) -> Path:
-    """Return a directory that is there; `UsageError` else."""
-    place = _check_exists(path, "directory")
-    if _find_kind(place) != "directory":
-        raise UsageError(f"{path}: is a file, wanted a directory")
-    return place
-
-
-def _check_exists(path: str | Path, wanted: str) -> Path:
-    if _find_kind(Path(path)) is None:
-        why = "; it is read from this machine only" if _LIKE_A_URL.match(str(path)) else ""
-        raise UsageError(f"{path}: there is no such {wanted}{why}")
-    return Path(path)
-
-
-def _check_parent(place: Path) -> Path:
+    if _find_kind(place) == wrong:
+        raise UsageError(f"{path}: {problem}")
     above = next((parent for parent in place.absolute().parents if _find_kind(parent)), None)
     if above is not None and _find_kind(above) == "file":
         raise UsageError(f"{place}: {above} is a file, wanted a directory")
     return place
+
+
+def check_input_path(path: str | Path) -> Path:
+    """Return a file or directory that is there; `UsageError` else."""
+    return _check_input(path, "file or directory")
+
+
+def check_input_file(path: str | Path) -> Path:
+    """Return a file that is there; `UsageError` else."""
+    return _check_input(path, "file")
+
+
+def check_input_directory(path: str | Path) -> Path:
+    """Return a directory that is there; `UsageError` else."""
+    return _check_input(path, "directory")
+
+
+def _check_input(path: str | Path, wanted: str) -> Path:
+    kind = _find_kind(Path(path))
+    if kind is None:
+        why = "; it is read from this machine only" if _LIKE_A_URL.match(str(path)) else ""
+        raise UsageError(f"{path}: there is no such {wanted}{why}")
+    if kind not in wanted:
+        raise UsageError(f"{path}: is a {kind}, wanted a {wanted}")
+    return Path(path)
 
 
 def _find_kind(path: Path) -> str | None:

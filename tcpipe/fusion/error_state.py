@@ -154,7 +154,7 @@ def _find_gnss_faults(case: _FilterSection, timeline: EventTimeline) -> GnssFaul
 def _as_reopenings(
     wrong: GnssFaults, outputs: NDArray[np.float64], output_ns: NDArray[np.int64]
 ) -> tuple[GateReset, ...]:
-    """Return the spans in which the fixes were wrong, with how far they were off; then those of which nobody can tell."""
+    """Return the spans in which the fixes were wrong, with their error; then those that are undecided."""
     off_m = np.linalg.norm(outputs[:, kernel.SAVED - 3 : kernel.SAVED - 1], axis=1)
     found = []
     for span in wrong.spans:
@@ -202,7 +202,7 @@ def _level_start(
 
 
 def _compute_unseen_scale_std(run: FilterPass, measurements: Measurements) -> float:
-    """Return what the fixes cannot tell of the odometry's scale: their error at both ends of the ground that they span.
+    """Return the uncertainty of the odometry's scale that the fixes leave: their error at both ends of the ground that they span.
 
     It is at most the scale's own deviation. The white part of the error of many fixes is the filter's business.
     """
@@ -315,7 +315,7 @@ def _make_rejections(timeline: EventTimeline, run: FilterPass) -> Rejections:
 
 
 def find_gate_resets(timeline: EventTimeline, run: FilterPass) -> tuple[GateReset, ...]:
-    """Return each gate_reset of a gate: since when the sensor was refused, and how far it was off."""
+    """Return each gate reset: since when the sensor was rejected, and its difference."""
     found = []
     for event in np.flatnonzero(run.verdict == kernel.REOPENED):
         same = np.flatnonzero(timeline.kind[:event] == timeline.kind[event])

@@ -155,7 +155,7 @@ class FilterPass:
             self._lock_out[kernel.GNSS_POSITION] = _DOUBTED if follows else _DEAF
 
     def fixes_contradict(self) -> bool:
-        """Return whether fixes were refused for seconds on end while the other sensors carried the pose: they may err together."""
+        """Return whether fixes were rejected for seconds while the other sensors determined the pose: they may err together."""
         of_gnss = np.flatnonzero(self.timeline.kind == kernel.GNSS_POSITION)
         if not self.carried or of_gnss.size == 0:
             return False

@@ -24,7 +24,7 @@ _Array = NDArray[np.float64]
 
 
 class _Measurement(NamedTuple):
-    """One event: what kind of source, which of its entries, where it sits, what it says."""
+    """One event: kind of source, its entries, lever arm, measurement and variance."""
 
     kind: int
     entries: NDArray[np.int64]

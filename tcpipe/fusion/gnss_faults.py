@@ -1,4 +1,4 @@
-"""Since when and until when fixes err together: a wrong ambiguity, a reflection; told by both ends.
+"""Spans in which fixes err together (a wrong ambiguity, a reflection), determined from both ends.
 
 A filter that comes to a jump cannot know which side of it is wrong, and one that was led off by a ramp takes the return for the jump.
 Offline both sides are known. For each span in which the fixes may have erred the filter is run with an error of theirs in its state there
@@ -64,7 +64,7 @@ class Innovations:
 
 @dataclass(frozen=True, slots=True)
 class FaultHypothesis:
-    """How much the sensors contradict each other if fixes err in ``spans``, and when fixes were refused all the same."""
+    """How much the sensors contradict each other if fixes err in ``spans``, and the spans of rejected fixes that remain."""
 
     spans: Spans
     cost: float
@@ -115,7 +115,7 @@ def _is_in_runs(of: NDArray[np.bool_], fewest: int) -> NDArray[np.bool_]:
 
 
 def _find_rejected_spans(fixes: Innovations, free: NDArray[np.bool_]) -> Spans:
-    """Return from when to when fixes were refused for seconds on end, in which few were heard."""
+    """Return the spans in which fixes were rejected for seconds, almost without exception."""
     found: list[tuple[int, int, int]] = []
     for first, end in _find_runs(_is_in_runs(fixes.refused & ~free, _ALONE)):
         begin_ns, end_ns = int(fixes.stamp_ns[first]), int(fixes.stamp_ns[min(end, fixes.stamp_ns.size - 1)])
@@ -136,14 +136,14 @@ class GnssFaults:
     size_m: float
 
     def doubt_m2(self, stamp_ns: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the variance that stands for what nobody can tell, at each stamp [m²], east, north and up, shape (N, 3)."""
+        """Return the variance of undecided errors at each stamp [m²], east, north and up, shape (N, 3)."""
         unsure = is_inside(stamp_ns, self.doubtful) & ~is_inside(stamp_ns, self.spans)
         return np.asarray(unsure[:, None] * np.array([1.0, 1.0, 0.0]) * self.size_m**2)
 
 
 @dataclass(frozen=True, slots=True)
 class Jump:
-    """When fixes that were refused were followed at last, and by which way they were off, east and north [m]."""
+    """When rejected fixes were accepted at last, and their difference, east and north [m]."""
 
     stamp_ns: int
     off_m: NDArray[np.float64]

@@ -146,7 +146,7 @@ class _Path:
 
 
 def _collect_yaw_rate(measurements: Measurements, start_ns: int, bias: Floats) -> tuple[Floats, Floats]:
-    """Return samples of the yaw rate by the gyroscope, and through its gaps by what tells turning besides."""
+    """Return samples of the yaw rate by the gyroscope, and in its gaps by other sensors."""
     imu = measurements.imu
     other_s, other_rate = _collect_other_yaw_rate(measurements, start_ns)
     if imu is None or imu.stamp_ns.size == 0:
@@ -254,7 +254,7 @@ def _fit_course_to_fixes(fixes: NDArray[np.complex128], turned: Floats, stamp_s:
 
 
 def _position(gnss: Positions | None, path: _Path, quat: Floats, yaw: float) -> tuple[Floats, Floats]:
-    """base_link at the start and its standard deviation: the median of what the first fixes say, the drawn way taken off."""
+    """base_link at the start and its standard deviation: the median of the first fixes less the displacement since the start."""
     if gnss is None or gnss.stamp_ns.size == 0:
         return np.zeros(3), np.full(3, 1e-3)
     few = slice(0, min(10, gnss.stamp_ns.size))

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 GNSS, IMU, WHEELS, VISUAL, DOPPLER = "gnss", "imu", "wheel_odometry", "visual_odometry", "gnss_velocity"
-"""Roles, as they stand in the rejections table."""
+"""Roles, as in the rejections table."""
 
 NO_LEVER_ARM = (0.0, 0.0, 0.0)
 
@@ -86,7 +86,7 @@ class BodyVelocities:
 
     @property
     def measured(self) -> NDArray[np.bool_]:
-        """Along which axes most rows tell a velocity, shape (3,)."""
+        """Axes along which most rows have a velocity, shape (3,)."""
         told: NDArray[np.bool_] = (self.variance_m2ps2 < _UNMEASURED_M2PS2).mean(0) > 0.5
         return told
 

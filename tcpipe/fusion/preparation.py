@@ -279,7 +279,7 @@ def _iterate_slices(rows: int) -> Iterator[slice]:
 
 
 def _read_orientations(columns: Columns, usable: Ints, quat_xyzw: tuple[float, float, float, float]) -> Floats:
-    """Return enu_from_base_link by the unit's own filter, shape (N, 4); NaN where it tells none."""
+    """Return enu_from_base_link by the unit's own filter, shape (N, 4); NaN where it has none."""
     told = [columns[f"quat_{c}"] for c in "xyzw"]
     if any(np.isnan(component).all() for component in told):
         return np.broadcast_to(np.nan, (usable.size, 4))

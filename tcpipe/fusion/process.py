@@ -71,7 +71,7 @@ def is_gliding(measurements: Measurements) -> bool:
 
 
 def is_turned_by_course(measurements: Measurements) -> bool:
-    """Return whether the course over ground is all that tells how the robot turns."""
+    """Return whether only the course over ground shows how the robot turns."""
     told = measurements.imu is not None or turn_sources(measurements)
     return not told and measurements.gnss is not None and not is_gliding(measurements)
 
@@ -108,7 +108,7 @@ def estimate_slope_std_rad(measurements: Measurements) -> float | None:
 
 
 def level_stds_rad(measurements: Measurements) -> tuple[float, float]:
-    """Return the deviations with which pitch and roll are said, once a second, to be small where no accelerometer tells them.
+    """Return the standard deviations of a pitch and roll of zero, once a second, where no accelerometer measures them.
 
     Where the course alone tells the turns, what the antenna sways by would pass for roll: it is held.
     """
@@ -116,7 +116,7 @@ def level_stds_rad(measurements: Measurements) -> tuple[float, float]:
 
 
 def turn_scale_std(measurements: Measurements) -> float:
-    """Return how far the scale of the turn rate may be off where an odometry tells it; 0 where a gyroscope does, or nothing.
+    """Return the standard deviation of the scale of an odometry's turn rate; 0 where a gyroscope measures it, or no sensor.
 
     Without fixes nothing tells it: it stays 1.
     """
@@ -168,12 +168,12 @@ def make_process_noise(measurements: Measurements) -> NDArray[np.float64]:
 
 
 def estimate_gyro_density(gyro_std_radps: float, rate_hz: float) -> float:
-    """Return how fast the variance of an angle grows that a gyroscope tells [rad²/s]."""
+    """Return how fast the variance of a gyroscope's angle grows [rad²/s]."""
     return 1.5 * gyro_std_radps**2 / rate_hz + 1e-8
 
 
 def _fill_turn_noise(measurements: Measurements, density: NDArray[np.float64]) -> None:
-    """Fill in the noise of turning where an odometry, or nothing, tells how the robot turns."""
+    """Fill in the noise of turning where an odometry, or no sensor, measures how the robot turns."""
     sources = turn_sources(measurements)
     if is_gliding(measurements):
         density[:, kernel.GROUND] = 0.0

@@ -42,7 +42,7 @@ PREDICT, GNSS_POSITION, WHEEL_VELOCITY, VISUAL_VELOCITY, STANDING, STANDING_RATE
 """Kinds of events. SIDEWAYS: y and z of the body velocity are about zero; LEVEL: roll and pitch are small."""
 
 FLAT_TURN, VISUAL_TURN, GYRO_TURN, INERTIAL = range(4)
-"""Process modes: what tells how the robot turns. All but INERTIAL keep the body velocity."""
+"""Process modes: the source of the turn rate. All but INERTIAL keep the body velocity."""
 
 MOVED = (0, 1, 2, 9, 10, 11, 12, 13, 14)
 """Errors that others move into: th, v, p. All others stay what they are, but s_w, which may decay."""

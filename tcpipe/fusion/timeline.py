@@ -152,7 +152,7 @@ def _make_measured_parts(measurements: Measurements) -> list[_Part]:
 
 
 def _compute_unseen_turn_variance(stamp_ns: Ints, lever_arm_m: tuple[float, float, float]) -> Floats:
-    """Variance [m²/s²], shape (3,), of what a sensor off base_link sees of turns that no sensor tells; they last, as the ground does."""
+    """Variance [m²/s²], shape (3,), that turns which no sensor measures cause at a sensor off base_link; they last, as the ground does."""
     rate_hz = 1e9 / compute_median_period_ns(stamp_ns)
     x, y, z = np.square(lever_arm_m)
     lasting: Floats = np.array([z, z, x + y]) * UNSEEN_TURN_RADPS**2 * max(1.0, rate_hz * _UNSEEN_TURN_S)
@@ -199,7 +199,7 @@ def _make_constraints(measurements: Measurements, stationary_ns: Ints, start: in
 
 
 def _make_stationary_part(imu: InertialMeasurements, grid: Ints) -> _Part:
-    """Measure the gyroscope's bias, while the robot stands, by its mean around each stamp."""
+    """Measure the gyroscope's bias of a stationary robot by its mean around each stamp."""
     zero = int(imu.stamp_ns[0])
     stamp_s, centre_s = compute_seconds(imu.stamp_ns, zero), compute_seconds(grid, zero)
     half_s = 0.5e-9 * _STANDING_NS

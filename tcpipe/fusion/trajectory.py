@@ -24,12 +24,12 @@ from tcpipe.fusion.signals import compute_median_period_ns, is_in_gap
 from tcpipe.tables.facts import StretchFacts
 
 DISPLACEMENT_LAGS_S = (0.5, 1.0, 2.0, 4.0)
-"""Durations over which a smoother tells the uncertainty of a displacement [s]."""
+"""Durations over which a smoother states the uncertainty of a displacement [s]."""
 
 
 @dataclass(frozen=True, slots=True)
 class Rejections:
-    """Measurements that the gate refused, in time order.
+    """Measurements that the gate rejected, in time order.
 
     Attributes
     ----------

@@ -19,7 +19,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -191,7 +191,9 @@ def filter_forward(
         repairs += int(run(belief, np.asarray(q, np.float64), events, packed, outputs))
         cuts = np.cumsum([s.stop - s.start for s in rows])[:-1]
         for written, all_of in ((outputs.nis, nis), (outputs.outcome, outcome)):
-            for at, part in enumerate(np.split(_restore_order(written, order), cuts)):
+            by_source = np.empty_like(written)
+            by_source[order] = written
+            for at, part in enumerate(np.split(by_source, cuts)):
                 all_of[at][rows[at]] = part
         reached = until
     return ForwardResult(
@@ -353,12 +355,6 @@ def _sort_events(
         z=np.concatenate([source.z[of].ravel() for source, of in zip(sources, rows, strict=True)]),
         variance=np.concatenate([source.variance[of].ravel() for source, of in zip(sources, rows, strict=True)]),
     ), order
-
-
-def _restore_order(values: NDArray[Any], order: NDArray[np.int64]) -> NDArray[Any]:
-    found = np.empty_like(values)
-    found[order] = values
-    return found
 
 
 def _pack_sources(sources: Sequence[SensorRows], gates: Sequence[float]) -> Sources:

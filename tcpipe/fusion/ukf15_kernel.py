@@ -34,7 +34,7 @@ NOT_RUN = 0
 ACCEPTED = 1
 """Outcome: fused."""
 REJECTED = 2
-"""Outcome: refused by the gate."""
+"""Outcome: rejected by the gate."""
 RECOVERED = 3
 """Outcome: fused although outside the gate, after the states it measures were opened up (see `tcpipe.fusion.ukf15_kernel.run`)."""
 
@@ -49,7 +49,7 @@ class FilterState(NamedTuple):
     clock_s: NDArray[np.float64]
     """Its time, seconds since the run's origin, shape (1,)."""
     refused: NDArray[np.float64]
-    """Per source, how often it has been refused without a break, and since when [s], shape (S, 2)."""
+    """Per source, rejections in a row, and since when [s], shape (S, 2)."""
 
 
 class Sources(NamedTuple):
@@ -100,7 +100,7 @@ class Outputs(NamedTuple):
 STATES = 15
 """Length of the state."""
 X, Y, Z, ROLL, PITCH, YAW, VX, VY, VZ, WX, WY, WZ, AX, AY, AZ = range(STATES)
-"""Where each entry stands in the state: position, angles, velocity, angular velocity, acceleration."""
+"""Place of each entry in the state: position, angles, velocity, angular velocity, acceleration."""
 POSITION, ANGLES, VELOCITY, TURN, ACCELERATION = (slice(first, first + 3) for first in (X, ROLL, VX, WX, AX))
 
 SELECT = 0
@@ -526,7 +526,7 @@ def _open_up(
 
 @compile_kernel
 def is_locked_out(count: float, since_s: float, now_s: float) -> bool:
-    """Tell whether a gate that refused ``count`` measurements in a row since ``since_s`` guards a wrong belief."""
+    """Return whether ``count`` rejections in a row since ``since_s`` show that the estimate is wrong."""
     return count >= _LOCKOUT_COUNT and now_s - since_s >= _LOCKOUT_S
 
 

@@ -7,8 +7,6 @@ product is a parabola on each interval and its integral has a closed form; the t
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -88,6 +86,6 @@ def integrate_held_to(stamp_ns: Ints, value: Floats, at_ns: Ints) -> Floats:
     return integral
 
 
-def _integrate_product(step_s: NDArray[np.floating[Any]], a0: Floats, a1: Floats, b0: Floats, b1: Floats) -> Floats:
+def _integrate_product(step_s: NDArray[np.floating], a0: Floats, a1: Floats, b0: Floats, b1: Floats) -> Floats:
     integral: Floats = step_s * (2.0 * a0 * b0 + 2.0 * a1 * b1 + a0 * b1 + a1 * b0) / 6.0
     return integral

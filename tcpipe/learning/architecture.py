@@ -1,4 +1,12 @@
-"""The shape of a network, and whether networks can be made here: what is known of them without torch."""
+"""What is known of networks without torch: their shape, whether they can be trained here, and their loss (the paper's equation 4).
+
+``nrmse``
+    sqrt(((ŵ - w*) / max w*)² + ((v̂ - v*) / max v*)²): both errors without dimension, the normalised error that the paper names.
+``paper_eq4``
+    sqrt((ŵ - w*)² / max w* + (v̂ - v*)² / max v*): the equation as printed; power outweighs velocity about 270 : 1.
+
+Both are means over samples, with the maxima of train; the functions here take labels and predictions divided by these maxima.
+"""
 
 from __future__ import annotations
 
@@ -37,7 +45,7 @@ _MOST_INPUTS = 1024
 """Channels, numbers beside them, and outputs."""
 
 
-def weight_forms(shape: Architecture) -> dict[str, ArrayForm]:
+def list_weight_forms(shape: Architecture) -> dict[str, ArrayForm]:
     """Return names, types and shapes of the weights of a network in a file, without making it (`tcpipe.learning.network`)."""
     forms: dict[str, tuple[int, ...]] = {}
 

@@ -1,4 +1,4 @@
-"""The simplest that could do as well: what any model is shown beside, fitted on the samples that it was fitted on."""
+"""Baselines of a model, fitted on the same samples: curves, physics, boosted trees, and the networks of Wei and Isler (table IV)."""
 
 from __future__ import annotations
 
@@ -58,13 +58,10 @@ Predictor = Callable[[Split], Array]
 def compare_baselines(
     ours: Model, data: Dataset, sets: Mapping[str, Measured], said: Mapping[str, Costs], *, seed: int
 ) -> tuple[list[BaselineResult], list[Finding]]:
-    """Return the errors of every baseline on the very samples of a model's, with the ratios of the model's to them; and what lacks.
+    """Return the results of every baseline, and a finding for each that cannot be fitted.
 
-    Parameters
-    ----------
-    ours, data : the model, and the dataset whose training samples the baselines are fitted on.
-    sets, said : what was measured, and what the model says of it, by split.
-    seed : of the bootstrap.
+    The baselines are fitted on the training samples of ``data`` and evaluated on ``sets``, the same samples as the predictions ``said`` of
+    the model. ``seed`` is that of the bootstrap.
     """
     kind = ours.card.training.config.model
     own = {"boosting": TREES, "physics": PHYSICS}.get(kind)
@@ -86,7 +83,7 @@ def compare_baselines(
 
 
 def _select_fitted_samples(train: Split, ours: Model) -> Split:
-    """Return the samples that a model of this kind is fitted on: without the fold that stops a network, unless there is no other."""
+    """Return the samples that a model of this kind is fitted on: for a network without the fold that stops it."""
     labelled = train.take(np.isfinite(train.labels).all(axis=1))
     if ours.card.training.config.model != "resnet18":
         return labelled
@@ -153,7 +150,7 @@ def _fit_trees(train: Split, ours: Model) -> Predictor:
 
 
 def _group_samples(split: Split, block_m: float) -> tuple[Literal["runs", "blocks"], NDArray[np.generic]]:
-    """Return what errs alike: runs where there are enough, else blocks of ground."""
+    """Return groups of samples with correlated errors: runs where there are enough, else blocks of ground."""
     runs = split.column("run_id").astype(np.str_)
     if len(np.unique(runs)) >= _FEWEST_RUNS:
         return "runs", runs
@@ -166,9 +163,9 @@ def _group_samples(split: Split, block_m: float) -> tuple[Literal["runs", "block
 def compare_with_baseline(
     name: str, split: str, part: Measured, ours: Costs, theirs: Costs, *, block_m: float, seed: int
 ) -> Iterator[BaselineResult]:
-    """Yield the errors of a baseline ``name`` in every quantity that it says, with the ratios of the model's to them, of the same samples.
+    """Yield the results of a baseline for every quantity that it predicts.
 
-    ``ours`` and ``theirs`` are of the samples of ``part``; the bootstrap with ``seed`` draws runs, or blocks of ``block_m``.
+    ``ours`` and ``theirs`` are predictions for the samples of ``part``; the bootstrap with ``seed`` draws runs, or blocks of ``block_m``.
     """
     drawn_by, groups = _group_samples(part.split, block_m)
     for quantity in theirs:

@@ -47,10 +47,10 @@ from tcpipe.learning.metrics import (
     Array,
     Errors,
     Spread,
+    average_draws,
     compute_costs,
     compute_errors_by_class,
     label_floor,
-    mean_of_draws,
 )
 from tcpipe.learning.models import Model, load_model
 from tcpipe.learning.predictions import (
@@ -198,7 +198,7 @@ def _iterate_ablation(ours: Model, sets: Sets, config: EvaluateConfig, trained: 
                 )
                 for draw in range(config.noise_draws if noise else 1)
             ]
-            by_split[name] = {quantity: mean_of_draws(draw[quantity] for draw in draws) for quantity in draws[0]}
+            by_split[name] = {quantity: average_draws(draw[quantity] for draw in draws) for quantity in draws[0]}
         yield AblationRow(letters, "noise", **by_split)
         if config.retrain_ablation and noise:
             anew = trained("ablation_" + "".join(letters), Variant(channels=left))

@@ -1,4 +1,4 @@
-"""Fitting a network to one part of a dataset and stopping early by another, epoch by epoch, from where a checkpoint stands."""
+"""Fitting a network with early stopping on a held-out fold; checkpoints (one file) let a killed training continue unchanged."""
 
 from __future__ import annotations
 
@@ -95,22 +95,22 @@ Seed = Annotated[int, Bounds(ge=0, le=2**32 - 1)]
 Floats = NDArray[np.float32]
 
 _SLOWER = 0.1
-"""What the learning rate is multiplied by where it is too long a step."""
+"""Factor of the learning rate when the loss stops falling."""
 
 _TOGETHER = 256
 
 _STEPS_BETWEEN = 32
-"""Steps that are lost at most by a stop, unless an epoch has more: a state is 180 MB."""
+"""Steps that a stop loses at most, unless an epoch has more: a state has 180 MB."""
 
 _LAST = 0.8
-"""Share of the most epochs after which the rate is smaller in any case."""
+"""Share of the maximum of epochs after which the rate is smaller in any case."""
 
 
 @dataclass(frozen=True, slots=True)
 class FitConfig:
-    """How a model is trained; the paper gives ResNet-18, equation 4 and the learning rate.
+    """How a model is trained; ResNet-18, equation 4 and the learning rate are the paper's.
 
-    A table and physics take loss, weights, label and beside alone.
+    A table and physics use only loss, weights, label and beside.
     """
 
     model: ModelKind = "resnet18"
@@ -124,7 +124,7 @@ class FitConfig:
     seed: Seed = 0
     """Of weights, shuffles and mirrors."""
     fold: Annotated[int, Bounds(ge=0, le=99)] = 0
-    """Of train, that training is stopped by; the rest is fitted."""
+    """Of train, for early stopping; the rest is fitted."""
     mirror: bool = True
     """Mirror every other patch across its direction of travel."""
     inverse_variance_weights: bool = False
@@ -132,23 +132,23 @@ class FitConfig:
     width: Annotated[int, Bounds(ge=16, le=512)] = 64
     """Filters of the first stage, a multiple of 16."""
     label: EnergyName = "total"
-    """Which energy is trained on: all that was measured, or net of idle power."""
+    """Energy to train on: total, or above standing (less the idle power)."""
     extra_features: bool = False
-    """Whether it is told the turn and the commanded speed of each metre."""
+    """Whether turn and commanded speed of each segment are inputs, too."""
 
 
 @dataclass(frozen=True, slots=True)
 class Task:
-    """What is fitted on what."""
+    """Samples to fit and to stop by, and what is learned of them."""
 
     train: Split
-    """Both of the next."""
+    """``fit`` and ``held`` together."""
     fit: Split
     held: Split
     outputs: tuple[str, ...]
     """The split's label columns, or its energy alone."""
     extra_features: tuple[ExtraFeature, ...] = ()
-    """What it is told beside a patch."""
+    """Inputs besides the patch."""
 
 
 @dataclass(slots=True)
@@ -168,7 +168,7 @@ class TrainingTimes:
 
 @dataclass(frozen=True, slots=True)
 class Fitted:
-    """A trained model: its best weights, what its outputs are multiplied by, and how it went."""
+    """A trained model: its best weights, the factors of its outputs, and its predictions of held-out samples."""
 
     weights: Arrays
     scale: tuple[float, ...]
@@ -182,16 +182,12 @@ class Fitted:
 
 
 def fit(task: Task, config: FitConfig, *, name: str, key: str, checkpoint: Path) -> Fitted:
-    """Train until the held-out fold gets no better, and return the network as it was best.
+    """Train until the loss of the held-out fold stops falling, and return the network with the smallest.
 
-    Parameters
-    ----------
-    task, config : what and how.
-    name : for the lines about progress.
-    key : of dataset and options, kept in the checkpoint.
-    checkpoint : written before the first epoch and after every one, or every so many short ones, and gone on from where it is.
+    ``name`` is for progress messages. ``key``, of dataset and options, is kept in ``checkpoint``, from which training continues; it is
+    written before the first epoch and then at least every `_STEPS_BETWEEN` steps.
     """
-    scale = label_scale(task)
+    scale = find_label_scale(task)
     factors = compute_loss_factors(config.loss, scale)
     trainer, device = _make_trainer(task, config, scale, factors)
     network = trainer.network
@@ -249,7 +245,7 @@ def _make_trainer(task: Task, config: FitConfig, scale: Sequence[float], factors
     return Trainer(make_resnet18(shape, seed=config.seed, start=start.tolist()), factors), find_device_name()
 
 
-def label_scale(task: Task) -> tuple[float, ...]:
+def find_label_scale(task: Task) -> tuple[float, ...]:
     """Return the largest label of each output among all of train: what labels are divided by."""
     return tuple(float(value) for value in collect_labels(task.train, task.outputs).max(axis=0))
 
@@ -337,7 +333,7 @@ def _train_epoch(
 
 def _state(trainer: Trainer, best: Arrays) -> dict[str, Arrays]:
     """Return all arrays of a checkpoint."""
-    return {"now": trainer.network.arrays(), "best": best, "optimizer": trainer.memory()}
+    return {"now": trainer.network.arrays(), "best": best, "optimizer": trainer.copy_optimizer_state()}
 
 
 def _restore(trainer: Trainer, parts: dict[str, Arrays], where: str) -> None:
@@ -346,7 +342,7 @@ def _restore(trainer: Trainer, parts: dict[str, Arrays], where: str) -> None:
         raise ModelError(f"{where}: not a checkpoint; remove it, or start anew with --no-resume")
     for part in ("best", "now"):
         trainer.network.set_arrays(parts[part], where)
-    trainer.remember(parts["optimizer"], where)
+    trainer.load_optimizer_state(parts["optimizer"], where)
 
 
 def _say(name: str, progress: TrainingProgress, config: FitConfig, training_times_s: TrainingTimes) -> None:

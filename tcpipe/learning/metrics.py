@@ -119,7 +119,7 @@ def _combine_scores(found: list[Errors], count: int) -> list[float | None]:
     ]
 
 
-def mean_of_draws(draws: Iterable[Errors]) -> Errors:
+def average_draws(draws: Iterable[Errors]) -> Errors:
     """Return the mean errors of the same samples under several draws of noise."""
     found = list(draws)
     rmse, mape = _mean(draw.rmse for draw in found), _mean(draw.mape_percent for draw in found)

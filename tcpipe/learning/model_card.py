@@ -113,7 +113,7 @@ mean power w [W] and velocity v [m/s] give T = d / v and E = w d / v with d = {{
 
 - Takes float32 (N, {{ px }}, {{ px }}, {{ depth }}) in [0, 1]: {{ channels }}; a patch is {{ patch }} m wide, travel to the right.
 {% if extra_features -%}
-- Also takes: {{ extra_features }}: {{ extra_features }}: {{ extra_features }}: {{ extra_features }}.
+- Also takes: {{ extra_features }}: {{ extra_features }}: {{ extra_features }}: {{ extra_features }}: {{ extra_features }}.
 {% endif -%}
 - Velocity is the {{ velocity }} one; power is {{ energy }}; robot {{ robot }}.
 {%- if includes %}

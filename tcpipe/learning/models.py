@@ -30,7 +30,7 @@ from tcpipe.formats.integrity import compute_checksums, find_broken_checksums, r
 from tcpipe.formats.json_files import Json, digest, parse_typed
 from tcpipe.formats.parquet import read_table, write_table
 from tcpipe.formats.weights import read_arrays, write_arrays
-from tcpipe.learning.architecture import check_trainable, weight_forms
+from tcpipe.learning.architecture import check_trainable, list_weight_forms
 from tcpipe.learning.metrics import LEAST_VELOCITY_MPS
 from tcpipe.learning.model_card import EARLIER_SCHEMA_VERSION, KIND, SCHEMA_VERSION, ModelCard, is_current
 from tcpipe.learning.physics_model import PhysicsModel, list_physics_arrays, read_physics_model
@@ -80,7 +80,7 @@ class Model:
         check_trainable(self.card.architecture)
         from tcpipe.learning.network import make_resnet18  # noqa: PLC0415  torch takes seconds and half a gigabyte
 
-        arrays = read_arrays(self.place / WEIGHTS, weight_forms(self.card.architecture))
+        arrays = read_arrays(self.place / WEIGHTS, list_weight_forms(self.card.architecture))
         network = make_resnet18(self.card.architecture, seed=0, start=[0.0] * self.card.architecture.outputs)
         network.set_arrays(arrays, str(self.place / WEIGHTS))
         return network
@@ -199,12 +199,12 @@ class Model:
         numbers = standardize_features(self.card.extra_features, extra_features or empty_extra_features(len(patches)))
         if kind == "resnet18":
             return self.network.predict(append_planes(patches, numbers)) * np.array(self.card.scale, np.float32)
-        from tcpipe.learning.table_model import patch_features  # noqa: PLC0415  where it is needed, as is the next
+        from tcpipe.learning.table_model import compute_patch_features  # noqa: PLC0415  where it is needed, as is the next
 
         out = np.empty((len(patches), len(self.card.scale)), np.float32)
         for first in range(0, len(patches), _TOGETHER):
             rows = slice(first, first + _TOGETHER)
-            features = patch_features(
+            features = compute_patch_features(
                 patches[rows], channels=self.channels, class_count=self.classes.count, patch_m=self.patch_m
             )
             out[rows] = self.table.predict(np.column_stack([features, numbers[rows]]))

@@ -1,8 +1,9 @@
-"""The paper's network (section III-D): ResNet-18 with a head of two outputs, in plain torch; import it only where one is made.
+"""The paper's network (section III-D) and its training step, in plain torch: ResNet-18 with a head of two outputs, and Adam.
 
-He et al., Deep Residual Learning for Image Recognition, 2016, table 1: a 7 × 7 convolution and a pooling, both with stride 2, then two
-basic blocks each of 64, 128, 256 and 512 filters. The paper's was Keras's: steps of two pixels are padded as TensorFlow's "same" does, so
-that of an odd number of missing pixels the last one comes after; first weights and the batch norm's constants are Keras's, too.
+Import it only where a network is created. He et al., Deep Residual Learning for Image Recognition, 2016, table 1: a 7 × 7 convolution and
+a pooling, both with stride 2, then two basic blocks each of 64, 128, 256 and 512 filters. The paper used Keras: strides of two are padded
+as TensorFlow's "same" does, where the last of an odd number of padding pixels comes after the image; initial weights and the constants of
+batch normalisation are those of Keras.
 """
 
 from __future__ import annotations
@@ -201,19 +202,19 @@ class Trainer:
         self._optimizer.step()
         return float(loss.detach())
 
-    def memory(self) -> dict[str, NDArray[np.float32]]:
-        """Return a copy of what the optimiser remembers: of every weight its step and two moments."""
-        return {name: value.numpy(force=True).copy() for name, value in self._memory()}
+    def copy_optimizer_state(self) -> dict[str, NDArray[np.float32]]:
+        """Return a copy of the step and the two moments of every weight."""
+        return {name: value.numpy(force=True).copy() for name, value in self._list_state()}
 
-    def remember(self, arrays: Arrays, where: str) -> None:
-        """Put back what `memory` gave; `ModelError` if it is of another network."""
-        there = dict(self._memory())
+    def load_optimizer_state(self, arrays: Arrays, where: str) -> None:
+        """Restore what `copy_optimizer_state` returned; `ModelError` if it is of another network."""
+        there = dict(self._list_state())
         if {name: value.shape for name, value in arrays.items()} != {name: tuple(v.shape) for name, v in there.items()}:
             raise ModelError(f"{where}: holds the weights of another network; remove it and train the model again")
         for name, value in there.items():
             value.copy_(torch.from_numpy(np.array(arrays[name])))
 
-    def _memory(self) -> Iterator[tuple[str, Any]]:
+    def _list_state(self) -> Iterator[tuple[str, Any]]:
         for name, weight in self.network.named_parameters():
             for part, value in self._optimizer.state[weight].items():
                 yield f"{name}/{part}", value

@@ -1,4 +1,4 @@
-"""What a model says of a split beside what was measured there, whole or with layers replaced by noise."""
+"""Predictions of a model for a split, also with layers replaced by noise, and their table ``predictions.parquet``."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Fitting a model at once, without epochs: trees over features of every patch, or physics; each sample is told by the other folds, too."""
+"""Fitting a table model or physics, without epochs; models of the other folds also predict each sample."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from tcpipe.learning.fitting import (
     TrainingProgress,
     TrainingTimes,
     collect_labels,
-    label_scale,
+    find_label_scale,
 )
 from tcpipe.learning.physics_model import find_idle_power, fit_physics_model
-from tcpipe.learning.table_model import Floats, fit_table, patch_features
+from tcpipe.learning.table_model import Floats, compute_patch_features, fit_table
 
 logger = logging.getLogger("tcpipe")
 
@@ -55,7 +55,7 @@ def fit_at_once(task: Task, config: FitConfig, *, name: str, key: str, patch_m: 
     ------
     ModelError : LightGBM is not installed, or there are too few samples.
     """
-    split, scale, began = task.train, label_scale(task), time.perf_counter()
+    split, scale, began = task.train, find_label_scale(task), time.perf_counter()
     labels = collect_labels(split, task.outputs).astype(np.float64)
     weighed = config.inverse_variance_weights and split.weights.shape == labels.shape
     weights = split.weights.astype(np.float64) if weighed else np.ones_like(labels)
@@ -102,5 +102,5 @@ def compute_features(split: Split, patch_m: float, class_count: int) -> Floats:
     parts = []
     for first in range(0, len(split), _READ_TOGETHER):
         patches = split.batch(np.arange(first, min(first + _READ_TOGETHER, len(split))))[0]
-        parts.append(patch_features(patches, channels=split.channels, class_count=class_count, patch_m=patch_m))
+        parts.append(compute_patch_features(patches, channels=split.channels, class_count=class_count, patch_m=patch_m))
     return np.concatenate(parts)

@@ -1,6 +1,18 @@
-"""A table model: curves over slope and class, and boosted trees over all features of what these leave.
+"""A table model: curves over slope and class, and boosted trees over features of a patch for the residuals of these curves.
 
-Trees alone are flat beyond what they have seen, and with few samples coarse: the curves go on straight.
+Trees alone are constant outside the training range, and coarse with few samples; the curves continue as straight lines. LightGBM (extra
+``tables``) grows the trees; predicting needs only their arrays. The features come from the tensor alone:
+
+======== ==================================================================================================================
+channel  features
+======== ==================================================================================================================
+height   slope along travel and steepness across it [rad], curvature along and across [1/m] of the best paraboloid, standard
+         deviation of the ground from it (roughness) and highest minus lowest pixel (relief) [m]
+terrain  share of the patch that each class has
+others   mean, standard deviation (contrast), mean difference of neighbours along travel (texture)
+======== ==================================================================================================================
+
+Mirroring a patch across its travel changes none of them. A pixel without data counts as 0, as in the tensor.
 """
 
 from __future__ import annotations
@@ -25,7 +37,7 @@ _OF_GROUND, _OF_OTHERS = 6, 3
 """Features of a channel."""
 
 
-def patch_features(patches: Patches, *, channels: Sequence[str], class_count: int, patch_m: float) -> Floats:
+def compute_patch_features(patches: Patches, *, channels: Sequence[str], class_count: int, patch_m: float) -> Floats:
     """Return the features of tensors of shape (N, px, px, channels), shape (N, features).
 
     Parameters
@@ -84,20 +96,20 @@ def _compute_class_shares(values: Patches, class_count: int) -> Floats:
 Indices = NDArray[np.uint32]
 
 MOST_ROUNDS = 150
-"""Trees of an output at most; how many of them, the folds say."""
+"""Trees of an output at most; cross-validation over the folds chooses their number."""
 
 _RULES: Mapping[str, str | float | bool] = {
     "objective": "regression", "metric": "l2", "learning_rate": 0.1, "num_leaves": 15, "max_depth": 6, "min_data_in_leaf": 10,
     "lambda_l2": 1.0, "use_missing": False, "num_threads": 1, "deterministic": True, "force_col_wise": True, "verbosity": -1,
 }  # fmt: skip
-"""Of LightGBM: small trees that few steps walk, and the same bytes on any number of cores; nothing is drawn."""
+"""Of LightGBM: small trees; the same bytes on any number of cores; nothing random."""
 
 _ROWS_TOGETHER = 256
 
 
 @dataclass(frozen=True, slots=True)
 class Forest:
-    """Trees whose nodes lie one after another; an output is the sum of the leaves that its trees lead to."""
+    """Trees whose nodes are stored one after another; an output is the sum of one leaf of each of its trees."""
 
     feature: Indices
     """What a node asks for."""
@@ -139,7 +151,7 @@ _MOST_FEATURES, _MOST_DEPTH, _MOST_OUTPUTS = 100_000, 64, 1024
 
 
 def read_forest(arrays: Mapping[str, NDArray[Any]], where: str) -> Forest:
-    """Return the forest that `Forest.arrays` told of; `ModelError` if these are another model's."""
+    """Return the forest of `Forest.arrays`; `ModelError` if the arrays are of another model."""
     if arrays.keys() != {of.name for of in fields(Forest)}:
         raise ModelError(f"{where}: holds the weights of another model; remove it and train the model again")
     made = Forest(**arrays)
@@ -238,7 +250,7 @@ def _descend(  # noqa: PLR0917
     output: Indices,
     out: Floats,
 ) -> None:
-    """Add to ``out``, (N, outputs), the leaves that trees lead to; rows go down a tree side by side, none waiting for a branch."""
+    """Add the leaf values of each row to ``out``, (N, outputs); all rows descend a tree together, without branches."""
     at = np.empty(_ROWS_TOGETHER, np.uint32)
     for first in range(0, features.shape[0], _ROWS_TOGETHER):
         rows = features[first : first + _ROWS_TOGETHER]
@@ -279,7 +291,7 @@ def list_table_arrays(outputs: int) -> dict[str, ArrayForm]:
 def read_table_model(
     arrays: Mapping[str, NDArray[Any]], where: str, channels: Sequence[str], class_count: int
 ) -> TableModel:
-    """Return the model that `TableModel.arrays` told of; `ModelError` if these are another's."""
+    """Return the model of `TableModel.arrays`; `ModelError` if the arrays are of another model."""
     curves, rest = read_curves("linear", arrays, where)
     return TableModel(curves, read_forest(rest, where), tuple(channels), class_count)
 
@@ -293,7 +305,7 @@ def fit_table(
     channels: Sequence[str],
     class_count: int,
 ) -> tuple[TableModel, Floats]:
-    """Fit curves, and trees to what the curves of the other folds leave of each sample; return what the others said of it, too.
+    """Fit curves, and trees to the residuals of curves of the other folds; return also each sample's prediction by the other folds.
 
     Parameters
     ----------

@@ -52,7 +52,7 @@ _OPTIMIZERS: Mapping[ModelKind, str] = {"resnet18": "Adam", "boosting": "LightGB
 
 @dataclass(frozen=True, slots=True)
 class Variant:
-    """What another network than the paper's is trained on: its baselines, and its ablation when it is trained anew."""
+    """What a network for a baseline or for the retrained ablation is trained on."""
 
     channels: tuple[str, ...] = ()
     """Of the patch; empty: all that the dataset has."""
@@ -107,8 +107,8 @@ class TrainResult:
         )
 
 
-def model_for(dataset: str | Path) -> ModelKind:
-    """Return the kind of model that a dataset of this size is best served by, and say so."""
+def choose_model_kind(dataset: str | Path) -> ModelKind:
+    """Choose and log the kind of model that suits the number of training samples."""
     count = read_card(fetch_directory_by_range(dataset, by_range=is_shard)[0]).splits.get("train", 0)
     kind: ModelKind = "boosting" if count < FEW_SAMPLES else "resnet18"
     than, other = ("fewer than", "resnet18") if kind == "boosting" else ("not fewer than", "boosting")
@@ -131,18 +131,16 @@ def train(
     Parameters
     ----------
     dataset : what ``tcpipe build-dataset`` wrote.
-    out : the folder: new, or a model and nothing else, which is replaced unless it is whole and was trained on the same with the same
-        options; or a URL in a bucket, where it becomes the newest generation. While training runs its state is kept beside a folder, in
-        ``<out>.checkpoint``, and gone on from.
-    config : how.
-    variant : on what, where it is not the paper's network.
-    no_resume : leave an earlier state aside.
-    disposable : leave aside a state that is cut short or of another training, and say so: whoever asks for this network can make it again.
+    out : a new folder, or one with only a model, which is replaced unless it is complete and of the same dataset and options; or a URL in a
+        bucket, where it becomes the newest generation. ``<out>.checkpoint`` beside a folder keeps the state, so that a training continues.
+    config : the options.
+    variant : what another network than the paper's is trained on.
+    no_resume : ignore an earlier state.
+    disposable : replace a state that is damaged or of another training, with a warning; otherwise such a state is an error.
 
     Raises
     ------
-    DatasetError, ModelError : the dataset has nothing to train on or to weigh by, ``out`` is something else, or the state is cut short or
-        of another training.
+    DatasetError, ModelError, UsageError : the dataset has no samples or no weights, or ``out`` or the state is of something else.
     """
     rules, other = config or FitConfig(), variant or Variant()
     data = open_dataset(dataset, label=rules.label)
@@ -160,13 +158,13 @@ def train(
         and not no_resume
         and _is_whole(place)
     ):
-        _drop_what_is_done(checkpoint, key)
-        return _make_unchanged_result(place, known.training)
+        _remove_finished_state(checkpoint, key)
+        return _make_result(place, "unchanged", known.training, TrainingTimes())
     task = _add_extra_features(make_training_task(data, rules.fold, other), rules, data)
-    _refuse_strangers(place)
+    _reject_other_files(place)
     if rules.inverse_variance_weights and not other.energy_only:
-        _refuse_without_deviations(task, data)
-    if no_resume or (disposable and checkpoint.exists() and not _is_of(checkpoint, key)):
+        _require_deviations(task, data)
+    if no_resume or (disposable and checkpoint.exists() and not _can_continue(checkpoint, key)):
         checkpoint.unlink(missing_ok=True)
     fitted = _fit_model(task, rules, data, name=str(place), key=key, checkpoint=checkpoint)
     card = _make_card(data, task, rules, fitted, key)
@@ -176,26 +174,14 @@ def train(
         history="epoch,loss,held_out_loss\n" + history, readme=format_readme(card),
     )  # fmt: skip
     checkpoint.unlink(missing_ok=True)
-    progress = fitted.progress
-    return TrainResult(
-        str(place),
-        "done",
-        rules.model,
-        card.training.samples,
-        progress.epoch,
-        progress.best_epoch,
-        progress.best_loss,
-        fitted.device,
-        fitted.training_times_s,
-        fitted.training_times_s.feeding_share,
-    )
+    return _make_result(place, "done", card.training, fitted.training_times_s)
 
 
 def _train_into_bucket(dataset: str | Path, url: str, key: str, rules: FitConfig, other: Variant) -> TrainResult:
     """Train on this machine, and put the model to a URL."""
     known = read_model_card(fetch_directory(url)) if has_card(url) else None
     if known is not None and known.training.key == key:
-        return _make_unchanged_result(url, known.training)
+        return _make_result(url, "unchanged", known.training, TrainingTimes())
     with write_generation(url, CARD) as place:
         result = train(dataset, place, config=rules, variant=other)
     return replace(result, path=url)
@@ -217,7 +203,7 @@ def compute_dataset_checksum(card: DatasetCard) -> str:
 
 
 def make_training_task(data: Dataset, fold: int, variant: Variant) -> Task:
-    """Return what is fitted and what it is stopped by: a fold of train, never anything else; samples without a label are left out.
+    """Return labelled samples of train to fit, and the fold of train that stops the fitting.
 
     Raises
     ------
@@ -252,7 +238,7 @@ def make_training_task(data: Dataset, fold: int, variant: Variant) -> Task:
 
 
 def _add_extra_features(task: Task, rules: FitConfig, data: Dataset) -> Task:
-    """Return the task with what its model is told beside a patch; physics takes the turn in any case, a network of energy alone nothing."""
+    """Return the task with its model's extra features; physics always takes the turn, a network of energy alone none."""
     if rules.model != "physics" and (not rules.extra_features or len(task.outputs) == 1):
         return task
     wanted = ("turn_radpm",) if rules.model == "physics" else ("turn_radpm", "command_mps")
@@ -303,8 +289,8 @@ def _read_known_card(place: Path) -> ModelCard | None:
     return read_model_card(place)
 
 
-def _refuse_strangers(place: Path) -> None:
-    """Raise an error if replacing the folder would take something with it that is no part of a model."""
+def _reject_other_files(place: Path) -> None:
+    """Raise `UsageError` if the folder contains files that are not part of a model."""
     entries = {entry.name for entry in place.iterdir()} if place.is_dir() else set()
     strangers = sorted(name for name in entries - set(FILES) if not name.startswith("."))
     if strangers:
@@ -314,12 +300,12 @@ def _refuse_strangers(place: Path) -> None:
 
 
 def _find_checkpoint_path(place: Path) -> Path:
-    """Return where training keeps its state: beside the folder, also of one called ``.`` or ``..``."""
+    """Return the path of the state, beside the folder (which may be ``.`` or ``..``)."""
     named = place if place.name not in {"", ".."} else place.resolve()
     return named.with_name(f"{named.name}.checkpoint")
 
 
-def _is_of(checkpoint: Path, key: str) -> bool:
+def _can_continue(checkpoint: Path, key: str) -> bool:
     """Return whether training can continue from a checkpoint; warn where it cannot."""
     try:
         read_checkpoint(checkpoint, key)
@@ -329,8 +315,8 @@ def _is_of(checkpoint: Path, key: str) -> bool:
     return True
 
 
-def _drop_what_is_done(checkpoint: Path, key: str) -> None:
-    """Remove the state of a training that was ended between writing its model and removing its state."""
+def _remove_finished_state(checkpoint: Path, key: str) -> None:
+    """Remove the state of a training that was killed after it wrote its model."""
     with suppress(ModelError):
         read_checkpoint(checkpoint, key)
         checkpoint.unlink()
@@ -344,8 +330,8 @@ def _is_whole(place: Path) -> bool:
     return True
 
 
-def _refuse_without_deviations(task: Task, data: Dataset) -> None:
-    """Raise an error if labels are to be weighed by deviations that no sample has."""
+def _require_deviations(task: Task, data: Dataset) -> None:
+    """Raise `DatasetError` if no sample has a standard deviation of a label to weigh it by."""
     none = [label for label, weights in zip(task.outputs, task.fit.weights.T, strict=True) if not weights.any()]
     if none:
         raise DatasetError(
@@ -353,19 +339,12 @@ def _refuse_without_deviations(task: Task, data: Dataset) -> None:
         )
 
 
-def _make_unchanged_result(place: Path | str, told: Training) -> TrainResult:
+def _make_result(place: Path | str, status: str, training: Training, times: TrainingTimes) -> TrainResult:
     return TrainResult(
-        str(place),
-        "unchanged",
-        told.config.model,
-        told.samples,
-        told.epochs,
-        told.best_epoch,
-        told.held_out_loss,
-        told.device,
-        TrainingTimes(),
-        0.0,
-    )
+        path=str(place), status=status, model=training.config.model, samples=training.samples, epochs=training.epochs,
+        best_epoch=training.best_epoch, held_out_loss=training.held_out_loss, device=training.device, training_times_s=times,
+        feeding_share=times.feeding_share,
+    )  # fmt: skip
 
 
 def _make_card(data: Dataset, task: Task, config: FitConfig, fitted: Fitted, key: str) -> ModelCard:

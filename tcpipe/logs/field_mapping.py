@@ -148,11 +148,7 @@ def make_message_fields(role: str, values: Mapping[str, Floats], rows: int) -> d
     """Return the fields of the message that a role usually has, by dotted name, from those that are mapped.
 
     What is not mapped is what the message has for unknown: no orientation, no covariance, no altitude (NaN), a fix, zero elsewhere.
-
-    Parameters
-    ----------
-    values : by short name, in the units of `MAPPED`, shape (N,).
-    rows : N.
+    ``values`` are by short name, in the units of `MAPPED`, shape (rows,).
     """
     zero = np.zeros(rows)
     made: dict[str, NDArray[Any]] = {}
@@ -197,12 +193,9 @@ def find_topic(name: str, role: str, columns: Mapping[str, str]) -> tuple[str, s
 
 
 def parse_stamps_ns(values: NDArray[Any], unit: str) -> NDArray[np.int64] | str:
-    """Return numbers as [ns], or what is in the way of that in words; unit auto tells it by their size, since 1979.
+    """Return finite numbers, shape (N,), as [ns], or what is in the way of that in words.
 
-    Parameters
-    ----------
-    values : finite stamps, whole or not, shape (N,).
-    unit : auto, s, ms, us or ns.
+    ``unit`` is s, ms, us or ns; auto tells it by their size, since 1979.
     """
     if unit == "auto":
         middle = float(np.median(values)) if values.size else 0.0

@@ -66,10 +66,7 @@ def match_field_names(role: str, names: Sequence[str]) -> dict[str, str]:
 def propose_roles(topics: Iterable[Topic], settled: Collection[str]) -> Iterator[Finding]:
     """Yield a finding for each message type that no role knows and whose fields are called as those of a role that nothing can play.
 
-    Parameters
-    ----------
-    topics : the log's topics; what a definition in the log does not tell cannot be proposed.
-    settled : roles that are played, or that the recipe speaks of.
+    ``settled`` are roles that are played, or that the recipe speaks of; what a definition in the log does not tell cannot be proposed.
     """
     held = [of for of in topics if of.message_count != 0 and of.problem is None and not of.name.startswith(OVERLAY)]
     types = {topic.type_name for topic in held}

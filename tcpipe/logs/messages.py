@@ -549,10 +549,7 @@ _FACTORS = {
 def convert_imu_to_si(readings: Readings, units: str) -> Readings:
     """Return an IMU's readings in rad/s and m/s², variances included.
 
-    Parameters
-    ----------
-    readings : columns of the role imu, in the units of the message.
-    units : the recipe's ``imu_units``: si, deg (deg/s and m/s²), g (rad/s and g) or deg_g (deg/s and g).
+    ``units`` is the recipe's ``imu_units``: si, deg (deg/s and m/s²), g (rad/s and g) or deg_g (deg/s and g).
     """
     rate, force = _FACTORS[units]
     columns = dict(readings.columns)

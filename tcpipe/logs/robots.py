@@ -18,18 +18,7 @@ _SERIAL_NUMBER = re.compile(r"(?<![a-z0-9])([a-z]{1,2}\d{3})[_-]\d{4}(?!\d)")
 
 
 def find_robot(topics: Iterable[Topic], name: str | None, robots: Mapping[str, Robot]) -> tuple[str, str]:
-    """Return the robot's name and why it was taken.
-
-    Parameters
-    ----------
-    topics : the log's topics.
-    name : the profile's name where the user gave one.
-    robots : profiles by name.
-
-    Raises
-    ------
-    RecipeError : no profile has that name.
-    """
+    """Return the profile of a log, ``name`` where the user gave one, and why; `RecipeError` where no profile has that name."""
     if name is not None:
         if name not in robots:
             raise RecipeError(f"robot: no profile is called {name!r}; there are {', '.join(sorted(robots))}")
@@ -70,10 +59,6 @@ def find_robot_namespaces(candidates: Mapping[str, Sequence[str]]) -> dict[str, 
 
     Two namespaces are two robots when three roles or more, GNSS or wheels among them, could be played in either. A camera that brings an
     IMU and an odometry of its own, or a controller that takes commands and gives odometry, is no robot.
-
-    Parameters
-    ----------
-    candidates : topics that could play each role, by role.
     """
     roles_of: dict[str, set[str]] = {}
     for role, topics in candidates.items():

@@ -13,10 +13,11 @@ from tcpipe.tables.findings import Finding, Subject, make_finding
 
 @dataclass(frozen=True, slots=True)
 class Topic:
-    """One topic of a log, as its index tells; None where the index does not say.
+    """One topic of a log, or of a file of it, as the index tells; None where the index does not say.
 
     ``type_name`` is ``package/msg/Name`` for ROS 1 and ROS 2 alike; ``encoding`` is ``cdr``, ``ros1``, or what else the log names;
-    ``definition`` is the definition text in the log ("" where it has none); ``problem`` says why the topic cannot be read.
+    ``definition`` is the definition text in the log ("" where it has none), of the language ``schema_encoding``; ``problem`` says why the
+    topic cannot be read.
     """
 
     name: str
@@ -29,6 +30,7 @@ class Topic:
     problem: str | None = None
     silent_ns: int = 0
     """How long between the first and the last message there was none, as far as the index tells [ns]."""
+    schema_encoding: str = ""
 
     def joined(self, other: Topic) -> Topic:
         """Return this topic with the messages of ``other``, the same topic in another file."""

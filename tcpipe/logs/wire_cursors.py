@@ -69,18 +69,12 @@ class WalkResult:
 def walk(
     message: Record, data: NDArray[np.uint8], starts: Int64Array, ends: Int64Array, dialect: Dialect
 ) -> WalkResult:
-    """Find every field of every message.
+    """Find every field of every message; `RaggedError` where they are so unlike that they are cheaper to read one by one.
 
     Parameters
     ----------
-    message : the definition.
     data : bytes that hold all messages. In CDR the byte behind each message's header lies at a multiple of 8.
     starts, ends : where each message begins and ends, shape (N,), rising.
-    dialect : how they are serialised.
-
-    Raises
-    ------
-    RaggedError : the messages are so unlike that they are cheaper to read one by one.
     """
     fits = np.ones(len(starts), np.bool_)
     while fits.any():

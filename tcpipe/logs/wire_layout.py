@@ -63,13 +63,7 @@ ROS1 = Dialect("<", 0, 1, 0, 0, 0)
 
 
 def find_dialect(payload: bytes, encoding: str) -> Dialect:
-    """Return the dialect of a message, in CDR by its first bytes; `LayoutError` where these are none of CDR's plain ones.
-
-    Parameters
-    ----------
-    payload : the serialised message, or its beginning.
-    encoding : ``cdr`` or ``ros1``.
-    """
+    """Return the dialect of a message, in CDR by its first bytes; `LayoutError` where these are none of CDR's plain ones."""
     if encoding == "ros1":
         return ROS1
     if len(payload) < _CDR_HEADER or payload[0] != 0 or payload[1] not in _CDR_BYTE_ORDER:
@@ -144,12 +138,6 @@ class Layout:
 
 def walk_layout(message: Record, payload: bytes, *, encoding: str) -> Layout:
     """Walk one example message.
-
-    Parameters
-    ----------
-    message : the definition.
-    payload : the serialised example.
-    encoding : ``cdr`` or ``ros1``.
 
     Raises
     ------

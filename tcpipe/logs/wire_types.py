@@ -338,17 +338,7 @@ FieldTypes = tuple[tuple[str, FieldType], ...]
 
 
 def parse_msg(text: str, type_name: str) -> dict[str, FieldTypes]:
-    """Return the fields of each message in a definition text, by full name.
-
-    Parameters
-    ----------
-    text : the definition.
-    type_name : name of the first message in it, ``package/msg/Name``.
-
-    Raises
-    ------
-    MsgTextError : a line cannot be read.
-    """
+    """Return the fields of each message in a definition of ``type_name``, by full name; `MsgTextError` where a line is no field."""
     pieces = _SECTION.split(text.replace("\r\n", "\n") + "\n")
     names = [type_name, *map(normalize_type_name, pieces[1::2])]
     return {

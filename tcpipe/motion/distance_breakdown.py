@@ -14,7 +14,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -76,7 +75,7 @@ def compute_interval_length_m(stamp_ns: Ints, position_m: Floats, velocity_mps: 
     return np.where(compute_unexplained_m(stamp_ns, position_m, velocity_mps, piece) > JUMP_M, driven, length)
 
 
-def compute_interval_duration_s(stamp_ns: Ints, epoch: NDArray[np.integer[Any]]) -> Floats:
+def compute_interval_duration_s(stamp_ns: Ints, epoch: Ints) -> Floats:
     """Return the duration of every interval between rows, [s], shape (N - 1,); 0 across a clock epoch, whose step is no time."""
     return np.where(np.diff(epoch) == 0, np.diff(stamp_ns) * 1e-9, 0.0)
 

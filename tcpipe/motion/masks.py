@@ -65,7 +65,7 @@ def estimate_forward_acceleration_mps2(rows: MotionRows, *, window_s: float) -> 
 def find_accelerating(
     rows: MotionRows, acceleration_mps2: Floats, *, above_mps2: float, min_s: float, dilate_s: float
 ) -> Mask:
-    """Return rows of lasting acceleration or braking, widened on both sides: what can be told without a command topic."""
+    """Return rows of lasting acceleration or braking, widened on both sides: for logs without a command topic."""
     lasts = drop_short_runs(np.abs(acceleration_mps2) > above_mps2, rows.piece, min_rows=rows.count(min_s))
     return dilate_mask(lasts, rows.piece, before=rows.count(dilate_s), after=rows.count(dilate_s))
 

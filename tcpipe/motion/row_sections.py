@@ -6,7 +6,6 @@ A piece ends where the stamps make a step other than the track's period, or wher
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +18,7 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True, slots=True)
 class MotionRows:
-    """What tells how a robot moves: one value for each row of a regular track.
+    """Motion of a robot: one value for each row of a regular track.
 
     Attributes
     ----------
@@ -43,7 +42,7 @@ class MotionRows:
         return round(duration_s / self.period_s)
 
 
-def number_pieces(stamp_ns: Ints, epoch: NDArray[np.integer[Any]], *, period_ns: float) -> Ints:
+def number_pieces(stamp_ns: Ints, epoch: Ints, *, period_ns: float) -> Ints:
     """Return for each row the number of its uninterrupted piece, 0 upward, shape (N,).
 
     A piece ends at a clock epoch, and at a step that differs from ``period_ns`` by half of it or more.

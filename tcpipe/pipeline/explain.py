@@ -205,7 +205,7 @@ def _read_history(
         masks=tuple(_iterate_masks(run, *window)),
         rejected=tuple(_iterate_rejections(run, *window)),
         map=_map(source, sample, card.recipe),
-        recipe_differs_in=_find_changed_keys(card.recipe),
+        recipe_differs_in={key: of for key, of in flatten_recipe(card.recipe).items() if of != _DEFAULTS.get(key)},
         versions=Versions(card.tcpipe_version, __version__, card.data_model_version),
         made_from="segments" if streams is None else "streams",
     )
@@ -390,11 +390,6 @@ def _read_stored_layers(files: PatchFiles, card: DatasetCard, row: int) -> dict[
     place = find_rows_in_files(card, split)[split[row]][int((split[:row] == split[row]).sum())]
     piece = int(np.searchsorted(files.starts, place, side="right")) - 1
     return {name: pixels[place - files.starts[piece]] for name, pixels in files.read(piece, files.layers).items()}
-
-
-def _find_changed_keys(recipe: Recipe) -> dict[str, Setting]:
-    """Return the recipe's keys that are not at their default."""
-    return {key: value for key, value in flatten_recipe(recipe).items() if value != _DEFAULTS.get(key)}
 
 
 def flatten_recipe(recipe: Recipe) -> dict[str, Setting]:

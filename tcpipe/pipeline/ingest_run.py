@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Mapping
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
 from functools import partial
@@ -84,7 +83,8 @@ def _ingest(task: IngestTask, *, hashed: list[str], rows: list[RunFacts]) -> Ing
         log = opened or _open_log(task, stack)
         step("reading")
         streams, known = _read(store, run_id, before, log, task, sha256=sha256)
-        known = replace(known, tags={**(before.tags if before else _read_tags(state, run_id)), **task.tags})
+        tags = before.tags if before else next((row.tags for row in state.find_rows(run_id)), {})
+        known = replace(known, tags={**tags, **task.tags})
         if not known.streams:
             known = replace(known, streams=store.write_streams(run_id, streams, key=known.streams_key))
         store.write_run_json(run_id, known)
@@ -141,11 +141,6 @@ def _fuse_and_label(store: Store, run_id: str, streams: Streams, known: RunJson,
 def find_twin(known: RunJson | KnownLog | None, source: LogSource) -> str | None:
     """Return where else the same recording was ingested from, if it was."""
     return None if known is None or known.source.paths == source.origins else " + ".join(known.source.paths)
-
-
-def _read_tags(state: State, run_id: str) -> Mapping[str, str]:
-    """Return the tags that a run has, where its run.json is lost."""
-    return next((row.tags for row in state.find_rows(run_id)), {})
 
 
 def _read(

@@ -24,7 +24,7 @@ from tcpipe.report.colours import SPLIT_COLOURS
 from tcpipe.store import Store, find_store_above, is_store, run_at
 from tcpipe.tables.arrays import make_lines, to_texts
 from tcpipe.tables.columns import read_lonlat_deg, to_floats
-from tcpipe.terrain.patches import compute_footprints, patch_frames
+from tcpipe.terrain.patches import compute_footprints, make_patch_frames
 from tcpipe.terrain.projection import Projection, compute_area, parse_crs
 
 _REGIONS = {"train_test": SPLIT_COLOURS["train"], "unseen": SPLIT_COLOURS["unseen"], "exclude": SPLIT_COLOURS["buffer"]}
@@ -158,5 +158,5 @@ def _project_from_map(table: pa.Table, source: MapSource, card: DatasetCard) -> 
     area = compute_area(crs, source.bounds_m)
     place = Projection(parse_crs(card.recipe.read.gnss_crs, where="gnss_crs"), crs, area)
     start, end = (place.forward(read_lonlat_deg(table, name)) for name in ("start", "end"))
-    corners = compute_footprints(patch_frames(start, end, to_floats(table, "chord_m")), card.patch_m)
+    corners = compute_footprints(make_patch_frames(start, end, to_floats(table, "chord_m")), card.patch_m)
     return Projection(CRS.from_epsg(4326), crs, area).inverse(corners)

@@ -1,4 +1,1 @@
-"""What a trained model is for: the cost of a path, directional cost maps, least-cost paths.
-
-Nothing here knows how a model was trained: `cost_model.CostModel` is all that is asked of it.
-"""
+"""Costs of paths, directional cost maps and least-cost paths, by any model that satisfies `cost_model.CostModel`."""

@@ -180,17 +180,20 @@ def make_cost_map(
     UsageError, StoreError : ``out`` is something else, or cannot be written; the origin is far from the map.
     """
     check_model(model, source)
+    key = make_cost_map_key(model, source, cell_size_m)
     if is_url(out):
-        return _map_into_bucket(
-            model, source, str(out), cell_size_m=cell_size_m, origin_deg=origin_deg, step=step, cluster=cluster
-        )
+        url = str(out)
+        known = read_cost_map_card(fetch_directory(url)) if has_card(url) else None
+        if known is not None and (known.key, known.origin_deg) == (key, origin_deg):
+            return CostMapResult(url, "unchanged", known)
+        with write_generation(url, CARD) as place:
+            made = make_cost_map(
+                model, source, place, cell_size_m=cell_size_m, origin_deg=origin_deg, step=step, cluster=cluster
+            )
+        return replace(made, path=url)
     out = Path(out)
     clear_beside(out)
-    grid, key, origin_m = (
-        make_grid(source, cell_size_m),
-        make_cost_map_key(model, source, cell_size_m),
-        _find_origin_m(source, origin_deg),
-    )
+    grid, origin_m = make_grid(source, cell_size_m), _find_origin_m(source, origin_deg)
     if out.exists() and not (out / CARD).is_file() and (not out.is_dir() or any(out.iterdir())):
         raise UsageError(f"{out}: exists and is no cost map; give another directory")
     with _claim_spool(out) as place:
@@ -202,37 +205,13 @@ def make_cost_map(
             costs = open_cost_map(out, found)
         else:
             spool = _open_spool(place, key, grid)
-            _fill(model, source, spool, step, None if cluster is None else partial(_from_cluster, cluster, key))
+            _predict_missing(model, source, spool, key, step, cluster)
             costs = spool.costs
         with write_atomic_directory(out) as directory:
             card = replace(_write_files(model, source, key, directory, costs, origin_m=origin_m), origin_deg=origin_deg)
             write_sealed(directory / CARD, card)
         rmtree(place)
     return CostMapResult(str(out), "done", card)
-
-
-def _map_into_bucket(
-    model: CostModel,
-    source: MapFile,
-    url: str,
-    *,
-    cell_size_m: float,
-    origin_deg: tuple[float, float] | None,
-    step: Step,
-    cluster: Cluster | None,
-) -> CostMapResult:
-    """Make it on this machine, and put it to a URL."""
-    known = read_cost_map_card(fetch_directory(url)) if has_card(url) else None
-    if known is not None and (known.key, known.origin_deg) == (
-        make_cost_map_key(model, source, cell_size_m),
-        origin_deg,
-    ):
-        return CostMapResult(url, "unchanged", known)
-    with write_generation(url, CARD) as place:
-        made = make_cost_map(
-            model, source, place, cell_size_m=cell_size_m, origin_deg=origin_deg, step=step, cluster=cluster
-        )
-    return replace(made, path=url)
 
 
 def read_cost_map_card(path: Path) -> CostMapCard | None:
@@ -342,7 +321,7 @@ class _Task:
     blocks: tuple[Cells, ...]
 
 
-def _from_cluster(
+def _ask_cluster(
     cluster: Cluster, key: str, grid: MapGrid, todo: Sequence[Cells]
 ) -> Iterator[tuple[Cells, SegmentPredictions]]:
     """Yield what a cluster's workers say of each block, as their tasks end."""
@@ -369,14 +348,10 @@ def _answer(task: _Task) -> list[SegmentPredictions] | TcpipeError:
         return type(error)(*(f"{os.uname().nodename}: {problem}" for problem in error.problems))
 
 
-def _fill(
-    model: CostModel,
-    source: MapFile,
-    spool: _Spool,
-    step: Step,
-    elsewhere: Callable[[MapGrid, Sequence[Cells]], Iterator[tuple[Cells, SegmentPredictions]]] | None,
+def _predict_missing(  # noqa: PLR0917
+    model: CostModel, source: MapFile, spool: _Spool, key: str, step: Step, cluster: Cluster | None
 ) -> None:
-    """Ask the model about every cell that is not done."""
+    """Ask the model, here or on a cluster, about every cell that is not done."""
     costs = spool.costs
     frames = CellFrames(costs.grid, where=f"map {source.name}")
     missing = (spool.done == 0).reshape(costs.grid.rows, costs.grid.cols)
@@ -385,10 +360,10 @@ def _fill(
         logger.info("going on where it was: %.0f %% of the cells are done", 100.0 * (1.0 - missing.mean()))
     ready: list[Cells] = []
     answers: Iterator[tuple[Cells, SegmentPredictions]]
-    if elsewhere is None:
+    if cluster is None:
         answers = zip(todo, predict_segments(model, source, (frames.of(cells) for cells in todo)), strict=True)
     else:
-        answers = elsewhere(costs.grid, todo)
+        answers = _ask_cluster(cluster, key, costs.grid, todo)
     for number, (cells, found) in enumerate(answers, 1):
         costs.put(cells, found)
         ready.append(cells)
@@ -449,19 +424,14 @@ def _write(directory: Path, costs: CostGrid, origin_m: tuple[float, float]) -> d
     layout["affine"] = (grid.pixel_size_m, 0.0, grid.x_min_m, 0.0, -grid.pixel_size_m, grid.y_max_m)
     for name, unit in _QUANTITIES.items():
         bands = [*((band, unit) for band in (*_BAND_NAMES, "min", "mean")), ("best course, ccw from grid east", "deg")]
-        strip = _strip_of(costs, name)
+        strip = partial(_compute_strip, costs, name)
         write_cog(directory / f"{name}.tif", strip, dtype="float32", nodata=float("nan"), bands=bands, **layout)
     bands = [(band, "bits") for band in (*_BAND_NAMES, "all courses")]
-    write_cog(directory / "reasons.tif", _make_reason_reader(costs), dtype="uint16", nodata=None, bands=bands, **layout)
-    height = [("height", "m")]
     write_cog(
-        directory / "height.tif",
-        lambda first, last: costs.height_m[None, first:last],
-        dtype="float32",
-        nodata=float("nan"),
-        bands=height,
-        **layout,
+        directory / "reasons.tif", partial(_read_reasons, costs), dtype="uint16", nodata=None, bands=bands, **layout
     )
+    layout |= {"dtype": "float32", "nodata": float("nan"), "bands": [("height", "m")]}
+    write_cog(directory / "height.tif", lambda first, last: costs.height_m[None, first:last], **layout)
     scales = {name: _write_nav2(directory / f"{name}.yaml", costs, name, origin_m) for name in ("duration", "energy")}
     for name, scale in scales.items():
         write_text(directory / f"{name}.qml", make_raster_style(_MEAN_BAND, scale.lowest, scale.highest))
@@ -477,18 +447,16 @@ def _read_values(costs: CostGrid, name: str, first: int, last: int) -> Floats32:
     return np.asarray(values)
 
 
-def _strip_of(costs: CostGrid, name: str) -> Callable[[int, int], Floats32]:
-    def strip(first: int, last: int) -> Floats32:
-        values = _read_values(costs, name, first, last)
-        known = ~np.isnan(values)
-        some = known.any(axis=0)
-        least = np.where(known, values, np.inf).min(axis=0)
-        worth = np.where(known, -values if name == _GREATEST_IS_BEST else values, np.inf)
-        best = ANGLES_DEG[worth.argmin(axis=0)]
-        more = [np.where(some, band, np.nan) for band in (least, _mean(values), best)]
-        return np.concatenate([values, np.stack(more)]).astype(np.float32)
-
-    return strip
+def _compute_strip(costs: CostGrid, name: str, first: int, last: int) -> Floats32:
+    """Return a quantity of rows, and its minimum, mean and best course, shape (19, rows, cols)."""
+    values = _read_values(costs, name, first, last)
+    known = ~np.isnan(values)
+    some = known.any(axis=0)
+    least = np.where(known, values, np.inf).min(axis=0)
+    worth = np.where(known, -values if name == _GREATEST_IS_BEST else values, np.inf)
+    best = ANGLES_DEG[worth.argmin(axis=0)]
+    more = [np.where(some, band, np.nan) for band in (least, _mean(values), best)]
+    return np.concatenate([values, np.stack(more)]).astype(np.float32)
 
 
 def _mean(values: Floats32) -> NDArray[np.float64]:
@@ -499,12 +467,9 @@ def _mean(values: Floats32) -> NDArray[np.float64]:
     return np.asarray(np.where(count > 0, total / np.maximum(count, 1), np.nan))
 
 
-def _make_reason_reader(costs: CostGrid) -> Callable[[int, int], NDArray[np.uint16]]:
-    def strip(first: int, last: int) -> NDArray[np.uint16]:
-        bits = np.asarray(costs.reasons[:, first:last])
-        return np.concatenate([bits, np.bitwise_and.reduce(bits, axis=0)[None]])
-
-    return strip
+def _read_reasons(costs: CostGrid, first: int, last: int) -> NDArray[np.uint16]:
+    bits = np.asarray(costs.reasons[:, first:last])
+    return np.concatenate([bits, np.bitwise_and.reduce(bits, axis=0)[None]])
 
 
 _ROWS_TOGETHER = 256

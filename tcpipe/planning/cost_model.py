@@ -1,7 +1,4 @@
-"""What planning asks of a trained model: predictions, what they were learned from, and how wrong they were where it had not learned.
-
-A loaded model satisfies the protocol by having these members; planning imports no trainer.
-"""
+"""What planning needs of a trained model; `tcpipe.learning.models.Model` satisfies the protocol, and planning imports no trainer."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a model says of whole drives that were recorded and ingested, beside what they took."""
+"""Time and energy of whole ingested drives, measured and predicted, as files and a page."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ from tcpipe.tables.bits import flag_names
 from tcpipe.tables.catalogue import read_threshold
 from tcpipe.tables.columns import read_lonlat_deg, to_floats
 from tcpipe.tables.findings import PREDICTED, Finding, Subject, Verdict, judge, make_finding
-from tcpipe.terrain.patches import patch_frames
+from tcpipe.terrain.patches import make_patch_frames
 from tcpipe.terrain.tiles import MapReader, find_map_projection
 
 Floats = NDArray[np.float64]
@@ -188,7 +188,7 @@ def _predict_drive(model: CostModel, source: MapReader, segments: pa.Table, data
         * to_floats(segments, "duration_s")
         / to_floats(segments, "arc_length_m")
     )
-    frames = patch_frames(start, end, to_floats(segments, "chord_m"))
+    frames = make_patch_frames(start, end, to_floats(segments, "chord_m"))
     return join_predictions(predict_segments(model, source, iterate_batches(frames), turn_radpm=turn_radpm))
 
 
@@ -395,7 +395,8 @@ def _draw_sums(number: int, drive: DriveCost) -> Iterator[Plot]:
                 ("90 %", "@low{0.0} to @high{0.0}"),
             ],
         )
-        columns = dict(zip(("measured", "predicted", "low", "high"), _collect_columns(sums), strict=True))
+        names = ("measured", "predicted", "low", "high")
+        columns = {name: np.array([getattr(of, name) for of in sums], np.float64) for name in names}
         source = {"metres": distance_m, **columns}
         plot.figure.varea("metres", "low", "high", source=source, color=SPLIT_COLOURS["train"], alpha=0.2)
         plot.figure.hover.renderers = [
@@ -406,10 +407,3 @@ def _draw_sums(number: int, drive: DriveCost) -> Iterator[Plot]:
         plot.figure.yaxis.formatter.use_scientific = False
         first = plot
         yield plot
-
-
-def _collect_columns(sums: Sequence[IntervalComparison]) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
-    """Return measured, predicted, low, high, shape (4, N)."""
-    return np.array(
-        [[np.nan if v is None else v for v in (of.measured, of.predicted, of.low, of.high)] for of in sums]
-    ).T

@@ -32,7 +32,7 @@ from tcpipe.planning.segment_predictions import (
 )
 from tcpipe.tables.bits import flag_names
 from tcpipe.tables.columns import Column, TableSchema
-from tcpipe.terrain.patches import PatchFrames, compute_footprints, count_corners_on, patch_frames
+from tcpipe.terrain.patches import PatchFrames, compute_footprints, count_corners_on, make_patch_frames
 from tcpipe.terrain.projection import Projection, compute_area, make_metres_from_plane
 from tcpipe.terrain.tiles import MapReader, find_map_projection
 
@@ -294,7 +294,7 @@ class Pieces:
         """Return the patch of each piece; that of a shorter last one ends with it and reaches back over the piece before."""
         along = (self.end_xy_m - self.start_xy_m) / np.linalg.norm(self.end_xy_m - self.start_xy_m, axis=1)[:, None]
         start = self.end_xy_m - along * (chord_m / self.scale)
-        return patch_frames(start, self.end_xy_m, np.full(len(start), chord_m))
+        return make_patch_frames(start, self.end_xy_m, np.full(len(start), chord_m))
 
 
 def cut_path(xy_m: Floats, *, chord_m: float, scale: float) -> Pieces:

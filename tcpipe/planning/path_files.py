@@ -1,4 +1,4 @@
-"""`tcpipe predict-path`: a path from a file to its cost, and the table of its pieces to another."""
+"""The files of `tcpipe predict-path` (a table of path segments and its totals) and `tcpipe plan-path` (GeoJSON and a picture)."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from tcpipe.formats.geojson import LineFeature, check_lonlat, make_line_feature,
 from tcpipe.formats.integrity import compute_checksum, find_broken_seal, read_sealed_as, write_sealed
 from tcpipe.formats.json_files import convert_record, digest, read_as, write_json
 from tcpipe.formats.maps.map_files import MapFile, open_map
-from tcpipe.planning.cost_grid import LazyCostGrid, make_survey, read_survey
+from tcpipe.planning.cost_grid import make_survey, read_survey
 from tcpipe.planning.cost_map import CARD, CostMapCard, make_cost_map_key, open_cost_map, read_cost_map_card
 from tcpipe.planning.cost_model import CostModel, check_model
 from tcpipe.planning.path_cost import PathTotals, check_ending, compute_path_cost, write_pieces
@@ -87,15 +87,13 @@ class PathResult(NamedTotals):
 
     def __str__(self) -> str:
         """Return the totals, their intervals, and findings, as plain lines."""
-        above = ", net" if self.label_energy == "net" else ""
+        above = ", above standing" if self.label_energy == "net" else ""
         findings = format_findings(find_doubts(self, Subject("file", self.path.name)))
-        return clean_lines((f"{self.path}: {format_cost(self)}{above}", *findings, *self._out_lines()))
-
-    def _out_lines(self) -> tuple[str, ...]:
-        if self.out is None:
-            return ()
-        same = "; nothing to do: it is made from the same path, model and map"
-        return (f"{self.out}: {self.pieces} pieces{same if self.status == 'unchanged' else ''}",)
+        lines = [f"{self.path}: {format_cost(self)}{above}", *findings]
+        if self.out is not None:
+            same = "; nothing to do: it is made from the same path, model and map"
+            lines.append(f"{self.out}: {self.pieces} pieces{same if self.status == 'unchanged' else ''}")
+        return clean_lines(lines)
 
 
 def format_cost(of: PathTotals) -> str:
@@ -301,7 +299,10 @@ def plan(
     key = digest({**made_from, "cost_map": card is not None, "version": _PLAN_VERSION})
     if (found := _read_plans(out, picture, key)) is not None:
         return PlanResult(request.objective, out, picture, "unchanged", found)
-    survey = _open_survey(model, source, request, card)
+    if request.cost_map is None or card is None:
+        survey = make_survey(model, source, request.cell_size_m)
+    else:
+        survey = read_survey(model, source, open_cost_map(request.cost_map, card))
     wanted = (request.objective, *(name for name in OBJECTIVES if drawn and name != request.objective))
     plans = {
         name: plan_path(survey, start, goal, name, allow_extrapolation=request.allow_extrapolation, step=step)
@@ -345,13 +346,6 @@ def _read_card(path: Path, model: CostModel, source: MapFile) -> CostMapCard:
             f"{path}: is made from another model or map than {model.name} and {source.name}; make it again with tcpipe cost-map"
         )
     return card
-
-
-def _open_survey(model: CostModel, source: MapFile, request: PlanRequest, card: CostMapCard | None) -> LazyCostGrid:
-    """Return what a cost map knows, or nothing yet."""
-    if request.cost_map is None or card is None:
-        return make_survey(model, source, request.cell_size_m)
-    return read_survey(model, source, open_cost_map(request.cost_map, card))
 
 
 def _read_plans(out: Path, picture: Path | None, key: str) -> dict[Objective, PlanTotals] | None:

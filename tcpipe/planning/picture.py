@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from tcpipe.formats.atomic import write_atomic_file
 from tcpipe.planning.plan import Plan
 from tcpipe.tables.columns import to_floats
-from tcpipe.terrain.tiles import MapReader, level_for, read_window
+from tcpipe.terrain.tiles import MapReader, choose_level, read_window
 
 Array = NDArray[np.float64]
 
@@ -120,7 +120,7 @@ class _Backdrop:
 
     def __init__(self, source: MapReader, bounds: tuple[float, float, float, float]) -> None:
         left, bottom, right, top = bounds
-        level = level_for(source, max(right - left, top - bottom) / _PANEL_PX)
+        level = choose_level(source, max(right - left, top - bottom) / _PANEL_PX)
         corners = level.grid.px_from_xy(np.array([(left, top), (right, bottom)])) + 0.5
         (col0, row0), (col1, row1) = np.floor(corners[0]).astype(int), np.ceil(corners[1]).astype(int)
         step = max(1, max(row1 - row0, col1 - col0) // _PANEL_PX)

@@ -1,9 +1,8 @@
-"""The least-cost path between two points (the paper's purpose, section I), proved against all the ground that was not looked at.
+"""The least-cost path between two points (paper, section I), proved to be the best without predicting the whole map.
 
-A path over a point p is at least as long as the straight ways start-p-goal. So no point outside an ellipse can lie on a path shorter than
-one that is known: the ellipse is looked at, without predictions, and grows until the shortest way is proved. Then the model is asked, first
-about the ground of the shortest way and a little of every class, then about whatever could lie on a better path than the best so
-far, the likeliest first, until nothing could.
+A path over a point p is at least as long as the straight lines start-p-goal, so a path shorter than a known one lies in an ellipse. The
+search judges the ground in this ellipse without predictions and enlarges it until the shortest path is proved. Then it asks the model about
+the ground of the shortest path and some cells of every class, and then about cells that could lie on a better path, until there are none.
 """
 
 from __future__ import annotations
@@ -331,11 +330,9 @@ _CLASSES = 256
 
 
 def probe_cells(class_id: Classes, open_: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return cells to be predicted before anything is said of a class: squares of three by three around some of it, spread evenly.
+    """Return cells to predict first: for each class squares of three by three cells, spread evenly over it.
 
-    Parameters
-    ----------
-    class_id, open_ : of each cell, and whether it may be driven over as far as is known, shape (rows, cols).
+    ``class_id`` and ``open_`` (whether a cell may be driven over as far as is known) have shape (rows, cols).
     """
     rows, cols = class_id.shape
     found = np.zeros(class_id.shape, np.bool_)
@@ -350,14 +347,10 @@ def probe_cells(class_id: Classes, open_: NDArray[np.bool_]) -> NDArray[np.bool_
 def find_possible_gain(
     steps: Steps, class_id: Classes, found: LeastCostPath | None, start: int, goal: int
 ) -> tuple[Floats, NDArray[np.bool_]]:
-    """Return the least that a path over each cell can cost, shape (cells,), and whether that is less than the path that was found.
+    """Return the least that a path over each cell can cost, shape (cells,), and whether that is less than ``found`` costs.
 
-    Parameters
-    ----------
-    steps : every step that may be possible; those with a cost are known.
-    class_id : of each cell, shape (rows, cols).
-    found : the best path over known steps, None if there is none.
-    start, goal : flat indices of cells.
+    ``steps`` are all steps that may be possible, with a cost where it is known; ``class_id`` has shape (rows, cols); ``found`` is the best
+    path over known steps; ``start`` and ``goal`` are flat indices of cells.
     """
     known = np.isfinite(steps.cost)
     sure = Steps(steps.begin[known], steps.end[known], steps.cost[known], steps.length_m[known], steps.rise_m[known])

@@ -1,10 +1,12 @@
 """Least-cost paths over a cost grid: scipy's Dijkstra on a sparse graph of 16 courses (ADR-27).
 
-The cost of a step is the integral of the cost a metre, along the step's course, over the cells it crosses. Down a slope energy comes back
-and a metre may cost less than nothing, which Dijkstra forbids. A potential that is proportional to height takes the grade out: with
-c' = c - k (h_b - h_a) all paths from a start to a goal change by the same amount, so the best one stays the best, and k is chosen so that
-the cheapest metre is as dear as it can be. What is negative even then, a metre that gives back more than it was lifted for, is taken as
-nothing, and counted.
+The cost of a step is the integral of the cost a metre, along the step's course, over the cells it crosses. Downhill a metre may cost less
+than zero, which Dijkstra forbids. A potential proportional to height removes the grade: c' = c - k (h_b - h_a) changes all paths from a
+start to a goal by the same amount, so the best path stays the best. k maximises the cost of the cheapest metre; steps that stay negative
+count as zero, and `LeastCostPath` has their number.
+
+Turns cost ``M |turn|`` beyond those of the model's segments, which were nearly straight: the torque of a skid-steered robot hardly depends
+on its turn rate (ADR-13). Turns take no time here.
 """
 
 from __future__ import annotations
@@ -173,7 +175,7 @@ class Turning:
 
 
 def find_turning(fit: PhysicsFit | None, classes: ClassTable) -> Turning | None:
-    """Return what turning costs by a fit; a class that it does not name costs the mean of those that it does. None without such a term."""
+    """Return what turning costs by a fit, None without such a term; a class without a term costs the mean of the others."""
     found = {} if fit is None else {of.terrain: of.value for of in fit.terms if of.term == "turning"}
     if fit is None or not found:
         return None
@@ -184,13 +186,9 @@ def find_turning(fit: PhysicsFit | None, classes: ClassTable) -> Turning | None:
 
 
 def compute_turns(start_xy_m: Floats, end_xy_m: Floats) -> Floats:
-    """Return how far each of N pieces of a path turns [rad], shape (N,): half of the change of course at either of its ends.
+    """Return how far each of N path segments turns [rad], shape (N,): half of the change of course at either of its ends, shape (N, 2).
 
-    The chords' courses are compared, not those of the drawn line, so that the jitter of its points is no turn.
-
-    Parameters
-    ----------
-    start_xy_m, end_xy_m : of the pieces, in order, shape (N, 2).
+    It compares the courses of chords, so that jitter of the drawn points is no turn.
     """
     east, north = (end_xy_m - start_xy_m).T
     change = np.abs(wrap_to_pi(np.diff(np.arctan2(north, east))))
@@ -199,9 +197,6 @@ def compute_turns(start_xy_m: Floats, end_xy_m: Floats) -> Floats:
 
 Ints = NDArray[np.int64]
 
-_LEAST = 1e-9
-"""What costs nothing costs this: a zero is no edge to scipy."""
-
 _TURNS_RAD = np.radians(np.diff(np.append(ANGLES_DEG, 360.0)))
 """From each course to the next [rad], shape (16,)."""
 
@@ -209,14 +204,9 @@ _TURNS_RAD = np.radians(np.diff(np.append(ANGLES_DEG, 360.0)))
 def find_least_turning_path(
     steps: Steps, cols: int, start: int, goal: int, joule_per_rad: Floats
 ) -> LeastCostPath | None:
-    """Return the path of least energy, that of its turns included; None where there is none.
+    """Return the path of least energy with turns, None where there is none.
 
-    Parameters
-    ----------
-    steps : all steps, with a cost each [J].
-    cols : columns of the grid.
-    start, goal : flat indices of cells.
-    joule_per_rad : what a turn costs in each cell, shape (cells,).
+    ``steps`` cost joules on a grid of ``cols`` columns; ``start`` and ``goal`` are flat indices; ``joule_per_rad`` has shape (cells,).
     """
     cells, place = np.unique(np.concatenate([steps.begin, steps.end]), return_inverse=True)
     if not np.isin([start, goal], cells).all():

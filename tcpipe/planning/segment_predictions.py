@@ -1,4 +1,8 @@
-"""What a model says of metres of ground: sampled, judged, predicted, batch by batch; the next batch is sampled while the model answers."""
+"""Predictions of a model for 1 m segments of ground, and the reasons against each: no data, not traversable, outside the training range.
+
+A prediction outside the training range is a guess, so every segment has its reasons. The ranges are the smallest and largest values of
+training, not quantiles. Segments are processed in batches; a thread samples the next batch while the model predicts.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +22,7 @@ from tcpipe.terrain.classes import NODATA_ID
 from tcpipe.terrain.layers import HEIGHT_STEP_M
 from tcpipe.terrain.patches import PatchFrames, compute_footprints, count_corners_on
 from tcpipe.terrain.sampling import Patches, compute_relief_m, sample_patches
-from tcpipe.terrain.tiles import MapReader, TilePool, level_for
+from tcpipe.terrain.tiles import MapReader, TilePool, choose_level
 
 LANE_M = 0.7
 """Width of the strip that a robot needs, about the paper's Husky (0.67 m) [m]."""
@@ -149,7 +153,10 @@ def predict_segments(
     Without ``ask`` the ground is judged alone: no predictions. ``turn_radpm`` is how far a metre of each frame turns, of all batches one
     after another; without it all turn as usual.
     """
-    centring, tiles = fit_bias_correction(model.residuals), TilePool(level_for(source, model.patch_m / model.patch_px))
+    centring, tiles = (
+        fit_bias_correction(model.residuals),
+        TilePool(choose_level(source, model.patch_m / model.patch_px)),
+    )
 
     def sampled(frames: PatchFrames, first: int) -> tuple[Patches, NDArray[np.bool_], Floats | None]:
         chord_m = np.full(len(frames.centre_xy_m), model.chord_m)

@@ -1,13 +1,11 @@
-"""From steps along 16 courses to straight lines: a path's bends are left out where the line between two of its points is cheaper.
+"""Replacing steps along 16 courses by straight lines where these are cheaper.
 
-Dijkstra's path is made of 16 courses and up to 2.8 % longer than need be. Of all paths over some of its points, joined by straight lines,
-the cheapest is found; a line's cost is integrated over the cells it crosses, at its own course, interpolated between the two nearest. It
-never costs more than the steps, and crosses no cell that they could not.
+Dijkstra's path has 16 courses and is up to 2.8 % longer than necessary. This finds the cheapest path over a subset of its points, joined by
+straight lines. The cost of a line is its integral over the cells that it crosses, interpolated between the two nearest courses. The result
+never costs more than the steps and crosses no cell that is closed to them.
 """
 
 from __future__ import annotations
-
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,21 +27,11 @@ def find_best_lines(  # noqa: PLR0917
     so_far: NDArray[np.float64],
     before: NDArray[np.int64],
 ) -> None:
-    """Find, for each point of a path, the earlier one from which a straight line to it makes the path so far cheapest.
+    """Write the cost from the first point to each point of a path, and where its last line begins, to ``so_far`` and ``before``, (P,).
 
-    Parameters
-    ----------
-    per_metre, open_
-        Cost a metre, and whether it may be driven, shape (16, rows, cols).
-    angles, metres
-        Directions of the courses, counter-clockwise from the grid's east [rad], rising from 0, and ground metres a cell along each, (16,).
-    points
-        x along columns, y along rows [cells], centres are integers, shape (P, 2).
-    window
-        How many points back a line may begin.
-    so_far, before
-        Out, shape (P,): cost from the first point, and the point that the last line begins at. A line between neighbours is always
-        allowed: it is a step of the path.
+    ``per_metre`` and ``open_`` have shape (16, rows, cols). ``angles``, (16,), are the courses [rad], counter-clockwise from the grid's
+    east, rising from 0; ``metres``, (16,), the ground metres a cell along each. ``points`` [cells] are as in `straighten_path`. A line
+    begins at most ``window`` points earlier; a line between neighbours is a step of the path and always allowed.
     """
     so_far[0], before[0] = 0.0, 0
     for j in range(1, points.shape[0]):
@@ -56,7 +44,13 @@ def find_best_lines(  # noqa: PLR0917
 
 @compile_kernel
 def _compute_line_cost(  # noqa: PLR0917
-    per_metre: Any, open_: Any, angles: Any, metres: Any, begin: Any, end: Any, is_step: Any
+    per_metre: NDArray[np.float32],
+    open_: NDArray[np.bool_],
+    angles: NDArray[np.float64],
+    metres: NDArray[np.float64],
+    begin: NDArray[np.float64],
+    end: NDArray[np.float64],
+    is_step: bool,  # noqa: FBT001
 ) -> float:
     """Return the cost of a straight line, of its course by interpolation between the two nearest; infinite where it may not be driven."""
     east, north = end[0] - begin[0], begin[1] - end[1]
@@ -128,7 +122,7 @@ def straighten_path(
 
 
 def _choose_window(points: NDArray[np.float64]) -> int:
-    """Return how many points back lines may begin, so that the work stays bounded."""
+    """Return how many points earlier a line may begin, which bounds the work."""
     steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
     each = max(float(steps.mean()), 1.0) * SAMPLES_A_CELL / 2.0
     return int(np.clip(np.sqrt(_MOST_SAMPLES / (len(points) * each)), 2, len(points)))

@@ -81,10 +81,10 @@ def _integrate_to(each: Rail, at_ns: Ints, rule: Rule) -> Floats:
 
 
 FEWEST_ROWS = 40
-"""Rows of a standing robot that tell its power."""
+"""Fewest rows of a stationary robot."""
 _QUARTERS = 4
 _UNSEEN_SHARE = 0.1
-"""Of the power: how far one second of standing may lie from the rest of the run, which only further seconds tell. The pack of FoMo's robot,
+"""Of the power: how far one stationary second may be from the rest of the run. The pack of FoMo's robot,
 which stands once for seconds, gives 12 % of that more while driving than the drives take (docs/explanation/real-data.md)."""
 
 
@@ -131,7 +131,7 @@ def _split_halts(halts: list[Floats], rows: int) -> list[Floats]:
 
 
 def _estimate_noise_variance(seconds: list[Floats]) -> float:
-    """Return the variance [W²] that noise gives the mean of a second: the means of its quarters tell, however rows hang together."""
+    """Return the variance [W²] that noise gives the mean of a second: estimated from the means of its quarters, however rows correlate."""
     found = [
         float(np.var([quarter.mean() for quarter in np.array_split(each, _QUARTERS)], ddof=1)) / _QUARTERS
         for each in seconds

@@ -125,7 +125,7 @@ def _select_used_samples(stamp_ns: Stamps, start_ns: Stamps, end_ns: Stamps) -> 
 
 
 def _select_stationary_samples(signal: Samples, still_ns: Stamps, *, averaged: bool) -> NDArray[np.bool_]:
-    """Return the samples of a robot that stands, not within 0.2 s of its moving; of averages those whose period is such."""
+    """Return the samples of a stationary robot, 0.2 s from any motion; of averages those whose whole period is such."""
     edge_ns = round(_SETTLED_S / _NS)
     still = _is_inside(signal.stamp_ns, still_ns, edge_ns)
     if averaged:
@@ -144,7 +144,7 @@ def _is_inside(at_ns: Stamps, span_ns: Stamps, edge_ns: int) -> NDArray[np.bool_
 
 
 def _estimate_rounding(signal: Samples, start_ns: Stamps, end_ns: Stamps) -> Floats:
-    """Return the variance of a signal that stands on one level of its resolution, shape (M,): the error of all its samples is one."""
+    """Return the variance of a signal that stays on one level of its resolution, shape (M,): all its samples have one error."""
     changes = np.concatenate(([0], np.cumsum(np.diff(signal.value) != 0)))
     first, last = (np.clip(np.searchsorted(signal.stamp_ns, at) - 1, 0, len(changes) - 1) for at in (start_ns, end_ns))
     duration_s = (end_ns - start_ns) * _NS
@@ -262,7 +262,7 @@ _PRIOR_SAMPLES = 4.0  # that the whole record counts for beside those near a seg
 _CALM_S, _CALM_SAMPLES = 1.5, 8  # shorter than a halt, longer than what vibration correlates over
 _FEWEST_STILL = 8
 _MOST_OF_CALMEST = 2.0
-"""What scatters by more than this, against the calmest stretches, while a robot stands is more than the error of samples."""
+"""A stationary scatter above this, relative to the calmest spans, is more than the error of samples."""
 _NOT_NOISE = 16.0
 """A square beyond so many variances is no noise: of a normal variate one in 16,000."""
 _SIEVES = 5
@@ -364,7 +364,7 @@ def compute_curvature(signal: Samples) -> Floats:
 
 
 def _fit_sizes(made: Floats, seen: Floats, weight: Floats) -> list[float]:
-    """Return the non-negative size of each row of ``made``, shape (J, S), whose sum is nearest to what is seen."""
+    """Return the non-negative size of each row of ``made``, shape (J, S), whose sum is nearest to ``seen``."""
     fitted: list[float] = solve_non_negative((made * weight).T, seen * weight).tolist()
     return fitted
 

@@ -48,8 +48,8 @@ class PowerReadings:
     """Whether it averages is not known; ``averaged`` is what to assume where the motion does not show it either."""
     findings: tuple[Finding, ...] = ()
     current_sign: str | None = None
-    """What a drawn current is counted as, and what tells it; None without power."""
-    other_loads: tuple[str, ...] = ()
+    """The sign of a drawn current, and its source; None without power."""
+    includes: tuple[str, ...] = ()
     """What the currents feed besides the drives."""
 
     @property
@@ -102,14 +102,14 @@ def read_power(
     sign, of_sign, told_by = _sign(rails, log_times, sources, current_sign)
     if sign == 0:
         return PowerReadings(findings=of_sign)
-    other_loads = tuple(dict.fromkeys(of.other_loads for of in sources if of.other_loads))
-    loads = (make_finding("power-includes-loads", _POWER, names={"loads": name}) for name in other_loads)
+    includes = tuple(dict.fromkeys(of.other_loads for of in sources if of.other_loads))
+    loads = (make_finding("power-includes-loads", _POWER, names={"loads": name}) for name in includes)
     findings += [*of_sign, *odd, *loads]
     signed = {topic: [apply_sign(rail, sign) for rail in found] for topic, found in rails.items()}
     counts = any(of.energy for of in sources)
     unknown = any(of.averaging_unknown for of in sources) and not counts
     averaged = counts or any(of.averaged for of in sources)
-    return PowerReadings(signed, averaged, unknown, tuple(dict.fromkeys(findings)), told_by, other_loads)
+    return PowerReadings(signed, averaged, unknown, tuple(dict.fromkeys(findings)), told_by, includes)
 
 
 @dataclass(frozen=True, slots=True)
@@ -259,7 +259,7 @@ def _exclude_implausible(rails: Rails) -> tuple[dict[str, list[RailReadings]], l
 def _sign(
     rails: Rails, log_times: Mapping[str, Floats], sources: list[PowerSource], given: CurrentSign
 ) -> tuple[int, tuple[Finding, ...], str]:
-    """Return what makes a drawn current positive (0 where the record contradicts its type), findings, and what tells it."""
+    """Return the sign that makes a drawn current positive (0 where the record contradicts its type), findings, and its source."""
     if given != "auto":
         return (1 if given == "drawn_positive" else -1), (), f"{given} (recipe)"
     time_s, whole = _sum_currents(rails, log_times)
@@ -294,7 +294,7 @@ def _find_sign(code: str, names: Mapping[str, str], net: float, *signs: str) -> 
 
 
 def _weight_s(time_s: Floats) -> Floats:
-    """Return the time that each row stands for [s]; beside a hole no more than usual, or one row would outweigh a run."""
+    """Return the time of each row [s]; beside a gap no more than usual, or one row would outweigh a run."""
     if time_s.size < 2:
         return np.ones_like(time_s)
     between = np.gradient(time_s)

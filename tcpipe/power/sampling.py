@@ -21,7 +21,7 @@ _FEWEST_INTERVALS = 20
 _LEAST_MESSAGES = 1.5
 """For which a reading lasts."""
 _LONGEST_INTERVAL = 4
-"""In reading periods: longer ones, as of a robot that stands, show no period."""
+"""In reading periods: longer ones, as of a stationary robot, show no period."""
 _REGULAR_SHARE = 0.9
 _SINGLE_SHARE = 0.5
 """Of the intervals, one reading period long."""

@@ -48,7 +48,7 @@ BATTERY_STATE = "sensor_msgs/msg/BatteryState"
 _PERCENTAGE = "percentage"
 
 FLOAT_TYPES = ("std_msgs/msg/Float32", "std_msgs/msg/Float64")
-"""A voltage or a current alone, told apart by the topic's name."""
+"""A voltage or a current alone; the topic's name says which."""
 
 
 def find_sources(
@@ -283,7 +283,7 @@ Stamps = NDArray[np.int64]
 
 @dataclass(frozen=True, slots=True)
 class Counter:
-    """A counter row by row: energy since the first row [J], shape (N,), NaN where a row tells none, and how often it was reset before."""
+    """A counter row by row: energy since the first row [J], shape (N,), NaN where a row has none, and how often it was reset before."""
 
     energy_joule: Floats
     resets: NDArray[np.int64]

@@ -1,4 +1,4 @@
-"""What can be wrong with the simulated sensors; each fault is switched on alone, and how strong it is stands in `sensors`.
+"""Faults of the simulated sensors; each is switched on alone, and `sensors` states its size.
 
 Switching one changes nothing of another: every noise has a random stream of its own.
 """
@@ -35,7 +35,7 @@ class Faults:
     imu_vibration: bool = False
     """Shaking while driving."""
     imu_mounting: bool = False
-    """The unit is turned, and sits off base_link."""
+    """The unit is turned, and not at base_link."""
     imu_yaw_offset: bool = False
     """Its orientation, where it gives one, has a magnetic yaw error."""
     visual_noise: bool = False

@@ -51,7 +51,7 @@ class Recorder:
     gnss: Literal["fix", "nmea"] = "fix"
     """NavSatFix, or GGA sentences."""
     placements: bool = True
-    """Whether /tf_static tells where the sensors sit."""
+    """Whether /tf_static states the extrinsics of the sensors."""
 
 
 def make_streams(

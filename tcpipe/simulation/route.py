@@ -55,7 +55,7 @@ class Turn:
 
 @dataclass(frozen=True, slots=True)
 class Stuck:
-    """The wheels turn, the robot stands."""
+    """The wheels turn, the robot is stationary."""
 
     duration_s: float
 
@@ -198,7 +198,7 @@ class Wander:
     start_m: tuple[float, float]
     """From the site's south-west corner."""
     shares: tuple[tuple[int, float], ...] = ((4, 0.51), (5, 0.09), (6, 0.20), (7, 0.20))
-    """Wanted share of the way by class id (the paper's by default)."""
+    """Wanted share of the distance by class id (the paper's by default)."""
     x_range_m: tuple[float, float] | None = None
     """Kept between these, from the site's west border; None: the whole site."""
     margin_m: float = 5.0

@@ -61,7 +61,7 @@ class Gnss:
     """East and north."""
     vertical_std_m: float = 0.025
     covariance: Literal["known", "unknown"] = "known"
-    """Whether the message tells its own deviation."""
+    """Whether the message states its standard deviation."""
     mounting: Mounting = Mounting((0.1, 0.0, 0.9))
     outlier_share: float = 0.01
     outlier_m: float = 1.5
@@ -181,7 +181,7 @@ class Sensors:
     doppler: Doppler | None = None
 
     def mounted(self, faults: Faults) -> Sensors:
-        """Return the sensors where they really sit: at base_link unless the fault that moves them is on."""
+        """Return the sensors with their true extrinsics: at base_link unless the fault that moves them is on."""
         in_place = {"gnss": faults.gnss_lever_arm, "doppler": faults.gnss_lever_arm, "imu": faults.imu_mounting}
         carried = {name: of for name, kept in in_place.items() if not kept and (of := getattr(self, name)) is not None}
         return replace(self, **{name: replace(of, mounting=AT_BASE_LINK) for name, of in carried.items()})
@@ -270,7 +270,7 @@ def read_doppler(truth: Truth, sensor: Doppler, faults: Faults, noise: Noise) ->
 
 
 def read_wheels(truth: Truth, sensor: Wheels, faults: Faults, noise: Noise) -> Reading:
-    """Return velocity_mps and yaw_rate_radps as the wheels tell them, and their dead reckoning x_m, y_m, yaw_rad."""
+    """Return velocity_mps and yaw_rate_radps by the wheels, and their dead reckoning x_m, y_m, yaw_rad."""
     stamp = _sample_times(truth, sensor.rate_hz, noise("wheels.phase"))
     at = truth.at(stamp)
     velocity = at.wheel_velocity_mps if faults.wheel_slip else at.forward_velocity_mps

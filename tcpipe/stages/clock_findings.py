@@ -87,7 +87,7 @@ def _find_offset(found: ClockOffsets, role: str, offset: RoleOffset, streams: St
 
 
 def _select_known(each: RoleOffset | Pair) -> dict[str, Any]:
-    """Return the fields by name, None for what is not known."""
+    """Return the fields by name, None for unknown values."""
     return {name: None if isinstance(v, float) and not math.isfinite(v) else v for name, v in asdict(each).items()}
 
 
@@ -121,7 +121,7 @@ def _make_power_signal(streams: Streams, epoch: int) -> PowerSignal | None:
 def add_lag_on_path(
     clocks: StageReport[ClockFacts], fused: Fused, inputs: FusionInputs, streams: Streams
 ) -> StageReport[ClockFacts]:
-    """Return the findings on clocks with the lag of the fixes behind the path, where that is sure and was not told."""
+    """Return the findings on clocks with the time offset of the fixes along the path, where it is significant and not yet found."""
     if GNSS not in streams.sensors:
         return clocks
     return add_gnss_time_offset(clocks, solve_lag(fused.arms, compute_moved_m(inputs, streams)))

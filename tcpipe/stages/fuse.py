@@ -199,7 +199,7 @@ def fuse_mounted(inputs: FusionInputs, streams: Streams, config: FuseConfig) -> 
 
 
 def _correct_mounting(inputs: FusionInputs, fused: Fused, streams: Streams) -> FusionInputs | None:
-    """Return the inputs with what a track shows to be mounted otherwise mended; None where all is settled."""
+    """Return the inputs with the extrinsics and scales that a track shows; None where all have settled."""
     tilt = _find_tilt(inputs, fused)
     turn = np.zeros(2) if tilt is None else tilt.rad
     arm, move_m = _find_lever_arm(inputs, fused, streams, trusted=tilt is None)

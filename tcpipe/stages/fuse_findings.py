@@ -135,7 +135,7 @@ def _find_span_s(each: StretchFacts | GateReset, first_ns: int) -> tuple[float, 
 
 
 _CODES = {"position": "position", "displacement": "distance", "turn": "turn"}
-"""Beginnings of the codes by what is compared."""
+"""Beginnings of the codes by the quantity compared."""
 
 
 def make_audit_findings(fused: Fused, inputs: FusionInputs, streams: Streams) -> StageReport[AuditFacts]:
@@ -164,7 +164,7 @@ def make_audit_findings(fused: Fused, inputs: FusionInputs, streams: Streams) ->
 
 
 def _compute_command_ratio(inputs: FusionInputs, streams: Streams) -> float | None:
-    """Return how many times as fast as commanded the wheels go, where that is too fast and nothing else tells how long a metre is."""
+    """Return the ratio of the wheels' speed to the command where it is too high and no sensor makes the scale observable."""
     if not inputs.measurements:
         return None
     epoch = find_longest_epoch(inputs)

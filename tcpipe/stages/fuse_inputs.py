@@ -45,7 +45,7 @@ class FusionInputs:
     findings: list[Finding] = field(default_factory=list)
     excluded: frozenset[str] = frozenset()
     arm: Arm | None = None
-    """What is known of the antenna's arm where it was mended or nobody stated it."""
+    """The antenna's lever arm where it was corrected or is not stated."""
     imu_tilt: Tilt | None = None
     """Roll and pitch of the IMU's mounting that were taken out."""
     scales: Mapping[str, Scale] = field(default_factory=dict)
@@ -239,7 +239,7 @@ _ANYWHERE_DEG_M = (0.0, 45.0, 0.0)
 
 
 def find_recipe_role(role: str, streams: Streams) -> str:
-    """Return the role by which the recipe knows what is fused as ``role``: a pose that stands in for GNSS is a pose there."""
+    """Return the role in the recipe of the stream that is fused as ``role``: a pose that is used as GNSS is a pose there."""
     roles = streams.report.facts.roles
     return POSE if role == GNSS and POSE in roles and GNSS not in roles else role
 

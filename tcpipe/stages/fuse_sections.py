@@ -39,7 +39,7 @@ from tcpipe.tables.levels import REJECTIONS, Streams
 
 @dataclass(slots=True)
 class Fused:
-    """Every section's trajectory, facts and columns, its audit, what it tells of mountings; how long no track could be placed [s]."""
+    """Every section's trajectory, facts, columns, audit, and evidence on extrinsics and scales; time without a track [s]."""
 
     found: list[Trajectory] = field(default_factory=list)
     facts: list[StretchFacts] = field(default_factory=list)
@@ -67,7 +67,7 @@ def fuse_sections(inputs: FusionInputs, streams: Streams, config: FuseConfig) ->
         initial = _make_initial_state(section, fused.found[-1] if fused.found and inputs.datum_deg_m is None else None)
         # 2. Filter and smoother.
         trajectory = _estimate(section, initial, output_ns, config)
-        # 3. What it tells of how antenna and IMU are mounted and odometries scaled, and what nobody knows of it.
+        # 3. Evidence on extrinsics of antenna and IMU and on scales of odometries, and the uncertainty that remains.
         fused.arms.append(collect_arm_evidence(trajectory, section.measurements))
         fused.tilts.append(collect_tilt_evidence(trajectory, section.measurements))
         fused.ratios.append(compute_distance_ratios(trajectory, section.measurements))
@@ -85,7 +85,7 @@ def fuse_sections(inputs: FusionInputs, streams: Streams, config: FuseConfig) ->
 
 
 def _add_mounting_uncertainty(found: Trajectory, section: TrackSection, inputs: FusionInputs) -> Trajectory:
-    """Return the trajectory with what is not known of a mended or unstated mounting."""
+    """Return the trajectory with the uncertainty of corrected or unstated extrinsics."""
     gnss = section.measurements.gnss
     covariance = None if gnss is None else estimate_antenna_uncertainty(inputs.arm, inputs.imu_tilt, gnss.lever_arm_m)
     return found if gnss is None or covariance is None else add_antenna_uncertainty(found, covariance, gnss)

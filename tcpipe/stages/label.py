@@ -140,7 +140,7 @@ def compute_segment_costs(
 
 
 def _compute_displacement_std_m(cut: pa.Table, rows: pa.Table, *, smoothed: bool) -> NDArray[np.float64]:
-    """Return the error of each segment's displacement [m], shape (M,): as the smoother tells it, else as the rows' deviations allow."""
+    """Return the error of each segment's displacement [m], shape (M,): the smoother's, else by the rows' standard deviations."""
     start_ns, end_ns, stamp_ns = to_integers(cut, "start_ns"), to_integers(cut, "end_ns"), to_integers(rows, "stamp_ns")
     duration_s = (end_ns - start_ns).astype(np.float64) * 1e-9
     told_m = np.column_stack([interpolate(stamp_ns, to_floats(rows, name), start_ns) for name in _DISPLACEMENTS])
@@ -164,7 +164,7 @@ def _compute_displacement_std_m(cut: pa.Table, rows: pa.Table, *, smoothed: bool
 
 
 def _find_stationary_ns(rows: pa.Table, rate_hz: float) -> NDArray[np.int64]:
-    """Return begin and end [ns] of every section in which the robot stands, shape (S, 2)."""
+    """Return begin and end [ns] of every span in which the robot is stationary, shape (S, 2)."""
     stamp_ns = to_integers(rows, "stamp_ns")
     piece = number_pieces(stamp_ns, to_integers(rows, "clock_epoch"), period_ns=1e9 / rate_hz)
     standing = (to_numbers(rows["dropped_by"]) & np.uint32(DropReason.STATIONARY)) != 0
@@ -189,7 +189,7 @@ def find_idle_power(rows: pa.Table, rails: Mapping[int, list[Rail]], *, rate_hz:
 
 
 def _step_watt(rails: Mapping[int, list[Rail]]) -> float:
-    """Return the step in which the power of all rails together is told [W]; 0 where none shows."""
+    """Return the resolution of the power of all rails together [W]; 0 where none shows."""
     steps = [
         float(np.median(each.voltage_volt)) * estimate_resolution(each.current)
         for each in next((of for of in rails.values() if of), [])

@@ -23,7 +23,7 @@ from tcpipe.tables.levels import Streams, TrackInfo
 Arrays = dict[str, NDArray[np.float64]]
 
 _ROLLING_MPS = 0.05
-"""Wheels slower than this stand: no slip can be told."""
+"""Wheels slower than this are stationary: their slip is unknown."""
 _GRAVITY_BAND_MPS2 = (8.0, 12.0)
 """Of the median specific force: another one is of another unit, or without gravity, and its vibration is not known."""
 
@@ -81,7 +81,7 @@ def _turn_density(cut: pa.Table, imu: pa.Table | None, info: TrackInfo) -> NDArr
 
 
 def _compute_slip(cut: pa.Table, rows: pa.Table, cost: Labels) -> Arrays:
-    """Return the slip, and how sure it is: of the way over ground, and of the wheels' white noise."""
+    """Return the slip and its standard deviation, by the distance over ground and the wheels' white noise."""
     stamp_ns, wheel_mps = to_integers(rows, "stamp_ns"), to_floats(rows, "wheel_velocity_mps")
     mean_mps = mean_between(stamp_ns, wheel_mps, to_integers(cut, "start_ns"), to_integers(cut, "end_ns"))
     rolling_mps = np.where(np.abs(mean_mps) > _ROLLING_MPS, mean_mps, np.nan)

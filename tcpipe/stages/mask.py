@@ -129,7 +129,7 @@ _KEEP = suggest("keep", {"mask": {"require_full_speed": False}})
 
 @dataclass(frozen=True, slots=True)
 class SpeedLimit:
-    """The limit [m/s], None where nobody knows one; the run's top command [m/s] and the share of it held there; what was found."""
+    """The limit [m/s], None if unknown; the run's top command [m/s] and the share of the run at it; findings."""
 
     limit_mps: float | None
     top_mps: float
@@ -252,7 +252,7 @@ def _compute_chord_std_m(track: Track, rows: MotionRows, chord_m: float, config:
 
 
 def _compute_common_std_mps(track: Track) -> Floats:
-    """Return the part of each row's velocity deviation that its whole section has in common, since nothing tells how long a metre is."""
+    """Return the part of each row's velocity standard deviation that its section has in common: that of an unobservable scale."""
     table = track.table
     stamp_ns, epoch = to_integers(table, "stamp_ns"), to_integers(table, "clock_epoch")
     speed_mps = np.linalg.norm([to_floats(table, f"{name}_velocity_mps") for name in ("east", "north", "up")], axis=0)

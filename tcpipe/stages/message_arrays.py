@@ -24,7 +24,7 @@ class LogReader(Protocol):
 
     @property
     def topics(self) -> Mapping[str, Topic]:
-        """Every topic by name, as the log's index tells."""
+        """Every topic by name, by the log's index."""
 
     def tables(self, topics: Sequence[str]) -> dict[str, pa.Table]:
         """Return a table a topic: one row a message in the order of log time, ``log_time_ns``, ``publish_time_ns``, fields by dotted name.

@@ -41,7 +41,7 @@ def read_run(log: LogReader, config: ReadConfig, *, robot: str | None, known: Pr
     RoleError : a role cannot be decided, or no topic measures motion.
     RecipeError : no profile has the robot's name.
     """
-    # 1. Which topic plays which role, from the topic list alone.
+    # 1. Which topic is used as which role, from the topic list alone.
     assignment = decide_roles(config, log.topics.values(), robot, known=known)
     if assignment.problems:
         raise RoleError(*assignment.problems, findings=assignment.findings)
@@ -115,7 +115,7 @@ def make_role_table(
 
 
 def _read_parts(source: TopicReadings, timeline: Timeline, power: PowerReadings) -> list[dict[str, NDArray[Any]]]:
-    """Return a topic's columns; one part a rail where it plays power."""
+    """Return a topic's columns; one part a rail where it is used as power."""
     readings = source.readings.columns
     columns = {name: readings.pop(name)[timeline.row] for name in list(readings)}
     times: dict[str, NDArray[Any]] = {
@@ -168,7 +168,7 @@ def make_read_report(
         epochs=len(steps) + 1,
         clock_steps=tuple(steps),
         time_offset_s=offset_s,
-        power=None if power.current_sign is None else PowerSign(power.current_sign, power.averaged, power.other_loads),
+        power=None if power.current_sign is None else PowerSign(power.current_sign, power.averaged, power.includes),
     )
     return StageReport(tuple(dict.fromkeys(findings)), facts)
 

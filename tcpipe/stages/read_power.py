@@ -33,7 +33,7 @@ def read_power_of_topics(
     *,
     known: Profiles,
 ) -> PowerReadings:
-    """Return what the topics that play power hold, by topic their message type and columns; nothing unless all of them can be decoded."""
+    """Return the rails of the topics used as power, by message type and columns; none unless all of them can be decoded."""
     wanted = len(assignment.roles["power"].topics) if "power" in assignment.roles else 0
     if not topics:
         return PowerReadings()
@@ -55,7 +55,7 @@ def name_rail_columns(rail: str) -> tuple[str, str]:
 
 
 def name_counter_columns(rail: str) -> tuple[str, str]:
-    """Return the names of the columns in which a rail's counter of energy stands, where it has one."""
+    """Return the names of the columns of a rail's counter of energy, where it has one."""
     return f"{rail}: energy_joule", f"{rail}: resets"
 
 
@@ -216,7 +216,7 @@ def _rate_hz(at_ns: NDArray[np.int64]) -> float:
 
 
 def find_repeats(repeats: Sequence[Repeats]) -> Iterator[Finding]:
-    """Yield the finding that messages repeat readings, by the slowest of them; labels tell whether that is too slow."""
+    """Yield the finding that messages repeat readings, by the slowest of them; labelling finds whether that is too slow."""
     if not repeats:
         return
     slowest = min(repeats, key=lambda of: of.reading_hz)

@@ -21,7 +21,7 @@ from tcpipe.tables.findings import Finding, Subject, make_finding
 
 
 def find_read_config(recipe: Recipe, topics: Collection[str]) -> ReadConfig:
-    """Return what rules the reading of a log of these topics: of one that holds the mapped tables, they play their roles."""
+    """Return the configuration for a log of these topics: mapped tables that it holds are used as their roles."""
     roles: dict[Role, list[str]] = {}
     for name, table in recipe.tables.items():
         role = cast("Role", table.role or name)
@@ -31,7 +31,7 @@ def find_read_config(recipe: Recipe, topics: Collection[str]) -> ReadConfig:
 
 
 def decide_roles(config: ReadConfig, topics: Iterable[Topic], robot: str | None, *, known: Profiles) -> RoleAssignment:
-    """Return which topic plays which role, and why; `RecipeError` where no profile has the robot's name."""
+    """Return which topic is used as which role, and why; `RecipeError` where no profile has the robot's name."""
     topics = list(topics)
     assignment = assign_roles(
         topics,

@@ -44,7 +44,7 @@ from tcpipe.tables.levels import STREAMS, Sensor
 
 @dataclass(frozen=True, slots=True)
 class TopicReadings:
-    """A topic that plays a role: how many messages it has and what frames they name, and what of them is usable."""
+    """A topic that is used as a role: its number of messages, the frames that they name, and usable readings."""
 
     topic: str
     role: Role
@@ -55,7 +55,7 @@ class TopicReadings:
 
     @property
     def key(self) -> str:
-        """What tells it from others: a topic may tell places and velocities at once."""
+        """Its identity: one topic may hold positions and velocities."""
         return f"{self.topic} ({self.role})" if self.role == "gnss_velocity" else self.topic
 
 

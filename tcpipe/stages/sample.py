@@ -16,10 +16,16 @@ from tcpipe.tables.bits import Loss
 from tcpipe.tables.columns import read_lonlat_deg, to_floats
 from tcpipe.tables.findings import Finding, Subject, make_finding
 from tcpipe.tables.levels import PLACED_SEGMENTS
-from tcpipe.terrain.patches import check_scale, compute_footprints, count_corners_on, has_other_pixels, patch_frames
+from tcpipe.terrain.patches import (
+    check_scale,
+    compute_footprints,
+    count_corners_on,
+    has_other_pixels,
+    make_patch_frames,
+)
 from tcpipe.terrain.projection import Projection
 from tcpipe.terrain.sampling import Patches, join_patches, sample_patches
-from tcpipe.terrain.tiles import MapReader, TilePool, find_map_projection, level_for
+from tcpipe.terrain.tiles import MapReader, TilePool, choose_level, find_map_projection
 
 _LOSSES = (Loss.POSITION_UNCERTAIN, Loss.OUTSIDE_MAP, Loss.NODATA, Loss.NOT_TRAVERSABLE)
 
@@ -61,7 +67,7 @@ def sample_segments(
     PLACED_SEGMENTS.check(segments, more=True)
     chord_m, projection = to_floats(segments, "chord_m"), find_map_projection(source, gnss_crs)
     start, end = (projection.forward(read_lonlat_deg(segments, name)) for name in ("start", "end"))
-    frames = patch_frames(start, end, chord_m)
+    frames = make_patch_frames(start, end, chord_m)
     corners = compute_footprints(frames, config.patch_m)
     lost_by = np.zeros(segments.num_rows, np.uint32)
     lost_by[count_corners_on(source.grid, corners) < (4 if config.min_valid_fraction >= 1.0 else 1)] = Loss.OUTSIDE_MAP
@@ -72,7 +78,7 @@ def sample_segments(
     patches = sample_patches(source, frames, chord_m[rows], patch_m=config.patch_m, patch_px=config.patch_px, pool=pool)
     lost_by[rows] = _find_losses(patches, corners[rows], source, config)
     good = lost_by[rows] == 0
-    kept, patches = rows[good], patches if good.all() else patches.only(good)
+    kept, patches = rows[good], patches if good.all() else patches.keep_valid(good)
     return Sampled(
         kept=kept,
         map_index=np.zeros(kept.size, np.uint8),
@@ -103,9 +109,9 @@ def sum_losses(arc_length_m: NDArray[np.float64], lost_by: NDArray[np.uint32]) -
 
 
 def _find_in_map(source: MapReader, config: SampleConfig, projection: Projection) -> tuple[Finding, ...]:
-    """Return what is doubtful about a map whatever segments lie on it: its datum, and the size of its pixels."""
+    """Return the findings on a map itself: its datum, and the size of its pixels."""
     subject, patch_pixel_m = Subject("map", source.name), config.patch_m / config.patch_px
-    map_pixel_m = level_for(source, patch_pixel_m).grid.pixel_size_m
+    map_pixel_m = choose_level(source, patch_pixel_m).grid.pixel_size_m
     findings = projection.find_rough_shift(subject)
     if not has_other_pixels(patch_pixel_m, map_pixel_m):
         return findings
@@ -121,7 +127,7 @@ def _find_in_map(source: MapReader, config: SampleConfig, projection: Projection
 
 
 _ELSEWHERE = (Loss.OUTSIDE_MAP, Loss.NODATA)
-"""What is lost so on one map may be found on the next; what is not traversable, or nobody knows where, is lost on all."""
+"""A segment lost so on one map may be on the next; one on untraversable ground or of uncertain position is lost on all."""
 
 
 def sample_on_maps(

@@ -117,7 +117,7 @@ class Layer:
         return self.step / width, -self.low / width
 
 
-def find_no_data_value(dtype: np.dtype[Any]) -> float:
+def find_no_data_value(dtype: np.dtype[np.generic]) -> float:
     """Return what stands for no data in a map's pixels of a type."""
     return float("nan") if dtype.kind == "f" else 0
 

@@ -38,7 +38,7 @@ class PatchFrames:
         return PatchFrames(self.centre_xy_m[chosen], self.along_xy[chosen], self.left_xy[chosen])
 
 
-def patch_frames(start_xy_m: FloatArray, end_xy_m: FloatArray, chord_m: FloatArray) -> PatchFrames:
+def make_patch_frames(start_xy_m: FloatArray, end_xy_m: FloatArray, chord_m: FloatArray) -> PatchFrames:
     """Return the frames of patches from their segments' projected ends.
 
     Parameters

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import minimum_filter
 
 from tcpipe.tables.catalogue import read_threshold
-from tcpipe.terrain.tiles import MapReader, group_by_tile, level_for, read_window
+from tcpipe.terrain.tiles import MapReader, choose_level, group_by_tile, read_window
 
 FloatArray = NDArray[np.float64]
 
@@ -116,7 +116,7 @@ def register_track(source: MapReader, xy_m: FloatArray, height_m: FloatArray) ->
     -------
     None where fewer than `_FEWEST_POINTS` points, half a metre apart, lie well inside the map.
     """
-    level = level_for(source, _STEP_M)
+    level = choose_level(source, _STEP_M)
     finite = np.isfinite(xy_m).all(axis=1) & np.isfinite(height_m)
     at = np.flatnonzero(finite)[_thin_points(xy_m[finite])]
     at = at[level.grid.contains(xy_m[at])]

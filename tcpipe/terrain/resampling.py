@@ -1,10 +1,12 @@
-"""Putting a raster on a map's grid: bilinear where it is as coarse or coarser, mean or majority where it is finer, nearest for classes.
+"""Resampling a raster onto a map's grid, and a map's coarser levels.
 
-Strict about missing data: a bilinear tap or a part of a mean without data leaves the pixel without data, instead of leaning on what is
-left. A tap of weight zero does not count, so that a raster that lies on the grid already passes unchanged.
+A raster as coarse as the grid or coarser is interpolated bilinearly, a finer one averaged (classes: nearest or majority). A bilinear tap
+or a part of a mean without data leaves the pixel without data. A tap of weight zero does not count, so a raster on the grid passes
+unchanged. The kernels take a *lattice* of positions: source pixel coordinates (centres are integers) of every ``step``-th pixel of the
+grid, beginning one step outside; they interpolate positions between.
 
-All take a *lattice* of positions: source pixel coordinates (centres are integers) of every ``step``-th pixel of the grid, beginning one
-step outside; positions between are interpolated.
+A pixel of a level spans ``factor`` x ``factor`` map pixels: their mean, or their commonest class (ties go to the lower id; no data votes).
+A patch takes the coarsest level that is not coarser than its own pixels.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Sampling many patches from one map: ordered along a space-filling curve, tile by tile, in bounded memory."""
+"""Sampling many patches, or classes at points, from one map: along a space-filling curve, tile by tile, in bounded memory."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from tcpipe.terrain.layers import HEIGHT_STEP_M, STACKS, group_stacks
 from tcpipe.terrain.patches import PatchFrames, map_px_from_patch, sample_chord_px
 from tcpipe.terrain.sampling_kernel import HEIGHT_NODATA, Ground, Stacks, sample_tiles
-from tcpipe.terrain.tiles import MapReader, TilePool, group_by_tile, level_for, read_window
+from tcpipe.terrain.tiles import MapReader, TilePool, choose_level, group_by_tile, read_window
 
 
 def compute_relief_m(height: NDArray[np.uint16]) -> NDArray[np.float64]:
@@ -48,8 +48,8 @@ class Patches:
         """Return all but the pixels, by name."""
         return {entry.name: getattr(self, entry.name) for entry in fields(self)[1:]}
 
-    def only(self, good: NDArray[np.bool_]) -> Patches:
-        """Return the good patches, in their order; their pixels move together in place, and these patches are void."""
+    def keep_valid(self, good: NDArray[np.bool_]) -> Patches:
+        """Return the good patches, in their order; their pixels move in place, so do not use these patches afterwards."""
         rising = np.flatnonzero(good)
         for layer, first in product(self.pixels.values(), range(0, len(rising), _MOVED_ROWS)):
             here = rising[first : first + _MOVED_ROWS]
@@ -84,9 +84,9 @@ def sample_patches(
     frames : where the patches lie, in the map's CRS.
     chord_m : length of each segment on the ground [m], shape (N,).
     patch_m, patch_px : side of a patch on the ground [m], and in pixels.
-    pool : tiles of the level `level_for` the patches' pitch, to go on with from call to call; None holds them for this call alone.
+    pool : tiles of the level `choose_level` the patches' pitch, to go on with from call to call; None holds them for this call alone.
     """
-    level = level_for(source, patch_m / patch_px)
+    level = choose_level(source, patch_m / patch_px)
     pixels = map_px_from_patch(frames, level.grid, patch_m=patch_m, patch_px=patch_px)
     points = max(round(patch_px * float(np.median(chord_m)) / patch_m), 1) if chord_m.size else 1
     chords = sample_chord_px(frames, level.grid, chord_m=chord_m, points=points)

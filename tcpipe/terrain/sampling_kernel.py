@@ -10,7 +10,7 @@ since numba tests signed ones for Python's counting from the end. The rest is pa
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -207,7 +207,7 @@ def _copy_near(tiles: Tiles, box: NDArray[np.int64], near: _Near) -> None:
 
 
 @compile_kernel
-def _copy_run(source: NDArray[Any], here: int, near: NDArray[Any], there: int, count: int) -> None:
+def _copy_run(source: NDArray[np.generic], here: int, near: NDArray[np.generic], there: int, count: int) -> None:
     run, begin, place = np.uint64(RUN_PX), np.uint64(here), np.uint64(there)
     if here + count + RUN_PX > source.size:  # the last pixels of all
         for k in range(np.uint64(count)):

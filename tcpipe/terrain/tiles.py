@@ -67,11 +67,11 @@ class MapReader(Protocol):
     def expect(self, tiles: Sequence[tuple[int, int]]) -> None:
         """Have tiles (row, column) of all layers at hand that are read soon, where that takes long."""
 
-    def read_tile(self, layer: str, i: int, j: int, out: NDArray[Any]) -> None:
+    def read_tile(self, layer: str, i: int, j: int, out: NDArray[np.generic]) -> None:
         """Put the tile in row i and column j into ``out``, contiguous, `tile_px` each way; beyond the map it holds no data."""
 
 
-def level_for(source: MapReader, pixel_size_m: float) -> MapReader:
+def choose_level(source: MapReader, pixel_size_m: float) -> MapReader:
     """Return the map's level whose pixels are nearest below ``pixel_size_m`` [m]: coarse enough not to alias, fine enough to show all."""
     factor = choose_factor(source.factors, source.grid.pixel_size_m, pixel_size_m)
     return source if factor == 1 else source.at(factor)

@@ -137,12 +137,9 @@ def test_page_names_every_room():
 def test_each_file_format_has_the_home_that_the_page_gives():
     homes = {name: {f"{home}" for home in re.findall(r"`([\w/]+\.py)`", cell)} for name, cell in _table("Homes")}
     assert {"rosbags", "mcap", "rasterio", "zarr", "msgspec", "pyarrow.parquet", "numba", "torch"} <= set(homes)
+    imports = {path: [f"{used}." for used in _imported(tree)] for path, tree in read_trees().items()}
     importers = {
-        name: {
-            path
-            for path, tree in read_trees().items()
-            if any(f"{used}.".startswith(f"{name}.") for used in _imported(tree))
-        }
+        name: {path for path, used in imports.items() if any(of.startswith(f"{name}.") for of in used)}
         for name in homes
     }
     assert importers == homes

@@ -187,7 +187,7 @@ def _written(data: bytes) -> tuple[Rows, dict[Row, bytes], dict[str, list[bytes]
         rows, payloads = _rows(log.tables(log.topics)), {}
         for part in log._parts:  # the bytes themselves
             for block in part.blocks(frozenset(part.channels)):
-                topic = part.channels[block.channel].topic
+                topic = part.channels[block.channel].name
                 for at, length, stamp in zip(
                     block.offsets.tolist(), block.lengths.tolist(), block.log_time_ns.tolist(), strict=True
                 ):

@@ -100,7 +100,7 @@ def test_every_mcap_layout_of_the_conformance_suite(tmp_path):
         ]
         part.close()
         assert found == wanted, path.name
-        assert {c.topic for c in part.channels.values()} == {c["topic"] for kind, c in records if kind == "Channel"}
+        assert {c.name for c in part.channels.values()} == {c["topic"] for kind, c in records if kind == "Channel"}
         assert sum(channel.message_count or 0 for channel in part.channels.values()) == len(wanted)
         assert not part.damage
 

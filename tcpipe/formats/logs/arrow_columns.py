@@ -194,9 +194,7 @@ class TopicTable:
     def take(self, *, share: float = 1.0) -> pa.Table:
         """Return the messages held, sorted by log time (those of equal time in the order of the log), and forget them.
 
-        Parameters
-        ----------
-        share : with less than 1, about so much of them, the earlier ones; the rest stays, for what comes later but belongs before it.
+        With a ``share`` below 1, about so much of them, the earlier ones: the rest stays, for what comes later but belongs before it.
         """
         self._flush()
         self._decode_ragged()

@@ -37,7 +37,6 @@ from tcpipe.formats.logs.log_part import (
     MAX_CHUNK_BYTES,
     Bounds,
     ByteSource,
-    Channel,
     DamageError,
     FetchedFile,
     Int64Array,
@@ -46,7 +45,7 @@ from tcpipe.formats.logs.log_part import (
     decompress_prefix,
     outline_of,
 )
-from tcpipe.logs.topics import Damage, compute_silence_ns, normalize_type_name
+from tcpipe.logs.topics import Damage, Topic, compute_silence_ns, normalize_type_name
 
 _CHUNK_MARK = b"\x04\0\0\0op=\x05"
 _MAX_CHUNK_HEADER = 128
@@ -105,7 +104,7 @@ class BagPart:
         except LogError:
             self.close()
             raise
-        self.channels = {number: _make_channel(self._connections[number]) for number in sorted(self._connections)}
+        self.channels = {number: _make_topic(self._connections[number]) for number in sorted(self._connections)}
 
     def _read_index_or_walk(self) -> None:
         try:
@@ -465,15 +464,15 @@ def _find_needed_bytes(offset: int, record: BagRecord) -> tuple[int, int]:
     )
 
 
-def _make_channel(connection: _Connection) -> Channel:
-    return Channel(
+def _make_topic(connection: _Connection) -> Topic:
+    return Topic(
         connection.topic,
         connection.type_name,
-        "ros1",
-        "ros1msg",
-        connection.definition,
         connection.count,
         min(connection.starts, default=None),
         max(connection.ends, default=None),
-        compute_silence_ns(list(zip(connection.starts, connection.ends, strict=True)), connection.count),
+        "ros1",
+        connection.definition,
+        silent_ns=compute_silence_ns(list(zip(connection.starts, connection.ends, strict=True)), connection.count),
+        schema_encoding="ros1msg",
     )

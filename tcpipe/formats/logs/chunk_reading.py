@@ -315,8 +315,7 @@ def plan_chunk_spans(
     Parameters
     ----------
     entries : the messages of those chunks whose index is sound.
-    sizes : the chunks' decompressed sizes, shape (M,) [byte].
-    sound : which chunks have a sound index, shape (M,).
+    sizes, sound : the chunks' decompressed sizes [byte], and which have a sound index, shape (M,).
     wanted : the channels to read.
     """
     entries = entries.at(np.isin(entries.channel, wanted))

@@ -19,7 +19,7 @@ from tcpipe.errors import LogError
 from tcpipe.formats.finding_lines import describe_finding
 from tcpipe.formats.logs.arrow_columns import TopicTable
 from tcpipe.formats.logs.log_container import WANTED, find_container, open_part
-from tcpipe.formats.logs.log_part import Channel, FetchedFile, LogPart, MessageBlock
+from tcpipe.formats.logs.log_part import FetchedFile, LogPart, MessageBlock
 from tcpipe.formats.logs.ros_types import DefinitionError, MessageType, TypeLibrary
 from tcpipe.formats.logs.rosbag2 import (
     METADATA,
@@ -52,20 +52,13 @@ _FILE_SYSTEMS_OWN = ("lost+found",)
 
 
 def open_log(path: Path | str, *, message_definitions: Path | None = None) -> Log:
-    """Open a log, whatever its container.
+    """Open a log, whatever its container; `LogError` says what was found where the path is no log.
 
     Parameters
     ----------
-    path
-        A .mcap, .bag or .db3 file (told by content, not by name), or a ROS 2 bag directory; or the URL of one (``s3://…``): of an
-        .mcap or .bag with an index only what is asked for is fetched, anything else is copied until the log is closed.
-    message_definitions
-        A directory of .msg files for types that the log does not define.
-
-    Raises
-    ------
-    LogError
-        The path is no log: one line with what was found there and what was wanted.
+    path : a .mcap, .bag or .db3 file (told by content, not by name), or a ROS 2 bag directory; or the URL of one (``s3://…``): of an .mcap
+        or .bag with an index only what is asked for is fetched, anything else is copied until the log is closed.
+    message_definitions : a directory of .msg files for types that the log does not define.
     """
     with ExitStack() as stack:
         stored: dict[Path, StoredObject] = {}
@@ -99,12 +92,7 @@ def is_log_file(name: str) -> bool:
 def find_logs(path: Path) -> list[Path]:
     """Return the logs at or below a path, in a fixed order; a ROS 2 bag directory is one log, hidden files are skipped.
 
-    A directory that cannot be read stands in the list itself: whoever opens it says why.
-
-    Raises
-    ------
-    LogError
-        There is no log.
+    A directory that cannot be read stands in the list itself: whoever opens it says why. `LogError`: there is no log.
     """
     path = Path(path)
     _refuse_what_is_not_there(path)
@@ -222,12 +210,7 @@ class Log:
     def sha256(self) -> str:
         """Return the SHA-256 of the file; of a bag directory, of its storage files one after the other, by name.
 
-        Of a log in object storage that is read by its index it is that of the index, the `outline`.
-
-        Raises
-        ------
-        LogError
-            The disk does not give all of it.
+        Of a log in object storage that is read by its index it is that of the index, the `outline`. `LogError`: the disk fails.
         """
         if self.is_known_by_outline:
             return self.outline
@@ -270,24 +253,10 @@ class Log:
         return tables[topic]
 
     def tables(self, topics: Iterable[str], *, threads: int = 1) -> dict[str, pa.Table]:
-        """Return the tables of several topics, read in one pass.
+        """Return the tables of several topics, read in one pass; the result does not depend on ``threads``.
 
-        Parameters
-        ----------
-        topics
-            Names of topics. One that cannot be decoded is missing from the result and named in `findings`.
-        threads
-            How many threads read and decompress; the result does not depend on it.
-
-        Returns
-        -------
-        dict of pyarrow.Table
-            One row a message in the order of log time: ``log_time_ns``, ``publish_time_ns``, then the fields by dotted name.
-
-        Raises
-        ------
-        LogError
-            A topic is not in the log.
+        A table has one row a message in the order of log time: ``log_time_ns``, ``publish_time_ns``, then the fields by dotted name.
+        A topic that cannot be decoded is missing and named in `findings`. `LogError`: a topic is not in the log.
         """
         (tables,) = self.batches(topics, batch_bytes=None, threads=threads)
         return tables
@@ -295,25 +264,11 @@ class Log:
     def batches(
         self, topics: Iterable[str], *, batch_bytes: int | None = BATCH_BYTES, threads: int = 1
     ) -> Iterator[dict[str, pa.Table]]:
-        """Yield the tables of several topics piece by piece, read in one pass, in memory that does not grow with the log.
+        """Yield the tables of several topics piece by piece, as `tables`, in memory that does not grow with the log.
 
         Each dict holds the next rows of some topics (those that hold most); the last one names every topic. Rows are in the order of
-        log time, also from piece to piece, as long as no message lies in the log further than half a piece behind its time;
-        `findings` counts those that do.
-
-        Parameters
-        ----------
-        topics
-            Names of topics. One that cannot be decoded is missing and named in `findings`.
-        batch_bytes
-            How much is gathered over all topics before some is yielded; None yields everything at once.
-        threads
-            How many threads read and decompress; the pieces do not depend on it.
-
-        Raises
-        ------
-        LogError
-            A topic is not in the log.
+        log time, also from piece to piece, as long as no message lies in the log further than half a piece behind its time; `findings`
+        counts those that do. Some is yielded when more than ``batch_bytes`` are gathered over all topics; None yields everything at once.
         """
         collected = self._collectors(topics, in_pieces=batch_bytes is not None)
         most = math.inf if batch_bytes is None else batch_bytes
@@ -374,19 +329,19 @@ class Log:
         """Yield one file's blocks, each with its topic's table; channels that differ from their topic's type are set aside."""
         part, channels = self._parts[index], {}
         for number, channel in part.channels.items():
-            if channel.topic in collected:
+            if channel.name in collected:
                 if self._agrees(channel):
-                    channels[number] = collected[channel.topic]
+                    channels[number] = collected[channel.name]
                 else:
                     reason = f"the topic changes its type to {channel.type_name} ({channel.encoding})"
-                    self._note_undecoded(part.name, channel.topic, channel.message_count, reason)
+                    self._note_undecoded(part.name, channel.name, channel.message_count, reason)
         if channels:
             for block in decompress_blocks(part, frozenset(channels), threads=threads):
                 later = replace(block, ordinal=block.ordinal + (index << 48)) if index else block
                 yield channels[block.channel], later
 
-    def _agrees(self, channel: Channel) -> bool:
-        topic = self.topics[channel.topic]
+    def _agrees(self, channel: Topic) -> bool:
+        topic = self.topics[channel.name]
         if (channel.type_name, channel.encoding) != (topic.type_name, topic.encoding):
             return False
         if channel.definition in ("", topic.definition):
@@ -401,7 +356,7 @@ class Log:
     def _note_undecoded(self, file: str, topic: str, count: int | None, reason: str) -> None:
         self._damage.append(Damage("messages-not-decoded", file, topic=topic, messages_lost=count, reason=reason))
 
-    def _resolved(self, channel: Channel) -> MessageType | DefinitionError:
+    def _resolved(self, channel: Topic) -> MessageType | DefinitionError:
         try:
             return self._types.message_type(
                 channel.type_name,
@@ -425,41 +380,31 @@ class Log:
 
     def _merged_topics(self) -> dict[str, Topic]:
         """Merge the channels of all files by topic; where types differ, the one with most messages holds."""
-        self._channel_of: dict[str, Channel] = {}
+        self._channel_of: dict[str, Topic] = {}
         topics: dict[str, Topic] = {}
         channels = [channel for part in self._parts for channel in part.channels.values()]
-        for channel in sorted(channels, key=lambda c: (c.topic, -(c.message_count or 0), not c.definition)):
-            topic = _make_topic(channel, self._types)
-            first = self._channel_of.setdefault(channel.topic, channel)
+        for channel in sorted(channels, key=lambda c: (c.name, -(c.message_count or 0), not c.definition)):
+            topic = replace(channel, problem=_find_problem(channel, self._types))
+            first = self._channel_of.setdefault(channel.name, channel)
             if channel is first:
-                topics[channel.topic] = topic
+                topics[channel.name] = topic
                 if len(topics) > MAX_TOPICS:
                     raise LogError(f"{self.path}: it holds more than {MAX_TOPICS} topics; no such log is read")
             elif (channel.type_name, channel.encoding) == (first.type_name, first.encoding):
-                topics[channel.topic] = topics[channel.topic].joined(topic)
+                topics[channel.name] = topics[channel.name].joined(topic)
         return topics
 
 
-def _make_topic(channel: Channel, types: TypeLibrary) -> Topic:
-    problem = None
+def _find_problem(channel: Topic, types: TypeLibrary) -> str | None:
+    """Return why messages cannot be decoded; a definition that cannot be used is found when they are read."""
     if channel.encoding not in ("cdr", "ros1"):
-        problem = f"its messages are encoded as {channel.encoding or 'nothing known'}; cdr and ros1 are read"
-    elif not channel.type_name:
-        problem = "the log does not say of which type its messages are"
-    elif not channel.definition.strip() and not types.knows(channel.type_name):
-        where = "the log holds no definition of it, and none is bundled"
-        problem = f"type {channel.type_name} is unknown: {where}; give its .msg files with --msgdef DIR"
-    return Topic(
-        channel.topic,
-        channel.type_name,
-        channel.message_count,
-        channel.start_ns,
-        channel.end_ns,
-        channel.encoding,
-        channel.definition,
-        problem,
-        channel.silent_ns,
-    )
+        return f"its messages are encoded as {channel.encoding or 'nothing known'}; cdr and ros1 are read"
+    if not channel.type_name:
+        return "the log does not say of which type its messages are"
+    if channel.definition.strip() or types.knows(channel.type_name):
+        return None
+    where = "the log holds no definition of it, and none is bundled"
+    return f"type {channel.type_name} is unknown: {where}; give its .msg files with --msgdef DIR"
 
 
 def _open_directory(directory: Path, stack: ExitStack, fetched: Mapping[Path, FetchedFile]) -> _OpenFiles:

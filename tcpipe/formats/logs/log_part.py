@@ -5,7 +5,6 @@ A `LogPart` is one file of a log. `tcpipe.formats.logs.log_file` joins the parts
 
 from __future__ import annotations
 
-import errno
 import hashlib
 import os
 import struct
@@ -16,17 +15,15 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol, TypeVar
+from typing import Protocol, TypeVar
 
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
 from tcpipe.errors import LogError
-from tcpipe.logs.topics import Damage
-
-if TYPE_CHECKING:
-    from tcpipe.formats.object_storage import StoredObject
+from tcpipe.formats.object_storage import StoredObject
+from tcpipe.logs.topics import Damage, Topic
 
 MAX_CHUNK_BYTES = 1 << 29
 """A chunk that claims to hold more than this is taken for damaged: it is held as a whole. Writers make chunks of some megabytes."""
@@ -69,21 +66,6 @@ class DamageError(Exception):
 
 
 @dataclass(frozen=True, slots=True)
-class Channel:
-    """One source of messages in a file: a connection, channel or topic row. None where the index does not say."""
-
-    topic: str
-    type_name: str
-    encoding: str
-    schema_encoding: str
-    definition: str
-    message_count: int | None = None
-    start_ns: int | None = None
-    end_ns: int | None = None
-    silent_ns: int = 0
-
-
-@dataclass(frozen=True, slots=True)
 class MessageBlock:
     """Messages of one channel inside one buffer; arrays have shape (N,). ``ordinal`` is their order within the file.
 
@@ -116,8 +98,8 @@ class LogPart(Protocol):
     """What was found damaged so far; the same place may be in it twice."""
 
     @property
-    def channels(self) -> Mapping[int, Channel]:
-        """Return every channel by its number."""
+    def channels(self) -> Mapping[int, Topic]:
+        """Return every source of messages (a connection, channel or topic row) by its number."""
 
     @property
     def is_unchecked(self) -> bool:
@@ -338,12 +320,6 @@ def outline_of(size: int, index: bytes | memoryview) -> str:
     return hashlib.sha256(size.to_bytes(8, "little") + bytes(index)).hexdigest()
 
 
-def describe_full_disk(error: Exception) -> str:
-    """Say that there is no room for a copy of a log, where that is the error; else nothing."""
-    full = isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-    return "no room for a copy here; TMPDIR names a place that has some" if full else ""
-
-
 def is_bomb(compressed_bytes: int, size: int, *, whole: bool = False) -> bool:
     """Return whether compressed bytes claim to hold implausibly much; ``whole``: what would be held in memory as a whole."""
     ratio = _PLAUSIBLE_CHUNK_RATIO if whole else _PLAUSIBLE_RATIO
@@ -351,13 +327,7 @@ def is_bomb(compressed_bytes: int, size: int, *, whole: bool = False) -> bool:
 
 
 class Bounds:
-    """What one file may hold, by its size: `LogError` where it holds more, since it was made to take all memory or time.
-
-    Parameters
-    ----------
-    path : the file.
-    size : its size [byte].
-    """
+    """What one file may hold, by its size [byte]: `LogError` where it holds more, since it was made to take all memory or time."""
 
     def __init__(self, path: Path, size: int) -> None:
         self._path, self._size = path, size
@@ -390,18 +360,12 @@ class Bounds:
 
 
 def decompress(codec: str, data: memoryview, size: int, *, checked: bool = False) -> memoryview:
-    """Return the ``size`` bytes that ``data`` holds.
+    """Return the ``size`` bytes that ``data`` holds; `DamageError` where it does not decompress, or not to ``size``.
 
     Parameters
     ----------
     codec : ``lz4`` (frames), ``zstd`` or ``bz2``.
-    data : the compressed bytes.
-    size : how many bytes they hold.
     checked : a checksum of the result is compared afterwards.
-
-    Raises
-    ------
-    DamageError : the bytes do not decompress, or not to ``size``.
     """
     if size > MAX_CHUNK_BYTES or is_bomb(len(data), size, whole=True):
         raise DamageError("record-damaged")

@@ -30,7 +30,6 @@ from tcpipe.formats.logs.log_part import (
     MAX_CHUNK_BYTES,
     Bounds,
     ByteSource,
-    Channel,
     DamageError,
     FetchedFile,
     Int64Array,
@@ -66,7 +65,7 @@ from tcpipe.formats.logs.mcap_records import (
     read_summary,
     record_offsets,
 )
-from tcpipe.logs.topics import Damage, compute_silence_ns, normalize_type_name
+from tcpipe.logs.topics import Damage, Topic, compute_silence_ns, normalize_type_name
 
 _LOOSE_BYTES = 1 << 22
 """Messages outside chunks are read in runs of about this size."""
@@ -102,7 +101,7 @@ class McapPart:
         except LogError:
             self.close()
             raise
-        self.channels = {number: self._channel(number) for number in sorted(self._contents.channels)}
+        self.channels = {number: self._topic(number) for number in sorted(self._contents.channels)}
 
     def _read_index(self) -> None:
         """Read the summary, or, where it cannot be used, walk the file."""
@@ -474,7 +473,7 @@ class McapPart:
                 except DamageError as error:
                     self._note(error.cause, chunk.offset)
 
-    def _channel(self, number: int) -> Channel:
+    def _topic(self, number: int) -> Topic:
         channel = self._contents.channels[number]
         schema = self._contents.schemas.get(channel.schema, Schema("", "", ""))
         statistics = self._contents.statistics
@@ -483,16 +482,16 @@ class McapPart:
         else:
             tally = self._tallies.get(number, _Tally())
             count, start_ns, end_ns = tally.count, tally.start_ns, tally.end_ns
-        return Channel(
+        return Topic(
             channel.topic,
             normalize_type_name(schema.name),
-            channel.encoding,
-            schema.encoding,
-            schema.definition,
             count,
             start_ns,
             end_ns,
-            compute_silence_ns([(chunk.start_ns, chunk.end_ns) for chunk in self._holding(number)], count),
+            channel.encoding,
+            schema.definition,
+            silent_ns=compute_silence_ns([(chunk.start_ns, chunk.end_ns) for chunk in self._holding(number)], count),
+            schema_encoding=schema.encoding,
         )
 
     def _holding(self, channel: int) -> list[Chunk]:

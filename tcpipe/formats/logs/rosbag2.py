@@ -14,7 +14,8 @@ import numpy as np
 import pyarrow as pa
 
 from tcpipe.errors import LogError
-from tcpipe.formats.logs.log_part import MAX_CHUNK_BYTES, LogPart, MessageBlock, describe_full_disk, is_bomb
+from tcpipe.formats.atomic import describe_full_disk
+from tcpipe.formats.logs.log_part import MAX_CHUNK_BYTES, LogPart, MessageBlock, is_bomb
 from tcpipe.logs.topics import Damage
 
 METADATA = "metadata.yaml"
@@ -43,13 +44,7 @@ class Rosbag2Files:
 
 
 def find_rosbag2_files(directory: Path) -> Rosbag2Files:
-    """Return the storage files of a bag directory, by metadata.yaml, or by their names where it is missing.
-
-    Raises
-    ------
-    LogError
-        The directory holds no ROS 2 bag, or cannot be read.
-    """
+    """Return the storage files of a bag, by metadata.yaml, or by their names where it is missing; `LogError` where it is no bag."""
     try:
         present = list_storage_files(directory)
     except OSError as error:
@@ -189,7 +184,7 @@ def _decompress_block(block: MessageBlock, part: LogPart) -> MessageBlock:
             kept.append(row)
     lost = len(block.offsets) - len(kept)
     if lost:
-        topic = part.channels[block.channel].topic
+        topic = part.channels[block.channel].name
         part.damage.append(Damage("chunk-damaged", part.name, topic=topic, messages_lost=lost))
     lengths = np.fromiter(map(len, payloads), np.int64, len(payloads))
     rows = np.array(kept, np.int64)

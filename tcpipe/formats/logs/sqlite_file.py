@@ -18,16 +18,14 @@ from urllib.parse import quote
 import numpy as np
 
 from tcpipe.errors import LogError
-from tcpipe.formats.atomic import make_scratch_directory
+from tcpipe.formats.atomic import describe_full_disk, make_scratch_directory
 from tcpipe.formats.logs.log_part import (
     MAX_CHANNELS,
     Bounds,
-    Channel,
     MessageBlock,
-    describe_full_disk,
     group_by_key,
 )
-from tcpipe.logs.topics import Damage, normalize_type_name
+from tcpipe.logs.topics import Damage, Topic, normalize_type_name
 
 MAGIC = b"SQLite format 3\0"
 
@@ -138,7 +136,7 @@ class SqlitePart:
             if kind != "table" or not root or computed:
                 raise LogError(f"{path}: its {name!r} is no plain table; nothing can be had from it")
 
-    def _channels(self, path: Path) -> dict[int, Channel]:
+    def _channels(self, path: Path) -> dict[int, Topic]:
         rows = self._database.execute(
             "SELECT id, name, type, serialization_format FROM topics ORDER BY id LIMIT ?", (MAX_CHANNELS + 1,)
         ).fetchall()
@@ -150,12 +148,17 @@ class SqlitePart:
             if not isinstance(number, int):
                 self.damage.append(Damage("record-damaged", self.name))
                 continue
-            channels[number] = Channel(
+            schema_encoding, definition = definitions.get(type_name, ("", ""))
+            count, first, last = spans.get(number, (0, None, None))
+            channels[number] = Topic(
                 str(topic),
                 normalize_type_name(str(type_name)),
+                count,
+                first,
+                last,
                 str(encoding),
-                *definitions.get(type_name, ("", "")),
-                *spans.get(number, (0, None, None)),
+                definition,
+                schema_encoding=schema_encoding,
             )
         if unknown := spans.keys() - channels.keys():
             lost = sum(spans[number][0] for number in unknown)

@@ -112,7 +112,7 @@ class Source:
 
 @dataclass(frozen=True, slots=True)
 class Tile:
-    """What one raster file is that can play its role; `RasterTiles.read` reads it.
+    """A raster file that can be used as its role; `RasterTiles.read` reads it.
 
     ``affine`` is (a, b, c, d, e, f) of x = a·col + b·row + c, y = d·col + e·row + f at pixel *corners*; ``crs`` is WKT, or empty where
     the file has none; ``findings`` are about its bands and tags.
@@ -212,7 +212,7 @@ def open_raster_tiles() -> Iterator[RasterTiles]:
 
 
 def read_tile(path: Path, role: str, use: Use | None = None) -> Tile:
-    """Return what a raster file is that is to play a role; ``use`` is that of `USES` unless another is given.
+    """Return a raster file as the tile of a role; ``use`` is that of `USES` unless another is given.
 
     Raises
     ------

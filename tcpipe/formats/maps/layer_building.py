@@ -40,7 +40,7 @@ _SHOWN = 4
 
 @dataclass(frozen=True, slots=True)
 class Raster:
-    """Tiles that play a role together; ``affine``, ``crs`` and ``names`` as of `tcpipe.formats.maps.geotiff.Tile`."""
+    """Tiles that are used as a role together; ``affine``, ``crs`` and ``names`` as of `tcpipe.formats.maps.geotiff.Tile`."""
 
     label: str
     """What it is called in a message: the path, and how many more there are."""

@@ -57,7 +57,7 @@ class MapSummary(MapFacts):
     overviews: tuple[int, ...]
     class_table: tuple[TerrainClass, ...]
     described: Mapping[str, Description] = field(default_factory=dict, metadata=LEFT_OUT)
-    """What the names of layers other than the paper's do not tell."""
+    """Descriptions of layers other than the paper's."""
 
 
 _SHARES = 5

@@ -340,7 +340,7 @@ _LONG_NAMES = {"height": "height of the ground", "ortho": "grey of the orthophot
 
 
 def _describe_layers(layers: Mapping[str, Layer]) -> dict[str, Description]:
-    """Return what the names of layers alone do not tell."""
+    """Return the descriptions of layers other than the paper's."""
     return {name: describe_layer(layer) for name, layer in layers.items() if name not in PAPER_LAYERS}
 
 

@@ -7,7 +7,7 @@ centre lies in; ground outside all polygons has no data.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -29,7 +29,7 @@ from tcpipe.terrain.layers import Layer, Pixels, make_paper_layers
 from tcpipe.terrain.projection import Projection, compute_area
 
 PROPERTY = "class"
-"""The property that tells a polygon's class, in any case."""
+"""The property with a polygon's class, in any case."""
 
 SUFFIXES = (".geojson", ".json")
 """A terrain file that ends so is polygons."""
@@ -40,10 +40,10 @@ _EDGE_STEP_DEG = 0.001
 _TERRAIN = Subject("layer", "terrain")
 
 _LOOKED_AT = 5_000_000
-"""Vertices of pairs of polygons that are held against each other to tell how they overlap."""
+"""Most vertices of pairs of polygons that are compared for overlaps."""
 
 _TOGETHER = 32
-"""Polygons that are held against all others at one time."""
+"""Polygons that are compared with all others at one time."""
 
 _DETAILED = 10_000
 """A polygon of more vertices is cut to the part of the map that it is burnt into: each row of pixels looks at every edge."""
@@ -134,7 +134,7 @@ def _read_all(paths: Sequence[Path]) -> tuple[list[PolygonFeature], list[str]]:
 
 def _read_class_id(feature: PolygonFeature, scheme: ClassScheme, problems: list[str]) -> int:
     """Return a feature's class id; 0, and a line in ``problems``, where it has none."""
-    given = _read_property(feature.properties)
+    given = next((value for name, value in feature.properties.items() if name.casefold() == PROPERTY), None)
     if given is None:
         there = shorten_value(", ".join(sorted(feature.properties)) or "none")[1:-1]
         problems.append(
@@ -151,10 +151,6 @@ def _read_class_id(feature: PolygonFeature, scheme: ClassScheme, problems: list[
         names = ", ".join(entry.name for entry in scheme.table.classes)
         problems.append(f"{feature.where}: {PROPERTY} {shorten_value(given)} is not in the class table ({names})")
     return found or 0
-
-
-def _read_property(properties: Mapping[str, Any]) -> Any:
-    return next((value for name, value in properties.items() if name.casefold() == PROPERTY), None)
 
 
 def _parse_integer(given: Any) -> int | None:

@@ -1,1 +1,1 @@
-"""Sensors and clocks held against physics and each other, before any estimator runs."""
+"""Checks of sensors and clocks against physics and each other."""

@@ -91,12 +91,12 @@ class Comparison:
 
     @property
     def told(self) -> Mask:
-        """Where the sensor tells, shape (W,)."""
+        """Where the sensor has a value, shape (W,)."""
         return np.asarray(np.isfinite(self.difference).all(1))
 
     @property
     def size(self) -> Floats:
-        """Length of the difference, shape (W,); 0 where it is not told."""
+        """Length of the difference, shape (W,); 0 where it is unknown."""
         return np.where(self.told, np.linalg.norm(self.difference, axis=1), 0.0)
 
     @property
@@ -118,7 +118,7 @@ class Comparison:
 
 @dataclass(frozen=True, slots=True)
 class Tally:
-    """In how many windows in which the robot moves a sensor tells a thing, disagrees with the track undecided, and is alone."""
+    """Number of windows of motion in which a sensor has a value, disagrees with the track undecided, and is alone."""
 
     sensor: str
     what: What
@@ -173,17 +173,17 @@ def audit_trajectory(found: Trajectory, measurements: Measurements) -> tuple[Tra
 
 
 def is_astray(windows: int, astray: int) -> bool:
-    """Return whether the track is astray in more than a little of the windows in which a sensor tells the robot's way."""
+    """Return whether the track contradicts every sensor in more than a few of the windows in which one measures the distance."""
     return astray > max(1.0, _LITTLE * windows)
 
 
 def find_isolated_sensors(tallies: Iterable[Tally]) -> tuple[str, ...]:
-    """Return the sensors that two others contradict in most of the way."""
+    """Return the sensors that two others contradict over most of the distance."""
     return tuple(dict.fromkeys(t.sensor for t in _sum_tallies(tallies) if _is_most(t.alone, t.moving)))
 
 
 def find_undecided_sensors(tallies: Iterable[Tally]) -> tuple[tuple[str, What], ...]:
-    """Return what sensors contradict in most of the way, where no third tells throughout who is right.
+    """Return the sensors and quantities that contradict the track over most of the distance, where no third sensor decides.
 
     A position that is off while ways and turns agree is known to be off by how much, and stands in the deviations.
     """
@@ -195,7 +195,7 @@ def find_undecided_sensors(tallies: Iterable[Tally]) -> tuple[tuple[str, What], 
 
 
 def is_consistent(tallies: Iterable[Tally]) -> bool:
-    """Return whether nothing is contradicted in more than a little of the way, positions included."""
+    """Return whether no sensor contradicts the track over more than a little of the distance, positions included."""
     return all(t.undecided + t.alone <= _LITTLE * t.moving for t in _sum_tallies(tallies))
 
 
@@ -305,7 +305,7 @@ def _sum_increments(values: Floats, windows: NDArray[np.int64]) -> Floats:
 
 
 def _compute_distance_std_m(found: Trajectory) -> Floats:
-    """Return what the track claims of its displacement over a window [m], shape (N,): the longest told one, lengthened."""
+    """Return the track's uncertainty of its displacement over a window [m], shape (N,): that of the longest lag, extended."""
     last_s = DISPLACEMENT_LAGS_S[-1]
     told = found.displacement_std_m[:, -1] * _WINDOW_S / last_s
     return np.where(np.isfinite(told), told, found.forward_velocity_std_mps * _WINDOW_S)
@@ -314,7 +314,7 @@ def _compute_distance_std_m(found: Trajectory) -> Floats:
 def _compare_distances(
     role: str, said: Floats, track: Floats, noise: float, track_std: Floats, *, scale_seen: bool
 ) -> Comparison:
-    """Return what an odometry says of the way in each window; its scale is taken out where fixes tell it."""
+    """Return the displacement by an odometry in each window; its scale is removed where fixes show it."""
     if scale_seen:
         said = said / _scale(said[:, 0], track[:, 0])
     length_m = np.linalg.norm(track, axis=1)
@@ -412,7 +412,7 @@ def _find_isolated(one: Comparison, compared: Sequence[Comparison]) -> Mask:
 
 
 def _count_agreeing(compared: Sequence[Comparison]) -> NDArray[np.int64]:
-    """Return how many sensors besides the fixes hold with the track in all that they tell, shape (W,)."""
+    """Return how many sensors besides the fixes agree with the track in every quantity, shape (W,)."""
     others = {each.sensor: [c for c in compared if c.sensor == each.sensor] for each in compared if each.sensor != GNSS}
     holds = [np.all([c.told & ~c.disagrees for c in told], axis=0) for told in others.values()]
     return np.sum(holds, axis=0) if holds else np.zeros(1, np.int64)
@@ -453,7 +453,7 @@ def _compute_distance_error_m(compared: Sequence[Comparison], fixes: Iterable[Co
 
 
 def _compare_all_fixes(found: Trajectory, gnss: Positions | None, windows: NDArray[np.int64]) -> Iterable[Comparison]:
-    """Yield how all fixes move, refused or not, against the antenna on the track; their scatter counts where they claim less."""
+    """Yield the displacement of all fixes, rejected or not, and of the antenna on the track; their scatter counts where they claim less."""
     if gnss is None:
         return
     inside, off = _find_fix_residuals(found, matrix_from_quat(found.quat_xyzw), gnss)
@@ -475,7 +475,7 @@ def _find_largest_differences(disputed: Iterable[tuple[Floats, Mask]], windows: 
 
 
 def _inflate_trajectory(found: Trajectory, what: str, size: Floats) -> Trajectory:
-    """Return the trajectory with its deviations raised by the size of what is disputed at each row, shape (N,)."""
+    """Return the trajectory with its standard deviations inflated by the size of the disagreement at each row, shape (N,)."""
     if not size.any():
         return found
     if what == "turn":

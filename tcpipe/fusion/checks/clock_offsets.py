@@ -77,7 +77,7 @@ _MARGIN_NS = 5_000_000_000
 _FEWEST_WINDOWS = 3
 _LEAST_STD_S = 1e-3
 _LEAST_BY_FORCE_S = 0.02
-"""Slopes are felt as accelerations: what the accelerometer tells of a clock is a check more than a measure [s]."""
+"""Slopes act as accelerations: the accelerometer is a check of a clock rather than a measure [s]."""
 
 YAW_RATE, SPEED, ACCELERATION = "yaw rate", "speed", "acceleration"
 
@@ -141,7 +141,7 @@ class PowerSignal:
 
 @dataclass(frozen=True, slots=True)
 class ClockOffsets:
-    """Every pair compared, the sensor whose clock the others are held against, and the offsets of those connected to it.
+    """Every pair compared, the sensor with the reference clock, and the offsets of those connected to it.
 
     ``span_s`` is how long the run is.
     """
@@ -221,7 +221,7 @@ def _iterate_signals(m: Measurements, power: PowerSignal | None, at_ns: NDArray[
 def _compare_with_imu(
     imu: InertialMeasurements, twists: Mapping[str, Floats], gnss: Positions | None, at_ns: NDArray[np.int64]
 ) -> Iterable[Signals]:
-    """Yield what the gyroscope and the accelerometer tell of turns and changes of speed."""
+    """Yield the comparisons of gyroscope and accelerometer: turns and changes of speed."""
     gyro = compute_moving_mean(resample_signal(imu.stamp_ns, imu.angular_velocity_radps, at_ns), _ODOMETRY_S)
     for role, twist in twists.items():
         turning = compute_moving_mean(twist, _ODOMETRY_S)[:, 1]

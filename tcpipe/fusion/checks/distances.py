@@ -1,4 +1,4 @@
-"""How far each sensor says that the robot went: one that counts in other units, or stands still, tells another distance than the rest.
+"""Distances by each sensor: one that counts in other units, or does not move, has another distance than the rest.
 
 Distances are chords over ten seconds, or thirty where fixes are coarse, so that the noise of fixes does not count as driving: of fixes
 their difference, of an odometry what its own velocity and yaw rate add up to. A command is a voice where two sensors differ, though a
@@ -22,7 +22,7 @@ from tcpipe.fusion.checks.plausibility import SensorExclusion
 from tcpipe.fusion.measurements import GNSS, IMU, WHEELS, Measurements, Positions
 
 COMMAND = "command"
-"""The command's name among the distances; it is never refused."""
+"""The command's name among the distances; it is never excluded."""
 
 _WINDOW = round(10.0 / GRID_S)
 _LONG_WINDOW = 3 * _WINDOW
@@ -48,7 +48,7 @@ _RADIANS = (1 / 75, 1 / 30)
 
 @dataclass(frozen=True, slots=True)
 class Distances:
-    """How far the robot went in each window by each source [m], shape (W,), NaN where it does not tell; ``least_m`` may be noise."""
+    """Distance in each window by each source [m], shape (W,), NaN where unknown; ``least_m`` may be noise."""
 
     chord_m: Mapping[str, Floats]
     least_m: float
@@ -186,7 +186,7 @@ def _find_differing_pairs(found: Distances, sensors: list[str]) -> Iterable[tupl
 
 
 def _refuse(role: str, other: str, ratio: float, *, undecided: bool) -> SensorExclusion:
-    """Return the refusal of a sensor that goes ``ratio`` times as far as another."""
+    """Return the exclusion of a sensor that goes ``ratio`` times as far as another."""
     names = {"reference": other} | ({"suspect": other} if undecided else {})
     numbers = {"distance_ratio": ratio}
     if _KMH[0] < ratio < _KMH[1]:
@@ -218,7 +218,7 @@ _FEWEST_FROZEN_WINDOWS = 2
 
 
 def find_frozen_sensors(m: Measurements, found: Distances) -> dict[str, SensorExclusion]:
-    """Return the refusals by sensor; ``found`` tells how far the others went."""
+    """Return the exclusions by sensor; ``found`` are the distances of the others."""
     refusals = {}
     if m.gnss is not None and _is_one_value(m.gnss.position_enu_m) and _is_contradicted(GNSS, found):
         refusals[GNSS] = refuse_frozen(GNSS, "position", m.gnss.stamp_ns.size)
@@ -236,7 +236,7 @@ def find_frozen_sensors(m: Measurements, found: Distances) -> dict[str, SensorEx
 
 
 def refuse_frozen(role: str, quantity: str, messages: int) -> SensorExclusion:
-    """Return the refusal of a sensor that repeats one value."""
+    """Return the exclusion of a sensor that repeats one value."""
     return SensorExclusion(role, "frozen", {"quantity": quantity}, {"message_count": messages})
 
 

@@ -55,7 +55,7 @@ def check_ground_velocity(m: Measurements) -> SensorExclusion | None:
 def _compute_displacements(
     gnss: Positions, doppler: GroundVelocities
 ) -> tuple[NDArray[np.complex128], NDArray[np.complex128]] | None:
-    """Return the way by the fixes and by the velocity in windows [m], east and i times north; None where the fixes show too little."""
+    """Return the displacement by the fixes and by the velocity in windows [m], east and i times north; None where too few fixes move."""
     noise_m = float(np.sqrt(2.0 * np.median(gnss.variance_m2[:, :2])))
     zero = int(gnss.stamp_ns[0])
     fix_s = compute_seconds(gnss.stamp_ns, zero)
@@ -101,7 +101,7 @@ def _check_frame(
 
 
 def _check_time_offset(m: Measurements) -> SensorExclusion | None:
-    """Return by how much its stamps are off: by the first odometry, or, where that tells no lag, by how the fixes go."""
+    """Return the exclusion for a time offset: against the first odometry or, where that shows no lag, against the fixes."""
     at_ns = find_liveliest_window_ns(m)
     if at_ns is None or m.doppler is None or m.gnss is None:
         return None

@@ -125,7 +125,7 @@ def _compute_peak_std_s(explained: Floats, best: int, independent: float) -> flo
 
 
 def _has_rival(explained: Floats, best: int, independent: float) -> bool:
-    """Whether another peak is about as high: of a motion that repeats itself no lag can be told."""
+    """Whether another peak is about as high: a motion that repeats itself shows no lag."""
     inner = explained[1:-1]
     peaks = 1 + np.flatnonzero((inner >= explained[:-2]) & (inner >= explained[2:]))
     others = explained[peaks[np.abs(peaks - best) > 1]]
@@ -236,7 +236,7 @@ def find_liveliest_window_ns(m: Measurements) -> Ints | None:
 
 
 def _compute_driven_m(m: Measurements, at_ns: Ints) -> NDArray[np.float64]:
-    """Return the distance driven before each time [m], by the first sensor that tells one."""
+    """Return the distance driven before each time [m], by the first sensor that measures it."""
     source = m.wheels or m.visual
     if source is not None:
         stamp_ns, speed_mps = source.stamp_ns, np.nan_to_num(np.abs(source.velocity_mps[:, 0]))

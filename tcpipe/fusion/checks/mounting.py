@@ -33,7 +33,7 @@ from tcpipe.geometry.rotation import invert, matrix_from_quat, multiply, quat_fr
 Floats = NDArray[np.float64]
 
 ARM_STD_M = 0.5
-"""An antenna of which nothing is known sits within the size of a robot."""
+"""An unknown antenna is within the size of a robot."""
 LATE_STD_S = 0.1
 """What is known beforehand of the lag of its stamps."""
 
@@ -229,7 +229,7 @@ def estimate_antenna_uncertainty(
 
 
 def make_unknown_arm() -> Arm:
-    """Return what is known of an arm of which nothing tells."""
+    """Return the prior of an unknown lever arm."""
     return Arm(np.zeros(4), np.diag(np.square([ARM_STD_M] * 3 + [0.0])))
 
 
@@ -313,7 +313,7 @@ def level_imu(imu: InertialMeasurements, tilt_rad: Floats) -> InertialMeasuremen
 
 
 def move_antenna(gnss: Positions, error_m: Floats) -> Positions:
-    """Return the fixes of an antenna whose place in base_link is mended."""
+    """Return the fixes with a corrected lever arm."""
     x, y, z = (np.asarray(gnss.lever_arm_m) + error_m).tolist()
     return replace(gnss, lever_arm_m=(x, y, z))
 

@@ -1,4 +1,4 @@
-"""What sensors say of their own mounting, units and signs, held against each other: gravity, yaw rate, acceleration, direction of travel.
+"""Extrinsics, units and signs of sensors, compared with each other: gravity, yaw rate, acceleration, direction of travel.
 
 A robot stands upright on average, so the mean specific force shows a unit's up. Its yaw rate, told by wheels, camera or fixes, is a
 linear function of the gyroscope's axes whose coefficients show the gyroscope's unit and axis at once. Speeding up and turning accelerate
@@ -44,7 +44,7 @@ class SensorExclusion:
 
 
 def refuse_fixes(code: str, odometries: Collection[str], names: Mapping[str, str] | None = None) -> SensorExclusion:
-    """Return the refusal of fixes that odometries contradict; a single odometry is suspect, whoever confirms how it turns."""
+    """Return the exclusion of fixes that odometries contradict; a single odometry is suspect, even if a gyroscope confirms its turns."""
     if len(odometries) != 1:
         return SensorExclusion(GNSS, code, names or {})
     return SensorExclusion(GNSS, code, {**(names or {}), "suspect": next(iter(odometries))}, is_suspect_excludable=True)

@@ -69,7 +69,7 @@ YAW = np.diag([1.0, -1.0, -1.0])
 
 @dataclass(slots=True)
 class Checks:
-    """What was found: refusals in order, the scale of an odometry that is far off throughout, and the figures they rest on."""
+    """Exclusions in order, the scale of an odometry that is far off throughout, and the facts behind them."""
 
     refusals: list[SensorExclusion] = field(default_factory=list)
     scales: dict[str, Scale] = field(default_factory=dict)
@@ -131,7 +131,7 @@ def check_sensors(
 
 
 def _refuse_slow(imu: InertialMeasurements) -> SensorExclusion | None:
-    """Return the refusal of an IMU whose samples are, for most of its time, too far apart to tell the motion between them."""
+    """Return the exclusion of an IMU whose samples are mostly too far apart to show the motion between them."""
     step_s = np.diff(imu.stamp_ns) * 1e-9
     span_s = float(step_s.sum())
     if span_s > 0 and float(step_s[step_s < _LONGEST_IMU_STEP_S].sum()) >= _MOSTLY * span_s:
@@ -165,7 +165,7 @@ def _estimate_scales(
 def _add_command(
     twists: Mapping[str, Floats], command: CommandedSpeed | None, at_ns: NDArray[np.int64]
 ) -> dict[str, Floats]:
-    """Return the twists and, under `COMMAND`, the commanded speed with the yaw rate that an odometry tells."""
+    """Return the twists and, under `COMMAND`, the commanded speed with the yaw rate of an odometry."""
     if command is None or not twists:
         return dict(twists)
     wanted = hold_last(command.stamp_ns, command.forward_velocity_mps, at_ns)
@@ -198,7 +198,7 @@ def _replace_yaw_rate(
 
 
 def _check_path(checks: Checks, gnss: Positions, twists: Mapping[str, Floats], at_ns: NDArray[np.int64]) -> None:
-    """Check that the fixes go the way the odometries do; one odometry that no gyroscope confirms is as doubtful as they are."""
+    """Check that fixes and odometries have the same path; one odometry that no gyroscope confirms is as doubtful as the fixes."""
     refused = {refusal.role for refusal in checks.refusals}
     told = {role: compare_path_of_fixes(gnss, twist, at_ns) for role, twist in twists.items() if role not in refused}
     against = [role for role, how in told.items() if how in {"mirrored", "unlike"}]
@@ -283,7 +283,7 @@ def _collect_unit_evidence(units: str, axes: Mapping[str, YawAxis], rate: Floats
 
 
 def _find_upright_rotation(level: Floats, looks: Mapping[str, float]) -> Floats:
-    """Return the rotation that stands an IMU upright and, where acceleration shows it, looking ahead."""
+    """Return the rotation that levels an IMU and, where acceleration shows it, turns it forward."""
     yaw = next(iter(looks.values()), 0.0)
     return find_nearest_mounting(_rotate_about_z(yaw) @ level)
 
@@ -341,7 +341,7 @@ def _check_directions(
 
 
 def _refuse_yaw(looks: Mapping[str, float], turned_by: Floats) -> SensorExclusion:
-    """Return the refusal of an IMU that looks elsewhere by the accelerations of odometries, by yaw [rad]."""
+    """Return the exclusion of an IMU that the accelerations of odometries show to be turned, by yaw [rad]."""
     names = {"evidence": "acceleration", "reference": join_names(looks)}
     numbers = {"off_rad": next(iter(looks.values()))}
     return SensorExclusion(IMU, "imu-rotated", names, numbers, turned_by=turned_by)
@@ -350,7 +350,7 @@ def _refuse_yaw(looks: Mapping[str, float], turned_by: Floats) -> SensorExclusio
 def _check_against_command(
     forward: Mapping[str, Floats], command: CommandedSpeed | None, at_ns: NDArray[np.int64]
 ) -> dict[str, bool]:
-    """Return for each odometry that moves while a command stands whether it goes the other way."""
+    """Return for each odometry that moves under a command whether it moves the other way."""
     if command is None:
         return {}
     wanted = hold_last(command.stamp_ns, command.forward_velocity_mps, at_ns)

@@ -33,7 +33,7 @@ from tcpipe.tables.levels import PLACED_SEGMENTS
 from tcpipe.terrain.layers import Layer, join_layers, sort_layers
 from tcpipe.terrain.sampling import Patches
 from tcpipe.terrain.sampling_kernel import compute_morton
-from tcpipe.terrain.tiles import TilePool, level_for
+from tcpipe.terrain.tiles import TilePool, choose_level
 
 logger = logging.getLogger("tcpipe")
 
@@ -276,7 +276,7 @@ def _reuse_map(path: Path, fetched: FetchedShards | None, config: SampleConfig) 
     held = _held.pop(path, None)
     if held is None:
         source = open_map(path, fetched)
-        held = _HeldMap(source, TilePool(level_for(source, config.patch_m / config.patch_px)))
+        held = _HeldMap(source, TilePool(choose_level(source, config.patch_m / config.patch_px)))
     _held[path] = held
     if len(_held) > _HELD_MAPS:
         _held.popitem(last=False)

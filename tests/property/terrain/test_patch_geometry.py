@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tcpipe.terrain.grid import MapGrid
-from tcpipe.terrain.patches import compute_footprints, map_px_from_patch, patch_frames, sample_chord_px
+from tcpipe.terrain.patches import compute_footprints, make_patch_frames, map_px_from_patch, sample_chord_px
 from tcpipe.terrain.sampling_kernel import compute_morton
 
 PLACES = st.tuples(st.floats(-4e5, 4e5), st.floats(-4e5, 4e5))
@@ -26,7 +26,7 @@ def test_pixels_lie_where_the_ruling_says(*, start, angle, scale, chord_m, facto
     p0 = np.array([start])
     direction = np.array([(np.cos(angle), np.sin(angle))])
     pn = p0 + scale * chord_m * direction
-    frames = patch_frames(p0, pn, np.array([chord_m]))
+    frames = make_patch_frames(p0, pn, np.array([chord_m]))
 
     corners = compute_footprints(frames, patch_m)[0]
     sides = np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1)

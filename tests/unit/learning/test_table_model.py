@@ -5,7 +5,7 @@ import pytest
 
 from tcpipe.errors import ModelError
 from tcpipe.learning import table_model as forest
-from tcpipe.learning.table_model import fit_table, patch_features, read_table_model
+from tcpipe.learning.table_model import compute_patch_features, fit_table, read_table_model
 
 PX, PATCH_M = 40, 1.0
 ALONG, ACROSS = np.meshgrid(*[(np.arange(PX) + 0.5) / PX - 0.5] * 2)
@@ -13,7 +13,7 @@ ALONG, ACROSS = np.meshgrid(*[(np.arange(PX) + 0.5) / PX - 0.5] * 2)
 
 def _of_height(height_m):
     patches = np.asarray(height_m, np.float32)[None, ..., None]
-    return patch_features(patches, channels=("height",), class_count=7, patch_m=PATCH_M)[0]
+    return compute_patch_features(patches, channels=("height",), class_count=7, patch_m=PATCH_M)[0]
 
 
 def test_a_paraboloid_has_its_slopes_and_curvatures_and_no_roughness():
@@ -35,7 +35,7 @@ def test_shares_of_classes_and_the_picture():
     patch[0, :, :10, 1], patch[0, :, 10:, 1] = 3 / 6, 6 / 6
     patch[0, :, ::2, 0] = 0.5
     patch[..., 2] = 0.25
-    found = patch_features(patch, channels=("ortho", "terrain", "roots"), class_count=7, patch_m=PATCH_M)[0]
+    found = compute_patch_features(patch, channels=("ortho", "terrain", "roots"), class_count=7, patch_m=PATCH_M)[0]
     assert found == pytest.approx([0.25, 0.25, 0.5, 0, 0, 0, 0.25, 0, 0, 0.75, 0.25, 0, 0])
 
 
@@ -43,8 +43,10 @@ def test_a_mirror_changes_nothing():
     patches = np.random.default_rng(0).random((5, PX, PX, 3), np.float32)
     patches[..., 1] = np.rint(patches[..., 1] * 6) / 6
     rules = {"channels": ("ortho", "terrain", "height"), "class_count": 7, "patch_m": PATCH_M}
-    assert patch_features(patches[:, ::-1], **rules) == pytest.approx(patch_features(patches, **rules), abs=1e-5)
-    assert patch_features(patches[:0], **rules).shape == (0, 16)
+    assert compute_patch_features(patches[:, ::-1], **rules) == pytest.approx(
+        compute_patch_features(patches, **rules), abs=1e-5
+    )
+    assert compute_patch_features(patches[:0], **rules).shape == (0, 16)
 
 
 RULES = {**forest._RULES}

@@ -124,7 +124,7 @@ def test_a_rate_is_that_inside_epochs_and_unknown_of_one_row():
 
 
 ODD = make_finding("power-includes-loads", Subject("role", "power"), names={"loads": "computers"})
-POWER = PowerReadings(averaged=True, findings=(ODD,), current_sign="drawn", other_loads=("computers",))
+POWER = PowerReadings(averaged=True, findings=(ODD,), current_sign="drawn", includes=("computers",))
 
 
 def test_notes_that_count_nothing_are_left_out_and_powers_are_told():

@@ -6,7 +6,7 @@ from map_worlds import ArrayMap
 
 from tcpipe.terrain.grid import MapGrid
 from tcpipe.terrain.layers import PAPER_LAYERS
-from tcpipe.terrain.patches import patch_frames
+from tcpipe.terrain.patches import make_patch_frames
 from tcpipe.terrain.resampling import choose_factor, iterate_levels, list_factors, make_overview_grid
 from tcpipe.terrain.sampling import sample_patches
 
@@ -111,7 +111,7 @@ def test_a_patch_coarser_than_the_map_shows_means_not_every_nth_pixel():
     start = np.array([500_005.0, 5_199_995.0]) + rng.uniform(-2.0, 2.0, (60, 2))
     angle = rng.uniform(-np.pi, np.pi, 60)
     end = start + 2.0 * np.stack([np.cos(angle), np.sin(angle)], 1)
-    frames, chord_m = patch_frames(start, end, np.full(60, 2.0)), np.full(60, 2.0)
+    frames, chord_m = make_patch_frames(start, end, np.full(60, 2.0)), np.full(60, 2.0)
 
     def errors(factors):
         got = sample_patches(Levels(grid, arrays, factors=factors), frames, chord_m, patch_m=2.0, patch_px=20)

@@ -8,7 +8,7 @@ from scipy.ndimage import map_coordinates
 from tcpipe.formats.maps.building import build_map
 from tcpipe.formats.maps.map_files import open_map
 from tcpipe.terrain.grid import MapGrid
-from tcpipe.terrain.patches import map_px_from_patch, patch_frames
+from tcpipe.terrain.patches import make_patch_frames, map_px_from_patch
 from tcpipe.terrain.sampling import OFF_THE_MAP, find_classes_at, sample_patches
 from tcpipe.terrain.tiles import CACHED_TILES, TilePool, group_by_tile, read_window
 
@@ -19,7 +19,7 @@ def frames_at(grid, count, seed=1, margin_m=1.5, chord_m=1.0):
     middle = rng.uniform((x_min + margin_m, y_min + margin_m), (x_max - margin_m, y_max - margin_m), (count, 2))
     angle = rng.uniform(-np.pi, np.pi, count)
     half = 0.5 * chord_m * np.stack([np.cos(angle), np.sin(angle)], 1)
-    return patch_frames(middle - half, middle + half, np.full(count, chord_m))
+    return make_patch_frames(middle - half, middle + half, np.full(count, chord_m))
 
 
 def sample(source, frames, chord_m=1.0, patch_m=1.0, patch_px=40):
@@ -104,7 +104,7 @@ def test_a_plane_with_holes_keeps_its_slope():
     height = (0.25 * x + 0.1 * y).astype(np.float32)
     height[np.random.default_rng(0).random(height.shape) < 0.02] = np.nan
     start = np.array([(4.0, 5.0)])
-    got = sample(ArrayMap(grid, {"height": height}), patch_frames(start, start + np.array([1.0, 0.0]), np.ones(1)))
+    got = sample(ArrayMap(grid, {"height": height}), make_patch_frames(start, start + np.array([1.0, 0.0]), np.ones(1)))
     assert 0.5 < got.valid_fraction[0] < 1.0
     np.testing.assert_allclose(np.tan([got.slope_rad[0], got.cross_slope_rad[0]]), [0.25, 0.1], atol=1e-4)
 
@@ -112,7 +112,7 @@ def test_a_plane_with_holes_keeps_its_slope():
 def test_patches_beyond_the_map_have_no_data_there():
     source = random_map()
     start = np.array([(500_000.0 - 0.5, 5_199_995.0), (500_000.0 - 2.0, 5_199_995.0)])
-    got = sample(source, patch_frames(start, start + np.array([1.0, 0.0]), np.ones(2)))
+    got = sample(source, make_patch_frames(start, start + np.array([1.0, 0.0]), np.ones(2)))
     assert 0.45 < got.valid_fraction[0] < 0.5
     assert got.valid_fraction[1] == 0.0
     assert (got.pixels["height"][1] == 65535).all()
@@ -207,10 +207,10 @@ def test_good_patches_move_together():
     frames = frames_at(source.grid, 700)
     whole, good = sample(source, frames), np.random.default_rng(0).random(700) < 0.8
     good[:150] = True
-    got = sample(source, frames).only(good)
+    got = sample(source, frames).keep_valid(good)
     for name in ("ortho", "terrain", "height", "slope_rad", "terrain_class"):
         np.testing.assert_array_equal(values(got, name), values(whole, name)[good])
-    assert list(sample(ArrayMap(source.grid, {"height": source.arrays["height"]}), frames).only(good).pixels) == [
+    assert list(sample(ArrayMap(source.grid, {"height": source.arrays["height"]}), frames).keep_valid(good).pixels) == [
         "height"
     ]
 

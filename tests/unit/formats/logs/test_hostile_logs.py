@@ -294,14 +294,6 @@ def test_what_no_checksum_covers_is_said(tmp_path):
             assert log.damage == []
 
 
-def test_what_costs_nothing_is_a_note(tmp_path):
-    odd = [Message("/text", "std_msgs/msg/String", START_NS + n, b"\0\1\0\0\3\0\0\0a\xff\0", None) for n in range(3)]
-    with open_log(write_mcap(tmp_path / "a.mcap", odd)) as log:
-        log.tables(log.topics)
-        assert log.damage == []
-        assert [(finding.code, finding.severity) for finding in log.findings] == [("text-not-utf8", "note")]
-
-
 @pytest.mark.parametrize("count", [3, 40])
 def test_a_field_called_like_a_time_keeps_its_values(tmp_path, count):
     text = "int64 log_time_ns\nint64 publish_time_ns\nstring log_time_ns_\n"

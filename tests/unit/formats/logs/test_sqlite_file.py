@@ -115,20 +115,6 @@ def test_tables_that_ros_2_makes_otherwise_are_read(tmp_path, table):
     assert found == expected
 
 
-def test_a_row_of_another_type_is_counted_as_lost(tmp_path):
-    path = tmp_path / "a.db3"
-    with closing(database(path, count=50)) as connection, connection:
-        last = connection.execute("SELECT MAX(id) FROM messages").fetchone()[0]
-        connection.execute("INSERT INTO messages VALUES (?, 1, 2.5, x'0102')", (last + 1,))
-        connection.execute("INSERT INTO messages VALUES (?, 1, 7, x'0102')", (last + 2,))
-        connection.commit()
-        expected = [row for row in rows_by_sqlite(connection) if isinstance(row[2], int)]
-    with closing(SqlitePart(path, path.name)) as part:
-        found = sorted(number for block in part.blocks(frozenset({1, 300})) for number in block.ordinal.tolist())
-    assert found == [row[0] for row in expected]
-    assert [damage.messages_lost for damage in part.damage] == [1]
-
-
 def rows_of(path, data):
     """The rows that are read of a damaged file, and what is said of it."""
     path.write_bytes(data)

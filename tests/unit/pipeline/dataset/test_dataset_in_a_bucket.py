@@ -16,7 +16,7 @@ import tcpipe
 from tcpipe.errors import StoreError, UsageError
 from tcpipe.formats.bucket import open_place
 from tcpipe.formats.bucket_directories import GENERATIONS
-from tcpipe.learning.training import model_for
+from tcpipe.learning.training import choose_model_kind
 from tcpipe.pipeline.dataset import build as building
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.diff import diff
@@ -226,7 +226,7 @@ def test_commands_look_at_a_dataset_in_a_bucket(made, bucket):
     assert verify(URL).problems == (f"{URL}/stray: is no file of this dataset",)
     assert inspect(URL, recipe=Recipe()).samples == inspect(made / "zarr", recipe=Recipe()).samples
     assert inspect(URL, recipe=Recipe()).path == URL
-    assert model_for(URL) == "table"
+    assert choose_model_kind(URL) == "table"
     assert diff(made / "zarr", URL).same
     sample = tcpipe.open_dataset(URL)["train"].samples["sample_id"][0].as_py()
     assert explain(sample, dataset=URL, store=made / "store") == explain(
