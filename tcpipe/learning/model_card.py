@@ -113,18 +113,18 @@ mean power w [W] and velocity v [m/s] give T = d / v and E = w d / v with d = {{
 
 - Takes float32 (N, {{ px }}, {{ px }}, {{ depth }}) in [0, 1]: {{ channels }}; a patch is {{ patch }} m wide, travel to the right.
 {% if extra_features -%}
-- Also takes: {{ extra_features }}: {{ extra_features }}: {{ extra_features }}: {{ extra_features }}: {{ extra_features }}.
+- Also takes: {{ extra_features }}.
 {% endif -%}
 - Velocity is the {{ velocity }} one; power is {{ energy }}; robot {{ robot }}.
 {%- if includes %}
   What was measured feeds {{ includes }}, too.
 {%- endif %}
-{% if config.model == "table" -%}
+{% if config.model == "boosting" -%}
 - Table: a curve over the slope of each class, and up to {{ told.best_epoch }} boosted trees a label over features of the patch (LightGBM),
   as many as are best where each fold of train is predicted by the others; the loss {{ config.loss }} there is
   {{ "%.4f" | format(told.held_out_loss) }}.
 {% elif config.model == "physics" -%}
-- Physics: standing, drivetrain, grade, and rolling and turning of each class, at a speed that is a curve over class and slope; fitted
+- Physics: idle power, drivetrain, grade, and rolling and turning of each class, at a speed that is a curve over class and slope; fitted
   robustly. Its loss {{ config.loss }} where each fold of train is predicted by the others is {{ "%.4f" | format(told.held_out_loss) }}.
   Of a patch it takes slope and class, which `predict` takes as extra features.
 {% else -%}

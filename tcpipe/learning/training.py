@@ -112,7 +112,7 @@ def choose_model_kind(dataset: str | Path) -> ModelKind:
     count = read_card(fetch_directory_by_range(dataset, by_range=is_shard)[0]).splits.get("train", 0)
     kind: ModelKind = "boosting" if count < FEW_SAMPLES else "resnet18"
     than, other = ("fewer than", "resnet18") if kind == "boosting" else ("not fewer than", "boosting")
-    message = "%d training samples are %s %d: a %s is trained; --model %s is the other choice"
+    message = "%d training samples, %s %d: tcpipe trains a model of kind %s; to train the other kind: --model %s"
     logger.info(message, count, than, FEW_SAMPLES, kind, other)
     return kind
 

@@ -221,7 +221,7 @@ def _make_segments_data(segments: pa.Table, timeline: Timeline, run_map: RunMap)
     rise_m = to_floats(segments, "end_z_m") - to_floats(segments, "start_z_m")
     columns["slope"] = "f32", np.degrees(np.arctan2(rise_m, to_floats(segments, "chord_m")))
     columns["turn"], columns["turn_std"] = (
-        ("f32", np.degrees(to_floats(segments, f"turn_{part}rad"))) for part in ("", "std_")
+        ("f32", np.degrees(to_floats(segments, f"yaw_change_{part}rad"))) for part in ("", "std_")
     )
     columns["residual"] = "f32", to_floats(segments, "power_watt") - to_floats(segments, "physics_power_watt")
     return pack_columns(columns | {"quality": ("u16", to_integers(segments, "quality"))})

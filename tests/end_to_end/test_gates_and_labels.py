@@ -132,7 +132,7 @@ def meant(truth, values, labelled):
     return (at[1] - at[0]) / (end_ns - start_ns)
 
 
-def test_what_is_above_standing_is_as_wrong_as_it_says(faulty):
+def test_net_energy_is_as_wrong_as_it_says(faulty):
     _, labelled, truth = faulty
     true, idle = compute_true_cost(truth, spans(labelled)[0]), SimulatedRobot().idle_watt
     for name, wanted in (

@@ -71,7 +71,7 @@ def test_without_energy_there_is_none_of_its_deviations():
 
 
 @pytest.mark.parametrize(("idle_watt", "energy_joule"), [(np.nan, 200.0), (90.0, np.nan)])
-def test_above_standing_is_not_known_where_either_is_not(idle_watt, energy_joule):
+def test_net_energy_is_not_known_where_either_is_not(idle_watt, energy_joule):
     ends = {"end_power_watt": np.array([150.0]), "energy_noise_joule": np.array([1.0])}
     cost = one(duration_s=1.2, energy_joule=energy_joule, end_velocity_mps=0.8, **ends)
     got = subtract_idle_power(cost, idle_watt=idle_watt, idle_std_watt=2.0, **ends)

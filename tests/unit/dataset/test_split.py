@@ -53,7 +53,7 @@ def test_labels_are_power_and_velocity(path):
     np.testing.assert_array_equal(test.labels[:, 1], test.samples["velocity_mps"].to_numpy().astype(np.float32))
 
 
-def test_labels_above_standing_are_the_same_samples_less_what_standing_takes(path):
+def test_net_labels_are_those_of_the_same_samples_less_idle_power(path):
     total, above = (open_dataset(path, label=name)["test"] for name in ("total", "net"))
     assert above.label_columns == ("net_power_watt", "velocity_mps")
     np.testing.assert_allclose(above.labels[:, 0], total.labels[:, 0] - STANDING_WATT, rtol=1e-6)

@@ -80,7 +80,7 @@ def test_the_figures_are_the_arrays_own(evaluated, model, dataset):
     )
 
 
-def test_a_model_of_what_is_above_standing_is_held_against_that(model, dataset, tmp_path):
+def test_a_model_of_net_energy_is_compared_with_net_energy(model, dataset, tmp_path):
     training = load_model(model).card.training
     names = ("net_power_watt", "velocity_mps")
     made = made_model(tmp_path / "above", training=training, outputs=names, label_energy="net")

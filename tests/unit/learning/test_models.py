@@ -70,7 +70,7 @@ def test_no_model_and_half_a_model(tmp_path, place):
 @pytest.mark.parametrize(
     ("change", "match"),
     [
-        ({"schema_version": 99}, "written by model schema 99, wanted 2; train the model again"),
+        ({"schema_version": 99}, "written by model schema 99, wanted 3; train the model again"),
         ({"kind": "tcpipe dataset"}, "not the card of a tcpipe model"),
         (
             {"scale": None},

@@ -114,7 +114,7 @@ def test_rows_that_were_set_aside_are_counted_but_not_those_of_a_sensor_that_was
         PLACE,
         counts={"gnss": counts(variances_replaced=4), "imu": counts(invalid=2), "visual_odometry": counts(invalid=9)},
         findings=[sleeps, blind],
-        refused=frozenset({"visual_odometry"}),
+        excluded=frozenset({"visual_odometry"}),
     )
     assert warned(inputs, stretch(), skipped_s=0.55) == (
         sleeps,

@@ -241,7 +241,7 @@ def test_an_accelerometer_in_another_unit_or_without_gravity_tells_no_vibration(
     assert np.median(found) == pytest.approx(wanted, rel=0.05, nan_ok=True)
 
 
-def test_power_above_standing_of_a_robot_that_stands_first():
+def test_net_power_of_a_robot_that_stands_first():
     speed = np.where(T < 6, 0.0, np.minimum((T - 6) * 0.8, 0.8))
     watts = np.where(T < 6, 90.0, 240.0)
     stamp_ns = stamps(len(T))

@@ -226,7 +226,7 @@ def test_commands_look_at_a_dataset_in_a_bucket(made, bucket):
     assert verify(URL).problems == (f"{URL}/stray: is no file of this dataset",)
     assert inspect(URL, recipe=Recipe()).samples == inspect(made / "zarr", recipe=Recipe()).samples
     assert inspect(URL, recipe=Recipe()).path == URL
-    assert choose_model_kind(URL) == "table"
+    assert choose_model_kind(URL) == "boosting"
     assert diff(made / "zarr", URL).same
     sample = tcpipe.open_dataset(URL)["train"].samples["sample_id"][0].as_py()
     assert explain(sample, dataset=URL, store=made / "store") == explain(
