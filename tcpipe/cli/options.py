@@ -19,7 +19,7 @@ from click.shell_completion import CompletionItem
 from tcpipe.errors import TcpipeError, UsageError
 from tcpipe.formats import user_paths
 from tcpipe.tables import options
-from tcpipe.tables.earlier_names import EARLIER_CHOICES
+from tcpipe.tables.options import EARLIER_CHOICES
 
 if TYPE_CHECKING:
     from tcpipe.store import Store

@@ -16,9 +16,8 @@ from dataclasses import asdict, dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.tables.catalogue import read_threshold
 from tcpipe.tables.facts import EnergyBudget
-from tcpipe.tables.findings import Finding, Subject, make_finding
+from tcpipe.tables.findings import Finding, Subject, make_finding, read_threshold
 
 Floats = NDArray[np.float64]
 

@@ -29,8 +29,8 @@ from tcpipe.report.dataset_patches import choose_thinning, make_sheets
 from tcpipe.report.page import Section, Shaded
 from tcpipe.report.plots import Plot, make_plot
 from tcpipe.tables.arrays import to_texts
-from tcpipe.tables.catalogue import read_threshold
 from tcpipe.tables.columns import to_floats
+from tcpipe.tables.findings import read_threshold
 
 MEASURED, PREDICTED = DROPPED, SPLIT_COLOURS["train"]
 MOST_PERCENT = 50.0

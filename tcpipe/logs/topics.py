@@ -7,8 +7,7 @@ from dataclasses import dataclass, replace
 from itertools import accumulate
 from typing import Any
 
-from tcpipe.tables.catalogue import Severity
-from tcpipe.tables.findings import Finding, Subject, make_finding
+from tcpipe.tables.findings import Finding, Severity, Subject, make_finding
 
 
 @dataclass(frozen=True, slots=True)

@@ -26,8 +26,7 @@ from tcpipe.pipeline.log_sources import find_remote_logs
 from tcpipe.recipe import Recipe
 from tcpipe.recipe.checking import as_toml
 from tcpipe.store import Store, is_store, run_at
-from tcpipe.tables.catalogue import AFFECTED
-from tcpipe.tables.findings import Finding, Grade, Verdict
+from tcpipe.tables.findings import AFFECTED, Finding, Grade, Verdict
 
 if TYPE_CHECKING:
     from tcpipe.pipeline.inspected import InspectedDataset, InspectedMap

@@ -40,8 +40,7 @@ from tcpipe.pipeline.plan import LOG_STATES, TROUBLE, IngestTask, LogState, Step
 from tcpipe.pipeline.problems import find_incomplete_runs, make_missing, make_waiting
 from tcpipe.recipe import Recipe
 from tcpipe.store import Store, open_store
-from tcpipe.tables.catalogue import Severity, read_threshold
-from tcpipe.tables.findings import Finding, Subject, Verdict, judge_by_code, make_finding
+from tcpipe.tables.findings import Finding, Severity, Subject, Verdict, judge_by_code, make_finding, read_threshold
 
 _MOST_NAMES = 3
 _MOST_CALLS = 7

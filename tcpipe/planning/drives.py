@@ -36,9 +36,8 @@ from tcpipe.report.plots import Plot, make_plot
 from tcpipe.splits.audit import CLOSE, PLACES, are_near, compute_middles_deg
 from tcpipe.store import Store, open_store
 from tcpipe.tables.bits import flag_names
-from tcpipe.tables.catalogue import read_threshold
 from tcpipe.tables.columns import read_lonlat_deg, to_floats
-from tcpipe.tables.findings import PREDICTED, Finding, Subject, Verdict, judge, make_finding
+from tcpipe.tables.findings import PREDICTED, Finding, Subject, Verdict, judge, make_finding, read_threshold
 from tcpipe.terrain.patches import make_patch_frames
 from tcpipe.terrain.tiles import MapReader, find_map_projection
 

@@ -23,8 +23,7 @@ from tcpipe.formats.finding_lines import MOST_LINES, FindingGroup, format_findin
 from tcpipe.formats.json_files import Json
 from tcpipe.report import plots
 from tcpipe.report.plots import Plot
-from tcpipe.tables.catalogue import AFFECTED, Affected, Severity
-from tcpipe.tables.findings import Finding, Grade, Verdict, sort_findings
+from tcpipe.tables.findings import AFFECTED, Affected, Finding, Grade, Severity, Verdict, sort_findings
 
 _INVISIBLE = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\xad\u061c\u200b-\u200f\u2028-\u202e\u2060-\u206f\ufeff]")
 """Invisible characters and those that reverse the direction of text; a name may contain them."""

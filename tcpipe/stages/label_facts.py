@@ -17,10 +17,9 @@ from tcpipe.power.noise import compute_median_period_s, estimate_resolution
 from tcpipe.power.rails import Rail, Samples
 from tcpipe.tables.arrays import to_numbers
 from tcpipe.tables.bits import Quality, flag_name
-from tcpipe.tables.catalogue import read_threshold
 from tcpipe.tables.columns import to_floats, to_integers
 from tcpipe.tables.facts import EnergyBudget, LabelFacts, PhysicsFacts, RailFacts, SignalFacts
-from tcpipe.tables.findings import Finding, Subject, make_finding
+from tcpipe.tables.findings import Finding, Subject, make_finding, read_threshold
 
 _POWER, _WHEELS = Subject("role", "power"), Subject("role", "wheel_odometry")
 

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.errors import TableError
-from tcpipe.tables.catalogue import read_threshold
+from tcpipe.tables.findings import read_threshold
 from tcpipe.terrain.grid import MapGrid
 
 FloatArray = NDArray[np.float64]

@@ -19,8 +19,7 @@ from tcpipe.formats.maps.map_facts import MapFacts, MapInputs
 from tcpipe.formats.maps.map_files import SHARD_PX, MapWriter
 from tcpipe.formats.maps.terrain_polygons import PolygonLayer, is_drawn, place_polygons
 from tcpipe.formats.recipe_toml import parse_toml
-from tcpipe.tables.catalogue import read_threshold
-from tcpipe.tables.findings import Finding, Subject, make_finding
+from tcpipe.tables.findings import Finding, Subject, make_finding, read_threshold
 from tcpipe.terrain.classes import (
     MAX_ID,
     PAPER_SCHEME,

@@ -37,8 +37,8 @@ from tcpipe.formats.layer_descriptions import Description, describe_layer, make_
 from tcpipe.formats.maps.map_facts import MapFacts, MapSummary
 from tcpipe.formats.shards import DESCRIPTION, ShardedArray, ShardFetcher, open_sharded
 from tcpipe.formats.zarr_arrays import add_array, consolidate_metadata, create_group
-from tcpipe.tables.earlier_names import rename_keys
 from tcpipe.tables.facts import LEFT_OUT
+from tcpipe.tables.options import rename_keys
 from tcpipe.terrain.classes import ClassScheme, ClassTable, TerrainClass
 from tcpipe.terrain.grid import MapGrid
 from tcpipe.terrain.layers import LAYERS, PAPER_LAYERS, Layer, Pixels, find_no_data_value
