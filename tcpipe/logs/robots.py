@@ -9,7 +9,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from tcpipe.errors import RecipeError
 from tcpipe.logs.topics import Topic
 from tcpipe.recipe.suggestions import RecipeFragment
-from tcpipe.robots.profiles import GENERIC, Robot
+from tcpipe.robots import GENERIC, Robot
 
 _POWER_OF_ANY_CLEARPATH = "clearpath_platform_msgs/msg/Power"
 _FIRST_TO_PUBLISH_IT = "A200"

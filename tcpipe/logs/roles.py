@@ -28,7 +28,7 @@ from tcpipe.logs.topics import (
 )
 from tcpipe.power.sources import BATTERY_STATE, FLOAT_TYPES, find_quantity, is_corrected, make_rail_name
 from tcpipe.recipe.suggestions import RecipeFragment, suggest
-from tcpipe.robots.profiles import Profiles
+from tcpipe.robots import Profiles
 from tcpipe.tables.findings import Finding, Subject, make_finding
 
 NAV_SAT_FIX = "sensor_msgs/msg/NavSatFix"

@@ -24,8 +24,8 @@ from tcpipe.report.colours import SPLIT_COLOURS
 from tcpipe.store import Store, find_store_above, is_store, run_at
 from tcpipe.tables.arrays import make_lines, to_texts
 from tcpipe.tables.columns import read_lonlat_deg, to_floats
-from tcpipe.terrain.patches import compute_footprints, make_patch_frames
 from tcpipe.terrain.projection import Projection, compute_area, parse_crs
+from tcpipe.terrain.sampling import compute_footprints, make_patch_frames
 
 _REGIONS = {"train_test": SPLIT_COLOURS["train"], "unseen": SPLIT_COLOURS["unseen"], "exclude": SPLIT_COLOURS["buffer"]}
 _WGS84 = "EPSG:4326"

@@ -47,7 +47,7 @@ WANTED_HZ: Mapping[str, float] = {
     "imu": LEAST_RATE_HZ,
     **{role: read_threshold("rate-too-low", f"{role}_hz") for role in ("gnss", "wheel_odometry", "visual_odometry")},
 }
-"""Slower topics cost precision or columns; the rate of power depends on its source (`tcpipe.cost.quality`)."""
+"""Slower topics cost precision or columns; the rate of power depends on its source (`tcpipe.cost.labels`)."""
 
 LARGE_TYPES = frozenset(
     f"sensor_msgs/msg/{name}"

@@ -38,7 +38,7 @@ from tcpipe.store import Store, open_store
 from tcpipe.tables.bits import flag_names
 from tcpipe.tables.columns import read_lonlat_deg, to_floats
 from tcpipe.tables.findings import PREDICTED, Finding, Subject, Verdict, judge, make_finding, read_threshold
-from tcpipe.terrain.patches import make_patch_frames
+from tcpipe.terrain.sampling import make_patch_frames
 from tcpipe.terrain.tiles import MapReader, find_map_projection
 
 Floats = NDArray[np.float64]

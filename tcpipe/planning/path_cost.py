@@ -32,8 +32,8 @@ from tcpipe.planning.segment_predictions import (
 )
 from tcpipe.tables.bits import flag_names
 from tcpipe.tables.columns import Column, TableSchema
-from tcpipe.terrain.patches import PatchFrames, compute_footprints, count_corners_on, make_patch_frames
 from tcpipe.terrain.projection import Projection, compute_area, make_metres_from_plane
+from tcpipe.terrain.sampling import PatchFrames, compute_footprints, count_corners_on, make_patch_frames
 from tcpipe.terrain.tiles import MapReader, find_map_projection
 
 Floats = NDArray[np.float64]

@@ -20,8 +20,14 @@ from tcpipe.planning.cost_model import CostModel, predict_patches
 from tcpipe.tables.bits import flag_name
 from tcpipe.terrain.classes import NODATA_ID
 from tcpipe.terrain.layers import HEIGHT_STEP_M
-from tcpipe.terrain.patches import PatchFrames, compute_footprints, count_corners_on
-from tcpipe.terrain.sampling import Patches, compute_relief_m, sample_patches
+from tcpipe.terrain.sampling import (
+    Patches,
+    PatchFrames,
+    compute_footprints,
+    compute_relief_m,
+    count_corners_on,
+    sample_patches,
+)
 from tcpipe.terrain.tiles import MapReader, TilePool, choose_level
 
 LANE_M = 0.7

@@ -14,7 +14,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.robots.profiles import FieldPath, PowerSource, parse_fields
+from tcpipe.robots import FieldPath, PowerSource, parse_fields
 from tcpipe.tables.findings import Finding, Subject, make_finding, read_threshold
 
 Columns = Mapping[str, NDArray[Any]]

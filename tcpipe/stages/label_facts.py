@@ -8,13 +8,11 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from tcpipe.cost.labels import estimate_energy_budget, find_noise
-from tcpipe.cost.quality import find_wanted_rate
+from tcpipe.cost.labels import estimate_energy_budget, find_noise, find_wanted_rate
 from tcpipe.motion.distance_breakdown import find_interval_reason, sum_by_reason
 from tcpipe.motion.row_sections import number_pieces
-from tcpipe.power.energy import Rule, integrate_recorded_energy
 from tcpipe.power.noise import compute_median_period_s, estimate_resolution
-from tcpipe.power.rails import Rail, Samples
+from tcpipe.power.rails import Rail, Rule, Samples, integrate_recorded_energy
 from tcpipe.tables.arrays import to_numbers
 from tcpipe.tables.bits import Quality, flag_name
 from tcpipe.tables.columns import to_floats, to_integers

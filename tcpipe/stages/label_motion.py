@@ -6,8 +6,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from tcpipe.cost.labels import Labels
-from tcpipe.cost.quality import has_low_power_rate, has_slip, spans_near, touches_voltage_outside
+from tcpipe.cost.labels import Labels, has_low_power_rate, has_slip, spans_near, touches_voltage_outside
 from tcpipe.fusion.measurements import GNSS, IMU
 from tcpipe.fusion.process import estimate_gyro_density
 from tcpipe.fusion.signals import compute_median_period_ns, estimate_white_noise

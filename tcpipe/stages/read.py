@@ -17,7 +17,7 @@ from tcpipe.logs.topics import find_missing_roles
 from tcpipe.power.readings import PowerReadings
 from tcpipe.power.sources import list_power_lists
 from tcpipe.recipe import ReadConfig
-from tcpipe.robots.profiles import Profiles
+from tcpipe.robots import Profiles
 from tcpipe.stages.message_arrays import LogReader, gather_messages
 from tcpipe.stages.read_power import add_averaging, find_repeats, read_rail_power, remove_repeats
 from tcpipe.stages.read_roles import decide_roles, find_power_candidates

@@ -15,7 +15,7 @@ from tcpipe.logs.topics import Topic
 from tcpipe.power.sources import FLOAT_TYPES, LARGEST_AMP, LARGEST_VOLT, find_quantity, is_of_drives, make_rail_name
 from tcpipe.recipe import ReadConfig, Recipe, Role
 from tcpipe.recipe.suggestions import TomlValue, suggest
-from tcpipe.robots.profiles import Profiles
+from tcpipe.robots import Profiles
 from tcpipe.stages.message_arrays import LogReader, make_message_arrays
 from tcpipe.tables.findings import Finding, Subject, make_finding
 

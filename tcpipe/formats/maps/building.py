@@ -29,7 +29,6 @@ from tcpipe.terrain.classes import (
     find_named_scheme,
     make_own_scheme,
 )
-from tcpipe.terrain.grid import MapGrid
 from tcpipe.terrain.layers import (
     COLOURS,
     PAPER_LAYERS,
@@ -39,7 +38,7 @@ from tcpipe.terrain.layers import (
     make_paper_layers,
 )
 from tcpipe.terrain.projection import parse_crs
-from tcpipe.terrain.target_grid import Georeference, choose_crs, choose_grid, find_projection
+from tcpipe.terrain.target_grid import Georeference, MapGrid, choose_crs, choose_grid, find_projection
 
 Files = Path | Sequence[Path]
 """One file of a layer, or all; the last lies on top."""

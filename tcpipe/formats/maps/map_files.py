@@ -40,10 +40,9 @@ from tcpipe.formats.zarr_arrays import add_array, consolidate_metadata, create_g
 from tcpipe.tables.facts import LEFT_OUT
 from tcpipe.tables.options import rename_keys
 from tcpipe.terrain.classes import ClassScheme, ClassTable, TerrainClass
-from tcpipe.terrain.grid import MapGrid
 from tcpipe.terrain.layers import LAYERS, PAPER_LAYERS, Layer, Pixels, find_no_data_value
 from tcpipe.terrain.resampling import iterate_levels, list_factors, make_overview_grid
-from tcpipe.terrain.target_grid import MAX_PIXELS, MAX_SIDE_PX
+from tcpipe.terrain.target_grid import MAX_PIXELS, MAX_SIDE_PX, MapGrid
 
 TILE_PX = 512
 """Side of a tile: the unit that is decoded."""

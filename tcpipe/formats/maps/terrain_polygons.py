@@ -23,9 +23,9 @@ from tcpipe.formats.maps.geotiff import burn_polygons
 from tcpipe.formats.maps.layer_building import Tally
 from tcpipe.tables.findings import Finding, Subject, make_finding, read_threshold
 from tcpipe.terrain.classes import ClassScheme, name_key
-from tcpipe.terrain.grid import MapGrid
 from tcpipe.terrain.layers import Layer, Pixels, make_paper_layers
 from tcpipe.terrain.projection import Projection, compute_area
+from tcpipe.terrain.target_grid import MapGrid
 
 PROPERTY = "class"
 """The property with a polygon's class, in any case."""

@@ -16,7 +16,7 @@ from tcpipe.errors import DatasetError
 from tcpipe.formats.dataset_card import Covariate, RunSource
 from tcpipe.recipe import CovariateConfig
 from tcpipe.recipe.suggestions import suggest
-from tcpipe.robots.profiles import Robot
+from tcpipe.robots import Robot
 from tcpipe.tables.columns import to_integers
 from tcpipe.tables.findings import Finding, Subject, make_finding
 from tcpipe.tables.levels import SAMPLES

@@ -13,7 +13,7 @@ from tcpipe.pipeline.dataset.added_columns import find_narrow_patches
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.verify import verify
 from tcpipe.recipe import CovariateConfig, Recipe, SampleConfig, SplitConfig
-from tcpipe.robots.profiles import Robot
+from tcpipe.robots import Robot
 from tcpipe.store import Store, open_store
 from tcpipe.tables.findings import Subject, select_findings
 
