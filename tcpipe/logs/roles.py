@@ -13,12 +13,14 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import TypeVar
 
-from tcpipe.logs.robots import ask_which_robot, find_robot, find_robot_namespaces
 from tcpipe.logs.topics import (
     LISTED,
     Topic,
+    ask_which_robot,
     find_left_out,
     find_missing_roles,
+    find_robot,
+    find_robot_namespaces,
     find_short_topics,
     find_undecodable,
     format_coverage,

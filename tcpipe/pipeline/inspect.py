@@ -20,7 +20,7 @@ from tcpipe.formats.logs.table_folders import find_table_folders, list_table_fil
 from tcpipe.formats.object_storage import format_path, is_presigned, is_url
 from tcpipe.formats.run_documents import Counts, Ingestion, LogOrigin
 from tcpipe.formats.stored_runs import RunDirectory
-from tcpipe.logs.field_names import CALLED, match_field_names
+from tcpipe.logs.field_mapping import CALLED, match_field_names
 from tcpipe.pipeline.log_inspection import InspectedLog, inspect_log
 from tcpipe.pipeline.log_sources import find_remote_logs
 from tcpipe.recipe import Recipe

@@ -27,8 +27,15 @@ from tcpipe.power.rails import (
     integrate_energy,
 )
 from tcpipe.recipe import LabelConfig
-from tcpipe.stages.label_facts import find_label_findings, make_label_facts, sum_energy_entries
-from tcpipe.stages.label_motion import find_motion_flags, find_power_flags, is_clock_doubtful, make_motion_columns
+from tcpipe.stages.label_motion import (
+    find_label_findings,
+    find_motion_flags,
+    find_power_flags,
+    is_clock_doubtful,
+    make_label_facts,
+    make_motion_columns,
+    sum_energy_entries,
+)
 from tcpipe.stages.message_arrays import make_rails
 from tcpipe.tables.arrays import make_lines, select_rows, to_numbers
 from tcpipe.tables.bits import DropReason, Quality

@@ -8,8 +8,7 @@ from typing import Any, cast, get_args
 
 import numpy as np
 
-from tcpipe.logs.field_mapping import find_topic
-from tcpipe.logs.field_names import propose_roles
+from tcpipe.logs.field_mapping import find_topic, propose_roles
 from tcpipe.logs.roles import OVERLAY, RoleAssignment, assign_roles
 from tcpipe.logs.topics import Topic
 from tcpipe.power.sources import FLOAT_TYPES, LARGEST_AMP, LARGEST_VOLT, find_quantity, is_of_drives, make_rail_name
