@@ -260,7 +260,7 @@ _STAMP = re.compile(r"t|stamp|.*time(stamp)?.*|gpst|utc|date")
 
 def propose_tables(folder: Path, files: Sequence[Path]) -> InspectedTables:
     """Return the columns of each table, why some cannot be read, and a recipe for the rest."""
-    from tcpipe.formats.tables import read_column_names  # noqa: PLC0415  polars only where a table is read
+    from tcpipe.formats.logs.table_log import read_column_names  # noqa: PLC0415  polars only where a table is read
 
     columns: dict[str, tuple[str, ...]] = {}
     problems: dict[str, str] = {}

@@ -14,7 +14,7 @@ from pathlib import Path
 from tcpipe import __version__
 from tcpipe.cost.labels import format_budget
 from tcpipe.errors import DatasetError, MissingFileError, RecipeError, StoreError, UsageError, clean_lines
-from tcpipe.formats.atomic import clear_beside, write_atomic_directory, write_text
+from tcpipe.formats.atomic import check_local_output, clear_beside, write_atomic_directory, write_text
 from tcpipe.formats.bucket import open_place
 from tcpipe.formats.bucket_directories import fetch_directory_by_range, find_newest
 from tcpipe.formats.commits import CallRecord, Dataset, Entries
@@ -45,7 +45,6 @@ from tcpipe.formats.parquet import ROWS_PER_GROUP, write_parquet_rows
 from tcpipe.formats.place import DirectoryPlace
 from tcpipe.formats.recipe_toml import resolve_recipe
 from tcpipe.formats.run_documents import SPOOL
-from tcpipe.formats.user_paths import check_local_output
 from tcpipe.motion.distance_breakdown import KEPT
 from tcpipe.pipeline.calls import (
     BUILD,

@@ -27,7 +27,7 @@ from tcpipe.formats.dataset_card import (
     judge_dataset,
 )
 from tcpipe.formats.json_files import convert_record
-from tcpipe.formats.layer_descriptions import describe_layer
+from tcpipe.formats.maps.map_facts import describe_layer
 from tcpipe.formats.maps.map_files import MapFile
 from tcpipe.pipeline.dataset.content import Content
 from tcpipe.pipeline.dataset.inputs import BuildOptions, Inputs
