@@ -22,10 +22,11 @@ from tcpipe.formats.json_files import write_json
 from tcpipe.formats.object_storage import is_url
 from tcpipe.formats.stored_runs import RunDirectory
 from tcpipe.pipeline.generations import write_generation
-from tcpipe.planning.cost_model import CostModel, check_model
-from tcpipe.planning.segment_predictions import (
+from tcpipe.planning.cost_model import (
+    CostModel,
     Reason,
     SegmentPredictions,
+    check_model,
     iterate_batches,
     join_predictions,
     predict_segments,
