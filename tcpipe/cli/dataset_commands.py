@@ -130,7 +130,7 @@ def export(
     import resource
 
     if out.endswith(GEOPACKAGE):
-        from tcpipe.pipeline.layers import export_layers
+        from tcpipe.pipeline.export import export_layers
 
         if names or topics:
             raise UsageError(f"{out}: a GeoPackage holds no topics; give a directory for them")

@@ -56,11 +56,10 @@ from tcpipe.pipeline.calls import (
     open_log,
     start_stopwatch,
 )
-from tcpipe.pipeline.dataset.added_columns import read_all_covariates
 from tcpipe.pipeline.dataset.balance import BALANCE_COLUMNS, measure_balance
 from tcpipe.pipeline.dataset.build_dataset_options import BuildDatasetOptions
 from tcpipe.pipeline.dataset.card import CARD_COLUMNS, PHYSICS_COLUMNS, VELOCITY_COLUMN, is_whole, make_dataset_card
-from tcpipe.pipeline.dataset.content import gather_content, write_patches
+from tcpipe.pipeline.dataset.content import gather_content, read_all_covariates, write_patches
 from tcpipe.pipeline.dataset.inputs import BuildOptions, Inputs, choose_inputs, find_other_options, read_earlier_splits
 from tcpipe.pipeline.dataset.redaction import (
     make_redaction,
