@@ -29,8 +29,7 @@ from tcpipe.cli.output import (
     show_progress,
 )
 from tcpipe.errors import UsageError
-from tcpipe.pipeline.add_map_options import AddMapOptions
-from tcpipe.pipeline.dataset.build_dataset_options import BuildDatasetOptions
+from tcpipe.pipeline.options import AddMapOptions, BuildDatasetOptions
 
 if TYPE_CHECKING:
     from tcpipe.pipeline.export import Exported

@@ -57,7 +57,6 @@ from tcpipe.pipeline.calls import (
     start_stopwatch,
 )
 from tcpipe.pipeline.dataset.balance import BALANCE_COLUMNS, measure_balance
-from tcpipe.pipeline.dataset.build_dataset_options import BuildDatasetOptions
 from tcpipe.pipeline.dataset.card import CARD_COLUMNS, PHYSICS_COLUMNS, VELOCITY_COLUMN, is_whole, make_dataset_card
 from tcpipe.pipeline.dataset.content import gather_content, read_all_covariates, write_patches
 from tcpipe.pipeline.dataset.inputs import BuildOptions, Inputs, choose_inputs, find_other_options, read_earlier_splits
@@ -71,6 +70,7 @@ from tcpipe.pipeline.dataset.redaction import (
 from tcpipe.pipeline.dataset.runs import CHOICE_CODES, find_gone_runs
 from tcpipe.pipeline.dataset.sampling import Workers
 from tcpipe.pipeline.generations import read_generations, write_generation
+from tcpipe.pipeline.options import BuildDatasetOptions
 from tcpipe.recipe import Recipe
 from tcpipe.report.dataset_report import render_dataset_report
 from tcpipe.report.pictures import draw_classes, draw_maps, draw_relief, write_overview
