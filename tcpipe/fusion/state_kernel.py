@@ -18,9 +18,7 @@ References: E. A. Wan, R. van der Merwe, "The unscented Kalman filter for nonlin
 kinematics for the error-state Kalman filter", arXiv 1711.02508, 2017; C. Hertzberg et al., "Integrating generic sensor fusion algorithms
 with sound state representations through encapsulation of manifolds", Information Fusion 14 (1), 2013.
 
-Prediction of the error-state unscented filter; state and errors: `tcpipe.fusion.state_kernel`.
-
-Process, over an interval dt with the mean angular velocity w and specific force a of the IMU::
+Prediction: the process, over an interval dt with the mean angular velocity w and specific force a of the IMU::
 
     R⁺ = R exp((w - b_g) dt)    v⁺ = v + (R exp((w - b_g) dt/2) (a - b_a) - g e_z) dt    p⁺ = p + v dt + ½ (v⁺ - v) dt
 

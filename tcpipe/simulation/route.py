@@ -1,7 +1,7 @@
 """Where a simulated drive goes: legs, turns, pauses, and the smooth curve a leg follows.
 
 A plan is a list of manoeuvres. A `Leg` starts where the robot stands and looks, so that turns in place are found by the driver
-(`tcpipe.simulation.route`); its corners become arcs, its curvature is smoothed over half a metre, and a human's weaving is laid over it.
+(`simulate_drive`); its corners become arcs, its curvature is smoothed over half a metre, and a human's weaving is laid over it.
 
 Drives a robot over a world: manoeuvres in, truth out.
 

@@ -1,4 +1,4 @@
-"""Findings: observations in a log, a map or a run, as data (codes: `tcpipe.tables.findings`), and verdicts, judged from findings alone.
+"""Findings: observations in a log, a map or a run, as data, and verdicts, judged from findings alone.
 
 An error, a warning, the reason for a verdict and the cause of an exit code are all a `Finding`. Code that decides anything about a run
 reads findings; only the command line and the pages turn them into sentences.
