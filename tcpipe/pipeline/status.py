@@ -16,7 +16,7 @@ import numpy as np
 
 from tcpipe.cost.physics import PHYSICS_UNITS
 from tcpipe.errors import UsageError, clean_lines
-from tcpipe.formats.atomic import make_scratch_directory
+from tcpipe.formats.atomic import check_local_output, make_scratch_directory
 from tcpipe.formats.commit_log import pause_garbage_collection
 from tcpipe.formats.commits import CallRecord, Problem
 from tcpipe.formats.finding_lines import MOST_LINES, format_count, format_loss, format_verdict, group_findings
@@ -24,7 +24,6 @@ from tcpipe.formats.index_files import RunFacts
 from tcpipe.formats.object_storage import format_path, is_url, make_absolute
 from tcpipe.formats.recipe_toml import ingest_key, resolve_recipe
 from tcpipe.formats.stored_runs import Ingestions
-from tcpipe.formats.user_paths import check_local_output
 from tcpipe.motion.distance_breakdown import StoreLoss, find_largest_losses
 from tcpipe.pipeline.calls import (
     INGEST,
@@ -40,8 +39,7 @@ from tcpipe.pipeline.plan import LOG_STATES, TROUBLE, IngestTask, LogState, Step
 from tcpipe.pipeline.problems import find_incomplete_runs, make_missing, make_waiting
 from tcpipe.recipe import Recipe
 from tcpipe.store import Store, open_store
-from tcpipe.tables.catalogue import Severity, read_threshold
-from tcpipe.tables.findings import Finding, Subject, Verdict, judge_by_code, make_finding
+from tcpipe.tables.findings import Finding, Severity, Subject, Verdict, judge_by_code, make_finding, read_threshold
 
 _MOST_NAMES = 3
 _MOST_CALLS = 7

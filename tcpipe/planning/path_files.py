@@ -25,8 +25,7 @@ from tcpipe.planning.path_cost import PathTotals, check_ending, compute_path_cos
 from tcpipe.planning.plan import OBJECTIVES, Objective, PlanTotals, plan_path
 from tcpipe.store import open_store
 from tcpipe.tables.bounds import Bounds
-from tcpipe.tables.catalogue import read_threshold
-from tcpipe.tables.findings import LEFT_OUT, Finding, Subject, make_finding
+from tcpipe.tables.findings import LEFT_OUT, Finding, Subject, make_finding, read_threshold
 
 
 def choose_map(store: str | Path, name: str | None) -> MapFile:
