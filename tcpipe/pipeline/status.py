@@ -220,15 +220,15 @@ def _find_waiting(steps: Iterable[Step]) -> Iterator[Problem]:
 
 
 def _iterate_groups(steps: Iterable[Step]) -> Iterator[Group]:
-    """Yield logs of one standing with findings of the same codes on the same subjects; without findings, of the same cause."""
+    """Yield logs of one state with findings of the same codes on the same subjects; without findings, of the same cause."""
     groups: dict[tuple[LogState, Hashable], list[Step]] = {}
     for step in steps:
         alike = frozenset((of.code, None if of.subject.kind in ("log", "run") else of.subject) for of in step.findings)
         groups.setdefault((step.state, alike or step.cause), []).append(step)
-    for (standing, _), of in sorted(groups.items(), key=lambda item: (LOG_STATES.index(item[0][0]), -len(item[1]))):
+    for (state, _), of in sorted(groups.items(), key=lambda item: (LOG_STATES.index(item[0][0]), -len(item[1]))):
         causes = list(dict.fromkeys(step.cause for step in of))
         cause = causes[0] if len(causes) == 1 else f"{len(causes)} reasons, the first: {causes[0]}"
-        yield Group(standing, cause, tuple(step.task.source.name for step in of), sum(map(_sum_bytes, of)))
+        yield Group(state, cause, tuple(step.task.source.name for step in of), sum(map(_sum_bytes, of)))
 
 
 def _sum_bytes(step: Step) -> int:
@@ -292,9 +292,9 @@ def _iterate_measures(run: RunFacts) -> Iterator[tuple[str, str, float]]:
     if run.energy_budget is not None:
         yield "noise floor of E", "%", _IN_PERCENT * run.energy_budget.total
     if run.idle_watt is not None:
-        yield "standing power", PHYSICS_UNITS["standing"], run.idle_watt
+        yield "idle power", PHYSICS_UNITS["idle"], run.idle_watt
     for term, (value, std) in run.physics.items():
-        if not term.startswith("standing") and abs(value) > read_threshold(_CHANGE, "min_scatter_ratio") * std:
+        if not term.startswith("idle") and abs(value) > read_threshold(_CHANGE, "min_scatter_ratio") * std:
             yield f"physics term {term}", PHYSICS_UNITS.get(term.partition(" ")[0], ""), value
 
 

@@ -86,7 +86,7 @@ class PathResult(NamedTotals):
 
     def __str__(self) -> str:
         """Return the totals, their intervals, and findings, as plain lines."""
-        above = ", above standing" if self.label_energy == "net" else ""
+        above = ", net" if self.label_energy == "net" else ""
         findings = format_findings(find_doubts(self, Subject("file", self.path.name)))
         lines = [f"{self.path}: {format_cost(self)}{above}", *findings]
         if self.out is not None:
