@@ -246,8 +246,8 @@ page for the code, or for words such as dropout, lever arm, time offset, drift, 
 
 An **error** makes the labels that it affects not usable, a **warning** usable with care; a **note** changes no verdict. Data are kept
 unless the line states corrected, inflated (larger σ), excluded (the sensor or run) or rejected (the measurement). `tcpipe ingest`
-ends with exit code 3 for a **problem** until you acknowledge it (`tcpipe acknowledge`). `tcpipe inspect STORE/runs/RUN` lists all findings of a run
-with their remedies, `--json` as data. Here … stands for the recipe line or command that the finding prints.
+ends with exit code 3 for a **problem** until you acknowledge it (`tcpipe acknowledge`). `tcpipe inspect STORE/runs/RUN` lists all
+findings of a run with their remedies, `--json` as data. Here … stands for the recipe line or command that the finding prints.
 """
 
 
