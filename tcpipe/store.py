@@ -120,7 +120,7 @@ class Store:
         """Return the number of a map's last document, 0 where there is none; `StoreError` if the name cannot be one."""
         if not _MAP_NAME.fullmatch(name):
             raise StoreError(
-                f"map name {name!r}: wanted letters, digits, '_', '-', '.', beginning with a letter or digit"
+                f"map name {name!r}: expected letters, digits, '_', '-', '.', beginning with a letter or digit"
             )
         return find_highest_numbers(self.place.files("maps")).get(name, 0)
 
@@ -465,7 +465,9 @@ def open_store(root: str | Path, *, create: bool = False) -> Store:
     StoreError : it cannot be reached or written, or is of a data model that this version does not know.
     """
     if is_url(root) and not is_bucket(root):
-        raise UsageError(f"{root}: no store can lie there; wanted a directory, s3://bucket/name, gs:// or az://")
+        raise UsageError(
+            f"{root}: cannot be the place of a store; expected a directory, s3://bucket/name, gs:// or az://"
+        )
     root = str(root).rstrip("/") if is_url(root) else check_local_output(root)
     store = Store(root)
     if isinstance(root, Path):
@@ -490,6 +492,6 @@ def open_store(root: str | Path, *, create: bool = False) -> Store:
 
 def _refuse_file(path: Path, *, create: bool) -> None:
     if path.exists() and not path.is_dir():
-        raise UsageError(f"{path}: is a file, wanted a directory for the store")
+        raise UsageError(f"{path}: is a file, expected a directory for the store")
     if not path.exists() and not create:
         raise UsageError(f"{path}: there is no store here; run 'tcpipe ingest' first, or name another with --store")

@@ -223,7 +223,7 @@ def _make_parents(path: Path) -> Iterator[Path]:
     missing = [parent for parent in place.parents if not parent.exists()]
     in_the_way = next((parent for parent in place.parents if parent.exists() and not parent.is_dir()), None)
     if in_the_way is not None:
-        raise StoreError(f"{path}: cannot be written ({in_the_way} is a file, wanted a directory)")
+        raise StoreError(f"{path}: cannot be written ({in_the_way} is a file, expected a directory)")
     try:
         place.parent.mkdir(parents=True, exist_ok=True)
         yield place

@@ -188,7 +188,7 @@ class BucketPlace:
                     target.write(piece)
             if digest.hexdigest() != checksum.sha256:
                 raise StoreError(
-                    f"{self.where(name)}: its sha256 is {digest.hexdigest()[:12]}…, wanted {checksum.sha256[:12]}…"
+                    f"{self.where(name)}: its sha256 is {digest.hexdigest()[:12]}…, expected {checksum.sha256[:12]}…"
                 )
 
         return fetch_cached(checksum.sha256, fetch)

@@ -20,18 +20,18 @@ def check_local_output(path: str | Path) -> Path:
             f"{path}: is a URL; this is written on this machine: give a path, and copy from there what is made"
         )
     if found:
-        raise UsageError(f"{path}: is no URL; wanted {found[0]}/bucket/name, or a path of this machine")
+        raise UsageError(f"{path}: is no URL; expected {found[0]}/bucket/name, or a path of this machine")
     return Path(path)
 
 
 def check_output_directory(path: str | Path) -> Path:
     """Return where a directory is written; `UsageError` if a file or a URL is in the way."""
-    return _check_output(path, "file", "is a file, wanted a directory; give another")
+    return _check_output(path, "file", "is a file, expected a directory; give another")
 
 
 def check_output_file(path: str | Path) -> Path:
     """Return where a file is written; `UsageError` if a directory or a URL is in the way."""
-    return _check_output(path, "directory", "is a directory, wanted the name of a file")
+    return _check_output(path, "directory", "is a directory, expected the name of a file")
 
 
 def _check_output(path: str | Path, wrong: str, problem: str) -> Path:
@@ -40,7 +40,7 @@ def _check_output(path: str | Path, wrong: str, problem: str) -> Path:
         raise UsageError(f"{path}: {problem}")
     above = next((parent for parent in place.absolute().parents if _find_kind(parent)), None)
     if above is not None and _find_kind(above) == "file":
-        raise UsageError(f"{place}: {above} is a file, wanted a directory")
+        raise UsageError(f"{place}: {above} is a file, expected a directory")
     return place
 
 
@@ -65,7 +65,7 @@ def _check_input(path: str | Path, wanted: str) -> Path:
         why = "; it is read from this machine only" if _LIKE_A_URL.match(str(path)) else ""
         raise UsageError(f"{path}: there is no such {wanted}{why}")
     if kind not in wanted:
-        raise UsageError(f"{path}: is a {kind}, wanted a {wanted}")
+        raise UsageError(f"{path}: is a {kind}, expected a {wanted}")
     return Path(path)
 
 

@@ -71,7 +71,7 @@ def _read_headers(stream: BinaryIO, size: int) -> dict[str, ArrayForm]:
     with zipfile.ZipFile(stream) as archive:
         members = archive.infolist()
         if any(of.compress_type != zipfile.ZIP_STORED for of in members) or sum(of.file_size for of in members) > size:
-            raise ValueError("compressed, or larger than the file; wanted plain arrays")
+            raise ValueError("compressed, or larger than the file; expected plain arrays")
         for member in members:
             with archive.open(member) as array:
                 read_header = _READERS.get(np.lib.format.read_magic(array))
@@ -108,5 +108,5 @@ def _find_wrong_form(
                 lengths.setdefault(of, length)
         bound = tuple(lengths.get(of, of) if isinstance(of, str) else of for of in wanted[1])
         if (dtype, shape) != (wanted[0], bound):
-            return f"{name} is {shape} of {dtype}, wanted {bound} of {wanted[0]}"
+            return f"{name} is {shape} of {dtype}, expected {bound} of {wanted[0]}"
     return None

@@ -98,7 +98,7 @@ def fit_physics_model(extra_features: ExtraFeatures, labels: Floats, *, idle_wat
     metres = FitSamples(power, velocity, np.tan(extra_features.slope_rad), extra_features.turn_radpm * velocity, names)
     found = fit_physics(metres, idle_watt=idle_watt)
     if found is None:
-        raise ModelError(f"{len(labels)} samples to fit physics to, wanted at least {FEWEST} that move")
+        raise ModelError(f"{len(labels)} samples to fit physics to, expected at least {FEWEST} that move")
     known = extra_features.turn_radpm[np.isfinite(extra_features.turn_radpm)]
     return PhysicsModel(
         speed=fit_curves("linear", extra_features.slope_rad, extra_features.class_id, labels[:, 1:]),

@@ -160,7 +160,7 @@ def read_forest(arrays: Mapping[str, NDArray[Any]], where: str) -> Forest:
         "child": nodes, "root": nodes, "feature": _MOST_FEATURES, "output": _MOST_OUTPUTS, "depth": _MOST_DEPTH,
     }  # fmt: skip
     if not made.root.size or any((getattr(made, name) >= bound).any() for name, bound in most.items()):
-        raise ModelError(f"{where}: holds trees that lead nowhere; train the model again")
+        raise ModelError(f"{where}: contains trees with invalid nodes; train the model again")
     if not (np.isfinite(made.threshold).all() and np.isfinite(made.value).all()):
         raise ModelError(f"{where}: holds trees with numbers that are not finite; train the model again")
     return made
@@ -232,7 +232,7 @@ def _load_lightgbm() -> Any:
     try:
         import lightgbm  # noqa: PLC0415  asked for here alone
     except ImportError:
-        raise ModelError("lightgbm not installed, wanted to train a table: pip install 'tcpipe[tables]'") from None
+        raise ModelError("lightgbm not installed, required to train a table: pip install 'tcpipe[tables]'") from None
     except OSError as error:
         raise ModelError(f"lightgbm cannot be loaded ({error}); install the system's package libgomp1") from None
     return lightgbm

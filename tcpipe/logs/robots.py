@@ -21,7 +21,7 @@ def find_robot(topics: Iterable[Topic], name: str | None, robots: Mapping[str, R
     """Return the profile of a log, ``name`` where the user gave one, and why; `RecipeError` where no profile has that name."""
     if name is not None:
         if name not in robots:
-            raise RecipeError(f"robot: no profile is called {name!r}; there are {', '.join(sorted(robots))}")
+            raise RecipeError(f"robot: no profile {name!r}; known: {', '.join(sorted(robots))}")
         return name, "given"
     listed = sorted(topics, key=lambda topic: topic.name)
     if by_type := _find_only_topic(
@@ -29,14 +29,14 @@ def find_robot(topics: Iterable[Topic], name: str | None, robots: Mapping[str, R
     ):
         return by_type[0], f"topic {by_type[1].name} is {by_type[1].type_name}"
     if by_name := _find_only_topic((n, t) for t in listed for n, of in robots.items() if _is_called(of, t)):
-        return by_name[0], f"topic {by_name[1].name} is called so"
+        return by_name[0], f"topic {by_name[1].name} has its name"
     for topic in listed:
         if topic.type_name == _POWER_OF_ANY_CLEARPATH:
             if other := next((found for of in listed if (found := _SERIAL_NUMBER.search(of.name.lower()))), None):
-                return GENERIC, f"topics are named after the platform {other[1].upper()}, which no profile knows"
+                return GENERIC, f"topics are named after the platform {other[1].upper()}, which has no profile"
             first = next((n for n, of in robots.items() if of.platform == _FIRST_TO_PUBLISH_IT), GENERIC)
             return first, f"topic {topic.name} is {topic.type_name}, and nothing names another platform"
-    return GENERIC, "no topic tells the robot"
+    return GENERIC, "no topic identifies the robot"
 
 
 def _is_called(robot: Robot, topic: Topic) -> bool:
@@ -82,7 +82,7 @@ def ask_which_robot(robots: Mapping[str, Sequence[str]]) -> list[str]:
     first, *others = robots
     other = "".join(f' or "{name}"' for name in others)
     return [
-        f"the log holds {len(robots)} robots, and a run is of one: {each}",
-        "settle it in the recipe (tcpipe.toml), for example:",
+        f"the log holds {len(robots)} robots, but a run has one: {each}",
+        "decide in the recipe (tcpipe.toml), for example:",
         *f"{RecipeFragment({'read': {'namespace': first}}).toml()}  #{other}".splitlines(),
     ]

@@ -157,11 +157,11 @@ def list_undecodable(topics: Iterable[Topic]) -> Iterator[str]:
     if by_reason:
         reasons = "; ".join(f"{format_topic_names(topics)}: {why}" for why, topics in list(by_reason.items())[:LISTED])
         more = f"; {len(by_reason) - LISTED} more reasons" if len(by_reason) > LISTED else ""
-        yield f"topics that hold data which cannot be decoded: {reasons}{more}"
+        yield f"topics with data that cannot be decoded: {reasons}{more}"
 
 
 _LITTLE_SPAN = 0.5
-"""A sensor that was silent for more than half of the drive does not win by its name."""
+"""A sensor that was no messages for more than half of the drive does not win by its name."""
 _LITTLE_SPAN_OF_POWER = 0.1
 """What tells propulsion apart and what tells a whole battery are not of one quantity: there coverage weighs less."""
 _SILENCE_NS, _SILENT_PERIODS = 5_000_000_000, 10
@@ -205,7 +205,7 @@ def format_coverage(topic: Topic) -> str:
     """Return ``658 messages over 65.7 s``, as far as the index tells."""
     span_s = _compute_span_s(topic)
     count = "some messages" if topic.message_count is None else f"{topic.message_count} messages"
-    silent = f", silent for {topic.silent_ns / 1e9:.1f} s of them" if topic.silent_ns else ""
+    silent = f", no messages for {topic.silent_ns / 1e9:.1f} s of them" if topic.silent_ns else ""
     return count if span_s is None else f"{count} over {span_s:.1f} s{silent}"
 
 

@@ -251,7 +251,7 @@ class _Walk:
         alignment = min(alignment, self.dialect.max_alignment)
         start = self.position + -(self.position - self.dialect.origin) % alignment
         if start + size > len(self.payload):
-            raise LayoutError(f"byte {start + size} is wanted of a message of {len(self.payload)}")
+            raise LayoutError(f"byte {start + size} is beyond the end of a message of {len(self.payload)}")
         self.position = start + size
         return start
 

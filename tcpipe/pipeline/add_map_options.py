@@ -30,13 +30,14 @@ class AddMapOptions:
     )
     """The property is a class name, value or id."""
     classes: str | Path | None = option(
-        None, Option("What the terrain values mean: CSV value,id,name,traversable, or TOML.", (), "input_file", "FILE")
+        None,
+        Option("Class table of the terrain values: CSV value,id,name,traversable, or TOML.", (), "input_file", "FILE"),
     )
     """None takes the store's, else the paper's seven classes. The first map with terrain or classes sets the store's table."""
     layers: Mapping[str, Files] | None = option(
         None,
         Option(
-            "Another raster of one band, as a layer NAME; repeat it for more layers.",
+            "Another raster of one band, as layer NAME; repeatable.",
             ("--layer",),
             "layers",
             "NAME=FILE",
@@ -45,7 +46,7 @@ class AddMapOptions:
     categorical: Mapping[str, str | Path | None] | None = option(
         None,
         Option(
-            "Layer NAME holds classes: those of FILE, like --classes, or as the raster itself names its values.",
+            "Layer NAME contains classes: named by FILE, like --classes, or by the raster itself.",
             (),
             "class_tables",
             "NAME[=FILE]",
@@ -53,10 +54,13 @@ class AddMapOptions:
     )
     """None: as the raster names its values."""
     ortho_bands: Literal["grey", "rgb"] = option(
-        "grey", Option("rgb keeps red, green and blue as layers beside the grey.", (), ("grey", "rgb"))
+        "grey", Option("rgb also keeps red, green and blue as layers.", (), ("grey", "rgb"))
     )
     crs: str | None = option(
-        None, Option("Projected, metric CRS of the map (default: the height's, or its UTM zone).", metavar="EPSG:n")
+        None,
+        Option(
+            "Projected, metric CRS of the map (default: that of the height raster, or its UTM zone).", metavar="EPSG:n"
+        ),
     )
-    force: bool = option(False, Option("Replace a map of that name made from something else."))
+    force: bool = option(False, Option("Replace a map of this name that has other inputs."))
     store: str | Path = option("tcpipe-store", STORE)

@@ -26,32 +26,33 @@ class IngestOptions:
     robot: str | None = option(
         None,
         Option(
-            "Robot profile: one that `tcpipe init` lists, or of the recipe (found by message types and topic names otherwise).",
+            "Robot profile, built in or from the recipe (default: found by message types and topic names).",
             kind="robot",
             metavar="NAME",
         ),
     )
-    tags: Mapping[str, str] | None = tags("Free tag on the runs; repeatable.")
+    tags: Mapping[str, str] | None = tags("Tag for the runs; repeatable.")
     jobs: int = jobs("Logs")
     cluster: str | None = option(None, CLUSTER)
     """Its workers see logs and store under the same absolute paths."""
-    as_one: bool = option(False, Option("All logs are parts of one drive (splits; power logged apart)."))
+    as_one: bool = option(False, Option("Treat all logs as parts of one drive (split logs; power in a separate log)."))
     message_definitions: str | Path | None = option(None, MESSAGE_DEFINITIONS)
     shard: tuple[int, int] | None = option(
-        None, Option("Only the I-th of N shares of the logs: one for each task of an array.", (), "shard", "I/N")
+        None,
+        Option("Ingest only the I-th of N shares of the logs: one for each task of an array job.", (), "shard", "I/N"),
     )
     min_age_s: float = option(
         0.0,
         Option(
-            "A log that was written to since (90, 90s, 10m, 2h, 1d) waits for another call.",
+            "Skip logs that were changed more recently than this (90, 90s, 10m, 2h, 1d).",
             ("--min-age",),
             "duration",
             "T",
             shown="0",
         ),
     )
-    retry_failed: bool = option(False, Option("Try again what is known to fail."))
-    force: bool = option(False, Option("Do again what is there already, and what is known to fail."))
+    retry_failed: bool = option(False, Option("Try logs again that failed before."))
+    force: bool = option(False, Option("Ingest all logs again, also those that failed before."))
     on_found: Callable[[Mapping[str, int]], None] | None = None
     """Called once with the size [byte] of every log by its name."""
     on_result: Callable[[IngestResult], None] | None = None

@@ -242,7 +242,7 @@ def _make_stored(run: RunDirectory) -> StoredIngestion:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class InspectedTables:
-    """A folder of tables that no recipe maps: what they hold, and the recipe that is proposed."""
+    """A folder of tables without a mapping in the recipe: what they hold, and the recipe that is proposed."""
 
     kind: Literal["tables"] = "tables"
     path: str
@@ -251,7 +251,7 @@ class InspectedTables:
     problems: Mapping[str, str]
     """By file, why it cannot be read."""
     recipe: str
-    """TOML; "" where no column says what it is."""
+    """TOML; "" where no column has a known name."""
 
 
 _COMMAND = re.compile(r"cmd|command|joy")

@@ -192,7 +192,7 @@ def _find_lone_parts(paths: Iterable[Path], *, together: bool) -> Iterator[tuple
         if len(parts) > 1 and not (together and parts.issubset(mine)):
             for path in sorted(parts.intersection(mine)):
                 what = f"{path}: is one of the {len(parts)} parts of the ROS 2 bag {bag}"
-                yield path, f"{what}, and static transforms stand in the first of them only; give the directory"
+                yield path, f"{what}, and only the first part has the static transforms; give the directory"
 
 
 def select_shard(sources: Sequence[LogSource], shard: tuple[int, int]) -> list[LogSource]:

@@ -1,4 +1,4 @@
-"""What a minute of recording promises of a day: segments an hour, where the metres go, how sure labels are; and what mends it first.
+"""Check a short test log before a campaign: expected segments per hour, losses of distance, uncertainty of labels, and remedies.
 
 The excerpt goes through the very stages that ingest runs, in memory: what is predicted of a log is what ingesting it would give.
 """
@@ -156,7 +156,7 @@ class Preflight:
         said += [f"loss      {format_loss(loss)}" for loss in self.losses]
         said += [f"record    {self.record}"] if self.record else []
         rates = ", ".join(name if hz is None else f"{name} at {hz:.3g} Hz" for name, hz in self.large.items())
-        said += [f"large     images and point clouds, not recorded by that: {rates}"] if rates else []
+        said += [f"large     images and point clouds, which this command does not record: {rates}"] if rates else []
         said += ["ready: no problems found"] if self.exit_code == 0 else []
         return clean_lines(said)
 

@@ -160,7 +160,7 @@ def find_status(
     lately: Sequence[str] = sources or (max(ingests)[1] if ingests else ())
     given = given or asked
     if not given and not state.calls:
-        raise UsageError(f"{opened.root}: no call of ingest is remembered here; give the logs or their folders")
+        raise UsageError(f"{opened.root}: no earlier call of ingest is known; give the logs or their folders")
     with make_scratch_directory() as staging:
         found = find_sources(given, as_one=as_one, staging=staging, tables=ruling.tables)
     no_tags: Mapping[str, str] = {}
@@ -294,7 +294,7 @@ def _iterate_measures(run: RunFacts) -> Iterator[tuple[str, str, float]]:
     if run.energy_budget is not None:
         yield "noise floor of E", "%", _IN_PERCENT * run.energy_budget.total
     if run.idle_watt is not None:
-        yield "standing power", PHYSICS_UNITS["standing"], run.idle_watt
+        yield "idle power", PHYSICS_UNITS["standing"], run.idle_watt
     for term, (value, std) in run.physics.items():
         if not term.startswith("standing") and abs(value) > read_threshold(_CHANGE, "min_scatter_ratio") * std:
             yield f"physics term {term}", PHYSICS_UNITS.get(term.partition(" ")[0], ""), value

@@ -122,7 +122,7 @@ def check_model(model: CostModel, source: MapReader) -> None:
     missing = [layer for layer in needed if layer not in source.layers]
     if missing:
         problems.append(
-            f"map {source.name}: has no {', '.join(missing)}, which model {model.name} wants; add the map with --{missing[0]}"
+            f"map {source.name}: has no {', '.join(missing)}, which model {model.name} needs; add the map with --{missing[0]}"
         )
     if "terrain" in needed and "terrain" in source.layers and model.classes != source.classes:
         different = "; ".join(source.classes.differences(model.classes))
@@ -154,7 +154,7 @@ def predict_patches(
         said = model.predict(form.form(pixels, rows), extra_features.take(rows))
         if said.shape != (rows.size, 2):
             raise ModelError(
-                f"{model.name}: gives {said.shape[-1]} numbers a patch, wanted two: power and velocity; train it on both labels"
+                f"{model.name}: gives {said.shape[-1]} numbers a patch, expected two: power and velocity; train it on both labels"
             )
         out[rows] = said
     out[~(np.isfinite(out).all(axis=1) & (out[:, 1] > 0.0))] = np.nan

@@ -39,7 +39,7 @@ class Reason(IntFlag):
     NODATA = 1 << 1
     """A pixel of the patch has no data in some layer; no cost."""
     NOT_TRAVERSABLE = 1 << 2
-    """The class under most of the chord cannot be driven over; no cost."""
+    """The class under most of the chord is not traversable; no cost."""
     NO_MOTION = 1 << 3
     """The model predicts no forward velocity; no cost."""
     CLASS_OUTSIDE_TRAINING = 1 << 4
@@ -51,9 +51,9 @@ class Reason(IntFlag):
     RELIEF_OUTSIDE_TRAINING = 1 << 7
     """The patch's largest height difference is outside the training samples'."""
     OBSTACLE = 1 << 8
-    """More than 5 % of the strip that the robot drives over (0.7 m wide) cannot be driven over, though the middle can."""
+    """More than 5 % of the strip that the robot drives over (0.7 m wide) is not traversable, though the middle is."""
     CURVED = 1 << 9
-    """The path bends more within the metre than any segment that is trained on (its recipe's `max_arc_to_chord`)."""
+    """The path is more curved here than any training segment (its recipe's `max_arc_to_chord`)."""
 
 
 NO_COST = Reason.OUTSIDE_MAP | Reason.NODATA | Reason.NOT_TRAVERSABLE | Reason.NO_MOTION

@@ -57,7 +57,7 @@ page.start(async () => {
     const box = at("chosen"), { key, unit, digits } = kinds[at("quantity").value];
     box.replaceChildren();
     if (!places.length) {
-      box.append(make("p", "Click a point, draw a box, or go through them by Next, the worst first: what is chosen stands here."));
+      box.append(make("p", "Click a point, draw a box, or step through the samples by Next, worst first: the selection appears here."));
       return;
     }
     const i = shown[places[0]];

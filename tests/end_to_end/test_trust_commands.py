@@ -44,7 +44,7 @@ def test_verify_reads_everything_again(work):
         assert done.returncode == 0, done.stdout
         (line,) = done.stdout.splitlines()
         assert f": {kind}; " in line
-        assert line.endswith("all as it was written")
+        assert line.endswith("no changes found")
 
 
 def test_verify_names_what_is_wrong_one_line_each_and_fails(work):

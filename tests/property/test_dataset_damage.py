@@ -121,7 +121,7 @@ def test_a_card_of_any_other_content_with_a_whole_seal_is_told_or_changes_nothin
     ("change", "said"),
     [
         ({"samples": 10**18}, "10000000000000000"),
-        ({"patch_px": 10**6}, "wanted up to 10000000 of up to 1024 px"),
+        ({"patch_px": 10**6}, "expected up to 10000000 of up to 1024 px"),
         ({"shards": [{"path": "data/x", "split": "train", "rows": -5}]}, "its shards hold -5 rows"),
         ({"format": "csv"}, "zarr or parquet"),
         ({"layers": {}}, "in 0 layers"),

@@ -58,7 +58,7 @@ def test_a_closed_iterator_leaves_no_task_waiting(cluster):
 
 def test_a_worker_of_another_version_is_refused(cluster, monkeypatch):
     monkeypatch.setattr(execution, "__version__", "99.0")
-    with pytest.raises(UsageError, match=f"a worker has tcpipe {tcpipe.__version__}, wanted 99.0 as here"):
+    with pytest.raises(UsageError, match=f"a worker has tcpipe {tcpipe.__version__}, expected 99.0 as here"):
         list(run_all(where, [1], jobs=1, cluster=cluster.address))
 
 
@@ -70,7 +70,9 @@ def test_what_a_worker_or_the_scheduler_lacks_is_one_line(cluster, tmp_path, mon
     (tmp_path / "only_here.py").write_text("def task(value):\n    return value\n")
     monkeypatch.syspath_prepend(tmp_path)
     task = importlib.import_module("only_here").task
-    with pytest.raises(UsageError, match=r"tcp://.*: the scheduler lacks tcpipe; install there what is installed here"):
+    with pytest.raises(
+        UsageError, match=r"tcp://.*: the scheduler lacks tcpipe; install the same packages there as here"
+    ):
         list(run_all(task, [1], jobs=1, cluster=cluster.address))
 
 
@@ -94,7 +96,7 @@ def test_what_workers_spend_counts_here(cluster):
 def test_a_worker_of_many_threads_is_refused(tmp_path):
     with dask_cluster(tmp_path, workers=0) as wide:
         wide.start_worker(threads=2)
-        with pytest.raises(UsageError, match="has 2 threads; wanted one a worker"):
+        with pytest.raises(UsageError, match="has 2 threads; expected one a worker"):
             list(run_all(where, [1], jobs=1, cluster=wide.address))
 
 
@@ -103,7 +105,7 @@ def test_a_scheduler_that_is_not_there_is_one_line(monkeypatch):
     with pytest.raises(UsageError, match=r"tcp://127\.0\.0\.1:9: no Dask scheduler answers"):
         list(run_all(where, [1], jobs=1, cluster="tcp://127.0.0.1:9"))
     for address in ("nowhere", "ftp://x:1", "tcp://x"):
-        with pytest.raises(UsageError, match="no address of a Dask scheduler; wanted tcp://host:port"):
+        with pytest.raises(UsageError, match="not the address of a Dask scheduler; expected tcp://host:port"):
             list(run_all(where, [1], jobs=1, cluster=address))
 
 
@@ -125,10 +127,10 @@ def test_workers_that_stay_away_and_a_scheduler_that_goes_are_one_line(tmp_path,
                 brief.workers[0].kill()
                 with pytest.raises(TcpipeError, match="has had no workers for 1 s; start some"):
                     next(outcomes)
-        assert "has no workers any more; waiting for one" in caplog.text
+        assert "lost all its workers; waiting for one" in caplog.text
         brief.start_worker()
         with closing(run_all(time.sleep, [0, 600], jobs=1, cluster=brief.address)) as outcomes:
             next(outcomes)
             brief.scheduler.kill()
-            with pytest.raises(TcpipeError, match="the scheduler is gone; start it, and run the same command again"):
+            with pytest.raises(TcpipeError, match="the scheduler stopped; start it and run the same command again"):
                 next(outcomes)

@@ -416,7 +416,7 @@ def _open_directory(directory: Path, stack: ExitStack, fetched: Mapping[Path, Fe
         if not below:
             raise
         names = ", ".join(below[:_LISTED]) + (" and more" if len(below) > _LISTED else "")
-        raise LogError(*error.problems, f"{directory}: logs lie below it, give one of them: {names}") from None
+        raise LogError(*error.problems, f"{directory}: contains several logs, give one of them: {names}") from None
     _allow_files(len(found.paths))
     parts, damage, errors = [], list(found.damage), []
     for file in found.paths:

@@ -338,7 +338,9 @@ def _read_definitions(texts: Iterable[tuple[str, str]]) -> _Definitions:
 def _read_definitions_of_directory(directory: Path) -> _Definitions:
     """Parse ``package/msg/Name.msg`` or ``package/Name.msg`` files below a directory, and .idl files."""
     if not directory.is_dir():
-        raise LogError(f"{directory}: there is no such directory; wanted one with package/msg/Name.msg files below it")
+        raise LogError(
+            f"{directory}: there is no such directory; expected one with package/msg/Name.msg files below it"
+        )
     found: _Definitions = {}
     problems = []
     for path in sorted([*directory.rglob("*.idl"), *directory.rglob("*.msg")]):
@@ -351,7 +353,7 @@ def _read_definitions_of_directory(directory: Path) -> _Definitions:
     if problems:
         raise LogError(*problems)
     if not found:
-        raise LogError(f"{directory}: no .msg or .idl file below it; wanted package/msg/Name.msg")
+        raise LogError(f"{directory}: no .msg or .idl file below it; expected package/msg/Name.msg")
     return found
 
 

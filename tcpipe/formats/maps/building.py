@@ -329,9 +329,9 @@ def read_class_scheme(path: Path) -> ClassScheme:
         if classes.setdefault(entry.id, entry) != entry:
             problems.append(f"{path}: {where}: id {entry.id} was {classes[entry.id]} before, now {entry}")
         taken = [value for value in values if id_by_value.setdefault(value, entry.id) != entry.id]
-        problems += [f"{path}: {where}: value {value} stands for id {id_by_value[value]} already" for value in taken]
+        problems += [f"{path}: {where}: value {value} already has id {id_by_value[value]}" for value in taken]
     if not classes and not problems:
-        problems.append(f"{path}: the class table has no classes (wanted columns {','.join(_COLUMNS)})")
+        problems.append(f"{path}: the class table has no classes (expected columns {','.join(_COLUMNS)})")
     if problems:
         raise MapError(
             *problems[:_SHOWN], *([f"{path}: … and {len(problems) - _SHOWN} more"] if len(problems) > _SHOWN else [])
@@ -343,7 +343,7 @@ def _read_csv_rows(text: str, path: Path) -> list[tuple[str, dict[str, Any]]]:
     reader = csv.DictReader(StringIO(text, newline=""), skipinitialspace=True)
     missing = [name for name in _COLUMNS if name not in (reader.fieldnames or ())]
     if missing:
-        raise MapError(f"{path}: line 1: columns {','.join(missing)} are missing (wanted {','.join(_COLUMNS)})")
+        raise MapError(f"{path}: line 1: columns {','.join(missing)} are missing (expected {','.join(_COLUMNS)})")
     return [(f"line {reader.line_num}", row) for row in reader]
 
 
@@ -355,11 +355,11 @@ def _read_toml_rows(text: str) -> list[tuple[str, dict[str, Any]]]:
 def _parse_entry(row: Any, where: str, problems: list[str]) -> tuple[list[int], TerrainClass] | None:
     before = len(problems)
     if not isinstance(row, dict):
-        problems.append(f"{where}: wanted a table with {', '.join(_COLUMNS)}")
+        problems.append(f"{where}: expected a table with {', '.join(_COLUMNS)}")
         return None
     problems += [f"{where}: {name} is missing" for name in _COLUMNS if row.get(name) in (None, "")]
     problems += [
-        f"{where}: {name!r} is not a column (wanted {', '.join(_COLUMNS)})" for name in row if name not in _COLUMNS
+        f"{where}: {name!r} is not a column (expected {', '.join(_COLUMNS)})" for name in row if name not in _COLUMNS
     ]
     if len(problems) > before:
         return None

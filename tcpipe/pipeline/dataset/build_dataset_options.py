@@ -28,12 +28,12 @@ class BuildDatasetOptions:
     map_name: str | Sequence[str] | None = option(
         None,
         Option(
-            "Map to sample from (default: the only one in the store); repeat it for several; the first has priority where they overlap.",
+            "Map to sample from (default: the only one in the store); repeatable; where maps overlap, the first has priority.",
             ("--map",), "map", "NAME", repeatable=True,
         ),
     )  # fmt: skip
-    robot: str | None = option(None, Option("Only runs of this robot.", (), "robot", "NAME"))
-    tags: Mapping[str, str] | None = tags("Only runs with this tag; repeat it for several, all of them.")
+    robot: str | None = option(None, Option("Use only runs of this robot.", (), "robot", "NAME"))
+    tags: Mapping[str, str] | None = tags("Use only runs with this tag; if repeated, with all of the tags.")
     store: str | Path = option("tcpipe-store", STORE)
     recipe: Recipe | str | Path | None = option(None, RECIPE)
     jobs: int = jobs("Runs sampled")
@@ -43,32 +43,33 @@ class BuildDatasetOptions:
     holdout: str | None = option(
         None,
         Option(
-            "How test samples are drawn: block, sample, run, or tag:NAME, which holds out values of a tag (default: the recipe's).",
+            "Unit that is held out for test: block, sample, run, or tag:NAME for values of a tag (default: from the recipe).",
             (), "holdout", "HOW",
         ),
     )  # fmt: skip
     covariates: str | Path | Sequence[str | Path] = option(
         (),
         Option(
-            "Table (CSV or Parquet) whose columns are joined to the samples by time, as weather or soil; repeat it for several.",
+            "Table (CSV or Parquet) that is joined to the samples by time, such as weather or soil; repeatable.",
             (), "input_file", "FILE", repeatable=True,
         ),
     )  # fmt: skip
-    seed: int | None = option(None, Option("Seed of split and row order (default: the recipe's).", (), SEED))
+    seed: int | None = option(None, Option("Seed of split and row order (default: from the recipe).", (), SEED))
     keep_split: str | Path | None = option(
-        None, Option("An earlier dataset (OUT, too): its samples keep their split and fold.", (), "sealed", "OLD")
+        None,
+        Option("An earlier dataset (OUT is possible) whose samples keep their split and fold.", (), "sealed", "OLD"),
     )
     min_runs: int | None = option(
         None,
         Option(
-            "Fail with fewer runs; with enough, excluded or missing runs are notes.",
+            "Fail if fewer runs are usable; otherwise excluded and missing runs are notes.",
             (), Range(1, 1_000_000), "N",
         ),
     )  # fmt: skip
     redact: bool = option(
         False,
         Option(
-            "For publication: move everything to 0 N 0 E and omit names of logs, runs, topics, paths, hosts and users."
+            "For publication: move all positions to 0 N 0 E and omit names of logs, runs, topics, paths, hosts and users."
         ),
     )
     force: bool = option(

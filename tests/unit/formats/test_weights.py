@@ -26,8 +26,8 @@ def test_what_is_written_is_read(tmp_path):
 @pytest.mark.parametrize(
     ("change", "wanted"),
     [
-        ({"a": np.zeros((3, 2), np.float32)}, r"a is \(3, 2\) of float32, wanted \(3, 2\) of float64"),
-        ({"b": np.zeros(4, np.uint32)}, r"b is \(4,\) of uint32, wanted \(3,\)"),
+        ({"a": np.zeros((3, 2), np.float32)}, r"a is \(3, 2\) of float32, expected \(3, 2\) of float64"),
+        ({"b": np.zeros(4, np.uint32)}, r"b is \(4,\) of uint32, expected \(3,\)"),
         ({"b": np.zeros((), np.uint32)}, r"b is \(\) of uint32"),
         ({"c": np.zeros(3)}, "'c' is not of it"),
     ],

@@ -110,7 +110,7 @@ def test_an_older_dataset_cannot_tell_and_says_so(dataset, tmp_path, monkeypatch
     monkeypatch.setattr(Split, "labels", property(real_labels))
     config = FitConfig(model="boosting", extra_features=True)
     train(dataset, tmp_path / "model", config=config)
-    assert "its samples have no commanded speed (commanded_velocity_mps): the model is not told it" in caplog.text
+    assert "its samples have no commanded speed (commanded_velocity_mps): the model does not use it" in caplog.text
     assert [of.name for of in load_model(tmp_path / "model").card.extra_features] == ["turn_radpm"]
     absent.add("mean_abs_yaw_rate_radps")
     with pytest.raises(

@@ -200,7 +200,7 @@ def test_its_files_say_the_same(evaluated):
     assert all("label noise alone" in table for table in tables)
     assert "default-src 'none'" in page  # whatever it names, it asks for nothing
     assert (
-        "They are trained beside a network only, and here none was." in page
+        "They are trained only if the model is a network." in page
     )  # networks of Wei and Isler, of which table IV tells
     assert not re.search(r"RMSE of E.*[0-9] J, [-+]", page)  # a row of nine ranges fits
     told = page[: page.index('<script type="application/json"')]
@@ -321,7 +321,7 @@ def test_a_network_of_energy_alone_is_no_model_to_evaluate(dataset, tmp_path):
     place = made_model(
         tmp_path / "energy", architecture=architecture, channels=("height",), outputs=("energy_joule",), scale=(400.0,)
     )
-    with pytest.raises(ModelError, match="it predicts energy_joule alone, wanted power_watt and velocity_mps"):
+    with pytest.raises(ModelError, match="it predicts energy_joule alone, expected power_watt and velocity_mps"):
         run_evaluation(place, dataset, tmp_path / "evaluation", config=CONFIG)
 
 

@@ -265,8 +265,8 @@ def test_a_recipe_that_does_not_fit_the_log_is_an_error_with_what_there_is() -> 
         *topics, chosen={"gnss": ["/gps"], "imu": ["/odom"], "power": ["/left/battery", "/right/battery"], "radar": []}
     )
     text = "\n".join(found.problems)
-    assert "read.topics.gnss names /gps, which the log does not hold; it holds /fix" in text
-    assert "read.topics.imu: /odom is nav_msgs/msg/Odometry; wanted sensor_msgs/msg/Imu" in text
+    assert "read.topics.gnss names /gps, which the log does not have; it has /fix" in text
+    assert "read.topics.imu: /odom is nav_msgs/msg/Odometry; expected sensor_msgs/msg/Imu" in text
     assert "read.topics.power names /right/battery" in text
     assert "no role 'radar'" in text
 
@@ -531,7 +531,7 @@ def test_a_namespace_that_holds_nothing_is_a_mistake():
         ("/do150_0001", "dingo", "is called so"),
         ("/r100-0001", "ridgeback", "is called so"),
         ("/a300_0001", "husky_a300", "is called so"),
-        ("/x400_0001", "generic", "the platform X400, which no profile knows"),
+        ("/x400_0001", "generic", "the platform X400, which has no profile"),
         ("", "husky", "nothing names another platform"),
         ("/room100_0001", "husky", "nothing names another platform"),
     ],

@@ -85,7 +85,7 @@ def test_a_store_of_another_data_model_is_told_so(store, tmp_path):
     make_outdated(store, "a", "b", "c")
     with pytest.raises(
         DatasetError,
-        match=rf"3 runs in the store, all of data model 0\.9, wanted {DATA_MODEL_VERSION}; ingest their logs",
+        match=rf"3 runs in the store, all of data model 0\.9, expected {DATA_MODEL_VERSION}; ingest their logs",
     ):
         runs(store, tmp_path)
 
@@ -128,7 +128,7 @@ def test_a_dataset_of_a_store_that_cannot_be_written_says_that_it_leaves_no_comm
     monkeypatch.setattr(place, "put_new", lambda _, name, __: (_ for _ in ()).throw(StoreError(f"{name}: read-only")))
     for _ in range(2):
         build_dataset(tmp_path / "out", store=store.root, recipe=Recipe())
-    assert "so the store does not know how this call ended" in caplog.text
+    assert "so the store has no record of how this call ended" in caplog.text
     assert "so 'tcpipe prune' does not know the runs of this dataset" in caplog.text
 
 

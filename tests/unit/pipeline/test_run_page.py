@@ -111,7 +111,7 @@ def test_where_streams_are_gone_the_track_is_drawn_and_the_page_says_so(store, t
 def test_trust_refusals_clocks_and_the_noise_floor_are_on_the_page(store):
     run, html = page(store)
     facts = run.manifest.info.report.facts
-    trust = html.split("<h2>How far each sensor was believed</h2>")[1].split("<h2>")[0]
+    trust = html.split("<h2>Rejected measurements by sensor</h2>")[1].split("<h2>")[0]
     for role, nis in facts.fuse.nis_mean.items():
         (row,) = [row for row in trust.split("<tr>") if f"<td>{role.replace('_', ' ')}</td>" in row]
         assert f"<td>{nis:.2f}</td>" in row
@@ -131,9 +131,7 @@ def test_where_sensors_disagree_with_the_track_is_on_the_page(store):
     facts = replace(info.report.facts, audit=AuditFacts((each,)))
     told = replace(run.manifest, info=replace(info, report=StageReport((), facts)))
     (section,) = [s for s in make_sensor_sections(None, told, run.rejections()) if "disagree" in s.title]
-    assert section.rows == [
-        ("gnss", "position", "10 to 20 s", "0.49 m", "0.016 m", "deviations are raised, segments flagged")
-    ]
+    assert section.rows == [("gnss", "position", "10 to 20 s", "0.49 m", "0.016 m", "σ inflated, segments flagged")]
 
 
 def test_every_topic_stands_on_the_page_and_may_break(store):

@@ -64,7 +64,7 @@ def test_what_is_whole_verifies(made, name):
     found = verify(made / name)
     assert found.problems == ()
     assert (found.kind, found.read["samples"], found.read["patches"]) == ("dataset", 448, 448)
-    assert "all as it was written" in str(found)
+    assert "no changes found" in str(found)
 
 
 def test_a_store_its_runs_and_its_map_verify(made):
@@ -191,7 +191,7 @@ def test_a_run_that_holds_anothers_segments_is_found(copy):
     found["checksums"] = json.loads(manifest(north).read_text())["checksums"]
     write_sealed(manifest(south), found)
     problems = "\n".join(verify(store).problems)
-    assert "holds segments of run_id north; wanted south" in problems
+    assert "holds segments of run_id north; expected south" in problems
     assert "its segment ids are not the run's id" in problems
 
 
@@ -296,7 +296,7 @@ def test_a_pixel_or_a_label_that_is_not_the_stores_is_found(copy, made, tmp_path
     )
     found = explain(sample, dataset=made / "zarr", store=store.root)
     assert found.differences[0].startswith("power_watt: ")
-    assert found.differences[1:] == ("run north was ingested anew since, with other segments",)
+    assert found.differences[1:] == ("run north was ingested again later, with other segments",)
 
 
 def test_a_map_that_was_replaced_is_named_as_the_reason(made, copy, tmp_path):
@@ -309,8 +309,8 @@ def test_a_map_that_was_replaced_is_named_as_the_reason(made, copy, tmp_path):
         inputs=MapInputs({"height": {"height.tif": "another"}}),
     )
     found = explain(sample, dataset=made / "zarr", store=store.root).differences
-    assert "terrain: map site has no such layer any more" in found
-    assert found[-1] == "map site was added anew since, from other files"
+    assert "terrain: map site no longer has this layer" in found
+    assert found[-1] == "map site was added again later, from other files"
     elsewhere = World(WORLD.crs, WORLD.x_m + 500.0, WORLD.y_m, side_m=20.0).write(tmp_path, pixel_size_m=0.2)
     put_map(
         store,
@@ -319,7 +319,7 @@ def test_a_map_that_was_replaced_is_named_as_the_reason(made, copy, tmp_path):
         inputs=MapInputs({"height": {"height.tif": "another"}}),
     )
     found = explain(sample, dataset=made / "zarr", store=store.root).differences
-    assert found[0] == "map site gives no patch for it any more"
+    assert found[0] == "map site no longer gives a patch for it"
 
 
 def test_an_unknown_sample_and_an_unknown_run_are_said(made, copy):
@@ -350,7 +350,7 @@ ASK = {
     [
         (
             {"kind": "tcpipe dataset", "data_model_version": "7.0"},
-            f"d: written by data model 7.0, wanted {DATA_MODEL_VERSION}; build it again",
+            f"d: written by data model 7.0, expected {DATA_MODEL_VERSION}; build it again",
         ),
         ({"kind": "shopping list"}, "dataset.json: not the card of a tcpipe dataset"),
     ],

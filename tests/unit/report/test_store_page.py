@@ -106,7 +106,7 @@ def test_sums_are_of_the_ruling_recipe_without_superseded_runs(store):
     driven_m = sum(sum(made.distance_by_reason_m.values()) for made in current)
     assert f"<div><b>{driven_m:.0f} m</b><span>driven</span></div>" in html
     assert "<div><b>3</b><span>runs</span></div>" in html
-    losses = html.split("<h2>Where every metre went</h2>")[1].split("</section>")[0]
+    losses = html.split("<h2>Distance breakdown</h2>")[1].split("</section>")[0]
     assert losses.index("<td>gap</td>") < losses.index("<td>stationary</td>")
 
 

@@ -134,12 +134,12 @@ def test_all_that_a_mapping_names_in_vain_is_said_at_once(tmp_path):
     for words in (
         "tables.gnss.file: there is no fixes.csv here; there are imu.csv, late.csv, odom.csv",
         "tables.imu.columns: imu needs angular_velocity_y",
-        "tables.cmd: plays role 'cmd'; wanted role = one of gnss",
-        "column v of words.csv holds text ('fast' in row 1), wanted numbers",
+        "tables.cmd: plays role 'cmd'; expected role = one of gnss",
+        "column v of words.csv holds text ('fast' in row 1), expected numbers",
         "odom.csv has no column px, py; it has t, v, w",
         "relative.csv, column t: its stamps",
         "/speed and /wheel_odometry have no time in common (they begin 1000.000 s apart)",
-        "notes.docx'; wanted a name that ends in .csv",
+        "notes.docx'; expected a name that ends in .csv",
     ):
         assert words in said
 

@@ -161,7 +161,7 @@ def polygon(ring):
 WRONG = {
     "many": ("[" * (MAX_VALUES + 1), "1500001 positions, rings and objects, at most 1500000; simplify it"),
     "nested": ('{"type":' + "[" * 200_000, "not JSON"),
-    "deep": ('{"a":' * 100_000 + "1" + "}" * 100_000, "not JSON|wanted an object with a 'type'"),
+    "deep": ('{"a":' * 100_000 + "1" + "}" * 100_000, "not JSON|expected an object with a 'type'"),
     "collections": (
         collections(200),
         "a GeometryCollection without a list of geometries, or more than 8 in one another",

@@ -203,7 +203,7 @@ def test_tiles_are_windows_and_hold_no_data_beyond_the_map(path):
         ("grid.rows", 10**9, "pixels"),
         ("grid.rows", 0, "pixels"),
         ("grid.rows", -5, "pixels"),
-        ("grid.cols", "wide", "wanted a whole number"),
+        ("grid.cols", "wide", "expected a whole number"),
         ("tile_px", 0, "tiles and overviews"),
         ("factors", [1, 0], "tiles and overviews"),
         ("factors", [1, 10**12], "tiles and overviews"),

@@ -227,7 +227,7 @@ EVERYTHING = box(-20, -20, 20, 20)
     [
         ([box(1000, 0, 1100, 100)], DatasetError, ("covers none of the 20 samples", "about 0.99 km")),
         ([box(-20, -0.4, 20, 0.4)], DatasetError, ("no whole footprint",)),
-        ([EVERYTHING, EVERYTHING], DatasetError, ("20 of 20 samples lie in its exclude polygons",)),
+        ([EVERYTHING, EVERYTHING], DatasetError, ("20 of 20 samples are in its exclude polygons",)),
         (json.dumps(SWAPPED), DatasetError, ("axes swapped",)),
         ("{", RegionError, ("not GeoJSON",)),
     ],
