@@ -61,7 +61,7 @@ def figures(run: RunDirectory, truth: Truth) -> Iterator[tuple[str, str]]:
 
 
 def describe_net_labels(segments: pa.Table, truth: Truth) -> Iterator[tuple[str, str]]:
-    """Yield the same of what is net of idle power; the truth's standing power is that of steps in which nothing moves."""
+    """Yield the same net of idle power; the truth's standing power is that of steps in which nothing moves."""
     still = (truth.wheel_velocity_mps == 0.0) & (np.abs(truth.angular_velocity_radps).max(axis=1) < 1e-6)
     standing = float(np.median(truth.power_watt[still]))
     true = compute_true_cost(truth, to_integers(segments, "start_ns"))

@@ -270,9 +270,7 @@ def _connect_client(address: str) -> Iterator[Client]:
     except ImportError:
         raise UsageError("dask not installed, required for --cluster: pip install 'tcpipe[cluster]'") from None
     if not _ADDRESS.fullmatch(address):
-        raise UsageError(
-            f"{address!r}: not the address of a Dask scheduler; expected tcp://host:port or tls://host:port"
-        )
+        raise UsageError(f"{address!r}: no address of a scheduler; expected tcp://host:port or tls://host:port")
     with _mute_loggers("distributed", "distributed.client"):
         try:
             client = Client(address, timeout=_ANSWER_S, set_as_default=False)

@@ -442,7 +442,7 @@ def run_at(path: Path | str) -> tuple[Store, list[RunDirectory]] | None:
     if damaged := [line for (_, recipe), line in found.damaged.items() if recipe_id in (None, recipe)]:
         raise StoreError(*damaged)
     if not runs:
-        raise StoreError(f"{path}: holds no finished run of data model {DATA_MODEL_VERSION}; ingest its log again")
+        raise StoreError(f"{path}: contains no finished run of data model {DATA_MODEL_VERSION}; ingest its log again")
     return store, runs
 
 
@@ -465,9 +465,7 @@ def open_store(root: str | Path, *, create: bool = False) -> Store:
     StoreError : it cannot be reached or written, or is of a data model that this version does not know.
     """
     if is_url(root) and not is_bucket(root):
-        raise UsageError(
-            f"{root}: cannot be the place of a store; expected a directory, s3://bucket/name, gs:// or az://"
-        )
+        raise UsageError(f"{root}: no place for a store; expected a directory, s3://bucket/name, gs:// or az://")
     root = str(root).rstrip("/") if is_url(root) else check_local_output(root)
     store = Store(root)
     if isinstance(root, Path):

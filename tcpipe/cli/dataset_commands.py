@@ -86,9 +86,7 @@ def build_dataset(options: BuildDatasetOptions, *, as_json: bool, quiet: bool) -
 @click.command()
 @click.argument("path", type=SEALED, metavar="PATH")
 @click.option(
-    "--no-runs",
-    is_flag=True,
-    help="For a store: write only its own page, which links to the existing pages of its runs.",
+    "--no-runs", is_flag=True, help="For a store: write only its own page, with links to existing pages of runs."
 )
 @click.option(
     "--patches",

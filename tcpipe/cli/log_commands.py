@@ -318,10 +318,7 @@ def acknowledge(names: tuple[str, ...], *, store: str, as_json: bool) -> int:
     help="Keep this run or recipe; repeatable.",
 )
 @click.option(
-    "--forget",
-    multiple=True,
-    metavar="DATASET",
-    help="This dataset no longer exists: remove what only it needs; repeatable.",
+    "--forget", multiple=True, metavar="DATASET", help="Remove what only this deleted dataset needs; repeatable."
 )
 @min_age_option("1d", "Remove files of killed calls that are older than this (90, 90s, 10m, 2h, 1d).")
 @click.option("--dry-run", is_flag=True, help="Print what would be removed; change nothing.")

@@ -322,9 +322,7 @@ def min_age_option(default: str, about: str) -> Option:
     return click.option("--min-age", "min_age_s", default=default, metavar="T", callback=parse_duration, help=about)
 
 
-seed_option = make_click_option(
-    "seed", 1, options.Option("Seed of the site: the same seed gives the same site.", kind=options.SEED)
-)
+seed_option = make_click_option("seed", 1, options.Option("Seed of the simulated site.", kind=options.SEED))
 """``--seed`` of a simulation."""
 
 dry_run_option = make_click_option("dry_run", False, options.DRY_RUN)

@@ -64,7 +64,7 @@ def _make_claims_section(claims: Sequence[Claim], audit: str) -> Section:
     ]  # fmt: skip
     text = (
         "RMSE of E of the network over a baseline's, of the same samples, with its 95 % interval: held if all of it lies below 1, NOT held "
-        "if above, open if it holds 1. Height, class and slow ground matter by construction of the site, so they are no claims. "
+        "if above, open if it contains 1. Height, class and slow ground matter by construction of the site, so they are no claims. "
         + audit
     )
     header = ("claim", "split", "", "here", "the paper")
@@ -159,7 +159,7 @@ DIFFERENCES = (
     ("optimiser, batch, epochs", "not told", "Adam, 64, until a fold of train gets no better; the rate falls"),
     ("mirrors", "not told", "every other patch is mirrored across its travel"),
     ("early stopping by", "not stated; 'validation' is the unseen area", "a fold of train, a fifth, which is not fitted"),
-    ("power, velocity", "means of samples at 20 Hz", "w = E / T, v = d / T: E = w d / v holds exactly"),
+    ("power, velocity", "means of samples at 20 Hz", "w = E / T, v = d / T: E = w d / v is exact"),
     ("order of figures", "tables of w, v, T, E; table III of w, v, E, T", "the same tables in the same order, each row beside the paper's"),
     ("ablation", "a layer becomes random noise; distribution and draws not stated", "uniform in [0, 1] per pixel, mean of several draws"),
     ("Wei and Isler: architecture", "'the approach from' their paper: heights to E", "our ResNet-18, heights alone, one output"),

@@ -471,7 +471,7 @@ def has_sample_ids(directory: Path, ids: Sequence[str]) -> bool:
         except FileNotFoundError:
             raise StoreError(f"{path}: is missing") from None
         except (OSError, ValueError, RuntimeError) as error:
-            raise StoreError(f"{path}: does not hold the ids of the samples ({error})") from None
+            raise StoreError(f"{path}: does not contain the ids of the samples ({error})") from None
     return True
 
 

@@ -116,7 +116,7 @@ def parse_json(data: bytes, path: Path | str) -> dict[str, Json]:
         raise StoreError(f"{path}: not a readable JSON file ({error}); remove it and run the command again") from None
     if not isinstance(found, dict):
         raise StoreError(
-            f"{path}: holds {type(found).__name__}, expected a JSON object; remove it and run the command again"
+            f"{path}: contains {type(found).__name__}, expected a JSON object; remove it and run the command again"
         )
     return found
 

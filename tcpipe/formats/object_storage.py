@@ -128,7 +128,7 @@ def split_url(url: str, *, one_object: bool = False) -> tuple[str, str]:
     shown, query = split_secrets(scheme, rest)
     public = f"{scheme}{slashes}{shown}"
     if shown + query != rest:
-        raise UsageError(f"{public}: a URL may not hold a user name or password; {_describe_credentials(scheme)}")
+        raise UsageError(f"{public}: a URL may not contain a user name or password; {_describe_credentials(scheme)}")
     query = query.partition("#")[0].removeprefix("?")
     if query and not (one_object and scheme.lower() in ("http", "https")):
         what = "only the http:// or https:// URL of one log may have a query (?…)"

@@ -329,7 +329,7 @@ def _decode(codec: Any, data: bytes, out: NDArray[Any]) -> None:
     """Fill ``out`` with what is encoded; `ValueError` where that is more or less."""
     size = int.from_bytes(data[4:8], "little") if isinstance(codec, numcodecs.Blosc) else _read_zstd_size(data)
     if size != out.nbytes:
-        raise ValueError(f"it holds {size} bytes, expected {out.nbytes}")
+        raise ValueError(f"it contains {size} bytes, expected {out.nbytes}")
     codec.decode(data, out=out)
 
 

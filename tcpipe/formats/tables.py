@@ -116,7 +116,7 @@ def _scan(path: Path, numbers: list[str] | None = None, *, quote: str | None = '
         raise LogError(f"{path}: it cannot be read ({error.strerror})") from None
     comments, lines = _split_comment_lines(head)
     if not lines:
-        raise LogError(f"{path}: it holds no table: it is empty")
+        raise LogError(f"{path}: it contains no table: it is empty")
     separator = next((sign for sign in (b",", b";", b"\t") if sign in lines[0]), b" ")
     first = (_DAY_AND_TIME.sub(rb"\1-\2-\3T", lines[0]) if separator == b" " else lines[0]).split(
         None if separator == b" " else separator

@@ -74,14 +74,14 @@ def read_curves(form: Form, arrays: Mapping[str, NDArray[Any]], where: str) -> t
         curves = Curves(form, *(rest.pop(f"{_STORED}{name}") for name in _ARRAYS))
     except KeyError:
         raise ModelError(
-            f"{where}: holds the weights of another model, or of an older kind; train the model again"
+            f"{where}: contains the weights of another model, or of an older kind; train the model again"
         ) from None
     functions = (
         _evaluate_functions(form, curves.knots_rad, np.zeros(1)).shape[1] if curves.knots_rad.size <= _MOST_KNOTS else 0
     )
     finite = all(np.isfinite(of).all() for of in (curves.knots_rad, curves.pooled, curves.own))
     if len(curves.pooled) != functions or not finite or len(curves.class_id) > _MOST_CLASSES:
-        raise ModelError(f"{where}: holds curves that no training makes; train the model again")
+        raise ModelError(f"{where}: contains curves that no training makes; train the model again")
     return curves, rest
 
 

@@ -141,7 +141,7 @@ def _draw_scatter(name: str, points_name: str, across: str, up: str, source: Any
     """Return a plot of every sample with the line of those that are right, and its points; the page's script fills both."""
     plot = make_plot(
         name,
-        alt=f"{up.capitalize()} over {across}, a point a sample; the tables below hold the figures by class.",
+        alt=f"{up.capitalize()} over {across}, a point a sample; the tables below list the figures by class.",
         axes=("slope along travel [°]", "predicted less measured") if across == "slope" else (across, up),
         height_px=380,
         tools="tap,box_select,pan,wheel_zoom,box_zoom,reset,save",

@@ -99,7 +99,9 @@ def run_evaluation(
     if not ((place / JSON).is_file() and (place / SAMPLES).is_file()) or read_json(place / JSON).get("key") != key:
         found, table = evaluate(model, dataset, place, rules, key=key, plant=plant)
         if _make_key(model, dataset, rules, simulated=plant is not None) != key:
-            raise StoreError(f"{dataset} or {model}: another call has replaced it meanwhile; run the command again")
+            raise StoreError(
+                f"{dataset} or {model}: another call has replaced it in the meantime; run the command again"
+            )
         write_table(table, place / SAMPLES)
         write_json(place / JSON, found)  # last: with it the evaluation is whole
     values = read_as(place / JSON, Evaluation)  # in the order of the file, as the next call will read it

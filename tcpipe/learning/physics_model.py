@@ -74,9 +74,9 @@ def read_physics_model(arrays: Mapping[str, NDArray[Any]], where: str) -> Physic
     speed, rest = read_curves("linear", arrays, where)
     rest = {"drivetrain_newton": np.array(0.0), **rest}  # models before 0.7 have all of it in P0
     if rest.keys() != set(_NUMBERS):
-        raise ModelError(f"{where}: holds the weights of another model; train the model again")
+        raise ModelError(f"{where}: contains the weights of another model; train the model again")
     if not all(np.isfinite(of).all() for of in rest.values()):
-        raise ModelError(f"{where}: holds coefficients that are not finite; train the model again")
+        raise ModelError(f"{where}: contains coefficients that are not finite; train the model again")
     return PhysicsModel(speed, **rest)
 
 

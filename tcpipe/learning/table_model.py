@@ -153,7 +153,7 @@ _MOST_FEATURES, _MOST_DEPTH, _MOST_OUTPUTS = 100_000, 64, 1024
 def read_forest(arrays: Mapping[str, NDArray[Any]], where: str) -> Forest:
     """Return the forest of `Forest.arrays`; `ModelError` if the arrays are of another model."""
     if arrays.keys() != {of.name for of in fields(Forest)}:
-        raise ModelError(f"{where}: holds the weights of another model; remove it and train the model again")
+        raise ModelError(f"{where}: contains the weights of another model; remove it and train the model again")
     made = Forest(**arrays)
     nodes = len(made.feature)
     most = {
@@ -162,7 +162,7 @@ def read_forest(arrays: Mapping[str, NDArray[Any]], where: str) -> Forest:
     if not made.root.size or any((getattr(made, name) >= bound).any() for name, bound in most.items()):
         raise ModelError(f"{where}: contains trees with invalid nodes; train the model again")
     if not (np.isfinite(made.threshold).all() and np.isfinite(made.value).all()):
-        raise ModelError(f"{where}: holds trees with numbers that are not finite; train the model again")
+        raise ModelError(f"{where}: contains trees with numbers that are not finite; train the model again")
     return made
 
 

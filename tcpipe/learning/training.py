@@ -227,7 +227,7 @@ def make_training_task(data: Dataset, fold: int, variant: Variant) -> Task:
     if not len(held) or not len(fitted):
         folds = sorted({int(number) for number in train.column("fold")})
         named = ", ".join(map(str, folds))
-        cure = f"a block holds {data.card.recipe.split.block_m:g} m of ground: drive more of it"
+        cure = f"a block contains {data.card.recipe.split.block_m:g} m of ground: drive more of it"
         if data.card.recipe.split.holdout in ("run", "tag"):
             cure = "they are of whole runs: drive once more, or build it with --holdout block"
         raise DatasetError(
@@ -295,7 +295,7 @@ def _reject_other_files(place: Path) -> None:
     strangers = sorted(name for name in entries - set(FILES) if not name.startswith("."))
     if strangers:
         raise UsageError(
-            f"{place}: holds {', '.join(strangers)} in the directory of a model, which would be replaced; move it, or give another OUT"
+            f"{place}: contains {', '.join(strangers)} in the directory of a model, which would be replaced; move it, or give another OUT"
         )
 
 

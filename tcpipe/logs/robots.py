@@ -82,7 +82,7 @@ def ask_which_robot(robots: Mapping[str, Sequence[str]]) -> list[str]:
     first, *others = robots
     other = "".join(f' or "{name}"' for name in others)
     return [
-        f"the log holds {len(robots)} robots, but a run has one: {each}",
+        f"the log contains {len(robots)} robots, but a run has one: {each}",
         "decide in the recipe (tcpipe.toml), for example:",
         *f"{RecipeFragment({'read': {'namespace': first}}).toml()}  #{other}".splitlines(),
     ]

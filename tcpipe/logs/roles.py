@@ -286,8 +286,8 @@ def _take_chosen(
         if missing and (role == "power" or not present):
             decided.undecided.add(role)
             decided.problems.append(
-                f"recipe read.topics.{role} names {', '.join(missing)}, which the log does not hold; "
-                f"it holds {format_topics(topics.values(), decided.types[role])}"
+                f"recipe read.topics.{role} names {', '.join(missing)}, which the log does not have; "
+                f"it has {format_topics(topics.values(), decided.types[role])}"
             )
         for name in wanted:
             if topics[name].type_name not in decided.types[role] and role not in mapped:

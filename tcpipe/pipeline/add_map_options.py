@@ -30,8 +30,7 @@ class AddMapOptions:
     )
     """The property is a class name, value or id."""
     classes: str | Path | None = option(
-        None,
-        Option("Class table of the terrain values: CSV value,id,name,traversable, or TOML.", (), "input_file", "FILE"),
+        None, Option("Class table: CSV with value,id,name,traversable, or TOML.", (), "input_file", "FILE")
     )
     """None takes the store's, else the paper's seven classes. The first map with terrain or classes sets the store's table."""
     layers: Mapping[str, Files] | None = option(
@@ -57,10 +56,7 @@ class AddMapOptions:
         "grey", Option("rgb also keeps red, green and blue as layers.", (), ("grey", "rgb"))
     )
     crs: str | None = option(
-        None,
-        Option(
-            "Projected, metric CRS of the map (default: that of the height raster, or its UTM zone).", metavar="EPSG:n"
-        ),
+        None, Option("Projected, metric CRS of the map (default: the height's, or its UTM zone).", metavar="EPSG:n")
     )
     force: bool = option(False, Option("Replace a map of this name that has other inputs."))
     store: str | Path = option("tcpipe-store", STORE)

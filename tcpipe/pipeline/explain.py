@@ -223,13 +223,7 @@ def _sample(directory: Path, sample_id: str) -> _Sample:
     row = pc.index(ids, sample_id).as_py()
     if row < 0:
         near = [name for name in ids.to_pylist() if sample_id and sample_id in name][:3]
-        hint = (
-            f"; did you mean {', '.join(near)}?"
-            if near
-            else f"; one of its ids is {ids[0].as_py()}"
-            if len(ids)
-            else ""
-        )
+        hint = f"; did you mean {', '.join(near)}?" if near else f"; an example is {ids[0].as_py()}" if len(ids) else ""
         raise DatasetError(f"{directory}: no sample {sample_id!r}{hint}")
     try:
         names = [name for name in sample_columns(directory) if name != GEOMETRY]

@@ -186,7 +186,7 @@ def _inspect_logs_at(
     logs: Sequence[Path | str], path: Path | str, ask: Callable[[Path | str], InspectedLog]
 ) -> InspectedLog | InspectedLogs:
     if not logs:
-        raise UsageError(f"{path}: is no map, dataset, run or store, and holds no log")
+        raise UsageError(f"{path}: is no map, dataset, run or store, and contains no log")
     if len(logs) == 1:
         return ask(logs[0])
     return InspectedLogs(path=str(path), logs=tuple(_try_inspect(entry, ask) for entry in logs))

@@ -176,7 +176,7 @@ def _find_logs_at(path: Path, tables: Mappings) -> list[Path]:
                 *error.problems, f"{path}: nor is one of the files that the recipe's tables name: {files}"
             ) from None
         if path.is_dir() and (held := list_table_files(path)):
-            hint = f"{path}: it holds {len(held)} tables ({held[0].name}, …): map them in the recipe; tcpipe inspect proposes how"
+            hint = f"{path}: it contains {len(held)} tables ({held[0].name}, …): map them in the recipe; tcpipe inspect proposes how"
             raise LogError(*error.problems, hint) from None
         raise
 

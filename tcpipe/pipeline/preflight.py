@@ -127,10 +127,10 @@ class Preflight:
     log: str
     robot: str | None
     expected_yield: ExpectedYield | None
-    """None where ingesting it would fail."""
+    """None where ingest would fail."""
     topics: tuple[RoleTopic, ...]
     problems: tuple[str, ...]
-    """Why ingesting it would fail."""
+    """Why ingest would fail."""
     findings: tuple[Finding, ...]
     """Of ingesting it, and what is too slow, missing or off in such recordings, the worst first."""
     verdict: Verdict
@@ -141,7 +141,7 @@ class Preflight:
     large: Mapping[str, float | None]
     """Images and point clouds, which it leaves out, with the messages that come of each a second."""
     exit_code: int
-    """0 ready; 3 there are warnings, errors or no segments; 1 ingesting it would fail."""
+    """0 ready; 3 there are warnings, errors or no segments; 1 ingest would fail."""
 
     def __str__(self) -> str:
         """Return it as lines."""

@@ -150,7 +150,7 @@ def verify_run(store: Store, run_id: str, recipe: str | None = None) -> Iterator
     for name in recipes if recipe is None else [recipe]:
         yield from _isolate_errors(_make_ingestion(store.runs_place, run_id, name))
     if not recipes:
-        yield f"{place.where()}: holds no finished run; ingest its log again"
+        yield f"{place.where()}: contains no finished run; ingest its log again"
     for name in names:
         if name not in there and name.partition("/")[0] not in recipes:
             yield _describe_stranger(place, name)
@@ -351,7 +351,7 @@ def _find_wrong_joins(run: RunDirectory, tables: Mapping[str, pa.Table]) -> Iter
     for column, wanted in (("run_id", run_id), ("robot", run.manifest.robot)):
         others = set(segments.column(column).unique().to_pylist()) - {wanted}
         if others:
-            yield f"holds segments of {column} {', '.join(sorted(others))}; expected {wanted}"
+            yield f"contains segments of {column} {', '.join(sorted(others))}; expected {wanted}"
     if len(start_ns) and (np.any(end_ns <= start_ns) or np.any(start_ns[1:] < end_ns[:-1])):
         yield "its segments do not follow one another in time"
     stamps = to_integers(tables["track"], "stamp_ns")
@@ -376,4 +376,4 @@ def _verify_layer(path: Path, level: MapFile, layer: str, covered: float | None)
     if covered is not None and not math.isclose(share, covered, rel_tol=1e-9):
         yield f"{path}: {layer} covers {share:.6%} of the map, {covered:.6%} when it was added; add the map again"
     if highest > kind.high:
-        yield f"{path}: {layer} holds class {highest}, the table ends at {kind.high:g}"
+        yield f"{path}: {layer} contains class {highest}, the table ends at {kind.high:g}"

@@ -125,7 +125,7 @@ def find_drive(store: Store, log: str) -> RunDirectory:
     if len(found) > 1:
         recipes = ", ".join(run.recipe_id for run in found)
         raise UsageError(
-            f"{log}: {store.root} holds it under several recipes ({recipes}); expected one: give a store with it alone"
+            f"{log}: {store.root} contains it under several recipes ({recipes}); expected one: give a store with it alone"
         )
     return found[0]
 

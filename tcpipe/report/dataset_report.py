@@ -100,11 +100,7 @@ def render_dataset_report(directory: Path, beside: Path | None = None, *, folder
             *_make_finding_sections(card),
             *make_physics_sections(dict(card.physics)),
             *make_budget_sections(card.energy_budget),
-            Section(
-                "Distance breakdown",
-                "Distances in samples and excluded distances add up to the odometer.",
-                plots=[waterfall],
-            ),
+            Section("Distance breakdown", "Used and excluded distances add up to the odometer.", plots=[waterfall]),
             *_make_removal_sections(card),
             *make_balance_sections(card.balance),
             _make_audit_section(card, samples, shown),

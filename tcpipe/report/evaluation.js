@@ -71,7 +71,7 @@ page.start(async () => {
         ["ground", kind.map((pair) => pair.join(" ")).join(", ")]]), make("p", "The worst of them:"));
     }
     left.append(pairs(inWords(i)));
-    right.append(...(cell.has(i) ? page.patches(told.patches, cell.get(i)) : [make("p", "The page carries patches of the worst metres of E alone.", { className: "note" })]));
+    right.append(...(cell.has(i) ? page.patches(told.patches, cell.get(i)) : [make("p", "The page only contains the patches of the samples with the largest errors of E.", { className: "note" })]));
     box.append(left, right);
   }
   const choose = page.chooseSamples(source, () => shown.length, (places) => show([...places].sort((a, b) => a - b)));

@@ -134,12 +134,7 @@ GNSS_VELOCITY = _make_stream_schema(
     "gnss_velocity",
     "Velocity of the antenna over ground, from its receiver (Doppler).",
     *(Column(f"{axis}_velocity_mps", _F64, "m/s", f"velocity {axis}", "enu", axis == "up") for axis in _ENU),
-    *(
-        _make_nullable(
-            f"{axis}_var_m2ps2", "m2/s2", f"variance of the velocity {axis}; null if the message has none", "enu"
-        )
-        for axis in _ENU
-    ),
+    *(_make_nullable(f"{axis}_var_m2ps2", "m2/s2", f"variance {axis}; null if unknown", "enu") for axis in _ENU),
     Column("fix_status", pa.int8(), "1", "NavSatStatus as in gnss; -1 if the message has none"),
 )
 

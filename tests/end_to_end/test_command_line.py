@@ -129,7 +129,7 @@ def _bad_input(kind: str, here: Path) -> Path:
             (path / "readme.txt").touch()
         case "a pipe or a device":
             os.mkfifo(path)
-        case "nothing in the log tells motion":
+        case "no motion in the log":
             times = np.arange(5, dtype=np.int64) * 1_000_000_000
             write_mcap(path, [MessageStream("/chatter", "std_msgs/msg/String", times)])
     return path
@@ -143,7 +143,7 @@ def _bad_input(kind: str, here: Path) -> Path:
         ("not a log", 1),
         ("no log in this directory", 2),
         ("a pipe or a device", 1),
-        ("nothing in the log tells motion", 1),
+        ("no motion in the log", 1),
     ],
 )
 def test_what_is_no_log_is_said_in_plain_lines(kind: str, code: int, tmp_path: Path) -> None:

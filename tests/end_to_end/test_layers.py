@@ -175,7 +175,7 @@ def test_a_raster_s_own_names_are_its_classes(site, tmp_path):
         (["--layer", "m={}/moisture.tif", "--layer", "m={}/canopy.tif"], 2, "--layer m: is given twice"),
         (["--layer", "m={}/absent.tif"], 2, "absent.tif: there is no such file"),
         (["--layer", "m={}/colour.tif"], 1, "colour.tif: m has 3 bands (red, green, blue), expected one"),
-        (["--layer", "m={}/canopy.tif", "--categorical", "m"], 1, "does not say what its values mean"),
+        (["--layer", "m={}/canopy.tif", "--categorical", "m"], 1, "does not define the meaning of its values"),
         (["--layer", "m={}/moisture.tif", "--categorical", "m={}/canopy.csv"], 1, "expected integer class values"),
         (["--layer", "m={}/away.tif"], 1, "has no data anywhere on the height raster"),
         (["--layer", "m={}/empty.tif"], 1, "has no data anywhere on the height raster"),

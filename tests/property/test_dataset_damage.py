@@ -142,7 +142,7 @@ def test_what_a_card_promises_has_bounds(dataset, change, said):
     [
         ("[" * 10**5, "not a readable JSON file"),
         ("{} " * (MOST_BYTES // 3 + 1), "larger than 32 MB"),
-        ("7", "holds int"),
+        ("7", "contains int"),
     ],
 )
 def test_a_card_that_is_no_card_is_one_line(dataset, text, said):

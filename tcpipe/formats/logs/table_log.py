@@ -136,7 +136,7 @@ def _read_table(folder: Path, name: str, mapping: TableMapping) -> _Read | list[
     except LogError as error:
         return [problem.removeprefix(f"{folder}/") for problem in error.problems]
     empty = [
-        f"{where}: column {column} of {mapping.file} holds text ({text!r} in row {row}), expected numbers"
+        f"{where}: column {column} of {mapping.file} contains text ({text!r} in row {row}), expected numbers"
         for column, (_, row, text) in cells.texts.items()
         if not np.isfinite(cells.columns[column]).any()
     ]
@@ -150,7 +150,7 @@ def _read_stamps(cells: Cells, stamp: str, mapping: TableMapping) -> NDArray[np.
     """Return the known stamps [ns, UTC], or what is in the way of that."""
     known = cells.stamp[cells.stamp_known]
     if not known.size:
-        return "it holds neither numbers nor dates (expected seconds, or text as 2025-10-14T15:41:25.7Z)"
+        return "it contains neither numbers nor dates (expected seconds, or text as 2025-10-14T15:41:25.7Z)"
     found = parse_stamps_ns(known, "ns" if cells.stamp_is_time else mapping.stamp_unit)
     if isinstance(found, str):
         return f"{found} (stamp_unit)"

@@ -166,7 +166,7 @@ def _read_own_schemes(more: MoreLayers, rasters: Mapping[str, Raster]) -> dict[s
         for name, table in more.categorical.items()
     }
     if problems := [
-        f"{rasters[name].label}: does not say what its values mean (no attribute table, no category names); "
+        f"{rasters[name].label}: does not define the meaning of its values (no attribute table, no category names); "
         f"give a table: --categorical {name}=classes.csv"
         for name, scheme in schemes.items()
         if scheme is None
@@ -188,7 +188,7 @@ def _choose_scheme(classes: Path | None, agreed: ClassScheme | None, terrain: Ra
         ours = ", ".join(entry.name for entry in scheme.table.classes)
         raise MapError(
             f"{terrain.label}: none of its class names ({theirs}) is in the class table ({ours}); "
-            "say with --classes what its values mean"
+            "define them with --classes"
         )
     return named, "names"
 
@@ -227,7 +227,7 @@ def _place_all(rasters: dict[str, Raster], crs: str | None) -> dict[str, Georefe
     for role, raster in rasters.items():
         text = raster.crs or crs
         if text is None:
-            problems.append(f"{raster.label}: has no CRS; if you know which one it is in, say so with --crs EPSG:n")
+            problems.append(f"{raster.label}: has no CRS; if you know it, give it with --crs EPSG:n")
             continue
         try:
             found = parse_crs(text, where=raster.label if raster.crs else "--crs")
@@ -377,7 +377,7 @@ def _parse_entry(row: Any, where: str, problems: list[str]) -> tuple[list[int], 
         return None
     name = str(row["name"]).strip(" \t")
     if not name.isprintable():
-        problems.append(f"{where}: name {name!r} holds characters that cannot be printed")
+        problems.append(f"{where}: name {name!r} contains characters that cannot be printed")
         return None
     return [value for value in values if value is not None], TerrainClass(class_id, name, traversable=traversable)
 

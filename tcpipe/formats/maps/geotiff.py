@@ -371,7 +371,7 @@ def _suggest_polygons(path: Path) -> str:
 
 def _refuse_unplaced(dataset: Any, path: Path) -> None:
     if dataset.count == 0:
-        raise MapError(f"{path}: the file holds no bands itself; name one of its subdatasets as a GeoTIFF")
+        raise MapError(f"{path}: the file contains no bands itself; name one of its subdatasets as a GeoTIFF")
     if dataset.crs is None and dataset.gcps[0]:
         raise MapError(
             f"{path}: placed by {len(dataset.gcps[0])} ground control points only; rectify it first (gdalwarp -tps in.tif out.tif)"

@@ -86,7 +86,7 @@ def is_drawn(paths: Sequence[Path]) -> bool:
     drawn = [path for path in paths if path.suffix.lower() in SUFFIXES]
     if drawn and len(drawn) != len(paths):
         other = next(path for path in paths if path not in drawn)
-        raise MapError(f"terrain: {drawn[0]} holds polygons, {other} does not; expected one kind")
+        raise MapError(f"terrain: {drawn[0]} contains polygons, {other} does not; expected one kind")
     return bool(drawn)
 
 

@@ -123,7 +123,7 @@ class BuildResult:
     def _facts(self) -> list[str]:
         card = self.card
         if card is None:
-            return [f"{self.path}: would be made of at most {self.estimate}"]
+            return [f"{self.path}: would have at most {self.estimate}"]
         counts = ", ".join(f"{card.splits[name]} {name}" for name in SPLITS)
         head = f"{self.path}: {card.samples} samples ({counts})"
         if self.status == "unchanged":
@@ -227,7 +227,7 @@ def _refuse_other_options(
     if known is None or known.inputs == inputs.digest or force:
         return
     if others := find_other_options(known, options, inputs):
-        what = "it was made with other options and is kept; give another OUT, or replace it with --force"
+        what = "it was made with other options and is not changed; give another OUT, or replace it with --force"
         raise UsageError(f"{place}: {what}", *(f"{place}: {line}" for line in others))
 
 
@@ -312,9 +312,7 @@ def _read_card_in_place(place: Path) -> tuple[DatasetCard | None, bool]:
     if not place.is_dir():
         raise UsageError(f"{place}: is a file, expected a directory for the dataset; give another OUT")
     if not (place / CARD).is_file():
-        raise UsageError(
-            f"{place}: exists and is not a dataset (it has no {CARD}); it is not changed; give another OUT"
-        )
+        raise UsageError(f"{place}: exists and is not a dataset (no {CARD}); it is not changed; give another OUT")
     try:
         card, proved = read_card(place, proved=False), True
     except DatasetError as error:
@@ -329,9 +327,7 @@ def _read_card_in_place(place: Path) -> tuple[DatasetCard | None, bool]:
     others = sorted({path.relative_to(place).as_posix() for path in place.rglob("*") if path.is_file()} - ours)
     if others:
         more = f" and {len(others) - 1} more" if len(others) > 1 else ""
-        raise UsageError(
-            f"{place}: holds {others[0]}{more} in the directory of the dataset; move it or give another OUT"
-        )
+        raise UsageError(f"{place}: contains {others[0]}{more}, not of the dataset; move it or give another OUT")
     return card, proved
 
 

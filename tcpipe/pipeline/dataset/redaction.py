@@ -293,7 +293,7 @@ def _iterate_leaks(card: DatasetCard, samples: pa.Table) -> Iterator[str]:
     reasons = card.verdict.reasons if card.verdict else ()
     every = (card.findings, reasons, *card.findings_by_run.values(), *card.findings_by_map.values())
     revealing = [finding.code for findings in every for finding in findings if _redact_finding(finding) != finding]
-    yield from (f"a finding {code} holds more than is public" for code in revealing)
+    yield from (f"a finding {code} contains more than is public" for code in revealing)
 
 
 def compute_plane_per_chord(samples: pa.Table) -> tuple[float, float, float]:

@@ -73,7 +73,7 @@ def test_nothing_is_a_file_too_and_what_is_gone_is_told(place: Place) -> None:
     place.delete("empty")
     place.delete("empty")
     assert place.read("empty") is None
-    with pytest.raises(StoreError, match="nowhere: is gone"):
+    with pytest.raises(StoreError, match="nowhere: is missing"):
         place.read_range("nowhere", 0, 1)
     assert place.entries() == []
 

@@ -34,7 +34,7 @@ def test_what_is_written_is_read(tmp_path):
 )
 def test_arrays_of_another_type_or_length_are_refused(tmp_path, change, wanted):
     write_arrays(tmp_path / "w.npz", {**good(), **change})
-    with pytest.raises(ModelError, match=f"holds the weights of another model: {wanted}"):
+    with pytest.raises(ModelError, match=f"contains the weights of another model: {wanted}"):
         read_arrays(tmp_path / "w.npz", FORMS)
 
 

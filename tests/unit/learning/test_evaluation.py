@@ -284,7 +284,7 @@ def test_a_dataset_that_is_replaced_meanwhile_is_told(evaluated, model, dataset,
         return replace(values, key=key), read_table(place / "predictions.parquet")
 
     monkeypatch.setattr("tcpipe.learning.evaluation_files.evaluate", replaced_meanwhile)
-    with pytest.raises(StoreError, match="another call has replaced it meanwhile; run the command again"):
+    with pytest.raises(StoreError, match="another call has replaced it in the meantime; run the command again"):
         run_evaluation(model, mine, tmp_path / "evaluation", config=CONFIG)
     assert not (tmp_path / "evaluation" / "evaluation.json").exists()
 

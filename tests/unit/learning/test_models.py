@@ -98,7 +98,7 @@ def test_an_edited_card_is_refused_and_every_damaged_file_is_named(tmp_path):
     card = (place / "model.json").read_text()
     assert '"robot": "husky"' in card
     (place / "model.json").write_text(card.replace('"robot": "husky"', '"robot": "jackal"'))
-    _refused(place, r"model\.json: is not as it was written.*; remove the folder and train the model again")
+    _refused(place, r"model\.json: has changed since it was written.*; remove the folder and train the model again")
 
 
 def test_a_card_is_read_without_torch(place):

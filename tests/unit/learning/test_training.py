@@ -225,7 +225,7 @@ def test_what_cannot_be_trained_on(dataset, tmp_path, monkeypatch):
 )
 def test_a_folder_of_something_else_is_left_alone(dataset, tmp_path, name, text):
     (tmp_path / name).write_text(text)
-    with pytest.raises(UsageError, match="exists and is no model; it is left alone"):
+    with pytest.raises(UsageError, match="exists and is no model; it is not changed"):
         train(dataset, tmp_path, config=CONFIG)
     assert (tmp_path / name).read_text() == text
 
@@ -235,7 +235,7 @@ def test_what_lies_beside_a_model_is_not_replaced_with_it(trained, dataset, tmp_
     shutil.copytree(trained[0], place)
     (place / "notes.txt").write_text("important")
     assert train(dataset, place, config=CONFIG).status == "unchanged"
-    with pytest.raises(UsageError, match=r"holds notes.txt beside a model, and would be replaced"):
+    with pytest.raises(UsageError, match=r"contains notes.txt in the directory of a model"):
         train(dataset, place, config=replace(CONFIG, seed=1))
     assert (place / "notes.txt").exists()
 

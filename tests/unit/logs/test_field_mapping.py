@@ -74,7 +74,7 @@ def test_every_problem_of_a_mapping_is_said():
     assert "expected one of m/s" in next(
         find_mapping_problems("r", "command", {"linear_x": "v"}, {"linear_x": "furlongs"})
     )
-    assert "expected role = one of gnss" in next(find_mapping_problems("r", "voltage_left", {}, {}))
+    assert "expected one of gnss" in next(find_mapping_problems("r", "voltage_left", {}, {}))
 
 
 @pytest.mark.parametrize("role", [role for role in MAPPED if role != "power"])

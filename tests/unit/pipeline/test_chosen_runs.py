@@ -76,7 +76,7 @@ def test_runs_of_another_data_model_are_named(store, tmp_path):
     assert found.outdated == {"a": "0.9"}
     with pytest.raises(
         StoreError,
-        match=rf"runs/a: holds no finished run of data model {DATA_MODEL_VERSION}; ingest its log again",
+        match=rf"runs/a: contains no finished run of data model {DATA_MODEL_VERSION}; ingest its log again",
     ):
         report(store.root / "runs" / "a")
 
@@ -114,7 +114,10 @@ def test_a_dataset_that_was_moved_before_another_was_built_in_its_place_still_ho
     out.rename(tmp_path / "moved")
     build_dataset(out, store=store.root, recipe=Recipe())
     (kept,) = prune(store=store.root, recipe=Recipe(), dry_run=True).kept
-    assert kept.stays == f"a dataset that lay at {out} refers to it; 'tcpipe prune --forget {out}' if that is gone"
+    assert (
+        kept.stays
+        == f"a dataset, formerly at {out}, refers to it; if it no longer exists: 'tcpipe prune --forget {out}'"
+    )
     shutil.rmtree(out)
     (tmp_path / "moved").rename(out)
     build_dataset(out, store=store.root, recipe=Recipe(), force=True)

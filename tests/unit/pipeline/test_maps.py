@@ -184,7 +184,7 @@ def test_a_quick_look_shows_classes_over_the_orthophoto_and_gaps_in_white(site, 
         assert slope == pytest.approx(0.65, abs=0.02)
     before = Store(store).map_picture("m").read_bytes()
     Store(store).map_picture("m").unlink()
-    assert [line.rpartition(": ")[2] for line in verify(store).problems] == ["is gone"]
+    assert [line.rpartition(": ")[2] for line in verify(store).problems] == ["is missing"]
     assert add(store, "m", **site, force=True).status == "done"
     assert Store(store).map_picture("m").read_bytes() == before
     assert verify(store).problems == ()

@@ -98,7 +98,7 @@ def test_a_half_copied_log_that_lies_elsewhere_too_still_counts(tmp_path, night)
     [
         ({"seed": 1, "start_ns": START_NS + 10**12}, "its content differs"),
         ({"seed": 1}, "its content differs"),  # no battery behind the clock: each drive begins at one instant
-        ({"rows": 700}, "this log holds 47% of it"),
+        ({"rows": 700}, "this log contains 47% of it"),
     ],
 )
 def test_a_name_used_again_and_a_log_that_lost_something_supersede_nothing(tmp_path, night, later, why):

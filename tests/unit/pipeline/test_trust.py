@@ -191,7 +191,7 @@ def test_a_run_that_holds_anothers_segments_is_found(copy):
     found["checksums"] = json.loads(manifest(north).read_text())["checksums"]
     write_sealed(manifest(south), found)
     problems = "\n".join(verify(store).problems)
-    assert "holds segments of run_id north; expected south" in problems
+    assert "contains segments of run_id north; expected south" in problems
     assert "its segment ids are not the run's id" in problems
 
 
@@ -200,7 +200,7 @@ def test_files_that_went_or_came_are_found(copy):
     (directory / "overview.png").unlink()
     (directory / "notes.txt").write_text("mine")
     assert [problem.split(": ")[1] for problem in verify(directory).problems[:2]] == [
-        "is gone",
+        "is missing",
         "is no file of this dataset",
     ]
 
@@ -214,7 +214,7 @@ def test_damage_of_a_map_is_found_and_hides_nothing_else(copy):
     assert any("height, rows 0" in problem for problem in verify(layers).problems)
     assert any("ortho covers 0.000000%" in problem for problem in verify(layers).problems)
     problems = verify(store).problems
-    for words in ("height/c/0/0: its sha256", "ortho/c/0/0: is gone", "north: holds no finished run"):
+    for words in ("height/c/0/0: its sha256", "ortho/c/0/0: is missing", "north: contains no finished run"):
         assert any(words in problem for problem in problems), words
 
 
@@ -259,7 +259,7 @@ def test_an_ingestion_that_lost_its_manifest_or_a_table_does_not_hide_behind_ano
     lost.unlink()
     problems = "\n".join(verify(store).problems)
     assert f"{table(run, 'track')}: was left behind" in problems
-    assert f"{lost}: is gone" in problems
+    assert f"{lost}: is missing" in problems
 
 
 def test_what_is_none_of_these_is_said(tmp_path):

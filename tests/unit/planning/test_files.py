@@ -153,13 +153,13 @@ def test_a_cost_map_of_other_cells_gives_another_plan_and_a_damaged_one_is_refus
         assert plan(MODEL, source, request, out=out, picture=None).status == "done"
         assert plan(MODEL, source, request, out=out, picture=None).status == "unchanged"
     (costs / "cost-map.json").write_text("{}")
-    with pytest.raises(ModelError, match="not as it was written"):
+    with pytest.raises(ModelError, match="has changed since it was written"):
         plan(MODEL, source, request, out=out, picture=None)
 
 
 def test_files_of_the_user_are_left_alone(source, path):
     before = path.read_bytes()
-    with pytest.raises(UsageError, match="is no plan; it is left alone"):
+    with pytest.raises(UsageError, match="is no plan; it is not changed"):
         plan(MODEL, source, _request(source, cell_size_m=2.0), out=path, picture=None)
     mine = path.rename(path.with_suffix(".json"))
     with pytest.raises(UsageError, match="is the path itself"):

@@ -348,7 +348,7 @@ def test_a_log_whose_only_motion_is_unusable_fails_and_says_why() -> None:
     lost = table.set_column(table.column_names.index("status.status"), "status.status", pa.array([-1] * 50, pa.int8()))
     with pytest.raises(RoleError) as error:
         read({"/fix": (kind, lost), "/imu/data": imu()})
-    assert error.value.problems[0].startswith("nothing in the log tells motion")
+    assert error.value.problems[0].startswith("no motion in the log")
     (unused,) = select_findings(error.value.findings, "messages-unused")
     assert unused.numbers["no_fix_count"] == 50
 

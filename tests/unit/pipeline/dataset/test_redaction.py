@@ -175,7 +175,7 @@ def test_verify_says_that_it_is_redacted_and_finds_what_is_told_all_the_same(bui
     assert list(find_leaks(card, samples)) == []
     assert len(list(find_leaks(card, read_samples(here / "told")))) == 7
     found = list(find_leaks(replace(card, findings=(*card.findings, LEAKING[0])), samples))
-    assert found == ["it is marked as redacted, but a finding topic-not-used holds more than is public"]
+    assert found == ["it is marked as redacted, but a finding topic-not-used contains more than is public"]
     assert list(find_leaks(replace(card, maps=read_card(here / "told").maps), samples))
 
 
