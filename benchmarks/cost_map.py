@@ -47,7 +47,7 @@ def prepared(directory: Path, side_m: float, width: int) -> tuple[MapFile, Model
     build_map(directory / "site.zarr", name="site", **layers)
     ranges = {"slope_rad": (-1.5, 1.5), "cross_slope_rad": (-1.5, 1.5), "relief_m": (0.0, 9.0)}
     seen = TrainingRange(dict.fromkeys((4, 5, 6, 7), 100), (4, 5, 6, 7), ranges)
-    made_model(directory / "model", seen=seen, architecture=Architecture(40, 3, 2, width), scale=CARD.scale)
+    made_model(directory / "model", training_range=seen, architecture=Architecture(40, 3, 2, width), scale=CARD.scale)
     return open_map(directory / "site.zarr"), load_model(directory / "model")
 
 

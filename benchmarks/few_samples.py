@@ -26,8 +26,7 @@ from tcpipe.learning.metrics import LEAST_VELOCITY_MPS, compute_costs
 from tcpipe.learning.models import load_model
 from tcpipe.learning.network import make_resnet18
 from tcpipe.learning.predictions import collect_measured
-from tcpipe.learning.table_fitting import compute_features
-from tcpipe.learning.table_model import fit_table
+from tcpipe.learning.table_model import compute_features, fit_table
 from tcpipe.learning.training import Variant, make_training_task, read_class_table
 
 Predict = Callable[[Split], NDArray[np.floating]]

@@ -26,8 +26,8 @@ from tcpipe.formats.integrity import compute_checksum
 from tcpipe.formats.logs.writing import write_mcap
 from tcpipe.formats.stored_runs import RunDirectory
 from tcpipe.pipeline.calls import open_log
+from tcpipe.pipeline.dataset.inputs import remove_duplicates
 from tcpipe.pipeline.dataset.runs import SelectedRuns, choose_runs
-from tcpipe.pipeline.duplicates import remove_duplicates
 from tcpipe.pipeline.ingest import ingest
 from tcpipe.pipeline.log_sources import LogSource, find_sources
 from tcpipe.pipeline.prune import prune

@@ -21,8 +21,8 @@ from tcpipe.formats.contracts import DOCUMENTS
 from tcpipe.formats.finding_lines import format_number
 from tcpipe.formats.recipe_toml import format_commented_toml, load_shipped_profiles
 from tcpipe.planning.path_cost import PIECES
-from tcpipe.tables.catalogue import Entry, read_catalogue, read_sections
 from tcpipe.tables.columns import Column, TableSchema
+from tcpipe.tables.findings import Entry, read_catalogue, read_sections
 from tcpipe.tables.levels import (
     DATA_MODEL_VERSION,
     LABELLED_SEGMENTS,

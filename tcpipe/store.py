@@ -31,7 +31,7 @@ from pathlib import Path, PurePosixPath
 import pyarrow as pa
 
 from tcpipe.errors import StoreError, TableError, UsageError
-from tcpipe.formats.atomic import clear_scratch
+from tcpipe.formats.atomic import check_local_output, clear_scratch
 from tcpipe.formats.bucket import open_place
 from tcpipe.formats.bucket_directories import FetchedShards, fetch_files
 from tcpipe.formats.commit_log import Stamp, pause_garbage_collection, put_commit, read_state
@@ -71,7 +71,6 @@ from tcpipe.formats.stored_runs import (
     put_tables,
     subdirectory,
 )
-from tcpipe.formats.user_paths import check_local_output
 from tcpipe.tables.levels import (
     DATA_MODEL_VERSION,
     EARLIER_VERSIONS,

@@ -12,8 +12,8 @@ from rasterio import Affine
 from tcpipe.tables.arrays import make_lines
 from tcpipe.tables.levels import LABELLED_SEGMENTS
 from tcpipe.terrain.classes import PAPER_CLASSES, ClassTable
-from tcpipe.terrain.grid import MapGrid
 from tcpipe.terrain.layers import find_no_data_value, make_paper_layers
+from tcpipe.terrain.target_grid import MapGrid
 
 
 @dataclass(frozen=True)

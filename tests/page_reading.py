@@ -1,4 +1,4 @@
-"""Reads what a page carries, by the rules of `tcpipe.report.column_packing` written a second time."""
+"""Reads what a page carries, by the rules of `tcpipe.report.page` written a second time."""
 
 import base64
 import json

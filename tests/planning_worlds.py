@@ -4,7 +4,7 @@ import numpy as np
 from map_worlds import ArrayMap
 
 from tcpipe.planning.path_cost import find_projection
-from tcpipe.terrain.grid import MapGrid
+from tcpipe.terrain.target_grid import MapGrid
 
 WEST_M, NORTH_M = 500_000.0, 5_200_000.0
 

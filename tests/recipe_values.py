@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 from tcpipe.recipe import Recipe
 from tcpipe.recipe.checking import read_annotations
-from tcpipe.robots.profiles import PowerSource
+from tcpipe.robots import PowerSource
 from tcpipe.tables.bounds import Bounds
 
 

@@ -26,8 +26,7 @@ import dagster as dg
 from tcpipe.formats.finding_lines import format_finding, list_findings
 from tcpipe.formats.json_files import parse_typed
 from tcpipe.pipeline.log_sources import LogSource, find_sources
-from tcpipe.tables.catalogue import AFFECTED
-from tcpipe.tables.findings import Finding, Verdict, is_problem, select_findings
+from tcpipe.tables.findings import AFFECTED, Finding, Verdict, is_problem, select_findings
 
 Answer = Mapping[str, Any]
 

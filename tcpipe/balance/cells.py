@@ -12,7 +12,7 @@ from scipy.ndimage import label
 from shapely.geometry.base import BaseGeometry
 
 from tcpipe.balance.correlation import Correlation, compute_effective_size
-from tcpipe.tables.catalogue import read_threshold
+from tcpipe.tables.findings import read_threshold
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]

@@ -29,8 +29,7 @@ from tcpipe.cli.output import (
     show_progress,
 )
 from tcpipe.errors import UsageError
-from tcpipe.pipeline.add_map_options import AddMapOptions
-from tcpipe.pipeline.dataset.build_dataset_options import BuildDatasetOptions
+from tcpipe.pipeline.options import AddMapOptions, BuildDatasetOptions
 
 if TYPE_CHECKING:
     from tcpipe.pipeline.export import Exported
@@ -130,7 +129,7 @@ def export(
     import resource
 
     if out.endswith(GEOPACKAGE):
-        from tcpipe.pipeline.layers import export_layers
+        from tcpipe.pipeline.export import export_layers
 
         if names or topics:
             raise UsageError(f"{out}: a GeoPackage cannot contain topics; give a directory")

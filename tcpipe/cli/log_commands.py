@@ -35,7 +35,7 @@ from tcpipe.cli.output import (
     show_progress,
 )
 from tcpipe.errors import UsageError
-from tcpipe.pipeline.ingest_options import IngestOptions
+from tcpipe.pipeline.options import IngestOptions
 
 if TYPE_CHECKING:
     from tcpipe.pipeline.ingest import IngestSummary

@@ -17,9 +17,9 @@ from click.core import ParameterSource
 from click.shell_completion import CompletionItem
 
 from tcpipe.errors import TcpipeError, UsageError
-from tcpipe.formats import user_paths
+from tcpipe.formats import atomic
 from tcpipe.tables import options
-from tcpipe.tables.earlier_names import EARLIER_CHOICES
+from tcpipe.tables.options import EARLIER_CHOICES
 
 if TYPE_CHECKING:
     from tcpipe.store import Store
@@ -140,23 +140,21 @@ complete_runs = _complete_names(lambda context: store.run_ids() if (store := _st
 complete_maps = _complete_names(lambda context: store.maps() if (store := _store(context)) else ())
 """Offers the store's maps."""
 
-OUTPUT_DIRECTORY = Place(user_paths.check_output_directory, written=True)
-OUTPUT_FILE = Place(user_paths.check_output_file, written=True)
+OUTPUT_DIRECTORY = Place(atomic.check_output_directory, written=True)
+OUTPUT_FILE = Place(atomic.check_output_file, written=True)
 GEOPACKAGE = ".gpkg"
 OUTPUT_EXPORT = Place(
-    lambda path: (user_paths.check_output_file if path.endswith(GEOPACKAGE) else user_paths.check_output_directory)(
-        path
-    ),
+    lambda path: (atomic.check_output_file if path.endswith(GEOPACKAGE) else atomic.check_output_directory)(path),
     written=True,
 )
 """A directory, or a GeoPackage by its name."""
-INPUT_FILE = Place(user_paths.check_input_file)
-INPUT_DIRECTORY = Place(user_paths.check_input_directory)
-SEALED = Place(user_paths.check_input_directory, urls=True)
+INPUT_FILE = Place(atomic.check_input_file)
+INPUT_DIRECTORY = Place(atomic.check_input_directory)
+SEALED = Place(atomic.check_input_directory, urls=True)
 """A dataset, a model, a store or a run, here or in a bucket."""
-PUBLISHED = Place(user_paths.check_output_directory, written=True, urls=True)
+PUBLISHED = Place(atomic.check_output_directory, written=True, urls=True)
 """Where a dataset, a model or a store is written, here or in a bucket."""
-LOG = Place(user_paths.check_input_path, urls=True)
+LOG = Place(atomic.check_input_path, urls=True)
 """A log, here or in object storage."""
 ONE_OF_SEVERAL = Place(str)
 """A log or raster, by pattern or address; the command checks each one and reports all problems at once."""

@@ -105,7 +105,7 @@ _ANSWERS = {
     "evaluate-drives.answer": "planning.drives.Drives",
     "explain.answer": "pipeline.explain.Explained",
     "export.answer": "pipeline.export.Exported",
-    "export-layers.answer": "pipeline.layers.ExportedLayers",
+    "export-layers.answer": "pipeline.export.ExportedLayers",
     "ingest-log.answer": "pipeline.plan.LogLine",
     "ingest-summary.answer": "pipeline.ingest.SummaryLine",
     "inspect-dataset.answer": "pipeline.inspected.InspectedDataset",

@@ -25,7 +25,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.power.least_squares import solve_non_negative
+from tcpipe.power.noise import solve_non_negative
 from tcpipe.tables.facts import PhysicsFit, PhysicsScore, PhysicsTerm
 
 Floats = NDArray[np.float64]

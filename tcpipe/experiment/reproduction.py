@@ -15,9 +15,14 @@ import numpy as np
 
 from tcpipe.dataset import Split, open_dataset
 from tcpipe.errors import DatasetError, UsageError, clean_lines
-from tcpipe.experiment.claims import Claim, check_claims
 from tcpipe.experiment.reproduction_page import render_reproduction_page
-from tcpipe.experiment.simulation_floor import compute_true_costs, compute_variance_shares, remove_hidden_variation
+from tcpipe.experiment.simulation_floor import (
+    Claim,
+    check_claims,
+    compute_true_costs,
+    compute_variance_shares,
+    remove_hidden_variation
+)
 from tcpipe.formats.atomic import clear, write_text
 from tcpipe.formats.json_files import write_json
 from tcpipe.learning.evaluation_facts import EvaluateConfig, Evaluation, SplitErrors

@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 
-from tcpipe.experiment.claims import Claim
-from tcpipe.experiment.simulation_floor import CLASS_AND_SLOPE
+from tcpipe.experiment.simulation_floor import CLASS_AND_SLOPE, Claim
 from tcpipe.learning.evaluation_facts import Evaluation
 from tcpipe.learning.evaluation_figures import EvaluatedSamples
 from tcpipe.learning.evaluation_files import SIMULATED

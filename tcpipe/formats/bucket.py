@@ -1,10 +1,20 @@
-"""A place in object storage: a prefix of a bucket, through obstore (S3, Google, Azure)."""
+"""A place in object storage: a prefix of a bucket, through obstore (S3, Google, Azure).
+
+A bounded cache of this machine, by content: what was fetched from a bucket once is not fetched again.
+
+A key names its content for good (a sha256; an object's version and a range of it), so that nothing in here can be outdated. It lies in
+``TCPIPE_CACHE``, else the user's cache directory, and holds at most ``TCPIPE_CACHE_BYTES`` (8 GB): what was not used for longest goes.
+
+The cache also keeps the digest of each checked file under its `Place.version`, so that a file is hashed again only after it has changed.
+"""
 
 from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Callable, Iterator, Sequence
+import tempfile
+import threading
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass
@@ -12,10 +22,9 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
-from tcpipe.errors import MissingFileError, StoreError
+from tcpipe.errors import MissingFileError, StoreError, UsageError
 from tcpipe.formats.atomic import make_scratch_directory
-from tcpipe.formats.content_cache import fetch_cached
-from tcpipe.formats.integrity import Checksum
+from tcpipe.formats.integrity import Checksum, find_wrong_checksum
 from tcpipe.formats.object_storage import connect_store, convert_errors, is_url, split_url
 from tcpipe.formats.place import DirectoryPlace, Entry, Place
 
@@ -221,3 +230,133 @@ def _convert_missing(where: str) -> Iterator[None]:
         yield
     except FileNotFoundError:
         raise MissingFileError(where) from None
+
+
+_MOST_BYTES = 8_000_000_000
+_SHARE_UNSEEN = 64
+"""The cache may be larger than its bound by one part in so many: looking at all of its files takes time."""
+_unseen_bytes = [float("inf")]
+"""What this process has put there since it last looked."""
+_IN_USE_S = 60.0
+"""What was used so lately stays: another process may be about to open it."""
+
+
+def fetch_cached(key: str, fetch: Callable[[Path], object]) -> Path:
+    """Return the file of a key; where there is none, ``fetch`` writes it. `StoreError`: the cache cannot be written."""
+    path = _find_cache_path(key)
+    if _is_there(path):
+        return path
+    temporary = path.with_name(f"{path.name}-{os.getpid()}-{threading.get_ident()}")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        fetch(temporary)
+        put = temporary.stat()
+        # Nothing is synced, and what a killed process leaves goes in its turn: whoever reads it proves it.
+        temporary.replace(path)
+    except OSError as error:
+        told = f"{path}: cannot be written ({error.strerror or error}); TCPIPE_CACHE names another place for what is fetched"
+        raise StoreError(told) from error
+    finally:
+        with suppress(OSError):
+            temporary.unlink()
+    _unseen_bytes[0] += put.st_size
+    if _unseen_bytes[0] * _SHARE_UNSEEN > (most := _read_cache_limit()):
+        _make_room(path.parent.parent, most, now=put.st_mtime)
+        _unseen_bytes[0] = 0
+    return path
+
+
+def is_cached(key: str) -> bool:
+    """Tell whether there is a file of a key, which then stays for a while."""
+    return _is_there(_find_cache_path(key))
+
+
+def _is_there(path: Path) -> bool:
+    with suppress(FileNotFoundError, NotADirectoryError):
+        os.utime(path)
+        return True
+    return False
+
+
+def _find_cache_path(key: str) -> Path:
+    digest = hashlib.sha256(key.encode()).hexdigest()
+    return _find_cache_directory() / digest[:2] / digest
+
+
+def _find_cache_directory() -> Path:
+    if given := os.environ.get("TCPIPE_CACHE"):
+        return Path(given)
+    base = Path(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache"))  # noqa: PTH111  also without a home
+    if base.is_absolute() and os.access(next(of for of in (base, *base.parents) if of.exists()), os.W_OK):
+        return base / "tcpipe"
+    return Path(tempfile.gettempdir()) / f"tcpipe-cache-{os.getuid()}"
+
+
+def _read_cache_limit() -> int:
+    given = os.environ.get("TCPIPE_CACHE_BYTES", str(_MOST_BYTES))
+    if not given.isdecimal():
+        raise UsageError(f"TCPIPE_CACHE_BYTES is {given!r}, expected a number of bytes")
+    return int(given)
+
+
+def _make_room(directory: Path, most: int, *, now: float) -> None:
+    """Remove what was not used for longest until the bound holds."""
+    files = []
+    for path in directory.glob("??/*"):
+        with suppress(OSError):
+            seen = path.stat()
+            files.append((seen.st_mtime, seen.st_size, path))
+    total = sum(size for _, size, _ in files)
+    for used, size, path in sorted(files):
+        if total <= most or now - used < _IN_USE_S:
+            return
+        path.unlink(missing_ok=True)
+        total -= size
+
+
+_FETCHES_AT_ONCE = 4
+"""Files that are read side by side: a disk gives no more, and two cores hash 1 to 3 GB a second."""
+
+
+def find_wrong_files(place: Place, checksums: Mapping[str, Checksum], names: Iterable[str]) -> list[str]:
+    """Return a line for each file at a place that is not what a card has of it; all sizes are compared before a file is read.
+
+    Parameters
+    ----------
+    place : where the files lie.
+    checksums : what the card has of them, by name.
+    names : which of them.
+    """
+    names = list(names)
+    sizes = [line for name in names if (line := _check_size(place, name, checksums.get(name)))]
+    if sizes:
+        return sizes
+    with ThreadPoolExecutor(_FETCHES_AT_ONCE) as pool:
+        return [line for line in pool.map(lambda name: _check_digest(place, name, checksums[name]), names) if line]
+
+
+def _check_size(place: Place, name: str, wanted: Checksum | None) -> str | None:
+    size, where = place.size(name), place.where(name)
+    if size is None or wanted is None:
+        return find_wrong_checksum(where, None if size is None else Checksum(size, ""), wanted)
+    return None if size == wanted.size_bytes else f"{where}: {size} bytes, expected {wanted.size_bytes}"
+
+
+def _check_digest(place: Place, name: str, wanted: Checksum) -> str | None:
+    version = place.version(name)
+    if version is not None and _read_remembered(place, name, version) == wanted.sha256:
+        return None
+    return find_wrong_checksum(place.where(name), place.checksum(name), wanted)
+
+
+def _read_remembered(place: Place, name: str, version: str) -> str | None:
+    """Return the digest of a version of a file, found now where it is not remembered; None where it cannot be kept."""
+
+    def find(to: Path) -> None:
+        checksum = place.checksum(name)
+        to.write_text("" if checksum is None else checksum.sha256)
+
+    try:
+        return fetch_cached(f"sha256 of {version}", find).read_text(errors="replace")
+    except (OSError, StoreError):
+        return None

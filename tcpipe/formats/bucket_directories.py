@@ -25,10 +25,9 @@ import google_crc32c
 
 from tcpipe.errors import StoreError, UsageError
 from tcpipe.formats.atomic import make_lasting_scratch, make_scratch_directory
-from tcpipe.formats.bucket import map_concurrently, open_place
+from tcpipe.formats.bucket import fetch_cached, find_wrong_files, is_cached, map_concurrently, open_place
 from tcpipe.formats.commit_log import LOG, read_newest_commit, read_state
 from tcpipe.formats.commits import State
-from tcpipe.formats.content_cache import fetch_cached, find_wrong_files, is_cached
 from tcpipe.formats.integrity import Checksum, Checksums, find_broken_checksums
 from tcpipe.formats.json_files import parse_json, parse_typed
 from tcpipe.formats.object_storage import is_bucket, is_url

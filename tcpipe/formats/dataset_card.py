@@ -10,8 +10,7 @@ from tcpipe.balance.correlation import Correlation, Floor
 from tcpipe.formats.finding_lines import FindingGroup, group_findings
 from tcpipe.formats.geojson import PolygonGeometry
 from tcpipe.formats.integrity import Checksum
-from tcpipe.formats.layer_descriptions import Description
-from tcpipe.formats.maps.map_facts import MapInputs
+from tcpipe.formats.maps.map_facts import Description, MapInputs
 from tcpipe.motion.distance_breakdown import Group
 from tcpipe.recipe import Recipe
 from tcpipe.splits.audit import HeldOut
@@ -256,7 +255,7 @@ class DatasetCard:
     patch_m: float
     patch_px: int
     layers: Mapping[str, Description]
-    """By layer: its numpy type, what stands for no data, and its CF attributes (`tcpipe.formats.layer_descriptions`)."""
+    """By layer: its numpy type, what stands for no data, and its CF attributes (`tcpipe.formats.maps.map_facts`)."""
     tensor: Mapping[str, str | tuple[str, ...]]
     """``channels``, and by layer how what is stored becomes a channel from 0 to 1."""
     classes: tuple[TerrainClass, ...]

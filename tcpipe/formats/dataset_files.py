@@ -23,12 +23,12 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from tcpipe.errors import DatasetError, RecipeError, StoreError, UsageError
+from tcpipe.formats.bucket import find_wrong_files
 from tcpipe.formats.bucket_directories import FetchedShards
-from tcpipe.formats.content_cache import find_wrong_files
 from tcpipe.formats.dataset_card import KIND, DatasetCard, Shard
 from tcpipe.formats.integrity import prove_files, read_sealed
 from tcpipe.formats.json_files import parse_typed
-from tcpipe.formats.layer_descriptions import make_cf_attributes, read_layers
+from tcpipe.formats.maps.map_facts import make_cf_attributes, read_layers
 from tcpipe.formats.parquet import read_column_names, read_row_count, read_row_group, read_table, write_parquet_bytes
 from tcpipe.formats.place import DirectoryPlace, Place
 from tcpipe.formats.shards import DESCRIPTION, ShardedArray, decode_chunk, open_sharded

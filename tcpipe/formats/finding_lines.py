@@ -11,8 +11,19 @@ import numpy as np
 
 from tcpipe.motion.distance_breakdown import StoreLoss, make_loss_code
 from tcpipe.recipe.suggestions import RecipeFragment
-from tcpipe.tables.catalogue import AFFECTED, Affected, Entry, Severity, rank_severity, read_catalogue
-from tcpipe.tables.findings import GRADES, Finding, Remedy, Verdict, sort_findings
+from tcpipe.tables.findings import (
+    AFFECTED,
+    GRADES,
+    Affected,
+    Entry,
+    Finding,
+    Remedy,
+    Severity,
+    Verdict,
+    rank_severity,
+    read_catalogue,
+    sort_findings
+)
 
 K = TypeVar("K", bound=Hashable)
 

@@ -21,9 +21,8 @@ from tcpipe.formats.parquet import read_parquet_bytes, write_parquet_bytes
 from tcpipe.formats.place import Place
 from tcpipe.formats.run_documents import Ingestion, LogOrigin, Manifest, RunJson
 from tcpipe.tables.arrays import make_column
-from tcpipe.tables.catalogue import AFFECTED
 from tcpipe.tables.facts import EnergyBudget, PhysicsFit
-from tcpipe.tables.findings import Finding, Verdict, judge, select_findings
+from tcpipe.tables.findings import AFFECTED, Finding, Verdict, judge, select_findings
 
 RUNS = "runs.parquet"
 

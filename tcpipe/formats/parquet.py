@@ -21,8 +21,8 @@ from tcpipe.errors import StoreError
 from tcpipe.formats.atomic import write_atomic_file
 from tcpipe.formats.json_files import to_json_line
 from tcpipe.tables.columns import read_lonlat_deg
-from tcpipe.tables.earlier_names import EARLIER_COLUMNS
 from tcpipe.tables.levels import GEOMETRY, Datum
+from tcpipe.tables.options import EARLIER_COLUMNS
 
 ROWS_PER_GROUP = 1 << 17
 """Rows of a group: what is decoded together."""

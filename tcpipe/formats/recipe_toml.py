@@ -16,8 +16,8 @@ from tcpipe.errors import RecipeError
 from tcpipe.formats.json_files import Json, digest, to_plain
 from tcpipe.recipe import IngestSections, Recipe, TableMapping
 from tcpipe.recipe.checking import as_toml, describe, format_values, from_values, read_annotations
-from tcpipe.robots.profiles import GENERIC, PowerSource, Profiles, Robot
-from tcpipe.tables.earlier_names import EARLIER_KEYS
+from tcpipe.robots import GENERIC, PowerSource, Profiles, Robot
+from tcpipe.tables.options import EARLIER_KEYS
 
 logger = logging.getLogger(__name__)
 

@@ -10,7 +10,7 @@ listed refusals. Fixes that contradict the rest while it carries the pose are no
 the state, where both ends tell that they have one (`gnss_faults`). Where fixes scatter far less than they claim, the rest of their error
 lasts (`find_fix_errors`): it is no noise that averages out.
 
-`error_state_pass` runs the kernels over a section. The kernels: `state_kernel` (state, errors and sigma points), `prediction_kernel`,
+`error_state_pass` runs the kernels over a section. The kernels: `state_kernel` (state, errors and sigma points, prediction),
 `error_state_kernel` (updates, events and gates) and `smoother_kernel`.
 """
 

@@ -1,6 +1,6 @@
 """Forward pass of the error-state unscented filter: updates by one measurement, events in order, gates that reject and reset, GNSS error.
 
-Every update draws new sigma points. State and errors are in `state_kernel`, the prediction in `prediction_kernel`, the backward pass in
+Every update draws new sigma points. State, errors and the prediction are in `state_kernel`, the backward pass in
 `smoother_kernel`.
 """
 
@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.compiled import compile_kernel
-from tcpipe.fusion.prediction_kernel import predict
 from tcpipe.fusion.state_kernel import (
     ACCEPTED,
     CENTRE_WEIGHT,
@@ -37,7 +36,8 @@ from tcpipe.fusion.state_kernel import (
     copy_values,
     displace_state,
     factorize_covariance,
-    save_state,
+    predict,
+    save_state
 )
 
 

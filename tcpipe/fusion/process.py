@@ -140,7 +140,7 @@ def find_scale_stds(measurements: Measurements) -> tuple[float, float]:
 
 
 def make_process_noise(measurements: Measurements) -> NDArray[np.float64]:
-    """Return the process noise by mode, shape (4, 20), as `tcpipe.fusion.prediction_kernel.predict` takes it.
+    """Return the process noise by mode, shape (4, 20), as `tcpipe.fusion.state_kernel.predict` takes it.
 
     It includes the scale and alignment errors of the IMU. Biases and scales wander. Slip comes and goes, so the wheels' scale returns to
     one; where only the wheels and the camera measure speed, neither is known to be right on average, and it wanders freely.

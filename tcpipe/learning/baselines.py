@@ -14,7 +14,6 @@ from tcpipe.dataset import Dataset, Split
 from tcpipe.dataset.extra_features import read_extra_features
 from tcpipe.errors import DatasetError, ModelError
 from tcpipe.geometry.datum import enu_from_geodetic
-from tcpipe.learning.curves import Curves, Form, fit_curves
 from tcpipe.learning.evaluation_facts import SPLITS, BaselineResult
 from tcpipe.learning.metrics import (
     ALL,
@@ -30,7 +29,7 @@ from tcpipe.learning.metrics import (
     compute_errors_by_class,
 )
 from tcpipe.learning.models import Model
-from tcpipe.learning.physics_model import find_idle_power, fit_physics_model
+from tcpipe.learning.physics_model import Curves, Form, find_idle_power, fit_curves, fit_physics_model
 from tcpipe.learning.predictions import Measured, predict_costs, predict_spreads
 from tcpipe.learning.training import Variant
 from tcpipe.tables.findings import Finding, Subject, make_finding
@@ -126,8 +125,7 @@ def _fit_physics(train: Split, ours: Model) -> Predictor:
 
 def _fit_trees(train: Split, ours: Model) -> Predictor:
     """Return trees over features of all layers, and of the turn."""
-    from tcpipe.learning.table_fitting import compute_features  # noqa: PLC0415  numba loads with it, and with the next
-    from tcpipe.learning.table_model import fit_table  # noqa: PLC0415
+    from tcpipe.learning.table_model import compute_features, fit_table  # noqa: PLC0415  numba loads with it
 
     folds, labels = train.column("fold"), train.labels.astype(np.float64)
     if len(np.unique(folds)) < 2:

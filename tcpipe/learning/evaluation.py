@@ -62,10 +62,9 @@ from tcpipe.learning.predictions import (
     predict_spreads,
 )
 from tcpipe.learning.training import Variant, compute_dataset_checksum, make_training_task, train
-from tcpipe.robots.profiles import Robot
+from tcpipe.robots import Robot
 from tcpipe.splits.audit import CLOSE, PLACES, are_near, compute_middles_deg
-from tcpipe.tables.catalogue import read_threshold
-from tcpipe.tables.findings import Finding, Remedy, Subject, judge, make_finding
+from tcpipe.tables.findings import Finding, Remedy, Subject, judge, make_finding, read_threshold
 from tcpipe.terrain.classes import NODATA_ID
 
 logger = logging.getLogger("tcpipe")

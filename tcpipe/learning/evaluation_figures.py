@@ -24,13 +24,12 @@ from tcpipe.learning.predictions import (
     make_column_name,
 )
 from tcpipe.report.colours import CLASS_COLOURS, DROPPED, FAINT, SPLIT_COLOURS, find_class_colour
-from tcpipe.report.column_packing import Column, make_shown_column, pack_columns
 from tcpipe.report.dataset_patches import choose_thinning, make_sheets
-from tcpipe.report.page import Section, Shaded
+from tcpipe.report.page import Column, Section, Shaded, make_shown_column, pack_columns
 from tcpipe.report.plots import Plot, make_plot
 from tcpipe.tables.arrays import to_texts
-from tcpipe.tables.catalogue import read_threshold
 from tcpipe.tables.columns import to_floats
+from tcpipe.tables.findings import read_threshold
 
 MEASURED, PREDICTED = DROPPED, SPLIT_COLOURS["train"]
 MOST_PERCENT = 50.0

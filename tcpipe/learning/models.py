@@ -34,8 +34,8 @@ from tcpipe.learning.architecture import check_trainable, list_weight_forms
 from tcpipe.learning.metrics import LEAST_VELOCITY_MPS
 from tcpipe.learning.model_card import EARLIER_SCHEMA_VERSION, KIND, SCHEMA_VERSION, ModelCard, is_current
 from tcpipe.learning.physics_model import PhysicsModel, list_physics_arrays, read_physics_model
-from tcpipe.tables.earlier_names import EARLIER_CHOICES, EARLIER_MODEL_KEYS, rename_keys
 from tcpipe.tables.facts import PhysicsFit
+from tcpipe.tables.options import EARLIER_CHOICES, EARLIER_MODEL_KEYS, rename_keys
 from tcpipe.terrain.classes import ClassTable
 
 if TYPE_CHECKING:

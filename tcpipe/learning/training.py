@@ -190,7 +190,7 @@ def _train_into_bucket(dataset: str | Path, url: str, key: str, rules: FitConfig
 def _fit_model(task: Task, rules: FitConfig, data: Dataset, *, name: str, key: str, checkpoint: Path) -> Fitted:
     if rules.model == "resnet18":
         return fit(task, rules, name=name, key=key, checkpoint=checkpoint)
-    from tcpipe.learning.table_fitting import fit_at_once  # noqa: PLC0415  numba loads with it
+    from tcpipe.learning.table_model import fit_at_once  # noqa: PLC0415  numba loads with it
 
     return fit_at_once(
         task, rules, name=name, key=key, patch_m=data.card.patch_m, class_count=read_class_table(data.card).count

@@ -19,9 +19,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.tables.catalogue import read_threshold
 from tcpipe.tables.facts import ClockStep
-from tcpipe.tables.findings import Finding, Subject, make_finding
+from tcpipe.tables.findings import Finding, Subject, make_finding, read_threshold
 
 Ints = NDArray[np.int64]
 Mask = NDArray[np.bool_]

@@ -19,8 +19,7 @@ from tcpipe.logs import roles
 from tcpipe.logs.extrinsics import is_base
 from tcpipe.logs.nmea import STATUS_AND_STD_OF_QUALITY, add_date, read_gga, read_over_ground
 from tcpipe.recipe.suggestions import suggest
-from tcpipe.tables.catalogue import read_threshold
-from tcpipe.tables.findings import Finding, Subject, make_finding
+from tcpipe.tables.findings import Finding, Subject, make_finding, read_threshold
 
 Columns = Mapping[str, NDArray[Any]]
 Floats = NDArray[np.float64]

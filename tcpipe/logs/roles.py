@@ -13,12 +13,14 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import TypeVar
 
-from tcpipe.logs.robots import ask_which_robot, find_robot, find_robot_namespaces
 from tcpipe.logs.topics import (
     LISTED,
     Topic,
+    ask_which_robot,
     find_left_out,
     find_missing_roles,
+    find_robot,
+    find_robot_namespaces,
     find_short_topics,
     find_undecodable,
     format_coverage,
@@ -28,7 +30,7 @@ from tcpipe.logs.topics import (
 )
 from tcpipe.power.sources import BATTERY_STATE, FLOAT_TYPES, find_quantity, is_corrected, make_rail_name
 from tcpipe.recipe.suggestions import RecipeFragment, suggest
-from tcpipe.robots.profiles import Profiles
+from tcpipe.robots import Profiles
 from tcpipe.tables.findings import Finding, Subject, make_finding
 
 NAV_SAT_FIX = "sensor_msgs/msg/NavSatFix"

@@ -20,8 +20,7 @@ from numpy.typing import NDArray
 
 from tcpipe.motion.row_sections import find_piece_spans, find_runs
 from tcpipe.tables.bits import DropReason, flag_name
-from tcpipe.tables.catalogue import read_threshold
-from tcpipe.tables.findings import Finding, Subject, make_finding
+from tcpipe.tables.findings import Finding, Subject, make_finding, read_threshold
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]

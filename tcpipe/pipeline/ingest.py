@@ -38,7 +38,6 @@ from tcpipe.pipeline.calls import (
     start_stopwatch,
     stored_bytes,
 )
-from tcpipe.pipeline.ingest_options import IngestOptions
 from tcpipe.pipeline.ingest_run import Ingested, find_twin, ingest_one
 from tcpipe.pipeline.log_sources import (
     FoundLogs,
@@ -52,6 +51,7 @@ from tcpipe.pipeline.log_sources import (
     recall_hash,
     select_shard,
 )
+from tcpipe.pipeline.options import IngestOptions
 from tcpipe.pipeline.plan import IngestResult, IngestTask, Step, check_age, make_died_result, make_result, plan
 from tcpipe.pipeline.problems import find_problems, is_acknowledged, make_failure
 from tcpipe.store import Store, open_store

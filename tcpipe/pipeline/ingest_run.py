@@ -25,8 +25,7 @@ from tcpipe.pipeline.plan import IngestResult, IngestTask, check_age, make_resul
 from tcpipe.progress import set_task, step
 from tcpipe.recipe import IngestSections
 from tcpipe.store import Store
-from tcpipe.tables.catalogue import read_threshold
-from tcpipe.tables.findings import Finding, Subject, judge, make_finding
+from tcpipe.tables.findings import Finding, Subject, judge, make_finding, read_threshold
 from tcpipe.tables.levels import DATA_MODEL_VERSION, LabelledSegments, MaskedTrack, Streams, Track, add_findings
 
 _M_MMAP_THRESHOLD = -3

@@ -20,14 +20,13 @@ from tcpipe.formats.logs.table_folders import find_table_folders, list_table_fil
 from tcpipe.formats.object_storage import format_path, is_presigned, is_url
 from tcpipe.formats.run_documents import Counts, Ingestion, LogOrigin
 from tcpipe.formats.stored_runs import RunDirectory
-from tcpipe.logs.field_names import CALLED, match_field_names
+from tcpipe.logs.field_mapping import CALLED, match_field_names
 from tcpipe.pipeline.log_inspection import InspectedLog, inspect_log
 from tcpipe.pipeline.log_sources import find_remote_logs
 from tcpipe.recipe import Recipe
 from tcpipe.recipe.checking import as_toml
 from tcpipe.store import Store, is_store, run_at
-from tcpipe.tables.catalogue import AFFECTED
-from tcpipe.tables.findings import Finding, Grade, Verdict
+from tcpipe.tables.findings import AFFECTED, Finding, Grade, Verdict
 
 if TYPE_CHECKING:
     from tcpipe.pipeline.inspected import InspectedDataset, InspectedMap
@@ -261,7 +260,7 @@ _STAMP = re.compile(r"t|stamp|.*time(stamp)?.*|gpst|utc|date")
 
 def propose_tables(folder: Path, files: Sequence[Path]) -> InspectedTables:
     """Return the columns of each table, why some cannot be read, and a recipe for the rest."""
-    from tcpipe.formats.tables import read_column_names  # noqa: PLC0415  polars only where a table is read
+    from tcpipe.formats.logs.table_log import read_column_names  # noqa: PLC0415  polars only where a table is read
 
     columns: dict[str, tuple[str, ...]] = {}
     problems: dict[str, str] = {}

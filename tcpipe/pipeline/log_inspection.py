@@ -11,7 +11,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from tcpipe.cost.quality import find_wanted_rate, is_too_slow
+from tcpipe.cost.labels import find_wanted_rate, is_too_slow
 from tcpipe.formats.logs.log_file import Log
 from tcpipe.formats.recipe_toml import load_profiles
 from tcpipe.logs.clocks import CLOCK, LOG_CLOCK, SECOND_NS, SIMULATED_NS, Timeline, TopicTimes, settle_clocks
@@ -20,7 +20,7 @@ from tcpipe.logs.topics import Topic, split_notes
 from tcpipe.pipeline.log_sources import find_damaged_log, find_total_loss
 from tcpipe.power.sources import find_sources
 from tcpipe.recipe import Recipe
-from tcpipe.robots.profiles import Profiles
+from tcpipe.robots import Profiles
 from tcpipe.stages.read_roles import decide_roles, find_power_candidates, find_read_config
 from tcpipe.tables.facts import ABSENT, ClockStep
 from tcpipe.tables.findings import Finding, Subject, make_finding, sort_findings

@@ -20,7 +20,7 @@ from tcpipe.formats.maps.map_facts import MapInputs, MapSummary, map_lines
 from tcpipe.formats.maps.map_files import open_map
 from tcpipe.formats.maps.terrain_polygons import is_drawn
 from tcpipe.formats.run_documents import remove_if_empty
-from tcpipe.pipeline.add_map_options import AddMapOptions, Files
+from tcpipe.pipeline.options import AddMapOptions, Files
 from tcpipe.report.pictures import draw_quick_look, write_quick_look
 from tcpipe.store import Store, open_store
 from tcpipe.tables.levels import SAMPLES

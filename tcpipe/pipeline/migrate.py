@@ -39,9 +39,9 @@ from tcpipe.formats.run_documents import (
 from tcpipe.pipeline.calls import is_committed, open_log
 from tcpipe.recipe import SplitConfig
 from tcpipe.store import Store
-from tcpipe.tables.earlier_names import EARLIER_DOCUMENT_KEYS, rename_keys
 from tcpipe.tables.findings import Finding, Subject, SubjectKind, judge, make_finding
 from tcpipe.tables.levels import DATA_MODEL_VERSION, EARLIER_VERSIONS
+from tcpipe.tables.options import EARLIER_DOCUMENT_KEYS, rename_keys
 
 T = TypeVar("T")
 

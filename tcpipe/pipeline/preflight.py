@@ -29,10 +29,9 @@ from tcpipe.pipeline.log_inspection import InspectedLog, inspect_log
 from tcpipe.recipe import ReadConfig, Recipe, Role
 from tcpipe.stages.read import read_run
 from tcpipe.stages.read_roles import decide_roles, find_read_config
-from tcpipe.tables.catalogue import read_threshold
 from tcpipe.tables.columns import to_integers
 from tcpipe.tables.facts import NOTHING_FOUND, EnergyBudget, StageFacts
-from tcpipe.tables.findings import Finding, Subject, Verdict, judge, make_finding, sort_findings
+from tcpipe.tables.findings import Finding, Subject, Verdict, judge, make_finding, read_threshold, sort_findings
 from tcpipe.tables.levels import LabelledSegments
 
 MISSING: Mapping[Role, str] = {
@@ -48,7 +47,7 @@ WANTED_HZ: Mapping[str, float] = {
     "imu": LEAST_RATE_HZ,
     **{role: read_threshold("rate-too-low", f"{role}_hz") for role in ("gnss", "wheel_odometry", "visual_odometry")},
 }
-"""Slower topics cost precision or columns; the rate of power depends on its source (`tcpipe.cost.quality`)."""
+"""Slower topics cost precision or columns; the rate of power depends on its source (`tcpipe.cost.labels`)."""
 
 LARGE_TYPES = frozenset(
     f"sensor_msgs/msg/{name}"

@@ -16,7 +16,7 @@ import numpy as np
 
 from tcpipe.cost.physics import PHYSICS_UNITS
 from tcpipe.errors import UsageError, clean_lines
-from tcpipe.formats.atomic import make_scratch_directory
+from tcpipe.formats.atomic import check_local_output, make_scratch_directory
 from tcpipe.formats.commit_log import pause_garbage_collection
 from tcpipe.formats.commits import CallRecord, Problem
 from tcpipe.formats.finding_lines import MOST_LINES, format_count, format_loss, format_verdict, group_findings
@@ -24,7 +24,6 @@ from tcpipe.formats.index_files import RunFacts
 from tcpipe.formats.object_storage import format_path, is_url, make_absolute
 from tcpipe.formats.recipe_toml import ingest_key, resolve_recipe
 from tcpipe.formats.stored_runs import Ingestions
-from tcpipe.formats.user_paths import check_local_output
 from tcpipe.motion.distance_breakdown import StoreLoss, find_largest_losses
 from tcpipe.pipeline.calls import (
     INGEST,
@@ -40,8 +39,7 @@ from tcpipe.pipeline.plan import LOG_STATES, TROUBLE, IngestTask, LogState, Step
 from tcpipe.pipeline.problems import find_incomplete_runs, make_missing, make_waiting
 from tcpipe.recipe import Recipe
 from tcpipe.store import Store, open_store
-from tcpipe.tables.catalogue import Severity, read_threshold
-from tcpipe.tables.findings import Finding, Subject, Verdict, judge_by_code, make_finding
+from tcpipe.tables.findings import Finding, Severity, Subject, Verdict, judge_by_code, make_finding, read_threshold
 
 _MOST_NAMES = 3
 _MOST_CALLS = 7
@@ -222,15 +220,15 @@ def _find_waiting(steps: Iterable[Step]) -> Iterator[Problem]:
 
 
 def _iterate_groups(steps: Iterable[Step]) -> Iterator[Group]:
-    """Yield logs of one standing with findings of the same codes on the same subjects; without findings, of the same cause."""
+    """Yield logs of one state with findings of the same codes on the same subjects; without findings, of the same cause."""
     groups: dict[tuple[LogState, Hashable], list[Step]] = {}
     for step in steps:
         alike = frozenset((of.code, None if of.subject.kind in ("log", "run") else of.subject) for of in step.findings)
         groups.setdefault((step.state, alike or step.cause), []).append(step)
-    for (standing, _), of in sorted(groups.items(), key=lambda item: (LOG_STATES.index(item[0][0]), -len(item[1]))):
+    for (state, _), of in sorted(groups.items(), key=lambda item: (LOG_STATES.index(item[0][0]), -len(item[1]))):
         causes = list(dict.fromkeys(step.cause for step in of))
         cause = causes[0] if len(causes) == 1 else f"{len(causes)} reasons, the first: {causes[0]}"
-        yield Group(standing, cause, tuple(step.task.source.name for step in of), sum(map(_sum_bytes, of)))
+        yield Group(state, cause, tuple(step.task.source.name for step in of), sum(map(_sum_bytes, of)))
 
 
 def _sum_bytes(step: Step) -> int:
@@ -294,9 +292,9 @@ def _iterate_measures(run: RunFacts) -> Iterator[tuple[str, str, float]]:
     if run.energy_budget is not None:
         yield "noise floor of E", "%", _IN_PERCENT * run.energy_budget.total
     if run.idle_watt is not None:
-        yield "idle power", PHYSICS_UNITS["standing"], run.idle_watt
+        yield "idle power", PHYSICS_UNITS["idle"], run.idle_watt
     for term, (value, std) in run.physics.items():
-        if not term.startswith("standing") and abs(value) > read_threshold(_CHANGE, "min_scatter_ratio") * std:
+        if not term.startswith("idle") and abs(value) > read_threshold(_CHANGE, "min_scatter_ratio") * std:
             yield f"physics term {term}", PHYSICS_UNITS.get(term.partition(" ")[0], ""), value
 
 

@@ -16,12 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.errors import MapError
-from tcpipe.planning.cost_model import CostModel
-from tcpipe.planning.segment_predictions import BATCH, NO_COST, Bits, Reason, SegmentPredictions, predict_segments
-from tcpipe.terrain.grid import MapGrid
-from tcpipe.terrain.patches import PatchFrames
+from tcpipe.planning.cost_model import BATCH, NO_COST, Bits, CostModel, Reason, SegmentPredictions, predict_segments
 from tcpipe.terrain.projection import make_metres_from_plane, parse_crs
-from tcpipe.terrain.sampling import find_classes_at
+from tcpipe.terrain.sampling import PatchFrames, find_classes_at
+from tcpipe.terrain.target_grid import MapGrid
 from tcpipe.terrain.tiles import CACHED_TILES, MapReader, choose_level
 
 COURSES = 16

@@ -49,11 +49,10 @@ from tcpipe.planning.cost_grid import (
     make_empty_grid,
     make_grid,
 )
-from tcpipe.planning.cost_model import CostModel, check_model
+from tcpipe.planning.cost_model import CostModel, Reason, SegmentPredictions, check_model, predict_segments
 from tcpipe.planning.path_cost import find_projection
-from tcpipe.planning.segment_predictions import Reason, SegmentPredictions, predict_segments
 from tcpipe.tables.bits import flag_name
-from tcpipe.terrain.grid import MapGrid
+from tcpipe.terrain.target_grid import MapGrid
 
 logger = logging.getLogger("tcpipe")
 

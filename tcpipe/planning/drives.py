@@ -22,10 +22,11 @@ from tcpipe.formats.json_files import write_json
 from tcpipe.formats.object_storage import is_url
 from tcpipe.formats.stored_runs import RunDirectory
 from tcpipe.pipeline.generations import write_generation
-from tcpipe.planning.cost_model import CostModel, check_model
-from tcpipe.planning.segment_predictions import (
+from tcpipe.planning.cost_model import (
+    CostModel,
     Reason,
     SegmentPredictions,
+    check_model,
     iterate_batches,
     join_predictions,
     predict_segments,
@@ -36,10 +37,9 @@ from tcpipe.report.plots import Plot, make_plot
 from tcpipe.splits.audit import CLOSE, PLACES, are_near, compute_middles_deg
 from tcpipe.store import Store, open_store
 from tcpipe.tables.bits import flag_names
-from tcpipe.tables.catalogue import read_threshold
 from tcpipe.tables.columns import read_lonlat_deg, to_floats
-from tcpipe.tables.findings import PREDICTED, Finding, Subject, Verdict, judge, make_finding
-from tcpipe.terrain.patches import make_patch_frames
+from tcpipe.tables.findings import PREDICTED, Finding, Subject, Verdict, judge, make_finding, read_threshold
+from tcpipe.terrain.sampling import make_patch_frames
 from tcpipe.terrain.tiles import MapReader, find_map_projection
 
 Floats = NDArray[np.float64]

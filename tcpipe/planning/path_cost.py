@@ -20,20 +20,21 @@ from tcpipe.formats.atomic import write_atomic_file
 from tcpipe.formats.json_files import write_json
 from tcpipe.formats.parquet import write_table
 from tcpipe.geometry.rotation import wrap_to_pi
-from tcpipe.planning.cost_model import CostModel, check_model
-from tcpipe.planning.search import compute_turns, find_turning
-from tcpipe.planning.segment_predictions import (
+from tcpipe.planning.cost_model import (
+    CostModel,
     Reason,
     SegmentPredictions,
+    check_model,
     count_reasons,
     iterate_batches,
     join_predictions,
     predict_segments,
 )
+from tcpipe.planning.search import compute_turns, find_turning
 from tcpipe.tables.bits import flag_names
 from tcpipe.tables.columns import Column, TableSchema
-from tcpipe.terrain.patches import PatchFrames, compute_footprints, count_corners_on, make_patch_frames
 from tcpipe.terrain.projection import Projection, compute_area, make_metres_from_plane
+from tcpipe.terrain.sampling import PatchFrames, compute_footprints, count_corners_on, make_patch_frames
 from tcpipe.terrain.tiles import MapReader, find_map_projection
 
 Floats = NDArray[np.float64]

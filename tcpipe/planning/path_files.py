@@ -25,8 +25,7 @@ from tcpipe.planning.path_cost import PathTotals, check_ending, compute_path_cos
 from tcpipe.planning.plan import OBJECTIVES, Objective, PlanTotals, plan_path
 from tcpipe.store import open_store
 from tcpipe.tables.bounds import Bounds
-from tcpipe.tables.catalogue import read_threshold
-from tcpipe.tables.findings import LEFT_OUT, Finding, Subject, make_finding
+from tcpipe.tables.findings import LEFT_OUT, Finding, Subject, make_finding, read_threshold
 
 
 def choose_map(store: str | Path, name: str | None) -> MapFile:
@@ -87,7 +86,7 @@ class PathResult(NamedTotals):
 
     def __str__(self) -> str:
         """Return the totals, their intervals, and findings, as plain lines."""
-        above = ", net of idle power" if self.label_energy == "net" else ""
+        above = ", net" if self.label_energy == "net" else ""
         findings = format_findings(find_doubts(self, Subject("file", self.path.name)))
         lines = [f"{self.path}: {format_cost(self)}{above}", *findings]
         if self.out is not None:

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from tcpipe.errors import PathError
 from tcpipe.formats.json_files import convert_record
 from tcpipe.planning.cost_grid import BARRED, COURSES, LazyCostGrid, Mask
+from tcpipe.planning.cost_model import Reason
 from tcpipe.planning.path_cost import PathCost, PathTotals, compute_path_cost, describe_off_map, find_projection
 from tcpipe.planning.search import (
     LeastCostPath,
@@ -29,9 +30,8 @@ from tcpipe.planning.search import (
     find_least_turning_path,
     find_turning,
     make_steps,
+    straighten_path
 )
-from tcpipe.planning.segment_predictions import Reason
-from tcpipe.planning.shortcuts import straighten_path
 from tcpipe.tables.bits import flag_names
 from tcpipe.terrain.classes import NODATA_ID
 from tcpipe.terrain.sampling import find_classes_at

@@ -25,9 +25,8 @@ from tcpipe.power.sources import (
     sign_by_mean,
 )
 from tcpipe.recipe.suggestions import suggest
-from tcpipe.robots.profiles import CurrentSign, PowerSource
-from tcpipe.tables.catalogue import Severity, read_threshold
-from tcpipe.tables.findings import Finding, Remedy, Subject, make_finding
+from tcpipe.robots import CurrentSign, PowerSource
+from tcpipe.tables.findings import Finding, Remedy, Severity, Subject, make_finding, read_threshold
 
 _LOG_TIME = "log_time_ns"
 _POWER = Subject("role", "power")

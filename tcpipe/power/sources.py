@@ -14,9 +14,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.robots.profiles import FieldPath, PowerSource, parse_fields
-from tcpipe.tables.catalogue import read_threshold
-from tcpipe.tables.findings import Finding, Subject, make_finding
+from tcpipe.robots import FieldPath, PowerSource, parse_fields
+from tcpipe.tables.findings import Finding, Subject, make_finding, read_threshold
 
 Columns = Mapping[str, NDArray[Any]]
 Floats = NDArray[np.float64]

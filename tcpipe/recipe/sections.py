@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
 from tcpipe.recipe.checking import validate_fields
-from tcpipe.robots.profiles import PlausibleSpeed, PowerSource, Robot
+from tcpipe.robots import PlausibleSpeed, PowerSource, Robot
 from tcpipe.tables.bounds import Bounds
 from tcpipe.tables.facts import LEFT_OUT
 

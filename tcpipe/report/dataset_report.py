@@ -20,7 +20,6 @@ from tcpipe.formats.finding_lines import format_group, group_findings
 from tcpipe.formats.json_files import Json
 from tcpipe.formats.run_documents import MARK
 from tcpipe.report.colours import CLASS_COLOURS, DROPPED, FAINT, KEPT, SPLIT_COLOURS, find_class_colour
-from tcpipe.report.column_packing import Column, make_shown_column, pack_columns
 from tcpipe.report.dataset_patches import PER_SHEET, make_patches_data
 from tcpipe.report.label_sections import (
     LABELS,
@@ -32,7 +31,17 @@ from tcpipe.report.label_sections import (
     make_quality_section,
 )
 from tcpipe.report.maps import draw_dataset_map
-from tcpipe.report.page import Link, Number, Section, VerdictBox, render_page, show_verdict
+from tcpipe.report.page import (
+    Column,
+    Link,
+    Number,
+    Section,
+    VerdictBox,
+    make_shown_column,
+    pack_columns,
+    render_page,
+    show_verdict
+)
 from tcpipe.report.plots import Plot, draw_waterfall, label_histograms, make_plot
 from tcpipe.splits.assignment import SPLITS
 from tcpipe.tables.arrays import to_texts

@@ -172,7 +172,7 @@ const page = (() => {
     return choose;
   }
   const mean = (values) => values.reduce((a, b) => a + b, 0) / values.length;
-  // Columns as `tcpipe.report.column_packing` wrote them.
+  // Columns as `tcpipe.report.page` wrote them.
   async function unpack({ columns, data }) {
     const stream = new Blob([bytesOf(data)]).stream().pipeThrough(new DecompressionStream("deflate"));
     const buffer = await new Response(stream).arrayBuffer();

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from tcpipe.formats.json_files import Json
 from tcpipe.geometry.datum import enu_from_geodetic
 from tcpipe.report.colours import DROPPED, KEPT, LINE_COLOURS, REASON_COLOURS
-from tcpipe.report.column_packing import Column, make_shown_column, pack_columns
+from tcpipe.report.page import Column, make_shown_column, pack_columns
 from tcpipe.report.plots import Plot, add_cursor, make_plot, show_text
 from tcpipe.tables.arrays import to_texts
 from tcpipe.tables.bits import DropReason, flag_name

@@ -18,7 +18,6 @@ from tcpipe.formats.parquet import read_table
 from tcpipe.formats.run_documents import Counts, Manifest, RunJson
 from tcpipe.formats.stored_runs import RunDirectory
 from tcpipe.report.colours import DOUBTED, FAINT, KEPT, UNUSED
-from tcpipe.report.column_packing import Column, make_shown_column, pack_columns
 from tcpipe.report.label_sections import (
     LABELS,
     QUALITY_WORDS,
@@ -29,7 +28,7 @@ from tcpipe.report.label_sections import (
     make_quality_section,
 )
 from tcpipe.report.maps import Pictures, RunMap, draw_run_map
-from tcpipe.report.page import Link, Number, Section, render_page, show_verdict
+from tcpipe.report.page import Column, Link, Number, Section, make_shown_column, pack_columns, render_page, show_verdict
 from tcpipe.report.plots import Plot, draw_histogram, label_histograms, make_plot
 from tcpipe.report.run_plots import (
     SPEED_ROLES,

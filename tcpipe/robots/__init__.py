@@ -1,4 +1,184 @@
 """What is known of robots and of the messages that tell their power: TOML files beside this one, read by `tcpipe.formats.recipe_toml`.
 
 A recipe holds the same tables, ``[robots.NAME]`` and ``[[power_sources]]``; they go before these.
+
+Robots and power sources as plain records: one schema for the package's own TOML files and for a recipe's tables.
 """
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Annotated, Literal
+
+from tcpipe.tables.bounds import Bounds
+
+Size = Annotated[float, Bounds(ge=0.05, le=100)]
+"""Of a robot [m]: from a toy's to a mining truck's."""
+Speed = Annotated[float, Bounds(ge=0.01, le=100)]
+PlausibleSpeed = Annotated[float, Bounds(ge=2, le=1000)]
+"""A bound that no true track reaches [m/s]: at walking pace it would refuse robots that drive."""
+Volt = Annotated[float, Bounds(ge=0.1, le=1e4)]
+Scale = Annotated[float, Bounds(gt=0, le=1e9)]
+
+GENERIC = "generic"
+"""The name of a robot of which nothing is known."""
+
+MAX_PLAUSIBLE_MPS = 15.0
+"""No ground robot that records terrain costs is faster [m/s]: a faster track is an estimate that went astray."""
+
+CurrentSign = Literal["drawn_positive", "drawn_negative", "auto"]
+
+_FIELD = re.compile(r"\s*(?P<path>[\w.]+)(?P<of_list>\[(?P<index>\d*)\](?P<inner>\.[\w.]+)?)?\s*")
+_TYPE = re.compile(r"\w+/msg/\w+")
+
+
+@dataclass(frozen=True, slots=True)
+class FieldPath:
+    """One field of a message that a power source names.
+
+    ``column`` is its column: the dotted name, with ``[]`` behind a list of messages (``drivers[].current``). Of a list ``index`` is the
+    element that is meant, and with ``every`` all are summed. ``sign`` is -1 where it is subtracted.
+    """
+
+    column: str
+    index: int | None = None
+    every: bool = False
+    sign: int = 1
+
+
+@dataclass(frozen=True, slots=True)
+class Robot:
+    """Properties of a robot model; omitted keys are unknown."""
+
+    width_m: Size | None = None
+    """Width of its footprint, wheels or tracks included [m]."""
+    length_m: Size | None = None
+    """Length of its footprint [m]."""
+    max_velocity_mps: Speed | None = None
+    """Maximum speed [m/s]; below this command the terrain does not limit the speed."""
+    max_plausible_mps: PlausibleSpeed = field(default=MAX_PLAUSIBLE_MPS, metadata={"json": (MAX_PLAUSIBLE_MPS,)})
+    """Largest plausible speed of a track [m/s]; faster rows get no label."""
+    voltage_range_volt: tuple[Volt, Volt] | None = None
+    """Lowest and highest voltage of the battery [V]; segments outside are flagged."""
+    platform: str | None = None
+    """Platform code that power sources refer to (Clearpath's, as A200)."""
+    status_types: list[str] = field(default_factory=list)
+    """Message types that only this robot publishes; they identify it."""
+    topic_words: list[str] = field(default_factory=list)
+    """Words in topic names that identify this robot; whole words, in lower case."""
+
+    def contradictions(self) -> Iterator[tuple[str, str]]:
+        """Yield each key whose value cannot be, and what was wanted."""
+        if self.voltage_range_volt is not None and self.voltage_range_volt[0] >= self.voltage_range_volt[1]:
+            yield "voltage_range_volt", "the lower of two voltages first"
+
+
+@dataclass(frozen=True, slots=True)
+class PowerSource:
+    """One power rail in a message type: a voltage and the current that drives the wheels at it. Use one table per rail.
+
+    Fields are named by dotted path; ``volts[0]`` is an element of a list, ``drivers[0].amps`` a field of a message in a list,
+    ``drivers[].amps`` the sum over all of them; ``left + right - spare`` is a sum of fields.
+    """
+
+    type: str
+    """Message type, as package/msg/Name in ROS 1 and 2 alike."""
+    voltage: str = ""
+    """Field of the voltage [V]; omit it if the message contains only a current."""
+    current: str = ""
+    """Field of the current [A]; omit it if the message contains only a voltage, or a counter."""
+    energy: str = ""
+    """Field of a counter of energy, in place of a current, for example drawn - given_back."""
+    voltage_scale: Scale = 1.0
+    """Factor on the voltage: 0.001 if it is in millivolts."""
+    current_scale: Scale = 1.0
+    """Factor on the current: 0.001 if it is in milliamperes."""
+    energy_scale: Scale = 1.0
+    """Factor on the counter: 3600 if it counts watt-hours."""
+    counter_wraps: Annotated[float, Bounds(gt=0, le=1e19)] | None = None
+    """Value at which the counter wraps to zero, in its own unit; if omitted, a decrease is a reset."""
+    rail: str = ""
+    """Name of the rail; default: that of the topic."""
+    averaged: bool = False
+    """Whether a value is the mean over the period that ends with the message, not an instantaneous sample."""
+    averaging_unknown: bool = False
+    """Averaging is unknown: tcpipe estimates it from the motion if possible, otherwise uses `averaged`."""
+    sign: CurrentSign = "drawn_positive"
+    """Sign of a drawn current; auto if it differs by robot: the mean over the run decides."""
+    propulsion: bool = True
+    """Whether the current feeds only the drives; such sources have priority."""
+    other_loads: str = ""
+    """Other loads of the current; named in a warning."""
+    open_questions: str = ""
+    """Unknown properties; listed in the reference."""
+    unsupported_reason: str = ""
+    """Why this type does not measure power, and an alternative; the type is then never used and needs no fields."""
+    rate_setting: str = ""
+    """Setting of its rate; named if the rate is too low."""
+    fallback: bool = False
+    """Used only if the other tables of the type cannot be read or have no power (a current that is always zero)."""
+    platform: str | None = None
+    """Only for robots of this platform."""
+    topic: str | None = None
+    """Only for topics whose name ends with this."""
+    husky_power: Literal["battery", "drivers"] | None = None
+    """Only with this value of `read.husky_power`."""
+    currents_listed: Annotated[int, Bounds(ge=1, le=1000)] | None = None
+    """Number of currents in the list of the message, if its definition states it; messages of another length are rejected."""
+    wraps_amp: Annotated[float, Bounds(ge=1, le=1e9)] | None = None
+    """A current above half of this is a negative one read as unsigned [A]; if omitted, tcpipe infers it from the data."""
+
+    def contradictions(self) -> Iterator[tuple[str, str]]:
+        """Yield each key whose value cannot be, and what was wanted."""
+        if not _TYPE.fullmatch(self.type):
+            yield "type", "package/msg/Name"
+        for key in ("voltage", "current", "energy"):
+            if (text := getattr(self, key)) and not all(map(_FIELD.fullmatch, re.split(r"[+-]", text))):
+                yield key, "fields joined by + or -, for example status.left_amp + amps[1] or drivers[].amp"
+        if self.unsupported_reason:
+            if self.voltage or self.current or self.energy:
+                yield "unsupported_reason", "no field besides it"
+        elif not self.voltage and not self.current:
+            yield "current", "a voltage, a current or both"
+        if self.energy and (self.current or not self.voltage):
+            yield "energy", "a voltage besides it, and no current"
+
+
+@dataclass(frozen=True, slots=True)
+class Profiles:
+    """All that is known: robots by name, and power sources, best first."""
+
+    robots: dict[str, Robot] = field(default_factory=dict)
+    power_sources: list[PowerSource] = field(default_factory=list)
+
+    def types(self, *, propulsion: bool = False) -> list[str]:
+        """Return the message types that carry power, best first; with ``propulsion`` those that tell it apart for some robot."""
+        return list(
+            dict.fromkeys(
+                of.type for of in self.power_sources if (of.propulsion and not of.unsupported_reason) or not propulsion
+            )
+        )
+
+    def refusals(self) -> dict[str, str]:
+        """Return the message types that carry currents but tell no power, and why."""
+        telling = {of.type for of in self.power_sources if not of.unsupported_reason}
+        return {of.type: of.unsupported_reason for of in self.power_sources if of.type not in telling}
+
+    def before(self, others: Profiles) -> Profiles:
+        """Return these and others: a robot's name and a message type that are here are not taken from there."""
+        mine = set(self.types())
+        there = [source for source in others.power_sources if source.type not in mine]
+        return Profiles({**others.robots, **self.robots}, [*self.power_sources, *there])
+
+
+def parse_fields(text: str) -> list[FieldPath]:
+    """Return the fields that a source's text joins by + and -."""
+    found = []
+    for part in re.finditer(r"([+-]?)([^+-]+)", text):
+        if of := _FIELD.fullmatch(part[2]):
+            column = of["path"] + (f"[]{of['inner']}" if of["inner"] else "")
+            index = int(of["index"]) if of["index"] else None
+            found.append(FieldPath(column, index, bool(of["of_list"]) and index is None, -1 if part[1] == "-" else 1))
+    return found

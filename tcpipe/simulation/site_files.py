@@ -17,8 +17,8 @@ from tcpipe.formats.json_files import to_json, write_json
 from tcpipe.formats.logs.writing import write_bag, write_mcap, write_rosbag2
 from tcpipe.formats.maps.geotiff import write_geotiff
 from tcpipe.formats.parquet import read_table, write_table
-from tcpipe.simulation.drive import simulate_drive
 from tcpipe.simulation.messages import make_streams
+from tcpipe.simulation.route import simulate_drive
 from tcpipe.simulation.scenarios import DriveSpec, RasterSpec, Scenario
 from tcpipe.simulation.scenarios import find_scenario as scenario_by_name
 from tcpipe.simulation.sensors import Noise, Reading, record

@@ -23,9 +23,8 @@ from tcpipe.stages.fuse_inputs import (
     state_extrinsics,
 )
 from tcpipe.stages.fuse_sections import Fused
-from tcpipe.tables.catalogue import read_threshold
 from tcpipe.tables.facts import AuditFacts, Disagreement, FuseFacts, GateReset, MountingFacts, StretchFacts, make_vector
-from tcpipe.tables.findings import Finding, StageReport, Subject, make_finding
+from tcpipe.tables.findings import Finding, StageReport, Subject, make_finding, read_threshold
 from tcpipe.tables.levels import Sensor, Streams
 
 _COURSE = "course over ground"

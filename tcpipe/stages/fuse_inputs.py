@@ -16,11 +16,10 @@ from numpy.typing import NDArray
 
 from tcpipe.fusion import preparation
 from tcpipe.fusion.checks.clock_offsets import smooth_stamps
-from tcpipe.fusion.checks.doppler import check_ground_velocity
 from tcpipe.fusion.checks.mounting import Arm, Tilt
 from tcpipe.fusion.checks.odometry_scale import Scale, rescale_odometries
 from tcpipe.fusion.checks.plausibility import SensorExclusion
-from tcpipe.fusion.checks.sensors import CommandedSpeed, check_sensors
+from tcpipe.fusion.checks.sensors import CommandedSpeed, check_ground_velocity, check_sensors
 from tcpipe.fusion.measurements import DOPPLER, GNSS, IMU, VISUAL, WHEELS, Measurements
 from tcpipe.fusion.preparation import Prepared
 from tcpipe.geometry.datum import geodetic_from_enu

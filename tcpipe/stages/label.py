@@ -10,19 +10,32 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from tcpipe.cost.labels import Labels, compute_labels, subtract_idle_power
+from tcpipe.cost.labels import Labels, combine_flags, compute_labels, has_mean_mismatch, subtract_idle_power
 from tcpipe.cost.physics import ALL, FitSamples, fit_and_validate_physics, fit_physics
-from tcpipe.cost.quality import combine_flags, has_mean_mismatch
 from tcpipe.fusion.trajectory import DISPLACEMENT_LAGS_S
 from tcpipe.geometry.piecewise_linear import interpolate, mean_between
 from tcpipe.motion.row_sections import find_runs, number_pieces
 from tcpipe.motion.uncertainty import compute_along_std_m, compute_displacement_std_m, interpolate_durations_m
-from tcpipe.power.energy import IdlePower, Rule, count_samples_inside, estimate_idle_power, integrate_energy
 from tcpipe.power.noise import estimate_energy_noise, estimate_resolution
-from tcpipe.power.rails import Rail, compute_power_watt
+from tcpipe.power.rails import (
+    IdlePower,
+    Rail,
+    Rule,
+    compute_power_watt,
+    count_samples_inside,
+    estimate_idle_power,
+    integrate_energy
+)
 from tcpipe.recipe import LabelConfig
-from tcpipe.stages.label_facts import find_label_findings, make_label_facts, sum_energy_entries
-from tcpipe.stages.label_motion import find_motion_flags, find_power_flags, is_clock_doubtful, make_motion_columns
+from tcpipe.stages.label_motion import (
+    find_label_findings,
+    find_motion_flags,
+    find_power_flags,
+    is_clock_doubtful,
+    make_label_facts,
+    make_motion_columns,
+    sum_energy_entries
+)
 from tcpipe.stages.message_arrays import make_rails
 from tcpipe.tables.arrays import make_lines, select_rows, to_numbers
 from tcpipe.tables.bits import DropReason, Quality

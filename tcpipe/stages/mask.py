@@ -14,12 +14,11 @@ from tcpipe.motion.row_sections import Floats, Mask, MotionRows, number_pieces
 from tcpipe.motion.uncertainty import compute_along_std_m, compute_chord_ahead_std_m
 from tcpipe.recipe import MaskConfig
 from tcpipe.recipe.suggestions import suggest
-from tcpipe.robots.profiles import MAX_PLAUSIBLE_MPS
+from tcpipe.robots import MAX_PLAUSIBLE_MPS
 from tcpipe.tables.bits import DropReason, flag_name
-from tcpipe.tables.catalogue import read_threshold
 from tcpipe.tables.columns import to_floats, to_integers
 from tcpipe.tables.facts import MaskFacts
-from tcpipe.tables.findings import Finding, Remedy, Subject, make_finding
+from tcpipe.tables.findings import Finding, Remedy, Subject, make_finding, read_threshold
 from tcpipe.tables.levels import MASKED_TRACK, TRACK, MaskedTrack, Track, add_findings
 
 

@@ -17,14 +17,13 @@ from tcpipe.logs.topics import find_missing_roles
 from tcpipe.power.readings import PowerReadings
 from tcpipe.power.sources import list_power_lists
 from tcpipe.recipe import ReadConfig
-from tcpipe.robots.profiles import Profiles
+from tcpipe.robots import Profiles
 from tcpipe.stages.message_arrays import LogReader, gather_messages
 from tcpipe.stages.read_power import add_averaging, find_repeats, read_rail_power, remove_repeats
 from tcpipe.stages.read_roles import decide_roles, find_power_candidates
 from tcpipe.stages.read_sources import TopicReadings, place_pose, place_sensors, read_sources
-from tcpipe.tables.catalogue import Severity, read_threshold
 from tcpipe.tables.facts import PowerSign, RobotChoice, RoleFacts, StageFacts, TopicClock, TopicFacts
-from tcpipe.tables.findings import Finding, StageReport, Subject, make_finding
+from tcpipe.tables.findings import Finding, Severity, StageReport, Subject, make_finding, read_threshold
 from tcpipe.tables.levels import STREAMS, Sensor, Streams
 
 

@@ -18,11 +18,10 @@ from tcpipe.power.sampling import find_readings, is_stated_averaged
 from tcpipe.power.sources import Counter, RailReadings, reject_power
 from tcpipe.recipe import ReadConfig
 from tcpipe.recipe.suggestions import suggest
-from tcpipe.robots.profiles import Profiles
+from tcpipe.robots import Profiles
 from tcpipe.tables.arrays import select_rows, to_texts
-from tcpipe.tables.catalogue import Severity, read_threshold
 from tcpipe.tables.columns import to_floats, to_integers
-from tcpipe.tables.findings import Finding, Subject, make_finding
+from tcpipe.tables.findings import Finding, Severity, Subject, make_finding, read_threshold
 from tcpipe.tables.levels import STREAMS
 
 

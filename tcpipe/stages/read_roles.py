@@ -8,14 +8,13 @@ from typing import Any, cast, get_args
 
 import numpy as np
 
-from tcpipe.logs.field_mapping import find_topic
-from tcpipe.logs.field_names import propose_roles
+from tcpipe.logs.field_mapping import find_topic, propose_roles
 from tcpipe.logs.roles import OVERLAY, RoleAssignment, assign_roles
 from tcpipe.logs.topics import Topic
 from tcpipe.power.sources import FLOAT_TYPES, LARGEST_AMP, LARGEST_VOLT, find_quantity, is_of_drives, make_rail_name
 from tcpipe.recipe import ReadConfig, Recipe, Role
 from tcpipe.recipe.suggestions import TomlValue, suggest
-from tcpipe.robots.profiles import Profiles
+from tcpipe.robots import Profiles
 from tcpipe.stages.message_arrays import LogReader, make_message_arrays
 from tcpipe.tables.findings import Finding, Subject, make_finding
 

@@ -34,7 +34,7 @@ from tcpipe.logs.topics import Topic, make_topic_not_decoded
 from tcpipe.power.readings import PowerReadings
 from tcpipe.recipe import Extrinsics, ReadConfig, Role
 from tcpipe.recipe.suggestions import suggest
-from tcpipe.robots.profiles import Profiles
+from tcpipe.robots import Profiles
 from tcpipe.stages.message_arrays import LogReader, read_transforms
 from tcpipe.stages.read_power import read_power_of_topics, select_power_rows
 from tcpipe.tables.columns import to_floats

@@ -16,15 +16,17 @@ from tcpipe.tables.bits import Loss
 from tcpipe.tables.columns import read_lonlat_deg, to_floats
 from tcpipe.tables.findings import Finding, Subject, make_finding
 from tcpipe.tables.levels import PLACED_SEGMENTS
-from tcpipe.terrain.patches import (
+from tcpipe.terrain.projection import Projection
+from tcpipe.terrain.sampling import (
+    Patches,
     check_scale,
     compute_footprints,
     count_corners_on,
     has_other_pixels,
+    join_patches,
     make_patch_frames,
+    sample_patches
 )
-from tcpipe.terrain.projection import Projection
-from tcpipe.terrain.sampling import Patches, join_patches, sample_patches
 from tcpipe.terrain.tiles import MapReader, TilePool, choose_level, find_map_projection
 
 _LOSSES = (Loss.POSITION_UNCERTAIN, Loss.OUTSIDE_MAP, Loss.NODATA, Loss.NOT_TRAVERSABLE)

@@ -25,10 +25,9 @@ from tcpipe.path import Cut, cut_by_chord
 from tcpipe.recipe import SegmentConfig
 from tcpipe.tables.arrays import to_numbers
 from tcpipe.tables.bits import DropReason, Loss, flag_name
-from tcpipe.tables.catalogue import read_threshold
 from tcpipe.tables.columns import to_floats, to_integers
 from tcpipe.tables.facts import SegmentFacts
-from tcpipe.tables.findings import Finding, Subject, make_finding
+from tcpipe.tables.findings import Finding, Subject, make_finding, read_threshold
 from tcpipe.tables.levels import SEGMENTS, Datum, MaskedTrack, Segments, TrackInfo, add_findings
 
 ENTRIES = ("kept", *(flag_name(bit) for bit in (*DropReason, Loss.CURVED, Loss.LEFTOVER)))

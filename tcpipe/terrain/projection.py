@@ -20,8 +20,7 @@ from pyproj.transformer import AreaOfInterest as TransformArea
 from pyproj.transformer import TransformerGroup
 
 from tcpipe.errors import MapError
-from tcpipe.tables.catalogue import read_threshold
-from tcpipe.tables.findings import Finding, Subject, make_finding
+from tcpipe.tables.findings import Finding, Subject, make_finding, read_threshold
 
 FloatArray = NDArray[np.float64]
 

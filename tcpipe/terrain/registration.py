@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import minimum_filter
 
-from tcpipe.tables.catalogue import read_threshold
+from tcpipe.tables.findings import read_threshold
 from tcpipe.terrain.tiles import MapReader, choose_level, group_by_tile, read_window
 
 FloatArray = NDArray[np.float64]

@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.compiled import compile_kernel
-from tcpipe.terrain.grid import MapGrid
 from tcpipe.terrain.layers import Layer, Pixels
+from tcpipe.terrain.target_grid import MapGrid
 
 SNAP_PX = 1e-4
 """A position nearer than this to a source pixel's centre is at the centre [source px]."""

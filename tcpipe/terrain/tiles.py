@@ -11,11 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.terrain.classes import ClassTable
-from tcpipe.terrain.grid import MapGrid
 from tcpipe.terrain.layers import STACKS, Layer, Stack, find_no_data_value, group_stacks
 from tcpipe.terrain.projection import Projection, compute_area, parse_crs
 from tcpipe.terrain.resampling import choose_factor
 from tcpipe.terrain.sampling_kernel import Tiles, compute_morton
+from tcpipe.terrain.target_grid import MapGrid
 
 CACHED_TILES = 96
 """Decoded tiles kept: 150 MB of three layers at 512 px."""

@@ -7,8 +7,7 @@ from package_source import read_nodes
 
 from tcpipe.formats.finding_lines import describe_finding
 from tcpipe.tables.bits import Quality, flag_name
-from tcpipe.tables.catalogue import AFFECTED, SEVERITIES, read_catalogue, read_sections
-from tcpipe.tables.findings import Finding, Subject
+from tcpipe.tables.findings import AFFECTED, SEVERITIES, Finding, Subject, read_catalogue, read_sections
 
 LONGEST = 100
 LINES = "tcpipe.formats.finding_lines"

@@ -224,9 +224,9 @@ def test_an_imu_that_nothing_places_is_refused_and_its_mounting_proposed(tmp_pat
     values = reduce(merged, places)
     assert values == reduce(merged, reversed(places))  # no two findings propose different values for one key
     config = parse_recipe(values, where="followed").read
-    assert config.placement["imu"] == cure(labelled, "imu").placement["imu"]
+    assert config.extrinsics["imu"] == cure(labelled, "imu").extrinsics["imu"]
     assert (
-        np.abs(np.mod(np.subtract(config.placement["imu"].rpy_rad, (np.pi, 0.0, np.pi / 2)) + 1, 2 * np.pi) - 1).max()
+        np.abs(np.mod(np.subtract(config.extrinsics["imu"].rpy_rad, (np.pi, 0.0, np.pi / 2)) + 1, 2 * np.pi) - 1).max()
         < 1e-3
     )
     placed = run(drive, tmp_path, config)

@@ -205,7 +205,7 @@ def test_every_wrong_key_of_a_recipe_found_upward_is_named(log: Path, tmp_path: 
     (tmp_path / "tcpipe.toml").write_text("[fuse]\nfoo = 1\n[mask]\nbar = 2\n[segment]\nchord_m = -1\n")
     told = plain_lines(tcpipe("ingest", log, cwd=tmp_path / "a" / "b"), 2)
     assert str(tmp_path / "tcpipe.toml") in told
-    assert all(key in told for key in ("fuse.foo", "gate.bar", "segment.chord_m"))
+    assert all(key in told for key in ("fuse.foo", "mask.bar", "segment.chord_m"))
 
 
 def test_a_raster_without_crs_and_a_map_that_is_there(sites: list[SimulatedSite], tmp_path: Path) -> None:

@@ -30,8 +30,8 @@ from tcpipe.pipeline.report import report
 from tcpipe.pipeline.verify import verify
 from tcpipe.recipe import Recipe
 from tcpipe.store import Store, open_store
-from tcpipe.tables.earlier_names import EARLIER_DOCUMENT_KEYS
 from tcpipe.tables.levels import DATA_MODEL_VERSION, SAMPLES
+from tcpipe.tables.options import EARLIER_DOCUMENT_KEYS
 
 DATA = Path(__file__).parents[1] / "data"
 

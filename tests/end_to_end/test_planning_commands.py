@@ -29,7 +29,9 @@ def place(tmp_path_factory) -> Path:
     layers = World("EPSG:32633", 500_000.0, 5_200_000.0, 30.0).write(here, 0.1)
     add_map("site", **layers, store=here / "tcpipe-store")
     ranges = {"slope_rad": (-0.5, 0.5), "cross_slope_rad": (-0.5, 0.5), "relief_m": (0.0, 1.0)}
-    made_model(here / "model", seen=TrainingRange(CARD.seen.class_counts | {5: 10}, (4, 5, 6, 7), ranges))
+    made_model(
+        here / "model", training_range=TrainingRange(CARD.training_range.class_counts | {5: 10}, (4, 5, 6, 7), ranges)
+    )
     line = {"type": "LineString", "coordinates": [[14.9999, 46.9534], [15.0001, 46.9535]]}
     (here / "path.geojson").write_text(json.dumps(line))
     return here

@@ -147,7 +147,7 @@ def test_a_preflight_promises_what_ingesting_gives(work):
     blind = json.loads(tcpipe("preflight", log, "--json", "-q", "--recipe", "blind.toml", cwd=work).stdout)
     assert {"no-gnss", "no-power"} <= {finding["code"] for finding in blind["findings"]}
     assert blind["exit_code"] == 3
-    assert blind["promise"]["relative_std_median"]["energy"] is None
+    assert blind["expected_yield"]["relative_std_median"]["energy"] is None
     assert names[0] in blind["record"].split(), "what this recipe ignores is recorded all the same"
     (work / "blind.toml").unlink()
 

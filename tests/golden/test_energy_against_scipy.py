@@ -7,8 +7,7 @@ import pytest
 from made_tracks import stamps
 from scipy.integrate import quad
 
-from tcpipe.power.energy import integrate_energy
-from tcpipe.power.rails import make_rail, make_samples
+from tcpipe.power.rails import integrate_energy, make_rail, make_samples
 
 
 def uneven(rng, count, mean_ns):

@@ -8,8 +8,7 @@ from shared_data import shared_data
 
 from tcpipe.formats.logs.log_file import open_log
 from tcpipe.formats.recipe_toml import load_shipped_profiles
-from tcpipe.power.energy import integrate_recorded_energy
-from tcpipe.power.rails import make_rail, make_samples
+from tcpipe.power.rails import integrate_recorded_energy, make_rail, make_samples
 from tcpipe.recipe import ReadConfig
 from tcpipe.stages import read
 from tcpipe.stages.message_arrays import make_rails

@@ -13,7 +13,7 @@ from tcpipe.formats.recipe_toml import load_profiles, load_shipped_profiles
 from tcpipe.power.readings import PowerReadings, read_power
 from tcpipe.power.sources import list_power_lists
 from tcpipe.recipe import Recipe
-from tcpipe.robots.profiles import PowerSource
+from tcpipe.robots import PowerSource
 from tcpipe.stages.message_arrays import make_message_arrays
 from tcpipe.tables.findings import select_findings
 

@@ -75,7 +75,7 @@ from tcpipe.formats.recipe_toml import load_shipped_profiles
 from tcpipe.recipe import Recipe
 from tcpipe.splits.regions import Regions, Side
 from tcpipe.tables.bits import flag_names
-from tcpipe.tables.catalogue import read_catalogue
+from tcpipe.tables.findings import read_catalogue
 
 
 def call(function):

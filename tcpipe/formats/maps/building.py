@@ -19,8 +19,7 @@ from tcpipe.formats.maps.map_facts import MapFacts, MapInputs
 from tcpipe.formats.maps.map_files import SHARD_PX, MapWriter
 from tcpipe.formats.maps.terrain_polygons import PolygonLayer, is_drawn, place_polygons
 from tcpipe.formats.recipe_toml import parse_toml
-from tcpipe.tables.catalogue import read_threshold
-from tcpipe.tables.findings import Finding, Subject, make_finding
+from tcpipe.tables.findings import Finding, Subject, make_finding, read_threshold
 from tcpipe.terrain.classes import (
     MAX_ID,
     PAPER_SCHEME,
@@ -30,7 +29,6 @@ from tcpipe.terrain.classes import (
     find_named_scheme,
     make_own_scheme,
 )
-from tcpipe.terrain.grid import MapGrid
 from tcpipe.terrain.layers import (
     COLOURS,
     PAPER_LAYERS,
@@ -40,7 +38,7 @@ from tcpipe.terrain.layers import (
     make_paper_layers,
 )
 from tcpipe.terrain.projection import parse_crs
-from tcpipe.terrain.target_grid import Georeference, choose_crs, choose_grid, find_projection
+from tcpipe.terrain.target_grid import Georeference, MapGrid, choose_crs, choose_grid, find_projection
 
 Files = Path | Sequence[Path]
 """One file of a layer, or all; the last lies on top."""

@@ -34,7 +34,7 @@ from rasterio.windows import Window
 
 from tcpipe.errors import MapError
 from tcpipe.formats.atomic import write_atomic_file
-from tcpipe.formats.maps.value_names import read_value_names
+from tcpipe.formats.maps.map_facts import read_value_names
 from tcpipe.tables.findings import Finding, Subject, make_finding
 from tcpipe.terrain.layers import LUMA_RGB
 

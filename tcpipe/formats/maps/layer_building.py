@@ -23,11 +23,10 @@ from tcpipe.errors import MapError
 from tcpipe.formats.maps.geotiff import RasterTiles, Tile, Use, open_raster_tiles, read_tile
 from tcpipe.tables.findings import Finding, Subject, make_finding
 from tcpipe.terrain.classes import ClassScheme
-from tcpipe.terrain.grid import MapGrid
 from tcpipe.terrain.layers import Layer, Pixels
 from tcpipe.terrain.projection import Projection
 from tcpipe.terrain.resampling import mean, resample_bilinear, resample_majority
-from tcpipe.terrain.target_grid import LATTICE_STEP_PX, Georeference, compute_source_lattice
+from tcpipe.terrain.target_grid import LATTICE_STEP_PX, Georeference, MapGrid, compute_source_lattice
 
 MAX_FILES = 100_000
 """Of one layer."""

@@ -1,14 +1,29 @@
-"""What is known of a map: what it is made from, what building it found, and what it is as a whole."""
+"""What is known of a map: what it is made from, what building it found, and what it is as a whole.
+
+What a raster says its values mean: its raster attribute table, or its category names.
+
+Layers as JSON values, in a dataset's card and in a map; as CF attributes, by which xarray decodes patches.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
+from typing import TypeAlias
+from xml.etree.ElementTree import Element, fromstring
 
-from tcpipe.formats.layer_descriptions import Description, read_layers
+from tcpipe.formats.json_files import parse_typed
 from tcpipe.tables.findings import LEFT_OUT, Finding
-from tcpipe.terrain.classes import TerrainClass
+from tcpipe.terrain.classes import ClassTable, TerrainClass
+from tcpipe.terrain.layers import (
+    PAPER_LAYERS,
+    Kind,
+    Layer,
+    make_categorical_layer,
+    make_continuous_layer,
+    make_paper_layers
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,3 +113,115 @@ def _format_percent(share: float) -> str:
     if 0.0 < percent < 0.5:
         return "<1 %"
     return ">99 %" if 99.5 <= percent < 100.0 else f"{percent:.0f} %"
+
+
+_VALUE_USAGES = ("5", "3")
+"""GDAL's GFU_MinMax, GFU_Min: the column that holds the value (or where a range of values begins)."""
+_UPPER_USAGE = "4"
+_NAME_USAGE = "2"
+_STRING_TYPE = "2"
+_NAME_TITLES = ("class name", "classname", "class names", "class", "name", "label", "category", "terrain")
+
+
+def read_value_names(vrt: str, band: int) -> dict[int, str]:
+    """Return names by value of a band, from 1, by a VRT document that GDAL wrote of a raster; those of the attribute table come first."""
+    root = fromstring(vrt)  # noqa: S314  GDAL wrote it
+    described = root.find(f"./VRTRasterBand[@band='{band}']")
+    if described is None:
+        return {}
+    table = described.find("GDALRasterAttributeTable")
+    names = {} if table is None else _read_table_names(table)
+    return names or _read_category_names(described)
+
+
+def _read_category_names(described: Element) -> dict[int, str]:
+    names = [(entry.text or "").strip() for entry in described.findall("./CategoryNames/Category")]
+    return {value: name for value, name in enumerate(names) if name}
+
+
+def _read_table_names(table: Element) -> dict[int, str]:
+    columns = [
+        tuple((column.findtext(tag) or "").strip() for tag in ("Name", "Type", "Usage"))
+        for column in table.findall("FieldDefn")
+    ]
+    titles = [" ".join(title.casefold().replace("_", " ").split()) for title, _, _ in columns]
+    values = [n for usage in _VALUE_USAGES for n, column in enumerate(columns) if column[2] == usage]
+    values += [n for n, title in enumerate(titles) if title == "value"]
+    texts = [n for n, column in enumerate(columns) if column[1] == _STRING_TYPE]
+    named = [n for n in texts if columns[n][2] == _NAME_USAGE]
+    named += sorted((n for n in texts if titles[n] in _NAME_TITLES), key=lambda n: _NAME_TITLES.index(titles[n]))
+    named += texts if len(texts) == 1 else []
+    if not values or not named:
+        return {}
+    uppers = [n for n, column in enumerate(columns) if column[2] == _UPPER_USAGE]
+    rows = [[(cell.text or "").strip() for cell in row.findall("F")] for row in table.findall("Row")]
+    found = ((_parse_single_value(row, values[0], uppers), row[named[0]]) for row in rows if len(row) == len(columns))
+    return {value: name for value, name in found if value is not None and name}
+
+
+def _parse_single_value(row: Sequence[str], column: int, uppers: Sequence[int]) -> int | None:
+    """Return the one integer that a row is about; None where it is about a range or a fraction."""
+    try:
+        value = float(row[column])
+        upper = float(row[uppers[0]]) if uppers else value
+    except ValueError:
+        return None
+    return int(value) if value == upper and value.is_integer() else None
+
+
+Value: TypeAlias = str | int | float | Sequence[float | Mapping[str, str | int | bool]] | None
+Description: TypeAlias = Mapping[str, Value]
+
+
+@dataclass(frozen=True, slots=True)
+class _LayerDescription:
+    """What is read of a description; the paper's layers need none of it."""
+
+    kind: Kind = "continuous"
+    long_name: str = ""
+    units: str = "1"
+    actual_range: tuple[float, float] = (0.0, 1.0)
+    classes: tuple[TerrainClass, ...] = ()
+
+
+def make_cf_flags(classes: ClassTable | None) -> dict[str, Value]:
+    """Return what CF says of classes: their ids, and their names without a space."""
+    entries = () if classes is None else classes.classes
+    names = " ".join(entry.name.replace(" ", "_") for entry in entries)
+    return {"flag_values": [entry.id for entry in entries], "flag_meanings": names}
+
+
+def make_cf_attributes(layer: Layer) -> dict[str, Value]:
+    """Return the CF attributes of a layer of patches."""
+    about: dict[str, Value] = {"long_name": layer.long_name, "units": layer.unit}
+    if layer.kind == "categorical":
+        return {**about, **make_cf_flags(layer.classes)}
+    if layer.stack == "floats":
+        return {**about, "actual_range": [layer.low, layer.high]}
+    about |= {"scale_factor": layer.step, "add_offset": 0.0}
+    return {**about, "missing_value": layer.nodata} if layer.kind == "relative" else about
+
+
+def describe_layer(layer: Layer) -> Description:
+    """Return a layer as JSON values; of one that its name alone does not tell, also its kind and its classes."""
+    known = {"dtype": layer.stored.name, "nodata": layer.nodata, **make_cf_attributes(layer)}
+    if layer.name in PAPER_LAYERS:
+        return known
+    table = () if layer.classes is None else layer.classes.classes
+    return {**known, "kind": layer.kind, **({"classes": [asdict(entry) for entry in table]} if table else {})}
+
+
+def read_layers(found: Mapping[str, Description], classes: Sequence[TerrainClass], path: Path) -> dict[str, Layer]:
+    """Return the layers that `describe_layer` wrote into ``path``, by name; ``classes`` are those of terrain, if any."""
+    layers: dict[str, Layer] = {}
+    for name, description in found.items():
+        told = parse_typed(description, _LayerDescription, path)
+        if name in PAPER_LAYERS:
+            known = make_paper_layers([name], ClassTable(tuple(classes))) if classes else PAPER_LAYERS
+            layers[name] = replace(known[name], long_name=told.long_name or known[name].long_name)
+        elif told.kind == "categorical":
+            layers[name] = make_categorical_layer(name, ClassTable(told.classes))
+        else:
+            low, high = told.actual_range
+            layers[name] = make_continuous_layer(name, unit=told.units, low=low, high=high)
+    return layers

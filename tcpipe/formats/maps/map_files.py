@@ -33,17 +33,15 @@ from pyproj import CRS
 from tcpipe.errors import MapError, StoreError
 from tcpipe.formats.integrity import prove_files, read_checksums
 from tcpipe.formats.json_files import convert_record, parse_typed, read_json, to_plain
-from tcpipe.formats.layer_descriptions import Description, describe_layer, make_cf_flags, read_layers
-from tcpipe.formats.maps.map_facts import MapFacts, MapSummary
+from tcpipe.formats.maps.map_facts import Description, MapFacts, MapSummary, describe_layer, make_cf_flags, read_layers
 from tcpipe.formats.shards import DESCRIPTION, ShardedArray, ShardFetcher, open_sharded
 from tcpipe.formats.zarr_arrays import add_array, consolidate_metadata, create_group
-from tcpipe.tables.earlier_names import rename_keys
 from tcpipe.tables.facts import LEFT_OUT
+from tcpipe.tables.options import rename_keys
 from tcpipe.terrain.classes import ClassScheme, ClassTable, TerrainClass
-from tcpipe.terrain.grid import MapGrid
 from tcpipe.terrain.layers import LAYERS, PAPER_LAYERS, Layer, Pixels, find_no_data_value
 from tcpipe.terrain.resampling import iterate_levels, list_factors, make_overview_grid
-from tcpipe.terrain.target_grid import MAX_PIXELS, MAX_SIDE_PX
+from tcpipe.terrain.target_grid import MAX_PIXELS, MAX_SIDE_PX, MapGrid
 
 TILE_PX = 512
 """Side of a tile: the unit that is decoded."""

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.formats.atomic import write_atomic_file, write_text
-from tcpipe.terrain.grid import MapGrid
+from tcpipe.terrain.target_grid import MapGrid
 
 LETHAL = 100
 """Cost of what is never crossed."""

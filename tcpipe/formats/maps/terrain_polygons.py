@@ -21,12 +21,11 @@ from tcpipe.errors import MapError, RegionError
 from tcpipe.formats.geojson import PolygonFeature, read_polygons, shorten_problems, shorten_value
 from tcpipe.formats.maps.geotiff import burn_polygons
 from tcpipe.formats.maps.layer_building import Tally
-from tcpipe.tables.catalogue import read_threshold
-from tcpipe.tables.findings import Finding, Subject, make_finding
+from tcpipe.tables.findings import Finding, Subject, make_finding, read_threshold
 from tcpipe.terrain.classes import ClassScheme, name_key
-from tcpipe.terrain.grid import MapGrid
 from tcpipe.terrain.layers import Layer, Pixels, make_paper_layers
 from tcpipe.terrain.projection import Projection, compute_area
+from tcpipe.terrain.target_grid import MapGrid
 
 PROPERTY = "class"
 """The property with a polygon's class, in any case."""

@@ -25,7 +25,7 @@ class SensorExclusion:
 
     Attributes
     ----------
-    code : of the finding (`tcpipe.tables.catalogue`).
+    code : of the finding (`tcpipe.tables.findings`).
     names, numbers : of the finding; the name ``suspect`` is the other role that may be wrong instead.
     units : value of the recipe's ``imu_units`` that sets it right.
     turned_by : rotation (3, 3) from what the extrinsics in use make of the sensor to base_link.

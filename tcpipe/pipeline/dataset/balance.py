@@ -40,8 +40,8 @@ from tcpipe.formats.maps.map_files import MapFile
 from tcpipe.splits.assignment import SPLITS
 from tcpipe.splits.regions import Regions
 from tcpipe.tables.arrays import to_texts
-from tcpipe.tables.catalogue import read_threshold
 from tcpipe.tables.columns import to_floats, to_integers
+from tcpipe.tables.findings import read_threshold
 from tcpipe.terrain.projection import Projection, compute_area, parse_crs
 
 BALANCE_COLUMNS = (

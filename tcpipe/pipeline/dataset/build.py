@@ -14,7 +14,7 @@ from pathlib import Path
 from tcpipe import __version__
 from tcpipe.cost.labels import format_budget
 from tcpipe.errors import DatasetError, MissingFileError, RecipeError, StoreError, UsageError, clean_lines
-from tcpipe.formats.atomic import clear_beside, write_atomic_directory, write_text
+from tcpipe.formats.atomic import check_local_output, clear_beside, write_atomic_directory, write_text
 from tcpipe.formats.bucket import open_place
 from tcpipe.formats.bucket_directories import fetch_directory_by_range, find_newest
 from tcpipe.formats.commits import CallRecord, Dataset, Entries
@@ -45,7 +45,6 @@ from tcpipe.formats.parquet import ROWS_PER_GROUP, write_parquet_rows
 from tcpipe.formats.place import DirectoryPlace
 from tcpipe.formats.recipe_toml import resolve_recipe
 from tcpipe.formats.run_documents import SPOOL
-from tcpipe.formats.user_paths import check_local_output
 from tcpipe.motion.distance_breakdown import KEPT
 from tcpipe.pipeline.calls import (
     BUILD,
@@ -57,11 +56,9 @@ from tcpipe.pipeline.calls import (
     open_log,
     start_stopwatch,
 )
-from tcpipe.pipeline.dataset.added_columns import read_all_covariates
 from tcpipe.pipeline.dataset.balance import BALANCE_COLUMNS, measure_balance
-from tcpipe.pipeline.dataset.build_dataset_options import BuildDatasetOptions
 from tcpipe.pipeline.dataset.card import CARD_COLUMNS, PHYSICS_COLUMNS, VELOCITY_COLUMN, is_whole, make_dataset_card
-from tcpipe.pipeline.dataset.content import gather_content, write_patches
+from tcpipe.pipeline.dataset.content import gather_content, read_all_covariates, write_patches
 from tcpipe.pipeline.dataset.inputs import BuildOptions, Inputs, choose_inputs, find_other_options, read_earlier_splits
 from tcpipe.pipeline.dataset.redaction import (
     make_redaction,
@@ -73,6 +70,7 @@ from tcpipe.pipeline.dataset.redaction import (
 from tcpipe.pipeline.dataset.runs import CHOICE_CODES, find_gone_runs
 from tcpipe.pipeline.dataset.sampling import Workers
 from tcpipe.pipeline.generations import read_generations, write_generation
+from tcpipe.pipeline.options import BuildDatasetOptions
 from tcpipe.recipe import Recipe
 from tcpipe.report.dataset_report import render_dataset_report
 from tcpipe.report.pictures import draw_classes, draw_maps, draw_relief, write_overview

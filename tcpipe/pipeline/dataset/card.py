@@ -27,7 +27,7 @@ from tcpipe.formats.dataset_card import (
     judge_dataset,
 )
 from tcpipe.formats.json_files import convert_record
-from tcpipe.formats.layer_descriptions import describe_layer
+from tcpipe.formats.maps.map_facts import describe_layer
 from tcpipe.formats.maps.map_files import MapFile
 from tcpipe.pipeline.dataset.content import Content
 from tcpipe.pipeline.dataset.inputs import BuildOptions, Inputs
@@ -36,10 +36,9 @@ from tcpipe.recipe.suggestions import suggest
 from tcpipe.splits.assignment import SPLITS
 from tcpipe.splits.audit import HeldOut
 from tcpipe.tables.bits import Quality, flag_name
-from tcpipe.tables.catalogue import Severity, read_threshold
 from tcpipe.tables.columns import to_floats
 from tcpipe.tables.facts import PhysicsFit
-from tcpipe.tables.findings import Finding, Remedy, Subject, make_finding
+from tcpipe.tables.findings import Finding, Remedy, Severity, Subject, make_finding, read_threshold
 from tcpipe.tables.levels import DATA_MODEL_VERSION
 from tcpipe.terrain.layers import LAYERS, Layer
 

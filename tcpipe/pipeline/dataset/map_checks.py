@@ -25,9 +25,8 @@ from tcpipe.motion.distance_breakdown import (
 from tcpipe.motion.row_sections import number_pieces
 from tcpipe.recipe import Recipe
 from tcpipe.tables.bits import DropReason, flag_name
-from tcpipe.tables.catalogue import read_threshold
 from tcpipe.tables.columns import to_floats, to_integers
-from tcpipe.tables.findings import Finding, Subject, SubjectKind, make_finding
+from tcpipe.tables.findings import Finding, Subject, SubjectKind, make_finding, read_threshold
 from tcpipe.terrain.projection import Projection
 from tcpipe.terrain.registration import Registration, register_track
 from tcpipe.terrain.sampling import OFF_THE_MAP, find_classes_at

@@ -16,7 +16,7 @@ from tcpipe.formats.recipe_toml import ingest_key
 from tcpipe.formats.run_documents import LogOrigin
 from tcpipe.formats.stored_runs import Ingestions, RunDirectory
 from tcpipe.recipe import Recipe
-from tcpipe.robots.profiles import GENERIC
+from tcpipe.robots import GENERIC
 from tcpipe.store import Store
 from tcpipe.tables.findings import Finding, Remedy, Subject, make_finding
 from tcpipe.tables.levels import DATA_MODEL_VERSION, Sensor

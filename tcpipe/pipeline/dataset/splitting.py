@@ -22,8 +22,8 @@ from tcpipe.splits.audit import audit_leakage
 from tcpipe.splits.regions import Regions, project_regions
 from tcpipe.stages.sample import Sampled
 from tcpipe.tables.columns import to_integers
-from tcpipe.terrain.grid import MapGrid
 from tcpipe.terrain.projection import Projection, compute_area, parse_crs
+from tcpipe.terrain.target_grid import MapGrid
 
 _MARGIN_DEG = 0.05
 """Regions are cut this far around the samples (3 km or more below 60° latitude)."""

@@ -5,8 +5,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from made_tracks import stamps
 
-from tcpipe.power.energy import integrate_energy, integrate_recorded_energy
-from tcpipe.power.rails import make_rail, make_samples
+from tcpipe.power.rails import integrate_energy, integrate_recorded_energy, make_rail, make_samples
 
 
 @st.composite

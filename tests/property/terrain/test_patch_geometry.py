@@ -4,9 +4,9 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tcpipe.terrain.grid import MapGrid
-from tcpipe.terrain.patches import compute_footprints, make_patch_frames, map_px_from_patch, sample_chord_px
+from tcpipe.terrain.sampling import compute_footprints, make_patch_frames, map_px_from_patch, sample_chord_px
 from tcpipe.terrain.sampling_kernel import compute_morton
+from tcpipe.terrain.target_grid import MapGrid
 
 PLACES = st.tuples(st.floats(-4e5, 4e5), st.floats(-4e5, 4e5))
 

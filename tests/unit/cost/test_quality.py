@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tcpipe.cost.quality import has_low_power_rate, touches_voltage_outside
+from tcpipe.cost.labels import has_low_power_rate, touches_voltage_outside
 from tcpipe.power.rails import make_rail, make_samples
 
 

@@ -5,8 +5,8 @@ from pathlib import Path
 import pytest
 from made_models import made_comparison, made_evaluation
 
-from tcpipe.experiment.claims import CLAIMS, check_claims
 from tcpipe.experiment.reproduction_page import DIFFERENCES
+from tcpipe.experiment.simulation_floor import CLAIMS, check_claims
 from tcpipe.learning.baselines import PER_CLASS
 from tcpipe.learning.evaluation_facts import SplitErrors
 from tcpipe.learning.metrics import Ratio

@@ -165,7 +165,7 @@ def test_a_copy_that_is_not_what_it_should_be_is_no_copy(served: Path) -> None:
 def test_the_cache_is_bounded(served: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     (served / "tests").mkdir()
     monkeypatch.setenv("TCPIPE_CACHE_BYTES", "2500")
-    monkeypatch.setattr("tcpipe.formats.content_cache._IN_USE_S", -1.0)
+    monkeypatch.setattr("tcpipe.formats.bucket._IN_USE_S", -1.0)
     place = open_place("s3://tests")
     for number in range(5):
         data = bytes([number]) * 1000

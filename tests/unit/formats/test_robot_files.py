@@ -8,7 +8,7 @@ from tcpipe.errors import RecipeError
 from tcpipe.formats.json_files import to_plain
 from tcpipe.formats.recipe_toml import format_commented_toml, load_profiles, load_shipped_profiles, parse_recipe
 from tcpipe.recipe import Recipe
-from tcpipe.robots.profiles import GENERIC, FieldPath, PowerSource, Robot, parse_fields
+from tcpipe.robots import GENERIC, FieldPath, PowerSource, Robot, parse_fields
 
 
 def test_a_robot_has_a_file_of_its_name_and_stands_in_the_recipe_that_init_writes():

@@ -7,7 +7,7 @@ import polars as pl
 import pytest
 
 from tcpipe.errors import LogError
-from tcpipe.formats.tables import read_cells, read_column_names
+from tcpipe.formats.logs.table_log import read_cells, read_column_names
 
 
 def ns(*time):

@@ -5,7 +5,7 @@ import pytest
 from unit.fusion import dense_reference, drive
 from unit.fusion.dense_reference import FORCE, LEVER, RATE, P, X
 
-from tcpipe.fusion import error_state_kernel, error_state_pass, prediction_kernel, state_kernel
+from tcpipe.fusion import error_state_kernel, error_state_pass, state_kernel
 from tcpipe.fusion.gnss_faults import FixErrors
 from tcpipe.fusion.initial import find_initial_state, find_stationary_intervals
 from tcpipe.fusion.measurements import select_measurements
@@ -29,7 +29,7 @@ def test_prediction_is_the_unscented_transform(mode, scaled):
     x, covariance, moved = X.copy(), P.copy(), np.zeros((12, 9))
     work, _ = state_kernel.allocate_workspace(17)
     q = np.concatenate((np.linspace(0.01, 0.02, 19), [scaled, 0.03]))
-    prediction_kernel.predict(x, covariance, q, 0.03, 0.4, RATE, FORCE, mode, moved, work)
+    state_kernel.predict(x, covariance, q, 0.03, 0.4, RATE, FORCE, mode, moved, work)
     wanted_x, wanted_P, cross = dense_reference.predict(X, P, q, 0.03, 0.4, RATE, FORCE, mode)
     assert np.allclose(x, wanted_x, atol=1e-13)
     assert np.allclose(covariance, wanted_P, atol=1e-13)
@@ -45,7 +45,7 @@ def test_a_covariance_that_is_none_is_repaired_and_counted():
     work, _ = state_kernel.allocate_workspace(17)
     broken = P.copy()
     broken[3, 3] = -1e-12
-    prediction_kernel.predict(X.copy(), broken, np.zeros(21), 0.0, 0.1, RATE, FORCE, 3, np.zeros((12, 9)), work)
+    state_kernel.predict(X.copy(), broken, np.zeros(21), 0.0, 0.1, RATE, FORCE, 3, np.zeros((12, 9)), work)
     assert work[8][0] > 0
     assert np.isfinite(broken).all()
     assert np.linalg.eigvalsh(broken).min() > 0

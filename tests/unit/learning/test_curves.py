@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.interpolate import CubicSpline
 
-from tcpipe.learning.curves import fit_curves
+from tcpipe.learning.physics_model import fit_curves
 
 MANY = 3000
 

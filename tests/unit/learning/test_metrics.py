@@ -49,8 +49,8 @@ def test_all_is_the_samples_pooled(drawn):
 
 def test_the_papers_own_all_is_its_classes_combined():
     """MAPE weighted by count, RMSE in quadrature: with the shares of classes in all its data its table I nearly gives its column All."""
+    from tcpipe.learning.evaluation_page import BY_CLASS
     from tcpipe.learning.metrics import Errors
-    from tcpipe.learning.paper_tables import BY_CLASS
 
     shares = np.array([51, 9, 20, 20])
     for quantity in "wE":

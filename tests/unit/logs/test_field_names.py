@@ -1,7 +1,7 @@
 """What a message type of somebody's own could play is told by its definition, and by nothing that is of another role."""
 
 from tcpipe.formats.recipe_toml import load_shipped_profiles
-from tcpipe.logs.field_names import _list_number_fields, match_field_names, propose_roles
+from tcpipe.logs.field_mapping import _list_number_fields, match_field_names, propose_roles
 from tcpipe.logs.topics import Topic
 from tcpipe.recipe import ReadConfig
 from tcpipe.stages.read_roles import decide_roles

@@ -7,9 +7,15 @@ import pytest
 from tcpipe.errors import RecipeError
 from tcpipe.formats.recipe_toml import load_shipped_profiles
 from tcpipe.logs import roles
-from tcpipe.logs.robots import find_robot, find_robot_namespaces
 from tcpipe.logs.roles import RoleAssignment
-from tcpipe.logs.topics import Topic, compute_silence_ns, find_short_topics, format_coverage
+from tcpipe.logs.topics import (
+    Topic,
+    compute_silence_ns,
+    find_robot,
+    find_robot_namespaces,
+    find_short_topics,
+    format_coverage,
+)
 from tcpipe.tables.findings import select_findings
 
 FIX, IMU = "sensor_msgs/msg/NavSatFix", "sensor_msgs/msg/Imu"

@@ -21,8 +21,7 @@ from tcpipe.motion.distance_breakdown import (
     sum_lengths_m,
 )
 from tcpipe.tables.bits import DropReason, Loss, flag_name
-from tcpipe.tables.catalogue import read_catalogue
-from tcpipe.tables.findings import Subject
+from tcpipe.tables.findings import Subject, read_catalogue
 
 G, S, A = (int(bit) for bit in (DropReason.GAP, DropReason.STATIONARY, DropReason.ACCELERATING))
 

@@ -15,7 +15,7 @@ from synthetic_store import box, region_file, small_store
 from tcpipe.cli import cli
 from tcpipe.errors import UsageError
 from tcpipe.pipeline.dataset.build import build_dataset
-from tcpipe.pipeline.layers import export_layers
+from tcpipe.pipeline.export import export_layers
 
 pyogrio = pytest.importorskip("pyogrio", reason="the extra gis is not installed")
 

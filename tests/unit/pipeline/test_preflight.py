@@ -15,8 +15,8 @@ from tcpipe.pipeline.preflight import (
 )
 from tcpipe.recipe import ReadConfig
 from tcpipe.tables.bits import DropReason, Loss, flag_name
-from tcpipe.tables.catalogue import read_catalogue
 from tcpipe.tables.facts import EnergyBudget
+from tcpipe.tables.findings import read_catalogue
 
 
 def topic(name, type_name="std_msgs/msg/String", encoding="cdr"):

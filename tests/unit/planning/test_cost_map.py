@@ -26,7 +26,7 @@ from tcpipe.formats.bucket_directories import fetch_directory
 from tcpipe.pipeline.verify import verify
 from tcpipe.planning.cost_grid import ANGLES_DEG, iterate_blocks, make_grid
 from tcpipe.planning.cost_map import Cluster, make_cost_map, make_cost_map_key, open_cost_map, read_cost_map_card
-from tcpipe.planning.segment_predictions import Reason
+from tcpipe.planning.cost_model import Reason
 
 MODEL = PhysicsModel()
 

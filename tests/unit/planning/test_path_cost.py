@@ -10,8 +10,8 @@ from physics_model import PhysicsModel, energy_joule, made_residuals, velocity_m
 from planning_worlds import lonlat, plane
 
 from tcpipe.errors import ModelError, PathError
+from tcpipe.planning.cost_model import Reason
 from tcpipe.planning.path_cost import compute_path_cost, cut_path
-from tcpipe.planning.segment_predictions import Reason
 from tcpipe.tables.facts import PhysicsFit, PhysicsTerm
 from tcpipe.terrain.classes import PAPER_CLASSES, ClassTable
 

@@ -33,7 +33,7 @@ from tcpipe.planning.search import (
 )
 from tcpipe.tables.facts import PhysicsFit, PhysicsTerm
 from tcpipe.terrain.classes import PAPER_CLASSES
-from tcpipe.terrain.grid import MapGrid
+from tcpipe.terrain.target_grid import MapGrid
 
 
 @pytest.mark.parametrize("course", range(COURSES))

@@ -4,8 +4,15 @@ import numpy as np
 import pytest
 from made_tracks import stamps
 
-from tcpipe.power.energy import count_samples_inside, estimate_idle_power, integrate_energy, integrate_recorded_energy
-from tcpipe.power.rails import compute_power_watt, make_rail, make_samples
+from tcpipe.power.rails import (
+    compute_power_watt,
+    count_samples_inside,
+    estimate_idle_power,
+    integrate_energy,
+    integrate_recorded_energy,
+    make_rail,
+    make_samples,
+)
 
 ZERO = stamps(1)[0]
 

@@ -9,8 +9,6 @@ from scipy.optimize import nnls
 from scipy.signal import lfilter
 
 from tcpipe.power import noise as energy_noise
-from tcpipe.power.energy import integrate_energy
-from tcpipe.power.least_squares import solve_non_negative
 from tcpipe.power.noise import (
     SignalModel,
     _compute_second_differences,
@@ -27,9 +25,10 @@ from tcpipe.power.noise import (
     estimate_local_scale,
     estimate_resolution,
     fit_signal_model,
+    solve_non_negative,
     sum_squared_weights,
 )
-from tcpipe.power.rails import Rail, Samples, make_rail, make_samples
+from tcpipe.power.rails import Rail, Samples, integrate_energy, make_rail, make_samples
 
 ZERO = stamps(1)[0]
 STARTS = ZERO + (np.arange(5, 595, 1.3) * 1e9).astype(np.int64)

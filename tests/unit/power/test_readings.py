@@ -7,7 +7,7 @@ from tcpipe.formats.recipe_toml import load_shipped_profiles
 from tcpipe.power import readings
 from tcpipe.power.readings import PowerReadings
 from tcpipe.power.sources import BATTERY_STATE
-from tcpipe.robots.profiles import PowerSource
+from tcpipe.robots import PowerSource
 from tcpipe.tables.findings import Subject, select_findings
 
 HUSKY_STATUS = "husky_msgs/msg/HuskyStatus"

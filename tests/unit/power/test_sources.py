@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from tcpipe.power.energy import integrate_energy
-from tcpipe.power.rails import make_rail, make_samples
+from tcpipe.power.rails import integrate_energy, make_rail, make_samples
 from tcpipe.power.sources import (
     LARGEST_AMP,
     RailReadings,
@@ -16,7 +15,7 @@ from tcpipe.power.sources import (
     read_rails,
     sign_by_mean,
 )
-from tcpipe.robots.profiles import PowerSource
+from tcpipe.robots import PowerSource
 
 VARIED = np.array([5.0, 6.0])
 

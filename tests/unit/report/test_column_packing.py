@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from page_reading import unpacked
 
-from tcpipe.report.column_packing import make_shown_column, pack_columns
+from tcpipe.report.page import make_shown_column, pack_columns
 
 COUNT = 1000
 

@@ -6,9 +6,8 @@ from scipy.spatial.transform import Rotation
 
 from tcpipe.errors import UsageError
 from tcpipe.simulation import compute_true_cost
-from tcpipe.simulation.drive import simulate_drive
 from tcpipe.simulation.robot import GRAVITY_MPS2, GroundModel, SimulatedRobot
-from tcpipe.simulation.route import Leg, Pause, Turn
+from tcpipe.simulation.route import Leg, Pause, Turn, simulate_drive
 from tcpipe.simulation.scenarios import make_small_world
 from tcpipe.simulation.world import GRASS, Site, World
 

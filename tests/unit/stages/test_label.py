@@ -10,7 +10,7 @@ from simulated_streams import log_of, streams_of
 
 from tcpipe.cost.labels import CAUSES, format_budget
 from tcpipe.pipeline.ingest_run import run_stages
-from tcpipe.power.energy import IdlePower, integrate_energy
+from tcpipe.power.rails import IdlePower, integrate_energy
 from tcpipe.recipe import LabelConfig, MaskConfig, Recipe, SegmentConfig
 from tcpipe.simulation import Faults, find_scenario
 from tcpipe.simulation.robot import GRAVITY_MPS2, SimulatedRobot

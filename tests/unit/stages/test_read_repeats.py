@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from made_tracks import power_streams, stamps
 
-from tcpipe.power.energy import integrate_energy
 from tcpipe.power.noise import compute_median_period_s, estimate_energy_noise
+from tcpipe.power.rails import integrate_energy
 from tcpipe.simulation import find_scenario, simulate_readings
 from tcpipe.simulation.faults import Faults
 from tcpipe.simulation.scenarios import make_small_world

@@ -10,7 +10,7 @@ from tcpipe.recipe import SampleConfig
 from tcpipe.stages.sample import sample_segments, sum_losses
 from tcpipe.tables.bits import Loss
 from tcpipe.tables.findings import Subject
-from tcpipe.terrain.grid import MapGrid
+from tcpipe.terrain.target_grid import MapGrid
 
 CRS = "EPSG:32633"
 

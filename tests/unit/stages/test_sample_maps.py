@@ -9,7 +9,7 @@ from tcpipe.recipe import SampleConfig
 from tcpipe.stages.sample import sample_on_maps, sample_segments, sum_losses
 from tcpipe.tables.bits import Loss
 from tcpipe.terrain.classes import PAPER_CLASSES, ClassTable
-from tcpipe.terrain.grid import MapGrid
+from tcpipe.terrain.target_grid import MapGrid
 
 CRS = "EPSG:32633"
 NORTH = 5_200_000.0

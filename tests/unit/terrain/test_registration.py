@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from map_worlds import ArrayMap
 
-from tcpipe.terrain.grid import MapGrid
 from tcpipe.terrain.layers import PAPER_LAYERS
 from tcpipe.terrain.registration import register_track
 from tcpipe.terrain.resampling import iterate_levels, make_overview_grid
+from tcpipe.terrain.target_grid import MapGrid
 
 SIDE, PITCH_M = 1000, 0.1
 

@@ -4,11 +4,10 @@ import numpy as np
 import pytest
 from map_worlds import ArrayMap
 
-from tcpipe.terrain.grid import MapGrid
 from tcpipe.terrain.layers import PAPER_LAYERS
-from tcpipe.terrain.patches import make_patch_frames
 from tcpipe.terrain.resampling import choose_factor, iterate_levels, list_factors, make_overview_grid
-from tcpipe.terrain.sampling import sample_patches
+from tcpipe.terrain.sampling import make_patch_frames, sample_patches
+from tcpipe.terrain.target_grid import MapGrid
 
 
 def grid_of(rows, cols, pixel_size_m=0.05):

@@ -7,9 +7,8 @@ from scipy.ndimage import map_coordinates
 
 from tcpipe.formats.maps.building import build_map
 from tcpipe.formats.maps.map_files import open_map
-from tcpipe.terrain.grid import MapGrid
-from tcpipe.terrain.patches import make_patch_frames, map_px_from_patch
-from tcpipe.terrain.sampling import OFF_THE_MAP, find_classes_at, sample_patches
+from tcpipe.terrain.sampling import OFF_THE_MAP, find_classes_at, make_patch_frames, map_px_from_patch, sample_patches
+from tcpipe.terrain.target_grid import MapGrid
 from tcpipe.terrain.tiles import CACHED_TILES, TilePool, group_by_tile, read_window
 
 

@@ -20,8 +20,8 @@ from tcpipe.formats.maps.building import build_map
 from tcpipe.formats.maps.map_facts import MapFacts, MapInputs
 from tcpipe.formats.maps.map_files import SHARD_PX, MapWriter, open_map
 from tcpipe.terrain.classes import PAPER_SCHEME
-from tcpipe.terrain.grid import MapGrid
 from tcpipe.terrain.layers import make_paper_layers
+from tcpipe.terrain.target_grid import MapGrid
 
 FACTS = MapFacts(
     sources={},

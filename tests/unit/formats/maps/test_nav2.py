@@ -5,7 +5,7 @@ import pytest
 from ruamel.yaml import YAML
 
 from tcpipe.formats.maps.nav2 import HIGHEST, LETHAL, write_nav2_map
-from tcpipe.terrain.grid import MapGrid
+from tcpipe.terrain.target_grid import MapGrid
 
 
 def _nav2(share):

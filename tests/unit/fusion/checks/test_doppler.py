@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from rough_drive import ANTENNA_M, measured
 
-from tcpipe.fusion.checks.doppler import check_ground_velocity
+from tcpipe.fusion.checks.sensors import check_ground_velocity
 from tcpipe.fusion.measurements import GroundVelocities
 
 STD_MPS = 0.05

@@ -9,11 +9,11 @@ from synthetic_store import add_run, add_world, lanes, segments
 from tcpipe.dataset import open_dataset
 from tcpipe.errors import DatasetError, RecipeError
 from tcpipe.formats.dataset_files import read_card, read_samples
-from tcpipe.pipeline.dataset.added_columns import find_narrow_patches
 from tcpipe.pipeline.dataset.build import build_dataset
+from tcpipe.pipeline.dataset.content import find_narrow_patches
 from tcpipe.pipeline.verify import verify
 from tcpipe.recipe import CovariateConfig, Recipe, SampleConfig, SplitConfig
-from tcpipe.robots.profiles import Robot
+from tcpipe.robots import Robot
 from tcpipe.store import Store, open_store
 from tcpipe.tables.findings import Subject, select_findings
 

@@ -21,8 +21,7 @@ from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.dataset.redaction import PLANE, compute_plane_per_chord, find_leaks, redact_findings
 from tcpipe.pipeline.verify import verify
 from tcpipe.store import open_store
-from tcpipe.tables.catalogue import read_catalogue
-from tcpipe.tables.findings import Finding, Remedy, Subject, SubjectKind, make_finding, select_findings
+from tcpipe.tables.findings import Finding, Remedy, Subject, SubjectKind, make_finding, read_catalogue, select_findings
 
 DRAWS_DATASET_PAGES = True
 

@@ -1,0 +1,191 @@
+"""The options of ``tcpipe ingest``, ``add-map`` and ``build-dataset``, and of the functions of these names."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import KW_ONLY, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal, TypeAlias
+
+from tcpipe.tables.options import (
+    CLUSTER,
+    DRY_RUN,
+    MESSAGE_DEFINITIONS,
+    RECIPE,
+    SEED,
+    STORE,
+    Option,
+    Range,
+    jobs,
+    option,
+    required,
+    tags
+)
+
+if TYPE_CHECKING:
+    from tcpipe.formats.dataset_files import FileFormat
+    from tcpipe.pipeline.plan import IngestResult
+    from tcpipe.recipe import Recipe
+
+
+@dataclass(frozen=True, slots=True)
+class IngestOptions:
+    """Which logs are ingested, into which store, and how."""
+
+    logs: Iterable[str | Path] = required(Option(kind="several", metavar="LOG...", repeatable=True, is_argument=True))
+    """Files, ROS 2 bag directories, folders searched downward, or URLs of such (``s3://…``), which are read by range or copied."""
+    _: KW_ONLY
+    store: str | Path = option("tcpipe-store", STORE)
+    recipe: Recipe | str | Path | None = option(None, RECIPE)
+    robot: str | None = option(
+        None,
+        Option(
+            "Robot profile, built in or from the recipe (default: found by message types and topic names).",
+            kind="robot",
+            metavar="NAME"
+        )
+    )
+    tags: Mapping[str, str] | None = tags("Tag for the runs; repeatable.")
+    jobs: int = jobs("Logs")
+    cluster: str | None = option(None, CLUSTER)
+    """Its workers see logs and store under the same absolute paths."""
+    as_one: bool = option(False, Option("Treat all logs as parts of one drive (split logs; power in a separate log)."))
+    message_definitions: str | Path | None = option(None, MESSAGE_DEFINITIONS)
+    shard: tuple[int, int] | None = option(
+        None,
+        Option("Ingest only the I-th of N shares of the logs: one for each task of an array job.", (), "shard", "I/N")
+    )
+    min_age_s: float = option(
+        0.0,
+        Option(
+            "Skip logs that were changed more recently than this (90, 90s, 10m, 2h, 1d).",
+            ("--min-age",),
+            "duration",
+            "T",
+            shown="0"
+        )
+    )
+    retry_failed: bool = option(False, Option("Try logs again that failed before."))
+    force: bool = option(False, Option("Ingest all logs again, also those that failed before."))
+    on_found: Callable[[Mapping[str, int]], None] | None = None
+    """Called once with the size [byte] of every log by its name."""
+    on_result: Callable[[IngestResult], None] | None = None
+    """Called as each log ends, in the order of ending."""
+
+
+Files: TypeAlias = "str | Path | Sequence[str | Path]"
+"""A file, a pattern of files such as ``dem/*.tif`` (its files by name), or several of both: tiles of one grid, the last on top."""
+
+
+def _raster(about: str) -> Option:
+    return Option(about, (), "several", "FILE", repeatable=True)
+
+
+@dataclass(frozen=True, slots=True)
+class AddMapOptions:
+    """Which rasters become a map of a store; they need not share grid, resolution or CRS."""
+
+    name: str = required(Option(is_argument=True))
+    _: KW_ONLY
+    height: Files = required(_raster("Height raster, metres."))
+    ortho: Files | None = option(None, _raster("Orthophoto, grey or RGB."))
+    terrain: Files | None = option(
+        None, _raster("Terrain classes: one integer band, or GeoJSON polygons with a property 'class'.")
+    )
+    """The property is a class name, value or id."""
+    classes: str | Path | None = option(
+        None, Option("Class table: CSV with value,id,name,traversable, or TOML.", (), "input_file", "FILE")
+    )
+    """None takes the store's, else the paper's seven classes. The first map with terrain or classes sets the store's table."""
+    layers: Mapping[str, Files] | None = option(
+        None,
+        Option(
+            "Another raster of one band, as layer NAME; repeatable.",
+            ("--layer",),
+            "layers",
+            "NAME=FILE"
+        )
+    )
+    categorical: Mapping[str, str | Path | None] | None = option(
+        None,
+        Option(
+            "Layer NAME contains classes: named by FILE, like --classes, or by the raster itself.",
+            (),
+            "class_tables",
+            "NAME[=FILE]"
+        )
+    )
+    """None: as the raster names its values."""
+    ortho_bands: Literal["grey", "rgb"] = option(
+        "grey", Option("rgb also keeps red, green and blue as layers.", (), ("grey", "rgb"))
+    )
+    crs: str | None = option(
+        None, Option("Projected, metric CRS of the map (default: the height's, or its UTM zone).", metavar="EPSG:n")
+    )
+    force: bool = option(False, Option("Replace a map of this name that has other inputs."))
+    store: str | Path = option("tcpipe-store", STORE)
+
+
+@dataclass(frozen=True, slots=True)
+class BuildDatasetOptions:
+    """Which runs and maps a dataset is made from, and how."""
+
+    out: str | Path = option("dataset", Option(kind="published", metavar="[OUT]", is_argument=True))
+    """A directory that is new, empty or holds a dataset of the same options; or a URL, where each build is a generation."""
+    _: KW_ONLY
+    split: str | Path | None = option(
+        None, Option("GeoJSON region (WGS84): inside is train and test, outside is unseen.", (), "input_file", "FILE")
+    )
+    """None: everything is train and test."""
+    map_name: str | Sequence[str] | None = option(
+        None,
+        Option(
+            "Map to sample from (default: the only one in the store); repeatable; where maps overlap, the first has priority.",
+            ("--map",), "map", "NAME", repeatable=True
+        ),
+    )  # fmt: skip
+    robot: str | None = option(None, Option("Use only runs of this robot.", (), "robot", "NAME"))
+    tags: Mapping[str, str] | None = tags("Use only runs with this tag; if repeated, with all of the tags.")
+    store: str | Path = option("tcpipe-store", STORE)
+    recipe: Recipe | str | Path | None = option(None, RECIPE)
+    jobs: int = jobs("Runs sampled")
+    cluster: str | None = option(None, CLUSTER)
+    """Its workers see the store under the same absolute path or URL."""
+    file_format: FileFormat = option("zarr", Option(flags=("--format",), kind=("zarr", "parquet")))
+    holdout: str | None = option(
+        None,
+        Option(
+            "Unit that is held out for test: block, sample, run, or tag:NAME for values of a tag (default: from the recipe).",
+            (), "holdout", "HOW"
+        ),
+    )  # fmt: skip
+    covariates: str | Path | Sequence[str | Path] = option(
+        (),
+        Option(
+            "Table (CSV or Parquet) that is joined to the samples by time, such as weather or soil; repeatable.",
+            (), "input_file", "FILE", repeatable=True
+        ),
+    )  # fmt: skip
+    seed: int | None = option(None, Option("Seed of split and row order (default: from the recipe).", (), SEED))
+    keep_split: str | Path | None = option(
+        None,
+        Option("An earlier dataset (OUT is possible) whose samples keep their split and fold.", (), "sealed", "OLD")
+    )
+    min_runs: int | None = option(
+        None,
+        Option(
+            "Fail if fewer runs are usable; otherwise excluded and missing runs are notes.",
+            (), Range(1, 1_000_000), "N"
+        ),
+    )  # fmt: skip
+    redact: bool = option(
+        False,
+        Option(
+            "For publication: move all positions to 0 N 0 E and omit names of logs, runs, topics, paths, hosts and users."
+        )
+    )
+    force: bool = option(
+        False,
+        Option("Replace a dataset that was made with other options (region, map, tags, recipe …).")
+    )
+    dry_run: bool = option(False, DRY_RUN)
