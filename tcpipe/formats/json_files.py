@@ -158,7 +158,7 @@ def _format_validation_error(message: str) -> str:
     plain_names = re.sub(
         r"`(.+?)`", lambda name: " or ".join(_JSON_NAMES.get(n, n) for n in name[1].split(" | ")), what
     )
-    return f"{key}: {plain_names.replace('Expected', 'wanted')}".removeprefix(": ")
+    return f"{key}: {plain_names.replace('Expected', 'expected')}".removeprefix(": ")
 
 
 _JSON_NAMES = {

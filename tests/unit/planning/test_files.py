@@ -86,7 +86,7 @@ def test_a_path_that_leaves_the_map_is_done_in_part(source, tmp_path):
     found = predict_path(MODEL, source, tmp_path / "off.geojson", None)
     assert found.exit_code == 3
     assert "outside map" in str(found)
-    assert f"without {found.pieces_without_cost} of {found.pieces} pieces" in str(found)
+    assert f"without {found.pieces_without_cost} of {found.pieces} path segments" in str(found)
 
 
 def _request(source, **options) -> PlanRequest:
