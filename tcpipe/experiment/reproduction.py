@@ -21,7 +21,7 @@ from tcpipe.experiment.simulation_floor import (
     check_claims,
     compute_true_costs,
     compute_variance_shares,
-    remove_hidden_variation
+    remove_hidden_variation,
 )
 from tcpipe.formats.atomic import clear, write_text
 from tcpipe.formats.json_files import write_json

@@ -22,7 +22,7 @@ from tcpipe.tables.findings import (
     Verdict,
     rank_severity,
     read_catalogue,
-    sort_findings
+    sort_findings,
 )
 
 K = TypeVar("K", bound=Hashable)

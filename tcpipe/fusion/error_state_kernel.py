@@ -37,7 +37,7 @@ from tcpipe.fusion.state_kernel import (
     displace_state,
     factorize_covariance,
     predict,
-    save_state
+    save_state,
 )
 
 

@@ -41,7 +41,7 @@ from tcpipe.learning.fitting import (
     TrainingProgress,
     TrainingTimes,
     collect_labels,
-    find_label_scale
+    find_label_scale,
 )
 from tcpipe.learning.physics_model import (
     Curves,
@@ -49,7 +49,7 @@ from tcpipe.learning.physics_model import (
     fit_curves,
     fit_physics_model,
     list_curve_arrays,
-    read_curves
+    read_curves,
 )
 from tcpipe.terrain.layers import HEIGHT_RANGE_M
 

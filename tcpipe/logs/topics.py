@@ -328,5 +328,5 @@ def ask_which_robot(robots: Mapping[str, Sequence[str]]) -> list[str]:
     return [
         f"the log contains {len(robots)} robots, but a run has one: {each}",
         "decide in the recipe (tcpipe.toml), for example:",
-        *f"{RecipeFragment({'read': {'namespace': first}}).toml()}  #{other}".splitlines()
+        *f"{RecipeFragment({'read': {'namespace': first}}).toml()}  #{other}".splitlines(),
     ]

@@ -344,7 +344,7 @@ def _iterate_dataset_layers(directory: Path) -> Iterator[VectorLayer]:
         card.recipe.read.gnss_crs,
         table,
         _make_lines(table),
-        {"split": split, **_make_power_style(table)}
+        {"split": split, **_make_power_style(table)},
     )
     named = table.select(["sample_id", "split", "map"])
     areas = list(shapely.to_wkb(shapely.polygons(_compute_footprints(card, table))))
@@ -363,7 +363,7 @@ def _iterate_dataset_layers(directory: Path) -> Iterator[VectorLayer]:
             _WGS84,
             kinds,
             _make_multi_lines(shapes),
-            {"split": make_classes_style("split", _REGIONS, "fill")}
+            {"split": make_classes_style("split", _REGIONS, "fill")},
         )
     if (directory / DRIVE_NEXT).is_file() and (features := read_polygons(directory / DRIVE_NEXT)[0]):
         facts = pa.Table.from_pylist([dict(feature.properties) for feature in features])
@@ -375,7 +375,7 @@ def _iterate_dataset_layers(directory: Path) -> Iterator[VectorLayer]:
             _WGS84,
             facts,
             _make_multi_lines(shapes),
-            {"class": make_classes_style("class", rare, "fill")}
+            {"class": make_classes_style("class", rare, "fill")},
         )
 
 

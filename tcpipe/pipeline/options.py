@@ -19,7 +19,7 @@ from tcpipe.tables.options import (
     jobs,
     option,
     required,
-    tags
+    tags,
 )
 
 if TYPE_CHECKING:
@@ -42,8 +42,8 @@ class IngestOptions:
         Option(
             "Robot profile, built in or from the recipe (default: found by message types and topic names).",
             kind="robot",
-            metavar="NAME"
-        )
+            metavar="NAME",
+        ),
     )
     tags: Mapping[str, str] | None = tags("Tag for the runs; repeatable.")
     jobs: int = jobs("Logs")
@@ -53,7 +53,7 @@ class IngestOptions:
     message_definitions: str | Path | None = option(None, MESSAGE_DEFINITIONS)
     shard: tuple[int, int] | None = option(
         None,
-        Option("Ingest only the I-th of N shares of the logs: one for each task of an array job.", (), "shard", "I/N")
+        Option("Ingest only the I-th of N shares of the logs: one for each task of an array job.", (), "shard", "I/N"),
     )
     min_age_s: float = option(
         0.0,
@@ -62,8 +62,8 @@ class IngestOptions:
             ("--min-age",),
             "duration",
             "T",
-            shown="0"
-        )
+            shown="0",
+        ),
     )
     retry_failed: bool = option(False, Option("Try logs again that failed before."))
     force: bool = option(False, Option("Ingest all logs again, also those that failed before."))
@@ -98,13 +98,7 @@ class AddMapOptions:
     )
     """None takes the store's, else the paper's seven classes. The first map with terrain or classes sets the store's table."""
     layers: Mapping[str, Files] | None = option(
-        None,
-        Option(
-            "Another raster of one band, as layer NAME; repeatable.",
-            ("--layer",),
-            "layers",
-            "NAME=FILE"
-        )
+        None, Option("Another raster of one band, as layer NAME; repeatable.", ("--layer",), "layers", "NAME=FILE")
     )
     categorical: Mapping[str, str | Path | None] | None = option(
         None,
@@ -112,8 +106,8 @@ class AddMapOptions:
             "Layer NAME contains classes: named by FILE, like --classes, or by the raster itself.",
             (),
             "class_tables",
-            "NAME[=FILE]"
-        )
+            "NAME[=FILE]",
+        ),
     )
     """None: as the raster names its values."""
     ortho_bands: Literal["grey", "rgb"] = option(
@@ -169,7 +163,7 @@ class BuildDatasetOptions:
     seed: int | None = option(None, Option("Seed of split and row order (default: from the recipe).", (), SEED))
     keep_split: str | Path | None = option(
         None,
-        Option("An earlier dataset (OUT is possible) whose samples keep their split and fold.", (), "sealed", "OLD")
+        Option("An earlier dataset (OUT is possible) whose samples keep their split and fold.", (), "sealed", "OLD"),
     )
     min_runs: int | None = option(
         None,
@@ -182,10 +176,9 @@ class BuildDatasetOptions:
         False,
         Option(
             "For publication: move all positions to 0 N 0 E and omit names of logs, runs, topics, paths, hosts and users."
-        )
+        ),
     )
     force: bool = option(
-        False,
-        Option("Replace a dataset that was made with other options (region, map, tags, recipe …).")
+        False, Option("Replace a dataset that was made with other options (region, map, tags, recipe …).")
     )
     dry_run: bool = option(False, DRY_RUN)

@@ -31,7 +31,7 @@ from tcpipe.terrain.sampling import (
     compute_footprints,
     compute_relief_m,
     count_corners_on,
-    sample_patches
+    sample_patches,
 )
 from tcpipe.terrain.tiles import MapReader, TilePool, choose_level
 
@@ -311,7 +311,7 @@ def predict_segments(
     """
     centring, tiles = (
         fit_bias_correction(model.residuals),
-        TilePool(choose_level(source, model.patch_m / model.patch_px))
+        TilePool(choose_level(source, model.patch_m / model.patch_px)),
     )
 
     def sampled(frames: PatchFrames, first: int) -> tuple[Patches, NDArray[np.bool_], Floats | None]:
@@ -357,7 +357,7 @@ def _predict_batch(
         terrain_class=patches.terrain_class,
         slope_rad=np.where(known, patches.slope_rad, np.nan),
         cross_slope_rad=np.where(known, patches.cross_slope_rad, np.nan),
-        height_m=np.where(known, patches.height_min_m + middle, np.nan)
+        height_m=np.where(known, patches.height_min_m + middle, np.nan),
     )
 
 

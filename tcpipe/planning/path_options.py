@@ -49,7 +49,7 @@ class PlanPathOptions:
         None,
         Option(
             "Cost map of this model and map; without one, only the necessary cells are predicted.", (), "sealed", "DIR"
-        )
+        ),
     )
     cell_size_m: float = option(
         1.0,

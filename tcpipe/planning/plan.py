@@ -30,7 +30,7 @@ from tcpipe.planning.search import (
     find_least_turning_path,
     find_turning,
     make_steps,
-    straighten_path
+    straighten_path,
 )
 from tcpipe.tables.bits import flag_names
 from tcpipe.terrain.classes import NODATA_ID

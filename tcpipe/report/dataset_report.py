@@ -40,7 +40,7 @@ from tcpipe.report.page import (
     make_shown_column,
     pack_columns,
     render_page,
-    show_verdict
+    show_verdict,
 )
 from tcpipe.report.plots import Plot, draw_waterfall, label_histograms, make_plot
 from tcpipe.splits.assignment import SPLITS

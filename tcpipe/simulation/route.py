@@ -496,7 +496,7 @@ def _compute_power(
         acceleration_mps2=np.gradient(driven.wheel_mps, _DT_S),
         yaw_rate_radps=yaw_rate,
         slope_rad=slope,
-        rolling_resistance=rolling * (1.0 + robot.resistance_noise * noise)
+        rolling_resistance=rolling * (1.0 + robot.resistance_noise * noise),
     )
     voltage, current = robot.battery(robot.propulsion_watt(wheel_power, driven.wheel_mps), dt_s=_DT_S)
     return voltage, current, 0.5 + 0.15 * np.tanh(yaw_rate)

@@ -24,7 +24,7 @@ from tcpipe.power.rails import (
     compute_power_watt,
     count_samples_inside,
     estimate_idle_power,
-    integrate_energy
+    integrate_energy,
 )
 from tcpipe.recipe import LabelConfig
 from tcpipe.stages.label_motion import (
@@ -34,7 +34,7 @@ from tcpipe.stages.label_motion import (
     is_clock_doubtful,
     make_label_facts,
     make_motion_columns,
-    sum_energy_entries
+    sum_energy_entries,
 )
 from tcpipe.stages.message_arrays import make_rails
 from tcpipe.tables.arrays import make_lines, select_rows, to_numbers

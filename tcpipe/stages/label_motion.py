@@ -19,7 +19,7 @@ from tcpipe.cost.labels import (
     has_low_power_rate,
     has_slip,
     spans_near,
-    touches_voltage_outside
+    touches_voltage_outside,
 )
 from tcpipe.fusion.measurements import GNSS, IMU
 from tcpipe.fusion.process import estimate_gyro_density
@@ -246,7 +246,7 @@ def make_label_facts(
         },
         energy_budget=_make_budget(energy, energy_variance_j2),
         quality={flag_name(bit): int(((quality & np.uint32(bit)) != 0).sum()) for bit in Quality},
-        physics=physics
+        physics=physics,
     )
 
 

@@ -25,7 +25,7 @@ from tcpipe.terrain.sampling import (
     has_other_pixels,
     join_patches,
     make_patch_frames,
-    sample_patches
+    sample_patches,
 )
 from tcpipe.terrain.tiles import MapReader, TilePool, choose_level, find_map_projection
 

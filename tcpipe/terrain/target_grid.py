@@ -216,7 +216,7 @@ class MapGrid:
             self.x_min_m,
             self.y_max_m - self.rows * self.pixel_size_m,
             self.x_min_m + self.cols * self.pixel_size_m,
-            self.y_max_m
+            self.y_max_m,
         )
 
     @property

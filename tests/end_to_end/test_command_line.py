@@ -335,7 +335,7 @@ def test_a_log_that_is_still_written_is_not_taken_for_whole(log: Path, tmp_path:
     assert (done.returncode, done.stderr) == (0, "")
     (result,) = told(done)["results"]
     assert result["status"] == "waiting"
-    assert "changed while it was looked at" in result["notes"][0]
+    assert "changed during the check" in result["notes"][0]
     assert not list(tmp_path.glob("tcpipe-store/runs/*"))
 
 
@@ -468,7 +468,7 @@ def test_a_batch_that_is_ended_goes_on_where_it_was(number: signal.Signals, logs
     _, told = running.communicate(timeout=HANGS_S)
     if number != signal.SIGKILL:
         assert running.returncode == 128 + number
-        assert "nothing is half-written" in told
+        assert "no output is incomplete" in told
         assert "Traceback" not in told
         assert not list(tmp_path.rglob(".tmp-*"))
     end = time.monotonic() + 20

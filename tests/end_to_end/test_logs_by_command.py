@@ -197,7 +197,7 @@ def test_logs_in_object_storage(tmp_path):
         assert "nothing to do: 1 of 1" in again.stdout
         assert len(fetched) == requests  # what is known is not fetched again
         denied = tcpipe("inspect", f"s3://{FORBIDDEN}/run.mcap", cwd=tmp_path, env=environment)
-        assert "wants credentials; set AWS_" in plain_lines(denied, 1, most=1)
+        assert "requires credentials; set AWS_" in plain_lines(denied, 1, most=1)
 
 
 @pytest.fixture

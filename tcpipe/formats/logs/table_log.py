@@ -281,7 +281,7 @@ def read_cells(path: Path, *, stamp: str, columns: list[str]) -> Cells:
         is_time,
         {name: values.fill_null(np.nan).to_numpy() for name, values in numbers.items()},
         texts,
-        tuple(dict.fromkeys(f"{path.name}: {str(line.message).splitlines()[0]}" for line in said))
+        tuple(dict.fromkeys(f"{path.name}: {str(line.message).splitlines()[0]}" for line in said)),
     )
 
 
@@ -344,7 +344,7 @@ def _scan(path: Path, numbers: list[str] | None = None, *, quote: str | None = '
         infer_schema=numbers is not None,
         infer_schema_length=_INFERRED_ROWS,
         ignore_errors=True,
-        truncate_ragged_lines=True
+        truncate_ragged_lines=True,
     )
 
 

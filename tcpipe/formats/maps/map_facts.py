@@ -22,7 +22,7 @@ from tcpipe.terrain.layers import (
     Layer,
     make_categorical_layer,
     make_continuous_layer,
-    make_paper_layers
+    make_paper_layers,
 )
 
 

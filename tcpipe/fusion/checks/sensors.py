@@ -29,7 +29,7 @@ from tcpipe.fusion.checks.distances import (
     find_contradictions,
     find_distances,
     find_frozen_sensors,
-    refuse_frozen
+    refuse_frozen,
 )
 from tcpipe.fusion.checks.lags import (
     FIXES_S,
@@ -66,7 +66,7 @@ from tcpipe.fusion.measurements import (
     GroundVelocities,
     InertialMeasurements,
     Measurements,
-    Positions
+    Positions,
 )
 from tcpipe.fusion.signals import compute_median_period_ns, compute_seconds, hold_last, integrate_signal, is_in_gap
 from tcpipe.tables.facts import AxisFacts, SensorChecks, make_vector

@@ -379,7 +379,7 @@ def _find_twice(run: RunDirectory, duplicates: int, others: Sequence[str]) -> Fi
         Subject("run", run.run_id),
         names={"others": ", ".join(others)},
         duplicate_count=duplicates,
-        segment_count=run.facts.segments
+        segment_count=run.facts.segments,
     )
 
 

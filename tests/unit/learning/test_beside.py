@@ -86,9 +86,9 @@ def test_physics_is_a_model_like_the_others(told, tmp_path):
     with pytest.raises(ModelError, match="physics needs the slope and class of each patch"):
         model.predict(split.with_channels("height").patches)
     assert tcpipe("train", told, "model", "--model", "physics", cwd=tmp_path).stdout.startswith("model: nothing to do")
-    with pytest.raises(UsageError, match="leave out --physics-from"):
+    with pytest.raises(UsageError, match="remove --physics-from"):
         choose_model(str(tmp_path / "model"), physics=str(told))
-    with pytest.raises(UsageError, match="takes no commanded speed; leave out --speed"):
+    with pytest.raises(UsageError, match="has no input for the commanded speed; remove --speed"):
         choose_model(str(tmp_path / "model"), speed_mps=0.5)
 
 

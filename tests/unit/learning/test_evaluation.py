@@ -92,7 +92,7 @@ def test_a_model_of_net_energy_is_compared_with_net_energy(model, dataset, tmp_p
     found = values.splits["unseen"]
     assert found.errors["E"]["all"].rmse == pytest.approx(np.sqrt(np.mean((told - energy) ** 2)), rel=1e-4)
     assert found.label_floor["E"]["all"].rmse == pytest.approx(1.2)
-    assert "above what the robot draws" in (tmp_path / "evaluation" / "evaluation.html").read_text()
+    assert "net of idle power" in (tmp_path / "evaluation" / "evaluation.html").read_text()
 
 
 def test_how_near_training_it_is_and_what_blocks_say(evaluated, model, dataset):
@@ -112,7 +112,7 @@ def test_how_near_training_it_is_and_what_blocks_say(evaluated, model, dataset):
     tables = [part for part in page.split("<h2>")[1:] if "<table" in part]
     assert len(tables) >= 6
     assert all("Audit (test held out by block)" in part for part in tables)
-    assert "the one fold of train that stopped it (20 samples)" in page
+    assert "the fold of train used for early stopping (20 samples)" in page
     assert page.count("held-out blocks of train") == 8  # RMSE and MAPE of four quantities, beside the rows of test
     residuals = load_model(model).residuals
     assert values.blocks["w"]["all"].count == len(residuals["power_watt"])
@@ -193,7 +193,7 @@ def test_its_files_say_the_same(evaluated):
     )
     assert float(row["rmse"]) == values.splits["unseen"].errors["E"]["mud"].rmse
     page = (place / "evaluation.html").read_text()
-    for told in ("Table I:", "Table II:", "Table III:", "Table V:", "12.80", "17.45", "Worst metres"):
+    for told in ("Table I:", "Table II:", "Table III:", "Table V:", "12.80", "17.45", "Worst segments"):
         assert told in page
     tables = re.split(r"<h2>Table [IV]+:", page)[1:]
     assert len(tables) == 5
@@ -321,7 +321,7 @@ def test_a_network_of_energy_alone_is_no_model_to_evaluate(dataset, tmp_path):
     place = made_model(
         tmp_path / "energy", architecture=architecture, channels=("height",), outputs=("energy_joule",), scale=(400.0,)
     )
-    with pytest.raises(ModelError, match="it predicts energy_joule alone, expected power_watt and velocity_mps"):
+    with pytest.raises(ModelError, match="it predicts only energy_joule, expected power_watt and velocity_mps"):
         run_evaluation(place, dataset, tmp_path / "evaluation", config=CONFIG)
 
 

@@ -251,7 +251,7 @@ def test_what_cannot_be_decoded_is_a_finding_each_and_one_line_of_the_error() ->
     proto = topic("/proto", IMU, problem="its messages are encoded as protobuf; cdr and ros1 are read")
     empty = topic("/empty", IMU, 0, problem="its messages are encoded as cbor; cdr and ros1 are read")
     found = assign_roles([*json, proto, empty], {})
-    (said,) = [line for line in found.problems if line.startswith("topics that hold data which")]
+    (said,) = [line for line in found.problems if line.startswith("topics with data that")]
     assert (
         "/json0, /json1, /json10, /json11, /json2, /json3, /json4, /json5 and 4 more: its messages are encoded as json"
         in said

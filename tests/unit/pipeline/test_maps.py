@@ -307,5 +307,5 @@ def test_the_command_takes_patterns_and_repeated_options_and_knows_a_pattern_wit
     assert CliRunner().invoke(cli, [*whole, str(tmp_path / "*/dem.tif")], catch_exceptions=False).exit_code == 0
     again = CliRunner().invoke(cli, [*whole, east, "--height", west], catch_exceptions=False)
     assert "nothing to do" in again.stdout
-    with pytest.raises(UsageError, match="is a pattern without quotes"):
+    with pytest.raises(UsageError, match="quote patterns, as in"):
         CliRunner().invoke(cli, [*whole, east, west], standalone_mode=False, catch_exceptions=False)

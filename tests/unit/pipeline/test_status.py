@@ -97,7 +97,7 @@ def test_losses_are_the_metres_of_all_manifests_the_largest_first(first_night):
 
 def test_without_logs_it_looks_where_ingest_was_told_to(first_night, tmp_path):
     assert find_status(store=first_night / "store", recipe=Recipe()).counts == where(first_night).counts
-    with pytest.raises(UsageError, match="no call of ingest is remembered here; give the logs"):
+    with pytest.raises(UsageError, match="no earlier call of ingest is known; give the logs"):
         find_status(store=tmp_path, recipe=Recipe())
 
 

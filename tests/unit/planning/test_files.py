@@ -162,7 +162,7 @@ def test_files_of_the_user_are_left_alone(source, path):
     with pytest.raises(UsageError, match="is no plan; it is not changed"):
         plan(MODEL, source, _request(source, cell_size_m=2.0), out=path, picture=None)
     mine = path.rename(path.with_suffix(".json"))
-    with pytest.raises(UsageError, match="is the path itself"):
+    with pytest.raises(UsageError, match="is the file of the path"):
         predict_path(MODEL, source, mine, mine)
     assert mine.read_bytes() == before
 

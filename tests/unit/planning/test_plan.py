@@ -104,7 +104,7 @@ def test_ends_that_cannot_be_used_are_named_together():
         _plan(source, (15.0, 4.0), (4.0, 4.0), "time")
     with pytest.raises(PathError, match=r"are 0\.\d+ m apart"):
         _plan(source, (4.0, 4.0), (4.3, 4.0), "time")
-    with pytest.raises(PathError, match="lie in one cell of 5 m; choose a smaller --cell-size"):
+    with pytest.raises(PathError, match="are in one cell of 5 m; choose a smaller --cell-size"):
         _plan(source, (1.0, 4.0), (4.0, 4.0), "time", survey=make_survey(MODEL, source, 5.0))
     swapped = lonlat(source, (4.0, 4.0), (26.0, 4.0))[:, ::-1]
     with pytest.raises(PathError, match="axes look swapped") as error:
@@ -118,7 +118,7 @@ def test_no_way_says_what_would_open_one():
         _plan(source, (4.0, 4.0), (20.0, 4.0), "distance")
     mud = plane(24.0, classes=lambda east, _: np.where(np.abs(east - 12.0) < 1.5, 5, 4))
     grass_only = replace(MODEL, class_counts={4: 100}, pixel_classes=(4,))
-    with pytest.raises(PathError, match="--allow-extrapolation crosses it"):
+    with pytest.raises(PathError, match="--allow-extrapolation crosses other ground"):
         _plan(mud, (4.0, 4.0), (20.0, 4.0), "distance", model=grass_only)
     found = _plan(mud, (4.0, 4.0), (20.0, 4.0), "time", model=grass_only, allow_extrapolation=True)
     assert found.totals.reasons["class_outside_training"] >= 3

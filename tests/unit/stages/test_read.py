@@ -522,7 +522,7 @@ def test_a_pose_is_placed_by_its_crs_and_stands_in_for_the_fixes():
     local = read(topics, topics={"pose": ["/slam/pose"]})
     assert local.tables["pose"]["lon_deg"].null_count == 100
     assert "pose-not-georeferenced" in codes(local)
-    for crs, said in (("EPSG:4326", "not projected"), ("MTM 7", "not a coordinate reference system")):
+    for crs, said in (("EPSG:4326", "not projected"), ("MTM 7", "not a CRS")):
         with pytest.raises(RecipeError, match=said):
             read(topics, topics={"pose": ["/slam/pose"]}, pose_crs=crs)
 

@@ -459,7 +459,7 @@ def test_several_wrong_rasters_are_named_at_once(tmp_path):
 
 def test_a_wanted_crs_must_be_metric(tmp_path):
     write_tif(tmp_path / "h.tif", raster_of(plane, NORTH_UP), None, NORTH_UP)
-    for crs, wanted in (("EPSG:3857", "not metric"), ("EPSG:4326", "not metric"), ("nonsense", "not a coordinate")):
+    for crs, wanted in (("EPSG:3857", "not metric"), ("EPSG:4326", "not metric"), ("nonsense", "not a CRS")):
         with pytest.raises(MapError, match=wanted):
             built(tmp_path, height=tmp_path / "h.tif", crs=crs)
     _, source = built(tmp_path, height=tmp_path / "h.tif", crs="EPSG:32633")

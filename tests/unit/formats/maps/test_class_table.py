@@ -53,7 +53,7 @@ def test_every_wrong_line_is_named(tmp_path):
     assert "from 1 to 255" in lines[1]
     assert "neither true nor false" in lines[2]
     assert "name is missing" in lines[3]
-    assert "value 5 stands for id 5 already" in lines[4]
+    assert "value 5 already has id 5" in lines[4]
     assert "id 5 was" in lines[5]
 
 

@@ -253,7 +253,7 @@ def test_distances_do_not_tell_the_scale_of_the_plane(built):
         as_before = as_before.set_column(at, name, [(redacted[name].to_numpy() * k / 0.01).round() * 0.01])
     assert compute_plane_per_chord(as_before)[0] == pytest.approx(k, abs=5 * std)
     assert any(
-        "the scale of the maps' plane tells the place" in line
+        "the scale of the maps' plane reveals the place" in line
         for line in find_leaks(read_card(here / "redacted"), as_before)
     )
 
