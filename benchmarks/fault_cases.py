@@ -212,7 +212,9 @@ def _make_model(place: Path) -> None:
     config = FitConfig(epochs=1, width=16)
     training = replace(CARD.training, config=config, samples={"fitted": 100, "held out": 20})
     made_model(
-        place / "model", training_range=TrainingRange(CARD.training_range.class_counts | {5: 10}, (4, 5, 6, 7), ranges), training=training
+        place / "model",
+        training_range=TrainingRange(CARD.training_range.class_counts | {5: 10}, (4, 5, 6, 7), ranges),
+        training=training,
     )
     ends = [[float(value) for value in end.split(",")] for end in (FROM, TO)]
     (place / "path.geojson").write_text(json.dumps({"type": "LineString", "coordinates": ends}))

@@ -242,12 +242,12 @@ def _bits(column: str, flags: type[IntFlag]) -> str:
 _TROUBLESHOOTING = """# Findings: troubleshooting
 
 What tcpipe reports about logs, maps, runs and datasets. Each line of a report ends with a code in brackets, as `[no-gnss]`; search this
-page for the code, or for words such as dropout, lever arm, time offset, drift, multipath, no power.
+page for the code, or for words such as dropout, lever arm, time offset, drift, multipath, no power (more in parentheses).
 
 An **error** makes the labels that it affects not usable, a **warning** usable with care; a **note** changes no verdict. Data are kept
 unless the line states corrected, inflated (larger σ), excluded (the sensor or run) or rejected (the measurement). `tcpipe ingest`
-ends with exit code 3 for a **problem** until you acknowledge it (`tcpipe acknowledge`). `tcpipe inspect RUN` lists all findings of a run
-with their remedies, `--json` as data. Here … stands for the recipe line or command that the finding prints.
+ends with exit code 3 for a **problem** until you acknowledge it (`tcpipe acknowledge`). `tcpipe inspect STORE/runs/RUN` lists all
+findings of a run with their remedies, `--json` as data. Here … stands for the recipe line or command that the finding prints.
 """
 
 
@@ -276,7 +276,7 @@ def _finding(code: str, entry: Entry) -> str:
     lines += [f"Thresholds: {limits}.\n"] if limits else []
     above = "\n".join(lines).lower()
     words = [word for word in entry.words if word.lower() not in above]
-    lines += [f"*Search:* {', '.join(words)}.\n"] if words else []
+    lines += [f"({', '.join(words)})\n"] if words else []
     return "\n".join(lines)
 
 

@@ -26,7 +26,7 @@ FIRST, LAST, REPLACE, APPEND, CREATE = "first statement", "last statement", "rep
 COLUMN = "dataclasses.replace({0}, columns=(*{0}.columns, Column('mine', pa.float64(), 'm', 'mine')))"
 CHANGES = {
     "threshold": ("FuseConfig", REPLACE, "= 0.999\n", "= 0.99\n"),
-    "outlier gate": ("find_chi_square_threshold", FIRST, "probability = 0.5"),
+    "outlier gate": ("filter_block", FIRST, "return 'mine'"),
     "check of a sensor": ("check_sensors", FIRST, "return 'mine'"),
     "mask": ("mask_track", FIRST, "return 'mine'"),
     "w, v, T, E and their σ": ("compute_labels", FIRST, "displacement_std_m = 2 * displacement_std_m"),
@@ -53,7 +53,7 @@ CHANGES = {
     ),
     "command": ("_COMMANDS", APPEND, "\n_COMMANDS['mine'] = ('mine', 'My command')\n"),
     "command option": ("IngestOptions", LAST, "mine: bool = option(False, Option('Mine.'))"),
-    "plot of a page": ("time_plots", FIRST, "return 'mine'"),
+    "plot of the page of a run": ("time_plots", FIRST, "return 'mine'"),
 }
 """By row: the name (or file) that is changed, and how."""
 
@@ -61,7 +61,7 @@ IMPORTS = "".join(
     f"from {file.removesuffix('.py').replace('/', '.')} import {name}\n"
     for places in PLACES.values()
     for file, name in places
-    if name and name != "take"
+    if name
 )
 EFFECTS = """
 import inspect, json
@@ -97,7 +97,7 @@ except LogError as error:
 profiles = load_shipped_profiles()
 print(json.dumps({
     "threshold": Recipe().fuse.gate_probability == 0.99,
-    "outlier gate": find_chi_square_threshold(1, 0.999) < 1.0,
+    "outlier gate": call(filter_block) == "mine",
     "check of a sensor": call(check_sensors) == "mine",
     "mask": call(mask_track) == "mine",
     "w, v, T, E and their σ": bool(labels.duration_std_s[0] == 2.0),
@@ -112,7 +112,7 @@ print(json.dumps({
     "finding": read_catalogue()["mine"].title == "Mine",
     "command": CliRunner().invoke(cli, ["mine"]).output == "mine\\n",
     "command option": "--mine" in CliRunner().invoke(cli, ["ingest", "--help"]).output,
-    "plot of a page": call(time_plots) == "mine",
+    "plot of the page of a run": call(time_plots) == "mine",
 }))
 """
 

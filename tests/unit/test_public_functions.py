@@ -129,8 +129,8 @@ def test_the_functions_give_what_the_commands_print(place, monkeypatch):
     assert (trained.status, trained.path) == ("done", "model")
     assert _said(here, "train", "dataset", "model", "--model", "physics")["status"] == "unchanged"
 
-    found = tcpipe.evaluate("model", "dataset", draws=2, baselines=False)
-    assert found.values.config == EvaluateConfig(draws=2, baselines=False)
+    found = tcpipe.evaluate("model", "dataset", noise_draws=2, baselines=False)
+    assert found.values.config == EvaluateConfig(noise_draws=2, baselines=False)
     said = _said(here, "evaluate", "model", "dataset", "again", "--noise-draws", "2", "--no-baselines", "--quiet")
     assert said["splits"]["test"]["errors"]["E"]["all"]["rmse"] == found.values.splits["test"].errors["E"]["all"].rmse
     drives = tcpipe.evaluate("model", "dataset", "drives", drives=["north"], map_name="site", store=store)
