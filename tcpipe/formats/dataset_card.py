@@ -25,7 +25,7 @@ KIND = "tcpipe dataset"
 class LabelColumns:
     """Which columns of samples.parquet train, and which velocity that is."""
 
-    columns: tuple[str, ...]
+    columns: tuple[str, str]
     velocity: str
     includes: tuple[str, ...] = field(default=(), metadata=LEFT_OUT)
     """Loads besides the drives in the power of any run."""

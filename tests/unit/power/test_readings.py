@@ -87,7 +87,7 @@ def test_clearpath_power_by_platform(robot: str, option: str, expected: np.ndarr
     np.testing.assert_allclose(power_watt(found), expected, rtol=1e-9)
     assert found.averaged == (robot != "husky")  # a Husky's driver asks for the state of the moment
     assert bool(found.findings) == (robot not in ("husky", "jackal"))  # the total current feeds the computers too
-    assert [("power-includes-loads", name) for name in found.other_loads] == [
+    assert [("power-includes-loads", name) for name in found.includes] == [
         (of.code, of.names["loads"]) for of in found.findings
     ]
 
