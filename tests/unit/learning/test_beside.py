@@ -121,5 +121,5 @@ def test_an_older_dataset_cannot_tell_and_says_so(dataset, tmp_path, monkeypatch
     train(dataset, tmp_path / "physics", config=FitConfig(model="physics"))
     physics = load_model(tmp_path / "physics")
     assert not physics.takes_turns
-    with pytest.raises(ModelError, match="is a model of physics, which has no network"):
+    with pytest.raises(ModelError, match="is a model of kind physics, without a network"):
         _ = physics.network

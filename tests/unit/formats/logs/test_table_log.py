@@ -134,7 +134,7 @@ def test_all_that_a_mapping_names_in_vain_is_said_at_once(tmp_path):
     for words in (
         "tables.gnss.file: there is no fixes.csv here; there are imu.csv, late.csv, odom.csv",
         "tables.imu.columns: imu needs angular_velocity_y",
-        "tables.cmd: plays role 'cmd'; expected one of gnss",
+        "tables.cmd: role is 'cmd'; expected one of gnss",
         "column v of words.csv contains text ('fast' in row 1), expected numbers",
         "odom.csv has no column px, py; it has t, v, w",
         "relative.csv, column t: its stamps",

@@ -171,7 +171,7 @@ WRONG = {
     "infinite": (polygon([*SQUARE[:4], [float("inf"), 1.0], SQUARE[0]]), "not rings of finite"),
     "nan": (polygon([*SQUARE[:4], [float("nan"), 1.0], SQUARE[0]]), "not rings of finite"),
     "huge": (polygon([[1e308, 1e308], *SQUARE[1:4], [1e308, 1e308]]), "no lon/lat degrees"),
-    "long": ('{"type": "' + "x" * 10**6 + '"}', "xxx…, wanted"),
+    "long": ('{"type": "' + "x" * 10**6 + '"}', "xxx…, expected"),
 }
 
 
