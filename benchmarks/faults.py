@@ -218,7 +218,7 @@ def _untrue(plain: Undisturbed, fault: Fault, ended: Ended, now: Tree) -> Iterat
         if ended.late_s > LATEST_S and fault.after_s:
             yield f"took {ended.late_s:.1f} s to end"
         if ended.code != 128 + fault.signal:
-            yield f"ends with {ended.code}, wanted {128 + fault.signal}: {ended.said.strip()[-200:]}"
+            yield f"ends with {ended.code}, expected {128 + fault.signal}: {ended.said.strip()[-200:]}"
     elif ended.code not in (1, 3) or "No space left" not in ended.said:
         yield f"ends with {ended.code}: {ended.said.strip()[-200:]}"
 

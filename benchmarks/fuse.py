@@ -225,7 +225,7 @@ def _ratios(found: dict[str, list[float]]) -> None:
         print("no g++ or no Eigen (libeigen3-dev): not compared with C++")
     for name, other, limit in wanted:
         ratio = statistics.median(a / b for a, b in zip(found[name], found[other], strict=True))
-        print(f"{name} / {other}: {ratio:.4f} (wanted {limit})")
+        print(f"{name} / {other}: {ratio:.4f} (expected {limit})")
 
 
 def fuse_hours(hours: float) -> None:

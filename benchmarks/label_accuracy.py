@@ -61,12 +61,12 @@ def figures(run: RunDirectory, truth: Truth) -> Iterator[tuple[str, str]]:
 
 
 def describe_net_labels(segments: pa.Table, truth: Truth) -> Iterator[tuple[str, str]]:
-    """Yield the same of what is above standing; the truth's standing power is that of steps in which nothing moves."""
+    """Yield the same net of idle power; the truth's standing power is that of steps in which nothing moves."""
     still = (truth.wheel_velocity_mps == 0.0) & (np.abs(truth.angular_velocity_radps).max(axis=1) < 1e-6)
     standing = float(np.median(truth.power_watt[still]))
     true = compute_true_cost(truth, to_integers(segments, "start_ns"))
     told, std = to_floats(segments, "idle_power_watt"), to_floats(segments, "idle_power_std_watt")
-    yield "standing power", f"{told[0]:.2f} W, claimed deviation {std[0]:.2f} W; truth {standing:.2f} W"
+    yield "idle power", f"{told[0]:.2f} W, claimed deviation {std[0]:.2f} W; truth {standing:.2f} W"
     wanted = true.energy_joule - standing * true.duration_s
     error = to_floats(segments, "net_energy_joule") - wanted
     std = to_floats(segments, "net_energy_std_joule")

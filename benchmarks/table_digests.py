@@ -287,7 +287,7 @@ def main() -> None:
         print(describe_counts(digests))
         return
     if wrong := [pair for pair in given.renamed if not re.fullmatch(r"[^=]+=[^=]+", pair)]:
-        parser.error(f"--renamed {wrong[0]}: wanted OLD=NEW")
+        parser.error(f"--renamed {wrong[0]}: expected OLD=NEW")
     renamed = dict(pair.split("=", 1) for pair in given.renamed)
     first = flatten_digests(given.first, renamed, set(given.ignore))
     second = flatten_digests(given.second, {}, set(given.ignore))

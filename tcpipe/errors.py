@@ -111,7 +111,7 @@ class MissingFileError(StoreError):
     """A file that the store should have is gone; ``where`` is its path or URL."""
 
     def __init__(self, where: str, findings: Iterable[Any] = ()) -> None:
-        super().__init__(f"{where}: is gone", findings=findings)
+        super().__init__(f"{where}: is missing", findings=findings)
         self.where = where
 
     def __reduce__(self) -> tuple[type[TcpipeError], tuple[str, ...], dict[str, tuple[Any, ...]]]:

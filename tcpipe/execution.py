@@ -89,7 +89,7 @@ def run_all(
         suspects: list[int] = []
         yield from _run_until_broken(function, tasks, waiting, suspects, workers=min(jobs, len(waiting)))
         if suspects:
-            logger.warning("a worker process died; what ran beside it runs again, one by one")
+            logger.warning("a worker process died; the tasks that ran at the same time run again, one by one")
         for index in suspects:  # one of those that ran when the pool broke killed it: each again, alone
             yield _run_alone(function, tasks[index], index)
 
@@ -232,13 +232,13 @@ def _run_on_cluster(function: Callable[[T], R], tasks: Sequence[T], address: str
                     yield Outcome(index, None, died=True)
                 except ModuleNotFoundError as error:
                     raise UsageError(
-                        f"{address}: a worker lacks {error.name}; install there what is installed here"
+                        f"{address}: a worker lacks {error.name}; install the same packages there as here"
                     ) from None
                 except RuntimeError as error:
                     if "deserialization" not in str(error):
                         raise
                     raise UsageError(
-                        f"{address}: the scheduler lacks tcpipe; install there what is installed here"
+                        f"{address}: the scheduler lacks tcpipe; install the same packages there as here"
                     ) from None
                 else:
                     _spent["cpu_s"] += cpu_s
@@ -258,9 +258,9 @@ def _wait_for_first(client: Client, running: Iterable[Any], address: str) -> Seq
         except TimeoutError:
             alone_s = 0.0 if client.nthreads() else alone_s + _ANSWER_S
         if alone_s and not said:
-            logger.warning("%s: has no workers any more; waiting for one", address)
+            logger.warning("%s: lost all its workers; waiting for one", address)
             said = True
-    raise TcpipeError(f"{address}: has had no workers for {_ALONE_S} s; start some, and run the same command again")
+    raise TcpipeError(f"{address}: had no workers for {_ALONE_S} s; start workers and run the same command again")
 
 
 @contextmanager
@@ -268,9 +268,9 @@ def _connect_client(address: str) -> Iterator[Client]:
     try:
         from distributed import Client  # noqa: PLC0415  most calls stay on this machine
     except ImportError:
-        raise UsageError("dask not installed, wanted for --cluster: pip install 'tcpipe[cluster]'") from None
+        raise UsageError("dask not installed, required for --cluster: pip install 'tcpipe[cluster]'") from None
     if not _ADDRESS.fullmatch(address):
-        raise UsageError(f"{address!r}: no address of a Dask scheduler; wanted tcp://host:port or tls://host:port")
+        raise UsageError(f"{address!r}: no address of a scheduler; expected tcp://host:port or tls://host:port")
     with _mute_loggers("distributed", "distributed.client"):
         try:
             client = Client(address, timeout=_ANSWER_S, set_as_default=False)
@@ -281,7 +281,7 @@ def _connect_client(address: str) -> Iterator[Client]:
             with client:
                 yield client
         except (OSError, CancelledError):
-            raise TcpipeError(f"{address}: the scheduler is gone; start it, and run the same command again") from None
+            raise TcpipeError(f"{address}: the scheduler stopped; start it and run the same command again") from None
 
 
 @contextmanager
@@ -307,24 +307,24 @@ def _count_workers(client: Client, address: str) -> int:
         client.wait_for_workers(1, timeout=_ALONE_S)
     except TimeoutError:
         raise UsageError(
-            f"{address}: the scheduler has no workers; start some: dask worker {address} --nthreads 1"
+            f"{address}: the scheduler has no workers; start one: dask worker {address} --nthreads 1"
         ) from None
     threads = client.nthreads()
     if many := [worker for worker, count in threads.items() if count != 1]:
         raise UsageError(
-            f"{many[0]}: has {threads[many[0]]} threads; wanted one a worker: dask worker {address} --nthreads 1"
+            f"{many[0]}: has {threads[many[0]]} threads; expected one a worker: dask worker {address} --nthreads 1"
         )
     # Not a function of tcpipe: a worker that lacks it would end when it is handed one.
     for worker, version in client.run(eval, "__import__('tcpipe').__version__", on_error="return").items():
         if isinstance(version, ImportError):
-            raise UsageError(f"{worker}: a worker lacks tcpipe ({version}); install there what is installed here")
+            raise UsageError(f"{worker}: a worker lacks tcpipe ({version}); install the same packages there as here")
         if version != __version__ and isinstance(version, str):  # else it is gone again
             raise _make_cluster_error(worker, version, wanted=__version__)
     return len(threads)
 
 
 def _make_cluster_error(worker: str, version: str, *, wanted: str) -> UsageError:
-    return UsageError(f"{worker}: a worker has tcpipe {version}, wanted {wanted} as here; install that")
+    return UsageError(f"{worker}: a worker has tcpipe {version}, expected {wanted} as here; install that")
 
 
 @dataclass(frozen=True, slots=True)

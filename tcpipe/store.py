@@ -119,7 +119,7 @@ class Store:
         """Return the number of a map's last document, 0 where there is none; `StoreError` if the name cannot be one."""
         if not _MAP_NAME.fullmatch(name):
             raise StoreError(
-                f"map name {name!r}: wanted letters, digits, '_', '-', '.', beginning with a letter or digit"
+                f"map name {name!r}: expected letters, digits, '_', '-', '.', beginning with a letter or digit"
             )
         return find_highest_numbers(self.place.files("maps")).get(name, 0)
 
@@ -441,7 +441,7 @@ def run_at(path: Path | str) -> tuple[Store, list[RunDirectory]] | None:
     if damaged := [line for (_, recipe), line in found.damaged.items() if recipe_id in (None, recipe)]:
         raise StoreError(*damaged)
     if not runs:
-        raise StoreError(f"{path}: holds no finished run of data model {DATA_MODEL_VERSION}; ingest its log again")
+        raise StoreError(f"{path}: contains no finished run of data model {DATA_MODEL_VERSION}; ingest its log again")
     return store, runs
 
 
@@ -464,7 +464,7 @@ def open_store(root: str | Path, *, create: bool = False) -> Store:
     StoreError : it cannot be reached or written, or is of a data model that this version does not know.
     """
     if is_url(root) and not is_bucket(root):
-        raise UsageError(f"{root}: no store can lie there; wanted a directory, s3://bucket/name, gs:// or az://")
+        raise UsageError(f"{root}: no place for a store; expected a directory, s3://bucket/name, gs:// or az://")
     root = str(root).rstrip("/") if is_url(root) else check_local_output(root)
     store = Store(root)
     if isinstance(root, Path):
@@ -489,6 +489,6 @@ def open_store(root: str | Path, *, create: bool = False) -> Store:
 
 def _refuse_file(path: Path, *, create: bool) -> None:
     if path.exists() and not path.is_dir():
-        raise UsageError(f"{path}: is a file, wanted a directory for the store")
+        raise UsageError(f"{path}: is a file, expected a directory for the store")
     if not path.exists() and not create:
         raise UsageError(f"{path}: there is no store here; run 'tcpipe ingest' first, or name another with --store")

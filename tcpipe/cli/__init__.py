@@ -33,31 +33,31 @@ C = TypeVar("C", bound=Callable[..., Any])
 
 
 _COMMANDS = {
-    "demo": ("site_commands", "See everything work on a simulated site"),
+    "demo": ("site_commands", "Run all commands on a simulated site"),
     "init": ("site_commands", "Write a commented recipe"),
-    "inspect": ("inspect", "What is in a log, map, dataset or store"),
-    "preflight": ("log_commands", "What a minute of recording promises"),
-    "ingest": ("log_commands", "Logs to labelled 1 m segments"),
-    "status": ("log_commands", "Where every log stands"),
+    "inspect": ("inspect", "List the contents of a log, map, dataset or store"),
+    "preflight": ("log_commands", "Check a short test recording before a campaign"),
+    "ingest": ("log_commands", "Convert logs to labelled 1 m segments"),
+    "status": ("log_commands", "List the state and problems of every log"),
     "acknowledge": ("log_commands", "Do not report known problems again"),
     "prune": ("log_commands", "Remove what a store no longer needs"),
-    "add-map": ("dataset_commands", "Rasters of a site into the store"),
-    "build-dataset": ("dataset_commands", "Segments and map to a dataset"),
+    "add-map": ("dataset_commands", "Add the rasters of a site to the store"),
+    "build-dataset": ("dataset_commands", "Build a dataset from segments and maps"),
     "train": ("model_commands", "Train a model on a dataset"),
-    "evaluate": ("model_commands", "Measure a model, beside the paper's tables"),
-    "reproduce": ("model_commands", "The paper's experiment, on a simulated site"),
-    "predict-path": ("model_commands", "Time and energy of a path"),
-    "cost-map": ("model_commands", "Directional cost maps of a whole map"),
-    "plan-path": ("model_commands", "The path of least energy, time or distance"),
-    "report": ("dataset_commands", "HTML page of a run, dataset or store"),
-    "overlay": ("log_commands", "A run as MCAP, to see beside its log"),
-    "export": ("dataset_commands", "Topics as Parquet; a dataset for QGIS"),
-    "explain": ("dataset_commands", "Where a sample came from; make it again"),
-    "verify": ("dataset_commands", "Re-read everything, compare counts and checksums"),
-    "migrate": ("dataset_commands", "Bring a store, map or dataset to this data model"),
-    "diff": ("dataset_commands", "What changed between two datasets, by cause"),
-    "schemas": ("site_commands", "The contracts as JSON Schema"),
-    "simulate": ("site_commands", "A simulated site with its truth"),
+    "evaluate": ("model_commands", "Evaluate a model and compare it with the paper"),
+    "reproduce": ("model_commands", "Repeat the paper's experiment on a simulated site"),
+    "predict-path": ("model_commands", "Predict time and energy of a path"),
+    "cost-map": ("model_commands", "Compute directional cost maps of a whole map"),
+    "plan-path": ("model_commands", "Plan the path of least energy, time or distance"),
+    "report": ("dataset_commands", "Write the Write the HTML page of a run, dataset or store"),
+    "overlay": ("log_commands", "Write a run as MCAP, to view with its log"),
+    "export": ("dataset_commands", "Export topics as Parquet, or a dataset for QGIS"),
+    "explain": ("dataset_commands", "Trace a sample to its log and compute it again"),
+    "verify": ("dataset_commands", "Read all files again, compare counts and checksums"),
+    "migrate": ("dataset_commands", "Convert a store, map or dataset to this data model"),
+    "diff": ("dataset_commands", "List the differences of two datasets, by cause"),
+    "schemas": ("site_commands", "Write the JSON Schemas of tables and documents"),
+    "simulate": ("site_commands", "Write a simulated site with its true values"),
 }
 """The module and the purpose of each command, in the order a user meets them; the command NAME-X is the function NAME_X there."""
 
@@ -115,7 +115,7 @@ def _begin_debugging(context: click.Context, _: click.Parameter, wanted: bool) -
 
 def _debug_option(*, hidden: bool) -> Callable[[C], C]:
     """Return ``--debug``, which is accepted before and after the command's name."""
-    about = "Say what is done and when, and where an error comes from; also after COMMAND."
+    about = "Log each step with its time, and print the traceback of an error; also after COMMAND."
     return click.option(
         "--debug", is_flag=True, is_eager=True, expose_value=False, callback=_begin_debugging, hidden=hidden, help=about
     )
@@ -141,7 +141,7 @@ def cli() -> None:
     """  # noqa: D301  \b keeps the block's lines
 
 
-_NOTHING_HALF = "nothing is half-written; run the same command again"
+_NOTHING_HALF = "no output is incomplete; run the same command again"
 _LATEST_S = 4.0
 """So long a process has to end in order: a library that waits for a network or computes lets no signal through to Python."""
 
@@ -270,7 +270,7 @@ def _describe_unforeseen(error: Exception) -> str:
     """Return the message for a package that only an extra installs, or for a bug."""
     lacking = str(error.name).partition(".")[0] if isinstance(error, ModuleNotFoundError) else ""
     if extra := _EXTRAS.get(lacking):
-        return f"{lacking} not installed, wanted by this command: pip install 'tcpipe[{extra}]'"
+        return f"{lacking} not installed, required by this command: pip install 'tcpipe[{extra}]'"
     return f"internal error, {type(error).__name__}: {error}; please report it (tcpipe --debug shows where)"
 
 

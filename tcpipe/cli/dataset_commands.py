@@ -41,15 +41,15 @@ if TYPE_CHECKING:
 @json_option
 @quiet_option
 def add_map(options: AddMapOptions, *, strays: tuple[str, ...], as_json: bool, quiet: bool) -> None:
-    """Put rasters that need not share grid, resolution or CRS on one common grid, and add them to the store as NAME.
+    """Put rasters on one common grid and add them to the store as map NAME; their grids, resolutions and CRS may differ.
 
-    A raster is a GeoTIFF, JPEG 2000 or ERDAS Imagine file. One in many tiles is given as a pattern in quotes, --height 'dem/*.tif', or by
-    repeating the option; where tiles overlap, the last lies on top.
+    A raster is a GeoTIFF, JPEG 2000 or ERDAS Imagine file. For a raster of many tiles, give a pattern in quotes, --height 'dem/*.tif', or
+    repeat the option; where tiles overlap, tcpipe uses the last one.
     """
     from tcpipe.pipeline.maps import run_add_map
 
     if strays:
-        raise UsageError(f"{strays[0]}: belongs to no option; is a pattern without quotes? wanted --height 'dem/*.tif'")
+        raise UsageError(f"{strays[0]}: belongs to no option; quote patterns, as in --height 'dem/*.tif'")
     with show_progress(f"map {options.name}", quiet=quiet):
         added = run_add_map(options)
     print_result(added, as_json=as_json)
@@ -62,10 +62,10 @@ def add_map(options: AddMapOptions, *, strays: tuple[str, ...], as_json: bool, q
 def build_dataset(options: BuildDatasetOptions, *, as_json: bool, quiet: bool) -> int:
     """Sample a rotated patch for every segment, split by region, and write the dataset to OUT (default: dataset).
 
-    A dataset that is there is built again from the runs of today if its options are the same; with others it is refused
+    An existing dataset with the same options is built again from the current runs. If its options differ, the command fails,
     unless --force is given.
 
-    Exit code 3: runs that belong in are left out or gone, or a split that was asked for is empty; each is a line with its remedy.
+    Exit code 3: runs are excluded or missing, or a requested split is empty; a line for each names the remedy.
     """
     from tcpipe.pipeline.dataset.build import run_build_dataset
 
@@ -85,12 +85,12 @@ def build_dataset(options: BuildDatasetOptions, *, as_json: bool, quiet: bool) -
 @click.command()
 @click.argument("path", type=SEALED, metavar="PATH")
 @click.option(
-    "--no-runs", is_flag=True, help="Of a store: its own page alone, which leads to those of the runs that are there."
+    "--no-runs", is_flag=True, help="For a store: write only its own page, with links to existing pages of runs."
 )
 @click.option(
     "--patches",
     is_flag=True,
-    help="Of a dataset: pictures of all its patches in a folder beside the page, which shows them.",
+    help="For a dataset: write images of all patches to a folder next to the page, and show them.",
 )
 def report(path: str, *, no_runs: bool, patches: bool) -> None:
     """Write report.html for PATH: a run directory, a dataset, or a store and each of its runs; and print the physics of each robot.
@@ -105,7 +105,7 @@ def report(path: str, *, no_runs: bool, patches: bool) -> None:
         for line in page.physics:
             print_line(f"  {line}")
     if not any(page.changed for page in written):
-        print_line("nothing to do: the pages are there as they would be written")
+        print_line("nothing to do: the pages are up to date")
 
 
 @click.command()
@@ -118,12 +118,12 @@ def report(path: str, *, no_runs: bool, patches: bool) -> None:
 def export(
     log: str, out: str, *, names: tuple[str, ...], topics: tuple[str, ...], msgdef: str | None, as_json: bool
 ) -> int:
-    """Write topics of LOG to OUT as Parquet, one file a topic, one row a message, columns by dotted field name.
+    """Write topics of LOG to OUT as Parquet, one file per topic, one row per message, columns by dotted field name.
 
-    Units of columns and the definition of the message stand in the files' metadata. What OUT holds already of the same
-    log is left alone.
+    The metadata of the files has the units of the columns and the definition of the message. tcpipe does not write topics again that
+    OUT already contains from the same log.
 
-    Of a dataset, a store or a run OUT is a GeoPackage (a name that ends in .gpkg; needs the extra gis): samples, footprints,
+    For a dataset, a store or a run, OUT is a GeoPackage (a name that ends in .gpkg; needs the extra gis): samples, footprints,
     regions and where to drive next, or segments, with styles for QGIS.
     """
     import resource
@@ -132,7 +132,7 @@ def export(
         from tcpipe.pipeline.export import export_layers
 
         if names or topics:
-            raise UsageError(f"{out}: a GeoPackage holds no topics; give a directory for them")
+            raise UsageError(f"{out}: a GeoPackage cannot contain topics; give a directory")
         print_result(export_layers(log, Path(out)), as_json=as_json)
         return 0
     from tcpipe.pipeline.export import export as run
@@ -157,7 +157,7 @@ def _print(exported: Exported, log: str, out: str) -> None:
         for topic in exported.topics:
             print_line(f"{topic.messages:>9} messages  {topic.topic}  {topic.path}")
         if not exported.topics:
-            print_line(f"nothing to export: {log} holds no topic")
+            print_line(f"nothing to export: {log} has no topics")
     for kind, findings in (("damage", exported.damage), ("remark", exported.notes)):
         for finding in findings:
             print_line(f"{kind}: {describe_finding(finding)} [{finding.code}]", err=True)
@@ -165,12 +165,12 @@ def _print(exported: Exported, log: str, out: str) -> None:
 
 @click.command()
 @click.argument("sample_id", metavar="SAMPLE_ID")
-@click.option("--dataset", default="dataset", type=SEALED, metavar="DIR", help="The dataset that holds it.")
+@click.option("--dataset", default="dataset", type=SEALED, metavar="DIR", help="The dataset that contains the sample.")
 @store_option
 @json_option
 @quiet_option
 def explain(sample_id: str, *, dataset: str, store: str, as_json: bool, quiet: bool) -> int:
-    """Trace SAMPLE_ID to its log, stamps, messages, masked rows, map tiles and recipe, and make it again: exit code 1 if it differs."""
+    """Trace SAMPLE_ID to its log, stamps, messages, masked rows, map tiles and recipe, and compute it again: exit code 1 if it differs."""
     from tcpipe.pipeline.explain import explain as run
 
     with show_progress("explain", quiet=quiet):
@@ -183,9 +183,9 @@ def explain(sample_id: str, *, dataset: str, store: str, as_json: bool, quiet: b
 @click.argument("path", type=SEALED, metavar="PATH")
 @json_option
 def verify(path: str, *, as_json: bool) -> int:
-    """Re-read the dataset, run, store, map, model or cost map at PATH: compare counts, checksums, contracts.
+    """Read the dataset, run, store, map, model or cost map at PATH again: compare counts, checksums, schemas.
 
-    Exit code 1: something is not as it was written.
+    Exit code 1: a file has changed, is missing or contradicts another.
     """
     from tcpipe.pipeline.verify import verify as run
 
@@ -199,11 +199,11 @@ def verify(path: str, *, as_json: bool) -> int:
 @click.argument("to", type=PUBLISHED, required=False, metavar="[TO]")
 @json_option
 def migrate(path: str, to: str | None, *, as_json: bool) -> int:
-    """Bring the store, map or dataset at PATH from an earlier data model to this one, or a store to another place.
+    """Convert the store, map or dataset at PATH from an earlier data model to this one, or copy a store to another place.
 
-    With TO, a directory or URL, the store at PATH stays as it is, and TO is one of this data model with the same content.
+    With TO, a directory or URL, the store at PATH is not changed, and TO is a store of this data model with the same content.
 
-    What is of this data model is left alone. A call that was killed is gone on with by calling it again.
+    Documents of this data model are not changed. After an interruption, run the same command again.
     """
     from tcpipe.pipeline.migrate import migrate as run
 
@@ -217,7 +217,7 @@ def migrate(path: str, to: str | None, *, as_json: bool) -> int:
 @click.argument("b", type=SEALED, metavar="B")
 @json_option
 def diff(a: str, b: str, *, as_json: bool) -> int:
-    """Name what changed from A to B and why (log, recipe key, map, region, code), with the labels' shift; exit code 1 if they differ."""
+    """List what changed from A to B and why (log, recipe key, map, region, code), and how the labels shift; exit code 1 if they differ."""
     from tcpipe.pipeline.diff import diff as run
 
     found = run(a, b)

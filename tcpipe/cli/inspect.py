@@ -20,13 +20,13 @@ if TYPE_CHECKING:
 
 @click.command()
 @click.argument("path", type=LOG, metavar="PATH")
-@click.option("--full", is_flag=True, help="Read everything: damage and gaps, not the index alone.")
+@click.option("--full", is_flag=True, help="Read the whole file to find damage and gaps, not only the index.")
 @robot_option()
 @recipe_option
 @msgdef_option
 @json_option
 def inspect(path: str, *, full: bool, robot: str | None, recipe: str | None, msgdef: str | None, as_json: bool) -> int:
-    """Show what PATH holds: a log's topics, types, rates, and which topic plays which role and why; a map; a dataset; a run; a store."""
+    """List the content of PATH: a log's topics, types, rates and roles, with reasons; a map; a dataset; a run; a store."""
     from tcpipe.pipeline.inspect import inspect as run
 
     ruling, _ = resolve_recipe_with_source(recipe)
@@ -83,7 +83,7 @@ def _print_log(log: InspectedLog) -> None:
     if full:
         _print_clocks(log)
     if log.problems:
-        print_line("to be decided:")
+        print_line("you must decide:")
     for line in log.problems:
         print_line(f"  {line}")
     _print_findings(log.findings or ())
@@ -223,16 +223,16 @@ def _print_run(found: InspectedRun) -> None:
 
 
 def _print_tables(found: InspectedTables) -> None:
-    print_line(f"{found.path}: {len(found.columns) + len(found.problems)} tables that no recipe maps")
+    print_line(f"{found.path}: {len(found.columns) + len(found.problems)} tables without a mapping in the recipe")
     print_line("")
     _print_table(["table", "columns"], [[file, _format_list(names)] for file, names in found.columns.items()])
     for line in found.problems.values():
         print_line(line)
     print_line("")
     print_line(
-        "a recipe for it, by what the columns are called; look at units and stamps:"
+        "proposed recipe, from the names of the columns; check units and stamps:"
         if found.recipe
-        else "no column says what it is"
+        else "no column has a known name"
     )
     for line in found.recipe.splitlines():
         print_line(line)

@@ -45,17 +45,17 @@ if TYPE_CHECKING:
 @click.command()
 @add_options(IngestOptions)
 @dry_run_option
-@click.option("--json", "as_json", is_flag=True, help="Print a JSON object for each log as it ends, and one of all.")
+@click.option("--json", "as_json", is_flag=True, help="Print a JSON object when each log ends, and one summary.")
 @quiet_option
 def ingest(options: IngestOptions, *, dry_run: bool, as_json: bool, quiet: bool) -> int:
-    """Read logs, fuse the sensors, gate, cut into 1 m segments, and label each with power, velocity, time and energy.
+    """Read logs, fuse the sensors, mask unsteady driving, cut 1 m segments, and label them with power, velocity, time and energy.
 
-    A LOG is a .mcap, a .bag, a .db3, a ROS 2 bag directory, or a folder of such, searched downward, or the s3:// URL of
-    one. What is in the store already (same content, same recipe) is left alone, and what failed for its content is not
-    tried again. A line is printed as each log ends; of several logs, findings follow by code.
+    A LOG is a .mcap, a .bag, a .db3, a ROS 2 bag directory, a folder of these, or an s3:// URL. tcpipe skips logs that are in the
+    store (same content, same recipe) and logs that failed before with the same content. It prints a line when each log ends; for
+    several logs, findings follow by code.
 
-    Exit code 3: some logs failed, are damaged, or give no segment though the robot drove, and that is news: it was not
-    told before, and not acknowledged (tcpipe acknowledge).
+    Exit code 3: some logs failed, are damaged, or give no segments although the robot drove, and the problem is new: not reported
+    before and not acknowledged (tcpipe acknowledge).
     """
     from tcpipe.formats.json_files import convert_record
     from tcpipe.pipeline.ingest import SummaryLine, run_ingest
@@ -127,7 +127,7 @@ def _list_outcome(result: IngestResult, store: Path | str, *, several: bool) -> 
     budget = run.energy_budget if run and is_new else None
     problems = select_problems(result.findings)
     if run is None:
-        known = " (known, not tried again)" if result.known else ""
+        known = " (failed before, skipped)" if result.known else ""
         yield f"{result.status:<10} {result.log}{aside or known}"
     else:
         known = f" ({run.defect}, known)" if run.defect and not result.is_new_problem else ""
@@ -179,7 +179,7 @@ def _print_sum(summary: IngestSummary) -> None:
         for status in ("done", "unchanged", "damaged", "empty", "failed", "waiting")
     }
     if not number:
-        print_line("nothing to do: this shard holds none of the logs")
+        print_line("nothing to do: this shard has none of the logs")
     elif count["unchanged"] + len(old) == number:
         print_line(f"nothing to do: {count['unchanged']} of {number} logs are in {summary.store} already")
     elif count["failed"] == number:
@@ -217,18 +217,18 @@ def _print_known(summary: IngestSummary) -> None:
 @click.argument("paths", nargs=-1, type=ONE_OF_SEVERAL, metavar="[STORE] [LOG...]")
 @store_option
 @recipe_option
-@robot_option("Robot profile that ingest is given.")
-@min_age_option("10m", "A log that was written to since (90, 90s, 10m, 2h, 1d) is growing.")
+@robot_option("Robot profile, as for ingest.")
+@min_age_option("10m", "A log that was changed more recently than this (90, 90s, 10m, 2h, 1d) counts as growing.")
 @json_option
 def status(
     paths: tuple[str, ...], *, store: str, recipe: str | None, robot: str | None, min_age_s: float, as_json: bool
 ) -> int:
-    """Say of every log whether it is in the store, is still to be ingested, failed or grows, and why; and what the latest calls did.
+    """List for every log whether it is in the store, waits for ingest, failed or is growing, and why; and the latest calls.
 
-    Without LOG: of the logs and folders that the latest calls of ingest were given. Nothing of a log is read.
+    Without LOG: the logs and folders that the latest calls of ingest were given. The command does not read logs.
 
-    Exit code 3: a log failed, is damaged or gave no segment, a call was killed, a log waits for more than two nights, files of a run or
-    a commit are missing, and nobody acknowledged that (tcpipe acknowledge).
+    Exit code 3: a log failed, is damaged or gave no segments, a call was killed, a log waits for more than two nights, or files of a
+    run or a commit are missing, and nobody acknowledged it (tcpipe acknowledge).
     """
     from tcpipe.formats.finding_lines import format_finding
     from tcpipe.formats.object_storage import is_url
@@ -238,7 +238,7 @@ def status(
     if paths and is_store(paths[0]):
         store, paths = paths[0], paths[1:]
     elif paths and not is_url(store) and not Path(store).exists():
-        raise UsageError(f"{paths[0]}: there is no store here, nor one at {store}; name it with --store")
+        raise UsageError(f"{paths[0]}: no store here and none at {store}; name one with --store")
     found = run(paths, store=store, recipe=resolve_recipe_with_source(recipe)[0], robot=robot, min_age_s=min_age_s)
     if as_json:
         print_json(found)
@@ -259,12 +259,12 @@ def status(
 def preflight(
     log: str, *, robot: str | None, recipe: str | None, msgdef: str | None, as_json: bool, quiet: bool
 ) -> int:
-    """Predict from LOG, a minute or more as it will be driven, what a day of such recording gives, and what to correct before.
+    """Predict from LOG, a typical minute or more, how much data a day of such recording gives, and what to correct before.
 
-    Segments an hour, where the metres go, the deviations of labels, the verdict, findings with their remedies, and the command that
-    records what is needed. Nothing is written.
+    Prints segments per hour, the distance breakdown, the uncertainty of labels, the verdict, findings with remedies, and the command
+    that records the required topics. Writes no files.
 
-    Exit codes: 0 ready; 3 there are warnings, errors or no segments; 1 ingesting it would fail.
+    Exit codes: 0 ready; 3 warnings, errors or no segments; 1 ingest would fail.
     """
     from tcpipe.pipeline.preflight import preflight as run
 
@@ -284,13 +284,13 @@ def preflight(
 @store_option
 @json_option
 def acknowledge(names: tuple[str, ...], *, store: str, as_json: bool) -> int:
-    """Acknowledge problems that somebody has looked at: damaged logs, runs without segments, failed logs. ingest reports them no more.
+    """Acknowledge problems that somebody has checked: damaged logs, runs without segments, failed logs. tcpipe then stops reporting them.
 
-    Acknowledge a call that was killed by the name that status prints, a log that waits and a damaged commit by its path.
+    Name a killed call as status prints it; name a waiting log or a damaged commit by its path.
 
-    A run of which files are missing is given up: the store no longer expects it.
+    If files of a run are missing, this gives up the run: the store no longer expects it.
 
-    This holds for this problem of this content: another problem, or other content, is reported.
+    This applies to one problem of one content: tcpipe reports other problems, and other content.
     """
     from tcpipe.formats.finding_lines import describe_title
     from tcpipe.pipeline.problems import acknowledge as run
@@ -315,13 +315,13 @@ def acknowledge(names: tuple[str, ...], *, store: str, as_json: bool) -> int:
     multiple=True,
     metavar="RUN|RECIPE",
     shell_complete=complete_runs,
-    help="Nothing of this run or recipe goes; repeatable.",
+    help="Keep this run or recipe; repeatable.",
 )
 @click.option(
-    "--forget", multiple=True, metavar="DATASET", help="This dataset is gone; what it referred to may go; repeatable."
+    "--forget", multiple=True, metavar="DATASET", help="Remove what only this deleted dataset needs; repeatable."
 )
-@min_age_option("1d", "What killed calls left is removed when it is so old (90, 90s, 10m, 2h, 1d).")
-@click.option("--dry-run", is_flag=True, help="Say what would be removed; do nothing.")
+@min_age_option("1d", "Remove files of killed calls that are older than this (90, 90s, 10m, 2h, 1d).")
+@click.option("--dry-run", is_flag=True, help="Print what would be removed; change nothing.")
 @json_option
 def prune(
     *,
@@ -333,9 +333,9 @@ def prune(
     dry_run: bool,
     as_json: bool,
 ) -> int:
-    """Remove results of older recipes where the ruling one has its own, superseded runs, and what killed calls left.
+    """Remove results of earlier recipes that the current recipe replaces, superseded runs, and files of killed calls.
 
-    Nothing goes that a dataset refers to, built from this store wherever it lies now, nor a directory that holds a file of somebody else.
+    tcpipe keeps everything that a dataset built from this store needs, and directories that contain files of others.
     """
     from tcpipe.pipeline.prune import prune as run
 
@@ -358,7 +358,7 @@ def prune(
 def overlay(run: str, out: str, *, as_json: bool) -> None:
     """Write OUT.mcap from RUN (STORE/runs/ID), on the clock of its log: open both together in Foxglove, or OUT in Rerun or PlotJuggler.
 
-    It holds the fused track, segments with labels, what was dropped and why, and the measurements that were refused.
+    OUT contains the fused track, segments with labels, masked sections with reasons, and rejected measurements.
     """
     from tcpipe.pipeline.overlay import write_overlay as write
 

@@ -23,10 +23,10 @@ if TYPE_CHECKING:
 @json_option
 @quiet_option
 def train(options: TrainOptions, *, as_json: bool, quiet: bool) -> None:
-    """Train ResNet-18, stopped early by a fold of train, or a table on DATASET's patches and labels, and write the model folder OUT.
+    """Train a model on DATASET: ResNet-18 with early stopping on a fold of train, boosted trees, or physics; write it to the folder OUT.
 
-    Needs an extra: pip install 'tcpipe[train]', or 'tcpipe[tables]' for a table. A network runs on a GPU when there is one; its training
-    goes on where it was stopped.
+    Needs an extra: pip install 'tcpipe[train]', or 'tcpipe[tables]' for boosting. A network uses a GPU if there is one; an interrupted
+    training resumes.
     """
     from tcpipe.api import run_train
 
@@ -40,15 +40,15 @@ def train(options: TrainOptions, *, as_json: bool, quiet: bool) -> None:
 @json_option
 @quiet_option
 def evaluate(options: EvaluateOptions, *, as_json: bool, quiet: bool) -> None:
-    """Measure MODEL on DATASET's test samples and unseen area, and write evaluation.json, .csv and .html to OUT.
+    """Evaluate MODEL on DATASET's test samples and unseen area, and write evaluation.json, .csv and .html to OUT.
 
     RMSE and MAPE of power, velocity, time and energy by terrain class; the ablation of the input layers; the baselines of Wei and
-    Isler and the expected time; what the labels' own noise allows; each beside the paper's own figures. Networks that it trains are
-    kept in OUT and used again; predictions.parquet holds every prediction. OUT may be a URL in a bucket, where each evaluation is a
-    generation.
+    Isler and the expected time; the noise floor of the labels; all with the values of the paper. OUT keeps the networks that the
+    command trains, for the next call; predictions.parquet has every prediction. OUT may be a URL in a bucket, where each evaluation is
+    a generation.
 
-    With --drive: time and energy of whole drives, measured against predicted on the store's map, with intervals and figures, in
-    drives.json and drives.html of OUT; DATASET, that MODEL was trained on, tells whether a drive was held back.
+    With --drive: time and energy of whole drives, measured and predicted on the store's map, with intervals and figures, in
+    drives.json and drives.html of OUT; DATASET, which MODEL was trained on, shows whether a drive was held back.
     """
     from tcpipe.api import run_evaluate
 
@@ -62,12 +62,14 @@ def evaluate(options: EvaluateOptions, *, as_json: bool, quiet: bool) -> None:
 
 @click.command()
 @click.argument("directory", default="tcpipe-reproduction", type=OUTPUT_DIRECTORY, metavar="[DIR]")
-@click.option("--quick", is_flag=True, help="Minutes: a small site and a narrow network, to see it run.")
-@click.option("--seeds", default=1, type=click.IntRange(1, 100), help="Trainings; claims compare their means.")
+@click.option("--quick", is_flag=True, help="Run for minutes only: a small site and a narrow network.")
+@click.option(
+    "--seeds", default=1, type=click.IntRange(1, 100), help="Number of trainings; the claims compare their means."
+)
 @jobs_option("Logs read")
 @click.option(
     "--hidden-variance", cls=RenamedOption, earlier="--hidden", default=1.0, type=click.FloatRange(0.0, 10.0), metavar="FACTOR",
-    help="Variance of the resistance that nothing shows, over that of the frozen site.",
+    help="Factor on the variance of the rolling resistance that no input shows (1: the default site).",
 )  # fmt: skip
 @click.option(
     "--baselines/--no-baselines", default=True,
@@ -86,10 +88,10 @@ def reproduce(
     as_json: bool,
     quiet: bool,
 ) -> None:
-    """Simulate the paper's site, drive it, build the dataset, train, evaluate, and say which of the paper's claims hold.
+    """Simulate the paper's site, drive it, build the dataset, train, evaluate, and test the claims of the paper.
 
-    Takes up to an hour and a half on two cores, and goes on from where it was stopped. The data are simulated: what is compared with the
-    paper is the pattern, not the figures. Writes reproduction.html, reproduction.json and everything behind them to DIR.
+    Takes up to 90 minutes on two cores; an interrupted call resumes. The data are simulated: compare the pattern with the
+    paper, not the numbers. Writes reproduction.html, reproduction.json and all intermediate results to DIR.
     """
     from tcpipe.experiment.reproduction import reproduce as run
 
@@ -105,10 +107,10 @@ def reproduce(
 @json_option
 @quiet_option
 def predict_path(options: PredictPathOptions, *, as_json: bool, quiet: bool) -> int:
-    """Cut a path into pieces of a metre and predict the time and energy of each and of all, with intervals.
+    """Cut a path into segments of one metre and predict the time and energy of each and of the whole path, with intervals.
 
-    Pieces on ground where MODEL has no business (a class, slope or relief not seen in training, off the map, no data, not
-    traversable) are marked and counted. Exit code 3: some pieces have no cost.
+    The command marks and counts path segments that MODEL cannot predict (class, slope or relief outside the training range, outside
+    the map, no data, not traversable). Exit code 3: some path segments have no cost.
     """
     from tcpipe.api import run_predict_path
 
@@ -123,10 +125,10 @@ def predict_path(options: PredictPathOptions, *, as_json: bool, quiet: bool) -> 
 @json_option
 @quiet_option
 def cost_map(options: CostMapOptions, *, as_json: bool, quiet: bool) -> None:
-    """Predict power, velocity, time and energy a metre along 16 courses in every cell of a map.
+    """Predict power, velocity, and time and energy per metre, along 16 courses in every cell of a map.
 
-    Writes to OUT (default: cost-map) Cloud-Optimised GeoTIFFs with a band a course, the reasons where MODEL has no business, and
-    maps for Nav2. An interrupted call goes on where it was; OUT may be a URL in a bucket, where each map is a generation.
+    Writes to OUT (default: cost-map) Cloud-Optimised GeoTIFFs with one band per course, the reasons where MODEL cannot predict, and
+    maps for Nav2. An interrupted call resumes; OUT may be a URL in a bucket, where each map is a generation.
     """
     from tcpipe.planning.cost_map import Cluster, make_cost_map
 
@@ -161,9 +163,9 @@ def _load_inputs(options: CostMapOptions) -> tuple[CostModel, MapFile]:
 @json_option
 @quiet_option
 def plan_path(options: PlanPathOptions, *, as_json: bool, quiet: bool) -> int:
-    """Find the path of least energy, time or distance between two points, over costs that depend on the direction of travel.
+    """Find the path of least energy, time or distance between two points; costs depend on the direction of travel.
 
-    Exit code 3: some of the path has no cost, because --cell-size is large.
+    Exit code 3: parts of the path have no cost, because --cell-size is large.
     """
     from tcpipe.api import run_plan_path
 

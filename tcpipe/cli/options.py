@@ -69,7 +69,7 @@ class LonLat(click.ParamType[tuple[float, float]]):
         except ValueError:
             lon = lat = nan
         if not (isfinite(lon) and isfinite(lat)):
-            self.fail(f"{value!r}: wanted LON,LAT in degrees, as 15.45,47.07", param, ctx)
+            self.fail(f"{value!r}: expected LON,LAT in degrees, as 15.45,47.07", param, ctx)
         return lon, lat
 
 
@@ -168,7 +168,7 @@ def parse_duration(_: click.Context, __: click.Parameter, value: str) -> float:
     """Turn ``90``, ``90s``, ``10m``, ``2h``, ``1d`` into seconds."""
     match = re.fullmatch(r"(\d{1,9}(?:\.\d{1,9})?)\s*([smhd]?)", value.strip())
     if match is None:
-        raise click.BadParameter(f"{value!r}: wanted a time: 90 or 90s, 10m, 2h, 1d")
+        raise click.BadParameter(f"{value!r}: expected a time: 90 or 90s, 10m, 2h, 1d")
     return float(match[1]) * _SECONDS[match[2]]
 
 
@@ -179,7 +179,7 @@ def parse_shard(_: click.Context, __: click.Parameter, value: str | None) -> tup
     match = re.fullmatch(r"(\d{1,6})/(\d{1,6})", value.strip())
     index, count = (int(match[1]), int(match[2])) if match else (0, 0)
     if not 1 <= index <= count <= _MOST_SHARDS:
-        raise click.BadParameter(f"{value!r}: wanted I/N, I from 1 to N, N at most {_MOST_SHARDS}, for example 1/8")
+        raise click.BadParameter(f"{value!r}: expected I/N, I from 1 to N, N at most {_MOST_SHARDS}, for example 1/8")
     return index, count
 
 
@@ -187,21 +187,21 @@ def tag_values(_: click.Context, __: click.Parameter, values: tuple[str, ...]) -
     """Turn ``K=V`` pairs into a dict; a pair without key or '=' is a usage error."""
     for value in values:
         if value.find("=") < 1:
-            raise click.BadParameter(f"{value!r}: wanted KEY=VALUE")
+            raise click.BadParameter(f"{value!r}: expected KEY=VALUE")
     return dict(value.split("=", 1) for value in values)
 
 
 def layer_values(_: click.Context, __: click.Parameter, values: tuple[str, ...]) -> dict[str, str]:
     """Turn ``NAME=FILE`` pairs into a dict."""
-    files = _parse_named_files("--layer", values, "the tiles of one layer are a pattern: NAME='tiles/*.tif'")
+    files = _parse_named_files("--layer", values, "give the tiles of one layer as a pattern: NAME='tiles/*.tif'")
     if bare := [layer for layer, file in files.items() if not (layer and file)]:
-        raise UsageError(f"--layer {bare[0]}: wanted NAME=FILE")
+        raise UsageError(f"--layer {bare[0]}: expected NAME=FILE")
     return files
 
 
 def class_table_values(_: click.Context, __: click.Parameter, values: tuple[str, ...]) -> dict[str, str | None]:
     """Turn ``NAME`` and ``NAME=FILE`` into a dict, None where there is no file."""
-    tables = _parse_named_files("--categorical", values, "wanted one class table a layer")
+    tables = _parse_named_files("--categorical", values, "expected one class table a layer")
     return {name: table or None for name, table in tables.items()}
 
 
@@ -217,7 +217,7 @@ def _parse_named_files(option: str, given: tuple[str, ...], hint: str) -> dict[s
 def parse_holdout(_: click.Context, __: click.Parameter, value: str | None) -> str | None:
     """Return a valid kind of holdout; anything else is a usage error."""
     if value is not None and re.fullmatch(r"block|sample|run|tag:.+", value) is None:
-        raise click.BadParameter(f"{value!r}: wanted block, sample, run, or tag:NAME")
+        raise click.BadParameter(f"{value!r}: expected block, sample, run, or tag:NAME")
     return value
 
 
@@ -301,7 +301,7 @@ msgdef_option = make_click_option("msgdef", None, options.MESSAGE_DEFINITIONS)
 json_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON object instead of text.")
 """``--json``: one JSON object on stdout instead of text."""
 
-quiet_option = click.option("--quiet", "-q", is_flag=True, help="No progress on stderr.")
+quiet_option = click.option("--quiet", "-q", is_flag=True, help="Print no progress on stderr.")
 """``--quiet``: no progress on stderr."""
 
 
@@ -320,7 +320,7 @@ def min_age_option(default: str, about: str) -> Option:
     return click.option("--min-age", "min_age_s", default=default, metavar="T", callback=parse_duration, help=about)
 
 
-seed_option = make_click_option("seed", 1, options.Option("Same seed, same site.", kind=options.SEED))
+seed_option = make_click_option("seed", 1, options.Option("Seed of the simulated site.", kind=options.SEED))
 """``--seed`` of a simulation."""
 
 dry_run_option = make_click_option("dry_run", False, options.DRY_RUN)

@@ -17,7 +17,7 @@ from tcpipe.errors import UsageError
 @seed_option
 @quiet_option
 def demo(directory: str, *, seed: int, quiet: bool) -> None:
-    """Simulate a small site and two drives, run the whole pipeline on them, and say what to open.
+    """Simulate a small site and two drives, run the whole pipeline on them, and print which pages to open.
 
     Writes to DIR (default: tcpipe-demo): real .mcap and .bag logs, real GeoTIFFs, a store, a dataset and its report.
     """
@@ -41,9 +41,9 @@ def init(directory: str) -> None:
         write_text(path, format_commented_toml())
         print_line(f"wrote {path}")
     elif path.is_file() and path.read_bytes() == format_commented_toml().encode():
-        print_line(f"nothing to do: {path} is there already")
+        print_line(f"nothing to do: {path} exists")
     else:
-        raise UsageError(f"{path}: is there already and holds something else; it is never overwritten")
+        raise UsageError(f"{path}: exists with other content; it is never overwritten")
 
 
 @click.command()
@@ -59,7 +59,7 @@ def init(directory: str) -> None:
 @json_option
 @quiet_option
 def simulate(out: str, *, scenario: str, seed: int, as_json: bool, quiet: bool) -> None:
-    """Write a simulated site to OUT: real .mcap and .bag logs, real GeoTIFFs, and the truth behind them."""
+    """Write a simulated site to OUT: real .mcap and .bag logs, real GeoTIFFs, and the true values."""
     from tcpipe.simulation import simulate as run
 
     with show_progress("simulate", quiet=quiet):
@@ -70,13 +70,13 @@ def simulate(out: str, *, scenario: str, seed: int, as_json: bool, quiet: bool) 
         for path in (*site.logs, *site.rasters.values(), site.region, *site.truths):
             print_line(str(path))
         if site.unchanged:
-            print_line(f"nothing to do: the site is in {out} already")
+            print_line(f"nothing to do: {out} already contains the site")
 
 
 @click.command()
 @click.argument("out", type=OUTPUT_DIRECTORY, metavar="OUT")
 def schemas(out: str) -> None:
-    """Write the contract of every table, document and --json answer, and of the recipe, as JSON Schema, one file each, to OUT."""
+    """Write the JSON Schema of every table, document and --json answer, and of the recipe, one file each, to OUT."""
     from tcpipe.formats.atomic import clear, write_text
     from tcpipe.formats.contracts import make_contracts
 

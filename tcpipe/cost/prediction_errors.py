@@ -30,7 +30,7 @@ Ints = NDArray[np.int64]
 Residuals = Mapping[str, NDArray[np.generic]]
 
 COVERAGE = 0.9
-"""Share of drives that an interval is to hold."""
+"""Share of drives that an interval is to cover."""
 
 FEWEST = 20
 """Fewest held-out samples for errors, and of a class for a bias of its own."""

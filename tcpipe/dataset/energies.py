@@ -24,13 +24,13 @@ class Energy:
 
 
 ENERGIES: Mapping[str, Energy] = {
-    "total": Energy("power_watt", "power_std_watt", "energy_joule", "energy_std_joule", "all that was measured"),
+    "total": Energy("power_watt", "power_std_watt", "energy_joule", "energy_std_joule", "total"),
     "net": Energy(
         "net_power_watt",
         "net_power_std_watt",
         "net_energy_joule",
         "net_energy_std_joule",
-        "above what the robot draws while it stands",
+        "net of idle power",
     ),
 }
 
@@ -38,5 +38,5 @@ ENERGIES: Mapping[str, Energy] = {
 def find_energy(name: str) -> Energy:
     """Return an energy by its name; `DatasetError` lists those there are."""
     if name not in ENERGIES:
-        raise DatasetError(f"label {name!r}: wanted one of {', '.join(ENERGIES)}")
+        raise DatasetError(f"label {name!r}: expected one of {', '.join(ENERGIES)}")
     return ENERGIES[name]

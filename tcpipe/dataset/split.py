@@ -53,9 +53,7 @@ class SampleColumns:
         if name not in self._read:
             there = sample_columns(self.directory)
             if name not in {*there, *SAMPLES.names()}:
-                raise DatasetError(
-                    f"{self.directory}: its samples have no column {name!r}; there are {', '.join(there)}"
-                )
+                raise DatasetError(f"{self.directory}: its samples have no column {name!r}; it has {', '.join(there)}")
             self._read[name] = read_samples(self.directory, [name]).column(name).take(pa.array(self.rows)).to_numpy()
         return self._read[name]
 
@@ -183,7 +181,7 @@ class Split:
         named = {flag_name(bit): int(bit) for bit in Quality}
         unknown = [name for name in without if name not in named]
         if unknown:
-            raise DatasetError(f"quality {', '.join(unknown)}: wanted some of {', '.join(named)}")
+            raise DatasetError(f"quality {', '.join(unknown)}: expected some of {', '.join(named)}")
         bits = sum(named[name] for name in set(without))
         good = (self.column("quality").astype(np.int64) & bits) == 0
         for name, limit in ((self.energy.power_std, max_power_std_watt), ("velocity_std_mps", max_velocity_std_mps)):
@@ -221,11 +219,11 @@ class Split:
         from_disk : decode chunk by chunk instead of keeping the split in memory; None decides by its size.
         """
         if size < 1:
-            raise DatasetError(f"batches of {size} samples: wanted 1 or more")
+            raise DatasetError(f"batches of {size} samples: expected 1 or more")
         columns = tuple((name, self.column(name)) for name in features)
         textual = [name for name, column in columns if column.dtype.kind not in "biuf"]
         if textual:
-            raise DatasetError(f"features {', '.join(textual)}: wanted columns of numbers")
+            raise DatasetError(f"features {', '.join(textual)}: expected columns of numbers")
         disk = not self.view.stored.fit(self.view.form.layers) if from_disk is None else from_disk
         return Batches(
             view=self.view,
@@ -317,7 +315,7 @@ def open_dataset(path: str | Path, *, layers: Sequence[str] | None = None, label
     column = read_samples(directory, [energy.power]).column(energy.power)
     if card.samples and column.null_count == len(column):
         raise DatasetError(
-            f"{directory}: no sample has {energy.power}: its robot was hardly stationary in any run, or the data model is older than 1.3; "
+            f"{directory}: no sample has {energy.power}: the robot was never stationary for long, or the data model is older than 1.3; "
             "ingest the logs and build it again, or take the label total"
         )
     files = open_patches(directory, card, fetched)

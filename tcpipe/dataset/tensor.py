@@ -82,5 +82,5 @@ def make_tensor_layout(channels: Sequence[str], known: Mapping[str, Layer]) -> T
     unknown = [channel for channel in channels if channel not in possible]
     if unknown or not channels:
         named = ", ".join(unknown) or "none"
-        raise DatasetError(f"channels asked for: {named}; this dataset can give {', '.join(possible)}")
+        raise DatasetError(f"requested channels: {named}; this dataset has {', '.join(possible)}")
     return TensorLayout(tuple(channels), known)

@@ -70,7 +70,7 @@ RECIPE = replace(Recipe(), robot="husky", split=replace(Recipe().split, holdout=
 
 @dataclass(frozen=True, slots=True)
 class SampleCounts:
-    """What was driven: samples by split, by class of each split, and all."""
+    """Driven distance by class: samples by split, by class of each split, and all."""
 
     splits: Mapping[str, int] = field(default_factory=dict)
     terrain: Mapping[str, Mapping[str, int]] = field(default_factory=dict)
@@ -117,7 +117,7 @@ class Reproduction:
         spent = ", ".join(f"{name} {seconds:.0f} s" for name, seconds in self.seconds.items())
         return clean_lines(
             (
-                "the data are simulated: what is compared with the paper is the pattern, not the figures",
+                "the data are simulated: compare the pattern with the paper, not the numbers",
                 *shares,
                 *(str(claim) for claim in self.claims),
                 f"of {len(self.claims)} claims: " + ", ".join(f"{count} {name}" for name, count in verdicts.items()),

@@ -14,7 +14,7 @@ from tcpipe.learning.metrics import ALL, LEAST, QUANTITIES, UNITS
 from tcpipe.report.page import Section
 from tcpipe.simulation.paper_site import read_paper_parameters
 
-_QUICK = "This is a quick run: a small site, a narrow network, few epochs. It shows that everything runs; believe no figure of it."
+_QUICK = "This is a quick run: a small site, a narrow network, few epochs. It only shows that all steps run: do not use its numbers."
 _PAPER_SHARES = {"grass": 51, "mud": 9, "unpaved road": 20, "paved road": 20}
 _PAPER_COUNTS = {"train": 5142, "test": 1286, "unseen": 4458}
 
@@ -63,11 +63,11 @@ def _make_claims_section(claims: Sequence[Claim], audit: str) -> Section:
     ]  # fmt: skip
     text = (
         "RMSE of E of the network over a baseline's, of the same samples, with its 95 % interval: held if all of it lies below 1, NOT held "
-        "if above, open if it holds 1. Height, class and slow ground matter by construction of the site, so they are no claims. "
+        "if above, open if it contains 1. Height, class and slow ground matter by construction of the site, so they are no claims. "
         + audit
     )
     header = ("claim", "split", "", "here", "the paper")
-    return Section("What could have failed", text, header=header, rows=rows, figures_from=3)
+    return Section("Claims of the paper", text, header=header, rows=rows, figures_from=3)
 
 
 def _make_floor_section(run: Evaluation) -> Section:
@@ -81,10 +81,10 @@ def _make_floor_section(run: Evaluation) -> Section:
             rmse = (f"{value:.3f} {UNITS[quantity]}" for value in (here.rmse, least.rmse, here.rmse - least.rmse))
             mape = (here.mape_percent, least.mape_percent, here.mape_percent - least.mape_percent)
             rows.append((split, quantity, *rmse, *(f"{value:.2f} %" for value in mape)))
-    text = "The floor knows the simulator, map, path and turn without error; what nothing shows and the labels' noise are left to it. "
+    text = "The floor knows the simulator, map, path and turn without error; hidden variation and the noise of the labels remain. "
     text += format_audit(run)
     header = ("", "", "RMSE", "of the floor", "excess", "MAPE", "of the floor", "excess")
-    return Section("How far above the floor", text, header=header, rows=rows, figures_from=2)
+    return Section("Error relative to the noise floor", text, header=header, rows=rows, figures_from=2)
 
 
 def _make_variance_section(shares: Mapping[str, float], hidden_variance: float) -> Section:
@@ -99,8 +99,8 @@ def _make_variance_section(shares: Mapping[str, float], hidden_variance: float) 
         "changes where a part of the simulated world is taken out. They add up to one only as far as they are independent. "
         f"The hidden resistance has {hidden_variance:g} times the variance of the frozen site."
     )
-    header = ("what shows it", "of the variance of E", "of what is not class and slope")
-    return Section("What E's variance is made of", text, header=header, rows=rows, figures_from=1)
+    header = ("source", "of the variance of E", "share of the rest")
+    return Section("Variance of E by source", text, header=header, rows=rows, figures_from=1)
 
 
 def _make_drives_section(splits: Mapping[str, int], terrain: Mapping[str, Mapping[str, int]]) -> Section:
@@ -111,7 +111,7 @@ def _make_drives_section(splits: Mapping[str, int], terrain: Mapping[str, Mappin
     ]
     rows += [(f"samples of {name}", f"{splits[name]}", f"{told}") for name, told in _PAPER_COUNTS.items()]
     rows.append(("all samples", f"{total}", "10886"))
-    return Section("What was driven", header=("", "here", "the paper"), rows=rows, figures_from=1)
+    return Section("Driven distance by class", header=("", "here", "the paper"), rows=rows, figures_from=1)
 
 
 def _make_seed_sections(runs: Sequence[Evaluation]) -> list[Section]:
@@ -146,7 +146,7 @@ def _make_sources_section(*, quick: bool) -> Section:
     if quick:
         rows.insert(0, ("site, drives", "made up: the small site of `tcpipe demo`, three short drives"))
     text = "Frozen in tcpipe/simulation/paper_site.toml before the first training."
-    return Section("Where the simulator's numbers come from", text, header=("what", "source"), rows=rows)
+    return Section("Sources of the simulator's parameters", text, header=("what", "source"), rows=rows)
 
 
 DIFFERENCES = (
@@ -157,10 +157,10 @@ DIFFERENCES = (
     ("loss", "equation 4, α = 1 / max w, which has a dimension", "1 / max²; the paper's as printed is --loss paper_eq4"),
     ("optimiser, batch, epochs", "not told", "Adam, 64, until a fold of train gets no better; the rate falls"),
     ("mirrors", "not told", "every other patch is mirrored across its travel"),
-    ("who stops the training", "not told; 'validation' is the unseen area", "a fold of train, a fifth, which is not fitted"),
-    ("power, velocity", "means of samples at 20 Hz", "w = E / T, v = d / T: E = w d / v holds exactly"),
+    ("early stopping by", "not stated; 'validation' is the unseen area", "a fold of train, a fifth, which is not fitted"),
+    ("power, velocity", "means of samples at 20 Hz", "w = E / T, v = d / T: E = w d / v is exact"),
     ("order of figures", "tables of w, v, T, E; table III of w, v, E, T", "the same tables in the same order, each row beside the paper's"),
-    ("ablation", "a layer becomes random noise; distribution and draws not told", "uniform in [0, 1] per pixel, mean of several draws"),
+    ("ablation", "a layer becomes random noise; distribution and draws not stated", "uniform in [0, 1] per pixel, mean of several draws"),
     ("Wei and Isler: architecture", "'the approach from' their paper: heights to E", "our ResNet-18, heights alone, one output"),
     ("Wei and Isler: loss", "not told", "nrmse of one output, which is the mean absolute error"),
     ("Wei and Isler: length of training", "not told", "as many steps as the one net, stopped by as many steps without a better loss"),
@@ -177,4 +177,4 @@ def _count_labels_without_mape(found: Evaluation) -> Iterator[tuple[str, str, st
             for quantity, errors in part.errors.items()
             if ALL in errors
         )
-        yield f"MAPE, {split}", "of all samples; labels near nothing not told", f"left out of {part.samples}: {counts}"
+        yield f"MAPE, {split}", "of all samples; labels near zero not stated", f"left out of {part.samples}: {counts}"

@@ -146,7 +146,7 @@ CLAIMS = {
     CURVES["spline"]: "the net beats class and slope",
     TREES: "the net beats gradient boosting",
 }
-"""By the baseline that it is about; each is of E, on every split."""
+"""By the baseline; each is of E, on every split."""
 
 
 @dataclass(frozen=True, slots=True)

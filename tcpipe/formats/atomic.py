@@ -225,7 +225,7 @@ def _make_parents(path: Path) -> Iterator[Path]:
     missing = [parent for parent in place.parents if not parent.exists()]
     in_the_way = next((parent for parent in place.parents if parent.exists() and not parent.is_dir()), None)
     if in_the_way is not None:
-        raise StoreError(f"{path}: cannot be written ({in_the_way} is a file, wanted a directory)")
+        raise StoreError(f"{path}: cannot be written ({in_the_way} is a file, expected a directory)")
     try:
         place.parent.mkdir(parents=True, exist_ok=True)
         yield place
@@ -380,22 +380,20 @@ def check_local_output(path: str | Path) -> Path:
     """Return where something is written. `UsageError`: it is a URL, of which a local directory ``s3:`` would become."""
     found = _LIKE_A_URL.match(str(path))
     if found and "://" in str(path):
-        raise UsageError(
-            f"{path}: is a URL; this is written on this machine: give a path, and copy from there what is made"
-        )
+        raise UsageError(f"{path}: is a URL; this output is local: give a path, and copy the result")
     if found:
-        raise UsageError(f"{path}: is no URL; wanted {found[0]}/bucket/name, or a path of this machine")
+        raise UsageError(f"{path}: is no URL; expected {found[0]}/bucket/name, or a path of this machine")
     return Path(path)
 
 
 def check_output_directory(path: str | Path) -> Path:
     """Return where a directory is written; `UsageError` if a file or a URL is in the way."""
-    return _check_output(path, "file", "is a file, wanted a directory; give another")
+    return _check_output(path, "file", "is a file, expected a directory; give another")
 
 
 def check_output_file(path: str | Path) -> Path:
     """Return where a file is written; `UsageError` if a directory or a URL is in the way."""
-    return _check_output(path, "directory", "is a directory, wanted the name of a file")
+    return _check_output(path, "directory", "is a directory, expected the name of a file")
 
 
 def _check_output(path: str | Path, wrong: str, problem: str) -> Path:
@@ -404,7 +402,7 @@ def _check_output(path: str | Path, wrong: str, problem: str) -> Path:
         raise UsageError(f"{path}: {problem}")
     above = next((parent for parent in place.absolute().parents if _find_kind(parent)), None)
     if above is not None and _find_kind(above) == "file":
-        raise UsageError(f"{place}: {above} is a file, wanted a directory")
+        raise UsageError(f"{place}: {above} is a file, expected a directory")
     return place
 
 
@@ -429,7 +427,7 @@ def _check_input(path: str | Path, wanted: str) -> Path:
         why = "; it is read from this machine only" if _LIKE_A_URL.match(str(path)) else ""
         raise UsageError(f"{path}: there is no such {wanted}{why}")
     if kind not in wanted:
-        raise UsageError(f"{path}: is a {kind}, wanted a {wanted}")
+        raise UsageError(f"{path}: is a {kind}, expected a {wanted}")
     return Path(path)
 
 

@@ -197,7 +197,7 @@ class BucketPlace:
                     target.write(piece)
             if digest.hexdigest() != checksum.sha256:
                 raise StoreError(
-                    f"{self.where(name)}: its sha256 is {digest.hexdigest()[:12]}…, wanted {checksum.sha256[:12]}…"
+                    f"{self.where(name)}: its sha256 is {digest.hexdigest()[:12]}…, expected {checksum.sha256[:12]}…"
                 )
 
         return fetch_cached(checksum.sha256, fetch)
@@ -295,7 +295,7 @@ def _find_cache_directory() -> Path:
 def _read_cache_limit() -> int:
     given = os.environ.get("TCPIPE_CACHE_BYTES", str(_MOST_BYTES))
     if not given.isdecimal():
-        raise UsageError(f"TCPIPE_CACHE_BYTES is {given!r}, wanted a number of bytes")
+        raise UsageError(f"TCPIPE_CACHE_BYTES is {given!r}, expected a number of bytes")
     return int(given)
 
 
@@ -339,7 +339,7 @@ def _check_size(place: Place, name: str, wanted: Checksum | None) -> str | None:
     size, where = place.size(name), place.where(name)
     if size is None or wanted is None:
         return find_wrong_checksum(where, None if size is None else Checksum(size, ""), wanted)
-    return None if size == wanted.size_bytes else f"{where}: {size} bytes, wanted {wanted.size_bytes}"
+    return None if size == wanted.size_bytes else f"{where}: {size} bytes, expected {wanted.size_bytes}"
 
 
 def _check_digest(place: Place, name: str, wanted: Checksum) -> str | None:

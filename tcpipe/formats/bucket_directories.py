@@ -227,7 +227,7 @@ def _read_checksums(card: FoundCard) -> Mapping[str, Checksum]:
     where = card.place.where(card.name)
     checksums = parse_typed(parse_json(card.data, Path(where)), Checksums, Path(where)).checksums
     if outside := [file for file in checksums if file.startswith("/") or ".." in file.split("/")]:
-        raise StoreError(f"{where}: names {outside[0]!r}, which is no file beside it")
+        raise StoreError(f"{where}: names {outside[0]!r}, which is not in its directory")
     return checksums
 
 
@@ -294,4 +294,4 @@ def _fetch_one(place: Place, name: str, checksum: Checksum, to: Path) -> None:
             return
         held.unlink(missing_ok=True)
         to.unlink()
-    raise StoreError(f"{place.where(name)}: is not as its card says, {checksum.sha256[:12]}…")
+    raise StoreError(f"{place.where(name)}: differs from its card, {checksum.sha256[:12]}…")

@@ -151,7 +151,7 @@ def read_commit(log: Place, number: int) -> ReadCommit:
     name = commit_name(number)
     data, where = log.read(name), log.where(name)
     if data is None:
-        raise StoreError(f"{where}: is gone")
+        raise StoreError(f"{where}: is missing")
     document = verify_document(data, where)
     commit = parse_typed(document, Commit, where)
     if commit.number != number:

@@ -91,7 +91,7 @@ def read_covariates(path: Path, *, time_column: str | None = None, time_unit: Ti
     Parameters
     ----------
     path : CSV or Parquet, by its ending.
-    time_column : None takes the only one that is called so.
+    time_column : None takes the only one that has its name.
     time_unit : of stamps that are numbers; text is ISO 8601, and UTC where it names no zone.
 
     Raises
@@ -105,7 +105,7 @@ def read_covariates(path: Path, *, time_column: str | None = None, time_unit: Ti
             table = pl.scan_csv(path, infer_schema_length=None, null_values=_NO_VALUE).collect()
     except (pl.exceptions.PolarsError, OSError, ValueError) as error:
         raise DatasetError(
-            f"{path}: not a readable table ({str(error).splitlines()[0]}); wanted CSV or Parquet"
+            f"{path}: not a readable table ({str(error).splitlines()[0]}); expected CSV or Parquet"
         ) from None
     column = _time_column(path, table, time_column)
     stamps = _parse_stamps(path, table[column], time_unit)
@@ -122,11 +122,11 @@ def read_covariates(path: Path, *, time_column: str | None = None, time_unit: Ti
         findings.append(make_finding("covariates-without-time", subject, names={"column": column}, row_count=lost))
     if rows.is_empty() or rows.width == 1:
         raise DatasetError(
-            f"{path}: {rows.height} rows of {rows.width - 1} columns beside {column}; wanted one of each at least"
+            f"{path}: {rows.height} rows of {rows.width - 1} columns besides {column}; expected at least one of each"
         )
     if twice := _find_first_repeated(rows[_STAMP]):
         raise DatasetError(
-            f"{path}: rows of {_format_utc(twice)} differ from one another; wanted one row a stamp: one station, one depth a file"
+            f"{path}: rows of {_format_utc(twice)} differ from one another; expected one row a stamp: one station, one depth a file"
         )
     return CovariateTable(path.name, compute_checksum(path), column, rows, tuple(findings))
 
@@ -164,7 +164,7 @@ def _parse_stamps(path: Path, column: pl.Series, unit: TimeUnit) -> pl.Series:
     if column.dtype.is_numeric():
         return _convert_numeric_stamps(path, column, unit)
     if column.dtype != pl.String:
-        raise DatasetError(f"{path}: {column.name} is {column.dtype}; wanted stamps: numbers, or text in ISO 8601")
+        raise DatasetError(f"{path}: {column.name} is {column.dtype}; expected stamps: numbers, or text in ISO 8601")
     return pl.Series([_parse_iso_stamp(path, column.name, text) for text in column], dtype=pl.Int64)
 
 
@@ -174,7 +174,7 @@ def _parse_iso_stamp(path: Path, name: str, text: str | None) -> int | None:
     try:
         told = datetime.fromisoformat(text.strip())
     except ValueError:
-        raise DatasetError(f"{path}: {name} is {text!r}; wanted ISO 8601, as 2025-10-14T11:41:00Z") from None
+        raise DatasetError(f"{path}: {name} is {text!r}; expected ISO 8601, as 2025-10-14T11:41:00Z") from None
     since = (told if told.tzinfo else told.replace(tzinfo=UTC)) - datetime(1970, 1, 1, tzinfo=UTC)
     return (since.days * 86_400 + since.seconds) * 10**9 + since.microseconds * 1000
 

@@ -28,7 +28,7 @@ class LabelColumns:
     columns: tuple[str, str]
     velocity: str
     includes: tuple[str, ...] = field(default=(), metadata=LEFT_OUT)
-    """What the power of any run feeds besides the drives."""
+    """Loads besides the drives in the power of any run."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -263,7 +263,7 @@ class DatasetCard:
     energy_budget: EnergyBudget | None = None
     split: SplitResult
     distance_by_reason_m: Mapping[str, float]
-    """Where every metre of the runs went [m]."""
+    """Distance breakdown of the runs [m]."""
     removal: Removal
     balance: Balance
     runs: tuple[RunSource, ...]
@@ -277,12 +277,12 @@ class DatasetCard:
     verdict: Verdict | None = None
     """By all findings of the dataset, its maps and the runs that have samples; None in cards of before data model 3.0."""
     physics: Mapping[str, PhysicsFit] = field(default_factory=dict, metadata=LEFT_OUT)
-    """By robot, what standing, drivetrain, rolling, grade and turning take on each class; without robots for which nothing fits."""
+    """By robot, the physics model: idle, drivetrain, rolling, grade and turning on each class; robots without a fit are omitted."""
     covariates: tuple[Covariate, ...] = field(default=(), metadata=LEFT_OUT)
     added_columns: Mapping[str, str] = field(default_factory=dict, metadata=LEFT_OUT)
     """Columns of samples.parquet beyond its schema: run tags and covariates, each with its meaning."""
     redaction: Redacted | None = field(default=None, metadata=LEFT_OUT)
-    """What is not told; None of a dataset that tells all."""
+    """What is redacted; None for a dataset that is not redacted."""
     shards: tuple[Shard, ...]
     checksums: Mapping[str, Checksum]
     """By path inside the dataset."""

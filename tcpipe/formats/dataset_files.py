@@ -258,7 +258,7 @@ def read_card(directory: Path, *, proved: bool = True) -> DatasetCard:
     if not directory.exists():
         raise UsageError(f"{directory}: there is no such directory; run 'tcpipe build-dataset' first")
     if not directory.is_dir():
-        raise UsageError(f"{directory}: is a file, wanted the directory of a dataset")
+        raise UsageError(f"{directory}: is a file, expected the directory of a dataset")
     if not (directory / CARD).is_file():
         raise UsageError(f"{directory}: not a dataset: it has no {CARD}")
     with _convert_errors():
@@ -278,7 +278,7 @@ def read_card(directory: Path, *, proved: bool = True) -> DatasetCard:
 
 def _describe_outdated(directory: Path, version: object) -> str:
     remedy = "run 'tcpipe migrate' on it or build it again" if version in EARLIER_VERSIONS else "build it again"
-    return f"{directory}: written by data model {version}, wanted {DATA_MODEL_VERSION}; {remedy}"
+    return f"{directory}: written by data model {version}, expected {DATA_MODEL_VERSION}; {remedy}"
 
 
 def _is_current(card: Mapping[str, object]) -> bool:
@@ -388,7 +388,7 @@ class PatchFiles:
             raise DatasetError(*(f"{problem}; build the dataset again" for problem in error.problems)) from None
         except (KeyError, ValueError):
             raise DatasetError(
-                f"{self.directory}: piece {piece} of its patches is not what the card says; build it again"
+                f"{self.directory}: piece {piece} of its patches contradicts the card; build it again"
             ) from None
         return {layer: into[layer][:rows] for layer in layers}
 
@@ -415,7 +415,7 @@ def open_patches(
     known = card.format in get_args(FileFormat)
     if not (layers and known and 0 < px <= MOST_PX and 0 <= samples <= MOST_SAMPLES):
         raise DatasetError(
-            f"{directory / CARD}: {samples} patches of {px} px in {len(layers)} layers, {card.format}: wanted up to "
+            f"{directory / CARD}: {samples} patches of {px} px in {len(layers)} layers, {card.format}: expected up to "
             f"{MOST_SAMPLES} of up to {MOST_PX} px, zarr or parquet"
         )
     if "terrain" in layers and not card.classes:
@@ -437,14 +437,14 @@ def _refuse_others(wrong: Sequence[str], directory: Path) -> None:
     if wrong:
         more = f", and {len(wrong) - 1} more shards" if len(wrong) > 1 else ""
         raise DatasetError(
-            f"{wrong[0]}{more}: not of the build that {directory / CARD} tells of; copy the whole dataset again, or build it again"
+            f"{wrong[0]}{more}: not of the build of {directory / CARD}; copy the whole dataset again, or build it again"
         )
 
 
 def _open_sharded_patches(directory: Path, layers: Mapping[str, Layer], px: int, card: DatasetCard) -> PatchFiles:
     rows = [shard.rows for shard in card.shards]
     if min(rows, default=0) < 0 or sum(rows) != card.samples:
-        raise DatasetError(f"{directory / CARD}: its shards hold {sum(rows)} rows, wanted {card.samples}")
+        raise DatasetError(f"{directory / CARD}: its shards hold {sum(rows)} rows, expected {card.samples}")
     groups = [
         (shard.path, group, min(GROUP_ROWS, shard.rows - group * GROUP_ROWS))
         for shard in card.shards
@@ -469,9 +469,9 @@ def has_sample_ids(directory: Path, ids: Sequence[str]) -> bool:
             if decode_chunk(place, path.read_bytes(), len(wanted)) != wanted:
                 return False
         except FileNotFoundError:
-            raise StoreError(f"{path}: is gone") from None
+            raise StoreError(f"{path}: is missing") from None
         except (OSError, ValueError, RuntimeError) as error:
-            raise StoreError(f"{path}: does not hold the ids of the samples ({error})") from None
+            raise StoreError(f"{path}: does not contain the ids of the samples ({error})") from None
     return True
 
 

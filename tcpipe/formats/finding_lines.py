@@ -173,7 +173,7 @@ def format_loss(loss: StoreLoss) -> str:
 
 
 def advise_on_loss(reason: str) -> str:
-    """Return how to lose less distance for a reason of the breakdown; "" where nothing is to be done."""
+    """Return the remedy for a reason of the distance breakdown; "" without one."""
     entry = read_catalogue().get(make_loss_code(reason))
     return entry.advice if entry else ""
 

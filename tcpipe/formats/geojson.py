@@ -59,7 +59,7 @@ def read_regions(path: Path) -> Regions:
             polygons[str(kind)] += feature.polygons
         else:
             problems.append(
-                f"{feature.where}: property split is {shorten_value(kind)}, wanted one of {', '.join(KINDS)}"
+                f"{feature.where}: property split is {shorten_value(kind)}, expected one of {', '.join(KINDS)}"
             )
     if not problems and not any(polygons.values()):
         problems.append(f"{path}: no polygon in it; draw the region that trains and tests as a polygon")
@@ -147,7 +147,7 @@ def _parse_document(path: Path) -> Mapping[str, Json]:
     except (ValueError, RecursionError) as error:
         raise RegionError(f"{path}: not GeoJSON: not JSON ({error})") from None
     if not isinstance(document, dict) or "type" not in document:
-        raise RegionError(f"{path}: not GeoJSON: wanted an object with a 'type' such as FeatureCollection")
+        raise RegionError(f"{path}: not GeoJSON: expected an object with a 'type' such as FeatureCollection")
     crs = json.dumps(document.get("crs"))[:_SHOWN_CHARACTERS]
     if crs != "null" and not any(name in crs for name in _WGS84_NAMES):
         raise RegionError(
@@ -169,12 +169,12 @@ def _iterate_features(path: Path) -> Iterator[tuple[str, Mapping[str, Json], Jso
         features = [{"type": "Feature", "properties": None, "geometry": document}]
     else:
         raise RegionError(
-            f"{path}: not GeoJSON: type {shorten_value(name)}, wanted FeatureCollection, Feature or a geometry"
+            f"{path}: not GeoJSON: type {shorten_value(name)}, expected FeatureCollection, Feature or a geometry"
         )
     for number, feature in enumerate(features):
         where = f"{path}: feature {number}"
         if not isinstance(feature, dict) or feature.get("type") != "Feature":
-            raise RegionError(f"{where}: not GeoJSON: wanted an object of type Feature")
+            raise RegionError(f"{where}: not GeoJSON: expected an object of type Feature")
         properties = feature.get("properties")
         yield where, properties if isinstance(properties, dict) else {}, feature.get("geometry")
 
@@ -195,7 +195,7 @@ def _iterate_polygons(where: str, geometry: Json, problems: list[str], *, depth:
         for part in parts:
             yield from _iterate_polygons(where, part, problems, depth=depth + 1)
     elif name not in ("Polygon", "MultiPolygon"):
-        problems.append(f"{where}: geometry is {shorten_value(name)}, wanted Polygon or MultiPolygon")
+        problems.append(f"{where}: geometry is {shorten_value(name)}, expected Polygon or MultiPolygon")
     else:
         coordinates = told.get("coordinates")
         parts = coordinates if name == "MultiPolygon" else [coordinates]
@@ -290,22 +290,22 @@ def read_line(path: Path) -> NDArray[np.float64]:
     except RegionError as error:
         raise PathError(*error.problems) from None
     if not features:
-        raise PathError(f"{path}: is empty; wanted one LineString")
+        raise PathError(f"{path}: is empty; expected one LineString")
     if len(features) > 1:
-        raise PathError(f"{path}: has {len(features)} features, wanted one LineString; a path is one line")
+        raise PathError(f"{path}: has {len(features)} features, expected one LineString; a path is one line")
     where, _, geometry = features[0]
     name = geometry.get("type") if isinstance(geometry, dict) else None
     coordinates = geometry.get("coordinates") if isinstance(geometry, dict) else None
     if name == "MultiLineString" and isinstance(coordinates, list) and len(coordinates) == 1:
         name, coordinates = "LineString", coordinates[0]
     if name != "LineString":
-        raise PathError(f"{where}: geometry is {shorten_value(name)}, wanted one LineString")
+        raise PathError(f"{where}: geometry is {shorten_value(name)}, expected one LineString")
     return _read_positions(where, coordinates)
 
 
 def _read_positions(where: str, coordinates: Json) -> NDArray[np.float64]:
     if not isinstance(coordinates, list) or not coordinates:
-        raise PathError(f"{where}: its line has no points; wanted at least two")
+        raise PathError(f"{where}: its line has no points; expected at least two")
     try:
         lonlat = np.array([position[:2] for position in coordinates], dtype=np.float64)
     except (TypeError, ValueError, KeyError, OverflowError):
@@ -313,7 +313,7 @@ def _read_positions(where: str, coordinates: Json) -> NDArray[np.float64]:
     if lonlat.ndim != 2 or lonlat.shape[1] != 2 or not np.isfinite(lonlat).all():
         raise PathError(f"{where}: its coordinates are not finite [lon, lat] positions")
     if len(lonlat) < 2 or (lonlat == lonlat[0]).all():
-        raise PathError(f"{where}: its line is one point; wanted a path from one point to another")
+        raise PathError(f"{where}: its line is one point; expected a path from one point to another")
     check_lonlat(where, lonlat)
     return lonlat
 
@@ -325,7 +325,7 @@ def check_lonlat(where: str, lonlat_deg: NDArray[np.float64]) -> None:
         raise PathError(f"{where}: ({lon:g}, {lat:g}) is no lon, lat: the axes look swapped; longitude comes first")
     if abs(lon) > 180.0 or abs(lat) > 90.0:
         raise PathError(
-            f"{where}: ({lon:g}, {lat:g}) is no lon, lat in degrees: it looks projected; wanted WGS 84 (EPSG:4326)"
+            f"{where}: ({lon:g}, {lat:g}) is no lon, lat in degrees: it looks projected; expected WGS 84 (EPSG:4326)"
         )
 
 

@@ -49,7 +49,7 @@ def write_geopackage(path: Path, layers: Sequence[VectorLayer]) -> None:
     """
     ogr = _import_pyogrio()
     if path.exists() and not _is_of(ogr, path, {layer.name for layer in layers}):
-        raise UsageError(f"{path}: is there, and no GeoPackage of tcpipe; give another name")
+        raise UsageError(f"{path}: exists and is not a GeoPackage of tcpipe; give another name")
     ogr.set_gdal_config_options({"OGR_CURRENT_DATE": _ANY_DAY})
     with write_atomic_file(path) as temporary:
         made = temporary.with_name("layers.gpkg")

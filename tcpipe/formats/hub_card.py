@@ -122,7 +122,7 @@ def _iterate_lines(card: DatasetCard, picture: str) -> Iterator[str]:
         yield f"| {_escape_markdown(name)} | {layer['dtype']} | {_escape_markdown(str(layer.get('units', '')))} |"
     yield from (
         "",
-        "`dataset.json` says how each is decoded.",
+        "`dataset.json` describes the decoding.",
         "",
         "## Reading it",
         "",
@@ -143,7 +143,7 @@ def _iterate_lines(card: DatasetCard, picture: str) -> Iterator[str]:
         "",
     )
     yield from ("```bibtex", *_format_bibtex(card), "```", "")
-    yield f"Made with tcpipe {card.tcpipe_version}, data model {card.data_model_version}. `tcpipe verify` proves every file."
+    yield f"Made with tcpipe {card.tcpipe_version}, data model {card.data_model_version}. `tcpipe verify` checks every file."
 
 
 def _describe_reading(card: DatasetCard) -> Iterator[str]:
@@ -161,7 +161,7 @@ def _format_splits(card: DatasetCard) -> str:
         f"`test` is drawn by {rules.holdout} ({100 * rules.test_fraction:g} % of the samples inside the region), `unseen` lies "
         f"outside of it, `buffer` within {card.split.buffer_m:.2f} m of its edge, and is in no other split; `train` has "
         f"{len(card.folds_of_train)} folds. "
-        "`dataset.json` has the audit of what overlaps."
+        "`dataset.json` has the audit of overlaps."
     )
 
 
@@ -305,7 +305,7 @@ def _patch_field(layer: str, values: int, kind: str) -> pa.Field:
     return pa.field(
         layer,
         pa.list_(pa.float32() if kind == "f" else pa.uint16(), values),
-        metadata={"doc": f"layer {layer} as stored; dataset.json says how to decode it"},
+        metadata={"doc": f"layer {layer} as stored; dataset.json describes the decoding"},
     )
 
 

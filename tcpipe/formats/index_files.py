@@ -78,7 +78,7 @@ class RunFacts(Ingestion):
     commit: int = 0
     """Number of the commit that made it visible."""
     idle_watt: float | None = None
-    """What the robot draws while it stands."""
+    """Idle power of the robot."""
     physics: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     """Terms of the fit of power and their standard deviations, in SI, by ``term`` or, of one class of terrain, ``term on terrain``."""
 

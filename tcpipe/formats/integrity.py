@@ -31,7 +31,7 @@ CHECKSUMS = "checksums.json"
 _SEAL_LINE = re.compile(rb'^  "document_sha256": "([0-9a-f]{64})"(,?)\n', re.MULTILINE)
 """The seal in canonical JSON: the text without this line is what it is the hash of."""
 
-_TELLS = "; 'tcpipe verify {}' tells what else is not as it was written"
+_TELLS = "; 'tcpipe verify {}' lists all changed files"
 
 _PAGE_SEAL = "<!-- sha256 of the lines above: {} -->\n"
 _PNG_START = b"\x89PNG\r\n\x1a\n"
@@ -122,7 +122,7 @@ def seal_page(html: str) -> str:
 
 def describe_broken(path: Path | str) -> str:
     """Return the line about a file that is not what its seal or its checksum says."""
-    return f"{path}: is not as it was written: its checksum does not agree"
+    return f"{path}: has changed since it was written: its checksum differs"
 
 
 def find_broken_seal(path: Path) -> str | None:
@@ -138,7 +138,7 @@ def find_broken_seal(path: Path) -> str | None:
 def find_broken_seal_in(data: bytes | None, where: Path | str) -> str | None:
     """Return the same of the bytes of a file that lies at ``where``; None: it is not there."""
     if data is None:
-        return f"{where}: is gone"
+        return f"{where}: is missing"
     whole = {".html": _is_whole_page, ".png": _is_whole_png}.get(Path(where).suffix, _is_whole_document)
     return None if whole(data) else describe_broken(where)
 
@@ -148,12 +148,12 @@ def find_broken_checksums(directory: Path, checksums: Mapping[str, Checksum | No
     for name, wanted in checksums.items():
         path = directory / name
         if not path.is_file():
-            yield f"{path}: is gone"
+            yield f"{path}: is missing"
             continue
         try:
             size = path.stat().st_size
             if wanted is not None and size != wanted.size_bytes:
-                yield f"{path}: has {size} bytes, wanted {wanted.size_bytes}"
+                yield f"{path}: has {size} bytes, expected {wanted.size_bytes}"
                 continue
             found = compute_checksum(path)
         except OSError as error:
@@ -166,13 +166,13 @@ def find_broken_checksums(directory: Path, checksums: Mapping[str, Checksum | No
 def find_wrong_checksum(where: Path | str, found: Checksum | None, wanted: Checksum | None) -> str | None:
     """Return in one line how a file differs from what a document has of it (None: nothing), None if it does not."""
     if found is None:
-        return f"{where}: is gone"
+        return f"{where}: is missing"
     if wanted is None:
         return f"{where}: its sha256 is not on record"
     if found == wanted:
         return None
-    size = "" if found.size_bytes == wanted.size_bytes else f" ({found.size_bytes} bytes, wanted {wanted.size_bytes})"
-    return f"{where}: its sha256 is {found.sha256[:12]}…, wanted {wanted.sha256[:12]}…{size}"
+    size = "" if found.size_bytes == wanted.size_bytes else f" ({found.size_bytes} bytes, expected {wanted.size_bytes})"
+    return f"{where}: its sha256 is {found.sha256[:12]}…, expected {wanted.sha256[:12]}…{size}"
 
 
 def compute_checksum(path: Path) -> Checksum:

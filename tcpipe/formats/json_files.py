@@ -116,7 +116,7 @@ def parse_json(data: bytes, path: Path | str) -> dict[str, Json]:
         raise StoreError(f"{path}: not a readable JSON file ({error}); remove it and run the command again") from None
     if not isinstance(found, dict):
         raise StoreError(
-            f"{path}: holds {type(found).__name__}, wanted a JSON object; remove it and run the command again"
+            f"{path}: contains {type(found).__name__}, expected a JSON object; remove it and run the command again"
         )
     return found
 
@@ -158,7 +158,7 @@ def _format_validation_error(message: str) -> str:
     plain_names = re.sub(
         r"`(.+?)`", lambda name: " or ".join(_JSON_NAMES.get(n, n) for n in name[1].split(" | ")), what
     )
-    return f"{key}: {plain_names.replace('Expected', 'wanted')}".removeprefix(": ")
+    return f"{key}: {plain_names.replace('Expected', 'expected')}".removeprefix(": ")
 
 
 _JSON_NAMES = {

@@ -44,10 +44,10 @@ _CODE = re.compile(r"<Code>(\w+)</Code>")
 _STATUS = re.compile(r"\b[45]\d\d [A-Z][A-Za-z ]*(?=: )")
 """After it follows what the server wrote, which may repeat the query."""
 _REFUSED = {
-    "RequestTimeTooSkewed": "this machine's clock is not the store's; set it",
-    "SignatureDoesNotMatch": "the secret key that is set is not that of the access key",
-    "InvalidAccessKeyId": "the store does not know the access key that is set",
-    "ExpiredToken": "the credentials that are set have expired",
+    "RequestTimeTooSkewed": "the clock of this machine is wrong; set it",
+    "SignatureDoesNotMatch": "the secret key does not belong to the access key",
+    "InvalidAccessKeyId": "the store does not know the access key",
+    "ExpiredToken": "the credentials have expired",
 }
 """Codes of denial that say more than that it is one."""
 _CREDENTIALS = {
@@ -128,7 +128,7 @@ def split_url(url: str, *, one_object: bool = False) -> tuple[str, str]:
     shown, query = split_secrets(scheme, rest)
     public = f"{scheme}{slashes}{shown}"
     if shown + query != rest:
-        raise UsageError(f"{public}: a URL may not hold a user name or password; {_describe_credentials(scheme)}")
+        raise UsageError(f"{public}: a URL may not contain a user name or password; {_describe_credentials(scheme)}")
     query = query.partition("#")[0].removeprefix("?")
     if query and not (one_object and scheme.lower() in ("http", "https")):
         what = "only the http:// or https:// URL of one log may have a query (?…)"
@@ -247,11 +247,11 @@ def _describe_store_error(url: str, error: Exception, code: str | None, what: st
     if denied and code in _REFUSED:
         return _REFUSED[code]
     if denied and code == "AccessDenied" and (what == "written" or os.environ.get("AWS_ACCESS_KEY_ID")):
-        return "the credentials that are set do not allow it"
+        return "the credentials do not allow it"
     if denied and not code and "403" in reason and scheme == "s3" and os.environ.get("AWS_ACCESS_KEY_ID"):
-        return "the store refuses the credentials that are set, or this machine's clock is not the store's"
+        return "the store rejects the credentials, or the clock of this machine is wrong"
     if denied and scheme in _CREDENTIALS:
-        return f"the store wants credentials; set {_CREDENTIALS[scheme]}"
+        return f"the store requires credentials; set {_CREDENTIALS[scheme]}"
     return describe_full_disk(error) or reason
 
 
@@ -260,7 +260,7 @@ def _refuse_endpoints_that_are_none(scheme: str) -> None:
     for name in ("AWS_ENDPOINT_URL", "AWS_ENDPOINT_URL_S3", "AWS_ENDPOINT"):
         value = os.environ.get(name) or os.environ.get(name.lower())
         if scheme == "s3" and value and not _ENDPOINT.fullmatch(value):
-            raise ValueError(f"{name} is {value!r}, wanted http://host or https://host, with :port where it has one")
+            raise ValueError(f"{name} is {value!r}, expected http://host or https://host, with :port where it has one")
 
 
 def _split_url(url: str) -> tuple[str, str]:
@@ -285,7 +285,7 @@ def connect_store(url: str, query: str = "") -> tuple[ObjectStore, str]:
     container, name = _split_url(url)
     scheme, _, bucket = container.partition("://")
     if not bucket:
-        raise ValueError(f"it names no bucket; wanted {scheme}://bucket/name")
+        raise ValueError(f"it names no bucket; expected {scheme}://bucket/name")
     _refuse_endpoints_that_are_none(scheme)
     options: dict[str, Any] = {} if scheme == "file" else {"retry_config": _RETRIES}
     if scheme != "file":  # who names an endpoint without TLS means it

@@ -145,8 +145,8 @@ def format_commented_toml(recipe: Recipe | None = None) -> str:
 
 
 def _iterate_toml_lines(recipe: Recipe, definitions: Mapping[str, Any]) -> Iterator[str]:
-    yield "# The recipe of tcpipe. Every key is here with its default, commented out; remove the # to change one."
-    yield "# Units stand in the names. Reasons: docs/explanation/rulings.md"
+    yield "# The recipe of tcpipe. Every key with its default, commented out; remove the # to change one."
+    yield "# Names end in the unit. Reasons: docs/explanation/rulings.md"
     default = Recipe()
     names = f"one of {', '.join(sorted(load_shipped_profiles().robots))}, or of [robots]"
     yield from _iterate_key_lines(

@@ -126,7 +126,7 @@ class Ingestion:
     message_definitions: str = ""
     tags: Mapping[str, str]
     distance_by_reason_m: Mapping[str, float]
-    """Where every metre went [m], by entry."""
+    """Distance breakdown [m], by entry."""
     damage: tuple[Finding, ...]
 
     @property
@@ -197,7 +197,7 @@ def read_sealed_at(
     """Read and prove a sealed document; `StoreError` where it is gone, or not as it was written."""
     data = place.read(name)
     if data is None:
-        raise StoreError(f"{place.where(name)}: is gone")
+        raise StoreError(f"{place.where(name)}: is missing")
     return verify_document(data, place.where(name), ours=ours)
 
 

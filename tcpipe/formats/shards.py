@@ -99,7 +99,7 @@ class ShardedArray:
                 _decode(self.codec, data, out)
         except FileNotFoundError:
             if not self.sparse:
-                raise StoreError(f"{path}: is gone") from None
+                raise StoreError(f"{path}: is missing") from None
             out[...] = self.fill
         except (OSError, RuntimeError, ValueError) as error:
             raise StoreError(f"{path}: chunk {index} is damaged ({error})") from None
@@ -239,7 +239,7 @@ def open_sharded(
     """
     where = path / DESCRIPTION
     if not where.exists():
-        raise StoreError(f"{path}: is gone")
+        raise StoreError(f"{path}: is missing")
     described = read_json(where)
     compression = _find_compression(described)
     wanted = {
@@ -255,7 +255,7 @@ def open_sharded(
     }
     for key, value in wanted.items():
         if described.get(key) != value:
-            raise StoreError(f"{where}: {key} is {reprlib.repr(described.get(key))}, wanted {value}")
+            raise StoreError(f"{where}: {key} is {reprlib.repr(described.get(key))}, expected {value}")
     codec = _make_codec(compression, where)
     return ShardedArray(path, shape, chunk_shape, shard_shape, dtype, fill, sparse, codec, fetched)
 
@@ -322,14 +322,14 @@ def _make_codec(compression: Any, where: Path) -> Any:
         blosc = parse_typed(compression.get("configuration"), _Blosc, where)
         shuffle = _BLOSC_SHUFFLES[blosc.shuffle]
         return numcodecs.Blosc(cname=blosc.cname, clevel=blosc.clevel, shuffle=shuffle, blocksize=blosc.blocksize)
-    raise StoreError(f"{where}: compressed by {reprlib.repr(name)}, wanted zstd or blosc")
+    raise StoreError(f"{where}: compressed by {reprlib.repr(name)}, expected zstd or blosc")
 
 
 def _decode(codec: Any, data: bytes, out: NDArray[Any]) -> None:
     """Fill ``out`` with what is encoded; `ValueError` where that is more or less."""
     size = int.from_bytes(data[4:8], "little") if isinstance(codec, numcodecs.Blosc) else _read_zstd_size(data)
     if size != out.nbytes:
-        raise ValueError(f"it holds {size} bytes, wanted {out.nbytes}")
+        raise ValueError(f"it contains {size} bytes, expected {out.nbytes}")
     codec.decode(data, out=out)
 
 

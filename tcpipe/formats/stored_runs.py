@@ -50,7 +50,7 @@ class RunDirectory:
         """The whole manifest, with the run's tags as they are now; `StoreError` if it is not as it was written."""
         manifest = _read_manifest(self.place, self.facts.manifest, self.files_state)
         if (manifest.run_id, manifest.recipe_id) != (self.run_id, self.recipe_id):
-            what = f"is of {manifest.run_id}/{manifest.recipe_id}, but lies in {self.run_id}/{self.recipe_id}"
+            what = f"is of {manifest.run_id}/{manifest.recipe_id}, but is stored in {self.run_id}/{self.recipe_id}"
             raise StoreError(f"{self.place.where(self.facts.manifest)}: {what}")
         return replace(manifest, tags=self.facts.tags)
 
@@ -230,7 +230,7 @@ def fetch_local_file(place: Place, name: str, wanted: Checksum) -> Path:
         path.unlink(missing_ok=True)
         return place.local(name, wanted)
     if wrong:
-        raise StoreError(f"{wrong}; 'tcpipe verify {place.where()}' tells what else is not as it was written")
+        raise StoreError(f"{wrong}; 'tcpipe verify {place.where()}' lists all changed files")
     return path
 
 

@@ -46,7 +46,7 @@ def read_arrays(
         with path.open("rb") as stream:
             found = _read_headers(stream, path.stat().st_size)
             if forms is not None and (wrong := _find_wrong_form(found, forms, optional)):
-                raise ModelError(f"{path}: holds the weights of another model: {wrong}; train the model again")
+                raise ModelError(f"{path}: contains the weights of another model: {wrong}; train the model again")
             with np.load(stream, allow_pickle=False) as held:
                 return {name: held[name] for name in held.files}
     except FileNotFoundError:
@@ -71,7 +71,7 @@ def _read_headers(stream: BinaryIO, size: int) -> dict[str, ArrayForm]:
     with zipfile.ZipFile(stream) as archive:
         members = archive.infolist()
         if any(of.compress_type != zipfile.ZIP_STORED for of in members) or sum(of.file_size for of in members) > size:
-            raise ValueError("compressed, or larger than the file; wanted plain arrays")
+            raise ValueError("compressed, or larger than the file; expected plain arrays")
         for member in members:
             with archive.open(member) as array:
                 read_header = _READERS.get(np.lib.format.read_magic(array))
@@ -79,7 +79,7 @@ def _read_headers(stream: BinaryIO, size: int) -> dict[str, ArrayForm]:
                     raise ValueError(f"{member.filename[:80]!r} is no array")
                 shape, _, dtype = read_header(array)
                 if dtype.hasobject or min(shape, default=0) < 0:
-                    raise ValueError(f"{member.filename[:80]!r} holds no numbers")
+                    raise ValueError(f"{member.filename[:80]!r} contains no numbers")
                 if array.tell() + dtype.itemsize * math.prod(shape) != member.file_size:
                     raise ValueError(f"{member.filename[:80]!r} claims {shape} of {dtype}, which its bytes are not")
             found[member.filename.removesuffix(".npy")] = dtype.name, shape
@@ -108,5 +108,5 @@ def _find_wrong_form(
                 lengths.setdefault(of, length)
         bound = tuple(lengths.get(of, of) if isinstance(of, str) else of for of in wanted[1])
         if (dtype, shape) != (wanted[0], bound):
-            return f"{name} is {shape} of {dtype}, wanted {bound} of {wanted[0]}"
+            return f"{name} is {shape} of {dtype}, expected {bound} of {wanted[0]}"
     return None

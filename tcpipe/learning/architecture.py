@@ -70,10 +70,10 @@ def list_weight_forms(shape: Architecture) -> dict[str, ArrayForm]:
 def check_trainable(shape: Architecture) -> None:
     """Raise `ModelError` if torch is not installed or the width is no multiple of `BLOCK`."""
     if find_spec("torch") is None:
-        raise ModelError("torch not installed, wanted to train or use a network: pip install 'tcpipe[train]'")
+        raise ModelError("torch not installed, required to train or use a network: pip install 'tcpipe[train]'")
     if shape.width % BLOCK or not BLOCK <= shape.width <= _MOST_WIDTH:
         raise ModelError(
-            f"a network of width {shape.width}: wanted a multiple of {BLOCK}, from {BLOCK} to {_MOST_WIDTH}"
+            f"a network of width {shape.width}: expected a multiple of {BLOCK}, from {BLOCK} to {_MOST_WIDTH}"
         )
     if not (0 < shape.depth + shape.extra_features <= _MOST_INPUTS and 0 < shape.outputs <= _MOST_INPUTS):
         raise ModelError(

@@ -130,7 +130,7 @@ def _fit_trees(train: Split, ours: Model) -> Predictor:
     folds, labels = train.column("fold"), train.labels.astype(np.float64)
     if len(np.unique(folds)) < 2:
         raise ModelError(
-            f"{len(train)} training samples are in one fold, wanted two or more to tell how many trees are best"
+            f"{len(train)} training samples are in one fold, expected two or more, to choose the number of trees"
         )
 
     def features(split: Split) -> Array:

@@ -228,7 +228,7 @@ def _find_fastest_mps(robot: str, data: Dataset) -> float | None:
 
 
 def _time(ours: Model, sets: Sets, said: Said, *, max_velocity_mps: float | None) -> dict[str, dict[str, Errors]]:
-    """Return table V: T by this model, and T_e = d / v_e at the robot's greatest speed."""
+    """Return table V: T by this model, and T_e = d / v_e at the robot's maximum speed."""
     found = {OURS: {name: _compute_errors(said[name], part, ours)["T"] for name, part in sets.items()}}
     if max_velocity_mps is not None:
         expected = {

@@ -111,12 +111,12 @@ def sample_sections(samples: EvaluatedSamples, audits: Mapping[str, str]) -> lis
     if not samples.table.num_rows:
         return []
     worst = (
-        f"The {_WORST} samples of each split whose E is furthest off, the furthest first. Travel is to the right; a click says more above. "
-        "Look for what they share: a class that the map has wrong, a step that the heights miss, a label with a large σ."
+        f"The {_WORST} samples of each split with the largest errors of E, largest first. Travel is to the right; click for details. "
+        "Look for a common cause: a wrong class in the map, a step missing in the heights, a label with a large σ."
     )
     return [
         _draw_predictions(samples),
-        Section("Worst metres", worst, controls="gallery.html"),
+        Section("Worst segments", worst, controls="gallery.html"),
         *(_draw_errors_by_slope(samples.table, split, audit) for split, audit in audits.items()),
         _draw_calibration(samples.table),
     ]
@@ -124,8 +124,8 @@ def sample_sections(samples: EvaluatedSamples, audits: Mapping[str, str]) -> lis
 
 def _draw_predictions(samples: EvaluatedSamples) -> Section:
     text = (
-        "Each point is a metre; on the line it is predicted right. Hover for its figures, click it for σ, intervals and where it is from, "
-        "or draw a box; Next goes on to the one that is less off."
+        "Each point is a segment; on the line the prediction is exact. Hover for values, click for σ, intervals and origin, "
+        "or draw a box; Next shows the next smaller error."
     )
     if samples.table.num_rows > len(samples.shown):
         text += f" {len(samples.shown)} of {samples.table.num_rows} are shown, drawn at random, and the worst."
@@ -140,7 +140,7 @@ def _draw_scatter(name: str, points_name: str, across: str, up: str, source: Any
     """Return a plot of every sample with the line of those that are right, and its points; the page's script fills both."""
     plot = make_plot(
         name,
-        alt=f"{up.capitalize()} over {across}, a point a sample; the tables below hold the figures by class.",
+        alt=f"{up.capitalize()} over {across}, a point a sample; the tables below list the figures by class.",
         axes=("slope along travel [°]", "predicted less measured") if across == "slope" else (across, up),
         height_px=380,
         tools="tap,box_select,pan,wheel_zoom,box_zoom,reset,save",
@@ -188,8 +188,8 @@ def _draw_errors_by_slope(table: pa.Table, split: str, audit: str) -> Section:
         return Shaded(text, rmse[cell] / most, alarm=is_doubtful)
 
     text = (
-        "RMSE of E [J], mean error (predicted less measured), and in brackets of how many metres; darker is worse. * and a dashed border: "
-        f"90 % intervals hold fewer than {100 * least:.0f} % of {enough:.0f} labels or more there: do not rely on them. {audit}"
+        "RMSE of E [J], mean error (predicted less measured), in brackets the number of segments; darker is worse. * and a dashed border: "
+        f"90 % intervals cover fewer than {100 * least:.0f} % of {enough:.0f} labels or more there: do not rely on them. {audit}"
     )
     header = ["class", *(SLOPE_NAMES[at] for at in columns)]
     table_rows = [[name, *(shade((name, at)) for at in columns)] for _, name in ids]
@@ -206,7 +206,7 @@ def _draw_calibration(table: pa.Table) -> Section:
             continue
         plot = make_plot(
             f"calibration {split}",
-            alt=f"Share of labels of {split} below each quantile that the model states; on the diagonal it knows its own errors.",
+            alt=f"Share of labels of {split} below each quantile that the model states; on the diagonal the model is calibrated.",
             axes=("share stated", f"share of {split} labels below"),
             legend={_CALLED[q]: _COLOURS[q] for q in found},
             height_px=320,
@@ -224,12 +224,12 @@ def _draw_calibration(table: pa.Table) -> Section:
         plot.figure.hover.renderers = lines
         plots.append(plot)
     text = (
-        "What share of labels lies below each quantile of the stated errors, taken as normal. On the diagonal the model knows how wrong it "
-        "is; steeper in the middle it is less sure than it could be, flatter too sure; all above it predicts too much."
+        "Share of labels below each quantile of the stated errors, assumed normal. On the diagonal the model is calibrated; "
+        "steeper in the middle: underconfident; flatter: overconfident; all above: predictions are too large."
         if plots
-        else "The model states no errors: too few samples were held out."
+        else "The model states no uncertainty: too few samples were held out."
     )
-    return Section("Does it know how wrong it is", text, plots=plots)
+    return Section("Calibration of the stated uncertainty", text, plots=plots)
 
 
 def draw_paper_figures(plots: Mapping[str, Plotted]) -> Iterator[Section]:

@@ -30,7 +30,7 @@ from tcpipe.learning.training import compute_dataset_checksum
 from tcpipe.pipeline.generations import write_generation
 from tcpipe.tables.findings import PREDICTED
 
-SIMULATED = "The data are simulated: what can be compared with the paper is the pattern, not the figures."
+SIMULATED = "The data are simulated: compare the pattern with the paper, not the numbers."
 
 JSON, CSV, PAGE, SAMPLES = "evaluation.json", "evaluation.csv", "evaluation.html", "predictions.parquet"
 
@@ -54,7 +54,7 @@ class EvaluationResult:
             energy = part.errors["E"][ALL]
             if energy.coverage_percent is not None:
                 lines.append(
-                    f"{split}: 90 % intervals hold {energy.coverage_percent:.1f} % of E, CRPS {energy.crps:.2f} J"
+                    f"{split}: 90 % intervals cover {energy.coverage_percent:.1f} % of E, CRPS {energy.crps:.2f} J"
                 )
             lines.append(f"{split}: {format_leakage(part.leakage)}")
         lines += describe_ratios(self.values.baselines)
@@ -95,17 +95,19 @@ def run_evaluation(
     if place.exists() and (
         not place.is_dir() or {entry.name for entry in place.iterdir() if entry.name[0] != "."} - ours
     ):
-        raise UsageError(f"{place}: exists and is no evaluation; it is left alone; give another OUT")
+        raise UsageError(f"{place}: exists and is no evaluation; it is not changed; give another OUT")
     if not ((place / JSON).is_file() and (place / SAMPLES).is_file()) or read_json(place / JSON).get("key") != key:
         found, table = evaluate(model, dataset, place, rules, key=key, plant=plant)
         if _make_key(model, dataset, rules, simulated=plant is not None) != key:
-            raise StoreError(f"{dataset} or {model}: another call has replaced it meanwhile; run the command again")
+            raise StoreError(
+                f"{dataset} or {model}: another call has replaced it in the meantime; run the command again"
+            )
         write_table(table, place / SAMPLES)
         write_json(place / JSON, found)  # last: with it the evaluation is whole
     values = read_as(place / JSON, Evaluation)  # in the order of the file, as the next call will read it
     name = values.dataset.name
     of = "" if values.model.label_energy == "total" else f" (w and E {ENERGIES[values.model.label_energy].words})"
-    lead = f"Model {Path(model).name} on dataset {name}: errors of power w, velocity v, time T and energy E{of}, beside the paper's."
+    lead = f"Model {Path(model).name} on dataset {name}: errors of power w, velocity v, time T and energy E{of}, compared with the paper."
     table = io.StringIO()
     writer = csv.writer(table, lineterminator="\n")
     writer.writerows([COLUMNS, *list_evaluation_rows(values)])

@@ -21,12 +21,12 @@ FLOORS = {"label_floor": "label noise alone", "simulation_floor": "simulation's 
 """Lower bounds of errors, and their names on the page."""
 
 MEASURES = {"rmse": "RMSE", "mape_percent": "MAPE"}
-SCORES = {"coverage_percent": "held by 90 %", "nll": "NLL", "crps": "CRPS"}
+SCORES = {"coverage_percent": "coverage of 90 %", "nll": "NLL", "crps": "CRPS"}
 """How well a model states its own errors (`tcpipe.learning.metrics`)."""
 _ALL_MEASURES = MEASURES | SCORES
 
 COUNTED = (
-    "Beside a MAPE stands of how many labels it is: those of at least "
+    "The number in brackets after a MAPE counts its labels: those of at least "
     + ", ".join(f"{least:g} {UNITS[quantity]} ({quantity})" for quantity, least in LEAST.items())
     + ". "
 )
@@ -134,7 +134,7 @@ def _format_measure(measure: str, quantity: str) -> str:
 
 def _make_baselines_section(found: Evaluation) -> Section:
     """Return the model and the baselines, with the ratio of their errors."""
-    title = "Beside what is simplest"
+    title = "Comparison with baselines"
     if not found.baselines:
         return Section(title)
     rows = []
@@ -146,11 +146,11 @@ def _make_baselines_section(found: Evaluation) -> Section:
                 if (row.split, row.quantity) == (split, quantity):
                     figures = [*_format_figures(row.errors, quantity, MEASURES), *_BLANK]
                     rows.append(("", "", row.baseline, *figures, str(row.rmse_ratio), str(row.mape_ratio)))
-    header = ("", "", "", "RMSE", "MAPE [%]", "held by 90 % [%]", "NLL", "CRPS", "ratio of RMSE", "ratio of MAPE")
+    header = ("", "", "", "RMSE", "MAPE [%]", "coverage of 90 % [%]", "NLL", "CRPS", "ratio of RMSE", "ratio of MAPE")
     text = (
-        "Fitted on the samples that the model was fitted on, measured on the same as it. Ratios are the model's error over the "
+        "The baselines use the training and test samples of the model. Ratios are the model's error over the "
         "baseline's, with their 95 % interval (paired bootstrap over runs or blocks): below 1 the model is better. Physics and boosting "
-        f"are told the turn of each metre, too. {COUNTED}{'. '.join(describe_ratios(found.baselines))}. {format_audit(found)}"
+        f"also know the turn of each segment. {COUNTED}{'. '.join(describe_ratios(found.baselines))}. {format_audit(found)}"
     )
     return Section(title, text, header=header, rows=rows, figures_from=3)
 
@@ -188,7 +188,7 @@ def _iterate_class_rows(found: Evaluation, split: str, quantity: str) -> Iterato
         repeats = found.repeatability[quantity]
         if measure == "rmse" and repeats is not None:
             blank = [""] * len(part.classes)
-            yield ("", "repeats to, driven again", *blank, f"{repeats.std:.{_DIGITS[quantity]}f}")
+            yield ("", "repeatability (driven twice)", *blank, f"{repeats.std:.{_DIGITS[quantity]}f}")
     if part.errors[quantity][ALL].nll is not None:
         for score in SCORES:
             yield make_row(f"{quantity}, {_format_measure(score, quantity)}", "here", part.errors[quantity], score)
@@ -200,10 +200,10 @@ def _describe_error_samples(found: Evaluation) -> str:
     count = training.samples["held out"]
     if training.config.model == "resnet18":
         return (
-            f"Intervals, NLL and CRPS rest on its errors on the one fold of train that stopped it ({count} samples), which it fits a "
-            "little too well: no second network was trained for them. "
+            f"Intervals, NLL and CRPS rest on its errors on the fold of train used for early stopping ({count} samples), and are slightly "
+            "too small: no second network was trained for them. "
         )
-    return f"Intervals, NLL and CRPS rest on its errors on all {count} samples of train, each told by the other folds. "
+    return f"Intervals, NLL and CRPS rest on its errors on all {count} samples of train, each predicted by the other folds. "
 
 
 def format_audit(found: Evaluation) -> str:
@@ -214,7 +214,7 @@ def format_audit(found: Evaluation) -> str:
 def format_leakage(leakage: Leakage | None) -> str:
     """Return how near to training a split is, in words."""
     if leakage is None:
-        return "Nothing is known of its distance from training."
+        return "Its distance from training is unknown."
     sharing = "" if leakage.sharing_percent is None else f"; {leakage.sharing_percent:.0f} % share ground with one"
     return (
         f"Audit (test held out by {leakage.holdout}): the middles of {leakage.near_percent:.0f} % of these samples are within "
@@ -223,9 +223,9 @@ def format_leakage(leakage: Leakage | None) -> str:
 
 
 _TEXT = {
-    "test": "Held-out blocks of train are those that the model was not fitted on (a network was stopped by them). "
-    "Label noise alone is what a perfect prediction would show for the labels' own standard deviations.",
-    "unseen": "The paper calls it validation; nothing was tuned or stopped by it.",
+    "test": "Held-out blocks of train: the model was not fitted on them (a network used them for early stopping). "
+    "Label noise alone: the error of a perfect prediction, from the standard deviations of the labels.",
+    "unseen": "The paper calls it validation; tcpipe uses it neither for tuning nor for early stopping.",
 }
 
 
@@ -250,7 +250,7 @@ def _make_ablation_section(found: Evaluation) -> Section:
             rows.append((FLOORS[floor], split, "", *format_row(by_quantity)))
     header = ("layers", "", "", *(f"{quantity} {_format_measure(measure, quantity)}" for quantity, measure in columns))
     text = (
-        f"Layers not named are replaced by noise, mean of {found.config.noise_draws} draws; retrained: a network that never had them. "
+        f"Layers not named are replaced by noise, mean of {found.config.noise_draws} draws; retrained: a network without these layers. "
         f"{COUNTED}{format_audit(found)}"
     )
     return Section("Table III: ablation", text, header=header, rows=rows, figures_from=3)
@@ -283,7 +283,7 @@ def _make_comparison_section(
     repeats = found.repeatability[quantity]
     if repeats is not None:
         cells = [[f"{repeats.std:.{_DIGITS[quantity]}f}", "", *_BLANK]] * len(splits)
-        rows.append(("repeats to, driven again", "", *(cell for part in cells for cell in part)))
+        rows.append(("repeatability (driven twice)", "", *(cell for part in cells for cell in part)))
     measures = (f"{split}, {_format_measure(measure, quantity)}" for split in splits for measure in _ALL_MEASURES)
     text += f" {COUNTED}{format_audit(found)}"
     return Section(title, text, header=("", "", *measures), rows=rows, figures_from=2)
@@ -291,20 +291,20 @@ def _make_comparison_section(
 
 def _make_energy_section(found: Evaluation) -> Section:
     text = (
-        "Wei and Isler predict E from heights alone: one network of grass, or one for every class, each with as many steps as ours. "
+        "Wei and Isler predict E from heights alone: one network for grass, or one per class, each with as many steps as ours. "
         "All rows are of the same samples. "
     )
     ratios = "; ".join(f"{row.split}, {row.baseline}: {row.rmse_ratio}" for row in found.networks)
     text += (
-        f"RMSE of ours over theirs, with its 95 % interval: {ratios}."
+        f"RMSE ratio, ours to theirs, with 95 % CI: {ratios}."
         if ratios
-        else "They are trained beside a network only, and here none was."
+        else "They are trained only if the model is a network."
     )
     return _make_comparison_section("Table IV: energy against Wei and Isler", text, found, ENERGY, "E")
 
 
 def _make_time_section(found: Evaluation) -> Section:
-    text = "The expected time is d / v at the robot's greatest speed."
+    text = "The expected time is d / v at the robot's maximum speed."
     return _make_comparison_section("Table V: time against the expected time", text, found, TIME, "T")
 
 

@@ -65,9 +65,9 @@ def read_checkpoint(path: Path, key: str) -> tuple[TrainingProgress, dict[str, A
         progress = _read_progress(json.loads(arrays.pop(_STATE).tobytes()))
     except (ModelError, KeyError, TypeError, ValueError) as error:
         reason = error.problems[0].removeprefix(f"{path}: ") if isinstance(error, ModelError) else "not a checkpoint"
-        raise ModelError(f"{path}: {reason}; remove it, or start anew with --no-resume") from None
+        raise ModelError(f"{path}: {reason}; remove it, or start again with --no-resume") from None
     if progress.key != key:
-        raise ModelError(f"{path}: of another dataset or other options; remove it, or start anew with --no-resume")
+        raise ModelError(f"{path}: of another dataset or other options; remove it, or start again with --no-resume")
     parts: dict[str, dict[str, NDArray[np.generic]]] = {}
     for name, array in arrays.items():
         part, _, rest = name.partition("/")
@@ -132,7 +132,7 @@ class FitConfig:
     width: Annotated[int, Bounds(ge=16, le=512)] = 64
     """Filters of the first stage, a multiple of 16."""
     label: EnergyName = "total"
-    """Energy to train on: total, or above standing (less the idle power)."""
+    """Energy to train on: total, or net of idle power (less the idle power)."""
     extra_features: bool = False
     """Whether turn and commanded speed of each segment are inputs, too."""
 
@@ -198,7 +198,7 @@ def fit(task: Task, config: FitConfig, *, name: str, key: str, checkpoint: Path)
         progress, parts = read_checkpoint(checkpoint, key)
         _restore(trainer, parts, str(checkpoint))
         best = parts["best"]
-        logger.info("%s: goes on after epoch %d", name, progress.epoch)
+        logger.info("%s: resumes after epoch %d", name, progress.epoch)
     else:  # a place that cannot be written is found now, not after an epoch
         write_checkpoint(checkpoint, progress, _state(trainer, best))
     training_times_s = TrainingTimes()
@@ -339,7 +339,7 @@ def _state(trainer: Trainer, best: Arrays) -> dict[str, Arrays]:
 def _restore(trainer: Trainer, parts: dict[str, Arrays], where: str) -> None:
     """Put weights, the best ones for a look, and the optimiser's memory back."""
     if parts.keys() != {"now", "best", "optimizer"}:
-        raise ModelError(f"{where}: not a checkpoint; remove it, or start anew with --no-resume")
+        raise ModelError(f"{where}: not a checkpoint; remove it, or start again with --no-resume")
     for part in ("best", "now"):
         trainer.network.set_arrays(parts[part], where)
     trainer.load_optimizer_state(parts["optimizer"], where)

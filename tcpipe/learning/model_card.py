@@ -89,7 +89,7 @@ class ModelCard:
     label_energy: EnergyName = "total"
     """total or net: which power w is, and so which energy E."""
     label_includes: tuple[str, ...] = ()
-    """What the power that was measured feeds besides the drives, as the dataset's card has it."""
+    """Loads besides the drives in the measured power, from the card of the dataset."""
     robot: str
     classes: tuple[TerrainClass, ...]
     training_range: TrainingRange
@@ -117,11 +117,11 @@ mean power w [W] and velocity v [m/s] give T = d / v and E = w d / v with d = {{
 {% endif -%}
 - Velocity is the {{ velocity }} one; power is {{ energy }}; robot {{ robot }}.
 {%- if includes %}
-  What was measured feeds {{ includes }}, too.
+  The measured power also feeds {{ includes }}.
 {%- endif %}
 {% if config.model == "boosting" -%}
 - Table: a curve over the slope of each class, and up to {{ told.best_epoch }} boosted trees a label over features of the patch (LightGBM),
-  as many as are best where each fold of train is predicted by the others; the loss {{ config.loss }} there is
+  number chosen by cross-validation over the folds of train; the loss {{ config.loss }} there is
   {{ "%.4f" | format(told.held_out_loss) }}.
 {% elif config.model == "physics" -%}
 - Physics: idle power, drivetrain, grade, and rolling and turning of each class, at a speed that is a curve over class and slope; fitted
@@ -131,10 +131,10 @@ mean power w [W] and velocity v [m/s] give T = d / v and E = w d / v with d = {{
 - Network: ResNet-18 of width {{ width }}; loss {{ config.loss }}, Adam {{ config.learning_rate }}, batch {{ config.batch_size }},
   seed {{ config.seed }}; best of {{ told.epochs }} epochs by fold {{ config.fold }} of train: {{ told.best_epoch }},
   loss {{ "%.4f" | format(told.held_out_loss) }}. Its intervals rest on its errors on the
-  {{ told.samples["held out"] }} samples of that one fold, which it fits a little too well.
+  {{ told.samples["held out"] }} samples of that one fold, which make them slightly too small.
 {% endif -%}
 - Trained on {{ told.samples["fitted"] }} samples of {{ dataset.name }}, checksum {{ dataset.sha256 }}.
-- Seen: {{ classes }}; slope {{ slope }}; relief of a patch {{ relief }}. Beyond these it has no business.
+- Training range: {{ classes }}; slope {{ slope }}; relief of a patch {{ relief }}. Do not use the model outside of these ranges.
 
 ```python
 from tcpipe.learning.models import load_model

@@ -26,9 +26,9 @@ class TrainOptions:
     model: ModelKind | None = option(
         None,
         Option(
-            "The paper's network; boosted trees on features of patches; or physics. The last two take seconds and heed --loss, "
-            "--inverse-variance-weights, --label and --extra-features alone (default: a table of fewer than 20000 samples, "
-            "else, and with the network's own options, the network).",
+            "The paper's network; boosted trees on features of patches; or physics. The last two take seconds and use only --loss, "
+            "--inverse-variance-weights, --label and --extra-features (default: boosting below 20000 samples, "
+            "otherwise, or with an option of the network, resnet18).",
             kind=("resnet18", "boosting", "physics"),
         ),
     )  # fmt: skip
@@ -39,17 +39,17 @@ class TrainOptions:
             kind=("nrmse", "paper_eq4"),
         ),
     )
-    epochs: int | None = option(None, Option("At most.", kind=Range(1, 100_000), shown=100))
+    epochs: int | None = option(None, Option("Most epochs.", kind=Range(1, 100_000), shown=100))
     patience: int | None = option(
-        None, Option("Epochs without a better held-out loss.", kind=Range(1, 100_000), shown=12)
+        None, Option("Epochs without a better held-out loss before training stops.", kind=Range(1, 100_000), shown=12)
     )
     batch_size: int | None = option(
         None, Option("Samples in a batch.", ("--batch-size",), Range(1, 65_536), shown=64, earlier="--batch")
     )
     learning_rate: float | None = option(None, Option(kind=Range(0.0, 1.0, is_open=True), shown=1e-4))
-    fold: int | None = option(None, Option("Fold of train to stop early by.", kind=Range(0, 99), shown=0))
+    fold: int | None = option(None, Option("Fold of train held out for early stopping.", kind=Range(0, 99), shown=0))
     mirror: bool | None = option(
-        None, Option("Mirror every other patch across its travel.", ("--mirror/--no-mirror",), shown=True)
+        None, Option("Mirror every other patch across its direction of travel.", ("--mirror/--no-mirror",), shown=True)
     )
     inverse_variance_weights: bool = option(
         False,
@@ -62,7 +62,7 @@ class TrainOptions:
     label: EnergyName = option(
         "total",
         Option(
-            "Energy to train on: all that was measured, or less what the robot draws while it stands.",
+            "Energy to train on: total, or net (less the idle power).",
             kind=("total", "net"),
         ),
     )
@@ -73,9 +73,9 @@ class TrainOptions:
             ("--extra-features",), earlier="--beside",
         ),
     )  # fmt: skip
-    seed: int | None = option(None, Option("Of weights, shuffles and mirrors.", kind=SEED, shown=0))
+    seed: int | None = option(None, Option("Seed of weights, shuffles and mirrors.", kind=SEED, shown=0))
     no_resume: bool = option(
-        False, Option("Do not go on from where an earlier training was stopped.", ("--no-resume",), earlier="--fresh")
+        False, Option("Start again instead of resuming a stopped training.", ("--no-resume",), earlier="--fresh")
     )
 
 
@@ -85,7 +85,7 @@ class EvaluateOptions:
 
     model: str | Path = required(MODEL)
     dataset: str | Path = required(Option(kind="sealed", metavar="DATASET", is_argument=True))
-    """Of drives the one that the model was trained on."""
+    """With drives: the dataset that the model was trained on."""
     out: str | Path = option("evaluation", Option(kind="published", metavar="[OUT]", is_argument=True))
     _: KW_ONLY
     noise_draws: int = option(
@@ -94,22 +94,22 @@ class EvaluateOptions:
     baselines: bool = option(
         True,
         Option(
-            "Train the height-only networks of Wei and Isler: one of grass, one a class.",
+            "Train the height-only networks of Wei and Isler: one for grass, one per class.",
             ("--baselines/--no-baselines",),
         ),
     )
     retrain_ablation: bool = option(
         False,
         Option(
-            "Train a network for each input set of the ablation, too (six more).",
+            "Also train a network for each input set of the ablation (six more).",
             ("--retrain-ablation",), earlier="--retrain",
         ),
     )  # fmt: skip
-    seed: int = option(0, Option("Of the noise.", kind=SEED))
+    seed: int = option(0, Option("Seed of the noise.", kind=SEED))
     drives: Sequence[str | Path] = option(
         (),
         Option(
-            "Measure MODEL on a whole drive instead: an ingested log, by its path or its run's name; may be repeated.",
+            "Evaluate MODEL on a whole drive instead: an ingested log, by its path or the name of its run; repeatable.",
             ("--drive",), metavar="LOG", repeatable=True,
         ),
     )  # fmt: skip

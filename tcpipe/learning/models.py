@@ -76,7 +76,9 @@ class Model:
         """Return the torch module, images (N, depth, px, px) to outputs over ``card.scale``; torch is imported for it."""
         kind = self.card.training.config.model
         if kind != "resnet18":
-            raise ModelError(f"{self.name}: is a model of {kind}, which has no network; predict asks any model")
+            raise ModelError(
+                f"{self.name}: is a model of kind {kind}, without a network; use predict, which works with any model"
+            )
         check_trainable(self.card.architecture)
         from tcpipe.learning.network import make_resnet18  # noqa: PLC0415  torch takes seconds and half a gigabyte
 
@@ -179,7 +181,7 @@ class Model:
         wanted = (self.patch_px, self.patch_px, self.card.architecture.depth)
         if patches.shape[1:] != wanted:
             raise ModelError(
-                f"{self.name}: patches of shape {patches.shape[1:]}, wanted {wanted}: {', '.join(self.channels)}"
+                f"{self.name}: patches of shape {patches.shape[1:]}, expected {wanted}: {', '.join(self.channels)}"
             )
         out = self.outputs(patches, extra_features)
         if "velocity_mps" in self._short_outputs:
@@ -261,7 +263,7 @@ def set_speed(model: Model, speed_mps: float) -> Model:
     command = next((of for of in model.card.extra_features if of.name == "command_mps"), None)
     if command is None:
         raise UsageError(
-            f"{model.name}: takes no commanded speed; leave out --speed, or train it with --extra-features"
+            f"{model.name}: has no input for the commanded speed; remove --speed, or train it with --extra-features"
         )
     low, high = command.training_range
     if not low - _SPEED_MARGIN_MPS <= speed_mps <= high + _SPEED_MARGIN_MPS:
@@ -277,13 +279,11 @@ def set_speed(model: Model, speed_mps: float) -> Model:
 def set_physics(model: Model, dataset: str | Path) -> Model:
     """Return the model with the physics of its robot that a dataset's card holds, instead of its own; `ModelError` if it holds none."""
     if model.takes_turns:
-        raise UsageError(
-            f"{model.name}: is told the turns of a path and holds what they cost; leave out --physics-from"
-        )
+        raise UsageError(f"{model.name}: already includes the cost of turns; remove --physics-from")
     card = read_card(fetch_directory_by_range(dataset, by_range=is_shard)[0])
     if model.robot not in card.physics:
         raise ModelError(
-            f"{dataset}: its card has no physics of robot {model.robot}; there is that of {', '.join(card.physics) or 'none'}"
+            f"{dataset}: its card has no physics of robot {model.robot}; only of {', '.join(card.physics) or 'none'}"
         )
     own = replace(model.card, physics=card.physics[model.robot])
     return replace(model, card=own, checksum=digest([model.checksum, own.physics]))
@@ -304,7 +304,7 @@ def read_model_card(place: Path) -> ModelCard:
         if not is_current(found):
             version = found.get("schema_version")
             raise ModelError(
-                f"{where}: written by model schema {version}, wanted {SCHEMA_VERSION}; train the model again"
+                f"{where}: written by model schema {version}, expected {SCHEMA_VERSION}; train the model again"
             )
         return parse_typed(found, ModelCard, where)
     except StoreError as error:

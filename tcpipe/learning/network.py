@@ -108,7 +108,7 @@ class ResNet18(nn.Module):
         there = self._weights()
         shapes = {_make_weight_name(name): tuple(_reorder_axes(value).shape) for name, value in there.items()}
         if {name: value.shape for name, value in arrays.items()} != shapes:
-            raise ModelError(f"{where}: holds the weights of another network; remove it and train the model again")
+            raise ModelError(f"{where}: contains the weights of another network; remove it and train the model again")
         for name, value in there.items():
             _reorder_axes(value).copy_(torch.from_numpy(np.ascontiguousarray(arrays[_make_weight_name(name)])))
 
@@ -210,7 +210,7 @@ class Trainer:
         """Restore what `copy_optimizer_state` returned; `ModelError` if it is of another network."""
         there = dict(self._list_state())
         if {name: value.shape for name, value in arrays.items()} != {name: tuple(v.shape) for name, v in there.items()}:
-            raise ModelError(f"{where}: holds the weights of another network; remove it and train the model again")
+            raise ModelError(f"{where}: contains the weights of another network; remove it and train the model again")
         for name, value in there.items():
             value.copy_(torch.from_numpy(np.array(arrays[name])))
 

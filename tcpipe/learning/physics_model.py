@@ -79,9 +79,9 @@ def read_physics_model(arrays: Mapping[str, NDArray[Any]], where: str) -> Physic
     speed, rest = read_curves("linear", arrays, where)
     rest = {"drivetrain_newton": np.array(0.0), **rest}  # models before 0.7 have all of it in P0
     if rest.keys() != set(_NUMBERS):
-        raise ModelError(f"{where}: holds the weights of another model; train the model again")
+        raise ModelError(f"{where}: contains the weights of another model; train the model again")
     if not all(np.isfinite(of).all() for of in rest.values()):
-        raise ModelError(f"{where}: holds coefficients that are not finite; train the model again")
+        raise ModelError(f"{where}: contains coefficients that are not finite; train the model again")
     return PhysicsModel(speed, **rest)
 
 
@@ -103,7 +103,7 @@ def fit_physics_model(extra_features: ExtraFeatures, labels: Floats, *, idle_wat
     metres = FitSamples(power, velocity, np.tan(extra_features.slope_rad), extra_features.turn_radpm * velocity, names)
     found = fit_physics(metres, idle_watt=idle_watt)
     if found is None:
-        raise ModelError(f"{len(labels)} samples to fit physics to, wanted at least {FEWEST} that move")
+        raise ModelError(f"{len(labels)} samples to fit physics to, expected at least {FEWEST} that move")
     known = extra_features.turn_radpm[np.isfinite(extra_features.turn_radpm)]
     return PhysicsModel(
         speed=fit_curves("linear", extra_features.slope_rad, extra_features.class_id, labels[:, 1:]),
@@ -194,14 +194,14 @@ def read_curves(form: Form, arrays: Mapping[str, NDArray[Any]], where: str) -> t
         curves = Curves(form, *(rest.pop(f"{_STORED}{name}") for name in _ARRAYS))
     except KeyError:
         raise ModelError(
-            f"{where}: holds the weights of another model, or of an older kind; train the model again"
+            f"{where}: contains the weights of another model, or of an older kind; train the model again"
         ) from None
     functions = (
         _evaluate_functions(form, curves.knots_rad, np.zeros(1)).shape[1] if curves.knots_rad.size <= _MOST_KNOTS else 0
     )
     finite = all(np.isfinite(of).all() for of in (curves.knots_rad, curves.pooled, curves.own))
     if len(curves.pooled) != functions or not finite or len(curves.class_id) > _MOST_CLASSES:
-        raise ModelError(f"{where}: holds curves that no training makes; train the model again")
+        raise ModelError(f"{where}: contains curves that no training makes; train the model again")
     return curves, rest
 
 

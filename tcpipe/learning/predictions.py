@@ -131,7 +131,7 @@ def check_origin(card: ModelCard, data: Dataset, name: str) -> None:
     if compute_dataset_checksum(data.card) != card.dataset.sha256:
         raise ModelError(
             f"{name}: was trained on another dataset ({card.dataset.name}, {card.dataset.sha256[:12]}) than {data.path}; "
-            "wanted that one, which tells whether a drive was held back"
+            "expected that one, to find out whether a drive was held back"
         )
 
 
@@ -152,7 +152,7 @@ def check_fit(card: ModelCard, data: Dataset, name: str) -> None:
         f"{key} is {mine!r} in the model, {theirs!r} in the dataset" for key, mine, theirs in same if mine != theirs
     ]
     if len(card.outputs) != len(told.label.columns):
-        problems.append(f"it predicts {', '.join(card.outputs)} alone, wanted {' and '.join(told.label.columns)}")
+        problems.append(f"it predicts only {', '.join(card.outputs)}, expected {' and '.join(told.label.columns)}")
     absent = [channel for channel in card.channels if channel not in told.layers]
     problems += [f"the dataset has no layer {', '.join(absent)}, which the model takes"] if absent else []
     if problems:

@@ -176,16 +176,16 @@ _MOST_FEATURES, _MOST_DEPTH, _MOST_OUTPUTS = 100_000, 64, 1024
 def read_forest(arrays: Mapping[str, NDArray[Any]], where: str) -> Forest:
     """Return the forest of `Forest.arrays`; `ModelError` if the arrays are of another model."""
     if arrays.keys() != {of.name for of in fields(Forest)}:
-        raise ModelError(f"{where}: holds the weights of another model; remove it and train the model again")
+        raise ModelError(f"{where}: contains the weights of another model; remove it and train the model again")
     made = Forest(**arrays)
     nodes = len(made.feature)
     most = {
         "child": nodes, "root": nodes, "feature": _MOST_FEATURES, "output": _MOST_OUTPUTS, "depth": _MOST_DEPTH,
     }  # fmt: skip
     if not made.root.size or any((getattr(made, name) >= bound).any() for name, bound in most.items()):
-        raise ModelError(f"{where}: holds trees that lead nowhere; train the model again")
+        raise ModelError(f"{where}: contains trees with invalid nodes; train the model again")
     if not (np.isfinite(made.threshold).all() and np.isfinite(made.value).all()):
-        raise ModelError(f"{where}: holds trees with numbers that are not finite; train the model again")
+        raise ModelError(f"{where}: contains trees with numbers that are not finite; train the model again")
     return made
 
 
@@ -255,7 +255,7 @@ def _load_lightgbm() -> Any:
     try:
         import lightgbm  # noqa: PLC0415  asked for here alone
     except ImportError:
-        raise ModelError("lightgbm not installed, wanted to train a table: pip install 'tcpipe[tables]'") from None
+        raise ModelError("lightgbm not installed, required to train a table: pip install 'tcpipe[tables]'") from None
     except OSError as error:
         raise ModelError(f"lightgbm cannot be loaded ({error}); install the system's package libgomp1") from None
     return lightgbm

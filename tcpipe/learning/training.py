@@ -213,7 +213,7 @@ def make_training_task(data: Dataset, fold: int, variant: Variant) -> Task:
     outputs = (train.energy.energy,) if variant.energy_only else train.label_columns
     wanted = np.isfinite(train.labels).all(axis=1)
     if unlabelled := len(train) - int(wanted.sum()):
-        logger.info("%s: %d of %d samples of train have no label and are left out", data.path, unlabelled, len(train))
+        logger.info("%s: %d of %d samples of train have no label and are not used", data.path, unlabelled, len(train))
     if variant.classes:
         wanted &= np.isin(train.column("terrain_class"), variant.classes)
     train = train.take(wanted)
@@ -221,18 +221,18 @@ def make_training_task(data: Dataset, fold: int, variant: Variant) -> Task:
         train = train.with_channels(*variant.channels)
     if not len(train):
         raise DatasetError(
-            f"{data.path}: no labelled samples in split train; is its region (--split) where the runs are?"
+            f"{data.path}: no labelled samples in split train; check that its region (--split) contains runs"
         )
     fitted, held = train.fold(fold)
     if not len(held) or not len(fitted):
         folds = sorted({int(number) for number in train.column("fold")})
         named = ", ".join(map(str, folds))
-        cure = f"a block holds {data.card.recipe.split.block_m:g} m of ground: drive more of it"
+        cure = f"a block contains {data.card.recipe.split.block_m:g} m of ground: drive more of it"
         if data.card.recipe.split.holdout in ("run", "tag"):
             cure = "they are of whole runs: drive once more, or build it with --holdout block"
         raise DatasetError(
             f"{data.path}: fold {fold} of train leaves {len(fitted)} samples to fit and {len(held)} held out; "
-            f"wanted both (there are folds {named}; {cure})"
+            f"expected both (there are folds {named}; {cure})"
         )
     return Task(train, fitted, held, outputs)
 
@@ -246,11 +246,11 @@ def _add_extra_features(task: Task, rules: FitConfig, data: Dataset) -> Task:
     lacking = [_CALLED[name] for name in wanted if name not in {of.name for of in found}]
     if lacking and not found and rules.model != "physics":
         raise DatasetError(
-            f"{data.path}: its samples have no {' and no '.join(lacking)}; process the runs anew and build the dataset again, "
+            f"{data.path}: its samples have no {' and no '.join(lacking)}; ingest the logs again and build the dataset again, "
             "or train without --extra-features"
         )
     if lacking:
-        logger.warning("%s: its samples have no %s: the model is not told it", data.path, " and no ".join(lacking))
+        logger.warning("%s: its samples have no %s: the model does not use it", data.path, " and no ".join(lacking))
     return replace(task, extra_features=found)
 
 
@@ -283,7 +283,7 @@ def _read_known_card(place: Path) -> ModelCard | None:
     with suppress(StoreError):  # what cannot be read is told by `read_model_card`
         found = read_json(place / CARD) if (place / CARD).is_file() else {}
     if found is not None and found.get("kind") != KIND:
-        raise UsageError(f"{place}: exists and is no model; it is left alone; give another OUT")
+        raise UsageError(f"{place}: exists and is no model; it is not changed; give another OUT")
     if found is not None and not is_current(found):
         return None
     return read_model_card(place)
@@ -295,7 +295,7 @@ def _reject_other_files(place: Path) -> None:
     strangers = sorted(name for name in entries - set(FILES) if not name.startswith("."))
     if strangers:
         raise UsageError(
-            f"{place}: holds {', '.join(strangers)} beside a model, and would be replaced; move that away, or give another OUT"
+            f"{place}: contains {', '.join(strangers)} in the directory of a model, which would be replaced; move it, or give another OUT"
         )
 
 
@@ -310,7 +310,7 @@ def _can_continue(checkpoint: Path, key: str) -> bool:
     try:
         read_checkpoint(checkpoint, key)
     except ModelError as error:
-        logger.warning("%s. Training starts anew now", error.problems[0])
+        logger.warning("%s. Training starts again", error.problems[0])
         return False
     return True
 

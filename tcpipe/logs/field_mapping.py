@@ -130,7 +130,7 @@ def find_mapping_problems(
 ) -> Iterator[str]:
     """Yield what is wrong with a mapping, whatever it is mapped to."""
     if role not in MAPPED:
-        yield f"{where}: plays role {role!r}; wanted role = one of {', '.join(MAPPED)}"
+        yield f"{where}: role is {role!r}; expected one of {', '.join(MAPPED)}"
         return
     known = MAPPED[role]
     if unknown := [name for name in columns if name not in known]:
@@ -143,7 +143,7 @@ def find_mapping_problems(
         if name not in columns:
             yield f"{where}.units: {name} is not in columns"
         elif name in known and unit not in UNITS[known[name].unit]:
-            yield f"{where}.units: {name} is in {unit!r}; wanted one of {', '.join(UNITS[known[name].unit])}"
+            yield f"{where}.units: {name} is in {unit!r}; expected one of {', '.join(UNITS[known[name].unit])}"
 
 
 def convert_units(role: str, values: Mapping[str, Floats], units: Mapping[str, str]) -> dict[str, Floats]:
@@ -209,7 +209,7 @@ def parse_stamps_ns(values: NDArray[Any], unit: str) -> NDArray[np.int64] | str:
         middle = float(np.median(values)) if values.size else 0.0
         fitting = [name for name, ns in _NS_OF.items() if _YEARS_S[0] < middle * ns / 1e9 < _YEARS_S[1]]
         if not fitting:
-            return f"its stamps ({middle:.12g}) do not count from 1970; say what they count, one of {', '.join(_NS_OF)}"
+            return f"its stamps ({middle:.12g}) do not count from 1970; set their unit, one of {', '.join(_NS_OF)}"
         unit = fitting[0]
     factor = _NS_OF[unit]
     if np.issubdtype(values.dtype, np.integer):
@@ -247,15 +247,15 @@ def make_mapped_message(
             found = None
         if found is None:
             problems.append(
-                f'recipe read.fields.{role}.{name} is "{text}"; wanted a field, as "pvt.lat" or "lat * 1e-7"'
+                f'recipe read.fields.{role}.{name} is "{text}"; expected a field, as "pvt.lat" or "lat * 1e-7"'
             )
         elif found[1] not in columns or (columns[found[1]].ndim == 2) != (found[2] is not None):
             held = ", ".join(field for field in columns if not field.endswith("time_ns"))
             problems.append(
-                f"recipe read.fields.{role}.{name} names {text}, which its messages do not hold; they hold {held}"
+                f"recipe read.fields.{role}.{name} names {text}, which its messages do not have; they have {held}"
             )
         elif not np.issubdtype(columns[found[1]].dtype, np.number):
-            problems.append(f"recipe read.fields.{role}.{name} names {text}, which is text; wanted numbers")
+            problems.append(f"recipe read.fields.{role}.{name} names {text}, which is text; expected numbers")
         elif found[2] is not None and int(found[2]) >= columns[found[1]].shape[1]:
             problems.append(
                 f"recipe read.fields.{role}.{name} names {text}; the list has {columns[found[1]].shape[1]} elements"

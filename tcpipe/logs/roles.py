@@ -166,12 +166,12 @@ def assign_roles(
     decided = _Decisions(types, propulsion, known.refusals())
     if namespace is not None and not any(topic.type_name not in TRANSFORMS for topic in listed.values()):
         decided.problems.append(
-            f"recipe read.namespace: no topic lies below {namespace}; the log holds {format_topics(every.values())}"
+            f"recipe read.namespace: no topic below {namespace}; the log has {format_topics(every.values())}"
         )
     _take_chosen(decided, listed, wanted, mapped)
     taken = {name for role in decided.roles.values() for name in role.topics}
     free = [topic for topic in listed.values() if topic.name not in taken and _is_usable(decided, topic, ignored)]
-    settled = dict.fromkeys(wanted, "the recipe chooses what plays {role}")
+    settled = dict.fromkeys(wanted, "the recipe chooses the topic for {role}")
     if "pose" in decided.roles:
         _let_stand_in(decided, settled, pose_sources)
     found = {
@@ -222,10 +222,10 @@ def _let_stand_in(decided: _Decisions, settled: dict[str, str], pose_sources: Co
     for role in ("gnss", *pose_sources):
         if role in decided.roles:
             decided.problems.append(
-                f"recipe read.topics names {decided.roles[role].topics[0]} as {role} and {pose} as pose: the pose stands in for it; "
-                f"drop one of both"
+                f"recipe read.topics names {decided.roles[role].topics[0]} as {role} and {pose} as pose: the pose replaces it; "
+                f"remove one of them"
             )
-        settled.setdefault(role, f"the pose of {pose} stands in for it")
+        settled.setdefault(role, f"the pose {pose} is used instead")
 
 
 def _decide_pose(decided: _Decisions, candidates: Ranked, *, taken: bool) -> None:
@@ -242,7 +242,7 @@ def _decide_pose(decided: _Decisions, candidates: Ranked, *, taken: bool) -> Non
             decided.left_out[topic.name] = f"{why} that it is another estimator's output"
 
 
-_NO_FIXES = "it goes with the fixes of its receiver, and no topic plays gnss"
+_NO_FIXES = "it needs the fixes of its receiver, and no topic is used as gnss"
 
 
 def _decide_velocity(decided: _Decisions, candidates: Ranked) -> None:
@@ -288,19 +288,19 @@ def _take_chosen(
         if missing and (role == "power" or not present):
             decided.undecided.add(role)
             decided.problems.append(
-                f"recipe read.topics.{role} names {', '.join(missing)}, which the log does not hold; "
-                f"it holds {format_topics(topics.values(), decided.types[role])}"
+                f"recipe read.topics.{role} names {', '.join(missing)}, which the log does not have; "
+                f"it has {format_topics(topics.values(), decided.types[role])}"
             )
         for name in wanted:
             if topics[name].type_name not in decided.types[role] and role not in mapped:
                 wanted_types = " or ".join(decided.types[role])
                 decided.problems.append(
-                    f"recipe read.topics.{role}: {name} is {topics[name].type_name}; wanted {wanted_types}"
+                    f"recipe read.topics.{role}: {name} is {topics[name].type_name}; expected {wanted_types}"
                 )
             elif topics[name].problem is not None:
                 decided.problems.append(f"recipe read.topics.{role}: {name} cannot be read: {topics[name].problem}")
         if wanted:
-            decided.roles[role] = PlayedRole(role, tuple(wanted), topics[wanted[0]].type_name, "the recipe says so")
+            decided.roles[role] = PlayedRole(role, tuple(wanted), topics[wanted[0]].type_name, "set in the recipe")
 
 
 def _is_usable(decided: _Decisions, topic: Topic, ignored: Sequence[str]) -> bool:
@@ -316,7 +316,7 @@ def _is_usable(decided: _Decisions, topic: Topic, ignored: Sequence[str]) -> boo
     elif topic.message_count == 0:
         why = "it has no messages"
     elif topic.name.startswith(OVERLAY):
-        why = "tcpipe made it of another log (tcpipe overlay): ingest that one"
+        why = "tcpipe made it from another log (tcpipe overlay): ingest that log"
     if why is not None:
         decided.left_out[topic.name] = why
     return why is None
@@ -381,13 +381,13 @@ Sorted = tuple[str | None, tuple[int, ...], str]
 
 def _sort_gnss(topic: Topic, *, role: str, fused: re.Pattern[str]) -> Sorted:
     if word := _find_role_word(fused, topic.name):
-        return None, (), f"its name ({word}) says that it is another estimator's output"
+        return None, (), f"its name ({word}) means output of another estimator"
     return role, (ROLE_TYPES[role].index(topic.type_name),), ""
 
 
 def _sort_imu(topic: Topic) -> Sorted:
     if word := _find_role_word(_OTHER_IMU, topic.name):
-        return "imu", (1,), f"its name ({word}) says that it is another device's or made from odometry"
+        return "imu", (1,), f"its name ({word}) means another device, or computed from odometry"
     raw = bool(re.search(r"(^|[/_])raw$", topic.name))
     return "imu", (0, int(raw)), ""
 
@@ -399,13 +399,13 @@ def _sort_odometry(topic: Topic) -> Sorted:
     kind = ROLE_TYPES["wheel_odometry"].index(topic.type_name)
     for pattern, what in _NO_SENSOR:
         if word := _find_role_word(pattern, name):
-            return None, (), f"its name ({word}) says that it is {what}"
+            return None, (), f"its name ({word}) means {what}"
     if word := _find_role_word(_VISUAL, name):
-        return "visual_odometry", (kind,), f"its name says {word}"
+        return "visual_odometry", (kind,), f"its name contains {word}"
     explicit = bool(re.search(r"wheel|velocity_controller|platform|encoder|diff_drive|drive_base", name.lower()))
     if topic.type_name != ODOMETRY and not explicit and not _find_role_word(_WHEEL, name):
-        return None, (), "its name does not say what it measures"
-    return "wheel_odometry", (int(not explicit), kind), "its name says wheels" if explicit else ""
+        return None, (), "its name does not identify what it measures"
+    return "wheel_odometry", (int(not explicit), kind), "its name means wheels" if explicit else ""
 
 
 def _sort_twist(topic: Topic) -> Sorted:
@@ -414,31 +414,31 @@ def _sort_twist(topic: Topic) -> Sorted:
     if topic.type_name == TWIST_STAMPED and _find_role_word(_COMMAND, name):
         return _sort_command(topic)
     if word and not _find_role_word(_NOT_DOPPLER, name):
-        return "gnss_velocity", (ROLE_TYPES["gnss_velocity"].index(topic.type_name),), f"its name says {word}"
+        return "gnss_velocity", (ROLE_TYPES["gnss_velocity"].index(topic.type_name),), f"its name contains {word}"
     return _sort_odometry(topic)
 
 
 def _sort_pose(topic: Topic) -> Sorted:
     if word := _find_role_word(_SLAM, topic.name):
-        return "pose", (ROLE_TYPES["pose"].index(topic.type_name),), f"its name ({word}) says"
+        return "pose", (ROLE_TYPES["pose"].index(topic.type_name),), f"its name ({word}) means"
     return (
         None,
         (),
-        "a pose is taken where the recipe names it, or its name says icp, slam, loam, lio, cartographer or hector",
+        "a pose is used if the recipe names it, or its name contains icp, slam, loam, lio, cartographer or hector",
     )
 
 
 def _sort_command(topic: Topic) -> Sorted:
     name = topic.name.lower()
     if not _find_role_word(_COMMAND, name):
-        return None, (), "a Twist that is not called a command"
+        return None, (), "a Twist whose name is not that of a command"
     stamped = ROLE_TYPES["command"].index(topic.type_name)
     if name.endswith("cmd_vel_out"):
-        return "command", (0, stamped), "it leaves the controller"
+        return "command", (0, stamped), "it is the output of the controller"
     if _find_role_word(_HUMAN_OR_PLANNER, name):
         return "command", (3, stamped), "the only command"
     if re.search(r"controller|platform|base", name):
-        return "command", (1, stamped), "it reaches the controller"
+        return "command", (1, stamped), "it is the input of the controller"
     return "command", (2, stamped), ""
 
 
@@ -450,7 +450,7 @@ def _sort_power(decided: _Decisions, topic: Topic) -> Sorted:
     if topic.type_name in decided.refusals:
         return None, (), f"its type {decided.refusals[topic.type_name]}"
     if topic.type_name in decided.propulsion:
-        return "power", (0, decided.propulsion.index(topic.type_name)), "its type tells propulsion apart"
+        return "power", (0, decided.propulsion.index(topic.type_name)), "its type measures propulsion separately"
     if topic.type_name == BATTERY_STATE:
         return "power", (1 if _find_role_word(_DRIVES, topic.name) else 4,), ""
     return "power", (3,), ""
@@ -502,7 +502,7 @@ def _decide(decided: _Decisions, role: str, candidates: Ranked) -> None:
         why = f"{len(rails)} sides of one robot, summed" if len(rails) > 1 else "voltage and current on two topics"
     else:
         decided.ambiguous.append(
-            f"role {role} is ambiguous, {len(first)} topics could play it: {format_topics(topics)}"
+            f"role {role} is ambiguous, {len(first)} topics could be used: {format_topics(topics)}"
         )
         decided.recipe_lines.append(_format_recipe_line(role, names))
         decided.undecided.add(role)
@@ -548,7 +548,7 @@ def _format_recipe_line(role: str, names: Sequence[str]) -> str:
 
 def _list_questions(decided: _Decisions) -> list[str]:
     head = RecipeFragment({"read.topics": {}}).toml()
-    how = ["settle it in the recipe (tcpipe.toml), for example:", head, *decided.recipe_lines]
+    how = ["decide in the recipe (tcpipe.toml), for example:", head, *decided.recipe_lines]
     return [*decided.ambiguous, *how] if decided.ambiguous else []
 
 
@@ -557,7 +557,7 @@ def _find_no_motion(decided: _Decisions, topics: Sequence[Topic]) -> tuple[list[
     if any(role in decided.roles or role in decided.undecided for role in MOTION_ROLES):
         return [], []
     findings = []
-    lines = ["nothing in the log tells motion: no topic plays wheel_odometry, visual_odometry or gnss"]
+    lines = ["no motion in the log: no topic is used as wheel_odometry, visual_odometry or gnss"]
     able = {
         topic.name: role
         for role in reversed(MOTION_ROLES)
@@ -569,13 +569,13 @@ def _find_no_motion(decided: _Decisions, topics: Sequence[Topic]) -> tuple[list[
         reasons = "; ".join(f"{name} since {why}" for name, why in list(could.items())[:LISTED])
         readable = {of.name for of in topics if of.problem is None and not of.name.startswith(OVERLAY)}
         name = next((name for name in could if name in readable), "")
-        lines.append(f"left out: {reasons}")
+        lines.append(f"not used: {reasons}")
         if name:
             role = able[name]
             names, remedies = {"role": role, "reason": "name"}, suggest("use", {"read.topics": {role: [name]}})
             subject = Subject("topic", name)
             findings.append(make_finding("topic-left-out", subject, severity="warning", names=names, remedies=remedies))
-    return [*lines, *list_undecodable(topics), f"the log holds {format_topics(topics)}"], findings
+    return [*lines, *list_undecodable(topics), f"the log has {format_topics(topics)}"], findings
 
 
 def _transform_topics(topics: Iterable[Topic], ignored: Sequence[str]) -> tuple[str, ...]:

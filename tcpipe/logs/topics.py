@@ -164,11 +164,11 @@ def list_undecodable(topics: Iterable[Topic]) -> Iterator[str]:
     if by_reason:
         reasons = "; ".join(f"{format_topic_names(topics)}: {why}" for why, topics in list(by_reason.items())[:LISTED])
         more = f"; {len(by_reason) - LISTED} more reasons" if len(by_reason) > LISTED else ""
-        yield f"topics that hold data which cannot be decoded: {reasons}{more}"
+        yield f"topics with data that cannot be decoded: {reasons}{more}"
 
 
 _LITTLE_SPAN = 0.5
-"""A sensor that was silent for more than half of the drive does not win by its name."""
+"""A sensor that was no messages for more than half of the drive does not win by its name."""
 _LITTLE_SPAN_OF_POWER = 0.1
 """What tells propulsion apart and what tells a whole battery are not of one quantity: there coverage weighs less."""
 _SILENCE_NS, _SILENT_PERIODS = 5_000_000_000, 10
@@ -212,7 +212,7 @@ def format_coverage(topic: Topic) -> str:
     """Return ``658 messages over 65.7 s``, as far as the index tells."""
     span_s = _compute_span_s(topic)
     count = "some messages" if topic.message_count is None else f"{topic.message_count} messages"
-    silent = f", silent for {topic.silent_ns / 1e9:.1f} s of them" if topic.silent_ns else ""
+    silent = f", no messages for {topic.silent_ns / 1e9:.1f} s of them" if topic.silent_ns else ""
     return count if span_s is None else f"{count} over {span_s:.1f} s{silent}"
 
 
@@ -265,7 +265,7 @@ def find_robot(topics: Iterable[Topic], name: str | None, robots: Mapping[str, R
     """Return the profile of a log, ``name`` where the user gave one, and why; `RecipeError` where no profile has that name."""
     if name is not None:
         if name not in robots:
-            raise RecipeError(f"robot: no profile is called {name!r}; there are {', '.join(sorted(robots))}")
+            raise RecipeError(f"robot: no profile {name!r}; known: {', '.join(sorted(robots))}")
         return name, "given"
     listed = sorted(topics, key=lambda topic: topic.name)
     if by_type := _find_only_topic(
@@ -273,14 +273,14 @@ def find_robot(topics: Iterable[Topic], name: str | None, robots: Mapping[str, R
     ):
         return by_type[0], f"topic {by_type[1].name} is {by_type[1].type_name}"
     if by_name := _find_only_topic((n, t) for t in listed for n, of in robots.items() if _is_called(of, t)):
-        return by_name[0], f"topic {by_name[1].name} is called so"
+        return by_name[0], f"topic {by_name[1].name} has its name"
     for topic in listed:
         if topic.type_name == _POWER_OF_ANY_CLEARPATH:
             if other := next((found for of in listed if (found := _SERIAL_NUMBER.search(of.name.lower()))), None):
-                return GENERIC, f"topics are named after the platform {other[1].upper()}, which no profile knows"
+                return GENERIC, f"topics are named after the platform {other[1].upper()}, which has no profile"
             first = next((n for n, of in robots.items() if of.platform == _FIRST_TO_PUBLISH_IT), GENERIC)
             return first, f"topic {topic.name} is {topic.type_name}, and nothing names another platform"
-    return GENERIC, "no topic tells the robot"
+    return GENERIC, "no topic identifies the robot"
 
 
 def _is_called(robot: Robot, topic: Topic) -> bool:
@@ -326,7 +326,7 @@ def ask_which_robot(robots: Mapping[str, Sequence[str]]) -> list[str]:
     first, *others = robots
     other = "".join(f' or "{name}"' for name in others)
     return [
-        f"the log holds {len(robots)} robots, and a run is of one: {each}",
-        "settle it in the recipe (tcpipe.toml), for example:",
+        f"the log contains {len(robots)} robots, but a run has one: {each}",
+        "decide in the recipe (tcpipe.toml), for example:",
         *f"{RecipeFragment({'read': {'namespace': first}}).toml()}  #{other}".splitlines(),
     ]

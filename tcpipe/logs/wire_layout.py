@@ -67,7 +67,7 @@ def find_dialect(payload: bytes, encoding: str) -> Dialect:
     if encoding == "ros1":
         return ROS1
     if len(payload) < _CDR_HEADER or payload[0] != 0 or payload[1] not in _CDR_BYTE_ORDER:
-        raise LayoutError(f"CDR header {payload[:_CDR_HEADER].hex(' ')} is none that ROS 2 writes")
+        raise LayoutError(f"CDR header {payload[:_CDR_HEADER].hex(' ')} is invalid in ROS 2")
     max_alignment = _XCDR2_ALIGNMENT if payload[1] in _PLAIN_XCDR2 else 8
     return Dialect(_CDR_BYTE_ORDER[payload[1]], _CDR_HEADER, max_alignment, 1, 1, _CDR_PADDING)
 
@@ -251,7 +251,7 @@ class _Walk:
         alignment = min(alignment, self.dialect.max_alignment)
         start = self.position + -(self.position - self.dialect.origin) % alignment
         if start + size > len(self.payload):
-            raise LayoutError(f"byte {start + size} is wanted of a message of {len(self.payload)}")
+            raise LayoutError(f"byte {start + size} is beyond the end of a message of {len(self.payload)}")
         self.position = start + size
         return start
 

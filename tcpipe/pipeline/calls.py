@@ -152,7 +152,7 @@ def _end(log: LogWriter, kind: Kind, entries: Entries) -> None:
     try:
         log.commit(kind, entries)
     except StoreError as error:
-        logger.warning("%s: so the store does not know how this call ended", error.problems[0])
+        logger.warning("%s: so the store has no record of how this call ended", error.problems[0])
 
 
 def make_call(command: str, works_on: Sequence[str], options: object = None) -> Begun:
@@ -258,7 +258,7 @@ def estimate(calls: Sequence[CallRecord], command: str, amount: int, *, jobs: in
     """
     like = [call for call in calls if call.command == command and _parse_amount(call)]
     of = "logs" if command == INGEST else "samples"
-    rates, source = MEASURED[command], "by figures measured elsewhere: this store has no history of it"
+    rates, source = MEASURED[command], "from default figures: this store has no earlier calls"
     if like:
         done, alone = sum(_parse_amount(call) for call in like), rates.call_s / rates.cpu_s
         more_s = sum(max(0.0, call.cpu_s - rates.call_s) for call in like)

@@ -46,7 +46,7 @@ class DemoResult:
                 f'                 train = tcpipe.open_dataset("{here}/dataset")["train"]',
                 "                 train.patches  # float32 (N, 40, 40, 3): ortho, terrain, height",
                 "                 train.labels   # (N, 2): power [W], velocity [m/s]",
-                *(("", "nothing to do: all of it was there already") if self.unchanged else ()),
+                *(("", "nothing to do: everything exists") if self.unchanged else ()),
             )
         )
 
@@ -62,7 +62,7 @@ def run_demo(directory: Path, *, seed: int, say: Callable[[str], None]) -> DemoR
     site_path, store_path, dataset_path = directory / "site", directory / "store", directory / "dataset"
     clear(directory)
     if directory.exists() and not directory.is_dir():
-        raise UsageError(f"{directory}: is a file, wanted a directory for the demo")
+        raise UsageError(f"{directory}: is a file, expected a directory for the demo")
     if directory.exists() and any(directory.iterdir()) and not site_path.exists():
         raise UsageError(f"{directory}: exists and is no demo; give another directory")
     say("simulating a site and two drives")

@@ -208,7 +208,7 @@ def _run_causes(a: Mapping[str, RunSource], b: Mapping[str, RunSource]) -> Itera
             yield f"log: {which} {', '.join(run.logs)} (run {run_id}, {run.samples} samples)"
         elif a[run_id].segments_sha256 != b[run_id].segments_sha256:
             was, now = a[run_id].recipe_id, b[run_id].recipe_id
-            why = f"ingested with recipe {was} → {now}" if was != now else "the same log and recipe, ingested anew"
+            why = f"ingested with recipe {was} → {now}" if was != now else "the same log and recipe, ingested again"
             yield f"log: run {run_id} has other segments: {why}"
 
 
@@ -217,7 +217,7 @@ def _map_causes(a: Mapping[str, MapSource], b: Mapping[str, MapSource]) -> Itera
         if name not in a or name not in b:
             yield f"map: {'added' if name not in a else 'removed'} {name}"
         elif a[name].sha256 != b[name].sha256:
-            yield f"map: {name} is another one: {', '.join(_map_changes(a[name], b[name])) or 'its files were made anew'}"
+            yield f"map: {name} is another one: {', '.join(_map_changes(a[name], b[name])) or 'its files were made again'}"
 
 
 def _map_changes(a: MapSource, b: MapSource) -> Iterator[str]:
@@ -237,7 +237,7 @@ def _iterate_lines(found: Difference) -> Iterator[str]:
         yield f"{found.a} and {found.b}: the same {found.samples['in both']} samples, made from the same"
         return
     yield f"{found.a} → {found.b}"
-    yield from found.causes or ("no cause on record: same code, recipe, logs, maps and region",)
+    yield from found.causes or ("no recorded cause: same code, recipe, logs, maps and region",)
     yield "samples: " + ", ".join(
         f"{count} {name}"
         for name, count in found.samples.items()

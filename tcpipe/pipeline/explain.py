@@ -223,9 +223,7 @@ def _sample(directory: Path, sample_id: str) -> _Sample:
     row = pc.index(ids, sample_id).as_py()
     if row < 0:
         near = [name for name in ids.to_pylist() if sample_id and sample_id in name][:3]
-        hint = (
-            f"; did you mean {', '.join(near)}?" if near else f"; an id of it is {ids[0].as_py()}" if len(ids) else ""
-        )
+        hint = f"; did you mean {', '.join(near)}?" if near else f"; an example is {ids[0].as_py()}" if len(ids) else ""
         raise DatasetError(f"{directory}: no sample {sample_id!r}{hint}")
     try:
         names = [name for name in sample_columns(directory) if name != GEOMETRY]
@@ -242,7 +240,7 @@ def _run(store: Store, directory: Path, card: DatasetCard, sample: _Sample) -> R
     recipe_id = next((run.recipe_id for run in card.runs if run.run_id == sample.run_id), None)
     if recipe_id is None:
         raise DatasetError(
-            f"{directory}: its card lists no run {sample.run_id}; 'tcpipe verify {directory}' tells what else is wrong"
+            f"{directory}: its card lists no run {sample.run_id}; 'tcpipe verify {directory}' lists all problems"
         )
     for run in store.recipes_of(sample.run_id):
         if run.recipe_id == recipe_id:
@@ -339,11 +337,11 @@ def _sample_again(
     if row < 0:
         away_s = np.abs(to_integers(segments, "start_ns") - sample.start_ns).min(initial=np.iinfo(np.int64).max) / 1e9
         near = f"; the nearest begins {away_s:.3f} s away" if segments.num_rows else "; it has none now"
-        return f"no segment of run {run.run_id} begins at this stamp any more{near}"
+        return f"no segment of run {run.run_id} begins at this stamp now{near}"
     segment = segments.slice(row, 1).to_pylist()[0]
     sampled = _sample_segment(segment, source, recipe)
     if len(sampled.kept) == 0:
-        return f"map {source.name} gives no patch for it any more"
+        return f"map {source.name} no longer gives a patch for it"
     return segment, sampled.patches
 
 
@@ -365,7 +363,7 @@ def _iterate_differences(
     for layer, stored in _read_stored_layers(files, card, sample.row).items():
         pixels = patches.pixels.get(layer)
         if pixels is None:
-            yield f"{layer}: map {sample.map} has no such layer any more"
+            yield f"{layer}: map {sample.map} no longer has this layer"
         elif not np.array_equal(pixels[0], stored, equal_nan=pixels.dtype.kind == "f"):
             yield f"{layer}: {int((pixels[0] != stored).sum())} of {stored.size} pixels differ"
 
@@ -377,11 +375,11 @@ def _iterate_reasons(card: DatasetCard, sample: _Sample, run: RunDirectory, sour
         yield f"made by tcpipe {', '.join(sorted(versions - {__version__}))}, this is {__version__}"
     for entry in card.maps:
         if entry.name == sample.map and entry.inputs != source.facts.inputs:
-            yield f"map {source.name} was added anew since, from other files"
+            yield f"map {source.name} was added again later, from other files"
     for made_from in card.runs:
         now = run.checksum("segments.parquet").sha256
         if made_from.run_id == run.run_id and made_from.segments_sha256 != now:
-            yield f"run {run.run_id} was ingested anew since, with other segments"
+            yield f"run {run.run_id} was ingested again later, with other segments"
 
 
 def _read_stored_layers(files: PatchFiles, card: DatasetCard, row: int) -> dict[str, NDArray[np.generic]]:
@@ -414,7 +412,7 @@ def _iterate_lines(sample_id: str, facts: History, differences: Sequence[str]) -
         f"quality {', '.join(facts.quality) or 'clean'}"
     )
     paths, sha256 = (facts.source.paths, facts.source.sha256) if facts.source else ((), "")
-    there = [path if Path(path).exists() else f"{path} (not there now)" for path in paths]
+    there = [path if Path(path).exists() else f"{path} (now missing)" for path in paths]
     yield f"log      {', '.join(there) or 'unknown'} (sha256 {sha256[:12]}…), run {run.run_id}, robot {run.robot}"
     yield f"stamps   {sample['start_ns']} to {sample['end_ns']} ns"
     for role, found in facts.messages.items():
@@ -435,7 +433,7 @@ def _iterate_lines(sample_id: str, facts: History, differences: Sequence[str]) -
     versions = facts.versions
     yield f"versions dataset {versions.dataset}, run {run.tcpipe_version}, here {versions.here}; data model {versions.data_model}"
     if differences:
-        yield f"made again from the {facts.made_from}: it differs"
+        yield f"computed again from the {facts.made_from}: it differs"
         yield from (f"  {line}" for line in differences)
     else:
-        yield f"made again from the {facts.made_from}: equal, bit for bit"
+        yield f"computed again from the {facts.made_from}: identical"

@@ -213,13 +213,11 @@ def _refuse_others_files(index: Mapping[str, IndexEntry], made_from: ExportOrigi
     taken = sorted({others[path.name] for path in paths.values() if path.name in others})
     if taken:
         out = next(iter(paths.values())).parent
-        raise UsageError(f"{out}: holds the same topics of {', '.join(taken)}; give another directory")
+        raise UsageError(f"{out}: contains the same topics of {', '.join(taken)}; give another directory")
     known = {entry.file for entry in index.values()}
     strange = [path for path in paths.values() if path.exists() and path.name not in known and not _is_a_topics(path)]
     if strange:
-        raise UsageError(
-            *(f"{path}: is there, and no topic that was exported; give another directory" for path in strange)
-        )
+        raise UsageError(*(f"{path}: exists and is not an exported topic; give another directory" for path in strange))
 
 
 def _is_a_topics(path: Path) -> bool:

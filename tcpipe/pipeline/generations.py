@@ -49,7 +49,7 @@ def read_generations(place: Place, card: str) -> State:
         there = {*place.folders(), *place.files()} - {GENERATIONS, LOG}
         name = card if card in there else min(there, default=card)
     if name != card:
-        raise UsageError(f"{place.where()}: holds {name} and no {card}; it is left alone; give another place")
+        raise UsageError(f"{place.where()}: contains {name} and no {card}; it is not changed; give another place")
     return state
 
 

@@ -63,7 +63,7 @@ logger = logging.getLogger("tcpipe")
 _TOGETHER_S = 1.0
 """What ends within so long is one commit."""
 
-_NO_LOGS = "no logs given; wanted .mcap, .bag or .db3 files, ROS 2 bag directories, or folders of them or of tables"
+_NO_LOGS = "no logs given; expected .mcap, .bag or .db3 files, ROS 2 bag directories, or folders of them or of tables"
 
 
 @dataclass(frozen=True, slots=True)
@@ -340,7 +340,7 @@ def find_superseded(
     found, notes, gone, parties = list[Superseded](), list[str](), state.superseded, state.parties
     if run_id in gone:
         found.append(Superseded(run_id, None))
-        notes.append(f"run {run_id} counts again: its recording is back")
+        notes.append(f"run {run_id} counts again: its log is available again")
     seen = {sighting.sha256 for sighting in state.seen.get(source.lineage, ())}
     new = sha256 not in seen
     earlier = seen - {sha256} if new or run_id in parties else ()
@@ -350,10 +350,10 @@ def find_superseded(
             elsewhere = _describe_elsewhere(state, older, source) if share >= _CONTAINED else ""
             if share >= _CONTAINED and not elsewhere:
                 found.append(Superseded(older, run_id))
-                notes.append(f"run {older}, made from this path before, is superseded: this log holds what it held")
+                notes.append(f"run {older}, made from this path before, is superseded: this log contains its content")
             elif new:
-                held = f"this log holds {share:.0%} of it" if share else "that was another recording"
-                why = f"its recording lies at {elsewhere}" if elsewhere else held
+                held = f"this log contains {share:.0%} of it" if share else "its content differs"
+                why = f"its log is at {elsewhere}" if elsewhere else held
                 notes.append(f"run {older}, made from this path before, stays: {why}")
     return found, notes
 

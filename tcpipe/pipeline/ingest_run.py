@@ -51,7 +51,7 @@ def ingest_one(task: IngestTask) -> Ingested:
     with set_task(task.source.name):
         result = mark_reported(task, partial(_ingest, hashed=hashed, rows=rows))
     if task.source.has_changed():
-        note = "it changed while it was looked at; it is ingested when its recording has ended"
+        note = "changed during the check; will be ingested when its recording has ended"
         return Ingested(task.source, IngestResult(task.source.name, "waiting", notes=(note,)))
     return Ingested(task.source, replace(result, sha256=hashed[0]) if hashed else result, tuple(rows))
 

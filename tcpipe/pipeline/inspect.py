@@ -185,7 +185,7 @@ def _inspect_logs_at(
     logs: Sequence[Path | str], path: Path | str, ask: Callable[[Path | str], InspectedLog]
 ) -> InspectedLog | InspectedLogs:
     if not logs:
-        raise UsageError(f"{path}: is no map, dataset, run or store, and holds no log")
+        raise UsageError(f"{path}: is no map, dataset, run or store, and contains no log")
     if len(logs) == 1:
         return ask(logs[0])
     return InspectedLogs(path=str(path), logs=tuple(_try_inspect(entry, ask) for entry in logs))
@@ -241,7 +241,7 @@ def _make_stored(run: RunDirectory) -> StoredIngestion:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class InspectedTables:
-    """A folder of tables that no recipe maps: what they hold, and the recipe that is proposed."""
+    """A folder of tables without a mapping in the recipe: what they hold, and the recipe that is proposed."""
 
     kind: Literal["tables"] = "tables"
     path: str
@@ -250,7 +250,7 @@ class InspectedTables:
     problems: Mapping[str, str]
     """By file, why it cannot be read."""
     recipe: str
-    """TOML; "" where no column says what it is."""
+    """TOML; "" where no column has a known name."""
 
 
 _COMMAND = re.compile(r"cmd|command|joy")

@@ -71,7 +71,7 @@ class InspectedTopic:
     rate_hz: float | None
     role: str | None
     why: str | None
-    """Why it plays its role, or plays none."""
+    """Why it is used as its role, or is not used."""
     stamps: StampCounts | None = field(default=None, metadata=ABSENT)
     wrong_stamps: int | None = field(default=None, metadata=ABSENT)
     """Stamps beside zero that were replaced."""

@@ -176,7 +176,7 @@ def _find_logs_at(path: Path, tables: Mappings) -> list[Path]:
                 *error.problems, f"{path}: nor is one of the files that the recipe's tables name: {files}"
             ) from None
         if path.is_dir() and (held := list_table_files(path)):
-            hint = f"{path}: it holds {len(held)} tables ({held[0].name}, …): map them in the recipe; tcpipe inspect proposes how"
+            hint = f"{path}: it contains {len(held)} tables ({held[0].name}, …): map them in the recipe; tcpipe inspect proposes how"
             raise LogError(*error.problems, hint) from None
         raise
 
@@ -192,7 +192,7 @@ def _find_lone_parts(paths: Iterable[Path], *, together: bool) -> Iterator[tuple
         if len(parts) > 1 and not (together and parts.issubset(mine)):
             for path in sorted(parts.intersection(mine)):
                 what = f"{path}: is one of the {len(parts)} parts of the ROS 2 bag {bag}"
-                yield path, f"{what}, and static transforms stand in the first of them only; give the directory"
+                yield path, f"{what}, and only the first part has the static transforms; give the directory"
 
 
 def select_shard(sources: Sequence[LogSource], shard: tuple[int, int]) -> list[LogSource]:

@@ -161,9 +161,9 @@ def _match_files(text: str) -> list[str]:
 def _describe_no_file(text: str) -> str:
     """Say why a text names no file."""
     if "://" in text or text.startswith("/vsi"):
-        return f"{text}: is an address, wanted a file on this machine: gdal_translate {text} local.tif"
+        return f"{text}: is an address, expected a file on this machine: gdal_translate {text} local.tif"
     if Path(text).is_dir():
-        return f"{text}: is a directory, wanted its files: '{text.rstrip('/')}/*.tif'"
+        return f"{text}: is a directory, expected its files: '{text.rstrip('/')}/*.tif'"
     return f"{text}: no file matches" if glob.has_magic(text) else f"{text}: there is no such file"
 
 
@@ -194,7 +194,7 @@ def _refuse_other(store: Store, name: str, inputs: MapInputs) -> None:
     try:
         found = open_map(*store.map_files(name))
     except (MapError, StoreError) as error:
-        raise MapError(*error.problems, f"map {name}: add it anew with --force") from None
+        raise MapError(*error.problems, f"map {name}: add it again with --force") from None
     before = found.facts.inputs
     roles = dict.fromkeys([*_ROLES, *before.files, *inputs.files])
     changes = [_describe_change(role, before.files.get(role, {}), inputs.files.get(role, {})) for role in roles]

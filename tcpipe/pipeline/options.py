@@ -40,32 +40,33 @@ class IngestOptions:
     robot: str | None = option(
         None,
         Option(
-            "Robot profile: one that `tcpipe init` lists, or of the recipe (found by message types and topic names otherwise).",
+            "Robot profile, built in or from the recipe (default: found by message types and topic names).",
             kind="robot",
             metavar="NAME",
         ),
     )
-    tags: Mapping[str, str] | None = tags("Free tag on the runs; repeatable.")
+    tags: Mapping[str, str] | None = tags("Tag for the runs; repeatable.")
     jobs: int = jobs("Logs")
     cluster: str | None = option(None, CLUSTER)
     """Its workers see logs and store under the same absolute paths."""
-    as_one: bool = option(False, Option("All logs are parts of one drive (splits; power logged apart)."))
+    as_one: bool = option(False, Option("Treat all logs as parts of one drive (split logs; power in a separate log)."))
     message_definitions: str | Path | None = option(None, MESSAGE_DEFINITIONS)
     shard: tuple[int, int] | None = option(
-        None, Option("Only the I-th of N shares of the logs: one for each task of an array.", (), "shard", "I/N")
+        None,
+        Option("Ingest only the I-th of N shares of the logs: one for each task of an array job.", (), "shard", "I/N"),
     )
     min_age_s: float = option(
         0.0,
         Option(
-            "A log that was written to since (90, 90s, 10m, 2h, 1d) waits for another call.",
+            "Skip logs that were changed more recently than this (90, 90s, 10m, 2h, 1d).",
             ("--min-age",),
             "duration",
             "T",
             shown="0",
         ),
     )
-    retry_failed: bool = option(False, Option("Try again what is known to fail."))
-    force: bool = option(False, Option("Do again what is there already, and what is known to fail."))
+    retry_failed: bool = option(False, Option("Try logs again that failed before."))
+    force: bool = option(False, Option("Ingest all logs again, also those that failed before."))
     on_found: Callable[[Mapping[str, int]], None] | None = None
     """Called once with the size [byte] of every log by its name."""
     on_result: Callable[[IngestResult], None] | None = None
@@ -93,22 +94,16 @@ class AddMapOptions:
     )
     """The property is a class name, value or id."""
     classes: str | Path | None = option(
-        None, Option("What the terrain values mean: CSV value,id,name,traversable, or TOML.", (), "input_file", "FILE")
+        None, Option("Class table: CSV with value,id,name,traversable, or TOML.", (), "input_file", "FILE")
     )
     """None takes the store's, else the paper's seven classes. The first map with terrain or classes sets the store's table."""
     layers: Mapping[str, Files] | None = option(
-        None,
-        Option(
-            "Another raster of one band, as a layer NAME; repeat it for more layers.",
-            ("--layer",),
-            "layers",
-            "NAME=FILE",
-        ),
+        None, Option("Another raster of one band, as layer NAME; repeatable.", ("--layer",), "layers", "NAME=FILE")
     )
     categorical: Mapping[str, str | Path | None] | None = option(
         None,
         Option(
-            "Layer NAME holds classes: those of FILE, like --classes, or as the raster itself names its values.",
+            "Layer NAME contains classes: named by FILE, like --classes, or by the raster itself.",
             (),
             "class_tables",
             "NAME[=FILE]",
@@ -116,12 +111,12 @@ class AddMapOptions:
     )
     """None: as the raster names its values."""
     ortho_bands: Literal["grey", "rgb"] = option(
-        "grey", Option("rgb keeps red, green and blue as layers beside the grey.", (), ("grey", "rgb"))
+        "grey", Option("rgb also keeps red, green and blue as layers.", (), ("grey", "rgb"))
     )
     crs: str | None = option(
         None, Option("Projected, metric CRS of the map (default: the height's, or its UTM zone).", metavar="EPSG:n")
     )
-    force: bool = option(False, Option("Replace a map of that name made from something else."))
+    force: bool = option(False, Option("Replace a map of this name that has other inputs."))
     store: str | Path = option("tcpipe-store", STORE)
 
 
@@ -139,12 +134,12 @@ class BuildDatasetOptions:
     map_name: str | Sequence[str] | None = option(
         None,
         Option(
-            "Map to sample from (default: the only one in the store); repeat it for several; the first has priority where they overlap.",
-            ("--map",), "map", "NAME", repeatable=True,
+            "Map to sample from (default: the only one in the store); repeatable; where maps overlap, the first has priority.",
+            ("--map",), "map", "NAME", repeatable=True
         ),
     )  # fmt: skip
-    robot: str | None = option(None, Option("Only runs of this robot.", (), "robot", "NAME"))
-    tags: Mapping[str, str] | None = tags("Only runs with this tag; repeat it for several, all of them.")
+    robot: str | None = option(None, Option("Use only runs of this robot.", (), "robot", "NAME"))
+    tags: Mapping[str, str] | None = tags("Use only runs with this tag; if repeated, with all of the tags.")
     store: str | Path = option("tcpipe-store", STORE)
     recipe: Recipe | str | Path | None = option(None, RECIPE)
     jobs: int = jobs("Runs sampled")
@@ -154,36 +149,36 @@ class BuildDatasetOptions:
     holdout: str | None = option(
         None,
         Option(
-            "How test samples are drawn: block, sample, run, or tag:NAME, which holds out values of a tag (default: the recipe's).",
-            (), "holdout", "HOW",
+            "Unit that is held out for test: block, sample, run, or tag:NAME for values of a tag (default: from the recipe).",
+            (), "holdout", "HOW"
         ),
     )  # fmt: skip
     covariates: str | Path | Sequence[str | Path] = option(
         (),
         Option(
-            "Table (CSV or Parquet) whose columns are joined to the samples by time, as weather or soil; repeat it for several.",
-            (), "input_file", "FILE", repeatable=True,
+            "Table (CSV or Parquet) that is joined to the samples by time, such as weather or soil; repeatable.",
+            (), "input_file", "FILE", repeatable=True
         ),
     )  # fmt: skip
-    seed: int | None = option(None, Option("Seed of split and row order (default: the recipe's).", (), SEED))
+    seed: int | None = option(None, Option("Seed of split and row order (default: from the recipe).", (), SEED))
     keep_split: str | Path | None = option(
-        None, Option("An earlier dataset (OUT, too): its samples keep their split and fold.", (), "sealed", "OLD")
+        None,
+        Option("An earlier dataset (OUT is possible) whose samples keep their split and fold.", (), "sealed", "OLD"),
     )
     min_runs: int | None = option(
         None,
         Option(
-            "Fail with fewer runs; with enough, excluded or missing runs are notes.",
-            (), Range(1, 1_000_000), "N",
+            "Fail if fewer runs are usable; otherwise excluded and missing runs are notes.",
+            (), Range(1, 1_000_000), "N"
         ),
     )  # fmt: skip
     redact: bool = option(
         False,
         Option(
-            "For publication: move everything to 0 N 0 E and omit names of logs, runs, topics, paths, hosts and users."
+            "For publication: move all positions to 0 N 0 E and omit names of logs, runs, topics, paths, hosts and users."
         ),
     )
     force: bool = option(
-        False,
-        Option("Replace a dataset that was made with other options (region, map, tags, recipe …)."),
+        False, Option("Replace a dataset that was made with other options (region, map, tags, recipe …).")
     )
     dry_run: bool = option(False, DRY_RUN)

@@ -103,7 +103,7 @@ def _refuse_others(out: Path) -> None:
             with open_log(out) as log:
                 mine = all(name.startswith(OVERLAY) for name in log.topics)
     if not mine:
-        raise UsageError(f"{out}: is there, and no overlay; give another name")
+        raise UsageError(f"{out}: exists and is not an overlay; give another name")
 
 
 def _iterate_streams(store: Store, run: RunDirectory) -> Iterator[MessageStream]:
@@ -163,7 +163,7 @@ def _find_recorder_clock(store: Store, run: RunDirectory) -> _Clock:
     """Return the clock of a run's log; `StoreError` where its streams are not those that the run was made from."""
     known = store.run_json(run.run_id)
     if known is None or known.streams_key != run.streams_key or not known.streams:
-        raise StoreError(f"{run.where}: the streams it was made from are gone or were read anew; ingest the log again")
+        raise StoreError(f"{run.where}: its streams are missing or were read again; ingest the log again")
     columns = ["stamp_ns", "log_time_ns", "clock_epoch"]
     tables = (read_table(path, columns) for path in store.stream_files(run.run_id, known).values())
     return _Clock(max(tables, key=lambda table: table.num_rows))

@@ -80,11 +80,11 @@ class IngestResult:
     """The log from which the same recording was ingested before, under another path; it is one run."""
     sha256: str | None = None
     notes: tuple[str, ...] = ()
-    """What else is to be said: why it waits, which runs it supersedes."""
+    """Notes: why it waits, which runs it supersedes."""
     transient: bool = False
     """Whether it failed for what may pass: a full disk, a killed worker."""
     known: bool = False
-    """Whether it failed before and was not tried again, or what is wrong with its run was told before."""
+    """Whether it failed before and was not tried again, or what is wrong with its run was reported before."""
     acknowledged: bool = False
     """Whether a person has acknowledged what is wrong with it (`tcpipe acknowledge`)."""
     traceback: str | None = None
@@ -273,7 +273,7 @@ def _describe_content(task: IngestTask) -> str:
 def _stand(task: IngestTask, made: RunFacts, state: State) -> Step:
     """Return the step of a log that is in the store as it would be made now."""
     if made.superseded_by:
-        return Step(task, "superseded", "a longer recording has taken its place", made)
+        return Step(task, "superseded", "superseded by a longer log", made)
     problems = find_problems(made)
     if not problems:
         return Step(task, "done", made=made)
@@ -291,10 +291,10 @@ def _describe_pending(task: IngestTask, known: _Known) -> str:
         acknowledged = is_acknowledged([make_failure(of.content, of.log) for of in before], known.state)
         return f"{_describe_failure(before, task)}{', acknowledged' if acknowledged else ''}; to be tried again"
     if task.force:
-        return "to be done again if it is there already"
+        return "to be ingested again if present"
     if sha256 and any(run_id.endswith(f"-{sha256[:8]}") for run_id in known.broken):
         return "files of its run are missing"
-    return "its content is another than before" if task.source.lineage in known.state.seen and not sha256 else ""
+    return "its content has changed" if task.source.lineage in known.state.seen and not sha256 else ""
 
 
 def _describe_failure(before: Sequence[Failure], task: IngestTask) -> str:

@@ -1,4 +1,4 @@
-"""What a minute of recording promises of a day: segments an hour, where the metres go, how sure labels are; and what mends it first.
+"""Check a short test log before a campaign: expected segments per hour, losses of distance, uncertainty of labels, and remedies.
 
 The excerpt goes through the very stages that ingest runs, in memory: what is predicted of a log is what ingesting it would give.
 """
@@ -126,10 +126,10 @@ class Preflight:
     log: str
     robot: str | None
     expected_yield: ExpectedYield | None
-    """None where ingesting it would fail."""
+    """None where ingest would fail."""
     topics: tuple[RoleTopic, ...]
     problems: tuple[str, ...]
-    """Why ingesting it would fail."""
+    """Why ingest would fail."""
     findings: tuple[Finding, ...]
     """Of ingesting it, and what is too slow, missing or off in such recordings, the worst first."""
     verdict: Verdict
@@ -140,7 +140,7 @@ class Preflight:
     large: Mapping[str, float | None]
     """Images and point clouds, which it leaves out, with the messages that come of each a second."""
     exit_code: int
-    """0 ready; 3 there are warnings, errors or no segments; 1 ingesting it would fail."""
+    """0 ready; 3 there are warnings, errors or no segments; 1 ingest would fail."""
 
     def __str__(self) -> str:
         """Return it as lines."""
@@ -155,7 +155,7 @@ class Preflight:
         said += [f"loss      {format_loss(loss)}" for loss in self.losses]
         said += [f"record    {self.record}"] if self.record else []
         rates = ", ".join(name if hz is None else f"{name} at {hz:.3g} Hz" for name, hz in self.large.items())
-        said += [f"large     images and point clouds, not recorded by that: {rates}"] if rates else []
+        said += [f"large     images and point clouds, which this command does not record: {rates}"] if rates else []
         said += ["ready: no problems found"] if self.exit_code == 0 else []
         return clean_lines(said)
 

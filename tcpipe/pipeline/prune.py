@@ -170,7 +170,7 @@ def _forget(log: LogWriter, names: Sequence[str], *, dry_run: bool) -> None:
     paths = {name: {name.rstrip("/"), str(Path(name).absolute())} for name in names}
     gone = {name: [of for of in log.state.datasets.values() if of.out in paths[name]] for name in names}
     if unknown := [name for name in names if not gone[name]]:
-        raise UsageError(*(f"{name}: no dataset of this store lay there; nothing is removed" for name in unknown))
+        raise UsageError(*(f"{name}: not a dataset of this store; nothing is removed" for name in unknown))
     if not dry_run:
         log.commit("pruned", Entries(forgotten=tuple(of for each in gone.values() for of in each)))
 
@@ -183,7 +183,7 @@ def _find_references(state: State) -> tuple[dict[tuple[str, str], str], str | No
     for made in sorted(state.datasets.values(), key=is_replaced, reverse=True):
         told = f"dataset {made.out} refers to it"
         if is_replaced(made):
-            told = f"a dataset that lay at {made.out} refers to it; 'tcpipe prune --forget {made.out}' if that is gone"
+            told = f"a dataset, formerly at {made.out}, refers to it; if it no longer exists: 'tcpipe prune --forget {made.out}'"
         found.update(dict.fromkeys(made.runs, told))
     return found, None
 

@@ -158,7 +158,7 @@ def find_status(
     lately: Sequence[str] = sources or (max(ingests)[1] if ingests else ())
     given = given or asked
     if not given and not state.calls:
-        raise UsageError(f"{opened.root}: no call of ingest is remembered here; give the logs or their folders")
+        raise UsageError(f"{opened.root}: no earlier call of ingest is known; give the logs or their folders")
     with make_scratch_directory() as staging:
         found = find_sources(given, as_one=as_one, staging=staging, tables=ruling.tables)
     no_tags: Mapping[str, str] = {}

@@ -75,7 +75,7 @@ class Verified:
         """Return a line of what was read, and one for each problem."""
         read = ", ".join(f"{count} {what}" for what, count in self.read.items()) or "nothing"
         count = len(self.problems)
-        verdict = f"{count} problem{'s' if count > 1 else ''}" if count else "all as it was written"
+        verdict = f"{count} problem{'s' if count > 1 else ''}" if count else "no changes found"
         return clean_lines((f"{self.path}: {self.kind}; {read} read again: {verdict}", *self.problems, *self.notes))
 
 
@@ -106,9 +106,7 @@ def verify(path: Path | str) -> Verified:
         problems += error.problems
     if kind not in ("store", "run"):
         again = "the next command that writes it removes it"
-        problems += [
-            f"{left}: was left behind by a command that was killed; {again}" for left in find_leftovers(Path(path))
-        ]
+        problems += [f"{left}: was left by a killed command; {again}" for left in find_leftovers(Path(path))]
     return Verified(
         str(path), kind, read, tuple(dict.fromkeys(problems)), _read_notes(Path(path)) if kind == "dataset" else ()
     )
@@ -211,7 +209,7 @@ def _verify_samples(directory: Path, card: DatasetCard) -> Iterator[CheckResult]
     yield from (f"{directory / CARD}: {problem}" for problem in _find_wrong_runs(samples, card))
     used_m = math.fsum(to_floats(samples, "arc_length_m")[samples.column("split").to_numpy() != "buffer"])
     if not math.isclose(used_m, card.distance_by_reason_m[KEPT], rel_tol=1e-9, abs_tol=1e-6):
-        yield f"{directory / CARD}: the ledger keeps {card.distance_by_reason_m[KEPT]:.3f} m, the samples cover {used_m:.3f} m"
+        yield f"{directory / CARD}: the distance breakdown keeps {card.distance_by_reason_m[KEPT]:.3f} m, the samples cover {used_m:.3f} m"
     if card.redaction is not None:
         yield from (f"{directory / CARD}: {problem}" for problem in find_leaks(card, samples))
     yield from _verify_patches(directory, card, samples)
@@ -255,7 +253,7 @@ def _find_wrong_runs(samples: pa.Table, card: DatasetCard) -> Iterator[str]:
     if len(known_m) == len(driven_m) and not math.isclose(
         math.fsum(known_m), distance_by_reason_m, rel_tol=1e-9, abs_tol=1e-6
     ):
-        yield f"the ledger sums to {distance_by_reason_m:.3f} m, its runs drove {math.fsum(known_m):.3f} m"
+        yield f"the distance breakdown sums to {distance_by_reason_m:.3f} m, its runs drove {math.fsum(known_m):.3f} m"
     if pool_budgets(run.energy_budget for run in card.runs) != card.energy_budget:
         yield "its energy budget is not that of its runs"
 

@@ -72,7 +72,7 @@ def verify_store(store: Store) -> Iterator[CheckResult]:
             yield _describe_stranger(place, name)
     for name in place.folders():
         if name == SPOOL:
-            yield f"{place.where(name)}: is of a build that goes on, or was killed; 'tcpipe prune' removes what is old"
+            yield f"{place.where(name)}: belongs to a build that is running or was killed; 'tcpipe prune' removes old ones"
         elif name not in (LOG, "maps", "runs", _INDEX):
             yield _describe_stranger(place, name)
     yield from verify_log(place.below(LOG))
@@ -116,7 +116,7 @@ def _verify_snapshot(log: Place, state: State) -> Iterator[CheckResult]:
         yield from error.problems
         return
     same = fold([found]) == replace(state, digest="")
-    yield ("files", 1) if same else f"{log.where(name)}: does not say what the commits say; remove it"
+    yield ("files", 1) if same else f"{log.where(name)}: contradicts the commits; remove it"
 
 
 def _verify_runs(store: Store) -> Iterator[CheckResult]:
@@ -139,7 +139,7 @@ def verify_run(store: Store, run_id: str, recipe: str | None = None) -> Iterator
     there, last, folders = _list_documents(place), find_highest_numbers(names), place.folders()
     yield from _verify_seals(place, sorted(there))
     if "run" not in last:
-        yield f"{place.where(name_document('run', 1))}: is gone"
+        yield f"{place.where(name_document('run', 1))}: is missing"
     known = None
     for number in range(1, last.get("run", 0) + 1):
         with suppress(StoreError):
@@ -150,7 +150,7 @@ def verify_run(store: Store, run_id: str, recipe: str | None = None) -> Iterator
     for name in recipes if recipe is None else [recipe]:
         yield from _isolate_errors(_make_ingestion(store.runs_place, run_id, name))
     if not recipes:
-        yield f"{place.where()}: holds no finished run; ingest its log again"
+        yield f"{place.where()}: contains no finished run; ingest its log again"
     for name in names:
         if name not in there and name.partition("/")[0] not in recipes:
             yield _describe_stranger(place, name)
@@ -202,14 +202,14 @@ def _find_wrong_files(place: Place, checksums: Mapping[str, Checksum]) -> Iterat
 def _describe_stranger(place: Place, name: str) -> str:
     """Return a line about what no document knows."""
     if any(_DIGEST.fullmatch(part) for part in name.split("/")):
-        return f"{place.where(name)}: was left behind by a command that was killed; 'tcpipe prune' removes it"
+        return f"{place.where(name)}: was left by a killed command; 'tcpipe prune' removes it"
     return f"{place.where(name)}: is no file of this store"
 
 
 def _find_left_behind(root: Path) -> Iterator[str]:
     for path in sorted(root.glob(f"{TEMPORARY_PREFIX}*")):
         if is_abandoned(path):
-            yield f"{path}: was left behind by a command that was killed; the next tcpipe ingest or add-map removes it"
+            yield f"{path}: was left by a killed command; the next tcpipe ingest or add-map removes it"
 
 
 def find_strangers(place: Place) -> Iterator[str]:
@@ -337,9 +337,9 @@ def _find_disagreements(run: RunDirectory, tables: Mapping[str, pa.Table]) -> It
         manifest.distance_by_reason_m.get(KEPT, 0.0),
     )
     if not math.isclose(covered_m, kept_m, rel_tol=1e-9, abs_tol=1e-6):
-        yield f"the ledger keeps {kept_m:.3f} m, the segments cover {covered_m:.3f} m"
+        yield f"the distance breakdown keeps {kept_m:.3f} m, the segments cover {covered_m:.3f} m"
     if manifest.run_id != run.run_id:
-        yield f"is of run {manifest.run_id}, but lies in {run.run_id}"
+        yield f"is of run {manifest.run_id}, but is stored in {run.run_id}"
 
 
 def _find_wrong_joins(run: RunDirectory, tables: Mapping[str, pa.Table]) -> Iterator[str]:
@@ -351,7 +351,7 @@ def _find_wrong_joins(run: RunDirectory, tables: Mapping[str, pa.Table]) -> Iter
     for column, wanted in (("run_id", run_id), ("robot", run.manifest.robot)):
         others = set(segments.column(column).unique().to_pylist()) - {wanted}
         if others:
-            yield f"holds segments of {column} {', '.join(sorted(others))}; wanted {wanted}"
+            yield f"contains segments of {column} {', '.join(sorted(others))}; expected {wanted}"
     if len(start_ns) and (np.any(end_ns <= start_ns) or np.any(start_ns[1:] < end_ns[:-1])):
         yield "its segments do not follow one another in time"
     stamps = to_integers(tables["track"], "stamp_ns")
@@ -376,4 +376,4 @@ def _verify_layer(path: Path, level: MapFile, layer: str, covered: float | None)
     if covered is not None and not math.isclose(share, covered, rel_tol=1e-9):
         yield f"{path}: {layer} covers {share:.6%} of the map, {covered:.6%} when it was added; add the map again"
     if highest > kind.high:
-        yield f"{path}: {layer} holds class {highest}, the table ends at {kind.high:g}"
+        yield f"{path}: {layer} contains class {highest}, the table ends at {kind.high:g}"

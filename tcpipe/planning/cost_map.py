@@ -139,7 +139,7 @@ class CostMapResult:
         return clean_lines(
             (
                 head,
-                f"{cells.with_cost} cells with a cost, {cells.trusted} of them on ground the model knows along some course",
+                f"{cells.with_cost} cells with a cost, {cells.trusted} of them within the training range along some course",
                 *((f"cells and courses: {reasons}",) if reasons else ()),
             )
         )
@@ -292,7 +292,7 @@ def _allocate(path: Path, size_bytes: int) -> None:
         with path.open("r+b") as opened:
             os.posix_fallocate(opened.fileno(), 0, size_bytes)
     except OSError as error:
-        raise StoreError(f"{path}: cannot be written ({error.strerror}); wanted {size_bytes / 1e6:.0f} MB") from None
+        raise StoreError(f"{path}: cannot be written ({error.strerror}); expected {size_bytes / 1e6:.0f} MB") from None
 
 
 def _read_job(place: Path) -> str | None:
@@ -338,7 +338,7 @@ def _answer(task: _Task) -> list[SegmentPredictions] | TcpipeError:
         model, source = task.inputs()
         if make_cost_map_key(model, source, task.grid.pixel_size_m) != task.key:
             raise UsageError(
-                f"a worker finds another map {source.name} or model {model.name} than the caller; wanted the same files under "
+                f"a worker finds another map {source.name} or model {model.name} than the caller; expected the same files under "
                 "the same names"
             )
         frames = CellFrames(task.grid, where=f"map {source.name}")
@@ -356,7 +356,7 @@ def _predict_missing(  # noqa: PLR0917
     missing = (spool.done == 0).reshape(costs.grid.rows, costs.grid.cols)
     todo = list(iterate_blocks(source, model, costs.grid, missing))
     if not missing.all():
-        logger.info("going on where it was: %.0f %% of the cells are done", 100.0 * (1.0 - missing.mean()))
+        logger.info("resuming: %.0f %% of the cells are done", 100.0 * (1.0 - missing.mean()))
     ready: list[Cells] = []
     answers: Iterator[tuple[Cells, SegmentPredictions]]
     if cluster is None:
@@ -385,8 +385,8 @@ def _find_origin_m(source: MapFile, origin_deg: tuple[float, float] | None) -> t
     off_m = np.hypot(x_m - np.clip(x_m, x_min, x_max), y_m - np.clip(y_m, y_min, y_max))
     if not off_m <= _FARTHEST_ORIGIN_M:
         raise UsageError(
-            f"--origin {origin_deg[0]:g},{origin_deg[1]:g}: lies {off_m / 1000.0:.0f} km from map {source.name}, wanted at most "
-            f"{_FARTHEST_ORIGIN_M / 1000.0:.0f}; give LON,LAT (longitude first) of where the robot's map frame begins"
+            f"--origin {origin_deg[0]:g},{origin_deg[1]:g}: is {off_m / 1000.0:.0f} km from map {source.name}, expected at most "
+            f"{_FARTHEST_ORIGIN_M / 1000.0:.0f}; give LON,LAT (longitude first) of the origin of the robot's map frame"
         )
     return x_m, y_m
 

@@ -139,7 +139,7 @@ def check_model(model: CostModel, source: MapReader) -> None:
     missing = [layer for layer in needed if layer not in source.layers]
     if missing:
         problems.append(
-            f"map {source.name}: has no {', '.join(missing)}, which model {model.name} wants; add the map with --{missing[0]}"
+            f"map {source.name}: has no {', '.join(missing)}, which model {model.name} needs; add the map with --{missing[0]}"
         )
     if "terrain" in needed and "terrain" in source.layers and model.classes != source.classes:
         different = "; ".join(source.classes.differences(model.classes))
@@ -171,7 +171,7 @@ def predict_patches(
         said = model.predict(form.form(pixels, rows), extra_features.take(rows))
         if said.shape != (rows.size, 2):
             raise ModelError(
-                f"{model.name}: gives {said.shape[-1]} numbers a patch, wanted two: power and velocity; train it on both labels"
+                f"{model.name}: gives {said.shape[-1]} numbers a patch, expected two: power and velocity; train it on both labels"
             )
         out[rows] = said
     out[~(np.isfinite(out).all(axis=1) & (out[:, 1] > 0.0))] = np.nan
@@ -197,7 +197,7 @@ class Reason(IntFlag):
     NODATA = 1 << 1
     """A pixel of the patch has no data in some layer; no cost."""
     NOT_TRAVERSABLE = 1 << 2
-    """The class under most of the chord cannot be driven over; no cost."""
+    """The class under most of the chord is not traversable; no cost."""
     NO_MOTION = 1 << 3
     """The model predicts no forward velocity; no cost."""
     CLASS_OUTSIDE_TRAINING = 1 << 4
@@ -209,9 +209,9 @@ class Reason(IntFlag):
     RELIEF_OUTSIDE_TRAINING = 1 << 7
     """The patch's largest height difference is outside the training samples'."""
     OBSTACLE = 1 << 8
-    """More than 5 % of the strip that the robot drives over (0.7 m wide) cannot be driven over, though the middle can."""
+    """More than 5 % of the strip that the robot drives over (0.7 m wide) is not traversable, though the middle is."""
     CURVED = 1 << 9
-    """The path bends more within the metre than any segment that is trained on (its recipe's `max_arc_to_chord`)."""
+    """The path is more curved here than any training segment (its recipe's `max_arc_to_chord`)."""
 
 
 NO_COST = Reason.OUTSIDE_MAP | Reason.NODATA | Reason.NOT_TRAVERSABLE | Reason.NO_MOTION

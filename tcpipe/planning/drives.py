@@ -45,7 +45,7 @@ from tcpipe.terrain.tiles import MapReader, find_map_projection
 Floats = NDArray[np.float64]
 
 UNCERTAIN, UNLABELLED = "position_uncertain", "no_label"
-"""Why a metre is not compared, beside `Reason`."""
+"""Why a segment is not compared, besides `Reason`."""
 
 _POINTS = 60
 """Of a curve along a drive."""
@@ -120,12 +120,12 @@ def find_drive(store: Store, log: str) -> RunDirectory:
             found.append(run)
     if not found:
         raise UsageError(
-            f"{log}: no run of this log in {store.root}; wanted its path or its run's name: run 'tcpipe ingest {log}' first"
+            f"{log}: no run of this log in {store.root}; expected its path or its run's name: run 'tcpipe ingest {log}' first"
         )
     if len(found) > 1:
         recipes = ", ".join(run.recipe_id for run in found)
         raise UsageError(
-            f"{log}: {store.root} holds it under several recipes ({recipes}); wanted one: give a store with it alone"
+            f"{log}: {store.root} contains it under several recipes ({recipes}); expected one: give a store with it alone"
         )
     return found[0]
 
@@ -244,7 +244,7 @@ def format_drive(drive: DriveCost) -> list[str]:
         if drive.compared_m:
             interval = (
                 "no interval" if of.low is None or of.high is None
-                else f"{COVERAGE:.0%}: {of.low:.0f} to {of.high:.0f}, which {'holds' if of.held else 'does NOT hold'} it"
+                else f"{'inside' if of.held else 'OUTSIDE'} the {COVERAGE:.0%} prediction interval {of.low:.0f} to {of.high:.0f}"
             )  # fmt: skip
             lines.append(
                 f"{drive.run_id}: {called} {of.measured:.0f} {unit} measured, {of.predicted:.0f} {unit} predicted "
@@ -287,7 +287,7 @@ class DrivesResult:
             hits = [sum(getattr(drive, name).held is True for drive in held) for name in ("duration_s", "energy_joule")]
             sums = ", ".join(f"{called} {of.off_percent:+.1f} %" for called, of in of_both.items())
             lines.append(
-                f"all {len(held)} drives held back: {sums}; intervals hold {hits[0]} of the times and {hits[1]} of the energies"
+                f"all {len(held)} drives held back: {sums}; intervals cover {hits[0]} of the times and {hits[1]} of the energies"
             )
         lines += [f"verdict: {format_verdict(self.values.verdict, PREDICTED)}", *format_findings(self.values.findings)]
         return clean_lines((*lines, f"open {self.path}/{PAGE}"))
@@ -310,7 +310,7 @@ def evaluate_drives(
     runs = [find_drive(opened, log) for log in logs]
     clear(place)
     if place.exists() and not place.is_dir():
-        raise UsageError(f"{place}: is a file, wanted a directory to write {JSON} and {PAGE} into")
+        raise UsageError(f"{place}: is a file, expected a directory to write {JSON} and {PAGE} into")
     found = tuple(compute_drive_cost(model, source, run, data, log=log) for run, log in zip(runs, logs, strict=True))
     held, findings = (
         [drive for drive in found if drive.held_back],
@@ -335,7 +335,7 @@ def _sum(parts: Sequence[IntervalComparison]) -> IntervalComparison:
 def _render_page(values: Drives) -> str:
     return render_page(
         title="Drives, measured and predicted",
-        lead=f"Model {Path(values.model).name}: sums along each drive over the metres that can be compared, with 90 % intervals.",
+        lead=f"Model {Path(values.model).name}: sums along each drive over the comparable segments, with 90 % intervals.",
         numbers=[
             Number(f"{of.off_percent:+.1f} %", f"{called} of all drives held back, predicted less measured")
             for called, of in (("time", values.duration_s), ("energy", values.energy_joule))

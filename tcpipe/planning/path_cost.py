@@ -58,10 +58,10 @@ class PathTotals:
     """None, as that of energy, without held-out samples."""
     energy_interval_joule: tuple[float, float] | None
     coverage: float = COVERAGE
-    """Share of drives that an interval is to hold."""
+    """Share of drives that an interval is to cover."""
     held_out_samples: int = 0
     held_out_runs: int = 0
-    """What the intervals are told by."""
+    """Samples that determine the intervals."""
     reasons: Mapping[str, int]
     """Pieces by reason; a piece may have several."""
     complete: bool
@@ -112,16 +112,16 @@ def cut_into_pieces(source: MapReader, lonlat_deg: Floats, *, chord_m: float, wh
     projection = find_projection(source)
     xy_m = projection.forward(lonlat_deg)
     if not np.isfinite(xy_m).all():
-        raise PathError(f"{where}: points of it lie outside the area where the CRS of map {source.name} is defined")
+        raise PathError(f"{where}: points are outside the area where the CRS of map {source.name} is defined")
     length_m = float(np.linalg.norm(np.diff(xy_m, axis=0), axis=1).sum()) if len(xy_m) > 1 else 0.0
     scale = float(np.mean(np.sqrt(np.abs(np.linalg.det(make_metres_from_plane(projection.target, xy_m))))))
     if not length_m:
-        raise PathError(f"{where}: is one point; wanted a path of at least {chord_m:g} m")
+        raise PathError(f"{where}: is one point; expected a path of at least {chord_m:g} m")
     pieces = cut_path(xy_m, chord_m=chord_m, scale=scale)
     if not pieces.chord_m.size or pieces.chord_m[0] < chord_m * (1.0 - 1e-6):
         raise PathError(
             f"{where}: is {length_m * scale:.2f} m long and never {chord_m:g} m from where it starts; "
-            f"wanted a path of at least {chord_m:g} m"
+            f"expected a path of at least {chord_m:g} m"
         )
     return pieces
 
@@ -206,7 +206,7 @@ def describe_off_map(source: MapReader, where: str, lonlat_deg: Floats) -> str:
     hint = (
         "the axes look swapped; longitude comes first"
         if swapped
-        else "wanted lon, lat in WGS 84, and the map of this site"
+        else "expected lon, lat in WGS 84, and the map of this site"
     )
     extent = f"lon {west:.5f} to {east:.5f}, lat {south:.5f} to {north:.5f}"
     return f"{where}: is not on map {source.name} ({extent}); {hint}"
@@ -217,33 +217,33 @@ _F, _WGS84 = pa.float64(), "WGS84"
 PIECES = TableSchema(
     "pieces",
     "path",
-    "A path's pieces and what each costs, in order (tcpipe predict-path).",
+    "Segments of a path in order, with their costs (tcpipe predict-path).",
     (
-        Column("piece", pa.int64(), "", "Number of the piece, from 0."),
+        Column("piece", pa.int64(), "", "Number of the path segment, from 0."),
         Column("start_lon_deg", _F, "deg", "Longitude of its start.", _WGS84),
         Column("start_lat_deg", _F, "deg", "Latitude of its start.", _WGS84),
         Column("end_lon_deg", _F, "deg", "Longitude of its end.", _WGS84),
         Column("end_lat_deg", _F, "deg", "Latitude of its end.", _WGS84),
         Column("distance_m", _F, "m", "Length of the path before it, horizontal."),
-        Column("chord_m", _F, "m", "Straight length, horizontal; the last piece is what remains."),
-        Column("arc_length_m", _F, "m", "Length along the path, horizontal; what its cost is for."),
+        Column("chord_m", _F, "m", "Straight length, horizontal; the last one is the remainder."),
+        Column("arc_length_m", _F, "m", "Length along the path, horizontal; its cost is for this length."),
         Column("course_rad", _F, "rad", "Direction of its chord, counter-clockwise from true east.", "ENU"),
         Column("terrain_class", pa.uint8(), "", "Majority class under the chord; 0: none."),
         Column("terrain_name", pa.string(), "", "Name of that class."),
         Column("slope_rad", _F, "rad", "Slope along travel, uphill positive.", nullable=True),
         Column("cross_slope_rad", _F, "rad", "Slope across travel, positive when the left side is higher.", nullable=True),
-        Column("power_watt", _F, "W", "Predicted mean power; null without a cost, as all that follows.", nullable=True),
+        Column("power_watt", _F, "W", "Predicted mean power; null without a cost, as all following columns.", nullable=True),
         Column("velocity_mps", _F, "m/s", "Predicted ground velocity.", nullable=True),
         Column("duration_s", _F, "s", "Predicted time: arc length over velocity.", nullable=True),
         Column("duration_low_s", _F, "s", "Lower end of its 90 % interval.", nullable=True),
         Column("duration_high_s", _F, "s", "Upper end of its 90 % interval.", nullable=True),
-        Column("turn_rad", _F, "rad", "Half of the change of course at either end: what it turns."),
-        Column("turn_energy_joule", _F, "J", "What that costs beyond the turns of training; null without physics.", nullable=True),
-        Column("energy_joule", _F, "J", "Predicted energy: power times time, and that of its turn.", nullable=True),
+        Column("turn_rad", _F, "rad", "Turn: half of the change of course at either end."),
+        Column("turn_energy_joule", _F, "J", "Energy of the turn beyond the turns of training; null without physics.", nullable=True),
+        Column("energy_joule", _F, "J", "Predicted energy: power times time, plus the energy of the turn.", nullable=True),
         Column("energy_low_joule", _F, "J", "Lower end of its 90 % interval.", nullable=True),
         Column("energy_high_joule", _F, "J", "Upper end of its 90 % interval.", nullable=True),
-        Column("reasons", pa.uint16(), "bits", "Why it has no cost, or none to be trusted; 0: neither.", flags=Reason),
-        Column("reason_names", pa.string(), "", "The same as words, separated by spaces."),
+        Column("reasons", pa.uint16(), "bits", "Why it has no cost, or an unreliable one; 0: reliable.", flags=Reason),
+        Column("reason_names", pa.string(), "", "The same as names, separated by spaces."),
     ),
 )  # fmt: skip
 
@@ -253,9 +253,9 @@ ENDINGS = (".csv", ".parquet", ".json")
 def check_ending(path: Path) -> None:
     """Raise `UsageError` unless a table can be written to a file of this name."""
     if path.suffix.lower() not in ENDINGS:
-        raise UsageError(f"{path}: wanted a name that ends in {', '.join(ENDINGS[:-1])} or {ENDINGS[-1]}")
+        raise UsageError(f"{path}: expected a name that ends in {', '.join(ENDINGS[:-1])} or {ENDINGS[-1]}")
     if path.is_dir():
-        raise UsageError(f"{path}: is a directory, wanted a file")
+        raise UsageError(f"{path}: is a directory, expected a file")
 
 
 def write_pieces(path: Path, table: pa.Table) -> None:

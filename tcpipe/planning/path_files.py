@@ -91,7 +91,7 @@ class PathResult(NamedTotals):
         lines = [f"{self.path}: {format_cost(self)}{above}", *findings]
         if self.out is not None:
             same = "; nothing to do: it is made from the same path, model and map"
-            lines.append(f"{self.out}: {self.pieces} pieces{same if self.status == 'unchanged' else ''}")
+            lines.append(f"{self.out}: {self.pieces} path segments{same if self.status == 'unchanged' else ''}")
         return clean_lines(lines)
 
 
@@ -99,7 +99,7 @@ def format_cost(of: PathTotals) -> str:
     """Return length, time and energy with their intervals, as one line."""
     duration = _format_quantity(of.duration_s, of.duration_interval_s, "s")
     energy = _format_quantity(of.energy_joule, of.energy_interval_joule, "J")
-    part = "" if of.complete else f", without {of.pieces_without_cost} of {of.pieces} pieces"
+    part = "" if of.complete else f", without {of.pieces_without_cost} of {of.pieces} path segments"
     turns = (
         ""
         if of.turn_energy_joule is None
@@ -143,7 +143,7 @@ def predict_path(model: CostModel, source: MapFile, path: Path, out: Path | None
         check_ending(out)
         clear_beside(out)
         if out.resolve() == path.resolve():
-            raise UsageError(f"{out}: is the path itself; give the table another name")
+            raise UsageError(f"{out}: is the file of the path; give the table another name")
     lonlat_deg = read_line(path)
     line = {"lonlat_deg": lonlat_deg.tolist(), "version": _PATH_VERSION}
     key = digest({**line, "model": model.checksum, "map": source.summary()})
@@ -328,9 +328,9 @@ def plan(
 
 def _check_names(out: Path, picture: Path | None) -> None:
     if out.suffix.lower() not in {".geojson", ".json"} or out.is_dir():
-        raise UsageError(f"{out}: wanted the name of a file that ends in .geojson or .json")
+        raise UsageError(f"{out}: expected the name of a file that ends in .geojson or .json")
     if picture is not None and (picture.suffix.lower() != ".png" or picture.is_dir()):
-        raise UsageError(f"{picture}: wanted the name of a file that ends in .png")
+        raise UsageError(f"{picture}: expected the name of a file that ends in .png")
 
 
 def _read_card(path: Path, model: CostModel, source: MapFile) -> CostMapCard:
@@ -354,7 +354,7 @@ def _read_plans(out: Path, picture: Path | None, key: str) -> dict[Objective, Pl
     try:
         about = read_as(out, PlanFile).tcpipe
     except StoreError:
-        raise UsageError(f"{out}: exists and is no plan; it is left alone; give another --out") from None
+        raise UsageError(f"{out}: exists and is no plan; it is not changed; give another --out") from None
     if about.key != key:
         return None
     if picture is not None and not (picture.is_file() and compute_checksum(picture).sha256 == about.picture_sha256):

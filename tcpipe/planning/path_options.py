@@ -22,7 +22,7 @@ class PredictPathOptions:
     _: KW_ONLY
     map_name: str | None = option(None, MAP)
     out: str | Path | None = option(
-        None, Option("Write the table of pieces: .csv, .parquet or .json.", (), "output_file", "FILE")
+        None, Option("Write the table of path segments: .csv, .parquet or .json.", (), "output_file", "FILE")
     )
     physics_from: str | Path | None = option(None, PHYSICS)
     speed_mps: float | None = option(None, SPEED)
@@ -34,25 +34,27 @@ class PlanPathOptions:
     """Between which points a path is planned, by which model, and what is to be least."""
 
     model: str | Path = required(MODEL)
-    start: tuple[float, float] = required(Option("Where it begins (WGS84, degrees).", ("--from",), "lonlat"))
-    goal: tuple[float, float] = required(Option("Where it ends.", ("--to",), "lonlat"))
+    start: tuple[float, float] = required(Option("Start of the path (WGS84, degrees).", ("--from",), "lonlat"))
+    goal: tuple[float, float] = required(Option("End of the path.", ("--to",), "lonlat"))
     _: KW_ONLY
-    objective: Objective = option("energy", Option("What is to be least.", (), ("energy", "time", "distance")))
+    objective: Objective = option("energy", Option("Quantity to minimise.", (), ("energy", "time", "distance")))
     map_name: str | None = option(
         None, Option("Map to plan on (default: the only one in the store).", ("--map",), "map", "NAME")
     )
-    out: str | Path = option("plan.geojson", Option("The path as GeoJSON.", (), "output_file", "FILE"))
+    out: str | Path = option("plan.geojson", Option("Write the path as GeoJSON.", (), "output_file", "FILE"))
     picture: str | Path | None = option(
-        None, Option("Draw all three objectives side by side on the hill (.png).", (), "output_file", "FILE")
+        None, Option("Draw the paths of all three objectives on the map (.png).", (), "output_file", "FILE")
     )
     cost_map: str | Path | None = option(
         None,
-        Option("A cost map of this model and map; without one only what is needed is predicted.", (), "sealed", "DIR"),
+        Option(
+            "Cost map of this model and map; without one, only the necessary cells are predicted.", (), "sealed", "DIR"
+        ),
     )
     cell_size_m: float = option(
         1.0,
         Option(
-            "Side of a cell; that of --cost-map rules.",
+            "Side of a cell; --cost-map overrides it.",
             ("--cell-size",),
             Range(0.05, 1000.0),
             "METRES",
@@ -62,7 +64,7 @@ class PlanPathOptions:
     allow_extrapolation: bool = option(
         False,
         Option(
-            "Also cross ground unlike any that the model was trained on.",
+            "Also cross ground outside the training range of the model.",
             ("--allow-extrapolation",), earlier="--allow-unseen",
         ),
     )  # fmt: skip
@@ -87,7 +89,7 @@ class CostMapOptions:
     origin_deg: tuple[float, float] | None = option(
         None,
         Option(
-            "Where the Nav2 maps' frame begins, as navsat_transform's datum (default: where the map's CRS does).",
+            "Origin of the frame of the Nav2 maps, as navsat_transform's datum (default: that of the map's CRS).",
             ("--origin",),
             "lonlat",
         ),
@@ -95,5 +97,5 @@ class CostMapOptions:
     speed_mps: float | None = option(None, SPEED)
     store: str = option("tcpipe-store", STORE)
     cluster: str | None = option(
-        None, replace(CLUSTER, about="Dask scheduler whose workers do it, tcp://host:port (or TCPIPE_CLUSTER).")
+        None, replace(CLUSTER, about="Dask scheduler whose workers compute it, tcp://host:port (or TCPIPE_CLUSTER).")
     )

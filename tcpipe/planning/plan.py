@@ -162,16 +162,16 @@ class _Search:
                 if class_id == NODATA_ID:
                     problems.append(f"{label}: map {source.name} has no data there")
                 elif not may[class_id]:
-                    problems.append(f"{label}: stands on {names[class_id]}, which is not traversable")
+                    problems.append(f"{label}: is on {names[class_id]}, which is not traversable")
         apart_m = float(np.linalg.norm(self.ends_xy_m[1] - self.ends_xy_m[0]))
         if apart_m < self.survey.model.chord_m:
             problems.append(
-                f"{labels[0]} and {labels[1]} are {apart_m:.2f} m apart; wanted at least {self.survey.model.chord_m:g} m"
+                f"{labels[0]} and {labels[1]} are {apart_m:.2f} m apart; expected at least {self.survey.model.chord_m:g} m"
             )
         elif len(set(self._cells.tolist())) == 1:
             pixel_size_m = self.survey.costs.grid.pixel_size_m
             problems.append(
-                f"{labels[0]} and {labels[1]} lie in one cell of {pixel_size_m:g} m; choose a smaller --cell-size"
+                f"{labels[0]} and {labels[1]} are in one cell of {pixel_size_m:g} m; choose a smaller --cell-size"
             )
         if problems:
             raise PathError(*problems)
@@ -189,7 +189,7 @@ class _Search:
                 hint = (
                     ""
                     if self.allow_extrapolation or common & BARRED
-                    else ", or cross such ground with --allow-extrapolation"
+                    else ", or allow such ground with --allow-extrapolation"
                 )
                 problems.append(
                     f"{label}: no course can be driven from there on map {self.survey.source.name} ({words}); choose another point{hint}"
@@ -233,7 +233,7 @@ class _Search:
         while True:
             ellipse = self._ellipse(bound_m)
             if not self.survey.judged[ellipse].all():
-                logger.info("looking at the ground of %d cells", np.count_nonzero(ellipse & ~self.survey.judged))
+                logger.info("checking the ground of %d cells", np.count_nonzero(ellipse & ~self.survey.judged))
             self.survey.judge(ellipse, self.step)
             self._check_open()
             found = self._found("distance", self.survey.judged)
@@ -250,8 +250,8 @@ class _Search:
         probes, ellipse = probe_cells(class_id, open_), self._ellipse(bound_m) & open_
         if not survey.predicted[probes | ellipse].all():
             logger.info(
-                "without --cost-map the model is asked about the ground that could matter: %d to %d cells, %d courses each; "
-                "with one, which tcpipe cost-map makes once, a plan takes seconds",
+                "without --cost-map the model predicts %d to %d cells, %d courses each; "
+                "with a cost map (tcpipe cost-map) a plan takes seconds",
                 *(int(np.count_nonzero(cells & ~survey.predicted)) for cells in (probes | ellipse, open_)),
                 COURSES,
             )
@@ -290,7 +290,7 @@ class _Search:
         count = int(np.count_nonzero(wanted & ~self.survey.predicted))
         if not count:
             return pace_s
-        logger.info("asking the model about %d cells%s", count, f", about {count * pace_s:.0f} s" if pace_s else "")
+        logger.info("predicting %d cells%s", count, f", about {count * pace_s:.0f} s" if pace_s else "")
         begun_s = time.monotonic()
         self.survey.predict(wanted, self.step)
         return (time.monotonic() - begun_s) / count
@@ -309,14 +309,12 @@ class _Search:
 
     def _no_way(self) -> str:
         """Say why there is no way."""
-        text = f"there is no way from start to goal on map {self.survey.source.name}"
+        text = f"no path from start to goal on map {self.survey.source.name}"
         if not self.allow_extrapolation:
             other = _Search(self.survey, self.ends_xy_m, self.ends_deg, allow_extrapolation=True, step=self.step)
             if other._found("distance", self.survey.judged) is not None:
-                return (
-                    f"{text} but over ground unlike any that the model was trained on; --allow-extrapolation crosses it"
-                )
-        return f"{text}: what lies between cannot be driven over, or has no data"
+                return f"{text} within the training range of the model; --allow-extrapolation crosses other ground"
+        return f"{text}: the ground between them is not traversable or has no data"
 
 
 Classes = NDArray[np.uint8]

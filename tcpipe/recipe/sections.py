@@ -44,7 +44,7 @@ Scale = Annotated[float, Bounds(ge=0.01, le=100)]
 
 @dataclass(frozen=True, slots=True)
 class Extrinsics:
-    """Where a sensor sits: base_link_from_sensor."""
+    """Extrinsics of a sensor: base_link_from_sensor."""
 
     xyz_m: tuple[Metres, Metres, Metres] = (0.0, 0.0, 0.0)
     """Position of the sensor in base_link (x forward, y left, z up) [m]."""
@@ -57,38 +57,38 @@ class Extrinsics:
 
 @dataclass(frozen=True, slots=True)
 class ReadConfig:
-    """Which topics play which role, and how their numbers and stamps are to be understood."""
+    """Topics by role, and the meaning of their numbers and stamps."""
 
     topics: dict[Role, list[str]] = field(default_factory=dict)
-    """Topics by role (gnss, gnss_velocity, imu, wheel_odometry, visual_odometry, power, command, pose), where their types do not tell."""
+    """Topics by role (gnss, gnss_velocity, imu, wheel_odometry, visual_odometry, power, command, pose), where types are ambiguous."""
     ignore_topics: list[str] = field(default_factory=list)
-    """Topics that play no role whatever their type."""
+    """Topics that are never used."""
     fields: dict[MappedRole, dict[str, str]] = field(default_factory=dict, metadata=LEFT_OUT)
-    """By role, where the fields of a message type of your own stand, as gnss.latitude = "pvt.lat * 1e-7"; its topic stands under topics."""
+    """Fields of your own message types by role, as gnss.latitude = "pvt.lat * 1e-7"; also name the topic under topics."""
     pose_crs: str | None = field(default=None, metadata=LEFT_OUT)
-    """Projected CRS of the pose's positions, as EPSG:2949; none leaves them in a frame of their own, which no map has."""
+    """Projected CRS of the pose's positions, as EPSG:2949; without one they stay in a local frame and cannot be placed on a map."""
     pose_sources: list[MadeFrom] = field(default_factory=list, metadata=LEFT_OUT)
-    """Roles that the pose was made from (beside GNSS): they are not fused beside it, which would count them twice."""
+    """Roles that the pose was computed from (besides GNSS): they are not fused as well, because they would count twice."""
     namespace: str | None = None
-    """Of several robots in one log, the one whose topics lie below this name (for example "/husky_1"); none takes all topics."""
+    """For a log of several robots: use only topics below this name (for example "/husky_1"); default: all topics."""
     extrinsics: dict[Role, Extrinsics] = field(default_factory=dict)
     """Sensor extrinsics by role; overrides /tf_static."""
     gnss_crs: str = "EPSG:4326"
     """Geographic CRS of the GNSS positions; RTK often comes in a national datum."""
     time_source: dict[Role, Literal["auto", "header", "log"]] = field(default_factory=dict)
-    """Which stamp rules, by role; auto takes header.stamp when it is set and follows the log time."""
+    """Source of stamps by role: header, log or auto; auto uses header.stamp if it is set and follows the log time."""
     time_offset_s: dict[Role, Offset] = field(default_factory=dict)
-    """Added to the stamps of a role [s]."""
+    """Offset added to the stamps of a role [s]."""
     odometry_scale: dict[Role, Scale] = field(default_factory=dict, metadata=LEFT_OUT)
-    """What the velocities and the ways of an odometry are multiplied with (wheels of another radius, a camera of another baseline)."""
+    """Factor on velocities and distances of an odometry (wheels of another radius, a camera of another baseline)."""
     imu_units: Literal["si", "deg", "g", "deg_g"] = "si"
-    """Units of the IMU: si is rad/s and m/s² as REP-103 asks; deg is deg/s and m/s²; g is rad/s and g; deg_g is deg/s and g."""
+    """Units of the IMU: si is rad/s and m/s² as in REP-103; deg is deg/s and m/s²; g is rad/s and g; deg_g is deg/s and g."""
     current_sign: Literal["auto", "drawn_positive", "drawn_negative"] = "auto"
-    """Sign of the currents: auto takes the message type's; BatteryState, on which robots disagree, is told by its mean over the run."""
+    """Sign of currents: auto uses that of the message type; for BatteryState, which differs by robot, the mean over the run decides."""
     power_averaged: Literal["auto", "yes", "no"] = "auto"
-    """Whether the power source averages over its message period: auto takes the message type's."""
+    """Whether the power source averages over its message period: auto uses the value of the message type."""
     husky_power: Literal["battery", "drivers"] = "battery"
-    """A Husky's power: battery takes battery voltage times both driver currents (the paper's), drivers each driver's own voltage."""
+    """Power of a Husky: battery is battery voltage times both driver currents (as in the paper), drivers uses each driver's voltage."""
 
     def __post_init__(self) -> None:
         validate_fields(self, "read")
@@ -96,18 +96,18 @@ class ReadConfig:
 
 @dataclass(frozen=True, slots=True)
 class FuseConfig:
-    """The estimator and the noise it assumes where the log does not say."""
+    """The estimator, and the noise that it assumes if the log states none."""
 
     estimator: Literal["smoother", "ukf"] = "smoother"
     """smoother: error-state unscented filter and fixed-interval smoother; ukf: the paper's forward filter, 15 states."""
     engine: Literal["compiled", "filterpy"] = "compiled"
-    """What runs the 15-state filter; filterpy is the slow reference."""
+    """Implementation of the 15-state filter; filterpy is the slow reference."""
     rate_hz: Annotated[float, Bounds(ge=1, le=500)] = 20.0
-    """Rate of the track (the paper: 20 Hz); no motion of a robot wants more than 500 rows a second."""
+    """Rate of the track, at most 500 Hz (the paper: 20 Hz)."""
     gate_probability: Annotated[float, Bounds(ge=0.5, le=0.999999999)] = 0.999
-    """Chi-square gate: a measurement less likely than this is refused and listed."""
+    """Outlier gate (chi-square): a measurement less likely than this is rejected and listed."""
     gnss_std_floor_m: Deviation = 0.01
-    """No GNSS standard deviation is taken below this, whatever the receiver says [m]."""
+    """Lower bound of GNSS standard deviations, whatever the receiver reports [m]."""
     gnss_default_std_m: Deviation = 0.05
     """Horizontal standard deviation where the receiver gives none (the paper's RTK: 5 cm); vertical is twice as large [m]."""
     gnss_velocity_std_mps: Deviation = field(default=0.1, metadata={"json": (0.1,)})
@@ -117,7 +117,7 @@ class FuseConfig:
     visual_std_mps: Deviation = 0.05
     """Standard deviation of visual velocity where the source gives none [m/s]."""
     nonholonomic_std_mps: Deviation = 0.15
-    """Sideways and vertical body velocity are zero to within this; much smaller values lock GNSS out [m/s]."""
+    """Sideways and vertical body velocity are zero to within this; much smaller values cause GNSS to be rejected [m/s]."""
     gyro_noise_radps: Deviation = 0.003
     """White noise of the gyroscope at its rate [rad/s]."""
     accelerometer_noise_mps2: Deviation = 0.10
@@ -133,38 +133,38 @@ class FuseConfig:
 
 @dataclass(frozen=True, slots=True)
 class MaskConfig:
-    """What steady driving is; everything else is marked, never deleted."""
+    """Limits of steady driving; all other rows are masked, never deleted."""
 
     max_acceleration_mps2: Limit = 0.3
-    """Without a command topic: steadier than this [m/s²]."""
+    """Largest steady acceleration without a command topic [m/s²]."""
     acceleration_window_s: Window = 0.45
     """Acceleration is the slope of the forward velocity over this long, centred [s]."""
     ramp_acceleration_mps2: Limit = 0.1
-    """A start or stop ramp, beside standing or turning in place, lasts while the speed changes faster than this [m/s²]."""
+    """A ramp after or before a stop or a turn in place lasts while the speed changes faster than this [m/s²]."""
     min_event_s: Window = 0.2
     """An acceleration or rotation shorter than this is noise [s]."""
     dilate_s: Widening = 0.25
-    """Acceleration marks are widened by this on both sides [s]."""
+    """Masks of acceleration are widened by this on both sides [s]."""
     command_step_mps: Limit = 0.1
     """A command change larger than this within `command_window_s` is a change (a joystick jitters) [m/s]."""
     command_window_s: Window = 0.5
     """See `command_step_mps` [s]."""
     command_settle_s: Widening = 2.0
-    """Rows this long after a commanded change are dropped [s]."""
+    """Rows this long after a commanded change are masked [s]."""
     require_full_speed: bool = True
-    """With commands: drop rows commanded below `full_speed_fraction` of the robot's maximum; their speed is not the terrain's limit."""
+    """With commands: mask rows commanded below `full_speed_fraction` of the robot's maximum, where the terrain does not limit the speed."""
     full_speed_fraction: Fraction = 0.95
     """See `require_full_speed`."""
     max_velocity_mps: Limit | None = None
-    """The robot's maximum speed; none takes the profile's [m/s]."""
+    """Maximum speed of the robot; default: from the profile [m/s]."""
     max_plausible_mps: PlausibleSpeed | None = field(default=None, metadata=LEFT_OUT)
-    """No label where the track is faster than this, and no run where most of a minute of driving is; none takes the profile's [m/s]."""
+    """No labels where the track is faster than this; the run fails if most of a minute is. Default: from the profile [m/s]."""
     stationary_velocity_mps: Limit = 0.05
-    """Slower than this (and not turning) is standing [m/s]."""
+    """Slower than this (and not turning) is stationary [m/s]."""
     stationary_yaw_rate_radps: Limit = 0.05
     """See `stationary_velocity_mps` [rad/s]."""
     stuck_wheel_velocity_mps: Limit = 0.2
-    """Wheels faster than this while the ground speed is that of standing are stuck [m/s]."""
+    """Wheels faster than this while the robot does not move are stuck [m/s]."""
     turning_velocity_mps: Limit = 0.10
     """Slower than this while turning is turning in place [m/s]."""
     turning_yaw_rate_radps: Limit = 0.10
@@ -172,9 +172,9 @@ class MaskConfig:
     min_turn_radius_m: Limit = 0.5
     """Turning tighter than this is turning in place [m]."""
     keep_reversing: bool = False
-    """Keep stretches driven backwards."""
+    """Keep sections driven backwards."""
     max_relative_position_std_m: Deviation = 0.10
-    """A stretch whose position error over one chord would exceed this is a gap [m]."""
+    """A section is a gap where the standard deviation of the distance over one chord exceeds this [m]."""
 
     def __post_init__(self) -> None:
         validate_fields(self, "mask")
@@ -187,7 +187,7 @@ class SegmentConfig:
     chord_m: Annotated[float, Bounds(ge=0.05, le=1000)] = 1.0
     """d: straight-line length of a segment in the horizontal plane [m]."""
     max_arc_to_chord: ArcToChord = 1.02
-    """A segment more curved than this is dropped (radius below 1.5 m for 1 m)."""
+    """Largest arc over chord of a segment; more curved ones are excluded (radius below 1.5 m for 1 m)."""
 
     def __post_init__(self) -> None:
         validate_fields(self, "segment")
@@ -195,16 +195,16 @@ class SegmentConfig:
 
 @dataclass(frozen=True, slots=True)
 class LabelConfig:
-    """How power becomes a label."""
+    """How labels are computed."""
 
     velocity: Literal["ground", "fused"] = "ground"
-    """Which velocity trains: ground is chord / duration; fused the mean of the filter's forward velocity (the paper's v*)."""
+    """Velocity used as label: ground is chord / duration; fused is the mean fused forward velocity (the paper's v*)."""
     integration: Literal["exact", "right_endpoint"] = "exact"
     """exact integrates the product of two piecewise-linear signals; right_endpoint is the paper's sum."""
     flag_arc_to_chord: ArcToChord = 1.01
     """A segment more curved than this is flagged."""
     flag_position_std_m: Deviation = 0.10
-    """A segment with an end whose absolute position is less certain than this is flagged as of weak GNSS [m]."""
+    """A segment with an end whose absolute position is less certain than this is flagged weak_gnss [m]."""
 
     def __post_init__(self) -> None:
         validate_fields(self, "label")
@@ -217,11 +217,11 @@ class SampleConfig:
     patch_m: Annotated[float, Bounds(ge=0.05, le=100)] = 1.0
     """Side of the patch on the ground [m]."""
     patch_px: Annotated[int, Bounds(ge=2, le=1024)] = 40
-    """Side of the patch in pixels; the pitch is patch_m / patch_px whatever the map's resolution."""
+    """Side of the patch in pixels; its pixel size is patch_m / patch_px, independent of the map."""
     min_valid_fraction: Fraction = 1.0
-    """A patch with a smaller share of valid pixels is dropped."""
+    """Smallest share of valid pixels of a patch."""
     max_position_std_m: Deviation = 0.10
-    """A sample whose absolute position is less certain than this is dropped [m]."""
+    """Largest standard deviation of the absolute position of a sample [m]."""
 
     def __post_init__(self) -> None:
         validate_fields(self, "sample")
@@ -229,10 +229,10 @@ class SampleConfig:
 
 @dataclass(frozen=True, slots=True)
 class SplitConfig:
-    """Who trains and who tests."""
+    """How samples are split into train and test."""
 
     holdout: Literal["block", "sample", "run", "tag"] = "block"
-    """block keeps spatial neighbours together, sample is the paper's random draw, run keeps whole runs, tag runs of one tag's value."""
+    """Unit held out for test: block (spatial), sample (random, as in the paper), run, or tag (runs with the same value of a tag)."""
     holdout_tag: str = ""
     """With the holdout tag: which tag, for example season."""
     test_fraction: Annotated[float, Bounds(ge=0, lt=1)] = 0.2
@@ -240,9 +240,9 @@ class SplitConfig:
     block_m: Annotated[float, Bounds(ge=0.1, le=1e6)] = 10.0
     """Side of a spatial block [m]."""
     buffer_m: Annotated[float, Bounds(ge=0, le=1e6)] | None = None
-    """A footprint nearer than this to a region's border goes to no split; none takes sqrt(2) times the chord [m]."""
+    """A footprint nearer than this to the border of a region is in no split; default: sqrt(2) times the chord [m]."""
     folds: Annotated[int, Bounds(ge=2, le=100)] = 5
-    """Folds of spatial cross-validation among train and test: whole blocks, or whole runs (or tags) with the holdout run (or tag)."""
+    """Number of folds for cross-validation on train and test; a fold has whole blocks, or whole runs (or tags) with that holdout."""
     seed: Annotated[int, Bounds(ge=0, le=2**32 - 1)] = 0
     """Seed of the split and of the row order."""
 
@@ -255,11 +255,11 @@ class CovariateConfig:
     """How tables of weather, soil or snow are joined to the samples by time (`tcpipe build-dataset --covariates`)."""
 
     time_column: str | None = None
-    """Column of the stamps; none takes the only one called time, stamp, timestamp, date or datetime, with or without a unit."""
+    """Column of the stamps; default: the only one named time, stamp, timestamp, date or datetime, with or without a unit."""
     time_unit: Literal["auto", "s", "ms", "us", "ns"] = "auto"
-    """Unit of stamps that are numbers, since 1970: auto takes the name's ending, else the one by which they are of this century."""
+    """Unit of stamps that are numbers, since 1970: auto uses the ending of the name, or the unit that gives dates of this century."""
     max_age_s: Annotated[float, Bounds(ge=1e-3, le=1e9)] = 7200.0
-    """A sample takes the last row before its start; one that is older than this is not taken [s]."""
+    """Each sample uses the last row before its start; largest age of this row [s]."""
 
     def __post_init__(self) -> None:
         validate_fields(self, "covariates")
@@ -267,7 +267,7 @@ class CovariateConfig:
 
 @dataclass(frozen=True, slots=True)
 class DatasetConfig:
-    """What the dataset says of itself."""
+    """Description of the dataset."""
 
     name: str = "terrain-cost"
     """Name in the card."""
@@ -276,9 +276,9 @@ class DatasetConfig:
     licence: str = ""
     """Licence of the data (SPDX identifier)."""
     creator: str = ""
-    """Who made it."""
+    """Creator of the dataset."""
     compression: Literal["zstd", "lz4"] = "zstd"
-    """How patches are stored in Zarr: zstd takes less room, lz4 is read two to three times as fast."""
+    """Compression of patches in Zarr: zstd is smaller, lz4 is two to three times as fast to read."""
 
     def __post_init__(self) -> None:
         validate_fields(self, "dataset")
@@ -286,20 +286,20 @@ class DatasetConfig:
 
 @dataclass(frozen=True, slots=True)
 class TableMapping:
-    """A table of a folder of CSV, text or Parquet files: which role it plays, which of its columns are what, in which units, and when."""
+    """A table in a folder of CSV, text or Parquet files: its role, columns, units and stamps."""
 
     file: str = ""
-    """Its file, from the folder that is ingested."""
+    """File name, relative to the ingested folder."""
     role: Role | None = None
-    """The role it plays; none takes the table's name. Of power several tables may be."""
+    """Role of the table; default: its name. Power may have several tables."""
     columns: dict[str, str] = field(default_factory=dict)
-    """By field (latitude, linear_x, voltage, …: docs/how-to/tables.md) the column's name; column_1 and so on where there is no header."""
+    """Column name by field (latitude, linear_x, voltage, …: docs/how-to/tables.md); column_1 and so on without a header."""
     units: dict[str, str] = field(default_factory=dict)
-    """Units by field where they are not deg, m, m/s, rad/s, m/s2, V and A: "rad", "km/h", "deg/s", "g", "mV", …"""
+    """Units by field, if not deg, m, m/s, rad/s, m/s2, V and A: "rad", "km/h", "deg/s", "g", "mV", …"""
     stamp: str | None = None
-    """The column of stamps; none takes the first."""
+    """Column of the stamps; default: the first."""
     stamp_unit: Literal["auto", "s", "ms", "us", "ns"] = "auto"
-    """What its numbers count; auto tells by their size, if they count from 1970. Text is a date and time, in UTC where it says nothing."""
+    """Unit of numeric stamps; auto infers it from their size if they count from 1970. Text is date and time, UTC unless stated."""
     offset_s: Offset = 0.0
     """Added to the stamps [s]."""
 
@@ -323,7 +323,7 @@ class Recipe:
     """All keys of tcpipe.toml."""
 
     robot: str | None = None
-    """The robot's profile by name; none finds it by message types and topic names."""
+    """Robot profile; default: found by message types and topic names."""
     read: ReadConfig = field(default_factory=ReadConfig)
     fuse: FuseConfig = field(default_factory=FuseConfig)
     mask: MaskConfig = field(default_factory=MaskConfig)
@@ -334,11 +334,11 @@ class Recipe:
     covariates: CovariateConfig = field(default_factory=CovariateConfig)
     dataset: DatasetConfig = field(default_factory=DatasetConfig)
     robots: dict[str, Robot] = field(default_factory=dict, metadata=LEFT_OUT)
-    """Robots of your own by name; one that is called as one of tcpipe's takes its place."""
+    """Your own robot profiles by name; a profile with a built-in name replaces the built-in one."""
     power_sources: list[PowerSource] = field(default_factory=list, metadata=LEFT_OUT)
-    """What message types of your own tell of power, a table a rail; those of a type take the place of tcpipe's of that type."""
+    """Power sources of your own message types, one table per rail; they replace the built-in ones of the same type."""
     tables: dict[str, TableMapping] = field(default_factory=dict, metadata=LEFT_OUT)
-    """The tables of a log that is a folder of CSV, text or Parquet files, by role or by any name."""
+    """Tables of a log that is a folder of CSV, text or Parquet files, by role or by any name."""
 
     def __post_init__(self) -> None:
         validate_fields(self, "")

@@ -110,7 +110,7 @@ page.start(async () => {
     const box = at("chosen");
     box.replaceChildren();
     if (!chosen.length) {
-      box.append(make("p", "Click a point on the map, or draw a box in the plot: what it holds stands here."));
+      box.append(make("p", "Click a point on the map, or draw a box in the plot: the samples appear here."));
       return;
     }
     const i = chosen[0];

@@ -91,7 +91,7 @@ def render_dataset_report(directory: Path, beside: Path | None = None, *, folder
     try:
         patches = make_patches_data(directory, card, samples, shown.row_of)
     except DatasetError as error:
-        patches, lost = None, [*lost, f"no patch is shown: {error.problems[0]}"]
+        patches, lost = None, [*lost, f"no patches are shown: {error.problems[0]}"]
     waterfall = draw_waterfall(card.distance_by_reason_m)
     hrefs = {} if beside is None else _find_run_pages(beside, card)
     return render_page(
@@ -109,7 +109,7 @@ def render_dataset_report(directory: Path, beside: Path | None = None, *, folder
             *_make_finding_sections(card),
             *make_physics_sections(dict(card.physics)),
             *make_budget_sections(card.energy_budget),
-            Section("Where every metre went", "In samples and lost add up to the odometer.", plots=[waterfall]),
+            Section("Distance breakdown", "Used and excluded distances add up to the odometer.", plots=[waterfall]),
             *_make_removal_sections(card),
             *make_balance_sections(card.balance),
             _make_audit_section(card, samples, shown),
@@ -132,7 +132,7 @@ def _make_verdict(card: DatasetCard) -> VerdictBox | None:
 
 _GALLERY = Section(
     "Patches",
-    "Some of every split, class and slope. Travel is to the right; a click chooses the sample on the map.",
+    "Examples of every split, class and slope. Travel is to the right; click one to select the sample on the map.",
     controls="gallery.html",
 )
 
@@ -152,7 +152,7 @@ def _make_numbers(card: DatasetCard) -> list[Number]:
 
 
 def _make_map_section(shown: SamplesShown, plots: list[Plot]) -> Section:
-    text = "Where each sample lies; dashed: the split's region. The buffer is in no split. A box in the plot chooses on the map."
+    text = "Positions of samples; dashed: region of the split. The buffer is in no split. A box in the plot selects on the map."
     if shown.cell_m is not None:
         text += (
             f" There are more than {MOST_SAMPLES} samples: a point is the mean of one split and class in a square of "
@@ -213,7 +213,7 @@ def _list_store_pages(beside: Path, hrefs: Mapping[str, str]) -> list[Link]:
 
 def _make_label_sections(samples: pa.Table) -> list[Section]:
     plots = label_histograms(samples, "samples") if samples.num_rows else []
-    return [Section("Labels", "One value a sample.", plots=plots)] if samples.num_rows else []
+    return [Section("Labels", "One value per sample.", plots=plots)] if samples.num_rows else []
 
 
 def _draw_distances(samples: pa.Table, shown: SamplesShown) -> Iterator[Plot]:
@@ -254,9 +254,9 @@ def _make_audit_section(card: DatasetCard, samples: pa.Table, shown: SamplesShow
         )
         for part in card.split.audit
     ]
-    counts = ("samples", "overlap train", "neighbours of train", "places train knows")
+    counts = ("samples", "overlap train", "neighbours of train", "places near train")
     header = ("split", *counts, "nearest train", "median")
-    text = "How much of what tests has been seen in training. On the map: colour by the way to the nearest train metre, or tick its lines."
+    text = "Held-out samples near training samples. On the map: colour by distance to the nearest training sample, or tick its lines."
     return Section("Leakage audit", text, header=header, rows=rows, plots=list(_draw_distances(samples, shown)))
 
 
@@ -267,14 +267,14 @@ def _make_finding_sections(card: DatasetCard) -> list[Section]:
         (format_group(group, len(card.runs)), ", ".join(group.of), sum(samples[run_id] for run_id in group.of))
         for group in group_findings(card.findings_by_run.items())
     ]
-    text = "One line a code; each run's own page has all of its findings."
+    text = "One line per code; the page of each run lists all of its findings."
     return [Section("Findings of ingest", text, header=("finding", "runs", "samples"), rows=rows)] if rows else []
 
 
 def _make_removal_sections(card: DatasetCard) -> list[Section]:
     """Return how much of each class and slope is in samples; none where nothing was driven."""
     sections = []
-    text = "Where the shares differ, what is removed depends on the ground."
+    text = "If the shares differ, the exclusion depends on the ground (selection bias)."
     for groups, what in ((card.removal.by_class, "class"), (card.removal.by_slope, "slope along travel")):
         rows = []
         for group in groups:
@@ -303,9 +303,9 @@ def _make_table_sections(card: DatasetCard, hrefs: Mapping[str, str]) -> list[Se
         )
         for run in card.runs
     ]
-    text = "'tcpipe report DATASET' makes them lead to the runs' pages, where the store lies beside the dataset."
+    text = "'tcpipe report DATASET' links the pages of the runs if the store is next to the dataset."
     if hrefs:
-        text = "Each leads to the run's own page, once 'tcpipe report STORE' has written it."
+        text = "Links lead to the pages of the runs, once 'tcpipe report STORE' has written them."
     header = ("run", "robot", "log", "samples", "noise floor of E")
     return [*sections, Section("Runs", text, header=header, rows=runs, figures_from=3)]
 
@@ -330,7 +330,7 @@ def _make_provenance_section(card: DatasetCard) -> Section:
         ("licence", card.licence or "none given"),
         ("creator", card.creator or "none given"),
     ]
-    text = "The same inputs make the same dataset; its recipe and every file's checksum stand in dataset.json."
+    text = "The same inputs give the same dataset; dataset.json contains its recipe and the checksum of every file."
     return Section("Provenance", text, header=("what", "is"), rows=rows, folded=True)
 
 

@@ -57,7 +57,7 @@ page.start(async () => {
     const box = at("chosen"), { key, unit, digits } = kinds[at("quantity").value];
     box.replaceChildren();
     if (!places.length) {
-      box.append(make("p", "Click a point, draw a box, or go through them by Next, the worst first: what is chosen stands here."));
+      box.append(make("p", "Click a point, draw a box, or step through the samples by Next, worst first: the selection appears here."));
       return;
     }
     const i = shown[places[0]];
@@ -71,7 +71,7 @@ page.start(async () => {
         ["ground", kind.map((pair) => pair.join(" ")).join(", ")]]), make("p", "The worst of them:"));
     }
     left.append(pairs(inWords(i)));
-    right.append(...(cell.has(i) ? page.patches(told.patches, cell.get(i)) : [make("p", "The page carries patches of the worst metres of E alone.", { className: "note" })]));
+    right.append(...(cell.has(i) ? page.patches(told.patches, cell.get(i)) : [make("p", "The page only contains the patches of the samples with the largest errors of E.", { className: "note" })]));
     box.append(left, right);
   }
   const choose = page.chooseSamples(source, () => shown.length, (places) => show([...places].sort((a, b) => a - b)));

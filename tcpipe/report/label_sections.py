@@ -28,15 +28,15 @@ LABELS = {
 
 QUALITY_WORDS = {
     Quality.LOW_POWER_RATE: "power was sampled too slowly",
-    Quality.NEAR_GAP: "a gap in the data is less than a chord away",
+    Quality.NEAR_GAP: "a gap in the data is within one chord",
     Quality.HIGH_SLIP: "wheels and ground differ by more than 20 %",
     Quality.WEAK_GNSS: "position is uncertain",
     Quality.CURVED: "the path bends",
     Quality.POWER_MEAN_MISMATCH: "mean power and energy over time differ by more than 5 %",
-    Quality.NO_COMMAND: "no command topic: full speed is not proved",
+    Quality.NO_COMMAND: "no command topic: full speed is unverified",
     Quality.VOLTAGE_OUT_OF_RANGE: "voltage leaves the robot's range",
-    Quality.CLOCK_DOUBTFUL: "a clock is doubtful",
-    Quality.PHYSICS_OUTLIER: "power is far from what physics predicts",
+    Quality.CLOCK_DOUBTFUL: "a clock is uncertain",
+    Quality.PHYSICS_OUTLIER: "power differs much from the physics model",
     Quality.BELOW_FULL_SPEED: "commanded below full speed",
     Quality.SENSORS_DISAGREE: "sensors disagree",
 }
@@ -44,7 +44,7 @@ QUALITY_WORDS = {
 
 
 def make_losses_sections(ledgers_m: Sequence[Mapping[str, float]], text: str, *, names_runs: bool) -> list[Section]:
-    """Return where the distance of runs went, and how to lose less of it; none without a run."""
+    """Return the largest losses of distance of runs with their remedies; none without a run."""
     if not ledgers_m:
         return []
     rows = [
@@ -57,11 +57,11 @@ def make_losses_sections(ledgers_m: Sequence[Mapping[str, float]], text: str, *,
         )
         for loss in find_largest_losses(ledgers_m)
     ]
-    header = ("lost to", "metres", "of all", *(["runs"] if names_runs else []), "to lose less")
+    header = ("lost to", "metres", "of all", *(["runs"] if names_runs else []), "remedy")
     total_m = Counter[str]()
     for distance_by_reason_m in ledgers_m:
         total_m.update(distance_by_reason_m)
-    return [Section("Where every metre went", text, header=header, rows=rows, plots=[draw_waterfall(total_m)])]
+    return [Section("Distance breakdown", text, header=header, rows=rows, plots=[draw_waterfall(total_m)])]
 
 
 def find_distinguishing_bits(bits: NDArray[np.integer]) -> int:
@@ -76,13 +76,13 @@ def make_quality_section(bits: NDArray[np.integer], noun: str) -> Section:
     rows = [item for item in counts.items() if item[1]]
     if not rows:
         return Section("Quality flags", f"None: all {noun} are clean.")
-    text = "A label may carry several; docs/reference/columns.md says what each means."
+    text = "A label may have several flags; docs/reference/columns.md explains them."
     return Section("Quality flags", text, header=("flag", noun), rows=rows)
 
 
 _BUDGET_ROWS = {
     "position": "position of both ends",
-    "rate": "what the current did between two samples",
+    "rate": "variation of the current between samples",
     "current": "noise and rounding of the current",
     "voltage": "voltage",
     "total": "all together",
@@ -95,7 +95,7 @@ def make_budget_sections(budget: EnergyBudget | None) -> list[Section]:
     if budget is None:
         return []
     rows = [(text, f"{100 * getattr(budget, name):.2f} %") for name, text in _BUDGET_ROWS.items()]
-    title = "How wrong a label may be"
+    title = "Uncertainty of labels"
     return [Section(title, format_budget(budget), header=("from", "of E"), rows=rows, figures_from=1)]
 
 
@@ -143,7 +143,7 @@ def _format_with_std(term: PhysicsTerm) -> str:
 def make_physics_sections(fits: Mapping[str, PhysicsFit]) -> list[Section]:
     """Return the section on the fits by robot, if any."""
     text = " ".join(describe_physics(robot, fit) for robot, fit in fits.items())
-    return [Section("What a metre costs: standing, drivetrain, rolling, grade, turning", text)] if fits else []
+    return [Section("Power by cause: idle, drivetrain, rolling, grade, turning", text)] if fits else []
 
 
 _UNITS = {"watt": "W", "mps": "m/s", "s": "s", "joule": "J"}
@@ -153,15 +153,15 @@ def make_balance_sections(balance: Balance) -> list[Section]:
     """Return how samples are spread over class, slope and speed, and how well labels repeat themselves."""
     by_slope, by_speed = balance.by_class_and_slope, balance.cells
     text = (
-        f"Samples, and in brackets how many independent ones they are worth: neighbours are alike ({_format_correlation(balance)}). "
-        f"{sum(cell['rare'] for cell in by_slope)} of {len(by_slope)} cells are worth fewer than {balance.enough_effective:g} and "
-        "marked with * and a dashed border; – is ground of the map that nobody drove. drive-next.geojson holds where to drive for them."
+        f"Samples, in brackets the effective (independent) number: neighbours are correlated ({_format_correlation(balance)}). "
+        f"{sum(cell['rare'] for cell in by_slope)} of {len(by_slope)} cells have fewer than {balance.enough_effective:g}, "
+        "marked with * and a dashed border; – is ground of the map without samples. drive-next.geojson proposes where to drive."
     )
     header, rows = _make_cell_table(by_slope, "class", [(cell["class"] or "any",) for cell in by_slope])
     slope_section = Section("Balance of class and slope", text, header=header, rows=rows)
     keys = [(cell["class"] or "any", cell["speed_mps"]) for cell in by_speed]
     header, rows = _make_cell_table(by_speed, "class, speed [m/s]", keys)
-    text = "The same by the velocity that is the label."
+    text = "The same, by velocity (the label)."
     speed_section = Section("Balance of class, slope and speed", text, header=header, rows=rows, folded=True)
     return [slope_section, speed_section, _make_repeatability_section(balance)]
 
@@ -197,7 +197,7 @@ def _format_correlation(balance: Balance) -> str:
         for label, entry in balance.correlation.items()
         if entry is not None
     ]
-    return "; ".join(found) or "how far cannot be told from so few"
+    return "; ".join(found) or "range unknown, too few samples"
 
 
 def _make_repeatability_section(balance: Balance) -> Section:
@@ -210,12 +210,12 @@ def _make_repeatability_section(balance: Balance) -> Section:
             rows.append((_name(label), f"{entry.std:.3g} {unit}", interval, entry.pairs, entry.places,
                          f"{100 * (1 - min(entry.share_of_variance, 1.0)):.1f} %"))  # fmt: skip
     text = (
-        "Places that were driven again in the same direction: no model can predict a single label better than it repeats itself."
+        "Places that were driven twice in the same direction: this variation limits the accuracy of every model."
         if rows
-        else "No place was driven twice in the same direction; do so to learn how well a label repeats itself."
+        else "No place was driven twice in the same direction; drive some ground twice to measure the repeatability of labels."
     )
-    header = ("label", "repeats to (standard deviation)", "95 % interval", "pairs", "places", "variance to explain")
-    return Section("Repeatability: no model can beat this", text, header=header if rows else (), rows=rows)
+    header = ("label", "repeatability (σ)", "95 % interval", "pairs", "places", "variance to explain")
+    return Section("Repeatability: lower bound of model errors", text, header=header if rows else (), rows=rows)
 
 
 def _name(label: str) -> str:

@@ -47,7 +47,7 @@ def draw_dataset_map(directory: Path, card: DatasetCard, sample_count: int) -> t
     bounds = compute_joint_bounds_m([(grid.crs, grid.bounds_m) for grid in card.maps])
     tools = "box_select,lasso_select,tap"
     plot = make_map_plot(
-        alt=f"Map of {sample_count} points, coloured by what is chosen above; the tables below hold the counts.",
+        alt=f"Map of {sample_count} points, coloured by the quantity chosen above; the tables below list the counts.",
         axes=("easting [m]", "northing [m]"),
         height_px=110 + 500 * (bounds[3] - bounds[1]) / max(bounds[2] - bounds[0], 1e-9),
         tools=f"pan,wheel_zoom,{tools},reset,save",
@@ -84,7 +84,7 @@ def draw_dataset_map(directory: Path, card: DatasetCard, sample_count: int) -> t
     )
     brush = make_plot(
         "brush",
-        alt="Points of the map as a plot of what is chosen above it; a box drawn here chooses them on the map.",
+        alt="Points of the map, plotted by the quantity chosen above; a box drawn here selects them on the map.",
         axes=("slope along travel [°]", "power w [W]"),
         height_px=figure.height,
         tools=f"{tools},pan,wheel_zoom,reset,save",
@@ -112,7 +112,7 @@ def _lay_dataset_pictures(plot: Plot, directory: Path, card: DatasetCard, bounds
             continue
         pixels = read_picture(directory / file)
         if pixels is None:
-            lost.append(f"{file} is lost or damaged: the map has no {name.strip()}")
+            lost.append(f"{file} is missing or damaged: the map has no {name.strip()}")
             continue
         lay_picture(plot, name.strip(), make_picture_uri(pixels, exact=file == CLASSES), bounds, visible=number == 0)
     return lost
@@ -206,8 +206,8 @@ def draw_run_map(
 
 def _explain_no_map(store: Store, *, has_datum: bool) -> str:
     if not has_datum:
-        return "No fix of a GNSS: the track lies in a plane of its own, and no map can be laid under it."
-    return "No map of the store lies under the track." if store.maps() else "The store has no map ('tcpipe add-map')."
+        return "No GNSS fix: the track has only local coordinates and cannot be placed on a map."
+    return "No map of the store covers the track." if store.maps() else "The store has no map ('tcpipe add-map')."
 
 
 def _find_ground(
@@ -236,7 +236,7 @@ def _draw_track(axes: tuple[str, str], xy_m: Floats) -> Plot:
     low, high = xy_m.min(axis=0), xy_m.max(axis=0)
     width, height = np.maximum(high - low, 0.1 * np.max(high - low, initial=10.0))
     plot = make_map_plot(
-        alt="Map of the track: segments, and where and why the rest is not used; the waterfall below holds the metres.",
+        alt="Map of the track: segments, and where and why the rest is not used; the chart below shows the distances.",
         axes=axes,
         height_px=110 + 900 * height / width,
     )

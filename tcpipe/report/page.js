@@ -103,7 +103,7 @@ const page = (() => {
       figure.append(patch(sheets, layer, i, 96), make("figcaption", layer.name));
       room.append(figure);
     }
-    return [room, make("p", "Travel is to the right; height is over the patch's own range.", { className: "note" })];
+    return [room, make("p", "Travel is to the right; height uses the range of the patch.", { className: "note" })];
   }
   // Colours by name.
   const legend = (entries) => entries.map(([text, colour]) => {

@@ -142,7 +142,7 @@ def draw_waterfall(distance_by_reason_m: Mapping[str, float]) -> Plot:
     metres = [total, *(metres for _, metres in losses), kept]
     plot = make_plot(
         "ledger",
-        alt=f"Waterfall of the loss ledger: of {total:.0f} m driven, {kept:.0f} m are kept.",
+        alt=f"Distance breakdown: of {total:.0f} m driven, {kept:.0f} m are kept.",
         axes=("metres", ""),
         height_px=90 + 26 * len(names),
         tools="save",

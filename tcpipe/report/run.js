@@ -119,7 +119,7 @@ page.start(async () => {
   const number = (value, [, , unit, digits]) => (finite(value) ? `${value.toFixed(digits)} ${unit}` : "none");
   function coloured(key) {
     if (key === "quality") {
-      const entries = [["segment", told.kept], ["with a flag", told.doubted], ["kept, in no segment", told.unused], ...told.reasons
+      const entries = [["segment", told.kept], ["with a flag", told.doubted], ["kept, not in a segment", told.unused], ...told.reasons
         .filter(([bit]) => spans.bits.some((bits) => bits & bit)).map(([, name, , colour]) => [name, colour])];
       at("scale").replaceChildren(...page.legend(entries));
       return flagged;
@@ -178,7 +178,7 @@ page.start(async () => {
     const i = nearest(track.t, t), near = Math.abs(track.t[i] - t) <= track.gap_s;
     model("here").data_source.data = near ? { x: [track.x[i]], y: [track.y[i]] } : { x: [], y: [] };
     const why = reasonsAt(t).map(([, name]) => name), k = segmentAt(t);
-    const use = k >= 0 ? `segment ${k + 1}` : bitsAt(t) === null ? "no track" : why.length ? `not used: ${why.join(", ")}` : "kept, in no segment";
+    const use = k >= 0 ? `segment ${k + 1}` : bitsAt(t) === null ? "no track" : why.length ? `not used: ${why.join(", ")}` : "kept, not in a segment";
     at("cursor").textContent = [`${t.toFixed(2)} s`, use, ...values(t).map(([name, value]) => `${name} ${value}`)].join(" · ");
   }
   let chosen = null;
@@ -199,9 +199,9 @@ page.start(async () => {
         ["quality", flags.length ? flags.join("; ") : "clean"],
         ["in a dataset", page.explain(`${told.run}-${told.starts[i]}`)]]));
     } else {
-      left.append(make("b", bitsAt(t) === null ? "No track here" : why.length ? "Not used" : "Kept, but in no segment"),
+      left.append(make("b", bitsAt(t) === null ? "No track here" : why.length ? "Not used" : "Kept, but not in a segment"),
         pairs(why.length ? why.map(([, name, words]) => [name, words]) : [["why", bitsAt(t) === null
-          ? "nothing was recorded that could be fused" : "what is steady here is too bent, or the end of it is shorter than a segment"]]));
+          ? "no measurements that can be fused" : "steady, but too curved, or shorter than a segment"]]));
     }
     right.append(make("b", `${t.toFixed(2)} s`), pairs([["time", clock(t)], ...values(t)]));
     at("chosen").replaceChildren(left, right);

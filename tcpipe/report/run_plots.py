@@ -227,21 +227,21 @@ def find_mask_spans(track: pa.Table, timeline: Timeline, rate_hz: float) -> Span
 
 
 REASON_WORDS = {
-    DropReason.GAP: "no usable motion or power here: a gap of a sensor, a jump, or a position that is too uncertain",
+    DropReason.GAP: "no usable motion or power: gap of a sensor, jump, or uncertain position",
     DropReason.STATIONARY: "it stands",
-    DropReason.STUCK: "the wheels turn, the robot does not move",
-    DropReason.TURNING_IN_PLACE: "it turns on the spot, or nearly",
-    DropReason.REVERSING: "it drives backwards",
-    DropReason.ACCELERATING: "its speed is changing",
-    DropReason.BELOW_FULL_SPEED: "it is commanded below full speed: the speed is not the terrain's limit",
+    DropReason.STUCK: "the wheels turn but the robot does not move",
+    DropReason.TURNING_IN_PLACE: "turning in place, or nearly",
+    DropReason.REVERSING: "driving backwards",
+    DropReason.ACCELERATING: "the speed changes",
+    DropReason.BELOW_FULL_SPEED: "commanded below full speed: the terrain does not limit the speed",
 }
 """Why a row of the track is not used."""
 
 _SPEEDS = {
     "gnss_velocity": "GNSS, Doppler",
-    "gnss": "GNSS, a second's way",
+    "gnss": "GNSS, displacement over 1 s",
     "visual_odometry": "visual odometry",
-    "pose": "poses, a second's way",
+    "pose": "poses, displacement over 1 s",
 }
 SPEED_ROLES = tuple(_SPEEDS)
 _UNITS = {"power": "W", "current": "A", "voltage": "V", "speed": "m/s", "height": "m", "σ": "m"}
@@ -266,7 +266,7 @@ _TRACK_LINES = (
     Line("height", "", "track", "height"),
     Line("σ", "position (DRMS)", "track", "position_std"),
     Line("σ", "height", "track", "height_std"),
-    Line("σ", "a second's way", "track", "chord_std"),
+    Line("σ", "displacement over 1 s", "track", "chord_std"),
 )
 
 
@@ -353,7 +353,7 @@ def _draw_masks(timeline: Timeline, spans: Spans, facts: StageFacts) -> Plot:
     rows = ["kept", *(flag_name(bit).replace("_", " ") for bit in reasons), *dict.fromkeys(row for row, *_ in events)]
     plot = make_plot(
         "gates",
-        alt="What of the drive is kept, by which gates the rest is dropped, and when sensors were refused or disagreed.",
+        alt="Kept sections of the drive, masks of the rest, and when sensors were rejected or disagreed.",
         axes=("", ""),
         height_px=40 + 22 * len(rows),
         tools="xbox_zoom",
@@ -380,7 +380,7 @@ def _iterate_events(timeline: Timeline, facts: StageFacts) -> Iterator[tuple[str
     for stretch in facts.fuse.stretches if facts.fuse else ():
         for opened in stretch.gate_resets:
             role = opened.role.replace("_", " ")
-            text = f"{role} was refused all this time, and off by {opened.size:.2g}"
+            text = f"{role} was rejected all this time; difference {opened.size:.2g}"
             events.append((f"{role} shut out", opened.start_ns, opened.end_ns, stretch.clock_epoch, text))
     for row, start_ns, end_ns, epoch, text in events:
         start_s, end_s = timeline.seconds(np.array([start_ns, end_ns]), np.full(2, epoch)).tolist()
@@ -405,7 +405,7 @@ def _draw_rejections(timeline: Timeline, first: Plot, rejections: pa.Table) -> I
         "√(χ²/gate)",
         first,
         legend={role.replace("_", " "): colour for role, colour in colours.items()},
-        alt="Measurements that the filter refused: how many times as far off as its gate allows. The table below counts them.",
+        alt="Measurements that the outlier gate rejected: distance relative to the limit of the gate. The table below counts them.",
     )
     for role, colour in colours.items():
         rows = (roles == role) & np.isfinite(t_s)
@@ -443,8 +443,8 @@ def _draw_labels(first: Plot) -> Plot:
         "label plot",
         "w [W], ± σ",
         first,
-        legend={"segment": KEPT, "segment that carries a flag": LINE_COLOURS[1]},
-        alt="The label of each segment that is chosen above, with its standard deviation.",
+        legend={"segment": KEPT, "segment with a flag": LINE_COLOURS[1]},
+        alt="The label chosen above, for each segment, with its standard deviation.",
     )
     ends = [0.0, 1.0]
     empty = {"t": ends, "y": ends, "low": ends, "high": ends, "colour": [KEPT] * 2}

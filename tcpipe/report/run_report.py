@@ -50,7 +50,7 @@ from tcpipe.tables.facts import ClockOffset, PhysicsFacts, StageFacts
 from tcpipe.tables.findings import Finding, select_findings
 
 _PAGE = "report.html"
-_DAMAGE = "Where messages are lost or may be."
+_DAMAGE = "Places where messages are or may be lost."
 _STEP_M = 0.05
 """Positions of the track that are nearer become one on the map."""
 
@@ -90,7 +90,7 @@ def run_report(store: Store, run: RunDirectory, pictures_by_map: MutableMapping[
         links=[Link("All runs of the store", f"../../../{_PAGE}")] if store.place.size(_PAGE) is not None else [],
         sections=[
             *drive,
-            *make_losses_sections([ledger], "Kept and dropped distances add up to the odometer.", names_runs=False),
+            *make_losses_sections([ledger], "Kept and excluded distances add up to the odometer.", names_runs=False),
             *_make_label_sections(segments, label.physics if label else None, manifest.robot),
             *([make_quality_section(to_integers(segments, "quality"), "segments")] if segments.num_rows else []),
             *make_budget_sections(run.facts.energy_budget),
@@ -119,7 +119,7 @@ def _draw_run(
 ) -> tuple[list[Section], Json]:
     """Return map and plots over time, and the data of their script; None of a run without a track."""
     if not track.num_rows:
-        return [Section("The drive", "No track: the log holds nothing that could be fused.")], None
+        return [Section("The drive", "No track: the log has no measurements that can be fused.")], None
     info = run.manifest.info
     timeline = make_timeline(track)
     has_datum = info.datum is not None
@@ -155,7 +155,7 @@ def _draw_run(
         "unused": UNUSED,
         "tall_by_wide": float(np.divide(*np.maximum(np.ptp(run_map.track_xy_m, axis=0), 1.0)[::-1])),
     }
-    text = "Colour shows what the distance is used for, or why it is not; click on the track or in a plot below for details."
+    text = "The colour shows the use of the distance, or why it is excluded; click on the track or a plot for details."
     over = " ".join([_describe_series(series, lines), *lost])
     sections = [
         Section("The drive", " ".join([text, *run_map.missing]), controls="run.html", plots=[run_map.plot]),
@@ -177,9 +177,9 @@ def _read_series(store: Store, run: RunDirectory, timeline: Timeline) -> tuple[l
             files = store.stream_files(run.run_id, replace(run_json, streams=streams))
             tables = {role: read_table(path) for role, path in files.items()}
     except (StoreError, TableError) as error:
-        return [], [f"What sensors told cannot be drawn: {error.problems[0]}."]
+        return [], [f"The measurements cannot be drawn: {error.problems[0]}."]
     if not tables and run.manifest.counts.messages.get("gnss"):
-        return [], ["What sensors told is gone or was read anew: of it the track's columns are drawn."]
+        return [], ["The measurements are missing or were read again: the plots show only columns of the track."]
     series = list(make_rail_series(tables.pop("power"), timeline)) if "power" in tables else []
     if "gnss_velocity" in tables:
         tables.pop("gnss", None)
@@ -190,15 +190,15 @@ def _read_series(store: Store, run: RunDirectory, timeline: Timeline) -> tuple[l
 def _describe_series(series: Sequence[Series], lines: Sequence[Line]) -> str:
     """Return the text above the plots over time, with the series that are thinned."""
     text = (
-        "Shaded: not used, in the colour of the reason. Draw a box to zoom, double-click for the whole run; every plot follows. "
-        "Where many values share a pixel, the line goes through the lowest and the highest of them."
+        "Shaded: excluded, in the colour of the reason. Draw a box to zoom, double-click for the whole run; all plots follow. "
+        "Where many values share a pixel, the line shows their minimum and maximum."
     )
     if not any(line.plot == "power" for line in lines):
         text += " There is no power."
     for part in series:
         if len(part.t_s) < part.value_count:
             text += (
-                f" {part.name.replace('_', ' ')}: {part.value_count} values; the page carries the lowest and the highest of every "
+                f" {part.name.replace('_', ' ')}: {part.value_count} values; the page contains the minimum and maximum of every "
                 f"{-(-2 * part.value_count // len(part.t_s))}."
             )
     return text
@@ -229,16 +229,16 @@ def _make_segments_data(segments: pa.Table, timeline: Timeline, run_map: RunMap)
 def _make_label_sections(segments: pa.Table, physics: PhysicsFacts | None, robot: str) -> Iterator[Section]:
     if not segments.num_rows:
         return
-    yield Section("Labels", "One value a segment.", plots=label_histograms(segments, "segments", prefix="of "))
+    yield Section("Labels", "One value per segment.", plots=label_histograms(segments, "segments", prefix="of "))
     if physics is None or not physics.fitted:
         return
     yield from make_physics_sections({} if physics.fit is None else {robot: physics.fit})
     text = (
-        f"Power minus what standing, drivetrain, rolling, grade and turning, fitted on this run, predict ({physics.segments} segments): "
+        f"Power minus the physics model (idle, drivetrain, rolling, grade, turning) fitted on this run ({physics.segments} segments): "
         f"terrain and errors. {physics.outliers} segments are further than four standard deviations of "
         f"{physics.residual_watt:.0f} W."
     )
-    yield Section("What physics leaves unexplained", text, plots=list(_draw_physics(segments)))
+    yield Section("Residuals of the physics model", text, plots=list(_draw_physics(segments)))
 
 
 def _draw_physics(segments: pa.Table) -> Iterator[Plot]:
@@ -247,7 +247,7 @@ def _draw_physics(segments: pa.Table) -> Iterator[Plot]:
     known = np.isfinite(measured) & np.isfinite(fitted)
     plot = make_plot(
         "physics",
-        alt="Power of each segment as it was measured against what physics predicts; on the line they are equal.",
+        alt="Measured power of each segment over the power that the physics model predicts; equal on the line.",
         axes=("w by physics [W]", "w [W]"),
         height_px=220,
         tools="save",
@@ -285,7 +285,7 @@ def _make_topics_section(run_json: RunJson, counts: Counts) -> Section:
         for role, sensor in sorted(run_json.sensors.items())
     ]
     header = ("role", "topic", "type", "messages", "stamp", "placed by", "why this topic")
-    return Section("Sensors", "Which topic played which role.", header=header, rows=rows)
+    return Section("Sensors", "Roles and the topics used for them.", header=header, rows=rows)
 
 
 def _make_trust_sections(facts: StageFacts, rejections: pa.Table) -> list[Section]:
@@ -306,12 +306,12 @@ def _make_trust_sections(facts: StageFacts, rejections: pa.Table) -> list[Sectio
     if not rows:
         return []
     text = (
-        "Refused: by the χ² gate, or unusable (rejections.parquet lists each). NIS is the mean squared innovation over its "
-        "variance and dimension, of what was taken: 1 fits its claimed error; far above, the sensor is worse than it says; "
-        "far below, better."
+        "Rejected: by the χ² gate, or unusable (rejections.parquet lists each). NIS is the mean squared innovation over its "
+        "variance and dimension, of fused measurements: at 1 the stated σ is correct; far above 1 it is too small; "
+        "far below, too large."
     )
-    header = ("sensor", "measurements", "refused", "NIS", "not fused, since")
-    return [Section("How far each sensor was believed", text, header=header, rows=rows)]
+    header = ("sensor", "measurements", "rejected", "NIS", "excluded because")
+    return [Section("Rejected measurements by sensor", text, header=header, rows=rows)]
 
 
 def _make_disagreement_sections(facts: StageFacts) -> list[Section]:
@@ -327,13 +327,13 @@ def _make_disagreement_sections(facts: StageFacts) -> list[Section]:
             f"{(part.start_ns - start_ns) * 1e-9:.0f} to {(part.end_ns - start_ns) * 1e-9:.0f} s",
             f"{part.size:.2g} {part.unit}",
             f"{part.expected_std:.2g} {part.unit}",
-            "it is alone, the track is believed" if part.alone else "deviations are raised, segments flagged",
+            "outvoted by other sensors; track unchanged" if part.alone else "σ inflated, segments flagged",
         )
         for part in disagreements
     ]
-    text = "The track held against each sensor that fed it, in windows of five seconds: where they differ beyond what both claim."
-    header = ("sensor", "what", "in the run", "off by", "expected (1σ)", "so")
-    return [Section("Where sensors disagree with the track", text, header=header, rows=rows)]
+    text = "The track compared with each fused sensor in windows of 5 s: differences beyond the stated uncertainties."
+    header = ("sensor", "what", "in the run", "difference", "expected (1σ)", "action")
+    return [Section("Disagreements of sensors and track", text, header=header, rows=rows)]
 
 
 def _make_clock_sections(facts: StageFacts, findings: Sequence[Finding]) -> list[Section]:
@@ -356,7 +356,7 @@ def _make_clock_sections(facts: StageFacts, findings: Sequence[Finding]) -> list
     text = ""
     if clock_offsets and rows:
         reference = _name(clock_offsets.reference)
-        text = f"How late stamps are against {reference}, by what the sensors say of the same motion. Nothing is corrected."
+        text = f"Time offsets relative to {reference}, from the motion that both sensors measure; not corrected."
     if steps:
         text += f" The clock steps: {'; '.join(steps)}."
     header = ("sensor", "late by", "± (2σ)", "drift", "correction")
@@ -386,5 +386,5 @@ def _make_provenance_section(run: RunDirectory, manifest: Manifest, run_json: Ru
         ("tags", ", ".join(f"{key}={value}" for key, value in manifest.tags.items()) or "none"),
         *((("log", f"sha256 {run_json.source.sha256}"),) if run_json is not None else ()),
     ]
-    text = "The same log and recipe make the same run."
+    text = "The same log and recipe give the same run."
     return Section("Provenance", text, header=("what", "is"), rows=rows, folded=True)

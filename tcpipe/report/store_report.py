@@ -203,10 +203,10 @@ def store_report(store: StoreFacts) -> str:
     runs = sort_runs(store)
     current = [run for run in runs if run.is_current]
     groups = [(group, len(current), "runs") for group in store.groups]
-    problem = "No run can be used. 'tcpipe ingest LOG' adds runs; 'tcpipe preflight LOG' checks a log."
+    problem = "The store has no usable runs. 'tcpipe ingest LOG' adds runs; 'tcpipe preflight LOG' checks a log."
     return render_page(
         title=f"Store {store.where}",
-        lead="All its runs. Sums, drift and losses are of the recipe that most runs are of, superseded runs left aside.",
+        lead="All runs. Sums, trends and losses use the most frequent recipe and exclude superseded runs.",
         verdict=show_verdict(store.verdict, store.changes, groups) if current else None,
         numbers=_make_numbers(store, current),
         warnings=[] if current else [problem],
@@ -215,7 +215,7 @@ def store_report(store: StoreFacts) -> str:
             *_make_drift_sections(runs),
             *make_losses_sections(
                 [run.facts.distance_by_reason_m for run in current if run.facts],
-                "The largest losses, and how to lose less; 'tcpipe status' lists the same.",
+                "The largest losses of distance and their remedies; 'tcpipe status' lists the same.",
                 names_runs=True,
             ),
             *_make_findings_sections(store, current),
@@ -260,9 +260,9 @@ def _make_table_section(store: StoreFacts, runs: Sequence[StoredRun]) -> list[Se
         )
         for run in runs[:MOST_ROWS]
     ]
-    text = "A click on a head sorts; what is chosen in the plots below stands alone here."
+    text = "Click a column head to sort; a selection in the plots below filters the table."
     if len(runs) > MOST_ROWS:
-        text += f" Without scripts the first {MOST_ROWS} of {len(runs)} stand here."
+        text += f" Without scripts the table shows the first {MOST_ROWS} of {len(runs)}."
     return [Section("All runs", text, header=_COLUMNS, rows=rows, controls="store.html")]
 
 
@@ -284,7 +284,7 @@ def _make_drift_sections(runs: Sequence[StoredRun]) -> list[Section]:
     for name, label in names.items():
         plot = make_plot(
             f"drift {name}",
-            alt=f"{label} of every run over the time at which it began; the table has the same figures.",
+            alt=f"{label} of every run over the time at which it began; the table lists the same values.",
             axes=("", label),
             legend=dict(_list_robots(runs)),
             height_px=260,
@@ -306,8 +306,8 @@ def _make_drift_sections(runs: Sequence[StoredRun]) -> list[Section]:
         )
         source = points.data_source
         plots.append(plot)
-    text = "A point is a run. A box drawn here chooses runs in the table, and the table's filters choose here."
-    return [Section("Over the nights", text, plots=plots, controls="store-drift.html" if "term" in names else "")]
+    text = "Each point is a run. A box drawn here selects runs in the table; the filters of the table apply here."
+    return [Section("Trends over time", text, plots=plots, controls="store-drift.html" if "term" in names else "")]
 
 
 def _list_robots(runs: Sequence[StoredRun]) -> list[tuple[str, str]]:
@@ -322,7 +322,7 @@ def _make_findings_sections(store: StoreFacts, current: Sequence[StoredRun]) -> 
         for group in store.groups
     ]
     header = ("severity", "finding", "runs", "such as")
-    text = "Of the current runs, by code, the worst first; each run's own page has all of its own."
+    text = "Findings of the current runs by code, worst first; the page of each run lists all of its findings."
     return [Section("Findings by code", text, header=header, rows=rows)] if rows else []
 
 
@@ -333,12 +333,12 @@ def _make_datasets_sections(store: StoreFacts, runs: Sequence[StoredRun]) -> lis
             Link(dataset.out, dataset.page) if dataset.page else dataset.out,
             len(dataset.runs),
             len(current_runs.difference(dataset.runs)) if dataset.there else "",
-            "" if dataset.there else "another dataset lies there now",
+            "" if dataset.there else "replaced by another dataset",
         )
         for dataset in store.datasets[-_MOST_LISTED:]
     ]
     header = ("dataset", "runs in it", "runs not in it", "")
-    return [Section("Datasets", "Those that were built of this store.", header=header, rows=rows)] if rows else []
+    return [Section("Datasets", "Datasets that were built from this store.", header=header, rows=rows)] if rows else []
 
 
 def _make_problem_sections(store: StoreFacts, runs: Sequence[StoredRun]) -> list[Section]:
@@ -350,7 +350,7 @@ def _make_problem_sections(store: StoreFacts, runs: Sequence[StoredRun]) -> list
             rows.append((run.run_id, run.state, _describe_problem(run.facts) if run.facts else line))
     if not rows:
         return []
-    text = "'tcpipe acknowledge' marks what cannot be repaired."
+    text = "Use 'tcpipe acknowledge' for problems that cannot be repaired."
     if len(rows) > _MOST_LISTED:
         text += f" The first {_MOST_LISTED} of {len(rows)}; the table above has every run."
     header = ("log or run", "is", "why")

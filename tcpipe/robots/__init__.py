@@ -50,24 +50,24 @@ class FieldPath:
 
 @dataclass(frozen=True, slots=True)
 class Robot:
-    """What is known of a robot before its log is opened; what is left out is not known."""
+    """Properties of a robot model; omitted keys are unknown."""
 
     width_m: Size | None = None
     """Width of its footprint, wheels or tracks included [m]."""
     length_m: Size | None = None
     """Length of its footprint [m]."""
     max_velocity_mps: Speed | None = None
-    """Maximum speed [m/s]; a segment that was commanded slower than this is not at the terrain's limit."""
+    """Maximum speed [m/s]; below this command the terrain does not limit the speed."""
     max_plausible_mps: PlausibleSpeed = field(default=MAX_PLAUSIBLE_MPS, metadata={"json": (MAX_PLAUSIBLE_MPS,)})
-    """A track of this robot that is faster is wrong [m/s]: it bears no label there."""
+    """Largest plausible speed of a track [m/s]; faster rows get no label."""
     voltage_range_volt: tuple[Volt, Volt] | None = None
-    """Lowest and highest voltage that its battery has [V]; a segment beyond is flagged."""
+    """Lowest and highest voltage of the battery [V]; segments outside are flagged."""
     platform: str | None = None
-    """The kind of robot by which power sources tell it apart (Clearpath's code, as A200)."""
+    """Platform code that power sources refer to (Clearpath's, as A200)."""
     status_types: list[str] = field(default_factory=list)
-    """Message types that only this robot publishes; a log that holds one is of it."""
+    """Message types that only this robot publishes; they identify it."""
     topic_words: list[str] = field(default_factory=list)
-    """Words by which a topic's name tells this robot; whole words, in small letters."""
+    """Words in topic names that identify this robot; whole words, in lower case."""
 
     def contradictions(self) -> Iterator[tuple[str, str]]:
         """Yield each key whose value cannot be, and what was wanted."""
@@ -77,7 +77,7 @@ class Robot:
 
 @dataclass(frozen=True, slots=True)
 class PowerSource:
-    """What a message type tells of one rail: one voltage and the current that drives the wheels at it. Several rails are several tables.
+    """One power rail in a message type: a voltage and the current that drives the wheels at it. Use one table per rail.
 
     Fields are named by dotted path; ``volts[0]`` is an element of a list, ``drivers[0].amps`` a field of a message in a list,
     ``drivers[].amps`` the sum over all of them; ``left + right - spare`` is a sum of fields.
@@ -86,49 +86,49 @@ class PowerSource:
     type: str
     """Message type, as package/msg/Name in ROS 1 and 2 alike."""
     voltage: str = ""
-    """Field of the voltage [V]; none where the message carries a current alone."""
+    """Field of the voltage [V]; omit it if the message contains only a current."""
     current: str = ""
-    """Field of the current [A]; none where it carries a voltage alone, or a counter."""
+    """Field of the current [A]; omit it if the message contains only a voltage, or a counter."""
     energy: str = ""
     """Field of a counter of energy, in place of a current, for example drawn - given_back."""
     voltage_scale: Scale = 1.0
-    """What the voltage's field is multiplied by: 0.001 where it is in millivolts."""
+    """Factor on the voltage: 0.001 if it is in millivolts."""
     current_scale: Scale = 1.0
-    """What the current's field is multiplied by: 0.001 where it is in milliamperes."""
+    """Factor on the current: 0.001 if it is in milliamperes."""
     energy_scale: Scale = 1.0
-    """What the counter is multiplied by: 3600 where it counts watt-hours."""
+    """Factor on the counter: 3600 if it counts watt-hours."""
     counter_wraps: Annotated[float, Bounds(gt=0, le=1e19)] | None = None
-    """Where the counter begins at zero again, in its own unit; without, a counter that falls was reset."""
+    """Value at which the counter wraps to zero, in its own unit; if omitted, a decrease is a reset."""
     rail: str = ""
-    """The rail's name; none takes the topic's."""
+    """Name of the rail; default: that of the topic."""
     averaged: bool = False
-    """Whether a value is the mean over the period that ends with the message, rather than sampled."""
+    """Whether a value is the mean over the period that ends with the message, not an instantaneous sample."""
     averaging_unknown: bool = False
-    """Nobody knows whether it averages: the motion tells where it can, else `averaged` counts."""
+    """Averaging is unknown: tcpipe estimates it from the motion if possible, otherwise uses `averaged`."""
     sign: CurrentSign = "drawn_positive"
-    """Which sign a drawn current has; auto where robots disagree: the mean over the run tells."""
+    """Sign of a drawn current; auto if it differs by robot: the mean over the run decides."""
     propulsion: bool = True
-    """Whether the current drives the wheels alone; such a source is taken before others."""
+    """Whether the current feeds only the drives; such sources have priority."""
     other_loads: str = ""
-    """What the current feeds besides the drives; said in a warning."""
+    """Other loads of the current; named in a warning."""
     open_questions: str = ""
-    """What is not known of it; stands in the reference."""
+    """Unknown properties; listed in the reference."""
     unsupported_reason: str = ""
-    """Why this type tells no power, and what would; then it plays no role, and no field is named."""
+    """Why this type does not measure power, and an alternative; the type is then never used and needs no fields."""
     rate_setting: str = ""
-    """What sets its rate; said where it comes too slowly."""
+    """Setting of its rate; named if the rate is too low."""
     fallback: bool = False
-    """Only where the type's other tables cannot be read or hold no power (a current that is zero throughout)."""
+    """Used only if the other tables of the type cannot be read or have no power (a current that is always zero)."""
     platform: str | None = None
     """Only for robots of this platform."""
     topic: str | None = None
-    """Only for topics whose name ends so."""
+    """Only for topics whose name ends with this."""
     husky_power: Literal["battery", "drivers"] | None = None
-    """Only where `read.husky_power` says so."""
+    """Only with this value of `read.husky_power`."""
     currents_listed: Annotated[int, Bounds(ge=1, le=1000)] | None = None
-    """How many currents the message's list holds, where its definition says so; a message of another length is refused."""
+    """Number of currents in the list of the message, if its definition states it; messages of another length are rejected."""
     wraps_amp: Annotated[float, Bounds(ge=1, le=1e9)] | None = None
-    """A current above half of this is a negative one that was read as unsigned [A]; without, the record tells."""
+    """A current above half of this is a negative one read as unsigned [A]; if omitted, tcpipe infers it from the data."""
 
     def contradictions(self) -> Iterator[tuple[str, str]]:
         """Yield each key whose value cannot be, and what was wanted."""
@@ -139,11 +139,11 @@ class PowerSource:
                 yield key, "fields joined by + or -, for example status.left_amp + amps[1] or drivers[].amp"
         if self.unsupported_reason:
             if self.voltage or self.current or self.energy:
-                yield "unsupported_reason", "no field beside it"
+                yield "unsupported_reason", "no field besides it"
         elif not self.voltage and not self.current:
             yield "current", "a voltage, a current or both"
         if self.energy and (self.current or not self.voltage):
-            yield "energy", "a voltage beside it, and no current"
+            yield "energy", "a voltage besides it, and no current"
 
 
 @dataclass(frozen=True, slots=True)

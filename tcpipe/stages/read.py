@@ -80,7 +80,7 @@ def read_run(log: LogReader, config: ReadConfig, *, robot: str | None, known: Pr
     )
     report = StageReport(tuple(dict.fromkeys(findings)), replace(report.facts, odometry_scale=scale))
     if not any(role in streams for role in MOTION_ROLES):
-        what = "nothing in the log tells motion: wheel_odometry, visual_odometry, gnss and pose have no usable row"
+        what = "no motion in the log: wheel_odometry, visual_odometry, gnss and pose have no usable rows"
         raise RoleError(what, findings=report.findings)
     return Streams(streams, sensors, assignment.robot, crs, power.averaged, report)
 

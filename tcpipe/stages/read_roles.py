@@ -50,7 +50,7 @@ def decide_roles(config: ReadConfig, topics: Iterable[Topic], robot: str | None,
     # for logs without that sensor as well.
     there = ", ".join(assignment.roles)
     problems = tuple(
-        f"recipe read.time_offset_s.{role}: no topic of this log plays {role}, so it does nothing; roles that are there: {there}"
+        f"recipe read.time_offset_s.{role}: no topic of this log is used as {role}, so it has no effect; roles in the log: {there}"
         for role in config.time_offset_s
         if role not in assignment.roles
     )

@@ -236,7 +236,7 @@ def place_pose(
     except MapError as error:
         raise RecipeError(*error.problems) from None
     if not crs.is_projected or crs.geodetic_crs is None:
-        raise RecipeError(f"recipe read.pose_crs: {crs.name} is not projected (metres); positions in degrees play gnss")
+        raise RecipeError(f"recipe read.pose_crs: {crs.name} is not projected (metres); use degrees as gnss")
     pose = streams[_POSE]
     lon, lat = Transformer.from_crs(crs, crs.geodetic_crs, always_xy=True).transform(
         to_floats(pose, "x_m"), to_floats(pose, "y_m")

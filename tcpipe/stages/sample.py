@@ -178,7 +178,7 @@ def _project_to_first_map(sampled: Sampled, source: MapReader, first: MapReader)
         return sampled.footprint_xy_m
     placed = find_map_projection(first, "EPSG:4326").forward(sampled.footprint_lonlat_deg)
     if not np.isfinite(placed).all():
-        raise MapError(f"map {source.name}: lies too far from map {first.name} for one dataset; build one from each")
+        raise MapError(f"map {source.name}: is too far from map {first.name} for one dataset; build one from each")
     return placed
 
 

@@ -16,7 +16,7 @@ def flag_names(bits: int, flags: type[IntFlag]) -> tuple[str, ...]:
 
 
 class DropReason(IntFlag):
-    """Why a row of the track is not used; 0 means kept. Order is precedence in the loss ledger."""
+    """Why a row of the track is not used; 0 means kept. The order is the precedence in the distance breakdown."""
 
     GAP = 1 << 0
     """No usable motion or power estimate: sensor gap, power gap, clock epoch, a jump, or relative position error too large."""
@@ -31,11 +31,11 @@ class DropReason(IntFlag):
     ACCELERATING = 1 << 5
     """A commanded change of speed (2 s after it), or, without commands, |dv/dt| > 0.3 m/s² for 0.2 s; start and stop ramps."""
     BELOW_FULL_SPEED = 1 << 6
-    """Commanded below 0.95 of the robot's maximum: the speed is not the terrain's limit."""
+    """Commanded below 0.95 of the robot's maximum: the terrain does not limit the speed."""
 
 
 class Quality(IntFlag):
-    """What a user may want to know of a label; 0 means clean."""
+    """Limitations of a label; 0 means none."""
 
     LOW_POWER_RATE = 1 << 0
     """Current sampled below 10 Hz (instantaneous) or 2 Hz (averaged by the source), or a voltage that varies by 2 %."""
@@ -44,32 +44,32 @@ class Quality(IntFlag):
     HIGH_SLIP = 1 << 2
     """Wheel speed and ground speed differ by more than 20 %."""
     WEAK_GNSS = 1 << 3
-    """Deviation of the horizontal position (DRMS, `position_std_m`) above `label.flag_position_std_m` at either end."""
+    """Standard deviation of the horizontal position (DRMS, `position_std_m`) above `label.flag_position_std_m` at either end."""
     CURVED = 1 << 4
     """Arc over chord above 1.01."""
     POWER_MEAN_MISMATCH = 1 << 5
     """The plain mean of the power samples differs from energy / duration by more than 5 %."""
     NO_COMMAND = 1 << 6
-    """No command topic: it cannot be known whether the robot was driven at its maximum."""
+    """No command topic: it is unknown whether the robot was driven at its maximum speed."""
     VOLTAGE_OUT_OF_RANGE = 1 << 7
     """The voltage leaves the range of the robot profile."""
     CLOCK_DOUBTFUL = 1 << 8
-    """A clock of the segment's run stepped, drifts or seems off (an IMU's by more than 0.15 s), or the recorder's time had to be used."""
+    """A clock of the run stepped, drifts or has an offset (an IMU's: more than 0.15 s), or log time replaces the stamps."""
     PHYSICS_OUTLIER = 1 << 9
-    """The power is more than four robust standard deviations from what physics, fitted on the run, predicts."""
+    """The power is more than four robust standard deviations from the physics model fitted on the run."""
     BELOW_FULL_SPEED = 1 << 10
-    """Commanded on average below `full_speed_fraction` of the robot's maximum: the speed is not the terrain's limit."""
+    """Commanded on average below `full_speed_fraction` of the robot's maximum: the terrain does not limit the speed."""
     SENSORS_DISAGREE = 1 << 11
-    """A sensor says another position, way or turn there than the track, beyond what both claim, and nothing tells which is right."""
+    """A sensor and the track disagree on position, distance or turn beyond their uncertainties, and no third sensor decides."""
 
 
 class Loss(IntFlag):
-    """Entries of the loss ledger beyond the bits of `DropReason`: metres that are no kept row's fault."""
+    """Entries of the distance breakdown beyond the bits of `DropReason`: losses after the mask."""
 
     CURVED = 1 << 16
     """Arc over chord above 1.02: cut, but not straight enough to be a segment."""
     LEFTOVER = 1 << 17
-    """The end of a steady stretch, shorter than a chord."""
+    """The end of a steady section, shorter than a chord."""
     OUTSIDE_MAP = 1 << 18
     """The patch leaves every map."""
     NODATA = 1 << 19
@@ -79,10 +79,10 @@ class Loss(IntFlag):
     POSITION_UNCERTAIN = 1 << 21
     """Absolute position standard deviation above `sample.max_position_std_m` when sampling."""
     SPLIT_BUFFER = 1 << 22
-    """The footprint straddles, or is nearer than the buffer to, a region's border."""
+    """The footprint crosses the border of a region, or is nearer to it than the buffer."""
     NO_POWER = 1 << 23
-    """A segment without a label: the run has no power source, or none over this stretch."""
+    """A segment without a label: the run has no power source, or none over this segment."""
     SPLIT_EXCLUDED = 1 << 24
-    """The footprint lies in a region whose `split` is `exclude`."""
+    """The footprint is in a region whose `split` is `exclude`."""
     RECORDED_TWICE = 1 << 25
-    """Another run of the dataset has the same stretch of the same drive."""
+    """Another run of the dataset has the same section of the same drive."""

@@ -108,14 +108,14 @@ class TableSchema:
     def _problems(self, table: pa.Table, *, more: bool) -> Iterable[str]:
         for column in self.columns:
             if column.name not in table.column_names:
-                yield f"table {self.name}: column {column.name} is missing (wanted {column.dtype}, {column.unit})"
+                yield f"table {self.name}: column {column.name} is missing (expected {column.dtype}, {column.unit})"
                 continue
             got = table.schema.field(column.name).type
             data = table.column(column.name)
             if got != column.dtype:
-                yield f"table {self.name}: column {column.name} is {got}, wanted {column.dtype}"
+                yield f"table {self.name}: column {column.name} is {got}, expected {column.dtype}"
             elif data.null_count and not column.nullable:
-                yield f"table {self.name}: column {column.name} has {data.null_count} nulls, wanted none"
+                yield f"table {self.name}: column {column.name} has {data.null_count} nulls, expected none"
             elif (
                 pa.types.is_floating(got)
                 and not pc.all(pc.is_finite(data.drop_null())).as_py()

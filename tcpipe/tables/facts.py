@@ -321,7 +321,7 @@ class PhysicsTerm:
     """A coefficient of P = standing + drivetrain v / cos(s) + rolling v + grade v tan(s) + turning |yaw rate|, with its deviation."""
 
     term: str
-    """``standing``, ``drivetrain`` (motors and gears, paid on any grade), ``rolling``, ``grade`` or ``turning``."""
+    """``idle``, ``drivetrain`` (motors and gears, paid on any grade), ``rolling``, ``grade`` or ``turning``."""
     terrain: str
     """The class of terrain, or ``all``."""
     value: float

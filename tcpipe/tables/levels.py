@@ -132,10 +132,10 @@ VISUAL_ODOMETRY = _make_odometry_schema(
 
 GNSS_VELOCITY = _make_stream_schema(
     "gnss_velocity",
-    "Velocity of the antenna over ground as its receiver tells it (Doppler).",
+    "Velocity of the antenna over ground, from its receiver (Doppler).",
     *(Column(f"{axis}_velocity_mps", _F64, "m/s", f"velocity {axis}", "enu", axis == "up") for axis in _ENU),
-    *(_make_nullable(f"{axis}_var_m2ps2", "m2/s2", f"its variance {axis}; null: not told", "enu") for axis in _ENU),
-    Column("fix_status", pa.int8(), "1", "NavSatStatus as in gnss; -1 where the message tells none"),
+    *(_make_nullable(f"{axis}_var_m2ps2", "m2/s2", f"variance {axis}; null if unknown", "enu") for axis in _ENU),
+    Column("fix_status", pa.int8(), "1", "NavSatStatus as in gnss; -1 if the message has none"),
 )
 
 POWER = _make_stream_schema(
@@ -155,11 +155,11 @@ COMMAND = _make_stream_schema(
 
 POSE = _make_stream_schema(
     "pose",
-    "Positions made elsewhere (SLAM, post-processing), which stand in for GNSS.",
-    *(Column(f"{axis}_m", _F64, "m", f"position, {axis}, as it was made", "pose_crs or its own") for axis in "xyz"),
-    _make_nullable("lon_deg", "deg", "longitude; null where no CRS is told", "gnss_crs"),
-    _make_nullable("lat_deg", "deg", "latitude; null where no CRS is told", "gnss_crs"),
-    _make_nullable("alt_m", "m", "height, as it was made; null where no CRS is told", "gnss_crs"),
+    "Positions from SLAM or post-processing, used in place of GNSS.",
+    *(Column(f"{axis}_m", _F64, "m", f"position, {axis}, as recorded", "pose_crs or its own") for axis in "xyz"),
+    _make_nullable("lon_deg", "deg", "longitude; null without a CRS", "gnss_crs"),
+    _make_nullable("lat_deg", "deg", "latitude; null without a CRS", "gnss_crs"),
+    _make_nullable("alt_m", "m", "height, as recorded; null without a CRS", "gnss_crs"),
     *(
         _make_nullable(f"{name}_var_m2", "m2", f"variance along {axis}; null where none is given", "")
         for name, axis in (("east", "x"), ("north", "y"), ("up", "z"))
@@ -197,7 +197,7 @@ _TRACK_COLUMNS = (
         _make_nullable(
             f"displacement_std_{name}_m",
             "m",
-            f"standard deviation of the horizontal displacement over the next {name}, along it, the correlation of both ends counted; "
+            f"standard deviation of the horizontal displacement over the next {name}, along it, including the correlation of both ends; "
             "null where the track does not go on, and without a smoother",
             "enu",
         )
@@ -259,7 +259,7 @@ _SEGMENT_COLUMNS = (
     ),
 )
 
-SEGMENTS = TableSchema("segments", "L4", "Steady, straight pieces of one chord each.", _SEGMENT_COLUMNS)
+SEGMENTS = TableSchema("segments", "L4", "Steady, straight sections of one chord each.", _SEGMENT_COLUMNS)
 
 _GAPS = "null where the IMU has gaps or is below 50 Hz"
 _UNSURE = "null without a gyroscope or a smoother"
@@ -283,13 +283,13 @@ MOTION_COLUMNS = tuple(
         (
             "slip_fraction",
             "1",
-            "1 - mean speed over ground / mean speed of the wheels as they tell it, both along the body; null without wheels",
+            "1 - mean speed over ground / mean speed of the wheels, both along the body; null without wheels",
             "base_link",
         ),
         (
             "slip_std_fraction",
             "1",
-            "standard deviation of slip_fraction from the speed over ground: a wrong wheel radius is not in it, it counts as slip",
+            "standard deviation of slip_fraction from the speed over ground: it excludes a wrong wheel radius, which counts as slip",
             "base_link",
         ),
         (
@@ -306,16 +306,16 @@ _NET_COLUMNS = tuple(
     _make_nullable(name, unit, doc, since="1.3")
     for name, unit, doc in (
         ("voltage_volt", "V", "time-mean of the voltage, over the rails; null without power"),
-        ("idle_power_watt", "W", "what the robot draws while it stands, of the run; null where it hardly stood"),
+        ("idle_power_watt", "W", "power of the stationary robot in this run; null if it was hardly stationary"),
         (
             "idle_power_std_watt",
             "W",
-            "standard deviation of idle_power_watt: how it differs over the run, and how well it is measured",
+            "standard deviation of idle_power_watt: variation over the run and measurement noise",
         ),
         ("net_power_watt", "W", "power_watt less idle_power_watt"),
-        ("net_power_std_watt", "W", "standard deviation of it, as a label of the true metre"),
+        ("net_power_std_watt", "W", "standard deviation of net_power_watt as a label of the segment"),
         ("net_energy_joule", "J", "energy_joule less idle_power_watt times duration_s"),
-        ("net_energy_std_joule", "J", "standard deviation of it, likewise"),
+        ("net_energy_std_joule", "J", "standard deviation of net_energy_joule, likewise"),
     )
 )
 
@@ -324,7 +324,7 @@ _LABEL_COLUMNS = (
     Column("velocity_mps", _F64, "m/s", "v: chord / duration"),
     _make_nullable("power_watt", "W", "w: energy / duration; null without power"),
     _make_nullable("energy_joule", "J", "E: integral of voltage times current; null without power"),
-    Column("duration_std_s", _F64, "s", "standard deviation of the duration, as a label of the true metre"),
+    Column("duration_std_s", _F64, "s", "standard deviation of the duration as a label of the true chord"),
     Column("velocity_std_mps", _F64, "m/s", "standard deviation of the velocity, likewise"),
     _make_nullable("power_std_watt", "W", "standard deviation of the power, likewise; null without power"),
     _make_nullable("energy_std_joule", "J", "standard deviation of the energy, likewise; null without power"),
@@ -332,16 +332,16 @@ _LABEL_COLUMNS = (
     _make_nullable(
         "physics_power_watt",
         "W",
-        "power by standing, drivetrain, rolling, grade and turning alone, fitted on the run; null without power or fit",
+        "power predicted by the physics model fitted on the run; null without power or fit",
     ),
     Column("power_samples", pa.int32(), "1", "power samples inside the segment"),
-    Column("quality", pa.uint32(), "bits", "what a user may want to know, 0 = clean", flags=Quality),
+    Column("quality", pa.uint32(), "bits", "limitations of the label, 0 = none", flags=Quality),
 )
 
 LABELLED_SEGMENTS = TableSchema(
     "segments",
     "L5",
-    "Segments with the cost of the metre each one covers.",
+    "Segments with their labels.",
     (
         *(*_SEGMENT_COLUMNS, *MOTION_COLUMNS, *_LABEL_COLUMNS),
         _make_geometry("LineString from start to end; null in a local frame", "gnss_crs"),
@@ -357,7 +357,7 @@ PLACED_SEGMENTS = LABELLED_SEGMENTS.select_columns(
 SAMPLES = TableSchema(
     "samples",
     "L6",
-    "One row a sample, in the order of the patches.",
+    "One row per sample, in the order of the patches.",
     (
         Column("sample_id", pa.string(), "", "the segment's id; joins samples and patches"),
         Column("split", pa.string(), "", "train, test, unseen or buffer"),
@@ -379,7 +379,7 @@ SAMPLES = TableSchema(
             "majority class id under the chord; null without a terrain layer",
             nullable=True,
         ),
-        Column("terrain_name", pa.string(), "", "its name; null without a terrain layer", nullable=True),
+        Column("terrain_name", pa.string(), "", "name of that class; null without a terrain layer", nullable=True),
         _make_nullable("terrain_purity", "1", "share of the chord on that class; null without a terrain layer"),
         Column(
             "slope_rad", _F64, "rad", "slope of a plane fitted to the patch's heights, positive uphill along travel"
@@ -400,7 +400,7 @@ SAMPLES = TableSchema(
 REJECTIONS = TableSchema(
     "rejections",
     "L2",
-    "Measurements that the filter refused, and why.",
+    "Measurements that the filter rejected, and why.",
     (
         Column("stamp_ns", _I64, "ns", "time of the measurement"),
         Column("role", pa.string(), "", "gnss, gnss_velocity, imu, wheel_odometry, visual_odometry"),
@@ -413,7 +413,7 @@ REJECTIONS = TableSchema(
 
 @dataclass(frozen=True, slots=True)
 class Sensor:
-    """Where a stream came from and where its sensor sits.
+    """The topic of a stream and the extrinsics of its sensor.
 
     ``xyz_m`` and ``quat_xyzw`` are base_link_from_sensor (position of the sensor in base_link; rotation sensor to base_link).
     """
@@ -427,7 +427,7 @@ class Sensor:
     placed_by: str = "assumed"
     """``tf_static``, ``recipe``, ``same frame`` (the message is already in base_link), ``assumed``, or ``not needed`` (power, command)."""
     time_source: str = "header"
-    """``header`` or ``log``: which stamp rules."""
+    """Source of the stamps: ``header`` or ``log``."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -50,7 +50,7 @@ RECIPE = Option(
     "Recipe (or TCPIPE_RECIPE, or the nearest tcpipe.toml upward; else defaults).", (), "input_file", "FILE"
 )
 CLUSTER = Option(
-    "Dask scheduler whose workers do it, tcp://host:port (or TCPIPE_CLUSTER); instead of --jobs.",
+    "Dask scheduler whose workers compute it, tcp://host:port (or TCPIPE_CLUSTER); instead of --jobs.",
     metavar="ADDRESS",
     envvar="TCPIPE_CLUSTER",
 )
@@ -60,7 +60,7 @@ MESSAGE_DEFINITIONS = Option(
 MAP = Option("Map to look at (default: the only one in the store).", ("--map",), "map", "NAME")
 MODEL = Option(kind="sealed", metavar="MODEL", is_argument=True)
 PHYSICS = Option(
-    "Dataset whose card says what turning costs the robot (default: the one that MODEL was trained on).",
+    "Dataset whose card has the power of turning of the robot (default: the one that MODEL was trained on).",
     ("--physics-from",),
     "sealed",
     "DATASET",
@@ -105,7 +105,7 @@ def as_function(options: Callable[P, O], run: Callable[[O], R]) -> Callable[P, R
 
     shown = {of.name: of.metadata.get("option", Option()).about for of in fields(options)}  # type: ignore[arg-type]
     lines = [f"{name} : {about}" for name, about in shown.items() if about]
-    more = f"`{getattr(options, '__module__', '')}` says more of each."
+    more = f"`{getattr(options, '__module__', '')}` describes each of them."
     call.__name__ = call.__qualname__ = run.__name__.removeprefix("run_")
     call.__module__ = run.__module__
     call.__doc__ = "\n".join([cleandoc(run.__doc__ or ""), "", "Parameters", "----------", *lines, "", more])

@@ -188,5 +188,5 @@ def find_wrong_name(name: str, *, taken: Collection[str]) -> str | None:
     if name in _TAKEN or name in taken or name.endswith("_one_hot"):
         return f"layer {name}: the name is taken; choose another"
     if not _NAME.fullmatch(name):
-        return f"layer {name!r}: wanted small letters, digits and '_', beginning with a letter, 40 at most"
+        return f"layer {name!r}: expected small letters, digits and '_', beginning with a letter, 40 at most"
     return None

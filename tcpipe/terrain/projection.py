@@ -35,12 +35,12 @@ def parse_crs(text: str, *, where: str) -> CRS:
     try:
         crs = CRS.from_user_input(text)
     except CRSError as error:
-        raise MapError(f"{where}: {text[:60]!r} is not a coordinate reference system (wanted EPSG:n or WKT)") from error
+        raise MapError(f"{where}: {text[:60]!r} is not a CRS (expected EPSG:n or WKT)") from error
     while crs.is_compound or crs.is_bound:
         crs = crs.sub_crs_list[0] if crs.is_compound else CRS(crs.source_crs)
     crs = crs.to_2d()
     if crs.geodetic_crs is None or not (crs.is_projected or crs.is_geographic):
-        raise MapError(f"{where}: the CRS {crs.name!r} is not tied to the earth (wanted a projected or geographic CRS)")
+        raise MapError(f"{where}: the CRS {crs.name!r} is local (expected a projected or geographic CRS)")
     radius_m = _read_ellipsoid(crs)[0]
     if abs(radius_m / _EARTH_RADIUS_M - 1.0) > 0.02:
         raise MapError(
@@ -108,7 +108,7 @@ def find_utm_crs(crs: CRS, xy: tuple[float, float]) -> CRS:
     geodetic = CRS(crs.geodetic_crs)
     lon, lat = Transformer.from_crs(crs, geodetic, always_xy=True).transform(*xy)
     if not (math.isfinite(lon) and math.isfinite(lat)):
-        raise MapError(f"the point {xy} lies outside the area where the CRS {crs.name!r} is defined")
+        raise MapError(f"the point {xy} is outside the area where the CRS {crs.name!r} is defined")
     spot = AreaOfInterest(lon, lat, lon, lat)
     found = query_utm_crs_info(datum_name=geodetic.name, area_of_interest=spot)
     if found:

@@ -228,7 +228,7 @@ def check_scale(frames: PatchFrames) -> None:
     if wrong.size:
         raise TableError(
             f"table segments: {wrong.size} chords contradict their end positions (the first is {scale[wrong[0]]:.3f} times as long "
-            "on the map); wanted longitude and latitude of the same two points"
+            "on the map); expected longitude and latitude of the same two points"
         )
 
 

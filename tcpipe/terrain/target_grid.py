@@ -108,7 +108,7 @@ def choose_crs(height: Georeference, wanted: CRS | None) -> CRS:
     if wanted is not None:
         raise MapError(
             f"{height.name}: the CRS {crs.name!r} is not metric there (its unit is more than 1 % off a metre of ground, "
-            "or it is mirrored); wanted a UTM zone or a national grid"
+            "or it is mirrored); expected a UTM zone or a national grid"
         )
     raise MapError(
         f"{height.name}: too large for one metric map: in {crs.name} its edges would be more than 1 % out of scale; cut out the site first"
@@ -167,7 +167,7 @@ def _compute_pixel_side(raster: Georeference, crs: CRS) -> float:
     placed = points if projection is None else projection.forward(points)
     side = float(np.linalg.norm(placed[1:] - placed[0], axis=1).min())
     if not math.isfinite(side):
-        raise MapError(f"{raster.name}: lies outside the area where the map's CRS {crs.name!r} is defined")
+        raise MapError(f"{raster.name}: is outside the area where the map's CRS {crs.name!r} is defined")
     return side
 
 

@@ -129,7 +129,7 @@ def _bad_input(kind: str, here: Path) -> Path:
             (path / "readme.txt").touch()
         case "a pipe or a device":
             os.mkfifo(path)
-        case "nothing in the log tells motion":
+        case "no motion in the log":
             times = np.arange(5, dtype=np.int64) * 1_000_000_000
             write_mcap(path, [MessageStream("/chatter", "std_msgs/msg/String", times)])
     return path
@@ -143,7 +143,7 @@ def _bad_input(kind: str, here: Path) -> Path:
         ("not a log", 1),
         ("no log in this directory", 2),
         ("a pipe or a device", 1),
-        ("nothing in the log tells motion", 1),
+        ("no motion in the log", 1),
     ],
 )
 def test_what_is_no_log_is_said_in_plain_lines(kind: str, code: int, tmp_path: Path) -> None:
@@ -162,25 +162,25 @@ def test_what_is_no_log_is_said_in_plain_lines(kind: str, code: int, tmp_path: P
         (["nosuch"], "No such command", 2),
         (["ingest", "LOG", "--store", ""], "is a variable not set?", 2),
         (["ingest", "LOG", "--store="], "is a variable not set?", 2),
-        (["ingest", "LOG", "--tag", "=wet"], "wanted KEY=VALUE", 2),
+        (["ingest", "LOG", "--tag", "=wet"], "expected KEY=VALUE", 2),
         (["ingest", "LOG", "--robot", "nosuch"], "robot 'nosuch' is not known", 2),
         (["ingest", "LOG", "--recipe", "none.toml"], "there is no such file", 2),
         (
             ["ingest", "LOG", "--store", "https://x.org/store"],
-            "wanted a directory, s3://bucket/name, gs:// or az://",
+            "expected a directory, s3://bucket/name, gs:// or az://",
             2,
         ),
-        (["ingest", "LOG", "--store", "LOG"], "is a file, wanted a directory", 2),
-        (["ingest", "LOG", "--store", "LOG/below"], "is a file, wanted a directory", 2),
+        (["ingest", "LOG", "--store", "LOG"], "is a file, expected a directory", 2),
+        (["ingest", "LOG", "--store", "LOG/below"], "is a file, expected a directory", 2),
         (["build-dataset", "--store", "nosuch"], "there is no store here", 2),
         (["inspect", "nosuch"], "there is no such file", 2),
         (["report", "nosuch"], "there is no such directory", 2),
         (["export", "LOG", "out", "--topics", "/nosuch"], "topic /nosuch is not in this log", 1),
-        (["export", "LOG", "LOG/below"], "is a file, wanted a directory", 2),
+        (["export", "LOG", "LOG/below"], "is a file, expected a directory", 2),
         (["simulate", "out", "--scenario", "nosuch"], "scenario 'nosuch' is unknown", 2),
         (["simulate", ".."], "is not this simulated site", 2),
-        (["schemas", "LOG"], "is a file, wanted a directory", 2),
-        (["init", "LOG"], "is a file, wanted a directory", 2),
+        (["schemas", "LOG"], "is a file, expected a directory", 2),
+        (["init", "LOG"], "is a file, expected a directory", 2),
         (["add-map", "m", "--height", "LOG"], "not a raster", 1),
     ],
 )
@@ -335,7 +335,7 @@ def test_a_log_that_is_still_written_is_not_taken_for_whole(log: Path, tmp_path:
     assert (done.returncode, done.stderr) == (0, "")
     (result,) = told(done)["results"]
     assert result["status"] == "waiting"
-    assert "changed while it was looked at" in result["notes"][0]
+    assert "changed during the check" in result["notes"][0]
     assert not list(tmp_path.glob("tcpipe-store/runs/*"))
 
 
@@ -468,7 +468,7 @@ def test_a_batch_that_is_ended_goes_on_where_it_was(number: signal.Signals, logs
     _, told = running.communicate(timeout=HANGS_S)
     if number != signal.SIGKILL:
         assert running.returncode == 128 + number
-        assert "nothing is half-written" in told
+        assert "no output is incomplete" in told
         assert "Traceback" not in told
         assert not list(tmp_path.rglob(".tmp-*"))
     end = time.monotonic() + 20

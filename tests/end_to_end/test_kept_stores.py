@@ -293,7 +293,7 @@ def test_what_is_damaged_or_not_known_is_left_and_named(untouched):
     manifest.write_text(text.replace('"husky"', '"jackal"', 1))
     damaged = migrate(untouched / "store")
     assert (len(damaged.migrated), damaged.exit_code) == (1, 3)
-    assert "not as it was written" in damaged.problems[0]
+    assert "has changed since it was written" in damaged.problems[0]
     write_sealed(untouched / "store" / "store.json", {"data_model_version": "4.0"})
     with pytest.raises(UsageError, match=r"is of data model 4\.0, this version knows 2\.0, 2\.1, 3\.0"):
         migrate(untouched / "store")

@@ -75,9 +75,7 @@ def test_why_a_log_of_another_encoding_is_refused_is_said(tmp_path, encoding):
         writer.add_message(channel, START_NS, b"{}", START_NS)
         writer.finish()
     said = plain_lines(tcpipe("ingest", "run.mcap", cwd=tmp_path), 1)
-    assert (
-        f"topics that hold data which cannot be decoded: /pose: its messages are encoded as {encoding}; cdr and" in said
-    )
+    assert f"topics with data that cannot be decoded: /pose: its messages are encoded as {encoding}; cdr and" in said
 
 
 def test_what_plays_no_role_is_said_and_kept(tmp_path):
@@ -199,7 +197,7 @@ def test_logs_in_object_storage(tmp_path):
         assert "nothing to do: 1 of 1" in again.stdout
         assert len(fetched) == requests  # what is known is not fetched again
         denied = tcpipe("inspect", f"s3://{FORBIDDEN}/run.mcap", cwd=tmp_path, env=environment)
-        assert "wants credentials; set AWS_" in plain_lines(denied, 1, most=1)
+        assert "requires credentials; set AWS_" in plain_lines(denied, 1, most=1)
 
 
 @pytest.fixture

@@ -51,7 +51,7 @@ def test_a_cluster_makes_the_bytes_that_this_machine_makes(tmp_path, monkeypatch
         killed = subprocess.run([sys.executable, "-c", KILLED, cluster.address, "3"], cwd=tmp_path, check=False)
         assert killed.returncode == -signal.SIGKILL
         built = tcpipe("build-dataset", "far", "--store", "there", "--cluster", cluster.address, cwd=tmp_path)
-    assert "going on where it was: " in built.stderr
+    assert "resuming: " in built.stderr
     assert not (tmp_path / "there" / "spool").exists()
     monkeypatch.undo()
     tcpipe("build-dataset", "near", "--store", "there", cwd=tmp_path)

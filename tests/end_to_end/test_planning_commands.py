@@ -71,7 +71,7 @@ def test_a_plan_over_a_cost_map_costs_what_predict_path_says_of_it(place: Path):
     assert costed["energy_joule"] == pytest.approx(said["plans"]["time"]["energy_joule"], rel=1e-4)
     assert "nothing to do" in _run(*plan, *outputs, cwd=place)
     (place / "costs" / "energy.pgm").write_bytes(b"")
-    assert "energy.pgm: has 0 bytes, wanted" in _run("verify", "costs", cwd=place, code=1)
+    assert "energy.pgm: has 0 bytes, expected" in _run("verify", "costs", cwd=place, code=1)
 
 
 @pytest.mark.parametrize(
@@ -80,13 +80,21 @@ def test_a_plan_over_a_cost_map_costs_what_predict_path_says_of_it(place: Path):
         (("predict-path", "none", "--path", "path.geojson"), 2, "no such directory"),
         (("predict-path", "model", "--path", "none.geojson"), 2, "no such file"),
         (("predict-path", "model", "--path", "path.geojson", "--out", "pieces.txt"), 2, "ends in .csv"),
-        (("plan-path", "model", "--from", "15.0,nan", "--to", _TO), 2, "wanted LON,LAT"),
+        (("plan-path", "model", "--from", "15.0,nan", "--to", _TO), 2, "expected LON,LAT"),
         (("plan-path", "model", "--from", _FROM, "--to", "200,46.9"), 1, "no lon, lat"),
         (("cost-map", "model", "--map", "other"), 1, "no map 'other'"),
         (("cost-map", "model", "--cell-size", "0"), 2, "--cell-size"),
-        (("cost-map", "model", "--speed", "0.5"), 2, "takes no commanded speed"),
-        (("predict-path", "model", "--path", "path.geojson", "--speed", "0.5"), 2, "takes no commanded speed"),
-        (("plan-path", "model", "--from", _FROM, "--to", _TO, "--speed", "0.5"), 2, "takes no commanded speed"),
+        (("cost-map", "model", "--speed", "0.5"), 2, "has no input for the commanded speed"),
+        (
+            ("predict-path", "model", "--path", "path.geojson", "--speed", "0.5"),
+            2,
+            "has no input for the commanded speed",
+        ),
+        (
+            ("plan-path", "model", "--from", _FROM, "--to", _TO, "--speed", "0.5"),
+            2,
+            "has no input for the commanded speed",
+        ),
         (("predict-path", "model", "--path", "path.geojson", "--physics-from", "none"), 2, "no such directory"),
         (("plan-path", "model", "--from", _FROM, "--to", _TO, "--physics-from", "none"), 2, "no such directory"),
     ],

@@ -124,7 +124,7 @@ def test_an_interrupted_training_ends_as_one_that_is_not(reproduced, tmp_path):
         running.send_signal(signal.SIGINT)
         told = running.communicate(timeout=HANGS_S)[1]
     assert running.returncode == 130, told
-    assert "nothing is half-written" in told
+    assert "no output is incomplete" in told
     assert [path.name for path in tmp_path.iterdir()] == ["stopped.checkpoint"]
     resumed, whole = (tcpipe(*options, name, cwd=tmp_path, env=ENV) for name in ("stopped", "whole"))
     assert "stopped: goes on after epoch" in resumed.stderr

@@ -44,7 +44,7 @@ def test_verify_reads_everything_again(work):
         assert done.returncode == 0, done.stdout
         (line,) = done.stdout.splitlines()
         assert f": {kind}; " in line
-        assert line.endswith("all as it was written")
+        assert line.endswith("no changes found")
 
 
 def test_verify_names_what_is_wrong_one_line_each_and_fails(work):
@@ -69,7 +69,7 @@ def test_a_sample_is_traced_to_its_log_and_made_again_bit_for_bit(work, ids):
     done = tcpipe("explain", ids[0], "--dataset", "dataset", "--store", "tcpipe-store", "--quiet", cwd=work)
     assert done.returncode == 0, done.stdout
     lines = done.stdout.splitlines()
-    assert lines[-1] == "made again from the streams: equal, bit for bit"
+    assert lines[-1] == "made again from the streams: identical"
     assert {"labels", "log", "stamps", "messages", "map", "recipe", "versions"} <= {
         line.split()[0] for line in lines[1:-1]
     }
@@ -114,10 +114,10 @@ def test_an_overlay_lies_on_its_logs_clock_and_on_its_segments(work):
     apart_ns = ours_ns[:, 1] - np.interp(ours_ns[:, 0], *delays_ns.T)
     assert np.abs(apart_ns).max() < 0.05e9
     plain_lines(tcpipe("overlay", run, log, cwd=work), 2)  # a recording is never replaced
-    assert "is there, and no overlay" in tcpipe("overlay", run, log, cwd=work).stderr
+    assert "exists and is not an overlay" in tcpipe("overlay", run, log, cwd=work).stderr
     made_of_itself = tcpipe("ingest", "over.mcap", "--store", "another", cwd=work)
     assert made_of_itself.returncode == 1
-    assert "tcpipe made it of another log" in made_of_itself.stderr + made_of_itself.stdout
+    assert "tcpipe made it from another log" in made_of_itself.stderr + made_of_itself.stdout
 
 
 def test_a_preflight_promises_what_ingesting_gives(work):

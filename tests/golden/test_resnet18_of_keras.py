@@ -50,5 +50,7 @@ def test_it_is_the_network_of_keras(case):
     assert first == pytest.approx(case["losses"][0], rel=1e-5)
     assert second == pytest.approx(case["losses"][1], rel=1e-3)
     del weights["head/bias"]
-    with pytest.raises(ModelError, match="golden: holds the weights of another network; remove it and train the model"):
+    with pytest.raises(
+        ModelError, match="golden: contains the weights of another network; remove it and train the model"
+    ):
         network.set_arrays(weights, "golden")

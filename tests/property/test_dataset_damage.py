@@ -121,7 +121,7 @@ def test_a_card_of_any_other_content_with_a_whole_seal_is_told_or_changes_nothin
     ("change", "said"),
     [
         ({"samples": 10**18}, "10000000000000000"),
-        ({"patch_px": 10**6}, "wanted up to 10000000 of up to 1024 px"),
+        ({"patch_px": 10**6}, "expected up to 10000000 of up to 1024 px"),
         ({"shards": [{"path": "data/x", "split": "train", "rows": -5}]}, "its shards hold -5 rows"),
         ({"format": "csv"}, "zarr or parquet"),
         ({"layers": {}}, "in 0 layers"),
@@ -142,7 +142,7 @@ def test_what_a_card_promises_has_bounds(dataset, change, said):
     [
         ("[" * 10**5, "not a readable JSON file"),
         ("{} " * (MOST_BYTES // 3 + 1), "larger than 32 MB"),
-        ("7", "holds int"),
+        ("7", "contains int"),
     ],
 )
 def test_a_card_that_is_no_card_is_one_line(dataset, text, said):

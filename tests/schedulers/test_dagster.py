@@ -102,7 +102,7 @@ def test_what_cannot_be_read_fails_with_the_commands_own_words(defs, site):
             (event,) = [event for event in failed.all_events if event.is_step_failure]
             assert "junk.mcap" in event.step_failure_data.user_failure_data.description
             assert not [event for event in failed.all_events if event.is_step_up_for_retry], (
-                "what it holds does not pass"
+                "what it contains does not pass"
             )
     finally:
         (site / "logs" / "junk.mcap").unlink()

@@ -50,7 +50,7 @@ def called(of):
 @pytest.mark.parametrize("of", PARAMETERS, ids=called)
 def test_a_path_has_a_type_that_looks_at_it(of):
     _, parameter = of
-    assert not isinstance(parameter.type, click.Path | click.File), "wanted a type of tcpipe.cli.options"
+    assert not isinstance(parameter.type, click.Path | click.File), "expected a type of tcpipe.cli.options"
     if isinstance(parameter.type, click.types.StringParamType):
         assert parameter.name in TEXTS, (
             "a text that is no path is listed above; a path has a type of tcpipe.cli.options"
@@ -77,7 +77,7 @@ def test_what_is_given_is_looked_at_before_the_command_begins(of, tmp_path, monk
         for url in urls[: 1 if parameter.type.urls else None]:
             assert "this machine" in told(parameter, url)
     if parameter.type.written:
-        assert "is a file, wanted a directory" in told(parameter, "file/below")
+        assert "is a file, expected a directory" in told(parameter, "file/below")
     else:
         assert told(parameter, "gone").startswith("gone: there is no such ")
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
@@ -182,7 +182,7 @@ def test_functions_refuse_the_same_also_where_a_path_was_made_of_the_url(here, n
     for out in (Path("s3://bucket/out"), *(["s3://bucket/out"] if name not in ("add_map", "open_store") else [])):
         with pytest.raises(
             UsageError,
-            match=r"s3:/+bucket/out: is (a URL; this is written on|no URL; wanted s3://bucket/name, or a path)",
+            match=r"s3:/+bucket/out: is (a URL; this output is local|no URL; expected s3://bucket/name, or a path)",
         ):
             FUNCTIONS[name](out, here / "file")
     assert not (here / "s3:").exists()

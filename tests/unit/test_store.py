@@ -157,11 +157,11 @@ def test_what_a_copier_left_by_halves_is_named_and_not_used(tmp_path):
         iter(store.ingestions().damaged.values())
     )
     path.unlink()
-    assert "track.parquet: is gone" in next(iter(store.ingestions().damaged.values()))
+    assert "track.parquet: is missing" in next(iter(store.ingestions().damaged.values()))
     path.write_bytes(whole)
     manifest(run).unlink()
     (line,) = inspect(store.root, recipe=Recipe()).damaged_runs.values()
-    assert line.endswith("manifest-1.json: is gone; ingest the log again")
+    assert line.endswith("manifest-1.json: is missing; ingest the log again")
     (store.root / "store.json").unlink()
     with pytest.raises(UsageError, match="which this version does not read, or an incomplete copy"):
         open_store(store.root)

@@ -14,7 +14,7 @@ from tcpipe.formats.logs.mcap_file import McapPart
 from tcpipe.formats.logs.rosbag2 import ZSTD_MAGIC, decompress_file
 from tcpipe.formats.logs.sqlite_file import SqlitePart
 
-WANTED = "wanted an .mcap, a .bag (2.0), or a ROS 2 bag directory or .db3"
+WANTED = "expected an .mcap, a .bag (2.0), or a ROS 2 bag directory or .db3"
 _KNOWN_MAGIC = (
     (b"PK\x03\x04", "a zip archive"),
     (b"\x1f\x8b", "a gzip file"),

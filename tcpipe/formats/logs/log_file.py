@@ -389,7 +389,7 @@ class Log:
             if channel is first:
                 topics[channel.name] = topic
                 if len(topics) > MAX_TOPICS:
-                    raise LogError(f"{self.path}: it holds more than {MAX_TOPICS} topics; no such log is read")
+                    raise LogError(f"{self.path}: it contains more than {MAX_TOPICS} topics; no such log is read")
             elif (channel.type_name, channel.encoding) == (first.type_name, first.encoding):
                 topics[channel.name] = topics[channel.name].joined(topic)
         return topics
@@ -400,10 +400,10 @@ def _find_problem(channel: Topic, types: TypeLibrary) -> str | None:
     if channel.encoding not in ("cdr", "ros1"):
         return f"its messages are encoded as {channel.encoding or 'nothing known'}; cdr and ros1 are read"
     if not channel.type_name:
-        return "the log does not say of which type its messages are"
+        return "the log does not state the type of its messages"
     if channel.definition.strip() or types.knows(channel.type_name):
         return None
-    where = "the log holds no definition of it, and none is bundled"
+    where = "the log contains no definition of it, and none is bundled"
     return f"type {channel.type_name} is unknown: {where}; give its .msg files with --msgdef DIR"
 
 
@@ -416,7 +416,7 @@ def _open_directory(directory: Path, stack: ExitStack, fetched: Mapping[Path, Fe
         if not below:
             raise
         names = ", ".join(below[:_LISTED]) + (" and more" if len(below) > _LISTED else "")
-        raise LogError(*error.problems, f"{directory}: logs lie below it, give one of them: {names}") from None
+        raise LogError(*error.problems, f"{directory}: contains several logs, give one of them: {names}") from None
     _allow_files(len(found.paths))
     parts, damage, errors = [], list(found.damage), []
     for file in found.paths:

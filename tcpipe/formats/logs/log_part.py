@@ -347,13 +347,13 @@ class Bounds:
             self._seen.add(chunk)
             self._records += records
         if self._records > self.most_records:
-            raise self._bomb(f"it holds more than {self.most_records} records in {self._size} bytes")
+            raise self._bomb(f"it contains more than {self.most_records} records in {self._size} bytes")
 
     def count(self, chunks: int, channels: int) -> None:
         """Take how many chunks and channels there are."""
         for count, most, what in ((chunks, MAX_CHUNKS, "chunks"), (channels, MAX_CHANNELS, "topics or connections")):
             if count > most:
-                raise self._bomb(f"it holds more than {most} {what}")
+                raise self._bomb(f"it contains more than {most} {what}")
 
     def _bomb(self, why: str) -> LogError:
         return LogError(f"{self._path}: {why}; it is taken for a bomb, not a log")

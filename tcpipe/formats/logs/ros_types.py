@@ -174,7 +174,7 @@ class TypeLibrary:
         fallback = functools.partial(self._fallback, ros1=ros1)
         if type_name not in known and fallback(type_name) is None:
             where = (
-                "the log holds no definition of it" if not definition.strip() else "its definition names other types"
+                "the log contains no definition of it" if not definition.strip() else "its definition names other types"
             )
             raise DefinitionError(
                 f"type {type_name} is unknown: {where}, and none is bundled; give its .msg files with --msgdef DIR"
@@ -185,11 +185,11 @@ class TypeLibrary:
             raise DefinitionError(f"type {type_name} unfolds to {wire.leaves} columns, more than {MAX_COLUMNS}")
         elements = count_fixed_elements(wire)
         if elements > MAX_FIXED_ELEMENTS:
-            what = f"holds {elements} texts or messages in arrays of fixed length, more than {MAX_FIXED_ELEMENTS}"
+            what = f"contains {elements} texts or messages in arrays of fixed length, more than {MAX_FIXED_ELEMENTS}"
             raise DefinitionError(f"type {type_name} {what}")
         if is_boundless(wire, empty_bytes=0 if ros1 else 1):
             raise DefinitionError(
-                f"type {type_name} holds an array of messages that take no bytes: nothing bounds its length"
+                f"type {type_name} contains an array of messages that take no bytes: nothing bounds its length"
             )
         return MessageType(wire, source, definitions)
 
@@ -338,7 +338,9 @@ def _read_definitions(texts: Iterable[tuple[str, str]]) -> _Definitions:
 def _read_definitions_of_directory(directory: Path) -> _Definitions:
     """Parse ``package/msg/Name.msg`` or ``package/Name.msg`` files below a directory, and .idl files."""
     if not directory.is_dir():
-        raise LogError(f"{directory}: there is no such directory; wanted one with package/msg/Name.msg files below it")
+        raise LogError(
+            f"{directory}: there is no such directory; expected one with package/msg/Name.msg files below it"
+        )
     found: _Definitions = {}
     problems = []
     for path in sorted([*directory.rglob("*.idl"), *directory.rglob("*.msg")]):
@@ -351,7 +353,7 @@ def _read_definitions_of_directory(directory: Path) -> _Definitions:
     if problems:
         raise LogError(*problems)
     if not found:
-        raise LogError(f"{directory}: no .msg or .idl file below it; wanted package/msg/Name.msg")
+        raise LogError(f"{directory}: no .msg or .idl file below it; expected package/msg/Name.msg")
     return found
 
 

@@ -50,7 +50,7 @@ def find_rosbag2_files(directory: Path) -> Rosbag2Files:
     except OSError as error:
         raise LogError(f"{directory}: it cannot be read ({error.strerror})") from None
     if len(present) > MAX_FILES:
-        raise LogError(f"{directory}: it holds {len(present)} files; bags of up to {MAX_FILES} are read")
+        raise LogError(f"{directory}: it contains {len(present)} files; bags of up to {MAX_FILES} are read")
     information = _read_bag_information(directory / METADATA)
     return (
         _find_files_by_name(directory, present)

@@ -129,7 +129,7 @@ def _read_table(folder: Path, name: str, mapping: TableMapping) -> _Read | list[
     problems = list(find_mapping_problems(where, role, mapping.columns, mapping.units))
     path = folder / mapping.file
     if not is_table(mapping.file):
-        problems.append(f"{where}.file is {mapping.file!r}; wanted a name that ends in {', '.join(TABLE_SUFFIXES)}")
+        problems.append(f"{where}.file is {mapping.file!r}; expected a name that ends in {', '.join(TABLE_SUFFIXES)}")
     elif not path.is_file():
         held = ", ".join(str(file.relative_to(folder)) for file in list_table_files(folder)[:20])
         problems.append(f"{where}.file: there is no {mapping.file} here; there are {held or 'no tables at all'}")
@@ -144,7 +144,7 @@ def _read_table(folder: Path, name: str, mapping: TableMapping) -> _Read | list[
     except LogError as error:
         return [problem.removeprefix(f"{folder}/") for problem in error.problems]
     empty = [
-        f"{where}: column {column} of {mapping.file} holds text ({text!r} in row {row}), wanted numbers"
+        f"{where}: column {column} of {mapping.file} contains text ({text!r} in row {row}), expected numbers"
         for column, (_, row, text) in cells.texts.items()
         if not np.isfinite(cells.columns[column]).any()
     ]
@@ -158,7 +158,7 @@ def _read_stamps(cells: Cells, stamp: str, mapping: TableMapping) -> NDArray[np.
     """Return the known stamps [ns, UTC], or what is in the way of that."""
     known = cells.stamp[cells.stamp_known]
     if not known.size:
-        return "it holds neither numbers nor dates (wanted seconds, or text as 2025-10-14T15:41:25.7Z)"
+        return "it contains neither numbers nor dates (expected seconds, or text as 2025-10-14T15:41:25.7Z)"
     found = parse_stamps_ns(known, "ns" if cells.stamp_is_time else mapping.stamp_unit)
     if isinstance(found, str):
         return f"{found} (stamp_unit)"
@@ -322,7 +322,7 @@ def _scan(path: Path, numbers: list[str] | None = None, *, quote: str | None = '
         raise LogError(f"{path}: it cannot be read ({error.strerror})") from None
     comments, lines = _split_comment_lines(head)
     if not lines:
-        raise LogError(f"{path}: it holds no table: it is empty")
+        raise LogError(f"{path}: it contains no table: it is empty")
     separator = next((sign for sign in (b",", b";", b"\t") if sign in lines[0]), b" ")
     first = (_DAY_AND_TIME.sub(rb"\1-\2-\3T", lines[0]) if separator == b" " else lines[0]).split(
         None if separator == b" " else separator

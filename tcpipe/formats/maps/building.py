@@ -164,7 +164,7 @@ def _read_own_schemes(more: MoreLayers, rasters: Mapping[str, Raster]) -> dict[s
         for name, table in more.categorical.items()
     }
     if problems := [
-        f"{rasters[name].label}: does not say what its values mean (no attribute table, no category names); "
+        f"{rasters[name].label}: does not define the meaning of its values (no attribute table, no category names); "
         f"give a table: --categorical {name}=classes.csv"
         for name, scheme in schemes.items()
         if scheme is None
@@ -186,7 +186,7 @@ def _choose_scheme(classes: Path | None, agreed: ClassScheme | None, terrain: Ra
         ours = ", ".join(entry.name for entry in scheme.table.classes)
         raise MapError(
             f"{terrain.label}: none of its class names ({theirs}) is in the class table ({ours}); "
-            "say with --classes what its values mean"
+            "define them with --classes"
         )
     return named, "names"
 
@@ -225,7 +225,7 @@ def _place_all(rasters: dict[str, Raster], crs: str | None) -> dict[str, Georefe
     for role, raster in rasters.items():
         text = raster.crs or crs
         if text is None:
-            problems.append(f"{raster.label}: has no CRS; if you know which one it is in, say so with --crs EPSG:n")
+            problems.append(f"{raster.label}: has no CRS; if you know it, give it with --crs EPSG:n")
             continue
         try:
             found = parse_crs(text, where=raster.label if raster.crs else "--crs")
@@ -327,9 +327,9 @@ def read_class_scheme(path: Path) -> ClassScheme:
         if classes.setdefault(entry.id, entry) != entry:
             problems.append(f"{path}: {where}: id {entry.id} was {classes[entry.id]} before, now {entry}")
         taken = [value for value in values if id_by_value.setdefault(value, entry.id) != entry.id]
-        problems += [f"{path}: {where}: value {value} stands for id {id_by_value[value]} already" for value in taken]
+        problems += [f"{path}: {where}: value {value} already has id {id_by_value[value]}" for value in taken]
     if not classes and not problems:
-        problems.append(f"{path}: the class table has no classes (wanted columns {','.join(_COLUMNS)})")
+        problems.append(f"{path}: the class table has no classes (expected columns {','.join(_COLUMNS)})")
     if problems:
         raise MapError(
             *problems[:_SHOWN], *([f"{path}: … and {len(problems) - _SHOWN} more"] if len(problems) > _SHOWN else [])
@@ -341,7 +341,7 @@ def _read_csv_rows(text: str, path: Path) -> list[tuple[str, dict[str, Any]]]:
     reader = csv.DictReader(StringIO(text, newline=""), skipinitialspace=True)
     missing = [name for name in _COLUMNS if name not in (reader.fieldnames or ())]
     if missing:
-        raise MapError(f"{path}: line 1: columns {','.join(missing)} are missing (wanted {','.join(_COLUMNS)})")
+        raise MapError(f"{path}: line 1: columns {','.join(missing)} are missing (expected {','.join(_COLUMNS)})")
     return [(f"line {reader.line_num}", row) for row in reader]
 
 
@@ -353,11 +353,11 @@ def _read_toml_rows(text: str) -> list[tuple[str, dict[str, Any]]]:
 def _parse_entry(row: Any, where: str, problems: list[str]) -> tuple[list[int], TerrainClass] | None:
     before = len(problems)
     if not isinstance(row, dict):
-        problems.append(f"{where}: wanted a table with {', '.join(_COLUMNS)}")
+        problems.append(f"{where}: expected a table with {', '.join(_COLUMNS)}")
         return None
     problems += [f"{where}: {name} is missing" for name in _COLUMNS if row.get(name) in (None, "")]
     problems += [
-        f"{where}: {name!r} is not a column (wanted {', '.join(_COLUMNS)})" for name in row if name not in _COLUMNS
+        f"{where}: {name!r} is not a column (expected {', '.join(_COLUMNS)})" for name in row if name not in _COLUMNS
     ]
     if len(problems) > before:
         return None
@@ -375,7 +375,7 @@ def _parse_entry(row: Any, where: str, problems: list[str]) -> tuple[list[int], 
         return None
     name = str(row["name"]).strip(" \t")
     if not name.isprintable():
-        problems.append(f"{where}: name {name!r} holds characters that cannot be printed")
+        problems.append(f"{where}: name {name!r} contains characters that cannot be printed")
         return None
     return [value for value in values if value is not None], TerrainClass(class_id, name, traversable=traversable)
 

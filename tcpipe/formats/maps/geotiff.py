@@ -280,7 +280,7 @@ def _find_driver(path: Path, *, raster: Path) -> str:
     what = known or ("something else" if head else "empty")
     rewrite = f" ({_rewrite(raster)})" if known else ""
     raise MapError(
-        f"{path}: is {what}, not a raster that is read; wanted GeoTIFF, JPEG 2000 or ERDAS Imagine{rewrite}{_suggest_polygons(path)}"
+        f"{path}: is {what}, not a raster that is read; expected GeoTIFF, JPEG 2000 or ERDAS Imagine{rewrite}{_suggest_polygons(path)}"
     )
 
 
@@ -300,7 +300,7 @@ def _list_plain_files(path: Path, driver: str) -> tuple[Path, ...]:
     with _open_as(Source(path, driver, ())) as dataset:
         if any(dataset.tags(ns=domain) for domain in _REDIRECTIONS):
             raise MapError(
-                f"{path}: names another file for its overviews, which is not followed; write it anew: {_rewrite(path)}"
+                f"{path}: names another file for its overviews, which tcpipe does not open; write it again: {_rewrite(path)}"
             )
         block = max(
             rows * cols * np.dtype(dtype).itemsize
@@ -315,7 +315,7 @@ def _list_plain_files(path: Path, driver: str) -> tuple[Path, ...]:
         files = {Path(name) for name in dataset.files}
     strangers = sorted(str(file) for file in files if file.parent != _make_absolute(path).parent)
     if strangers:
-        raise MapError(f"{path}: reaches for {strangers[0]}, which does not lie beside it; {_rewrite(path)}")
+        raise MapError(f"{path}: refers to {strangers[0]}, which is not in the same directory; {_rewrite(path)}")
     return (path, *sorted(path.with_name(file.name) for file in files if file.name != path.name))
 
 
@@ -331,7 +331,7 @@ def _refuse_beside(path: Path) -> None:
     if statistics.is_file() and statistics.stat().st_size > _MAX_STATISTICS_BYTES:
         size = f"{statistics.stat().st_size / 1e6:.0f} MB"
         raise MapError(
-            f"{statistics}: {size}, at most {_MAX_STATISTICS_BYTES // 10**6}; write its raster anew: {_rewrite(path)}"
+            f"{statistics}: {size}, at most {_MAX_STATISTICS_BYTES // 10**6}; write its raster again: {_rewrite(path)}"
         )
 
 
@@ -371,7 +371,7 @@ def _suggest_polygons(path: Path) -> str:
 
 def _refuse_unplaced(dataset: Any, path: Path) -> None:
     if dataset.count == 0:
-        raise MapError(f"{path}: the file holds no bands itself; name one of its subdatasets as a GeoTIFF")
+        raise MapError(f"{path}: the file contains no bands itself; name one of its subdatasets as a GeoTIFF")
     if dataset.crs is None and dataset.gcps[0]:
         raise MapError(
             f"{path}: placed by {len(dataset.gcps[0])} ground control points only; rectify it first (gdalwarp -tps in.tif out.tif)"
@@ -394,7 +394,7 @@ def _choose_bands(dataset: Any, path: Path, role: str, use: Use) -> tuple[tuple[
         rgb = [colours.get(colour) for colour in (ColorInterp.red, ColorInterp.green, ColorInterp.blue)]
         palette = dataset.colorinterp[0] == ColorInterp.palette
         if not palette and any(kind not in {np.dtype(np.uint8), np.dtype(np.uint16)} for kind in kinds):
-            raise MapError(f"{path}: ortho is {dataset.dtypes[0]}, wanted 8-bit or 16-bit unsigned")
+            raise MapError(f"{path}: ortho is {dataset.dtypes[0]}, expected 8-bit or 16-bit unsigned")
         if None not in rgb:
             more = make_finding("ortho-bands-unused", subject, names={**file, "bands": names})
             return tuple(band for band in rgb if band is not None), (more,) if len(plain) > 3 else ()
@@ -403,18 +403,18 @@ def _choose_bands(dataset: Any, path: Path, role: str, use: Use) -> tuple[tuple[
         if len(plain) == 3:
             return tuple(plain), (make_finding("ortho-colours-assumed", subject, names=file),)
         wanted = "grey or red, green, blue" if use == "grey" else "red, green, blue for --ortho-bands rgb"
-        raise MapError(f"{path}: ortho has {dataset.count} bands ({names}), wanted {wanted}, and alpha at most")
+        raise MapError(f"{path}: ortho has {dataset.count} bands ({names}), expected {wanted}, and alpha at most")
     if len(plain) != 1:
-        raise MapError(f"{path}: {role} has {dataset.count} bands ({names}), wanted one")
+        raise MapError(f"{path}: {role} has {dataset.count} bands ({names}), expected one")
     kind = kinds.pop()
     wanted = "metres" if use == "metres" else "numbers"
     if use != "classes" and dataset.colorinterp[plain[0] - 1] == ColorInterp.palette:
         hint = "" if use == "metres" else f"; are they classes? add --categorical {role}"
-        raise MapError(f"{path}: {role} is a palette of colours, wanted {wanted}{hint}")
+        raise MapError(f"{path}: {role} is a palette of colours, expected {wanted}{hint}")
     if use != "classes" and kind.kind not in "fiu":
-        raise MapError(f"{path}: {role} is {kind}, wanted floating point or integer {wanted}")
+        raise MapError(f"{path}: {role} is {kind}, expected floating point or integer {wanted}")
     if use == "classes" and kind.kind not in "iu":
-        raise MapError(f"{path}: {role} is {kind}, wanted integer class values")
+        raise MapError(f"{path}: {role} is {kind}, expected integer class values")
     return (plain[0],), ()
 
 
@@ -432,7 +432,7 @@ def _read_scaling(
         return (1.0, 0.0), (make_finding("scale-not-applied", subject, names=file, scale=scale, offset=offset),)
     unit = (dataset.units[bands[0] - 1] or "").strip()
     if unit.lower() not in _METRES:
-        raise MapError(f"{path}: height is in {unit!r}, wanted metres (or cm, mm, ft)")
+        raise MapError(f"{path}: height is in {unit!r}, expected metres (or cm, mm, ft)")
     metres = _METRES[unit.lower()] if unit else _find_vertical_unit_m(dataset, path)
     return (scale * metres, offset * metres), ()
 
@@ -445,7 +445,7 @@ def _find_vertical_unit_m(dataset: Any, path: Path) -> float:
         return float(vertical[0].axis_info[0].unit_conversion_factor)
     if crs is not None and crs.is_projected and "foot" in (lain := crs.axis_info[0].unit_name).lower():
         raise MapError(
-            f"{path}: its CRS is in {lain}, and nothing says in which unit its heights are; say it in the file: "
+            f"{path}: its CRS is in {lain}, and the unit of its heights is unknown; state it in the file: "
             "gdal_edit -units ft FILE (or us-ft, or m)"
         )
     return 1.0

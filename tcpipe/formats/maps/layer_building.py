@@ -159,7 +159,7 @@ def _refuse_odd(tiles: Sequence[Tile], what: str, keys: Sequence[str], mended: s
         names = ", ".join(_shorten_list([str(tile.path) for tile, _ in odd]))
         got, wanted = (_shorten_crs(key) for key in (odd[0][1], usual))
         raise MapError(
-            f"{tiles[0].role}: {len(odd)} of {len(tiles)} files have another {what} than the rest ({got}, wanted {wanted}): {names}; "
+            f"{tiles[0].role}: {len(odd)} of {len(tiles)} files have another {what} than the rest ({got}, expected {wanted}): {names}; "
             f"write them like the rest: {mended}"
         )
 

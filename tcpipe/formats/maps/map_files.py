@@ -157,7 +157,7 @@ def open_map(path: Path, fetched: ShardFetcher | None = None, *, proved: bool = 
     found = attributes.get("tcpipe_map") if isinstance(attributes, dict) else None
     if not isinstance(found, dict) or found.get("version") not in {PAPER_VERSION, MAP_VERSION}:
         version = found.get("version") if isinstance(found, dict) else None
-        raise MapError(f"{path}: not a map of this version (got {version}, wanted {MAP_VERSION}); add it again")
+        raise MapError(f"{path}: not a map of this version (got {version}, expected {MAP_VERSION}); add it again")
     try:
         kept = parse_typed(found | {"grid": rename_keys(found.get("grid"))}, _Attributes, path)
         described = {name: kept.described.get(name, {}) for name in kept.layers}
@@ -168,7 +168,7 @@ def open_map(path: Path, fetched: ShardFetcher | None = None, *, proved: bool = 
     wanted = [f"{_level_path(factor)}{layer}" for factor in kept.factors for layer in kept.layers]
     missing = [array for array in wanted if not (path / array / DESCRIPTION).is_file()]
     if missing:
-        raise MapError(f"{path}: the map's {', '.join(missing)} is gone; add the map again")
+        raise MapError(f"{path}: the map's {', '.join(missing)} is missing; add the map again")
     if proved:
         _prove(path, fetched)
     try:
@@ -190,7 +190,7 @@ def _refuse_sizes(kept: _Attributes, path: Path) -> None:
         )
     wanted = (TILE_PX, list_factors(kept.grid))
     if (kept.tile_px, kept.factors) != wanted:
-        raise StoreError(f"{path}: tiles and overviews are {(kept.tile_px, kept.factors)}, wanted {wanted}")
+        raise StoreError(f"{path}: tiles and overviews are {(kept.tile_px, kept.factors)}, expected {wanted}")
 
 
 def _open_array(path: Path, layer: Layer, whole: MapGrid, factor: int, fetched: ShardFetcher | None) -> ShardedArray:

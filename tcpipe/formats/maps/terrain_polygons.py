@@ -85,7 +85,7 @@ def is_drawn(paths: Sequence[Path]) -> bool:
     drawn = [path for path in paths if path.suffix.lower() in SUFFIXES]
     if drawn and len(drawn) != len(paths):
         other = next(path for path in paths if path not in drawn)
-        raise MapError(f"terrain: {drawn[0]} holds polygons, {other} does not; wanted one kind")
+        raise MapError(f"terrain: {drawn[0]} contains polygons, {other} does not; expected one kind")
     return bool(drawn)
 
 
@@ -179,7 +179,7 @@ def _project_polygons(
             f"{label}: none of its polygons is on the map, but would be with the axes swapped: GeoJSON is lon before lat (RFC 7946)"
         )
     raise MapError(
-        f"{label}: none of its polygons is on the map: they lie around {lon:.5f}, {lat:.5f} (lon, lat), "
+        f"{label}: none of its polygons is on the map: they are around {lon:.5f}, {lat:.5f} (lon, lat), "
         f"the map covers {west:.5f} to {east:.5f}, {south:.5f} to {north:.5f}"
     )
 

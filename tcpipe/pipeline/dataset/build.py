@@ -121,7 +121,7 @@ class BuildResult:
     def _facts(self) -> list[str]:
         card = self.card
         if card is None:
-            return [f"{self.path}: would be made of at most {self.estimate}"]
+            return [f"{self.path}: would have at most {self.estimate}"]
         counts = ", ".join(f"{card.splits[name]} {name}" for name in SPLITS)
         head = f"{self.path}: {card.samples} samples ({counts})"
         if self.status == "unchanged":
@@ -225,7 +225,7 @@ def _refuse_other_options(
     if known is None or known.inputs == inputs.digest or force:
         return
     if others := find_other_options(known, options, inputs):
-        what = "it was made with other options and is kept; give another OUT, or replace it with --force"
+        what = "it was made with other options and is not changed; give another OUT, or replace it with --force"
         raise UsageError(f"{place}: {what}", *(f"{place}: {line}" for line in others))
 
 
@@ -264,7 +264,7 @@ def _find_left_out(
     if min_runs is None:
         return (*chosen.damaged, *fewer)
     if len(inputs.runs) < min_runs:
-        count = f"{len(inputs.runs)} runs, wanted {min_runs} or more (--min-runs); nothing is written"
+        count = f"{len(inputs.runs)} runs, expected {min_runs} or more (--min-runs); nothing is written"
         groups = group_dataset_findings((*chosen.damaged, *fewer), {run.run_id: () for run in inputs.runs})
         raise DatasetError(count, *format_mixed_groups(groups))
     return (*chosen.damaged, *(replace(finding, severity="note") for finding in fewer))
@@ -298,7 +298,7 @@ def _merge_recipe(recipe: Recipe | str | Path | None, *, holdout: str | None, se
     )
     if rules.holdout == "tag" and not rules.holdout_tag:
         raise RecipeError(
-            'recipe: split.holdout is "tag"; wanted split.holdout_tag too, for example "season" (--holdout tag:season)'
+            'recipe: split.holdout is "tag"; expected split.holdout_tag too, for example "season" (--holdout tag:season)'
         )
     return replace(recipe, split=rules)
 
@@ -308,13 +308,13 @@ def _read_card_in_place(place: Path) -> tuple[DatasetCard | None, bool]:
     if not place.exists() or (place.is_dir() and not any(place.iterdir())):
         return None, False
     if not place.is_dir():
-        raise UsageError(f"{place}: is a file, wanted a directory for the dataset; give another OUT")
+        raise UsageError(f"{place}: is a file, expected a directory for the dataset; give another OUT")
     if not (place / CARD).is_file():
-        raise UsageError(f"{place}: exists and is not a dataset (it has no {CARD}); it is left alone; give another OUT")
+        raise UsageError(f"{place}: exists and is not a dataset (no {CARD}); it is not changed; give another OUT")
     try:
         card, proved = read_card(place, proved=False), True
     except DatasetError as error:
-        left = f"{place}: is left alone, since its inputs are unknown; move it away or give another OUT"
+        left = f"{place}: is not changed, because its inputs are unknown; move it or give another OUT"
         raise DatasetError(*error.problems, left) from None
     try:
         read_current_card(place)
@@ -325,7 +325,7 @@ def _read_card_in_place(place: Path) -> tuple[DatasetCard | None, bool]:
     others = sorted({path.relative_to(place).as_posix() for path in place.rglob("*") if path.is_file()} - ours)
     if others:
         more = f" and {len(others) - 1} more" if len(others) > 1 else ""
-        raise UsageError(f"{place}: holds {others[0]}{more} beside the dataset; move it away or give another OUT")
+        raise UsageError(f"{place}: contains {others[0]}{more}, not of the dataset; move it or give another OUT")
     return card, proved
 
 

@@ -345,7 +345,7 @@ def _describe_nothing_sampled(segments: pa.Table, lost_m: Mapping[Loss, float], 
     lon, lat = (float(np.mean(to_floats(segments, f"start_{axis}_deg"))) for axis in ("lon", "lat"))
     names = f"map{'s' if len(sources) > 1 else ''} {', '.join(source.name for source in sources)}"
     return (
-        f"{names}: none of {segments.num_rows} segments gives a sample ({where}); the runs lie around "
+        f"{names}: none of {segments.num_rows} segments gives a sample ({where}); the runs are around "
         f"{lon:.5f}, {lat:.5f} (lon, lat), {'; '.join(_describe_coverage(source, alone=len(sources) == 1) for source in sources)}"
     )
 

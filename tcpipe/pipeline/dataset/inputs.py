@@ -157,7 +157,7 @@ def _map_digest(name: str, path: Path) -> str:
     if wrong:
         what = f"{wrong[0]}{f' and {len(wrong) - 1} more' if len(wrong) > 1 else ''}"
         raise MapError(
-            f"map {name}: not as it was written: {what} ('tcpipe verify {path}' lists everything); add the map again with --force"
+            f"map {name}: changed since it was written: {what} ('tcpipe verify {path}' lists everything); add the map again with --force"
         )
     return _digest_of(found)
 

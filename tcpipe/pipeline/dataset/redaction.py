@@ -134,7 +134,7 @@ def _estimate_scale(samples: SampleTable, gnss_crs: str, map_crs: str) -> float:
     scale = plane_chord / chord_chord if chord_chord else 1.0
     if abs(scale - 1.0) > _MOST_SCALE:
         raise DatasetError(
-            f"a metre of ground is {scale:.4f} m in the maps' CRS, which would tell the latitude; add the maps in a CRS whose metres are "
+            f"a metre of ground is {scale:.4f} m in the maps' CRS, which would reveal the latitude; add the maps in a CRS whose metres are "
             "those of the ground, such as UTM (gdalwarp -t_srs), and build the redacted dataset with them"
         )
     return scale
@@ -270,7 +270,7 @@ def move_coordinates(coordinates: Any, move: Callable[[Floats], Floats]) -> Any:
 
 def find_leaks(card: DatasetCard, samples: pa.Table) -> Iterator[str]:
     """Yield a line for each secret that a redacted dataset reveals."""
-    return (f"it is said to be redacted, but {leak}" for leak in _iterate_leaks(card, samples))
+    return (f"it is marked as redacted, but {leak}" for leak in _iterate_leaks(card, samples))
 
 
 def _iterate_leaks(card: DatasetCard, samples: pa.Table) -> Iterator[str]:
@@ -278,21 +278,21 @@ def _iterate_leaks(card: DatasetCard, samples: pa.Table) -> Iterator[str]:
         lon, lat, x_m, y_m = (to_floats(samples, f"{end}_{name}") for name in ("lon_deg", "lat_deg", "x_m", "y_m"))
         plane_x_m, plane_y_m = _make_transformer("EPSG:4326", PLANE).transform(lon, lat)
         if (np.hypot(x_m - plane_x_m, y_m - plane_y_m) > _REDACTED_WITHIN_M).any():
-            yield f"{end}_x_m and {end}_y_m are not along its lon and lat: their angle tells the latitude; build it again"
+            yield f"{end}_x_m and {end}_y_m are not along its lon and lat: their angle reveals the latitude; build it again"
         for axis, degrees in zip(_AXES, (lon, lat), strict=True):
             if (np.abs(degrees) > REACH_DEG).any():
                 yield f"{end}_{axis}_deg is beyond {REACH_DEG:g} degrees"
     yield from (f"map {source.name} has the CRS {source.crs}" for source in card.maps if source.crs != PLANE)
     named = [run.run_id for run in card.runs if run.logs or not re.fullmatch(r"run\d{4,}-[0-9a-f]+", run.run_id)]
-    yield from (f"tells what the log of run {name} is called" for name in named)
+    yield from (f"reveals the name of the log of run {name}" for name in named)
     ratio, _, most = compute_plane_per_chord(samples)
     if abs(ratio - 1.0) > max(most, _SCALE_VARIES):
-        yield f"distances are {ratio:.6f} of chord_m: the scale of the maps' plane tells the place; build it again"
+        yield f"distances are {ratio:.6f} of chord_m: the scale of the maps' plane reveals the place; build it again"
     yield from (f"tells {text!r}" for text in (*card.label.includes, *card.added_columns.values()) if text)
     reasons = card.verdict.reasons if card.verdict else ()
     every = (card.findings, reasons, *card.findings_by_run.values(), *card.findings_by_map.values())
     revealing = [finding.code for findings in every for finding in findings if _redact_finding(finding) != finding]
-    yield from (f"a finding {code} holds more than is public" for code in revealing)
+    yield from (f"a finding {code} contains more than is public" for code in revealing)
 
 
 def compute_plane_per_chord(samples: pa.Table) -> tuple[float, float, float]:

@@ -60,7 +60,7 @@ def choose_runs(
             damaged.setdefault(run_id, line)
     if not runs:
         raise DatasetError(
-            *(f"run {run_id}: left out: {line}; ingest its log again with --force" for run_id, line in damaged.items())
+            *(f"run {run_id}: excluded: {line}; ingest its log again with --force" for run_id, line in damaged.items())
         )
     if robot is None:
         _refuse_unlike(store, [run for run in runs if run.facts.robot == GENERIC])
@@ -111,7 +111,7 @@ def _refuse_unlike(store: Store, runs: Iterable[RunDirectory]) -> None:
     groups = group_similar_runs({run.run_id: run.facts.log.sensors if run.facts.log else {} for run in runs})
     if len(groups) > 1:
         raise DatasetError(
-            f"{store.root}: the runs of robot {GENERIC} are not all of one robot: their sensors differ; wanted one: tag each "
+            f"{store.root}: the runs of robot {GENERIC} are not all of one robot: their sensors differ; expected one: tag each "
             "(tcpipe ingest LOG --tag robot=NAME) and choose it with --tag robot=NAME, or pool them with --robot generic",
             *(f"{_format_names(names)}: {format_robot(sensors)}" for names, sensors in groups),
         )
@@ -140,7 +140,7 @@ def _describe_no_runs(store: Store, found: Ingestions) -> list[str]:
     elif found.outdated:
         versions = ", ".join(sorted({str(head.data_model_version) for head in found.outdated.values()}))
         head = (
-            f"{len(found.outdated)} runs in the store, all of data model {versions}, wanted {DATA_MODEL_VERSION}; "
+            f"{len(found.outdated)} runs in the store, all of data model {versions}, expected {DATA_MODEL_VERSION}; "
             "ingest their logs again"
         )
     return [*([f"{store.root}: {head}"] if head else []), *dict.fromkeys(found.damaged.values())]

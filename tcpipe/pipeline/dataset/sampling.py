@@ -195,7 +195,7 @@ def sample_all_segments(
     layers = sort_layers(join_layers([source.layers for source in sources]))
     spool = Spool(workers.waiting.below("pixels"), layers, config.patch_px, kept=workers.cluster is not None)
     if count := len(spool.place.files()):
-        logger.info("going on where it was: %d of %d batches are sampled", count, len(rows))
+        logger.info("resuming: %d of %d batches are sampled", count, len(rows))
     placed = segments.select(PLACED_SEGMENTS.names())
     batches = _Batches(rows, _Batch(0, ranks, placed, maps, config, gnss_crs, spool))
     lost_by, slots = np.zeros(segments.num_rows, np.uint32), np.zeros(segments.num_rows, np.int64)

@@ -135,12 +135,12 @@ def _describe_nothing_inside(regions: Regions, lonlat_deg: NDArray[np.float64], 
     near, excluded = int((split == "buffer").sum()), int((split == EXCLUDED).sum())
     if excluded:
         return (
-            f"the region (--split) leaves no training sample: {excluded} of {len(split)} samples lie in its exclude polygons, "
+            f"the region (--split) leaves no training sample: {excluded} of {len(split)} samples are in its exclude polygons, "
             f"{near} on a border or nearer to one than the buffer; redraw them"
         )
     if near:
         return (
-            f"the region (--split) holds no whole footprint: {near} of {len(split)} samples lie on its border or nearer "
+            f"the region (--split) contains no whole footprint: {near} of {len(split)} samples are on its border or nearer "
             f"to it than the buffer; draw it larger, or lower the {format_recipe_key('split.buffer_m')}"
         )
     swapped = shapely.transform(regions.train_test, lambda lonlat: lonlat[:, ::-1])
@@ -154,6 +154,6 @@ def _describe_nothing_inside(regions: Regions, lonlat_deg: NDArray[np.float64], 
         *(shapely.transform(each, lambda p: p * km_per_deg) for each in (regions.train_test, points))
     )
     return (
-        f"the region (--split) covers none of the {len(split)} samples: they lie around {lon:.5f}, {lat:.5f} (lon, lat), "
+        f"the region (--split) covers none of the {len(split)} samples: they are around {lon:.5f}, {lat:.5f} (lon, lat), "
         f"about {apart_km:.2g} km from it; draw it over the runs"
     )

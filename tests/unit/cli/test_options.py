@@ -27,5 +27,5 @@ def test_a_share():
     ],
 )
 def test_what_is_neither(parse, text, wanted):
-    with pytest.raises(click.BadParameter, match=f"wanted {wanted}"):
+    with pytest.raises(click.BadParameter, match=f"expected {wanted}"):
         parse(CONTEXT, PARAMETER, text)

@@ -29,7 +29,7 @@ def test_who_does_not_end_is_ended(ended, capfd):
         signal.raise_signal(signal.SIGTERM)
         assert event.wait(60)
     assert codes == [128 + signal.SIGTERM]
-    assert capfd.readouterr().err == ("tcpipe: ended by SIGTERM; nothing is half-written; run the same command again\n")
+    assert capfd.readouterr().err == ("tcpipe: ended by SIGTERM; no output is incomplete; run the same command again\n")
 
 
 def test_who_ends_in_time_and_other_signals_are_left_alone(ended):

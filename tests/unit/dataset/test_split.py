@@ -64,7 +64,7 @@ def test_net_labels_are_those_of_the_same_samples_less_idle_power(path):
     variance = half.column("net_power_std_watt") ** 2
     np.testing.assert_allclose(half.weights[:, 0] * variance, (half.weights[:, 0] * variance)[0], rtol=1e-5)
     assert set(above.clean(max_power_std_watt=1.25).column("net_power_std_watt")) <= {1.0, 1.1, 1.2}
-    with pytest.raises(DatasetError, match="label 'sum': wanted one of total, net"):
+    with pytest.raises(DatasetError, match="label 'sum': expected one of total, net"):
         open_dataset(path, label="sum")
 
 
@@ -196,9 +196,9 @@ def test_a_label_whose_error_is_not_known_weighs_nothing(path):
 
 def test_batches_that_cannot_be_are_refused_in_a_line(path):
     train = open_dataset(path)["train"]
-    with pytest.raises(DatasetError, match="batches of 0 samples: wanted 1 or more"):
+    with pytest.raises(DatasetError, match="batches of 0 samples: expected 1 or more"):
         train.batches(0)
-    with pytest.raises(DatasetError, match="features terrain_name: wanted columns of numbers"):
+    with pytest.raises(DatasetError, match="features terrain_name: expected columns of numbers"):
         train.batches(8, features=["slope_rad", "terrain_name"])
     with pytest.raises(DatasetError, match="no column 'slope'"):
         train.batches(8, features=["slope"])
@@ -268,7 +268,7 @@ def test_samples_are_left_out_by_quality_and_error(path):
     np.testing.assert_array_equal(kept.labels, train.labels[:51])
     np.testing.assert_array_equal(kept.patches, train.patches[:51])
     assert kept.samples["sample_id"].to_pylist() == train.samples["sample_id"].to_pylist()[:51]
-    with pytest.raises(DatasetError, match="quality fast: wanted some of low_power_rate"):
+    with pytest.raises(DatasetError, match="quality fast: expected some of low_power_rate"):
         train.clean(("fast",))
 
 

@@ -82,7 +82,7 @@ def test_a_place_that_cannot_be_is_told_by_its_own_name(tmp_path: Path, write: C
     (tmp_path / "file").touch()
     path = tmp_path / "file" / "below" / "it"
     with (
-        pytest.raises(StoreError, match=f"^{re.escape(str(path))}: cannot be written .*/file is a file, wanted"),
+        pytest.raises(StoreError, match=f"^{re.escape(str(path))}: cannot be written .*/file is a file, expected"),
         write(path),
     ):
         pass

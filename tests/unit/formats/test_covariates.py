@@ -107,11 +107,11 @@ def test_two_rows_of_one_stamp_that_differ_are_refused(tmp_path):
         (
             "time,temp_c\n17,2\n",
             {},
-            "time: its stamps (17) do not count from 1970; say what they count, one of ns, us, ms, s (recipe key covariates.time_unit)",
+            "time: its stamps (17) do not count from 1970; set their unit, one of ns, us, ms, s (recipe key covariates.time_unit)",
         ),
-        ("time,temp_c\nnoon,2\n", {}, "time is 'noon'; wanted ISO 8601"),
+        ("time,temp_c\nnoon,2\n", {}, "time is 'noon'; expected ISO 8601"),
         ("time,temp_c\n", {}, "0 rows of 1 columns"),
-        ("time\n2025-01-01\n", {}, "1 rows of 0 columns beside time"),
+        ("time\n2025-01-01\n", {}, "1 rows of 0 columns besides time"),
         ("", {}, "not a readable table"),
     ],
 )

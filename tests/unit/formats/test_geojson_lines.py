@@ -44,8 +44,8 @@ def test_one_line_in_any_wrapping_is_read(tmp_path, document):
         ({"type": "LineString", "coordinates": [[15.0], [15.0, 47.0]]}, "positions"),
         ({"type": "LineString", "coordinates": [[47.0, 115.0], [47.0, 115.1]]}, "axes look swapped"),
         ({"type": "LineString", "coordinates": [[500000.0, 5200000.0], [500010.0, 5200000.0]]}, "projected"),
-        ({"type": "Point", "coordinates": [15.0, 47.0]}, "wanted one LineString"),
-        ({"type": "MultiLineString", "coordinates": [LINE["coordinates"]] * 2}, "wanted one LineString"),
+        ({"type": "Point", "coordinates": [15.0, 47.0]}, "expected one LineString"),
+        ({"type": "MultiLineString", "coordinates": [LINE["coordinates"]] * 2}, "expected one LineString"),
         ({"type": "FeatureCollection", "features": [{"type": "Feature", "geometry": LINE}] * 2}, "has 2 features"),
     ],
 )

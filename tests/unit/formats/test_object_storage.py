@@ -91,7 +91,7 @@ def test_a_store_that_wants_credentials_is_told_in_one_line(bucket):
     with pytest.raises(LogError) as refused:
         open_log(f"s3://{FORBIDDEN}/run.mcap")
     (problem,) = refused.value.problems
-    assert problem.startswith(f"s3://{FORBIDDEN}/run.mcap: it cannot be read (the store wants credentials; set AWS_")
+    assert problem.startswith(f"s3://{FORBIDDEN}/run.mcap: it cannot be read (the store requires credentials; set AWS_")
 
 
 def test_a_log_is_inspected_where_nothing_beside_it_can_be_read(bucket):
@@ -126,5 +126,5 @@ def test_a_url_that_leads_nowhere_is_refused(url):
 
 def test_an_endpoint_that_is_no_address_is_refused(monkeypatch):
     monkeypatch.setenv("AWS_ENDPOINT_URL", "localhost:9000")
-    with pytest.raises(LogError, match="AWS_ENDPOINT_URL is 'localhost:9000', wanted http://host"):
+    with pytest.raises(LogError, match="AWS_ENDPOINT_URL is 'localhost:9000', expected http://host"):
         open_log("s3://bucket/run.mcap")

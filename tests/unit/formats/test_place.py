@@ -73,7 +73,7 @@ def test_nothing_is_a_file_too_and_what_is_gone_is_told(place: Place) -> None:
     place.delete("empty")
     place.delete("empty")
     assert place.read("empty") is None
-    with pytest.raises(StoreError, match="nowhere: is gone"):
+    with pytest.raises(StoreError, match="nowhere: is missing"):
         place.read_range("nowhere", 0, 1)
     assert place.entries() == []
 
@@ -114,28 +114,26 @@ def served(tmp_path, monkeypatch):
 def test_a_bucket_that_cannot_be_used_is_one_line(served: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(StoreError, match=r"^s3://nowhere/x: it cannot be read \(there is no such bucket\)$"):
         open_place("s3://nowhere/x").check()
-    with pytest.raises(StoreError, match="wants credentials; set AWS_ACCESS_KEY_ID"):
+    with pytest.raises(StoreError, match="requires credentials; set AWS_ACCESS_KEY_ID"):
         open_place(f"s3://{FORBIDDEN}/x").check()
     with pytest.raises(
-        StoreError, match=r"skewed/x: it cannot be read \(this machine's clock is not the store's; set it\)$"
+        StoreError, match=r"skewed/x: it cannot be read \(the clock of this machine is wrong; set it\)$"
     ):
         open_place(f"s3://{SKEWED}/x").check()
     with monkeypatch.context() as keys:
         keys.setenv("AWS_ACCESS_KEY_ID", "a")
         keys.setenv("AWS_SECRET_ACCESS_KEY", "b")
-        with pytest.raises(StoreError, match=r"refuses the credentials that are set, or this machine's clock is not"):
+        with pytest.raises(StoreError, match=r"rejects the credentials, or the clock of this machine is wrong"):
             open_place(f"s3://{SKEWED}/x").size("a")
-    with pytest.raises(StoreError, match=r"it names no bucket; wanted s3://bucket/name"):
+    with pytest.raises(StoreError, match=r"it names no bucket; expected s3://bucket/name"):
         open_place("s3:///x").check()
     with monkeypatch.context() as half:
         half.delenv("AWS_SKIP_SIGNATURE")
         half.setenv("AWS_ACCESS_KEY_ID", "a")
-        with pytest.raises(StoreError, match="wants credentials; set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY"):
+        with pytest.raises(StoreError, match="requires credentials; set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY"):
             open_place("s3://tests/x").check()
     open_place(f"s3://{READ_ONLY}").check()
-    with pytest.raises(
-        StoreError, match=r"read-only/x/a: it cannot be written \(the credentials that are set do not allow it\)"
-    ):
+    with pytest.raises(StoreError, match=r"read-only/x/a: it cannot be written \(the credentials do not allow it\)"):
         open_place(f"s3://{READ_ONLY}/x").put_new("a", b"")
     monkeypatch.setenv("AWS_ENDPOINT_URL", "http://127.0.0.1:9")
     began = time.monotonic()

@@ -87,8 +87,8 @@ def test_everything_that_is_wrong_with_a_robot_is_said_at_once_by_its_key():
         'power_sources.1.current is "i["; expected fields joined by +',
         "power_sources.2.current",
         'power_sources.3.sign is "plus"; expected one of auto',
-        'power_sources.4.energy is "e"; expected a voltage beside it, and no current',
-        'power_sources.5.unsupported_reason is "tells phases"; expected no field beside it',
+        'power_sources.4.energy is "e"; expected a voltage besides it, and no current',
+        'power_sources.5.unsupported_reason is "tells phases"; expected no field besides it',
     ]
     assert len(said) == len(keys)
     assert all(line.startswith(key) for line, key in zip(said, keys, strict=True)), said

@@ -57,13 +57,13 @@ def test_a_kept_document_is_read_whole_and_written_as_it_was(kept, pattern, cls)
 @pytest.mark.parametrize(
     ("keys", "line"),
     [
-        (("counts", "segments"), "counts.segments: wanted a whole number, got a list"),
-        (("distance_by_reason_m", "kept"), "distance_by_reason_m[...]: wanted a number, got a list"),
+        (("counts", "segments"), "counts.segments: expected a whole number, got a list"),
+        (("distance_by_reason_m", "kept"), "distance_by_reason_m[...]: expected a number, got a list"),
         (
             ("info", "report", "facts", "fuse", "rows"),
-            "info.report.facts.fuse.rows: wanted a whole number, got a list",
+            "info.report.facts.fuse.rows: expected a whole number, got a list",
         ),
-        (("info", "datum"), "info.datum: wanted an object or null, got a list"),
+        (("info", "datum"), "info.datum: expected an object or null, got a list"),
     ],
 )
 def test_a_value_of_another_type_is_named_by_file_and_key(kept, keys, line):

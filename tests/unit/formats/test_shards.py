@@ -80,7 +80,7 @@ def test_what_zarr_leaves_out_is_fill_value(tmp_path):
     assert np.isnan(ours.chunk((0, 0, 0))).all()  # a chunk that is not in its shard
     assert (ours.chunk((1, 0, 0)) == 1.0).all()
     assert np.isnan(ours.chunk((5, 0, 0))).all()  # a shard without a file
-    with pytest.raises(StoreError, match="is gone"):
+    with pytest.raises(StoreError, match="is missing"):
         opened(tmp_path / "a.zarr" / "x", theirs).chunk((5, 0, 0))
 
 
@@ -114,9 +114,9 @@ def test_a_changed_byte_is_an_error_never_a_number(tmp_path, where):
 def test_arrays_of_others_are_refused_in_a_line(tmp_path):
     plain = zarr.create_array(tmp_path / "plain.zarr", shape=(4, 4), chunks=(2, 2), dtype="u1")
     wanted = {**form(plain), "shard_shape": (4, 4)}
-    with pytest.raises(StoreError, match=r"plain.zarr/zarr.json: chunk_grid is .*, wanted .*\[4, 4\]"):
+    with pytest.raises(StoreError, match=r"plain.zarr/zarr.json: chunk_grid is .*, expected .*\[4, 4\]"):
         open_sharded(tmp_path / "plain.zarr", **wanted)
-    with pytest.raises(StoreError, match="is gone"):
+    with pytest.raises(StoreError, match="is missing"):
         open_sharded(tmp_path / "nothing", **wanted)
 
 
@@ -173,8 +173,8 @@ def crc(data):
 @pytest.mark.parametrize(
     ("length", "place", "wanted"),
     [
-        (10, (None, None), "it holds 10 bytes, wanted 576"),
-        (500_000_000, (None, None), "it holds 500000000 bytes, wanted 576"),
+        (10, (None, None), "it contains 10 bytes, expected 576"),
+        (500_000_000, (None, None), "it contains 500000000 bytes, expected 576"),
         (576, (2**63, 100), "its index names bytes beyond it"),
         (576, (0, 2**62), "its index names bytes beyond it"),
         (576, (0, 3), "its index names bytes beyond it"),

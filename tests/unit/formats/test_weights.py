@@ -26,15 +26,15 @@ def test_what_is_written_is_read(tmp_path):
 @pytest.mark.parametrize(
     ("change", "wanted"),
     [
-        ({"a": np.zeros((3, 2), np.float32)}, r"a is \(3, 2\) of float32, wanted \(3, 2\) of float64"),
-        ({"b": np.zeros(4, np.uint32)}, r"b is \(4,\) of uint32, wanted \(3,\)"),
+        ({"a": np.zeros((3, 2), np.float32)}, r"a is \(3, 2\) of float32, expected \(3, 2\) of float64"),
+        ({"b": np.zeros(4, np.uint32)}, r"b is \(4,\) of uint32, expected \(3,\)"),
         ({"b": np.zeros((), np.uint32)}, r"b is \(\) of uint32"),
         ({"c": np.zeros(3)}, "'c' is not of it"),
     ],
 )
 def test_arrays_of_another_type_or_length_are_refused(tmp_path, change, wanted):
     write_arrays(tmp_path / "w.npz", {**good(), **change})
-    with pytest.raises(ModelError, match=f"holds the weights of another model: {wanted}"):
+    with pytest.raises(ModelError, match=f"contains the weights of another model: {wanted}"):
         read_arrays(tmp_path / "w.npz", FORMS)
 
 

@@ -129,7 +129,11 @@ def test_epochs_and_long_pauses_cut():
     # The clock was set back: stamps of the second epoch overlap those of the first.
     second = Measurements(wheels=wheels(grid(5 * S, 9 * S, S // 10)), gnss=gnss([6 * S]))
     found = cut_sections({1: second, 0: first})
-    assert [(s.clock_epoch, s.start_ns // S, -(-s.end_ns // S)) for s in found] == [(0, 0, 10), (0, 100, 110), (1, 5, 9)]
+    assert [(s.clock_epoch, s.start_ns // S, -(-s.end_ns // S)) for s in found] == [
+        (0, 0, 10),
+        (0, 100, 110),
+        (1, 5, 9),
+    ]
     assert found[0].measurements.wheels.stamp_ns.size == 100
     assert found[0].measurements.gnss is None
     assert found[2].measurements.gnss.stamp_ns.size == 1

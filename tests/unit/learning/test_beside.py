@@ -86,9 +86,9 @@ def test_physics_is_a_model_like_the_others(told, tmp_path):
     with pytest.raises(ModelError, match="physics needs the slope and class of each patch"):
         model.predict(split.with_channels("height").patches)
     assert tcpipe("train", told, "model", "--model", "physics", cwd=tmp_path).stdout.startswith("model: nothing to do")
-    with pytest.raises(UsageError, match="leave out --physics-from"):
+    with pytest.raises(UsageError, match="remove --physics-from"):
         choose_model(str(tmp_path / "model"), physics=str(told))
-    with pytest.raises(UsageError, match="takes no commanded speed; leave out --speed"):
+    with pytest.raises(UsageError, match="has no input for the commanded speed; remove --speed"):
         choose_model(str(tmp_path / "model"), speed_mps=0.5)
 
 
@@ -110,7 +110,7 @@ def test_an_older_dataset_cannot_tell_and_says_so(dataset, tmp_path, monkeypatch
     monkeypatch.setattr(Split, "labels", property(real_labels))
     config = FitConfig(model="boosting", extra_features=True)
     train(dataset, tmp_path / "model", config=config)
-    assert "its samples have no commanded speed (commanded_velocity_mps): the model is not told it" in caplog.text
+    assert "its samples have no commanded speed (commanded_velocity_mps): the model does not use it" in caplog.text
     assert [of.name for of in load_model(tmp_path / "model").card.extra_features] == ["turn_radpm"]
     absent.add("mean_abs_yaw_rate_radps")
     with pytest.raises(
@@ -121,5 +121,5 @@ def test_an_older_dataset_cannot_tell_and_says_so(dataset, tmp_path, monkeypatch
     train(dataset, tmp_path / "physics", config=FitConfig(model="physics"))
     physics = load_model(tmp_path / "physics")
     assert not physics.takes_turns
-    with pytest.raises(ModelError, match="is a model of physics, which has no network"):
+    with pytest.raises(ModelError, match="is a model of kind physics, without a network"):
         _ = physics.network

@@ -92,7 +92,7 @@ def test_a_model_of_net_energy_is_compared_with_net_energy(model, dataset, tmp_p
     found = values.splits["unseen"]
     assert found.errors["E"]["all"].rmse == pytest.approx(np.sqrt(np.mean((told - energy) ** 2)), rel=1e-4)
     assert found.label_floor["E"]["all"].rmse == pytest.approx(1.2)
-    assert "above what the robot draws" in (tmp_path / "evaluation" / "evaluation.html").read_text()
+    assert "net of idle power" in (tmp_path / "evaluation" / "evaluation.html").read_text()
 
 
 def test_how_near_training_it_is_and_what_blocks_say(evaluated, model, dataset):
@@ -112,7 +112,7 @@ def test_how_near_training_it_is_and_what_blocks_say(evaluated, model, dataset):
     tables = [part for part in page.split("<h2>")[1:] if "<table" in part]
     assert len(tables) >= 6
     assert all("Audit (test held out by block)" in part for part in tables)
-    assert "the one fold of train that stopped it (20 samples)" in page
+    assert "the fold of train used for early stopping (20 samples)" in page
     assert page.count("held-out blocks of train") == 8  # RMSE and MAPE of four quantities, beside the rows of test
     residuals = load_model(model).residuals
     assert values.blocks["w"]["all"].count == len(residuals["power_watt"])
@@ -193,14 +193,14 @@ def test_its_files_say_the_same(evaluated):
     )
     assert float(row["rmse"]) == values.splits["unseen"].errors["E"]["mud"].rmse
     page = (place / "evaluation.html").read_text()
-    for told in ("Table I:", "Table II:", "Table III:", "Table V:", "12.80", "17.45", "Worst metres"):
+    for told in ("Table I:", "Table II:", "Table III:", "Table V:", "12.80", "17.45", "Worst segments"):
         assert told in page
     tables = re.split(r"<h2>Table [IV]+:", page)[1:]
     assert len(tables) == 5
     assert all("label noise alone" in table for table in tables)
     assert "default-src 'none'" in page  # whatever it names, it asks for nothing
     assert (
-        "They are trained beside a network only, and here none was." in page
+        "They are trained only if the model is a network." in page
     )  # networks of Wei and Isler, of which table IV tells
     assert not re.search(r"RMSE of E.*[0-9] J, [-+]", page)  # a row of nine ranges fits
     told = page[: page.index('<script type="application/json"')]
@@ -284,7 +284,7 @@ def test_a_dataset_that_is_replaced_meanwhile_is_told(evaluated, model, dataset,
         return replace(values, key=key), read_table(place / "predictions.parquet")
 
     monkeypatch.setattr("tcpipe.learning.evaluation_files.evaluate", replaced_meanwhile)
-    with pytest.raises(StoreError, match="another call has replaced it meanwhile; run the command again"):
+    with pytest.raises(StoreError, match="another call has replaced it in the meantime; run the command again"):
         run_evaluation(model, mine, tmp_path / "evaluation", config=CONFIG)
     assert not (tmp_path / "evaluation" / "evaluation.json").exists()
 
@@ -321,7 +321,7 @@ def test_a_network_of_energy_alone_is_no_model_to_evaluate(dataset, tmp_path):
     place = made_model(
         tmp_path / "energy", architecture=architecture, channels=("height",), outputs=("energy_joule",), scale=(400.0,)
     )
-    with pytest.raises(ModelError, match="it predicts energy_joule alone, wanted power_watt and velocity_mps"):
+    with pytest.raises(ModelError, match="it predicts only energy_joule, expected power_watt and velocity_mps"):
         run_evaluation(place, dataset, tmp_path / "evaluation", config=CONFIG)
 
 

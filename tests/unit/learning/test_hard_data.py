@@ -99,7 +99,7 @@ def test_samples_without_a_label_are_left_out_and_counted(dataset, tmp_path, kin
     monkeypatch.setattr(Split, "labels", property(labels))
     caplog.set_level("INFO", "tcpipe")
     train(dataset, tmp_path / "model", config=FitConfig(model=kind))
-    assert "samples of train have no label and are left out" in caplog.text
+    assert "samples of train have no label and are not used" in caplog.text
     assert np.isfinite(load_model(tmp_path / "model").residuals["power_predicted_watt"]).all()
     monkeypatch.setattr(Split, "labels", property(lambda split: np.full((len(split), 2), np.nan, np.float32)))
     with pytest.raises(DatasetError, match="no labelled samples in split train"):

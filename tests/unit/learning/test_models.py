@@ -51,7 +51,7 @@ def test_velocity_is_never_nothing(tmp_path):
 
 def test_patches_of_another_shape(place):
     with pytest.raises(
-        ModelError, match=r"patches of shape \(40, 40, 2\), wanted \(40, 40, 3\): ortho, terrain, height"
+        ModelError, match=r"patches of shape \(40, 40, 2\), expected \(40, 40, 3\): ortho, terrain, height"
     ):
         load_model(place).predict(np.zeros((1, 40, 40, 2), np.float32))
 
@@ -64,17 +64,17 @@ def test_no_model_and_half_a_model(tmp_path, place):
     _refused(cut, r"model.json: not a readable JSON file \(.*\); remove the folder and train the model again")
     cut = made_model(tmp_path / "cut")
     (cut / WEIGHTS).write_bytes((cut / WEIGHTS).read_bytes()[:-100])
-    _refused(cut, "weights.npz: has .* bytes, wanted .*; train the model again")
+    _refused(cut, "weights.npz: has .* bytes, expected .*; train the model again")
 
 
 @pytest.mark.parametrize(
     ("change", "match"),
     [
-        ({"schema_version": 99}, "written by model schema 99, wanted 3; train the model again"),
+        ({"schema_version": 99}, "written by model schema 99, expected 3; train the model again"),
         ({"kind": "tcpipe dataset"}, "not the card of a tcpipe model"),
         (
             {"scale": None},
-            "model.json: is not what this version writes: scale: wanted a list, got null; remove the folder and",
+            "model.json: is not what this version writes: scale: expected a list, got null; remove the folder and",
         ),
     ],
 )
@@ -98,7 +98,7 @@ def test_an_edited_card_is_refused_and_every_damaged_file_is_named(tmp_path):
     card = (place / "model.json").read_text()
     assert '"robot": "husky"' in card
     (place / "model.json").write_text(card.replace('"robot": "husky"', '"robot": "jackal"'))
-    _refused(place, r"model\.json: is not as it was written.*; remove the folder and train the model again")
+    _refused(place, r"model\.json: has changed since it was written.*; remove the folder and train the model again")
 
 
 def test_a_card_is_read_without_torch(place):

@@ -63,7 +63,7 @@ def test_odd_batches_of_a_narrow_network_on_two_threads():
 
 @pytest.mark.parametrize("width", [4, 8, 24])
 def test_widths_that_are_no_multiple_of_sixteen(width):
-    with pytest.raises(ModelError, match=f"a network of width {width}: wanted a multiple of 16"):
+    with pytest.raises(ModelError, match=f"a network of width {width}: expected a multiple of 16"):
         check_trainable(Architecture(40, 3, 2, width))
 
 

@@ -79,5 +79,5 @@ def test_arrays_there_and_back():
 
 def test_too_few_samples_are_said():
     extra_features, labels = drive(count=19)
-    with pytest.raises(ModelError, match="19 samples to fit physics to, wanted at least 20"):
+    with pytest.raises(ModelError, match="19 samples to fit physics to, expected at least 20"):
         fit_physics_model(extra_features, labels, idle_watt=None)

@@ -74,7 +74,7 @@ def test_trees_by_hand():
     assert made.predict(features).tolist() == [[11.0, 3.0], [12.0, 5.0], [11.0, 4.0], [11.0, 3.0]]
     assert made.predict(np.tile(features, (200, 1)))[796:].tolist() == made.predict(features).tolist()
     assert forest.read_forest(made.arrays(), "here").predict(features[:1]).tolist() == [[11.0, 3.0]]
-    with pytest.raises(ModelError, match="here: holds the weights of another model"):
+    with pytest.raises(ModelError, match="here: contains the weights of another model"):
         forest.read_forest({"head/bias": np.zeros(2)}, "here")
 
 
@@ -146,6 +146,6 @@ def test_arrays_there_and_back_and_an_older_kind(fitted):
     again = read_table_model(model.arrays(), "weights.npz", CHANNELS, CLASSES)
     assert np.array_equal(again.predict(features), model.predict(features))
     with pytest.raises(
-        ModelError, match="holds the weights of another model, or of an older kind; train the model again"
+        ModelError, match="contains the weights of another model, or of an older kind; train the model again"
     ):
         read_table_model(model.forest.arrays(), "weights.npz", CHANNELS, CLASSES)

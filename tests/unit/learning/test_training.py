@@ -79,7 +79,7 @@ def test_net_energy_can_be_trained_on(energy_only, dataset, tmp_path):
     names = ("net_energy_joule",) if energy_only else ("net_power_watt", "velocity_mps")
     assert (card.label_energy, card.outputs) == ("net", names)
     assert card.scale == pytest.approx(tuple(float(split.column(name).max()) for name in names))
-    assert "above what the robot draws while it stands" in (tmp_path / "model" / "MODEL.md").read_text()
+    assert "net of idle power" in (tmp_path / "model" / "MODEL.md").read_text()
 
 
 @pytest.mark.parametrize(
@@ -168,7 +168,7 @@ def test_a_state_of_another_training_or_cut_short_is_told(dataset, tmp_path, mon
         train(dataset, tmp_path / "other", config=replace(CONFIG, seed=1))
     checkpoint.write_bytes(checkpoint.read_bytes()[:-1000])
     with pytest.raises(
-        ModelError, match=r"other.checkpoint: cut short or damaged .*; remove it, or start anew with --no-resume"
+        ModelError, match=r"other.checkpoint: cut short or damaged .*; remove it, or start again with --no-resume"
     ) as told:
         train(dataset, tmp_path / "other", config=CONFIG)
     assert len(told.value.problems) == 1
@@ -225,7 +225,7 @@ def test_what_cannot_be_trained_on(dataset, tmp_path, monkeypatch):
 )
 def test_a_folder_of_something_else_is_left_alone(dataset, tmp_path, name, text):
     (tmp_path / name).write_text(text)
-    with pytest.raises(UsageError, match="exists and is no model; it is left alone"):
+    with pytest.raises(UsageError, match="exists and is no model; it is not changed"):
         train(dataset, tmp_path, config=CONFIG)
     assert (tmp_path / name).read_text() == text
 
@@ -235,7 +235,7 @@ def test_what_lies_beside_a_model_is_not_replaced_with_it(trained, dataset, tmp_
     shutil.copytree(trained[0], place)
     (place / "notes.txt").write_text("important")
     assert train(dataset, place, config=CONFIG).status == "unchanged"
-    with pytest.raises(UsageError, match=r"holds notes.txt beside a model, and would be replaced"):
+    with pytest.raises(UsageError, match=r"contains notes.txt in the directory of a model"):
         train(dataset, place, config=replace(CONFIG, seed=1))
     assert (place / "notes.txt").exists()
 
@@ -323,5 +323,5 @@ def test_a_foreign_one_is_told(tmp_path, state):
     whole = {"key": "key", "epoch": 0, "best_epoch": 0, "best_loss": 1.0, "history": []}
     text = json.dumps({**whole, **state} if state else []).encode()
     write_arrays(tmp_path / "x.checkpoint", {"state": np.frombuffer(text, np.uint8)})
-    with pytest.raises(ModelError, match=r"x.checkpoint: not a checkpoint; remove it, or start anew with --no-resume"):
+    with pytest.raises(ModelError, match=r"x.checkpoint: not a checkpoint; remove it, or start again with --no-resume"):
         read_checkpoint(tmp_path / "x.checkpoint", "key")

@@ -71,10 +71,10 @@ def test_every_problem_of_a_mapping_is_said():
     assert "has no yaw" in said[0]
     assert "needs angular_velocity_y, angular_velocity_z, linear_acceleration_x" in said[1]
     assert "roll is not in columns" in said[2]
-    assert "wanted one of m/s" in next(
+    assert "expected one of m/s" in next(
         find_mapping_problems("r", "command", {"linear_x": "v"}, {"linear_x": "furlongs"})
     )
-    assert "wanted role = one of gnss" in next(find_mapping_problems("r", "voltage_left", {}, {}))
+    assert "expected one of gnss" in next(find_mapping_problems("r", "voltage_left", {}, {}))
 
 
 @pytest.mark.parametrize("role", [role for role in MAPPED if role != "power"])
@@ -122,4 +122,4 @@ def test_a_message_of_ones_own_is_mapped_field_by_field_and_all_that_is_wrong_is
     wrong = make_mapped_message("gnss", columns, names)
     assert isinstance(wrong, list)
     assert len(wrong) == 6
-    assert "which its messages do not hold; they hold pvt.lat, pvt.lon, acc, name" in wrong[1]
+    assert "which its messages do not have; they have pvt.lat, pvt.lon, acc, name" in wrong[1]

@@ -251,7 +251,7 @@ def test_what_cannot_be_decoded_is_a_finding_each_and_one_line_of_the_error() ->
     proto = topic("/proto", IMU, problem="its messages are encoded as protobuf; cdr and ros1 are read")
     empty = topic("/empty", IMU, 0, problem="its messages are encoded as cbor; cdr and ros1 are read")
     found = assign_roles([*json, proto, empty], {})
-    (said,) = [line for line in found.problems if line.startswith("topics that hold data which")]
+    (said,) = [line for line in found.problems if line.startswith("topics with data that")]
     assert (
         "/json0, /json1, /json10, /json11, /json2, /json3, /json4, /json5 and 4 more: its messages are encoded as json"
         in said
@@ -271,8 +271,8 @@ def test_a_recipe_that_does_not_fit_the_log_is_an_error_with_what_there_is() -> 
         *topics, chosen={"gnss": ["/gps"], "imu": ["/odom"], "power": ["/left/battery", "/right/battery"], "radar": []}
     )
     text = "\n".join(found.problems)
-    assert "read.topics.gnss names /gps, which the log does not hold; it holds /fix" in text
-    assert "read.topics.imu: /odom is nav_msgs/msg/Odometry; wanted sensor_msgs/msg/Imu" in text
+    assert "read.topics.gnss names /gps, which the log does not have; it has /fix" in text
+    assert "read.topics.imu: /odom is nav_msgs/msg/Odometry; expected sensor_msgs/msg/Imu" in text
     assert "read.topics.power names /right/battery" in text
     assert "no role 'radar'" in text
 
@@ -284,7 +284,7 @@ def proposals(found: RoleAssignment) -> list[dict]:
 def test_a_log_without_motion_says_so_in_three_lines_and_how_to_use_what_was_left_out() -> None:
     found = assign(("/odometry/filtered", ODOMETRY), ("/imu", IMU), ("/chatter", "std_msgs/msg/String"))
     assert len(found.problems) == 3
-    assert found.problems[0].startswith("nothing in the log tells motion")
+    assert found.problems[0].startswith("no motion in the log")
     assert proposals(found) == [{"read.topics": {"wheel_odometry": ["/odometry/filtered"]}}]
     assert "/chatter (std_msgs/msg/String" in found.problems[2]
     assert len(assign(("/chatter", "std_msgs/msg/String")).problems) == 2
@@ -360,7 +360,7 @@ def test_the_robot_is_found_by_types_then_by_names(topics: list[tuple[str, str]]
 
 def test_the_robot_given_rules_and_must_exist() -> None:
     assert assign(("/status", HUSKY), ("/odom", ODOMETRY), robot="warthog").robot == "warthog"
-    with pytest.raises(RecipeError, match="there are dingo, generic, husky, husky_a300, jackal, ridgeback, warthog"):
+    with pytest.raises(RecipeError, match="known: dingo, generic, husky, husky_a300, jackal, ridgeback, warthog"):
         assign(("/odom", ODOMETRY), robot="spot")
 
 
@@ -378,7 +378,7 @@ def test_a_motors_phase_currents_play_no_role_and_the_reason_is_said() -> None:
     assert found.roles["power"].topics == ("/a300_0001/platform/bms/state",)
     name = "/a300_0001/platform/motors/feedback"
     assert ("power", name, "message-type") in left_out(found)
-    assert "the current in the motor's phases" in found.left_out[name]
+    assert "the phase current of the motor" in found.left_out[name]
     assert found.problems == ()
 
 
@@ -414,7 +414,7 @@ def test_other_poses_and_two_of_them_play_only_where_they_are_named(topics: list
     name = topics[0][0]
     named = assign(WHEELS, *topics, ("/fix", FIX), chosen={"pose": [name]})
     assert played(named) == {"wheel_odometry": ("/platform/odom",), "pose": (name,)}
-    assert named.left_out["/fix"] == f"the pose of {name} stands in for it"
+    assert named.left_out["/fix"] == f"the pose {name} is used instead"
 
 
 def test_what_a_pose_was_made_from_is_not_fused_again() -> None:
@@ -481,7 +481,7 @@ def test_of_two_receivers_that_of_the_fixes_is_taken_and_without_fixes_none() ->
     assert left_out(nobody) == [("gnss_velocity", name, "several-fit") for name, _ in topics[:2]]
     alone = assign(*topics)
     assert "gnss_velocity" not in played(alone)
-    assert "no topic plays gnss" in alone.left_out["/rear/fix_velocity"]
+    assert "no topic is used as gnss" in alone.left_out["/rear/fix_velocity"]
 
 
 KINDS = {"fix": "sensor_msgs/msg/NavSatFix", "imu": "sensor_msgs/msg/Imu", "odom": "nav_msgs/msg/Odometry"}
@@ -511,7 +511,7 @@ def assign_two_robots(namespace=None, chosen=None):
 
 def test_the_namespace_answers_the_question():
     question = assign_two_robots().problems
-    assert question[0].startswith("the log holds 2 robots")
+    assert question[0].startswith("the log contains 2 robots")
     assert question[-1].startswith('namespace = "/anna"')
     for name in ("/bert", "bert", "/bert/"):
         found = assign_two_robots(name)
@@ -525,19 +525,19 @@ def test_topics_chosen_by_name_need_no_namespace():
 
 
 def test_a_namespace_that_holds_nothing_is_a_mistake():
-    assert "no topic lies below /carl" in assign_two_robots("/carl").problems[0]
+    assert "no topic below /carl" in assign_two_robots("/carl").problems[0]
 
 
 @pytest.mark.parametrize(
     ("namespace", "name", "why"),
     [
-        ("/a200_0123", "husky", "is called so"),
-        ("/j100_0001", "jackal", "is called so"),
-        ("/w200_0001", "warthog", "is called so"),
-        ("/do150_0001", "dingo", "is called so"),
-        ("/r100-0001", "ridgeback", "is called so"),
-        ("/a300_0001", "husky_a300", "is called so"),
-        ("/x400_0001", "generic", "the platform X400, which no profile knows"),
+        ("/a200_0123", "husky", "has its name"),
+        ("/j100_0001", "jackal", "has its name"),
+        ("/w200_0001", "warthog", "has its name"),
+        ("/do150_0001", "dingo", "has its name"),
+        ("/r100-0001", "ridgeback", "has its name"),
+        ("/a300_0001", "husky_a300", "has its name"),
+        ("/x400_0001", "generic", "the platform X400, which has no profile"),
         ("", "husky", "nothing names another platform"),
         ("/room100_0001", "husky", "nothing names another platform"),
     ],
@@ -571,5 +571,5 @@ def test_a_topic_that_paused_for_most_of_the_drive_covers_little():
     whole = Topic("/odom", "nav_msgs/msg/Odometry", 600, 0, 60 * S, "cdr", "")
     paused = replace(whole, name="/wheel/odom", message_count=200, silent_ns=40 * S)
     assert find_short_topics([whole, paused], [whole, paused]) == {"/wheel/odom"}
-    assert format_coverage(paused) == "200 messages over 60.0 s, silent for 40.0 s of them"
+    assert format_coverage(paused) == "200 messages over 60.0 s, no messages for 40.0 s of them"
     assert find_short_topics([replace(paused, silent_ns=20 * S)], [whole]) == frozenset()

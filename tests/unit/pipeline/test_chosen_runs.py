@@ -76,7 +76,7 @@ def test_runs_of_another_data_model_are_named(store, tmp_path):
     assert found.outdated == {"a": "0.9"}
     with pytest.raises(
         StoreError,
-        match=rf"runs/a: holds no finished run of data model {DATA_MODEL_VERSION}; ingest its log again",
+        match=rf"runs/a: contains no finished run of data model {DATA_MODEL_VERSION}; ingest its log again",
     ):
         report(store.root / "runs" / "a")
 
@@ -85,7 +85,7 @@ def test_a_store_of_another_data_model_is_told_so(store, tmp_path):
     make_outdated(store, "a", "b", "c")
     with pytest.raises(
         DatasetError,
-        match=rf"3 runs in the store, all of data model 0\.9, wanted {DATA_MODEL_VERSION}; ingest their logs",
+        match=rf"3 runs in the store, all of data model 0\.9, expected {DATA_MODEL_VERSION}; ingest their logs",
     ):
         runs(store, tmp_path)
 
@@ -93,7 +93,7 @@ def test_a_store_of_another_data_model_is_told_so(store, tmp_path):
 def test_a_dry_run_counts_and_estimates_and_a_build_is_remembered(store, tmp_path):
     planned = build_dataset(tmp_path / "out", store=store.root, recipe=Recipe(), dry_run=True)
     assert (planned.status, planned.estimate.amount, planned.exit_code) == ("planned", 60, 0)
-    assert "at most 60 samples: about 2 s and 258 kB (by figures measured elsewhere" in str(planned)
+    assert "at most 60 samples: about 2 s and 258 kB (from default figures" in str(planned)
     assert not (tmp_path / "out").exists()
     made = build_dataset(tmp_path / "out", store=store.root, recipe=Recipe())
     (record,) = store.state().datasets.values()
@@ -114,7 +114,10 @@ def test_a_dataset_that_was_moved_before_another_was_built_in_its_place_still_ho
     out.rename(tmp_path / "moved")
     build_dataset(out, store=store.root, recipe=Recipe())
     (kept,) = prune(store=store.root, recipe=Recipe(), dry_run=True).kept
-    assert kept.stays == f"a dataset that lay at {out} refers to it; 'tcpipe prune --forget {out}' if that is gone"
+    assert (
+        kept.stays
+        == f"a dataset, formerly at {out}, refers to it; if it no longer exists: 'tcpipe prune --forget {out}'"
+    )
     shutil.rmtree(out)
     (tmp_path / "moved").rename(out)
     build_dataset(out, store=store.root, recipe=Recipe(), force=True)
@@ -128,7 +131,7 @@ def test_a_dataset_of_a_store_that_cannot_be_written_says_that_it_leaves_no_comm
     monkeypatch.setattr(place, "put_new", lambda _, name, __: (_ for _ in ()).throw(StoreError(f"{name}: read-only")))
     for _ in range(2):
         build_dataset(tmp_path / "out", store=store.root, recipe=Recipe())
-    assert "so the store does not know how this call ended" in caplog.text
+    assert "so the store has no record of how this call ended" in caplog.text
     assert "so 'tcpipe prune' does not know the runs of this dataset" in caplog.text
 
 

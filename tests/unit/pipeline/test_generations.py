@@ -212,5 +212,5 @@ def test_a_reader_asks_as_often_of_many_generations_as_of_one(served):
 def test_what_is_of_another_kind_is_left_alone(served):
     place = BucketPlace("s3://tests/x")
     write(place, "a model", card="model.json")
-    with pytest.raises(UsageError, match=r"s3://tests/x: holds model.json and no c.json; it is left alone"):
+    with pytest.raises(UsageError, match=r"s3://tests/x: contains model.json and no c.json; it is not changed"):
         write(place, "mine")

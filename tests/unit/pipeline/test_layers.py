@@ -89,7 +89,7 @@ def test_a_store_is_its_segments_and_nothing_else_is_replaced(dataset, tmp_path)
     assert "448 segments" in found.output
     assert layer(tmp_path / "store.gpkg", "segments")[1].num_rows == 448
     (tmp_path / "mine.gpkg").write_text("mine")
-    with pytest.raises(UsageError, match="no GeoPackage of tcpipe"):
+    with pytest.raises(UsageError, match="is not a GeoPackage of tcpipe"):
         export_layers(dataset, tmp_path / "mine.gpkg")
     with pytest.raises(UsageError, match="is no dataset, run or store"):
         export_layers(tmp_path, tmp_path / "new.gpkg")

@@ -184,7 +184,7 @@ def test_a_quick_look_shows_classes_over_the_orthophoto_and_gaps_in_white(site, 
         assert slope == pytest.approx(0.65, abs=0.02)
     before = Store(store).map_picture("m").read_bytes()
     Store(store).map_picture("m").unlink()
-    assert [line.rpartition(": ")[2] for line in verify(store).problems] == ["is gone"]
+    assert [line.rpartition(": ")[2] for line in verify(store).problems] == ["is missing"]
     assert add(store, "m", **site, force=True).status == "done"
     assert Store(store).map_picture("m").read_bytes() == before
     assert verify(store).problems == ()
@@ -293,9 +293,9 @@ def test_a_tile_that_a_pattern_names_once_more_lies_where_it_is_named_last(site,
 def test_what_names_no_file_is_said(site, store, tmp_path):
     given = {"height": [tmp_path, "https://x.org/dem.tif", "/vsicurl/x.tif"], "ortho": str(tmp_path / "*.jpg")}
     assert refused(store, "m", UsageError, **given) == (
-        f"{tmp_path}: is a directory, wanted its files: '{tmp_path}/*.tif'",
-        "https://x.org/dem.tif: is an address, wanted a file on this machine: gdal_translate https://x.org/dem.tif local.tif",
-        "/vsicurl/x.tif: is an address, wanted a file on this machine: gdal_translate /vsicurl/x.tif local.tif",
+        f"{tmp_path}: is a directory, expected its files: '{tmp_path}/*.tif'",
+        "https://x.org/dem.tif: is an address, expected a file on this machine: gdal_translate https://x.org/dem.tif local.tif",
+        "/vsicurl/x.tif: is an address, expected a file on this machine: gdal_translate /vsicurl/x.tif local.tif",
         f"{tmp_path}/*.jpg: no file matches",
     )
 
@@ -307,5 +307,5 @@ def test_the_command_takes_patterns_and_repeated_options_and_knows_a_pattern_wit
     assert CliRunner().invoke(cli, [*whole, str(tmp_path / "*/dem.tif")], catch_exceptions=False).exit_code == 0
     again = CliRunner().invoke(cli, [*whole, east, "--height", west], catch_exceptions=False)
     assert "nothing to do" in again.stdout
-    with pytest.raises(UsageError, match="is a pattern without quotes"):
+    with pytest.raises(UsageError, match="quote patterns, as in"):
         CliRunner().invoke(cli, [*whole, east, west], standalone_mode=False, catch_exceptions=False)

@@ -67,14 +67,14 @@ def test_a_half_copied_log_is_superseded_when_it_is_complete_and_counts_when_it_
     found, code = night()
     assert (code, found["run.mcap"].status) == (0, "done")
     assert found["run.mcap"].notes == (
-        f"run {half}, made from this path before, is superseded: this log holds what it held",
+        f"run {half}, made from this path before, is superseded: this log contains its content",
     )
     assert half not in counted(tmp_path)
     assert inspect(tmp_path / "store", recipe=Recipe()).superseded == {half: found["run.mcap"].run.run_id}
     assert night()[0]["run.mcap"].notes == ()  # said once
     for place in ("run.mcap", "elsewhere.mcap"):  # back where it was, then under another name
         copy_part(whole, tmp_path / "logs" / place, 0.6)
-        assert f"run {half} counts again: its recording is back" in night()[0][place].notes
+        assert f"run {half} counts again: its log is available again" in night()[0][place].notes
         assert half in counted(tmp_path)
         (tmp_path / "logs" / place).unlink()
         shutil.copy(whole, log)
@@ -96,9 +96,9 @@ def test_a_half_copied_log_that_lies_elsewhere_too_still_counts(tmp_path, night)
 @pytest.mark.parametrize(
     ("later", "why"),
     [
-        ({"seed": 1, "start_ns": START_NS + 10**12}, "that was another recording"),
-        ({"seed": 1}, "that was another recording"),  # no battery behind the clock: each drive begins at one instant
-        ({"rows": 700}, "this log holds 47% of it"),
+        ({"seed": 1, "start_ns": START_NS + 10**12}, "its content differs"),
+        ({"seed": 1}, "its content differs"),  # no battery behind the clock: each drive begins at one instant
+        ({"rows": 700}, "this log contains 47% of it"),
     ],
 )
 def test_a_name_used_again_and_a_log_that_lost_something_supersede_nothing(tmp_path, night, later, why):

@@ -71,7 +71,7 @@ def test_what_a_dataset_refers_to_stays_also_where_that_was_moved(store, tmp_pat
     assert found.removed == ()
     assert {each.stays for each in found.kept} == {f"dataset {tmp_path / 'moved'} refers to it"}
     assert len(there(store)) == 5
-    with pytest.raises(UsageError, match="no dataset of this store lay there; nothing is removed"):
+    with pytest.raises(UsageError, match="not a dataset of this store; nothing is removed"):
         prune(store=store.root, recipe=Recipe(), forget=["nosuch"])
     assert len(prune(store=store.root, recipe=Recipe(), forget=[str(tmp_path / "moved")]).removed) == 2
 
@@ -181,7 +181,7 @@ def test_pixels_of_a_killed_build_go_when_they_are_old(store):
     name = f"{SPOOL}/0123-abcdef01/7.arrow"
     store.place.put(name, b"pixels")
     assert verify(store.root).problems == (
-        f"{store.root / SPOOL}: is of a build that goes on, or was killed; 'tcpipe prune' removes what is old",
+        f"{store.root / SPOOL}: belongs to a build that is running or was killed; 'tcpipe prune' removes old ones",
     )
     prune(store=store.root, recipe=Recipe())
     assert store.place.read(name) == b"pixels"

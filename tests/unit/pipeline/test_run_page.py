@@ -105,13 +105,13 @@ def test_where_streams_are_gone_the_track_is_drawn_and_the_page_says_so(store, t
     (document.parent / power).write_bytes(b"damaged")
     html = run_report(Store(alone), run)
     assert list(data_of(html)["series"]) == ["track"]
-    assert "What sensors told cannot be drawn" in html
+    assert "The measurements cannot be drawn" in html
 
 
 def test_trust_refusals_clocks_and_the_noise_floor_are_on_the_page(store):
     run, html = page(store)
     facts = run.manifest.info.report.facts
-    trust = html.split("<h2>How far each sensor was believed</h2>")[1].split("<h2>")[0]
+    trust = html.split("<h2>Rejected measurements by sensor</h2>")[1].split("<h2>")[0]
     for role, nis in facts.fuse.nis_mean.items():
         (row,) = [row for row in trust.split("<tr>") if f"<td>{role.replace('_', ' ')}</td>" in row]
         assert f"<td>{nis:.2f}</td>" in row
@@ -120,20 +120,18 @@ def test_trust_refusals_clocks_and_the_noise_floor_are_on_the_page(store):
     clocks = html.split("<h2>Clocks</h2>")[1].split("<h2>")[0]
     assert all(f"<td>{role.replace('_', ' ')}</td>" in clocks for role in facts.clock_offsets.offsets)
     assert f"Noise floor of E {100 * facts.label.energy_budget.total:.1f} %" in html
-    assert "Kept and dropped distances add up to the odometer" in html
+    assert "Kept and excluded distances add up to the odometer" in html
 
 
 def test_where_sensors_disagree_with_the_track_is_on_the_page(store):
     run, html = page(store)
-    assert "Where sensors disagree" not in html
+    assert "Disagreements of sensors and track" not in html
     info, start_ns = run.manifest.info, run.manifest.info.report.facts.fuse.stretches[0].start_ns
     each = Disagreement(start_ns + 10**10, start_ns + 2 * 10**10, "gnss", "position", 0.49, "m", 0.016, alone=False)
     facts = replace(info.report.facts, audit=AuditFacts((each,)))
     told = replace(run.manifest, info=replace(info, report=StageReport((), facts)))
     (section,) = [s for s in make_sensor_sections(None, told, run.rejections()) if "disagree" in s.title]
-    assert section.rows == [
-        ("gnss", "position", "10 to 20 s", "0.49 m", "0.016 m", "deviations are raised, segments flagged")
-    ]
+    assert section.rows == [("gnss", "position", "10 to 20 s", "0.49 m", "0.016 m", "σ inflated, segments flagged")]
 
 
 def test_every_topic_stands_on_the_page_and_may_break(store):

@@ -139,14 +139,14 @@ def test_runs_that_have_to_be_ingested_again_are_told_each_time_unless_so_many_a
     assert build(store).exit_code == 0
     under_another_recipe(store, "b", "c", "d")
     before = (store.root.parent / "out" / "dataset.json").read_bytes()
-    with pytest.raises(DatasetError, match=r"1 runs, wanted 2 or more \(--min-runs\); nothing is written"):
+    with pytest.raises(DatasetError, match=r"1 runs, expected 2 or more \(--min-runs\); nothing is written"):
         build(store, min_runs=2)
     assert (store.root.parent / "out" / "dataset.json").read_bytes() == before
     for status in ("done", "unchanged"):
         result = build(store)
         assert problems(result) == [("run-ingested-otherwise", run_id) for run_id in "bcd"]
         (line,) = result.finding_lines(problems=True)
-        assert line.startswith("warning: 3 of 4 runs: Run left out: ingested with another recipe")
+        assert line.startswith("warning: 3 of 4 runs: Run excluded: ingested with another recipe")
         assert "To ingest the logs again: 'tcpipe ingest /logs'" in line
         assert (result.status, result.exit_code) == (status, 3)
     assert build(store, min_runs=1).exit_code == 0

@@ -1,4 +1,4 @@
-"""Where every log stands: each state once, told by what ingest did, and the same after it."""
+"""List the state and problems of every log: each state once, told by what ingest did, and the same after it."""
 
 import json
 import os
@@ -97,7 +97,7 @@ def test_losses_are_the_metres_of_all_manifests_the_largest_first(first_night):
 
 def test_without_logs_it_looks_where_ingest_was_told_to(first_night, tmp_path):
     assert find_status(store=first_night / "store", recipe=Recipe()).counts == where(first_night).counts
-    with pytest.raises(UsageError, match="no call of ingest is remembered here; give the logs"):
+    with pytest.raises(UsageError, match="no earlier call of ingest is known; give the logs"):
         find_status(store=tmp_path, recipe=Recipe())
 
 
@@ -141,7 +141,7 @@ def test_new_changed_growing_passing_and_accepted_logs_are_told_apart(night):
     assert found.counts == {"done": 2, "quarantined": 1, "growing": 1, "pending": 2, "failed_transient": 1}
     told = {(group.state, group.cause): group.logs for group in found.groups}
     assert told["pending", ""] == (str(logs / "new.mcap"),)
-    assert told["pending", "its content is another than before"] == (str(logs / "whole.mcap"),)
+    assert told["pending", "its content has changed"] == (str(logs / "whole.mcap"),)
     assert told["failed_transient", "No space left on device (28)"] == (str(logs / "passing.mcap"),)
     assert told["done", "damaged, acknowledged"] == (str(logs / "cut.mcap"),)
     assert found.exit_code == 3  # the disk is full
@@ -228,7 +228,7 @@ def test_a_store_that_is_not_there_is_named_as_it_was_given(tmp_path, monkeypatc
 
 def test_a_dry_run_of_what_is_forced_says_that_it_is_done_again(first_night):
     causes = {group.cause for group in where(first_night, force=True).groups}
-    assert "to be done again if it is there already" in causes
+    assert "to be ingested again if present" in causes
 
 
 def test_a_dry_run_says_what_would_be_done_and_does_nothing(first_night, tmp_path):
@@ -237,7 +237,7 @@ def test_a_dry_run_says_what_would_be_done_and_does_nothing(first_night, tmp_pat
     )
     assert told.exit_code == 0, told.output
     assert "4 pending" in told.output
-    assert "by figures measured elsewhere: this store has no history of it" in told.output
+    assert "from default figures: this store has no earlier calls" in told.output
     assert not (tmp_path / "none").exists()
 
 

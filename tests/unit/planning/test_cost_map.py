@@ -250,7 +250,7 @@ def test_a_damaged_file_is_named_by_verify_and_by_who_reads_it_and_a_second_call
         open_cost_map(out, card)
     assert make_cost_map(MODEL, source, out, cell_size_m=2.0).status == "done"
     (out / "cost-map.json").write_text((out / "cost-map.json").read_text().replace("16", "17"))
-    assert "not as it was written" in verify(out).problems[0]
+    assert "has changed since it was written" in verify(out).problems[0]
     assert read_cost_map_card(out) is None
     assert make_cost_map(MODEL, source, out, cell_size_m=2.0).status == "done"
     assert verify(out).problems == ()

@@ -79,7 +79,7 @@ def test_a_drive_that_was_trained_on_is_marked_and_in_no_sum(made, tmp_path):
 def test_what_cannot_be_compared_is_told(made):
     store, data, source = made
     with pytest.raises(
-        UsageError, match=r"elsewhere.mcap: no run of this log in .*; wanted its path or its run's name"
+        UsageError, match=r"elsewhere.mcap: no run of this log in .*; expected its path or its run's name"
     ):
         find_drive(store, "elsewhere.mcap")
     with pytest.raises(ModelError, match="is of robot husky, model physics of jackal"):

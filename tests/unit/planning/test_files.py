@@ -86,7 +86,7 @@ def test_a_path_that_leaves_the_map_is_done_in_part(source, tmp_path):
     found = predict_path(MODEL, source, tmp_path / "off.geojson", None)
     assert found.exit_code == 3
     assert "outside map" in str(found)
-    assert f"without {found.pieces_without_cost} of {found.pieces} pieces" in str(found)
+    assert f"without {found.pieces_without_cost} of {found.pieces} path segments" in str(found)
 
 
 def _request(source, **options) -> PlanRequest:
@@ -153,16 +153,16 @@ def test_a_cost_map_of_other_cells_gives_another_plan_and_a_damaged_one_is_refus
         assert plan(MODEL, source, request, out=out, picture=None).status == "done"
         assert plan(MODEL, source, request, out=out, picture=None).status == "unchanged"
     (costs / "cost-map.json").write_text("{}")
-    with pytest.raises(ModelError, match="not as it was written"):
+    with pytest.raises(ModelError, match="has changed since it was written"):
         plan(MODEL, source, request, out=out, picture=None)
 
 
 def test_files_of_the_user_are_left_alone(source, path):
     before = path.read_bytes()
-    with pytest.raises(UsageError, match="is no plan; it is left alone"):
+    with pytest.raises(UsageError, match="is no plan; it is not changed"):
         plan(MODEL, source, _request(source, cell_size_m=2.0), out=path, picture=None)
     mine = path.rename(path.with_suffix(".json"))
-    with pytest.raises(UsageError, match="is the path itself"):
+    with pytest.raises(UsageError, match="is the file of the path"):
         predict_path(MODEL, source, mine, mine)
     assert mine.read_bytes() == before
 

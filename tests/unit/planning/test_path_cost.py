@@ -165,7 +165,7 @@ def test_where_the_model_says_that_nothing_moves_there_is_no_cost():
 
 
 def test_a_model_of_something_else_is_refused():
-    with pytest.raises(ModelError, match="gives 1 numbers a patch, wanted two"):
+    with pytest.raises(ModelError, match="gives 1 numbers a patch, expected two"):
         _cost(plane(), (4.0, 4.0), (9.0, 4.0), model=_EnergyAlone())
 
 

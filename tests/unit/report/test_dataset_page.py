@@ -175,7 +175,7 @@ def test_a_damaged_dataset_says_so_on_its_page(built, tmp_path):
         if file.is_file():
             file.write_bytes(b"\0" * file.stat().st_size)
     html = render_dataset_report(tmp_path / "dataset")
-    for words in ("overview.png is lost or damaged", "where to drive next cannot be shown", "no patch is shown"):
+    for words in ("overview.png is missing or damaged", "where to drive next cannot be shown", "no patches are shown"):
         assert words in html
     assert data_of(html)["patches"] is None
 

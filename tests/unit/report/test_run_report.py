@@ -128,7 +128,7 @@ def test_a_run_without_power_map_or_sensors_says_so(tmp_path):
 def test_a_run_without_track_or_segments_is_a_page_too(tmp_path):
     empty = make_finding("no-segments", Subject("run", "run"), names={"reason": "gap"}, driven_m=12.0, lost_m=12.0)
     html = page_of(tmp_path, drive().slice(0, 0), distance_by_reason_m={"kept": 0.0, "gap": 12.0}, findings=(empty,))
-    assert "No track: the log holds nothing that could be fused." in html
+    assert "No track: the log has no measurements that can be fused." in html
     assert "no segments from 12 m driven; largest loss: gap, 12 m" in html
     assert "<td>gap</td>" in html
 

@@ -106,7 +106,7 @@ def test_sums_are_of_the_ruling_recipe_without_superseded_runs(store):
     driven_m = sum(sum(made.distance_by_reason_m.values()) for made in current)
     assert f"<div><b>{driven_m:.0f} m</b><span>driven</span></div>" in html
     assert "<div><b>3</b><span>runs</span></div>" in html
-    losses = html.split("<h2>Where every metre went</h2>")[1].split("</section>")[0]
+    losses = html.split("<h2>Distance breakdown</h2>")[1].split("</section>")[0]
     assert losses.index("<td>gap</td>") < losses.index("<td>stationary</td>")
 
 
@@ -140,11 +140,11 @@ def test_names_are_text_and_pages_are_led_to_where_they_are(store):
 
 def test_an_empty_store_and_one_of_failed_logs_alone_have_a_page(tmp_path):
     store = open_store(tmp_path / "store", create=True)
-    assert "No run can be used." in shown(store)[1]
+    assert "The store has no usable runs." in shown(store)[1]
     junk = Failure("1", "1" * 64, ("/logs/junk",), ("/logs/junk: is no log",), "0")
     open_log(store).commit("failed", Entries(failed=(junk,)))
     _, html, *_ = shown(store)
-    assert "No run can be used." in html
+    assert "The store has no usable runs." in html
     assert "junk: is no log" in html
     with pytest.raises(UsageError, match="is no dataset, run or store"):
         report(tmp_path)
@@ -169,7 +169,7 @@ def test_many_runs_are_all_told_and_some_can_be_read_without_scripts(store, monk
     monkeypatch.setattr("tcpipe.report.store_report.MOST_ROWS", 2)
     _, html, _, rows = shown(store)
     assert len(rows) == 5
-    assert "Without scripts the first 2 of 5 stand here." in html
+    assert "Without scripts the table shows the first 2 of 5." in html
     assert html.split("<h2>All runs</h2>")[1].split("</section>")[0].count("<tr>") == 3
 
 

@@ -348,7 +348,7 @@ def test_a_log_whose_only_motion_is_unusable_fails_and_says_why() -> None:
     lost = table.set_column(table.column_names.index("status.status"), "status.status", pa.array([-1] * 50, pa.int8()))
     with pytest.raises(RoleError) as error:
         read({"/fix": (kind, lost), "/imu/data": imu()})
-    assert error.value.problems[0].startswith("nothing in the log tells motion")
+    assert error.value.problems[0].startswith("no motion in the log")
     (unused,) = select_findings(error.value.findings, "messages-unused")
     assert unused.numbers["no_fix_count"] == 50
 
@@ -491,7 +491,7 @@ def test_a_gnss_message_of_ones_own_is_read_by_the_fields_the_recipe_names():
         np.testing.assert_allclose(found.tables["gnss"][name].to_numpy(), given, rtol=1e-12)
     with pytest.raises(RoleError) as caught:
         read(topics, topics={"gnss": ["/rtk/pvt"]}, fields={"gnss": {"latitude": "lat", "longitude": "pvt.lon"}})
-    assert "names lat, which its messages do not hold; they hold" in caught.value.problems[0]
+    assert "names lat, which its messages do not have; they have" in caught.value.problems[0]
 
 
 def pose(lon: np.ndarray, lat: np.ndarray) -> tuple[str, pa.Table]:
@@ -522,7 +522,7 @@ def test_a_pose_is_placed_by_its_crs_and_stands_in_for_the_fixes():
     local = read(topics, topics={"pose": ["/slam/pose"]})
     assert local.tables["pose"]["lon_deg"].null_count == 100
     assert "pose-not-georeferenced" in codes(local)
-    for crs, said in (("EPSG:4326", "not projected"), ("MTM 7", "not a coordinate reference system")):
+    for crs, said in (("EPSG:4326", "not projected"), ("MTM 7", "not a CRS")):
         with pytest.raises(RecipeError, match=said):
             read(topics, topics={"pose": ["/slam/pose"]}, pose_crs=crs)
 

@@ -85,10 +85,10 @@ def topic_of(definition, name="acme_msgs/msg/Thing", topic="/evil"):
             "L0 part\n" + "".join(f"{'=' * 80}\nMSG: acme_msgs/L{n}\nL{n + 1} part\n" for n in range(3000)),
             "nests more than 64 messages",
         ),
-        ("string[1000000000] texts\n", "holds 1000000000 texts or messages in arrays of fixed length"),
+        ("string[1000000000] texts\n", "contains 1000000000 texts or messages in arrays of fixed length"),
         (
             "Part[1000] parts\n" + "=" * 80 + "\nMSG: acme_msgs/Part\nstring[1000] texts\n",
-            "holds 1000000 texts or messages in arrays of fixed length",
+            "contains 1000000 texts or messages in arrays of fixed length",
         ),
         ("float64 { x\n", "cannot be parsed"),
         ("", "is unknown"),

@@ -95,8 +95,8 @@ def test_idl():
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("", "is unknown: the log holds no definition of it"),
-        ("  \n", "is unknown: the log holds no definition of it"),
+        ("", "is unknown: the log contains no definition of it"),
+        ("  \n", "is unknown: the log contains no definition of it"),
         ("other_msgs/Missing part\n", "other_msgs/msg/Missing, a part of acme_msgs/msg/Thing, is defined neither"),
         ("Thing[] children\n", "contains itself: acme_msgs/msg/Thing > acme_msgs/msg/Thing"),
         ("float64 x\n---\nfloat64 y\n", "that of a service, not of a message"),

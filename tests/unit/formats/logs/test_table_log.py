@@ -134,12 +134,12 @@ def test_all_that_a_mapping_names_in_vain_is_said_at_once(tmp_path):
     for words in (
         "tables.gnss.file: there is no fixes.csv here; there are imu.csv, late.csv, odom.csv",
         "tables.imu.columns: imu needs angular_velocity_y",
-        "tables.cmd: plays role 'cmd'; wanted role = one of gnss",
-        "column v of words.csv holds text ('fast' in row 1), wanted numbers",
+        "tables.cmd: role is 'cmd'; expected one of gnss",
+        "column v of words.csv contains text ('fast' in row 1), expected numbers",
         "odom.csv has no column px, py; it has t, v, w",
         "relative.csv, column t: its stamps",
         "/speed and /wheel_odometry have no time in common (they begin 1000.000 s apart)",
-        "notes.docx'; wanted a name that ends in .csv",
+        "notes.docx'; expected a name that ends in .csv",
     ):
         assert words in said
 
@@ -207,7 +207,7 @@ def test_a_folder_of_tables_is_ingested_as_one_log_and_what_is_in_the_way_is_sai
     folder = folder_with(tmp_path, odom=odometry())
     with pytest.raises(UsageError) as caught:
         ingest([folder], store=tmp_path / "store", recipe=Recipe())
-    assert "it holds 1 tables (odom.csv, …): map them in the recipe" in caught.value.problems[1]
+    assert "it contains 1 tables (odom.csv, …): map them in the recipe" in caught.value.problems[1]
     wrong = Recipe(tables={"gnss": TableMapping("fixes.csv")})
     with pytest.raises(UsageError) as caught:
         ingest([folder], store=tmp_path / "store", recipe=wrong)

@@ -423,17 +423,17 @@ def bad_rasters(directory: Path):
         ("height", write("globe.tif", np.zeros((1, 360, 720), np.float32), "EPSG:4326", world), "too large"),
         ("height", write("nodata.tif", np.full_like(good, -9.0), nodata=-9.0), "every pixel is nodata"),
         ("height", write("nan.tif", np.full_like(good, np.nan)), "every pixel is nodata"),
-        ("height", write("rgb.tif", np.zeros((3, 9, 9), np.uint8)), "3 bands.*wanted one"),
+        ("height", write("rgb.tif", np.zeros((3, 9, 9), np.uint8)), "3 bands.*expected one"),
         ("height", write("complex.tif", np.zeros((1, 9, 9), np.complex64)), "complex64"),
         ("height", write("cm.tif", good * 100.0), "not metres"),
-        ("ortho", write("float.tif"), "float32, wanted 8-bit or 16-bit"),
+        ("ortho", write("float.tif"), "float32, expected 8-bit or 16-bit"),
         ("ortho", write("five.tif", np.zeros((5, 9, 9), np.uint8)), "5 bands"),
         (
             "ortho",
             write("away.tif", np.ones((3, 9, 9), np.uint8), affine=Affine(1, 0, 5e5, 0, -1, 5e6)),
             "no data anywhere",
         ),
-        ("terrain", write("real.tif"), "float32, wanted integer"),
+        ("terrain", write("real.tif"), "float32, expected integer"),
         ("terrain", write("empty.tif", np.zeros((1, 400, 400), np.uint8), nodata=0), "no data anywhere"),
     ]
 
@@ -459,7 +459,7 @@ def test_several_wrong_rasters_are_named_at_once(tmp_path):
 
 def test_a_wanted_crs_must_be_metric(tmp_path):
     write_tif(tmp_path / "h.tif", raster_of(plane, NORTH_UP), None, NORTH_UP)
-    for crs, wanted in (("EPSG:3857", "not metric"), ("EPSG:4326", "not metric"), ("nonsense", "not a coordinate")):
+    for crs, wanted in (("EPSG:3857", "not metric"), ("EPSG:4326", "not metric"), ("nonsense", "not a CRS")):
         with pytest.raises(MapError, match=wanted):
             built(tmp_path, height=tmp_path / "h.tif", crs=crs)
     _, source = built(tmp_path, height=tmp_path / "h.tif", crs="EPSG:32633")

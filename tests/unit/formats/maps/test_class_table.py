@@ -53,7 +53,7 @@ def test_every_wrong_line_is_named(tmp_path):
     assert "from 1 to 255" in lines[1]
     assert "neither true nor false" in lines[2]
     assert "name is missing" in lines[3]
-    assert "value 5 stands for id 5 already" in lines[4]
+    assert "value 5 already has id 5" in lines[4]
     assert "id 5 was" in lines[5]
 
 
@@ -161,7 +161,7 @@ def polygon(ring):
 WRONG = {
     "many": ("[" * (MAX_VALUES + 1), "1500001 positions, rings and objects, at most 1500000; simplify it"),
     "nested": ('{"type":' + "[" * 200_000, "not JSON"),
-    "deep": ('{"a":' * 100_000 + "1" + "}" * 100_000, "not JSON|wanted an object with a 'type'"),
+    "deep": ('{"a":' * 100_000 + "1" + "}" * 100_000, "not JSON|expected an object with a 'type'"),
     "collections": (
         collections(200),
         "a GeometryCollection without a list of geometries, or more than 8 in one another",
@@ -171,7 +171,7 @@ WRONG = {
     "infinite": (polygon([*SQUARE[:4], [float("inf"), 1.0], SQUARE[0]]), "not rings of finite"),
     "nan": (polygon([*SQUARE[:4], [float("nan"), 1.0], SQUARE[0]]), "not rings of finite"),
     "huge": (polygon([[1e308, 1e308], *SQUARE[1:4], [1e308, 1e308]]), "no lon/lat degrees"),
-    "long": ('{"type": "' + "x" * 10**6 + '"}', "xxx…, wanted"),
+    "long": ('{"type": "' + "x" * 10**6 + '"}', "xxx…, expected"),
 }
 
 

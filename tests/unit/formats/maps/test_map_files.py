@@ -146,7 +146,7 @@ def test_of_a_map_in_a_bucket_the_tiles_that_are_read_are_fetched(wide, tmp_path
         whole = sum((served / layer / "c" / "0" / "0").stat().st_size for layer in here.layers)
         assert fetched.sent_bytes - opened < 0.1 * whole
         (served / "height" / "c" / "1" / "1").unlink()
-        with pytest.raises(MapError, match=r"height, rows 2050 to 2090.*cannot be read.*is gone"):
+        with pytest.raises(MapError, match=r"height, rows 2050 to 2090.*cannot be read.*is missing"):
             there.read("height", 2050, 2090, 2050, 2090)
 
 
@@ -176,12 +176,12 @@ def test_a_layer_that_is_gone_is_named(path, tmp_path):
     copy = tmp_path / "copy.zarr"
     shutil.copytree(path, copy)
     shutil.rmtree(copy / "ortho")
-    with pytest.raises(MapError, match="the map's ortho is gone"):
+    with pytest.raises(MapError, match="the map's ortho is missing"):
         open_map(copy)
     shutil.rmtree(copy)
     shutil.copytree(path, copy)
     shutil.rmtree(copy / "overviews" / "4")
-    with pytest.raises(MapError, match=r"the map's overviews/4/height, .* is gone"):
+    with pytest.raises(MapError, match=r"the map's overviews/4/height, .* is missing"):
         open_map(copy)
 
 
@@ -203,7 +203,7 @@ def test_tiles_are_windows_and_hold_no_data_beyond_the_map(path):
         ("grid.rows", 10**9, "pixels"),
         ("grid.rows", 0, "pixels"),
         ("grid.rows", -5, "pixels"),
-        ("grid.cols", "wide", "wanted a whole number"),
+        ("grid.cols", "wide", "expected a whole number"),
         ("tile_px", 0, "tiles and overviews"),
         ("factors", [1, 0], "tiles and overviews"),
         ("factors", [1, 10**12], "tiles and overviews"),

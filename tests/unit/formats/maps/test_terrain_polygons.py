@@ -132,7 +132,7 @@ def test_drawings_that_cannot_be_placed_are_refused_in_one_line(tmp_path, height
         (collection(tmp_path, feature(swapped, **mud)), "axes swapped"),
         (collection(tmp_path, feature(projected, **mud), name="p.geojson"), "no lon/lat degrees: they look projected"),
         (collection(tmp_path, feature(FIELD, **mud), name="u.geojson", crs=utm), "declares the CRS"),
-        (collection(tmp_path, feature(far, **mud), name="f.geojson"), r"they lie around 10.05.*the map covers 15.7"),
+        (collection(tmp_path, feature(far, **mud), name="f.geojson"), r"they are around 10.05.*the map covers 15.7"),
         (collection(tmp_path, feature(bow, **mud), name="b.geojson"), "Self-intersection"),
         (collection(tmp_path, feature([], **mud), name="e.geojson"), "geometry is empty"),
         (collection(tmp_path, feature([0.0, 0.0], "Point", **mud), name="o.geojson"), "geometry is 'Point'"),

@@ -69,7 +69,7 @@ def hostile(site, secret, address):
     yield (
         "text.tif",
         "root:x:0:0",
-        "is something else, not a raster that is read; wanted GeoTIFF, JPEG 2000 or ERDAS Imagine$",
+        "is something else, not a raster that is read; expected GeoTIFF, JPEG 2000 or ERDAS Imagine$",
     )
     yield "empty.tif", "", "is empty"
     yield "polyglot.tif", f"EHFA_HEADER_TAG {VRT.format(0, secret)}", "virtual raster"

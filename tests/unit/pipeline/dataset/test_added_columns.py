@@ -137,7 +137,7 @@ def test_a_tag_is_held_out_whole(store, tmp_path):
 def test_a_holdout_wants_a_tag_that_all_runs_carry(store, tmp_path):
     with pytest.raises(DatasetError, match=r"1 of 4 runs do not have it \(a\)"):
         build(store, tmp_path / "out", holdout="tag:driver")
-    with pytest.raises(RecipeError, match=r"wanted split\.holdout_tag too"):
+    with pytest.raises(RecipeError, match=r"expected split\.holdout_tag too"):
         build(store, tmp_path / "out", holdout="tag")
 
 

@@ -67,7 +67,7 @@ def test_what_was_driven_twice_gives_the_noise_that_was_put_in(balance):
 def test_the_page_shows_every_cell_by_class_and_by_speed(built, balance):
     page = (built / "report.html").read_text()
     by_class, by_speed = page.split("<h2>Balance of class and slope")[1].split("<h2>Balance of class, slope and speed")
-    by_speed = by_speed.split("<h2>Repeatability: no model can beat this")[0]
+    by_speed = by_speed.split("<h2>Repeatability: lower bound of model errors")[0]
     for cells, shown in ((balance["by_class_and_slope"], by_class), (balance["cells"], by_speed)):
         found = [int(count) for count in re.findall(r"<td[^>]*><span[^>]*>(\d+) \(\d+\)\*?</span></td>", shown)]
         assert sorted(found) == sorted(sum(cell["samples"].values()) for cell in cells if any(cell["samples"].values()))

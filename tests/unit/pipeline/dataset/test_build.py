@@ -206,7 +206,7 @@ def test_a_map_that_lost_a_part_is_refused_and_not_taken_for_a_hole(store, tmp_p
     for path in [part] if part.is_file() else sorted(path for path in part.rglob("*") if path.is_file()):
         path.unlink()
     line = refused(store, tmp_path, MapError)
-    assert "map site: not as it was written" in line
+    assert "map site: changed since it was written" in line
     assert "add the map again" in line
 
 
@@ -227,7 +227,7 @@ EVERYTHING = box(-20, -20, 20, 20)
     [
         ([box(1000, 0, 1100, 100)], DatasetError, ("covers none of the 20 samples", "about 0.99 km")),
         ([box(-20, -0.4, 20, 0.4)], DatasetError, ("no whole footprint",)),
-        ([EVERYTHING, EVERYTHING], DatasetError, ("20 of 20 samples lie in its exclude polygons",)),
+        ([EVERYTHING, EVERYTHING], DatasetError, ("20 of 20 samples are in its exclude polygons",)),
         (json.dumps(SWAPPED), DatasetError, ("axes swapped",)),
         ("{", RegionError, ("not GeoJSON",)),
     ],

@@ -74,11 +74,11 @@ def test_from_a_store_in_a_bucket_the_same_dataset_is_built(made, bucket, tmp_pa
 
 def test_what_lies_there_and_is_no_dataset_is_left_alone(made, bucket):
     (bucket[0] / "notes.txt").write_text("mine")
-    with pytest.raises(UsageError, match=r"s3://sets: holds notes.txt and no dataset.json; it is left alone"):
+    with pytest.raises(UsageError, match=r"s3://sets: contains notes.txt and no dataset.json; it is not changed"):
         build_dataset("s3://sets", store=made / "store", recipe=Recipe())
     assert files(bucket[0]) == {"notes.txt": b"mine"}
     shutil.copytree(made / "store", bucket[0] / "st")
-    with pytest.raises(UsageError, match=r"s3://sets/st: holds index and no dataset.json; it is left alone"):
+    with pytest.raises(UsageError, match=r"s3://sets/st: contains index and no dataset.json; it is not changed"):
         build_dataset("s3://sets/st", store=made / "store", recipe=Recipe())
 
 

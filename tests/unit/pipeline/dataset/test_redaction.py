@@ -174,7 +174,7 @@ def test_verify_says_that_it_is_redacted_and_finds_what_is_told_all_the_same(bui
     assert list(find_leaks(card, samples)) == []
     assert len(list(find_leaks(card, read_samples(here / "told")))) == 7
     found = list(find_leaks(replace(card, findings=(*card.findings, LEAKING[0])), samples))
-    assert found == ["it is said to be redacted, but a finding topic-not-used holds more than is public"]
+    assert found == ["it is marked as redacted, but a finding topic-not-used contains more than is public"]
     assert list(find_leaks(replace(card, maps=read_card(here / "told").maps), samples))
 
 
@@ -253,7 +253,7 @@ def test_distances_do_not_tell_the_scale_of_the_plane(built):
         as_before = as_before.set_column(at, name, [(redacted[name].to_numpy() * k / 0.01).round() * 0.01])
     assert compute_plane_per_chord(as_before)[0] == pytest.approx(k, abs=5 * std)
     assert any(
-        "the scale of the maps' plane tells the place" in line
+        "the scale of the maps' plane reveals the place" in line
         for line in find_leaks(read_card(here / "redacted"), as_before)
     )
 

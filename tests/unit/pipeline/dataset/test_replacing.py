@@ -58,7 +58,7 @@ def refused(here: Path, **how: object) -> tuple[str, ...]:
             build_dataset(here / "dataset", **usual(here, dry_run=dry_run, **how))
         problems.append(caught.value.problems)
     assert problems[0] == problems[1]
-    assert "made with other options and is kept; give another OUT, or replace it with --force" in problems[0][0]
+    assert "made with other options and is not changed; give another OUT, or replace it with --force" in problems[0][0]
     assert tree(here / "dataset") == before
     return tuple(line.partition("dataset: ")[2] for line in problems[0][1:])
 
@@ -161,7 +161,7 @@ def test_a_redacted_dataset_does_not_tell_its_options(here):
 def test_what_is_no_dataset_is_left_alone_with_force_too(here, force):
     for name, error, text in (
         ("notes.txt", UsageError, "exists and is not a dataset"),
-        ("dataset.json", DatasetError, "is left alone, since its inputs are unknown; move it away"),
+        ("dataset.json", DatasetError, "is not changed, because its inputs are unknown; move it away"),
     ):
         (here / "folder").mkdir(exist_ok=True)
         (here / "folder" / name).write_text("{}")
@@ -178,7 +178,7 @@ def test_in_a_bucket_the_differences_are_named_too_and_force_builds_the_next_gen
         in_environment(monkeypatch, environment, here / "cache")
         with pytest.raises(UsageError) as caught:
             build_dataset("s3://sets/ds", **usual(here, map_name="yard"))
-        assert "was made with other options and is kept" in caught.value.problems[0]
+        assert "was made with other options and is not changed" in caught.value.problems[0]
         assert caught.value.problems[1:] == (f"s3://sets/ds: {OTHER['map_name'][1]}",)
         assert build_dataset("s3://sets/ds", **usual(here)).status == "unchanged"
         assert tree(here / "served" / "sets" / "ds") == tree(here / "dataset")
