@@ -17,6 +17,7 @@ from tcpipe.formats.integrity import write_sealed
 from tcpipe.learning.models import WEIGHTS, load_model
 from tcpipe.pipeline.generations import write_generation
 from tcpipe.pipeline.verify import verify
+from tcpipe.tables.options import EARLIER_MODEL_KEYS, rename_keys
 
 pytest.importorskip("torch")
 
@@ -83,6 +84,21 @@ def test_another_card(tmp_path, change, match):
     card = json.loads((place / "model.json").read_text())
     write_sealed(place / "model.json", {**card, **change})
     _refused(place, match)
+
+
+def test_a_card_of_0_8_is_read_by_the_names_of_today(tmp_path):
+    place = made_model(tmp_path / "model")
+    earlier = {new: old for old, new in EARLIER_MODEL_KEYS.items()}
+    card = rename_keys(json.loads((place / "model.json").read_text()), earlier) | {
+        "schema_version": 2,
+        "label_energy": "above_standing",
+    }
+    card["training"]["config"] |= {"model": "table", "label": "above_standing"}
+    assert {"seen", "beside"} <= card.keys()
+    write_sealed(place / "model.json", card)
+    read = load_model(place).card
+    assert read == replace(CARD, label_energy="net", training=read.training, checksums=read.checksums)
+    assert (read.training.config.model, read.training.config.label) == ("boosting", "net")
 
 
 def test_an_edited_card_is_refused_and_every_damaged_file_is_named(tmp_path):
