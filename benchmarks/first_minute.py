@@ -37,9 +37,9 @@ def first_minute(log: Path, out: Path) -> Path:
 def promise_of(log: Path) -> tuple[ExpectedYield, str]:
     """Return what a log promises, and one sigma of its E."""
     found = preflight(log, recipe=Recipe())
-    assert found.promise is not None, found.problems
-    std = found.promise.relative_std_median["energy"]
-    return found.promise, "none" if std is None else f"{100 * std:.1f} %"
+    assert found.expected_yield is not None, found.problems
+    std = found.expected_yield.relative_std_median["energy"]
+    return found.expected_yield, "none" if std is None else f"{100 * std:.1f} %"
 
 
 def main() -> None:

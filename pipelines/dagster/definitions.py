@@ -173,7 +173,7 @@ def dataset() -> dg.MaterializeResult:
             "status": made["status"],
             "samples": card["samples"],
             **{f"{name}_samples": count for name, count in card["splits"].items()},
-            **({"doubtful_share": card["doubtful"]["share"]} if card["doubtful"] else {}),
+            **({"flagged_share": card["flagged_samples"]["share"]} if card["flagged_samples"] else {}),
             "where_every_metre_went": _ledger(card["distance_by_reason_m"]),
             "findings": _listed(list_findings(findings)),
             "page": dg.MetadataValue.path(str(Path(out).absolute() / "report.html")),

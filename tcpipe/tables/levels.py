@@ -28,9 +28,9 @@ READ_VERSIONS = (DATA_MODEL_VERSION,)
 EARLIER_VERSIONS = ("2.0", "2.1")
 """Versions that `tcpipe migrate` brings to the current one."""
 
-TABLES_VERSION = "2.1"  # in which a table last changed
+TABLES_VERSION = "3.0"  # in which a table last changed
 
-READ_TABLES = ("2.0", TABLES_VERSION)
+READ_TABLES = (*EARLIER_VERSIONS, TABLES_VERSION)
 """Versions of tables that are read as they are."""
 
 GEOMETRY = "geometry"

@@ -97,7 +97,7 @@ def opened(request, chromium, dataset):
 def evaluation(dataset, tmp_path_factory):
     here = tmp_path_factory.mktemp("evaluated")
     train(dataset, here / "physics", config=FitConfig(model="physics"))
-    run_evaluation(here / "physics", dataset, here / "evaluation", config=EvaluateConfig(draws=1))
+    run_evaluation(here / "physics", dataset, here / "evaluation", config=EvaluateConfig(noise_draws=1))
     return here / "evaluation/evaluation.html"
 
 
