@@ -380,7 +380,7 @@ def check_local_output(path: str | Path) -> Path:
     """Return where something is written. `UsageError`: it is a URL, of which a local directory ``s3:`` would become."""
     found = _LIKE_A_URL.match(str(path))
     if found and "://" in str(path):
-        raise UsageError(f"{path}: is a URL; this output is local: give a path, and copy the result")
+        raise UsageError(f"{path}: is a URL; tcpipe writes this on this machine: give a path, and copy the result")
     if found:
         raise UsageError(f"{path}: is no URL; expected {found[0]}/bucket/name, or a path of this machine")
     return Path(path)

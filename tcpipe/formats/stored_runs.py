@@ -108,7 +108,9 @@ class Lost:
 
     def __str__(self) -> str:
         """Return it as one line."""
-        how = "is gone" if self.size_bytes is None else f"has {self.size_bytes} bytes, expected {self.expected_bytes}"
+        how = (
+            "is missing" if self.size_bytes is None else f"has {self.size_bytes} bytes, expected {self.expected_bytes}"
+        )
         return f"{self.where}: {how}; ingest the log again"
 
 

@@ -159,7 +159,7 @@ def sort_runs(store: StoreFacts) -> list[StoredRun]:
         for (run_id, recipe_id), facts in found.rows.items()
     ]
     rows.sort(key=lambda run: (-run.begin_ns, run.run_id, not run.is_current, run.recipe_id))
-    rows += [StoredRun(*part, "not as it was written", None, "", (), ()) for part in found.damaged]
+    rows += [StoredRun(*part, "files changed or missing", None, "", (), ()) for part in found.damaged]
     return rows + [
         StoredRun(name, "", f"of data model {head.data_model_version}", None, "", (), ())
         for name, head in found.outdated.items()

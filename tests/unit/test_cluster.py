@@ -64,7 +64,7 @@ def test_a_worker_of_another_version_is_refused(cluster, monkeypatch):
 
 def test_what_a_worker_or_the_scheduler_lacks_is_one_line(cluster, tmp_path, monkeypatch):
     with pytest.raises(
-        UsageError, match=r"tcp://.*: a worker lacks nowhere_to_be_had; install the same packages is installed"
+        UsageError, match=r"tcp://.*: a worker lacks nowhere_to_be_had; install the same packages there"
     ):
         list(run_all(wants_more, [1], jobs=1, cluster=cluster.address))
     (tmp_path / "only_here.py").write_text("def task(value):\n    return value\n")

@@ -182,7 +182,7 @@ def test_functions_refuse_the_same_also_where_a_path_was_made_of_the_url(here, n
     for out in (Path("s3://bucket/out"), *(["s3://bucket/out"] if name not in ("add_map", "open_store") else [])):
         with pytest.raises(
             UsageError,
-            match=r"s3:/+bucket/out: is (a URL; this output is local|no URL; expected s3://bucket/name, or a path)",
+            match=r"s3:/+bucket/out: is (a URL; tcpipe writes this on|no URL; expected s3://bucket/name, or a path)",
         ):
             FUNCTIONS[name](out, here / "file")
     assert not (here / "s3:").exists()

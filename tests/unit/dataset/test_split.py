@@ -253,7 +253,7 @@ def test_channels_are_chosen_and_classes_become_planes(path):
     assert chosen.layers(np.arange(1)).keys() == {"height", "terrain"}
     np.testing.assert_array_equal(train.with_channels("ortho").patches[..., 0], train.patches[..., 0])
     np.testing.assert_array_equal(train.with_channels("terrain").patches[..., 0], train.patches[..., 1])
-    with pytest.raises(DatasetError, match="can give ortho, terrain, height, terrain_one_hot"):
+    with pytest.raises(DatasetError, match="this dataset has ortho, terrain, height, terrain_one_hot"):
         train.with_channels("colour")
 
 

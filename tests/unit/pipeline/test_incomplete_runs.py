@@ -105,7 +105,7 @@ def test_what_a_run_lost_is_a_problem_to_every_command_until_it_is_back(place, t
         assert list(inspect(root, recipe=Recipe()).damaged_runs)
         assert len(Store(root).ingestions().finished) == 2
     reporting.report(root, runs=False)
-    assert "have changed since they were written" in (files / "report.html").read_text()
+    assert "files changed or missing" in (files / "report.html").read_text()
     assert Store(root).state() == before
     put_back()
     assert not Store(root).ingestions().damaged

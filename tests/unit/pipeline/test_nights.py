@@ -89,7 +89,7 @@ def test_a_half_copied_log_that_lies_elsewhere_too_still_counts(tmp_path, night)
     half = night()[0]["run.mcap"].run.run_id
     shutil.copy(whole, log)
     (note,) = night()[0]["run.mcap"].notes
-    assert note.endswith(f"stays: its recording lies at {tmp_path}/logs/twin.mcap")
+    assert note.endswith(f"stays: its log is at {tmp_path}/logs/twin.mcap")
     assert half in counted(tmp_path)
 
 

@@ -130,7 +130,7 @@ def test_where_sensors_disagree_with_the_track_is_on_the_page(store):
     each = Disagreement(start_ns + 10**10, start_ns + 2 * 10**10, "gnss", "position", 0.49, "m", 0.016, alone=False)
     facts = replace(info.report.facts, audit=AuditFacts((each,)))
     told = replace(run.manifest, info=replace(info, report=StageReport((), facts)))
-    (section,) = [s for s in make_sensor_sections(None, told, run.rejections()) if "disagree" in s.title]
+    (section,) = [s for s in make_sensor_sections(None, told, run.rejections()) if "Disagree" in s.title]
     assert section.rows == [("gnss", "position", "10 to 20 s", "0.49 m", "0.016 m", "σ inflated, segments flagged")]
 
 

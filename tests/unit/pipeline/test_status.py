@@ -223,7 +223,7 @@ def test_a_run_whose_log_s_document_is_gone_is_named_and_asked_for_again(first_n
 def test_a_store_that_is_not_there_is_named_as_it_was_given(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     told = CliRunner().invoke(cli, ["status", "nosuch"])
-    assert str(told.exception) == "nosuch: there is no store here, nor one at tcpipe-store; name it with --store"
+    assert str(told.exception) == "nosuch: no store here and none at tcpipe-store; name one with --store"
 
 
 def test_a_dry_run_of_what_is_forced_says_that_it_is_done_again(first_night):

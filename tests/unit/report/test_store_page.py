@@ -162,7 +162,7 @@ def test_a_run_that_cannot_be_read_is_named_and_costs_no_other_page(tmp_path):
         report(store.root)
     rows = {row["run"]: row for row in shown(store)[3]}
     assert (rows["a"]["href"] != "", rows["b"]["href"], rows["c"]["href"]) == (True, "", "")
-    assert rows["c"]["state"] == "not as it was written"
+    assert rows["c"]["state"] == "files changed or missing"
 
 
 def test_many_runs_are_all_told_and_some_can_be_read_without_scripts(store, monkeypatch):

@@ -73,7 +73,7 @@ def test_a_run_whose_ground_lies_elsewhere_on_the_map_is_a_warning(built):
     assert sizes == pytest.approx([1.7, -1.5, 0.8], abs=0.05)
     assert shifted.numbers["std_m"] < 0.1
     assert result.card.verdict.position == "not usable"
-    assert "error: off: its ground lies 1.7" in str(result)
+    assert "error: off: the terrain is shifted by 1.7" in str(result)
 
 
 def test_the_card_keeps_every_runs_registration(built):

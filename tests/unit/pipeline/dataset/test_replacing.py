@@ -161,7 +161,7 @@ def test_a_redacted_dataset_does_not_tell_its_options(here):
 def test_what_is_no_dataset_is_left_alone_with_force_too(here, force):
     for name, error, text in (
         ("notes.txt", UsageError, "exists and is not a dataset"),
-        ("dataset.json", DatasetError, "is not changed, because its inputs are unknown; move it away"),
+        ("dataset.json", DatasetError, "is not changed, because its inputs are unknown; move it"),
     ):
         (here / "folder").mkdir(exist_ok=True)
         (here / "folder" / name).write_text("{}")
