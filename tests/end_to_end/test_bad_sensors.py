@@ -598,7 +598,9 @@ def test_a_pose_that_nobody_names_is_offered_as_what_it_can_be(drive, tmp_path):
 def test_an_offset_of_a_role_that_is_not_there_is_an_error_and_a_placement_a_warning(drive, tmp_path):
     topics = {"read": {"topics": {"pose": [POSE_TOPIC]}}}
     other = with_pose(drive)
-    with pytest.raises(RoleError, match=r"read.time_offset_s.gnss: no topic of this log plays gnss.*are there: .*pose"):
+    with pytest.raises(
+        RoleError, match=r"read.time_offset_s.gnss: no topic of this log is used as gnss.*roles in the log: .*pose"
+    ):
         read(other, tmp_path, parse_recipe(merged(topics, {"read": {"time_offset_s": {"gnss": -0.3}}}), where="").read)
     placed = {"read": {"extrinsics": {"gnss": {"xyz_m": [0.1, 0.0, 0.5]}}}}
     found = read(other, tmp_path, parse_recipe(merged(topics, placed), where="").read)

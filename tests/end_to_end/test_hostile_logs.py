@@ -172,7 +172,7 @@ HOSTILE = {
     "records.bag": (bag(bag_chunk(bz2.compress(bytes(12_000_000)), b"bz2", 12_000_000)), BOMB),
     "claims.bag": (bag(bag_chunk(lz4.frame.compress(bytes(1 << 28)), b"lz4", 1 << 31)), "a length, type or field is impossible"),
     "connections.bag": (bag(bag_chunk(b"".join(bag_record(7, b"", conn=struct.pack("<I", n), topic=b"/t") for n in range(70_000)))), BOMB),
-    "long metadata": (directory("x: [1, 2]\n" * 300_000), "file-unlisted"),
+    "long metadata": (directory("x: [1, 2]\n" * 300_000), "is damaged"),
     "files": (directory("", 4200), "bags of up to 4096 are read"),
     "names of files": (directory("rosbag2_bagfile_information:\n  relative_file_paths:\n" + "  - a\n" * 5000), "names 5000 files"),
     "links": (linked, ""),

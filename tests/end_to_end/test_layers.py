@@ -143,7 +143,7 @@ def test_a_changed_pixel_of_an_own_layer_is_found(datasets, tmp_path):
 
 
 def test_a_layer_that_is_not_there_is_refused_in_a_line(datasets):
-    with pytest.raises(DatasetError, match="channels asked for: soil; this dataset can give ortho, terrain"):
+    with pytest.raises(DatasetError, match="requested channels: soil; this dataset has ortho, terrain"):
         tcpipe.open_dataset(datasets / "zarr", layers=["ortho", "soil"])
 
 

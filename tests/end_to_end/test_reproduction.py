@@ -127,7 +127,7 @@ def test_an_interrupted_training_ends_as_one_that_is_not(reproduced, tmp_path):
     assert "no output is incomplete" in told
     assert [path.name for path in tmp_path.iterdir()] == ["stopped.checkpoint"]
     resumed, whole = (tcpipe(*options, name, cwd=tmp_path, env=ENV) for name in ("stopped", "whole"))
-    assert "stopped: goes on after epoch" in resumed.stderr
+    assert "stopped: resumes after epoch" in resumed.stderr
     assert whole.returncode == 0
     assert {path.name: path.read_bytes() for path in (tmp_path / "stopped").iterdir()} == {
         path.name: path.read_bytes() for path in (tmp_path / "whole").iterdir()
@@ -141,7 +141,7 @@ def test_bad_input_is_one_plain_line(reproduced):
     assert "there is no such directory" in plain_lines(nowhere, 2)
     networks = here / "here" / "seed-0" / "evaluation" / "networks"
     baseline = next(networks.glob("wei_isler_*"))
-    assert "it predicts energy_joule alone" in plain_lines(
+    assert "it predicts only energy_joule" in plain_lines(
         tcpipe("evaluate", baseline, "here/dataset", "of-energy", cwd=here, env=ENV), 1
     )
     (here / "mine").mkdir()

@@ -69,7 +69,7 @@ def test_a_sample_is_traced_to_its_log_and_made_again_bit_for_bit(work, ids):
     done = tcpipe("explain", ids[0], "--dataset", "dataset", "--store", "tcpipe-store", "--quiet", cwd=work)
     assert done.returncode == 0, done.stdout
     lines = done.stdout.splitlines()
-    assert lines[-1] == "made again from the streams: identical"
+    assert lines[-1] == "computed again from the streams: identical"
     assert {"labels", "log", "stamps", "messages", "map", "recipe", "versions"} <= {
         line.split()[0] for line in lines[1:-1]
     }
