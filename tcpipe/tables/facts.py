@@ -318,7 +318,7 @@ class EnergyBudget:
 
 @dataclass(frozen=True, slots=True)
 class PhysicsTerm:
-    """A coefficient of P = standing + drivetrain v / cos(s) + rolling v + grade v tan(s) + turning |yaw rate|, with its deviation."""
+    """A coefficient of P = idle + drivetrain v / cos(s) + rolling v + grade v tan(s) + turning |yaw rate|, with its deviation."""
 
     term: str
     """``idle``, ``drivetrain`` (motors and gears, paid on any grade), ``rolling``, ``grade`` or ``turning``."""

@@ -158,29 +158,33 @@ EARLIER_DOCUMENT_KEYS = {
     "remarks": "notes",
     "pitch_m": "pixel_size_m",
     "doubtful": "flagged_samples",
-    "usual_turn_radpm": "mean_turn_radpm",
 }
 """Keys of manifests and cards; `tcpipe migrate` renames them."""
-
 
 EARLIER_MODEL_KEYS = {
     "beside": "extra_features",
     "seen": "training_range",
     "batch": "batch_size",
     "weights": "inverse_variance_weights",
-    "usual_turn_radpm": "mean_turn_radpm",
-    "standing": "idle",
 }
 """Keys of model.json."""
 
+_EARLIER_PHYSICS = {"standing": "idle", "usual_turn_radpm": "mean_turn_radpm"}
+"""Terms and keys below a key ``physics``."""
 
-def rename_keys(document: Any, names: Mapping[str, str] = EARLIER_DOCUMENT_KEYS) -> Any:
+
+def rename_keys(document: Any, names: dict[str, str] = EARLIER_DOCUMENT_KEYS) -> Any:
     """Return a document, or a part of one, with keys by their names of today."""
     if isinstance(document, list):
         return [rename_keys(item, names) for item in document]
     if not isinstance(document, Mapping):
         return document
-    return {names.get(key, key): rename_keys(value, names) for key, value in document.items()}
+    return {
+        names.get(key, key): _EARLIER_PHYSICS.get(value, value)
+        if key == "term"
+        else rename_keys(value, names | _EARLIER_PHYSICS if key == "physics" else names)
+        for key, value in document.items()
+    }
 
 
 EARLIER_CHOICES = {"table": "boosting", "above_standing": "net"}

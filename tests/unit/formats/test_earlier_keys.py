@@ -6,6 +6,7 @@ import pytest
 
 from tcpipe.errors import RecipeError
 from tcpipe.formats.recipe_toml import load_recipe, parse_recipe
+from tcpipe.tables.options import rename_keys
 
 EARLIER = """
 [gate]
@@ -41,3 +42,12 @@ def test_keys_of_0_8_are_read_with_one_note(tmp_path: Path, caplog: pytest.LogCa
 def test_a_key_by_both_names_is_an_error() -> None:
     with pytest.raises(RecipeError, match="unknown key gate; known here"):
         parse_recipe({"gate": {}, "mask": {}}, where="r")
+
+
+def test_terms_of_physics_and_reasons_of_the_distance_breakdown_have_their_own_names() -> None:
+    terms = {"terms": [{"term": "standing", "value": 14.0}], "energy_share": {"standing": 0.1}, "usual_turn_radpm": 0.2}
+    found = rename_keys({"ledger_m": {"standing": 1.0}, "physics": {"husky": terms}})
+    assert found["distance_by_reason_m"] == {"stationary": 1.0}
+    assert found["physics"]["husky"] == {
+        "terms": [{"term": "idle", "value": 14.0}], "energy_share": {"idle": 0.1}, "mean_turn_radpm": 0.2,
+    }  # fmt: skip
