@@ -21,7 +21,7 @@ FLOORS = {"label_floor": "label noise alone", "simulation_floor": "simulation's 
 """Lower bounds of errors, and their names on the page."""
 
 MEASURES = {"rmse": "RMSE", "mape_percent": "MAPE"}
-SCORES = {"coverage_percent": "coverage of 90 %", "nll": "NLL", "crps": "CRPS"}
+SCORES = {"coverage_percent": "coverage", "nll": "NLL", "crps": "CRPS"}
 """How well a model states its own errors (`tcpipe.learning.metrics`)."""
 _ALL_MEASURES = MEASURES | SCORES
 
