@@ -21,7 +21,7 @@ FLOORS = {"label_floor": "label noise alone", "simulation_floor": "simulation's 
 """Lower bounds of errors, and their names on the page."""
 
 MEASURES = {"rmse": "RMSE", "mape_percent": "MAPE"}
-SCORES = {"coverage_percent": "coverage", "nll": "NLL", "crps": "CRPS"}
+SCORES = {"coverage_percent": "in 90 %", "nll": "NLL", "crps": "CRPS"}
 """How well a model states its own errors (`tcpipe.learning.metrics`)."""
 _ALL_MEASURES = MEASURES | SCORES
 
@@ -146,7 +146,7 @@ def _make_baselines_section(found: Evaluation) -> Section:
                 if (row.split, row.quantity) == (split, quantity):
                     figures = [*_format_figures(row.errors, quantity, MEASURES), *_BLANK]
                     rows.append(("", "", row.baseline, *figures, str(row.rmse_ratio), str(row.mape_ratio)))
-    header = ("", "", "", "RMSE", "MAPE [%]", "coverage of 90 % [%]", "NLL", "CRPS", "ratio of RMSE", "ratio of MAPE")
+    header = ("", "", "", "RMSE", "MAPE [%]", "in 90 % [%]", "NLL", "CRPS", "ratio of RMSE", "ratio of MAPE")
     text = (
         "The baselines use the training and test samples of the model. Ratios are the model's error over the "
         "baseline's, with their 95 % interval (paired bootstrap over runs or blocks): below 1 the model is better. Physics and boosting "
