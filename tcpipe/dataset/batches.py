@@ -64,7 +64,7 @@ class StoredPixels:
             return {layer: memory[layer][at] for layer in layers}
         return self._read(self.rows[at], layers)
 
-    def pieces_of(self, at: Ints) -> Ints:
+    def find_pieces(self, at: Ints) -> Ints:
         """Return the piece that holds each of the samples ``at``, (M,)."""
         return np.asarray(np.searchsorted(self.files.starts, self.rows[at], side="right") - 1)
 
@@ -76,7 +76,7 @@ class StoredPixels:
         Yielded are arrays of the pool, which the next one overwrites; rows in them, and which of ``at`` these are, both (B,). The first
         ``spare`` rows are the caller's. ``rng`` shuffles the pieces and the samples within each pool; None keeps the order of the files.
         """
-        files, rows, piece_of = self.files, self.rows[at], self.pieces_of(at)
+        files, rows, piece_of = self.files, self.rows[at], self.find_pieces(at)
         order = np.argsort(piece_of, kind="stable")
         parts = np.split(order, np.flatnonzero(np.diff(piece_of[order])) + 1) if len(order) else []
         if rng is not None:
@@ -162,7 +162,7 @@ class Batches:
         number, count = self.shard
         self._samples = np.arange(len(self.view.at))
         if count > 1 and self.from_disk:
-            piece_of = self.view.stored.pieces_of(self.view.at)
+            piece_of = self.view.stored.find_pieces(self.view.at)
             self._samples = np.flatnonzero(np.isin(piece_of, np.unique(piece_of)[number::count]))
         elif count > 1:
             self._samples = self._samples[number::count]

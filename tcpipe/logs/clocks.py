@@ -433,17 +433,17 @@ def find_simulated_clock(stamps: Mapping[str, tuple[Ints, Ints]], *, published: 
     stamps : by topic, log times and header stamps [ns], each of shape (N,), a header's 0 where it is unset.
     published : whether the log holds a /clock topic; without, stamps must be no wall clock's.
     """
-    told = {name: (log[header > 0], header[header > 0]) for name, (log, header) in stamps.items() if _is_told(header)}
-    counting = [name for name, (_, header) in told.items() if _is_counting_clock(header, published=published)]
-    if not counting or 2 * len(counting) <= len(told):
+    used = {name: (log[header > 0], header[header > 0]) for name, (log, header) in stamps.items() if _is_timed(header)}
+    counting = [name for name, (_, header) in used.items() if _is_counting_clock(header, published=published)]
+    if not counting or 2 * len(counting) <= len(used):
         return None
-    log, clock = max((told[name] for name in counting), key=lambda of: len(of[0]))
+    log, clock = max((used[name] for name in counting), key=lambda of: len(of[0]))
     ahead = np.concatenate(([True], clock[1:] > np.maximum.accumulate(clock)[:-1]))
     log, first = np.unique(log[ahead], return_index=True)
     return SimulatedClock(log, clock[ahead][first], frozenset(counting)) if len(log) > 1 else None
 
 
-def _is_told(header_ns: Ints) -> bool:
+def _is_timed(header_ns: Ints) -> bool:
     known = int(np.count_nonzero(header_ns > 0))
     return known >= _FEWEST and known > _MOST_UNSET * len(header_ns)
 

@@ -22,6 +22,7 @@ READ = """
 import json, re, sys, time
 import tcpipe
 from tcpipe.errors import TcpipeError
+from tcpipe.formats.finding_lines import describe_finding
 from tcpipe.pipeline.inspect import inspect
 from tcpipe.recipe import Recipe
 
@@ -32,7 +33,7 @@ def most_bytes():  # getrusage's would hold what the parent had before this prog
 def read(path):
     with tcpipe.read_log(path) as log:
         rows = sum(table.num_rows for table in log.tables(log.topics).values())
-        return log.damage[:5], rows
+        return [describe_finding(finding) for finding in log.findings][:5], rows
 
 for path in sys.argv[1:]:
     for what, run in {
@@ -172,7 +173,7 @@ HOSTILE = {
     "records.bag": (bag(bag_chunk(bz2.compress(bytes(12_000_000)), b"bz2", 12_000_000)), BOMB),
     "claims.bag": (bag(bag_chunk(lz4.frame.compress(bytes(1 << 28)), b"lz4", 1 << 31)), "a length, type or field is impossible"),
     "connections.bag": (bag(bag_chunk(b"".join(bag_record(7, b"", conn=struct.pack("<I", n), topic=b"/t") for n in range(70_000)))), BOMB),
-    "long metadata": (directory("x: [1, 2]\n" * 300_000), "is damaged"),
+    "long metadata": (directory("x: [1, 2]\n" * 300_000), "metadata.yaml is missing, unusable or without this file"),
     "files": (directory("", 4200), "bags of up to 4096 are read"),
     "names of files": (directory("rosbag2_bagfile_information:\n  relative_file_paths:\n" + "  - a\n" * 5000), "names 5000 files"),
     "links": (linked, ""),

@@ -56,9 +56,7 @@ def test_a_run_guided_by_coverage_finds_nothing(name, tmp_path):
     command = [sys.executable, "-W", "ignore", TARGET_FILE, name, f"--runs={RUNS[name]}", "--seed=1"]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr[-3000:]
-    ended = re.search(
-        r"^Done (\d+) runs", done.stderr, re.MULTILINE
-    )  # libFuzzer sometimes does one more than it is asked for
+    ended = re.search(r"^Done (\d+) runs", done.stderr, re.MULTILINE)  # libFuzzer may do one more than is asked for
     assert ended is not None, done.stderr[-3000:]
     assert int(ended[1]) >= RUNS[name], done.stderr[-3000:]
     assert list(tmp_path.iterdir()) == []
