@@ -319,6 +319,24 @@ _NET_COLUMNS = tuple(
     )
 )
 
+_SCALE, _SENSOR = "scale of a lone odometry", "gain and zero of the power sensor"
+_COMMON_COLUMNS = tuple(
+    _make_nullable(
+        name,
+        unit,
+        f"part of {name.replace('_common', '')} that is one error of all segments of the run ({cause}): it adds up linearly over a path",
+        since="3.0",
+    )
+    for name, unit, cause in (
+        ("duration_common_std_s", "s", _SCALE),
+        ("velocity_common_std_mps", "m/s", _SCALE),
+        ("power_common_std_watt", "W", f"{_SENSOR}, {_SCALE}"),
+        ("energy_common_std_joule", "J", f"{_SENSOR}, {_SCALE}"),
+        ("net_power_common_std_watt", "W", f"idle power, gain of the power sensor, {_SCALE}"),
+        ("net_energy_common_std_joule", "J", f"idle power, gain of the power sensor, {_SCALE}"),
+    )
+)
+
 _LABEL_COLUMNS = (
     Column("duration_s", _F64, "s", "T: time from start to end"),
     Column("velocity_mps", _F64, "m/s", "v: chord / duration"),
@@ -329,12 +347,22 @@ _LABEL_COLUMNS = (
     _make_nullable("power_std_watt", "W", "standard deviation of the power, likewise; null without power"),
     _make_nullable("energy_std_joule", "J", "standard deviation of the energy, likewise; null without power"),
     *_NET_COLUMNS,
+    *_COMMON_COLUMNS,
     _make_nullable(
         "physics_power_watt",
         "W",
         "power predicted by the physics model fitted on the run; null without power or fit",
     ),
     Column("power_samples", pa.int32(), "1", "power samples inside the segment"),
+    Column(
+        "confirming_sensor_count",
+        pa.int32(),
+        "1",
+        "independent sensors of motion (GNSS or pose, wheels, camera) that measured in the segment and agree with its length and duration; "
+        "power has one sensor",
+        nullable=True,
+        since="3.0",
+    ),
     Column("quality", pa.uint32(), "bits", "limitations of the label, 0 = none", flags=Quality),
 )
 
