@@ -116,11 +116,11 @@ class PowerSource:
     propulsion: bool = True
     """Whether the current feeds only the drives; such sources have priority."""
     gain_std_fraction: Share = GAIN_STD_FRACTION
-    """Standard deviation of the gain of the sensor, as a fraction: one error of a whole run."""
+    """σ of the sensor's gain: one error of a whole run."""
     offset_std_amp: Annotated[float, Bounds(ge=0, le=1e4)] = OFFSET_STD_AMP
-    """Standard deviation of the zero of the current [A], likewise."""
+    """σ of the zero of the current, likewise [A]."""
     rest_current_amp: tuple[Amp, Amp] | None = None
-    """Lowest and highest current that the stationary robot can draw, if the hardware is known [A]; beyond is an offset of the sensor."""
+    """Lowest and highest current of the stationary robot, if known; beyond is an offset [A]."""
     other_loads: str = ""
     """Other loads of the current; named in a warning."""
     open_questions: str = ""

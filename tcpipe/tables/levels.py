@@ -319,23 +319,18 @@ _NET_COLUMNS = tuple(
     )
 )
 
-_SCALE, _SENSOR = "scale of a lone odometry", "gain and zero of the power sensor"
 _COMMON_COLUMNS = tuple(
-    _make_nullable(
-        name,
-        unit,
-        f"part of {name.replace('_common', '')} that is one error of all segments of the run ({cause}): it adds up linearly over a path",
-        since="3.0",
-    )
-    for name, unit, cause in (
-        ("duration_common_std_s", "s", _SCALE),
-        ("velocity_common_std_mps", "m/s", _SCALE),
-        ("power_common_std_watt", "W", f"{_SENSOR}, {_SCALE}"),
-        ("energy_common_std_joule", "J", f"{_SENSOR}, {_SCALE}"),
-        ("net_power_common_std_watt", "W", f"idle power, gain of the power sensor, {_SCALE}"),
-        ("net_energy_common_std_joule", "J", f"idle power, gain of the power sensor, {_SCALE}"),
+    _make_nullable(name, unit, f"part of {name.replace('_common', '')} that is one error of the whole run", since="3.0")
+    for name, unit in (
+        ("duration_common_std_s", "s"),
+        ("velocity_common_std_mps", "m/s"),
+        ("power_common_std_watt", "W"),
+        ("energy_common_std_joule", "J"),
+        ("net_power_common_std_watt", "W"),
+        ("net_energy_common_std_joule", "J"),
     )
 )
+"""Over a path these add up linearly."""
 
 _LABEL_COLUMNS = (
     Column("duration_s", _F64, "s", "T: time from start to end"),
@@ -358,8 +353,7 @@ _LABEL_COLUMNS = (
         "confirming_sensor_count",
         pa.int32(),
         "1",
-        "independent sensors of motion (GNSS or pose, wheels, camera) that measured in the segment and agree with its length and duration; "
-        "power has one sensor",
+        "GNSS or pose, wheels, camera: how many measured in the segment and agree with the track",
         nullable=True,
         since="3.0",
     ),
