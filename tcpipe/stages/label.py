@@ -34,12 +34,6 @@ from tcpipe.power.rails import (
     integrate_energy,
 )
 from tcpipe.recipe import LabelConfig
-from tcpipe.stages.label_common import (
-    compute_common_displacement_std_m,
-    count_confirming_sensors,
-    find_power_prior,
-    make_sensor_error,
-)
 from tcpipe.stages.label_motion import (
     find_label_findings,
     find_motion_flags,
@@ -48,6 +42,12 @@ from tcpipe.stages.label_motion import (
     make_label_facts,
     make_motion_columns,
     sum_energy_entries,
+)
+from tcpipe.stages.label_uncertainty import (
+    compute_common_displacement_std_m,
+    count_confirming_sensors,
+    find_power_prior,
+    make_sensor_error,
 )
 from tcpipe.stages.message_arrays import make_rails
 from tcpipe.tables.arrays import make_lines, select_rows, to_numbers
