@@ -145,7 +145,7 @@ def subtract_idle_power(
         end_power_watt - idle_watt,
         end_power_watt - cost.power_watt,
     )  # that an error of T is multiplied with
-    values = {
+    values: dict[str, Floats | float] = {
         "idle_power_watt": idle_watt,
         "idle_power_std_watt": idle_std_watt,
         "net_power_watt": cost.power_watt - idle_watt,

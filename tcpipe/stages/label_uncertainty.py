@@ -32,11 +32,9 @@ class PowerPrior:
 
 def find_power_prior(power: PowerSign | None, config: LabelConfig) -> PowerPrior:
     """Return what is known of the power sensor: by the recipe, else by the kind of source."""
-    told = (
-        (config.power_gain_std_fraction, power and power.gain_std_fraction, GAIN_STD_FRACTION),
-        (config.power_offset_std_amp, power and power.offset_std_amp, OFFSET_STD_AMP),
-    )
-    return PowerPrior(*(next(value for value in values if value is not None) for values in told))
+    gain = config.power_gain_std_fraction, power.gain_std_fraction if power else None, GAIN_STD_FRACTION
+    offset = config.power_offset_std_amp, power.offset_std_amp if power else None, OFFSET_STD_AMP
+    return PowerPrior(*(next(value for value in values if value is not None) for values in (gain, offset)))
 
 
 def make_sensor_error(cut: pa.Table, rails: list[Rail], prior: PowerPrior, *, rule: Rule) -> SensorError:
