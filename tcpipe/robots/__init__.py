@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
 from tcpipe.tables.bounds import Bounds
+from tcpipe.tables.findings import LEFT_OUT
 
 Size = Annotated[float, Bounds(ge=0.05, le=100)]
 """Of a robot [m]: from a toy's to a mining truck's."""
@@ -115,11 +116,13 @@ class PowerSource:
     """Sign of a drawn current; auto if it differs by robot: the mean over the run decides."""
     propulsion: bool = True
     """Whether the current feeds only the drives; such sources have priority."""
-    gain_std_fraction: Share = GAIN_STD_FRACTION
+    gain_std_fraction: Share = field(default=GAIN_STD_FRACTION, metadata={"json": (GAIN_STD_FRACTION,)})
     """σ of the sensor's gain: one error of a whole run."""
-    offset_std_amp: Annotated[float, Bounds(ge=0, le=1e4)] = OFFSET_STD_AMP
+    offset_std_amp: Annotated[float, Bounds(ge=0, le=1e4)] = field(
+        default=OFFSET_STD_AMP, metadata={"json": (OFFSET_STD_AMP,)}
+    )
     """σ of the zero of the current, likewise [A]."""
-    rest_current_amp: tuple[Amp, Amp] | None = None
+    rest_current_amp: tuple[Amp, Amp] | None = field(default=None, metadata=LEFT_OUT)
     """Lowest and highest current of the stationary robot, if known; beyond is an offset [A]."""
     other_loads: str = ""
     """Other loads of the current; named in a warning."""
