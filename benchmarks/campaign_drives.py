@@ -45,6 +45,10 @@ Messages = Sequence[MessageStream]
 
 QUANTITIES = {"T": "duration_s", "v": "velocity_mps", "w": "power_watt", "E": "energy_joule", "start": "position_m"}
 """What is compared with the truth, and its column; the last is the start point's place."""
+RING = float(np.sqrt(-np.log(0.05)))
+"""The radius over DRMS inside which 95 of 100 points lie where both axes err alike."""
+_GAP_S = 5.0
+TRACK = ("xy_m", "velocity_mps", "yaw_rad", "gap_xy_m", "gap_inside")
 FIRST_SEED = 501
 HUSKY = Recorder("ros2", "clearpath_power")
 WHOLE = replace(Faults.every(), gnss_outage=False, visual_dropouts=False, power_gap=False)
@@ -277,7 +281,7 @@ class Outcome:
     blamed: list[str] = field(default_factory=list)
     """Subjects of which a warning says that they were excluded or rejected."""
     track: dict[str, float] = field(default_factory=dict)
-    """RMS errors of the track's rows: xy_m, velocity_mps, yaw_rad; NaN where there is no place."""
+    """By `TRACK`: RMS errors of the track's rows; the last of rows in gaps of the fixes, and the share of these inside `RING` DRMS."""
     cpu_s: float = 0.0
     trace: str = ""
     """Where an error that nobody foresaw comes from."""
@@ -304,20 +308,36 @@ def judge_log(drive: Drive, log: MemoryLog, fault: Fault) -> Outcome:
         return replace(nothing, said=[f"{type(error).__name__}: {error}"], trace=traceback.format_exc())
     spent_s = time.process_time() - begun_s
     compared = _compared(labelled, read, drive, fault, max_std_m=recipe.sample.max_position_std_m)
-    return replace(compared, track=_track_errors(track, drive, fault), cpu_s=spent_s)
+    return replace(compared, track=_track_errors(track, read, drive, fault), cpu_s=spent_s)
 
 
-def _track_errors(track: Track, drive: Drive, fault: Fault) -> dict[str, float]:
+def _track_errors(track: Track, read: Streams, drive: Drive, fault: Fault) -> dict[str, float]:
     table, geod = track.table, pyproj.Geod(ellps="WGS84")
-    at = drive.truth.at(fault.true_ns(to_integers(table, "stamp_ns"), drive))
+    stamp_ns = to_integers(table, "stamp_ns")
+    true_ns = fault.true_ns(stamp_ns, drive)
+    at = drive.truth.at(true_ns)
     _, _, apart_m = geod.inv(to_floats(table, "lon_deg"), to_floats(table, "lat_deg"), at.lon_deg, at.lat_deg)
     yaw_rad = np.angle(np.exp(1j * (to_floats(table, "yaw_rad") - rpy_from_quat(at.quat_xyzw)[:, 2])))
-    errors = {
-        "xy_m": apart_m,
-        "velocity_mps": to_floats(table, "forward_velocity_mps") - at.forward_velocity_mps,
-        "yaw_rad": np.where(np.isfinite(apart_m), yaw_rad, np.nan),
-    }
-    return {name: float(np.sqrt(np.mean(np.square(error)))) for name, error in errors.items()}
+    drms_m = np.hypot(to_floats(table, "x_std_m"), to_floats(table, "y_std_m"))
+    known = true_ns >= drive.first_ns
+    placed = known & np.isfinite(apart_m)
+    gap = placed & _in_gap(read, stamp_ns)
+    inside = float(np.mean(apart_m[gap] <= RING * drms_m[gap])) if gap.any() else float("nan")
+    velocity_mps = (to_floats(table, "forward_velocity_mps") - at.forward_velocity_mps)[known]
+    figures = (_rms(apart_m[placed]), _rms(velocity_mps), _rms(yaw_rad[placed]), _rms(apart_m[gap]), inside)
+    return dict(zip(TRACK, figures, strict=True))
+
+
+def _in_gap(read: Streams, stamp_ns: np.ndarray) -> np.ndarray:
+    """Return which times lie between two fixes that are more than `_GAP_S` apart."""
+    fix_ns = to_integers(read.tables["gnss"], "stamp_ns") if "gnss" in read.tables else np.zeros(0, np.int64)
+    wide = np.flatnonzero(np.diff(fix_ns) > _GAP_S * 1e9)
+    between = (fix_ns[wide][:, None] < stamp_ns) & (stamp_ns < fix_ns[wide + 1][:, None])
+    return np.asarray(between.any(axis=0))
+
+
+def _rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(np.square(values)))) if values.size else float("nan")
 
 
 def said_of(findings: Iterable[Finding]) -> list[str]:
