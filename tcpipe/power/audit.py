@@ -1,0 +1,178 @@
+"""What a log shows of its power sensor's errors: the zero of a current at rest, a gain that changes, and a sign that is lost.
+
+A battery sags in proportion to the current: dU = -R dI over seconds, with R its resistance. That is known without any model of the robot or
+its ground, so that it judges the current: where R seems to change at once, the gain of the current did (by the inverse), and where the
+voltage rises with the current, the current flows back and its sign is lost. Nothing is corrected: what is found widens σ.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import uniform_filter1d
+
+from tcpipe.power.rails import Rail, interpolate_rail
+from tcpipe.tables.findings import read_threshold
+
+Floats = NDArray[np.float64]
+Stamps = NDArray[np.int64]
+
+_WINDOW_S = 10.0
+"""Slower changes of the voltage are those of its charge."""
+_BLOCK_S = 10.0
+_FEWEST_BLOCKS = 6
+"""On either side of a change."""
+_FEWEST_SAMPLES = 400
+_CLEAR, _SURE, _GRADUAL = 20.0, 6.0, 3.0
+"""Standard deviations that show the resistance itself, a change of it, and that it is not gradual (a battery warms up)."""
+_NORMAL = 0.6745
+"""Median of the absolute value of a normal variate of unit variance."""
+_FEWEST_BRAKED = 5
+_SETTLED_NS = 300_000_000
+"""After a stop and before a start the motors still draw."""
+_SHORTEST_HALT_NS = 1_000_000_000
+
+
+def measure_rest_currents(rail: Rail, still_ns: Stamps) -> Floats:
+    """Return the mean current of a rail in each halt of a second or more [A]; ``still_ns``, shape (S, 2), are begin and end of all halts [ns]."""
+    settled = still_ns + np.array([_SETTLED_NS, -_SETTLED_NS])
+    settled = settled[settled[:, 1] - settled[:, 0] >= _SHORTEST_HALT_NS]
+    first, last = (np.searchsorted(rail.current.stamp_ns, at_ns) for at_ns in settled.T)
+    sums = np.concatenate(([0.0], np.cumsum(rail.current.value)))
+    used = last > first
+    return np.asarray((sums[last] - sums[first])[used] / (last - first)[used])
+
+
+def estimate_offset_std(rest_amp: Floats, rest_range_amp: tuple[float, float], prior_amp: float) -> float:
+    """Return the standard deviation of a rail's zero by its currents in halts, [A], no less than the prior.
+
+    The offset is anywhere between what a rest outside the range of the hardware exceeds its ends by. A robot that a halt holds on a slope
+    draws more, so that the least halt counts; halts that differ more than that have changed their zero, and none tells which is right.
+    """
+    if not rest_amp.size:
+        return prior_amp
+    low, high = rest_range_amp
+    least, most = float(rest_amp.min()), float(rest_amp.max())
+    std = prior_amp
+    if least < low - prior_amp or least > high + prior_amp:
+        ends = least - high, least - low
+        std = max(std, ((ends[0] ** 2 + ends[0] * ends[1] + ends[1] ** 2) / 3.0) ** 0.5)
+    if most - least > read_threshold("current-offset", "min_difference_amp"):
+        std = max(std, (most - least) / 2.0**0.5)
+    return std
+
+
+@dataclass(frozen=True, slots=True)
+class Sag:
+    """Changes of voltage [V] and current [A] within seconds, shape (N,), and of the current's neighbours, whose noise is another."""
+
+    stamp_ns: Stamps
+    volt: Floats
+    amp: Floats
+    neighbour_amp: Floats
+
+    def products(self, edge_ns: Stamps) -> tuple[Floats, Floats]:
+        """Return the sums of voltage and of current, times the current's neighbours, up to each time, shape (E,)."""
+        at = np.searchsorted(self.stamp_ns, edge_ns)
+        sums = (np.concatenate(([0.0], np.cumsum(of * self.neighbour_amp))) for of in (self.volt, self.amp))
+        by_volt, by_amp = (of[at] for of in sums)
+        return by_volt, by_amp
+
+
+def measure_sag(rails: Sequence[Rail]) -> Sag | None:
+    """Return how mean voltage and summed current of all rails change; None with too few samples."""
+    known = [each for each in rails if len(each.stamp_ns)]
+    if not known or len(known) < len(rails):
+        return None
+    first, last = max(each.stamp_ns[0] for each in known), min(each.stamp_ns[-1] for each in known)
+    stamp_ns = known[0].current.stamp_ns
+    stamp_ns = stamp_ns[(stamp_ns >= first) & (stamp_ns <= last)]
+    if len(stamp_ns) < _FEWEST_SAMPLES:
+        return None
+    values = [interpolate_rail(each, stamp_ns) for each in known]
+    volt, amp = np.mean([of[0] for of in values], axis=0), np.sum([of[1] for of in values], axis=0)
+    rows = max(round(_WINDOW_S * 1e9 / float(np.median(np.diff(stamp_ns)))), 3)
+    volt, amp = (of - uniform_filter1d(of, rows, mode="nearest") for of in (volt, amp))
+    return Sag(stamp_ns, volt, amp, 0.5 * (np.roll(amp, 1) + np.roll(amp, -1)))
+
+
+@dataclass(frozen=True, slots=True)
+class GainChange:
+    """A gain of the current that changed at ``at_ns`` [ns] by the factor ``ratio``."""
+
+    at_ns: int
+    ratio: float
+
+
+def find_gain_change(sag: Sag | None) -> GainChange | None:
+    """Return the clearest change of the gain, by the battery's resistance before and after; None where it is not sure, or gradual."""
+    if sag is None:
+        return None
+    edge_ns = np.arange(sag.stamp_ns[0], sag.stamp_ns[-1], round(_BLOCK_S * 1e9), dtype=np.int64)
+    by_volt, weight = (np.diff(of) for of in sag.products(edge_ns))
+    used = weight > 0.0
+    edge_ns, by_volt, weight = edge_ns[:-1][used], by_volt[used], weight[used]
+    count = len(weight)
+    if count < 2 * _FEWEST_BLOCKS or not _is_known(by_volt, weight):
+        return None
+    resistance, place = -by_volt / weight, np.arange(count)
+
+    def fit(columns: Floats) -> tuple[Floats, float]:
+        root = np.sqrt(weight)
+        value = np.linalg.lstsq(columns * root[:, None], resistance * root, rcond=None)[0]
+        return value, float(np.sum(weight * (resistance - columns @ value) ** 2))
+
+    splits = list(range(_FEWEST_BLOCKS, count - _FEWEST_BLOCKS + 1))
+    steps = [fit(np.column_stack((place < first, place >= first)).astype(np.float64)) for first in splits]
+    best = min(range(len(splits)), key=lambda at: steps[at][1])
+    (before, after), left = steps[best]
+    variance = left / (count - 3)
+    _, constant = fit(np.ones((count, 1)))
+    _, gradual = fit(np.column_stack((np.ones(count), place)))
+    is_sure = constant - left > _SURE**2 * variance and gradual - left > _GRADUAL**2 * variance
+    if (
+        not is_sure
+        or min(before, after) <= 0.0
+        or abs(before / after - 1.0) < read_threshold("current-gain-changes", "min_change_fraction")
+    ):
+        return None
+    return GainChange(int(edge_ns[splits[best]]), float(before / after))
+
+
+def _is_known(by_volt: Floats, by_amp: Floats) -> bool:
+    """Return whether the battery sags clearly, by what blocks leave over."""
+    total = float(by_amp.sum())
+    if total <= 0.0:
+        return False
+    resistance = -float(by_volt.sum()) / total
+    std = float(np.linalg.norm(by_volt + resistance * by_amp)) / total
+    return resistance > _CLEAR * std
+
+
+def find_lost_signs(sag: Sag | None, start_ns: Stamps, end_ns: Stamps, rise: Floats) -> NDArray[np.bool_]:
+    """Return the segments whose current flows back, but has no sign, shape (M,); none unless the steepest downhill ones surely show it.
+
+    There voltage and current rise together: the likelihood of both signs is compared. ``rise`` is the tangent of the slope along travel.
+    """
+    nothing = np.zeros(len(rise), dtype=np.bool_)
+    if sag is None or not len(rise):
+        return nothing
+    (volt_0, amp_0), (volt_1, amp_1) = sag.products(start_ns), sag.products(end_ns)
+    by_volt, by_amp = volt_1 - volt_0, amp_1 - amp_0
+    driven = rise > 0.0
+    if not _is_known(by_volt[driven], by_amp[driven]):
+        return nothing
+    resistance = -float(by_volt[driven].sum()) / float(by_amp[driven].sum())
+    residual_volt = float(np.median(np.abs(sag.volt + resistance * sag.amp))) / _NORMAL
+    gain = 2.0 * resistance * by_volt / residual_volt**2
+    order = np.argsort(rise)
+    evidence = np.cumsum(gain[order[rise[order] < 0.0]])
+    if len(evidence) < _FEWEST_BRAKED or evidence[_FEWEST_BRAKED - 1 :].max() < _SURE**2 / 2.0:
+        return nothing
+    steep = order[: int(np.argmax(evidence)) + 1]
+    lost: NDArray[np.bool_] = (rise < 0.0) & (gain > 0.0)
+    lost[steep] = True
+    return lost
