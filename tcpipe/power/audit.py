@@ -31,13 +31,15 @@ _CLEAR, _SURE, _GRADUAL = 20.0, 6.0, 3.0
 _NORMAL = 0.6745
 """Median of the absolute value of a normal variate of unit variance."""
 _FEWEST_BRAKED = 5
+_LIKELY = 8.0
+"""Logarithm of a ratio of likelihoods: of three thousand segments one by chance."""
 _SETTLED_NS = 300_000_000
 """After a stop and before a start the motors still draw."""
 _SHORTEST_HALT_NS = 1_000_000_000
 
 
 def measure_rest_currents(rail: Rail, still_ns: Stamps) -> Floats:
-    """Return the mean current of a rail in each halt of a second or more [A]; ``still_ns``, shape (S, 2), are begin and end of all halts [ns]."""
+    """Return the mean current of a rail in each halt of a second or more [A]; ``still_ns``, shape (S, 2), begin and end [ns]."""
     settled = still_ns + np.array([_SETTLED_NS, -_SETTLED_NS])
     settled = settled[settled[:, 1] - settled[:, 0] >= _SHORTEST_HALT_NS]
     first, last = (np.searchsorted(rail.current.stamp_ns, at_ns) for at_ns in settled.T)
@@ -153,9 +155,9 @@ def _is_known(by_volt: Floats, by_amp: Floats) -> bool:
 
 
 def find_lost_signs(sag: Sag | None, start_ns: Stamps, end_ns: Stamps, rise: Floats) -> NDArray[np.bool_]:
-    """Return the segments whose current flows back, but has no sign, shape (M,); none unless the steepest downhill ones surely show it.
+    """Return the segments whose current flows back, but has no sign, shape (M,); none unless several downhill ones surely show it.
 
-    There voltage and current rise together: the likelihood of both signs is compared. ``rise`` is the tangent of the slope along travel.
+    There voltage and current rise together: the likelihoods of both signs are compared. ``rise`` is the tangent of the slope along travel.
     """
     nothing = np.zeros(len(rise), dtype=np.bool_)
     if sag is None or not len(rise):
@@ -168,11 +170,12 @@ def find_lost_signs(sag: Sag | None, start_ns: Stamps, end_ns: Stamps, rise: Flo
     resistance = -float(by_volt[driven].sum()) / float(by_amp[driven].sum())
     residual_volt = float(np.median(np.abs(sag.volt + resistance * sag.amp))) / _NORMAL
     gain = 2.0 * resistance * by_volt / residual_volt**2
-    order = np.argsort(rise)
-    evidence = np.cumsum(gain[order[rise[order] < 0.0]])
-    if len(evidence) < _FEWEST_BRAKED or evidence[_FEWEST_BRAKED - 1 :].max() < _SURE**2 / 2.0:
+    clear = gain > _LIKELY
+    count, chance = np.count_nonzero(clear & ~driven), clear[driven].mean() * np.count_nonzero(~driven)
+    if count < max(_FEWEST_BRAKED, 5.0 * chance):
         return nothing
-    steep = order[: int(np.argmax(evidence)) + 1]
-    lost: NDArray[np.bool_] = (rise < 0.0) & (gain > 0.0)
-    lost[steep] = True
+    order = np.argsort(rise)
+    steep = order[: int(np.argmax(np.cumsum(gain[order]))) + 1]  # few of which are clear by themselves
+    lost: NDArray[np.bool_] = ~driven & (gain > 0.0)
+    lost[steep] |= ~driven[steep]
     return lost
