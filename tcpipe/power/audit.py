@@ -26,7 +26,7 @@ _BLOCK_S = 10.0
 _FEWEST_BLOCKS = 6
 """On either side of a change."""
 _FEWEST_SAMPLES = 400
-_CLEAR, _SURE, _GRADUAL = 20.0, 6.0, 3.0
+_CLEAR, _SURE, _GRADUAL = 20.0, 5.0, 3.0
 """Standard deviations that show the resistance itself, a change of it, and that it is not gradual (a battery warms up)."""
 _NORMAL = 0.6745
 """Median of the absolute value of a normal variate of unit variance."""
@@ -48,20 +48,25 @@ def measure_rest_currents(rail: Rail, still_ns: Stamps) -> Floats:
     return np.asarray((sums[last] - sums[first])[used] / (last - first)[used])
 
 
+def summarize_rest(rest_amp: Floats) -> tuple[float, float]:
+    """Return a low and a high current at rest [A], of at least one halt: a fifth of the halts may be odd (held on a slope, or stuck)."""
+    low, high = np.quantile(rest_amp, (0.2, 0.8)).tolist()
+    return low, high
+
+
 def estimate_offset_std(rest_amp: Floats, rest_range_amp: tuple[float, float], prior_amp: float) -> float:
     """Return the standard deviation of a rail's zero by its currents in halts, [A], no less than the prior.
 
-    The offset is anywhere between what a rest outside the range of the hardware exceeds its ends by. A robot that a halt holds on a slope
-    draws more, so that the least halt counts; halts that differ more than that have changed their zero, and none tells which is right.
+    Halts beyond what the hardware takes, by more than the prior, leave a range of offsets, all as likely. On a slope the drives may take
+    more, so that the low halts count. Where halts differ, the zero moved, and none tells which is right.
     """
     if not rest_amp.size:
         return prior_amp
-    low, high = rest_range_amp
-    least, most = float(rest_amp.min()), float(rest_amp.max())
+    least, most = summarize_rest(rest_amp)
+    first, last = least - rest_range_amp[1], least - rest_range_amp[0]
     std = prior_amp
-    if least < low - prior_amp or least > high + prior_amp:
-        ends = least - high, least - low
-        std = max(std, ((ends[0] ** 2 + ends[0] * ends[1] + ends[1] ** 2) / 3.0) ** 0.5)
+    if first > prior_amp or last < -prior_amp:
+        std = max(std, ((first**2 + first * last + last**2) / 3.0) ** 0.5)
     if most - least > read_threshold("current-offset", "min_difference_amp"):
         std = max(std, (most - least) / 2.0**0.5)
     return std
@@ -130,7 +135,9 @@ def find_gain_change(sag: Sag | None) -> GainChange | None:
     splits = list(range(_FEWEST_BLOCKS, count - _FEWEST_BLOCKS + 1))
     steps = [fit(np.column_stack((place < first, place >= first)).astype(np.float64)) for first in splits]
     best = min(range(len(splits)), key=lambda at: steps[at][1])
-    (before, after), left = steps[best]
+    left, first = steps[best][1], splits[best]
+    # The level of the current steps, too, when its gain does: the blocks beside it tell the time, but not the ratio.
+    before, after = (-float(by_volt[of].sum() / weight[of].sum()) for of in (slice(first - 1), slice(first + 1, None)))
     variance = left / (count - 3)
     _, constant = fit(np.ones((count, 1)))
     _, gradual = fit(np.column_stack((np.ones(count), place)))
@@ -141,7 +148,7 @@ def find_gain_change(sag: Sag | None) -> GainChange | None:
         or abs(before / after - 1.0) < read_threshold("current-gain-changes", "min_change_fraction")
     ):
         return None
-    return GainChange(int(edge_ns[splits[best]]), float(before / after))
+    return GainChange(int(edge_ns[first]), before / after)
 
 
 def _is_known(by_volt: Floats, by_amp: Floats) -> bool:

@@ -93,7 +93,7 @@ def label_segments(
         if not cut.num_rows:
             continue
         sensor = make_sensor_error(cut, rails, power, rule=rule)
-        power = replace(power, lost_signs=power.lost_signs + np.count_nonzero(sensor.sign_joule))
+        power = replace(power, lost_signs=power.lost_signs + int(np.count_nonzero(sensor.sign_joule)))
         cost, net, causes = compute_segment_costs(
             cut, rows, rails, masked.info, rule=rule, standing=standing, sensor=sensor
         )

@@ -20,6 +20,7 @@ from tcpipe.power.audit import (
     find_lost_signs,
     measure_rest_currents,
     measure_sag,
+    summarize_rest,
 )
 from tcpipe.power.rails import Rail, Rule, integrate_energy
 from tcpipe.recipe import LabelConfig
@@ -35,11 +36,12 @@ from tcpipe.tables.levels import Streams, TrackInfo
 Floats = NDArray[np.float64]
 
 
-def find_stationary_ns(rows: pa.Table, rate_hz: float) -> NDArray[np.int64]:
-    """Return begin and end [ns] of every span in which the robot is stationary, shape (S, 2)."""
+def find_stationary_ns(rows: pa.Table, rate_hz: float, *, but: int = 0) -> NDArray[np.int64]:
+    """Return begin and end [ns] of every span in which the robot is stationary, and not in another way, shape (S, 2)."""
     stamp_ns = to_integers(rows, "stamp_ns")
     piece = number_pieces(stamp_ns, to_integers(rows, "clock_epoch"), period_ns=1e9 / rate_hz)
-    standing = (to_numbers(rows["dropped_by"]) & np.uint32(DropReason.STATIONARY)) != 0
+    reasons = to_numbers(rows["dropped_by"])
+    standing = ((reasons & np.uint32(DropReason.STATIONARY)) != 0) & ((reasons & np.uint32(but)) == 0)
     return stamp_ns[find_runs(standing, piece)]
 
 
@@ -62,15 +64,15 @@ def audit_power_sensor(
         return facts
     rest_amp: dict[str, list[Floats]] = {}
     for epoch, rails in rails_by_epoch.items():
-        still_ns = find_stationary_ns(select_rows(rows, "clock_epoch", epoch), info.rate_hz)
+        still_ns = find_stationary_ns(select_rows(rows, "clock_epoch", epoch), info.rate_hz, but=DropReason.STUCK)
         for rail in rails:
             rest_amp.setdefault(rail.name, []).append(measure_rest_currents(rail, still_ns))
     joined = [of for parts in rest_amp.values() if (of := np.concatenate(parts)).size]
     if not joined:
         return facts
     std_amp = max(estimate_offset_std(of, power.rest_current_amp, facts.offset_std_amp) for of in joined)
-    ends = min(float(of.min()) for of in joined), max(float(of.max()) for of in joined)
-    return replace(facts, offset_std_amp=std_amp, rest_amp=ends)
+    low, high = zip(*map(summarize_rest, joined), strict=True)
+    return replace(facts, offset_std_amp=std_amp, rest_amp=(min(low), max(high)))
 
 
 def _find_prior(power: PowerSign | None) -> tuple[float, float]:
