@@ -57,6 +57,10 @@ file = "test_gps_20251118_162921.csv"
 stamp = "timestamp (ns)"
 columns = { latitude = "latitude (deg)", longitude = "longitude (deg)", altitude = "alt_msl (m)" }
 """
+TEST1 = """
+[read.extrinsics]
+imu = { xyz_m = [0.0, -0.3, 0.52], rpy_rad = [1.5707963, 0.0, -1.5707963] }
+"""
 
 
 @dataclass(frozen=True)
@@ -80,13 +84,15 @@ def list_cases(logs: Path, data: Path) -> Iterator[Case]:
     for variant, topics in HUSKY_VARIANTS.items():
         yield from (Case(f"husky/{path.stem}{variant}", path, f"[read.topics]\n{HUSKY}{topics}") for path in husky)
     yield Case("evo/nav2_turtlebot", logs / "evo" / "nav2_turtlebot.mcap")
-    yield Case("evo/nav2_turtlebot, AMCL", logs / "evo" / "nav2_turtlebot.mcap", '[read.topics]\npose = ["/amcl_pose"]\n')
+    yield Case(
+        "evo/nav2_turtlebot, AMCL", logs / "evo" / "nav2_turtlebot.mcap", '[read.topics]\npose = ["/amcl_pose"]\n'
+    )
     for name in ("bag_0", "bag2_0"):
         yield Case(f"gps_nav_ws/{name}", logs / "gps_nav_ws" / f"{name}.db3")
     yield Case("fomo/red_2025-10-14-11-41", logs / "fomo", FOMO)
     yield Case("fau/test_gps_20251118_162921", logs / "fau", FAU)
-    for name in ("test1", "test2", "test1_2014"):
-        yield Case(f"robot_localization/{name}", data / "robot_localization" / f"{name}.bag")
+    for name, recipe in (("test1", TEST1), ("test2", ""), ("test1_2014", "")):
+        yield Case(f"robot_localization/{name}", data / "robot_localization" / f"{name}.bag", recipe)
     yield Case("warthog_grass_a", data / "warthog_grass_a" / "run.mcap")
 
 
@@ -139,7 +145,9 @@ def print_pooled(name: str, half: Half) -> None:
     for variant, values in sorted(half.ratios.items()):
         within = np.mean(np.abs(np.array(values) - 1.0) < 0.02)
         low, high = min(values), max(values)
-        print(f"{variant:<44} {len(values):3d} logs, median {np.median(values):.4f}, {low:.4f} to {high:.4f}, {within:.0%} within 2 %")
+        print(
+            f"{variant:<44} {len(values):3d} logs, median {np.median(values):.4f}, {low:.4f} to {high:.4f}, {within:.0%} within 2 %"
+        )
 
 
 def main() -> None:

@@ -16,11 +16,11 @@ from tcpipe.stages.fuse_inputs import find_recipe_role
 from tcpipe.stages.read import read_run
 from tcpipe.stages.read_roles import find_read_config
 from tcpipe.stages.withheld import WithheldScore, compare_withheld, score_comparisons
-from tcpipe.store import run_at
+from tcpipe.store import is_store, run_at
 from tcpipe.tables.levels import Streams
 
 _HEADER = (
-    "withheld", "window", "chord", "windows", "values", "error", "95 %", "sigma", "<1s", "<2s", "line", "95 %", "",
+    "withheld", "window", "chord", "windows", "values", "error", "95 %", "σ", "≤ 1σ", "≤ 2σ", "line", "95 %", "",
 )  # fmt: skip
 
 
@@ -40,10 +40,15 @@ class Audit:
         """Return it as a table, in metres."""
         lines = [f"{self.run}: robot {self.robot}"]
         if self.scores:
-            lines += ["errors and sigma in m (median), share of errors inside 1 and 2 sigma, straight line between the ends", ""]
+            lines += [
+                "m: median and 95 % of the errors, their median σ; shares inside 1σ and 2σ; errors of a straight line between the ends",
+                "",
+            ]
             rows = [_HEADER, *map(_make_row, self.scores)]
             widths = [max(len(row[k]) for row in rows) for k in range(len(_HEADER))]
-            lines += ["  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
+            lines += [
+                "  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows
+            ]
         lines += [f"track / {role}: {ratio:.4f} of its distance" for role, ratio in self.length_ratios.items()]
         lines += [f"not audited: {line}" for line in self.skipped]
         return clean_lines(lines)
@@ -105,6 +110,8 @@ def read_audited(
 
 def _read_stored(run: Path | str) -> tuple[Streams, FuseConfig] | None:
     """Return the streams of a run of a store, and how it was fused; None for any other path."""
+    if is_store(run):
+        raise UsageError(f"{run}: is a store; give one of its runs, {run}/runs/RUN")
     found = run_at(run)
     if found is None:
         return None

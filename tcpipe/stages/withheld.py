@@ -1,4 +1,4 @@
-"""Withhold a sensor in windows, fuse the rest, and compare what was withheld with the track: a judgement by data that made no part of it."""
+"""Withhold a sensor in windows, fuse the rest, and compare the track with what was withheld."""
 
 from __future__ import annotations
 
@@ -11,16 +11,18 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from tcpipe.errors import FusionError
-from tcpipe.fusion.measurements import DOPPLER, GNSS, VISUAL, WHEELS, BodyVelocities, Positions
+from tcpipe.fusion.measurements import DOPPLER, GNSS, VISUAL, WHEELS, BodyVelocities, Measurements, Positions
 from tcpipe.fusion.process import VISUAL_SCALE_STD, WHEEL_SCALE_STD
 from tcpipe.fusion.signals import compute_seconds, integrate_signal, is_covered
-from tcpipe.geometry.rotation import quat_from_rpy, rotate
+from tcpipe.geometry.datum import enu_from_geodetic, geodetic_from_enu
+from tcpipe.geometry.rotation import matrix_from_quat, quat_from_rpy
 from tcpipe.progress import step
 from tcpipe.recipe import FuseConfig
 from tcpipe.stages.fuse import fuse_run
 from tcpipe.stages.fuse_inputs import FusionInputs, convert_pose_to_fixes, find_longest_epoch, prepare_inputs
 from tcpipe.tables.arrays import number_column, select_rows
 from tcpipe.tables.columns import FloatColumns, to_integers
+from tcpipe.tables.facts import MountingFacts
 from tcpipe.tables.levels import Streams, Track
 
 Floats = NDArray[np.float64]
@@ -107,12 +109,22 @@ def score_comparisons(comparisons: Sequence[Comparison]) -> WithheldScore:
     straight_m = np.concatenate([each.straight_m for each in comparisons])
     windows = sum(len(np.unique(each.window)) for each in comparisons)
     within = (float(np.mean(normalized < 1.0)), float(np.mean(normalized < 2.0)))
-    line = (float(np.median(straight_m)), float(np.quantile(straight_m, 0.95))) if first.chord_s is None else None
+    is_fix = first.chord_s is None
     return WithheldScore(
-        first.role, first.window_s, first.chord_s, windows, len(error_m),
-        float(np.median(error_m)), float(np.quantile(error_m, 0.95)), float(np.median(std_m)), *within,
-        *(line or (None, None)), _judge_coverage(within, windows, is_fix=line is not None),
-    )  # fmt: skip
+        role=first.role,
+        window_s=first.window_s,
+        chord_s=first.chord_s,
+        windows=windows,
+        compared=len(error_m),
+        median_error_m=float(np.median(error_m)),
+        p95_error_m=float(np.quantile(error_m, 0.95)),
+        median_std_m=float(np.median(std_m)),
+        within_1_sigma=within[0],
+        within_2_sigma=within[1],
+        straight_median_m=float(np.median(straight_m)) if is_fix else None,
+        straight_p95_m=float(np.quantile(straight_m, 0.95)) if is_fix else None,
+        calibration=_judge_coverage(within, windows, is_fix=is_fix),
+    )
 
 
 def _judge_coverage(within: tuple[float, float], windows: int, *, is_fix: bool) -> Calibration:
@@ -122,14 +134,32 @@ def _judge_coverage(within: tuple[float, float], windows: int, *, is_fix: bool) 
     return "underconfident" if is_fix and within[0] > _NOMINAL[0] + spread[0] else "calibrated"
 
 
-def place_windows(start_s: float, end_s: float, length_s: float) -> Floats:
+def place_windows(span_s: float, length_s: float) -> Floats:
     """Return start and end of windows spread evenly over a span [s], shape (N, 2); as much data as a window is long lies between two."""
-    span_s = end_s - start_s - 2.0 * _END_S
-    count = max(int((span_s + length_s) / (2.0 * length_s)), 0)
-    gap_s = (span_s - count * length_s) / max(count - 1, 1)
-    first_s = start_s + _END_S + (0.5 * gap_s if count == 1 else 0.0)
+    inner_s = span_s - 2.0 * _END_S
+    count = max(int((inner_s + length_s) / (2.0 * length_s)), 0)
+    gap_s = (inner_s - count * length_s) / max(count - 1, 1)
+    first_s = _END_S + (0.5 * gap_s if count == 1 else 0.0)
     starts_s = first_s + np.arange(count) * (length_s + gap_s)
     return np.stack([starts_s, starts_s + length_s], -1)
+
+
+@dataclass(frozen=True, slots=True)
+class _Run:
+    """A run, its measurements, and the clock epoch that is judged."""
+
+    run_id: str
+    streams: Streams
+    config: FuseConfig
+    inputs: FusionInputs
+    epoch: int
+
+    @property
+    def measurements(self) -> Measurements:
+        return self.inputs.measurements[self.epoch]
+
+    def fuse(self, streams: Streams) -> Track:
+        return fuse_run(streams, self.config, run_id=self.run_id)
 
 
 def compare_withheld(streams: Streams, config: FuseConfig, *, run_id: str) -> WithheldComparisons:
@@ -145,46 +175,45 @@ def compare_withheld(streams: Streams, config: FuseConfig, *, run_id: str) -> Wi
     inputs = prepare_inputs(streams, config)
     if not inputs.measurements:
         raise FusionError(f"{run_id}: no sensor measures motion")
-    epoch = find_longest_epoch(inputs)
+    run = _Run(run_id, streams, config, inputs, find_longest_epoch(inputs))
     comparisons, skipped = list[Comparison](), list[tuple[str, str]]()
-    motion = [role for role in (GNSS, WHEELS, VISUAL) if role in inputs.measurements[epoch].sensors()]
+    motion = [role for role in (GNSS, WHEELS, VISUAL) if role in run.measurements.sensors()]
     if len(motion) == 1:
         skipped.append((motion[0], "no other sensor measures motion"))
     for role in motion if len(motion) > 1 else ():
+        stamp_ns = run.measurements.sensors()[role].stamp_ns
+        span_s = float(stamp_ns[-1] - stamp_ns[0]) * 1e-9
         for length_s in WINDOWS_S:
+            windows_ns = int(stamp_ns[0]) + np.round(place_windows(span_s, length_s) * 1e9).astype(np.int64)
+            if not windows_ns.size:
+                needed_s = length_s + 2.0 * _END_S
+                skipped.append((role, f"{length_s:.0f} s: covers {span_s:.0f} s, {needed_s:.0f} s are needed"))
+                break
             try:
-                comparisons += _compare_role(role, length_s, epoch, inputs, streams, config, run_id=run_id)
+                comparisons += _compare_role(run, role, length_s, windows_ns)
             except FusionError as error:
                 skipped.append((role, f"{length_s:.0f} s: {error.problems[0]}"))
-    ratios = {} if GNSS in motion else _compare_lengths(fuse_run(streams, config, run_id=run_id), epoch, inputs)
+    ratios = {} if GNSS in motion else _compare_lengths(run)
     return WithheldComparisons(tuple(comparisons), tuple(skipped), ratios)
 
 
-def _compare_role(
-    role: str, length_s: float, epoch: int, inputs: FusionInputs, streams: Streams, config: FuseConfig, *, run_id: str
-) -> Iterator[Comparison]:
-    measurements = inputs.measurements[epoch]
-    sensor = measurements.sensors()[role]
-    zero_ns = int(sensor.stamp_ns[0])
-    last_s = float(compute_seconds(sensor.stamp_ns[-1:], zero_ns)[0])
-    windows_s = place_windows(0.0, last_s, length_s)
-    if not windows_s.size:
-        raise FusionError(f"the sensor covers {last_s:.0f} s, {length_s + 2.0 * _END_S:.0f} s are needed")
-    windows_ns = zero_ns + np.round(windows_s * 1e9).astype(np.int64)
+def _compare_role(run: _Run, role: str, length_s: float, windows_ns: Ints) -> Iterator[Comparison]:
     step(f"fusing without {role} for {len(windows_ns)} x {length_s:.0f} s")
-    track = fuse_run(withhold(streams, role, epoch, windows_ns), config, run_id=run_id)
+    track = run.fuse(withhold(run.streams, role, run.epoch, windows_ns))
     facts = track.info.report.facts
     if role == GNSS and facts.sensor_checks is not None and role in facts.sensor_checks.excluded:
         raise FusionError("tcpipe excludes the other fixes of the run")
-    rows = TrackRows(track, epoch)
+    rows = TrackRows(track, run.epoch)
     moving = np.array([rows.measure_length_m(*window) >= _LEAST_WINDOW_M for window in windows_ns])
     if not moving.any():
         raise FusionError("the rest has no track in the windows, or the robot is stationary there")
-    numbers = np.flatnonzero(moving)
+    numbers, sensor = np.flatnonzero(moving), run.measurements.sensors()[role]
     if isinstance(sensor, Positions):
-        moved_m = facts.mounting.antenna_moved_m if facts.mounting else None
-        arm_m = np.asarray(streams.sensors[GNSS].xyz_m) + (np.zeros(3) if moved_m is None else np.asarray(moved_m))
-        yield _compare_fixes(sensor, rows, windows_ns, numbers, arm_m=arm_m, window_s=length_s)
+        sensor = _move_origin(sensor, run.inputs, track)
+        mounting = facts.mounting or MountingFacts()
+        arm_m = np.asarray(run.streams.sensors[GNSS].xyz_m) + (mounting.antenna_moved_m or np.zeros(3))
+        arm_std_m = np.asarray(mounting.antenna_std_m or np.zeros(3))
+        yield _compare_fixes(sensor, rows, windows_ns, numbers, arm_m=arm_m, arm_std_m=arm_std_m, window_s=length_s)
     elif isinstance(sensor, BodyVelocities):
         for chord_s in CHORDS_S:
             found = _compare_chords(role, sensor, rows, windows_ns, numbers, chord_s=chord_s, window_s=length_s)
@@ -206,6 +235,16 @@ def withhold(streams: Streams, role: str, epoch: int, windows_ns: Ints) -> Strea
     )
 
 
+def _move_origin(fixes: Positions, inputs: FusionInputs, track: Track) -> Positions:
+    """Return the fixes in the track's own plane: its origin is the first fixes, of which some may be withheld."""
+    datum = track.info.datum
+    if datum is None or inputs.datum_deg_m is None:
+        raise FusionError("the track of the rest has only local coordinates")
+    places = geodetic_from_enu(fixes.position_enu_m, datum_deg_m=inputs.datum_deg_m)
+    moved = enu_from_geodetic(*places, datum_deg_m=(datum.lon_deg, datum.lat_deg, datum.alt_m))
+    return replace(fixes, position_enu_m=moved)
+
+
 class TrackRows:
     """The rows of a track's clock epoch, between which it is interpolated."""
 
@@ -221,7 +260,7 @@ class TrackRows:
         after = np.searchsorted(self.stamp_ns, stamp_ns)
         inside = (after > 0) & (after < self.stamp_ns.size)
         after = np.clip(after, 1, max(self.stamp_ns.size - 1, 1))
-        if self.stamp_ns.size < 2:  # noqa: PLR2004  nothing to interpolate
+        if self.stamp_ns.size < 2:
             return np.zeros(stamp_ns.size, np.bool_)
         found: NDArray[np.bool_] = inside & (self.stamp_ns[after] - self.stamp_ns[after - 1] <= self._longest_ns)
         return found
@@ -248,15 +287,26 @@ def _integrate(stamp_ns: Ints, values: Floats, start_ns: Ints, end_ns: Ints) -> 
     zero_ns = int(stamp_ns[0])
     stamp_s = compute_seconds(stamp_ns, zero_ns)
     start, end = (
-        integrate_signal(stamp_s, values[:, None], compute_seconds(at_ns, zero_ns))[:, 0] for at_ns in (start_ns, end_ns)
+        integrate_signal(stamp_s, values[:, None], compute_seconds(at_ns, zero_ns))[:, 0]
+        for at_ns in (start_ns, end_ns)
     )
     return end - start
 
 
 def _compare_fixes(
-    fixes: Positions, rows: TrackRows, windows_ns: Ints, numbers: Ints, *, arm_m: Floats, window_s: float
+    fixes: Positions,
+    rows: TrackRows,
+    windows_ns: Ints,
+    numbers: Ints,
+    *,
+    arm_m: Floats,
+    arm_std_m: Floats,
+    window_s: float,
 ) -> Comparison:
-    """Compare one fix a second: those of a second share the error of the track, and much of their own."""
+    """Compare one fix a second: those of a second share the error of the track, and much of their own.
+
+    What is not known of the arm is part of base_link's σ, not of the antenna's: an error of the arm moves both.
+    """
     chosen, window, straight = [], [], []
     for number in numbers.tolist():
         start_ns, end_ns = windows_ns[number].tolist()
@@ -274,12 +324,13 @@ def _compare_fixes(
     if not kept.size:
         raise FusionError("no fix lies on the track of the rest")
     rpy = [rows.interpolate(f"{name}_rad", stamp_ns, is_angle=True) for name in ("roll", "pitch", "yaw")]
-    arm = rotate(quat_from_rpy(*rpy), np.tile(arm_m, (kept.size, 1)))[:, :2]
-    predicted = np.stack([rows.interpolate(f"{axis}_m", stamp_ns) for axis in "xy"], -1) + arm
+    rotation = matrix_from_quat(quat_from_rpy(*rpy))[:, :2]
+    predicted = np.stack([rows.interpolate(f"{axis}_m", stamp_ns) for axis in "xy"], -1) + rotation @ arm_m
     std = np.stack([rows.interpolate(f"{axis}_std_m", stamp_ns) for axis in "xy"], -1)
+    variance = np.maximum(std**2 - rotation**2 @ arm_std_m**2, 0.0)
     return Comparison(
         GNSS, window_s, None, np.concatenate(window), fixes.position_enu_m[kept, :2] - predicted,
-        np.sqrt(std**2 + fixes.variance_m2[kept, :2]), np.concatenate(straight),
+        np.sqrt(variance + fixes.variance_m2[kept, :2]), np.concatenate(straight),
     )  # fmt: skip
 
 
@@ -295,33 +346,37 @@ def _compare_chords(
 ) -> Comparison:
     """Compare distances along the odometry's own axis, one chord a second; its scale is that of the rest of the run."""
     chord_ns = round(chord_s * 1e9)
-    start_ns = np.arange(rows.stamp_ns[0], rows.stamp_ns[-1] - chord_ns, 1_000_000_000, np.int64)
+    start_ns = np.arange(int(rows.stamp_ns[0]), int(rows.stamp_ns[-1]) - chord_ns, 1_000_000_000, dtype=np.int64)
     row = np.searchsorted(rows.stamp_ns, start_ns)
     start_ns = rows.stamp_ns[row]
     end_ns = start_ns + chord_ns
     track_m = rows.integrate_forward(odometry.lever_arm_m, start_ns, end_ns)
     sensor_m = _integrate(odometry.stamp_ns, odometry.velocity_mps[:, 0], start_ns, end_ns)
     std_m = rows.columns[f"displacement_std_{chord_s:.0f}s_m"][row]
-    usable = is_covered(odometry.stamp_ns, start_ns, end_ns) & np.isfinite(std_m) & is_covered(rows.stamp_ns, start_ns, end_ns)
+    usable = (
+        is_covered(odometry.stamp_ns, start_ns, end_ns)
+        & np.isfinite(std_m)
+        & is_covered(rows.stamp_ns, start_ns, end_ns)
+    )
     usable &= np.abs(track_m) > _LEAST_MPS * chord_s
     number = np.searchsorted(windows_ns[:, 0], start_ns, "right") - 1
-    before_end = end_ns <= windows_ns[np.maximum(number, 0), 1]
-    outside = usable & ((number < 0) | (start_ns >= windows_ns[np.maximum(number, 0), 1]))
+    window_end_ns = np.where(number < 0, start_ns, windows_ns[np.maximum(number, 0), 1])
+    outside = usable & (start_ns >= window_end_ns) & (np.searchsorted(windows_ns[:, 0], end_ns) - 1 == number)
     scale = float(np.median(sensor_m[outside] / track_m[outside])) if outside.sum() >= _SCALE_CHORDS else 1.0
-    inside = usable & (number >= 0) & before_end & np.isin(number, numbers)
+    inside = usable & (end_ns <= window_end_ns) & np.isin(number, numbers)
     error_m = (sensor_m[inside] / scale - track_m[inside])[:, None]
     std_m = np.hypot(std_m[inside], _SCALE_STD[role] * track_m[inside])[:, None]
     return Comparison(role, window_s, chord_s, number[inside], error_m, std_m, np.full(len(error_m), np.nan))
 
 
-def _compare_lengths(track: Track, epoch: int, inputs: FusionInputs) -> dict[str, float]:
-    """Return the horizontal length of the track over the distance that each odometry measures, by role; turns in place count for neither."""
-    rows = TrackRows(track, epoch)
+def _compare_lengths(run: _Run) -> dict[str, float]:
+    """Return the horizontal length of the track over the distance that each odometry measures, by role."""
+    rows = TrackRows(run.fuse(run.streams), run.epoch)
     if rows.stamp_ns.size == 0:
         return {}
     length_m = rows.measure_length_m(int(rows.stamp_ns[0]), int(rows.stamp_ns[-1]) + 1)
     ratios = {}
-    for role, odometry in inputs.measurements[epoch].odometries().items():
+    for role, odometry in run.measurements.odometries().items():
         speed = np.abs(odometry.velocity_mps[:, 0])
         odometer_m = float(_integrate(odometry.stamp_ns, speed, rows.stamp_ns[:1], rows.stamp_ns[-1:])[0])
         if odometer_m > _LEAST_WINDOW_M:
