@@ -1,4 +1,6 @@
-"""Judge the estimator on public logs by sensors that are withheld from it: ``python benchmarks/withheld.py [LOGS] [--only NAME]``.
+"""Judge the estimator on public logs by sensors that are withheld from it.
+
+    python benchmarks/withheld.py [LOGS] [--only NAME] [--log LOG ...]
 
 For each log `tcpipe audit` withholds fixes, wheels and camera in windows of 10, 30 and 60 s; see `tcpipe/stages/withheld.py`. One row a log
 shows the fixes: windows, median error, 95 % error and σ [m], and the share of errors inside 1σ and 2σ. Pooled figures follow, one value a
@@ -34,8 +36,9 @@ import numpy as np
 
 from tcpipe.errors import TcpipeError
 from tcpipe.formats.recipe_toml import load_recipe
+from tcpipe.fusion.withheld import Comparison, score_comparisons
 from tcpipe.pipeline.audit import read_audited
-from tcpipe.stages.withheld import Comparison, WithheldComparisons, compare_withheld, score_comparisons
+from tcpipe.stages.withheld import WithheldComparisons, compare_withheld
 
 HUSKY = 'wheel_odometry = ["odometry/filtered"]\n'
 HUSKY_VARIANTS = {"": "", ", no GNSS": "gnss = []\n", ", no GNSS, no IMU": "gnss = []\nimu = []\n"}
@@ -154,12 +157,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("logs", nargs="?", type=Path, default=Path(os.environ.get("TCPIPE_PUBLIC_LOGS", "public-logs")))
     parser.add_argument("--only", default="", help="cases whose name contains this")
+    parser.add_argument("--log", type=Path, action="append", help="audit this log instead; repeatable")
     given = parser.parse_args()
     data = Path(os.environ.get("TCPIPE_TEST_DATA", Path(__file__).parents[2] / "shared" / "data"))
+    cases = [Case(str(log), log) for log in given.log] if given.log else list_cases(given.logs, data)
     halves = {"open": Half(), "held out": Half()}
     print(f"{'log':<44} {'half':<8} {'CPU':>8} | fixes withheld for: windows, error, 95 %, sigma [m], <1s, <2s")
     with tempfile.TemporaryDirectory() as directory:
-        for case in (case for case in list_cases(given.logs, data) if given.only in case.name):
+        for case in (case for case in cases if given.only in case.name):
             if not case.path.exists():
                 print(f"{case.name:<44} not there: {case.path}")
                 continue

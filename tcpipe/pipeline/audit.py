@@ -10,12 +10,13 @@ from tcpipe.errors import StoreError, UsageError, clean_lines
 from tcpipe.formats.logs.log_joining import open_single_log
 from tcpipe.formats.object_storage import format_path, is_url
 from tcpipe.formats.recipe_toml import load_profiles
+from tcpipe.fusion.withheld import WithheldScore, score_comparisons
 from tcpipe.progress import step
 from tcpipe.recipe import FuseConfig, Recipe
 from tcpipe.stages.fuse_inputs import find_recipe_role
 from tcpipe.stages.read import read_run
 from tcpipe.stages.read_roles import find_read_config
-from tcpipe.stages.withheld import WithheldScore, compare_withheld, score_comparisons
+from tcpipe.stages.withheld import compare_withheld
 from tcpipe.store import is_store, run_at
 from tcpipe.tables.levels import Streams
 

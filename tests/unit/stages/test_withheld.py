@@ -10,10 +10,11 @@ from unit.fusion import drive
 from unit.stages.test_fuse import filled, sensor, streams_of
 
 from tcpipe.errors import FusionError
+from tcpipe.fusion.withheld import place_windows, score_comparisons
 from tcpipe.recipe import FuseConfig
 from tcpipe.stages import withheld
 from tcpipe.stages.fuse import fuse_run
-from tcpipe.stages.withheld import compare_withheld, place_windows, score_comparisons, withhold
+from tcpipe.stages.withheld import compare_withheld, withhold
 from tcpipe.tables.columns import to_floats, to_integers
 from tcpipe.tables.levels import GNSS_VELOCITY
 
