@@ -176,6 +176,7 @@ _FEWEST = 8  # windows
 _TOLD = 0.5  # less, and the larger of fit and prior holds
 _SHORTEST_S = 1.0  # windows that every section has enough of
 _MOST_UNCLAIMED = 0.5  # share of fixes without a claim, whose noise stays the recipe's
+_ONE_TIME = 0.6  # share of the claim that may well belong to one correlation time, 1σ
 _UNLIKE = 0.25  # by this share of the total, processes in the plane differ from those of the height
 _LOOSEST = 25.0  # a prior's standard deviation grows by so much at most
 _LEAST_LEVEL = 1e-3  # of the squares, relative to the fitted sum
@@ -393,7 +394,8 @@ def _find_prior(name: str, prior: NoiseModel) -> tuple[float, float]:
     """Return mean and standard deviation of a density before the data speak."""
     kind, _, last = name.rpartition(" ")
     if name.startswith("up ") and prior.vertical is not None:
-        return _find_fix_prior(last, prior.vertical), prior.vertical.claimed_m2
+        mean, claimed = _find_fix_prior(last, prior.vertical), prior.vertical.claimed_m2
+        return mean, claimed if last == "white" else _ONE_TIME * claimed
     if name.startswith("fix ") and prior.horizontal is not None and prior.vertical is not None:
         return _find_plane_prior(last, prior.horizontal, prior.vertical)
     if last == "turn" or (last == "velocity" and kind in prior.odometries):
@@ -419,12 +421,14 @@ def _find_plane_prior(part: str, prior: FixNoise, vertical: FixNoise) -> tuple[f
     """
     usual = _find_fix_prior(part, prior)
     told = vertical.correlated.told
-    if part == "white" or told <= 0.0:
+    if part == "white":
         return usual, prior.claimed_m2
+    if told <= 0.0:
+        return usual, _ONE_TIME * prior.claimed_m2
     ratio = prior.claimed_m2 / vertical.claimed_m2
     alike = ratio * sum(each.variance for each in vertical.processes if each.time_s == float(part))
     total = ratio * sum(each.variance for each in vertical.processes)
-    return told * alike + (1 - told) * usual, told * _UNLIKE * total + (1.01 - told) * prior.claimed_m2
+    return told * alike + (1 - told) * usual, told * _UNLIKE * total + (1.01 - told) * _ONE_TIME * prior.claimed_m2
 
 
 def _find_heading_variance(prior: NoiseModel) -> float:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,7 +26,8 @@ from tcpipe.geometry.rotation import matrix_from_quat, multiply, quat_from_rotat
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
-Mask = NDArray[np.bool_]
+Plane = NDArray[np.complex128]
+_Number = TypeVar("_Number", np.float64, np.complex128)
 
 STEP_S = 0.05
 """Between the rows of a grid."""
@@ -205,7 +206,7 @@ def remove_spikes(values: Floats) -> Floats:
     return np.where(off > _SPIKE * scatter, smooth, values)
 
 
-def integrate_grid(rate: Floats) -> Floats:
+def integrate_grid(rate: NDArray[_Number]) -> NDArray[_Number]:
     """Return the integral from zero on over a grid of `STEP_S` of samples (n,) or (n, k)."""
     total = np.zeros_like(rate)
     np.cumsum(0.5 * (rate[1:] + rate[:-1]) * STEP_S, axis=0, out=total[1:])
@@ -272,12 +273,13 @@ class _Alignment:
         # The turn scale of an odometry is an error of heading that grows with the turn.
         self._turn = (attitude.yaw_rad - attitude.yaw_rad.mean()) * (attitude.role != IMU)
 
-    def _difference(self, values: Any) -> Any:
-        """Return the change over each window of what is on the grid, real or complex (n,)."""
+    def _difference(self, values: Floats | Plane) -> Plane:
+        """Return the change over each window of what is on the grid (n,)."""
         time_s = self._attitude.time_s
-        return np.interp(self._end_s, time_s, values) - np.interp(self._start_s, time_s, values)
+        plane = np.asarray(values, np.complex128)
+        return np.interp(self._end_s, time_s, plane) - np.interp(self._start_s, time_s, plane)
 
-    def _horizontal(self, forward: Floats, fit: _Fit) -> tuple[Any, Any]:
+    def _horizontal(self, forward: Floats, fit: _Fit) -> tuple[Plane, Plane]:
         """Return velocity and arm, complex, on the grid."""
         turn, rotation = np.exp(1j * fit.turn_rad), self._attitude.rotation
         velocity = fit.scale * forward * (rotation[:, 0, 0] + 1j * rotation[:, 1, 0]) * turn
@@ -355,8 +357,8 @@ class _Alignment:
         """Return the slow error of pitch [rad] on the grid (n,) with which the track climbs as the fixes do."""
         knots_s = np.linspace(0.0, self._knots_s[-1], max(2, round(float(self._knots_s[-1]) / _PITCH_KNOT_S) + 1))
         hats = np.maximum(0.0, 1.0 - np.abs(self._middle_s[:, None] - knots_s) / knots_s[1])
-        path = self._difference(integrate_grid(speed))
-        rise = self._moved_m[:, 2] - self._difference(integrate_grid(climb) + self._arm_m[:, 2])
+        path = self._difference(integrate_grid(speed)).real
+        rise = self._moved_m[:, 2] - self._difference(integrate_grid(climb) + self._arm_m[:, 2]).real
         pitch = np.zeros(knots_s.size)
         for _ in range(_ROUNDS // 2):
             off = rise - path * (hats @ pitch)
