@@ -127,26 +127,21 @@ def find_gain_change(sag: Sag | None) -> GainChange | None:
         return None
     resistance, place = -by_volt / weight, np.arange(count)
 
-    def fit(columns: Floats) -> tuple[Floats, float]:
-        root = np.sqrt(weight)
-        value = np.linalg.lstsq(columns * root[:, None], resistance * root, rcond=None)[0]
-        return value, float(np.sum(weight * (resistance - columns @ value) ** 2))
+    def unexplained(*columns: Floats | NDArray[np.bool_ | np.int64]) -> float:
+        by = np.sqrt(weight)
+        design = np.column_stack(columns) * by[:, None]
+        target = resistance * by
+        return float(np.sum((target - design @ np.linalg.lstsq(design, target, rcond=None)[0]) ** 2))
 
     splits = list(range(_FEWEST_BLOCKS, count - _FEWEST_BLOCKS + 1))
-    steps = [fit(np.column_stack((place < first, place >= first)).astype(np.float64)) for first in splits]
-    best = min(range(len(splits)), key=lambda at: steps[at][1])
-    left, first = steps[best][1], splits[best]
+    left = [unexplained(place < first, place >= first) for first in splits]
+    first, variance = splits[int(np.argmin(left))], min(left) / (count - 3)
+    constant, gradual = unexplained(np.ones(count)), unexplained(np.ones(count), place)
+    is_sure = constant - min(left) > _SURE**2 * variance and gradual - min(left) > _GRADUAL**2 * variance
     # The level of the current steps, too, when its gain does: the blocks beside it tell the time, but not the ratio.
     before, after = (-float(by_volt[of].sum() / weight[of].sum()) for of in (slice(first - 1), slice(first + 1, None)))
-    variance = left / (count - 3)
-    _, constant = fit(np.ones((count, 1)))
-    _, gradual = fit(np.column_stack((np.ones(count), place)))
-    is_sure = constant - left > _SURE**2 * variance and gradual - left > _GRADUAL**2 * variance
-    if (
-        not is_sure
-        or min(before, after) <= 0.0
-        or abs(before / after - 1.0) < read_threshold("current-gain-changes", "min_change_fraction")
-    ):
+    least = read_threshold("current-gain-changes", "min_change_fraction")
+    if not is_sure or min(before, after) <= 0.0 or abs(before / after - 1.0) < least:
         return None
     return GainChange(int(edge_ns[first]), before / after)
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 import pyarrow as pa
@@ -91,26 +90,38 @@ def _add_gain_change(facts: PowerSensorFacts, rails_by_epoch: Mapping[int, list[
     return replace(facts, gain_std_fraction=std, gain_ratio=change.ratio, gain_changed_ns=change.at_ns)
 
 
+_POWER = Subject("role", "power")
+
+
 def find_sensor_findings(label: LabelFacts, info: TrackInfo, start_ns: int) -> Iterator[Finding]:
     """Yield what the audit of the power sensor found; ``start_ns`` is when the track begins."""
     facts, power = label.power_sensor, info.report.facts.power
     if facts is None:
         return
-    make = partial(make_finding, subject=Subject("role", "power"))
     if facts.rest_amp and power and power.rest_current_amp and facts.offset_std_amp > _find_prior(power)[1]:
-        (lowest, highest), (least, most) = facts.rest_amp, power.rest_current_amp
-        numbers = {"lowest_amp": lowest, "highest_amp": highest, "least_amp": least, "most_amp": most}
-        keys = {"label": {"power_offset_std_amp": round(facts.offset_std_amp, 2)}}
-        yield make(
-            "current-offset", remedies=suggest("state_offset", keys), offset_std_amp=facts.offset_std_amp, **numbers
+        yield make_finding(
+            "current-offset",
+            _POWER,
+            remedies=suggest("state_offset", {"label": {"power_offset_std_amp": round(facts.offset_std_amp, 2)}}),
+            lowest_amp=facts.rest_amp[0],
+            highest_amp=facts.rest_amp[1],
+            least_amp=power.rest_current_amp[0],
+            most_amp=power.rest_current_amp[1],
+            offset_std_amp=facts.offset_std_amp,
         )
     if facts.gain_ratio is not None and facts.gain_changed_ns is not None:
         at_s = (facts.gain_changed_ns - start_ns) * 1e-9
-        keys = {"label": {"power_gain_std_fraction": round(facts.gain_std_fraction, 3)}}
-        numbers = {"gain_ratio": facts.gain_ratio, "at_s": at_s, "gain_std_fraction": facts.gain_std_fraction}
-        yield make("current-gain-changes", remedies=suggest("state_gain", keys), span_s=(at_s, at_s), **numbers)
+        yield make_finding(
+            "current-gain-changes",
+            _POWER,
+            remedies=suggest("state_gain", {"label": {"power_gain_std_fraction": round(facts.gain_std_fraction, 3)}}),
+            span_s=(at_s, at_s),
+            gain_ratio=facts.gain_ratio,
+            at_s=at_s,
+            gain_std_fraction=facts.gain_std_fraction,
+        )
     if facts.lost_signs:
-        yield make("current-sign-lost", segment_fraction=facts.lost_signs / label.segments)
+        yield make_finding("current-sign-lost", _POWER, segment_fraction=facts.lost_signs / label.segments)
 
 
 def make_sensor_error(cut: pa.Table, rails: list[Rail], facts: PowerSensorFacts, *, rule: Rule) -> SensorError:
