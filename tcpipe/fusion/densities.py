@@ -118,6 +118,8 @@ class NoiseModel:
     stamp_s2: float = 0.0
     stamp_told: float = 0.0
     residuals: tuple[ResidualLevel, ...] = field(default=(), repr=False)
+    densities: Mapping[str, Mapping[str, float]] = field(default_factory=dict, repr=False)
+    """By axis, the fitted densities by the names of `tcpipe.fusion.pair_residuals.Residuals.features`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -218,6 +220,10 @@ def fit_noise(measurements: Measurements, residuals: Sequence[Residuals]) -> Noi
         stamp_s2=stamp_s2,
         stamp_told=stamp_told,
         residuals=tuple(level for fit in (by_turns, plane, by_heights) for level in fit.find_levels()),
+        densities={
+            axis: fit.get_densities()
+            for axis, fit in ((TURN, by_turns), (ALONG, plane), (ACROSS, plane), (UP, by_heights))
+        },
     )
 
 
@@ -310,6 +316,10 @@ class _Fit:
         """Return which share the data tell of a sum of the densities, by factors (C,)."""
         before = float(np.square(factors * self._usual_std).sum())
         return float(np.clip(1.0 - factors @ self._covariance @ factors / before, 0.0, 1.0)) if before > 0.0 else 0.0
+
+    def get_densities(self) -> dict[str, float]:
+        """Return every density by name."""
+        return dict(zip(self._names, self._variances.tolist(), strict=True))
 
     def find_density(self, name: str, prior: float) -> tuple[float, float]:
         """Return a density, and its share told; the larger of fit and prior where the data tell less than half of it."""

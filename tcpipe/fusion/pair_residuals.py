@@ -31,6 +31,7 @@ from tcpipe.fusion.level_motion import (
     get_turn_rates,
     integrate_grid,
     make_free_track,
+    remove_spikes,
 )
 from tcpipe.fusion.measurements import GNSS, Measurements, Positions
 from tcpipe.fusion.signals import (
@@ -146,6 +147,7 @@ def _compare_fixes(section: _Section, gnss: Positions, role: str, track: Track, 
     attitude = section.attitude
     fix_s = compute_seconds(gnss.stamp_ns, section.zero_ns)
     off = gnss.position_enu_m - interpolate_signal(attitude.time_s, track.path_m + track.arm_m, fix_s)
+    off = np.stack([remove_spikes(axis, fill=np.nan) for axis in off.T], -1)
     sways = 0.0 if attitude.is_level else gnss.lever_arm_m[2]
     has_others = len(section.measurements.odometries()) > 1
     sources = (section.measurements.odometries()[role].stamp_ns, attitude.source_ns)
