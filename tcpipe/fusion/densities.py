@@ -392,7 +392,7 @@ def _split_cells(each: Residuals, names: Sequence[str]) -> Iterator[_Cell]:
     features = np.stack([each.features.get(name, np.zeros(each.value.size)) for name in names], -1)
     for is_still in (False, True):
         if is_still:  # what little the robot moves then must not explain them
-            features = features * np.array([" scale" not in name and name != "sway" for name in names])
+            features = features * np.array([" scale" not in name and not name.startswith("sway") for name in names])
         rows = np.flatnonzero((each.is_still == is_still) & np.isfinite(each.value) & (each.value != 0.0))
         if rows.size < _FEWEST:
             continue
@@ -411,6 +411,8 @@ def _find_prior(name: str, prior: NoiseModel) -> tuple[float, float]:
     if last == "turn" or (last == "velocity" and kind in prior.odometries):
         density = prior.turns[kind].white_rad2ps if last == "turn" else prior.odometries[kind].velocity_m2ps
         return density, PRIORS[name].times * density
+    if kind == "sway":
+        return PRIORS[kind].variance, PRIORS[kind].variance
     if kind in PRIORS:
         process = _make_process(kind)
         if kind == "heading scale":
