@@ -31,6 +31,7 @@ from tcpipe.fusion.level_motion import (
     get_turn_rates,
     integrate_grid,
     make_free_track,
+    remove_spikes,
 )
 from tcpipe.fusion.measurements import GNSS, Measurements, Positions
 from tcpipe.fusion.signals import (
@@ -50,6 +51,8 @@ TIMES_S = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 40.0, 80.0)
 """Time differences."""
 FIX_S, SCALE_S, TURN_S = (1.0, 3.0, 10.0, 30.0, 100.0), (3.0, 10.0, 30.0, 100.0), (10.0, 100.0)
 """Correlation times of processes: of fixes, of scales and directions, of yaw rates."""
+MOVING_S = (1.0, 3.0)
+"""The same of errors of fixes that are there only while the robot moves."""
 
 _NODES = 40  # of the path within a window
 _WINDOWS = 600  # of one length, at most
@@ -57,7 +60,7 @@ _FEWEST = 8  # windows of one length
 _OVERLAPPING = 8  # windows begin in the length of one
 _LONGEST_GAP_NS = 300_000_000
 _STILL_MPS, _STILL_RAD, _STILL_S = 0.02, 0.02, 0.5  # the last: speeds are averaged, so that noise is none
-_SWAY_M = 5.0  # the ground's slope changes over so much
+_SWAY_M = (1.0, 3.0, 10.0, 30.0)  # the ground's slope changes over so much
 _PAIR_STEP_S = 0.1  # between windows' ends of sensors that are no fixes
 
 
@@ -146,6 +149,7 @@ def _compare_fixes(section: _Section, gnss: Positions, role: str, track: Track, 
     attitude = section.attitude
     fix_s = compute_seconds(gnss.stamp_ns, section.zero_ns)
     off = gnss.position_enu_m - interpolate_signal(attitude.time_s, track.path_m + track.arm_m, fix_s)
+    off = np.stack([remove_spikes(axis, fill=np.nan) for axis in off.T], -1)
     sways = 0.0 if attitude.is_level else gnss.lever_arm_m[2]
     has_others = len(section.measurements.odometries()) > 1
     sources = (section.measurements.odometries()[role].stamp_ns, attitude.source_ns)
@@ -165,10 +169,11 @@ def _compare_fixes(section: _Section, gnss: Positions, role: str, track: Track, 
         for axis, value in values.items():
             features = _describe_fixes(gnss, axis, first, last, time_s)
             features |= window.describe(role, axis, has_others=has_others)
+            features |= window.describe_moving("up" if axis == UP else "fix")
             if axis != UP:
                 features["stamp"] = window.describe_stamps(axis)
             if sways and axis != UP:
-                features["sway"] = -2.0 * sways**2 * np.expm1(-window.length_m / _SWAY_M)
+                features |= {f"sway {each:g}": -2.0 * sways**2 * np.expm1(-window.length_m / each) for each in _SWAY_M}
             stamps = gnss.stamp_ns[first], gnss.stamp_ns[last]
             made.append(Residuals((GNSS, role), axis, time_s, *stamps, value, features, is_still))
     return made
@@ -306,6 +311,13 @@ class _Window:
         features |= {f"heading scale {tau:g}": _integrate_process(other, self.time_s, tau) for tau in SCALE_S}
         features["slide velocity"] = self._integrate_moving(self._aside if axis == ALONG else self._ahead)
         return features
+
+    def describe_moving(self, name: str) -> dict[str, Floats]:
+        """Return the factors of errors of fixes that are there only while the robot moves: receivers hold a stationary position."""
+        begin, end = (np.abs(self._speed[:, [0, -1]]) > _STILL_MPS).T.astype(np.float64)
+        return {
+            f"{name} moving {tau:g}": begin + end - 2.0 * begin * end * np.exp(-self.time_s / tau) for tau in MOVING_S
+        }
 
     def describe_stamps(self, axis: str) -> Floats:
         """Return the factor of the variance of the stamps at both ends, of the nodes nearest to them."""
