@@ -2,8 +2,8 @@
 
 `estimate_noise` returns a `NoiseModel`. A filter takes from it, each number in the unit that its name ends with:
 
-- ``horizontal`` and ``vertical``: of fixes, east and north alike, and up. ``compute_white_m2`` of a fix's claim is the variance of its
-  independent error; ``correlated`` is a Gauss-Markov error of position, to be a state of each axis.
+- ``horizontal`` and ``vertical``: of fixes, east and north alike, and up. ``white_m2`` is independent from fix to fix; ``correlated`` is a
+  Gauss-Markov error of position, to be a state of each axis. Both are those of a fix that claims ``claimed_m2``, and in proportion to it.
 - ``odometries[role].velocity_m2ps``: the variance of the distance grows by so much a second of driving; a velocity at f Hz has the
   variance ``velocity_m2ps * f``. Zero while the robot is stationary.
 - ``odometries[role].scale``: Gauss-Markov error of the scale around its mean, [1]; ``shared_scale``: the same for all odometries at once.
@@ -65,14 +65,6 @@ class FixNoise:
     correlated: GaussMarkov
     processes: tuple[GaussMarkov, ...]
     white_told: float = 0.0
-
-    def compute_white_m2(self, claimed_m2: Floats) -> Floats:
-        """Return the white variance of fixes that claim these variances, any shape.
-
-        What a fix claims beyond the median is white altogether, since ``correlated`` is that of a fix of the median claim.
-        """
-        share = claimed_m2 / self.claimed_m2
-        return np.asarray(self.white_m2 * share + self.correlated.variance * np.maximum(share - 1.0, 0.0))
 
 
 @dataclass(frozen=True, slots=True)
