@@ -205,10 +205,16 @@ def _claimed(name: str, std_m: float, family: FixError) -> Callable[[Readings, D
     return alter("gnss", change)
 
 
+def _ordinary_currents(readings: Readings, drive: Drive) -> Readings:
+    """Return both drivers' currents with a gain (2 %) and a zero (0.2 A together) that are drawn once a drive."""
+    gain, zero_amp = drive.noise("ordinary.power").normal(0.0, (0.02, 0.2)).tolist()
+    return _currents(lambda amp, _: (1.0 + gain) * amp + 0.5 * zero_amp)(readings, drive)
+
+
 def _ordinary_noise(readings: Readings, drive: Drive) -> Readings:
     rng = drive.noise("ordinary")
     std_m, tau_s = rng.uniform(0.008, 0.020), float(np.exp(rng.uniform(*np.log([5.0, 60.0]))))
-    return _claimed("ordinary.fixes", std_m, gauss_markov(std_m, tau_s))(readings, drive)
+    return _claimed("ordinary.fixes", std_m, gauss_markov(std_m, tau_s))(_ordinary_currents(readings, drive), drive)
 
 
 # What a log says of the antenna, clocks, power
@@ -385,7 +391,11 @@ def _in_ordinary(fault: Fault) -> Fault:
 
 def _noise(name: str, std_m: float, family: FixError) -> Fault:
     """Return another noise of the fixes in place of the ordinary one; it is claimed."""
-    return Fault(name, route="valley", readings=_claimed("noise", std_m, family), messages=ORDINARY.messages)
+    claimed = _claimed("noise", std_m, family)
+    return Fault(
+        name, route="valley", messages=ORDINARY.messages,
+        readings=lambda readings, drive: claimed(_ordinary_currents(readings, drive), drive),
+    )  # fmt: skip
 
 
 def _arm(name: str, messages: Callable[[Messages, Drive], Messages], said: str, route: str = "valley") -> Fault:
