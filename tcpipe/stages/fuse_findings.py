@@ -8,14 +8,12 @@ from typing import Any
 import numpy as np
 
 from tcpipe.fusion.checks.audit import find_undecided_sensors
-from tcpipe.fusion.checks.mounting import Arm, Tilt
 from tcpipe.fusion.checks.odometry_scale import Scale, compute_command_ratio
 from tcpipe.fusion.measurements import GNSS, IMU, VISUAL, WHEELS
 from tcpipe.geometry.rotation import matrix_from_quat, quat_from_rpy
 from tcpipe.recipe.suggestions import suggest
 from tcpipe.stages.fuse_inputs import (
     FusionInputs,
-    compute_moved_m,
     exclude_role,
     find_longest_epoch,
     find_recipe_role,
@@ -23,7 +21,15 @@ from tcpipe.stages.fuse_inputs import (
     state_extrinsics,
 )
 from tcpipe.stages.fuse_sections import Fused
-from tcpipe.tables.facts import AuditFacts, Disagreement, FuseFacts, GateReset, MountingFacts, StretchFacts, make_vector
+from tcpipe.tables.facts import (
+    AuditFacts,
+    Disagreement,
+    FuseFacts,
+    GateReset,
+    MountingFacts,
+    ParameterFacts,
+    StretchFacts,
+)
 from tcpipe.tables.findings import Finding, StageReport, Subject, make_finding, read_threshold
 from tcpipe.tables.levels import Sensor, Streams
 
@@ -189,20 +195,48 @@ def _find_disagreement(found: Sequence[Disagreement], first_ns: int) -> Finding:
     )
 
 
-def make_mounting_findings(inputs: FusionInputs, streams: Streams) -> StageReport[MountingFacts | None]:
-    """Return what was corrected, with the recipe keys that would state it."""
-    arm, tilt = inputs.arm, inputs.imu_tilt
-    findings = [] if arm is None else [_find_arm(arm, streams.sensors[GNSS], find_recipe_role(GNSS, streams))]
-    findings += [] if tilt is None else [_find_tilt(tilt, streams.sensors[IMU])]
+_SURELY = 4.0  # standard deviations
+_LEAST_ARM_M = 0.1  # what a finding names
+_LEAST_TILT_RAD = 0.0175
+_LEAST_SCALE = 0.03
+
+
+def make_mounting_findings(inputs: FusionInputs, fused: Fused, streams: Streams) -> StageReport[MountingFacts | None]:
+    """Return where the run shows other extrinsics or scales than are stated, with the recipe keys that would state it."""
+    findings: list[Finding] = []
+    longest = max(fused.facts, key=lambda of: of.end_ns - of.start_ns)
+    arm, tilt = longest.parameters.get("antenna"), longest.parameters.get("mounting of the IMU")
+    moved = std_m = roll_pitch = None
+    if arm is not None and GNSS in streams.sensors:
+        sensor = streams.sensors[GNSS]
+        if sensor.placed_by == "assumed" or _is_contradicted(arm, _LEAST_ARM_M):
+            moved, std_m = arm.value, arm.std
+            findings.append(_find_arm(arm, sensor, find_recipe_role(GNSS, streams)))
+    if tilt is not None and _is_contradicted(tilt, _LEAST_TILT_RAD):
+        roll_pitch = tilt.value[0], tilt.value[1]
+        findings.append(_find_tilt(tilt, streams.sensors[IMU]))
+    scales = dict(inputs.scales) | _find_scales(inputs, longest)
     given = streams.report.facts.odometry_scale or {}
-    findings += [_find_odometry_scale(role, scale, given.get(role, 1.0)) for role, scale in inputs.scales.items()]
+    findings += [_find_odometry_scale(role, scale, given.get(role, 1.0)) for role, scale in scales.items()]
     if not findings:
         return StageReport((), None)
-    std_m = None if arm is None else make_vector(np.sqrt(np.diag(arm.covariance)[:3]))
-    moved = None if arm is None else make_vector(compute_moved_m(inputs, streams))
-    roll_pitch = None if tilt is None else (float(tilt.rad[0]), float(tilt.rad[1]))
-    scales = {role: scale.factor for role, scale in inputs.scales.items()} or None
-    return StageReport(tuple(findings), MountingFacts(moved, std_m, roll_pitch, scales))
+    factors = {role: scale.factor for role, scale in scales.items()} or None
+    return StageReport(tuple(findings), MountingFacts(moved, std_m, roll_pitch, factors))
+
+
+def _is_contradicted(found: ParameterFacts, least: float) -> bool:
+    """Return whether a parameter surely differs from what is stated, by so much at least."""
+    return any(abs(v) > max(_SURELY * s, least) for v, s in zip(found.value, found.std, strict=True))
+
+
+def _find_scales(inputs: FusionInputs, longest: StretchFacts) -> dict[str, Scale]:
+    """Return the scales of odometries that surely differ from 1."""
+    found = {}
+    for name, role in (("wheel scale", WHEELS), ("camera scale", VISUAL)):
+        scale = longest.parameters.get(name)
+        if scale is not None and _is_contradicted(scale, _LEAST_SCALE) and role not in inputs.scales:
+            found[role] = Scale(1.0 + scale.value[0], scale.std[0])
+    return found
 
 
 def _find_odometry_scale(role: str, scale: Scale, given: float) -> Finding:
@@ -212,8 +246,8 @@ def _find_odometry_scale(role: str, scale: Scale, given: float) -> Finding:
     return make_finding("odometry-scale", subject, remedies=remedies, scale=scale.factor, scale_std=std, **by_speed)
 
 
-def _find_arm(arm: Arm, sensor: Sensor, name: str) -> Finding:
-    place, std_m = np.asarray(sensor.xyz_m) + arm.error[:3], np.sqrt(np.diag(arm.covariance)[:3])
+def _find_arm(arm: ParameterFacts, sensor: Sensor, name: str) -> Finding:
+    place = np.asarray(sensor.xyz_m) + arm.value
     axes = ("forward", "left", "up")
     return make_finding(
         "lever-arm-unknown" if sensor.placed_by == "assumed" else "lever-arm-contradicted",
@@ -221,18 +255,18 @@ def _find_arm(arm: Arm, sensor: Sensor, name: str) -> Finding:
         names={"placed_by": sensor.placed_by},
         remedies=state_extrinsics(name, np.round(place, 2).tolist(), matrix_from_quat(sensor.quat_xyzw)),
         **{f"{axis}_m": value for axis, value in zip(axes, place.tolist(), strict=True)},
-        **{f"{axis}_std_m": value for axis, value in zip(axes, std_m.tolist(), strict=True)},
+        **{f"{axis}_std_m": value for axis, value in zip(axes, arm.std, strict=True)},
     )
 
 
-def _find_tilt(tilt: Tilt, sensor: Sensor) -> Finding:
-    roll_rad, pitch_rad = tilt.rad.tolist()
-    turn = matrix_from_quat(quat_from_rpy(roll_rad, pitch_rad, 0.0)) @ matrix_from_quat(sensor.quat_xyzw)
+def _find_tilt(tilt: ParameterFacts, sensor: Sensor) -> Finding:
+    """Return the finding of an IMU that is mounted otherwise: its measurements turn into the robot's axes by the inverse."""
+    turn = matrix_from_quat(quat_from_rpy(*(-value for value in tilt.value))) @ matrix_from_quat(sensor.quat_xyzw)
     return make_finding(
         "imu-tilted",
         Subject("role", IMU),
         names={"placed_by": sensor.placed_by},
         remedies=state_extrinsics(IMU, sensor.xyz_m, turn),
-        roll_rad=roll_rad,
-        pitch_rad=pitch_rad,
+        roll_rad=-tilt.value[0],
+        pitch_rad=-tilt.value[1],
     )
