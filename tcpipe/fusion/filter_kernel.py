@@ -63,6 +63,7 @@ class Inputs(NamedTuple):
     mode, turned, gained : motion from the tick before, as `move_state` takes it, (K,), (K, 9), (K, 6).
     noise : variance added to rotation and body velocity [rad², m²/s²], (K, 6).
     rate, has_gyro : angular velocity at the tick, as measured [rad/s], (K, 3), and whether by a gyroscope, (K,).
+    quickens : acceleration forward at the tick [m/s²], (K,). Not the state's own, whose noise would look like a lag of every sensor.
     value, variance : measurements by kind, (K, 8, 3); NaN: none.
     tau : time of the measurement after the tick [s], (K, 8).
     levers : places of odometries on the robot [m], (8, 3).
@@ -76,6 +77,7 @@ class Inputs(NamedTuple):
     noise: Matrix
     rate: Matrix
     has_gyro: NDArray[np.bool_]
+    quickens: Vector
     value: NDArray[np.float64]
     variance: NDArray[np.float64]
     tau: Matrix
@@ -471,16 +473,13 @@ def filter_ticks(first: int, last: int, inputs: Inputs, model: Model, memory: Me
     )
     gain = (np.zeros(3), np.zeros((3, n)), np.zeros((3, n)), np.zeros((3, n)), np.zeros((3, 3)), np.zeros((3, 3)))
     F, kept, K, turn = np.zeros((MOST, MOST)), np.ones(n), np.zeros((3, n)), np.zeros(18)
-    quickens, before = np.zeros(3), np.zeros(3)
+    quickens = np.zeros(3)
     y, H, _, _, _, inverse = gain
     for k in range(first, last):
-        for i in range(3):
-            before[i] = x[U + 6 + i]
         if k > 0:
             _move(k, inputs, model, x, P, F, room)
             _decay(k, inputs, model, x, P, kept)
-        for i in range(3):
-            quickens[i] = (x[U + 6 + i] - before[i]) / inputs.period_s if k > 0 else 0.0
+        quickens[0] = inputs.quickens[k]
         if keep and k > 0:
             for i in range(MOST):
                 for j in range(MOST):

@@ -29,7 +29,14 @@ from tcpipe.fusion.process import (
     make_motion_noise,
     turn_sources,
 )
-from tcpipe.fusion.signals import compute_interval_means, compute_median_period_ns, compute_seconds, is_covered
+from tcpipe.fusion.signals import (
+    compute_interval_means,
+    compute_median_of_five,
+    compute_median_period_ns,
+    compute_seconds,
+    compute_slopes,
+    is_covered,
+)
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -40,6 +47,7 @@ _STATIONARY_STD_MPS = 0.01  # a robot that stands rocks
 _STATIONARY_RATE_STD_RADPS = 5e-4
 _LEVEL_EVERY_S = 1.0
 _UNMEASURED = 1e6
+_ACCELERATION_WINDOW_S = 0.4
 _LASTING_S = 0.1  # errors of an odometry beyond its white noise are independent after this time
 
 
@@ -137,6 +145,7 @@ def build_ticks(m: Measurements, noise: NoiseModel, stationary_ns: Ints, start_n
         make_motion_noise(m, noise, stamp_ns, mode, turn_rate, period_s),
         rate,
         around >= state.GYRO_TURN,
+        _compute_acceleration(m, stamp_ns),
         value,
         variance,
         tau,
@@ -264,6 +273,16 @@ def _preintegrate(t: Floats, w: Floats, f: Floats, ends: Floats, period_s: float
         for i in range(3):
             gained[k, i] = v[i]
             gained[k, 3 + i] = p[i]
+
+
+def _compute_acceleration(m: Measurements, stamp_ns: Ints) -> Floats:
+    """Return the forward acceleration at each tick by how an odometry's velocity changes; 0 where there is none."""
+    source = m.visual if m.visual is not None else m.wheels
+    if source is None or source.stamp_ns.size < 3:
+        return np.zeros(stamp_ns.size)
+    slope = compute_slopes(source.stamp_ns, compute_median_of_five(source.velocity_mps[:, 0]), _ACCELERATION_WINDOW_S)
+    found = np.interp(compute_seconds(stamp_ns, int(stamp_ns[0])), compute_seconds(source.stamp_ns, int(stamp_ns[0])), slope)
+    return np.where(is_covered(source.stamp_ns, stamp_ns, stamp_ns), found, 0.0)
 
 
 def _find_turn_rates(m: Measurements, before_ns: Ints, after_ns: Ints, zero_ns: int) -> tuple[Floats, NDArray[np.int8]]:
