@@ -6,9 +6,10 @@ the stage `read` the tables that a log on disk would give, and the stages from t
 
 from __future__ import annotations
 
+import time
 import traceback
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cache
 from typing import Any
 
@@ -20,34 +21,41 @@ from tcpipe.errors import TcpipeError
 from tcpipe.formats.finding_lines import format_finding
 from tcpipe.formats.logs.writing import MessageStream
 from tcpipe.formats.recipe_toml import load_shipped_profiles
+from tcpipe.geometry.rotation import rpy_from_quat
 from tcpipe.logs.messages import list_needed_fields
 from tcpipe.logs.topics import Topic
 from tcpipe.pipeline.ingest_run import run_stages
 from tcpipe.recipe import Recipe
 from tcpipe.simulation import Faults, Truth, compute_true_cost, simulate_readings
 from tcpipe.simulation.messages import Recorder, make_streams
-from tcpipe.simulation.route import Leg, Manoeuvre, Pause, Wander
+from tcpipe.simulation.robot import SimulatedRobot
+from tcpipe.simulation.route import Leg, Pause, Wander
 from tcpipe.simulation.scenarios import DriveSpec, RasterSpec, Scenario, make_small_world
 from tcpipe.simulation.sensors import Noise, Reading, Sensors, record
-from tcpipe.simulation.world import Site
+from tcpipe.simulation.world import MUD, PAVED, UNPAVED, Band, Ellipse, Hill, Site, World, draw_waves
 from tcpipe.stages.read import read_run
 from tcpipe.tables.arrays import to_numbers
 from tcpipe.tables.bits import Quality, flag_name
 from tcpipe.tables.columns import to_floats, to_integers
 from tcpipe.tables.findings import Finding
-from tcpipe.tables.levels import LabelledSegments, Streams
+from tcpipe.tables.levels import LabelledSegments, Streams, Track
 
 Readings = Mapping[str, Reading]
 Messages = Sequence[MessageStream]
 
 QUANTITIES = {"T": "duration_s", "v": "velocity_mps", "w": "power_watt", "E": "energy_joule", "start": "position_m"}
 """What is compared with the truth, and its column; the last is the start point's place."""
+RING = float(np.sqrt(-np.log(0.05)))
+"""The radius over DRMS inside which 95 of 100 points lie where both axes err alike."""
+_GAP_S = 5.0
+TRACK = ("xy_m", "velocity_mps", "yaw_rad", "gap_xy_m", "gap_inside")
 FIRST_SEED = 501
 HUSKY = Recorder("ros2", "clearpath_power")
 WHOLE = replace(Faults.every(), gnss_outage=False, visual_dropouts=False, power_gap=False)
 """Noise, scales, biases, mounts, outliers and delays of every sensor, but no hole in any: what is clean here."""
 _STARTS_M = ((14.0, 34.0), (110.0, 30.0), (90.0, 55.0), (30.0, 60.0), (60.0, 30.0), (40.0, 20.0))
-_WHEEL_PERIOD_S = 0.02
+_VALLEY_STARTS_M = ((40.0, 60.0), (150.0, 110.0), (90.0, 150.0), (200.0, 60.0), (120.0, 40.0), (60.0, 120.0))
+_NO_SENSORS = Sensors(*[None] * 6)
 
 
 @dataclass(frozen=True)
@@ -57,6 +65,8 @@ class Drive:
     truth: Truth
     site: Site
     noise: Noise
+    robot: str | None = "husky"
+    """The profile that the log is read with; None: a robot without one."""
 
     @property
     def first_ns(self) -> int:
@@ -112,25 +122,78 @@ class Fault:
         )  # fmt: skip
 
 
+def _hills(seed: int, length_m: float) -> tuple[World, DriveSpec]:
+    start_m = _STARTS_M[seed % len(_STARTS_M)]
+    plan = Wander(length_m, start_m, climbing=0.4)
+    return make_small_world(), DriveSpec("hills", plan, start_m, sensors=_NO_SENSORS)
+
+
+def _straight(_: int, length_m: float) -> tuple[World, DriveSpec]:
+    world = replace(make_small_world(Site(width_m=900.0)), hills=(), regions=(), holes=())
+    plan = (Pause(3.0), Leg(((10.0 + 4.0 * length_m, 40.0),)), Pause(3.0))
+    return world, DriveSpec("straight", plan, (10.0, 40.0), sensors=_NO_SENSORS, weave_m=0.0)
+
+
+def _standing(_: int, __: float) -> tuple[World, DriveSpec]:
+    return make_small_world(), DriveSpec("standing", (Pause(60.0),), _STARTS_M[0], sensors=_NO_SENSORS)
+
+
+def _valley(seed: int, length_m: float) -> tuple[World, DriveSpec]:
+    """Another place and a heavier, faster robot than the campaign's and the tests'."""
+    world = World(
+        site=Site(epsg=32632, west_m=421300.0, south_m=5311700.0, width_m=260.0, height_m=200.0, geoid_m=48.3),
+        base_m=311.0,
+        hills=(
+            Hill(60.0, 90.0, 8.5, 17.0, 14.0), Hill(140.0, 60.0, 7.0, 12.0, 19.0), Hill(200.0, 130.0, 9.5, 20.0, 16.0),
+            Hill(110.0, 150.0, -5.0, 18.0, 13.0), Hill(230.0, 50.0, 6.0, 15.0, 15.0),
+        ),
+        waves=draw_waves(71, count=6, total=0.13, wavelength_m=(8.0, 30.0)),
+        regions=(
+            Band(UNPAVED, 130.0, 100.0, 0.6, 5.0, 6.0, 90.0, 1.1), Band(PAVED, 130.0, 70.0, -0.2, 6.0, 3.0, 110.0, 0.2),
+            Ellipse(MUD, 80.0, 60.0, 11.0, 8.0, 0.7), Ellipse(MUD, 170.0, 120.0, 9.0, 13.0, 1.9),
+        ),
+        resistance=draw_waves(73, count=8, total=0.05, wavelength_m=(2.0, 15.0)),
+    )  # fmt: skip
+    robot = SimulatedRobot(
+        mass_kg=118.0, max_velocity_mps=1.25, speed_time_constant_s=0.35, max_acceleration_mps2=0.8, max_yaw_rate_radps=0.9,
+        slope_slip=0.07, wheelbase_m=0.65, scrub_torque_nm=240.0, idle_watt=21.0, electronics_watt=55.0,
+    )  # fmt: skip
+    start_m = _VALLEY_STARTS_M[seed % len(_VALLEY_STARTS_M)]
+    plan = Wander(length_m, start_m, climbing=0.4)
+    return world, DriveSpec("valley", plan, start_m, sensors=_NO_SENSORS, robot=robot)
+
+
+def _few_turns(count: int) -> Callable[[int, float], tuple[World, DriveSpec]]:
+    """Return a drive over the valley whose only turns are some corners."""
+
+    def make(seed: int, length_m: float) -> tuple[World, DriveSpec]:
+        world, spec = _valley(seed, length_m)
+        corners_m = ((35.0, 30.0), (215.0, 35.0), (205.0, 165.0), (50.0, 160.0))[: count + 2]
+        return world, replace(spec, plan=(Pause(4.0), Leg(corners_m[1:]), Pause(3.0)), start_m=corners_m[0])
+
+    return make
+
+
+def _plain(seed: int, length_m: float) -> tuple[World, DriveSpec]:
+    """Return a drive of the same robot where nothing rises."""
+    world, spec = _valley(seed, length_m)
+    return replace(world, hills=(), waves=()), spec
+
+
+ROUTES: Mapping[str, Callable[[int, float], tuple[World, DriveSpec]]] = {
+    "hills": _hills, "straight": _straight, "standing": _standing,
+    "valley": _valley, "plain": _plain, "one turn": _few_turns(1), "two turns": _few_turns(2),
+}  # fmt: skip
+"""A world and a drive over it by name, from a seed and about how far to drive [m]."""
+
+
 @cache
 def simulated(route: str, seed: int, length_m: float) -> Drive:
-    """Return a drive: over hills, straight ahead, or standing."""
-    start_m = _STARTS_M[seed % len(_STARTS_M)]
-    site = Site(width_m=900.0) if route == "straight" else Site()
-    world = make_small_world(site)
-    plan: tuple[Manoeuvre, ...] | Wander
-    if route == "straight":
-        start_m, world = (10.0, 40.0), replace(world, hills=(), regions=(), holes=())
-        plan = (Pause(3.0), Leg(((10.0 + 4.0 * length_m, 40.0),)), Pause(3.0))
-    elif route == "standing":
-        plan = (Pause(60.0),)
-    else:
-        plan = Wander(length_m, start_m, climbing=0.4)
-    weave_m = 0.0 if route == "straight" else 0.04
-    spec = DriveSpec("drive", plan, start_m, sensors=Sensors(*[None] * 6), weave_m=weave_m)
+    """Return a drive along one of `ROUTES`."""
+    world, spec = ROUTES[route](seed, length_m)
     scenario = Scenario("campaign", world, (spec,), ((1.0, 1.0), (80.0, 1.0), (80.0, 79.0)), RasterSpec(2.0, 2.0, 2.0))
     truth, _ = simulate_readings(scenario, seed=seed)
-    return Drive(truth, site, Noise(seed, 0))
+    return Drive(truth, world.site, Noise(seed, 0), "husky" if spec.robot == SimulatedRobot() else None)
 
 
 @dataclass(frozen=True)
@@ -215,34 +278,66 @@ class Outcome:
     kept_m: float
     said: list[str]
     """Findings, or why there is no run."""
+    blamed: list[str] = field(default_factory=list)
+    """Subjects of which a warning says that they were excluded or rejected."""
+    track: dict[str, float] = field(default_factory=dict)
+    """By `TRACK`: RMS errors of the track's rows; the last of rows in gaps of the fixes, and the share of these inside `RING` DRMS."""
+    cpu_s: float = 0.0
     trace: str = ""
     """Where an error that nobody foresaw comes from."""
 
 
 def outcome_of(drive: Drive, sensors: Sensors, fault: Fault) -> Outcome:
     """Run the stages of ingest over a log, and compare with the truth; no error gets out."""
-    true_m = float(drive.truth.distance_m[-1])
-    recipe = Recipe()
+    return judge_log(drive, log_of(drive, sensors, fault), fault)
+
+
+def judge_log(drive: Drive, log: MemoryLog, fault: Fault) -> Outcome:
+    """Return the same of a log that is there."""
+    recipe, begun_s = Recipe(), time.process_time()
+    nothing = Outcome(
+        [], {name: [] for name in QUANTITIES}, {name: [] for name in QUANTITIES}, [], [],
+        0.0, float(drive.truth.distance_m[-1]), float("nan"), 0.0, [],
+    )  # fmt: skip
     try:
-        read = read_run(log_of(drive, sensors, fault), recipe.read, robot="husky", known=load_shipped_profiles())
-        _, _, labelled = run_stages(read, recipe.ingest, run_id="run")
+        read = read_run(log, recipe.read, robot=drive.robot, known=load_shipped_profiles())
+        track, _, labelled = run_stages(read, recipe.ingest, run_id="run")
     except TcpipeError as error:
-        return Outcome(
-            [],
-            _nothing(),
-            _nothing(),
-            [],
-            [],
-            0.0,
-            true_m,
-            float("nan"),
-            0.0,
-            [*error.problems, *said_of(error.findings)],
-        )
+        return replace(nothing, said=[*error.problems, *said_of(error.findings)], cpu_s=time.process_time() - begun_s)
     except Exception as error:  # noqa: BLE001  the campaign is to find them
-        trace, said = traceback.format_exc(), [f"{type(error).__name__}: {error}"]
-        return Outcome([], _nothing(), _nothing(), [], [], 0.0, true_m, float("nan"), 0.0, said, trace)
-    return _compared(labelled, read, drive, fault, max_std_m=recipe.sample.max_position_std_m)
+        return replace(nothing, said=[f"{type(error).__name__}: {error}"], trace=traceback.format_exc())
+    spent_s = time.process_time() - begun_s
+    compared = _compared(labelled, read, drive, fault, max_std_m=recipe.sample.max_position_std_m)
+    return replace(compared, track=_track_errors(track, read, drive, fault), cpu_s=spent_s)
+
+
+def _track_errors(track: Track, read: Streams, drive: Drive, fault: Fault) -> dict[str, float]:
+    table, geod = track.table, pyproj.Geod(ellps="WGS84")
+    stamp_ns = to_integers(table, "stamp_ns")
+    true_ns = fault.true_ns(stamp_ns, drive)
+    at = drive.truth.at(true_ns)
+    _, _, apart_m = geod.inv(to_floats(table, "lon_deg"), to_floats(table, "lat_deg"), at.lon_deg, at.lat_deg)
+    yaw_rad = np.angle(np.exp(1j * (to_floats(table, "yaw_rad") - rpy_from_quat(at.quat_xyzw)[:, 2])))
+    drms_m = np.hypot(to_floats(table, "x_std_m"), to_floats(table, "y_std_m"))
+    known = true_ns >= drive.first_ns
+    placed = known & np.isfinite(apart_m)
+    gap = placed & _in_gap(read, stamp_ns)
+    inside = float(np.mean(apart_m[gap] <= RING * drms_m[gap])) if gap.any() else float("nan")
+    velocity_mps = (to_floats(table, "forward_velocity_mps") - at.forward_velocity_mps)[known]
+    figures = (_rms(apart_m[placed]), _rms(velocity_mps), _rms(yaw_rad[placed]), _rms(apart_m[gap]), inside)
+    return dict(zip(TRACK, figures, strict=True))
+
+
+def _in_gap(read: Streams, stamp_ns: np.ndarray) -> np.ndarray:
+    """Return which times lie between two fixes that are more than `_GAP_S` apart."""
+    fix_ns = to_integers(read.tables["gnss"], "stamp_ns") if "gnss" in read.tables else np.zeros(0, np.int64)
+    wide = np.flatnonzero(np.diff(fix_ns) > _GAP_S * 1e9)
+    between = (fix_ns[wide][:, None] < stamp_ns) & (stamp_ns < fix_ns[wide + 1][:, None])
+    return np.asarray(between.any(axis=0))
+
+
+def _rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(np.square(values)))) if values.size else float("nan")
 
 
 def said_of(findings: Iterable[Finding]) -> list[str]:
@@ -250,12 +345,8 @@ def said_of(findings: Iterable[Finding]) -> list[str]:
     return [format_finding(finding) for finding in dict.fromkeys(findings)]
 
 
-def _nothing() -> dict[str, list[float]]:
-    return {name: [] for name in QUANTITIES}
-
-
 def _compared(labelled: LabelledSegments, read: Streams, drive: Drive, fault: Fault, *, max_std_m: float) -> Outcome:
-    table = labelled.table
+    table, findings = labelled.table, labelled.info.report.findings
     start_ns = fault.true_ns(to_integers(table, "start_ns"), drive)
     true = compute_true_cost(drive.truth, start_ns)
     error, claimed = {}, {}
@@ -267,13 +358,15 @@ def _compared(labelled: LabelledSegments, read: Streams, drive: Drive, fault: Fa
     lon, lat = to_floats(table, "start_lon_deg"), to_floats(table, "start_lat_deg")
     std_m = to_floats(table, "position_std_m")
     _, _, apart_m = pyproj.Geod(ellps="WGS84").inv(lon, lat, there.lon_deg, there.lat_deg)
-    error["start"], claimed["start"] = apart_m.tolist(), std_m.tolist()
+    error["start"] = np.where(np.isfinite(true.duration_s), apart_m, np.nan).tolist()
+    claimed["start"] = std_m.tolist()
     placed = np.isfinite(lon) & (std_m <= max_std_m)
     return Outcome(
         start_s=drive.seconds(start_ns).tolist(), error=error, claimed=claimed,
         bits=to_numbers(table["quality"]).tolist(), placed=placed.tolist(),
         driven_m=sum(labelled.distance_by_reason_m.values()), true_m=float(drive.truth.distance_m[-1]), wheels_m=wheels_m(read),
-        kept_m=labelled.distance_by_reason_m.get("kept", 0.0), said=said_of(labelled.info.report.findings),
+        kept_m=labelled.distance_by_reason_m.get("kept", 0.0), said=said_of(findings),
+        blamed=sorted({f.subject.name for f in findings if f.severity != "note" and f.action in ("excluded", "rejected")}),
     )  # fmt: skip
 
 

@@ -72,34 +72,34 @@ class Cell:
         return replace(Sensors(), **({"gnss": Gnss(rate_hz=self.gnss_hz), "doppler": doppler} | left))
 
 
-def _of(role: str, change: Callable[[Reading, Drive], Reading]) -> Callable[[Readings, Drive], Readings]:
+def alter(role: str, change: Callable[[Reading, Drive], Reading]) -> Callable[[Readings, Drive], Readings]:
     """Return a change of what one sensor measured, where it is there."""
     return lambda readings, drive: {
         name: change(reading, drive) if name == role else reading for name, reading in readings.items()
     }
 
 
-def _values(reading: Reading, **values: Any) -> Reading:
+def replace_values(reading: Reading, **values: Any) -> Reading:
     return replace(reading, values={**reading.values, **values})
 
 
-def _inside(reading: Reading, drive: Drive, window_s: tuple[float, float]) -> np.ndarray:
+def is_inside(reading: Reading, drive: Drive, window_s: tuple[float, float]) -> np.ndarray:
     at_s = drive.seconds(reading.stamp_ns)
     return (at_s >= window_s[0]) & (at_s < window_s[1])
 
 
-def _moved(reading: Reading, drive: Drive, enu_m: np.ndarray) -> Reading:
+def move_fixes(reading: Reading, drive: Drive, enu_m: np.ndarray) -> Reading:
     """Return fixes moved by metres, shape (N, 3)."""
     place = drive.site.enu_m(*(reading.values[name] for name in ("lon_deg", "lat_deg", "alt_m")))
     lon, lat, alt = drive.site.lonlatalt(place + enu_m)
-    return _values(reading, lon_deg=lon, lat_deg=lat, alt_m=alt)
+    return replace_values(reading, lon_deg=lon, lat_deg=lat, alt_m=alt)
 
 
 def _claiming(reading: Reading, std_m: float, where: np.ndarray) -> Reading:
     """Return fixes that claim a deviation, twice as large in height, where told."""
     covariance = reading.values["covariance"].copy()
     covariance[np.ix_(where, [0, 4, 8])] = np.square([std_m, std_m, 2 * std_m])
-    return _values(reading, covariance=covariance)
+    return replace_values(reading, covariance=covariance)
 
 
 def _wandering(reading: Reading, drive: Drive, name: str, std_m: float, tau_s: float) -> np.ndarray:
@@ -117,24 +117,26 @@ def _wrong_fix(ramp_s: float) -> Callable[[Reading, Drive], Reading]:
     def change(reading: Reading, drive: Drive) -> Reading:
         since_s = drive.seconds(reading.stamp_ns) - MINUTE_S[0]
         size = np.clip(since_s / ramp_s, 0.0, 1.0) if ramp_s else (since_s >= 0.0).astype(float)
-        return _moved(reading, drive, (size * _inside(reading, drive, MINUTE_S))[:, None] * _ASIDE)
+        return move_fixes(reading, drive, (size * is_inside(reading, drive, MINUTE_S))[:, None] * _ASIDE)
 
     return change
 
 
 def _float(reading: Reading, drive: Drive) -> Reading:
-    inside = _inside(reading, drive, MINUTE_S)
+    inside = is_inside(reading, drive, MINUTE_S)
     return _claiming(
-        _moved(reading, drive, inside[:, None] * _wandering(reading, drive, "float", 0.3, 30.0)), 0.3, inside
+        move_fixes(reading, drive, inside[:, None] * _wandering(reading, drive, "float", 0.3, 30.0)), 0.3, inside
     )
 
 
 def _metre_level(claimed_m: float | None, std_m: float) -> Callable[[Reading, Drive], Reading]:
     def change(reading: Reading, drive: Drive) -> Reading:
-        moved = _moved(reading, drive, _wandering(reading, drive, "metres", std_m, 60.0))
+        moved = move_fixes(reading, drive, _wandering(reading, drive, "metres", std_m, 60.0))
         if claimed_m is None:
             unknown = np.zeros(reading.stamp_ns.size, np.uint8)
-            return _values(moved, covariance=np.zeros_like(reading.values["covariance"]), covariance_type=unknown)
+            return replace_values(
+                moved, covariance=np.zeros_like(reading.values["covariance"]), covariance_type=unknown
+            )
         return _claiming(moved, claimed_m, np.ones(reading.stamp_ns.size, bool))
 
     return change
@@ -142,19 +144,19 @@ def _metre_level(claimed_m: float | None, std_m: float) -> Callable[[Reading, Dr
 
 def _noisy_minute(reading: Reading, drive: Drive) -> Reading:
     more = drive.noise("more noise").standard_normal((reading.stamp_ns.size, 3)) * [0.015, 0.015, 0.025]
-    return _moved(reading, drive, _inside(reading, drive, MINUTE_S)[:, None] * more * np.sqrt(4.0**2 - 1.0))
+    return move_fixes(reading, drive, is_inside(reading, drive, MINUTE_S)[:, None] * more * np.sqrt(4.0**2 - 1.0))
 
 
-def _late(seconds: float) -> Callable[[Reading, Drive], Reading]:
+def shift_stamps(seconds: float) -> Callable[[Reading, Drive], Reading]:
     return lambda reading, _: replace(reading, stamp_ns=reading.stamp_ns + round(seconds * 1e9))
 
 
 def _scaled(name: str, factor: float, window_s: tuple[float, float] | None = None) -> Callable[..., Reading]:
     def change(reading: Reading, drive: Drive) -> Reading:
-        hit = np.ones(reading.stamp_ns.size, bool) if window_s is None else _inside(reading, drive, window_s)
+        hit = np.ones(reading.stamp_ns.size, bool) if window_s is None else is_inside(reading, drive, window_s)
         values = reading.values[name]
         wide = hit.reshape(-1, *[1] * (values.ndim - 1))
-        return _values(reading, **{name: np.where(wide, values * factor, values)})
+        return replace_values(reading, **{name: np.where(wide, values * factor, values)})
 
     return change
 
@@ -163,7 +165,7 @@ def _bias_jump(reading: Reading, drive: Drive) -> Reading:
     after = (drive.seconds(reading.stamp_ns) >= MINUTE_S[0])[:, None]
     rate = reading.values["angular_velocity_radps"] + after * np.array([0.01, -0.01, 0.03])
     force = reading.values["specific_force_mps2"] + after * np.array([0.3, 0.2, 0.1])
-    return _values(reading, angular_velocity_radps=rate, specific_force_mps2=force)
+    return replace_values(reading, angular_velocity_radps=rate, specific_force_mps2=force)
 
 
 def _placed(role: str, turn_rad: tuple[float, float, float], shift_m: tuple[float, float, float]) -> Callable[..., Any]:
@@ -185,15 +187,15 @@ def _on(role: str, change: Callable[[MessageStream], MessageStream]) -> Callable
     return lambda messages, _: [change(m) if m.topic == _TOPICS[role] else m for m in messages]
 
 
-def _with(m: MessageStream, columns: dict[str, Any] | None = None, **constants: Any) -> MessageStream:
+def edit_messages(m: MessageStream, columns: dict[str, Any] | None = None, **constants: Any) -> MessageStream:
     named = {name.replace("__", "."): value for name, value in constants.items()}
     gone = {name: values for name, values in m.columns.items() if name not in named}
     return replace(m, columns={**gone, **(columns or {})}, constants={**m.constants, **named})
 
 
-def _without_gnss_place(messages: Messages, _: Drive) -> Messages:
+def remove_antenna_frame(messages: Messages, _: Drive) -> Messages:
     def change(m: MessageStream) -> MessageStream:
-        return _with(m, transforms=[t for t in m.constants["transforms"] if t["child_frame_id"] != "gps_link"])
+        return edit_messages(m, transforms=[t for t in m.constants["transforms"] if t["child_frame_id"] != "gps_link"])
 
     return [change(m) if m.topic == _TOPICS["tf_static"] else m for m in messages]
 
@@ -202,7 +204,7 @@ def _planar(m: MessageStream) -> MessageStream:
     covariance = np.diag([9e-4, 9e-4, 1e6, 1e6, 1e6, 1e-4]).ravel()
     still = np.zeros(m.log_time_ns.size)
     flat = {f"twist.twist.{name}": still for name in ("linear.z", "angular.x", "angular.y")}
-    return _with(m, flat, twist__covariance=covariance)
+    return edit_messages(m, flat, twist__covariance=covariance)
 
 
 def _receipt_beside_laggy(messages: Messages, drive: Drive) -> Messages:
@@ -211,14 +213,14 @@ def _receipt_beside_laggy(messages: Messages, drive: Drive) -> Messages:
     for m in messages:
         if m.topic == _TOPICS["gnss"]:
             sec, nanosec = np.divmod(m.log_time_ns, 1_000_000_000)
-            found.append(_with(m, {"header.stamp.sec": sec, "header.stamp.nanosec": nanosec}))
+            found.append(edit_messages(m, {"header.stamp.sec": sec, "header.stamp.nanosec": nanosec}))
         elif m.topic == _TOPICS["wheels"]:
             lag = drive.truth.at(m.publish_time_ns - 180_000_000)
             columns = {
                 "twist.twist.linear.x": lag.forward_velocity_mps,
                 "twist.twist.angular.z": lag.angular_velocity_radps[:, 2],
             }
-            found.append(replace(_with(m, columns), topic="/a200_0000/platform/odom/filtered"))
+            found.append(replace(edit_messages(m, columns), topic="/a200_0000/platform/odom/filtered"))
         else:
             found.append(m)
     return found
@@ -232,7 +234,9 @@ def _slow_simulation(messages: Messages, drive: Drive) -> Messages:
             return replace(m, log_time_ns=drive.first_ns + 3 * (m.log_time_ns - drive.first_ns))
         sec, nanosec = np.divmod(m.publish_time_ns - drive.first_ns + 1_000_000_000, 1_000_000_000)
         slow_ns = drive.first_ns + 3 * (m.log_time_ns - drive.first_ns)
-        return replace(_with(m, {"header.stamp.sec": sec, "header.stamp.nanosec": nanosec}), log_time_ns=slow_ns)
+        return replace(
+            edit_messages(m, {"header.stamp.sec": sec, "header.stamp.nanosec": nanosec}), log_time_ns=slow_ns
+        )
 
     return [change(m) for m in messages]
 
@@ -266,27 +270,29 @@ def _five_seconds(messages: Messages, drive: Drive) -> Messages:
 
 
 def _gnss_covariance(values: list[float]) -> Callable[[Messages, Drive], Messages]:
-    return _on("gnss", lambda m: _with(m, {"position_covariance": np.tile(np.array(values), (m.log_time_ns.size, 1))}))
+    return _on(
+        "gnss", lambda m: edit_messages(m, {"position_covariance": np.tile(np.array(values), (m.log_time_ns.size, 1))})
+    )
 
 
 def _odometry_covariance(value: np.ndarray) -> Callable[[Messages, Drive], Messages]:
-    return lambda messages, drive: _on("visual", lambda m: _with(m, twist__covariance=value))(
-        _on("wheels", lambda m: _with(m, twist__covariance=value))(messages, drive), drive
+    return lambda messages, drive: _on("visual", lambda m: edit_messages(m, twist__covariance=value))(
+        _on("wheels", lambda m: edit_messages(m, twist__covariance=value))(messages, drive), drive
     )
 
 
 def _of_the_body(reading: Reading, drive: Drive) -> Reading:
     """Return a receiver's velocity as a driver would write it that turns it into the body's axes."""
     velocity = rotate(invert(drive.truth.at(reading.stamp_ns).quat_xyzw), reading.values["velocity_enu_mps"])
-    return _values(reading, velocity_enu_mps=velocity)
+    return replace_values(reading, velocity_enu_mps=velocity)
 
 
 def _down(reading: Reading, _: Drive) -> Reading:
-    return _values(reading, velocity_enu_mps=reading.values["velocity_enu_mps"][:, [1, 0, 2]] * [1.0, 1.0, -1.0])
+    return replace_values(reading, velocity_enu_mps=reading.values["velocity_enu_mps"][:, [1, 0, 2]] * [1.0, 1.0, -1.0])
 
 
 def _holes(reading: Reading, drive: Drive) -> Reading:
-    keep = ~_inside(reading, drive, (100.0, 110.0))
+    keep = ~is_inside(reading, drive, (100.0, 110.0))
     values = {name: column[keep] for name, column in reading.values.items()}
     return Reading(reading.stamp_ns[keep], reading.log_time_ns[keep], values)
 
@@ -301,7 +307,8 @@ def _power(rate_hz: float, reading_hz: float | None = None) -> Callable[[Sensors
 
 _DEG = float(np.radians(1.0))
 _NAN, _BAD = float("nan"), np.diag([-0.01, -1.0, -2.0, float("nan"), float("inf"), -1.0]).ravel()
-_DIS = r"sensors_disagree|disagree|contradict|not fused|refused|beyond their claim|wrong"
+_CLOCKS = "time-offset|clocks-differ|clock-drift"
+_SLIPPING = _scaled("velocity_mps", 1.43, MINUTE_S)
 
 FAULTS: dict[str, Fault] = {
     fault.name: fault
@@ -313,37 +320,37 @@ FAULTS: dict[str, Fault] = {
             for rate_hz in (1.0, 5.0, 20.0)
         ),
         Fault("power read at 1 Hz in messages at 20 Hz", calibrated=True, sensors=_power(20.0, 1.0)),
-        Fault("10 s without GNSS", ("gnss",), (100.0, 110.0), readings=_of("gnss", _holes)),
+        Fault("10 s without GNSS", ("gnss",), (100.0, 110.0), readings=alter("gnss", _holes)),
         # Fixes that lie
-        Fault("wrong fix", ("gnss",), MINUTE_S, "gnss", readings=_of("gnss", _wrong_fix(0.0))),
-        Fault("wrong fix by a ramp", ("gnss",), MINUTE_S, "gnss", readings=_of("gnss", _wrong_fix(10.0))),
-        Fault("float minute", ("gnss",), MINUTE_S, readings=_of("gnss", _float)),
-        Fault("noisy minute", ("gnss",), MINUTE_S, "gnss", readings=_of("gnss", _noisy_minute)),
-        Fault("metres, none claimed", ("gnss",), None, "gnss", True, readings=_of("gnss", _metre_level(None, 1.0))),
-        Fault("metres, claimed", ("gnss",), None, may_refuse=True, readings=_of("gnss", _metre_level(2.3, 2.3))),
+        Fault("wrong fix", ("gnss",), MINUTE_S, "gnss", readings=alter("gnss", _wrong_fix(0.0))),
+        Fault("wrong fix by a ramp", ("gnss",), MINUTE_S, "gnss", readings=alter("gnss", _wrong_fix(10.0))),
+        Fault("float minute", ("gnss",), MINUTE_S, readings=alter("gnss", _float)),
+        Fault("noisy minute", ("gnss",), MINUTE_S, "gnss", readings=alter("gnss", _noisy_minute)),
+        Fault("metres, none claimed", ("gnss",), None, "gnss", True, readings=alter("gnss", _metre_level(None, 1.0))),
+        Fault("metres, claimed", ("gnss",), None, may_refuse=True, readings=alter("gnss", _metre_level(2.3, 2.3))),
         # Places that are not true
         Fault("IMU pitched by 5 deg", ("imu",), told=_placed("imu", (0.0, 5 * _DEG, 0.0), (0.0, 0.0, 0.0))),
         Fault("IMU pitched by 2 deg", ("imu",), told=_placed("imu", (0.0, 2 * _DEG, 0.0), (0.0, 0.0, 0.0))),
         Fault("IMU rolled by 5 deg", ("imu",), told=_placed("imu", (5 * _DEG, 0.0, 0.0), (0.0, 0.0, 0.0))),
         Fault("arm wrong fore-aft", ("gnss",), None, "lever-arm", unseen_m=_APART_M, told=_placed("gnss", (0, 0, 0), (0.5, 0, 0))),
         Fault("arm wrong sideways", ("gnss",), None, "lever-arm", unseen_m=_APART_M, told=_placed("gnss", (0, 0, 0), (0, 0.5, 0))),
-        Fault("arm unknown", ("gnss",), None, "sensor-not-placed", unseen_m=_APART_M, messages=_without_gnss_place),
+        Fault("arm unknown", ("gnss",), None, "sensor-not-placed", unseen_m=_APART_M, messages=remove_antenna_frame),
         # Clocks
-        Fault("GNSS 0.1 s late", ("gnss",), None, "time-offset|clocks-differ|clock-drift", readings=_of("gnss", _late(0.1))),
-        Fault("GNSS 0.2 s late", ("gnss",), None, "time-offset|clocks-differ|clock-drift", readings=_of("gnss", _late(0.2))),
-        Fault("IMU 0.1 s late", ("imu",), None, "time-offset|clocks-differ|clock-drift", readings=_of("imu", _late(0.1))),
+        Fault("GNSS 0.1 s late", ("gnss",), None, _CLOCKS, readings=alter("gnss", shift_stamps(0.1))),
+        Fault("GNSS 0.2 s late", ("gnss",), None, _CLOCKS, readings=alter("gnss", shift_stamps(0.2))),
+        Fault("IMU 0.1 s late", ("imu",), None, _CLOCKS, readings=alter("imu", shift_stamps(0.1))),
         Fault("straight ahead", route="straight", calibrated=True),
         Fault("receipt stamps, laggy odometry", ("wheels",), None, messages=_receipt_beside_laggy),
         Fault("slow simulated time", messages=_slow_simulation, true_ns=_from_simulated),
         # Odometry and IMU that lie
-        Fault("wheels 1.3 too fast", ("wheels",), None, "wheel", True, readings=_of("wheels", _scaled("velocity_mps", 1.3))),
-        Fault("wheels slip for a minute", ("wheels",), MINUTE_S, "wheel", readings=_of("wheels", _scaled("velocity_mps", 1.43, MINUTE_S))),
-        Fault("visual 1.3 too fast", ("visual",), None, "visual", True, readings=_of("visual", _scaled("linear_mps", 1.3))),
-        Fault("wheels turn at 0", ("wheels",), None, readings=_of("wheels", _scaled("yaw_rate_radps", 0.0))),
-        Fault("visual turns at 0", ("visual",), None, readings=_of("visual", _scaled("angular_radps", 0.0))),
+        Fault("wheels 1.3 too fast", ("wheels",), None, "wheel", True, readings=alter("wheels", _scaled("velocity_mps", 1.3))),
+        Fault("wheels slip for a minute", ("wheels",), MINUTE_S, "wheel", readings=alter("wheels", _SLIPPING)),
+        Fault("visual 1.3 too fast", ("visual",), None, "visual", True, readings=alter("visual", _scaled("linear_mps", 1.3))),
+        Fault("wheels turn at 0", ("wheels",), None, readings=alter("wheels", _scaled("yaw_rate_radps", 0.0))),
+        Fault("visual turns at 0", ("visual",), None, readings=alter("visual", _scaled("angular_radps", 0.0))),
         Fault("planar visual", ("visual",), None, messages=_on("visual", _planar)),
-        Fault("gyro at 0", ("imu",), None, "imu", readings=_of("imu", _scaled("angular_velocity_radps", 0.0))),
-        Fault("IMU biases jump", ("imu",), None, readings=_of("imu", _bias_jump)),
+        Fault("gyro at 0", ("imu",), None, "imu", readings=alter("imu", _scaled("angular_velocity_radps", 0.0))),
+        Fault("IMU biases jump", ("imu",), None, readings=alter("imu", _bias_jump)),
         # Logs that are odd
         Fault("three messages on the better name", ("wheels",), None, messages=_three_messages_beside),
         Fault("5 s", may_refuse=True, messages=_five_seconds),
@@ -357,13 +364,13 @@ FAULTS: dict[str, Fault] = {
 
 _SAID = "gnss_velocity"
 VELOCITY_FAULTS: dict[str, Fault] = {
-    f"velocity {name}": Fault(f"velocity {name}", ("doppler",), window_s, said, readings=_of("doppler", change))
+    f"velocity {name}": Fault(f"velocity {name}", ("doppler",), window_s, said, readings=alter("doppler", change))
     for name, window_s, said, change in (
         ("frozen at 0", None, _SAID, _scaled("velocity_enu_mps", 0.0)),
         ("0 for a minute", MINUTE_S, _SAID, _scaled("velocity_enu_mps", 0.0, MINUTE_S)),
         ("north, east, down", None, _SAID, _down),
         ("of the body", None, _SAID, _of_the_body),
-        ("0.2 s late", None, "", _late(0.2)),
+        ("0.2 s late", None, "", shift_stamps(0.2)),
     )
 }
 """Of a receiver's own velocity; in sets that have one."""
