@@ -240,7 +240,7 @@ def _make_trajectory(m: Measurements, made: Pass, smoothed: Smoothed, std: Float
     position, yaw_variance = x[:, 9:12].copy(), variances[:, 3]
     position_variance, speed_variance = variances[:, :3].copy(), variances[:, 4].copy()
     speed = np.linalg.norm(velocity, axis=1)
-    links = _interpolate_links(smoothed, ticks, at, output_ns)
+    links = _interpolate_links(smoothed, at, output_ns)
     antenna = np.zeros(3) if m.gnss is None else np.asarray(m.gnss.lever_arm_m)
     slope_std = estimate_slope_std_rad(m) or SLOPE_RAD
     if is_gliding(m):  # level, and along the course
@@ -306,7 +306,7 @@ def _make_skew(v: Floats) -> Floats:
     return np.stack([np.stack(row, -1) for row in rows], -2)
 
 
-def _interpolate_links(smoothed: Smoothed, ticks: Ticks, at: Ints, output_ns: Ints) -> Floats:
+def _interpolate_links(smoothed: Smoothed, at: Ints, output_ns: Ints) -> Floats:
     """Return the variance of displacements at each wanted stamp [m²], shape (N, 4); NaN where none stands at the other end."""
     found = np.full((output_ns.size, len(DISPLACEMENT_LAGS_S)), np.nan)
     for column, lag_s in enumerate(DISPLACEMENT_LAGS_S):

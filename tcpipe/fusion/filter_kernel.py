@@ -132,7 +132,7 @@ class Memory(NamedTuple):
 
 
 class Steps(NamedTuple):
-    """What the smoother needs of B ticks: motion F, kept shares, updates by kind (gain K, H, S⁻¹ y, S⁻¹, turn of axes), P after each tick."""
+    """What the smoother needs of B ticks: motion F, kept shares, updates by kind (gain K, H, S⁻¹ y, S⁻¹, turn of axes), P after all."""
 
     F: NDArray[np.float64]
     kept: Matrix
@@ -157,9 +157,9 @@ class Tests(NamedTuple):
 MOTION_WITHOUT_GYRO, MOTION_WITH_GYRO = KINDS, KINDS + 1
 """Rows of `Model.depends` beside the kinds of measurements."""
 MOST = MOVING + 1
+"""Errors on which motion depends, at most."""
 _SILENT_S = 2.0
 _SPREAD = sqrt(3.0)  # matches the fourth moment of a normal distribution
-"""Errors on which motion depends, at most."""
 
 
 def allocate_steps(ticks: int, n: int) -> Steps:
@@ -291,7 +291,9 @@ def _decay(k: int, inputs: Inputs, model: Model, x: Vector, P: Matrix, kept: Vec
 
 
 @compile_kernel
-def _compare(k: int, kind: int, inputs: Inputs, model: Model, x: Vector, P: Matrix, quickens: Vector, gain: Any, room: Any) -> float:  # fmt: skip
+def _compare(
+    k: int, kind: int, inputs: Inputs, model: Model, x: Vector, P: Matrix, quickens: Vector, gain: Any, room: Any
+) -> float:
     """Fill innovation, H, P H', S and S⁻¹ of one measurement; return log det S."""
     y, H, Hs, cross, S, inverse = gain
     L, M, missed, d, high, turn, up, down = room[0], room[1], room[3], room[4], room[5], room[8], room[9], room[10]
@@ -338,7 +340,8 @@ def _compare(k: int, kind: int, inputs: Inputs, model: Model, x: Vector, P: Matr
             S[b, a] = s
         S[a, a] += inputs.variance[k, kind, a]
         y[a] = inputs.value[k, kind, a] - y[a]
-    return _invert(S, size, inverse)
+    log_det: float = _invert(S, size, inverse)
+    return log_det
 
 
 @compile_kernel
@@ -368,6 +371,7 @@ def _invert(S: Matrix, size: int, out: Matrix) -> float:
 
 @compile_kernel
 def _compute_nis(y: Vector, inverse: Matrix, size: int) -> float:
+    """Return the squared normalised innovation."""
     s = 0.0
     for a in range(size):
         for b in range(size):
@@ -448,7 +452,17 @@ def _widen(kind: int, P: Matrix, y: Vector, size: int, scale: int) -> None:
 
 
 @compile_kernel
-def filter_ticks(first: int, last: int, inputs: Inputs, model: Model, memory: Memory, keep: bool, steps: Steps, tests: Tests, states: Matrix) -> None:  # noqa: FBT001  # fmt: skip
+def filter_ticks(
+    first: int,
+    last: int,
+    inputs: Inputs,
+    model: Model,
+    memory: Memory,
+    keep: bool,
+    steps: Steps,
+    tests: Tests,
+    states: Matrix,
+) -> None:
     """Filter ticks ``first`` to ``last``, the latter excluded; ``memory`` becomes that after them.
 
     Parameters
@@ -584,7 +598,9 @@ class Adjoint(NamedTuple):
 
 
 @compile_kernel
-def _step_before_update(K: Matrix, H: Matrix, size: int, pull: Vector, inverse: Matrix, turn: Vector, adjoint: Adjoint, B: Matrix) -> None:  # fmt: skip
+def _step_before_update(
+    K: Matrix, H: Matrix, size: int, pull: Vector, inverse: Matrix, turn: Vector, adjoint: Adjoint, B: Matrix
+) -> None:
     """Take the adjoint back over one update."""
     information, rows = adjoint.information, adjoint.rows
     n = information.shape[0]
@@ -669,7 +685,9 @@ def _step_before_motion(F: Matrix, kept: Vector, places: Indices, m: int, adjoin
 
 
 @compile_kernel
-def _smooth_tick(k: int, P: Matrix, x: Vector, model: Model, adjoint: Adjoint, lags: Indices, out: Smoothed, A: Matrix, room: Any) -> None:  # fmt: skip
+def _smooth_tick(
+    k: int, P: Matrix, x: Vector, model: Model, adjoint: Adjoint, lags: Indices, out: Smoothed, A: Matrix, room: Any
+) -> None:
     """Fill the smoothed estimate at tick k."""
     information, rows, ticks, ends = adjoint
     d, turn, c, after = room
@@ -764,7 +782,17 @@ def _smooth_tick(k: int, P: Matrix, x: Vector, model: Model, adjoint: Adjoint, l
 
 
 @compile_kernel
-def smooth_ticks(first: int, last: int, inputs: Inputs, model: Model, steps: Steps, states: Matrix, lags: Indices, adjoint: Adjoint, out: Smoothed) -> None:  # fmt: skip
+def smooth_ticks(
+    first: int,
+    last: int,
+    inputs: Inputs,
+    model: Model,
+    steps: Steps,
+    states: Matrix,
+    lags: Indices,
+    adjoint: Adjoint,
+    out: Smoothed,
+) -> None:
     """Smooth ticks ``last - 1`` down to ``first``.
 
     Parameters

@@ -48,7 +48,9 @@ PARAMETERS = (
     Parameter("wheel scale", state.WHEEL_SCALE, 1, 0.0, 0.0, "1", "`process.find_scale_stds`; walk: `densities`"),
     Parameter("camera scale", state.VISUAL_SCALE, 1, 0.0, 0.0, "1", "`process.find_scale_stds`; walk: `densities`"),
     Parameter("turn scale", state.TURN_SCALE, 1, 0.0, 0.0, "1", "`process.turn_scale_std`"),
-    Parameter("turning centre", state.TURNING_CENTRE, 1, 0.05, 0.0, "m", "skid-steered robots turn ahead of their middle"),
+    Parameter(
+        "turning centre", state.TURNING_CENTRE, 1, 0.05, 0.0, "m", "skid-steered robots turn ahead of their middle"
+    ),
     Parameter("mounting of the IMU", state.MOUNT, 3, 0.0175, 0.0, "rad", "stated to a degree"),
     Parameter("mounting of the camera", state.VISUAL_MOUNT, 2, 0.0175, 0.0, "rad", "stated to a degree"),
     Parameter("lag of wheels", state.WHEEL_LAG, 1, 0.02, 0.0, "s", "drivers stamp on arrival"),
@@ -100,7 +102,9 @@ def make_priors(m: Measurements, noise: NoiseModel, ticks: Ticks) -> tuple[Float
     if turn_scale_std(m):
         std[state.TURN_SCALE] = turn_scale_std(m)
         walk[state.TURN_SCALE] = np.sqrt(2.0 / 60.0) * turn_scale_std(m)
-    if m.gnss is not None and has_tilt:  # where roll and pitch are not known, an antenna that sways looks like one elsewhere
+    if (
+        m.gnss is not None and has_tilt
+    ):  # where roll and pitch are not known, an antenna that sways looks like one elsewhere
         std[state.ARM : state.ARM + 3] = m.gnss.lever_arm_std_m
     if has_fixes:
         std[state.FIX_ERROR : state.FIX_ERROR + 3] = np.sqrt(ticks.fix_variance_m2[0])

@@ -147,7 +147,7 @@ def find_scale_stds(measurements: Measurements) -> tuple[float, float]:
     return (0.0 if measurements.visual is None else WHEEL_SCALE_STD), 0.0
 
 
-def make_motion_noise(
+def make_motion_noise(  # noqa: PLR0917
     m: Measurements,
     noise: NoiseModel,
     stamp_ns: NDArray[np.int64],

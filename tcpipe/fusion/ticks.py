@@ -10,6 +10,7 @@ and pitch are small.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,7 +18,7 @@ from numpy.typing import NDArray
 
 from tcpipe.compiled import compile_kernel
 from tcpipe.fusion import state
-from tcpipe.fusion.densities import NoiseModel
+from tcpipe.fusion.densities import FixNoise, NoiseModel
 from tcpipe.fusion.filter_kernel import Inputs
 from tcpipe.fusion.initial import compute_course_rate
 from tcpipe.fusion.measurements import VISUAL, WHEELS, BodyVelocities, InertialMeasurements, Measurements
@@ -73,7 +74,9 @@ def find_tick_period_ns(period_ns: int) -> int:
     return period_ns // -(-period_ns // _LONGEST_NS)
 
 
-def build_ticks(m: Measurements, noise: NoiseModel, stationary_ns: Ints, start_ns: int, end_ns: int, *, output_ns: Ints) -> Ticks:  # fmt: skip
+def build_ticks(  # noqa: C901, PLR0915  one array after the other
+    m: Measurements, noise: NoiseModel, stationary_ns: Ints, start_ns: int, end_ns: int, *, output_ns: Ints
+) -> Ticks:
     """Return the ticks from that before ``start_ns`` to that after ``end_ns``; ``stationary_ns``, shape (S, 2), are stops [ns].
 
     Every wanted stamp (``output_ns``, multiples of the track's period) is a tick.
@@ -119,7 +122,7 @@ def build_ticks(m: Measurements, noise: NoiseModel, stationary_ns: Ints, start_n
         if m.imu is None and (m.visual is None or m.visual.turn_rate_radps is None):
             variances = variances + _compute_unseen_turn_variance(m.doppler.stamp_ns, m.gnss.lever_arm_m)
         put(state.DOPPLER, m.doppler.stamp_ns, m.doppler.velocity_enu_mps, variances)
-    _add_constraints(m, noise, stationary_ns, stamp_ns, value, variance)
+    _add_constraints(m, stationary_ns, stamp_ns, value, variance)
     if m.wheels is not None:
         levers[state.SIDEWAYS] = m.wheels.lever_arm_m
 
@@ -162,12 +165,13 @@ def _compute_white_shares(noise: NoiseModel) -> Floats:
 
 
 def _compute_correlated_shares(noise: NoiseModel) -> Floats:
+    """Return the share of their correlated error, east, north, up."""
     return _make_axes(noise, lambda fix: fix.correlated.variance / fix.claimed_m2)
 
 
-def _make_axes(noise: NoiseModel, compute) -> Floats:
-    assert noise.horizontal is not None and noise.vertical is not None
-    return np.array([compute(noise.horizontal)] * 2 + [compute(noise.vertical)])
+def _make_axes(noise: NoiseModel, compute: Callable[[FixNoise], float]) -> Floats:
+    axes = (noise.horizontal, noise.horizontal, noise.vertical)
+    return np.array([0.0 if axis is None else compute(axis) for axis in axes])
 
 
 def _make_fix_process(noise: NoiseModel, variance_m2: Floats, period_s: float) -> tuple[Floats, Floats]:
@@ -204,7 +208,7 @@ def _compute_unseen_turn_variance(stamp_ns: Ints, lever_arm_m: tuple[float, floa
     return np.array([z, z, x + y]) * UNSEEN_TURN_RADPS**2 * lasting
 
 
-def _add_constraints(m: Measurements, noise: NoiseModel, stationary_ns: Ints, stamp_ns: Ints, value: Floats, variance: Floats) -> None:  # fmt: skip
+def _add_constraints(m: Measurements, stationary_ns: Ints, stamp_ns: Ints, value: Floats, variance: Floats) -> None:
     period_s = float(stamp_ns[1] - stamp_ns[0]) * 1e-9
     if is_gliding(m):  # which way the body looks is not known
         return
@@ -235,7 +239,9 @@ def _add_constraints(m: Measurements, noise: NoiseModel, stationary_ns: Ints, st
 
 
 @compile_kernel
-def _preintegrate(t: Floats, w: Floats, f: Floats, ends: Floats, period_s: float, wanted: Ints, turned: Floats, gained: Floats) -> None:  # fmt: skip
+def _preintegrate(  # noqa: PLR0917, C901  compiled
+    t: Floats, w: Floats, f: Floats, ends: Floats, period_s: float, wanted: Ints, turned: Floats, gained: Floats
+) -> None:
     """Fill rotation, velocity and displacement over the tick before each wanted end, of samples (s, rad/s, m/s²) linear in between."""
     r, step, both = np.zeros(9), np.zeros(9), np.zeros(9)
     wm, fm, a = np.zeros(3), np.zeros(3), np.zeros(3)
@@ -281,7 +287,9 @@ def _compute_acceleration(m: Measurements, stamp_ns: Ints) -> Floats:
     if source is None or source.stamp_ns.size < 3:
         return np.zeros(stamp_ns.size)
     slope = compute_slopes(source.stamp_ns, compute_median_of_five(source.velocity_mps[:, 0]), _ACCELERATION_WINDOW_S)
-    found = np.interp(compute_seconds(stamp_ns, int(stamp_ns[0])), compute_seconds(source.stamp_ns, int(stamp_ns[0])), slope)
+    found = np.interp(
+        compute_seconds(stamp_ns, int(stamp_ns[0])), compute_seconds(source.stamp_ns, int(stamp_ns[0])), slope
+    )
     return np.where(is_covered(source.stamp_ns, stamp_ns, stamp_ns), found, 0.0)
 
 

@@ -29,6 +29,7 @@ from tcpipe.tables.facts import (
     MountingFacts,
     ParameterFacts,
     StretchFacts,
+    make_vector,
 )
 from tcpipe.tables.findings import Finding, StageReport, Subject, make_finding, read_threshold
 from tcpipe.tables.levels import Sensor, Streams
@@ -210,7 +211,7 @@ def make_mounting_findings(inputs: FusionInputs, fused: Fused, streams: Streams)
     if arm is not None and GNSS in streams.sensors:
         sensor = streams.sensors[GNSS]
         if sensor.placed_by == "assumed" or _is_contradicted(arm, _LEAST_ARM_M):
-            moved, std_m = arm.value, arm.std
+            moved, std_m = make_vector(np.array(arm.value)), make_vector(np.array(arm.std))
             findings.append(_find_arm(arm, sensor, find_recipe_role(GNSS, streams)))
     if tilt is not None and _is_contradicted(tilt, _LEAST_TILT_RAD):
         roll_pitch = tilt.value[0], tilt.value[1]
@@ -249,13 +250,14 @@ def _find_odometry_scale(role: str, scale: Scale, given: float) -> Finding:
 def _find_arm(arm: ParameterFacts, sensor: Sensor, name: str) -> Finding:
     place = np.asarray(sensor.xyz_m) + arm.value
     axes = ("forward", "left", "up")
+    numbers: dict[str, Any] = {f"{axis}_m": value for axis, value in zip(axes, place.tolist(), strict=True)}
+    numbers |= {f"{axis}_std_m": value for axis, value in zip(axes, arm.std, strict=True)}
     return make_finding(
         "lever-arm-unknown" if sensor.placed_by == "assumed" else "lever-arm-contradicted",
         Subject("role", name),
         names={"placed_by": sensor.placed_by},
         remedies=state_extrinsics(name, np.round(place, 2).tolist(), matrix_from_quat(sensor.quat_xyzw)),
-        **{f"{axis}_m": value for axis, value in zip(axes, place.tolist(), strict=True)},
-        **{f"{axis}_std_m": value for axis, value in zip(axes, arm.std, strict=True)},
+        **numbers,
     )
 
 

@@ -265,4 +265,3 @@ def convert_pose_to_fixes(streams: Streams) -> tuple[Streams, bool]:
     tables = {role: table for role, table in streams.tables.items() if role != POSE} | {GNSS: fixes}
     sensors = {role: sensor for role, sensor in streams.sensors.items() if role != POSE} | {GNSS: streams.sensors[POSE]}
     return replace(streams, tables=tables, sensors=sensors), local
-
