@@ -30,9 +30,10 @@ from tcpipe.fusion.filter_kernel import (
     filter_ticks,
     smooth_ticks,
 )
+from tcpipe.fusion.hypotheses import POSSIBLE, Change, Hypothesis, compute_evidence, compute_weights, explain, find_suspects
 from tcpipe.fusion.initial import compute_course, find_stationary_intervals
 from tcpipe.fusion.measurements import DOPPLER, GNSS, VISUAL, WHEELS, InitialState, Measurements
-from tcpipe.fusion.parameters import PARAMETERS, make_model, make_priors, make_start
+from tcpipe.fusion.parameters import PARAMETERS, expand_start, make_model, make_priors, make_start
 from tcpipe.fusion.process import (
     GROUND,
     SLOPE_RAD,
@@ -83,12 +84,14 @@ def list_blocks(size: int) -> list[tuple[int, int]]:
     return list(pairwise([*range(0, size, _BLOCK), size]))
 
 
-def filter_section(ticks: Ticks, model: Model, start: Memory, *, until: int | None = None) -> Pass:
-    """Return the forward pass from a start, over all ticks or those before ``until``."""
+def filter_section(ticks: Ticks, model: Model, start: Memory, *, begin: int = 0, until: int | None = None) -> Pass:
+    """Return the forward pass from a start, over all ticks or those from ``begin``, where a block begins, to before ``until``."""
     size = min(until or ticks.stamp_ns.size, ticks.stamp_ns.size)
     made = Pass(ticks, model, [], make_tests(size), np.zeros((size, state.NX)), start.copy())
     empty = allocate_steps(0, model.active.size)
     for first, last in list_blocks(size):
+        if first < begin:
+            continue
         made.checkpoints.append(made.last.copy())
         filter_ticks(first, last, ticks.inputs, model, made.last, False, empty, made.tests, made.states)
     return made
@@ -133,16 +136,94 @@ def run_error_state(m: Measurements, initial: InitialState, *, output_ns: Ints, 
     noise, standing = estimate_noise(m), find_stationary_intervals(m)
     ticks = build_ticks(m, noise, standing, _find_start_ns(m, output_ns), int(output_ns[-1]), output_ns=output_ns)
     std, walk = make_priors(m, noise, ticks)
-    model = make_model(m, std, walk, (), period_s=ticks.inputs.period_s, gate_probability=gate_probability)
-    start = make_start(initial, model, std, (0.0, 0.0, 0.0) if m.gnss is None else m.gnss.lever_arm_m)
-    first_minute = filter_section(ticks, model, start, until=round(_LEVELLING_S / ticks.inputs.period_s))
+    section = _Section(m, ticks, std, walk, gate_probability)
+    start = make_start(initial, section.model(), std, (0.0, 0.0, 0.0) if m.gnss is None else m.gnss.lever_arm_m)
+    first_minute = filter_section(ticks, section.model(), start, until=round(_LEVELLING_S / ticks.inputs.period_s))
     start.x[:9] = smooth_section(first_minute).states[0, :9]
-    made = filter_section(ticks, model, start)
+    made = filter_section(ticks, section.model(), start)
+    hypotheses = section.explain(made, start)
+    if hypotheses:
+        made = section.filter(start, hypotheses[0])
     smoothed = smooth_section(made)
+    if len(hypotheses) > 1:
+        rivals = [smooth_section(section.filter(start, each)) for each in hypotheses[1:]]
+        widen(smoothed, rivals, compute_weights(hypotheses), made.ticks.inputs.period_s)
     if not np.isfinite(smoothed.states).all():
         finding = make_finding("estimate-not-finite", Subject("run", ""))
         raise FusionError("the estimate is not finite", findings=[finding])
-    return _make_trajectory(m, made, smoothed, std, output_ns)
+    return _make_trajectory(m, made, smoothed, std, output_ns, hypotheses[:1])
+
+
+@dataclass(frozen=True, slots=True)
+class _Section:
+    """A section that is filtered under several hypotheses."""
+
+    measurements: Measurements
+    ticks: Ticks
+    std: Floats
+    walk: Floats
+    gate_probability: float
+
+    def model(self, changes: Hypothesis = Hypothesis((), 0.0), *, judges: bool = False) -> Model:
+        """Return the model under a hypothesis; one that ``judges`` holds all errors that another could change, and follows no fix."""
+        return make_model(
+            self.measurements,
+            self.std,
+            self.walk,
+            changes.events,
+            period_s=self.ticks.inputs.period_s,
+            gate_probability=self.gate_probability,
+            follows=not judges,
+            ignored=changes.ignored,
+            possible=POSSIBLE if judges else (),
+        )
+
+    def filter(self, start: Memory, hypothesis: Hypothesis) -> Pass:
+        """Return the forward pass under a hypothesis."""
+        model = self.model(hypothesis)
+        return filter_section(self.ticks, model, expand_start(start, self.model(), model))
+
+    def explain(self, made: Pass, start: Memory) -> list[Hypothesis]:
+        """Return the hypotheses that explain where sensors contradict each other, the best first; none where they do not."""
+        period_s, size = self.ticks.inputs.period_s, self.ticks.stamp_ns.size
+        suspects = find_suspects(made.tests, period_s)
+        if not suspects:
+            return []
+        model = self.model(judges=True)
+        plain = filter_section(self.ticks, model, expand_start(start, self.model(), model))
+
+        def judge(changes: tuple[Change, ...], first: int, last: int) -> float:
+            if not changes:
+                return compute_evidence(plain.tests, model.gates, first, last)
+            changed = self.model(Hypothesis(changes, 0.0), judges=True)
+            block = first // _BLOCK
+            again = filter_section(self.ticks, changed, plain.checkpoints[block], begin=block * _BLOCK, until=last)
+            return compute_evidence(again.tests, model.gates, first, last)
+
+        found = explain(suspects, judge, size, period_s)
+        return found if found[0].changes or len(found) > 1 else []
+
+
+def widen(best: Smoothed, rivals: Sequence[Smoothed], weights: Floats, period_s: float) -> None:
+    """Mix the variances of estimates under several hypotheses about the best one: Σ w (P + d d')."""
+    best.variances[:] *= weights[0]
+    best.links[:] *= weights[0]
+    lags = [round(lag_s / period_s) for lag_s in DISPLACEMENT_LAGS_S]
+    for other, weight in zip(rivals, weights[1:], strict=True):
+        apart = np.column_stack((
+            other.states[:, 9:12] - best.states[:, 9:12],
+            _compute_yaw(other.states) - _compute_yaw(best.states),
+            other.states[:, state.U + 6] - best.states[:, state.U + 6],
+        ))
+        apart[:, 3] = (apart[:, 3] + np.pi) % (2.0 * np.pi) - np.pi
+        best.variances[:] += weight * (other.variances + apart**2)
+        for column, lag in enumerate(lags):
+            length = [np.hypot(*(x[lag:, 9:11] - x[:-lag, 9:11]).T) for x in (other.states, best.states)]
+            best.links[:-lag, column] += weight * (other.links[:-lag, column] + (length[0] - length[1]) ** 2)
+
+
+def _compute_yaw(states: Floats) -> Floats:
+    return np.arctan2(states[:, 3], states[:, 0])
 
 
 def _find_start_ns(m: Measurements, output_ns: Ints) -> int:
@@ -150,7 +231,7 @@ def _find_start_ns(m: Measurements, output_ns: Ints) -> int:
     return min(*moving, int(output_ns[0])) if moving else int(output_ns[0])
 
 
-def _make_trajectory(m: Measurements, made: Pass, smoothed: Smoothed, std: Floats, output_ns: Ints) -> Trajectory:
+def _make_trajectory(m: Measurements, made: Pass, smoothed: Smoothed, std: Floats, output_ns: Ints, explained: Sequence[Hypothesis]) -> Trajectory:  # fmt: skip
     """Return the trajectory at the wanted stamps [ns], with what no state of the filter can know in its deviations."""
     ticks = made.ticks
     at = np.searchsorted(ticks.stamp_ns, output_ns)
@@ -202,7 +283,7 @@ def _make_trajectory(m: Measurements, made: Pass, smoothed: Smoothed, std: Float
         forward_velocity_std_mps=np.sqrt(speed_variance + (scale_std * speed) ** 2),
         rejections=_make_rejections(m, made),
         displacement_std_m=np.sqrt(links),
-        facts=_make_facts(m, made, smoothed, std, scale_std),
+        facts=_make_facts(m, made, smoothed, std, scale_std, explained),
     )
 
 
@@ -307,7 +388,17 @@ def find_gate_resets(made: Pass) -> tuple[GateReset, ...]:
     return tuple(sorted(found, key=lambda each: each.start_ns))
 
 
-def _make_facts(m: Measurements, made: Pass, smoothed: Smoothed, std: Floats, scale_std: float) -> StretchFacts:
+def _list_changes(made: Pass, explained: Sequence[Hypothesis]) -> Iterator[GateReset]:
+    """Yield the spans of the changes that explain the run best, with the size of what was rejected there."""
+    for change in (c for each in explained for c in each.changes):
+        last = change.last or made.states.shape[0] - 1
+        off = np.linalg.norm(made.tests.fix_innovation[change.first : last, :2], axis=1)
+        size = float(np.nanmax(off, initial=0.0)) if change.role == state.FIX else 0.0
+        stamps = made.ticks.stamp_ns[[change.first, last]].tolist()
+        yield GateReset(ROLES[change.role], *stamps, size)
+
+
+def _make_facts(m: Measurements, made: Pass, smoothed: Smoothed, std: Floats, scale_std: float, explained: Sequence[Hypothesis]) -> StretchFacts:  # fmt: skip
     rows = _list_rows(m, made)
     tests = made.tests
     nis = {}
@@ -329,7 +420,7 @@ def _make_facts(m: Measurements, made: Pass, smoothed: Smoothed, std: Floats, sc
         events=int(made.ticks.stamp_ns.size),
         zero_velocity_updates=int((tests.verdict[:, state.STATIONARY] > 0).sum()),
         gnss_lasting_error_m=float(np.sqrt(np.median(made.ticks.fix_variance_m2[:, 0]))),
-        gate_resets=find_gate_resets(made),
+        gate_resets=(*_list_changes(made, explained), *find_gate_resets(made)),
         covariance_repairs=0,
         gyro_bias_radps=None if std[state.TURN_SCALE] else make_vector(x[state.GYRO_BIAS : state.GYRO_BIAS + 3]),
         turn_scale=float(1.0 / (1.0 - x[state.TURN_SCALE])) if std[state.TURN_SCALE] else None,

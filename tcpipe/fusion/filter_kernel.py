@@ -102,6 +102,7 @@ class Model(NamedTuple):
     scales : by kind, the place in ``active`` of the sensor's own scale; -1: none.
     events : at a tick, errors from a place in ``active`` on: (tick, place, count, whether the error is another one now); (e, 4).
     sizes : variance added by each event, (e,).
+    ignored : measurements that are predicted and not used: (kind, first tick, last tick, the latter excluded), (i, 3).
     """
 
     active: Indices
@@ -115,6 +116,7 @@ class Model(NamedTuple):
     scales: Indices
     events: NDArray[np.int64]
     sizes: Vector
+    ignored: NDArray[np.int64]
 
 
 class Memory(NamedTuple):
@@ -513,7 +515,12 @@ def filter_ticks(
             if kind == FIX:
                 for a in range(3):
                     tests.fix_innovation[k, a] = y[a]
-            if not nis <= model.gates[kind]:
+            is_used = nis <= model.gates[kind]
+            for j in range(model.ignored.shape[0]):
+                if model.ignored[j, 0] == kind and model.ignored[j, 1] <= k < model.ignored[j, 2]:
+                    is_used = False
+                    waits[kind, 1] = 0.0
+            if not is_used:
                 verdict = REJECTED
                 waits[kind, 0] += 1.0
                 is_alone = True

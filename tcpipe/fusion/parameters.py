@@ -150,9 +150,14 @@ def make_model(
     period_s: float,
     gate_probability: float,
     follows: bool = True,
+    ignored: Sequence[tuple[int, int, int]] = (),
+    possible: Sequence[int] = (),
 ) -> Model:
-    """Return the filter's model; unless it ``follows``, rejected fixes are never taken to be right after all."""
-    involved = {e for event in events for e in range(event.place, event.place + event.count)}
+    """Return the filter's model; unless it ``follows``, rejected fixes are never taken to be right after all.
+
+    ``ignored``: measurements (kind, first tick, last tick) that are not used; ``possible``: errors that other events could change.
+    """
+    involved = {e for event in events for e in range(event.place, event.place + event.count)} | set(possible)
     active = np.array([e for e in range(state.N) if e < state.GYRO_BIAS or std[e] or walk[e] or e in involved])
     position = {int(e): i for i, e in enumerate(active)}
     depends = np.zeros((state.KINDS + 2, active.size), np.int64)
@@ -179,6 +184,7 @@ def make_model(
         scales=scales,
         events=np.array([(e.tick, position[e.place], e.count, e.is_new) for e in events], np.int64).reshape(-1, 4),
         sizes=np.array([e.std**2 for e in events], np.float64),
+        ignored=np.array(ignored, np.int64).reshape(-1, 3),
     )
 
 
@@ -215,3 +221,10 @@ def make_start(initial: InitialState, model: Model, std: Floats, arm_m: Sequence
     P[6:9, 6:9] = np.eye(3) * initial.velocity_std_mps**2
     active = model.active
     return Memory(x, P[np.ix_(active, active)].copy(), np.zeros((state.KINDS, 2)))
+
+
+def expand_start(start: Memory, model: Model, other: Model) -> Memory:
+    """Return a start of one model as that of another, in which more errors are active."""
+    P = np.zeros((state.N, state.N))
+    P[np.ix_(model.active, model.active)] = start.P
+    return Memory(start.x.copy(), P[np.ix_(other.active, other.active)].copy(), start.waits.copy())
