@@ -6,7 +6,7 @@ time with everything kept, and smoothed. The second pass repeats the arithmetic 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -30,7 +30,15 @@ from tcpipe.fusion.filter_kernel import (
     filter_ticks,
     smooth_ticks,
 )
-from tcpipe.fusion.hypotheses import POSSIBLE, Change, Hypothesis, compute_evidence, compute_weights, explain, find_suspects
+from tcpipe.fusion.hypotheses import (
+    POSSIBLE,
+    Change,
+    Hypothesis,
+    compute_evidence,
+    compute_weights,
+    explain,
+    find_suspects,
+)
 from tcpipe.fusion.initial import compute_course, find_stationary_intervals
 from tcpipe.fusion.measurements import DOPPLER, GNSS, VISUAL, WHEELS, InitialState, Measurements
 from tcpipe.fusion.parameters import PARAMETERS, expand_start, make_model, make_priors, make_start
@@ -59,6 +67,7 @@ _LEVELLING_S = 60.0
 """The start is filtered twice over this time: attitude and yaw at its end are those of the beginning, smoothed."""
 _ANY_YAW_STD_RAD = np.pi / np.sqrt(3.0)
 _MANY_FIXES = 50
+_UNCHANGED = Hypothesis((), 0.0)
 
 
 @dataclass(slots=True)
@@ -164,7 +173,7 @@ class _Section:
     walk: Floats
     gate_probability: float
 
-    def model(self, changes: Hypothesis = Hypothesis((), 0.0), *, judges: bool = False) -> Model:
+    def model(self, changes: Hypothesis = _UNCHANGED, *, judges: bool = False) -> Model:
         """Return the model under a hypothesis; one that ``judges`` holds all errors that another could change, and follows no fix."""
         return make_model(
             self.measurements,
@@ -210,11 +219,13 @@ def widen(best: Smoothed, rivals: Sequence[Smoothed], weights: Floats, period_s:
     best.links[:] *= weights[0]
     lags = [round(lag_s / period_s) for lag_s in DISPLACEMENT_LAGS_S]
     for other, weight in zip(rivals, weights[1:], strict=True):
-        apart = np.column_stack((
-            other.states[:, 9:12] - best.states[:, 9:12],
-            _compute_yaw(other.states) - _compute_yaw(best.states),
-            other.states[:, state.U + 6] - best.states[:, state.U + 6],
-        ))
+        apart = np.column_stack(
+            (
+                other.states[:, 9:12] - best.states[:, 9:12],
+                _compute_yaw(other.states) - _compute_yaw(best.states),
+                other.states[:, state.U + 6] - best.states[:, state.U + 6],
+            )
+        )
         apart[:, 3] = (apart[:, 3] + np.pi) % (2.0 * np.pi) - np.pi
         best.variances[:] += weight * (other.variances + apart**2)
         for column, lag in enumerate(lags):
@@ -231,7 +242,9 @@ def _find_start_ns(m: Measurements, output_ns: Ints) -> int:
     return min(*moving, int(output_ns[0])) if moving else int(output_ns[0])
 
 
-def _make_trajectory(m: Measurements, made: Pass, smoothed: Smoothed, std: Floats, output_ns: Ints, explained: Sequence[Hypothesis]) -> Trajectory:  # fmt: skip
+def _make_trajectory(  # noqa: PLR0917
+    m: Measurements, made: Pass, smoothed: Smoothed, std: Floats, output_ns: Ints, explained: Sequence[Hypothesis]
+) -> Trajectory:
     """Return the trajectory at the wanted stamps [ns], with what no state of the filter can know in its deviations."""
     ticks = made.ticks
     at = np.searchsorted(ticks.stamp_ns, output_ns)
@@ -398,7 +411,9 @@ def _list_changes(made: Pass, explained: Sequence[Hypothesis]) -> Iterator[GateR
         yield GateReset(ROLES[change.role], *stamps, size)
 
 
-def _make_facts(m: Measurements, made: Pass, smoothed: Smoothed, std: Floats, scale_std: float, explained: Sequence[Hypothesis]) -> StretchFacts:  # fmt: skip
+def _make_facts(  # noqa: PLR0917
+    m: Measurements, made: Pass, smoothed: Smoothed, std: Floats, scale_std: float, explained: Sequence[Hypothesis]
+) -> StretchFacts:
     rows = _list_rows(m, made)
     tests = made.tests
     nis = {}
