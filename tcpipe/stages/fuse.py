@@ -9,13 +9,7 @@ from typing import Any
 import numpy as np
 
 from tcpipe.errors import FusionError
-from tcpipe.fusion.checks.audit import (
-    count_confirmations,
-    find_isolated_sensors,
-    find_undecided_sensors,
-    is_astray,
-    is_consistent,
-)
+from tcpipe.fusion.checks.audit import is_astray
 from tcpipe.fusion.checks.plausibility import SensorExclusion, refuse_fixes
 from tcpipe.fusion.measurements import GNSS, IMU
 from tcpipe.recipe import FuseConfig
@@ -50,8 +44,8 @@ def fuse_run(streams: Streams, config: FuseConfig, *, run_id: str) -> Track:
     streams, local = convert_pose_to_fixes(streams)
     run = Subject("run", run_id)
     inputs, sanity = drop_implausible_sensors(prepare_inputs(streams, config), streams)
-    # 2. Each section for itself: where it starts, filter and smoother; again where that shows other mountings, or a sensor to be alone.
-    inputs, sanity, fused = fuse_agreeing(inputs, sanity, streams, config, run=run)
+    # 2. Each section for itself: where it starts, filter and smoother; again without a sensor that leads the track away from all others.
+    inputs, sanity, fused = fuse_recovering(inputs, sanity, streams, config, run=run)
     if not fused.found:
         raise FusionError("no motion to fuse", findings=(_find_nothing(streams, inputs, run), *sanity.findings))
     columns = {name: np.concatenate([part[name] for part in fused.columns]) for name in fused.columns[0]}
@@ -99,64 +93,38 @@ def _find_nothing(streams: Streams, inputs: FusionInputs, run: Subject) -> Findi
 Judged = tuple[FusionInputs, StageReport[SensorChecks]]
 
 
-def fuse_agreeing(
+def fuse_recovering(
     inputs: FusionInputs, sanity: StageReport[SensorChecks], streams: Streams, config: FuseConfig, *, run: Subject
 ) -> tuple[FusionInputs, StageReport[SensorChecks], Fused]:
-    """Fuse each section; where sensors contradict each other over most of the distance, again without the one that is at fault.
+    """Fuse each section; where the track contradicts every sensor, again without the one that misleads it.
 
-    The sensor that differs from the others is not always the wrong one: an IMU whose bias has jumped leads the track and the odometries
-    away from the fixes. So each sensor is excluded for a trial, also where the track contradicts every sensor. Corrections of extrinsics
-    and scales that such a track showed are discarded.
+    That is the IMU, which carries the state from tick to tick, if the track recovers without it; else the only sensor without which it
+    does.
 
     Raises
     ------
     FusionError : the track contradicts every sensor, whichever is excluded.
     """
     fused = fuse_sections(inputs, streams, config)
-    lone, astray = find_isolated_sensors(fused.tallies), is_astray(fused.windows, fused.astray)
-    if lone or astray or find_undecided_sensors(fused.tallies):
-        lone = _find_fault(inputs, sanity, streams, config, astray=astray) or lone
-        if lone:
-            inputs, sanity = _without(lone, inputs, sanity, streams, astray=astray)
-            fused = fuse_sections(inputs, streams, config)
-    if is_astray(fused.windows, fused.astray):
-        astray_fraction = fused.astray / fused.windows
-        finding = make_finding("track-contradicts-sensors", run, astray_fraction=astray_fraction)
-        raise FusionError("the track contradicts every sensor", findings=(finding, *sanity.findings))
-    return inputs, sanity, fused
-
-
-def _without(
-    roles: Sequence[str], inputs: FusionInputs, sanity: StageReport[SensorChecks], streams: Streams, *, astray: bool
-) -> Judged:
-    code = "misleads-track" if astray else "contradicted-by-others"
-    odometries = {name for m in inputs.measurements.values() for name in m.odometries()}.difference(roles)
-    refusals = [refuse_fixes(code, odometries) if role == GNSS else SensorExclusion(role, code) for role in roles]
-    return exclude_sensors(inputs, sanity, refusals, streams)
-
-
-def _find_fault(
-    inputs: FusionInputs, sanity: StageReport[SensorChecks], streams: Streams, config: FuseConfig, *, astray: bool
-) -> tuple[str, ...]:
-    """Return the one sensor without which the others agree; of several the one whose others confirm each other most, none of two equals.
-
-    Where the track is ``astray``, it is the IMU, of which the process is made, if the track recovers without it; else the only sensor
-    without which it recovers.
-    """
-    roles = sorted({role for m in inputs.measurements.values() for role in m.sensors()})
-    if len(roles) <= 2 and not astray:
-        return ()
-    agreeing: dict[str, int] = {}
-    following: list[str] = []
-    for role in roles:
-        rest, _ = _without([role], inputs, sanity, streams, astray=astray)
+    if not is_astray(fused.windows, fused.astray):
+        return inputs, sanity, fused
+    recovered = {}
+    for role in sorted({role for m in inputs.measurements.values() for role in m.sensors()}):
+        rest, without = _exclude(role, inputs, sanity, streams)
         if any(m.gnss is not None or m.odometries() for m in rest.measurements.values()):
             tried = fuse_sections(rest, streams, config)
-            if tried.tallies and is_consistent(tried.tallies):
-                agreeing[role] = count_confirmations(tried.tallies)
             if tried.found and not is_astray(tried.windows, tried.astray):
-                following.append(role)
-    best = [role for role, confirmed in agreeing.items() if confirmed == max(agreeing.values())]
-    if astray and (len(best) != 1 or best[0] not in following):
-        best = [IMU] if IMU in following else following
-    return (best[0],) if len(best) == 1 else ()
+                recovered[role] = rest, without, tried
+    if IMU in recovered:
+        return recovered[IMU]
+    if len(recovered) == 1:
+        return next(iter(recovered.values()))
+    finding = make_finding("track-contradicts-sensors", run, astray_fraction=fused.astray / fused.windows)
+    raise FusionError("the track contradicts every sensor", findings=(finding, *sanity.findings))
+
+
+def _exclude(role: str, inputs: FusionInputs, sanity: StageReport[SensorChecks], streams: Streams) -> Judged:
+    odometries = {name for m in inputs.measurements.values() for name in m.odometries()}.difference({role})
+    code = "misleads-track"
+    refusal = refuse_fixes(code, odometries) if role == GNSS else SensorExclusion(role, code)
+    return exclude_sensors(inputs, sanity, [refusal], streams)
