@@ -7,8 +7,9 @@ time with everything kept, and smoothed. The second pass repeats the arithmetic 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,17 +31,9 @@ from tcpipe.fusion.filter_kernel import (
     filter_ticks,
     smooth_ticks,
 )
-from tcpipe.fusion.hypotheses import (
-    POSSIBLE,
-    Change,
-    Hypothesis,
-    compute_evidence,
-    compute_weights,
-    explain,
-    find_suspects,
-)
+from tcpipe.fusion.hypotheses import POSSIBLE, Hypothesis, compute_weights, explain, find_suspects
 from tcpipe.fusion.initial import compute_course, find_stationary_intervals
-from tcpipe.fusion.measurements import DOPPLER, GNSS, VISUAL, WHEELS, InitialState, Measurements
+from tcpipe.fusion.measurements import DOPPLER, GNSS, IMU, VISUAL, WHEELS, InitialState, Measurements
 from tcpipe.fusion.parameters import PARAMETERS, expand_start, make_model, make_priors, make_start
 from tcpipe.fusion.process import (
     GROUND,
@@ -55,7 +48,7 @@ from tcpipe.fusion.process import (
 from tcpipe.fusion.ticks import Ticks, build_ticks
 from tcpipe.fusion.trajectory import DISPLACEMENT_LAGS_S, Rejections, Trajectory
 from tcpipe.geometry.rotation import matrix_from_quat, quat_from_matrix, quat_from_rpy
-from tcpipe.tables.facts import GateReset, ParameterFacts, StretchFacts, make_vector
+from tcpipe.tables.facts import ChangeFacts, GateReset, ParameterFacts, StretchFacts, make_vector
 from tcpipe.tables.findings import Subject, make_finding
 
 Floats = NDArray[np.float64]
@@ -194,23 +187,17 @@ class _Section:
 
     def explain(self, made: Pass, start: Memory) -> list[Hypothesis]:
         """Return the hypotheses that explain where sensors contradict each other, the best first; none where they do not."""
-        period_s, size = self.ticks.inputs.period_s, self.ticks.stamp_ns.size
-        suspects = find_suspects(made.tests, period_s)
-        if not suspects:
+        if not find_suspects(made.tests, self.ticks.inputs.period_s):
             return []
         model = self.model(judges=True)
         plain = filter_section(self.ticks, model, expand_start(start, self.model(), model))
 
-        def judge(changes: tuple[Change, ...], first: int, last: int) -> float:
-            if not changes:
-                return compute_evidence(plain.tests, model.gates, first, last)
-            changed = self.model(Hypothesis(changes, 0.0), judges=True)
+        def run(changed: Hypothesis, first: int, last: int) -> Pass:
             block = first // _BLOCK
-            again = filter_section(self.ticks, changed, plain.checkpoints[block], begin=block * _BLOCK, until=last)
-            return compute_evidence(again.tests, model.gates, first, last)
+            begin = plain.checkpoints[block]
+            return filter_section(self.ticks, self.model(changed, judges=True), begin, begin=block * _BLOCK, until=last)
 
-        found = explain(suspects, judge, size, period_s)
-        return found if found[0].changes or len(found) > 1 else []
+        return explain(plain, run, frozenset(model.active.tolist()))
 
 
 def widen(best: Smoothed, rivals: Sequence[Smoothed], weights: Floats, period_s: float) -> None:
@@ -297,6 +284,7 @@ def _make_trajectory(  # noqa: PLR0917
         rejections=_make_rejections(m, made),
         displacement_std_m=np.sqrt(links),
         facts=_make_facts(m, made, smoothed, std, scale_std, explained),
+        corrected=_correct_measurements(m, made, smoothed, explained),
     )
 
 
@@ -401,14 +389,53 @@ def find_gate_resets(made: Pass) -> tuple[GateReset, ...]:
     return tuple(sorted(found, key=lambda each: each.start_ns))
 
 
-def _list_changes(made: Pass, explained: Sequence[Hypothesis]) -> Iterator[GateReset]:
-    """Yield the spans of the changes that explain the run best, with the size of what was rejected there."""
+def _correct_measurements(
+    m: Measurements, made: Pass, smoothed: Smoothed, explained: Sequence[Hypothesis]
+) -> Measurements:
+    """Return fixes and odometry without what the estimate found to be wrong with them, as the audit compares them with the track."""
+    changes = [c for each in explained for c in each.changes if c.kind == "useless"]
+    rows, found = made.ticks.rows, {}
+    for kind, name in ((state.FIX, "gnss"), (state.WHEELS, "wheels"), (state.VISUAL, "visual")):
+        source = getattr(m, name)
+        if source is None:
+            continue
+        tick = rows[kind].clip(0, made.states.shape[0] - 1)
+        x = smoothed.states[tick, 6:]
+        if kind == state.FIX:
+            rotation = smoothed.states[tick, :9].reshape(-1, 3, 3)
+            moved = x[:, state.ARM : state.ARM + 3] - np.asarray(source.lever_arm_m)
+            late = x[:, state.FIX_LAG, None] * np.einsum("nij,nj->ni", rotation, x[:, state.U : state.U + 3])
+            off = np.einsum("nij,nj->ni", rotation, moved) - late + x[:, state.FIX_OFFSET : state.FIX_OFFSET + 3]
+            corrected = replace(source, position_enu_m=source.position_enu_m - off)
+        else:
+            places = (
+                (state.WHEEL_SCALE, state.WHEEL_LAG) if kind == state.WHEELS else (state.VISUAL_SCALE, state.VISUAL_LAG)
+            )
+            scale = 1.0 + x[:, places[0]] + x[:, state.SHARED_SCALE]
+            stamp_ns = source.stamp_ns - round(float(np.median(x[:, places[1]])) * 1e9)
+            corrected = replace(source, stamp_ns=stamp_ns, velocity_mps=source.velocity_mps / scale[:, None])
+        kept = np.ones(tick.size, np.bool_)
+        for change in changes:
+            if change.role == kind:
+                kept &= (tick < change.first) | (tick >= (change.last or made.states.shape[0]))
+        found[name] = _select_rows(corrected, kept) if not kept.all() else corrected
+    return replace(m, **found)
+
+
+def _select_rows(source: Any, kept: NDArray[np.bool_]) -> Any:
+    values = {field.name: getattr(source, field.name) for field in fields(source)}
+    return replace(source, **{name: value[kept] for name, value in values.items() if isinstance(value, np.ndarray)})
+
+
+def _list_changes(made: Pass, explained: Sequence[Hypothesis]) -> Iterator[ChangeFacts]:
+    """Yield the changes that explain the run best, with the size of the fixes' innovation there."""
     for change in (c for each in explained for c in each.changes):
         last = change.last or made.states.shape[0] - 1
         off = np.linalg.norm(made.tests.fix_innovation[change.first : last, :2], axis=1)
         size = float(np.nanmax(off, initial=0.0)) if change.role == state.FIX else 0.0
-        stamps = made.ticks.stamp_ns[[change.first, last]].tolist()
-        yield GateReset(ROLES[change.role], *stamps, size)
+        role = IMU if change.kind == "gyroscope" else ROLES[change.role]
+        start_ns, end_ns = made.ticks.stamp_ns[[change.first, last]].tolist()
+        yield ChangeFacts(change.kind, role, start_ns, end_ns, size)
 
 
 def _make_facts(  # noqa: PLR0917
@@ -435,7 +462,8 @@ def _make_facts(  # noqa: PLR0917
         events=int(made.ticks.stamp_ns.size),
         zero_velocity_updates=int((tests.verdict[:, state.STATIONARY] > 0).sum()),
         gnss_lasting_error_m=float(np.sqrt(np.median(made.ticks.fix_variance_m2[:, 0]))),
-        gate_resets=(*_list_changes(made, explained), *find_gate_resets(made)),
+        gate_resets=find_gate_resets(made),
+        changes=tuple(_list_changes(made, explained)),
         covariance_repairs=0,
         gyro_bias_radps=None if std[state.TURN_SCALE] else make_vector(x[state.GYRO_BIAS : state.GYRO_BIAS + 3]),
         turn_scale=float(1.0 / (1.0 - x[state.TURN_SCALE])) if std[state.TURN_SCALE] else None,

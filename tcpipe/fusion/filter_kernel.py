@@ -63,7 +63,8 @@ class Inputs(NamedTuple):
     mode, turned, gained : motion from the tick before, as `move_state` takes it, (K,), (K, 9), (K, 6).
     noise : variance added to rotation and body velocity [rad², m²/s²], (K, 6).
     rate, has_gyro : angular velocity at the tick, as measured [rad/s], (K, 3), and whether by a gyroscope, (K,).
-    quickens : acceleration forward at the tick [m/s²], (K,). Not the state's own, whose noise would look like a lag of every sensor.
+    quickens : acceleration forward at the tick [m/s²], for the wheels and fixes, and for the camera, (K, 2). Not the state's own, whose
+        noise would look like a lag of every sensor.
     value, variance : measurements by kind, (K, 8, 3); NaN: none.
     tau : time of the measurement after the tick [s], (K, 8).
     levers : places of odometries on the robot [m], (8, 3).
@@ -77,7 +78,7 @@ class Inputs(NamedTuple):
     noise: Matrix
     rate: Matrix
     has_gyro: NDArray[np.bool_]
-    quickens: Vector
+    quickens: Matrix
     value: NDArray[np.float64]
     variance: NDArray[np.float64]
     tau: Matrix
@@ -495,7 +496,6 @@ def filter_ticks(
         if k > 0:
             _move(k, inputs, model, x, P, F, room)
             _decay(k, inputs, model, x, P, kept)
-        quickens[0] = inputs.quickens[k]
         if keep and k > 0:
             for i in range(MOST):
                 for j in range(MOST):
@@ -507,6 +507,7 @@ def filter_ticks(
             if not np.isfinite(inputs.value[k, kind, 0]):
                 continue
             size = SIZES[kind]
+            quickens[0] = inputs.quickens[k, 1 if kind == VISUAL else 0]
             log_det = _compare(k, kind, inputs, model, x, P, quickens, gain, room)
             nis = _compute_nis(y, inverse, size)
             tests.nis[k, kind] = nis

@@ -11,8 +11,9 @@ Blame is never what is left when a sensor is ignored: without fixes everything i
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +21,9 @@ from numpy.typing import NDArray
 from tcpipe.fusion import state
 from tcpipe.fusion.filter_kernel import ACCEPTED, NONE, Tests
 from tcpipe.fusion.parameters import Event
+
+if TYPE_CHECKING:
+    from tcpipe.fusion.error_state import Pass
 
 Floats = NDArray[np.float64]
 
@@ -42,6 +46,8 @@ _SURELY = 20.0
 """Log likelihood by which a further change must explain more, beyond its cost."""
 _TEMPER = 8.0
 """Errors of measurements last: so many of them tell as much as an independent one."""
+_NEAR = 3.0 * _TEMPER
+_MOST_RIVALS = 2
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,11 +64,14 @@ class Change:
         """Log of how unlikely it is beforehand."""
         return _COSTS[self.kind] + (0.0 if self.last is None else 2.0)
 
+    @property
+    def blocks(self) -> tuple[tuple[int, int, float], ...]:
+        """Errors that it changes: the first, their number, and by how much [their unit]."""
+        return _BLOCKS.get((self.kind, self.role), ())
+
     def list_events(self) -> Iterator[Event]:
         """Yield what it changes in the state."""
-        if self.kind == "useless":
-            return
-        for place, count, std in _PLACES[self.kind, self.role]:
+        for place, count, std in self.blocks:
             yield Event(self.first, place, count, std)
             if self.last is not None:
                 yield Event(
@@ -70,7 +79,7 @@ class Change:
                 )
 
 
-_PLACES: dict[tuple[str, int], tuple[tuple[int, int, float], ...]] = {
+_BLOCKS: dict[tuple[str, int], tuple[tuple[int, int, float], ...]] = {
     ("offset", state.FIX): ((state.FIX_OFFSET, 3, 1.0),),
     ("antenna", state.FIX): ((state.ARM, 3, 0.3),),
     ("clock", state.FIX): ((state.FIX_LAG, 1, 0.3),),
@@ -147,31 +156,36 @@ def compute_evidence(tests: Tests, gates: Floats, first: int, last: int) -> floa
     return float(-0.5 * np.nansum(nis + tests.log_det[first:last, kinds]))
 
 
-def explain(
-    suspects: Sequence[Suspect], judge: Callable[[tuple[Change, ...], int, int], float], size: int, period_s: float
-) -> list[Hypothesis]:
-    """Return the hypotheses that explain the suspects best, the best first; one of no change where none does.
+def explain(made: Pass, run: Callable[[Hypothesis, int, int], Pass], active: Collection[int]) -> list[Hypothesis]:
+    """Return the hypotheses that explain best where sensors contradict each other, the best first; none where they do not.
 
-    ``judge`` returns the evidence of changes between two ticks.
+    ``made`` is the pass without any change, in which no rejected fix is followed; ``run`` makes that under a hypothesis between two ticks
+    (its rows before the first mean nothing). Only errors that are ``active`` can change. The longest contradiction is explained first; then the longest that is
+    left.
     """
-    first = min(s.first for s in suspects)
-    last = min(size, max(s.last for s in suspects) + round(_HORIZON_S / period_s))
-    plain = judge((), first, last)
-    best, tried = Hypothesis((), 0.0), [Hypothesis((), 0.0)]
-    for _ in range(min(_MOST_CHANGES, len(suspects) + 1)):
-        start = best
-        for change in _list_changes(suspects, size):
-            if any(change.kind == c.kind and change.role == c.role and change.first == c.first for c in start.changes):
-                continue
-            changes = (*start.changes, change)
-            score = judge(changes, first, last) - plain - sum(c.cost for c in changes)
-            tried.append(Hypothesis(changes, score))
-            best = max(best, tried[-1], key=lambda each: each.score)
-        if best.score < start.score + _SURELY:
-            best = start
+    period_s, gates, size = made.ticks.inputs.period_s, made.model.gates, made.states.shape[0]
+    best, tests, found = Hypothesis((), 0.0), made.tests, [Hypothesis((), 0.0)]
+    for _ in range(_MOST_CHANGES):
+        suspects = find_suspects(tests, period_s)
+        if not suspects:
             break
-    rivals = [each for each in tried if each.score > best.score - 3.0 * _TEMPER and each.changes != best.changes]
-    return [best, *sorted(rivals, key=lambda each: -each.score)[:3]]
+        first = min([suspects[0].first, *(c.first for c in best.changes)])
+        last = min(size, suspects[0].last + round(_HORIZON_S / period_s))
+        plain = compute_evidence(tests, gates, first, last)
+        tried: list[tuple[Hypothesis, Pass]] = []
+        for change in _list_changes(suspects[0], size):
+            if all(e in active for place, count, _ in change.blocks for e in range(place, place + count)):
+                changed = Hypothesis((*best.changes, change), 0.0)
+                again = run(changed, first, last)
+                gained = compute_evidence(again.tests, gates, first, last) - plain - change.cost
+                tried.append((replace(changed, score=best.score + gained), again))
+        top, _ = max(tried, key=lambda each: each[0].score)
+        found += [each for each, _ in tried]
+        if top.score < best.score + _SURELY:
+            break
+        best, tests = top, run(top, 0, size).tests
+    rivals = [each for each in found if best.score - _NEAR < each.score and each.changes != best.changes]
+    return [best, *sorted(rivals, key=lambda each: -each.score)[:_MOST_RIVALS]] if best.changes or rivals else []
 
 
 def compute_weights(hypotheses: Sequence[Hypothesis]) -> Floats:
@@ -181,20 +195,17 @@ def compute_weights(hypotheses: Sequence[Hypothesis]) -> Floats:
     return np.asarray(weights / weights.sum())
 
 
-def _list_changes(suspects: Sequence[Suspect], size: int) -> Iterator[Change]:
+def _list_changes(suspect: Suspect, size: int) -> Iterator[Change]:
     """Yield single changes that could explain a suspect."""
-    for suspect in suspects:
-        first, last = suspect.first, None if suspect.last >= size else suspect.last
-        if suspect.role == state.FIX:
-            if last is not None:
-                yield Change("offset", state.FIX, first, last)
-                yield Change("useless", state.FIX, first, last)
-            yield Change("offset", state.FIX, first)
-            yield Change("antenna", state.FIX, first)
-            yield Change("clock", state.FIX, first)
-            yield Change("gyroscope", state.FIX, first)
-            yield Change("pose", state.FIX, first)
-        else:
-            yield Change("scale", suspect.role, first, last)
-            yield Change("clock", suspect.role, first)
-            yield Change("gyroscope", state.FIX, first)
+    role, first, last = suspect.role, suspect.first, None if suspect.last >= size else suspect.last
+    if role != state.FIX:
+        yield Change("scale", role, first, last)
+        yield Change("clock", role, first)
+        yield Change("useless", role, first, last)
+        yield Change("gyroscope", state.FIX, first)
+        return
+    if last is not None:
+        yield Change("offset", role, first, last)
+        yield Change("useless", role, first, last)
+    for kind in ("offset", "antenna", "clock", "gyroscope", "pose"):
+        yield Change(kind, role, first)

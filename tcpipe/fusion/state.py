@@ -212,6 +212,7 @@ def predict_measurement(
     u0, u1, u2 = x[U + 6] + t * quickens[0], x[U + 7] + t * quickens[1], x[U + 8] + t * quickens[2]
     # From the axes of the IMU to those of the robot.
     v0, v1, v2 = u0 - m1 * u2 + m2 * u1, u1 - m2 * u0 + m0 * u2, u2 - m0 * u1 + m1 * u0
+    w0, w1, w2 = w0 - m1 * w2 + m2 * w1, w1 - m2 * w0 + m0 * w2, w2 - m0 * w1 + m1 * w0
     v0 += w1 * lever[2] - w2 * lever[1]
     v1 += w2 * lever[0] - w0 * lever[2]
     v2 += w0 * lever[1] - w1 * lever[0]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -23,6 +23,7 @@ from tcpipe.stages.fuse_inputs import (
 from tcpipe.stages.fuse_sections import Fused
 from tcpipe.tables.facts import (
     AuditFacts,
+    ChangeFacts,
     Disagreement,
     FuseFacts,
     GateReset,
@@ -71,6 +72,7 @@ def find_fuse_findings(
     elif inputs.datum_deg_m is not None:
         findings += [_find_initial_yaw(of, first_ns, gnss) for of in facts.stretches if of.heading_from != _COURSE]
     findings += _find_reopenings(facts, first_ns)
+    findings += _find_changes(facts, first_ns, fixes)
     findings += _find_scale(inputs, facts)
     findings += _find_rejections(facts, fixes)
     for key, code in (("variances_replaced", "variances-replaced"), ("invalid", "values-unusable")):
@@ -136,7 +138,29 @@ def _find_reopenings(facts: FuseFacts, first_ns: int) -> list[Finding]:
     return findings
 
 
-def _find_span_s(each: StretchFacts | GateReset, first_ns: int) -> tuple[float, float]:
+def _find_changes(facts: FuseFacts, first_ns: int, fixes: str) -> Iterator[Finding]:
+    """Yield what explains contradictions of sensors: what changed, when, and by how much fixes were off."""
+    for change in (each for section in facts.stretches for each in section.changes):
+        subject = Subject("role", fixes if change.role == GNSS else change.role)
+        names = {"change": _CHANGES[change.kind]}
+        yield make_finding(
+            "sensor-changed", subject, span_s=_find_span_s(change, first_ns), names=names, off_m=change.size
+        )
+
+
+_CHANGES = {
+    "offset": "positions are off by a constant",
+    "antenna": "the antenna was moved",
+    "clock": "its clock stepped",
+    "gyroscope": "the bias of its gyroscope jumped",
+    "scale": "its scale changed",
+    "pose": "the robot was moved without being measured",
+    "useless": "it measured nothing usable",
+}
+"""Changes in words."""
+
+
+def _find_span_s(each: StretchFacts | GateReset | ChangeFacts, first_ns: int) -> tuple[float, float]:
     return (each.start_ns - first_ns) / 1e9, (each.end_ns - first_ns) / 1e9
 
 

@@ -56,7 +56,7 @@ def fuse_sections(inputs: FusionInputs, streams: Streams, config: FuseConfig) ->
         # 2. Filter and smoother.
         trajectory = _estimate(section, initial, output_ns, config)
         # 3. What came out is held against what went in.
-        trajectory, audit = audit_trajectory(trajectory, section.measurements)
+        trajectory, audit = audit_trajectory(trajectory, trajectory.corrected or section.measurements)
         fused.disagreements += (replace(each, clock_epoch=section.clock_epoch) for each in audit.disagreements)
         fused.tallies += audit.tallies
         fused.windows, fused.astray = fused.windows + audit.windows, fused.astray + audit.astray
