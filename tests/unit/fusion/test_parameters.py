@@ -123,7 +123,7 @@ LEFT = {
     "lag of fixes": 0.4,
     "lag of wheels": 0.3,
     "lag of camera": 0.3,
-    "camera scale": 0.6,
+    "camera scale": 0.9,
     "mounting of the camera": 0.5,
 }
 """Largest share of the prior deviation that stays."""
