@@ -118,6 +118,8 @@ class NoiseModel:
     stamp_s2: float = 0.0
     stamp_told: float = 0.0
     residuals: tuple[ResidualLevel, ...] = field(default=(), repr=False)
+    densities: Mapping[str, Mapping[str, float]] = field(default_factory=dict, repr=False)
+    """By axis, the fitted densities by the names of `tcpipe.fusion.pair_residuals.Residuals.features`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -218,6 +220,10 @@ def fit_noise(measurements: Measurements, residuals: Sequence[Residuals]) -> Noi
         stamp_s2=stamp_s2,
         stamp_told=stamp_told,
         residuals=tuple(level for fit in (by_turns, plane, by_heights) for level in fit.find_levels()),
+        densities={
+            axis: fit.get_densities()
+            for axis, fit in ((TURN, by_turns), (ALONG, plane), (ACROSS, plane), (UP, by_heights))
+        },
     )
 
 
@@ -311,6 +317,10 @@ class _Fit:
         before = float(np.square(factors * self._usual_std).sum())
         return float(np.clip(1.0 - factors @ self._covariance @ factors / before, 0.0, 1.0)) if before > 0.0 else 0.0
 
+    def get_densities(self) -> dict[str, float]:
+        """Return every density by name."""
+        return dict(zip(self._names, self._variances.tolist(), strict=True))
+
     def find_density(self, name: str, prior: float) -> tuple[float, float]:
         """Return a density, and its share told; the larger of fit and prior where the data tell less than half of it."""
         if name not in self._names:
@@ -382,7 +392,7 @@ def _split_cells(each: Residuals, names: Sequence[str]) -> Iterator[_Cell]:
     features = np.stack([each.features.get(name, np.zeros(each.value.size)) for name in names], -1)
     for is_still in (False, True):
         if is_still:  # what little the robot moves then must not explain them
-            features = features * np.array([" scale" not in name and name != "sway" for name in names])
+            features = features * np.array([" scale" not in name and not name.startswith("sway") for name in names])
         rows = np.flatnonzero((each.is_still == is_still) & np.isfinite(each.value) & (each.value != 0.0))
         if rows.size < _FEWEST:
             continue
@@ -401,6 +411,8 @@ def _find_prior(name: str, prior: NoiseModel) -> tuple[float, float]:
     if last == "turn" or (last == "velocity" and kind in prior.odometries):
         density = prior.turns[kind].white_rad2ps if last == "turn" else prior.odometries[kind].velocity_m2ps
         return density, PRIORS[name].times * density
+    if kind == "sway":
+        return PRIORS[kind].variance, PRIORS[kind].variance
     if kind in PRIORS:
         process = _make_process(kind)
         if kind == "heading scale":

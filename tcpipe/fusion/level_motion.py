@@ -198,12 +198,12 @@ def compute_forward_mps(source: BodyVelocities, attitude: Attitude, zero_ns: int
     return np.asarray(means + attitude.rate_radps[:, 2] * y - attitude.rate_radps[:, 1] * z)
 
 
-def remove_spikes(values: Floats) -> Floats:
-    """Return a signal (N,) with samples far off the median of five around them replaced by it: what a filter's gate rejects."""
+def remove_spikes(values: Floats, *, fill: Floats | float | None = None) -> Floats:
+    """Return a signal (N,) with samples far off the median of five around them replaced, by that median: what a filter's gate rejects."""
     smooth = compute_median_of_five(values)
     off = np.abs(values - smooth)
     scatter = float(np.median(off[off > 0.0])) if (off > 0.0).any() else 0.0
-    return np.where(off > _SPIKE * scatter, smooth, values)
+    return np.where(off > _SPIKE * scatter, smooth if fill is None else fill, values)
 
 
 def integrate_grid(rate: NDArray[_Number]) -> NDArray[_Number]:

@@ -31,6 +31,7 @@ from tcpipe.fusion.level_motion import (
     get_turn_rates,
     integrate_grid,
     make_free_track,
+    remove_spikes,
 )
 from tcpipe.fusion.measurements import GNSS, Measurements, Positions
 from tcpipe.fusion.signals import (
@@ -57,7 +58,7 @@ _FEWEST = 8  # windows of one length
 _OVERLAPPING = 8  # windows begin in the length of one
 _LONGEST_GAP_NS = 300_000_000
 _STILL_MPS, _STILL_RAD, _STILL_S = 0.02, 0.02, 0.5  # the last: speeds are averaged, so that noise is none
-_SWAY_M = 5.0  # the ground's slope changes over so much
+_SWAY_M = (1.0, 3.0, 10.0, 30.0)  # the ground's slope changes over so much
 _PAIR_STEP_S = 0.1  # between windows' ends of sensors that are no fixes
 
 
@@ -146,6 +147,7 @@ def _compare_fixes(section: _Section, gnss: Positions, role: str, track: Track, 
     attitude = section.attitude
     fix_s = compute_seconds(gnss.stamp_ns, section.zero_ns)
     off = gnss.position_enu_m - interpolate_signal(attitude.time_s, track.path_m + track.arm_m, fix_s)
+    off = np.stack([remove_spikes(axis, fill=np.nan) for axis in off.T], -1)
     sways = 0.0 if attitude.is_level else gnss.lever_arm_m[2]
     has_others = len(section.measurements.odometries()) > 1
     sources = (section.measurements.odometries()[role].stamp_ns, attitude.source_ns)
@@ -168,7 +170,7 @@ def _compare_fixes(section: _Section, gnss: Positions, role: str, track: Track, 
             if axis != UP:
                 features["stamp"] = window.describe_stamps(axis)
             if sways and axis != UP:
-                features["sway"] = -2.0 * sways**2 * np.expm1(-window.length_m / _SWAY_M)
+                features |= {f"sway {each:g}": -2.0 * sways**2 * np.expm1(-window.length_m / each) for each in _SWAY_M}
             stamps = gnss.stamp_ns[first], gnss.stamp_ns[last]
             made.append(Residuals((GNSS, role), axis, time_s, *stamps, value, features, is_still))
     return made

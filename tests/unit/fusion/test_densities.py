@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 from unit.fusion import drive
 
-from tcpipe.fusion.densities import GaussMarkov, estimate_noise, make_prior_model
-from tcpipe.fusion.measurements import Measurements, select_measurements
+from tcpipe.fusion.densities import GaussMarkov, estimate_noise, fit_noise, make_prior_model
+from tcpipe.fusion.event_candidates import find_event_candidates
+from tcpipe.fusion.measurements import GNSS, Measurements, select_measurements
+from tcpipe.fusion.pair_residuals import find_residuals
 
 LONG_S, SHORT_S = 660.0, 90.0
 
@@ -183,3 +185,52 @@ def test_fixes_at_one_hertz_and_of_metres():
     model = estimate_noise(replace(whole, gnss=slow))
     true = np.sqrt(2.0 * 0.2**2 + GaussMarkov(1.2**2, 60.0).difference_variance(np.array(10.0)))
     assert 0.7 < compute_change_std(model.horizontal, 10.0) / true < 1.5
+
+
+def find_candidates(measurements):
+    residuals = find_residuals(measurements)
+    return find_event_candidates(residuals, fit_noise(measurements, residuals))
+
+
+def shift_fixes(whole, shift_m):
+    """Add what a function of the time since the first fix [s] returns [m] to the east of the fixes."""
+    t = (whole.gnss.stamp_ns - whole.gnss.stamp_ns[0]) * 1e-9
+    return change_fixes(whole, position_enu_m=whole.gnss.position_enu_m + shift_m(t)[:, None] * [1.0, 0.0, 0.0])
+
+
+def test_no_event_where_nothing_happened():
+    assert not [each for each in find_candidates(measure(4, 0.006, 0.01)) if GNSS in each.pair and each.z > 5.0]
+
+
+def test_both_ends_of_a_wrong_span_are_found_to_a_second():
+    wrong = shift_fixes(measure(4, 0.006, 0.01), lambda t: np.where((t > 250.0) & (t < 310.0), 0.5, 0.0))
+    first_ns = int(wrong.gnss.stamp_ns[0])
+    at_s = np.array([(each.at_ns - first_ns) * 1e-9 for each in find_candidates(wrong) if GNSS in each.pair])
+    for end_s in (250.0, 310.0):
+        assert np.abs(at_s - end_s).min() < 1.0
+
+
+def test_a_smooth_excursion_is_found_in_long_windows():
+    excursion = shift_fixes(
+        measure(4, 0.006, 0.01), lambda t: 0.5 * np.sin(np.pi * np.clip((t - 300.0) / 60.0, 0.0, 1.0)) ** 2
+    )
+    first_ns = int(excursion.gnss.stamp_ns[0])
+    found = [each for each in find_candidates(excursion) if GNSS in each.pair and each.z > 5.0]
+    assert found
+    assert max(each.time_s for each in found) >= 20.0
+    for each in found:
+        assert (each.end_ns - first_ns) * 1e-9 > 300.0
+        assert (each.start_ns - first_ns) * 1e-9 < 360.0
+
+
+def test_frozen_fixes_are_found():
+    whole = measure(4, 0.006, 0.01)
+    t = (whole.gnss.stamp_ns - whole.gnss.stamp_ns[0]) * 1e-9
+    frozen = (t > 250.0) & (t < 260.0)
+    place = np.where(frozen[:, None], whole.gnss.position_enu_m[np.argmax(frozen)], whole.gnss.position_enu_m)
+    worst = find_candidates(change_fixes(whole, position_enu_m=place))[0]
+    start_s, end_s = ((each - whole.gnss.stamp_ns[0]) * 1e-9 for each in (worst.start_ns, worst.end_ns))
+    assert GNSS in worst.pair
+    assert worst.z > 20.0
+    assert start_s < 260.0
+    assert end_s > 250.0
