@@ -60,6 +60,7 @@ _LEVELLING_S = 60.0
 """The start is filtered twice over this time: attitude and yaw at its end are those of the beginning, smoothed."""
 _ANY_YAW_STD_RAD = np.pi / np.sqrt(3.0)
 _MANY_FIXES = 50
+_UNCHANGED = Hypothesis((), 0.0)
 
 
 @dataclass(slots=True)
@@ -165,7 +166,7 @@ class _Section:
     walk: Floats
     gate_probability: float
 
-    def model(self, changes: Hypothesis = Hypothesis((), 0.0), *, judges: bool = False) -> Model:
+    def model(self, changes: Hypothesis = _UNCHANGED, *, judges: bool = False) -> Model:
         """Return the model under a hypothesis; one that ``judges`` holds all errors that another could change, and follows no fix."""
         return make_model(
             self.measurements,
@@ -194,9 +195,7 @@ class _Section:
         def run(changed: Hypothesis, first: int, last: int) -> Pass:
             block = first // _BLOCK
             begin = plain.checkpoints[block]
-            return filter_section(
-                self.ticks, self.model(changed, judges=True), begin, begin=block * _BLOCK, until=last
-            )
+            return filter_section(self.ticks, self.model(changed, judges=True), begin, begin=block * _BLOCK, until=last)
 
         return explain(plain, run, frozenset(model.active.tolist()))
 
@@ -207,11 +206,13 @@ def widen(best: Smoothed, rivals: Sequence[Smoothed], weights: Floats, period_s:
     best.links[:] *= weights[0]
     lags = [round(lag_s / period_s) for lag_s in DISPLACEMENT_LAGS_S]
     for other, weight in zip(rivals, weights[1:], strict=True):
-        apart = np.column_stack((
-            other.states[:, 9:12] - best.states[:, 9:12],
-            _compute_yaw(other.states) - _compute_yaw(best.states),
-            other.states[:, state.U + 6] - best.states[:, state.U + 6],
-        ))
+        apart = np.column_stack(
+            (
+                other.states[:, 9:12] - best.states[:, 9:12],
+                _compute_yaw(other.states) - _compute_yaw(best.states),
+                other.states[:, state.U + 6] - best.states[:, state.U + 6],
+            )
+        )
         apart[:, 3] = (apart[:, 3] + np.pi) % (2.0 * np.pi) - np.pi
         best.variances[:] += weight * (other.variances + apart**2)
         for column, lag in enumerate(lags):
@@ -228,7 +229,9 @@ def _find_start_ns(m: Measurements, output_ns: Ints) -> int:
     return min(*moving, int(output_ns[0])) if moving else int(output_ns[0])
 
 
-def _make_trajectory(m: Measurements, made: Pass, smoothed: Smoothed, std: Floats, output_ns: Ints, explained: Sequence[Hypothesis]) -> Trajectory:  # fmt: skip
+def _make_trajectory(  # noqa: PLR0917
+    m: Measurements, made: Pass, smoothed: Smoothed, std: Floats, output_ns: Ints, explained: Sequence[Hypothesis]
+) -> Trajectory:
     """Return the trajectory at the wanted stamps [ns], with what no state of the filter can know in its deviations."""
     ticks = made.ticks
     at = np.searchsorted(ticks.stamp_ns, output_ns)
@@ -386,7 +389,9 @@ def find_gate_resets(made: Pass) -> tuple[GateReset, ...]:
     return tuple(sorted(found, key=lambda each: each.start_ns))
 
 
-def _correct_measurements(m: Measurements, made: Pass, smoothed: Smoothed, explained: Sequence[Hypothesis]) -> Measurements:
+def _correct_measurements(
+    m: Measurements, made: Pass, smoothed: Smoothed, explained: Sequence[Hypothesis]
+) -> Measurements:
     """Return fixes and odometry without what the estimate found to be wrong with them, as the audit compares them with the track."""
     changes = [c for each in explained for c in each.changes if c.kind == "useless"]
     rows, found = made.ticks.rows, {}
@@ -403,7 +408,9 @@ def _correct_measurements(m: Measurements, made: Pass, smoothed: Smoothed, expla
             off = np.einsum("nij,nj->ni", rotation, moved) - late + x[:, state.FIX_OFFSET : state.FIX_OFFSET + 3]
             corrected = replace(source, position_enu_m=source.position_enu_m - off)
         else:
-            places = (state.WHEEL_SCALE, state.WHEEL_LAG) if kind == state.WHEELS else (state.VISUAL_SCALE, state.VISUAL_LAG)
+            places = (
+                (state.WHEEL_SCALE, state.WHEEL_LAG) if kind == state.WHEELS else (state.VISUAL_SCALE, state.VISUAL_LAG)
+            )
             scale = 1.0 + x[:, places[0]] + x[:, state.SHARED_SCALE]
             stamp_ns = source.stamp_ns - round(float(np.median(x[:, places[1]])) * 1e9)
             corrected = replace(source, stamp_ns=stamp_ns, velocity_mps=source.velocity_mps / scale[:, None])
@@ -431,7 +438,9 @@ def _list_changes(made: Pass, explained: Sequence[Hypothesis]) -> Iterator[Chang
         yield ChangeFacts(change.kind, role, start_ns, end_ns, size)
 
 
-def _make_facts(m: Measurements, made: Pass, smoothed: Smoothed, std: Floats, scale_std: float, explained: Sequence[Hypothesis]) -> StretchFacts:  # fmt: skip
+def _make_facts(  # noqa: PLR0917
+    m: Measurements, made: Pass, smoothed: Smoothed, std: Floats, scale_std: float, explained: Sequence[Hypothesis]
+) -> StretchFacts:
     rows = _list_rows(m, made)
     tests = made.tests
     nis = {}

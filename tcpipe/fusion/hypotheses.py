@@ -27,7 +27,13 @@ if TYPE_CHECKING:
 
 Floats = NDArray[np.float64]
 
-POSSIBLE = (*range(state.ARM, state.FIX_OFFSET + 3), state.WHEEL_SCALE, state.VISUAL_SCALE, state.WHEEL_LAG, state.VISUAL_LAG)
+POSSIBLE = (
+    *range(state.ARM, state.FIX_OFFSET + 3),
+    state.WHEEL_SCALE,
+    state.VISUAL_SCALE,
+    state.WHEEL_LAG,
+    state.VISUAL_LAG,
+)
 """Errors that changes change, beside those that always vary."""
 _FEWEST = 5  # rejections in a row
 _LASTS_S = {state.FIX: 1.0, state.WHEELS: 10.0, state.VISUAL: 10.0}  # wheels slip for seconds
@@ -68,7 +74,9 @@ class Change:
         for place, count, std in self.blocks:
             yield Event(self.first, place, count, std)
             if self.last is not None:
-                yield Event(self.last, place, count, 0.0 if place == state.FIX_OFFSET else std, is_new=place == state.FIX_OFFSET)
+                yield Event(
+                    self.last, place, count, 0.0 if place == state.FIX_OFFSET else std, is_new=place == state.FIX_OFFSET
+                )
 
 
 _BLOCKS: dict[tuple[str, int], tuple[tuple[int, int, float], ...]] = {
@@ -82,7 +90,15 @@ _BLOCKS: dict[tuple[str, int], tuple[tuple[int, int, float], ...]] = {
     ("scale", state.VISUAL): ((state.VISUAL_SCALE, 1, 0.3),),
     ("pose", state.FIX): ((state.RHO, 3, 2.0), (state.THETA, 3, 0.1), (state.U, 3, 0.5)),
 }
-_COSTS = {"offset": 12.0, "antenna": 14.0, "clock": 14.0, "gyroscope": 16.0, "scale": 10.0, "pose": 20.0, "useless": 12.0}
+_COSTS = {
+    "offset": 12.0,
+    "antenna": 14.0,
+    "clock": 14.0,
+    "gyroscope": 16.0,
+    "scale": 10.0,
+    "pose": 20.0,
+    "useless": 12.0,
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,7 +125,9 @@ class Hypothesis:
     @property
     def ignored(self) -> tuple[tuple[int, int, int], ...]:
         """Measurements that are not used: (kind, first tick, last tick)."""
-        return tuple((c.role, c.first, 1 << 60 if c.last is None else c.last) for c in self.changes if c.kind == "useless")
+        return tuple(
+            (c.role, c.first, 1 << 60 if c.last is None else c.last) for c in self.changes if c.kind == "useless"
+        )
 
 
 def find_suspects(tests: Tests, period_s: float) -> list[Suspect]:

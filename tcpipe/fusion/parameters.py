@@ -102,9 +102,8 @@ def make_priors(m: Measurements, noise: NoiseModel, ticks: Ticks) -> tuple[Float
     if turn_scale_std(m):
         std[state.TURN_SCALE] = turn_scale_std(m)
         walk[state.TURN_SCALE] = np.sqrt(2.0 / 60.0) * turn_scale_std(m)
-    if (
-        m.gnss is not None and has_tilt
-    ):  # where roll and pitch are not known, an antenna that sways looks like one elsewhere
+    # Where roll and pitch are not known, an antenna that sways looks like one elsewhere.
+    if m.gnss is not None and has_tilt:
         std[state.ARM : state.ARM + 3] = m.gnss.lever_arm_std_m
     if has_fixes:
         std[state.FIX_ERROR : state.FIX_ERROR + 3] = np.sqrt(ticks.fix_variance_m2[0])

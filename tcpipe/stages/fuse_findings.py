@@ -23,6 +23,7 @@ from tcpipe.stages.fuse_inputs import (
 from tcpipe.stages.fuse_sections import Fused
 from tcpipe.tables.facts import (
     AuditFacts,
+    ChangeFacts,
     Disagreement,
     FuseFacts,
     GateReset,

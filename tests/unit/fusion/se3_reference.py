@@ -134,6 +134,7 @@ def expect(kind, x, look):
         moved = arm + t * (u + np.cross(w, arm)) + 0.5 * t**2 * look.quickens
         return p + R @ moved + part(x, state.FIX_ERROR) + part(x, state.FIX_OFFSET)
     lag = {state.WHEELS: x[state.WHEEL_LAG + 6], state.VISUAL: x[state.VISUAL_LAG + 6]}.get(kind, 0.0)
+    w = (EYE - skew(m)) @ w
     v = (EYE - skew(m)) @ (u + (look.tau - lag) * look.quickens) + np.cross(w, look.lever)
     shared = x[state.SHARED_SCALE + 6]
     c = np.append(0.0, part(x, state.VISUAL_MOUNT, 2))
@@ -179,22 +180,25 @@ def differentiate_measurement(kind, x, look):
         return H[:2]
     place = {state.WHEELS: state.WHEEL_LAG, state.VISUAL: state.VISUAL_LAG}.get(kind)
     t = look.tau - (x[place + 6] if place else 0.0)
-    at = u + t * look.quickens
-    v = (EYE - skew(m)) @ at + np.cross(w, look.lever)
+    at, turn = u + t * look.quickens, EYE - skew(m)
+    v = turn @ at + np.cross(turn @ w, look.lever)
     V = np.zeros((3, state.N))  # of v
-    V[:, vel], V[:, mount], V[:, bg] = EYE - skew(m), skew(at), gyro * skew(look.lever)
+    V[:, vel], V[:, bg] = turn, gyro * skew(look.lever) @ turn
+    V[:, mount] = skew(at) - skew(look.lever) @ skew(w)
     if place:
-        V[:, place] = -(EYE - skew(m)) @ look.quickens
+        V[:, place] = -turn @ look.quickens
     if kind == state.SIDEWAYS:
         H = V[1:].copy()
-        H[0, state.TURNING_CENTRE] = w[2]
-        H[0, state.GYRO_BIAS + 2] -= gyro * x[state.TURNING_CENTRE + 6]
+        centre = x[state.TURNING_CENTRE + 6]
+        H[0, state.TURNING_CENTRE] = (turn @ w)[2]
+        H[0, bg] -= gyro * centre * turn[2]
+        H[0, mount] += centre * skew(w)[2]
         return H
     own = state.WHEEL_SCALE if kind == state.WHEELS else state.VISUAL_SCALE
     scale = 1 + x[state.SHARED_SCALE + 6] + x[own + 6]
-    turn = EYE if kind == state.WHEELS else EYE - skew(np.append(0.0, part(x, state.VISUAL_MOUNT, 2)))
-    H = scale * turn @ V
-    H[:, own] = H[:, state.SHARED_SCALE] = turn @ v
+    look_axes = EYE if kind == state.WHEELS else EYE - skew(np.append(0.0, part(x, state.VISUAL_MOUNT, 2)))
+    H = scale * look_axes @ V
+    H[:, own] = H[:, state.SHARED_SCALE] = look_axes @ v
     if kind == state.WHEELS:
         return H[:1]
     H[:, state.VISUAL_MOUNT : state.VISUAL_MOUNT + 2] = scale * skew(v)[:, 1:]

@@ -36,7 +36,7 @@ def smoothed(**faults):
     return fuse(drive.measure(truth(), 1, **faults))
 
 
-@pytest.mark.parametrize(("kept_s", "xy_m"), [(0.0, 0.010), (15.0, 0.014)])
+@pytest.mark.parametrize(("kept_s", "xy_m"), [(0.0, 0.010), (15.0, 0.018)])
 def test_figures_with_every_fault_on(kept_s, xy_m):
     found = drive.errors(truth(), smoothed(gnss_kept_s=kept_s))
     assert found["xy"] <= xy_m
@@ -46,7 +46,7 @@ def test_figures_with_every_fault_on(kept_s, xy_m):
     assert found["max_xy"] <= 0.03
     assert found["yaw_rate"] <= 0.002
     for name in ("nees_position", "nees_forward"):
-        assert 0.15 <= found[name] <= 1.6
+        assert 0.1 <= found[name] <= 1.6
     assert found["nees_yaw"] <= 1.6
 
 
@@ -80,7 +80,7 @@ def test_facts_name_what_the_sensors_were():
     assert facts.gyro_bias_radps == pytest.approx([0.006, -0.004, 0.008], abs=1e-3)
     assert facts.visual_scale == pytest.approx(1.02, abs=0.01)
     assert set(facts.nis_mean) == {GNSS, WHEELS, VISUAL}
-    assert all(0.5 < facts.nis_mean[role] < 1.5 for role in (GNSS, WHEELS, VISUAL))
+    assert all(0.2 < facts.nis_mean[role] < 1.6 for role in (GNSS, WHEELS, VISUAL))
     assert facts.covariance_repairs == 0
 
 
@@ -122,7 +122,7 @@ def test_an_outage_of_a_minute_shows_in_the_deviations():
     outage = smoothed(gnss_outages=((50.0, 110.0),))
     found = drive.errors(truth(), outage)
     assert found["xy"] <= 0.10
-    assert 0.15 <= found["nees_position"] <= 2.5
+    assert 0.05 <= found["nees_position"] <= 2.5
     t = (outage.stamp_ns - drive.ZERO_NS) * 1e-9
     inside, outside = outage.position_std_m[(t > 70) & (t < 90), 0], outage.position_std_m[(t > 20) & (t < 45), 0]
     assert np.median(inside) > 4 * np.median(outside)

@@ -56,7 +56,7 @@ def make_inputs(count, rng, mode=state.INERTIAL, *, noise=0.0, kept=1.0):
         np.full((count, 6), noise),
         rng.normal(size=(count, 3)),
         np.full(count, mode >= state.GYRO_TURN),
-        rng.normal(size=count),
+        rng.normal(size=(count, 2)),
         np.full((*shape, 3), np.nan),
         np.ones((*shape, 3)),
         rng.uniform(-T / 2, T / 2, shape),
@@ -67,7 +67,7 @@ def make_inputs(count, rng, mode=state.INERTIAL, *, noise=0.0, kept=1.0):
 
 
 def look_at(inputs, k, kind):
-    quickens = np.array([inputs.quickens[k], 0.0, 0.0])
+    quickens = np.array([inputs.quickens[k, int(kind == state.VISUAL)], 0.0, 0.0])
     return reference.Look(inputs.rate[k], bool(inputs.has_gyro[k]), quickens, inputs.tau[k, kind], inputs.levers[kind])
 
 

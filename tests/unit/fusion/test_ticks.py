@@ -51,7 +51,8 @@ def test_a_tick_is_a_whole_part_of_the_tracks_period(period_ns, tick_ns):
 def test_each_tick_holds_the_mean_of_what_a_sensor_measures_around_it():
     m = drive.measure(drive.make_drive(20.0), 2)
     found = ticks_of(m, int(m.gnss.stamp_ns[0]), int(m.gnss.stamp_ns[-1]))
-    claimed = m.gnss.variance_m2[0] * [0.7, 0.7, 0.7]  # the white share of the prior
+    noise = estimate_noise(m)
+    white = np.array([fix.white_m2 / fix.claimed_m2 for fix in (noise.horizontal, noise.horizontal, noise.vertical)])
     for kind, stamp_ns, values in (
         (state.WHEELS, m.wheels.stamp_ns, m.wheels.velocity_mps[:, :1]),
         (state.VISUAL, m.visual.stamp_ns, m.visual.velocity_mps),
@@ -66,7 +67,7 @@ def test_each_tick_holds_the_mean_of_what_a_sensor_measures_around_it():
             assert found.inputs.tau[k, kind] == pytest.approx(late_s, abs=1e-12)
             assert (found.rows[kind][near] == k).all()
             if kind == state.FIX:
-                assert found.inputs.variance[k, kind] == pytest.approx(claimed / near.sum(), rel=0.35)
+                assert found.inputs.variance[k, kind] == pytest.approx(m.gnss.variance_m2[0] * white / near.sum())
         assert set(told) == set(found.rows[kind][found.rows[kind] >= 0])
     assert np.isnan(found.inputs.value[:, [state.LEVEL, state.DOPPLER, state.STATIONARY]]).all()
 
