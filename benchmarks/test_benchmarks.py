@@ -48,6 +48,9 @@ SMALLEST = {
     "build_dataset": Smallest("{out} 300", rf"floors: .*: {NUMBER} x"),
     "campaign": Smallest("--out {out} --cells ^GNSS,.wheels.10.Hz:.clean --quick", r"w \d.* E \d"),
     "cost_map": Smallest("4 16", rf"{NUMBER} x the bare forward pass", package="torch"),
+    "densities": Smallest(
+        "--seeds 701 --length 60 --only 'white 1.5 cm, no camera'", rf"white 1.5 cm +no camera +{NUMBER}"
+    ),
     "error_budget": Smallest("", rf"averaged, 20 Hz \| {NUMBER} %"),
     "faults": Smallest("kills --only 'a file over another' --times 1", r"together +[1-9]"),
     "few_samples": Smallest(
@@ -76,6 +79,7 @@ SMALLEST = {
     "table_model": Smallest("200", rf"{NUMBER} s for trees[\s\S]*\d predictions/s"),
     "tables": Smallest("0.01", rf"CPU: {NUMBER} times"),
     "train_step": Smallest("{dataset} 16", rf"throughput {NUMBER} x", package="torch"),
+    "withheld": Smallest("--log {log}", rf"gnss 10 s +1 +\d+ +{NUMBER} +{NUMBER}"),
     "yield_of_logs": Smallest("{log}", rf"mcap( +{NUMBER}){{7}}\n"),
 }
 """By the name of the program."""

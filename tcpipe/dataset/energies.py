@@ -35,6 +35,11 @@ ENERGIES: Mapping[str, Energy] = {
 }
 
 
+def name_common_std(column: str) -> str:
+    """Return the name of the part of a standard deviation that is one error of all labels of a run, by that of the whole."""
+    return column.replace("_std_", "_common_std_")
+
+
 def find_energy(name: str) -> Energy:
     """Return an energy by its name; `DatasetError` lists those there are."""
     if name not in ENERGIES:

@@ -10,7 +10,14 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from tcpipe.cost.labels import Labels, combine_flags, compute_labels, has_mean_mismatch, subtract_idle_power
+from tcpipe.cost.labels import (
+    Labels,
+    SensorError,
+    combine_flags,
+    compute_labels,
+    has_mean_mismatch,
+    subtract_idle_power,
+)
 from tcpipe.cost.physics import ALL, FitSamples, fit_and_validate_physics, fit_physics
 from tcpipe.fusion.trajectory import DISPLACEMENT_LAGS_S
 from tcpipe.geometry.piecewise_linear import interpolate, mean_between
@@ -35,6 +42,14 @@ from tcpipe.stages.label_motion import (
     make_label_facts,
     make_motion_columns,
     sum_energy_entries,
+)
+from tcpipe.stages.label_uncertainty import (
+    audit_power_sensor,
+    compute_common_displacement_std_m,
+    count_confirming_sensors,
+    find_sensor_findings,
+    find_stationary_ns,
+    make_sensor_error,
 )
 from tcpipe.stages.message_arrays import make_rails
 from tcpipe.tables.arrays import make_lines, select_rows, to_numbers
@@ -71,12 +86,17 @@ def label_segments(
     epochs: list[int] = np.unique(to_integers(masked.table, "clock_epoch")).tolist()
     rails_by_epoch = {epoch: make_rails(streams, epoch) for epoch in epochs}
     standing = find_idle_power(masked.table, rails_by_epoch, rate_hz=masked.info.rate_hz)
+    power = audit_power_sensor(masked.table, rails_by_epoch, masked.info, config)
     for epoch, rails in rails_by_epoch.items():
         rows, cut = (select_rows(table, "clock_epoch", epoch) for table in (masked.table, segments.table))
         joules.update(sum_energy_entries(rows, rails, rate_hz=masked.info.rate_hz, rule=rule))
         if not cut.num_rows:
             continue
-        cost, net, causes = compute_segment_costs(cut, rows, rails, masked.info, rule=rule, standing=standing)
+        sensor = make_sensor_error(cut, rails, power, rule=rule)
+        power = replace(power, lost_signs=power.lost_signs + int(np.count_nonzero(sensor.sign_joule)))
+        cost, net, causes = compute_segment_costs(
+            cut, rows, rails, masked.info, rule=rule, standing=standing, sensor=sensor
+        )
         variance_j2.append(causes)
         spans = to_integers(cut, "start_ns"), to_integers(cut, "end_ns")
         count, mean_watt = count_samples_inside(rails, *spans)
@@ -101,6 +121,7 @@ def label_segments(
                 voltage_volt=mean_between(to_integers(rows, "stamp_ns"), to_floats(rows, "voltage_volt"), *spans),
                 physics_power_watt=np.full(cut.num_rows, np.nan),
                 power_samples=count,
+                confirming_sensor_count=count_confirming_sensors(cut, streams, masked.info.report.facts),
                 quality=combine_flags(flags, cut.num_rows),
                 geometry=make_lines(*(read_lonlat_deg(cut, end) for end in ("start", "end"))),
             )
@@ -110,7 +131,10 @@ def label_segments(
     facts = make_label_facts(
         table, rails_by_epoch, joules, distance_by_reason_m, variance_j2, rule=rule, velocity=velocity, physics=physics
     )
-    info = add_findings(segments.info, find_label_findings(facts), replace(segments.info.report.facts, label=facts))
+    facts = replace(facts, power_sensor=None if facts.energy_joule is None else power)
+    start_ns = int(masked.table["stamp_ns"][0].as_py()) if masked.table.num_rows else 0
+    findings = (*find_label_findings(facts), *find_sensor_findings(facts, masked.info, start_ns))
+    info = add_findings(segments.info, findings, replace(segments.info.report.facts, label=facts))
     return LabelledSegments(table, info, segments.distance_by_reason_m)
 
 
@@ -119,14 +143,21 @@ _BETTER_HZ = 20.0
 
 
 def compute_segment_costs(
-    cut: pa.Table, rows: pa.Table, rails: list[Rail], info: TrackInfo, *, rule: Rule, standing: IdlePower
+    cut: pa.Table,
+    rows: pa.Table,
+    rails: list[Rail],
+    info: TrackInfo,
+    *,
+    rule: Rule,
+    standing: IdlePower,
+    sensor: SensorError,
 ) -> tuple[Labels, dict[str, NDArray[np.float64]], dict[str, NDArray[np.float64]]]:
     """Return the labels of one epoch's segments, the net labels, and the variances of their energies by cause [J²].
 
     ``cut`` and ``rows`` are the epoch's segments and rows of the masked track.
     """
     start_ns, end_ns, stamp_ns = to_integers(cut, "start_ns"), to_integers(cut, "end_ns"), to_integers(rows, "stamp_ns")
-    spans = start_ns, end_ns, _find_stationary_ns(rows, info.rate_hz)
+    spans = start_ns, end_ns, find_stationary_ns(rows, info.rate_hz)
     noise = estimate_energy_noise(rails, *spans)
     better = estimate_energy_noise(rails, *spans, rate_hz=_BETTER_HZ)
     ground_mps = np.hypot(to_floats(rows, "east_velocity_mps"), to_floats(rows, "north_velocity_mps"))
@@ -139,6 +170,8 @@ def compute_segment_costs(
         end_power_watt=end_watt,
         displacement_std_m=_compute_displacement_std_m(cut, rows, smoothed=info.estimator == "smoother"),
         energy_noise_joule=noise_joule,
+        common_displacement_std_m=compute_common_displacement_std_m(cut, info.report.facts),
+        sensor=sensor,
     )
     net = subtract_idle_power(
         cost,
@@ -146,9 +179,11 @@ def compute_segment_costs(
         idle_std_watt=standing.std_watt,
         end_power_watt=end_watt,
         energy_noise_joule=noise_joule,
+        sensor=sensor,
     )
-    position = (end_watt * cost.duration_std_s) ** 2
+    position = end_watt**2 * (cost.duration_std_s**2 - cost.duration_common_std_s**2)
     causes = {"position": position, "rate": noise.rate, "current": noise.current, "voltage": noise.voltage}
+    causes["common"] = cost.energy_common_std_joule**2
     return cost, net, {**causes, "at_20_hz": position + np.minimum(better.std_joule(), noise_joule) ** 2}
 
 
@@ -174,14 +209,6 @@ def _compute_displacement_std_m(cut: pa.Table, rows: pa.Table, *, smoothed: bool
         smoothed=smoothed,
     )
     return np.where(np.isnan(told), modelled, told)
-
-
-def _find_stationary_ns(rows: pa.Table, rate_hz: float) -> NDArray[np.int64]:
-    """Return begin and end [ns] of every span in which the robot is stationary, shape (S, 2)."""
-    stamp_ns = to_integers(rows, "stamp_ns")
-    piece = number_pieces(stamp_ns, to_integers(rows, "clock_epoch"), period_ns=1e9 / rate_hz)
-    standing = (to_numbers(rows["dropped_by"]) & np.uint32(DropReason.STATIONARY)) != 0
-    return stamp_ns[find_runs(standing, piece)]
 
 
 _EDGE_S = 0.3

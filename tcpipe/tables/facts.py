@@ -80,12 +80,16 @@ class ClockStep:
 class PowerSign:
     """Sign of a drawn current and its source; whether the power source averages over its message period.
 
-    ``includes``: known loads besides the drives (computers, payload).
+    ``includes``: known loads besides the drives (computers, payload). ``gain_std_fraction`` and ``offset_std_amp`` are the σ of gain and
+    zero of a sensor of this kind, ``rest_current_amp`` the currents that a rail of it can have at rest, None where nothing is known.
     """
 
     current_sign: str
     averaged: bool
     includes: tuple[str, ...] = field(default=(), metadata=LEFT_OUT)
+    gain_std_fraction: float | None = field(default=None, metadata=LEFT_OUT)
+    offset_std_amp: float | None = field(default=None, metadata=LEFT_OUT)
+    rest_current_amp: tuple[float, float] | None = field(default=None, metadata=LEFT_OUT)
 
 
 @dataclass(frozen=True, slots=True)
@@ -314,6 +318,8 @@ class EnergyBudget:
     voltage: float
     at_20_hz: float
     """The total with power at 20 Hz."""
+    common: float | None = field(default=None, metadata=LEFT_OUT)
+    """The error that all segments of a run share, which is not part of the total; None in documents of earlier versions."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -377,6 +383,22 @@ class PhysicsFacts:
 
 
 @dataclass(frozen=True, slots=True)
+class PowerSensorFacts:
+    """What is not known of the power sensor: σ of its gain and of the zero of a rail [A], and what the log shows (`tcpipe.power.audit`).
+
+    ``rest_amp``: lowest and highest current of a rail in halts; the gain changed by ``gain_ratio`` at ``gain_changed_ns``;
+    ``lost_signs``: segments whose current flows back without a sign.
+    """
+
+    gain_std_fraction: float
+    offset_std_amp: float
+    rest_amp: tuple[float, float] | None = field(default=None, metadata=LEFT_OUT)
+    gain_ratio: float | None = field(default=None, metadata=LEFT_OUT)
+    gain_changed_ns: int | None = field(default=None, metadata=LEFT_OUT)
+    lost_signs: int = 0
+
+
+@dataclass(frozen=True, slots=True)
 class LabelFacts:
     """The run's energy by entry of the distance breakdown, its power rails by clock epoch, and uncertainty and flags of its labels."""
 
@@ -393,6 +415,7 @@ class LabelFacts:
     energy_budget: EnergyBudget | None
     quality: Mapping[str, int]
     physics: PhysicsFacts
+    power_sensor: PowerSensorFacts | None = field(default=None, metadata=LEFT_OUT)
 
 
 @dataclass(frozen=True, slots=True)
