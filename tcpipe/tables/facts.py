@@ -103,6 +103,29 @@ class GateReset:
 
 
 @dataclass(frozen=True, slots=True)
+class ChangeFacts:
+    """A change that explains a contradiction: its kind (offset, antenna, clock, gyroscope, scale, pose, useless), sensor and span.
+
+    ``size``: largest innovation of fixes there [m]; 0 of another sensor.
+    """
+
+    kind: str
+    role: str
+    start_ns: int
+    end_ns: int
+    size: float
+
+
+@dataclass(frozen=True, slots=True)
+class ParameterFacts:
+    """What a section showed of a parameter: its difference from what was known beforehand, with σ, and σ beforehand."""
+
+    value: tuple[float, ...]
+    std: tuple[float, ...]
+    prior_std: tuple[float, ...]
+
+
+@dataclass(frozen=True, slots=True)
 class StretchFacts:
     """One section that was fused in one pass: counts and estimates of the filter, then its span and initial state.
 
@@ -129,6 +152,8 @@ class StretchFacts:
     visual_scale_std: float | None = field(default=None, metadata=LEFT_OUT)
     common_scale_std: float | None = field(default=None, metadata=LEFT_OUT)
     """σ of the unobservable common odometry scale, included in σ of distances, speeds and labels."""
+    changes: tuple[ChangeFacts, ...] = field(default=(), metadata=LEFT_OUT)
+    parameters: Mapping[str, ParameterFacts] = field(default_factory=dict, metadata=LEFT_OUT)
     clock_epoch: int = 0
     start_ns: int = 0
     end_ns: int = 0
