@@ -133,11 +133,14 @@ def drop_repeated_fixes(gnss: Positions, odometry: BodyVelocities | None) -> tup
     last = np.append(first[1:], stamp_ns.size) - 1
     lasting = stamp_ns[last] - stamp_ns[first] >= _FROZEN_NS
     if odometry is None:
-        return _select_fixes(gnss, changes | np.repeat(lasting, last - first + 1)), ()
+        kept = changes | np.repeat(lasting, last - first + 1)
+        return (gnss if kept.all() else _select_fixes(gnss, kept)), ()
     zero = int(stamp_ns[0])
     speed = np.nan_to_num(np.abs(odometry.velocity_mps[:, :1]))
     driven_m = integrate_signal(compute_seconds(odometry.stamp_ns, zero), speed, compute_seconds(stamp_ns, zero))[:, 0]
-    frozen = np.flatnonzero(lasting & (driven_m[last] - driven_m[first] > _DRIVES_MPS * (stamp_ns[last] - stamp_ns[first]) * 1e-9))
+    frozen = np.flatnonzero(
+        lasting & (driven_m[last] - driven_m[first] > _DRIVES_MPS * (stamp_ns[last] - stamp_ns[first]) * 1e-9)
+    )
     found = (Repeats(int(stamp_ns[first[i]]), int(stamp_ns[last[i]]), int(last[i] - first[i])) for i in frozen)
     return _select_fixes(gnss, changes), tuple(found)
 

@@ -89,7 +89,13 @@ def _find_offset(found: ClockOffsets, role: str, offset: RoleOffset, streams: St
         by_log = streams.sensors[role].time_source == "log"
         remedies = () if by_log else suggest("use_log_time", {"read.time_source": {name: "log"}})
         return make_finding(
-            "clock-drift", subject, action=action, names=names, remedies=remedies, drift_s=drift_s, drift_2std_s=drift_2std_s
+            "clock-drift",
+            subject,
+            action=action,
+            names=names,
+            remedies=remedies,
+            drift_s=drift_s,
+            drift_2std_s=drift_2std_s,
         )
     given_s = streams.report.facts.time_offset_s.get(name, 0.0)
     correction_s = round(given_s - offset_s, 3 if offset.std_s < _FINE_S else 2)

@@ -106,7 +106,9 @@ def _find_frozen(repeats: preparation.Repeats, streams: Streams) -> Finding:
 
 def _find_first_ns(streams: Streams) -> int:
     """Return the first stamp of any sensor [ns]."""
-    return min(int(to_integers(table.slice(0, 1), "stamp_ns")[0]) for table in streams.tables.values() if table.num_rows)
+    return min(
+        int(to_integers(table.slice(0, 1), "stamp_ns")[0]) for table in streams.tables.values() if table.num_rows
+    )
 
 
 def _prepare(role: str, table: pa.Table, sensor: Sensor, config: FuseConfig, inputs: FusionInputs) -> Any:

@@ -5,9 +5,8 @@ what speed and acceleration cost. A pair is compared only where the robot turns 
 compare but what the controller corrects, and that leads the body. Each gives a lag with its standard deviation (`lags`), over the whole run
 and in windows of ten minutes, through which a line tells the drift; the pairs together give each sensor's offset from the clock that most
 of them share. A sensor is blamed only where two others agree against it and no pair contradicts; else two differ, and nobody knows which
-is off. Offsets are taken out of the stamps before fusion; the estimator's lags carry what is left. A lag of which the halves of a short run
-differ is a step of a clock, which the estimator finds. The course of the fixes is not held against the gyroscope: an antenna that sits
-ahead of the turning point by l leads the body's course by l / v, 0.1 s for 10 cm.
+is off. Offsets are taken out of the stamps before fusion; the estimator's lags carry what is left. The course of the fixes is not held
+against the gyroscope: an antenna that sits ahead of the turning point by l leads the body's course by l / v, 0.1 s for 10 cm.
 
 Stamps of fixes may jitter: receivers and localisation nodes that stamp a fix when they send it, some tenths of a second after they
 measured it, make positions that stand still and then leap, whatever variance they claim. Over each pair of successive fixes the distance
@@ -288,33 +287,40 @@ def _select_power(power: PowerSignal | None, first_ns: int, last_ns: int) -> Pow
 
 
 def _pair(names: tuple[str, str, str], windows: list[tuple[float, Floats]], span_s: float) -> Pair | None:
-    """Return a pair of the whole run; where it drifts for sure, as it is in the middle of the run."""
+    """Return a pair of the whole run; where it drifts for sure, as it is in the middle of the run.
+
+    None where the lag is unknown, or parts of the run have others than a drift would make: a clock that steps, which the estimator finds.
+    """
     lags = [(at_s, estimate_lag([products])) for at_s, products in windows] if len(windows) > 1 else []
     known = [
         (at_s, lag) for at_s, lag in lags if lag and _is_determined(names[0], lag.offset_s, lag.std_s, lag.explained)
     ]
     told = tuple((at_s, lag.offset_s, lag.std_s) for at_s, lag in known)
-    whole = estimate_lag([products for _, products in windows])
-    if len(windows) == 1 and _is_unsteady(windows[0][1]):
-        return None
+    whole, drift, middle_s, rate = estimate_lag([products for _, products in windows]), (math.nan, math.nan), 0.0, 0.0
     if len(told) >= _FEWEST_WINDOWS:
         (middle_s, rate), (middle_std_s, rate_std) = _fit_offset_line(np.array(told), span_s)
         drift = (3600.0 * rate, 3600.0 * rate_std)
-        if whole is None or abs(rate) > _SURE * rate_std:
-            explained = float(np.median([lag.explained for _, lag in known]))
-            return Pair(*names, middle_s, middle_std_s, explained, *drift, told)
-        return Pair(*names, whole.offset_s, whole.std_s, whole.explained, *drift, told)
-    return None if whole is None else Pair(*names, whole.offset_s, whole.std_s, whole.explained, windows=told)
+        if any(_is_surely_other(of - middle_s - rate * (at_s - span_s / 2), std) for at_s, of, std in told):
+            return None
+    if any(_steps_inside(products, rate) for _, products in windows):
+        return None
+    if len(told) >= _FEWEST_WINDOWS and (whole is None or abs(rate) > _SURE * rate_std):
+        explained = float(np.median([lag.explained for _, lag in known]))
+        return Pair(*names, middle_s, middle_std_s, explained, *drift, told)
+    return None if whole is None else Pair(*names, whole.offset_s, whole.std_s, whole.explained, *drift, told)
 
 
-def _is_unsteady(products: Floats) -> bool:
-    """Return whether the lag of a window's first half is surely not that of its second: a step, which the estimate finds."""
-    half = products.shape[1] // 2
-    first, last = estimate_lag([products[:, :half]]), estimate_lag([products[:, half:]])
+def _steps_inside(products: Floats, rate: float) -> bool:
+    """Return whether the lags of both halves of a window differ by more than a drift [s/s] makes."""
+    first, last = (estimate_lag([half]) for half in np.array_split(products, 2, axis=1))
     if first is None or last is None:
         return False
-    apart_s = abs(last.offset_s - first.offset_s)
-    return apart_s > max(_NOTED_MOTION_S, _SURE * math.hypot(first.std_s, last.std_s))
+    drifted_s = rate * _WINDOW_NS * 0.5e-9
+    return _is_surely_other(last.offset_s - first.offset_s - drifted_s, math.hypot(first.std_s, last.std_s))
+
+
+def _is_surely_other(apart_s: float, std_s: float) -> bool:
+    return abs(apart_s) > max(_NOTED_MOTION_S, _SURE * std_s)
 
 
 def _fit_offset_line(told: Floats, span_s: float) -> tuple[tuple[float, float], tuple[float, float]]:
