@@ -57,7 +57,7 @@ def correct_clocks(streams: Streams, inputs: FusionInputs) -> tuple[FusionInputs
 
 def _align(m: Measurements, off: Mapping[str, RoleOffset], first_ns: int, span_s: float) -> Measurements:
     names = {GNSS: "gnss", DOPPLER: "doppler", IMU: "imu", WHEELS: "wheels", VISUAL: "visual"}
-    shifted = {
+    shifted: dict[str, Any] = {
         names[role]: replace(sensor, stamp_ns=shift_stamps(sensor.stamp_ns, off[role], first_ns, span_s))
         for role, sensor in m.sensors().items()
         if role in off
