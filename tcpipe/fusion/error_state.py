@@ -18,18 +18,13 @@ from tcpipe.errors import FusionError
 from tcpipe.fusion import state
 from tcpipe.fusion.densities import NoiseModel, estimate_noise
 from tcpipe.fusion.filter_kernel import (
-    EVERY,
     REJECTED,
     RESET,
-    SELDOM,
-    Adjoint,
     Memory,
     Model,
-    Smoothed,
     Tests,
     allocate_steps,
     filter_ticks,
-    smooth_ticks,
 )
 from tcpipe.fusion.hypotheses import POSSIBLE, Hypothesis, compute_weights, explain, find_suspects
 from tcpipe.fusion.initial import compute_course, find_stationary_intervals
@@ -45,6 +40,7 @@ from tcpipe.fusion.process import (
     is_gliding,
     is_turned_by_course,
 )
+from tcpipe.fusion.smoother_kernel import EVERY, SELDOM, Adjoint, Smoothed, smooth_ticks
 from tcpipe.fusion.ticks import Ticks, build_ticks
 from tcpipe.fusion.trajectory import DISPLACEMENT_LAGS_S, Rejections, Trajectory
 from tcpipe.geometry.rotation import matrix_from_quat, quat_from_matrix, quat_from_rpy

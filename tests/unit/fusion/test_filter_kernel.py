@@ -9,7 +9,8 @@ from unit.fusion import se3_reference as reference
 
 from tcpipe.fusion import error_state, state
 from tcpipe.fusion.error_state import filter_section, make_tests, smooth_section
-from tcpipe.fusion.filter_kernel import ACCEPTED, EVERY, REJECTED, RESET, Inputs, Memory, allocate_steps, filter_ticks
+from tcpipe.fusion.filter_kernel import ACCEPTED, REJECTED, RESET, Inputs, Memory, allocate_steps, filter_ticks
+from tcpipe.fusion.smoother_kernel import EVERY
 from tcpipe.fusion.measurements import Measurements
 from tcpipe.fusion.parameters import Event, make_model
 from tcpipe.fusion.ticks import Ticks
