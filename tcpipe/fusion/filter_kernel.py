@@ -121,7 +121,7 @@ class Model(NamedTuple):
 
 
 class Memory(NamedTuple):
-    """State carried from tick to tick: x (43,), P (n, n), rejections in a row and seconds since the last accepted, by kind, (8, 2)."""
+    """State carried from tick to tick: x (45,), P (n, n), rejections in a row and seconds since the last accepted, by kind, (8, 2)."""
 
     x: Vector
     P: Matrix
@@ -471,7 +471,7 @@ def filter_ticks(
     inputs, model : see there.
     memory : state before ``first``: at tick ``first - 1``, or at ``first`` where that is 0.
     keep : whether ``steps`` is filled; tick k has row ``k - first``.
-    tests, states : filled for these ticks; states are x after the measurements of each, shape (K, 43).
+    tests, states : filled for these ticks; states are x after the measurements of each, shape (K, 45).
     """
     x, P, waits = memory
     n = P.shape[0]
@@ -565,7 +565,7 @@ class Smoothed(NamedTuple):
 
     Attributes
     ----------
-    states : x, (K, 43).
+    states : x, (K, 45).
     variances : of the position east, north, up [m²], yaw [rad²] and forward velocity [m²/s²], (K, 5).
     links : variance of the horizontal displacement, along its direction, from a tick to the one each of the lags later [m²], (K, l); NaN
         where it was not computed: it is at every `EVERY` ticks.
