@@ -2,8 +2,8 @@
 
 `estimate_noise` returns a `NoiseModel`. A filter takes from it, each number in the unit that its name ends with:
 
-- ``fixes[axis].white_m2 / fixes[axis].claimed_m2``: factor on the claimed variance of every fix; the errors that remain are independent.
-- ``fixes[axis].correlated``: a Gauss-Markov error of position, to be a state; of a fix that claims ``claimed_m2``.
+- ``horizontal`` and ``vertical``: of fixes, east and north alike, and up. ``white_m2`` is independent from fix to fix; ``correlated`` is a
+  Gauss-Markov error of position, to be a state of each axis. Both are those of a fix that claims ``claimed_m2``, and in proportion to it.
 - ``odometries[role].velocity_m2ps``: the variance of the distance grows by so much a second of driving; a velocity at f Hz has the
   variance ``velocity_m2ps * f``. Zero while the robot is stationary.
 - ``odometries[role].scale``: Gauss-Markov error of the scale around its mean, [1]; ``shared_scale``: the same for all odometries at once.
@@ -141,7 +141,7 @@ PRIORS = {
     # [1]: slip by load and ground; cameras vary by 5 to 15 % on slopes. Shared: tilt and slip that no pair of odometries shows.
     "wheel_odometry scale": Prior(0.01**2, 30.0, 4.0),
     "visual_odometry scale": Prior(0.03**2, 30.0, 4.0),
-    "shared scale": Prior(0.001**2, 30.0, 1.0),
+    "shared scale": Prior(0.003**2, 30.0),
     "slide velocity": Prior(1e-4),  # m²/s: 1 cm sideways after a second
     # rad²: what the alignment leaves of heading and pitch; roll and pitch where no accelerometer measures them.
     "heading scale": Prior(0.005**2, 30.0),
@@ -164,6 +164,8 @@ PRIORS = {
 }
 """Variances and densities before the data speak; units in the comments."""
 
+_FLOOR_M, _FLOOR_SHARE = 0.002, 0.0025
+"""Of the white noise of fixes, absolute and of the claimed variance: receivers that filter repeat their errors to 0.1 mm."""
 _CENTIMETRES_M2 = 0.1**2  # fixes that claim less are RTK's
 _SUMMARY_S = np.array([1.0, 2.0, 5.0, 10.0, 20.0, 40.0])  # where one process stands for a sum
 _SUMMARY_TAU_S = np.geomspace(2.0, 100.0, 40)
@@ -176,9 +178,13 @@ _CAUTION = 0.6  # standard deviations of a fitted process that a filter's proces
 _OVERLAP = 2.0  # other lengths and axes tell the same: the number of windows is divided by this
 _FEWEST = 8  # windows
 _TOLD = 0.5  # less, and the larger of fit and prior holds
-_SHORTEST_S = 1.0  # windows that every section has enough of
+_FIT, _SHORTEST_S = (
+    4.0,
+    20.0,
+)  # windows longer by so much, but not than this, enter the fit: few, but none would tell less
 _MOST_UNCLAIMED = 0.5  # share of fixes without a claim, whose noise stays the recipe's
 _ONE_TIME = 0.6  # share of the claim that may well belong to one correlation time, 1σ
+_MOVING = 0.02  # the same of what errs only while the robot moves
 _UNLIKE = 0.25  # by this share of the total, processes in the plane differ from those of the height
 _LOOSEST = 25.0  # a prior's standard deviation grows by so much at most
 _LEAST_LEVEL = 1e-3  # of the squares, relative to the fitted sum
@@ -214,7 +220,7 @@ def fit_noise(measurements: Measurements, residuals: Sequence[Residuals]) -> Noi
         prior,
         horizontal=plane.find_fix_noise("fix", prior.horizontal) if prior.horizontal and claims else prior.horizontal,
         odometries={role: plane.find_odometry_noise(role, noise) for role, noise in prior.odometries.items()},
-        shared_scale=plane.find_process("shared scale", prior.shared_scale),
+        shared_scale=plane.find_process(prior.shared_scale, "shared scale"),
         slide_m2ps=slide_m2ps,
         slide_told=slide_told,
         stamp_s2=stamp_s2,
@@ -267,7 +273,9 @@ class _Fit:
             ]
         )
         self._variances, self._covariance = self._mean, np.diag(self._std**2)
-        cells = [cell for cell in self._cells if cell.residuals.time_s <= max(longest_s, _SHORTEST_S)]
+        cells = [
+            cell for cell in self._cells if cell.residuals.time_s <= max(longest_s, min(_FIT * longest_s, _SHORTEST_S))
+        ]
         for number in range(_ROUNDS if cells else 0):
             rows, levels = zip(
                 *(cell.find_level(self._variances, truncated=number >= _ROUNDS // 2) for cell in cells), strict=True
@@ -330,12 +338,12 @@ class _Fit:
         fitted = float(self._variances[row])
         return (fitted if told >= _TOLD else max(fitted, prior)), told
 
-    def find_process(self, name: str, prior: GaussMarkov) -> GaussMarkov:
-        """Return the Gauss-Markov process that is nearest to the sum of those called ``name``.
+    def find_process(self, prior: GaussMarkov, *names: str) -> GaussMarkov:
+        """Return the Gauss-Markov process that is nearest to the sum of those of these names.
 
         What the data do not tell, by its share or by the length of the section, is the larger of fit and prior.
         """
-        parts = self.find_parts(name)
+        parts = self.find_parts(*names)
         if not parts:
             return prior
         factors = np.zeros(len(self._names))
@@ -350,28 +358,30 @@ class _Fit:
         untold = (self._longest_s < _SUMMARY_S) | (told < _TOLD)
         return _summarize(np.where(untold, np.maximum(fitted, prior.difference_variance(_SUMMARY_S)), fitted), told)
 
-    def find_parts(self, name: str) -> list[tuple[float, int, float]]:
-        """Return correlation time [s], row and variance of each process called ``name``."""
-        rows = [row for row, each in enumerate(self._names) if each.rpartition(" ")[0] == name]
+    def find_parts(self, *names: str) -> list[tuple[float, int, float]]:
+        """Return correlation time [s], row and variance of each process of these names."""
+        rows = [row for row, each in enumerate(self._names) if each.rpartition(" ")[0] in names]
         return [(float(self._names[row].rpartition(" ")[2]), row, float(self._variances[row])) for row in rows]
 
     def find_fix_noise(self, name: str, prior: FixNoise) -> FixNoise:
         """Return the noise of fixes along an axis."""
-        correlated = self.find_process(f"{name} process", prior.correlated)
-        processes = tuple(GaussMarkov(variance, tau) for tau, _, variance in sorted(self.find_parts(f"{name} process")))
+        names = (f"{name} process", f"{name} moving")
+        correlated = self.find_process(prior.correlated, *names)
+        processes = tuple(GaussMarkov(variance, tau) for tau, _, variance in sorted(self.find_parts(*names)))
         white, told = self.find_density(f"{name} white", prior.white_m2)
+        white = max(white, _FLOOR_M**2, _FLOOR_SHARE * prior.claimed_m2)
         return FixNoise(prior.claimed_m2, white, correlated, processes or prior.processes, told)
 
     def find_odometry_noise(self, role: str, prior: OdometryNoise) -> OdometryNoise:
         """Return the noise of an odometry's velocity."""
         density, told = self.find_density(f"{role} velocity", prior.velocity_m2ps)
-        return OdometryNoise(density, self.find_process(f"{role} scale", prior.scale), told)
+        return OdometryNoise(density, self.find_process(prior.scale, f"{role} scale"), told)
 
     def find_turn_noise(self, role: str, prior: TurnNoise) -> TurnNoise:
         """Return the noise of a yaw rate."""
         density, told = self.find_density(f"{role} turn", prior.white_rad2ps)
         bias, scale = (
-            self.find_process(f"{role} {name}", getattr(prior, name.split()[-1])) for name in ("bias", "turn scale")
+            self.find_process(getattr(prior, name.split()[-1]), f"{role} {name}") for name in ("bias", "turn scale")
         )
         return TurnNoise(density, bias, scale, told)
 
@@ -403,44 +413,40 @@ def _split_cells(each: Residuals, names: Sequence[str]) -> Iterator[_Cell]:
 def _find_prior(name: str, prior: NoiseModel) -> tuple[float, float]:
     """Return mean and standard deviation of a density before the data speak."""
     kind, _, last = name.rpartition(" ")
-    if name.startswith("up ") and prior.vertical is not None:
-        mean, claimed = _find_fix_prior(last, prior.vertical), prior.vertical.claimed_m2
-        return mean, claimed if last == "white" else _ONE_TIME * claimed
-    if name.startswith("fix ") and prior.horizontal is not None and prior.vertical is not None:
-        return _find_plane_prior(last, prior.horizontal, prior.vertical)
+    if name.startswith(("fix ", "up ")) and prior.horizontal is not None and prior.vertical is not None:
+        return _find_fix_prior(name, prior.horizontal, prior.vertical)
     if last == "turn" or (last == "velocity" and kind in prior.odometries):
         density = prior.turns[kind].white_rad2ps if last == "turn" else prior.odometries[kind].velocity_m2ps
         return density, PRIORS[name].times * density
-    if kind == "sway":
-        return PRIORS[kind].variance, PRIORS[kind].variance
-    if kind in PRIORS:
-        process = _make_process(kind)
-        if kind == "heading scale":
-            process = replace(process, variance=_find_heading_variance(prior))
-        taus = SCALE_S if kind.endswith(" scale") and not kind.endswith("turn scale") else TURN_S
-        return _share_process(process, float(last), taus), PRIORS[kind].times * process.variance
-    return PRIORS[name].variance, PRIORS[name].times * PRIORS[name].variance
+    if name in PRIORS or kind == "sway":
+        known = PRIORS[name if name in PRIORS else kind]
+        return known.variance, known.times * known.variance
+    process = _make_process(kind)
+    if kind == "heading scale":
+        process = replace(process, variance=_find_heading_variance(prior))
+    taus = TURN_S if kind.endswith((" bias", " turn scale")) else SCALE_S
+    return _share_process(process, float(last), taus), PRIORS[kind].times * process.variance
 
 
-def _find_fix_prior(part: str, prior: FixNoise) -> float:
-    return prior.white_m2 if part == "white" else _share_process(prior.correlated, float(part), FIX_S)
-
-
-def _find_plane_prior(part: str, prior: FixNoise, vertical: FixNoise) -> tuple[float, float]:
-    """Return mean and standard deviation for fixes in the plane: as the heights show them, as far as they tell, by the ratio of claims.
+def _find_fix_prior(name: str, horizontal: FixNoise, vertical: FixNoise) -> tuple[float, float]:
+    """Return the same for fixes; in the plane it is what the heights show, as far as they tell, by the ratio of claims.
 
     Heights are compared with a track whose pitch hardly errs, while an odometry's scale hides slow errors of fixes in the plane.
     """
-    usual = _find_fix_prior(part, prior)
+    axis, kind, time_s = (*name.split(), "")[:3]
+    fixes = vertical if axis == "up" else horizontal
+    if kind == "white":
+        return fixes.white_m2, fixes.claimed_m2
+    if kind == "moving":
+        return 0.0, _MOVING * fixes.claimed_m2
+    usual, usual_std = _share_process(fixes.correlated, float(time_s), FIX_S), _ONE_TIME * fixes.claimed_m2
     told = vertical.correlated.told
-    if part == "white":
-        return usual, prior.claimed_m2
-    if told <= 0.0:
-        return usual, _ONE_TIME * prior.claimed_m2
-    ratio = prior.claimed_m2 / vertical.claimed_m2
-    alike = ratio * sum(each.variance for each in vertical.processes if each.time_s == float(part))
-    total = ratio * sum(each.variance for each in vertical.processes)
-    return told * alike + (1 - told) * usual, told * _UNLIKE * total + (1.01 - told) * _ONE_TIME * prior.claimed_m2
+    if axis == "up" or told <= 0.0:
+        return usual, usual_std
+    ratio = horizontal.claimed_m2 / vertical.claimed_m2
+    alike = ratio * sum(each.variance for each in vertical.processes if each.time_s == float(time_s))
+    total = max(ratio * sum(each.variance for each in vertical.processes), horizontal.correlated.variance)
+    return told * alike + (1.0 - told) * usual, told * _UNLIKE * total + (1.01 - told) * usual_std
 
 
 def _find_heading_variance(prior: NoiseModel) -> float:

@@ -36,7 +36,7 @@ POSSIBLE = (
 )
 """Errors that changes change, beside those that always vary."""
 _FEWEST = 5  # rejections in a row
-_LASTS_S = {state.FIX: 1.0, state.WHEELS: 1.0, state.VISUAL: 1.0}
+_LASTS_S = {state.FIX: 1.0, state.WHEELS: 10.0, state.VISUAL: 10.0}  # wheels slip for seconds
 _TOGETHER_S = 5.0
 _MOST_SUSPECTS = 3
 _MOST_CHANGES = 3
@@ -46,7 +46,7 @@ _SURELY = 20.0
 """Log likelihood by which a further change must explain more, beyond its cost."""
 _TEMPER = 8.0
 """Errors of measurements last: so many of them tell as much as an independent one."""
-_NEAR = 3.0 * _TEMPER
+_NEAR = 2.5 * _TEMPER
 _MOST_RIVALS = 2
 
 

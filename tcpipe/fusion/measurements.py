@@ -18,7 +18,7 @@ GNSS, IMU, WHEELS, VISUAL, DOPPLER = "gnss", "imu", "wheel_odometry", "visual_od
 """Roles, as in the rejections table."""
 
 NO_LEVER_ARM = (0.0, 0.0, 0.0)
-STATED_ARM_STD_M = (0.02, 0.02, 0.05)
+STATED_ARM_STD_M = (0.05, 0.05, 0.1)
 """Of an antenna whose place is stated: a tape measure, and the height of base_link over the ground."""
 UNSTATED_ARM_STD_M = (0.5, 0.5, 0.5)
 """Of one whose place is not: it is on the robot."""

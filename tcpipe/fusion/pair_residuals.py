@@ -51,6 +51,8 @@ TIMES_S = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 40.0, 80.0)
 """Time differences."""
 FIX_S, SCALE_S, TURN_S = (1.0, 3.0, 10.0, 30.0, 100.0), (3.0, 10.0, 30.0, 100.0), (10.0, 100.0)
 """Correlation times of processes: of fixes, of scales and directions, of yaw rates."""
+MOVING_S = (1.0, 3.0)
+"""The same of errors of fixes that are there only while the robot moves."""
 
 _NODES = 40  # of the path within a window
 _WINDOWS = 600  # of one length, at most
@@ -167,6 +169,7 @@ def _compare_fixes(section: _Section, gnss: Positions, role: str, track: Track, 
         for axis, value in values.items():
             features = _describe_fixes(gnss, axis, first, last, time_s)
             features |= window.describe(role, axis, has_others=has_others)
+            features |= window.describe_moving("up" if axis == UP else "fix")
             if axis != UP:
                 features["stamp"] = window.describe_stamps(axis)
             if sways and axis != UP:
@@ -308,6 +311,13 @@ class _Window:
         features |= {f"heading scale {tau:g}": _integrate_process(other, self.time_s, tau) for tau in SCALE_S}
         features["slide velocity"] = self._integrate_moving(self._aside if axis == ALONG else self._ahead)
         return features
+
+    def describe_moving(self, name: str) -> dict[str, Floats]:
+        """Return the factors of errors of fixes that are there only while the robot moves: receivers hold a stationary position."""
+        begin, end = (np.abs(self._speed[:, [0, -1]]) > _STILL_MPS).T.astype(np.float64)
+        return {
+            f"{name} moving {tau:g}": begin + end - 2.0 * begin * end * np.exp(-self.time_s / tau) for tau in MOVING_S
+        }
 
     def describe_stamps(self, axis: str) -> Floats:
         """Return the factor of the variance of the stamps at both ends, of the nodes nearest to them."""

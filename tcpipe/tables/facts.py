@@ -408,6 +408,22 @@ class PhysicsFacts:
 
 
 @dataclass(frozen=True, slots=True)
+class PowerSensorFacts:
+    """What is not known of the power sensor: σ of its gain and of the zero of a rail [A], and what the log shows (`tcpipe.power.audit`).
+
+    ``rest_amp``: lowest and highest current of a rail in halts; the gain changed by ``gain_ratio`` at ``gain_changed_ns``;
+    ``lost_signs``: segments whose current flows back without a sign.
+    """
+
+    gain_std_fraction: float
+    offset_std_amp: float
+    rest_amp: tuple[float, float] | None = field(default=None, metadata=LEFT_OUT)
+    gain_ratio: float | None = field(default=None, metadata=LEFT_OUT)
+    gain_changed_ns: int | None = field(default=None, metadata=LEFT_OUT)
+    lost_signs: int = 0
+
+
+@dataclass(frozen=True, slots=True)
 class LabelFacts:
     """The run's energy by entry of the distance breakdown, its power rails by clock epoch, and uncertainty and flags of its labels."""
 
@@ -424,6 +440,7 @@ class LabelFacts:
     energy_budget: EnergyBudget | None
     quality: Mapping[str, int]
     physics: PhysicsFacts
+    power_sensor: PowerSensorFacts | None = field(default=None, metadata=LEFT_OUT)
 
 
 @dataclass(frozen=True, slots=True)

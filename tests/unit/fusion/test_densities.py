@@ -9,7 +9,14 @@ from unit.fusion import drive
 
 from tcpipe.fusion.densities import GaussMarkov, estimate_noise, fit_noise, make_prior_model
 from tcpipe.fusion.event_candidates import find_event_candidates
-from tcpipe.fusion.measurements import GNSS, Measurements, select_measurements
+from tcpipe.fusion.measurements import (
+    GNSS,
+    BodyVelocities,
+    InertialMeasurements,
+    Measurements,
+    Positions,
+    select_measurements,
+)
 from tcpipe.fusion.pair_residuals import find_residuals
 
 LONG_S, SHORT_S = 660.0, 90.0
@@ -234,3 +241,28 @@ def test_frozen_fixes_are_found():
     assert worst.z > 20.0
     assert start_s < 260.0
     assert end_s > 250.0
+
+
+def test_features_of_a_straight_drive_are_those_of_the_analytic_integrals():
+    t_ns = np.arange(0, 100_000_000_000, 50_000_000)
+    t = t_ns * 1e-9
+    nothing = np.full(t.size, np.nan)
+    speed = np.column_stack((np.full(t.size, 1.5), nothing, nothing))
+    wheels = BodyVelocities(t_ns, speed, np.where(np.isfinite(speed), 1e-3, np.nan), nothing, nothing)
+    force = np.tile([0.0, 0.0, 9.81], (t.size, 1))
+    imu = InertialMeasurements(t_ns, np.zeros((t.size, 3)), force, np.full((t.size, 4), np.nan), 1e-3, 1e-2)
+    east = np.column_stack((1.5 * t, np.zeros(t.size), np.zeros(t.size)))
+    gnss = Positions(t_ns, east, np.full((t.size, 3), 1e-4))
+    for each in find_residuals(Measurements(gnss=gnss, imu=imu, wheels=wheels)):
+        length_s = each.time_s
+        assert np.abs(each.value).max() < 1e-6
+        if length_s < 0.5 or each.axis not in {"along", "across"}:
+            continue
+        for tau in (3.0, 30.0):
+            # Variance of the integral of a Gauss-Markov process of variance 1 (Gelb 1974, section 3.6).
+            integral = 1.5**2 * 2.0 * tau**2 * (length_s / tau - 1.0 + np.exp(-length_s / tau))
+            along, across = (integral, 0.0) if each.axis == "along" else (0.0, integral)
+            assert each.features[f"wheel_odometry scale {tau:g}"] == pytest.approx(along, rel=0.03, abs=1e-9)
+            assert each.features[f"heading scale {tau:g}"] == pytest.approx(across, rel=0.03, abs=1e-9)
+        assert each.features["fix process 10"] == pytest.approx(2.0 - 2.0 * np.exp(-length_s / 10.0))
+        assert each.features["wheel_odometry velocity"] == pytest.approx(length_s if each.axis == "along" else 0.0)
