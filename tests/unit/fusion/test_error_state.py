@@ -234,8 +234,8 @@ def test_the_last_bit_of_a_measurement_decides_nothing():
     found, again = smoothed(), fuse(replace(measurements, gnss=nearby))
     assert again.facts.rejected == found.facts.rejected
     assert np.abs(again.position_enu_m - found.position_enu_m).max() < 1e-8
-    np.testing.assert_allclose(again.position_std_m, found.position_std_m, rtol=1e-4)
-    np.testing.assert_allclose(again.displacement_std_m, found.displacement_std_m, rtol=1e-4)
+    np.testing.assert_allclose(again.position_std_m, found.position_std_m, rtol=1e-3)
+    np.testing.assert_allclose(again.displacement_std_m, found.displacement_std_m, rtol=1e-3)
 
 
 def test_any_size_of_blocks_gives_the_same(monkeypatch):
