@@ -411,10 +411,12 @@ def _correct_measurements(
             corrected = replace(source, position_enu_m=source.position_enu_m - off)
         else:
             places = (
-                (state.WHEEL_SCALE, state.WHEEL_LAG) if kind == state.WHEELS else (state.VISUAL_SCALE, state.VISUAL_LAG)
+                (state.WHEEL_SCALE, state.WHEEL_SLIP, state.WHEEL_LAG)
+                if kind == state.WHEELS
+                else (state.VISUAL_SCALE, state.VISUAL_SLIP, state.VISUAL_LAG)
             )
-            scale = 1.0 + x[:, places[0]] + x[:, state.SHARED_SCALE]
-            stamp_ns = source.stamp_ns - round(float(np.median(x[:, places[1]])) * 1e9)
+            scale = 1.0 + x[:, places[0]] + x[:, places[1]] + x[:, state.SHARED_SCALE]
+            stamp_ns = source.stamp_ns - round(float(np.median(x[:, places[2]])) * 1e9)
             corrected = replace(source, stamp_ns=stamp_ns, velocity_mps=source.velocity_mps / scale[:, None])
         kept = np.ones(tick.size, np.bool_)
         for change in changes:

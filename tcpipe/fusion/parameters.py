@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from tcpipe.fusion import state
 from tcpipe.fusion.densities import GaussMarkov, NoiseModel
 from tcpipe.fusion.filter_kernel import Memory, Model
-from tcpipe.fusion.measurements import VISUAL, WHEELS, InitialState, Measurements
+from tcpipe.fusion.measurements import IMU, VISUAL, WHEELS, InitialState, Measurements
 from tcpipe.fusion.process import find_scale_stds, turn_scale_std
 from tcpipe.fusion.signals import find_chi_square_threshold
 from tcpipe.fusion.ticks import Ticks
@@ -41,7 +41,7 @@ class Parameter:
 
 
 PARAMETERS = (
-    Parameter("gyroscope bias", state.GYRO_BIAS, 3, 0.02, 4e-5, "rad/s", "MEMS: 1°/s at turn-on, 10°/h in a run"),
+    Parameter("gyroscope bias", state.GYRO_BIAS, 3, 0.02, 0.0, "rad/s", "MEMS: 1°/s at turn-on; walk: `densities`"),
     Parameter("accelerometer bias", state.ACCELEROMETER_BIAS, 3, 0.15, 3e-4, "m/s²", "MEMS: 15 mg, 1 mg in a run"),
     Parameter("antenna", state.ARM, 3, 0.0, 0.0, "m", "stated or not: `Positions.lever_arm_std_m`"),
     Parameter("lag of fixes", state.FIX_LAG, 1, 0.02, 0.0, "s", "drivers stamp on arrival"),
@@ -59,7 +59,8 @@ PARAMETERS = (
 """What does not come from the run itself; the scales of odometries and the errors of fixes do, see `make_priors`."""
 _PATIENCE = {state.FIX: (5.0, 15.0, 5.0), state.WHEELS: (5.0, 5.0, 0.3), state.VISUAL: (5.0, 5.0, 0.3)}
 _NEVER = (1e18, 1e18, 1e18)
-_SCALE_WALK = 1e-3  # 1/√s, of a scale around which slip varies: 1 % in two minutes
+_MINUTE_S = 60.0
+_MEAN_LASTS_S = 100.0  # the mean of a varying scale strays by as much as the scale varies
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,10 +94,12 @@ def make_priors(m: Measurements, noise: NoiseModel, ticks: Ticks) -> tuple[Float
         if wanted.get(parameter.name, False):
             rows = slice(parameter.place, parameter.place + parameter.count)
             std[rows], walk[rows] = parameter.std, parameter.walk
+    if m.imu is not None:
+        walk[state.GYRO_BIAS : state.GYRO_BIAS + 3] = _find_walk(noise.turns[IMU].bias)
     scales = dict(zip((WHEELS, VISUAL), find_scale_stds(m), strict=True))
     for role, place in ((WHEELS, state.WHEEL_SCALE), (VISUAL, state.VISUAL_SCALE)):
         if role in m.odometries() and scales[role]:
-            std[place], walk[place] = scales[role], _SCALE_WALK
+            std[place], walk[place] = scales[role], np.sqrt(noise.odometries[role].scale.variance / _MEAN_LASTS_S)
     time_s = np.full(state.N, np.inf)
     for place, process in _list_varying_scales(m, noise).items():
         std[place], time_s[place] = np.sqrt(process.variance), process.time_s
@@ -109,6 +112,11 @@ def make_priors(m: Measurements, noise: NoiseModel, ticks: Ticks) -> tuple[Float
     if has_fixes:
         std[state.FIX_ERROR : state.FIX_ERROR + 3] = np.sqrt(ticks.fix_variance_m2[0])
     return std, walk, time_s
+
+
+def _find_walk(process: GaussMarkov) -> float:
+    """Return the deviation of a second's walk that strays as far as a Gauss-Markov process over a minute."""
+    return float(np.sqrt(2.0 * process.variance * -np.expm1(-_MINUTE_S / process.time_s) / _MINUTE_S))
 
 
 def _list_varying_scales(m: Measurements, noise: NoiseModel) -> dict[int, GaussMarkov]:
