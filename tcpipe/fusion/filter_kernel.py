@@ -56,8 +56,7 @@ class Inputs(NamedTuple):
     mode, turned, gained : motion from the tick before, as `move_state` takes it, (K,), (K, 9), (K, 6).
     noise : variance added to rotation and body velocity [rad², m²/s²], (K, 6).
     rate, has_gyro : angular velocity at the tick, as measured [rad/s], (K, 3), and whether by a gyroscope, (K,).
-    quickens : acceleration forward at the tick [m/s²], for the wheels and fixes, and for the camera, (K, 2). Not the state's own, whose
-        noise would look like a lag of every sensor.
+    quickens : acceleration forward at the tick [m/s²], (K,). Not the state's own, whose noise would look like a lag of every sensor.
     value, variance : measurements by kind, (K, 8, 3); NaN: none.
     tau : time of the measurement after the tick [s], (K, 8).
     levers : places of odometries on the robot [m], (8, 3).
@@ -71,7 +70,7 @@ class Inputs(NamedTuple):
     noise: Matrix
     rate: Matrix
     has_gyro: NDArray[np.bool_]
-    quickens: Matrix
+    quickens: Vector
     value: NDArray[np.float64]
     variance: NDArray[np.float64]
     tau: Matrix
@@ -114,7 +113,7 @@ class Model(NamedTuple):
 
 
 class Memory(NamedTuple):
-    """State carried from tick to tick: x (43,), P (n, n), rejections in a row and seconds since the last accepted, by kind, (8, 2)."""
+    """State carried from tick to tick: x (45,), P (n, n), rejections in a row and seconds since the last accepted, by kind, (8, 2)."""
 
     x: Vector
     P: Matrix
@@ -464,7 +463,7 @@ def filter_ticks(
     inputs, model : see there.
     memory : state before ``first``: at tick ``first - 1``, or at ``first`` where that is 0.
     keep : whether ``steps`` is filled; tick k has row ``k - first``.
-    tests, states : filled for these ticks; states are x after the measurements of each, shape (K, 43).
+    tests, states : filled for these ticks; states are x after the measurements of each, shape (K, 45).
     """
     x, P, waits = memory
     n = P.shape[0]
@@ -495,12 +494,12 @@ def filter_ticks(
                     steps.F[k - first, i, j] = F[i, j]
             for i in range(n):
                 steps.kept[k - first, i] = kept[i]
+        quickens[0] = inputs.quickens[k]
         for kind in range(KINDS):
             waits[kind, 1] += inputs.period_s
             if not np.isfinite(inputs.value[k, kind, 0]):
                 continue
             size = SIZES[kind]
-            quickens[0] = inputs.quickens[k, 1 if kind == VISUAL else 0]
             log_det = _compare(k, kind, inputs, model, x, P, quickens, gain, room)
             nis = _compute_nis(y, inverse, size)
             tests.nis[k, kind] = nis
