@@ -68,7 +68,7 @@ def make_inputs(count, rng, mode=state.INERTIAL, *, noise=0.0, kept=1.0):
 
 
 def look_at(inputs, k, kind):
-    quickens = np.array([inputs.quickens[k, int(kind == state.VISUAL)], 0.0, 0.0])
+    quickens = np.array([inputs.quickens[k], 0.0, 0.0])
     return reference.Look(inputs.rate[k], bool(inputs.has_gyro[k]), quickens, inputs.tau[k, kind], inputs.levers[kind])
 
 
