@@ -139,7 +139,7 @@ def run_error_state(m: Measurements, initial: InitialState, *, output_ns: Ints, 
     first_minute = filter_section(ticks, section.model(), start, until=round(_LEVELLING_S / ticks.inputs.period_s))
     start.x[:9] = smooth_section(first_minute).states[0, :9]
     made = filter_section(ticks, section.model(), start)
-    hypotheses = section.explain(made, start)
+    hypotheses = section.explain(made, start) if _has_dead_reckoning(m) else []
     if hypotheses:
         made = section.filter(start, hypotheses[0])
     smoothed = smooth_section(made)
@@ -150,6 +150,11 @@ def run_error_state(m: Measurements, initial: InitialState, *, output_ns: Ints, 
         finding = make_finding("estimate-not-finite", Subject("run", ""))
         raise FusionError("the estimate is not finite", findings=[finding])
     return _make_trajectory(m, noise, made, smoothed, std, output_ns, hypotheses[:1])
+
+
+def _has_dead_reckoning(m: Measurements) -> bool:
+    """Return whether an IMU and an odometry, or a camera that sees all turns, carry the pose on without fixes, so that these can be judged."""
+    return bool(m.odometries()) if m.imu is not None else m.visual is not None and m.visual.turn_rate_radps is not None
 
 
 @dataclass(frozen=True, slots=True)
