@@ -19,18 +19,13 @@ from tcpipe.fusion import state
 from tcpipe.fusion.densities import NoiseModel, estimate_noise
 from tcpipe.fusion.event_candidates import find_turn_jump
 from tcpipe.fusion.filter_kernel import (
-    EVERY,
     REJECTED,
     RESET,
-    SELDOM,
-    Adjoint,
     Memory,
     Model,
-    Smoothed,
     Tests,
     allocate_steps,
     filter_ticks,
-    smooth_ticks,
 )
 from tcpipe.fusion.hypotheses import POSSIBLE, Hypothesis, compute_weights, explain, find_suspects
 from tcpipe.fusion.initial import compute_course, find_stationary_intervals
@@ -46,6 +41,7 @@ from tcpipe.fusion.process import (
     is_gliding,
     is_turned_by_course,
 )
+from tcpipe.fusion.smoother_kernel import EVERY, SELDOM, Adjoint, Smoothed, smooth_ticks
 from tcpipe.fusion.ticks import Ticks, build_ticks
 from tcpipe.fusion.trajectory import DISPLACEMENT_LAGS_S, Rejections, Trajectory
 from tcpipe.geometry.rotation import matrix_from_quat, quat_from_matrix, quat_from_rpy
@@ -138,13 +134,13 @@ def run_error_state(m: Measurements, initial: InitialState, *, output_ns: Ints, 
     """
     noise, standing = estimate_noise(m), find_stationary_intervals(m)
     ticks = build_ticks(m, noise, standing, _find_start_ns(m, output_ns), int(output_ns[-1]), output_ns=output_ns)
-    std, walk = make_priors(m, noise, ticks)
-    section = _Section(m, ticks, std, walk, gate_probability)
+    std, walk, time_s = make_priors(m, noise, ticks)
+    section = _Section(m, ticks, std, walk, time_s, gate_probability)
     start = make_start(initial, section.model(), std, (0.0, 0.0, 0.0) if m.gnss is None else m.gnss.lever_arm_m)
     first_minute = filter_section(ticks, section.model(), start, until=round(_LEVELLING_S / ticks.inputs.period_s))
     start.x[:9] = smooth_section(first_minute).states[0, :9]
     made = filter_section(ticks, section.model(), start)
-    hypotheses = section.explain(made, start)
+    hypotheses = section.explain(made, start) if _has_dead_reckoning(m) else []
     if hypotheses:
         made = section.filter(start, hypotheses[0])
     smoothed = smooth_section(made)
@@ -157,6 +153,11 @@ def run_error_state(m: Measurements, initial: InitialState, *, output_ns: Ints, 
     return _make_trajectory(m, noise, made, smoothed, std, output_ns, hypotheses[:1])
 
 
+def _has_dead_reckoning(m: Measurements) -> bool:
+    """Return whether an IMU and an odometry, or a camera that sees all turns, carry the pose on, so that fixes can be judged."""
+    return bool(m.odometries()) if m.imu is not None else m.visual is not None and m.visual.turn_rate_radps is not None
+
+
 @dataclass(frozen=True, slots=True)
 class _Section:
     """A section that is filtered under several hypotheses."""
@@ -165,6 +166,7 @@ class _Section:
     ticks: Ticks
     std: Floats
     walk: Floats
+    time_s: Floats
     gate_probability: float
 
     def model(self, changes: Hypothesis = _UNCHANGED, *, judges: bool = False) -> Model:
@@ -176,6 +178,7 @@ class _Section:
             changes.events,
             period_s=self.ticks.inputs.period_s,
             gate_probability=self.gate_probability,
+            time_s=self.time_s,
             follows=not judges,
             ignored=changes.ignored,
             possible=POSSIBLE if judges else (),
@@ -422,10 +425,12 @@ def _correct_measurements(
             corrected = replace(source, position_enu_m=source.position_enu_m - off)
         else:
             places = (
-                (state.WHEEL_SCALE, state.WHEEL_LAG) if kind == state.WHEELS else (state.VISUAL_SCALE, state.VISUAL_LAG)
+                (state.WHEEL_SCALE, state.WHEEL_SLIP, state.WHEEL_LAG)
+                if kind == state.WHEELS
+                else (state.VISUAL_SCALE, state.VISUAL_SLIP, state.VISUAL_LAG)
             )
-            scale = 1.0 + x[:, places[0]] + x[:, state.SHARED_SCALE]
-            stamp_ns = source.stamp_ns - round(float(np.median(x[:, places[1]])) * 1e9)
+            scale = 1.0 + x[:, places[0]] + x[:, places[1]] + x[:, state.SHARED_SCALE]
+            stamp_ns = source.stamp_ns - round(float(np.median(x[:, places[2]])) * 1e9)
             corrected = replace(source, stamp_ns=stamp_ns, velocity_mps=source.velocity_mps / scale[:, None])
         kept = np.ones(tick.size, np.bool_)
         for change in changes:
@@ -480,9 +485,9 @@ def _make_facts(  # noqa: PLR0917
         gyro_bias_radps=None if std[state.TURN_SCALE] else make_vector(x[state.GYRO_BIAS : state.GYRO_BIAS + 3]),
         turn_scale=float(1.0 / (1.0 - x[state.TURN_SCALE])) if std[state.TURN_SCALE] else None,
         accelerometer_bias_mps2=make_vector(x[state.ACCELEROMETER_BIAS : state.ACCELEROMETER_BIAS + 3]),
-        wheel_scale=float(1.0 + x[state.WHEEL_SCALE] + x[state.SHARED_SCALE]),
+        wheel_scale=float(1.0 + x[state.WHEEL_SCALE] + x[state.WHEEL_SLIP] + x[state.SHARED_SCALE]),
         wheel_scale_std=max(spread(state.WHEEL_SCALE), scale_std),
-        visual_scale=float(1.0 + x[state.VISUAL_SCALE] + x[state.SHARED_SCALE]),
+        visual_scale=float(1.0 + x[state.VISUAL_SCALE] + x[state.VISUAL_SLIP] + x[state.SHARED_SCALE]),
         visual_scale_std=max(spread(state.VISUAL_SCALE), scale_std),
         common_scale_std=scale_std,
         parameters=_describe_parameters(m, made, smoothed, std),

@@ -176,7 +176,7 @@ class Hypothesis:
 
 
 def find_suspects(tests: Tests, period_s: float) -> list[Suspect]:
-    """Return where sensors are rejected for long, in order of time; what is much shorter than the longest may follow from it and is last."""
+    """Return where sensors are rejected for long, in order of time; last, what is much shorter than the longest."""
     found: list[Suspect] = []
     for kind, lasts_s in _LASTS_S.items():
         rows = np.flatnonzero(tests.verdict[:, kind] != NONE)
@@ -209,7 +209,7 @@ def explain(
 
     ``made`` is the pass without any change, in which no rejected fix is followed; ``run`` makes that under a hypothesis between two ticks
     (its rows before the first mean nothing). Only errors that are ``active`` can change. A ``jump`` that the gyroscope's turns show is
-    tried first; then the longest contradiction is explained, then the longest that is left.
+    tried first; then one contradiction after the other is explained.
     """
     period_s, gates, size = made.ticks.inputs.period_s, made.model.gates, made.states.shape[0]
     best, tests, found = Hypothesis((), 0.0), made.tests, [Hypothesis((), 0.0)]

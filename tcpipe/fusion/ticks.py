@@ -150,7 +150,7 @@ def build_ticks(  # noqa: C901, PLR0915  one array after the other
         make_motion_noise(m, noise, stamp_ns, mode, turn_rate, period_s),
         rate,
         around >= state.GYRO_TURN,
-        _compute_accelerations(m, stamp_ns),
+        _compute_acceleration(m, stamp_ns),
         value,
         variance,
         tau,
@@ -290,17 +290,14 @@ def _preintegrate(  # noqa: PLR0917, C901  compiled
             gained[k, 3 + i] = p[i]
 
 
-def _compute_accelerations(m: Measurements, stamp_ns: Ints) -> Floats:
-    """Return the forward acceleration at each tick by how the other odometry's velocity changes, for wheels and camera, shape (K, 2).
-
-    A sensor's own would be late as it is; without another one there is no choice. 0 where there is none.
-    """
-    of_camera, of_wheels = (_compute_slope(source, stamp_ns) for source in (m.visual, m.wheels))
-    return np.column_stack((of_wheels if m.visual is None else of_camera, of_camera if m.wheels is None else of_wheels))
+def _compute_acceleration(m: Measurements, stamp_ns: Ints) -> Floats:
+    """Return the forward acceleration at each tick by how the velocities of odometries change, their mean; 0 where there is none."""
+    slopes = [_compute_slope(source, stamp_ns) for source in m.odometries().values()]
+    return np.mean(slopes, axis=0) if slopes else np.zeros(stamp_ns.size)
 
 
-def _compute_slope(source: BodyVelocities | None, stamp_ns: Ints) -> Floats:
-    if source is None or source.stamp_ns.size < 3:
+def _compute_slope(source: BodyVelocities, stamp_ns: Ints) -> Floats:
+    if source.stamp_ns.size < 3:
         return np.zeros(stamp_ns.size)
     slope = compute_slopes(source.stamp_ns, compute_median_of_five(source.velocity_mps[:, 0]), _ACCELERATION_WINDOW_S)
     zero = int(stamp_ns[0])
