@@ -42,7 +42,7 @@ from tcpipe.fusion.process import (
     is_turned_by_course,
 )
 from tcpipe.fusion.smoother_kernel import EVERY, SELDOM, Adjoint, Smoothed, smooth_ticks
-from tcpipe.fusion.ticks import Ticks, build_ticks
+from tcpipe.fusion.ticks import Pass, Ticks, build_ticks
 from tcpipe.fusion.trajectory import DISPLACEMENT_LAGS_S, Rejections, Trajectory
 from tcpipe.geometry.rotation import matrix_from_quat, quat_from_matrix, quat_from_rpy
 from tcpipe.tables.facts import ChangeFacts, GateReset, ParameterFacts, StretchFacts, make_vector
@@ -58,18 +58,6 @@ _LEVELLING_S = 60.0
 _ANY_YAW_STD_RAD = np.pi / np.sqrt(3.0)
 _MANY_FIXES = 50
 _UNCHANGED = Hypothesis((), 0.0)
-
-
-@dataclass(slots=True)
-class Pass:
-    """One forward pass over a section: its model, checkpoints, tests, and filtered states by tick."""
-
-    ticks: Ticks
-    model: Model
-    checkpoints: list[Memory]
-    tests: Tests
-    states: Floats
-    last: Memory
 
 
 def make_tests(size: int) -> Tests:

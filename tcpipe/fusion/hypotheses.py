@@ -14,7 +14,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,10 +22,7 @@ from tcpipe.fusion import state
 from tcpipe.fusion.event_candidates import TurnJump
 from tcpipe.fusion.filter_kernel import ACCEPTED, NONE, REJECTED, Tests
 from tcpipe.fusion.parameters import Event
-from tcpipe.fusion.ticks import Ticks
-
-if TYPE_CHECKING:
-    from tcpipe.fusion.error_state import Pass
+from tcpipe.fusion.ticks import Pass, Ticks
 
 Floats = NDArray[np.float64]
 
