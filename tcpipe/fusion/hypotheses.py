@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.fusion import state
-from tcpipe.fusion.event_candidates import TurnJump
+from tcpipe.fusion.event_candidates import EventCandidate, TurnJump
 from tcpipe.fusion.filter_kernel import ACCEPTED, NONE, REJECTED, Tests
 from tcpipe.fusion.parameters import Event
 from tcpipe.fusion.ticks import Pass, Ticks
@@ -256,6 +256,20 @@ def _make_wander(tick: int, off_m: float, size: int, period_s: float) -> Change:
     around = round(_ERR_FOR_S / period_s)
     last = tick + around
     return Change("wander", state.FIX, max(0, tick - around), None if last >= size else last, off_m, tick)
+
+
+def make_excursions(made: Pass, candidates: Sequence[EventCandidate]) -> list[Hypothesis]:
+    """Return the hypothesis that fixes err in the spans of candidates; none without candidates."""
+    stamp_ns, size = made.ticks.stamp_ns, made.states.shape[0]
+    changes: list[Change] = []
+    for each in sorted(candidates, key=lambda each: each.start_ns):
+        first, last = np.searchsorted(stamp_ns, (each.start_ns, each.end_ns)).clip(0, size).tolist()
+        off_m = abs(each.change)
+        if changes and first < (changes[-1].last or size):
+            before = changes.pop()
+            first, last, off_m = before.first, max(last, before.last or size), max(off_m, before.size)
+        changes.append(Change("wander", state.FIX, first, None if last >= size else last, off_m))
+    return [Hypothesis(tuple(changes), 0.0)] if changes else []
 
 
 def _make_jump(made: Pass, jump: TurnJump) -> Change:
