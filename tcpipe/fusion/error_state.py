@@ -430,6 +430,10 @@ def _correct_measurements(
             if change.role == kind:
                 kept &= (tick < change.first) | (tick >= (change.last or made.states.shape[0]))
         found[name] = _select_rows(corrected, kept) if not kept.all() else corrected
+    if m.imu is not None:
+        at = np.searchsorted(made.ticks.stamp_ns, m.imu.stamp_ns).clip(0, made.states.shape[0] - 1)
+        bias = smoothed.states[at, state.GYRO_BIAS + 6 : state.GYRO_BIAS + 9]
+        found["imu"] = replace(m.imu, angular_velocity_radps=m.imu.angular_velocity_radps - bias)
     return replace(m, **found)
 
 

@@ -51,9 +51,7 @@ def test_a_jump_within_an_outage_bends_no_track():
 
 
 def test_fixes_that_are_off_and_return_are_named_with_their_span_and_size():
-    off = move_fixes(
-        drive.measure(truth(), 1, visual=False), lambda at: np.where((at > 60.0) & (at < 100.0), 0.5, 0.0)
-    )
+    off = move_fixes(drive.measure(truth(), 1, visual=False), lambda at: np.where((at > 60.0) & (at < 100.0), 0.5, 0.0))
     found = fuse(off)
     (change,) = found.facts.changes
     assert (change.kind, change.role) == ("offset", GNSS)
