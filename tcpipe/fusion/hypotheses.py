@@ -40,6 +40,7 @@ _TOGETHER_S = 5.0
 _MOST_CHANGES = 3
 _CARRIED_M = 1.0  # a jump that is smaller is one of the fixes
 _ERR_FOR_S = 40.0
+_SIDE = 60.0  # log likelihood by which fixes err rather before a step than after it
 _MUCH_SHORTER = 0.25
 _ALIKE = 0.4  # of the size of an innovation
 _HORIZON_S = 60.0
@@ -238,7 +239,7 @@ def explain(
                 around, *sides = (_add(top, each) for each in _list_wanders(change.first, change.size, size, period_s))
                 begin = min(c.first for c in around.changes)
                 likely = [compute_evidence(run(each, begin, last).tests, gates, begin, last) for each in sides]
-                best = around if abs(likely[0] - likely[1]) < _SURELY else sides[int(np.argmax(likely))]
+                best = around if abs(likely[0] - likely[1]) < _SIDE else sides[int(np.argmax(likely))]
             tests = run(best, 0, size).tests
         elif number > 0:
             break
