@@ -157,8 +157,8 @@ def settle_clocks(topics: Mapping[str, TopicTimes], *, clock_published: bool = F
     return _settle_steps(topics, [])
 
 
-def _find_times_passed_twice(topics: Mapping[str, TopicTimes]) -> list[tuple[int, int]]:
-    """Return the spans of log time [ns] in which most regular topics have twice their messages: a host's clock was set back.
+def _find_times_passed_twice(topics: Mapping[str, TopicTimes]) -> list[tuple[int, int, float]]:
+    """Return where most regular topics have twice their messages, since a host's clock was set back: log times [ns], and by how much [s].
 
     A log is in order of log time: messages of before and after lie between each other there.
     """
@@ -179,21 +179,24 @@ def _find_times_passed_twice(topics: Mapping[str, TopicTimes]) -> list[tuple[int
         ([0], (np.mean(np.abs(regular - 2.0) < _ABOUT_TWICE, axis=0) > _MOSTLY).astype(np.int8), [0])
     )
     begins, ends = np.flatnonzero(np.diff(twice) > 0), np.flatnonzero(np.diff(twice) < 0)
+    excess = np.concatenate(([0.0], np.cumsum(np.mean(regular - 1.0, axis=0)))) * STEP_NS / SECOND_NS
     return [
-        (zero + int(a - 1) * STEP_NS, zero + int(b + 1) * STEP_NS)
-        for a, b in zip(begins, ends, strict=True)
-        if b - a > 1
+        (zero + (a - 1) * STEP_NS, zero + (b + 1) * STEP_NS, float(excess[b + 1] - excess[a - 1]))
+        for a, b in zip(begins.tolist(), ends.tolist(), strict=True)
+        if b - a > 1 and a > 0 and b + 1 < excess.size
     ]
 
 
-def _settle_after_setting_back(topics: Mapping[str, TopicTimes], spans: Sequence[tuple[int, int]]) -> AlignedClocks:
+def _settle_after_setting_back(
+    topics: Mapping[str, TopicTimes], spans: Sequence[tuple[int, int, float]]
+) -> AlignedClocks:
     """Return the timelines without what lies in times that the clock passed twice: what of it is earlier nobody can tell."""
     kept = {
-        name: np.flatnonzero(~np.any([(a <= of.log_time_ns) & (of.log_time_ns < b) for a, b in spans], axis=0))
+        name: np.flatnonzero(~np.any([(a <= of.log_time_ns) & (of.log_time_ns < b) for a, b, _ in spans], axis=0))
         for name, of in topics.items()
     }
     rest = {name: select_times(of, kept[name]) for name, of in topics.items()}
-    steps = [ClockStep(b, (a + 2 * STEP_NS - b) / SECOND_NS, ()) for a, b in spans]
+    steps = [ClockStep(end_ns, -size_s, ()) for _, end_ns, size_s in spans]
     settled = _settle_steps(rest, steps)
     timelines = {
         name: replace(
