@@ -54,6 +54,8 @@ CLOCK = "rosgraph_msgs/msg/Clock"
 _FEWEST_IN_BIN = 4
 _FEWEST_REGULAR = 2
 _ABOUT_TWICE = 0.5
+_MOST_BINS = 2_000_000
+"""Of half a second: eleven days."""
 _MOSTLY = 0.5
 _BACK_NS = 1_000_000_000
 _MOST_BACK = 0.01
@@ -162,14 +164,14 @@ def _find_times_passed_twice(topics: Mapping[str, TopicTimes]) -> list[tuple[int
 
     A log is in order of log time: messages of before and after lie between each other there.
     """
-    every = [times.header_ns if _is_set(times).all() else times.log_time_ns for times in topics.values()]
-    stamps = [np.asarray(each) for each in every if each is not None and len(each)]
-    if not stamps:
+    used = [times for times in topics.values() if len(times.log_time_ns)]
+    if not used:
         return []
-    zero = min(int(each.min()) for each in stamps)
-    size = (
-        max(int(times.log_time_ns[-1]) for times in topics.values() if len(times.log_time_ns)) - zero
-    ) // STEP_NS + 1
+    zero = min(int(times.log_time_ns[0]) for times in used)
+    size = (max(int(times.log_time_ns[-1]) for times in used) - zero) // STEP_NS + 1
+    if size > _MOST_BINS:  # log times are no clock's
+        return []
+    stamps = [_bring_to_log_clock(times) for times in used]
     counts = np.array([np.bincount(((of - zero) // STEP_NS).clip(0, size), minlength=size + 1) for of in stamps])
     usual = np.array([np.median(of[of > 0]) for of in counts])
     regular = counts[usual >= _FEWEST_IN_BIN] / usual[usual >= _FEWEST_IN_BIN, None]
@@ -179,12 +181,22 @@ def _find_times_passed_twice(topics: Mapping[str, TopicTimes]) -> list[tuple[int
         ([0], (np.mean(np.abs(regular - 2.0) < _ABOUT_TWICE, axis=0) > _MOSTLY).astype(np.int8), [0])
     )
     begins, ends = np.flatnonzero(np.diff(twice) > 0), np.flatnonzero(np.diff(twice) < 0)
-    excess = np.concatenate(([0.0], np.cumsum(np.mean(regular - 1.0, axis=0)))) * STEP_NS / SECOND_NS
-    return [
-        (zero + (a - 1) * STEP_NS, zero + (b + 1) * STEP_NS, float(excess[b + 1] - excess[a - 1]))
-        for a, b in zip(begins.tolist(), ends.tolist(), strict=True)
-        if b - a > 1 and a > 0 and b + 1 < excess.size
-    ]
+    excess_s = np.concatenate(([0.0], np.cumsum(np.mean(regular - 1.0, axis=0)))) * STEP_NS / SECOND_NS
+    found = []
+    for begin, end in zip(begins.tolist(), ends.tolist(), strict=True):
+        step_s = float(excess_s[min(end + 1, size)] - excess_s[max(begin - 1, 0)])
+        # A driver that catches up sends what it did not send before: there is no more than usual in a longer time.
+        around_s = float(excess_s[min(2 * end - begin + 2, size)] - excess_s[max(2 * begin - end - 2, 0)])
+        if end - begin > 1 and around_s > _MOSTLY * step_s:
+            found.append((zero + (begin - 1) * STEP_NS, zero + (end + 1) * STEP_NS, step_s))
+    return found
+
+
+def _bring_to_log_clock(times: TopicTimes) -> Ints:
+    """Return the header stamps less their median distance from the log times [ns]; log times where some are unset."""
+    if times.header_ns is None or not _is_set(times).all():
+        return times.log_time_ns
+    return times.header_ns - int(np.median(times.header_ns - times.log_time_ns))
 
 
 def _settle_after_setting_back(
