@@ -113,6 +113,14 @@ def _find_first_ns(streams: Streams) -> int:
     )
 
 
+def _find_used_s(role: str, streams: Streams) -> tuple[float, float] | None:
+    """Return when a sensor's first and last messages are [s]."""
+    if role not in streams.tables:
+        return None
+    stamp_ns = to_integers(streams.tables[role], "stamp_ns")
+    return (int(stamp_ns[0]) - _find_first_ns(streams)) / 1e9, (int(stamp_ns[-1]) - _find_first_ns(streams)) / 1e9
+
+
 def _prepare(role: str, table: pa.Table, sensor: Sensor, config: FuseConfig, inputs: FusionInputs) -> Any:
     stamp_ns, columns = to_integers(table, "stamp_ns"), FloatColumns(table)
     place: Mapping[str, Any] = {"xyz_m": sensor.xyz_m, "quat_xyzw": sensor.quat_xyzw}
@@ -232,11 +240,10 @@ def _find_exclusion(refusal: SensorExclusion, streams: Streams) -> Finding:
     else:
         remedies = exclude_role(name)
     numbers: Mapping[str, Any] = refusal.numbers
-    first_ns, stamp_ns = _find_first_ns(streams), to_integers(streams.tables[refusal.role], "stamp_ns")
     return make_finding(
         refusal.code,
         Subject("role", name),
-        span_s=((int(stamp_ns[0]) - first_ns) / 1e9, (int(stamp_ns[-1]) - first_ns) / 1e9),
+        span_s=_find_used_s(refusal.role, streams),
         action="excluded",
         severity="note" if refusal.role == DOPPLER else None,
         names={"topic": sensor.topic, "placed_by": sensor.placed_by, **refusal.names},
