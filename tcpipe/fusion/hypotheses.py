@@ -160,8 +160,8 @@ def explain(made: Pass, run: Callable[[Hypothesis, int, int], Pass], active: Col
     """Return the hypotheses that explain best where sensors contradict each other, the best first; none where they do not.
 
     ``made`` is the pass without any change, in which no rejected fix is followed; ``run`` makes that under a hypothesis between two ticks
-    (its rows before the first mean nothing). Only errors that are ``active`` can change. The longest contradiction is explained first; then the longest that is
-    left.
+    (its rows before the first mean nothing). Only errors that are ``active`` can change. The longest contradiction is explained first;
+    then the longest that is left.
     """
     period_s, gates, size = made.ticks.inputs.period_s, made.model.gates, made.states.shape[0]
     best, tests, found = Hypothesis((), 0.0), made.tests, [Hypothesis((), 0.0)]
