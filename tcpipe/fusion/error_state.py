@@ -16,20 +16,15 @@ from numpy.typing import NDArray
 
 from tcpipe.errors import FusionError
 from tcpipe.fusion import state
-from tcpipe.fusion.densities import estimate_noise
+from tcpipe.fusion.densities import NoiseModel, estimate_noise
 from tcpipe.fusion.filter_kernel import (
-    EVERY,
     REJECTED,
     RESET,
-    SELDOM,
-    Adjoint,
     Memory,
     Model,
-    Smoothed,
     Tests,
     allocate_steps,
     filter_ticks,
-    smooth_ticks,
 )
 from tcpipe.fusion.hypotheses import POSSIBLE, Hypothesis, compute_weights, explain, find_suspects
 from tcpipe.fusion.initial import compute_course, find_stationary_intervals
@@ -45,6 +40,7 @@ from tcpipe.fusion.process import (
     is_gliding,
     is_turned_by_course,
 )
+from tcpipe.fusion.smoother_kernel import EVERY, SELDOM, Adjoint, Smoothed, smooth_ticks
 from tcpipe.fusion.ticks import Ticks, build_ticks
 from tcpipe.fusion.trajectory import DISPLACEMENT_LAGS_S, Rejections, Trajectory
 from tcpipe.geometry.rotation import matrix_from_quat, quat_from_matrix, quat_from_rpy
@@ -137,8 +133,8 @@ def run_error_state(m: Measurements, initial: InitialState, *, output_ns: Ints, 
     """
     noise, standing = estimate_noise(m), find_stationary_intervals(m)
     ticks = build_ticks(m, noise, standing, _find_start_ns(m, output_ns), int(output_ns[-1]), output_ns=output_ns)
-    std, walk = make_priors(m, noise, ticks)
-    section = _Section(m, ticks, std, walk, gate_probability)
+    std, walk, time_s = make_priors(m, noise, ticks)
+    section = _Section(m, ticks, std, walk, time_s, gate_probability)
     start = make_start(initial, section.model(), std, (0.0, 0.0, 0.0) if m.gnss is None else m.gnss.lever_arm_m)
     first_minute = filter_section(ticks, section.model(), start, until=round(_LEVELLING_S / ticks.inputs.period_s))
     start.x[:9] = smooth_section(first_minute).states[0, :9]
@@ -153,7 +149,7 @@ def run_error_state(m: Measurements, initial: InitialState, *, output_ns: Ints, 
     if not np.isfinite(smoothed.states).all():
         finding = make_finding("estimate-not-finite", Subject("run", ""))
         raise FusionError("the estimate is not finite", findings=[finding])
-    return _make_trajectory(m, made, smoothed, std, output_ns, hypotheses[:1])
+    return _make_trajectory(m, noise, made, smoothed, std, output_ns, hypotheses[:1])
 
 
 @dataclass(frozen=True, slots=True)
@@ -164,6 +160,7 @@ class _Section:
     ticks: Ticks
     std: Floats
     walk: Floats
+    time_s: Floats
     gate_probability: float
 
     def model(self, changes: Hypothesis = _UNCHANGED, *, judges: bool = False) -> Model:
@@ -175,6 +172,7 @@ class _Section:
             changes.events,
             period_s=self.ticks.inputs.period_s,
             gate_probability=self.gate_probability,
+            time_s=self.time_s,
             follows=not judges,
             ignored=changes.ignored,
             possible=POSSIBLE if judges else (),
@@ -230,7 +228,13 @@ def _find_start_ns(m: Measurements, output_ns: Ints) -> int:
 
 
 def _make_trajectory(  # noqa: PLR0917
-    m: Measurements, made: Pass, smoothed: Smoothed, std: Floats, output_ns: Ints, explained: Sequence[Hypothesis]
+    m: Measurements,
+    noise: NoiseModel,
+    made: Pass,
+    smoothed: Smoothed,
+    std: Floats,
+    output_ns: Ints,
+    explained: Sequence[Hypothesis],
 ) -> Trajectory:
     """Return the trajectory at the wanted stamps [ns], with what no state of the filter can know in its deviations."""
     ticks = made.ticks
@@ -256,6 +260,10 @@ def _make_trajectory(  # noqa: PLR0917
     elif is_turned_by_course(m):
         # The course takes a sway of the antenna for a turn: nothing tells one from the other, and roll is taken to be none.
         position_variance[:, :2] += (slope_std * antenna[2] * rotation[:, :2, 1]) ** 2
+    if noise.horizontal is not None and noise.vertical is not None:
+        # What fixes claim beyond what the run shows lasts longer than the run can show.
+        for axes, fix in ((slice(0, 2), noise.horizontal), (slice(2, 3), noise.vertical)):
+            position_variance[:, axes] += max(0.0, fix.claimed_m2 - fix.white_m2 - fix.correlated.variance)
     if m.gnss is not None and not std[state.ARM]:
         turned = np.unwrap(np.arctan2(rotation[:, 1, 0], rotation[:, 0, 0]))
         variance, moved = _compute_arm_variance(m, rotation, turned, made)
@@ -409,10 +417,12 @@ def _correct_measurements(
             corrected = replace(source, position_enu_m=source.position_enu_m - off)
         else:
             places = (
-                (state.WHEEL_SCALE, state.WHEEL_LAG) if kind == state.WHEELS else (state.VISUAL_SCALE, state.VISUAL_LAG)
+                (state.WHEEL_SCALE, state.WHEEL_SLIP, state.WHEEL_LAG)
+                if kind == state.WHEELS
+                else (state.VISUAL_SCALE, state.VISUAL_SLIP, state.VISUAL_LAG)
             )
-            scale = 1.0 + x[:, places[0]] + x[:, state.SHARED_SCALE]
-            stamp_ns = source.stamp_ns - round(float(np.median(x[:, places[1]])) * 1e9)
+            scale = 1.0 + x[:, places[0]] + x[:, places[1]] + x[:, state.SHARED_SCALE]
+            stamp_ns = source.stamp_ns - round(float(np.median(x[:, places[2]])) * 1e9)
             corrected = replace(source, stamp_ns=stamp_ns, velocity_mps=source.velocity_mps / scale[:, None])
         kept = np.ones(tick.size, np.bool_)
         for change in changes:
@@ -468,9 +478,9 @@ def _make_facts(  # noqa: PLR0917
         gyro_bias_radps=None if std[state.TURN_SCALE] else make_vector(x[state.GYRO_BIAS : state.GYRO_BIAS + 3]),
         turn_scale=float(1.0 / (1.0 - x[state.TURN_SCALE])) if std[state.TURN_SCALE] else None,
         accelerometer_bias_mps2=make_vector(x[state.ACCELEROMETER_BIAS : state.ACCELEROMETER_BIAS + 3]),
-        wheel_scale=float(1.0 + x[state.WHEEL_SCALE] + x[state.SHARED_SCALE]),
+        wheel_scale=float(1.0 + x[state.WHEEL_SCALE] + x[state.WHEEL_SLIP] + x[state.SHARED_SCALE]),
         wheel_scale_std=max(spread(state.WHEEL_SCALE), scale_std),
-        visual_scale=float(1.0 + x[state.VISUAL_SCALE] + x[state.SHARED_SCALE]),
+        visual_scale=float(1.0 + x[state.VISUAL_SCALE] + x[state.VISUAL_SLIP] + x[state.SHARED_SCALE]),
         visual_scale_std=max(spread(state.VISUAL_SCALE), scale_std),
         common_scale_std=scale_std,
         parameters=_describe_parameters(m, made, smoothed, std),

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from tcpipe.fusion import state
 from tcpipe.fusion.densities import GaussMarkov, NoiseModel
 from tcpipe.fusion.filter_kernel import Memory, Model
-from tcpipe.fusion.measurements import VISUAL, WHEELS, InitialState, Measurements
+from tcpipe.fusion.measurements import IMU, VISUAL, WHEELS, InitialState, Measurements
 from tcpipe.fusion.process import find_scale_stds, turn_scale_std
 from tcpipe.fusion.signals import find_chi_square_threshold
 from tcpipe.fusion.ticks import Ticks
@@ -41,10 +41,10 @@ class Parameter:
 
 
 PARAMETERS = (
-    Parameter("gyroscope bias", state.GYRO_BIAS, 3, 0.02, 4e-5, "rad/s", "MEMS: 1°/s at turn-on, 10°/h in a run"),
+    Parameter("gyroscope bias", state.GYRO_BIAS, 3, 0.02, 0.0, "rad/s", "MEMS: 1°/s at turn-on; walk: `densities`"),
     Parameter("accelerometer bias", state.ACCELEROMETER_BIAS, 3, 0.15, 3e-4, "m/s²", "MEMS: 15 mg, 1 mg in a run"),
     Parameter("antenna", state.ARM, 3, 0.0, 0.0, "m", "stated or not: `Positions.lever_arm_std_m`"),
-    Parameter("lag of fixes", state.FIX_LAG, 1, 0.02, 0.0, "s", "drivers stamp on arrival"),
+    Parameter("lag of fixes", state.FIX_LAG, 1, 0.02, 1e-3, "s", "drivers stamp on arrival"),
     Parameter("wheel scale", state.WHEEL_SCALE, 1, 0.0, 0.0, "1", "`process.find_scale_stds`; walk: `densities`"),
     Parameter("camera scale", state.VISUAL_SCALE, 1, 0.0, 0.0, "1", "`process.find_scale_stds`; walk: `densities`"),
     Parameter("turn scale", state.TURN_SCALE, 1, 0.0, 0.0, "1", "`process.turn_scale_std`"),
@@ -53,12 +53,14 @@ PARAMETERS = (
     ),
     Parameter("mounting of the IMU", state.MOUNT, 3, 0.0175, 0.0, "rad", "stated to a degree"),
     Parameter("mounting of the camera", state.VISUAL_MOUNT, 2, 0.0175, 0.0, "rad", "stated to a degree"),
-    Parameter("lag of wheels", state.WHEEL_LAG, 1, 0.02, 0.0, "s", "drivers stamp on arrival"),
-    Parameter("lag of camera", state.VISUAL_LAG, 1, 0.03, 0.0, "s", "exposure and processing"),
+    Parameter("lag of wheels", state.WHEEL_LAG, 1, 0.02, 1e-3, "s", "drivers stamp on arrival"),
+    Parameter("lag of camera", state.VISUAL_LAG, 1, 0.03, 1e-3, "s", "exposure and processing"),
 )
 """What does not come from the run itself; the scales of odometries and the errors of fixes do, see `make_priors`."""
 _PATIENCE = {state.FIX: (5.0, 15.0, 5.0), state.WHEELS: (5.0, 5.0, 0.3), state.VISUAL: (5.0, 5.0, 0.3)}
 _NEVER = (1e18, 1e18, 1e18)
+_MINUTE_S = 60.0
+_MEAN_LASTS_S = 100.0  # the mean of a varying scale strays by as much as the scale varies
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,8 +74,8 @@ class Event:
     is_new: bool = False
 
 
-def make_priors(m: Measurements, noise: NoiseModel, ticks: Ticks) -> tuple[Floats, Floats]:
-    """Return standard deviation and walk of every error, shapes (37,): 0 where it is known exactly, or nothing depends on it."""
+def make_priors(m: Measurements, noise: NoiseModel, ticks: Ticks) -> tuple[Floats, Floats, Floats]:
+    """Return standard deviation, walk and correlation time of every error, shapes (39,): 0 where it is exact, or nothing depends on it."""
     std, walk = np.zeros(state.N), np.zeros(state.N)
     has_imu, has_fixes = m.imu is not None, m.gnss is not None
     has_tilt = has_imu or (m.visual is not None and m.visual.turn_rate_radps is not None)
@@ -92,13 +94,15 @@ def make_priors(m: Measurements, noise: NoiseModel, ticks: Ticks) -> tuple[Float
         if wanted.get(parameter.name, False):
             rows = slice(parameter.place, parameter.place + parameter.count)
             std[rows], walk[rows] = parameter.std, parameter.walk
+    if m.imu is not None:
+        walk[state.GYRO_BIAS : state.GYRO_BIAS + 3] = _find_walk(noise.turns[IMU].bias)
     scales = dict(zip((WHEELS, VISUAL), find_scale_stds(m), strict=True))
     for role, place in ((WHEELS, state.WHEEL_SCALE), (VISUAL, state.VISUAL_SCALE)):
         if role in m.odometries() and scales[role]:
-            std[place], walk[place] = scales[role], _find_walk(noise.odometries[role].scale)
-    if has_fixes and m.odometries():
-        walk[state.SHARED_SCALE] = _find_walk(noise.shared_scale)
-        std[state.SHARED_SCALE] = 1e-6
+            std[place], walk[place] = scales[role], np.sqrt(noise.odometries[role].scale.variance / _MEAN_LASTS_S)
+    time_s = np.full(state.N, np.inf)
+    for place, process in _list_varying_scales(m, noise).items():
+        std[place], time_s[place] = np.sqrt(process.variance), process.time_s
     if turn_scale_std(m):
         std[state.TURN_SCALE] = turn_scale_std(m)
         walk[state.TURN_SCALE] = np.sqrt(2.0 / 60.0) * turn_scale_std(m)
@@ -107,23 +111,33 @@ def make_priors(m: Measurements, noise: NoiseModel, ticks: Ticks) -> tuple[Float
         std[state.ARM : state.ARM + 3] = m.gnss.lever_arm_std_m
     if has_fixes:
         std[state.FIX_ERROR : state.FIX_ERROR + 3] = np.sqrt(ticks.fix_variance_m2[0])
-    return std, walk
+    return std, walk, time_s
 
 
 def _find_walk(process: GaussMarkov) -> float:
-    """Return the deviation of a second's walk that strays as fast as a Gauss-Markov process does over short times."""
-    return float(np.sqrt(2.0 * process.variance / process.time_s))
+    """Return the deviation of a second's walk that strays as far as a Gauss-Markov process over a minute."""
+    return float(np.sqrt(2.0 * process.variance * -np.expm1(-_MINUTE_S / process.time_s) / _MINUTE_S))
+
+
+def _list_varying_scales(m: Measurements, noise: NoiseModel) -> dict[int, GaussMarkov]:
+    """Return how scales of odometries vary around their means, by error; only fixes show it."""
+    if m.gnss is None:
+        return {}
+    places = {WHEELS: state.WHEEL_SLIP, VISUAL: state.VISUAL_SLIP}
+    found = {places[role]: noise.odometries[role].scale for role in m.odometries()}
+    return found | ({state.SHARED_SCALE: noise.shared_scale} if found else {})
 
 
 _MOTION = (*range(state.THETA, state.GYRO_BIAS),)
 _BODY = (*range(state.U, state.GYRO_BIAS + 3), *range(state.MOUNT, state.MOUNT + 3))
 _ANTENNA = (*range(state.THETA, state.THETA + 3), *_BODY, *range(state.ARM, state.FIX_LAG + 1))
 _DEPENDS: Mapping[int, Sequence[int]] = {
-    state.WHEELS: (*_BODY, state.WHEEL_SCALE, state.SHARED_SCALE, state.WHEEL_LAG),
+    state.WHEELS: (*_BODY, state.WHEEL_SCALE, state.WHEEL_SLIP, state.SHARED_SCALE, state.WHEEL_LAG),
     state.SIDEWAYS: (*_BODY, state.TURNING_CENTRE),
     state.VISUAL: (
         *_BODY,
         state.VISUAL_SCALE,
+        state.VISUAL_SLIP,
         state.SHARED_SCALE,
         state.VISUAL_MOUNT,
         state.VISUAL_MOUNT + 1,
@@ -149,6 +163,7 @@ def make_model(
     period_s: float,
     gate_probability: float,
     follows: bool = True,
+    time_s: Floats | None = None,
     ignored: Sequence[tuple[int, int, int]] = (),
     possible: Sequence[int] = (),
 ) -> Model:
@@ -156,6 +171,7 @@ def make_model(
 
     ``ignored``: measurements (kind, first tick, last tick) that are not used; ``possible``: errors that other events could change.
     """
+    kept = np.ones(state.N) if time_s is None else np.exp(-period_s / time_s)
     involved = {e for event in events for e in range(event.place, event.place + event.count)} | set(possible)
     active = np.array([e for e in range(state.N) if e < state.GYRO_BIAS or std[e] or walk[e] or e in involved])
     position = {int(e): i for i, e in enumerate(active)}
@@ -175,8 +191,8 @@ def make_model(
         active=active,
         depends=depends,
         counts=counts,
-        kept=np.ones(active.size),
-        noise=np.square(walk[active]) * period_s,
+        kept=kept[active],
+        noise=np.square(walk[active]) * period_s + np.square(std[active]) * (1.0 - kept[active] ** 2),
         gates=gates,
         patience=_find_patience(m, follows=follows),
         mount=position.get(state.MOUNT, -1),

@@ -33,8 +33,8 @@ GRAVITY_MPS2 = 9.80665  # standard gravity (CGPM 1901)
 THETA, RHO, U, GYRO_BIAS, ACCELEROMETER_BIAS = 0, 3, 6, 9, 12
 ARM, FIX_LAG, FIX_ERROR, FIX_OFFSET = 15, 18, 19, 22
 WHEEL_SCALE, VISUAL_SCALE, SHARED_SCALE, TURN_SCALE, TURNING_CENTRE = 25, 26, 27, 28, 29
-MOUNT, VISUAL_MOUNT, WHEEL_LAG, VISUAL_LAG = 30, 33, 35, 36
-N = 37
+MOUNT, VISUAL_MOUNT, WHEEL_LAG, VISUAL_LAG, WHEEL_SLIP, VISUAL_SLIP = 30, 33, 35, 36, 37, 38
+N = 39
 """Errors; their meaning from `ARM` on: `tcpipe.fusion.parameters.PARAMETERS`."""
 NX = N + 6
 MOVING = 15
@@ -219,8 +219,8 @@ def predict_measurement(
     if kind == SIDEWAYS:
         out[0], out[1] = v1 + w2 * x[TURNING_CENTRE + 6], v2
     elif kind == WHEELS:
-        out[0] = v0 * (1.0 + x[WHEEL_SCALE + 6] + x[SHARED_SCALE + 6])
+        out[0] = v0 * (1.0 + x[WHEEL_SCALE + 6] + x[WHEEL_SLIP + 6] + x[SHARED_SCALE + 6])
     else:
         c1, c2 = x[VISUAL_MOUNT + 6], x[VISUAL_MOUNT + 7]
-        s = 1.0 + x[VISUAL_SCALE + 6] + x[SHARED_SCALE + 6]
+        s = 1.0 + x[VISUAL_SCALE + 6] + x[VISUAL_SLIP + 6] + x[SHARED_SCALE + 6]
         out[0], out[1], out[2] = s * (v0 - c1 * v2 + c2 * v1), s * (v1 - c2 * v0), s * (v2 + c1 * v0)

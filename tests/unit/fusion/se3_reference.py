@@ -81,7 +81,7 @@ def move(x, tick):
 
 
 def differentiate_motion(x, tick):
-    """Return the Jacobian of the errors after a tick for those before, (37, 37)."""
+    """Return the Jacobian of the errors after a tick for those before, (39, 39)."""
     T, (R, _, u), F = tick.T, split(x), np.eye(state.N)
     th, rho, vel, bg, ba = (slice(k, k + 3) for k in range(0, 15, 3))
     b, a = part(x, state.GYRO_BIAS), part(x, state.ACCELEROMETER_BIAS)
@@ -139,8 +139,8 @@ def expect(kind, x, look):
     shared = x[state.SHARED_SCALE + 6]
     c = np.append(0.0, part(x, state.VISUAL_MOUNT, 2))
     return {
-        state.WHEELS: (1 + shared + x[state.WHEEL_SCALE + 6]) * v[:1],
-        state.VISUAL: (1 + shared + x[state.VISUAL_SCALE + 6]) * (EYE - skew(c)) @ v,
+        state.WHEELS: (1 + shared + x[state.WHEEL_SCALE + 6] + x[state.WHEEL_SLIP + 6]) * v[:1],
+        state.VISUAL: (1 + shared + x[state.VISUAL_SCALE + 6] + x[state.VISUAL_SLIP + 6]) * (EYE - skew(c)) @ v,
         state.SIDEWAYS: np.array([v[1] + w[2] * x[state.TURNING_CENTRE + 6], v[2]]),
         state.STATIONARY: u,
         state.STATIONARY_RATE: part(x, state.GYRO_BIAS),
@@ -149,7 +149,7 @@ def expect(kind, x, look):
 
 
 def differentiate_measurement(kind, x, look):
-    """Return the Jacobian of a measurement for the errors, (size, 37)."""
+    """Return the Jacobian of a measurement for the errors, (size, 39)."""
     R, _, u = split(x)
     H = np.zeros((3, state.N))
     th, rho, vel, bg = (slice(k, k + 3) for k in (state.THETA, state.RHO, state.U, state.GYRO_BIAS))
@@ -194,11 +194,12 @@ def differentiate_measurement(kind, x, look):
         H[0, bg] -= gyro * centre * turn[2]
         H[0, mount] += centre * skew(w)[2]
         return H
-    own = state.WHEEL_SCALE if kind == state.WHEELS else state.VISUAL_SCALE
-    scale = 1 + x[state.SHARED_SCALE + 6] + x[own + 6]
+    by_wheels = [state.WHEEL_SCALE, state.WHEEL_SLIP, state.SHARED_SCALE]
+    scales = by_wheels if kind == state.WHEELS else [state.VISUAL_SCALE, state.VISUAL_SLIP, state.SHARED_SCALE]
+    scale = 1 + sum(x[place + 6] for place in scales)
     look_axes = EYE if kind == state.WHEELS else EYE - skew(np.append(0.0, part(x, state.VISUAL_MOUNT, 2)))
     H = scale * look_axes @ V
-    H[:, own] = H[:, state.SHARED_SCALE] = look_axes @ v
+    H[:, scales] = (look_axes @ v)[:, None]
     if kind == state.WHEELS:
         return H[:1]
     H[:, state.VISUAL_MOUNT : state.VISUAL_MOUNT + 2] = scale * skew(v)[:, 1:]

@@ -9,7 +9,8 @@ from unit.fusion import se3_reference as reference
 
 from tcpipe.fusion import error_state, state
 from tcpipe.fusion.error_state import filter_section, make_tests, smooth_section
-from tcpipe.fusion.filter_kernel import ACCEPTED, EVERY, REJECTED, RESET, Inputs, Memory, allocate_steps, filter_ticks
+from tcpipe.fusion.filter_kernel import ACCEPTED, REJECTED, RESET, Inputs, Memory, allocate_steps, filter_ticks
+from tcpipe.fusion.smoother_kernel import EVERY
 from tcpipe.fusion.measurements import Measurements
 from tcpipe.fusion.parameters import Event, make_model
 from tcpipe.fusion.ticks import Ticks
@@ -176,7 +177,7 @@ class Problem:
 
     def __init__(self, seed, mode, ticks=60):
         rng = np.random.default_rng(seed)
-        free = {*FAULTY} - {*range(state.FIX_OFFSET, state.FIX_OFFSET + 3), state.SHARED_SCALE}
+        free = {*FAULTY} - {*range(state.FIX_OFFSET, state.FIX_OFFSET + 3), state.SHARED_SCALE, state.VISUAL_SLIP}
         free -= {state.TURN_SCALE} if mode >= state.GYRO_TURN else {*range(state.GYRO_BIAS, state.ARM)}
         walking = {state.WHEEL_SCALE, state.VISUAL_SCALE} | ({*range(state.GYRO_BIAS, state.ARM)} & free)
         std, walk = np.zeros(state.N), np.zeros(state.N)
@@ -275,8 +276,8 @@ def test_filter_and_smoother_solve_the_least_squares_problem_of_all_ticks(monkey
         assert np.abs(off).max() < 0.1
         R = states[k][:9].reshape(3, 3)
         position = R @ wanted[3:6, 3:6] @ R.T
-        assert np.diag(position) == pytest.approx(found.variances[k, :3], rel=0.01)
-        assert wanted[6, 6] == pytest.approx(found.variances[k, 4], rel=0.01)
+        assert np.diag(position) == pytest.approx(found.variances[k, :3], rel=0.02)
+        assert wanted[6, 6] == pytest.approx(found.variances[k, 4], rel=0.02)
         mount = [list(active).index(e) for e in range(state.MOUNT, state.MOUNT + 3)]
         turned = maps[k][:3] + maps[k][mount]
         robot = R @ (np.eye(3) + reference.skew(states[k][state.MOUNT + 6 : state.MOUNT + 9]))

@@ -1,0 +1,282 @@
+"""Backward pass of the error-state filter: its smoother.
+
+The smoother is that of Bryson and Frazier in the form of Bierman: it inverts no covariance, so parameters may be known exactly. Back in
+time over each update (gain K, innovation y of covariance S; G turns the axes of the error with the correction) and each motion F::
+
+    l ← G' l, Λ ← G' Λ G    l ← (I - K H)' l - H' S⁻¹ y,  Λ ← (I - K H)' Λ (I - K H) + H' S⁻¹ H    l ← F' l, Λ ← F' Λ F
+    x_s = x - P l    P_s = P - P Λ P    cov(d_j, d_k) = P_j (product of all transitions from j to k)' (I - Λ_k P_k),  j < k
+
+Reference: G. J. Bierman, "Fixed interval smoothing with discrete measurements", International Journal of Control 18 (1), 1973.
+"""
+
+from __future__ import annotations
+
+from math import sqrt
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from tcpipe.compiled import compile_kernel
+from tcpipe.fusion.filter_kernel import MOTION_WITH_GYRO, MOTION_WITHOUT_GYRO, Indices, Inputs, Model, Steps, turn_rows
+from tcpipe.fusion.state import GYRO_TURN, KINDS, RHO, SIZES, Matrix, N, U, Vector, displace_state
+
+
+class Smoothed(NamedTuple):
+    """Smoothed estimate by tick.
+
+    Attributes
+    ----------
+    states : x, (K, 45).
+    variances : of the position east, north, up [m²], yaw [rad²] and forward velocity [m²/s²], (K, 5).
+    links : variance of the horizontal displacement, along its direction, from a tick to the one each of the lags later [m²], (K, l); NaN
+        where it was not computed: it is at every `EVERY` ticks.
+    spreads : standard deviation of every active error every `SELDOM` ticks, (K / SELDOM, n).
+    """
+
+    states: Matrix
+    variances: Matrix
+    links: Matrix
+    spreads: Matrix
+
+
+EVERY, SELDOM = 4, 100
+
+
+class Adjoint(NamedTuple):
+    """What the smoother carries back in time.
+
+    Attributes
+    ----------
+    information : Λ, (n, n).
+    rows : l, and for each of Q ticks ahead the columns of I - Λ P that belong to its position east and north, (1 + 2 Q, n).
+    ticks : of those ticks, (Q,); -1: none.
+    ends : of those ticks, position east and north, and their smoothed covariance (ee, en, nn), (Q, 5).
+    """
+
+    information: Matrix
+    rows: Matrix
+    ticks: Indices
+    ends: Matrix
+
+
+@compile_kernel
+def _step_before_update(
+    K: Matrix, H: Matrix, size: int, pull: Vector, inverse: Matrix, turn: Vector, adjoint: Adjoint, B: Matrix
+) -> None:
+    """Take the adjoint back over one update."""
+    information, rows = adjoint.information, adjoint.rows
+    n = information.shape[0]
+    turn_rows(rows.T, turn, rows.shape[0], True)
+    turn_rows(information, turn, n, True)
+    turn_rows(information.T, turn, n, True)
+    for r in range(rows.shape[0]):
+        for a in range(size):
+            s = 0.0
+            for i in range(n):
+                s += K[a, i] * rows[r, i]
+            B[a, 0] = s + (pull[a] if r == 0 else 0.0)
+        for a in range(size):
+            f = B[a, 0]
+            for i in range(n):
+                rows[r, i] -= H[a, i] * f
+    for a in range(size):  # B = K' Λ
+        for j in range(n):
+            B[a, j] = 0.0
+        for i in range(n):
+            f = K[a, i]
+            for j in range(n):
+                B[a, j] += f * information[i, j]
+    for a in range(size):
+        for b in range(size):
+            s = inverse[a, b]
+            for j in range(n):
+                s += B[a, j] * K[b, j]
+            B[a, n + b] = 0.5 * s
+    for a in range(size):
+        for b in range(size):
+            f = B[a, n + b]
+            for j in range(n):
+                B[a, n + 3 + j] = (B[a, n + 3 + j] if b > 0 else 0.0) + f * H[b, j]
+        for j in range(n):
+            B[a, j] -= B[a, n + 3 + j]
+    for a in range(size):
+        for i in range(n):
+            h, f = H[a, i], B[a, i]
+            for j in range(n):
+                information[i, j] -= h * B[a, j] + f * H[a, j]
+
+
+@compile_kernel
+def _step_before_motion(F: Matrix, kept: Vector, places: Indices, m: int, adjoint: Adjoint, W: Matrix) -> None:
+    """Take the adjoint back over the motion of a tick."""
+    information, rows = adjoint.information, adjoint.rows
+    n = information.shape[0]
+    for i in range(n):
+        f = kept[i]
+        if f != 1.0:
+            for j in range(n):
+                information[i, j] *= f
+                information[j, i] *= f
+            for r in range(rows.shape[0]):
+                rows[r, i] *= f
+    for r in range(rows.shape[0]):
+        for a in range(m):
+            W[0, a] = rows[r, places[a]]
+        for b in range(m):
+            s = 0.0
+            for a in range(m):
+                s += F[a, b] * W[0, a]
+            rows[r, places[b]] = s
+    for _ in range(2):  # F' from the left, twice: Λ is symmetric
+        for b in range(m):
+            for j in range(n):
+                W[b, j] = 0.0
+        for a in range(m):
+            for b in range(m):
+                f = F[a, b]
+                for j in range(n):
+                    W[b, j] += f * information[places[a], j]
+        for b in range(m):
+            for j in range(n):
+                information[places[b], j] = W[b, j]
+        for i in range(n):
+            for j in range(i):
+                s = information[i, j]
+                information[i, j] = information[j, i]
+                information[j, i] = s
+
+
+@compile_kernel
+def _smooth_tick(
+    k: int, P: Matrix, x: Vector, model: Model, adjoint: Adjoint, lags: Indices, out: Smoothed, A: Matrix, room: Any
+) -> None:
+    """Fill the smoothed estimate at tick k."""
+    information, rows, ticks, ends = adjoint
+    d, turn, c, after = room
+    n = P.shape[0]
+    for e in range(N):
+        d[e] = 0.0
+    for i in range(n):
+        s = 0.0
+        for j in range(n):
+            s -= P[i, j] * rows[0, j]
+        d[model.active[i]] = s
+    displace_state(x, d, 1.0, out.states[k], turn)
+    # The covariance of rotation, position and velocity; of all errors now and then.
+    count = n if k % SELDOM == 0 else 9
+    for i in range(n):
+        if i >= count and not model.mount <= i < model.mount + 3:
+            continue
+        for j in range(n):
+            A[i, j] = 0.0
+        for b in range(n):
+            f = P[i, b]
+            for j in range(n):
+                A[i, j] += f * information[b, j]
+    if count == n:
+        for i in range(n):
+            s = P[i, i]
+            for j in range(n):
+                s -= A[i, j] * P[j, i]
+            out.spreads[k // SELDOM, i] = sqrt(max(s, 0.0))
+    size = 9 if model.mount < 0 else 12
+    for i in range(size):
+        row = i if i < 9 else model.mount + i - 9
+        for j in range(size):
+            column = j if j < 9 else model.mount + j - 9
+            s = P[row, column]
+            for b in range(n):
+                s -= A[row, b] * P[b, column]
+            c[i, j] = s
+    for i in range(3, size - 6):  # the robot turns with the IMU and with its mounting
+        for j in range(size):
+            c[i - 3, j] += c[6 + i, j]
+    for i in range(3, size - 6):
+        for j in range(size):
+            c[j, i - 3] += c[j, 6 + i]
+    for axis in range(3):
+        s = 0.0
+        for i in range(3):
+            for j in range(3):
+                s += x[3 * axis + i] * x[3 * axis + j] * c[RHO + i, RHO + j]
+        out.variances[k, axis] = s
+    level2 = max(x[0] * x[0] + x[3] * x[3], 1e-6)  # yaw = atan2(R10, R00)
+    jy, jz = x[7] / level2, x[8] / level2
+    out.variances[k, 3] = jy * jy * c[1, 1] + 2.0 * jy * jz * c[1, 2] + jz * jz * c[2, 2]
+    out.variances[k, 4] = c[U, U]
+    # Displacements to later ticks, along their direction.
+    for q in range(ticks.size):
+        for column in range(lags.size):
+            if ticks[q] < 0 or ticks[q] - k != lags[column]:
+                continue
+            east, north = ends[q, 0] - out.states[k, 9], ends[q, 1] - out.states[k, 10]
+            length = max(sqrt(east * east + north * north), 1e-12)
+            east, north = east / length, north / length
+            s = east * east * ends[q, 2] + 2.0 * east * north * ends[q, 3] + north * north * ends[q, 4]
+            for i in range(3):
+                ai = east * x[i] + north * x[3 + i]
+                for j in range(3):
+                    s += ai * (east * x[j] + north * x[3 + j]) * c[RHO + i, RHO + j]
+                line = P[RHO + i]
+                for j in range(n):
+                    s -= 2.0 * ai * line[j] * (east * rows[1 + 2 * q, j] + north * rows[2 + 2 * q, j])
+            out.links[k, column] = max(s, 0.0)
+    if k % EVERY == 0:
+        q = (k // EVERY) % ticks.size
+        ticks[q] = k
+        ends[q, 0], ends[q, 1] = out.states[k, 9], out.states[k, 10]
+        for axis in range(2):
+            for b in range(axis, 2):
+                s = 0.0
+                for i in range(3):
+                    for j in range(3):
+                        s += x[3 * axis + i] * x[3 * b + j] * c[RHO + i, RHO + j]
+                ends[q, 2 + axis + b] = s
+            for j in range(n):
+                after[j] = 0.0
+                for i in range(3):
+                    after[j] += P[RHO + i, j] * x[3 * axis + i]
+            for i in range(n):
+                s = x[3 * axis + i - RHO] if RHO <= i < RHO + 3 else 0.0
+                for j in range(n):
+                    s -= information[i, j] * after[j]
+                rows[1 + 2 * q + axis, i] = s
+
+
+@compile_kernel
+def smooth_ticks(
+    first: int,
+    last: int,
+    inputs: Inputs,
+    model: Model,
+    steps: Steps,
+    states: Matrix,
+    lags: Indices,
+    adjoint: Adjoint,
+    out: Smoothed,
+) -> None:
+    """Smooth ticks ``last - 1`` down to ``first``.
+
+    Parameters
+    ----------
+    steps, states : of these ticks, as `filter_ticks` filled them.
+    lags : ticks over which displacements are wanted.
+    adjoint : of tick ``last`` before its motion; becomes that of ``first`` before its motion.
+    out : filled for these ticks.
+    """
+    n = adjoint.information.shape[0]
+    A, B = np.zeros((n, n)), np.zeros((3, 2 * n + 3))
+    room = (np.zeros(N), np.zeros(9), np.zeros((12, 12)), np.zeros(n))
+    for k in range(last - 1, first - 1, -1):
+        row = k - first
+        _smooth_tick(k, steps.P[row], states[k], model, adjoint, lags, out, A, room)
+        for kind in range(KINDS - 1, -1, -1):
+            if steps.used[row, kind]:
+                _step_before_update(
+                    steps.K[row, kind], steps.H[row, kind], SIZES[kind], steps.pull[row, kind],
+                    steps.inverse[row, kind], steps.turn[row, kind], adjoint, B,
+                )  # fmt: skip
+        if k > 0:
+            motion = MOTION_WITH_GYRO if inputs.mode[k] >= GYRO_TURN else MOTION_WITHOUT_GYRO
+            places, m = model.depends[motion], model.counts[motion]
+            _step_before_motion(steps.F[row], steps.kept[row], places, m, adjoint, A)
