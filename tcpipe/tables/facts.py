@@ -104,9 +104,9 @@ class GateReset:
 
 @dataclass(frozen=True, slots=True)
 class ChangeFacts:
-    """A change that explains a contradiction: its kind (offset, antenna, clock, gyroscope, scale, pose, useless), sensor and span.
+    """A change that explains a contradiction: its kind (offset, wander, antenna, clock, gyroscope, scale, pose, useless), sensor and span.
 
-    ``size``: largest innovation of fixes there [m]; 0 of another sensor.
+    ``size``: median innovation of fixes there [m]; 0 of another sensor.
     """
 
     kind: str
