@@ -153,7 +153,7 @@ def run_error_state(m: Measurements, initial: InitialState, *, output_ns: Ints, 
 
 
 def _has_dead_reckoning(m: Measurements) -> bool:
-    """Return whether an IMU and an odometry, or a camera that sees all turns, carry the pose on without fixes, so that these can be judged."""
+    """Return whether an IMU and an odometry, or a camera that sees all turns, carry the pose on without fixes: these can be judged."""
     return bool(m.odometries()) if m.imu is not None else m.visual is not None and m.visual.turn_rate_radps is not None
 
 
