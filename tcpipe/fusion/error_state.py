@@ -26,7 +26,7 @@ from tcpipe.fusion.filter_kernel import (
     allocate_steps,
     filter_ticks,
 )
-from tcpipe.fusion.hypotheses import POSSIBLE, Hypothesis, compute_weights, explain, find_suspects
+from tcpipe.fusion.hypotheses import POSSIBLE, Hypothesis, Pass, compute_weights, explain, find_suspects
 from tcpipe.fusion.initial import compute_course, find_stationary_intervals
 from tcpipe.fusion.measurements import DOPPLER, GNSS, IMU, VISUAL, WHEELS, InitialState, Measurements
 from tcpipe.fusion.parameters import PARAMETERS, expand_start, make_model, make_priors, make_start
@@ -57,18 +57,6 @@ _LEVELLING_S = 60.0
 _ANY_YAW_STD_RAD = np.pi / np.sqrt(3.0)
 _MANY_FIXES = 50
 _UNCHANGED = Hypothesis((), 0.0)
-
-
-@dataclass(slots=True)
-class Pass:
-    """One forward pass over a section: its model, checkpoints, tests, and filtered states by tick."""
-
-    ticks: Ticks
-    model: Model
-    checkpoints: list[Memory]
-    tests: Tests
-    states: Floats
-    last: Memory
 
 
 def make_tests(size: int) -> Tests:

@@ -13,17 +13,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.fusion import state
-from tcpipe.fusion.filter_kernel import ACCEPTED, NONE, Tests
+from tcpipe.fusion.filter_kernel import ACCEPTED, NONE, Memory, Model, Tests
 from tcpipe.fusion.parameters import Event
-
-if TYPE_CHECKING:
-    from tcpipe.fusion.error_state import Pass
+from tcpipe.fusion.ticks import Ticks
 
 Floats = NDArray[np.float64]
 
@@ -48,6 +45,18 @@ _TEMPER = 8.0
 """Errors of measurements last: so many of them tell as much as an independent one."""
 _NEAR = 2.5 * _TEMPER
 _MOST_RIVALS = 2
+
+
+@dataclass(slots=True)
+class Pass:
+    """One forward pass over a section: its model, checkpoints, tests, and filtered states by tick."""
+
+    ticks: Ticks
+    model: Model
+    checkpoints: list[Memory]
+    tests: Tests
+    states: Floats
+    last: Memory
 
 
 @dataclass(frozen=True, slots=True)
