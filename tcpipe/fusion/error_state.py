@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from tcpipe.errors import FusionError
 from tcpipe.fusion import state
 from tcpipe.fusion.densities import NoiseModel, estimate_noise
+from tcpipe.fusion.event_candidates import find_turn_jump
 from tcpipe.fusion.filter_kernel import (
     REJECTED,
     RESET,
@@ -26,7 +27,7 @@ from tcpipe.fusion.filter_kernel import (
     allocate_steps,
     filter_ticks,
 )
-from tcpipe.fusion.hypotheses import POSSIBLE, Hypothesis, Pass, compute_weights, explain, find_suspects
+from tcpipe.fusion.hypotheses import POSSIBLE, Hypothesis, compute_weights, explain, find_suspects
 from tcpipe.fusion.initial import compute_course, find_stationary_intervals
 from tcpipe.fusion.measurements import DOPPLER, GNSS, IMU, VISUAL, WHEELS, InitialState, Measurements
 from tcpipe.fusion.parameters import PARAMETERS, expand_start, make_model, make_priors, make_start
@@ -41,7 +42,7 @@ from tcpipe.fusion.process import (
     is_turned_by_course,
 )
 from tcpipe.fusion.smoother_kernel import EVERY, SELDOM, Adjoint, Smoothed, smooth_ticks
-from tcpipe.fusion.ticks import Ticks, build_ticks
+from tcpipe.fusion.ticks import Pass, Ticks, build_ticks
 from tcpipe.fusion.trajectory import DISPLACEMENT_LAGS_S, Rejections, Trajectory
 from tcpipe.geometry.rotation import matrix_from_quat, quat_from_matrix, quat_from_rpy
 from tcpipe.tables.facts import ChangeFacts, GateReset, ParameterFacts, StretchFacts, make_vector
@@ -141,7 +142,7 @@ def run_error_state(m: Measurements, initial: InitialState, *, output_ns: Ints, 
 
 
 def _has_dead_reckoning(m: Measurements) -> bool:
-    """Return whether an IMU and an odometry, or a camera that sees all turns, carry the pose on without fixes: these can be judged."""
+    """Return whether an IMU and an odometry, or a camera that sees all turns, carry the pose on, so that fixes can be judged."""
     return bool(m.odometries()) if m.imu is not None else m.visual is not None and m.visual.turn_rate_radps is not None
 
 
@@ -174,11 +175,12 @@ class _Section:
     def filter(self, start: Memory, hypothesis: Hypothesis) -> Pass:
         """Return the forward pass under a hypothesis."""
         model = self.model(hypothesis)
-        return filter_section(self.ticks, model, expand_start(start, self.model(), model))
+        return filter_section(hypothesis.alter_ticks(self.ticks), model, expand_start(start, self.model(), model))
 
     def explain(self, made: Pass, start: Memory) -> list[Hypothesis]:
         """Return the hypotheses that explain where sensors contradict each other, the best first; none where they do not."""
-        if not find_suspects(made.tests, self.ticks.inputs.period_s):
+        jump = find_turn_jump(self.measurements)
+        if jump is None and not find_suspects(made.tests, self.ticks.inputs.period_s):
             return []
         model = self.model(judges=True)
         plain = filter_section(self.ticks, model, expand_start(start, self.model(), model))
@@ -186,9 +188,10 @@ class _Section:
         def run(changed: Hypothesis, first: int, last: int) -> Pass:
             block = first // _BLOCK
             begin = plain.checkpoints[block]
-            return filter_section(self.ticks, self.model(changed, judges=True), begin, begin=block * _BLOCK, until=last)
+            ticks = changed.alter_ticks(self.ticks)
+            return filter_section(ticks, self.model(changed, judges=True), begin, begin=block * _BLOCK, until=last)
 
-        return explain(plain, run, frozenset(model.active.tolist()))
+        return explain(plain, run, frozenset(model.active.tolist()), jump)
 
 
 def widen(best: Smoothed, rivals: Sequence[Smoothed], weights: Floats, period_s: float) -> None:
@@ -394,7 +397,7 @@ def _correct_measurements(
     m: Measurements, made: Pass, smoothed: Smoothed, explained: Sequence[Hypothesis]
 ) -> Measurements:
     """Return fixes and odometry without what the estimate found to be wrong with them, as the audit compares them with the track."""
-    changes = [c for each in explained for c in each.changes if c.kind == "useless"]
+    changes = [c for each in explained for c in each.changes if c.kind in {"useless", "offset", "wander"}]
     rows, found = made.ticks.rows, {}
     for kind, name in ((state.FIX, "gnss"), (state.WHEELS, "wheels"), (state.VISUAL, "visual")):
         source = getattr(m, name)
@@ -406,7 +409,7 @@ def _correct_measurements(
             rotation = smoothed.states[tick, :9].reshape(-1, 3, 3)
             moved = x[:, state.ARM : state.ARM + 3] - np.asarray(source.lever_arm_m)
             late = x[:, state.FIX_LAG, None] * np.einsum("nij,nj->ni", rotation, x[:, state.U : state.U + 3])
-            off = np.einsum("nij,nj->ni", rotation, moved) - late + x[:, state.FIX_OFFSET : state.FIX_OFFSET + 3]
+            off = np.einsum("nij,nj->ni", rotation, moved) - late
             corrected = replace(source, position_enu_m=source.position_enu_m - off)
         else:
             places = (
@@ -431,11 +434,10 @@ def _select_rows(source: Any, kept: NDArray[np.bool_]) -> Any:
 
 
 def _list_changes(made: Pass, explained: Sequence[Hypothesis]) -> Iterator[ChangeFacts]:
-    """Yield the changes that explain the run best, with the size of the fixes' innovation there."""
+    """Yield the changes that explain the run best."""
     for change in (c for each in explained for c in each.changes):
         last = change.last or made.states.shape[0] - 1
-        off = np.linalg.norm(made.tests.fix_innovation[change.first : last, :2], axis=1)
-        size = float(np.nanmax(off, initial=0.0)) if change.role == state.FIX else 0.0
+        size = 0.0 if change.kind == "gyroscope" else change.size
         role = IMU if change.kind == "gyroscope" else ROLES[change.role]
         start_ns, end_ns = made.ticks.stamp_ns[[change.first, last]].tolist()
         yield ChangeFacts(change.kind, role, start_ns, end_ns, size)

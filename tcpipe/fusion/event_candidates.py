@@ -12,8 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from tcpipe.fusion.densities import NoiseModel
-from tcpipe.fusion.measurements import GNSS
-from tcpipe.fusion.pair_residuals import TURN, Residuals
+from tcpipe.fusion.level_motion import find_turn_roles, get_turn_rates
+from tcpipe.fusion.measurements import GNSS, IMU, Measurements
+from tcpipe.fusion.pair_residuals import TURN, Residuals, align_turns
+from tcpipe.fusion.signals import compute_interval_means, compute_seconds, is_covered
 
 _GATE = 4.0  # standard deviations
 _FEWEST = 3  # overlapping windows
@@ -82,3 +84,86 @@ def _find_runs(each: Residuals, noise: NoiseModel) -> Iterator[EventCandidate]:
             each.pair, each.axis, each.time_s, start_ns, int(each.end_ns[rows[-1]]), at_ns,
             float(each.value[worst]), float(abs(z[worst])), int(rows.size),
         )  # fmt: skip
+
+
+_STEP_S = 0.5
+_BLOCK_S = 10.0
+_AROUND_S, _LEAST_S = 60.0, 15.0  # compared before and after a jump
+_FAR = 4.0  # standard deviations beyond which a turn is a slip
+_JUMPS = 8.0  # standard deviations
+_LEAST_JUMP_RADPS = 0.003
+_MAD = 1.4826
+_MOST_GAIN = 50.0
+_ROUNDS = 4
+
+
+@dataclass(frozen=True, slots=True)
+class TurnJump:
+    """A jump of the gyroscope's bias, by the turns of an odometry.
+
+    Attributes
+    ----------
+    at_ns, time_std_s : [ns] when, and how well that is known [s].
+    change, std : [rad/s].
+    gain : log likelihood against none.
+    """
+
+    at_ns: int
+    time_std_s: float
+    change: float
+    std: float
+    gain: float
+
+
+def find_turn_jump(m: Measurements) -> TurnJump | None:
+    """Return the largest jump of the gyroscope's vertical bias that turns of camera or wheels show; None if there is none."""
+    roles = find_turn_roles(m)
+    if m.imu is None or len(roles) < 2:
+        return None
+    found = [jump for role in roles if role != IMU for jump in _find_jumps(m, role)]
+    return max(found, key=lambda jump: abs(jump.change) / jump.std, default=None)
+
+
+def _find_jumps(m: Measurements, role: str) -> Iterator[TurnJump]:
+    """Yield the largest jump by one odometry."""
+    sources = [get_turn_rates(m, each) for each in (IMU, role)]
+    begin_ns, end_ns = (
+        max(int(stamp_ns[0]) for stamp_ns, _ in sources),
+        min(int(stamp_ns[-1]) for stamp_ns, _ in sources),
+    )
+    edges_ns = np.arange(begin_ns, end_ns, round(_STEP_S * 1e9))
+    around, least, block = (round(each / _STEP_S) for each in (_AROUND_S, _LEAST_S, _BLOCK_S))
+    if edges_ns.size <= 2 * least + block:
+        return
+    edges_s = compute_seconds(edges_ns, begin_ns)
+    turns = []
+    for stamp_ns, rate in sources:
+        mean = compute_interval_means(compute_seconds(stamp_ns, begin_ns), rate[:, 2:], edges_s[:-1], edges_s[1:])[:, 0]
+        turns.append(np.where(is_covered(stamp_ns, edges_ns[:-1], edges_ns[1:]), mean, np.nan) * _STEP_S)
+    known = np.isfinite(turns).all(axis=0)
+    if known.sum() <= 2 * least + block:
+        return
+    turn = np.cumsum(np.stack(turns, -1)[known], axis=0)
+    rows = np.arange(least, len(turn) - least)
+    before, after = np.minimum(rows, around), np.minimum(len(turn) - 1 - rows, around)
+    jumped = np.zeros(len(turn))
+    for _ in range(_ROUNDS):  # the scale is fitted without the jump
+        aligned = align_turns(turn - np.column_stack((jumped, 0.0 * jumped)), block) + jumped
+        off = np.diff(aligned) / _STEP_S
+        off -= np.median(off)
+        scatter = _MAD * np.median(np.abs(off)) + 1e-9
+        off = off.clip(-_FAR * scatter, _FAR * scatter)
+        total = np.concatenate(([0.0], np.cumsum(off)))
+        step = (total[rows + after] - total[rows]) / after - (total[rows] - total[rows - before]) / before
+        blocks = off[: off.size // block * block].reshape(-1, block).mean(1)
+        # Differences of neighbours hold no jump, but for one of them.
+        density = np.square(_MAD * np.median(np.abs(np.diff(blocks)))) / 2.0 * block
+        std = np.sqrt(density * (1.0 / before + 1.0 / after)) + 1e-9
+        top = int(np.argmax(np.abs(step) / std))
+        change, spread = float(step[top]), float(std[top])
+        jumped = change * _STEP_S * np.arange(-rows[top], len(turn) - rows[top]).clip(0)
+    if abs(change) < max(_JUMPS * spread, _LEAST_JUMP_RADPS):
+        return
+    time_std_s = max(_STEP_S, 2.0 * density * _STEP_S / change**2)
+    at_ns = int(edges_ns[:-1][known][rows[top] + 1])
+    yield TurnJump(at_ns, time_std_s, change, spread, min(_MOST_GAIN, 0.5 * (change / spread) ** 2))

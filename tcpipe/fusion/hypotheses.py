@@ -1,10 +1,11 @@
 """What may have happened where sensors contradict each other for a while: hypotheses, each scored by the evidence of all measurements.
 
-A hypothesis is a set of at most three changes. A change makes one block of the state uncertain at a tick, and where it ends makes it what
-it was: fixes are off by a constant, the antenna was moved, a clock stepped, a gyroscope's bias jumped, the scale of an odometry changed,
-the robot was carried, a sensor is useless for a while. Each hypothesis runs the filter over the same measurements, predicted whether they
-are used or not; its score is the log likelihood, with what lies beyond the gate counted as the gate, less a cost by kind. The changes
-that explain most are found one after the other; hypotheses that are nearly as good widen the deviations where they differ.
+A hypothesis is a set of changes. A change makes one block of the state uncertain at a tick, and where it ends makes it what it was: fixes
+are off by a constant, the antenna was moved, a clock stepped, a gyroscope's bias jumped, the scale of an odometry changed, the robot was
+carried, a sensor is useless for a while. Fixes do not err for ever: where nothing tells when they did, their lasting error is taken to be
+larger around a step. Each hypothesis runs the filter over the same measurements, predicted whether they are used or not; its score is the
+log likelihood, with what lies beyond the gate counted as the gate, less a cost by kind. The changes that explain most are found one after
+the other; hypotheses that are nearly as good widen the deviations where they differ.
 
 Blame is never what is left when a sensor is ignored: without fixes everything is explained.
 """
@@ -18,9 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.fusion import state
-from tcpipe.fusion.filter_kernel import ACCEPTED, NONE, Memory, Model, Tests
+from tcpipe.fusion.event_candidates import TurnJump
+from tcpipe.fusion.filter_kernel import ACCEPTED, NONE, REJECTED, Tests
 from tcpipe.fusion.parameters import Event
-from tcpipe.fusion.ticks import Ticks
+from tcpipe.fusion.ticks import Pass, Ticks
 
 Floats = NDArray[np.float64]
 
@@ -35,8 +37,11 @@ POSSIBLE = (
 _FEWEST = 5  # rejections in a row
 _LASTS_S = {state.FIX: 1.0, state.WHEELS: 10.0, state.VISUAL: 10.0}  # wheels slip for seconds
 _TOGETHER_S = 5.0
-_MOST_SUSPECTS = 3
 _MOST_CHANGES = 3
+_CARRIED_M = 1.0  # a jump that is smaller is one of the fixes
+_ERR_FOR_S = 40.0
+_MUCH_SHORTER = 0.25
+_ALIKE = 0.4  # of the size of an innovation
 _HORIZON_S = 60.0
 """How far the score looks beyond the last contradiction."""
 _SURELY = 20.0
@@ -47,47 +52,67 @@ _NEAR = 2.5 * _TEMPER
 _MOST_RIVALS = 2
 
 
-@dataclass(slots=True)
-class Pass:
-    """One forward pass over a section: its model, checkpoints, tests, and filtered states by tick."""
-
-    ticks: Ticks
-    model: Model
-    checkpoints: list[Memory]
-    tests: Tests
-    states: Floats
-    last: Memory
-
-
 @dataclass(frozen=True, slots=True)
 class Change:
-    """One change: its kind, the sensor it is of, and its first and last tick (None: to the end of the section)."""
+    """One change: its kind, the sensor it is of, and its first and last tick (None: to the end of the section).
+
+    ``size``: how far fixes are off [m]; ``steps_at``: the tick at which their error changes at once. ``jump``: of a gyroscope, where its
+    turns tell it.
+    """
 
     kind: str
     role: int
     first: int
     last: int | None = None
+    size: float = 0.0
+    steps_at: int | None = None
+    jump: TurnJump | None = None
 
     @property
     def cost(self) -> float:
-        """Log of how unlikely it is beforehand."""
-        return _COSTS[self.kind] + (0.0 if self.last is None else 2.0)
+        """Log of how unlikely it is beforehand, less what the turns tell of it."""
+        return _COSTS[self.kind] + (0.0 if self.last is None else 2.0) - (0.0 if self.jump is None else self.jump.gain)
 
     @property
     def blocks(self) -> tuple[tuple[int, int, float], ...]:
         """Errors that it changes: the first, their number, and by how much [their unit]."""
-        return _BLOCKS.get((self.kind, self.role), ())
+        blocks = _BLOCKS.get((self.kind, self.role), ())
+        if self.jump is not None:  # the turn is not known while it is not known when the bias jumped
+            return (*blocks, (state.THETA + 2, 1, abs(self.jump.change) * self.jump.time_std_s))
+        return blocks
 
     def list_events(self) -> Iterator[Event]:
         """Yield what it changes in the state."""
         for place, count, std in self.blocks:
             yield Event(self.first, place, count, std)
             if self.last is not None:
-                yield Event(
-                    self.last, place, count, 0.0 if place == state.FIX_OFFSET else std, is_new=place == state.FIX_OFFSET
-                )
+                is_new = place == state.FIX_OFFSET
+                yield Event(self.last, place, count, 0.0 if is_new else std, is_new)
+
+    def alter_ticks(self, ticks: Ticks) -> Ticks:
+        """Return the ticks as they are under the change."""
+        inputs = ticks.inputs
+        if self.kind == "wander":
+            kept, noise, variance = inputs.fix_kept.copy(), inputs.fix_noise.copy(), ticks.fix_variance_m2.copy()
+            span = slice(self.first, self.last)
+            variance[span] = np.maximum(variance[span], np.square(self.size * _ERRS_ALONG))
+            if self.steps_at is not None:
+                kept[self.steps_at] = 0.0
+            if self.last is not None:
+                kept[self.last] *= np.sqrt(variance[self.last, 0] / variance[self.last - 1, 0])
+            earlier = np.concatenate((variance[:1], variance[:-1]))
+            noise[span] = np.maximum(variance[span] - kept[span, None] ** 2 * earlier[span], 0.0)
+            return replace(ticks, inputs=inputs._replace(fix_kept=kept, fix_noise=noise), fix_variance_m2=variance)
+        if self.jump is not None:
+            value, spread = inputs.value.copy(), inputs.variance.copy()
+            value[self.first, state.STATIONARY_RATE] = 0.0, 0.0, self.size
+            spread[self.first, state.STATIONARY_RATE] = _UNMEASURED, _UNMEASURED, self.jump.std**2
+            return replace(ticks, inputs=inputs._replace(value=value, variance=spread))
+        return ticks
 
 
+_ERRS_ALONG = np.array([1.0, 1.0, 1.7])  # heights err more
+_UNMEASURED = 1e3  # rad²/s²
 _BLOCKS: dict[tuple[str, int], tuple[tuple[int, int, float], ...]] = {
     ("offset", state.FIX): ((state.FIX_OFFSET, 3, 1.0),),
     ("antenna", state.FIX): ((state.ARM, 3, 0.3),),
@@ -106,6 +131,7 @@ _COSTS = {
     "gyroscope": 16.0,
     "scale": 10.0,
     "pose": 20.0,
+    "wander": 12.0,
     "useless": 12.0,
 }
 
@@ -131,6 +157,12 @@ class Hypothesis:
         """What all changes change in the state, in order of time."""
         return tuple(sorted((e for c in self.changes for e in c.list_events()), key=lambda event: event.tick))
 
+    def alter_ticks(self, ticks: Ticks) -> Ticks:
+        """Return the ticks as they are under all changes."""
+        for change in self.changes:
+            ticks = change.alter_ticks(ticks)
+        return ticks
+
     @property
     def ignored(self) -> tuple[tuple[int, int, int], ...]:
         """Measurements that are not used: (kind, first tick, last tick)."""
@@ -140,7 +172,7 @@ class Hypothesis:
 
 
 def find_suspects(tests: Tests, period_s: float) -> list[Suspect]:
-    """Return where sensors are rejected for long, the longest first."""
+    """Return where sensors are rejected for long, in order of time; last, what is much shorter than the longest."""
     found: list[Suspect] = []
     for kind, lasts_s in _LASTS_S.items():
         rows = np.flatnonzero(tests.verdict[:, kind] != NONE)
@@ -155,7 +187,8 @@ def find_suspects(tests: Tests, period_s: float) -> list[Suspect]:
                 first = of_kind.pop().first
             of_kind.append(Suspect(kind, first, last))
         found += of_kind
-    return sorted(found, key=lambda s: s.first - s.last)[:_MOST_SUSPECTS]
+    longest = max((each.last - each.first for each in found), default=0)
+    return sorted(found, key=lambda each: ((each.last - each.first) < _MUCH_SHORTER * longest, each.first))
 
 
 def compute_evidence(tests: Tests, gates: Floats, first: int, last: int) -> float:
@@ -165,36 +198,71 @@ def compute_evidence(tests: Tests, gates: Floats, first: int, last: int) -> floa
     return float(-0.5 * np.nansum(nis + tests.log_det[first:last, kinds]))
 
 
-def explain(made: Pass, run: Callable[[Hypothesis, int, int], Pass], active: Collection[int]) -> list[Hypothesis]:
+def explain(
+    made: Pass, run: Callable[[Hypothesis, int, int], Pass], active: Collection[int], jump: TurnJump | None = None
+) -> list[Hypothesis]:
     """Return the hypotheses that explain best where sensors contradict each other, the best first; none where they do not.
 
     ``made`` is the pass without any change, in which no rejected fix is followed; ``run`` makes that under a hypothesis between two ticks
-    (its rows before the first mean nothing). Only errors that are ``active`` can change. The longest contradiction is explained first;
-    then the longest that is left.
+    (its rows before the first mean nothing). Only errors that are ``active`` can change. A ``jump`` that the gyroscope's turns show is
+    tried first; then one contradiction after the other is explained.
     """
     period_s, gates, size = made.ticks.inputs.period_s, made.model.gates, made.states.shape[0]
     best, tests, found = Hypothesis((), 0.0), made.tests, [Hypothesis((), 0.0)]
-    for _ in range(_MOST_CHANGES):
+    for number in range(_MOST_CHANGES + 1):
         suspects = find_suspects(tests, period_s)
-        if not suspects:
+        if number == 0:
+            changes = [] if jump is None else [_make_jump(made, jump)]
+            end = size
+        elif suspects:
+            changes, end = list(_list_changes(suspects[0], suspects, tests, period_s)), suspects[0].last
+        else:
             break
-        first = min([suspects[0].first, *(c.first for c in best.changes)])
-        last = min(size, suspects[0].last + round(_HORIZON_S / period_s))
-        plain = compute_evidence(tests, gates, first, last)
-        tried: list[tuple[Hypothesis, Pass]] = []
-        for change in _list_changes(suspects[0], size):
+        last = min(size, end + round(_HORIZON_S / period_s))
+        tried: list[Hypothesis] = []
+        for change in changes:
             if all(e in active for place, count, _ in change.blocks for e in range(place, place + count)):
                 changed = Hypothesis((*best.changes, change), 0.0)
-                again = run(changed, first, last)
-                gained = compute_evidence(again.tests, gates, first, last) - plain - change.cost
-                tried.append((replace(changed, score=best.score + gained), again))
-        top, _ = max(tried, key=lambda each: each[0].score)
-        found += [each for each, _ in tried]
-        if top.score < best.score + _SURELY:
+                first = min(c.first for c in changed.changes)
+                plain = compute_evidence(tests, gates, first, last)
+                gained = compute_evidence(run(changed, first, last).tests, gates, first, last) - plain - change.cost
+                tried.append(replace(changed, score=best.score + gained))
+        found += tried
+        top = max(tried, key=lambda each: each.score, default=best)
+        # Fixes that are rejected have to be explained: the filter would follow them in the end.
+        if top.score >= best.score + _SURELY or (tried and number and suspects[0].role == state.FIX):
+            found.remove(top)
+            best = replace(top, changes=(*top.changes[:-1], _soften(top.changes[-1], size, period_s)))
+            tests = run(best, 0, size).tests
+        elif number > 0:
             break
-        best, tests = top, run(top, 0, size).tests
+    left = [each for each in find_suspects(tests, period_s) if each.role == state.FIX] if best.changes else []
     rivals = [each for each in found if best.score - _NEAR < each.score and each.changes != best.changes]
+    off_m = [float(np.linalg.norm(_find_innovation_m(each, tests))) for each in left]
+    errs = [_make_wander(each.first, size_m, size, period_s) for each, size_m in zip(left, off_m, strict=True)]
+    best = replace(best, changes=(*best.changes, *errs))
     return [best, *sorted(rivals, key=lambda each: -each.score)[:_MOST_RIVALS]] if best.changes or rivals else []
+
+
+def _soften(change: Change, size: int, period_s: float) -> Change:
+    """Return a change; instead of a small jump of the pose that fixes err about then, before or after: which it is nothing tells."""
+    if change.kind != "pose" or change.size > _CARRIED_M:
+        return change
+    return _make_wander(change.first, change.size, size, period_s)
+
+
+def _make_wander(tick: int, off_m: float, size: int, period_s: float) -> Change:
+    """Return the change that fixes err around a tick."""
+    around = round(_ERR_FOR_S / period_s)
+    last = tick + around
+    return Change("wander", state.FIX, max(0, tick - around), None if last >= size else last, off_m, tick)
+
+
+def _make_jump(made: Pass, jump: TurnJump) -> Change:
+    """Return the change of a gyroscope whose bias is known afterwards: what it was before, and how far it jumped."""
+    first = int(np.searchsorted(made.ticks.stamp_ns, jump.at_ns).clip(1, made.states.shape[0] - 1))
+    before = float(made.states[first - 1, state.GYRO_BIAS + 8])
+    return Change("gyroscope", state.FIX, first, size=before + jump.change, jump=jump)
 
 
 def compute_weights(hypotheses: Sequence[Hypothesis]) -> Floats:
@@ -204,8 +272,9 @@ def compute_weights(hypotheses: Sequence[Hypothesis]) -> Floats:
     return np.asarray(weights / weights.sum())
 
 
-def _list_changes(suspect: Suspect, size: int) -> Iterator[Change]:
+def _list_changes(suspect: Suspect, suspects: Sequence[Suspect], tests: Tests, period_s: float) -> Iterator[Change]:
     """Yield single changes that could explain a suspect."""
+    size = tests.verdict.shape[0]
     role, first, last = suspect.role, suspect.first, None if suspect.last >= size else suspect.last
     if role != state.FIX:
         yield Change("scale", role, first, last)
@@ -213,8 +282,29 @@ def _list_changes(suspect: Suspect, size: int) -> Iterator[Change]:
         yield Change("useless", role, first, last)
         yield Change("gyroscope", state.FIX, first)
         return
+    off_m = _find_innovation_m(suspect, tests)
+    # Fixes that return to what is right contradict a track that followed them as far, the other way.
+    returns = [
+        each.first
+        for each in suspects
+        if each.role == role
+        and each.first > first
+        and np.linalg.norm(_find_innovation_m(each, tests) + off_m) < _ALIKE * np.linalg.norm(off_m)
+    ]
+    size_m = float(np.linalg.norm(off_m))
+    for end in dict.fromkeys([suspect.last, *sorted(returns)[:1]]):
+        if end < size:
+            yield Change("offset", role, first, end, size_m)
     if last is not None:
-        yield Change("offset", role, first, last)
         yield Change("useless", role, first, last)
-    for kind in ("offset", "antenna", "clock", "gyroscope", "pose"):
-        yield Change(kind, role, first)
+    heard = np.flatnonzero(tests.verdict[:first, role] != NONE)
+    silent = int(heard[-1]) + 1 if heard.size and (first - heard[-1]) * period_s > _TOGETHER_S else first
+    for kind, at in (("antenna", first), ("clock", first), ("gyroscope", silent), ("pose", silent)):
+        yield Change(kind, role, at, size=size_m)
+
+
+def _find_innovation_m(suspect: Suspect, tests: Tests) -> Floats:
+    """Return the median of the rejected fixes' innovations, east and north."""
+    span = slice(suspect.first, suspect.last)
+    rejected = tests.fix_innovation[span][tests.verdict[span, state.FIX] == REJECTED]
+    return np.asarray(np.median(rejected[:, :2], axis=0))

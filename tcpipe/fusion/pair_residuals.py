@@ -229,7 +229,7 @@ def _compare_turns(section: _Section) -> list[Residuals]:
     made = []
     for a, b in combinations(rates, 2):
         turn = np.stack([integrate_grid(rates[role])[rows] for role in (a, b)], -1)
-        off = _align_turns(turn, round(5.0 / _PAIR_STEP_S))
+        off = align_turns(turn, round(5.0 / _PAIR_STEP_S))
         for window_s, i, j in section.choose_windows(at_ns, [sources[a], sources[b]]):
             rate = _take_nodes(rates[a], at_s[i], at_s[j])
             features = {f"{role} turn": np.full(i.size, window_s) for role in (a, b)}
@@ -243,7 +243,7 @@ def _compare_turns(section: _Section) -> list[Residuals]:
     return made
 
 
-def _align_turns(turn: Floats, step: int) -> Floats:
+def align_turns(turn: Floats, step: int) -> Floats:
     """Return the first of two turns (n, 2) less the second, whose scale and bias are fitted over windows of ``step`` rows."""
     change = turn[step:] - turn[:-step]
     if not change.size:

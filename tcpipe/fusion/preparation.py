@@ -11,7 +11,7 @@ the derivative of the position is: then the velocity of a robot that only drives
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +25,7 @@ from tcpipe.fusion.measurements import (
     InertialMeasurements,
     Positions,
 )
-from tcpipe.fusion.signals import compute_median_period_ns, estimate_white_noise
+from tcpipe.fusion.signals import compute_median_period_ns, compute_seconds, estimate_white_noise, integrate_signal
 from tcpipe.geometry.datum import enu_from_geodetic
 from tcpipe.geometry.rotation import invert, matrix_from_quat, multiply, normalize, rotate, rotation_vector_from_quat
 from tcpipe.tables.findings import Finding, Subject, make_finding
@@ -47,6 +47,8 @@ _MAX_VELOCITY_MPS = 50.0  # no robot is faster
 _MAX_RATE_RADPS = 100.0  # no gyroscope measures more
 _MAX_FORCE_MPS2 = 1000.0  # no accelerometer measures more
 _GRAVITY_BAND_MPS2 = (8.0, 12.0)
+_FROZEN_NS = 1_000_000_000  # fixes that repeat for less are those of a slow receiver
+_DRIVES_MPS = 0.1  # mean speed
 _DATUM_FIXES = 10  # the ENU origin is their median
 _NOISE_WINDOW_S = 2.0  # window of noise around each sample
 _TURNS_INTO = 0.1  # cosine: an unmeasured axis affects another, 6°
@@ -65,6 +67,15 @@ class Prepared:
     repeated: int = 0
     variances_replaced: int = 0
     findings: tuple[Finding, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Repeats:
+    """Measurements that repeat one value while the robot drives: stamps of the first and the last [ns], and how many repeat it."""
+
+    start_ns: int
+    end_ns: int
+    messages: int
 
 
 def find_datum(lon_deg: Floats, lat_deg: Floats, alt_m: Floats) -> tuple[float, float, float] | None:
@@ -106,6 +117,38 @@ def prepare_positions(
     unclaimed_rows = unclaimed if unclaimed.any() else None
     made = Positions(stamp_ns[usable], fixes, variance, lever_arm_m, lever_arm_std_m, unclaimed_rows)
     return made, prepared
+
+
+def drop_repeated_fixes(gnss: Positions, odometry: BodyVelocities | None) -> tuple[Positions, tuple[Repeats, ...]]:
+    """Return the fixes without those that repeat the one before to the last digit, and where they do while the robot drives.
+
+    They carry no information: a receiver that hangs, or a slow one that is published at a higher rate. Without odometry a robot may be
+    stationary where fixes repeat for a second or longer: they are kept. So are fixes that never change.
+    """
+    stamp_ns = gnss.stamp_ns
+    changes = np.concatenate(([True], (np.diff(gnss.position_enu_m, axis=0) != 0.0).any(1)))
+    first = np.flatnonzero(changes)
+    if first.size < 2 or first.size == stamp_ns.size:
+        return gnss, ()
+    last = np.append(first[1:], stamp_ns.size) - 1
+    lasting = stamp_ns[last] - stamp_ns[first] >= _FROZEN_NS
+    if odometry is None:
+        kept = changes | np.repeat(lasting, last - first + 1)
+        return (gnss if kept.all() else _select_fixes(gnss, kept)), ()
+    zero = int(stamp_ns[0])
+    speed = np.nan_to_num(np.abs(odometry.velocity_mps[:, :1]))
+    driven_m = integrate_signal(compute_seconds(odometry.stamp_ns, zero), speed, compute_seconds(stamp_ns, zero))[:, 0]
+    frozen = np.flatnonzero(
+        lasting & (driven_m[last] - driven_m[first] > _DRIVES_MPS * (stamp_ns[last] - stamp_ns[first]) * 1e-9)
+    )
+    found = (Repeats(int(stamp_ns[first[i]]), int(stamp_ns[last[i]]), int(last[i] - first[i])) for i in frozen)
+    return _select_fixes(gnss, changes), tuple(found)
+
+
+def _select_fixes(gnss: Positions, rows: Mask) -> Positions:
+    unclaimed = None if gnss.unclaimed is None else gnss.unclaimed[rows]
+    fixes, variance = gnss.position_enu_m[rows], gnss.variance_m2[rows]
+    return replace(gnss, stamp_ns=gnss.stamp_ns[rows], position_enu_m=fixes, variance_m2=variance, unclaimed=unclaimed)
 
 
 def prepare_ground_velocities(
@@ -352,6 +395,7 @@ def _clean_variances(variance: Floats, default: Floats, floor: float) -> tuple[F
 __all__ = [
     "Columns",
     "Prepared",
+    "drop_repeated_fixes",
     "find_datum",
     "prepare_body_velocities",
     "prepare_ground_velocities",

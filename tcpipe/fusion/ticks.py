@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from tcpipe.compiled import compile_kernel
 from tcpipe.fusion import state
 from tcpipe.fusion.densities import FixNoise, NoiseModel
-from tcpipe.fusion.filter_kernel import Inputs
+from tcpipe.fusion.filter_kernel import Inputs, Memory, Model, Tests
 from tcpipe.fusion.initial import compute_course_rate
 from tcpipe.fusion.measurements import VISUAL, WHEELS, BodyVelocities, InertialMeasurements, Measurements
 from tcpipe.fusion.process import (
@@ -69,6 +69,18 @@ class Ticks:
     inputs: Inputs
     rows: dict[int, Ints]
     fix_variance_m2: Floats
+
+
+@dataclass(slots=True)
+class Pass:
+    """One forward pass over a section: its model, checkpoints, tests, and filtered states by tick."""
+
+    ticks: Ticks
+    model: Model
+    checkpoints: list[Memory]
+    tests: Tests
+    states: Floats
+    last: Memory
 
 
 def find_tick_period_ns(period_ns: int) -> int:

@@ -127,19 +127,25 @@ def find_gain_change(sag: Sag | None) -> GainChange | None:
         return None
     resistance, place = -by_volt / weight, np.arange(count)
 
-    def unexplained(*columns: Floats | NDArray[np.bool_ | np.int64]) -> float:
-        by = np.sqrt(weight)
-        design = np.column_stack(columns) * by[:, None]
-        target = resistance * by
-        return float(np.sum((target - design @ np.linalg.lstsq(design, target, rcond=None)[0]) ** 2))
+    def judge(first: int) -> tuple[float, float]:
+        """Return by how many variances a step explains more than a constant, and than a gradual change."""
+        # The level of the current steps, too, when its gain does, which disturbs the blocks beside it.
+        apart = np.abs(place - first + 0.5) > 1.0
+        by, at = np.sqrt(weight[apart]), place[apart]
+        target = resistance[apart] * by
 
-    splits = list(range(_FEWEST_BLOCKS, count - _FEWEST_BLOCKS + 1))
-    left = [unexplained(place < first, place >= first) for first in splits]
-    first, variance = splits[int(np.argmin(left))], min(left) / (count - 3)
-    constant, gradual = unexplained(np.ones(count)), unexplained(np.ones(count), place)
-    is_sure = constant - min(left) > _SURE**2 * variance and gradual - min(left) > _GRADUAL**2 * variance
-    # The level of the current steps, too, when its gain does: the blocks beside it tell the time, but not the ratio.
+        def unexplained(*columns: Floats | NDArray[np.bool_ | np.int64]) -> float:
+            design = np.column_stack(columns) * by[:, None]
+            return float(np.sum((target - design @ np.linalg.lstsq(design, target, rcond=None)[0]) ** 2))
+
+        step, ones = unexplained(at < first, at >= first), np.ones(len(at))
+        variance = max(step / (len(at) - 3), 1e-300)
+        return (unexplained(ones) - step) / variance, (unexplained(ones, at) - step) / variance
+
+    judged = {first: judge(first) for first in range(_FEWEST_BLOCKS, count - _FEWEST_BLOCKS + 1)}
+    first = max(judged, key=lambda at: judged[at][0])
     before, after = (-float(by_volt[of].sum() / weight[of].sum()) for of in (slice(first - 1), slice(first + 1, None)))
+    is_sure = judged[first][0] > _SURE**2 and judged[first][1] > _GRADUAL**2
     least = read_threshold("current-gain-changes", "min_change_fraction")
     if not is_sure or min(before, after) <= 0.0 or abs(before / after - 1.0) < least:
         return None

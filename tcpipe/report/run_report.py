@@ -356,7 +356,7 @@ def _make_clock_sections(facts: StageFacts, findings: Sequence[Finding]) -> list
     text = ""
     if clock_offsets and rows:
         reference = _name(clock_offsets.reference)
-        text = f"Time offsets relative to {reference}, from the motion that both sensors measure; not corrected."
+        text = f"Time offsets relative to {reference}, from the motion that both sensors measure."
     if steps:
         text += f" The clock steps: {'; '.join(steps)}."
     header = ("sensor", "late by", "± (2σ)", "drift", "correction")

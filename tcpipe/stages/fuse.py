@@ -13,7 +13,7 @@ from tcpipe.fusion.checks.audit import is_astray
 from tcpipe.fusion.checks.plausibility import SensorExclusion, refuse_fixes
 from tcpipe.fusion.measurements import GNSS, IMU
 from tcpipe.recipe import FuseConfig
-from tcpipe.stages.clock_findings import add_offset_uncertainty, check_clocks
+from tcpipe.stages.clock_findings import correct_clocks
 from tcpipe.stages.fuse_findings import find_fuse_findings, make_audit_findings, make_fuse_facts, make_mounting_findings
 from tcpipe.stages.fuse_inputs import (
     FusionInputs,
@@ -40,10 +40,12 @@ def fuse_run(streams: Streams, config: FuseConfig, *, run_id: str) -> Track:
     FusionError : no sensor measures motion, or the estimate breaks down.
     """
     # 1. A pose made elsewhere is what the fixes are.
-    #    Streams become measurements: one frame, one set of units, usable variances; sensors that cannot be right are left out.
+    #    Streams become measurements: one frame, one set of units, usable variances; sensors that cannot be right are left out,
+    #    and the clocks of the others agree.
     streams, local = convert_pose_to_fixes(streams)
     run = Subject("run", run_id)
     inputs, sanity = drop_implausible_sensors(prepare_inputs(streams, config), streams)
+    inputs, clocks = correct_clocks(streams, inputs)
     # 2. Each section for itself: where it starts, filter and smoother; again without a sensor that leads the track away from all others.
     inputs, sanity, fused = fuse_recovering(inputs, sanity, streams, config, run=run)
     if not fused.found:
@@ -53,10 +55,8 @@ def fuse_run(streams: Streams, config: FuseConfig, *, run_id: str) -> Track:
         columns |= {name: np.full_like(columns[name], np.nan) for name in ("lon_deg", "lat_deg", "alt_m")}
     table = TRACK.table(**columns)
     datum = None if local or inputs.datum_deg_m is None else Datum(*inputs.datum_deg_m, crs=streams.gnss_crs)
-    # 3. What was left out, where sensors disagree with the track, and whether their clocks agree.
+    # 3. What was left out, and where sensors disagree with the track.
     summary = make_fuse_facts(inputs, fused.facts, rows=table.num_rows, skipped_s=fused.skipped_s)
-    clocks = check_clocks(streams, inputs)
-    table = add_offset_uncertainty(table, clocks.facts)
     mounting, audit = make_mounting_findings(inputs, fused, streams), make_audit_findings(fused, inputs, streams)
     found = (sanity, mounting, audit, clocks)
     findings = (

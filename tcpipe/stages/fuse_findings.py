@@ -150,11 +150,12 @@ def _find_changes(facts: FuseFacts, first_ns: int, fixes: str) -> Iterator[Findi
 
 _CHANGES = {
     "offset": "positions are off by a constant",
+    "wander": "positions err far more than usual",
     "antenna": "the antenna was moved",
     "clock": "its clock stepped",
     "gyroscope": "the bias of its gyroscope jumped",
     "scale": "its scale changed",
-    "pose": "the robot was moved without being measured",
+    "pose": "a clock stepped, or the robot was moved without being measured",
     "useless": "it measured nothing usable",
 }
 """Changes in words."""

@@ -78,7 +78,13 @@ def prepare_inputs(streams: Streams, config: FuseConfig) -> FusionInputs:
     for epoch in sorted({int(e) for table in tables.values() for e in pc.unique(table["clock_epoch"]).to_pylist()}):
         parts = {role: select_rows(table, "clock_epoch", epoch) for role, table in tables.items()}
         found = {role: _prepare(role, part, streams.sensors[role], config, inputs) for role, part in parts.items()}
-        gnss, findings = smooth_stamps(found.get(GNSS), found.get(WHEELS) or found.get(VISUAL))
+        gnss, odometry = found.get(GNSS), found.get(WHEELS) or found.get(VISUAL)
+        if gnss is not None:
+            count = gnss.stamp_ns.size
+            gnss, repeats = preparation.drop_repeated_fixes(gnss, odometry)
+            inputs.counts[GNSS]["repeated"] += count - gnss.stamp_ns.size
+            inputs.findings += [_find_frozen(each, streams) for each in repeats]
+        gnss, findings = smooth_stamps(gnss, odometry)
         inputs.findings += findings
         inputs.measurements[epoch] = Measurements(
             gnss=gnss,
@@ -89,6 +95,20 @@ def prepare_inputs(streams: Streams, config: FuseConfig) -> FusionInputs:
             nonholonomic_std_mps=config.nonholonomic_std_mps,
         )
     return inputs
+
+
+def _find_frozen(repeats: preparation.Repeats, streams: Streams) -> Finding:
+    first_ns = _find_first_ns(streams)
+    span_s = (repeats.start_ns - first_ns) / 1e9, (repeats.end_ns - first_ns) / 1e9
+    subject, names = Subject("role", find_recipe_role(GNSS, streams)), {"quantity": "position"}
+    return make_finding("frozen", subject, span_s=span_s, names=names, message_count=repeats.messages)
+
+
+def _find_first_ns(streams: Streams) -> int:
+    """Return the first stamp of any sensor [ns]."""
+    return min(
+        int(to_integers(table.slice(0, 1), "stamp_ns")[0]) for table in streams.tables.values() if table.num_rows
+    )
 
 
 def _prepare(role: str, table: pa.Table, sensor: Sensor, config: FuseConfig, inputs: FusionInputs) -> Any:
@@ -203,9 +223,6 @@ def _find_exclusion(refusal: SensorExclusion, streams: Streams) -> Finding:
     sensor, name = streams.sensors[refusal.role], find_recipe_role(refusal.role, streams)
     if refusal.units is not None:
         remedies = suggest("state_units", {"read": {"imu_units": refusal.units}})
-    elif refusal.late_s is not None:
-        given_s = streams.report.facts.time_offset_s.get(name, 0.0)
-        remedies = suggest("correct", {"read.time_offset_s": {name: round(given_s - refusal.late_s, 2)}})
     elif refusal.turned_by is not None:
         remedies = state_extrinsics(name, sensor.xyz_m, refusal.turned_by @ matrix_from_quat(sensor.quat_xyzw))
     elif refusal.is_suspect_excludable:
@@ -213,9 +230,11 @@ def _find_exclusion(refusal: SensorExclusion, streams: Streams) -> Finding:
     else:
         remedies = exclude_role(name)
     numbers: Mapping[str, Any] = refusal.numbers
+    first_ns, stamp_ns = _find_first_ns(streams), to_integers(streams.tables[refusal.role], "stamp_ns")
     return make_finding(
         refusal.code,
         Subject("role", name),
+        span_s=((int(stamp_ns[0]) - first_ns) / 1e9, (int(stamp_ns[-1]) - first_ns) / 1e9),
         action="excluded",
         severity="note" if refusal.role == DOPPLER else None,
         names={"topic": sensor.topic, "placed_by": sensor.placed_by, **refusal.names},

@@ -191,12 +191,12 @@ def _find_gap_edges(rows: pa.Table, rate_hz: float) -> NDArray[np.bool_]:
 def is_clock_doubtful(streams: Streams, info: TrackInfo) -> bool:
     """Return whether a clock of the run stepped or has an offset, or motion or power has the recorder's time.
 
-    Commands mostly have no stamp of their own, and labels do not depend on it. A small offset of an IMU is in the positions' deviations.
+    Commands mostly have no stamp of their own, and labels do not depend on it. An offset that is known is taken out, but for that of power.
     """
     recorder = any(s.time_source == "log" for role, s in streams.sensors.items() if role != "command")
     clocks = info.report.facts.clock_offsets
     off = clocks is not None and any(
-        (offset.noted or offset.drifts) and not (role == "imu" and clocks.heading_offset_s)
+        (offset.noted or offset.drifts) and (role == "power" or not offset.blamed)
         for role, offset in clocks.offsets.items()
     )
     return recorder or off or streams.report.facts.epochs > 1

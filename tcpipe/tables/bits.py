@@ -54,7 +54,7 @@ class Quality(IntFlag):
     VOLTAGE_OUT_OF_RANGE = 1 << 7
     """The voltage leaves the range of the robot profile."""
     CLOCK_DOUBTFUL = 1 << 8
-    """A clock of the run stepped, drifts or has an offset (an IMU's: more than 0.15 s), or log time replaces the stamps."""
+    """A clock of the run stepped, two clocks differ, that of power has an offset, or log time replaces the stamps."""
     PHYSICS_OUTLIER = 1 << 9
     """The power is more than four robust standard deviations from the physics model fitted on the run."""
     BELOW_FULL_SPEED = 1 << 10

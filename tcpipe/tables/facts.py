@@ -104,9 +104,9 @@ class GateReset:
 
 @dataclass(frozen=True, slots=True)
 class ChangeFacts:
-    """A change that explains a contradiction: its kind (offset, antenna, clock, gyroscope, scale, pose, useless), sensor and span.
+    """A change that explains a contradiction: its kind (offset, wander, antenna, clock, gyroscope, scale, pose, useless), sensor and span.
 
-    ``size``: largest innovation of fixes there [m]; 0 of another sensor.
+    ``size``: median innovation of fixes there [m]; 0 of another sensor.
     """
 
     kind: str
@@ -273,18 +273,12 @@ class ClockOffset:
 
 @dataclass(frozen=True, slots=True)
 class ClockFacts:
-    """The sensors' clocks in one clock epoch: all pairs compared, and each role's offset from the reference.
-
-    ``position_offset_s``, a possible time offset of GNSS [s], times the velocity is included in the track's position σ;
-    ``heading_offset_s``, the time offset of the IMU [s], times the yaw rate is included over a metre.
-    """
+    """The sensors' clocks in one clock epoch before offsets were taken out: all pairs, and each role's offset from the reference."""
 
     clock_epoch: int
     reference: str
     pairs: tuple[ClockPair, ...]
     offsets: Mapping[str, ClockOffset]
-    position_offset_s: float | None = field(default=None, metadata=LEFT_OUT)
-    heading_offset_s: float | None = field(default=None, metadata=LEFT_OUT)
 
 
 @dataclass(frozen=True, slots=True)

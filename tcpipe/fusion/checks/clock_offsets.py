@@ -5,8 +5,8 @@ what speed and acceleration cost. A pair is compared only where the robot turns 
 compare but what the controller corrects, and that leads the body. Each gives a lag with its standard deviation (`lags`), over the whole run
 and in windows of ten minutes, through which a line tells the drift; the pairs together give each sensor's offset from the clock that most
 of them share. A sensor is blamed only where two others agree against it and no pair contradicts; else two differ, and nobody knows which
-is off. Nothing is corrected here: a person decides. The course of the fixes is not held against the gyroscope: an antenna that sits
-ahead of the turning point by l leads the body's course by l / v, 0.1 s for 10 cm.
+is off. Offsets are taken out of the stamps before fusion; the estimator's lags carry what is left. The course of the fixes is not held
+against the gyroscope: an antenna that sits ahead of the turning point by l leads the body's course by l / v, 0.1 s for 10 cm.
 
 Stamps of fixes may jitter: receivers and localisation nodes that stamp a fix when they send it, some tenths of a second after they
 measured it, make positions that stand still and then leap, whatever variance they claim. Over each pair of successive fixes the distance
@@ -37,11 +37,13 @@ from tcpipe.fusion.checks.lags import (
     resample_twist,
 )
 from tcpipe.fusion.measurements import (
+    DOPPLER,
     GNSS,
     IMU,
     VISUAL,
     WHEELS,
     BodyVelocities,
+    GroundVelocities,
     InertialMeasurements,
     Measurements,
     Positions,
@@ -67,9 +69,8 @@ _LIVELY_S = 2.0
 _ODOMETRY_S = 0.1
 _ACCELERATION_S = 0.3
 _POWER_S = 0.2
+_DOPPLER_S = 0.3
 _SLOW_S = 4.0
-_LITTLE_TURNED_S = 0.15
-"""At 0.5 rad/s the heading is 4 degrees behind by then, and a length a quarter of a percent off."""
 _STOPPED_MPS = 0.1
 _NEAR_STOP_S = 3.0
 _WINDOW_NS = 600_000_000_000
@@ -151,30 +152,6 @@ class ClockOffsets:
     offsets: Mapping[str, RoleOffset]
     span_s: float = 0.0
 
-    @property
-    def position_offset_s(self) -> float:
-        """By how much the fixes' clock may be off [s]: the robot's speed times this is an error of every position.
-
-        Its offset where it is blamed; where nobody is, each clock is as likely the right one as the next.
-        """
-        gnss = self.offsets.get(GNSS)
-        if gnss is None or not (gnss.noted or gnss.drifts):
-            return 0.0
-        drifted_s = abs(gnss.drift_s_per_h) * self.span_s / 7200.0 if gnss.drifts else 0.0
-        if gnss.blamed:
-            return abs(gnss.offset_s) + drifted_s
-        others = [0.0, *(offset.offset_s for role, offset in self.offsets.items() if role != GNSS)]
-        apart = [0.0, *(abs(gnss.offset_s - other_s) + drifted_s for other_s in others)]
-        return math.sqrt(sum(each**2 for each in apart) / len(apart))
-
-    @property
-    def heading_offset_s(self) -> float:
-        """By how much the gyroscope's clock is off, where it is blamed and that is little [s]: it turns late, and no label minds."""
-        imu = self.offsets.get(IMU)
-        if imu is None or not imu.noted or not imu.blamed or imu.drifts:
-            return 0.0
-        return abs(imu.offset_s) if abs(imu.offset_s) <= _LITTLE_TURNED_S else 0.0
-
 
 def find_clock_offsets(measurements: Measurements, power: PowerSignal | None) -> ClockOffsets:
     """Return the offsets between the stamps of a clock epoch's sensors, and their drift; ``power`` is the sum over the drive rails.
@@ -199,6 +176,14 @@ def find_clock_offsets(measurements: Measurements, power: PowerSignal | None) ->
     return _solve_offsets(tuple(pair for pair in pairs if pair is not None), span_s)
 
 
+def shift_stamps(stamp_ns: NDArray[np.int64], offset: RoleOffset, first_ns: int, span_s: float) -> NDArray[np.int64]:
+    """Return stamps [ns] without an offset and its drift; the run begins at ``first_ns`` and lasts ``span_s``."""
+    late_s = np.full(stamp_ns.size, offset.offset_s)
+    if offset.drifts:
+        late_s += offset.drift_s_per_h / 3600.0 * (compute_seconds(stamp_ns, first_ns) - span_s / 2.0)
+    return stamp_ns - np.rint(late_s * 1e9).astype(np.int64)
+
+
 def _iterate_signals(m: Measurements, power: PowerSignal | None, at_ns: NDArray[np.int64]) -> Iterable[Signals]:
     """Yield what can be compared in a window: whose stamps against whose, by what, target and regressors on the grid."""
     twists = {role: resample_twist(source, at_ns) for role, source in m.odometries().items()}
@@ -213,9 +198,28 @@ def _iterate_signals(m: Measurements, power: PowerSignal | None, at_ns: NDArray[
                 compute_moving_mean(compute_antenna_speed(twist, m.gnss.lever_arm_m), FIXES_S), FIXES_S
             )
             yield GNSS, role, SPEED, *select_speed_changes(np.abs(compute_fix_velocity(m.gnss, at_ns))[:, None], seen)
+    if m.doppler is not None:
+        yield from _compare_doppler(m.doppler, m.gnss, twists, at_ns)
     if power is not None and twists:
         role = next(iter(twists))
         yield POWER, role, "power of speed, acceleration and turning", *_prepare_power(power, twists[role], at_ns)
+
+
+def _compare_doppler(
+    doppler: GroundVelocities, gnss: Positions | None, twists: Mapping[str, Floats], at_ns: NDArray[np.int64]
+) -> Iterable[Signals]:
+    """Yield the comparisons of a receiver's velocity: its size with that of an odometry, its axes with the fixes."""
+    if gnss is None:
+        return
+    velocity = resample_signal(doppler.stamp_ns, doppler.velocity_enu_mps[:, :2], at_ns)
+    for role, twist in list(twists.items())[:1]:
+        seen = compute_moving_mean(compute_antenna_speed(twist, gnss.lever_arm_m), _DOPPLER_S)
+        size = compute_moving_mean(np.linalg.norm(velocity, axis=1)[:, None], _DOPPLER_S)
+        yield DOPPLER, role, SPEED, *select_speed_changes(size, seen)
+    by_fixes = compute_fix_velocity(gnss, at_ns)
+    smooth = compute_moving_mean(velocity, FIXES_S).T
+    for axis, own, seen in zip(("east", "north"), smooth, (by_fixes.real, by_fixes.imag), strict=True):
+        yield DOPPLER, GNSS, f"velocity {axis}", own, compute_moving_mean(seen[:, None], _DOPPLER_S)
 
 
 def _compare_with_imu(
@@ -283,21 +287,40 @@ def _select_power(power: PowerSignal | None, first_ns: int, last_ns: int) -> Pow
 
 
 def _pair(names: tuple[str, str, str], windows: list[tuple[float, Floats]], span_s: float) -> Pair | None:
-    """Return a pair of the whole run; where it drifts for sure, as it is in the middle of the run."""
+    """Return a pair of the whole run; where it drifts for sure, as it is in the middle of the run.
+
+    None where the lag is unknown, or parts of the run have others than a drift would make: a clock that steps, which the estimator finds.
+    """
     lags = [(at_s, estimate_lag([products])) for at_s, products in windows] if len(windows) > 1 else []
     known = [
         (at_s, lag) for at_s, lag in lags if lag and _is_determined(names[0], lag.offset_s, lag.std_s, lag.explained)
     ]
     told = tuple((at_s, lag.offset_s, lag.std_s) for at_s, lag in known)
-    whole = estimate_lag([products for _, products in windows])
+    whole, drift, middle_s, rate = estimate_lag([products for _, products in windows]), (math.nan, math.nan), 0.0, 0.0
     if len(told) >= _FEWEST_WINDOWS:
         (middle_s, rate), (middle_std_s, rate_std) = _fit_offset_line(np.array(told), span_s)
         drift = (3600.0 * rate, 3600.0 * rate_std)
-        if whole is None or abs(rate) > _SURE * rate_std:
-            explained = float(np.median([lag.explained for _, lag in known]))
-            return Pair(*names, middle_s, middle_std_s, explained, *drift, told)
-        return Pair(*names, whole.offset_s, whole.std_s, whole.explained, *drift, told)
-    return None if whole is None else Pair(*names, whole.offset_s, whole.std_s, whole.explained, windows=told)
+        if any(_is_surely_other(of - middle_s - rate * (at_s - span_s / 2), std) for at_s, of, std in told):
+            return None
+    if any(_steps_inside(products, rate) for _, products in windows):
+        return None
+    if len(told) >= _FEWEST_WINDOWS and (whole is None or abs(rate) > _SURE * rate_std):
+        explained = float(np.median([lag.explained for _, lag in known]))
+        return Pair(*names, middle_s, middle_std_s, explained, *drift, told)
+    return None if whole is None else Pair(*names, whole.offset_s, whole.std_s, whole.explained, *drift, told)
+
+
+def _steps_inside(products: Floats, rate: float) -> bool:
+    """Return whether the lags of both halves of a window differ by more than a drift [s/s] makes."""
+    first, last = (estimate_lag([half]) for half in np.array_split(products, 2, axis=1))
+    if first is None or last is None:
+        return False
+    drifted_s = rate * _WINDOW_NS * 0.5e-9
+    return _is_surely_other(last.offset_s - first.offset_s - drifted_s, math.hypot(first.std_s, last.std_s))
+
+
+def _is_surely_other(apart_s: float, std_s: float) -> bool:
+    return abs(apart_s) > max(_NOTED_MOTION_S, _SURE * std_s)
 
 
 def _fit_offset_line(told: Floats, span_s: float) -> tuple[tuple[float, float], tuple[float, float]]:
@@ -350,8 +373,11 @@ def _prepare_power(power: PowerSignal, twist: Floats, at_ns: NDArray[np.int64]) 
 
 
 def _solve_offsets(pairs: tuple[Pair, ...], span_s: float = 0.0) -> ClockOffsets:
-    """Return each sensor's offset from the clock that most sensors share, by weighted least squares over the pairs that are determined."""
-    known = [pair for pair in pairs if pair.determined]
+    """Return each sensor's offset from the clock that most sensors share, by weighted least squares over the pairs that are determined.
+
+    The receiver's velocity has no say: it has the clock of the fixes, and no label needs it.
+    """
+    known = [pair for pair in pairs if pair.determined and pair.late != DOPPLER]
     linked = [role for role in ROLES if any(role in {pair.late, pair.against} for pair in known)]
     best: dict[str, RoleOffset] = {}
     reference = ""
@@ -365,6 +391,11 @@ def _solve_offsets(pairs: tuple[Pair, ...], span_s: float = 0.0) -> ClockOffsets
         for role, offset in best.items()
         if role != reference
     }
+    of_doppler = [pair for pair in pairs if pair.determined and pair.late == DOPPLER]
+    if of_doppler:
+        reference = reference or of_doppler[0].against
+        offsets = _solve_against_reference(reference, [*linked, reference, DOPPLER], [*known, *of_doppler], span_s)
+        told |= {DOPPLER: replace(offsets[DOPPLER], blamed=True)} if DOPPLER in offsets else {}
     return ClockOffsets(pairs, reference, told, span_s)
 
 

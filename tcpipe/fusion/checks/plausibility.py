@@ -29,7 +29,6 @@ class SensorExclusion:
     names, numbers : of the finding; the name ``suspect`` is the other role that may be wrong instead.
     units : value of the recipe's ``imu_units`` that sets it right.
     turned_by : rotation (3, 3) from what the extrinsics in use make of the sensor to base_link.
-    late_s : time offset of its stamps [s] that the recipe can correct.
     is_suspect_excludable : whether excluding the suspect instead sets it right.
     """
 
@@ -39,7 +38,6 @@ class SensorExclusion:
     numbers: Mapping[str, float] = field(default_factory=dict)
     units: str | None = None
     turned_by: NDArray[np.float64] | None = None
-    late_s: float | None = None
     is_suspect_excludable: bool = False
 
 

@@ -8,8 +8,7 @@ A receiver's own velocity against the fixes of the same receiver, before it is f
 
 Its integral over windows is held against the displacement of the fixes. Windows are as long as it takes for the way in them to be far
 longer than the fixes are noisy. Zero while the fixes move is a frozen one; a way as long as theirs in other directions is that of another
-frame; one that is late or early against the odometry is off by what the robot's velocity changes meanwhile, as is one that
-is not of the fixes' time; which of these two is off nobody can tell.
+frame.
 """
 
 from __future__ import annotations
@@ -20,7 +19,6 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.fusion.checks.clock_offsets import compute_antenna_speed, select_speed_changes
 from tcpipe.fusion.checks.distances import (
     COMMAND,
     Distances,
@@ -32,14 +30,11 @@ from tcpipe.fusion.checks.distances import (
     refuse_frozen,
 )
 from tcpipe.fusion.checks.lags import (
-    FIXES_S,
     GRID_S,
     Floats,
-    Lag,
     compute_course_rate,
     compute_fix_velocity,
     compute_moving_mean,
-    find_lag,
     find_liveliest_window_ns,
     resample_signal,
     resample_twist,
@@ -396,10 +391,6 @@ _CLEARLY = 4.0  # σ of fixes that a distance needs
 _MOVES_M = 1.0  # shorter distances do not count; windows 4 to 64 s
 _OFF = 0.25  # allowed share of disagreement in the right frame
 _STANDS = 0.1  # a velocity with less distance is frozen
-_LATE_S = 0.05  # smallest reported offset: 2 cm/s at 0.5 rad/s
-_SURE = 4.0  # σ
-_MAX_STD_S = 0.03  # of a reported offset
-_MIN_EXPLAINED = 0.5  # variance shared by two speeds
 _MAX_GAP_NS = 1_000_000_000
 
 
@@ -412,7 +403,7 @@ def check_ground_velocity(m: Measurements) -> SensorExclusion | None:
     windows = _compute_displacements(m.gnss, m.doppler)
     if windows is None:
         return SensorExclusion(DOPPLER, "velocity-unverified")
-    return _check_frame(*windows, m.doppler.stamp_ns.size) or _check_time_offset(m)
+    return _check_frame(*windows, m.doppler.stamp_ns.size)
 
 
 def _compute_displacements(
@@ -461,39 +452,3 @@ def _check_frame(
     if abs(size - 1.0) <= _OFF:
         return SensorExclusion(DOPPLER, "velocity-frame", {"frame": "unknown"})
     return SensorExclusion(DOPPLER, "distance-contradicted", {"reference": GNSS}, {"distance_ratio": size})
-
-
-def _check_time_offset(m: Measurements) -> SensorExclusion | None:
-    """Return the exclusion for a time offset: against the first odometry or, where that shows no lag, against the fixes."""
-    at_ns = find_liveliest_window_ns(m)
-    if at_ns is None or m.doppler is None or m.gnss is None:
-        return None
-    velocity = resample_signal(m.doppler.stamp_ns, m.doppler.velocity_enu_mps[:, :2], at_ns)
-    for role, odometry in list(m.odometries().items())[:1]:
-        speed = compute_moving_mean(np.linalg.norm(velocity, axis=1)[:, None], _DOPPLER_SMOOTH_S)
-        of_odometry = compute_antenna_speed(resample_twist(odometry, at_ns), m.gnss.lever_arm_m)
-        lag = find_lag(*select_speed_changes(speed, compute_moving_mean(of_odometry, _DOPPLER_SMOOTH_S)))
-        if lag is not None and _is_known(lag):
-            return _refuse_late("time-offset", role, lag, late_s=lag.offset_s) if _is_off(lag) else None
-    seen = compute_fix_velocity(m.gnss, at_ns)
-    for axis, of_fixes in zip(compute_moving_mean(velocity, FIXES_S).T, (seen.real, seen.imag), strict=True):
-        lag = find_lag(axis, compute_moving_mean(of_fixes[:, None], _DOPPLER_SMOOTH_S))
-        if lag is not None and _is_known(lag) and _is_off(lag):
-            return _refuse_late("clocks-differ", GNSS, lag)
-    return None
-
-
-def _refuse_late(code: str, reference: str, lag: Lag, *, late_s: float | None = None) -> SensorExclusion:
-    numbers = {"offset_s": lag.offset_s, "offset_2std_s": 2 * lag.std_s, "apart_s": abs(lag.offset_s)}
-    return SensorExclusion(DOPPLER, code, {"reference": reference}, numbers, late_s=late_s)
-
-
-_DOPPLER_SMOOTH_S = 0.3  # averaging of speeds
-
-
-def _is_known(lag: Lag) -> bool:
-    return lag.std_s <= _MAX_STD_S and lag.explained >= _MIN_EXPLAINED
-
-
-def _is_off(lag: Lag) -> bool:
-    return abs(lag.offset_s) > max(_LATE_S, _SURE * lag.std_s)

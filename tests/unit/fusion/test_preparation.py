@@ -1,12 +1,16 @@
 """Columns to measurements, by hand and against PROJ and scipy."""
 
+from dataclasses import replace
+
 import numpy as np
 import pyproj
 import pytest
 from scipy.spatial.transform import Rotation
 
-from tcpipe.fusion.measurements import STATED_ARM_STD_M
+from tcpipe.fusion.measurements import STATED_ARM_STD_M, BodyVelocities, Positions
 from tcpipe.fusion.preparation import (
+    Repeats,
+    drop_repeated_fixes,
     find_datum,
     prepare_body_velocities,
     prepare_ground_velocities,
@@ -215,3 +219,39 @@ def test_a_receivers_velocity_has_a_deviation_always_and_a_vast_one_where_it_tel
     assert found.velocity_enu_mps.tolist() == [[1.0, 2.0, 0.0], [1.0, 2.0, 0.1], [1.0, 1.0, 0.0]]
     wanted = [[0.04, 0.04, 1e6], [0.01, 0.01, 0.04], [0.0004, 0.09, 0.16]]
     assert found.variance_m2ps2 == pytest.approx(np.array(wanted))
+
+
+def driven_fixes(repeat, speed=1.0):
+    """Fixes at 10 Hz along x, of which each in ``repeat`` is the one before; and wheels."""
+    stamp = stamps(100)
+    place = np.column_stack((0.1 * speed * np.arange(100), np.zeros((100, 2))))
+    for row in repeat:
+        place[row] = place[row - 1]
+    wheels = BodyVelocities(stamp, *(np.full((100, 3), speed),) * 2, *(np.zeros(100),) * 2)
+    return Positions(stamp, place, np.ones((100, 3)), unclaimed=np.arange(100) > 50), wheels
+
+
+def test_fixes_that_hang_while_the_robot_drives_are_left_out_and_named():
+    gnss, wheels = driven_fixes(range(30, 51))
+    found, repeats = drop_repeated_fixes(gnss, wheels)
+    assert found.stamp_ns.tolist() == np.delete(gnss.stamp_ns, range(30, 51)).tolist()
+    assert found.unclaimed.sum() == 49
+    assert repeats == (Repeats(int(gnss.stamp_ns[29]), int(gnss.stamp_ns[50]), 21),)
+
+
+def test_a_slow_receiver_that_is_published_more_often_is_slow():
+    """Every second fix is new: nothing hangs."""
+    gnss, wheels = driven_fixes(range(1, 100, 2))
+    for odometry in (wheels, None):
+        found, repeats = drop_repeated_fixes(gnss, odometry)
+        assert found.stamp_ns.tolist() == gnss.stamp_ns[::2].tolist()
+        assert repeats == ()
+
+
+def test_fixes_of_a_stationary_robot_may_repeat():
+    gnss, wheels = driven_fixes(range(30, 51))
+    at_rest = replace(wheels, velocity_mps=0.0 * wheels.velocity_mps)
+    assert drop_repeated_fixes(gnss, at_rest)[1] == ()
+    assert drop_repeated_fixes(gnss, None) == (gnss, ())
+    never = replace(gnss, position_enu_m=np.zeros((100, 3)))
+    assert drop_repeated_fixes(never, wheels) == (never, ())

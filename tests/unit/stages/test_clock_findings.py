@@ -2,16 +2,14 @@
 
 from dataclasses import replace
 
-import pyarrow as pa
 import pytest
 from simulated_streams import log_of, streams_of
 from suggested_recipes import proposed
 
 from tcpipe.recipe import FuseConfig, ReadConfig
 from tcpipe.simulation import find_scenario
-from tcpipe.stages.clock_findings import add_offset_uncertainty, check_clocks
+from tcpipe.stages.clock_findings import correct_clocks
 from tcpipe.stages.fuse_inputs import prepare_inputs
-from tcpipe.tables.facts import ClockFacts
 from tcpipe.tables.findings import Subject
 
 LATE_S = {"gnss": 0.25, "wheel_odometry": 0.15, "imu": -0.10, "visual_odometry": 0.20, "power": 0.25}
@@ -28,7 +26,7 @@ def drive_log(tmp_path, index, seed, *late):
 
 def doctor(log, config=None):
     streams = streams_of(log, config)
-    return check_clocks(streams, prepare_inputs(streams, FuseConfig()))
+    return correct_clocks(streams, prepare_inputs(streams, FuseConfig()))[1]
 
 
 @pytest.mark.parametrize("seed", [31, 33])
@@ -47,6 +45,7 @@ def test_the_sensor_that_is_late_is_found_and_by_how_much(tmp_path, role, index)
     assert noted[role].offset_s == pytest.approx(LATE_S[role], abs=WITHIN_S[role])
     (finding,) = found.findings
     assert (finding.code, finding.subject) == ("time-offset", Subject("role", role))
+    assert finding.action == ("kept" if role == "power" else "corrected")
     assert finding.numbers["offset_s"] == noted[role].offset_s
     assert proposed(finding)["read"]["time_offset_s"] == {
         role: pytest.approx(-LATE_S[role], abs=WITHIN_S[role] + 0.005)
@@ -66,6 +65,16 @@ def test_the_remedy_corrects_it(tmp_path):
     assert proposed(again)["read"]["time_offset_s"]["gnss"] == pytest.approx(offsets_s["gnss"], abs=0.011)
 
 
+def test_an_offset_is_taken_out_of_the_stamps_that_are_fused(tmp_path):
+    streams = streams_of(drive_log(tmp_path, 0, 41, "wheel_odometry"))
+    before = prepare_inputs(streams, FuseConfig())
+    after, _ = correct_clocks(streams, before)
+    moved_s = (after.measurements[0].wheels.stamp_ns - before.measurements[0].wheels.stamp_ns) * 1e-9
+    assert moved_s == pytest.approx(-LATE_S["wheel_odometry"], abs=WITHIN_S["wheel_odometry"])
+    assert after.measurements[0].imu is before.measurements[0].imu
+    assert correct_clocks(streams, after)[1].findings == ()
+
+
 def test_a_short_drive_says_what_it_cannot_tell(tmp_path):
     """One start and one stop in half a minute, fixes of a metre: their clock is not spoken of, the gyroscope's is."""
     tiny = find_scenario("tiny")
@@ -76,21 +85,3 @@ def test_a_short_drive_says_what_it_cannot_tell(tmp_path):
     assert "gnss" not in found.facts.offsets
     assert found.findings == ()
     assert not any(pair.determined for pair in found.facts.pairs if pair.late == "gnss")
-
-
-def test_what_an_offset_costs_is_the_way_driven_in_it():
-    """0.2 s at 0.6 m/s east and 0.8 m/s north: 0.12 and 0.16 m, beside 0.05 m that were claimed."""
-    velocity, std = {"east": 0.6, "north": 0.8, "up": 0.0}, dict.fromkeys("xyz", 0.05)
-    columns = {f"{axis}_velocity_mps": [value, -value] for axis, value in velocity.items()} | {
-        "yaw_rate_radps": [0.0, 1.2]
-    }
-    track = pa.table(columns | {f"{axis}_std_m": [value] * 2 for axis, value in std.items()})
-    facts = ClockFacts(0, "imu", (), {}, position_offset_s=0.2)
-    found = add_offset_uncertainty(track, facts)
-    assert found.column("x_std_m").to_pylist() == pytest.approx([0.13, 0.13])
-    assert found.column("y_std_m").to_pylist() == pytest.approx([(0.16**2 + 0.05**2) ** 0.5] * 2)
-    assert found.column("z_std_m").to_pylist() == [0.05, 0.05]
-    assert add_offset_uncertainty(track, replace(facts, position_offset_s=None)) is track
-    turned = add_offset_uncertainty(track, replace(facts, position_offset_s=None, heading_offset_s=0.1))
-    assert turned.column("x_std_m").to_pylist() == pytest.approx([0.05, 0.13])  # 1.2 rad/s for 0.1 s, over a metre
-    assert turned.column("z_std_m").to_pylist() == [0.05, 0.05]

@@ -161,9 +161,9 @@ def streams(*, epochs=1, **time_sources):
     return Streams({}, sensors, "husky", report=StageReport((), StageFacts(epochs=epochs)))
 
 
-def clocks(role, *, noted=False, drifts=False, heading_offset_s=None):
-    offset = ClockOffset(0.1, 0.01, noted, None, None, drifts)
-    return info(clock_offsets=ClockFacts(0, "gnss", (), {role: offset}, heading_offset_s=heading_offset_s))
+def clocks(role, *, noted=False, drifts=False, blamed=False):
+    offset = ClockOffset(0.1, 0.01, noted, None, None, drifts, blamed)
+    return info(clock_offsets=ClockFacts(0, "gnss", (), {role: offset}))
 
 
 def test_a_clock_is_doubtful_that_steps_or_is_the_recorders():
@@ -172,13 +172,14 @@ def test_a_clock_is_doubtful_that_steps_or_is_the_recorders():
     assert is_clock_doubtful(streams(epochs=2, gnss="header"), info())
 
 
-def test_a_clock_is_doubtful_that_is_off_unless_the_heading_carries_it():
+def test_a_clock_is_doubtful_that_is_off_unless_it_was_corrected():
     good = streams(gnss="header")
     assert not is_clock_doubtful(good, clocks("imu"))
     assert is_clock_doubtful(good, clocks("imu", noted=True))
     assert is_clock_doubtful(good, clocks("imu", drifts=True))
-    assert not is_clock_doubtful(good, clocks("imu", noted=True, heading_offset_s=0.01))
-    assert is_clock_doubtful(good, clocks("gnss", noted=True, heading_offset_s=0.01))
+    assert not is_clock_doubtful(good, clocks("imu", noted=True, blamed=True))
+    assert not is_clock_doubtful(good, clocks("gnss", drifts=True, blamed=True))
+    assert is_clock_doubtful(good, clocks("power", noted=True, blamed=True))
 
 
 T = np.arange(0, 30, 0.05)

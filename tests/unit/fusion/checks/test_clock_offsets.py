@@ -5,8 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tcpipe.fusion.checks.clock_offsets import Pair, _solve_offsets, find_clock_offsets
-from tcpipe.fusion.measurements import BodyVelocities, InertialMeasurements, Measurements, Positions
+from tcpipe.fusion.checks.clock_offsets import Pair, RoleOffset, _solve_offsets, find_clock_offsets, shift_stamps
+from tcpipe.fusion.measurements import (
+    BodyVelocities,
+    InertialMeasurements,
+    Measurements,
+    Positions,
+    select_measurements,
+)
 
 
 def pair(late, against, offset_s, std_s=0.002, explained=0.9, *, by="speed"):
@@ -98,35 +104,6 @@ def test_a_yaw_rate_does_not_speak_for_a_speed():
     )  # it contradicts its own yaw rate
 
 
-def test_what_the_clock_of_the_fixes_may_be_off_by_is_a_cost_of_positions():
-    """Two clocks that differ by 0.1 s: either is right; three: 0.4 and 0.2 s apart, or not at all."""
-    agreed = pair("visual_odometry", "wheel_odometry", 0.0)
-    drifting = Pair("gnss", "wheel_odometry", "speed", 0.1, 0.002, 0.9, 0.36, 0.01)
-    assert _solve_offsets((drifting, agreed), 3600.0).position_offset_s == pytest.approx(0.1 + 0.18)
-    assert _solve_offsets((pair("gnss", "wheel_odometry", -0.1), agreed)).position_offset_s == pytest.approx(0.1)
-    assert _solve_offsets((pair("gnss", "wheel_odometry", -0.1),)).position_offset_s == pytest.approx(0.1 * 0.5**0.5)
-    three = _solve_offsets((pair("gnss", "wheel_odometry", 0.2), pair("wheel_odometry", "imu", 0.2, by="yaw rate")))
-    assert three.position_offset_s == pytest.approx(((0.4**2 + 0.2**2) / 3) ** 0.5)
-    assert _solve_offsets((pair("gnss", "wheel_odometry", 0.01),)).position_offset_s == 0.0
-    assert _solve_offsets((pair("imu", "wheel_odometry", 0.1),)).position_offset_s == 0.0
-
-
-def test_a_gyroscope_that_is_a_little_late_is_a_matter_of_the_heading():
-    def found(offset_s):
-        turning = {"by": "yaw rate"}
-        pairs = (
-            pair("wheel_odometry", "imu", -offset_s, **turning),
-            pair("visual_odometry", "imu", -offset_s, **turning),
-        )
-        return _solve_offsets((*pairs, pair("visual_odometry", "wheel_odometry", 0.0)))
-
-    assert found(0.1).heading_offset_s == pytest.approx(0.1)
-    assert found(0.3).heading_offset_s == found(0.01).heading_offset_s == 0.0
-    assert (
-        _solve_offsets((pair("wheel_odometry", "imu", -0.1, by="yaw rate"),)).heading_offset_s == 0.0
-    )  # who is late is not known
-
-
 HALF_HOUR = np.arange(0.0, 1900.0, 0.04)
 
 
@@ -205,3 +182,31 @@ def test_a_straight_tells_nothing_of_clocks():
     found = find_clock_offsets(Measurements(imu=imu, wheels=wheels), None)
     assert found.offsets == {}
     assert not any(each.determined for each in found.pairs)
+
+
+@pytest.mark.parametrize("length_s", [400.0, 1900.0])
+def test_a_clock_that_steps_has_no_offset(length_s):
+    """Late by 0.3 s from half-time: neither 0.15 s nor a drift would set it right."""
+    drive = drive_with_clocks(gnss=np.where(length_s / 2 > HALF_HOUR, 0.0, 0.3))
+    found = find_clock_offsets(select_measurements(drive, 0, round(length_s * 1e9)), None)
+    assert not any(pair.late == "gnss" for pair in found.pairs)
+    assert not any(offset.noted or offset.drifts for offset in found.offsets.values())
+
+
+def test_stamps_without_offset_and_drift():
+    """0.1 s in the middle of 100 s and 0.36 s an hour: 0.095 s at the beginning, 0.105 s at the end."""
+    stamp_ns = np.array([0, 50, 100], np.int64) * 10**9
+    steady = RoleOffset(0.1, 0.01, noted=True)
+    assert (stamp_ns - shift_stamps(stamp_ns, steady, 0, 100.0)).tolist() == [100_000_000] * 3
+    drifting = replace(steady, drift_s_per_h=0.36, drifts=True)
+    assert (stamp_ns - shift_stamps(stamp_ns, drifting, 0, 100.0)).tolist() == [95_000_000, 100_000_000, 105_000_000]
+
+
+def test_a_receivers_velocity_has_no_say_in_whose_clock_is_right():
+    """It shares the clock of the fixes: together they are one voice against the wheels."""
+    late = pair("gnss", "wheel_odometry", 0.2), pair("gnss_velocity", "wheel_odometry", 0.3)
+    found = _solve_offsets(late)
+    assert not found.offsets["gnss"].blamed
+    assert found.offsets["gnss_velocity"].offset_s == pytest.approx(0.3)
+    alone = _solve_offsets((pair("gnss_velocity", "gnss", 0.3, by="velocity east"),))
+    assert (alone.reference, alone.offsets["gnss_velocity"].noted) == ("gnss", True)
