@@ -3,7 +3,7 @@
 Every message has a log time (when the recorder received it); most have a header stamp (when it was measured). The header's rules where it
 is set and follows the log time, within 10 s, up to a constant offset; otherwise log time; topic by topic. A *lasting* step (> 0.5 s) of
 header minus log time opens a new clock epoch, common to all topics. Lasting means 10 s, or to the log's end: delays, bursts and single
-wrong stamps are no steps.
+wrong stamps are no steps. So does a host's clock that is set back: log times and headers pass a time twice, which is left out.
 
 A simulation runs slower than the wall clock, or faster, and may pause; ROS publishes its time on /clock, and stamps of before September
 2001 are no wall clock's. Where most topics count such a time, and it runs forward, it rules, and no epoch is opened: topics without a
@@ -51,6 +51,12 @@ SIMULATED_NS = 10**18
 CLOCK = "rosgraph_msgs/msg/Clock"
 """The type of the topic that publishes simulated time."""
 
+_FEWEST_IN_BIN = 4
+_FEWEST_REGULAR = 2
+_ABOUT_TWICE = 0.5
+_MOST_BINS = 2_000_000
+"""Of half a second: eleven days."""
+_MOSTLY = 0.5
 _BACK_NS = 1_000_000_000
 _MOST_BACK = 0.01
 LOG_CLOCK = Subject("log", "clock")
@@ -147,11 +153,90 @@ def settle_clocks(topics: Mapping[str, TopicTimes], *, clock_published: bool = F
         return AlignedClocks(
             {name: _make_simulated_timeline(name, times, simulated) for name, times in topics.items()}, [], simulated
         )
+    set_back = _find_times_passed_twice(topics)
+    if set_back:
+        return _settle_after_setting_back(topics, set_back)
+    return _settle_steps(topics, [])
+
+
+def _find_times_passed_twice(topics: Mapping[str, TopicTimes]) -> list[tuple[int, int, float]]:
+    """Return where most regular topics have twice their messages, since a host's clock was set back: log times [ns], and by how much [s].
+
+    A log is in order of log time: messages of before and after lie between each other there.
+    """
+    used = [times for times in topics.values() if len(times.log_time_ns)]
+    if not used:
+        return []
+    zero = min(int(times.log_time_ns[0]) for times in used)
+    size = (max(int(times.log_time_ns[-1]) for times in used) - zero) // STEP_NS + 1
+    if size > _MOST_BINS:  # log times are no clock's
+        return []
+    stamps = [_bring_to_log_clock(times) for times in used]
+    counts = np.array([np.bincount(((of - zero) // STEP_NS).clip(0, size), minlength=size + 1) for of in stamps])
+    usual = np.array([np.median(of[of > 0]) for of in counts])
+    regular = counts[usual >= _FEWEST_IN_BIN] / usual[usual >= _FEWEST_IN_BIN, None]
+    if len(regular) < _FEWEST_REGULAR:
+        return []
+    twice = np.concatenate(
+        ([0], (np.mean(np.abs(regular - 2.0) < _ABOUT_TWICE, axis=0) > _MOSTLY).astype(np.int8), [0])
+    )
+    begins, ends = np.flatnonzero(np.diff(twice) > 0), np.flatnonzero(np.diff(twice) < 0)
+    excess_s = np.concatenate(([0.0], np.cumsum(np.mean(regular - 1.0, axis=0)))) * STEP_NS / SECOND_NS
+    found = []
+    for begin, end in zip(begins.tolist(), ends.tolist(), strict=True):
+        step_s = float(excess_s[min(end + 1, size)] - excess_s[max(begin - 1, 0)])
+        # A driver that catches up sends what it did not send before: there is no more than usual in a longer time.
+        around_s = float(excess_s[min(2 * end - begin + 2, size)] - excess_s[max(2 * begin - end - 2, 0)])
+        if end - begin > 1 and around_s > _MOSTLY * step_s:
+            found.append((zero + (begin - 1) * STEP_NS, zero + (end + 1) * STEP_NS, step_s))
+    return found
+
+
+def _bring_to_log_clock(times: TopicTimes) -> Ints:
+    """Return the header stamps less their median distance from the log times [ns]; log times where some are unset."""
+    if times.header_ns is None or not _is_set(times).all():
+        return times.log_time_ns
+    return times.header_ns - int(np.median(times.header_ns - times.log_time_ns))
+
+
+def _settle_after_setting_back(
+    topics: Mapping[str, TopicTimes], spans: Sequence[tuple[int, int, float]]
+) -> AlignedClocks:
+    """Return the timelines without what lies in times that the clock passed twice: what of it is earlier nobody can tell."""
+    kept = {
+        name: np.flatnonzero(~np.any([(a <= of.log_time_ns) & (of.log_time_ns < b) for a, b, _ in spans], axis=0))
+        for name, of in topics.items()
+    }
+    rest = {name: select_times(of, kept[name]) for name, of in topics.items()}
+    steps = [ClockStep(end_ns, -size_s, ()) for _, end_ns, size_s in spans]
+    settled = _settle_steps(rest, steps)
+    timelines = {
+        name: replace(
+            of,
+            row=kept[name][of.row],
+            dropped=of.dropped | {"clock_set_back": len(topics[name].log_time_ns) - len(kept[name])},
+        )
+        for name, of in settled.timelines.items()
+    }
+    return replace(settled, timelines=timelines)
+
+
+def select_times(times: TopicTimes, rows: Ints) -> TopicTimes:
+    """Return the times of some rows."""
+    header_ns = None if times.header_ns is None else times.header_ns[rows]
+    content = tuple(column[rows] for column in times.content)
+    return replace(times, log_time_ns=times.log_time_ns[rows], header_ns=header_ns, content=content)
+
+
+def _settle_steps(topics: Mapping[str, TopicTimes], of_host: Sequence[ClockStep]) -> AlignedClocks:
+    """Return each topic's timeline, and the steps of single clocks beside those of the host's."""
     steps_of = {name: _find_steps(times) for name, times in topics.items()}
     reasons = {name: _find_header_problem(times, steps_of[name]) for name, times in topics.items()}
     # A header that does not rule has no say about the others' clock either.
     trusted = {name: steps for name, steps in steps_of.items() if reasons[name] is None}
     steps = _find_common_steps({name: topics[name].log_time_ns for name in topics}, trusted)
+    steps += [of for of in of_host if all(abs(of.log_time_ns - each.log_time_ns) > _TOGETHER_NS for each in steps)]
+    steps.sort(key=lambda step: step.log_time_ns)
     drafts = {
         name: _make_draft(times, reasons[name], _assign_epochs(name, times, steps, trusted.get(name, [])))
         for name, times in topics.items()

@@ -184,6 +184,7 @@ def find_lost_signs(sag: Sag | None, start_ns: Stamps, end_ns: Stamps, rise: Flo
         return nothing
     order = np.argsort(rise)
     steep = order[: int(np.argmax(np.cumsum(gain[order]))) + 1]  # few of which are clear by themselves
-    lost: NDArray[np.bool_] = ~driven & (gain > 0.0)
+    # Segments as steep as most of these may flow back for a part of their time.
+    lost: NDArray[np.bool_] = ~driven & ((gain > 0.0) | (rise <= np.quantile(rise[clear & ~driven], 0.8)))
     lost[steep] |= ~driven[steep]
     return lost

@@ -11,6 +11,7 @@ from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tcpipe.fusion.checks.clock_offsets import (
     POWER,
@@ -23,6 +24,7 @@ from tcpipe.fusion.checks.clock_offsets import (
 )
 from tcpipe.fusion.checks.lags import find_span_ns
 from tcpipe.fusion.measurements import DOPPLER, GNSS, IMU, VISUAL, WHEELS, Measurements
+from tcpipe.logs.clocks import LOG_CLOCK
 from tcpipe.power.rails import compute_power_at
 from tcpipe.recipe.suggestions import suggest
 from tcpipe.stages.fuse_inputs import FusionInputs, find_longest_epoch, find_recipe_role
@@ -33,6 +35,8 @@ from tcpipe.tables.levels import Streams
 
 _MAX_GAP_NS = 300_000_000
 _FINE_S = 0.004
+_JUMP_NS = 500_000_000
+_DRIVES_MPS = 0.3
 
 
 def correct_clocks(streams: Streams, inputs: FusionInputs) -> tuple[FusionInputs, StageReport[ClockFacts | None]]:
@@ -52,7 +56,44 @@ def correct_clocks(streams: Streams, inputs: FusionInputs) -> tuple[FusionInputs
     if span is not None:
         aligned = {number: _align(m, off, span[0], found.span_s) for number, m in inputs.measurements.items()}
         inputs = replace(inputs, measurements=aligned)
+    cuts_ns, jumps = find_clock_jumps(inputs)
+    inputs, findings = replace(inputs, cuts_ns=cuts_ns), (*findings, *jumps)
     return inputs, StageReport(findings, ClockFacts(epoch, found.reference, pairs, offsets))
+
+
+def find_clock_jumps(inputs: FusionInputs) -> tuple[tuple[int, ...], tuple[Finding, ...]]:
+    """Return the first stamps [ns] after the clock of all sensors was set forward, and the findings.
+
+    Nothing is measured before them, and by the fixes the robot, which drives before and after, does not drive meanwhile.
+    """
+    jumps: list[tuple[int, int]] = []
+    for m in inputs.measurements.values():
+        odometry = m.wheels or m.visual
+        if m.gnss is None or odometry is None:
+            continue
+        stamp_ns = np.unique(np.concatenate([sensor.stamp_ns for sensor in m.sensors().values()]))
+        for row in np.flatnonzero(np.diff(stamp_ns) > _JUMP_NS):
+            ends_ns = stamp_ns[[row, row + 1]]
+            driven = odometry.velocity_mps[_find_rows_around(odometry.stamp_ns, ends_ns[0]), 0]
+            moved_m = np.diff(m.gnss.position_enu_m[_find_rows_around(m.gnss.stamp_ns, ends_ns[0]), :2], axis=0)
+            slowest_mps = float(np.abs(driven).min())
+            if slowest_mps > _DRIVES_MPS and np.linalg.norm(moved_m) < 0.5e-9 * slowest_mps * np.diff(ends_ns)[0]:
+                jumps.append((int(ends_ns[0]), int(ends_ns[1])))
+    return tuple(after_ns for _, after_ns in jumps), tuple(_find_jump(inputs, *ends_ns) for ends_ns in jumps)
+
+
+def _find_rows_around(stamp_ns: NDArray[np.int64], at_ns: int) -> NDArray[np.int64]:
+    """Return the last row until a stamp [ns] and the one after it."""
+    after = np.searchsorted(stamp_ns, at_ns, "right")
+    return np.array([after - 1, after]).clip(0, stamp_ns.size - 1)
+
+
+def _find_jump(inputs: FusionInputs, before_ns: int, after_ns: int) -> Finding:
+    stamps = [int(sensor.stamp_ns[0]) for m in inputs.measurements.values() for sensor in m.sensors().values()]
+    at_s, step_s = (after_ns - min(stamps)) * 1e-9, (after_ns - before_ns) * 1e-9
+    return make_finding(
+        "clock-step", LOG_CLOCK, span_s=(at_s, at_s), names={"topics": "all topics"}, step_s=step_s, at_s=at_s
+    )
 
 
 def _align(m: Measurements, off: Mapping[str, RoleOffset], first_ns: int, span_s: float) -> Measurements:

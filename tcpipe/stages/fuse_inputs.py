@@ -53,6 +53,8 @@ class FusionInputs:
     excluded: frozenset[str] = frozenset()
     scales: Mapping[str, Scale] = field(default_factory=dict)
     """By odometry, the scale that was taken out."""
+    cuts_ns: tuple[int, ...] = ()
+    """First stamps after the clock of all sensors was set forward."""
 
     def note(self, role: str, prepared: Prepared) -> None:
         """Remember what was set aside."""
@@ -109,6 +111,14 @@ def _find_first_ns(streams: Streams) -> int:
     return min(
         int(to_integers(table.slice(0, 1), "stamp_ns")[0]) for table in streams.tables.values() if table.num_rows
     )
+
+
+def _find_used_s(role: str, streams: Streams) -> tuple[float, float] | None:
+    """Return when a sensor's first and last messages are [s]."""
+    if role not in streams.tables:
+        return None
+    stamp_ns = to_integers(streams.tables[role], "stamp_ns")
+    return (int(stamp_ns[0]) - _find_first_ns(streams)) / 1e9, (int(stamp_ns[-1]) - _find_first_ns(streams)) / 1e9
 
 
 def _prepare(role: str, table: pa.Table, sensor: Sensor, config: FuseConfig, inputs: FusionInputs) -> Any:
@@ -230,11 +240,10 @@ def _find_exclusion(refusal: SensorExclusion, streams: Streams) -> Finding:
     else:
         remedies = exclude_role(name)
     numbers: Mapping[str, Any] = refusal.numbers
-    first_ns, stamp_ns = _find_first_ns(streams), to_integers(streams.tables[refusal.role], "stamp_ns")
     return make_finding(
         refusal.code,
         Subject("role", name),
-        span_s=((int(stamp_ns[0]) - first_ns) / 1e9, (int(stamp_ns[-1]) - first_ns) / 1e9),
+        span_s=_find_used_s(refusal.role, streams),
         action="excluded",
         severity="note" if refusal.role == DOPPLER else None,
         names={"topic": sensor.topic, "placed_by": sensor.placed_by, **refusal.names},

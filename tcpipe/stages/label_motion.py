@@ -199,7 +199,8 @@ def is_clock_doubtful(streams: Streams, info: TrackInfo) -> bool:
         (offset.noted or offset.drifts) and (role == "power" or not offset.blamed)
         for role, offset in clocks.offsets.items()
     )
-    return recorder or off or streams.report.facts.epochs > 1
+    # A step of all clocks leaves them together.
+    return recorder or off or any(step.topics for step in streams.report.facts.clock_steps)
 
 
 _POWER, _WHEELS = Subject("role", "power"), Subject("role", "wheel_odometry")

@@ -133,7 +133,7 @@ def _read_parts(source: TopicReadings, timeline: Timeline, power: PowerReadings)
     return parts
 
 
-_EXPECTED = frozenset({"not_gga", "no_velocity"})
+_EXPECTED = frozenset({"not_gga", "no_velocity", "clock_set_back"})
 """Reasons why messages of a topic are of no use to a role: sentences of other kinds."""
 
 
@@ -157,7 +157,7 @@ def make_read_report(
             findings += _find_clock(source, timelines[source.key], is_simulated=clocks.simulated is not None)
     start_ns = min((int(of.readings.log_time_ns[0]) for of in sources if len(of.readings.row)), default=0)
     for step in steps:
-        at_s, names = (step.log_time_ns - start_ns) / 1e9, {"topics": ", ".join(step.topics)}
+        at_s, names = (step.log_time_ns - start_ns) / 1e9, {"topics": ", ".join(step.topics) or "all topics"}
         span_s, step_s = (at_s, at_s), step.step_s
         findings.append(make_finding("clock-step", LOG_CLOCK, span_s=span_s, names=names, step_s=step_s, at_s=at_s))
     facts = StageFacts(

@@ -69,7 +69,7 @@ class RoleFacts:
 
 @dataclass(frozen=True, slots=True)
 class ClockStep:
-    """A step of header minus log time: its log time [ns], size [s] and topics."""
+    """A step of header minus log time: its log time [ns], size [s] and topics; without topics a step of all clocks."""
 
     log_time_ns: int
     step_s: float

@@ -10,9 +10,9 @@ from unit.fusion import se3_reference as reference
 from tcpipe.fusion import error_state, state
 from tcpipe.fusion.error_state import filter_section, make_tests, smooth_section
 from tcpipe.fusion.filter_kernel import ACCEPTED, REJECTED, RESET, Inputs, Memory, allocate_steps, filter_ticks
-from tcpipe.fusion.smoother_kernel import EVERY
 from tcpipe.fusion.measurements import Measurements
 from tcpipe.fusion.parameters import Event, make_model
+from tcpipe.fusion.smoother_kernel import EVERY
 from tcpipe.fusion.ticks import Ticks
 
 T = 0.05
@@ -57,7 +57,7 @@ def make_inputs(count, rng, mode=state.INERTIAL, *, noise=0.0, kept=1.0):
         np.full((count, 6), noise),
         rng.normal(size=(count, 3)),
         np.full(count, mode >= state.GYRO_TURN),
-        rng.normal(size=(count, 2)),
+        rng.normal(size=count),
         np.full((*shape, 3), np.nan),
         np.ones((*shape, 3)),
         rng.uniform(-T / 2, T / 2, shape),

@@ -141,6 +141,38 @@ def test_a_stalled_recorder_is_no_step() -> None:
     np.testing.assert_array_equal(found.stamp_ns, header)
 
 
+def set_back(log: np.ndarray, seconds: float) -> np.ndarray:
+    """Log times in order, of a log whose host set its clock at half a minute."""
+    return np.sort(np.where(log < START + 30 * S, log, log - round(seconds * S)))
+
+
+def test_a_host_that_sets_its_clock_back_opens_an_epoch_for_all_and_loses_what_is_passed_twice() -> None:
+    fast, slow = set_back(log_times(rate_hz=100.0), 3.0), set_back(log_times(), 3.0)
+    found, steps = settle(imu=times(fast, fast), odometry=times(slow, slow), command=times(slow, None))
+    (step,) = steps
+    assert step.topics == ()
+    assert step.step_s == pytest.approx(-3.0, abs=0.1)
+    for name, log in (("imu", fast), ("odometry", slow), ("command", slow)):
+        timeline = found[name]
+        np.testing.assert_array_equal(timeline.stamp_ns, log[timeline.row])
+        before = timeline.stamp_ns[timeline.clock_epoch == 0], timeline.stamp_ns[timeline.clock_epoch == 1]
+        assert START + 26 * S - S // 10 <= before[0].max() < START + 27 * S
+        assert START + 30 * S <= before[1].min() < START + 31 * S + S // 10
+        assert timeline.dropped == {"clock_set_back": len(log) - len(timeline.row)}
+
+
+def test_one_topic_at_twice_its_rate_and_drivers_that_catch_up_are_no_step() -> None:
+    fast, slow = log_times(rate_hz=100.0), log_times()
+    twice = np.sort(np.concatenate((fast, fast[1000:1300] + S // 300)))
+    assert settle(imu=times(twice, twice), odometry=times(slow, slow), visual=times(slow, slow))[1] == []
+
+    def stalled(log: np.ndarray) -> np.ndarray:
+        late = (log >= START + 20 * S) & (log < START + 24 * S)
+        return np.where(late, log + (START + 24 * S - log) // 2, log)
+
+    assert settle(imu=times(stalled(fast), stalled(fast)), odometry=times(stalled(slow), stalled(slow)))[1] == []
+
+
 def test_single_wrong_stamps_are_replaced_and_counted() -> None:
     log = log_times()
     header = log - 1_000_000

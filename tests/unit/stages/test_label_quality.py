@@ -18,6 +18,7 @@ from tcpipe.tables.facts import (
     AuditFacts,
     ClockFacts,
     ClockOffset,
+    ClockStep,
     Disagreement,
     FuseFacts,
     GateReset,
@@ -156,9 +157,9 @@ def test_fixes_that_were_off_dispute_a_segment(role, disputed):
     assert (flags(cut(), about=info(fuse=fuse)) == {Quality.SENSORS_DISAGREE}) == disputed
 
 
-def streams(*, epochs=1, **time_sources):
+def streams(*, steps=(), **time_sources):
     sensors = {role: Sensor(f"/{role}", "x/msg/Y", role, "why", time_source=at) for role, at in time_sources.items()}
-    return Streams({}, sensors, "husky", report=StageReport((), StageFacts(epochs=epochs)))
+    return Streams({}, sensors, "husky", report=StageReport((), StageFacts(epochs=len(steps) + 1, clock_steps=steps)))
 
 
 def clocks(role, *, noted=False, drifts=False, blamed=False):
@@ -169,7 +170,8 @@ def clocks(role, *, noted=False, drifts=False, blamed=False):
 def test_a_clock_is_doubtful_that_steps_or_is_the_recorders():
     assert not is_clock_doubtful(streams(gnss="header", command="log"), info())
     assert is_clock_doubtful(streams(gnss="log"), info())
-    assert is_clock_doubtful(streams(epochs=2, gnss="header"), info())
+    assert is_clock_doubtful(streams(steps=(ClockStep(0, 2.0, ("/fix",)),), gnss="header"), info())
+    assert not is_clock_doubtful(streams(steps=(ClockStep(0, -3.0, ()),), gnss="header"), info())  # all of them step
 
 
 def test_a_clock_is_doubtful_that_is_off_unless_it_was_corrected():
