@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from tcpipe.errors import FusionError
 from tcpipe.fusion import state
-from tcpipe.fusion.densities import NoiseModel, estimate_noise
-from tcpipe.fusion.event_candidates import find_turn_jump
+from tcpipe.fusion.densities import NoiseModel, fit_noise
+from tcpipe.fusion.event_candidates import EventCandidate, find_fix_excursions, find_turn_jump
 from tcpipe.fusion.filter_kernel import (
     REJECTED,
     RESET,
@@ -27,9 +27,10 @@ from tcpipe.fusion.filter_kernel import (
     allocate_steps,
     filter_ticks,
 )
-from tcpipe.fusion.hypotheses import POSSIBLE, Hypothesis, compute_weights, explain, find_suspects
+from tcpipe.fusion.hypotheses import POSSIBLE, Hypothesis, compute_weights, explain, find_suspects, make_excursions
 from tcpipe.fusion.initial import compute_course, find_stationary_intervals
 from tcpipe.fusion.measurements import DOPPLER, GNSS, IMU, VISUAL, WHEELS, InitialState, Measurements
+from tcpipe.fusion.pair_residuals import find_residuals
 from tcpipe.fusion.parameters import PARAMETERS, expand_start, make_model, make_priors, make_start
 from tcpipe.fusion.process import (
     GROUND,
@@ -120,7 +121,8 @@ def run_error_state(m: Measurements, initial: InitialState, *, output_ns: Ints, 
     ------
     FusionError : the estimate is not finite.
     """
-    noise, standing = estimate_noise(m), find_stationary_intervals(m)
+    residuals, standing = find_residuals(m), find_stationary_intervals(m)
+    noise = fit_noise(m, residuals)
     ticks = build_ticks(m, noise, standing, _find_start_ns(m, output_ns), int(output_ns[-1]), output_ns=output_ns)
     std, walk, time_s = make_priors(m, noise, ticks)
     section = _Section(m, ticks, std, walk, time_s, gate_probability)
@@ -128,7 +130,7 @@ def run_error_state(m: Measurements, initial: InitialState, *, output_ns: Ints, 
     first_minute = filter_section(ticks, section.model(), start, until=round(_LEVELLING_S / ticks.inputs.period_s))
     start.x[:9] = smooth_section(first_minute).states[0, :9]
     made = filter_section(ticks, section.model(), start)
-    hypotheses = section.explain(made, start) if _has_dead_reckoning(m) else []
+    hypotheses = section.explain(made, start, find_fix_excursions(residuals, noise)) if _has_dead_reckoning(m) else []
     if hypotheses:
         made = section.filter(start, hypotheses[0])
     smoothed = smooth_section(made)
@@ -177,11 +179,14 @@ class _Section:
         model = self.model(hypothesis)
         return filter_section(hypothesis.alter_ticks(self.ticks), model, expand_start(start, self.model(), model))
 
-    def explain(self, made: Pass, start: Memory) -> list[Hypothesis]:
-        """Return the hypotheses that explain where sensors contradict each other, the best first; none where they do not."""
+    def explain(self, made: Pass, start: Memory, excursions: Sequence[EventCandidate]) -> list[Hypothesis]:
+        """Return the hypotheses that explain where sensors contradict each other, the best first; none where they do not.
+
+        ``excursions`` are smooth errors of fixes, which the filter follows.
+        """
         jump = find_turn_jump(self.measurements)
         if jump is None and not find_suspects(made.tests, self.ticks.inputs.period_s):
-            return []
+            return make_excursions(made, excursions)
         model = self.model(judges=True)
         plain = filter_section(self.ticks, model, expand_start(start, self.model(), model))
 
@@ -425,6 +430,10 @@ def _correct_measurements(
             if change.role == kind:
                 kept &= (tick < change.first) | (tick >= (change.last or made.states.shape[0]))
         found[name] = _select_rows(corrected, kept) if not kept.all() else corrected
+    if m.imu is not None:
+        at = np.searchsorted(made.ticks.stamp_ns, m.imu.stamp_ns).clip(0, made.states.shape[0] - 1)
+        bias = smoothed.states[at, state.GYRO_BIAS + 6 : state.GYRO_BIAS + 9]
+        found["imu"] = replace(m.imu, angular_velocity_radps=m.imu.angular_velocity_radps - bias)
     return replace(m, **found)
 
 
@@ -494,5 +503,6 @@ def _describe_parameters(m: Measurements, made: Pass, smoothed: Smoothed, std: F
             value = value - m.gnss.lever_arm_m
         spread = smoothed.spreads[-1, [active.index(e) for e in errors]]
         prior = std[list(errors)]
-        found[parameter.name] = ParameterFacts(tuple(value.tolist()), tuple(spread.tolist()), tuple(prior.tolist()))
+        varies = smoothed.states[:, [e + 6 for e in errors]].std(axis=0)
+        found[parameter.name] = ParameterFacts(*(tuple(each.tolist()) for each in (value, spread, prior, varies)))
     return found

@@ -14,13 +14,15 @@ import numpy as np
 from tcpipe.fusion.densities import NoiseModel
 from tcpipe.fusion.level_motion import find_turn_roles, get_turn_rates
 from tcpipe.fusion.measurements import GNSS, IMU, Measurements
-from tcpipe.fusion.pair_residuals import TURN, Residuals, align_turns
+from tcpipe.fusion.pair_residuals import ACROSS, ALONG, TURN, Residuals, align_turns
 from tcpipe.fusion.signals import compute_interval_means, compute_seconds, is_covered
 
 _GATE = 4.0  # standard deviations
 _FEWEST = 3  # overlapping windows
 _SHORTEST_S = 4.0  # single fixes off are for the gate
 _LEAST = 1e-6  # m² or rad²
+_ALIKE = 2.0
+_LONG_S = 8.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,6 +63,27 @@ def find_event_candidates(residuals: Sequence[Residuals], noise: NoiseModel) -> 
         if not any(each.start_ns <= candidate.at_ns <= each.end_ns for each in of_same):
             kept.append(candidate)
     return tuple(kept)
+
+
+def find_fix_excursions(residuals: Sequence[Residuals], noise: NoiseModel) -> tuple[EventCandidate, ...]:
+    """Return where fixes moved otherwise than two odometries alike, which did not slip at the same time."""
+    of_fixes = [
+        each for each in find_event_candidates(residuals, noise) if GNSS in each.pair and each.axis in {ALONG, ACROSS}
+    ]
+    long = (
+        each for each in of_fixes if each.time_s > _LONG_S
+    )  # in shorter ones an antenna that turns is elsewhere than stated
+    return tuple(one for one in long if any(_is_confirmed(one, other) for other in of_fixes))
+
+
+def _is_confirmed(one: EventCandidate, other: EventCandidate) -> bool:
+    overlap_ns = min(one.end_ns, other.end_ns) - max(one.start_ns, other.start_ns)
+    is_other = other.pair != one.pair and other.axis == one.axis and overlap_ns > 0
+    return (
+        is_other
+        and one.change * other.change > 0.0
+        and abs(other.change) < _ALIKE * abs(one.change) < _ALIKE**2 * abs(other.change)
+    )
 
 
 def _find_runs(each: Residuals, noise: NoiseModel) -> Iterator[EventCandidate]:

