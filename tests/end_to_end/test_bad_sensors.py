@@ -287,7 +287,6 @@ def astray(columns: Columns) -> Columns:
 
 
 UNLIKE = {
-    "fixes that go astray": ("gnss", astray, "contradicted-by-others", {}),
     "fixes that never change": (
         "gnss",
         constant(("latitude", "longitude", "altitude")),
@@ -316,6 +315,12 @@ UNLIKE = {
         {"quantity": "acceleration"},
     ),
 }
+
+
+def test_labels_hold_where_fixes_wander_off(drive, tmp_path):
+    labelled = run(drive.changed("gnss", astray), tmp_path)
+    assert "gnss" in {of.subject.name for of in labelled.info.report.findings if of.code == "sensor-changed"}
+    assert_labels_hold(labelled, drive.truth, within=0.06)
 
 
 @pytest.mark.parametrize("what", UNLIKE)
