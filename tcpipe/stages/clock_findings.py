@@ -6,7 +6,7 @@ Power is not fused, and its stamps stay as they are.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import asdict, replace
 from typing import Any
 
@@ -39,19 +39,22 @@ _JUMP_NS = 500_000_000
 _DRIVES_MPS = 0.3
 
 
-def correct_clocks(streams: Streams, inputs: FusionInputs) -> tuple[FusionInputs, StageReport[ClockFacts | None]]:
+def correct_clocks(
+    streams: Streams, inputs: FusionInputs, unsteady: Collection[str] = ()
+) -> tuple[FusionInputs, StageReport[ClockFacts | None]]:
     """Return the inputs on one clock, and the offsets that were taken out, by the longest clock epoch.
 
-    The remedy that states an offset includes what the recipe adds already.
+    The remedy that states an offset includes what the recipe adds already. Clocks of ``unsteady`` sensors step: they have no offset.
     """
     if not inputs.measurements:
         return inputs, StageReport((), None)
     epoch = find_longest_epoch(inputs)
     found = find_clock_offsets(inputs.measurements[epoch], _make_power_signal(streams, epoch))
-    off = {role: offset for role, offset in found.offsets.items() if offset.drifts or offset.noted}
+    steady = {role: offset for role, offset in found.offsets.items() if role not in unsteady}
+    off = {role: offset for role, offset in steady.items() if offset.drifts or offset.noted}
     findings = tuple(_find_offset(found, role, offset, streams) for role, offset in off.items())
     pairs = tuple(ClockPair(**_select_known(pair), determined=pair.determined) for pair in found.pairs)
-    offsets = {role: ClockOffset(**_select_known(offset)) for role, offset in found.offsets.items()}
+    offsets = {role: ClockOffset(**_select_known(offset)) for role, offset in steady.items()}
     span = find_span_ns(inputs.measurements[epoch])
     if span is not None:
         aligned = {number: _align(m, off, span[0], found.span_s) for number, m in inputs.measurements.items()}

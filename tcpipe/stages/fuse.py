@@ -40,14 +40,21 @@ def fuse_run(streams: Streams, config: FuseConfig, *, run_id: str) -> Track:
     FusionError : no sensor measures motion, or the estimate breaks down.
     """
     # 1. A pose made elsewhere is what the fixes are.
-    #    Streams become measurements: one frame, one set of units, usable variances; sensors that cannot be right are left out,
-    #    and the clocks of the others agree.
+    #    Streams become measurements: one frame, one set of units, usable variances; sensors that cannot be right are left out.
     streams, local = convert_pose_to_fixes(streams)
     run = Subject("run", run_id)
     inputs, sanity = drop_implausible_sensors(prepare_inputs(streams, config), streams)
-    inputs, clocks = correct_clocks(streams, inputs)
-    # 2. Each section for itself: where it starts, filter and smoother; again without a sensor that leads the track away from all others.
-    inputs, sanity, fused = fuse_recovering(inputs, sanity, streams, config, run=run)
+    # 2. Each section for itself: where it starts, filter and smoother; again without a sensor that leads the track away from all others,
+    #    and on the clock of a sensor as it is where the estimate finds that it steps: it has no offset.
+    aligned, clocks = correct_clocks(streams, inputs)
+    judged = fuse_recovering(aligned, sanity, streams, config, run=run)
+    unsteady = {change.role for section in judged[2].facts for change in section.changes if change.kind == "clock"}
+    if clocks.facts is not None and any(
+        offset.noted for role, offset in clocks.facts.offsets.items() if role in unsteady
+    ):
+        aligned, clocks = correct_clocks(streams, inputs, unsteady)
+        judged = fuse_recovering(aligned, sanity, streams, config, run=run)
+    inputs, sanity, fused = judged
     if not fused.found:
         raise FusionError("no motion to fuse", findings=(_find_nothing(streams, inputs, run), *sanity.findings))
     columns = {name: np.concatenate([part[name] for part in fused.columns]) for name in fused.columns[0]}

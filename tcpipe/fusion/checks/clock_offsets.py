@@ -59,6 +59,8 @@ ROLES = (IMU, WHEELS, VISUAL, GNSS, POWER)
 _NOTED_S = {POWER: 0.08}
 _NOTED_MOTION_S = 0.05
 _SURE = 4.0  # standard deviations
+_CLEARLY = 10.0
+"""Standard deviations of an offset that is not known well: the mean of a clock that steps scatters by more."""
 _MAX_STD_S = {POWER: 0.04}
 _MAX_MOTION_STD_S = 0.02
 _MIN_EXPLAINED = 0.25
@@ -287,10 +289,7 @@ def _select_power(power: PowerSignal | None, first_ns: int, last_ns: int) -> Pow
 
 
 def _pair(names: tuple[str, str, str], windows: list[tuple[float, Floats]], span_s: float) -> Pair | None:
-    """Return a pair of the whole run; where it drifts for sure, as it is in the middle of the run.
-
-    None where the lag is unknown, or parts of the run have others than a drift would make: a clock that steps, which the estimator finds.
-    """
+    """Return a pair of the whole run; where it drifts for sure, as it is in the middle of the run."""
     lags = [(at_s, estimate_lag([products])) for at_s, products in windows] if len(windows) > 1 else []
     known = [
         (at_s, lag) for at_s, lag in lags if lag and _is_determined(names[0], lag.offset_s, lag.std_s, lag.explained)
@@ -300,27 +299,10 @@ def _pair(names: tuple[str, str, str], windows: list[tuple[float, Floats]], span
     if len(told) >= _FEWEST_WINDOWS:
         (middle_s, rate), (middle_std_s, rate_std) = _fit_offset_line(np.array(told), span_s)
         drift = (3600.0 * rate, 3600.0 * rate_std)
-        if any(_is_surely_other(of - middle_s - rate * (at_s - span_s / 2), std) for at_s, of, std in told):
-            return None
-    if any(_steps_inside(products, rate) for _, products in windows):
-        return None
     if len(told) >= _FEWEST_WINDOWS and (whole is None or abs(rate) > _SURE * rate_std):
         explained = float(np.median([lag.explained for _, lag in known]))
         return Pair(*names, middle_s, middle_std_s, explained, *drift, told)
     return None if whole is None else Pair(*names, whole.offset_s, whole.std_s, whole.explained, *drift, told)
-
-
-def _steps_inside(products: Floats, rate: float) -> bool:
-    """Return whether the lags of both halves of a window differ by more than a drift [s/s] makes."""
-    first, last = (estimate_lag([half]) for half in np.array_split(products, 2, axis=1))
-    if first is None or last is None:
-        return False
-    drifted_s = rate * _WINDOW_NS * 0.5e-9
-    return _is_surely_other(last.offset_s - first.offset_s - drifted_s, math.hypot(first.std_s, last.std_s))
-
-
-def _is_surely_other(apart_s: float, std_s: float) -> bool:
-    return abs(apart_s) > max(_NOTED_MOTION_S, _SURE * std_s)
 
 
 def _fit_offset_line(told: Floats, span_s: float) -> tuple[tuple[float, float], tuple[float, float]]:
@@ -341,7 +323,7 @@ def _fit_offset_line(told: Floats, span_s: float) -> tuple[tuple[float, float], 
 
 def _is_determined(role: str, offset_s: float, std_s: float, explained: float) -> bool:
     limit_s = _MAX_STD_S.get(role, _MAX_MOTION_STD_S)
-    known = std_s <= limit_s or (std_s <= 3 * limit_s and abs(offset_s) > _SURE * std_s)
+    known = std_s <= limit_s or (std_s <= 3 * limit_s and abs(offset_s) > _CLEARLY * std_s)
     return known and explained >= _MIN_EXPLAINED
 
 

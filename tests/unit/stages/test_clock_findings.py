@@ -75,6 +75,9 @@ def test_an_offset_is_taken_out_of_the_stamps_that_are_fused(tmp_path):
     assert moved_s == pytest.approx(-LATE_S["wheel_odometry"], abs=WITHIN_S["wheel_odometry"])
     assert after.measurements[0].imu is before.measurements[0].imu
     assert correct_clocks(streams, after)[1].findings == ()
+    as_it_is, report = correct_clocks(streams, before, {"wheel_odometry"})
+    assert as_it_is.measurements[0].wheels is before.measurements[0].wheels
+    assert report.findings == ()
 
 
 def test_a_short_drive_says_what_it_cannot_tell(tmp_path):

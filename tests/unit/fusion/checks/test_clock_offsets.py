@@ -63,8 +63,9 @@ def test_pairs_in_a_ring_are_weighed_by_their_variances():
     [
         (0.0, 0.019, 0.9, True),
         (0.0, 0.03, 0.9, False),
-        (0.3, 0.05, 0.9, True),
-        (0.3, 0.07, 0.9, False),
+        (0.3, 0.025, 0.9, True),
+        (0.3, 0.05, 0.9, False),
+        (0.7, 0.07, 0.9, False),
         (0.3, 0.01, 0.2, False),
     ],
 )
@@ -184,13 +185,11 @@ def test_a_straight_tells_nothing_of_clocks():
     assert not any(each.determined for each in found.pairs)
 
 
-@pytest.mark.parametrize("length_s", [400.0, 1900.0])
-def test_a_clock_that_steps_has_no_offset(length_s):
-    """Late by 0.3 s from half-time: neither 0.15 s nor a drift would set it right."""
-    drive = drive_with_clocks(gnss=np.where(length_s / 2 > HALF_HOUR, 0.0, 0.3))
-    found = find_clock_offsets(select_measurements(drive, 0, round(length_s * 1e9)), None)
-    assert not any(pair.late == "gnss" for pair in found.pairs)
-    assert not any(offset.noted or offset.drifts for offset in found.offsets.values())
+def test_the_mean_of_a_clock_that_steps_is_not_known():
+    """Late by 0.3 s from half-time: 0.15 s sets neither half right, and parts of the run show it."""
+    drive = drive_with_clocks(gnss=np.where(HALF_HOUR < 200.0, 0.0, 0.3))
+    found = find_clock_offsets(select_measurements(drive, 0, 400 * 10**9), None)
+    assert "gnss" not in found.offsets
 
 
 def test_stamps_without_offset_and_drift():
