@@ -58,6 +58,7 @@ _LEVELLING_S = 60.0
 """The start is filtered twice over this time: attitude and yaw at its end are those of the beginning, smoothed."""
 _ANY_YAW_STD_RAD = np.pi / np.sqrt(3.0)
 _MANY_FIXES = 50
+_JUDGED_M = 0.5
 _UNCHANGED = Hypothesis((), 0.0)
 
 
@@ -130,7 +131,7 @@ def run_error_state(m: Measurements, initial: InitialState, *, output_ns: Ints, 
     first_minute = filter_section(ticks, section.model(), start, until=round(_LEVELLING_S / ticks.inputs.period_s))
     start.x[:9] = smooth_section(first_minute).states[0, :9]
     made = filter_section(ticks, section.model(), start)
-    hypotheses = section.explain(made, start, find_fix_excursions(residuals, noise)) if _has_dead_reckoning(m) else []
+    hypotheses = section.explain(made, start, find_fix_excursions(residuals, noise)) if _is_judging_fixes(m) else []
     if hypotheses:
         made = section.filter(start, hypotheses[0])
     smoothed = smooth_section(made)
@@ -143,9 +144,10 @@ def run_error_state(m: Measurements, initial: InitialState, *, output_ns: Ints, 
     return _make_trajectory(m, noise, made, smoothed, std, output_ns, hypotheses[:1])
 
 
-def _has_dead_reckoning(m: Measurements) -> bool:
-    """Return whether an IMU and an odometry, or a camera that sees all turns, carry the pose on, so that fixes can be judged."""
-    return bool(m.odometries()) if m.imu is not None else m.visual is not None and m.visual.turn_rate_radps is not None
+def _is_judging_fixes(m: Measurements) -> bool:
+    """Return whether an IMU and an odometry, or a camera that sees all turns, carry the pose better than fixes show it for a minute."""
+    carries = bool(m.odometries()) if m.imu is not None else m.visual is not None and m.visual.turn_rate_radps is not None
+    return carries and (m.gnss is None or float(np.median(m.gnss.variance_m2[:, 0])) < _JUDGED_M**2)
 
 
 @dataclass(frozen=True, slots=True)

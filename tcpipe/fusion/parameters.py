@@ -16,7 +16,7 @@ from tcpipe.fusion import state
 from tcpipe.fusion.densities import GaussMarkov, NoiseModel
 from tcpipe.fusion.filter_kernel import Memory, Model
 from tcpipe.fusion.measurements import IMU, VISUAL, WHEELS, InitialState, Measurements
-from tcpipe.fusion.process import find_scale_stds, turn_scale_std
+from tcpipe.fusion.process import find_scale_stds, is_length_observable, turn_scale_std
 from tcpipe.fusion.signals import find_chi_square_threshold
 from tcpipe.fusion.ticks import Ticks
 from tcpipe.geometry.rotation import matrix_from_quat
@@ -121,7 +121,7 @@ def _find_walk(process: GaussMarkov) -> float:
 
 def _list_varying_scales(m: Measurements, noise: NoiseModel) -> dict[int, GaussMarkov]:
     """Return how scales of odometries vary around their means, by error; only fixes show it."""
-    if m.gnss is None:
+    if not is_length_observable(m):
         return {}
     places = {WHEELS: state.WHEEL_SLIP, VISUAL: state.VISUAL_SLIP}
     found = {places[role]: noise.odometries[role].scale for role in m.odometries()}

@@ -136,13 +136,21 @@ def turn_scale_std(measurements: Measurements) -> float:
     return _VISUAL_TURN_SCALE_STD if sources[-1] is measurements.visual else _WHEEL_TURN_SCALE_STD
 
 
+def is_length_observable(m: Measurements) -> bool:
+    """Return whether fixes are fine enough, for the ground that they span, to show how long a metre of odometry is."""
+    if m.gnss is None or m.gnss.stamp_ns.size < 2:
+        return False
+    span_m = float(np.linalg.norm(np.ptp(m.gnss.position_enu_m[:, :2], axis=0)))
+    return float(np.sqrt(2.0 * np.median(m.gnss.variance_m2[:, 0]))) < WHEEL_SCALE_STD * max(span_m, 1e-3)
+
+
 def find_scale_stds(measurements: Measurements) -> tuple[float, float]:
     """Return the standard deviations of the scales of wheels and visual odometry; 0 where a scale is unobservable: it stays 1.
 
     Only fixes make a scale observable. Without any, one odometry is the measure: the camera where there is one, else the wheels. What an
     accelerometer adds up to over a minute is its tilt and its bias.
     """
-    if measurements.gnss is not None:
+    if is_length_observable(measurements):
         return WHEEL_SCALE_STD, VISUAL_SCALE_STD
     return (0.0 if measurements.visual is None else WHEEL_SCALE_STD), 0.0
 

@@ -48,6 +48,7 @@ _STATIONARY_STD_MPS = 0.01  # a robot that stands rocks
 _STATIONARY_RATE_STD_RADPS = 5e-4
 _LEVEL_EVERY_S = 1.0
 _UNMEASURED = 1e6
+_TOLD = 0.5  # share of a density that the run must tell
 _MOVING_MPS = 0.05  # slower is stationary (ruling)
 _MEDIAN_OF_SQUARES = 0.4549  # of a normal variable of variance 1
 _ACCELERATION_WINDOW_S = 0.4
@@ -205,8 +206,11 @@ def _make_velocity_variance(m: Measurements, source: BodyVelocities, noise: Nois
     claimed = source.variance_m2ps2
     found = claimed.copy()
     relative = claimed[:, 0] / np.median(claimed[:, 0])
-    white = max(noise.odometries[role].velocity_m2ps * rate_hz, _estimate_scatter(source.velocity_mps[:, 0]))
-    found[:, 0] = white * np.maximum(relative, 1.0)
+    of_run, scatter = noise.odometries[role], _estimate_scatter(source.velocity_mps[:, 0])
+    density = of_run.velocity_m2ps
+    if of_run.velocity_told < _TOLD:  # what is claimed beyond the scatter of the samples lasts
+        density = max(density, _LASTING_S * (float(np.median(claimed[:, 0])) - scatter))
+    found[:, 0] = max(density * rate_hz, scatter) * np.maximum(relative, 1.0)
     for axis in range(1, 3):
         if not np.isfinite(claimed[:, axis]).all() or np.ptp(source.velocity_mps[:, axis]) == 0.0:
             found[:, axis] = _UNMEASURED  # an axis that is always zero is a constraint, not a measurement
