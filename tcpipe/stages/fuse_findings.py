@@ -269,8 +269,9 @@ def _find_scales(inputs: FusionInputs, longest: StretchFacts) -> dict[str, Scale
 def _find_varying_scale(longest: StretchFacts) -> Iterator[Finding]:
     """Yield the finding of a camera whose scale varies; that of wheels always does: they slip."""
     scale = longest.parameters.get("camera scale")
-    if scale is not None and scale.variation[0] > read_threshold("odometry-scale-varies", "min_variation_fraction"):
-        yield make_finding("odometry-scale-varies", Subject("role", VISUAL), variation_fraction=scale.variation[0])
+    variation = 0.0 if scale is None else max(scale.variation, default=0.0)
+    if variation > read_threshold("odometry-scale-varies", "min_variation_fraction"):
+        yield make_finding("odometry-scale-varies", Subject("role", VISUAL), variation_fraction=variation)
 
 
 def _find_odometry_scale(role: str, scale: Scale, given: float) -> Finding:

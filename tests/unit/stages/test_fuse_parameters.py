@@ -75,3 +75,13 @@ def test_a_scale_that_is_surely_not_one_is_stated_beside_what_is_stated_already(
     assert proposed(finding)["read"]["odometry_scale"] == {"wheel_odometry": pytest.approx(0.5 / 1.3, rel=1e-3)}
     assert make_findings(log, camera_scale=((0.06,), (0.02,), (0.05,))).findings == ()
     assert make_findings(log, camera_scale=((0.02,), (0.001,), (0.05,))).findings == ()
+
+
+def test_a_camera_whose_scale_varies_is_named_and_wheels_which_always_slip_are_not():
+    def vary(std):
+        return (0.0,), (0.01,), (0.05,), (std,)
+
+    (finding,) = make_findings(streams(), camera_scale=vary(0.02)).findings
+    assert (finding.code, finding.subject.name) == ("odometry-scale-varies", "visual_odometry")
+    assert finding.numbers["variation_fraction"] == pytest.approx(0.02)
+    assert make_findings(streams(), camera_scale=vary(0.002), wheel_scale=vary(0.02)).findings == ()
