@@ -146,7 +146,9 @@ def run_error_state(m: Measurements, initial: InitialState, *, output_ns: Ints, 
 
 def _is_judging_fixes(m: Measurements) -> bool:
     """Return whether an IMU and an odometry, or a camera that sees all turns, carry the pose better than fixes show it for a minute."""
-    carries = bool(m.odometries()) if m.imu is not None else m.visual is not None and m.visual.turn_rate_radps is not None
+    carries = (
+        bool(m.odometries()) if m.imu is not None else m.visual is not None and m.visual.turn_rate_radps is not None
+    )
     return carries and (m.gnss is None or float(np.median(m.gnss.variance_m2[:, 0])) < _JUDGED_M**2)
 
 
