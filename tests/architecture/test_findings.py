@@ -2,12 +2,13 @@
 
 import ast
 from functools import cache
+from typing import get_args
 
 from package_source import read_nodes
 
 from tcpipe.formats.finding_lines import describe_finding
 from tcpipe.tables.bits import Quality, flag_name
-from tcpipe.tables.findings import AFFECTED, SEVERITIES, Finding, Subject, read_catalogue, read_sections
+from tcpipe.tables.findings import AFFECTED, SEVERITIES, Action, Finding, Subject, read_catalogue, read_sections
 
 LONGEST = 100
 LINES = "tcpipe.formats.finding_lines"
@@ -121,6 +122,7 @@ def test_entries_are_whole():
     for code, entry in read_catalogue().items():
         assert not entry.flag or entry.flag in bits, code
         assert entry.severity in SEVERITIES, code
+        assert entry.action in get_args(Action), code
         assert set(entry.affects) <= set(AFFECTED), code
         assert entry.title, code
         assert entry.cause, code
