@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from tcpipe.fusion.level_motion import KNOT_S
 from tcpipe.fusion.measurements import IMU, Measurements, Positions
 from tcpipe.fusion.pair_residuals import ACROSS, ALONG, FIX_S, SCALE_S, TURN, TURN_S, UP, Residuals, find_residuals
-from tcpipe.fusion.signals import compute_median_period_ns
+from tcpipe.fusion.signals import compute_median_period_ns, multiply_by_vector
 from tcpipe.power.noise import solve_non_negative
 
 Floats = NDArray[np.float64]
@@ -246,7 +246,7 @@ class _Cell:
 
     def find_level(self, variances: Floats, *, truncated: bool) -> tuple[Floats, float]:
         """Return the features relative to the fitted sum, their mean (C,), and the level of the squares in the same measure."""
-        fitted = self.features @ variances + _LEAST
+        fitted = multiply_by_vector(self.features, variances) + _LEAST
         z2 = self.square / fitted
         relative = (self.features / fitted[:, None]).mean(0)
         inside = z2[z2 < _GATE]
@@ -293,7 +293,7 @@ class _Fit:
                 solve_non_negative(matrix * std, target) * std
             )  # in units of the prior, so that rounding does not decide
             self._variances = 0.5 * (self._variances + fitted)
-            self._covariance = np.linalg.inv(matrix.T @ matrix)
+            self._covariance = np.linalg.inv(np.einsum("mi,mj->ij", matrix, matrix))
 
     def _count_windows(self, cells: Sequence[_Cell]) -> Floats:
         """Return how many windows of each cell are independent.
@@ -305,7 +305,7 @@ class _Fit:
         for cell in cells:
             key = cell.residuals.pair, cell.residuals.axis, cell.is_still
             levels.setdefault(key, []).append(
-                (cell.residuals.time_s, float((cell.features @ self._variances).mean()) + _LEAST)
+                (cell.residuals.time_s, float((multiply_by_vector(cell.features, self._variances)).mean()) + _LEAST)
             )
         counts = []
         for cell in cells:
@@ -389,7 +389,7 @@ class _Fit:
         """Yield measured and fitted size of the residuals of each cell."""
         for cell, count in zip(self._cells, self._count_windows(self._cells), strict=True):
             _, level = cell.find_level(self._variances, truncated=True)
-            fitted = float(np.sqrt((cell.features @ self._variances + _LEAST).mean()))
+            fitted = float(np.sqrt((multiply_by_vector(cell.features, self._variances) + _LEAST).mean()))
             z = 0.5 * np.log(max(level, 1e-9)) * np.sqrt(2.0 * count)
             each = cell.residuals
             yield ResidualLevel(

@@ -21,6 +21,8 @@ from tcpipe.fusion.signals import (
     compute_median_of_five,
     compute_median_period_ns,
     compute_seconds,
+    multiply_by_vector,
+    solve_least_squares,
 )
 from tcpipe.geometry.rotation import matrix_from_quat, multiply, quat_from_rotation_vector
 
@@ -303,7 +305,7 @@ class _Alignment:
             off = fix * unit - length
             if number == 0:  # a heading at each knot, however far off
                 seen = np.where(moving, fix * unit / np.maximum(np.abs(fix), 1e-9), 0.0)
-                towards = self._hats.T @ seen
+                towards = np.einsum("mk,m->k", self._hats, seen)
                 usable = np.abs(towards) > 0.5
                 if not usable.any():
                     return None
@@ -322,7 +324,7 @@ class _Alignment:
             columns, off = columns * root[:, None], off * root
             matrix = np.concatenate((columns.real, columns.imag, np.diag(noise / prior)))
             target = np.concatenate((off.real, off.imag, -before * noise / prior))
-            found = np.linalg.lstsq(matrix, target, rcond=None)[0]
+            found = solve_least_squares(matrix, target)
             fit = _Fit(
                 fit.turn_rad + found[1] * self._turn + np.interp(time_s, self._knots_s, found[5:]),
                 fit.scale * (1.0 + float(found[0])),
@@ -361,11 +363,11 @@ class _Alignment:
         rise = self._moved_m[:, 2] - self._difference(integrate_grid(climb) + self._arm_m[:, 2]).real
         pitch = np.zeros(knots_s.size)
         for _ in range(_ROUNDS // 2):
-            off = rise - path * (hats @ pitch)
+            off = rise - path * multiply_by_vector(hats, pitch)
             noise = float(np.median(np.abs(off))) + 1e-6
             root = 1.0 / (1.0 + np.square(off / (2.5 * noise)))
             matrix = np.concatenate(
                 (hats * (path * root)[:, None], np.diag(np.full(pitch.size, noise / _PITCH_STD_RAD)))
             )
-            pitch = np.linalg.lstsq(matrix, np.concatenate((rise * root, np.zeros(pitch.size))), rcond=None)[0]
+            pitch = solve_least_squares(matrix, np.concatenate((rise * root, np.zeros(pitch.size))))
         return np.interp(self._attitude.time_s, knots_s, pitch)

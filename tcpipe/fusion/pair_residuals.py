@@ -40,6 +40,8 @@ from tcpipe.fusion.signals import (
     compute_seconds,
     interpolate_signal,
     is_in_gap,
+    multiply_by_vector,
+    solve_least_squares,
 )
 
 Floats = NDArray[np.float64]
@@ -251,9 +253,9 @@ def align_turns(turn: Floats, step: int) -> Floats:
     matrix = np.stack((change[:, 1], np.ones(len(change))), -1)
     found = np.array([1.0, 0.0])
     for _ in range(5):
-        off = change[:, 0] - matrix @ found
+        off = change[:, 0] - multiply_by_vector(matrix, found)
         root = 1.0 / (1.0 + np.square(off / (2.5 * float(np.median(np.abs(off))) + 1e-9)))
-        found = np.linalg.lstsq(matrix * root[:, None], change[:, 0] * root, rcond=None)[0]
+        found = solve_least_squares(matrix * root[:, None], change[:, 0] * root)
     return np.asarray(turn[:, 0] - found[0] * turn[:, 1] - found[1] / step * np.arange(len(turn)))
 
 
@@ -270,7 +272,7 @@ def _integrate_process(weight: Floats, window_s: float, tau_s: float) -> Floats:
     step_s = window_s / weight.shape[1]
     node = np.arange(weight.shape[1])
     covariance = np.exp(-np.abs(node[:, None] - node) * (step_s / tau_s)) * step_s**2
-    return np.asarray(np.einsum("mi,mi->m", weight @ covariance, weight))
+    return np.asarray(np.einsum("mj,mj->m", np.einsum("mi,ij->mj", weight, covariance), weight))
 
 
 class _Window:

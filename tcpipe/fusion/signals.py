@@ -143,3 +143,15 @@ def _compute_chi_square_tail(freedom: int, value: float) -> float:
         total += term
         term *= half / (k + 1 + 0.5 * odd)
     return total
+
+
+def multiply_by_vector(matrix: Floats, vector: Floats) -> Floats:
+    """Return the product of a large matrix (M, C) and a vector (C,), the same bits whatever the number of threads of the BLAS."""
+    return np.asarray(np.einsum("mc,c->m", matrix, vector))
+
+
+def solve_least_squares(matrix: Floats, target: Floats) -> Floats:
+    """Return the solution of M equations by least squares, shape (C,); of least norm where they do not show it. Bits: `multiply_by_vector`."""
+    normal = np.einsum("mi,mj->ij", matrix, matrix)
+    solved: Floats = np.linalg.lstsq(normal, np.einsum("mi,m->i", matrix, target), rcond=1e-13)[0]
+    return solved

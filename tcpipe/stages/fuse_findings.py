@@ -224,7 +224,7 @@ def _find_disagreement(found: Sequence[Disagreement], first_ns: int) -> Finding:
 _SURELY = 4.0  # standard deviations
 _LEAST_ARM_M = 0.1  # what a finding names
 _LEAST_TILT_RAD = 0.0175
-_LEAST_SCALE = 0.03
+_LEAST_SCALE = 0.1
 
 
 def make_mounting_findings(inputs: FusionInputs, fused: Fused, streams: Streams) -> StageReport[MountingFacts | None]:
