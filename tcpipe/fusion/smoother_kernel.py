@@ -40,6 +40,7 @@ class Smoothed(NamedTuple):
 
 
 EVERY, SELDOM = 4, 100
+_SHORT_M = 0.01
 
 
 class Adjoint(NamedTuple):
@@ -210,16 +211,21 @@ def _smooth_tick(
             if ticks[q] < 0 or ticks[q] - k != lags[column]:
                 continue
             east, north = ends[q, 0] - out.states[k, 9], ends[q, 1] - out.states[k, 10]
-            length = max(sqrt(east * east + north * north), 1e-12)
-            east, north = east / length, north / length
-            s = east * east * ends[q, 2] + 2.0 * east * north * ends[q, 3] + north * north * ends[q, 4]
-            for i in range(3):
-                ai = east * x[i] + north * x[3 + i]
-                for j in range(3):
-                    s += ai * (east * x[j] + north * x[3 + j]) * c[RHO + i, RHO + j]
-                line = P[RHO + i]
-                for j in range(n):
-                    s -= 2.0 * ai * line[j] * (east * rows[1 + 2 * q, j] + north * rows[2 + 2 * q, j])
+            short = 0.5 * _SHORT_M * _SHORT_M  # where the robot hardly moves, along any direction
+            share = (east * east + short, 2.0 * east * north, north * north + short)
+            s = 0.0
+            for axis in range(2):
+                for other in range(axis, 2):
+                    v = ends[q, 2 + axis + other]
+                    for i in range(3):
+                        for j in range(3):
+                            v += x[3 * axis + i] * x[3 * other + j] * c[RHO + i, RHO + j]
+                        line = P[RHO + i]
+                        for j in range(n):
+                            v -= line[j] * x[3 * axis + i] * rows[1 + 2 * q + other, j]
+                            v -= line[j] * x[3 * other + i] * rows[1 + 2 * q + axis, j]
+                    s += share[axis + other] * v
+            s /= east * east + north * north + 2.0 * short
             out.links[k, column] = max(s, 0.0)
     if k % EVERY == 0:
         q = (k // EVERY) % ticks.size

@@ -52,6 +52,7 @@ _TOLD = 0.5  # share of a density that the run must tell
 _MOVING_MPS = 0.05  # slower is stationary (ruling)
 _MEDIAN_OF_SQUARES = 0.4549  # of a normal variable of variance 1
 _ACCELERATION_WINDOW_S = 0.4
+_SLIDE_LASTS_S = 0.016  # sideways velocities are independent after this time, where turning centre and mounting are states
 _LASTING_S = 0.1  # errors of an odometry beyond its white noise are independent after this time
 
 
@@ -238,7 +239,7 @@ def _add_constraints(m: Measurements, stationary_ns: Ints, stamp_ns: Ints, value
     if is_gliding(m):  # which way the body looks is not known
         return
     value[:, state.SIDEWAYS, :2] = 0.0
-    variance[:, state.SIDEWAYS, :2] = m.nonholonomic_std_mps**2 * _LASTING_S / period_s
+    variance[:, state.SIDEWAYS, :2] = m.nonholonomic_std_mps**2 * _SLIDE_LASTS_S / period_s
     imu = m.imu
     if imu is None or not imu.accelerometer_usable:
         every = max(1, round(_LEVEL_EVERY_S / period_s))

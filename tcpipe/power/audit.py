@@ -12,7 +12,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import uniform_filter1d
 
 from tcpipe.power.rails import Rail, interpolate_rail
 from tcpipe.tables.findings import read_threshold
@@ -102,8 +101,15 @@ def measure_sag(rails: Sequence[Rail]) -> Sag | None:
     values = [interpolate_rail(each, stamp_ns) for each in known]
     volt, amp = np.mean([of[0] for of in values], axis=0), np.sum([of[1] for of in values], axis=0)
     rows = max(round(_WINDOW_S * 1e9 / float(np.median(np.diff(stamp_ns)))), 3)
-    volt, amp = (of - uniform_filter1d(of, rows, mode="nearest") for of in (volt, amp))
+    volt, amp = (of - _compute_moving_mean(of, rows) for of in (volt, amp))
     return Sag(stamp_ns, volt, amp, 0.5 * (np.roll(amp, 1) + np.roll(amp, -1)))
+
+
+def _compute_moving_mean(values: Floats, rows: int) -> Floats:
+    """Return the mean over so many rows around each, the ends repeated."""
+    padded = np.pad(values, (rows // 2 + 1, rows - rows // 2 - 1), mode="edge")
+    total = np.cumsum(padded)
+    return np.asarray((total[rows:] - total[:-rows]) / rows)
 
 
 @dataclass(frozen=True, slots=True)

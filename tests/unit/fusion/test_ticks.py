@@ -139,7 +139,7 @@ def test_the_constraint_carries_the_same_information_at_any_length_of_ticks():
     for period_ns in (50_000_000, 20_000_000):
         found = ticks_of(m, start_ns, end_ns, period_ns=period_ns)
         told = np.sum(1.0 / found.inputs.variance[:, state.SIDEWAYS, 0]) / 18.0
-        assert told == pytest.approx(10.0 / m.nonholonomic_std_mps**2, rel=0.02)
+        assert told == pytest.approx(62.5 / m.nonholonomic_std_mps**2, rel=0.02)
 
 
 def test_a_stop_measures_velocity_and_bias_five_times_a_second():

@@ -23,6 +23,7 @@ from tcpipe.stages.segment import segment_track
 from tcpipe.tables.bits import Quality
 from tcpipe.tables.columns import to_floats, to_integers
 from tcpipe.tables.facts import (
+    ClockStep,
     AuditFacts,
     Disagreement,
     FuseFacts,
@@ -286,7 +287,8 @@ def test_clock_doubtful_when_the_recorder_stamped_what_counts(role, doubtful):
     sensors = {role: Sensor("/t", "x/msg/Y", "f", "why", time_source="log")}
     streams = power_streams({"drive": record()}, sensors=sensors)
     assert flagged(label(straight_track(SPEED), streams), Quality.CLOCK_DOUBTFUL).all() == doubtful
-    stepped = replace(streams, sensors={}, report=StageReport((), StageFacts(epochs=2)))
+    step = ClockStep(ZERO, 3.0, ("/t",))
+    stepped = replace(streams, sensors={}, report=StageReport((), StageFacts(epochs=2, clock_steps=(step,))))
     assert flagged(label(straight_track(SPEED), stepped), Quality.CLOCK_DOUBTFUL).all()
 
 
