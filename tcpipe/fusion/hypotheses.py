@@ -127,7 +127,7 @@ _BLOCKS: dict[tuple[str, int], tuple[tuple[int, int, float], ...]] = {
 }
 _COSTS = {
     "offset": 12.0,
-    "antenna": 14.0,
+    "antenna": 40.0,
     "clock": 14.0,
     "gyroscope": 16.0,
     "scale": 10.0,
