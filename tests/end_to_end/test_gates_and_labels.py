@@ -177,7 +177,8 @@ def test_turns_attitude_slip_and_vibration_are_the_robots(faulty):
         assert 0.5 < np.sqrt(np.mean(normalized**2)) < 1.5, name
     middle_ns = start_ns + (end_ns - start_ns) // 2
     for name, angle in (("roll_rad", roll), ("pitch_rad", pitch)):
-        assert to_floats(table, name) == pytest.approx(np.interp(middle_ns, truth.stamp_ns, angle), abs=0.006)
+        # The mounting of an IMU is stated to a degree.
+        assert to_floats(table, name) == pytest.approx(np.interp(middle_ns, truth.stamp_ns, angle), abs=0.0175)
     # White noise of three axes at 100 Hz, of which the band, half passed at its edges, passes 14.4 of 50 Hz.
     white = np.hypot(Imu().vibration_mps2 * wheel_mps, Imu().accelerometer_std_mps2)
     ratio = to_floats(table, "vibration_mps2") / (white * np.sqrt(3 * 14.4 / 50))

@@ -106,7 +106,7 @@ def test_the_track_is_the_drive(track, truth):
     roll_pitch_yaw = rotation.as_euler("xyz")
     for k, name in enumerate(("roll_rad", "pitch_rad", "yaw_rad")):
         difference = np.angle(np.exp(1j * (to_floats(table, name) - roll_pitch_yaw[:, k])))
-        assert np.sqrt(np.mean(difference**2)) < 0.005
+        assert np.sqrt(np.mean(difference**2)) < 0.0175  # the mounting of an IMU is stated to a degree
     assert np.abs(to_floats(table, "forward_velocity_mps") - np.interp(t, truth.t, truth.forward)).max() < 0.03
     speed = np.stack([to_floats(table, f"{name}_velocity_mps") for name in ("east", "north", "up")], -1)
     assert np.abs(speed - truth.at(truth.velocity, t)).max() < 0.04
