@@ -397,7 +397,10 @@ def find_gate_resets(made: Pass) -> tuple[GateReset, ...]:
             heard = np.flatnonzero((verdict[:tick] != REJECTED) & (verdict[:tick] != 0))
             since = np.flatnonzero(verdict[heard[-1] + 1 : tick] == REJECTED) + heard[-1] + 1 if heard.size else []
             first = since[0] if len(since) else tick
-            size = float(np.linalg.norm(made.tests.fix_innovation[tick, :2])) if kind == state.FIX else 0.0
+            off = made.tests.fix_innovation[tick, :2]
+            if kind != state.FIX:  # the forward velocity of the tick before
+                off = made.ticks.inputs.value[tick, kind, :1] - made.states[max(tick - 1, 0), state.U + 6]
+            size = float(np.linalg.norm(off))
             found.append(GateReset(role, int(stamp_ns[first]), int(stamp_ns[tick]), size))
     return tuple(sorted(found, key=lambda each: each.start_ns))
 

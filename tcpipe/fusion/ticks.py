@@ -48,6 +48,7 @@ _STATIONARY_STD_MPS = 0.01  # a robot that stands rocks
 _STATIONARY_RATE_STD_RADPS = 5e-4
 _LEVEL_EVERY_S = 1.0
 _UNMEASURED = 1e6
+_LEAST_M2PS = 4e-6  # 2 mm after a second: the mean of a tick is no better than that
 _TOLD = 0.5  # share of a density that the run must tell
 _MOVING_MPS = 0.05  # slower is stationary (ruling)
 _MEDIAN_OF_SQUARES = 0.4549  # of a normal variable of variance 1
@@ -208,7 +209,7 @@ def _make_velocity_variance(m: Measurements, source: BodyVelocities, noise: Nois
     found = claimed.copy()
     relative = claimed[:, 0] / np.median(claimed[:, 0])
     of_run, scatter = noise.odometries[role], _estimate_scatter(source.velocity_mps[:, 0])
-    density = of_run.velocity_m2ps
+    density = max(of_run.velocity_m2ps, _LEAST_M2PS)
     if of_run.velocity_told < _TOLD:  # what is claimed beyond the scatter of the samples lasts
         density = max(density, _LASTING_S * (float(np.median(claimed[:, 0])) - scatter))
     found[:, 0] = max(density * rate_hz, scatter) * np.maximum(relative, 1.0)
