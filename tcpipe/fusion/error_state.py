@@ -399,7 +399,7 @@ def find_gate_resets(made: Pass) -> tuple[GateReset, ...]:
             first = since[0] if len(since) else tick
             off = made.tests.fix_innovation[tick, :2]
             if kind != state.FIX:  # the forward velocity of the tick before
-                off = made.ticks.inputs.value[tick, kind, :1] - made.states[max(tick - 1, 0), state.U + 6]
+                off = made.ticks.inputs.value[tick, kind, :1] - made.states[max(int(tick) - 1, 0), state.U + 6]
             size = float(np.linalg.norm(off))
             found.append(GateReset(role, int(stamp_ns[first]), int(stamp_ns[tick]), size))
     return tuple(sorted(found, key=lambda each: each.start_ns))

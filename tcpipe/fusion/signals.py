@@ -151,7 +151,7 @@ def multiply_by_vector(matrix: Floats, vector: Floats) -> Floats:
 
 
 def solve_least_squares(matrix: Floats, target: Floats) -> Floats:
-    """Return the solution of M equations by least squares, shape (C,); of least norm where they do not show it. Bits: `multiply_by_vector`."""
+    """Return the least-squares solution of M equations, shape (C,), of least norm; the same bits as `multiply_by_vector` says."""
     normal = np.einsum("mi,mj->ij", matrix, matrix)
     solved: Floats = np.linalg.lstsq(normal, np.einsum("mi,m->i", matrix, target), rcond=1e-13)[0]
     return solved

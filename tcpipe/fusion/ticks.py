@@ -53,7 +53,9 @@ _TOLD = 0.5  # share of a density that the run must tell
 _MOVING_MPS = 0.05  # slower is stationary (ruling)
 _MEDIAN_OF_SQUARES = 0.4549  # of a normal variable of variance 1
 _ACCELERATION_WINDOW_S = 0.4
-_SLIDE_LASTS_S = 0.016  # sideways velocities are independent after this time, where turning centre and mounting are states
+_SLIDE_LASTS_S = (
+    0.016  # sideways velocities are independent after this time, where turning centre and mounting are states
+)
 _LASTING_S = 0.1  # errors of an odometry beyond its white noise are independent after this time
 
 

@@ -117,7 +117,7 @@ class FuseConfig:
     visual_std_mps: Deviation = 0.05
     """Standard deviation of visual velocity where the source gives none [m/s]."""
     nonholonomic_std_mps: Deviation = 0.15
-    """Sideways and vertical velocity of the turning centre are zero to within this, sixty times a second; far less, and GNSS is rejected [m/s]."""
+    """Sideways and vertical velocity are zero to within this, sixty times a second; much smaller values cause GNSS to be rejected [m/s]."""
     gyro_noise_radps: Deviation = 0.003
     """White noise of the gyroscope at its rate [rad/s]."""
     accelerometer_noise_mps2: Deviation = 0.10

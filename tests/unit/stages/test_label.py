@@ -23,8 +23,8 @@ from tcpipe.stages.segment import segment_track
 from tcpipe.tables.bits import Quality
 from tcpipe.tables.columns import to_floats, to_integers
 from tcpipe.tables.facts import (
-    ClockStep,
     AuditFacts,
+    ClockStep,
     Disagreement,
     FuseFacts,
     GateReset,
