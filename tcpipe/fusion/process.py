@@ -33,10 +33,8 @@ from tcpipe.fusion.signals import (
 
 WHEEL_SCALE_STD = 0.12  # a skid-steered robot on grass slips by so much
 VISUAL_SCALE_STD = 0.05  # stereo calibration
-_WHEEL_SCALE_TIME_S = 60.0  # correlation time of slip
 _WHEEL_TURN_SCALE_STD = 0.2  # turn rate of skidding wheels
 _VISUAL_TURN_SCALE_STD = 0.03  # turn rate of a camera
-_TURN_SCALE_TIME_S = 60.0  # correlation time, as wheel scale
 SLOPE_RAD = 0.1  # of ground, where nothing shows it
 DOPPLER_LASTS_S = 3.0  # what a correlation that fades in 1.5 s weighs
 UNSEEN_TURN_RADPS = 0.07  # roll and pitch of a robot on uneven ground
