@@ -60,12 +60,12 @@ SMALLEST = {
     "fuse": Smallest(
         "--hours 0.01 --paired-seconds 5", rf"compiled / 15-state filterpy: {NUMBER}[\s\S]*peak memory {NUMBER} MB"
     ),
-    "fusion_accuracy": Smallest("--drives 1 --only 'GNSS alone'", rf"GNSS alone, smoothed +{NUMBER}"),
+    "fusion_accuracy": Smallest("--drives 1 --only 'GNSS alone'", rf"GNSS alone +{NUMBER}"),
     "honesty": Smallest(
         "--cells '^GNSS, wheels: clean' --seeds 1 --length 60 --out {out}/a.json",
         rf"GNSS, wheels: clean +\d+( +\d+/\d+){{5}} +{NUMBER}",
     ),
-    "label_accuracy": Smallest("--scenario tiny", rf"odometer +-?{NUMBER}%"),
+    "label_accuracy": Smallest("--scenario tiny", rf"odometer +[+-]?{NUMBER}%"),
     "load_dataset": Smallest("{out} 300", rf"epoch from disk, zstd: {NUMBER} x memmap"),
     "many_runs": Smallest("{out} 3", rf"prune --dry-run, again +{NUMBER} s wall"),
     "path_coverage": Smallest("--train 2 --metres 100 --further 2", rf"energy +1 m: +{NUMBER} %"),

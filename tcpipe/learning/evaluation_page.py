@@ -21,14 +21,14 @@ FLOORS = {"label_floor": "label noise alone", "simulation_floor": "simulation's 
 """Lower bounds of errors, and their names on the page."""
 
 MEASURES = {"rmse": "RMSE", "mape_percent": "MAPE"}
-SCORES = {"coverage_percent": "coverage", "nll": "NLL", "crps": "CRPS"}
+SCORES = {"coverage_percent": "inside", "nll": "NLL", "crps": "CRPS"}
 """How well a model states its own errors (`tcpipe.learning.metrics`)."""
 _ALL_MEASURES = MEASURES | SCORES
 
 COUNTED = (
     "The number in brackets after a MAPE counts its labels: those of at least "
     + ", ".join(f"{least:g} {UNITS[quantity]} ({quantity})" for quantity, least in LEAST.items())
-    + ". Coverage is the share of labels inside the model's 90 % intervals. "
+    + ". Inside: the share of labels in the 90 % intervals of the model. "
 )
 _DIGITS = {"w": 2, "v": 3, "T": 3, "E": 2}
 _CALLED = {"test": "test samples of the known area", "unseen": "the unseen area"}
@@ -146,7 +146,7 @@ def _make_baselines_section(found: Evaluation) -> Section:
                 if (row.split, row.quantity) == (split, quantity):
                     figures = [*_format_figures(row.errors, quantity, MEASURES), *_BLANK]
                     rows.append(("", "", row.baseline, *figures, str(row.rmse_ratio), str(row.mape_ratio)))
-    header = ("", "", "", "RMSE", "MAPE [%]", "coverage [%]", "NLL", "CRPS", "ratio of RMSE", "ratio of MAPE")
+    header = ("", "", "", "RMSE", "MAPE [%]", "inside [%]", "NLL", "CRPS", "ratio of RMSE", "ratio of MAPE")
     text = (
         "The baselines use the training and test samples of the model. Ratios are the model's error over the "
         "baseline's, with their 95 % interval (paired bootstrap over runs or blocks): below 1 the model is better. Physics and boosting "
