@@ -27,7 +27,7 @@ from tcpipe.fusion.level_motion import KNOT_S
 from tcpipe.fusion.measurements import IMU, Measurements, Positions
 from tcpipe.fusion.pair_residuals import ACROSS, ALONG, FIX_S, SCALE_S, TURN, TURN_S, UP, Residuals, find_residuals
 from tcpipe.fusion.signals import compute_median_period_ns, multiply_by_vector
-from tcpipe.power.noise import solve_non_negative
+from tcpipe.power.noise import MEDIAN_OF_SQUARES, solve_non_negative
 
 Floats = NDArray[np.float64]
 
@@ -172,16 +172,14 @@ _SUMMARY_TAU_S = np.geomspace(2.0, 100.0, 40)
 _TOLD_S = 10.0  # the share told is that of the change over so long
 _ROUNDS = 16  # of which the first half takes medians
 _GATE = 9.0  # of z², afterwards
-_MEDIAN, _TRUNCATED = 0.4549, 0.9733  # median of χ², and its mean below the gate; one degree
+_TRUNCATED = 0.9733  # mean of z² below the gate
 _LONGEST = 15.0  # a section's length through this: longer windows are too few to tell a variance
 _CAUTION = 0.6  # standard deviations of a fitted process that a filter's process is larger by
 _OVERLAP = 2.0  # other lengths and axes tell the same: the number of windows is divided by this
 _FEWEST = 8  # windows
 _TOLD = 0.5  # less, and the larger of fit and prior holds
-_FIT, _SHORTEST_S = (
-    4.0,
-    20.0,
-)  # windows longer by so much, but not than this, enter the fit: few, but none would tell less
+# Windows that are up to so many times as long as the longest enter the fit if they are not longer than this: few, but better than none.
+_FIT, _SHORTEST_S = 4.0, 20.0
 _MOST_UNCLAIMED = 0.5  # share of fixes without a claim, whose noise stays the recipe's
 _ONE_TIME = 0.6  # share of the claim that may well belong to one correlation time, 1σ
 _MOVING = 0.02  # the same of what errs only while the robot moves
@@ -252,7 +250,7 @@ class _Cell:
         inside = z2[z2 < _GATE]
         if truncated and inside.size:
             return relative, float(inside.mean()) / _TRUNCATED
-        return relative, float(np.median(z2)) / _MEDIAN
+        return relative, float(np.median(z2)) / MEDIAN_OF_SQUARES
 
 
 class _Fit:
@@ -289,9 +287,8 @@ class _Fit:
             # Its mean is below that of the level by 1 / n.
             logarithm = np.log(np.maximum(levels, _LEAST_LEVEL)) + np.minimum(1.0 / (_OVERLAP * counts), 0.5)
             target = np.concatenate(((1.0 + logarithm) * weight, self._mean / std))
-            fitted = (
-                solve_non_negative(matrix * std, target) * std
-            )  # in units of the prior, so that rounding does not decide
+            # Solved in units of the prior, so that rounding does not decide.
+            fitted = solve_non_negative(matrix * std, target) * std
             self._variances = 0.5 * (self._variances + fitted)
             self._covariance = np.linalg.inv(np.einsum("mi,mj->ij", matrix, matrix))
 
@@ -320,7 +317,7 @@ class _Fit:
             counts.append(cell.square.size / (1.0 + 2.0 * np.square(correlation).sum()) / _OVERLAP)
         return np.array(counts)
 
-    def _told(self, factors: Floats) -> float:
+    def _compute_share_told(self, factors: Floats) -> float:
         """Return which share the data tell of a sum of the densities, by factors (C,)."""
         before = float(np.square(factors * self._usual_std).sum())
         return float(np.clip(1.0 - factors @ self._covariance @ factors / before, 0.0, 1.0)) if before > 0.0 else 0.0
@@ -334,7 +331,7 @@ class _Fit:
         if name not in self._names:
             return prior, 0.0
         row = self._names.index(name)
-        told = self._told(np.eye(len(self._names))[row])
+        told = self._compute_share_told(np.eye(len(self._names))[row])
         fitted = float(self._variances[row])
         return (fitted if told >= _TOLD else max(fitted, prior)), told
 
@@ -349,7 +346,7 @@ class _Fit:
         factors = np.zeros(len(self._names))
         for tau, row, _ in parts:
             factors[row] = -2.0 * np.expm1(-_TOLD_S / tau)
-        told = self._told(factors) * float((self._longest_s >= _SUMMARY_S).mean())
+        told = self._compute_share_told(factors) * float((self._longest_s >= _SUMMARY_S).mean())
         shape = np.zeros((_SUMMARY_S.size, len(self._names)))
         for tau, row, _ in parts:
             shape[:, row] = GaussMarkov(1.0, tau).difference_variance(_SUMMARY_S)
@@ -528,4 +525,4 @@ def _compute_density(stamp_ns: NDArray[np.int64], values: Floats) -> float:
     second = second[second > 0.0]
     if second.size < _FEWEST:
         return 0.0
-    return float(np.median(second)) ** 2 / _MEDIAN / 6.0 * compute_median_period_ns(stamp_ns[finite]) * 1e-9
+    return float(np.median(second)) ** 2 / MEDIAN_OF_SQUARES / 6.0 * compute_median_period_ns(stamp_ns[finite]) * 1e-9

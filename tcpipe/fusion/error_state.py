@@ -7,9 +7,8 @@ time with everything kept, and smoothed. The second pass repeats the arithmetic 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +18,8 @@ from tcpipe.fusion import state
 from tcpipe.fusion.densities import NoiseModel, fit_noise
 from tcpipe.fusion.event_candidates import EventCandidate, find_fix_excursions, find_turn_jump
 from tcpipe.fusion.filter_kernel import (
+    ACCEPTED,
+    NONE,
     REJECTED,
     RESET,
     Memory,
@@ -29,7 +30,7 @@ from tcpipe.fusion.filter_kernel import (
 )
 from tcpipe.fusion.hypotheses import POSSIBLE, Hypothesis, compute_weights, explain, find_suspects, make_excursions
 from tcpipe.fusion.initial import compute_course, find_stationary_intervals
-from tcpipe.fusion.measurements import DOPPLER, GNSS, IMU, VISUAL, WHEELS, InitialState, Measurements
+from tcpipe.fusion.measurements import DOPPLER, GNSS, IMU, VISUAL, WHEELS, InitialState, Measurements, select_rows
 from tcpipe.fusion.pair_residuals import find_residuals
 from tcpipe.fusion.parameters import PARAMETERS, expand_start, make_model, make_priors, make_start
 from tcpipe.fusion.process import (
@@ -57,8 +58,8 @@ _BLOCK = 1024
 _LEVELLING_S = 60.0
 """The start is filtered twice over this time: attitude and yaw at its end are those of the beginning, smoothed."""
 _ANY_YAW_STD_RAD = np.pi / np.sqrt(3.0)
-_MANY_FIXES = 50
-_JUDGED_M = 0.5
+_MANY_FIXES = 50  # from so many on, their white noise is averaged out
+_JUDGED_M = 0.5  # fixes that claim more are not judged: motion carries the pose no better
 _UNCHANGED = Hypothesis((), 0.0)
 
 
@@ -127,16 +128,17 @@ def run_error_state(m: Measurements, initial: InitialState, *, output_ns: Ints, 
     ticks = build_ticks(m, noise, standing, _find_start_ns(m, output_ns), int(output_ns[-1]), output_ns=output_ns)
     std, walk, time_s = make_priors(m, noise, ticks)
     section = _Section(m, ticks, std, walk, time_s, gate_probability)
-    start = make_start(initial, section.model(), std, (0.0, 0.0, 0.0) if m.gnss is None else m.gnss.lever_arm_m)
-    first_minute = filter_section(ticks, section.model(), start, until=round(_LEVELLING_S / ticks.inputs.period_s))
+    model = section.make_model()
+    start = make_start(initial, model, std, (0.0, 0.0, 0.0) if m.gnss is None else m.gnss.lever_arm_m)
+    first_minute = filter_section(ticks, model, start, until=round(_LEVELLING_S / ticks.inputs.period_s))
     start.x[:9] = smooth_section(first_minute).states[0, :9]
-    made = filter_section(ticks, section.model(), start)
+    made = filter_section(ticks, model, start)
     hypotheses = section.explain(made, start, find_fix_excursions(residuals, noise)) if _is_judging_fixes(m) else []
     if hypotheses:
-        made = section.filter(start, hypotheses[0])
+        made = section.filter(start, model, hypotheses[0])
     smoothed = smooth_section(made)
     if len(hypotheses) > 1:
-        rivals = [smooth_section(section.filter(start, each)) for each in hypotheses[1:]]
+        rivals = [smooth_section(section.filter(start, model, each)) for each in hypotheses[1:]]
         widen(smoothed, rivals, compute_weights(hypotheses), made.ticks.inputs.period_s)
     if not np.isfinite(smoothed.states).all():
         finding = make_finding("estimate-not-finite", Subject("run", ""))
@@ -163,7 +165,7 @@ class _Section:
     time_s: Floats
     gate_probability: float
 
-    def model(self, changes: Hypothesis = _UNCHANGED, *, judges: bool = False) -> Model:
+    def make_model(self, changes: Hypothesis = _UNCHANGED, *, judges: bool = False) -> Model:
         """Return the model under a hypothesis; one that ``judges`` holds all errors that another could change, and follows no fix."""
         return make_model(
             self.measurements,
@@ -178,10 +180,10 @@ class _Section:
             possible=POSSIBLE if judges else (),
         )
 
-    def filter(self, start: Memory, hypothesis: Hypothesis) -> Pass:
-        """Return the forward pass under a hypothesis."""
-        model = self.model(hypothesis)
-        return filter_section(hypothesis.alter_ticks(self.ticks), model, expand_start(start, self.model(), model))
+    def filter(self, start: Memory, model: Model, hypothesis: Hypothesis) -> Pass:
+        """Return the forward pass under a hypothesis from a start of the ``model`` without one."""
+        changed = self.make_model(hypothesis)
+        return filter_section(hypothesis.alter_ticks(self.ticks), changed, expand_start(start, model, changed))
 
     def explain(self, made: Pass, start: Memory, excursions: Sequence[EventCandidate]) -> list[Hypothesis]:
         """Return the hypotheses that explain where sensors contradict each other, the best first; none where they do not.
@@ -191,14 +193,14 @@ class _Section:
         jump = find_turn_jump(self.measurements)
         if jump is None and not find_suspects(made.tests, self.ticks.inputs.period_s):
             return make_excursions(made, excursions)
-        model = self.model(judges=True)
-        plain = filter_section(self.ticks, model, expand_start(start, self.model(), model))
+        model = self.make_model(judges=True)
+        plain = filter_section(self.ticks, model, expand_start(start, made.model, model))
 
         def run(changed: Hypothesis, first: int, last: int) -> Pass:
             block = first // _BLOCK
             begin = plain.checkpoints[block]
             ticks = changed.alter_ticks(self.ticks)
-            return filter_section(ticks, self.model(changed, judges=True), begin, begin=block * _BLOCK, until=last)
+            return filter_section(ticks, self.make_model(changed, judges=True), begin, begin=block * _BLOCK, until=last)
 
         return explain(plain, run, frozenset(model.active.tolist()), jump)
 
@@ -228,7 +230,7 @@ def _compute_yaw(states: Floats) -> Floats:
 
 
 def _find_start_ns(m: Measurements, output_ns: Ints) -> int:
-    moving = [int(sensor.stamp_ns[0]) for role, sensor in m.sensors().items() if role != "imu"]
+    moving = [int(sensor.stamp_ns[0]) for role, sensor in m.sensors().items() if role != IMU]
     return min(*moving, int(output_ns[0])) if moving else int(output_ns[0])
 
 
@@ -355,7 +357,7 @@ def _compute_unseen_scale_std(m: Measurements, made: Pass) -> float:
     if not m.odometries():
         return 0.0
     own = WHEEL_SCALE_STD if m.visual is None else VISUAL_SCALE_STD
-    used = np.flatnonzero(made.tests.verdict[:, state.FIX] == 1)
+    used = np.flatnonzero(made.tests.verdict[:, state.FIX] == ACCEPTED)
     if used.size < 2:
         return own
     place, variance = made.ticks.inputs.value[used, state.FIX], made.ticks.inputs.variance[used, state.FIX, 0]
@@ -394,7 +396,7 @@ def find_gate_resets(made: Pass) -> tuple[GateReset, ...]:
     for kind, role in ROLES.items():
         verdict, stamp_ns = made.tests.verdict[:, kind], made.ticks.stamp_ns
         for tick in np.flatnonzero(verdict == RESET):
-            heard = np.flatnonzero((verdict[:tick] != REJECTED) & (verdict[:tick] != 0))
+            heard = np.flatnonzero((verdict[:tick] != REJECTED) & (verdict[:tick] != NONE))
             since = np.flatnonzero(verdict[heard[-1] + 1 : tick] == REJECTED) + heard[-1] + 1 if heard.size else []
             first = since[0] if len(since) else tick
             off = made.tests.fix_innovation[tick, :2]
@@ -436,17 +438,12 @@ def _correct_measurements(
         for change in changes:
             if change.role == kind:
                 kept &= (tick < change.first) | (tick >= (change.last or made.states.shape[0]))
-        found[name] = _select_rows(corrected, kept) if not kept.all() else corrected
+        found[name] = corrected if kept.all() else select_rows(corrected, kept)
     if m.imu is not None:
         at = np.searchsorted(made.ticks.stamp_ns, m.imu.stamp_ns).clip(0, made.states.shape[0] - 1)
         bias = smoothed.states[at, state.GYRO_BIAS + 6 : state.GYRO_BIAS + 9]
         found["imu"] = replace(m.imu, angular_velocity_radps=m.imu.angular_velocity_radps - bias)
     return replace(m, **found)
-
-
-def _select_rows(source: Any, kept: NDArray[np.bool_]) -> Any:
-    values = {field.name: getattr(source, field.name) for field in fields(source)}
-    return replace(source, **{name: value[kept] for name, value in values.items() if isinstance(value, np.ndarray)})
 
 
 def _list_changes(made: Pass, explained: Sequence[Hypothesis]) -> Iterator[ChangeFacts]:
@@ -466,7 +463,7 @@ def _make_facts(  # noqa: PLR0917
     tests = made.tests
     nis = {}
     for kind in rows:
-        taken = tests.verdict[:, kind] == 1
+        taken = tests.verdict[:, kind] == ACCEPTED
         nis[ROLES[kind]] = float(tests.nis[taken, kind].mean()) / state.SIZES[kind] if taken.any() else None
     verdicts = {ROLES[kind]: tests.verdict[tick, kind] for kind, (_, tick) in rows.items()}
     last, active = smoothed.states[-1], list(made.model.active)
@@ -481,7 +478,7 @@ def _make_facts(  # noqa: PLR0917
         rejected={role: int((of == REJECTED).sum()) for role, of in verdicts.items()},
         reopened={role: int((of == RESET).sum()) for role, of in verdicts.items()},
         events=int(made.ticks.stamp_ns.size),
-        zero_velocity_updates=int((tests.verdict[:, state.STATIONARY] > 0).sum()),
+        zero_velocity_updates=int((tests.verdict[:, state.STATIONARY] != NONE).sum()),
         gnss_lasting_error_m=float(np.sqrt(np.median(made.ticks.fix_variance_m2[:, 0]))),
         gate_resets=find_gate_resets(made),
         changes=tuple(_list_changes(made, explained)),

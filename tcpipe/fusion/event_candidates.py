@@ -70,9 +70,8 @@ def find_fix_excursions(residuals: Sequence[Residuals], noise: NoiseModel) -> tu
     of_fixes = [
         each for each in find_event_candidates(residuals, noise) if GNSS in each.pair and each.axis in {ALONG, ACROSS}
     ]
-    long = (
-        each for each in of_fixes if each.time_s > _LONG_S
-    )  # in shorter ones an antenna that turns is elsewhere than stated
+    # Shorter ones may show only that the antenna is elsewhere than stated while the robot turns.
+    long = [each for each in of_fixes if each.time_s > _LONG_S]
     return tuple(one for one in long if any(_is_confirmed(one, other) for other in of_fixes))
 
 

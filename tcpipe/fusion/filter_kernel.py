@@ -56,7 +56,7 @@ class Inputs(NamedTuple):
     mode, turned, gained : motion from the tick before, as `move_state` takes it, (K,), (K, 9), (K, 6).
     noise : variance added to rotation and body velocity [rad², m²/s²], (K, 6).
     rate, has_gyro : angular velocity at the tick, as measured [rad/s], (K, 3), and whether by a gyroscope, (K,).
-    quickens : acceleration forward at the tick [m/s²], (K,). Not the state's own, whose noise would look like a lag of every sensor.
+    acceleration : of the body, forward, at the tick [m/s²], (K,). Not the state's own, whose noise would look like a lag of every sensor.
     value, variance : measurements by kind, (K, 8, 3); NaN: none.
     tau : time of the measurement after the tick [s], (K, 8).
     levers : places of odometries on the robot [m], (8, 3).
@@ -70,7 +70,7 @@ class Inputs(NamedTuple):
     noise: Matrix
     rate: Matrix
     has_gyro: NDArray[np.bool_]
-    quickens: Vector
+    acceleration: Vector
     value: NDArray[np.float64]
     variance: NDArray[np.float64]
     tau: Matrix
@@ -196,6 +196,15 @@ def _solve_for_map(M: Matrix, rows: int, L: Matrix, m: int, F: Matrix) -> None:
 
 
 @compile_kernel
+def _draw_sigma_point(i: int, m: int, active: Indices, places: Indices, L: Matrix, d: Vector) -> None:
+    """Fill d with the errors of the i-th sigma point: √3 times a column of the factor of P at m places."""
+    for e in range(N):
+        d[e] = 0.0
+    for r in range(i, m):
+        d[active[places[r]]] = _SPREAD * L[r, i]
+
+
+@compile_kernel
 def _move(k: int, inputs: Inputs, model: Model, x: Vector, P: Matrix, F: Matrix, room: Any) -> None:
     """Carry x and P over the motion of tick k; F becomes the map of the errors on which it depends."""
     L, M, W, missed, d, high, low, centre, turn, up, down = room
@@ -208,10 +217,7 @@ def _move(k: int, inputs: Inputs, model: Model, x: Vector, P: Matrix, F: Matrix,
         for b in range(m):
             missed[a, b] = 0.0
     for i in range(m):
-        for e in range(N):
-            d[e] = 0.0
-        for r in range(i, m):
-            d[model.active[places[r]]] = _SPREAD * L[r, i]
+        _draw_sigma_point(i, m, model.active, places, L, d)
         displace_state(x, d, 1.0, low, turn)
         move_state(low, mode, inputs.period_s, inputs.turned[k], inputs.gained[k], high, turn)
         compute_moving_error(high, centre, up)
@@ -285,7 +291,7 @@ def _decay(k: int, inputs: Inputs, model: Model, x: Vector, P: Matrix, kept: Vec
 
 @compile_kernel
 def _compare(
-    k: int, kind: int, inputs: Inputs, model: Model, x: Vector, P: Matrix, quickens: Vector, gain: Any, room: Any
+    k: int, kind: int, inputs: Inputs, model: Model, x: Vector, P: Matrix, acceleration: Vector, gain: Any, room: Any
 ) -> float:
     """Fill innovation, H, P H', S and S⁻¹ of one measurement; return log det S."""
     y, H, Hs, cross, S, inverse = gain
@@ -293,7 +299,7 @@ def _compare(
     places, m, size, n = model.depends[kind], model.counts[kind], SIZES[kind], P.shape[0]
     rate, gyro, tau, lever = inputs.rate[k], inputs.has_gyro[k], inputs.tau[k, kind], inputs.levers[kind]
     centre = S[0]
-    predict_measurement(kind, x, rate, gyro, quickens, tau, lever, centre)
+    predict_measurement(kind, x, rate, gyro, acceleration, tau, lever, centre)
     for a in range(size):
         y[a] = centre[a]
     _factorize(P, places, m, L)
@@ -301,14 +307,11 @@ def _compare(
         for b in range(3):
             missed[a, b] = 0.0
     for i in range(m):
-        for e in range(N):
-            d[e] = 0.0
-        for r in range(i, m):
-            d[model.active[places[r]]] = _SPREAD * L[r, i]
+        _draw_sigma_point(i, m, model.active, places, L, d)
         displace_state(x, d, 1.0, high, turn)
-        predict_measurement(kind, high, rate, gyro, quickens, tau, lever, up)
+        predict_measurement(kind, high, rate, gyro, acceleration, tau, lever, up)
         displace_state(x, d, -1.0, high, turn)
-        predict_measurement(kind, high, rate, gyro, quickens, tau, lever, down)
+        predict_measurement(kind, high, rate, gyro, acceleration, tau, lever, down)
         for a in range(size):
             M[a, i] = 0.5 / _SPREAD * (up[a] - down[a])
             for b in range(a + 1):
@@ -482,7 +485,7 @@ def filter_ticks(
     )
     gain = (np.zeros(3), np.zeros((3, n)), np.zeros((3, n)), np.zeros((3, n)), np.zeros((3, 3)), np.zeros((3, 3)))
     F, kept, K, turn = np.zeros((MOST, MOST)), np.ones(n), np.zeros((3, n)), np.zeros(18)
-    quickens = np.zeros(3)
+    acceleration = np.zeros(3)
     y, H, _, _, _, inverse = gain
     for k in range(first, last):
         if k > 0:
@@ -494,13 +497,13 @@ def filter_ticks(
                     steps.F[k - first, i, j] = F[i, j]
             for i in range(n):
                 steps.kept[k - first, i] = kept[i]
-        quickens[0] = inputs.quickens[k]
+        acceleration[0] = inputs.acceleration[k]
         for kind in range(KINDS):
             waits[kind, 1] += inputs.period_s
             if not np.isfinite(inputs.value[k, kind, 0]):
                 continue
             size = SIZES[kind]
-            log_det = _compare(k, kind, inputs, model, x, P, quickens, gain, room)
+            log_det = _compare(k, kind, inputs, model, x, P, acceleration, gain, room)
             nis = _compute_nis(y, inverse, size)
             tests.nis[k, kind] = nis
             tests.log_det[k, kind] = log_det
@@ -523,7 +526,7 @@ def filter_ticks(
                 if waits[kind, 0] >= model.patience[kind, 0] and waits[kind, 1] >= patience_s:
                     verdict = RESET
                     _widen(kind, P, y, size, -1 if is_alone else model.scales[kind])
-                    _compare(k, kind, inputs, model, x, P, quickens, gain, room)
+                    _compare(k, kind, inputs, model, x, P, acceleration, gain, room)
             tests.verdict[k, kind] = verdict
             if verdict == REJECTED:
                 continue

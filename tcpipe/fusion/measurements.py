@@ -194,6 +194,11 @@ def _select_source(source: _Source | None, start_ns: int, end_ns: int) -> _Sourc
     if source is None:
         return None
     rows = slice(*np.searchsorted(source.stamp_ns, (start_ns, end_ns + 1)))
+    return select_rows(source, rows) if rows.stop > rows.start else None
+
+
+def select_rows(source: _Source, rows: slice | NDArray[np.bool_]) -> _Source:
+    """Return a sensor with some of its rows."""
     values = {field.name: getattr(source, field.name) for field in fields(source)}
-    inside: dict[str, Any] = {name: value[rows] for name, value in values.items() if isinstance(value, np.ndarray)}
-    return replace(source, **inside) if rows.stop > rows.start else None
+    chosen: dict[str, Any] = {name: value[rows] for name, value in values.items() if isinstance(value, np.ndarray)}
+    return replace(source, **chosen)

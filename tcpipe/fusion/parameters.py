@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from tcpipe.fusion import state
 from tcpipe.fusion.densities import GaussMarkov, NoiseModel
-from tcpipe.fusion.filter_kernel import Memory, Model
+from tcpipe.fusion.filter_kernel import MOTION_WITH_GYRO, MOTION_WITHOUT_GYRO, Memory, Model
 from tcpipe.fusion.measurements import IMU, VISUAL, WHEELS, InitialState, Measurements
 from tcpipe.fusion.process import find_scale_stds, is_length_observable, turn_scale_std
 from tcpipe.fusion.signals import find_chi_square_threshold
@@ -103,9 +103,8 @@ def make_priors(m: Measurements, noise: NoiseModel, ticks: Ticks) -> tuple[Float
     time_s = np.full(state.N, np.inf)
     for place, process in _list_varying_scales(m, noise).items():
         std[place], time_s[place] = np.sqrt(process.variance), process.time_s
-    if turn_scale_std(m):
-        std[state.TURN_SCALE] = turn_scale_std(m)
-        walk[state.TURN_SCALE] = np.sqrt(2.0 / 60.0) * turn_scale_std(m)
+    std[state.TURN_SCALE] = turn_scale_std(m)
+    walk[state.TURN_SCALE] = np.sqrt(2.0 / _MINUTE_S) * std[state.TURN_SCALE]
     # Where roll and pitch are not known, an antenna that sways looks like one elsewhere.
     if m.gnss is not None and has_tilt:
         std[state.ARM : state.ARM + 3] = m.gnss.lever_arm_std_m
@@ -148,8 +147,8 @@ _DEPENDS: Mapping[int, Sequence[int]] = {
     state.LEVEL: range(3),
     state.DOPPLER: _ANTENNA,
     state.FIX: (*_ANTENNA, *range(state.RHO, state.RHO + 3), *range(state.FIX_ERROR, state.FIX_OFFSET + 3)),
-    state.KINDS: (*_MOTION, state.TURN_SCALE),
-    state.KINDS + 1: range(state.MOVING),
+    MOTION_WITHOUT_GYRO: (*_MOTION, state.TURN_SCALE),
+    MOTION_WITH_GYRO: range(state.MOVING),
 }
 """Errors on which each kind of measurement depends, and motion by odometry and by gyroscope."""
 
@@ -183,7 +182,7 @@ def make_model(
         depends[row, : len(places)] = places
     gates = np.full(state.KINDS, np.inf)
     for kind in (state.WHEELS, state.VISUAL, state.STATIONARY, state.STATIONARY_RATE, state.DOPPLER, state.FIX):
-        gates[kind] = find_chi_square_threshold(SIZE_OF[kind], gate_probability)
+        gates[kind] = find_chi_square_threshold(state.SIZES[kind], gate_probability)
     scales = np.full(state.KINDS, -1, np.int64)
     scales[state.WHEELS] = position.get(state.WHEEL_SCALE, -1)
     scales[state.VISUAL] = position.get(state.VISUAL_SCALE, -1)
@@ -201,9 +200,6 @@ def make_model(
         sizes=np.array([e.std**2 for e in events], np.float64),
         ignored=np.array(ignored, np.int64).reshape(-1, 3),
     )
-
-
-SIZE_OF = dict(enumerate(state.SIZES))
 
 
 def _find_patience(m: Measurements, *, follows: bool) -> Floats:

@@ -165,11 +165,11 @@ def move_state(x: Vector, mode: int, T: float, turned: Vector, gained: Vector, o
 
 @compile_kernel
 def predict_measurement(
-    kind: int, x: Vector, rate: Vector, has_gyro: bool, quickens: Vector, tau: float, lever: Vector, out: Vector
+    kind: int, x: Vector, rate: Vector, has_gyro: bool, acceleration: Vector, tau: float, lever: Vector, out: Vector
 ) -> None:  # fmt: skip
     """Fill ``out`` with what a sensor measures of a state.
 
-    ``rate``: angular velocity at the tick, bias or scale not removed; ``quickens``: time derivative of ``u``; ``tau``: time of the
+    ``rate``: angular velocity at the tick, bias or scale not removed; ``acceleration``: time derivative of ``u``; ``tau``: time of the
     measurement after the tick [s]; ``lever``: place of an odometry on the robot.
     """
     if kind == STATIONARY:
@@ -190,16 +190,16 @@ def predict_measurement(
         a0, a1, a2 = x[ARM + 6], x[ARM + 7], x[ARM + 8]
         a0, a1, a2 = a0 + m1 * a2 - m2 * a1, a1 + m2 * a0 - m0 * a2, a2 + m0 * a1 - m1 * a0
         t = tau - x[FIX_LAG + 6]
-        v0 = x[U + 6] + t * quickens[0] + w1 * a2 - w2 * a1
-        v1 = x[U + 7] + t * quickens[1] + w2 * a0 - w0 * a2
-        v2 = x[U + 8] + t * quickens[2] + w0 * a1 - w1 * a0
+        v0 = x[U + 6] + t * acceleration[0] + w1 * a2 - w2 * a1
+        v1 = x[U + 7] + t * acceleration[1] + w2 * a0 - w0 * a2
+        v2 = x[U + 8] + t * acceleration[2] + w0 * a1 - w1 * a0
         if kind == DOPPLER:
             for i in range(3):
                 out[i] = x[3 * i] * v0 + x[3 * i + 1] * v1 + x[3 * i + 2] * v2
             return
-        a0 += t * (v0 - 0.5 * t * quickens[0])
-        a1 += t * (v1 - 0.5 * t * quickens[1])
-        a2 += t * (v2 - 0.5 * t * quickens[2])
+        a0 += t * (v0 - 0.5 * t * acceleration[0])
+        a1 += t * (v1 - 0.5 * t * acceleration[1])
+        a2 += t * (v2 - 0.5 * t * acceleration[2])
         for i in range(3):
             out[i] = x[9 + i] + x[3 * i] * a0 + x[3 * i + 1] * a1 + x[3 * i + 2] * a2
             out[i] += x[FIX_ERROR + 6 + i] + x[FIX_OFFSET + 6 + i]
@@ -209,7 +209,7 @@ def predict_measurement(
         t -= x[WHEEL_LAG + 6]
     elif kind == VISUAL:
         t -= x[VISUAL_LAG + 6]
-    u0, u1, u2 = x[U + 6] + t * quickens[0], x[U + 7] + t * quickens[1], x[U + 8] + t * quickens[2]
+    u0, u1, u2 = x[U + 6] + t * acceleration[0], x[U + 7] + t * acceleration[1], x[U + 8] + t * acceleration[2]
     # From the axes of the IMU to those of the robot.
     v0, v1, v2 = u0 - m1 * u2 + m2 * u1, u1 - m2 * u0 + m0 * u2, u2 - m0 * u1 + m1 * u0
     w0, w1, w2 = w0 - m1 * w2 + m2 * w1, w1 - m2 * w0 + m0 * w2, w2 - m0 * w1 + m1 * w0

@@ -38,6 +38,7 @@ from tcpipe.fusion.signals import (
     compute_slopes,
     is_covered,
 )
+from tcpipe.power.noise import MEDIAN_OF_SQUARES
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -47,15 +48,13 @@ _STATIONARY_EVERY_S = 0.2
 _STATIONARY_STD_MPS = 0.01  # a robot that stands rocks
 _STATIONARY_RATE_STD_RADPS = 5e-4
 _LEVEL_EVERY_S = 1.0
-_UNMEASURED = 1e6
+_UNMEASURED = 1e6  # m²/s²
 _LEAST_M2PS = 4e-6  # 2 mm after a second: the mean of a tick is no better than that
 _TOLD = 0.5  # share of a density that the run must tell
 _MOVING_MPS = 0.05  # slower is stationary (ruling)
-_MEDIAN_OF_SQUARES = 0.4549  # of a normal variable of variance 1
 _ACCELERATION_WINDOW_S = 0.4
-_SLIDE_LASTS_S = (
-    0.016  # sideways velocities are independent after this time, where turning centre and mounting are states
-)
+# Sideways velocities are independent after this time: what lasts longer of them is in the states of turning centre and mounting.
+_SLIDE_LASTS_S = 0.016
 _LASTING_S = 0.1  # errors of an odometry beyond its white noise are independent after this time
 
 
@@ -227,7 +226,7 @@ def _make_velocity_variance(m: Measurements, source: BodyVelocities, noise: Nois
 def _estimate_scatter(velocity_mps: Floats) -> float:
     """Return the variance of a moving odometry's samples around their neighbours', by the median: wild ones do not move it."""
     second = np.diff(velocity_mps, n=2)[(np.abs(velocity_mps) > _MOVING_MPS)[1:-1]]
-    return float(np.median(second**2) / (6.0 * _MEDIAN_OF_SQUARES)) if second.size > 1 else 0.0
+    return float(np.median(second**2) / (6.0 * MEDIAN_OF_SQUARES)) if second.size > 1 else 0.0
 
 
 def _compute_unseen_turn_variance(stamp_ns: Ints, lever_arm_m: tuple[float, float, float]) -> Floats:

@@ -269,7 +269,7 @@ _MOST_OF_CALMEST = 2.0
 _NOT_NOISE = 16.0
 """A square beyond so many variances is no noise: of a normal variate one in 16,000."""
 _SIEVES = 5
-_MEDIAN_OF_SQUARE = 0.4549
+MEDIAN_OF_SQUARES = 0.4549
 """Of a normal variate of unit variance."""
 _OVERLAP_NODES = 24  # of the overlap of two periods
 
@@ -381,7 +381,7 @@ def _estimate_stationary_error(signal: Samples, still: Mask) -> float | None:
     if still.sum() <= _FEWEST_STILL:
         return None
     square = np.diff(signal.value[still]) ** 2
-    variance = float(np.median(square)) / _MEDIAN_OF_SQUARE
+    variance = float(np.median(square)) / MEDIAN_OF_SQUARES
     for _ in range(_SIEVES):
         variance = float(np.mean(square[square <= _NOT_NOISE * variance]))
     return variance / 2.0

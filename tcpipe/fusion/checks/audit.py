@@ -42,6 +42,7 @@ from tcpipe.fusion.signals import (
 )
 from tcpipe.fusion.trajectory import DISPLACEMENT_LAGS_S, Trajectory
 from tcpipe.geometry.rotation import matrix_from_quat, quat_from_matrix, rotation_vector_from_quat
+from tcpipe.power.noise import MEDIAN_OF_SQUARES
 from tcpipe.tables.facts import Disagreement
 
 Floats = NDArray[np.float64]
@@ -63,7 +64,6 @@ _FEWEST_WINDOWS = 4  # fewer say nothing about a run
 _SCALES = (0.5, 2.0)
 _ASTRAY_M = 1.0  # a larger difference in 5 s is divergence
 _SURELY = 4.0  # and by this many σ of the sensor
-_MEDIAN_OF_SQUARES = 0.4549  # of a normal variable of variance 1
 _LASTING_MPS = 0.02  # lasting odometry error (`preparation._VELOCITY_FLOOR_MPS`)
 _SCALE_STD = {WHEELS: WHEEL_SCALE_STD, VISUAL: VISUAL_SCALE_STD}
 _TURN_SCALE_STD = {WHEELS: 0.3, VISUAL: 0.03, IMU: 0.01}
@@ -444,7 +444,7 @@ def _compare_all_fixes(found: Trajectory, gnss: Positions | None, windows: NDArr
     zero = int(found.stamp_ns[0])
     begin, end = compute_seconds(found.stamp_ns, zero)[windows].T
     second = np.diff(gnss.position_enu_m[inside, :2], n=2, axis=0)
-    scatter = np.sqrt(np.median(second**2) / (6 * _MEDIAN_OF_SQUARES)) if second.size else 0.0
+    scatter = np.sqrt(np.median(second**2) / (6 * MEDIAN_OF_SQUARES)) if second.size else 0.0
     claim = np.maximum(np.sqrt(gnss.variance_m2[inside, :2].mean(1)), scatter)
     yield _compare_fix_displacements(compute_seconds(gnss.stamp_ns[inside], zero), off, claim, begin, end)
 

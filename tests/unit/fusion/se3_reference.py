@@ -118,7 +118,7 @@ class Look:
 
     rate: np.ndarray
     has_gyro: bool
-    quickens: np.ndarray
+    acceleration: np.ndarray
     tau: float
     lever: np.ndarray
 
@@ -130,12 +130,12 @@ def expect(kind, x, look):
     if kind in {state.DOPPLER, state.FIX}:
         arm, t = (EYE + skew(m)) @ part(x, state.ARM), look.tau - x[state.FIX_LAG + 6]
         if kind == state.DOPPLER:
-            return R @ (u + t * look.quickens + np.cross(w, arm))
-        moved = arm + t * (u + np.cross(w, arm)) + 0.5 * t**2 * look.quickens
+            return R @ (u + t * look.acceleration + np.cross(w, arm))
+        moved = arm + t * (u + np.cross(w, arm)) + 0.5 * t**2 * look.acceleration
         return p + R @ moved + part(x, state.FIX_ERROR) + part(x, state.FIX_OFFSET)
     lag = {state.WHEELS: x[state.WHEEL_LAG + 6], state.VISUAL: x[state.VISUAL_LAG + 6]}.get(kind, 0.0)
     w = (EYE - skew(m)) @ w
-    v = (EYE - skew(m)) @ (u + (look.tau - lag) * look.quickens) + np.cross(w, look.lever)
+    v = (EYE - skew(m)) @ (u + (look.tau - lag) * look.acceleration) + np.cross(w, look.lever)
     shared = x[state.SHARED_SCALE + 6]
     c = np.append(0.0, part(x, state.VISUAL_MOUNT, 2))
     return {
@@ -159,11 +159,11 @@ def differentiate_measurement(kind, x, look):
     if kind in {state.DOPPLER, state.FIX}:
         stated, t = part(x, state.ARM), look.tau - x[state.FIX_LAG + 6]
         arm = (EYE + skew(m)) @ stated
-        v = u + t * look.quickens + np.cross(w, arm)
+        v = u + t * look.acceleration + np.cross(w, arm)
         if kind == state.DOPPLER:
-            q, by_arm, by_u, by_t = v, skew(w), EYE, look.quickens
+            q, by_arm, by_u, by_t = v, skew(w), EYE, look.acceleration
         else:
-            q, by_arm, by_u, by_t = arm + t * v - 0.5 * t**2 * look.quickens, EYE + t * skew(w), t * EYE, v
+            q, by_arm, by_u, by_t = arm + t * v - 0.5 * t**2 * look.acceleration, EYE + t * skew(w), t * EYE, v
         H[:, th], H[:, vel] = -R @ skew(q), R @ by_u
         H[:, bg] = gyro * R @ by_u @ skew(arm)
         H[:, arms], H[:, mount] = R @ by_arm @ (EYE + skew(m)), -R @ by_arm @ skew(stated)
@@ -180,13 +180,13 @@ def differentiate_measurement(kind, x, look):
         return H[:2]
     place = {state.WHEELS: state.WHEEL_LAG, state.VISUAL: state.VISUAL_LAG}.get(kind)
     t = look.tau - (x[place + 6] if place else 0.0)
-    at, turn = u + t * look.quickens, EYE - skew(m)
+    at, turn = u + t * look.acceleration, EYE - skew(m)
     v = turn @ at + np.cross(turn @ w, look.lever)
     V = np.zeros((3, state.N))  # of v
     V[:, vel], V[:, bg] = turn, gyro * skew(look.lever) @ turn
     V[:, mount] = skew(at) - skew(look.lever) @ skew(w)
     if place:
-        V[:, place] = -turn @ look.quickens
+        V[:, place] = -turn @ look.acceleration
     if kind == state.SIDEWAYS:
         H = V[1:].copy()
         centre = x[state.TURNING_CENTRE + 6]

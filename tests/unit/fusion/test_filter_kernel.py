@@ -68,8 +68,10 @@ def make_inputs(count, rng, mode=state.INERTIAL, *, noise=0.0, kept=1.0):
 
 
 def look_at(inputs, k, kind):
-    quickens = np.array([inputs.quickens[k], 0.0, 0.0])
-    return reference.Look(inputs.rate[k], bool(inputs.has_gyro[k]), quickens, inputs.tau[k, kind], inputs.levers[kind])
+    acceleration = np.array([inputs.acceleration[k], 0.0, 0.0])
+    return reference.Look(
+        inputs.rate[k], bool(inputs.has_gyro[k]), acceleration, inputs.tau[k, kind], inputs.levers[kind]
+    )
 
 
 def model_of(free, *, walk=0.0):
@@ -158,7 +160,7 @@ def test_a_wide_covariance_passes_as_a_cloud_does():
     x[:9], x[state.ARM + 6] = np.eye(3).ravel(), 2.0
     P = np.diag([1e-8, 1e-8, np.radians(20.0) ** 2, *[1e-8] * 6])
     inputs.value[0, state.FIX], inputs.variance[0, state.FIX] = 0.0, 1e-4
-    inputs.tau[:], inputs.rate[:], inputs.quickens[:] = 0.0, 0.0, 0.0
+    inputs.tau[:], inputs.rate[:], inputs.acceleration[:] = 0.0, 0.0, 0.0
     tests, states = make_tests(1), np.zeros((1, state.NX))
     memory = Memory(x.copy(), P.copy(), np.zeros((state.KINDS, 2)))
     filter_ticks(0, 1, inputs, model, memory, False, allocate_steps(0, 9), tests, states)
@@ -342,7 +344,7 @@ def test_rejections_in_a_row_open_the_gate_again():
     rng = np.random.default_rng(4)
     inputs, model = make_inputs(120, rng, state.FLAT_TURN, noise=1e-6), model_of(())
     model.gates[state.FIX] = 16.27
-    inputs.rate[:], inputs.turned[:], inputs.quickens[:], inputs.tau[:] = 0.0, 0.0, 0.0, 0.0
+    inputs.rate[:], inputs.turned[:], inputs.acceleration[:], inputs.tau[:] = 0.0, 0.0, 0.0, 0.0
     inputs.value[:, state.STATIONARY], inputs.variance[:, state.STATIONARY] = 0.0, 1e-4
     inputs.value[:, state.FIX], inputs.variance[:, state.FIX] = 0.0, 1e-4
     inputs.value[40:, state.FIX, 0] = 5.0
