@@ -28,6 +28,7 @@ from tcpipe.report.label_sections import (
     make_quality_section,
 )
 from tcpipe.report.maps import Pictures, RunMap, draw_run_map
+from tcpipe.report.noise import make_noise_sections
 from tcpipe.report.page import Column, Link, Number, Section, make_shown_column, pack_columns, render_page, show_verdict
 from tcpipe.report.plots import Plot, draw_histogram, label_histograms, make_plot
 from tcpipe.report.run_plots import (
@@ -267,6 +268,7 @@ def make_sensor_sections(run_json: RunJson | None, manifest: Manifest, rejection
     return [
         *([] if run_json is None else [_make_topics_section(run_json, manifest.counts)]),
         *_make_trust_sections(facts, rejections),
+        *make_noise_sections(facts),
         *_make_disagreement_sections(facts),
         *_make_clock_sections(facts, manifest.info.report.findings),
     ]
