@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from tcpipe.errors import DatasetError, TcpipeError
 from tcpipe.execution import run_all, unwrap_result
+from tcpipe.formats.atomic import move_to_file
 from tcpipe.formats.dataset_card import (
     Covariate,
     MapRegistration,
@@ -267,7 +268,7 @@ def gather_content(directory: Path, inputs: Inputs, options: BuildOptions, worke
     logger.info("sampling %d segments of %d runs", segments.num_rows, len(inputs.runs))
     ranks = _rank_segments(segments, seed=recipe.split.seed)
     sampled, slot, spool = sample_all_segments(
-        segments, ranks, inputs.maps, recipe.sample, gnss_crs=recipe.read.gnss_crs, workers=workers
+        segments, ranks, inputs.maps, recipe.sample, gnss_crs=recipe.read.gnss_crs, workers=workers, directory=directory
     )
     sources = tuple(open_map(*of) for of in inputs.maps())
     lost_m = sum_losses(to_floats(segments, "arc_length_m"), sampled.lost_by)
@@ -280,6 +281,7 @@ def gather_content(directory: Path, inputs: Inputs, options: BuildOptions, worke
     assigned, result = draw_splits(
         segments, sampled, sources[0].grid, options.regions, recipe, earlier=options.earlier, tags=tags
     )
+    assigned = Assignment(move_to_file(assigned.split, directory), move_to_file(assigned.fold, directory))
     split = assigned.split
     arc_m = to_floats(segments, "arc_length_m")[sampled.kept]
     unused_m = {Loss.SPLIT_BUFFER: arc_m[split == "buffer"].sum(), Loss.SPLIT_EXCLUDED: arc_m[split == EXCLUDED].sum()}
@@ -288,7 +290,7 @@ def gather_content(directory: Path, inputs: Inputs, options: BuildOptions, worke
     in_use = sampled.kept[(split != "buffer") & (split != EXCLUDED)]
     removal, biased = find_removed_by_ground(inputs.runs, segments, in_use, sources, recipe)
     kept = np.flatnonzero(split != EXCLUDED)
-    order = kept[np.argsort(ranks[sampled.kept[kept]], kind="stable")]
+    order = move_to_file(kept[np.argsort(ranks[sampled.kept[kept]], kind="stable")], directory)
     added, covariates, incomplete = make_added_columns(
         segments, sampled.kept[order], inputs.sources, inputs.covariates, recipe.covariates, layers=tuple(spool.layers)
     )
