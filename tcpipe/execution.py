@@ -13,9 +13,8 @@ import re
 import signal
 import threading
 import time
-import uuid
 from collections.abc import Callable, Generator, Iterable, Iterator
-from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, ProcessPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
 from dataclasses import astuple, dataclass, field, replace
@@ -62,10 +61,6 @@ class Executor(Protocol):
         """Let a worker call a function; both are pickled."""
 
 
-Cluster: TypeAlias = "str | Executor"
-"""The address of a Dask scheduler, or an executor."""
-
-
 @dataclass(frozen=True, slots=True)
 class Outcome(Generic[R]):
     """What became of task ``index``: its result, or, when ``died``, nothing because its worker was killed."""
@@ -85,7 +80,7 @@ def unwrap_result(outcome: Outcome[R | TcpipeError]) -> R:
 
 
 def run_all(
-    function: Callable[[T], R], tasks: Iterable[T], *, jobs: int, cluster: Cluster | None = None
+    function: Callable[[T], R], tasks: Iterable[T], *, jobs: int, cluster: str | Executor | None = None
 ) -> Generator[Outcome[R]]:
     """Yield the outcome of ``function(task)`` for every task, as each ends; a task is asked for when a worker can have it.
 
@@ -95,7 +90,7 @@ def run_all(
     Parameters
     ----------
     jobs : processes; this one for 1.
-    cluster : whose workers do it instead. They see the same files under the same names.
+    cluster : the address of a Dask scheduler, or an executor, whose workers do it instead. They see the same files under the same names.
 
     Raises
     ------
@@ -237,6 +232,17 @@ class _Workers:
     client: Client | None = None
     alone_s: float = 0.0
 
+    def submit(self, function: Callable[[T], R], task: T, caller: _Caller) -> Job[_Answer[R]]:
+        """Hand a task to the executor; `TcpipeError` where it takes none."""
+        try:
+            return self.executor.submit(_run_on_worker, function, task, caller)
+        except BrokenExecutor as error:  # as of the tasks that it has
+            job = Future[_Answer[R]]()
+            job.set_exception(error)
+            return job
+        except RuntimeError as error:
+            raise TcpipeError(f"{self.name}: takes no tasks ({error})") from None
+
     def wait_for_first(self, running: Iterable[Job[R]]) -> list[Job[R]]:
         """Return the tasks that have ended, when the first has; `TcpipeError` where all workers of a cluster stay away."""
         futures = [job for job in running if isinstance(job, Future)]
@@ -268,18 +274,18 @@ class _Workers:
 
 
 def _run_elsewhere(
-    function: Callable[[T], R], todo: Iterator[tuple[int, T]], cluster: Cluster
+    function: Callable[[T], R], todo: Iterator[tuple[int, T]], cluster: str | Executor
 ) -> Generator[Outcome[R]]:
     """Run tasks by an executor; Dask's runs that of a killed worker again on another, three times."""
     with _open_workers(cluster) as workers:
-        caller = _Caller(_identify(), logger.getEffectiveLevel(), __version__)
+        caller = _Caller((os.uname().nodename, os.getpid()), logger.getEffectiveLevel(), __version__)
         if client := workers.client:
             caller = replace(caller, topic=f"tcpipe-{client.id}")
             client.subscribe_topic(caller.topic, lambda event: logger.log(*event[1]))
         running = dict[Job[_Answer[R]], int]()
         while True:
             for index, task in islice(todo, workers.at_once - len(running)):
-                running[workers.executor.submit(_run_on_worker, function, task, caller)] = index
+                running[workers.submit(function, task, caller)] = index
             if not running:
                 return
             for job in workers.wait_for_first(running):
@@ -311,7 +317,7 @@ def _get_answer(job: Job[_Answer[R]], name: str) -> _Answer[R] | None:
 
 
 @contextmanager
-def _open_workers(cluster: Cluster) -> Iterator[_Workers]:
+def _open_workers(cluster: str | Executor) -> Iterator[_Workers]:
     """Yield the workers of a scheduler's address or of an executor, which is left open; what is wrong with them is one line."""
     if isinstance(cluster, str):
         with _connect_client(cluster) as client:
@@ -387,14 +393,6 @@ def _make_cluster_error(worker: str, version: str, *, wanted: str) -> UsageError
     return UsageError(f"{worker}: a worker has tcpipe {version}, expected {wanted} as here; install that")
 
 
-_TOKEN = uuid.uuid4().hex
-
-
-def _identify() -> tuple[str, int]:
-    """Return what distinguishes this process from any other, forked ones included."""
-    return _TOKEN, os.getpid()
-
-
 @dataclass(frozen=True, slots=True)
 class _Caller:
     """Whose task it is: its process and version, from which level on it forwards what is logged, and by which topic of Dask."""
@@ -418,7 +416,7 @@ def _run_on_worker(function: Callable[[T], R], task: T, caller: _Caller) -> _Ans
     """Run a task on a worker; on a thread of the caller as it is."""
     if caller.version != __version__:
         raise _make_cluster_error(os.uname().nodename, __version__, wanted=caller.version)
-    if caller.process == _identify():
+    if caller.process == (os.uname().nodename, os.getpid()):
         return _Answer(function(task))
     said, began_s, before = list[Said](), time.process_time(), (logger.handlers, logger.level)
     send: Callable[[Said], object] = said.append

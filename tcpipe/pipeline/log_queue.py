@@ -111,7 +111,7 @@ class LogQueue:
     def _claim(self, unit: list[int], claims: Claims, *, take_over: bool) -> list[Item]:
         """Return what is to be done of a unit once it is claimed; where another task has it, it is left."""
         source = self._tasks[unit[0]].source
-        key = self._make_key(source.place, source.files)
+        key = self._make_key(f"{source.place} {source.files}")
         most = _MOST_TASKS if self._own.isdisjoint(unit) else _UNLIMITED
         held = claims.claim(key, source.name, take_over=take_over, most=most)
         self._left += [unit] if held == "theirs" else []
@@ -148,6 +148,6 @@ class LogQueue:
     def _rank(self, unit: Sequence[int]) -> tuple[bool, int]:
         return self._own.isdisjoint(unit), -sum(self._tasks[at].source.size_bytes for at in unit)
 
-    def _make_key(self, *of: object) -> str:
+    def _make_key(self, of: str) -> str:
         task = self._tasks[0]
         return digest([of, ingest_key(task.recipe), task.robot, task.definitions, __version__])[:_KEY_HEX]

@@ -236,7 +236,7 @@ def add_hashes(sources: Sequence[LogSource]) -> list[LogSource]:
 
 def group_alike(sources: Sequence[LogSource]) -> list[list[int]]:
     """Return together the indices of logs that may be the same recording: of one size, and with the same bytes at the end."""
-    groups, sizes = dict[object, list[int]](), Counter(source.size_bytes for source in sources)
+    groups, sizes = dict[tuple[int, bytes] | int, list[int]](), Counter(source.size_bytes for source in sources)
     for index, source in enumerate(sources):
         end = _read_end(source) if sizes[source.size_bytes] > 1 else None
         groups.setdefault(index if end is None else (source.size_bytes, end), []).append(index)

@@ -173,7 +173,9 @@ def test_shares_of_a_folder_and_parts_of_a_bag(tmp_path):
     shutil.copy(tmp_path / "logs" / "run0.mcap", tmp_path / "logs" / "bag" / "bag_1.mcap")
     shares = [tcpipe("ingest", "logs", "--shard", f"{index}/2", "--json", cwd=tmp_path) for index in (1, 2)]
     assert [share.returncode for share in shares] == [0, 0]
-    logs = [{result["log"].rsplit("/", 1)[1]: result["status"] for result in told(share)["results"]} for share in shares]
+    logs = [
+        {result["log"].rsplit("/", 1)[1]: result["status"] for result in told(share)["results"]} for share in shares
+    ]
     assert logs[0] == dict.fromkeys(["bag", "run1.mcap", "run0.mcap"], "done"), "nobody had begun the other share"
     assert logs[1] == {"run0.mcap": "unchanged"}
     part = tcpipe("ingest", "logs/bag/bag_1.mcap", cwd=tmp_path)
