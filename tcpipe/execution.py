@@ -190,7 +190,7 @@ def _end_with(life: Connection) -> None:
 class _LogForwarder(logging.Handler):
     """Hands what a worker logs to ``send``, as arguments of `Logger.log`: plain values, what is said as text of one argument."""
 
-    def __init__(self, send: Callable[[Said], object]) -> None:
+    def __init__(self, send: Callable[[Said], None]) -> None:
         super().__init__()
         self._send = send
 
@@ -419,7 +419,7 @@ def _run_on_worker(function: Callable[[T], R], task: T, caller: _Caller) -> _Ans
     if caller.process == (os.uname().nodename, os.getpid()):
         return _Answer(function(task))
     said, began_s, before = list[Said](), time.process_time(), (logger.handlers, logger.level)
-    send: Callable[[Said], object] = said.append
+    send: Callable[[Said], None] = said.append
     if caller.topic is not None:
         from distributed import get_worker  # noqa: PLC0415  most calls stay on this machine
 

@@ -70,8 +70,8 @@ class Claims:
         return "given up"
 
     def release(self, key: str) -> None:
-        """Remove a claim, and those of killed tasks on the same log."""
-        with self._lock:
+        """Remove a claim, and those of killed tasks on the same log; one that cannot be removed expires."""
+        with self._lock, suppress(StoreError):
             _, number = self._held.pop(key, ("", 0))
             for last in range(number, 0, -1):
                 self._place.delete(f"{key}-{last}.json")
@@ -87,8 +87,7 @@ class Claims:
     def release_all(self) -> None:
         """Remove all claims of this task."""
         for key in list(self._held):
-            with suppress(StoreError):
-                self.release(key)
+            self.release(key)
 
     def remove_expired(self) -> None:
         """Remove what killed tasks left."""

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import time
 from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from typing import TypeAlias
 
 from tcpipe import __version__
+from tcpipe.errors import StoreError
 from tcpipe.formats.json_files import digest
 from tcpipe.formats.recipe_toml import ingest_key
 from tcpipe.pipeline import claims as claiming
 from tcpipe.pipeline.calls import LogWriter
-from tcpipe.pipeline.claims import Claims
+from tcpipe.pipeline.claims import Claims, Held
 from tcpipe.pipeline.log_sources import add_hashes, group_alike, plan_rounds
 from tcpipe.pipeline.plan import IngestResult, IngestTask, Step, make_planner
 
@@ -113,12 +115,14 @@ class LogQueue:
         source = self._tasks[unit[0]].source
         key = self._make_key(f"{source.place} {source.files}")
         most = _MOST_TASKS if self._own.isdisjoint(unit) else _UNLIMITED
-        held = claims.claim(key, source.name, take_over=take_over, most=most)
+        held: Held = "mine"
+        with suppress(StoreError):  # a store that does not answer costs the log that is written then, not the call
+            if (held := claims.claim(key, source.name, take_over=take_over, most=most)) == "mine":
+                self._log.refresh()
         self._left += [unit] if held == "theirs" else []
         self._given_up |= held == "given up"
         if held != "mine":
             return []
-        self._log.refresh()
         todo = self._list_todo(unit)
         if not todo:
             claims.release(key)
