@@ -31,6 +31,7 @@ from tcpipe.fusion.filter_kernel import (
 from tcpipe.fusion.hypotheses import POSSIBLE, Hypothesis, compute_weights, explain, find_suspects, make_excursions
 from tcpipe.fusion.initial import compute_course, find_stationary_intervals
 from tcpipe.fusion.measurements import DOPPLER, GNSS, IMU, VISUAL, WHEELS, InitialState, Measurements, select_rows
+from tcpipe.fusion.noise_curves import describe_noise
 from tcpipe.fusion.pair_residuals import find_residuals
 from tcpipe.fusion.parameters import PARAMETERS, expand_start, make_model, make_priors, make_start
 from tcpipe.fusion.process import (
@@ -300,7 +301,7 @@ def _make_trajectory(  # noqa: PLR0917
         forward_velocity_std_mps=np.sqrt(speed_variance + (scale_std * speed) ** 2),
         rejections=_make_rejections(m, made),
         displacement_std_m=np.sqrt(links),
-        facts=_make_facts(m, made, smoothed, std, scale_std, explained),
+        facts=replace(_make_facts(m, made, smoothed, std, scale_std, explained), noise=describe_noise(m, noise)),
         corrected=_correct_measurements(m, made, smoothed, explained),
     )
 
@@ -482,7 +483,6 @@ def _make_facts(  # noqa: PLR0917
         gnss_lasting_error_m=float(np.sqrt(np.median(made.ticks.fix_variance_m2[:, 0]))),
         gate_resets=find_gate_resets(made),
         changes=tuple(_list_changes(made, explained)),
-        covariance_repairs=0,
         gyro_bias_radps=None if std[state.TURN_SCALE] else make_vector(x[state.GYRO_BIAS : state.GYRO_BIAS + 3]),
         turn_scale=float(1.0 / (1.0 - x[state.TURN_SCALE])) if std[state.TURN_SCALE] else None,
         accelerometer_bias_mps2=make_vector(x[state.ACCELEROMETER_BIAS : state.ACCELEROMETER_BIAS + 3]),
@@ -500,12 +500,12 @@ def _describe_parameters(m: Measurements, made: Pass, smoothed: Smoothed, std: F
     active, found = list(made.model.active), {}
     for parameter in PARAMETERS:
         errors = range(parameter.place, parameter.place + parameter.count)
-        if not all(std[e] for e in errors):
+        if not any(std[e] for e in errors):
             continue
         value = smoothed.states[-1, [e + 6 for e in errors]]
         if parameter.place == state.ARM and m.gnss is not None:
             value = value - m.gnss.lever_arm_m
-        spread = smoothed.spreads[-1, [active.index(e) for e in errors]]
+        spread = np.array([smoothed.spreads[-1, active.index(e)] if e in active else 0.0 for e in errors])
         prior = std[list(errors)]
         varies = smoothed.states[:, [e + 6 for e in errors]].std(axis=0)
         found[parameter.name] = ParameterFacts(*(tuple(each.tolist()) for each in (value, spread, prior, varies)))
