@@ -76,6 +76,7 @@ SMALLEST = {
     "table_model": Smallest("200", rf"{NUMBER} s for trees[\s\S]*\d predictions/s"),
     "tables": Smallest("0.01", rf"CPU: {NUMBER} times"),
     "train_step": Smallest("{dataset} 16", rf"throughput {NUMBER} x", package="torch"),
+    "withheld": Smallest("--log {log}", rf"gnss 10 s +1 +\d+ +{NUMBER} +{NUMBER}"),
     "yield_of_logs": Smallest("{log}", rf"mcap( +{NUMBER}){{7}}\n"),
 }
 """By the name of the program."""

@@ -280,6 +280,33 @@ def preflight(
 
 
 @click.command()
+@click.argument("run", type=LOG, metavar="LOG|RUN")
+@robot_option()
+@recipe_option
+@msgdef_option
+@json_option
+@quiet_option
+def audit(run: str, *, robot: str | None, recipe: str | None, msgdef: str | None, as_json: bool, quiet: bool) -> int:
+    """Judge the uncertainty of LOG, or of RUN (STORE/runs/ID), by measurements that its track does not use.
+
+    tcpipe withholds the fixes in windows of 10, 30 and 60 s, fuses the rest, and prints the error of the predicted antenna, its σ, the
+    share of errors inside 1σ and 2σ, and the error of a straight line through the window. Wheels and camera likewise, by the distance
+    in 1 and 4 s. Without fixes: length of the track over that of each odometry. Writes no files.
+    """
+    from tcpipe.pipeline.audit import audit as judge
+
+    with show_progress("audit", quiet=quiet):
+        found = judge(
+            run,
+            recipe=resolve_recipe_with_source(recipe)[0],
+            robot=robot,
+            message_definitions=Path(msgdef) if msgdef else None,
+        )
+    print_result(found, as_json=as_json)
+    return 0
+
+
+@click.command()
 @click.argument("names", nargs=-1, required=True, metavar="RUN|LOG|CALL...", shell_complete=complete_runs)
 @store_option
 @json_option

@@ -7,6 +7,9 @@ but the true ones 1 m + e, the true metre ends e / v_end earlier than the segmen
 
 so an error e of the displacement between both ends, whose standard deviation counts their correlation, is an error of every label.
 
+Part of σ is one error of all segments of a run: the scale of a lone odometry, gain and zero of the power sensor, the idle power. It has
+columns of its own, since it adds up linearly over a path, while the rest averages out.
+
 Quality bits of labels; none of them removes a segment.
 """
 
@@ -35,6 +38,7 @@ class Labels:
     ----------
     duration_s, velocity_mps, power_watt, energy_joule : T [s], v = chord / T [m/s], w = E / T [W], E [J].
     *_std : their standard deviations as labels of the true metre, in the same units.
+    *_common_std : the part of them that is one error of all segments of the run.
     """
 
     duration_s: Floats
@@ -45,6 +49,31 @@ class Labels:
     velocity_std_mps: Floats
     power_std_watt: Floats
     energy_std_joule: Floats
+    duration_common_std_s: Floats
+    velocity_common_std_mps: Floats
+    power_common_std_watt: Floats
+    energy_common_std_joule: Floats
+
+
+@dataclass(frozen=True, slots=True)
+class SensorError:
+    """What is not known of the power sensor: standard deviations, each one error of a whole run.
+
+    Attributes
+    ----------
+    gain_fraction : of its gain, shape (M,) or a number.
+    offset_joule : what an error of its zero changes of each segment's energy [J], shape (M,) or a number.
+    sign_joule : what a lost sign changes [J], likewise.
+    """
+
+    gain_fraction: Floats | float = 0.0
+    offset_joule: Floats | float = 0.0
+    sign_joule: Floats | float = 0.0
+
+    def std_joule(self, energy_joule: Floats, *, of_net_energy: bool = False) -> Floats:
+        """Return the standard deviation of energies [J], shape (M,); the idle power contains the offset, so that net energy does not."""
+        variance = (self.gain_fraction * energy_joule) ** 2 + np.square(self.sign_joule)
+        return np.asarray(np.sqrt(variance if of_net_energy else variance + np.square(self.offset_joule)))
 
 
 def compute_labels(
@@ -56,6 +85,8 @@ def compute_labels(
     end_power_watt: Floats,
     displacement_std_m: Floats,
     energy_noise_joule: Floats,
+    common_displacement_std_m: Floats | float = 0.0,
+    sensor: SensorError = SensorError(),
 ) -> Labels:
     """Return w, v, T, E with T = d / v and E = w d / v as identities, and their standard deviations; every array has shape (M,).
 
@@ -66,10 +97,16 @@ def compute_labels(
     end_velocity_mps, end_power_watt : [m/s], [W], at the segment's end; the speed counts as at least a tenth of the mean.
     displacement_std_m : [m], of the displacement between both estimated ends, their correlation counted.
     energy_noise_joule : [J], from sampling, noise and quantisation of the power, independent of the displacement.
+    common_displacement_std_m : [m], the part of the displacement's that is one error of the run.
+    sensor : of the power.
     """
     velocity_mps, power_watt = chord_m / duration_s, energy_joule / duration_s
     end_power_watt = np.where(np.isfinite(energy_joule), end_power_watt, np.nan)
-    duration_std_s = displacement_std_m / np.maximum(np.abs(end_velocity_mps), 0.1 * velocity_mps)
+    end_mps = np.maximum(np.abs(end_velocity_mps), 0.1 * velocity_mps)
+    common_s = common_displacement_std_m / end_mps
+    duration_std_s = np.maximum(displacement_std_m, common_displacement_std_m) / end_mps
+    sensor_joule = sensor.std_joule(energy_joule)
+    record_joule = np.hypot(energy_noise_joule, sensor_joule)
     return Labels(
         duration_s=duration_s,
         velocity_mps=velocity_mps,
@@ -77,31 +114,48 @@ def compute_labels(
         energy_joule=energy_joule,
         duration_std_s=duration_std_s,
         velocity_std_mps=velocity_mps * duration_std_s / duration_s,
-        power_std_watt=np.hypot((end_power_watt - power_watt) * duration_std_s, energy_noise_joule) / duration_s,
-        energy_std_joule=np.hypot(end_power_watt * duration_std_s, energy_noise_joule),
+        power_std_watt=np.hypot((end_power_watt - power_watt) * duration_std_s, record_joule) / duration_s,
+        energy_std_joule=np.hypot(end_power_watt * duration_std_s, record_joule),
+        duration_common_std_s=common_s,
+        velocity_common_std_mps=velocity_mps * common_s / duration_s,
+        power_common_std_watt=np.hypot((end_power_watt - power_watt) * common_s, sensor_joule) / duration_s,
+        energy_common_std_joule=np.hypot(end_power_watt * common_s, sensor_joule),
     )
 
 
 def subtract_idle_power(
-    cost: Labels, *, idle_watt: float, idle_std_watt: float, end_power_watt: Floats, energy_noise_joule: Floats
+    cost: Labels,
+    *,
+    idle_watt: float,
+    idle_std_watt: float,
+    end_power_watt: Floats,
+    energy_noise_joule: Floats,
+    sensor: SensorError = SensorError(),
 ) -> dict[str, Floats]:
     """Return the columns of net labels, shape (M,): E_true = E - P0 T - (P_end - P0) e / v_end, as in the head of this module.
 
     ``idle_watt`` is P0, the idle power, NaN if unknown; the error of P0 is one error of a whole run. Again E = w d / v. The other
     parameters are those of `compute_labels`.
     """
-    noise_joule = np.hypot(energy_noise_joule, idle_std_watt * cost.duration_s)
     energy_joule = cost.energy_joule - idle_watt * cost.duration_s
     known = np.isfinite(energy_joule)
-    displaced_joule = (end_power_watt - idle_watt) * cost.duration_std_s
-    return {
-        "idle_power_watt": np.where(known, idle_watt, np.nan),
-        "idle_power_std_watt": np.where(known, idle_std_watt, np.nan),
+    common_joule = np.hypot(sensor.std_joule(energy_joule, of_net_energy=True), idle_std_watt * cost.duration_s)
+    total_joule = np.hypot(energy_noise_joule, common_joule)
+    of_energy, of_power = (
+        end_power_watt - idle_watt,
+        end_power_watt - cost.power_watt,
+    )  # that an error of T is multiplied with
+    values: dict[str, Floats | float] = {
+        "idle_power_watt": idle_watt,
+        "idle_power_std_watt": idle_std_watt,
         "net_power_watt": cost.power_watt - idle_watt,
-        "net_power_std_watt": np.where(known, np.hypot(cost.power_std_watt, idle_std_watt), np.nan),
+        "net_power_std_watt": np.hypot(of_power * cost.duration_std_s, total_joule) / cost.duration_s,
+        "net_power_common_std_watt": np.hypot(of_power * cost.duration_common_std_s, common_joule) / cost.duration_s,
         "net_energy_joule": energy_joule,
-        "net_energy_std_joule": np.where(known, np.hypot(displaced_joule, noise_joule), np.nan),
+        "net_energy_std_joule": np.hypot(of_energy * cost.duration_std_s, total_joule),
+        "net_energy_common_std_joule": np.hypot(of_energy * cost.duration_common_std_s, common_joule),
     }
+    return {name: np.where(known, value, np.nan) for name, value in values.items()}
 
 
 CAUSES = ("position", "rate", "current", "voltage")
@@ -113,7 +167,7 @@ def estimate_energy_budget(
 ) -> EnergyBudget | None:
     """Return the noise floor of E, shape (M,) [J], NaN without a label; None without energies.
 
-    ``variance_j2`` has variances, shape (M,) [J²], of the `CAUSES`, which are independent and add up, and of ``at_20_hz``.
+    ``variance_j2`` has variances, shape (M,) [J²], of the `CAUSES`, which are independent and add up, of ``at_20_hz`` and ``common``.
     """
     known = np.isfinite(energy_joule)
     mean_joule = float(np.abs(energy_joule[known]).mean()) if known.any() else 0.0
@@ -134,7 +188,8 @@ def pool_budgets(budgets: Iterable[EnergyBudget | None]) -> EnergyBudget | None:
     mean_joule = sum(each["segments"] * each["mean_energy_joule"] for each in known) / count
     squares = {
         name: sum(each["segments"] * (each[name] * each["mean_energy_joule"]) ** 2 for each in known) / count
-        for name in ("total", *CAUSES, "at_20_hz")
+        for name in ("total", *CAUSES, "at_20_hz", "common")
+        if all(each[name] is not None for each in known)
     }
     return EnergyBudget(
         count, mean_joule, **{name: float(np.sqrt(square)) / mean_joule for name, square in squares.items()}
@@ -160,6 +215,8 @@ def format_budget(budget: EnergyBudget) -> str:
     text = f"{floor}: {causes} (they add in square)"
     if budget.at_20_hz < 0.95 * budget.total:
         text += f"; power at 20 Hz would leave {100 * budget.at_20_hz:.1f} %"
+    if budget.common is not None:
+        text += f". Besides, one error of the whole run: {100 * budget.common:.1f} % (power sensor, odometry scale)"
     return text + "."
 
 

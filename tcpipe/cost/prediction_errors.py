@@ -11,14 +11,18 @@ Estimated are, in this order:
   beginning, so that of neighbours may be negative; beyond, it never rises, and distances with few pairs are taken together. What is left
   at the greatest distance is each run's own; few runs tell it as Student's t.
 
-With a_i the spreads and s_i the errors of the biases, a path errs by z sqrt(sum_ij a_i a_j rho_ij + (sum_i s_i)²): less, of itself, the
-longer it is, and never less than a run differs from another.
+* the **common error** of the labels themselves (gain and zero of the power sensor, scale of a lone odometry): held-out samples have it
+  too, so that no residual shows it. It is the share of it in the sum of the labels, by the columns of their standard deviations.
+
+With a_i the spreads, s_i the errors of the biases and c the share of the common error, a path of costs p_i errs by
+z sqrt(sum_ij a_i a_j rho_ij + (sum_i s_i)² + (c sum_i |p_i|)²): less, of itself, the longer it is, and never less than a run differs from
+another, or than the labels' sensors are known.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -69,6 +73,7 @@ class Errors:
     of_class : by what it is multiplied, by class id, shape (256,).
     low, high : 5 % and 95 % quantiles of the errors over their spread.
     bias_std : standard error of the class's bias, of the prediction, shape (256,).
+    common_share : standard deviation of the labels' common error, of the prediction; 0 where the labels do not state it.
     lag_m, correlation : of two metres so far apart on one run, from each lag to the next.
     of_run : the last of them, each run's own, raised for the small number of runs.
     runs, samples : that were held out.
@@ -85,6 +90,7 @@ class Errors:
     of_run: float
     runs: int
     samples: int
+    common_share: float = 0.0
 
     def compute_std(self, predicted: Floats, class_id: NDArray[np.integer]) -> Floats:
         """Return the standard deviation of each prediction, shape (N,)."""
@@ -104,7 +110,8 @@ class Errors:
         if not alone:
             return middle, middle
         variance = max(self._variance(spread), alone / spread.size)
-        common = float((np.abs(values) * self.bias_std[class_id]).sum())
+        size = np.abs(values)
+        common = np.hypot(float((size * self.bias_std[class_id]).sum()), self.common_share * float(size.sum()))
         # Errors of a single metre are no normal ones, sums nearly.
         like_one = min(variance / float(spread.sum()) ** 2, 1.0)
         ends = (np.array([self.low, self.high]) * like_one + np.array([-_Z, _Z]) * (1.0 - like_one)) / _Z
@@ -150,7 +157,8 @@ def _fit_bias_correction(held: _Held) -> BiasCorrection:
 def fit_errors(residuals: Residuals) -> dict[str, Errors] | None:
     """Return the errors of ``power``, ``velocity``, ``duration`` and ``energy`` a metre; None with fewer than `FEWEST` held-out samples.
 
-    ``residuals`` has a row for each of them: run_id, start_ns, terrain_class, power_watt, velocity_mps, and both as predicted.
+    ``residuals`` has a row for each of them: run_id, start_ns, terrain_class, power_watt, velocity_mps, and both as predicted; where known
+    also duration_s of its segment, duration_common_std_s and energy_common_std_joule.
     """
     held = _Held.collect(residuals)
     if held is None:
@@ -161,8 +169,25 @@ def fit_errors(residuals: Residuals) -> dict[str, Errors] | None:
     std = {"duration": correction.duration.std, "energy": correction.energy.std}
     nothing = np.zeros(_CLASSES)
     return {
-        name: _fit_class_errors(of, held.true[name], held, std.get(name, nothing)) for name, of in predicted.items()
+        name: replace(
+            _fit_class_errors(of, held.true[name], held, std.get(name, nothing)),
+            common_share=_find_common_share(residuals, name),
+        )
+        for name, of in predicted.items()
     }
+
+
+_COMMON = {"duration": "duration_common_std_s", "energy": "energy_common_std_joule"}
+
+
+def _find_common_share(residuals: Residuals, name: str) -> float:
+    """Return the standard deviation of the labels' common error as a share of their sum; 0 where it is not stated."""
+    if not {_COMMON.get(name, name), "duration_s"} <= residuals.keys():
+        return 0.0
+    std, label = residuals[_COMMON[name]].astype(np.float64), residuals["duration_s"].astype(np.float64)
+    label = label if name == "duration" else np.abs(residuals["power_watt"].astype(np.float64) * label)
+    known = np.isfinite(std + label)
+    return float(std[known].sum() / label[known].sum()) if label[known].any() else 0.0
 
 
 @dataclass(frozen=True, slots=True)

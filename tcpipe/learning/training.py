@@ -399,4 +399,7 @@ def _make_residuals_table(fitted: Fitted, outputs: tuple[str, ...]) -> pa.Table:
         quantity, _, unit = name.rpartition("_")
         columns[name] = labels[:, number].astype(np.float64)
         columns[f"{quantity}_predicted_{unit}"] = said[:, number].astype(np.float64)
+    if len(outputs) > 1:  # what the labels have in common is in no residual
+        columns |= {name: held.column(name) for name in ("duration_s", "duration_common_std_s")}
+        columns["energy_common_std_joule"] = held.column(held.energy.energy_common_std)
     return pa.table(columns)

@@ -19,7 +19,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from tcpipe.motion.row_sections import Floats, MotionRows, find_piece_bounds
+from tcpipe.motion.row_sections import Floats, Ints, MotionRows, find_piece_bounds
+from tcpipe.tables.facts import FuseFacts
 
 
 def compute_displacement_std_m(
@@ -93,3 +94,12 @@ def compute_chord_ahead_std_m(
         smoothed=smoothed,
     )
     return np.where(np.isnan(told), modelled, told)
+
+
+def find_common_scale_std(facts: FuseFacts | None, stamp_ns: Ints, clock_epoch: Ints) -> Floats:
+    """Return the standard deviation of the unobservable scale of distances at each time, shape (N,): one error of its whole section."""
+    std = np.zeros(len(stamp_ns))
+    for section in facts.stretches if facts else ():
+        inside = (clock_epoch == section.clock_epoch) & (stamp_ns >= section.start_ns) & (stamp_ns <= section.end_ns)
+        std[inside] = section.common_scale_std or 0.0
+    return std

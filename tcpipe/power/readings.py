@@ -50,6 +50,12 @@ class PowerReadings:
     """The sign of a drawn current, and its source; None without power."""
     includes: tuple[str, ...] = ()
     """What the currents feed besides the drives."""
+    gain_std_fraction: float | None = None
+    """σ of the gain of the least certain source, as a fraction."""
+    offset_std_amp: float | None = None
+    """Of the zero of its current [A]."""
+    rest_current_amp: tuple[float, float] | None = None
+    """Lowest and highest current of a rail at rest [A]; None where a source does not state it."""
 
     @property
     def is_rejected(self) -> bool:
@@ -108,7 +114,20 @@ def read_power(
     counts = any(of.energy for of in sources)
     unknown = any(of.averaging_unknown for of in sources) and not counts
     averaged = counts or any(of.averaged for of in sources)
-    return PowerReadings(signed, averaged, unknown, tuple(dict.fromkeys(findings)), told_by, includes)
+    rest = [of.rest_current_amp for of in sources if of.current and of.rest_current_amp]
+    return PowerReadings(
+        signed,
+        averaged,
+        unknown,
+        tuple(dict.fromkeys(findings)),
+        told_by,
+        includes,
+        gain_std_fraction=max(of.gain_std_fraction for of in sources),
+        offset_std_amp=max(of.offset_std_amp for of in sources),
+        rest_current_amp=(min(of[0] for of in rest), max(of[1] for of in rest))
+        if rest and len(rest) == sum(bool(of.current or of.energy) for of in sources)
+        else None,
+    )
 
 
 @dataclass(frozen=True, slots=True)

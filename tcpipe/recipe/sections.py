@@ -205,6 +205,10 @@ class LabelConfig:
     """A segment more curved than this is flagged."""
     flag_position_std_m: Deviation = 0.10
     """A segment with an end whose absolute position is less certain than this is flagged weak_gnss [m]."""
+    power_gain_std_fraction: Fraction | None = field(default=None, metadata=LEFT_OUT)
+    """σ of the power sensor's gain; default: from the power source."""
+    power_offset_std_amp: Annotated[float, Bounds(ge=0, le=1e4)] | None = field(default=None, metadata=LEFT_OUT)
+    """σ of the zero of each rail's current; default: from the power source and the current at rest [A]."""
 
     def __post_init__(self) -> None:
         validate_fields(self, "label")

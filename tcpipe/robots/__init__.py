@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
 from tcpipe.tables.bounds import Bounds
+from tcpipe.tables.findings import LEFT_OUT
 
 Size = Annotated[float, Bounds(ge=0.05, le=100)]
 """Of a robot [m]: from a toy's to a mining truck's."""
@@ -21,6 +22,12 @@ PlausibleSpeed = Annotated[float, Bounds(ge=2, le=1000)]
 """A bound that no true track reaches [m/s]: at walking pace it would refuse robots that drive."""
 Volt = Annotated[float, Bounds(ge=0.1, le=1e4)]
 Scale = Annotated[float, Bounds(gt=0, le=1e9)]
+Share = Annotated[float, Bounds(ge=0, le=1)]
+Amp = Annotated[float, Bounds(ge=-1e4, le=1e4)]
+
+GAIN_STD_FRACTION, OFFSET_STD_AMP = 0.02, 0.2
+"""σ of gain and zero [A] of a current sensor where nothing better is known: those of open-loop Hall sensors (Allegro ACS712, 20 A, data
+sheet: total output error ± 1.5 %; its zero drifts by 3.4 mA per kelvin, 0.14 A over 40 K), and half as much again."""
 
 GENERIC = "generic"
 """The name of a robot of which nothing is known."""
@@ -109,6 +116,14 @@ class PowerSource:
     """Sign of a drawn current; auto if it differs by robot: the mean over the run decides."""
     propulsion: bool = True
     """Whether the current feeds only the drives; such sources have priority."""
+    gain_std_fraction: Share = field(default=GAIN_STD_FRACTION, metadata={"json": (GAIN_STD_FRACTION,)})
+    """σ of the sensor's gain: one error of a whole run."""
+    offset_std_amp: Annotated[float, Bounds(ge=0, le=1e4)] = field(
+        default=OFFSET_STD_AMP, metadata={"json": (OFFSET_STD_AMP,)}
+    )
+    """σ of the zero of the current, likewise [A]."""
+    rest_current_amp: tuple[Amp, Amp] | None = field(default=None, metadata=LEFT_OUT)
+    """Lowest and highest current of the stationary robot, if known; beyond is an offset [A]."""
     other_loads: str = ""
     """Other loads of the current; named in a warning."""
     open_questions: str = ""
@@ -142,6 +157,8 @@ class PowerSource:
                 yield "unsupported_reason", "no field besides it"
         elif not self.voltage and not self.current:
             yield "current", "a voltage, a current or both"
+        if self.rest_current_amp is not None and self.rest_current_amp[0] > self.rest_current_amp[1]:
+            yield "rest_current_amp", "the lower of two currents first"
         if self.energy and (self.current or not self.voltage):
             yield "energy", "a voltage besides it, and no current"
 

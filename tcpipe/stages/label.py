@@ -10,7 +10,14 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from tcpipe.cost.labels import Labels, combine_flags, compute_labels, has_mean_mismatch, subtract_idle_power
+from tcpipe.cost.labels import (
+    Labels,
+    SensorError,
+    combine_flags,
+    compute_labels,
+    has_mean_mismatch,
+    subtract_idle_power,
+)
 from tcpipe.cost.physics import ALL, FitSamples, fit_and_validate_physics, fit_physics
 from tcpipe.fusion.trajectory import DISPLACEMENT_LAGS_S
 from tcpipe.geometry.piecewise_linear import interpolate, mean_between
@@ -35,6 +42,12 @@ from tcpipe.stages.label_motion import (
     make_label_facts,
     make_motion_columns,
     sum_energy_entries,
+)
+from tcpipe.stages.label_uncertainty import (
+    compute_common_displacement_std_m,
+    count_confirming_sensors,
+    find_power_prior,
+    make_sensor_error,
 )
 from tcpipe.stages.message_arrays import make_rails
 from tcpipe.tables.arrays import make_lines, select_rows, to_numbers
@@ -71,12 +84,16 @@ def label_segments(
     epochs: list[int] = np.unique(to_integers(masked.table, "clock_epoch")).tolist()
     rails_by_epoch = {epoch: make_rails(streams, epoch) for epoch in epochs}
     standing = find_idle_power(masked.table, rails_by_epoch, rate_hz=masked.info.rate_hz)
+    prior = find_power_prior(masked.info.report.facts.power, config)
     for epoch, rails in rails_by_epoch.items():
         rows, cut = (select_rows(table, "clock_epoch", epoch) for table in (masked.table, segments.table))
         joules.update(sum_energy_entries(rows, rails, rate_hz=masked.info.rate_hz, rule=rule))
         if not cut.num_rows:
             continue
-        cost, net, causes = compute_segment_costs(cut, rows, rails, masked.info, rule=rule, standing=standing)
+        sensor = make_sensor_error(cut, rails, prior, rule=rule)
+        cost, net, causes = compute_segment_costs(
+            cut, rows, rails, masked.info, rule=rule, standing=standing, sensor=sensor
+        )
         variance_j2.append(causes)
         spans = to_integers(cut, "start_ns"), to_integers(cut, "end_ns")
         count, mean_watt = count_samples_inside(rails, *spans)
@@ -101,6 +118,7 @@ def label_segments(
                 voltage_volt=mean_between(to_integers(rows, "stamp_ns"), to_floats(rows, "voltage_volt"), *spans),
                 physics_power_watt=np.full(cut.num_rows, np.nan),
                 power_samples=count,
+                confirming_sensor_count=count_confirming_sensors(cut, streams, masked.info.report.facts),
                 quality=combine_flags(flags, cut.num_rows),
                 geometry=make_lines(*(read_lonlat_deg(cut, end) for end in ("start", "end"))),
             )
@@ -119,7 +137,14 @@ _BETTER_HZ = 20.0
 
 
 def compute_segment_costs(
-    cut: pa.Table, rows: pa.Table, rails: list[Rail], info: TrackInfo, *, rule: Rule, standing: IdlePower
+    cut: pa.Table,
+    rows: pa.Table,
+    rails: list[Rail],
+    info: TrackInfo,
+    *,
+    rule: Rule,
+    standing: IdlePower,
+    sensor: SensorError,
 ) -> tuple[Labels, dict[str, NDArray[np.float64]], dict[str, NDArray[np.float64]]]:
     """Return the labels of one epoch's segments, the net labels, and the variances of their energies by cause [J²].
 
@@ -139,6 +164,8 @@ def compute_segment_costs(
         end_power_watt=end_watt,
         displacement_std_m=_compute_displacement_std_m(cut, rows, smoothed=info.estimator == "smoother"),
         energy_noise_joule=noise_joule,
+        common_displacement_std_m=compute_common_displacement_std_m(cut, info.report.facts),
+        sensor=sensor,
     )
     net = subtract_idle_power(
         cost,
@@ -146,9 +173,11 @@ def compute_segment_costs(
         idle_std_watt=standing.std_watt,
         end_power_watt=end_watt,
         energy_noise_joule=noise_joule,
+        sensor=sensor,
     )
-    position = (end_watt * cost.duration_std_s) ** 2
+    position = end_watt**2 * (cost.duration_std_s**2 - cost.duration_common_std_s**2)
     causes = {"position": position, "rate": noise.rate, "current": noise.current, "voltage": noise.voltage}
+    causes["common"] = cost.energy_common_std_joule**2
     return cost, net, {**causes, "at_20_hz": position + np.minimum(better.std_joule(), noise_joule) ** 2}
 
 

@@ -11,7 +11,7 @@ from tcpipe.fusion.trajectory import DISPLACEMENT_LAGS_S
 from tcpipe.motion import masks
 from tcpipe.motion.distance_breakdown import JUMP_M, compute_unexplained_m
 from tcpipe.motion.row_sections import Floats, Mask, MotionRows, number_pieces
-from tcpipe.motion.uncertainty import compute_along_std_m, compute_chord_ahead_std_m
+from tcpipe.motion.uncertainty import compute_along_std_m, compute_chord_ahead_std_m, find_common_scale_std
 from tcpipe.recipe import MaskConfig
 from tcpipe.recipe.suggestions import suggest
 from tcpipe.robots import MAX_PLAUSIBLE_MPS
@@ -253,13 +253,10 @@ def _compute_chord_std_m(track: Track, rows: MotionRows, chord_m: float, config:
 def _compute_common_std_mps(track: Track) -> Floats:
     """Return the part of each row's velocity standard deviation that its section has in common: that of an unobservable scale."""
     table = track.table
-    stamp_ns, epoch = to_integers(table, "stamp_ns"), to_integers(table, "clock_epoch")
     speed_mps = np.linalg.norm([to_floats(table, f"{name}_velocity_mps") for name in ("east", "north", "up")], axis=0)
-    scale_std = np.zeros(len(speed_mps))
-    fuse = track.info.report.facts.fuse
-    for section in fuse.stretches if fuse else ():
-        inside = (epoch == section.clock_epoch) & (stamp_ns >= section.start_ns) & (stamp_ns <= section.end_ns)
-        scale_std[inside] = section.common_scale_std or 0.0
+    scale_std = find_common_scale_std(
+        track.info.report.facts.fuse, to_integers(table, "stamp_ns"), to_integers(table, "clock_epoch")
+    )
     common_mps: Floats = scale_std * speed_mps
     return common_mps
 

@@ -167,9 +167,20 @@ def make_read_report(
         epochs=len(steps) + 1,
         clock_steps=tuple(steps),
         time_offset_s=offset_s,
-        power=None if power.current_sign is None else PowerSign(power.current_sign, power.averaged, power.includes),
+        power=None if power.current_sign is None else _describe_power(power),
     )
     return StageReport(tuple(dict.fromkeys(findings)), facts)
+
+
+def _describe_power(power: PowerReadings) -> PowerSign:
+    return PowerSign(
+        power.current_sign or "",
+        power.averaged,
+        power.includes,
+        power.gain_std_fraction,
+        power.offset_std_amp,
+        power.rest_current_amp,
+    )
 
 
 def _find_unused(source: TopicReadings, timeline: Timeline | None) -> Iterator[Finding]:

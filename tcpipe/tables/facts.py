@@ -80,12 +80,16 @@ class ClockStep:
 class PowerSign:
     """Sign of a drawn current and its source; whether the power source averages over its message period.
 
-    ``includes``: known loads besides the drives (computers, payload).
+    ``includes``: known loads besides the drives (computers, payload). ``gain_std_fraction`` and ``offset_std_amp`` are the σ of gain and
+    zero of a sensor of this kind, ``rest_current_amp`` the currents that a rail of it can have at rest, None where nothing is known.
     """
 
     current_sign: str
     averaged: bool
     includes: tuple[str, ...] = field(default=(), metadata=LEFT_OUT)
+    gain_std_fraction: float | None = field(default=None, metadata=LEFT_OUT)
+    offset_std_amp: float | None = field(default=None, metadata=LEFT_OUT)
+    rest_current_amp: tuple[float, float] | None = field(default=None, metadata=LEFT_OUT)
 
 
 @dataclass(frozen=True, slots=True)
@@ -314,6 +318,8 @@ class EnergyBudget:
     voltage: float
     at_20_hz: float
     """The total with power at 20 Hz."""
+    common: float | None = field(default=None, metadata=LEFT_OUT)
+    """The error that all segments of a run share, which is not part of the total; None in documents of earlier versions."""
 
 
 @dataclass(frozen=True, slots=True)

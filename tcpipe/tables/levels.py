@@ -319,6 +319,19 @@ _NET_COLUMNS = tuple(
     )
 )
 
+_COMMON_COLUMNS = tuple(
+    _make_nullable(name, unit, f"part of {name.replace('_common', '')} that is one error of the whole run", since="3.0")
+    for name, unit in (
+        ("duration_common_std_s", "s"),
+        ("velocity_common_std_mps", "m/s"),
+        ("power_common_std_watt", "W"),
+        ("energy_common_std_joule", "J"),
+        ("net_power_common_std_watt", "W"),
+        ("net_energy_common_std_joule", "J"),
+    )
+)
+"""Over a path these add up linearly."""
+
 _LABEL_COLUMNS = (
     Column("duration_s", _F64, "s", "T: time from start to end"),
     Column("velocity_mps", _F64, "m/s", "v: chord / duration"),
@@ -329,12 +342,21 @@ _LABEL_COLUMNS = (
     _make_nullable("power_std_watt", "W", "standard deviation of the power, likewise; null without power"),
     _make_nullable("energy_std_joule", "J", "standard deviation of the energy, likewise; null without power"),
     *_NET_COLUMNS,
+    *_COMMON_COLUMNS,
     _make_nullable(
         "physics_power_watt",
         "W",
         "power predicted by the physics model fitted on the run; null without power or fit",
     ),
     Column("power_samples", pa.int32(), "1", "power samples inside the segment"),
+    Column(
+        "confirming_sensor_count",
+        pa.int32(),
+        "1",
+        "GNSS or pose, wheels, camera: how many measured in the segment and agree with the track",
+        nullable=True,
+        since="3.0",
+    ),
     Column("quality", pa.uint32(), "bits", "limitations of the label, 0 = none", flags=Quality),
 )
 

@@ -233,6 +233,7 @@ def test_definitions_that_a_log_lacks_can_be_given(undefined):
         ("inspect", "broken", 1, "its definition cannot be parsed"),
         ("ingest", "none", 1, "no .msg or .idl file below it"),
         ("preflight", "nowhere", 2, "no such directory"),
+        ("audit", "none", 1, "no .msg or .idl file below it"),
         ("inspect", "a.mcap", 2, "is a file"),
     ],
 )

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import signal
 import subprocess
 import time
@@ -150,6 +151,43 @@ def test_a_preflight_promises_what_ingesting_gives(work):
     assert blind["expected_yield"]["relative_std_median"]["energy"] is None
     assert names[0] in blind["record"].split(), "what this recipe ignores is recorded all the same"
     (work / "blind.toml").unlink()
+
+
+def test_an_audit_holds_a_track_against_what_is_withheld_from_it(work):
+    (log,) = (work / "site" / "logs").glob("*.mcap")
+    done = tcpipe("audit", log, "--json", "--quiet", cwd=work)
+    found = json.loads(done.stdout)
+    assert (done.returncode, done.stderr) == (0, "")
+    by_kind = {(of["role"], of["window_s"], of["chord_s"]): of for of in found["scores"]}
+    odometries = {(f"{name}_odometry", 10.0, chord_s) for name in ("wheel", "visual") for chord_s in (1.0, 4.0)}
+    assert by_kind.keys() == {("gnss", 10.0, None), *odometries}
+    fixes = by_kind["gnss", 10.0, None]
+    assert fixes["median_error_m"] < 0.1 < fixes["straight_median_m"]
+    assert (fixes["windows"], fixes["compared"], fixes["within_2_sigma"]) == (1, 10, 1.0)
+    assert "gnss, 30 s: covers 30 s, 40 s are needed" in found["skipped"]
+    # The same from the store, and as text.
+    (run,) = (work / "tcpipe-store" / "runs").iterdir()
+    assert json.loads(tcpipe("audit", run, "--json", cwd=work).stdout)["scores"] == found["scores"]
+    text = tcpipe("audit", log, "-q", "--robot", "husky", cwd=work).stdout
+    assert re.search(r"^ *gnss  +10 s +1 +10 +0\.\d{3} .* 100% .* calibrated$", text, re.MULTILINE)
+    assert not list(work.glob("*audit*"))
+
+
+def test_an_audit_of_a_run_without_fixes_or_without_anything_to_compare(work):
+    (log,) = (work / "site" / "logs").glob("*.mcap")
+    (work / "wheels.toml").write_text("[read.topics]\ngnss = []\nvisual_odometry = []\n")
+    done = tcpipe("audit", log, "--recipe", "wheels.toml", "--json", "-q", cwd=work)
+    found = json.loads(done.stdout)
+    assert done.returncode == 0
+    assert found["scores"] == []
+    assert found["length_ratios"] == {"wheel_odometry": pytest.approx(1.0, abs=0.05)}
+    (work / "fixes.toml").write_text("[read.topics]\nwheel_odometry = []\nvisual_odometry = []\n")
+    said = plain_lines(tcpipe("audit", log, "--recipe", "fixes.toml", "-q", cwd=work), 2)
+    assert "nothing can be withheld and compared" in said
+    assert "gnss, no other sensor measures motion" in said
+    assert "tcpipe-store/runs/RUN" in plain_lines(tcpipe("audit", "tcpipe-store", "-q", cwd=work), 2)
+    for name in ("wheels.toml", "fixes.toml"):
+        (work / name).unlink()
 
 
 def messages_of(path, *topics):

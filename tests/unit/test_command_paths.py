@@ -106,6 +106,7 @@ CALLS = [
     "add-map site --height file --store https://bucket/store",
     "add-map site --height file --layer a=gone.tif",
     "add-map site --height file --layer a=file --categorical a=gone.csv",
+    "audit gone",
     "build-dataset out --store gone",
     "build-dataset out --store file",
     "build-dataset out --store empty --split gone.geojson",

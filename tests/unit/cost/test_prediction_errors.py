@@ -112,3 +112,19 @@ def test_pieces_without_a_cost_add_nothing():
 
 def test_too_few_held_out_samples_say_nothing():
     assert fit_errors(made_residuals(19)) is None
+
+
+def test_what_all_labels_have_in_common_adds_up_linearly_along_a_path():
+    """Labels of one sensor whose gain is known to 2 %: no residual shows it, and no length makes it smaller."""
+    exact = made_residuals(4000, sigma=0.02)
+    stated = {
+        **exact,
+        "duration_s": np.full(4000, 1.25),
+        "duration_common_std_s": np.zeros(4000),
+        "energy_common_std_joule": 0.02 * exact["power_watt"] * 1.25,
+    }
+    without, with_common = (fit_errors(residuals) for residuals in (exact, stated))
+    for count in (10, 1000):
+        added = np.sqrt(_width(with_common["energy"], count) ** 2 - _width(without["energy"], count) ** 2)
+        assert added == pytest.approx(2.0 * 1.645 * 0.02, rel=0.02)
+        assert _width(with_common["duration"], count) == _width(without["duration"], count)

@@ -8,7 +8,7 @@ import pytest
 from made_tracks import make_track, power_streams, stamps, straight_track
 from simulated_streams import log_of, streams_of
 
-from tcpipe.cost.labels import CAUSES, format_budget
+from tcpipe.cost.labels import CAUSES, SensorError, format_budget
 from tcpipe.pipeline.ingest_run import run_stages
 from tcpipe.power.rails import IdlePower, integrate_energy
 from tcpipe.recipe import LabelConfig, MaskConfig, Recipe, SegmentConfig
@@ -262,7 +262,8 @@ def test_error_budget_adds_up_to_the_deviations():
     labelled = label(straight_track(SPEED, std_m=1.0), power_streams({"drive": record(0.2, amp=rough)}))
     budget = labelled.info.report.facts.label.energy_budget
     energy, std = to_floats(labelled.table, "energy_joule"), to_floats(labelled.table, "energy_std_joule")
-    assert budget.total == pytest.approx(np.sqrt(np.mean(std**2)) / energy.mean())
+    assert np.hypot(budget.total, budget.common) == pytest.approx(np.sqrt(np.mean(std**2)) / energy.mean())
+    assert budget.common == pytest.approx(np.hypot(0.02, 0.2 / 6.0), rel=0.01)
     assert budget.total**2 == pytest.approx(sum(getattr(budget, cause) ** 2 for cause in CAUSES))
     assert budget.position == pytest.approx(144 * 0.004 * 1.25 / 0.8 / 180, rel=0.05)
     assert budget.position < budget.at_20_hz < 0.7 * budget.total
@@ -308,8 +309,9 @@ def test_epochs_with_overlapping_stamps_keep_their_own_power():
 
 def test_deviations_grow_with_their_causes():
     rough = lambda t: 6 + np.random.default_rng(0).normal(0, 1, len(t))  # noqa: E731
-    smooth = label(straight_track(SPEED, std_m=1.0), power_streams({"drive": record()})).table
-    noisy = label(straight_track(SPEED, std_m=1.0), power_streams({"drive": record(amp=rough)})).table
+    exact = {"config": LabelConfig(power_gain_std_fraction=0.0, power_offset_std_amp=0.0)}
+    smooth = label(straight_track(SPEED, std_m=1.0), power_streams({"drive": record()}), **exact).table
+    noisy = label(straight_track(SPEED, std_m=1.0), power_streams({"drive": record(amp=rough)}), **exact).table
     unsure = label(straight_track(SPEED, velocity_std_mps=0.02, std_m=1.0), power_streams({"drive": record()})).table
     assert to_floats(smooth, "duration_std_s") == pytest.approx(0.004 * 1.25 / 0.8, rel=1e-3)
     assert to_floats(smooth, "energy_std_joule") == pytest.approx(144 * 0.004 * 1.25 / 0.8, rel=1e-3)
@@ -415,7 +417,9 @@ def test_the_track_has_the_power_that_the_label_takes_at_a_segments_end(averaged
     cut = segment_track(masked, SegmentConfig()).table
     rule = "averaged" if averaged else "exact"
     unknown, rails = IdlePower(np.nan, np.nan), make_rails(streams, 0)
-    cost, _, causes = compute_segment_costs(cut, masked.table, rails, masked.info, rule=rule, standing=unknown)
+    cost, _, causes = compute_segment_costs(
+        cut, masked.table, rails, masked.info, rule=rule, standing=unknown, sensor=SensorError()
+    )
     label_watt = np.sqrt(causes["position"]) / cost.duration_std_s
     assert cut.num_rows > 40
     assert label_watt == pytest.approx(track_watt(streams, to_integers(cut, "end_ns")))

@@ -1,0 +1,169 @@
+"""What a withheld sensor shows of a track: errors that a test puts into the track are found, and their size is held against its σ."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from unit.fusion import drive
+from unit.stages.test_fuse import filled, sensor, streams_of
+
+from tcpipe.errors import FusionError
+from tcpipe.fusion.withheld import place_windows, score_comparisons
+from tcpipe.recipe import FuseConfig
+from tcpipe.stages import withheld
+from tcpipe.stages.fuse import fuse_run
+from tcpipe.stages.withheld import compare_withheld, withhold
+from tcpipe.tables.columns import to_floats, to_integers
+from tcpipe.tables.levels import GNSS_VELOCITY
+
+SECONDS = 185.0
+END_S = 5.0
+
+
+@given(st.floats(0.0, 5000.0), st.sampled_from([10.0, 30.0, 60.0]))
+def test_windows_lie_inside_the_run_with_as_much_data_between(span_s, length_s):
+    windows = place_windows(span_s, length_s)
+    assert np.diff(windows, axis=1) == pytest.approx(length_s)
+    assert (windows[1:, 0] - windows[:-1, 1] >= length_s - 1e-6).all()
+    if span_s < length_s + 2 * END_S:
+        assert not windows.size
+    else:
+        assert windows[0, 0] >= END_S - 1e-6
+        assert windows[-1, 1] <= span_s - END_S + 1e-6
+        assert len(windows) == int((span_s - 2 * END_S + length_s) / (2 * length_s)), "a further one would fit"
+
+
+@pytest.fixture(scope="module")
+def streams():
+    measured = drive.measure(drive.make_drive(SECONDS, turns=0.5), 1, gnss_outliers=0.0, slip=0.0)
+    return streams_of(measured)
+
+
+@pytest.fixture(scope="module")
+def track(streams):
+    return fuse_run(streams, FuseConfig(), run_id="run")
+
+
+def audited(streams, track, monkeypatch, change, windows_s=(10.0,)):
+    """Compare what is withheld with a track whose columns are changed by a function of their values and of the stamps [s]."""
+    monkeypatch.setattr(withheld, "WINDOWS_S", windows_s)
+    time_s = (to_integers(track.table, "stamp_ns") - drive.ZERO_NS) * 1e-9
+    columns = {name: track.table[name] for name in track.table.column_names}
+    columns |= change({name: to_floats(track.table, name) for name in track.table.column_names}, time_s)
+    table = track.table.select([])
+    for name, values in columns.items():
+        table = table.append_column(track.table.schema.field(name), [values])
+    monkeypatch.setattr(withheld, "fuse_run", lambda *_, **__: replace(track, table=table))
+    return compare_withheld(streams, FuseConfig(), run_id="run").comparisons
+
+
+def shift(std_m, claimed_m):
+    """Return a change that moves a track by a normal error, another one every ten seconds, and claims a σ."""
+    errors = np.random.default_rng(5).normal(0.0, std_m, (2, 30))
+
+    def change(columns, time_s):
+        step = (time_s / 10.0).astype(int)
+        moved = {f"{axis}_m": columns[f"{axis}_m"] + errors[k, step] for k, axis in enumerate("xy")}
+        return moved | {f"{axis}_std_m": np.full(time_s.size, claimed_m) for axis in "xy"}
+
+    return change
+
+
+def test_an_error_of_the_track_is_what_the_fixes_show_of_it(streams, track, monkeypatch):
+    def change(columns, _):
+        return {"x_m": columns["x_m"] + 0.3, "y_m": columns["y_m"] - 0.4}
+
+    (fixes,) = (of for of in audited(streams, track, monkeypatch, change) if of.chord_s is None)
+    score = score_comparisons([fixes])
+    assert fixes.error_m.mean(axis=0) == pytest.approx([-0.3, 0.4], abs=0.01), "withheld less predicted"
+    assert score.median_error_m == pytest.approx(0.5, abs=0.01)
+    assert (score.windows, score.calibration) == (9, "overconfident")
+    assert score.compared <= 10 * score.windows, "one a second"
+    # A line through a window of ten seconds of curves is a metre off; the fixes at its ends are not.
+    assert score.straight_median_m > 0.3
+    assert fixes.straight_m.min() < 0.1
+
+
+def test_a_sigma_is_held_against_errors_of_its_size(streams, track, monkeypatch):
+    def score(claimed_m):
+        comparisons = audited(streams, track, monkeypatch, shift(0.3, claimed_m))
+        return score_comparisons([of for of in comparisons if of.chord_s is None])
+
+    honest, tenth, vast = score(0.3), score(0.03), score(3.0)
+    assert honest.calibration == "calibrated"
+    assert honest.median_std_m == pytest.approx(0.3 * np.sqrt(2.0), rel=0.01)
+    assert tenth.calibration == "overconfident"
+    assert tenth.within_2_sigma < 0.5 < honest.within_2_sigma
+    assert (vast.calibration, vast.within_1_sigma) == ("underconfident", 1.0)
+
+
+def test_one_window_shows_only_gross_overconfidence(streams, track, monkeypatch):
+    comparisons = audited(streams, track, monkeypatch, shift(0.3, 0.03), windows_s=(150.0,))
+    (fixes,) = (of for of in comparisons if of.chord_s is None)
+    assert score_comparisons([fixes]).calibration == "overconfident"
+    assert score_comparisons([replace(fixes, std_m=fixes.std_m * 100.0)]).calibration == "calibrated"
+
+
+@pytest.mark.parametrize("role", ["wheel_odometry", "visual_odometry"])
+def test_the_scale_of_an_odometry_is_that_of_the_rest_of_the_run(streams, track, monkeypatch, role):
+    first_s, last_s = ((to_integers(streams.tables[role], "stamp_ns")[[0, -1]] - drive.ZERO_NS) * 1e-9).tolist()
+    windows_s = first_s + place_windows(last_s - first_s, 10.0)
+
+    def too_far(columns, time_s):
+        inside = ((time_s[:, None] >= windows_s[:, 0]) & (time_s[:, None] <= windows_s[:, 1])).any(1)
+        return {"forward_velocity_mps": columns["forward_velocity_mps"] * np.where(inside, 1.3, 1.0)}
+
+    def scored(change, chord_s):
+        found = audited(streams, track, monkeypatch, change)
+        return score_comparisons([of for of in found if of.role == role and of.chord_s == chord_s])
+
+    everywhere = scored(lambda columns, _: {"forward_velocity_mps": 1.3 * columns["forward_velocity_mps"]}, 1.0)
+    assert everywhere.median_error_m < 0.02
+    short, long = scored(too_far, 1.0), scored(too_far, 4.0)
+    assert short.median_error_m == pytest.approx(0.27, abs=0.06)
+    assert long.median_error_m == pytest.approx(4 * short.median_error_m, rel=0.15)
+    assert short.straight_median_m is None
+
+
+def test_a_sensor_is_withheld_in_its_windows_and_with_it_the_velocity_of_its_receiver(streams):
+    stamp_ns = to_integers(streams.tables["gnss"], "stamp_ns")
+    velocity = filled(GNSS_VELOCITY, stamp_ns)
+    both = replace(
+        streams,
+        tables={**streams.tables, "gnss_velocity": velocity},
+        sensors={**streams.sensors, "gnss_velocity": sensor()},
+    )
+    windows_ns = drive.ns(np.array([[20.0, 30.0], [50.0, 60.0]]))
+    rest = withhold(both, "gnss", 0, windows_ns)
+    inside = ((stamp_ns[:, None] >= windows_ns[:, 0]) & (stamp_ns[:, None] <= windows_ns[:, 1])).any(1)
+    for role in ("gnss", "gnss_velocity"):
+        assert to_integers(rest.tables[role], "stamp_ns").tolist() == stamp_ns[~inside].tolist()
+    assert rest.tables["wheel_odometry"] is both.tables["wheel_odometry"]
+    assert withhold(both, "gnss", 1, windows_ns).tables["gnss"].num_rows == stamp_ns.size, "another clock epoch"
+
+
+def test_the_fused_rest_of_a_clean_drive_predicts_its_fixes(streams, monkeypatch):
+    monkeypatch.setattr(withheld, "WINDOWS_S", (10.0,))
+    found = compare_withheld(streams, FuseConfig(), run_id="run")
+    kinds = {(of.role, of.chord_s) for of in found.comparisons}
+    assert kinds == {("gnss", None), *((f"{of}_odometry", chord) for of in ("wheel", "visual") for chord in (1.0, 4.0))}
+    assert not found.skipped
+    fixes = score_comparisons([of for of in found.comparisons if of.chord_s is None])
+    assert 10.0 * fixes.median_error_m < fixes.straight_median_m
+    assert fixes.calibration != "overconfident"
+
+
+def test_a_run_without_fixes_shows_its_length_against_its_odometry(streams):
+    def ratios(*removed):
+        tables = {role: table for role, table in streams.tables.items() if role not in removed}
+        return compare_withheld(replace(streams, tables=tables), FuseConfig(), run_id="run")
+
+    alone = ratios("gnss", "visual_odometry")
+    assert alone.skipped == (("wheel_odometry", "no other sensor measures motion"),)
+    assert alone.length_ratios == {"wheel_odometry": pytest.approx(1.0, abs=0.05)}
+    only_fixes = ratios("wheel_odometry", "visual_odometry")
+    assert (only_fixes.comparisons, only_fixes.length_ratios) == ((), {})
+    with pytest.raises(FusionError, match="no sensor measures motion"):
+        ratios("gnss", "wheel_odometry", "visual_odometry", "imu")
