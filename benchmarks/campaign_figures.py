@@ -142,7 +142,7 @@ def figures_of(cell: Cell, results: Sequence[Result], clean: Sequence[Result]) -
     made.needlessly = sum(r.oracle is None or r.oracle > 0 for r in results if not r.outcome.bits)
     lengths = [o.driven_m / o.wheels_m for o in outcomes if np.isfinite(o.wheels_m) and o.wheels_m > 1.0]
     made.wheels = float(np.mean(lengths)) if lengths else float("nan")
-    made.said = [line for line, _ in Counter(_plain(line) for o in outcomes for line in o.said).most_common(6)]
+    made.said = [line for line, _ in Counter(blot_numbers(line) for o in outcomes for line in o.said).most_common(6)]
     made.traces = [o.trace for o in outcomes if o.trace]
     made.failures = _failures(made, cell, outcomes)
     return made
@@ -150,7 +150,7 @@ def figures_of(cell: Cell, results: Sequence[Result], clean: Sequence[Result]) -
 
 def map_figures(result: MapResult) -> Figures:
     """Return the figures of the map's cell: what was said, and the verdict."""
-    said = [_plain(line) for line in result.said]
+    said = [blot_numbers(line) for line in result.said]
     return Figures(NAME, 1, {}, refused=int(result.refused), said=said, failures=result.failures)
 
 
@@ -187,7 +187,7 @@ def _yield(made: Figures, pool: _Pool, clean: _Pool) -> None:
     made.kept_good = float((~pool.doubt[good]).mean()) if good.any() else float("nan")
 
 
-def _plain(line: str) -> str:
+def blot_numbers(line: str) -> str:
     """Return a finding with its numbers blotted out, so that seeds say the same."""
     return re.sub(r"[-+]?\d+(\.\d+)?", "#", line)
 

@@ -178,10 +178,10 @@ class ErrorState:
         self.output_ns = np.arange(first, last + 1, dtype=np.int64) * 50_000_000
         self.events = sum(table.num_rows for table in streams.tables.values())
 
-    def us(self, *, smooth: bool) -> float:
+    def us(self) -> float:
         """CPU microseconds a message."""
         begin = time.process_time()
-        run_error_state(self.measurements, self.initial, output_ns=self.output_ns, smooth=smooth)
+        run_error_state(self.measurements, self.initial, output_ns=self.output_ns)
         return 1e6 * (time.process_time() - begin) / self.events
 
 
@@ -189,7 +189,7 @@ def print_paired(seconds: float) -> None:
     """Interleave every estimator and print medians and paired ratios."""
     short, drive = min(4.0, seconds), ErrorState(seconds)
     ukf15_us("compiled", 1.0)
-    ErrorState(5.0).us(smooth=True)
+    ErrorState(5.0).us()
     found: dict[str, list[float]] = {}
     with tempfile.TemporaryDirectory() as directory:
         command = compiled_eigen(Path(directory), seconds)
@@ -197,8 +197,7 @@ def print_paired(seconds: float) -> None:
             run = {
                 "15-state compiled": ukf15_us("compiled", seconds)[0],
                 "15-state filterpy": ukf15_us("filterpy", short)[0],
-                "error-state forward": drive.us(smooth=False),
-                "error-state forward + smoother": drive.us(smooth=True),
+                "error-state forward + smoother": drive.us(),
             }
             if command is not None:
                 run["C++ Eigen core, 15 states"] = eigen_us(command, seconds)[0]

@@ -100,7 +100,7 @@ class Errors:
     normalized: np.ndarray
 
 
-def errors(streams: Streams, truth: Truth, *, smooth: bool) -> Errors:
+def errors(streams: Streams, truth: Truth) -> Errors:
     """Fuse and compare, over every section."""
     config = FuseConfig()
     inputs, _ = drop_implausible_sensors(prepare_inputs(streams, config), streams)
@@ -112,9 +112,8 @@ def errors(streams: Streams, truth: Truth, *, smooth: bool) -> Errors:
             section.measurements, find_stationary_intervals(section.measurements), section.start_ns
         )
         found = run_error_state(
-            section.measurements, initial, output_ns=output_ns, smooth=smooth,
-            gate_probability=config.gate_probability,
-        )  # fmt: skip
+            section.measurements, initial, output_ns=output_ns, gate_probability=config.gate_probability
+        )
         at = truth.at(output_ns)
         position = found.position_enu_m
         if inputs.datum_deg_m is not None:
@@ -219,16 +218,14 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as temporary:
         directory = temporary if given.keep is None else given.keep
         for name, std_m, outage_s, removed, chosen in cases(seeds, given.only):
-            found: dict[str, list[Errors]] = {"forward": [], "smoothed": []}
+            drives: list[Errors] = []
             vibration = QUIET_MPS2 if "quiet" in name else None
             for seed in chosen:
                 place = Path(directory) / f"{seed}_{std_m}_{outage_s}_{vibration}"
                 streams, truth = made_drive(place, seed, gnss_std_m=std_m, outage_s=outage_s, vibration_mps2=vibration)
-                for which, drives in found.items():
-                    drives.append(errors(without(streams, *removed), truth, smooth=which == "smoothed"))
-            for which, drives in found.items():
-                print(row(f"{name}, {which}", drives, outage=False), flush=True)
-            print(row(f"{name}, smoothed, in outages", found["smoothed"], outage=True), flush=True)
+                drives.append(errors(without(streams, *removed), truth))
+            print(row(name, drives, outage=False), flush=True)
+            print(row(f"{name}, in outages", drives, outage=True), flush=True)
             if not removed:
                 print(f"{'  possible':<34} {'':15} {1e3 * possible_mps(std_m, vibration):7.1f}", flush=True)
 

@@ -1,7 +1,8 @@
 """Whether labels are as wrong as they claim: the truth gate, on drives and families of errors that the estimator does not contain.
 
     python benchmarks/honesty.py --gate --out A.json [--cache DIR]      # the gate: two seeds of each of its cells
-    python benchmarks/honesty.py --cells "outage|: clean" --seeds 10    # any cells, by a regular expression
+    python benchmarks/honesty.py --first-seed 8001 --seeds 10           # the verdict: all cells, on drives that nothing was tuned on
+    python benchmarks/honesty.py --cells "outage|: clean" --seeds 1     # any cells, by a regular expression
     python benchmarks/honesty.py --compare A.json B.json                # two estimators on the same drives
     python benchmarks/honesty.py --read A.json                          # the table again
     python benchmarks/honesty.py --list                                 # all cells; those beyond the gate are indented
@@ -35,7 +36,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 
 from campaign_drives import QUANTITIES, RING, TRACK, Drive, MemoryLog, Outcome, judge_log, log_of, simulated
 from campaign_faults import SETS
-from campaign_figures import LABELS, OF_THE_DRIVE
+from campaign_figures import LABELS, OF_THE_DRIVE, blot_numbers
 from honesty_cells import HonestCell, honest_cells
 
 from tcpipe.tables.bits import Quality
@@ -172,7 +173,7 @@ def figures_of(cell: HonestCell, outcomes: Sequence[Outcome], bases: Sequence[Ou
     known = np.isfinite(error)
     lengths = [of.driven_m / of.wheels_m for of in outcomes if of.driven_m and np.isfinite(of.wheels_m)]
     at_fault = {_ROLES.get(role, role) for role in cell.fault.at_fault}
-    said = [bool(re.search(cell.fault.said, "\n".join(of.said))) for of in outcomes]
+    said = [_names(cell.fault.said, of, base) for of, base in zip(outcomes, bases, strict=True)]
     figures = Figures(
         cell.name, cell.fault.calibrated,
         {name: values[np.isfinite(values)] for name, values in ratio.items()},
@@ -186,6 +187,12 @@ def figures_of(cell: HonestCell, outcomes: Sequence[Outcome], bases: Sequence[Ou
     )  # fmt: skip
     figures.misses = list(_misses(figures, cell))
     return figures
+
+
+def _names(pattern: str, outcome: Outcome, base: Outcome) -> bool:
+    """Return whether a finding holds the pattern that is not made without the fault as well, whatever its numbers."""
+    without = {blot_numbers(line) for line in base.said}
+    return bool(re.search(pattern, "\n".join(line for line in outcome.said if blot_numbers(line) not in without)))
 
 
 def _losses(labels: Labels, base: Labels) -> tuple[int, int]:
@@ -244,7 +251,7 @@ def _pooled(name: str, values: Sequence[float]) -> float:
 # Pages
 
 HEAD = (
-    f"{'cell':<46} {'labels':>6} {'T':>6} {'v':>6} {'w':>6} {'E':>6} {'start':>6} {'σ/RMS':>5} {'lost':>4} "
+    f"{'cell':<50} {'labels':>6} {'T':>6} {'v':>6} {'w':>6} {'E':>6} {'start':>6} {'σ/RMS':>5} {'lost':>4} "
     f"{'xy mm':>6} {'mm/s':>5} {'yaw °':>6} {'length':>6} {'named':>5} {'CPU s':>5}"
 )
 
@@ -269,7 +276,7 @@ def row(of: Figures) -> str:
     blamed = f" blamed: {', '.join(of.blamed)}" if of.blamed else ""
     if np.isfinite(of.track["gap_xy_m"]):
         blamed = f" gap: {1e3 * of.track['gap_xy_m']:.0f} mm, {of.track['gap_inside']:.0%} inside{blamed}"
-    return f"{of.cell:<46} {' '.join(figures)}  {'; '.join(of.misses) or 'ok'}{blamed}"
+    return f"{of.cell:<50} {' '.join(figures)}  {'; '.join(of.misses) or 'ok'}{blamed}"
 
 
 def summary(every: Sequence[Figures]) -> list[str]:
@@ -298,7 +305,7 @@ def summary(every: Sequence[Figures]) -> list[str]:
 
 def compare(first: Mapping[Key, Outcome], second: Mapping[Key, Outcome]) -> Iterator[str]:
     """Yield how far the second's errors are from the first's, over the first's deviations, where both have labels; a line a drive."""
-    yield f"{'cell':<46} {'seed':>5} {'both':>5} {'median |Δ|/σ, max':>18} {'1σ/2σ of T, then E':>24} {'start':>13}"
+    yield f"{'cell':<50} {'seed':>5} {'both':>5} {'median |Δ|/σ, max':>18} {'1σ/2σ of T, then E':>24} {'start':>13}"
     for (cell, seed), outcome in first.items():
         if (cell, seed) not in second:
             continue
@@ -311,7 +318,7 @@ def compare(first: Mapping[Key, Outcome], second: Mapping[Key, Outcome]) -> Iter
         moved = np.concatenate(change)
         moved = moved[np.isfinite(moved)]
         medians = f"{np.median(moved):8.2f} {moved.max():8.1f}" if moved.size else f"{'–':>8} {'–':>8}"
-        yield f"{cell:<46} {seed:5d} {matched.sum():5d} {medians}  " + "  ".join(
+        yield f"{cell:<50} {seed:5d} {matched.sum():5d} {medians}  " + "  ".join(
             " → ".join(_of_sure(of, name, (1.0, RING if name == "start" else 2.0)) for of in labels)
             for name in ("T", "E", "start")
         )

@@ -173,9 +173,9 @@ def by_load(depth: float) -> Scale:
     return make
 
 
-def err(name: str, family: FixError) -> Callable[[Readings, Drive], Readings]:
+def err(family: FixError) -> Callable[[Readings, Drive], Readings]:
     """Return a change of fixes by a family; the receiver knows nothing of it."""
-    return alter("gnss", lambda reading, drive: _moved_by(reading, drive, family, name))
+    return alter("gnss", lambda reading, drive: _moved_by(reading, drive, family, "fault"))
 
 
 def scale(role: str, family: Scale) -> Callable[[Readings, Drive], Readings]:
@@ -191,7 +191,8 @@ def scale(role: str, family: Scale) -> Callable[[Readings, Drive], Readings]:
 
 
 def _moved_by(reading: Reading, drive: Drive, family: FixError, name: str) -> Reading:
-    return move_fixes(reading, drive, family(drive.truth.at(reading.stamp_ns), drive.noise(name)))
+    stamp_ns, row = np.unique(reading.stamp_ns, return_inverse=True)  # a fix that was recorded twice errs once
+    return move_fixes(reading, drive, family(drive.truth.at(stamp_ns), drive.noise(name))[row])
 
 
 def _claimed(name: str, std_m: float, family: FixError) -> Callable[[Readings, Drive], Readings]:
@@ -274,10 +275,8 @@ def step_host_clock(seconds: float) -> Fault:
         after = np.where(stamp_ns >= high_ns, stamp_ns - step_ns, 0)
         return np.where(stamp_ns < low_ns, stamp_ns, after)
 
-    return Fault(
-        f"host clock steps by {seconds:+g} s", said="clock",
-        messages=lambda messages, drive: [change(m, drive) for m in messages], true_ns=true_ns,
-    )  # fmt: skip
+    fault = ORDINARY & Fault("", messages=lambda messages, drive: [change(m, drive) for m in messages], true_ns=true_ns)
+    return replace(fault, name=f"host clock steps by {seconds:+g} s", said="clock", route="valley")
 
 
 def _late_from_half_time(seconds: float) -> Callable[[Reading, Drive], Reading]:
@@ -376,11 +375,10 @@ class HonestCell:
         return replace(sensors, **dict.fromkeys(SETS[self.sensors]))
 
 
-def _in_ordinary(fault: Fault) -> Fault:
-    return replace(
-        ORDINARY & fault, name=fault.name, said=fault.said, at_fault=fault.at_fault, may_refuse=fault.may_refuse,
-        route=fault.route if fault.route != "hills" else "valley",
-    )  # fmt: skip
+def _fault(name: str, role: str, said: str, readings: Callable[[Readings, Drive], Readings]) -> Fault:
+    """Return a fault of a sensor in an ordinary world; where ``said`` is empty nobody could name it."""
+    fault = Fault(name, (role,), readings=readings)
+    return replace(ORDINARY & fault, name=name, at_fault=fault.at_fault, said=said, route="valley")
 
 
 def _noise(name: str, std_m: float, family: FixError) -> Fault:
@@ -393,22 +391,6 @@ def _arm(name: str, messages: Callable[[Messages, Drive], Messages], said: str, 
     return Fault(name, ("gnss",), said=said, readings=_ordinary_noise, messages=messages, route=route)
 
 
-def _of_gnss(name: str, family: FixError, said: str = "") -> Fault:
-    return _in_ordinary(Fault(name, ("gnss",), said=said, readings=err("fault", family)))
-
-
-def _of_role(role: str, name: str, change: Callable[[Reading, Drive], Reading], said: str) -> Fault:
-    return _in_ordinary(Fault(name, (role,), said=said, readings=alter(role, change)))
-
-
-def _scaled(role: str, name: str, family: Scale, said: str = "") -> Fault:
-    return _in_ordinary(Fault(name, (role,), said=said, readings=scale(role, family)))
-
-
-def _of_power(name: str, change: Callable[[np.ndarray, np.ndarray], np.ndarray], said: str = "") -> Fault:
-    return _in_ordinary(Fault(name, said=said, readings=_currents(change)))
-
-
 _OF_NO_FAULT = r"stamp-jitter|lever-arm-\w+|sensor-not-placed|odometry-scale|velocity-scatters|measurements-rejected"
 _GNSS, _VISUAL, _WHEELS, _IMU = (
     rf"(?m)^{role}\b(?!.*\[({_OF_NO_FAULT})\])" for role in ("gnss", "visual_odometry", "wheel_odometry", "imu")
@@ -419,7 +401,9 @@ _POWER = r"(?m)\[(power|current)[\w-]*(offset|gain|sign|scale|contradict|inconsi
 
 
 _BY: Mapping[str, Callable[[float], Scale]] = {"slope": by_slope, "terrain": by_terrain, "load": by_load}
+_SCALED = (("camera", "visual", _VISUAL, "all"), ("wheel", "wheels", "", "no visual"))
 _IN_BOTH = ("all", "no visual")
+_CLEAN_SETS = (*_IN_BOTH, "no wheels", "no IMU", "GNSS, wheels", "GNSS, visual", "no GNSS", "wheels, IMU")
 
 FAULTS: tuple[tuple[Fault, tuple[str, ...]], ...] = (
     (Fault("white 1.5 cm, exact arm", route="valley", readings=_claimed("noise", 0.0142, gauss_markov(0.0142, 1e-3))), _IN_BOTH),
@@ -428,48 +412,45 @@ FAULTS: tuple[tuple[Fault, tuple[str, ...]], ...] = (
         for cm, tau_s, gate in ((0.8, 15, ("all",)), (1.5, 10, _IN_BOTH), (2, 10, _IN_BOTH), (3, 5, _IN_BOTH), (3, 20, ("no visual",)))
     ),
     *((_noise(f"flicker noise {cm} cm", cm / 100, flicker(cm / 100)), _IN_BOTH) for cm in (1, 2)),
-    *((_of_gnss(f"multipath of places {cm} cm", multipath(cm / 100)), _IN_BOTH) for cm in (1, 3)),
-    *((_of_gnss(f"constellation steps {cm} cm", steps(cm / 100)), ("all", "no visual")[cm < 3 :][:1]) for cm in (2, 5)),
-    (_of_gnss("ambiguity ramps 0.1 m", ramps(0.1)), ("all",)),
-    (_of_gnss("ambiguity ramps 0.3 m", ramps(0.3), _GNSS), ("all",)),
-    (_of_gnss("excursion 0.15 m in 60 s", excursion(0.15, 60)), _IN_BOTH),
-    (_of_gnss("excursion 0.4 m in 40 s", excursion(0.4, 40), _GNSS), _IN_BOTH),
-    (_of_gnss("excursion 0.4 m in 120 s", excursion(0.4, 120)), _IN_BOTH),
-    (_of_gnss("fix 0.2 m wrong for 30 s", wrong_fix(0.2, 30), _GNSS), ()),
-    (_of_gnss("fix 0.5 m wrong for 60 s", wrong_fix(0.5, 60), _GNSS), _IN_BOTH),
-    (_of_gnss("antenna moved by 0.1 m", moved_antenna(0.1)), ("all",)),
-    (_of_gnss("antenna moved by 0.3 m", moved_antenna(0.3), _GNSS), ("all",)),
+    *((_fault(f"multipath of places {cm} cm", "gnss", "", err(multipath(cm / 100))), _IN_BOTH) for cm in (1, 3)),
+    (_fault("constellation steps 2 cm", "gnss", "", err(steps(0.02))), ("no visual",)),
+    (_fault("constellation steps 5 cm", "gnss", "", err(steps(0.05))), ("all",)),
+    (_fault("ambiguity ramps 0.1 m", "gnss", "", err(ramps(0.1))), ("all",)),
+    (_fault("ambiguity ramps 0.3 m", "gnss", _GNSS, err(ramps(0.3))), ("all",)),
+    (_fault("excursion 0.15 m in 60 s", "gnss", "", err(excursion(0.15, 60))), _IN_BOTH),
+    (_fault("excursion 0.4 m in 40 s", "gnss", _GNSS, err(excursion(0.4, 40))), _IN_BOTH),
+    (_fault("excursion 0.4 m in 120 s", "gnss", "", err(excursion(0.4, 120))), _IN_BOTH),
+    (_fault("fix 0.2 m wrong for 30 s", "gnss", _GNSS, err(wrong_fix(0.2, 30))), ()),
+    (_fault("fix 0.5 m wrong for 60 s", "gnss", _GNSS, err(wrong_fix(0.5, 60))), _IN_BOTH),
+    (_fault("antenna moved by 0.1 m", "gnss", "", err(moved_antenna(0.1))), ("all",)),
+    (_fault("antenna moved by 0.3 m", "gnss", _GNSS, err(moved_antenna(0.3))), ("all",)),
     *(
-        (_scaled("visual", f"camera scale by {by} {percent} %", family(percent / 100), _VISUAL if percent > 5 else ""), gate)
-        for (by, family), percent in product(_BY.items(), (5, 10, 15))
-        for gate in [("all",) if by == "slope" or percent == 10 else ()]
-    ),
-    *(
-        (_scaled("wheels", f"wheel scale by {by} {percent} %", family(percent / 100)), ("no visual",) if by != "load" else ())
-        for (by, family), percent in product(_BY.items(), (5, 10))
+        (_fault(f"{of} scale by {by} {percent} %", role, said if percent > 5 else "", scale(role, family(percent / 100))), gate)
+        for (of, role, said, sets), (by, family), percent in product(_SCALED, _BY.items(), (5, 10, 15))
+        for gate in [(sets,) if by == "slope" or percent == 10 else ()]
     ),
     *((_arm(f"arm {m:g} m wrong in height", state_arm(_higher(m)), _ARM if m > 0.2 else ""), ("all",)) for m in (0.15, 0.30, 0.65)),
     *((_arm(f"arm {m:g} m wrong aside, one turn", state_arm(_aside(m)), "", "one turn"), ()) for m in (0.1, 0.5)),
     (_arm("arm 0.1 m wrong aside, two turns", state_arm(_aside(0.1)), "", "two turns"), ("all",)),
     (_arm("arm 0.5 m wrong aside, two turns", state_arm(_aside(0.5)), _ARM, "two turns"), ("all",)),
     *((_arm(f"arm not stated, {route}", remove_antenna_frame, _ARM, route), ("all",)) for route in ("one turn", "two turns")),
-    (_of_power("current offset 0.3 A", lambda amp, _: amp + 0.15), ("all",)),
-    (_of_power("current offset 1 A", lambda amp, _: amp + 0.5, _POWER), ("all",)),
-    (_of_power("regeneration unsigned", lambda amp, _: np.abs(amp), _POWER), ("all",)),
-    (_of_power("current gain +3 % at half-time", lambda amp, after: amp * (1.0 + 0.03 * after)), ("all",)),
-    (_of_power("current gain +10 % at half-time", lambda amp, after: amp * (1.0 + 0.10 * after), _POWER), ("all",)),
-    (_of_role("gnss", "fixes frozen for 10 s", _frozen(10.0), _GNSS), _IN_BOTH),
-    *((_in_ordinary(step_host_clock(seconds)), ("all",)) for seconds in (-3.0, 3.0)),
+    (_fault("current offset 0.3 A", "power", "", _currents(lambda amp, _: amp + 0.15)), ("all",)),
+    (_fault("current offset 1 A", "power", _POWER, _currents(lambda amp, _: amp + 0.5)), ("all",)),
+    (_fault("regeneration unsigned", "power", _POWER, _currents(lambda amp, _: np.abs(amp))), ("all",)),
+    (_fault("current gain +3 % at half-time", "power", "", _currents(lambda amp, after: amp * (1.0 + 0.03 * after))), ("all",)),
+    (_fault("current gain +10 % at half-time", "power", _POWER, _currents(lambda amp, after: amp * (1.0 + 0.10 * after))), ("all",)),
+    (_fault("fixes frozen for 10 s", "gnss", _GNSS, alter("gnss", _frozen(10.0))), _IN_BOTH),
+    *((step_host_clock(seconds), ("all",)) for seconds in (-3.0, 3.0)),
     *(
-        (_of_role("gnss", f"GNSS clock {s:+g} s at half-time", _late_from_half_time(s), _GNSS), ("all",))
+        (_fault(f"GNSS clock {s:+g} s at half-time", "gnss", _GNSS, alter("gnss", _late_from_half_time(s))), ("all",))
         for s in (0.1, 0.3)
     ),
-    (_in_ordinary(Fault("60 s outage", readings=_outage(60.0))), _IN_BOTH),
+    (_fault("60 s outage", "gnss", "", _outage(60.0)), _IN_BOTH),
     *(
-        (_in_ordinary(Fault(f"60 s outage, gyro jumps by {rate:g} rad/s", ("imu",), said=_IMU, readings=_outage(60.0, rate))), gate)
+        (_fault(f"60 s outage, gyro jumps by {rate:g} rad/s", "imu", _IMU, _outage(60.0, rate)), gate)
         for rate, gate in ((0.01, ()), (0.03, _IN_BOTH))
     ),
-    (_of_role("wheels", "wheels 0.13 s late", shift_stamps(0.13), _WHEELS), ("no visual", "GNSS, wheels")),
+    (_fault("wheels 0.13 s late", "wheels", _WHEELS, alter("wheels", shift_stamps(0.13))), ("no visual", "GNSS, wheels")),
     *((_clean(route), ("wheels alone",)) for route in ("plain", "valley")),
 )  # fmt: skip
 """Faults, and the sets of sensors that meet them in the gate."""
@@ -477,16 +458,7 @@ FAULTS: tuple[tuple[Fault, tuple[str, ...]], ...] = (
 
 def honest_cells() -> Iterator[HonestCell]:
     """Yield every cell, the clean ones first; none twice."""
-    for sensors in (
-        "all",
-        "no visual",
-        "no wheels",
-        "no IMU",
-        "GNSS, wheels",
-        "GNSS, visual",
-        "no GNSS",
-        "wheels, IMU",
-    ):
+    for sensors in _CLEAN_SETS:
         yield HonestCell(sensors, _clean("valley"))
     for fault, gate in FAULTS:
         yield from (HonestCell(sensors, fault) for sensors in gate)

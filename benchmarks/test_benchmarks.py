@@ -48,6 +48,9 @@ SMALLEST = {
     "build_dataset": Smallest("{out} 300", rf"floors: .*: {NUMBER} x"),
     "campaign": Smallest("--out {out} --cells ^GNSS,.wheels.10.Hz:.clean --quick", r"w \d.* E \d"),
     "cost_map": Smallest("4 16", rf"{NUMBER} x the bare forward pass", package="torch"),
+    "densities": Smallest(
+        "--seeds 701 --length 60 --only 'white 1.5 cm, no camera'", rf"white 1.5 cm +no camera +{NUMBER}"
+    ),
     "error_budget": Smallest("", rf"averaged, 20 Hz \| {NUMBER} %"),
     "faults": Smallest("kills --only 'a file over another' --times 1", r"together +[1-9]"),
     "few_samples": Smallest(

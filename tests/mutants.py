@@ -47,7 +47,6 @@ ROOMS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
             "tests/unit/stages/test_read_findings.py",
             "tests/unit/stages/test_fuse_findings.py",
             "tests/unit/stages/test_label_quality.py",
-            "tests/unit/stages/test_fuse_mounting.py",
         ),
     ),
     "verify": (("tcpipe/pipeline/verify.py",), ("tests/unit/pipeline/test_trust.py",)),

@@ -289,9 +289,9 @@ def preflight(
 def audit(run: str, *, robot: str | None, recipe: str | None, msgdef: str | None, as_json: bool, quiet: bool) -> int:
     """Judge the uncertainty of LOG, or of RUN (STORE/runs/ID), by measurements that its track does not use.
 
-    tcpipe withholds the fixes in windows of 10, 30 and 60 s, fuses the rest, and prints the error of the predicted antenna, its σ, the
-    share of errors inside 1σ and 2σ, and the error of a straight line through the window. Wheels and camera likewise, by the distance
-    in 1 and 4 s. Without fixes: length of the track over that of each odometry. Writes no files.
+    tcpipe fuses the run without its fixes in windows of 10, 30 and 60 s and prints the error of the predicted antenna, its σ, the share
+    of errors inside 1σ and 2σ, and the error of a straight line. The same for wheels and camera, by the distance in 1 and 4 s.
+    Without fixes: length of the track over that of each odometry.
     """
     from tcpipe.pipeline.audit import audit as judge
 

@@ -19,25 +19,25 @@ class Energy:
     power_std: str
     energy: str
     energy_std: str
-    energy_common_std: str
-    """Part of it that is one error of the run."""
     words: str
     """Description for pages."""
 
 
 ENERGIES: Mapping[str, Energy] = {
-    "total": Energy(
-        "power_watt", "power_std_watt", "energy_joule", "energy_std_joule", "energy_common_std_joule", "total"
-    ),
+    "total": Energy("power_watt", "power_std_watt", "energy_joule", "energy_std_joule", "total"),
     "net": Energy(
         "net_power_watt",
         "net_power_std_watt",
         "net_energy_joule",
         "net_energy_std_joule",
-        "net_energy_common_std_joule",
         "net of idle power",
     ),
 }
+
+
+def name_common_std(column: str) -> str:
+    """Return the name of the part of a standard deviation that is one error of all labels of a run, by that of the whole."""
+    return column.replace("_std_", "_common_std_")
 
 
 def find_energy(name: str) -> Energy:

@@ -13,7 +13,7 @@ import pyarrow as pa
 from numpy.typing import ArrayLike, NDArray
 
 from tcpipe.dataset.batches import Batches, SampleView, StoredPixels
-from tcpipe.dataset.energies import ENERGIES, Energy, find_energy
+from tcpipe.dataset.energies import ENERGIES, Energy, find_energy, name_common_std
 from tcpipe.dataset.tensor import make_tensor_layout
 from tcpipe.errors import DatasetError
 from tcpipe.formats.bucket_directories import fetch_directory_by_range
@@ -131,8 +131,11 @@ class Split:
 
     @cached_property
     def weights(self) -> Floats:
-        """Inverse variance of each label over its mean, float32, shape (N, 2); 0 where the variance is unknown."""
-        std = np.column_stack([self.column(name) for name in (self.energy.power_std, "velocity_std_mps")])
+        """Inverse variance of each label over its mean, float32, shape (N, 2); 0 where the variance is unknown.
+
+        What all labels of a run share is no part of it: no weights average that out.
+        """
+        std = np.column_stack([self.own_std(name) for name in (self.energy.power_std, "velocity_std_mps")])
         return np.column_stack([_compute_inverse_variance_weights(column) for column in std.T]).astype(np.float32)
 
     @cached_property
@@ -143,6 +146,12 @@ class Split:
     def column(self, name: str) -> NDArray[np.generic]:
         """Return a column of samples.parquet, shape (N,)."""
         return self._columns[name][self.view.at]
+
+    def own_std(self, name: str) -> NDArray[np.float64]:
+        """Return the standard deviation ``name`` of each label without the part that all labels of a run share, shape (N,)."""
+        total = self.column(name).astype(np.float64)
+        shared = np.nan_to_num(self.column(name_common_std(name)).astype(np.float64))
+        return np.sqrt(np.maximum(total**2 - shared**2, 0.0))
 
     def layers(self, indices: NDArray[np.int64]) -> dict[str, NDArray[Any]]:
         """Return the stored layers of samples, each of shape (B, px, px): as ``dataset.json`` says of each."""

@@ -2,13 +2,14 @@
 
 `estimate_noise` returns a `NoiseModel`. A filter takes from it, each number in the unit that its name ends with:
 
-- ``fixes[axis].white_m2 / fixes[axis].claimed_m2``: factor on the claimed variance of every fix; the errors that remain are independent.
-- ``fixes[axis].correlated``: a Gauss-Markov error of position, to be a state; of a fix that claims ``claimed_m2``.
+- ``horizontal`` and ``vertical``: of fixes, east and north alike, and up. ``white_m2`` is independent from fix to fix; ``correlated`` is a
+  Gauss-Markov error of position, to be a state of each axis. Both are those of a fix that claims ``claimed_m2``, and in proportion to it.
 - ``odometries[role].velocity_m2ps``: the variance of the distance grows by so much a second of driving; a velocity at f Hz has the
   variance ``velocity_m2ps * f``. Zero while the robot is stationary.
 - ``odometries[role].scale``: Gauss-Markov error of the scale around its mean, [1]; ``shared_scale``: the same for all odometries at once.
 - ``turns[role].white_rad2ps``: the variance of the angle grows by so much a second; ``bias`` and ``scale``: Gauss-Markov errors of the turn
   rate, around their means, in rad/s and [1].
+- ``stamp_s2``: variance of the time stamps of fixes; adds ``stamp_s2 * speed**2`` to the variance of a fix along the course, white.
 - ``slide_m2ps``: the variance of the sideways displacement grows by so much a second of driving.
 
 ``told`` is the share told by the data: 0 is only the prior, 1 only the data. Densities are never evidence against a sensor.
@@ -16,18 +17,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.fusion.measurements import (
-    IMU,
-    Measurements,
-    Positions,
-)
-from tcpipe.fusion.signals import compute_median_period_ns, estimate_white_noise
+from tcpipe.fusion.level_motion import KNOT_S
+from tcpipe.fusion.measurements import IMU, Measurements, Positions
+from tcpipe.fusion.pair_residuals import ACROSS, ALONG, FIX_S, SCALE_S, TURN, TURN_S, UP, Residuals, find_residuals
+from tcpipe.fusion.signals import compute_median_period_ns
+from tcpipe.power.noise import solve_non_negative
 
 Floats = NDArray[np.float64]
 
@@ -115,73 +115,387 @@ class NoiseModel:
     shared_scale: GaussMarkov
     slide_m2ps: float
     slide_told: float = 0.0
+    stamp_s2: float = 0.0
+    stamp_told: float = 0.0
     residuals: tuple[ResidualLevel, ...] = field(default=(), repr=False)
+    densities: Mapping[str, Mapping[str, float]] = field(default_factory=dict, repr=False)
+    """By axis, the fitted densities by the names of `tcpipe.fusion.pair_residuals.Residuals.features`."""
 
 
 @dataclass(frozen=True, slots=True)
 class Prior:
-    """A variance or density with its correlation time; ``times``: the data may show it to be so many times larger or smaller (1σ)."""
+    """A variance or density, with its correlation time, and how many times as large it may well be (1σ)."""
 
     variance: float
     time_s: float = 0.0
-    times: float = 4.0
+    times: float = 1.0
 
 
 PRIORS = {
     # Share of the claimed variance. RTK: 0.8 cm of 1.5 cm (real logs: 0.5 to 3 cm over 5 to 60 s); code phase: atmosphere and orbits.
     "fix, centimetres": Prior(0.3, 15.0),
     "fix, more": Prior(0.8, 60.0),
-    # m²/s: 5 mm after a second, what encoders of 0.03 m/s at 50 Hz give, and the ground.
-    "velocity wheel_odometry": Prior(2.5e-5),
-    "velocity visual_odometry": Prior(4e-5),
+    # m²/s beside the noise that the samples show: 2 mm after a second.
+    "wheel_odometry velocity": Prior(4e-6),
+    "visual_odometry velocity": Prior(4e-6),
     # [1]: slip by load and ground; cameras vary by 5 to 15 % on slopes. Shared: tilt and slip that no pair of odometries shows.
-    "scale wheel_odometry": Prior(0.01**2, 30.0),
-    "scale visual_odometry": Prior(0.03**2, 30.0),
-    "scale shared": Prior(0.007**2, 30.0),
-    "slide": Prior(1e-4),  # m²/s: 1 cm sideways after a second
-    # rad²/s beside the noise that the samples show; floors of MEMS units.
-    "turn imu": Prior(1e-8),
-    "turn wheel_odometry": Prior(1e-5),
-    "turn visual_odometry": Prior(1e-6),
-    # rad²/s²: in-run instability of uncooled MEMS (3 mrad/s in a minute at the worst); of odometries, what their frames turn.
-    "bias imu": Prior(3e-4**2, 100.0),
-    "bias wheel_odometry": Prior(1e-3**2, 100.0),
-    "bias visual_odometry": Prior(3e-4**2, 100.0),
+    "wheel_odometry scale": Prior(0.01**2, 30.0, 4.0),
+    "visual_odometry scale": Prior(0.03**2, 30.0, 4.0),
+    "shared scale": Prior(0.003**2, 30.0),
+    "slide velocity": Prior(1e-4),  # m²/s: 1 cm sideways after a second
+    # rad²: what the alignment leaves of heading and pitch; roll and pitch where no accelerometer measures them.
+    "heading scale": Prior(0.005**2, 30.0),
+    "pitch scale": Prior(0.0015**2, 30.0),
+    "sway": Prior(0.05**2),
+    "rocking": Prior(0.003**2),  # m²: heights of the driving body, white
+    "stamp": Prior(0.003**2),  # s²: time stamps of fixes, which err by as much times the velocity
+    # rad²/s beside the noise that the samples show.
+    "imu turn": Prior(1e-8),
+    "wheel_odometry turn": Prior(1e-5),
+    "visual_odometry turn": Prior(1e-6),
+    # rad²/s²: in-run instability of uncooled MEMS, 0.04 °/s.
+    "imu bias": Prior(7e-4**2, 100.0),
+    "wheel_odometry bias": Prior(1e-3**2, 100.0),
+    "visual_odometry bias": Prior(3e-4**2, 100.0),
     # [1]: wheels skid in turns.
-    "turn scale imu": Prior(1e-3**2, 60.0),
-    "turn scale wheel_odometry": Prior(0.1**2, 60.0),
-    "turn scale visual_odometry": Prior(0.02**2, 60.0),
+    "imu turn scale": Prior(1e-3**2, 100.0),
+    "wheel_odometry turn scale": Prior(0.1**2, 100.0),
+    "visual_odometry turn scale": Prior(0.02**2, 100.0),
 }
 """Variances and densities before the data speak; units in the comments."""
 
+_FLOOR_M, _FLOOR_SHARE = 0.002, 0.0025
+"""Of the white noise of fixes, absolute and of the claimed variance: receivers that filter repeat their errors to 0.1 mm."""
 _CENTIMETRES_M2 = 0.1**2  # fixes that claim less are RTK's
+_SUMMARY_S = np.array([1.0, 2.0, 5.0, 10.0, 20.0, 40.0])  # where one process stands for a sum
+_SUMMARY_TAU_S = np.geomspace(2.0, 100.0, 40)
+_TOLD_S = 10.0  # the share told is that of the change over so long
+_ROUNDS = 16  # of which the first half takes medians
+_GATE = 9.0  # of z², afterwards
+_MEDIAN, _TRUNCATED = 0.4549, 0.9733  # median of χ², and its mean below the gate; one degree
+_LONGEST = 15.0  # a section's length through this: longer windows are too few to tell a variance
+_CAUTION = 0.6  # standard deviations of a fitted process that a filter's process is larger by
+_OVERLAP = 2.0  # other lengths and axes tell the same: the number of windows is divided by this
+_FEWEST = 8  # windows
+_TOLD = 0.5  # less, and the larger of fit and prior holds
+_FIT, _SHORTEST_S = (
+    4.0,
+    20.0,
+)  # windows longer by so much, but not than this, enter the fit: few, but none would tell less
+_MOST_UNCLAIMED = 0.5  # share of fixes without a claim, whose noise stays the recipe's
+_ONE_TIME = 0.6  # share of the claim that may well belong to one correlation time, 1σ
+_MOVING = 0.02  # the same of what errs only while the robot moves
+_UNLIKE = 0.25  # by this share of the total, processes in the plane differ from those of the height
+_LOOSEST = 25.0  # a prior's standard deviation grows by so much at most
+_LEAST_LEVEL = 1e-3  # of the squares, relative to the fitted sum
+_LEAST = 1e-10  # m² or rad²: rounding
 
 
 def estimate_noise(measurements: Measurements) -> NoiseModel:
     """Return the noise of each sensor of a section; what the data do not tell is the prior's."""
-    return make_prior_model(measurements)
+    return fit_noise(measurements, find_residuals(measurements))
+
+
+def fit_noise(measurements: Measurements, residuals: Sequence[Residuals]) -> NoiseModel:
+    """Return the noise of each sensor by the residuals of `find_residuals`: yaw rates first, then the horizontal plane, then heights."""
+    prior = make_prior_model(measurements)
+    if not residuals:
+        return prior
+    section_ns = max(each.end_ns.max() for each in residuals) - min(each.start_ns.min() for each in residuals)
+    longest_s = 1e-9 * float(section_ns) / _LONGEST
+    by_turns, by_heights = (
+        _Fit([each for each in residuals if each.axis == axis], prior, longest_s) for axis in (TURN, UP)
+    )
+    gnss = measurements.gnss
+    claims = gnss is not None and (gnss.unclaimed is None or gnss.unclaimed.mean() < _MOST_UNCLAIMED)
+    prior = replace(
+        prior,
+        turns={role: by_turns.find_turn_noise(role, noise) for role, noise in prior.turns.items()},
+        vertical=by_heights.find_fix_noise("up", prior.vertical) if prior.vertical and claims else prior.vertical,
+    )
+    plane = _Fit([each for each in residuals if each.axis in (ALONG, ACROSS)], prior, longest_s)
+    slide_m2ps, slide_told = plane.find_density("slide velocity", prior.slide_m2ps)
+    stamp_s2, stamp_told = plane.find_density("stamp", prior.stamp_s2)
+    return replace(
+        prior,
+        horizontal=plane.find_fix_noise("fix", prior.horizontal) if prior.horizontal and claims else prior.horizontal,
+        odometries={role: plane.find_odometry_noise(role, noise) for role, noise in prior.odometries.items()},
+        shared_scale=plane.find_process(prior.shared_scale, "shared scale"),
+        slide_m2ps=slide_m2ps,
+        slide_told=slide_told,
+        stamp_s2=stamp_s2,
+        stamp_told=stamp_told,
+        residuals=tuple(level for fit in (by_turns, plane, by_heights) for level in fit.find_levels()),
+        densities={
+            axis: fit.get_densities()
+            for axis, fit in ((TURN, by_turns), (ALONG, plane), (ACROSS, plane), (UP, by_heights))
+        },
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class _Cell:
+    """Residuals of one pair, axis and length, of a robot that moves or is stationary; ``features`` (M, C), ``square`` (M,)."""
+
+    residuals: Residuals
+    is_still: bool
+    features: Floats
+    square: Floats
+    apart_s: float
+    """Between the starts of windows that follow each other."""
+
+    def find_level(self, variances: Floats, *, truncated: bool) -> tuple[Floats, float]:
+        """Return the features relative to the fitted sum, their mean (C,), and the level of the squares in the same measure."""
+        fitted = self.features @ variances + _LEAST
+        z2 = self.square / fitted
+        relative = (self.features / fitted[:, None]).mean(0)
+        inside = z2[z2 < _GATE]
+        if truncated and inside.size:
+            return relative, float(inside.mean()) / _TRUNCATED
+        return relative, float(np.median(z2)) / _MEDIAN
+
+
+class _Fit:
+    """Non-negative densities by name, fitted to residuals: E r² = Σ density × feature, with the weights of that sum."""
+
+    def __init__(self, residuals: Sequence[Residuals], prior: NoiseModel, longest_s: float) -> None:
+        self._names = sorted({name for each in residuals for name in each.features})
+        self._longest_s = longest_s
+        self._cells = [cell for each in residuals for cell in _split_cells(each, self._names)]
+        pairs = np.array([_find_prior(name, prior) for name in self._names]).reshape(-1, 2)
+        self._mean, self._std = pairs.T
+        # The height tells about the plane, so what both tell is measured against the claims.
+        claims = {"up": prior.vertical, "fix": prior.horizontal}
+        self._usual_std = np.array(
+            [
+                fixes.claimed_m2 if (fixes := claims.get(name.split()[0])) else std
+                for name, std in zip(self._names, self._std, strict=True)
+            ]
+        )
+        self._variances, self._covariance = self._mean, np.diag(self._std**2)
+        cells = [
+            cell for cell in self._cells if cell.residuals.time_s <= max(longest_s, min(_FIT * longest_s, _SHORTEST_S))
+        ]
+        for number in range(_ROUNDS if cells else 0):
+            rows, levels = zip(
+                *(cell.find_level(self._variances, truncated=number >= _ROUNDS // 2) for cell in cells), strict=True
+            )
+            counts = self._count_windows(cells)
+            weight = np.sqrt(0.5 * counts)
+            # What is many times the usual is not held back by it: a prior's standard deviation grows with the density.
+            std = np.clip(self._variances, self._std, _LOOSEST * self._std)
+            matrix = np.concatenate((np.array(rows) * weight[:, None], np.diag(1.0 / std)))
+            # The logarithm of a level misfits alike where the sum is too large and where it is too small.
+            # Its mean is below that of the level by 1 / n.
+            logarithm = np.log(np.maximum(levels, _LEAST_LEVEL)) + np.minimum(1.0 / (_OVERLAP * counts), 0.5)
+            target = np.concatenate(((1.0 + logarithm) * weight, self._mean / std))
+            fitted = (
+                solve_non_negative(matrix * std, target) * std
+            )  # in units of the prior, so that rounding does not decide
+            self._variances = 0.5 * (self._variances + fitted)
+            self._covariance = np.linalg.inv(matrix.T @ matrix)
+
+    def _count_windows(self, cells: Sequence[_Cell]) -> Floats:
+        """Return how many windows of each cell are independent.
+
+        Windows of length Δ that begin s apart have the correlation (D(Δ + s) + D(|Δ - s|) - 2 D(s)) / 2 D(Δ), with the structure function
+        D of the fitted sum: overlapping windows of white noise are independent of each other, those of a random walk are not.
+        """
+        levels: dict[tuple[tuple[str, str], str, bool], list[tuple[float, float]]] = {}
+        for cell in cells:
+            key = cell.residuals.pair, cell.residuals.axis, cell.is_still
+            levels.setdefault(key, []).append(
+                (cell.residuals.time_s, float((cell.features @ self._variances).mean()) + _LEAST)
+            )
+        counts = []
+        for cell in cells:
+            time_s, level = np.array(levels[cell.residuals.pair, cell.residuals.axis, cell.is_still]).T
+            length_s = cell.residuals.time_s
+            later_s = cell.apart_s * np.arange(1, 2 * round(length_s / cell.apart_s) + 1)
+            at = [
+                np.interp(each, time_s, level) * (each > 1e-3)
+                for each in (length_s + later_s, np.abs(length_s - later_s), later_s)
+            ]
+            correlation = (at[0] + at[1] - 2.0 * at[2]) / (2.0 * np.interp(length_s, time_s, level))
+            counts.append(cell.square.size / (1.0 + 2.0 * np.square(correlation).sum()) / _OVERLAP)
+        return np.array(counts)
+
+    def _told(self, factors: Floats) -> float:
+        """Return which share the data tell of a sum of the densities, by factors (C,)."""
+        before = float(np.square(factors * self._usual_std).sum())
+        return float(np.clip(1.0 - factors @ self._covariance @ factors / before, 0.0, 1.0)) if before > 0.0 else 0.0
+
+    def get_densities(self) -> dict[str, float]:
+        """Return every density by name."""
+        return dict(zip(self._names, self._variances.tolist(), strict=True))
+
+    def find_density(self, name: str, prior: float) -> tuple[float, float]:
+        """Return a density, and its share told; the larger of fit and prior where the data tell less than half of it."""
+        if name not in self._names:
+            return prior, 0.0
+        row = self._names.index(name)
+        told = self._told(np.eye(len(self._names))[row])
+        fitted = float(self._variances[row])
+        return (fitted if told >= _TOLD else max(fitted, prior)), told
+
+    def find_process(self, prior: GaussMarkov, *names: str) -> GaussMarkov:
+        """Return the Gauss-Markov process that is nearest to the sum of those of these names.
+
+        What the data do not tell, by its share or by the length of the section, is the larger of fit and prior.
+        """
+        parts = self.find_parts(*names)
+        if not parts:
+            return prior
+        factors = np.zeros(len(self._names))
+        for tau, row, _ in parts:
+            factors[row] = -2.0 * np.expm1(-_TOLD_S / tau)
+        told = self._told(factors) * float((self._longest_s >= _SUMMARY_S).mean())
+        shape = np.zeros((_SUMMARY_S.size, len(self._names)))
+        for tau, row, _ in parts:
+            shape[:, row] = GaussMarkov(1.0, tau).difference_variance(_SUMMARY_S)
+        unsure = np.sqrt(np.einsum("ij,jk,ik->i", shape, self._covariance, shape))
+        fitted = shape @ self._variances + _CAUTION * unsure
+        untold = (self._longest_s < _SUMMARY_S) | (told < _TOLD)
+        return _summarize(np.where(untold, np.maximum(fitted, prior.difference_variance(_SUMMARY_S)), fitted), told)
+
+    def find_parts(self, *names: str) -> list[tuple[float, int, float]]:
+        """Return correlation time [s], row and variance of each process of these names."""
+        rows = [row for row, each in enumerate(self._names) if each.rpartition(" ")[0] in names]
+        return [(float(self._names[row].rpartition(" ")[2]), row, float(self._variances[row])) for row in rows]
+
+    def find_fix_noise(self, name: str, prior: FixNoise) -> FixNoise:
+        """Return the noise of fixes along an axis."""
+        names = (f"{name} process", f"{name} moving")
+        correlated = self.find_process(prior.correlated, *names)
+        processes = tuple(GaussMarkov(variance, tau) for tau, _, variance in sorted(self.find_parts(*names)))
+        white, told = self.find_density(f"{name} white", prior.white_m2)
+        white = max(white, _FLOOR_M**2, _FLOOR_SHARE * prior.claimed_m2)
+        return FixNoise(prior.claimed_m2, white, correlated, processes or prior.processes, told)
+
+    def find_odometry_noise(self, role: str, prior: OdometryNoise) -> OdometryNoise:
+        """Return the noise of an odometry's velocity."""
+        density, told = self.find_density(f"{role} velocity", prior.velocity_m2ps)
+        return OdometryNoise(density, self.find_process(prior.scale, f"{role} scale"), told)
+
+    def find_turn_noise(self, role: str, prior: TurnNoise) -> TurnNoise:
+        """Return the noise of a yaw rate."""
+        density, told = self.find_density(f"{role} turn", prior.white_rad2ps)
+        bias, scale = (
+            self.find_process(getattr(prior, name.split()[-1]), f"{role} {name}") for name in ("bias", "turn scale")
+        )
+        return TurnNoise(density, bias, scale, told)
+
+    def find_levels(self) -> Iterator[ResidualLevel]:
+        """Yield measured and fitted size of the residuals of each cell."""
+        for cell, count in zip(self._cells, self._count_windows(self._cells), strict=True):
+            _, level = cell.find_level(self._variances, truncated=True)
+            fitted = float(np.sqrt((cell.features @ self._variances + _LEAST).mean()))
+            z = 0.5 * np.log(max(level, 1e-9)) * np.sqrt(2.0 * count)
+            each = cell.residuals
+            yield ResidualLevel(
+                each.pair, each.axis, each.time_s, cell.is_still, cell.square.size, fitted * np.sqrt(level), fitted, float(z)
+            )  # fmt: skip
+
+
+def _split_cells(each: Residuals, names: Sequence[str]) -> Iterator[_Cell]:
+    """Yield the residuals of the moving and of the stationary robot, without exact zeros: a value that was repeated says nothing."""
+    features = np.stack([each.features.get(name, np.zeros(each.value.size)) for name in names], -1)
+    for is_still in (False, True):
+        if is_still:  # what little the robot moves then must not explain them
+            features = features * np.array([" scale" not in name and not name.startswith("sway") for name in names])
+        rows = np.flatnonzero((each.is_still == is_still) & np.isfinite(each.value) & (each.value != 0.0))
+        if rows.size < _FEWEST:
+            continue
+        apart_s = float(np.median(np.diff(each.start_ns[rows]))) * 1e-9
+        yield _Cell(each, is_still, features[rows], np.square(each.value[rows]), apart_s)
+
+
+def _find_prior(name: str, prior: NoiseModel) -> tuple[float, float]:
+    """Return mean and standard deviation of a density before the data speak."""
+    kind, _, last = name.rpartition(" ")
+    if name.startswith(("fix ", "up ")) and prior.horizontal is not None and prior.vertical is not None:
+        return _find_fix_prior(name, prior.horizontal, prior.vertical)
+    if last == "turn" or (last == "velocity" and kind in prior.odometries):
+        density = prior.turns[kind].white_rad2ps if last == "turn" else prior.odometries[kind].velocity_m2ps
+        return density, PRIORS[name].times * density
+    if name in PRIORS or kind == "sway":
+        known = PRIORS[name if name in PRIORS else kind]
+        return known.variance, known.times * known.variance
+    process = _make_process(kind)
+    if kind == "heading scale":
+        process = replace(process, variance=_find_heading_variance(prior))
+    taus = TURN_S if kind.endswith((" bias", " turn scale")) else SCALE_S
+    return _share_process(process, float(last), taus), PRIORS[kind].times * process.variance
+
+
+def _find_fix_prior(name: str, horizontal: FixNoise, vertical: FixNoise) -> tuple[float, float]:
+    """Return the same for fixes; in the plane it is what the heights show, as far as they tell, by the ratio of claims.
+
+    Heights are compared with a track whose pitch hardly errs, while an odometry's scale hides slow errors of fixes in the plane.
+    """
+    axis, kind, time_s = (*name.split(), "")[:3]
+    fixes = vertical if axis == "up" else horizontal
+    if kind == "white":
+        return fixes.white_m2, fixes.claimed_m2
+    if kind == "moving":
+        return 0.0, _MOVING * fixes.claimed_m2
+    usual, usual_std = _share_process(fixes.correlated, float(time_s), FIX_S), _ONE_TIME * fixes.claimed_m2
+    told = vertical.correlated.told
+    if axis == "up" or told <= 0.0:
+        return usual, usual_std
+    ratio = horizontal.claimed_m2 / vertical.claimed_m2
+    alike = ratio * sum(each.variance for each in vertical.processes if each.time_s == float(time_s))
+    total = max(ratio * sum(each.variance for each in vertical.processes), horizontal.correlated.variance)
+    return told * alike + (1.0 - told) * usual, told * _UNLIKE * total + (1.01 - told) * usual_std
+
+
+def _find_heading_variance(prior: NoiseModel) -> float:
+    """Return the variance of the heading [rad²] that is left between the knots of the alignment: of a Brownian bridge."""
+    best = next(iter(prior.turns.values()))
+    return KNOT_S / 6.0 * best.white_rad2ps + KNOT_S**2 / 100.0 * best.bias.variance
+
+
+def _share_process(process: GaussMarkov, tau_s: float, taus_s: Sequence[float]) -> float:
+    """Return the part of a process's variance that belongs to one of several correlation times: linear in their logarithm."""
+    place = np.interp(np.log(process.time_s), np.log(taus_s), np.arange(len(taus_s)))
+    return float(process.variance * max(0.0, 1.0 - abs(place - taus_s.index(tau_s))))
+
+
+def _summarize(structure: Floats, told: float) -> GaussMarkov:
+    """Return the process whose structure function is nearest to one at `_SUMMARY_S`, in the logarithm."""
+    if not (structure > 0.0).all():
+        return GaussMarkov(0.0, _TOLD_S, told)
+    shape = -2.0 * np.expm1(-_SUMMARY_S / _SUMMARY_TAU_S[:, None])
+    ratio = np.log(structure / shape)
+    best = int(np.argmin(ratio.std(1)))
+    return GaussMarkov(float(np.exp(ratio[best].mean())), float(_SUMMARY_TAU_S[best]), told)
 
 
 def make_prior_model(measurements: Measurements) -> NoiseModel:
     """Return the noise by priors and claims alone."""
-    gnss, roles = measurements.gnss, list(measurements.odometries())
+    gnss = measurements.gnss
     turning = [role for role, source in measurements.odometries().items() if np.isfinite(source.yaw_rate_radps).any()]
     return NoiseModel(
         horizontal=None if gnss is None else _make_fix_prior(gnss, slice(0, 2)),
         vertical=None if gnss is None else _make_fix_prior(gnss, slice(2, 3)),
         odometries={
-            role: OdometryNoise(PRIORS[f"velocity {role}"].variance, _make_process(f"scale {role}")) for role in roles
+            role: OdometryNoise(
+                _compute_density(each.stamp_ns, each.velocity_mps[:, 0]) + PRIORS[f"{role} velocity"].variance,
+                _make_process(f"{role} scale"),
+            )
+            for role, each in measurements.odometries().items()
         },
         turns={
             role: TurnNoise(
                 _estimate_turn_density(measurements, role),
-                _make_process(f"bias {role}"),
-                _make_process(f"turn scale {role}"),
+                _make_process(f"{role} bias"),
+                _make_process(f"{role} turn scale"),
             )
             for role in (*([IMU] if measurements.imu is not None else []), *turning)
         },
-        shared_scale=_make_process("scale shared"),
-        slide_m2ps=PRIORS["slide"].variance,
+        shared_scale=_make_process("shared scale"),
+        slide_m2ps=PRIORS["slide velocity"].variance,
+        stamp_s2=0.0 if gnss is None else PRIORS["stamp"].variance,
     )
 
 
@@ -204,10 +518,14 @@ def _estimate_turn_density(measurements: Measurements, role: str) -> float:
     else:
         source = measurements.odometries()[role]
         shown = _compute_density(source.stamp_ns, source.yaw_rate_radps)
-    return shown + PRIORS[f"turn {role}"].variance
+    return shown + PRIORS[f"{role} turn"].variance
 
 
 def _compute_density(stamp_ns: NDArray[np.int64], values: Floats) -> float:
+    """Return the density of white noise [u² s] by the median of the second differences that are not zero."""
     finite = np.isfinite(values)
-    stamp_ns, values = stamp_ns[finite], values[finite]
-    return estimate_white_noise(values[:, None]) ** 2 * compute_median_period_ns(stamp_ns) * 1e-9
+    second = np.abs(np.diff(values[finite], n=2))
+    second = second[second > 0.0]
+    if second.size < _FEWEST:
+        return 0.0
+    return float(np.median(second)) ** 2 / _MEDIAN / 6.0 * compute_median_period_ns(stamp_ns[finite]) * 1e-9

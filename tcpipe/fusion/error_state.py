@@ -1,355 +1,493 @@
-"""The default estimator: error-state unscented filter forward, unscented smoother backward (equations: the kernels).
+"""The default estimator: an error-state unscented filter on SE(3), and its smoother (`filter_kernel`: equations).
 
-Memory is bounded: the forward pass keeps a checkpoint per block of events; on the way back each block is filtered once more, this time
-with everything kept, and smoothed. The second pass repeats the arithmetic of the first exactly, gates included.
-
-Gates recover. A sensor that has been refused many times in a row and for a long time (GNSS 15 s, 5 s without visual odometry or IMU;
-odometry 5 s, 0.3 s where nothing else tells velocity) is taken to be right and the filter wrong: the covariance is lifted by the
-innovation before that update, which the smoother sees as process noise. Until then a multipath jump or a slipping wheel costs nothing but
-listed refusals. Fixes that contradict the rest while it carries the pose are not followed: in a second round an error of theirs is part of
-the state, where both ends tell that they have one (`gnss_faults`). Where fixes scatter far less than they claim, the rest of their error
-lasts (`find_fix_errors`): it is no noise that averages out.
-
-`error_state_pass` runs the kernels over a section. The kernels: `state_kernel` (state, errors and sigma points, prediction),
-`error_state_kernel` (updates, events and gates) and `smoother_kernel`.
+Memory is bounded: the forward pass keeps a checkpoint for each block of ticks; on the way back each block is filtered once more, this
+time with everything kept, and smoothed. The second pass repeats the arithmetic of the first exactly, gates included.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.errors import FusionError
-from tcpipe.fusion import state_kernel as kernel
-from tcpipe.fusion.error_state_pass import DOF, ROLES, FilterPass, compute_lag_rows
-from tcpipe.fusion.gnss_faults import (
-    FaultHypothesis,
-    FixErrors,
-    GnssFaults,
-    Spans,
-    find_fix_errors,
-    find_returned_fixes,
-    find_wrong_fixes,
-    is_inside,
+from tcpipe.fusion import state
+from tcpipe.fusion.densities import estimate_noise
+from tcpipe.fusion.filter_kernel import (
+    EVERY,
+    REJECTED,
+    RESET,
+    SELDOM,
+    Adjoint,
+    Memory,
+    Model,
+    Smoothed,
+    Tests,
+    allocate_steps,
+    filter_ticks,
+    smooth_ticks,
 )
+from tcpipe.fusion.hypotheses import POSSIBLE, Hypothesis, compute_weights, explain, find_suspects
 from tcpipe.fusion.initial import compute_course, find_stationary_intervals
-from tcpipe.fusion.measurements import GNSS, InitialState, Measurements, select_measurements
-from tcpipe.fusion.process import GROUND, UNSEEN_TURN_RADPS, VISUAL_SCALE_STD, WHEEL_SCALE_STD
-from tcpipe.fusion.signals import compute_median_period_ns
-from tcpipe.fusion.timeline import EventTimeline, build_timeline
+from tcpipe.fusion.measurements import DOPPLER, GNSS, IMU, VISUAL, WHEELS, InitialState, Measurements
+from tcpipe.fusion.parameters import PARAMETERS, expand_start, make_model, make_priors, make_start
+from tcpipe.fusion.process import (
+    GROUND,
+    SLOPE_RAD,
+    UNSEEN_TURN_RADPS,
+    VISUAL_SCALE_STD,
+    WHEEL_SCALE_STD,
+    estimate_slope_std_rad,
+    is_gliding,
+    is_turned_by_course,
+)
+from tcpipe.fusion.ticks import Ticks, build_ticks
 from tcpipe.fusion.trajectory import DISPLACEMENT_LAGS_S, Rejections, Trajectory
 from tcpipe.geometry.rotation import matrix_from_quat, quat_from_matrix, quat_from_rpy
-from tcpipe.tables.facts import GateReset, StretchFacts, make_vector
+from tcpipe.tables.facts import ChangeFacts, GateReset, ParameterFacts, StretchFacts, make_vector
 from tcpipe.tables.findings import Subject, make_finding
 
-_MANY_FIXES = 50  # fewest fixes for an average
-_LEVELLING_NS = 60_000_000_000  # first pass for roll and pitch without IMU
-_ODOMETRY_HOLDS_M = 0.1  # odometry drift in `_LASTS_S`
-_LASTS_S = 30.0  # spacing of fixes whose metre-size error lasts
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+ROLES = {state.WHEELS: WHEELS, state.VISUAL: VISUAL, state.DOPPLER: DOPPLER, state.FIX: GNSS}
+_BLOCK = 1024
+_LEVELLING_S = 60.0
+"""The start is filtered twice over this time: attitude and yaw at its end are those of the beginning, smoothed."""
+_ANY_YAW_STD_RAD = np.pi / np.sqrt(3.0)
+_MANY_FIXES = 50
+_UNCHANGED = Hypothesis((), 0.0)
 
 
-def run_error_state(
-    measurements: Measurements,
-    initial: InitialState,
-    *,
-    output_ns: NDArray[np.int64],
-    gate_probability: float = 0.999,
-    smooth: bool = True,
-) -> Trajectory:
-    """Filter one section and, unless ``smooth`` is False, smooth it; return the states of base_link in ENU at ``output_ns``.
+@dataclass(slots=True)
+class Pass:
+    """One forward pass over a section: its model, checkpoints, tests, and filtered states by tick."""
+
+    ticks: Ticks
+    model: Model
+    checkpoints: list[Memory]
+    tests: Tests
+    states: Floats
+    last: Memory
+
+
+def make_tests(size: int) -> Tests:
+    """Return tests to be filled."""
+    shape = size, state.KINDS
+    return Tests(np.full(shape, np.nan), np.full(shape, np.nan), np.zeros(shape, np.int8), np.full((size, 3), np.nan))
+
+
+def list_blocks(size: int) -> list[tuple[int, int]]:
+    """Return first and last tick, the latter excluded, of each block."""
+    return list(pairwise([*range(0, size, _BLOCK), size]))
+
+
+def filter_section(ticks: Ticks, model: Model, start: Memory, *, begin: int = 0, until: int | None = None) -> Pass:
+    """Return the forward pass from a start, over all ticks or those from ``begin``, where a block begins, to before ``until``."""
+    size = min(until or ticks.stamp_ns.size, ticks.stamp_ns.size)
+    made = Pass(ticks, model, [], make_tests(size), np.zeros((size, state.NX)), start.copy())
+    empty = allocate_steps(0, model.active.size)
+    for first, last in list_blocks(size):
+        if first < begin:
+            continue
+        made.checkpoints.append(made.last.copy())
+        filter_ticks(first, last, ticks.inputs, model, made.last, False, empty, made.tests, made.states)
+    return made
+
+
+def smooth_section(made: Pass) -> Smoothed:
+    """Return the smoothed estimate of a forward pass."""
+    size, n = made.states.shape[0], made.model.active.size
+    lags = np.array([round(lag_s / made.ticks.inputs.period_s) for lag_s in DISPLACEMENT_LAGS_S])
+    ahead = int(lags.max()) // EVERY + 1
+    adjoint = Adjoint(
+        np.zeros((n, n)), np.zeros((1 + 2 * ahead, n)), np.full(ahead, -1, np.int64), np.zeros((ahead, 5))
+    )
+    out = Smoothed(
+        np.zeros_like(made.states),
+        np.zeros((size, 5)),
+        np.full((size, lags.size), np.nan),
+        np.zeros((-(-size // SELDOM), n)),
+    )
+    steps, again, filtered = allocate_steps(min(size, _BLOCK), n), make_tests(size), np.zeros_like(made.states)
+    for (first, last), memory in zip(reversed(list_blocks(size)), reversed(made.checkpoints), strict=True):
+        steps.used[:] = False
+        filter_ticks(first, last, made.ticks.inputs, made.model, memory.copy(), True, steps, again, filtered)
+        smooth_ticks(first, last, made.ticks.inputs, made.model, steps, filtered, lags, adjoint, out)
+    return out
+
+
+def run_error_state(m: Measurements, initial: InitialState, *, output_ns: Ints, gate_probability: float = 0.999) -> Trajectory:  # fmt: skip
+    """Filter and smooth one section; return the states of base_link in ENU at ``output_ns``.
 
     Parameters
     ----------
-    measurements : at least one of GNSS, wheels and visual odometry.
+    m : at least one of GNSS, wheels and visual odometry.
     initial : state at the first measurement.
-    output_ns : [ns], shape (N,), increasing.
+    output_ns : [ns], shape (N,), increasing multiples of the track's period.
     gate_probability : a measurement less likely than 1 minus this is rejected.
 
     Raises
     ------
     FusionError : the estimate is not finite.
     """
-    if measurements.imu is None and output_ns.size:
-        initial = _level_start(measurements, initial, output_ns, gate_probability)
-    standing = find_stationary_intervals(measurements)
-    errors = find_fix_errors(measurements)
-    case = _FilterSection(measurements, initial, output_ns, gate_probability, None)
-    if errors is not None and errors.matters:
-        case = replace(case, errors=errors)
-    timeline = case.timeline(standing, errors)
-    run, outputs = case.passed(timeline, keep=smooth)
-    wrong = None
-    if errors is not None and run.fixes_contradict():  # again, with an error of theirs where both ends tell of one
-        del run, outputs, timeline  # each takes room as the log is long
-        case = replace(case, errors=errors)
-        timeline = case.timeline(standing, errors)
-        wrong = _find_gnss_faults(case, timeline)
-        run, outputs = case.passed(timeline, () if wrong is None else wrong.spans, keep=smooth)
-    elif not run.carried:
-        wrong = find_returned_fixes(run.jumps())
-    if smooth:
-        run.smooth(outputs)
-    if errors is not None and case.errors is None:
-        run.lasting_m2 = _interpolate_fix_error(errors, measurements, output_ns)
-    if wrong is not None:
-        run.wrong = _as_reopenings(wrong, outputs, output_ns)
-        run.lasting_m2 = run.lasting_m2 + wrong.doubt_m2(output_ns)
-    run.unseen_scale_std = _compute_unseen_scale_std(run, measurements)
-    if not np.isfinite(outputs).all():
-        raise FusionError(
-            "the estimate is not finite", findings=[make_finding("estimate-not-finite", Subject("run", ""))]
-        )
-    return make_trajectory(run.timeline, outputs, run, output_ns)
+    noise, standing = estimate_noise(m), find_stationary_intervals(m)
+    ticks = build_ticks(m, noise, standing, _find_start_ns(m, output_ns), int(output_ns[-1]), output_ns=output_ns)
+    std, walk = make_priors(m, noise, ticks)
+    section = _Section(m, ticks, std, walk, gate_probability)
+    start = make_start(initial, section.model(), std, (0.0, 0.0, 0.0) if m.gnss is None else m.gnss.lever_arm_m)
+    first_minute = filter_section(ticks, section.model(), start, until=round(_LEVELLING_S / ticks.inputs.period_s))
+    start.x[:9] = smooth_section(first_minute).states[0, :9]
+    made = filter_section(ticks, section.model(), start)
+    hypotheses = section.explain(made, start)
+    if hypotheses:
+        made = section.filter(start, hypotheses[0])
+    smoothed = smooth_section(made)
+    if len(hypotheses) > 1:
+        rivals = [smooth_section(section.filter(start, each)) for each in hypotheses[1:]]
+        widen(smoothed, rivals, compute_weights(hypotheses), made.ticks.inputs.period_s)
+    if not np.isfinite(smoothed.states).all():
+        finding = make_finding("estimate-not-finite", Subject("run", ""))
+        raise FusionError("the estimate is not finite", findings=[finding])
+    return _make_trajectory(m, made, smoothed, std, output_ns, hypotheses[:1])
 
 
 @dataclass(frozen=True, slots=True)
-class _FilterSection:
-    """A section that is filtered, more than once where its fixes contradict the rest; with ``errors`` that of the fixes is in the state."""
+class _Section:
+    """A section that is filtered under several hypotheses."""
 
     measurements: Measurements
-    initial: InitialState
-    output_ns: NDArray[np.int64]
+    ticks: Ticks
+    std: Floats
+    walk: Floats
     gate_probability: float
-    errors: FixErrors | None
 
-    def timeline(self, standing: NDArray[np.int64], errors: FixErrors | None) -> EventTimeline:
-        """Return the events, fixes with the variance that counts from one to the next."""
-        heard = _inflate_correlated_fixes(self.measurements, errors, doubted=self.errors is not None)
-        return build_timeline(heard, standing, self.output_ns)
+    def model(self, changes: Hypothesis = _UNCHANGED, *, judges: bool = False) -> Model:
+        """Return the model under a hypothesis; one that ``judges`` holds all errors that another could change, and follows no fix."""
+        return make_model(
+            self.measurements,
+            self.std,
+            self.walk,
+            changes.events,
+            period_s=self.ticks.inputs.period_s,
+            gate_probability=self.gate_probability,
+            follows=not judges,
+            ignored=changes.ignored,
+            possible=POSSIBLE if judges else (),
+        )
 
-    def passed(
-        self, timeline: EventTimeline, spans: Spans = (), *, follows: bool = True, keep: bool = False
-    ) -> tuple[FilterPass, NDArray[np.float64]]:
-        """Return the forward pass in which the error of the fixes is free in ``spans``, and its states at the wanted stamps."""
-        run = self.prepared(timeline, spans, follows=follows)
-        return run, run.filtered(self.initial, keep=keep)
+    def filter(self, start: Memory, hypothesis: Hypothesis) -> Pass:
+        """Return the forward pass under a hypothesis."""
+        model = self.model(hypothesis)
+        return filter_section(self.ticks, model, expand_start(start, self.model(), model))
 
-    def prepared(self, timeline: EventTimeline, spans: Spans, *, follows: bool) -> FilterPass:
-        """Return the pass before it is made."""
-        run = FilterPass(timeline, self.measurements, self.gate_probability, lags=compute_lag_rows(self.output_ns))
-        if self.errors is not None:
-            run.doubt_fixes(self.errors, spans, follows=follows)
-        return run
+    def explain(self, made: Pass, start: Memory) -> list[Hypothesis]:
+        """Return the hypotheses that explain where sensors contradict each other, the best first; none where they do not."""
+        if not find_suspects(made.tests, self.ticks.inputs.period_s):
+            return []
+        model = self.model(judges=True)
+        plain = filter_section(self.ticks, model, expand_start(start, self.model(), model))
 
+        def run(changed: Hypothesis, first: int, last: int) -> Pass:
+            block = first // _BLOCK
+            begin = plain.checkpoints[block]
+            return filter_section(self.ticks, self.model(changed, judges=True), begin, begin=block * _BLOCK, until=last)
 
-def _find_gnss_faults(case: _FilterSection, timeline: EventTimeline) -> GnssFaults | None:
-    """Return when the fixes erred together, where that explains what contradicts them."""
-    follower, _ = case.passed(timeline)
-    known = tuple((r.start_ns, r.end_ns) for r in find_gate_resets(timeline, follower) if r.role == GNSS)
-    del follower
-    plain, _ = case.passed(timeline, follows=False)
-    usual = plain.usual()
-
-    def tried(spans: Spans) -> FaultHypothesis:
-        run = case.prepared(timeline, spans, follows=False) if spans else plain
-        if spans:
-            run.filtered_like(plain, case.initial)
-        return run.explained(spans, usual)
-
-    return find_wrong_fixes(tried, (int(timeline.stamp_ns[0]), int(timeline.stamp_ns[-1])), known)
+        return explain(plain, run, frozenset(model.active.tolist()))
 
 
-def _as_reopenings(
-    wrong: GnssFaults, outputs: NDArray[np.float64], output_ns: NDArray[np.int64]
-) -> tuple[GateReset, ...]:
-    """Return the spans in which the fixes were wrong, with their error; then those that are undecided."""
-    off_m = np.linalg.norm(outputs[:, kernel.SAVED - 3 : kernel.SAVED - 1], axis=1)
-    found = []
-    for span in wrong.spans:
-        within = off_m[is_inside(output_ns, (span,))]
-        found.append(GateReset(GNSS, *span, float(within.max()) if within.size else wrong.size_m))
-    return (*found, *(GateReset(GNSS, *span, wrong.size_m) for span in wrong.doubtful))
+def widen(best: Smoothed, rivals: Sequence[Smoothed], weights: Floats, period_s: float) -> None:
+    """Mix the variances of estimates under several hypotheses about the best one: Σ w (P + d d')."""
+    best.variances[:] *= weights[0]
+    best.links[:] *= weights[0]
+    lags = [round(lag_s / period_s) for lag_s in DISPLACEMENT_LAGS_S]
+    for other, weight in zip(rivals, weights[1:], strict=True):
+        apart = np.column_stack(
+            (
+                other.states[:, 9:12] - best.states[:, 9:12],
+                _compute_yaw(other.states) - _compute_yaw(best.states),
+                other.states[:, state.U + 6] - best.states[:, state.U + 6],
+            )
+        )
+        apart[:, 3] = (apart[:, 3] + np.pi) % (2.0 * np.pi) - np.pi
+        best.variances[:] += weight * (other.variances + apart**2)
+        for column, lag in enumerate(lags):
+            length = [np.hypot(*(x[lag:, 9:11] - x[:-lag, 9:11]).T) for x in (other.states, best.states)]
+            best.links[:-lag, column] += weight * (other.links[:-lag, column] + (length[0] - length[1]) ** 2)
 
 
-def _inflate_correlated_fixes(measurements: Measurements, errors: FixErrors | None, *, doubted: bool) -> Measurements:
-    """Return the measurements with the variance of fixes that counts from one to the next: the claim, where nothing else holds the rest."""
-    if errors is None or measurements.gnss is None:
-        return measurements
-    gnss = measurements.gnss
-    variance = errors.white_m2 if doubted else np.maximum(errors.white_m2, gnss.variance_m2)
-    if gnss.unclaimed is not None:
-        variance = np.where(gnss.unclaimed[:, None], errors.white_m2, variance)
-    if errors.of_metres:  # odometry knows better for half a minute: so often they count
-        together = max(1.0, _LASTS_S * 1e9 / compute_median_period_ns(gnss.stamp_ns))
-        lasting_m2 = np.median(errors.lasting_m2[:, 0])
-        variance = np.maximum(variance, errors.lasting_m2) * min(together, lasting_m2 / _ODOMETRY_HOLDS_M**2)
-    return replace(measurements, gnss=replace(measurements.gnss, variance_m2=variance))
+def _compute_yaw(states: Floats) -> Floats:
+    return np.arctan2(states[:, 3], states[:, 0])
 
 
-def _interpolate_fix_error(
-    errors: FixErrors, measurements: Measurements, output_ns: NDArray[np.int64]
-) -> NDArray[np.float64]:
-    """Return what lasts of the fixes' errors at each wanted stamp [m²], shape (N, 3)."""
-    if measurements.gnss is None:
-        return np.zeros((output_ns.size, 3))
-    nearest = np.searchsorted(measurements.gnss.stamp_ns, output_ns).clip(0, measurements.gnss.stamp_ns.size - 1)
-    return np.asarray(errors.lasting_m2[nearest])
+def _find_start_ns(m: Measurements, output_ns: Ints) -> int:
+    moving = [int(sensor.stamp_ns[0]) for role, sensor in m.sensors().items() if role != "imu"]
+    return min(*moving, int(output_ns[0])) if moving else int(output_ns[0])
 
 
-def _level_start(
-    measurements: Measurements, initial: InitialState, output_ns: NDArray[np.int64], gate_probability: float
-) -> InitialState:
-    """Return the start with the attitude that its first minute, smoothed, says it had: without an IMU it starts level, on any slope."""
-    output_ns = output_ns[output_ns < output_ns[0] + _LEVELLING_NS]
-    first = select_measurements(measurements, np.iinfo(np.int64).min, int(output_ns[-1]))
-    timeline = build_timeline(first, find_stationary_intervals(first), output_ns)
-    outputs = FilterPass(timeline, first, gate_probability, lags=compute_lag_rows(output_ns)).smoothed(initial)
-    if not np.isfinite(outputs[0]).all():
-        return initial
-    return replace(initial, quat_xyzw=quat_from_matrix(outputs[0, 0:9].reshape(3, 3)))
+def _make_trajectory(  # noqa: PLR0917
+    m: Measurements, made: Pass, smoothed: Smoothed, std: Floats, output_ns: Ints, explained: Sequence[Hypothesis]
+) -> Trajectory:
+    """Return the trajectory at the wanted stamps [ns], with what no state of the filter can know in its deviations."""
+    ticks = made.ticks
+    at = np.searchsorted(ticks.stamp_ns, output_ns)
+    x, variances = smoothed.states[at], smoothed.variances[at]
+    rotation, velocity, rate = _make_motion(x, ticks, at)
+    position, yaw_variance = x[:, 9:12].copy(), variances[:, 3]
+    position_variance, speed_variance = variances[:, :3].copy(), variances[:, 4].copy()
+    speed = np.linalg.norm(velocity, axis=1)
+    links = _interpolate_links(smoothed, at, output_ns)
+    antenna = np.zeros(3) if m.gnss is None else np.asarray(m.gnss.lever_arm_m)
+    slope_std = estimate_slope_std_rad(m) or SLOPE_RAD
+    if is_gliding(m):  # level, and along the course
+        yaw = compute_course(velocity)
+        rotation = matrix_from_quat(quat_from_rpy(0.0, 0.0, yaw))
+        rate = np.zeros((yaw.size, 3))
+        rate[:, 2] = np.gradient(yaw, (output_ns - output_ns[0]) * 1e-9) if yaw.size > 1 else 0.0
+        position -= rotation @ antenna
+        position_variance[:, :2] += (slope_std * antenna[2]) ** 2
+        speed_variance = speed_variance + (UNSEEN_TURN_RADPS * antenna[2]) ** 2
+        sway = np.minimum(GROUND * speed[:, None] * DISPLACEMENT_LAGS_S, 2 * slope_std**2) * antenna[2] ** 2
+        links = links + sway
+    elif is_turned_by_course(m):
+        # The course takes a sway of the antenna for a turn: nothing tells one from the other, and roll is taken to be none.
+        position_variance[:, :2] += (slope_std * antenna[2] * rotation[:, :2, 1]) ** 2
+    if m.gnss is not None and not std[state.ARM]:
+        turned = np.unwrap(np.arctan2(rotation[:, 1, 0], rotation[:, 0, 0]))
+        variance, moved = _compute_arm_variance(m, rotation, turned, made)
+        position_variance += variance
+        links = links + moved
+    if m.imu is None and not m.odometries():
+        # From positions alone forward and reverse look the same: yaw may be anything, and so the place below the antenna.
+        beside = rotation @ antenna
+        aside, above = np.sum(beside[:, :2] ** 2, axis=1), 2 * (rotation[:, 2, :2] @ antenna[:2]) ** 2
+        position_variance += np.column_stack((aside, aside, above))
+        yaw_variance = yaw_variance + _ANY_YAW_STD_RAD**2
+        speed_variance = speed_variance + 1.5 * speed**2
+    scale_std = _compute_unseen_scale_std(m, made)
+    if m.gnss is None:
+        position_variance += (scale_std * (position - position[0])) ** 2
+    links = links + (scale_std * speed[:, None] * DISPLACEMENT_LAGS_S) ** 2
+    return Trajectory(
+        stamp_ns=output_ns,
+        position_enu_m=position,
+        quat_xyzw=quat_from_matrix(rotation),
+        velocity_enu_mps=velocity,
+        angular_velocity_radps=rate,
+        position_std_m=np.sqrt(position_variance),
+        yaw_std_rad=np.sqrt(yaw_variance),
+        forward_velocity_std_mps=np.sqrt(speed_variance + (scale_std * speed) ** 2),
+        rejections=_make_rejections(m, made),
+        displacement_std_m=np.sqrt(links),
+        facts=_make_facts(m, made, smoothed, std, scale_std, explained),
+        corrected=_correct_measurements(m, made, smoothed, explained),
+    )
 
 
-def _compute_unseen_scale_std(run: FilterPass, measurements: Measurements) -> float:
+def _make_motion(x: Floats, ticks: Ticks, at: Ints) -> tuple[Floats, Floats, Floats]:
+    """Return attitude of the robot, shape (N, 3, 3), velocity in ENU [m/s] and angular velocity in its axes [rad/s], shapes (N, 3)."""
+    imu = x[:, :9].reshape(-1, 3, 3)
+    mount = x[:, state.MOUNT + 6 : state.MOUNT + 9]
+    rotation = imu + imu @ _make_skew(mount)
+    rotation = matrix_from_quat(quat_from_matrix(rotation)) if mount.any() else imu
+    velocity = np.einsum("nij,nj->ni", imu, x[:, state.U + 6 : state.U + 9])
+    gyro = ticks.inputs.has_gyro[at, None]
+    bias, scale = x[:, state.GYRO_BIAS + 6 : state.GYRO_BIAS + 9], x[:, state.TURN_SCALE + 6, None]
+    rate = np.where(gyro, ticks.inputs.rate[at] - bias, ticks.inputs.rate[at] * (1.0 - scale))
+    return rotation, velocity, rate - np.cross(mount, rate)
+
+
+def _make_skew(v: Floats) -> Floats:
+    zero = np.zeros(v.shape[0])
+    rows = ((zero, -v[:, 2], v[:, 1]), (v[:, 2], zero, -v[:, 0]), (-v[:, 1], v[:, 0], zero))
+    return np.stack([np.stack(row, -1) for row in rows], -2)
+
+
+def _interpolate_links(smoothed: Smoothed, at: Ints, output_ns: Ints) -> Floats:
+    """Return the variance of displacements at each wanted stamp [m²], shape (N, 4); NaN where none stands at the other end."""
+    found = np.full((output_ns.size, len(DISPLACEMENT_LAGS_S)), np.nan)
+    for column, lag_s in enumerate(DISPLACEMENT_LAGS_S):
+        known = np.flatnonzero(np.isfinite(smoothed.links[:, column]))
+        if known.size == 0:
+            continue
+        found[:, column] = np.interp(at, known, smoothed.links[known, column])
+        later = output_ns + round(lag_s * 1e9)
+        row = np.searchsorted(output_ns, later).clip(0, output_ns.size - 1)
+        found[np.abs(output_ns[row] - later) > 0.1e9 * lag_s, column] = np.nan
+    return found
+
+
+def _compute_arm_variance(m: Measurements, rotation: Floats, yaw: Floats, made: Pass) -> tuple[Floats, Floats]:
+    """Return the variance that an antenna whose place nothing shows adds to positions, (N, 3), and to displacements, (N, 4) [m²]."""
+    assert m.gnss is not None  # noqa: S101
+    std = np.asarray(m.gnss.lever_arm_std_m)
+    moved = np.zeros((yaw.size, len(DISPLACEMENT_LAGS_S)))
+    for column, lag_s in enumerate(DISPLACEMENT_LAGS_S):
+        rows = round(lag_s / made.ticks.inputs.period_s)
+        turned = np.zeros(yaw.size)
+        turned[: max(yaw.size - rows, 0)] = yaw[rows:] - yaw[:-rows] if yaw.size > rows else 0.0
+        moved[:, column] = (2.0 * np.sin(0.5 * turned)) ** 2 * std[0] * std[1]
+    return np.einsum("nij,j->ni", rotation**2, std**2), moved
+
+
+def _compute_unseen_scale_std(m: Measurements, made: Pass) -> float:
     """Return the uncertainty of the odometry's scale that the fixes leave: their error at both ends of the ground that they span.
 
     It is at most the scale's own deviation. The white part of the error of many fixes is the filter's business.
     """
-    own = WHEEL_SCALE_STD if measurements.visual is None else VISUAL_SCALE_STD
-    of_gnss = (run.timeline.kind == kernel.GNSS_POSITION) & (run.verdict == kernel.ACCEPTED)
-    if measurements.wheels is None and measurements.visual is None:
+    if not m.odometries():
         return 0.0
-    if of_gnss.sum() < 2:
+    own = WHEEL_SCALE_STD if m.visual is None else VISUAL_SCALE_STD
+    used = np.flatnonzero(made.tests.verdict[:, state.FIX] == 1)
+    if used.size < 2:
         return own
-    few_m2 = np.median(run.timeline.variance[of_gnss, 0]) if of_gnss.sum() < _MANY_FIXES else 0.0
-    span_m = np.linalg.norm(np.ptp(run.timeline.value[of_gnss, :2], axis=0))
-    lasting_m2 = run.lasting_error_m() ** 2
+    place, variance = made.ticks.inputs.value[used, state.FIX], made.ticks.inputs.variance[used, state.FIX, 0]
+    few_m2 = np.median(variance) if used.size < _MANY_FIXES else 0.0
+    span_m = np.linalg.norm(np.ptp(place[:, :2], axis=0))
+    lasting_m2 = np.median(made.ticks.fix_variance_m2[used, 0])
     return float(min(own, np.sqrt(2.0 * max(lasting_m2, few_m2)) / max(span_m, 1e-3)))
 
 
-def make_trajectory(
-    timeline: EventTimeline, outputs: NDArray[np.float64], run: FilterPass, output_ns: NDArray[np.int64]
-) -> Trajectory:
-    """Return the trajectory at the wanted stamps [ns], of ``outputs`` as `FilterPass` gives them; they are changed in place.
-
-    What no row of the filter can know is added: lasting errors of fixes, a scale or a yaw that nothing has measured.
-    """
-    rate_radps = timeline.output_rate_radps
-    if run.along_course:
-        rate_radps = _look_along(outputs, output_ns, run.antenna_m, run.slope_std_rad)
-    rotation = outputs[:, 0:9].reshape(-1, 3, 3)
-    scale_std, speed_mps = run.unseen_scale_std, np.linalg.norm(outputs[:, 15:18], axis=1)
-    outputs[:, 23:26] += run.lasting_m2
-    if run.unplaced:
-        outputs[:, 23:26] += (scale_std * (outputs[:, 18:21] - outputs[0, 18:21])) ** 2
-    if run.turns_by_course:
-        # The course takes a sway of the antenna for a turn: nothing tells one from the other, and roll is taken to be none.
-        outputs[:, 23:25] += (run.slope_std_rad * run.antenna_m[2] * rotation[:, :2, 1]) ** 2
-    if run.unseen_yaw_std:
-        _add_unknown_yaw(outputs, rotation, run.unseen_yaw_std, run.antenna_m)
-    bias = outputs[:, 9:12] * (timeline.output_rate_radps if run.turn_scale_std else timeline.output_has_gyro[:, None])
-    return Trajectory(
-        stamp_ns=output_ns,
-        position_enu_m=outputs[:, 18:21].copy(),
-        quat_xyzw=quat_from_matrix(rotation),
-        velocity_enu_mps=outputs[:, 15:18].copy(),
-        angular_velocity_radps=rate_radps - bias,
-        position_std_m=np.sqrt(outputs[:, 23:26]),
-        yaw_std_rad=np.sqrt(outputs[:, 26]),
-        forward_velocity_std_mps=np.hypot(np.sqrt(outputs[:, 27]), scale_std * speed_mps),
-        rejections=_make_rejections(timeline, run),
-        displacement_std_m=np.hypot(
-            np.hypot(_compute_displacement_std_m(run, output_ns), _compute_sway_m(run, speed_mps)),
-            scale_std * speed_mps[:, None] * DISPLACEMENT_LAGS_S,
-        ),
-        facts=_make_facts(timeline, run),
-    )
+def _list_rows(m: Measurements, made: Pass) -> Mapping[int, tuple[Ints, Ints]]:
+    """Return by kind of measurement the stamps of its rows, and the tick of each."""
+    sensors = m.sensors()
+    found = {}
+    for kind, role in ROLES.items():
+        if role in sensors:
+            ticks = made.ticks.rows[kind]
+            inside = (ticks >= 0) & (ticks < made.states.shape[0])
+            found[kind] = sensors[role].stamp_ns[inside], ticks[inside]
+    return found
 
 
-def _look_along(
-    outputs: NDArray[np.float64], output_ns: NDArray[np.int64], antenna_m: NDArray[np.float64], slope_std_rad: float
-) -> NDArray[np.float64]:
-    """Make the antenna's states the body's, level and along its course; return how fast that turns [rad/s], shape (N, 3)."""
-    yaw = compute_course(outputs[:, 15:18])
-    rotation = matrix_from_quat(quat_from_rpy(0.0, 0.0, yaw))
-    outputs[:, 0:9] = rotation.reshape(-1, 9)
-    outputs[:, 18:21] -= rotation @ antenna_m
-    # The antenna sways over ground that no sensor shows.
-    outputs[:, 23:25] += (slope_std_rad * antenna_m[2]) ** 2
-    outputs[:, 27] += (UNSEEN_TURN_RADPS * antenna_m[2]) ** 2
-    rate = np.zeros((yaw.size, 3))
-    if yaw.size > 1:
-        rate[:, 2] = np.gradient(yaw, (output_ns - output_ns[0]) * 1e-9)
-    return rate
+def _make_rejections(m: Measurements, made: Pass) -> Rejections:
+    parts = []
+    for kind, (stamp_ns, tick) in _list_rows(m, made).items():
+        refused = made.tests.verdict[tick, kind] == REJECTED
+        parts.append((stamp_ns[refused], np.full(int(refused.sum()), ROLES[kind]), made.tests.nis[tick[refused], kind],
+                      np.full(int(refused.sum()), made.model.gates[kind])))  # fmt: skip
+    stamp_ns, role, nis, gate = (np.concatenate(values) for values in zip(*parts, strict=True))
+    order = np.argsort(stamp_ns, kind="stable")
+    return Rejections(stamp_ns[order], role[order], np.full(order.size, "gate"), nis[order], gate[order])
 
 
-def _compute_sway_m(run: FilterPass, speed_mps: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return by how much an antenna on a body of unseen attitude moves otherwise than the body over each displacement, shape (N, 4)."""
-    if not run.along_course:
-        return np.zeros((speed_mps.size, 1))
-    tilt2 = np.minimum(GROUND * speed_mps[:, None] * DISPLACEMENT_LAGS_S, 2 * run.slope_std_rad**2)
-    return np.asarray(np.sqrt(tilt2) * abs(run.antenna_m[2]))
-
-
-def _add_unknown_yaw(
-    outputs: NDArray[np.float64], rotation: NDArray[np.float64], yaw_std: float, antenna_m: NDArray[np.float64]
-) -> None:
-    """Add what cannot be known where yaw may be anything: itself, where below its antenna the robot is, and whether it drives forward."""
-    velocity, beside = outputs[:, 15:18], rotation @ antenna_m
-    aside2 = np.sum(beside[:, :2] ** 2, axis=1)
-    above2 = 2 * (rotation[:, 2, :2] @ antenna_m[:2]) ** 2
-    outputs[:, 23:26] += np.column_stack((aside2, aside2, above2))
-    outputs[:, 26] += yaw_std**2
-    outputs[:, 27] += 1.5 * np.sum(velocity**2, axis=1)
-
-
-def _compute_displacement_std_m(run: FilterPass, output_ns: NDArray[np.int64]) -> NDArray[np.float64]:
-    std = np.sqrt(run.displacement_variance_m2)
-    for column, (lag, lag_s) in enumerate(zip(compute_lag_rows(output_ns), DISPLACEMENT_LAGS_S, strict=True)):
-        step_s = (output_ns[lag:] - output_ns[:-lag]) * 1e-9
-        std[: step_s.size, column][np.abs(step_s - lag_s) > 0.1 * lag_s] = np.nan  # across a gap
-    return std
-
-
-def _make_rejections(timeline: EventTimeline, run: FilterPass) -> Rejections:
-    refused = np.flatnonzero((run.verdict == kernel.REFUSED) & np.isin(timeline.kind, list(ROLES)))
-    kind = timeline.kind[refused]
-    return Rejections(
-        stamp_ns=timeline.stamp_ns[refused],
-        role=np.array([ROLES[int(k)] for k in kind], np.str_),
-        reason=np.full(refused.size, "gate"),
-        normalized_innovation_squared=run.nis[refused],
-        threshold=run.gates[kind],
-    )
-
-
-def find_gate_resets(timeline: EventTimeline, run: FilterPass) -> tuple[GateReset, ...]:
+def find_gate_resets(made: Pass) -> tuple[GateReset, ...]:
     """Return each gate reset: since when the sensor was rejected, and its difference."""
     found = []
-    for event in np.flatnonzero(run.verdict == kernel.REOPENED):
-        same = np.flatnonzero(timeline.kind[:event] == timeline.kind[event])
-        heard = same[run.verdict[same] != kernel.REFUSED]
-        first = same[same > heard[-1]][0] if heard.size and heard[-1] < same[-1] else event
-        size = float(np.linalg.norm(run.innovation[event, : 2 if timeline.kind[event] == kernel.GNSS_POSITION else 1]))
-        role = ROLES[int(timeline.kind[event])]
-        if role == GNSS and any(w.start_ns <= timeline.stamp_ns[event] <= w.end_ns for w in run.wrong):
-            continue  # known by both ends
-        found.append(GateReset(role, int(timeline.stamp_ns[first]), int(timeline.stamp_ns[event]), size))
-    return tuple(sorted((*run.wrong, *found), key=lambda gate_reset: gate_reset.start_ns))
+    for kind, role in ROLES.items():
+        verdict, stamp_ns = made.tests.verdict[:, kind], made.ticks.stamp_ns
+        for tick in np.flatnonzero(verdict == RESET):
+            heard = np.flatnonzero((verdict[:tick] != REJECTED) & (verdict[:tick] != 0))
+            since = np.flatnonzero(verdict[heard[-1] + 1 : tick] == REJECTED) + heard[-1] + 1 if heard.size else []
+            first = since[0] if len(since) else tick
+            size = float(np.linalg.norm(made.tests.fix_innovation[tick, :2])) if kind == state.FIX else 0.0
+            found.append(GateReset(role, int(stamp_ns[first]), int(stamp_ns[tick]), size))
+    return tuple(sorted(found, key=lambda each: each.start_ns))
 
 
-def _make_facts(timeline: EventTimeline, run: FilterPass) -> StretchFacts:
-    kinds = {role: timeline.kind == kind for kind, role in ROLES.items() if (timeline.kind == kind).any()}
-    taken = {role: of_kind & (run.verdict == kernel.ACCEPTED) for role, of_kind in kinds.items()}
-    dof = {role: DOF[kind] for kind, role in ROLES.items()}
-    x, deviation = run.last.x, np.sqrt(np.diag(run.last.P))
+def _correct_measurements(
+    m: Measurements, made: Pass, smoothed: Smoothed, explained: Sequence[Hypothesis]
+) -> Measurements:
+    """Return fixes and odometry without what the estimate found to be wrong with them, as the audit compares them with the track."""
+    changes = [c for each in explained for c in each.changes if c.kind == "useless"]
+    rows, found = made.ticks.rows, {}
+    for kind, name in ((state.FIX, "gnss"), (state.WHEELS, "wheels"), (state.VISUAL, "visual")):
+        source = getattr(m, name)
+        if source is None:
+            continue
+        tick = rows[kind].clip(0, made.states.shape[0] - 1)
+        x = smoothed.states[tick, 6:]
+        if kind == state.FIX:
+            rotation = smoothed.states[tick, :9].reshape(-1, 3, 3)
+            moved = x[:, state.ARM : state.ARM + 3] - np.asarray(source.lever_arm_m)
+            late = x[:, state.FIX_LAG, None] * np.einsum("nij,nj->ni", rotation, x[:, state.U : state.U + 3])
+            off = np.einsum("nij,nj->ni", rotation, moved) - late + x[:, state.FIX_OFFSET : state.FIX_OFFSET + 3]
+            corrected = replace(source, position_enu_m=source.position_enu_m - off)
+        else:
+            places = (
+                (state.WHEEL_SCALE, state.WHEEL_LAG) if kind == state.WHEELS else (state.VISUAL_SCALE, state.VISUAL_LAG)
+            )
+            scale = 1.0 + x[:, places[0]] + x[:, state.SHARED_SCALE]
+            stamp_ns = source.stamp_ns - round(float(np.median(x[:, places[1]])) * 1e9)
+            corrected = replace(source, stamp_ns=stamp_ns, velocity_mps=source.velocity_mps / scale[:, None])
+        kept = np.ones(tick.size, np.bool_)
+        for change in changes:
+            if change.role == kind:
+                kept &= (tick < change.first) | (tick >= (change.last or made.states.shape[0]))
+        found[name] = _select_rows(corrected, kept) if not kept.all() else corrected
+    return replace(m, **found)
+
+
+def _select_rows(source: Any, kept: NDArray[np.bool_]) -> Any:
+    values = {field.name: getattr(source, field.name) for field in fields(source)}
+    return replace(source, **{name: value[kept] for name, value in values.items() if isinstance(value, np.ndarray)})
+
+
+def _list_changes(made: Pass, explained: Sequence[Hypothesis]) -> Iterator[ChangeFacts]:
+    """Yield the changes that explain the run best, with the size of the fixes' innovation there."""
+    for change in (c for each in explained for c in each.changes):
+        last = change.last or made.states.shape[0] - 1
+        off = np.linalg.norm(made.tests.fix_innovation[change.first : last, :2], axis=1)
+        size = float(np.nanmax(off, initial=0.0)) if change.role == state.FIX else 0.0
+        role = IMU if change.kind == "gyroscope" else ROLES[change.role]
+        start_ns, end_ns = made.ticks.stamp_ns[[change.first, last]].tolist()
+        yield ChangeFacts(change.kind, role, start_ns, end_ns, size)
+
+
+def _make_facts(  # noqa: PLR0917
+    m: Measurements, made: Pass, smoothed: Smoothed, std: Floats, scale_std: float, explained: Sequence[Hypothesis]
+) -> StretchFacts:
+    rows = _list_rows(m, made)
+    tests = made.tests
+    nis = {}
+    for kind in rows:
+        taken = tests.verdict[:, kind] == 1
+        nis[ROLES[kind]] = float(tests.nis[taken, kind].mean()) / state.SIZES[kind] if taken.any() else None
+    verdicts = {ROLES[kind]: tests.verdict[tick, kind] for kind, (_, tick) in rows.items()}
+    last, active = smoothed.states[-1], list(made.model.active)
+
+    def spread(error: int) -> float:
+        return float(smoothed.spreads[-1, active.index(error)]) if error in active else 0.0
+
+    x = last[6:]
     return StretchFacts(
-        nis_mean={role: float(run.nis[t].mean()) / dof[role] if t.any() else None for role, t in taken.items()},
-        measurements={role: int(of_kind.sum()) for role, of_kind in kinds.items()},
-        rejected={role: int((of_kind & (run.verdict == kernel.REFUSED)).sum()) for role, of_kind in kinds.items()},
-        reopened={role: int((of_kind & (run.verdict == kernel.REOPENED)).sum()) for role, of_kind in kinds.items()},
-        events=int(timeline.stamp_ns.size),
-        zero_velocity_updates=int((timeline.kind == kernel.STANDING).sum()),
-        gnss_lasting_error_m=run.lasting_error_m(),
-        gate_resets=find_gate_resets(timeline, run),
-        covariance_repairs=int(run.repairs),
-        gyro_bias_radps=None if run.turn_scale_std else make_vector(x[9:12]),
-        turn_scale=float(1 + x[11]) if run.turn_scale_std else None,
-        accelerometer_bias_mps2=make_vector(x[12:15]),
-        wheel_scale=float(1 + x[21]),
-        wheel_scale_std=float(max(deviation[15], run.unseen_scale_std)),
-        visual_scale=float(1 + x[22]),
-        visual_scale_std=float(max(deviation[16], run.unseen_scale_std)),
-        common_scale_std=run.unseen_scale_std,
+        nis_mean=nis,
+        measurements={role: int(of.size) for role, of in verdicts.items()},
+        rejected={role: int((of == REJECTED).sum()) for role, of in verdicts.items()},
+        reopened={role: int((of == RESET).sum()) for role, of in verdicts.items()},
+        events=int(made.ticks.stamp_ns.size),
+        zero_velocity_updates=int((tests.verdict[:, state.STATIONARY] > 0).sum()),
+        gnss_lasting_error_m=float(np.sqrt(np.median(made.ticks.fix_variance_m2[:, 0]))),
+        gate_resets=find_gate_resets(made),
+        changes=tuple(_list_changes(made, explained)),
+        covariance_repairs=0,
+        gyro_bias_radps=None if std[state.TURN_SCALE] else make_vector(x[state.GYRO_BIAS : state.GYRO_BIAS + 3]),
+        turn_scale=float(1.0 / (1.0 - x[state.TURN_SCALE])) if std[state.TURN_SCALE] else None,
+        accelerometer_bias_mps2=make_vector(x[state.ACCELEROMETER_BIAS : state.ACCELEROMETER_BIAS + 3]),
+        wheel_scale=float(1.0 + x[state.WHEEL_SCALE] + x[state.SHARED_SCALE]),
+        wheel_scale_std=max(spread(state.WHEEL_SCALE), scale_std),
+        visual_scale=float(1.0 + x[state.VISUAL_SCALE] + x[state.SHARED_SCALE]),
+        visual_scale_std=max(spread(state.VISUAL_SCALE), scale_std),
+        common_scale_std=scale_std,
+        parameters=_describe_parameters(m, made, smoothed, std),
     )
+
+
+def _describe_parameters(m: Measurements, made: Pass, smoothed: Smoothed, std: Floats) -> Mapping[str, ParameterFacts]:
+    """Return what the section showed of each parameter that was not known exactly, at its end."""
+    active, found = list(made.model.active), {}
+    for parameter in PARAMETERS:
+        errors = range(parameter.place, parameter.place + parameter.count)
+        if not all(std[e] for e in errors):
+            continue
+        value = smoothed.states[-1, [e + 6 for e in errors]]
+        if parameter.place == state.ARM and m.gnss is not None:
+            value = value - m.gnss.lever_arm_m
+        spread = smoothed.spreads[-1, [active.index(e) for e in errors]]
+        prior = std[list(errors)]
+        found[parameter.name] = ParameterFacts(tuple(value.tolist()), tuple(spread.tolist()), tuple(prior.tolist()))
+    return found

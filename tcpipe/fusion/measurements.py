@@ -18,6 +18,10 @@ GNSS, IMU, WHEELS, VISUAL, DOPPLER = "gnss", "imu", "wheel_odometry", "visual_od
 """Roles, as in the rejections table."""
 
 NO_LEVER_ARM = (0.0, 0.0, 0.0)
+STATED_ARM_STD_M = (0.05, 0.05, 0.1)
+"""Of an antenna whose place is stated: a tape measure, and the height of base_link over the ground."""
+UNSTATED_ARM_STD_M = (0.5, 0.5, 0.5)
+"""Of one whose place is not: it is on the robot."""
 
 
 _UNMEASURED_M2PS2 = 1e3
@@ -33,7 +37,7 @@ class Positions:
     stamp_ns : [ns], shape (N,), int64, increasing.
     position_enu_m : [m], shape (N, 3), antenna in the ENU plane of the datum.
     variance_m2 : [m²], shape (N, 3), east, north, up; floored, never unknown.
-    lever_arm_m : [m], position of the antenna in base_link.
+    lever_arm_m, lever_arm_std_m : [m], position of the antenna in base_link, and its standard deviation; 0: known exactly.
     unclaimed : shape (N,), where the receiver claims none and the variance is the recipe's; None where it always claims one.
     """
 
@@ -41,6 +45,7 @@ class Positions:
     position_enu_m: NDArray[np.float64]
     variance_m2: NDArray[np.float64]
     lever_arm_m: tuple[float, float, float] = NO_LEVER_ARM
+    lever_arm_std_m: tuple[float, float, float] = STATED_ARM_STD_M
     unclaimed: NDArray[np.bool_] | None = None
 
 

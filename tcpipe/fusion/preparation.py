@@ -90,6 +90,7 @@ def prepare_positions(
     *,
     datum_deg_m: tuple[float, float, float],
     lever_arm_m: tuple[float, float, float],
+    lever_arm_std_m: tuple[float, float, float],
     default_std_m: float,
     floor_std_m: float,
 ) -> tuple[Positions, Prepared]:
@@ -102,7 +103,9 @@ def prepare_positions(
     variance, replaced = _clean_variances(variance, default, floor_std_m**2)
     fixes = enu_from_geodetic(lon[usable], lat[usable], alt[usable], datum_deg_m=datum_deg_m)
     prepared = Prepared(stamp_ns[~_is_fix(lon, lat, alt)], repeated, replaced)
-    return Positions(stamp_ns[usable], fixes, variance, lever_arm_m, unclaimed if unclaimed.any() else None), prepared
+    unclaimed_rows = unclaimed if unclaimed.any() else None
+    made = Positions(stamp_ns[usable], fixes, variance, lever_arm_m, lever_arm_std_m, unclaimed_rows)
+    return made, prepared
 
 
 def prepare_ground_velocities(

@@ -12,8 +12,16 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.fusion import state_kernel as kernel
-from tcpipe.fusion.measurements import BodyVelocities, GroundVelocities, InertialMeasurements, Measurements, Positions
+from tcpipe.fusion import state
+from tcpipe.fusion.densities import NoiseModel
+from tcpipe.fusion.measurements import (
+    IMU,
+    BodyVelocities,
+    GroundVelocities,
+    InertialMeasurements,
+    Measurements,
+    Positions,
+)
 from tcpipe.fusion.signals import (
     compute_median_of_five,
     compute_median_period_ns,
@@ -118,7 +126,7 @@ def level_stds_rad(measurements: Measurements) -> tuple[float, float]:
 def turn_scale_std(measurements: Measurements) -> float:
     """Return the standard deviation of the scale of an odometry's turn rate; 0 where a gyroscope measures it, or no sensor.
 
-    Without fixes nothing tells it: it stays 1.
+    Without fixes nothing shows it: it stays 1.
     """
     if measurements.imu is not None or measurements.gnss is None:
         return 0.0
@@ -139,32 +147,33 @@ def find_scale_stds(measurements: Measurements) -> tuple[float, float]:
     return (0.0 if measurements.visual is None else WHEEL_SCALE_STD), 0.0
 
 
-def make_process_noise(measurements: Measurements) -> NDArray[np.float64]:
-    """Return the process noise by mode, shape (4, 20), as `tcpipe.fusion.state_kernel.predict` takes it.
+def make_motion_noise(  # noqa: PLR0917
+    m: Measurements,
+    noise: NoiseModel,
+    stamp_ns: NDArray[np.int64],
+    mode: NDArray[np.int8],
+    rate_radps: NDArray[np.float64],
+    period_s: float,
+) -> NDArray[np.float64]:
+    """Return the variance that motion adds over the tick before each stamp, of rotation [rad²] and body velocity [m²/s²], shape (K, 6).
 
-    It includes the scale and alignment errors of the IMU. Biases and scales wander. Slip comes and goes, so the wheels' scale returns to
-    one; where only the wheels and the camera measure speed, neither is known to be right on average, and it wanders freely.
+    ``mode`` and ``rate_radps`` are those of the tick, as `tcpipe.fusion.state.move_state` takes them.
     """
-    density = np.zeros((4, kernel.N + 4))
-    density[:, 0:3] = _DRIFT
-    density[:, 3:6] = (1e-4) ** 2
-    density[:, 6:9] = (1.5e-3) ** 2  # a milli-g or two in a minute, as uncooled MEMS units drift
-    density[:, 10:12] = _estimate_slide_density(measurements.visual)
-    density[:, kernel.SLIDING] = measurements.visual is None and measurements.wheels is None
-    density[: kernel.GYRO_TURN, kernel.GROUND] = GROUND
-    density[:, 12:15] = 1e-8
-    density[:, 15] = 2 * WHEEL_SCALE_STD**2 / _WHEEL_SCALE_TIME_S
-    density[:, 16] = 0.002**2
-    density[:, kernel.DECAY] = 1 / _WHEEL_SCALE_TIME_S
-    density[:, 15:17] *= np.square(find_scale_stds(measurements)) > 0
-    _fill_turn_noise(measurements, density)
-    imu = measurements.imu
-    if imu is not None:
-        rate_hz = 1e9 / compute_median_period_ns(imu.stamp_ns)
-        density[kernel.GYRO_TURN :, 0:3] = estimate_gyro_density(imu.gyro_std_radps, rate_hz)
-    else:
-        density[:, 3:6] = 2 * turn_scale_std(measurements) ** 2 / _TURN_SCALE_TIME_S
-    return density
+    density = np.zeros((stamp_ns.size, 6))
+    by_gyro = mode >= state.GYRO_TURN
+    if m.imu is not None:
+        density[by_gyro, :3] = noise.turns[IMU].white_rad2ps
+    metres_per_s = _compute_speed(m, stamp_ns[~by_gyro])
+    density[~by_gyro] = _make_turn_density(m, mode[~by_gyro], rate_radps[~by_gyro], metres_per_s)
+    inertial = mode == state.INERTIAL
+    if m.imu is not None and inertial.any():
+        density[inertial, 3:] = _make_accelerometer_density(m.imu)(stamp_ns[inertial])[:, None]
+    if not inertial.all():
+        forward = _make_odometry_density(m)(stamp_ns[~inertial])
+        aside = _estimate_slide_density(m.visual) + (forward if not m.odometries() else 0.0)
+        density[~inertial, 3] = forward
+        density[~inertial, 4:] = np.broadcast_to(np.reshape(aside, (-1, 1)), (forward.size, 2))
+    return density * period_s
 
 
 def estimate_gyro_density(gyro_std_radps: float, rate_hz: float) -> float:
@@ -172,40 +181,40 @@ def estimate_gyro_density(gyro_std_radps: float, rate_hz: float) -> float:
     return 1.5 * gyro_std_radps**2 / rate_hz + 1e-8
 
 
-def _fill_turn_noise(measurements: Measurements, density: NDArray[np.float64]) -> None:
-    """Fill in the noise of turning where an odometry, or no sensor, measures how the robot turns."""
-    sources = turn_sources(measurements)
-    if is_gliding(measurements):
-        density[:, kernel.GROUND] = 0.0
-    elif not sources:
-        density[kernel.FLAT_TURN, 2] = _COURSE_TURN
+def _compute_speed(m: Measurements, at_ns: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Return about how fast the robot drives [m/s]; 1 where only fixes show it."""
+    source = next(iter(m.odometries().values()), None)
+    if source is None:
+        return np.ones(at_ns.size)
+    return np.abs(_interpolate_density(source.stamp_ns, source.velocity_mps[:, 0], at_ns))
+
+
+def _make_turn_density(
+    m: Measurements, mode: NDArray[np.int8], rate_radps: NDArray[np.float64], speed_mps: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return the noise density of turns that no gyroscope measures [rad²/s], shape (K, 6), its last columns 0."""
+    density = np.full((mode.size, 6), 0.0)
+    density[:, :3] = _DRIFT
+    sources = turn_sources(m)
+    ground = np.full(mode.size, 0.0 if is_gliding(m) else GROUND)
+    if is_turned_by_course(m):
+        density[:, 2] = _COURSE_TURN
     for source in sources:
-        visual = source is measurements.visual
-        rows = [kernel.VISUAL_TURN] if visual else [kernel.FLAT_TURN]
+        visual = source is m.visual
+        rows = mode == (state.VISUAL_TURN if visual else state.FLAT_TURN)
         known = np.isfinite(source.yaw_rate_radps)
         rate_hz = 1e9 / compute_median_period_ns(source.stamp_ns[known])
         turns = source.yaw_rate_radps[known, None] if source.turn_rate_radps is None else source.turn_rate_radps[known]
-        density[rows, 0 if turns.shape[1] == 3 else 2 : 3] = 1.1 * estimate_white_noise(turns) ** 2 / rate_hz + _DRIFT
-        if turns.shape[1] == 3:
-            density[rows, kernel.GROUND] = 0.0
-        best = measurements.imu is None and source is sources[-1]
-        density[rows, kernel.SCALED] = best
+        spatial = turns.shape[1] == 3
+        density[rows, 0 if spatial else 2 : 3] = 1.1 * estimate_white_noise(turns) ** 2 / rate_hz + _DRIFT
+        if spatial:
+            ground[rows] = 0.0
+        best = m.imu is None and source is sources[-1]
         # The scale is off by this share for a second at a time, beside what is constant of it.
-        density[rows, kernel.TURNING] = (0.02 if visual else 0.1 if best else 0.3) ** 2
-
-
-def estimate_shake_density(
-    measurements: Measurements, stamp_ns: NDArray[np.int64], mode: NDArray[np.int8]
-) -> NDArray[np.float64]:
-    """Return the noise density of the velocity at each event [m²/s³], shape (E,), for its process mode."""
-    imu = measurements.imu
-    q_v = np.full(stamp_ns.size, np.nan)
-    inertial = mode == kernel.INERTIAL
-    if imu is not None and inertial.any():
-        q_v[inertial] = _make_accelerometer_density(imu)(stamp_ns[inertial])
-    if not inertial.all():
-        q_v[~inertial] = _make_odometry_density(measurements)(stamp_ns[~inertial])
-    return q_v
+        share = 0.02 if visual else 0.1 if best else 0.3
+        density[rows, :3] += np.square(share * rate_radps[rows])
+    density[:, :2] += (ground * speed_mps)[:, None]
+    return density
 
 
 _Density = Callable[[NDArray[np.int64]], NDArray[np.float64]]

@@ -65,6 +65,7 @@ class Trajectory:
         its direction, the correlation of both ends counted exactly; NaN where no row stands there, and throughout in a forward filter,
         which does not know it. In between the variance may be interpolated in time, from zero at no time.
     facts : what the filter counted and settled on.
+    corrected : the measurements without what it found to be wrong with them; None: as they were.
     """
 
     stamp_ns: NDArray[np.int64]
@@ -78,6 +79,7 @@ class Trajectory:
     rejections: Rejections
     displacement_std_m: NDArray[np.float64]
     facts: StretchFacts
+    corrected: Measurements | None = None
 
 
 _PAUSE_NS = 5_000_000_000  # a longer pause begins a new section

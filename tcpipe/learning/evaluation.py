@@ -178,7 +178,7 @@ def _split_errors(
         class_order=tuple(counts),
         errors=errors_of(said, spreads),
         leakage=measure_leakage(data, found.split),
-        label_floor=label_floor(found.deviations, found.costs, found.class_ids, found.names),
+        label_floor=label_floor(found.own_deviations, found.costs, found.class_ids, found.names),
         simulation_floor=None if plant is None else errors_of(plant(found.split)),
     )
 

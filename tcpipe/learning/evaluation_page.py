@@ -21,14 +21,14 @@ FLOORS = {"label_floor": "label noise alone", "simulation_floor": "simulation's 
 """Lower bounds of errors, and their names on the page."""
 
 MEASURES = {"rmse": "RMSE", "mape_percent": "MAPE"}
-SCORES = {"coverage_percent": "in 90 %", "nll": "NLL", "crps": "CRPS"}
+SCORES = {"coverage_percent": "coverage", "nll": "NLL", "crps": "CRPS"}
 """How well a model states its own errors (`tcpipe.learning.metrics`)."""
 _ALL_MEASURES = MEASURES | SCORES
 
 COUNTED = (
     "The number in brackets after a MAPE counts its labels: those of at least "
     + ", ".join(f"{least:g} {UNITS[quantity]} ({quantity})" for quantity, least in LEAST.items())
-    + ". "
+    + ". Coverage is the share of labels inside the model's 90 % intervals. "
 )
 _DIGITS = {"w": 2, "v": 3, "T": 3, "E": 2}
 _CALLED = {"test": "test samples of the known area", "unseen": "the unseen area"}
@@ -146,7 +146,7 @@ def _make_baselines_section(found: Evaluation) -> Section:
                 if (row.split, row.quantity) == (split, quantity):
                     figures = [*_format_figures(row.errors, quantity, MEASURES), *_BLANK]
                     rows.append(("", "", row.baseline, *figures, str(row.rmse_ratio), str(row.mape_ratio)))
-    header = ("", "", "", "RMSE", "MAPE [%]", "in 90 % [%]", "NLL", "CRPS", "ratio of RMSE", "ratio of MAPE")
+    header = ("", "", "", "RMSE", "MAPE [%]", "coverage [%]", "NLL", "CRPS", "ratio of RMSE", "ratio of MAPE")
     text = (
         "The baselines use the training and test samples of the model. Ratios are the model's error over the "
         "baseline's, with their 95 % interval (paired bootstrap over runs or blocks): below 1 the model is better. Physics and boosting "
@@ -224,7 +224,7 @@ def format_leakage(leakage: Leakage | None) -> str:
 
 _TEXT = {
     "test": "Held-out blocks of train: the model was not fitted on them (a network used them for early stopping). "
-    "Label noise alone: the error of a perfect prediction, from the standard deviations of the labels.",
+    "Label noise alone: the error of a perfect prediction, from the part of their standard deviations that labels of a run do not share.",
     "unseen": "The paper calls it validation; tcpipe uses it neither for tuning nor for early stopping.",
 }
 

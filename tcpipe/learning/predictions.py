@@ -36,16 +36,19 @@ class Measured:
     split: Split
     costs: Mapping[str, Array]
     deviations: Mapping[str, Array]
+    own_deviations: Mapping[str, Array]
+    """Without the part that all labels of a run share: a model of labels of one sensor learns that part."""
     class_ids: NDArray[np.int64]
     names: Mapping[int, str]
     """Of the classes that occur, by id."""
 
     def take(self, rows: NDArray[np.int64]) -> Measured:
         """Return some of the samples."""
-        costs, deviations = (
-            {name: values[rows] for name, values in of.items()} for of in (self.costs, self.deviations)
+        costs, deviations, own_deviations = (
+            {name: values[rows] for name, values in of.items()}
+            for of in (self.costs, self.deviations, self.own_deviations)
         )
-        return Measured(self.split.take(rows), costs, deviations, self.class_ids[rows], self.names)
+        return Measured(self.split.take(rows), costs, deviations, own_deviations, self.class_ids[rows], self.names)
 
 
 def collect_measured(split: Split, names: Mapping[int, str]) -> Measured:
@@ -60,20 +63,17 @@ def collect_measured(split: Split, names: Mapping[int, str]) -> Measured:
     with_label = np.isfinite(split.labels).all(axis=1) & np.isfinite(split.column(of.energy).astype(np.float64))
     chosen = split.take(with_label)
     labels = chosen.labels.astype(np.float64)
-    plain = {name: chosen.column(name).astype(np.float64) for name in (
-        "duration_s", of.energy, of.power_std, "velocity_std_mps", "duration_std_s", of.energy_std, "terrain_class",
-    )}  # fmt: skip
+    std = {"w": of.power_std, "v": "velocity_std_mps", "T": "duration_std_s", "E": of.energy_std}
+    deviations = {cost: chosen.column(name).astype(np.float64) for cost, name in std.items()}
+    own_deviations = {cost: chosen.own_std(name) for cost, name in std.items()}
+    plain = {name: chosen.column(name).astype(np.float64) for name in ("duration_s", of.energy, "terrain_class")}
     class_ids = np.nan_to_num(plain["terrain_class"], nan=_UNKNOWN[0]).astype(np.int64)
     known = dict([_UNKNOWN, *names.items()])
     return Measured(
         chosen,
         {"w": labels[:, 0], "v": labels[:, 1], "T": plain["duration_s"], "E": plain[of.energy]},
-        {
-            "w": plain[of.power_std],
-            "v": plain["velocity_std_mps"],
-            "T": plain["duration_std_s"],
-            "E": plain[of.energy_std],
-        },
+        deviations,
+        own_deviations,
         class_ids,
         {class_id: known.get(class_id, str(class_id)) for class_id in np.unique(class_ids).tolist()},
     )

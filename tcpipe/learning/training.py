@@ -12,6 +12,7 @@ import numpy as np
 import pyarrow as pa
 
 from tcpipe.dataset import Dataset, Split, open_dataset
+from tcpipe.dataset.energies import name_common_std
 from tcpipe.dataset.extra_features import available_features, read_extra_features
 from tcpipe.errors import DatasetError, ModelError, StoreError, UsageError
 from tcpipe.formats.atomic import clear_beside
@@ -401,5 +402,5 @@ def _make_residuals_table(fitted: Fitted, outputs: tuple[str, ...]) -> pa.Table:
         columns[f"{quantity}_predicted_{unit}"] = said[:, number].astype(np.float64)
     if len(outputs) > 1:  # what the labels have in common is in no residual
         columns |= {name: held.column(name) for name in ("duration_s", "duration_common_std_s")}
-        columns["energy_common_std_joule"] = held.column(held.energy.energy_common_std)
+        columns["energy_common_std_joule"] = held.column(name_common_std(held.energy.energy_std))
     return pa.table(columns)

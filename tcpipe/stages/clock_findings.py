@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
 
 from tcpipe.fusion.checks.clock_offsets import ClockOffsets, Pair, PowerSignal, RoleOffset, find_clock_offsets
-from tcpipe.fusion.checks.mounting import solve_lag
 from tcpipe.fusion.measurements import GNSS, IMU
 from tcpipe.power.rails import compute_power_at
 from tcpipe.recipe.suggestions import suggest
-from tcpipe.stages.fuse_inputs import FusionInputs, compute_moved_m, find_longest_epoch, find_recipe_role
-from tcpipe.stages.fuse_sections import Fused
+from tcpipe.stages.fuse_inputs import FusionInputs, find_longest_epoch, find_recipe_role
 from tcpipe.stages.message_arrays import make_rails
 from tcpipe.tables.columns import to_floats
 from tcpipe.tables.facts import ClockFacts, ClockOffset, ClockPair
@@ -116,35 +114,3 @@ def _make_power_signal(streams: Streams, epoch: int) -> PowerSignal | None:
     _, _, watt = compute_power_at(rails, stamp_ns, max_gap_ns=_MAX_GAP_NS)
     known = np.isfinite(watt)
     return PowerSignal(stamp_ns[known], watt[known], streams.power_averaged) if known.sum() > 1 else None
-
-
-def add_lag_on_path(
-    clocks: StageReport[ClockFacts], fused: Fused, inputs: FusionInputs, streams: Streams
-) -> StageReport[ClockFacts]:
-    """Return the findings on clocks with the time offset of the fixes along the path, where it is significant and not yet found."""
-    if GNSS not in streams.sensors:
-        return clocks
-    return add_gnss_time_offset(clocks, solve_lag(fused.arms, compute_moved_m(inputs, streams)))
-
-
-def add_gnss_time_offset(clocks: StageReport[ClockFacts], lag: tuple[float, float] | None) -> StageReport[ClockFacts]:
-    """Return the findings with a lag of the fixes and its deviation [s].
-
-    Whether they are late or the odometry early, the path does not tell.
-    """
-    known = clocks.facts.offsets.get(GNSS)
-    if lag is None or clocks.facts.position_offset_s or (known is not None and (known.noted or known.drifts)):
-        return clocks
-    lag_s, std_s = lag
-    finding = make_finding(
-        "clocks-differ",
-        Subject("role", GNSS),
-        action="inflated",
-        names={"reference": "odometry", "by": "path"},
-        offset_s=lag_s,
-        offset_2std_s=2 * std_s,
-        apart_s=abs(lag_s),
-    )
-    offset = ClockOffset(lag_s, std_s, True, None, None, False, blamed=False)
-    facts = replace(clocks.facts, offsets={**clocks.facts.offsets, GNSS: offset}, position_offset_s=abs(lag_s))
-    return StageReport((*clocks.findings, finding), facts)

@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
 
 from tcpipe.fusion.checks.audit import find_undecided_sensors
-from tcpipe.fusion.checks.mounting import Arm, Tilt
 from tcpipe.fusion.checks.odometry_scale import Scale, compute_command_ratio
 from tcpipe.fusion.measurements import GNSS, IMU, VISUAL, WHEELS
 from tcpipe.geometry.rotation import matrix_from_quat, quat_from_rpy
 from tcpipe.recipe.suggestions import suggest
 from tcpipe.stages.fuse_inputs import (
     FusionInputs,
-    compute_moved_m,
     exclude_role,
     find_longest_epoch,
     find_recipe_role,
@@ -23,7 +21,17 @@ from tcpipe.stages.fuse_inputs import (
     state_extrinsics,
 )
 from tcpipe.stages.fuse_sections import Fused
-from tcpipe.tables.facts import AuditFacts, Disagreement, FuseFacts, GateReset, MountingFacts, StretchFacts, make_vector
+from tcpipe.tables.facts import (
+    AuditFacts,
+    ChangeFacts,
+    Disagreement,
+    FuseFacts,
+    GateReset,
+    MountingFacts,
+    ParameterFacts,
+    StretchFacts,
+    make_vector,
+)
 from tcpipe.tables.findings import Finding, StageReport, Subject, make_finding, read_threshold
 from tcpipe.tables.levels import Sensor, Streams
 
@@ -64,6 +72,7 @@ def find_fuse_findings(
     elif inputs.datum_deg_m is not None:
         findings += [_find_initial_yaw(of, first_ns, gnss) for of in facts.stretches if of.heading_from != _COURSE]
     findings += _find_reopenings(facts, first_ns)
+    findings += _find_changes(facts, first_ns, fixes)
     findings += _find_scale(inputs, facts)
     findings += _find_rejections(facts, fixes)
     for key, code in (("variances_replaced", "variances-replaced"), ("invalid", "values-unusable")):
@@ -129,7 +138,29 @@ def _find_reopenings(facts: FuseFacts, first_ns: int) -> list[Finding]:
     return findings
 
 
-def _find_span_s(each: StretchFacts | GateReset, first_ns: int) -> tuple[float, float]:
+def _find_changes(facts: FuseFacts, first_ns: int, fixes: str) -> Iterator[Finding]:
+    """Yield what explains contradictions of sensors: what changed, when, and by how much fixes were off."""
+    for change in (each for section in facts.stretches for each in section.changes):
+        subject = Subject("role", fixes if change.role == GNSS else change.role)
+        names = {"change": _CHANGES[change.kind]}
+        yield make_finding(
+            "sensor-changed", subject, span_s=_find_span_s(change, first_ns), names=names, off_m=change.size
+        )
+
+
+_CHANGES = {
+    "offset": "positions are off by a constant",
+    "antenna": "the antenna was moved",
+    "clock": "its clock stepped",
+    "gyroscope": "the bias of its gyroscope jumped",
+    "scale": "its scale changed",
+    "pose": "the robot was moved without being measured",
+    "useless": "it measured nothing usable",
+}
+"""Changes in words."""
+
+
+def _find_span_s(each: StretchFacts | GateReset | ChangeFacts, first_ns: int) -> tuple[float, float]:
     return (each.start_ns - first_ns) / 1e9, (each.end_ns - first_ns) / 1e9
 
 
@@ -189,20 +220,48 @@ def _find_disagreement(found: Sequence[Disagreement], first_ns: int) -> Finding:
     )
 
 
-def make_mounting_findings(inputs: FusionInputs, streams: Streams) -> StageReport[MountingFacts | None]:
-    """Return what was corrected, with the recipe keys that would state it."""
-    arm, tilt = inputs.arm, inputs.imu_tilt
-    findings = [] if arm is None else [_find_arm(arm, streams.sensors[GNSS], find_recipe_role(GNSS, streams))]
-    findings += [] if tilt is None else [_find_tilt(tilt, streams.sensors[IMU])]
+_SURELY = 4.0  # standard deviations
+_LEAST_ARM_M = 0.1  # what a finding names
+_LEAST_TILT_RAD = 0.0175
+_LEAST_SCALE = 0.03
+
+
+def make_mounting_findings(inputs: FusionInputs, fused: Fused, streams: Streams) -> StageReport[MountingFacts | None]:
+    """Return where the run shows other extrinsics or scales than are stated, with the recipe keys that would state it."""
+    findings: list[Finding] = []
+    longest = max(fused.facts, key=lambda of: of.end_ns - of.start_ns)
+    arm, tilt = longest.parameters.get("antenna"), longest.parameters.get("mounting of the IMU")
+    moved = std_m = roll_pitch = None
+    if arm is not None and GNSS in streams.sensors:
+        sensor = streams.sensors[GNSS]
+        if sensor.placed_by == "assumed" or _is_contradicted(arm, _LEAST_ARM_M):
+            moved, std_m = make_vector(np.array(arm.value)), make_vector(np.array(arm.std))
+            findings.append(_find_arm(arm, sensor, find_recipe_role(GNSS, streams)))
+    if tilt is not None and _is_contradicted(tilt, _LEAST_TILT_RAD):
+        roll_pitch = tilt.value[0], tilt.value[1]
+        findings.append(_find_tilt(tilt, streams.sensors[IMU]))
+    scales = dict(inputs.scales) | _find_scales(inputs, longest)
     given = streams.report.facts.odometry_scale or {}
-    findings += [_find_odometry_scale(role, scale, given.get(role, 1.0)) for role, scale in inputs.scales.items()]
+    findings += [_find_odometry_scale(role, scale, given.get(role, 1.0)) for role, scale in scales.items()]
     if not findings:
         return StageReport((), None)
-    std_m = None if arm is None else make_vector(np.sqrt(np.diag(arm.covariance)[:3]))
-    moved = None if arm is None else make_vector(compute_moved_m(inputs, streams))
-    roll_pitch = None if tilt is None else (float(tilt.rad[0]), float(tilt.rad[1]))
-    scales = {role: scale.factor for role, scale in inputs.scales.items()} or None
-    return StageReport(tuple(findings), MountingFacts(moved, std_m, roll_pitch, scales))
+    factors = {role: scale.factor for role, scale in scales.items()} or None
+    return StageReport(tuple(findings), MountingFacts(moved, std_m, roll_pitch, factors))
+
+
+def _is_contradicted(found: ParameterFacts, least: float) -> bool:
+    """Return whether a parameter surely differs from what is stated, by so much at least."""
+    return any(abs(v) > max(_SURELY * s, least) for v, s in zip(found.value, found.std, strict=True))
+
+
+def _find_scales(inputs: FusionInputs, longest: StretchFacts) -> dict[str, Scale]:
+    """Return the scales of odometries that surely differ from 1."""
+    found = {}
+    for name, role in (("wheel scale", WHEELS), ("camera scale", VISUAL)):
+        scale = longest.parameters.get(name)
+        if scale is not None and _is_contradicted(scale, _LEAST_SCALE) and role not in inputs.scales:
+            found[role] = Scale(1.0 + scale.value[0], scale.std[0])
+    return found
 
 
 def _find_odometry_scale(role: str, scale: Scale, given: float) -> Finding:
@@ -212,27 +271,28 @@ def _find_odometry_scale(role: str, scale: Scale, given: float) -> Finding:
     return make_finding("odometry-scale", subject, remedies=remedies, scale=scale.factor, scale_std=std, **by_speed)
 
 
-def _find_arm(arm: Arm, sensor: Sensor, name: str) -> Finding:
-    place, std_m = np.asarray(sensor.xyz_m) + arm.error[:3], np.sqrt(np.diag(arm.covariance)[:3])
+def _find_arm(arm: ParameterFacts, sensor: Sensor, name: str) -> Finding:
+    place = np.asarray(sensor.xyz_m) + arm.value
     axes = ("forward", "left", "up")
+    numbers: dict[str, Any] = {f"{axis}_m": value for axis, value in zip(axes, place.tolist(), strict=True)}
+    numbers |= {f"{axis}_std_m": value for axis, value in zip(axes, arm.std, strict=True)}
     return make_finding(
         "lever-arm-unknown" if sensor.placed_by == "assumed" else "lever-arm-contradicted",
         Subject("role", name),
         names={"placed_by": sensor.placed_by},
         remedies=state_extrinsics(name, np.round(place, 2).tolist(), matrix_from_quat(sensor.quat_xyzw)),
-        **{f"{axis}_m": value for axis, value in zip(axes, place.tolist(), strict=True)},
-        **{f"{axis}_std_m": value for axis, value in zip(axes, std_m.tolist(), strict=True)},
+        **numbers,
     )
 
 
-def _find_tilt(tilt: Tilt, sensor: Sensor) -> Finding:
-    roll_rad, pitch_rad = tilt.rad.tolist()
-    turn = matrix_from_quat(quat_from_rpy(roll_rad, pitch_rad, 0.0)) @ matrix_from_quat(sensor.quat_xyzw)
+def _find_tilt(tilt: ParameterFacts, sensor: Sensor) -> Finding:
+    """Return the finding of an IMU that is mounted otherwise: its measurements turn into the robot's axes by the inverse."""
+    turn = matrix_from_quat(quat_from_rpy(*(-value for value in tilt.value))) @ matrix_from_quat(sensor.quat_xyzw)
     return make_finding(
         "imu-tilted",
         Subject("role", IMU),
         names={"placed_by": sensor.placed_by},
         remedies=state_extrinsics(IMU, sensor.xyz_m, turn),
-        roll_rad=roll_rad,
-        pitch_rad=pitch_rad,
+        roll_rad=-tilt.value[0],
+        pitch_rad=-tilt.value[1],
     )

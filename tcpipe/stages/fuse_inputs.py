@@ -16,11 +16,19 @@ from numpy.typing import NDArray
 
 from tcpipe.fusion import preparation
 from tcpipe.fusion.checks.clock_offsets import smooth_stamps
-from tcpipe.fusion.checks.mounting import Arm, Tilt
 from tcpipe.fusion.checks.odometry_scale import Scale, rescale_odometries
 from tcpipe.fusion.checks.plausibility import SensorExclusion
 from tcpipe.fusion.checks.sensors import CommandedSpeed, check_ground_velocity, check_sensors
-from tcpipe.fusion.measurements import DOPPLER, GNSS, IMU, VISUAL, WHEELS, Measurements
+from tcpipe.fusion.measurements import (
+    DOPPLER,
+    GNSS,
+    IMU,
+    STATED_ARM_STD_M,
+    UNSTATED_ARM_STD_M,
+    VISUAL,
+    WHEELS,
+    Measurements,
+)
 from tcpipe.fusion.preparation import Prepared
 from tcpipe.geometry.datum import geodetic_from_enu
 from tcpipe.geometry.rotation import matrix_from_quat, rpy_from_matrix
@@ -43,10 +51,6 @@ class FusionInputs:
     counts: dict[str, dict[str, int]] = field(default_factory=dict)
     findings: list[Finding] = field(default_factory=list)
     excluded: frozenset[str] = frozenset()
-    arm: Arm | None = None
-    """The antenna's lever arm where it was corrected or is not stated."""
-    imu_tilt: Tilt | None = None
-    """Roll and pitch of the IMU's mounting that were taken out."""
     scales: Mapping[str, Scale] = field(default_factory=dict)
     """By odometry, the scale that was taken out."""
 
@@ -100,6 +104,7 @@ def _prepare(role: str, table: pa.Table, sensor: Sensor, config: FuseConfig, inp
             columns,
             datum_deg_m=inputs.datum_deg_m,
             lever_arm_m=sensor.xyz_m,
+            lever_arm_std_m=UNSTATED_ARM_STD_M if sensor.placed_by == "assumed" else STATED_ARM_STD_M,
             default_std_m=config.gnss_default_std_m,
             floor_std_m=config.gnss_std_floor_m,
         )
@@ -260,9 +265,3 @@ def convert_pose_to_fixes(streams: Streams) -> tuple[Streams, bool]:
     tables = {role: table for role, table in streams.tables.items() if role != POSE} | {GNSS: fixes}
     sensors = {role: sensor for role, sensor in streams.sensors.items() if role != POSE} | {GNSS: streams.sensors[POSE]}
     return replace(streams, tables=tables, sensors=sensors), local
-
-
-def compute_moved_m(inputs: FusionInputs, streams: Streams) -> NDArray[np.float64]:
-    """Return by how much the arm in use differs from the one that was read [m], shape (3,)."""
-    arms = [m.gnss.lever_arm_m for m in inputs.measurements.values() if m.gnss is not None]
-    return np.asarray(arms[0]) - np.asarray(streams.sensors[GNSS].xyz_m) if arms else np.zeros(3)

@@ -11,15 +11,6 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from tcpipe.fusion.checks.audit import Tally, audit_trajectory
-from tcpipe.fusion.checks.mounting import (
-    ArmEvidence,
-    TiltEvidence,
-    add_antenna_uncertainty,
-    collect_arm_evidence,
-    collect_tilt_evidence,
-    estimate_antenna_uncertainty,
-)
-from tcpipe.fusion.checks.odometry_scale import compute_distance_ratios
 from tcpipe.fusion.error_state import run_error_state
 from tcpipe.fusion.initial import find_initial_state, find_stationary_intervals
 from tcpipe.fusion.measurements import BodyVelocities, InitialState
@@ -39,7 +30,7 @@ from tcpipe.tables.levels import REJECTIONS, Streams
 
 @dataclass(slots=True)
 class Fused:
-    """Every section's trajectory, facts, columns, audit, and evidence on extrinsics and scales; time without a track [s]."""
+    """Every section's trajectory, facts, columns and audit; time without a track [s]."""
 
     found: list[Trajectory] = field(default_factory=list)
     facts: list[StretchFacts] = field(default_factory=list)
@@ -48,9 +39,6 @@ class Fused:
     tallies: list[Tally] = field(default_factory=list)
     windows: int = 0
     astray: int = 0
-    arms: list[ArmEvidence | None] = field(default_factory=list)
-    tilts: list[TiltEvidence | None] = field(default_factory=list)
-    ratios: list[Mapping[str, NDArray[np.float64]]] = field(default_factory=list)
     skipped_s: float = 0.0
 
 
@@ -67,28 +55,16 @@ def fuse_sections(inputs: FusionInputs, streams: Streams, config: FuseConfig) ->
         initial = _make_initial_state(section, fused.found[-1] if fused.found and inputs.datum_deg_m is None else None)
         # 2. Filter and smoother.
         trajectory = _estimate(section, initial, output_ns, config)
-        # 3. Evidence on extrinsics of antenna and IMU and on scales of odometries, and the uncertainty that remains.
-        fused.arms.append(collect_arm_evidence(trajectory, section.measurements))
-        fused.tilts.append(collect_tilt_evidence(trajectory, section.measurements))
-        fused.ratios.append(compute_distance_ratios(trajectory, section.measurements))
-        trajectory = _add_mounting_uncertainty(trajectory, section, inputs)
-        # 4. What came out is held against what went in.
-        trajectory, audit = audit_trajectory(trajectory, section.measurements)
+        # 3. What came out is held against what went in.
+        trajectory, audit = audit_trajectory(trajectory, trajectory.corrected or section.measurements)
         fused.disagreements += (replace(each, clock_epoch=section.clock_epoch) for each in audit.disagreements)
         fused.tallies += audit.tallies
         fused.windows, fused.astray = fused.windows + audit.windows, fused.astray + audit.astray
         fused.found.append(trajectory)
         fused.facts.append(make_section_facts(section, initial, trajectory))
-        # 5. What else is known at the track's stamps.
+        # 4. What else is known at the track's stamps.
         fused.columns.append(_make_columns(section, trajectory, inputs, streams, config))
     return fused
-
-
-def _add_mounting_uncertainty(found: Trajectory, section: TrackSection, inputs: FusionInputs) -> Trajectory:
-    """Return the trajectory with the uncertainty of corrected or unstated extrinsics."""
-    gnss = section.measurements.gnss
-    covariance = None if gnss is None else estimate_antenna_uncertainty(inputs.arm, inputs.imu_tilt, gnss.lever_arm_m)
-    return found if gnss is None or covariance is None else add_antenna_uncertainty(found, covariance, gnss)
 
 
 def _make_initial_state(section: TrackSection, last: Trajectory | None) -> InitialState:

@@ -44,9 +44,11 @@ from tcpipe.stages.label_motion import (
     sum_energy_entries,
 )
 from tcpipe.stages.label_uncertainty import (
+    audit_power_sensor,
     compute_common_displacement_std_m,
     count_confirming_sensors,
-    find_power_prior,
+    find_sensor_findings,
+    find_stationary_ns,
     make_sensor_error,
 )
 from tcpipe.stages.message_arrays import make_rails
@@ -84,13 +86,14 @@ def label_segments(
     epochs: list[int] = np.unique(to_integers(masked.table, "clock_epoch")).tolist()
     rails_by_epoch = {epoch: make_rails(streams, epoch) for epoch in epochs}
     standing = find_idle_power(masked.table, rails_by_epoch, rate_hz=masked.info.rate_hz)
-    prior = find_power_prior(masked.info.report.facts.power, config)
+    power = audit_power_sensor(masked.table, rails_by_epoch, masked.info, config)
     for epoch, rails in rails_by_epoch.items():
         rows, cut = (select_rows(table, "clock_epoch", epoch) for table in (masked.table, segments.table))
         joules.update(sum_energy_entries(rows, rails, rate_hz=masked.info.rate_hz, rule=rule))
         if not cut.num_rows:
             continue
-        sensor = make_sensor_error(cut, rails, prior, rule=rule)
+        sensor = make_sensor_error(cut, rails, power, rule=rule)
+        power = replace(power, lost_signs=power.lost_signs + int(np.count_nonzero(sensor.sign_joule)))
         cost, net, causes = compute_segment_costs(
             cut, rows, rails, masked.info, rule=rule, standing=standing, sensor=sensor
         )
@@ -128,7 +131,10 @@ def label_segments(
     facts = make_label_facts(
         table, rails_by_epoch, joules, distance_by_reason_m, variance_j2, rule=rule, velocity=velocity, physics=physics
     )
-    info = add_findings(segments.info, find_label_findings(facts), replace(segments.info.report.facts, label=facts))
+    facts = replace(facts, power_sensor=None if facts.energy_joule is None else power)
+    start_ns = int(masked.table["stamp_ns"][0].as_py()) if masked.table.num_rows else 0
+    findings = (*find_label_findings(facts), *find_sensor_findings(facts, masked.info, start_ns))
+    info = add_findings(segments.info, findings, replace(segments.info.report.facts, label=facts))
     return LabelledSegments(table, info, segments.distance_by_reason_m)
 
 
@@ -151,7 +157,7 @@ def compute_segment_costs(
     ``cut`` and ``rows`` are the epoch's segments and rows of the masked track.
     """
     start_ns, end_ns, stamp_ns = to_integers(cut, "start_ns"), to_integers(cut, "end_ns"), to_integers(rows, "stamp_ns")
-    spans = start_ns, end_ns, _find_stationary_ns(rows, info.rate_hz)
+    spans = start_ns, end_ns, find_stationary_ns(rows, info.rate_hz)
     noise = estimate_energy_noise(rails, *spans)
     better = estimate_energy_noise(rails, *spans, rate_hz=_BETTER_HZ)
     ground_mps = np.hypot(to_floats(rows, "east_velocity_mps"), to_floats(rows, "north_velocity_mps"))
@@ -203,14 +209,6 @@ def _compute_displacement_std_m(cut: pa.Table, rows: pa.Table, *, smoothed: bool
         smoothed=smoothed,
     )
     return np.where(np.isnan(told), modelled, told)
-
-
-def _find_stationary_ns(rows: pa.Table, rate_hz: float) -> NDArray[np.int64]:
-    """Return begin and end [ns] of every span in which the robot is stationary, shape (S, 2)."""
-    stamp_ns = to_integers(rows, "stamp_ns")
-    piece = number_pieces(stamp_ns, to_integers(rows, "clock_epoch"), period_ns=1e9 / rate_hz)
-    standing = (to_numbers(rows["dropped_by"]) & np.uint32(DropReason.STATIONARY)) != 0
-    return stamp_ns[find_runs(standing, piece)]
 
 
 _EDGE_S = 0.3

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
 
 import numpy as np
 import pyarrow as pa
@@ -10,43 +11,134 @@ from numpy.typing import NDArray
 
 from tcpipe.cost.labels import SensorError
 from tcpipe.fusion.measurements import GNSS, VISUAL, WHEELS
+from tcpipe.motion.row_sections import find_runs, number_pieces
 from tcpipe.motion.uncertainty import find_common_scale_std
+from tcpipe.power.audit import (
+    estimate_offset_std,
+    find_gain_change,
+    find_lost_signs,
+    measure_rest_currents,
+    measure_sag,
+    summarize_rest,
+)
 from tcpipe.power.rails import Rail, Rule, integrate_energy
 from tcpipe.recipe import LabelConfig
+from tcpipe.recipe.suggestions import suggest
 from tcpipe.robots import GAIN_STD_FRACTION, OFFSET_STD_AMP
-from tcpipe.tables.arrays import select_rows
+from tcpipe.tables.arrays import select_rows, to_numbers
+from tcpipe.tables.bits import DropReason
 from tcpipe.tables.columns import to_floats, to_integers
-from tcpipe.tables.facts import PowerSign, StageFacts
-from tcpipe.tables.levels import Streams
+from tcpipe.tables.facts import LabelFacts, PowerSensorFacts, PowerSign, StageFacts
+from tcpipe.tables.findings import Finding, Subject, make_finding
+from tcpipe.tables.levels import Streams, TrackInfo
 
 Floats = NDArray[np.float64]
 
 
-@dataclass(frozen=True, slots=True)
-class PowerPrior:
-    """Standard deviations of a power sensor's gain, as a fraction, and of the zero of each rail's current [A]."""
-
-    gain_fraction: float
-    offset_amp: float
-
-
-def find_power_prior(power: PowerSign | None, config: LabelConfig) -> PowerPrior:
-    """Return what is known of the power sensor: by the recipe, else by the kind of source."""
-    gain = config.power_gain_std_fraction, power.gain_std_fraction if power else None, GAIN_STD_FRACTION
-    offset = config.power_offset_std_amp, power.offset_std_amp if power else None, OFFSET_STD_AMP
-    return PowerPrior(*(next(value for value in values if value is not None) for values in (gain, offset)))
+def find_stationary_ns(rows: pa.Table, rate_hz: float, *, but: int = 0) -> NDArray[np.int64]:
+    """Return begin and end [ns] of every span in which the robot is stationary, and not in another way, shape (S, 2)."""
+    stamp_ns = to_integers(rows, "stamp_ns")
+    piece = number_pieces(stamp_ns, to_integers(rows, "clock_epoch"), period_ns=1e9 / rate_hz)
+    reasons = to_numbers(rows["dropped_by"])
+    standing = ((reasons & np.uint32(DropReason.STATIONARY)) != 0) & ((reasons & np.uint32(but)) == 0)
+    return stamp_ns[find_runs(standing, piece)]
 
 
-def make_sensor_error(cut: pa.Table, rails: list[Rail], prior: PowerPrior, *, rule: Rule) -> SensorError:
+def audit_power_sensor(
+    rows: pa.Table, rails_by_epoch: Mapping[int, list[Rail]], info: TrackInfo, config: LabelConfig
+) -> PowerSensorFacts:
+    """Return what is not known of the power sensor: by the recipe, else by the kind of source and by what the run shows.
+
+    ``rows`` are those of the masked track.
+    """
+    power = info.report.facts.power
+    facts = PowerSensorFacts(*_find_prior(power))
+    if config.power_gain_std_fraction is not None:
+        facts = replace(facts, gain_std_fraction=config.power_gain_std_fraction)
+    else:
+        facts = _add_gain_change(facts, rails_by_epoch)
+    if config.power_offset_std_amp is not None:
+        return replace(facts, offset_std_amp=config.power_offset_std_amp)
+    if power is None or power.rest_current_amp is None:
+        return facts
+    rest_amp: dict[str, list[Floats]] = {}
+    for epoch, rails in rails_by_epoch.items():
+        still_ns = find_stationary_ns(select_rows(rows, "clock_epoch", epoch), info.rate_hz, but=DropReason.STUCK)
+        for rail in rails:
+            rest_amp.setdefault(rail.name, []).append(measure_rest_currents(rail, still_ns))
+    joined = [of for parts in rest_amp.values() if (of := np.concatenate(parts)).size]
+    if not joined:
+        return facts
+    std_amp = max(estimate_offset_std(of, power.rest_current_amp, facts.offset_std_amp) for of in joined)
+    low, high = zip(*map(summarize_rest, joined), strict=True)
+    return replace(facts, offset_std_amp=std_amp, rest_amp=(min(low), max(high)))
+
+
+def _find_prior(power: PowerSign | None) -> tuple[float, float]:
+    """Return the standard deviations of gain and zero [A] that the kind of source states."""
+    gain, offset = (power.gain_std_fraction, power.offset_std_amp) if power else (None, None)
+    return GAIN_STD_FRACTION if gain is None else gain, OFFSET_STD_AMP if offset is None else offset
+
+
+def _add_gain_change(facts: PowerSensorFacts, rails_by_epoch: Mapping[int, list[Rail]]) -> PowerSensorFacts:
+    """Return the facts with a changed gain: of both parts of the run either may be right."""
+    changes = [found for rails in rails_by_epoch.values() if (found := find_gain_change(measure_sag(rails)))]
+    if not changes:
+        return facts
+    change = max(changes, key=lambda of: abs(of.ratio - 1.0))
+    std = float(np.hypot(facts.gain_std_fraction, (change.ratio - 1.0) / 2.0**0.5))
+    return replace(facts, gain_std_fraction=std, gain_ratio=change.ratio, gain_changed_ns=change.at_ns)
+
+
+_POWER = Subject("role", "power")
+
+
+def find_sensor_findings(label: LabelFacts, info: TrackInfo, start_ns: int) -> Iterator[Finding]:
+    """Yield what the audit of the power sensor found; ``start_ns`` is when the track begins."""
+    facts, power = label.power_sensor, info.report.facts.power
+    if facts is None:
+        return
+    if facts.rest_amp and power and power.rest_current_amp and facts.offset_std_amp > _find_prior(power)[1]:
+        yield make_finding(
+            "current-offset",
+            _POWER,
+            remedies=suggest("state_offset", {"label": {"power_offset_std_amp": round(facts.offset_std_amp, 2)}}),
+            lowest_amp=facts.rest_amp[0],
+            highest_amp=facts.rest_amp[1],
+            least_amp=power.rest_current_amp[0],
+            most_amp=power.rest_current_amp[1],
+            offset_std_amp=facts.offset_std_amp,
+        )
+    if facts.gain_ratio is not None and facts.gain_changed_ns is not None:
+        at_s = (facts.gain_changed_ns - start_ns) * 1e-9
+        yield make_finding(
+            "current-gain-changes",
+            _POWER,
+            remedies=suggest("state_gain", {"label": {"power_gain_std_fraction": round(facts.gain_std_fraction, 3)}}),
+            span_s=(at_s, at_s),
+            gain_ratio=facts.gain_ratio,
+            at_s=at_s,
+            gain_std_fraction=facts.gain_std_fraction,
+        )
+    if facts.lost_signs:
+        yield make_finding("current-sign-lost", _POWER, segment_fraction=facts.lost_signs / label.segments)
+
+
+def make_sensor_error(cut: pa.Table, rails: list[Rail], facts: PowerSensorFacts, *, rule: Rule) -> SensorError:
     """Return what the power sensor's errors change of one epoch's segments: the zeros of several rails are independent, gains are not."""
     spans = to_integers(cut, "start_ns"), to_integers(cut, "end_ns")
     offsets = [
         integrate_energy(
-            [replace(rail, current_amp=np.full_like(rail.current_amp, prior.offset_amp))], *spans, rule=rule
+            [replace(rail, current_amp=np.full_like(rail.current_amp, facts.offset_std_amp))], *spans, rule=rule
         )
         for rail in rails
     ]
-    return SensorError(prior.gain_fraction, np.linalg.norm(offsets, axis=0) if offsets else np.nan)
+    rise = (to_floats(cut, "end_z_m") - to_floats(cut, "start_z_m")) / to_floats(cut, "chord_m")
+    lost = find_lost_signs(measure_sag(rails), *spans, rise)
+    # What flows back counts as drawn: the energy is wrong by twice itself.
+    sign_joule = np.where(lost, np.abs(integrate_energy(rails, *spans, rule=rule)), 0.0)
+    offset_joule = np.linalg.norm(offsets, axis=0) if offsets else np.nan
+    return SensorError(facts.gain_std_fraction, offset_joule, sign_joule)
 
 
 def compute_common_displacement_std_m(cut: pa.Table, facts: StageFacts) -> Floats:

@@ -103,6 +103,29 @@ class GateReset:
 
 
 @dataclass(frozen=True, slots=True)
+class ChangeFacts:
+    """A change that explains a contradiction: its kind (offset, antenna, clock, gyroscope, scale, pose, useless), sensor and span.
+
+    ``size``: largest innovation of fixes there [m]; 0 of another sensor.
+    """
+
+    kind: str
+    role: str
+    start_ns: int
+    end_ns: int
+    size: float
+
+
+@dataclass(frozen=True, slots=True)
+class ParameterFacts:
+    """What a section showed of a parameter: its difference from what was known beforehand, with σ, and σ beforehand."""
+
+    value: tuple[float, ...]
+    std: tuple[float, ...]
+    prior_std: tuple[float, ...]
+
+
+@dataclass(frozen=True, slots=True)
 class StretchFacts:
     """One section that was fused in one pass: counts and estimates of the filter, then its span and initial state.
 
@@ -129,6 +152,8 @@ class StretchFacts:
     visual_scale_std: float | None = field(default=None, metadata=LEFT_OUT)
     common_scale_std: float | None = field(default=None, metadata=LEFT_OUT)
     """σ of the unobservable common odometry scale, included in σ of distances, speeds and labels."""
+    changes: tuple[ChangeFacts, ...] = field(default=(), metadata=LEFT_OUT)
+    parameters: Mapping[str, ParameterFacts] = field(default_factory=dict, metadata=LEFT_OUT)
     clock_epoch: int = 0
     start_ns: int = 0
     end_ns: int = 0
@@ -383,6 +408,22 @@ class PhysicsFacts:
 
 
 @dataclass(frozen=True, slots=True)
+class PowerSensorFacts:
+    """What is not known of the power sensor: σ of its gain and of the zero of a rail [A], and what the log shows (`tcpipe.power.audit`).
+
+    ``rest_amp``: lowest and highest current of a rail in halts; the gain changed by ``gain_ratio`` at ``gain_changed_ns``;
+    ``lost_signs``: segments whose current flows back without a sign.
+    """
+
+    gain_std_fraction: float
+    offset_std_amp: float
+    rest_amp: tuple[float, float] | None = field(default=None, metadata=LEFT_OUT)
+    gain_ratio: float | None = field(default=None, metadata=LEFT_OUT)
+    gain_changed_ns: int | None = field(default=None, metadata=LEFT_OUT)
+    lost_signs: int = 0
+
+
+@dataclass(frozen=True, slots=True)
 class LabelFacts:
     """The run's energy by entry of the distance breakdown, its power rails by clock epoch, and uncertainty and flags of its labels."""
 
@@ -399,6 +440,7 @@ class LabelFacts:
     energy_budget: EnergyBudget | None
     quality: Mapping[str, int]
     physics: PhysicsFacts
+    power_sensor: PowerSensorFacts | None = field(default=None, metadata=LEFT_OUT)
 
 
 @dataclass(frozen=True, slots=True)

@@ -161,6 +161,7 @@ def test_sure_and_wrong_lost_and_silent_are_missed(cell):
     assert misses(cell, outcome(), outcome()) == ["named in 0%"]
     jitter = replace(outcome(), said=["gnss: stamps of 2 % of the fixes jitter [stamp-jitter]"])
     assert misses(cell, jitter, outcome()) == ["named in 0%"]
+    assert misses(cell, replace(outcome(), said=said), replace(outcome(), said=said)) == ["named in 0%"]
     gone = replace(outcome(0), said=said, track={})
     assert misses(cell, gone, outcome()) == ["100% lost"]
     wide = honesty.figures_of(cell.base, [outcome(sigma=2.0)], [outcome()])

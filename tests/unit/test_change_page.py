@@ -26,7 +26,7 @@ FIRST, LAST, REPLACE, APPEND, CREATE = "first statement", "last statement", "rep
 COLUMN = "dataclasses.replace({0}, columns=(*{0}.columns, Column('mine', pa.float64(), 'm', 'mine')))"
 CHANGES = {
     "threshold": ("FuseConfig", REPLACE, "= 0.999\n", "= 0.99\n"),
-    "outlier gate": ("filter_block", FIRST, "return 'mine'"),
+    "outlier gate": ("filter_ticks", FIRST, "return 'mine'"),
     "check of a sensor": ("check_sensors", FIRST, "return 'mine'"),
     "mask": ("mask_track", FIRST, "return 'mine'"),
     "w, v, T, E and their σ": ("compute_labels", FIRST, "displacement_std_m = 2 * displacement_std_m"),
@@ -97,7 +97,7 @@ except LogError as error:
 profiles = load_shipped_profiles()
 print(json.dumps({
     "threshold": Recipe().fuse.gate_probability == 0.99,
-    "outlier gate": call(filter_block) == "mine",
+    "outlier gate": call(filter_ticks) == "mine",
     "check of a sensor": call(check_sensors) == "mine",
     "mask": call(mask_track) == "mine",
     "w, v, T, E and their σ": bool(labels.duration_std_s[0] == 2.0),

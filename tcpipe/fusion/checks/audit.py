@@ -177,11 +177,6 @@ def is_astray(windows: int, astray: int) -> bool:
     return astray > max(1.0, _LITTLE * windows)
 
 
-def find_isolated_sensors(tallies: Iterable[Tally]) -> tuple[str, ...]:
-    """Return the sensors that two others contradict over most of the distance."""
-    return tuple(dict.fromkeys(t.sensor for t in _sum_tallies(tallies) if _is_most(t.alone, t.moving)))
-
-
 def find_undecided_sensors(tallies: Iterable[Tally]) -> tuple[tuple[str, What], ...]:
     """Return the sensors and quantities that contradict the track over most of the distance, where no third sensor decides.
 
@@ -192,17 +187,6 @@ def find_undecided_sensors(tallies: Iterable[Tally]) -> tuple[tuple[str, What], 
         for t in _sum_tallies(tallies)
         if t.what != "position" and _is_most(t.undecided + t.alone, t.moving) and not _is_most(t.alone, t.moving)
     )
-
-
-def is_consistent(tallies: Iterable[Tally]) -> bool:
-    """Return whether no sensor contradicts the track over more than a little of the distance, positions included."""
-    return all(t.undecided + t.alone <= _LITTLE * t.moving for t in _sum_tallies(tallies))
-
-
-def count_confirmations(tallies: Iterable[Tally]) -> int:
-    """Return how many sensors say a thing that another says as well: those that nothing else tells are held against themselves alone."""
-    told = [t.what for t in _sum_tallies(tallies) if _is_most(t.moving, t.moving) and t.what != "position"]
-    return len(told) - len(set(told))
 
 
 def _is_most(windows: int, moving: int) -> bool:

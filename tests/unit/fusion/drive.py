@@ -103,6 +103,7 @@ def measure(
     gnss_hz=10.0,
     gnss_outliers=0.02,
     gnss_outages=(),
+    gnss_kept_s=0.0,
     slip=0.12,
     visual_scale=1.02,
     imu_hz=200.0,
@@ -126,6 +127,8 @@ def measure(
             t = t[(t < a) | (t > b)]
         std = gnss_std * np.array([1, 1, 1.6])
         antenna = drive.at(drive.position, t) + drive.slerp(t).apply(LEVER) + rng.normal(size=(t.size, 3)) * std
+        if gnss_kept_s:  # 0.3 of the variance lasts
+            antenna += np.sqrt(0.3) * std * make_lasting_errors(t, gnss_kept_s, seed)
         wild = rng.random(t.size) < gnss_outliers
         antenna[wild] += rng.normal(size=(wild.sum(), 3)) * 1.5
         found["gnss"] = Positions(ns(t), antenna, np.tile(std**2, (t.size, 1)), LEVER)
@@ -162,6 +165,15 @@ def measure(
         force = drive.at(drive.force, t) + [0.05, -0.04, 0.06] + 2e-4 * walk + rng.normal(size=(t.size, 3)) * 0.08
         found["imu"] = InertialMeasurements(ns(t), gyro, force, np.full((t.size, 4), np.nan), 0.003, 0.10)
     return Measurements(**found)
+
+
+def make_lasting_errors(t, time_s, seed):
+    """Return Gauss-Markov errors of variance 1 with a correlation time at times [s], shape (N, 3)."""
+    found = np.random.default_rng((seed, 7)).normal(size=(t.size, 3))
+    kept = np.exp(-np.diff(t) / time_s)
+    for k, share in enumerate(kept):
+        found[k + 1] = share * found[k] + np.sqrt(1 - share**2) * found[k + 1]
+    return found
 
 
 def errors(drive, trajectory, *, after_s=0.0):

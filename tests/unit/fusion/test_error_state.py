@@ -9,13 +9,11 @@ from scipy.spatial.transform import Rotation
 from unit.fusion import drive
 
 from tcpipe.errors import FusionError
+from tcpipe.fusion import error_state
 from tcpipe.fusion.error_state import run_error_state
-from tcpipe.fusion.error_state_pass import FilterPass, compute_lag_rows
-from tcpipe.fusion.gnss_faults import find_fix_errors
 from tcpipe.fusion.initial import find_initial_state, find_stationary_intervals
-from tcpipe.fusion.measurements import GNSS, VISUAL, WHEELS
+from tcpipe.fusion.measurements import GNSS, VISUAL, WHEELS, BodyVelocities, Measurements
 from tcpipe.fusion.process import WHEEL_SCALE_STD, estimate_slope_std_rad
-from tcpipe.fusion.timeline import build_timeline
 from tcpipe.geometry.rotation import matrix_from_quat
 
 PERIOD_NS = 50_000_000
@@ -38,25 +36,28 @@ def smoothed(**faults):
     return fuse(drive.measure(truth(), 1, **faults))
 
 
-def test_figures_with_every_fault_on():
-    found = drive.errors(truth(), smoothed())
-    assert found["xy"] <= 0.006
-    assert found["z"] <= 0.006
+@pytest.mark.parametrize(("kept_s", "xy_m"), [(0.0, 0.010), (15.0, 0.018)])
+def test_figures_with_every_fault_on(kept_s, xy_m):
+    found = drive.errors(truth(), smoothed(gnss_kept_s=kept_s))
+    assert found["xy"] <= xy_m
+    assert found["z"] <= 0.020
     assert found["forward"] <= 0.004
-    assert found["yaw_deg"] <= 0.15
+    assert found["yaw_deg"] <= 0.12
     assert found["max_xy"] <= 0.03
-    assert found["yaw_rate"] <= 0.005
+    assert found["yaw_rate"] <= 0.002
+    for name in ("nees_position", "nees_forward"):
+        assert 0.1 <= found[name] <= 1.6
+    assert found["nees_yaw"] <= 1.6
 
 
-def test_the_smoother_beats_the_filter_and_both_are_honest():
-    forward = drive.errors(truth(), fuse(drive.measure(truth(), 1), smooth=False), after_s=10.0)
-    both = drive.errors(truth(), smoothed(), after_s=10.0)
-    assert both["forward"] <= 0.6 * forward["forward"]
-    assert both["xy"] <= 0.7 * forward["xy"]
-    for found in (forward, both):
-        assert 0.5 <= found["nees_position"] <= 1.6
-        assert 0.1 <= found["nees_yaw"] <= 2.0
-        assert 0.25 <= found["nees_forward"] <= 1.6
+def test_a_declared_arm_costs_nothing():
+    measurements = drive.measure(truth(), 1)
+    exact = replace(measurements.gnss, lever_arm_std_m=(0.0, 0.0, 0.0))
+    found = fuse(replace(measurements, gnss=exact))
+    stated = smoothed()
+    assert "antenna" not in found.facts.parameters
+    assert drive.errors(truth(), found)["xy"] <= 0.009
+    assert np.median(found.position_std_m[:, 2]) < 0.8 * np.median(stated.position_std_m[:, 2])
 
 
 @pytest.mark.parametrize("faults", [{}, {"gnss_std": 0.05}, {"visual": False}], ids=str)
@@ -79,8 +80,7 @@ def test_facts_name_what_the_sensors_were():
     assert facts.gyro_bias_radps == pytest.approx([0.006, -0.004, 0.008], abs=1e-3)
     assert facts.visual_scale == pytest.approx(1.02, abs=0.01)
     assert set(facts.nis_mean) == {GNSS, WHEELS, VISUAL}
-    assert all(0.7 < facts.nis_mean[role] < 1.3 for role in (GNSS, VISUAL))
-    assert 0.05 < facts.nis_mean[WHEELS] < 1.0  # beyond noise they claim nothing here; slip is a state
+    assert all(0.2 < facts.nis_mean[role] < 1.6 for role in (GNSS, WHEELS, VISUAL))
     assert facts.covariance_repairs == 0
 
 
@@ -104,7 +104,7 @@ def test_outliers_are_refused_and_listed():
         ({"wheels": False, "visual": False}, 0.01, 0.01, 0.5),
         ({"imu": False}, 0.10, 0.05, 6.0),
         ({"imu": False, "visual": False}, 0.15, 0.05, 6.0),
-        ({"gnss_std": 1.0, "gnss_hz": 1.0}, 0.6, 0.01, 0.5),
+        ({"gnss_std": 1.0, "gnss_hz": 1.0}, 0.6, 0.02, 0.5),
         ({"imu_hz": 20.0}, 0.01, 0.01, 0.4),
     ],
     ids=["no visual", "no wheels", "gnss and imu", "no imu", "gnss and wheels", "sbas", "slow imu"],
@@ -122,77 +122,10 @@ def test_an_outage_of_a_minute_shows_in_the_deviations():
     outage = smoothed(gnss_outages=((50.0, 110.0),))
     found = drive.errors(truth(), outage)
     assert found["xy"] <= 0.10
-    assert 0.3 <= found["nees_position"] <= 2.5
+    assert 0.05 <= found["nees_position"] <= 2.5
     t = (outage.stamp_ns - drive.ZERO_NS) * 1e-9
     inside, outside = outage.position_std_m[(t > 70) & (t < 90), 0], outage.position_std_m[(t > 20) & (t < 45), 0]
     assert np.median(inside) > 4 * np.median(outside)
-
-
-def displaced(measurements, start_s, end_s, offset_m, *, ramp_s=0.0):
-    """Return the measurements with fixes that are off by ``offset_m`` (3,) for some time, growing to it over ``ramp_s``."""
-    t = (measurements.gnss.stamp_ns - drive.ZERO_NS) * 1e-9
-    share = np.clip((t - start_s) / max(ramp_s, 1e-9), 0.0, 1.0) * (t < end_s)
-    fixes = measurements.gnss.position_enu_m + share[:, None] * np.asarray(offset_m)
-    return replace(measurements, gnss=replace(measurements.gnss, position_enu_m=fixes))
-
-
-def normalized(found, *, first_s, last_s):
-    """Return the horizontal error over its deviation between two times, shape (N,), and the largest error [m]."""
-    t = (found.stamp_ns - drive.ZERO_NS) * 1e-9
-    rows = (t > first_s) & (t < last_s)
-    error = (found.position_enu_m - truth().at(truth().position, t))[rows, :2]
-    return np.hypot(*(error / found.position_std_m[rows, :2]).T), np.hypot(*error.T).max()
-
-
-@pytest.mark.parametrize(("start_s", "end_s", "ramp_s"), [(70, 80, 0), (65, 110, 0), (65, 110, 10)], ids=str)
-def test_fixes_that_err_together_move_neither_the_track_nor_what_it_claims(start_s, end_s, ramp_s):
-    found = fuse(displaced(drive.measure(truth(), 1), start_s, end_s, (0.4, -0.3, 0.2), ramp_s=ramp_s))
-    off, most_m = normalized(found, first_s=5, last_s=145)
-    assert most_m < 0.1
-    assert np.mean(off < 2 * np.sqrt(2)) > 0.85
-    first = next(r for r in found.facts.gate_resets if r.role == GNSS)
-    assert start_s - 5 < (first.start_ns - drive.ZERO_NS) * 1e-9 <= start_s  # with what leads up to it
-    assert (first.end_ns - drive.ZERO_NS) * 1e-9 == pytest.approx(end_s, abs=0.5)
-    if not ramp_s:
-        assert first.size == pytest.approx(0.5, abs=0.1)
-        assert np.median(found.position_std_m[-100:, 0]) < 0.02  # the fixes are right again, and count again
-
-
-def test_a_jump_that_stays_is_taken_for_an_error_of_the_fixes():
-    found = fuse(displaced(drive.measure(truth(), 1), 70.0, 1e9, (3.0, 0.0, 0.0)))
-    (gate_reset,) = [r for r in found.facts.gate_resets if r.role == GNSS]
-    assert gate_reset.size == pytest.approx(3.0, abs=0.1)
-    off, most_m = normalized(found, first_s=5, last_s=145)
-    assert most_m < 0.5
-    assert np.mean(off < 2 * np.sqrt(2)) > 0.85
-    assert found.position_std_m[-1, 0] > 5 * np.median(found.position_std_m[200:1000, 0])
-
-
-def test_a_noisy_minute_counts_as_noisy_there_alone():
-    measurements = drive.measure(truth(), 1)
-    t = (measurements.gnss.stamp_ns - drive.ZERO_NS) * 1e-9
-    noise = np.random.default_rng(3).normal(size=(t.size, 3)) * 0.06 * ((t > 60) & (t < 100))[:, None]
-    fixes = replace(measurements.gnss, position_enu_m=measurements.gnss.position_enu_m + noise)
-    errors = find_fix_errors(replace(measurements, gnss=fixes))
-    assert np.sqrt(np.median(errors.white_m2[(t > 65) & (t < 95), 0])) == pytest.approx(0.062, rel=0.25)
-    assert np.sqrt(errors.white_m2[(t < 50) | (t > 110), 0]) == pytest.approx(0.015, rel=0.01)
-    assert not errors.matters
-
-
-def test_fixes_that_claim_nothing_are_as_good_as_they_scatter():
-    measurements = drive.measure(truth(), 1)
-    unknown = np.ones(measurements.gnss.stamp_ns.size, bool)
-    fixes = replace(measurements.gnss, variance_m2=np.full_like(measurements.gnss.variance_m2, 0.05**2))
-    silent = replace(fixes, unclaimed=unknown)
-    errors = find_fix_errors(replace(measurements, gnss=silent))
-    assert np.sqrt(np.median(errors.white_m2[:, 0])) == pytest.approx(0.015, rel=0.15)
-    assert not errors.matters
-    # A receiver that says five centimetres means them.
-    assert np.sqrt(np.median(find_fix_errors(replace(measurements, gnss=fixes)).lasting_m2[:, 0])) > 0.04
-    t = (silent.stamp_ns - drive.ZERO_NS) * 1e-9
-    wave = 0.5 * np.sin(t[:, None] / 4.0) * ((t > 60) & (t < 110))[:, None] * [1.0, 0.0, 0.0]
-    bent = find_fix_errors(replace(measurements, gnss=replace(silent, position_enu_m=silent.position_enu_m + wave)))
-    assert np.sqrt(np.median(bent.lasting_m2[(t > 65) & (t < 105), 0])) > 0.5
 
 
 def test_without_gnss_the_track_starts_at_the_origin_and_keeps_its_shape():
@@ -253,50 +186,6 @@ def test_a_speed_without_a_yaw_rate_goes_where_the_fixes_go():
     assert (across > sway_m * (1.0 - rotation[:, 2, 1] ** 2) / np.sqrt(2.0)).all()
 
 
-def test_the_noise_of_a_turn_rate_is_no_scale_of_it():
-    """A camera off base_link feels each turn as a velocity: there the noise of its rate would pull the rate's scale towards nothing."""
-    measurements = drive.measure(truth(), 1, imu=False, wheels=False)
-    at_s = (measurements.visual.stamp_ns - drive.ZERO_NS) * 1e-9
-    rate = truth().at(truth().rate, at_s)
-    rate = rate + np.random.default_rng(3).normal(size=rate.shape) * 0.02
-    turning = replace(
-        measurements.visual, turn_rate_radps=rate, yaw_rate_radps=rate[:, 2], yaw_rate_var=np.full(at_s.size, 0.02**2)
-    )
-    output_ns = np.arange(int(measurements.gnss.stamp_ns[-1]) - 10**9, int(measurements.gnss.stamp_ns[-1]), 10**8)
-    seen = replace(measurements, visual=turning)
-    run = FilterPass(
-        build_timeline(seen, find_stationary_intervals(seen), output_ns), seen, 0.999, lags=compute_lag_rows(output_ns)
-    )
-    run.filtered(find_initial_state(seen, find_stationary_intervals(seen), int(seen.gnss.stamp_ns[0])))
-    scale, std = run.last.x[9:12], np.sqrt(np.diag(run.last.P)[3:6])
-    assert std[0] < 0.08
-    assert (np.abs(scale) < 2.0 * std).all()
-
-
-@pytest.mark.parametrize("span_s", [(60.0, 90.0), (0.0, 40.0)])
-def test_a_pass_that_goes_on_from_another_ones_checkpoint_is_the_pass_itself(span_s):
-    measurements = drive.measure(truth(), 1)
-    standing, output_ns = find_stationary_intervals(measurements), measurements.gnss.stamp_ns[:1]
-    timeline = build_timeline(measurements, standing, output_ns)
-    first_ns = int(timeline.stamp_ns[0])
-    initial = find_initial_state(measurements, standing, first_ns)
-    errors = find_fix_errors(measurements)
-    spans = (tuple(first_ns + int(at_s * 1e9) for at_s in span_s),)
-
-    def made(spans):
-        run = FilterPass(timeline, measurements, 0.999, lags=[1, 2, 4, 8])
-        run.doubt_fixes(errors, spans, follows=False)
-        return run
-
-    plain, whole, resumed = made(()), made(spans), made(spans)
-    plain.filtered(initial)
-    whole.filtered(initial)
-    resumed.filtered_like(plain, initial)
-    assert (whole.nis != plain.nis).any()
-    for name in ("nis", "innovation", "verdict"):
-        np.testing.assert_array_equal(getattr(resumed, name), getattr(whole, name))
-
-
 def test_noisy_fixes_alone_say_that_they_hardly_tell_a_speed():
     measurements = drive.measure(truth(), 1, imu=False, visual=False, wheels=False, gnss_std=2.3, gnss_hz=1.0)
     found = fuse(measurements)
@@ -326,16 +215,56 @@ def test_an_estimate_that_is_not_finite_is_an_error():
     assert [of.code for of in error.value.findings] == ["estimate-not-finite"]
 
 
-def test_a_receiver_whose_clock_is_off_is_trusted_less_rather_than_refused():
+@pytest.mark.parametrize("lag_s", [0.05, 0.10])
+def test_a_receiver_whose_clock_is_off_is_read_at_its_time(lag_s):
     late = drive.measure(truth(), 1)
-    shifted = replace(late.gnss, stamp_ns=late.gnss.stamp_ns + 250_000_000)
-    found = fuse(replace(late, gnss=shifted))
-    assert found.facts.rejected[GNSS] < 0.2 * found.facts.measurements[GNSS]
-    assert max(r.size for r in found.facts.gate_resets) > 0.1
-    error = drive.errors(truth(), found, after_s=5.0)
-    assert 0.1 < error["xy"] < 0.3  # a quarter of a second of way, but no more
-    assert error["forward"] < 0.03
-    assert smoothed().facts.gate_resets == ()
+    found = fuse(replace(late, gnss=replace(late.gnss, stamp_ns=late.gnss.stamp_ns + round(lag_s * 1e9))))
+    lag = found.facts.parameters["lag of fixes"]
+    assert lag.prior_std == (0.02,)
+    assert lag.value[0] == pytest.approx(lag_s, abs=3.5 * lag.std[0])
+    assert lag.std[0] < 0.005
+    assert drive.errors(truth(), found)["xy"] < 0.012
+    assert found.facts.gate_resets == ()
+
+
+def test_the_last_bit_of_a_measurement_decides_nothing():
+    """Platforms differ in the last bits of their arithmetic."""
+    measurements = drive.measure(truth(), 1)
+    nearby = replace(measurements.gnss, position_enu_m=measurements.gnss.position_enu_m * (1.0 + 1e-13))
+    found, again = smoothed(), fuse(replace(measurements, gnss=nearby))
+    assert again.facts.rejected == found.facts.rejected
+    assert np.abs(again.position_enu_m - found.position_enu_m).max() < 1e-8
+    np.testing.assert_allclose(again.position_std_m, found.position_std_m, rtol=1e-4)
+    np.testing.assert_allclose(again.displacement_std_m, found.displacement_std_m, rtol=1e-4)
+
+
+def test_any_size_of_blocks_gives_the_same(monkeypatch):
+    whole = smoothed()
+    monkeypatch.setattr(error_state, "_BLOCK", 61)
+    found = fuse(drive.measure(truth(), 1))
+    for name in ("position_enu_m", "quat_xyzw", "position_std_m", "displacement_std_m"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(whole, name))
+    assert found.facts == whole.facts
+
+
+@pytest.mark.parametrize(("hills", "within"), [(0.0, 5e-4), (1.0, 5e-3)], ids=["flat", "hilly"])
+def test_a_track_of_wheels_alone_is_as_long_as_they_say(hills, within):
+    """The wheels follow the ground: on a slope their length is that in space."""
+    s = np.arange(0.0, 120.0, 0.02)
+    speed = 0.9 * np.clip(s - 2.0, 0.0, 1.0) * (1.0 + 0.1 * np.sin(s / 3.0))
+    climb = hills * 0.3 * np.sin(s / 9.0)
+    turn = 0.3 * np.sin(s / 5.0) + 0.1
+    stamp_ns = drive.ns(s)
+    noise = np.random.default_rng(4).normal(size=(s.size, 2))
+    three = np.full((s.size, 3), np.nan)
+    velocity, variance = three.copy(), three.copy()
+    velocity[:, 0], variance[:, 0] = speed + 0.01 * noise[:, 0], 0.03**2
+    rate = turn * np.cos(climb) * (speed > 0) + 0.01 * noise[:, 1]
+    wheels = BodyVelocities(stamp_ns, velocity, variance, rate, np.full(s.size, 0.05**2))
+    found = fuse(Measurements(wheels=wheels))
+    driven_m = np.sum(np.linalg.norm(np.diff(found.position_enu_m, axis=0), axis=1))
+    own_m = drive.integral(stamp_ns, speed)[-1]
+    assert driven_m == pytest.approx(own_m, rel=within)
 
 
 def test_two_fixes_close_together_say_nothing_of_how_long_a_metre_is():

@@ -5,6 +5,7 @@ import pyproj
 import pytest
 from scipy.spatial.transform import Rotation
 
+from tcpipe.fusion.measurements import STATED_ARM_STD_M
 from tcpipe.fusion.preparation import (
     find_datum,
     prepare_body_velocities,
@@ -29,7 +30,7 @@ def gnss_columns(lon, lat, alt, variance=0.0004):
 
 
 def fixes(stamp_ns, columns):
-    rules = {"lever_arm_m": ARM, "default_std_m": 0.05, "floor_std_m": 0.01}
+    rules = {"lever_arm_m": ARM, "lever_arm_std_m": STATED_ARM_STD_M, "default_std_m": 0.05, "floor_std_m": 0.01}
     return prepare_positions(stamp_ns, columns, datum_deg_m=DATUM, **rules)
 
 

@@ -9,10 +9,10 @@ from suggested_recipes import proposed
 
 from tcpipe.recipe import FuseConfig, ReadConfig
 from tcpipe.simulation import find_scenario
-from tcpipe.stages.clock_findings import add_gnss_time_offset, add_offset_uncertainty, check_clocks
+from tcpipe.stages.clock_findings import add_offset_uncertainty, check_clocks
 from tcpipe.stages.fuse_inputs import prepare_inputs
-from tcpipe.tables.facts import ClockFacts, ClockOffset
-from tcpipe.tables.findings import StageReport, Subject, make_finding
+from tcpipe.tables.facts import ClockFacts
+from tcpipe.tables.findings import Subject
 
 LATE_S = {"gnss": 0.25, "wheel_odometry": 0.15, "imu": -0.10, "visual_odometry": 0.20, "power": 0.25}
 WITHIN_S = {"gnss": 0.020, "wheel_odometry": 0.020, "imu": 0.020, "visual_odometry": 0.020, "power": 0.050}
@@ -94,21 +94,3 @@ def test_what_an_offset_costs_is_the_way_driven_in_it():
     turned = add_offset_uncertainty(track, replace(facts, position_offset_s=None, heading_offset_s=0.1))
     assert turned.column("x_std_m").to_pylist() == pytest.approx([0.05, 0.13])  # 1.2 rad/s for 0.1 s, over a metre
     assert turned.column("z_std_m").to_pylist() == [0.05, 0.05]
-
-
-def test_a_lag_that_only_the_path_tells_is_said_and_costs_what_is_driven_in_it():
-    before = make_finding(
-        "time-offset", Subject("role", "power"), offset_s=0.1, offset_2std_s=0.02, names={"reference": "imu"}
-    )
-    silent = StageReport((before,), ClockFacts(0, "imu", (), {}))
-    assert add_gnss_time_offset(silent, None) is silent
-    found = add_gnss_time_offset(silent, (0.12, 0.02))
-    assert found.facts.position_offset_s == 0.12
-    assert found.facts.offsets["gnss"].noted
-    assert not found.facts.offsets["gnss"].blamed
-    assert found.findings[0] == before
-    assert (found.findings[1].code, found.findings[1].subject.name) == ("clocks-differ", "gnss")
-    assert found.findings[1].numbers == {"offset_s": 0.12, "offset_2std_s": 0.04, "apart_s": 0.12}
-    told = ClockOffset(0.1, 0.01, True, None, None, False)
-    by_signals = StageReport((), ClockFacts(0, "imu", (), {"gnss": told}))
-    assert add_gnss_time_offset(by_signals, (0.12, 0.02)) is by_signals

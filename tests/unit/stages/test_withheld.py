@@ -16,6 +16,7 @@ from tcpipe.stages import withheld
 from tcpipe.stages.fuse import fuse_run
 from tcpipe.stages.withheld import compare_withheld, withhold
 from tcpipe.tables.columns import to_floats, to_integers
+from tcpipe.tables.facts import MountingFacts
 from tcpipe.tables.levels import GNSS_VELOCITY
 
 SECONDS = 185.0
@@ -97,6 +98,20 @@ def test_a_sigma_is_held_against_errors_of_its_size(streams, track, monkeypatch)
     assert tenth.calibration == "overconfident"
     assert tenth.within_2_sigma < 0.5 < honest.within_2_sigma
     assert (vast.calibration, vast.within_1_sigma) == ("underconfident", 1.0)
+
+
+def test_what_is_not_known_of_the_lever_arm_is_no_part_of_the_antennas_sigma(streams, track, monkeypatch):
+    """The σ of base_link contains 0.5 m of the arm along each axis of the body; the antenna is known to 0.3 m."""
+    stated = replace(streams, sensors={**streams.sensors, "gnss": sensor((0.0, 0.0, 0.0))})
+    facts = replace(track.info.report.facts, mounting=MountingFacts(drive.LEVER, (0.5, 0.5, 0.5)))
+    estimated = replace(track, info=replace(track.info, report=replace(track.info.report, facts=facts)))
+    (fixes,) = (
+        of
+        for of in audited(stated, estimated, monkeypatch, shift(0.0, float(np.hypot(0.3, 0.5))))
+        if of.chord_s is None
+    )
+    assert fixes.std_m == pytest.approx(0.3, rel=0.02)
+    assert score_comparisons([fixes]).median_error_m < 0.05, "the antenna is where the estimated arm has it"
 
 
 def test_one_window_shows_only_gross_overconfidence(streams, track, monkeypatch):

@@ -1,0 +1,821 @@
+"""Forward pass of the error-state unscented filter over ticks of the track, and its backward pass, the smoother.
+
+Means pass through motion and measurements at the centre. Covariances pass through sigma points of the errors on which each depends, drawn
+anew from their marginal covariance: with ``P_s = L L'``, the points ``x ± √3 L_i`` give the linear map ``F`` that fits
+the function best and, as additional noise, what that map misses::
+
+    F L_i = (f(x + √3 L_i) - f(x - √3 L_i)) / 2√3        missed: Σ e_i e_i' / 3,  e_i = (f(x + √3 L_i) + f(x - √3 L_i)) / 2 - f(x)
+
+The smoother is that of Bryson and Frazier in the form of Bierman: it inverts no covariance, so parameters may be known exactly. Back in
+time over each update (gain K, innovation y of covariance S; G turns the axes of the error with the correction) and each motion F::
+
+    l ← G' l, Λ ← G' Λ G    l ← (I - K H)' l - H' S⁻¹ y,  Λ ← (I - K H)' Λ (I - K H) + H' S⁻¹ H    l ← F' l, Λ ← F' Λ F
+    x_s = x - P l    P_s = P - P Λ P    cov(d_j, d_k) = P_j (product of all transitions from j to k)' (I - Λ_k P_k),  j < k
+
+References: M. Brossard et al., "A code for unscented Kalman filtering on manifolds (UKF-M)", ICRA 2020; G. J. Bierman, "Fixed interval
+smoothing with discrete measurements", International Journal of Control 18 (1), 1973.
+"""
+
+from __future__ import annotations
+
+from math import log, sqrt
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tcpipe.compiled import compile_kernel
+from tcpipe.fusion.state import (
+    FIX,
+    FIX_ERROR,
+    GYRO_TURN,
+    KINDS,
+    MOVING,
+    NX,
+    RHO,
+    SIZES,
+    THETA,
+    VISUAL,
+    WHEELS,
+    Matrix,
+    N,
+    U,
+    Vector,
+    compute_moving_error,
+    displace_state,
+    make_rotation,
+    move_state,
+    predict_measurement,
+)
+
+NONE, ACCEPTED, REJECTED, RESET = range(4)
+"""Verdicts of the gate. RESET: rejected for so long that the state is taken to be wrong, not the sensor."""
+
+Indices = NDArray[np.int64]
+
+
+class Inputs(NamedTuple):
+    """All that a section measures, by tick k of K; see `tcpipe.fusion.ticks`.
+
+    Attributes
+    ----------
+    period_s : time of a tick [s].
+    mode, turned, gained : motion from the tick before, as `move_state` takes it, (K,), (K, 9), (K, 6).
+    noise : variance added to rotation and body velocity [rad², m²/s²], (K, 6).
+    rate, has_gyro : angular velocity at the tick, as measured [rad/s], (K, 3), and whether by a gyroscope, (K,).
+    quickens : acceleration forward at the tick [m/s²], for the wheels and fixes, and for the camera, (K, 2). Not the state's own, whose
+        noise would look like a lag of every sensor.
+    value, variance : measurements by kind, (K, 8, 3); NaN: none.
+    tau : time of the measurement after the tick [s], (K, 8).
+    levers : places of odometries on the robot [m], (8, 3).
+    fix_kept, fix_noise : share of the fixes' correlated error that stays since the tick before (K,), and variance added to it [m²], (K, 3).
+    """
+
+    period_s: float
+    mode: NDArray[np.int8]
+    turned: Matrix
+    gained: Matrix
+    noise: Matrix
+    rate: Matrix
+    has_gyro: NDArray[np.bool_]
+    quickens: Matrix
+    value: NDArray[np.float64]
+    variance: NDArray[np.float64]
+    tau: Matrix
+    levers: Matrix
+    fix_kept: Vector
+    fix_noise: Matrix
+
+
+class Model(NamedTuple):
+    """What the filter assumes.
+
+    Attributes
+    ----------
+    active : errors that are not known exactly, in order, (n,).
+    depends : by kind of measurement, and then motion by odometry and by gyroscope, the places in ``active`` of the errors on which it
+        depends, (10, n), of which the first ``counts`` (10,) are used.
+    kept, noise : share that stays of each error over a tick, and variance added, (n,).
+    gates : largest squared normalised innovation by kind; infinite: no gate.
+    patience : by kind, rejections in a row, and seconds since the last accepted measurement, after which one is accepted; the seconds
+        where no other sensor of motion is heard; (8, 3).
+    mount : place of the IMU's mounting in ``active``; -1: known exactly.
+    scales : by kind, the place in ``active`` of the sensor's own scale; -1: none.
+    events : at a tick, errors from a place in ``active`` on: (tick, place, count, whether the error is another one now); (e, 4).
+    sizes : variance added by each event, (e,).
+    ignored : measurements that are predicted and not used: (kind, first tick, last tick, the latter excluded), (i, 3).
+    """
+
+    active: Indices
+    depends: NDArray[np.int64]
+    counts: Indices
+    kept: Vector
+    noise: Vector
+    gates: Vector
+    patience: Matrix
+    mount: int
+    scales: Indices
+    events: NDArray[np.int64]
+    sizes: Vector
+    ignored: NDArray[np.int64]
+
+
+class Memory(NamedTuple):
+    """State carried from tick to tick: x (43,), P (n, n), rejections in a row and seconds since the last accepted, by kind, (8, 2)."""
+
+    x: Vector
+    P: Matrix
+    waits: Matrix
+
+    def copy(self) -> Memory:
+        """Return a copy."""
+        return Memory(self.x.copy(), self.P.copy(), self.waits.copy())
+
+
+class Steps(NamedTuple):
+    """What the smoother needs of B ticks: motion F, kept shares, updates by kind (gain K, H, S⁻¹ y, S⁻¹, turn of axes), P after all."""
+
+    F: NDArray[np.float64]
+    kept: Matrix
+    used: NDArray[np.bool_]
+    K: NDArray[np.float64]
+    H: NDArray[np.float64]
+    pull: NDArray[np.float64]
+    inverse: NDArray[np.float64]
+    turn: NDArray[np.float64]
+    P: NDArray[np.float64]
+
+
+class Tests(NamedTuple):
+    """By tick and kind: squared normalised innovation, log det S, verdict of the gate; innovation of the fixes."""
+
+    nis: Matrix
+    log_det: Matrix
+    verdict: NDArray[np.int8]
+    fix_innovation: Matrix
+
+
+MOTION_WITHOUT_GYRO, MOTION_WITH_GYRO = KINDS, KINDS + 1
+"""Rows of `Model.depends` beside the kinds of measurements."""
+MOST = MOVING + 1
+"""Errors on which motion depends, at most."""
+_SILENT_S = 2.0
+_SPREAD = sqrt(3.0)  # matches the fourth moment of a normal distribution
+
+
+def allocate_steps(ticks: int, n: int) -> Steps:
+    """Return room for what the smoother needs of so many ticks."""
+    return Steps(
+        np.zeros((ticks, MOST, MOST)),
+        np.ones((ticks, n)),
+        np.zeros((ticks, KINDS), np.bool_),
+        np.zeros((ticks, KINDS, 3, n)),
+        np.zeros((ticks, KINDS, 3, n)),
+        np.zeros((ticks, KINDS, 3)),
+        np.zeros((ticks, KINDS, 3, 3)),
+        np.zeros((ticks, KINDS, 18)),
+        np.zeros((ticks, n, n)),
+    )
+
+
+@compile_kernel
+def _factorize(P: Matrix, places: Indices, m: int, L: Matrix) -> None:
+    """Fill L with the lower Cholesky factor of P at m places; a pivot that rounding has spoiled is lifted."""
+    for i in range(m):
+        for j in range(i + 1):
+            s = P[places[i], places[j]]
+            for k in range(j):
+                s -= L[i, k] * L[j, k]
+            if i == j:
+                L[i, i] = sqrt(max(s, 1e-14 * P[places[i], places[i]] + 1e-300))
+            else:
+                L[i, j] = s / L[j, j]
+
+
+@compile_kernel
+def _solve_for_map(M: Matrix, rows: int, L: Matrix, m: int, F: Matrix) -> None:
+    """Fill F with M L⁻¹."""
+    for a in range(rows):
+        for i in range(m - 1, -1, -1):
+            s = M[a, i]
+            for j in range(i + 1, m):
+                s -= F[a, j] * L[j, i]
+            F[a, i] = s / L[i, i]
+
+
+@compile_kernel
+def _move(k: int, inputs: Inputs, model: Model, x: Vector, P: Matrix, F: Matrix, room: Any) -> None:
+    """Carry x and P over the motion of tick k; F becomes the map of the errors on which it depends."""
+    L, M, W, missed, d, high, low, centre, turn, up, down = room
+    mode = inputs.mode[k]
+    row = MOTION_WITH_GYRO if mode >= GYRO_TURN else MOTION_WITHOUT_GYRO
+    places, m, n = model.depends[row], model.counts[row], P.shape[0]
+    move_state(x, mode, inputs.period_s, inputs.turned[k], inputs.gained[k], centre, turn)
+    _factorize(P, places, m, L)
+    for a in range(m):
+        for b in range(m):
+            missed[a, b] = 0.0
+    for i in range(m):
+        for e in range(N):
+            d[e] = 0.0
+        for r in range(i, m):
+            d[model.active[places[r]]] = _SPREAD * L[r, i]
+        displace_state(x, d, 1.0, low, turn)
+        move_state(low, mode, inputs.period_s, inputs.turned[k], inputs.gained[k], high, turn)
+        compute_moving_error(high, centre, up)
+        displace_state(x, d, -1.0, low, turn)
+        move_state(low, mode, inputs.period_s, inputs.turned[k], inputs.gained[k], high, turn)
+        compute_moving_error(high, centre, down)
+        for a in range(m):
+            e = model.active[places[a]]
+            if e < MOVING:
+                M[a, i] = 0.5 / _SPREAD * (up[e] - down[e])
+                d[e] = 0.5 * (up[e] + down[e])
+            else:
+                M[a, i] = L[a, i] if a >= i else 0.0
+                d[e] = 0.0
+        for a in range(m):
+            for b in range(m):
+                missed[a, b] += d[model.active[places[a]]] * d[model.active[places[b]]] / 3.0
+    _solve_for_map(M, m, L, m, F)
+    for a in range(m):
+        for j in range(n):
+            W[a, j] = 0.0
+        for b in range(m):
+            f = F[a, b]
+            line = P[places[b]]
+            for j in range(n):
+                W[a, j] += f * line[j]
+    for a in range(m):
+        for j in range(n):
+            P[places[a], j] = W[a, j]
+            P[j, places[a]] = W[a, j]
+    for a in range(m):
+        for b in range(a + 1):
+            s = missed[a, b]
+            for c in range(m):
+                s += W[a, places[c]] * F[b, c]
+            P[places[a], places[b]] = s
+            P[places[b], places[a]] = s
+    for j in range(NX):
+        x[j] = centre[j]
+    for e in range(3):  # rotation and velocity are always active, and first
+        P[THETA + e, THETA + e] += inputs.noise[k, e]
+        P[U + e, U + e] += inputs.noise[k, 3 + e]
+
+
+@compile_kernel
+def _decay(k: int, inputs: Inputs, model: Model, x: Vector, P: Matrix, kept: Vector) -> None:
+    """Let parameters decay and wander over tick k; begin its events. ``kept`` becomes the share that stays of each error."""
+    n = P.shape[0]
+    for i in range(n):
+        is_fix_error = FIX_ERROR <= model.active[i] < FIX_ERROR + 3
+        kept[i] = inputs.fix_kept[k] if is_fix_error else model.kept[i]
+    for j in range(model.events.shape[0]):
+        tick, first, count, is_new = model.events[j]
+        if tick == k:
+            for i in range(first, first + count):
+                kept[i] = 0.0 if is_new else kept[i]
+    for i in range(n):
+        if kept[i] != 1.0:
+            x[model.active[i] + 6] *= kept[i]
+            for j in range(n):
+                P[i, j] *= kept[i]
+                P[j, i] *= kept[i]
+        P[i, i] += model.noise[i]
+        if FIX_ERROR <= model.active[i] < FIX_ERROR + 3:
+            P[i, i] += inputs.fix_noise[k, model.active[i] - FIX_ERROR]
+    for j in range(model.events.shape[0]):
+        if model.events[j, 0] == k:
+            for i in range(model.events[j, 1], model.events[j, 1] + model.events[j, 2]):
+                P[i, i] += model.sizes[j]
+
+
+@compile_kernel
+def _compare(
+    k: int, kind: int, inputs: Inputs, model: Model, x: Vector, P: Matrix, quickens: Vector, gain: Any, room: Any
+) -> float:
+    """Fill innovation, H, P H', S and S⁻¹ of one measurement; return log det S."""
+    y, H, Hs, cross, S, inverse = gain
+    L, M, missed, d, high, turn, up, down = room[0], room[1], room[3], room[4], room[5], room[8], room[9], room[10]
+    places, m, size, n = model.depends[kind], model.counts[kind], SIZES[kind], P.shape[0]
+    rate, gyro, tau, lever = inputs.rate[k], inputs.has_gyro[k], inputs.tau[k, kind], inputs.levers[kind]
+    centre = S[0]
+    predict_measurement(kind, x, rate, gyro, quickens, tau, lever, centre)
+    for a in range(size):
+        y[a] = centre[a]
+    _factorize(P, places, m, L)
+    for a in range(3):
+        for b in range(3):
+            missed[a, b] = 0.0
+    for i in range(m):
+        for e in range(N):
+            d[e] = 0.0
+        for r in range(i, m):
+            d[model.active[places[r]]] = _SPREAD * L[r, i]
+        displace_state(x, d, 1.0, high, turn)
+        predict_measurement(kind, high, rate, gyro, quickens, tau, lever, up)
+        displace_state(x, d, -1.0, high, turn)
+        predict_measurement(kind, high, rate, gyro, quickens, tau, lever, down)
+        for a in range(size):
+            M[a, i] = 0.5 / _SPREAD * (up[a] - down[a])
+            for b in range(a + 1):
+                missed[a, b] += (0.5 * (up[a] + down[a]) - y[a]) * (0.5 * (up[b] + down[b]) - y[b]) / 3.0
+    _solve_for_map(M, size, L, m, Hs)
+    for a in range(size):
+        for j in range(n):
+            H[a, j] = 0.0
+            cross[a, j] = 0.0
+        for i in range(m):
+            h = Hs[a, i]
+            H[a, places[i]] = h
+            line = P[places[i]]
+            for j in range(n):
+                cross[a, j] += h * line[j]
+    for a in range(size):
+        for b in range(a + 1):
+            s = missed[a, b]
+            for i in range(m):
+                s += Hs[b, i] * cross[a, places[i]]
+            S[a, b] = s
+            S[b, a] = s
+        S[a, a] += inputs.variance[k, kind, a]
+        y[a] = inputs.value[k, kind, a] - y[a]
+    log_det: float = _invert(S, size, inverse)
+    return log_det
+
+
+@compile_kernel
+def _invert(S: Matrix, size: int, out: Matrix) -> float:
+    """Fill ``out`` with the inverse of a positive definite matrix of 1 to 3 rows; return the log of its determinant."""
+    if size == 1:
+        out[0, 0] = 1.0 / S[0, 0]
+        return log(S[0, 0])
+    if size == 2:
+        determinant = S[0, 0] * S[1, 1] - S[0, 1] * S[0, 1]
+        out[0, 0], out[1, 1] = S[1, 1] / determinant, S[0, 0] / determinant
+        out[0, 1] = out[1, 0] = -S[0, 1] / determinant
+        return log(determinant)
+    out[0, 0] = S[1, 1] * S[2, 2] - S[1, 2] * S[1, 2]
+    out[0, 1] = S[0, 2] * S[1, 2] - S[0, 1] * S[2, 2]
+    out[0, 2] = S[0, 1] * S[1, 2] - S[0, 2] * S[1, 1]
+    out[1, 1] = S[0, 0] * S[2, 2] - S[0, 2] * S[0, 2]
+    out[1, 2] = S[0, 1] * S[0, 2] - S[0, 0] * S[1, 2]
+    out[2, 2] = S[0, 0] * S[1, 1] - S[0, 1] * S[0, 1]
+    determinant = S[0, 0] * out[0, 0] + S[0, 1] * out[0, 1] + S[0, 2] * out[0, 2]
+    for a in range(3):
+        for b in range(a, 3):
+            out[a, b] /= determinant
+            out[b, a] = out[a, b]
+    return log(determinant)
+
+
+@compile_kernel
+def _compute_nis(y: Vector, inverse: Matrix, size: int) -> float:
+    """Return the squared normalised innovation."""
+    s = 0.0
+    for a in range(size):
+        for b in range(size):
+            s += y[a] * y[b] * inverse[a, b]
+    return s
+
+
+@compile_kernel
+def _make_turn(a: float, b: float, c: float, out: Vector) -> None:
+    """Fill ``out`` with how rotation errors, and then position errors, change axes after a correction by (a, b, c).
+
+    The right Jacobian of SO(3) to second order (Solà 2017, eq. 183), and the inverse rotation.
+    """
+    make_rotation(-a, -b, -c, out[9:])
+    make_rotation(-0.5 * a, -0.5 * b, -0.5 * c, out)
+
+
+@compile_kernel
+def _turn_rows(A: Matrix, turn: Vector, columns: int, transposed: bool) -> None:
+    """Multiply the first two blocks of three rows of A from the left by two 3 x 3 matrices, or by their transposes."""
+    for block in range(2):
+        r, o = 3 * block, 9 * block
+        for j in range(columns):
+            a, b, c = A[r, j], A[r + 1, j], A[r + 2, j]
+            for i in range(3):
+                if transposed:
+                    A[r + i, j] = turn[o + i] * a + turn[o + 3 + i] * b + turn[o + 6 + i] * c
+                else:
+                    A[r + i, j] = turn[o + 3 * i] * a + turn[o + 3 * i + 1] * b + turn[o + 3 * i + 2] * c
+
+
+@compile_kernel
+def _correct(x: Vector, P: Matrix, active: Indices, size: int, gain: Any, K: Matrix, turn: Vector, room: Any) -> None:
+    """Correct x and P by what `_compare` has left; K' and the turn of the axes are kept."""
+    y, _, _, cross, _, inverse = gain
+    d, high, small = room[4], room[5], room[8]
+    n = P.shape[0]
+    for e in range(N):
+        d[e] = 0.0
+    for a in range(size):
+        for j in range(n):
+            s = 0.0
+            for b in range(size):
+                s += inverse[a, b] * cross[b, j]
+            K[a, j] = s
+            d[active[j]] += s * y[a]
+    for a in range(size):
+        for i in range(n):
+            f = K[a, i]
+            for j in range(n):
+                P[i, j] -= f * cross[a, j]
+    displace_state(x, d, 1.0, high, small)
+    for j in range(NX):
+        x[j] = high[j]
+    _make_turn(d[0], d[1], d[2], turn)
+    _turn_rows(P, turn, n, False)
+    _turn_rows(P.T, turn, n, False)
+    for i in range(n):
+        for j in range(i):
+            s = 0.5 * (P[i, j] + P[j, i])
+            P[i, j] = s
+            P[j, i] = s
+
+
+@compile_kernel
+def _widen(kind: int, P: Matrix, y: Vector, size: int, scale: int) -> None:
+    """Widen P where a sensor was rejected for long, so that it is heard again: the state has jumped, or the ``scale`` there (-1: none)."""
+    if kind == FIX:
+        P[THETA + 2, THETA + 2] += 0.1**2
+        for i in range(3):
+            P[RHO + i, RHO + i] += y[i] * y[i]
+            P[U + i, U + i] += 0.3**2
+    elif scale >= 0:
+        P[scale, scale] += 0.1**2
+    else:
+        for i in range(size):
+            P[U + i, U + i] += y[i] * y[i]
+
+
+@compile_kernel
+def filter_ticks(
+    first: int,
+    last: int,
+    inputs: Inputs,
+    model: Model,
+    memory: Memory,
+    keep: bool,
+    steps: Steps,
+    tests: Tests,
+    states: Matrix,
+) -> None:
+    """Filter ticks ``first`` to ``last``, the latter excluded; ``memory`` becomes that after them.
+
+    Parameters
+    ----------
+    inputs, model : see there.
+    memory : state before ``first``: at tick ``first - 1``, or at ``first`` where that is 0.
+    keep : whether ``steps`` is filled; tick k has row ``k - first``.
+    tests, states : filled for these ticks; states are x after the measurements of each, shape (K, 43).
+    """
+    x, P, waits = memory
+    n = P.shape[0]
+    room = (
+        np.zeros((n, n)),
+        np.zeros((n, n)),
+        np.zeros((MOST, n)),
+        np.zeros((MOST, MOST)),
+        np.zeros(N),
+        np.zeros(NX),
+        np.zeros(NX),
+        np.zeros(NX),
+        np.zeros(9),
+        np.zeros(MOVING),
+        np.zeros(MOVING),
+    )
+    gain = (np.zeros(3), np.zeros((3, n)), np.zeros((3, n)), np.zeros((3, n)), np.zeros((3, 3)), np.zeros((3, 3)))
+    F, kept, K, turn = np.zeros((MOST, MOST)), np.ones(n), np.zeros((3, n)), np.zeros(18)
+    quickens = np.zeros(3)
+    y, H, _, _, _, inverse = gain
+    for k in range(first, last):
+        if k > 0:
+            _move(k, inputs, model, x, P, F, room)
+            _decay(k, inputs, model, x, P, kept)
+        if keep and k > 0:
+            for i in range(MOST):
+                for j in range(MOST):
+                    steps.F[k - first, i, j] = F[i, j]
+            for i in range(n):
+                steps.kept[k - first, i] = kept[i]
+        for kind in range(KINDS):
+            waits[kind, 1] += inputs.period_s
+            if not np.isfinite(inputs.value[k, kind, 0]):
+                continue
+            size = SIZES[kind]
+            quickens[0] = inputs.quickens[k, 1 if kind == VISUAL else 0]
+            log_det = _compare(k, kind, inputs, model, x, P, quickens, gain, room)
+            nis = _compute_nis(y, inverse, size)
+            tests.nis[k, kind] = nis
+            tests.log_det[k, kind] = log_det
+            verdict = ACCEPTED
+            if kind == FIX:
+                for a in range(3):
+                    tests.fix_innovation[k, a] = y[a]
+            is_used = nis <= model.gates[kind]
+            for j in range(model.ignored.shape[0]):
+                if model.ignored[j, 0] == kind and model.ignored[j, 1] <= k < model.ignored[j, 2]:
+                    is_used = False
+                    waits[kind, 1] = 0.0
+            if not is_used:
+                verdict = REJECTED
+                waits[kind, 0] += 1.0
+                is_alone = True
+                for other in (WHEELS, VISUAL, FIX):
+                    is_alone = is_alone and (other == kind or waits[other, 1] > _SILENT_S)
+                patience_s = model.patience[kind, 2 if is_alone else 1]
+                if waits[kind, 0] >= model.patience[kind, 0] and waits[kind, 1] >= patience_s:
+                    verdict = RESET
+                    _widen(kind, P, y, size, -1 if is_alone else model.scales[kind])
+                    _compare(k, kind, inputs, model, x, P, quickens, gain, room)
+            tests.verdict[k, kind] = verdict
+            if verdict == REJECTED:
+                continue
+            waits[kind, 0] = 0.0
+            waits[kind, 1] = 0.0
+            _correct(x, P, model.active, size, gain, K, turn, room)
+            if keep:
+                row = k - first
+                steps.used[row, kind] = True
+                for a in range(size):
+                    s = 0.0
+                    for b in range(size):
+                        steps.inverse[row, kind, a, b] = inverse[a, b]
+                        s += inverse[a, b] * y[b]
+                    steps.pull[row, kind, a] = s
+                    for j in range(n):
+                        steps.K[row, kind, a, j] = K[a, j]
+                        steps.H[row, kind, a, j] = H[a, j]
+                for j in range(18):
+                    steps.turn[row, kind, j] = turn[j]
+        for j in range(NX):
+            states[k, j] = x[j]
+        if keep:
+            for i in range(n):
+                for j in range(n):
+                    steps.P[k - first, i, j] = P[i, j]
+
+
+class Smoothed(NamedTuple):
+    """Smoothed estimate by tick.
+
+    Attributes
+    ----------
+    states : x, (K, 43).
+    variances : of the position east, north, up [m²], yaw [rad²] and forward velocity [m²/s²], (K, 5).
+    links : variance of the horizontal displacement, along its direction, from a tick to the one each of the lags later [m²], (K, l); NaN
+        where it was not computed: it is at every `EVERY` ticks.
+    spreads : standard deviation of every active error every `SELDOM` ticks, (K / SELDOM, n).
+    """
+
+    states: Matrix
+    variances: Matrix
+    links: Matrix
+    spreads: Matrix
+
+
+EVERY, SELDOM = 4, 100
+
+
+class Adjoint(NamedTuple):
+    """What the smoother carries back in time.
+
+    Attributes
+    ----------
+    information : Λ, (n, n).
+    rows : l, and for each of Q ticks ahead the columns of I - Λ P that belong to its position east and north, (1 + 2 Q, n).
+    ticks : of those ticks, (Q,); -1: none.
+    ends : of those ticks, position east and north, and their smoothed covariance (ee, en, nn), (Q, 5).
+    """
+
+    information: Matrix
+    rows: Matrix
+    ticks: Indices
+    ends: Matrix
+
+
+@compile_kernel
+def _step_before_update(
+    K: Matrix, H: Matrix, size: int, pull: Vector, inverse: Matrix, turn: Vector, adjoint: Adjoint, B: Matrix
+) -> None:
+    """Take the adjoint back over one update."""
+    information, rows = adjoint.information, adjoint.rows
+    n = information.shape[0]
+    _turn_rows(rows.T, turn, rows.shape[0], True)
+    _turn_rows(information, turn, n, True)
+    _turn_rows(information.T, turn, n, True)
+    for r in range(rows.shape[0]):
+        for a in range(size):
+            s = 0.0
+            for i in range(n):
+                s += K[a, i] * rows[r, i]
+            B[a, 0] = s + (pull[a] if r == 0 else 0.0)
+        for a in range(size):
+            f = B[a, 0]
+            for i in range(n):
+                rows[r, i] -= H[a, i] * f
+    for a in range(size):  # B = K' Λ
+        for j in range(n):
+            B[a, j] = 0.0
+        for i in range(n):
+            f = K[a, i]
+            for j in range(n):
+                B[a, j] += f * information[i, j]
+    for a in range(size):
+        for b in range(size):
+            s = inverse[a, b]
+            for j in range(n):
+                s += B[a, j] * K[b, j]
+            B[a, n + b] = 0.5 * s
+    for a in range(size):
+        for b in range(size):
+            f = B[a, n + b]
+            for j in range(n):
+                B[a, n + 3 + j] = (B[a, n + 3 + j] if b > 0 else 0.0) + f * H[b, j]
+        for j in range(n):
+            B[a, j] -= B[a, n + 3 + j]
+    for a in range(size):
+        for i in range(n):
+            h, f = H[a, i], B[a, i]
+            for j in range(n):
+                information[i, j] -= h * B[a, j] + f * H[a, j]
+
+
+@compile_kernel
+def _step_before_motion(F: Matrix, kept: Vector, places: Indices, m: int, adjoint: Adjoint, W: Matrix) -> None:
+    """Take the adjoint back over the motion of a tick."""
+    information, rows = adjoint.information, adjoint.rows
+    n = information.shape[0]
+    for i in range(n):
+        f = kept[i]
+        if f != 1.0:
+            for j in range(n):
+                information[i, j] *= f
+                information[j, i] *= f
+            for r in range(rows.shape[0]):
+                rows[r, i] *= f
+    for r in range(rows.shape[0]):
+        for a in range(m):
+            W[0, a] = rows[r, places[a]]
+        for b in range(m):
+            s = 0.0
+            for a in range(m):
+                s += F[a, b] * W[0, a]
+            rows[r, places[b]] = s
+    for _ in range(2):  # F' from the left, twice: Λ is symmetric
+        for b in range(m):
+            for j in range(n):
+                W[b, j] = 0.0
+        for a in range(m):
+            for b in range(m):
+                f = F[a, b]
+                for j in range(n):
+                    W[b, j] += f * information[places[a], j]
+        for b in range(m):
+            for j in range(n):
+                information[places[b], j] = W[b, j]
+        for i in range(n):
+            for j in range(i):
+                s = information[i, j]
+                information[i, j] = information[j, i]
+                information[j, i] = s
+
+
+@compile_kernel
+def _smooth_tick(
+    k: int, P: Matrix, x: Vector, model: Model, adjoint: Adjoint, lags: Indices, out: Smoothed, A: Matrix, room: Any
+) -> None:
+    """Fill the smoothed estimate at tick k."""
+    information, rows, ticks, ends = adjoint
+    d, turn, c, after = room
+    n = P.shape[0]
+    for e in range(N):
+        d[e] = 0.0
+    for i in range(n):
+        s = 0.0
+        for j in range(n):
+            s -= P[i, j] * rows[0, j]
+        d[model.active[i]] = s
+    displace_state(x, d, 1.0, out.states[k], turn)
+    # The covariance of rotation, position and velocity; of all errors now and then.
+    count = n if k % SELDOM == 0 else 9
+    for i in range(n):
+        if i >= count and not model.mount <= i < model.mount + 3:
+            continue
+        for j in range(n):
+            A[i, j] = 0.0
+        for b in range(n):
+            f = P[i, b]
+            for j in range(n):
+                A[i, j] += f * information[b, j]
+    if count == n:
+        for i in range(n):
+            s = P[i, i]
+            for j in range(n):
+                s -= A[i, j] * P[j, i]
+            out.spreads[k // SELDOM, i] = sqrt(max(s, 0.0))
+    size = 9 if model.mount < 0 else 12
+    for i in range(size):
+        row = i if i < 9 else model.mount + i - 9
+        for j in range(size):
+            column = j if j < 9 else model.mount + j - 9
+            s = P[row, column]
+            for b in range(n):
+                s -= A[row, b] * P[b, column]
+            c[i, j] = s
+    for i in range(3, size - 6):  # the robot turns with the IMU and with its mounting
+        for j in range(size):
+            c[i - 3, j] += c[6 + i, j]
+    for i in range(3, size - 6):
+        for j in range(size):
+            c[j, i - 3] += c[j, 6 + i]
+    for axis in range(3):
+        s = 0.0
+        for i in range(3):
+            for j in range(3):
+                s += x[3 * axis + i] * x[3 * axis + j] * c[RHO + i, RHO + j]
+        out.variances[k, axis] = s
+    level2 = max(x[0] * x[0] + x[3] * x[3], 1e-6)  # yaw = atan2(R10, R00)
+    jy, jz = x[7] / level2, x[8] / level2
+    out.variances[k, 3] = jy * jy * c[1, 1] + 2.0 * jy * jz * c[1, 2] + jz * jz * c[2, 2]
+    out.variances[k, 4] = c[U, U]
+    # Displacements to later ticks, along their direction.
+    for q in range(ticks.size):
+        for column in range(lags.size):
+            if ticks[q] < 0 or ticks[q] - k != lags[column]:
+                continue
+            east, north = ends[q, 0] - out.states[k, 9], ends[q, 1] - out.states[k, 10]
+            length = max(sqrt(east * east + north * north), 1e-12)
+            east, north = east / length, north / length
+            s = east * east * ends[q, 2] + 2.0 * east * north * ends[q, 3] + north * north * ends[q, 4]
+            for i in range(3):
+                ai = east * x[i] + north * x[3 + i]
+                for j in range(3):
+                    s += ai * (east * x[j] + north * x[3 + j]) * c[RHO + i, RHO + j]
+                line = P[RHO + i]
+                for j in range(n):
+                    s -= 2.0 * ai * line[j] * (east * rows[1 + 2 * q, j] + north * rows[2 + 2 * q, j])
+            out.links[k, column] = max(s, 0.0)
+    if k % EVERY == 0:
+        q = (k // EVERY) % ticks.size
+        ticks[q] = k
+        ends[q, 0], ends[q, 1] = out.states[k, 9], out.states[k, 10]
+        for axis in range(2):
+            for b in range(axis, 2):
+                s = 0.0
+                for i in range(3):
+                    for j in range(3):
+                        s += x[3 * axis + i] * x[3 * b + j] * c[RHO + i, RHO + j]
+                ends[q, 2 + axis + b] = s
+            for j in range(n):
+                after[j] = 0.0
+                for i in range(3):
+                    after[j] += P[RHO + i, j] * x[3 * axis + i]
+            for i in range(n):
+                s = x[3 * axis + i - RHO] if RHO <= i < RHO + 3 else 0.0
+                for j in range(n):
+                    s -= information[i, j] * after[j]
+                rows[1 + 2 * q + axis, i] = s
+
+
+@compile_kernel
+def smooth_ticks(
+    first: int,
+    last: int,
+    inputs: Inputs,
+    model: Model,
+    steps: Steps,
+    states: Matrix,
+    lags: Indices,
+    adjoint: Adjoint,
+    out: Smoothed,
+) -> None:
+    """Smooth ticks ``last - 1`` down to ``first``.
+
+    Parameters
+    ----------
+    steps, states : of these ticks, as `filter_ticks` filled them.
+    lags : ticks over which displacements are wanted.
+    adjoint : of tick ``last`` before its motion; becomes that of ``first`` before its motion.
+    out : filled for these ticks.
+    """
+    n = adjoint.information.shape[0]
+    A, B = np.zeros((n, n)), np.zeros((3, 2 * n + 3))
+    room = (np.zeros(N), np.zeros(9), np.zeros((12, 12)), np.zeros(n))
+    for k in range(last - 1, first - 1, -1):
+        row = k - first
+        _smooth_tick(k, steps.P[row], states[k], model, adjoint, lags, out, A, room)
+        for kind in range(KINDS - 1, -1, -1):
+            if steps.used[row, kind]:
+                _step_before_update(
+                    steps.K[row, kind], steps.H[row, kind], SIZES[kind], steps.pull[row, kind],
+                    steps.inverse[row, kind], steps.turn[row, kind], adjoint, B,
+                )  # fmt: skip
+        if k > 0:
+            motion = MOTION_WITH_GYRO if inputs.mode[k] >= GYRO_TURN else MOTION_WITHOUT_GYRO
+            places, m = model.depends[motion], model.counts[motion]
+            _step_before_motion(steps.F[row], steps.kept[row], places, m, adjoint, A)

@@ -1,0 +1,371 @@
+"""How the body moved by one odometry and the turn rates, in a level frame, aligned robustly with the fixes.
+
+Attitude is dead reckoning: the gyroscope's increments multiplied, in a frame that drifts. Up in that frame is the specific force averaged
+over seconds, less the accelerations that the odometry tells; heading is the direction of the body's x-axis about it, and wanders with the
+gyroscope. The alignment takes out what a filter estimates anyhow: the odometry's scale, the heading's slow drift, an error of the
+antenna's lever arm and a time offset, by iterated least squares with weights that fall with the square of a residual (Cauchy's loss).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tcpipe.fusion.measurements import IMU, BodyVelocities, InertialMeasurements, Measurements, Positions
+from tcpipe.fusion.signals import (
+    compute_interval_means,
+    compute_median_of_five,
+    compute_median_period_ns,
+    compute_seconds,
+)
+from tcpipe.geometry.rotation import matrix_from_quat, multiply, quat_from_rotation_vector
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Plane = NDArray[np.complex128]
+_Number = TypeVar("_Number", np.float64, np.complex128)
+
+STEP_S = 0.05
+"""Between the rows of a grid."""
+KNOT_S = 60.0
+"""Between knots of the heading's drift."""
+_UP_S = 10.0  # the specific force is averaged over so much
+_SLOWEST_IMU_NS = 100_000_000  # slower units do not show turns
+_ALIGN_S = 10.0  # windows of the alignment
+_PITCH_KNOT_S = 240.0  # the same of pitch, whose error is an accelerometer's bias
+_ROUNDS = 8
+_SPIKE = 8.0  # times the median distance from the median of five: more than 5σ
+_ARM_STD_M, _OFFSET_STD_S, _PITCH_STD_RAD = 0.3, 0.3, 0.1  # of what the alignment takes out
+_LEAST_SCALE = 0.2  # an odometry of less shows another motion
+_MOVES_M = 0.2  # shorter windows show no heading
+_FEWEST = 4  # windows that show a heading
+
+
+@dataclass(frozen=True, slots=True)
+class Attitude:
+    """Attitude on a grid of times [s], in a level frame whose heading drifts.
+
+    ``rotation`` (n, 3, 3) level_from_base_link; ``yaw_rad`` (n,) continuous; ``rate_radps`` (n, 3) in base_link; ``role``: the source of
+    the yaw rate; ``is_level``: roll and pitch are measured.
+    """
+
+    time_s: Floats
+    rotation: Floats
+    yaw_rad: Floats
+    rate_radps: Floats
+    role: str
+    source_ns: Ints
+    is_level: bool
+
+
+def find_turn_roles(measurements: Measurements) -> list[str]:
+    """Return the sensors that show turns, the best first: IMU, camera, wheels."""
+    imu = measurements.imu
+    usable = (
+        imu is not None and imu.stamp_ns.size >= _FEWEST and compute_median_period_ns(imu.stamp_ns) <= _SLOWEST_IMU_NS
+    )
+    sources = [
+        role
+        for role, each in measurements.odometries().items()
+        if np.count_nonzero(np.isfinite(each.yaw_rate_radps)) >= _FEWEST
+    ]
+    return ([IMU] if usable else []) + sources[::-1]
+
+
+def get_turn_rates(measurements: Measurements, role: str) -> tuple[Ints, Floats]:
+    """Return stamps [ns] and angular velocities (N, 3) of a sensor; about x and y zero where it does not measure them."""
+    if role == IMU and measurements.imu is not None:
+        return measurements.imu.stamp_ns, measurements.imu.angular_velocity_radps
+    source = measurements.odometries()[role]
+    finite = np.isfinite(source.yaw_rate_radps)
+    rate = np.zeros((int(finite.sum()), 3))
+    rate[:, 2] = source.yaw_rate_radps[finite]
+    if source.turn_rate_radps is not None:
+        rate[:, :2] = source.turn_rate_radps[finite, :2]
+    return source.stamp_ns[finite], rate
+
+
+def find_attitude(measurements: Measurements, zero_ns: int, end_s: float) -> Attitude | None:
+    """Return the attitude from ``zero_ns`` on; None where no sensor shows turns."""
+    roles = find_turn_roles(measurements)
+    if not roles or end_s < 2 * STEP_S:
+        return None
+    time_s = np.arange(0.0, end_s + STEP_S, STEP_S)
+    stamp_ns, rate = get_turn_rates(measurements, roles[0])
+    means = compute_interval_means(compute_seconds(stamp_ns, zero_ns), rate, time_s[:-1], time_s[1:])
+    rate = np.concatenate((means, means[-1:]))
+    imu = measurements.imu
+    if roles[0] != IMU or imu is None or not imu.accelerometer_usable:
+        yaw = integrate_grid(rate[:, 2])
+        return Attitude(time_s, _rotation_about_up(yaw), yaw, rate, roles[0], stamp_ns, is_level=False)
+    force = _mean_force(measurements, imu, zero_ns, time_s, rate)
+    quat = _multiply_increments(rate[:-1] * STEP_S)
+    up = _find_up(quat, force)
+    # What turns "up" in the drifting frame is the gyroscope's bias about the level axes.
+    turn = np.cross(up, np.gradient(up, STEP_S, axis=0))
+    bias = np.median(np.einsum("nji,nj->ni", matrix_from_quat(quat), turn), axis=0)
+    quat = _multiply_increments((rate[:-1] - bias) * STEP_S)
+    up = _find_up(quat, force)
+    rotation = _level(up) @ matrix_from_quat(quat)
+    yaw = np.unwrap(np.arctan2(rotation[:, 1, 0], rotation[:, 0, 0]))
+    return Attitude(time_s, rotation, yaw, rate - bias, IMU, stamp_ns, is_level=True)
+
+
+def _rotation_about_up(yaw: Floats) -> Floats:
+    half = 0.5 * yaw
+    zero = np.zeros_like(yaw)
+    return matrix_from_quat(np.stack((zero, zero, np.sin(half), np.cos(half)), -1))
+
+
+def _mean_force(
+    measurements: Measurements, imu: InertialMeasurements, zero_ns: int, time_s: Floats, rate: Floats
+) -> Floats:
+    """Return the specific force less the acceleration that an odometry tells, (n, 3)."""
+    means = compute_interval_means(
+        compute_seconds(imu.stamp_ns, zero_ns), imu.specific_force_mps2, time_s - 0.5 * STEP_S, time_s + 0.5 * STEP_S
+    )
+    for source in measurements.odometries().values():
+        speed = average_grid(
+            np.interp(time_s, compute_seconds(source.stamp_ns, zero_ns), source.velocity_mps[:, 0]), 0.5
+        )
+        acceleration = (np.gradient(speed, STEP_S), rate[:, 2] * speed, -rate[:, 1] * speed)
+        return np.asarray(means - np.stack(acceleration, -1))
+    return means
+
+
+def average_grid(values: Floats, window_s: float) -> Floats:
+    """Return the centred moving mean over a window, along the first axis; shorter at the ends."""
+    half = max(1, round(0.5 * window_s / STEP_S))
+    total = np.concatenate((np.zeros((1, *values.shape[1:])), np.cumsum(values, axis=0)))
+    index = np.arange(len(values))
+    first, last = np.maximum(index - half, 0), np.minimum(index + half + 1, len(values))
+    count = (last - first).reshape(-1, *[1] * (values.ndim - 1))
+    return np.asarray((total[last] - total[first]) / count)
+
+
+def _multiply_increments(turn_rad: Floats) -> Floats:
+    """Return the products of rotation vectors (n, 3) from the first on, (n + 1, 4): a prefix scan by doubling."""
+    quat = np.concatenate(([[0.0, 0.0, 0.0, 1.0]], quat_from_rotation_vector(turn_rad)))
+    step = 1
+    while step < len(quat):
+        quat[step:] = multiply(quat[:-step], quat[step:])
+        step *= 2
+    return quat
+
+
+def _find_up(quat: Floats, force: Floats) -> Floats:
+    """Return the direction of the averaged specific force in the drifting frame, (n, 3)."""
+    up = average_grid(np.einsum("nij,nj->ni", matrix_from_quat(quat), force), _UP_S)
+    return np.asarray(up / np.maximum(np.linalg.norm(up, axis=1, keepdims=True), 1e-9))
+
+
+def _level(up: Floats) -> Floats:
+    """Return the smallest rotations (n, 3, 3) that turn each direction to z."""
+    x, y, z = up.T
+    k = 1.0 / np.maximum(1.0 + z, 1e-3)
+    rows = ((1 - x * x * k, -x * y * k, -x), (-x * y * k, 1 - y * y * k, -y), (x, y, z))
+    return np.stack([np.stack(row, -1) for row in rows], -2)
+
+
+@dataclass(frozen=True, slots=True)
+class Track:
+    """Track of one odometry on the grid of its attitude.
+
+    Attributes
+    ----------
+    speed_mps : (n,) horizontal, forward positive; scaled as the fixes say.
+    heading_rad : (n,) of base_link's x-axis, from east where there are fixes.
+    path_m : (n, 3) of base_link, from zero on; east, north, up where there are fixes.
+    arm_m : (n, 3) the antenna from base_link in the same axes, with what a time offset of the fixes adds.
+    """
+
+    speed_mps: Floats
+    heading_rad: Floats
+    path_m: Floats
+    arm_m: Floats
+
+
+def compute_forward_mps(source: BodyVelocities, attitude: Attitude, zero_ns: int) -> Floats:
+    """Return base_link's forward velocity on the attitude's grid (n,), without spikes."""
+    speed = remove_spikes(source.velocity_mps[:, 0])
+    stamp_s, half = compute_seconds(source.stamp_ns, zero_ns), 0.5 * STEP_S
+    means = compute_interval_means(stamp_s, speed[:, None], attitude.time_s - half, attitude.time_s + half)[:, 0]
+    _, y, z = source.lever_arm_m
+    return np.asarray(means + attitude.rate_radps[:, 2] * y - attitude.rate_radps[:, 1] * z)
+
+
+def remove_spikes(values: Floats, *, fill: Floats | float | None = None) -> Floats:
+    """Return a signal (N,) with samples far off the median of five around them replaced, by that median: what a filter's gate rejects."""
+    smooth = compute_median_of_five(values)
+    off = np.abs(values - smooth)
+    scatter = float(np.median(off[off > 0.0])) if (off > 0.0).any() else 0.0
+    return np.where(off > _SPIKE * scatter, smooth if fill is None else fill, values)
+
+
+def integrate_grid(rate: NDArray[_Number]) -> NDArray[_Number]:
+    """Return the integral from zero on over a grid of `STEP_S` of samples (n,) or (n, k)."""
+    total = np.zeros_like(rate)
+    np.cumsum(0.5 * (rate[1:] + rate[:-1]) * STEP_S, axis=0, out=total[1:])
+    return total
+
+
+def make_free_track(forward_mps: Floats, attitude: Attitude) -> Track:
+    """Return a track in the level frame, aligned with nothing."""
+    path = integrate_grid(forward_mps[:, None] * attitude.rotation[:, :, 0])
+    level = np.hypot(attitude.rotation[:, 0, 0], attitude.rotation[:, 1, 0])
+    return Track(forward_mps * level, attitude.yaw_rad, path, np.zeros_like(path))
+
+
+def align_tracks(
+    forward_mps: Mapping[str, Floats], gnss: Positions, attitude: Attitude, zero_ns: int
+) -> dict[str, Track]:
+    """Return the tracks of odometries in the frame of the fixes; none where the fixes show no motion.
+
+    Heading, arm and time offset are fitted to the odometry that follows the fixes best, and then hold for the others.
+    """
+    alignment = _Alignment(gnss, attitude, zero_ns)
+    fits = {role: fit for role, forward in forward_mps.items() if (fit := alignment.fit(forward)) is not None}
+    if not fits:
+        return {}
+    best = min(fits.values(), key=lambda fit: fit.noise_m)
+    scales = {role: alignment.find_scale(forward_mps[role], best) for role in fits}
+    return {
+        role: alignment.make_track(forward_mps[role], replace(best, scale=scale))
+        for role, scale in scales.items()
+        if scale > _LEAST_SCALE
+    }
+
+
+@dataclass(frozen=True, slots=True)
+class _Fit:
+    """What turns a dead-reckoned track into the fixes: ``turn_rad`` (n,) on the grid; ``noise_m``: median residual."""
+
+    turn_rad: Floats
+    scale: float = 1.0
+    arm_m: complex = 0j
+    offset_s: float = 0.0
+    noise_m: float = np.inf
+
+
+class _Alignment:
+    """Windows of fixes, and least squares over them; the horizontal plane as complex numbers."""
+
+    def __init__(self, gnss: Positions, attitude: Attitude, zero_ns: int) -> None:
+        self._attitude = attitude
+        self._arm_m = attitude.rotation @ np.asarray(gnss.lever_arm_m)
+        time_s, end_s = compute_seconds(gnss.stamp_ns, zero_ns), float(attitude.time_s[-1])
+        window_s = min(_ALIGN_S, 0.25 * end_s)
+        apart = max(1, round(0.2 * window_s * 1e9 / compute_median_period_ns(gnss.stamp_ns)))
+        first = np.arange(0, time_s.size, apart)
+        last = np.minimum(np.searchsorted(time_s, time_s[first] + window_s), time_s.size - 1)
+        near = np.abs(time_s[last] - time_s[first] - window_s) < 0.3 * window_s
+        first, last = first[near], last[near]
+        self._start_s, self._end_s = time_s[first], time_s[last]
+        self._moved_m = gnss.position_enu_m[last] - gnss.position_enu_m[first]
+        self._knots_s = np.linspace(0.0, end_s, max(2, round(end_s / KNOT_S) + 1))
+        middle = 0.5 * (self._start_s + self._end_s)
+        self._hats = np.maximum(0.0, 1.0 - np.abs(middle[:, None] - self._knots_s) / self._knots_s[1])
+        self._middle_s = middle
+        # The turn scale of an odometry is an error of heading that grows with the turn.
+        self._turn = (attitude.yaw_rad - attitude.yaw_rad.mean()) * (attitude.role != IMU)
+
+    def _difference(self, values: Floats | Plane) -> Plane:
+        """Return the change over each window of what is on the grid (n,)."""
+        time_s = self._attitude.time_s
+        plane = np.asarray(values, np.complex128)
+        return np.interp(self._end_s, time_s, plane) - np.interp(self._start_s, time_s, plane)
+
+    def _horizontal(self, forward: Floats, fit: _Fit) -> tuple[Plane, Plane]:
+        """Return velocity and arm, complex, on the grid."""
+        turn, rotation = np.exp(1j * fit.turn_rad), self._attitude.rotation
+        velocity = fit.scale * forward * (rotation[:, 0, 0] + 1j * rotation[:, 1, 0]) * turn
+        ahead = np.exp(1j * (self._attitude.yaw_rad + fit.turn_rad))
+        arm = (self._arm_m[:, 0] + 1j * self._arm_m[:, 1]) * turn + fit.arm_m * ahead + fit.offset_s * velocity
+        return velocity, arm
+
+    def fit(self, forward: Floats) -> _Fit | None:
+        """Return scale, heading by knots, turn scale, arm and time offset; None where the fixes show no motion."""
+        fix = self._moved_m[:, 0] + 1j * self._moved_m[:, 1]
+        fit, time_s = _Fit(np.zeros_like(forward)), self._attitude.time_s
+        turn = np.interp(0.5 * (self._start_s + self._end_s), time_s, self._turn)
+        for number in range(_ROUNDS):
+            velocity, arm = self._horizontal(forward, fit)
+            moved = self._difference(integrate_grid(velocity) + arm)
+            length = np.abs(moved)
+            moving = length > max(0.3 * float(np.median(length)) if length.size else 0.0, _MOVES_M)
+            if moving.sum() < _FEWEST:
+                return None
+            unit = np.conj(moved) / np.maximum(length, 1e-9)
+            off = fix * unit - length
+            if number == 0:  # a heading at each knot, however far off
+                seen = np.where(moving, fix * unit / np.maximum(np.abs(fix), 1e-9), 0.0)
+                towards = self._hats.T @ seen
+                usable = np.abs(towards) > 0.5
+                if not usable.any():
+                    return None
+                angle = np.unwrap(np.angle(towards[usable]))
+                fit = replace(fit, turn_rad=np.interp(time_s, self._knots_s[usable], angle))
+                continue
+            noise = float(np.median(np.abs(off[moving]))) + 1e-6
+            root = np.where(moving, 1.0, 0.0) / (1.0 + np.square(np.abs(off) / (2.5 * noise)))
+            spin = self._difference(np.exp(1j * (self._attitude.yaw_rad + fit.turn_rad))) * unit
+            columns = np.column_stack(
+                (length, 1j * length * turn, spin, 1j * spin, self._difference(velocity) * unit, 1j * length[:, None] * self._hats)
+            )  # fmt: skip
+            prior = np.concatenate(([1.0, 0.5, _ARM_STD_M, _ARM_STD_M, _OFFSET_STD_S], np.ones(self._knots_s.size)))
+            before = np.zeros(prior.size)
+            before[2:5] = fit.arm_m.real, fit.arm_m.imag, fit.offset_s  # priors hold for these in all
+            columns, off = columns * root[:, None], off * root
+            matrix = np.concatenate((columns.real, columns.imag, np.diag(noise / prior)))
+            target = np.concatenate((off.real, off.imag, -before * noise / prior))
+            found = np.linalg.lstsq(matrix, target, rcond=None)[0]
+            fit = _Fit(
+                fit.turn_rad + found[1] * self._turn + np.interp(time_s, self._knots_s, found[5:]),
+                fit.scale * (1.0 + float(found[0])),
+                fit.arm_m + complex(found[2], found[3]),
+                fit.offset_s + float(found[4]),
+                noise,
+            )
+        return fit
+
+    def find_scale(self, forward: Floats, fit: _Fit) -> float:
+        """Return by how much the fixes move farther along an odometry's track, the median; negative where it goes the other way."""
+        velocity, arm = self._horizontal(forward, replace(fit, scale=1.0))
+        moved, fix = self._difference(integrate_grid(velocity)), self._moved_m[:, 0] + 1j * self._moved_m[:, 1]
+        length = np.abs(moved)
+        moving = length > max(0.3 * float(np.median(length)), _MOVES_M)
+        ratio = ((fix - self._difference(arm)) * np.conj(moved)).real[moving] / length[moving] ** 2
+        return float(np.median(ratio)) if ratio.size else 0.0
+
+    def make_track(self, forward: Floats, fit: _Fit) -> Track:
+        """Return the aligned track, its pitch corrected by the fixes' heights."""
+        velocity, arm = self._horizontal(forward, fit)
+        speed = fit.scale * forward
+        climb = speed * self._attitude.rotation[:, 2, 0]
+        if self._attitude.is_level:
+            climb = climb + speed * self._fit_pitch(speed, climb)
+        path = integrate_grid(np.stack((velocity.real, velocity.imag, climb), -1))
+        level = np.abs(velocity) * np.sign(speed)
+        heading = self._attitude.yaw_rad + fit.turn_rad
+        return Track(level, heading, path, np.stack((arm.real, arm.imag, self._arm_m[:, 2]), -1))
+
+    def _fit_pitch(self, speed: Floats, climb: Floats) -> Floats:
+        """Return the slow error of pitch [rad] on the grid (n,) with which the track climbs as the fixes do."""
+        knots_s = np.linspace(0.0, self._knots_s[-1], max(2, round(float(self._knots_s[-1]) / _PITCH_KNOT_S) + 1))
+        hats = np.maximum(0.0, 1.0 - np.abs(self._middle_s[:, None] - knots_s) / knots_s[1])
+        path = self._difference(integrate_grid(speed)).real
+        rise = self._moved_m[:, 2] - self._difference(integrate_grid(climb) + self._arm_m[:, 2]).real
+        pitch = np.zeros(knots_s.size)
+        for _ in range(_ROUNDS // 2):
+            off = rise - path * (hats @ pitch)
+            noise = float(np.median(np.abs(off))) + 1e-6
+            root = 1.0 / (1.0 + np.square(off / (2.5 * noise)))
+            matrix = np.concatenate(
+                (hats * (path * root)[:, None], np.diag(np.full(pitch.size, noise / _PITCH_STD_RAD)))
+            )
+            pitch = np.linalg.lstsq(matrix, np.concatenate((rise * root, np.zeros(pitch.size))), rcond=None)[0]
+        return np.interp(self._attitude.time_s, knots_s, pitch)

@@ -1,0 +1,338 @@
+"""Residuals of every pair of sensors over windows of several lengths, and what each density adds to their variance.
+
+A residual is how much farther one sensor says that the robot moved, or turned, than another, over a window of Δ seconds: of fixes against
+an odometry along and across the heading in the window's middle, and up; of two odometries along; of two yaw rates as an angle. Its variance
+is a sum of densities times features, which are integrals over the path driven in the window:
+
+- fixes: white noise and Gauss-Markov processes, on each axis, also at rest;
+- an odometry: white velocity noise, and a scale as Gauss-Markov processes; a scale that all odometries share, which no pair of them shows;
+- slide: white noise of the sideways velocity; heading and pitch: Gauss-Markov errors of the direction in which an odometry is added up;
+- yaw rates: white noise, a bias and a scale as Gauss-Markov processes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tcpipe.fusion.level_motion import (
+    STEP_S,
+    Attitude,
+    Track,
+    align_tracks,
+    average_grid,
+    compute_forward_mps,
+    find_attitude,
+    find_turn_roles,
+    get_turn_rates,
+    integrate_grid,
+    make_free_track,
+    remove_spikes,
+)
+from tcpipe.fusion.measurements import GNSS, Measurements, Positions
+from tcpipe.fusion.signals import (
+    compute_interval_means,
+    compute_median_period_ns,
+    compute_seconds,
+    interpolate_signal,
+    is_in_gap,
+)
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+ALONG, ACROSS, UP, TURN = "along", "across", "up", "turn"
+TIMES_S = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 40.0, 80.0)
+"""Time differences."""
+FIX_S, SCALE_S, TURN_S = (1.0, 3.0, 10.0, 30.0, 100.0), (3.0, 10.0, 30.0, 100.0), (10.0, 100.0)
+"""Correlation times of processes: of fixes, of scales and directions, of yaw rates."""
+MOVING_S = (1.0, 3.0)
+"""The same of errors of fixes that are there only while the robot moves."""
+
+_NODES = 40  # of the path within a window
+_WINDOWS = 600  # of one length, at most
+_FEWEST = 8  # windows of one length
+_OVERLAPPING = 8  # windows begin in the length of one
+_LONGEST_GAP_NS = 300_000_000
+_STILL_MPS, _STILL_RAD, _STILL_S = 0.02, 0.02, 0.5  # the last: speeds are averaged, so that noise is none
+_SWAY_M = (1.0, 3.0, 10.0, 30.0)  # the ground's slope changes over so much
+_PAIR_STEP_S = 0.1  # between windows' ends of sensors that are no fixes
+
+
+@dataclass(frozen=True, slots=True)
+class Residuals:
+    """Residuals of a pair of sensors along one axis over windows of one length, one row a window.
+
+    Attributes
+    ----------
+    start_ns, end_ns : [ns], shape (M,).
+    value : [m], turns [rad], shape (M,).
+    features : by name of a density, its factor in the variance of each value, shape (M,).
+    is_still : shape (M,), the robot is stationary throughout.
+    """
+
+    pair: tuple[str, str]
+    axis: str
+    time_s: float
+    start_ns: Ints
+    end_ns: Ints
+    value: Floats
+    features: Mapping[str, Floats]
+    is_still: Mask
+
+
+@dataclass(frozen=True, slots=True)
+class _Section:
+    """A section's measurements and attitude."""
+
+    measurements: Measurements
+    attitude: Attitude
+    zero_ns: int
+
+    def choose_windows(self, at_ns: Ints, sources: Sequence[Ints]) -> Iterator[tuple[float, Ints, Ints]]:
+        """Yield each time difference with first and last rows of its windows among increasing stamps (N,).
+
+        No source, by its stamps, has a gap within a window.
+        """
+        at_s = compute_seconds(at_ns, self.zero_ns)
+        period_s = max(float(np.median(np.diff(at_s))), 1e-3) if at_s.size > 1 else np.inf
+        gaps_ns = [max(_LONGEST_GAP_NS, 3 * compute_median_period_ns(stamp_ns)) for stamp_ns in sources]
+        for time_s in TIMES_S:
+            if time_s < 0.9 * period_s:
+                continue
+            first = np.arange(0, at_s.size, max(1, round(time_s / _OVERLAPPING / period_s), -(-at_s.size // _WINDOWS)))
+            last = np.searchsorted(at_s, at_s[first] + time_s - 0.5 * period_s)
+            first, last = first[last < at_s.size], last[last < at_s.size]
+            length_s = at_s[last] - at_s[first]
+            usable = np.abs(length_s - time_s) < max(0.05 * time_s, 0.6 * period_s)
+            for stamp_ns, longest_ns in zip(sources, gaps_ns, strict=True):
+                usable &= ~is_in_gap(stamp_ns, at_ns[first], at_ns[last], longest_ns=longest_ns)
+            if usable.sum() >= _FEWEST:
+                yield float(np.median(length_s[usable])), first[usable], last[usable]
+
+    def make_stamps(self) -> tuple[Ints, Ints]:
+        """Return rows of the grid where windows without fixes may end, and their stamps [ns]."""
+        rows = np.arange(0, self.attitude.time_s.size, round(_PAIR_STEP_S / STEP_S))
+        return rows, self.zero_ns + np.rint(self.attitude.time_s[rows] * 1e9).astype(np.int64)
+
+
+def find_residuals(measurements: Measurements) -> list[Residuals]:
+    """Return the residuals of all pairs of sensors that can be compared; none without odometry or without turns."""
+    odometries, gnss = measurements.odometries(), measurements.gnss
+    stamps = [each.stamp_ns for each in odometries.values()] + ([] if gnss is None else [gnss.stamp_ns])
+    zero_ns = min((int(stamp_ns[0]) for stamp_ns in stamps), default=0)
+    end_s = (max((int(stamp_ns[-1]) for stamp_ns in stamps), default=0) - zero_ns) * 1e-9
+    attitude = find_attitude(measurements, zero_ns, end_s)
+    if attitude is None or not odometries:
+        return []
+    section = _Section(measurements, attitude, zero_ns)
+    residuals = _compare_turns(section)
+    forward = {role: compute_forward_mps(each, attitude, zero_ns) for role, each in odometries.items()}
+    tracks = {} if gnss is None else align_tracks(forward, gnss, attitude, zero_ns)
+    speed = np.max([np.abs(average_grid(each, _STILL_S)) for each in forward.values()], axis=0)
+    for role, track in tracks.items():
+        residuals += _compare_fixes(section, gnss, role, track, speed) if gnss is not None else []
+    if len(tracks) < len(forward):
+        tracks = {role: make_free_track(each, attitude) for role, each in forward.items()}
+    for first, second in combinations(tracks, 2):
+        residuals += _compare_odometries(section, (first, second), tracks[first], tracks[second])
+    return residuals
+
+
+def _compare_fixes(section: _Section, gnss: Positions, role: str, track: Track, speed_mps: Floats) -> list[Residuals]:
+    """Return the residuals of fixes against an aligned track; ``speed_mps`` (n,) tells whether the robot moves."""
+    attitude = section.attitude
+    fix_s = compute_seconds(gnss.stamp_ns, section.zero_ns)
+    off = gnss.position_enu_m - interpolate_signal(attitude.time_s, track.path_m + track.arm_m, fix_s)
+    off = np.stack([remove_spikes(axis, fill=np.nan) for axis in off.T], -1)
+    sways = 0.0 if attitude.is_level else gnss.lever_arm_m[2]
+    has_others = len(section.measurements.odometries()) > 1
+    sources = (section.measurements.odometries()[role].stamp_ns, attitude.source_ns)
+    made = []
+    for time_s, first, last in section.choose_windows(gnss.stamp_ns, sources):
+        window = _Window(track, attitude, fix_s[first], fix_s[last])
+        change = off[last] - off[first]
+        cosine, sine = np.cos(window.heading_rad), np.sin(window.heading_rad)
+        values = {
+            ALONG: cosine * change[:, 0] + sine * change[:, 1],
+            ACROSS: cosine * change[:, 1] - sine * change[:, 0],
+            UP: change[:, 2],
+        }
+        is_still = window.is_still(speed_mps)
+        if not attitude.is_level:
+            values[UP] = np.where(is_still, values[UP], np.nan)
+        for axis, value in values.items():
+            features = _describe_fixes(gnss, axis, first, last, time_s)
+            features |= window.describe(role, axis, has_others=has_others)
+            features |= window.describe_moving("up" if axis == UP else "fix")
+            if axis != UP:
+                features["stamp"] = window.describe_stamps(axis)
+            if sways and axis != UP:
+                features |= {f"sway {each:g}": -2.0 * sways**2 * np.expm1(-window.length_m / each) for each in _SWAY_M}
+            stamps = gnss.stamp_ns[first], gnss.stamp_ns[last]
+            made.append(Residuals((GNSS, role), axis, time_s, *stamps, value, features, is_still))
+    return made
+
+
+def _describe_fixes(gnss: Positions, axis: str, first: Ints, last: Ints, time_s: float) -> dict[str, Floats]:
+    """Return the factors of the fixes' densities, which are those of a fix of the median claim."""
+    claimed = gnss.variance_m2[:, 2] if axis == UP else gnss.variance_m2[:, :2].mean(1)
+    share = claimed / np.median(claimed)
+    a, b = share[first], share[last]
+    name = "up" if axis == UP else "fix"
+    features = {f"{name} white": a + b}
+    for tau in FIX_S:
+        features[f"{name} process {tau:g}"] = a + b - 2.0 * np.sqrt(a * b) * np.exp(-time_s / tau)
+    return features
+
+
+def _compare_odometries(section: _Section, pair: tuple[str, str], first: Track, second: Track) -> list[Residuals]:
+    """Return the residuals of two odometries along the heading of the first, the second scaled to it."""
+    (rows, at_ns), time_s = section.make_stamps(), section.attitude.time_s
+    at_s = time_s[rows]
+    length = [integrate_grid(track.speed_mps)[rows] for track in (first, second)]
+    step = max(1, round(5.0 / _PAIR_STEP_S))
+    moved = [each[step:] - each[:-step] for each in length]
+    moves = np.abs(moved[0]) > 0.2
+    if not moves.any():
+        return []
+    scale = float(np.median(moved[1][moves] / moved[0][moves]))
+    if scale <= 0.0:
+        return []
+    off = length[0] - length[1] / scale
+    made = []
+    straight = replace(first, heading_rad=np.zeros(time_s.size))
+    sources = [section.attitude.source_ns, *(section.measurements.odometries()[role].stamp_ns for role in pair)]
+    for window_s, i, j in section.choose_windows(at_ns, sources):
+        window = _Window(straight, section.attitude, at_s[i], at_s[j])
+        features = window.describe_odometry(pair[0], ALONG) | window.describe_odometry(pair[1], ALONG)
+        is_still = window.length_m < _STILL_MPS * window_s
+        made.append(Residuals(pair, ALONG, window_s, at_ns[i], at_ns[j], off[j] - off[i], features, is_still))
+    return made
+
+
+def _compare_turns(section: _Section) -> list[Residuals]:
+    """Return the residuals of the yaw rates of each two sensors; scale and bias of the second are fitted to the first."""
+    (rows, at_ns), time_s = section.make_stamps(), section.attitude.time_s
+    at_s = time_s[rows]
+    rates, sources = {}, {}
+    for role in find_turn_roles(section.measurements):
+        stamp_ns, rate = get_turn_rates(section.measurements, role)
+        middle = compute_seconds(stamp_ns, section.zero_ns)
+        means = compute_interval_means(middle, rate[:, 2:], time_s - 0.5 * STEP_S, time_s + 0.5 * STEP_S)
+        rates[role], sources[role] = means[:, 0], stamp_ns
+    made = []
+    for a, b in combinations(rates, 2):
+        turn = np.stack([integrate_grid(rates[role])[rows] for role in (a, b)], -1)
+        off = _align_turns(turn, round(5.0 / _PAIR_STEP_S))
+        for window_s, i, j in section.choose_windows(at_ns, [sources[a], sources[b]]):
+            rate = _take_nodes(rates[a], at_s[i], at_s[j])
+            features = {f"{role} turn": np.full(i.size, window_s) for role in (a, b)}
+            for tau in TURN_S:
+                bias = np.full(i.size, 2.0 * tau**2 * (window_s / tau + np.expm1(-window_s / tau)))
+                scale = _integrate_process(rate, window_s, tau)
+                features |= {f"{role} bias {tau:g}": bias for role in (a, b)}
+                features |= {f"{role} turn scale {tau:g}": scale for role in (a, b)}
+            is_still = np.zeros(i.size, np.bool_)
+            made.append(Residuals((a, b), TURN, window_s, at_ns[i], at_ns[j], off[j] - off[i], features, is_still))
+    return made
+
+
+def _align_turns(turn: Floats, step: int) -> Floats:
+    """Return the first of two turns (n, 2) less the second, whose scale and bias are fitted over windows of ``step`` rows."""
+    change = turn[step:] - turn[:-step]
+    if not change.size:
+        return np.asarray(turn[:, 0] - turn[:, 1])
+    matrix = np.stack((change[:, 1], np.ones(len(change))), -1)
+    found = np.array([1.0, 0.0])
+    for _ in range(5):
+        off = change[:, 0] - matrix @ found
+        root = 1.0 / (1.0 + np.square(off / (2.5 * float(np.median(np.abs(off))) + 1e-9)))
+        found = np.linalg.lstsq(matrix * root[:, None], change[:, 0] * root, rcond=None)[0]
+    return np.asarray(turn[:, 0] - found[0] * turn[:, 1] - found[1] / step * np.arange(len(turn)))
+
+
+def _take_nodes(values: Floats, start_s: Floats, end_s: Floats) -> Floats:
+    """Return what is on the grid in the middles of the parts of each window, (M, nodes)."""
+    nodes = max(2, min(_NODES, round(float(np.median(end_s - start_s)) / STEP_S)))
+    part = (np.arange(nodes) + 0.5) / nodes
+    rows = np.rint((start_s[:, None] + (end_s - start_s)[:, None] * part) / STEP_S).astype(np.int64)
+    return np.asarray(values[rows.clip(0, values.size - 1)])
+
+
+def _integrate_process(weight: Floats, window_s: float, tau_s: float) -> Floats:
+    """Return the variance of the integral of weights (M, nodes) times a Gauss-Markov process of variance 1, shape (M,)."""
+    step_s = window_s / weight.shape[1]
+    node = np.arange(weight.shape[1])
+    covariance = np.exp(-np.abs(node[:, None] - node) * (step_s / tau_s)) * step_s**2
+    return np.asarray(np.einsum("mi,mi->m", weight @ covariance, weight))
+
+
+class _Window:
+    """The path within windows of one length, as a track tells it."""
+
+    def __init__(self, track: Track, attitude: Attitude, start_s: Floats, end_s: Floats) -> None:
+        self._span = (start_s, end_s)
+        self._yaw = attitude.yaw_rad
+        self.time_s = float(np.median(end_s - start_s))
+        self.heading_rad = np.interp(0.5 * (start_s + end_s), attitude.time_s, track.heading_rad)
+        direction = _take_nodes(track.heading_rad, start_s, end_s) - self.heading_rad[:, None]
+        self._speed = _take_nodes(track.speed_mps, start_s, end_s)
+        self._climb = _take_nodes(np.gradient(track.path_m[:, 2], STEP_S), start_s, end_s)
+        self._ahead, self._aside = np.cos(direction), np.sin(direction)
+        self._step_s = self.time_s / self._speed.shape[1]
+        self.length_m = np.abs(self._speed).sum(1) * self._step_s
+
+    def is_still(self, speed_mps: Floats) -> Mask:
+        """Return whether the robot neither moves nor turns in each window."""
+        turned = np.ptp(_take_nodes(self._yaw, *self._span), axis=1)
+        return np.asarray(
+            (_take_nodes(speed_mps, *self._span) < _STILL_MPS).all(1) & (turned < _STILL_RAD + 0.01 * self.time_s)
+        )
+
+    def describe(self, role: str, axis: str, *, has_others: bool) -> dict[str, Floats]:
+        """Return the factors of the densities of an odometry that is compared with fixes."""
+        if axis == UP:
+            moving = np.abs(self._speed[:, [0, -1]]) > _STILL_MPS
+            pitch = {"rocking": moving.sum(1).astype(np.float64)}
+            pitch |= {f"pitch scale {tau:g}": _integrate_process(self._speed, self.time_s, tau) for tau in SCALE_S}
+            return pitch | {
+                f"{role} scale {tau:g}": _integrate_process(self._climb, self.time_s, tau) for tau in SCALE_S
+            }
+        features = self.describe_odometry(role, axis)
+        if has_others:  # a scale that all share looks like that of a lone odometry
+            features |= {f"shared scale {tau:g}": features[f"{role} scale {tau:g}"] for tau in SCALE_S}
+        other = self._speed * (self._aside if axis == ALONG else self._ahead)
+        features |= {f"heading scale {tau:g}": _integrate_process(other, self.time_s, tau) for tau in SCALE_S}
+        features["slide velocity"] = self._integrate_moving(self._aside if axis == ALONG else self._ahead)
+        return features
+
+    def describe_moving(self, name: str) -> dict[str, Floats]:
+        """Return the factors of errors of fixes that are there only while the robot moves: receivers hold a stationary position."""
+        begin, end = (np.abs(self._speed[:, [0, -1]]) > _STILL_MPS).T.astype(np.float64)
+        return {
+            f"{name} moving {tau:g}": begin + end - 2.0 * begin * end * np.exp(-self.time_s / tau) for tau in MOVING_S
+        }
+
+    def describe_stamps(self, axis: str) -> Floats:
+        """Return the factor of the variance of the stamps at both ends, of the nodes nearest to them."""
+        velocity = self._speed * (self._ahead if axis == ALONG else self._aside)
+        return np.asarray(np.square(velocity[:, 0]) + np.square(velocity[:, -1]))
+
+    def describe_odometry(self, role: str, axis: str) -> dict[str, Floats]:
+        """Return the factors of an odometry's own densities."""
+        direction = self._ahead if axis == ALONG else self._aside
+        forward = self._speed * direction
+        features = {f"{role} scale {tau:g}": _integrate_process(forward, self.time_s, tau) for tau in SCALE_S}
+        features[f"{role} velocity"] = self._integrate_moving(direction)
+        return features
+
+    def _integrate_moving(self, direction: Floats) -> Floats:
+        """Return the time [s] that the robot moves, by the square of a direction cosine (M, nodes)."""
+        moving = np.abs(self._speed) > 1e-3
+        return np.asarray((moving * direction**2).sum(1) * self._step_s)

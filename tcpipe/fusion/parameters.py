@@ -1,0 +1,229 @@
+"""Parameters of the estimator: what is known of each beforehand, and how it wanders.
+
+Each is an entry of the state. What the measurements do not show of a parameter keeps its prior by the update itself, and its uncertainty
+is part of that of the track. Noise of the sensors: `tcpipe.fusion.densities`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tcpipe.fusion import state
+from tcpipe.fusion.densities import GaussMarkov, NoiseModel
+from tcpipe.fusion.filter_kernel import Memory, Model
+from tcpipe.fusion.measurements import VISUAL, WHEELS, InitialState, Measurements
+from tcpipe.fusion.process import find_scale_stds, turn_scale_std
+from tcpipe.fusion.signals import find_chi_square_threshold
+from tcpipe.fusion.ticks import Ticks
+from tcpipe.geometry.rotation import matrix_from_quat
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Parameter:
+    """One parameter: its first entry in the errors and their number, standard deviation beforehand, and that of a second's walk.
+
+    A deviation of 0 is another for each run, as the source says.
+    """
+
+    name: str
+    place: int
+    count: int
+    std: float
+    walk: float
+    unit: str
+    source: str
+
+
+PARAMETERS = (
+    Parameter("gyroscope bias", state.GYRO_BIAS, 3, 0.02, 4e-5, "rad/s", "MEMS: 1°/s at turn-on, 10°/h in a run"),
+    Parameter("accelerometer bias", state.ACCELEROMETER_BIAS, 3, 0.15, 3e-4, "m/s²", "MEMS: 15 mg, 1 mg in a run"),
+    Parameter("antenna", state.ARM, 3, 0.0, 0.0, "m", "stated or not: `Positions.lever_arm_std_m`"),
+    Parameter("lag of fixes", state.FIX_LAG, 1, 0.02, 0.0, "s", "drivers stamp on arrival"),
+    Parameter("wheel scale", state.WHEEL_SCALE, 1, 0.0, 0.0, "1", "`process.find_scale_stds`; walk: `densities`"),
+    Parameter("camera scale", state.VISUAL_SCALE, 1, 0.0, 0.0, "1", "`process.find_scale_stds`; walk: `densities`"),
+    Parameter("turn scale", state.TURN_SCALE, 1, 0.0, 0.0, "1", "`process.turn_scale_std`"),
+    Parameter(
+        "turning centre", state.TURNING_CENTRE, 1, 0.05, 0.0, "m", "skid-steered robots turn ahead of their middle"
+    ),
+    Parameter("mounting of the IMU", state.MOUNT, 3, 0.0175, 0.0, "rad", "stated to a degree"),
+    Parameter("mounting of the camera", state.VISUAL_MOUNT, 2, 0.0175, 0.0, "rad", "stated to a degree"),
+    Parameter("lag of wheels", state.WHEEL_LAG, 1, 0.02, 0.0, "s", "drivers stamp on arrival"),
+    Parameter("lag of camera", state.VISUAL_LAG, 1, 0.03, 0.0, "s", "exposure and processing"),
+)
+"""What does not come from the run itself; the scales of odometries and the errors of fixes do, see `make_priors`."""
+_PATIENCE = {state.FIX: (5.0, 15.0, 5.0), state.WHEELS: (5.0, 5.0, 0.3), state.VISUAL: (5.0, 5.0, 0.3)}
+_NEVER = (1e18, 1e18, 1e18)
+
+
+@dataclass(frozen=True, slots=True)
+class Event:
+    """What changes at a tick: errors from ``place`` on become uncertain by ``std`` more; ``is_new``: they are other errors from then on."""
+
+    tick: int
+    place: int
+    count: int
+    std: float
+    is_new: bool = False
+
+
+def make_priors(m: Measurements, noise: NoiseModel, ticks: Ticks) -> tuple[Floats, Floats]:
+    """Return standard deviation and walk of every error, shapes (37,): 0 where it is known exactly, or nothing depends on it."""
+    std, walk = np.zeros(state.N), np.zeros(state.N)
+    has_imu, has_fixes = m.imu is not None, m.gnss is not None
+    has_tilt = has_imu or (m.visual is not None and m.visual.turn_rate_radps is not None)
+    inertial = bool((ticks.inputs.mode == state.INERTIAL).any())
+    wanted = {
+        "gyroscope bias": has_imu,
+        "accelerometer bias": inertial,
+        "lag of fixes": has_fixes and has_tilt,
+        "turning centre": has_imu,
+        "mounting of the IMU": inertial,
+        "mounting of the camera": m.visual is not None and bool(m.visual.measured.all()),
+        "lag of wheels": inertial and m.wheels is not None,
+        "lag of camera": inertial and m.visual is not None,
+    }
+    for parameter in PARAMETERS:
+        if wanted.get(parameter.name, False):
+            rows = slice(parameter.place, parameter.place + parameter.count)
+            std[rows], walk[rows] = parameter.std, parameter.walk
+    scales = dict(zip((WHEELS, VISUAL), find_scale_stds(m), strict=True))
+    for role, place in ((WHEELS, state.WHEEL_SCALE), (VISUAL, state.VISUAL_SCALE)):
+        if role in m.odometries() and scales[role]:
+            std[place], walk[place] = scales[role], _find_walk(noise.odometries[role].scale)
+    if has_fixes and m.odometries():
+        walk[state.SHARED_SCALE] = _find_walk(noise.shared_scale)
+        std[state.SHARED_SCALE] = 1e-6
+    if turn_scale_std(m):
+        std[state.TURN_SCALE] = turn_scale_std(m)
+        walk[state.TURN_SCALE] = np.sqrt(2.0 / 60.0) * turn_scale_std(m)
+    # Where roll and pitch are not known, an antenna that sways looks like one elsewhere.
+    if m.gnss is not None and has_tilt:
+        std[state.ARM : state.ARM + 3] = m.gnss.lever_arm_std_m
+    if has_fixes:
+        std[state.FIX_ERROR : state.FIX_ERROR + 3] = np.sqrt(ticks.fix_variance_m2[0])
+    return std, walk
+
+
+def _find_walk(process: GaussMarkov) -> float:
+    """Return the deviation of a second's walk that strays as fast as a Gauss-Markov process does over short times."""
+    return float(np.sqrt(2.0 * process.variance / process.time_s))
+
+
+_MOTION = (*range(state.THETA, state.GYRO_BIAS),)
+_BODY = (*range(state.U, state.GYRO_BIAS + 3), *range(state.MOUNT, state.MOUNT + 3))
+_ANTENNA = (*range(state.THETA, state.THETA + 3), *_BODY, *range(state.ARM, state.FIX_LAG + 1))
+_DEPENDS: Mapping[int, Sequence[int]] = {
+    state.WHEELS: (*_BODY, state.WHEEL_SCALE, state.SHARED_SCALE, state.WHEEL_LAG),
+    state.SIDEWAYS: (*_BODY, state.TURNING_CENTRE),
+    state.VISUAL: (
+        *_BODY,
+        state.VISUAL_SCALE,
+        state.SHARED_SCALE,
+        state.VISUAL_MOUNT,
+        state.VISUAL_MOUNT + 1,
+        state.VISUAL_LAG,
+    ),
+    state.STATIONARY: range(state.U, state.U + 3),
+    state.STATIONARY_RATE: range(state.GYRO_BIAS, state.GYRO_BIAS + 3),
+    state.LEVEL: range(3),
+    state.DOPPLER: _ANTENNA,
+    state.FIX: (*_ANTENNA, *range(state.RHO, state.RHO + 3), *range(state.FIX_ERROR, state.FIX_OFFSET + 3)),
+    state.KINDS: (*_MOTION, state.TURN_SCALE),
+    state.KINDS + 1: range(state.MOVING),
+}
+"""Errors on which each kind of measurement depends, and motion by odometry and by gyroscope."""
+
+
+def make_model(
+    m: Measurements,
+    std: Floats,
+    walk: Floats,
+    events: Sequence[Event],
+    *,
+    period_s: float,
+    gate_probability: float,
+    follows: bool = True,
+    ignored: Sequence[tuple[int, int, int]] = (),
+    possible: Sequence[int] = (),
+) -> Model:
+    """Return the filter's model; unless it ``follows``, rejected fixes are never taken to be right after all.
+
+    ``ignored``: measurements (kind, first tick, last tick) that are not used; ``possible``: errors that other events could change.
+    """
+    involved = {e for event in events for e in range(event.place, event.place + event.count)} | set(possible)
+    active = np.array([e for e in range(state.N) if e < state.GYRO_BIAS or std[e] or walk[e] or e in involved])
+    position = {int(e): i for i, e in enumerate(active)}
+    depends = np.zeros((state.KINDS + 2, active.size), np.int64)
+    counts = np.zeros(state.KINDS + 2, np.int64)
+    for row, errors in _DEPENDS.items():
+        places = sorted(position[e] for e in errors if e in position)
+        counts[row] = len(places)
+        depends[row, : len(places)] = places
+    gates = np.full(state.KINDS, np.inf)
+    for kind in (state.WHEELS, state.VISUAL, state.STATIONARY, state.STATIONARY_RATE, state.DOPPLER, state.FIX):
+        gates[kind] = find_chi_square_threshold(SIZE_OF[kind], gate_probability)
+    scales = np.full(state.KINDS, -1, np.int64)
+    scales[state.WHEELS] = position.get(state.WHEEL_SCALE, -1)
+    scales[state.VISUAL] = position.get(state.VISUAL_SCALE, -1)
+    return Model(
+        active=active,
+        depends=depends,
+        counts=counts,
+        kept=np.ones(active.size),
+        noise=np.square(walk[active]) * period_s,
+        gates=gates,
+        patience=_find_patience(m, follows=follows),
+        mount=position.get(state.MOUNT, -1),
+        scales=scales,
+        events=np.array([(e.tick, position[e.place], e.count, e.is_new) for e in events], np.int64).reshape(-1, 4),
+        sizes=np.array([e.std**2 for e in events], np.float64),
+        ignored=np.array(ignored, np.int64).reshape(-1, 3),
+    )
+
+
+SIZE_OF = dict(enumerate(state.SIZES))
+
+
+def _find_patience(m: Measurements, *, follows: bool) -> Floats:
+    patience = np.array([_PATIENCE.get(kind, _NEVER) for kind in range(state.KINDS)])
+    if m.visual is None or m.imu is None:  # what is left cannot overrule fixes for long
+        patience[state.FIX, 1] = _PATIENCE[state.FIX][2]
+    if m.imu is None and m.visual is None:  # wheels that dig in must not overrule fixes
+        patience[state.FIX, 1:] = 1.0
+    if not follows:
+        patience[state.FIX] = _NEVER
+    return patience
+
+
+def make_start(initial: InitialState, model: Model, std: Floats, arm_m: Sequence[float]) -> Memory:
+    """Return the filter's state at the first tick."""
+    x, P = np.zeros(state.NX), np.zeros((state.N, state.N))
+    rotation = matrix_from_quat(initial.quat_xyzw)
+    x[:9] = rotation.ravel()
+    x[9:12] = initial.position_enu_m
+    x[state.U + 6 : state.U + 9] = rotation.T @ initial.velocity_enu_mps
+    np.fill_diagonal(P, std**2)
+    if std[state.GYRO_BIAS]:
+        x[state.GYRO_BIAS + 6 : state.GYRO_BIAS + 9] = initial.gyro_bias_radps
+        bias = range(state.GYRO_BIAS, state.GYRO_BIAS + 3)
+        P[bias, bias] = initial.gyro_bias_std_radps**2
+    x[state.ARM + 6 : state.ARM + 9] = arm_m
+    level = np.diag(np.square([initial.tilt_std_rad, initial.tilt_std_rad, initial.yaw_std_rad]))
+    P[0:3, 0:3] = rotation.T @ level @ rotation
+    P[3:6, 3:6] = rotation.T @ np.diag(np.square(initial.position_std_m)) @ rotation
+    P[6:9, 6:9] = np.eye(3) * initial.velocity_std_mps**2
+    active = model.active
+    return Memory(x, P[np.ix_(active, active)].copy(), np.zeros((state.KINDS, 2)))
+
+
+def expand_start(start: Memory, model: Model, other: Model) -> Memory:
+    """Return a start of one model as that of another, in which more errors are active."""
+    P = np.zeros((state.N, state.N))
+    P[np.ix_(model.active, model.active)] = start.P
+    return Memory(start.x.copy(), P[np.ix_(other.active, other.active)].copy(), start.waits.copy())

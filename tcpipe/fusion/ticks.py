@@ -1,0 +1,341 @@
+"""What a section measures, tick by tick of the track: motion between ticks, and at each tick the mean of each sensor's measurements.
+
+Ticks are the multiples of the track's period, or of a part of it that is at most 50 ms long. A sensor that measures several times a tick
+gives the mean of value and stamp. Late messages are no problem offline: everything is in order of its stamp of measurement.
+
+Two constraints are measurements of our own making: the turning centre of the robot moves neither sideways nor upward; and a robot that
+is stationary (`tcpipe.fusion.initial`) has no velocity, and its gyroscope shows its bias. Where no accelerometer shows up and down, roll
+and pitch are small.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tcpipe.compiled import compile_kernel
+from tcpipe.fusion import state
+from tcpipe.fusion.densities import FixNoise, NoiseModel
+from tcpipe.fusion.filter_kernel import Inputs
+from tcpipe.fusion.initial import compute_course_rate
+from tcpipe.fusion.measurements import VISUAL, WHEELS, BodyVelocities, InertialMeasurements, Measurements
+from tcpipe.fusion.process import (
+    DOPPLER_LASTS_S,
+    UNSEEN_TURN_RADPS,
+    is_gliding,
+    level_stds_rad,
+    make_motion_noise,
+    turn_sources,
+)
+from tcpipe.fusion.signals import (
+    compute_interval_means,
+    compute_median_of_five,
+    compute_median_period_ns,
+    compute_seconds,
+    compute_slopes,
+    is_covered,
+)
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+_LONGEST_NS = 50_000_000
+_STATIONARY_EVERY_S = 0.2
+_STATIONARY_STD_MPS = 0.01  # a robot that stands rocks
+_STATIONARY_RATE_STD_RADPS = 5e-4
+_LEVEL_EVERY_S = 1.0
+_UNMEASURED = 1e6
+_ACCELERATION_WINDOW_S = 0.4
+_LASTING_S = 0.1  # errors of an odometry beyond its white noise are independent after this time
+
+
+@dataclass(frozen=True, slots=True)
+class Ticks:
+    """Ticks of a section.
+
+    Attributes
+    ----------
+    stamp_ns : [ns], shape (K,). inputs : what the filter takes.
+    rows : by kind of measurement, the tick of each row of its sensor; -1: of none.
+    fix_variance_m2 : variance of the fixes' correlated error at each tick [m²], (K, 3).
+    """
+
+    stamp_ns: Ints
+    inputs: Inputs
+    rows: dict[int, Ints]
+    fix_variance_m2: Floats
+
+
+def find_tick_period_ns(period_ns: int) -> int:
+    """Return the time of a tick [ns]: a whole part of the track's period, at most 50 ms."""
+    return period_ns // -(-period_ns // _LONGEST_NS)
+
+
+def build_ticks(  # noqa: C901, PLR0915  one array after the other
+    m: Measurements, noise: NoiseModel, stationary_ns: Ints, start_ns: int, end_ns: int, *, output_ns: Ints
+) -> Ticks:
+    """Return the ticks from that before ``start_ns`` to that after ``end_ns``; ``stationary_ns``, shape (S, 2), are stops [ns].
+
+    Every wanted stamp (``output_ns``, multiples of the track's period) is a tick.
+    """
+    tick_ns = find_tick_period_ns(compute_median_period_ns(output_ns) if output_ns.size > 1 else _LONGEST_NS)
+    stamp_ns = np.arange(start_ns // tick_ns, -(-end_ns // tick_ns) + 1, dtype=np.int64) * tick_ns
+    period_s = tick_ns * 1e-9
+    size = stamp_ns.size
+    value = np.full((size, state.KINDS, 3), np.nan)
+    variance, tau, levers = np.ones_like(value), np.zeros((size, state.KINDS)), np.zeros((state.KINDS, 3))
+    rows: dict[int, Ints] = {}
+
+    def put(kind: int, source_ns: Ints, values: Floats, variances: Floats) -> None:
+        at = np.rint((source_ns - stamp_ns[0]) / tick_ns).astype(np.int64)
+        inside = (at >= 0) & (at < size)
+        rows[kind] = np.where(inside, at, -1)
+        at, values, variances = at[inside], values[inside], variances[inside]
+        offset_s = (source_ns[inside] - stamp_ns[at]) * 1e-9
+        count = np.bincount(at, minlength=size)
+        told, width = count > 0, values.shape[1]
+
+        def mean(of: Floats) -> Floats:
+            return np.bincount(at, of, size)[told] / count[told]
+
+        for axis in range(width):
+            value[told, kind, axis] = mean(values[:, axis])
+            variance[told, kind, axis] = mean(variances[:, axis]) / count[told]
+        tau[told, kind] = mean(offset_s)
+
+    for kind, role, source in ((state.WHEELS, WHEELS, m.wheels), (state.VISUAL, VISUAL, m.visual)):
+        if source is not None:
+            levers[kind] = source.lever_arm_m
+            axes = 1 if kind == state.WHEELS else 3
+            put(kind, source.stamp_ns, source.velocity_mps[:, :axes], _make_velocity_variance(m, source, noise, role))
+    fix_variance = np.zeros((size, 3))
+    if m.gnss is not None:
+        put(state.FIX, m.gnss.stamp_ns, m.gnss.position_enu_m, m.gnss.variance_m2 * _compute_white_shares(noise))
+        nearest = np.searchsorted(m.gnss.stamp_ns, stamp_ns).clip(0, m.gnss.stamp_ns.size - 1)
+        fix_variance = m.gnss.variance_m2[nearest] * _compute_correlated_shares(noise)
+    if m.gnss is not None and m.doppler is not None:
+        lasting = max(1.0, DOPPLER_LASTS_S * 1e9 / compute_median_period_ns(m.doppler.stamp_ns))
+        variances = m.doppler.variance_m2ps2 * lasting
+        if m.imu is None and (m.visual is None or m.visual.turn_rate_radps is None):
+            variances = variances + _compute_unseen_turn_variance(m.doppler.stamp_ns, m.gnss.lever_arm_m)
+        put(state.DOPPLER, m.doppler.stamp_ns, m.doppler.velocity_enu_mps, variances)
+    _add_constraints(m, stationary_ns, stamp_ns, value, variance)
+    if m.wheels is not None:
+        levers[state.SIDEWAYS] = m.wheels.lever_arm_m
+
+    before_ns = stamp_ns - tick_ns
+    turn_rate, mode = _find_turn_rates(m, before_ns, stamp_ns, int(stamp_ns[0]))
+    rate, around = _find_turn_rates(m, stamp_ns - tick_ns // 2, stamp_ns + tick_ns // 2, int(stamp_ns[0]))
+    turned, gained = np.zeros((size, 9)), np.zeros((size, 6))
+    turned[:, :3] = turn_rate * period_s
+    by_gyro = np.flatnonzero(mode == state.GYRO_TURN)
+    if m.imu is not None and by_gyro.size:
+        imu_s, end_s = compute_seconds(m.imu.stamp_ns, int(stamp_ns[0])), compute_seconds(stamp_ns, int(stamp_ns[0]))
+        _preintegrate(
+            imu_s, m.imu.angular_velocity_radps, m.imu.specific_force_mps2, end_s, period_s, by_gyro, turned, gained
+        )
+        if m.imu.accelerometer_usable:
+            mode[by_gyro] = state.INERTIAL
+    kept, fix_noise = _make_fix_process(noise, fix_variance, period_s)
+    inputs = Inputs(
+        period_s,
+        mode,
+        turned,
+        gained,
+        make_motion_noise(m, noise, stamp_ns, mode, turn_rate, period_s),
+        rate,
+        around >= state.GYRO_TURN,
+        _compute_accelerations(m, stamp_ns),
+        value,
+        variance,
+        tau,
+        levers,
+        kept,
+        fix_noise,
+    )
+    return Ticks(stamp_ns, inputs, rows, fix_variance)
+
+
+def _compute_white_shares(noise: NoiseModel) -> Floats:
+    """Return the white share of the claimed variance of fixes, east, north, up."""
+    return _make_axes(noise, lambda fix: fix.white_m2 / fix.claimed_m2)
+
+
+def _compute_correlated_shares(noise: NoiseModel) -> Floats:
+    """Return the share of their correlated error, east, north, up."""
+    return _make_axes(noise, lambda fix: fix.correlated.variance / fix.claimed_m2)
+
+
+def _make_axes(noise: NoiseModel, compute: Callable[[FixNoise], float]) -> Floats:
+    axes = (noise.horizontal, noise.horizontal, noise.vertical)
+    return np.array([0.0 if axis is None else compute(axis) for axis in axes])
+
+
+def _make_fix_process(noise: NoiseModel, variance_m2: Floats, period_s: float) -> tuple[Floats, Floats]:
+    """Return the share of the fixes' correlated error that stays over each tick, and the variance added to it."""
+    size = variance_m2.shape[0]
+    if noise.horizontal is None:
+        return np.ones(size), np.zeros((size, 3))
+    before = np.concatenate((variance_m2[:1], variance_m2[:-1]))
+    shrunk = np.sqrt(np.minimum(1.0, variance_m2[:, 0] / np.maximum(before[:, 0], 1e-12)))
+    kept = np.exp(-period_s / noise.horizontal.correlated.time_s) * shrunk
+    return kept, np.maximum(variance_m2 - kept[:, None] ** 2 * before, 0.0)
+
+
+def _make_velocity_variance(m: Measurements, source: BodyVelocities, noise: NoiseModel, role: str) -> Floats:
+    """Return the variance of each sample: forward by the run's noise, more where more is claimed than usual; others as claimed."""
+    rate_hz = 1e9 / compute_median_period_ns(source.stamp_ns)
+    claimed = source.variance_m2ps2
+    found = claimed.copy()
+    relative = claimed[:, 0] / np.median(claimed[:, 0])
+    found[:, 0] = noise.odometries[role].velocity_m2ps * rate_hz * np.maximum(relative, 1.0)
+    for axis in range(1, 3):
+        if not np.isfinite(claimed[:, axis]).all() or np.ptp(source.velocity_mps[:, axis]) == 0.0:
+            found[:, axis] = _UNMEASURED  # an axis that is always zero is a constraint, not a measurement
+    flat = source.turn_rate_radps is None and m.imu is None and role == VISUAL
+    if flat:
+        found = found + _compute_unseen_turn_variance(source.stamp_ns, source.lever_arm_m)
+    return found
+
+
+def _compute_unseen_turn_variance(stamp_ns: Ints, lever_arm_m: tuple[float, float, float]) -> Floats:
+    """Variance [m²/s²], shape (3,), that turns which no sensor measures cause at a sensor off base_link; they last for a second."""
+    x, y, z = np.square(lever_arm_m)
+    lasting = max(1.0, 1e9 / compute_median_period_ns(stamp_ns))
+    return np.array([z, z, x + y]) * UNSEEN_TURN_RADPS**2 * lasting
+
+
+def _add_constraints(m: Measurements, stationary_ns: Ints, stamp_ns: Ints, value: Floats, variance: Floats) -> None:
+    period_s = float(stamp_ns[1] - stamp_ns[0]) * 1e-9
+    if is_gliding(m):  # which way the body looks is not known
+        return
+    value[:, state.SIDEWAYS, :2] = 0.0
+    variance[:, state.SIDEWAYS, :2] = m.nonholonomic_std_mps**2 * _LASTING_S / period_s
+    imu = m.imu
+    if imu is None or not imu.accelerometer_usable:
+        every = max(1, round(_LEVEL_EVERY_S / period_s))
+        value[::every, state.LEVEL, :2] = 0.0
+        variance[::every, state.LEVEL, :2] = np.square(level_stds_rad(m))
+    if imu is None or not stationary_ns.size:
+        return
+    inside = np.zeros(stamp_ns.size, np.bool_)
+    for first, last in stationary_ns:
+        inside[np.searchsorted(stamp_ns, first) : np.searchsorted(stamp_ns, last)] = True
+    rows = np.flatnonzero(inside)
+    rows = rows[rows % max(1, round(_STATIONARY_EVERY_S / period_s)) == 0]
+    zero = int(stamp_ns[0])
+    at_s, half_s = compute_seconds(stamp_ns[rows], zero), 0.5 * _STATIONARY_EVERY_S
+    samples = max(1.0, _STATIONARY_EVERY_S * 1e9 / compute_median_period_ns(imu.stamp_ns))
+    value[rows, state.STATIONARY] = 0.0
+    variance[rows, state.STATIONARY] = _STATIONARY_STD_MPS**2
+    imu_s = compute_seconds(imu.stamp_ns, zero)
+    value[rows, state.STATIONARY_RATE] = compute_interval_means(
+        imu_s, imu.angular_velocity_radps, at_s - half_s, at_s + half_s
+    )
+    variance[rows, state.STATIONARY_RATE] = imu.gyro_std_radps**2 / samples + _STATIONARY_RATE_STD_RADPS**2
+
+
+@compile_kernel
+def _preintegrate(  # noqa: PLR0917, C901  compiled
+    t: Floats, w: Floats, f: Floats, ends: Floats, period_s: float, wanted: Ints, turned: Floats, gained: Floats
+) -> None:
+    """Fill rotation, velocity and displacement over the tick before each wanted end, of samples (s, rad/s, m/s²) linear in between."""
+    r, step, both = np.zeros(9), np.zeros(9), np.zeros(9)
+    wm, fm, a = np.zeros(3), np.zeros(3), np.zeros(3)
+    v, p = np.zeros(3), np.zeros(3)
+    j = 0
+    for k in wanted:
+        now = ends[k] - period_s
+        state.make_rotation(0.0, 0.0, 0.0, r)
+        for i in range(3):
+            v[i] = p[i] = 0.0
+        while now < ends[k] - 1e-9:
+            while j + 1 < t.size and t[j + 1] <= now + 1e-9:
+                j += 1
+            end = ends[k]
+            if t[j] > now + 1e-9:
+                end = min(t[j], end)
+            elif j + 1 < t.size:
+                end = min(t[j + 1], end)
+            h, middle = end - now, 0.5 * (end + now)
+            after = min(j + 1, t.size - 1)
+            share = min(max((middle - t[j]) / (t[after] - t[j]), 0.0), 1.0) if after > j else 0.0
+            for i in range(3):
+                wm[i] = (1.0 - share) * w[j, i] + share * w[after, i]
+                fm[i] = (1.0 - share) * f[j, i] + share * f[after, i]
+            state.make_rotation(0.5 * h * wm[0], 0.5 * h * wm[1], 0.5 * h * wm[2], step)
+            state.multiply_rotations(r, step, both)
+            for i in range(3):
+                a[i] = both[3 * i] * fm[0] + both[3 * i + 1] * fm[1] + both[3 * i + 2] * fm[2]
+                p[i] += h * (v[i] + 0.5 * h * a[i])
+                v[i] += h * a[i]
+            state.multiply_rotations(both, step, r)
+            now = end
+        for i in range(9):
+            turned[k, i] = r[i]
+        for i in range(3):
+            gained[k, i] = v[i]
+            gained[k, 3 + i] = p[i]
+
+
+def _compute_accelerations(m: Measurements, stamp_ns: Ints) -> Floats:
+    """Return the forward acceleration at each tick by how the other odometry's velocity changes, for wheels and camera, shape (K, 2).
+
+    A sensor's own would be late as it is; without another one there is no choice. 0 where there is none.
+    """
+    of_camera, of_wheels = (_compute_slope(source, stamp_ns) for source in (m.visual, m.wheels))
+    return np.column_stack((of_wheels if m.visual is None else of_camera, of_camera if m.wheels is None else of_wheels))
+
+
+def _compute_slope(source: BodyVelocities | None, stamp_ns: Ints) -> Floats:
+    if source is None or source.stamp_ns.size < 3:
+        return np.zeros(stamp_ns.size)
+    slope = compute_slopes(source.stamp_ns, compute_median_of_five(source.velocity_mps[:, 0]), _ACCELERATION_WINDOW_S)
+    zero = int(stamp_ns[0])
+    found = np.interp(compute_seconds(stamp_ns, zero), compute_seconds(source.stamp_ns, zero), slope)
+    return np.where(is_covered(source.stamp_ns, stamp_ns, stamp_ns), found, 0.0)
+
+
+def _find_turn_rates(m: Measurements, before_ns: Ints, after_ns: Ints, zero_ns: int) -> tuple[Floats, NDArray[np.int8]]:
+    """Return the mean angular velocity over each interval by the best source that covers it, and the mode of motion that goes with it."""
+    imu = m.imu
+    if imu is None or imu.stamp_ns.size == 0:
+        return _compute_odometric_turn_rate(m, before_ns, after_ns, zero_ns)
+    covered = is_covered(imu.stamp_ns, before_ns, after_ns)
+    rate, mode = np.zeros((before_ns.size, 3)), np.full(before_ns.size, state.GYRO_TURN, np.int8)
+    rate[covered] = _compute_means(imu, before_ns[covered], after_ns[covered], zero_ns)
+    rate[~covered], mode[~covered] = _compute_odometric_turn_rate(m, before_ns[~covered], after_ns[~covered], zero_ns)
+    return rate, mode
+
+
+def _compute_means(imu: InertialMeasurements, before_ns: Ints, after_ns: Ints, zero_ns: int) -> Floats:
+    stamp_s = compute_seconds(imu.stamp_ns, zero_ns)
+    return compute_interval_means(
+        stamp_s, imu.angular_velocity_radps, compute_seconds(before_ns, zero_ns), compute_seconds(after_ns, zero_ns)
+    )
+
+
+def _compute_odometric_turn_rate(
+    m: Measurements, before_ns: Ints, after_ns: Ints, zero_ns: int
+) -> tuple[Floats, NDArray[np.int8]]:
+    """Return the mean angular velocity by the odometries, shape (K, 3), and the mode; by the course over ground where there are none."""
+    rate = np.zeros((before_ns.size, 3))
+    mode = np.full(before_ns.size, state.FLAT_TURN, np.int8)
+    start_s, end_s = compute_seconds(before_ns, zero_ns), compute_seconds(after_ns, zero_ns)
+    sources = turn_sources(m)
+    odometry = next(iter(m.odometries().values()), None)
+    if not sources and m.gnss is not None and not is_gliding(m):
+        stamp_s, values = compute_course_rate(m.gnss, odometry, zero_ns)
+        rate[:, 2] = compute_interval_means(stamp_s, values[:, None], start_s, end_s)[:, 0]
+    for rank, source in enumerate(sources):
+        known = np.isfinite(source.yaw_rate_radps)
+        turns = source.turn_rate_radps
+        values = np.stack((0 * source.yaw_rate_radps,) * 2 + (source.yaw_rate_radps,), -1) if turns is None else turns
+        inside = is_covered(source.stamp_ns[known], before_ns, after_ns) | (rank == 0)
+        stamp_s = compute_seconds(source.stamp_ns[known], zero_ns)
+        rate[inside] = compute_interval_means(stamp_s, values[known], start_s[inside], end_s[inside])
+        mode[inside] = state.VISUAL_TURN if source is m.visual else state.FLAT_TURN
+    return rate, mode

@@ -1,0 +1,183 @@
+"""What a log shows of its power sensor's errors: the zero of a current at rest, a gain that changes, and a sign that is lost.
+
+A battery sags in proportion to the current: dU = -R dI over seconds, with R its resistance. That is known without any model of the robot or
+its ground, so that it judges the current: where R seems to change at once, the gain of the current did (by the inverse), and where the
+voltage rises with the current, the current flows back and its sign is lost. Nothing is corrected: what is found widens σ.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import uniform_filter1d
+
+from tcpipe.power.rails import Rail, interpolate_rail
+from tcpipe.tables.findings import read_threshold
+
+Floats = NDArray[np.float64]
+Stamps = NDArray[np.int64]
+
+_WINDOW_S = 10.0
+"""Slower changes of the voltage are those of its charge."""
+_BLOCK_S = 10.0
+_FEWEST_BLOCKS = 6
+"""On either side of a change."""
+_FEWEST_SAMPLES = 400
+_CLEAR, _SURE, _GRADUAL = 20.0, 5.0, 3.0
+"""Standard deviations that show the resistance itself, a change of it, and that it is not gradual (a battery warms up)."""
+_NORMAL = 0.6745
+"""Median of the absolute value of a normal variate of unit variance."""
+_FEWEST_BRAKED = 5
+_LIKELY = 8.0
+"""Logarithm of a ratio of likelihoods: of three thousand segments one by chance."""
+_SETTLED_NS = 300_000_000
+"""After a stop and before a start the motors still draw."""
+_SHORTEST_HALT_NS = 1_000_000_000
+
+
+def measure_rest_currents(rail: Rail, still_ns: Stamps) -> Floats:
+    """Return the mean current of a rail in each halt of a second or more [A]; ``still_ns``, shape (S, 2), begin and end [ns]."""
+    settled = still_ns + np.array([_SETTLED_NS, -_SETTLED_NS])
+    settled = settled[settled[:, 1] - settled[:, 0] >= _SHORTEST_HALT_NS]
+    first, last = (np.searchsorted(rail.current.stamp_ns, at_ns) for at_ns in settled.T)
+    sums = np.concatenate(([0.0], np.cumsum(rail.current.value)))
+    used = last > first
+    return np.asarray((sums[last] - sums[first])[used] / (last - first)[used])
+
+
+def summarize_rest(rest_amp: Floats) -> tuple[float, float]:
+    """Return a low and a high current at rest [A], of at least one halt: a fifth of the halts may be odd (held on a slope, or stuck)."""
+    low, high = np.quantile(rest_amp, (0.2, 0.8)).tolist()
+    return low, high
+
+
+def estimate_offset_std(rest_amp: Floats, rest_range_amp: tuple[float, float], prior_amp: float) -> float:
+    """Return the standard deviation of a rail's zero by its currents in halts, [A], no less than the prior.
+
+    Halts beyond what the hardware takes, by more than the prior, leave a range of offsets, all as likely. On a slope the drives may take
+    more, so that the low halts count. Where halts differ, the zero moved, and none tells which is right.
+    """
+    if not rest_amp.size:
+        return prior_amp
+    least, most = summarize_rest(rest_amp)
+    first, last = least - rest_range_amp[1], least - rest_range_amp[0]
+    std = prior_amp
+    if first > prior_amp or last < -prior_amp:
+        std = max(std, ((first**2 + first * last + last**2) / 3.0) ** 0.5)
+    if most - least > read_threshold("current-offset", "min_difference_amp"):
+        std = max(std, (most - least) / 2.0**0.5)
+    return std
+
+
+@dataclass(frozen=True, slots=True)
+class Sag:
+    """Changes of voltage [V] and current [A] within seconds, shape (N,), and of the current's neighbours, whose noise is another."""
+
+    stamp_ns: Stamps
+    volt: Floats
+    amp: Floats
+    neighbour_amp: Floats
+
+    def products(self, edge_ns: Stamps) -> tuple[Floats, Floats]:
+        """Return the sums of voltage and of current, times the current's neighbours, up to each time, shape (E,)."""
+        at = np.searchsorted(self.stamp_ns, edge_ns)
+        sums = (np.concatenate(([0.0], np.cumsum(of * self.neighbour_amp))) for of in (self.volt, self.amp))
+        by_volt, by_amp = (of[at] for of in sums)
+        return by_volt, by_amp
+
+
+def measure_sag(rails: Sequence[Rail]) -> Sag | None:
+    """Return how mean voltage and summed current of all rails change; None with too few samples."""
+    known = [each for each in rails if len(each.stamp_ns)]
+    if not known or len(known) < len(rails):
+        return None
+    first, last = max(each.stamp_ns[0] for each in known), min(each.stamp_ns[-1] for each in known)
+    stamp_ns = known[0].current.stamp_ns
+    stamp_ns = stamp_ns[(stamp_ns >= first) & (stamp_ns <= last)]
+    if len(stamp_ns) < _FEWEST_SAMPLES:
+        return None
+    values = [interpolate_rail(each, stamp_ns) for each in known]
+    volt, amp = np.mean([of[0] for of in values], axis=0), np.sum([of[1] for of in values], axis=0)
+    rows = max(round(_WINDOW_S * 1e9 / float(np.median(np.diff(stamp_ns)))), 3)
+    volt, amp = (of - uniform_filter1d(of, rows, mode="nearest") for of in (volt, amp))
+    return Sag(stamp_ns, volt, amp, 0.5 * (np.roll(amp, 1) + np.roll(amp, -1)))
+
+
+@dataclass(frozen=True, slots=True)
+class GainChange:
+    """A gain of the current that changed at ``at_ns`` [ns] by the factor ``ratio``."""
+
+    at_ns: int
+    ratio: float
+
+
+def find_gain_change(sag: Sag | None) -> GainChange | None:
+    """Return the clearest change of the gain, by the battery's resistance before and after; None where it is not sure, or gradual."""
+    if sag is None:
+        return None
+    edge_ns = np.arange(sag.stamp_ns[0], sag.stamp_ns[-1], round(_BLOCK_S * 1e9), dtype=np.int64)
+    by_volt, weight = (np.diff(of) for of in sag.products(edge_ns))
+    used = weight > 0.0
+    edge_ns, by_volt, weight = edge_ns[:-1][used], by_volt[used], weight[used]
+    count = len(weight)
+    if count < 2 * _FEWEST_BLOCKS or not _is_known(by_volt, weight):
+        return None
+    resistance, place = -by_volt / weight, np.arange(count)
+
+    def unexplained(*columns: Floats | NDArray[np.bool_ | np.int64]) -> float:
+        by = np.sqrt(weight)
+        design = np.column_stack(columns) * by[:, None]
+        target = resistance * by
+        return float(np.sum((target - design @ np.linalg.lstsq(design, target, rcond=None)[0]) ** 2))
+
+    splits = list(range(_FEWEST_BLOCKS, count - _FEWEST_BLOCKS + 1))
+    left = [unexplained(place < first, place >= first) for first in splits]
+    first, variance = splits[int(np.argmin(left))], min(left) / (count - 3)
+    constant, gradual = unexplained(np.ones(count)), unexplained(np.ones(count), place)
+    is_sure = constant - min(left) > _SURE**2 * variance and gradual - min(left) > _GRADUAL**2 * variance
+    # The level of the current steps, too, when its gain does: the blocks beside it tell the time, but not the ratio.
+    before, after = (-float(by_volt[of].sum() / weight[of].sum()) for of in (slice(first - 1), slice(first + 1, None)))
+    least = read_threshold("current-gain-changes", "min_change_fraction")
+    if not is_sure or min(before, after) <= 0.0 or abs(before / after - 1.0) < least:
+        return None
+    return GainChange(int(edge_ns[first]), before / after)
+
+
+def _is_known(by_volt: Floats, by_amp: Floats) -> bool:
+    """Return whether the battery sags clearly, by what blocks leave over."""
+    total = float(by_amp.sum())
+    if total <= 0.0:
+        return False
+    resistance = -float(by_volt.sum()) / total
+    std = float(np.linalg.norm(by_volt + resistance * by_amp)) / total
+    return resistance > _CLEAR * std
+
+
+def find_lost_signs(sag: Sag | None, start_ns: Stamps, end_ns: Stamps, rise: Floats) -> NDArray[np.bool_]:
+    """Return the segments whose current flows back, but has no sign, shape (M,); none unless several downhill ones surely show it.
+
+    There voltage and current rise together: the likelihoods of both signs are compared. ``rise`` is the tangent of the slope along travel.
+    """
+    nothing = np.zeros(len(rise), dtype=np.bool_)
+    if sag is None or not len(rise):
+        return nothing
+    (volt_0, amp_0), (volt_1, amp_1) = sag.products(start_ns), sag.products(end_ns)
+    by_volt, by_amp = volt_1 - volt_0, amp_1 - amp_0
+    driven = rise > 0.0
+    if not _is_known(by_volt[driven], by_amp[driven]):
+        return nothing
+    resistance = -float(by_volt[driven].sum()) / float(by_amp[driven].sum())
+    residual_volt = float(np.median(np.abs(sag.volt + resistance * sag.amp))) / _NORMAL
+    gain = 2.0 * resistance * by_volt / residual_volt**2
+    clear = gain > _LIKELY
+    count, chance = np.count_nonzero(clear & ~driven), clear[driven].mean() * np.count_nonzero(~driven)
+    if count < max(_FEWEST_BRAKED, 5.0 * chance):
+        return nothing
+    order = np.argsort(rise)
+    steep = order[: int(np.argmax(np.cumsum(gain[order]))) + 1]  # few of which are clear by themselves
+    lost: NDArray[np.bool_] = ~driven & (gain > 0.0)
+    lost[steep] |= ~driven[steep]
+    return lost

@@ -1,0 +1,131 @@
+"""Power sensors that err, on a simulated drive over hills: labels against the truth, and what is found."""
+
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import pytest
+from simulated_streams import streams_of
+
+from tcpipe.pipeline.ingest_run import run_stages
+from tcpipe.recipe import Recipe
+from tcpipe.recipe.checking import from_values
+from tcpipe.simulation import Faults, compute_true_cost, find_scenario, read_truth, simulate
+from tcpipe.simulation.route import Wander
+from tcpipe.simulation.scenarios import RasterSpec
+from tcpipe.stages.fuse_sections import make_power_columns
+from tcpipe.stages.label import label_segments
+from tcpipe.stages.segment import segment_track
+from tcpipe.tables.columns import to_floats, to_integers
+from tcpipe.tables.levels import MASKED_TRACK, STREAMS
+
+NOISY = Faults.only("gnss_noise", "imu_noise", "wheel_noise", "visual_noise", "power_noise")
+CODES = {"current-offset", "current-gain-changes", "current-sign-lost"}
+
+
+@pytest.fixture(scope="module")
+def drive(tmp_path_factory):
+    """Streams, masked track and truth of five minutes with halts; power errs afterwards."""
+    plan = find_scenario("hills12")
+    start_m = (14.0, 34.0)
+    spec = replace(plan.drives[0], plan=Wander(220.0, start_m, climbing=0.5), start_m=start_m, faults=NOISY)
+    single = replace(plan, drives=(spec,), rasters=RasterSpec(1.0, 1.0, 1.0))
+    site = simulate(tmp_path_factory.mktemp("power"), scenario=single, seed=7)
+    streams = streams_of(site.logs[0])
+    _, masked, _ = run_stages(streams, Recipe().ingest, run_id="run")
+    return streams, masked, read_truth(site.truths[0])
+
+
+def label(drive, change=lambda amp, _: amp, recipe=None):
+    """Label with the current [A] that ``change`` makes of the right one and the share of the drive that has passed."""
+    streams, masked, _ = drive
+    table = streams.tables["power"]
+    stamp_ns = to_integers(table, "stamp_ns")
+    share = (stamp_ns - stamp_ns[0]) / (stamp_ns[-1] - stamp_ns[0])
+    columns = {name: table[name] for name in table.column_names}
+    columns["current_amp"] = change(to_floats(table, "current_amp"), share)
+    streams = replace(streams, tables={**streams.tables, "power": STREAMS["power"].table(**columns)})
+    rows = masked.table
+    power = make_power_columns(streams, 0, to_integers(rows, "stamp_ns"), max_gap_ns=300_000_000)
+    masked = replace(
+        masked, table=MASKED_TRACK.table(**{name: power.get(name, rows[name]) for name in rows.column_names})
+    )
+    recipe = recipe or Recipe()
+    return label_segments(segment_track(masked, recipe.segment), masked, streams, recipe.label, voltage_range_volt=None)
+
+
+def normalized(drive, labelled, name, part="std"):
+    true = compute_true_cost(drive[2], to_integers(labelled.table, "start_ns"))
+    quantity, unit = name.rsplit("_", 1)
+    return (to_floats(labelled.table, name) - getattr(true, name)) / to_floats(
+        labelled.table, f"{quantity}_{part}_{unit}"
+    )
+
+
+def find_codes(labelled):
+    return {found.code: found for found in labelled.info.report.findings if found.code in CODES}
+
+
+FAULTS = {
+    "offset of 1 A": (lambda amp, _: amp + 1.0, "current-offset"),
+    "offset of 0.5 A": (lambda amp, _: amp + 0.5, "current-offset"),
+    "offset of -1 A": (lambda amp, _: amp - 1.0, "current-offset"),
+    "zero moves by 1 A": (lambda amp, share: amp + (share > 0.5), "current-offset"),
+    "unsigned": (lambda amp, _: np.abs(amp), "current-sign-lost"),
+    "gain + 10 %": (lambda amp, share: amp * np.where(share > 0.5, 1.1, 1.0), "current-gain-changes"),
+    "gain - 10 %": (lambda amp, share: amp * np.where(share > 0.4, 0.9, 1.0), "current-gain-changes"),
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_fault_is_named_and_labels_are_no_more_wrong_than_they_say(drive, fault):
+    change, code = FAULTS[fault]
+    labelled = label(drive, change)
+    assert set(find_codes(labelled)) == {code}
+    for name in ("power_watt", "energy_joule"):
+        assert np.mean(np.abs(normalized(drive, labelled, name)) < 2.0) >= 0.92, name
+
+
+def test_the_line_that_a_finding_suggests_removes_it_and_keeps_the_uncertainty(drive):
+    for fault in ("offset of 1 A", "gain + 10 %"):
+        change, code = FAULTS[fault]
+        before = label(drive, change)
+        (remedy,) = find_codes(before)[code].remedies
+        after = label(drive, change, from_values(Recipe, dict(remedy.recipe), where="suggested"))
+        assert not find_codes(after)
+        std = [to_floats(of.table, "energy_std_joule") for of in (before, after)]
+        assert std[1] == pytest.approx(std[0], rel=0.02)
+
+
+def test_a_change_of_gain_has_its_time_and_ratio(drive):
+    change, code = FAULTS["gain + 10 %"]
+    found = find_codes(label(drive, change))[code]
+    stamp_ns = to_integers(drive[0].tables["power"], "stamp_ns")
+    assert found.numbers["gain_ratio"] == pytest.approx(1.1, abs=0.03)
+    assert found.span_s[0] == pytest.approx(0.5 * (stamp_ns[-1] - stamp_ns[0]) * 1e-9, abs=20.0)
+
+
+def test_a_right_sensor_gives_no_finding_and_only_its_prior(drive):
+    labelled = label(drive)
+    assert not find_codes(labelled)
+    sensor = labelled.info.report.facts.label.power_sensor
+    assert (sensor.gain_std_fraction, sensor.offset_std_amp, sensor.lost_signs) == (0.02, 0.2, 0)
+
+
+def test_labels_of_many_sensors_are_as_wrong_as_they_say(drive):
+    """Gain and zero drawn once a run, as the prior has them: pooled over runs, σ is right."""
+    rng = np.random.default_rng(5)
+    drawn = [partial(lambda amp, _, gain, zero: amp * (1.0 + gain) + zero, gain=rng.normal(0, 0.02), zero=rng.normal(0, 0.2))
+             for _ in range(40)]  # fmt: skip
+    runs = [label(drive, change) for change in drawn]
+    for name in ("power_watt", "energy_joule"):
+        off = np.abs(np.concatenate([normalized(drive, run, name) for run in runs]))
+        assert 0.55 < np.mean(off < 1.0) < 0.80
+        assert 0.90 < np.mean(off < 2.0) < 0.995
+    # Over the whole drive the common part alone tells the error of the sum, added up linearly.
+    sums = []
+    for run in runs:
+        true = compute_true_cost(drive[2], to_integers(run.table, "start_ns"))
+        error = to_floats(run.table, "energy_joule") - true.energy_joule
+        sums.append(error.sum() / to_floats(run.table, "energy_common_std_joule").sum())
+    assert 0.7 < np.sqrt(np.mean(np.square(sums))) < 1.3

@@ -1,0 +1,205 @@
+"""Motion, measurements and their Jacobians on SE(3), written out in numpy and scipy: what the compiled kernels are compared with.
+
+The robot is at X = (R, p), its velocity u in the axes of its IMU; errors: R = R̂ Exp(θ), p = p̂ + R̂ ρ, all others are added.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from tcpipe.fusion import state
+
+G = np.array([0.0, 0.0, 9.80665])
+EYE = np.eye(3)
+
+
+def skew(v):
+    return np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
+
+
+def exp(v):
+    return Rotation.from_rotvec(v).as_matrix()
+
+
+def right_jacobian(v):
+    """Exp(v + d) = Exp(v) Exp(J d), Solà 2017, eq. 143."""
+    t = np.linalg.norm(v)
+    if t < 1e-9:
+        return EYE
+    K = skew(v)
+    return EYE - (1 - np.cos(t)) / t**2 * K + (t - np.sin(t)) / t**3 * K @ K
+
+
+def part(x, place, count=3):
+    return x[place + 6 : place + 6 + count]
+
+
+def split(x):
+    return x[:9].reshape(3, 3), x[9:12], part(x, state.U)
+
+
+def plus(x, d):
+    R, p, _ = split(x)
+    y = x.copy()
+    y[:9], y[9:12] = (R @ exp(d[:3])).ravel(), p + R @ d[3:6]
+    y[12:] += d[6:]
+    return y
+
+
+def minus(y, x):
+    R, p, _ = split(x)
+    turn = Rotation.from_matrix(R.T @ y[:9].reshape(3, 3)).as_rotvec()
+    return np.concatenate((turn, R.T @ (y[9:12] - p), y[12:] - x[12:]))
+
+
+@dataclass
+class Tick:
+    """Motion over a tick: how it is known, T, the turn D or the rotation vector r, velocity v and displacement s of the forces."""
+
+    mode: int
+    T: float
+    turned: np.ndarray
+    gained: np.ndarray
+
+
+def move(x, tick):
+    """Return the state after a tick."""
+    T, (R, p, u) = tick.T, split(x)
+    bg, ba, kappa = part(x, state.GYRO_BIAS), part(x, state.ACCELEROMETER_BIAS), x[state.TURN_SCALE + 6]
+    by_gyro = tick.mode >= state.GYRO_TURN
+    D = tick.turned.reshape(3, 3) @ exp(-T * bg) if by_gyro else exp((1 - kappa) * tick.turned[:3])
+    y = x.copy()
+    if tick.mode == state.INERTIAL:
+        v, s = tick.gained[:3] - 0.5 * T * np.cross(bg, tick.gained[:3]), tick.gained[3:]
+        y[9:12] = p + R @ (u * T + s - 0.5 * T**2 * ba) - 0.5 * T**2 * G
+        y[12:15] = D.T @ (u + v - T * ba - T * R.T @ G)
+    else:
+        y[9:12] = p + R @ (EYE + D) @ u * T / 2
+    y[:9] = (R @ D).ravel()
+    return y
+
+
+def differentiate_motion(x, tick):
+    """Return the Jacobian of the errors after a tick for those before, (37, 37)."""
+    T, (R, _, u), F = tick.T, split(x), np.eye(state.N)
+    th, rho, vel, bg, ba = (slice(k, k + 3) for k in range(0, 15, 3))
+    b, a = part(x, state.GYRO_BIAS), part(x, state.ACCELEROMETER_BIAS)
+    D = R.T @ move(x, tick)[:9].reshape(3, 3)
+    # D = D̂ Exp(ψ)
+    turn = np.zeros((3, state.N))
+    if tick.mode >= state.GYRO_TURN:
+        turn[:, bg] = -T * right_jacobian(-T * b)
+    else:
+        turn[:, state.TURN_SCALE] = -tick.turned[:3]
+    F[th] = turn
+    F[th, th] = D.T
+    F[rho] = 0.0
+    F[rho, rho] = D.T
+    if tick.mode == state.INERTIAL:
+        q = u * T + tick.gained[3:] - 0.5 * T**2 * a
+        F[rho, th], F[rho, vel], F[rho, ba] = -D.T @ skew(q), T * D.T, -0.5 * T**2 * D.T
+        w = u + tick.gained[:3] - 0.5 * T * np.cross(b, tick.gained[:3]) - T * a - T * R.T @ G
+        F[vel] = skew(D.T @ w) @ turn
+        F[vel, th] = -T * D.T @ skew(R.T @ G)
+        F[vel, vel], F[vel, ba] = D.T, -T * D.T
+        F[vel, bg] += 0.5 * T * D.T @ skew(tick.gained[:3])
+    else:
+        q = (EYE + D) @ u * T / 2
+        F[rho] = -0.5 * T * skew(u) @ turn
+        F[rho, th], F[rho, rho] = -D.T @ skew(q), D.T
+        F[rho, vel] = 0.5 * T * (EYE + D.T)
+    return F
+
+
+@dataclass
+class Look:
+    """What surrounds a measurement: rate of the gyroscope or of odometry, acceleration, time after the tick, place of the sensor."""
+
+    rate: np.ndarray
+    has_gyro: bool
+    quickens: np.ndarray
+    tau: float
+    lever: np.ndarray
+
+
+def expect(kind, x, look):
+    """Return what a sensor measures."""
+    R, p, u = split(x)
+    m, w = part(x, state.MOUNT), look.rate - (part(x, state.GYRO_BIAS) if look.has_gyro else 0.0)
+    if kind in {state.DOPPLER, state.FIX}:
+        arm, t = (EYE + skew(m)) @ part(x, state.ARM), look.tau - x[state.FIX_LAG + 6]
+        if kind == state.DOPPLER:
+            return R @ (u + t * look.quickens + np.cross(w, arm))
+        moved = arm + t * (u + np.cross(w, arm)) + 0.5 * t**2 * look.quickens
+        return p + R @ moved + part(x, state.FIX_ERROR) + part(x, state.FIX_OFFSET)
+    lag = {state.WHEELS: x[state.WHEEL_LAG + 6], state.VISUAL: x[state.VISUAL_LAG + 6]}.get(kind, 0.0)
+    w = (EYE - skew(m)) @ w
+    v = (EYE - skew(m)) @ (u + (look.tau - lag) * look.quickens) + np.cross(w, look.lever)
+    shared = x[state.SHARED_SCALE + 6]
+    c = np.append(0.0, part(x, state.VISUAL_MOUNT, 2))
+    return {
+        state.WHEELS: (1 + shared + x[state.WHEEL_SCALE + 6]) * v[:1],
+        state.VISUAL: (1 + shared + x[state.VISUAL_SCALE + 6]) * (EYE - skew(c)) @ v,
+        state.SIDEWAYS: np.array([v[1] + w[2] * x[state.TURNING_CENTRE + 6], v[2]]),
+        state.STATIONARY: u,
+        state.STATIONARY_RATE: part(x, state.GYRO_BIAS),
+        state.LEVEL: R[2, :2],
+    }[kind]
+
+
+def differentiate_measurement(kind, x, look):
+    """Return the Jacobian of a measurement for the errors, (size, 37)."""
+    R, _, u = split(x)
+    H = np.zeros((3, state.N))
+    th, rho, vel, bg = (slice(k, k + 3) for k in (state.THETA, state.RHO, state.U, state.GYRO_BIAS))
+    arms, mount = slice(state.ARM, state.ARM + 3), slice(state.MOUNT, state.MOUNT + 3)
+    m, w = part(x, state.MOUNT), look.rate - (part(x, state.GYRO_BIAS) if look.has_gyro else 0.0)
+    gyro = float(look.has_gyro)
+    if kind in {state.DOPPLER, state.FIX}:
+        stated, t = part(x, state.ARM), look.tau - x[state.FIX_LAG + 6]
+        arm = (EYE + skew(m)) @ stated
+        v = u + t * look.quickens + np.cross(w, arm)
+        if kind == state.DOPPLER:
+            q, by_arm, by_u, by_t = v, skew(w), EYE, look.quickens
+        else:
+            q, by_arm, by_u, by_t = arm + t * v - 0.5 * t**2 * look.quickens, EYE + t * skew(w), t * EYE, v
+        H[:, th], H[:, vel] = -R @ skew(q), R @ by_u
+        H[:, bg] = gyro * R @ by_u @ skew(arm)
+        H[:, arms], H[:, mount] = R @ by_arm @ (EYE + skew(m)), -R @ by_arm @ skew(stated)
+        H[:, state.FIX_LAG] = -R @ by_t
+        if kind == state.FIX:
+            H[:, rho] = R
+            H[:, state.FIX_ERROR : state.FIX_ERROR + 3] = H[:, state.FIX_OFFSET : state.FIX_OFFSET + 3] = EYE
+        return H
+    if kind in {state.STATIONARY, state.STATIONARY_RATE}:
+        H[:, vel if kind == state.STATIONARY else bg] = EYE
+        return H
+    if kind == state.LEVEL:  # the lowest row of R Exp(θ)
+        H[:, th] = skew(R[2])
+        return H[:2]
+    place = {state.WHEELS: state.WHEEL_LAG, state.VISUAL: state.VISUAL_LAG}.get(kind)
+    t = look.tau - (x[place + 6] if place else 0.0)
+    at, turn = u + t * look.quickens, EYE - skew(m)
+    v = turn @ at + np.cross(turn @ w, look.lever)
+    V = np.zeros((3, state.N))  # of v
+    V[:, vel], V[:, bg] = turn, gyro * skew(look.lever) @ turn
+    V[:, mount] = skew(at) - skew(look.lever) @ skew(w)
+    if place:
+        V[:, place] = -turn @ look.quickens
+    if kind == state.SIDEWAYS:
+        H = V[1:].copy()
+        centre = x[state.TURNING_CENTRE + 6]
+        H[0, state.TURNING_CENTRE] = (turn @ w)[2]
+        H[0, bg] -= gyro * centre * turn[2]
+        H[0, mount] += centre * skew(w)[2]
+        return H
+    own = state.WHEEL_SCALE if kind == state.WHEELS else state.VISUAL_SCALE
+    scale = 1 + x[state.SHARED_SCALE + 6] + x[own + 6]
+    look_axes = EYE if kind == state.WHEELS else EYE - skew(np.append(0.0, part(x, state.VISUAL_MOUNT, 2)))
+    H = scale * look_axes @ V
+    H[:, own] = H[:, state.SHARED_SCALE] = look_axes @ v
+    if kind == state.WHEELS:
+        return H[:1]
+    H[:, state.VISUAL_MOUNT : state.VISUAL_MOUNT + 2] = scale * skew(v)[:, 1:]
+    return H

@@ -1,0 +1,385 @@
+"""Sigma points against Jacobians, and filter and smoother against one large least-squares problem."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+from unit.fusion import se3_reference as reference
+
+from tcpipe.fusion import error_state, state
+from tcpipe.fusion.error_state import filter_section, make_tests, smooth_section
+from tcpipe.fusion.filter_kernel import ACCEPTED, EVERY, REJECTED, RESET, Inputs, Memory, allocate_steps, filter_ticks
+from tcpipe.fusion.measurements import Measurements
+from tcpipe.fusion.parameters import Event, make_model
+from tcpipe.fusion.ticks import Ticks
+
+T = 0.05
+MODES = (state.FLAT_TURN, state.VISUAL_TURN, state.GYRO_TURN, state.INERTIAL)
+FAULTY = range(state.GYRO_BIAS, state.N)
+"""Errors that may be known exactly."""
+seeds = st.integers(0, 2**32 - 1)
+subsets = st.sets(st.sampled_from(FAULTY))
+
+
+def make_state(rng):
+    """Return a state anywhere, with parameters of a usual size."""
+    x = 0.05 * rng.normal(size=state.NX)
+    x[:9] = Rotation.random(rng=rng).as_matrix().ravel()
+    x[9:12], x[12:15] = rng.normal(size=3), rng.normal(size=3)
+    x[state.ARM + 6 : state.ARM + 9] = rng.normal(size=3)
+    return x
+
+
+def make_covariance(rng, size, std):
+    root = rng.normal(size=(size, size)) / np.sqrt(size) + 0.3 * np.eye(size)
+    return std**2 * root @ root.T
+
+
+def make_inputs(count, rng, mode=state.INERTIAL, *, noise=0.0, kept=1.0):
+    """Return ticks of random motion without measurements."""
+    turned, gained = np.zeros((count, 9)), np.zeros((count, 6))
+    for k in range(count):
+        turn = rng.normal(size=3) * T
+        turned[k, :3] = turn
+        if mode >= state.GYRO_TURN:
+            turned[k] = Rotation.from_rotvec(turn).as_matrix().ravel()
+        gained[k] = np.concatenate(
+            ((rng.normal(size=3) + reference.G) * T, (rng.normal(size=3) + reference.G) * T**2 / 2)
+        )
+    shape = count, state.KINDS
+    return Inputs(
+        T,
+        np.full(count, mode, np.int8),
+        turned,
+        gained,
+        np.full((count, 6), noise),
+        rng.normal(size=(count, 3)),
+        np.full(count, mode >= state.GYRO_TURN),
+        rng.normal(size=(count, 2)),
+        np.full((*shape, 3), np.nan),
+        np.ones((*shape, 3)),
+        rng.uniform(-T / 2, T / 2, shape),
+        rng.normal(size=(state.KINDS, 3)),
+        np.full(count, kept),
+        np.full((count, 3), noise),
+    )
+
+
+def look_at(inputs, k, kind):
+    quickens = np.array([inputs.quickens[k, int(kind == state.VISUAL)], 0.0, 0.0])
+    return reference.Look(inputs.rate[k], bool(inputs.has_gyro[k]), quickens, inputs.tau[k, kind], inputs.levers[kind])
+
+
+def model_of(free, *, walk=0.0):
+    """Return the model in which the errors of ``free`` are not known exactly; its gates let everything pass."""
+    std = np.zeros(state.N)
+    std[sorted(free)] = 1.0
+    walks = np.full(state.N, 0.0)
+    walks[sorted(free)] = walk
+    model = make_model(Measurements(), std, walks, (), period_s=T, gate_probability=0.999)
+    return model._replace(gates=np.full(state.KINDS, np.inf))
+
+
+def filter_all(inputs, model, memory):
+    """Return what each tick keeps for the smoother, and the states."""
+    count = inputs.mode.size
+    steps, states = allocate_steps(count, model.active.size), np.zeros((count, state.NX))
+    filter_ticks(0, count, inputs, model, memory, True, steps, make_tests(count), states)
+    return steps, states
+
+
+def differentiate(function, count, step=1e-6):
+    """Return the Jacobian by central differences."""
+    ahead = [np.atleast_1d(function(step * e)) - np.atleast_1d(function(-step * e)) for e in np.eye(count)]
+    return np.array(ahead).T / (2 * step)
+
+
+@pytest.mark.parametrize("mode", MODES)
+@settings(max_examples=10, deadline=None)
+@given(seed=seeds, free=subsets)
+def test_motion_maps_small_errors_by_its_jacobian(mode, seed, free):
+    rng = np.random.default_rng(seed)
+    x, inputs, model = make_state(rng), make_inputs(2, rng, mode), model_of(free)
+    tick = reference.Tick(mode, T, inputs.turned[1], inputs.gained[1])
+    wanted = reference.differentiate_motion(x, tick)
+    centre = reference.move(x, tick)
+    numeric = differentiate(lambda d: reference.minus(reference.move(reference.plus(x, d), tick), centre), state.N)
+    assert np.allclose(wanted, numeric, atol=1e-7)
+
+    P = make_covariance(rng, model.active.size, 1e-4)
+    memory = Memory(x.copy(), P.copy(), np.zeros((state.KINDS, 2)))
+    steps, states = filter_all(inputs, model, memory)
+    F = wanted[np.ix_(model.active, model.active)]
+    assert np.allclose(reference.minus(states[1], centre), 0.0, atol=1e-12)
+    assert np.allclose(steps.P[1], F @ P @ F.T, atol=1e-12)
+    used = model.depends[state.KINDS + (mode >= state.GYRO_TURN)]
+    used = used[: model.counts[state.KINDS + (mode >= state.GYRO_TURN)]]
+    assert np.allclose(steps.F[1][: used.size, : used.size], F[np.ix_(used, used)], atol=1e-6)
+    others = np.delete(np.arange(model.active.size), used)
+    assert np.allclose(F[:, others], np.eye(model.active.size)[:, others], atol=0.0)
+
+
+@pytest.mark.parametrize("kind", range(state.KINDS))
+@settings(max_examples=10, deadline=None)
+@given(seed=seeds, free=subsets, mode=st.sampled_from(MODES))
+def test_each_measurement_maps_small_errors_by_its_jacobian(kind, seed, free, mode):
+    rng = np.random.default_rng(seed)
+    x, inputs, model = make_state(rng), make_inputs(1, rng, mode), model_of(free)
+    look, size = look_at(inputs, 0, kind), state.SIZES[kind]
+    wanted = reference.differentiate_measurement(kind, x, look)
+    numeric = differentiate(lambda d: reference.expect(kind, reference.plus(x, d), look), state.N)
+    assert np.allclose(wanted, numeric, atol=1e-7)
+
+    R = np.diag(rng.uniform(0.5, 2.0, size)) * 1e-8
+    z = reference.expect(kind, x, look) + 1e-4 * rng.normal(size=size)
+    inputs.value[0, kind, :size], inputs.variance[0, kind, :size] = z, np.diag(R)
+    P = make_covariance(rng, model.active.size, 1e-4)
+    memory = Memory(x.copy(), P.copy(), np.zeros((state.KINDS, 2)))
+    steps, states = filter_all(inputs, model, memory)
+    H = wanted[:, model.active]
+    assert np.allclose(steps.H[0, kind][:size], H, atol=2e-3 if kind >= state.DOPPLER else 5e-4)
+    S = H @ P @ H.T + R
+    K = P @ H.T @ np.linalg.inv(S)
+    y = z - reference.expect(kind, x, look)
+    moved = np.zeros(state.N)
+    moved[model.active] = K @ y
+    scale = np.sqrt(np.diag(P))
+    off = (reference.minus(states[0], reference.plus(x, moved))[model.active]) / scale
+    assert np.abs(off).max() < 2e-3
+    assert np.allclose(steps.P[0] / np.outer(scale, scale), (P - K @ S @ K.T) / np.outer(scale, scale), atol=2e-3)
+
+
+def test_a_wide_covariance_passes_as_a_cloud_does():
+    """With 20 degrees of yaw and an antenna 2 m ahead a Jacobian says that fixes scatter sideways only, by 0.70 m."""
+    rng = np.random.default_rng(3)
+    x, model, inputs = np.zeros(state.NX), model_of(()), make_inputs(1, rng, state.FLAT_TURN)
+    x[:9], x[state.ARM + 6] = np.eye(3).ravel(), 2.0
+    P = np.diag([1e-8, 1e-8, np.radians(20.0) ** 2, *[1e-8] * 6])
+    inputs.value[0, state.FIX], inputs.variance[0, state.FIX] = 0.0, 1e-4
+    inputs.tau[:], inputs.rate[:], inputs.quickens[:] = 0.0, 0.0, 0.0
+    tests, states = make_tests(1), np.zeros((1, state.NX))
+    memory = Memory(x.copy(), P.copy(), np.zeros((state.KINDS, 2)))
+    filter_ticks(0, 1, inputs, model, memory, False, allocate_steps(0, 9), tests, states)
+    yaw = np.radians(20.0) * rng.normal(size=400_000)
+    cloud = 2.0 * np.stack((np.cos(yaw) - 1.0, np.sin(yaw)), -1)
+    second = cloud.T @ cloud / yaw.size + np.eye(2) * 1e-4
+    assert tests.log_det[0, state.FIX] == pytest.approx(np.log(np.linalg.det(second) * 1e-4), abs=0.15)
+    assert second[0, 0] > 100 * 1e-4
+
+
+class Problem:
+    """A drive of 3 s whose measurements are drawn from the model, with its solution by one least-squares problem over all ticks.
+
+    Unknown are the error at the start and the noise of each tick, each over its standard deviation: ``free``.
+    """
+
+    def __init__(self, seed, mode, ticks=60):
+        rng = np.random.default_rng(seed)
+        free = {*FAULTY} - {*range(state.FIX_OFFSET, state.FIX_OFFSET + 3), state.SHARED_SCALE}
+        free -= {state.TURN_SCALE} if mode >= state.GYRO_TURN else {*range(state.GYRO_BIAS, state.ARM)}
+        walking = {state.WHEEL_SCALE, state.VISUAL_SCALE} | ({*range(state.GYRO_BIAS, state.ARM)} & free)
+        std, walk = np.zeros(state.N), np.zeros(state.N)
+        std[sorted(free)], walk[sorted(walking)] = 0.01, 0.003
+        self.inputs = make_inputs(ticks, rng, mode, noise=1e-6, kept=0.9)
+        self.model = make_model(Measurements(), std, walk, (), period_s=T, gate_probability=0.999)
+        self.model.gates[:] = np.inf
+        n = self.model.active.size
+        self.P = np.diag(np.square(np.concatenate((np.full(9, 0.01), std[self.model.active[9:]]))))
+        self.x = np.zeros(state.NX)
+        self.x[:9], self.x[12] = np.eye(3).ravel(), 1.0
+        self.x[state.ARM + 6 : state.ARM + 9] = 0.3, 0.1, 0.5
+        variance = self.model.noise.copy()
+        for places, added in ((range(3), 1e-6), (range(state.U, state.U + 3), 1e-6), (range(19, 22), 1e-6)):
+            variance[np.isin(self.model.active, places)] += added
+        self.noisy = np.flatnonzero(variance)
+        self.std = np.sqrt(variance[self.noisy])
+        self.free = n + (ticks - 1) * self.noisy.size
+        self.rows = []
+        true, _ = self.play(rng.normal(size=self.free))
+        for k in range(ticks):
+            for kind in set(range(state.KINDS)) - {state.STATIONARY, state.STATIONARY_RATE}:
+                if k % (2 + kind) == 0:
+                    size = state.SIZES[kind]
+                    self.inputs.variance[k, kind, :size] = 0.01**2
+                    noise = 0.01 * rng.normal(size=size)
+                    look = look_at(self.inputs, k, kind)
+                    self.inputs.value[k, kind, :size] = reference.expect(kind, true[k], look) + noise
+                    self.rows.append((k, kind))
+
+    def step(self, before, d, G, places):
+        """Return the state displaced by d at ``places`` of the active errors, and G, which stands before it, in its axes."""
+        whole = np.zeros(state.N)
+        whole[self.model.active[places]] = d
+        turn = reference.exp(-whole[:3])
+        G = G.copy()
+        G[:3], G[3:6] = turn @ G[:3], turn @ G[3:6]
+        return reference.plus(before, whole), G, reference.right_jacobian(whole[:3])
+
+    def play(self, free):
+        """Return the states, and the Jacobian of each state's active errors."""
+        model, n = self.model, self.model.active.size
+        x, G, J = self.step(self.x, np.sqrt(np.diag(self.P)) * free[:n], np.zeros((n, self.free)), np.arange(n))
+        G[:, :n] = np.sqrt(self.P)
+        G[:3, :n] = J @ G[:3, :n]
+        G[3:6] = reference.exp(-np.sqrt(self.P[0, 0]) * free[:3]) @ G[3:6]
+        states, maps = [x], [G]
+        for k in range(1, self.inputs.mode.size):
+            tick = reference.Tick(int(self.inputs.mode[k]), T, self.inputs.turned[k], self.inputs.gained[k])
+            F = reference.differentiate_motion(x, tick)[np.ix_(model.active, model.active)]
+            x, G = reference.move(x, tick), F @ G
+            x[state.FIX_ERROR + 6 : state.FIX_ERROR + 9] *= 0.9
+            G[np.isin(model.active, range(19, 22))] *= 0.9
+            columns = n + (k - 1) * self.noisy.size + np.arange(self.noisy.size)
+            x, G, J = self.step(x, self.std * free[columns], G, self.noisy)
+            G[self.noisy, columns] += self.std
+            G[:3, columns] = J @ G[:3, columns]
+            states.append(x)
+            maps.append(G)
+        return np.array(states), maps
+
+    def solve(self):
+        """Return the states, the Jacobians, and the covariance of what is free."""
+        free = np.zeros(self.free)
+        for _ in range(6):
+            states, maps = self.play(free)
+            lines, residuals = [np.eye(free.size)], [free]
+            for k, kind in self.rows:
+                size = state.SIZES[kind]
+                look = look_at(self.inputs, k, kind)
+                H = reference.differentiate_measurement(kind, states[k], look)[:, self.model.active]
+                lines.append(-H @ maps[k] / 0.01)
+                residuals.append((self.inputs.value[k, kind, :size] - reference.expect(kind, states[k], look)) / 0.01)
+            J, r = np.vstack(lines), np.concatenate(residuals)
+            covariance = np.linalg.inv(J.T @ J)
+            free = free - covariance @ J.T @ r
+        return *self.play(free), covariance
+
+    def smooth(self):
+        stamp_ns = np.arange(self.inputs.mode.size, dtype=np.int64) * 50_000_000
+        ticks = Ticks(stamp_ns, self.inputs, {}, np.ones((stamp_ns.size, 3)))
+        memory = Memory(self.x.copy(), self.P.copy(), np.zeros((state.KINDS, 2)))
+        return smooth_section(filter_section(ticks, self.model, memory))
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_filter_and_smoother_solve_the_least_squares_problem_of_all_ticks(monkeypatch, mode):
+    monkeypatch.setattr(error_state, "_BLOCK", 17)
+    problem = Problem(11, mode)
+    found = problem.smooth()
+    states, maps, covariance = problem.solve()
+    active, at = problem.model.active, range(0, len(maps), 2)
+    for k in at:
+        wanted = maps[k] @ covariance @ maps[k].T
+        off = reference.minus(found.states[k], states[k])[active] / np.sqrt(np.diag(wanted))
+        assert np.abs(off).max() < 0.1
+        R = states[k][:9].reshape(3, 3)
+        position = R @ wanted[3:6, 3:6] @ R.T
+        assert np.diag(position) == pytest.approx(found.variances[k, :3], rel=0.01)
+        assert wanted[6, 6] == pytest.approx(found.variances[k, 4], rel=0.01)
+        mount = [list(active).index(e) for e in range(state.MOUNT, state.MOUNT + 3)]
+        turned = maps[k][:3] + maps[k][mount]
+        robot = R @ (np.eye(3) + reference.skew(states[k][state.MOUNT + 6 : state.MOUNT + 9]))
+
+        def compute_yaw(d, R=robot):
+            ahead = R @ reference.exp(d)
+            return np.arctan2(ahead[1, 0], ahead[0, 0])
+
+        by_turn = differentiate(compute_yaw, 3)
+        assert (by_turn @ turned @ covariance @ turned.T @ by_turn.T)[0, 0] == pytest.approx(
+            found.variances[k, 3], rel=0.02
+        )
+        for column, lag in enumerate((10, 20, 40)):
+            if k + lag >= len(maps) or (k + lag) % EVERY:
+                assert np.isnan(found.links[k, column])
+                continue
+            after = states[k + lag][:9].reshape(3, 3) @ maps[k + lag][3:6]
+            between = (after - R @ maps[k][3:6])[:2]
+            along = states[k + lag][9:11] - states[k][9:11]
+            along /= np.linalg.norm(along)
+            variance = along @ between @ covariance @ between.T @ along
+            assert variance == pytest.approx(found.links[k, column], rel=0.02)
+    spread = np.sqrt(np.diag(maps[0] @ covariance @ maps[0].T))
+    assert spread == pytest.approx(found.spreads[0], rel=0.01)
+
+
+@settings(max_examples=12, deadline=None)
+@given(seed=seeds, free=subsets, kinds=st.sets(st.sampled_from(range(state.KINDS))), mode=st.sampled_from(MODES))
+def test_what_no_measurement_shows_keeps_its_prior_and_what_is_exact_stays(seed, free, kinds, mode):
+    rng = np.random.default_rng(seed)
+    inputs, model = make_inputs(30, rng, mode, noise=1e-5), model_of(free)
+    inputs.fix_noise[:] = 0.0
+    for kind in kinds:
+        inputs.value[::2, kind, : state.SIZES[kind]] = rng.normal(size=(15, state.SIZES[kind]))
+    x, n = make_state(rng), model.active.size
+    std = rng.uniform(0.01, 0.3, n)
+    memory = Memory(x.copy(), np.diag(std**2), np.zeros((state.KINDS, 2)))
+    steps, states = filter_all(inputs, model, memory)
+
+    for P in steps.P:
+        assert np.array_equal(P, P.T)
+        scale = np.sqrt(np.diag(P))
+        assert np.linalg.eigvalsh(P / np.outer(scale, scale)).min() > -1e-12
+
+    exact = np.setdiff1d(FAULTY, model.active) + 6
+    assert np.array_equal(states[:, exact], np.tile(x[exact], (30, 1)))
+
+    moves = model.depends[state.KINDS + (mode >= state.GYRO_TURN)][
+        : model.counts[state.KINDS + (mode >= state.GYRO_TURN)]
+    ]
+    shown = {*moves, *(i for kind in kinds for i in model.depends[kind][: model.counts[kind]])}
+    hidden = sorted(set(range(n)) - shown)
+    stamp_ns = np.arange(30, dtype=np.int64) * 50_000_000
+    ticks = Ticks(stamp_ns, inputs, {}, np.ones((30, 3)))
+    smoothed = smooth_section(filter_section(ticks, model, Memory(x, np.diag(std**2), np.zeros((state.KINDS, 2)))))
+    assert np.array_equal(smoothed.spreads[0, hidden], np.sqrt(std[hidden] ** 2))
+    places = model.active[hidden] + 6
+    assert np.array_equal(smoothed.states[:, places], np.tile(x[places], (30, 1)))
+
+
+def test_rejections_in_a_row_open_the_gate_again():
+    rng = np.random.default_rng(4)
+    inputs, model = make_inputs(120, rng, state.FLAT_TURN, noise=1e-6), model_of(())
+    model.gates[state.FIX] = 16.27
+    inputs.rate[:], inputs.turned[:], inputs.quickens[:], inputs.tau[:] = 0.0, 0.0, 0.0, 0.0
+    inputs.value[:, state.STATIONARY], inputs.variance[:, state.STATIONARY] = 0.0, 1e-4
+    inputs.value[:, state.FIX], inputs.variance[:, state.FIX] = 0.0, 1e-4
+    inputs.value[40:, state.FIX, 0] = 5.0
+    model.patience[state.FIX] = 5.0, 2.0, 2.0
+    x = np.zeros(state.NX)
+    x[:9] = np.eye(3).ravel()
+    tests, states = make_tests(120), np.zeros((120, state.NX))
+    memory = Memory(x, np.eye(9) * 1e-4, np.zeros((state.KINDS, 2)))
+    filter_ticks(0, 120, inputs, model, memory, False, allocate_steps(0, 9), tests, states)
+    assert (tests.verdict[:40, state.FIX] == ACCEPTED).all()
+    reset = int(np.flatnonzero(tests.verdict[:, state.FIX] == RESET)[0])
+    assert reset * T == pytest.approx(39 * T + 2.0, abs=T)
+    assert (tests.verdict[40:reset, state.FIX] == REJECTED).all()
+    assert np.abs(states[39:reset, 9]).max() < 0.01
+    assert (tests.verdict[reset + 1 :, state.FIX] == ACCEPTED).all()
+    assert states[-1, 9] == pytest.approx(5.0, abs=0.05)
+
+
+def test_an_event_makes_an_error_uncertain_or_another_one():
+    rng = np.random.default_rng(4)
+    inputs = make_inputs(10, rng)
+    std = np.zeros(state.N)
+    std[[state.WHEEL_SCALE, state.VISUAL_SCALE]] = 0.1
+    events = (
+        Event(5, state.WHEEL_SCALE, 1, 0.3),
+        Event(7, state.VISUAL_SCALE, 1, 0.2, is_new=True),
+        Event(6, state.ARM, 3, 0.4),
+    )
+    model = make_model(Measurements(), std, np.zeros(state.N), events, period_s=T, gate_probability=0.999)
+    x, n = make_state(rng), model.active.size
+    P = np.diag(np.square(np.concatenate((np.full(9, 0.1), std[model.active[9:]]))))
+    steps, states = filter_all(inputs, model, Memory(x.copy(), P, np.zeros((state.KINDS, 2))))
+    place = {e: i for i, e in enumerate(model.active)}
+    spread = np.sqrt(np.array([np.diag(of) for of in steps.P]))
+    assert n == 9 + 2 + 3
+    assert spread[4:6, place[state.WHEEL_SCALE]] == pytest.approx([0.1, np.hypot(0.1, 0.3)])
+    assert spread[6:8, place[state.VISUAL_SCALE]] == pytest.approx([0.1, 0.2])
+    assert spread[5:7, place[state.ARM]] == pytest.approx([0.0, 0.4])
+    assert states[6, state.VISUAL_SCALE + 6] == x[state.VISUAL_SCALE + 6]
+    assert states[7, state.VISUAL_SCALE + 6] == 0.0
+    assert states[9, state.WHEEL_SCALE + 6] == x[state.WHEEL_SCALE + 6]

@@ -1,0 +1,90 @@
+"""Which sensor is left out where the track contradicts all of them: the one without which it recovers."""
+
+import numpy as np
+import pytest
+
+from tcpipe.errors import FusionError
+from tcpipe.fusion.measurements import BodyVelocities, InertialMeasurements, Measurements, Positions
+from tcpipe.recipe import FuseConfig
+from tcpipe.stages import fuse as stage
+from tcpipe.stages.fuse_inputs import FusionInputs
+from tcpipe.stages.fuse_sections import Fused
+from tcpipe.tables.facts import SensorChecks
+from tcpipe.tables.findings import StageReport, Subject
+from tcpipe.tables.levels import Sensor, Streams
+
+STAMP_NS = np.arange(5, dtype=np.int64)
+ROLES = ("gnss", "imu", "wheel_odometry", "visual_odometry")
+STREAMS = Streams({}, {role: Sensor(f"/{role}", "x/msg/Y", role, "why") for role in ROLES}, "husky")
+NOTHING = StageReport((), SensorChecks())
+
+
+def odometry():
+    return BodyVelocities(STAMP_NS, np.zeros((5, 3)), np.ones((5, 3)), np.zeros(5), np.ones(5))
+
+
+def inputs(*, visual=True, imu=True):
+    quat = np.full((5, 4), np.nan)
+    heard = Measurements(
+        gnss=Positions(STAMP_NS, np.zeros((5, 3)), np.ones((5, 3))),
+        imu=InertialMeasurements(STAMP_NS, np.zeros((5, 3)), np.zeros((5, 3)), quat, 0.01, 0.1) if imu else None,
+        wheels=odometry(),
+        visual=odometry() if visual else None,
+    )
+    return FusionInputs((15.0, 47.0, 400.0), {0: heard})
+
+
+@pytest.fixture
+def fusing(monkeypatch):
+    """Fuse sets of sensors of which some lead a track astray."""
+    tried = []
+
+    def put(lost=()):
+        def fuse(given, *_):
+            (heard,) = given.measurements.values()
+            tried.append(frozenset(heard.sensors()))
+            return Fused(found=[None], windows=20, astray=12 if tried[-1] in lost else 0)
+
+        monkeypatch.setattr(stage, "fuse_sections", fuse)
+        return tried
+
+    return put
+
+
+def recovered(given):
+    found, sanity, _ = stage.fuse_recovering(given, NOTHING, STREAMS, FuseConfig(), run=Subject("run", "r"))
+    return set(found.measurements[0].sensors()), sanity
+
+
+def test_a_track_that_follows_its_sensors_is_fused_once(fusing):
+    tried = fusing()
+    sensors, sanity = recovered(inputs())
+    assert (sensors, sanity.facts.excluded, len(tried)) == (set(ROLES), {}, 1)
+
+
+@pytest.mark.parametrize("visual", [True, False])
+def test_of_a_track_that_goes_astray_the_imu_is_tried_first(fusing, visual):
+    roles = frozenset(ROLES) if visual else frozenset(ROLES) - {"visual_odometry"}
+    fusing(lost=[roles])
+    sensors, sanity = recovered(inputs(visual=visual))
+    assert sensors == roles - {"imu"}
+    assert sanity.facts.excluded == {"imu": "misleads-track"}
+
+
+def test_a_track_that_goes_astray_without_its_imu_too_is_mended_by_the_only_other_that_does(fusing):
+    roles = frozenset(ROLES)
+    lost = [roles, *(roles - {role} for role in ("imu", "gnss", "wheel_odometry"))]
+    fusing(lost=lost)
+    assert recovered(inputs())[0] == roles - {"visual_odometry"}
+    fusing(lost=lost[:-1])  # either of two: nobody can tell
+    with pytest.raises(FusionError):
+        recovered(inputs())
+
+
+def test_a_track_that_goes_astray_whatever_is_left_out_is_refused(fusing):
+    roles = frozenset(ROLES)
+    fusing(lost=[roles, *(roles - {role} for role in roles)])
+    with pytest.raises(FusionError) as error:
+        recovered(inputs())
+    (finding,) = error.value.findings
+    assert (finding.code, finding.numbers) == ("track-contradicts-sensors", {"astray_fraction": 0.6})
