@@ -278,6 +278,8 @@ class Outcome:
     kept_m: float
     said: list[str]
     """Findings, or why there is no run."""
+    common: dict[str, list[float]] = field(default_factory=dict)
+    """The part of ``claimed`` that is one error of the whole run."""
     blamed: list[str] = field(default_factory=list)
     """Subjects of which a warning says that they were excluded or rejected."""
     track: dict[str, float] = field(default_factory=dict)
@@ -349,11 +351,15 @@ def _compared(labelled: LabelledSegments, read: Streams, drive: Drive, fault: Fa
     table, findings = labelled.table, labelled.info.report.findings
     start_ns = fault.true_ns(to_integers(table, "start_ns"), drive)
     true = compute_true_cost(drive.truth, start_ns)
-    error, claimed = {}, {}
+    error, claimed, common = {}, {}, {}
     for name, column in list(QUANTITIES.items())[:-1]:
         quantity, unit = column.rsplit("_", 1)
         error[name] = (to_floats(table, column) - getattr(true, column)).tolist()
         claimed[name] = to_floats(table, f"{quantity}_std_{unit}").tolist()
+        of_run = f"{quantity}_common_std_{unit}"
+        common[name] = (
+            np.nan_to_num(to_floats(table, of_run)).tolist() if of_run in table.column_names else [0.0] * table.num_rows
+        )
     there = drive.truth.at(start_ns)
     lon, lat = to_floats(table, "start_lon_deg"), to_floats(table, "start_lat_deg")
     std_m = to_floats(table, "position_std_m")
@@ -362,7 +368,7 @@ def _compared(labelled: LabelledSegments, read: Streams, drive: Drive, fault: Fa
     claimed["start"] = std_m.tolist()
     placed = np.isfinite(lon) & (std_m <= max_std_m)
     return Outcome(
-        start_s=drive.seconds(start_ns).tolist(), error=error, claimed=claimed,
+        start_s=drive.seconds(start_ns).tolist(), error=error, claimed=claimed, common=common,
         bits=to_numbers(table["quality"]).tolist(), placed=placed.tolist(),
         driven_m=sum(labelled.distance_by_reason_m.values()), true_m=float(drive.truth.distance_m[-1]), wheels_m=wheels_m(read),
         kept_m=labelled.distance_by_reason_m.get("kept", 0.0), said=said_of(findings),

@@ -11,6 +11,7 @@ A cell (`honesty_cells.py`) is a set of sensors under a fault; its drives last a
 recorded, so that another estimator, or another simulator, is judged on the same drives. Of the labels that no bit doubts a row shows
 
     labels, per cent of T, v, w, E inside 1 and 2 sigma; per cent of start points inside DRMS and 1.73 DRMS (63 and 95 are wanted);
+    own: the same of T and E without the part of sigma that is common to a drive; c: the common error over its sigma, the largest;
     median sigma over RMS error of T; per cent of good labels lost: of the labels that are good on the same drive without the fault, those
     that are doubted or not there, though they are as good here; RMS errors of the track: position [mm], forward velocity [mm/s],
     yaw [deg]; the track's length over the wheels' own; whether the finding is named; which other sensors are blamed; CPU [s] a drive.
@@ -50,6 +51,7 @@ LIMITS = {
     "sigma over RMS": 1.2,
     "gap": 0.080,
     "gap inside": 0.92,
+    "common": 3.0,
 }
 CLEAN = {1: (0.60, 0.76), 2: (0.91, 0.98)}
 """Shares wanted of the labels of a set of sensors without a fault."""
@@ -112,7 +114,18 @@ class Labels:
     start_s: np.ndarray
     error: Mapping[str, np.ndarray]
     claimed: Mapping[str, np.ndarray]
+    common: Mapping[str, np.ndarray]
+    """The part of ``claimed`` that is one error of the whole drive."""
     sure: np.ndarray
+
+    def split(self, name: str) -> tuple[np.ndarray, float]:
+        """Return absolute errors over standard deviations without what is common, of sure labels, and the common error over its own."""
+        error, claimed, common = (of[name][self.sure] for of in (self.error, self.claimed, self.common))
+        known = np.isfinite(error) & np.isfinite(claimed)
+        error, common = error[known], common[known]
+        own = np.sqrt(np.maximum(claimed[known] ** 2 - common**2, 1e-12))
+        shared = float(np.sum(common * error / own**2) / (1.0 + np.sum((common / own) ** 2)))
+        return np.abs(error - shared * common) / own, shared
 
     @property
     def ratio(self) -> dict[str, np.ndarray]:
@@ -134,7 +147,8 @@ def labels_of(outcome: Outcome, sensors: str) -> Labels:
     error, claimed = (
         {name: np.asarray(of[name], float) for name in QUANTITIES} for of in (outcome.error, outcome.claimed)
     )
-    return Labels(np.asarray(outcome.start_s, float), error, claimed, (bits & ~int(described)) == 0)
+    common = {name: np.asarray(outcome.common.get(name, np.zeros(bits.size)), float) for name in QUANTITIES}
+    return Labels(np.asarray(outcome.start_s, float), error, claimed, common, (bits & ~int(described)) == 0)
 
 
 @dataclass
@@ -145,6 +159,10 @@ class Figures:
     clean: bool
     ratio: dict[str, np.ndarray]
     """Error over standard deviation of the labels that no bit doubts, by quantity."""
+    own: dict[str, np.ndarray]
+    """The same without what is common to a drive."""
+    common: dict[str, float]
+    """The largest common error of a drive over its standard deviation."""
     width: float
     good: int
     lost: int
@@ -157,9 +175,9 @@ class Figures:
     traces: int
     misses: list[str]
 
-    def inside(self, name: str, within: float) -> float:
+    def inside(self, name: str, within: float, *, own: bool = False) -> float:
         """Return the share of labels inside so many standard deviations."""
-        ratio = self.ratio[name]
+        ratio = (self.own if own else self.ratio)[name]
         return float(np.mean(ratio <= within)) if ratio.size >= _FEWEST else float("nan")
 
 
@@ -168,6 +186,7 @@ def figures_of(cell: HonestCell, outcomes: Sequence[Outcome], bases: Sequence[Ou
     labels = [labels_of(of, cell.sensors) for of in outcomes]
     losses = [_losses(of, labels_of(base, cell.sensors)) for of, base in zip(labels, bases, strict=True)]
     ratio = {name: _joined([of.ratio[name][of.sure] for of in labels]) for name in QUANTITIES}
+    split = {name: [of.split(name) for of in labels] for name in LABELS}
     error = _joined([of.error["T"][of.sure] for of in labels])
     claimed = _joined([of.claimed["T"][of.sure] for of in labels])
     known = np.isfinite(error)
@@ -177,6 +196,8 @@ def figures_of(cell: HonestCell, outcomes: Sequence[Outcome], bases: Sequence[Ou
     figures = Figures(
         cell.name, cell.fault.calibrated,
         {name: values[np.isfinite(values)] for name, values in ratio.items()},
+        {name: _joined([own for own, _ in of]) for name, of in split.items()},
+        {name: max(abs(shared) for _, shared in of) for name, of in split.items()},
         float(np.median(claimed[known]) / np.sqrt(np.mean(error[known] ** 2))) if known.sum() >= _FEWEST else float("nan"),
         sum(good for good, _ in losses), sum(lost for _, lost in losses),
         {name: _pooled(name, [of.track.get(name, np.nan) for of in outcomes]) for name in TRACK},
@@ -211,9 +232,8 @@ def _losses(labels: Labels, base: Labels) -> tuple[int, int]:
 def _misses(figures: Figures, cell: HonestCell) -> Iterator[str]:
     if figures.traces:
         yield f"{figures.traces} tracebacks"
-    if "gnss" not in SETS[cell.sensors]:  # else the odometry's scale is one error of a drive
-        yield from _uncovered(figures)
-    elif cell.sensors == "wheels alone" and abs(figures.length - 1.0) > (limit := LENGTHS[cell.fault.route]):
+    yield from _uncovered(figures, exactly=figures.clean and "gnss" not in SETS[cell.sensors])
+    if cell.sensors == "wheels alone" and abs(figures.length - 1.0) > (limit := LENGTHS[cell.fault.route]):
         yield f"length {figures.length - 1.0:+.2%}, limit {limit:.1%}"
     if "outage" in figures.cell and "jump" not in figures.cell and figures.track["gap_xy_m"] > LIMITS["gap"]:
         yield f"gap {1e3 * figures.track['gap_xy_m']:.0f} mm"
@@ -225,15 +245,19 @@ def _misses(figures: Figures, cell: HonestCell) -> Iterator[str]:
         yield f"named in {figures.named:.0%}"
 
 
-def _uncovered(figures: Figures) -> Iterator[str]:
-    bands = CLEAN if figures.clean else {2: (LIMITS["inside 2 sigma"], 1.0)}
+def _uncovered(figures: Figures, *, exactly: bool) -> Iterator[str]:
+    """Yield where coverage is too small; of clean drives with GNSS, whose own part is judged, also where it is too large."""
+    bands = CLEAN if exactly else {2: (LIMITS["inside 2 sigma"], 1.0)}
     for name, (within, (low, high)) in product(LABELS, bands.items()):
-        share = figures.inside(name, within)
+        share = figures.inside(name, within, own=exactly)
         if share < low or share > high:
             yield f"{name} {share:.0%} in {within}σ"
+    for name, sigmas in figures.common.items() if figures.clean else ():
+        if sigmas > LIMITS["common"]:
+            yield f"{name} {sigmas:.1f} common σ"
     if figures.inside("start", RING) < LIMITS["starts inside 95 %"]:
         yield f"start {figures.inside('start', RING):.0%}"
-    if figures.clean and figures.width > LIMITS["sigma over RMS"]:
+    if exactly and figures.width > LIMITS["sigma over RMS"]:
         yield f"σ {figures.width:.2f} RMS"
 
 
@@ -251,7 +275,8 @@ def _pooled(name: str, values: Sequence[float]) -> float:
 # Pages
 
 HEAD = (
-    f"{'cell':<50} {'labels':>6} {'T':>6} {'v':>6} {'w':>6} {'E':>6} {'start':>6} {'σ/RMS':>5} {'lost':>4} "
+    f"{'cell':<50} {'labels':>6} {'T':>6} {'v':>6} {'w':>6} {'E':>6} {'start':>6} {'own T':>6} {'own E':>6} "
+    f"{'c T':>3} {'c E':>3} {'σ/RMS':>5} {'lost':>4} "
     f"{'xy mm':>6} {'mm/s':>5} {'yaw °':>6} {'length':>6} {'named':>5} {'CPU s':>5}"
 )
 
@@ -260,8 +285,8 @@ def _number(value: float, form: str, factor: float = 1.0) -> str:
     return format(value * factor, form) if np.isfinite(value) else "–".rjust(int(re.findall(r"\d+", form)[0]))
 
 
-def _shares(figures: Figures, name: str, second: float = 2.0) -> str:
-    one, two = (figures.inside(name, within) for within in (1.0, second))
+def _shares(figures: Figures, name: str, second: float = 2.0, *, own: bool = False) -> str:
+    one, two = (figures.inside(name, within, own=own) for within in (1.0, second))
     return f"{100 * one:.0f}/{100 * two:.0f}".rjust(6) if np.isfinite(two) else "–".rjust(6)
 
 
@@ -269,7 +294,8 @@ def row(of: Figures) -> str:
     """Return a line of figures and what it misses."""
     lost = of.lost / of.good if of.good else float("nan")
     figures = (
-        f"{of.ratio['T'].size:6d}", *(_shares(of, name) for name in LABELS), _shares(of, "start", RING), _number(of.width, "5.2f"),
+        f"{of.ratio['T'].size:6d}", *(_shares(of, name) for name in LABELS), _shares(of, "start", RING),
+        *(_shares(of, name, own=True) for name in ("T", "E")), f"{of.common['T']:3.1f} {of.common['E']:3.1f}", _number(of.width, "5.2f"),
         _number(lost, "4.0f", 100), _number(of.track["xy_m"], "6.1f", 1e3), _number(of.track["velocity_mps"], "5.1f", 1e3),
         _number(of.track["yaw_rad"], "6.3f", 180 / np.pi), _number(of.length, "6.4f"), _number(of.named, "5.0f", 100), f"{of.cpu_s:5.1f}",
     )  # fmt: skip
@@ -284,7 +310,10 @@ def summary(every: Sequence[Figures]) -> list[str]:
     clean = [of for of in every if of.clean and ": clean" in of.cell and np.isfinite(of.inside("start", 1.0))]
     lines = []
     if clean:
-        pooled = {name: np.concatenate([of.ratio[name] for of in clean]) for name in QUANTITIES}
+        pooled = {
+            name: np.concatenate([(of.own if name in LABELS else of.ratio)[name] for of in clean])
+            for name in QUANTITIES
+        }
         inside = {
             name: [100 * np.mean(of <= k) for k in (1.0, RING if name == "start" else 2.0)]
             for name, of in pooled.items()

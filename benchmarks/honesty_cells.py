@@ -1,7 +1,8 @@
 """Cells of `honesty.py`: families of errors that no estimator models exactly, their sizes, and the sets of sensors that they meet.
 
 A family is a function from a drive to an error; its numbers come from a random stream of the drive, named like the family. Every cell lies
-in an ordinary world: fixes whose error is correlated in time with an honest covariance, and an antenna stated some centimetres off.
+in an ordinary world: fixes whose error is correlated in time with an honest covariance, an antenna stated some centimetres off, and
+a current sensor with a gain and an offset.
 """
 
 from __future__ import annotations
@@ -333,7 +334,18 @@ def _currents(change: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> Callabl
 # Cells
 
 
-ORDINARY = Fault("clean", readings=_ordinary_noise, messages=state_arm(some_centimetres))
+def _ordinary_power(readings: Readings, drive: Drive) -> Readings:
+    """Return currents with a gain within 3.5 % and an offset within 0.35 A, which no data sheet excludes."""
+    rng = drive.noise("ordinary.power")
+    gain, offset_amp = 1.0 + rng.uniform(-0.035, 0.035), rng.uniform(-0.35, 0.35)
+    return _currents(lambda amp, _: gain * amp + offset_amp / 2.0)(readings, drive)
+
+
+def _ordinary(readings: Readings, drive: Drive) -> Readings:
+    return _ordinary_power(_ordinary_noise(readings, drive), drive)
+
+
+ORDINARY = Fault("clean", readings=_ordinary, messages=state_arm(some_centimetres))
 
 
 def _clean(route: str) -> Fault:
@@ -383,12 +395,14 @@ def _fault(name: str, role: str, said: str, readings: Callable[[Readings, Drive]
 
 def _noise(name: str, std_m: float, family: FixError) -> Fault:
     """Return another noise of the fixes in place of the ordinary one; it is claimed."""
-    return Fault(name, route="valley", readings=_claimed("noise", std_m, family), messages=ORDINARY.messages)
+    noise = _claimed("noise", std_m, family)
+    readings = lambda readings, drive: _ordinary_power(noise(readings, drive), drive)  # noqa: E731
+    return Fault(name, route="valley", readings=readings, messages=ORDINARY.messages)
 
 
 def _arm(name: str, messages: Callable[[Messages, Drive], Messages], said: str, route: str = "valley") -> Fault:
     """Return another stated antenna in place of the ordinary one."""
-    return Fault(name, ("gnss",), said=said, readings=_ordinary_noise, messages=messages, route=route)
+    return Fault(name, ("gnss",), said=said, readings=_ordinary, messages=messages, route=route)
 
 
 _OF_NO_FAULT = r"stamp-jitter|lever-arm-\w+|sensor-not-placed|odometry-scale|velocity-scatters|measurements-rejected"

@@ -215,8 +215,6 @@ def format_budget(budget: EnergyBudget) -> str:
     text = f"{floor}: {causes} (they add in square)"
     if budget.at_20_hz < 0.95 * budget.total:
         text += f"; power at 20 Hz would leave {100 * budget.at_20_hz:.1f} %"
-    if budget.common is not None:
-        text += f". Besides, one error of the whole run: {100 * budget.common:.1f} % (power sensor, odometry scale)"
     return text + "."
 
 

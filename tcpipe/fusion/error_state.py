@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from tcpipe.errors import FusionError
 from tcpipe.fusion import state
-from tcpipe.fusion.densities import estimate_noise
+from tcpipe.fusion.densities import NoiseModel, estimate_noise
 from tcpipe.fusion.filter_kernel import (
     EVERY,
     REJECTED,
@@ -153,7 +153,7 @@ def run_error_state(m: Measurements, initial: InitialState, *, output_ns: Ints, 
     if not np.isfinite(smoothed.states).all():
         finding = make_finding("estimate-not-finite", Subject("run", ""))
         raise FusionError("the estimate is not finite", findings=[finding])
-    return _make_trajectory(m, made, smoothed, std, output_ns, hypotheses[:1])
+    return _make_trajectory(m, noise, made, smoothed, std, output_ns, hypotheses[:1])
 
 
 @dataclass(frozen=True, slots=True)
@@ -230,7 +230,13 @@ def _find_start_ns(m: Measurements, output_ns: Ints) -> int:
 
 
 def _make_trajectory(  # noqa: PLR0917
-    m: Measurements, made: Pass, smoothed: Smoothed, std: Floats, output_ns: Ints, explained: Sequence[Hypothesis]
+    m: Measurements,
+    noise: NoiseModel,
+    made: Pass,
+    smoothed: Smoothed,
+    std: Floats,
+    output_ns: Ints,
+    explained: Sequence[Hypothesis],
 ) -> Trajectory:
     """Return the trajectory at the wanted stamps [ns], with what no state of the filter can know in its deviations."""
     ticks = made.ticks
@@ -256,6 +262,10 @@ def _make_trajectory(  # noqa: PLR0917
     elif is_turned_by_course(m):
         # The course takes a sway of the antenna for a turn: nothing tells one from the other, and roll is taken to be none.
         position_variance[:, :2] += (slope_std * antenna[2] * rotation[:, :2, 1]) ** 2
+    if noise.horizontal is not None and noise.vertical is not None:
+        # What fixes claim beyond what the run shows lasts longer than the run can show.
+        for axes, fix in ((slice(0, 2), noise.horizontal), (slice(2, 3), noise.vertical)):
+            position_variance[:, axes] += max(0.0, fix.claimed_m2 - fix.white_m2 - fix.correlated.variance)
     if m.gnss is not None and not std[state.ARM]:
         turned = np.unwrap(np.arctan2(rotation[:, 1, 0], rotation[:, 0, 0]))
         variance, moved = _compute_arm_variance(m, rotation, turned, made)

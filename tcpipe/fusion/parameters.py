@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from tcpipe.fusion import state
 from tcpipe.fusion.densities import GaussMarkov, NoiseModel
 from tcpipe.fusion.filter_kernel import Memory, Model
-from tcpipe.fusion.measurements import VISUAL, WHEELS, InitialState, Measurements
+from tcpipe.fusion.measurements import IMU, VISUAL, WHEELS, InitialState, Measurements
 from tcpipe.fusion.process import find_scale_stds, turn_scale_std
 from tcpipe.fusion.signals import find_chi_square_threshold
 from tcpipe.fusion.ticks import Ticks
@@ -41,7 +41,7 @@ class Parameter:
 
 
 PARAMETERS = (
-    Parameter("gyroscope bias", state.GYRO_BIAS, 3, 0.02, 4e-5, "rad/s", "MEMS: 1°/s at turn-on, 10°/h in a run"),
+    Parameter("gyroscope bias", state.GYRO_BIAS, 3, 0.02, 0.0, "rad/s", "MEMS: 1°/s at turn-on; walk: `densities`"),
     Parameter("accelerometer bias", state.ACCELEROMETER_BIAS, 3, 0.15, 3e-4, "m/s²", "MEMS: 15 mg, 1 mg in a run"),
     Parameter("antenna", state.ARM, 3, 0.0, 0.0, "m", "stated or not: `Positions.lever_arm_std_m`"),
     Parameter("lag of fixes", state.FIX_LAG, 1, 0.02, 0.0, "s", "drivers stamp on arrival"),
@@ -92,6 +92,8 @@ def make_priors(m: Measurements, noise: NoiseModel, ticks: Ticks) -> tuple[Float
         if wanted.get(parameter.name, False):
             rows = slice(parameter.place, parameter.place + parameter.count)
             std[rows], walk[rows] = parameter.std, parameter.walk
+    if m.imu is not None:
+        walk[state.GYRO_BIAS : state.GYRO_BIAS + 3] = _find_walk(noise.turns[IMU].bias)
     scales = dict(zip((WHEELS, VISUAL), find_scale_stds(m), strict=True))
     for role, place in ((WHEELS, state.WHEEL_SCALE), (VISUAL, state.VISUAL_SCALE)):
         if role in m.odometries() and scales[role]:

@@ -48,6 +48,8 @@ _STATIONARY_STD_MPS = 0.01  # a robot that stands rocks
 _STATIONARY_RATE_STD_RADPS = 5e-4
 _LEVEL_EVERY_S = 1.0
 _UNMEASURED = 1e6
+_MOVING_MPS = 0.05  # slower is stationary (ruling)
+_MEDIAN_OF_SQUARES = 0.4549  # of a normal variable of variance 1
 _ACCELERATION_WINDOW_S = 0.4
 _LASTING_S = 0.1  # errors of an odometry beyond its white noise are independent after this time
 
@@ -191,7 +193,8 @@ def _make_velocity_variance(m: Measurements, source: BodyVelocities, noise: Nois
     claimed = source.variance_m2ps2
     found = claimed.copy()
     relative = claimed[:, 0] / np.median(claimed[:, 0])
-    found[:, 0] = noise.odometries[role].velocity_m2ps * rate_hz * np.maximum(relative, 1.0)
+    white = max(noise.odometries[role].velocity_m2ps * rate_hz, _estimate_scatter(source.velocity_mps[:, 0]))
+    found[:, 0] = white * np.maximum(relative, 1.0)
     for axis in range(1, 3):
         if not np.isfinite(claimed[:, axis]).all() or np.ptp(source.velocity_mps[:, axis]) == 0.0:
             found[:, axis] = _UNMEASURED  # an axis that is always zero is a constraint, not a measurement
@@ -199,6 +202,12 @@ def _make_velocity_variance(m: Measurements, source: BodyVelocities, noise: Nois
     if flat:
         found = found + _compute_unseen_turn_variance(source.stamp_ns, source.lever_arm_m)
     return found
+
+
+def _estimate_scatter(velocity_mps: Floats) -> float:
+    """Return the variance of a moving odometry's samples around their neighbours', by the median: wild ones do not move it."""
+    second = np.diff(velocity_mps, n=2)[(np.abs(velocity_mps) > _MOVING_MPS)[1:-1]]
+    return float(np.median(second**2) / (6.0 * _MEDIAN_OF_SQUARES)) if second.size > 1 else 0.0
 
 
 def _compute_unseen_turn_variance(stamp_ns: Ints, lever_arm_m: tuple[float, float, float]) -> Floats:

@@ -116,7 +116,7 @@ class FuseConfig:
     """Standard deviation of wheel velocity where the source gives none [m/s]."""
     visual_std_mps: Deviation = 0.05
     """Standard deviation of visual velocity where the source gives none [m/s]."""
-    nonholonomic_std_mps: Deviation = 0.15
+    nonholonomic_std_mps: Deviation = 0.06
     """Sideways and vertical body velocity are zero to within this; much smaller values cause GNSS to be rejected [m/s]."""
     gyro_noise_radps: Deviation = 0.003
     """White noise of the gyroscope at its rate [rad/s]."""

@@ -87,6 +87,7 @@ _BUDGET_ROWS = {
     "voltage": "voltage",
     "total": "all together",
     "at_20_hz": "all together, with power at 20 Hz",
+    "common": "one error of the whole run: power sensor, scale of a lone odometry (apart)",
 }
 
 
@@ -94,7 +95,8 @@ def make_budget_sections(budget: EnergyBudget | None) -> list[Section]:
     """Return the section on the noise floor of E; none where no segment has an energy."""
     if budget is None:
         return []
-    rows = [(text, f"{100 * getattr(budget, name):.2f} %") for name, text in _BUDGET_ROWS.items()]
+    shares = {text: getattr(budget, name) for name, text in _BUDGET_ROWS.items()}
+    rows = [(text, f"{100 * share:.2f} %") for text, share in shares.items() if share is not None]
     title = "Uncertainty of labels"
     return [Section(title, format_budget(budget), header=("from", "of E"), rows=rows, figures_from=1)]
 

@@ -168,6 +168,22 @@ def test_sure_and_wrong_lost_and_silent_are_missed(cell):
     assert any("RMS" in miss for miss in wide.misses)
 
 
+def test_what_is_common_to_a_drive_is_judged_apart(cell):
+    """A common error of one deviation leaves the own part calibrated; one of five is missed."""
+    missed = {}
+    for times in (1.0, 5.0):
+        made = outcome()
+        made.common["E"] = [3.0] * 200
+        made.claimed["E"] = [float(np.hypot(1.0, 3.0))] * 200
+        made.error["E"] = (np.array(made.error["E"]) + 3.0 * times).tolist()
+        figures = honesty.figures_of(cell.base, [made], [outcome()])
+        assert figures.common["E"] == pytest.approx(times, abs=0.1)
+        assert figures.inside("E", 1.0, own=True) == pytest.approx(0.68, abs=0.06)
+        missed[times] = figures.misses
+    assert missed[1.0] == []
+    assert any("common" in miss for miss in missed[5.0])
+
+
 def test_a_wrong_label_that_is_doubted_is_not_lost(cell):
     wrong = outcome(bits=1 << 8)
     wrong.error["T"] = [5.0] * 200
