@@ -202,8 +202,8 @@ class Sensors:
         rng, mounting = noise("gnss.stated"), self.gnss.mounting
         direction = rng.standard_normal(3)
         off_m = rng.uniform(0.0, self.gnss.stated_off_m) * direction / np.linalg.norm(direction)
-        xyz_m = tuple(float(metres) for metres in np.add(mounting.xyz_m, off_m))
-        return replace(self, gnss=replace(self.gnss, mounting=replace(mounting, xyz_m=xyz_m)))
+        x_m, y_m, z_m = np.add(mounting.xyz_m, off_m).tolist()
+        return replace(self, gnss=replace(self.gnss, mounting=replace(mounting, xyz_m=(x_m, y_m, z_m))))
 
 
 def record(truth: Truth, site: Site, sensors: Sensors, faults: Faults, noise: Noise) -> dict[str, Reading]:
