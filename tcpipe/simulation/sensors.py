@@ -70,7 +70,7 @@ class Gnss:
     covariance: Literal["known", "unknown"] = "known"
     """Whether the message states its standard deviation."""
     mounting: Mounting = Mounting((0.1, 0.0, 0.9))
-    stated_off_m: float = 0.0
+    stated_off_m: float = 0.05
     """By at most how much the log states another place than that, in a direction that each drive draws."""
     outlier_share: float = 0.01
     outlier_m: float = 1.5
@@ -78,6 +78,10 @@ class Gnss:
     stamp_jitter_s: float = 0.002
     delay_s: float = 0.06
     clock_offset_s: float = 0.25
+
+
+EXACT_GNSS = Gnss(std_m=0.015, vertical_std_m=0.025, lasting_std_m=(0.0, 0.0), stated_off_m=0.0)
+"""White noise, and an antenna where the log states it: kinder than real receivers."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -195,9 +199,9 @@ class Sensors:
         carried = {name: of for name, kept in in_place.items() if not kept and (of := getattr(self, name)) is not None}
         return replace(self, **{name: replace(of, mounting=AT_BASE_LINK) for name, of in carried.items()})
 
-    def stated(self, noise: Noise) -> Sensors:
-        """Return the sensors as the log of a drive states them: the antenna off by up to its ``stated_off_m``."""
-        if self.gnss is None or not self.gnss.stated_off_m:
+    def stated(self, faults: Faults, noise: Noise) -> Sensors:
+        """Return mounted sensors as the log of a drive states them: the antenna off by up to its ``stated_off_m``."""
+        if self.gnss is None or not faults.gnss_lever_arm:
             return self
         rng, mounting = noise("gnss.stated"), self.gnss.mounting
         direction = rng.standard_normal(3)

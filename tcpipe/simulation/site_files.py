@@ -70,7 +70,7 @@ def simulate(out: Path, *, scenario: str | Scenario = "demo", seed: int = 1) -> 
         for index, spec in enumerate(chosen.drives):
             truth, readings = simulate_readings(chosen, index, seed=seed)
             write_table(truth.table(), half.truths[index])
-            stated = spec.sensors.mounted(spec.faults).stated(Noise(seed, index))
+            stated = spec.sensors.mounted(spec.faults).stated(spec.faults, Noise(seed, index))
             _write_log(
                 half.logs[index], spec, make_streams(readings, stated, spec.recorder, geoid_m=chosen.world.site.geoid_m)
             )

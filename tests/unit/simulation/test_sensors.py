@@ -13,11 +13,10 @@ from tcpipe.geometry.datum import enu_from_geodetic
 from tcpipe.simulation.faults import Faults
 from tcpipe.simulation.robot import GRAVITY_MPS2
 from tcpipe.simulation.scenarios import HUSKY_ROS1, HUSKY_ROS2, make_small_world, make_tiny
-from tcpipe.simulation.sensors import CLOCK_STEP_NS, Doppler, Gnss, Noise, Power, Sensors, Visual, record
+from tcpipe.simulation.sensors import CLOCK_STEP_NS, EXACT_GNSS, Doppler, Gnss, Noise, Power, Sensors, Visual, record
 from tcpipe.tables.columns import to_floats, to_integers
 
 SITE = make_small_world().site
-WHITE = Gnss(std_m=0.015, vertical_std_m=0.025, lasting_std_m=(0.0, 0.0))
 
 
 def readings(truth, *names, sensors=None, seed=1):
@@ -146,7 +145,7 @@ def test_a_fault_leaves_the_noise_of_others_as_it_was(truth):
 
 def test_noise_is_as_strong_as_said(long_truth):
     every = {"gnss_noise", "wheel_noise", "imu_noise", "visual_noise", "power_noise", "gnss_stamp_jitter"}
-    sensors = Sensors(gnss=WHITE)
+    sensors = Sensors(gnss=EXACT_GNSS)
     plain, noisy = (readings(long_truth, *names, sensors=sensors) for names in ((), every))
     error = local(noisy["gnss"]) - local(plain["gnss"])
     np.testing.assert_allclose(error.std(axis=0), [0.015, 0.015, 0.025], rtol=0.05)
@@ -200,15 +199,15 @@ def test_the_lasting_part_of_fixes_lasts_as_long_as_said(long_truth, lasts_s):
 
 
 def test_a_log_states_the_antenna_off_by_up_to_what_it_is_told(truth):
-    sensors = Sensors(gnss=Gnss(stated_off_m=0.1))
-    off = np.array([
-        np.subtract(sensors.stated(Noise(seed, 0)).gnss.mounting.xyz_m, sensors.gnss.mounting.xyz_m) for seed in range(300)
-    ])  # fmt: skip
+    sensors, faults = Sensors(gnss=Gnss(stated_off_m=0.1)), Faults.only("gnss_lever_arm")
+    stated = [sensors.stated(faults, Noise(seed, 0)).gnss.mounting.xyz_m for seed in range(300)]
+    off = np.subtract(stated, sensors.gnss.mounting.xyz_m)
     length = np.linalg.norm(off, axis=1)
     assert length.max() <= 0.1
     assert length.mean() == pytest.approx(0.05, rel=0.1)
     assert np.abs(off.mean(axis=0)).max() < 0.01
-    assert Sensors().stated(Noise(1, 0)) == Sensors()
+    for exact, switches in ((sensors, Faults()), (Sensors(gnss=EXACT_GNSS), faults)):
+        assert exact.stated(switches, Noise(1, 0)) == exact
 
 
 def test_outliers_outages_and_gaps(long_truth):
