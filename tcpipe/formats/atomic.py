@@ -13,7 +13,6 @@ import atexit
 import ctypes
 import errno
 import fcntl
-import math
 import os
 import re
 import shutil
@@ -24,14 +23,8 @@ import uuid
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any, TypeVar
-
-import numpy as np
-from numpy.typing import DTypeLike, NDArray
 
 from tcpipe.errors import StoreError, UsageError
-
-T = TypeVar("T", bound=np.generic)
 
 TEMPORARY_PREFIX = ".tmp-"
 """What is left behind by a killed process begins with this; readers skip it."""
@@ -162,23 +155,6 @@ def make_lasting_scratch() -> Path:
     directory = context.__enter__()
     atexit.register(context.__exit__, None, None, None)
     return directory
-
-
-def make_mapped_array(directory: Path, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
-    """Return an array of zeros in a nameless file in a directory: the system may put its pages aside, so it takes no memory."""
-    size_bytes = np.dtype(dtype).itemsize * math.prod(shape)
-    if not size_bytes:
-        return np.zeros(shape, dtype)
-    with _convert_os_errors(directory), tempfile.TemporaryFile(dir=directory) as file:
-        os.posix_fallocate(file.fileno(), 0, size_bytes)  # a full disk is told now, not by a signal
-        return np.memmap(file, dtype, "r+", shape=shape).view(np.ndarray)
-
-
-def move_to_file(array: NDArray[T], directory: Path) -> NDArray[T]:
-    """Return a copy of an array as `make_mapped_array` gives it."""
-    mapped = make_mapped_array(directory, array.shape, array.dtype)
-    mapped[...] = array
-    return mapped
 
 
 def put_directory(directory: Path, path: Path) -> None:

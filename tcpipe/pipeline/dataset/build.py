@@ -74,7 +74,7 @@ from tcpipe.pipeline.dataset.sampling import Workers
 from tcpipe.pipeline.generations import read_generations, write_generation
 from tcpipe.pipeline.options import BuildDatasetOptions
 from tcpipe.recipe import Recipe
-from tcpipe.report.dataset_report import render_dataset_report
+from tcpipe.report.dataset_report import SAMPLE_COLUMNS, render_dataset_report
 from tcpipe.report.pictures import draw_classes, draw_maps, draw_relief, write_overview
 from tcpipe.splits.assignment import SPLITS
 from tcpipe.store import Store, open_store
@@ -398,13 +398,13 @@ def _build(directory: Path, inputs: Inputs, options: BuildOptions, workers: Work
     write_text(directory / CROISSANT, croissant)
     card = replace(card, checksums={**files, CROISSANT: compute_checksum(directory / CROISSANT)})
     write_sealed(directory / CARD, card)
-    write_text(directory / REPORT, seal_page(render_dataset_report(directory)))
+    write_text(directory / REPORT, seal_page(render_dataset_report(directory, samples=figures)))
     return card
 
 
 def _write_samples(path: Path, samples: SampleTable, mapped: Path) -> pa.Table:
-    """Write the samples; return the columns that the card is made from, mapped from another file."""
-    names = list(dict.fromkeys((*CARD_COLUMNS, *PHYSICS_COLUMNS, *BALANCE_COLUMNS)))
+    """Write the samples; return the columns that card and page are made from, mapped from another file."""
+    names = list(dict.fromkeys((*CARD_COLUMNS, *PHYSICS_COLUMNS, *BALANCE_COLUMNS, *SAMPLE_COLUMNS)))
 
     def write_both() -> Iterator[pa.Table]:
         for piece in samples.pieces(ROWS_PER_GROUP):

@@ -22,7 +22,6 @@ from numpy.typing import NDArray
 
 from tcpipe.errors import DatasetError, TcpipeError
 from tcpipe.execution import run_all, unwrap_result
-from tcpipe.formats.atomic import move_to_file
 from tcpipe.formats.dataset_card import (
     Covariate,
     MapRegistration,
@@ -42,7 +41,7 @@ from tcpipe.formats.dataset_files import (
 )
 from tcpipe.formats.finding_lines import format_mixed_groups
 from tcpipe.formats.maps.map_files import MapFile, open_map
-from tcpipe.formats.parquet import add_geo_metadata, map_table, read_table_bytes, write_pieces, write_table_bytes
+from tcpipe.formats.parquet import add_geo_metadata, map_table, move_to_file, read_table_bytes, write_pieces, write_table_bytes
 from tcpipe.formats.place import DirectoryPlace, Place
 from tcpipe.formats.recipe_toml import load_profiles
 from tcpipe.formats.stored_runs import RunDirectory
@@ -175,7 +174,8 @@ class SampleTable:
         """The samples' columns, with the extent of their places."""
         bare = pa.schema([*SAMPLES.arrow(), *self.added.schema]).empty_table()
         pieces = (self._centres_deg(self.patch[first : first + _ROWS]) for first in range(0, len(self), _ROWS))
-        return add_geo_metadata(bare, "Point", np.concatenate([np.empty((0, 2)), *pieces])).schema
+        corners = [corner for piece in pieces for corner in (piece.min(axis=0), piece.max(axis=0))]
+        return add_geo_metadata(bare, "Point", np.array(corners).reshape(-1, 2)).schema
 
     def _centres_deg(self, patches: NDArray[np.int64]) -> NDArray[np.float64]:
         """Return the centre of patches of ``sampled``, WGS 84 lon, lat [deg], shape (N, 2)."""

@@ -19,11 +19,11 @@ from numpy.typing import NDArray
 
 from tcpipe.errors import TcpipeError
 from tcpipe.execution import Executor, run_all, unwrap_result
-from tcpipe.formats.atomic import make_mapped_array, move_to_file
 from tcpipe.formats.bucket_directories import FetchedShards
 from tcpipe.formats.dataset_files import LayerPixels
 from tcpipe.formats.json_files import parse_typed_json, to_compact_json
 from tcpipe.formats.maps.map_files import MapFile, open_map
+from tcpipe.formats.parquet import make_mapped_array, move_to_file
 from tcpipe.formats.place import Place
 from tcpipe.progress import Meter
 from tcpipe.recipe import SampleConfig

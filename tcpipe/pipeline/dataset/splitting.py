@@ -70,7 +70,7 @@ def draw_splits(
         tagged=None if tags is None else _number_values(run, [tags[name] for name in run_names]),
     )
     split = assigned.split
-    if regions is not None and not np.isin(split, ("train", "test")).any():
+    if regions is not None and not ((split == "train") | (split == "test")).any():
         raise DatasetError(_describe_nothing_inside(regions, sampled.footprint_lonlat_deg, split))
     audit = audit_leakage(split, run, starts_ns, sampled.footprint_xy_m, chord_m=chord_m)
     counts = None
