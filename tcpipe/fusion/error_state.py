@@ -298,7 +298,10 @@ def _make_trajectory(  # noqa: PLR0917
         forward_velocity_std_mps=np.sqrt(speed_variance + (scale_std * speed) ** 2),
         rejections=_make_rejections(m, made),
         displacement_std_m=np.sqrt(links),
-        facts=_make_facts(m, made, smoothed, std, scale_std, explained),
+        facts=replace(
+            _make_facts(m, made, smoothed, std, scale_std, explained),
+            gnss_stamp_std_s=None if m.gnss is None else float(np.sqrt(noise.stamp_s2)),
+        ),
         corrected=_correct_measurements(m, made, smoothed, explained),
     )
 

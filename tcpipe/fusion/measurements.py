@@ -8,6 +8,7 @@ and floored. Rows are sorted by stamp, without repetitions. Both estimators take
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, TypeVar
 
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 
 GNSS, IMU, WHEELS, VISUAL, DOPPLER = "gnss", "imu", "wheel_odometry", "visual_odometry", "gnss_velocity"
 """Roles, as in the rejections table."""
+_FIELDS = {GNSS: "gnss", DOPPLER: "doppler", IMU: "imu", WHEELS: "wheels", VISUAL: "visual"}
 
 NO_LEVER_ARM = (0.0, 0.0, 0.0)
 STATED_ARM_STD_M = (0.05, 0.05, 0.1)
@@ -140,8 +142,12 @@ class Measurements:
 
     def sensors(self) -> dict[str, Positions | GroundVelocities | InertialMeasurements | BodyVelocities]:
         """Return the sensors that are there, by role."""
-        every = {GNSS: self.gnss, DOPPLER: self.doppler, IMU: self.imu, WHEELS: self.wheels, VISUAL: self.visual}
+        every = {role: getattr(self, name) for role, name in _FIELDS.items()}
         return {role: sensor for role, sensor in every.items() if sensor is not None}
+
+    def replace_sensors(self, changed: Mapping[str, Any]) -> Measurements:
+        """Return the measurements with other sensors, by role; None takes one out."""
+        return replace(self, **{_FIELDS[role]: sensor for role, sensor in changed.items()})
 
     def odometries(self) -> dict[str, BodyVelocities]:
         """Return the odometries that are there, by role; the wheels' first."""
@@ -180,21 +186,11 @@ _Source = TypeVar("_Source", Positions, GroundVelocities, BodyVelocities, Inerti
 
 def select_measurements(whole: Measurements, start_ns: int, end_ns: int) -> Measurements:
     """Return the measurements between two stamps, both included; a sensor without any is None."""
-    return replace(
-        whole,
-        gnss=_select_source(whole.gnss, start_ns, end_ns),
-        doppler=_select_source(whole.doppler, start_ns, end_ns),
-        imu=_select_source(whole.imu, start_ns, end_ns),
-        wheels=_select_source(whole.wheels, start_ns, end_ns),
-        visual=_select_source(whole.visual, start_ns, end_ns),
-    )
-
-
-def _select_source(source: _Source | None, start_ns: int, end_ns: int) -> _Source | None:
-    if source is None:
-        return None
-    rows = slice(*np.searchsorted(source.stamp_ns, (start_ns, end_ns + 1)))
-    return select_rows(source, rows) if rows.stop > rows.start else None
+    found = {}
+    for role, source in whole.sensors().items():
+        rows = slice(*np.searchsorted(source.stamp_ns, (start_ns, end_ns + 1)))
+        found[role] = select_rows(source, rows) if rows.stop > rows.start else None
+    return whole.replace_sensors(found)
 
 
 def select_rows(source: _Source, rows: slice | NDArray[np.bool_]) -> _Source:

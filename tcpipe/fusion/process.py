@@ -170,7 +170,7 @@ def make_motion_noise(  # noqa: PLR0917
     by_gyro = mode >= state.GYRO_TURN
     if m.imu is not None:
         density[by_gyro, :3] = noise.turns[IMU].white_rad2ps
-    metres_per_s = _compute_speed(m, stamp_ns[~by_gyro])
+    metres_per_s = compute_speed(m, stamp_ns[~by_gyro])
     density[~by_gyro] = _make_turn_density(m, mode[~by_gyro], rate_radps[~by_gyro], metres_per_s)
     inertial = mode == state.INERTIAL
     if m.imu is not None and inertial.any():
@@ -188,7 +188,7 @@ def estimate_gyro_density(gyro_std_radps: float, rate_hz: float) -> float:
     return 1.5 * gyro_std_radps**2 / rate_hz + 1e-8
 
 
-def _compute_speed(m: Measurements, at_ns: NDArray[np.int64]) -> NDArray[np.float64]:
+def compute_speed(m: Measurements, at_ns: NDArray[np.int64]) -> NDArray[np.float64]:
     """Return about how fast the robot drives [m/s]; 1 where only fixes show it."""
     source = next(iter(m.odometries().values()), None)
     if source is None:

@@ -25,6 +25,7 @@ from tcpipe.fusion.measurements import VISUAL, WHEELS, BodyVelocities, InertialM
 from tcpipe.fusion.process import (
     DOPPLER_LASTS_S,
     UNSEEN_TURN_RADPS,
+    compute_speed,
     is_gliding,
     level_stds_rad,
     make_motion_noise,
@@ -131,7 +132,9 @@ def build_ticks(  # noqa: C901, PLR0915  one array after the other
             put(kind, source.stamp_ns, source.velocity_mps[:, :axes], _make_velocity_variance(m, source, noise, role))
     fix_variance = np.zeros((size, 3))
     if m.gnss is not None:
-        put(state.FIX, m.gnss.stamp_ns, m.gnss.position_enu_m, m.gnss.variance_m2 * _compute_white_shares(noise))
+        variances = m.gnss.variance_m2 * _compute_white_shares(noise)
+        variances[:, :2] += noise.stamp_s2 * np.square(compute_speed(m, m.gnss.stamp_ns))[:, None]
+        put(state.FIX, m.gnss.stamp_ns, m.gnss.position_enu_m, variances)
         nearest = np.searchsorted(m.gnss.stamp_ns, stamp_ns).clip(0, m.gnss.stamp_ns.size - 1)
         fix_variance = m.gnss.variance_m2[nearest] * _compute_correlated_shares(noise)
     if m.gnss is not None and m.doppler is not None:

@@ -15,7 +15,6 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from tcpipe.fusion import preparation
-from tcpipe.fusion.checks.clock_offsets import smooth_stamps
 from tcpipe.fusion.checks.odometry_scale import Scale, rescale_odometries
 from tcpipe.fusion.checks.plausibility import SensorExclusion
 from tcpipe.fusion.checks.sensors import CommandedSpeed, check_ground_velocity, check_sensors
@@ -53,8 +52,6 @@ class FusionInputs:
     excluded: frozenset[str] = frozenset()
     scales: Mapping[str, Scale] = field(default_factory=dict)
     """By odometry, the scale that was taken out."""
-    cuts_ns: tuple[int, ...] = ()
-    """First stamps after the clock of all sensors was set forward."""
 
     def note(self, role: str, prepared: Prepared) -> None:
         """Remember what was set aside."""
@@ -86,8 +83,6 @@ def prepare_inputs(streams: Streams, config: FuseConfig) -> FusionInputs:
             gnss, repeats = preparation.drop_repeated_fixes(gnss, odometry)
             inputs.counts[GNSS]["repeated"] += count - gnss.stamp_ns.size
             inputs.findings += [_find_frozen(each, streams) for each in repeats]
-        gnss, findings = smooth_stamps(gnss, odometry)
-        inputs.findings += findings
         inputs.measurements[epoch] = Measurements(
             gnss=gnss,
             doppler=found.get(DOPPLER),

@@ -146,6 +146,7 @@ class StretchFacts:
     events: int | None = field(default=None, metadata=LEFT_OUT)
     zero_velocity_updates: int | None = field(default=None, metadata=LEFT_OUT)
     gnss_lasting_error_m: float | None = field(default=None, metadata=LEFT_OUT)
+    gnss_stamp_std_s: float | None = field(default=None, metadata=LEFT_OUT)
     gate_resets: tuple[GateReset, ...] = field(default=(), metadata=LEFT_OUT)
     gyro_bias_radps: Vector | None = None
     turn_scale: float | None = None
@@ -248,36 +249,37 @@ class AuditFacts:
 
 @dataclass(frozen=True, slots=True)
 class ClockPair:
-    """Two sensors' clocks compared (`tcpipe.fusion.checks.clock_offsets.Pair`), and whether that determines their offset."""
+    """Two sensors compared: by what, how late the first's stamps are against the second's, and how much one explains the other (0 to 1).
+
+    ``determined``: whether the offset is known well enough to be spoken of.
+    """
 
     late: str
     against: str
     by: str
-    offset_s: float | None
-    std_s: float | None
-    explained: float | None
-    drift_s_per_h: float | None
-    drift_std_s_per_h: float | None
-    windows: tuple[Vector, ...]
+    offset_s: float
+    std_s: float
+    explained: float
     determined: bool
 
 
 @dataclass(frozen=True, slots=True)
 class ClockOffset:
-    """Delay of a sensor's stamps (`tcpipe.fusion.checks.clock_offsets.RoleOffset`); ``blamed``: the sensor, not the reference, is off."""
+    """How late a sensor's stamps are against the reference's.
 
-    offset_s: float | None
-    std_s: float | None
+    ``noted``: whether a person should act on it; ``blamed``: the sensor is off, since two others agree against it; otherwise it and the
+    reference differ, and which of them is off is not known.
+    """
+
+    offset_s: float
+    std_s: float
     noted: bool
-    drift_s_per_h: float | None
-    drift_std_s_per_h: float | None
-    drifts: bool
     blamed: bool = True
 
 
 @dataclass(frozen=True, slots=True)
 class ClockFacts:
-    """The sensors' clocks in one clock epoch before offsets were taken out: all pairs, and each role's offset from the reference."""
+    """The sensors' clocks in one clock epoch before offsets were taken out: all pairs, and offsets of those connected to the reference."""
 
     clock_epoch: int
     reference: str
