@@ -271,7 +271,7 @@ def _make_trajectory(  # noqa: PLR0917
         # What fixes claim beyond what the run shows lasts longer than the run can show.
         for axes, fix in ((slice(0, 2), noise.horizontal), (slice(2, 3), noise.vertical)):
             position_variance[:, axes] += max(0.0, fix.claimed_m2 - fix.white_m2 - fix.correlated.variance)
-    if m.gnss is not None and not std[state.ARM]:
+    if m.gnss is not None and not std[state.ARM : state.ARM + 3].any():
         turned = np.unwrap(np.arctan2(rotation[:, 1, 0], rotation[:, 0, 0]))
         variance, moved = _compute_arm_variance(m, rotation, turned, made)
         position_variance += variance
@@ -298,10 +298,7 @@ def _make_trajectory(  # noqa: PLR0917
         forward_velocity_std_mps=np.sqrt(speed_variance + (scale_std * speed) ** 2),
         rejections=_make_rejections(m, made),
         displacement_std_m=np.sqrt(links),
-        facts=replace(
-            _make_facts(m, made, smoothed, std, scale_std, explained),
-            gnss_stamp_std_s=None if m.gnss is None else float(np.sqrt(noise.stamp_s2)),
-        ),
+        facts=_make_facts(m, made, smoothed, std, scale_std, explained),
         corrected=_correct_measurements(m, made, smoothed, explained),
     )
 
@@ -485,7 +482,6 @@ def _make_facts(  # noqa: PLR0917
         gnss_lasting_error_m=float(np.sqrt(np.median(made.ticks.fix_variance_m2[:, 0]))),
         gate_resets=find_gate_resets(made),
         changes=tuple(_list_changes(made, explained)),
-        covariance_repairs=0,
         gyro_bias_radps=None if std[state.TURN_SCALE] else make_vector(x[state.GYRO_BIAS : state.GYRO_BIAS + 3]),
         turn_scale=float(1.0 / (1.0 - x[state.TURN_SCALE])) if std[state.TURN_SCALE] else None,
         accelerometer_bias_mps2=make_vector(x[state.ACCELEROMETER_BIAS : state.ACCELEROMETER_BIAS + 3]),
@@ -503,12 +499,12 @@ def _describe_parameters(m: Measurements, made: Pass, smoothed: Smoothed, std: F
     active, found = list(made.model.active), {}
     for parameter in PARAMETERS:
         errors = range(parameter.place, parameter.place + parameter.count)
-        if not all(std[e] for e in errors):
+        if not any(std[e] for e in errors):
             continue
         value = smoothed.states[-1, [e + 6 for e in errors]]
         if parameter.place == state.ARM and m.gnss is not None:
             value = value - m.gnss.lever_arm_m
-        spread = smoothed.spreads[-1, [active.index(e) for e in errors]]
+        spread = np.array([smoothed.spreads[-1, active.index(e)] if e in active else 0.0 for e in errors])
         prior = std[list(errors)]
         varies = smoothed.states[:, [e + 6 for e in errors]].std(axis=0)
         found[parameter.name] = ParameterFacts(*(tuple(each.tolist()) for each in (value, spread, prior, varies)))

@@ -57,6 +57,8 @@ _FEWEST_ROWS = 20  # second differences for velocity scatter
 _SCATTERS_MORE = 3.0
 """Than is claimed: a speed by counts that come only with every other message does, a rough road does not."""
 _MEAN_S = 0.5  # averaging of such a velocity
+_JITTER_S = 0.05  # less does not matter
+_JITTER_STEPS, _JITTER_STEP_S, _JITTER_MPS = 41, 2.0, 0.3  # between fixes: so many together, the longest, the slowest
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,6 +151,45 @@ def _select_fixes(gnss: Positions, rows: Mask) -> Positions:
     unclaimed = None if gnss.unclaimed is None else gnss.unclaimed[rows]
     fixes, variance = gnss.position_enu_m[rows], gnss.variance_m2[rows]
     return replace(gnss, stamp_ns=gnss.stamp_ns[rows], position_enu_m=fixes, variance_m2=variance, unclaimed=unclaimed)
+
+
+def inflate_jittery_fixes(gnss: Positions, odometry: BodyVelocities) -> tuple[Positions, Floats]:
+    """Return the fixes with variances raised where their stamps jitter, and the standard deviation of the stamps at each [s], (N,).
+
+    Receivers and localization nodes that stamp a fix when they send it make positions that stand still and then leap. The distance between
+    two fixes is compared with that driven by the odometry (times the local ratio of the two, so that slip does not count). What this
+    residual spreads beyond the claimed noise, divided by the speed, is the jitter. It is 0 where it is small or unknown; while the robot is
+    stationary the value of the nearest motion is held. The variance grows by (2 speed jitter)²: such fixes are late by as much as they
+    scatter, and one late fix follows another, so the filter, for which errors are white, must not average them away.
+    """
+    zero = int(gnss.stamp_ns[0])
+    stamp_s, odometry_s = compute_seconds(gnss.stamp_ns, zero), compute_seconds(odometry.stamp_ns, zero)
+    speed = np.abs(odometry.velocity_mps[:, :1])
+    driven_m = np.diff(integrate_signal(odometry_s, speed, stamp_s), axis=0)[:, 0]
+    interval_s = np.diff(stamp_s)
+    moved_m = np.hypot(*np.diff(gnss.position_enu_m[:, :2], axis=0).T)
+    moving = (driven_m > _JITTER_MPS * interval_s) & (interval_s < _JITTER_STEP_S)
+    if moving.sum() < _JITTER_STEPS:
+        return gnss, np.zeros(stamp_s.size)
+    driven_m, moved_m, mean_speed = driven_m[moving], moved_m[moving], driven_m[moving] / interval_s[moving]
+    # A median: neither slip nor an outlying fix is jitter.
+    residual_s = (moved_m - np.median(_make_windows(moved_m / driven_m), axis=1) * driven_m) / mean_speed
+    claimed_s2 = (gnss.variance_m2[:-1, :2].mean(1) + gnss.variance_m2[1:, :2].mean(1))[moving] / 2 / mean_speed**2
+    claimed_s2 = _make_windows(claimed_s2).mean(1)
+    # One outlying fix spoils two pairs: the fourth fifth bears one in ten, yet sees tails that the median does not.
+    spread_s = np.quantile(_make_windows(np.abs(residual_s)), 0.8, axis=1) / 1.2816
+    excess_s2 = spread_s**2 / 2 - claimed_s2
+    matters = excess_s2 > np.maximum(_JITTER_S**2, 4 * claimed_s2)
+    middle_s = (0.5 * (stamp_s[1:] + stamp_s[:-1]))[moving]
+    jitter_s = np.interp(stamp_s, middle_s, np.sqrt(np.where(matters, excess_s2, 0.0)))
+    variance = gnss.variance_m2.copy()
+    variance[:, :2] += ((2 * np.interp(stamp_s, odometry_s, speed[:, 0]) * jitter_s) ** 2)[:, None]
+    return replace(gnss, variance_m2=variance), jitter_s
+
+
+def _make_windows(values: Floats) -> Floats:
+    """Return a window centred on each value, shape (N, 41), the signal mirrored at its ends."""
+    return np.lib.stride_tricks.sliding_window_view(np.pad(values, _JITTER_STEPS // 2, mode="reflect"), _JITTER_STEPS)
 
 
 def prepare_ground_velocities(

@@ -30,7 +30,7 @@ from tcpipe.fusion.signals import (
     estimate_white_noise,
     is_in_gap,
 )
-from tcpipe.power.noise import MEDIAN_OF_SQUARES
+from tcpipe.robust import estimate_robust_std
 
 WHEEL_SCALE_STD = 0.12  # a skid-steered robot on grass slips by so much
 VISUAL_SCALE_STD = 0.05  # stereo calibration
@@ -170,7 +170,7 @@ def make_motion_noise(  # noqa: PLR0917
     by_gyro = mode >= state.GYRO_TURN
     if m.imu is not None:
         density[by_gyro, :3] = noise.turns[IMU].white_rad2ps
-    metres_per_s = compute_speed(m, stamp_ns[~by_gyro])
+    metres_per_s = _compute_speed(m, stamp_ns[~by_gyro])
     density[~by_gyro] = _make_turn_density(m, mode[~by_gyro], rate_radps[~by_gyro], metres_per_s)
     inertial = mode == state.INERTIAL
     if m.imu is not None and inertial.any():
@@ -188,7 +188,7 @@ def estimate_gyro_density(gyro_std_radps: float, rate_hz: float) -> float:
     return 1.5 * gyro_std_radps**2 / rate_hz + 1e-8
 
 
-def compute_speed(m: Measurements, at_ns: NDArray[np.int64]) -> NDArray[np.float64]:
+def _compute_speed(m: Measurements, at_ns: NDArray[np.int64]) -> NDArray[np.float64]:
     """Return about how fast the robot drives [m/s]; 1 where only fixes show it."""
     source = next(iter(m.odometries().values()), None)
     if source is None:
@@ -299,4 +299,4 @@ def _estimate_slide_density(visual: BodyVelocities | None) -> float:
     if visual is None or visual.stamp_ns.size < 3:
         return _UNSEEN_SLIDE
     shown = [compute_slopes(visual.stamp_ns, visual.velocity_mps[:, axis], _SLIDE_WINDOW_S) for axis in (1, 2)]
-    return max(_SLIDE, _ACCELERATION_LASTS_S * float(np.median(np.square(shown)) / MEDIAN_OF_SQUARES))
+    return max(_SLIDE, _ACCELERATION_LASTS_S * estimate_robust_std(np.array(shown)) ** 2)

@@ -25,7 +25,6 @@ from tcpipe.fusion.measurements import VISUAL, WHEELS, BodyVelocities, InertialM
 from tcpipe.fusion.process import (
     DOPPLER_LASTS_S,
     UNSEEN_TURN_RADPS,
-    compute_speed,
     is_gliding,
     level_stds_rad,
     make_motion_noise,
@@ -39,7 +38,7 @@ from tcpipe.fusion.signals import (
     compute_slopes,
     is_covered,
 )
-from tcpipe.power.noise import MEDIAN_OF_SQUARES
+from tcpipe.robust import estimate_robust_std
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -132,9 +131,7 @@ def build_ticks(  # noqa: C901, PLR0915  one array after the other
             put(kind, source.stamp_ns, source.velocity_mps[:, :axes], _make_velocity_variance(m, source, noise, role))
     fix_variance = np.zeros((size, 3))
     if m.gnss is not None:
-        variances = m.gnss.variance_m2 * _compute_white_shares(noise)
-        variances[:, :2] += noise.stamp_s2 * np.square(compute_speed(m, m.gnss.stamp_ns))[:, None]
-        put(state.FIX, m.gnss.stamp_ns, m.gnss.position_enu_m, variances)
+        put(state.FIX, m.gnss.stamp_ns, m.gnss.position_enu_m, m.gnss.variance_m2 * _compute_white_shares(noise))
         nearest = np.searchsorted(m.gnss.stamp_ns, stamp_ns).clip(0, m.gnss.stamp_ns.size - 1)
         fix_variance = m.gnss.variance_m2[nearest] * _compute_correlated_shares(noise)
     if m.gnss is not None and m.doppler is not None:
@@ -229,7 +226,7 @@ def _make_velocity_variance(m: Measurements, source: BodyVelocities, noise: Nois
 def _estimate_scatter(velocity_mps: Floats) -> float:
     """Return the variance of a moving odometry's samples around their neighbours', by the median: wild ones do not move it."""
     second = np.diff(velocity_mps, n=2)[(np.abs(velocity_mps) > _MOVING_MPS)[1:-1]]
-    return float(np.median(second**2) / (6.0 * MEDIAN_OF_SQUARES)) if second.size > 1 else 0.0
+    return estimate_robust_std(second) ** 2 / 6.0 if second.size > 1 else 0.0
 
 
 def _compute_unseen_turn_variance(stamp_ns: Ints, lever_arm_m: tuple[float, float, float]) -> Floats:

@@ -5,7 +5,7 @@ Power is not fused, and its stamps stay as they are.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -13,6 +13,7 @@ import numpy as np
 
 from tcpipe.fusion.checks.clock_offsets import POWER, PowerSignal, find_clock_offsets
 from tcpipe.fusion.measurements import DOPPLER, Measurements
+from tcpipe.logs.clocks import LOG_CLOCK
 from tcpipe.power.rails import compute_power_at
 from tcpipe.recipe.suggestions import suggest
 from tcpipe.stages.fuse_inputs import FusionInputs, find_longest_epoch, find_recipe_role
@@ -23,6 +24,8 @@ from tcpipe.tables.levels import Streams
 
 _MAX_GAP_NS = 300_000_000
 _FINE_S = 0.004
+_JUMP_NS = 500_000_000
+_DRIVES_MPS = 0.3
 
 
 def correct_clocks(
@@ -38,7 +41,10 @@ def correct_clocks(
     found = find_clock_offsets(inputs.measurements[epoch], _make_power_signal(streams, epoch), clock_epoch=epoch)
     found = replace(found, offsets={role: offset for role, offset in found.offsets.items() if role not in unsteady})
     off = {role: offset for role, offset in found.offsets.items() if offset.noted}
-    findings = tuple(_find_offset(found, role, offset, streams) for role, offset in off.items())
+    findings = (
+        *(_find_offset(found, role, offset, streams) for role, offset in off.items()),
+        *find_clock_jumps(inputs),
+    )
     aligned = {number: _shift_stamps(m, off) for number, m in inputs.measurements.items()}
     return replace(inputs, measurements=aligned), StageReport(findings, found)
 
@@ -68,6 +74,30 @@ def _find_offset(found: ClockFacts, role: str, offset: ClockOffset, streams: Str
         remedies=suggest("correct", {"read.time_offset_s": {name: correction_s}}),
         **numbers,
     )
+
+
+def find_clock_jumps(inputs: FusionInputs) -> Iterator[Finding]:
+    """Yield where the clock of all sensors was set forward: a gap in which, by the fixes, a robot that drives does not move."""
+    stamps = [
+        np.unique(np.concatenate([of.stamp_ns for of in m.sensors().values()])) for m in inputs.measurements.values()
+    ]
+    for m, stamp_ns in zip(inputs.measurements.values(), stamps, strict=True):
+        if m.gnss is None or not m.odometries():
+            continue
+        odometry = next(iter(m.odometries().values()))
+        gaps = np.flatnonzero(np.diff(stamp_ns) > _JUMP_NS)
+        ends_ns = stamp_ns[[gaps, gaps + 1]]
+        slowest_mps = np.abs(np.interp(ends_ns, odometry.stamp_ns, odometry.velocity_mps[:, 0])).min(0)
+        moved_m = np.hypot(
+            *(np.diff(np.interp(ends_ns, m.gnss.stamp_ns, axis), axis=0)[0] for axis in m.gnss.position_enu_m[:, :2].T)
+        )
+        step_s = np.diff(ends_ns, axis=0)[0] * 1e-9
+        for gap in np.flatnonzero((slowest_mps > _DRIVES_MPS) & (moved_m < 0.5 * slowest_mps * step_s)):
+            at_s = float(ends_ns[1, gap] - min(each[0] for each in stamps)) * 1e-9
+            names = {"topics": "all topics"}
+            yield make_finding(
+                "clock-step", LOG_CLOCK, span_s=(at_s, at_s), names=names, step_s=float(step_s[gap]), at_s=at_s
+            )
 
 
 def _make_power_signal(streams: Streams, epoch: int) -> PowerSignal | None:

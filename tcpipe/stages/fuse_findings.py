@@ -71,9 +71,6 @@ def find_fuse_findings(
         findings.append(make_finding("local-frame", gnss))
     elif inputs.datum_deg_m is not None:
         findings += [_find_initial_yaw(of, first_ns, gnss) for of in facts.stretches if of.heading_from != _COURSE]
-    jitter_s = max((of.gnss_stamp_std_s or 0.0 for of in facts.stretches), default=0.0)
-    if jitter_s > read_threshold("stamp-jitter", "min_jitter_s"):
-        findings.append(make_finding("stamp-jitter", gnss, jitter_s=jitter_s))
     findings += _find_reopenings(facts, first_ns)
     findings += _find_changes(facts, first_ns, fixes)
     findings += _find_scale(inputs, facts)

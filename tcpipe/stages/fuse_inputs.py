@@ -5,7 +5,7 @@ A pose that another program estimated becomes the fixes of a GNSS.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -83,6 +83,9 @@ def prepare_inputs(streams: Streams, config: FuseConfig) -> FusionInputs:
             gnss, repeats = preparation.drop_repeated_fixes(gnss, odometry)
             inputs.counts[GNSS]["repeated"] += count - gnss.stamp_ns.size
             inputs.findings += [_find_frozen(each, streams) for each in repeats]
+        if gnss is not None and odometry is not None:
+            gnss, jitter_s = preparation.inflate_jittery_fixes(gnss, odometry)
+            inputs.findings += _find_jitter(jitter_s)
         inputs.measurements[epoch] = Measurements(
             gnss=gnss,
             doppler=found.get(DOPPLER),
@@ -99,6 +102,13 @@ def _find_frozen(repeats: preparation.Repeats, streams: Streams) -> Finding:
     span_s = (repeats.start_ns - first_ns) / 1e9, (repeats.end_ns - first_ns) / 1e9
     subject, names = Subject("role", find_recipe_role(GNSS, streams)), {"quantity": "position"}
     return make_finding("frozen", subject, span_s=span_s, names=names, message_count=repeats.messages)
+
+
+def _find_jitter(jitter_s: NDArray[np.float64]) -> Iterator[Finding]:
+    jumpy = jitter_s > 0
+    if jumpy.any():
+        numbers = {"jitter_fraction": float(jumpy.mean()), "jitter_s": float(np.median(jitter_s[jumpy]))}
+        yield make_finding("stamp-jitter", Subject("role", GNSS), **numbers)
 
 
 def _find_first_ns(streams: Streams) -> int:

@@ -146,7 +146,6 @@ class StretchFacts:
     events: int | None = field(default=None, metadata=LEFT_OUT)
     zero_velocity_updates: int | None = field(default=None, metadata=LEFT_OUT)
     gnss_lasting_error_m: float | None = field(default=None, metadata=LEFT_OUT)
-    gnss_stamp_std_s: float | None = field(default=None, metadata=LEFT_OUT)
     gate_resets: tuple[GateReset, ...] = field(default=(), metadata=LEFT_OUT)
     gyro_bias_radps: Vector | None = None
     turn_scale: float | None = None
