@@ -34,6 +34,8 @@ Widening = Annotated[float, Bounds(ge=0, le=600)]
 ArcToChord = Annotated[float, Bounds(ge=1, le=10)]
 """Length of an arc over that of its chord: 1 is straight, 1.57 a half circle."""
 Metres = Annotated[float, Bounds(ge=-1000, le=1000)]
+Tolerance = Annotated[float, Bounds(ge=0, le=10)]
+"""A standard deviation of a stated place [m]: 0 is exact, more than the robot says nothing."""
 Radians = Annotated[float, Bounds(ge=-6.3, le=6.3)]
 """An angle: one turn either way; more is mostly degrees."""
 Offset = Annotated[float, Bounds(ge=-2e9, le=2e9)]
@@ -110,6 +112,8 @@ class FuseConfig:
     """Lower bound of GNSS standard deviations, whatever the receiver reports [m]."""
     gnss_default_std_m: Deviation = 0.05
     """Horizontal standard deviation where the receiver gives none (the paper's RTK: 5 cm); vertical is twice as large [m]."""
+    lever_arm_std_m: tuple[Tolerance, Tolerance, Tolerance] | None = field(default=None, metadata=LEFT_OUT)
+    """Standard deviation of the stated lever arm of the GNSS antenna or pose [m]; 0: exact. Default: forward and left 0.05, up 0.1."""
     gnss_velocity_std_mps: Deviation = field(default=0.1, metadata={"json": (0.1,)})
     """Standard deviation of a receiver's own velocity where it gives none (NMEA never does) [m/s]; vertical is twice as large."""
     wheel_std_mps: Deviation = 0.05

@@ -139,7 +139,9 @@ def _prepare(role: str, table: pa.Table, sensor: Sensor, config: FuseConfig, inp
             columns,
             datum_deg_m=inputs.datum_deg_m,
             lever_arm_m=sensor.xyz_m,
-            lever_arm_std_m=UNSTATED_ARM_STD_M if sensor.placed_by == "assumed" else STATED_ARM_STD_M,
+            lever_arm_std_m=UNSTATED_ARM_STD_M
+            if sensor.placed_by == "assumed"
+            else config.lever_arm_std_m or STATED_ARM_STD_M,
             default_std_m=config.gnss_default_std_m,
             floor_std_m=config.gnss_std_floor_m,
         )
