@@ -364,7 +364,7 @@ def _make_clock_sections(facts: StageFacts, findings: Sequence[Finding]) -> list
 
 def _format_correction(role: str, findings: Sequence[Finding]) -> str:
     """Return the correction of a sensor's clock that its findings propose."""
-    clocks = select_findings(findings, "time-offset", "clocks-differ")
+    clocks = select_findings(findings, "time-offset", "clock-drift", "clocks-differ")
     role_findings = [finding for finding in clocks if finding.subject.name == role]
     remedies = [describe_remedy(finding, remedy) for finding in role_findings for remedy in finding.remedies]
     return "; ".join(remedies) or ", ".join(finding.code.replace("-", " ") for finding in role_findings)

@@ -5,21 +5,21 @@ Power is not fused, and its stamps stay as they are.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from tcpipe.fusion.checks.clock_offsets import POWER, PowerSignal, find_clock_offsets
-from tcpipe.fusion.measurements import DOPPLER, Measurements
+from tcpipe.fusion.checks.clock_offsets import POWER, PowerSignal, find_clock_offsets, find_middle_ns, shift_stamps
+from tcpipe.fusion.measurements import DOPPLER
 from tcpipe.logs.clocks import LOG_CLOCK
 from tcpipe.power.rails import compute_power_at
 from tcpipe.recipe.suggestions import suggest
 from tcpipe.stages.fuse_inputs import FusionInputs, find_longest_epoch, find_recipe_role
 from tcpipe.stages.message_arrays import make_rails
 from tcpipe.tables.facts import ClockFacts, ClockOffset
-from tcpipe.tables.findings import Finding, StageReport, Subject, make_finding
+from tcpipe.tables.findings import Action, Finding, StageReport, Subject, make_finding
 from tcpipe.tables.levels import Streams
 
 _MAX_GAP_NS = 300_000_000
@@ -40,36 +40,46 @@ def correct_clocks(
     epoch = find_longest_epoch(inputs)
     found = find_clock_offsets(inputs.measurements[epoch], _make_power_signal(streams, epoch), clock_epoch=epoch)
     found = replace(found, offsets={role: offset for role, offset in found.offsets.items() if role not in unsteady})
+    middle_ns, span_s = find_middle_ns(inputs.measurements[epoch])
     off = {role: offset for role, offset in found.offsets.items() if offset.noted}
     findings = (
-        *(_find_offset(found, role, offset, streams) for role, offset in off.items()),
+        *(_find_offset(found, role, offset, streams, span_s) for role, offset in off.items()),
         *find_clock_jumps(inputs),
     )
-    aligned = {number: _shift_stamps(m, off) for number, m in inputs.measurements.items()}
+    aligned = {
+        number: m.replace_sensors(
+            {
+                role: replace(sensor, stamp_ns=shift_stamps(sensor.stamp_ns, off[role], middle_ns))
+                for role, sensor in m.sensors().items()
+                if role in off
+            }
+        )
+        for number, m in inputs.measurements.items()
+    }
     return replace(inputs, measurements=aligned), StageReport(findings, found)
 
 
-def _shift_stamps(m: Measurements, off: Mapping[str, ClockOffset]) -> Measurements:
-    late_ns = {role: round(offset.offset_s * 1e9) for role, offset in off.items()}
-    sensors = {role: sensor for role, sensor in m.sensors().items() if role in late_ns}
-    return m.replace_sensors({role: replace(of, stamp_ns=of.stamp_ns - late_ns[role]) for role, of in sensors.items()})
-
-
-def _find_offset(found: ClockFacts, role: str, offset: ClockOffset, streams: Streams) -> Finding:
+def _find_offset(found: ClockFacts, role: str, offset: ClockOffset, streams: Streams, span_s: float) -> Finding:
     """Return the finding on a clock: which is off where two others agree, else that two differ."""
     name = find_recipe_role(role, streams)
     compared = dict.fromkeys(p.by for p in found.pairs if p.determined and role in {p.late, p.against})
     subject, names = Subject("role", name), {"reference": found.reference, "by": ", ".join(compared)}
     numbers: dict[str, Any] = {"offset_s": offset.offset_s, "offset_2std_s": 2 * offset.std_s}
+    drift: dict[str, Any] = {"drift_s": 1e-6 * offset.drift_ppm * span_s} if offset.drift_ppm else {}
     if not offset.blamed:
-        return make_finding("clocks-differ", subject, names=names, **numbers)
+        return make_finding("clocks-differ", subject, names=names, **numbers, **drift)
+    action: Action = "kept" if role == POWER else "corrected"
+    if drift:
+        by_log = streams.sensors[role].time_source == "log"
+        remedies = () if by_log else suggest("use_log_time", {"read.time_source": {name: "log"}})
+        return make_finding("clock-drift", subject, action=action, names=names, remedies=remedies, **drift)
     given_s = streams.report.facts.time_offset_s.get(name, 0.0)
     correction_s = round(given_s - offset.offset_s, 3 if offset.std_s < _FINE_S else 2)
     return make_finding(
         "time-offset",
         subject,
         severity="note" if role == DOPPLER else None,
-        action="kept" if role == POWER else "corrected",
+        action=action,
         names=names,
         remedies=suggest("correct", {"read.time_offset_s": {name: correction_s}}),
         **numbers,

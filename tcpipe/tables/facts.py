@@ -249,7 +249,7 @@ class AuditFacts:
 class ClockPair:
     """Two sensors compared: by what, how late the first's stamps are against the second's, and how much one explains the other (0 to 1).
 
-    ``determined``: whether the offset is known well enough to be spoken of.
+    ``determined``: whether the offset is known well enough to be spoken of; ``from_middle_s``: when, from the middle of the run.
     """
 
     late: str
@@ -259,11 +259,12 @@ class ClockPair:
     std_s: float
     explained: float
     determined: bool
+    from_middle_s: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
 class ClockOffset:
-    """How late a sensor's stamps are against the reference's.
+    """How late a sensor's stamps are against the reference's in the middle of the run, and their drift; 0 unless it is sure.
 
     ``noted``: whether a person should act on it; ``blamed``: the sensor is off, since two others agree against it; otherwise it and the
     reference differ, and which of them is off is not known.
@@ -273,6 +274,7 @@ class ClockOffset:
     std_s: float
     noted: bool
     blamed: bool = True
+    drift_ppm: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)

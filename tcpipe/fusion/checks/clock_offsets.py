@@ -1,20 +1,20 @@
 """Time offsets between the stamps of a run's sensors, by what they measure of the same motion.
 
-Small offsets, drift and jitter are states and noise of the estimator, and steps of a clock are hypotheses of it. Before fusion, larger
-offsets are found, and that of power, which is not fused. Over the half hour in which the robot drives most, two signals of one motion are
-shifted against each other until one explains most of the other (`lags`): the yaw rate of an odometry and the gyroscope, speeds, changes
-of speed and the accelerometer, power and what speed and acceleration cost. They are compared only where the robot turns or changes its
-speed: on a straight there is nothing to compare but what the controller corrects, and that leads the body. The course of the fixes is not
-held against the gyroscope: an antenna that sits ahead of the turning point by l leads the body's course by l / v, 0.1 s for 10 cm.
+Small offsets are states of the estimator, and steps of a clock are hypotheses of it. Before fusion, larger offsets are found, and that of
+power, which is not fused. Two signals of one motion are shifted against each other until one explains most of the other (`lags`): the yaw
+rate of an odometry and the gyroscope, speeds, changes of speed and the accelerometer, power and what speed and acceleration cost. They are
+compared only where the robot turns or changes its speed: on a straight there is nothing to compare but what the controller corrects, and
+that leads the body. The course of the fixes is not held against the gyroscope: an antenna that sits ahead of the turning point by l leads
+the body's course by l / v, 0.1 s for 10 cm.
 
-The pairs together give each sensor's offset from the clock that most of them share. A sensor is blamed only where two others agree against
-it and no pair contradicts; else two differ, and nobody knows which is off.
+The pairs together, in windows of ten minutes, give each sensor's offset and drift from the clock that most of them share. A sensor is
+blamed only where two others agree against it and no pair contradicts; else two differ, and nobody knows which is off.
 """
 
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import astuple, dataclass
+from dataclasses import astuple, dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,14 +25,25 @@ from tcpipe.fusion.checks.lags import (
     Floats,
     Lag,
     compute_fix_velocity,
+    compute_lag_products,
     compute_moving_mean,
-    find_lag,
-    find_liveliest_window_ns,
+    estimate_lag,
+    find_span_ns,
+    iterate_windows_ns,
     resample_signal,
     resample_twist,
 )
-from tcpipe.fusion.measurements import DOPPLER, GNSS, IMU, VISUAL, WHEELS, InertialMeasurements, Measurements
-from tcpipe.fusion.signals import compute_median_period_ns
+from tcpipe.fusion.measurements import (
+    DOPPLER,
+    GNSS,
+    IMU,
+    VISUAL,
+    WHEELS,
+    InertialMeasurements,
+    Measurements,
+    select_measurements,
+)
+from tcpipe.fusion.signals import compute_median_period_ns, compute_seconds
 from tcpipe.tables.facts import ClockFacts, ClockOffset, ClockPair
 
 POWER = "power"
@@ -47,6 +58,9 @@ _CLEARLY = (
 )
 _MIN_EXPLAINED = 0.25
 _LEAST_STD_S = 1e-3
+_WINDOW_NS, _MARGIN_NS = 600_000_000_000, 5_000_000_000
+_FEWEST_WINDOWS = 3  # that show a drift
+_DRIFT = 1e-3  # of a clock, 1σ
 _LEAST_BY_FORCE_S = 0.02  # slopes act as accelerations: the accelerometer checks a clock rather than measures it
 _TURNS_RADPS = 0.1
 _CHANGES_MPS = 0.1
@@ -75,19 +89,49 @@ def find_clock_offsets(m: Measurements, power: PowerSignal | None, *, clock_epoc
 
     Extrinsics need not be right, since a yaw rate is compared with all three axes of a gyroscope.
     """
-    at_ns = find_liveliest_window_ns(m)
-    signals = _iterate_signals(m, power, at_ns) if at_ns is not None else iter(())
-    found = ((names, find_lag(target, regressors)) for *names, target, regressors in signals)
-    return solve_offsets(
-        [make_pair(*names, lag) for names, lag in found if lag and np.isfinite(lag.std_s)], clock_epoch
-    )
+    middle_ns, span_s = find_middle_ns(m)
+    told: dict[tuple[str, str, str], list[tuple[float, Floats]]] = {}
+    for at_ns in iterate_windows_ns(m, _WINDOW_NS):
+        inside = select_measurements(m, int(at_ns[0]) - _MARGIN_NS, int(at_ns[-1]) + _MARGIN_NS)
+        for late, against, by, target, regressors in _iterate_signals(inside, power, at_ns):
+            products = compute_lag_products(target, regressors)
+            if products is not None:
+                at_s = (0.5 * float(at_ns[-1] - at_ns[0]) + float(at_ns[0] - middle_ns)) * 1e-9
+                told.setdefault((late, against, by), []).append((at_s, products))
+    pairs = [pair for names, windows in told.items() for pair in _list_pairs(*names, windows)]
+    return solve_offsets(pairs, clock_epoch, span_s)
 
 
-def make_pair(late: str, against: str, by: str, lag: Lag) -> ClockPair:
+def find_middle_ns(m: Measurements) -> tuple[int, float]:
+    """Return the middle of a set's measurements [ns], and how long they last [s]; 0 without any."""
+    first_ns, last_ns = find_span_ns(m) or (0, 0)
+    return (first_ns + last_ns) // 2, (last_ns - first_ns) * 1e-9
+
+
+def shift_stamps(stamp_ns: NDArray[np.int64], offset: ClockOffset, middle_ns: int) -> NDArray[np.int64]:
+    """Return stamps [ns] without an offset and its drift."""
+    return stamp_ns - np.rint(1e9 * _compute_lateness(offset, compute_seconds(stamp_ns, middle_ns))).astype(np.int64)
+
+
+def _compute_lateness(offset: ClockOffset, from_middle_s: Floats | float) -> Floats:
+    return np.asarray(offset.offset_s + 1e-6 * offset.drift_ppm * from_middle_s)
+
+
+def _list_pairs(late: str, against: str, by: str, windows: Sequence[tuple[float, Floats]]) -> list[ClockPair]:
+    """Return two sensors compared: in each window where three tell enough, else over the run."""
+    found = [(at_s, estimate_lag([products])) for at_s, products in windows] if len(windows) >= _FEWEST_WINDOWS else []
+    pairs = [pair for at_s, lag in found if lag and (pair := make_pair(late, against, by, lag, at_s)).determined]
+    if len(pairs) >= _FEWEST_WINDOWS:
+        return pairs
+    whole = estimate_lag([products for _, products in windows])
+    return [make_pair(late, against, by, whole)] if whole and np.isfinite(whole.std_s) else []
+
+
+def make_pair(late: str, against: str, by: str, lag: Lag, from_middle_s: float = 0.0) -> ClockPair:
     """Return two sensors compared; a lag is determined where its error is small or it is surely not zero."""
     limit_s = _MAX_POWER_STD_S if late == POWER else _MAX_STD_S
     known = lag.std_s <= limit_s or (lag.std_s <= 3 * limit_s and abs(lag.offset_s) > _CLEARLY * lag.std_s)
-    return ClockPair(late, against, by, *astuple(lag), determined=known and lag.explained >= _MIN_EXPLAINED)
+    return ClockPair(late, against, by, *astuple(lag), known and lag.explained >= _MIN_EXPLAINED, from_middle_s)
 
 
 def _iterate_signals(m: Measurements, power: PowerSignal | None, at_ns: NDArray[np.int64]) -> Iterator[Signals]:
@@ -175,25 +219,22 @@ def _prepare_power(power: PowerSignal, twist: Floats, at_ns: NDArray[np.int64]) 
     return np.where(_find_rows_near(speed < _STOPPED_MPS, _NEAR_STOP_S), fast[:, 0], np.nan), fast[:, 1:]
 
 
-def solve_offsets(pairs: Sequence[ClockPair], clock_epoch: int = 0) -> ClockFacts:
+def solve_offsets(pairs: Sequence[ClockPair], clock_epoch: int = 0, span_s: float = 0.0) -> ClockFacts:
     """Return each sensor's offset from the clock that most sensors share, by weighted least squares over the pairs that are determined.
 
     The receiver's velocity has no say: it has the clock of the fixes, and no label needs it.
     """
     known = [pair for pair in pairs if pair.determined]
-    solved = {role: _solve_against(role, known) for role in ROLES if any(role in {p.late, p.against} for p in known)}
+    solved = {
+        role: _solve_against(role, known, span_s) for role in ROLES if any(role in {p.late, p.against} for p in known)
+    }
     if not solved:
         return ClockFacts(clock_epoch, "", tuple(pairs), {})
     agreeing = {role: {role, *_find_agreeing(offsets)} for role, offsets in solved.items()}
     reference = max(solved, key=lambda role: len(agreeing[role]))  # the first of equals
-    told = {}
-    for role, (offset_s, std_s) in solved[reference].items():
-        noted = abs(offset_s) > max(_find_limit_s(role), _SURE * std_s)
-        among = [p for p in known if {p.late, p.against} <= agreeing[reference] | {role}]
-        blamed = role not in agreeing[reference] and _is_blamed(
-            role, among, {reference: (0.0, 0.0)} | solved[reference]
-        )
-        told[role] = ClockOffset(offset_s, std_s, noted, blamed or role == DOPPLER)
+    offsets = {reference: ClockOffset(0.0, 0.0, noted=False)} | solved[reference]
+    blamed = {role: role == DOPPLER or _is_blamed(role, agreeing[reference], offsets, known) for role in offsets}
+    told = {role: replace(offset, blamed=blamed[role]) for role, offset in solved[reference].items()}
     return ClockFacts(clock_epoch, reference, tuple(pairs), told)
 
 
@@ -206,38 +247,57 @@ def _get_std_s(pair: ClockPair) -> float:
     return max(pair.std_s, _LEAST_BY_FORCE_S if pair.by == ACCELERATION else _LEAST_STD_S)
 
 
-def _solve_against(reference: str, pairs: Sequence[ClockPair]) -> dict[str, tuple[float, float]]:
-    """Return offset and standard deviation [s] of each sensor that pairs connect to the reference."""
+def _solve_against(reference: str, pairs: Sequence[ClockPair], span_s: float) -> dict[str, ClockOffset]:
+    """Return offset and drift of each sensor that pairs connect to the reference; without windows that tell it, there is no drift."""
     connected = _find_connected(reference, pairs)
     used = [pair for pair in pairs if pair.late in connected]
     free = [role for role in (*ROLES, DOPPLER) if role in connected and role != reference]
-    std = np.array([_get_std_s(pair) for pair in used])
-    design = np.array([[(role == p.late) - float(role == p.against) for role in free] for p in used]) / std[:, None]
+    std, at_s = np.array([_get_std_s(pair) for pair in used]), np.array([pair.from_middle_s for pair in used])
+    signs = np.array([[(role == p.late) - float(role == p.against) for role in free] for p in used]) / std[:, None]
+    prior = np.hstack((np.zeros((len(free), len(free))), np.eye(len(free)) / _DRIFT))
+    design = np.vstack((np.hstack((signs, signs * at_s[:, None])), prior))
+    target = np.concatenate(([p.offset_s for p in used] / std, np.zeros(len(free))))
     inverse = np.linalg.pinv(design)
-    offsets, stds = inverse @ ([p.offset_s for p in used] / std), np.sqrt(np.square(inverse).sum(axis=1))
-    return dict(zip(free, zip(offsets.tolist(), stds.tolist(), strict=True), strict=True))
+    found, stds = inverse @ target, np.sqrt(np.square(inverse).sum(axis=1))
+    # Windows that scatter by more than they claim widen the deviation of a drift (Birge's ratio).
+    birge = max(1.0, float(np.sum(np.square(target - design @ found))) / max(1, len(used) - 2 * len(free)))
+    offsets = {}
+    for role, (offset_s, rate), (std_s, rate_std) in zip(
+        free, found.reshape(2, -1).T.tolist(), stds.reshape(2, -1).T.tolist(), strict=True
+    ):
+        drifts = abs(rate) > max(_SURE * np.sqrt(birge) * rate_std, _find_limit_s(role) / max(span_s, 1.0))
+        noted = bool(drifts or abs(offset_s) > max(_find_limit_s(role), _SURE * std_s))
+        offsets[role] = ClockOffset(offset_s, std_s, noted, drift_ppm=1e6 * rate if drifts else 0.0)
+    return offsets
 
 
 def _find_connected(role: str, pairs: Collection[ClockPair]) -> set[str]:
     """Return a sensor and those that pairs connect to it."""
     connected = {role}
-    for _ in pairs:
+    for _ in ROLES:
         connected |= {each for p in pairs if connected & {p.late, p.against} for each in (p.late, p.against)}
     return connected
 
 
-def _find_agreeing(offsets: Mapping[str, tuple[float, float]]) -> set[str]:
+def _find_agreeing(offsets: Mapping[str, ClockOffset]) -> set[str]:
     """Return the sensors that are near the reference; how surely does not matter: against a doubtful clock nobody is surely off."""
-    return {role for role, (offset_s, _) in offsets.items() if abs(offset_s) <= _find_limit_s(role) and role != DOPPLER}
+    near = {role for role, of in offsets.items() if abs(of.offset_s) <= _find_limit_s(role) and not of.drift_ppm}
+    return near - {DOPPLER}
 
 
-def _is_blamed(role: str, among: Sequence[ClockPair], offsets: Mapping[str, tuple[float, float]]) -> bool:
+def _is_blamed(
+    role: str, agreeing: Collection[str], offsets: Mapping[str, ClockOffset], pairs: Sequence[ClockPair]
+) -> bool:
     """Whether two sensors that agree speak against a role by the same kind of motion, and no pair contradicts any of them.
 
     A yaw rate says nothing of the clock of a speed: a filter may pass the gyroscope's on at once and smooth the wheels'.
     """
+    if role in agreeing:
+        return False
+    among = [p for p in pairs if {p.late, p.against} <= {role, *agreeing}]
     for p in among:
-        if abs(p.offset_s - offsets[p.late][0] + offsets[p.against][0]) > max(_SURE * _get_std_s(p), _NOTED_S):
+        late_s, against_s = (float(_compute_lateness(offsets[of], p.from_middle_s)) for of in (p.late, p.against))
+        if abs(p.offset_s - late_s + against_s) > max(_SURE * _get_std_s(p), _NOTED_S):
             return False
     kinds = ([p for p in among if (p.by == YAW_RATE) == turning] for turning in (True, False))
-    return any(len(_find_connected(role, pairs)) > 2 for pairs in kinds)
+    return any(len(_find_connected(role, of_kind)) > 2 for of_kind in kinds)

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tcpipe.fusion.checks.clock_offsets import find_clock_offsets, make_pair, solve_offsets
+from tcpipe.fusion.checks.clock_offsets import find_clock_offsets, make_pair, shift_stamps, solve_offsets
 from tcpipe.fusion.checks.lags import Lag
 from tcpipe.fusion.measurements import (
     BodyVelocities,
@@ -14,6 +14,7 @@ from tcpipe.fusion.measurements import (
     Positions,
     select_measurements,
 )
+from tcpipe.tables.facts import ClockOffset
 
 
 def pair(late, against, offset_s, std_s=0.002, explained=0.9, *, by="speed"):
@@ -137,10 +138,31 @@ def drive_with_clocks(**late_s):
     return Measurements(gnss=gnss, imu=imu, wheels=wheels)
 
 
-def test_a_late_clock_is_found_in_the_half_hour_that_tells_most():
+def test_a_clock_that_drifts_is_told_from_one_that_is_off():
+    """The receiver's clock runs 150 ppm slow about a middle of +0.02 s: over half an hour 0.28 s, of which a constant shows nothing."""
+    rate = 150e-6
+    found = find_clock_offsets(drive_with_clocks(gnss=0.02 + rate * (HALF_HOUR - 950.0)), None)
+    gnss = found.offsets["gnss"]
+    assert gnss.noted
+    assert gnss.drift_ppm == pytest.approx(1e6 * rate, rel=0.1)
+    assert gnss.offset_s == pytest.approx(0.02, abs=0.01)
+    assert found.offsets["wheel_odometry"].drift_ppm == 0.0
+    assert [round(pair.offset_s, 1) for pair in found.pairs if pair.late == "gnss"] == [-0.1, 0.0, 0.1]
+
+
+def test_steady_clocks_do_not_drift_and_a_late_one_is_only_late():
     found = find_clock_offsets(drive_with_clocks(gnss=np.full(HALF_HOUR.size, 0.2)), None)
+    assert not any(offset.drift_ppm for offset in found.offsets.values())
     assert {role for role, offset in found.offsets.items() if offset.noted} == {"gnss"}
     assert found.offsets["gnss"].offset_s == pytest.approx(0.2, abs=0.01)
+
+
+def test_the_drift_of_the_reference_is_its_own():
+    """Wheels and fixes agree with each other for ever; the gyroscope's clock drifts from both."""
+    found = find_clock_offsets(drive_with_clocks(imu=200e-6 * (HALF_HOUR - 950.0)), None)
+    assert found.reference == "wheel_odometry"
+    assert {role for role, offset in found.offsets.items() if offset.drift_ppm} == {"imu"}
+    assert found.offsets["imu"].drift_ppm == pytest.approx(200.0, rel=0.05)
 
 
 def test_a_straight_tells_nothing_of_clocks():
@@ -167,6 +189,15 @@ def test_the_mean_of_a_clock_that_steps_is_not_known():
     drive = drive_with_clocks(gnss=np.where(HALF_HOUR < 200.0, 0.0, 0.3))
     found = find_clock_offsets(select_measurements(drive, 0, 400 * 10**9), None)
     assert "gnss" not in found.offsets
+
+
+def test_stamps_without_offset_and_drift():
+    """0.1 s in the middle of 100 s and 0.36 s an hour: 0.095 s at the beginning, 0.105 s at the end."""
+    stamp_ns = np.array([0, 50, 100], np.int64) * 10**9
+    steady = ClockOffset(0.1, 0.01, noted=True)
+    assert (stamp_ns - shift_stamps(stamp_ns, steady, 50 * 10**9)).tolist() == [100_000_000] * 3
+    drifting = replace(steady, drift_ppm=100.0)
+    assert (stamp_ns - shift_stamps(stamp_ns, drifting, 50 * 10**9)).tolist() == [95_000_000, 100_000_000, 105_000_000]
 
 
 def test_a_receivers_velocity_has_no_say_in_whose_clock_is_right():
