@@ -186,8 +186,9 @@ _Source = TypeVar("_Source", Positions, GroundVelocities, BodyVelocities, Inerti
 
 def select_measurements(whole: Measurements, start_ns: int, end_ns: int) -> Measurements:
     """Return the measurements between two stamps, both included; a sensor without any is None."""
-    found = {}
-    for role, source in whole.sensors().items():
+    found: dict[str, Any] = {}
+    sensors: dict[str, Any] = dict(whole.sensors())
+    for role, source in sensors.items():
         rows = slice(*np.searchsorted(source.stamp_ns, (start_ns, end_ns + 1)))
         found[role] = select_rows(source, rows) if rows.stop > rows.start else None
     return whole.replace_sensors(found)

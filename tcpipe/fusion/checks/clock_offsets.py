@@ -14,7 +14,7 @@ blamed only where two others agree against it and no pair contradicts; else two 
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import astuple, dataclass, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -131,7 +131,16 @@ def make_pair(late: str, against: str, by: str, lag: Lag, from_middle_s: float =
     """Return two sensors compared; a lag is determined where its error is small or it is surely not zero."""
     limit_s = _MAX_POWER_STD_S if late == POWER else _MAX_STD_S
     known = lag.std_s <= limit_s or (lag.std_s <= 3 * limit_s and abs(lag.offset_s) > _CLEARLY * lag.std_s)
-    return ClockPair(late, against, by, *astuple(lag), known and lag.explained >= _MIN_EXPLAINED, from_middle_s)
+    return ClockPair(
+        late,
+        against,
+        by,
+        lag.offset_s,
+        lag.std_s,
+        lag.explained,
+        known and lag.explained >= _MIN_EXPLAINED,
+        from_middle_s,
+    )
 
 
 def _iterate_signals(m: Measurements, power: PowerSignal | None, at_ns: NDArray[np.int64]) -> Iterator[Signals]:
@@ -140,8 +149,8 @@ def _iterate_signals(m: Measurements, power: PowerSignal | None, at_ns: NDArray[
     if m.imu is not None:
         yield from _compare_with_imu(m.imu, twists, at_ns)
     if len(twists) == 2:
-        seen = {role: compute_moving_mean(np.abs(twist[:, :1]), _ODOMETRY_S) for role, twist in twists.items()}
-        yield VISUAL, WHEELS, SPEED, *_select_speed_changes(seen[VISUAL], seen[WHEELS])
+        speed = {role: compute_moving_mean(np.abs(twist[:, :1]), _ODOMETRY_S) for role, twist in twists.items()}
+        yield VISUAL, WHEELS, SPEED, *_select_speed_changes(speed[VISUAL], speed[WHEELS])
     if m.gnss is not None:
         velocity = compute_fix_velocity(m.gnss, at_ns)
         for role, twist in twists.items():
@@ -155,8 +164,8 @@ def _iterate_signals(m: Measurements, power: PowerSignal | None, at_ns: NDArray[
         if m.doppler is not None:
             of_receiver = resample_signal(m.doppler.stamp_ns, m.doppler.velocity_enu_mps[:, :2], at_ns)
             own = compute_moving_mean(compute_moving_mean(of_receiver, FIXES_S), FIXES_S)
-            for axis, seen in enumerate((velocity.real, velocity.imag)):
-                yield DOPPLER, GNSS, "velocity", own[:, axis], seen[:, None]
+            yield DOPPLER, GNSS, "velocity east", own[:, 0], velocity.real[:, None]
+            yield DOPPLER, GNSS, "velocity north", own[:, 1], velocity.imag[:, None]
     if power is not None and twists:
         role, twist = next(iter(twists.items()))
         yield POWER, role, "power of speed, acceleration and turning", *_prepare_power(power, twist, at_ns)
