@@ -127,7 +127,7 @@ class InertialMeasurements:
 
 @dataclass(frozen=True, slots=True)
 class Measurements:
-    """All measurements of one section of one clock epoch without a long gap; a role that the log lacks is None.
+    """All measurements of one section of one clock epoch without a long gap; a role without measurements is None.
 
     At least one of ``gnss``, ``wheels`` and ``visual`` is there. ``nonholonomic_std_mps``: sideways and vertical body velocity are
     zero to within this. ``doppler`` goes with ``gnss``, whose antenna it is of.
@@ -153,6 +153,11 @@ class Measurements:
         """Return the odometries that are there, by role; the wheels' first."""
         every = {WHEELS: self.wheels, VISUAL: self.visual}
         return {role: odometry for role, odometry in every.items() if odometry is not None}
+
+    @property
+    def first_odometry(self) -> BodyVelocities | None:
+        """The wheels, else visual odometry."""
+        return self.wheels or self.visual
 
 
 @dataclass(frozen=True, slots=True)

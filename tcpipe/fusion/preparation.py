@@ -24,8 +24,15 @@ from tcpipe.fusion.measurements import (
     GroundVelocities,
     InertialMeasurements,
     Positions,
+    select_rows,
 )
-from tcpipe.fusion.signals import compute_median_period_ns, compute_seconds, estimate_white_noise, integrate_signal
+from tcpipe.fusion.signals import (
+    compute_median_period_ns,
+    compute_seconds,
+    compute_window_means,
+    estimate_white_noise,
+    integrate_signal,
+)
 from tcpipe.geometry.datum import enu_from_geodetic
 from tcpipe.geometry.rotation import invert, matrix_from_quat, multiply, normalize, rotate, rotation_vector_from_quat
 from tcpipe.robust import estimate_robust_std
@@ -111,7 +118,7 @@ def prepare_positions(
     """Prepare GNSS fixes (columns of the role gnss); unknown variances: ``default_std_m`` horizontally, twice that vertically."""
     lon, lat, alt = columns["lon_deg"], columns["lat_deg"], columns["alt_m"]
     usable, repeated = _select_usable_rows(stamp_ns, _is_fix(lon, lat, alt))
-    variance = np.stack([columns[f"{axis}_var_m2"] for axis in ("east", "north", "up")], -1)[usable]
+    variance = _stack_columns(columns, [f"{axis}_var_m2" for axis in ("east", "north", "up")])[usable]
     default = np.square(default_std_m * np.array([1.0, 1.0, 2.0]))
     unclaimed = np.asarray(~_is_known(variance[:, :2]).all(1))
     variance, replaced = _clean_variances(variance, default, floor_std_m**2)
@@ -137,7 +144,7 @@ def drop_repeated_fixes(gnss: Positions, odometry: BodyVelocities | None) -> tup
     lasting = stamp_ns[last] - stamp_ns[first] >= _FROZEN_NS
     if odometry is None:
         kept = changes | np.repeat(lasting, last - first + 1)
-        return (gnss if kept.all() else _select_fixes(gnss, kept)), ()
+        return (gnss if kept.all() else select_rows(gnss, kept)), ()
     zero = int(stamp_ns[0])
     speed = np.nan_to_num(np.abs(odometry.velocity_mps[:, :1]))
     driven_m = integrate_signal(compute_seconds(odometry.stamp_ns, zero), speed, compute_seconds(stamp_ns, zero))[:, 0]
@@ -145,13 +152,7 @@ def drop_repeated_fixes(gnss: Positions, odometry: BodyVelocities | None) -> tup
         lasting & (driven_m[last] - driven_m[first] > _DRIVES_MPS * (stamp_ns[last] - stamp_ns[first]) * 1e-9)
     )
     found = (Repeats(int(stamp_ns[first[i]]), int(stamp_ns[last[i]]), int(last[i] - first[i])) for i in frozen)
-    return _select_fixes(gnss, changes), tuple(found)
-
-
-def _select_fixes(gnss: Positions, rows: Mask) -> Positions:
-    unclaimed = None if gnss.unclaimed is None else gnss.unclaimed[rows]
-    fixes, variance = gnss.position_enu_m[rows], gnss.variance_m2[rows]
-    return replace(gnss, stamp_ns=gnss.stamp_ns[rows], position_enu_m=fixes, variance_m2=variance, unclaimed=unclaimed)
+    return select_rows(gnss, changes), tuple(found)
 
 
 def inflate_jittery_fixes(gnss: Positions, odometry: BodyVelocities) -> tuple[Positions, Floats]:
@@ -262,7 +263,7 @@ def prepare_body_velocities(
     shown = _estimate_shown_variance(stamp_ns[usable], turned[:, 0], variance[:, 0])
     if shown.any():
         variance = np.maximum(variance, shown[:, None])
-        turned = _compute_moving_mean(stamp_ns[usable], turned)
+        turned = compute_window_means(stamp_ns[usable], turned, stamp_ns[usable], round(1e9 * _MEAN_S))
         findings.append(make_finding("velocity-scatters", subject, mean_s=_MEAN_S))
     if only_forward:
         turned[:, 1:] = np.nan
@@ -292,15 +293,6 @@ def _estimate_shown_variance(stamp_ns: Ints, values: Floats, variance: Floats) -
     if noise > _SCATTERS_MORE * float(np.sqrt(np.median(variance[known]))):
         shown[known] = np.square(_estimate_local_noise(stamp_ns[known], values[known, None]))
     return shown
-
-
-def _compute_moving_mean(stamp_ns: Ints, values: Floats) -> Floats:
-    """Return the mean of the samples (N, k) from a quarter of a second before each to a quarter after."""
-    half_ns = round(_MEAN_S * 0.5e9)
-    first = np.searchsorted(stamp_ns, stamp_ns - half_ns, "left")
-    last = np.searchsorted(stamp_ns, stamp_ns + half_ns, "right")
-    total = np.concatenate((np.zeros((1, values.shape[1])), np.cumsum(values, axis=0)))
-    return np.asarray((total[last] - total[first]) / (last - first)[:, None])
 
 
 def _rotate_vectors(matrix: Floats, values: Floats) -> Floats:
@@ -434,18 +426,6 @@ def _clean_variances(variance: Floats, default: Floats, floor: float) -> tuple[F
     return filled, int((~known).any(1).sum())
 
 
-__all__ = [
-    "Columns",
-    "Prepared",
-    "drop_repeated_fixes",
-    "find_datum",
-    "prepare_body_velocities",
-    "prepare_ground_velocities",
-    "prepare_imu",
-    "prepare_positions",
-]
-
-
 _MAX_INCREMENT_S = 1.0  # longer increments give no velocity
 _MOVED_M = 0.1  # smaller moves may be stationary
 _FEWEST = 20  # increments that identify the twist's axes
@@ -464,22 +444,21 @@ def has_twist(velocity_mps: Floats, pose_m: Floats) -> bool:
     return bool(np.nansum(np.abs(velocity_mps[known])) > 0) or not moves
 
 
-def compute_increments(
-    stamp_ns: NDArray[np.int64], pose_m: Floats, quat_xyzw: Floats
-) -> tuple[NDArray[np.int64], Floats, Floats]:
+def compute_increments(stamp_ns: Ints, pose_m: Floats, quat_xyzw: Floats) -> tuple[Ints, Floats, Floats]:
     """Return stamps, velocity and angular velocity in the child frame, in the middle of each two successive poses."""
-    stamp, position, quat = _select_posed_rows(stamp_ns, pose_m, quat_xyzw)
+    rows, _ = _select_usable_rows(stamp_ns, np.isfinite(pose_m).all(1) & np.isfinite(quat_xyzw).all(1))
+    stamp, position, quat = stamp_ns[rows], pose_m[rows], quat_xyzw[rows]
     step_ns = np.diff(stamp)
     step_s = np.asarray(step_ns, np.float64)[:, None] * 1e-9
     turn = rotation_vector_from_quat(multiply(invert(quat[:-1]), quat[1:]))
-    velocity = rotate(invert(_interpolate_half_way(quat[:-1], quat[1:])), np.diff(position, axis=0)) / step_s
+    # Half-way between two: the normalized sum of the quaternions of one hemisphere.
+    sign = np.where(np.sum(quat[:-1] * quat[1:], axis=-1, keepdims=True) < 0, -1.0, 1.0)
+    velocity = rotate(invert(normalize(quat[:-1] + sign * quat[1:])), np.diff(position, axis=0)) / step_s
     near = step_s[:, 0] <= _MAX_INCREMENT_S
     return stamp[:-1][near] + step_ns[near] // 2, velocity[near], (turn / step_s)[near]
 
 
-def compute_orientation_rates(
-    stamp_ns: NDArray[np.int64], rate_radps: Floats, quat_xyzw: Floats
-) -> tuple[Floats, NDArray[np.bool_]]:
+def compute_orientation_rates(stamp_ns: Ints, rate_radps: Floats, quat_xyzw: Floats) -> tuple[Floats, Mask]:
     """Return angular velocities, shape (N, 3), and which axes of them are by the orientation, shape (3,).
 
     Those are the axes about which it turns while ``rate_radps``, in the child frame, is missing or zero throughout. ``stamp_ns`` does not
@@ -502,7 +481,7 @@ def compute_orientation_rates(
     return rates, turns
 
 
-def is_along_pose_axes(stamp_ns: NDArray[np.int64], velocity_mps: Floats, pose_m: Floats, quat_xyzw: Floats) -> bool:
+def is_along_pose_axes(stamp_ns: Ints, velocity_mps: Floats, pose_m: Floats, quat_xyzw: Floats) -> bool:
     """Return whether velocities are surely along the axes of the pose's frame: its increments fit them so, and not turned by the pose.
 
     Velocities [m/s] have shape (N, 3), NaN where an axis is not measured.
@@ -528,24 +507,8 @@ def rotate_to_child_axes(velocity_mps: Floats, quat_xyzw: Floats) -> Floats:
     return np.where(np.isfinite(quat_xyzw).all(1, keepdims=True), turned, np.nan)
 
 
-def _compute_misfit(said: Floats, way: Floats, moving: NDArray[np.bool_]) -> float:
+def _compute_misfit(said: Floats, way: Floats, moving: Mask) -> float:
     """Return the share of the squares of a way that a velocity, whatever its scale, leaves unexplained (medians: poses may jump)."""
     size = np.linalg.norm(way[moving], axis=1)
     scale = np.median(np.linalg.norm(said[moving], axis=1) / size)
     return float(np.median(np.sum((said[moving] - scale * way[moving]) ** 2, axis=1) / (scale * size) ** 2))
-
-
-def _select_posed_rows(
-    stamp_ns: NDArray[np.int64], pose_m: Floats, quat_xyzw: Floats
-) -> tuple[NDArray[np.int64], Floats, Floats]:
-    """Return the rows with a pose, in order of time, one a stamp."""
-    posed = np.flatnonzero(np.isfinite(pose_m).all(1) & np.isfinite(quat_xyzw).all(1))
-    _, first = np.unique(stamp_ns[posed], return_index=True)
-    rows = posed[first]
-    return stamp_ns[rows], pose_m[rows], quat_xyzw[rows]
-
-
-def _interpolate_half_way(a: Floats, b: Floats) -> Floats:
-    """Rotation half-way between two: the normalised sum of the quaternions of one hemisphere."""
-    sign = np.where(np.sum(a * b, axis=-1, keepdims=True) < 0, -1.0, 1.0)
-    return normalize(a + sign * b)
