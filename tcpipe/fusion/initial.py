@@ -301,7 +301,7 @@ def _is_steady(at_ns: Ints, stamp_ns: Ints, values: Floats, largest: float, spre
     """Return whether mean and standard deviation of samples (N, k) around each stamp are small."""
     mean, square = (compute_window_means(stamp_ns, each, at_ns, _WINDOW_NS) for each in (values, values**2))
     small: NDArray[np.bool_] = (np.abs(mean) < largest) & (np.sqrt(np.maximum(square - mean**2, 0.0)) < spread)
-    return small.all(1)
+    return np.asarray(small.all(axis=1))
 
 
 def _find_intervals(stamp_ns: Ints, still: NDArray[np.bool_]) -> Ints:

@@ -125,6 +125,9 @@ class InertialMeasurements:
     accelerometer_noise_mps2: NDArray[np.float64] | None = None
 
 
+Sensor = Positions | GroundVelocities | InertialMeasurements | BodyVelocities
+
+
 @dataclass(frozen=True, slots=True)
 class Measurements:
     """All measurements of one section of one clock epoch without a long gap; a role without measurements is None.
@@ -140,14 +143,15 @@ class Measurements:
     nonholonomic_std_mps: float = 0.15
     doppler: GroundVelocities | None = None
 
-    def sensors(self) -> dict[str, Positions | GroundVelocities | InertialMeasurements | BodyVelocities]:
+    def sensors(self) -> dict[str, Sensor]:
         """Return the sensors that are there, by role."""
         every = {role: getattr(self, name) for role, name in _FIELDS.items()}
         return {role: sensor for role, sensor in every.items() if sensor is not None}
 
-    def replace_sensors(self, changed: Mapping[str, Any]) -> Measurements:
+    def replace_sensors(self, changed: Mapping[str, Sensor | None]) -> Measurements:
         """Return the measurements with other sensors, by role; None takes one out."""
-        return replace(self, **{_FIELDS[role]: sensor for role, sensor in changed.items()})
+        named: dict[str, Any] = {_FIELDS[role]: sensor for role, sensor in changed.items()}
+        return replace(self, **named)
 
     def odometries(self) -> dict[str, BodyVelocities]:
         """Return the odometries that are there, by role; the wheels' first."""
@@ -186,14 +190,13 @@ class InitialState:
     heading_from: str = "unknown"
 
 
-_Source = TypeVar("_Source", Positions, GroundVelocities, BodyVelocities, InertialMeasurements)
+_Source = TypeVar("_Source", bound=Sensor)
 
 
 def select_measurements(whole: Measurements, start_ns: int, end_ns: int) -> Measurements:
     """Return the measurements between two stamps, both included; a sensor without any is None."""
-    found: dict[str, Any] = {}
-    sensors: dict[str, Any] = dict(whole.sensors())
-    for role, source in sensors.items():
+    found: dict[str, Sensor | None] = {}
+    for role, source in whole.sensors().items():
         rows = slice(*np.searchsorted(source.stamp_ns, (start_ns, end_ns + 1)))
         found[role] = select_rows(source, rows) if rows.stop > rows.start else None
     return whole.replace_sensors(found)

@@ -446,7 +446,8 @@ def has_twist(velocity_mps: Floats, pose_m: Floats) -> bool:
 
 def compute_increments(stamp_ns: Ints, pose_m: Floats, quat_xyzw: Floats) -> tuple[Ints, Floats, Floats]:
     """Return stamps, velocity and angular velocity in the child frame, in the middle of each two successive poses."""
-    rows, _ = _select_usable_rows(stamp_ns, np.isfinite(pose_m).all(1) & np.isfinite(quat_xyzw).all(1))
+    posed = np.isfinite(np.hstack((pose_m, quat_xyzw))).all(axis=1)
+    rows, _ = _select_usable_rows(stamp_ns, np.asarray(posed))
     stamp, position, quat = stamp_ns[rows], pose_m[rows], quat_xyzw[rows]
     step_ns = np.diff(stamp)
     step_s = np.asarray(step_ns, np.float64)[:, None] * 1e-9

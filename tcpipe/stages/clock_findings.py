@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -64,17 +63,18 @@ def _find_offset(found: ClockFacts, role: str, offset: ClockOffset, streams: Str
     name = find_recipe_role(role, streams)
     compared = dict.fromkeys(p.by for p in found.pairs if p.determined and role in {p.late, p.against})
     subject, names = Subject("role", name), {"reference": found.reference, "by": ", ".join(compared)}
-    numbers: dict[str, Any] = {"offset_s": offset.offset_s, "offset_2std_s": 2 * offset.std_s}
-    drift: dict[str, Any] = {"drift_s": 1e-6 * offset.drift_ppm * span_s} if offset.drift_ppm else {}
+    offset_s, offset_2std_s, drift_s = offset.offset_s, 2 * offset.std_s, 1e-6 * offset.drift_ppm * span_s
     if not offset.blamed:
-        return make_finding("clocks-differ", subject, names=names, **numbers, **drift)
+        return make_finding(
+            "clocks-differ", subject, names=names, offset_s=offset_s, offset_2std_s=offset_2std_s, drift_s=drift_s
+        )
     action: Action = "kept" if role == POWER else "corrected"
-    if drift:
+    if offset.drift_ppm:
         by_log = streams.sensors[role].time_source == "log"
         remedies = () if by_log else suggest("use_log_time", {"read.time_source": {name: "log"}})
-        return make_finding("clock-drift", subject, action=action, names=names, remedies=remedies, **drift)
+        return make_finding("clock-drift", subject, action=action, names=names, remedies=remedies, drift_s=drift_s)
     given_s = streams.report.facts.time_offset_s.get(name, 0.0)
-    correction_s = round(given_s - offset.offset_s, 3 if offset.std_s < _FINE_S else 2)
+    correction_s = round(given_s - offset_s, 3 if offset.std_s < _FINE_S else 2)
     return make_finding(
         "time-offset",
         subject,
@@ -82,7 +82,8 @@ def _find_offset(found: ClockFacts, role: str, offset: ClockOffset, streams: Str
         action=action,
         names=names,
         remedies=suggest("correct", {"read.time_offset_s": {name: correction_s}}),
-        **numbers,
+        offset_s=offset_s,
+        offset_2std_s=offset_2std_s,
     )
 
 

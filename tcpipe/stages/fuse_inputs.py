@@ -107,11 +107,8 @@ def _find_frozen(repeats: preparation.Repeats, streams: Streams) -> Finding:
 def _find_jitter(jitter_s: NDArray[np.float64]) -> Iterator[Finding]:
     jumpy = jitter_s > 0
     if jumpy.any():
-        numbers: dict[str, Any] = {
-            "jitter_fraction": float(jumpy.mean()),
-            "jitter_s": float(np.median(jitter_s[jumpy])),
-        }
-        yield make_finding("stamp-jitter", Subject("role", GNSS), **numbers)
+        share, median_s = float(jumpy.mean()), float(np.median(jitter_s[jumpy]))
+        yield make_finding("stamp-jitter", Subject("role", GNSS), jitter_fraction=share, jitter_s=median_s)
 
 
 def _find_first_ns(streams: Streams) -> int:
