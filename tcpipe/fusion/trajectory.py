@@ -13,7 +13,7 @@ Both estimators are called alike::
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -95,15 +95,18 @@ class TrackSection:
     measurements: Measurements
 
 
-def cut_sections(measurements: Mapping[int, Measurements]) -> list[TrackSection]:
-    """Return the sections between pauses of measurements given by clock epoch, in order; those without motion are left out."""
+def cut_sections(measurements: Mapping[int, Measurements], cuts_ns: Sequence[int] = ()) -> list[TrackSection]:
+    """Return the sections of measurements given by clock epoch, in order of epoch and time; those without motion are left out.
+
+    A section ends at a pause, and before each of the stamps ``cuts_ns`` of a measurement.
+    """
     found = []
     for epoch in sorted(measurements):
         whole = measurements[epoch]
         stamp = _make_stamps(whole, with_imu=True)
         if stamp.size == 0:
             continue
-        pause = np.flatnonzero(np.diff(stamp) > _PAUSE_NS)
+        pause = np.flatnonzero((np.diff(stamp) > _PAUSE_NS) | np.isin(stamp[1:], cuts_ns))
         first = stamp[np.concatenate(([0], pause + 1))]
         last = stamp[np.concatenate((pause, [stamp.size - 1]))]
         for start, end in zip(first.tolist(), last.tolist(), strict=True):

@@ -41,10 +41,7 @@ def correct_clocks(
     found = replace(found, offsets={role: offset for role, offset in found.offsets.items() if role not in unsteady})
     middle_ns, span_s = find_middle_ns(inputs.measurements[epoch])
     off = {role: offset for role, offset in found.offsets.items() if offset.noted}
-    findings = (
-        *(_find_offset(found, role, offset, streams, span_s) for role, offset in off.items()),
-        *find_clock_jumps(inputs),
-    )
+    findings = [_find_offset(found, role, offset, streams, span_s) for role, offset in off.items()]
     aligned = {
         number: m.replace_sensors(
             {
@@ -55,7 +52,9 @@ def correct_clocks(
         )
         for number, m in inputs.measurements.items()
     }
-    return replace(inputs, measurements=aligned), StageReport(findings, found)
+    inputs = replace(inputs, measurements=aligned)
+    jumps = dict(find_clock_jumps(inputs))
+    return replace(inputs, cuts_ns=tuple(jumps)), StageReport((*findings, *jumps.values()), found)
 
 
 def _find_offset(found: ClockFacts, role: str, offset: ClockOffset, streams: Streams, span_s: float) -> Finding:
@@ -87,28 +86,26 @@ def _find_offset(found: ClockFacts, role: str, offset: ClockOffset, streams: Str
     )
 
 
-def find_clock_jumps(inputs: FusionInputs) -> Iterator[Finding]:
-    """Yield where the clock of all sensors was set forward: a gap in which, by the fixes, a robot that drives does not move."""
-    stamps = [
-        np.unique(np.concatenate([of.stamp_ns for of in m.sensors().values()])) for m in inputs.measurements.values()
-    ]
-    for m, stamp_ns in zip(inputs.measurements.values(), stamps, strict=True):
-        if m.gnss is None or not m.odometries():
+def find_clock_jumps(inputs: FusionInputs) -> Iterator[tuple[int, Finding]]:
+    """Yield the first stamps [ns] after the clock of all sensors was set forward, and the findings.
+
+    Nothing is measured before them, and by the fixes the robot, which drives before and after, does not drive meanwhile.
+    """
+    sets = list(inputs.measurements.values())
+    stamps = [np.unique(np.concatenate([sensor.stamp_ns for sensor in m.sensors().values()])) for m in sets]
+    for m, stamp_ns in zip(sets, stamps, strict=True):
+        odometry = m.first_odometry
+        if m.gnss is None or odometry is None:
             continue
-        odometry = next(iter(m.odometries().values()))
-        gaps = np.flatnonzero(np.diff(stamp_ns) > _JUMP_NS)
-        ends_ns = stamp_ns[[gaps, gaps + 1]]
-        slowest_mps = np.abs(np.interp(ends_ns, odometry.stamp_ns, odometry.velocity_mps[:, 0])).min(0)
-        moved_m = np.hypot(
-            *(np.diff(np.interp(ends_ns, m.gnss.stamp_ns, axis), axis=0)[0] for axis in m.gnss.position_enu_m[:, :2].T)
-        )
-        step_s = np.diff(ends_ns, axis=0)[0] * 1e-9
-        for gap in np.flatnonzero((slowest_mps > _DRIVES_MPS) & (moved_m < 0.5 * slowest_mps * step_s)):
-            at_s = float(ends_ns[1, gap] - min(each[0] for each in stamps)) * 1e-9
-            names = {"topics": "all topics"}
-            yield make_finding(
-                "clock-step", LOG_CLOCK, span_s=(at_s, at_s), names=names, step_s=float(step_s[gap]), at_s=at_s
-            )
+        for ends_ns in np.stack((stamp_ns[:-1], stamp_ns[1:]), -1)[np.diff(stamp_ns) > _JUMP_NS]:
+            step_s, at_s = float(np.diff(ends_ns)[0]) * 1e-9, float(ends_ns[1] - min(of[0] for of in stamps)) * 1e-9
+            driven = np.interp(ends_ns, odometry.stamp_ns, odometry.velocity_mps[:, 0])
+            moved_m = [np.diff(np.interp(ends_ns, m.gnss.stamp_ns, axis)) for axis in m.gnss.position_enu_m[:, :2].T]
+            slowest_mps = float(np.abs(driven).min())
+            if slowest_mps > _DRIVES_MPS and np.linalg.norm(moved_m) < 0.5 * slowest_mps * step_s:
+                span_s, names = (at_s, at_s), {"topics": "all topics"}
+                finding = make_finding("clock-step", LOG_CLOCK, span_s=span_s, names=names, step_s=step_s, at_s=at_s)
+                yield int(ends_ns[1]), finding
 
 
 def _make_power_signal(streams: Streams, epoch: int) -> PowerSignal | None:

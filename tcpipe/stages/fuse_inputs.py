@@ -52,6 +52,8 @@ class FusionInputs:
     excluded: frozenset[str] = frozenset()
     scales: Mapping[str, Scale] = field(default_factory=dict)
     """By odometry, the scale that was taken out."""
+    cuts_ns: tuple[int, ...] = ()
+    """First stamps after the clock of all sensors was set forward."""
 
     def note(self, role: str, prepared: Prepared) -> None:
         """Remember what was set aside."""

@@ -46,7 +46,7 @@ def fuse_sections(inputs: FusionInputs, streams: Streams, config: FuseConfig) ->
     """Fuse each section for itself, in order of epoch and stamp."""
     fused = Fused()
     period_ns, max_gap_ns = round(1e9 / config.rate_hz), int(config.max_gap_s * 1e9)
-    for section in cut_sections(inputs.measurements):
+    for section in cut_sections(inputs.measurements, inputs.cuts_ns):
         output_ns = make_track_stamps(section, period_ns=period_ns, max_gap_ns=max_gap_ns)
         if output_ns.size == 0 or (inputs.datum_deg_m is not None and section.measurements.gnss is None):
             fused.skipped_s += (section.end_ns - section.start_ns) * 1e-9

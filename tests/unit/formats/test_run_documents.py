@@ -19,6 +19,7 @@ SINCE = dict.fromkeys(("weight_over_efficiency_newton", "rolling_resistance", "g
     "blamed": True,
     "from_middle_s": 0.0,
     "drift_ppm": 0.0,
+    "covariance_repairs": 0,
     "sha256_of": "log",
     "gnss_velocity_std_mps": 0.1,
     "streams": {},

@@ -103,8 +103,8 @@ def driving(gap_s, *, moves):
 
 
 def test_a_gap_of_all_sensors_in_which_the_robot_did_not_drive_is_a_step_of_their_clock():
-    (finding,) = find_clock_jumps(driving(3.0, moves=False))
-    assert finding.code == "clock-step"
+    ((after_ns, finding),) = find_clock_jumps(driving(3.0, moves=False))
+    assert (after_ns, finding.code) == (13 * 10**9, "clock-step")
     assert (finding.numbers["at_s"], finding.numbers["step_s"]) == pytest.approx((13.0, 3.1))
     assert not list(find_clock_jumps(driving(3.0, moves=True)))
     assert not list(find_clock_jumps(driving(0.2, moves=False)))
