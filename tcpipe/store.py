@@ -31,8 +31,7 @@ from pathlib import Path, PurePosixPath
 import pyarrow as pa
 
 from tcpipe.errors import StoreError, TableError, UsageError
-from tcpipe.formats.atomic import check_local_output, clear_scratch
-from tcpipe.formats.bucket import open_place
+from tcpipe.formats.atomic import check_local_output
 from tcpipe.formats.bucket_directories import FetchedShards, fetch_files
 from tcpipe.formats.commit_log import Stamp, pause_garbage_collection, put_commit, read_state
 from tcpipe.formats.commits import Entries, Kind, State
@@ -41,7 +40,7 @@ from tcpipe.formats.integrity import CHECKSUMS, Checksum, compute_checksums, sea
 from tcpipe.formats.json_files import parse_typed, parse_typed_json, to_compact_json, to_json, to_plain
 from tcpipe.formats.object_storage import is_bucket, is_url
 from tcpipe.formats.parquet import add_segments_metadata, read_table
-from tcpipe.formats.place import DirectoryPlace, Place
+from tcpipe.formats.place import Place, open_place
 from tcpipe.formats.run_documents import (
     MARK,
     Manifest,
@@ -480,10 +479,7 @@ def open_store(root: str | Path, *, create: bool = False) -> Store:
         raise StoreError(f"{root}: is of data model {version}, this version knows {', '.join(READ_VERSIONS)}")
     if create:
         mark_store(store.place, found=found)
-        if isinstance(place := store.place, DirectoryPlace):  # what killed commands left
-            place.clear()
-        else:
-            clear_scratch()
+        store.place.clear()
     return store
 
 

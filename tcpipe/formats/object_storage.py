@@ -489,8 +489,13 @@ def _iterate_objects(store: ObjectStore, url: str, query: str, wanted: Callable[
 
 def _make_stored_object(url: str, query: str, name: str, meta: ObjectMeta) -> StoredObject:
     path, tag = str(meta["path"]), meta.get("e_tag")
-    modified_ns = round(meta["last_modified"].timestamp() * 1e6) * 1000
-    return StoredObject(url.rstrip("/") + path.removeprefix(name), query, path, int(meta["size"]), modified_ns, tag)
+    url = url.rstrip("/") + path.removeprefix(name)
+    return StoredObject(url, query, path, int(meta["size"]), read_modified_ns(meta), tag)
+
+
+def read_modified_ns(meta: ObjectMeta) -> int:
+    """Return when an object was written [ns since 1970]; stores tell microseconds at most."""
+    return round(meta["last_modified"].timestamp() * 1e6) * 1000
 
 
 def _place(object_name: str, directory: Path) -> Path:

@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from tcpipe.errors import StoreError, TcpipeError, UsageError, clean_lines
-from tcpipe.formats.bucket import open_place
 from tcpipe.formats.bucket_directories import find_newest
 from tcpipe.formats.commit_log import LOG
 from tcpipe.formats.commits import CallRecord, Dataset, Entries, Failure, LogSnapshot, Problem, State, Superseded
@@ -24,7 +23,7 @@ from tcpipe.formats.integrity import seal_document
 from tcpipe.formats.json_files import Json, parse_typed, to_json, to_plain
 from tcpipe.formats.maps.map_files import open_map
 from tcpipe.formats.object_storage import is_url
-from tcpipe.formats.place import Place
+from tcpipe.formats.place import Place, open_place
 from tcpipe.formats.recipe_toml import rename_earlier_keys
 from tcpipe.formats.run_documents import (
     MARK,

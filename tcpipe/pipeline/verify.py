@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from tcpipe.cost.labels import pool_budgets
 from tcpipe.errors import DatasetError, TcpipeError, UsageError, clean_lines
 from tcpipe.formats.atomic import find_leftovers
-from tcpipe.formats.bucket import open_place
 from tcpipe.formats.bucket_directories import REPORT_PATCHES, fetch_unproved, find_unlisted_files
 from tcpipe.formats.commit_log import LOG
 from tcpipe.formats.dataset_card import DatasetCard
@@ -38,6 +37,7 @@ from tcpipe.formats.integrity import Checksum, Checksums, find_broken_checksums,
 from tcpipe.formats.json_files import to_plain
 from tcpipe.formats.object_storage import is_bucket, is_url
 from tcpipe.formats.parquet import read_table
+from tcpipe.formats.place import open_place
 from tcpipe.formats.recipe_toml import make_recipe_id
 from tcpipe.motion.distance_breakdown import KEPT
 from tcpipe.pipeline.dataset.card import CARD_COLUMNS, measure_samples

@@ -31,7 +31,7 @@ from tcpipe.formats.integrity import (
 from tcpipe.formats.json_files import parse_typed
 from tcpipe.formats.maps.map_files import MapFile, open_map
 from tcpipe.formats.parquet import read_table
-from tcpipe.formats.place import DirectoryPlace, Place
+from tcpipe.formats.place import Place
 from tcpipe.formats.recipe_toml import ingest_key, make_recipe_id
 from tcpipe.formats.run_documents import (
     MARK,
@@ -78,8 +78,7 @@ def verify_store(store: Store) -> Iterator[CheckResult]:
     yield from verify_log(place.below(LOG))
     yield from _verify_maps(store)
     yield from _verify_runs(store)
-    if isinstance(place, DirectoryPlace):
-        yield from _find_left_behind(place.root)
+    yield from _find_left_behind(place.path) if place.path else ()
 
 
 def verify_log(log: Place) -> Iterator[CheckResult]:
@@ -253,7 +252,7 @@ def _verify_listed(directory: Path) -> Any:
         return None
     yield from find_broken_checksums(directory, checksums)
     yield "files", len(checksums) + 1
-    place = DirectoryPlace(directory)
+    place = Place(directory)
     for entry in place.entries():
         if entry.name not in {*checksums, CHECKSUMS}:
             yield _describe_stranger(place, entry.name)
