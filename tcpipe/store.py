@@ -466,14 +466,14 @@ def open_store(root: str | Path, *, create: bool = False) -> Store:
         raise UsageError(f"{root}: no place for a store; expected a directory, s3://bucket/name, gs:// or az://")
     root = str(root).rstrip("/") if is_url(root) else check_local_output(root)
     store = Store(root)
-    if isinstance(root, Path):
-        _refuse_file(root, create=create)
-    else:
+    if store.place.path is None:
         store.place.check()
+    elif store.place.path.is_file():
+        raise UsageError(f"{root}: is a file, expected a directory for the store")
     version = read_layout(store.place)
     _refuse_earlier(store.place, version)
     found = version is not None or is_store(root)
-    if not found and not create and not isinstance(root, Path):
+    if not found and not create and not (store.place.path and store.place.path.exists()):
         raise UsageError(f"{root}: there is no store here; run 'tcpipe ingest' first, or name another with --store")
     if version not in (None, *READ_VERSIONS):
         raise StoreError(f"{root}: is of data model {version}, this version knows {', '.join(READ_VERSIONS)}")
@@ -481,10 +481,3 @@ def open_store(root: str | Path, *, create: bool = False) -> Store:
         mark_store(store.place, found=found)
         store.place.clear()
     return store
-
-
-def _refuse_file(path: Path, *, create: bool) -> None:
-    if path.exists() and not path.is_dir():
-        raise UsageError(f"{path}: is a file, expected a directory for the store")
-    if not path.exists() and not create:
-        raise UsageError(f"{path}: there is no store here; run 'tcpipe ingest' first, or name another with --store")

@@ -28,10 +28,10 @@ from tcpipe.formats.atomic import make_lasting_scratch, make_scratch_directory
 from tcpipe.formats.cache import fetch_cached, is_cached
 from tcpipe.formats.commit_log import LOG, read_newest_commit, read_state
 from tcpipe.formats.commits import State
-from tcpipe.formats.integrity import Checksum, Checksums, find_broken_checksums
+from tcpipe.formats.integrity import Checksum, Checksums
 from tcpipe.formats.json_files import parse_json, parse_typed
 from tcpipe.formats.object_storage import is_bucket, is_url
-from tcpipe.formats.place import Place, find_wrong_files, open_place
+from tcpipe.formats.place import Place, find_changed_files, find_wrong_files, open_place
 
 CARDS = ("dataset.json", "model.json", "cost-map.json")
 """Documents that prove all files beside them."""
@@ -92,7 +92,7 @@ class FetchedShards:
         """Raise `StoreError` where a shard is not what its card says."""
         if not self.proves or names <= self._proved:
             return
-        if wrong := find_wrong_files(self.place, self.checksums, sorted(names - self._proved)):
+        if wrong := find_changed_files(self.place, self.checksums, sorted(names - self._proved)):
             raise StoreError(*wrong)
         self._proved.update(names)
 
@@ -290,7 +290,7 @@ def _fetch_one(place: Place, name: str, checksum: Checksum, to: Path) -> None:
                 os.link(held, to)
             except OSError:
                 shutil.copyfile(held, to)
-        if not list(find_broken_checksums(to.parent, {to.name: checksum})):
+        if not list(find_wrong_files(Place(to.parent), {to.name: checksum})):
             return
         held.unlink(missing_ok=True)
         to.unlink()

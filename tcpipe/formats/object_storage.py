@@ -97,6 +97,8 @@ class StoredObject:
     """An object: its name in the store, size [byte] and modification time [ns], and the tag that its content has."""
 
     url: str
+    bucket: str
+    """Or directory or server."""
     query: str
     """Of a presigned URL."""
     name: str
@@ -140,7 +142,7 @@ class StoredObject:
                 raise OSError(f"the store gives {len(data)} bytes for those from {span[0]} to {span[1]}")
             return data
 
-        return ask_store(self.url, get, LogError, query=self.query)
+        return ask_store(self.url, get, LogError, bucket=self.bucket, query=self.query)
 
 
 def is_url(text: str | Path) -> bool:
@@ -285,6 +287,7 @@ def ask_store(
     error: type[TcpipeError] = StoreError,
     *,
     what: str = "read",
+    bucket: str = "",
     query: str = "",
 ) -> T:
     """Return what a request gives to which an object is ``read`` or ``written``; while there is no answer it is made again.
@@ -295,7 +298,7 @@ def ask_store(
     """
     from obstore.exceptions import AlreadyExistsError, BaseError  # noqa: PLC0415
 
-    bucket, began, pauses = split_bucket(url)[0], time.monotonic(), chain(_PAUSES_S, repeat(_PAUSES_S[-1]))
+    bucket, began, pauses = bucket or split_bucket(url)[0], time.monotonic(), chain(_PAUSES_S, repeat(_PAUSES_S[-1]))
     settings = tuple(sorted((key, value) for key, value in os.environ.items() if key.upper().startswith(_SETTINGS)))
     patience = _patience[bucket, query, settings]
     while True:
@@ -489,8 +492,8 @@ def _iterate_objects(store: ObjectStore, url: str, query: str, wanted: Callable[
 
 def _make_stored_object(url: str, query: str, name: str, meta: ObjectMeta) -> StoredObject:
     path, tag = str(meta["path"]), meta.get("e_tag")
-    url = url.rstrip("/") + path.removeprefix(name)
-    return StoredObject(url, query, path, int(meta["size"]), read_modified_ns(meta), tag)
+    bucket, url = split_bucket(url)[0], url.rstrip("/") + path.removeprefix(name)
+    return StoredObject(url, bucket, query, path, int(meta["size"]), read_modified_ns(meta), tag)
 
 
 def read_modified_ns(meta: ObjectMeta) -> int:

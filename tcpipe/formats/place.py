@@ -32,7 +32,7 @@ from tcpipe.formats.atomic import (
     put_file,
 )
 from tcpipe.formats.cache import fetch_cached
-from tcpipe.formats.integrity import Checksum, find_wrong_checksum
+from tcpipe.formats.integrity import ALL_CHANGES, Checksum, find_wrong_checksum
 from tcpipe.formats.object_storage import ask_store, is_url, read_modified_ns, run_side_by_side, split_bucket, split_url
 
 if TYPE_CHECKING:
@@ -307,16 +307,30 @@ def _walk_files(directory: Path, prefix: str, but: str) -> list[Entry]:
     return found
 
 
-def find_wrong_files(place: Place, checksums: Mapping[str, Checksum], names: Iterable[str]) -> list[str]:
-    """Return a line for each file at a place that is not what a card has of it; all sizes are compared before a file is read.
+def find_wrong_files(place: Place, checksums: Mapping[str, Checksum | None]) -> Iterator[str]:
+    """Yield a line for every file at a place that is not what ``checksums`` has of it (None: nothing), each read where it lies."""
+    for name, wanted in checksums.items():
+        try:
+            line = _check_size(place, name, wanted)
+            line = line or find_wrong_checksum(place.where(name), place.checksum(name), wanted)
+        except StoreError as error:
+            line = error.problems[0]
+        if line:
+            yield line
+
+
+def prove_files(directory: Path, checksums: Mapping[str, Checksum], names: Iterable[str]) -> None:
+    """Compare files of a directory with what a sealed document has of them; `StoreError` names the first that differs."""
+    lines = list(find_wrong_files(Place(directory), {name: checksums.get(name) for name in names}))
+    if lines:
+        more = f", and {len(lines) - 1} more" if len(lines) > 1 else ""
+        raise StoreError(f"{lines[0]}{more}{ALL_CHANGES.format(directory)}")
+
+
+def find_changed_files(place: Place, checksums: Mapping[str, Checksum], names: Iterable[str]) -> list[str]:
+    """Return a line for each of some files that is not what a card has of it; all sizes are compared before a file is read.
 
     The digest of a file is kept in the cache under its `Place.version`: it is hashed again only after it has changed.
-
-    Parameters
-    ----------
-    place : where the files lie.
-    checksums : what the card has of them, by name.
-    names : which of them.
     """
     names = list(names)
     sizes = [line for name in names if (line := _check_size(place, name, checksums.get(name)))]
@@ -330,7 +344,7 @@ def _check_size(place: Place, name: str, wanted: Checksum | None) -> str | None:
     size, where = place.size(name), place.where(name)
     if size is None or wanted is None:
         return find_wrong_checksum(where, None if size is None else Checksum(size, ""), wanted)
-    return None if size == wanted.size_bytes else f"{where}: {size} bytes, expected {wanted.size_bytes}"
+    return None if size == wanted.size_bytes else f"{where}: has {size} bytes, expected {wanted.size_bytes}"
 
 
 def _check_digest(place: Place, name: str, wanted: Checksum) -> str | None:
