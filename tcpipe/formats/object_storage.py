@@ -9,7 +9,6 @@ import logging
 import math
 import multiprocessing
 import os
-import random
 import re
 import threading
 import time
@@ -309,7 +308,7 @@ def ask_store(
             result = request(store)
         except (BaseError, OSError, ValueError) as found:
             if store is not None and _is_unanswered(found):
-                now, pause = time.monotonic(), next(pauses) * random.uniform(0.5, 1.0)  # noqa: S311
+                now, pause = time.monotonic(), next(pauses)
                 if now - began + pause + (0.0 if patience.is_long else now - asked) < patience.limit_s:
                     _tell_no_answer(bucket, patience, found, waited_s=now - began)
                     _wait(pause)
