@@ -16,7 +16,6 @@ from tcpipe.stages.fuse_inputs import (
     FusionInputs,
     exclude_role,
     find_longest_epoch,
-    find_recipe_role,
     read_command,
     state_extrinsics,
 )
@@ -35,7 +34,8 @@ from tcpipe.tables.facts import (
 from tcpipe.tables.findings import Finding, StageReport, Subject, make_finding, read_threshold
 from tcpipe.tables.levels import Sensor, Streams
 
-_COURSE = "course over ground"
+_SURE = ("course over ground", "pose")
+"""What the yaw at the start may be from."""
 
 
 def make_fuse_facts(
@@ -61,20 +61,18 @@ def make_fuse_facts(
     )
 
 
-def find_fuse_findings(
-    inputs: FusionInputs, facts: FuseFacts, *, run: Subject, fixes: str = GNSS
-) -> tuple[Finding, ...]:
-    """Return what was observed while fusing; ``fixes`` is the recipe's role of the positions."""
-    gnss, first_ns = Subject("role", fixes), min((section.start_ns for section in facts.stretches), default=0)
+def find_fuse_findings(inputs: FusionInputs, facts: FuseFacts, *, run: Subject) -> tuple[Finding, ...]:
+    """Return what was observed while fusing."""
+    gnss, first_ns = Subject("role", GNSS), min((section.start_ns for section in facts.stretches), default=0)
     findings = [finding for finding in inputs.findings if finding.subject.name not in inputs.excluded]
     if inputs.datum_deg_m is None and GNSS in inputs.counts:  # a log without any fix was found when it was read
         findings.append(make_finding("local-frame", gnss))
     elif inputs.datum_deg_m is not None:
-        findings += [_find_initial_yaw(of, first_ns, gnss) for of in facts.stretches if of.heading_from != _COURSE]
+        findings += [_find_initial_yaw(of, first_ns, gnss) for of in facts.stretches if of.heading_from not in _SURE]
     findings += _find_reopenings(facts, first_ns)
-    findings += _find_changes(facts, first_ns, fixes)
+    findings += _find_changes(facts, first_ns)
     findings += _find_scale(inputs, facts)
-    findings += _find_rejections(facts, fixes)
+    findings += _find_rejections(facts)
     for key, code in (("variances_replaced", "variances-replaced"), ("invalid", "values-unusable")):
         findings += [
             make_finding(code, Subject("role", role), row_count=count[key])
@@ -102,16 +100,16 @@ def _find_scale(inputs: FusionInputs, facts: FuseFacts) -> list[Finding]:
     return [make_finding("odometry-scale-unobservable", subject, names=names, scale_std_fraction=std)]
 
 
-def _find_rejections(facts: FuseFacts, fixes: str) -> list[Finding]:
+def _find_rejections(facts: FuseFacts) -> list[Finding]:
     most = read_threshold("measurements-rejected", "max_rejected_fraction")
     findings = []
     for role, count in facts.measurements.items():
-        rejected, name = facts.rejected[role], fixes if role == GNSS else role
+        rejected = facts.rejected[role]
         if rejected > most * count:
             finding = make_finding(
                 "measurements-rejected",
-                Subject("role", name),
-                remedies=exclude_role(name),
+                Subject("role", role),
+                remedies=exclude_role(role),
                 rejected_fraction=rejected / count,
                 rejected_count=rejected,
                 measurement_count=count,
@@ -138,10 +136,10 @@ def _find_reopenings(facts: FuseFacts, first_ns: int) -> list[Finding]:
     return findings
 
 
-def _find_changes(facts: FuseFacts, first_ns: int, fixes: str) -> Iterator[Finding]:
+def _find_changes(facts: FuseFacts, first_ns: int) -> Iterator[Finding]:
     """Yield what explains contradictions of sensors: what changed, when, and by how much fixes were off."""
     for change in (each for section in facts.stretches for each in section.changes):
-        subject = Subject("role", fixes if change.role == GNSS else change.role)
+        subject = Subject("role", change.role)
         names = {"change": _CHANGES[change.kind]}
         yield make_finding(
             "sensor-changed", subject, span_s=_find_span_s(change, first_ns), names=names, off_m=change.size
@@ -155,6 +153,7 @@ _CHANGES = {
     "clock": "its clock stepped",
     "gyroscope": "the bias of its gyroscope jumped",
     "scale": "its scale changed",
+    "frame": "the frame of its attitude turned",
     "pose": "a clock stepped, or the robot was moved without being measured",
     "useless": "it measured nothing usable",
 }
@@ -179,9 +178,8 @@ def make_audit_findings(fused: Fused, inputs: FusionInputs, streams: Streams) ->
         _find_disagreement([e for e in found if (e.sensor, e.what, e.alone) == kind], first_ns) for kind in kinds
     ]
     for sensor, what in undecided:
-        name = find_recipe_role(sensor, streams)
-        names, subject = {"quantity": what}, Subject("role", name)
-        findings.append(make_finding("disagreement-undecided", subject, names=names, remedies=exclude_role(name)))
+        names, subject = {"quantity": what}, Subject("role", sensor)
+        findings.append(make_finding("disagreement-undecided", subject, names=names, remedies=exclude_role(sensor)))
     sensors = {sensor for sensor, _ in undecided}
     faster = _compute_command_ratio(inputs, streams)
     if faster is not None:
@@ -237,7 +235,7 @@ def make_mounting_findings(inputs: FusionInputs, fused: Fused, streams: Streams)
         sensor = streams.sensors[GNSS]
         if sensor.placed_by == "assumed" or _is_contradicted(arm, _LEAST_ARM_M):
             moved, std_m = make_vector(np.array(arm.value)), make_vector(np.array(arm.std))
-            findings.append(_find_arm(arm, sensor, find_recipe_role(GNSS, streams)))
+            findings.append(_find_arm(arm, sensor))
     if tilt is not None and _is_contradicted(tilt, _LEAST_TILT_RAD):
         roll_pitch = tilt.value[0], tilt.value[1]
         findings.append(_find_tilt(tilt, streams.sensors[IMU]))
@@ -281,16 +279,16 @@ def _find_odometry_scale(role: str, scale: Scale, given: float) -> Finding:
     return make_finding("odometry-scale", subject, remedies=remedies, scale=scale.factor, scale_std=std, **by_speed)
 
 
-def _find_arm(arm: ParameterFacts, sensor: Sensor, name: str) -> Finding:
+def _find_arm(arm: ParameterFacts, sensor: Sensor) -> Finding:
     place = np.asarray(sensor.xyz_m) + arm.value
     axes = ("forward", "left", "up")
     numbers: dict[str, Any] = {f"{axis}_m": value for axis, value in zip(axes, place.tolist(), strict=True)}
     numbers |= {f"{axis}_std_m": value for axis, value in zip(axes, arm.std, strict=True)}
     return make_finding(
         "lever-arm-unknown" if sensor.placed_by == "assumed" else "lever-arm-contradicted",
-        Subject("role", name),
+        Subject("role", GNSS),
         names={"placed_by": sensor.placed_by},
-        remedies=state_extrinsics(name, np.round(place, 2).tolist(), matrix_from_quat(sensor.quat_xyzw)),
+        remedies=state_extrinsics(GNSS, np.round(place, 2).tolist(), matrix_from_quat(sensor.quat_xyzw)),
         **numbers,
     )
 
