@@ -26,7 +26,7 @@ from tcpipe.power.noise import MEDIAN_OF_SQUARES
 
 Floats = NDArray[np.float64]
 
-STATED_MOUNTING_STD_RAD, UNSTATED_MOUNTING_STD_RAD = 0.0175, 0.05
+STATED_MOUNTING_STD_RAD, UNSTATED_MOUNTING_STD_RAD = 0.0175, 0.1
 _DEFAULT_STD_RAD = 0.01  # scan matching and visual SLAM state none, or any
 _FLOOR_STD_RAD = 0.003
 _UNMEASURED_RAD2 = 1e2
@@ -96,6 +96,11 @@ def align_mounting(fixes: Positions, odometry: BodyVelocities | None) -> Positio
     if np.linalg.norm(aside) < 0.5 * np.linalg.norm(up) or np.linalg.norm(ahead) < 0.5:
         return without
     x, y = ahead / np.linalg.norm(ahead), aside / np.linalg.norm(aside)
-    robot_from_sensor = quat_from_matrix(np.stack((x, y, np.cross(x, y))))
-    aligned = multiply(quat, invert(robot_from_sensor))
-    return replace(fixes, quat_xyzw=aligned, mounting_std_rad=UNSTATED_MOUNTING_STD_RAD)
+    turn = quat_from_matrix(np.stack((x, y, np.cross(x, y))))
+    mounting = tuple(multiply(turn, fixes.mounting_xyzw).tolist())
+    return replace(
+        fixes,
+        quat_xyzw=multiply(quat, invert(turn)),
+        mounting_xyzw=mounting,
+        mounting_std_rad=UNSTATED_MOUNTING_STD_RAD,
+    )

@@ -44,7 +44,7 @@ class Positions:
     unclaimed : shape (N,), where the receiver claims none and the variance is the recipe's; None where it always claims one.
     quat_xyzw, rotation_variance_rad2 : attitude enu_from_base_link, shape (N, 4), NaN where absent, and variance about the robot's axes,
         shape (N, 3); None: no attitude is measured.
-    mounting_std_rad : how well the rotation of the pose's sensor on the robot is known, about each axis.
+    mounting_xyzw, mounting_std_rad : base_link_from_sensor of a pose, stated or as the motion shows it, and σ about each axis.
     """
 
     stamp_ns: NDArray[np.int64]
@@ -55,6 +55,7 @@ class Positions:
     unclaimed: NDArray[np.bool_] | None = None
     quat_xyzw: NDArray[np.float64] | None = None
     rotation_variance_rad2: NDArray[np.float64] | None = None
+    mounting_xyzw: tuple[float, ...] = (0.0, 0.0, 0.0, 1.0)
     mounting_std_rad: float = 0.0
 
 

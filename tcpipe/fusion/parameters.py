@@ -56,9 +56,7 @@ PARAMETERS = (
     Parameter("lag of wheels", state.WHEEL_LAG, 1, 0.02, 1e-3, "s", "drivers stamp on arrival"),
     Parameter("lag of camera", state.VISUAL_LAG, 1, 0.03, 1e-3, "s", "exposure and processing"),
     Parameter("mounting of the pose", state.POSE_MOUNT, 3, 0.0, 0.0, "rad", "`Positions.mounting_std_rad`"),
-    Parameter(
-        "frame of the pose", state.POSE_FRAME, 3, 0.05, 1e-3, "rad", "starts level to 3°; drifts by 1° in 5 minutes"
-    ),
+    Parameter("frame of the pose", state.POSE_FRAME, 3, 0.05, 2e-3, "rad", "level to 3°; drifts by 1° a minute"),
 )
 """What does not come from the run itself; the scales of odometries and the errors of fixes do, see `make_priors`."""
 _PATIENCE = {state.FIX: (5.0, 15.0, 5.0), state.WHEELS: (5.0, 5.0, 0.3), state.VISUAL: (5.0, 5.0, 0.3)}

@@ -472,6 +472,8 @@ def _read_pose(columns: Columns) -> Readings:
     quat, bad = _read_orientation(columns, prefix.replace("position", "orientation"))
     if np.all(quat == quat[:1]):  # positions alone
         quat[:] = np.nan
+    if np.all(place[:, 2] == place[:1, 2]):  # a map in the plane
+        variances[:, 2] = _NO_HEIGHT_M2
     unknown = np.full(len(place), np.nan)
     values: dict[str, NDArray[Any]] = {f"{axis}_m": place[:, i] for i, axis in enumerate("xyz")}
     values |= dict.fromkeys(("lon_deg", "lat_deg", "alt_m"), unknown)

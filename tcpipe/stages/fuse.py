@@ -17,11 +17,11 @@ from tcpipe.stages.clock_findings import correct_clocks
 from tcpipe.stages.fuse_findings import find_fuse_findings, make_audit_findings, make_fuse_facts, make_mounting_findings
 from tcpipe.stages.fuse_inputs import (
     FusionInputs,
-    convert_pose_to_fixes,
     drop_implausible_sensors,
     exclude_sensors,
     name_pose,
     prepare_inputs,
+    prepare_pose,
 )
 from tcpipe.stages.fuse_sections import Fused, fuse_sections, make_rejections_table
 from tcpipe.tables.facts import SensorChecks
@@ -50,7 +50,7 @@ def _fuse(streams: Streams, config: FuseConfig, run_id: str) -> Track:
     # 1. A pose made elsewhere is what the fixes are.
     #    Streams become measurements: one frame, one set of units, usable variances; sensors that cannot be right are left out.
     is_posed = POSE in streams.tables
-    streams, local = convert_pose_to_fixes(streams)
+    streams, local = prepare_pose(streams)
     run = Subject("run", run_id)
     inputs, sanity = drop_implausible_sensors(prepare_inputs(streams, config), streams)
     # 2. Each section for itself: where it starts, filter and smoother; again without a sensor that leads the track away from all others,

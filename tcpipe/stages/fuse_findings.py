@@ -6,11 +6,12 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tcpipe.fusion.checks.audit import find_undecided_sensors
 from tcpipe.fusion.checks.odometry_scale import Scale, compute_command_ratio
-from tcpipe.fusion.measurements import GNSS, IMU, VISUAL, WHEELS
-from tcpipe.geometry.rotation import matrix_from_quat, quat_from_rpy
+from tcpipe.fusion.measurements import GNSS, IMU, VISUAL, WHEELS, Measurements
+from tcpipe.geometry.rotation import matrix_from_quat, multiply, quat_from_rotation_vector, quat_from_rpy
 from tcpipe.recipe.suggestions import suggest
 from tcpipe.stages.fuse_inputs import (
     FusionInputs,
@@ -140,13 +141,13 @@ def _find_changes(facts: FuseFacts, first_ns: int) -> Iterator[Finding]:
     """Yield what explains contradictions of sensors: what changed, when, and by how much fixes were off."""
     for change in (each for section in facts.stretches for each in section.changes):
         subject = Subject("role", change.role)
-        names = {"change": _CHANGES[change.kind]}
+        names = {"change": CHANGES[change.kind]}
         yield make_finding(
             "sensor-changed", subject, span_s=_find_span_s(change, first_ns), names=names, off_m=change.size
         )
 
 
-_CHANGES = {
+CHANGES = {
     "offset": "positions are off by a constant",
     "wander": "positions err far more than usual",
     "antenna": "the antenna was moved",
@@ -222,6 +223,7 @@ def _find_disagreement(found: Sequence[Disagreement], first_ns: int) -> Finding:
 _SURELY = 4.0  # standard deviations
 _LEAST_ARM_M = 0.1  # what a finding names
 _LEAST_TILT_RAD = 0.0175
+_LEAST_TURN_RAD = 0.05
 _LEAST_SCALE = 0.1
 
 
@@ -232,10 +234,16 @@ def make_mounting_findings(inputs: FusionInputs, fused: Fused, streams: Streams)
     arm, tilt = longest.parameters.get("antenna"), longest.parameters.get("mounting of the IMU")
     moved = std_m = roll_pitch = None
     if arm is not None and GNSS in streams.sensors:
-        sensor = streams.sensors[GNSS]
+        sensor, turned = streams.sensors[GNSS], longest.parameters.get("mounting of the pose")
+        turn = _find_rotation(turned, inputs.measurements.get(longest.clock_epoch), sensor)
         if sensor.placed_by == "assumed" or _is_contradicted(arm, _LEAST_ARM_M):
             moved, std_m = make_vector(np.array(arm.value)), make_vector(np.array(arm.std))
-            findings.append(_find_arm(arm, sensor))
+            findings.append(_find_arm(arm, sensor, turn))
+        if turned is not None and sensor.placed_by != "assumed" and _is_contradicted(turned, _LEAST_TURN_RAD):
+            remedies = state_extrinsics(GNSS, sensor.xyz_m, turn)
+            names, off_rad = {"placed_by": sensor.placed_by}, float(np.linalg.norm(turned.value))
+            fixes = Subject("role", GNSS)
+            findings.append(make_finding("pose-rotated", fixes, names=names, remedies=remedies, off_rad=off_rad))
     if tilt is not None and _is_contradicted(tilt, _LEAST_TILT_RAD):
         roll_pitch = tilt.value[0], tilt.value[1]
         findings.append(_find_tilt(tilt, streams.sensors[IMU]))
@@ -279,7 +287,14 @@ def _find_odometry_scale(role: str, scale: Scale, given: float) -> Finding:
     return make_finding("odometry-scale", subject, remedies=remedies, scale=scale.factor, scale_std=std, **by_speed)
 
 
-def _find_arm(arm: ParameterFacts, sensor: Sensor) -> Finding:
+def _find_rotation(turned: ParameterFacts | None, m: Measurements | None, sensor: Sensor) -> NDArray[np.float64]:
+    """Return how the sensor of positions is turned on the robot, shape (3, 3): that of a pose as its run shows it."""
+    if turned is None or m is None or m.gnss is None:
+        return matrix_from_quat(sensor.quat_xyzw)
+    return matrix_from_quat(multiply(quat_from_rotation_vector(turned.value), m.gnss.mounting_xyzw))
+
+
+def _find_arm(arm: ParameterFacts, sensor: Sensor, turn: NDArray[np.float64]) -> Finding:
     place = np.asarray(sensor.xyz_m) + arm.value
     axes = ("forward", "left", "up")
     numbers: dict[str, Any] = {f"{axis}_m": value for axis, value in zip(axes, place.tolist(), strict=True)}
@@ -288,7 +303,7 @@ def _find_arm(arm: ParameterFacts, sensor: Sensor) -> Finding:
         "lever-arm-unknown" if sensor.placed_by == "assumed" else "lever-arm-contradicted",
         Subject("role", GNSS),
         names={"placed_by": sensor.placed_by},
-        remedies=state_extrinsics(GNSS, np.round(place, 2).tolist(), matrix_from_quat(sensor.quat_xyzw)),
+        remedies=state_extrinsics(GNSS, np.round(place, 2).tolist(), turn),
         **numbers,
     )
 

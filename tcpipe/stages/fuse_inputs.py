@@ -71,6 +71,7 @@ class FusionInputs:
 def prepare_inputs(streams: Streams, config: FuseConfig) -> FusionInputs:
     """Turn the motion streams into measurements, one set a clock epoch."""
     tables = {role: streams.tables[role] for role in (GNSS, DOPPLER, IMU, WHEELS, VISUAL) if role in streams.tables}
+    tables |= {GNSS: streams.tables[POSE]} if POSE in streams.tables else {}
     datum = None
     if GNSS in tables:
         fixes = FloatColumns(tables[GNSS])
@@ -119,9 +120,10 @@ def _find_first_ns(streams: Streams) -> int:
 
 def _find_used_s(role: str, streams: Streams) -> tuple[float, float] | None:
     """Return when a sensor's first and last messages are [s]."""
-    if role not in streams.tables:
+    table = streams.tables.get(POSE if role == GNSS and POSE in streams.tables else role)
+    if table is None:
         return None
-    stamp_ns = to_integers(streams.tables[role], "stamp_ns")
+    stamp_ns = to_integers(table, "stamp_ns")
     return (int(stamp_ns[0]) - _find_first_ns(streams)) / 1e9, (int(stamp_ns[-1]) - _find_first_ns(streams)) / 1e9
 
 
@@ -282,8 +284,8 @@ def find_recipe_role(role: str, streams: Streams) -> str:
     return POSE if role == GNSS and POSE in roles and GNSS not in roles else role
 
 
-def convert_pose_to_fixes(streams: Streams) -> tuple[Streams, bool]:
-    """Return the streams with the pose in the place of GNSS, and whether it lies in a frame that is nowhere on the earth."""
+def prepare_pose(streams: Streams) -> tuple[Streams, bool]:
+    """Return the streams with the pose as fixes of a GNSS could be, and whether it lies in a frame that is nowhere on the earth."""
     pose = streams.tables.get(POSE)
     if pose is None:
         return streams, False
@@ -293,9 +295,8 @@ def convert_pose_to_fixes(streams: Streams) -> tuple[Streams, bool]:
         names = ("lon_deg", "lat_deg", "alt_m")
         geodetic = dict(zip(names, geodetic_from_enu(place, datum_deg_m=_ANYWHERE_DEG_M), strict=True))
         pose = STREAMS[POSE].table(**{name: pose[name] for name in pose.column_names} | geodetic)
-    tables = {role: table for role, table in streams.tables.items() if role != POSE} | {GNSS: pose}
-    sensors = {role: sensor for role, sensor in streams.sensors.items() if role != POSE} | {GNSS: streams.sensors[POSE]}
-    return replace(streams, tables=tables, sensors=sensors), local
+    sensors = {**streams.sensors, GNSS: streams.sensors[POSE]}
+    return replace(streams, tables={**streams.tables, POSE: pose}, sensors=sensors), local
 
 
 _Named = TypeVar("_Named")

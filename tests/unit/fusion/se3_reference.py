@@ -178,8 +178,11 @@ def differentiate_attitude(x, look):
 
 def differentiate_measurement(kind, x, look):
     """Return the Jacobian of a measurement for the errors, (size, 45)."""
-    if kind == state.ATTITUDE:
-        return differentiate_attitude(x, look)
+    return differentiate_attitude(x, look) if kind == state.ATTITUDE else differentiate_other(kind, x, look)
+
+
+def differentiate_other(kind, x, look):
+    """Return the same of what is no attitude."""
     R, _, u = split(x)
     H = np.zeros((3, state.N))
     th, rho, vel, bg = (slice(k, k + 3) for k in (state.THETA, state.RHO, state.U, state.GYRO_BIAS))
