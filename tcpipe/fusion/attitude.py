@@ -34,6 +34,7 @@ _FLAT = 1e-6  # of the lowest row of the rotation matrices: a pose in the plane 
 _FEWEST = 20  # attitudes, and chords
 _CHORD_NS = 1_000_000_000
 _CHORD_M, _STRAIGHT_RAD = 0.3, 0.1
+_MISSTATED_RAD = 0.25  # slopes that the robot drives along look like half of that
 
 
 def add_attitude(
@@ -63,16 +64,23 @@ def add_attitude(
     variance = np.maximum(stated, np.maximum(shown, _FLOOR_STD_RAD**2))
     if np.ptp(matrix_from_quat(quat_xyzw[known])[:, 2], axis=0).max() < _FLAT:
         variance[:, :2] = _UNMEASURED_RAD2
-    return replace(fixes, quat_xyzw=quat, rotation_variance_rad2=variance, mounting_std_rad=STATED_MOUNTING_STD_RAD)
+    return replace(
+        fixes,
+        quat_xyzw=quat,
+        rotation_variance_rad2=variance,
+        mounting_xyzw=tuple(np.asarray(mounting_xyzw).tolist()),
+        mounting_std_rad=STATED_MOUNTING_STD_RAD,
+    )
 
 
-def align_mounting(fixes: Positions, odometry: BodyVelocities | None) -> Positions:
+def align_mounting(fixes: Positions, odometry: BodyVelocities | None, *, is_stated: bool) -> Positions:
     """Return positions with the attitude of a robot that drives along its x axis, as the odometry tells its sign.
 
-    Without attitude where it hardly drives. Source: the TRIAD method, with the direction of motion first and the vertical second (H. D.
-    Black, "A passive system for determining the attitude of a satellite", AIAA Journal 2 (7), 1964).
+    Where the mounting is stated, only if the motion contradicts it; else without attitude where the robot hardly drives. Source: the TRIAD
+    method, with the direction of motion first and the vertical second (H. D. Black, "A passive system for determining the attitude of a
+    satellite", AIAA Journal 2 (7), 1964).
     """
-    without = replace(fixes, quat_xyzw=None, rotation_variance_rad2=None)
+    without = fixes if is_stated else replace(fixes, quat_xyzw=None, rotation_variance_rad2=None)
     if fixes.quat_xyzw is None:
         return fixes
     stamp_ns, quat = fixes.stamp_ns, fixes.quat_xyzw
@@ -97,6 +105,8 @@ def align_mounting(fixes: Positions, odometry: BodyVelocities | None) -> Positio
         return without
     x, y = ahead / np.linalg.norm(ahead), aside / np.linalg.norm(aside)
     turn = quat_from_matrix(np.stack((x, y, np.cross(x, y))))
+    if is_stated and np.linalg.norm(rotation_vector_from_quat(turn)) < _MISSTATED_RAD:
+        return fixes
     mounting = tuple(multiply(turn, fixes.mounting_xyzw).tolist())
     return replace(
         fixes,

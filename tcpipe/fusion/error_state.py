@@ -271,13 +271,16 @@ def _make_trajectory(  # noqa: PLR0917
         speed_variance = speed_variance + (UNSEEN_TURN_RADPS * antenna[2]) ** 2
         sway = np.minimum(GROUND * speed[:, None] * DISPLACEMENT_LAGS_S, 2 * slope_std**2) * antenna[2] ** 2
         links = links + sway
-    elif is_turned_by_course(m) and not m.has_attitude:
+    elif is_turned_by_course(m) and not m.has_posed_tilt:
         # The course takes a sway of the antenna for a turn: nothing tells one from the other, and roll is taken to be none.
         position_variance[:, :2] += (slope_std * antenna[2] * rotation[:, :2, 1]) ** 2
     if noise.horizontal is not None and noise.vertical is not None:
         # What fixes claim beyond what the run shows lasts longer than the run can show.
         for axes, fix in ((slice(0, 2), noise.horizontal), (slice(2, 3), noise.vertical)):
             position_variance[:, axes] += max(0.0, fix.claimed_m2 - fix.white_m2 - fix.correlated.variance)
+    if m.gnss is not None and not std[state.ARM + 2] and std[state.ARM]:
+        height_std = m.gnss.lever_arm_std_m[2]
+        position_variance += np.square([slope_std * height_std, slope_std * height_std, height_std])
     if m.gnss is not None and not std[state.ARM : state.ARM + 3].any():
         turned = np.unwrap(np.arctan2(rotation[:, 1, 0], rotation[:, 0, 0]))
         variance, moved = _compute_arm_variance(m, rotation, turned, made)

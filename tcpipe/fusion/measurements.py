@@ -29,6 +29,7 @@ UNSTATED_ARM_STD_M = (0.5, 0.5, 0.5)
 
 _UNMEASURED_M2PS2 = 1e3
 """A variance from which on an axis is not measured (ruling)."""
+_UNMEASURED_RAD2 = 10.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -155,8 +156,14 @@ class Measurements:
 
     @property
     def has_attitude(self) -> bool:
-        """Whether a pose measures the attitude."""
+        """Whether a pose measures the attitude, or yaw alone."""
         return self.gnss is not None and self.gnss.quat_xyzw is not None
+
+    @property
+    def has_posed_tilt(self) -> bool:
+        """Whether a pose measures roll and pitch."""
+        variance = None if self.gnss is None else self.gnss.rotation_variance_rad2
+        return variance is not None and float(variance[0, 0]) < _UNMEASURED_RAD2
 
     def odometries(self) -> dict[str, BodyVelocities]:
         """Return the odometries that are there, by role; the wheels' first."""

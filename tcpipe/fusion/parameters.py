@@ -80,7 +80,7 @@ def make_priors(m: Measurements, noise: NoiseModel, ticks: Ticks) -> tuple[Float
     """Return standard deviation, walk and correlation time of every error, shapes (45,): 0 where it is exact, or nothing depends on it."""
     std, walk = np.zeros(state.N), np.zeros(state.N)
     has_imu, has_fixes = m.imu is not None, m.gnss is not None
-    has_tilt = has_imu or m.has_attitude or (m.visual is not None and m.visual.turn_rate_radps is not None)
+    has_tilt = has_imu or m.has_posed_tilt or (m.visual is not None and m.visual.turn_rate_radps is not None)
     inertial = bool((ticks.inputs.mode == state.INERTIAL).any())
     wanted = {
         "gyroscope bias": has_imu,
@@ -108,9 +108,10 @@ def make_priors(m: Measurements, noise: NoiseModel, ticks: Ticks) -> tuple[Float
         std[place], time_s[place] = np.sqrt(process.variance), process.time_s
     std[state.TURN_SCALE] = turn_scale_std(m)
     walk[state.TURN_SCALE] = np.sqrt(2.0 / _MINUTE_S) * std[state.TURN_SCALE]
-    # Where roll and pitch are not known, an antenna that sways looks like one elsewhere.
-    if m.gnss is not None and has_tilt:
-        std[state.ARM : state.ARM + 3] = m.gnss.lever_arm_std_m
+    # Where roll and pitch are not known, an antenna that sways looks like one at another height; without yaw, elsewhere.
+    if m.gnss is not None and (has_tilt or m.has_attitude):
+        known = slice(0, 3 if has_tilt else 2)
+        std[state.ARM : state.ARM + 3][known] = m.gnss.lever_arm_std_m[known]
     if m.gnss is not None and m.has_attitude:
         std[state.POSE_MOUNT : state.POSE_MOUNT + 3] = m.gnss.mounting_std_rad
     if has_fixes:

@@ -119,7 +119,7 @@ def level_stds_rad(measurements: Measurements) -> tuple[float, float]:
 
     Where the course alone tells the turns, what the antenna sways by would pass for roll: it is held.
     """
-    is_held = is_turned_by_course(measurements) and not measurements.has_attitude
+    is_held = is_turned_by_course(measurements) and not measurements.has_posed_tilt
     return _LEVEL_STD_RAD, _HELD_STD_RAD if is_held else _LEVEL_STD_RAD
 
 

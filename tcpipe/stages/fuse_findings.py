@@ -11,7 +11,14 @@ from numpy.typing import NDArray
 from tcpipe.fusion.checks.audit import find_undecided_sensors
 from tcpipe.fusion.checks.odometry_scale import Scale, compute_command_ratio
 from tcpipe.fusion.measurements import GNSS, IMU, VISUAL, WHEELS, Measurements
-from tcpipe.geometry.rotation import matrix_from_quat, multiply, quat_from_rotation_vector, quat_from_rpy
+from tcpipe.geometry.rotation import (
+    matrix_from_quat,
+    multiply,
+    quat_from_matrix,
+    quat_from_rotation_vector,
+    quat_from_rpy,
+    rotation_vector_from_quat,
+)
 from tcpipe.recipe.suggestions import suggest
 from tcpipe.stages.fuse_inputs import (
     FusionInputs,
@@ -239,9 +246,11 @@ def make_mounting_findings(inputs: FusionInputs, fused: Fused, streams: Streams)
         if sensor.placed_by == "assumed" or _is_contradicted(arm, _LEAST_ARM_M):
             moved, std_m = make_vector(np.array(arm.value)), make_vector(np.array(arm.std))
             findings.append(_find_arm(arm, sensor, turn))
-        if turned is not None and sensor.placed_by != "assumed" and _is_contradicted(turned, _LEAST_TURN_RAD):
-            remedies = state_extrinsics(GNSS, sensor.xyz_m, turn)
-            names, off_rad = {"placed_by": sensor.placed_by}, float(np.linalg.norm(turned.value))
+        off = quat_from_matrix(turn @ matrix_from_quat(sensor.quat_xyzw).T)
+        off_rad = float(np.linalg.norm(rotation_vector_from_quat(off)))
+        unsure_rad = 0.0 if turned is None else float(np.linalg.norm(turned.std))
+        if sensor.placed_by != "assumed" and off_rad > max(_SURELY * unsure_rad, _LEAST_TURN_RAD):
+            remedies, names = state_extrinsics(GNSS, sensor.xyz_m, turn), {"placed_by": sensor.placed_by}
             fixes = Subject("role", GNSS)
             findings.append(make_finding("pose-rotated", fixes, names=names, remedies=remedies, off_rad=off_rad))
     if tilt is not None and _is_contradicted(tilt, _LEAST_TILT_RAD):

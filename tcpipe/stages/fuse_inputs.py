@@ -85,8 +85,7 @@ def prepare_inputs(streams: Streams, config: FuseConfig) -> FusionInputs:
         found = {role: _prepare(role, part, streams.sensors[role], config, inputs) for role, part in parts.items()}
         gnss, odometry = found.get(GNSS), found.get(WHEELS) or found.get(VISUAL)
         if gnss is not None:
-            if streams.sensors[GNSS].placed_by == "assumed":
-                gnss = align_mounting(gnss, odometry)
+            gnss = align_mounting(gnss, odometry, is_stated=streams.sensors[GNSS].placed_by != "assumed")
             count = gnss.stamp_ns.size
             gnss, repeats = preparation.drop_repeated_fixes(gnss, odometry)
             inputs.counts[GNSS]["repeated"] += count - gnss.stamp_ns.size

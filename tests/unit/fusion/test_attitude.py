@@ -61,7 +61,7 @@ def test_a_pose_in_the_plane_has_no_roll_and_pitch():
 def test_an_unknown_mounting_is_that_of_a_robot_that_drives_forward(sensor, sign):
     one = np.ones(COUNT)
     odometry = BodyVelocities(STAMP_NS, sign * np.outer(one, [0.8, 0.0, 0.0]), np.ones((COUNT, 3)), 0 * one, one)
-    pose = align_mounting(make_pose(sensor, noise_rad=0.01, mounting=Rotation.identity()), odometry)
+    pose = align_mounting(make_pose(sensor, noise_rad=0.01, mounting=Rotation.identity()), odometry, is_stated=False)
     forward = ROBOT if sign > 0 else ROBOT * Rotation.from_euler("z", np.pi)
     assert np.sqrt(np.mean(off_rad(pose, forward) ** 2)) < 0.04
     assert pose.mounting_std_rad == UNSTATED_MOUNTING_STD_RAD
@@ -71,7 +71,7 @@ def test_an_unknown_mounting_is_that_of_a_robot_that_drives_forward(sensor, sign
 
 def test_without_motion_an_unknown_mounting_stays_unknown():
     standing = replace(make_pose(), position_enu_m=np.zeros((COUNT, 3)))
-    assert align_mounting(standing, None).quat_xyzw is None
+    assert align_mounting(standing, None, is_stated=False).quat_xyzw is None
 
 
 def test_few_attitudes_are_none():
@@ -79,3 +79,12 @@ def test_few_attitudes_are_none():
     quat = np.full((COUNT, 4), np.nan)
     quat[:5] = 0.5
     assert add_attitude(fixes, PLACE_M[:, :2], quat, np.full((COUNT, 3), np.nan), (0.0, 0.0, 0.0, 1.0)) is fixes
+
+
+def test_a_stated_mounting_stays_unless_the_motion_contradicts_it():
+    near, far = (Rotation.from_euler("z", angle) for angle in (0.1, 1.5))
+    pose = make_pose(near, mounting=Rotation.identity())
+    assert align_mounting(pose, None, is_stated=True) is pose
+    assert off_rad(align_mounting(make_pose(far, mounting=Rotation.identity()), None, is_stated=True)).max() < 0.05
+    standing = replace(pose, position_enu_m=np.zeros((COUNT, 3)))
+    assert align_mounting(standing, None, is_stated=True) is standing
