@@ -182,5 +182,5 @@ def true_track(truth):
         forward_velocity_std_mps=np.full(rows.size, 0.01),
         rejections=Rejections(np.empty(0, np.int64), *np.empty((2, 0), np.str_), *np.empty((2, 0))),
         displacement_std_m=np.full((rows.size, 1), 0.01) * DISPLACEMENT_LAGS_S,
-        facts=StretchFacts({}, {}, {}, 0),
+        facts=StretchFacts({}, {}, {}),
     )

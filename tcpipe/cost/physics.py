@@ -26,6 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.power.noise import solve_non_negative
+from tcpipe.robust import estimate_robust_std
 from tcpipe.tables.facts import PhysicsFit, PhysicsScore, PhysicsTerm
 
 Floats = NDArray[np.float64]
@@ -45,7 +46,6 @@ _MOST_RECOVERED = 0.9
 _BEND = 0.1
 _STEPS = 100  # of reweighting at most
 _HUBER = 1.345  # 95 % efficient for normal errors (Huber, Robust Statistics, 1981)
-_NORMAL = 1.4826  # standard deviation over median absolute deviation of a normal variate
 _OUTLIER = 4.0  # robust standard deviations
 _FINEST = 0.02  # of the power: no such model is better
 _PLAUSIBLE_RESISTANCE = 1.5  # coefficient of rolling resistance: tracks in deep sand stay below
@@ -177,7 +177,7 @@ def fit_physics(metres: FitSamples, *, idle_watt: float | None = None, turning: 
             terms = [known for known in terms if known[0] != term]
             found = _fit_robustly(used, terms, idle_watt)
     off = used.power_watt - found.power_watt(used)
-    spread = _NORMAL * float(np.median(np.abs(off - np.median(off))))
+    spread = estimate_robust_std(off - np.median(off))
     return replace(
         found, residual_watt=max(spread, _FINEST * float(np.median(np.abs(used.power_watt)))), segments=rows.size
     )
@@ -253,7 +253,7 @@ def _fit_robustly(metres: FitSamples, terms: Sequence[tuple[str, str]], idle_wat
             clear = np.minimum(1.0, np.abs(wanted) / max(_BEND * value[terms.index(("grade", ALL))], 1e-9)) ** 2
         made = np.column_stack([np.where(always | driven[:, None], design, recovered * design), traction])
         off = force - made[:, :count] @ value
-        scale = max(_NORMAL * float(np.median(np.abs(off))), 1e-9)
+        scale = max(estimate_robust_std(off), 1e-9)
         weight = clear * np.minimum(1.0, _HUBER * scale / np.maximum(np.abs(off), 1e-12))
         by = made * np.sqrt(weight)[:, None] / scale
         target = (force + recovered * traction) * np.sqrt(weight) / scale

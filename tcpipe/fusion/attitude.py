@@ -22,7 +22,7 @@ from tcpipe.geometry.rotation import (
     rotate,
     rotation_vector_from_quat,
 )
-from tcpipe.power.noise import MEDIAN_OF_SQUARES
+from tcpipe.robust import MEDIAN_OF_SQUARES
 
 Floats = NDArray[np.float64]
 

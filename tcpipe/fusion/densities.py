@@ -27,7 +27,8 @@ from tcpipe.fusion.level_motion import KNOT_S
 from tcpipe.fusion.measurements import IMU, Measurements, Positions
 from tcpipe.fusion.pair_residuals import ACROSS, ALONG, FIX_S, SCALE_S, TURN, TURN_S, UP, Residuals, find_residuals
 from tcpipe.fusion.signals import compute_median_period_ns, multiply_by_vector
-from tcpipe.power.noise import MEDIAN_OF_SQUARES, solve_non_negative
+from tcpipe.power.noise import solve_non_negative
+from tcpipe.robust import MEDIAN_OF_SQUARES, estimate_robust_std
 
 Floats = NDArray[np.float64]
 
@@ -525,4 +526,4 @@ def _compute_density(stamp_ns: NDArray[np.int64], values: Floats) -> float:
     second = second[second > 0.0]
     if second.size < _FEWEST:
         return 0.0
-    return float(np.median(second)) ** 2 / MEDIAN_OF_SQUARES / 6.0 * compute_median_period_ns(stamp_ns[finite]) * 1e-9
+    return estimate_robust_std(second) ** 2 / 6.0 * compute_median_period_ns(stamp_ns[finite]) * 1e-9

@@ -498,7 +498,6 @@ def _make_facts(  # noqa: PLR0917
         gnss_lasting_error_m=float(np.sqrt(np.median(made.ticks.fix_variance_m2[:, 0]))),
         gate_resets=find_gate_resets(made),
         changes=tuple(_list_changes(made, explained)),
-        covariance_repairs=0,
         gyro_bias_radps=None if std[state.TURN_SCALE] else make_vector(x[state.GYRO_BIAS : state.GYRO_BIAS + 3]),
         turn_scale=float(1.0 / (1.0 - x[state.TURN_SCALE])) if std[state.TURN_SCALE] else None,
         accelerometer_bias_mps2=make_vector(x[state.ACCELEROMETER_BIAS : state.ACCELEROMETER_BIAS + 3]),

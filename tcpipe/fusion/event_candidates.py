@@ -16,6 +16,7 @@ from tcpipe.fusion.level_motion import find_turn_roles, get_turn_rates
 from tcpipe.fusion.measurements import GNSS, IMU, Measurements
 from tcpipe.fusion.pair_residuals import ACROSS, ALONG, TURN, Residuals, align_turns
 from tcpipe.fusion.signals import compute_interval_means, compute_seconds, is_covered
+from tcpipe.robust import estimate_robust_std
 
 _GATE = 4.0  # standard deviations
 _FEWEST = 3  # overlapping windows
@@ -114,7 +115,6 @@ _AROUND_S, _LEAST_S = 60.0, 15.0  # compared before and after a jump
 _FAR = 4.0  # standard deviations beyond which a turn is a slip
 _JUMPS = 8.0  # standard deviations
 _LEAST_JUMP_RADPS = 0.003
-_MAD = 1.4826
 _MOST_GAIN = 50.0
 _ROUNDS = 4
 
@@ -173,13 +173,13 @@ def _find_jumps(m: Measurements, role: str) -> Iterator[TurnJump]:
         aligned = align_turns(turn - np.column_stack((jumped, 0.0 * jumped)), block) + jumped
         off = np.diff(aligned) / _STEP_S
         off -= np.median(off)
-        scatter = _MAD * np.median(np.abs(off)) + 1e-9
+        scatter = estimate_robust_std(off) + 1e-9
         off = off.clip(-_FAR * scatter, _FAR * scatter)
         total = np.concatenate(([0.0], np.cumsum(off)))
         step = (total[rows + after] - total[rows]) / after - (total[rows] - total[rows - before]) / before
         blocks = off[: off.size // block * block].reshape(-1, block).mean(1)
         # Differences of neighbours hold no jump, but for one of them.
-        density = np.square(_MAD * np.median(np.abs(np.diff(blocks)))) / 2.0 * block
+        density = estimate_robust_std(np.diff(blocks)) ** 2 / 2.0 * block
         std = np.sqrt(density * (1.0 / before + 1.0 / after)) + 1e-9
         top = int(np.argmax(np.abs(step) / std))
         change, spread = float(step[top]), float(std[top])

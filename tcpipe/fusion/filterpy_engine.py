@@ -154,7 +154,7 @@ def _open_up(ukf: UnscentedKalmanFilter, measured: _Measurement) -> None:
             ukf.P[kernel.YAW, kernel.YAW] += kernel.MAX_OPENED_RAD**2
 
 
-def run(belief: FilterState, q: NDArray[np.float64], events: Events, sources: Sources, outputs: Outputs) -> int:
+def run(belief: FilterState, q: NDArray[np.float64], events: Events, sources: Sources, outputs: Outputs) -> None:
     """Filter forward as `tcpipe.fusion.ukf15_kernel.run` does; a covariance that is not positive definite raises here."""
     ukf = _make_filter(belief)
     refused, clock_s, e = belief.refused, float(belief.clock_s[0]), 0
@@ -178,4 +178,3 @@ def run(belief: FilterState, q: NDArray[np.float64], events: Events, sources: So
         clock_s = max(clock_s, output_s)
         outputs.x[k], outputs.variance[k] = ukf.x, np.diag(ukf.P)
     belief.x[: kernel.STATES], belief.P[:, : kernel.STATES], belief.clock_s[0] = ukf.x, ukf.P, clock_s
-    return 0

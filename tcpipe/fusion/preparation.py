@@ -30,6 +30,7 @@ from tcpipe.fusion.measurements import (
 from tcpipe.fusion.signals import compute_median_period_ns, compute_seconds, estimate_white_noise, integrate_signal
 from tcpipe.geometry.datum import enu_from_geodetic
 from tcpipe.geometry.rotation import invert, matrix_from_quat, multiply, normalize, rotate, rotation_vector_from_quat
+from tcpipe.robust import estimate_robust_std
 from tcpipe.tables.findings import Finding, Subject, make_finding
 
 Floats = NDArray[np.float64]
@@ -256,7 +257,7 @@ def _estimate_shown_variance(stamp_ns: Ints, values: Floats, variance: Floats) -
     shown = np.zeros(values.size)
     if moving.sum() < _FEWEST_ROWS:
         return shown
-    noise = 1.4826 / np.sqrt(6.0) * float(np.median(second[moving]))
+    noise = estimate_robust_std(second[moving]) / np.sqrt(6.0)
     if noise > _SCATTERS_MORE * float(np.sqrt(np.median(variance[known]))):
         shown[known] = np.square(_estimate_local_noise(stamp_ns[known], values[known, None]))
     return shown

@@ -30,7 +30,7 @@ from tcpipe.fusion.signals import (
     estimate_white_noise,
     is_in_gap,
 )
-from tcpipe.power.noise import MEDIAN_OF_SQUARES
+from tcpipe.robust import estimate_robust_std
 
 WHEEL_SCALE_STD = 0.12  # a skid-steered robot on grass slips by so much
 VISUAL_SCALE_STD = 0.05  # stereo calibration
@@ -300,4 +300,4 @@ def _estimate_slide_density(visual: BodyVelocities | None) -> float:
     if visual is None or visual.stamp_ns.size < 3:
         return _UNSEEN_SLIDE
     shown = [compute_slopes(visual.stamp_ns, visual.velocity_mps[:, axis], _SLIDE_WINDOW_S) for axis in (1, 2)]
-    return max(_SLIDE, _ACCELERATION_LASTS_S * float(np.median(np.square(shown)) / MEDIAN_OF_SQUARES))
+    return max(_SLIDE, _ACCELERATION_LASTS_S * estimate_robust_std(np.array(shown)) ** 2)

@@ -39,7 +39,7 @@ from tcpipe.fusion.signals import (
     is_covered,
 )
 from tcpipe.geometry.rotation import rotation_vector_from_quat
-from tcpipe.power.noise import MEDIAN_OF_SQUARES
+from tcpipe.robust import estimate_robust_std
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -237,7 +237,7 @@ def _make_velocity_variance(m: Measurements, source: BodyVelocities, noise: Nois
 def _estimate_scatter(velocity_mps: Floats) -> float:
     """Return the variance of a moving odometry's samples around their neighbours', by the median: wild ones do not move it."""
     second = np.diff(velocity_mps, n=2)[(np.abs(velocity_mps) > _MOVING_MPS)[1:-1]]
-    return float(np.median(second**2) / (6.0 * MEDIAN_OF_SQUARES)) if second.size > 1 else 0.0
+    return estimate_robust_std(second) ** 2 / 6.0 if second.size > 1 else 0.0
 
 
 def _compute_unseen_turn_variance(stamp_ns: Ints, lever_arm_m: tuple[float, float, float]) -> Floats:

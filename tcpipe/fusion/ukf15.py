@@ -96,8 +96,7 @@ class ForwardResult:
     """Result of the filter.
 
     ``x`` and ``variance`` are states and variances at the wanted stamps, (K, 15); ``final`` the last state, (15,), and covariance, (15,
-    15); ``nis`` and ``outcome``, by source, the normalised innovation squared and what became of each measurement; ``repairs`` counts
-    losses of positive definiteness.
+    15); ``nis`` and ``outcome``, by source, the normalised innovation squared and what became of each measurement.
     """
 
     x: NDArray[np.float64]
@@ -105,7 +104,6 @@ class ForwardResult:
     final: tuple[NDArray[np.float64], NDArray[np.float64]]
     nis: list[NDArray[np.float64]]
     outcome: list[NDArray[np.int8]]
-    repairs: int
 
 
 def run_ukf15(
@@ -180,7 +178,7 @@ def filter_forward(
     outcome = [np.full(source.stamp_ns.size, NOT_RUN, np.int8) for source in sources]
     packed = _pack_sources(sources, gates)
     run = _run_of(engine)
-    reached, repairs = [0] * len(sources), 0
+    reached = [0] * len(sources)
     for first in range(0, output_ns.size, _BLOCK):
         block = slice(first, first + _BLOCK)
         until = [int(np.searchsorted(s.stamp_ns, output_ns[block][-1], side="right")) for s in sources]
@@ -188,7 +186,7 @@ def filter_forward(
         events, order = _sort_events(sources, rows, start_ns)
         times_s = np.asarray((output_ns[block] - start_ns) * 1e-9, np.float64)
         outputs = Outputs(times_s, states[block], variances[block], np.empty(order.size), np.empty(order.size, np.int8))
-        repairs += int(run(belief, np.asarray(q, np.float64), events, packed, outputs))
+        run(belief, np.asarray(q, np.float64), events, packed, outputs)
         cuts = np.cumsum([s.stop - s.start for s in rows])[:-1]
         for written, all_of in ((outputs.nis, nis), (outputs.outcome, outcome)):
             by_source = np.empty_like(written)
@@ -196,14 +194,12 @@ def filter_forward(
             for at, part in enumerate(np.split(by_source, cuts)):
                 all_of[at][rows[at]] = part
         reached = until
-    return ForwardResult(
-        states, variances, (belief.x[: kernel.STATES], belief.P[:, : kernel.STATES]), nis, outcome, repairs
-    )
+    return ForwardResult(states, variances, (belief.x[: kernel.STATES], belief.P[:, : kernel.STATES]), nis, outcome)
 
 
-def _run_of(engine: Literal["compiled", "filterpy"]) -> Callable[..., int]:
+def _run_of(engine: Literal["compiled", "filterpy"]) -> Callable[..., None]:
     if engine == "compiled":
-        compiled: Callable[..., int] = kernel.run
+        compiled: Callable[..., None] = kernel.run
         return compiled
     from tcpipe.fusion import filterpy_engine  # noqa: PLC0415  it takes more than a second to load
 
@@ -394,4 +390,4 @@ def _make_facts(sources: Sequence[SensorRows], found: ForwardResult) -> StretchF
         rejected[role] = int((outcome == REJECTED).sum())
         recovered[role] = int((outcome == RECOVERED).sum())
         nis_mean[role] = float(nis[accepted].sum() / freedom[accepted].sum()) if accepted.any() else None
-    return StretchFacts(nis_mean, measurements, rejected, found.repairs, recovered=recovered)
+    return StretchFacts(nis_mean, measurements, rejected, recovered=recovered)

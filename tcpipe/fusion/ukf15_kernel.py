@@ -480,18 +480,15 @@ def _forget_correlations(P: NDArray[np.float64]) -> None:
 @compile_kernel
 def advance(
     x: NDArray[np.float64], P: NDArray[np.float64], q: NDArray[np.float64], dt: float, work: NDArray[np.float64]
-) -> int:
-    """Predict over dt [s] in equal steps of at most 0.1 s; return how often the covariance had to be repaired."""
+) -> None:
+    """Predict over dt [s] in equal steps of at most 0.1 s."""
     if not dt > 0.0:
-        return 0
+        return
     steps = max(1, int(np.ceil(dt / MAX_STEP_S - 1e-9)))
-    repairs = 0
     for _ in range(steps):
         if not predict(x, P, q, dt / steps, work):
             _forget_correlations(P)
-            repairs += 1
             predict(x, P, q, dt / steps, work)
-    return repairs
 
 
 @compile_kernel
@@ -531,8 +528,8 @@ def is_locked_out(count: float, since_s: float, now_s: float) -> bool:
 
 
 @compile_kernel
-def run(belief: FilterState, q: NDArray[np.float64], events: Events, sources: Sources, outputs: Outputs) -> int:
-    """Filter forward through all events up to the last output; return how often the covariance was repaired. ``belief`` moves in place.
+def run(belief: FilterState, q: NDArray[np.float64], events: Events, sources: Sources, outputs: Outputs) -> None:
+    """Filter forward through all events up to the last output. ``belief`` moves in place.
 
     When a gate has rejected every measurement of a source for 5 s (and five of them), the estimate is wrong: the variance of the states
     that the source measures is inflated by the innovation, the measurement is fused, and its outcome is `RECOVERED`. ``q`` is the variance
@@ -541,12 +538,11 @@ def run(belief: FilterState, q: NDArray[np.float64], events: Events, sources: So
     x, P, refused = belief.x, belief.P, belief.refused
     work = np.zeros((48, ROW))
     clock_s = belief.clock_s[0]
-    repairs = 0
     e = 0
     for k in range(outputs.time_s.size):
         while e < events.time_s.size and events.time_s[e] <= outputs.time_s[k]:
             now_s = events.time_s[e]
-            repairs += advance(x, P, q, now_s - clock_s, work)
+            advance(x, P, q, now_s - clock_s, work)
             clock_s = max(clock_s, now_s)
             s = events.source[e]
             kind, gate, lever = sources.kind[s], sources.gate[s], sources.lever_m[s]
@@ -556,7 +552,6 @@ def run(belief: FilterState, q: NDArray[np.float64], events: Events, sources: So
             nis = update(x, P, kind, index, lever, z, variance, gate, work)
             if nis == np.inf:
                 _forget_correlations(P)
-                repairs += 1
                 nis = update(x, P, kind, index, lever, z, variance, gate, work)
             outputs.nis[e] = nis
             outputs.outcome[e] = ACCEPTED
@@ -573,10 +568,9 @@ def run(belief: FilterState, q: NDArray[np.float64], events: Events, sources: So
                     outputs.outcome[e] = RECOVERED
                     refused[s, 0] = 0.0
             e += 1
-        repairs += advance(x, P, q, outputs.time_s[k] - clock_s, work)
+        advance(x, P, q, outputs.time_s[k] - clock_s, work)
         clock_s = max(clock_s, outputs.time_s[k])
         for i in range(STATES):
             outputs.x[k, i] = x[i]
             outputs.variance[k, i] = P[i, i]
     belief.clock_s[0] = clock_s
-    return repairs

@@ -8,6 +8,7 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import betaincinv
 
 from tcpipe.errors import FusionError
 from tcpipe.fusion.measurements import GNSS, VISUAL, WHEELS, BodyVelocities, Positions
@@ -27,9 +28,10 @@ _LEAST_MPS = 0.1  # slower chords have no direction
 _SCALE_CHORDS = 10  # fewer chords outside the windows give no scale
 _SCALE_STD = {WHEELS: WHEEL_SCALE_STD, VISUAL: VISUAL_SCALE_STD}
 _NOMINAL = (0.6827, 0.9545)
-_SIGNIFICANT = 2.0  # standard deviations of a share of windows
+_FEWEST_WINDOWS = 5  # fewer can share one place or one fault, and decide nothing
+_TAIL = 0.025  # of a share's interval, on either side
 
-Calibration = Literal["overconfident", "calibrated", "underconfident"]
+Calibration = Literal["overconfident", "calibrated", "underconfident", "undecided"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,8 +61,9 @@ class Comparison:
 class WithheldScore:
     """Errors against a withheld sensor over windows of one length [m], and the share of errors inside the σ that is claimed of them.
 
-    A window is one observation: ``calibration`` names a share that differs from the normal distribution's beyond 2σ of so many windows.
-    The σ of an odometry is the prior of its scale, which is wide: it cannot show that a track is underconfident.
+    The values of a window share its errors: ``calibration`` counts a window as one observation. It names a share whose exact binomial 95 %
+    interval excludes that of the normal distribution; fewer than five windows are ``undecided``. The σ of an odometry is the prior of
+    its scale, which is wide: it cannot show that a track is underconfident.
     """
 
     role: str
@@ -106,10 +109,13 @@ def score_comparisons(comparisons: Sequence[Comparison]) -> WithheldScore:
 
 
 def _judge_coverage(within: tuple[float, float], windows: int, *, is_fix: bool) -> Calibration:
-    spread = [_SIGNIFICANT * float(np.sqrt(share * (1.0 - share) / windows)) for share in _NOMINAL]
-    if within[1] < _NOMINAL[1] - spread[1]:
+    if windows < _FEWEST_WINDOWS:
+        return "undecided"
+    count_1, count_2 = (share * windows for share in within)
+    if count_2 < windows and betaincinv(count_2 + 1.0, windows - count_2, 1.0 - _TAIL) < _NOMINAL[1]:
         return "overconfident"
-    return "underconfident" if is_fix and within[0] > _NOMINAL[0] + spread[0] else "calibrated"
+    is_low = is_fix and count_1 > 0.0 and betaincinv(count_1, windows - count_1 + 1.0, _TAIL) > _NOMINAL[0]
+    return "underconfident" if is_low else "calibrated"
 
 
 def place_windows(span_s: float, length_s: float) -> Floats:

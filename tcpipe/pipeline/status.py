@@ -38,6 +38,7 @@ from tcpipe.pipeline.log_sources import find_sources, make_definitions_key, reca
 from tcpipe.pipeline.plan import LOG_STATES, TROUBLE, IngestTask, LogState, Step, plan
 from tcpipe.pipeline.problems import find_incomplete_runs, make_missing, make_waiting
 from tcpipe.recipe import Recipe
+from tcpipe.robust import estimate_robust_std
 from tcpipe.store import Store, open_store
 from tcpipe.tables.findings import Finding, Severity, Subject, Verdict, judge_by_code, make_finding, read_threshold
 
@@ -312,7 +313,7 @@ def find_shift(values: Sequence[float]) -> Shift | None:
     """Return how the latest values of a series differ from those before; None where they do not.
 
     The latest quarter of the values, at most 20, is compared with those before: the medians must differ by more than three robust standard
-    deviations (1.4826 times the median absolute deviation) of the earlier values and by 5 % of their median (thresholds of the catalogue).
+    deviations (by the median absolute deviation) of the earlier values and by 5 % of their median (thresholds of the catalogue).
     """
     if len(values) < read_threshold(_CHANGE, "min_runs_count"):
         return None
@@ -321,7 +322,7 @@ def find_shift(values: Sequence[float]) -> Shift | None:
     )
     earlier, latest = np.array(values[:-count], float), np.array(values[-count:], float)
     before, after = float(np.median(earlier)), float(np.median(latest))
-    scatter = 1.4826 * float(np.median(np.abs(earlier - before)))
+    scatter = estimate_robust_std(earlier - before)
     enough = max(
         read_threshold(_CHANGE, "min_scatter_ratio") * scatter,
         read_threshold(_CHANGE, "min_change_fraction") * abs(before),

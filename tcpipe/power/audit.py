@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.power.rails import Rail, interpolate_rail
+from tcpipe.robust import estimate_robust_std
 from tcpipe.tables.findings import read_threshold
 
 Floats = NDArray[np.float64]
@@ -27,7 +28,6 @@ _FEWEST_BLOCKS = 6
 _FEWEST_SAMPLES = 400
 _CLEAR, _SURE, _GRADUAL = 20.0, 5.0, 3.0
 """Standard deviations that show the resistance itself, a change of it, and that it is not gradual (a battery warms up)."""
-_NORMAL = 0.6745
 """Median of the absolute value of a normal variate of unit variance."""
 _FEWEST_BRAKED = 5
 _LIKELY = 8.0
@@ -182,7 +182,7 @@ def find_lost_signs(sag: Sag | None, start_ns: Stamps, end_ns: Stamps, rise: Flo
     if not _is_known(by_volt[driven], by_amp[driven]):
         return nothing
     resistance = -float(by_volt[driven].sum()) / float(by_amp[driven].sum())
-    residual_volt = float(np.median(np.abs(sag.volt + resistance * sag.amp))) / _NORMAL
+    residual_volt = estimate_robust_std(sag.volt + resistance * sag.amp)
     gain = 2.0 * resistance * by_volt / residual_volt**2
     clear = gain > _LIKELY
     count, chance = np.count_nonzero(clear & ~driven), clear[driven].mean() * np.count_nonzero(~driven)

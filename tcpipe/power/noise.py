@@ -28,6 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.power.rails import Rail, Samples, interpolate_rail
+from tcpipe.robust import MEDIAN_OF_SQUARES
 
 Floats = NDArray[np.float64]
 Stamps = NDArray[np.int64]
@@ -269,8 +270,6 @@ _MOST_OF_CALMEST = 2.0
 _NOT_NOISE = 16.0
 """A square beyond so many variances is no noise: of a normal variate one in 16,000."""
 _SIEVES = 5
-MEDIAN_OF_SQUARES = 0.4549
-"""Of a normal variate of unit variance."""
 _OVERLAP_NODES = 24  # of the overlap of two periods
 
 

@@ -140,7 +140,6 @@ class StretchFacts:
     nis_mean: Mapping[str, float | None]
     measurements: Mapping[str, int]
     rejected: Mapping[str, int]
-    covariance_repairs: int
     recovered: Mapping[str, int] | None = field(default=None, metadata=LEFT_OUT)
     reopened: Mapping[str, int] | None = field(default=None, metadata=LEFT_OUT)
     events: int | None = field(default=None, metadata=LEFT_OUT)

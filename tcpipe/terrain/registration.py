@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import minimum_filter
 
+from tcpipe.robust import estimate_robust_std
 from tcpipe.tables.findings import read_threshold
 from tcpipe.terrain.tiles import MapReader, choose_level, group_by_tile, read_window
 
@@ -129,7 +130,7 @@ def register_track(source: MapReader, xy_m: FloatArray, height_m: FloatArray) ->
     excess_m = ground_m[whole] - height_m[at][whole, None, None]
     best = _find_least(np.median(np.abs(excess_m - np.median(excess_m, axis=0)), axis=0))
     left = np.abs(excess_m[:, *best] - np.median(excess_m[:, *best]))
-    good = left <= _OUTLIER * 1.4826 * np.median(left) + 1e-6  # what is not the ground: bridges, trees
+    good = left <= _OUTLIER * estimate_robust_std(left) + 1e-6  # what is not the ground: bridges, trees
     best = _find_least(excess_m[good].var(axis=0))
     scale = _fit_height_scale(ground_m[whole][good], height_m[at][whole][good])
     return _refine_shift(excess_m[good], best, shift_m, scale)

@@ -42,7 +42,7 @@ from tcpipe.fusion.signals import (
 )
 from tcpipe.fusion.trajectory import DISPLACEMENT_LAGS_S, Trajectory
 from tcpipe.geometry.rotation import matrix_from_quat, quat_from_matrix, rotation_vector_from_quat
-from tcpipe.power.noise import MEDIAN_OF_SQUARES
+from tcpipe.robust import MEDIAN_OF_SQUARES
 from tcpipe.tables.facts import Disagreement
 
 Floats = NDArray[np.float64]

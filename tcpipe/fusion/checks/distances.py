@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from tcpipe.fusion.checks.lags import GRID_S, Floats, resample_fixes
 from tcpipe.fusion.checks.plausibility import SensorExclusion
 from tcpipe.fusion.measurements import GNSS, IMU, WHEELS, Measurements, Positions
+from tcpipe.robust import estimate_robust_std
 
 COMMAND = "command"
 """The command's name among the distances; it is never excluded."""
@@ -153,7 +154,7 @@ def estimate_far_scale(gnss: Positions, twist: Floats, at_ns: NDArray[np.int64])
     if len(ratios) < max(_FEWEST_WINDOWS, (1.0 - _UNLIKE_WINDOWS) * windows):
         return None
     factor = float(np.median(ratios))
-    spread = 1.4826 * float(np.median(np.abs(np.array(ratios) - factor)))
+    spread = estimate_robust_std(np.array(ratios) - factor)
     low, high = _NEAR_ONE
     if low < factor < high or not 1 / _MOST < factor < _MOST or spread > _ALIKE * abs(factor - 1.0):
         return None

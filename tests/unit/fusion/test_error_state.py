@@ -81,7 +81,6 @@ def test_facts_name_what_the_sensors_were():
     assert facts.visual_scale == pytest.approx(1.02, abs=0.01)
     assert set(facts.nis_mean) == {GNSS, WHEELS, VISUAL}
     assert all(0.2 < facts.nis_mean[role] < 1.6 for role in (GNSS, WHEELS, VISUAL))
-    assert facts.covariance_repairs == 0
 
 
 def test_outliers_are_refused_and_listed():

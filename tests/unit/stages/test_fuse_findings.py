@@ -22,7 +22,7 @@ ALL = ("gnss", "imu", "wheel_odometry")
 
 
 def stretch(*, sensors=ALL, heading_from="course over ground", **said):
-    told = {"nis_mean": {}, "measurements": {}, "rejected": {}, "covariance_repairs": 0} | said
+    told = {"nis_mean": {}, "measurements": {}, "rejected": {}} | said
     return StretchFacts(**told, sensors=sensors, heading_from=heading_from)
 
 
@@ -149,7 +149,7 @@ NOBODY = FusionInputs(None), Streams({}, {}, "husky")
 
 def fused(*found, tallies=()):
     return Fused(
-        facts=[StretchFacts({}, {}, {}, 0, start_ns=100 * SECOND_NS)], disagreements=list(found), tallies=list(tallies)
+        facts=[StretchFacts({}, {}, {}, start_ns=100 * SECOND_NS)], disagreements=list(found), tallies=list(tallies)
     )
 
 

@@ -25,8 +25,8 @@ def streams(placed_by="tf_static"):
 def make_findings(log, **parameters):
     """Return what is found of a run with sections that show nothing, and parameters, by name with spaces as underscores."""
     shown = {name.replace("_", " "): ParameterFacts(*of) for name, of in parameters.items()}
-    long = StretchFacts({}, {}, {}, 0, start_ns=0, end_ns=100, parameters=shown)
-    return make_mounting_findings(FusionInputs(None), Fused(facts=[StretchFacts({}, {}, {}, 0, end_ns=9), long]), log)
+    long = StretchFacts({}, {}, {}, start_ns=0, end_ns=100, parameters=shown)
+    return make_mounting_findings(FusionInputs(None), Fused(facts=[StretchFacts({}, {}, {}, end_ns=9), long]), log)
 
 
 def antenna(std_m):

@@ -234,7 +234,7 @@ def test_segments_in_which_the_gate_of_the_fixes_reopened_are_flagged():
         return GateReset(role, int(ZERO + begin_s * 1e9), int(ZERO + end_s * 1e9), 0.5)
 
     track = straight_track(SPEED)
-    stretch = StretchFacts({}, {}, {}, 0, gate_resets=(refused("gnss", 20, 30), refused("wheel_odometry", 40, 50)))
+    stretch = StretchFacts({}, {}, {}, gate_resets=(refused("gnss", 20, 30), refused("wheel_odometry", 40, 50)))
     facts = replace(track.info.report.facts, fuse=FuseFacts(0, (), {}, {}, {}, {}, 0.0, (stretch,)))
     told = replace(track, info=replace(track.info, report=StageReport((), facts)))
     labelled = label(told, power_streams({"drive": record()}))

@@ -152,7 +152,7 @@ def test_a_disagreement_that_is_settled_or_of_another_epoch_is_none():
 @pytest.mark.parametrize(("role", "disputed"), [("gnss", True), ("wheel_odometry", False)])
 def test_fixes_that_were_off_dispute_a_segment(role, disputed):
     off = GateReset(role, int(STAMPS[110]), int(STAMPS[115]), 1.0)
-    stretch = StretchFacts({}, {}, {}, 0, gate_resets=(off,))
+    stretch = StretchFacts({}, {}, {}, gate_resets=(off,))
     fuse = FuseFacts(200, ("gnss",), {}, {}, {}, {}, 0.0, (stretch,))
     assert (flags(cut(), about=info(fuse=fuse)) == {Quality.SENSORS_DISAGREE}) == disputed
 

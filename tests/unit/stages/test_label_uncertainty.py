@@ -72,7 +72,7 @@ def test_the_recipe_states_a_better_sensor():
 
 def section(**values):
     ends = {"start_ns": ZERO, "end_ns": ZERO + 80_000_000_000}
-    fused = StretchFacts({}, {}, {}, 0, **ends, **values)
+    fused = StretchFacts({}, {}, {}, **ends, **values)
     return {"fuse": FuseFacts(0, (), {}, {}, {}, {}, 0.0, (fused,))}
 
 

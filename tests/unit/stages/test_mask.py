@@ -157,7 +157,7 @@ def test_an_error_of_scale_that_a_run_has_in_common_makes_no_gap():
     assert rows_of(gate(track), DropReason.GAP).all()
     stamp_ns = track.table["stamp_ns"].to_numpy()
     ends = {"start_ns": int(stamp_ns[0]), "end_ns": int(stamp_ns[-1])}
-    stretch = StretchFacts({}, {}, {}, 0, common_scale_std=0.12, **ends)
+    stretch = StretchFacts({}, {}, {}, common_scale_std=0.12, **ends)
     facts = replace(track.info.report.facts, fuse=FuseFacts(200, (), {}, {}, {}, {}, 0.0, (stretch,)))
     known = gate(replace(track, info=replace(track.info, report=StageReport((), facts))))
     assert not rows_of(known, DropReason.GAP).any()

@@ -10,7 +10,7 @@ from unit.fusion import drive
 from unit.stages.test_fuse import filled, sensor, streams_of
 
 from tcpipe.errors import FusionError
-from tcpipe.fusion.withheld import place_windows, score_comparisons
+from tcpipe.fusion.withheld import Comparison, place_windows, score_comparisons
 from tcpipe.recipe import FuseConfig
 from tcpipe.stages import withheld
 from tcpipe.stages.fuse import fuse_run
@@ -89,7 +89,7 @@ def test_an_error_of_the_track_is_what_the_fixes_show_of_it(streams, track, monk
 
 def test_a_sigma_is_held_against_errors_of_its_size(streams, track, monkeypatch):
     def score(claimed_m):
-        comparisons = audited(streams, track, monkeypatch, shift(0.3, claimed_m))
+        comparisons = audited(streams, track, monkeypatch, shift(0.3, claimed_m), windows_s=(5.0,))
         return score_comparisons([of for of in comparisons if of.chord_s is None])
 
     honest, tenth, vast = score(0.3), score(0.03), score(3.0)
@@ -114,11 +114,30 @@ def test_what_is_not_known_of_the_lever_arm_is_no_part_of_the_antennas_sigma(str
     assert score_comparisons([fixes]).median_error_m < 0.05, "the antenna is where the estimated arm has it"
 
 
-def test_one_window_shows_only_gross_overconfidence(streams, track, monkeypatch):
-    comparisons = audited(streams, track, monkeypatch, shift(0.3, 0.03), windows_s=(150.0,))
-    (fixes,) = (of for of in comparisons if of.chord_s is None)
-    assert score_comparisons([fixes]).calibration == "overconfident"
-    assert score_comparisons([replace(fixes, std_m=fixes.std_m * 100.0)]).calibration == "calibrated"
+def make_fixes(shares_inside, values=20):
+    """Return fixes of as many windows as shares, of which such a share errs by half a σ and the rest by three."""
+    inside = [np.arange(values) < share * values for share in shares_inside]
+    error = np.where(np.concatenate(inside), 0.5, 3.0)[:, None] * np.ones(2)
+    window = np.repeat(np.arange(len(shares_inside)), values)
+    return Comparison("gnss", 60.0, None, window, error, np.ones_like(error), error[:, 0])
+
+
+@pytest.mark.parametrize(
+    ("shares_inside", "calibration"),
+    [
+        ((0.2, 1.0), "undecided"),  # as the demo's log: 60 % of 40 values inside, from two windows
+        ((0.0, 0.0), "undecided"),
+        ((0.0,) * 5, "overconfident"),
+        ((0.0, 0.0, 1.0, 1.0, 1.0, 1.0, 1.0), "calibrated"),
+        ((0.0, 0.0, 0.0, 1.0, 1.0, 1.0, 1.0), "overconfident"),
+        ((1.0,) * 9, "calibrated"),
+        ((1.0,) * 12, "underconfident"),
+    ],
+)
+def test_a_verdict_counts_windows_not_their_values(shares_inside, calibration):
+    score = score_comparisons([make_fixes(shares_inside)])
+    assert (score.windows, score.calibration) == (len(shares_inside), calibration)
+    assert score_comparisons([make_fixes(shares_inside, values=200)]).calibration == calibration
 
 
 @pytest.mark.parametrize("role", ["wheel_odometry", "visual_odometry"])
