@@ -166,7 +166,7 @@ POSE = _make_stream_schema(
     ),
     *(
         _make_nullable(
-            f"quat_{c}", "1", f"attitude frame_from_sensor, {c}; null where it is none", "pose_crs or its own"
+            f"quat_{c}", "1", f"frame_from_sensor, {c}; null where unknown", "pose_crs or its own"
         )
         for c in "xyzw"
     ),
