@@ -129,7 +129,7 @@ def prepare_positions(
             for names in (
                 ("x_m", "y_m"),
                 [f"quat_{c}" for c in "xyzw"],
-                [f"{axis}_rotation_var_rad2" for axis in "xyz"],
+                [f"rotation_{axis}_var" for axis in "xyz"],
             )
         )
         made = add_attitude(made, frame, quat, rotation_variance, mounting_xyzw)

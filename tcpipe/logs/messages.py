@@ -472,16 +472,15 @@ def _read_pose(columns: Columns) -> Readings:
     quat, bad = _read_orientation(columns, prefix.replace("position", "orientation"))
     if np.all(quat == quat[:1]):  # positions alone
         quat[:] = np.nan
-    if np.all(place[:, 2] == place[:1, 2]):  # a map in the plane
-        variances[:, 2] = _NO_HEIGHT_M2
+    variances[(place[:, 2] == place[:1, 2]).all(), 2] = _NO_HEIGHT_M2  # a map in the plane
     unknown = np.full(len(place), np.nan)
     values: dict[str, NDArray[Any]] = {f"{axis}_m": place[:, i] for i, axis in enumerate("xyz")}
     values |= dict.fromkeys(("lon_deg", "lat_deg", "alt_m"), unknown)
     values |= {f"{axis}_var_m2": variances[:, i] for i, axis in enumerate(("east", "north", "up"))}
     values |= {f"quat_{c}": quat[:, i] for i, c in enumerate("xyzw")}
-    values |= {f"{axis}_rotation_var_rad2": variances[:, 3 + i] for i, axis in enumerate("xyz")}
-    notes = {"without_covariance": int(np.count_nonzero(np.isnan(variances[:, 0])))}
-    notes |= {"bad_quaternions": int(np.count_nonzero(bad))}
+    values |= {f"rotation_{axis}_var": variances[:, 3 + i] for i, axis in enumerate("xyz")}
+    counted = {"without_covariance": np.isnan(variances[:, 0]), "bad_quaternions": bad}
+    notes = {name: int(np.count_nonzero(rows)) for name, rows in counted.items()}
     return _select_rows(columns, values, {"not_finite": ~np.isfinite(place.sum(-1))}, notes=notes)
 
 

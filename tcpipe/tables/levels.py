@@ -165,15 +165,10 @@ POSE = _make_stream_schema(
         for name, axis in (("east", "x"), ("north", "y"), ("up", "z"))
     ),
     *(
-        _make_nullable(
-            f"quat_{c}", "1", f"frame_from_sensor, {c}; null where unknown", "pose_crs or its own"
-        )
+        _make_nullable(f"quat_{c}", "1", f"frame_from_sensor, {c}; null where unknown", "pose_crs or its own")
         for c in "xyzw"
     ),
-    *(
-        _make_nullable(f"{axis}_rotation_var_rad2", "rad2", f"variance about {axis}; null where unknown")
-        for axis in "xyz"
-    ),
+    *(_make_nullable(f"rotation_{axis}_var", "rad2", f"variance about {axis}; null where unknown") for axis in "xyz"),
 )
 
 STREAMS: dict[str, TableSchema] = {
