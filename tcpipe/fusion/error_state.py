@@ -279,14 +279,7 @@ def _make_trajectory(  # noqa: PLR0917
         # What fixes claim beyond what the run shows lasts longer than the run can show.
         for axes, fix in ((slice(0, 2), noise.horizontal), (slice(2, 3), noise.vertical)):
             position_variance[:, axes] += max(0.0, fix.claimed_m2 - fix.white_m2 - fix.correlated.variance)
-<<<<<<< HEAD
-    if m.gnss is not None and not std[state.ARM + 2] and std[state.ARM]:
-        height_std = m.gnss.lever_arm_std_m[2]
-        position_variance += np.square([slope_std * height_std, slope_std * height_std, height_std])
-    if m.gnss is not None and not std[state.ARM : state.ARM + 3].any():
-=======
-    if m.gnss is not None and m.imu is None:
->>>>>>> dev
+    if m.gnss is not None and m.imu is None and not m.has_posed_tilt:
         turned = np.unwrap(np.arctan2(rotation[:, 1, 0], rotation[:, 0, 0]))
         # Without a gyroscope the noise of roll passes for sway: the height of the antenna is no better known than it was stated.
         unseen = np.asarray(m.gnss.lever_arm_std_m) * [not std[state.ARM], not std[state.ARM + 1], 1.0]

@@ -472,10 +472,10 @@ def _read_pose(columns: Columns) -> Readings:
     quat, bad = _read_orientation(columns, prefix.replace("position", "orientation"))
     if np.all(quat == quat[:1]):  # positions alone
         quat[:] = np.nan
-    variances[(place[:, 2] == place[:1, 2]).all(), 2] = _NO_HEIGHT_M2  # a map in the plane
-    unknown = np.full(len(place), np.nan)
+    if np.all(place[:, 2] == place[:1, 2]):  # a map in the plane
+        variances[:, 2] = _NO_HEIGHT_M2
     values: dict[str, NDArray[Any]] = {f"{axis}_m": place[:, i] for i, axis in enumerate("xyz")}
-    values |= dict.fromkeys(("lon_deg", "lat_deg", "alt_m"), unknown)
+    values |= dict.fromkeys(("lon_deg", "lat_deg", "alt_m"), np.full(len(place), np.nan))
     values |= {f"{axis}_var_m2": variances[:, i] for i, axis in enumerate(("east", "north", "up"))}
     values |= {f"quat_{c}": quat[:, i] for i, c in enumerate("xyzw")}
     values |= {f"rotation_{axis}_var": variances[:, 3 + i] for i, axis in enumerate("xyz")}
