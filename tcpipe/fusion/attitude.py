@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.fusion.measurements import BodyVelocities, Positions
+from tcpipe.fusion.measurements import UNMEASURED_RAD2, BodyVelocities, Positions
 from tcpipe.geometry.rotation import (
     invert,
     matrix_from_quat,
@@ -29,7 +29,6 @@ Floats = NDArray[np.float64]
 STATED_MOUNTING_STD_RAD, UNSTATED_MOUNTING_STD_RAD = 0.0175, 0.1
 _DEFAULT_STD_RAD = 0.01  # scan matching and visual SLAM state none, or any
 _FLOOR_STD_RAD = 0.003
-_UNMEASURED_RAD2 = 1e2
 _FLAT = 1e-6  # of the lowest row of the rotation matrices: a pose in the plane has yaw alone
 _FEWEST = 20  # attitudes, and chords
 _CHORD_NS = 1_000_000_000
@@ -63,7 +62,7 @@ def add_attitude(
     stated[:, :2] = stated[:, :2].mean(1, keepdims=True)  # of roll and pitch, whatever the yaw
     variance = np.maximum(stated, np.maximum(shown, _FLOOR_STD_RAD**2))
     if np.ptp(matrix_from_quat(quat_xyzw[known])[:, 2], axis=0).max() < _FLAT:
-        variance[:, :2] = _UNMEASURED_RAD2
+        variance[:, :2] = UNMEASURED_RAD2
     return replace(
         fixes,
         quat_xyzw=quat,

@@ -29,7 +29,8 @@ UNSTATED_ARM_STD_M = (0.5, 0.5, 0.5)
 
 _UNMEASURED_M2PS2 = 1e3
 """A variance from which on an axis is not measured (ruling)."""
-_UNMEASURED_RAD2 = 10.0
+UNMEASURED_RAD2 = 1e2
+"""Variance of a rotation about an axis that is not measured."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -163,7 +164,7 @@ class Measurements:
     def has_posed_tilt(self) -> bool:
         """Whether a pose measures roll and pitch."""
         variance = None if self.gnss is None else self.gnss.rotation_variance_rad2
-        return variance is not None and float(variance[0, 0]) < _UNMEASURED_RAD2
+        return variance is not None and float(variance[0, 0]) < UNMEASURED_RAD2
 
     def odometries(self) -> dict[str, BodyVelocities]:
         """Return the odometries that are there, by role; the wheels' first."""

@@ -303,7 +303,7 @@ _Named = TypeVar("_Named")
 
 def name_pose(value: _Named) -> _Named:
     """Return findings or facts in which the role of the pose stands for that of the fixes as which it was fused."""
-    named: Any = value
+    named = cast("object", value)
     if isinstance(value, str):
         named = POSE if value == GNSS else value
     elif isinstance(value, Mapping):
