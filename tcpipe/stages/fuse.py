@@ -24,7 +24,7 @@ from tcpipe.stages.fuse_inputs import (
     prepare_pose,
 )
 from tcpipe.stages.fuse_sections import Fused, fuse_sections, make_rejections_table
-from tcpipe.tables.facts import SensorChecks
+from tcpipe.tables.facts import SensorChecks, StageFacts
 from tcpipe.tables.findings import Finding, StageReport, Subject, make_finding
 from tcpipe.tables.levels import TRACK, Datum, Streams, Track, TrackInfo
 
@@ -79,16 +79,23 @@ def _fuse(streams: Streams, config: FuseConfig, run_id: str) -> Track:
         *find_fuse_findings(inputs, summary, run=run),
         *(finding for each in found for finding in each.findings),
     )
-    made = {
-        "fuse": summary,
-        "sensor_checks": sanity.facts,
-        "mounting": mounting.facts,
-        "audit": audit.facts,
-        "clock_offsets": clocks.facts,
-    }
+    made = StageFacts(
+        fuse=summary,
+        sensor_checks=sanity.facts,
+        mounting=mounting.facts,
+        audit=audit.facts,
+        clock_offsets=clocks.facts,
+    )
     if is_posed:
         findings, made = name_pose(findings), name_pose(made)
-    facts = replace(streams.report.facts, **made)
+    facts = replace(
+        streams.report.facts,
+        fuse=made.fuse,
+        sensor_checks=made.sensor_checks,
+        mounting=made.mounting,
+        audit=made.audit,
+        clock_offsets=made.clock_offsets,
+    )
     report = StageReport((*_drop_places(streams.report.findings, findings), *findings), facts)
     info = TrackInfo(run_id, streams.robot, datum, config.rate_hz, config.estimator, report)
     return Track(table, make_rejections_table(inputs, fused.found, POSE if is_posed else GNSS), info)
