@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from tcpipe.fusion.attitude import add_attitude
 from tcpipe.fusion.measurements import (
     IMU,
     VISUAL,
@@ -114,8 +115,12 @@ def prepare_positions(
     lever_arm_std_m: tuple[float, float, float],
     default_std_m: float,
     floor_std_m: float,
+    mounting_xyzw: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0),
 ) -> tuple[Positions, Prepared]:
-    """Prepare GNSS fixes (columns of the role gnss); unknown variances: ``default_std_m`` horizontally, twice that vertically."""
+    """Prepare GNSS fixes (columns of the role gnss); unknown variances: ``default_std_m`` horizontally, twice that vertically.
+
+    Or a pose (columns of the role pose), whose sensor is turned by ``mounting_xyzw`` to base_link.
+    """
     lon, lat, alt = columns["lon_deg"], columns["lat_deg"], columns["alt_m"]
     usable, repeated = _select_usable_rows(stamp_ns, _is_fix(lon, lat, alt))
     variance = _stack_columns(columns, [f"{axis}_var_m2" for axis in ("east", "north", "up")])[usable]
@@ -126,6 +131,16 @@ def prepare_positions(
     prepared = Prepared(stamp_ns[~_is_fix(lon, lat, alt)], repeated, replaced)
     unclaimed_rows = unclaimed if unclaimed.any() else None
     made = Positions(stamp_ns[usable], fixes, variance, lever_arm_m, lever_arm_std_m, unclaimed_rows)
+    if "quat_x" in columns:
+        frame, quat, rotation_variance = (
+            _stack_columns(columns, names)[usable]
+            for names in (
+                ("x_m", "y_m"),
+                [f"quat_{c}" for c in "xyzw"],
+                [f"rotation_{axis}_var" for axis in "xyz"],
+            )
+        )
+        made = add_attitude(made, frame, quat, rotation_variance, mounting_xyzw)
     return made, prepared
 
 
