@@ -297,8 +297,6 @@ def path_or_store(kind: Place) -> Option:
     """Return the decorator that declares PATH, without which a command works on the store as all others do."""
 
     def decorate(run: Callable[..., Any]) -> Callable[..., Any]:
-        @click.argument("path", type=kind, required=False, metavar="[PATH]")
-        @store_option
         @click.pass_context
         @wraps(run)
         def command(context: click.Context, /, *, path: str | None, store: str, **values: Any) -> Any:
@@ -306,7 +304,10 @@ def path_or_store(kind: Place) -> Option:
                 raise UsageError(f"{path}: PATH and --store are given; give one of them")
             return run(path=store if path is None else path, **values)
 
-        return command
+        declared: Callable[..., Any] = click.argument("path", type=kind, required=False, metavar="[PATH]")(
+            store_option(command)
+        )
+        return declared
 
     return decorate
 

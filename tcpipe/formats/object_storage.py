@@ -1,7 +1,7 @@
 """Logs in object storage (``s3://``, ``gs://``, ``az://``, ``http(s)://``, ``file://``): read by range, or copied to this machine.
 
-The home of obstore. Credentials, region and endpoint come from the environment, as the store's own tools take them (``AWS_…``), and from the
-profile of Amazon's.
+The home of obstore. Credentials, region and endpoint come from the environment, as the store's own tools take them (``AWS_…``), and from an
+``aws`` profile.
 """
 
 from __future__ import annotations
@@ -87,7 +87,8 @@ _REFUSED = {
 }
 """Codes of denial that say more than that it is one."""
 _CREDENTIALS = {
-    "s3": "AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or AWS_PROFILE; AWS_SKIP_SIGNATURE=true for public data; AWS_REGION; AWS_ENDPOINT_URL",
+    "s3": "AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or AWS_PROFILE; AWS_SKIP_SIGNATURE=true for public data; AWS_REGION; "
+    "AWS_ENDPOINT_URL",
     "gs": "GOOGLE_APPLICATION_CREDENTIALS, or GOOGLE_SKIP_SIGNATURE=true for what is public",
     "az": "AZURE_STORAGE_ACCOUNT_NAME and AZURE_STORAGE_ACCOUNT_KEY, or AZURE_SKIP_SIGNATURE=true for what is public",
 }
