@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -17,7 +17,7 @@ from tcpipe.formats.commits import State
 from tcpipe.formats.index_files import RunFacts
 from tcpipe.formats.integrity import Checksum, compute_checksum, compute_checksums, find_wrong_checksum
 from tcpipe.formats.parquet import read_range, read_table, write_table
-from tcpipe.formats.place import DirectoryPlace, Place
+from tcpipe.formats.place import Place
 from tcpipe.formats.recipe_toml import read_key
 from tcpipe.formats.run_documents import Manifest, name_folder, read_as_at
 from tcpipe.tables.findings import judge_again
@@ -148,7 +148,7 @@ def look_at_files(place: Place, rows: Iterable[RunFacts]) -> Iterator[tuple[RunF
     rows : ingestions as the log has them.
     """
     rows = list(rows)
-    find = _find_on_disk(place.root) if isinstance(place, DirectoryPlace) else _find_listed(place, rows)
+    find = make_file_finder(place, rows)
     for row in rows:
         states, lost = list[tuple[int, int]](), None
         for name, size_bytes in row.files.items():
@@ -160,9 +160,12 @@ def look_at_files(place: Place, rows: Iterable[RunFacts]) -> Iterator[tuple[RunF
         yield row, lost, tuple(states)
 
 
-def _find_on_disk(root: Path) -> Callable[[str], tuple[int, int] | None]:
-    """Return what tells the size [byte] and modification time [ns] of a file; None where there is none."""
+def make_file_finder(place: Place, rows: Collection[RunFacts]) -> Callable[[str], tuple[int, int] | None]:
+    """Return what tells the size [byte] and modification time [ns] of a file of the runs of rows; None where there is none."""
+    return _find_on_disk(place.path) if place.path else _find_listed(place, rows)
 
+
+def _find_on_disk(root: Path) -> Callable[[str], tuple[int, int] | None]:
     def find(name: str) -> tuple[int, int] | None:
         try:
             seen = os.stat(f"{root}/{name}")  # noqa: PTH116  of ten thousands
@@ -173,8 +176,8 @@ def _find_on_disk(root: Path) -> Callable[[str], tuple[int, int] | None]:
     return find
 
 
-def _find_listed(place: Place, rows: Sequence[RunFacts]) -> Callable[[str], tuple[int, int] | None]:
-    """Return the same from a listing of the run, or of all."""
+def _find_listed(place: Place, rows: Collection[RunFacts]) -> Callable[[str], tuple[int, int] | None]:
+    """Return it from a listing of the run, or of all."""
     run_ids = {row.run_id for row in rows}
     found = place.entries(run_ids.pop() if len(run_ids) == 1 else "") if rows else []
     return {entry.name: (entry.size_bytes, entry.modified_ns) for entry in found}.get
@@ -228,7 +231,7 @@ def fetch_local_file(place: Place, name: str, wanted: Checksum) -> Path:
     """Return a file on this machine, proved; `StoreError` if it is not as it was written."""
     path = place.local(name, wanted)
     wrong = find_wrong_checksum(place.where(name), compute_checksum(path) if path.is_file() else None, wanted)
-    if wrong and not isinstance(place, DirectoryPlace):  # the copy in the cache; a new one is proved when it is made
+    if wrong and place.path is None:  # the copy in the cache; a new one is proved when it is made
         path.unlink(missing_ok=True)
         return place.local(name, wanted)
     if wrong:
@@ -274,7 +277,7 @@ def lend_streams(place: Place, streams: Streams, stored: Mapping[str, Checksum])
     place : of the run.
     stored : the files of L1 in it.
     """
-    if not isinstance(place, DirectoryPlace):
+    if place.path is None:
         return streams
     files = {PurePosixPath(name).stem: place.local(name, of) for name, of in stored.items()}
     held = {role: table for role, table in streams.tables.items() if role not in _LENT}

@@ -20,7 +20,7 @@ from tcpipe.errors import DatasetError, StoreError, UsageError
 from tcpipe.formats.integrity import seal_document, write_sealed
 from tcpipe.formats.json_files import to_json
 from tcpipe.formats.maps.map_files import open_map
-from tcpipe.formats.place import DirectoryPlace
+from tcpipe.formats.place import Place
 from tcpipe.pipeline import migrate as migrating
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.explain import explain
@@ -255,8 +255,8 @@ def test_a_migration_that_is_killed_at_any_step_is_gone_on_with(untouched, tmp_p
             raise _Killed
         left[0] -= 1
 
-    for name in ("put", "put_new", "delete"):
-        monkeypatch.setattr(DirectoryPlace, name, _after(step, getattr(DirectoryPlace, name)))
+    for name in ("put", "put_new", "put_files", "delete"):
+        monkeypatch.setattr(Place, name, _after(step, getattr(Place, name)))
     for steps in range(200):
         left[0] = steps
         with suppress(_Killed):
@@ -268,6 +268,22 @@ def test_a_migration_that_is_killed_at_any_step_is_gone_on_with(untouched, tmp_p
     rows, others = ([*Store(place).state().runs.values()] for place in (got, whole))
     assert [replace(row, commit=0) for row in rows] == [replace(row, commit=0) for row in others]
     assert verify(got).problems == ()
+
+
+def test_each_file_that_is_copied_is_checked_by_its_digest(untouched, tmp_path):
+    store, target = untouched / "store", tmp_path / "target"
+    migrate(store, target)
+    (there,) = target.glob("runs/*/*/*/track.parquet")
+    whole = there.read_bytes()
+    there.write_bytes(whole[:-1] + b"?")
+    assert migrate(store, target).copied == 3, "the folder with the changed file"
+    assert there.read_bytes() == whole
+    (table,) = store.glob("maps/site/*/site.png")
+    table.write_bytes(table.read_bytes()[:-1] + b"?")
+    found = migrate(store, tmp_path / "other")
+    assert (found.exit_code, len(found.problems)) == (3, 1)
+    assert re.search(r"site\.png: its sha256 is .*; not copied", found.problems[0])
+    assert not list((tmp_path / "other").glob("maps/**/*.*"))
 
 
 def settled(store):
