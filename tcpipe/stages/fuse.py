@@ -10,7 +10,7 @@ import numpy as np
 
 from tcpipe.errors import FusionError
 from tcpipe.fusion.checks.audit import is_astray
-from tcpipe.fusion.checks.plausibility import SensorExclusion, refuse_fixes
+from tcpipe.fusion.checks.sanity import SensorExclusion, refuse_fixes
 from tcpipe.fusion.measurements import GNSS, IMU
 from tcpipe.recipe import FuseConfig
 from tcpipe.stages.clock_findings import correct_clocks

@@ -16,9 +16,13 @@ from numpy.typing import NDArray
 
 from tcpipe.fusion import preparation
 from tcpipe.fusion.checks.clock_offsets import smooth_stamps
-from tcpipe.fusion.checks.odometry_scale import Scale, rescale_odometries
-from tcpipe.fusion.checks.plausibility import SensorExclusion
-from tcpipe.fusion.checks.sensors import CommandedSpeed, check_ground_velocity, check_sensors
+from tcpipe.fusion.checks.sanity import (
+    CommandedSpeed,
+    SensorExclusion,
+    check_ground_velocity,
+    check_sensors,
+    rescale_odometries,
+)
 from tcpipe.fusion.measurements import (
     DOPPLER,
     GNSS,
@@ -51,8 +55,8 @@ class FusionInputs:
     counts: dict[str, dict[str, int]] = field(default_factory=dict)
     findings: list[Finding] = field(default_factory=list)
     excluded: frozenset[str] = frozenset()
-    scales: Mapping[str, Scale] = field(default_factory=dict)
-    """By odometry, the scale that was taken out."""
+    scales: Mapping[str, float] = field(default_factory=dict)
+    """By odometry, the scale that was taken out: far from 1."""
     cuts_ns: tuple[int, ...] = ()
     """First stamps after the clock of all sensors was set forward."""
 
@@ -170,16 +174,16 @@ def drop_implausible_sensors(inputs: FusionInputs, streams: Streams) -> tuple[Fu
         return inputs, StageReport((), SensorChecks())
     epoch = find_longest_epoch(inputs)
     stated = {role: sensor.placed_by in _STATED for role, sensor in streams.sensors.items()}
-    checks = check_sensors(
+    refusals, scales = check_sensors(
         inputs.measurements[epoch],
         command=read_command(streams, epoch),
         stated=stated,
         felt=_compute_median_specific_force(streams),
     )
-    if checks.scales:
-        measured = {number: rescale_odometries(m, checks.scales) for number, m in inputs.measurements.items()}
-        inputs = replace(inputs, measurements=measured, scales=checks.scales)
-    sane, found = exclude_sensors(inputs, StageReport((), checks.facts), checks.refusals, streams)
+    if scales:
+        measured = {number: rescale_odometries(m, scales) for number, m in inputs.measurements.items()}
+        inputs = replace(inputs, measurements=measured, scales=scales)
+    sane, found = exclude_sensors(inputs, StageReport((), SensorChecks()), [*refusals.values()], streams)
     doubt = check_ground_velocity(sane.measurements[epoch])
     return (sane, found) if doubt is None else exclude_sensors(sane, found, [doubt], streams)
 
