@@ -115,11 +115,9 @@ def check_sensors(
         return found, {}
     twists = {role: resample_twist(source, at_ns) for role, source in m.odometries().items()}
     wanted = None if command is None else hold_last(command.stamp_ns, command.forward_velocity_mps, at_ns)
-    paths = {role: _dead_reckon(twist) for role, twist in twists.items()}
-    noise_m2 = 0.0
-    if m.gnss is not None:
-        noise_m2 = 2.0 * float(np.median(m.gnss.variance_m2[:, :2]))
-        paths[GNSS] = resample_fixes(m.gnss, at_ns)
+    paths = {} if m.gnss is None else {GNSS: resample_fixes(m.gnss, at_ns)}
+    paths |= {role: _dead_reckon(twist) for role, twist in twists.items()}
+    noise_m2 = _compute_noise_m2(m.gnss)
     # 1. Turns and accelerations show units and mounting of the IMU, and signs of yaw rates.
     axes: dict[str, YawAxis] = {}
     looks: dict[str, float] = {}
@@ -181,6 +179,11 @@ _UNITS = {"km/h": (3.2, 4.0), "radians": (1 / 75, 1 / 30)}
 _NODE = round(0.5 / GRID_S)
 
 
+def _compute_noise_m2(gnss: Positions | None) -> float:
+    """Return the mean square that the noise of fixes adds to a path [m²]."""
+    return 0.0 if gnss is None else 2.0 * float(np.median(gnss.variance_m2[:, :2]))
+
+
 def _dead_reckon(twist: Floats) -> Path:
     """Return the path that a twist (M, 2) adds up to."""
     known = np.isfinite(twist.sum(1))
@@ -207,6 +210,10 @@ class Pair:
         """Return the mean square that is left of a when b, turned and scaled, is laid on it, and b's mirror image."""
         size = np.maximum(self.b_m2, 1e-9)
         return self.a_m2 - np.abs(self.product) ** 2 / size, self.a_m2 - np.abs(self.mirrored) ** 2 / size
+
+    def find_scale(self) -> float:
+        """Return how many times as far as a b goes, whatever the noise of a."""
+        return float(np.median(self.b_m2 / np.maximum(np.abs(self.product), 1e-9)))
 
     def is_alike(self, noise_m2: float) -> bool:
         """Return whether the paths have the same shape in most windows."""
@@ -266,9 +273,9 @@ def _check_distances(
         if is_still and fast == WHEELS and not votes[fast]:
             continue  # the wheels turn, the robot stands: stuck
         if GNSS in names and pairs[names].is_alike(noise_m2) and 1 / _MOST < ratio < _MOST:
-            odometry = names[0] if names[1] == GNSS else names[1]
+            odometry = names[1]
             if votes[odometry] <= votes[GNSS] and len(m.odometries()) == 1:
-                scales[odometry] = ratio if names[0] == GNSS else 1 / ratio
+                scales[odometry] = pairs[names].find_scale()
                 continue
         for role, other, lead in _find_outvoted([names], votes.__getitem__):
             times = ratio if role == names[1] else 1 / ratio
@@ -405,7 +412,7 @@ def _check_imu(
     up = find_up_axis(imu.specific_force_mps2)
     level = compute_levelling_rotation(up)
     force = resample_signal(imu.stamp_ns, imu.specific_force_mps2 @ level.T, at_ns)
-    looks = {}
+    looks: dict[str, float] = {}
     for role, twist in twists.items():
         yaw = find_forward_yaw_rad(twist, force, axes[role].late_s if role in axes else 0.0)
         looks |= {} if yaw is None else {role: yaw}
@@ -427,7 +434,7 @@ def _find_other_units(axes: Mapping[str, YawAxis], rate: Floats, felt: float) ->
 
     That is how many times as fast as another sensor the gyroscope turns (degrees: 57), or its fastest rate, and the median force.
     """
-    found = {}
+    found: dict[str, dict[str, float]] = {}
     if axes:
         scale = float(np.median([axis.scale for axis in axes.values()]))
         found |= {"deg": {"turn_ratio": 1.0 / scale}} if scale < _IN_DEGREES else {}
@@ -529,13 +536,14 @@ def check_ground_velocity(m: Measurements) -> SensorExclusion | None:
     path = integrate_signal(stamp_s, velocity, at_s) @ np.array([1.0, 1j])
     longest_ns = max(_MAX_GAP_NS, 3 * compute_median_period_ns(stamp_ns))
     path[is_in_gap(stamp_ns, at_ns, at_ns, longest_ns=longest_ns)] = np.nan
-    noise_m2 = 0.0 if m.gnss is None else 2.0 * float(np.median(m.gnss.variance_m2[:, :2]))
-    pair = None if m.gnss is None else compare_paths(resample_fixes(m.gnss, at_ns), path, _SHORT_S, noise_m2)
-    if pair is None:
+    fixes = np.full_like(path, np.nan) if m.gnss is None else resample_fixes(m.gnss, at_ns)
+    pair, driven = (compare_paths(fixes, each, _SHORT_S, _compute_noise_m2(m.gnss)) for each in (path, fixes))
+    if pair is None or driven is None:
         return SensorExclusion(DOPPLER, "velocity-unverified")
 
     def compute_misfit(product: Path) -> float:
-        return float(np.median(np.sqrt(np.maximum(pair.a_m2 + pair.b_m2 - 2.0 * product.real, 0.0) / pair.a_m2)))
+        misfit_m2 = np.maximum(pair.a_m2 + pair.b_m2 - 2.0 * product.real, 0.0)
+        return float(np.median(np.sqrt(misfit_m2 / np.maximum(pair.a_m2, 1e-9))))
 
     if compute_misfit(pair.product) <= _OFF:
         return None
