@@ -26,7 +26,7 @@ PROGRAM = "TCPIPE_TEST_OBJECT_STORAGE"
 """Names the program that starts the gateway; see tests/object_gateway.py."""
 
 OUTAGES_S = {"gateway stands still": 2.0, "gateway is killed": 1.0, "gateway is gone": 12.0}
-"""What befalls the gateway, and how long it lasts; the last is longer than requests are tried again."""
+"""What befalls the gateway, and how long it lasts; a first request does not wait for the end of the last."""
 
 
 VICTIMS = ("worker", "scheduler")

@@ -12,12 +12,14 @@ import hashlib
 import os
 import re
 import resource
+import shutil
 import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import TypeVar
 
+import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
@@ -57,8 +59,11 @@ def many_runs(directory: Path, count: int) -> tuple[Path, Store]:
         (logs / f"drive_{number:05d}.mcap").write_bytes(b"%08d" % number)
     open_store(store.root, create=True)
     log, sources = open_log(store), find_sources([logs], as_one=False, staging=Path()).sources
+    segments = run.table("segments")
     for start in range(0, count, 100):
-        made = [_copy(run, store, source, start + at) for at, source in enumerate(sources[start : start + 100])]
+        made = [
+            _copy(run, segments, store, source, start + at) for at, source in enumerate(sources[start : start + 100])
+        ]
         log.commit(
             "ingested",
             Entries(runs=tuple(of for each in made for of in each.runs), seen=tuple(of.seen[0] for of in made)),
@@ -66,19 +71,18 @@ def many_runs(directory: Path, count: int) -> tuple[Path, Store]:
     return logs, store
 
 
-def _copy(run: RunDirectory, store: Store, source: LogSource, number: int) -> Entries:
+def _copy(run: RunDirectory, segments: pa.Table, store: Store, source: LogSource, number: int) -> Entries:
     sha256 = hashlib.sha256(str(number).encode()).hexdigest()
     run_id = f"{source.stem}-{sha256[:8]}"
     there = run.file("segments.parquet").parent
     place = Path(store.root) / "runs" / run_id / run.recipe_id / there.name
     place.mkdir(parents=True)
     for name in ("track", "rejections"):
-        os.link(there / f"{name}.parquet", place / f"{name}.parquet")
+        _link(there / f"{name}.parquet", place / f"{name}.parquet")
     for stream in there.parents[1].glob("streams/*/*.parquet"):
         linked = place.parents[1] / stream.relative_to(there.parents[1])
         linked.parent.mkdir(parents=True, exist_ok=True)
-        os.link(stream, linked)
-    segments = run.table("segments")
+        _link(stream, linked)
     for name in ("start_ns", "end_ns"):
         at, column = segments.schema.get_field_index(name), pc.add(segments.column(name), number * DAY_NS)
         segments = segments.set_column(at, segments.schema.field(name), column)
@@ -90,6 +94,15 @@ def _copy(run: RunDirectory, store: Store, source: LogSource, number: int) -> En
     for document in (Path(run.recipe_id, "manifest-1.json"), Path("run-1.json")):
         (place.parents[1] / document).write_text(_renamed((there.parents[1] / document).read_text(), names))
     return Entries(runs=tuple(store.read_rows(run_id).values()), seen=(source.sighting(sha256),))
+
+
+def _link(file: Path, link: Path) -> None:
+    try:
+        os.link(file, link)
+    except OSError:  # a file system allows only so many links to a file
+        new = shutil.copyfile(file, file.with_suffix(".new"))
+        new.replace(file)
+        os.link(file, link)
 
 
 def _renamed(text: str, names: dict[str, str]) -> str:

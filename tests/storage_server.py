@@ -3,6 +3,7 @@
 import re
 import socket
 import threading
+import time
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -25,12 +26,15 @@ class Fetched(list[str]):
     """The objects fetched so far, one a request, and their bytes.
 
     The next ``cuts`` answers with an object break off in the middle; the next ``lost`` objects are written, and nobody is told.
+    Until ``away_until`` (`time.monotonic`) no request has an answer; of names with ``busy`` in them no object is taken.
     """
 
     sent_bytes = 0
     cuts = 0
     lost = 0
     requests = 0
+    away_until = 0.0
+    busy = ""
 
 
 class _Server(ThreadingHTTPServer):
@@ -39,6 +43,9 @@ class _Server(ThreadingHTTPServer):
         self.root = root
         self.fetched = Fetched()
         self.writing = threading.Lock()
+
+    def verify_request(self, *_: object) -> bool:
+        return time.monotonic() >= self.fetched.away_until
 
 
 class _Handler(BaseHTTPRequestHandler):
@@ -55,6 +62,9 @@ class _Handler(BaseHTTPRequestHandler):
         data = self.rfile.read(int(self.headers["Content-Length"]))
         bucket, _, name = unquote(urlsplit(self.path).path).lstrip("/").partition("/")
         path = self.server.root / bucket / name
+        if self.server.fetched.busy and self.server.fetched.busy in name:
+            self._send(503, b"<Error><Code>SlowDown</Code></Error>")
+            return
         if bucket == READ_ONLY:
             self._send(403, b"<Error><Code>AccessDenied</Code></Error>")
             return

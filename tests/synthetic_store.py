@@ -17,7 +17,7 @@ from tcpipe.recipe import Recipe
 from tcpipe.store import Store, open_store
 from tcpipe.tables.arrays import make_lines
 from tcpipe.tables.bits import DropReason
-from tcpipe.tables.facts import PowerSign, StageFacts
+from tcpipe.tables.facts import FuseFacts, NoiseFacts, PowerSign, StageFacts, StretchFacts
 from tcpipe.tables.findings import StageReport, judge
 from tcpipe.tables.levels import (
     DATA_MODEL_VERSION,
@@ -132,12 +132,13 @@ def add_run(
     findings=(),
     tags=None,
     includes=(),
+    facts=None,
 ):
     """Put a run with these segments, and this masked track, into the store, as ingestion would."""
     recipe = recipe or Recipe()
     robot = table.column("robot")[0].as_py() if table.num_rows else "husky"
     power = PowerSign("drawn_positive", averaged=False, includes=includes)
-    found = StageReport(tuple(findings), StageFacts(power=power) if includes else StageFacts())
+    found = StageReport(tuple(findings), facts or (StageFacts(power=power) if includes else StageFacts()))
     info = TrackInfo(run_id, robot, Datum(15.43, 47.07, 400.0), 20.0, "smoother", found)
     identity = make_recipe_id(recipe, robot)
     metres = float(np.sum(table.column("arc_length_m").to_numpy()))
@@ -167,6 +168,18 @@ def add_run(
         labelled=LabelledSegments(table, info, distance_by_reason_m),
     )
     commit_run(store, run_id)
+
+
+def make_noise_facts():
+    """Return facts of a run of fixes and wheels, whose noise was fitted."""
+    time_s = (0.1, 1.0, 10.0, 80.0)
+    noise = {
+        "gnss": NoiseFacts("m", time_s, (0.02, 0.02, 0.03, 0.03), (0.02,) * 4, (0.9, 0.9, 0.8, 0.7)),
+        "wheel_odometry": NoiseFacts("m", time_s, (0.002, 0.02, 0.2, 1.0), (0.001, 0.003, 0.01, 0.03), (0.3, 0.4, 0.5, 0.6)),
+        "wheel_odometry turn": NoiseFacts("rad", time_s, (0.001, 0.003, 0.01, 0.1), (0.001, 0.003, 0.01, 0.03), (0.9,) * 4),
+    }  # fmt: skip
+    sections = (StretchFacts({}, {}, {}, end_ns=1), StretchFacts({}, {}, {}, noise=noise, end_ns=10**10))
+    return StageFacts(fuse=FuseFacts(0, (), {}, {}, {}, {}, 0.0, sections))
 
 
 def commit_run(store, run_id):

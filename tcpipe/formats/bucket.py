@@ -18,28 +18,23 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass
-from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
 from tcpipe.errors import MissingFileError, StoreError, UsageError
 from tcpipe.formats.atomic import make_scratch_directory
 from tcpipe.formats.integrity import Checksum, find_wrong_checksum
-from tcpipe.formats.object_storage import connect_store, convert_errors, is_url, split_url
+from tcpipe.formats.object_storage import ask_store, is_url, run_side_by_side, split_bucket, split_url
 from tcpipe.formats.place import DirectoryPlace, Entry, Place
 
 if TYPE_CHECKING:
-    from obstore import ListResult, ObjectMeta
+    from obstore import GetOptions, ListResult, ObjectMeta
     from obstore.store import ObjectStore
 
 T = TypeVar("T")
 U = TypeVar("U")
 
 _PIECE_BYTES = 1 << 24
-_AT_ONCE = 8
-"""Files that are on their way at once."""
-
-_SETTINGS = ("AWS_", "GOOGLE_", "AZURE_", "HTTP", "NO_PROXY")
 
 
 def open_place(path: str | Path) -> Place:
@@ -49,10 +44,7 @@ def open_place(path: str | Path) -> Place:
 
 def map_concurrently(path: str | Path, function: Callable[[T], U], items: Sequence[T]) -> list[U]:
     """Return what a function gives for each item, one after another; some at once where it asks a bucket, as each answer takes a while."""
-    if not is_url(path) or not items:
-        return list(map(function, items))
-    with ThreadPoolExecutor(_AT_ONCE) as pool:
-        return list(pool.map(function, items))
+    return run_side_by_side(function, items) if is_url(path) else list(map(function, items))
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,44 +63,42 @@ class BucketPlace:
 
     def check(self) -> None:
         """Raise `StoreError` where nothing can be listed here."""
-        store, key = self._store()
-        with convert_errors(self.url, StoreError):
-            next(iter(store.list(prefix=key or None, chunk_size=1)), None)
+        self._ask("", lambda store, key: next(iter(store.list(prefix=key or None, chunk_size=1)), None))
 
     def read(self, name: str) -> bytes | None:
         """Return a whole object; None where there is none."""
-        store, key = self._store(name)
-        with suppress(FileNotFoundError), convert_errors(self.where(name), StoreError):
-            return bytes(store.get(key).bytes())
+        with suppress(FileNotFoundError):
+            return self._ask(name, lambda store, key: bytes(store.get(key).bytes()))
         return None
 
     def read_range(self, name: str, start: int, size: int) -> bytes:
         """Return ``size`` bytes from ``start`` on."""
-        store, key = self._store(name)
-        with _convert_missing(self.where(name)), convert_errors(self.where(name), StoreError):
-            return bytes(store.get_range(key, start=start, length=size)) if size else b""
+        with _convert_missing(self.where(name)):
+            return (
+                self._ask(name, lambda store, key: bytes(store.get_range(key, start=start, length=size)))
+                if size
+                else b""
+            )
 
     def size(self, name: str) -> int | None:
         """Return how large an object is [byte]."""
-        store, key = self._store(name)
-        with suppress(FileNotFoundError), convert_errors(self.where(name), StoreError):
-            return int(store.head(key)["size"])
+        with suppress(FileNotFoundError):
+            return self._ask(name, lambda store, key: int(store.head(key)["size"]))
         return None
 
     def version(self, name: str) -> str | None:
         """Return the URL of an object and its ETag; None where the bucket gives none."""
-        store, key = self._store(name)
-        with _convert_missing(self.where(name)), convert_errors(self.where(name), StoreError):
-            tag = store.head(key)["e_tag"]
+        with _convert_missing(self.where(name)):
+            tag = self._ask(name, lambda store, key: store.head(key)["e_tag"])
         return None if tag is None else f"{self.where(name)} {tag}"
 
     def entries(self, prefix: str = "", *, but: str = "") -> list[Entry]:
         """Return the objects below ``prefix/``, by name; so many a request that a large store takes few."""
         del but
-        store, key = self._store(prefix)
-        cut = len(self._store()[1]) + 1 if self._store()[1] else 0
-        with convert_errors(self.where(prefix), StoreError):
-            found = [meta for batch in store.list(prefix=key or None) for meta in batch]
+        cut = len(self._key("x")) - 1
+        found = self._ask(
+            prefix, lambda store, key: [meta for batch in store.list(prefix=key or None) for meta in batch]
+        )
         entries = (
             Entry(meta["path"][cut:], meta["size"], round(meta["last_modified"].timestamp() * 1e6) * 1000)
             for meta in found
@@ -125,35 +115,28 @@ class BucketPlace:
 
     def files_after(self, prefix: str, after: str) -> list[str]:
         """Return the names of the objects in ``prefix`` that sort after a name: a request for every thousand."""
-        store, key = self._store(prefix)
-        with convert_errors(self.where(prefix), StoreError):
-            batches = list(store.list(prefix=key or None, offset="/".join(part for part in (key, after) if part)))
-        names = (meta["path"][len(key) + 1 if key else 0 :] for batch in batches for meta in batch)
+        cut = len(self._key(f"{prefix}/x" if prefix else "x")) - 1
+        offset = self._key("/".join(part for part in (prefix, after) if part))
+        batches = self._ask(prefix, lambda store, key: list(store.list(prefix=key or None, offset=offset)))
+        names = (meta["path"][cut:] for batch in batches for meta in batch)
         return sorted(name for name in names if name > after and "/" not in name)
 
     def _in(self, prefix: str) -> ListResult[Sequence[ObjectMeta]]:
-        store, key = self._store(prefix)
-        with convert_errors(self.where(prefix), StoreError):
-            return store.list_with_delimiter(prefix=key or None)
+        return self._ask(prefix, lambda store, key: store.list_with_delimiter(prefix=key or None))
 
     def put(self, name: str, data: bytes, *, lasting: bool = True) -> None:
         """Write an object."""
         del lasting
-        store, key = self._store(name)
-        with convert_errors(self.where(name), StoreError, what="written"):
-            store.put(key, data, use_multipart=False)
+        self._ask(name, lambda store, key: store.put(key, data, use_multipart=False), what="written")
 
     def put_new(self, name: str, data: bytes) -> bool:
         """Write an object by a conditional request."""
         from obstore.exceptions import AlreadyExistsError  # noqa: PLC0415  most runs stay on this machine
 
-        store, key = self._store(name)
-        with convert_errors(self.where(name), StoreError, what="written"):
-            try:
-                store.put(key, data, mode="create", use_multipart=False)
-            except AlreadyExistsError:
-                return False
-        return True
+        with suppress(AlreadyExistsError):
+            self._ask(name, lambda store, key: store.put(key, data, mode="create", use_multipart=False), what="written")
+            return True
+        return False
 
     def workshop(self) -> AbstractContextManager[Path]:
         """Return a context: a temporary directory of this machine."""
@@ -164,27 +147,24 @@ class BucketPlace:
 
         def upload(path: Path) -> None:
             name = "/".join(part for part in (prefix, path.relative_to(directory).as_posix()) if part)
-            store, key = self._store(name)
-            with convert_errors(self.where(name), StoreError, what="written"):
-                store.put(key, path)
+            self._ask(name, lambda store, key: store.put(key, path), what="written")
 
         map_concurrently(self.url, upload, sorted(path for path in directory.rglob("*") if path.is_file()))
 
     def checksum(self, name: str) -> Checksum | None:
         """Return size and sha256 of an object."""
-        if self.size(name) is None:
-            return None
         size, digest = 0, hashlib.sha256()
-        for piece in self.pieces(name):
-            size += len(piece)
-            digest.update(piece)
-        return Checksum(size, digest.hexdigest())
+        with suppress(MissingFileError):
+            for piece in self.pieces(name):
+                size += len(piece)
+                digest.update(piece)
+            return Checksum(size, digest.hexdigest())
+        return None
 
     def delete(self, name: str) -> None:
         """Remove an object."""
-        store, key = self._store(name)
-        with suppress(FileNotFoundError), convert_errors(self.where(name), StoreError, what="written"):
-            store.delete(key)
+        with suppress(FileNotFoundError):
+            self._ask(name, lambda store, key: store.delete(key), what="written")
 
     def local(self, name: str, checksum: Checksum) -> Path:
         """Return the cached copy of an object with this content; `StoreError` where the object is gone or another."""
@@ -203,25 +183,29 @@ class BucketPlace:
         return fetch_cached(checksum.sha256, fetch)
 
     def pieces(self, name: str) -> Iterator[bytes]:
-        """Yield an object piece by piece; `StoreError` where there is none."""
-        store, key = self._store(name)
-        with _convert_missing(self.where(name)), convert_errors(self.where(name), StoreError):
-            for piece in store.get(key).stream(min_chunk_size=_PIECE_BYTES):
-                yield bytes(piece)
+        """Yield an object piece by piece; `StoreError` where there is none, or another one takes its place meanwhile."""
 
-    def _store(self, name: str = "") -> tuple[ObjectStore, str]:
-        """Return the bucket, and the name in it of what is called ``name`` here."""
-        settings = tuple(sorted((key, value) for key, value in os.environ.items() if key.upper().startswith(_SETTINGS)))
-        with convert_errors(self.url, StoreError):
-            store, prefix = _connect_cached(self.url, settings)
-        return store, "/".join(part for part in (prefix, name) if part)
+        def get(store: ObjectStore, key: str) -> tuple[ObjectMeta, bytes]:
+            found = store.get(key)
+            return found.meta, bytes(found.bytes()) if found.meta["size"] <= _PIECE_BYTES else b""
 
+        with _convert_missing(self.where(name)):
+            meta, whole = self._ask(name, get)
+            if whole:
+                yield whole
+                return
+            options: GetOptions = {"if_match": meta["e_tag"]} if meta["e_tag"] else {}
+            for start in range(0, meta["size"], _PIECE_BYTES):
+                options["range"] = (start, min(start + _PIECE_BYTES, meta["size"]))
+                yield self._ask(name, lambda store, key: bytes(store.get(key, options=options).bytes()))
 
-@lru_cache(maxsize=64)
-def _connect_cached(url: str, settings: tuple[tuple[str, str], ...]) -> tuple[ObjectStore, str]:
-    """Return what `connect_store` does, once for each setting of the environment."""
-    del settings
-    return connect_store(url)
+    def _ask(self, name: str, request: Callable[[ObjectStore, str], T], what: str = "read") -> T:
+        key = self._key(name)
+        return ask_store(self.where(name), lambda store: request(store, key), what=what)
+
+    def _key(self, name: str) -> str:
+        """Return the name in the bucket of what is called ``name`` here."""
+        return "/".join(part for part in (split_bucket(self.url)[1], name) if part)
 
 
 @contextmanager

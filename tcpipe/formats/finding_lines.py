@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from string import Formatter
 from typing import Generic, TypeVar
 
@@ -178,7 +179,7 @@ def advise_on_loss(reason: str) -> str:
     return entry.advice if entry else ""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class FindingGroup(Generic[K]):
     """Findings of one code in several runs, logs or maps."""
 
@@ -186,12 +187,12 @@ class FindingGroup(Generic[K]):
     of: Mapping[K, tuple[Finding, ...]]
     """By run, log or map."""
 
-    @property
+    @cached_property
     def findings(self) -> list[Finding]:
         """All of them, the worst first."""
         return sort_findings(finding for of in self.of.values() for finding in of)
 
-    @property
+    @cached_property
     def severity(self) -> Severity:
         """The worst of their severities."""
         return min((finding.severity for of in self.of.values() for finding in of), key=rank_severity)

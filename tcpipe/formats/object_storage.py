@@ -5,24 +5,39 @@ The home of obstore. Credentials, region and endpoint come from the environment,
 
 from __future__ import annotations
 
+import logging
+import math
+import multiprocessing
 import os
+import random
 import re
+import threading
+import time
+from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import timedelta
+from functools import lru_cache
+from itertools import chain, repeat
 from pathlib import Path, PurePosixPath
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 from urllib.parse import unquote
 
-from tcpipe.errors import LogError, TcpipeError, UsageError, split_secrets
+from tcpipe.errors import LogError, StoreError, TcpipeError, UsageError, hide_secrets, split_secrets
 from tcpipe.formats.atomic import describe_full_disk, make_scratch_directory
 
 if TYPE_CHECKING:
     from obstore import GetOptions, ObjectMeta
     from obstore.store import ObjectStore
 
+T = TypeVar("T")
+U = TypeVar("U")
+
+logger = logging.getLogger("tcpipe")
+
+_SETTINGS = ("AWS_", "GOOGLE_", "AZURE_", "HTTP", "NO_PROXY")
 _URL = re.compile(r"[a-z][a-z0-9+.-]*://", re.IGNORECASE)
 _ENDPOINT = re.compile(r"https?://([\w.-]+|\[[0-9a-f:]+\])(:\d{1,5})?(/[\w./-]*)?", re.IGNORECASE)
 _PIECE_BYTES = 1 << 24
@@ -30,19 +45,39 @@ _PIECE_BYTES = 1 << 24
 _AT_ONCE = 8
 _PERCENT_ENCODED = ("file", "http", "https")
 """Schemes whose names are written with percent signs; object stores' own tools write them as they are."""
-_RETRIES: dict[str, Any] = {
-    "max_retries": 6,
-    "retry_timeout": timedelta(seconds=30),
+_FIRST_S = 4.0
+"""So long the first request of a process waits for an answer: somebody may be watching."""
+_RETRY_MINUTES = 10.0
+"""So long later ones do, unless TCPIPE_RETRY_MINUTES says otherwise."""
+_PAUSES_S = (0.1, 0.2, 0.4, 0.8, 1.6, 3.0)
+"""Before a request is made again; the last one again and again."""
+_TELL_AFTER_S = 1.0
+"""A shorter interruption is not worth a line."""
+_IMPATIENT: dict[str, Any] = {"max_retries": 0}
+_PATIENT: dict[str, Any] = {
+    "max_retries": 4,
+    "retry_timeout": timedelta(seconds=2),
     "backoff": {"init_backoff": timedelta(milliseconds=100), "max_backoff": timedelta(seconds=1), "base": 2},
 }
-"""A store that does not answer is told after less than 5 s."""
+"""What obstore does by itself, for each part of a large file, before the whole request is made again here."""
 _DENIED = (
     "169.254.169.254", "Account must be specified", "401 Unauthorized", "403 Forbidden", "Missing AccessKeyId", "Missing SecretAccessKey"
 )  # fmt: skip
 """What is said where credentials are not set (a cloud machine's own are asked for, in vain), or wrong."""
+_NO_ANSWER = {
+    "ConnectionRefused": "connection refused",
+    "dns error": "the name of the host is not known",
+    "InvalidCertificate": "the certificate of the host is not valid",
+    "InvalidContentType": "the host does not use TLS: http:// instead of https://",
+    "kind: Timeout": "no answer in time",
+    "TimedOut": "no answer in time",
+}
+"""What obstore has of a broken connection, and how it is told."""
 _CODE = re.compile(r"<Code>(\w+)</Code>")
-_STATUS = re.compile(r"\b[45]\d\d [A-Z][A-Za-z ]*(?=: )")
-"""After it follows what the server wrote, which may repeat the query."""
+_STATUS = re.compile(r"\b([45]\d\d) [A-Z][A-Za-z ]*(?=: )")
+_ADDRESS = re.compile(r"https?://(?:[^\s/@]*@)?[^\s/?)]+")
+_TRY_AGAIN = (408, 429)
+"""Answers about the request that may be others a moment later, as all of 500 and more."""
 _REFUSED = {
     "RequestTimeTooSkewed": "the clock of this machine is wrong; set it",
     "SignatureDoesNotMatch": "the secret key does not belong to the access key",
@@ -61,8 +96,9 @@ _CREDENTIALS = {
 class StoredObject:
     """An object: its name in the store, size [byte] and modification time [ns], and the tag that its content has."""
 
-    store: ObjectStore
     url: str
+    query: str
+    """Of a presigned URL."""
     name: str
     size_bytes: int
     modified_ns: int
@@ -75,31 +111,36 @@ class StoredObject:
         ------
         LogError : it cannot be had, also after some attempts, or the object is another than it was.
         """
-        with convert_errors(self.url):
-            if len(spans) == 1:
-                return [self._range(spans[0])]
-            with ThreadPoolExecutor(_AT_ONCE) as pool:
-                return list(pool.map(self._range, spans))
+        return run_side_by_side(self._range, spans)
 
     def copy(self, to: Path) -> None:
         """Write all of it to a file; `LogError` as `ranges`, and where there is no room."""
-        with convert_errors(self.url), to.open("wb") as target:
-            for start in range(0, self.size_bytes, _PIECE_BYTES):
-                target.write(self._range((start, min(start + _PIECE_BYTES, self.size_bytes))))
+        try:
+            with to.open("wb") as target:
+                for start in range(0, self.size_bytes, _PIECE_BYTES):
+                    target.write(self._range((start, min(start + _PIECE_BYTES, self.size_bytes))))
+        except OSError as error:
+            raise LogError(
+                f"{self.url}: it cannot be copied ({describe_full_disk(error) or error.strerror})"
+            ) from error
         os.utime(to, ns=(self.modified_ns, self.modified_ns))
 
     def _range(self, span: tuple[int, int]) -> memoryview:
-        """Return one span of the object as it was when it was found; obstore asks again for what a broken connection cuts short."""
+        """Return one span of the object as it was when it was found."""
         from obstore.exceptions import PreconditionError  # noqa: PLC0415  most runs stay on this machine
 
         options: GetOptions = {"range": span, "if_match": self.tag} if self.tag else {"range": span}
-        try:
-            data = memoryview(self.store.get(self.name, options=options).bytes()).cast("B")
-        except PreconditionError:
-            raise LogError(f"{self.url}: changed while it was read; run it again") from None
-        if len(data) != span[1] - span[0]:
-            raise OSError(f"the store gives {len(data)} bytes for those from {span[0]} to {span[1]}")
-        return data
+
+        def get(store: ObjectStore) -> memoryview:
+            try:
+                data = memoryview(store.get(self.name, options=options).bytes()).cast("B")
+            except PreconditionError:
+                raise LogError(f"{self.url}: changed while it was read; run it again") from None
+            if len(data) != span[1] - span[0]:
+                raise OSError(f"the store gives {len(data)} bytes for those from {span[0]} to {span[1]}")
+            return data
+
+        return ask_store(self.url, get, LogError, query=self.query)
 
 
 def is_url(text: str | Path) -> bool:
@@ -196,7 +237,7 @@ def make_stand_ins(url: str, directory: Path, *, wanted: Callable[[str], bool]) 
 
 
 def _place_of(url: str, directory: Path) -> Path:
-    name = _split_url(url)[1]
+    name = split_bucket(url)[1]
     return directory / name if name else directory
 
 
@@ -204,55 +245,178 @@ def _lay_out_stand_ins(
     url: str, query: str, directory: Path, wanted: Callable[[str], bool]
 ) -> dict[Path, StoredObject]:
     """Lay out stand-ins, and return their objects."""
-    with convert_errors(url):
-        store, name = connect_store(url, query)
-        found = list(_iterate_objects(store, url, name, wanted, presigned=bool(query)))
-        if not found:
-            raise LogError(f"{url}: there is no such object, and no log below it")
-        laid = {_place(stored.name, directory): stored for stored in found}
+    found = ask_store(url, lambda store: list(_iterate_objects(store, url, query, wanted)), LogError, query=query)
+    if not found:
+        raise LogError(f"{url}: there is no such object, and no log below it")
+    laid = {_place(stored.name, directory): stored for stored in found}
+    try:
         for path, stored in laid.items():
             with path.open("wb") as target:
                 target.truncate(stored.size_bytes)
             os.utime(path, ns=(stored.modified_ns, stored.modified_ns))
+    except OSError as error:
+        raise LogError(f"{url}: it cannot be laid out ({describe_full_disk(error) or error.strerror})") from error
     return laid
 
 
-@contextmanager
-def convert_errors(url: str, error: type[TcpipeError] = LogError, *, what: str = "read") -> Iterator[None]:
-    """Turn what goes wrong while an object is ``read`` or ``written`` into one line; that it is not there passes as `FileNotFoundError`."""
-    from obstore.exceptions import BaseError  # noqa: PLC0415
+@dataclass(slots=True)
+class _Patience:
+    """How this process asks a bucket."""
 
+    is_long: bool = field(default_factory=lambda: multiprocessing.parent_process() is not None)
+    """Whether a request without an answer is made again for minutes: there was one before, or to the process that started this one."""
+    has_told: bool = False
+    """Whether it was said that there is no answer."""
+
+    @property
+    def limit_s(self) -> float:
+        """How long a request may wait for an answer."""
+        return _read_retry_s() if self.is_long else _FIRST_S
+
+
+_patience: defaultdict[object, _Patience] = defaultdict(_Patience)
+"""By bucket and environment."""
+_here = threading.local()
+
+
+def ask_store(
+    url: str,
+    request: Callable[[ObjectStore], T],
+    error: type[TcpipeError] = StoreError,
+    *,
+    what: str = "read",
+    query: str = "",
+) -> T:
+    """Return what a request gives to which an object is ``read`` or ``written``; while there is no answer it is made again.
+
+    The first request of a command fails within 5 s. Later ones, and those of worker processes, are made again for minutes; after one of
+    them was in vain, others are not until there is an answer. What goes wrong is one line; that something is not there passes as
+    `FileNotFoundError`, that it is there already as `AlreadyExistsError`.
+    """
+    from obstore.exceptions import AlreadyExistsError, BaseError  # noqa: PLC0415
+
+    bucket, began, pauses = split_bucket(url)[0], time.monotonic(), chain(_PAUSES_S, repeat(_PAUSES_S[-1]))
+    settings = tuple(sorted((key, value) for key, value in os.environ.items() if key.upper().startswith(_SETTINGS)))
+    patience = _patience[bucket, query, settings]
+    while True:
+        store: ObjectStore | None = None
+        asked = time.monotonic()
+        try:
+            store = _connect(bucket, query, settings, is_first=not patience.is_long)
+            result = request(store)
+        except (BaseError, OSError, ValueError) as found:
+            if store is not None and _is_unanswered(found):
+                now, pause = time.monotonic(), next(pauses) * random.uniform(0.5, 1.0)  # noqa: S311
+                if now - began + pause + (0.0 if patience.is_long else now - asked) < patience.limit_s:
+                    _tell_no_answer(bucket, patience, found, waited_s=now - began)
+                    _wait(pause)
+                    continue
+                patience.is_long = False  # whatever is asked next
+            passes = isinstance(found, FileNotFoundError | AlreadyExistsError) and error is not LogError
+            code = _CODE.search(str(found))
+            if passes and not (code and code[1] == "NoSuchBucket"):
+                patience.is_long = True
+                raise
+            reason = _describe_store_error(url, found, code and code[1], what)
+            raise error(f"{url}: it cannot be {what} ({reason})") from None
+        patience.is_long, patience.has_told = True, False
+        return result
+
+
+def _is_unanswered(error: Exception) -> bool:
+    """Return whether a request may have an answer a moment later: the connection broke, or the store is busy."""
+    from obstore.exceptions import GenericError  # noqa: PLC0415
+
+    if type(error) is OSError:  # a part of what was asked for
+        return True
+    if not isinstance(error, GenericError) or "LocalFileSystem" in str(error)[:50]:
+        return False
+    status = _STATUS.search(str(error))
+    if status:
+        return int(status[1]) >= 500 or int(status[1]) in _TRY_AGAIN
+    return not any(of in str(error) for of in (*_DENIED, "InvalidCertificate", "InvalidContentType"))
+
+
+def _tell_no_answer(bucket: str, patience: _Patience, error: Exception, *, waited_s: float) -> None:
+    """Say once that a bucket does not answer, unless it does in a moment."""
+    if patience.is_long and waited_s >= _TELL_AFTER_S and not patience.has_told:
+        patience.has_told = True
+        how = f"trying again for up to {_read_retry_s() / 60:g} min (TCPIPE_RETRY_MINUTES)"
+        logger.warning("%s: %s; %s", bucket, _describe_no_answer(error), how)
+
+
+def _read_retry_s() -> float:
+    given = os.environ.get("TCPIPE_RETRY_MINUTES", str(_RETRY_MINUTES))
     try:
-        yield
-    except (BaseError, OSError, ValueError) as found:
-        code = _CODE.search(str(found))
-        if isinstance(found, FileNotFoundError) and error is not LogError and not (code and code[1] == "NoSuchBucket"):
+        minutes = float(given)
+    except ValueError:
+        minutes = math.nan
+    if not 0.0 <= minutes < math.inf:
+        raise UsageError(f"TCPIPE_RETRY_MINUTES is {given!r}, expected a number of minutes, such as {_RETRY_MINUTES:g}")
+    return 60.0 * minutes
+
+
+def _wait(seconds: float) -> None:
+    """Wait; where `run_side_by_side` ends meanwhile, this thread ends."""
+    ended: threading.Event | None = getattr(_here, "ended", None)
+    if ended is None:
+        time.sleep(seconds)
+    elif ended.wait(seconds):
+        raise StoreError("interrupted")
+
+
+def run_side_by_side(function: Callable[[T], U], items: Sequence[T]) -> list[U]:
+    """Return what a function that asks a store gives for each item; some at once, as each answer takes a while."""
+    if len(items) <= 1:
+        return list(map(function, items))
+    ended = threading.Event()
+    with ThreadPoolExecutor(_AT_ONCE, initializer=lambda: setattr(_here, "ended", ended)) as pool:
+        try:
+            return list(pool.map(function, items))
+        except BaseException:  # also a signal: nobody waits for minutes then
+            ended.set()
             raise
-        raise error(
-            f"{url}: it cannot be {what} ({_describe_store_error(url, found, code and code[1], what)})"
-        ) from None
 
 
 def _describe_store_error(url: str, error: Exception, code: str | None, what: str) -> str:
-    """Return in words what a store, or the operating system, answered."""
-    from obstore.exceptions import PermissionDeniedError, UnauthenticatedError  # noqa: PLC0415
+    """Return in plain words what a store answered, and what to check."""
+    from obstore.exceptions import BaseError, PermissionDeniedError, UnauthenticatedError  # noqa: PLC0415
 
-    reason = next((line.strip() for line in str(error).splitlines() if line.strip()), type(error).__name__)
-    if status := _STATUS.search(reason):
-        reason = reason[: status.end()]
-    scheme = url.partition("://")[0].lower()
-    denied = isinstance(error, PermissionDeniedError | UnauthenticatedError) or any(of in reason for of in _DENIED)
+    text, scheme = str(error), url.partition("://")[0].lower()
+    denied = isinstance(error, PermissionDeniedError | UnauthenticatedError) or any(of in text for of in _DENIED)
+    if denied and scheme in _CREDENTIALS:
+        return _describe_denial(scheme, text, code, what)
     if code == "NoSuchBucket":
         return "there is no such bucket"
-    if denied and code in _REFUSED:
+    if isinstance(error, FileNotFoundError):
+        return "there is no such object"
+    if not isinstance(error, BaseError):  # of this module
+        return text
+    if scheme == "file":
+        return "the operating system does not allow it, or it is no file"
+    status = _STATUS.search(text)
+    return f"the store answers {status[0]}{f', {code}' if code else ''}" if status else _describe_no_answer(error)
+
+
+def _describe_denial(scheme: str, text: str, code: str | None, what: str) -> str:
+    if code in _REFUSED:
         return _REFUSED[code]
-    if denied and code == "AccessDenied" and (what == "written" or os.environ.get("AWS_ACCESS_KEY_ID")):
+    has_key = bool(os.environ.get("AWS_ACCESS_KEY_ID"))
+    if code == "AccessDenied" and (what == "written" or has_key):
         return "the credentials do not allow it"
-    if denied and not code and "403" in reason and scheme == "s3" and os.environ.get("AWS_ACCESS_KEY_ID"):
+    if not code and "403" in text and scheme == "s3" and has_key:
         return "the store rejects the credentials, or the clock of this machine is wrong"
-    if denied and scheme in _CREDENTIALS:
-        return f"the store requires credentials; set {_CREDENTIALS[scheme]}"
-    return describe_full_disk(error) or reason
+    return f"the store requires credentials; set {_CREDENTIALS[scheme]}"
+
+
+def _describe_no_answer(error: Exception) -> str:
+    """Return which address does not answer, how, and what to check."""
+    text = str(error)
+    address, status = _ADDRESS.search(text), _STATUS.search(text)
+    told = next((words for of, words in _NO_ANSWER.items() if of in text), "the connection broke")
+    told = f"it answers {status[0]}" if status else told
+    where = hide_secrets(address[0]) if address else "the store"
+    return f"no answer from {where}: {told}; check that it runs and that the address is right"
 
 
 def _refuse_endpoints_that_are_none(scheme: str) -> None:
@@ -263,7 +427,7 @@ def _refuse_endpoints_that_are_none(scheme: str) -> None:
             raise ValueError(f"{name} is {value!r}, expected http://host or https://host, with :port where it has one")
 
 
-def _split_url(url: str) -> tuple[str, str]:
+def split_bucket(url: str) -> tuple[str, str]:
     """Return the URL of a bucket, directory or server, and the name of the object or prefix in it."""
     scheme, _, rest = url.partition("://")
     scheme, rest = scheme.lower(), rest.rstrip("/")
@@ -277,49 +441,56 @@ def _split_url(url: str) -> tuple[str, str]:
     return f"{scheme}://{container}", unquote(name) if scheme in _PERCENT_ENCODED else name
 
 
-def connect_store(url: str, query: str = "") -> tuple[ObjectStore, str]:
-    """Return the store, and the name of the object or prefix in it; a presigned URL's server gets its ``query`` with each request."""
+def connect_store(url: str) -> tuple[ObjectStore, str]:
+    """Return the store, and the name of the object or prefix in it."""
+    container, name = split_bucket(split_url(url)[0])
+    return _connect(container, "", (), is_first=False), name
+
+
+@lru_cache(maxsize=64)
+def _connect(container: str, query: str, settings: tuple[tuple[str, str], ...], *, is_first: bool) -> ObjectStore:
+    """Return a bucket, directory or server, once for each setting of the environment; a presigned URL's server gets its query."""
     import obstore  # noqa: PLC0415
 
-    url = split_url(url)[0]
-    container, name = _split_url(url)
+    del settings
     scheme, _, bucket = container.partition("://")
     if not bucket:
         raise ValueError(f"it names no bucket; expected {scheme}://bucket/name")
     _refuse_endpoints_that_are_none(scheme)
-    options: dict[str, Any] = {} if scheme == "file" else {"retry_config": _RETRIES}
+    options: dict[str, Any] = {}
     if scheme != "file":  # who names an endpoint without TLS means it
-        options["client_options"] = {"allow_http": True, "connect_timeout": timedelta(seconds=3)}
+        client = {"allow_http": True, "connect_timeout": timedelta(seconds=3)}
+        client |= {"timeout": timedelta(seconds=_FIRST_S)} if is_first else {}
+        options = {"retry_config": _IMPATIENT if is_first else _PATIENT, "client_options": client}
     if query:  # also where the host is a bucket's: the query stands for the credentials
-        return obstore.store.HTTPStore.from_url(f"{container}?{query}", **options), name
-    return obstore.store.from_url(container, **options), name
+        return obstore.store.HTTPStore.from_url(f"{container}?{query}", **options)
+    return obstore.store.from_url(container, **options)
 
 
-def _iterate_objects(
-    store: ObjectStore, url: str, name: str, wanted: Callable[[str], bool], *, presigned: bool
-) -> Iterator[StoredObject]:
+def _iterate_objects(store: ObjectStore, url: str, query: str, wanted: Callable[[str], bool]) -> Iterator[StoredObject]:
     """Yield the object of a name; where there is none, what is wanted below it."""
-    if presigned:  # for one object and method: neither HEAD nor a list is allowed
+    name = split_bucket(url)[1]
+    if query:  # presigned for one object and method: neither HEAD nor a list is allowed
         if name:
-            yield _make_stored_object(store, url, name, store.get(name, options={"range": (0, 1)}).meta)
+            yield _make_stored_object(url, query, name, store.get(name, options={"range": (0, 1)}).meta)
         return
     if name:
         try:
-            yield _make_stored_object(store, url, name, store.head(name))
+            yield _make_stored_object(url, query, name, store.head(name))
         except (FileNotFoundError, IsADirectoryError):
             pass
         else:
             return
     for listed in store.list(prefix=name or None):
         yield from (
-            _make_stored_object(store, url, name, meta) for meta in listed if wanted(PurePosixPath(meta["path"]).name)
+            _make_stored_object(url, query, name, meta) for meta in listed if wanted(PurePosixPath(meta["path"]).name)
         )
 
 
-def _make_stored_object(store: ObjectStore, url: str, name: str, meta: ObjectMeta) -> StoredObject:
+def _make_stored_object(url: str, query: str, name: str, meta: ObjectMeta) -> StoredObject:
     path, tag = str(meta["path"]), meta.get("e_tag")
     modified_ns = round(meta["last_modified"].timestamp() * 1e6) * 1000
-    return StoredObject(store, url.rstrip("/") + path.removeprefix(name), path, int(meta["size"]), modified_ns, tag)
+    return StoredObject(url.rstrip("/") + path.removeprefix(name), query, path, int(meta["size"]), modified_ns, tag)
 
 
 def _place(object_name: str, directory: Path) -> Path:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -148,7 +148,7 @@ def look_at_files(place: Place, rows: Iterable[RunFacts]) -> Iterator[tuple[RunF
     rows : ingestions as the log has them.
     """
     rows = list(rows)
-    find = _find_on_disk(place.root) if isinstance(place, DirectoryPlace) else _find_listed(place, rows)
+    find = make_file_finder(place, rows)
     for row in rows:
         states, lost = list[tuple[int, int]](), None
         for name, size_bytes in row.files.items():
@@ -160,9 +160,12 @@ def look_at_files(place: Place, rows: Iterable[RunFacts]) -> Iterator[tuple[RunF
         yield row, lost, tuple(states)
 
 
-def _find_on_disk(root: Path) -> Callable[[str], tuple[int, int] | None]:
-    """Return what tells the size [byte] and modification time [ns] of a file; None where there is none."""
+def make_file_finder(place: Place, rows: Collection[RunFacts]) -> Callable[[str], tuple[int, int] | None]:
+    """Return what tells the size [byte] and modification time [ns] of a file of the runs of rows; None where there is none."""
+    return _find_on_disk(place.root) if isinstance(place, DirectoryPlace) else _find_listed(place, rows)
 
+
+def _find_on_disk(root: Path) -> Callable[[str], tuple[int, int] | None]:
     def find(name: str) -> tuple[int, int] | None:
         try:
             seen = os.stat(f"{root}/{name}")  # noqa: PTH116  of ten thousands
@@ -173,8 +176,8 @@ def _find_on_disk(root: Path) -> Callable[[str], tuple[int, int] | None]:
     return find
 
 
-def _find_listed(place: Place, rows: Sequence[RunFacts]) -> Callable[[str], tuple[int, int] | None]:
-    """Return the same from a listing of the run, or of all."""
+def _find_listed(place: Place, rows: Collection[RunFacts]) -> Callable[[str], tuple[int, int] | None]:
+    """Return it from a listing of the run, or of all."""
     run_ids = {row.run_id for row in rows}
     found = place.entries(run_ids.pop() if len(run_ids) == 1 else "") if rows else []
     return {entry.name: (entry.size_bytes, entry.modified_ns) for entry in found}.get

@@ -31,6 +31,7 @@ from tcpipe.fusion.filter_kernel import (
 from tcpipe.fusion.hypotheses import POSSIBLE, Hypothesis, compute_weights, explain, find_suspects, make_excursions
 from tcpipe.fusion.initial import compute_course, find_stationary_intervals
 from tcpipe.fusion.measurements import DOPPLER, GNSS, IMU, VISUAL, WHEELS, InitialState, Measurements, select_rows
+from tcpipe.fusion.noise_curves import describe_noise
 from tcpipe.fusion.pair_residuals import find_residuals
 from tcpipe.fusion.parameters import PARAMETERS, expand_start, make_model, make_priors, make_start
 from tcpipe.fusion.process import (
@@ -298,7 +299,7 @@ def _make_trajectory(  # noqa: PLR0917
         forward_velocity_std_mps=np.sqrt(speed_variance + (scale_std * speed) ** 2),
         rejections=_make_rejections(m, made),
         displacement_std_m=np.sqrt(links),
-        facts=_make_facts(m, made, smoothed, std, scale_std, explained),
+        facts=replace(_make_facts(m, made, smoothed, std, scale_std, explained), noise=describe_noise(m, noise)),
         corrected=_correct_measurements(m, made, smoothed, explained),
     )
 

@@ -19,14 +19,15 @@ from tcpipe.formats.finding_lines import format_findings
 from tcpipe.formats.json_files import to_plain
 from tcpipe.pipeline.explain import flatten_recipe
 from tcpipe.splits.assignment import SPLITS
+from tcpipe.tables.columns import to_integers
 from tcpipe.tables.findings import Finding, Subject
 
 _LABELS = ("power_watt", "velocity_mps", "duration_s", "energy_joule")
-_LABELLED = (
-    *(*_LABELS, "fused_velocity_mps"),
-    *("power_std_watt", "velocity_std_mps", "duration_std_s", "energy_std_joule"),
-)
+_STDS = ("power_std_watt", "velocity_std_mps", "duration_std_s", "energy_std_joule")
+_LABELLED = (*_LABELS, "fused_velocity_mps", *_STDS)
 _DRAWN = ("split", "fold")
+_SHARED = 0.9
+"""So much of their time samples share that are compared."""
 _VERSIONS = ("tcpipe_version", "data_model_version")
 
 Ints = NDArray[np.int64]
@@ -48,6 +49,8 @@ class Difference:
     """For every label: means, deviations and the largest gap between the two distribution functions, over all samples."""
     labels_of_train: Mapping[str, Mapping[str, float]]
     """The same over train alone."""
+    changes: Mapping[str, Mapping[str, float]]
+    """For every label and its σ: median and largest absolute change, over the samples of one run that share most of their time."""
     findings_gone: tuple[Finding, ...]
     """Findings of the first, by code and subject, that the second lacks: its own, its runs' and its maps'."""
     findings_new: tuple[Finding, ...]
@@ -95,7 +98,17 @@ def diff(a: str | Path, b: str | Path) -> Difference:
     gone, new = (tuple(of[key] for key in of if key not in other) for of, other in ((ours, theirs), (theirs, ours)))
     same = not (causes or moved or gone or new or any(counts[name] for name in _CHANGES))
     return Difference(
-        str(a), str(b), causes, counts, moved, _compute_shifts(tables), _compute_shifts(train), gone, new, same
+        a=str(a),
+        b=str(b),
+        causes=causes,
+        samples=counts,
+        moved=moved,
+        labels=_compute_shifts(tables),
+        labels_of_train=_compute_shifts(train),
+        changes=_measure_changes((first, second)),
+        findings_gone=gone,
+        findings_new=new,
+        same=same,
     )
 
 
@@ -115,6 +128,37 @@ def _compute_shifts(tables: Sequence[pa.Table]) -> dict[str, dict[str, float]]:
 def _read_values(table: pa.Table, name: str) -> NDArray[np.float64]:
     values: NDArray[np.float64] = table.column(name).to_numpy().astype(np.float64)
     return values
+
+
+def _measure_changes(directories: tuple[Path, Path]) -> dict[str, dict[str, float]]:
+    matched = _match_by_time(*(read_samples(directory, ["run_id", "start_ns", "end_ns"]) for directory in directories))
+    found = dict[str, dict[str, float]]()
+    for name in (*_LABELS, *_STDS):
+        ours, theirs = (
+            _read_values(read_samples(directory, [name]), name)[rows]
+            for directory, rows in zip(directories, matched, strict=True)
+        )
+        change = np.abs(theirs - ours)
+        if len(change := change[np.isfinite(change)]):
+            found[name] = {"samples": len(change), "median": float(np.median(change)), "largest": float(change.max())}
+    return found
+
+
+def _match_by_time(a: pa.Table, b: pa.Table) -> tuple[Ints, Ints]:
+    """Return the rows of samples of one run that share most of the longer one's time: on another track a run is cut elsewhere."""
+    runs = pc.unique(b.column("run_id"))
+    run = [pc.index_in(of.column("run_id"), value_set=runs).fill_null(-1).to_numpy() for of in (b, a)]
+    begin_b, end_b, begin_a, end_a = (to_integers(of, f"{end}_ns") for of in (b, a) for end in ("start", "end"))
+    order = np.lexsort((np.concatenate([begin_b, begin_a + (end_a - begin_a) // 2]), np.concatenate(run)))
+    latest = np.maximum.accumulate(np.where(order < len(b), np.arange(len(order)), 0))  # that began before each middle
+    of_a = order >= len(b)
+    in_a, in_b = order[of_a] - len(b), order[latest[of_a]]
+    is_same = (in_b < len(b)) & (run[0][np.minimum(in_b, len(b) - 1)] == run[1][in_a]) if len(b) else in_b < 0
+    in_a, in_b = in_a[is_same], in_b[is_same]
+    shared_ns = np.minimum(end_a[in_a], end_b[in_b]) - np.maximum(begin_a[in_a], begin_b[in_b])
+    longer_ns = np.maximum(end_a[in_a] - begin_a[in_a], end_b[in_b] - begin_b[in_b])
+    enough = shared_ns >= _SHARED * longer_ns
+    return in_a[enough], in_b[enough]
 
 
 def _count_differing(both: Sequence[tuple[Path, Ints]], names: Sequence[str]) -> int:
@@ -247,6 +291,10 @@ def _iterate_lines(found: Difference) -> Iterator[str]:
         yield "splits: " + ", ".join(f"{count} from {name}" for name, count in found.moved.items())
     for what, findings in (("gone", found.findings_gone), ("new", found.findings_new)):
         yield from (f"{what}: {line}" for line in format_findings(findings))
+    for name, change in found.changes.items():
+        if change["largest"] > 0.0:
+            count = f"{change['samples']:.0f} samples"
+            yield f"{name} of {count}: changed by {change['median']:.3g} in the median, by {change['largest']:.3g} at most"
     for part, shifts in (("", found.labels), (" in train", found.labels_of_train)):
         yield from (
             _shift_line(f"{name}{part}", shift) for name, shift in shifts.items() if shift.get("largest_gap", 0.0) > 0.0

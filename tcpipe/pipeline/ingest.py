@@ -172,7 +172,9 @@ def _call_of(
     store: Store, summary: IngestSummary, given: tuple[str, ...], tasks: Iterable[IngestTask], jobs: int
 ) -> CallRecord:
     """Return what the history holds of a call."""
-    done = [result for result in summary.results if result.status in ("done", "damaged", "empty")]
+    done, written_bytes = [result for result in summary.results if result.status in ("done", "damaged", "empty")], 0
+    with suppress(StoreError):  # a figure of the history
+        written_bytes = stored_bytes(store, [result.run.run_id for result in done if result.run])
     sizes = {task.source.name: sum(size for size, _ in task.source.files) for task in tasks}
     return CallRecord(
         INGEST,
@@ -183,7 +185,7 @@ def _call_of(
         logs=given,
         failed={result.log: result.problems[0] for result in summary.results if result.transient and result.problems},
         done_bytes=sum(sizes.get(result.log, 0) for result in done),
-        written_bytes=stored_bytes(store, [result.run.run_id for result in done if result.run]),
+        written_bytes=written_bytes,
     )
 
 
@@ -244,7 +246,7 @@ def _iterate_results(
 
 
 def _commit(log: LogWriter, ended: Sequence[tuple[int, IngestTask, Ingested]]) -> Iterator[tuple[int, IngestResult]]:
-    """Commit what became of logs, and yield it with what the log says of it."""
+    """Commit what became of logs, and yield it with what the log says of it; a run that cannot be committed has failed for now."""
     before, entries, notes = log.state, Entries(), dict[int, tuple[str, ...]]()
     for index, task, of in ended:
         more, notes[index] = _make_entries(log, task, of)
@@ -263,15 +265,24 @@ def _commit(log: LogWriter, ended: Sequence[tuple[int, IngestTask, Ingested]]) -
         kind: Kind = "ingested" if entries.runs else "failed" if entries.failed else "seen"
         log.commit(kind, make)
     except StoreError as error:
-        if entries.runs:
-            raise
-        logger.error("%s", error)  # noqa: TRY400  one line
+        if not entries.runs:
+            logger.error("%s", error)  # noqa: TRY400  one line
+        ended = [(index, task, _fail_commit(of, error) if of.rows else of) for index, task, of in ended]
     keep_state_here(log.store.place, log.state)
     for index, _, of in ended:
         result = replace(of.result, notes=(*of.result.notes, *notes[index]))
         if result.run and (by := others.get(result.run.run_id)):
             result = _settle_for(log.state.runs.get((by, result.run.recipe_id)), by, result, of.source)
         yield index, _judge_result(log.state, result, of.source, before=before)
+
+
+def _fail_commit(of: Ingested, error: StoreError) -> Ingested:
+    """Return that a run is in the store and no commit names it: the next call finds it there."""
+    problems = tuple(f"{of.result.log}: {problem}" for problem in error.problems)
+    findings = find_failure(of.result.log, type(error).__name__)
+    return replace(
+        of, result=IngestResult(of.result.log, "failed", causes=findings, problems=problems, transient=True), rows=()
+    )
 
 
 def _settle_for(made: RunFacts | None, run_id: str, result: IngestResult, source: LogSource) -> IngestResult:

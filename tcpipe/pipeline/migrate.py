@@ -7,20 +7,29 @@ and one that is done does nothing.
 
 from __future__ import annotations
 
+import re
+import shutil
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields, replace
 from itertools import chain
 from pathlib import Path
 from typing import Any, TypeVar
 
 from tcpipe.errors import StoreError, TcpipeError, UsageError, clean_lines
-from tcpipe.formats.bucket import open_place
+from tcpipe.formats.bucket import find_wrong_files, map_concurrently, open_place
 from tcpipe.formats.bucket_directories import find_newest
 from tcpipe.formats.commit_log import LOG
 from tcpipe.formats.commits import CallRecord, Dataset, Entries, Failure, LogSnapshot, Problem, State, Superseded
 from tcpipe.formats.dataset_card import DatasetCard
 from tcpipe.formats.dataset_files import CARD
-from tcpipe.formats.integrity import seal_document
+from tcpipe.formats.integrity import (
+    Checksum,
+    compute_checksum,
+    find_wrong_checksum,
+    seal_document,
+    verify_document,
+)
 from tcpipe.formats.json_files import Json, parse_typed, to_json, to_plain
 from tcpipe.formats.maps.map_files import open_map
 from tcpipe.formats.object_storage import is_url
@@ -28,6 +37,7 @@ from tcpipe.formats.place import Place
 from tcpipe.formats.recipe_toml import rename_earlier_keys
 from tcpipe.formats.run_documents import (
     MARK,
+    SPOOL,
     Manifest,
     RunJson,
     StoreDocument,
@@ -49,6 +59,12 @@ Document = Mapping[str, Any]
 
 _KNOWN_VERSIONS = (*EARLIER_VERSIONS, DATA_MODEL_VERSION)
 _RECORDS, _INDEX = "records/", "index/"
+_APART = (_RECORDS, _INDEX, f"{SPOOL}/", MARK)
+"""What is not copied: it is converted, or made again."""
+_IN_FOLDER = re.compile(r"(?:runs/[^/]+|maps)/[^/]+/[0-9a-f]{16}(?=/)")
+"""A folder that is named after its content, at the beginning of a name."""
+_AT_ONCE = 8
+"""Runs that are read and written side by side."""
 _WHOLLY_RENAMED = ("distance_by_reason_m", "flagged_samples", "removal", "physics")
 """Parts of cards and manifests that no names of users are keys of."""
 _TOGETHER = 500
@@ -137,55 +153,118 @@ def _bring_card(place: Place) -> tuple[str, ...]:
 
 def _store(source: Place, target: Place) -> Migrated:
     """Bring a store to this data model; ``target`` is ``source``, or where it is copied to."""
-    migrated, problems, names = list[str](), list[str](), [entry.name for entry in source.entries()]
-    documents = [name for name in names if name.startswith("runs/") and _is_document(name)]
-    copied = 0 if target == source else _copy(source, target, documents)
-    for name in documents:
-        data = None if target == source else source.read(name)
-        try:
-            data = _bring(source, name)
-        except TcpipeError as error:
-            problems += error.problems
-        if data is not None and target.read(name) != data:
-            target.put(name, data)
-            migrated += [target.where(name)] if read_layout(source) != DATA_MODEL_VERSION else []
+    is_current, names = read_layout(source) == DATA_MODEL_VERSION, [entry.name for entry in source.entries()]
+    there = {entry.name: entry.size_bytes for entry in target.entries()}
+    units, log = dict[str, list[str]](), list[str]()
+    for name in names:
+        if name.startswith("runs/") or (target != source and not name.startswith((*_APART, f"{LOG}/"))):
+            units.setdefault("/".join(name.split("/")[: 2 if name.startswith("runs/") else 1]), []).append(name)
+        elif target != source and name.startswith(f"{LOG}/"):
+            log.append(name)
+    with ThreadPoolExecutor(_AT_ONCE) as pool:
+        done = list(pool.map(lambda of: _bring_unit(source, target, of, there), units.values()))
+    copied = sum(of.copied for of in done) + sum(_put(target, name, source.read(name), there) for name in log)
+    changed = [] if is_current else [target.where(name) for of in done for name in of.changed]
+    problems = [line for of in done for line in of.problems]
     records = [name for name in names if name.startswith(_RECORDS)]
     if records or read_layout(target) != DATA_MODEL_VERSION:
         problems += _write_log(Store(target.where()), source, records)
-    mark = to_json(seal_document(StoreDocument(DATA_MODEL_VERSION))).encode()
-    if target.read(MARK) != mark:
-        target.put(MARK, mark)
+    _put(target, MARK, to_json(seal_document(StoreDocument(DATA_MODEL_VERSION))).encode(), there)
     for name in (name for name in names if target == source and name.startswith((_RECORDS, f"{_INDEX}logs."))):
         source.delete(name)
-    return Migrated(target.where(), tuple(migrated), len(documents) - len(migrated), tuple(problems), copied)
+    count = sum(map(_is_converted, names))
+    return Migrated(target.where(), tuple(changed), count - len(changed), tuple(problems), copied)
 
 
-def _is_document(name: str) -> bool:
-    of = split_number(name.rpartition("/")[2])
+@dataclass(frozen=True, slots=True)
+class _Unit:
+    """What became of the files of a run, or of all maps."""
+
+    changed: tuple[str, ...] = ()
+    copied: int = 0
+    problems: tuple[str, ...] = ()
+
+
+def _bring_unit(source: Place, target: Place, names: Sequence[str], there: Mapping[str, int]) -> _Unit:
+    """Copy the files of a run or map, where the target is another place, then put its documents, which name these files."""
+    documents, listed, problems = dict[str, bytes](), dict[str, Checksum](), list[str]()
+    for name in (name for name in names if split_number(name.rpartition("/")[2])):
+        if (data := source.read(name)) is None:
+            continue
+        documents[name], where = data, source.where(name)
+        try:
+            found = verify_document(data, where)
+            listed |= _read_checksums(found, name.rpartition("/")[0])
+            documents[name] = _bring(found, data, name, where)
+        except TcpipeError as error:
+            problems += error.problems
+    folders, copied = dict[str, list[str]](), 0
+    for name in (name for name in names if target != source and name not in documents):
+        folders.setdefault(match[0] if (match := _IN_FOLDER.match(name)) else "", []).append(name)
+    try:
+        for name in folders.pop("", ()):
+            copied += _put(target, name, source.read(name), there)
+        for prefix, of in folders.items():
+            copied += _copy_folder(source, target, prefix, {name: listed.get(name) for name in of}, there)
+    except StoreError as error:
+        return _Unit((), copied, (*problems, *error.problems))
+    put = [name for name, data in documents.items() if _put(target, name, data, there)]
+    changed = tuple(filter(_is_converted, put))
+    return _Unit(changed, copied + (len(put) - len(changed) if target != source else 0), tuple(problems))
+
+
+def _put(target: Place, name: str, data: bytes | None, there: Mapping[str, int]) -> bool:
+    """Write a file unless the target has it; return whether it was written."""
+    if data is None or (there.get(name) == len(data) and target.read(name) == data):
+        return False
+    target.put(name, data)
+    return True
+
+
+def _copy_folder(
+    source: Place, target: Place, prefix: str, wanted: Mapping[str, Checksum | None], there: Mapping[str, int]
+) -> int:
+    """Copy a folder that is named after its content, unless the target has it, byte for byte; return the number of files.
+
+    `StoreError` where a file is not what the documents have of it.
+    """
+    digests = {name: of or source.checksum(name) or Checksum(0, "") for name, of in wanted.items()}
+    if all(there.get(name) == of.size_bytes for name, of in digests.items()) and not find_wrong_files(
+        target, digests, digests
+    ):
+        return 0
+    with target.workshop() as directory:
+
+        def fetch(name: str) -> None:
+            path = directory / name.removeprefix(f"{prefix}/")
+            path.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(source.local(name, digests[name]), path)
+            if wrong := find_wrong_checksum(source.where(name), compute_checksum(path), digests[name]):
+                raise StoreError(f"{wrong}; not copied")
+
+        map_concurrently(source.where(), fetch, [*digests])
+        target.put_files(prefix, directory)
+    return len(digests)
+
+
+def _is_converted(name: str) -> bool:
+    """Return whether a file is a document of a run."""
+    of = split_number(name.rpartition("/")[2]) if name.startswith("runs/") else None
     return of is not None and of[0] in ("run", "manifest", "tags")
 
 
-def _copy(source: Place, target: Place, documents: Sequence[str]) -> int:
-    """Copy what a store holds but its documents and records, commits last; what is there already in its size is not copied again.
-
-    Returns the number of files that were copied.
-    """
-    there = {entry.name: entry.size_bytes for entry in target.entries()}
-    apart = (_RECORDS, _INDEX, MARK)
-    wanted = [of for of in source.entries() if not of.name.startswith(apart) and of.name not in set(documents)]
-    absent = [of for of in wanted if there.get(of.name) != of.size_bytes]
-    for entry in sorted(absent, key=lambda of: of.name.startswith(f"{LOG}/")):
-        target.put(entry.name, source.read(entry.name) or b"")
-    return len(absent)
+def _read_checksums(document: Document, above: str) -> dict[str, Checksum]:
+    """Return what a document has of files, by their name in the store."""
+    found = {**document.get("checksums", {}), **document.get("streams", {})}
+    return {f"{above}/{name}": parse_typed(of, Checksum, above) for name, of in found.items()}
 
 
-def _bring(place: Place, name: str) -> bytes:
-    """Return a document of a run as this data model has it; `StoreError` where it is damaged or of no data model that is known."""
-    where, kind = place.where(name), name.rpartition("/")[2].partition("-")[0]
-    found = read_sealed_at(place, name)
+def _bring(found: Document, data: bytes, name: str, where: str) -> bytes:
+    """Return a document of a run as this data model has it; `StoreError` where it is of no data model that is known."""
+    kind = name.rpartition("/")[2].partition("-")[0] if name.startswith("runs/") else ""
     document = _bring_document(found, where) if kind == "manifest" else _bring_run(found) if kind == "run" else found
     if document is found:
-        return place.read(name) or b""
+        return data
     parse_typed(document, Manifest if kind == "manifest" else RunJson, where)
     return to_json(seal_document(document)).encode()
 
@@ -227,6 +306,8 @@ def _bring_document(found: Document, where: str) -> Document:
         document |= {"maps": [_convert_findings(_rename_top_keys(of), "map", of["name"]) for of in found["maps"]]}
         rules = {of.name for of in fields(SplitConfig)} - {"buffer_m"}  # the recipe has them
         document |= {"split": _remove_keys(found["split"], *rules)}
+        if found.get("redaction"):  # their descriptions name tags and files
+            document |= {"added_columns": dict.fromkeys(found.get("added_columns", ()), "")}
     return {**document, "verdict": to_plain(judge(parse_typed(findings, tuple[Finding, ...], where)))}
 
 
@@ -270,9 +351,8 @@ def _write_log(store: Store, source: Place, record_names: Sequence[str]) -> list
     names = store.run_ids()
     for start in range(0, len(names), _TOGETHER):
         run_ids = names[start : start + _TOGETHER]
-        rows = [
-            row for run_id in run_ids for row in store.read_rows(run_id).values() if not is_committed(row, log.state)
-        ]
+        read = map_concurrently(source.where(), store.read_rows, run_ids)
+        rows = [row for of in read for row in of.values() if not is_committed(row, log.state)]
         known = (replace(row, log=row.log and replace(row.log, outline=outlines.get(row.run_id, ""))) for row in rows)
         log.commit("ingested", Entries(runs=tuple(known)))
     log.commit("seen", lambda state: _convert_records(records, state))

@@ -10,13 +10,14 @@ from pathlib import Path
 from tcpipe.errors import StoreError, UsageError
 from tcpipe.formats.bucket import open_place
 from tcpipe.formats.bucket_directories import fetch_directory_by_range
+from tcpipe.formats.commit_log import pause_garbage_collection
 from tcpipe.formats.commits import Dataset, State
 from tcpipe.formats.dataset_files import CARD, REPORT, read_current_card
 from tcpipe.formats.finding_lines import group_findings
 from tcpipe.formats.integrity import seal_page
 from tcpipe.formats.object_storage import is_url
 from tcpipe.formats.place import Place
-from tcpipe.formats.stored_runs import Ingestions, RunDirectory
+from tcpipe.formats.stored_runs import Ingestions, RunDirectory, make_file_finder
 from tcpipe.pipeline.plan import list_transient_failures
 from tcpipe.pipeline.problems import find_problems, is_acknowledged, make_failure
 from tcpipe.pipeline.prune import is_replaced
@@ -76,9 +77,10 @@ def report(path: Path | str, *, runs: bool = True, patches: bool = False) -> lis
 
 def _report_store(store: Store, *, runs: bool) -> list[Page]:
     """Write the store's page, first, as those of the runs lead to it, and again without the runs that cannot be read."""
-    found = store.ingestions()
-    facts = store_facts(store, found, will_be=found.finished if runs else ())
-    page, pages, problems = _write(store.place, store_report(facts), ()), list[Page](), list[str]()
+    with pause_garbage_collection():
+        found = store.ingestions()
+        page = _write(store.place, store_report(store_facts(store, found, will_be=found.finished if runs else ())), ())
+    pages, problems = list[Page](), list[str]()
     pictures_by_map: dict[str, Pictures] = {}
     for run in found.finished if runs else ():
         try:
@@ -128,9 +130,8 @@ def _write(place: Place, html: str, physics: tuple[str, ...]) -> Page:
 
 def store_facts(store: Store, found: Ingestions, *, will_be: Sequence[RunDirectory] = ()) -> StoreFacts:
     """Return what is known of all of a store; of the runs ``will_be`` the pages are about to be written."""
-    here = (entry.name.split("/") for entry in store.runs_place.entries("", but="streams"))
-    pages = {(parts[0], parts[1]) for parts in here if len(parts) == 3 and parts[2] == REPORT}
-    state = found.state
+    state, find = found.state, make_file_finder(store.runs_place, found.rows.values())
+    pages = {key for key in found.rows if find(f"{key[0]}/{key[1]}/{REPORT}")}
     known = {run.run_id for run in found.finished if is_acknowledged(find_problems(run.facts), state)}
     key = find_recipe_key(found)
     current = [run.facts for run in found.finished if run.facts.ingest_key == key]

@@ -207,10 +207,12 @@ def _format_json(name: str, value: Json) -> str:
 
 def _clean_data(value: Json) -> Json:
     """Return plain data with every text as one line that can be seen whole."""
-    if isinstance(value, Mapping):
-        return {clean_line(key): _clean_data(part) for key, part in value.items()}
     if isinstance(value, str):
         return value if value.isprintable() else clean_line(value)
+    if value is None or isinstance(value, int | float):
+        return value
+    if isinstance(value, Mapping):
+        return {clean_line(key): _clean_data(part) for key, part in value.items()}
     return [_clean_data(part) for part in value] if isinstance(value, Sequence) else value
 
 

@@ -8,7 +8,6 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import matplotlib.image
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
@@ -204,9 +203,11 @@ _PLAIN_PNG: dict[str, Any] = {"Software": None}
 
 def write_overview(path: Path, picture: NDArray[np.uint8], *, texts: Mapping[str, str] | None = None) -> None:
     """Write a picture, grey (R, C) or colour (R, C, 3), as PNG with texts by key; the same picture gives the same bytes."""
+    from matplotlib.image import imsave  # noqa: PLC0415  a page of a store needs no picture
+
     with write_atomic_file(path) as temporary:
         metadata = {**_PLAIN_PNG, **(texts or {})}
-        matplotlib.image.imsave(temporary, picture, format="png", cmap="gray", vmin=0, vmax=255, metadata=metadata)
+        imsave(temporary, picture, format="png", cmap="gray", vmin=0, vmax=255, metadata=metadata)
 
 
 _SHOWS = "tcpipe map"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, MutableMapping, Sequence
+from collections.abc import Iterator, Mapping, MutableMapping, Sequence
 from dataclasses import replace
 from pathlib import PurePosixPath
 
@@ -17,7 +17,7 @@ from tcpipe.formats.json_files import Json
 from tcpipe.formats.parquet import read_table
 from tcpipe.formats.run_documents import Counts, Manifest, RunJson
 from tcpipe.formats.stored_runs import RunDirectory
-from tcpipe.report.colours import DOUBTED, FAINT, KEPT, UNUSED
+from tcpipe.report.colours import DOUBTED, FAINT, KEPT, LINE_COLOURS, UNUSED
 from tcpipe.report.label_sections import (
     LABELS,
     QUALITY_WORDS,
@@ -29,7 +29,7 @@ from tcpipe.report.label_sections import (
 )
 from tcpipe.report.maps import Pictures, RunMap, draw_run_map
 from tcpipe.report.page import Column, Link, Number, Section, make_shown_column, pack_columns, render_page, show_verdict
-from tcpipe.report.plots import Plot, draw_histogram, label_histograms, make_plot
+from tcpipe.report.plots import Plot, draw_histogram, label_histograms, make_plot, show_text
 from tcpipe.report.run_plots import (
     SPEED_ROLES,
     Line,
@@ -46,11 +46,22 @@ from tcpipe.report.run_plots import (
 )
 from tcpipe.store import Store
 from tcpipe.tables.columns import to_floats, to_integers
-from tcpipe.tables.facts import ClockOffset, PhysicsFacts, StageFacts
+from tcpipe.tables.facts import ClockOffset, NoiseFacts, PhysicsFacts, StageFacts
 from tcpipe.tables.findings import Finding, select_findings
 
 _PAGE = "report.html"
 _DAMAGE = "Places where messages are or may be lost."
+_NOISE = (
+    "How much the error of each sensor changes over a time difference (1σ): fitted to the longest section of the run (line), and by the "
+    "covariances of its messages, were their errors independent (dashed). A filled circle: the run determines more than half of the "
+    "variance; an empty one: it is mostly what tcpipe assumes of such sensors."
+)
+_NOISE_PLOTS = {
+    "m": ("noise", "position, or distance driven [m]", 1.0),
+    "rad": ("noise of turns", "angle turned [°]", 180.0 / np.pi),
+}
+"""By unit of the facts: name of the plot, label and factor of its axis."""
+_TURN = " turn"
 _STEP_M = 0.05
 """Positions of the track that are nearer become one on the map."""
 
@@ -267,6 +278,7 @@ def make_sensor_sections(run_json: RunJson | None, manifest: Manifest, rejection
     return [
         *([] if run_json is None else [_make_topics_section(run_json, manifest.counts)]),
         *_make_trust_sections(facts, rejections),
+        *_make_noise_sections(facts),
         *_make_disagreement_sections(facts),
         *_make_clock_sections(facts, manifest.info.report.findings),
     ]
@@ -312,6 +324,58 @@ def _make_trust_sections(facts: StageFacts, rejections: pa.Table) -> list[Sectio
     )
     header = ("sensor", "measurements", "rejected", "NIS", "excluded because")
     return [Section("Rejected measurements by sensor", text, header=header, rows=rows)]
+
+
+def _make_noise_sections(facts: StageFacts) -> list[Section]:
+    """Return the section on the noise of the sensors; none of a run whose estimator does not fit it."""
+    stretches = [each for each in (facts.fuse.stretches if facts.fuse else ()) if each.noise]
+    if not stretches:
+        return []
+    noise = max(stretches, key=lambda each: each.end_ns - each.start_ns).noise
+    sensors = list(dict.fromkeys(name.removesuffix(_TURN) for name in noise))
+    plots = []
+    for unit in _NOISE_PLOTS:
+        drawn = {name: each for name, each in noise.items() if each.unit == unit}
+        if drawn:
+            plots.append(_draw_noise(unit, drawn, [sensors.index(name.removesuffix(_TURN)) for name in drawn]))
+    return [Section("Noise of the sensors", _NOISE, plots=plots)]
+
+
+def _draw_noise(unit: str, noise: Mapping[str, NoiseFacts], numbers: Sequence[int]) -> Plot:
+    """Return the plot of sensors of one unit; a sensor has the colour of its number in the other plot, too."""
+    name, label, factor = _NOISE_PLOTS[unit]
+    colours = {each.replace("_", " "): LINE_COLOURS[k] for each, k in zip(noise, numbers, strict=True)}
+    plot = make_plot(
+        name,
+        alt=f"σ of the error in {label} over time differences, for {', '.join(colours)}: fitted to the run, and as claimed.",
+        axes=("time difference [s]", f"σ of {label}"),
+        legend=colours,
+        tools="save",
+        waits=True,
+        x_axis_type="log",
+        y_axis_type="log",
+    )
+    for (sensor, colour), each in zip(colours.items(), noise.values(), strict=True):
+        std, claimed = (factor * np.array(values) for values in (each.std, each.claimed_std))
+        plot.figure.line(each.time_s, claimed, color=colour, line_dash="dashed", line_width=1.3)
+        plot.figure.line(each.time_s, std, color=colour, line_width=1.8)
+        source = {
+            "x": each.time_s,
+            "y": std,
+            "fill": [float(share > 0.5) for share in each.data_share],
+            "text": _describe_noise(sensor, each, std, claimed, "m" if unit == "m" else "°"),
+        }
+        show_text(plot, plot.figure.scatter("x", "y", size=7, color=colour, fill_alpha="fill", source=source))
+    return plot
+
+
+def _describe_noise(
+    sensor: str, each: NoiseFacts, std: NDArray[np.float64], claimed: NDArray[np.float64], unit: str
+) -> list[str]:
+    return [
+        f"{sensor} over {time_s:g} s: {fitted:.2g} {unit} fitted, {stated:.2g} {unit} claimed, {share:.0%} by the data"
+        for time_s, fitted, stated, share in zip(each.time_s, std, claimed, each.data_share, strict=True)
+    ]
 
 
 def _make_disagreement_sections(facts: StageFacts) -> list[Section]:

@@ -207,7 +207,8 @@ def sort_findings(findings: Iterable[Finding]) -> list[Finding]:
         entry = catalogue.get(finding.code)
         return rank_severity(finding.severity), -len(entry.affects if entry else ())
 
-    return sorted(dict.fromkeys(findings), key=rank)
+    objects = {id(of): of for of in findings}.values()  # runs share most of them, and a hash takes long
+    return sorted(dict.fromkeys(objects), key=rank)
 
 
 def select_findings(findings: Iterable[Finding], *codes: str) -> list[Finding]:
@@ -270,6 +271,17 @@ def judge(findings: Iterable[Finding]) -> Verdict:
     for finding in reversed(reasons):
         grades |= dict.fromkeys(catalogue[finding.code].affects, _GRADE_OF[finding.severity])
     return Verdict(**grades, reasons=reasons)
+
+
+def find_worst_grade(findings: Iterable[Finding]) -> Grade:
+    """Return the worst grade of the verdict on findings."""
+    catalogue, grades = read_catalogue(), [GRADES[0]]
+    grades += [
+        _GRADE_OF[of.severity]
+        for of in findings
+        if of.severity != "note" and of.code in catalogue and catalogue[of.code].affects
+    ]
+    return max(grades, key=GRADES.index)
 
 
 def judge_by_code(findings: Iterable[Finding]) -> Verdict:

@@ -255,7 +255,7 @@ def test_a_migration_that_is_killed_at_any_step_is_gone_on_with(untouched, tmp_p
             raise _Killed
         left[0] -= 1
 
-    for name in ("put", "put_new", "delete"):
+    for name in ("put", "put_new", "put_files", "delete"):
         monkeypatch.setattr(DirectoryPlace, name, _after(step, getattr(DirectoryPlace, name)))
     for steps in range(200):
         left[0] = steps
@@ -268,6 +268,22 @@ def test_a_migration_that_is_killed_at_any_step_is_gone_on_with(untouched, tmp_p
     rows, others = ([*Store(place).state().runs.values()] for place in (got, whole))
     assert [replace(row, commit=0) for row in rows] == [replace(row, commit=0) for row in others]
     assert verify(got).problems == ()
+
+
+def test_each_file_that_is_copied_is_checked_by_its_digest(untouched, tmp_path):
+    store, target = untouched / "store", tmp_path / "target"
+    migrate(store, target)
+    (there,) = target.glob("runs/*/*/*/track.parquet")
+    whole = there.read_bytes()
+    there.write_bytes(whole[:-1] + b"?")
+    assert migrate(store, target).copied == 3, "the folder with the changed file"
+    assert there.read_bytes() == whole
+    (table,) = store.glob("maps/site/*/site.png")
+    table.write_bytes(table.read_bytes()[:-1] + b"?")
+    found = migrate(store, tmp_path / "other")
+    assert (found.exit_code, len(found.problems)) == (3, 1)
+    assert re.search(r"site\.png: its sha256 is .*; not copied", found.problems[0])
+    assert not list((tmp_path / "other").glob("maps/**/*.*"))
 
 
 def settled(store):

@@ -6,7 +6,7 @@ from pathlib import Path
 from time import monotonic
 
 import pytest
-from synthetic_store import add_run, add_world, driven, lanes, segments
+from synthetic_store import add_run, add_world, driven, lanes, make_noise_facts, segments
 
 from tcpipe.learning.evaluation_facts import EvaluateConfig
 from tcpipe.learning.evaluation_files import run_evaluation
@@ -248,7 +248,7 @@ def run_page(tmp_path_factory):
     add_world(store, here)
     start, end = lanes((0.0,), -12.0, 12.0)
     table = segments("driven", start, end, start_ns=10**18)
-    add_run(store, "driven", table, track=driven(table), tags={"site": "<b>\x1b[31m'\"&"})
+    add_run(store, "driven", table, track=driven(table), tags={"site": "<b>\x1b[31m'\"&"}, facts=make_noise_facts())
     return Path(report(store.runs()[0].where)[0].path)
 
 
@@ -293,6 +293,14 @@ def test_a_run_is_worked_by_keyboard_and_all_its_plots_zoom_as_one(driving):
     until(driving, f"page.model('line 0').data_source.data.t.every((t) => t > {zoomed[0] - 0.1})")
     driving.select_option("#label", "E")
     assert driving.evaluate("page.model('label plot').left[0].axis_label") == "E [J], ± σ"
+
+
+def test_the_noise_of_sensors_is_drawn_and_says_how_much_the_data_tell(driving):
+    plot = driving.locator("figure[aria-label*='fitted to the run']").first
+    plot.scroll_into_view_if_needed()
+    until(driving, "page.plots.some((one) => one.model.name === 'noise')")
+    driving.mouse.move(*driving.evaluate(PLACE, ["noise", 10.0, 0.2]))
+    driving.get_by_text("wheel odometry over 10 s: 0.2 m fitted, 0.01 m claimed, 50% by the data").wait_for()
 
 
 ON_PAPER = """() => matchMedia("print").addEventListener("change", () => {

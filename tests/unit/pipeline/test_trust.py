@@ -7,6 +7,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from map_worlds import World
@@ -17,13 +18,14 @@ from tcpipe.dataset import open_dataset
 from tcpipe.errors import DatasetError, UsageError
 from tcpipe.formats.commits import Entries, LogSnapshot
 from tcpipe.formats.integrity import compute_checksum, find_broken_seal, read_seal, seal_page, write_sealed
+from tcpipe.formats.json_files import to_plain
 from tcpipe.formats.maps.map_facts import MapInputs
 from tcpipe.formats.maps.map_files import open_map
 from tcpipe.formats.place import DirectoryPlace
 from tcpipe.formats.run_documents import MapDocument, read_as_at
 from tcpipe.pipeline.calls import open_log
 from tcpipe.pipeline.dataset.build import build_dataset
-from tcpipe.pipeline.diff import diff
+from tcpipe.pipeline.diff import _match_by_time, diff
 from tcpipe.pipeline.explain import explain
 from tcpipe.pipeline.inspect import inspect
 from tcpipe.pipeline.report import report
@@ -416,6 +418,45 @@ def test_the_shift_of_labels_is_that_of_scipy(made, copy, tmp_path):
     a, b = (open_dataset(path)["train"].samples["power_watt"].to_numpy() for path in (made / "zarr", tmp_path / "b"))
     assert found.labels_of_train["power_watt"]["largest_gap"] == pytest.approx(ks_2samp(a, b).statistic)
     assert any(line.startswith("power_watt in train: mean ") for line in str(found).splitlines())
+
+
+@pytest.mark.parametrize("counts", [(0, 3), (3, 0), (40, 50)])
+def test_samples_are_matched_by_run_and_time(counts):
+    draw = np.random.default_rng(0)
+
+    def table(count):
+        begin = np.sort(draw.choice(60, count, replace=False)) * 10 + draw.integers(0, 3, count)
+        run_ids = pa.array(draw.choice(["x", "y", "z"], count).tolist(), pa.string())
+        return pa.table({"run_id": run_ids, "start_ns": begin, "end_ns": begin + 10})
+
+    a, b = table(counts[0]), table(counts[1])
+    wanted = {
+        (i, j)
+        for i, ours in enumerate(a.to_pylist())
+        for j, theirs in enumerate(b.to_pylist())
+        if ours["run_id"] == theirs["run_id"] and abs(ours["start_ns"] - theirs["start_ns"]) <= 1
+    }
+    assert set(zip(*map(np.ndarray.tolist, _match_by_time(a, b)), strict=True)) == wanted
+    assert wanted or not all(counts)
+
+
+def test_the_changes_of_labels_are_those_of_the_samples_in_both(made, copy):
+    other = copy("zarr")
+    table = pq.read_table(other / "samples.parquet")
+    at, energy = table.schema.get_field_index("energy_joule"), table.column("energy_joule").to_numpy().copy()
+    energy[:3] += (1.0, -4.0, 2.0)
+    pq.write_table(table.set_column(at, table.schema.field(at), pa.array(energy)), other / "samples.parquet")
+    card = json.loads((other / "dataset.json").read_text())
+    card["checksums"]["samples.parquet"] = to_plain(compute_checksum(other / "samples.parquet"))
+    write_sealed(other / "dataset.json", card)
+    found = diff(made / "zarr", other).changes
+    assert found["energy_joule"] == {"samples": len(energy), "median": 0.0, "largest": pytest.approx(4.0)}
+    assert set(found) == {
+        f"{name}_{unit}"
+        for name, unit in (("power", "watt"), ("velocity", "mps"), ("duration", "s"), ("energy", "joule"))
+        for name in (name, f"{name}_std")
+    }
+    assert {of["largest"] for name, of in found.items() if name != "energy_joule"} == {0.0}
 
 
 @pytest.mark.parametrize("name", ["zarr", "parquet"])

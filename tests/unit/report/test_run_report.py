@@ -6,7 +6,7 @@ import numpy as np
 import pyarrow as pa
 import pytest
 from page_reading import data_of, unpacked
-from synthetic_store import add_run, driven, lanes, segments
+from synthetic_store import add_run, driven, lanes, make_noise_facts, segments
 
 from tcpipe.report.run_plots import (
     downsample_columns,
@@ -107,6 +107,18 @@ def test_speed_of_a_sensor_that_tells_places_is_its_chord_over_a_second():
         6.0 * np.sin(1 / 6), abs=1e-3
     )  # chord of a circle of 3 m at 1 m/s
     assert np.diff(shown.t_s) == pytest.approx(1.0)
+
+
+def test_the_noise_of_the_longest_section_is_on_the_page(tmp_path):
+    html = page_of(tmp_path, drive(), track=driven(drive()), facts=make_noise_facts())
+    section = html.split("<h2>Noise of the sensors</h2>")[1].split("<h2>")[0]
+    assert section.count("<figure") == 2
+    assert "for gnss, wheel odometry: fitted to the run" in section
+    assert "for wheel odometry turn: fitted to the run" in section
+    colours = re.findall(r'style="background:(#\w+)"></i>wheel odometry', section)
+    assert len(colours) == 2, section
+    assert len(set(colours)) == 1, "one sensor, one colour"
+    assert "Noise of the sensors" not in page_of(tmp_path / "other", drive(), track=driven(drive()))
 
 
 def test_a_run_without_power_map_or_sensors_says_so(tmp_path):

@@ -139,7 +139,8 @@ def test_an_index_tells_recordings_apart(tmp_path):
         assert not a.is_known_by_outline
 
 
-def test_a_connection_that_breaks_is_made_again_and_named_where_it_breaks_for_good(drives):
+def test_a_connection_that_breaks_is_made_again_and_named_where_it_breaks_for_good(drives, monkeypatch):
+    monkeypatch.setenv("TCPIPE_RETRY_MINUTES", "0.01")
     bucket, fetched = drives
     messages, store = write(bucket / "run.mcap", "mcap zstd")
     with open_log("s3://drives/run.mcap") as log:

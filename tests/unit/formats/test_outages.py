@@ -1,0 +1,139 @@
+"""A store that does not answer: the first request fails soon, later ones wait, and one log's upload costs no other log."""
+
+import logging
+import time
+from pathlib import Path
+
+import pytest
+from object_gateway import in_environment
+from storage_server import object_store
+from wheel_drives import START_NS, drive_at
+
+from tcpipe.errors import StoreError, UsageError
+from tcpipe.formats.bucket import open_place
+from tcpipe.pipeline.ingest import ingest
+from tcpipe.pipeline.status import find_status
+from tcpipe.pipeline.verify import verify
+from tcpipe.recipe import Recipe
+from tcpipe.store import Store
+
+LIBRARY = ("Generic", "reqwest", "Error performing", "retries", "HTTP error")
+
+
+@pytest.fixture
+def served(tmp_path, monkeypatch):
+    (tmp_path / "served" / "tests").mkdir(parents=True)
+    with object_store(tmp_path / "served") as (environment, fetched):
+        in_environment(monkeypatch, environment, tmp_path / "cache")
+        yield fetched
+
+
+def test_the_first_request_fails_within_seconds_and_says_what_to_check(served, monkeypatch):
+    began, served.away_until = time.monotonic(), time.monotonic() + 60
+    with pytest.raises(StoreError) as away:
+        open_place("s3://tests/x").check()
+    assert time.monotonic() - began < 5
+    (line,) = away.value.problems
+    assert line.startswith("s3://tests/x: it cannot be read (no answer from http://127.0.0.1:")
+    assert "check that it runs" in line
+    assert not any(word in line for word in LIBRARY)
+    monkeypatch.setenv("AWS_ENDPOINT_URL", "http://127.0.0.1:9")
+    with pytest.raises(StoreError, match=r"no answer from http://127.0.0.1:9: connection refused; check"):
+        open_place("s3://tests/x").read("a")
+
+
+def test_later_requests_wait_with_one_line(served, caplog, monkeypatch):
+    monkeypatch.setenv("TCPIPE_RETRY_MINUTES", "10")
+    place = open_place("s3://tests/x")
+    place.put("a", b"before")
+    served.away_until = time.monotonic() + 3
+    with caplog.at_level(logging.WARNING, "tcpipe"):
+        place.put("a", b"after")
+        assert place.put_new("b", b"new")
+    assert (place.read("a"), place.read("b")) == (b"after", b"new")
+    (line,) = (record.getMessage() for record in caplog.records)
+    assert line.startswith("s3://tests: no answer from")
+    assert "trying again for up to 10 min (TCPIPE_RETRY_MINUTES)" in line
+
+
+def test_after_waiting_in_vain_the_next_requests_fail_soon_until_there_is_an_answer(served, monkeypatch):
+    monkeypatch.setenv("TCPIPE_RETRY_MINUTES", "0.02")
+    place = open_place("s3://tests/x")
+    place.put("a", b"content")
+    served.away_until = time.monotonic() + 60
+    with pytest.raises(StoreError, match="no answer"):
+        place.read("a")
+    monkeypatch.setenv("TCPIPE_RETRY_MINUTES", "10")
+    began = time.monotonic()
+    with pytest.raises(StoreError, match="no answer"):
+        place.read("a")
+    assert time.monotonic() - began < 5
+    served.away_until = 0.0
+    assert place.read("a") == b"content"
+
+
+def test_a_store_that_stays_busy_is_named_by_its_answer(served, monkeypatch):
+    monkeypatch.setenv("TCPIPE_RETRY_MINUTES", "0.01")
+    served.busy = "a"
+    with pytest.raises(StoreError) as busy:
+        open_place("s3://tests/x").put("a", b"")
+    assert busy.value.problems == (
+        "s3://tests/x/a: it cannot be written (the store answers 503 Service Unavailable, SlowDown)",
+    )
+
+
+@pytest.mark.parametrize("given", ["soon", "-1", "inf", "nan"])
+def test_a_time_that_is_none_is_refused(served, monkeypatch, given):
+    place = open_place("s3://tests/x")
+    place.read("a")
+    monkeypatch.setenv("TCPIPE_RETRY_MINUTES", given)
+    served.away_until = time.monotonic() + 1
+    with pytest.raises(UsageError, match=f"TCPIPE_RETRY_MINUTES is '{given}', expected a number of minutes"):
+        place.read("a")
+
+
+@pytest.fixture
+def logs(tmp_path):
+    """Two logs, each of which is a commit of its own."""
+    drive_at(tmp_path / "logs" / "one.mcap")
+    drive_at(tmp_path / "logs" / "two.mcap", seed=1, start_ns=START_NS + 10**13)
+    return tmp_path / "logs"
+
+
+def _ingest(logs):
+    return {Path(of.log).stem: of for of in ingest([logs], store="s3://tests/store", recipe=Recipe()).results}
+
+
+def _finish(logs):
+    """Expect that the next call makes up for the log that failed, and that nothing is left to do."""
+    assert {name: of.status for name, of in _ingest(logs).items()} == {"one": "done", "two": "unchanged"}
+    assert find_status([logs], store="s3://tests/store", recipe=Recipe(), min_age_s=0.0).counts == {"done": 2}
+    assert verify("s3://tests/store").problems == ()
+
+
+def test_a_failed_upload_costs_its_own_log(served, logs, monkeypatch):
+    monkeypatch.setenv("TCPIPE_RETRY_MINUTES", "0.01")
+    served.busy = "runs/one-"
+    found = _ingest(logs)
+    assert {name: of.status for name, of in found.items()} == {"one": "failed", "two": "done"}
+    assert "it cannot be written (the store answers 503" in found["one"].problems[0]
+    assert found["one"].transient
+    served.busy = ""
+    _finish(logs)
+
+
+def test_a_failed_commit_costs_its_own_logs(served, logs, monkeypatch):
+    monkeypatch.setattr("tcpipe.pipeline.ingest._TOGETHER_S", -1.0)
+    commit, refused = Store.commit, ["ingested"]
+
+    def refuse_first(store, state, stamp, kind, make):
+        if kind in refused:
+            refused.remove(kind)
+            raise StoreError("s3://tests/store/log/0000000002.json: it cannot be written (no answer)")
+        return commit(store, state, stamp, kind, make)
+
+    monkeypatch.setattr(Store, "commit", refuse_first)
+    found = _ingest(logs)
+    assert {name: of.status for name, of in found.items()} == {"one": "failed", "two": "done"}
+    assert "log/0000000002.json: it cannot be written" in found["one"].problems[0]
+    _finish(logs)
