@@ -26,10 +26,8 @@ from tcpipe.tables.facts import (
     Disagreement,
     FuseFacts,
     GateReset,
-    MountingFacts,
     ParameterFacts,
     StretchFacts,
-    make_vector,
 )
 from tcpipe.tables.findings import Finding, StageReport, Subject, make_finding, read_threshold
 from tcpipe.tables.levels import Sensor, Streams
@@ -210,49 +208,35 @@ _LEAST_TILT_RAD = 0.0175
 _LEAST_SCALE = 0.1
 
 
-def make_mounting_findings(inputs: FusionInputs, fused: Fused, streams: Streams) -> StageReport[MountingFacts | None]:
-    """Return where the run shows other extrinsics or scales than are stated, with the recipe keys that would state it."""
-    findings: list[Finding] = []
-    longest = max(fused.facts, key=lambda of: of.end_ns - of.start_ns)
-    arm, tilt = longest.parameters.get("antenna"), longest.parameters.get("mounting of the IMU")
-    moved = std_m = roll_pitch = None
+def find_parameter_findings(inputs: FusionInputs, facts: FuseFacts, streams: Streams) -> Iterator[Finding]:
+    """Yield where the run shows other extrinsics or scales than are stated, with the recipe keys that would state it."""
+    parameters = facts.parameters
+    arm, tilt = parameters.get("antenna"), parameters.get("mounting of the IMU")
     if arm is not None and GNSS in streams.sensors:
         sensor = streams.sensors[GNSS]
         if sensor.placed_by == "assumed" or _is_contradicted(arm, _LEAST_ARM_M):
-            moved, std_m = make_vector(np.array(arm.value)), make_vector(np.array(arm.std))
-            findings.append(_find_arm(arm, sensor, find_recipe_role(GNSS, streams)))
+            yield _find_arm(arm, sensor, find_recipe_role(GNSS, streams))
     if tilt is not None and _is_contradicted(tilt, _LEAST_TILT_RAD):
-        roll_pitch = tilt.value[0], tilt.value[1]
-        findings.append(_find_tilt(tilt, streams.sensors[IMU]))
-    scales = {}
+        yield _find_tilt(tilt, streams.sensors[IMU])
     for name, role in (("wheel scale", WHEELS), ("camera scale", VISUAL)):
-        found = longest.parameters.get(name)
+        found = parameters.get(name)
         if found is not None and (role in inputs.scales or _is_contradicted(found, _LEAST_SCALE)):
-            scales[role] = inputs.scales.get(role, 1.0) * (1.0 + found.value[0])
+            scale = inputs.scales.get(role, 1.0) * (1.0 + found.value[0])
             stated = (streams.report.facts.odometry_scale or {}).get(role, 1.0)
-            findings.append(_find_odometry_scale(role, scales[role], found.std[0], stated))
-    findings += _find_varying_scale(longest)
-    if not findings:
-        return StageReport((), None)
-    return StageReport(tuple(findings), MountingFacts(moved, std_m, roll_pitch, scales or None))
+            remedies = suggest("state", {"read.odometry_scale": {role: round(stated / scale, 4)}})
+            yield make_finding(
+                "odometry-scale", Subject("role", role), remedies=remedies, scale=scale, scale_std=found.std[0]
+            )
+    # That of wheels always varies: they slip.
+    camera = parameters.get("camera scale")
+    variation = 0.0 if camera is None else max(camera.variation, default=0.0)
+    if variation > read_threshold("odometry-scale-varies", "min_variation_fraction"):
+        yield make_finding("odometry-scale-varies", Subject("role", VISUAL), variation_fraction=variation)
 
 
 def _is_contradicted(found: ParameterFacts, least: float) -> bool:
     """Return whether a parameter surely differs from what is stated, by so much at least."""
     return any(abs(v) > max(_SURELY * s, least) for v, s in zip(found.value, found.std, strict=True))
-
-
-def _find_varying_scale(longest: StretchFacts) -> Iterator[Finding]:
-    """Yield the finding of a camera whose scale varies; that of wheels always does: they slip."""
-    scale = longest.parameters.get("camera scale")
-    variation = 0.0 if scale is None else max(scale.variation, default=0.0)
-    if variation > read_threshold("odometry-scale-varies", "min_variation_fraction"):
-        yield make_finding("odometry-scale-varies", Subject("role", VISUAL), variation_fraction=variation)
-
-
-def _find_odometry_scale(role: str, scale: float, std: float, stated: float) -> Finding:
-    remedies = suggest("state", {"read.odometry_scale": {role: round(stated / scale, 4)}})
-    return make_finding("odometry-scale", Subject("role", role), remedies=remedies, scale=scale, scale_std=std)
 
 
 def _find_arm(arm: ParameterFacts, sensor: Sensor, name: str) -> Finding:

@@ -198,22 +198,17 @@ class FuseFacts:
     skipped_s: float
     stretches: tuple[StretchFacts, ...]
 
+    @property
+    def parameters(self) -> Mapping[str, ParameterFacts]:
+        """What the longest section showed of each parameter."""
+        return max(self.stretches, key=lambda of: of.end_ns - of.start_ns).parameters
+
 
 @dataclass(frozen=True, slots=True)
 class SensorChecks:
     """The codes of the findings on excluded sensors, by role."""
 
     excluded: Mapping[str, str] = field(default_factory=dict)
-
-
-@dataclass(frozen=True, slots=True)
-class MountingFacts:
-    """Corrections: shift of the antenna in base_link and its σ, roll and pitch of the IMU, scale of each odometry against the track."""
-
-    antenna_moved_m: Vector | None = field(default=None, metadata=LEFT_OUT)
-    antenna_std_m: Vector | None = field(default=None, metadata=LEFT_OUT)
-    imu_tilt_rad: tuple[float, float] | None = field(default=None, metadata=LEFT_OUT)
-    odometry_scale: Mapping[str, float] | None = field(default=None, metadata=LEFT_OUT)
 
 
 @dataclass(frozen=True, slots=True)
@@ -452,7 +447,6 @@ class StageFacts:
     power: PowerSign | None = field(default=None, metadata=LEFT_OUT)
     fuse: FuseFacts | None = field(default=None, metadata=LEFT_OUT)
     sensor_checks: SensorChecks | None = field(default=None, metadata=LEFT_OUT)
-    mounting: MountingFacts | None = field(default=None, metadata=LEFT_OUT)
     audit: AuditFacts | None = field(default=None, metadata=LEFT_OUT)
     clock_offsets: ClockFacts | None = field(default=None, metadata=LEFT_OUT)
     mask: MaskFacts | None = field(default=None, metadata=LEFT_OUT)

@@ -113,7 +113,7 @@ def test_rows_that_were_set_aside_are_counted_but_not_those_of_a_sensor_that_was
         PLACE,
         counts={"gnss": counts(variances_replaced=4), "imu": counts(invalid=2), "visual_odometry": counts(invalid=9)},
         findings=[sleeps, blind],
-        excluded=frozenset({"visual_odometry"}),
+        excluded={"visual_odometry": make_finding("imu-no-acceleration", Subject("role", "visual_odometry"))},
     )
     assert warned(inputs, stretch(), skipped_s=0.55) == (
         sleeps,
