@@ -377,7 +377,9 @@ class HonestCell:
         imu = Mounting(tuple(rng.uniform(-0.2, 0.2, 3)), (rng.choice([0.0, np.pi]), 0.0, rng.integers(4) * np.pi / 2))
         camera = Mounting((rng.uniform(0.2, 0.5), rng.uniform(-0.1, 0.1), 0.5), (0.0, rng.uniform(0.0, 0.3), 0.0))
         sensors = Sensors(
-            gnss=Gnss(rng.choice([5.0, 10.0]), _WHITE_M, UP * _WHITE_M, mounting=Mounting(arm_m)),
+            gnss=Gnss(
+                rng.choice([5.0, 10.0]), _WHITE_M, UP * _WHITE_M, (0.0, 0.0), mounting=Mounting(arm_m), stated_off_m=0.0
+            ),
             wheels=Wheels(40.0, scale=rng.normal(1.0, 0.015), yaw_scale=rng.uniform(1.02, 1.15)),
             imu=Imu(mounting=imu, orientation=bool(rng.integers(2))),
             visual=Visual(20.0, scale=rng.normal(1.0, 0.02), mounting=camera),

@@ -2,6 +2,7 @@
 
     python benchmarks/label_accuracy.py                      # hills12: twelve hilly minutes, every sensor fault on
     python benchmarks/label_accuracy.py --scenario demo --seed 1
+    python benchmarks/label_accuracy.py --exact-gnss         # white noise of the fixes, and an antenna where the log states it
     python benchmarks/label_accuracy.py --recipe pipelines/husky-paper.toml
 
 Nothing of this is self-consistent: the truth comes from the simulator, which shares no formula with the pipeline but rotations.
@@ -12,6 +13,7 @@ import argparse
 import sys
 import tempfile
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +24,8 @@ from tcpipe import ingest
 from tcpipe.formats.recipe_toml import load_recipe
 from tcpipe.formats.stored_runs import RunDirectory
 from tcpipe.geometry.rotation import rpy_from_quat, wrap_to_pi
-from tcpipe.simulation import Truth, compute_true_cost, read_truth, simulate
+from tcpipe.simulation import Truth, compute_true_cost, find_scenario, read_truth, simulate
+from tcpipe.simulation.sensors import EXACT_GNSS
 from tcpipe.store import Store
 from tcpipe.tables.columns import to_floats, to_integers
 
@@ -92,9 +95,16 @@ def main() -> None:
     parser.add_argument("--scenario", default="hills12")
     parser.add_argument("--seed", type=int, default=11)
     parser.add_argument("--recipe", type=Path)
+    parser.add_argument(
+        "--exact-gnss", action="store_true", help="fixes err as white noise, the stated antenna does not"
+    )
     given = parser.parse_args()
+    scenario = find_scenario(given.scenario)
+    if given.exact_gnss:
+        drives = (replace(of, sensors=replace(of.sensors, gnss=EXACT_GNSS)) for of in scenario.drives)
+        scenario = replace(scenario, drives=tuple(drives))
     with tempfile.TemporaryDirectory() as directory:
-        site = simulate(Path(directory) / "site", scenario=given.scenario, seed=given.seed)
+        site = simulate(Path(directory) / "site", scenario=scenario, seed=given.seed)
         recipe = load_recipe(given.recipe)
         summary = ingest(site.logs, store=Path(directory) / "store", recipe=recipe)
         if summary.exit_code:

@@ -272,9 +272,11 @@ def _make_trajectory(  # noqa: PLR0917
         # What fixes claim beyond what the run shows lasts longer than the run can show.
         for axes, fix in ((slice(0, 2), noise.horizontal), (slice(2, 3), noise.vertical)):
             position_variance[:, axes] += max(0.0, fix.claimed_m2 - fix.white_m2 - fix.correlated.variance)
-    if m.gnss is not None and not std[state.ARM : state.ARM + 3].any():
+    if m.gnss is not None and m.imu is None:
         turned = np.unwrap(np.arctan2(rotation[:, 1, 0], rotation[:, 0, 0]))
-        variance, moved = _compute_arm_variance(m, rotation, turned, made)
+        # Without a gyroscope the noise of roll passes for sway: the height of the antenna is no better known than it was stated.
+        unseen = np.asarray(m.gnss.lever_arm_std_m) * [not std[state.ARM], not std[state.ARM + 1], 1.0]
+        variance, moved = _compute_arm_variance(unseen, rotation, turned, made)
         position_variance += variance
         links = links + moved
     if m.imu is None and not m.odometries():
@@ -337,10 +339,8 @@ def _interpolate_links(smoothed: Smoothed, at: Ints, output_ns: Ints) -> Floats:
     return found
 
 
-def _compute_arm_variance(m: Measurements, rotation: Floats, yaw: Floats, made: Pass) -> tuple[Floats, Floats]:
+def _compute_arm_variance(std: Floats, rotation: Floats, yaw: Floats, made: Pass) -> tuple[Floats, Floats]:
     """Return the variance that an antenna whose place nothing shows adds to positions, (N, 3), and to displacements, (N, 4) [m²]."""
-    assert m.gnss is not None  # noqa: S101
-    std = np.asarray(m.gnss.lever_arm_std_m)
     moved = np.zeros((yaw.size, len(DISPLACEMENT_LAGS_S)))
     for column, lag_s in enumerate(DISPLACEMENT_LAGS_S):
         rows = round(lag_s / made.ticks.inputs.period_s)

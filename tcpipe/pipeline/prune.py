@@ -210,13 +210,13 @@ _Unnamed = tuple[str, Place, list[Entry], str | None]
 
 
 def _iterate_spooled(store: Store, min_age_s: float) -> Iterator[_Unnamed]:
-    """Yield what builds left that were killed while a cluster's workers sampled for them, if it is old enough."""
+    """Yield what was shared by builds on a cluster and tasks of an array that were killed, if it is old enough."""
     before_ns = time.time_ns() - int(min_age_s * 1e9)
     for name in store.place.folders(SPOOL):
         place = store.place.below(f"{SPOOL}/{name}")
         entries = place.entries()
         if all(entry.modified_ns < before_ns for entry in entries):
-            yield "left by a killed build", place, entries, None
+            yield "left by a killed call", place, entries, None
 
 
 def _iterate_replaced(store: Store, state: State, min_age_s: float, unread: str | None) -> Iterator[_Unnamed]:

@@ -72,7 +72,7 @@ def verify_store(store: Store) -> Iterator[CheckResult]:
             yield _describe_stranger(place, name)
     for name in place.folders():
         if name == SPOOL:
-            yield f"{place.where(name)}: belongs to a build that is running or was killed; 'tcpipe prune' removes old ones"
+            yield f"{place.where(name)}: belongs to a call that is running or was killed; 'tcpipe prune' removes old ones"
         elif name not in (LOG, "maps", "runs", _INDEX):
             yield _describe_stranger(place, name)
     yield from verify_log(place.below(LOG))

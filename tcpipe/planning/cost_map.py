@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.errors import MapError, StoreError, TcpipeError, UsageError, clean_lines
-from tcpipe.execution import run_all, unwrap_result
+from tcpipe.execution import Executor, run_all, unwrap_result
 from tcpipe.formats.atomic import clear_beside, lock_directory, write_atomic_directory, write_text
 from tcpipe.formats.bucket_directories import fetch_directory, has_card
 from tcpipe.formats.geopackage import make_raster_style
@@ -304,9 +304,9 @@ def _read_job(place: Path) -> str | None:
 
 @dataclass(frozen=True, slots=True)
 class Cluster:
-    """A Dask scheduler's address, and what gives its workers the model and the map, by files that they see."""
+    """A Dask scheduler's address or an executor, and what gives its workers the model and the map, by files that they see."""
 
-    address: str
+    address: str | Executor
     inputs: Callable[[], tuple[CostModel, MapFile]]
 
 

@@ -13,7 +13,7 @@ class Faults:
     """Switches; all off is a perfect sensor set at base_link."""
 
     gnss_noise: bool = False
-    """White position noise."""
+    """Position noise, most of it correlated in time."""
     gnss_lever_arm: bool = False
     """The antenna is not at base_link."""
     gnss_outliers: bool = False

@@ -26,6 +26,9 @@ CLOCK_STEP_NS = 2_500_000_000
 
 Triple = tuple[float, float, float]
 
+_UP_OVER_EAST = 1.7
+"""Of lasting errors of fixes: satellites are all above."""
+
 
 @dataclass(frozen=True, slots=True)
 class Reading:
@@ -54,21 +57,31 @@ AT_BASE_LINK = Mounting()
 
 @dataclass(frozen=True, slots=True)
 class Gnss:
-    """RTK receiver."""
+    """RTK receiver; its covariance is that of both parts of its noise."""
 
     rate_hz: float = 10.0
-    std_m: float = 0.015
-    """East and north."""
-    vertical_std_m: float = 0.025
+    std_m: float = 0.005
+    """White, east and north."""
+    vertical_std_m: float = 0.0085
+    lasting_std_m: tuple[float, float] = (0.008, 0.020)
+    """Range of the part that is correlated in time, east and north; each drive draws one. (0, 0): all noise is white."""
+    lasts_s: tuple[float, float] = (5.0, 60.0)
+    """Range of its correlation time, of which each drive draws one."""
     covariance: Literal["known", "unknown"] = "known"
     """Whether the message states its standard deviation."""
     mounting: Mounting = Mounting((0.1, 0.0, 0.9))
+    stated_off_m: float = 0.05
+    """By at most how much the log states another place than that, in a direction that each drive draws."""
     outlier_share: float = 0.01
     outlier_m: float = 1.5
     outage_s: float = 10.0
     stamp_jitter_s: float = 0.002
     delay_s: float = 0.06
     clock_offset_s: float = 0.25
+
+
+EXACT_GNSS = Gnss(std_m=0.015, vertical_std_m=0.025, lasting_std_m=(0.0, 0.0), stated_off_m=0.0)
+"""White noise, and an antenna where the log states it: kinder than real receivers."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -186,6 +199,16 @@ class Sensors:
         carried = {name: of for name, kept in in_place.items() if not kept and (of := getattr(self, name)) is not None}
         return replace(self, **{name: replace(of, mounting=AT_BASE_LINK) for name, of in carried.items()})
 
+    def stated(self, faults: Faults, noise: Noise) -> Sensors:
+        """Return mounted sensors as the log of a drive states them: the antenna off by up to its ``stated_off_m``."""
+        if self.gnss is None or not faults.gnss_lever_arm:
+            return self
+        rng, mounting = noise("gnss.stated"), self.gnss.mounting
+        direction = rng.standard_normal(3)
+        off_m = rng.uniform(0.0, self.gnss.stated_off_m) * direction / np.linalg.norm(direction)
+        x_m, y_m, z_m = np.add(mounting.xyz_m, off_m).tolist()
+        return replace(self, gnss=replace(self.gnss, mounting=replace(mounting, xyz_m=(x_m, y_m, z_m))))
+
 
 def record(truth: Truth, site: Site, sensors: Sensors, faults: Faults, noise: Noise) -> dict[str, Reading]:
     """Return what all sensors said of a drive, by sensor (gnss, imu, wheels, visual, power, command, doppler); ``sensors`` as mounted."""
@@ -218,9 +241,11 @@ def read_gnss(truth: Truth, sensor: Gnss, faults: Faults, noise: Noise, *, site:
     stamp = _sample_times(truth, sensor.rate_hz, noise("gnss.phase"))
     at = truth.at(stamp)
     enu = at.enu_m + rotate(at.quat_xyzw, np.array(sensor.mounting.xyz_m))
-    deviation = np.array([sensor.std_m, sensor.std_m, sensor.vertical_std_m])
+    white_m = np.array([sensor.std_m, sensor.std_m, sensor.vertical_std_m])
+    lasting_m, lasts_s = _draw_lasting_noise(sensor, noise("gnss.drive"))
     if faults.gnss_noise:
-        enu = enu + deviation * noise("gnss.noise").standard_normal(enu.shape)
+        enu = enu + white_m * noise("gnss.noise").standard_normal(enu.shape)
+        enu = enu + lasting_m * _make_lasting_noise(stamp.size, 1.0 / (sensor.rate_hz * lasts_s), noise("gnss.lasting"))
     if faults.gnss_outliers:
         rng = noise("gnss.outliers")
         hit = rng.random(stamp.size) < sensor.outlier_share
@@ -237,7 +262,7 @@ def read_gnss(truth: Truth, sensor: Gnss, faults: Faults, noise: Noise, *, site:
     lon, lat, alt = (np.where(blind, np.nan, values) for values in (lon, lat, alt))
     known = sensor.covariance == "known"
     covariance = np.zeros((stamp.size, 9))
-    covariance[:, [0, 4, 8]] = deviation**2 if known else 0.0
+    covariance[:, [0, 4, 8]] = white_m**2 + lasting_m**2 if known else 0.0
     values = {"lon_deg": lon, "lat_deg": lat, "alt_m": alt, "covariance": covariance, "status": status}
     values["covariance_type"] = np.full(stamp.size, 2 if known else 0, dtype=np.uint8)
     said = stamp
@@ -249,6 +274,18 @@ def read_gnss(truth: Truth, sensor: Gnss, faults: Faults, noise: Noise, *, site:
     return _repeat_readings(_keep_rows(Reading(said, log_time, values), keep), faults, noise("gnss.duplicates"))
 
 
+def _draw_lasting_noise(sensor: Gnss, rng: np.random.Generator) -> tuple[Float, float]:
+    """Return size [m], shape (3,), and correlation time [s] of the lasting part of one drive's noise."""
+    std_m, lasts_s = rng.uniform(*sensor.lasting_std_m), np.exp(rng.uniform(*np.log(sensor.lasts_s)))
+    return std_m * np.array([1.0, 1.0, _UP_OVER_EAST]), float(lasts_s)
+
+
+def _make_lasting_noise(count: int, step: float, rng: np.random.Generator) -> Float:
+    """Return Gauss-Markov series of unit variance, shape (count, 3); ``step`` is between rows, in correlation times."""
+    white = rng.standard_normal((3, count))
+    return np.stack([make_correlated_noise(np.ascontiguousarray(row), float(np.exp(-step))) for row in white], axis=-1)
+
+
 def read_doppler(truth: Truth, sensor: Doppler, faults: Faults, noise: Noise) -> Reading:
     """Return velocity_enu_mps of the antenna, (N, 3), and what the receiver claims of it, covariance (N, 36)."""
     stamp = _sample_times(truth, sensor.rate_hz, noise("gnss.phase"))
@@ -256,9 +293,7 @@ def read_doppler(truth: Truth, sensor: Doppler, faults: Faults, noise: Noise) ->
     velocity = _interpolate(np.gradient(place, truth.stamp_ns * 1e-9, axis=0), truth, stamp)
     axes = np.array([1.0, 1.0, 2.0])
     if faults.gnss_noise:
-        kept = float(np.exp(-1.0 / (sensor.rate_hz * sensor.lasts_s)))
-        white = noise("doppler.lasting").standard_normal((3, stamp.size))
-        lasting = np.stack([make_correlated_noise(np.ascontiguousarray(row), kept) for row in white], axis=-1)
+        lasting = _make_lasting_noise(stamp.size, 1.0 / (sensor.rate_hz * sensor.lasts_s), noise("doppler.lasting"))
         scatter = noise("doppler.noise").standard_normal((stamp.size, 3))
         velocity = velocity + axes * (sensor.lasting_std_mps * lasting + sensor.std_mps * scatter)
     covariance = np.zeros((stamp.size, 36))
@@ -486,9 +521,7 @@ def _make_wandering_bias(stamp: NDArray[np.int64], size: float, rng: np.random.G
     """Return a constant of about ``size`` per axis that drifts by a fifth of it with a correlation time of 100 s, shape (N, 3)."""
     constant = size * np.sign(rng.standard_normal(3)) * rng.uniform(0.6, 1.2, 3)
     step_s = float(np.median(np.diff(stamp))) * 1e-9
-    white = rng.standard_normal((3, stamp.size))
-    drift = [make_correlated_noise(np.ascontiguousarray(row), float(np.exp(-step_s / 100.0))) for row in white]
-    return constant + 0.2 * size * np.stack(drift, axis=-1)
+    return constant + 0.2 * size * _make_lasting_noise(stamp.size, step_s / 100.0, rng)
 
 
 def _mean_before(truth: Truth, values: Float, stamp: NDArray[np.int64], period_ns: int) -> Float:

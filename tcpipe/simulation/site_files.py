@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,7 @@ from tcpipe import __version__
 from tcpipe.errors import UsageError
 from tcpipe.formats.atomic import clear_beside, write_atomic_directory, write_text
 from tcpipe.formats.json_files import to_json, write_json
-from tcpipe.formats.logs.writing import write_bag, write_mcap, write_rosbag2
+from tcpipe.formats.logs.writing import MessageStream, write_bag, write_mcap, write_rosbag2
 from tcpipe.formats.maps.geotiff import write_geotiff
 from tcpipe.formats.parquet import read_table, write_table
 from tcpipe.simulation.messages import make_streams
@@ -70,7 +70,10 @@ def simulate(out: Path, *, scenario: str | Scenario = "demo", seed: int = 1) -> 
         for index, spec in enumerate(chosen.drives):
             truth, readings = simulate_readings(chosen, index, seed=seed)
             write_table(truth.table(), half.truths[index])
-            _write_log(half.logs[index], spec, readings, geoid_m=chosen.world.site.geoid_m)
+            stated = spec.sensors.mounted(spec.faults).stated(spec.faults, Noise(seed, index))
+            _write_log(
+                half.logs[index], spec, make_streams(readings, stated, spec.recorder, geoid_m=chosen.world.site.geoid_m)
+            )
         write_json(half.region, _make_region(chosen))
         write_rasters(directory / "maps", chosen.world, chosen.rasters)
         write_json(half.world, about)
@@ -117,8 +120,7 @@ def read_truth(path: Path) -> Truth:
     return Truth.from_table(read_table(path))
 
 
-def _write_log(path: Path, spec: DriveSpec, readings: dict[str, Reading], *, geoid_m: float) -> None:
-    messages = make_streams(readings, spec.sensors.mounted(spec.faults), spec.recorder, geoid_m=geoid_m)
+def _write_log(path: Path, spec: DriveSpec, messages: Sequence[MessageStream]) -> None:
     match spec.container:
         case "mcap":
             write_mcap(path, messages, encoding="ros1" if spec.recorder.dialect == "ros1" else "cdr")

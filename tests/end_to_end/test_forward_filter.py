@@ -12,6 +12,8 @@ from tcpipe.stages.fuse import fuse_run
 from tcpipe.stages.read import read_run
 
 SETTLED_NS = 8_000_000_000
+HEIGHT_M = {"no faults": 0.02, "every fault": 0.06}
+"""With every fault the stated antenna is up to 5 cm off, fixes lastingly up to 3.4 cm in height, and nothing shows either."""
 
 
 @pytest.fixture(scope="module", params=["no faults", "every fault"])
@@ -20,11 +22,11 @@ def drive(request, tmp_path_factory):
     site = simulate(tmp_path_factory.mktemp("site"), scenario=make_tiny(faults, seconds=60.0), seed=5)
     with open_log(site.logs[0]) as log:
         streams = read_run(log, ReadConfig(), robot=None, known=load_shipped_profiles())
-    return streams, read_truth(site.truths[0])
+    return streams, read_truth(site.truths[0]), HEIGHT_M[request.param]
 
 
 def test_the_track_is_the_true_drive(drive):
-    streams, truth = drive
+    streams, truth, height_m = drive
     track = fuse_run(streams, FuseConfig(estimator="ukf"), run_id="tiny")
     column = {name: track.table[name].to_numpy() for name in track.table.column_names if not name.endswith("amp")}
     at = truth.at(column["stamp_ns"])
@@ -41,7 +43,7 @@ def test_the_track_is_the_true_drive(drive):
     assert track.info.estimator == "ukf"
     assert fixed.sum() > 0.7 * settled.sum()
     assert rms(np.hypot(east, north), fixed) < 0.02
-    assert rms(column["alt_m"] - at.alt_m, fixed) < 0.02
+    assert rms(column["alt_m"] - at.alt_m, fixed) < height_m
     assert rms(forward) < 0.03
     assert rms(yaw) < np.radians(1.0)
     assert rms(east / column["x_std_m"]) < 1.5

@@ -14,6 +14,7 @@ from pathlib import Path
 from tcpipe import __version__
 from tcpipe.cost.labels import format_budget
 from tcpipe.errors import DatasetError, MissingFileError, RecipeError, StoreError, UsageError, clean_lines
+from tcpipe.execution import Executor
 from tcpipe.formats.atomic import check_local_output, clear_beside, write_atomic_directory, write_text
 from tcpipe.formats.bucket import open_place
 from tcpipe.formats.bucket_directories import fetch_directory_by_range, find_newest
@@ -330,7 +331,9 @@ def _read_card_in_place(place: Path) -> tuple[DatasetCard | None, bool]:
 
 
 @contextmanager
-def _start_workers(directory: Path, store: Store, inputs: str, *, jobs: int, cluster: str | None) -> Iterator[Workers]:
+def _start_workers(
+    directory: Path, store: Store, inputs: str, *, jobs: int, cluster: str | Executor | None
+) -> Iterator[Workers]:
     """Yield the workers; their spool is in the new directory, or in the store, which a cluster's workers see."""
     if cluster is None:
         yield Workers(jobs, None, DirectoryPlace(directory / SPOOL), DirectoryPlace(directory))

@@ -181,7 +181,7 @@ def test_pixels_of_a_killed_build_go_when_they_are_old(store):
     name = f"{SPOOL}/0123-abcdef01/7.arrow"
     store.place.put(name, b"pixels")
     assert verify(store.root).problems == (
-        f"{store.root / SPOOL}: belongs to a build that is running or was killed; 'tcpipe prune' removes old ones",
+        f"{store.root / SPOOL}: belongs to a call that is running or was killed; 'tcpipe prune' removes old ones",
     )
     prune(store=store.root, recipe=Recipe())
     assert store.place.read(name) == b"pixels"

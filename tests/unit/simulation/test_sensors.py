@@ -13,7 +13,7 @@ from tcpipe.geometry.datum import enu_from_geodetic
 from tcpipe.simulation.faults import Faults
 from tcpipe.simulation.robot import GRAVITY_MPS2
 from tcpipe.simulation.scenarios import HUSKY_ROS1, HUSKY_ROS2, make_small_world, make_tiny
-from tcpipe.simulation.sensors import CLOCK_STEP_NS, Doppler, Noise, Power, Sensors, Visual, record
+from tcpipe.simulation.sensors import CLOCK_STEP_NS, EXACT_GNSS, Doppler, Gnss, Noise, Power, Sensors, Visual, record
 from tcpipe.tables.columns import to_floats, to_integers
 
 SITE = make_small_world().site
@@ -22,6 +22,10 @@ SITE = make_small_world().site
 def readings(truth, *names, sensors=None, seed=1):
     faults = Faults.only(*names)
     return record(truth, SITE, (sensors or Sensors()).mounted(faults), faults, Noise(seed, 0))
+
+
+def alone(gnss):
+    return Sensors(gnss, *[None] * 5)
 
 
 def local(reading):
@@ -141,8 +145,8 @@ def test_a_fault_leaves_the_noise_of_others_as_it_was(truth):
 
 def test_noise_is_as_strong_as_said(long_truth):
     every = {"gnss_noise", "wheel_noise", "imu_noise", "visual_noise", "power_noise", "gnss_stamp_jitter"}
-    plain, noisy = readings(long_truth), readings(long_truth, *every)
-    sensors = Sensors()
+    sensors = Sensors(gnss=EXACT_GNSS)
+    plain, noisy = (readings(long_truth, *names, sensors=sensors) for names in ((), every))
     error = local(noisy["gnss"]) - local(plain["gnss"])
     np.testing.assert_allclose(error.std(axis=0), [0.015, 0.015, 0.025], rtol=0.05)
     assert np.abs(error.mean(axis=0)).max() < 0.001
@@ -161,6 +165,49 @@ def test_noise_is_as_strong_as_said(long_truth):
     np.testing.assert_allclose(steps, np.round(steps), atol=1e-6)
     jitter = (noisy["gnss"].stamp_ns - plain["gnss"].stamp_ns) * 1e-9
     assert jitter.std() == pytest.approx(0.002, rel=0.1)
+
+
+def test_fixes_err_as_their_covariance_claims_whatever_lasts(truth):
+    """Each drive draws the size and the correlation time of the lasting part; claimed is what errs."""
+    claimed, normalized, steps = [], [], []
+    for seed in range(200):
+        fixes, plain = (readings(truth, *on, sensors=alone(Gnss()), seed=seed)["gnss"] for on in (("gnss_noise",), ()))
+        std_m = np.sqrt(fixes.values["covariance"][:, [0, 4, 8]])
+        error = local(fixes) - local(plain)
+        claimed.append(std_m[0])
+        normalized.append(error[0] / std_m[0])
+        steps.append(np.diff(error, axis=0).std(axis=0))
+    assert np.sqrt(np.mean(np.square(normalized))) == pytest.approx(1.0, abs=0.08)
+    east_m = np.array(claimed)[:, 0]
+    assert 0.0094 <= east_m.min() < 0.011
+    assert 0.019 < east_m.max() <= 0.0207
+    white_m = np.array(steps)[:, 0] / np.sqrt(2.0)
+    assert (white_m > 0.0045).all()
+    assert (white_m < 0.0065).all(), "neighbouring fixes err alike but for the white part"
+
+
+@pytest.mark.parametrize("lasts_s", [5.0, 20.0])
+def test_the_lasting_part_of_fixes_lasts_as_long_as_said(long_truth, lasts_s):
+    sensors = alone(Gnss(rate_hz=5.0, lasting_std_m=(0.02, 0.02), lasts_s=(lasts_s, lasts_s)))
+    lag = round(5.0 * lasts_s)
+    kept = []
+    for seed in range(8):
+        fixes, plain = (readings(long_truth, *on, sensors=sensors, seed=seed)["gnss"] for on in (("gnss_noise",), ()))
+        error = local(fixes) - local(plain)
+        kept.append(np.sum(error[:-lag] * error[lag:], axis=0) / np.sum(error**2, axis=0))
+    assert np.mean(np.array(kept)[:, :2]) == pytest.approx(np.exp(-1.0) * 0.02**2 / (0.02**2 + 0.005**2), abs=0.07)
+
+
+def test_a_log_states_the_antenna_off_by_up_to_what_it_is_told(truth):
+    sensors, faults = Sensors(gnss=Gnss(stated_off_m=0.1)), Faults.only("gnss_lever_arm")
+    stated = [sensors.stated(faults, Noise(seed, 0)).gnss.mounting.xyz_m for seed in range(300)]
+    off = np.subtract(stated, sensors.gnss.mounting.xyz_m)
+    length = np.linalg.norm(off, axis=1)
+    assert length.max() <= 0.1
+    assert length.mean() == pytest.approx(0.05, rel=0.1)
+    assert np.abs(off.mean(axis=0)).max() < 0.01
+    for exact, switches in ((sensors, Faults()), (Sensors(gnss=EXACT_GNSS), faults)):
+        assert exact.stated(switches, Noise(1, 0)) == exact
 
 
 def test_outliers_outages_and_gaps(long_truth):

@@ -131,7 +131,8 @@ def test_mcap_holds_the_readings(site):
     drawn = np.array([m.measured_currents for _, m in power])
     np.testing.assert_array_equal(drawn[:, 1], readings["power"].values["left_amp"][order].astype(np.float32))
     frames = {t.child_frame_id: t.transform.translation for _, m in found["/a200_0000/tf_static"] for t in m.transforms}
-    assert (frames["gps_link"].x, frames["gps_link"].z) == (0.1, 0.9)
+    off_m = np.hypot(frames["gps_link"].x - 0.1, frames["gps_link"].z - 0.9)
+    assert 0.0 < off_m <= 0.05, "the log states the antenna some centimetres off"
     assert all(m.header.frame_id == "gps_link" for _, m in found["/a200_0000/sensors/gps_0/fix"])
 
 
