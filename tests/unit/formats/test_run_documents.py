@@ -17,6 +17,7 @@ from tcpipe.store import Store
 KEPT = Path(__file__).parents[2] / "data" / "store-2.1.tar.xz"
 SINCE = dict.fromkeys(("weight_over_efficiency_newton", "rolling_resistance", "gyro_bias_radps", "turn_scale")) | {
     "blamed": True,
+    "covariance_repairs": 0,
     "sha256_of": "log",
     "gnss_velocity_std_mps": 0.1,
     "streams": {},
