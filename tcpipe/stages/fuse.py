@@ -11,7 +11,7 @@ import numpy as np
 from tcpipe.errors import FusionError
 from tcpipe.fusion.checks.audit import is_astray
 from tcpipe.fusion.checks.sanity import SensorExclusion, refuse_fixes
-from tcpipe.fusion.measurements import GNSS, IMU
+from tcpipe.fusion.measurements import GNSS, IMU, POSE
 from tcpipe.recipe import FuseConfig
 from tcpipe.stages.clock_findings import correct_clocks
 from tcpipe.stages.fuse_findings import (
@@ -22,14 +22,14 @@ from tcpipe.stages.fuse_findings import (
 )
 from tcpipe.stages.fuse_inputs import (
     FusionInputs,
-    convert_pose_to_fixes,
     drop_implausible_sensors,
     exclude_sensors,
-    find_recipe_role,
+    name_pose,
     prepare_inputs,
+    prepare_pose,
 )
 from tcpipe.stages.fuse_sections import Fused, fuse_sections, make_rejections_table
-from tcpipe.tables.facts import SensorChecks
+from tcpipe.tables.facts import SensorChecks, StageFacts
 from tcpipe.tables.findings import Finding, StageReport, Subject, make_finding
 from tcpipe.tables.levels import TRACK, Datum, Streams, Track, TrackInfo
 
@@ -44,9 +44,18 @@ def fuse_run(streams: Streams, config: FuseConfig, *, run_id: str) -> Track:
     ------
     FusionError : no sensor measures motion, or the estimate breaks down.
     """
+    try:
+        return _fuse(streams, config, run_id)
+    except FusionError as error:
+        findings = name_pose(error.findings) if POSE in streams.tables else error.findings
+        raise FusionError(*error.problems, findings=findings) from error
+
+
+def _fuse(streams: Streams, config: FuseConfig, run_id: str) -> Track:
     # 1. A pose made elsewhere is what the fixes are.
     #    Streams become measurements: one frame, one set of units, usable variances; sensors that cannot be right are left out.
-    streams, local = convert_pose_to_fixes(streams)
+    is_posed = POSE in streams.tables
+    streams, local = prepare_pose(streams)
     run = Subject("run", run_id)
     inputs = drop_implausible_sensors(prepare_inputs(streams, config), streams)
     # 2. Each section for itself: where it starts, filter and smoother; again without a sensor that leads the track away from all others,
@@ -70,19 +79,26 @@ def fuse_run(streams: Streams, config: FuseConfig, *, run_id: str) -> Track:
     summary = make_fuse_facts(used, fused.facts, rows=table.num_rows, skipped_s=fused.skipped_s)
     audit = make_audit_findings(fused, used, streams)
     findings = (
-        *find_fuse_findings(used, summary, run=run, fixes=find_recipe_role(GNSS, streams)),
+        *find_fuse_findings(used, summary, run=run),
         *used.excluded.values(),
         *find_parameter_findings(used, summary, streams),
         *audit.findings,
         *clocks.findings,
     )
     checks = SensorChecks({role: finding.code for role, finding in used.excluded.items()})
+    made = StageFacts(fuse=summary, sensor_checks=checks, audit=audit.facts, clock_offsets=clocks.facts)
+    if is_posed:
+        findings, made = name_pose(findings), name_pose(made)
     facts = replace(
-        streams.report.facts, fuse=summary, sensor_checks=checks, audit=audit.facts, clock_offsets=clocks.facts
+        streams.report.facts,
+        fuse=made.fuse,
+        sensor_checks=made.sensor_checks,
+        audit=made.audit,
+        clock_offsets=made.clock_offsets,
     )
     report = StageReport((*_drop_places(streams.report.findings, findings), *findings), facts)
     info = TrackInfo(run_id, streams.robot, datum, config.rate_hz, config.estimator, report)
-    return Track(table, make_rejections_table(used, fused.found), info)
+    return Track(table, make_rejections_table(used, fused.found, POSE if is_posed else GNSS), info)
 
 
 def _drop_places(read: tuple[Finding, ...], fused: tuple[Finding, ...]) -> Iterator[Finding]:

@@ -104,7 +104,7 @@ class GateReset:
 
 @dataclass(frozen=True, slots=True)
 class ChangeFacts:
-    """A change that explains a contradiction: its kind (offset, wander, antenna, clock, gyroscope, scale, pose, useless), sensor and span.
+    """A change that explains a contradiction: its kind (a key of `tcpipe.stages.fuse_findings.CHANGES`), sensor and span.
 
     ``size``: median innovation of fixes there [m]; 0 of another sensor.
     """
@@ -199,9 +199,9 @@ class FuseFacts:
     stretches: tuple[StretchFacts, ...]
 
     @property
-    def parameters(self) -> Mapping[str, ParameterFacts]:
-        """What the longest section showed of each parameter."""
-        return max(self.stretches, key=lambda of: of.end_ns - of.start_ns).parameters
+    def longest(self) -> StretchFacts:
+        """The longest section."""
+        return max(self.stretches, key=lambda of: of.end_ns - of.start_ns)
 
 
 @dataclass(frozen=True, slots=True)
