@@ -46,7 +46,7 @@ from tcpipe.report.run_plots import (
 )
 from tcpipe.store import Store
 from tcpipe.tables.columns import to_floats, to_integers
-from tcpipe.tables.facts import ClockOffset, NoiseFacts, PhysicsFacts, StageFacts
+from tcpipe.tables.facts import NoiseFacts, PhysicsFacts, StageFacts
 from tcpipe.tables.findings import Finding, select_findings
 
 _PAGE = "report.html"
@@ -411,9 +411,8 @@ def _make_clock_sections(facts: StageFacts, findings: Sequence[Finding]) -> list
     rows = [
         (
             _name(role),
-            f"{1e3 * (offset.offset_s or 0.0):+.0f} ms",
-            f"{2e3 * (offset.std_s or 0.0):.0f} ms",
-            _format_drift(offset),
+            f"{1e3 * offset.offset_s:+.0f} ms",
+            f"{2e3 * offset.std_s:.0f} ms",
             _format_correction(role, findings),
         )
         for role, offset in sorted(offsets.items())
@@ -424,7 +423,7 @@ def _make_clock_sections(facts: StageFacts, findings: Sequence[Finding]) -> list
         text = f"Time offsets relative to {reference}, from the motion that both sensors measure."
     if steps:
         text += f" The clock steps: {'; '.join(steps)}."
-    header = ("sensor", "late by", "± (2σ)", "drift", "correction")
+    header = ("sensor", "late by", "± (2σ)", "correction")
     return [Section("Clocks", text.strip(), header=header, rows=rows)]
 
 
@@ -434,12 +433,6 @@ def _format_correction(role: str, findings: Sequence[Finding]) -> str:
     role_findings = [finding for finding in clocks if finding.subject.name == role]
     remedies = [describe_remedy(finding, remedy) for finding in role_findings for remedy in finding.remedies]
     return "; ".join(remedies) or ", ".join(finding.code.replace("-", " ") for finding in role_findings)
-
-
-def _format_drift(offset: ClockOffset) -> str:
-    if offset.drift_s_per_h is None or offset.drift_std_s_per_h is None:
-        return ""
-    return f"{1e3 * offset.drift_s_per_h:+.0f} ± {2e3 * offset.drift_std_s_per_h:.0f} ms/h"
 
 
 def _make_provenance_section(run: RunDirectory, manifest: Manifest, run_json: RunJson | None) -> Section:

@@ -5,7 +5,7 @@ A pose that another program estimated is fused as fixes with an attitude; findin
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from typing import Any, TypeVar, cast
 
@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from tcpipe.fusion import preparation
 from tcpipe.fusion.attitude import align_mounting
-from tcpipe.fusion.checks.clock_offsets import smooth_stamps
 from tcpipe.fusion.checks.sanity import (
     CommandedSpeed,
     SensorExclusion,
@@ -94,8 +93,9 @@ def prepare_inputs(streams: Streams, config: FuseConfig) -> FusionInputs:
             gnss, repeats = preparation.drop_repeated_fixes(gnss, odometry)
             inputs.counts[GNSS]["repeated"] += count - gnss.stamp_ns.size
             inputs.findings += [_find_frozen(each, streams) for each in repeats]
-        gnss, findings = smooth_stamps(gnss, odometry)
-        inputs.findings += findings
+        if gnss is not None and odometry is not None:
+            gnss, jitter_s = preparation.inflate_jittery_fixes(gnss, odometry)
+            inputs.findings += _find_jitter(jitter_s)
         inputs.measurements[epoch] = Measurements(
             gnss=gnss,
             doppler=found.get(DOPPLER),
@@ -112,6 +112,13 @@ def _find_frozen(repeats: preparation.Repeats, streams: Streams) -> Finding:
     span_s = (repeats.start_ns - first_ns) / 1e9, (repeats.end_ns - first_ns) / 1e9
     subject, names = Subject("role", GNSS), {"quantity": "position"}
     return make_finding("frozen", subject, span_s=span_s, names=names, message_count=repeats.messages)
+
+
+def _find_jitter(jitter_s: NDArray[np.float64]) -> Iterator[Finding]:
+    jumpy = jitter_s > 0
+    if jumpy.any():
+        share, median_s = float(jumpy.mean()), float(np.median(jitter_s[jumpy]))
+        yield make_finding("stamp-jitter", Subject("role", GNSS), jitter_fraction=share, jitter_s=median_s)
 
 
 def _find_first_ns(streams: Streams) -> int:

@@ -194,8 +194,7 @@ def is_clock_doubtful(streams: Streams, info: TrackInfo) -> bool:
     recorder = any(s.time_source == "log" for role, s in streams.sensors.items() if role != "command")
     clocks = info.report.facts.clock_offsets
     off = clocks is not None and any(
-        (offset.noted or offset.drifts) and (role == "power" or not offset.blamed)
-        for role, offset in clocks.offsets.items()
+        offset.noted and (role == "power" or not offset.blamed) for role, offset in clocks.offsets.items()
     )
     # A step of all clocks leaves them together.
     return recorder or off or any(step.topics for step in streams.report.facts.clock_steps)

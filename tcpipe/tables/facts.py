@@ -237,36 +237,39 @@ class AuditFacts:
 
 @dataclass(frozen=True, slots=True)
 class ClockPair:
-    """Two sensors' clocks compared (`tcpipe.fusion.checks.clock_offsets.Pair`), and whether that determines their offset."""
+    """Two sensors compared: by what, how late the first's stamps are against the second's, and how much one explains the other (0 to 1).
+
+    ``determined``: whether the offset is known well enough to be spoken of; ``from_middle_s``: when, from the middle of the run.
+    """
 
     late: str
     against: str
     by: str
-    offset_s: float | None
-    std_s: float | None
-    explained: float | None
-    drift_s_per_h: float | None
-    drift_std_s_per_h: float | None
-    windows: tuple[Vector, ...]
+    offset_s: float
+    std_s: float
+    explained: float
     determined: bool
+    from_middle_s: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
 class ClockOffset:
-    """Delay of a sensor's stamps (`tcpipe.fusion.checks.clock_offsets.RoleOffset`); ``blamed``: the sensor, not the reference, is off."""
+    """How late a sensor's stamps are against the reference's in the middle of the run, and their drift; 0 unless it is sure.
 
-    offset_s: float | None
-    std_s: float | None
+    ``noted``: whether a person should act on it; ``blamed``: the sensor is off, since two others agree against it; otherwise it and the
+    reference differ, and which of them is off is not known.
+    """
+
+    offset_s: float
+    std_s: float
     noted: bool
-    drift_s_per_h: float | None
-    drift_std_s_per_h: float | None
-    drifts: bool
     blamed: bool = True
+    drift_ppm: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
 class ClockFacts:
-    """The sensors' clocks in one clock epoch before offsets were taken out: all pairs, and each role's offset from the reference."""
+    """The sensors' clocks in one clock epoch before offsets were taken out: all pairs, and offsets of those connected to the reference."""
 
     clock_epoch: int
     reference: str

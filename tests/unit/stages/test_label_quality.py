@@ -159,8 +159,8 @@ def streams(*, steps=(), **time_sources):
     return Streams({}, sensors, "husky", report=StageReport((), StageFacts(epochs=len(steps) + 1, clock_steps=steps)))
 
 
-def clocks(role, *, noted=False, drifts=False, blamed=False):
-    offset = ClockOffset(0.1, 0.01, noted, None, None, drifts, blamed)
+def clocks(role, *, noted=False, blamed=False):
+    offset = ClockOffset(0.1, 0.01, noted, blamed)
     return info(clock_offsets=ClockFacts(0, "gnss", (), {role: offset}))
 
 
@@ -175,9 +175,7 @@ def test_a_clock_is_doubtful_that_is_off_unless_it_was_corrected():
     good = streams(gnss="header")
     assert not is_clock_doubtful(good, clocks("imu"))
     assert is_clock_doubtful(good, clocks("imu", noted=True))
-    assert is_clock_doubtful(good, clocks("imu", drifts=True))
     assert not is_clock_doubtful(good, clocks("imu", noted=True, blamed=True))
-    assert not is_clock_doubtful(good, clocks("gnss", drifts=True, blamed=True))
     assert is_clock_doubtful(good, clocks("power", noted=True, blamed=True))
 
 
