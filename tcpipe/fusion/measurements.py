@@ -8,6 +8,7 @@ and floored. Rows are sorted by stamp, without repetitions. Both estimators take
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, TypeVar
 
@@ -16,6 +17,10 @@ from numpy.typing import NDArray
 
 GNSS, IMU, WHEELS, VISUAL, DOPPLER = "gnss", "imu", "wheel_odometry", "visual_odometry", "gnss_velocity"
 """Roles, as in the rejections table."""
+_FIELDS = {GNSS: "gnss", DOPPLER: "doppler", IMU: "imu", WHEELS: "wheels", VISUAL: "visual"}
+POSE = "pose"
+FIXES = (GNSS, POSE)
+"""Roles of positions: a pose is fused as fixes with an attitude."""
 
 NO_LEVER_ARM = (0.0, 0.0, 0.0)
 STATED_ARM_STD_M = (0.05, 0.05, 0.1)
@@ -26,11 +31,13 @@ UNSTATED_ARM_STD_M = (0.5, 0.5, 0.5)
 
 _UNMEASURED_M2PS2 = 1e3
 """A variance from which on an axis is not measured (ruling)."""
+UNMEASURED_RAD2 = 1e2
+"""Variance of a rotation about an axis that is not measured."""
 
 
 @dataclass(frozen=True, slots=True)
 class Positions:
-    """GNSS: positions of an antenna.
+    """GNSS: positions of an antenna. Or a pose that another program estimated: positions of a sensor, and the robot's attitude.
 
     Attributes
     ----------
@@ -39,6 +46,9 @@ class Positions:
     variance_m2 : [m²], shape (N, 3), east, north, up; floored, never unknown.
     lever_arm_m, lever_arm_std_m : [m], position of the antenna in base_link, and its standard deviation; 0: known exactly.
     unclaimed : shape (N,), where the receiver claims none and the variance is the recipe's; None where it always claims one.
+    quat_xyzw, rotation_variance_rad2 : attitude enu_from_base_link, shape (N, 4), NaN where absent, and variance about the robot's axes,
+        shape (N, 3); None: no attitude is measured.
+    mounting_xyzw, mounting_std_rad : base_link_from_sensor of a pose, stated or as the motion shows it, and σ about each axis.
     """
 
     stamp_ns: NDArray[np.int64]
@@ -47,6 +57,10 @@ class Positions:
     lever_arm_m: tuple[float, float, float] = NO_LEVER_ARM
     lever_arm_std_m: tuple[float, float, float] = STATED_ARM_STD_M
     unclaimed: NDArray[np.bool_] | None = None
+    quat_xyzw: NDArray[np.float64] | None = None
+    rotation_variance_rad2: NDArray[np.float64] | None = None
+    mounting_xyzw: tuple[float, ...] = (0.0, 0.0, 0.0, 1.0)
+    mounting_std_rad: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,9 +137,12 @@ class InertialMeasurements:
     accelerometer_noise_mps2: NDArray[np.float64] | None = None
 
 
+Sensor = Positions | GroundVelocities | InertialMeasurements | BodyVelocities
+
+
 @dataclass(frozen=True, slots=True)
 class Measurements:
-    """All measurements of one section of one clock epoch without a long gap; a role that the log lacks is None.
+    """All measurements of one section of one clock epoch without a long gap; a role without measurements is None.
 
     At least one of ``gnss``, ``wheels`` and ``visual`` is there. ``nonholonomic_std_mps``: sideways and vertical body velocity are
     zero to within this. ``doppler`` goes with ``gnss``, whose antenna it is of.
@@ -138,15 +155,36 @@ class Measurements:
     nonholonomic_std_mps: float = 0.15
     doppler: GroundVelocities | None = None
 
-    def sensors(self) -> dict[str, Positions | GroundVelocities | InertialMeasurements | BodyVelocities]:
+    def sensors(self) -> dict[str, Sensor]:
         """Return the sensors that are there, by role."""
-        every = {GNSS: self.gnss, DOPPLER: self.doppler, IMU: self.imu, WHEELS: self.wheels, VISUAL: self.visual}
+        every = {role: getattr(self, name) for role, name in _FIELDS.items()}
         return {role: sensor for role, sensor in every.items() if sensor is not None}
+
+    def replace_sensors(self, changed: Mapping[str, Sensor | None]) -> Measurements:
+        """Return the measurements with other sensors, by role; None takes one out."""
+        named: dict[str, Any] = {_FIELDS[role]: sensor for role, sensor in changed.items()}
+        return replace(self, **named)
+
+    @property
+    def has_attitude(self) -> bool:
+        """Whether a pose measures the attitude, or yaw alone."""
+        return self.gnss is not None and self.gnss.quat_xyzw is not None
+
+    @property
+    def has_posed_tilt(self) -> bool:
+        """Whether a pose measures roll and pitch."""
+        variance = None if self.gnss is None else self.gnss.rotation_variance_rad2
+        return variance is not None and float(variance[0, 0]) < UNMEASURED_RAD2
 
     def odometries(self) -> dict[str, BodyVelocities]:
         """Return the odometries that are there, by role; the wheels' first."""
         every = {WHEELS: self.wheels, VISUAL: self.visual}
         return {role: odometry for role, odometry in every.items() if odometry is not None}
+
+    @property
+    def first_odometry(self) -> BodyVelocities | None:
+        """The wheels, else visual odometry."""
+        return self.wheels or self.visual
 
 
 @dataclass(frozen=True, slots=True)
@@ -160,7 +198,7 @@ class InitialState:
     tilt_std_rad, yaw_std_rad : standard deviation of roll and pitch, and of yaw.
     velocity_enu_mps, velocity_std_mps : [m/s], shape (3,) and scalar.
     gyro_bias_radps : [rad/s], shape (3,); zero where the robot never stands.
-    heading_from : how yaw was found: ``course over ground``, ``orientation``, ``local frame`` or ``unknown``.
+    heading_from : how yaw was found: ``course over ground``, ``pose``, ``orientation``, ``local frame`` or ``unknown``.
     """
 
     position_enu_m: NDArray[np.float64]
@@ -175,26 +213,16 @@ class InitialState:
     heading_from: str = "unknown"
 
 
-_Source = TypeVar("_Source", Positions, GroundVelocities, BodyVelocities, InertialMeasurements)
+_Source = TypeVar("_Source", bound=Sensor)
 
 
 def select_measurements(whole: Measurements, start_ns: int, end_ns: int) -> Measurements:
     """Return the measurements between two stamps, both included; a sensor without any is None."""
-    return replace(
-        whole,
-        gnss=_select_source(whole.gnss, start_ns, end_ns),
-        doppler=_select_source(whole.doppler, start_ns, end_ns),
-        imu=_select_source(whole.imu, start_ns, end_ns),
-        wheels=_select_source(whole.wheels, start_ns, end_ns),
-        visual=_select_source(whole.visual, start_ns, end_ns),
-    )
-
-
-def _select_source(source: _Source | None, start_ns: int, end_ns: int) -> _Source | None:
-    if source is None:
-        return None
-    rows = slice(*np.searchsorted(source.stamp_ns, (start_ns, end_ns + 1)))
-    return select_rows(source, rows) if rows.stop > rows.start else None
+    found: dict[str, Sensor | None] = {}
+    for role, source in whole.sensors().items():
+        rows = slice(*np.searchsorted(source.stamp_ns, (start_ns, end_ns + 1)))
+        found[role] = select_rows(source, rows) if rows.stop > rows.start else None
+    return whole.replace_sensors(found)
 
 
 def select_rows(source: _Source, rows: slice | NDArray[np.bool_]) -> _Source:

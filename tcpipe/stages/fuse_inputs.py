@@ -1,13 +1,13 @@
 """Measurements by clock epoch, without sensors that contradict physics or the other sensors; findings name the remedy.
 
-A pose that another program estimated becomes the fixes of a GNSS.
+A pose that another program estimated is fused as fixes with an attitude; findings and facts call it by its role.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from typing import Any
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, fields, is_dataclass, replace
+from typing import Any, TypeVar, cast
 
 import numpy as np
 import pyarrow as pa
@@ -15,14 +15,19 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from tcpipe.fusion import preparation
-from tcpipe.fusion.checks.clock_offsets import smooth_stamps
-from tcpipe.fusion.checks.odometry_scale import Scale, rescale_odometries
-from tcpipe.fusion.checks.plausibility import SensorExclusion
-from tcpipe.fusion.checks.sensors import CommandedSpeed, check_ground_velocity, check_sensors
+from tcpipe.fusion.attitude import align_mounting
+from tcpipe.fusion.checks.sanity import (
+    CommandedSpeed,
+    SensorExclusion,
+    check_ground_velocity,
+    check_sensors,
+    rescale_odometries,
+)
 from tcpipe.fusion.measurements import (
     DOPPLER,
     GNSS,
     IMU,
+    POSE,
     STATED_ARM_STD_M,
     UNSTATED_ARM_STD_M,
     VISUAL,
@@ -36,23 +41,23 @@ from tcpipe.recipe import FuseConfig
 from tcpipe.recipe.suggestions import suggest
 from tcpipe.tables.arrays import select_rows
 from tcpipe.tables.columns import FloatColumns, to_floats, to_integers
-from tcpipe.tables.facts import SensorChecks
-from tcpipe.tables.findings import Finding, Remedy, StageReport, Subject, make_finding
+from tcpipe.tables.findings import Finding, Remedy, Subject, make_finding
 from tcpipe.tables.levels import STREAMS, Sensor, Streams
 
 
 @dataclass(slots=True)
 class FusionInputs:
-    """Measurements by epoch; datum (longitude, latitude, height) or None; by role, unusable stamps and counts; findings; refused roles."""
+    """Measurements by epoch; datum (longitude, latitude, height) or None; by role, unusable stamps and counts; findings."""
 
     datum_deg_m: tuple[float, float, float] | None
     measurements: dict[int, Measurements] = field(default_factory=dict)
     invalid_ns: dict[str, list[NDArray[np.int64]]] = field(default_factory=dict)
     counts: dict[str, dict[str, int]] = field(default_factory=dict)
     findings: list[Finding] = field(default_factory=list)
-    excluded: frozenset[str] = frozenset()
-    scales: Mapping[str, Scale] = field(default_factory=dict)
-    """By odometry, the scale that was taken out."""
+    excluded: Mapping[str, Finding] = field(default_factory=dict)
+    """By role, why a sensor is not fused."""
+    scales: Mapping[str, float] = field(default_factory=dict)
+    """By odometry, the scale that was taken out: far from 1."""
     cuts_ns: tuple[int, ...] = ()
     """First stamps after the clock of all sensors was set forward."""
 
@@ -69,6 +74,7 @@ class FusionInputs:
 def prepare_inputs(streams: Streams, config: FuseConfig) -> FusionInputs:
     """Turn the motion streams into measurements, one set a clock epoch."""
     tables = {role: streams.tables[role] for role in (GNSS, DOPPLER, IMU, WHEELS, VISUAL) if role in streams.tables}
+    tables |= {GNSS: streams.tables[POSE]} if POSE in streams.tables else {}
     datum = None
     if GNSS in tables:
         fixes = FloatColumns(tables[GNSS])
@@ -82,12 +88,14 @@ def prepare_inputs(streams: Streams, config: FuseConfig) -> FusionInputs:
         found = {role: _prepare(role, part, streams.sensors[role], config, inputs) for role, part in parts.items()}
         gnss, odometry = found.get(GNSS), found.get(WHEELS) or found.get(VISUAL)
         if gnss is not None:
+            gnss = align_mounting(gnss, odometry, is_stated=streams.sensors[GNSS].placed_by != "assumed")
             count = gnss.stamp_ns.size
             gnss, repeats = preparation.drop_repeated_fixes(gnss, odometry)
             inputs.counts[GNSS]["repeated"] += count - gnss.stamp_ns.size
             inputs.findings += [_find_frozen(each, streams) for each in repeats]
-        gnss, findings = smooth_stamps(gnss, odometry)
-        inputs.findings += findings
+        if gnss is not None and odometry is not None:
+            gnss, jitter_s = preparation.inflate_jittery_fixes(gnss, odometry)
+            inputs.findings += _find_jitter(jitter_s)
         inputs.measurements[epoch] = Measurements(
             gnss=gnss,
             doppler=found.get(DOPPLER),
@@ -102,8 +110,15 @@ def prepare_inputs(streams: Streams, config: FuseConfig) -> FusionInputs:
 def _find_frozen(repeats: preparation.Repeats, streams: Streams) -> Finding:
     first_ns = _find_first_ns(streams)
     span_s = (repeats.start_ns - first_ns) / 1e9, (repeats.end_ns - first_ns) / 1e9
-    subject, names = Subject("role", find_recipe_role(GNSS, streams)), {"quantity": "position"}
+    subject, names = Subject("role", GNSS), {"quantity": "position"}
     return make_finding("frozen", subject, span_s=span_s, names=names, message_count=repeats.messages)
+
+
+def _find_jitter(jitter_s: NDArray[np.float64]) -> Iterator[Finding]:
+    jumpy = jitter_s > 0
+    if jumpy.any():
+        share, median_s = float(jumpy.mean()), float(np.median(jitter_s[jumpy]))
+        yield make_finding("stamp-jitter", Subject("role", GNSS), jitter_fraction=share, jitter_s=median_s)
 
 
 def _find_first_ns(streams: Streams) -> int:
@@ -115,9 +130,10 @@ def _find_first_ns(streams: Streams) -> int:
 
 def _find_used_s(role: str, streams: Streams) -> tuple[float, float] | None:
     """Return when a sensor's first and last messages are [s]."""
-    if role not in streams.tables:
+    table = streams.tables.get(POSE if role == GNSS and POSE in streams.tables else role)
+    if table is None:
         return None
-    stamp_ns = to_integers(streams.tables[role], "stamp_ns")
+    stamp_ns = to_integers(table, "stamp_ns")
     return (int(stamp_ns[0]) - _find_first_ns(streams)) / 1e9, (int(stamp_ns[-1]) - _find_first_ns(streams)) / 1e9
 
 
@@ -139,6 +155,7 @@ def _prepare(role: str, table: pa.Table, sensor: Sensor, config: FuseConfig, inp
             else config.lever_arm_std_m or STATED_ARM_STD_M,
             default_std_m=config.gnss_default_std_m,
             floor_std_m=config.gnss_std_floor_m,
+            mounting_xyzw=sensor.quat_xyzw,
         )
     elif role == DOPPLER:
         made, prepared = preparation.prepare_ground_velocities(
@@ -164,47 +181,42 @@ def _prepare(role: str, table: pa.Table, sensor: Sensor, config: FuseConfig, inp
 _STATED = ("recipe", "tf_static", "same frame")
 
 
-def drop_implausible_sensors(inputs: FusionInputs, streams: Streams) -> tuple[FusionInputs, StageReport[SensorChecks]]:
-    """Return the inputs without the sensors that are refused, and the findings, judged over the longest clock epoch."""
+def drop_implausible_sensors(inputs: FusionInputs, streams: Streams) -> FusionInputs:
+    """Return the inputs without the sensors that cannot be right, judged over the longest clock epoch."""
     if not inputs.measurements:
-        return inputs, StageReport((), SensorChecks())
+        return inputs
     epoch = find_longest_epoch(inputs)
     stated = {role: sensor.placed_by in _STATED for role, sensor in streams.sensors.items()}
-    checks = check_sensors(
+    exclusions, scales = check_sensors(
         inputs.measurements[epoch],
         command=read_command(streams, epoch),
         stated=stated,
         felt=_compute_median_specific_force(streams),
     )
-    if checks.scales:
-        measured = {number: rescale_odometries(m, checks.scales) for number, m in inputs.measurements.items()}
-        inputs = replace(inputs, measurements=measured, scales=checks.scales)
-    sane, found = exclude_sensors(inputs, StageReport((), checks.facts), checks.refusals, streams)
-    doubt = check_ground_velocity(sane.measurements[epoch])
-    return (sane, found) if doubt is None else exclude_sensors(sane, found, [doubt], streams)
+    if scales:
+        measured = {number: rescale_odometries(m, scales) for number, m in inputs.measurements.items()}
+        inputs = replace(inputs, measurements=measured, scales=scales)
+    inputs = exclude_sensors(inputs, exclusions.values(), streams)
+    doubt = check_ground_velocity(inputs.measurements[epoch])
+    return inputs if doubt is None else exclude_sensors(inputs, [doubt], streams)
 
 
-def exclude_sensors(
-    inputs: FusionInputs, before: StageReport[SensorChecks], refusals: Sequence[SensorExclusion], streams: Streams
-) -> tuple[FusionInputs, StageReport[SensorChecks]]:
-    """Return the inputs without refused sensors, the findings, and the codes of these by role."""
-    refused = inputs.excluded | {refusal.role for refusal in refusals}
-    kept = {number: _without(refused, measurements) for number, measurements in inputs.measurements.items()}
-    codes = {**before.facts.excluded, **{refusal.role: refusal.code for refusal in refusals}}
-    findings = (*before.findings, *(_find_exclusion(refusal, streams) for refusal in refusals))
-    datum = None if GNSS in refused else inputs.datum_deg_m
-    inputs = replace(inputs, datum_deg_m=datum, measurements=kept, excluded=refused)
-    return inputs, StageReport(findings, replace(before.facts, excluded=codes))
+def exclude_sensors(inputs: FusionInputs, exclusions: Iterable[SensorExclusion], streams: Streams) -> FusionInputs:
+    """Return the inputs without some sensors."""
+    excluded = {**inputs.excluded, **{each.role: _find_exclusion(each, streams) for each in exclusions}}
+    kept = {number: _without(excluded, measurements) for number, measurements in inputs.measurements.items()}
+    datum = None if GNSS in excluded else inputs.datum_deg_m
+    return replace(inputs, datum_deg_m=datum, measurements=kept, excluded=excluded)
 
 
-def _without(refused: frozenset[str], m: Measurements) -> Measurements:
+def _without(excluded: Collection[str], m: Measurements) -> Measurements:
     return replace(
         m,
-        gnss=None if GNSS in refused else m.gnss,
-        doppler=None if refused & {GNSS, DOPPLER} else m.doppler,
-        imu=None if IMU in refused else m.imu,
-        wheels=None if WHEELS in refused else m.wheels,
-        visual=None if VISUAL in refused else m.visual,
+        gnss=None if GNSS in excluded else m.gnss,
+        doppler=None if GNSS in excluded or DOPPLER in excluded else m.doppler,
+        imu=None if IMU in excluded else m.imu,
+        wheels=None if WHEELS in excluded else m.wheels,
+        visual=None if VISUAL in excluded else m.visual,
     )
 
 
@@ -232,13 +244,13 @@ def _compute_median_specific_force(streams: Streams) -> float:
 
 def _find_exclusion(refusal: SensorExclusion, streams: Streams) -> Finding:
     """Return the finding of a sensor that is not fused; a receiver's velocity helps fixes that are fused, and no label needs it."""
-    sensor, name = streams.sensors[refusal.role], find_recipe_role(refusal.role, streams)
+    sensor, name = streams.sensors[refusal.role], refusal.role
     if refusal.units is not None:
         remedies = suggest("state_units", {"read": {"imu_units": refusal.units}})
     elif refusal.turned_by is not None:
         remedies = state_extrinsics(name, sensor.xyz_m, refusal.turned_by @ matrix_from_quat(sensor.quat_xyzw))
     elif refusal.is_suspect_excludable:
-        remedies = exclude_role(find_recipe_role(refusal.names["suspect"], streams), "exclude_suspect")
+        remedies = exclude_role(refusal.names["suspect"], "exclude_suspect")
     else:
         remedies = exclude_role(name)
     numbers: Mapping[str, Any] = refusal.numbers
@@ -267,31 +279,43 @@ def state_extrinsics(name: str, xyz_m: Sequence[float], turn: NDArray[np.float64
     )
 
 
-POSE = "pose"
 _ANYWHERE_DEG_M = (0.0, 45.0, 0.0)
 """Where a frame that is nowhere on the earth is taken to lie while its positions are fused: east, north and up stay what they are."""
 
 
 def find_recipe_role(role: str, streams: Streams) -> str:
-    """Return the role in the recipe of the stream that is fused as ``role``: a pose that is used as GNSS is a pose there."""
+    """Return the role in the recipe of the stream that is fused as ``role``: a pose that is fused as fixes is a pose there."""
     roles = streams.report.facts.roles
     return POSE if role == GNSS and POSE in roles and GNSS not in roles else role
 
 
-def convert_pose_to_fixes(streams: Streams) -> tuple[Streams, bool]:
-    """Return the streams with the pose as the fixes of a GNSS, and whether these lie in a frame that is nowhere on the earth."""
+def prepare_pose(streams: Streams) -> tuple[Streams, bool]:
+    """Return the streams with the pose as fixes of a GNSS could be, and whether it lies in a frame that is nowhere on the earth."""
     pose = streams.tables.get(POSE)
     if pose is None:
         return streams, False
-    lon, lat, alt = (to_floats(pose, name) for name in ("lon_deg", "lat_deg", "alt_m"))
-    local = bool(np.isnan(lon).any())
+    local = bool(np.isnan(to_floats(pose, "lon_deg")).any())
     if local:
         place = np.column_stack([to_floats(pose, f"{axis}_m") for axis in "xyz"])
-        lon, lat, alt = geodetic_from_enu(place, datum_deg_m=_ANYWHERE_DEG_M)
-    kept = {name: pose[name] for name in pose.column_names if name in STREAMS[GNSS].names()}
-    fixes = STREAMS[GNSS].table(
-        **kept | {"lon_deg": lon, "lat_deg": lat, "alt_m": alt, "fix_status": np.zeros(pose.num_rows, np.int8)}
-    )
-    tables = {role: table for role, table in streams.tables.items() if role != POSE} | {GNSS: fixes}
-    sensors = {role: sensor for role, sensor in streams.sensors.items() if role != POSE} | {GNSS: streams.sensors[POSE]}
-    return replace(streams, tables=tables, sensors=sensors), local
+        names = ("lon_deg", "lat_deg", "alt_m")
+        geodetic = dict(zip(names, geodetic_from_enu(place, datum_deg_m=_ANYWHERE_DEG_M), strict=True))
+        pose = STREAMS[POSE].table(**{name: pose[name] for name in pose.column_names} | geodetic)
+    sensors = {**streams.sensors, GNSS: streams.sensors[POSE]}
+    return replace(streams, tables={**streams.tables, POSE: pose}, sensors=sensors), local
+
+
+_Named = TypeVar("_Named")
+
+
+def name_pose(value: _Named) -> _Named:
+    """Return findings or facts in which the role of the pose stands for that of the fixes as which it was fused."""
+    named = cast("object", value)
+    if isinstance(value, str):
+        named = POSE if value == GNSS else value
+    elif isinstance(value, Mapping):
+        named = {name_pose(key): name_pose(item) for key, item in value.items()}
+    elif isinstance(value, tuple | list):
+        named = type(value)(name_pose(item) for item in value)
+    elif is_dataclass(value) and not isinstance(value, type):
+        named = replace(value, **{of.name: name_pose(getattr(value, of.name)) for of in fields(value)})
+    return cast("_Named", named)

@@ -21,7 +21,7 @@ from tcpipe.cost.labels import (
     spans_near,
     touches_voltage_outside,
 )
-from tcpipe.fusion.measurements import GNSS, IMU
+from tcpipe.fusion.measurements import FIXES, IMU
 from tcpipe.fusion.process import estimate_gyro_density
 from tcpipe.fusion.signals import compute_median_period_ns, estimate_white_noise
 from tcpipe.geometry.piecewise_linear import interpolate, mean_between
@@ -164,14 +164,12 @@ def find_motion_flags(
 
 
 def _find_disputed(cut: pa.Table, info: TrackInfo) -> NDArray[np.bool_]:
-    """Return the segments of one epoch that touch a time in which a sensor disagrees with the track undecided, or fixes were off it."""
+    """Return the segments of one epoch that touch a time in which a sensor disagrees with the track, or fixes were off it."""
     start_ns, end_ns, epoch = to_integers(cut, "start_ns"), to_integers(cut, "end_ns"), to_integers(cut, "clock_epoch")
     facts = info.report.facts
-    times = [
-        (e.clock_epoch, e.start_ns, e.end_ns) for e in (facts.audit.disagreements if facts.audit else ()) if not e.alone
-    ]
+    times = [(e.clock_epoch, e.start_ns, e.end_ns) for e in (facts.audit.disagreements if facts.audit else ())]
     for section in facts.fuse.stretches if facts.fuse else ():
-        times += [(section.clock_epoch, r.start_ns, r.end_ns) for r in section.gate_resets if r.role == GNSS]
+        times += [(section.clock_epoch, r.start_ns, r.end_ns) for r in section.gate_resets if r.role in FIXES]
     disputed = np.zeros(cut.num_rows, dtype=np.bool_)
     for of_epoch, first_ns, last_ns in times:
         disputed |= (epoch == of_epoch) & (start_ns <= last_ns) & (end_ns >= first_ns)
@@ -196,8 +194,7 @@ def is_clock_doubtful(streams: Streams, info: TrackInfo) -> bool:
     recorder = any(s.time_source == "log" for role, s in streams.sensors.items() if role != "command")
     clocks = info.report.facts.clock_offsets
     off = clocks is not None and any(
-        (offset.noted or offset.drifts) and (role == "power" or not offset.blamed)
-        for role, offset in clocks.offsets.items()
+        offset.noted and (role == "power" or not offset.blamed) for role, offset in clocks.offsets.items()
     )
     # A step of all clocks leaves them together.
     return recorder or off or any(step.topics for step in streams.report.facts.clock_steps)

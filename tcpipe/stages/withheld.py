@@ -10,7 +10,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from tcpipe.errors import FusionError
-from tcpipe.fusion.measurements import DOPPLER, GNSS, VISUAL, WHEELS, BodyVelocities, Measurements, Positions
+from tcpipe.fusion.measurements import DOPPLER, FIXES, GNSS, VISUAL, WHEELS, BodyVelocities, Measurements, Positions
 from tcpipe.fusion.withheld import (
     CHORDS_S,
     END_S,
@@ -26,10 +26,9 @@ from tcpipe.geometry.datum import enu_from_geodetic, geodetic_from_enu
 from tcpipe.progress import step
 from tcpipe.recipe import FuseConfig
 from tcpipe.stages.fuse import fuse_run
-from tcpipe.stages.fuse_inputs import FusionInputs, convert_pose_to_fixes, find_longest_epoch, prepare_inputs
+from tcpipe.stages.fuse_inputs import FusionInputs, find_longest_epoch, prepare_inputs, prepare_pose
 from tcpipe.tables.arrays import number_column, select_rows
 from tcpipe.tables.columns import FloatColumns, to_integers
-from tcpipe.tables.facts import MountingFacts
 from tcpipe.tables.levels import Streams, Track
 
 Ints = NDArray[np.int64]
@@ -75,7 +74,7 @@ def compare_withheld(streams: Streams, config: FuseConfig, *, run_id: str) -> Wi
     ------
     FusionError : no sensor measures motion.
     """
-    streams, _ = convert_pose_to_fixes(streams)
+    streams, _ = prepare_pose(streams)
     inputs = prepare_inputs(streams, config)
     if not inputs.measurements:
         raise FusionError(f"{run_id}: no sensor measures motion")
@@ -101,11 +100,15 @@ def compare_withheld(streams: Streams, config: FuseConfig, *, run_id: str) -> Wi
     return WithheldComparisons(tuple(comparisons), tuple(skipped), ratios)
 
 
+_OTHER_ARM = {"lever-arm-unknown", "lever-arm-contradicted"}
+"""Findings of an antenna that is elsewhere than stated."""
+
+
 def _compare_role(run: _Run, role: str, length_s: float, windows_ns: Ints) -> Iterator[Comparison]:
     step(f"fusing without {role} for {len(windows_ns)} x {length_s:.0f} s")
     track = run.fuse(withhold(run.streams, role, run.epoch, windows_ns))
     facts = track.info.report.facts
-    if role == GNSS and facts.sensor_checks is not None and role in facts.sensor_checks.excluded:
+    if role == GNSS and facts.sensor_checks is not None and not facts.sensor_checks.excluded.keys().isdisjoint(FIXES):
         raise FusionError("tcpipe excludes the other fixes of the run")
     rows = _select_rows(track, run.epoch)
     moving = np.array([rows.measure_length_m(*window) >= LEAST_WINDOW_M for window in windows_ns])
@@ -114,9 +117,10 @@ def _compare_role(run: _Run, role: str, length_s: float, windows_ns: Ints) -> It
     numbers, sensor = np.flatnonzero(moving), run.measurements.sensors()[role]
     if isinstance(sensor, Positions):
         sensor = _move_origin(sensor, run.inputs, track)
-        mounting = facts.mounting or MountingFacts()
-        arm_m = np.asarray(run.streams.sensors[GNSS].xyz_m) + (mounting.antenna_moved_m or np.zeros(3))
-        arm_std_m = np.asarray(mounting.antenna_std_m or np.zeros(3))
+        arm_m, arm_std_m = np.asarray(run.streams.sensors[GNSS].xyz_m), np.zeros(3)
+        if facts.fuse and any(finding.code in _OTHER_ARM for finding in track.info.report.findings):
+            arm = facts.fuse.longest.parameters["antenna"]
+            arm_m, arm_std_m = arm_m + arm.value, np.asarray(arm.std)
         yield compare_fixes(sensor, rows, windows_ns, numbers, arm_m=arm_m, arm_std_m=arm_std_m, window_s=length_s)
     elif isinstance(sensor, BodyVelocities):
         for chord_s in CHORDS_S:
@@ -133,7 +137,7 @@ def withhold(streams: Streams, role: str, epoch: int, windows_ns: Ints) -> Strea
         inside = np.searchsorted(windows_ns[:, 0], stamp_ns, "right") > np.searchsorted(windows_ns[:, 1], stamp_ns)
         return table.filter(number_column(~(inside & (to_integers(table, "clock_epoch") == epoch))))
 
-    without = (GNSS, DOPPLER) if role == GNSS else (role,)
+    without = (*FIXES, DOPPLER) if role == GNSS else (role,)
     return replace(
         streams, tables={name: keep(table) if name in without else table for name, table in streams.tables.items()}
     )

@@ -12,7 +12,7 @@ from object_gateway import in_environment
 from storage_server import object_store
 from wheel_drives import START_NS, drive_at
 
-from tcpipe.formats.place import DirectoryPlace
+from tcpipe.formats.place import Place
 from tcpipe.pipeline import claims as claims_module
 from tcpipe.pipeline import log_queue
 from tcpipe.pipeline.calls import identify_process
@@ -93,9 +93,9 @@ def test_an_array_with_late_and_killed_tasks_makes_the_store_of_one_call(root, d
 def test_a_task_lists_the_store_once_and_a_share_with_nothing_new_writes_nothing(tmp_path, drives, monkeypatch):
     listed = []
     for verb in ("entries", "folders", "files"):
-        true = getattr(DirectoryPlace, verb)
+        true = getattr(Place, verb)
         monkeypatch.setattr(
-            DirectoryPlace,
+            Place,
             verb,
             lambda self, *of, true=true, **how: (listed.append(self.where(*of)), true(self, *of, **how))[1],
         )

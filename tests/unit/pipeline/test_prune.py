@@ -10,7 +10,7 @@ from synthetic_store import add_run, lanes, segments, supersede
 
 from tcpipe.errors import UsageError
 from tcpipe.formats.commits import Dataset, Entries
-from tcpipe.formats.place import DirectoryPlace
+from tcpipe.formats.place import Place
 from tcpipe.formats.run_documents import SPOOL
 from tcpipe.pipeline.calls import open_log
 from tcpipe.pipeline.prune import prune
@@ -147,7 +147,7 @@ def test_a_directory_that_a_killed_prune_left_empty_goes_when_it_is_old(store):
 
 
 def test_a_kill_in_the_midst_of_it_leaves_what_no_reader_sees_and_a_later_call_removes(store, monkeypatch):
-    delete, left = DirectoryPlace.delete, [1]
+    delete, left = Place.delete, [1]
 
     def killed(*args):
         if not left[0]:
@@ -156,7 +156,7 @@ def test_a_kill_in_the_midst_of_it_leaves_what_no_reader_sees_and_a_later_call_r
         delete(*args)
 
     with monkeypatch.context() as patch:
-        patch.setattr(DirectoryPlace, "delete", killed)
+        patch.setattr(Place, "delete", killed)
         with pytest.raises(KeyboardInterrupt):
             prune(store=store.root, recipe=Recipe())
     assert ("a", old := old_recipe(store)) not in there(store)
