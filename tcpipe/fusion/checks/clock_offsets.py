@@ -23,6 +23,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from tcpipe.fusion.attitude import add_turn_variance
 from tcpipe.fusion.checks.lags import (
     FIXES_S,
     GRID_S,
@@ -519,7 +520,7 @@ def add_jitter_variance(gnss: Positions, odometry: BodyVelocities, jitter_s: NDA
     speed = np.interp(compute_seconds(gnss.stamp_ns, zero), compute_seconds(odometry.stamp_ns, zero), speed)
     variance = gnss.variance_m2.copy()
     variance[:, :2] += ((2 * speed * jitter_s) ** 2)[:, None]
-    return replace(gnss, variance_m2=variance)
+    return add_turn_variance(replace(gnss, variance_m2=variance), 2 * jitter_s)
 
 
 def _make_windows(values: NDArray[np.float64]) -> NDArray[np.float64]:
