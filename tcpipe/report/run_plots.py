@@ -375,7 +375,7 @@ def _iterate_events(timeline: Timeline, facts: StageFacts) -> Iterator[tuple[str
     events = []
     for part in facts.audit.disagreements if facts.audit else ():
         role = part.sensor.replace("_", " ")
-        text = f"{role}: {part.what} off by {part.size:.2g} {part.unit}, {part.expected_std:.2g} expected"
+        text = f"{role}: distance off by {part.size:.2g} m, {part.expected_std:.2g} expected"
         events.append((f"{role} disagrees", part.start_ns, part.end_ns, part.clock_epoch, text))
     for stretch in facts.fuse.stretches if facts.fuse else ():
         for opened in stretch.gate_resets:

@@ -387,16 +387,17 @@ def _make_disagreement_sections(facts: StageFacts) -> list[Section]:
     rows = [
         (
             _name(part.sensor),
-            part.what,
             f"{(part.start_ns - start_ns) * 1e-9:.0f} to {(part.end_ns - start_ns) * 1e-9:.0f} s",
-            f"{part.size:.2g} {part.unit}",
-            f"{part.expected_std:.2g} {part.unit}",
-            "outvoted by other sensors; track unchanged" if part.alone else "σ inflated, segments flagged",
+            f"{part.size:.2g} m",
+            f"{part.expected_std:.2g} m",
         )
         for part in disagreements
     ]
-    text = "The track compared with each fused sensor in windows of 5 s: differences beyond the stated uncertainties."
-    header = ("sensor", "what", "in the run", "difference", "expected (1σ)", "action")
+    text = (
+        "Windows of 5 s in which the distance of the track differs from that of every sensor. There σ is inflated and segments "
+        "are flagged."
+    )
+    header = ("nearest sensor", "in the run", "difference", "expected (1σ)")
     return [Section("Disagreements of sensors and track", text, header=header, rows=rows)]
 
 

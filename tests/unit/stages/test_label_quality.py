@@ -125,10 +125,8 @@ def test_a_hole_counts_by_the_rows_on_both_of_its_sides(late, near):
     assert (Quality.NEAR_GAP in flags(segment, track)) == near
 
 
-def disagreement(start_ns, end_ns, *, alone=False, clock_epoch=0):
-    return AuditFacts(
-        (Disagreement(int(start_ns), int(end_ns), "gnss", "position", 1.0, "m", 0.1, alone, clock_epoch),)
-    )
+def disagreement(start_ns, end_ns, *, clock_epoch=0):
+    return AuditFacts((Disagreement(int(start_ns), int(end_ns), "gnss", 1.0, 0.1, clock_epoch),))
 
 
 @pytest.mark.parametrize(
@@ -139,9 +137,8 @@ def test_a_disagreement_counts_where_it_touches_a_segment(before, behind, touche
     assert (flags(cut(), about=info(audit=audit)) == {Quality.SENSORS_DISAGREE}) == touches
 
 
-def test_a_disagreement_that_is_settled_or_of_another_epoch_is_none():
+def test_a_disagreement_of_another_epoch_is_none():
     span = STAMPS[100], STAMPS[120]
-    assert flags(cut(), about=info(audit=disagreement(*span, alone=True))) == set()
     assert flags(cut(), about=info(audit=disagreement(*span, clock_epoch=1))) == set()
     later = cut(clock_epoch=np.ones(1, np.int16))
     assert flags(later, about=info(audit=disagreement(*span))) == set()
