@@ -8,7 +8,7 @@ from storage_server import READ_ONLY, object_store
 
 from tcpipe.errors import StoreError
 from tcpipe.formats.aws_profile import read_aws_profile
-from tcpipe.formats.bucket import open_place
+from tcpipe.formats.place import open_place
 
 CREDENTIALS = """
 [default]
