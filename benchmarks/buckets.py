@@ -26,9 +26,9 @@ from made_logs import CAMERA_HZ, TYPES, by_time, image, write_mcap
 from scale import drive_streams, write_logs
 
 from tcpipe import open_dataset
-from tcpipe.formats.bucket import open_place
 from tcpipe.formats.logs.writing import _sort_messages
 from tcpipe.formats.object_storage import connect_store
+from tcpipe.formats.place import open_place
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.ingest import ingest
 from tcpipe.pipeline.inspect import inspect

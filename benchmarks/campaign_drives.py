@@ -280,6 +280,8 @@ class Outcome:
     """Findings, or why there is no run."""
     common: dict[str, list[float]] = field(default_factory=dict)
     """The part of ``claimed`` that is one error of the whole run."""
+    value: dict[str, list[float]] = field(default_factory=dict)
+    """The labels themselves, by quantity."""
     blamed: list[str] = field(default_factory=list)
     """Subjects of which a warning says that they were excluded or rejected."""
     track: dict[str, float] = field(default_factory=dict)
@@ -351,9 +353,10 @@ def _compared(labelled: LabelledSegments, read: Streams, drive: Drive, fault: Fa
     table, findings = labelled.table, labelled.info.report.findings
     start_ns = fault.true_ns(to_integers(table, "start_ns"), drive)
     true = compute_true_cost(drive.truth, start_ns)
-    error, claimed, common = {}, {}, {}
+    value, error, claimed, common = {}, {}, {}, {}
     for name, column in list(QUANTITIES.items())[:-1]:
         quantity, unit = column.rsplit("_", 1)
+        value[name] = to_floats(table, column).tolist()
         error[name] = (to_floats(table, column) - getattr(true, column)).tolist()
         claimed[name] = to_floats(table, f"{quantity}_std_{unit}").tolist()
         of_run = f"{quantity}_common_std_{unit}"
@@ -368,7 +371,7 @@ def _compared(labelled: LabelledSegments, read: Streams, drive: Drive, fault: Fa
     claimed["start"] = std_m.tolist()
     placed = np.isfinite(lon) & (std_m <= max_std_m)
     return Outcome(
-        start_s=drive.seconds(start_ns).tolist(), error=error, claimed=claimed, common=common,
+        start_s=drive.seconds(start_ns).tolist(), error=error, claimed=claimed, common=common, value=value,
         bits=to_numbers(table["quality"]).tolist(), placed=placed.tolist(),
         driven_m=sum(labelled.distance_by_reason_m.values()), true_m=float(drive.truth.distance_m[-1]), wheels_m=wheels_m(read),
         kept_m=labelled.distance_by_reason_m.get("kept", 0.0), said=said_of(findings),

@@ -16,7 +16,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
 from fault_children import in_child
 
-from tcpipe.formats.bucket import open_place
+from tcpipe.formats.place import open_place
 
 if TYPE_CHECKING:
     from dask_cluster import DaskCluster

@@ -57,6 +57,8 @@ CLEAN = {1: (0.60, 0.76), 2: (0.91, 0.98)}
 """Shares wanted of the labels of a set of sensors without a fault."""
 LENGTHS = {"plain": 0.002, "valley": 0.005}
 """By how much the track by wheels alone may differ from their own length."""
+_POWER = ("w", "E")
+"""Labels that a current sensor makes."""
 _SAME_S = 0.6
 """Labels of two estimates that start within this are of the same ground."""
 _FEWEST = 20
@@ -116,16 +118,30 @@ class Labels:
     claimed: Mapping[str, np.ndarray]
     common: Mapping[str, np.ndarray]
     """The part of ``claimed`` that is one error of the whole drive."""
+    value: Mapping[str, np.ndarray]
     sure: np.ndarray
 
     def split(self, name: str) -> tuple[np.ndarray, float]:
-        """Return absolute errors over standard deviations without what is common, of sure labels, and the common error over its own."""
+        """Return absolute errors over standard deviations without what is common, of sure labels, and the common error over its own.
+
+        A current sensor has two common errors: a gain errs by a share of each label, an offset by the same power in all of them.
+        """
         error, claimed, common = (of[name][self.sure] for of in (self.error, self.claimed, self.common))
         known = np.isfinite(error) & np.isfinite(claimed)
         error, common = error[known], common[known]
         own = np.sqrt(np.maximum(claimed[known] ** 2 - common**2, 1e-12))
         shared = float(np.sum(common * error / own**2) / (1.0 + np.sum((common / own) ** 2)))
-        return np.abs(error - shared * common) / own, shared
+        alike = [common]
+        if name in _POWER:
+            alike = [
+                self.value[name][self.sure][known],
+                self.value["T"][self.sure][known] if name == "E" else np.ones(error.size),
+            ]
+        if not common.any() or error.size <= len(alike):
+            return np.abs(error) / own, shared
+        shapes = np.column_stack(alike) / own[:, None]
+        left = error / own - shapes @ np.linalg.lstsq(shapes, error / own)[0]
+        return np.abs(left) * np.sqrt(error.size / (error.size - len(alike))), shared
 
     @property
     def ratio(self) -> dict[str, np.ndarray]:
@@ -147,8 +163,11 @@ def labels_of(outcome: Outcome, sensors: str) -> Labels:
     error, claimed = (
         {name: np.asarray(of[name], float) for name in QUANTITIES} for of in (outcome.error, outcome.claimed)
     )
-    common = {name: np.asarray(outcome.common.get(name, np.zeros(bits.size)), float) for name in QUANTITIES}
-    return Labels(np.asarray(outcome.start_s, float), error, claimed, common, (bits & ~int(described)) == 0)
+    common, value = (
+        {name: np.asarray(of.get(name, np.zeros(bits.size)), float) for name in QUANTITIES}
+        for of in (outcome.common, outcome.value)
+    )
+    return Labels(np.asarray(outcome.start_s, float), error, claimed, common, value, (bits & ~int(described)) == 0)
 
 
 @dataclass

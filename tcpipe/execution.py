@@ -1,4 +1,4 @@
-"""Independent tasks side by side, in this process, local processes or a Dask cluster; a worker that dies costs only its own task.
+"""Independent tasks side by side, in this process, local processes or an executor; a worker that dies costs only its own task.
 
 What workers log is said here. Local ones end with this process, and at once when it is interrupted; a cluster's finish what they began.
 The home of dask.
@@ -13,18 +13,19 @@ import re
 import signal
 import threading
 import time
-from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, CancelledError, Executor, Future, ProcessPoolExecutor, wait
+from collections.abc import Callable, Generator, Iterable, Iterator
+from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
-from dataclasses import astuple, dataclass
+from dataclasses import astuple, dataclass, field, replace
 from functools import partial
-from itertools import islice
+from itertools import chain, islice
 from multiprocessing.connection import Connection
-from typing import TYPE_CHECKING, Any, Generic, TypeAlias, TypeVar, cast
+from operator import itemgetter
+from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeAlias, TypeVar, cast
 
 from tcpipe import __version__
-from tcpipe.errors import TcpipeError, UsageError
+from tcpipe.errors import TcpipeError, UsageError, clean_line
 from tcpipe.progress import STEP, step_of
 
 if TYPE_CHECKING:
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 R = TypeVar("R")
+R_co = TypeVar("R_co", covariant=True)
 
 logger = logging.getLogger("tcpipe")
 
@@ -40,6 +42,23 @@ Said: TypeAlias = tuple[Any, ...]
 
 _LONGEST_SAYING_BYTES = 3000
 """Less than what a pipe takes in one piece: nothing is cut or mixed, whoever dies."""
+
+
+class Job(Protocol[R_co]):
+    """What an executor was handed: a `concurrent.futures.Future`, or a job of submitit."""
+
+    def done(self) -> bool:
+        """Return whether it has ended."""
+
+    def result(self) -> R_co:
+        """Return its result when it has ended."""
+
+
+class Executor(Protocol):
+    """Every `concurrent.futures.Executor`, Dask's (`Client.get_executor`) among them, and submitit's for Slurm."""
+
+    def submit(self, fn: Callable[..., R], /, *args: Any) -> Job[R]:
+        """Let a worker call a function; both are pickled."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,9 +80,9 @@ def unwrap_result(outcome: Outcome[R | TcpipeError]) -> R:
 
 
 def run_all(
-    function: Callable[[T], R], tasks: Sequence[T], *, jobs: int, cluster: str | None = None
+    function: Callable[[T], R], tasks: Iterable[T], *, jobs: int, cluster: str | Executor | None = None
 ) -> Generator[Outcome[R]]:
-    """Yield the outcome of ``function(task)`` for every task, as each ends.
+    """Yield the outcome of ``function(task)`` for every task, as each ends; a task is asked for when a worker can have it.
 
     ``function`` and tasks are picklable (workers are spawned); ``function`` returns its errors rather than raising them.
     Use it within ``contextlib.closing``: workers end when the iterator is closed.
@@ -71,55 +90,47 @@ def run_all(
     Parameters
     ----------
     jobs : processes; this one for 1.
-    cluster : address of a Dask scheduler (``tcp://host:8786``), whose workers do it instead. They see the same files under the same names.
+    cluster : the address of a Dask scheduler, or an executor, whose workers do it instead. They see the same files under the same names.
 
     Raises
     ------
     UsageError : there is no such scheduler, it has no workers, or they are not as they have to be.
     """
-    if cluster is not None and tasks:
-        yield from _run_on_cluster(function, tasks, cluster)
-        return
-    if jobs <= 1 or len(tasks) <= 1:
-        for index, task in enumerate(tasks):
+    todo = enumerate(tasks)
+    first = list(islice(todo, 1 + (jobs > 1)))
+    if first and cluster is not None:
+        yield from _run_elsewhere(function, chain(first, todo), cluster)
+    elif jobs > 1 and len(first) > 1:
+        yield from _run_in_pools(function, chain(first, todo), jobs)
+    else:
+        for index, task in chain(first, todo):
             yield Outcome(index, function(task))
-        return
-    waiting = list(range(len(tasks)))
-    while waiting:
-        suspects: list[int] = []
-        yield from _run_until_broken(function, tasks, waiting, suspects, workers=min(jobs, len(waiting)))
+
+
+def _run_in_pools(function: Callable[[T], R], todo: Iterator[tuple[int, T]], jobs: int) -> Iterator[Outcome[R]]:
+    """Run tasks in local processes; those that ran when the pool broke run again, one by one, before another pool goes on."""
+    while first := next(todo, None):
+        todo, running, suspects = chain([first], todo), dict[Future[R], tuple[int, T]](), list[tuple[int, T]]()
+        with _pool(jobs) as pool:
+            while not suspects:
+                for new in islice(todo, jobs - len(running)):
+                    try:
+                        running[pool.submit(function, new[1])] = new
+                    except BrokenProcessPool:
+                        todo = chain([new], todo)
+                        break
+                if not running:
+                    break
+                for future in wait(running, return_when=FIRST_COMPLETED).done:
+                    ended = running.pop(future)
+                    try:
+                        yield Outcome(ended[0], future.result())
+                    except BrokenProcessPool:
+                        suspects.append(ended)
         if suspects:
             logger.warning("a worker process died; the tasks that ran at the same time run again, one by one")
-        for index in suspects:  # one of those that ran when the pool broke killed it: each again, alone
-            yield _run_alone(function, tasks[index], index)
-
-
-def _run_until_broken(
-    function: Callable[[T], R], tasks: Sequence[T], waiting: list[int], suspects: list[int], *, workers: int
-) -> Iterator[Outcome[R]]:
-    """Run the waiting tasks; on a broken pool leave what ran then in ``suspects`` and what had not begun in ``waiting``."""
-    running: dict[Future[R], int] = {}
-    with _pool(workers) as pool:
-        while waiting or running:
-            while waiting and len(running) < workers:
-                try:
-                    running[pool.submit(function, tasks[waiting[0]])] = waiting[0]
-                except BrokenProcessPool:
-                    if not running:
-                        return
-                    break
-                del waiting[0]
-            done, _ = wait(running, return_when=FIRST_COMPLETED)
-            for future in done:
-                index = running.pop(future)
-                try:
-                    yield Outcome(index, future.result())
-                except BrokenProcessPool:
-                    suspects.append(index)
-            if suspects:
-                suspects.extend(running.values())
-                suspects.sort()
-                return
+        for index, task in sorted([*suspects, *running.values()], key=itemgetter(0)):  # one of them killed it
+            yield _run_alone(function, task, index)
 
 
 def _run_alone(function: Callable[[T], R], task: T, index: int) -> Outcome[R]:
@@ -131,7 +142,7 @@ def _run_alone(function: Callable[[T], R], task: T, index: int) -> Outcome[R]:
 
 
 @contextmanager
-def _pool(workers: int) -> Iterator[Executor]:
+def _pool(workers: int) -> Iterator[ProcessPoolExecutor]:
     """Yield worker processes that say here what they log and live no longer than this process wants them to."""
     context = multiprocessing.get_context("spawn")
     heard, saying = context.Pipe(duplex=False)
@@ -179,7 +190,7 @@ def _end_with(life: Connection) -> None:
 class _LogForwarder(logging.Handler):
     """Hands what a worker logs to ``send``, as arguments of `Logger.log`: plain values, what is said as text of one argument."""
 
-    def __init__(self, send: Callable[[Said], object]) -> None:
+    def __init__(self, send: Callable[[Said], None]) -> None:
         super().__init__()
         self._send = send
 
@@ -199,68 +210,133 @@ def read_cluster_cpu_s() -> float:
 
 
 _ANSWER_S = 10
-"""So long a scheduler has to answer."""
+"""So long a scheduler has to answer, and a cluster to have a worker."""
 _ALONE_S = 300
-"""So long it may be without a worker."""
+"""So long a cluster may have lost all its workers."""
 _ADDRESS = re.compile(r"(tcp|tls)://[^/@]+:\d+")
 _AHEAD = 2
 """Tasks that a worker is handed at once: the next waits beside it."""
+_MOST_SUBMITTED = 256
+"""Tasks that an executor of unknown size has at once."""
+_POLL_S = 0.5
+_LONGEST_REASON = 500
 
 
-def _run_on_cluster(function: Callable[[T], R], tasks: Sequence[T], address: str) -> Generator[Outcome[R]]:
-    """Run the tasks on a cluster's workers; one that is killed has its task run again on another, three times."""
-    from distributed import KilledWorker  # noqa: PLC0415  most calls stay on this machine
+@dataclass(slots=True)
+class _Workers:
+    """An executor, what it is called, and how many tasks it is handed at once; ``client`` if Dask's, which is silent where nobody works."""
 
-    with _connect_client(address) as client:
-        channel, todo = _Channel(f"tcpipe-{client.id}", logger.getEffectiveLevel()), iter(range(len(tasks)))
-        client.subscribe_topic(channel.topic, lambda event: logger.log(*event[1]))
+    executor: Executor
+    name: str
+    at_once: int = _MOST_SUBMITTED
+    client: Client | None = None
+    alone_s: float = 0.0
 
-        def submit(count: int) -> dict[Any, int]:
-            at_once = islice(todo, count)
-            return {
-                client.submit(_run_on_worker, function, tasks[at], __version__, channel, pure=False): at
-                for at in at_once
-            }
-
-        running = submit(_AHEAD * _count_workers(client, address))
-        while running:
-            for future in _wait_for_first(client, running, address):
-                index = running.pop(future)
-                try:
-                    result, cpu_s = future.result()
-                except KilledWorker:
-                    yield Outcome(index, None, died=True)
-                except ModuleNotFoundError as error:
-                    raise UsageError(
-                        f"{address}: a worker lacks {error.name}; install the same packages there as here"
-                    ) from None
-                except RuntimeError as error:
-                    if "deserialization" not in str(error):
-                        raise
-                    raise UsageError(
-                        f"{address}: the scheduler lacks tcpipe; install the same packages there as here"
-                    ) from None
-                else:
-                    _spent["cpu_s"] += cpu_s
-                    yield Outcome(index, result)
-                running |= submit(1)
-
-
-def _wait_for_first(client: Client, running: Iterable[Any], address: str) -> Sequence[Any]:
-    """Return the tasks that have ended, when the first has; `TcpipeError` where the scheduler goes, or workers stay away."""
-    from distributed import wait as wait_for  # noqa: PLC0415  as above
-
-    said, alone_s = False, 0.0
-    while alone_s < _ALONE_S:
+    def submit(self, function: Callable[[T], R], task: T, caller: _Caller) -> Job[_Answer[R]]:
+        """Hand a task to the executor; `TcpipeError` where it takes none."""
         try:
-            with client.as_current():
-                return list(wait_for(list(running), timeout=_ANSWER_S, return_when=FIRST_COMPLETED).done)
-        except TimeoutError:
-            alone_s = 0.0 if client.nthreads() else alone_s + _ANSWER_S
-        if alone_s and not said:
-            logger.warning("%s: lost all its workers; waiting for one", address)
-            said = True
-    raise TcpipeError(f"{address}: had no workers for {_ALONE_S} s; start workers and run the same command again")
+            return self.executor.submit(_run_on_worker, function, task, caller)
+        except BrokenExecutor as error:  # as of the tasks that it has
+            job = Future[_Answer[R]]()
+            job.set_exception(error)
+            return job
+        except RuntimeError as error:
+            raise TcpipeError(f"{self.name}: takes no tasks ({error})") from None
+
+    def wait_for_first(self, running: Iterable[Job[R]]) -> list[Job[R]]:
+        """Return the tasks that have ended, when the first has; `TcpipeError` where all workers of a cluster stay away."""
+        futures = [job for job in running if isinstance(job, Future)]
+        while True:
+            if futures:
+                ended: list[Job[R]] = [*wait(futures, timeout=_ANSWER_S, return_when=FIRST_COMPLETED).done]
+            else:
+                ended = [job for job in running if job.done()]
+            if ended:
+                return ended
+            if self.client is not None:
+                self._check_workers(self.client)
+            if not futures:
+                time.sleep(_POLL_S)
+
+    def _check_workers(self, client: Client) -> None:
+        if client.nthreads():
+            self.alone_s = 0.0
+        elif self.alone_s >= _ALONE_S:
+            raise TcpipeError(
+                f"{self.name}: had no workers for {_ALONE_S} s; start workers and run the same command again"
+            )
+        else:
+            if not self.alone_s:
+                logger.warning(
+                    "%s: lost all its workers; waiting for one: dask worker %s --nthreads 1", *[self.name] * 2
+                )
+            self.alone_s += _ANSWER_S
+
+
+def _run_elsewhere(
+    function: Callable[[T], R], todo: Iterator[tuple[int, T]], cluster: str | Executor
+) -> Generator[Outcome[R]]:
+    """Run tasks by an executor; Dask's runs that of a killed worker again on another, three times."""
+    with _open_workers(cluster) as workers:
+        caller = _Caller((os.uname().nodename, os.getpid()), logger.getEffectiveLevel(), __version__)
+        if client := workers.client:
+            caller = replace(caller, topic=f"tcpipe-{client.id}")
+            client.subscribe_topic(caller.topic, lambda event: logger.log(*event[1]))
+        running = dict[Job[_Answer[R]], int]()
+        while True:
+            for index, task in islice(todo, workers.at_once - len(running)):
+                running[workers.submit(function, task, caller)] = index
+            if not running:
+                return
+            for job in workers.wait_for_first(running):
+                index = running.pop(job)
+                answer = _get_answer(job, workers.name)
+                if answer is None:
+                    yield Outcome(index, None, died=True)
+                    continue
+                for said in answer.said:
+                    logger.log(*said)
+                _spent["cpu_s"] += answer.cpu_s
+                yield Outcome(index, answer.result)
+
+
+def _get_answer(job: Job[_Answer[R]], name: str) -> _Answer[R] | None:
+    """Return what a task gave, None where its worker died; `UsageError` where workers are not as they have to be."""
+    try:
+        return job.result()
+    except (TcpipeError, CancelledError):
+        raise
+    except ModuleNotFoundError as error:
+        raise UsageError(f"{name}: a worker lacks {error.name}; install the same packages there as here") from None
+    except Exception as error:  # noqa: BLE001  tasks return their errors: this one is the executor's
+        if "deserialization" in str(error):
+            raise UsageError(f"{name}: the scheduler lacks tcpipe; install the same packages there as here") from None
+        reason = clean_line(f"{type(error).__name__}: {'; '.join(str(error).split(chr(10)))}")
+        logger.warning("%s: a task ended without a result (%s)", name, reason[:_LONGEST_REASON])
+        return None
+
+
+@contextmanager
+def _open_workers(cluster: str | Executor) -> Iterator[_Workers]:
+    """Yield the workers of a scheduler's address or of an executor, which is left open; what is wrong with them is one line."""
+    if isinstance(cluster, str):
+        with _connect_client(cluster) as client:
+            yield _Workers(client.get_executor(), cluster, _AHEAD * _count_workers(client, cluster), client)
+        return
+    name, client = f"executor {type(cluster).__name__}", getattr(cluster, "_client", None)
+    if client is not None:  # Dask's
+        name = client.scheduler.address
+    with _convert_stop(name):
+        at_once = _MOST_SUBMITTED if client is None else _AHEAD * _count_workers(client, name)
+        yield _Workers(cluster, name, at_once, client)
+
+
+@contextmanager
+def _convert_stop(name: str) -> Iterator[None]:
+    try:
+        yield
+    except (OSError, CancelledError):
+        raise TcpipeError(f"{name}: the scheduler stopped; start it and run the same command again") from None
 
 
 @contextmanager
@@ -277,11 +353,8 @@ def _connect_client(address: str) -> Iterator[Client]:
         except (OSError, ValueError) as error:
             reason = str(error).partition("\n")[0] or type(error).__name__
             raise UsageError(f"{address}: no Dask scheduler answers ({reason}); start one: dask scheduler") from None
-        try:
-            with client:
-                yield client
-        except (OSError, CancelledError):
-            raise TcpipeError(f"{address}: the scheduler stopped; start it and run the same command again") from None
+        with _convert_stop(address), client:
+            yield client
 
 
 @contextmanager
@@ -299,21 +372,14 @@ def _mute_loggers(*names: str) -> Iterator[None]:
 
 def _count_workers(client: Client, address: str) -> int:
     """Return the number of workers; `UsageError` where there is none, or one has several threads, no tcpipe, or another."""
+    start = f"dask worker {address} --nthreads 1"
     try:
-        with suppress(TimeoutError):
-            client.wait_for_workers(1, timeout=_ANSWER_S)
-        if not client.nthreads():  # a cluster may be starting
-            logger.warning("%s: has no workers yet; waiting for one", address)
-        client.wait_for_workers(1, timeout=_ALONE_S)
+        client.wait_for_workers(1, timeout=_ANSWER_S)
     except TimeoutError:
-        raise UsageError(
-            f"{address}: the scheduler has no workers; start one: dask worker {address} --nthreads 1"
-        ) from None
+        raise UsageError(f"{address}: the scheduler has no workers after {_ANSWER_S} s; start one: {start}") from None
     threads = client.nthreads()
     if many := [worker for worker, count in threads.items() if count != 1]:
-        raise UsageError(
-            f"{many[0]}: has {threads[many[0]]} threads; expected one a worker: dask worker {address} --nthreads 1"
-        )
+        raise UsageError(f"{many[0]}: has {threads[many[0]]} threads; expected one a worker: {start}")
     # Not a function of tcpipe: a worker that lacks it would end when it is handed one.
     for worker, version in client.run(eval, "__import__('tcpipe').__version__", on_error="return").items():
         if isinstance(version, ImportError):
@@ -328,24 +394,41 @@ def _make_cluster_error(worker: str, version: str, *, wanted: str) -> UsageError
 
 
 @dataclass(frozen=True, slots=True)
-class _Channel:
-    """Where a cluster's workers say what they log, and from which level on."""
+class _Caller:
+    """Whose task it is: its process and version, from which level on it forwards what is logged, and by which topic of Dask."""
 
-    topic: str
+    process: tuple[str, int]
     level: int
+    version: str
+    topic: str | None = None
 
 
-def _run_on_worker(function: Callable[[T], R], task: T, version: str, channel: _Channel) -> tuple[R, float]:
-    """Run a task on a cluster's worker; return its result and the CPU seconds that it took; what it logs goes to the client before."""
-    from distributed import get_worker  # noqa: PLC0415  most calls stay on this machine
+@dataclass(frozen=True, slots=True)
+class _Answer(Generic[R]):
+    """What a task gave, the CPU seconds that it took, and what it logged, where that could not be forwarded at once."""
 
-    if version != __version__:
-        raise _make_cluster_error(os.uname().nodename, __version__, wanted=version)
-    saying, began_s = _LogForwarder(partial(get_worker().log_event, channel.topic)), time.process_time()
-    logger.addHandler(saying)
-    logger.setLevel(channel.level)
+    result: R
+    cpu_s: float = 0.0
+    said: list[Said] = field(default_factory=list)
+
+
+def _run_on_worker(function: Callable[[T], R], task: T, caller: _Caller) -> _Answer[R]:
+    """Run a task on a worker; on a thread of the caller as it is."""
+    if caller.version != __version__:
+        raise _make_cluster_error(os.uname().nodename, __version__, wanted=caller.version)
+    if caller.process == (os.uname().nodename, os.getpid()):
+        return _Answer(function(task))
+    said, began_s, before = list[Said](), time.process_time(), (logger.handlers, logger.level)
+    send: Callable[[Said], None] = said.append
+    if caller.topic is not None:
+        from distributed import get_worker  # noqa: PLC0415  most calls stay on this machine
+
+        send = partial(get_worker().log_event, caller.topic)
+    logger.handlers = [_LogForwarder(send)]  # a forked process has the caller's
+    logger.setLevel(caller.level)
     try:
         result = function(task)
-        return result, time.process_time() - began_s
     finally:
-        logger.removeHandler(saying)
+        logger.handlers = before[0]
+        logger.setLevel(before[1])
+    return _Answer(result, time.process_time() - began_s, said)

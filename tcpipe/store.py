@@ -12,7 +12,7 @@
       runs/<run_id>/streams/<digest>/<role>.parquet
       runs/<run_id>/<recipe_id>/manifest-<n>.json   what became of it; files and checksums of the tables
       runs/<run_id>/<recipe_id>/<digest>/           track.parquet, segments.parquet, rejections.parquet
-      spool/                                        pixels on their way into a dataset, while a cluster builds it
+      spool/                                        what calls that run share: pixels on their way into a dataset, claims on logs
       index/                                        runs.parquet: all runs as a table for other tools, made again at will
 
 Of numbered documents the highest holds. A ``<digest>`` names the content of what lies in it.
@@ -31,8 +31,7 @@ from pathlib import Path, PurePosixPath
 import pyarrow as pa
 
 from tcpipe.errors import StoreError, TableError, UsageError
-from tcpipe.formats.atomic import check_local_output, clear_scratch
-from tcpipe.formats.bucket import open_place
+from tcpipe.formats.atomic import check_local_output
 from tcpipe.formats.bucket_directories import FetchedShards, fetch_files
 from tcpipe.formats.commit_log import Stamp, pause_garbage_collection, put_commit, read_state
 from tcpipe.formats.commits import Entries, Kind, State
@@ -41,7 +40,7 @@ from tcpipe.formats.integrity import CHECKSUMS, Checksum, compute_checksums, sea
 from tcpipe.formats.json_files import parse_typed, parse_typed_json, to_compact_json, to_json, to_plain
 from tcpipe.formats.object_storage import is_bucket, is_url
 from tcpipe.formats.parquet import add_segments_metadata, read_table
-from tcpipe.formats.place import DirectoryPlace, Place
+from tcpipe.formats.place import Place, open_place
 from tcpipe.formats.run_documents import (
     MARK,
     Manifest,
@@ -467,28 +466,18 @@ def open_store(root: str | Path, *, create: bool = False) -> Store:
         raise UsageError(f"{root}: no place for a store; expected a directory, s3://bucket/name, gs:// or az://")
     root = str(root).rstrip("/") if is_url(root) else check_local_output(root)
     store = Store(root)
-    if isinstance(root, Path):
-        _refuse_file(root, create=create)
-    else:
+    if store.place.path is None:
         store.place.check()
+    elif store.place.path.is_file():
+        raise UsageError(f"{root}: is a file, expected a directory for the store")
     version = read_layout(store.place)
     _refuse_earlier(store.place, version)
     found = version is not None or is_store(root)
-    if not found and not create and not isinstance(root, Path):
+    if not found and not create and not (store.place.path and store.place.path.exists()):
         raise UsageError(f"{root}: there is no store here; run 'tcpipe ingest' first, or name another with --store")
     if version not in (None, *READ_VERSIONS):
         raise StoreError(f"{root}: is of data model {version}, this version knows {', '.join(READ_VERSIONS)}")
     if create:
         mark_store(store.place, found=found)
-        if isinstance(place := store.place, DirectoryPlace):  # what killed commands left
-            place.clear()
-        else:
-            clear_scratch()
+        store.place.clear()
     return store
-
-
-def _refuse_file(path: Path, *, create: bool) -> None:
-    if path.exists() and not path.is_dir():
-        raise UsageError(f"{path}: is a file, expected a directory for the store")
-    if not path.exists() and not create:
-        raise UsageError(f"{path}: there is no store here; run 'tcpipe ingest' first, or name another with --store")

@@ -89,6 +89,11 @@ def die_once(mark: Path) -> int:
     raise AssertionError
 
 
+def die(_: int) -> None:
+    """Kill the worker."""
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
 def wants_more(value: int) -> int:
     """Want a module that no worker has."""
     import nowhere_to_be_had  # type: ignore[import-not-found]

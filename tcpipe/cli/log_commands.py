@@ -179,7 +179,7 @@ def _print_sum(summary: IngestSummary) -> None:
         for status in ("done", "unchanged", "damaged", "empty", "failed", "waiting")
     }
     if not number:
-        print_line("nothing to do: this shard has none of the logs")
+        print_line("nothing to do: this task of the array has no log")
     elif count["unchanged"] + len(old) == number:
         print_line(f"nothing to do: {count['unchanged']} of {number} logs are in {summary.store} already")
     elif count["failed"] == number:

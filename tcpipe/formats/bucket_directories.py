@@ -25,13 +25,13 @@ import google_crc32c
 
 from tcpipe.errors import StoreError, UsageError
 from tcpipe.formats.atomic import make_lasting_scratch, make_scratch_directory
-from tcpipe.formats.bucket import fetch_cached, find_wrong_files, is_cached, map_concurrently, open_place
+from tcpipe.formats.cache import fetch_cached, is_cached
 from tcpipe.formats.commit_log import LOG, read_newest_commit, read_state
 from tcpipe.formats.commits import State
-from tcpipe.formats.integrity import Checksum, Checksums, find_broken_checksums
+from tcpipe.formats.integrity import Checksum, Checksums
 from tcpipe.formats.json_files import parse_json, parse_typed
 from tcpipe.formats.object_storage import is_bucket, is_url
-from tcpipe.formats.place import DirectoryPlace, Place
+from tcpipe.formats.place import Place, find_changed_files, find_wrong_files, open_place
 
 CARDS = ("dataset.json", "model.json", "cost-map.json")
 """Documents that prove all files beside them."""
@@ -77,7 +77,7 @@ class FetchedShards:
         pieces = list(pieces)
         self._prove({self._name(path) for path, *_ in pieces})
         absent = [piece for piece in pieces if not is_cached(self._key(*piece))]
-        map_concurrently(self.place.where(), lambda piece: self._held(*piece), absent)
+        self.place.map(lambda piece: self._held(*piece), absent)
 
     def fetch_file(self, path: Path) -> Path:
         """Return a cached copy of a whole file."""
@@ -92,7 +92,7 @@ class FetchedShards:
         """Raise `StoreError` where a shard is not what its card says."""
         if not self.proves or names <= self._proved:
             return
-        if wrong := find_wrong_files(self.place, self.checksums, sorted(names - self._proved)):
+        if wrong := find_changed_files(self.place, self.checksums, sorted(names - self._proved)):
             raise StoreError(*wrong)
         self._proved.update(names)
 
@@ -142,7 +142,7 @@ def fetch_unproved(url: str) -> Iterator[Path]:
                 (root / name).parent.mkdir(parents=True, exist_ok=True)
                 (root / name).write_bytes(data)
 
-        map_concurrently(url, bring, [*_read_checksums(card), card.name, *_UNLISTED])
+        card.place.map(bring, [*_read_checksums(card), card.name, *_UNLISTED])
         yield root
 
 
@@ -249,8 +249,8 @@ def fetch_files(
 
     A directory holds all of them: it is returned itself, with None. `StoreError` where a file cannot be had as its checksum says.
     """
-    if isinstance(place, DirectoryPlace):
-        return place.root, None
+    if place.path is not None:
+        return place.path, None
     root = _make_subdirectory(
         _make_copy_directory(place.where(), repr(sorted(checksums.items())).encode()), place.where()
     )
@@ -262,7 +262,7 @@ def _fetch_wanted(
 ) -> FetchedShards:
     """Bring what is wanted of a place's files below ``root``; return where the others are read."""
     absent = [(file, checksum) for file, checksum in checksums.items() if wanted(file) and not (root / file).exists()]
-    map_concurrently(place.where(), lambda of: _fetch_one(place, *of, root / of[0]), absent)
+    place.map(lambda of: _fetch_one(place, *of, root / of[0]), absent)
     return FetchedShards(place, root, checksums)
 
 
@@ -290,7 +290,7 @@ def _fetch_one(place: Place, name: str, checksum: Checksum, to: Path) -> None:
                 os.link(held, to)
             except OSError:
                 shutil.copyfile(held, to)
-        if not list(find_broken_checksums(to.parent, {to.name: checksum})):
+        if not list(find_wrong_files(Place(to.parent), {to.name: checksum})):
             return
         held.unlink(missing_ok=True)
         to.unlink()

@@ -22,7 +22,6 @@ from typing import TypeAlias
 import pyarrow as pa
 
 from tcpipe.errors import StoreError
-from tcpipe.formats.bucket import map_concurrently
 from tcpipe.formats.commits import Commit, Entries, Kind, Problem, Process, State, compact_state, fold
 from tcpipe.formats.integrity import SEAL, seal_document, verify_document
 from tcpipe.formats.json_files import parse_json, parse_typed, parse_typed_json, to_compact_json, to_json
@@ -92,9 +91,7 @@ def refresh(store: Place, state: State) -> State:
     """Return the state after the commits that were written since."""
     log = store.below(LOG)
     numbers = _list_commits(log, state.number)
-    for number, result in zip(
-        numbers, map_concurrently(log.where(), lambda n: _try_read_commit(log, n), numbers), strict=True
-    ):
+    for number, result in zip(numbers, log.map(lambda n: _try_read_commit(log, n), numbers), strict=True):
         wrong = [_make_problem("commit-missing", log, absent) for absent in range(state.number + 1, number)]
         wrong += [_make_problem("commit-damaged", log, number)] if isinstance(result, StoreError) else []
         if wrong:
@@ -112,7 +109,7 @@ def read_newest_commit(store: Place) -> Commit | None:
 
 def _list_commits(log: Place, after: int) -> list[int]:
     """Return the numbers of the commits after one, rising."""
-    found = (_COMMIT.fullmatch(name) for name in log.files_after("", commit_name(after)))
+    found = (_COMMIT.fullmatch(name) for name in log.files(after=commit_name(after)))
     return sorted(int(of[1]) for of in found if of)
 
 
@@ -198,7 +195,7 @@ def _keep_snapshot(log: Place, state: State, stamp: Stamp) -> State:
 
 
 def _list_snapshots(log: Place) -> list[str]:
-    return [name for name in log.files_after("", _SNAPSHOT) if name.startswith(_SNAPSHOT)]
+    return [name for name in log.files(after=_SNAPSHOT) if name.startswith(_SNAPSHOT)]
 
 
 def _encode_snapshot(state: State, stamp: Stamp) -> bytes:

@@ -23,14 +23,13 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from tcpipe.errors import DatasetError, RecipeError, StoreError, UsageError
-from tcpipe.formats.bucket import find_wrong_files
 from tcpipe.formats.bucket_directories import FetchedShards
 from tcpipe.formats.dataset_card import KIND, DatasetCard, Shard
-from tcpipe.formats.integrity import prove_files, read_sealed
+from tcpipe.formats.integrity import read_sealed
 from tcpipe.formats.json_files import parse_typed
 from tcpipe.formats.maps.map_facts import make_cf_attributes, read_layers
 from tcpipe.formats.parquet import read_column_names, read_row_count, read_row_group, read_table, write_parquet_bytes
-from tcpipe.formats.place import DirectoryPlace, Place
+from tcpipe.formats.place import Place, find_changed_files, prove_files
 from tcpipe.formats.shards import DESCRIPTION, ShardedArray, decode_chunk, open_sharded
 from tcpipe.formats.zarr_arrays import Compression, add_array, consolidate_metadata, create_group
 from tcpipe.splits.assignment import SPLITS
@@ -423,7 +422,7 @@ def open_patches(
     fetched = fetched and replace(fetched, proves=proved)
     if proved and fetched is None:
         shards = [name for name in card.checksums if is_shard(name)]
-        _refuse_others(find_wrong_files(DirectoryPlace(directory), card.checksums, shards), directory)
+        _refuse_others(find_changed_files(Place(directory), card.checksums, shards), directory)
     if card.format == "parquet":
         return replace(_open_sharded_patches(directory, layers, px, card), fetched=fetched)
     with _convert_errors(_AGAIN):

@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import re
 import zlib
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
@@ -31,7 +31,8 @@ CHECKSUMS = "checksums.json"
 _SEAL_LINE = re.compile(rb'^  "document_sha256": "([0-9a-f]{64})"(,?)\n', re.MULTILINE)
 """The seal in canonical JSON: the text without this line is what it is the hash of."""
 
-_TELLS = "; 'tcpipe verify {}' lists all changed files"
+ALL_CHANGES = "; 'tcpipe verify {}' lists all changed files"
+"""What a line about one of them ends with."""
 
 _PAGE_SEAL = "<!-- sha256 of the lines above: {} -->\n"
 _PNG_START = b"\x89PNG\r\n\x1a\n"
@@ -87,21 +88,13 @@ def verify_document(
     if not ours(found):
         return found
     if not _is_whole_document(data):
-        raise StoreError(f"{describe_broken(where)}{_TELLS.format(str(where).rpartition('/')[0])}")
+        raise StoreError(f"{describe_broken(where)}{ALL_CHANGES.format(str(where).rpartition('/')[0])}")
     return found
 
 
 def read_sealed_as(path: Path, cls: type[T]) -> T:
     """Read and prove a sealed JSON object, as a dataclass; `StoreError` as `read_sealed`."""
     return parse_typed(read_sealed(path), cls, path)
-
-
-def prove_files(directory: Path, checksums: Mapping[str, Checksum], names: Iterable[str]) -> None:
-    """Compare files of a directory with what a sealed document has of them; `StoreError` names the first that differs."""
-    lines = list(find_broken_checksums(directory, {name: checksums.get(name) for name in names}))
-    if lines:
-        more = f", and {len(lines) - 1} more" if len(lines) > 1 else ""
-        raise StoreError(f"{lines[0]}{more}{_TELLS.format(directory)}")
 
 
 def write_checksums(directory: Path) -> None:
@@ -141,26 +134,6 @@ def find_broken_seal_in(data: bytes | None, where: Path | str) -> str | None:
         return f"{where}: is missing"
     whole = {".html": _is_whole_page, ".png": _is_whole_png}.get(Path(where).suffix, _is_whole_document)
     return None if whole(data) else describe_broken(where)
-
-
-def find_broken_checksums(directory: Path, checksums: Mapping[str, Checksum | None]) -> Iterator[str]:
-    """Yield a line for every file below ``directory`` that is not what ``checksums`` has of it, by path; None: nothing."""
-    for name, wanted in checksums.items():
-        path = directory / name
-        if not path.is_file():
-            yield f"{path}: is missing"
-            continue
-        try:
-            size = path.stat().st_size
-            if wanted is not None and size != wanted.size_bytes:
-                yield f"{path}: has {size} bytes, expected {wanted.size_bytes}"
-                continue
-            found = compute_checksum(path)
-        except OSError as error:
-            yield f"{path}: cannot be read ({error.strerror})"
-            continue
-        if wrong := find_wrong_checksum(path, found, wanted):
-            yield wrong
 
 
 def find_wrong_checksum(where: Path | str, found: Checksum | None, wanted: Checksum | None) -> str | None:

@@ -9,7 +9,6 @@ import logging
 import math
 import multiprocessing
 import os
-import random
 import re
 import threading
 import time
@@ -97,6 +96,8 @@ class StoredObject:
     """An object: its name in the store, size [byte] and modification time [ns], and the tag that its content has."""
 
     url: str
+    bucket: str
+    """Or directory or server."""
     query: str
     """Of a presigned URL."""
     name: str
@@ -140,7 +141,7 @@ class StoredObject:
                 raise OSError(f"the store gives {len(data)} bytes for those from {span[0]} to {span[1]}")
             return data
 
-        return ask_store(self.url, get, LogError, query=self.query)
+        return ask_store(self.url, get, LogError, bucket=self.bucket, query=self.query)
 
 
 def is_url(text: str | Path) -> bool:
@@ -285,6 +286,7 @@ def ask_store(
     error: type[TcpipeError] = StoreError,
     *,
     what: str = "read",
+    bucket: str = "",
     query: str = "",
 ) -> T:
     """Return what a request gives to which an object is ``read`` or ``written``; while there is no answer it is made again.
@@ -295,7 +297,7 @@ def ask_store(
     """
     from obstore.exceptions import AlreadyExistsError, BaseError  # noqa: PLC0415
 
-    bucket, began, pauses = split_bucket(url)[0], time.monotonic(), chain(_PAUSES_S, repeat(_PAUSES_S[-1]))
+    bucket, began, pauses = bucket or split_bucket(url)[0], time.monotonic(), chain(_PAUSES_S, repeat(_PAUSES_S[-1]))
     settings = tuple(sorted((key, value) for key, value in os.environ.items() if key.upper().startswith(_SETTINGS)))
     patience = _patience[bucket, query, settings]
     while True:
@@ -306,7 +308,7 @@ def ask_store(
             result = request(store)
         except (BaseError, OSError, ValueError) as found:
             if store is not None and _is_unanswered(found):
-                now, pause = time.monotonic(), next(pauses) * random.uniform(0.5, 1.0)  # noqa: S311
+                now, pause = time.monotonic(), next(pauses)
                 if now - began + pause + (0.0 if patience.is_long else now - asked) < patience.limit_s:
                     _tell_no_answer(bucket, patience, found, waited_s=now - began)
                     _wait(pause)
@@ -489,8 +491,13 @@ def _iterate_objects(store: ObjectStore, url: str, query: str, wanted: Callable[
 
 def _make_stored_object(url: str, query: str, name: str, meta: ObjectMeta) -> StoredObject:
     path, tag = str(meta["path"]), meta.get("e_tag")
-    modified_ns = round(meta["last_modified"].timestamp() * 1e6) * 1000
-    return StoredObject(url.rstrip("/") + path.removeprefix(name), query, path, int(meta["size"]), modified_ns, tag)
+    bucket, url = split_bucket(url)[0], url.rstrip("/") + path.removeprefix(name)
+    return StoredObject(url, bucket, query, path, int(meta["size"]), read_modified_ns(meta), tag)
+
+
+def read_modified_ns(meta: ObjectMeta) -> int:
+    """Return when an object was written [ns since 1970]; stores tell microseconds at most."""
+    return round(meta["last_modified"].timestamp() * 1e6) * 1000
 
 
 def _place(object_name: str, directory: Path) -> Path:

@@ -235,7 +235,7 @@ def name_folder(checksums: Mapping[str, Checksum]) -> str:
 MARK = "store.json"
 """Is written first where a store is new, and last where one is brought over."""
 SPOOL = "spool"
-"""Where pixels wait until a dataset is written, in its directory or, for a cluster, in the store; they go in the end."""
+"""Where pixels wait until a dataset is written, in its directory or, for a cluster, in the store, and claims; they go in the end."""
 
 
 def is_outdated(place: Place) -> bool:

@@ -17,7 +17,7 @@ from tcpipe.formats.commits import State
 from tcpipe.formats.index_files import RunFacts
 from tcpipe.formats.integrity import Checksum, compute_checksum, compute_checksums, find_wrong_checksum
 from tcpipe.formats.parquet import read_range, read_table, write_table
-from tcpipe.formats.place import DirectoryPlace, Place
+from tcpipe.formats.place import Place
 from tcpipe.formats.recipe_toml import read_key
 from tcpipe.formats.run_documents import Manifest, name_folder, read_as_at
 from tcpipe.tables.findings import judge_again
@@ -162,7 +162,7 @@ def look_at_files(place: Place, rows: Iterable[RunFacts]) -> Iterator[tuple[RunF
 
 def make_file_finder(place: Place, rows: Collection[RunFacts]) -> Callable[[str], tuple[int, int] | None]:
     """Return what tells the size [byte] and modification time [ns] of a file of the runs of rows; None where there is none."""
-    return _find_on_disk(place.root) if isinstance(place, DirectoryPlace) else _find_listed(place, rows)
+    return _find_on_disk(place.path) if place.path else _find_listed(place, rows)
 
 
 def _find_on_disk(root: Path) -> Callable[[str], tuple[int, int] | None]:
@@ -231,7 +231,7 @@ def fetch_local_file(place: Place, name: str, wanted: Checksum) -> Path:
     """Return a file on this machine, proved; `StoreError` if it is not as it was written."""
     path = place.local(name, wanted)
     wrong = find_wrong_checksum(place.where(name), compute_checksum(path) if path.is_file() else None, wanted)
-    if wrong and not isinstance(place, DirectoryPlace):  # the copy in the cache; a new one is proved when it is made
+    if wrong and place.path is None:  # the copy in the cache; a new one is proved when it is made
         path.unlink(missing_ok=True)
         return place.local(name, wanted)
     if wrong:
@@ -277,7 +277,7 @@ def lend_streams(place: Place, streams: Streams, stored: Mapping[str, Checksum])
     place : of the run.
     stored : the files of L1 in it.
     """
-    if not isinstance(place, DirectoryPlace):
+    if place.path is None:
         return streams
     files = {PurePosixPath(name).stem: place.local(name, of) for name, of in stored.items()}
     held = {role: table for role, table in streams.tables.items() if role not in _LENT}

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from tcpipe.errors import FusionError
 from tcpipe.fusion import state
+from tcpipe.fusion.attitude import STATED_MOUNTING_STD_RAD
 from tcpipe.fusion.densities import NoiseModel, fit_noise
 from tcpipe.fusion.event_candidates import EventCandidate, find_fix_excursions, find_turn_jump
 from tcpipe.fusion.filter_kernel import (
@@ -54,7 +55,13 @@ from tcpipe.tables.findings import Subject, make_finding
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-ROLES = {state.WHEELS: WHEELS, state.VISUAL: VISUAL, state.DOPPLER: DOPPLER, state.FIX: GNSS}
+ROLES = {
+    state.WHEELS: WHEELS,
+    state.VISUAL: VISUAL,
+    state.DOPPLER: DOPPLER,
+    state.FIX: GNSS,
+    state.ATTITUDE: GNSS,
+}
 _BLOCK = 1024
 _LEVELLING_S = 60.0
 """The start is filtered twice over this time: attitude and yaw at its end are those of the beginning, smoothed."""
@@ -265,19 +272,21 @@ def _make_trajectory(  # noqa: PLR0917
         speed_variance = speed_variance + (UNSEEN_TURN_RADPS * antenna[2]) ** 2
         sway = np.minimum(GROUND * speed[:, None] * DISPLACEMENT_LAGS_S, 2 * slope_std**2) * antenna[2] ** 2
         links = links + sway
-    elif is_turned_by_course(m):
+    elif is_turned_by_course(m) and not m.has_posed_tilt:
         # The course takes a sway of the antenna for a turn: nothing tells one from the other, and roll is taken to be none.
         position_variance[:, :2] += (slope_std * antenna[2] * rotation[:, :2, 1]) ** 2
     if noise.horizontal is not None and noise.vertical is not None:
         # What fixes claim beyond what the run shows lasts longer than the run can show.
         for axes, fix in ((slice(0, 2), noise.horizontal), (slice(2, 3), noise.vertical)):
             position_variance[:, axes] += max(0.0, fix.claimed_m2 - fix.white_m2 - fix.correlated.variance)
-    if m.gnss is not None and not std[state.ARM : state.ARM + 3].any():
+    if m.gnss is not None and m.imu is None and not m.has_posed_tilt:
         turned = np.unwrap(np.arctan2(rotation[:, 1, 0], rotation[:, 0, 0]))
-        variance, moved = _compute_arm_variance(m, rotation, turned, made)
+        # Without a gyroscope the noise of roll passes for sway: the height of the antenna is no better known than it was stated.
+        unseen = np.asarray(m.gnss.lever_arm_std_m) * [not std[state.ARM], not std[state.ARM + 1], 1.0]
+        variance, moved = _compute_arm_variance(unseen, rotation, turned, made)
         position_variance += variance
         links = links + moved
-    if m.imu is None and not m.odometries():
+    if m.imu is None and not m.odometries() and not _is_yaw_measured(m):
         # From positions alone forward and reverse look the same: yaw may be anything, and so the place below the antenna.
         beside = rotation @ antenna
         aside, above = np.sum(beside[:, :2] ** 2, axis=1), 2 * (rotation[:, 2, :2] @ antenna[:2]) ** 2
@@ -302,6 +311,11 @@ def _make_trajectory(  # noqa: PLR0917
         facts=replace(_make_facts(m, made, smoothed, std, scale_std, explained), noise=describe_noise(m, noise)),
         corrected=_correct_measurements(m, made, smoothed, explained),
     )
+
+
+def _is_yaw_measured(m: Measurements) -> bool:
+    """Return whether a pose shows where the robot looks; how one that nothing places is turned is told by the direction of motion."""
+    return m.gnss is not None and m.has_attitude and m.gnss.mounting_std_rad <= STATED_MOUNTING_STD_RAD
 
 
 def _make_motion(x: Floats, ticks: Ticks, at: Ints) -> tuple[Floats, Floats, Floats]:
@@ -337,10 +351,8 @@ def _interpolate_links(smoothed: Smoothed, at: Ints, output_ns: Ints) -> Floats:
     return found
 
 
-def _compute_arm_variance(m: Measurements, rotation: Floats, yaw: Floats, made: Pass) -> tuple[Floats, Floats]:
+def _compute_arm_variance(std: Floats, rotation: Floats, yaw: Floats, made: Pass) -> tuple[Floats, Floats]:
     """Return the variance that an antenna whose place nothing shows adds to positions, (N, 3), and to displacements, (N, 4) [m²]."""
-    assert m.gnss is not None  # noqa: S101
-    std = np.asarray(m.gnss.lever_arm_std_m)
     moved = np.zeros((yaw.size, len(DISPLACEMENT_LAGS_S)))
     for column, lag_s in enumerate(DISPLACEMENT_LAGS_S):
         rows = round(lag_s / made.ticks.inputs.period_s)
@@ -373,7 +385,7 @@ def _list_rows(m: Measurements, made: Pass) -> Mapping[int, tuple[Ints, Ints]]:
     sensors = m.sensors()
     found = {}
     for kind, role in ROLES.items():
-        if role in sensors:
+        if role in sensors and kind in made.ticks.rows:
             ticks = made.ticks.rows[kind]
             inside = (ticks >= 0) & (ticks < made.states.shape[0])
             found[kind] = sensors[role].stamp_ns[inside], ticks[inside]
@@ -462,11 +474,12 @@ def _make_facts(  # noqa: PLR0917
 ) -> StretchFacts:
     rows = _list_rows(m, made)
     tests = made.tests
-    nis = {}
-    for kind in rows:
-        taken = tests.verdict[:, kind] == ACCEPTED
-        nis[ROLES[kind]] = float(tests.nis[taken, kind].mean()) / state.SIZES[kind] if taken.any() else None
-    verdicts = {ROLES[kind]: tests.verdict[tick, kind] for kind, (_, tick) in rows.items()}
+    nis, verdicts = {}, {}
+    for role in {ROLES[kind]: None for kind in rows}:
+        kinds = [kind for kind in rows if ROLES[kind] == role]
+        taken = np.concatenate([tests.nis[tests.verdict[:, kind] == ACCEPTED, kind] for kind in kinds])
+        nis[role] = float(taken.mean()) / state.SIZES[kinds[0]] if taken.size else None
+        verdicts[role] = np.concatenate([tests.verdict[rows[kind][1], kind] for kind in kinds])
     last, active = smoothed.states[-1], list(made.model.active)
 
     def spread(error: int) -> float:

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from tcpipe.compiled import compile_kernel
 from tcpipe.fusion.state import (
+    ATTITUDE,
     FIX,
     FIX_ERROR,
     GYRO_TURN,
@@ -57,10 +58,11 @@ class Inputs(NamedTuple):
     noise : variance added to rotation and body velocity [rad², m²/s²], (K, 6).
     rate, has_gyro : angular velocity at the tick, as measured [rad/s], (K, 3), and whether by a gyroscope, (K,).
     acceleration : of the body, forward, at the tick [m/s²], (K,). Not the state's own, whose noise would look like a lag of every sensor.
-    value, variance : measurements by kind, (K, 8, 3); NaN: none.
-    tau : time of the measurement after the tick [s], (K, 8).
-    levers : places of odometries on the robot [m], (8, 3).
+    value, variance : measurements by kind, (K, 9, 3); NaN: none. Of the attitude of a pose zero: it is measured from ``attitude``.
+    tau : time of the measurement after the tick [s], (K, 9).
+    levers : places of odometries on the robot [m], (9, 3).
     fix_kept, fix_noise : share of the fixes' correlated error that stays since the tick before (K,), and variance added to it [m²], (K, 3).
+    attitude : rotation vector of a pose's attitude, enu_from_robot [rad], (K, 3).
     """
 
     period_s: float
@@ -77,6 +79,7 @@ class Inputs(NamedTuple):
     levers: Matrix
     fix_kept: Vector
     fix_noise: Matrix
+    attitude: Matrix
 
 
 class Model(NamedTuple):
@@ -86,11 +89,11 @@ class Model(NamedTuple):
     ----------
     active : errors that are not known exactly, in order, (n,).
     depends : by kind of measurement, and then motion by odometry and by gyroscope, the places in ``active`` of the errors on which it
-        depends, (10, n), of which the first ``counts`` (10,) are used.
+        depends, (11, n), of which the first ``counts`` (11,) are used.
     kept, noise : share that stays of each error over a tick, and variance added, (n,).
     gates : largest squared normalised innovation by kind; infinite: no gate.
     patience : by kind, rejections in a row, and seconds since the last accepted measurement, after which one is accepted; the seconds
-        where no other sensor of motion is heard; (8, 3).
+        where no other sensor of motion is heard; (9, 3).
     mount : place of the IMU's mounting in ``active``; -1: known exactly.
     scales : by kind, the place in ``active`` of the sensor's own scale; -1: none.
     events : at a tick, errors from a place in ``active`` on: (tick, place, count, whether the error is another one now); (e, 4).
@@ -113,7 +116,7 @@ class Model(NamedTuple):
 
 
 class Memory(NamedTuple):
-    """State carried from tick to tick: x (45,), P (n, n), rejections in a row and seconds since the last accepted, by kind, (8, 2)."""
+    """State carried from tick to tick: x (51,), P (n, n), rejections in a row and seconds since the last accepted, by kind, (9, 2)."""
 
     x: Vector
     P: Matrix
@@ -297,7 +300,8 @@ def _compare(
     y, H, Hs, cross, S, inverse = gain
     L, M, missed, d, high, turn, up, down = room[0], room[1], room[3], room[4], room[5], room[8], room[9], room[10]
     places, m, size, n = model.depends[kind], model.counts[kind], SIZES[kind], P.shape[0]
-    rate, gyro, tau, lever = inputs.rate[k], inputs.has_gyro[k], inputs.tau[k, kind], inputs.levers[kind]
+    rate, gyro, tau = inputs.rate[k], inputs.has_gyro[k], inputs.tau[k, kind]
+    lever = inputs.attitude[k] if kind == ATTITUDE else inputs.levers[kind]
     centre = S[0]
     predict_measurement(kind, x, rate, gyro, acceleration, tau, lever, centre)
     for a in range(size):
@@ -466,7 +470,7 @@ def filter_ticks(
     inputs, model : see there.
     memory : state before ``first``: at tick ``first - 1``, or at ``first`` where that is 0.
     keep : whether ``steps`` is filled; tick k has row ``k - first``.
-    tests, states : filled for these ticks; states are x after the measurements of each, shape (K, 45).
+    tests, states : filled for these ticks; states are x after the measurements of each, shape (K, 51).
     """
     x, P, waits = memory
     n = P.shape[0]

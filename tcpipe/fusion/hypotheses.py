@@ -2,10 +2,10 @@
 
 A hypothesis is a set of changes. A change makes one block of the state uncertain at a tick, and where it ends makes it what it was: fixes
 are off by a constant, the antenna was moved, a clock stepped, a gyroscope's bias jumped, the scale of an odometry changed, the robot was
-carried, a sensor is useless for a while. Fixes do not err for ever: where nothing tells when they did, their lasting error is taken to be
-larger around a step. Each hypothesis runs the filter over the same measurements, predicted whether they are used or not; its score is the
-log likelihood, with what lies beyond the gate counted as the gate, less a cost by kind. The changes that explain most are found one after
-the other; hypotheses that are nearly as good widen the deviations where they differ.
+carried, the frame of a pose turned, a sensor is useless for a while. Fixes do not err for ever: where nothing tells when they did, their
+lasting error is taken to be larger around a step. Each hypothesis runs the filter over the same measurements, predicted whether they are
+used or not; its score is the log likelihood, with what lies beyond the gate counted as the gate, less a cost by kind. The changes that
+explain most are found one after the other; hypotheses that are nearly as good widen the deviations where they differ.
 
 Blame is never what is left when a sensor is ignored: without fixes everything is explained.
 """
@@ -35,7 +35,7 @@ POSSIBLE = (
 )
 """Errors that changes change, beside those that always vary."""
 _FEWEST = 5  # rejections in a row
-_LASTS_S = {state.FIX: 1.0, state.WHEELS: 10.0, state.VISUAL: 10.0}  # wheels slip for seconds
+_LASTS_S = {state.FIX: 1.0, state.WHEELS: 10.0, state.VISUAL: 10.0, state.ATTITUDE: 10.0}  # wheels slip for seconds
 _TOGETHER_S = 5.0
 _MOST_CHANGES = 3
 _CARRIED_M = 1.0  # a jump that is smaller is one of the fixes
@@ -123,6 +123,7 @@ _BLOCKS: dict[tuple[str, int], tuple[tuple[int, int, float], ...]] = {
     ("gyroscope", state.FIX): ((state.GYRO_BIAS, 3, 0.03),),
     ("scale", state.WHEELS): ((state.WHEEL_SCALE, 1, 0.3),),
     ("scale", state.VISUAL): ((state.VISUAL_SCALE, 1, 0.3),),
+    ("frame", state.ATTITUDE): ((state.POSE_FRAME, 3, 0.3),),
     ("pose", state.FIX): ((state.RHO, 3, 2.0), (state.THETA, 3, 0.1), (state.U, 3, 0.5)),
 }
 _COSTS = {
@@ -131,6 +132,7 @@ _COSTS = {
     "clock": 14.0,
     "gyroscope": 16.0,
     "scale": 10.0,
+    "frame": 14.0,
     "pose": 20.0,
     "wander": 12.0,
     "useless": 12.0,
@@ -196,7 +198,9 @@ def compute_evidence(tests: Tests, gates: Floats, first: int, last: int) -> floa
     """Return the log likelihood of the measurements of some ticks; one beyond the gate counts as the gate."""
     kinds = [state.WHEELS, state.VISUAL, state.DOPPLER, state.FIX]
     nis = np.minimum(tests.nis[first:last, kinds], gates[kinds])
-    return float(-0.5 * np.nansum(nis + tests.log_det[first:last, kinds]))
+    of_attitude = np.minimum(tests.nis[first:last, state.ATTITUDE], gates[state.ATTITUDE])
+    attitude = np.nansum(of_attitude + tests.log_det[first:last, state.ATTITUDE])
+    return float(-0.5 * (np.nansum(nis + tests.log_det[first:last, kinds]) + attitude))
 
 
 def explain(
@@ -298,8 +302,11 @@ def _list_changes(suspect: Suspect, suspects: Sequence[Suspect], tests: Tests, p
     size = tests.verdict.shape[0]
     role, first, last = suspect.role, suspect.first, None if suspect.last >= size else suspect.last
     if role != state.FIX:
-        yield Change("scale", role, first, last)
-        yield Change("clock", role, first)
+        if role == state.ATTITUDE:
+            yield Change("frame", role, first)
+        else:
+            yield Change("scale", role, first, last)
+            yield Change("clock", role, first)
         yield Change("useless", role, first, last)
         yield Change("gyroscope", state.FIX, first)
         return

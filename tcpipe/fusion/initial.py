@@ -39,6 +39,7 @@ _MAX_WINDOW_NS = 120_000_000_000  # longest search for the start
 _WINDOW_STEP_NS = 2_000_000_000  # growth of that window
 _TILT_AGREES_RAD = 0.2  # agreement of IMU attitude and gravity
 _GYRO_BIAS_STD_RADPS = 0.02  # turn-on bias of a MEMS gyroscope, 1°/s
+_POSED_YAW_STD_RAD = 0.1  # of a pose: its frame, and how its sensor is turned
 _UNKNOWN_YAW_STD_RAD = 0.6  # the sigma points of a wider one would meet behind the robot
 
 
@@ -180,11 +181,23 @@ def _estimate_yaw(measurements: Measurements, path: _Path, start_ns: int, bias_s
     own = _read_own_yaw(measurements.imu, start_ns)
     if measurements.gnss is None or measurements.gnss.stamp_ns.size == 0:
         return (0.0, 0.01, "local frame") if own is None else (own, 0.01, "orientation")
-    fit = _fit_course(measurements.gnss, path, start_ns)
+    posed = _read_yaw_of_pose(measurements.gnss, path, start_ns)
+    fit = _fit_course(measurements.gnss, path, start_ns) if path.known or posed is None else None
     if fit is not None:
         std = float(np.hypot(np.hypot(fit.yaw_std_rad, 0.03), bias_std * fit.centre_s))
         return fit.yaw_rad, min(std, _UNKNOWN_YAW_STD_RAD), "course over ground"
+    if posed is not None:
+        return posed, _POSED_YAW_STD_RAD, "pose"
     return (0.0, _UNKNOWN_YAW_STD_RAD, "unknown") if own is None else (own, _UNKNOWN_YAW_STD_RAD, "orientation")
+
+
+def _read_yaw_of_pose(gnss: Positions, path: _Path, start_ns: int) -> float | None:
+    """Return yaw at the start by the first attitude of a pose, and what the robot turned until then."""
+    known = np.flatnonzero(np.isfinite(gnss.quat_xyzw).all(1))[:1] if gnss.quat_xyzw is not None else np.empty(0, int)
+    if gnss.quat_xyzw is None or not known.size:
+        return None
+    turned = path.yaw(compute_seconds(gnss.stamp_ns[known], start_ns))
+    return float(rpy_from_quat(gnss.quat_xyzw[known[0]])[2] - turned[0])
 
 
 def _read_own_yaw(imu: InertialMeasurements | None, start_ns: int) -> float | None:

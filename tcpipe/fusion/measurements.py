@@ -16,6 +16,9 @@ from numpy.typing import NDArray
 
 GNSS, IMU, WHEELS, VISUAL, DOPPLER = "gnss", "imu", "wheel_odometry", "visual_odometry", "gnss_velocity"
 """Roles, as in the rejections table."""
+POSE = "pose"
+FIXES = (GNSS, POSE)
+"""Roles of positions: a pose is fused as fixes with an attitude."""
 
 NO_LEVER_ARM = (0.0, 0.0, 0.0)
 STATED_ARM_STD_M = (0.05, 0.05, 0.1)
@@ -26,11 +29,13 @@ UNSTATED_ARM_STD_M = (0.5, 0.5, 0.5)
 
 _UNMEASURED_M2PS2 = 1e3
 """A variance from which on an axis is not measured (ruling)."""
+UNMEASURED_RAD2 = 1e2
+"""Variance of a rotation about an axis that is not measured."""
 
 
 @dataclass(frozen=True, slots=True)
 class Positions:
-    """GNSS: positions of an antenna.
+    """GNSS: positions of an antenna. Or a pose that another program estimated: positions of a sensor, and the robot's attitude.
 
     Attributes
     ----------
@@ -39,6 +44,9 @@ class Positions:
     variance_m2 : [m²], shape (N, 3), east, north, up; floored, never unknown.
     lever_arm_m, lever_arm_std_m : [m], position of the antenna in base_link, and its standard deviation; 0: known exactly.
     unclaimed : shape (N,), where the receiver claims none and the variance is the recipe's; None where it always claims one.
+    quat_xyzw, rotation_variance_rad2 : attitude enu_from_base_link, shape (N, 4), NaN where absent, and variance about the robot's axes,
+        shape (N, 3); None: no attitude is measured.
+    mounting_xyzw, mounting_std_rad : base_link_from_sensor of a pose, stated or as the motion shows it, and σ about each axis.
     """
 
     stamp_ns: NDArray[np.int64]
@@ -47,6 +55,10 @@ class Positions:
     lever_arm_m: tuple[float, float, float] = NO_LEVER_ARM
     lever_arm_std_m: tuple[float, float, float] = STATED_ARM_STD_M
     unclaimed: NDArray[np.bool_] | None = None
+    quat_xyzw: NDArray[np.float64] | None = None
+    rotation_variance_rad2: NDArray[np.float64] | None = None
+    mounting_xyzw: tuple[float, ...] = (0.0, 0.0, 0.0, 1.0)
+    mounting_std_rad: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,6 +155,17 @@ class Measurements:
         every = {GNSS: self.gnss, DOPPLER: self.doppler, IMU: self.imu, WHEELS: self.wheels, VISUAL: self.visual}
         return {role: sensor for role, sensor in every.items() if sensor is not None}
 
+    @property
+    def has_attitude(self) -> bool:
+        """Whether a pose measures the attitude, or yaw alone."""
+        return self.gnss is not None and self.gnss.quat_xyzw is not None
+
+    @property
+    def has_posed_tilt(self) -> bool:
+        """Whether a pose measures roll and pitch."""
+        variance = None if self.gnss is None else self.gnss.rotation_variance_rad2
+        return variance is not None and float(variance[0, 0]) < UNMEASURED_RAD2
+
     def odometries(self) -> dict[str, BodyVelocities]:
         """Return the odometries that are there, by role; the wheels' first."""
         every = {WHEELS: self.wheels, VISUAL: self.visual}
@@ -160,7 +183,7 @@ class InitialState:
     tilt_std_rad, yaw_std_rad : standard deviation of roll and pitch, and of yaw.
     velocity_enu_mps, velocity_std_mps : [m/s], shape (3,) and scalar.
     gyro_bias_radps : [rad/s], shape (3,); zero where the robot never stands.
-    heading_from : how yaw was found: ``course over ground``, ``orientation``, ``local frame`` or ``unknown``.
+    heading_from : how yaw was found: ``course over ground``, ``pose``, ``orientation``, ``local frame`` or ``unknown``.
     """
 
     position_enu_m: NDArray[np.float64]

@@ -55,6 +55,8 @@ PARAMETERS = (
     Parameter("mounting of the camera", state.VISUAL_MOUNT, 2, 0.0175, 0.0, "rad", "stated to a degree"),
     Parameter("lag of wheels", state.WHEEL_LAG, 1, 0.02, 1e-3, "s", "drivers stamp on arrival"),
     Parameter("lag of camera", state.VISUAL_LAG, 1, 0.03, 1e-3, "s", "exposure and processing"),
+    Parameter("mounting of the pose", state.POSE_MOUNT, 3, 0.0, 0.0, "rad", "`Positions.mounting_std_rad`"),
+    Parameter("frame of the pose", state.POSE_FRAME, 3, 0.05, 2e-3, "rad", "level to 3°; drifts by 1° a minute"),
 )
 """What does not come from the run itself; the scales of odometries and the errors of fixes do, see `make_priors`."""
 _PATIENCE = {state.FIX: (5.0, 15.0, 5.0), state.WHEELS: (5.0, 5.0, 0.3), state.VISUAL: (5.0, 5.0, 0.3)}
@@ -75,10 +77,10 @@ class Event:
 
 
 def make_priors(m: Measurements, noise: NoiseModel, ticks: Ticks) -> tuple[Floats, Floats, Floats]:
-    """Return standard deviation, walk and correlation time of every error, shapes (39,): 0 where it is exact, or nothing depends on it."""
+    """Return standard deviation, walk and correlation time of every error, shapes (45,): 0 where it is exact, or nothing depends on it."""
     std, walk = np.zeros(state.N), np.zeros(state.N)
     has_imu, has_fixes = m.imu is not None, m.gnss is not None
-    has_tilt = has_imu or (m.visual is not None and m.visual.turn_rate_radps is not None)
+    has_tilt = has_imu or m.has_posed_tilt or (m.visual is not None and m.visual.turn_rate_radps is not None)
     inertial = bool((ticks.inputs.mode == state.INERTIAL).any())
     wanted = {
         "gyroscope bias": has_imu,
@@ -89,6 +91,7 @@ def make_priors(m: Measurements, noise: NoiseModel, ticks: Ticks) -> tuple[Float
         "mounting of the camera": m.visual is not None and bool(m.visual.measured.all()),
         "lag of wheels": inertial and m.wheels is not None,
         "lag of camera": inertial and m.visual is not None,
+        "frame of the pose": m.has_attitude,
     }
     for parameter in PARAMETERS:
         if wanted.get(parameter.name, False):
@@ -105,9 +108,12 @@ def make_priors(m: Measurements, noise: NoiseModel, ticks: Ticks) -> tuple[Float
         std[place], time_s[place] = np.sqrt(process.variance), process.time_s
     std[state.TURN_SCALE] = turn_scale_std(m)
     walk[state.TURN_SCALE] = np.sqrt(2.0 / _MINUTE_S) * std[state.TURN_SCALE]
-    # Where roll and pitch are not known, an antenna that sways looks like one elsewhere.
-    if m.gnss is not None and has_tilt:
-        std[state.ARM : state.ARM + 3] = m.gnss.lever_arm_std_m
+    # Where roll and pitch are not known, an antenna that sways looks like one at another height; without yaw, elsewhere.
+    if m.gnss is not None and (has_tilt or m.has_attitude):
+        known = slice(0, 3 if has_tilt else 2)
+        std[state.ARM : state.ARM + 3][known] = m.gnss.lever_arm_std_m[known]
+    if m.gnss is not None and m.has_attitude:
+        std[state.POSE_MOUNT : state.POSE_MOUNT + 3] = m.gnss.mounting_std_rad
     if has_fixes:
         std[state.FIX_ERROR : state.FIX_ERROR + 3] = np.sqrt(ticks.fix_variance_m2[0])
     return std, walk, time_s
@@ -147,6 +153,13 @@ _DEPENDS: Mapping[int, Sequence[int]] = {
     state.LEVEL: range(3),
     state.DOPPLER: _ANTENNA,
     state.FIX: (*_ANTENNA, *range(state.RHO, state.RHO + 3), *range(state.FIX_ERROR, state.FIX_OFFSET + 3)),
+    state.ATTITUDE: (
+        *range(state.THETA, state.THETA + 3),
+        *range(state.GYRO_BIAS, state.GYRO_BIAS + 3),
+        state.FIX_LAG,
+        *range(state.MOUNT, state.MOUNT + 3),
+        *range(state.POSE_MOUNT, state.POSE_FRAME + 3),
+    ),
     MOTION_WITHOUT_GYRO: (*_MOTION, state.TURN_SCALE),
     MOTION_WITH_GYRO: range(state.MOVING),
 }
@@ -181,7 +194,7 @@ def make_model(
         counts[row] = len(places)
         depends[row, : len(places)] = places
     gates = np.full(state.KINDS, np.inf)
-    for kind in (state.WHEELS, state.VISUAL, state.STATIONARY, state.STATIONARY_RATE, state.DOPPLER, state.FIX):
+    for kind in set(range(state.KINDS)) - {state.SIDEWAYS, state.LEVEL}:
         gates[kind] = find_chi_square_threshold(state.SIZES[kind], gate_probability)
     scales = np.full(state.KINDS, -1, np.int64)
     scales[state.WHEELS] = position.get(state.WHEEL_SCALE, -1)

@@ -11,11 +11,12 @@ the derivative of the position is: then the velocity of a robot that only drives
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from tcpipe.fusion.attitude import add_attitude
 from tcpipe.fusion.measurements import (
     IMU,
     VISUAL,
@@ -24,6 +25,7 @@ from tcpipe.fusion.measurements import (
     GroundVelocities,
     InertialMeasurements,
     Positions,
+    select_rows,
 )
 from tcpipe.fusion.signals import compute_median_period_ns, compute_seconds, estimate_white_noise, integrate_signal
 from tcpipe.geometry.datum import enu_from_geodetic
@@ -105,8 +107,12 @@ def prepare_positions(
     lever_arm_std_m: tuple[float, float, float],
     default_std_m: float,
     floor_std_m: float,
+    mounting_xyzw: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0),
 ) -> tuple[Positions, Prepared]:
-    """Prepare GNSS fixes (columns of the role gnss); unknown variances: ``default_std_m`` horizontally, twice that vertically."""
+    """Prepare GNSS fixes (columns of the role gnss); unknown variances: ``default_std_m`` horizontally, twice that vertically.
+
+    Or a pose (columns of the role pose), whose sensor is turned by ``mounting_xyzw`` to base_link.
+    """
     lon, lat, alt = columns["lon_deg"], columns["lat_deg"], columns["alt_m"]
     usable, repeated = _select_usable_rows(stamp_ns, _is_fix(lon, lat, alt))
     variance = np.stack([columns[f"{axis}_var_m2"] for axis in ("east", "north", "up")], -1)[usable]
@@ -117,6 +123,16 @@ def prepare_positions(
     prepared = Prepared(stamp_ns[~_is_fix(lon, lat, alt)], repeated, replaced)
     unclaimed_rows = unclaimed if unclaimed.any() else None
     made = Positions(stamp_ns[usable], fixes, variance, lever_arm_m, lever_arm_std_m, unclaimed_rows)
+    if "quat_x" in columns:
+        frame, quat, rotation_variance = (
+            _stack_columns(columns, names)[usable]
+            for names in (
+                ("x_m", "y_m"),
+                [f"quat_{c}" for c in "xyzw"],
+                [f"rotation_{axis}_var" for axis in "xyz"],
+            )
+        )
+        made = add_attitude(made, frame, quat, rotation_variance, mounting_xyzw)
     return made, prepared
 
 
@@ -135,7 +151,7 @@ def drop_repeated_fixes(gnss: Positions, odometry: BodyVelocities | None) -> tup
     lasting = stamp_ns[last] - stamp_ns[first] >= _FROZEN_NS
     if odometry is None:
         kept = changes | np.repeat(lasting, last - first + 1)
-        return (gnss if kept.all() else _select_fixes(gnss, kept)), ()
+        return (gnss if kept.all() else select_rows(gnss, kept)), ()
     zero = int(stamp_ns[0])
     speed = np.nan_to_num(np.abs(odometry.velocity_mps[:, :1]))
     driven_m = integrate_signal(compute_seconds(odometry.stamp_ns, zero), speed, compute_seconds(stamp_ns, zero))[:, 0]
@@ -143,13 +159,7 @@ def drop_repeated_fixes(gnss: Positions, odometry: BodyVelocities | None) -> tup
         lasting & (driven_m[last] - driven_m[first] > _DRIVES_MPS * (stamp_ns[last] - stamp_ns[first]) * 1e-9)
     )
     found = (Repeats(int(stamp_ns[first[i]]), int(stamp_ns[last[i]]), int(last[i] - first[i])) for i in frozen)
-    return _select_fixes(gnss, changes), tuple(found)
-
-
-def _select_fixes(gnss: Positions, rows: Mask) -> Positions:
-    unclaimed = None if gnss.unclaimed is None else gnss.unclaimed[rows]
-    fixes, variance = gnss.position_enu_m[rows], gnss.variance_m2[rows]
-    return replace(gnss, stamp_ns=gnss.stamp_ns[rows], position_enu_m=fixes, variance_m2=variance, unclaimed=unclaimed)
+    return select_rows(gnss, changes), tuple(found)
 
 
 def prepare_ground_velocities(

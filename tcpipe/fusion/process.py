@@ -71,7 +71,7 @@ def is_gliding(measurements: Measurements) -> bool:
 
     The velocity then strays over ground, and which way the body looks is not asked.
     """
-    alone = measurements.imu is None and not measurements.odometries()
+    alone = measurements.imu is None and not measurements.odometries() and not measurements.has_attitude
     return (
         alone and measurements.gnss is not None and _compute_fix_velocity_std_mps(measurements.gnss) > _SHOWS_COURSE_MPS
     )
@@ -119,7 +119,8 @@ def level_stds_rad(measurements: Measurements) -> tuple[float, float]:
 
     Where the course alone tells the turns, what the antenna sways by would pass for roll: it is held.
     """
-    return _LEVEL_STD_RAD, _HELD_STD_RAD if is_turned_by_course(measurements) else _LEVEL_STD_RAD
+    is_held = is_turned_by_course(measurements) and not measurements.has_posed_tilt
+    return _LEVEL_STD_RAD, _HELD_STD_RAD if is_held else _LEVEL_STD_RAD
 
 
 def turn_scale_std(measurements: Measurements) -> float:

@@ -26,7 +26,7 @@ class Smoothed(NamedTuple):
 
     Attributes
     ----------
-    states : x, (K, 45).
+    states : x, (K, 51).
     variances : of the position east, north, up [m²], yaw [rad²] and forward velocity [m²/s²], (K, 5).
     links : variance of the horizontal displacement, along its direction, from a tick to the one each of the lags later [m²], (K, l); NaN
         where it was not computed: it is at every `EVERY` ticks.

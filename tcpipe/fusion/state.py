@@ -34,17 +34,18 @@ THETA, RHO, U, GYRO_BIAS, ACCELEROMETER_BIAS = 0, 3, 6, 9, 12
 ARM, FIX_LAG, FIX_ERROR, FIX_OFFSET = 15, 18, 19, 22
 WHEEL_SCALE, VISUAL_SCALE, SHARED_SCALE, TURN_SCALE, TURNING_CENTRE = 25, 26, 27, 28, 29
 MOUNT, VISUAL_MOUNT, WHEEL_LAG, VISUAL_LAG, WHEEL_SLIP, VISUAL_SLIP = 30, 33, 35, 36, 37, 38
-N = 39
+POSE_MOUNT, POSE_FRAME = 39, 42
+N = 45
 """Errors; their meaning from `ARM` on: `tcpipe.fusion.parameters.PARAMETERS`."""
 NX = N + 6
 MOVING = 15
 """Errors before this one move with the robot; those from it on stay or decay."""
 
-KINDS = 8
-WHEELS, SIDEWAYS, VISUAL, STATIONARY, STATIONARY_RATE, LEVEL, DOPPLER, FIX = range(KINDS)
+KINDS = 9
+WHEELS, SIDEWAYS, VISUAL, STATIONARY, STATIONARY_RATE, LEVEL, DOPPLER, FIX, ATTITUDE = range(KINDS)
 """Kinds of measurements. SIDEWAYS: sideways and upward velocity of the turning centre are about zero; STATIONARY: the velocity, and
-STATIONARY_RATE: the gyroscope's rate less its bias; LEVEL: roll and pitch are small."""
-SIZES = (1, 2, 3, 3, 3, 2, 3, 3)
+STATIONARY_RATE: the gyroscope's rate less its bias; LEVEL: roll and pitch are small; ATTITUDE: that of a pose."""
+SIZES = (1, 2, 3, 3, 3, 2, 3, 3, 3)
 """Components of each kind of measurement."""
 
 FLAT_TURN, VISUAL_TURN, GYRO_TURN, INERTIAL = range(4)
@@ -95,8 +96,8 @@ def displace_state(x: Vector, d: Vector, sign: float, out: Vector, turn: Vector)
 
 
 @compile_kernel
-def compute_moving_error(y: Vector, x: Vector, out: Vector) -> None:
-    """Fill the first `MOVING` of ``out`` with the error of ``y`` against ``x``."""
+def compute_rotation_error(y: Vector, x: Vector, out: Vector) -> None:
+    """Fill the first 3 of ``out`` with the rotation vector from ``x`` to ``y``, of which the first 9 are rotation matrices."""
     a = b = c = 0.0
     trace = -1.0
     for k in range(3):  # antisymmetric part and trace of Rx' Ry
@@ -111,6 +112,12 @@ def compute_moving_error(y: Vector, x: Vector, out: Vector) -> None:
         sine = max(sqrt(sine2), 1e-12)
         f = 0.5 * atan2(sine, 0.5 * trace) / sine
     out[0], out[1], out[2] = f * a, f * b, f * c
+
+
+@compile_kernel
+def compute_moving_error(y: Vector, x: Vector, out: Vector) -> None:
+    """Fill the first `MOVING` of ``out`` with the error of ``y`` against ``x``."""
+    compute_rotation_error(y, x, out)
     for j in range(3):
         out[RHO + j] = x[j] * (y[9] - x[9]) + x[3 + j] * (y[10] - x[10]) + x[6 + j] * (y[11] - x[11])
     for e in range(U, MOVING):
@@ -164,13 +171,30 @@ def move_state(x: Vector, mode: int, T: float, turned: Vector, gained: Vector, o
 
 
 @compile_kernel
+def _predict_attitude(x: Vector, w0: float, w1: float, w2: float, t: float, measured: Vector, out: Vector) -> None:
+    """Fill ``out`` with the rotation from a measured attitude to that of a state, t seconds later at the angular velocity w."""
+    one, other, turn = np.empty(9), np.empty(9), np.empty(9)
+    make_rotation(t * w0, t * w1, t * w2, turn)
+    multiply_rotations(x, turn, one)
+    make_rotation(x[MOUNT + 6], x[MOUNT + 7], x[MOUNT + 8], turn)
+    multiply_rotations(one, turn, other)
+    make_rotation(x[POSE_MOUNT + 6], x[POSE_MOUNT + 7], x[POSE_MOUNT + 8], turn)
+    multiply_rotations(other, turn, one)
+    make_rotation(x[POSE_FRAME + 6], x[POSE_FRAME + 7], x[POSE_FRAME + 8], turn)
+    multiply_rotations(turn, one, other)
+    make_rotation(measured[0], measured[1], measured[2], one)
+    compute_rotation_error(other, one, out)
+
+
+@compile_kernel
 def predict_measurement(
     kind: int, x: Vector, rate: Vector, has_gyro: bool, acceleration: Vector, tau: float, lever: Vector, out: Vector
 ) -> None:  # fmt: skip
     """Fill ``out`` with what a sensor measures of a state.
 
     ``rate``: angular velocity at the tick, bias or scale not removed; ``acceleration``: time derivative of ``u``; ``tau``: time of the
-    measurement after the tick [s]; ``lever``: place of an odometry on the robot.
+    measurement after the tick [s]; ``lever``: place of an odometry on the robot. A pose measures its own attitude, the rotation vector
+    ``lever``: what is predicted is the rotation from there.
     """
     if kind == STATIONARY:
         out[0], out[1], out[2] = x[U + 6], x[U + 7], x[U + 8]
@@ -186,6 +210,9 @@ def predict_measurement(
         w0, w1, w2 = rate[0] - x[GYRO_BIAS + 6], rate[1] - x[GYRO_BIAS + 7], rate[2] - x[GYRO_BIAS + 8]
     else:  # beside a lever arm the noise of the rate would look like a scale
         w0, w1, w2 = rate[0], rate[1], rate[2]
+    if kind == ATTITUDE:
+        _predict_attitude(x, w0, w1, w2, tau - x[FIX_LAG + 6], lever, out)
+        return
     if kind >= DOPPLER:  # the antenna's place turned by the mounting of the IMU, whose axes are the state's
         a0, a1, a2 = x[ARM + 6], x[ARM + 7], x[ARM + 8]
         a0, a1, a2 = a0 + m1 * a2 - m2 * a1, a1 + m2 * a0 - m0 * a2, a2 + m0 * a1 - m1 * a0

@@ -38,6 +38,7 @@ from tcpipe.fusion.signals import (
     compute_slopes,
     is_covered,
 )
+from tcpipe.geometry.rotation import rotation_vector_from_quat
 from tcpipe.robust import estimate_robust_std
 
 Floats = NDArray[np.float64]
@@ -134,6 +135,15 @@ def build_ticks(  # noqa: C901, PLR0915  one array after the other
         put(state.FIX, m.gnss.stamp_ns, m.gnss.position_enu_m, m.gnss.variance_m2 * _compute_white_shares(noise))
         nearest = np.searchsorted(m.gnss.stamp_ns, stamp_ns).clip(0, m.gnss.stamp_ns.size - 1)
         fix_variance = m.gnss.variance_m2[nearest] * _compute_correlated_shares(noise)
+    attitude = np.zeros((size, 3))
+    if m.gnss is not None and m.gnss.quat_xyzw is not None and m.gnss.rotation_variance_rad2 is not None:
+        measured = np.where(np.isfinite(m.gnss.quat_xyzw).all(1), rows[state.FIX], -1)
+        known = np.flatnonzero(measured >= 0)
+        at, first = np.unique(measured[known], return_index=True)  # rotations have no mean: one a tick
+        chosen = known[first]
+        attitude[at] = rotation_vector_from_quat(m.gnss.quat_xyzw[chosen])
+        put(state.ATTITUDE, m.gnss.stamp_ns[chosen], np.zeros((at.size, 3)), m.gnss.rotation_variance_rad2[chosen])
+        rows[state.ATTITUDE] = measured
     if m.gnss is not None and m.doppler is not None:
         lasting = max(1.0, DOPPLER_LASTS_S * 1e9 / compute_median_period_ns(m.doppler.stamp_ns))
         variances = m.doppler.variance_m2ps2 * lasting
@@ -173,6 +183,7 @@ def build_ticks(  # noqa: C901, PLR0915  one array after the other
         levers,
         kept,
         fix_noise,
+        attitude,
     )
     return Ticks(stamp_ns, inputs, rows, fix_variance)
 

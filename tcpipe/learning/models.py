@@ -26,9 +26,10 @@ from tcpipe.errors import ModelError, StoreError, UsageError
 from tcpipe.formats.atomic import write_atomic_directory, write_text
 from tcpipe.formats.bucket_directories import fetch_directory, fetch_directory_by_range
 from tcpipe.formats.dataset_files import is_shard, read_card
-from tcpipe.formats.integrity import compute_checksums, find_broken_checksums, read_sealed, seal_document, write_sealed
+from tcpipe.formats.integrity import compute_checksums, read_sealed, seal_document, write_sealed
 from tcpipe.formats.json_files import Json, digest, parse_typed
 from tcpipe.formats.parquet import read_table, write_table
+from tcpipe.formats.place import Place, find_wrong_files
 from tcpipe.formats.weights import read_arrays, write_arrays
 from tcpipe.learning.architecture import check_trainable, list_weight_forms
 from tcpipe.learning.metrics import LEAST_VELOCITY_MPS
@@ -242,7 +243,7 @@ def load_model(path: str | Path) -> Model:
     """
     place = fetch_directory(path)
     card = read_model_card(place)
-    if problems := list(find_broken_checksums(place, card.checksums)):
+    if problems := list(find_wrong_files(Place(place), card.checksums)):
         raise ModelError(*(f"{problem}; train the model again" for problem in problems))
     table = read_table(place / RESIDUALS)
     residuals = {name: table.column(name).to_numpy() for name in table.column_names}

@@ -468,12 +468,19 @@ def _read_command(columns: Columns) -> Readings:
 
 def _read_pose(columns: Columns) -> Readings:
     prefix = "pose.pose.position" if "pose.pose.position.x" in columns else "pose.position"
-    place, variances = _read_vector(columns, prefix), _read_variances(columns, "pose.covariance", 0, 7, 14)
-    unknown = np.full(len(place), np.nan)
+    place, variances = _read_vector(columns, prefix), _read_variances(columns, "pose.covariance", 0, 7, 14, 21, 28, 35)
+    quat, bad = _read_orientation(columns, prefix.replace("position", "orientation"))
+    if np.all(quat == quat[:1]):  # positions alone
+        quat[:] = np.nan
+    if np.all(place[:, 2] == place[:1, 2]):  # a map in the plane
+        variances[:, 2] = _NO_HEIGHT_M2
     values: dict[str, NDArray[Any]] = {f"{axis}_m": place[:, i] for i, axis in enumerate("xyz")}
-    values |= dict.fromkeys(("lon_deg", "lat_deg", "alt_m"), unknown)
+    values |= dict.fromkeys(("lon_deg", "lat_deg", "alt_m"), np.full(len(place), np.nan))
     values |= {f"{axis}_var_m2": variances[:, i] for i, axis in enumerate(("east", "north", "up"))}
-    notes = {"without_covariance": int(np.count_nonzero(np.isnan(variances[:, 0])))}
+    values |= {f"quat_{c}": quat[:, i] for i, c in enumerate("xyzw")}
+    values |= {f"rotation_{axis}_var": variances[:, 3 + i] for i, axis in enumerate("xyz")}
+    counted = {"without_covariance": np.isnan(variances[:, 0]), "bad_quaternions": bad}
+    notes = {name: int(np.count_nonzero(rows)) for name, rows in counted.items()}
     return _select_rows(columns, values, {"not_finite": ~np.isfinite(place.sum(-1))}, notes=notes)
 
 
@@ -527,8 +534,12 @@ _FIELDS: dict[str, tuple[str, ...]] = {
         *_expand_field_names("twist.twist.linear.", "twist.twist.angular.", "pose.pose.position."),
         *_list_quat_fields("pose.pose.orientation"),
     ),
-    roles.POSE_WITH_COVARIANCE_STAMPED: (*_STAMP, *_expand_field_names("pose.pose.position.")),
-    roles.POSE_STAMPED: (*_STAMP, *_expand_field_names("pose.position.")),
+    roles.POSE_WITH_COVARIANCE_STAMPED: (
+        *_STAMP,
+        *_expand_field_names("pose.pose.position."),
+        *_list_quat_fields("pose.pose.orientation"),
+    ),
+    roles.POSE_STAMPED: (*_STAMP, *_expand_field_names("pose.position."), *_list_quat_fields("pose.orientation")),
     roles.TWIST: _expand_field_names("linear.", "angular."),
     roles.TWIST_STAMPED: (*_STAMP, *_expand_field_names("twist.linear.", "twist.angular.")),
     roles.TWIST_WITH_COVARIANCE_STAMPED: (*_STAMP, *_expand_field_names("twist.twist.linear.", "twist.twist.angular.")),

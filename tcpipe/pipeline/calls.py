@@ -17,7 +17,7 @@ from typing import Literal
 from tcpipe import __version__
 from tcpipe.errors import StoreError
 from tcpipe.execution import read_cluster_cpu_s
-from tcpipe.formats.commit_log import Stamp
+from tcpipe.formats.commit_log import Stamp, refresh
 from tcpipe.formats.commits import Begun, CallRecord, Entries, Kind, Problem, Process, State
 from tcpipe.formats.index_files import RunFacts
 from tcpipe.formats.json_files import convert_record, digest
@@ -31,6 +31,10 @@ class LogWriter:
 
     store: Store
     state: State
+
+    def refresh(self) -> None:
+        """Read what others have committed."""
+        self.state = refresh(self.store.place, self.state)
 
     def commit(self, kind: Kind, entries: Entries | Callable[[State], Entries]) -> None:
         """Write a commit, unless it adds nothing; `StoreError` where it cannot be written."""
@@ -118,6 +122,8 @@ class OpenCall:
 
     end: Entries = field(default_factory=Entries)
     kind: Kind = "ended"
+    is_whole: bool = True
+    """Whether all of its work is done, so that calls that were to do the same end with it."""
 
 
 @contextmanager
@@ -145,7 +151,7 @@ def commit_call(log: LogWriter, command: str, works_on: Sequence[str], *, option
     except Exception:
         _end(log, "ended", Entries(ended=tuple(begun)))
         raise
-    _end(log, opened.kind, replace(opened.end, ended=(*begun, *done)))
+    _end(log, opened.kind, replace(opened.end, ended=(*begun, *(done if opened.is_whole else ()))))
 
 
 def _end(log: LogWriter, kind: Kind, entries: Entries) -> None:

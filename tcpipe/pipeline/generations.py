@@ -9,11 +9,10 @@ from pathlib import Path
 
 from tcpipe.errors import UsageError
 from tcpipe.formats.atomic import make_scratch_directory
-from tcpipe.formats.bucket import map_concurrently, open_place
 from tcpipe.formats.bucket_directories import GENERATIONS, is_left_over, name_generation
 from tcpipe.formats.commit_log import LOG, Stamp, put_commit, read_state
 from tcpipe.formats.commits import Entries, Generation, Process, State
-from tcpipe.formats.place import Place
+from tcpipe.formats.place import Place, open_place
 
 _NOBODY = Process("", "", "", "", 0, "")
 """Who commits: the log of a redacted dataset names no machine."""
@@ -87,4 +86,4 @@ def _commit_as(number: int, generation: Generation) -> Callable[[State], Entries
 def _remove_leftovers(place: Place, state: State) -> None:
     """Remove what killed and slower calls left, and generations that were replaced for long."""
     names = [entry.name for entry in place.entries(GENERATIONS)]
-    map_concurrently(place.where(), place.delete, [name for name in names if is_left_over(name, state)])
+    place.map(place.delete, [name for name in names if is_left_over(name, state)])

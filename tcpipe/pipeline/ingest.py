@@ -17,7 +17,7 @@ import pyarrow as pa
 
 from tcpipe import __version__
 from tcpipe.errors import LogError, StoreError, UsageError, clean_line
-from tcpipe.execution import run_all
+from tcpipe.execution import Executor, run_all
 from tcpipe.formats.atomic import make_scratch_directory
 from tcpipe.formats.commit_log import keep_state_here, pause_garbage_collection
 from tcpipe.formats.commits import CallRecord, Entries, Failure, Kind, State, Superseded
@@ -38,21 +38,20 @@ from tcpipe.pipeline.calls import (
     start_stopwatch,
     stored_bytes,
 )
+from tcpipe.pipeline.claims import hold_claims
 from tcpipe.pipeline.ingest_run import Ingested, find_twin, ingest_one
+from tcpipe.pipeline.log_queue import Item, LogQueue
 from tcpipe.pipeline.log_sources import (
     FoundLogs,
     LogSource,
-    add_hashes,
     find_failure,
     find_sources,
     is_there,
     make_definitions_key,
-    plan_rounds,
-    recall_hash,
     select_shard,
 )
 from tcpipe.pipeline.options import IngestOptions
-from tcpipe.pipeline.plan import IngestResult, IngestTask, Step, check_age, make_died_result, make_result, plan
+from tcpipe.pipeline.plan import IngestResult, IngestTask, Step, check_age, make_died_result, make_result
 from tcpipe.pipeline.problems import find_problems, is_acknowledged, make_failure
 from tcpipe.store import Store, open_store
 from tcpipe.tables.findings import select_problems
@@ -113,7 +112,6 @@ def run_ingest(options: IngestOptions) -> IngestSummary:
         log = open_log(opened)
         before = log.state
         given = tuple(make_absolute(path) for path in logs if not is_presigned(path))  # signed URLs are not stored
-        mine = found.sources if shard is None else select_shard(found.sources, shard)
         root = opened.root
         message_definitions = None if options.message_definitions is None else Path(options.message_definitions)
         if options.cluster is not None:  # its workers are elsewhere
@@ -121,13 +119,11 @@ def run_ingest(options: IngestOptions) -> IngestSummary:
             message_definitions = None if message_definitions is None else message_definitions.absolute()
         common = (root, ruling, robot, dict(options.tags or {}), options.force, message_definitions)
         how = (*common, make_definitions_key(message_definitions), options.retry_failed, options.min_age_s)
-        seen = {} if options.force else log.state.seen
-        with pause_garbage_collection():
-            tasks = [IngestTask(recall_hash(source, seen.get(source.lineage, ())), *how) for source in mine]
-            if options.on_found:
-                sizes = {task.source.name: sum(size for size, _ in task.source.files) for task in tasks}
-                options.on_found({**dict.fromkeys(map(clean_line, found.problems), 0), **sizes})
-            steps = plan(tasks, log.state, broken=find_broken(opened, log.state, tasks))
+        tasks = [IngestTask(source, *how) for source in found.sources]
+        own = range(len(tasks)) if shard is None else select_shard(found.sources, shard)
+        if options.on_found:
+            sizes = {tasks[at].source.name: tasks[at].source.size_bytes for at in own}
+            options.on_found({**dict.fromkeys(map(clean_line, found.problems), 0), **sizes})
         results: dict[int, IngestResult] = {}
 
         def tell(ended: Iterable[tuple[int, IngestResult]]) -> IngestSummary:
@@ -137,16 +133,21 @@ def run_ingest(options: IngestOptions) -> IngestSummary:
                     options.on_result(result)
             return IngestSummary(opened.root, tuple(results[index] for index in sorted(results)))
 
-        with pause_garbage_collection():
-            summary = tell(_iterate_finished(log, found, steps))
-        work = {index: step.task for index, step in enumerate(steps) if step.is_todo}
-        begin = (INGEST, given, (ingest_key(ruling), robot, shard))
-        if work:
-            with commit_call(log, *begin[:2], options=begin[2]) as call:
-                summary = tell(_iterate_results(log, work, jobs=options.jobs, cluster=options.cluster))
-                call.end = Entries(calls=(measure_call(watch, _call_of(opened, summary, given, tasks, options.jobs)),))
-        else:
-            log.commit("ended", Entries(ended=tuple(find_settled_calls(log.state, make_call(*begin)))))
+        begin = (INGEST, given, (ingest_key(ruling), robot))
+        with nullcontext() if shard is None else hold_claims(opened.place) as claims:
+            with pause_garbage_collection():
+                broken = find_broken(opened, log.state, [found.sources[at] for at in own])
+                queue = LogQueue(log, tasks, own, broken, claims)
+                summary = tell(chain(_iterate_missing(found), _iterate_finished(log, queue.steps)))
+            if queue.is_done:
+                log.commit("ended", Entries(ended=tuple(find_settled_calls(log.state, make_call(*begin)))))
+            else:
+                with commit_call(log, *begin[:2], options=begin[2]) as call:
+                    tell(_iterate_results(log, queue, jobs=options.jobs, cluster=options.cluster))
+                    summary = tell(_iterate_left(log, queue.plan(at for at in own if at not in results)))
+                    call.is_whole = queue.is_done
+                    record = _call_of(opened, summary, given, tasks, options.jobs)
+                    call.end = Entries(calls=(measure_call(watch, record),))
         if log.state.number != before.number and log.state.runs:
             opened.write_index(log.state, before=before)
         return summary
@@ -156,14 +157,14 @@ ingest = as_function(IngestOptions, run_ingest)
 """`tcpipe.ingest`: its keywords are the fields of `IngestOptions`."""
 
 
-def find_broken(store: Store, state: State, tasks: Iterable[IngestTask]) -> set[tuple[str, str]]:
-    """Return the ingestions of these logs of which a file is gone.
+def find_broken(store: Store, state: State, sources: Iterable[LogSource]) -> set[tuple[str, str]]:
+    """Return the ingestions of what these logs hold or held of which a file is gone.
 
     In a bucket nobody looks, as that takes a request for every thousand files.
     """
     if isinstance(store.root, str):
         return set()
-    contents = {task.source.sha256 for task in tasks} - {None}
+    contents = {snapshot.sha256 for source in sources for snapshot in state.seen.get(source.lineage, ())}
     rows = [row for row in state.runs.values() if row.log and row.log.source.sha256 in contents]
     return {(row.run_id, row.recipe_id) for row, lost, _ in look_at_files(store.runs_place, rows) if lost}
 
@@ -175,7 +176,7 @@ def _call_of(
     done, written_bytes = [result for result in summary.results if result.status in ("done", "damaged", "empty")], 0
     with suppress(StoreError):  # a figure of the history
         written_bytes = stored_bytes(store, [result.run.run_id for result in done if result.run])
-    sizes = {task.source.name: sum(size for size, _ in task.source.files) for task in tasks}
+    sizes = {task.source.name: task.source.size_bytes for task in tasks}
     return CallRecord(
         INGEST,
         __version__,
@@ -189,14 +190,26 @@ def _call_of(
     )
 
 
-def _iterate_finished(log: LogWriter, found: FoundLogs, steps: Sequence[Step]) -> Iterator[tuple[int, IngestResult]]:
-    """Yield the result of each path that holds no log, and of each log that is in the store, is known to fail, or has to wait."""
-    parties = log.state.parties
+def _iterate_missing(found: FoundLogs) -> Iterator[tuple[int, IngestResult]]:
+    """Yield the result of each path that holds no log."""
     for index, (path, lines) in enumerate(found.problems.items(), start=-len(found.problems)):
         name = clean_line(path)
         findings = find_failure(name, "LogError")
         yield index, IngestResult(name, "failed", causes=findings, problems=lines, transient=True)
-    for index, step in enumerate(steps):
+
+
+def _iterate_left(log: LogWriter, steps: Mapping[int, Step]) -> Iterator[tuple[int, IngestResult]]:
+    """Yield the result of each log of this share that another task has ingested, or is at."""
+    yield from _iterate_finished(log, steps)
+    for index, step in steps.items():
+        if step.is_todo:
+            yield index, IngestResult(step.task.source.name, "waiting", notes=("another task of the array ingests it",))
+
+
+def _iterate_finished(log: LogWriter, steps: Mapping[int, Step]) -> Iterator[tuple[int, IngestResult]]:
+    """Yield the result of each log that is in the store, is known to fail, or has to wait."""
+    parties = log.state.parties
+    for index, step in steps.items():
         source, made = step.task.source, step.made
         if step.failure is not None:
             yield (
@@ -225,27 +238,31 @@ def _iterate_finished(log: LogWriter, found: FoundLogs, steps: Sequence[Step]) -
 
 
 def _iterate_results(
-    log: LogWriter, work: Mapping[int, IngestTask], *, jobs: int, cluster: str | None
+    log: LogWriter, queue: LogQueue, *, jobs: int, cluster: str | Executor | None
 ) -> Iterator[tuple[int, IngestResult]]:
     """Yield what became of each log by its index, once that is committed; what ends within a second is one commit."""
-    indices, hashed = list(work), add_hashes([task.source for task in work.values()])
-    tasks = [replace(task, source=source) for task, source in zip(work.values(), hashed, strict=True)]
     keep_state_here(log.store.place, log.state)
-    for turn in plan_rounds(hashed):
-        waiting, last_s = list[tuple[int, IngestTask, Ingested]](), 0.0
-        with closing(run_all(ingest_one, [tasks[at] for at in turn], jobs=jobs, cluster=cluster)) as outcomes:
+    for turn in queue.rounds():
+        taken, waiting, last_s = list[Item](), list[tuple[int, IngestTask, Ingested]](), 0.0
+        with closing(run_all(ingest_one, _take_tasks(turn, taken), jobs=jobs, cluster=cluster)) as outcomes:
             for outcome in outcomes:
-                task = tasks[at := turn[outcome.index]]
-                waiting.append(
-                    (indices[at], task, outcome.result or Ingested(task.source, make_died_result(task.source)))
-                )
+                index, task = taken[outcome.index]
+                waiting.append((index, task, outcome.result or Ingested(task.source, make_died_result(task.source))))
                 if time.monotonic() - last_s >= _TOGETHER_S:
-                    yield from _commit(log, waiting)
+                    yield from _commit(log, queue, waiting)
                     waiting, last_s = [], time.monotonic()
-        yield from _commit(log, waiting)
+        yield from _commit(log, queue, waiting)
 
 
-def _commit(log: LogWriter, ended: Sequence[tuple[int, IngestTask, Ingested]]) -> Iterator[tuple[int, IngestResult]]:
+def _take_tasks(turn: Iterable[Item], taken: list[Item]) -> Iterator[IngestTask]:
+    for item in turn:
+        taken.append(item)
+        yield item[1]
+
+
+def _commit(
+    log: LogWriter, queue: LogQueue, ended: Sequence[tuple[int, IngestTask, Ingested]]
+) -> Iterator[tuple[int, IngestResult]]:
     """Commit what became of logs, and yield it with what the log says of it; a run that cannot be committed has failed for now."""
     before, entries, notes = log.state, Entries(), dict[int, tuple[str, ...]]()
     for index, task, of in ended:
@@ -273,6 +290,7 @@ def _commit(log: LogWriter, ended: Sequence[tuple[int, IngestTask, Ingested]]) -
         result = replace(of.result, notes=(*of.result.notes, *notes[index]))
         if result.run and (by := others.get(result.run.run_id)):
             result = _settle_for(log.state.runs.get((by, result.run.recipe_id)), by, result, of.source)
+        queue.settle(index, result)
         yield index, _judge_result(log.state, result, of.source, before=before)
 
 

@@ -8,6 +8,7 @@ import sqlite3
 import stat
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -80,6 +81,11 @@ class LogSource:
     def sighting(self, sha256: str) -> LogSnapshot:
         """Return what is remembered of the log as it is now."""
         return LogSnapshot(self.origins, self.files, sha256)
+
+    @property
+    def size_bytes(self) -> int:
+        """The size of all files."""
+        return sum(size for size, _ in self.files)
 
     @property
     def youngest_ns(self) -> int:
@@ -195,10 +201,10 @@ def _find_lone_parts(paths: Iterable[Path], *, together: bool) -> Iterator[tuple
                 yield path, f"{what}, and only the first part has the static transforms; give the directory"
 
 
-def select_shard(sources: Sequence[LogSource], shard: tuple[int, int]) -> list[LogSource]:
-    """Return the logs of share ``(i, n)``, i from 1: whose turn a log is depends on where it lies in the folder given, on no other log."""
+def select_shard(sources: Sequence[LogSource], shard: tuple[int, int]) -> list[int]:
+    """Return which logs are dealt to share ``(i, n)``, i from 1: in turn, by their names in the folder given, wherever that is mounted."""
     index, count = shard
-    return [source for source in sources if int(digest(source.place), 16) % count == index - 1]
+    return sorted(range(len(sources)), key=lambda at: sources[at].place)[index - 1 :: count]
 
 
 def make_definitions_key(directory: Path | None) -> str:
@@ -223,11 +229,32 @@ def find_remote_logs(url: str, directory: Path) -> dict[Path, str]:
 
 
 def add_hashes(sources: Sequence[LogSource]) -> list[LogSource]:
-    """Return the sources with their hashes where two of one size may be the same recording."""
-    sizes = Counter(_measure_size(source) for source in sources)
-    return [
-        source if source.sha256 or sizes[_measure_size(source)] == 1 else _hash_source(source) for source in sources
-    ]
+    """Return the sources with their hashes where two may be the same recording."""
+    alone = {group[0] for group in group_alike(sources) if len(group) == 1}
+    return [source if source.sha256 or at in alone else _hash_source(source) for at, source in enumerate(sources)]
+
+
+def group_alike(sources: Sequence[LogSource]) -> list[list[int]]:
+    """Return together the indices of logs that may be the same recording: of one size, and with the same bytes at the end."""
+    groups, sizes = dict[tuple[int, bytes] | int, list[int]](), Counter(source.size_bytes for source in sources)
+    for index, source in enumerate(sources):
+        end = _read_end(source) if sizes[source.size_bytes] > 1 else None
+        groups.setdefault(index if end is None else (source.size_bytes, end), []).append(index)
+    return [*groups.values()]
+
+
+_END_BYTES = 4096
+
+
+def _read_end(source: LogSource) -> bytes | None:
+    """Return the last bytes of a log's largest file, where indexes and checksums are; None where that cannot be read from here."""
+    parts = [] if source.urls else [file for path in source.paths for file in (path, *path.rglob("*"))]
+    with suppress(OSError, ValueError):  # none is a file
+        size_bytes, largest = max((file.stat().st_size, file) for file in parts if file.is_file())
+        with largest.open("rb") as stream:
+            stream.seek(max(size_bytes - _END_BYTES, 0))
+            return stream.read()
+    return None
 
 
 def plan_rounds(sources: Sequence[LogSource]) -> list[list[int]]:
@@ -283,10 +310,6 @@ def is_there(sighting: LogSnapshot) -> bool:
     if any(is_url(origin) for origin in sighting.log):
         return True
     return _list_file_states([Path(origin) for origin in sighting.log]) == sighting.size_and_time
-
-
-def _measure_size(source: LogSource) -> int:
-    return sum(size for size, _ in source.files)
 
 
 def recall_hash(source: LogSource, seen: Sequence[LogSnapshot]) -> LogSource:

@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from tcpipe.errors import StoreError, TcpipeError, UsageError, clean_lines
-from tcpipe.formats.bucket import find_wrong_files, map_concurrently, open_place
 from tcpipe.formats.bucket_directories import find_newest
 from tcpipe.formats.commit_log import LOG
 from tcpipe.formats.commits import CallRecord, Dataset, Entries, Failure, LogSnapshot, Problem, State, Superseded
@@ -33,7 +32,7 @@ from tcpipe.formats.integrity import (
 from tcpipe.formats.json_files import Json, parse_typed, to_json, to_plain
 from tcpipe.formats.maps.map_files import open_map
 from tcpipe.formats.object_storage import is_url
-from tcpipe.formats.place import Place
+from tcpipe.formats.place import Place, find_changed_files, open_place
 from tcpipe.formats.recipe_toml import rename_earlier_keys
 from tcpipe.formats.run_documents import (
     MARK,
@@ -229,7 +228,7 @@ def _copy_folder(
     `StoreError` where a file is not what the documents have of it.
     """
     digests = {name: of or source.checksum(name) or Checksum(0, "") for name, of in wanted.items()}
-    if all(there.get(name) == of.size_bytes for name, of in digests.items()) and not find_wrong_files(
+    if all(there.get(name) == of.size_bytes for name, of in digests.items()) and not find_changed_files(
         target, digests, digests
     ):
         return 0
@@ -242,7 +241,7 @@ def _copy_folder(
             if wrong := find_wrong_checksum(source.where(name), compute_checksum(path), digests[name]):
                 raise StoreError(f"{wrong}; not copied")
 
-        map_concurrently(source.where(), fetch, [*digests])
+        source.map(fetch, [*digests])
         target.put_files(prefix, directory)
     return len(digests)
 
@@ -351,7 +350,7 @@ def _write_log(store: Store, source: Place, record_names: Sequence[str]) -> list
     names = store.run_ids()
     for start in range(0, len(names), _TOGETHER):
         run_ids = names[start : start + _TOGETHER]
-        read = map_concurrently(source.where(), store.read_rows, run_ids)
+        read = source.map(store.read_rows, run_ids)
         rows = [row for of in read for row in of.values() if not is_committed(row, log.state)]
         known = (replace(row, log=row.log and replace(row.log, outline=outlines.get(row.run_id, ""))) for row in rows)
         log.commit("ingested", Entries(runs=tuple(known)))

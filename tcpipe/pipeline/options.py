@@ -23,6 +23,7 @@ from tcpipe.tables.options import (
 )
 
 if TYPE_CHECKING:
+    from tcpipe.execution import Executor
     from tcpipe.formats.dataset_files import FileFormat
     from tcpipe.pipeline.plan import IngestResult
     from tcpipe.recipe import Recipe
@@ -47,13 +48,21 @@ class IngestOptions:
     )
     tags: Mapping[str, str] | None = tags("Tag for the runs; repeatable.")
     jobs: int = jobs("Logs")
-    cluster: str | None = option(None, CLUSTER)
-    """Its workers see logs and store under the same absolute paths."""
+    cluster: str | Executor | None = option(None, CLUSTER)
+    """Or, in Python, any executor: a `concurrent.futures.Executor`, Dask's (`Client.get_executor`), submitit's for Slurm.
+
+    Workers see logs and store under the same absolute paths.
+    """
     as_one: bool = option(False, Option("Treat all logs as parts of one drive (split logs; power in a separate log)."))
     message_definitions: str | Path | None = option(None, MESSAGE_DEFINITIONS)
     shard: tuple[int, int] | None = option(
         None,
-        Option("Ingest only the I-th of N shares of the logs: one for each task of an array job.", (), "shard", "I/N"),
+        Option(
+            "Be task I of N of an array job: ingest every N-th log, then those that no other task has begun.",
+            (),
+            "shard",
+            "I/N",
+        ),
     )
     min_age_s: float = option(
         0.0,
@@ -66,7 +75,9 @@ class IngestOptions:
         ),
     )
     retry_failed: bool = option(False, Option("Try logs again that failed before."))
-    force: bool = option(False, Option("Ingest all logs again, also those that failed before."))
+    force: bool = option(
+        False, Option("Ingest all logs again, also those that failed before; with --shard those of its own share.")
+    )
     on_found: Callable[[Mapping[str, int]], None] | None = None
     """Called once with the size [byte] of every log by its name."""
     on_result: Callable[[IngestResult], None] | None = None
@@ -143,7 +154,7 @@ class BuildDatasetOptions:
     store: str | Path = option("tcpipe-store", STORE)
     recipe: Recipe | str | Path | None = option(None, RECIPE)
     jobs: int = jobs("Runs sampled")
-    cluster: str | None = option(None, CLUSTER)
+    cluster: str | Executor | None = option(None, CLUSTER)
     """Its workers see the store under the same absolute path or URL."""
     file_format: FileFormat = option("zarr", Option(flags=("--format",), kind=("zarr", "parquet")))
     holdout: str | None = option(

@@ -6,7 +6,8 @@ import logging
 import time
 import traceback
 from collections.abc import Callable, Container, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Literal, TypeAlias, TypeVar, get_args
 
@@ -18,7 +19,7 @@ from tcpipe.formats.index_files import RunFacts
 from tcpipe.formats.json_files import digest
 from tcpipe.formats.recipe_toml import ingest_key
 from tcpipe.formats.run_documents import Manifest
-from tcpipe.pipeline.log_sources import LogSource, find_failure, is_transient
+from tcpipe.pipeline.log_sources import LogSource, find_failure, is_transient, recall_hash
 from tcpipe.pipeline.problems import find_problems, is_acknowledged, make_failure
 from tcpipe.recipe import Recipe
 from tcpipe.tables.findings import Finding, Verdict, select_problems
@@ -216,19 +217,14 @@ class _Known:
     broken: Iterable[str]
 
 
-def plan(
-    tasks: Iterable[IngestTask], state: State, *, broken: Container[tuple[str, str]] = (), now_ns: int | None = None
-) -> tuple[Step, ...]:
-    """Return what each log needs.
+def make_planner(state: State, *, broken: Container[tuple[str, str]] = ()) -> Callable[[IngestTask], Step]:
+    """Return what finds out what a log needs that is to be ingested now.
 
     Parameters
     ----------
-    tasks : the logs, with the hashes that are remembered of them, and how they are to be ingested.
     state : what the log of the store says.
     broken : runs and recipes of which files are gone.
-    now_ns : the time; that of the clock.
     """
-    now_ns = time.time_ns() if now_ns is None else now_ns
     made, failures, names = dict[str, list[RunFacts]](), dict[str, list[Failure]](), set[str]()
     for key, row in state.runs.items():
         if key in broken:
@@ -238,10 +234,17 @@ def plan(
     for failure in state.failed.values():
         failures.setdefault(failure.content, []).append(failure)
     known = _Known(state, made, failures, list_transient_failures(state.calls), names)
-    return tuple(_decide(task, known, now_ns) for task in tasks)
+    return partial(_decide, known=known, now_ns=time.time_ns())
+
+
+def plan(tasks: Iterable[IngestTask], state: State, *, broken: Container[tuple[str, str]] = ()) -> tuple[Step, ...]:
+    """Return what each log needs; parameters as those of `make_planner`."""
+    return tuple(map(make_planner(state, broken=broken), tasks))
 
 
 def _decide(task: IngestTask, known: _Known, now_ns: int) -> Step:
+    if not task.force:
+        task = replace(task, source=recall_hash(task.source, known.state.seen.get(task.source.lineage, ())))
     source, sha256 = task.source, None if task.force else task.source.sha256
     made = known.made.get(sha256, []) if sha256 else []
     current = next((row for row in made if task.is_made_by(row)), None)

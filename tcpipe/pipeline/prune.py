@@ -16,7 +16,7 @@ from tcpipe.formats.atomic import TEMPORARY_PREFIX, clear, clear_scratch, is_aba
 from tcpipe.formats.commits import Dataset, Entries, State
 from tcpipe.formats.dataset_files import CARD, read_card
 from tcpipe.formats.index_files import RunFacts
-from tcpipe.formats.place import DirectoryPlace, Entry, Place
+from tcpipe.formats.place import Entry, Place
 from tcpipe.formats.recipe_toml import ingest_key, resolve_recipe
 from tcpipe.formats.run_documents import SPOOL, find_highest_numbers, read_sealed_at, split_number
 from tcpipe.formats.stored_runs import Ingestions
@@ -107,7 +107,7 @@ def prune(
             log.commit("pruned", Entries(removed=tuple(parts)))
             _remove(place)
     left = [
-        Leftover("left by a killed call", str(path), _measure_size(DirectoryPlace(path)))
+        Leftover("left by a killed call", str(path), _measure_size(Place(path)))
         for path in _iterate_temporaries(opened, min_age_s)
     ]
     removed += left
@@ -200,7 +200,7 @@ def is_replaced(made: Dataset) -> bool:
 def _iterate_temporaries(store: Store, min_age_s: float) -> Iterator[Path]:
     """Yield what killed calls left on disk, if it is old enough."""
     place = store.place
-    for path in sorted(place.root.glob(f"{TEMPORARY_PREFIX}*")) if isinstance(place, DirectoryPlace) else ():
+    for path in sorted(place.path.glob(f"{TEMPORARY_PREFIX}*")) if place.path else ():
         if time.time() - path.stat().st_mtime >= min_age_s and is_abandoned(path):
             yield path
 
@@ -210,13 +210,13 @@ _Unnamed = tuple[str, Place, list[Entry], str | None]
 
 
 def _iterate_spooled(store: Store, min_age_s: float) -> Iterator[_Unnamed]:
-    """Yield what builds left that were killed while a cluster's workers sampled for them, if it is old enough."""
+    """Yield what was shared by builds on a cluster and tasks of an array that were killed, if it is old enough."""
     before_ns = time.time_ns() - int(min_age_s * 1e9)
     for name in store.place.folders(SPOOL):
         place = store.place.below(f"{SPOOL}/{name}")
         entries = place.entries()
         if all(entry.modified_ns < before_ns for entry in entries):
-            yield "left by a killed build", place, entries, None
+            yield "left by a killed call", place, entries, None
 
 
 def _iterate_replaced(store: Store, state: State, min_age_s: float, unread: str | None) -> Iterator[_Unnamed]:
@@ -297,12 +297,10 @@ def _remove(place: Place) -> None:
 
 def _remove_empty(store: Store, min_age_s: float) -> None:
     """Remove the directories, on disk, that a prune left empty which was killed between the last file and its directory."""
-    runs = store.runs_place
-    if not isinstance(runs, DirectoryPlace):
-        return
-    for above, _, files in os.walk(runs.root, topdown=False):
+    runs = store.runs_place.path
+    for above, _, files in os.walk(runs, topdown=False) if runs else ():
         with suppress(OSError):  # it is not empty, or gone
-            if not files and Path(above) != runs.root and time.time() - Path(above).stat().st_mtime >= min_age_s:
+            if not files and Path(above) != runs and time.time() - Path(above).stat().st_mtime >= min_age_s:
                 Path(above).rmdir()
 
 

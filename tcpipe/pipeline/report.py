@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from tcpipe.errors import StoreError, UsageError
-from tcpipe.formats.bucket import open_place
 from tcpipe.formats.bucket_directories import fetch_directory_by_range
 from tcpipe.formats.commit_log import pause_garbage_collection
 from tcpipe.formats.commits import Dataset, State
@@ -16,7 +15,7 @@ from tcpipe.formats.dataset_files import CARD, REPORT, read_current_card
 from tcpipe.formats.finding_lines import group_findings
 from tcpipe.formats.integrity import seal_page
 from tcpipe.formats.object_storage import is_url
-from tcpipe.formats.place import Place
+from tcpipe.formats.place import Place, open_place
 from tcpipe.formats.stored_runs import Ingestions, RunDirectory, make_file_finder
 from tcpipe.pipeline.plan import list_transient_failures
 from tcpipe.pipeline.problems import find_problems, is_acknowledged, make_failure

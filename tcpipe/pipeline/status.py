@@ -34,7 +34,7 @@ from tcpipe.pipeline.calls import (
     is_below,
     list_begun_calls,
 )
-from tcpipe.pipeline.log_sources import find_sources, make_definitions_key, recall_hash, select_shard
+from tcpipe.pipeline.log_sources import find_sources, make_definitions_key, select_shard
 from tcpipe.pipeline.plan import LOG_STATES, TROUBLE, IngestTask, LogState, Step, plan
 from tcpipe.pipeline.problems import find_incomplete_runs, make_missing, make_waiting
 from tcpipe.recipe import Recipe
@@ -165,9 +165,9 @@ def find_status(
     no_tags: Mapping[str, str] = {}
     common = (opened.root, ruling, robot or ruling.robot, no_tags, force, message_definitions)
     how = (*common, make_definitions_key(message_definitions), retry_failed)
-    seen, runs = {} if force else state.seen, opened.ingestions(state=state)
-    mine = found.sources if shard is None else select_shard(found.sources, shard)
-    tasks = (IngestTask(recall_hash(source, seen.get(source.lineage, ())), *how, min_age_s) for source in mine)
+    runs = opened.ingestions(state=state)
+    mine = range(len(found.sources)) if shard is None else select_shard(found.sources, shard)
+    tasks = (IngestTask(found.sources[at], *how, min_age_s) for at in mine)
     steps = plan(tasks, state, broken=() if isinstance(opened.root, str) else runs.lost)
     problems = [*_store_problems(runs)]
     if (
@@ -188,7 +188,9 @@ def find_status(
         sources=tuple(sources),
         counts=dict(sum((Counter({group.state: len(group.logs)}) for group in groups), Counter())),
         groups=groups,
-        to_do=estimate(state.calls, INGEST, sum(map(_sum_bytes, waiting)), jobs=jobs) if waiting else None,
+        to_do=estimate(state.calls, INGEST, sum(step.task.source.size_bytes for step in waiting), jobs=jobs)
+        if waiting
+        else None,
         problems=tuple(problem.finding for problem in problems),
         gone=tuple(chain(*(lines for path, lines in found.problems.items() if path not in lately))),
         superseded_runs=len(state.superseded),
@@ -229,11 +231,9 @@ def _iterate_groups(steps: Iterable[Step]) -> Iterator[Group]:
     for (state, _), of in sorted(groups.items(), key=lambda item: (LOG_STATES.index(item[0][0]), -len(item[1]))):
         causes = list(dict.fromkeys(step.cause for step in of))
         cause = causes[0] if len(causes) == 1 else f"{len(causes)} reasons, the first: {causes[0]}"
-        yield Group(state, cause, tuple(step.task.source.name for step in of), sum(map(_sum_bytes, of)))
-
-
-def _sum_bytes(step: Step) -> int:
-    return sum(size for size, _ in step.task.source.files)
+        yield Group(
+            state, cause, tuple(step.task.source.name for step in of), sum(step.task.source.size_bytes for step in of)
+        )
 
 
 def _format_words(state: LogState) -> str:

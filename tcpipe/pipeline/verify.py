@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from tcpipe.cost.labels import pool_budgets
 from tcpipe.errors import DatasetError, TcpipeError, UsageError, clean_lines
 from tcpipe.formats.atomic import find_leftovers
-from tcpipe.formats.bucket import open_place
 from tcpipe.formats.bucket_directories import REPORT_PATCHES, fetch_unproved, find_unlisted_files
 from tcpipe.formats.commit_log import LOG
 from tcpipe.formats.dataset_card import DatasetCard
@@ -34,10 +33,11 @@ from tcpipe.formats.dataset_files import (
     sample_columns,
     sample_count,
 )
-from tcpipe.formats.integrity import Checksum, Checksums, find_broken_checksums, find_broken_seal, read_sealed_as
+from tcpipe.formats.integrity import Checksum, Checksums, find_broken_seal, read_sealed_as
 from tcpipe.formats.json_files import to_plain
 from tcpipe.formats.object_storage import is_bucket, is_url
 from tcpipe.formats.parquet import read_table
+from tcpipe.formats.place import Place, find_wrong_files, open_place
 from tcpipe.formats.recipe_toml import make_recipe_id
 from tcpipe.motion.distance_breakdown import KEPT
 from tcpipe.pipeline.dataset.card import CARD_COLUMNS, measure_samples
@@ -183,7 +183,7 @@ def _verify_files(
     directory: Path, checksums: Mapping[str, Checksum], unlisted: Sequence[str], *, kind: str
 ) -> Iterator[str]:
     """Compare every file with the checksum that the card has of it; name those that it does not know."""
-    yield from find_broken_checksums(directory, checksums)
+    yield from find_wrong_files(Place(directory), checksums)
     there = {path.relative_to(directory).as_posix() for path in directory.rglob("*") if not path.is_dir()}
     for name in sorted(there - {*checksums, *unlisted}):
         if not (name.startswith(f"{REPORT_PATCHES}/") if kind == "dataset" else name.endswith(_BESIDE)):

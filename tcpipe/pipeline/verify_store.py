@@ -22,16 +22,13 @@ from tcpipe.formats.commits import Commit, State, fold
 from tcpipe.formats.index_files import make_run_facts
 from tcpipe.formats.integrity import (
     CHECKSUMS,
-    Checksum,
-    find_broken_checksums,
     find_broken_seal_in,
-    find_wrong_checksum,
     read_checksums,
 )
 from tcpipe.formats.json_files import parse_typed
 from tcpipe.formats.maps.map_files import MapFile, open_map
 from tcpipe.formats.parquet import read_table
-from tcpipe.formats.place import DirectoryPlace, Place
+from tcpipe.formats.place import Place, find_wrong_files
 from tcpipe.formats.recipe_toml import ingest_key, make_recipe_id
 from tcpipe.formats.run_documents import (
     MARK,
@@ -72,14 +69,13 @@ def verify_store(store: Store) -> Iterator[CheckResult]:
             yield _describe_stranger(place, name)
     for name in place.folders():
         if name == SPOOL:
-            yield f"{place.where(name)}: belongs to a build that is running or was killed; 'tcpipe prune' removes old ones"
+            yield f"{place.where(name)}: belongs to a call that is running or was killed; 'tcpipe prune' removes old ones"
         elif name not in (LOG, "maps", "runs", _INDEX):
             yield _describe_stranger(place, name)
     yield from verify_log(place.below(LOG))
     yield from _verify_maps(store)
     yield from _verify_runs(store)
-    if isinstance(place, DirectoryPlace):
-        yield from _find_left_behind(place.root)
+    yield from _find_left_behind(place.path) if place.path else ()
 
 
 def verify_log(log: Place) -> Iterator[CheckResult]:
@@ -182,7 +178,7 @@ def _verify_maps(store: Store) -> Iterator[CheckResult]:
 def _verify_stored_map(store: Store, name: str) -> Iterator[CheckResult]:
     yield "maps", 1
     place, document = store.place.below("maps"), store.map_document(name)
-    wrong = list(_find_wrong_files(place, document.checksums))
+    wrong = list(find_wrong_files(place, document.checksums))
     yield from wrong
     yield "files", len(document.checksums)
     if not wrong:
@@ -190,13 +186,6 @@ def _verify_stored_map(store: Store, name: str) -> Iterator[CheckResult]:
         yield from _verify_tiles(path, fetched)
         if document.picture in document.checksums and not is_picture_of_map(store.map_picture(name), path):
             yield f"{place.where(document.picture)}: does not show the map as it is; add the map again with --force"
-
-
-def _find_wrong_files(place: Place, checksums: Mapping[str, Checksum]) -> Iterator[str]:
-    """Yield a line for every file that is not what a document has of it."""
-    for name, wanted in checksums.items():
-        if line := find_wrong_checksum(place.where(name), place.checksum(name), wanted):
-            yield line
 
 
 def _describe_stranger(place: Place, name: str) -> str:
@@ -251,9 +240,9 @@ def _verify_listed(directory: Path) -> Any:
     except StoreError as error:
         yield from error.problems
         return None
-    yield from find_broken_checksums(directory, checksums)
+    yield from find_wrong_files(Place(directory), checksums)
     yield "files", len(checksums) + 1
-    place = DirectoryPlace(directory)
+    place = Place(directory)
     for entry in place.entries():
         if entry.name not in {*checksums, CHECKSUMS}:
             yield _describe_stranger(place, entry.name)
@@ -262,7 +251,7 @@ def _verify_listed(directory: Path) -> Any:
 
 def _verify_streams(place: Place, known: RunJson | None) -> Iterator[CheckResult]:
     checksums = known.streams if known else {}
-    wrong = list(_find_wrong_files(place, checksums))
+    wrong = list(find_wrong_files(place, checksums))
     yield from wrong
     yield "files", len(checksums)
     for name, of in checksums.items() if not wrong else ():
@@ -290,7 +279,7 @@ def _make_ingestion(runs: Place, run_id: str, recipe_name: str) -> Iterator[Chec
     of = (ingest_key(recipe), make_recipe_id(recipe, manifest.robot)) if isinstance(recipe, Mapping) else None
     if of != (manifest.ingest_key, recipe_name):
         yield f"{where}: its recipe is not the one that the directory is named after"
-    wrong = list(_find_wrong_files(place, manifest.checksums))
+    wrong = list(find_wrong_files(place, manifest.checksums))
     yield from wrong
     yield "files", len(manifest.checksums)
     yield from _verify_others(place, manifest)

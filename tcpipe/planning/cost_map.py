@@ -27,16 +27,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.errors import MapError, StoreError, TcpipeError, UsageError, clean_lines
-from tcpipe.execution import run_all, unwrap_result
+from tcpipe.execution import Executor, run_all, unwrap_result
 from tcpipe.formats.atomic import clear_beside, lock_directory, write_atomic_directory, write_text
 from tcpipe.formats.bucket_directories import fetch_directory, has_card
 from tcpipe.formats.geopackage import make_raster_style
-from tcpipe.formats.integrity import Checksum, compute_checksums, find_broken_checksums, read_sealed_as, write_sealed
+from tcpipe.formats.integrity import Checksum, compute_checksums, read_sealed_as, write_sealed
 from tcpipe.formats.json_files import digest, read_json, write_json
 from tcpipe.formats.maps.geotiff import read_bands, write_cog
 from tcpipe.formats.maps.map_files import MapFile
 from tcpipe.formats.maps.nav2 import HIGHEST, LETHAL, write_nav2_map
 from tcpipe.formats.object_storage import is_url
+from tcpipe.formats.place import Place, find_wrong_files
 from tcpipe.pipeline.generations import write_generation
 from tcpipe.planning.cost_grid import (
     ANGLES_DEG,
@@ -197,7 +198,7 @@ def make_cost_map(
         raise UsageError(f"{out}: exists and is no cost map; give another directory")
     with _claim_spool(out) as place:
         found = read_cost_map_card(out)  # another process may have been first
-        if found is not None and found.key == key and not any(find_broken_checksums(out, found.checksums)):
+        if found is not None and found.key == key and not any(find_wrong_files(Place(out), found.checksums)):
             if found.origin_deg == origin_deg:
                 rmtree(place)
                 return CostMapResult(str(out), "unchanged", found)
@@ -225,7 +226,7 @@ def read_cost_map_card(path: Path) -> CostMapCard | None:
 def open_cost_map(path: Path, card: CostMapCard) -> CostGrid:
     """Read the costs of a cost map into memory; `MapError` names every file that is damaged."""
     read = {f"{name}.tif": card.checksums[f"{name}.tif"] for name in ("power", "velocity", "reasons", "height")}
-    if problems := list(find_broken_checksums(path, read)):
+    if problems := list(find_wrong_files(Place(path), read)):
         raise MapError(*(f"{problem}; make the cost map again" for problem in problems))
     courses = range(1, COURSES + 1)
     power, velocity, reasons = (read_bands(path / f"{name}.tif", courses) for name in ("power", "velocity", "reasons"))
@@ -304,9 +305,9 @@ def _read_job(place: Path) -> str | None:
 
 @dataclass(frozen=True, slots=True)
 class Cluster:
-    """A Dask scheduler's address, and what gives its workers the model and the map, by files that they see."""
+    """A Dask scheduler's address or an executor, and what gives its workers the model and the map, by files that they see."""
 
-    address: str
+    address: str | Executor
     inputs: Callable[[], tuple[CostModel, MapFile]]
 
 

@@ -11,20 +11,20 @@ import numpy as np
 from tcpipe.errors import FusionError
 from tcpipe.fusion.checks.audit import is_astray
 from tcpipe.fusion.checks.plausibility import SensorExclusion, refuse_fixes
-from tcpipe.fusion.measurements import GNSS, IMU
+from tcpipe.fusion.measurements import GNSS, IMU, POSE
 from tcpipe.recipe import FuseConfig
 from tcpipe.stages.clock_findings import correct_clocks
 from tcpipe.stages.fuse_findings import find_fuse_findings, make_audit_findings, make_fuse_facts, make_mounting_findings
 from tcpipe.stages.fuse_inputs import (
     FusionInputs,
-    convert_pose_to_fixes,
     drop_implausible_sensors,
     exclude_sensors,
-    find_recipe_role,
+    name_pose,
     prepare_inputs,
+    prepare_pose,
 )
 from tcpipe.stages.fuse_sections import Fused, fuse_sections, make_rejections_table
-from tcpipe.tables.facts import SensorChecks
+from tcpipe.tables.facts import SensorChecks, StageFacts
 from tcpipe.tables.findings import Finding, StageReport, Subject, make_finding
 from tcpipe.tables.levels import TRACK, Datum, Streams, Track, TrackInfo
 
@@ -39,9 +39,18 @@ def fuse_run(streams: Streams, config: FuseConfig, *, run_id: str) -> Track:
     ------
     FusionError : no sensor measures motion, or the estimate breaks down.
     """
+    try:
+        return _fuse(streams, config, run_id)
+    except FusionError as error:
+        findings = name_pose(error.findings) if POSE in streams.tables else error.findings
+        raise FusionError(*error.problems, findings=findings) from error
+
+
+def _fuse(streams: Streams, config: FuseConfig, run_id: str) -> Track:
     # 1. A pose made elsewhere is what the fixes are.
     #    Streams become measurements: one frame, one set of units, usable variances; sensors that cannot be right are left out.
-    streams, local = convert_pose_to_fixes(streams)
+    is_posed = POSE in streams.tables
+    streams, local = prepare_pose(streams)
     run = Subject("run", run_id)
     inputs, sanity = drop_implausible_sensors(prepare_inputs(streams, config), streams)
     # 2. Each section for itself: where it starts, filter and smoother; again without a sensor that leads the track away from all others,
@@ -67,20 +76,29 @@ def fuse_run(streams: Streams, config: FuseConfig, *, run_id: str) -> Track:
     mounting, audit = make_mounting_findings(inputs, fused, streams), make_audit_findings(fused, inputs, streams)
     found = (sanity, mounting, audit, clocks)
     findings = (
-        *find_fuse_findings(inputs, summary, run=run, fixes=find_recipe_role(GNSS, streams)),
+        *find_fuse_findings(inputs, summary, run=run),
         *(finding for each in found for finding in each.findings),
     )
-    facts = replace(
-        streams.report.facts,
+    made = StageFacts(
         fuse=summary,
         sensor_checks=sanity.facts,
         mounting=mounting.facts,
         audit=audit.facts,
         clock_offsets=clocks.facts,
     )
+    if is_posed:
+        findings, made = name_pose(findings), name_pose(made)
+    facts = replace(
+        streams.report.facts,
+        fuse=made.fuse,
+        sensor_checks=made.sensor_checks,
+        mounting=made.mounting,
+        audit=made.audit,
+        clock_offsets=made.clock_offsets,
+    )
     report = StageReport((*_drop_places(streams.report.findings, findings), *findings), facts)
     info = TrackInfo(run_id, streams.robot, datum, config.rate_hz, config.estimator, report)
-    return Track(table, make_rejections_table(inputs, fused.found), info)
+    return Track(table, make_rejections_table(inputs, fused.found, POSE if is_posed else GNSS), info)
 
 
 def _drop_places(read: tuple[Finding, ...], fused: tuple[Finding, ...]) -> Iterator[Finding]:

@@ -6,17 +6,24 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tcpipe.fusion.checks.audit import find_undecided_sensors
 from tcpipe.fusion.checks.odometry_scale import Scale, compute_command_ratio
-from tcpipe.fusion.measurements import GNSS, IMU, VISUAL, WHEELS
-from tcpipe.geometry.rotation import matrix_from_quat, quat_from_rpy
+from tcpipe.fusion.measurements import GNSS, IMU, VISUAL, WHEELS, Measurements
+from tcpipe.geometry.rotation import (
+    matrix_from_quat,
+    multiply,
+    quat_from_matrix,
+    quat_from_rotation_vector,
+    quat_from_rpy,
+    rotation_vector_from_quat,
+)
 from tcpipe.recipe.suggestions import suggest
 from tcpipe.stages.fuse_inputs import (
     FusionInputs,
     exclude_role,
     find_longest_epoch,
-    find_recipe_role,
     read_command,
     state_extrinsics,
 )
@@ -35,7 +42,8 @@ from tcpipe.tables.facts import (
 from tcpipe.tables.findings import Finding, StageReport, Subject, make_finding, read_threshold
 from tcpipe.tables.levels import Sensor, Streams
 
-_COURSE = "course over ground"
+_SURE = ("course over ground", "pose")
+"""What the yaw at the start may be from."""
 
 
 def make_fuse_facts(
@@ -61,20 +69,18 @@ def make_fuse_facts(
     )
 
 
-def find_fuse_findings(
-    inputs: FusionInputs, facts: FuseFacts, *, run: Subject, fixes: str = GNSS
-) -> tuple[Finding, ...]:
-    """Return what was observed while fusing; ``fixes`` is the recipe's role of the positions."""
-    gnss, first_ns = Subject("role", fixes), min((section.start_ns for section in facts.stretches), default=0)
+def find_fuse_findings(inputs: FusionInputs, facts: FuseFacts, *, run: Subject) -> tuple[Finding, ...]:
+    """Return what was observed while fusing."""
+    gnss, first_ns = Subject("role", GNSS), min((section.start_ns for section in facts.stretches), default=0)
     findings = [finding for finding in inputs.findings if finding.subject.name not in inputs.excluded]
     if inputs.datum_deg_m is None and GNSS in inputs.counts:  # a log without any fix was found when it was read
         findings.append(make_finding("local-frame", gnss))
     elif inputs.datum_deg_m is not None:
-        findings += [_find_initial_yaw(of, first_ns, gnss) for of in facts.stretches if of.heading_from != _COURSE]
+        findings += [_find_initial_yaw(of, first_ns, gnss) for of in facts.stretches if of.heading_from not in _SURE]
     findings += _find_reopenings(facts, first_ns)
-    findings += _find_changes(facts, first_ns, fixes)
+    findings += _find_changes(facts, first_ns)
     findings += _find_scale(inputs, facts)
-    findings += _find_rejections(facts, fixes)
+    findings += _find_rejections(facts)
     for key, code in (("variances_replaced", "variances-replaced"), ("invalid", "values-unusable")):
         findings += [
             make_finding(code, Subject("role", role), row_count=count[key])
@@ -102,16 +108,16 @@ def _find_scale(inputs: FusionInputs, facts: FuseFacts) -> list[Finding]:
     return [make_finding("odometry-scale-unobservable", subject, names=names, scale_std_fraction=std)]
 
 
-def _find_rejections(facts: FuseFacts, fixes: str) -> list[Finding]:
+def _find_rejections(facts: FuseFacts) -> list[Finding]:
     most = read_threshold("measurements-rejected", "max_rejected_fraction")
     findings = []
     for role, count in facts.measurements.items():
-        rejected, name = facts.rejected[role], fixes if role == GNSS else role
+        rejected = facts.rejected[role]
         if rejected > most * count:
             finding = make_finding(
                 "measurements-rejected",
-                Subject("role", name),
-                remedies=exclude_role(name),
+                Subject("role", role),
+                remedies=exclude_role(role),
                 rejected_fraction=rejected / count,
                 rejected_count=rejected,
                 measurement_count=count,
@@ -138,23 +144,24 @@ def _find_reopenings(facts: FuseFacts, first_ns: int) -> list[Finding]:
     return findings
 
 
-def _find_changes(facts: FuseFacts, first_ns: int, fixes: str) -> Iterator[Finding]:
+def _find_changes(facts: FuseFacts, first_ns: int) -> Iterator[Finding]:
     """Yield what explains contradictions of sensors: what changed, when, and by how much fixes were off."""
     for change in (each for section in facts.stretches for each in section.changes):
-        subject = Subject("role", fixes if change.role == GNSS else change.role)
-        names = {"change": _CHANGES[change.kind]}
+        subject = Subject("role", change.role)
+        names = {"change": CHANGES[change.kind]}
         yield make_finding(
             "sensor-changed", subject, span_s=_find_span_s(change, first_ns), names=names, off_m=change.size
         )
 
 
-_CHANGES = {
+CHANGES = {
     "offset": "positions are off by a constant",
     "wander": "positions err far more than usual",
     "antenna": "the antenna was moved",
     "clock": "its clock stepped",
     "gyroscope": "the bias of its gyroscope jumped",
     "scale": "its scale changed",
+    "frame": "the frame of its attitude turned",
     "pose": "a clock stepped, or the robot was moved without being measured",
     "useless": "it measured nothing usable",
 }
@@ -179,9 +186,8 @@ def make_audit_findings(fused: Fused, inputs: FusionInputs, streams: Streams) ->
         _find_disagreement([e for e in found if (e.sensor, e.what, e.alone) == kind], first_ns) for kind in kinds
     ]
     for sensor, what in undecided:
-        name = find_recipe_role(sensor, streams)
-        names, subject = {"quantity": what}, Subject("role", name)
-        findings.append(make_finding("disagreement-undecided", subject, names=names, remedies=exclude_role(name)))
+        names, subject = {"quantity": what}, Subject("role", sensor)
+        findings.append(make_finding("disagreement-undecided", subject, names=names, remedies=exclude_role(sensor)))
     sensors = {sensor for sensor, _ in undecided}
     faster = _compute_command_ratio(inputs, streams)
     if faster is not None:
@@ -224,6 +230,7 @@ def _find_disagreement(found: Sequence[Disagreement], first_ns: int) -> Finding:
 _SURELY = 4.0  # standard deviations
 _LEAST_ARM_M = 0.1  # what a finding names
 _LEAST_TILT_RAD = 0.0175
+_LEAST_TURN_RAD = 0.05
 _LEAST_SCALE = 0.1
 
 
@@ -234,10 +241,18 @@ def make_mounting_findings(inputs: FusionInputs, fused: Fused, streams: Streams)
     arm, tilt = longest.parameters.get("antenna"), longest.parameters.get("mounting of the IMU")
     moved = std_m = roll_pitch = None
     if arm is not None and GNSS in streams.sensors:
-        sensor = streams.sensors[GNSS]
+        sensor, turned = streams.sensors[GNSS], longest.parameters.get("mounting of the pose")
+        turn = _find_rotation(turned, inputs.measurements.get(longest.clock_epoch), sensor)
         if sensor.placed_by == "assumed" or _is_contradicted(arm, _LEAST_ARM_M):
             moved, std_m = make_vector(np.array(arm.value)), make_vector(np.array(arm.std))
-            findings.append(_find_arm(arm, sensor, find_recipe_role(GNSS, streams)))
+            findings.append(_find_arm(arm, sensor, turn))
+        off = quat_from_matrix(turn @ matrix_from_quat(sensor.quat_xyzw).T)
+        off_rad = float(np.linalg.norm(rotation_vector_from_quat(off)))
+        unsure_rad = 0.0 if turned is None else float(np.linalg.norm(turned.std))
+        if sensor.placed_by != "assumed" and off_rad > max(_SURELY * unsure_rad, _LEAST_TURN_RAD):
+            remedies, names = state_extrinsics(GNSS, sensor.xyz_m, turn), {"placed_by": sensor.placed_by}
+            fixes = Subject("role", GNSS)
+            findings.append(make_finding("pose-rotated", fixes, names=names, remedies=remedies, off_rad=off_rad))
     if tilt is not None and _is_contradicted(tilt, _LEAST_TILT_RAD):
         roll_pitch = tilt.value[0], tilt.value[1]
         findings.append(_find_tilt(tilt, streams.sensors[IMU]))
@@ -281,16 +296,23 @@ def _find_odometry_scale(role: str, scale: Scale, given: float) -> Finding:
     return make_finding("odometry-scale", subject, remedies=remedies, scale=scale.factor, scale_std=std, **by_speed)
 
 
-def _find_arm(arm: ParameterFacts, sensor: Sensor, name: str) -> Finding:
+def _find_rotation(turned: ParameterFacts | None, m: Measurements | None, sensor: Sensor) -> NDArray[np.float64]:
+    """Return how the sensor of positions is turned on the robot, shape (3, 3): that of a pose as its run shows it."""
+    if turned is None or m is None or m.gnss is None:
+        return matrix_from_quat(sensor.quat_xyzw)
+    return matrix_from_quat(multiply(quat_from_rotation_vector(turned.value), m.gnss.mounting_xyzw))
+
+
+def _find_arm(arm: ParameterFacts, sensor: Sensor, turn: NDArray[np.float64]) -> Finding:
     place = np.asarray(sensor.xyz_m) + arm.value
     axes = ("forward", "left", "up")
     numbers: dict[str, Any] = {f"{axis}_m": value for axis, value in zip(axes, place.tolist(), strict=True)}
     numbers |= {f"{axis}_std_m": value for axis, value in zip(axes, arm.std, strict=True)}
     return make_finding(
         "lever-arm-unknown" if sensor.placed_by == "assumed" else "lever-arm-contradicted",
-        Subject("role", name),
+        Subject("role", GNSS),
         names={"placed_by": sensor.placed_by},
-        remedies=state_extrinsics(name, np.round(place, 2).tolist(), matrix_from_quat(sensor.quat_xyzw)),
+        remedies=state_extrinsics(GNSS, np.round(place, 2).tolist(), turn),
         **numbers,
     )
 

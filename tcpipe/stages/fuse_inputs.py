@@ -1,13 +1,13 @@
 """Measurements by clock epoch, without sensors that contradict physics or the other sensors; findings name the remedy.
 
-A pose that another program estimated becomes the fixes of a GNSS.
+A pose that another program estimated is fused as fixes with an attitude; findings and facts call it by its role.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from typing import Any
+from dataclasses import dataclass, field, fields, is_dataclass, replace
+from typing import Any, TypeVar, cast
 
 import numpy as np
 import pyarrow as pa
@@ -15,6 +15,7 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from tcpipe.fusion import preparation
+from tcpipe.fusion.attitude import align_mounting
 from tcpipe.fusion.checks.clock_offsets import smooth_stamps
 from tcpipe.fusion.checks.odometry_scale import Scale, rescale_odometries
 from tcpipe.fusion.checks.plausibility import SensorExclusion
@@ -23,6 +24,7 @@ from tcpipe.fusion.measurements import (
     DOPPLER,
     GNSS,
     IMU,
+    POSE,
     STATED_ARM_STD_M,
     UNSTATED_ARM_STD_M,
     VISUAL,
@@ -69,6 +71,7 @@ class FusionInputs:
 def prepare_inputs(streams: Streams, config: FuseConfig) -> FusionInputs:
     """Turn the motion streams into measurements, one set a clock epoch."""
     tables = {role: streams.tables[role] for role in (GNSS, DOPPLER, IMU, WHEELS, VISUAL) if role in streams.tables}
+    tables |= {GNSS: streams.tables[POSE]} if POSE in streams.tables else {}
     datum = None
     if GNSS in tables:
         fixes = FloatColumns(tables[GNSS])
@@ -82,6 +85,7 @@ def prepare_inputs(streams: Streams, config: FuseConfig) -> FusionInputs:
         found = {role: _prepare(role, part, streams.sensors[role], config, inputs) for role, part in parts.items()}
         gnss, odometry = found.get(GNSS), found.get(WHEELS) or found.get(VISUAL)
         if gnss is not None:
+            gnss = align_mounting(gnss, odometry, is_stated=streams.sensors[GNSS].placed_by != "assumed")
             count = gnss.stamp_ns.size
             gnss, repeats = preparation.drop_repeated_fixes(gnss, odometry)
             inputs.counts[GNSS]["repeated"] += count - gnss.stamp_ns.size
@@ -102,7 +106,7 @@ def prepare_inputs(streams: Streams, config: FuseConfig) -> FusionInputs:
 def _find_frozen(repeats: preparation.Repeats, streams: Streams) -> Finding:
     first_ns = _find_first_ns(streams)
     span_s = (repeats.start_ns - first_ns) / 1e9, (repeats.end_ns - first_ns) / 1e9
-    subject, names = Subject("role", find_recipe_role(GNSS, streams)), {"quantity": "position"}
+    subject, names = Subject("role", GNSS), {"quantity": "position"}
     return make_finding("frozen", subject, span_s=span_s, names=names, message_count=repeats.messages)
 
 
@@ -115,9 +119,10 @@ def _find_first_ns(streams: Streams) -> int:
 
 def _find_used_s(role: str, streams: Streams) -> tuple[float, float] | None:
     """Return when a sensor's first and last messages are [s]."""
-    if role not in streams.tables:
+    table = streams.tables.get(POSE if role == GNSS and POSE in streams.tables else role)
+    if table is None:
         return None
-    stamp_ns = to_integers(streams.tables[role], "stamp_ns")
+    stamp_ns = to_integers(table, "stamp_ns")
     return (int(stamp_ns[0]) - _find_first_ns(streams)) / 1e9, (int(stamp_ns[-1]) - _find_first_ns(streams)) / 1e9
 
 
@@ -139,6 +144,7 @@ def _prepare(role: str, table: pa.Table, sensor: Sensor, config: FuseConfig, inp
             else config.lever_arm_std_m or STATED_ARM_STD_M,
             default_std_m=config.gnss_default_std_m,
             floor_std_m=config.gnss_std_floor_m,
+            mounting_xyzw=sensor.quat_xyzw,
         )
     elif role == DOPPLER:
         made, prepared = preparation.prepare_ground_velocities(
@@ -232,13 +238,13 @@ def _compute_median_specific_force(streams: Streams) -> float:
 
 def _find_exclusion(refusal: SensorExclusion, streams: Streams) -> Finding:
     """Return the finding of a sensor that is not fused; a receiver's velocity helps fixes that are fused, and no label needs it."""
-    sensor, name = streams.sensors[refusal.role], find_recipe_role(refusal.role, streams)
+    sensor, name = streams.sensors[refusal.role], refusal.role
     if refusal.units is not None:
         remedies = suggest("state_units", {"read": {"imu_units": refusal.units}})
     elif refusal.turned_by is not None:
         remedies = state_extrinsics(name, sensor.xyz_m, refusal.turned_by @ matrix_from_quat(sensor.quat_xyzw))
     elif refusal.is_suspect_excludable:
-        remedies = exclude_role(find_recipe_role(refusal.names["suspect"], streams), "exclude_suspect")
+        remedies = exclude_role(refusal.names["suspect"], "exclude_suspect")
     else:
         remedies = exclude_role(name)
     numbers: Mapping[str, Any] = refusal.numbers
@@ -267,31 +273,43 @@ def state_extrinsics(name: str, xyz_m: Sequence[float], turn: NDArray[np.float64
     )
 
 
-POSE = "pose"
 _ANYWHERE_DEG_M = (0.0, 45.0, 0.0)
 """Where a frame that is nowhere on the earth is taken to lie while its positions are fused: east, north and up stay what they are."""
 
 
 def find_recipe_role(role: str, streams: Streams) -> str:
-    """Return the role in the recipe of the stream that is fused as ``role``: a pose that is used as GNSS is a pose there."""
+    """Return the role in the recipe of the stream that is fused as ``role``: a pose that is fused as fixes is a pose there."""
     roles = streams.report.facts.roles
     return POSE if role == GNSS and POSE in roles and GNSS not in roles else role
 
 
-def convert_pose_to_fixes(streams: Streams) -> tuple[Streams, bool]:
-    """Return the streams with the pose as the fixes of a GNSS, and whether these lie in a frame that is nowhere on the earth."""
+def prepare_pose(streams: Streams) -> tuple[Streams, bool]:
+    """Return the streams with the pose as fixes of a GNSS could be, and whether it lies in a frame that is nowhere on the earth."""
     pose = streams.tables.get(POSE)
     if pose is None:
         return streams, False
-    lon, lat, alt = (to_floats(pose, name) for name in ("lon_deg", "lat_deg", "alt_m"))
-    local = bool(np.isnan(lon).any())
+    local = bool(np.isnan(to_floats(pose, "lon_deg")).any())
     if local:
         place = np.column_stack([to_floats(pose, f"{axis}_m") for axis in "xyz"])
-        lon, lat, alt = geodetic_from_enu(place, datum_deg_m=_ANYWHERE_DEG_M)
-    kept = {name: pose[name] for name in pose.column_names if name in STREAMS[GNSS].names()}
-    fixes = STREAMS[GNSS].table(
-        **kept | {"lon_deg": lon, "lat_deg": lat, "alt_m": alt, "fix_status": np.zeros(pose.num_rows, np.int8)}
-    )
-    tables = {role: table for role, table in streams.tables.items() if role != POSE} | {GNSS: fixes}
-    sensors = {role: sensor for role, sensor in streams.sensors.items() if role != POSE} | {GNSS: streams.sensors[POSE]}
-    return replace(streams, tables=tables, sensors=sensors), local
+        names = ("lon_deg", "lat_deg", "alt_m")
+        geodetic = dict(zip(names, geodetic_from_enu(place, datum_deg_m=_ANYWHERE_DEG_M), strict=True))
+        pose = STREAMS[POSE].table(**{name: pose[name] for name in pose.column_names} | geodetic)
+    sensors = {**streams.sensors, GNSS: streams.sensors[POSE]}
+    return replace(streams, tables={**streams.tables, POSE: pose}, sensors=sensors), local
+
+
+_Named = TypeVar("_Named")
+
+
+def name_pose(value: _Named) -> _Named:
+    """Return findings or facts in which the role of the pose stands for that of the fixes as which it was fused."""
+    named = cast("object", value)
+    if isinstance(value, str):
+        named = POSE if value == GNSS else value
+    elif isinstance(value, Mapping):
+        named = {name_pose(key): name_pose(item) for key, item in value.items()}
+    elif isinstance(value, tuple | list):
+        named = type(value)(name_pose(item) for item in value)
+    elif is_dataclass(value) and not isinstance(value, type):
+        named = replace(value, **{of.name: name_pose(getattr(value, of.name)) for of in fields(value)})
+    return cast("_Named", named)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from tcpipe.fusion.checks.audit import Tally, audit_trajectory
 from tcpipe.fusion.error_state import run_error_state
 from tcpipe.fusion.initial import find_initial_state, find_stationary_intervals
-from tcpipe.fusion.measurements import BodyVelocities, InitialState
+from tcpipe.fusion.measurements import GNSS, BodyVelocities, InitialState
 from tcpipe.fusion.signals import compute_median_period_ns, compute_seconds, hold_last, is_in_gap
 from tcpipe.fusion.trajectory import DISPLACEMENT_LAGS_S, TrackSection, Trajectory, cut_sections, make_track_stamps
 from tcpipe.geometry.datum import geodetic_from_enu
@@ -158,8 +158,8 @@ def make_power_columns(streams: Streams, epoch: int, at_ns: NDArray[np.int64], *
     return dict(zip(("voltage_volt", "current_amp", "power_watt"), values, strict=True))
 
 
-def make_rejections_table(inputs: FusionInputs, found: list[Trajectory]) -> pa.Table:
-    """Return every refused measurement in order of time: by the gate, and those without a usable value."""
+def make_rejections_table(inputs: FusionInputs, found: list[Trajectory], fixes: str = GNSS) -> pa.Table:
+    """Return every refused measurement in order of time: by the gate, and those without a usable value; ``fixes`` is a role's name."""
     parts = [trajectory.rejections for trajectory in found]
     invalid = [(role, np.concatenate(stamps)) for role, stamps in sorted(inputs.invalid_ns.items())]
     size = sum(stamps.size for _, stamps in invalid)
@@ -172,6 +172,7 @@ def make_rejections_table(inputs: FusionInputs, found: list[Trajectory]) -> pa.T
         "threshold": [p.threshold for p in parts] + [unknown],
     }
     joined = {name: np.concatenate(values) for name, values in columns.items()}
+    joined["role"] = np.where(joined["role"] == GNSS, fixes, joined["role"])
     order = np.lexsort((joined["role"], joined["stamp_ns"]))
     return REJECTIONS.table(**{name: values[order] for name, values in joined.items()})
 

@@ -21,7 +21,7 @@ from tcpipe.cost.labels import (
     spans_near,
     touches_voltage_outside,
 )
-from tcpipe.fusion.measurements import GNSS, IMU
+from tcpipe.fusion.measurements import FIXES, IMU
 from tcpipe.fusion.process import estimate_gyro_density
 from tcpipe.fusion.signals import compute_median_period_ns, estimate_white_noise
 from tcpipe.geometry.piecewise_linear import interpolate, mean_between
@@ -171,7 +171,7 @@ def _find_disputed(cut: pa.Table, info: TrackInfo) -> NDArray[np.bool_]:
         (e.clock_epoch, e.start_ns, e.end_ns) for e in (facts.audit.disagreements if facts.audit else ()) if not e.alone
     ]
     for section in facts.fuse.stretches if facts.fuse else ():
-        times += [(section.clock_epoch, r.start_ns, r.end_ns) for r in section.gate_resets if r.role == GNSS]
+        times += [(section.clock_epoch, r.start_ns, r.end_ns) for r in section.gate_resets if r.role in FIXES]
     disputed = np.zeros(cut.num_rows, dtype=np.bool_)
     for of_epoch, first_ns, last_ns in times:
         disputed |= (epoch == of_epoch) & (start_ns <= last_ns) & (end_ns >= first_ns)

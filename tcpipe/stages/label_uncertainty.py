@@ -10,7 +10,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from tcpipe.cost.labels import SensorError
-from tcpipe.fusion.measurements import GNSS, VISUAL, WHEELS
+from tcpipe.fusion.measurements import FIXES, VISUAL, WHEELS
 from tcpipe.motion.row_sections import find_runs, number_pieces
 from tcpipe.motion.uncertainty import find_common_scale_std
 from tcpipe.power.audit import (
@@ -147,8 +147,8 @@ def compute_common_displacement_std_m(cut: pa.Table, facts: StageFacts) -> Float
     return scale_std * to_floats(cut, "chord_m")
 
 
-_MOTION = {GNSS: ("gnss", "pose"), WHEELS: ("wheel_odometry",), VISUAL: ("visual_odometry",)}
-"""Tables of each independent sensor of motion."""
+_MOTION = (*FIXES, WHEELS, VISUAL)
+"""Roles of the independent sensors of motion."""
 
 
 def count_confirming_sensors(cut: pa.Table, streams: Streams, facts: StageFacts) -> NDArray[np.int32]:
@@ -156,13 +156,8 @@ def count_confirming_sensors(cut: pa.Table, streams: Streams, facts: StageFacts)
     start_ns, end_ns = to_integers(cut, "start_ns"), to_integers(cut, "end_ns")
     epoch = int(to_integers(cut, "clock_epoch")[0])
     count = np.zeros(cut.num_rows, dtype=np.int32)
-    for sensor, tables in _MOTION.items():
-        stamps = [
-            to_integers(select_rows(streams.tables[name], "clock_epoch", epoch), "stamp_ns")
-            for name in tables
-            if name in streams.tables
-        ]
-        stamp_ns = np.sort(np.concatenate([*stamps, np.empty(0, np.int64)]))
+    for sensor in (role for role in _MOTION if role in streams.tables):
+        stamp_ns = np.sort(to_integers(select_rows(streams.tables[sensor], "clock_epoch", epoch), "stamp_ns"))
         confirms = np.searchsorted(stamp_ns, end_ns, side="right") > np.searchsorted(stamp_ns, start_ns, side="left")
         fused = [
             (section.start_ns, section.end_ns)

@@ -10,7 +10,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from tcpipe.errors import FusionError
-from tcpipe.fusion.measurements import DOPPLER, GNSS, VISUAL, WHEELS, BodyVelocities, Measurements, Positions
+from tcpipe.fusion.measurements import DOPPLER, FIXES, GNSS, VISUAL, WHEELS, BodyVelocities, Measurements, Positions
 from tcpipe.fusion.withheld import (
     CHORDS_S,
     END_S,
@@ -26,7 +26,7 @@ from tcpipe.geometry.datum import enu_from_geodetic, geodetic_from_enu
 from tcpipe.progress import step
 from tcpipe.recipe import FuseConfig
 from tcpipe.stages.fuse import fuse_run
-from tcpipe.stages.fuse_inputs import FusionInputs, convert_pose_to_fixes, find_longest_epoch, prepare_inputs
+from tcpipe.stages.fuse_inputs import FusionInputs, find_longest_epoch, prepare_inputs, prepare_pose
 from tcpipe.tables.arrays import number_column, select_rows
 from tcpipe.tables.columns import FloatColumns, to_integers
 from tcpipe.tables.facts import MountingFacts
@@ -75,7 +75,7 @@ def compare_withheld(streams: Streams, config: FuseConfig, *, run_id: str) -> Wi
     ------
     FusionError : no sensor measures motion.
     """
-    streams, _ = convert_pose_to_fixes(streams)
+    streams, _ = prepare_pose(streams)
     inputs = prepare_inputs(streams, config)
     if not inputs.measurements:
         raise FusionError(f"{run_id}: no sensor measures motion")
@@ -105,7 +105,7 @@ def _compare_role(run: _Run, role: str, length_s: float, windows_ns: Ints) -> It
     step(f"fusing without {role} for {len(windows_ns)} x {length_s:.0f} s")
     track = run.fuse(withhold(run.streams, role, run.epoch, windows_ns))
     facts = track.info.report.facts
-    if role == GNSS and facts.sensor_checks is not None and role in facts.sensor_checks.excluded:
+    if role == GNSS and facts.sensor_checks is not None and not facts.sensor_checks.excluded.keys().isdisjoint(FIXES):
         raise FusionError("tcpipe excludes the other fixes of the run")
     rows = _select_rows(track, run.epoch)
     moving = np.array([rows.measure_length_m(*window) >= LEAST_WINDOW_M for window in windows_ns])
@@ -133,7 +133,7 @@ def withhold(streams: Streams, role: str, epoch: int, windows_ns: Ints) -> Strea
         inside = np.searchsorted(windows_ns[:, 0], stamp_ns, "right") > np.searchsorted(windows_ns[:, 1], stamp_ns)
         return table.filter(number_column(~(inside & (to_integers(table, "clock_epoch") == epoch))))
 
-    without = (GNSS, DOPPLER) if role == GNSS else (role,)
+    without = (*FIXES, DOPPLER) if role == GNSS else (role,)
     return replace(
         streams, tables={name: keep(table) if name in without else table for name, table in streams.tables.items()}
     )

@@ -104,7 +104,7 @@ class GateReset:
 
 @dataclass(frozen=True, slots=True)
 class ChangeFacts:
-    """A change that explains a contradiction: its kind (offset, wander, antenna, clock, gyroscope, scale, pose, useless), sensor and span.
+    """A change that explains a contradiction: its kind (a key of `tcpipe.stages.fuse_findings.CHANGES`), sensor and span.
 
     ``size``: median innovation of fixes there [m]; 0 of another sensor.
     """

@@ -155,7 +155,7 @@ COMMAND = _make_stream_schema(
 
 POSE = _make_stream_schema(
     "pose",
-    "Positions from SLAM or post-processing, used in place of GNSS.",
+    "Positions and attitudes from SLAM or post-processing, used in place of GNSS.",
     *(Column(f"{axis}_m", _F64, "m", f"position, {axis}, as recorded", "pose_crs or its own") for axis in "xyz"),
     _make_nullable("lon_deg", "deg", "longitude; null without a CRS", "gnss_crs"),
     _make_nullable("lat_deg", "deg", "latitude; null without a CRS", "gnss_crs"),
@@ -164,6 +164,11 @@ POSE = _make_stream_schema(
         _make_nullable(f"{name}_var_m2", "m2", f"variance along {axis}; null where none is given", "")
         for name, axis in (("east", "x"), ("north", "y"), ("up", "z"))
     ),
+    *(
+        _make_nullable(f"quat_{c}", "1", f"frame_from_sensor, {c}; null where unknown", "pose_crs or its own")
+        for c in "xyzw"
+    ),
+    *(_make_nullable(f"rotation_{axis}_var", "rad2", f"variance about {axis}; null where unknown") for axis in "xyz"),
 )
 
 STREAMS: dict[str, TableSchema] = {

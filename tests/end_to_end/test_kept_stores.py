@@ -20,7 +20,7 @@ from tcpipe.errors import DatasetError, StoreError, UsageError
 from tcpipe.formats.integrity import seal_document, write_sealed
 from tcpipe.formats.json_files import to_json
 from tcpipe.formats.maps.map_files import open_map
-from tcpipe.formats.place import DirectoryPlace
+from tcpipe.formats.place import Place
 from tcpipe.pipeline import migrate as migrating
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.explain import explain
@@ -256,7 +256,7 @@ def test_a_migration_that_is_killed_at_any_step_is_gone_on_with(untouched, tmp_p
         left[0] -= 1
 
     for name in ("put", "put_new", "put_files", "delete"):
-        monkeypatch.setattr(DirectoryPlace, name, _after(step, getattr(DirectoryPlace, name)))
+        monkeypatch.setattr(Place, name, _after(step, getattr(Place, name)))
     for steps in range(200):
         left[0] = steps
         with suppress(_Killed):

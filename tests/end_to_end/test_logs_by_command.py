@@ -173,9 +173,11 @@ def test_shares_of_a_folder_and_parts_of_a_bag(tmp_path):
     shutil.copy(tmp_path / "logs" / "run0.mcap", tmp_path / "logs" / "bag" / "bag_1.mcap")
     shares = [tcpipe("ingest", "logs", "--shard", f"{index}/2", "--json", cwd=tmp_path) for index in (1, 2)]
     assert [share.returncode for share in shares] == [0, 0]
-    logs = [{result["log"] for result in told(share)["results"]} for share in shares]
-    assert not logs[0] & logs[1]
-    assert {log.rsplit("/", 1)[1] for log in logs[0] | logs[1]} == {"run0.mcap", "run1.mcap", "bag"}
+    logs = [
+        {result["log"].rsplit("/", 1)[1]: result["status"] for result in told(share)["results"]} for share in shares
+    ]
+    assert logs[0] == dict.fromkeys(["bag", "run1.mcap", "run0.mcap"], "done"), "nobody had begun the other share"
+    assert logs[1] == {"run0.mcap": "unchanged"}
     part = tcpipe("ingest", "logs/bag/bag_1.mcap", cwd=tmp_path)
     assert f"is one of the 2 parts of the ROS 2 bag {tmp_path / 'logs' / 'bag'}" in plain_lines(part, 2, most=1)
 

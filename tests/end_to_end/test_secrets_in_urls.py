@@ -12,9 +12,9 @@ from installed_command import plain_lines, tcpipe, told
 from written_bytes import written_bytes
 
 from tcpipe.errors import LogError, TcpipeError, UsageError, hide_secrets
-from tcpipe.formats.bucket import open_place
 from tcpipe.formats.dataset_files import read_samples
 from tcpipe.formats.logs.log_file import open_log
+from tcpipe.formats.place import open_place
 from tcpipe.simulation import simulate
 from tcpipe.store import Store
 

@@ -2,22 +2,29 @@
 
 import importlib
 import logging
+import multiprocessing
 import os
 import time
 from collections.abc import Iterator
-from contextlib import closing
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from contextlib import closing, contextmanager
+from pathlib import Path
 
 import pytest
 
 pytest.importorskip("distributed", reason="the extra cluster is not installed")
 
-from dask_cluster import DaskCluster, dask_cluster, die_once, spend, wants_more, where
+from dask_cluster import DaskCluster, dask_cluster, die, die_once, spend, wants_more, where
+from distributed import Client
+from wheel_drives import START_NS, drive_at
 
 import tcpipe
 from tcpipe import execution
 from tcpipe.errors import TcpipeError, UsageError
 from tcpipe.execution import read_cluster_cpu_s, run_all
+from tcpipe.pipeline.ingest import ingest
 from tcpipe.progress import STEP, Step, step_of
+from tcpipe.recipe import Recipe
 
 
 @pytest.fixture(scope="module")
@@ -112,10 +119,14 @@ def test_a_scheduler_that_is_not_there_is_one_line(monkeypatch):
 
 
 def test_a_scheduler_without_workers_is_one_line(tmp_path, monkeypatch):
-    monkeypatch.setattr(execution, "_ANSWER_S", 4)
-    monkeypatch.setattr(execution, "_ALONE_S", 1)
-    with dask_cluster(tmp_path, workers=0) as lonely, pytest.raises(UsageError, match="the scheduler has no workers"):
-        list(run_all(where, [1], jobs=1, cluster=lonely.address))
+    assert execution._ANSWER_S <= 10, "with what Python takes to start, a report after 15 s"
+    monkeypatch.setattr(execution, "_ANSWER_S", 2)
+    with dask_cluster(tmp_path, workers=0) as lonely, Client(lonely.address, set_as_default=False) as client:
+        for cluster in (lonely.address, client.get_executor()):
+            with pytest.raises(
+                UsageError, match=r"no workers after 2 s; start one: dask worker tcp://\S+ --nthreads 1"
+            ):
+                list(run_all(where, [1], jobs=1, cluster=cluster))
 
 
 def test_workers_that_stay_away_and_a_scheduler_that_goes_are_one_line(tmp_path, monkeypatch, caplog):
@@ -136,3 +147,68 @@ def test_workers_that_stay_away_and_a_scheduler_that_goes_are_one_line(tmp_path,
             brief.scheduler.kill()
             with pytest.raises(TcpipeError, match="the scheduler stopped; start it and run the same command again"):
                 next(outcomes)
+
+
+@contextmanager
+def submitit_executor(folder):
+    submitit = pytest.importorskip("submitit", reason="submitit is not installed")
+    yield submitit.LocalExecutor(folder / "submitit")
+
+
+@contextmanager
+def dask_executor(folder):
+    with dask_cluster(folder, workers=1) as cluster, Client(cluster.address, set_as_default=False) as client:
+        yield client.get_executor()
+
+
+EXECUTORS = {
+    "threads": lambda _: ThreadPoolExecutor(2),
+    "processes": lambda _: ProcessPoolExecutor(2, mp_context=multiprocessing.get_context("spawn")),
+    "forked": lambda _: ProcessPoolExecutor(2, mp_context=multiprocessing.get_context("fork")),
+    "dask": dask_executor,
+    "submitit": submitit_executor,
+}
+
+
+@pytest.fixture(params=EXECUTORS)
+def executor(request, tmp_path, monkeypatch):
+    """Executors of all kinds, whose workers find the tasks of tests."""
+    monkeypatch.setenv(
+        "PYTHONPATH", os.pathsep.join([str(Path(__file__).parents[1]), os.environ.get("PYTHONPATH", "")])
+    )
+    with EXECUTORS[request.param](tmp_path) as running:
+        yield running
+
+
+def test_any_executor_does_all_tasks_and_what_they_say_is_said_here_once(executor, caplog, monkeypatch):
+    monkeypatch.setattr(logging.getLogger("tcpipe"), "disabled", False)
+    with caplog.at_level(logging.INFO, "tcpipe"):
+        outcomes = sorted(run_all(where, range(3), jobs=1, cluster=executor), key=lambda outcome: outcome.index)
+    assert [outcome.result[0] for outcome in outcomes] == [0, 1, 4]
+    said = [record.getMessage() for record in caplog.records if record.name == "tcpipe" and not step_of(record)]
+    assert sorted(said) == [f"task {n}" for n in range(3)]
+
+
+def test_any_executor_ingests_the_bytes_that_this_process_does(executor, tmp_path):
+    for number in range(2):
+        drive_at(tmp_path / "logs" / f"{number}.mcap", seed=number, start_ns=START_NS + number * 10**13)
+    found = ingest([tmp_path / "logs"], store=tmp_path / "there", recipe=Recipe(), cluster=executor)
+    assert [result.status for result in found.results] == ["done", "done"]
+    ingest([tmp_path / "logs"], store=tmp_path / "here", recipe=Recipe())
+    there, here = (
+        {path.name: path.read_bytes() for path in (tmp_path / store / "runs").rglob("*.parquet")}
+        for store in ("there", "here")
+    )
+    assert there == here
+
+
+def test_a_task_whose_worker_died_is_named_and_a_stopped_executor_is_one_line(tmp_path, caplog, monkeypatch):
+    monkeypatch.setattr(logging.getLogger("tcpipe"), "disabled", False)
+    processes = ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn"))
+    with processes:
+        assert [outcome.died for outcome in run_all(die, [1, 2], jobs=1, cluster=processes)] == [True, True]
+    assert "executor ProcessPoolExecutor: a task ended without a result (BrokenProcessPool: " in caplog.text
+    with ThreadPoolExecutor(1) as threads:
+        pass
+    with pytest.raises(TcpipeError, match="executor ThreadPoolExecutor: takes no tasks"):
+        list(run_all(where, [1], jobs=1, cluster=threads))

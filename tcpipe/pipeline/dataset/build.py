@@ -14,8 +14,8 @@ from pathlib import Path
 from tcpipe import __version__
 from tcpipe.cost.labels import format_budget
 from tcpipe.errors import DatasetError, MissingFileError, RecipeError, StoreError, UsageError, clean_lines
+from tcpipe.execution import Executor
 from tcpipe.formats.atomic import check_local_output, clear_beside, write_atomic_directory, write_text
-from tcpipe.formats.bucket import open_place
 from tcpipe.formats.bucket_directories import fetch_directory_by_range, find_newest
 from tcpipe.formats.commits import CallRecord, Dataset, Entries
 from tcpipe.formats.dataset_card import DatasetCard, group_dataset_findings
@@ -42,7 +42,7 @@ from tcpipe.formats.json_files import digest, write_json
 from tcpipe.formats.maps.map_files import MapFile
 from tcpipe.formats.object_storage import is_url, make_absolute
 from tcpipe.formats.parquet import ROWS_PER_GROUP, write_parquet_rows
-from tcpipe.formats.place import DirectoryPlace
+from tcpipe.formats.place import Place, open_place
 from tcpipe.formats.recipe_toml import resolve_recipe
 from tcpipe.formats.run_documents import SPOOL
 from tcpipe.motion.distance_breakdown import KEPT
@@ -330,10 +330,12 @@ def _read_card_in_place(place: Path) -> tuple[DatasetCard | None, bool]:
 
 
 @contextmanager
-def _start_workers(directory: Path, store: Store, inputs: str, *, jobs: int, cluster: str | None) -> Iterator[Workers]:
+def _start_workers(
+    directory: Path, store: Store, inputs: str, *, jobs: int, cluster: str | Executor | None
+) -> Iterator[Workers]:
     """Yield the workers; their spool is in the new directory, or in the store, which a cluster's workers see."""
     if cluster is None:
-        yield Workers(jobs, None, DirectoryPlace(directory / SPOOL), DirectoryPlace(directory))
+        yield Workers(jobs, None, Place(directory / SPOOL), Place(directory))
         return
     waiting = store.place.below(f"{SPOOL}/{inputs}")
     try:

@@ -42,7 +42,7 @@ from tcpipe.formats.dataset_files import (
 from tcpipe.formats.finding_lines import format_mixed_groups
 from tcpipe.formats.maps.map_files import MapFile, open_map
 from tcpipe.formats.parquet import add_geo_metadata, map_table, read_table_bytes, write_pieces, write_table_bytes
-from tcpipe.formats.place import DirectoryPlace, Place
+from tcpipe.formats.place import Place
 from tcpipe.formats.recipe_toml import load_profiles
 from tcpipe.formats.stored_runs import RunDirectory
 from tcpipe.formats.zarr_arrays import Compression
@@ -412,7 +412,7 @@ def _write_shard(drawer: Drawer) -> TcpipeError | None:
 
 def _copy_shards(out: Place, directory: Path) -> None:
     """Copy the shards into the new directory, one at a time, if workers wrote them elsewhere."""
-    if out == DirectoryPlace(directory):
+    if out == Place(directory):
         return
     for entry in out.entries():
         (directory / entry.name).parent.mkdir(parents=True, exist_ok=True)

@@ -18,7 +18,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from tcpipe.errors import TcpipeError
-from tcpipe.execution import run_all, unwrap_result
+from tcpipe.execution import Executor, run_all, unwrap_result
 from tcpipe.formats.bucket_directories import FetchedShards
 from tcpipe.formats.dataset_files import LayerPixels
 from tcpipe.formats.json_files import parse_typed_json, to_compact_json
@@ -60,10 +60,10 @@ MapPlaces = Callable[[], tuple[tuple[Path, FetchedShards | None], ...]]
 
 @dataclass(frozen=True, slots=True)
 class Workers:
-    """Local processes, or the workers of the Dask scheduler at an address; they see both places."""
+    """Local processes, or the workers of a Dask scheduler or an executor; they see both places."""
 
     jobs: int
-    cluster: str | None
+    cluster: str | Executor | None
     waiting: Place
     """The spool."""
     out: Place

@@ -11,7 +11,6 @@ from storage_server import object_store
 
 from tcpipe.errors import StoreError
 from tcpipe.formats import commit_log
-from tcpipe.formats.bucket import BucketPlace
 from tcpipe.formats.commit_log import Stamp, put_commit, read_commit, read_state, refresh
 from tcpipe.formats.commits import (
     Begun,
@@ -29,7 +28,7 @@ from tcpipe.formats.commits import (
     compact_state,
     fold,
 )
-from tcpipe.formats.place import DirectoryPlace
+from tcpipe.formats.place import Place
 from tcpipe.tables.findings import Finding, Subject
 
 STAMP = Stamp(Process("lab", "m", "b", "n", 1, "2"), "2026-11-24T00:00:00.000+00:00")
@@ -38,12 +37,12 @@ STAMP = Stamp(Process("lab", "m", "b", "n", 1, "2"), "2026-11-24T00:00:00.000+00
 @pytest.fixture(params=["directory", "bucket"])
 def place(request, tmp_path, monkeypatch):
     if request.param == "directory":
-        yield DirectoryPlace(tmp_path / "store")
+        yield Place(tmp_path / "store")
         return
     (tmp_path / "served" / "tests").mkdir(parents=True)
     with object_store(tmp_path / "served") as (environment, _):
         in_environment(monkeypatch, environment, tmp_path / "cache")
-        yield BucketPlace("s3://tests/store")
+        yield Place("s3://tests/store")
 
 
 def saw(number):
@@ -160,9 +159,9 @@ def test_of_two_writers_none_loses_anything_and_the_second_is_asked_again(place)
 
 def test_many_writers_lose_nothing(tmp_path):
     program = (
-        "import sys; from pathlib import Path; from tcpipe.formats.place import DirectoryPlace\n"
+        "import sys; from pathlib import Path; from tcpipe.formats.place import Place\n"
         "from tcpipe.formats.commits import *; from tcpipe.formats.commit_log import *\n"
-        "place, who = DirectoryPlace(Path(sys.argv[1])), Process('lab', 'm', 'b', 'n', int(sys.argv[2]), '')\n"
+        "place, who = Place(Path(sys.argv[1])), Process('lab', 'm', 'b', 'n', int(sys.argv[2]), '')\n"
         "state = read_state(place)\n"
         "for n in range(30):\n"
         "    of = Entries(seen=(LogSnapshot((sys.argv[2],), ((n, 1),), '0'),))\n"
@@ -170,7 +169,7 @@ def test_many_writers_lose_nothing(tmp_path):
     )
     writers = [subprocess.Popen([sys.executable, "-c", program, str(tmp_path), str(by)]) for by in range(3)]
     assert [writer.wait(timeout=120) for writer in writers] == [0, 0, 0]
-    state = read_state(DirectoryPlace(tmp_path))
+    state = read_state(Place(tmp_path))
     assert (state.number, state.problems) == (90, ())
     assert {log: len(seen) for log, seen in state.seen.items()} == {"0": 30, "1": 30, "2": 30}
 
@@ -181,7 +180,7 @@ class _Killed(BaseException):
 
 def test_killed_at_any_put_the_log_is_whole(tmp_path, monkeypatch):
     monkeypatch.setattr(commit_log, "_EVERY", 2)
-    place, real, left = DirectoryPlace(tmp_path), DirectoryPlace.put_new, [0]
+    place, real, left = Place(tmp_path), Place.put_new, [0]
 
     def put_new(self, name, data):
         for act in (lambda: None, lambda: real(self, name, data)):
@@ -191,7 +190,7 @@ def test_killed_at_any_put_the_log_is_whole(tmp_path, monkeypatch):
             left[0] -= 1
         return done
 
-    monkeypatch.setattr(DirectoryPlace, "put_new", put_new)
+    monkeypatch.setattr(Place, "put_new", put_new)
     for steps in range(12):
         left[0] = steps
         with pytest.raises(_Killed):
@@ -206,7 +205,7 @@ def test_a_lost_answer_is_no_second_commit(tmp_path, monkeypatch):
     (tmp_path / "served" / "tests").mkdir(parents=True)
     with object_store(tmp_path / "served") as (environment, fetched):
         in_environment(monkeypatch, environment, tmp_path / "cache")
-        place = BucketPlace("s3://tests/store")
+        place = Place("s3://tests/store")
         fetched.lost = 3
         state = write(place, 2)
         assert (state.number, read_state(place)) == (2, state)
@@ -217,7 +216,7 @@ def test_reading_a_log_in_a_bucket_takes_a_constant_number_of_requests(tmp_path,
     with object_store(tmp_path / "served") as (environment, fetched):
         in_environment(monkeypatch, environment, tmp_path / "cache")
         monkeypatch.setattr(commit_log, "_EVERY", 8)
-        place, counts = BucketPlace("s3://tests/store"), []
+        place, counts = Place("s3://tests/store"), []
         state = State()
         for _ in range(5):
             state = write(place, 16, state)
@@ -240,6 +239,6 @@ def test_a_log_that_cannot_be_written_is_an_error(place, monkeypatch):
 
 
 def test_a_commit_is_readable_json(tmp_path):
-    write(DirectoryPlace(tmp_path), 1)
+    write(Place(tmp_path), 1)
     document = json.loads((tmp_path / "log" / "0000000001.json").read_text())
     assert (document["number"], document["kind"], document["parent"]) == (1, "seen", "")

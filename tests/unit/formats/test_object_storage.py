@@ -118,6 +118,14 @@ def test_a_file_whose_url_is_percent_encoded(tmp_path):
         assert not by_range
 
 
+def test_a_folder_by_its_file_url_is_read_by_range_and_copied(bucket):
+    directory = bucket[0] / "field"
+    with lay_out_objects(directory.as_uri(), wanted=is_log_file, by_range=(".mcap",)) as (copy, by_range):
+        (stored,) = by_range.values()
+        assert bytes(stored.ranges([(0, stored.size_bytes)])[0]) == (directory / "my run.mcap").read_bytes()
+        assert (copy / "bag" / "bag.db3").read_bytes() == (directory / "bag" / "bag.db3").read_bytes()
+
+
 @pytest.mark.parametrize("url", ["gopher://host/run.mcap", "s3://", "s3:///run.mcap"])
 def test_a_url_that_leads_nowhere_is_refused(url):
     with pytest.raises(LogError, match=f"{url}: it cannot be read"):

@@ -10,7 +10,7 @@ from storage_server import object_store
 from wheel_drives import START_NS, drive_at
 
 from tcpipe.errors import StoreError, UsageError
-from tcpipe.formats.bucket import open_place
+from tcpipe.formats.place import open_place
 from tcpipe.pipeline.ingest import ingest
 from tcpipe.pipeline.status import find_status
 from tcpipe.pipeline.verify import verify

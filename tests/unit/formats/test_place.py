@@ -12,9 +12,8 @@ from object_gateway import in_environment
 from storage_server import FORBIDDEN, READ_ONLY, SKEWED, object_store
 
 from tcpipe.errors import StoreError
-from tcpipe.formats.bucket import open_place
 from tcpipe.formats.integrity import Checksum
-from tcpipe.formats.place import Entry, Place
+from tcpipe.formats.place import Entry, Place, open_place
 
 NAMES = ("a.json", "drives of May/ü ñ #1?.json", "runs/100%/track.parquet", "runs/x/[1] & 'two'+~.bin")
 
@@ -165,7 +164,7 @@ def test_a_copy_that_is_not_what_it_should_be_is_no_copy(served: Path) -> None:
 def test_the_cache_is_bounded(served: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     (served / "tests").mkdir()
     monkeypatch.setenv("TCPIPE_CACHE_BYTES", "2500")
-    monkeypatch.setattr("tcpipe.formats.bucket._IN_USE_S", -1.0)
+    monkeypatch.setattr("tcpipe.formats.cache._IN_USE_S", -1.0)
     place = open_place("s3://tests")
     for number in range(5):
         data = bytes([number]) * 1000

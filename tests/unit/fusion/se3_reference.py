@@ -81,7 +81,7 @@ def move(x, tick):
 
 
 def differentiate_motion(x, tick):
-    """Return the Jacobian of the errors after a tick for those before, (39, 39)."""
+    """Return the Jacobian of the errors after a tick for those before, (45, 45)."""
     T, (R, _, u), F = tick.T, split(x), np.eye(state.N)
     th, rho, vel, bg, ba = (slice(k, k + 3) for k in range(0, 15, 3))
     b, a = part(x, state.GYRO_BIAS), part(x, state.ACCELEROMETER_BIAS)
@@ -123,10 +123,24 @@ class Look:
     lever: np.ndarray
 
 
+def compute_attitude(x, look):
+    """Return the attitude that a pose shows, in three parts: frame and robot, its turn since the tick, mountings."""
+    w = look.rate - (part(x, state.GYRO_BIAS) if look.has_gyro else 0.0)
+    turn = exp((look.tau - x[state.FIX_LAG + 6]) * w)
+    return (
+        exp(part(x, state.POSE_FRAME)) @ split(x)[0],
+        turn,
+        exp(part(x, state.MOUNT)) @ exp(part(x, state.POSE_MOUNT)),
+    )
+
+
 def expect(kind, x, look):
-    """Return what a sensor measures."""
+    """Return what a sensor measures; of an attitude the rotation from ``look.lever``."""
     R, p, u = split(x)
     m, w = part(x, state.MOUNT), look.rate - (part(x, state.GYRO_BIAS) if look.has_gyro else 0.0)
+    if kind == state.ATTITUDE:
+        frame, turn, mounted = compute_attitude(x, look)
+        return Rotation.from_matrix(exp(look.lever).T @ frame @ turn @ mounted).as_rotvec()
     if kind in {state.DOPPLER, state.FIX}:
         arm, t = (EYE + skew(m)) @ part(x, state.ARM), look.tau - x[state.FIX_LAG + 6]
         if kind == state.DOPPLER:
@@ -148,8 +162,27 @@ def expect(kind, x, look):
     }[kind]
 
 
+def differentiate_attitude(x, look):
+    """Return the Jacobian of an attitude for the errors, (3, 45)."""
+    H, (_, turn, mounted) = np.zeros((3, state.N)), compute_attitude(x, look)
+    m, c, f = (part(x, place) for place in (state.MOUNT, state.POSE_MOUNT, state.POSE_FRAME))
+    t, w = look.tau - x[state.FIX_LAG + 6], look.rate - (part(x, state.GYRO_BIAS) if look.has_gyro else 0.0)
+    late = mounted.T @ right_jacobian(t * w)
+    H[:, :3], H[:, state.FIX_LAG] = (turn @ mounted).T, -late @ w
+    H[:, state.GYRO_BIAS : state.GYRO_BIAS + 3] = -t * float(look.has_gyro) * late
+    H[:, state.MOUNT : state.MOUNT + 3] = exp(c).T @ right_jacobian(m)
+    H[:, state.POSE_MOUNT : state.POSE_MOUNT + 3] = right_jacobian(c)
+    H[:, state.POSE_FRAME : state.POSE_FRAME + 3] = (split(x)[0] @ turn @ mounted).T @ right_jacobian(f)
+    return np.linalg.inv(right_jacobian(expect(state.ATTITUDE, x, look))) @ H
+
+
 def differentiate_measurement(kind, x, look):
-    """Return the Jacobian of a measurement for the errors, (size, 39)."""
+    """Return the Jacobian of a measurement for the errors, (size, 45)."""
+    return differentiate_attitude(x, look) if kind == state.ATTITUDE else differentiate_other(kind, x, look)
+
+
+def differentiate_other(kind, x, look):
+    """Return the same of what is no attitude."""
     R, _, u = split(x)
     H = np.zeros((3, state.N))
     th, rho, vel, bg = (slice(k, k + 3) for k in (state.THETA, state.RHO, state.U, state.GYRO_BIAS))

@@ -64,14 +64,14 @@ def make_inputs(count, rng, mode=state.INERTIAL, *, noise=0.0, kept=1.0):
         rng.normal(size=(state.KINDS, 3)),
         np.full(count, kept),
         np.full((count, 3), noise),
+        rng.normal(size=(count, 3)),
     )
 
 
 def look_at(inputs, k, kind):
     acceleration = np.array([inputs.acceleration[k], 0.0, 0.0])
-    return reference.Look(
-        inputs.rate[k], bool(inputs.has_gyro[k]), acceleration, inputs.tau[k, kind], inputs.levers[kind]
-    )
+    lever = inputs.attitude[k] if kind == state.ATTITUDE else inputs.levers[kind]
+    return reference.Look(inputs.rate[k], bool(inputs.has_gyro[k]), acceleration, inputs.tau[k, kind], lever)
 
 
 def model_of(free, *, walk=0.0):
@@ -129,6 +129,7 @@ def test_motion_maps_small_errors_by_its_jacobian(mode, seed, free):
 def test_each_measurement_maps_small_errors_by_its_jacobian(kind, seed, free, mode):
     rng = np.random.default_rng(seed)
     x, inputs, model = make_state(rng), make_inputs(1, rng, mode), model_of(free)
+    inputs.attitude[0] = Rotation.from_matrix(x[:9].reshape(3, 3)).as_rotvec()
     look, size = look_at(inputs, 0, kind), state.SIZES[kind]
     wanted = reference.differentiate_measurement(kind, x, look)
     numeric = differentiate(lambda d: reference.expect(kind, reference.plus(x, d), look), state.N)
@@ -203,6 +204,7 @@ class Problem:
         for k in range(ticks):
             for kind in set(range(state.KINDS)) - {state.STATIONARY, state.STATIONARY_RATE}:
                 if k % (2 + kind) == 0:
+                    self.inputs.attitude[k] = Rotation.from_matrix(true[k][:9].reshape(3, 3)).as_rotvec()
                     size = state.SIZES[kind]
                     self.inputs.variance[k, kind, :size] = 0.01**2
                     noise = 0.01 * rng.normal(size=size)

@@ -10,10 +10,10 @@ from object_gateway import in_environment
 from storage_server import object_store
 
 from tcpipe.errors import UsageError
-from tcpipe.formats.bucket import BucketPlace
 from tcpipe.formats.bucket_directories import GENERATIONS, find_newest
 from tcpipe.formats.commit_log import Stamp, put_commit, read_state
 from tcpipe.formats.commits import Entries, Generation, Process, State
+from tcpipe.formats.place import Place
 from tcpipe.pipeline import generations
 from tcpipe.pipeline.generations import write_generation
 
@@ -35,18 +35,18 @@ def place(request, tmp_path, monkeypatch):
     environment = request.getfixturevalue(request.param)
     if request.param == "gateway":
         in_environment(monkeypatch, environment, tmp_path / "cache")
-    return BucketPlace(f"s3://tests/{uuid.uuid4().hex}/a b")
+    return Place(f"s3://tests/{uuid.uuid4().hex}/a b")
 
 
 def write(place, text, card=CARD, more=()):
-    with write_generation(place.url, card) as directory:
+    with write_generation(place.root, card) as directory:
         for name in (card, "data", *more):
             (directory / name).write_text(text)
 
 
 def seen(place):
     """What a reader finds: the card, and the file beside it."""
-    found = find_newest(place.url, [CARD])
+    found = find_newest(place.root, [CARD])
     return found and (found.data.decode(), (found.place.read("data") or b"").decode())
 
 
@@ -76,7 +76,7 @@ def outrun(monkeypatch, place, text):
 
 
 def test_of_two_at_once_the_second_is_the_next_generation_and_nothing_is_mixed(place):
-    with write_generation(place.url, CARD) as mine:
+    with write_generation(place.root, CARD) as mine:
         write(place, "theirs")
         for name in (CARD, "data"):
             (mine / name).write_text("mine")
@@ -142,7 +142,7 @@ def test_killed_at_any_request_nobody_sees_half_and_the_next_call_is_not_blocked
     for name in ("put", "delete"):
         monkeypatch.setattr(obstore, name, killing(getattr(obstore, name)))
     for steps in range(100):
-        each, done = BucketPlace(f"{place.url}/{steps}"), True
+        each, done = Place(f"{place.root}/{steps}"), True
         write(each, "old")
         each.put(f"{GENERATIONS}/0000000001-{'f' * 16}/data", b"of a killed call")
         left[0] = steps
@@ -185,7 +185,7 @@ class Clock:
 
 
 def test_generations_go_a_week_after_they_were_replaced_and_two_stay(served, monkeypatch):
-    place = BucketPlace("s3://tests/x")
+    place = Place("s3://tests/x")
     monkeypatch.setattr(generations, "datetime", Clock(1, 2, 3, 9, 30))
     found = []
     for number in range(1, 6):
@@ -196,7 +196,7 @@ def test_generations_go_a_week_after_they_were_replaced_and_two_stay(served, mon
 
 
 def test_a_reader_asks_as_often_of_many_generations_as_of_one(served):
-    place, state, asked = BucketPlace("s3://tests/x"), State(), set()
+    place, state, asked = Place("s3://tests/x"), State(), set()
     stamp = Stamp(Process("", "", "", "", 0, ""), "2026-11-24T00:00:00+00:00")
     for number in range(1, 70):  # a snapshot is written meanwhile
         built = Generation(f"{GENERATIONS}/{number:010}-{'0' * 16}", CARD, stamp.at)
@@ -204,13 +204,13 @@ def test_a_reader_asks_as_often_of_many_generations_as_of_one(served):
         if number in (1, 2, 69):
             place.put(f"{built.folder}/{CARD}", str(number).encode())
             before = served.requests
-            assert find_newest(place.url, [CARD]).data == str(number).encode()
+            assert find_newest(place.root, [CARD]).data == str(number).encode()
             asked.add(served.requests - before)
     assert asked == {3}
 
 
 def test_what_is_of_another_kind_is_left_alone(served):
-    place = BucketPlace("s3://tests/x")
+    place = Place("s3://tests/x")
     write(place, "a model", card="model.json")
     with pytest.raises(UsageError, match=r"s3://tests/x: contains model.json and no c.json; it is not changed"):
         write(place, "mine")

@@ -10,7 +10,7 @@ from synthetic_store import add_run, lanes, segments, supersede
 
 from tcpipe.errors import UsageError
 from tcpipe.formats.commits import Dataset, Entries
-from tcpipe.formats.place import DirectoryPlace
+from tcpipe.formats.place import Place
 from tcpipe.formats.run_documents import SPOOL
 from tcpipe.pipeline.calls import open_log
 from tcpipe.pipeline.prune import prune
@@ -147,7 +147,7 @@ def test_a_directory_that_a_killed_prune_left_empty_goes_when_it_is_old(store):
 
 
 def test_a_kill_in_the_midst_of_it_leaves_what_no_reader_sees_and_a_later_call_removes(store, monkeypatch):
-    delete, left = DirectoryPlace.delete, [1]
+    delete, left = Place.delete, [1]
 
     def killed(*args):
         if not left[0]:
@@ -156,7 +156,7 @@ def test_a_kill_in_the_midst_of_it_leaves_what_no_reader_sees_and_a_later_call_r
         delete(*args)
 
     with monkeypatch.context() as patch:
-        patch.setattr(DirectoryPlace, "delete", killed)
+        patch.setattr(Place, "delete", killed)
         with pytest.raises(KeyboardInterrupt):
             prune(store=store.root, recipe=Recipe())
     assert ("a", old := old_recipe(store)) not in there(store)
@@ -181,7 +181,7 @@ def test_pixels_of_a_killed_build_go_when_they_are_old(store):
     name = f"{SPOOL}/0123-abcdef01/7.arrow"
     store.place.put(name, b"pixels")
     assert verify(store.root).problems == (
-        f"{store.root / SPOOL}: belongs to a build that is running or was killed; 'tcpipe prune' removes old ones",
+        f"{store.root / SPOOL}: belongs to a call that is running or was killed; 'tcpipe prune' removes old ones",
     )
     prune(store=store.root, recipe=Recipe())
     assert store.place.read(name) == b"pixels"

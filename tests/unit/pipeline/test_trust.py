@@ -21,7 +21,7 @@ from tcpipe.formats.integrity import compute_checksum, find_broken_seal, read_se
 from tcpipe.formats.json_files import to_plain
 from tcpipe.formats.maps.map_facts import MapInputs
 from tcpipe.formats.maps.map_files import open_map
-from tcpipe.formats.place import DirectoryPlace
+from tcpipe.formats.place import Place
 from tcpipe.formats.run_documents import MapDocument, read_as_at
 from tcpipe.pipeline.calls import open_log
 from tcpipe.pipeline.dataset.build import build_dataset
@@ -477,8 +477,8 @@ def test_a_shard_of_another_build_is_refused_though_its_own_checksums_agree(copy
 def test_a_digest_is_found_once_until_the_file_changes(copy, monkeypatch, tmp_path):
     monkeypatch.setenv("TCPIPE_CACHE", str(tmp_path / "cache"))
     dataset, hashed = copy("zarr"), []
-    whole = DirectoryPlace.checksum
-    monkeypatch.setattr(DirectoryPlace, "checksum", lambda place, name: hashed.append(name) or whole(place, name))
+    whole = Place.checksum
+    monkeypatch.setattr(Place, "checksum", lambda place, name: hashed.append(name) or whole(place, name))
     open_dataset(dataset)
     shards = sorted(hashed)
     layers = [f"patches.zarr/{layer}/c/0/0/0" for layer in ("height", "ortho", "terrain")]

@@ -8,8 +8,8 @@ from page_reading import data_of
 from synthetic_store import add_run, add_world, lanes, segments, supersede
 
 from tcpipe.errors import StoreError, UsageError
-from tcpipe.formats.bucket import open_place
 from tcpipe.formats.commits import CallRecord, Entries, Failure
+from tcpipe.formats.place import open_place
 from tcpipe.pipeline import calls
 from tcpipe.pipeline.calls import open_log
 from tcpipe.pipeline.dataset.build import build_dataset

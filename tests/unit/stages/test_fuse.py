@@ -248,7 +248,8 @@ def with_pose(streams, columns):
     kept = {name: fixes[name] for name in fixes.column_names if name in POSE.names()}
     tables = {role: table for role, table in streams.tables.items() if role != "gnss"}
     sensors = {role: of for role, of in streams.sensors.items() if role != "gnss"} | {"pose": streams.sensors["gnss"]}
-    return replace(streams, tables=tables | {"pose": POSE.table(**kept | columns)}, sensors=sensors)
+    unknown = dict.fromkeys((of.name for of in POSE.columns if of.nullable), np.full(fixes.num_rows, np.nan))
+    return replace(streams, tables=tables | {"pose": POSE.table(**unknown | kept | columns)}, sensors=sensors)
 
 
 def test_a_pose_in_a_frame_of_its_own_gives_the_same_drive_and_no_place(streams, track):

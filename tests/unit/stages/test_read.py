@@ -500,6 +500,8 @@ def pose(lon: np.ndarray, lat: np.ndarray) -> tuple[str, pa.Table]:
         "pose.pose.position.x": east,
         "pose.pose.position.y": north,
         "pose.pose.position.z": full(len(lon), 640.0),
+        **xyz("pose.pose.orientation", len(lon)),
+        "pose.pose.orientation.w": full(len(lon), 1.0),
     }
     covariance = cov(len(lon), 6, 0.0004)
     return "geometry_msgs/msg/PoseWithCovarianceStamped", message_table(

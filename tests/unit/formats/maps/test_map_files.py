@@ -13,12 +13,12 @@ from object_gateway import in_environment
 from storage_server import object_store
 
 from tcpipe.errors import MapError
-from tcpipe.formats.bucket import open_place
 from tcpipe.formats.bucket_directories import fetch_files
 from tcpipe.formats.integrity import compute_checksums, write_checksums
 from tcpipe.formats.maps.building import build_map
 from tcpipe.formats.maps.map_facts import MapFacts, MapInputs
 from tcpipe.formats.maps.map_files import SHARD_PX, MapWriter, open_map
+from tcpipe.formats.place import open_place
 from tcpipe.terrain.classes import PAPER_SCHEME
 from tcpipe.terrain.layers import make_paper_layers
 from tcpipe.terrain.target_grid import MapGrid

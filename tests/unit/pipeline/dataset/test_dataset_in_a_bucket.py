@@ -14,8 +14,8 @@ from synthetic_store import add_run, lanes, segments, small_store
 
 import tcpipe
 from tcpipe.errors import StoreError, UsageError
-from tcpipe.formats.bucket import open_place
 from tcpipe.formats.bucket_directories import GENERATIONS
+from tcpipe.formats.place import open_place
 from tcpipe.learning.training import choose_model_kind
 from tcpipe.pipeline.dataset import build as building
 from tcpipe.pipeline.dataset.build import build_dataset

@@ -36,13 +36,13 @@ def many_tasks():
         return pickle.loads(pickle.dumps(what))  # noqa: S301  our own
 
     def elsewhere(function, tasks, _):
-        for index in range(len(tasks)):
-            yield Outcome(index, sent(sent(function)(sent(tasks[index]))))
+        for index, task in tasks:
+            yield Outcome(index, sent(sent(function)(sent(task))))
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(sampling, "_BATCH_ROWS", BATCH_ROWS)
         patch.setattr(dataset_files, "SHARD_ROWS", SHARD_ROWS)
-        patch.setattr(execution, "_run_on_cluster", elsewhere)
+        patch.setattr(execution, "_run_elsewhere", elsewhere)
         yield
 
 
@@ -122,7 +122,7 @@ def test_a_killed_build_goes_on_and_what_is_half_written_does_not_count(made, st
     assert len([path for path in (spool / "files").rglob("*") if path.is_file()]) == 2 * 3, "two shards of three layers"
     assert prune(store=store.root, recipe=Recipe(), dry_run=True).removed == (), "it may be going on"
     found = prune(store=store.root, recipe=Recipe(), dry_run=True, min_age_s=0.0).removed
-    assert {of.what for of in found} == {"left by a killed build"}
+    assert {of.what for of in found} == {"left by a killed call"}
     assert {Path(of.path) for of in found} == {path for path in spool.rglob("*") if path.is_file()}
     build(store.root, tmp_path / "out")
     assert len(sampled) == BATCHES + 3, "nothing is sampled that was there"

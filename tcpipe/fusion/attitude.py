@@ -1,0 +1,115 @@
+"""Attitude of a pose that another program estimated (LIO, SLAM, motion capture), in the ENU plane and in the axes of the robot.
+
+A pose gives position and attitude of its sensor in one frame. Where the frame lies in a CRS, its axes are those of the grid: the positions
+in both frames show the angle between them. A sensor that nothing places is turned as the motion shows it: the robot drives forward, and is
+upright on the whole.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tcpipe.fusion.measurements import UNMEASURED_RAD2, BodyVelocities, Positions
+from tcpipe.geometry.rotation import (
+    invert,
+    matrix_from_quat,
+    multiply,
+    quat_from_matrix,
+    quat_from_rpy,
+    rotate,
+    rotation_vector_from_quat,
+)
+from tcpipe.robust import MEDIAN_OF_SQUARES
+
+Floats = NDArray[np.float64]
+
+STATED_MOUNTING_STD_RAD, UNSTATED_MOUNTING_STD_RAD = 0.0175, 0.1
+_DEFAULT_STD_RAD = 0.01  # scan matching and visual SLAM state none, or any
+_FLOOR_STD_RAD = 0.003
+_FLAT = 1e-6  # of the lowest row of the rotation matrices: a pose in the plane has yaw alone
+_FEWEST = 20  # attitudes, and chords
+_CHORD_NS = 1_000_000_000
+_CHORD_M, _STRAIGHT_RAD = 0.3, 0.1
+_MISSTATED_RAD = 0.25  # slopes that the robot drives along look like half of that
+
+
+def add_attitude(
+    fixes: Positions, frame_m: Floats, quat_xyzw: Floats, variance_rad2: Floats, mounting_xyzw: tuple[float, ...]
+) -> Positions:
+    """Return positions with the attitude of the robot.
+
+    Parameters
+    ----------
+    fixes : positions of a pose in the ENU plane.
+    frame_m : [m], shape (N, 2), the same positions in the frame of the pose.
+    quat_xyzw, variance_rad2 : frame_from_sensor, shape (N, 4), and its variance about the frame's axes, shape (N, 3); NaN where unknown.
+    mounting_xyzw : base_link_from_sensor.
+    """
+    known = np.isfinite(quat_xyzw).all(1)
+    if known.sum() < _FEWEST:
+        return fixes
+    east, frame = (
+        xy[:, 0] + 1j * xy[:, 1] - np.mean(xy[:, 0] + 1j * xy[:, 1]) for xy in (fixes.position_enu_m, frame_m)
+    )
+    grid_north_rad = np.angle(np.sum(east * np.conj(frame)))
+    quat = multiply(multiply(quat_from_rpy(0.0, 0.0, grid_north_rad), quat_xyzw), invert(mounting_xyzw))
+    turns = rotation_vector_from_quat(multiply(invert(quat[known][:-1]), quat[known][1:]))
+    shown = np.median(np.square(np.diff(turns, axis=0)), axis=0) / MEDIAN_OF_SQUARES / 6.0
+    stated = np.where(np.isfinite(variance_rad2), variance_rad2, _DEFAULT_STD_RAD**2)
+    stated[:, :2] = stated[:, :2].mean(1, keepdims=True)  # of roll and pitch, whatever the yaw
+    variance = np.maximum(stated, np.maximum(shown, _FLOOR_STD_RAD**2))
+    if np.ptp(matrix_from_quat(quat_xyzw[known])[:, 2], axis=0).max() < _FLAT:
+        variance[:, :2] = UNMEASURED_RAD2
+    return replace(
+        fixes,
+        quat_xyzw=quat,
+        rotation_variance_rad2=variance,
+        mounting_xyzw=tuple(np.asarray(mounting_xyzw).tolist()),
+        mounting_std_rad=STATED_MOUNTING_STD_RAD,
+    )
+
+
+def align_mounting(fixes: Positions, odometry: BodyVelocities | None, *, is_stated: bool) -> Positions:
+    """Return positions with the attitude of a robot that drives along its x axis, as the odometry tells its sign.
+
+    Where the mounting is stated, only if the motion contradicts it; else without attitude where the robot hardly drives. Source: the TRIAD
+    method, with the direction of motion first and the vertical second (H. D. Black, "A passive system for determining the attitude of a
+    satellite", AIAA Journal 2 (7), 1964).
+    """
+    without = fixes if is_stated else replace(fixes, quat_xyzw=None, rotation_variance_rad2=None)
+    if fixes.quat_xyzw is None:
+        return fixes
+    stamp_ns, quat = fixes.stamp_ns, fixes.quat_xyzw
+    last = np.searchsorted(stamp_ns, stamp_ns + _CHORD_NS)
+    first = np.flatnonzero(last < stamp_ns.size)
+    last = last[first]
+    way = fixes.position_enu_m[last] - fixes.position_enu_m[first]
+    length = np.linalg.norm(way, axis=1)
+    turned = np.linalg.norm(rotation_vector_from_quat(multiply(invert(quat[first]), quat[last])), axis=1)
+    straight = (length > _CHORD_M) & (turned < _STRAIGHT_RAD) & (stamp_ns[last] - stamp_ns[first] < 2 * _CHORD_NS)
+    if straight.sum() < _FEWEST:
+        return without
+    middle = (first + last)[straight] // 2
+    direction = rotate(invert(quat[middle]), way[straight] / length[straight, None])
+    if odometry is not None:
+        forward = np.interp(stamp_ns[middle], odometry.stamp_ns, odometry.velocity_mps[:, 0])
+        direction *= np.sign(forward)[:, None]
+    ahead = np.nanmedian(direction, axis=0)
+    up = np.nanmean(matrix_from_quat(quat)[:, 2], axis=0)
+    aside = np.cross(up, ahead)
+    if np.linalg.norm(aside) < 0.5 * np.linalg.norm(up) or np.linalg.norm(ahead) < 0.5:
+        return without
+    x, y = ahead / np.linalg.norm(ahead), aside / np.linalg.norm(aside)
+    turn = quat_from_matrix(np.stack((x, y, np.cross(x, y))))
+    if is_stated and np.linalg.norm(rotation_vector_from_quat(turn)) < _MISSTATED_RAD:
+        return fixes
+    mounting = tuple(multiply(turn, fixes.mounting_xyzw).tolist())
+    return replace(
+        fixes,
+        quat_xyzw=multiply(quat, invert(turn)),
+        mounting_xyzw=mounting,
+        mounting_std_rad=UNSTATED_MOUNTING_STD_RAD,
+    )
