@@ -6,7 +6,7 @@ BIN := .venv/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 .DEFAULT_GOAL := help
 
-.PHONY: help demo test test-benchmarks test-object-storage test-dagster test-pages test-mutants check check-and-train kernels lock schemas docs release clean
+.PHONY: help demo test test-benchmarks test-object-storage test-dagster test-pages test-mutants check check-and-train kernels compare-peers lock schemas docs release clean
 
 help:
 	@sed -n 's/^#   //p' Makefile
@@ -102,6 +102,16 @@ MUTANTS ?=
 test-mutants: .venv-mutants/installed
 	.venv-mutants/bin/python tests/mutants.py $(MUTANTS)
 
+# tcpipe beside pyins on the same simulated drives (PEERS="--seeds 1" is shorter), whose pandas wants an environment of its own.
+PEERS ?=
+.venv-peers/installed: pyproject.toml
+	$(PYTHON) -m venv .venv-peers
+	.venv-peers/bin/python -m pip --disable-pip-version-check install --quiet --no-compile python-ins==1.0.1 --editable .
+	@touch $@
+
+compare-peers: .venv-peers/installed
+	.venv-peers/bin/python benchmarks/peers.py $(PEERS)
+
 # The locks: hashes, no registry address. Needs uv; run it when pyproject.toml's dependencies change.
 # The one for training holds what PyTorch needs beside itself.
 UV_LOCK := uv pip compile --universal --python-version 3.11 --generate-hashes --no-emit-index-url --no-annotate --no-header --quiet
@@ -135,4 +145,4 @@ release: .venv/installed
 	@ls dist
 
 clean:
-	rm -rf .venv .venv-dagster .venv-docs .venv-pages .venv-mutants build dist tcpipe-demo
+	rm -rf .venv .venv-dagster .venv-docs .venv-pages .venv-mutants .venv-peers build dist tcpipe-demo

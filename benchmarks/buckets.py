@@ -27,7 +27,7 @@ from scale import drive_streams, write_logs
 
 from tcpipe import open_dataset
 from tcpipe.formats.logs.writing import _sort_messages
-from tcpipe.formats.object_storage import connect_store
+from tcpipe.formats.object_storage import split_bucket
 from tcpipe.formats.place import open_place
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.ingest import ingest
@@ -136,7 +136,8 @@ def ingest_camera(bucket, directory, gigabytes=1):
     told = [(at, drive[index].topic, payload) for index, _, payload, at, _ in _sort_messages(drive, "cdr")]
     images = int((told[-1][0] - told[0][0]) / 1e9 * CAMERA_HZ)
     url = f"{bucket}/camera-{gigabytes}.mcap"
-    store, name = connect_store(url)
+    bucket, name = split_bucket(url)
+    store = obstore.store.from_url(bucket, client_options={"allow_http": True})
     with obstore.open_writer(store, name) as writer:
         write_mcap(
             Counting(writer),

@@ -103,7 +103,7 @@ class Errors:
 def errors(streams: Streams, truth: Truth) -> Errors:
     """Fuse and compare, over every section."""
     config = FuseConfig()
-    inputs, _ = drop_implausible_sensors(prepare_inputs(streams, config), streams)
+    inputs = drop_implausible_sensors(prepare_inputs(streams, config), streams)
     parts = []
     for section in cut_sections(inputs.measurements):
         output_ns = make_track_stamps(section, period_ns=50_000_000, max_gap_ns=int(config.max_gap_s * 1e9))

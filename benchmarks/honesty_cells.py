@@ -196,7 +196,7 @@ def _moved_by(reading: Reading, drive: Drive, family: FixError, name: str) -> Re
     return move_fixes(reading, drive, family(drive.truth.at(stamp_ns), drive.noise(name))[row])
 
 
-def _claimed(name: str, std_m: float, family: FixError) -> Callable[[Readings, Drive], Readings]:
+def claim_noise(name: str, std_m: float, family: FixError) -> Callable[[Readings, Drive], Readings]:
     """Return a change of fixes by a family of that standard deviation, which the covariance states beside the white part."""
 
     def change(reading: Reading, drive: Drive) -> Reading:
@@ -210,7 +210,7 @@ def _claimed(name: str, std_m: float, family: FixError) -> Callable[[Readings, D
 def _ordinary_noise(readings: Readings, drive: Drive) -> Readings:
     rng = drive.noise("ordinary")
     std_m, tau_s = rng.uniform(0.008, 0.020), float(np.exp(rng.uniform(*np.log([5.0, 60.0]))))
-    return _claimed("ordinary.fixes", std_m, gauss_markov(std_m, tau_s))(readings, drive)
+    return claim_noise("ordinary.fixes", std_m, gauss_markov(std_m, tau_s))(readings, drive)
 
 
 # What a log says of the antenna, clocks, power
@@ -299,7 +299,7 @@ def _frozen(length_s: float) -> Callable[[Reading, Drive], Reading]:
     return change
 
 
-def _outage(length_s: float, gyro_jump_radps: float = 0.0) -> Callable[[Readings, Drive], Readings]:
+def cut_fixes(length_s: float, gyro_jump_radps: float = 0.0) -> Callable[[Readings, Drive], Readings]:
     def change(readings: Readings, drive: Drive) -> Readings:
         begin_s = _begin_s(drive.seconds(drive.truth.stamp_ns[-1:])[0], length_s, drive.noise("outage"))
 
@@ -397,7 +397,7 @@ def _fault(name: str, role: str, said: str, readings: Callable[[Readings, Drive]
 
 def _noise(name: str, std_m: float, family: FixError) -> Fault:
     """Return another noise of the fixes in place of the ordinary one; it is claimed."""
-    noise = _claimed("noise", std_m, family)
+    noise = claim_noise("noise", std_m, family)
     readings = lambda readings, drive: _ordinary_power(noise(readings, drive), drive)  # noqa: E731
     return Fault(name, route="valley", readings=readings, messages=ORDINARY.messages)
 
@@ -422,7 +422,7 @@ _IN_BOTH = ("all", "no visual")
 _CLEAN_SETS = (*_IN_BOTH, "no wheels", "no IMU", "GNSS, wheels", "GNSS, visual", "no GNSS", "wheels, IMU")
 
 FAULTS: tuple[tuple[Fault, tuple[str, ...]], ...] = (
-    (Fault("white 1.5 cm, exact arm", route="valley", readings=_claimed("noise", 0.0142, gauss_markov(0.0142, 1e-3))), _IN_BOTH),
+    (Fault("white 1.5 cm, exact arm", route="valley", readings=claim_noise("noise", 0.0142, gauss_markov(0.0142, 1e-3))), _IN_BOTH),
     *(
         (_noise(f"noise {cm:g} cm over {tau_s} s", cm / 100, gauss_markov(cm / 100, tau_s)), gate)
         for cm, tau_s, gate in ((0.8, 15, ("all",)), (1.5, 10, _IN_BOTH), (2, 10, _IN_BOTH), (3, 5, _IN_BOTH), (3, 20, ("no visual",)))
@@ -461,9 +461,9 @@ FAULTS: tuple[tuple[Fault, tuple[str, ...]], ...] = (
         (_fault(f"GNSS clock {s:+g} s at half-time", "gnss", _GNSS, alter("gnss", _late_from_half_time(s))), ("all",))
         for s in (0.1, 0.3)
     ),
-    (_fault("60 s outage", "gnss", "", _outage(60.0)), _IN_BOTH),
+    (_fault("60 s outage", "gnss", "", cut_fixes(60.0)), _IN_BOTH),
     *(
-        (_fault(f"60 s outage, gyro jumps by {rate:g} rad/s", "imu", _IMU, _outage(60.0, rate)), gate)
+        (_fault(f"60 s outage, gyro jumps by {rate:g} rad/s", "imu", _IMU, cut_fixes(60.0, rate)), gate)
         for rate, gate in ((0.01, ()), (0.03, _IN_BOTH))
     ),
     (_fault("wheels 0.13 s late", "wheels", _WHEELS, alter("wheels", shift_stamps(0.13))), ("no visual", "GNSS, wheels")),

@@ -69,6 +69,9 @@ SMALLEST = {
     "load_dataset": Smallest("{out} 300", rf"epoch from disk, zstd: {NUMBER} x memmap"),
     "many_runs": Smallest("{out} 3", rf"prune --dry-run, again +{NUMBER} s wall"),
     "path_coverage": Smallest("--train 2 --metres 100 --further 2", rf"energy +1 m: +{NUMBER} %"),
+    "peers": Smallest(
+        "--seeds 1 --length 40 --outage 10 --only white", rf"white +pyins( +{NUMBER}){{3}}", package="pyins"
+    ),
     "physics": Smallest("--metres 100", rf"C_rr grass +{NUMBER} ± +{NUMBER}"),
     "read_logs": Smallest("--minutes 0.05", rf"{NUMBER} of {NUMBER} figures met"),
     "real_data": Smallest("drive={log}", rf"drive, .*blocks .* {NUMBER} J"),

@@ -31,7 +31,7 @@ from tcpipe.formats.commits import State
 from tcpipe.formats.integrity import Checksum, Checksums
 from tcpipe.formats.json_files import parse_json, parse_typed
 from tcpipe.formats.object_storage import is_bucket, is_url
-from tcpipe.formats.place import Place, find_changed_files, find_wrong_files, open_place
+from tcpipe.formats.place import Place, find_changed_files, open_place
 
 CARDS = ("dataset.json", "model.json", "cost-map.json")
 """Documents that prove all files beside them."""
@@ -281,17 +281,11 @@ def _make_subdirectory(directory: Path, url: str) -> Path:
 
 
 def _fetch_one(place: Place, name: str, checksum: Checksum, to: Path) -> None:
-    """Link or copy the cached content of a file to where it is wanted; a cached copy that is not as it was goes and is fetched anew."""
+    """Link or copy the cached content of a file to where it is wanted."""
     to.parent.mkdir(parents=True, exist_ok=True)
-    for _ in range(2):
-        held = place.local(name, checksum)
-        with suppress(FileExistsError):
-            try:
-                os.link(held, to)
-            except OSError:
-                shutil.copyfile(held, to)
-        if not list(find_wrong_files(Place(to.parent), {to.name: checksum})):
-            return
-        held.unlink(missing_ok=True)
-        to.unlink()
-    raise StoreError(f"{place.where(name)}: differs from its card, {checksum.sha256[:12]}…")
+    held = place.proved(name, checksum)
+    with suppress(FileExistsError):
+        try:
+            os.link(held, to)
+        except OSError:
+            shutil.copyfile(held, to)

@@ -443,12 +443,6 @@ def split_bucket(url: str) -> tuple[str, str]:
     return f"{scheme}://{container}", unquote(name) if scheme in _PERCENT_ENCODED else name
 
 
-def connect_store(url: str) -> tuple[ObjectStore, str]:
-    """Return the store, and the name of the object or prefix in it."""
-    container, name = split_bucket(split_url(url)[0])
-    return _connect(container, "", (), is_first=False), name
-
-
 @lru_cache(maxsize=64)
 def _connect(container: str, query: str, settings: tuple[tuple[str, str], ...], *, is_first: bool) -> ObjectStore:
     """Return a bucket, directory or server, once for each setting of the environment; a presigned URL's server gets its query."""

@@ -32,7 +32,7 @@ from tcpipe.formats.atomic import (
     put_file,
 )
 from tcpipe.formats.cache import fetch_cached
-from tcpipe.formats.integrity import ALL_CHANGES, Checksum, find_wrong_checksum
+from tcpipe.formats.integrity import ALL_CHANGES, Checksum, compute_checksum, find_wrong_checksum
 from tcpipe.formats.object_storage import ask_store, is_url, read_modified_ns, run_side_by_side, split_bucket, split_url
 
 if TYPE_CHECKING:
@@ -230,6 +230,17 @@ class Place:
                 raise StoreError(wrong)
 
         return fetch_cached(checksum.sha256, fetch)
+
+    def proved(self, name: str, checksum: Checksum) -> Path:
+        """Return `local`, read again; a copy that is not as it was is fetched anew. `StoreError` if the file is not as it was written."""
+        path = self.local(name, checksum)
+        wrong = find_wrong_checksum(self.where(name), compute_checksum(path) if path.is_file() else None, checksum)
+        if wrong and self.path is None:
+            path.unlink(missing_ok=True)
+            return self.local(name, checksum)
+        if wrong:
+            raise StoreError(f"{wrong}{ALL_CHANGES.format(self.where())}")
+        return path
 
     def map(self, function: Callable[[T], U], items: Sequence[T]) -> list[U]:
         """Return what a function gives for each item, one after another; where it asks a bucket some at once."""

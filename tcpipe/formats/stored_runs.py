@@ -15,7 +15,7 @@ import pyarrow as pa
 from tcpipe.errors import StoreError
 from tcpipe.formats.commits import State
 from tcpipe.formats.index_files import RunFacts
-from tcpipe.formats.integrity import Checksum, compute_checksum, compute_checksums, find_wrong_checksum
+from tcpipe.formats.integrity import Checksum, compute_checksums
 from tcpipe.formats.parquet import read_range, read_table, write_table
 from tcpipe.formats.place import Place
 from tcpipe.formats.recipe_toml import read_key
@@ -72,7 +72,7 @@ class RunDirectory:
 
     def file(self, name: str) -> Path:
         """Return ``track.parquet`` and such on this machine, proved; `StoreError` if it is not as it was written."""
-        return fetch_local_file(self.place, self._name(name), self.checksum(name))
+        return self.place.proved(self._name(name), self.checksum(name))
 
     def table(self, name: str, columns: Sequence[str] | None = None) -> pa.Table:
         """Read ``track``, ``segments`` or ``rejections``, or some of its columns; `StoreError` if it is not as it was written."""
@@ -225,18 +225,6 @@ def put_tables(place: Place, tables: Mapping[str, pa.Table], *, folder: str = ""
 def subdirectory(prefix: str, checksums: Mapping[str, Checksum]) -> dict[str, Checksum]:
     """Return checksums by the names that their files have where ``prefix`` lies."""
     return {f"{prefix}/{name}": of for name, of in checksums.items()}
-
-
-def fetch_local_file(place: Place, name: str, wanted: Checksum) -> Path:
-    """Return a file on this machine, proved; `StoreError` if it is not as it was written."""
-    path = place.local(name, wanted)
-    wrong = find_wrong_checksum(place.where(name), compute_checksum(path) if path.is_file() else None, wanted)
-    if wrong and place.path is None:  # the copy in the cache; a new one is proved when it is made
-        path.unlink(missing_ok=True)
-        return place.local(name, wanted)
-    if wrong:
-        raise StoreError(f"{wrong}; 'tcpipe verify {place.where()}' lists all changed files")
-    return path
 
 
 _LENT = ("imu", "wheel_odometry", "visual_odometry")

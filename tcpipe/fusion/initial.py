@@ -25,12 +25,15 @@ from tcpipe.fusion.signals import (
     compute_interval_means,
     compute_median_of_five,
     compute_seconds,
+    compute_window_means,
     integrate_signal,
     is_covered,
 )
 from tcpipe.geometry.rotation import quat_from_rpy, rotate, rpy_from_quat
 
 Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Plane = NDArray[np.complex128]
 
 _MIN_COURSE_M = 5.0  # driven before course gives yaw (ruling)
 _MIN_COURSE_STD = 10.0  # distance over σ of fixes: yaw to 6°
@@ -43,7 +46,7 @@ _POSED_YAW_STD_RAD = 0.1  # of a pose: its frame, and how its sensor is turned
 _UNKNOWN_YAW_STD_RAD = 0.6  # the sigma points of a wider one would meet behind the robot
 
 
-def find_initial_state(measurements: Measurements, stationary_ns: NDArray[np.int64], start_ns: int) -> InitialState:
+def find_initial_state(measurements: Measurements, stationary_ns: Ints, start_ns: int) -> InitialState:
     """Return the state at ``start_ns`` [ns], the first stamp of a section; ``stationary_ns`` [ns], shape (K, 2), are its stops."""
     bias, bias_std = _estimate_gyro_bias(measurements.imu, stationary_ns)
     roll, pitch, tilt_std = _estimate_tilt(measurements.imu, stationary_ns, start_ns)
@@ -66,7 +69,7 @@ def find_initial_state(measurements: Measurements, stationary_ns: NDArray[np.int
     )
 
 
-def _estimate_gyro_bias(imu: InertialMeasurements | None, stationary_ns: NDArray[np.int64]) -> tuple[Floats, float]:
+def _estimate_gyro_bias(imu: InertialMeasurements | None, stationary_ns: Ints) -> tuple[Floats, float]:
     if imu is None or stationary_ns.size == 0:
         return np.zeros(3), _GYRO_BIAS_STD_RADPS
     inside = (imu.stamp_ns >= stationary_ns[0, 0]) & (imu.stamp_ns <= stationary_ns[0, 1])
@@ -76,11 +79,9 @@ def _estimate_gyro_bias(imu: InertialMeasurements | None, stationary_ns: NDArray
     return mean, max(0.002, imu.gyro_std_radps / np.sqrt(inside.sum()))
 
 
-def _estimate_tilt(
-    imu: InertialMeasurements | None, stationary_ns: NDArray[np.int64], start_ns: int
-) -> tuple[float, float, float]:
+def _estimate_tilt(imu: InertialMeasurements | None, stationary_ns: Ints, start_ns: int) -> tuple[float, float, float]:
     """Roll and pitch [rad] at the start, and their standard deviation."""
-    if imu is None or imu.stamp_ns.size == 0:
+    if imu is None:
         return 0.0, 0.0, 0.2
     stands = stationary_ns.size > 0 and stationary_ns[0, 0] < start_ns + 2_000_000_000
     end = int(stationary_ns[0, 1]) if stands else start_ns + 1_500_000_000
@@ -103,7 +104,7 @@ class _Path:
     def __init__(self, measurements: Measurements, start_ns: int, bias: Floats) -> None:
         self.start_ns = start_ns
         self._yaw_s, self._yaw_rate = _collect_yaw_rate(measurements, start_ns, bias)
-        source = _choose_speed_source(measurements)
+        source = measurements.first_odometry
         self.known = source is not None
         self._lever = np.zeros(2) if measurements.gnss is None else np.asarray(measurements.gnss.lever_arm_m)[:2]
         if source is None:
@@ -122,7 +123,7 @@ class _Path:
         )
         return turned[:, 0]
 
-    def antenna(self, at_s: Floats) -> NDArray[np.complex128]:
+    def antenna(self, at_s: Floats) -> Plane:
         """Antenna east + i north [m] as drawn."""
         antenna = np.asarray(complex(*self._lever) * np.exp(1j * self.yaw(at_s)), np.complex128)
         if self.known:
@@ -150,7 +151,7 @@ def _collect_yaw_rate(measurements: Measurements, start_ns: int, bias: Floats) -
     """Return samples of the yaw rate by the gyroscope, and in its gaps by other sensors."""
     imu = measurements.imu
     other_s, other_rate = _collect_other_yaw_rate(measurements, start_ns)
-    if imu is None or imu.stamp_ns.size == 0:
+    if imu is None:
         return other_s, other_rate
     other_ns = start_ns + np.rint(other_s * 1e9).astype(np.int64)
     missing = ~is_covered(imu.stamp_ns, other_ns, other_ns)
@@ -161,8 +162,8 @@ def _collect_yaw_rate(measurements: Measurements, start_ns: int, bias: Floats) -
 
 
 def _collect_other_yaw_rate(measurements: Measurements, start_ns: int) -> tuple[Floats, Floats]:
-    sources, odometry, gnss = turn_sources(measurements), _choose_speed_source(measurements), measurements.gnss
-    if not sources and odometry is not None and gnss is not None and gnss.stamp_ns.size:
+    sources, odometry, gnss = turn_sources(measurements), measurements.first_odometry, measurements.gnss
+    if not sources and odometry is not None and gnss is not None:
         stamp_s, rate = compute_course_rate(gnss, odometry, start_ns)
         return stamp_s, rate[:, None]
     if not sources:
@@ -172,14 +173,10 @@ def _collect_other_yaw_rate(measurements: Measurements, start_ns: int) -> tuple[
     return compute_seconds(source.stamp_ns[known], start_ns), source.yaw_rate_radps[known, None]
 
 
-def _choose_speed_source(measurements: Measurements) -> BodyVelocities | None:
-    return next((source for source in measurements.odometries().values() if source.stamp_ns.size), None)
-
-
 def _estimate_yaw(measurements: Measurements, path: _Path, start_ns: int, bias_std: float) -> tuple[float, float, str]:
     """Yaw at the start [rad], its standard deviation, and where it is from."""
     own = _read_own_yaw(measurements.imu, start_ns)
-    if measurements.gnss is None or measurements.gnss.stamp_ns.size == 0:
+    if measurements.gnss is None:
         return (0.0, 0.01, "local frame") if own is None else (own, 0.01, "orientation")
     posed = _read_yaw_of_pose(measurements.gnss, path, start_ns)
     fit = _fit_course(measurements.gnss, path, start_ns) if path.known or posed is None else None
@@ -248,7 +245,7 @@ def _fit_course(gnss: Positions, path: _Path, start_ns: int) -> _Fit | None:
     return best
 
 
-def _fit(fixes: NDArray[np.complex128], drawn: NDArray[np.complex128], stamp_s: Floats, noise_m: float) -> _Fit | None:
+def _fit(fixes: Plane, drawn: Plane, stamp_s: Floats, noise_m: float) -> _Fit | None:
     """Lay the drawn path over the fixes by the rotation (and scale) that fits best."""
     a, b = fixes - fixes.mean(), drawn - drawn.mean()
     extent2 = float(np.sum(np.abs(b) ** 2))
@@ -260,7 +257,7 @@ def _fit(fixes: NDArray[np.complex128], drawn: NDArray[np.complex128], stamp_s: 
     return _Fit(float(np.angle(product)), float(std), residual, float(stamp_s.mean()))
 
 
-def _fit_course_to_fixes(fixes: NDArray[np.complex128], turned: Floats, stamp_s: Floats) -> _Fit:
+def _fit_course_to_fixes(fixes: Plane, turned: Floats, stamp_s: Floats) -> _Fit:
     """Without odometry: each step between fixes goes forward, turned back by the yaw turned until then."""
     middle = 0.5 * (turned[1:] + turned[:-1])
     return _Fit(float(np.angle(np.sum(np.diff(fixes) * np.exp(-1j * middle)))), 0.2, 0.0, float(stamp_s.mean()))
@@ -268,7 +265,7 @@ def _fit_course_to_fixes(fixes: NDArray[np.complex128], turned: Floats, stamp_s:
 
 def _position(gnss: Positions | None, path: _Path, quat: Floats, yaw: float) -> tuple[Floats, Floats]:
     """base_link at the start and its standard deviation: the median of the first fixes less the displacement since the start."""
-    if gnss is None or gnss.stamp_ns.size == 0:
+    if gnss is None:
         return np.zeros(3), np.full(3, 1e-3)
     few = slice(0, min(10, gnss.stamp_ns.size))
     at_s = compute_seconds(gnss.stamp_ns[few], path.start_ns)
@@ -296,44 +293,31 @@ _MIN_LENGTH_NS = 600_000_000  # shorter stops do not count
 _MARGIN_NS = 150_000_000  # removed at both ends: rocking
 
 
-def find_stationary_intervals(measurements: Measurements) -> NDArray[np.int64]:
+def find_stationary_intervals(measurements: Measurements) -> Ints:
     """Return when the robot is stationary for certain: first and last stamp of each stay of at least 0.3 s [ns], shape (K, 2), in order.
 
     Empty without wheels or without gyroscope.
     """
     wheels, imu = measurements.wheels, measurements.imu
-    if wheels is None or imu is None or wheels.stamp_ns.size == 0 or imu.stamp_ns.size == 0:
+    if wheels is None or imu is None:
         return np.empty((0, 2), np.int64)
     stamp = wheels.stamp_ns
     # Clipped, so that a single wild sample does not wake the robot.
     clipped = np.clip(wheels.velocity_mps[:, :1], -_MAX_SAMPLE_MPS, _MAX_SAMPLE_MPS)
-    mean, spread = _compute_window_statistics(stamp, stamp, clipped)
-    still = (np.abs(mean[:, 0]) < _MAX_WHEEL_MPS) & (spread[:, 0] < _MAX_WHEEL_SPREAD_MPS)
-    mean, spread = _compute_window_statistics(stamp, imu.stamp_ns, imu.angular_velocity_radps)
+    still = _is_steady(stamp, stamp, clipped, _MAX_WHEEL_MPS, _MAX_WHEEL_SPREAD_MPS)
     quiet = max(_MIN_SPREAD_RADPS, 4 * imu.gyro_std_radps)
-    still &= (np.abs(mean) < _MAX_BIAS_RADPS).all(1) & (spread < quiet).all(1)
+    still &= _is_steady(stamp, imu.stamp_ns, imu.angular_velocity_radps, _MAX_BIAS_RADPS, quiet)
     return _find_intervals(stamp, still)
 
 
-def _compute_window_statistics(
-    at_ns: NDArray[np.int64], stamp_ns: NDArray[np.int64], values: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Mean and standard deviation of (N, k) values within half a window of each stamp; NaN where there are none."""
-    first = np.searchsorted(stamp_ns, at_ns - _WINDOW_NS // 2, "left")
-    last = np.searchsorted(stamp_ns, at_ns + _WINDOW_NS // 2, "right")
-    count = np.where(last > first, last - first, 1)
-    mean, spread = np.empty((2, at_ns.size, values.shape[1]))
-    total = np.zeros(stamp_ns.size + 1)
-    for k, value in enumerate(values.T):  # one by one: a long signal takes room
-        np.cumsum(value, out=total[1:])
-        mean[:, k] = (total[last] - total[first]) / count
-        np.cumsum(value**2, out=total[1:])
-        spread[:, k] = np.sqrt(np.maximum((total[last] - total[first]) / count - mean[:, k] ** 2, 0.0))
-    mean[last == first] = spread[last == first] = np.nan
-    return mean, spread
+def _is_steady(at_ns: Ints, stamp_ns: Ints, values: Floats, largest: float, spread: float) -> NDArray[np.bool_]:
+    """Return whether mean and standard deviation of samples (N, k) around each stamp are small."""
+    mean, square = (compute_window_means(stamp_ns, each, at_ns, _WINDOW_NS) for each in (values, values**2))
+    small: NDArray[np.bool_] = (np.abs(mean) < largest) & (np.sqrt(np.maximum(square - mean**2, 0.0)) < spread)
+    return np.asarray(small.all(axis=1))
 
 
-def _find_intervals(stamp_ns: NDArray[np.int64], still: NDArray[np.bool_]) -> NDArray[np.int64]:
+def _find_intervals(stamp_ns: Ints, still: NDArray[np.bool_]) -> Ints:
     """Find runs of True, not bridged over gaps of half a second, shortened at both ends, the short ones left out."""
     joined = still[1:] & still[:-1] & (np.diff(stamp_ns) < _WINDOW_NS)
     first = np.flatnonzero(still & ~np.concatenate(([False], joined)))
@@ -354,9 +338,7 @@ _WILD = 5.0  # σ off its neighbours' line: fix is bridged
 _TURNS_MPS2 = 2.0  # largest bend of that line in a turn
 
 
-def compute_course_rate(
-    gnss: Positions, odometry: BodyVelocities | None, zero_ns: int
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def compute_course_rate(gnss: Positions, odometry: BodyVelocities | None, zero_ns: int) -> tuple[Floats, Floats]:
     """Return how fast the course over ground turns: stamps [s] from ``zero_ns`` on, twice a second at most, and rates [rad/s].
 
     The course is that of the displacement over a second, or over as many as it takes to exceed the noise of the fixes; in between it turns
@@ -396,9 +378,7 @@ def compute_course_rate(
     return stamp_s, np.concatenate(([0.0], rate, [0.0]))
 
 
-def _bridge_outliers(
-    stamp_s: NDArray[np.float64], places: NDArray[np.complex128], std_m: float
-) -> NDArray[np.complex128]:
+def _bridge_outliers(stamp_s: Floats, places: Plane, std_m: float) -> Plane:
     """Return places [m], shape (N,), those on the line between their neighbours that lie further off it than noise and a turn explain."""
     if places.size < 3:
         return places
@@ -413,12 +393,12 @@ def _bridge_outliers(
     return found
 
 
-def compute_course(velocity_mps: NDArray[np.float64]) -> NDArray[np.float64]:
+def compute_course(velocity_mps: Floats) -> Floats:
     """Return the direction of horizontal velocities (N, 3) [rad], continuous; that before it where the robot hardly moves."""
     moving = np.flatnonzero(np.hypot(velocity_mps[:, 0], velocity_mps[:, 1]) > _MOVING_MPS)
     if moving.size == 0:
         return np.zeros(velocity_mps.shape[0])
     course = np.unwrap(np.arctan2(velocity_mps[moving, 1], velocity_mps[moving, 0]))
     last = np.searchsorted(moving, np.arange(velocity_mps.shape[0]), "right") - 1
-    held: NDArray[np.float64] = course[np.maximum(last, 0)]
+    held: Floats = course[np.maximum(last, 0)]
     return held

@@ -8,6 +8,7 @@ and floored. Rows are sorted by stamp, without repetitions. Both estimators take
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, TypeVar
 
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 
 GNSS, IMU, WHEELS, VISUAL, DOPPLER = "gnss", "imu", "wheel_odometry", "visual_odometry", "gnss_velocity"
 """Roles, as in the rejections table."""
+_FIELDS = {GNSS: "gnss", DOPPLER: "doppler", IMU: "imu", WHEELS: "wheels", VISUAL: "visual"}
 POSE = "pose"
 FIXES = (GNSS, POSE)
 """Roles of positions: a pose is fused as fixes with an attitude."""
@@ -135,9 +137,12 @@ class InertialMeasurements:
     accelerometer_noise_mps2: NDArray[np.float64] | None = None
 
 
+Sensor = Positions | GroundVelocities | InertialMeasurements | BodyVelocities
+
+
 @dataclass(frozen=True, slots=True)
 class Measurements:
-    """All measurements of one section of one clock epoch without a long gap; a role that the log lacks is None.
+    """All measurements of one section of one clock epoch without a long gap; a role without measurements is None.
 
     At least one of ``gnss``, ``wheels`` and ``visual`` is there. ``nonholonomic_std_mps``: sideways and vertical body velocity are
     zero to within this. ``doppler`` goes with ``gnss``, whose antenna it is of.
@@ -150,10 +155,15 @@ class Measurements:
     nonholonomic_std_mps: float = 0.15
     doppler: GroundVelocities | None = None
 
-    def sensors(self) -> dict[str, Positions | GroundVelocities | InertialMeasurements | BodyVelocities]:
+    def sensors(self) -> dict[str, Sensor]:
         """Return the sensors that are there, by role."""
-        every = {GNSS: self.gnss, DOPPLER: self.doppler, IMU: self.imu, WHEELS: self.wheels, VISUAL: self.visual}
+        every = {role: getattr(self, name) for role, name in _FIELDS.items()}
         return {role: sensor for role, sensor in every.items() if sensor is not None}
+
+    def replace_sensors(self, changed: Mapping[str, Sensor | None]) -> Measurements:
+        """Return the measurements with other sensors, by role; None takes one out."""
+        named: dict[str, Any] = {_FIELDS[role]: sensor for role, sensor in changed.items()}
+        return replace(self, **named)
 
     @property
     def has_attitude(self) -> bool:
@@ -170,6 +180,11 @@ class Measurements:
         """Return the odometries that are there, by role; the wheels' first."""
         every = {WHEELS: self.wheels, VISUAL: self.visual}
         return {role: odometry for role, odometry in every.items() if odometry is not None}
+
+    @property
+    def first_odometry(self) -> BodyVelocities | None:
+        """The wheels, else visual odometry."""
+        return self.wheels or self.visual
 
 
 @dataclass(frozen=True, slots=True)
@@ -198,26 +213,16 @@ class InitialState:
     heading_from: str = "unknown"
 
 
-_Source = TypeVar("_Source", Positions, GroundVelocities, BodyVelocities, InertialMeasurements)
+_Source = TypeVar("_Source", bound=Sensor)
 
 
 def select_measurements(whole: Measurements, start_ns: int, end_ns: int) -> Measurements:
     """Return the measurements between two stamps, both included; a sensor without any is None."""
-    return replace(
-        whole,
-        gnss=_select_source(whole.gnss, start_ns, end_ns),
-        doppler=_select_source(whole.doppler, start_ns, end_ns),
-        imu=_select_source(whole.imu, start_ns, end_ns),
-        wheels=_select_source(whole.wheels, start_ns, end_ns),
-        visual=_select_source(whole.visual, start_ns, end_ns),
-    )
-
-
-def _select_source(source: _Source | None, start_ns: int, end_ns: int) -> _Source | None:
-    if source is None:
-        return None
-    rows = slice(*np.searchsorted(source.stamp_ns, (start_ns, end_ns + 1)))
-    return select_rows(source, rows) if rows.stop > rows.start else None
+    found: dict[str, Sensor | None] = {}
+    for role, source in whole.sensors().items():
+        rows = slice(*np.searchsorted(source.stamp_ns, (start_ns, end_ns + 1)))
+        found[role] = select_rows(source, rows) if rows.stop > rows.start else None
+    return whole.replace_sensors(found)
 
 
 def select_rows(source: _Source, rows: slice | NDArray[np.bool_]) -> _Source:

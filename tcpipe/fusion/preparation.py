@@ -11,7 +11,7 @@ the derivative of the position is: then the velocity of a robot that only drives
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,7 +27,13 @@ from tcpipe.fusion.measurements import (
     Positions,
     select_rows,
 )
-from tcpipe.fusion.signals import compute_median_period_ns, compute_seconds, estimate_white_noise, integrate_signal
+from tcpipe.fusion.signals import (
+    compute_median_period_ns,
+    compute_seconds,
+    compute_window_means,
+    estimate_white_noise,
+    integrate_signal,
+)
 from tcpipe.geometry.datum import enu_from_geodetic
 from tcpipe.geometry.rotation import invert, matrix_from_quat, multiply, normalize, rotate, rotation_vector_from_quat
 from tcpipe.robust import estimate_robust_std
@@ -60,6 +66,8 @@ _FEWEST_ROWS = 20  # second differences for velocity scatter
 _SCATTERS_MORE = 3.0
 """Than is claimed: a speed by counts that come only with every other message does, a rough road does not."""
 _MEAN_S = 0.5  # averaging of such a velocity
+_JITTER_S = 0.05  # less does not matter
+_JITTER_STEPS, _JITTER_STEP_S, _JITTER_MPS = 41, 2.0, 0.3  # between fixes: so many together, the longest, the slowest
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,7 +123,7 @@ def prepare_positions(
     """
     lon, lat, alt = columns["lon_deg"], columns["lat_deg"], columns["alt_m"]
     usable, repeated = _select_usable_rows(stamp_ns, _is_fix(lon, lat, alt))
-    variance = np.stack([columns[f"{axis}_var_m2"] for axis in ("east", "north", "up")], -1)[usable]
+    variance = _stack_columns(columns, [f"{axis}_var_m2" for axis in ("east", "north", "up")])[usable]
     default = np.square(default_std_m * np.array([1.0, 1.0, 2.0]))
     unclaimed = np.asarray(~_is_known(variance[:, :2]).all(1))
     variance, replaced = _clean_variances(variance, default, floor_std_m**2)
@@ -160,6 +168,45 @@ def drop_repeated_fixes(gnss: Positions, odometry: BodyVelocities | None) -> tup
     )
     found = (Repeats(int(stamp_ns[first[i]]), int(stamp_ns[last[i]]), int(last[i] - first[i])) for i in frozen)
     return select_rows(gnss, changes), tuple(found)
+
+
+def inflate_jittery_fixes(gnss: Positions, odometry: BodyVelocities) -> tuple[Positions, Floats]:
+    """Return the fixes with variances raised where their stamps jitter, and the standard deviation of the stamps at each [s], (N,).
+
+    Receivers and localization nodes that stamp a fix when they send it make positions that stand still and then leap. The distance between
+    two fixes is compared with that driven by the odometry (times the local ratio of the two, so that slip does not count). What this
+    residual spreads beyond the claimed noise, divided by the speed, is the jitter. It is 0 where it is small or unknown; while the robot is
+    stationary the value of the nearest motion is held. The variance grows by (2 speed jitter)²: such fixes are late by as much as they
+    scatter, and one late fix follows another, so the filter, for which errors are white, must not average them away.
+    """
+    zero = int(gnss.stamp_ns[0])
+    stamp_s, odometry_s = compute_seconds(gnss.stamp_ns, zero), compute_seconds(odometry.stamp_ns, zero)
+    speed = np.abs(odometry.velocity_mps[:, :1])
+    driven_m = np.diff(integrate_signal(odometry_s, speed, stamp_s), axis=0)[:, 0]
+    interval_s = np.diff(stamp_s)
+    moved_m = np.hypot(*np.diff(gnss.position_enu_m[:, :2], axis=0).T)
+    moving = (driven_m > _JITTER_MPS * interval_s) & (interval_s < _JITTER_STEP_S)
+    if moving.sum() < _JITTER_STEPS:
+        return gnss, np.zeros(stamp_s.size)
+    driven_m, moved_m, mean_speed = driven_m[moving], moved_m[moving], driven_m[moving] / interval_s[moving]
+    # A median: neither slip nor an outlying fix is jitter.
+    residual_s = (moved_m - np.median(_make_windows(moved_m / driven_m), axis=1) * driven_m) / mean_speed
+    claimed_s2 = (gnss.variance_m2[:-1, :2].mean(1) + gnss.variance_m2[1:, :2].mean(1))[moving] / 2 / mean_speed**2
+    claimed_s2 = _make_windows(claimed_s2).mean(1)
+    # One outlying fix spoils two pairs: the fourth fifth bears one in ten, yet sees tails that the median does not.
+    spread_s = np.quantile(_make_windows(np.abs(residual_s)), 0.8, axis=1) / 1.2816
+    excess_s2 = spread_s**2 / 2 - claimed_s2
+    matters = excess_s2 > np.maximum(_JITTER_S**2, 4 * claimed_s2)
+    middle_s = (0.5 * (stamp_s[1:] + stamp_s[:-1]))[moving]
+    jitter_s = np.interp(stamp_s, middle_s, np.sqrt(np.where(matters, excess_s2, 0.0)))
+    variance = gnss.variance_m2.copy()
+    variance[:, :2] += ((2 * np.interp(stamp_s, odometry_s, speed[:, 0]) * jitter_s) ** 2)[:, None]
+    return replace(gnss, variance_m2=variance), jitter_s
+
+
+def _make_windows(values: Floats) -> Floats:
+    """Return a window centred on each value, shape (N, 41), the signal mirrored at its ends."""
+    return np.lib.stride_tricks.sliding_window_view(np.pad(values, _JITTER_STEPS // 2, mode="reflect"), _JITTER_STEPS)
 
 
 def prepare_ground_velocities(
@@ -231,7 +278,7 @@ def prepare_body_velocities(
     shown = _estimate_shown_variance(stamp_ns[usable], turned[:, 0], variance[:, 0])
     if shown.any():
         variance = np.maximum(variance, shown[:, None])
-        turned = _compute_moving_mean(stamp_ns[usable], turned)
+        turned = compute_window_means(stamp_ns[usable], turned, stamp_ns[usable], round(1e9 * _MEAN_S))
         findings.append(make_finding("velocity-scatters", subject, mean_s=_MEAN_S))
     if only_forward:
         turned[:, 1:] = np.nan
@@ -261,15 +308,6 @@ def _estimate_shown_variance(stamp_ns: Ints, values: Floats, variance: Floats) -
     if noise > _SCATTERS_MORE * float(np.sqrt(np.median(variance[known]))):
         shown[known] = np.square(_estimate_local_noise(stamp_ns[known], values[known, None]))
     return shown
-
-
-def _compute_moving_mean(stamp_ns: Ints, values: Floats) -> Floats:
-    """Return the mean of the samples (N, k) from a quarter of a second before each to a quarter after."""
-    half_ns = round(_MEAN_S * 0.5e9)
-    first = np.searchsorted(stamp_ns, stamp_ns - half_ns, "left")
-    last = np.searchsorted(stamp_ns, stamp_ns + half_ns, "right")
-    total = np.concatenate((np.zeros((1, values.shape[1])), np.cumsum(values, axis=0)))
-    return np.asarray((total[last] - total[first]) / (last - first)[:, None])
 
 
 def _rotate_vectors(matrix: Floats, values: Floats) -> Floats:
@@ -403,18 +441,6 @@ def _clean_variances(variance: Floats, default: Floats, floor: float) -> tuple[F
     return filled, int((~known).any(1).sum())
 
 
-__all__ = [
-    "Columns",
-    "Prepared",
-    "drop_repeated_fixes",
-    "find_datum",
-    "prepare_body_velocities",
-    "prepare_ground_velocities",
-    "prepare_imu",
-    "prepare_positions",
-]
-
-
 _MAX_INCREMENT_S = 1.0  # longer increments give no velocity
 _MOVED_M = 0.1  # smaller moves may be stationary
 _FEWEST = 20  # increments that identify the twist's axes
@@ -433,22 +459,22 @@ def has_twist(velocity_mps: Floats, pose_m: Floats) -> bool:
     return bool(np.nansum(np.abs(velocity_mps[known])) > 0) or not moves
 
 
-def compute_increments(
-    stamp_ns: NDArray[np.int64], pose_m: Floats, quat_xyzw: Floats
-) -> tuple[NDArray[np.int64], Floats, Floats]:
+def compute_increments(stamp_ns: Ints, pose_m: Floats, quat_xyzw: Floats) -> tuple[Ints, Floats, Floats]:
     """Return stamps, velocity and angular velocity in the child frame, in the middle of each two successive poses."""
-    stamp, position, quat = _select_posed_rows(stamp_ns, pose_m, quat_xyzw)
+    posed = np.isfinite(np.hstack((pose_m, quat_xyzw))).all(axis=1)
+    rows, _ = _select_usable_rows(stamp_ns, np.asarray(posed))
+    stamp, position, quat = stamp_ns[rows], pose_m[rows], quat_xyzw[rows]
     step_ns = np.diff(stamp)
     step_s = np.asarray(step_ns, np.float64)[:, None] * 1e-9
     turn = rotation_vector_from_quat(multiply(invert(quat[:-1]), quat[1:]))
-    velocity = rotate(invert(_interpolate_half_way(quat[:-1], quat[1:])), np.diff(position, axis=0)) / step_s
+    # Half-way between two: the normalized sum of the quaternions of one hemisphere.
+    sign = np.where(np.sum(quat[:-1] * quat[1:], axis=-1, keepdims=True) < 0, -1.0, 1.0)
+    velocity = rotate(invert(normalize(quat[:-1] + sign * quat[1:])), np.diff(position, axis=0)) / step_s
     near = step_s[:, 0] <= _MAX_INCREMENT_S
     return stamp[:-1][near] + step_ns[near] // 2, velocity[near], (turn / step_s)[near]
 
 
-def compute_orientation_rates(
-    stamp_ns: NDArray[np.int64], rate_radps: Floats, quat_xyzw: Floats
-) -> tuple[Floats, NDArray[np.bool_]]:
+def compute_orientation_rates(stamp_ns: Ints, rate_radps: Floats, quat_xyzw: Floats) -> tuple[Floats, Mask]:
     """Return angular velocities, shape (N, 3), and which axes of them are by the orientation, shape (3,).
 
     Those are the axes about which it turns while ``rate_radps``, in the child frame, is missing or zero throughout. ``stamp_ns`` does not
@@ -471,7 +497,7 @@ def compute_orientation_rates(
     return rates, turns
 
 
-def is_along_pose_axes(stamp_ns: NDArray[np.int64], velocity_mps: Floats, pose_m: Floats, quat_xyzw: Floats) -> bool:
+def is_along_pose_axes(stamp_ns: Ints, velocity_mps: Floats, pose_m: Floats, quat_xyzw: Floats) -> bool:
     """Return whether velocities are surely along the axes of the pose's frame: its increments fit them so, and not turned by the pose.
 
     Velocities [m/s] have shape (N, 3), NaN where an axis is not measured.
@@ -497,24 +523,8 @@ def rotate_to_child_axes(velocity_mps: Floats, quat_xyzw: Floats) -> Floats:
     return np.where(np.isfinite(quat_xyzw).all(1, keepdims=True), turned, np.nan)
 
 
-def _compute_misfit(said: Floats, way: Floats, moving: NDArray[np.bool_]) -> float:
+def _compute_misfit(said: Floats, way: Floats, moving: Mask) -> float:
     """Return the share of the squares of a way that a velocity, whatever its scale, leaves unexplained (medians: poses may jump)."""
     size = np.linalg.norm(way[moving], axis=1)
     scale = np.median(np.linalg.norm(said[moving], axis=1) / size)
     return float(np.median(np.sum((said[moving] - scale * way[moving]) ** 2, axis=1) / (scale * size) ** 2))
-
-
-def _select_posed_rows(
-    stamp_ns: NDArray[np.int64], pose_m: Floats, quat_xyzw: Floats
-) -> tuple[NDArray[np.int64], Floats, Floats]:
-    """Return the rows with a pose, in order of time, one a stamp."""
-    posed = np.flatnonzero(np.isfinite(pose_m).all(1) & np.isfinite(quat_xyzw).all(1))
-    _, first = np.unique(stamp_ns[posed], return_index=True)
-    rows = posed[first]
-    return stamp_ns[rows], pose_m[rows], quat_xyzw[rows]
-
-
-def _interpolate_half_way(a: Floats, b: Floats) -> Floats:
-    """Rotation half-way between two: the normalised sum of the quaternions of one hemisphere."""
-    sign = np.where(np.sum(a * b, axis=-1, keepdims=True) < 0, -1.0, 1.0)
-    return normalize(a + sign * b)

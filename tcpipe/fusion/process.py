@@ -191,7 +191,7 @@ def estimate_gyro_density(gyro_std_radps: float, rate_hz: float) -> float:
 
 def _compute_speed(m: Measurements, at_ns: NDArray[np.int64]) -> NDArray[np.float64]:
     """Return about how fast the robot drives [m/s]; 1 where only fixes show it."""
-    source = next(iter(m.odometries().values()), None)
+    source = m.first_odometry
     if source is None:
         return np.ones(at_ns.size)
     return np.abs(_interpolate_density(source.stamp_ns, source.velocity_mps[:, 0], at_ns))

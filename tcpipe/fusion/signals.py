@@ -85,6 +85,18 @@ def compute_median_period_ns(stamp_ns: Ints) -> int:
     return max(1, int(np.median(np.diff(stamp_ns)))) if stamp_ns.size > 1 else 1
 
 
+def compute_window_means(stamp_ns: Ints, values: Floats, at_ns: Ints, window_ns: int) -> Floats:
+    """Return the means of the samples (N, k) within half a window of each stamp, shape (M, k); NaN where there are none."""
+    first = np.searchsorted(stamp_ns, at_ns - window_ns // 2, "left")
+    last = np.searchsorted(stamp_ns, at_ns + window_ns // 2, "right")
+    count = np.where(last > first, (last - first).astype(np.float64), np.nan)
+    mean, total = np.empty((at_ns.size, values.shape[1])), np.zeros(stamp_ns.size + 1)
+    for axis, value in zip(mean.T, values.T, strict=True):  # one by one: a long signal takes room
+        np.cumsum(value, out=total[1:])
+        axis[:] = (total[last] - total[first]) / count
+    return mean
+
+
 def compute_median_of_five(values: Floats) -> Floats:
     """Return the running median of five of a signal (N,), its ends repeated: single outliers vanish."""
     if values.size < 5:

@@ -10,7 +10,6 @@ and pitch are small.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,10 +17,10 @@ from numpy.typing import NDArray
 
 from tcpipe.compiled import compile_kernel
 from tcpipe.fusion import state
-from tcpipe.fusion.densities import FixNoise, NoiseModel
+from tcpipe.fusion.densities import NoiseModel
 from tcpipe.fusion.filter_kernel import Inputs, Memory, Model, Tests
 from tcpipe.fusion.initial import compute_course_rate
-from tcpipe.fusion.measurements import VISUAL, WHEELS, BodyVelocities, InertialMeasurements, Measurements
+from tcpipe.fusion.measurements import VISUAL, WHEELS, BodyVelocities, Measurements
 from tcpipe.fusion.process import (
     DOPPLER_LASTS_S,
     UNSEEN_TURN_RADPS,
@@ -132,9 +131,10 @@ def build_ticks(  # noqa: C901, PLR0915  one array after the other
             put(kind, source.stamp_ns, source.velocity_mps[:, :axes], _make_velocity_variance(m, source, noise, role))
     fix_variance = np.zeros((size, 3))
     if m.gnss is not None:
-        put(state.FIX, m.gnss.stamp_ns, m.gnss.position_enu_m, m.gnss.variance_m2 * _compute_white_shares(noise))
+        white, correlated = _compute_shares(noise)
+        put(state.FIX, m.gnss.stamp_ns, m.gnss.position_enu_m, m.gnss.variance_m2 * white)
         nearest = np.searchsorted(m.gnss.stamp_ns, stamp_ns).clip(0, m.gnss.stamp_ns.size - 1)
-        fix_variance = m.gnss.variance_m2[nearest] * _compute_correlated_shares(noise)
+        fix_variance = m.gnss.variance_m2[nearest] * correlated
     attitude = np.zeros((size, 3))
     if m.gnss is not None and m.gnss.quat_xyzw is not None and m.gnss.rotation_variance_rad2 is not None:
         measured = np.where(np.isfinite(m.gnss.quat_xyzw).all(1), rows[state.FIX], -1)
@@ -188,19 +188,11 @@ def build_ticks(  # noqa: C901, PLR0915  one array after the other
     return Ticks(stamp_ns, inputs, rows, fix_variance)
 
 
-def _compute_white_shares(noise: NoiseModel) -> Floats:
-    """Return the white share of the claimed variance of fixes, east, north, up."""
-    return _make_axes(noise, lambda fix: fix.white_m2 / fix.claimed_m2)
-
-
-def _compute_correlated_shares(noise: NoiseModel) -> Floats:
-    """Return the share of their correlated error, east, north, up."""
-    return _make_axes(noise, lambda fix: fix.correlated.variance / fix.claimed_m2)
-
-
-def _make_axes(noise: NoiseModel, compute: Callable[[FixNoise], float]) -> Floats:
-    axes = (noise.horizontal, noise.horizontal, noise.vertical)
-    return np.array([0.0 if axis is None else compute(axis) for axis in axes])
+def _compute_shares(noise: NoiseModel) -> tuple[Floats, Floats]:
+    """Return white and correlated share of the claimed variance of fixes, each east, north, up."""
+    axes = [fix for fix in (noise.horizontal, noise.horizontal, noise.vertical) if fix is not None]
+    shares = np.array([(fix.white_m2 / fix.claimed_m2, fix.correlated.variance / fix.claimed_m2) for fix in axes])
+    return shares[:, 0], shares[:, 1]
 
 
 def _make_fix_process(noise: NoiseModel, variance_m2: Floats, period_s: float) -> tuple[Floats, Floats]:
@@ -338,20 +330,17 @@ def _compute_slope(source: BodyVelocities, stamp_ns: Ints) -> Floats:
 def _find_turn_rates(m: Measurements, before_ns: Ints, after_ns: Ints, zero_ns: int) -> tuple[Floats, NDArray[np.int8]]:
     """Return the mean angular velocity over each interval by the best source that covers it, and the mode of motion that goes with it."""
     imu = m.imu
-    if imu is None or imu.stamp_ns.size == 0:
+    if imu is None:
         return _compute_odometric_turn_rate(m, before_ns, after_ns, zero_ns)
     covered = is_covered(imu.stamp_ns, before_ns, after_ns)
     rate, mode = np.zeros((before_ns.size, 3)), np.full(before_ns.size, state.GYRO_TURN, np.int8)
-    rate[covered] = _compute_means(imu, before_ns[covered], after_ns[covered], zero_ns)
+    rate[covered] = compute_interval_means(
+        compute_seconds(imu.stamp_ns, zero_ns),
+        imu.angular_velocity_radps,
+        *(compute_seconds(each[covered], zero_ns) for each in (before_ns, after_ns)),
+    )
     rate[~covered], mode[~covered] = _compute_odometric_turn_rate(m, before_ns[~covered], after_ns[~covered], zero_ns)
     return rate, mode
-
-
-def _compute_means(imu: InertialMeasurements, before_ns: Ints, after_ns: Ints, zero_ns: int) -> Floats:
-    stamp_s = compute_seconds(imu.stamp_ns, zero_ns)
-    return compute_interval_means(
-        stamp_s, imu.angular_velocity_radps, compute_seconds(before_ns, zero_ns), compute_seconds(after_ns, zero_ns)
-    )
 
 
 def _compute_odometric_turn_rate(
@@ -362,9 +351,8 @@ def _compute_odometric_turn_rate(
     mode = np.full(before_ns.size, state.FLAT_TURN, np.int8)
     start_s, end_s = compute_seconds(before_ns, zero_ns), compute_seconds(after_ns, zero_ns)
     sources = turn_sources(m)
-    odometry = next(iter(m.odometries().values()), None)
     if not sources and m.gnss is not None and not is_gliding(m):
-        stamp_s, values = compute_course_rate(m.gnss, odometry, zero_ns)
+        stamp_s, values = compute_course_rate(m.gnss, m.first_odometry, zero_ns)
         rate[:, 2] = compute_interval_means(stamp_s, values[:, None], start_s, end_s)[:, 0]
     for rank, source in enumerate(sources):
         known = np.isfinite(source.yaw_rate_radps)

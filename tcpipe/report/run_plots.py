@@ -308,7 +308,7 @@ def time_plots(
             asdict(line) | {"colour": colours[line.name], "unit": _UNITS[name]} for line in lines if line.plot == name
         ]
         plots.append(plot)
-    plots += [*_draw_rejections(timeline, first, rejections), *_draw_clocks(timeline, first, facts)]
+    plots += _draw_rejections(timeline, first, rejections)
     if has_labels:
         plots.append(_draw_labels(first))
     for plot in plots[1:-1]:
@@ -375,7 +375,7 @@ def _iterate_events(timeline: Timeline, facts: StageFacts) -> Iterator[tuple[str
     events = []
     for part in facts.audit.disagreements if facts.audit else ():
         role = part.sensor.replace("_", " ")
-        text = f"{role}: {part.what} off by {part.size:.2g} {part.unit}, {part.expected_std:.2g} expected"
+        text = f"{role}: distance off by {part.size:.2g} m, {part.expected_std:.2g} expected"
         events.append((f"{role} disagrees", part.start_ns, part.end_ns, part.clock_epoch, text))
     for stretch in facts.fuse.stretches if facts.fuse else ():
         for opened in stretch.gate_resets:
@@ -414,27 +414,6 @@ def _draw_rejections(timeline: Timeline, first: Plot, rejections: pa.Table) -> I
             x, y = shown.t_s.astype(np.float32), shown.columns["y"][1].astype(np.float32)
             plot.figure.scatter(x, y, size=5, color=colour, alpha=0.7)
     plot.figure.y_range.start = 0
-    yield plot
-
-
-def _draw_clocks(timeline: Timeline, first: Plot, facts: StageFacts) -> Iterator[Plot]:
-    """Yield how late sensors' stamps are over the run, pair by pair, where that is determined."""
-    offsets = facts.clock_offsets
-    start_s = {epoch.number: epoch.start_s for epoch in timeline.epochs}
-    if offsets is None or offsets.clock_epoch not in start_s:
-        return
-    pairs = [pair for pair in offsets.pairs if pair.determined and pair.windows]
-    if not pairs:
-        return
-    names = [f"{pair.late} against {pair.against} by {pair.by}".replace("_", " ") for pair in pairs]
-    colours = _choose_colours(names)
-    plot = _draw_panel("clocks", "late by [ms], ± σ", first, legend=colours)
-    for pair, name in zip(pairs, names, strict=True):
-        at_s, offset_s, std_s = np.array(pair.windows).T
-        at_s = at_s + start_s[offsets.clock_epoch]
-        low_ms, high_ms = 1e3 * (offset_s - std_s), 1e3 * (offset_s + std_s)
-        plot.figure.segment(at_s, low_ms, at_s, high_ms, color=colours[name], line_width=2)
-        plot.figure.scatter(at_s, 1e3 * offset_s, size=6, color=colours[name])
     yield plot
 
 

@@ -46,7 +46,7 @@ from tcpipe.report.run_plots import (
 )
 from tcpipe.store import Store
 from tcpipe.tables.columns import to_floats, to_integers
-from tcpipe.tables.facts import ClockOffset, NoiseFacts, PhysicsFacts, StageFacts
+from tcpipe.tables.facts import NoiseFacts, PhysicsFacts, StageFacts
 from tcpipe.tables.findings import Finding, select_findings
 
 _PAGE = "report.html"
@@ -387,16 +387,17 @@ def _make_disagreement_sections(facts: StageFacts) -> list[Section]:
     rows = [
         (
             _name(part.sensor),
-            part.what,
             f"{(part.start_ns - start_ns) * 1e-9:.0f} to {(part.end_ns - start_ns) * 1e-9:.0f} s",
-            f"{part.size:.2g} {part.unit}",
-            f"{part.expected_std:.2g} {part.unit}",
-            "outvoted by other sensors; track unchanged" if part.alone else "σ inflated, segments flagged",
+            f"{part.size:.2g} m",
+            f"{part.expected_std:.2g} m",
         )
         for part in disagreements
     ]
-    text = "The track compared with each fused sensor in windows of 5 s: differences beyond the stated uncertainties."
-    header = ("sensor", "what", "in the run", "difference", "expected (1σ)", "action")
+    text = (
+        "Windows of 5 s in which the distance of the track differs from that of every sensor. There σ is inflated and segments "
+        "are flagged."
+    )
+    header = ("nearest sensor", "in the run", "difference", "expected (1σ)")
     return [Section("Disagreements of sensors and track", text, header=header, rows=rows)]
 
 
@@ -410,9 +411,8 @@ def _make_clock_sections(facts: StageFacts, findings: Sequence[Finding]) -> list
     rows = [
         (
             _name(role),
-            f"{1e3 * (offset.offset_s or 0.0):+.0f} ms",
-            f"{2e3 * (offset.std_s or 0.0):.0f} ms",
-            _format_drift(offset),
+            f"{1e3 * offset.offset_s:+.0f} ms",
+            f"{2e3 * offset.std_s:.0f} ms",
             _format_correction(role, findings),
         )
         for role, offset in sorted(offsets.items())
@@ -423,7 +423,7 @@ def _make_clock_sections(facts: StageFacts, findings: Sequence[Finding]) -> list
         text = f"Time offsets relative to {reference}, from the motion that both sensors measure."
     if steps:
         text += f" The clock steps: {'; '.join(steps)}."
-    header = ("sensor", "late by", "± (2σ)", "drift", "correction")
+    header = ("sensor", "late by", "± (2σ)", "correction")
     return [Section("Clocks", text.strip(), header=header, rows=rows)]
 
 
@@ -433,12 +433,6 @@ def _format_correction(role: str, findings: Sequence[Finding]) -> str:
     role_findings = [finding for finding in clocks if finding.subject.name == role]
     remedies = [describe_remedy(finding, remedy) for finding in role_findings for remedy in finding.remedies]
     return "; ".join(remedies) or ", ".join(finding.code.replace("-", " ") for finding in role_findings)
-
-
-def _format_drift(offset: ClockOffset) -> str:
-    if offset.drift_s_per_h is None or offset.drift_std_s_per_h is None:
-        return ""
-    return f"{1e3 * offset.drift_s_per_h:+.0f} ± {2e3 * offset.drift_std_s_per_h:.0f} ms/h"
 
 
 def _make_provenance_section(run: RunDirectory, manifest: Manifest, run_json: RunJson | None) -> Section:

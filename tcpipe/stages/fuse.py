@@ -10,11 +10,16 @@ import numpy as np
 
 from tcpipe.errors import FusionError
 from tcpipe.fusion.checks.audit import is_astray
-from tcpipe.fusion.checks.plausibility import SensorExclusion, refuse_fixes
+from tcpipe.fusion.checks.sanity import SensorExclusion, refuse_fixes
 from tcpipe.fusion.measurements import GNSS, IMU, POSE
 from tcpipe.recipe import FuseConfig
 from tcpipe.stages.clock_findings import correct_clocks
-from tcpipe.stages.fuse_findings import find_fuse_findings, make_audit_findings, make_fuse_facts, make_mounting_findings
+from tcpipe.stages.fuse_findings import (
+    find_fuse_findings,
+    find_parameter_findings,
+    make_audit_findings,
+    make_fuse_facts,
+)
 from tcpipe.stages.fuse_inputs import (
     FusionInputs,
     drop_implausible_sensors,
@@ -52,53 +57,48 @@ def _fuse(streams: Streams, config: FuseConfig, run_id: str) -> Track:
     is_posed = POSE in streams.tables
     streams, local = prepare_pose(streams)
     run = Subject("run", run_id)
-    inputs, sanity = drop_implausible_sensors(prepare_inputs(streams, config), streams)
+    inputs = drop_implausible_sensors(prepare_inputs(streams, config), streams)
     # 2. Each section for itself: where it starts, filter and smoother; again without a sensor that leads the track away from all others,
     #    and on the clock of a sensor as it is where the estimate finds that it steps: it has no offset.
     aligned, clocks = correct_clocks(streams, inputs)
-    judged = fuse_recovering(aligned, sanity, streams, config, run=run)
-    unsteady = {change.role for section in judged[2].facts for change in section.changes if change.kind == "clock"}
+    used, fused = fuse_recovering(aligned, streams, config, run=run)
+    unsteady = {change.role for section in fused.facts for change in section.changes if change.kind == "clock"}
     if clocks.facts is not None and any(
         offset.noted for role, offset in clocks.facts.offsets.items() if role in unsteady
     ):
         aligned, clocks = correct_clocks(streams, inputs, unsteady)
-        judged = fuse_recovering(aligned, sanity, streams, config, run=run)
-    inputs, sanity, fused = judged
+        used, fused = fuse_recovering(aligned, streams, config, run=run)
     if not fused.found:
-        raise FusionError("no motion to fuse", findings=(_find_nothing(streams, inputs, run), *sanity.findings))
+        raise FusionError("no motion to fuse", findings=(_find_nothing(streams, used, run), *used.excluded.values()))
     columns = {name: np.concatenate([part[name] for part in fused.columns]) for name in fused.columns[0]}
     if local:
         columns |= {name: np.full_like(columns[name], np.nan) for name in ("lon_deg", "lat_deg", "alt_m")}
     table = TRACK.table(**columns)
-    datum = None if local or inputs.datum_deg_m is None else Datum(*inputs.datum_deg_m, crs=streams.gnss_crs)
-    # 3. What was left out, and where sensors disagree with the track.
-    summary = make_fuse_facts(inputs, fused.facts, rows=table.num_rows, skipped_s=fused.skipped_s)
-    mounting, audit = make_mounting_findings(inputs, fused, streams), make_audit_findings(fused, inputs, streams)
-    found = (sanity, mounting, audit, clocks)
+    datum = None if local or used.datum_deg_m is None else Datum(*used.datum_deg_m, crs=streams.gnss_crs)
+    # 3. What was left out, what the run shows of the sensors, and where the track follows none.
+    summary = make_fuse_facts(used, fused.facts, rows=table.num_rows, skipped_s=fused.skipped_s)
+    audit = make_audit_findings(fused, used, streams)
     findings = (
-        *find_fuse_findings(inputs, summary, run=run),
-        *(finding for each in found for finding in each.findings),
+        *find_fuse_findings(used, summary, run=run),
+        *used.excluded.values(),
+        *find_parameter_findings(used, summary, streams),
+        *audit.findings,
+        *clocks.findings,
     )
-    made = StageFacts(
-        fuse=summary,
-        sensor_checks=sanity.facts,
-        mounting=mounting.facts,
-        audit=audit.facts,
-        clock_offsets=clocks.facts,
-    )
+    checks = SensorChecks({role: finding.code for role, finding in used.excluded.items()})
+    made = StageFacts(fuse=summary, sensor_checks=checks, audit=audit.facts, clock_offsets=clocks.facts)
     if is_posed:
         findings, made = name_pose(findings), name_pose(made)
     facts = replace(
         streams.report.facts,
         fuse=made.fuse,
         sensor_checks=made.sensor_checks,
-        mounting=made.mounting,
         audit=made.audit,
         clock_offsets=made.clock_offsets,
     )
     report = StageReport((*_drop_places(streams.report.findings, findings), *findings), facts)
     info = TrackInfo(run_id, streams.robot, datum, config.rate_hz, config.estimator, report)
-    return Track(table, make_rejections_table(inputs, fused.found, POSE if is_posed else GNSS), info)
+    return Track(table, make_rejections_table(used, fused.found, POSE if is_posed else GNSS), info)
 
 
 def _drop_places(read: tuple[Finding, ...], fused: tuple[Finding, ...]) -> Iterator[Finding]:
@@ -115,12 +115,9 @@ def _find_nothing(streams: Streams, inputs: FusionInputs, run: Subject) -> Findi
     return make_finding("no-motion", run, **rows)
 
 
-Judged = tuple[FusionInputs, StageReport[SensorChecks]]
-
-
 def fuse_recovering(
-    inputs: FusionInputs, sanity: StageReport[SensorChecks], streams: Streams, config: FuseConfig, *, run: Subject
-) -> tuple[FusionInputs, StageReport[SensorChecks], Fused]:
+    inputs: FusionInputs, streams: Streams, config: FuseConfig, *, run: Subject
+) -> tuple[FusionInputs, Fused]:
     """Fuse each section; where the track contradicts every sensor, again without the one that misleads it.
 
     That is the IMU, which carries the state from tick to tick, if the track recovers without it; else the only sensor without which it
@@ -132,24 +129,24 @@ def fuse_recovering(
     """
     fused = fuse_sections(inputs, streams, config)
     if not is_astray(fused.windows, fused.astray):
-        return inputs, sanity, fused
+        return inputs, fused
     recovered = {}
     for role in sorted({role for m in inputs.measurements.values() for role in m.sensors()}):
-        rest, without = _exclude(role, inputs, sanity, streams)
+        rest = _exclude_misleading(role, inputs, streams)
         if any(m.gnss is not None or m.odometries() for m in rest.measurements.values()):
             tried = fuse_sections(rest, streams, config)
             if tried.found and not is_astray(tried.windows, tried.astray):
-                recovered[role] = rest, without, tried
+                recovered[role] = rest, tried
     if IMU in recovered:
         return recovered[IMU]
     if len(recovered) == 1:
         return next(iter(recovered.values()))
     finding = make_finding("track-contradicts-sensors", run, astray_fraction=fused.astray / fused.windows)
-    raise FusionError("the track contradicts every sensor", findings=(finding, *sanity.findings))
+    raise FusionError("the track contradicts every sensor", findings=(finding, *inputs.excluded.values()))
 
 
-def _exclude(role: str, inputs: FusionInputs, sanity: StageReport[SensorChecks], streams: Streams) -> Judged:
+def _exclude_misleading(role: str, inputs: FusionInputs, streams: Streams) -> FusionInputs:
     odometries = {name for m in inputs.measurements.values() for name in m.odometries()}.difference({role})
     code = "misleads-track"
-    refusal = refuse_fixes(code, odometries) if role == GNSS else SensorExclusion(role, code)
-    return exclude_sensors(inputs, sanity, [refusal], streams)
+    exclusion = refuse_fixes(code, odometries) if role == GNSS else SensorExclusion(role, code)
+    return exclude_sensors(inputs, [exclusion], streams)

@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.fusion.checks.audit import find_undecided_sensors
-from tcpipe.fusion.checks.odometry_scale import Scale, compute_command_ratio
+from tcpipe.fusion.checks.sanity import compute_command_ratio
 from tcpipe.fusion.measurements import GNSS, IMU, VISUAL, WHEELS, Measurements
 from tcpipe.geometry.rotation import (
     matrix_from_quat,
@@ -34,10 +33,8 @@ from tcpipe.tables.facts import (
     Disagreement,
     FuseFacts,
     GateReset,
-    MountingFacts,
     ParameterFacts,
     StretchFacts,
-    make_vector,
 )
 from tcpipe.tables.findings import Finding, StageReport, Subject, make_finding, read_threshold
 from tcpipe.tables.levels import Sensor, Streams
@@ -79,7 +76,7 @@ def find_fuse_findings(inputs: FusionInputs, facts: FuseFacts, *, run: Subject) 
         findings += [_find_initial_yaw(of, first_ns, gnss) for of in facts.stretches if of.heading_from not in _SURE]
     findings += _find_reopenings(facts, first_ns)
     findings += _find_changes(facts, first_ns)
-    findings += _find_scale(inputs, facts)
+    findings += _find_scale(facts)
     findings += _find_rejections(facts)
     for key, code in (("variances_replaced", "variances-replaced"), ("invalid", "values-unusable")):
         findings += [
@@ -97,13 +94,13 @@ def _find_initial_yaw(section: StretchFacts, first_ns: int, gnss: Subject) -> Fi
     return make_finding("initial-yaw-uncertain", gnss, span_s=_find_span_s(section, first_ns), names=names)
 
 
-def _find_scale(inputs: FusionInputs, facts: FuseFacts) -> list[Finding]:
+def _find_scale(facts: FuseFacts) -> list[Finding]:
     """Return the finding that nothing shows well how long a metre of odometry is."""
     std = max((section.common_scale_std or 0.0 for section in facts.stretches), default=0.0)
     if std <= read_threshold("odometry-scale-unobservable", "min_scale_std_fraction"):
         return []
     role = WHEELS if WHEELS in facts.sensors or VISUAL not in facts.sensors else VISUAL
-    names = {"reason": "coarse-gnss" if GNSS in facts.sensors or inputs.scales else "no-gnss"}
+    names = {"reason": "coarse-gnss" if GNSS in facts.sensors else "no-gnss"}
     subject = Subject("role", role)
     return [make_finding("odometry-scale-unobservable", subject, names=names, scale_std_fraction=std)]
 
@@ -168,36 +165,23 @@ CHANGES = {
 """Changes in words."""
 
 
-def _find_span_s(each: StretchFacts | GateReset | ChangeFacts, first_ns: int) -> tuple[float, float]:
+def _find_span_s(each: StretchFacts | GateReset | ChangeFacts | Disagreement, first_ns: int) -> tuple[float, float]:
     return (each.start_ns - first_ns) / 1e9, (each.end_ns - first_ns) / 1e9
 
 
-_CODES = {"position": "position", "displacement": "distance", "turn": "turn"}
-"""Beginnings of the codes by the quantity compared."""
-
-
 def make_audit_findings(fused: Fused, inputs: FusionInputs, streams: Streams) -> StageReport[AuditFacts]:
-    """Return every disagreement, the sensors that contradict each other over most of the distance, and the findings of both."""
-    undecided = find_undecided_sensors(fused.tallies)
+    """Return every disagreement, wheels that are faster than any command, and the findings of both."""
     found = fused.disagreements
     first_ns = min((section.start_ns for section in fused.facts), default=0)
-    kinds = dict.fromkeys((each.sensor, each.what, each.alone) for each in found)
-    findings = [
-        _find_disagreement([e for e in found if (e.sensor, e.what, e.alone) == kind], first_ns) for kind in kinds
-    ]
-    for sensor, what in undecided:
-        names, subject = {"quantity": what}, Subject("role", sensor)
-        findings.append(make_finding("disagreement-undecided", subject, names=names, remedies=exclude_role(sensor)))
-    sensors = {sensor for sensor, _ in undecided}
+    findings = [_find_disagreement(found, first_ns)] if found else []
     faster = _compute_command_ratio(inputs, streams)
     if faster is not None:
-        sensors.add(WHEELS)
         scale = round((streams.report.facts.odometry_scale or {}).get(WHEELS, 1.0) / faster, 2)
         remedies = suggest("state_scale", {"read.odometry_scale": {WHEELS: scale}})
         remedies += exclude_role("command", "exclude_command")
         wheels = Subject("role", WHEELS)
         findings.append(make_finding("faster-than-commanded", wheels, remedies=remedies, speed_ratio=faster))
-    return StageReport(tuple(findings), AuditFacts(tuple(found), tuple(sorted(sensors))))
+    return StageReport(tuple(findings), AuditFacts(tuple(found), () if faster is None else (WHEELS,)))
 
 
 def _compute_command_ratio(inputs: FusionInputs, streams: Streams) -> float | None:
@@ -208,20 +192,18 @@ def _compute_command_ratio(inputs: FusionInputs, streams: Streams) -> float | No
     m, command = inputs.measurements[epoch], read_command(streams, epoch)
     if m.wheels is None or m.gnss is not None or m.visual is not None or command is None:
         return None
-    return compute_command_ratio(m.wheels, command.stamp_ns, command.forward_velocity_mps)
+    return compute_command_ratio(m.wheels, command)
 
 
 def _find_disagreement(found: Sequence[Disagreement], first_ns: int) -> Finding:
-    """Return the finding of all disagreements of one kind: how often, the largest, and when that is."""
+    """Return the finding of all disagreements: how often, the largest, and when that is."""
     worst = max(found, key=lambda each: each.size / each.expected_std)
-    numbers: dict[str, Any] = {f"off_{worst.unit}": worst.size, f"expected_std_{worst.unit}": worst.expected_std}
     return make_finding(
-        f"{_CODES[worst.what]}-disagrees",
+        "distance-disagrees",
         Subject("role", worst.sensor),
-        severity="note" if worst.alone else None,
-        action="kept" if worst.alone else None,
-        span_s=((worst.start_ns - first_ns) / 1e9, (worst.end_ns - first_ns) / 1e9),
-        **numbers,
+        span_s=_find_span_s(worst, first_ns),
+        off_m=worst.size,
+        expected_std_m=worst.expected_std,
         event_count=len(found),
         total_s=sum(each.end_ns - each.start_ns for each in found) / 1e9,
     )
@@ -234,66 +216,44 @@ _LEAST_TURN_RAD = 0.05
 _LEAST_SCALE = 0.1
 
 
-def make_mounting_findings(inputs: FusionInputs, fused: Fused, streams: Streams) -> StageReport[MountingFacts | None]:
-    """Return where the run shows other extrinsics or scales than are stated, with the recipe keys that would state it."""
-    findings: list[Finding] = []
-    longest = max(fused.facts, key=lambda of: of.end_ns - of.start_ns)
-    arm, tilt = longest.parameters.get("antenna"), longest.parameters.get("mounting of the IMU")
-    moved = std_m = roll_pitch = None
+def find_parameter_findings(inputs: FusionInputs, facts: FuseFacts, streams: Streams) -> Iterator[Finding]:
+    """Yield where the run shows other extrinsics or scales than are stated, with the recipe keys that would state it."""
+    longest = facts.longest
+    parameters = longest.parameters
+    arm, tilt = parameters.get("antenna"), parameters.get("mounting of the IMU")
     if arm is not None and GNSS in streams.sensors:
-        sensor, turned = streams.sensors[GNSS], longest.parameters.get("mounting of the pose")
+        sensor, turned = streams.sensors[GNSS], parameters.get("mounting of the pose")
         turn = _find_rotation(turned, inputs.measurements.get(longest.clock_epoch), sensor)
         if sensor.placed_by == "assumed" or _is_contradicted(arm, _LEAST_ARM_M):
-            moved, std_m = make_vector(np.array(arm.value)), make_vector(np.array(arm.std))
-            findings.append(_find_arm(arm, sensor, turn))
+            yield _find_arm(arm, sensor, turn)
         off = quat_from_matrix(turn @ matrix_from_quat(sensor.quat_xyzw).T)
         off_rad = float(np.linalg.norm(rotation_vector_from_quat(off)))
         unsure_rad = 0.0 if turned is None else float(np.linalg.norm(turned.std))
         if sensor.placed_by != "assumed" and off_rad > max(_SURELY * unsure_rad, _LEAST_TURN_RAD):
             remedies, names = state_extrinsics(GNSS, sensor.xyz_m, turn), {"placed_by": sensor.placed_by}
             fixes = Subject("role", GNSS)
-            findings.append(make_finding("pose-rotated", fixes, names=names, remedies=remedies, off_rad=off_rad))
+            yield make_finding("pose-rotated", fixes, names=names, remedies=remedies, off_rad=off_rad)
     if tilt is not None and _is_contradicted(tilt, _LEAST_TILT_RAD):
-        roll_pitch = tilt.value[0], tilt.value[1]
-        findings.append(_find_tilt(tilt, streams.sensors[IMU]))
-    scales = dict(inputs.scales) | _find_scales(inputs, longest)
-    given = streams.report.facts.odometry_scale or {}
-    findings += [_find_odometry_scale(role, scale, given.get(role, 1.0)) for role, scale in scales.items()]
-    findings += _find_varying_scale(longest)
-    if not findings:
-        return StageReport((), None)
-    factors = {role: scale.factor for role, scale in scales.items()} or None
-    return StageReport(tuple(findings), MountingFacts(moved, std_m, roll_pitch, factors))
+        yield _find_tilt(tilt, streams.sensors[IMU])
+    for name, role in (("wheel scale", WHEELS), ("camera scale", VISUAL)):
+        found = parameters.get(name)
+        if found is not None and (role in inputs.scales or _is_contradicted(found, _LEAST_SCALE)):
+            scale = inputs.scales.get(role, 1.0) * (1.0 + found.value[0])
+            stated = (streams.report.facts.odometry_scale or {}).get(role, 1.0)
+            remedies = suggest("state", {"read.odometry_scale": {role: round(stated / scale, 4)}})
+            yield make_finding(
+                "odometry-scale", Subject("role", role), remedies=remedies, scale=scale, scale_std=found.std[0]
+            )
+    # That of wheels always varies: they slip.
+    camera = parameters.get("camera scale")
+    variation = 0.0 if camera is None else max(camera.variation, default=0.0)
+    if variation > read_threshold("odometry-scale-varies", "min_variation_fraction"):
+        yield make_finding("odometry-scale-varies", Subject("role", VISUAL), variation_fraction=variation)
 
 
 def _is_contradicted(found: ParameterFacts, least: float) -> bool:
     """Return whether a parameter surely differs from what is stated, by so much at least."""
     return any(abs(v) > max(_SURELY * s, least) for v, s in zip(found.value, found.std, strict=True))
-
-
-def _find_scales(inputs: FusionInputs, longest: StretchFacts) -> dict[str, Scale]:
-    """Return the scales of odometries that surely differ from 1."""
-    found = {}
-    for name, role in (("wheel scale", WHEELS), ("camera scale", VISUAL)):
-        scale = longest.parameters.get(name)
-        if scale is not None and _is_contradicted(scale, _LEAST_SCALE) and role not in inputs.scales:
-            found[role] = Scale(1.0 + scale.value[0], scale.std[0])
-    return found
-
-
-def _find_varying_scale(longest: StretchFacts) -> Iterator[Finding]:
-    """Yield the finding of a camera whose scale varies; that of wheels always does: they slip."""
-    scale = longest.parameters.get("camera scale")
-    variation = 0.0 if scale is None else max(scale.variation, default=0.0)
-    if variation > read_threshold("odometry-scale-varies", "min_variation_fraction"):
-        yield make_finding("odometry-scale-varies", Subject("role", VISUAL), variation_fraction=variation)
-
-
-def _find_odometry_scale(role: str, scale: Scale, given: float) -> Finding:
-    by_speed: dict[str, Any] = {} if scale.driven_m is None else {"driven_m": scale.driven_m}
-    remedies = suggest("state", {"read.odometry_scale": {role: round(given / scale.factor, 4)}})
-    subject, std = Subject("role", role), scale.std
-    return make_finding("odometry-scale", subject, remedies=remedies, scale=scale.factor, scale_std=std, **by_speed)
 
 
 def _find_rotation(turned: ParameterFacts | None, m: Measurements | None, sensor: Sensor) -> NDArray[np.float64]:

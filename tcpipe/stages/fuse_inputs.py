@@ -5,7 +5,7 @@ A pose that another program estimated is fused as fixes with an attitude; findin
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from typing import Any, TypeVar, cast
 
@@ -16,10 +16,13 @@ from numpy.typing import NDArray
 
 from tcpipe.fusion import preparation
 from tcpipe.fusion.attitude import align_mounting
-from tcpipe.fusion.checks.clock_offsets import smooth_stamps
-from tcpipe.fusion.checks.odometry_scale import Scale, rescale_odometries
-from tcpipe.fusion.checks.plausibility import SensorExclusion
-from tcpipe.fusion.checks.sensors import CommandedSpeed, check_ground_velocity, check_sensors
+from tcpipe.fusion.checks.sanity import (
+    CommandedSpeed,
+    SensorExclusion,
+    check_ground_velocity,
+    check_sensors,
+    rescale_odometries,
+)
 from tcpipe.fusion.measurements import (
     DOPPLER,
     GNSS,
@@ -38,23 +41,23 @@ from tcpipe.recipe import FuseConfig
 from tcpipe.recipe.suggestions import suggest
 from tcpipe.tables.arrays import select_rows
 from tcpipe.tables.columns import FloatColumns, to_floats, to_integers
-from tcpipe.tables.facts import SensorChecks
-from tcpipe.tables.findings import Finding, Remedy, StageReport, Subject, make_finding
+from tcpipe.tables.findings import Finding, Remedy, Subject, make_finding
 from tcpipe.tables.levels import STREAMS, Sensor, Streams
 
 
 @dataclass(slots=True)
 class FusionInputs:
-    """Measurements by epoch; datum (longitude, latitude, height) or None; by role, unusable stamps and counts; findings; refused roles."""
+    """Measurements by epoch; datum (longitude, latitude, height) or None; by role, unusable stamps and counts; findings."""
 
     datum_deg_m: tuple[float, float, float] | None
     measurements: dict[int, Measurements] = field(default_factory=dict)
     invalid_ns: dict[str, list[NDArray[np.int64]]] = field(default_factory=dict)
     counts: dict[str, dict[str, int]] = field(default_factory=dict)
     findings: list[Finding] = field(default_factory=list)
-    excluded: frozenset[str] = frozenset()
-    scales: Mapping[str, Scale] = field(default_factory=dict)
-    """By odometry, the scale that was taken out."""
+    excluded: Mapping[str, Finding] = field(default_factory=dict)
+    """By role, why a sensor is not fused."""
+    scales: Mapping[str, float] = field(default_factory=dict)
+    """By odometry, the scale that was taken out: far from 1."""
     cuts_ns: tuple[int, ...] = ()
     """First stamps after the clock of all sensors was set forward."""
 
@@ -90,8 +93,9 @@ def prepare_inputs(streams: Streams, config: FuseConfig) -> FusionInputs:
             gnss, repeats = preparation.drop_repeated_fixes(gnss, odometry)
             inputs.counts[GNSS]["repeated"] += count - gnss.stamp_ns.size
             inputs.findings += [_find_frozen(each, streams) for each in repeats]
-        gnss, findings = smooth_stamps(gnss, odometry)
-        inputs.findings += findings
+        if gnss is not None and odometry is not None:
+            gnss, jitter_s = preparation.inflate_jittery_fixes(gnss, odometry)
+            inputs.findings += _find_jitter(jitter_s)
         inputs.measurements[epoch] = Measurements(
             gnss=gnss,
             doppler=found.get(DOPPLER),
@@ -108,6 +112,13 @@ def _find_frozen(repeats: preparation.Repeats, streams: Streams) -> Finding:
     span_s = (repeats.start_ns - first_ns) / 1e9, (repeats.end_ns - first_ns) / 1e9
     subject, names = Subject("role", GNSS), {"quantity": "position"}
     return make_finding("frozen", subject, span_s=span_s, names=names, message_count=repeats.messages)
+
+
+def _find_jitter(jitter_s: NDArray[np.float64]) -> Iterator[Finding]:
+    jumpy = jitter_s > 0
+    if jumpy.any():
+        share, median_s = float(jumpy.mean()), float(np.median(jitter_s[jumpy]))
+        yield make_finding("stamp-jitter", Subject("role", GNSS), jitter_fraction=share, jitter_s=median_s)
 
 
 def _find_first_ns(streams: Streams) -> int:
@@ -170,47 +181,42 @@ def _prepare(role: str, table: pa.Table, sensor: Sensor, config: FuseConfig, inp
 _STATED = ("recipe", "tf_static", "same frame")
 
 
-def drop_implausible_sensors(inputs: FusionInputs, streams: Streams) -> tuple[FusionInputs, StageReport[SensorChecks]]:
-    """Return the inputs without the sensors that are refused, and the findings, judged over the longest clock epoch."""
+def drop_implausible_sensors(inputs: FusionInputs, streams: Streams) -> FusionInputs:
+    """Return the inputs without the sensors that cannot be right, judged over the longest clock epoch."""
     if not inputs.measurements:
-        return inputs, StageReport((), SensorChecks())
+        return inputs
     epoch = find_longest_epoch(inputs)
     stated = {role: sensor.placed_by in _STATED for role, sensor in streams.sensors.items()}
-    checks = check_sensors(
+    exclusions, scales = check_sensors(
         inputs.measurements[epoch],
         command=read_command(streams, epoch),
         stated=stated,
         felt=_compute_median_specific_force(streams),
     )
-    if checks.scales:
-        measured = {number: rescale_odometries(m, checks.scales) for number, m in inputs.measurements.items()}
-        inputs = replace(inputs, measurements=measured, scales=checks.scales)
-    sane, found = exclude_sensors(inputs, StageReport((), checks.facts), checks.refusals, streams)
-    doubt = check_ground_velocity(sane.measurements[epoch])
-    return (sane, found) if doubt is None else exclude_sensors(sane, found, [doubt], streams)
+    if scales:
+        measured = {number: rescale_odometries(m, scales) for number, m in inputs.measurements.items()}
+        inputs = replace(inputs, measurements=measured, scales=scales)
+    inputs = exclude_sensors(inputs, exclusions.values(), streams)
+    doubt = check_ground_velocity(inputs.measurements[epoch])
+    return inputs if doubt is None else exclude_sensors(inputs, [doubt], streams)
 
 
-def exclude_sensors(
-    inputs: FusionInputs, before: StageReport[SensorChecks], refusals: Sequence[SensorExclusion], streams: Streams
-) -> tuple[FusionInputs, StageReport[SensorChecks]]:
-    """Return the inputs without refused sensors, the findings, and the codes of these by role."""
-    refused = inputs.excluded | {refusal.role for refusal in refusals}
-    kept = {number: _without(refused, measurements) for number, measurements in inputs.measurements.items()}
-    codes = {**before.facts.excluded, **{refusal.role: refusal.code for refusal in refusals}}
-    findings = (*before.findings, *(_find_exclusion(refusal, streams) for refusal in refusals))
-    datum = None if GNSS in refused else inputs.datum_deg_m
-    inputs = replace(inputs, datum_deg_m=datum, measurements=kept, excluded=refused)
-    return inputs, StageReport(findings, replace(before.facts, excluded=codes))
+def exclude_sensors(inputs: FusionInputs, exclusions: Iterable[SensorExclusion], streams: Streams) -> FusionInputs:
+    """Return the inputs without some sensors."""
+    excluded = {**inputs.excluded, **{each.role: _find_exclusion(each, streams) for each in exclusions}}
+    kept = {number: _without(excluded, measurements) for number, measurements in inputs.measurements.items()}
+    datum = None if GNSS in excluded else inputs.datum_deg_m
+    return replace(inputs, datum_deg_m=datum, measurements=kept, excluded=excluded)
 
 
-def _without(refused: frozenset[str], m: Measurements) -> Measurements:
+def _without(excluded: Collection[str], m: Measurements) -> Measurements:
     return replace(
         m,
-        gnss=None if GNSS in refused else m.gnss,
-        doppler=None if refused & {GNSS, DOPPLER} else m.doppler,
-        imu=None if IMU in refused else m.imu,
-        wheels=None if WHEELS in refused else m.wheels,
-        visual=None if VISUAL in refused else m.visual,
+        gnss=None if GNSS in excluded else m.gnss,
+        doppler=None if GNSS in excluded or DOPPLER in excluded else m.doppler,
+        imu=None if IMU in excluded else m.imu,
+        wheels=None if WHEELS in excluded else m.wheels,
+        visual=None if VISUAL in excluded else m.visual,
     )
 
 

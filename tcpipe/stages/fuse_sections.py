@@ -10,7 +10,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from tcpipe.fusion.checks.audit import Tally, audit_trajectory
+from tcpipe.fusion.checks.audit import audit_trajectory
 from tcpipe.fusion.error_state import run_error_state
 from tcpipe.fusion.initial import find_initial_state, find_stationary_intervals
 from tcpipe.fusion.measurements import GNSS, BodyVelocities, InitialState
@@ -36,7 +36,6 @@ class Fused:
     facts: list[StretchFacts] = field(default_factory=list)
     columns: list[Mapping[str, NDArray[Any]]] = field(default_factory=list)
     disagreements: list[Disagreement] = field(default_factory=list)
-    tallies: list[Tally] = field(default_factory=list)
     windows: int = 0
     astray: int = 0
     skipped_s: float = 0.0
@@ -58,7 +57,6 @@ def fuse_sections(inputs: FusionInputs, streams: Streams, config: FuseConfig) ->
         # 3. What came out is held against what went in.
         trajectory, audit = audit_trajectory(trajectory, trajectory.corrected or section.measurements)
         fused.disagreements += (replace(each, clock_epoch=section.clock_epoch) for each in audit.disagreements)
-        fused.tallies += audit.tallies
         fused.windows, fused.astray = fused.windows + audit.windows, fused.astray + audit.astray
         fused.found.append(trajectory)
         fused.facts.append(make_section_facts(section, initial, trajectory))

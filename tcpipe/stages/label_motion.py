@@ -164,12 +164,10 @@ def find_motion_flags(
 
 
 def _find_disputed(cut: pa.Table, info: TrackInfo) -> NDArray[np.bool_]:
-    """Return the segments of one epoch that touch a time in which a sensor disagrees with the track undecided, or fixes were off it."""
+    """Return the segments of one epoch that touch a time in which a sensor disagrees with the track, or fixes were off it."""
     start_ns, end_ns, epoch = to_integers(cut, "start_ns"), to_integers(cut, "end_ns"), to_integers(cut, "clock_epoch")
     facts = info.report.facts
-    times = [
-        (e.clock_epoch, e.start_ns, e.end_ns) for e in (facts.audit.disagreements if facts.audit else ()) if not e.alone
-    ]
+    times = [(e.clock_epoch, e.start_ns, e.end_ns) for e in (facts.audit.disagreements if facts.audit else ())]
     for section in facts.fuse.stretches if facts.fuse else ():
         times += [(section.clock_epoch, r.start_ns, r.end_ns) for r in section.gate_resets if r.role in FIXES]
     disputed = np.zeros(cut.num_rows, dtype=np.bool_)
@@ -196,8 +194,7 @@ def is_clock_doubtful(streams: Streams, info: TrackInfo) -> bool:
     recorder = any(s.time_source == "log" for role, s in streams.sensors.items() if role != "command")
     clocks = info.report.facts.clock_offsets
     off = clocks is not None and any(
-        (offset.noted or offset.drifts) and (role == "power" or not offset.blamed)
-        for role, offset in clocks.offsets.items()
+        offset.noted and (role == "power" or not offset.blamed) for role, offset in clocks.offsets.items()
     )
     # A step of all clocks leaves them together.
     return recorder or off or any(step.topics for step in streams.report.facts.clock_steps)

@@ -167,7 +167,7 @@ def count_confirming_sensors(cut: pa.Table, streams: Streams, facts: StageFacts)
         disputed = [
             (span.start_ns, span.end_ns)
             for span in (facts.audit.disagreements if facts.audit else ())
-            if span.clock_epoch == epoch and span.sensor == sensor and span.what != "turn"
+            if span.clock_epoch == epoch
         ]
         count += confirms & _touches(fused, start_ns, end_ns) & ~_touches(disputed, start_ns, end_ns)
     return count

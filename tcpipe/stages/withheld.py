@@ -29,7 +29,6 @@ from tcpipe.stages.fuse import fuse_run
 from tcpipe.stages.fuse_inputs import FusionInputs, find_longest_epoch, prepare_inputs, prepare_pose
 from tcpipe.tables.arrays import number_column, select_rows
 from tcpipe.tables.columns import FloatColumns, to_integers
-from tcpipe.tables.facts import MountingFacts
 from tcpipe.tables.levels import Streams, Track
 
 Ints = NDArray[np.int64]
@@ -101,6 +100,10 @@ def compare_withheld(streams: Streams, config: FuseConfig, *, run_id: str) -> Wi
     return WithheldComparisons(tuple(comparisons), tuple(skipped), ratios)
 
 
+_OTHER_ARM = {"lever-arm-unknown", "lever-arm-contradicted"}
+"""Findings of an antenna that is elsewhere than stated."""
+
+
 def _compare_role(run: _Run, role: str, length_s: float, windows_ns: Ints) -> Iterator[Comparison]:
     step(f"fusing without {role} for {len(windows_ns)} x {length_s:.0f} s")
     track = run.fuse(withhold(run.streams, role, run.epoch, windows_ns))
@@ -114,9 +117,10 @@ def _compare_role(run: _Run, role: str, length_s: float, windows_ns: Ints) -> It
     numbers, sensor = np.flatnonzero(moving), run.measurements.sensors()[role]
     if isinstance(sensor, Positions):
         sensor = _move_origin(sensor, run.inputs, track)
-        mounting = facts.mounting or MountingFacts()
-        arm_m = np.asarray(run.streams.sensors[GNSS].xyz_m) + (mounting.antenna_moved_m or np.zeros(3))
-        arm_std_m = np.asarray(mounting.antenna_std_m or np.zeros(3))
+        arm_m, arm_std_m = np.asarray(run.streams.sensors[GNSS].xyz_m), np.zeros(3)
+        if facts.fuse and any(finding.code in _OTHER_ARM for finding in track.info.report.findings):
+            arm = facts.fuse.longest.parameters["antenna"]
+            arm_m, arm_std_m = arm_m + arm.value, np.asarray(arm.std)
         yield compare_fixes(sensor, rows, windows_ns, numbers, arm_m=arm_m, arm_std_m=arm_std_m, window_s=length_s)
     elif isinstance(sensor, BodyVelocities):
         for chord_s in CHORDS_S:

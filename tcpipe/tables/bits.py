@@ -60,7 +60,7 @@ class Quality(IntFlag):
     BELOW_FULL_SPEED = 1 << 10
     """Commanded on average below `full_speed_fraction` of the robot's maximum: the terrain does not limit the speed."""
     SENSORS_DISAGREE = 1 << 11
-    """A sensor and the track disagree on position, distance or turn beyond their uncertainties, and no third sensor decides."""
+    """The track moves unlike every sensor, or contradicted the fixes for seconds."""
 
 
 class Loss(IntFlag):

@@ -198,64 +198,38 @@ class FuseFacts:
     skipped_s: float
     stretches: tuple[StretchFacts, ...]
 
-
-@dataclass(frozen=True, slots=True)
-class AxisFacts:
-    """Axis of the IMU about which another sensor turns, and the ratio of their yaw rates."""
-
-    axis: Vector
-    scale: float
+    @property
+    def longest(self) -> StretchFacts:
+        """The longest section."""
+        return max(self.stretches, key=lambda of: of.end_ns - of.start_ns)
 
 
 @dataclass(frozen=True, slots=True)
 class SensorChecks:
-    """Plausibility checks of the sensors, and the codes of the findings on excluded ones.
-
-    ``distance_m`` are median chords over ten seconds, ``up`` is gravity in the robot's axes, ``looks_rad`` the yaw of the IMU by each
-    odometry with σ, ``specific_force_median`` in the IMU's own unit.
-    """
+    """The codes of the findings on excluded sensors, by role."""
 
     excluded: Mapping[str, str] = field(default_factory=dict)
-    distance_m: Mapping[str, float] | None = field(default=None, metadata=LEFT_OUT)
-    specific_force_median: float | None = field(default=None, metadata=LEFT_OUT)
-    up: Vector | None = field(default=None, metadata=LEFT_OUT)
-    yaw_axis: Mapping[str, AxisFacts] | None = field(default=None, metadata=LEFT_OUT)
-    looks_rad: Mapping[str, tuple[float, ...]] | None = field(default=None, metadata=LEFT_OUT)
-
-
-@dataclass(frozen=True, slots=True)
-class MountingFacts:
-    """Corrections: shift of the antenna in base_link and its σ, roll and pitch of the IMU, scale of each odometry against the track."""
-
-    antenna_moved_m: Vector | None = field(default=None, metadata=LEFT_OUT)
-    antenna_std_m: Vector | None = field(default=None, metadata=LEFT_OUT)
-    imu_tilt_rad: tuple[float, float] | None = field(default=None, metadata=LEFT_OUT)
-    odometry_scale: Mapping[str, float] | None = field(default=None, metadata=LEFT_OUT)
 
 
 @dataclass(frozen=True, slots=True)
 class Disagreement:
-    """A span in which a sensor differs from the track beyond both uncertainties (`tcpipe.fusion.checks.audit`).
+    """A span in which the track's displacement differs from that of every sensor (`tcpipe.fusion.checks.audit`).
 
-    ``what`` is position, displacement or turn; ``size`` the largest difference over a window in ``unit`` (m or rad), ``expected_std`` its
-    expected σ. ``alone``: two other sensors contradict this one, so the track stays; otherwise its σ is inflated, and segments there are
-    flagged sensors_disagree.
+    ``sensor`` is the nearest, ``size`` [m] the largest difference over a window, ``expected_std`` [m] the sensor's σ. The track's σ is
+    inflated there, and segments are flagged sensors_disagree.
     """
 
     start_ns: int
     end_ns: int
     sensor: str
-    what: str
     size: float
-    unit: str
     expected_std: float
-    alone: bool
     clock_epoch: int = 0
 
 
 @dataclass(frozen=True, slots=True)
 class AuditFacts:
-    """Disagreements of track and sensors, and sensors that contradict each other over most of the distance without a decision."""
+    """Where the track disagrees with every sensor, and the sensors of which nothing shows that their distance is right: no segments."""
 
     disagreements: tuple[Disagreement, ...] = ()
     undecided: tuple[str, ...] = ()
@@ -263,36 +237,39 @@ class AuditFacts:
 
 @dataclass(frozen=True, slots=True)
 class ClockPair:
-    """Two sensors' clocks compared (`tcpipe.fusion.checks.clock_offsets.Pair`), and whether that determines their offset."""
+    """Two sensors compared: by what, how late the first's stamps are against the second's, and how much one explains the other (0 to 1).
+
+    ``determined``: whether the offset is known well enough to be spoken of; ``from_middle_s``: when, from the middle of the run.
+    """
 
     late: str
     against: str
     by: str
-    offset_s: float | None
-    std_s: float | None
-    explained: float | None
-    drift_s_per_h: float | None
-    drift_std_s_per_h: float | None
-    windows: tuple[Vector, ...]
+    offset_s: float
+    std_s: float
+    explained: float
     determined: bool
+    from_middle_s: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
 class ClockOffset:
-    """Delay of a sensor's stamps (`tcpipe.fusion.checks.clock_offsets.RoleOffset`); ``blamed``: the sensor, not the reference, is off."""
+    """How late a sensor's stamps are against the reference's in the middle of the run, and their drift; 0 unless it is sure.
 
-    offset_s: float | None
-    std_s: float | None
+    ``noted``: whether a person should act on it; ``blamed``: the sensor is off, since two others agree against it; otherwise it and the
+    reference differ, and which of them is off is not known.
+    """
+
+    offset_s: float
+    std_s: float
     noted: bool
-    drift_s_per_h: float | None
-    drift_std_s_per_h: float | None
-    drifts: bool
     blamed: bool = True
+    drift_ppm: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
 class ClockFacts:
-    """The sensors' clocks in one clock epoch before offsets were taken out: all pairs, and each role's offset from the reference."""
+    """The sensors' clocks in one clock epoch before offsets were taken out: all pairs, and offsets of those connected to the reference."""
 
     clock_epoch: int
     reference: str
@@ -473,7 +450,6 @@ class StageFacts:
     power: PowerSign | None = field(default=None, metadata=LEFT_OUT)
     fuse: FuseFacts | None = field(default=None, metadata=LEFT_OUT)
     sensor_checks: SensorChecks | None = field(default=None, metadata=LEFT_OUT)
-    mounting: MountingFacts | None = field(default=None, metadata=LEFT_OUT)
     audit: AuditFacts | None = field(default=None, metadata=LEFT_OUT)
     clock_offsets: ClockFacts | None = field(default=None, metadata=LEFT_OUT)
     mask: MaskFacts | None = field(default=None, metadata=LEFT_OUT)

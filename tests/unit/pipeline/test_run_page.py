@@ -136,11 +136,11 @@ def test_where_sensors_disagree_with_the_track_is_on_the_page(store):
     run, html = page(store)
     assert "Disagreements of sensors and track" not in html
     info, start_ns = run.manifest.info, run.manifest.info.report.facts.fuse.stretches[0].start_ns
-    each = Disagreement(start_ns + 10**10, start_ns + 2 * 10**10, "gnss", "position", 0.49, "m", 0.016, alone=False)
+    each = Disagreement(start_ns + 10**10, start_ns + 2 * 10**10, "gnss", 4.9, 0.016)
     facts = replace(info.report.facts, audit=AuditFacts((each,)))
     told = replace(run.manifest, info=replace(info, report=StageReport((), facts)))
     (section,) = [s for s in make_sensor_sections(None, told, run.rejections()) if "Disagree" in s.title]
-    assert section.rows == [("gnss", "position", "10 to 20 s", "0.49 m", "0.016 m", "σ inflated, segments flagged")]
+    assert section.rows == [("gnss", "10 to 20 s", "4.9 m", "0.016 m")]
 
 
 def test_every_topic_stands_on_the_page_and_may_break(store):

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from suggested_recipes import proposed
 
-from tcpipe.fusion.checks.audit import Tally
 from tcpipe.fusion.measurements import BodyVelocities, InertialMeasurements, InitialState, Measurements, Positions
 from tcpipe.fusion.trajectory import TrackSection
 from tcpipe.recipe import FuseConfig
@@ -114,7 +113,7 @@ def test_rows_that_were_set_aside_are_counted_but_not_those_of_a_sensor_that_was
         PLACE,
         counts={"gnss": counts(variances_replaced=4), "imu": counts(invalid=2), "visual_odometry": counts(invalid=9)},
         findings=[sleeps, blind],
-        excluded=frozenset({"visual_odometry"}),
+        excluded={"visual_odometry": make_finding("imu-no-acceleration", Subject("role", "visual_odometry"))},
     )
     assert warned(inputs, stretch(), skipped_s=0.55) == (
         sleeps,
@@ -140,17 +139,15 @@ def test_a_sensor_that_left_the_path_is_one_finding_with_its_worst():
 SECOND_NS = 1_000_000_000
 
 
-def off(begin_s, end_s, size, *, sensor="gnss", what="position", alone=False):
-    return Disagreement(begin_s * SECOND_NS, end_s * SECOND_NS, sensor, what, size, "m", 0.02, alone)
+def off(begin_s, end_s, size, *, sensor="gnss"):
+    return Disagreement(begin_s * SECOND_NS, end_s * SECOND_NS, sensor, size, 0.02)
 
 
 NOBODY = FusionInputs(None), Streams({}, {}, "husky")
 
 
-def fused(*found, tallies=()):
-    return Fused(
-        facts=[StretchFacts({}, {}, {}, start_ns=100 * SECOND_NS)], disagreements=list(found), tallies=list(tallies)
-    )
+def fused(*found):
+    return Fused(facts=[StretchFacts({}, {}, {}, start_ns=100 * SECOND_NS)], disagreements=list(found))
 
 
 def test_nothing_is_said_where_nobody_disagrees():
@@ -160,23 +157,12 @@ def test_nothing_is_said_where_nobody_disagrees():
 
 
 def test_a_finding_holds_sensor_what_window_size_and_what_was_expected():
-    told = make_audit_findings(fused(off(110, 130, 0.2), off(160, 220, 0.49), off(150, 155, 9.0, alone=True)), *NOBODY)
-    shared, lone = told.findings
-    assert (shared.code, shared.subject.name, shared.action) == ("position-disagrees", "gnss", "inflated")
-    assert shared.numbers == {"off_m": 0.49, "expected_std_m": 0.02, "event_count": 2, "total_s": 80.0}
+    told = make_audit_findings(fused(off(110, 130, 2.0), off(160, 220, 4.9)), *NOBODY)
+    (shared,) = told.findings
+    assert (shared.code, shared.subject.name, shared.action) == ("distance-disagrees", "gnss", "inflated")
+    assert shared.numbers == {"off_m": 4.9, "expected_std_m": 0.02, "event_count": 2, "total_s": 80.0}
     assert shared.span_s == (60.0, 120.0)
-    assert (lone.code, lone.severity, lone.action) == ("position-disagrees", "note", "kept")
-    assert (lone.numbers["off_m"], lone.span_s) == (9.0, (50.0, 55.0))
-    assert len(told.facts.disagreements) == 3
-
-
-def test_a_run_that_no_third_decides_says_why_it_has_no_segments():
-    told = make_audit_findings(fused(tallies=[Tally("wheel_odometry", "displacement", 20, 15, 0)]), *NOBODY)
-    assert told.facts.undecided == ("wheel_odometry",)
-    (finding,) = told.findings
-    assert (finding.code, finding.subject.name) == ("disagreement-undecided", "wheel_odometry")
-    assert (finding.severity, finding.names) == ("error", {"quantity": "displacement"})
-    assert proposed(finding) == {"read": {"topics": {"wheel_odometry": []}}}
+    assert len(told.facts.disagreements) == 2
 
 
 def wheels_alone(speed_mps):

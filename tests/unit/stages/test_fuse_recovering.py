@@ -9,14 +9,12 @@ from tcpipe.recipe import FuseConfig
 from tcpipe.stages import fuse as stage
 from tcpipe.stages.fuse_inputs import FusionInputs
 from tcpipe.stages.fuse_sections import Fused
-from tcpipe.tables.facts import SensorChecks
-from tcpipe.tables.findings import StageReport, Subject
+from tcpipe.tables.findings import Subject
 from tcpipe.tables.levels import Sensor, Streams
 
 STAMP_NS = np.arange(5, dtype=np.int64)
 ROLES = ("gnss", "imu", "wheel_odometry", "visual_odometry")
 STREAMS = Streams({}, {role: Sensor(f"/{role}", "x/msg/Y", role, "why") for role in ROLES}, "husky")
-NOTHING = StageReport((), SensorChecks())
 
 
 def odometry():
@@ -52,23 +50,23 @@ def fusing(monkeypatch):
 
 
 def recovered(given):
-    found, sanity, _ = stage.fuse_recovering(given, NOTHING, STREAMS, FuseConfig(), run=Subject("run", "r"))
-    return set(found.measurements[0].sensors()), sanity
+    found, _ = stage.fuse_recovering(given, STREAMS, FuseConfig(), run=Subject("run", "r"))
+    return set(found.measurements[0].sensors()), {role: of.code for role, of in found.excluded.items()}
 
 
 def test_a_track_that_follows_its_sensors_is_fused_once(fusing):
     tried = fusing()
-    sensors, sanity = recovered(inputs())
-    assert (sensors, sanity.facts.excluded, len(tried)) == (set(ROLES), {}, 1)
+    sensors, excluded = recovered(inputs())
+    assert (sensors, excluded, len(tried)) == (set(ROLES), {}, 1)
 
 
 @pytest.mark.parametrize("visual", [True, False])
 def test_of_a_track_that_goes_astray_the_imu_is_tried_first(fusing, visual):
     roles = frozenset(ROLES) if visual else frozenset(ROLES) - {"visual_odometry"}
     fusing(lost=[roles])
-    sensors, sanity = recovered(inputs(visual=visual))
+    sensors, excluded = recovered(inputs(visual=visual))
     assert sensors == roles - {"imu"}
-    assert sanity.facts.excluded == {"imu": "misleads-track"}
+    assert excluded == {"imu": "misleads-track"}
 
 
 def test_a_track_that_goes_astray_without_its_imu_too_is_mended_by_the_only_other_that_does(fusing):

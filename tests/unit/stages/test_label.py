@@ -212,13 +212,13 @@ def test_slip_weak_position_curve_and_command():
     assert flagged(curved, Quality.CURVED).all()
 
 
-def test_segments_that_touch_a_time_in_which_sensors_disagree_undecided_are_flagged():
-    def between(begin_s, end_s, *, alone=False, clock_epoch=0):
+def test_segments_that_touch_a_time_in_which_sensors_disagree_are_flagged():
+    def between(begin_s, end_s, *, clock_epoch=0):
         span = (int(ZERO + begin_s * 1e9), int(ZERO + end_s * 1e9))
-        return Disagreement(*span, "gnss", "position", 0.5, "m", 0.02, alone=alone, clock_epoch=clock_epoch)
+        return Disagreement(*span, "gnss", 0.5, 0.02, clock_epoch)
 
     track = straight_track(SPEED)
-    audit = AuditFacts((between(20, 30), between(40, 50, alone=True), between(5, 10, clock_epoch=1)))
+    audit = AuditFacts((between(20, 30), between(5, 10, clock_epoch=1)))
     facts = replace(track.info.report.facts, audit=audit)
     told = replace(track, info=replace(track.info, report=StageReport((), facts)))
     labelled = label(told, power_streams({"drive": record()}))

@@ -125,10 +125,8 @@ def test_a_hole_counts_by_the_rows_on_both_of_its_sides(late, near):
     assert (Quality.NEAR_GAP in flags(segment, track)) == near
 
 
-def disagreement(start_ns, end_ns, *, alone=False, clock_epoch=0):
-    return AuditFacts(
-        (Disagreement(int(start_ns), int(end_ns), "gnss", "position", 1.0, "m", 0.1, alone, clock_epoch),)
-    )
+def disagreement(start_ns, end_ns, *, clock_epoch=0):
+    return AuditFacts((Disagreement(int(start_ns), int(end_ns), "gnss", 1.0, 0.1, clock_epoch),))
 
 
 @pytest.mark.parametrize(
@@ -139,9 +137,8 @@ def test_a_disagreement_counts_where_it_touches_a_segment(before, behind, touche
     assert (flags(cut(), about=info(audit=audit)) == {Quality.SENSORS_DISAGREE}) == touches
 
 
-def test_a_disagreement_that_is_settled_or_of_another_epoch_is_none():
+def test_a_disagreement_of_another_epoch_is_none():
     span = STAMPS[100], STAMPS[120]
-    assert flags(cut(), about=info(audit=disagreement(*span, alone=True))) == set()
     assert flags(cut(), about=info(audit=disagreement(*span, clock_epoch=1))) == set()
     later = cut(clock_epoch=np.ones(1, np.int16))
     assert flags(later, about=info(audit=disagreement(*span))) == set()
@@ -162,8 +159,8 @@ def streams(*, steps=(), **time_sources):
     return Streams({}, sensors, "husky", report=StageReport((), StageFacts(epochs=len(steps) + 1, clock_steps=steps)))
 
 
-def clocks(role, *, noted=False, drifts=False, blamed=False):
-    offset = ClockOffset(0.1, 0.01, noted, None, None, drifts, blamed)
+def clocks(role, *, noted=False, blamed=False):
+    offset = ClockOffset(0.1, 0.01, noted, blamed)
     return info(clock_offsets=ClockFacts(0, "gnss", (), {role: offset}))
 
 
@@ -178,9 +175,7 @@ def test_a_clock_is_doubtful_that_is_off_unless_it_was_corrected():
     good = streams(gnss="header")
     assert not is_clock_doubtful(good, clocks("imu"))
     assert is_clock_doubtful(good, clocks("imu", noted=True))
-    assert is_clock_doubtful(good, clocks("imu", drifts=True))
     assert not is_clock_doubtful(good, clocks("imu", noted=True, blamed=True))
-    assert not is_clock_doubtful(good, clocks("gnss", drifts=True, blamed=True))
     assert is_clock_doubtful(good, clocks("power", noted=True, blamed=True))
 
 

@@ -16,7 +16,8 @@ from tcpipe.stages import withheld
 from tcpipe.stages.fuse import fuse_run
 from tcpipe.stages.withheld import compare_withheld, withhold
 from tcpipe.tables.columns import to_floats, to_integers
-from tcpipe.tables.facts import MountingFacts
+from tcpipe.tables.facts import ParameterFacts
+from tcpipe.tables.findings import Subject, make_finding
 from tcpipe.tables.levels import GNSS_VELOCITY
 
 SECONDS = 185.0
@@ -103,8 +104,13 @@ def test_a_sigma_is_held_against_errors_of_its_size(streams, track, monkeypatch)
 def test_what_is_not_known_of_the_lever_arm_is_no_part_of_the_antennas_sigma(streams, track, monkeypatch):
     """The σ of base_link contains 0.5 m of the arm along each axis of the body; the antenna is known to 0.3 m."""
     stated = replace(streams, sensors={**streams.sensors, "gnss": sensor((0.0, 0.0, 0.0))})
-    facts = replace(track.info.report.facts, mounting=MountingFacts(drive.LEVER, (0.5, 0.5, 0.5)))
-    estimated = replace(track, info=replace(track.info, report=replace(track.info.report, facts=facts)))
+    report = track.info.report
+    shown = {"antenna": ParameterFacts(drive.LEVER, (0.5,) * 3, (0.5,) * 3)}
+    fuse = replace(report.facts.fuse, stretches=[replace(of, parameters=shown) for of in report.facts.fuse.stretches])
+    numbers = {f"{axis}{end}": 0.0 for axis in ("forward", "left", "up") for end in ("_m", "_std_m")}
+    unknown = make_finding("lever-arm-unknown", Subject("role", "gnss"), names={"placed_by": "assumed"}, **numbers)
+    report = replace(report, findings=(unknown,), facts=replace(report.facts, fuse=fuse))
+    estimated = replace(track, info=replace(track.info, report=report))
     (fixes,) = (
         of
         for of in audited(stated, estimated, monkeypatch, shift(0.0, float(np.hypot(0.3, 0.5))))

@@ -7,7 +7,7 @@ import pytest
 from rough_drive import ANTENNA_M, measured
 
 from tcpipe.fusion.checks.clock_offsets import find_clock_offsets
-from tcpipe.fusion.checks.sensors import check_ground_velocity
+from tcpipe.fusion.checks.sanity import check_ground_velocity
 from tcpipe.fusion.measurements import GroundVelocities
 
 STD_MPS = 0.05

@@ -1,9 +1,21 @@
 """Lags of made signals: sub-sample, through other scales and axes, with an error that is what repeated trials show."""
 
+import itertools
+
 import numpy as np
 import pytest
 
-from tcpipe.fusion.checks.lags import GRID_NS, GRID_S, average_on_grid, compute_moving_mean, find_lag, make_grid_ns
+from tcpipe.fusion.checks.lags import (
+    GRID_NS,
+    GRID_S,
+    average_on_grid,
+    compute_moving_mean,
+    find_lag,
+    find_liveliest_window_ns,
+    iterate_windows_ns,
+    make_grid_ns,
+)
+from tcpipe.fusion.measurements import BodyVelocities, Measurements
 
 S = 1_000_000_000
 AT = make_grid_ns(0, 120 * S)
@@ -85,3 +97,34 @@ def test_a_flat_peak_tells_little_however_alike_its_parts_are():
     found, clear = find_lag(noisy, slow), find_lag(slow[:, 0] + 1e-3 * noisy, slow)
     assert found is None or found.std_s > 0.05
     assert clear.std_s < 1e-2
+
+
+def test_an_hour_of_standing_is_not_what_is_judged():
+    stamp_ns = np.arange(0, 3 * 3600, dtype=np.int64) * 1_000_000_000
+    speed = np.where(stamp_ns > 2.2 * 3600e9, 1.0, 0.0)
+    nothing = np.full(speed.size, np.nan)
+    wheels = BodyVelocities(
+        stamp_ns, np.column_stack((speed, nothing, nothing)), np.ones((speed.size, 3)), nothing, nothing
+    )
+    at_ns = find_liveliest_window_ns(Measurements(wheels=wheels))
+    assert at_ns[0] >= 2.1 * 3600e9
+    assert (at_ns[-1] - at_ns[0]) * 1e-9 == pytest.approx(1800.0, abs=0.1)
+
+
+def wheels_at(at_s):
+    nothing = np.full(at_s.size, np.nan)
+    velocity = np.column_stack((np.ones(at_s.size), nothing, nothing))
+    return BodyVelocities(np.int64(at_s) * 10**9, velocity, np.ones((at_s.size, 3)), nothing, nothing)
+
+
+def test_where_nothing_was_measured_for_years_there_are_no_windows():
+    years = np.concatenate((np.arange(600), 10**9 + np.arange(600)))
+    assert len(list(iterate_windows_ns(Measurements(wheels=wheels_at(years)), 600 * 10**9))) == 4
+
+
+def test_windows_cover_all_of_the_time_once():
+    found = list(iterate_windows_ns(Measurements(wheels=wheels_at(np.arange(2501))), 600 * 10**9))
+    assert len(found) == 4
+    assert found[0][0] == 0
+    assert all(abs(b[0] - a[-1]) <= GRID_NS for a, b in itertools.pairwise(found))
+    assert 2500 * 10**9 - found[-1][-1] < GRID_NS
