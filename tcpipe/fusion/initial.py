@@ -70,13 +70,11 @@ def find_initial_state(measurements: Measurements, stationary_ns: Ints, start_ns
 
 
 def _estimate_gyro_bias(imu: InertialMeasurements | None, stationary_ns: Ints) -> tuple[Floats, float]:
-    if imu is None or stationary_ns.size == 0:
-        return np.zeros(3), _GYRO_BIAS_STD_RADPS
-    inside = (imu.stamp_ns >= stationary_ns[0, 0]) & (imu.stamp_ns <= stationary_ns[0, 1])
-    if inside.sum() < 10:
-        return np.zeros(3), _GYRO_BIAS_STD_RADPS
-    mean: Floats = imu.angular_velocity_radps[inside].mean(0)
-    return mean, max(0.002, imu.gyro_std_radps / np.sqrt(inside.sum()))
+    if imu is not None and stationary_ns.size:
+        inside = (imu.stamp_ns >= stationary_ns[0, 0]) & (imu.stamp_ns <= stationary_ns[0, 1])
+        if inside.sum() >= 10:
+            return imu.angular_velocity_radps[inside].mean(0), max(0.002, imu.gyro_std_radps / np.sqrt(inside.sum()))
+    return np.zeros(3), _GYRO_BIAS_STD_RADPS
 
 
 def _estimate_tilt(imu: InertialMeasurements | None, stationary_ns: Ints, start_ns: int) -> tuple[float, float, float]:
@@ -215,9 +213,8 @@ class _Fit:
 def _fit_course(gnss: Positions, path: _Path, start_ns: int) -> _Fit | None:
     """Find the first window of fixes that the drawn path fits; the best of all where none fits well."""
     stamp_s = compute_seconds(gnss.stamp_ns, start_ns)
-    east_north = compute_median_of_five(gnss.position_enu_m[:, 0]) + 1j * compute_median_of_five(
-        gnss.position_enu_m[:, 1]
-    )
+    east, north = (compute_median_of_five(axis) for axis in gnss.position_enu_m[:, :2].T)
+    east_north = east + 1j * north
     noise = float(np.median(np.sqrt(gnss.variance_m2[:, :2].mean(1))))
     wanted = max(_MIN_COURSE_M, _MIN_COURSE_STD * noise)
     drawn = path.antenna(stamp_s)
@@ -232,16 +229,13 @@ def _fit_course(gnss: Positions, path: _Path, start_ns: int) -> _Fit | None:
         if far.size == 0:
             continue
         inside = slice(first, first + int(far[0]) + 1)
-        if stamp_s[inside][-1] - stamp_s[first] > wanted / _MIN_SPEED_MPS and not path.known:
-            continue
-        fit = _fit(east_north[inside], drawn[inside], stamp_s[inside], noise) if path.known else None
-        if not path.known:
+        if path.known:
+            fit = _fit(east_north[inside], drawn[inside], stamp_s[inside], noise)
+            if fit is not None and fit.residual_m <= max(3 * noise, 0.05 * wanted):
+                return fit
+            best = min((each for each in (best, fit) if each), key=lambda each: each.residual_m, default=None)
+        elif stamp_s[inside][-1] - stamp_s[first] <= wanted / _MIN_SPEED_MPS:
             return _fit_course_to_fixes(east_north[inside], path.yaw(stamp_s[inside]), stamp_s[inside])
-        if fit is None:
-            continue
-        if fit.residual_m <= max(3 * noise, 0.05 * wanted):
-            return fit
-        best = fit if best is None or fit.residual_m < best.residual_m else best
     return best
 
 
