@@ -1,8 +1,8 @@
 """tcpipe under Dagster: ``dagster dev -f pipelines/dagster/definitions.py``.
 
 Every log is a partition, found by a sensor; the assets are ``run`` (of one log), ``dataset`` and ``model``. What tcpipe says of them is
-their metadata, what it finds wrong is an asset check. The commands do the work: nothing is relied upon but their exit codes and their
-``--json`` answers. Where things lie is told by the environment:
+their metadata, what it finds wrong is an asset check. The commands do the work: a run of a partition looks at no other log. Where things
+lie is told by the environment:
 
     TCPIPE_LOGS      folder or URL of the recordings (default: recordings)
     TCPIPE_STORE     store with the maps (tcpipe-store)
@@ -16,16 +16,21 @@ import os
 import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
 import dagster as dg
 
+from tcpipe import __version__
+from tcpipe.formats.commits import State
 from tcpipe.formats.finding_lines import format_finding, list_findings
-from tcpipe.formats.json_files import parse_typed
-from tcpipe.pipeline.log_sources import LogSource, find_sources
+from tcpipe.formats.json_files import digest, parse_typed
+from tcpipe.formats.object_storage import is_url
+from tcpipe.formats.recipe_toml import ingest_key, resolve_recipe
+from tcpipe.pipeline.log_sources import find_sources
+from tcpipe.pipeline.plan import IngestTask, Step, plan
+from tcpipe.store import is_store, open_store
 from tcpipe.tables.findings import AFFECTED, Finding, Verdict, is_problem, select_findings
 
 Answer = Mapping[str, Any]
@@ -34,8 +39,14 @@ LOGS = dg.DynamicPartitionsDefinition(name="logs")
 
 _DONE = {0, 3}
 """Exit codes with a result: done; done, and something in it wants to be looked at."""
-_YOUNG_NS = 600 * 10**9
+_USAGE = 2
+"""Exit code of a call that fails again however often it is tried."""
+_YOUNG_S = 600.0
 """A log that was written to since is not asked for yet: it may still be written, or on its way."""
+_A_TICK = 100
+"""Most logs that one tick of the sensor asks for."""
+_RETRIES = dg.RetryPolicy(max_retries=3, delay=600, backoff=dg.Backoff.EXPONENTIAL, jitter=dg.Jitter.PLUS_MINUS)
+"""Of what may pass: a full disk, a network."""
 
 
 def _place(name: str, default: str) -> str:
@@ -48,7 +59,8 @@ def _answers(command: str, *arguments: str, codes: Collection[int] = _DONE) -> l
     done = subprocess.run(line, capture_output=True, text=True, check=False)
     if done.returncode not in codes or not done.stdout.strip():
         said = done.stderr.strip() or done.stdout.strip()
-        raise dg.Failure(description=said, metadata={"exit code": done.returncode, "command": " ".join(line[2:])})
+        told = {"exit code": done.returncode, "command": " ".join(line[2:])}
+        raise dg.Failure(said, metadata=told, allow_retries=done.returncode != _USAGE)
     text, found, decoder = done.stdout.strip(), [], json.JSONDecoder()
     while text:
         value, end = decoder.raw_decode(text)
@@ -57,11 +69,21 @@ def _answers(command: str, *arguments: str, codes: Collection[int] = _DONE) -> l
     return found
 
 
-def _sources() -> dict[str, LogSource]:
-    """Return the logs that there are, by partition: where each lies in the folder."""
+def _plan() -> dict[str, Step]:
+    """Return what every log needs as recipe and store are now, by partition: where it lies in the folder."""
+    recipe, store = resolve_recipe(None), _place("TCPIPE_STORE", "tcpipe-store")
     with tempfile.TemporaryDirectory() as staging:
-        found = find_sources([_place("TCPIPE_LOGS", "recordings")], as_one=False, staging=Path(staging))
-    return {source.place: source for source in found.sources}
+        logs = [_place("TCPIPE_LOGS", "recordings")]
+        found = find_sources(logs, as_one=False, staging=Path(staging), tables=recipe.tables).sources
+    state = open_store(store).state() if is_store(store) else State()
+    tasks = [IngestTask(source, store, recipe, recipe.robot, {}, force=False, min_age_s=_YOUNG_S) for source in found]
+    return {step.task.source.place: step for step in plan(tasks, state)}
+
+
+def _make_run_key(step: Step) -> str:
+    """Return what changes when a log is to be ingested again: its name, size and time, the recipe, the version."""
+    source, recipe = step.task.source, step.task.recipe
+    return f"{source.place}:{digest([source.files_digest, ingest_key(recipe), recipe.robot, __version__])[:16]}"
 
 
 def _listed(lines: list[str]) -> dg.MetadataValue:
@@ -108,27 +130,31 @@ def _verified(path: str) -> dg.AssetCheckResult:
 
 @dg.asset(
     partitions_def=LOGS,
-    retry_policy=dg.RetryPolicy(max_retries=3, delay=600),  # of what may pass: a full disk, a network
+    pool="tcpipe_ingest",
+    retry_policy=_RETRIES,
+    code_version=__version__,
     group_name="tcpipe",
     kinds={"parquet"},
     check_specs=[
-        dg.AssetCheckSpec("as_written", asset="run", description="Every byte is as it was written (tcpipe verify)."),
+        dg.AssetCheckSpec(
+            "as_written", asset="run", blocking=True, description="Every byte is as it was written (tcpipe verify)."
+        ),
         dg.AssetCheckSpec("usable", asset="run", description="Position, time and energy are usable without care."),
     ],
 )
 def run(context: dg.AssetExecutionContext) -> dg.MaterializeResult:
     """Labelled segments of one log, in the store."""
-    source = _sources().get(context.partition_key)
-    if source is None:
-        gone = f"{context.partition_key}: this log is no longer below {_place('TCPIPE_LOGS', 'recordings')}"
-        raise dg.Failure(gone, allow_retries=False)
-    result = _answers("ingest", *source.origins, codes={0, 1, 3})[-1]["results"][0]
+    log = f"{_place('TCPIPE_LOGS', 'recordings').rstrip('/')}/{context.partition_key}"
+    if not is_url(log) and not Path(log).exists():
+        raise dg.Failure(f"{log}: this log is gone", allow_retries=False)
+    result = _answers("ingest", log, codes={0, 1, 3})[-1]["results"][0]
     if result["status"] in ("failed", "waiting"):
         said = "\n".join([*result["problems"], *result["notes"]]) or result["status"]
         raise dg.Failure(said, allow_retries=result["transient"] or result["status"] == "waiting")
     made = result["run"]
     budget = made["energy_budget"]
     return dg.MaterializeResult(
+        data_version=dg.DataVersion(digest([made["run_id"], made["recipe_id"], made["segments_sha256"]])),
         metadata={
             "run": made["run_id"],
             "recipe": made["recipe_id"],
@@ -148,11 +174,14 @@ def run(context: dg.AssetExecutionContext) -> dg.MaterializeResult:
 
 @dg.asset(
     deps=[run],
+    pool="tcpipe_build",
+    retry_policy=_RETRIES,
+    code_version=__version__,
     group_name="tcpipe",
     kinds={"zarr", "parquet"},
     check_specs=[
-        dg.AssetCheckSpec(
-            "as_written", asset="dataset", description="Every byte is as it was written (tcpipe verify)."
+        dg.AssetCheckSpec(  # no model is trained where it fails
+            "as_written", asset="dataset", blocking=True, description="Every byte is as it was written (tcpipe verify)."
         ),
         dg.AssetCheckSpec("as_asked_for", asset="dataset", description="No run is left out, no split is empty."),
         dg.AssetCheckSpec(
@@ -169,6 +198,7 @@ def dataset() -> dg.MaterializeResult:
     problems = [format_finding(finding) for finding in findings if is_problem(finding)]
     shared = [format_finding(finding) for finding in select_findings(findings, "split-leakage")]
     return dg.MaterializeResult(
+        data_version=dg.DataVersion(card["inputs"]),
         metadata={
             "status": made["status"],
             "samples": card["samples"],
@@ -187,7 +217,14 @@ def dataset() -> dg.MaterializeResult:
     )
 
 
-@dg.asset(deps=[dataset], group_name="tcpipe", kinds={"lightgbm"})
+@dg.asset(
+    deps=[dataset],
+    pool="tcpipe_build",
+    retry_policy=_RETRIES,
+    code_version=__version__,
+    group_name="tcpipe",
+    kinds={"lightgbm"},
+)
 def model() -> dg.MaterializeResult:
     """Trees on features of the dataset's patches."""
     data, out = _place("TCPIPE_DATASET", "dataset"), _place("TCPIPE_MODEL", "model")
@@ -203,18 +240,15 @@ one_log = dg.define_asset_job("one_log", dg.AssetSelection.assets(run), descript
 
 @dg.sensor(job=one_log, minimum_interval_seconds=300, default_status=dg.DefaultSensorStatus.RUNNING)
 def new_logs(context: dg.SensorEvaluationContext) -> dg.SensorResult:
-    """Ask for a run of every log that is new, or was written to since, once it rests."""
-    sources = _sources()
-    known = set(context.instance.get_dynamic_partitions("logs"))
+    """Ask for a run of every log that is new or is to be ingested again, once it rests; a tick goes on behind the last one."""
+    steps, known, last = _plan(), set(context.instance.get_dynamic_partitions("logs")), context.cursor or ""
+    wanted = [at for at, step in steps.items() if step.is_todo or (at not in known and step.state != "growing")]
+    places = sorted(wanted, key=lambda place: (place <= last, place))[:_A_TICK]
+    new = sorted(set(places) - known)
     return dg.SensorResult(
-        run_requests=[
-            dg.RunRequest(partition_key=place, run_key=f"{place}:{source.files_digest}")
-            for place, source in sources.items()
-            if time.time_ns() - source.youngest_ns > _YOUNG_NS
-        ],
-        dynamic_partitions_requests=[LOGS.build_add_request(sorted(set(sources) - known))]
-        if set(sources) - known
-        else [],
+        run_requests=[dg.RunRequest(partition_key=place, run_key=_make_run_key(steps[place])) for place in places],
+        dynamic_partitions_requests=[LOGS.build_add_request(new)] if new else [],
+        cursor=places[-1] if places else last,
     )
 
 

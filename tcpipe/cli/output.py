@@ -200,19 +200,26 @@ def _format_megabytes(size_bytes: float) -> str:
     return f"{size_bytes / 1e6:.1f}"
 
 
+_ONE_EVENT_S = 60.0
+
+
 class _Lines(logging.Handler):
-    """Sends messages of the pipeline to the progress display."""
+    """Sends messages of the pipeline to the progress display; what several workers say of one event is one line."""
 
     def __init__(self, shown: Progress) -> None:
         super().__init__()
         self._shown = shown
+        self._warned = dict[str, float]()
 
     def emit(self, record: logging.LogRecord) -> None:
+        text = record.getMessage()
         if step := step_of(record):
             self._shown.step(step)
-        else:
-            said = self._shown.problem if record.levelno >= logging.ERROR else self._shown.line
-            said(record.getMessage())
+        elif record.levelno >= logging.ERROR:
+            self._shown.problem(text)
+        elif record.levelno < logging.WARNING or record.created - self._warned.get(text, 0.0) > _ONE_EVENT_S:
+            self._warned[text] = record.created
+            self._shown.line(text)
 
 
 @contextmanager

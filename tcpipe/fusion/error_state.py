@@ -406,7 +406,7 @@ def _make_rejections(m: Measurements, made: Pass) -> Rejections:
 def find_gate_resets(made: Pass) -> tuple[GateReset, ...]:
     """Return each gate reset: since when the sensor was rejected, and its difference."""
     found = []
-    for kind, role in ROLES.items():
+    for kind, role in ((kind, role) for kind, role in ROLES.items() if kind != state.ATTITUDE):
         verdict, stamp_ns = made.tests.verdict[:, kind], made.ticks.stamp_ns
         for tick in np.flatnonzero(verdict == RESET):
             heard = np.flatnonzero((verdict[:tick] != REJECTED) & (verdict[:tick] != NONE))

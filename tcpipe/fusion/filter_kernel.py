@@ -444,6 +444,9 @@ def _widen(kind: int, P: Matrix, y: Vector, size: int, scale: int) -> None:
         for i in range(3):
             P[RHO + i, RHO + i] += y[i] * y[i]
             P[U + i, U + i] += 0.3**2
+    elif kind == ATTITUDE:
+        for i in range(3):
+            P[THETA + i, THETA + i] += y[i] * y[i]
     elif scale >= 0:
         P[scale, scale] += 0.1**2
     else:

@@ -223,6 +223,7 @@ def _find_patience(m: Measurements, *, follows: bool) -> Floats:
         patience[state.FIX, 1:] = 1.0
     if not follows:
         patience[state.FIX] = _NEVER
+    patience[state.ATTITUDE] = patience[state.FIX]
     return patience
 
 

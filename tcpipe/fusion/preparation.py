@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.fusion.attitude import add_attitude
+from tcpipe.fusion.attitude import add_attitude, add_turn_variance
 from tcpipe.fusion.measurements import (
     IMU,
     VISUAL,
@@ -201,7 +201,7 @@ def inflate_jittery_fixes(gnss: Positions, odometry: BodyVelocities) -> tuple[Po
     jitter_s = np.interp(stamp_s, middle_s, np.sqrt(np.where(matters, excess_s2, 0.0)))
     variance = gnss.variance_m2.copy()
     variance[:, :2] += ((2 * np.interp(stamp_s, odometry_s, speed[:, 0]) * jitter_s) ** 2)[:, None]
-    return replace(gnss, variance_m2=variance), jitter_s
+    return add_turn_variance(replace(gnss, variance_m2=variance), 2 * jitter_s), jitter_s
 
 
 def _make_windows(values: Floats) -> Floats:

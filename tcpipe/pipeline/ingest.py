@@ -162,7 +162,7 @@ def find_broken(store: Store, state: State, sources: Iterable[LogSource]) -> set
 
     In a bucket nobody looks, as that takes a request for every thousand files.
     """
-    if isinstance(store.root, str):
+    if store.place.path is None:
         return set()
     contents = {snapshot.sha256 for source in sources for snapshot in state.seen.get(source.lineage, ())}
     rows = [row for row in state.runs.values() if row.log and row.log.source.sha256 in contents]

@@ -168,7 +168,7 @@ def find_status(
     runs = opened.ingestions(state=state)
     mine = range(len(found.sources)) if shard is None else select_shard(found.sources, shard)
     tasks = (IngestTask(found.sources[at], *how, min_age_s) for at in mine)
-    steps = plan(tasks, state, broken=() if isinstance(opened.root, str) else runs.lost)
+    steps = plan(tasks, state, broken=runs.lost if opened.place.path else ())
     problems = [*_store_problems(runs)]
     if (
         not create

@@ -91,7 +91,7 @@ def find_clock_jumps(inputs: FusionInputs) -> Iterator[tuple[int, Finding]]:
 
     Nothing is measured before them, and by the fixes the robot, which drives before and after, does not drive meanwhile.
     """
-    sets = list(inputs.measurements.values())
+    sets = [m for m in inputs.measurements.values() if m.sensors()]
     stamps = [np.unique(np.concatenate([sensor.stamp_ns for sensor in m.sensors().values()])) for m in sets]
     for m, stamp_ns in zip(sets, stamps, strict=True):
         odometry = m.first_odometry

@@ -3,12 +3,14 @@
 `make test-dagster` runs it in an environment of its own.
 """
 
+import importlib.util
 import os
-import runpy
+import shutil
 from pathlib import Path
 
 import pytest
 
+from tcpipe.pipeline.ingest import ingest
 from tcpipe.pipeline.maps import add_map
 from tcpipe.simulation import Faults, make_tiny, simulate
 
@@ -17,8 +19,13 @@ dg = pytest.importorskip("dagster", reason="dagster is not installed (make test-
 DEFINITIONS = Path(__file__).parents[2] / "pipelines" / "dagster" / "definitions.py"
 
 
+@pytest.fixture
+def site(simulated: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(simulated, tmp_path / "site"))
+
+
 @pytest.fixture(scope="module")
-def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def simulated(tmp_path_factory: pytest.TempPathFactory) -> Path:
     place = tmp_path_factory.mktemp("site")
     made = simulate(place, scenario=make_tiny(Faults.every()))
     add_map("site", **made.rasters, store=place / "store")
@@ -27,17 +34,30 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def defs(site: Path, monkeypatch: pytest.MonkeyPatch) -> dg.Definitions:
+def module(site: Path, monkeypatch: pytest.MonkeyPatch):
     where = {"LOGS": "logs", "STORE": "store", "DATASET": "dataset", "MODEL": "model"}
     for name, place in where.items():
         monkeypatch.setenv(f"TCPIPE_{name}", str(site / place))
     monkeypatch.delenv("TCPIPE_SPLIT", raising=False)
-    return runpy.run_path(str(DEFINITIONS))["defs"]
+    monkeypatch.delenv("TCPIPE_RECIPE", raising=False)
+    spec = importlib.util.spec_from_file_location("definitions", DEFINITIONS)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
 
 
-def found(defs, instance):
+@pytest.fixture
+def defs(module) -> dg.Definitions:
+    return module.defs
+
+
+def found(defs, instance, cursor=None):
     """Return what the sensor asks for, and what partitions it makes."""
-    return defs.resolve_sensor_def("new_logs")(dg.build_sensor_context(instance=instance))
+    return defs.resolve_sensor_def("new_logs")(dg.build_sensor_context(instance=instance, cursor=cursor))
+
+
+def data_version(materialization):
+    return materialization.tags["dagster/data_version"]
 
 
 def test_a_new_log_is_found_and_becomes_a_dataset_with_metadata_and_checks(defs, site):
@@ -48,6 +68,7 @@ def test_a_new_log_is_found_and_becomes_a_dataset_with_metadata_and_checks(defs,
         assert (request.partition_key, wanted.partition_keys) == ("tiny.mcap", ["tiny.mcap"])
         instance.add_dynamic_partitions("logs", ["tiny.mcap"])
         assert not found(defs, instance).dynamic_partitions_requests
+        assert [again.run_key for again in found(defs, instance).run_requests] == [request.run_key]
 
         done = defs.resolve_job_def("one_log").execute_in_process(instance=instance, partition_key="tiny.mcap")
         made = {
@@ -55,6 +76,9 @@ def test_a_new_log_is_found_and_becomes_a_dataset_with_metadata_and_checks(defs,
             for event in done.get_asset_materialization_events()
         }
         assert done.success
+        assert not found(defs, instance).run_requests, "it is in the store"
+        (materialized,) = done.asset_materializations_for_node("run")
+        assert {"dagster/data_version", "dagster/code_version"} <= set(materialized.tags)
         assert made["run"]["segments"].value > 5
         assert made["run"]["driven_m"].value == pytest.approx(14.5, abs=0.5)
         checks = {check.check_name: check for check in done.get_asset_check_evaluations()}
@@ -69,6 +93,9 @@ def test_a_new_log_is_found_and_becomes_a_dataset_with_metadata_and_checks(defs,
         )
         assert built.success
         metadata = built.asset_materializations_for_node("dataset")[0].metadata
+        again = dg.materialize([defs.resolve_assets_def("dataset")], instance=instance, selection="dataset")
+        first, second = (of.asset_materializations_for_node("dataset")[0] for of in (built, again))
+        assert data_version(first) == data_version(second), "nothing has changed"
         assert metadata["samples"].value == made["run"]["segments"].value
         assert "accelerating" in metadata["where_every_metre_went"].value
         assert metadata["map"].value.startswith("![map](data:image/png;base64,")
@@ -106,6 +133,63 @@ def test_what_cannot_be_read_fails_with_the_commands_own_words(defs, site):
             )
     finally:
         (site / "logs" / "junk.mcap").unlink()
+
+
+def test_ten_thousand_logs_are_asked_for_a_hundred_at_a_time(defs, site, tmp_path, monkeypatch):
+    (logs := tmp_path / "many").mkdir()
+    for number in range(250):
+        (logs / f"{number:03}.mcap").touch()
+        os.utime(logs / f"{number:03}.mcap", ns=(10**18, 10**18))
+    monkeypatch.setenv("TCPIPE_LOGS", str(logs))
+    with dg.DagsterInstance.ephemeral() as instance:
+        asked, cursor = [], None
+        for _ in range(4):
+            tick = found(defs, instance, cursor)
+            for wanted in tick.dynamic_partitions_requests:
+                instance.add_dynamic_partitions("logs", list(wanted.partition_keys))
+            asked.append([request.partition_key for request in tick.run_requests])
+            cursor = tick.cursor
+    places = [f"{number:03}.mcap" for number in range(250)]
+    assert asked == [places[:100], places[100:200], places[200:] + places[:50], places[50:150]]
+
+
+def test_another_recipe_asks_for_a_log_again_under_another_key(defs, site, tmp_path, monkeypatch):
+    (recipe := tmp_path / "recipe.toml").write_text("[segment]\nchord_m = 2.0\n")
+    with dg.DagsterInstance.ephemeral() as instance:
+        instance.add_dynamic_partitions("logs", ["tiny.mcap"])
+        keys = [request.run_key for request in found(defs, instance).run_requests]
+        monkeypatch.setenv("TCPIPE_RECIPE", str(recipe))
+        (request,) = found(defs, instance).run_requests
+        assert request.run_key not in keys
+
+
+def test_a_run_of_one_log_looks_at_no_other(module, monkeypatch):
+    monkeypatch.setattr(module, "find_sources", None)
+    with dg.DagsterInstance.ephemeral() as instance:
+        instance.add_dynamic_partitions("logs", ["tiny.mcap", *map(str, range(1000))])
+        job = module.defs.resolve_job_def("one_log")
+        assert job.execute_in_process(instance=instance, partition_key="tiny.mcap").success
+
+
+def test_no_model_is_trained_on_a_dataset_that_is_not_as_written(module, site, monkeypatch):
+    ingest([site / "logs"], store=site / "store")
+    answers = module._answers
+    monkeypatch.setattr(dg.RetryPolicy, "calculate_delay", lambda *_: 0)
+
+    for problems, trained in ((["one byte differs"], set()), ([], {"model"})):
+
+        def answer(command, *arguments, problems=problems, **how):
+            if command == "train":
+                return [{"model": "boosting"}]
+            found = answers(command, *arguments, **how)
+            return [{**found[0], "problems": problems}] if command == "verify" else found
+
+        monkeypatch.setattr(module, "_answers", answer)
+        with dg.DagsterInstance.ephemeral() as instance:
+            job = module.defs.resolve_job_def("nightly")
+            done = job.execute_in_process(instance=instance, raise_on_error=False)
+        made = {event.step_key for event in done.get_asset_materialization_events()}
+        assert (done.success, made - {"dataset"}) == (bool(trained), trained)
 
 
 def test_the_definitions_can_be_loaded(defs):

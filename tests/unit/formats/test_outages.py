@@ -9,6 +9,7 @@ from object_gateway import in_environment
 from storage_server import object_store
 from wheel_drives import START_NS, drive_at
 
+from tcpipe.cli.output import show_progress
 from tcpipe.errors import StoreError, UsageError
 from tcpipe.formats.place import open_place
 from tcpipe.pipeline.ingest import ingest
@@ -90,6 +91,19 @@ def test_a_time_that_is_none_is_refused(served, monkeypatch, given):
     served.away_until = time.monotonic() + 30
     with pytest.raises(UsageError, match=f"TCPIPE_RETRY_MINUTES is '{given}', expected a number of minutes"):
         place.read("a")
+
+
+def test_what_several_workers_say_of_an_outage_is_one_line(capsys):
+    logger = logging.getLogger("tcpipe")
+    with show_progress("ingest", quiet=False):
+        for text in (
+            "s3://tests: no answer",
+            "s3://tests: no answer",
+            "s3://other: no answer",
+            "s3://tests: no answer",
+        ):
+            logger.warning(text)
+    assert capsys.readouterr().err.splitlines() == ["s3://tests: no answer", "s3://other: no answer"]
 
 
 @pytest.fixture

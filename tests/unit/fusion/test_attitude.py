@@ -6,7 +6,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from tcpipe.fusion.attitude import STATED_MOUNTING_STD_RAD, UNSTATED_MOUNTING_STD_RAD, add_attitude, align_mounting
+from tcpipe.fusion.attitude import (
+    STATED_MOUNTING_STD_RAD,
+    UNSTATED_MOUNTING_STD_RAD,
+    add_attitude,
+    add_turn_variance,
+    align_mounting,
+)
 from tcpipe.fusion.measurements import BodyVelocities, Positions
 
 COUNT = 600
@@ -88,3 +94,12 @@ def test_a_stated_mounting_stays_unless_the_motion_contradicts_it():
     assert off_rad(align_mounting(make_pose(far, mounting=Rotation.identity()), None, is_stated=True)).max() < 0.05
     standing = replace(pose, position_enu_m=np.zeros((COUNT, 3)))
     assert align_mounting(standing, None, is_stated=True) is standing
+
+
+def test_stamps_that_jitter_make_attitudes_uncertain_by_how_far_the_robot_turns():
+    pose = make_pose()
+    raised = add_turn_variance(pose, np.full(COUNT, 0.2)).rotation_variance_rad2 - pose.rotation_variance_rad2
+    rate = np.abs(np.gradient(YAW_RAD, TIME_S)) * np.cos(PITCH_RAD)
+    assert np.sqrt(raised[:, 2]) == pytest.approx(0.2 * rate, abs=0.005)
+    without = replace(pose, quat_xyzw=None)
+    assert add_turn_variance(without, np.ones(COUNT)) is without

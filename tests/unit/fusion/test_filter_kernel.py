@@ -365,6 +365,29 @@ def test_rejections_in_a_row_open_the_gate_again():
     assert states[-1, 9] == pytest.approx(5.0, abs=0.05)
 
 
+def test_an_attitude_that_is_rejected_for_long_is_followed():
+    rng = np.random.default_rng(4)
+    inputs, model = make_inputs(120, rng, state.FLAT_TURN, noise=1e-8), model_of(())
+    model.gates[state.ATTITUDE] = 16.27
+    inputs.rate[:], inputs.turned[:], inputs.acceleration[:], inputs.tau[:] = 0.0, 0.0, 0.0, 0.0
+    inputs.value[:, state.STATIONARY], inputs.variance[:, state.STATIONARY] = 0.0, 1e-4
+    inputs.value[:, state.ATTITUDE], inputs.variance[:, state.ATTITUDE] = 0.0, 1e-4
+    inputs.attitude[:] = 0.0
+    inputs.attitude[40:, 2] = 1.0
+    model.patience[state.ATTITUDE] = 5.0, 2.0, 2.0
+    x = np.zeros(state.NX)
+    x[:9] = np.eye(3).ravel()
+    tests, states = make_tests(120), np.zeros((120, state.NX))
+    filter_ticks(
+        0, 120, inputs, model, Memory(x, np.eye(9) * 1e-4, np.zeros((state.KINDS, 2))), False, allocate_steps(0, 9),
+        tests, states,
+    )  # fmt: skip
+    reset = int(np.flatnonzero(tests.verdict[:, state.ATTITUDE] == RESET)[0])
+    assert reset * T == pytest.approx(39 * T + 2.0, abs=T)
+    assert (tests.verdict[reset + 1 :, state.ATTITUDE] == ACCEPTED).all()
+    assert np.arctan2(states[-1, 3], states[-1, 0]) == pytest.approx(1.0, abs=0.02)
+
+
 def test_an_event_makes_an_error_uncertain_or_another_one():
     rng = np.random.default_rng(4)
     inputs = make_inputs(10, rng)
