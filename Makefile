@@ -63,12 +63,10 @@ OBJECT_STORAGE ?= ../shared/tools/object-storage
 test-object-storage: .venv/installed-dev
 	TCPIPE_TEST_OBJECT_STORAGE=$(abspath $(OBJECT_STORAGE)) $(BIN)/pytest -rs -k gateway tests/unit/test_store.py tests/unit/formats/test_place.py tests/unit/pipeline/test_generations.py
 
-# Compiled while one core checks and installs, those of both estimators: each worker of the tests would compile them for itself.
+# Compiled while one core checks and installs: each worker of the tests would compile them for itself.
 kernels: .venv/installed-dev
 	@rm -rf .venv/tiny
 	$(BIN)/python tests/tiny_pipeline.py .venv/tiny
-	@printf '[fuse]\nestimator = "ukf"\n' > .venv/tiny/ukf.toml
-	$(BIN)/tcpipe ingest .venv/tiny/site/logs --recipe .venv/tiny/ukf.toml --store .venv/tiny/ukf --quiet
 	@rm -rf .venv/tiny
 
 # The definitions for Dagster, executed (docs/how-to/dagster.md); its pins want an environment of their own.

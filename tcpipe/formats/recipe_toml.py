@@ -17,7 +17,7 @@ from tcpipe.formats.json_files import Json, digest, to_plain
 from tcpipe.recipe import IngestSections, Recipe, TableMapping
 from tcpipe.recipe.checking import as_toml, describe, format_values, from_values, read_annotations
 from tcpipe.robots import GENERIC, PowerSource, Profiles, Robot
-from tcpipe.tables.options import EARLIER_KEYS
+from tcpipe.tables.options import EARLIER_KEYS, REMOVED_KEYS
 
 logger = logging.getLogger(__name__)
 
@@ -70,12 +70,15 @@ def resolve_recipe(given: Recipe | str | Path | None) -> Recipe:
 
 
 def parse_recipe(values: Mapping[str, Any], *, where: str) -> Recipe:
-    """Check recipe values; `RecipeError` carries one line for every wrong key. Keys by earlier names are read, with a note."""
+    """Check recipe values; `RecipeError` carries one line for every wrong key. Earlier keys are read, with a note."""
     values, renamed = rename_earlier_keys(values)
     if renamed:
         logger.warning(
             "%s: keys have new names: %s", where, ", ".join(f"{old} is {new}" for old, new in renamed.items())
         )
+    values, removed = _drop_removed_keys(values)
+    if removed:
+        logger.warning("%s: keys without effect since tcpipe 0.9: %s", where, ", ".join(removed))
     return from_values(Recipe, values, where=where)
 
 
@@ -83,6 +86,18 @@ def rename_earlier_keys(values: Mapping[str, Any]) -> tuple[Mapping[str, Any], d
     """Return recipe values with `EARLIER_KEYS` by their names of today, and those that were found."""
     renamed: dict[str, str] = {}
     return _rename(values, EARLIER_KEYS | _EARLIER_OF_MASK, renamed), renamed
+
+
+def _drop_removed_keys(values: Mapping[str, Any]) -> tuple[Mapping[str, Any], list[str]]:
+    """Return recipe values without `REMOVED_KEYS`, and those that were found."""
+    found = dict(values)
+    removed = []
+    for path in REMOVED_KEYS:
+        section, _, key = path.partition(".")
+        if isinstance(found.get(section), Mapping) and key in found[section]:
+            found[section] = {name: value for name, value in found[section].items() if name != key}
+            removed.append(path)
+    return found, removed
 
 
 def _rename(values: Any, names: Mapping[str, str], renamed: dict[str, str], path: str = "") -> Any:
@@ -120,7 +135,11 @@ _KEYS: dict[int, tuple[Recipe, str]] = {}
 
 def _hash_values(values: Mapping[str, Json]) -> str:
     names = [section.name for section in fields(IngestSections)]
-    return _digest({name: values.get(name) for name in names if values.get(name) or name not in _OWN_TABLES})
+    counted: dict[str, Any] = {name: values.get(name) for name in names if values.get(name) or name not in _OWN_TABLES}
+    for path, default in REMOVED_KEYS.items():
+        section, _, key = path.partition(".")
+        counted[section] = {key: default, **(counted[section] or {})}
+    return _digest(counted)
 
 
 def _digest(values: Any) -> str:

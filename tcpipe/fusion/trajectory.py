@@ -6,7 +6,7 @@ than 5 s: the estimator does not carry its certainty over it.
 Both estimators are called alike::
 
     run_error_state(measurements, initial, *, output_ns, gate_probability, smooth=True) -> Trajectory
-    run_ukf15(measurements, initial, *, output_ns, gate_probability, engine) -> Trajectory
+    run_ukf15(measurements, initial, *, output_ns, gate_probability) -> Trajectory
 
 ``output_ns`` are the wanted stamps, increasing, inside the span of the measurements.
 """

@@ -1,7 +1,9 @@
 """The paper's forward filter (section IV-A: GNSS, wheel odometry, IMU and visual odometry through one unscented Kalman filter).
 
-Fifteen states as in robot_localization, moved by `tcpipe.fusion.ukf15_kernel` or, for comparison, by
-`tcpipe.fusion.filterpy_engine`. What each sensor shows:
+State, in this order: position x y z [m] in the ENU plane; roll, pitch, yaw [rad]; body velocity [m/s]; body angular velocity
+[rad/s]; body acceleration, which is the derivative of the body velocity [m/s²]. The process holds angular velocity and
+acceleration constant, as in robot_localization (T. Moore and D. Stouch, A Generalized Extended Kalman Filter Implementation for the
+Robot Operating System, 2014). What each sensor shows:
 
 * GNSS: the position of its antenna, whose lever arm turns with the attitude.
 * IMU: roll and pitch of its own attitude filter where it has one (its yaw may be magnetic or offset and is not used), angular
@@ -12,19 +14,24 @@ Fifteen states as in robot_localization, moved by `tcpipe.fusion.ukf15_kernel` o
 
 What no sensor shows is held near zero by a weak prior, since a random walk that nothing observes would grow until the sigma points
 go round the circle. Estimates use the past only; the smoother is `tcpipe.fusion.error_state`.
+
+filterpy 2.0.0 does the scaled unscented transform (E. A. Wan and R. van der Merwe, 2000) with alpha = 1, kappa = 0, beta = 2, so that
+the points lie at sqrt(15) deviations and no weight is negative.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from functools import cache
+from heapq import merge
+from itertools import count, repeat
 
 import numpy as np
+from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter
 from numpy.typing import NDArray
 
-from tcpipe.fusion import ukf15_kernel as kernel
 from tcpipe.fusion.measurements import (
     GNSS,
     IMU,
@@ -36,15 +43,19 @@ from tcpipe.fusion.measurements import (
     Measurements,
 )
 from tcpipe.fusion.signals import find_chi_square_threshold, is_covered
+from tcpipe.fusion.state import GRAVITY_MPS2
 from tcpipe.fusion.trajectory import DISPLACEMENT_LAGS_S, Rejections, Trajectory
-from tcpipe.fusion.ukf15_kernel import ACCEPTED, NOT_RUN, RECOVERED, REJECTED, Events, FilterState, Outputs, Sources
-from tcpipe.geometry.rotation import invert, quat_from_rpy, rotate, rpy_from_quat
+from tcpipe.geometry.rotation import invert, quat_from_rpy, rotate, rpy_from_quat, wrap_to_pi
 from tcpipe.tables.facts import StretchFacts
 
-_PLACE, _TURNING, _ACCELERATING = (
-    tuple(range(kernel.STATES)[of]) for of in (kernel.POSITION, kernel.TURN, kernel.ACCELERATION)
-)
-"""Entries of the state, as a source names what it measures."""
+STATES = 15
+"""Length of the state."""
+X, Y, Z, ROLL, PITCH, YAW, VX, VY, VZ, WX, WY, WZ, AX, AY, AZ = range(STATES)
+"""Place of each entry in the state: position, angles, velocity, angular velocity, acceleration."""
+POSITION, ANGLES, VELOCITY, TURN, ACCELERATION = (slice(first, first + 3) for first in (X, ROLL, VX, WX, AX))
+
+NOT_RUN, ACCEPTED, REJECTED, RECOVERED = range(4)
+"""Outcome of a measurement: not reached; fused; rejected by the gate; fused outside the gate after its states were opened up."""
 
 PROCESS_VARIANCE = np.array([1e-4] * 3 + [1e-4] * 3 + [1e-2] * 3 + [1.0] * 3 + [2.0] * 3)
 """Variance that each state gains in a second, shape (15,): angular velocity changes by 1 rad/s, acceleration by 1.4 m/s², in a second
@@ -60,12 +71,22 @@ that its many messages are worth a few. Without it the filter trusts slipping wh
 SKID_STD = 0.2
 """Likewise of the yaw rate of wheels that skid when they turn."""
 
-_BLOCK = 4096  # outputs filtered at a time: bounds the memory of a long run
+MAX_STEP_S = 0.1
+"""Longer predictions are divided, so that an angle's deviation stays far below pi [s]."""
+
+MAX_OPENED_RAD = 0.5
+"""No angle is opened up further than this: sigma points must not go round the circle [rad]."""
+
+_LOCKOUT_S, _LOCKOUT_COUNT = 5.0, 5
 _GROUND = "ground"
 _PRIOR = "prior"
 _GROUND_PERIOD_NS = 50_000_000
 _LEVEL_PERIOD_NS = 1_000_000_000
-_CALM_STD_RADPS, _CALM_STD_MPS2, _LEVEL_STD_RAD = (0.05, 0.05, 1.0), 1.0, 0.15
+_CALM_STD = dict(zip(range(WX, STATES), (0.05, 0.05, 1.0, 1.0, 1.0, 1.0), strict=True))
+"""Of angular velocity [rad/s] and acceleration [m/s²] that no sensor shows."""
+_LEVEL_STD_RAD = 0.15
+
+_Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,44 +96,38 @@ class SensorRows:
     Attributes
     ----------
     role : whose measurements these are; constraints have roles of their own and are in no table.
-    kind : `SELECT`, `ANTENNA`, `SPECIFIC_FORCE` or `SENSOR_VELOCITY` of `tcpipe.fusion.ukf15_kernel`.
-    entries : which states (`SELECT`), or which of the sensor's three entries, are measured; at most six.
+    entries : the states that are measured: position, velocity and acceleration where the sensor sits, the others of base_link.
     stamp_ns : [ns], shape (N,), increasing.
     z, variance : shape (N, m), finite.
     lever_arm_m : [m], position of the sensor in base_link.
+    is_specific_force : the acceleration is what an accelerometer feels, with gravity and the turning of the velocity.
     """
 
     role: str
-    kind: int
     entries: tuple[int, ...]
     stamp_ns: NDArray[np.int64]
-    z: NDArray[np.float64]
-    variance: NDArray[np.float64]
+    z: _Array
+    variance: _Array
     lever_arm_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    is_specific_force: bool = False
 
 
 @dataclass(frozen=True, slots=True)
 class ForwardResult:
     """Result of the filter.
 
-    ``x`` and ``variance`` are states and variances at the wanted stamps, (K, 15); ``final`` the last state, (15,), and covariance, (15,
-    15); ``nis`` and ``outcome``, by source, the normalised innovation squared and what became of each measurement.
+    ``x`` and ``variance`` are states and variances at the wanted stamps, (K, 15); ``nis`` and ``outcome``, by source, the normalised
+    innovation squared and what became of each measurement.
     """
 
-    x: NDArray[np.float64]
-    variance: NDArray[np.float64]
-    final: tuple[NDArray[np.float64], NDArray[np.float64]]
-    nis: list[NDArray[np.float64]]
+    x: _Array
+    variance: _Array
+    nis: list[_Array]
     outcome: list[NDArray[np.int8]]
 
 
 def run_ukf15(
-    measurements: Measurements,
-    initial: InitialState,
-    *,
-    output_ns: NDArray[np.int64],
-    gate_probability: float,
-    engine: Literal["compiled", "filterpy"],
+    measurements: Measurements, initial: InitialState, *, output_ns: NDArray[np.int64], gate_probability: float
 ) -> Trajectory:
     """Return base_link's trajectory at ``output_ns`` by the paper's forward filter; each state uses the measurements up to its stamp.
 
@@ -121,26 +136,23 @@ def run_ukf15(
     measurements, initial : one section of a run, and its state at the first measurement.
     output_ns : [ns], shape (K,), increasing.
     gate_probability : a measurement less likely than this is rejected (χ² on its normalised innovation squared).
-    engine : ``compiled`` or ``filterpy``.
     """
     sources = collect_sources(measurements, initial, end_ns=int(output_ns[-1]))
     gates = [_find_gate(source, gate_probability) for source in sources]
     x, P = _make_initial_state(initial)
     start_ns = min(int(source.stamp_ns[0]) for source in sources if source.stamp_ns.size)
-    found = filter_forward(
-        sources, gates, x=x, P=P, q=PROCESS_VARIANCE, start_ns=start_ns, output_ns=output_ns, engine=engine
-    )
-    quat = quat_from_rpy(*found.x[:, kernel.ANGLES].T)
+    found = filter_forward(sources, gates, x=x, P=P, q=PROCESS_VARIANCE, start_ns=start_ns, output_ns=output_ns)
+    quat = quat_from_rpy(*found.x[:, ANGLES].T)
     std = np.sqrt(found.variance)
     return Trajectory(
         stamp_ns=output_ns,
-        position_enu_m=found.x[:, kernel.POSITION],
+        position_enu_m=found.x[:, POSITION],
         quat_xyzw=quat,
-        velocity_enu_mps=rotate(quat, found.x[:, kernel.VELOCITY]),
-        angular_velocity_radps=found.x[:, kernel.TURN],
-        position_std_m=std[:, kernel.POSITION],
-        yaw_std_rad=std[:, kernel.YAW],
-        forward_velocity_std_mps=std[:, kernel.VX],
+        velocity_enu_mps=rotate(quat, found.x[:, VELOCITY]),
+        angular_velocity_radps=found.x[:, TURN],
+        position_std_m=std[:, POSITION],
+        yaw_std_rad=std[:, YAW],
+        forward_velocity_std_mps=std[:, VX],
         rejections=_make_rejections(sources, gates, found),
         displacement_std_m=np.full((output_ns.size, len(DISPLACEMENT_LAGS_S)), np.nan),
         facts=_make_facts(sources, found),
@@ -151,14 +163,16 @@ def filter_forward(
     sources: Sequence[SensorRows],
     gates: Sequence[float],
     *,
-    x: NDArray[np.float64],
-    P: NDArray[np.float64],
-    q: NDArray[np.float64],
+    x: _Array,
+    P: _Array,
+    q: _Array,
     start_ns: int,
     output_ns: NDArray[np.int64],
-    engine: Literal["compiled", "filterpy"] = "compiled",
 ) -> ForwardResult:
     """Run the 15-state filter over any sources.
+
+    When a gate has rejected every measurement of a source for 5 s (and five of them), the estimate is wrong: the variance of the states
+    that the source measures is inflated by the innovation, the measurement is fused, and its outcome is `RECOVERED`.
 
     Parameters
     ----------
@@ -167,43 +181,160 @@ def filter_forward(
     x, P : state, shape (15,), and covariance, shape (15, 15), at ``start_ns`` [ns]; nothing may be older.
     q : variance that each state gains in a second, shape (15,).
     output_ns : [ns], shape (K,), increasing.
-    engine : ``compiled`` or ``filterpy``.
     """
-    belief = FilterState(
-        np.zeros(kernel.ROW), np.zeros((kernel.STATES, kernel.ROW)), np.zeros(1), np.zeros((len(sources), 2))
-    )
-    belief.x[: kernel.STATES], belief.P[:, : kernel.STATES] = x, P
-    states, variances = np.empty((output_ns.size, kernel.STATES)), np.empty((output_ns.size, kernel.STATES))
+    ukf, clock_ns = _Filter(x, P), start_ns
+    states, variances = np.empty((2, output_ns.size, STATES))
     nis = [np.full(source.stamp_ns.size, np.nan) for source in sources]
     outcome = [np.full(source.stamp_ns.size, NOT_RUN, np.int8) for source in sources]
-    packed = _pack_sources(sources, gates)
-    run = _run_of(engine)
-    reached = [0] * len(sources)
-    for first in range(0, output_ns.size, _BLOCK):
-        block = slice(first, first + _BLOCK)
-        until = [int(np.searchsorted(s.stamp_ns, output_ns[block][-1], side="right")) for s in sources]
-        rows = [slice(begin, end) for begin, end in zip(reached, until, strict=True)]
-        events, order = _sort_events(sources, rows, start_ns)
-        times_s = np.asarray((output_ns[block] - start_ns) * 1e-9, np.float64)
-        outputs = Outputs(times_s, states[block], variances[block], np.empty(order.size), np.empty(order.size, np.int8))
-        run(belief, np.asarray(q, np.float64), events, packed, outputs)
-        cuts = np.cumsum([s.stop - s.start for s in rows])[:-1]
-        for written, all_of in ((outputs.nis, nis), (outputs.outcome, outcome)):
-            by_source = np.empty_like(written)
-            by_source[order] = written
-            for at, part in enumerate(np.split(by_source, cuts)):
-                all_of[at][rows[at]] = part
-        reached = until
-    return ForwardResult(states, variances, (belief.x[: kernel.STATES], belief.P[:, : kernel.STATES]), nis, outcome)
+    rejected_since_ns: list[list[int]] = [[] for _ in sources]
+    for stamp_ns, of, row in _iterate_events([*(source.stamp_ns for source in sources), output_ns]):
+        ukf.advance(q, (stamp_ns - clock_ns) * 1e-9)
+        clock_ns = stamp_ns
+        if of == len(sources):
+            states[row], variances[row] = ukf.x, np.diag(ukf.P)
+            if row == output_ns.size - 1:
+                break
+            continue
+        source, rejected = sources[of], rejected_since_ns[of]
+        nis[of][row] = ukf.fuse(source, row, gates[of])
+        outcome[of][row] = ACCEPTED
+        if nis[of][row] <= gates[of]:
+            rejected.clear()
+            continue
+        outcome[of][row] = REJECTED
+        rejected.append(stamp_ns)
+        if len(rejected) >= _LOCKOUT_COUNT and stamp_ns - rejected[0] >= _LOCKOUT_S * 1e9:
+            ukf.open_up(source, row)
+            ukf.fuse(source, row, math.inf)
+            outcome[of][row] = RECOVERED
+            rejected.clear()
+    return ForwardResult(states, variances, nis, outcome)
 
 
-def _run_of(engine: Literal["compiled", "filterpy"]) -> Callable[..., None]:
-    if engine == "compiled":
-        compiled: Callable[..., None] = kernel.run
-        return compiled
-    from tcpipe.fusion import filterpy_engine  # noqa: PLC0415  it takes more than a second to load
+def _iterate_events(stamps_ns: Sequence[NDArray[np.int64]]) -> Iterator[tuple[int, int, int]]:
+    """Yield stamp [ns], series and row in order of time; of one stamp, the earlier series first."""
+    return merge(*(zip(map(int, stamps), repeat(of), count()) for of, stamps in enumerate(stamps_ns)))
 
-    return filterpy_engine.run
+
+def predict_states(x: _Array, dt: float) -> _Array:
+    """Return states, shape (M, 15), after ``dt`` [s] of constant body acceleration and angular velocity."""
+    roll, pitch, _ = angles = x[:, ANGLES].T
+    wx, wy, wz = x[:, TURN].T
+    about_up = np.sin(roll) * wy + np.cos(roll) * wz
+    moved = x.copy()
+    moved[:, POSITION] += rotate(quat_from_rpy(*angles), dt * x[:, VELOCITY] + 0.5 * dt**2 * x[:, ACCELERATION])
+    moved[:, ROLL] += dt * (wx + np.tan(pitch) * about_up)
+    moved[:, PITCH] += dt * (np.cos(roll) * wy - np.sin(roll) * wz)
+    moved[:, YAW] += dt * about_up / np.cos(pitch)
+    moved[:, VELOCITY] += dt * x[:, ACCELERATION]
+    return moved
+
+
+def predict_measurements(x: _Array, source: SensorRows) -> _Array:
+    """Return what a source would measure in states, shape (M, 15): shape (M, m)."""
+    if not source.is_specific_force and not any(source.lever_arm_m):
+        return x[:, source.entries]
+    shown, turn = x.copy(), x[:, TURN]
+    shown[:, VELOCITY] += np.cross(turn, source.lever_arm_m)
+    if POSITION.start in source.entries:
+        shown[:, POSITION] += rotate(quat_from_rpy(*x[:, ANGLES].T), source.lever_arm_m)
+    if source.is_specific_force:
+        up = rotate(invert(quat_from_rpy(*x[:, ANGLES].T)), (0.0, 0.0, GRAVITY_MPS2))
+        shown[:, ACCELERATION] += np.cross(turn, shown[:, VELOCITY]) + up
+    return shown[:, source.entries]
+
+
+class _Filter(UnscentedKalmanFilter):  # type: ignore[misc]  # filterpy has no annotations
+    """filterpy's filter, with what it lacks: angles on a circle, a covariance kept positive definite, all sigma points at once.
+
+    filterpy takes a function of one sigma point; 31 calls for each measurement would take five times as long.
+    """
+
+    def __init__(self, x: _Array, P: _Array) -> None:
+        points = MerweScaledSigmaPoints(STATES, alpha=1.0, beta=2.0, kappa=0.0)
+        mean, difference = _make_circular_functions((ROLL, PITCH, YAW))
+        super().__init__(STATES, 1, 0.0, None, None, points, x_mean_fn=mean, residual_x=difference)
+        self.x, self.P = x.copy(), P.copy()
+
+    def advance(self, q: _Array, dt: float) -> None:
+        """Predict over ``dt`` [s] in equal steps of at most 0.1 s."""
+        steps = math.ceil(dt / MAX_STEP_S - 1e-9) if dt > 0.0 else 0
+        for _ in range(steps):
+            self.Q = np.diag(q * (dt / steps))
+            self.predict(dt / steps, _transform)
+            self.x[ANGLES] = wrap_to_pi(self.x[ANGLES])
+
+    def fuse(self, source: SensorRows, row: int, gate: float) -> float:
+        """Fuse one measurement unless its normalised innovation squared, which is returned, exceeds the gate."""
+        self.sigmas_f = self._draw_points()  # filterpy would use those of the last prediction
+        shown = iter(predict_measurements(self.sigmas_f, source))
+        on_circle = tuple(k for k, entry in enumerate(source.entries) if ROLL <= entry <= YAW)
+        self.z_mean, self.residual_z = _make_circular_functions(on_circle)
+        x, P = self.x, self.P
+        self.update(source.z[row], np.diag(source.variance[row]), _transform, lambda _: next(shown))
+        nis = float(self.y @ self.SI @ self.y)
+        if not nis <= gate:
+            self.x, self.P = x, P
+        self.x[ANGLES] = wrap_to_pi(self.x[ANGLES])
+        return nis
+
+    def open_up(self, source: SensorRows, row: int) -> None:
+        """Add the squared innovation to the variance of the states that a source shows; positions open the yaw, which leads them astray."""
+        innovation = source.z[row] - predict_measurements(self.x[None], source)[0]
+        for entry, y in zip(source.entries, innovation, strict=True):
+            self.P[entry, entry] += (min(abs(wrap_to_pi(y)), MAX_OPENED_RAD) if ROLL <= entry <= YAW else y) ** 2
+            if entry == X:
+                self.P[YAW, YAW] += MAX_OPENED_RAD**2
+
+    def _draw_points(self) -> _Array:
+        """Return sigma points; where rounding has made the covariance useless, keep its variances alone."""
+        try:
+            return np.asarray(self.points_fn.sigma_points(self.x, self.P))
+        except np.linalg.LinAlgError:
+            self.P = np.diag(np.maximum(np.abs(np.diag(self.P)), 1e-12))
+            return np.asarray(self.points_fn.sigma_points(self.x, self.P))
+
+    def compute_process_sigmas(self, dt: float, *_: object) -> None:
+        """As filterpy calls it."""
+        self.sigmas_f = predict_states(self._draw_points(), dt)
+
+    def cross_variance(self, x: _Array, z: _Array, sigmas_f: _Array, sigmas_h: _Array) -> _Array:
+        """As filterpy calls it."""
+        return np.asarray(self.residual_x(sigmas_f, x).T * self.Wc @ self.residual_z(sigmas_h, z))
+
+
+def _transform(  # noqa: PLR0917  filterpy gives positional arguments
+    sigmas: _Array,
+    Wm: _Array,
+    Wc: _Array,
+    noise: _Array,
+    mean: Callable[..., _Array],
+    difference: Callable[..., _Array],
+) -> tuple[_Array, _Array]:
+    """Return mean and covariance of sigma points, as filterpy calls it."""
+    centre = mean(sigmas, Wm)
+    deviations = difference(sigmas, centre)
+    return centre, deviations.T * Wc @ deviations + noise
+
+
+@cache
+def _make_circular_functions(
+    angles: tuple[int, ...],
+) -> tuple[Callable[[_Array, _Array], _Array], Callable[[_Array, _Array], _Array]]:
+    """Return the mean of sigma points and the difference of vectors whose entries ``angles`` lie on a circle."""
+    on_circle = list(angles)
+
+    def mean(points: _Array, weights: _Array) -> _Array:
+        found = weights @ points
+        found[on_circle] = np.arctan2(weights @ np.sin(points[:, on_circle]), weights @ np.cos(points[:, on_circle]))
+        return found
+
+    def difference(a: _Array, b: _Array) -> _Array:
+        found = np.subtract(a, b)
+        found[..., on_circle] = wrap_to_pi(found[..., on_circle])
+        return found
+
+    return (mean, difference) if angles else (lambda points, weights: weights @ points, np.subtract)
 
 
 def collect_sources(measurements: Measurements, initial: InitialState, *, end_ns: int) -> list[SensorRows]:
@@ -220,7 +351,7 @@ def collect_sources(measurements: Measurements, initial: InitialState, *, end_ns
     )
     start_ns = min(int(source.stamp_ns[0]) for source in sensors if source.stamp_ns.size)
     std = measurements.nonholonomic_std_mps
-    ground = _make_zero_source(_GROUND, {kernel.VY: std, kernel.VZ: std}, start_ns, end_ns, _GROUND_PERIOD_NS)
+    ground = _make_zero_source(_GROUND, {VY: std, VZ: std}, start_ns, end_ns, _GROUND_PERIOD_NS)
     priors = _make_priors(sensors, start_ns, end_ns)
     if imu is not None:  # in its gaps the filter must not go on turning and accelerating as it did before them
         priors += _select_in_gaps(
@@ -235,18 +366,18 @@ def _make_imu_sources(measurements: Measurements, initial: InitialState) -> list
         return []
     turn = imu.angular_velocity_radps - initial.gyro_bias_radps
     variance = np.broadcast_to(imu.gyro_std_radps**2, turn.shape)
-    sources = [SensorRows(IMU, kernel.SELECT, _TURNING, imu.stamp_ns, turn, variance)]
+    sources = [SensorRows(IMU, (WX, WY, WZ), imu.stamp_ns, turn, variance)]
     if imu.accelerometer_usable:
         variance = np.broadcast_to(imu.accelerometer_std_mps2**2, turn.shape)
         force = imu.specific_force_mps2
         sources.append(
-            SensorRows(IMU, kernel.SPECIFIC_FORCE, (0, 1, 2), imu.stamp_ns, force, variance, imu.lever_arm_m)
+            SensorRows(IMU, (AX, AY, AZ), imu.stamp_ns, force, variance, imu.lever_arm_m, is_specific_force=True)
         )
     known = np.isfinite(imu.quat_xyzw).all(axis=1)
     if known.any():
         tilt = rpy_from_quat(imu.quat_xyzw[known])[:, :2]
         variance = np.broadcast_to(TILT_STD_RAD**2, tilt.shape)
-        sources.append(SensorRows(IMU, kernel.SELECT, (kernel.ROLL, kernel.PITCH), imu.stamp_ns[known], tilt, variance))
+        sources.append(SensorRows(IMU, (ROLL, PITCH), imu.stamp_ns[known], tilt, variance))
     return sources
 
 
@@ -257,8 +388,6 @@ def _make_velocity_sources(
     if odometry is None:
         return []
     lever = odometry.lever_arm_m
-    kind = kernel.SENSOR_VELOCITY if any(lever) else kernel.SELECT
-    first = 0 if any(lever) else kernel.VX
     known = np.isfinite(odometry.velocity_mps)
     per_second = 1e9 / float(np.median(np.diff(odometry.stamp_ns))) if odometry.stamp_ns.size > 1 else 1.0
     every_variance = odometry.variance_m2ps2 + per_second * np.square(SCALE_STD * odometry.velocity_mps)
@@ -267,8 +396,8 @@ def _make_velocity_sources(
         rows, columns = (known == pattern).all(axis=1), np.flatnonzero(pattern)
         if columns.size:
             z, variance = odometry.velocity_mps[rows][:, columns], every_variance[rows][:, columns]
-            entries = tuple(int(first + column) for column in columns)
-            sources.append(SensorRows(role, kind, entries, odometry.stamp_ns[rows], z, variance, lever))
+            entries = tuple(int(VX + column) for column in columns)
+            sources.append(SensorRows(role, entries, odometry.stamp_ns[rows], z, variance, lever))
     rows = np.isfinite(odometry.yaw_rate_radps)
     if imu is not None:
         rows &= ~is_covered(imu.stamp_ns, odometry.stamp_ns, odometry.stamp_ns)
@@ -276,7 +405,7 @@ def _make_velocity_sources(
         z = odometry.yaw_rate_radps[rows, None]
         scale_std = SKID_STD if role == WHEELS else SCALE_STD
         variance = odometry.yaw_rate_var[rows, None] + per_second * np.square(scale_std * z)
-        sources.append(SensorRows(role, kernel.SELECT, (kernel.WZ,), odometry.stamp_ns[rows], z, variance))
+        sources.append(SensorRows(role, (WZ,), odometry.stamp_ns[rows], z, variance))
     return sources
 
 
@@ -284,23 +413,20 @@ def _make_gnss_sources(measurements: Measurements) -> list[SensorRows]:
     gnss = measurements.gnss
     if gnss is None:
         return []
-    kind = kernel.ANTENNA if any(gnss.lever_arm_m) else kernel.SELECT
-    return [SensorRows(GNSS, kind, _PLACE, gnss.stamp_ns, gnss.position_enu_m, gnss.variance_m2, gnss.lever_arm_m)]
+    return [SensorRows(GNSS, (X, Y, Z), gnss.stamp_ns, gnss.position_enu_m, gnss.variance_m2, gnss.lever_arm_m)]
 
 
 def _make_zero_source(role: str, stds: Mapping[int, float], start_ns: int, end_ns: int, period_ns: int) -> SensorRows:
     """Return states that are zero to within their standard deviations, said again and again."""
     stamps = np.arange(start_ns + period_ns, end_ns + 1, period_ns, dtype=np.int64)
     z = np.zeros((stamps.size, len(stds)))
-    return SensorRows(role, kernel.SELECT, tuple(stds), stamps, z, z + np.square(list(stds.values())))
+    return SensorRows(role, tuple(stds), stamps, z, z + np.square(list(stds.values())))
 
 
 def _make_priors(sensors: Sequence[SensorRows], start_ns: int, end_ns: int) -> list[SensorRows]:
-    selected = {entry for source in sensors if source.kind == kernel.SELECT for entry in source.entries}
-    force = any(source.kind == kernel.SPECIFIC_FORCE for source in sensors)
-    calm = {state: std for state, std in zip(_TURNING, _CALM_STD_RADPS, strict=True) if state not in selected}
-    calm |= {} if force else dict.fromkeys(_ACCELERATING, _CALM_STD_MPS2)
-    level = {} if force or kernel.ROLL in selected else dict.fromkeys((kernel.ROLL, kernel.PITCH), _LEVEL_STD_RAD)
+    shown = {entry for source in sensors for entry in source.entries}
+    calm = {state: std for state, std in _CALM_STD.items() if state not in shown}
+    level = {} if shown & {ROLL, AX} else dict.fromkeys((ROLL, PITCH), _LEVEL_STD_RAD)
     return [
         _make_zero_source(_PRIOR, stds, start_ns, end_ns, period_ns)
         for stds, period_ns in ((calm, _GROUND_PERIOD_NS), (level, _LEVEL_PERIOD_NS))
@@ -326,54 +452,24 @@ def _find_gate(source: SensorRows, probability: float) -> float:
 
 
 def _make_initial_state(initial: InitialState) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    x, std = np.zeros(kernel.STATES), np.empty(kernel.STATES)
-    x[kernel.POSITION], std[kernel.POSITION] = initial.position_enu_m, initial.position_std_m
-    x[kernel.ANGLES] = rpy_from_quat(initial.quat_xyzw)
+    x, std = np.zeros(STATES), np.empty(STATES)
+    x[POSITION], std[POSITION] = initial.position_enu_m, initial.position_std_m
+    x[ANGLES] = rpy_from_quat(initial.quat_xyzw)
     attitude_std = (initial.tilt_std_rad, initial.tilt_std_rad, initial.yaw_std_rad)
-    std[kernel.ANGLES] = np.minimum(attitude_std, kernel.MAX_OPENED_RAD)  # sigma points lie at sqrt(15) deviations
-    x[kernel.VELOCITY] = rotate(invert(initial.quat_xyzw), initial.velocity_enu_mps)
-    std[kernel.VELOCITY], std[kernel.TURN], std[kernel.ACCELERATION] = initial.velocity_std_mps, 0.1, 0.5
+    std[ANGLES] = np.minimum(attitude_std, MAX_OPENED_RAD)  # sigma points lie at sqrt(15) deviations
+    x[VELOCITY] = rotate(invert(initial.quat_xyzw), initial.velocity_enu_mps)
+    std[VELOCITY], std[TURN], std[ACCELERATION] = initial.velocity_std_mps, 0.1, 0.5
     return x, np.diag(std**2)
-
-
-def _sort_events(
-    sources: Sequence[SensorRows], rows: Sequence[slice], start_ns: int
-) -> tuple[Events, NDArray[np.int64]]:
-    """Return these rows in order of time, and for each which one it was of those of the sources end to end."""
-    stamp_ns = np.concatenate([source.stamp_ns[of] for source, of in zip(sources, rows, strict=True)])
-    which = np.repeat(np.arange(len(sources), dtype=np.int8), [of.stop - of.start for of in rows])
-    width = np.array([len(source.entries) for source in sources])[which]
-    order = np.argsort(stamp_ns, kind="stable")
-    return Events(
-        time_s=np.asarray((stamp_ns[order] - start_ns) * 1e-9, np.float64),
-        source=which[order],
-        at=(np.cumsum(width) - width)[order],
-        z=np.concatenate([source.z[of].ravel() for source, of in zip(sources, rows, strict=True)]),
-        variance=np.concatenate([source.variance[of].ravel() for source, of in zip(sources, rows, strict=True)]),
-    ), order
-
-
-def _pack_sources(sources: Sequence[SensorRows], gates: Sequence[float]) -> Sources:
-    entries = np.zeros((len(sources), 6), np.int64)
-    for row, source in zip(entries, sources, strict=True):
-        row[: len(source.entries)] = source.entries
-    return Sources(
-        kind=np.array([source.kind for source in sources], np.int64),
-        width=np.array([len(source.entries) for source in sources], np.int64),
-        entries=entries,
-        lever_m=np.array([source.lever_arm_m for source in sources], np.float64),
-        gate=np.array(gates, np.float64),
-    )
 
 
 def _make_rejections(sources: Sequence[SensorRows], gates: Sequence[float], found: ForwardResult) -> Rejections:
     refused = [outcome == REJECTED for outcome in found.outcome]
-    count = [int(rows.sum()) for rows in refused]
+    counts = [int(rows.sum()) for rows in refused]
     stamp_ns = np.concatenate([source.stamp_ns[rows] for source, rows in zip(sources, refused, strict=True)])
     order = np.argsort(stamp_ns, kind="stable")
-    role = np.repeat([source.role for source in sources], count)[order]
+    role = np.repeat([source.role for source in sources], counts)[order]
     nis = np.concatenate([nis[rows] for nis, rows in zip(found.nis, refused, strict=True)])[order]
-    return Rejections(stamp_ns[order], role, np.full(role.size, "gate"), nis, np.repeat(gates, count)[order])
+    return Rejections(stamp_ns[order], role, np.full(role.size, "gate"), nis, np.repeat(gates, counts)[order])
 
 
 def _make_facts(sources: Sequence[SensorRows], found: ForwardResult) -> StretchFacts:

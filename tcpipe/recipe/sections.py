@@ -102,8 +102,6 @@ class FuseConfig:
 
     estimator: Literal["smoother", "ukf"] = "smoother"
     """smoother: error-state unscented filter and fixed-interval smoother; ukf: the paper's forward filter, 15 states."""
-    engine: Literal["compiled", "filterpy"] = "compiled"
-    """Implementation of the 15-state filter; filterpy is the slow reference."""
     rate_hz: Annotated[float, Bounds(ge=1, le=500)] = 20.0
     """Rate of the track, at most 500 Hz (the paper: 20 Hz)."""
     gate_probability: Annotated[float, Bounds(ge=0.5, le=0.999999999)] = 0.999

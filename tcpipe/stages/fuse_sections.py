@@ -78,11 +78,9 @@ def _estimate(
 ) -> Trajectory:
     gate = config.gate_probability
     if config.estimator == "ukf":
-        from tcpipe.fusion.ukf15 import run_ukf15  # noqa: PLC0415  its kernels load only when it is asked for
+        from tcpipe.fusion.ukf15 import run_ukf15  # noqa: PLC0415  filterpy takes a second to load
 
-        return run_ukf15(
-            section.measurements, initial, output_ns=output_ns, gate_probability=gate, engine=config.engine
-        )
+        return run_ukf15(section.measurements, initial, output_ns=output_ns, gate_probability=gate)
     return run_error_state(section.measurements, initial, output_ns=output_ns, gate_probability=gate)
 
 

@@ -142,6 +142,9 @@ EARLIER_KEYS = {
 }
 """Keys of the recipe by their path; * is any name or item."""
 
+REMOVED_KEYS = {"fuse.engine": "compiled"}
+"""Keys of the recipe that have no effect any more, by their path, with the default that still counts in the recipe's id."""
+
 EARLIER_DOCUMENT_KEYS = {
     **EARLIER_COLUMNS,
     "gate": "mask",

@@ -156,7 +156,6 @@ def test_an_imu_too_slow_to_integrate_changes_nothing(drive, tmp_path, when, wit
     [
         (Recipe(), ("visual", "doppler"), 0.08),
         (Recipe(), FIXES, 0.01),
-        (UKF, ("visual", "doppler"), 0.01),
         (UKF, FIXES, 0.08),
     ],
 )

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from tcpipe.errors import RecipeError
+from tcpipe.formats.json_files import to_plain
 from tcpipe.formats.recipe_toml import (
     find_recipe,
     format_commented_toml,
@@ -142,6 +143,13 @@ def test_names_of_recipes_are_those_of_0_8() -> None:
         for recipe in (Recipe(), parse_recipe(own, where="r"))
     }
     assert names == {"87f31f5a": ("fd3f3c8a", "4ddf11ad"), "1652ca06": ("92c6ab9a", "0b4c8076")}
+
+
+def test_a_key_without_effect_is_read_with_a_note_and_changes_no_id(caplog: pytest.LogCaptureFixture) -> None:
+    given = parse_recipe({"fuse": {"engine": "filterpy", "rate_hz": 10}}, where="r")
+    assert caplog.messages == ["r: keys without effect since tcpipe 0.9: fuse.engine"]
+    assert given == Recipe(fuse=FuseConfig(rate_hz=10))
+    assert ingest_key(given) == ingest_key({**to_plain(given), "fuse": {**to_plain(given.fuse), "engine": "compiled"}})
 
 
 @pytest.mark.parametrize("value", [{1.0, 2.0, 3.0}, (0.0, float("nan"), 0.0), (0.0, 0.0, float("inf")), b"abc", "abc"])
