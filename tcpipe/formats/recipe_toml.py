@@ -71,33 +71,17 @@ def resolve_recipe(given: Recipe | str | Path | None) -> Recipe:
 
 def parse_recipe(values: Mapping[str, Any], *, where: str) -> Recipe:
     """Check recipe values; `RecipeError` carries one line for every wrong key. Earlier keys are read, with a note."""
-    values, renamed = rename_earlier_keys(values)
+    renamed: dict[str, str] = {}
+    values = _rename(values, EARLIER_KEYS | _EARLIER_OF_MASK | dict.fromkeys(REMOVED_KEYS, ""), renamed)
     if renamed:
-        logger.warning(
-            "%s: keys have new names: %s", where, ", ".join(f"{old} is {new}" for old, new in renamed.items())
-        )
-    values, removed = _drop_removed_keys(values)
-    if removed:
-        logger.warning("%s: keys without effect since tcpipe 0.9: %s", where, ", ".join(removed))
+        notes = (f"{old} is {new}" if new else f"{old} has no effect" for old, new in renamed.items())
+        logger.warning("%s: keys of earlier versions: %s", where, ", ".join(notes))
     return from_values(Recipe, values, where=where)
 
 
-def rename_earlier_keys(values: Mapping[str, Any]) -> tuple[Mapping[str, Any], dict[str, str]]:
-    """Return recipe values with `EARLIER_KEYS` by their names of today, and those that were found."""
-    renamed: dict[str, str] = {}
-    return _rename(values, EARLIER_KEYS | _EARLIER_OF_MASK, renamed), renamed
-
-
-def _drop_removed_keys(values: Mapping[str, Any]) -> tuple[Mapping[str, Any], list[str]]:
-    """Return recipe values without `REMOVED_KEYS`, and those that were found."""
-    found = dict(values)
-    removed = []
-    for path in REMOVED_KEYS:
-        section, _, key = path.partition(".")
-        if isinstance(found.get(section), Mapping) and key in found[section]:
-            found[section] = {name: value for name, value in found[section].items() if name != key}
-            removed.append(path)
-    return found, removed
+def rename_earlier_keys(values: Mapping[str, Any]) -> Any:
+    """Return recipe values with `EARLIER_KEYS` by their names of today."""
+    return _rename(values, EARLIER_KEYS | _EARLIER_OF_MASK, {})
 
 
 def _rename(values: Any, names: Mapping[str, str], renamed: dict[str, str], path: str = "") -> Any:
@@ -113,6 +97,8 @@ def _rename(values: Any, names: Mapping[str, str], renamed: dict[str, str], path
             name = key
         elif name != key:
             renamed[below] = name
+        if not name:  # it has no effect any more
+            continue
         found[name] = _rename(value, names, renamed, below)
     return found
 
@@ -135,10 +121,11 @@ _KEYS: dict[int, tuple[Recipe, str]] = {}
 
 def _hash_values(values: Mapping[str, Json]) -> str:
     names = [section.name for section in fields(IngestSections)]
-    counted: dict[str, Any] = {name: values.get(name) for name in names if values.get(name) or name not in _OWN_TABLES}
+    counted = {name: values.get(name) for name in names if values.get(name) or name not in _OWN_TABLES}
     for path, default in REMOVED_KEYS.items():
         section, _, key = path.partition(".")
-        counted[section] = {key: default, **(counted[section] or {})}
+        if isinstance(known := counted[section], Mapping):
+            counted[section] = {key: default, **known}
     return _digest(counted)
 
 

@@ -236,7 +236,7 @@ def predict_measurements(x: _Array, source: SensorRows) -> _Array:
         return x[:, source.entries]
     shown, turn = x.copy(), x[:, TURN]
     shown[:, VELOCITY] += np.cross(turn, source.lever_arm_m)
-    if POSITION.start in source.entries:
+    if X in source.entries:
         shown[:, POSITION] += rotate(quat_from_rpy(*x[:, ANGLES].T), source.lever_arm_m)
     if source.is_specific_force:
         up = rotate(invert(quat_from_rpy(*x[:, ANGLES].T)), (0.0, 0.0, GRAVITY_MPS2))
@@ -282,7 +282,7 @@ class _Filter(UnscentedKalmanFilter):  # type: ignore[misc]  # filterpy has no a
         """Add the squared innovation to the variance of the states that a source shows; positions open the yaw, which leads them astray."""
         innovation = source.z[row] - predict_measurements(self.x[None], source)[0]
         for entry, y in zip(source.entries, innovation, strict=True):
-            self.P[entry, entry] += (min(abs(wrap_to_pi(y)), MAX_OPENED_RAD) if ROLL <= entry <= YAW else y) ** 2
+            self.P[entry, entry] += (min(abs(float(wrap_to_pi(y))), MAX_OPENED_RAD) if ROLL <= entry <= YAW else y) ** 2
             if entry == X:
                 self.P[YAW, YAW] += MAX_OPENED_RAD**2
 
@@ -294,7 +294,7 @@ class _Filter(UnscentedKalmanFilter):  # type: ignore[misc]  # filterpy has no a
             self.P = np.diag(np.maximum(np.abs(np.diag(self.P)), 1e-12))
             return np.asarray(self.points_fn.sigma_points(self.x, self.P))
 
-    def compute_process_sigmas(self, dt: float, *_: object) -> None:
+    def compute_process_sigmas(self, dt: float, _fx: None = None) -> None:
         """As filterpy calls it."""
         self.sigmas_f = predict_states(self._draw_points(), dt)
 

@@ -286,7 +286,7 @@ def _bring_document(found: Document, where: str) -> Document:
         known = ", ".join(_KNOWN_VERSIONS)
         raise StoreError(f"{where}: of data model {version}, this version knows {known}; left as it is")
     document = {**_remove_keys(found, "warnings", "problems", "findings"), "data_model_version": DATA_MODEL_VERSION}
-    document = _rename_top_keys(document) | {"recipe": rename_earlier_keys(found["recipe"])[0]}
+    document = _rename_top_keys(document) | {"recipe": rename_earlier_keys(found["recipe"])}
     document |= rename_keys({name: document[name] for name in _WHOLLY_RENAMED if name in document})
     if "info" in found:
         earlier = rename_keys(found["info"]["findings"])

@@ -13,7 +13,10 @@ from tcpipe.stages.read import read_run
 
 SETTLED_NS = 8_000_000_000
 POSITION_M = {"no faults": (0.02, 0.02), "every fault": (0.04, 0.06)}
-"""RMS error, horizontally and in height. With every fault the stated antenna is up to 5 cm off, fixes lastingly up to 3.4 cm in height, and nothing shows either."""
+"""RMS error, horizontally and in height.
+
+With every fault the stated antenna is up to 5 cm off, fixes lastingly up to 3.4 cm in height, and nothing shows either.
+"""
 
 
 @pytest.fixture(scope="module", params=["no faults", "every fault"])

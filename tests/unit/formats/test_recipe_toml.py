@@ -147,7 +147,7 @@ def test_names_of_recipes_are_those_of_0_8() -> None:
 
 def test_a_key_without_effect_is_read_with_a_note_and_changes_no_id(caplog: pytest.LogCaptureFixture) -> None:
     given = parse_recipe({"fuse": {"engine": "filterpy", "rate_hz": 10}}, where="r")
-    assert caplog.messages == ["r: keys without effect since tcpipe 0.9: fuse.engine"]
+    assert caplog.messages == ["r: keys of earlier versions: fuse.engine has no effect"]
     assert given == Recipe(fuse=FuseConfig(rate_hz=10))
     assert ingest_key(given) == ingest_key({**to_plain(given), "fuse": {**to_plain(given.fuse), "engine": "compiled"}})
 
