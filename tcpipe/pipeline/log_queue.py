@@ -86,8 +86,6 @@ class LogQueue:
             if take_over and self._left and not self._wait():
                 return
             take_over = True
-        if self._claims is not None and not self._given_up:
-            self._claims.remove_expired()
 
     def settle(self, index: int, result: IngestResult) -> None:
         """Remove the claim of a log that is committed; while it may be tried again, other tasks leave it to this one until that ends."""
@@ -96,6 +94,11 @@ class LogQueue:
             return
         if key not in self._keys.values():
             self._claims.release(key)
+
+    def clean(self) -> None:
+        """Remove what killed tasks left, once nothing is to be done."""
+        if self._claims is not None and self.is_done:
+            self._claims.remove_expired()
 
     def _take(self, later: list[Item], *, take_over: bool) -> Iterator[Item]:
         """Yield logs as they are claimed; what may be the same recording as one of those goes to ``later``."""

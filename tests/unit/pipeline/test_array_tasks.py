@@ -107,6 +107,9 @@ def test_a_task_lists_the_store_once_and_a_share_with_nothing_new_writes_nothing
     again = ingest([drives], store=tmp_path / "store", recipe=Recipe(), shard=(1, 4))
     assert [result.status for result in again.results] == ["unchanged"] * 2
     assert open_store(tmp_path / "store").place.entries() == before
+    claim_elsewhere(tmp_path / "store", "killed after its commit", lease_s=-1.0)
+    ingest([drives], store=tmp_path / "store", recipe=Recipe(), shard=(1, 4))
+    assert open_store(tmp_path / "store").place.entries() == before
 
 
 def claim_elsewhere(store, key, *, lease_s):
