@@ -53,6 +53,9 @@ class Job(Protocol[R_co]):
     def result(self) -> R_co:
         """Return its result when it has ended."""
 
+    def cancel(self) -> Any:
+        """Let it not begin."""
+
 
 class Executor(Protocol):
     """Every `concurrent.futures.Executor`, Dask's (`Client.get_executor`) among them, and submitit's for Slurm."""
@@ -277,12 +280,11 @@ def _run_elsewhere(
     function: Callable[[T], R], todo: Iterator[tuple[int, T]], cluster: str | Executor
 ) -> Generator[Outcome[R]]:
     """Run tasks by an executor; Dask's runs that of a killed worker again on another, three times."""
-    with _open_workers(cluster) as workers:
+    with _open_workers(cluster) as workers, _cancel_left(dict[Job[_Answer[R]], int]()) as running:
         caller = _Caller((os.uname().nodename, os.getpid()), logger.getEffectiveLevel(), __version__)
         if client := workers.client:
             caller = replace(caller, topic=f"tcpipe-{client.id}")
             client.subscribe_topic(caller.topic, lambda event: logger.log(*event[1]))
-        running = dict[Job[_Answer[R]], int]()
         while True:
             for index, task in islice(todo, workers.at_once - len(running)):
                 running[workers.submit(function, task, caller)] = index
@@ -298,6 +300,16 @@ def _run_elsewhere(
                     logger.log(*said)
                 _spent["cpu_s"] += answer.cpu_s
                 yield Outcome(index, answer.result)
+
+
+@contextmanager
+def _cancel_left(running: dict[Job[R], int]) -> Iterator[dict[Job[R], int]]:
+    """Yield the tasks that an executor has; in the end those that have not begun do not begin any more."""
+    try:
+        yield running
+    finally:
+        for job in running:
+            job.cancel()
 
 
 def _get_answer(job: Job[_Answer[R]], name: str) -> _Answer[R] | None:
