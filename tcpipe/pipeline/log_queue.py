@@ -56,7 +56,9 @@ class LogQueue:
         """What the logs of this task's share need as the call begins."""
         todo = [at for at, _ in self._select_todo(every)]
         units = [[todo[at] for at in unit] for unit in group_alike([tasks[at].source for at in todo])]
-        self._left = units if claims is None else sorted(units, key=self._rank)
+        if claims is not None:
+            units.sort(key=lambda unit: (self._own.isdisjoint(unit), -sum(tasks[at].source.size_bytes for at in unit)))
+        self._left = units
 
     def plan(self, indices: Iterable[int]) -> dict[int, Step]:
         """Return what logs need now; those of other shares as a call without options that ingest again."""
@@ -151,9 +153,6 @@ class LogQueue:
             for at, step in steps.items()
             if step.is_todo and (at in self._own or step.state != "failed_transient")
         ]
-
-    def _rank(self, unit: Sequence[int]) -> tuple[bool, int]:
-        return self._own.isdisjoint(unit), -sum(self._tasks[at].source.size_bytes for at in unit)
 
     def _make_key(self, of: str) -> str:
         task = self._tasks[0]
