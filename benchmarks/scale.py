@@ -57,14 +57,10 @@ def write_logs(directory: Path, hours: int) -> list[Path]:
 
 def drive_streams() -> list[MessageStream]:
     """Return what is recorded of the drive, at most `MOST_HZ` of each topic: hours are to be had in minutes."""
-    from tcpipe.simulation.messages import make_streams
     from tcpipe.simulation.scenarios import find_scenario
-    from tcpipe.simulation.site_files import simulate_readings
+    from tcpipe.simulation.site_files import simulate_messages
 
-    (spec,) = (of := find_scenario("hills12")).drives
-    readings = simulate_readings(of)[1]
-    said = make_streams(readings, spec.sensors.mounted(spec.faults), spec.recorder, geoid_m=of.world.site.geoid_m)
-    return [thinned(stream) for stream in said]
+    return [thinned(stream) for stream in simulate_messages(find_scenario("hills12"))[1]]
 
 
 def thinned(stream: MessageStream) -> MessageStream:

@@ -167,6 +167,10 @@ class Store:
         if not put and not (after and maps.read(new) == data):  # the answer to one's own may be lost
             raise StoreError(f"map {name}: another process has written it meanwhile, and it stays; look at it first")
 
+    def check_writable(self) -> None:
+        """Raise `StoreError` where the store cannot be written: before work whose result would have no place."""
+        mark_store(self.place, found=True)
+
     def state(self) -> State:
         """Return what the log says."""
         return read_state(self.place)
@@ -457,7 +461,7 @@ def open_store(root: str | Path, *, create: bool = False) -> Store:
     Raises
     ------
     UsageError : it is missing (unless ``create``), a file, or of an earlier layout.
-    StoreError : it cannot be reached or written, or is of a data model that this version does not know.
+    StoreError : it cannot be reached or made, or is of a data model that this version does not know.
     """
     if is_url(root) and not is_bucket(root):
         raise UsageError(f"{root}: no place for a store; expected a directory, s3://bucket/name, gs:// or az://")
@@ -475,6 +479,7 @@ def open_store(root: str | Path, *, create: bool = False) -> Store:
     if version not in (None, *READ_VERSIONS):
         raise StoreError(f"{root}: is of data model {version}, this version knows {', '.join(READ_VERSIONS)}")
     if create:
-        mark_store(store.place, found=found)
+        if not found:
+            mark_store(store.place)
         store.place.clear()
     return store

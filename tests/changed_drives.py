@@ -6,9 +6,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from tcpipe.formats.logs.writing import MessageStream
-from tcpipe.simulation import Faults, Truth, find_scenario, simulate_readings
-from tcpipe.simulation.messages import TOPICS, make_streams
+from tcpipe.simulation import Faults, Truth, find_scenario
+from tcpipe.simulation.messages import TOPICS
 from tcpipe.simulation.route import Wander
+from tcpipe.simulation.site_files import simulate_messages
 
 NAMES = TOPICS["ros2"]
 Columns = dict[str, np.ndarray]
@@ -44,6 +45,5 @@ def make(plan=None, *, placements: bool = True) -> Drive:
         faults=replace(Faults.every(), gnss_outage=False, visual_dropouts=False, power_gap=False),
     )
     demo = replace(demo, drives=(spec,))
-    truth, readings = simulate_readings(demo, seed=5)
-    made = make_streams(readings, spec.sensors.mounted(spec.faults), spec.recorder, geoid_m=demo.world.site.geoid_m)
-    return Drive(truth, tuple(made))
+    truth, messages = simulate_messages(demo, seed=5)
+    return Drive(truth, tuple(messages))

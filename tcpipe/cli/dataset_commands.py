@@ -17,6 +17,7 @@ from tcpipe.cli.options import (
     add_options,
     json_option,
     msgdef_option,
+    path_or_store,
     quiet_option,
     store_option,
 )
@@ -83,7 +84,7 @@ def build_dataset(options: BuildDatasetOptions, *, as_json: bool, quiet: bool) -
 
 
 @click.command()
-@click.argument("path", type=SEALED, metavar="PATH")
+@path_or_store(SEALED)
 @click.option(
     "--no-runs", is_flag=True, help="For a store: write only its own page, with links to existing pages of runs."
 )
@@ -93,7 +94,7 @@ def build_dataset(options: BuildDatasetOptions, *, as_json: bool, quiet: bool) -
     help="For a dataset: write images of all patches to a folder next to the page, and show them.",
 )
 def report(path: str, *, no_runs: bool, patches: bool) -> None:
-    """Write report.html for PATH: a run directory, a dataset, or a store and each of its runs; and print the physics of each robot.
+    """Write report.html for PATH: a run directory, a dataset, or (default) the store and its runs; and print the robots' physics.
 
     The page needs no network.
     """
@@ -180,10 +181,10 @@ def explain(sample_id: str, *, dataset: str, store: str, as_json: bool, quiet: b
 
 
 @click.command()
-@click.argument("path", type=SEALED, metavar="PATH")
+@path_or_store(SEALED)
 @json_option
 def verify(path: str, *, as_json: bool) -> int:
-    """Read the dataset, run, store, map, model or cost map at PATH again: compare counts, checksums, schemas.
+    """Read the dataset, run, map, model or cost map at PATH, or the store, again: compare counts, checksums, schemas.
 
     Exit code 1: a file has changed, is missing or contradicts another.
     """
@@ -195,11 +196,11 @@ def verify(path: str, *, as_json: bool) -> int:
 
 
 @click.command()
-@click.argument("path", type=SEALED, metavar="PATH")
+@path_or_store(SEALED)
 @click.argument("to", type=PUBLISHED, required=False, metavar="[TO]")
 @json_option
 def migrate(path: str, to: str | None, *, as_json: bool) -> int:
-    """Convert the store, map or dataset at PATH from an earlier data model to this one, or copy a store to another place.
+    """Convert the map or dataset at PATH, or the store, from an earlier data model to this one, or copy a store to another place.
 
     With TO, a directory or URL, the store at PATH is not changed, and TO is a store of this data model with the same content.
 

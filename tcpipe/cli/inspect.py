@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from tcpipe.cli.options import LOG, json_option, msgdef_option, recipe_option, robot_option
+from tcpipe.cli.options import LOG, json_option, msgdef_option, path_or_store, recipe_option, robot_option
 from tcpipe.cli.output import print_json, print_line, resolve_recipe_with_source
 
 if TYPE_CHECKING:
@@ -19,14 +19,14 @@ if TYPE_CHECKING:
 
 
 @click.command()
-@click.argument("path", type=LOG, metavar="PATH")
+@path_or_store(LOG)
 @click.option("--full", is_flag=True, help="Read the whole file to find damage and gaps, not only the index.")
 @robot_option()
 @recipe_option
 @msgdef_option
 @json_option
 def inspect(path: str, *, full: bool, robot: str | None, recipe: str | None, msgdef: str | None, as_json: bool) -> int:
-    """List the content of PATH: a log's topics, types, rates and roles, with reasons; a map; a dataset; a run; a store."""
+    """List the content of PATH: a log's topics, types, rates and roles, with reasons; a map; a dataset; a run; without it, the store."""
     from tcpipe.pipeline.inspect import inspect as run
 
     ruling, _ = resolve_recipe_with_source(recipe)

@@ -214,7 +214,7 @@ def _print_known(summary: IngestSummary) -> None:
 
 
 @click.command()
-@click.argument("paths", nargs=-1, type=ONE_OF_SEVERAL, metavar="[STORE] [LOG...]")
+@click.argument("paths", nargs=-1, type=ONE_OF_SEVERAL, metavar="[LOG...]")
 @store_option
 @recipe_option
 @robot_option("Robot profile, as for ingest.")

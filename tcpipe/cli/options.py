@@ -292,6 +292,26 @@ def add_options(cls: type[Any]) -> Option:
 store_option = make_click_option("store", "tcpipe-store", options.STORE)
 """``--store``, or TCPIPE_STORE, or ./tcpipe-store."""
 
+
+def path_or_store(kind: Place) -> Option:
+    """Return the decorator that declares PATH, without which a command works on the store as all others do."""
+
+    def decorate(run: Callable[..., Any]) -> Callable[..., Any]:
+        @click.pass_context
+        @wraps(run)
+        def command(context: click.Context, /, *, path: str | None, store: str, **values: Any) -> Any:
+            if path is not None and context.get_parameter_source("store") is ParameterSource.COMMANDLINE:
+                raise UsageError(f"{path}: PATH and --store are given; give one of them")
+            return run(path=store if path is None else path, **values)
+
+        declared: Callable[..., Any] = click.argument("path", type=kind, required=False, metavar="[PATH]")(
+            store_option(command)
+        )
+        return declared
+
+    return decorate
+
+
 recipe_option = make_click_option("recipe", None, options.RECIPE)
 """``--recipe``; without it TCPIPE_RECIPE, the nearest tcpipe.toml upward, or the defaults."""
 

@@ -1,6 +1,7 @@
 """Logs in object storage (``s3://``, ``gs://``, ``az://``, ``http(s)://``, ``file://``): read by range, or copied to this machine.
 
-The home of obstore. Credentials, region and endpoint come from the environment, as the store's own tools take them (``AWS_…``).
+The home of obstore. Credentials, region and endpoint come from the environment, as the store's own tools take them (``AWS_…``), and from an
+``aws`` profile.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ from urllib.parse import unquote
 
 from tcpipe.errors import LogError, StoreError, TcpipeError, UsageError, hide_secrets, split_secrets
 from tcpipe.formats.atomic import describe_full_disk, make_scratch_directory
+from tcpipe.formats.aws_profile import read_aws_profile
 
 if TYPE_CHECKING:
     from obstore import GetOptions, ObjectMeta
@@ -85,7 +87,8 @@ _REFUSED = {
 }
 """Codes of denial that say more than that it is one."""
 _CREDENTIALS = {
-    "s3": "AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or AWS_SKIP_SIGNATURE=true for what is public; AWS_REGION; AWS_ENDPOINT_URL",
+    "s3": "AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or AWS_PROFILE; AWS_SKIP_SIGNATURE=true for public data; AWS_REGION; "
+    "AWS_ENDPOINT_URL",
     "gs": "GOOGLE_APPLICATION_CREDENTIALS, or GOOGLE_SKIP_SIGNATURE=true for what is public",
     "az": "AZURE_STORAGE_ACCOUNT_NAME and AZURE_STORAGE_ACCOUNT_KEY, or AZURE_SKIP_SIGNATURE=true for what is public",
 }
@@ -403,7 +406,7 @@ def _describe_store_error(url: str, error: Exception, code: str | None, what: st
 def _describe_denial(scheme: str, text: str, code: str | None, what: str) -> str:
     if code in _REFUSED:
         return _REFUSED[code]
-    has_key = bool(os.environ.get("AWS_ACCESS_KEY_ID"))
+    has_key = any(os.environ.get(name) for name in ("AWS_ACCESS_KEY_ID", "AWS_PROFILE"))
     if code == "AccessDenied" and (what == "written" or has_key):
         return "the credentials do not allow it"
     if not code and "403" in text and scheme == "s3" and has_key:
@@ -458,6 +461,7 @@ def _connect(container: str, query: str, settings: tuple[tuple[str, str], ...], 
         client = {"allow_http": True, "connect_timeout": timedelta(seconds=3)}
         client |= {"timeout": timedelta(seconds=_FIRST_S)} if is_first else {}
         options = {"retry_config": _IMPATIENT if is_first else _PATIENT, "client_options": client}
+    options |= read_aws_profile() if scheme == "s3" else {}
     if query:  # also where the host is a bucket's: the query stands for the credentials
         return obstore.store.HTTPStore.from_url(f"{container}?{query}", **options)
     return obstore.store.from_url(container, **options)

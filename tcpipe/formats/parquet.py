@@ -6,16 +6,19 @@ all pages say how large the table becomes: one that is out of proportion to its 
 
 from __future__ import annotations
 
+import math
+import os
+import tempfile
 from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
 from tcpipe.errors import StoreError
 from tcpipe.formats.atomic import write_atomic_file
@@ -23,6 +26,8 @@ from tcpipe.formats.json_files import to_json_line
 from tcpipe.tables.columns import read_lonlat_deg
 from tcpipe.tables.levels import GEOMETRY, Datum
 from tcpipe.tables.options import EARLIER_COLUMNS
+
+N = TypeVar("N", bound=np.generic)
 
 ROWS_PER_GROUP = 1 << 17
 """Rows of a group: what is decoded together."""
@@ -317,6 +322,23 @@ def map_table(path: Path) -> pa.Table:
     """Return the whole table as a view of the file, which must outlive it."""
     with pa.memory_map(str(path)) as source:
         return pa.ipc.open_file(source).read_all()
+
+
+def make_mapped_array(directory: Path, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
+    """Return an array of zeros in a nameless file in a directory: the system may put its pages aside, so it takes no memory."""
+    size_bytes = np.dtype(dtype).itemsize * math.prod(shape)
+    if not size_bytes:
+        return np.zeros(shape, dtype)
+    with tempfile.TemporaryFile(dir=directory) as file:
+        os.posix_fallocate(file.fileno(), 0, size_bytes)  # a full disk is told now, not by a signal
+        return np.memmap(file, dtype, "r+", shape=shape).view(np.ndarray)
+
+
+def move_to_file(array: NDArray[N], directory: Path) -> NDArray[N]:
+    """Return a copy of an array as `make_mapped_array` gives it."""
+    mapped = make_mapped_array(directory, array.shape, array.dtype)
+    mapped[...] = array
+    return mapped
 
 
 def write_table_bytes(table: pa.Table) -> bytes:

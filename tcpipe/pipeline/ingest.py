@@ -142,6 +142,7 @@ def run_ingest(options: IngestOptions) -> IngestSummary:
             if queue.is_done:
                 log.commit("ended", Entries(ended=tuple(find_settled_calls(log.state, make_call(*begin)))))
             else:
+                opened.check_writable()
                 with commit_call(log, *begin[:2], options=begin[2]) as call:
                     tell(_iterate_results(log, queue, jobs=options.jobs, cluster=options.cluster))
                     summary = tell(_iterate_left(log, queue.plan(at for at in own if at not in results)))

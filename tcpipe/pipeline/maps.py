@@ -81,6 +81,7 @@ def run_add_map(options: AddMapOptions) -> AddedMap:
         )
         if before and not options.force:
             return _check_unchanged(opened, name, inputs)
+        opened.check_writable()
         try:
             with opened.new_map(name, after=before) as path:
                 build_map(

@@ -77,14 +77,18 @@ class SamplesShown:
     json: Json
 
 
-def render_dataset_report(directory: Path, beside: Path | None = None, *, folder: str = "") -> str:
+def render_dataset_report(
+    directory: Path, beside: Path | None = None, *, folder: str = "", samples: pa.Table | None = None
+) -> str:
     """Return the HTML page of the dataset in ``directory``; `DatasetError` if it is none, or of another data model.
 
     ``beside`` is the directory in which the dataset lies: the page leads to runs of stores that lie there too. ``folder`` beside the page
-    holds pictures of all patches (`tcpipe.report.dataset_patches.iterate_pictures`), if it is given.
+    holds pictures of all patches (`tcpipe.report.dataset_patches.iterate_pictures`), if it is given. ``samples`` has at least
+    `SAMPLE_COLUMNS` of the samples; None: they are read.
     Patches, pictures and places to drive that are lost or damaged are said on the page, which is written without them.
     """
-    card, samples = read_current_card(directory), read_samples(directory, SAMPLE_COLUMNS)
+    card = read_current_card(directory)
+    samples = read_samples(directory, SAMPLE_COLUMNS) if samples is None else samples
     shown = select_samples(card, samples)
     plots, lost = draw_dataset_map(directory, card, len(shown.xy_m))
     quality = samples.column("quality").to_numpy()

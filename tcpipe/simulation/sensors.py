@@ -26,9 +26,6 @@ CLOCK_STEP_NS = 2_500_000_000
 
 Triple = tuple[float, float, float]
 
-_UP_OVER_EAST = 1.7
-"""Of lasting errors of fixes: satellites are all above."""
-
 
 @dataclass(frozen=True, slots=True)
 class Reading:
@@ -277,7 +274,7 @@ def read_gnss(truth: Truth, sensor: Gnss, faults: Faults, noise: Noise, *, site:
 def _draw_lasting_noise(sensor: Gnss, rng: np.random.Generator) -> tuple[Float, float]:
     """Return size [m], shape (3,), and correlation time [s] of the lasting part of one drive's noise."""
     std_m, lasts_s = rng.uniform(*sensor.lasting_std_m), np.exp(rng.uniform(*np.log(sensor.lasts_s)))
-    return std_m * np.array([1.0, 1.0, _UP_OVER_EAST]), float(lasts_s)
+    return std_m * np.array([1.0, 1.0, 1.7]), float(lasts_s)  # satellites are all above
 
 
 def _make_lasting_noise(count: int, step: float, rng: np.random.Generator) -> Float:

@@ -68,12 +68,9 @@ def simulate(out: Path, *, scenario: str | Scenario = "demo", seed: int = 1) -> 
     with write_atomic_directory(out) as directory:
         half = _read_site(directory, chosen)
         for index, spec in enumerate(chosen.drives):
-            truth, readings = simulate_readings(chosen, index, seed=seed)
+            truth, messages = simulate_messages(chosen, index, seed=seed)
             write_table(truth.table(), half.truths[index])
-            stated = spec.sensors.mounted(spec.faults).stated(spec.faults, Noise(seed, index))
-            _write_log(
-                half.logs[index], spec, make_streams(readings, stated, spec.recorder, geoid_m=chosen.world.site.geoid_m)
-            )
+            _write_log(half.logs[index], spec, messages)
         write_json(half.region, _make_region(chosen))
         write_rasters(directory / "maps", chosen.world, chosen.rasters)
         write_json(half.world, about)
@@ -113,6 +110,13 @@ def simulate_readings(scenario: Scenario, index: int = 0, *, seed: int = 1) -> t
     )
     sensors = spec.sensors.mounted(spec.faults)
     return truth, record(truth, scenario.world.site, sensors, spec.faults, noise)
+
+
+def simulate_messages(scenario: Scenario, index: int = 0, *, seed: int = 1) -> tuple[Truth, list[MessageStream]]:
+    """Return the truth of one drive of a scenario, and what is recorded of it; nothing is written."""
+    spec, (truth, readings) = scenario.drives[index], simulate_readings(scenario, index, seed=seed)
+    stated = spec.sensors.mounted(spec.faults).stated(spec.faults, Noise(seed, index))
+    return truth, make_streams(readings, stated, spec.recorder, geoid_m=scenario.world.site.geoid_m)
 
 
 def read_truth(path: Path) -> Truth:

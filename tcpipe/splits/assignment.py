@@ -205,11 +205,11 @@ def assign_splits(
     split = np.array(["train", "unseen", "buffer", EXCLUDED], dtype=np.str_)[sides]
     old = np.full(n, "", np.str_) if kept is None else np.where(sides == Side.EXCLUDED, "", kept.split)
     split[old != ""] = old[old != ""]
-    inside = np.flatnonzero(np.isin(split, ("train", "test")))
+    inside = np.flatnonzero((split == "train") | (split == "test"))
     known = np.select([old[inside] == "test", old[inside] == "train"], [1, 0], UNDECIDED)
     whole = {"run": (run, run_names), "tag": tagged}.get(holdout)
     groups = (
-        assign_blocks(corners_xy_m[inside].mean(axis=1), block_m=block_m)
+        assign_blocks(corners_xy_m.mean(axis=1)[inside], block_m=block_m)
         if whole is None
         else group_by_run(whole[0][inside], whole[1])
     )

@@ -86,7 +86,7 @@ def _audit_split(name: str, split: NDArray[np.str_], run: Ints, follows: Ints, c
         pairs += int(real.sum())
         overlaps[i[real]] = True
         repeated[i[real & (run[held[i]] != run[train[j]])]] = True
-    crossing = (split[follows] == name).any(axis=1) & (split[follows] == "train").any(axis=1)
+    crossing = (split == name)[follows].any(axis=1) & (split == "train")[follows].any(axis=1)
     apart_m = compute_nearest_m(queries, references)
     return HeldOut(
         split=name,

@@ -90,8 +90,8 @@ def find_fuse_findings(inputs: FusionInputs, facts: FuseFacts, *, run: Subject) 
 
 
 def _find_initial_yaw(section: StretchFacts, first_ns: int, gnss: Subject) -> Finding:
-    names = {"source": section.heading_from}
-    return make_finding("initial-yaw-uncertain", gnss, span_s=_find_span_s(section, first_ns), names=names)
+    span_s = _find_span_s(section, first_ns)
+    return make_finding("initial-yaw-uncertain", gnss, span_s=span_s, names={"source": section.heading_from})
 
 
 def _find_scale(facts: FuseFacts) -> list[Finding]:
@@ -231,8 +231,7 @@ def find_parameter_findings(inputs: FusionInputs, facts: FuseFacts, streams: Str
         unsure_rad = 0.0 if turned is None else float(np.linalg.norm(turned.std))
         if sensor.placed_by != "assumed" and off_rad > max(_SURELY * unsure_rad, _LEAST_TURN_RAD):
             remedies, names = state_extrinsics(GNSS, sensor.xyz_m, turn), {"placed_by": sensor.placed_by}
-            fixes = Subject("role", GNSS)
-            yield make_finding("pose-rotated", fixes, names=names, remedies=remedies, off_rad=off_rad)
+            yield make_finding("pose-rotated", Subject("role", GNSS), names=names, remedies=remedies, off_rad=off_rad)
     if tilt is not None and _is_contradicted(tilt, _LEAST_TILT_RAD):
         yield _find_tilt(tilt, streams.sensors[IMU])
     for name, role in (("wheel scale", WHEELS), ("camera scale", VISUAL)):

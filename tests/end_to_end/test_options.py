@@ -97,3 +97,17 @@ def test_patches_of_a_report_lie_beside_it_and_other_answers_are_json(place: Pat
     assert {path.parent for path in place.rglob("*") if path.is_file()} - {path.parent for path in before}
     assert answer("diff", "dataset", "dataset", cwd=place)["same"]
     assert answer("migrate", "store", cwd=place)["migrated"] == []
+
+
+def test_the_store_is_named_in_the_same_way_everywhere(place: Path) -> None:
+    for command in (("inspect",), ("verify",), ("migrate",), ("report", "--no-runs"), ("status",)):
+        by_option = tcpipe(*command, "--store", "store", cwd=place)
+        by_variable = tcpipe(*command, cwd=place, env={"TCPIPE_STORE": "store"})
+        as_before = tcpipe(*command, "store", cwd=place)
+        outputs = {done.stdout.replace("no logs", "") for done in (by_option, by_variable, as_before)}
+        assert len(outputs) == 1 or command[0] == "report", command
+        assert {by_option.returncode, by_variable.returncode, as_before.returncode} == {0}, by_option.stderr
+    twice = tcpipe("verify", "store", "--store", "store", cwd=place)
+    assert (twice.returncode, twice.stderr) == (2, "tcpipe: store: PATH and --store are given; give one of them\n")
+    nowhere = tcpipe("verify", cwd=place)
+    assert (nowhere.returncode, nowhere.stdout) == (2, "")

@@ -13,5 +13,5 @@ def dataset_page(request: pytest.FixtureRequest) -> Iterator[None]:
     """Leave out the page of each dataset, two thirds of a small build, but in modules that say ``DRAWS_DATASET_PAGES = True``."""
     with pytest.MonkeyPatch.context() as patch:
         if not getattr(request.module, "DRAWS_DATASET_PAGES", False):
-            patch.setattr("tcpipe.pipeline.dataset.build.render_dataset_report", lambda *_: "<!doctype html>")
+            patch.setattr("tcpipe.pipeline.dataset.build.render_dataset_report", lambda *_, **__: "<!doctype html>")
         yield

@@ -199,9 +199,11 @@ def test_a_bucket_that_keeps_no_two_writers_apart_or_cannot_be_written_is_refuse
         (tmp_path / "served" / name).mkdir(parents=True)
     with object_store(tmp_path / "served") as (environment, _):
         in_environment(monkeypatch, environment, tmp_path / "cache")
-        for _ in range(2):
-            with pytest.raises(StoreError, match=r"s3://overwriting/x: this object store overwrites what is there"):
-                open_store("s3://overwriting/x", create=True)
+        overwrites = r"s3://overwriting/x: this object store overwrites what is there"
+        with pytest.raises(StoreError, match=overwrites):
+            open_store("s3://overwriting/x", create=True)
+        with pytest.raises(StoreError, match=overwrites):
+            open_store("s3://overwriting/x", create=True).check_writable()
         with pytest.raises(
             StoreError, match=r"s3://read-only/x/store.json: it cannot be written \(the credentials .*; name another"
         ):

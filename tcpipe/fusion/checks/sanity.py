@@ -217,8 +217,7 @@ class Pair:
 
     def is_alike(self, noise_m2: float) -> bool:
         """Return whether the paths have the same shape in most windows."""
-        is_near = self.compute_misfits_m2()[0] < noise_m2 + _UNLIKE**2 * self.a_m2
-        return bool(np.mean(is_near) > 1.0 - _UNLIKE)
+        return bool(np.mean(self.compute_misfits_m2()[0] < noise_m2 + _UNLIKE**2 * self.a_m2) > 1.0 - _UNLIKE)
 
 
 def compare_paths(a: Path, b: Path, shortest_s: float, noise_m2: float) -> Pair | None:

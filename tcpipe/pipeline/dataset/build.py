@@ -11,6 +11,8 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
+import pyarrow as pa
+
 from tcpipe import __version__
 from tcpipe.cost.labels import format_budget
 from tcpipe.errors import DatasetError, MissingFileError, RecipeError, StoreError, UsageError, clean_lines
@@ -32,7 +34,6 @@ from tcpipe.formats.dataset_files import (
     SHARDS,
     read_card,
     read_current_card,
-    read_samples,
 )
 from tcpipe.formats.finding_lines import format_mixed_groups, format_verdict
 from tcpipe.formats.geojson import read_regions
@@ -41,7 +42,7 @@ from tcpipe.formats.integrity import compute_checksum, compute_checksums, seal_p
 from tcpipe.formats.json_files import digest, write_json
 from tcpipe.formats.maps.map_files import MapFile
 from tcpipe.formats.object_storage import is_url, make_absolute
-from tcpipe.formats.parquet import ROWS_PER_GROUP, write_parquet_rows
+from tcpipe.formats.parquet import ROWS_PER_GROUP, map_table, write_parquet_rows, write_pieces
 from tcpipe.formats.place import Place, open_place
 from tcpipe.formats.recipe_toml import resolve_recipe
 from tcpipe.formats.run_documents import SPOOL
@@ -58,7 +59,7 @@ from tcpipe.pipeline.calls import (
 )
 from tcpipe.pipeline.dataset.balance import BALANCE_COLUMNS, measure_balance
 from tcpipe.pipeline.dataset.card import CARD_COLUMNS, PHYSICS_COLUMNS, VELOCITY_COLUMN, is_whole, make_dataset_card
-from tcpipe.pipeline.dataset.content import gather_content, read_all_covariates, write_patches
+from tcpipe.pipeline.dataset.content import SampleTable, gather_content, read_all_covariates, write_patches
 from tcpipe.pipeline.dataset.inputs import BuildOptions, Inputs, choose_inputs, find_other_options, read_earlier_splits
 from tcpipe.pipeline.dataset.redaction import (
     make_redaction,
@@ -72,7 +73,7 @@ from tcpipe.pipeline.dataset.sampling import Workers
 from tcpipe.pipeline.generations import read_generations, write_generation
 from tcpipe.pipeline.options import BuildDatasetOptions
 from tcpipe.recipe import Recipe
-from tcpipe.report.dataset_report import render_dataset_report
+from tcpipe.report.dataset_report import SAMPLE_COLUMNS, render_dataset_report
 from tcpipe.report.pictures import draw_classes, draw_maps, draw_relief, write_overview
 from tcpipe.splits.assignment import SPLITS
 from tcpipe.store import Store, open_store
@@ -357,14 +358,11 @@ def _build(directory: Path, inputs: Inputs, options: BuildOptions, workers: Work
     if redaction is not None:
         content, inputs = redact_content(content, redaction), redact_inputs(inputs, redaction)
     logger.info("writing %d samples", len(content.samples))
-    with write_parquet_rows(directory / SAMPLES, content.samples.schema) as write:
-        for piece in content.samples.pieces(ROWS_PER_GROUP):
-            write(piece)
+    figures = _write_samples(directory / SAMPLES, content.samples, waiting / "figures.arrow")
     shards = write_patches(directory, content, options.file_format, workers, compression=recipe.dataset.compression)
-    shutil.rmtree(waiting)
     _write_overviews(directory, content.sources)
     balance, drive_next = measure_balance(
-        read_samples(directory, BALANCE_COLUMNS),
+        figures.select(BALANCE_COLUMNS),
         content.samples.centres_xy_m(),
         content.sources,
         velocity_column=VELOCITY_COLUMN[recipe.label.velocity],
@@ -373,9 +371,9 @@ def _build(directory: Path, inputs: Inputs, options: BuildOptions, workers: Work
         buffer_m=content.split.buffer_m,
     )
     write_json(directory / DRIVE_NEXT, drive_next if redaction is None else redact_features(drive_next, redaction))
-    samples = read_samples(directory, (*CARD_COLUMNS, *PHYSICS_COLUMNS))
-    card = make_dataset_card(samples, options, inputs, content, balance=balance, shards=shards)
+    card = make_dataset_card(figures, options, inputs, content, balance=balance, shards=shards)
     card = card if redaction is None else redact_card(card, redaction)
+    shutil.rmtree(waiting)
     spool, schema = content.spool, content.samples.schema
     files = compute_checksums(directory)
     write_text(
@@ -399,8 +397,22 @@ def _build(directory: Path, inputs: Inputs, options: BuildOptions, workers: Work
     write_text(directory / CROISSANT, croissant)
     card = replace(card, checksums={**files, CROISSANT: compute_checksum(directory / CROISSANT)})
     write_sealed(directory / CARD, card)
-    write_text(directory / REPORT, seal_page(render_dataset_report(directory)))
+    write_text(directory / REPORT, seal_page(render_dataset_report(directory, samples=figures)))
     return card
+
+
+def _write_samples(path: Path, samples: SampleTable, mapped: Path) -> pa.Table:
+    """Write the samples; return the columns that card and page are made from, mapped from another file."""
+    names = list(dict.fromkeys((*CARD_COLUMNS, *PHYSICS_COLUMNS, *BALANCE_COLUMNS, *SAMPLE_COLUMNS)))
+
+    def write_both() -> Iterator[pa.Table]:
+        for piece in samples.pieces(ROWS_PER_GROUP):
+            write(piece)
+            yield piece.select(names).replace_schema_metadata(None)
+
+    with write_parquet_rows(path, samples.schema) as write:
+        write_pieces(mapped, pa.schema([samples.schema.field(name) for name in names]), write_both())
+    return map_table(mapped)
 
 
 def _write_overviews(directory: Path, sources: Sequence[MapFile]) -> None:

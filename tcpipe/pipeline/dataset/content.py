@@ -41,7 +41,14 @@ from tcpipe.formats.dataset_files import (
 )
 from tcpipe.formats.finding_lines import format_mixed_groups
 from tcpipe.formats.maps.map_files import MapFile, open_map
-from tcpipe.formats.parquet import add_geo_metadata, map_table, read_table_bytes, write_pieces, write_table_bytes
+from tcpipe.formats.parquet import (
+    add_geo_metadata,
+    map_table,
+    move_to_file,
+    read_table_bytes,
+    write_pieces,
+    write_table_bytes,
+)
 from tcpipe.formats.place import Place
 from tcpipe.formats.recipe_toml import load_profiles
 from tcpipe.formats.stored_runs import RunDirectory
@@ -174,7 +181,8 @@ class SampleTable:
         """The samples' columns, with the extent of their places."""
         bare = pa.schema([*SAMPLES.arrow(), *self.added.schema]).empty_table()
         pieces = (self._centres_deg(self.patch[first : first + _ROWS]) for first in range(0, len(self), _ROWS))
-        return add_geo_metadata(bare, "Point", np.concatenate([np.empty((0, 2)), *pieces])).schema
+        corners = [corner for piece in pieces for corner in (piece.min(axis=0), piece.max(axis=0))]
+        return add_geo_metadata(bare, "Point", np.array(corners).reshape(-1, 2)).schema
 
     def _centres_deg(self, patches: NDArray[np.int64]) -> NDArray[np.float64]:
         """Return the centre of patches of ``sampled``, WGS 84 lon, lat [deg], shape (N, 2)."""
@@ -267,7 +275,7 @@ def gather_content(directory: Path, inputs: Inputs, options: BuildOptions, worke
     logger.info("sampling %d segments of %d runs", segments.num_rows, len(inputs.runs))
     ranks = _rank_segments(segments, seed=recipe.split.seed)
     sampled, slot, spool = sample_all_segments(
-        segments, ranks, inputs.maps, recipe.sample, gnss_crs=recipe.read.gnss_crs, workers=workers
+        segments, ranks, inputs.maps, recipe.sample, gnss_crs=recipe.read.gnss_crs, workers=workers, directory=directory
     )
     sources = tuple(open_map(*of) for of in inputs.maps())
     lost_m = sum_losses(to_floats(segments, "arc_length_m"), sampled.lost_by)
@@ -280,6 +288,7 @@ def gather_content(directory: Path, inputs: Inputs, options: BuildOptions, worke
     assigned, result = draw_splits(
         segments, sampled, sources[0].grid, options.regions, recipe, earlier=options.earlier, tags=tags
     )
+    assigned = Assignment(move_to_file(assigned.split, directory), move_to_file(assigned.fold, directory))
     split = assigned.split
     arc_m = to_floats(segments, "arc_length_m")[sampled.kept]
     unused_m = {Loss.SPLIT_BUFFER: arc_m[split == "buffer"].sum(), Loss.SPLIT_EXCLUDED: arc_m[split == EXCLUDED].sum()}
@@ -288,7 +297,7 @@ def gather_content(directory: Path, inputs: Inputs, options: BuildOptions, worke
     in_use = sampled.kept[(split != "buffer") & (split != EXCLUDED)]
     removal, biased = find_removed_by_ground(inputs.runs, segments, in_use, sources, recipe)
     kept = np.flatnonzero(split != EXCLUDED)
-    order = kept[np.argsort(ranks[sampled.kept[kept]], kind="stable")]
+    order = move_to_file(kept[np.argsort(ranks[sampled.kept[kept]], kind="stable")], directory)
     added, covariates, incomplete = make_added_columns(
         segments, sampled.kept[order], inputs.sources, inputs.covariates, recipe.covariates, layers=tuple(spool.layers)
     )

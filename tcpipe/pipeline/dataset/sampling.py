@@ -23,6 +23,7 @@ from tcpipe.formats.bucket_directories import FetchedShards
 from tcpipe.formats.dataset_files import LayerPixels
 from tcpipe.formats.json_files import parse_typed_json, to_compact_json
 from tcpipe.formats.maps.map_files import MapFile, open_map
+from tcpipe.formats.parquet import make_mapped_array, move_to_file
 from tcpipe.formats.place import Place
 from tcpipe.progress import Meter
 from tcpipe.recipe import SampleConfig
@@ -183,11 +184,12 @@ def sample_all_segments(
     *,
     gnss_crs: str,
     workers: Workers,
+    directory: Path,
 ) -> tuple[Sampled, NDArray[np.int64], Spool]:
     """Sample each of M segments from the first map with data for it; return the results, slots in the order of ``kept``, and the spool.
 
     ``ranks`` give the dataset's order, uniform over 64 bits, shape (M,); ``gnss_crs`` is the CRS of the segments' positions.
-    `TcpipeError` if the map or the segments cannot be used.
+    The results are arrays in files in ``directory``. `TcpipeError` if the map or the segments cannot be used.
     """
     sources = [open_map(*of) for of in maps()]
     check_same_layers(sources)
@@ -198,7 +200,7 @@ def sample_all_segments(
         logger.info("resuming: %d of %d batches are sampled", count, len(rows))
     placed = segments.select(PLACED_SEGMENTS.names())
     batches = _Batches(rows, _Batch(0, ranks, placed, maps, config, gnss_crs, spool))
-    lost_by, slots = np.zeros(segments.num_rows, np.uint32), np.zeros(segments.num_rows, np.int64)
+    lost_by, slots = (make_mapped_array(directory, (segments.num_rows,), kind) for kind in (np.uint32, np.int64))
     counts, columns = [0] * len(rows), dict[str, NDArray[Any]]()
     findings: dict[int, tuple[Finding, ...]] = {}
     meter = Meter("sampling", segments.num_rows)
@@ -212,17 +214,18 @@ def sample_all_segments(
                 slots[kept[_sort_rows(ranks[kept])]] = (batch << _ROW_BITS) + np.arange(len(kept))
                 counts[batch], findings[batch] = len(kept), part.findings
                 for name, values in _make_columns(part).items():
-                    whole = columns.setdefault(name, np.zeros((len(lost_by), *values.shape[1:]), values.dtype))
-                    whole[kept] = values
+                    if name not in columns:
+                        columns[name] = make_mapped_array(directory, (len(lost_by), *values.shape[1:]), values.dtype)
+                    columns[name][kept] = values
     finally:
         _held.clear()
     kept = np.flatnonzero(lost_by == 0)
     for name in columns:
-        columns[name] = columns[name][kept]
+        columns[name] = move_to_file(columns[name][kept], directory)
     every = dict.fromkeys(finding for index in sorted(findings) for finding in findings[index])
     placing = {name: columns.pop(name) for name in _PLACING}
     sampled = Sampled(kept=kept, patches=Patches({}, **columns), lost_by=lost_by, findings=tuple(every), **placing)
-    return sampled, slots[kept], replace(spool, counts=tuple(counts))
+    return sampled, move_to_file(slots[kept], directory), replace(spool, counts=tuple(counts))
 
 
 def _as_bytes(sampled: Sampled) -> bytes:

@@ -25,6 +25,8 @@ from tcpipe.tables.columns import to_integers
 from tcpipe.terrain.projection import Projection, compute_area, parse_crs
 from tcpipe.terrain.target_grid import MapGrid
 
+_ROWS = 1 << 16
+"""Rows whose ids are in memory together."""
 _MARGIN_DEG = 0.05
 """Regions are cut this far around the samples (3 km or more below 60° latitude)."""
 
@@ -49,10 +51,11 @@ def draw_splits(
     starts_ns = to_integers(segments, "start_ns")
     run, run_names = _number_runs(segments, starts_ns)
     run, starts_ns = run[sampled.kept], starts_ns[sampled.kept]
-    ids = segments.column("segment_id").take(pa.array(sampled.kept))
-    kept = None if earlier is None else _read_earlier_assignment(ids, earlier)
+    ids, rows = segments.column("segment_id"), sampled.kept
+    kept = None if earlier is None else _read_earlier_assignment(ids.take(pa.array(rows)), earlier)
+    pieces = (ids.take(pa.array(rows[first : first + _ROWS])) for first in range(0, len(rows), _ROWS))
     assigned = assign_splits(
-        np.concatenate([hash_ranks(part.to_pylist(), seed=rules.seed, purpose="test") for part in ids.chunks]),
+        np.concatenate([hash_ranks(part.to_pylist(), seed=rules.seed, purpose="test") for part in pieces]),
         run,
         run_names,
         sampled.footprint_xy_m,
@@ -67,7 +70,7 @@ def draw_splits(
         tagged=None if tags is None else _number_values(run, [tags[name] for name in run_names]),
     )
     split = assigned.split
-    if regions is not None and not np.isin(split, ("train", "test")).any():
+    if regions is not None and not ((split == "train") | (split == "test")).any():
         raise DatasetError(_describe_nothing_inside(regions, sampled.footprint_lonlat_deg, split))
     audit = audit_leakage(split, run, starts_ns, sampled.footprint_xy_m, chord_m=chord_m)
     counts = None

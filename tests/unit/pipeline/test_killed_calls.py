@@ -228,3 +228,7 @@ def test_a_store_that_cannot_be_written_is_built_from_and_asked_as_ever(tmp_path
     with commit_call(open_log(store), "build-dataset", ["/out"]):
         assert list_begun_calls(store.state()) == []
     assert told(tmp_path / "store").exit_code == 0
+    assert ingest([logs], store=tmp_path / "store", recipe=Recipe()).exit_code == 0, "there is nothing new"
+    drive_at(logs / "later.mcap", seed=7)
+    with pytest.raises(StoreError, match="read-only; name another with --store"):
+        ingest([logs], store=tmp_path / "store", recipe=Recipe())
