@@ -13,7 +13,6 @@ import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
-from itertools import chain
 from pathlib import Path
 from typing import Literal, TypeVar
 
@@ -282,7 +281,7 @@ def remove_if_empty(place: str | Path) -> Iterator[None]:
     try:
         yield
     finally:
-        if made and not any(chain(*map(store.glob, ("runs/*", "maps/*-*.json", f"{SPOOL}/*/*")))):
+        if made and not any(path for of in ("runs/*", "maps/*-*.json", f"{SPOOL}/*/*") for path in store.glob(of)):
             for own in ("log", "index"):
                 shutil.rmtree(store / own, ignore_errors=True)
             (store / MARK).unlink(missing_ok=True)
