@@ -23,7 +23,6 @@ Item: TypeAlias = tuple[int, IngestTask]
 _MOST_TASKS = 3
 """So many tasks work on a log of another's share, one after the other: what kills each of them must not kill all of the array."""
 _UNLIMITED = 1000
-_KEY_HEX = 32
 
 
 class LogQueue:
@@ -156,4 +155,4 @@ class LogQueue:
 
     def _make_key(self, of: str) -> str:
         task = self._tasks[0]
-        return digest([of, ingest_key(task.recipe), task.robot, task.definitions, __version__])[:_KEY_HEX]
+        return digest([of, ingest_key(task.recipe), task.robot, task.definitions, __version__])

@@ -142,6 +142,18 @@ def test_a_claim_is_taken_over_when_its_lease_is_over_and_a_killer_of_tasks_is_g
     assert not (tmp_path / "spool").exists()
 
 
+def test_a_store_without_runs_stays_while_another_task_is_at_it(tmp_path):
+    (tmp_path / "logs").mkdir()
+    (tmp_path / "logs" / "junk.mcap").write_bytes(b"junk")
+
+    def try_junk(elsewhere):
+        ingest([tmp_path / "logs"], store=tmp_path / "store", recipe=Recipe(), on_found=elsewhere)
+        return (tmp_path / "store" / "log").exists()
+
+    assert not try_junk(None)
+    assert try_junk(lambda _: claim_elsewhere(tmp_path / "store", "a", lease_s=60.0))
+
+
 def test_a_task_that_lives_renews_its_claims(tmp_path, monkeypatch):
     monkeypatch.setattr(claims_module, "LEASE_S", 0.4)
     place = open_store(tmp_path, create=True).place
