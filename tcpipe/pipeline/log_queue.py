@@ -138,7 +138,7 @@ class LogQueue:
         waiting = self._make_key("waiting")
         if self._claims is None or self._claims.claim(waiting, "", take_over=True, most=_UNLIMITED) != "mine":
             return False
-        time.sleep(claiming.LEASE_S / 8)
+        time.sleep(claiming.LEASE_S / 24)
         self._log.refresh()
         return True
 
