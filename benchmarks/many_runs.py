@@ -6,6 +6,7 @@
     python benchmarks/many_runs.py DIRECTORY RUNS new      one new log alone, with the memory that it takes
 
 Logs and runs are copies of one short drive under other names, hashes and times, laid out as ingestion would have; documents have its size.
+10,000 take one CPU minute, 100,000 eleven and 8 GB.
 """
 
 import hashlib

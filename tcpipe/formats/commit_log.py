@@ -39,6 +39,8 @@ _SEAL_BYTES = 64
 """The first line of a snapshot is the sha256 (hex) of the rest."""
 _KEPT = 2
 """So many snapshots stay."""
+_MANY_RUNS = 5_000
+"""The search for cycles would go through the rows of so many three times, in vain: they are kept out of it."""
 
 
 ReadCommit: TypeAlias = tuple[Commit, str, int]
@@ -84,7 +86,10 @@ def read_state(store: Place) -> State:
             break
         except StoreError as error:
             logger.info("%s; an earlier snapshot, or all commits, are read instead", error)
-    return refresh(store, state)
+    state = refresh(store, state)
+    if len(state.runs) >= _MANY_RUNS:
+        gc.freeze()
+    return state
 
 
 def refresh(store: Place, state: State) -> State:

@@ -479,13 +479,17 @@ def test_a_digest_is_found_once_until_the_file_changes(copy, monkeypatch, tmp_pa
     dataset, hashed = copy("zarr"), []
     whole = Place.checksum
     monkeypatch.setattr(Place, "checksum", lambda place, name: hashed.append(name) or whole(place, name))
+
+    def hashed_shards():
+        return sorted(name for name in hashed if "/c/" in name)
+
     open_dataset(dataset)
-    shards = sorted(hashed)
+    shards = hashed_shards()
     layers = [f"patches.zarr/{layer}/c/0/0/0" for layer in ("height", "ortho", "terrain")]
     assert shards == sorted([*layers, "patches.zarr/sample_id/c/0"])
     for _ in range(2):
         open_dataset(dataset)
-    assert sorted(hashed) == shards
+    assert hashed_shards() == shards
     path = dataset / shards[0]
     seen = path.stat()
     flip(path)
