@@ -62,6 +62,7 @@ def test_a_kept_document_is_read_whole_and_written_as_it_was(kept, pattern, cls)
         del facts["sensor_checks"][name]
     for each in facts.get("audit", {}).get("disagreements", ()):
         del each["what"], each["unit"], each["alone"]  # since 3.0 always of the distance, in metres
+    written.get("recipe", {}).get("fuse", {}).pop("engine", None)  # since 3.0 without effect
     assert without(to_plain(read_as(path, cls)), SINCE) == without(written, SINCE)
 
 
