@@ -53,6 +53,9 @@ class Job(Protocol[R_co]):
     def result(self) -> R_co:
         """Return its result when it has ended."""
 
+    def cancel(self) -> bool | None:
+        """Let it not begin."""
+
 
 class Executor(Protocol):
     """Every `concurrent.futures.Executor`, Dask's (`Client.get_executor`) among them, and submitit's for Slurm."""
@@ -219,7 +222,6 @@ _AHEAD = 2
 _MOST_SUBMITTED = 256
 """Tasks that an executor of unknown size has at once."""
 _POLL_S = 0.5
-_LONGEST_REASON = 500
 
 
 @dataclass(slots=True)
@@ -250,13 +252,12 @@ class _Workers:
             if futures:
                 ended: list[Job[R]] = [*wait(futures, timeout=_ANSWER_S, return_when=FIRST_COMPLETED).done]
             else:
+                time.sleep(_POLL_S)
                 ended = [job for job in running if job.done()]
             if ended:
                 return ended
             if self.client is not None:
                 self._check_workers(self.client)
-            if not futures:
-                time.sleep(_POLL_S)
 
     def _check_workers(self, client: Client) -> None:
         if client.nthreads():
@@ -268,7 +269,7 @@ class _Workers:
         else:
             if not self.alone_s:
                 logger.warning(
-                    "%s: lost all its workers; waiting for one: dask worker %s --nthreads 1", *[self.name] * 2
+                    "%s: lost all its workers; waiting for one (dask worker ADDRESS --nthreads 1)", self.name
                 )
             self.alone_s += _ANSWER_S
 
@@ -277,33 +278,34 @@ def _run_elsewhere(
     function: Callable[[T], R], todo: Iterator[tuple[int, T]], cluster: str | Executor
 ) -> Generator[Outcome[R]]:
     """Run tasks by an executor; Dask's runs that of a killed worker again on another, three times."""
-    with _open_workers(cluster) as workers:
+    with _open_workers(cluster) as workers, _cancel_left(dict[Job[_Answer[R]], int]()) as running:
         caller = _Caller((os.uname().nodename, os.getpid()), logger.getEffectiveLevel(), __version__)
         if client := workers.client:
             caller = replace(caller, topic=f"tcpipe-{client.id}")
             client.subscribe_topic(caller.topic, lambda event: logger.log(*event[1]))
-        running = dict[Job[_Answer[R]], int]()
         while True:
             for index, task in islice(todo, workers.at_once - len(running)):
                 running[workers.submit(function, task, caller)] = index
             if not running:
                 return
             for job in workers.wait_for_first(running):
-                index = running.pop(job)
-                answer = _get_answer(job, workers.name)
-                if answer is None:
-                    yield Outcome(index, None, died=True)
-                    continue
-                for said in answer.said:
-                    logger.log(*said)
-                _spent["cpu_s"] += answer.cpu_s
-                yield Outcome(index, answer.result)
+                yield _get_outcome(job, running.pop(job), workers.name)
 
 
-def _get_answer(job: Job[_Answer[R]], name: str) -> _Answer[R] | None:
-    """Return what a task gave, None where its worker died; `UsageError` where workers are not as they have to be."""
+@contextmanager
+def _cancel_left(running: dict[Job[R], int]) -> Iterator[dict[Job[R], int]]:
+    """Yield the tasks that an executor has; in the end those that have not begun do not begin any more."""
     try:
-        return job.result()
+        yield running
+    finally:
+        for job in running:
+            job.cancel()
+
+
+def _get_outcome(job: Job[_Answer[R]], index: int, name: str) -> Outcome[R]:
+    """Return what became of a task, after saying what it logged; `UsageError` where workers are not as they have to be."""
+    try:
+        answer = job.result()
     except (TcpipeError, CancelledError):
         raise
     except ModuleNotFoundError as error:
@@ -311,9 +313,13 @@ def _get_answer(job: Job[_Answer[R]], name: str) -> _Answer[R] | None:
     except Exception as error:  # noqa: BLE001  tasks return their errors: this one is the executor's
         if "deserialization" in str(error):
             raise UsageError(f"{name}: the scheduler lacks tcpipe; install the same packages there as here") from None
-        reason = clean_line(f"{type(error).__name__}: {'; '.join(str(error).split(chr(10)))}")
-        logger.warning("%s: a task ended without a result (%s)", name, reason[:_LONGEST_REASON])
-        return None
+        reason = clean_line(f"{type(error).__name__}: {'; '.join(str(error).splitlines())}")
+        logger.warning("%s: a task ended without a result (%s)", name, reason[:_LONGEST_SAYING_BYTES])
+        return Outcome(index, None, died=True)
+    for said in answer.said:
+        logger.log(*said)
+    _spent["cpu_s"] += answer.cpu_s
+    return Outcome(index, answer.result)
 
 
 @contextmanager

@@ -20,6 +20,7 @@ from unittest.mock import patch
 
 from tcpipe.cli import main
 from tcpipe.cli.site_commands import json_output_types
+from tcpipe.formats import object_storage
 from tcpipe.formats.json_files import parse_typed, to_plain
 
 COMMAND = Path(sys.executable).parent / "tcpipe"
@@ -85,7 +86,8 @@ def _serve(client: socket.socket) -> None:
 
 
 def _run_here(command: list[str], cwd: Path, env: Mapping[str, str], out: int, err: int) -> int:
-    with chdir(cwd), patch.dict(os.environ, env, clear=True), _standard_files(out, err):
+    new = patch.dict(object_storage._patience, clear=True)  # as in a process that has had no answer
+    with chdir(cwd), patch.dict(os.environ, env, clear=True), new, _standard_files(out, err):
         return _exit_code(command)
 
 

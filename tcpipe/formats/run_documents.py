@@ -272,7 +272,7 @@ def mark_store(place: Place, *, found: bool = False) -> None:
 
 @contextmanager
 def remove_if_empty(place: str | Path) -> Iterator[None]:
-    """Remove what was made for a store on this machine when no run or map came into it, what is remembered of failures too."""
+    """Remove what was made for a store on this machine when no run or map came into it and no other task is at it, failures too."""
     if is_url(place):
         yield
         return
@@ -281,7 +281,7 @@ def remove_if_empty(place: str | Path) -> Iterator[None]:
     try:
         yield
     finally:
-        if made and not any(store.glob("runs/*")) and not any(store.glob("maps/*-*.json")):
+        if made and not any(path for of in ("runs/*", "maps/*-*.json", f"{SPOOL}/*/*") for path in store.glob(of)):
             for own in ("log", "index"):
                 shutil.rmtree(store / own, ignore_errors=True)
             (store / MARK).unlink(missing_ok=True)

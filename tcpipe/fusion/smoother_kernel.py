@@ -61,7 +61,7 @@ class Adjoint(NamedTuple):
 
 
 @compile_kernel
-def _step_before_update(
+def step_before_update(
     K: Matrix, H: Matrix, size: int, pull: Vector, inverse: Matrix, turn: Vector, adjoint: Adjoint, B: Matrix
 ) -> None:
     """Take the adjoint back over one update."""
@@ -108,7 +108,7 @@ def _step_before_update(
 
 
 @compile_kernel
-def _step_before_motion(F: Matrix, kept: Vector, places: Indices, m: int, adjoint: Adjoint, W: Matrix) -> None:
+def step_before_motion(F: Matrix, kept: Vector, places: Indices, m: int, adjoint: Adjoint, W: Matrix) -> None:
     """Take the adjoint back over the motion of a tick."""
     information, rows = adjoint.information, adjoint.rows
     n = information.shape[0]
@@ -145,6 +145,11 @@ def _step_before_motion(F: Matrix, kept: Vector, places: Indices, m: int, adjoin
                 s = information[i, j]
                 information[i, j] = information[j, i]
                 information[j, i] = s
+    for i in range(
+        n
+    ):  # The step over an update takes Λ for symmetric: what is not would grow over half an hour to all of it.
+        for j in range(i):
+            information[i, j] = information[j, i] = 0.5 * (information[i, j] + information[j, i])
 
 
 @compile_kernel
@@ -278,11 +283,11 @@ def smooth_ticks(
         _smooth_tick(k, steps.P[row], states[k], model, adjoint, lags, out, A, room)
         for kind in range(KINDS - 1, -1, -1):
             if steps.used[row, kind]:
-                _step_before_update(
+                step_before_update(
                     steps.K[row, kind], steps.H[row, kind], SIZES[kind], steps.pull[row, kind],
                     steps.inverse[row, kind], steps.turn[row, kind], adjoint, B,
                 )  # fmt: skip
         if k > 0:
             motion = MOTION_WITH_GYRO if inputs.mode[k] >= GYRO_TURN else MOTION_WITHOUT_GYRO
             places, m = model.depends[motion], model.counts[motion]
-            _step_before_motion(steps.F[row], steps.kept[row], places, m, adjoint, A)
+            step_before_motion(steps.F[row], steps.kept[row], places, m, adjoint, A)

@@ -149,6 +149,7 @@ def run_ingest(options: IngestOptions) -> IngestSummary:
                     call.is_whole = queue.is_done
                     record = _call_of(opened, summary, given, tasks, options.jobs)
                     call.end = Entries(calls=(measure_call(watch, record),))
+            queue.clean()
         if log.state.number != before.number and log.state.runs:
             opened.write_index(log.state, before=before)
         return summary

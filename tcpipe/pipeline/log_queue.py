@@ -23,7 +23,6 @@ Item: TypeAlias = tuple[int, IngestTask]
 _MOST_TASKS = 3
 """So many tasks work on a log of another's share, one after the other: what kills each of them must not kill all of the array."""
 _UNLIMITED = 1000
-_KEY_HEX = 32
 
 
 class LogQueue:
@@ -56,7 +55,9 @@ class LogQueue:
         """What the logs of this task's share need as the call begins."""
         todo = [at for at, _ in self._select_todo(every)]
         units = [[todo[at] for at in unit] for unit in group_alike([tasks[at].source for at in todo])]
-        self._left = units if claims is None else sorted(units, key=self._rank)
+        if claims is not None:
+            units.sort(key=lambda unit: (self._own.isdisjoint(unit), -sum(tasks[at].source.size_bytes for at in unit)))
+        self._left = units
 
     def plan(self, indices: Iterable[int]) -> dict[int, Step]:
         """Return what logs need now; those of other shares as a call without options that ingest again."""
@@ -86,8 +87,6 @@ class LogQueue:
             if take_over and self._left and not self._wait():
                 return
             take_over = True
-        if self._claims is not None and not self._given_up:
-            self._claims.remove_expired()
 
     def settle(self, index: int, result: IngestResult) -> None:
         """Remove the claim of a log that is committed; while it may be tried again, other tasks leave it to this one until that ends."""
@@ -96,6 +95,11 @@ class LogQueue:
             return
         if key not in self._keys.values():
             self._claims.release(key)
+
+    def clean(self) -> None:
+        """Remove what killed tasks left, once nothing is to be done."""
+        if self._claims is not None and self.is_done:
+            self._claims.remove_expired()
 
     def _take(self, later: list[Item], *, take_over: bool) -> Iterator[Item]:
         """Yield logs as they are claimed; what may be the same recording as one of those goes to ``later``."""
@@ -134,7 +138,7 @@ class LogQueue:
         waiting = self._make_key("waiting")
         if self._claims is None or self._claims.claim(waiting, "", take_over=True, most=_UNLIMITED) != "mine":
             return False
-        time.sleep(claiming.LEASE_S / 8)
+        time.sleep(claiming.LEASE_S / 24)
         self._log.refresh()
         return True
 
@@ -149,9 +153,6 @@ class LogQueue:
             if step.is_todo and (at in self._own or step.state != "failed_transient")
         ]
 
-    def _rank(self, unit: Sequence[int]) -> tuple[bool, int]:
-        return self._own.isdisjoint(unit), -sum(self._tasks[at].source.size_bytes for at in unit)
-
     def _make_key(self, of: str) -> str:
         task = self._tasks[0]
-        return digest([of, ingest_key(task.recipe), task.robot, task.definitions, __version__])[:_KEY_HEX]
+        return digest([of, ingest_key(task.recipe), task.robot, task.definitions, __version__])

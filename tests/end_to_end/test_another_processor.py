@@ -19,9 +19,9 @@ from simulated_streams import streams_of
 import tcpipe
 
 NEAR = 1e-9
+NEAR_DIFFERENCE = 1e-7
+"""Of a standard deviation whose variance is a small difference of large ones."""
 """Of the largest value of a column; the page says 1e-12, this leaves room for processors that were not seen."""
-NEAR_DIFFERENCE = 1e-6
-"""Of standard deviations: the smoother's variance is a small difference of large ones; the page says 1e-7."""
 
 PIPELINE = Path(__file__).parents[1] / "tiny_pipeline.py"
 
@@ -46,7 +46,7 @@ def _unlike(ours: pa.Table, theirs: pa.Table) -> list[str]:
 def _near(name: str, ours: pa.ChunkedArray, theirs: pa.ChunkedArray) -> bool:
     if pa.types.is_floating(ours.type):
         here, there = (column.to_numpy().astype(float) for column in (ours, theirs))
-        near = NEAR_DIFFERENCE if "_std_" in name else NEAR
+        near = NEAR_DIFFERENCE if name.startswith("displacement_std") else NEAR
         return np.allclose(there, here, rtol=0.0, atol=near * np.nanmax(np.abs(here), initial=0.0), equal_nan=True)
     if name == "geometry":
         here, there = (shapely.get_coordinates(shapely.from_wkb(column.to_pylist())) for column in (ours, theirs))

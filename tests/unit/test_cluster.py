@@ -189,6 +189,14 @@ def test_any_executor_does_all_tasks_and_what_they_say_is_said_here_once(executo
     assert sorted(said) == [f"task {n}" for n in range(3)]
 
 
+def test_what_has_not_begun_when_a_call_ends_does_not_begin(tmp_path):
+    with ThreadPoolExecutor(1) as threads:
+        with closing(run_all(time.sleep, [0, *[0.2] * 200], jobs=1, cluster=threads)) as outcomes:
+            next(outcomes)
+        began_s = time.monotonic()
+    assert time.monotonic() - began_s < 20.0
+
+
 def test_any_executor_ingests_the_bytes_that_this_process_does(executor, tmp_path):
     for number in range(2):
         drive_at(tmp_path / "logs" / f"{number}.mcap", seed=number, start_ns=START_NS + number * 10**13)

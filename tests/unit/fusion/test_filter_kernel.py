@@ -12,7 +12,7 @@ from tcpipe.fusion.error_state import filter_section, make_tests, smooth_section
 from tcpipe.fusion.filter_kernel import ACCEPTED, REJECTED, RESET, Inputs, Memory, allocate_steps, filter_ticks
 from tcpipe.fusion.measurements import Measurements
 from tcpipe.fusion.parameters import Event, make_model
-from tcpipe.fusion.smoother_kernel import EVERY
+from tcpipe.fusion.smoother_kernel import EVERY, Adjoint, step_before_motion, step_before_update
 from tcpipe.fusion.ticks import Ticks
 
 T = 0.05
@@ -411,3 +411,29 @@ def test_an_event_makes_an_error_uncertain_or_another_one():
     assert states[6, state.VISUAL_SCALE + 6] == x[state.VISUAL_SCALE + 6]
     assert states[7, state.VISUAL_SCALE + 6] == 0.0
     assert states[9, state.WHEEL_SCALE + 6] == x[state.WHEEL_SCALE + 6]
+
+
+def test_rounding_of_the_smoothers_information_does_not_grow():
+    """Whatever rounding adds to one half of Λ, P - P Λ P is a covariance at every tick, with constant errors too."""
+    rng, n, ticks = np.random.default_rng(3), 6, 5_000
+    covariance, noise = np.diag(rng.uniform(0.1, 1.0, n)), np.zeros(n)
+    noise[:3] = 1e-4
+    rows = rng.normal(size=(ticks, 1, n))
+    gains, inverses, filtered = np.empty((ticks, 1, n)), np.empty((ticks, 1, 1)), np.empty((ticks, n, n))
+    for k, H in enumerate(rows):
+        S = H @ covariance @ H.T + 1.0
+        gains[k], inverses[k] = (covariance @ H.T / S).T, 1.0 / S
+        keep = np.eye(n) - gains[k].T @ H
+        covariance = keep @ covariance @ keep.T + gains[k].T @ gains[k]
+        filtered[k] = covariance
+        covariance = covariance + np.diag(noise)
+    information = np.zeros((n, n))
+    adjoint = Adjoint(information, np.zeros((1, n)), np.full(0, -1), np.zeros((0, 5)))
+    turn, places, room = np.tile(np.eye(3).ravel(), 2), np.arange(3), np.zeros((n, 2 * n + 3))
+    for k in range(ticks - 1, -1, -1):
+        smoothed = filtered[k] - filtered[k] @ information @ filtered[k]
+        assert np.linalg.eigvalsh(0.5 * (smoothed + smoothed.T)).min() > 0.0, k
+        step_before_update(gains[k], rows[k], 1, np.zeros(1), inverses[k], turn, adjoint, room)
+        information += 1e-9 * rng.normal() * np.abs(information).max() * (np.eye(n, k=1) - np.eye(n, k=-1))
+        step_before_motion(np.eye(3), np.ones(n), places, 3, adjoint, np.zeros((n, n)))
+    assert np.array_equal(information, information.T)

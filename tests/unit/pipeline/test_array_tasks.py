@@ -57,37 +57,41 @@ def drives(tmp_path_factory):
     return folder
 
 
-def read_files(directory):
-    return {str(path.relative_to(directory)): path.read_bytes() for path in directory.rglob("*") if path.is_file()}
+def read_runs(root):
+    place = open_store(root).place.below("runs")
+    return {entry.name: place.read(entry.name) for entry in place.entries()}
 
 
-@pytest.fixture(params=["directory", "bucket"])
+@pytest.fixture(params=["directory", "served", "gateway"])
 def root(request, tmp_path, monkeypatch):
-    """Where a store is to be, and the directory that holds it."""
+    """Where a store is to be."""
     if request.param == "directory":
-        yield tmp_path / "store", tmp_path / "store"
-        return
-    (tmp_path / "served" / "tests").mkdir(parents=True)
-    with object_store(tmp_path / "served") as (environment, _):
-        in_environment(monkeypatch, environment, tmp_path / "cache")
-        yield "s3://tests/store", tmp_path / "served" / "tests" / "store"
+        yield tmp_path / "store"
+    elif request.param == "gateway":
+        in_environment(monkeypatch, request.getfixturevalue("gateway"), tmp_path / "cache")
+        yield f"s3://tests/{tmp_path.name}/store"
+    else:
+        (tmp_path / "served" / "tests").mkdir(parents=True)
+        with object_store(tmp_path / "served") as (environment, _):
+            in_environment(monkeypatch, environment, tmp_path / "cache")
+            yield "s3://tests/store"
 
 
 def test_an_array_with_late_and_killed_tasks_makes_the_store_of_one_call(root, drives, tmp_path):
     (marks := tmp_path / "marks").mkdir()
     running = []
     for share, deadly in ((1, "3"), (2, "none"), (3, "none"), (4, "2")):
-        line = [sys.executable, "-c", TASK, drives, root[0], str(share), marks, deadly]
+        line = [sys.executable, "-c", TASK, drives, root, str(share), marks, deadly]
         running.append(subprocess.Popen(list(map(str, line))))
         time.sleep(0.5)
     codes = [task.wait(timeout=120) for task in running]
     assert codes[:3] == [-9, 0, 0]
     assert codes[3] in (0, -9), "by then another task may have its log"
-    assert read_files(root[1] / "runs") == read_files(drives.parent / "store" / "runs")
-    assert read_files(root[1] / "spool") == {}
+    assert read_runs(root) == read_runs(drives.parent / "store")
+    assert open_store(root).place.entries("spool") == []
     begun = [mark.name.partition("-")[0] for mark in marks.iterdir()]
     assert {name for name in begun if begun.count(name) > 1} <= {"2", "3"}, "only logs of killed tasks are begun twice"
-    assert find_status([drives], store=root[0], recipe=Recipe()).counts == {"done": 7}
+    assert find_status([drives], store=root, recipe=Recipe()).counts == {"done": 7}
 
 
 def test_a_task_lists_the_store_once_and_a_share_with_nothing_new_writes_nothing(tmp_path, drives, monkeypatch):
@@ -106,6 +110,9 @@ def test_a_task_lists_the_store_once_and_a_share_with_nothing_new_writes_nothing
     before = open_store(tmp_path / "store").place.entries()
     again = ingest([drives], store=tmp_path / "store", recipe=Recipe(), shard=(1, 4))
     assert [result.status for result in again.results] == ["unchanged"] * 2
+    assert open_store(tmp_path / "store").place.entries() == before
+    claim_elsewhere(tmp_path / "store", "killed after its commit", lease_s=-1.0)
+    ingest([drives], store=tmp_path / "store", recipe=Recipe(), shard=(1, 4))
     assert open_store(tmp_path / "store").place.entries() == before
 
 
@@ -133,6 +140,18 @@ def test_a_claim_is_taken_over_when_its_lease_is_over_and_a_killer_of_tasks_is_g
         assert mine.claim("a", "log", take_over=True, most=9) == "mine"
         assert len(mine._place.files()) == 4
     assert not (tmp_path / "spool").exists()
+
+
+def test_a_store_without_runs_stays_while_another_task_is_at_it(tmp_path):
+    (tmp_path / "logs").mkdir()
+    (tmp_path / "logs" / "junk.mcap").write_bytes(b"junk")
+
+    def try_junk(elsewhere):
+        ingest([tmp_path / "logs"], store=tmp_path / "store", recipe=Recipe(), on_found=elsewhere)
+        return (tmp_path / "store" / "log").exists()
+
+    assert not try_junk(None)
+    assert try_junk(lambda _: claim_elsewhere(tmp_path / "store", "a", lease_s=60.0))
 
 
 def test_a_task_that_lives_renews_its_claims(tmp_path, monkeypatch):
@@ -167,4 +186,4 @@ def test_the_first_idle_task_waits_for_claims_of_others_and_the_next_ends(tmp_pa
     monkeypatch.setattr(claims_module, "LEASE_S", 1.0)
     theirs[0].renew()
     assert list_waiting(1) == []
-    assert read_files(tmp_path / "store" / "runs") == read_files(drives.parent / "store" / "runs")
+    assert read_runs(tmp_path / "store") == read_runs(drives.parent / "store")

@@ -187,13 +187,13 @@ def sent(monkeypatch):
     seen = []
 
     def elsewhere(function, tasks, _):
-        for index in reversed(range(len(tasks))):
+        for index, task in reversed([*tasks]):
             seen.append(index)
-            function, task = pickle.loads(pickle.dumps((function, tasks[index])))  # noqa: S301  our own
+            function, task = pickle.loads(pickle.dumps((function, task)))  # noqa: S301, PLW2901  our own
             yield Outcome(index, pickle.loads(pickle.dumps(function(task))))  # noqa: S301
 
     monkeypatch.setattr("tcpipe.planning.cost_map._BLOCKS_KEPT", 2)
-    monkeypatch.setattr("tcpipe.execution._run_on_cluster", elsewhere)
+    monkeypatch.setattr("tcpipe.execution._run_elsewhere", elsewhere)
     return seen
 
 
