@@ -88,7 +88,7 @@ def test_a_signature_is_in_nothing_that_is_written_or_printed(site, tmp_path):
     printed = []
 
     def run(*arguments, codes=(0,)):
-        done = tcpipe(*arguments, cwd=tmp_path)
+        done = tcpipe(*arguments, cwd=tmp_path, env={"TCPIPE_RETRY_MINUTES": "0"})
         assert done.returncode in codes, done.stderr
         printed.append((arguments, (done.stdout + done.stderr).encode()))
         return done
