@@ -31,7 +31,17 @@ from tcpipe.fusion.filter_kernel import (
 )
 from tcpipe.fusion.hypotheses import POSSIBLE, Hypothesis, compute_weights, explain, find_suspects, make_excursions
 from tcpipe.fusion.initial import compute_course, find_stationary_intervals
-from tcpipe.fusion.measurements import DOPPLER, GNSS, IMU, VISUAL, WHEELS, InitialState, Measurements, select_rows
+from tcpipe.fusion.measurements import (
+    DOPPLER,
+    GNSS,
+    IMU,
+    STATED_ARM_STD_M,
+    VISUAL,
+    WHEELS,
+    InitialState,
+    Measurements,
+    select_rows,
+)
 from tcpipe.fusion.noise_curves import describe_noise
 from tcpipe.fusion.pair_residuals import find_residuals
 from tcpipe.fusion.parameters import PARAMETERS, expand_start, make_model, make_priors, make_start
@@ -262,6 +272,7 @@ def _make_trajectory(  # noqa: PLR0917
     links = _interpolate_links(smoothed, at, output_ns)
     antenna = np.zeros(3) if m.gnss is None else np.asarray(m.gnss.lever_arm_m)
     slope_std = estimate_slope_std_rad(m) or SLOPE_RAD
+    tilted = np.minimum(GROUND * speed[:, None] * DISPLACEMENT_LAGS_S, 2 * slope_std**2)
     if is_gliding(m):  # level, and along the course
         yaw = compute_course(velocity)
         rotation = matrix_from_quat(quat_from_rpy(0.0, 0.0, yaw))
@@ -270,8 +281,7 @@ def _make_trajectory(  # noqa: PLR0917
         position -= rotation @ antenna
         position_variance[:, :2] += (slope_std * antenna[2]) ** 2
         speed_variance = speed_variance + (UNSEEN_TURN_RADPS * antenna[2]) ** 2
-        sway = np.minimum(GROUND * speed[:, None] * DISPLACEMENT_LAGS_S, 2 * slope_std**2) * antenna[2] ** 2
-        links = links + sway
+        links = links + tilted * antenna[2] ** 2
     elif is_turned_by_course(m) and not m.has_posed_tilt:
         # The course takes a sway of the antenna for a turn: nothing tells one from the other, and roll is taken to be none.
         position_variance[:, :2] += (slope_std * antenna[2] * rotation[:, :2, 1]) ** 2
@@ -285,7 +295,8 @@ def _make_trajectory(  # noqa: PLR0917
         unseen = np.asarray(m.gnss.lever_arm_std_m) * [not std[state.ARM], not std[state.ARM + 1], 1.0]
         variance, moved = _compute_arm_variance(unseen, rotation, turned, made)
         position_variance += variance
-        links = links + moved
+        # The noise of tilt holds the sway of an antenna whose height is known as well as a stated one.
+        links = links + moved + tilted * max(0.0, unseen[2] ** 2 - STATED_ARM_STD_M[2] ** 2)
     if m.imu is None and not m.odometries() and not _is_yaw_measured(m):
         # From positions alone forward and reverse look the same: yaw may be anything, and so the place below the antenna.
         beside = rotation @ antenna

@@ -215,6 +215,10 @@ def test_an_imu_that_nothing_places_is_refused_and_its_mounting_proposed(tmp_pat
     drive = make(placements=False)
     labelled = run(drive, tmp_path)
     assert refused(labelled) == {"imu"}
+    # Without it nothing measures how an antenna sways whose height nobody states: σ holds that.
+    table, true = labelled.table, compute_true_cost(drive.truth, labelled.table["start_ns"].to_numpy())
+    error, std = table["duration_s"].to_numpy() - true.duration_s, table["duration_std_s"].to_numpy()
+    assert np.mean(np.abs(error) < 2.0 * std) >= 0.85
     places = [
         proposed(finding)
         for finding in labelled.info.report.findings
