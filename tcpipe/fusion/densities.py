@@ -181,7 +181,8 @@ _FEWEST = 8  # windows
 _TOLD = 0.5  # less, and the larger of fit and prior holds
 # Windows that are up to so many times as long as the longest enter the fit if they are not longer than this: few, but better than none.
 _FIT, _SHORTEST_S = 4.0, 20.0
-_MOST_UNCLAIMED = 0.5  # share of fixes without a claim, whose noise stays the recipe's
+_MOST_UNCLAIMED = 0.5  # share of fixes without a claim: more, and the run shows what they err by
+_CLAIM_ROUNDS, _ABOUT_RIGHT = 4, 1.5  # of that estimate; a claim is about right within this factor of the variance
 _ONE_TIME = 0.6  # share of the claim that may well belong to one correlation time, 1σ
 _MOVING = 0.02  # the same of what errs only while the robot moves
 _UNLIKE = 0.25  # by this share of the total, processes in the plane differ from those of the height
@@ -195,6 +196,23 @@ def estimate_noise(measurements: Measurements) -> NoiseModel:
     return fit_noise(measurements, find_residuals(measurements))
 
 
+def claim_fixes(m: Measurements, residuals: Sequence[Residuals]) -> Measurements:
+    """Return measurements whose fixes claim at least the noise that the run shows, where the receiver claims none for most."""
+    for _ in range(_CLAIM_ROUNDS):
+        if m.gnss is None or m.gnss.unclaimed is None or m.gnss.unclaimed.mean() < _MOST_UNCLAIMED:
+            return m
+        found = fit_noise(m, residuals)
+        times = [
+            (fix.white_m2 + fix.correlated.variance) / fix.claimed_m2 if fix else 1.0
+            for fix in (found.horizontal, found.vertical)
+        ]
+        scale = np.where(m.gnss.unclaimed[:, None], np.maximum(1.0, [times[0], times[0], times[1]]), 1.0)
+        if scale.max() < _ABOUT_RIGHT:
+            return m
+        m = replace(m, gnss=replace(m.gnss, variance_m2=m.gnss.variance_m2 * scale))
+    return m
+
+
 def fit_noise(measurements: Measurements, residuals: Sequence[Residuals]) -> NoiseModel:
     """Return the noise of each sensor by the residuals of `find_residuals`: yaw rates first, then the horizontal plane, then heights."""
     prior = make_prior_model(measurements)
@@ -205,19 +223,17 @@ def fit_noise(measurements: Measurements, residuals: Sequence[Residuals]) -> Noi
     by_turns, by_heights = (
         _Fit([each for each in residuals if each.axis == axis], prior, longest_s) for axis in (TURN, UP)
     )
-    gnss = measurements.gnss
-    claims = gnss is not None and (gnss.unclaimed is None or gnss.unclaimed.mean() < _MOST_UNCLAIMED)
     prior = replace(
         prior,
         turns={role: by_turns.find_turn_noise(role, noise) for role, noise in prior.turns.items()},
-        vertical=by_heights.find_fix_noise("up", prior.vertical) if prior.vertical and claims else prior.vertical,
+        vertical=by_heights.find_fix_noise("up", prior.vertical) if prior.vertical else None,
     )
     plane = _Fit([each for each in residuals if each.axis in (ALONG, ACROSS)], prior, longest_s)
     slide_m2ps, slide_told = plane.find_density("slide velocity", prior.slide_m2ps)
     stamp_s2, stamp_told = plane.find_density("stamp", prior.stamp_s2)
     return replace(
         prior,
-        horizontal=plane.find_fix_noise("fix", prior.horizontal) if prior.horizontal and claims else prior.horizontal,
+        horizontal=plane.find_fix_noise("fix", prior.horizontal) if prior.horizontal else None,
         odometries={role: plane.find_odometry_noise(role, noise) for role, noise in prior.odometries.items()},
         shared_scale=plane.find_process(prior.shared_scale, "shared scale"),
         slide_m2ps=slide_m2ps,

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from tcpipe.errors import FusionError
 from tcpipe.fusion import state
 from tcpipe.fusion.attitude import STATED_MOUNTING_STD_RAD
-from tcpipe.fusion.densities import NoiseModel, fit_noise
+from tcpipe.fusion.densities import NoiseModel, claim_fixes, fit_noise
 from tcpipe.fusion.event_candidates import EventCandidate, find_fix_excursions, find_turn_jump
 from tcpipe.fusion.filter_kernel import (
     ACCEPTED,
@@ -53,6 +53,7 @@ from tcpipe.fusion.process import (
     WHEEL_SCALE_STD,
     estimate_slope_std_rad,
     is_gliding,
+    is_length_observable,
     is_turned_by_course,
 )
 from tcpipe.fusion.smoother_kernel import EVERY, SELDOM, Adjoint, Smoothed, smooth_ticks
@@ -142,6 +143,7 @@ def run_error_state(m: Measurements, initial: InitialState, *, output_ns: Ints, 
     FusionError : the estimate is not finite.
     """
     residuals, standing = find_residuals(m), find_stationary_intervals(m)
+    m = claim_fixes(m, residuals)
     noise = fit_noise(m, residuals)
     ticks = build_ticks(m, noise, standing, _find_start_ns(m, output_ns), int(output_ns[-1]), output_ns=output_ns)
     std, walk, time_s = make_priors(m, noise, ticks)
@@ -382,7 +384,7 @@ def _compute_unseen_scale_std(m: Measurements, made: Pass) -> float:
         return 0.0
     own = WHEEL_SCALE_STD if m.visual is None else VISUAL_SCALE_STD
     used = np.flatnonzero(made.tests.verdict[:, state.FIX] == ACCEPTED)
-    if used.size < 2:
+    if used.size < 2 or not is_length_observable(m):
         return own
     place, variance = made.ticks.inputs.value[used, state.FIX], made.ticks.inputs.variance[used, state.FIX, 0]
     few_m2 = np.median(variance) if used.size < _MANY_FIXES else 0.0

@@ -137,11 +137,15 @@ def turn_scale_std(measurements: Measurements) -> float:
 
 
 def is_length_observable(m: Measurements) -> bool:
-    """Return whether fixes are fine enough, for the ground that they span, to show how long a metre of odometry is."""
+    """Return whether fixes are fine enough, for the ground that they span, to show how long a metre of odometry is.
+
+    They must show it four times as well as it is known: else an accelerometer would, whose errors pass for a scale.
+    """
     if m.gnss is None or m.gnss.stamp_ns.size < 2:
         return False
+    known = WHEEL_SCALE_STD if m.visual is None else VISUAL_SCALE_STD
     span_m = float(np.linalg.norm(np.ptp(m.gnss.position_enu_m[:, :2], axis=0)))
-    return float(np.sqrt(2.0 * np.median(m.gnss.variance_m2[:, 0]))) < WHEEL_SCALE_STD * max(span_m, 1e-3)
+    return float(np.sqrt(2.0 * np.median(m.gnss.variance_m2[:, 0]))) < 0.25 * known * max(span_m, 1e-3)
 
 
 def find_scale_stds(measurements: Measurements) -> tuple[float, float]:

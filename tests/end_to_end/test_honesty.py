@@ -174,6 +174,7 @@ def test_what_is_common_to_a_drive_is_judged_apart(cell):
     for times in (1.0, 5.0):
         made = outcome()
         made.common["E"] = [3.0] * 200
+        made.value.update(E=[30.0] * 200, T=[1.0] * 200)
         made.claimed["E"] = [float(np.hypot(1.0, 3.0))] * 200
         made.error["E"] = (np.array(made.error["E"]) + 3.0 * times).tolist()
         figures = honesty.figures_of(cell.base, [made], [outcome()])

@@ -92,6 +92,7 @@ def test_what_is_needed_makes_a_message_that_can_be_read(role):
 
 def test_deviations_are_the_diagonal_of_a_covariance():
     values = {name: np.full(3, value) for name, value in PLACE.items()}
+    values["z"] = values["z"] + np.array([0.0, 0.1, 0.2])
     columns = make_message_fields("pose", values, 3) | {"log_time_ns": np.arange(3)}
     found = read_messages(columns, "pose", MAPPED_TYPES["pose"]).columns
     assert [found[f"{axis}_var_m2"][0] for axis in ("east", "north", "up")] == pytest.approx([0.01, 0.04, 0.09])
