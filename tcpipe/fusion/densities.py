@@ -181,8 +181,11 @@ _FEWEST = 8  # windows
 _TOLD = 0.5  # less, and the larger of fit and prior holds
 # Windows that are up to so many times as long as the longest enter the fit if they are not longer than this: few, but better than none.
 _FIT, _SHORTEST_S = 4.0, 20.0
-_MOST_UNCLAIMED = 0.5  # share of fixes without a claim: more, and the run shows what they err by
-_CLAIM_ROUNDS, _ABOUT_RIGHT = 4, 1.5  # of that estimate; a claim is about right within this factor of the variance
+_MOST_UNCLAIMED = (
+    0.5  # share of fixes without a claim: more, and their noise is the recipe's, or more where the run shows more
+)
+_ABOUT_RIGHT = 1.5  # a claim is, within this factor of the variance
+_CODE_PHASE_M2 = 1.5**2  # of each axis; GPS Standard Positioning Service, Performance Standard 2020
 _ONE_TIME = 0.6  # share of the claim that may well belong to one correlation time, 1σ
 _MOVING = 0.02  # the same of what errs only while the robot moves
 _UNLIKE = 0.25  # by this share of the total, processes in the plane differ from those of the height
@@ -197,20 +200,26 @@ def estimate_noise(measurements: Measurements) -> NoiseModel:
 
 
 def claim_fixes(m: Measurements, residuals: Sequence[Residuals]) -> Measurements:
-    """Return measurements whose fixes claim at least the noise that the run shows, where the receiver claims none for most."""
-    for _ in range(_CLAIM_ROUNDS):
-        if m.gnss is None or m.gnss.unclaimed is None or m.gnss.unclaimed.mean() < _MOST_UNCLAIMED:
-            return m
-        found = fit_noise(m, residuals)
-        times = [
-            (fix.white_m2 + fix.correlated.variance) / fix.claimed_m2 if fix else 1.0
-            for fix in (found.horizontal, found.vertical)
-        ]
-        scale = np.where(m.gnss.unclaimed[:, None], np.maximum(1.0, [times[0], times[0], times[1]]), 1.0)
-        if scale.max() < _ABOUT_RIGHT:
-            return m
-        m = replace(m, gnss=replace(m.gnss, variance_m2=m.gnss.variance_m2 * scale))
-    return m
+    """Return measurements whose fixes claim what the run shows, where the receiver claims nothing for most and the recipe too little.
+
+    What errs by more than a decimetre has no fixed ambiguities: its error lasts longer than a run can show, and is that of the code phase.
+    """
+    if m.gnss is None or m.gnss.unclaimed is None or _is_claimed(m.gnss):
+        return m
+    found = replace(m, gnss=replace(m.gnss, unclaimed=None))
+    noise = fit_noise(found, residuals)
+    if noise.horizontal is None or noise.vertical is None:
+        return m
+    shown_m2 = noise.horizontal.white_m2 + noise.horizontal.correlated.variance
+    if shown_m2 < _ABOUT_RIGHT * noise.horizontal.claimed_m2:
+        return m
+    least_m2 = shown_m2 if shown_m2 < _CENTIMETRES_M2 else max(shown_m2, _CODE_PHASE_M2)
+    times = np.where(m.gnss.unclaimed[:, None], max(1.0, least_m2 / noise.horizontal.claimed_m2), 1.0)
+    return replace(found, gnss=replace(m.gnss, unclaimed=None, variance_m2=m.gnss.variance_m2 * times))
+
+
+def _is_claimed(gnss: Positions) -> bool:
+    return gnss.unclaimed is None or gnss.unclaimed.mean() < _MOST_UNCLAIMED
 
 
 def fit_noise(measurements: Measurements, residuals: Sequence[Residuals]) -> NoiseModel:
@@ -223,17 +232,18 @@ def fit_noise(measurements: Measurements, residuals: Sequence[Residuals]) -> Noi
     by_turns, by_heights = (
         _Fit([each for each in residuals if each.axis == axis], prior, longest_s) for axis in (TURN, UP)
     )
+    claims = measurements.gnss is not None and _is_claimed(measurements.gnss)
     prior = replace(
         prior,
         turns={role: by_turns.find_turn_noise(role, noise) for role, noise in prior.turns.items()},
-        vertical=by_heights.find_fix_noise("up", prior.vertical) if prior.vertical else None,
+        vertical=by_heights.find_fix_noise("up", prior.vertical) if prior.vertical and claims else prior.vertical,
     )
     plane = _Fit([each for each in residuals if each.axis in (ALONG, ACROSS)], prior, longest_s)
     slide_m2ps, slide_told = plane.find_density("slide velocity", prior.slide_m2ps)
     stamp_s2, stamp_told = plane.find_density("stamp", prior.stamp_s2)
     return replace(
         prior,
-        horizontal=plane.find_fix_noise("fix", prior.horizontal) if prior.horizontal else None,
+        horizontal=plane.find_fix_noise("fix", prior.horizontal) if prior.horizontal and claims else prior.horizontal,
         odometries={role: plane.find_odometry_noise(role, noise) for role, noise in prior.odometries.items()},
         shared_scale=plane.find_process(prior.shared_scale, "shared scale"),
         slide_m2ps=slide_m2ps,

@@ -306,7 +306,7 @@ def _make_trajectory(  # noqa: PLR0917
         position_variance += np.column_stack((aside, aside, above))
         yaw_variance = yaw_variance + _ANY_YAW_STD_RAD**2
         speed_variance = speed_variance + 1.5 * speed**2
-    scale_std = _compute_unseen_scale_std(m, made)
+    scale_std = _compute_unseen_scale_std(m, noise, made)
     if m.gnss is None:
         position_variance += (scale_std * (position - position[0])) ** 2
     links = links + (scale_std * speed[:, None] * DISPLACEMENT_LAGS_S) ** 2
@@ -375,7 +375,7 @@ def _compute_arm_variance(std: Floats, rotation: Floats, yaw: Floats, made: Pass
     return np.einsum("nij,j->ni", rotation**2, std**2), moved
 
 
-def _compute_unseen_scale_std(m: Measurements, made: Pass) -> float:
+def _compute_unseen_scale_std(m: Measurements, noise: NoiseModel, made: Pass) -> float:
     """Return the uncertainty of the odometry's scale that the fixes leave: their error at both ends of the ground that they span.
 
     It is at most the scale's own deviation. The white part of the error of many fixes is the filter's business.
@@ -384,7 +384,7 @@ def _compute_unseen_scale_std(m: Measurements, made: Pass) -> float:
         return 0.0
     own = WHEEL_SCALE_STD if m.visual is None else VISUAL_SCALE_STD
     used = np.flatnonzero(made.tests.verdict[:, state.FIX] == ACCEPTED)
-    if used.size < 2 or not is_length_observable(m):
+    if used.size < 2 or not is_length_observable(m, noise.horizontal):
         return own
     place, variance = made.ticks.inputs.value[used, state.FIX], made.ticks.inputs.variance[used, state.FIX, 0]
     few_m2 = np.median(variance) if used.size < _MANY_FIXES else 0.0

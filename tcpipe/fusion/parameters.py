@@ -99,7 +99,7 @@ def make_priors(m: Measurements, noise: NoiseModel, ticks: Ticks) -> tuple[Float
             std[rows], walk[rows] = parameter.std, parameter.walk
     if m.imu is not None:
         walk[state.GYRO_BIAS : state.GYRO_BIAS + 3] = _find_walk(noise.turns[IMU].bias)
-    scales = dict(zip((WHEELS, VISUAL), find_scale_stds(m), strict=True))
+    scales = dict(zip((WHEELS, VISUAL), find_scale_stds(m, noise.horizontal), strict=True))
     for role, place in ((WHEELS, state.WHEEL_SCALE), (VISUAL, state.VISUAL_SCALE)):
         if role in m.odometries() and scales[role]:
             std[place], walk[place] = scales[role], np.sqrt(noise.odometries[role].scale.variance / _MEAN_LASTS_S)
@@ -126,7 +126,7 @@ def _find_walk(process: GaussMarkov) -> float:
 
 def _list_varying_scales(m: Measurements, noise: NoiseModel) -> dict[int, GaussMarkov]:
     """Return how scales of odometries vary around their means, by error; only fixes show it."""
-    if not is_length_observable(m):
+    if not is_length_observable(m, noise.horizontal):
         return {}
     places = {WHEELS: state.WHEEL_SLIP, VISUAL: state.VISUAL_SLIP}
     found = {places[role]: noise.odometries[role].scale for role in m.odometries()}

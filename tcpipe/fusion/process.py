@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.fusion import state
-from tcpipe.fusion.densities import NoiseModel
+from tcpipe.fusion.densities import FixNoise, NoiseModel
 from tcpipe.fusion.measurements import (
     IMU,
     BodyVelocities,
@@ -136,25 +136,26 @@ def turn_scale_std(measurements: Measurements) -> float:
     return _VISUAL_TURN_SCALE_STD if sources[-1] is measurements.visual else _WHEEL_TURN_SCALE_STD
 
 
-def is_length_observable(m: Measurements) -> bool:
-    """Return whether fixes are fine enough, for the ground that they span, to show how long a metre of odometry is.
+def is_length_observable(m: Measurements, fixes: FixNoise | None) -> bool:
+    """Return whether fixes show, on the ground that they span, how long a metre of odometry is, four times as well as it is known.
 
-    They must show it four times as well as it is known: else an accelerometer would, whose errors pass for a scale.
+    Else an accelerometer would show it, whose errors pass for a scale. The white noise of many fixes averages out.
     """
-    if m.gnss is None or m.gnss.stamp_ns.size < 2:
+    if m.gnss is None or fixes is None or m.gnss.stamp_ns.size < 2:
         return False
     known = WHEEL_SCALE_STD if m.visual is None else VISUAL_SCALE_STD
     span_m = float(np.linalg.norm(np.ptp(m.gnss.position_enu_m[:, :2], axis=0)))
-    return float(np.sqrt(2.0 * np.median(m.gnss.variance_m2[:, 0]))) < 0.25 * known * max(span_m, 1e-3)
+    lasting_m2 = fixes.correlated.variance + fixes.white_m2 / m.gnss.stamp_ns.size
+    return float(np.sqrt(2.0 * lasting_m2)) < 0.25 * known * max(span_m, 1e-3)
 
 
-def find_scale_stds(measurements: Measurements) -> tuple[float, float]:
+def find_scale_stds(measurements: Measurements, fixes: FixNoise | None) -> tuple[float, float]:
     """Return the standard deviations of the scales of wheels and visual odometry; 0 where a scale is unobservable: it stays 1.
 
     Only fixes make a scale observable. Without any, one odometry is the measure: the camera where there is one, else the wheels. What an
     accelerometer adds up to over a minute is its tilt and its bias.
     """
-    if is_length_observable(measurements):
+    if is_length_observable(measurements, fixes):
         return WHEEL_SCALE_STD, VISUAL_SCALE_STD
     return (0.0 if measurements.visual is None else WHEEL_SCALE_STD), 0.0
 
