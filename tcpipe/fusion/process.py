@@ -137,7 +137,7 @@ def turn_scale_std(measurements: Measurements) -> float:
 
 
 def is_length_observable(m: Measurements, fixes: FixNoise | None) -> bool:
-    """Return whether fixes show, on the ground that they span, how long a metre of odometry is, four times as well as it is known.
+    """Return whether fixes show, on the ground that they span, how long a metre of odometry is, twice as well as it is known.
 
     Else an accelerometer would show it, whose errors pass for a scale. The white noise of many fixes averages out.
     """
@@ -146,7 +146,7 @@ def is_length_observable(m: Measurements, fixes: FixNoise | None) -> bool:
     known = WHEEL_SCALE_STD if m.visual is None else VISUAL_SCALE_STD
     span_m = float(np.linalg.norm(np.ptp(m.gnss.position_enu_m[:, :2], axis=0)))
     lasting_m2 = fixes.correlated.variance + fixes.white_m2 / m.gnss.stamp_ns.size
-    return float(np.sqrt(2.0 * lasting_m2)) < 0.25 * known * max(span_m, 1e-3)
+    return float(np.sqrt(2.0 * lasting_m2)) < 0.5 * known * max(span_m, 1e-3)
 
 
 def find_scale_stds(measurements: Measurements, fixes: FixNoise | None) -> tuple[float, float]:
