@@ -36,8 +36,8 @@ from tcpipe.fusion.level_motion import (
 from tcpipe.fusion.measurements import GNSS, Measurements, Positions
 from tcpipe.fusion.signals import (
     compute_interval_means,
-    compute_median_period_ns,
     compute_seconds,
+    find_longest_step_ns,
     interpolate_signal,
     is_in_gap,
     multiply_by_vector,
@@ -103,7 +103,7 @@ class _Section:
         """
         at_s = compute_seconds(at_ns, self.zero_ns)
         period_s = max(float(np.median(np.diff(at_s))), 1e-3) if at_s.size > 1 else np.inf
-        gaps_ns = [max(_LONGEST_GAP_NS, 3 * compute_median_period_ns(stamp_ns)) for stamp_ns in sources]
+        gaps_ns = [find_longest_step_ns(stamp_ns, _LONGEST_GAP_NS) for stamp_ns in sources]
         for time_s in TIMES_S:
             if time_s < 0.9 * period_s:
                 continue

@@ -68,10 +68,14 @@ def is_in_gap(stamp_ns: Ints, start_ns: Ints, end_ns: Ints, *, longest_ns: int) 
     return touches
 
 
-def is_covered(stamp_ns: Ints, start_ns: Ints, end_ns: Ints) -> NDArray[np.bool_]:
-    """Return whether each interval lies among samples without a gap: three periods of the samples, at least 0.1 s."""
-    longest = max(_MIN_INPUT_GAP_NS, 3 * compute_median_period_ns(stamp_ns))
-    return ~is_in_gap(stamp_ns, start_ns, end_ns, longest_ns=longest)
+def is_covered(stamp_ns: Ints, start_ns: Ints, end_ns: Ints, *, least_ns: int = _MIN_INPUT_GAP_NS) -> NDArray[np.bool_]:
+    """Return whether each interval lies among samples without a gap, as `find_longest_step_ns` says."""
+    return ~is_in_gap(stamp_ns, start_ns, end_ns, longest_ns=find_longest_step_ns(stamp_ns, least_ns))
+
+
+def find_longest_step_ns(stamp_ns: Ints, least_ns: int) -> int:
+    """Return the longest time between samples that is no gap [ns]: three of their periods, at least ``least_ns``."""
+    return max(least_ns, 3 * compute_median_period_ns(stamp_ns))
 
 
 def hold_last(stamp_ns: Ints, values: Floats, at_ns: Ints) -> Floats:

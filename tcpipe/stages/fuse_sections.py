@@ -14,7 +14,7 @@ from tcpipe.fusion.checks.audit import audit_trajectory
 from tcpipe.fusion.error_state import run_error_state
 from tcpipe.fusion.initial import find_initial_state, find_stationary_intervals
 from tcpipe.fusion.measurements import GNSS, BodyVelocities, InitialState
-from tcpipe.fusion.signals import compute_median_period_ns, compute_seconds, hold_last, is_in_gap
+from tcpipe.fusion.signals import compute_seconds, hold_last, is_covered
 from tcpipe.fusion.trajectory import DISPLACEMENT_LAGS_S, TrackSection, Trajectory, cut_sections, make_track_stamps
 from tcpipe.geometry.datum import geodetic_from_enu
 from tcpipe.geometry.rotation import matrix_from_quat, rpy_from_matrix, rpy_from_quat
@@ -133,8 +133,7 @@ def make_wheel_column(
         return np.full(at_ns.size, np.nan)
     zero = int(wheels.stamp_ns[0])
     between = np.interp(compute_seconds(at_ns, zero), compute_seconds(wheels.stamp_ns, zero), wheels.velocity_mps[:, 0])
-    longest = max(max_gap_ns, 3 * compute_median_period_ns(wheels.stamp_ns))
-    return np.where(is_in_gap(wheels.stamp_ns, at_ns, at_ns, longest_ns=longest), np.nan, between)
+    return np.where(is_covered(wheels.stamp_ns, at_ns, at_ns, least_ns=max_gap_ns), between, np.nan)
 
 
 def make_command_columns(streams: Streams, epoch: int, at_ns: NDArray[np.int64]) -> Arrays:

@@ -1,4 +1,4 @@
-"""Whether the track follows any sensor: a net below the estimator, whose outlier gate cannot see that it has lost the robot.
+"""Check whether the track follows any sensor: an outlier gate cannot show that the track is wrong, since it rejects what contradicts it.
 
 In windows of five seconds the track's displacement is compared with that of every sensor, rejected measurements too: an odometry's
 velocity, integrated, along the track's own axes (wheels: forward only); the later fixes less the earlier, against the antenna. The track
@@ -21,7 +21,7 @@ from tcpipe.fusion.signals import (
     compute_interval_means,
     compute_median_period_ns,
     compute_seconds,
-    is_in_gap,
+    is_covered,
 )
 from tcpipe.fusion.trajectory import DISPLACEMENT_LAGS_S, Trajectory
 from tcpipe.geometry.rotation import matrix_from_quat, quat_from_matrix, rotation_vector_from_quat
@@ -45,7 +45,10 @@ _SCALE_STD = {WHEELS: WHEEL_SCALE_STD, VISUAL: VISUAL_SCALE_STD}
 
 @dataclass(frozen=True, slots=True)
 class Audit:
-    """Where the track of a section is astray, in order of time; in how many windows it is, and in how many a sensor measures the way."""
+    """Where the track of a section is astray, in order of time.
+
+    ``windows``: in how many windows a sensor measures the distance; ``astray``: in how many of them the track is astray.
+    """
 
     disagreements: tuple[Disagreement, ...] = ()
     windows: int = 0
@@ -124,8 +127,7 @@ def _compare_odometry(
     step_s = np.diff(at_s)[:, None]
     velocity = source.velocity_mps[:, : track.shape[1]]
     told = compute_interval_means(compute_seconds(source.stamp_ns, zero), velocity, at_s[:-1], at_s[1:]) * step_s
-    longest_ns = max(_MAX_GAP_NS, 3 * period_ns)
-    told[is_in_gap(source.stamp_ns, stamp_ns[:-1], stamp_ns[1:], longest_ns=longest_ns)] = np.nan
+    told[~is_covered(source.stamp_ns, stamp_ns[:-1], stamp_ns[1:], least_ns=_MAX_GAP_NS)] = np.nan
     if role == WHEELS:  # that turn while the robot stands: it is stuck, and they are right
         told[(np.abs(track[:, :1]) < _STANDS_MPS * step_s) & (np.abs(told) > _STANDS_MPS * step_s)] = np.nan
     told, track = (np.stack([values[first:last].sum(0) for first, last in windows]) for values in (told, track))

@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from tcpipe.fusion.measurements import BodyVelocities, Measurements, Positions
 from tcpipe.fusion.signals import (
     compute_median_of_five,
-    compute_median_period_ns,
     compute_seconds,
+    find_longest_step_ns,
     integrate_signal,
     is_in_gap,
 )
@@ -237,7 +237,7 @@ def find_liveliest_window_ns(m: Measurements) -> Ints | None:
 
 def _compute_driven_m(m: Measurements, at_ns: Ints) -> NDArray[np.float64]:
     """Return the distance driven before each time [m], by the first sensor that measures it."""
-    source = m.wheels or m.visual
+    source = m.first_odometry
     if source is not None:
         stamp_ns, speed_mps = source.stamp_ns, np.nan_to_num(np.abs(source.velocity_mps[:, 0]))
         steps_m = speed_mps[1:] * np.diff(compute_seconds(stamp_ns, int(stamp_ns[0])))
@@ -262,9 +262,7 @@ _COURSE_MPS = 0.3
 
 def resample_signal(stamp_ns: NDArray[np.int64], values: Floats, at_ns: NDArray[np.int64]) -> Floats:
     """Return a signal (N, k) on the grid, shape (M, k); NaN in gaps of half a second or three periods."""
-    return average_on_grid(
-        stamp_ns, values, at_ns, longest_gap_ns=max(_MAX_GAP_NS, 3 * compute_median_period_ns(stamp_ns))
-    )
+    return average_on_grid(stamp_ns, values, at_ns, longest_gap_ns=find_longest_step_ns(stamp_ns, _MAX_GAP_NS))
 
 
 def resample_twist(source: BodyVelocities, at_ns: NDArray[np.int64]) -> Floats:
