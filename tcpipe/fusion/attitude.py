@@ -89,9 +89,9 @@ def align_mounting(fixes: Positions, odometry: BodyVelocities | None, *, is_stat
     method, with the direction of motion first and the vertical second (H. D. Black, "A passive system for determining the attitude of a
     satellite", AIAA Journal 2 (7), 1964).
     """
-    without = fixes if is_stated else replace(fixes, quat_xyzw=None, rotation_variance_rad2=None)
     if fixes.quat_xyzw is None:
         return fixes
+    without = fixes if is_stated else replace(fixes, quat_xyzw=None, rotation_variance_rad2=None)
     stamp_ns, quat = fixes.stamp_ns, fixes.quat_xyzw
     last = np.searchsorted(stamp_ns, stamp_ns + _CHORD_NS)
     first = np.flatnonzero(last < stamp_ns.size)

@@ -181,9 +181,8 @@ _FEWEST = 8  # windows
 _TOLD = 0.5  # less, and the larger of fit and prior holds
 # Windows that are up to so many times as long as the longest enter the fit if they are not longer than this: few, but better than none.
 _FIT, _SHORTEST_S = 4.0, 20.0
-_MOST_UNCLAIMED = (
-    0.5  # share of fixes without a claim: more, and their noise is the recipe's, or more where the run shows more
-)
+# Share of fixes without a claim: of a run with more, the noise is the recipe's, or more where the run shows more.
+_MOST_UNCLAIMED = 0.5
 _ABOUT_RIGHT = 1.5  # a claim is, within this factor of the variance
 _CODE_PHASE_M2 = 1.5**2  # of each axis; GPS Standard Positioning Service, Performance Standard 2020
 _ONE_TIME = 0.6  # share of the claim that may well belong to one correlation time, 1σ
@@ -199,12 +198,12 @@ def estimate_noise(measurements: Measurements) -> NoiseModel:
     return fit_noise(measurements, find_residuals(measurements))
 
 
-def claim_fixes(m: Measurements, residuals: Sequence[Residuals]) -> Measurements:
+def inflate_unclaimed_fixes(m: Measurements, residuals: Sequence[Residuals]) -> Measurements:
     """Return measurements whose fixes claim what the run shows, where the receiver claims nothing for most and the recipe too little.
 
     What errs by more than a decimetre has no fixed ambiguities: its error lasts longer than a run can show, and is that of the code phase.
     """
-    if m.gnss is None or m.gnss.unclaimed is None or _is_claimed(m.gnss):
+    if m.gnss is None or m.gnss.unclaimed is None or _has_claims(m.gnss):
         return m
     found = replace(m, gnss=replace(m.gnss, unclaimed=None))
     noise = fit_noise(found, residuals)
@@ -218,7 +217,8 @@ def claim_fixes(m: Measurements, residuals: Sequence[Residuals]) -> Measurements
     return replace(found, gnss=replace(m.gnss, unclaimed=None, variance_m2=m.gnss.variance_m2 * times))
 
 
-def _is_claimed(gnss: Positions) -> bool:
+def _has_claims(gnss: Positions) -> bool:
+    """Return whether the receiver claims a variance for most fixes."""
     return gnss.unclaimed is None or gnss.unclaimed.mean() < _MOST_UNCLAIMED
 
 
@@ -232,7 +232,7 @@ def fit_noise(measurements: Measurements, residuals: Sequence[Residuals]) -> Noi
     by_turns, by_heights = (
         _Fit([each for each in residuals if each.axis == axis], prior, longest_s) for axis in (TURN, UP)
     )
-    claims = measurements.gnss is not None and _is_claimed(measurements.gnss)
+    claims = measurements.gnss is not None and _has_claims(measurements.gnss)
     prior = replace(
         prior,
         turns={role: by_turns.find_turn_noise(role, noise) for role, noise in prior.turns.items()},
@@ -344,7 +344,7 @@ class _Fit:
             counts.append(cell.square.size / (1.0 + 2.0 * np.square(correlation).sum()) / _OVERLAP)
         return np.array(counts)
 
-    def _compute_share_told(self, factors: Floats) -> float:
+    def _compute_data_share(self, factors: Floats) -> float:
         """Return which share the data tell of a sum of the densities, by factors (C,)."""
         before = float(np.square(factors * self._usual_std).sum())
         return float(np.clip(1.0 - factors @ self._covariance @ factors / before, 0.0, 1.0)) if before > 0.0 else 0.0
@@ -358,7 +358,7 @@ class _Fit:
         if name not in self._names:
             return prior, 0.0
         row = self._names.index(name)
-        told = self._compute_share_told(np.eye(len(self._names))[row])
+        told = self._compute_data_share(np.eye(len(self._names))[row])
         fitted = float(self._variances[row])
         return (fitted if told >= _TOLD else max(fitted, prior)), told
 
@@ -373,7 +373,7 @@ class _Fit:
         factors = np.zeros(len(self._names))
         for tau, row, _ in parts:
             factors[row] = -2.0 * np.expm1(-_TOLD_S / tau)
-        told = self._compute_share_told(factors) * float((self._longest_s >= _SUMMARY_S).mean())
+        told = self._compute_data_share(factors) * float((self._longest_s >= _SUMMARY_S).mean())
         shape = np.zeros((_SUMMARY_S.size, len(self._names)))
         for tau, row, _ in parts:
             shape[:, row] = GaussMarkov(1.0, tau).difference_variance(_SUMMARY_S)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from tcpipe.errors import FusionError
 from tcpipe.fusion import state
 from tcpipe.fusion.attitude import STATED_MOUNTING_STD_RAD
-from tcpipe.fusion.densities import NoiseModel, claim_fixes, fit_noise
+from tcpipe.fusion.densities import NoiseModel, fit_noise, inflate_unclaimed_fixes
 from tcpipe.fusion.event_candidates import EventCandidate, find_fix_excursions, find_turn_jump
 from tcpipe.fusion.filter_kernel import (
     ACCEPTED,
@@ -143,7 +143,7 @@ def run_error_state(m: Measurements, initial: InitialState, *, output_ns: Ints, 
     FusionError : the estimate is not finite.
     """
     residuals, standing = find_residuals(m), find_stationary_intervals(m)
-    m = claim_fixes(m, residuals)
+    m = inflate_unclaimed_fixes(m, residuals)
     noise = fit_noise(m, residuals)
     ticks = build_ticks(m, noise, standing, _find_start_ns(m, output_ns), int(output_ns[-1]), output_ns=output_ns)
     std, walk, time_s = make_priors(m, noise, ticks)
