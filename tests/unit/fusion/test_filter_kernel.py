@@ -342,20 +342,29 @@ def test_what_no_measurement_shows_keeps_its_prior_and_what_is_exact_stays(seed,
     assert np.array_equal(smoothed.states[:, places], np.tile(x[places], (30, 1)))
 
 
-def test_rejections_in_a_row_open_the_gate_again():
-    rng = np.random.default_rng(4)
-    inputs, model = make_inputs(120, rng, state.FLAT_TURN, noise=1e-6), model_of(())
-    model.gates[state.FIX] = 16.27
+def filter_stationary(kind, displace, noise):
+    """Return tests and states of a stationary robot whose measurements of one kind ``displace`` changes."""
+    inputs, model = make_inputs(120, np.random.default_rng(4), state.FLAT_TURN, noise=noise), model_of(())
+    model.gates[kind] = 16.27
     inputs.rate[:], inputs.turned[:], inputs.acceleration[:], inputs.tau[:] = 0.0, 0.0, 0.0, 0.0
     inputs.value[:, state.STATIONARY], inputs.variance[:, state.STATIONARY] = 0.0, 1e-4
-    inputs.value[:, state.FIX], inputs.variance[:, state.FIX] = 0.0, 1e-4
-    inputs.value[40:, state.FIX, 0] = 5.0
-    model.patience[state.FIX] = 5.0, 2.0, 2.0
+    inputs.value[:, kind], inputs.variance[:, kind] = 0.0, 1e-4
+    inputs.attitude[:] = 0.0
+    displace(inputs)
+    model.patience[kind] = 5.0, 2.0, 2.0
     x = np.zeros(state.NX)
     x[:9] = np.eye(3).ravel()
     tests, states = make_tests(120), np.zeros((120, state.NX))
     memory = Memory(x, np.eye(9) * 1e-4, np.zeros((state.KINDS, 2)))
     filter_ticks(0, 120, inputs, model, memory, False, allocate_steps(0, 9), tests, states)
+    return tests, states
+
+
+def test_rejections_in_a_row_open_the_gate_again():
+    def move(inputs):
+        inputs.value[40:, state.FIX, 0] = 5.0
+
+    tests, states = filter_stationary(state.FIX, move, noise=1e-6)
     assert (tests.verdict[:40, state.FIX] == ACCEPTED).all()
     reset = int(np.flatnonzero(tests.verdict[:, state.FIX] == RESET)[0])
     assert reset * T == pytest.approx(39 * T + 2.0, abs=T)
@@ -366,22 +375,10 @@ def test_rejections_in_a_row_open_the_gate_again():
 
 
 def test_an_attitude_that_is_rejected_for_long_is_followed():
-    rng = np.random.default_rng(4)
-    inputs, model = make_inputs(120, rng, state.FLAT_TURN, noise=1e-8), model_of(())
-    model.gates[state.ATTITUDE] = 16.27
-    inputs.rate[:], inputs.turned[:], inputs.acceleration[:], inputs.tau[:] = 0.0, 0.0, 0.0, 0.0
-    inputs.value[:, state.STATIONARY], inputs.variance[:, state.STATIONARY] = 0.0, 1e-4
-    inputs.value[:, state.ATTITUDE], inputs.variance[:, state.ATTITUDE] = 0.0, 1e-4
-    inputs.attitude[:] = 0.0
-    inputs.attitude[40:, 2] = 1.0
-    model.patience[state.ATTITUDE] = 5.0, 2.0, 2.0
-    x = np.zeros(state.NX)
-    x[:9] = np.eye(3).ravel()
-    tests, states = make_tests(120), np.zeros((120, state.NX))
-    filter_ticks(
-        0, 120, inputs, model, Memory(x, np.eye(9) * 1e-4, np.zeros((state.KINDS, 2))), False, allocate_steps(0, 9),
-        tests, states,
-    )  # fmt: skip
+    def turn(inputs):
+        inputs.attitude[40:, 2] = 1.0
+
+    tests, states = filter_stationary(state.ATTITUDE, turn, noise=1e-8)
     reset = int(np.flatnonzero(tests.verdict[:, state.ATTITUDE] == RESET)[0])
     assert reset * T == pytest.approx(39 * T + 2.0, abs=T)
     assert (tests.verdict[reset + 1 :, state.ATTITUDE] == ACCEPTED).all()
