@@ -13,7 +13,7 @@ from tcpipe.formats.recipe_toml import load_profiles
 from tcpipe.fusion.withheld import WithheldScore, score_comparisons
 from tcpipe.progress import step
 from tcpipe.recipe import FuseConfig, Recipe
-from tcpipe.stages.fuse_inputs import find_recipe_role
+from tcpipe.stages.fuse_inputs import name_pose
 from tcpipe.stages.read import read_run
 from tcpipe.stages.read_roles import find_read_config
 from tcpipe.stages.withheld import compare_withheld
@@ -87,11 +87,11 @@ def audit(
     name = format_path(run)
     streams, config = read_audited(run, recipe, robot=robot, message_definitions=message_definitions)
     found = compare_withheld(streams, config, run_id=name)
-    skipped = tuple(f"{find_recipe_role(role, streams)}, {reason}" for role, reason in found.skipped)
+    skipped = tuple(f"{name_pose(role, streams)}, {reason}" for role, reason in found.skipped)
     if not found.comparisons and not found.length_ratios:
         raise UsageError(f"{name}: nothing can be withheld and compared", *skipped)
     scores = (score_comparisons([each]) for each in found.comparisons)
-    named = tuple(replace(score, role=find_recipe_role(score.role, streams)) for score in scores)
+    named = tuple(replace(score, role=name_pose(score.role, streams)) for score in scores)
     return Audit(name, streams.robot, named, skipped, found.length_ratios)
 
 

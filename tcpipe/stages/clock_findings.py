@@ -15,7 +15,7 @@ from tcpipe.fusion.measurements import DOPPLER
 from tcpipe.logs.clocks import LOG_CLOCK
 from tcpipe.power.rails import compute_power_at
 from tcpipe.recipe.suggestions import suggest
-from tcpipe.stages.fuse_inputs import FusionInputs, find_longest_epoch, find_recipe_role
+from tcpipe.stages.fuse_inputs import FusionInputs, find_longest_epoch, name_pose
 from tcpipe.stages.message_arrays import make_rails
 from tcpipe.tables.facts import ClockFacts, ClockOffset
 from tcpipe.tables.findings import Action, Finding, StageReport, Subject, make_finding
@@ -59,9 +59,8 @@ def correct_clocks(
 
 def _find_offset(found: ClockFacts, role: str, offset: ClockOffset, streams: Streams, span_s: float) -> Finding:
     """Return the finding on a clock: which is off where two others agree, else that two differ."""
-    name = find_recipe_role(role, streams)
     compared = dict.fromkeys(p.by for p in found.pairs if p.determined and role in {p.late, p.against})
-    subject, names = Subject("role", name), {"reference": found.reference, "by": ", ".join(compared)}
+    subject, names = Subject("role", role), {"reference": found.reference, "by": ", ".join(compared)}
     offset_s, offset_2std_s, drift_s = offset.offset_s, 2 * offset.std_s, 1e-6 * offset.drift_ppm * span_s
     if not offset.blamed:
         return make_finding(
@@ -70,9 +69,9 @@ def _find_offset(found: ClockFacts, role: str, offset: ClockOffset, streams: Str
     action: Action = "kept" if role == POWER else "corrected"
     if offset.drift_ppm:
         by_log = streams.sensors[role].time_source == "log"
-        remedies = () if by_log else suggest("use_log_time", {"read.time_source": {name: "log"}})
+        remedies = () if by_log else suggest("use_log_time", {"read.time_source": {role: "log"}})
         return make_finding("clock-drift", subject, action=action, names=names, remedies=remedies, drift_s=drift_s)
-    given_s = streams.report.facts.time_offset_s.get(name, 0.0)
+    given_s = streams.report.facts.time_offset_s.get(name_pose(role, streams), 0.0)
     correction_s = round(given_s - offset_s, 3 if offset.std_s < _FINE_S else 2)
     return make_finding(
         "time-offset",
@@ -80,7 +79,7 @@ def _find_offset(found: ClockFacts, role: str, offset: ClockOffset, streams: Str
         severity="note" if role == DOPPLER else None,
         action=action,
         names=names,
-        remedies=suggest("correct", {"read.time_offset_s": {name: correction_s}}),
+        remedies=suggest("correct", {"read.time_offset_s": {role: correction_s}}),
         offset_s=offset_s,
         offset_2std_s=offset_2std_s,
     )

@@ -10,8 +10,8 @@ import numpy as np
 
 from tcpipe.errors import FusionError
 from tcpipe.fusion.checks.audit import is_astray
-from tcpipe.fusion.checks.sanity import SensorExclusion, refuse_fixes
-from tcpipe.fusion.measurements import GNSS, IMU, POSE
+from tcpipe.fusion.checks.sanity import SensorExclusion, make_fix_exclusion
+from tcpipe.fusion.measurements import GNSS, IMU
 from tcpipe.recipe import FuseConfig
 from tcpipe.stages.clock_findings import correct_clocks
 from tcpipe.stages.fuse_findings import (
@@ -29,7 +29,7 @@ from tcpipe.stages.fuse_inputs import (
     prepare_pose,
 )
 from tcpipe.stages.fuse_sections import Fused, fuse_sections, make_rejections_table
-from tcpipe.tables.facts import SensorChecks, StageFacts
+from tcpipe.tables.facts import SensorChecks
 from tcpipe.tables.findings import Finding, StageReport, Subject, make_finding
 from tcpipe.tables.levels import TRACK, Datum, Streams, Track, TrackInfo
 
@@ -47,14 +47,12 @@ def fuse_run(streams: Streams, config: FuseConfig, *, run_id: str) -> Track:
     try:
         return _fuse(streams, config, run_id)
     except FusionError as error:
-        findings = name_pose(error.findings) if POSE in streams.tables else error.findings
-        raise FusionError(*error.problems, findings=findings) from error
+        raise FusionError(*error.problems, findings=name_pose(error.findings, streams)) from error
 
 
 def _fuse(streams: Streams, config: FuseConfig, run_id: str) -> Track:
     # 1. A pose made elsewhere is what the fixes are.
     #    Streams become measurements: one frame, one set of units, usable variances; sensors that cannot be right are left out.
-    is_posed = POSE in streams.tables
     streams, local = prepare_pose(streams)
     run = Subject("run", run_id)
     inputs = drop_implausible_sensors(prepare_inputs(streams, config), streams)
@@ -86,19 +84,17 @@ def _fuse(streams: Streams, config: FuseConfig, run_id: str) -> Track:
         *clocks.findings,
     )
     checks = SensorChecks({role: finding.code for role, finding in used.excluded.items()})
-    made = StageFacts(fuse=summary, sensor_checks=checks, audit=audit.facts, clock_offsets=clocks.facts)
-    if is_posed:
-        findings, made = name_pose(findings), name_pose(made)
+    findings = name_pose(findings, streams)
     facts = replace(
         streams.report.facts,
-        fuse=made.fuse,
-        sensor_checks=made.sensor_checks,
-        audit=made.audit,
-        clock_offsets=made.clock_offsets,
+        fuse=name_pose(summary, streams),
+        sensor_checks=name_pose(checks, streams),
+        audit=name_pose(audit.facts, streams),
+        clock_offsets=name_pose(clocks.facts, streams),
     )
     report = StageReport((*_drop_places(streams.report.findings, findings), *findings), facts)
     info = TrackInfo(run_id, streams.robot, datum, config.rate_hz, config.estimator, report)
-    return Track(table, make_rejections_table(used, fused.found, POSE if is_posed else GNSS), info)
+    return Track(table, make_rejections_table(used, fused.found, name_pose(GNSS, streams)), info)
 
 
 def _drop_places(read: tuple[Finding, ...], fused: tuple[Finding, ...]) -> Iterator[Finding]:
@@ -148,5 +144,5 @@ def fuse_recovering(
 def _exclude_misleading(role: str, inputs: FusionInputs, streams: Streams) -> FusionInputs:
     odometries = {name for m in inputs.measurements.values() for name in m.odometries()}.difference({role})
     code = "misleads-track"
-    exclusion = refuse_fixes(code, odometries) if role == GNSS else SensorExclusion(role, code)
+    exclusion = make_fix_exclusion(code, odometries) if role == GNSS else SensorExclusion(role, code)
     return exclude_sensors(inputs, [exclusion], streams)

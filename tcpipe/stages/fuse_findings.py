@@ -39,8 +39,8 @@ from tcpipe.tables.facts import (
 from tcpipe.tables.findings import Finding, StageReport, Subject, make_finding, read_threshold
 from tcpipe.tables.levels import Sensor, Streams
 
-_SURE = ("course over ground", "pose")
-"""What the yaw at the start may be from."""
+_CERTAIN_YAW_SOURCES = ("course over ground", "pose")
+"""Sources of the initial yaw that need no finding."""
 
 
 def make_fuse_facts(
@@ -73,7 +73,11 @@ def find_fuse_findings(inputs: FusionInputs, facts: FuseFacts, *, run: Subject) 
     if inputs.datum_deg_m is None and GNSS in inputs.counts:  # a log without any fix was found when it was read
         findings.append(make_finding("local-frame", gnss))
     elif inputs.datum_deg_m is not None:
-        findings += [_find_initial_yaw(of, first_ns, gnss) for of in facts.stretches if of.heading_from not in _SURE]
+        findings += [
+            _find_initial_yaw(of, first_ns, gnss)
+            for of in facts.stretches
+            if of.heading_from not in _CERTAIN_YAW_SOURCES
+        ]
     findings += _find_reopenings(facts, first_ns)
     findings += _find_changes(facts, first_ns)
     findings += _find_scale(facts)

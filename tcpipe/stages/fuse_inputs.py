@@ -5,7 +5,7 @@ A pose that another program estimated is fused as fixes with an attitude; findin
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from typing import Any, TypeVar, cast
 
@@ -130,7 +130,7 @@ def _find_first_ns(streams: Streams) -> int:
 
 def _find_used_s(role: str, streams: Streams) -> tuple[float, float] | None:
     """Return when a sensor's first and last messages are [s]."""
-    table = streams.tables.get(POSE if role == GNSS and POSE in streams.tables else role)
+    table = streams.tables.get(name_pose(role, streams))
     if table is None:
         return None
     stamp_ns = to_integers(table, "stamp_ns")
@@ -204,20 +204,11 @@ def drop_implausible_sensors(inputs: FusionInputs, streams: Streams) -> FusionIn
 def exclude_sensors(inputs: FusionInputs, exclusions: Iterable[SensorExclusion], streams: Streams) -> FusionInputs:
     """Return the inputs without some sensors."""
     excluded = {**inputs.excluded, **{each.role: _find_exclusion(each, streams) for each in exclusions}}
-    kept = {number: _without(excluded, measurements) for number, measurements in inputs.measurements.items()}
+    # The receiver's velocity is of the antenna of the fixes.
+    gone = dict.fromkeys((*excluded, DOPPLER) if GNSS in excluded else excluded)
+    kept = {number: measurements.replace_sensors(gone) for number, measurements in inputs.measurements.items()}
     datum = None if GNSS in excluded else inputs.datum_deg_m
     return replace(inputs, datum_deg_m=datum, measurements=kept, excluded=excluded)
-
-
-def _without(excluded: Collection[str], m: Measurements) -> Measurements:
-    return replace(
-        m,
-        gnss=None if GNSS in excluded else m.gnss,
-        doppler=None if GNSS in excluded or DOPPLER in excluded else m.doppler,
-        imu=None if IMU in excluded else m.imu,
-        wheels=None if WHEELS in excluded else m.wheels,
-        visual=None if VISUAL in excluded else m.visual,
-    )
 
 
 def find_longest_epoch(inputs: FusionInputs) -> int:
@@ -242,25 +233,25 @@ def _compute_median_specific_force(streams: Streams) -> float:
     return float(np.median(np.linalg.norm(force, axis=1)))
 
 
-def _find_exclusion(refusal: SensorExclusion, streams: Streams) -> Finding:
+def _find_exclusion(exclusion: SensorExclusion, streams: Streams) -> Finding:
     """Return the finding of a sensor that is not fused; a receiver's velocity helps fixes that are fused, and no label needs it."""
-    sensor, name = streams.sensors[refusal.role], refusal.role
-    if refusal.units is not None:
-        remedies = suggest("state_units", {"read": {"imu_units": refusal.units}})
-    elif refusal.turned_by is not None:
-        remedies = state_extrinsics(name, sensor.xyz_m, refusal.turned_by @ matrix_from_quat(sensor.quat_xyzw))
-    elif refusal.is_suspect_excludable:
-        remedies = exclude_role(refusal.names["suspect"], "exclude_suspect")
+    sensor, name = streams.sensors[exclusion.role], exclusion.role
+    if exclusion.units is not None:
+        remedies = suggest("state_units", {"read": {"imu_units": exclusion.units}})
+    elif exclusion.turned_by is not None:
+        remedies = state_extrinsics(name, sensor.xyz_m, exclusion.turned_by @ matrix_from_quat(sensor.quat_xyzw))
+    elif exclusion.is_suspect_excludable:
+        remedies = exclude_role(exclusion.names["suspect"], "exclude_suspect")
     else:
         remedies = exclude_role(name)
-    numbers: Mapping[str, Any] = refusal.numbers
+    numbers: Mapping[str, Any] = exclusion.numbers
     return make_finding(
-        refusal.code,
+        exclusion.code,
         Subject("role", name),
-        span_s=_find_used_s(refusal.role, streams),
+        span_s=_find_used_s(exclusion.role, streams),
         action="excluded",
-        severity="note" if refusal.role == DOPPLER else None,
-        names={"topic": sensor.topic, "placed_by": sensor.placed_by, **refusal.names},
+        severity="note" if exclusion.role == DOPPLER else None,
+        names={"topic": sensor.topic, "placed_by": sensor.placed_by, **exclusion.names},
         remedies=remedies,
         **numbers,
     )
@@ -283,12 +274,6 @@ _ANYWHERE_DEG_M = (0.0, 45.0, 0.0)
 """Where a frame that is nowhere on the earth is taken to lie while its positions are fused: east, north and up stay what they are."""
 
 
-def find_recipe_role(role: str, streams: Streams) -> str:
-    """Return the role in the recipe of the stream that is fused as ``role``: a pose that is fused as fixes is a pose there."""
-    roles = streams.report.facts.roles
-    return POSE if role == GNSS and POSE in roles and GNSS not in roles else role
-
-
 def prepare_pose(streams: Streams) -> tuple[Streams, bool]:
     """Return the streams with the pose as fixes of a GNSS could be, and whether it lies in a frame that is nowhere on the earth."""
     pose = streams.tables.get(POSE)
@@ -307,15 +292,17 @@ def prepare_pose(streams: Streams) -> tuple[Streams, bool]:
 _Named = TypeVar("_Named")
 
 
-def name_pose(value: _Named) -> _Named:
-    """Return findings or facts in which the role of the pose stands for that of the fixes as which it was fused."""
+def name_pose(value: _Named, streams: Streams) -> _Named:
+    """Return a role, findings or facts in which the role of a pose stands for that of the fixes as which it is fused."""
+    if POSE not in streams.tables:
+        return value
     named = cast("object", value)
     if isinstance(value, str):
         named = POSE if value == GNSS else value
     elif isinstance(value, Mapping):
-        named = {name_pose(key): name_pose(item) for key, item in value.items()}
+        named = {name_pose(key, streams): name_pose(item, streams) for key, item in value.items()}
     elif isinstance(value, tuple | list):
-        named = type(value)(name_pose(item) for item in value)
+        named = type(value)(name_pose(item, streams) for item in value)
     elif is_dataclass(value) and not isinstance(value, type):
-        named = replace(value, **{of.name: name_pose(getattr(value, of.name)) for of in fields(value)})
+        named = replace(value, **{of.name: name_pose(getattr(value, of.name), streams) for of in fields(value)})
     return cast("_Named", named)

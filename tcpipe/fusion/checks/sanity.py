@@ -49,7 +49,7 @@ from tcpipe.fusion.measurements import (
     Measurements,
     Positions,
 )
-from tcpipe.fusion.signals import compute_median_period_ns, compute_seconds, hold_last, integrate_signal, is_in_gap
+from tcpipe.fusion.signals import compute_median_period_ns, compute_seconds, hold_last, integrate_signal, is_covered
 
 Path = NDArray[np.complex128]
 """Places on the grid [m], east and i times north, NaN where unknown, shape (M,)."""
@@ -156,7 +156,9 @@ def _find_outvoted(
             yield b, a, -lead
 
 
-def refuse_fixes(code: str, odometries: Collection[str], names: Mapping[str, str] | None = None) -> SensorExclusion:
+def make_fix_exclusion(
+    code: str, odometries: Collection[str], names: Mapping[str, str] | None = None
+) -> SensorExclusion:
     """Return the exclusion of fixes that odometries contradict; a single odometry is suspect, even if a gyroscope confirms its turns."""
     if len(odometries) != 1:
         return SensorExclusion(GNSS, code, names or {})
@@ -215,7 +217,7 @@ class Pair:
         """Return how many times as far as a b goes, whatever the noise of a."""
         return float(np.median(self.b_m2 / np.maximum(np.abs(self.product), 1e-9)))
 
-    def is_alike(self, noise_m2: float) -> bool:
+    def has_same_shape(self, noise_m2: float) -> bool:
         """Return whether the paths have the same shape in most windows."""
         return bool(np.mean(self.compute_misfits_m2()[0] < noise_m2 + _UNLIKE**2 * self.a_m2) > 1.0 - _UNLIKE)
 
@@ -253,8 +255,8 @@ def _check_distances(
     values = {role: source.velocity_mps for role, source in m.odometries().items()}
     values |= {} if m.gnss is None else {GNSS: m.gnss.position_enu_m}
     for role, of_role in values.items():
-        if _is_one_value(of_role) and any(role in names and _differ_in_places(pair) for names, pair in pairs.items()):
-            found[role] = _refuse_frozen(role, "velocity" if role != GNSS else "position", len(of_role))
+        if _is_constant(of_role) and any(role in names and _has_unequal_lengths(pair) for names, pair in pairs.items()):
+            found[role] = _make_frozen_exclusion(role, "velocity" if role != GNSS else "position", len(of_role))
     ratios = {names: pair.ratio for names, pair in pairs.items() if not found.keys() & set(names)}
     agreeing = [names for names, ratio in ratios.items() if 1 / _FACTOR <= ratio <= _FACTOR]
     scales = {}
@@ -271,35 +273,35 @@ def _check_distances(
         votes[fast] += is_still and fast in turning
         if is_still and fast == WHEELS and not votes[fast]:
             continue  # the wheels turn, the robot stands: stuck
-        if GNSS in names and pairs[names].is_alike(noise_m2) and 1 / _MOST < ratio < _MOST:
+        if GNSS in names and pairs[names].has_same_shape(noise_m2) and 1 / _MOST < ratio < _MOST:
             odometry = names[1]
             if votes[odometry] <= votes[GNSS] and len(m.odometries()) == 1:
                 scales[odometry] = pairs[names].find_scale()
                 continue
         for role, other, lead in _find_outvoted([names], votes.__getitem__):
             times = ratio if role == names[1] else 1 / ratio
-            _exclude(found, _refuse_distance(role, other, times, is_tie=lead == 0))
+            _exclude(found, _make_distance_exclusion(role, other, times, is_tie=lead == 0))
     return scales
 
 
-def _is_one_value(values: Floats) -> bool:
+def _is_constant(values: Floats) -> bool:
     """Return whether all rows of (N, k) are the same to the last digit, and enough of them."""
     return len(values) >= _FEWEST_VALUES and np.array_equal(
         values, np.broadcast_to(values[0], values.shape), equal_nan=True
     )
 
 
-def _differ_in_places(pair: Pair) -> bool:
+def _has_unequal_lengths(pair: Pair) -> bool:
     """Return whether one path is clearly longer than the other in some windows."""
     sizes = np.sqrt((pair.a_m2, pair.b_m2))
     return bool((np.abs(np.diff(sizes, axis=0)) > 0.5 * sizes.max(0)).sum() > 1)
 
 
-def _refuse_frozen(role: str, quantity: str, messages: int) -> SensorExclusion:
+def _make_frozen_exclusion(role: str, quantity: str, messages: int) -> SensorExclusion:
     return SensorExclusion(role, "frozen", {"quantity": quantity}, {"message_count": messages})
 
 
-def _refuse_distance(role: str, other: str, ratio: float, *, is_tie: bool) -> SensorExclusion:
+def _make_distance_exclusion(role: str, other: str, ratio: float, *, is_tie: bool) -> SensorExclusion:
     """Return the exclusion of a sensor that goes ``ratio`` times as far as another."""
     names = {"reference": other} | ({"suspect": other} if is_tie else {})
     for unit, (least, most) in _UNITS.items():
@@ -323,7 +325,7 @@ def _check_shapes(found: Exclusions, paths: Mapping[str, Path], noise_m2: float,
     is_confirmed = len(against) > 1 or against[0] in turning
     names = {"reference": ", ".join(against)}
     if "unlike" in shapes.values():
-        found |= {GNSS: refuse_fixes("path-unlike", shapes, names)} if is_confirmed else {}
+        found |= {GNSS: make_fix_exclusion("path-unlike", shapes, names)} if is_confirmed else {}
     elif is_confirmed:
         found[GNSS] = SensorExclusion(GNSS, "path-mirrored", names)
     else:
@@ -375,8 +377,8 @@ def _find_frozen_imu(imu: InertialMeasurements) -> Exclusions:
         ("acceleration", imu.specific_force_mps2),
         ("angular_velocity", imu.angular_velocity_radps),
     ):
-        if _is_one_value(values):
-            return {IMU: _refuse_frozen(IMU, quantity, len(values))}
+        if _is_constant(values):
+            return {IMU: _make_frozen_exclusion(IMU, quantity, len(values))}
     return {}
 
 
@@ -424,7 +426,7 @@ def _check_imu(
     signs = {role: bool(axis.axis[2] > 0) for role, axis in axes.items() if abs(axis.axis[2]) > _SAME_WAY}
     _check_yaw_signs(found, signs, is_stated=is_stated)
     if looks and all(_ASIDE_RAD < abs(each) <= _BACKWARDS_RAD for each in looks.values()):
-        _exclude(found, _refuse_yaw(looks, turned_by))
+        _exclude(found, _make_yaw_exclusion(looks, turned_by))
     return axes, {} if IMU in found else looks
 
 
@@ -459,7 +461,7 @@ def _check_yaw_signs(found: Exclusions, signs: Mapping[str, bool], *, is_stated:
             _exclude(found, SensorExclusion(role, "yaw-rate-sign", names, turned_by=YAW))
 
 
-def _refuse_yaw(looks: Mapping[str, float], turned_by: Floats) -> SensorExclusion:
+def _make_yaw_exclusion(looks: Mapping[str, float], turned_by: Floats) -> SensorExclusion:
     """Return the exclusion of an IMU that the accelerations of odometries show to be turned, by yaw [rad]."""
     names, numbers = (
         {"evidence": "acceleration", "reference": ", ".join(looks)},
@@ -500,7 +502,8 @@ def _check_directions(
     for role, other, lead in _find_outvoted([pair for pair, is_same in same.items() if not is_same], count_votes):
         if role == IMU:
             _exclude(
-                found, _refuse_yaw({each: yaw for each, yaw in looks.items() if abs(yaw) > _BACKWARDS_RAD}, FORWARD)
+                found,
+                _make_yaw_exclusion({each: yaw for each, yaw in looks.items() if abs(yaw) > _BACKWARDS_RAD}, FORWARD),
             )
         elif role != COMMAND and role not in turned:
             turned.add(role)
@@ -533,8 +536,7 @@ def check_ground_velocity(m: Measurements) -> SensorExclusion | None:
     velocity, stamp_ns = m.doppler.velocity_enu_mps[:, :2], m.doppler.stamp_ns
     at_s, stamp_s = (compute_seconds(each, int(at_ns[0])) for each in (at_ns, stamp_ns))
     path = integrate_signal(stamp_s, velocity, at_s) @ np.array([1.0, 1j])
-    longest_ns = max(_MAX_GAP_NS, 3 * compute_median_period_ns(stamp_ns))
-    path[is_in_gap(stamp_ns, at_ns, at_ns, longest_ns=longest_ns)] = np.nan
+    path[~is_covered(stamp_ns, at_ns, at_ns, least_ns=_MAX_GAP_NS)] = np.nan
     fixes = np.full_like(path, np.nan) if m.gnss is None else resample_fixes(m.gnss, at_ns)
     pair, driven = (compare_paths(fixes, each, _SHORT_S, _compute_noise_m2(m.gnss)) for each in (path, fixes))
     if pair is None or driven is None:
@@ -547,7 +549,7 @@ def check_ground_velocity(m: Measurements) -> SensorExclusion | None:
     if compute_misfit(pair.product) <= _OFF:
         return None
     if pair.ratio < 0.1:
-        return _refuse_frozen(DOPPLER, "velocity", stamp_ns.size)
+        return _make_frozen_exclusion(DOPPLER, "velocity", stamp_ns.size)
     is_ned = compute_misfit(-1j * pair.mirrored) <= _OFF
     if is_ned or abs(pair.ratio - 1.0) <= _OFF:
         return SensorExclusion(DOPPLER, "velocity-frame", {"frame": "north-east-down" if is_ned else "unknown"})
@@ -556,14 +558,12 @@ def check_ground_velocity(m: Measurements) -> SensorExclusion | None:
 
 def rescale_odometries(m: Measurements, scales: Mapping[str, float]) -> Measurements:
     """Return measurements without the scales of odometries that are known; their claims do not become better."""
-
-    def rescale(role: str, source: BodyVelocities | None) -> BodyVelocities | None:
-        if source is None or role not in scales:
-            return source
-        variance = source.variance_m2ps2 * max(1.0, scales[role] ** -2.0)
-        return replace(source, velocity_mps=source.velocity_mps / scales[role], variance_m2ps2=variance)
-
-    return replace(m, wheels=rescale(WHEELS, m.wheels), visual=rescale(VISUAL, m.visual))
+    rescaled = {}
+    for role, source in m.odometries().items():
+        if role in scales:
+            variance = source.variance_m2ps2 * max(1.0, scales[role] ** -2.0)
+            rescaled[role] = replace(source, velocity_mps=source.velocity_mps / scales[role], variance_m2ps2=variance)
+    return m.replace_sensors(rescaled)
 
 
 _SHORTEST_NS = 40_000_000_000  # shorter may be one place of slip
