@@ -178,7 +178,7 @@ _LONGEST = 15.0  # a section's length through this: longer windows are too few t
 _CAUTION = 0.6  # standard deviations of a fitted process that a filter's process is larger by
 _OVERLAP = 2.0  # other lengths and axes tell the same: the number of windows is divided by this
 _FEWEST = 8  # windows
-_TOLD = 0.5  # less, and the larger of fit and prior holds
+DETERMINED = 0.5  # share that the data tell of a density: less, and the larger of fit and prior holds
 # Windows that are up to so many times as long as the longest enter the fit if they are not longer than this: few, but better than none.
 _FIT, _SHORTEST_S = 4.0, 20.0
 # Share of fixes without a claim: of a run with more, the noise is the recipe's, or more where the run shows more.
@@ -360,7 +360,7 @@ class _Fit:
         row = self._names.index(name)
         told = self._compute_data_share(np.eye(len(self._names))[row])
         fitted = float(self._variances[row])
-        return (fitted if told >= _TOLD else max(fitted, prior)), told
+        return (fitted if told >= DETERMINED else max(fitted, prior)), told
 
     def find_process(self, prior: GaussMarkov, *names: str) -> GaussMarkov:
         """Return the Gauss-Markov process that is nearest to the sum of those of these names.
@@ -379,7 +379,7 @@ class _Fit:
             shape[:, row] = GaussMarkov(1.0, tau).difference_variance(_SUMMARY_S)
         unsure = np.sqrt(np.einsum("ij,jk,ik->i", shape, self._covariance, shape))
         fitted = shape @ self._variances + _CAUTION * unsure
-        untold = (self._longest_s < _SUMMARY_S) | (told < _TOLD)
+        untold = (self._longest_s < _SUMMARY_S) | (told < DETERMINED)
         return _summarize(np.where(untold, np.maximum(fitted, prior.difference_variance(_SUMMARY_S)), fitted), told)
 
     def find_parts(self, *names: str) -> list[tuple[float, int, float]]:

@@ -49,9 +49,8 @@ from tcpipe.fusion.process import (
     GROUND,
     SLOPE_RAD,
     UNSEEN_TURN_RADPS,
-    VISUAL_SCALE_STD,
-    WHEEL_SCALE_STD,
     estimate_slope_std_rad,
+    find_best_scale_std,
     is_gliding,
     is_length_observable,
     is_turned_by_course,
@@ -382,7 +381,7 @@ def _compute_unseen_scale_std(m: Measurements, noise: NoiseModel, made: Pass) ->
     """
     if not m.odometries():
         return 0.0
-    own = WHEEL_SCALE_STD if m.visual is None else VISUAL_SCALE_STD
+    own = find_best_scale_std(m)
     used = np.flatnonzero(made.tests.verdict[:, state.FIX] == ACCEPTED)
     if used.size < 2 or not is_length_observable(m, noise.horizontal):
         return own

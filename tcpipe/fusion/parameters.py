@@ -99,7 +99,7 @@ def make_priors(m: Measurements, noise: NoiseModel, ticks: Ticks) -> tuple[Float
             std[rows], walk[rows] = parameter.std, parameter.walk
     if m.imu is not None:
         walk[state.GYRO_BIAS : state.GYRO_BIAS + 3] = _find_walk(noise.turns[IMU].bias)
-    scales = dict(zip((WHEELS, VISUAL), find_scale_stds(m, noise.horizontal), strict=True))
+    scales = find_scale_stds(m, noise.horizontal)
     for role, place in ((WHEELS, state.WHEEL_SCALE), (VISUAL, state.VISUAL_SCALE)):
         if role in m.odometries() and scales[role]:
             std[place], walk[place] = scales[role], np.sqrt(noise.odometries[role].scale.variance / _MEAN_LASTS_S)

@@ -7,7 +7,7 @@ body velocity is held, it follows how fast the forward velocity changes there.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +16,8 @@ from tcpipe.fusion import state
 from tcpipe.fusion.densities import FixNoise, NoiseModel
 from tcpipe.fusion.measurements import (
     IMU,
+    VISUAL,
+    WHEELS,
     BodyVelocities,
     GroundVelocities,
     InertialMeasurements,
@@ -32,8 +34,11 @@ from tcpipe.fusion.signals import (
 )
 from tcpipe.robust import estimate_robust_std
 
-WHEEL_SCALE_STD = 0.12  # a skid-steered robot on grass slips by so much
-VISUAL_SCALE_STD = 0.05  # stereo calibration
+SCALE_STD: Mapping[str, float] = {
+    WHEELS: 0.12,  # a skid-steered robot on grass slips by so much
+    VISUAL: 0.05,  # stereo calibration
+}
+"""By odometry, σ of its scale before the run shows it."""
 _WHEEL_TURN_SCALE_STD = 0.2  # turn rate of skidding wheels
 _VISUAL_TURN_SCALE_STD = 0.03  # turn rate of a camera
 SLOPE_RAD = 0.1  # of ground, where nothing shows it
@@ -143,21 +148,25 @@ def is_length_observable(m: Measurements, fixes: FixNoise | None) -> bool:
     """
     if m.gnss is None or fixes is None or m.gnss.stamp_ns.size < 2:
         return False
-    known = WHEEL_SCALE_STD if m.visual is None else VISUAL_SCALE_STD
     span_m = float(np.linalg.norm(np.ptp(m.gnss.position_enu_m[:, :2], axis=0)))
     lasting_m2 = fixes.correlated.variance + fixes.white_m2 / m.gnss.stamp_ns.size
-    return float(np.sqrt(2.0 * lasting_m2)) < 0.5 * known * max(span_m, 1e-3)
+    return float(np.sqrt(2.0 * lasting_m2)) < 0.5 * find_best_scale_std(m) * max(span_m, 1e-3)
 
 
-def find_scale_stds(measurements: Measurements, fixes: FixNoise | None) -> tuple[float, float]:
-    """Return the standard deviations of the scales of wheels and visual odometry; 0 where a scale is unobservable: it stays 1.
+def find_best_scale_std(m: Measurements) -> float:
+    """Return the σ of the scale of the odometry whose scale is known best before the run shows it."""
+    return SCALE_STD[WHEELS if m.visual is None else VISUAL]
+
+
+def find_scale_stds(measurements: Measurements, fixes: FixNoise | None) -> Mapping[str, float]:
+    """Return the standard deviations of the scales of odometries by role; 0 where a scale is unobservable: it stays 1.
 
     Only fixes make a scale observable. Without any, one odometry is the measure: the camera where there is one, else the wheels. What an
     accelerometer adds up to over a minute is its tilt and its bias.
     """
     if is_length_observable(measurements, fixes):
-        return WHEEL_SCALE_STD, VISUAL_SCALE_STD
-    return (0.0 if measurements.visual is None else WHEEL_SCALE_STD), 0.0
+        return SCALE_STD
+    return {WHEELS: 0.0 if measurements.visual is None else SCALE_STD[WHEELS], VISUAL: 0.0}
 
 
 def make_motion_noise(  # noqa: PLR0917

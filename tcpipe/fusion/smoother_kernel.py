@@ -145,9 +145,8 @@ def step_before_motion(F: Matrix, kept: Vector, places: Indices, m: int, adjoint
                 s = information[i, j]
                 information[i, j] = information[j, i]
                 information[j, i] = s
-    for i in range(
-        n
-    ):  # The step over an update takes Λ for symmetric: what is not would grow over half an hour to all of it.
+    # The step over an update takes Λ for symmetric: an asymmetry by rounding would grow to the size of Λ within half an hour.
+    for i in range(n):
         for j in range(i):
             information[i, j] = information[j, i] = 0.5 * (information[i, j] + information[j, i])
 

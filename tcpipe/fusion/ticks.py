@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from tcpipe.compiled import compile_kernel
 from tcpipe.fusion import state
-from tcpipe.fusion.densities import NoiseModel
+from tcpipe.fusion.densities import DETERMINED, NoiseModel
 from tcpipe.fusion.filter_kernel import Inputs, Memory, Model, Tests
 from tcpipe.fusion.initial import compute_course_rate
 from tcpipe.fusion.measurements import VISUAL, WHEELS, BodyVelocities, Measurements
@@ -50,7 +50,6 @@ _STATIONARY_RATE_STD_RADPS = 5e-4
 _LEVEL_EVERY_S = 1.0
 _UNMEASURED = 1e6  # m²/s²
 _LEAST_M2PS = 4e-6  # 2 mm after a second: the mean of a tick is no better than that
-_TOLD = 0.5  # share of a density that the run must tell
 _MOVING_MPS = 0.05  # slower is stationary (ruling)
 _ACCELERATION_WINDOW_S = 0.4
 # Sideways velocities are independent after this time: what lasts longer of them is in the states of turning centre and mounting.
@@ -214,7 +213,7 @@ def _make_velocity_variance(m: Measurements, source: BodyVelocities, noise: Nois
     relative = claimed[:, 0] / np.median(claimed[:, 0])
     of_run, scatter = noise.odometries[role], _estimate_scatter(source.velocity_mps[:, 0])
     density = max(of_run.velocity_m2ps, _LEAST_M2PS)
-    if of_run.velocity_told < _TOLD:  # what is claimed beyond the scatter of the samples lasts
+    if of_run.velocity_told < DETERMINED:  # what is claimed beyond the scatter of the samples lasts
         density = max(density, _LASTING_S * (float(np.median(claimed[:, 0])) - scatter))
     found[:, 0] = max(density * rate_hz, scatter) * np.maximum(relative, 1.0)
     for axis in range(1, 3):

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from scipy.special import betaincinv
 
 from tcpipe.errors import FusionError
-from tcpipe.fusion.measurements import GNSS, VISUAL, WHEELS, BodyVelocities, Positions
-from tcpipe.fusion.process import VISUAL_SCALE_STD, WHEEL_SCALE_STD
+from tcpipe.fusion.measurements import GNSS, BodyVelocities, Positions
+from tcpipe.fusion.process import SCALE_STD
 from tcpipe.fusion.signals import compute_seconds, integrate_signal, is_covered
 from tcpipe.geometry.rotation import matrix_from_quat, quat_from_rpy
 
@@ -26,7 +26,6 @@ END_S = 5.0  # at either end of a run the sensor stays this long, to start from 
 LEAST_WINDOW_M = 1.0  # a window in which the robot drives less compares a robot that is stationary
 _LEAST_MPS = 0.1  # slower chords have no direction
 _SCALE_CHORDS = 10  # fewer chords outside the windows give no scale
-_SCALE_STD = {WHEELS: WHEEL_SCALE_STD, VISUAL: VISUAL_SCALE_STD}
 _NOMINAL = (0.6827, 0.9545)
 _FEWEST_WINDOWS = 5  # fewer can share one place or one fault, and decide nothing
 _TAIL = 0.025  # of a share's interval, on either side
@@ -247,5 +246,5 @@ def compare_chords(
     scale = float(np.median(sensor_m[outside] / track_m[outside])) if outside.sum() >= _SCALE_CHORDS else 1.0
     inside = usable & (end_ns <= window_end_ns) & np.isin(number, numbers)
     error_m = (sensor_m[inside] / scale - track_m[inside])[:, None]
-    std_m = np.hypot(std_m[inside], _SCALE_STD[role] * track_m[inside])[:, None]
+    std_m = np.hypot(std_m[inside], SCALE_STD[role] * track_m[inside])[:, None]
     return Comparison(role, window_s, chord_s, number[inside], error_m, std_m, np.full(len(error_m), np.nan))

@@ -15,8 +15,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.fusion.measurements import GNSS, VISUAL, WHEELS, BodyVelocities, Measurements, Positions
-from tcpipe.fusion.process import VISUAL_SCALE_STD, WHEEL_SCALE_STD
+from tcpipe.fusion.measurements import GNSS, WHEELS, BodyVelocities, Measurements, Positions
+from tcpipe.fusion.process import SCALE_STD
 from tcpipe.fusion.signals import (
     compute_interval_means,
     compute_median_period_ns,
@@ -40,7 +40,6 @@ _ASTRAY_M = 1.0  # a larger difference in 5 s is divergence
 _SURELY = 4.0  # and by this many σ of the sensor
 _LITTLE = 0.1  # share of windows that may be astray
 _LASTING_MPS = 0.02  # lasting odometry error (`preparation._VELOCITY_FLOOR_MPS`)
-_SCALE_STD = {WHEELS: WHEEL_SCALE_STD, VISUAL: VISUAL_SCALE_STD}
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,7 +134,7 @@ def _compare_odometry(
     if scale_seen and far.sum() >= _FEWEST:
         told = told / np.clip(np.median(told[far, 0] / track[far, 0]), *_SCALES)
     noise_m = float(np.sqrt(np.median(source.variance_m2ps2[:, 0]) * period_ns * 1e-9 * _WINDOW_S))
-    lasting_m = np.hypot(_SCALE_STD[role] * np.linalg.norm(track, axis=1), _LASTING_MPS * _WINDOW_S)
+    lasting_m = np.hypot(SCALE_STD[role] * np.linalg.norm(track, axis=1), _LASTING_MPS * _WINDOW_S)
     return np.linalg.norm(told - track, axis=1), np.hypot(lasting_m, noise_m)
 
 

@@ -53,9 +53,8 @@ ROLES = (IMU, WHEELS, VISUAL, GNSS, POWER)
 _NOTED_S, _NOTED_POWER_S = 0.05, 0.08
 _SURE = 4.0  # standard deviations
 _MAX_STD_S, _MAX_POWER_STD_S = 0.02, 0.04
-_CLEARLY = (
-    10.0  # standard deviations of an offset that is not known well: the mean of a clock that steps scatters by more
-)
+# Standard deviations of an offset that is not known well: the mean of a clock that steps scatters by more.
+_CLEARLY = 10.0
 _MIN_EXPLAINED = 0.25
 _LEAST_STD_S = 1e-3
 _WINDOW_NS, _MARGIN_NS = 600_000_000_000, 5_000_000_000

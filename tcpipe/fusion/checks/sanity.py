@@ -172,11 +172,11 @@ _LENGTHENED = (1, 3, 9)  # windows, where the noise of fixes hides what is drive
 _FAR_M = 1.0
 _FEWEST_WINDOWS = 3
 _FACTOR = 2.0  # between distances that agree
-_STILL = 20.0
+_STILL = 20.0  # ratio of distances from which on the shorter one is no motion
 _UNLIKE = 0.3  # share of the size of a path that slip may bend, and of windows that may be unlike
-_BEND_M = 0.3
-_CLEARLY = 3.0
-_MOST = 5.0  # scale of an odometry
+_BEND_M = 0.3  # a path that bends less is its own mirror image
+_CLEARLY = 3.0  # ratio of misfits that decides between a path and its mirror image
+_MOST = 5.0  # largest scale of an odometry that is taken out
 _UNITS = {"km/h": (3.2, 4.0), "radians": (1 / 75, 1 / 30)}
 _NODE = round(0.5 / GRID_S)
 

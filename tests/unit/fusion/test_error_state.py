@@ -13,7 +13,7 @@ from tcpipe.fusion import error_state
 from tcpipe.fusion.error_state import run_error_state
 from tcpipe.fusion.initial import find_initial_state, find_stationary_intervals
 from tcpipe.fusion.measurements import GNSS, VISUAL, WHEELS, BodyVelocities, Measurements
-from tcpipe.fusion.process import WHEEL_SCALE_STD, estimate_slope_std_rad
+from tcpipe.fusion.process import SCALE_STD, estimate_slope_std_rad
 from tcpipe.geometry.rotation import matrix_from_quat
 
 PERIOD_NS = 50_000_000
@@ -161,7 +161,7 @@ def test_without_gnss_a_metre_of_the_wheels_stays_one(kept):
     driven_m = np.sum(np.linalg.norm(np.diff(found.position_enu_m, axis=0), axis=1))
     assert driven_m == pytest.approx(own_m, rel=0.02)
     assert found.facts.wheel_scale == pytest.approx(1.0, abs=1e-6)
-    assert found.facts.common_scale_std == found.facts.wheel_scale_std == WHEEL_SCALE_STD
+    assert found.facts.common_scale_std == found.facts.wheel_scale_std == SCALE_STD["wheel_odometry"]
     moving = np.linalg.norm(found.velocity_enu_mps, axis=1) > 0.5
     assert (found.forward_velocity_std_mps[moving] > 0.1 * np.linalg.norm(found.velocity_enu_mps, axis=1)[moving]).all()
     assert np.linalg.norm(found.position_std_m[-1]) > 0.1 * np.linalg.norm(found.position_enu_m[-1])
