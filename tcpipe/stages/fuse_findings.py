@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from tcpipe.fusion.checks.sanity import compute_command_ratio
 from tcpipe.fusion.measurements import GNSS, IMU, VISUAL, WHEELS, Measurements
+from tcpipe.fusion.process import SCALE_STD
 from tcpipe.geometry.rotation import (
     matrix_from_quat,
     multiply,
@@ -240,13 +241,12 @@ def find_parameter_findings(inputs: FusionInputs, facts: FuseFacts, streams: Str
         yield _find_tilt(tilt, streams.sensors[IMU])
     for name, role in (("wheel scale", WHEELS), ("camera scale", VISUAL)):
         found = parameters.get(name)
-        if found is not None and (role in inputs.scales or _is_contradicted(found, _LEAST_SCALE)):
-            scale = inputs.scales.get(role, 1.0) * (1.0 + found.value[0])
+        if role in inputs.scales or (found is not None and _is_contradicted(found, _LEAST_SCALE)):
+            value, std = (0.0, SCALE_STD[role]) if found is None else (found.value[0], found.std[0])
+            scale = inputs.scales.get(role, 1.0) * (1.0 + value)
             stated = (streams.report.facts.odometry_scale or {}).get(role, 1.0)
             remedies = suggest("state", {"read.odometry_scale": {role: round(stated / scale, 4)}})
-            yield make_finding(
-                "odometry-scale", Subject("role", role), remedies=remedies, scale=scale, scale_std=found.std[0]
-            )
+            yield make_finding("odometry-scale", Subject("role", role), remedies=remedies, scale=scale, scale_std=std)
     # That of wheels always varies: they slip.
     camera = parameters.get("camera scale")
     variation = 0.0 if camera is None else max(camera.variation, default=0.0)

@@ -548,6 +548,16 @@ def test_wheels_that_go_too_short_a_way_and_tell_no_turn_rate_are_rescaled_by_co
     assert select_findings(found.findings, "rate-from-orientation")
 
 
+def test_a_scale_that_is_taken_out_is_told_where_the_estimator_has_none(drive, tmp_path):
+    other = drive.without("imu", "visual", "command")
+    other = other.changed("wheels", lambda c: {"twist.twist.linear.x": 3.0 * c["twist.twist.linear.x"]})
+    labelled = run(other, tmp_path, recipe=parse_recipe({"fuse": {"estimator": "ukf"}}, where="test"))
+    (scale,) = select_findings(labelled.info.report.findings, "odometry-scale")
+    assert scale.numbers["scale"] == pytest.approx(3.0, rel=0.1)
+    stated = proposed(scale)["read"]["odometry_scale"]["wheel_odometry"]
+    assert stated == pytest.approx(1.0 / 3.0, rel=0.1)
+
+
 LATE_S = 0.3
 
 
