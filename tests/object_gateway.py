@@ -5,12 +5,14 @@ import os
 import re
 import signal
 import subprocess
+import uuid
 from collections.abc import Iterator
 from pathlib import Path
 
 import obstore
 import pytest
 from obstore.store import from_url
+from storage_server import object_store
 
 # Where a monitor of Ceph comes up at all it does so in seconds; where it does not, its client asks for five minutes.
 ATTEMPTS, SECONDS_EACH = 3, 90
@@ -89,3 +91,16 @@ def in_environment(patch: pytest.MonkeyPatch, environment: dict[str, str], cache
         patch.delenv(name, raising=False)
     for name, value in {**environment, "TCPIPE_CACHE": str(cache)}.items():
         patch.setenv(name, value)
+
+
+@contextlib.contextmanager
+def open_bucket(kind: str, request: pytest.FixtureRequest, patch: pytest.MonkeyPatch, directory: Path) -> Iterator[str]:
+    """Yield the URL of an empty place, in the bucket ``tests`` of the ``gateway`` or of a server that serves ``directory/served``."""
+    if kind == "gateway":
+        in_environment(patch, request.getfixturevalue("gateway"), directory / "cache")
+        yield f"s3://tests/{uuid.uuid4().hex}"
+    else:
+        (directory / "served" / "tests").mkdir(parents=True)
+        with object_store(directory / "served") as (environment, _):
+            in_environment(patch, environment, directory / "cache")
+            yield "s3://tests"

@@ -6,7 +6,7 @@ import sys
 from dataclasses import replace
 
 import pytest
-from object_gateway import in_environment
+from object_gateway import in_environment, open_bucket
 from storage_server import object_store
 
 from tcpipe.errors import StoreError
@@ -39,10 +39,8 @@ def place(request, tmp_path, monkeypatch):
     if request.param == "directory":
         yield Place(tmp_path / "store")
         return
-    (tmp_path / "served" / "tests").mkdir(parents=True)
-    with object_store(tmp_path / "served") as (environment, _):
-        in_environment(monkeypatch, environment, tmp_path / "cache")
-        yield Place("s3://tests/store")
+    with open_bucket(request.param, request, monkeypatch, tmp_path) as url:
+        yield Place(f"{url}/store")
 
 
 def saw(number):

@@ -3,12 +3,11 @@
 import hashlib
 import pickle
 import time
-import uuid
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
-from object_gateway import in_environment
+from object_gateway import in_environment, open_bucket
 from storage_server import FORBIDDEN, READ_ONLY, SKEWED, object_store
 
 from tcpipe.errors import StoreError
@@ -22,14 +21,9 @@ NAMES = ("a.json", "drives of May/ü ñ #1?.json", "runs/100%/track.parquet", "r
 def place(request, tmp_path, monkeypatch):
     if request.param == "directory":
         yield open_place(tmp_path / "place")
-    elif request.param == "gateway":
-        in_environment(monkeypatch, request.getfixturevalue("gateway"), tmp_path / "cache")
-        yield open_place(f"s3://tests/{uuid.uuid4().hex}/below this")
-    else:
-        (tmp_path / "served" / "tests").mkdir(parents=True)
-        with object_store(tmp_path / "served") as (environment, _):
-            in_environment(monkeypatch, environment, tmp_path / "cache")
-            yield open_place("s3://tests/below this/")
+        return
+    with open_bucket(request.param, request, monkeypatch, tmp_path) as url:
+        yield open_place(f"{url}/below this/")
 
 
 def _names(entries: list[Entry]) -> list[str]:

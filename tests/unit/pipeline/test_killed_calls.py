@@ -12,8 +12,7 @@ from types import SimpleNamespace
 
 import pytest
 from click.testing import CliRunner
-from object_gateway import in_environment
-from storage_server import object_store
+from object_gateway import open_bucket
 from wheel_drives import START_NS, drive_at
 
 from tcpipe.cli import cli
@@ -40,10 +39,8 @@ def root(request, tmp_path, monkeypatch):
     if request.param == "directory":
         yield tmp_path / "store"
         return
-    (tmp_path / "served" / "tests").mkdir(parents=True)
-    with object_store(tmp_path / "served") as (environment, _):
-        in_environment(monkeypatch, environment, tmp_path / "cache")
-        yield "s3://tests/store"
+    with open_bucket(request.param, request, monkeypatch, tmp_path) as url:
+        yield f"{url}/store"
 
 
 @pytest.fixture(scope="module")
