@@ -12,7 +12,7 @@ from pathlib import Path
 import obstore
 import pytest
 from obstore.store import from_url
-from storage_server import object_store
+from storage_server import Fetched, object_store
 
 # Where a monitor of Ceph comes up at all it does so in seconds; where it does not, its client asks for five minutes.
 ATTEMPTS, SECONDS_EACH = 3, 90
@@ -93,14 +93,19 @@ def in_environment(patch: pytest.MonkeyPatch, environment: dict[str, str], cache
         patch.setenv(name, value)
 
 
-@contextlib.contextmanager
-def open_bucket(kind: str, request: pytest.FixtureRequest, patch: pytest.MonkeyPatch, directory: Path) -> Iterator[str]:
-    """Yield the URL of an empty place, in the bucket ``tests`` of the ``gateway`` or of a server that serves ``directory/served``."""
-    if kind == "gateway":
-        in_environment(patch, request.getfixturevalue("gateway"), directory / "cache")
-        yield f"s3://tests/{uuid.uuid4().hex}"
-    else:
-        (directory / "served" / "tests").mkdir(parents=True)
-        with object_store(directory / "served") as (environment, _):
-            in_environment(patch, environment, directory / "cache")
-            yield "s3://tests"
+@pytest.fixture
+def served(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Fetched]:
+    """Lead to a bucket ``tests`` that a server of this process has in ``served/tests``, and yield what was asked of it so far."""
+    (tmp_path / "served" / "tests").mkdir(parents=True)
+    with object_store(tmp_path / "served") as (environment, fetched):
+        in_environment(monkeypatch, environment, tmp_path / "cache")
+        yield fetched
+
+
+def open_bucket(kind: str, request: pytest.FixtureRequest, patch: pytest.MonkeyPatch, directory: Path) -> str:
+    """Return the URL of an empty place in the bucket ``tests`` of the ``gateway``, or of a server as `served`."""
+    if kind != "gateway":
+        request.getfixturevalue("served")
+        return "s3://tests"
+    in_environment(patch, request.getfixturevalue("gateway"), directory / "cache")
+    return f"s3://tests/{uuid.uuid4().hex}"

@@ -28,10 +28,9 @@ RUN = "north"
 def root(request, tmp_path, monkeypatch):
     """Where a store is to be."""
     if request.param == "directory":
-        yield tmp_path / "store"
-        return
-    with open_bucket(request.param, request, monkeypatch, tmp_path) as url:
-        yield f"{url}/a store"
+        return tmp_path / "store"
+    url = open_bucket(request.param, request, monkeypatch, tmp_path)
+    return f"{url}/a store"
 
 
 def put(store: Store, length_m: float = 10.0, **how: object) -> None:

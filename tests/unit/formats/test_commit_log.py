@@ -37,10 +37,9 @@ STAMP = Stamp(Process("lab", "m", "b", "n", 1, "2"), "2026-11-24T00:00:00.000+00
 @pytest.fixture(params=["directory", "bucket"])
 def place(request, tmp_path, monkeypatch):
     if request.param == "directory":
-        yield Place(tmp_path / "store")
-        return
-    with open_bucket(request.param, request, monkeypatch, tmp_path) as url:
-        yield Place(f"{url}/store")
+        return Place(tmp_path / "store")
+    url = open_bucket(request.param, request, monkeypatch, tmp_path)
+    return Place(f"{url}/store")
 
 
 def saw(number):

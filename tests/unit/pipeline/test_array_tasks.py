@@ -65,10 +65,9 @@ def read_runs(root):
 def root(request, tmp_path, monkeypatch):
     """Where a store is to be."""
     if request.param == "directory":
-        yield tmp_path / "store"
-        return
-    with open_bucket(request.param, request, monkeypatch, tmp_path) as url:
-        yield f"{url}/store"
+        return tmp_path / "store"
+    url = open_bucket(request.param, request, monkeypatch, tmp_path)
+    return f"{url}/store"
 
 
 def test_an_array_with_late_and_killed_tasks_makes_the_store_of_one_call(root, drives, tmp_path):

@@ -37,10 +37,9 @@ NIGHT_S = 86_400
 def root(request, tmp_path, monkeypatch):
     """Where a store is to be."""
     if request.param == "directory":
-        yield tmp_path / "store"
-        return
-    with open_bucket(request.param, request, monkeypatch, tmp_path) as url:
-        yield f"{url}/store"
+        return tmp_path / "store"
+    url = open_bucket(request.param, request, monkeypatch, tmp_path)
+    return f"{url}/store"
 
 
 @pytest.fixture(scope="module")
