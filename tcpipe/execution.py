@@ -1,6 +1,6 @@
 """Independent tasks side by side, in this process, local processes or an executor; a worker that dies costs only its own task.
 
-What workers log is said here. Local ones end with this process, and at once when it is interrupted; a cluster's finish what they began.
+This process logs what its workers log. Local workers end with it, and at once when it is interrupted; a cluster's finish their tasks.
 The home of dask.
 """
 
@@ -226,7 +226,7 @@ _POLL_S = 0.5
 
 @dataclass(slots=True)
 class _Workers:
-    """An executor, what it is called, and how many tasks it is handed at once; ``client`` if Dask's, which is silent where nobody works."""
+    """An executor, what it is called, and how many tasks it is handed at once; ``client``: of Dask, which waits without workers."""
 
     executor: Executor
     name: str
@@ -278,28 +278,23 @@ def _run_elsewhere(
     function: Callable[[T], R], todo: Iterator[tuple[int, T]], cluster: str | Executor
 ) -> Generator[Outcome[R]]:
     """Run tasks by an executor; Dask's runs that of a killed worker again on another, three times."""
-    with _open_workers(cluster) as workers, _cancel_left(dict[Job[_Answer[R]], int]()) as running:
+    running = dict[Job[_Answer[R]], int]()
+    with _open_workers(cluster) as workers:
         caller = _Caller((os.uname().nodename, os.getpid()), logger.getEffectiveLevel(), __version__)
         if client := workers.client:
             caller = replace(caller, topic=f"tcpipe-{client.id}")
             client.subscribe_topic(caller.topic, lambda event: logger.log(*event[1]))
-        while True:
-            for index, task in islice(todo, workers.at_once - len(running)):
-                running[workers.submit(function, task, caller)] = index
-            if not running:
-                return
-            for job in workers.wait_for_first(running):
-                yield _get_outcome(job, running.pop(job), workers.name)
-
-
-@contextmanager
-def _cancel_left(running: dict[Job[R], int]) -> Iterator[dict[Job[R], int]]:
-    """Yield the tasks that an executor has; in the end those that have not begun do not begin any more."""
-    try:
-        yield running
-    finally:
-        for job in running:
-            job.cancel()
+        try:
+            while True:
+                for index, task in islice(todo, workers.at_once - len(running)):
+                    running[workers.submit(function, task, caller)] = index
+                if not running:
+                    return
+                for job in workers.wait_for_first(running):
+                    yield _get_outcome(job, running.pop(job), workers.name)
+        finally:
+            for job in running:  # what has not begun does not begin any more
+                job.cancel()
 
 
 def _get_outcome(job: Job[_Answer[R]], index: int, name: str) -> Outcome[R]:
@@ -419,7 +414,7 @@ class _Answer(Generic[R]):
 
 
 def _run_on_worker(function: Callable[[T], R], task: T, caller: _Caller) -> _Answer[R]:
-    """Run a task on a worker; on a thread of the caller as it is."""
+    """Run a task on a worker, and forward what it logs; a thread of the caller's process logs there itself."""
     if caller.version != __version__:
         raise _make_cluster_error(os.uname().nodename, __version__, wanted=caller.version)
     if caller.process == (os.uname().nodename, os.getpid()):

@@ -5,12 +5,14 @@ import os
 import re
 import signal
 import subprocess
+import uuid
 from collections.abc import Iterator
 from pathlib import Path
 
 import obstore
 import pytest
 from obstore.store import from_url
+from storage_server import Fetched, object_store
 
 # Where a monitor of Ceph comes up at all it does so in seconds; where it does not, its client asks for five minutes.
 ATTEMPTS, SECONDS_EACH = 3, 90
@@ -89,3 +91,21 @@ def in_environment(patch: pytest.MonkeyPatch, environment: dict[str, str], cache
         patch.delenv(name, raising=False)
     for name, value in {**environment, "TCPIPE_CACHE": str(cache)}.items():
         patch.setenv(name, value)
+
+
+@pytest.fixture
+def served(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Fetched]:
+    """Lead to a bucket ``tests`` that a server of this process has in ``served/tests``, and yield what was asked of it so far."""
+    (tmp_path / "served" / "tests").mkdir(parents=True)
+    with object_store(tmp_path / "served") as (environment, fetched):
+        in_environment(monkeypatch, environment, tmp_path / "cache")
+        yield fetched
+
+
+def open_bucket(kind: str, request: pytest.FixtureRequest, patch: pytest.MonkeyPatch, directory: Path) -> str:
+    """Return the URL of an empty place in the bucket ``tests`` of the ``gateway``, or of a server as `served`."""
+    if kind != "gateway":
+        request.getfixturevalue("served")
+        return "s3://tests"
+    in_environment(patch, request.getfixturevalue("gateway"), directory / "cache")
+    return f"s3://tests/{uuid.uuid4().hex}"

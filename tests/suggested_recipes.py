@@ -2,18 +2,18 @@
 
 import tomllib
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import Any
 
-from tcpipe.formats.finding_lines import format_remedy_lines
 from tcpipe.formats.recipe_toml import parse_recipe
 from tcpipe.recipe import Recipe
+from tcpipe.recipe.suggestions import RecipeFragment
 from tcpipe.tables.findings import Finding
 
 
 def proposed(finding: Finding, *, alternative: int = 0) -> dict[str, Any]:
-    """The recipe values that a remedy of a finding proposes, by the lines that are printed."""
-    return tomllib.loads("\n".join(format_remedy_lines(replace(finding, remedies=(finding.remedies[alternative],)))))
+    """The recipe values that a remedy of a finding proposes, by its lines of a recipe."""
+    recipe = finding.remedies[alternative].recipe
+    return tomllib.loads(RecipeFragment(recipe, is_checked=True).toml()) if recipe else {}
 
 
 def merged(one: Mapping[str, Any], other: Mapping[str, Any]) -> dict[str, Any]:

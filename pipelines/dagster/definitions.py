@@ -47,13 +47,14 @@ _A_TICK = 100
 """Most logs that one tick of the sensor asks for."""
 _RETRIES = dg.RetryPolicy(max_retries=3, delay=600, backoff=dg.Backoff.EXPONENTIAL, jitter=dg.Jitter.PLUS_MINUS)
 """Of what may pass: a full disk, a network."""
+_OF_ALL_ASSETS: dict[str, Any] = {"retry_policy": _RETRIES, "code_version": __version__, "group_name": "tcpipe"}
 
 
-def _place(name: str, default: str) -> str:
+def _read_setting(name: str, default: str) -> str:
     return os.environ.get(name, default)
 
 
-def _answers(command: str, *arguments: str, codes: Collection[int] = _DONE) -> list[Answer]:
+def _run_command(command: str, *arguments: str, codes: Collection[int] = _DONE) -> list[Answer]:
     """Run a command; return what it prints as JSON, or fail with its own words."""
     line = [sys.executable, "-m", "tcpipe", command, *arguments, "--json"]
     done = subprocess.run(line, capture_output=True, text=True, check=False)
@@ -71,9 +72,9 @@ def _answers(command: str, *arguments: str, codes: Collection[int] = _DONE) -> l
 
 def _plan() -> dict[str, Step]:
     """Return what every log needs as recipe and store are now, by partition: where it lies in the folder."""
-    recipe, store = resolve_recipe(None), _place("TCPIPE_STORE", "tcpipe-store")
+    recipe, store = resolve_recipe(None), _read_setting("TCPIPE_STORE", "tcpipe-store")
     with tempfile.TemporaryDirectory() as staging:
-        logs = [_place("TCPIPE_LOGS", "recordings")]
+        logs = [_read_setting("TCPIPE_LOGS", "recordings")]
         found = find_sources(logs, as_one=False, staging=Path(staging), tables=recipe.tables).sources
     state = open_store(store).state() if is_store(store) else State()
     tasks = [IngestTask(source, store, recipe, recipe.robot, {}, force=False, min_age_s=_YOUNG_S) for source in found]
@@ -86,11 +87,11 @@ def _make_run_key(step: Step) -> str:
     return f"{source.place}:{digest([source.files_digest, ingest_key(recipe), recipe.robot, __version__])[:16]}"
 
 
-def _listed(lines: list[str]) -> dg.MetadataValue:
+def _format_list(lines: list[str]) -> dg.MetadataValue:
     return dg.MetadataValue.md("\n".join(f"- {line}" for line in lines) or "none")
 
 
-def _ledger(distance_by_reason_m: Mapping[str, float]) -> dg.MetadataValue:
+def _format_distances(distance_by_reason_m: Mapping[str, float]) -> dg.MetadataValue:
     """Return where every metre went, as a table."""
     rows = sorted(distance_by_reason_m.items(), key=lambda row: -row[1])
     return dg.MetadataValue.md(
@@ -99,7 +100,7 @@ def _ledger(distance_by_reason_m: Mapping[str, float]) -> dg.MetadataValue:
     )
 
 
-def _picture(path: Path) -> dict[str, dg.MetadataValue]:
+def _read_picture(path: Path) -> dict[str, dg.MetadataValue]:
     """Return a PNG as something that the page shows, nothing where there is none."""
     if not path.is_file():
         return {}
@@ -107,47 +108,49 @@ def _picture(path: Path) -> dict[str, dg.MetadataValue]:
     return {"map": dg.MetadataValue.md(f"![map](data:image/png;base64,{data})")}
 
 
-def _check(name: str, problems: list[str], *, warn: bool = False, **more: int | str) -> dg.AssetCheckResult:
+def _make_check(name: str, problems: list[str], *, warn: bool = False, **more: int | str) -> dg.AssetCheckResult:
     severity = dg.AssetCheckSeverity.WARN if warn else dg.AssetCheckSeverity.ERROR
-    metadata = {"problems": _listed(problems), **more}
+    metadata = {"problems": _format_list(problems), **more}
     return dg.AssetCheckResult(check_name=name, passed=not problems, severity=severity, metadata=metadata)
 
 
-def _judged(result: Answer) -> dg.AssetCheckResult:
+def _check_usable(result: Answer) -> dg.AssetCheckResult:
     """Return whether position, time and energy of a run are usable; the reasons are the problems, the worst first."""
     verdict = parse_typed(result["verdict"], Verdict, "tcpipe ingest --json")
     damage = parse_typed(result["run"]["damage"], tuple[Finding, ...], "tcpipe ingest --json")
     lines = [*map(format_finding, verdict.reasons), *map(format_finding, damage)]
     grades = {name: getattr(verdict, name) for name in AFFECTED}
-    return _check("usable", lines, warn=verdict.worst != "not usable", **grades)
+    return _make_check("usable", lines, warn=verdict.worst != "not usable", **grades)
 
 
-def _verified(path: str) -> dg.AssetCheckResult:
-    """Re-read what was made."""
-    (found,) = _answers("verify", path, codes={0, 1})
-    return _check("as_written", found["problems"], **found["read"])
+def _check_as_written(path: str) -> dg.AssetCheckResult:
+    """Return whether what was made reads again as it was written."""
+    (found,) = _run_command("verify", path, codes={0, 1})
+    return _make_check("as_written", found["problems"], **found["read"])
+
+
+def _make_as_written_spec(asset: str) -> dg.AssetCheckSpec:
+    """Return the check of `_check_as_written`; what depends on the asset is not made where it fails."""
+    description = "Every byte is as it was written (tcpipe verify)."
+    return dg.AssetCheckSpec("as_written", asset=asset, blocking=True, description=description)
 
 
 @dg.asset(
     partitions_def=LOGS,
     pool="tcpipe_ingest",
-    retry_policy=_RETRIES,
-    code_version=__version__,
-    group_name="tcpipe",
+    **_OF_ALL_ASSETS,
     kinds={"parquet"},
     check_specs=[
-        dg.AssetCheckSpec(
-            "as_written", asset="run", blocking=True, description="Every byte is as it was written (tcpipe verify)."
-        ),
+        _make_as_written_spec("run"),
         dg.AssetCheckSpec("usable", asset="run", description="Position, time and energy are usable without care."),
     ],
 )
 def run(context: dg.AssetExecutionContext) -> dg.MaterializeResult:
     """Labelled segments of one log, in the store."""
-    log = f"{_place('TCPIPE_LOGS', 'recordings').rstrip('/')}/{context.partition_key}"
+    log = f"{_read_setting('TCPIPE_LOGS', 'recordings').rstrip('/')}/{context.partition_key}"
     if not is_url(log) and not Path(log).exists():
         raise dg.Failure(f"{log}: this log is gone", allow_retries=False)
-    result = _answers("ingest", log, codes={0, 1, 3})[-1]["results"][0]
+    result = _run_command("ingest", log, codes={0, 1, 3})[-1]["results"][0]
     if result["status"] in ("failed", "waiting"):
         said = "\n".join([*result["problems"], *result["notes"]]) or result["status"]
         raise dg.Failure(said, allow_retries=result["transient"] or result["status"] == "waiting")
@@ -166,8 +169,8 @@ def run(context: dg.AssetExecutionContext) -> dg.MaterializeResult:
             **({"energy_floor": budget["total"]} if budget else {}),
         },
         check_results=[
-            _verified(f"{_place('TCPIPE_STORE', 'tcpipe-store')}/runs/{made['run_id']}"),
-            _judged(result),
+            _check_as_written(f"{_read_setting('TCPIPE_STORE', 'tcpipe-store')}/runs/{made['run_id']}"),
+            _check_usable(result),
         ],
     )
 
@@ -175,14 +178,10 @@ def run(context: dg.AssetExecutionContext) -> dg.MaterializeResult:
 @dg.asset(
     deps=[run],
     pool="tcpipe_build",
-    retry_policy=_RETRIES,
-    code_version=__version__,
-    group_name="tcpipe",
+    **_OF_ALL_ASSETS,
     kinds={"zarr", "parquet"},
     check_specs=[
-        dg.AssetCheckSpec(  # no model is trained where it fails
-            "as_written", asset="dataset", blocking=True, description="Every byte is as it was written (tcpipe verify)."
-        ),
+        _make_as_written_spec("dataset"),  # no model is trained where it fails
         dg.AssetCheckSpec("as_asked_for", asset="dataset", description="No run is left out, no split is empty."),
         dg.AssetCheckSpec(
             "held_out", asset="dataset", description="No patch of test or unseen shares ground with one of train."
@@ -191,9 +190,9 @@ def run(context: dg.AssetExecutionContext) -> dg.MaterializeResult:
 )
 def dataset() -> dg.MaterializeResult:
     """Patches and labels of all runs, split by region."""
-    out = _place("TCPIPE_DATASET", "dataset")
+    out = _read_setting("TCPIPE_DATASET", "dataset")
     region = os.environ.get("TCPIPE_SPLIT")
-    (made,) = _answers("build-dataset", out, *(["--split", region] if region else []))
+    (made,) = _run_command("build-dataset", out, *(["--split", region] if region else []))
     card, findings = made["card"], parse_typed(made["findings"], tuple[Finding, ...], "tcpipe build-dataset --json")
     problems = [format_finding(finding) for finding in findings if is_problem(finding)]
     shared = [format_finding(finding) for finding in select_findings(findings, "split-leakage")]
@@ -204,15 +203,15 @@ def dataset() -> dg.MaterializeResult:
             "samples": card["samples"],
             **{f"{name}_samples": count for name, count in card["splits"].items()},
             **({"flagged_share": card["flagged_samples"]["share"]} if card["flagged_samples"] else {}),
-            "where_every_metre_went": _ledger(card["distance_by_reason_m"]),
-            "findings": _listed(list_findings(findings)),
+            "where_every_metre_went": _format_distances(card["distance_by_reason_m"]),
+            "findings": _format_list(list_findings(findings)),
             "page": dg.MetadataValue.path(str(Path(out).absolute() / "report.html")),
-            **_picture(Path(out) / "overview.png"),
+            **_read_picture(Path(out) / "overview.png"),
         },
         check_results=[
-            _verified(out),
-            _check("as_asked_for", problems, warn=True),
-            _check("held_out", shared, warn=True),
+            _check_as_written(out),
+            _make_check("as_asked_for", problems, warn=True),
+            _make_check("held_out", shared, warn=True),
         ],
     )
 
@@ -220,15 +219,13 @@ def dataset() -> dg.MaterializeResult:
 @dg.asset(
     deps=[dataset],
     pool="tcpipe_build",
-    retry_policy=_RETRIES,
-    code_version=__version__,
-    group_name="tcpipe",
+    **_OF_ALL_ASSETS,
     kinds={"lightgbm"},
 )
 def model() -> dg.MaterializeResult:
     """Trees on features of the dataset's patches."""
-    data, out = _place("TCPIPE_DATASET", "dataset"), _place("TCPIPE_MODEL", "model")
-    (trained,) = _answers("train", data, out, "--model", "boosting")
+    data, out = _read_setting("TCPIPE_DATASET", "dataset"), _read_setting("TCPIPE_MODEL", "model")
+    (trained,) = _run_command("train", data, out, "--model", "boosting")
     return dg.MaterializeResult(metadata={"model": dg.MetadataValue.json(dict(trained))})
 
 

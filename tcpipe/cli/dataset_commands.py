@@ -15,9 +15,9 @@ from tcpipe.cli.options import (
     PUBLISHED,
     SEALED,
     add_options,
+    add_path_or_store,
     json_option,
     msgdef_option,
-    path_or_store,
     quiet_option,
     store_option,
 )
@@ -84,7 +84,7 @@ def build_dataset(options: BuildDatasetOptions, *, as_json: bool, quiet: bool) -
 
 
 @click.command()
-@path_or_store(SEALED)
+@add_path_or_store(SEALED)
 @click.option(
     "--no-runs", is_flag=True, help="For a store: write only its own page, with links to existing pages of runs."
 )
@@ -181,7 +181,7 @@ def explain(sample_id: str, *, dataset: str, store: str, as_json: bool, quiet: b
 
 
 @click.command()
-@path_or_store(SEALED)
+@add_path_or_store(SEALED)
 @json_option
 def verify(path: str, *, as_json: bool) -> int:
     """Read the dataset, run, map, model or cost map at PATH, or the store, again: compare counts, checksums, schemas.
@@ -196,7 +196,7 @@ def verify(path: str, *, as_json: bool) -> int:
 
 
 @click.command()
-@path_or_store(SEALED)
+@add_path_or_store(SEALED)
 @click.argument("to", type=PUBLISHED, required=False, metavar="[TO]")
 @json_option
 def migrate(path: str, to: str | None, *, as_json: bool) -> int:

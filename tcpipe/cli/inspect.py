@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from tcpipe.cli.options import LOG, json_option, msgdef_option, path_or_store, recipe_option, robot_option
+from tcpipe.cli.options import LOG, add_path_or_store, json_option, msgdef_option, recipe_option, robot_option
 from tcpipe.cli.output import print_json, print_line, resolve_recipe_with_source
 
 if TYPE_CHECKING:
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 @click.command()
-@path_or_store(LOG)
+@add_path_or_store(LOG)
 @click.option("--full", is_flag=True, help="Read the whole file to find damage and gaps, not only the index.")
 @robot_option()
 @recipe_option

@@ -293,7 +293,7 @@ store_option = make_click_option("store", "tcpipe-store", options.STORE)
 """``--store``, or TCPIPE_STORE, or ./tcpipe-store."""
 
 
-def path_or_store(kind: Place) -> Option:
+def add_path_or_store(kind: Place) -> Option:
     """Return the decorator that declares PATH, without which a command works on the store as all others do."""
 
     def decorate(run: Callable[..., Any]) -> Callable[..., Any]:

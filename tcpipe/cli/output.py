@@ -201,6 +201,7 @@ def _format_megabytes(size_bytes: float) -> str:
 
 
 _ONE_EVENT_S = 60.0
+"""Warnings of the same text within this time tell of one event."""
 
 
 class _Lines(logging.Handler):

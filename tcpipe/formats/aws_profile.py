@@ -12,19 +12,21 @@ _KEYS = {
     "aws_secret_access_key": "secret_access_key",
     "aws_session_token": "session_token",
 }
-_PLACES = {
+ENDPOINT_VARIABLES = ("AWS_ENDPOINT_URL", "AWS_ENDPOINT_URL_S3", "AWS_ENDPOINT")
+_LOCATIONS = {
     "region": ("region", ("AWS_REGION", "AWS_DEFAULT_REGION")),
-    "endpoint_url": ("endpoint", ("AWS_ENDPOINT_URL", "AWS_ENDPOINT_URL_S3", "AWS_ENDPOINT")),
+    "endpoint_url": ("endpoint", ENDPOINT_VARIABLES),
 }
-"""Name of obstore, and the variables that come before the profile."""
+"""By entry of a profile: obstore's name for it, and the environment variables that take precedence."""
 _OTHER_CREDENTIALS = (
     *("AWS_ACCESS_KEY_ID", "AWS_SKIP_SIGNATURE", "AWS_WEB_IDENTITY_TOKEN_FILE"),
     *("AWS_CONTAINER_CREDENTIALS_RELATIVE_URI", "AWS_CONTAINER_CREDENTIALS_FULL_URI"),
 )
+"""Environment variables that take precedence over the keys of a profile."""
 
 
 def read_aws_profile(environment: Mapping[str, str] = os.environ) -> dict[str, str]:
-    """Return what the profile of ``AWS_PROFILE``, or ``default``, says and the environment does not, by obstore's names.
+    """Return the settings of the profile ``AWS_PROFILE``, else ``default``, that the environment does not give, by obstore's names.
 
     Raises
     ------
@@ -43,7 +45,7 @@ def read_aws_profile(environment: Mapping[str, str] = os.environ) -> dict[str, s
     found = {**(sections[0] or {}), **(sections[1] or {})}
     said = {
         key: found[entry]
-        for entry, (key, given) in _PLACES.items()
+        for entry, (key, given) in _LOCATIONS.items()
         if entry in found and not environment.keys() & given
     }
     if environment.keys() & _OTHER_CREDENTIALS:

@@ -1,7 +1,7 @@
-"""A bounded cache of this machine, by content: what was fetched from a bucket once is not fetched again.
+"""A cache of limited size on this machine: tcpipe does not fetch from a bucket again what it has fetched once.
 
-A key names its content for good (a sha256; an object's version and a range of it), so that nothing in here can be outdated. It lies in
-``TCPIPE_CACHE``, else the user's cache directory, and holds at most ``TCPIPE_CACHE_BYTES`` (8 GB): what was not used for longest goes.
+A key determines the content (a sha256; an object's version and a range of it), so no file here is ever outdated. The cache is the directory
+``TCPIPE_CACHE``, else one in the user's cache directory. Above ``TCPIPE_CACHE_BYTES`` (8 GB) it removes the least recently used files.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from tcpipe.errors import StoreError, UsageError
 
 _MOST_BYTES = 8_000_000_000
 _SHARE_UNSEEN = 64
-"""The cache may be larger than its bound by one part in so many: looking at all of its files takes time."""
+"""A process may exceed the limit by one part in so many before it looks at all files of the cache again, which takes time."""
 _unseen_bytes = [float("inf")]
-"""What this process has put there since it last looked."""
+"""What this process has added since it last looked; infinite before it has looked."""
 _IN_USE_S = 60.0
-"""What was used so lately stays: another process may be about to open it."""
+"""A file that was used within this time stays: another process may be about to open it."""
 
 
 def fetch_cached(key: str, fetch: Callable[[Path], object]) -> Path:
@@ -35,7 +35,7 @@ def fetch_cached(key: str, fetch: Callable[[Path], object]) -> Path:
         path.parent.mkdir(parents=True, exist_ok=True)
         fetch(temporary)
         put = temporary.stat()
-        # Nothing is synced, and what a killed process leaves goes in its turn: whoever reads it proves it.
+        # Not synced: readers compare checksums. What a killed process leaves is removed in its turn.
         temporary.replace(path)
     except OSError as error:
         told = f"{path}: cannot be written ({error.strerror or error}); TCPIPE_CACHE names another place for what is fetched"
@@ -51,7 +51,7 @@ def fetch_cached(key: str, fetch: Callable[[Path], object]) -> Path:
 
 
 def is_cached(key: str) -> bool:
-    """Tell whether there is a file of a key, which then stays for a while."""
+    """Return whether there is a file of a key; it counts as used now."""
     return _is_there(_find_cache_path(key))
 
 
@@ -84,7 +84,7 @@ def _read_cache_limit() -> int:
 
 
 def _make_room(directory: Path, most: int, *, now: float) -> None:
-    """Remove what was not used for longest until the bound holds."""
+    """Remove the least recently used files until the limit holds."""
     files = []
     for path in directory.glob("??/*"):
         with suppress(OSError):

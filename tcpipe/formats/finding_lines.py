@@ -106,11 +106,6 @@ def format_finding(finding: Finding) -> str:
     return f"{describe_finding(finding)}{f'. {remedy}' if remedy else ''}".rstrip(".") + f" [{finding.code}]"
 
 
-def format_remedy_lines(finding: Finding) -> list[str]:
-    """Return the lines of a recipe that the finding's remedies propose, as they stand in a file."""
-    return [line for of in finding.remedies if of.recipe for line in _build_recipe_fragment(of).toml().splitlines()]
-
-
 def format_remedy_blocks(findings: Iterable[Finding]) -> list[str]:
     """Return the recipes of remedies that fit in no line, each once, as they stand in a file."""
     remedies = (of for finding in findings for of in finding.remedies if _is_block(of))

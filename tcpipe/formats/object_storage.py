@@ -27,7 +27,7 @@ from urllib.parse import unquote
 
 from tcpipe.errors import LogError, StoreError, TcpipeError, UsageError, hide_secrets, split_secrets
 from tcpipe.formats.atomic import describe_full_disk, make_scratch_directory
-from tcpipe.formats.aws_profile import read_aws_profile
+from tcpipe.formats.aws_profile import ENDPOINT_VARIABLES, read_aws_profile
 
 if TYPE_CHECKING:
     from obstore import GetOptions, ObjectMeta
@@ -42,14 +42,14 @@ _SETTINGS = ("AWS_", "GOOGLE_", "AZURE_", "HTTP", "NO_PROXY")
 _URL = re.compile(r"[a-z][a-z0-9+.-]*://", re.IGNORECASE)
 _ENDPOINT = re.compile(r"https?://([\w.-]+|\[[0-9a-f:]+\])(:\d{1,5})?(/[\w./-]*)?", re.IGNORECASE)
 _PIECE_BYTES = 1 << 24
-"""What is copied comes in requests of so many bytes."""
+"""A large file is read in requests of so many bytes."""
 _AT_ONCE = 8
 _PERCENT_ENCODED = ("file", "http", "https")
 """Schemes whose names are written with percent signs; object stores' own tools write them as they are."""
 _FIRST_S = 4.0
-"""So long the first request of a process waits for an answer: somebody may be watching."""
+"""The first request of a process waits so long for an answer: a user may be watching."""
 _RETRY_MINUTES = 10.0
-"""So long later ones do, unless TCPIPE_RETRY_MINUTES says otherwise."""
+"""Later requests wait so long, unless TCPIPE_RETRY_MINUTES gives another time."""
 _PAUSES_S = (0.1, 0.2, 0.4, 0.8, 1.6, 3.0)
 """Before a request is made again; the last one again and again."""
 _TELL_AFTER_S = 1.0
@@ -121,8 +121,8 @@ class StoredObject:
         """Write all of it to a file; `LogError` as `ranges`, and where there is no room."""
         try:
             with to.open("wb") as target:
-                for start in range(0, self.size_bytes, _PIECE_BYTES):
-                    target.write(self._range((start, min(start + _PIECE_BYTES, self.size_bytes))))
+                for span in split_into_pieces(self.size_bytes):
+                    target.write(self._range(span))
         except OSError as error:
             raise LogError(
                 f"{self.url}: it cannot be copied ({describe_full_disk(error) or error.strerror})"
@@ -145,6 +145,12 @@ class StoredObject:
             return data
 
         return ask_store(self.url, get, LogError, bucket=self.bucket, query=self.query)
+
+
+def split_into_pieces(size_bytes: int) -> Iterator[tuple[int, int]]:
+    """Yield start and stop of each piece of a file that is read or copied piece by piece."""
+    for start in range(0, size_bytes, _PIECE_BYTES):
+        yield start, min(start + _PIECE_BYTES, size_bytes)
 
 
 def is_url(text: str | Path) -> bool:
@@ -295,8 +301,8 @@ def ask_store(
     """Return what a request gives to which an object is ``read`` or ``written``; while there is no answer it is made again.
 
     The first request of a command fails within 5 s. Later ones, and those of worker processes, are made again for minutes; after one of
-    them was in vain, others are not until there is an answer. What goes wrong is one line; that something is not there passes as
-    `FileNotFoundError`, that it is there already as `AlreadyExistsError`.
+    them has failed, the next ones fail soon, too, until the store answers again. An error is one line; `FileNotFoundError` (no such object)
+    and `AlreadyExistsError` pass.
     """
     from obstore.exceptions import AlreadyExistsError, BaseError  # noqa: PLC0415
 
@@ -424,9 +430,9 @@ def _describe_no_answer(error: Exception) -> str:
     return f"no answer from {where}: {told}; check that it runs and that the address is right"
 
 
-def _refuse_endpoints_that_are_none(scheme: str) -> None:
-    """Refuse an endpoint that is no address: obstore would end the process."""
-    for name in ("AWS_ENDPOINT_URL", "AWS_ENDPOINT_URL_S3", "AWS_ENDPOINT"):
+def _check_endpoints(scheme: str) -> None:
+    """Raise `ValueError` where an endpoint is no address: obstore would end the process."""
+    for name in ENDPOINT_VARIABLES:
         value = os.environ.get(name) or os.environ.get(name.lower())
         if scheme == "s3" and value and not _ENDPOINT.fullmatch(value):
             raise ValueError(f"{name} is {value!r}, expected http://host or https://host, with :port where it has one")
@@ -455,7 +461,7 @@ def _connect(container: str, query: str, settings: tuple[tuple[str, str], ...], 
     scheme, _, bucket = container.partition("://")
     if not bucket:
         raise ValueError(f"it names no bucket; expected {scheme}://bucket/name")
-    _refuse_endpoints_that_are_none(scheme)
+    _check_endpoints(scheme)
     options: dict[str, Any] = {}
     if scheme != "file":  # who names an endpoint without TLS means it
         client = {"allow_http": True, "connect_timeout": timedelta(seconds=3)}

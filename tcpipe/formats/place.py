@@ -6,8 +6,8 @@ A name is relative, with ``/`` between its parts. What may be there already unde
 - a document that exactly one writer may make (`Place.put_new`): the first wins, and is told so;
 - a file that can be made again at will, and is nobody's truth (`Place.put`): the last writer's stays.
 
-Nothing appears before it is whole, and on disk before it is synced. Each verb says what it is to a path and what to an object;
-obstore's own directories are not used: they sync nothing, and hide what a killed writer leaves from whoever clears it.
+No file appears before it is whole and, on disk, synced. Each method has its own code for a path and for an object: obstore's store for
+local directories syncs nothing, and lists nothing of what a killed writer leaves, which `Place.clear` removes.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import TYPE_CHECKING, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, BinaryIO, NamedTuple, TypeVar
 
 from tcpipe.errors import MissingFileError, StoreError
 from tcpipe.formats.atomic import (
@@ -33,7 +33,15 @@ from tcpipe.formats.atomic import (
 )
 from tcpipe.formats.cache import fetch_cached
 from tcpipe.formats.integrity import ALL_CHANGES, Checksum, compute_checksum, find_wrong_checksum
-from tcpipe.formats.object_storage import ask_store, is_url, read_modified_ns, run_side_by_side, split_bucket, split_url
+from tcpipe.formats.object_storage import (
+    ask_store,
+    is_url,
+    read_modified_ns,
+    run_side_by_side,
+    split_bucket,
+    split_into_pieces,
+    split_url,
+)
 
 if TYPE_CHECKING:
     from obstore.store import ObjectStore
@@ -41,7 +49,6 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 U = TypeVar("U")
 
-_PIECE_BYTES = 1 << 24
 _READS_AT_ONCE = 4
 """Files that are read side by side: a disk gives no more, and two cores hash 1 to 3 GB a second."""
 
@@ -192,12 +199,7 @@ class Place:
     def checksum(self, name: str) -> Checksum | None:
         """Return size and sha256 of a file, every byte read where it lies; None where there is none."""
         size = self.size(name)
-        if size is None:
-            return None
-        digest = hashlib.sha256()
-        for piece in self._pieces(name, size):
-            digest.update(piece)
-        return Checksum(size, digest.hexdigest())
+        return None if size is None else self._hash_pieces(name, size)
 
     def delete(self, name: str) -> None:
         """Remove a file; where there is none nothing happens. Directories above it that it leaves empty go, too."""
@@ -219,14 +221,9 @@ class Place:
             return self._at(name)
 
         def fetch(path: Path) -> None:
-            digest = hashlib.sha256()
             with path.open("wb") as target:
-                for piece in self._pieces(name, checksum.size_bytes):
-                    digest.update(piece)
-                    target.write(piece)
-            if wrong := find_wrong_checksum(
-                self.where(name), Checksum(checksum.size_bytes, digest.hexdigest()), checksum
-            ):
+                found = self._hash_pieces(name, checksum.size_bytes, target)
+            if wrong := find_wrong_checksum(self.where(name), found, checksum):
                 raise StoreError(wrong)
 
         return fetch_cached(checksum.sha256, fetch)
@@ -266,9 +263,15 @@ class Place:
         except OSError as error:
             raise StoreError(f"{self.where(name)}: cannot be {what} ({error.strerror or error})") from error
 
-    def _pieces(self, name: str, size: int) -> Iterator[bytes]:
-        for start in range(0, size, _PIECE_BYTES):
-            yield self.read_range(name, start, min(_PIECE_BYTES, size - start))
+    def _hash_pieces(self, name: str, size: int, target: BinaryIO | None = None) -> Checksum:
+        """Return the checksum of the first ``size`` bytes of a file, which are written to ``target`` as they are read."""
+        digest = hashlib.sha256()
+        for start, stop in split_into_pieces(size):
+            piece = self.read_range(name, start, stop - start)
+            digest.update(piece)
+            if target is not None:
+                target.write(piece)
+        return Checksum(size, digest.hexdigest())
 
     def _key(self, name: str) -> str:
         """Return the name in the bucket of what is called ``name`` here."""

@@ -1,11 +1,11 @@
-"""Claims: which task of an array (``--shard I/N``) works on a log, so that no two do, and that of a killed task is taken over.
+"""Claims of the tasks of an array (``--shard I/N``): one task works on a log, and another takes over the log of a killed one.
 
 ::
 
-    spool/claims/<log>-<n>.json    the n-th task that works on a log: its process, and until when that holds unless it is renewed
+    spool/claims/<log>-<n>.json    the n-th task that works on a log: its process, and when the claim expires unless it is renewed
 
-A claim is put where there is none, renewed while its task lives, and removed when its log is committed. Only time depends on claims:
-whoever ingests a log, also two at once, makes the same files and one run.
+A task claims a log before it begins, renews the claim while it lives, and removes it when the log is committed. Claims only save time:
+two tasks that ingest one log, also at once, make the same files and one run.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from tcpipe.formats.run_documents import SPOOL
 from tcpipe.pipeline.calls import identify_process, is_alive
 
 LEASE_S = 120.0
-"""So long a claim holds. Clocks that differ by more make tasks do the same work, nothing worse."""
+"""A claim expires after this time. Where clocks differ by more, two tasks do the same work; nothing worse happens."""
 
 Held = Literal["mine", "theirs", "given up"]
 
@@ -39,7 +39,7 @@ class Claim:
     until_ns: int
 
     def is_live(self) -> bool:
-        """Return whether the task works on it still, as far as can be seen from here."""
+        """Return whether the claim has not expired and its process has not ended, as far as can be seen from here."""
         return is_alive(self.process) is not False and time.time_ns() < self.until_ns
 
 
@@ -53,7 +53,7 @@ class Claims:
         self._lock = threading.Lock()
 
     def claim(self, key: str, log: str, *, take_over: bool, most: int) -> Held:
-        """Claim a log; with ``take_over`` also one whose task is gone, unless ``most`` have worked on it."""
+        """Claim a log; with ``take_over`` also one whose claim is no longer live, unless ``most`` tasks have tried it."""
         if key in self._held:
             return "mine"
         for number in range(1, most + 1):
@@ -77,7 +77,7 @@ class Claims:
                 self._place.delete(f"{key}-{last}.json")
 
     def renew(self) -> None:
-        """Let all claims hold from now on."""
+        """Write all claims again, with the full time until they expire."""
         for key in list(self._held):
             with self._lock, suppress(StoreError):
                 if key in self._held:
@@ -90,7 +90,7 @@ class Claims:
             self.release(key)
 
     def remove_expired(self) -> None:
-        """Remove what killed tasks left."""
+        """Remove the claims that killed tasks left."""
         for name in self._place.files():
             claim = self._read(name)
             if claim is not None and not claim.is_live():
@@ -106,7 +106,7 @@ class Claims:
 
 @contextmanager
 def hold_claims(store: Place) -> Iterator[Claims]:
-    """Yield the claims of this task, which are renewed until the block ends, and removed then."""
+    """Yield the claims of this task; a thread renews them until the block ends, which removes them."""
     claims, ended = Claims(store.below(f"{SPOOL}/claims")), threading.Event()
 
     def renew() -> None:

@@ -147,9 +147,9 @@ def run_ingest(options: IngestOptions) -> IngestSummary:
                     tell(_iterate_results(log, queue, jobs=options.jobs, cluster=options.cluster))
                     summary = tell(_iterate_left(log, queue.plan(at for at in own if at not in results)))
                     call.is_whole = queue.is_done
-                    record = _call_of(opened, summary, given, tasks, options.jobs)
+                    record = _make_call_record(opened, summary, given, tasks, options.jobs)
                     call.end = Entries(calls=(measure_call(watch, record),))
-            queue.clean()
+            queue.remove_expired_claims()
         if log.state.number != before.number and log.state.runs:
             opened.write_index(log.state, before=before)
         return summary
@@ -171,7 +171,7 @@ def find_broken(store: Store, state: State, sources: Iterable[LogSource]) -> set
     return {(row.run_id, row.recipe_id) for row, lost, _ in look_at_files(store.runs_place, rows) if lost}
 
 
-def _call_of(
+def _make_call_record(
     store: Store, summary: IngestSummary, given: tuple[str, ...], tasks: Iterable[IngestTask], jobs: int
 ) -> CallRecord:
     """Return what the history holds of a call."""
@@ -201,7 +201,7 @@ def _iterate_missing(found: FoundLogs) -> Iterator[tuple[int, IngestResult]]:
 
 
 def _iterate_left(log: LogWriter, steps: Mapping[int, Step]) -> Iterator[tuple[int, IngestResult]]:
-    """Yield the result of each log of this share that another task has ingested, or is at."""
+    """Yield the result of each log of this share that another task has ingested or works on."""
     yield from _iterate_finished(log, steps)
     for index, step in steps.items():
         if step.is_todo:
@@ -244,7 +244,7 @@ def _iterate_results(
 ) -> Iterator[tuple[int, IngestResult]]:
     """Yield what became of each log by its index, once that is committed; what ends within a second is one commit."""
     keep_state_here(log.store.place, log.state)
-    for turn in queue.rounds():
+    for turn in queue.iterate_rounds():
         taken, waiting, last_s = list[Item](), list[tuple[int, IngestTask, Ingested]](), 0.0
         with closing(run_all(ingest_one, _take_tasks(turn, taken), jobs=jobs, cluster=cluster)) as outcomes:
             for outcome in outcomes:
@@ -291,8 +291,8 @@ def _commit(
     for index, _, of in ended:
         result = replace(of.result, notes=(*of.result.notes, *notes[index]))
         if result.run and (by := others.get(result.run.run_id)):
-            result = _settle_for(log.state.runs.get((by, result.run.recipe_id)), by, result, of.source)
-        queue.settle(index, result)
+            result = _adopt_committed_run(log.state.runs.get((by, result.run.recipe_id)), by, result, of.source)
+        queue.release_claim(index, result)
         yield index, _judge_result(log.state, result, of.source, before=before)
 
 
@@ -305,7 +305,7 @@ def _fail_commit(of: Ingested, error: StoreError) -> Ingested:
     )
 
 
-def _settle_for(made: RunFacts | None, run_id: str, result: IngestResult, source: LogSource) -> IngestResult:
+def _adopt_committed_run(made: RunFacts | None, run_id: str, result: IngestResult, source: LogSource) -> IngestResult:
     """Return what becomes of a log whose content another call has committed as ``run_id`` meanwhile: that run, if it is of this recipe."""
     if made is not None and made.log is not None:
         same_as = " + ".join(made.log.source.paths)

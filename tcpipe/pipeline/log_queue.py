@@ -1,4 +1,4 @@
-"""Which log is ingested next: of a call alone in the order given, of a task of an array its own share first, then what nobody has begun."""
+"""Which log is ingested next: a call alone goes by the order given, a task of an array takes its share, then what no task has begun."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from tcpipe.formats.recipe_toml import ingest_key
 from tcpipe.pipeline import claims as claiming
 from tcpipe.pipeline.calls import LogWriter
 from tcpipe.pipeline.claims import Claims, Held
-from tcpipe.pipeline.log_sources import add_hashes, group_alike, plan_rounds
+from tcpipe.pipeline.log_sources import add_hashes, group_possible_duplicates, plan_rounds
 from tcpipe.pipeline.plan import IngestResult, IngestTask, Step, make_planner
 
 Item: TypeAlias = tuple[int, IngestTask]
 
 _MOST_TASKS = 3
-"""So many tasks work on a log of another's share, one after the other: what kills each of them must not kill all of the array."""
+"""At most so many tasks try a log of another's share, one after the other: a log that kills its task must not kill the whole array."""
 _UNLIMITED = 1000
 
 
@@ -54,7 +54,7 @@ class LogQueue:
         self.steps = {at: every[at] for at in own}
         """What the logs of this task's share need as the call begins."""
         todo = [at for at, _ in self._select_todo(every)]
-        units = [[todo[at] for at in unit] for unit in group_alike([tasks[at].source for at in todo])]
+        units = [[todo[at] for at in unit] for unit in group_possible_duplicates([tasks[at].source for at in todo])]
         if claims is not None:
             units.sort(key=lambda unit: (self._own.isdisjoint(unit), -sum(tasks[at].source.size_bytes for at in unit)))
         self._left = units
@@ -71,13 +71,13 @@ class LogQueue:
 
     @property
     def is_done(self) -> bool:
-        """Whether nothing is left, also with other tasks."""
+        """Whether no log is to be done: this task has none left, other tasks work on none, and none was given up."""
         return not self._given_up and not any(map(self._list_todo, self._left))
 
-    def rounds(self) -> Iterator[Iterable[Item]]:
+    def iterate_rounds(self) -> Iterator[Iterable[Item]]:
         """Yield logs to ingest side by side, then logs to ingest after those, and so on.
 
-        The first task that finds only logs of others waits until they are done, and takes over those of killed tasks; the next ones end.
+        The first task that finds only logs on which others work waits for them, and takes over those of killed tasks; later tasks end.
         """
         take_over = False
         while self._left:
@@ -88,21 +88,21 @@ class LogQueue:
                 return
             take_over = True
 
-    def settle(self, index: int, result: IngestResult) -> None:
-        """Remove the claim of a log that is committed; while it may be tried again, other tasks leave it to this one until that ends."""
+    def release_claim(self, index: int, result: IngestResult) -> None:
+        """Remove the claim of a log that is committed; one that may be tried again stays claimed until this task ends."""
         key = self._keys.pop(index, None)
         if self._claims is None or key is None or result.transient or result.status == "waiting":
             return
         if key not in self._keys.values():
             self._claims.release(key)
 
-    def clean(self) -> None:
-        """Remove what killed tasks left, once nothing is to be done."""
+    def remove_expired_claims(self) -> None:
+        """Remove the claims that killed tasks left, once no log is to be done."""
         if self._claims is not None and self.is_done:
             self._claims.remove_expired()
 
     def _take(self, later: list[Item], *, take_over: bool) -> Iterator[Item]:
-        """Yield logs as they are claimed; what may be the same recording as one of those goes to ``later``."""
+        """Yield logs as they are claimed; those that hold the same recording as one of them go to ``later``."""
         units, self._left = self._left, []
         for unit in units:
             todo = self._list_todo(unit)
@@ -115,7 +115,7 @@ class LogQueue:
             yield from (items[at] for at in now)
 
     def _claim(self, unit: list[int], claims: Claims, *, take_over: bool) -> list[Item]:
-        """Return what is to be done of a unit once it is claimed; where another task has it, it is left."""
+        """Claim a unit, and return which of its logs are to be done; none where another task has it, which `_left` keeps."""
         source = self._tasks[unit[0]].source
         key = self._make_key(f"{source.place} {source.files}")
         most = _MOST_TASKS if self._own.isdisjoint(unit) else _UNLIMITED
@@ -134,7 +134,7 @@ class LogQueue:
         return todo
 
     def _wait(self) -> bool:
-        """Wait a while for other tasks; return False where one of them does that already."""
+        """Wait a while for other tasks; return False where another task waits already."""
         waiting = self._make_key("waiting")
         if self._claims is None or self._claims.claim(waiting, "", take_over=True, most=_UNLIMITED) != "mine":
             return False
@@ -146,7 +146,7 @@ class LogQueue:
         return self._select_todo(self.plan(unit))
 
     def _select_todo(self, steps: Mapping[int, Step]) -> list[Item]:
-        """Return what is to be done; of other shares not what failed for now."""
+        """Return the logs that are to be done; not those of other shares that failed for now."""
         return [
             (at, step.task)
             for at, step in steps.items()

@@ -228,14 +228,13 @@ def find_remote_logs(url: str, directory: Path) -> dict[Path, str]:
     }
 
 
-def add_hashes(sources: Sequence[LogSource]) -> list[LogSource]:
-    """Return the sources with their hashes where two may be the same recording."""
-    alone = {group[0] for group in group_alike(sources) if len(group) == 1}
-    return [source if source.sha256 or at in alone else _hash_source(source) for at, source in enumerate(sources)]
+def add_hashes(group: Sequence[LogSource]) -> list[LogSource]:
+    """Return the logs of one of `group_possible_duplicates` with their hashes, which a log alone does not need."""
+    return [source if source.sha256 or len(group) == 1 else _hash_source(source) for source in group]
 
 
-def group_alike(sources: Sequence[LogSource]) -> list[list[int]]:
-    """Return together the indices of logs that may be the same recording: of one size, and with the same bytes at the end."""
+def group_possible_duplicates(sources: Sequence[LogSource]) -> list[list[int]]:
+    """Return the indices of logs in groups that may be the same recording: logs of one size with the same bytes at the end."""
     groups, sizes = dict[tuple[int, bytes] | int, list[int]](), Counter(source.size_bytes for source in sources)
     for index, source in enumerate(sources):
         end = _read_end(source) if sizes[source.size_bytes] > 1 else None

@@ -10,7 +10,6 @@ from __future__ import annotations
 import re
 import shutil
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields, replace
 from itertools import chain
 from pathlib import Path
@@ -22,16 +21,10 @@ from tcpipe.formats.commit_log import LOG
 from tcpipe.formats.commits import CallRecord, Dataset, Entries, Failure, LogSnapshot, Problem, State, Superseded
 from tcpipe.formats.dataset_card import DatasetCard
 from tcpipe.formats.dataset_files import CARD
-from tcpipe.formats.integrity import (
-    Checksum,
-    compute_checksum,
-    find_wrong_checksum,
-    seal_document,
-    verify_document,
-)
+from tcpipe.formats.integrity import Checksum, compute_checksum, find_wrong_checksum, seal_document, verify_document
 from tcpipe.formats.json_files import Json, parse_typed, to_json, to_plain
 from tcpipe.formats.maps.map_files import open_map
-from tcpipe.formats.object_storage import is_url
+from tcpipe.formats.object_storage import is_url, run_side_by_side
 from tcpipe.formats.place import Place, find_changed_files, open_place
 from tcpipe.formats.recipe_toml import rename_earlier_keys
 from tcpipe.formats.run_documents import (
@@ -62,8 +55,6 @@ _APART = (_RECORDS, _INDEX, f"{SPOOL}/", MARK)
 """What is not copied: it is converted, or made again."""
 _IN_FOLDER = re.compile(r"(?:runs/[^/]+|maps)/[^/]+/[0-9a-f]{16}(?=/)")
 """A folder that is named after its content, at the beginning of a name."""
-_AT_ONCE = 8
-"""Runs that are read and written side by side."""
 _WHOLLY_RENAMED = ("distance_by_reason_m", "flagged_samples", "removal", "physics")
 """Parts of cards and manifests that no names of users are keys of."""
 _TOGETHER = 500
@@ -118,7 +109,7 @@ def migrate(path: Path | str, to: Path | str | None = None) -> Migrated:
     if (version := read_layout(source)) is not None:
         if version not in _KNOWN_VERSIONS:
             raise UsageError(f"{path}: is of data model {version}, this version knows {', '.join(_KNOWN_VERSIONS)}")
-        return _store(source, source if to is None else open_place(to))
+        return _bring_store(source, source if to is None else open_place(to))
     if to is not None:
         raise UsageError(f"{path}: is no store; only stores are brought elsewhere")
     try:
@@ -150,7 +141,7 @@ def _bring_card(place: Place) -> tuple[str, ...]:
     return (where,)
 
 
-def _store(source: Place, target: Place) -> Migrated:
+def _bring_store(source: Place, target: Place) -> Migrated:
     """Bring a store to this data model; ``target`` is ``source``, or where it is copied to."""
     is_current, names = read_layout(source) == DATA_MODEL_VERSION, [entry.name for entry in source.entries()]
     there = {entry.name: entry.size_bytes for entry in target.entries()}
@@ -160,8 +151,7 @@ def _store(source: Place, target: Place) -> Migrated:
             units.setdefault("/".join(name.split("/")[: 2 if name.startswith("runs/") else 1]), []).append(name)
         elif target != source and name.startswith(f"{LOG}/"):
             log.append(name)
-    with ThreadPoolExecutor(_AT_ONCE) as pool:
-        done = list(pool.map(lambda of: _bring_unit(source, target, of, there), units.values()))
+    done = run_side_by_side(lambda of: _bring_unit(source, target, of, there), [*units.values()])
     copied = sum(of.copied for of in done) + sum(_put(target, name, source.read(name), there) for name in log)
     changed = [] if is_current else [target.where(name) for of in done for name in of.changed]
     problems = [line for of in done for line in of.problems]

@@ -20,11 +20,7 @@ from tcpipe.formats.bucket_directories import FetchedShards
 from tcpipe.formats.commit_log import LOG, commit_name, make_snapshot_name, read_commit, read_snapshot
 from tcpipe.formats.commits import Commit, State, fold
 from tcpipe.formats.index_files import make_run_facts
-from tcpipe.formats.integrity import (
-    CHECKSUMS,
-    find_broken_seal_in,
-    read_checksums,
-)
+from tcpipe.formats.integrity import CHECKSUMS, find_broken_seal_in, read_checksums
 from tcpipe.formats.json_files import parse_typed
 from tcpipe.formats.maps.map_files import MapFile, open_map
 from tcpipe.formats.parquet import read_table

@@ -173,7 +173,7 @@ def test_a_run_of_one_log_looks_at_no_other(module, monkeypatch):
 
 def test_no_model_is_trained_on_a_dataset_that_is_not_as_written(module, site, monkeypatch):
     ingest([site / "logs"], store=site / "store")
-    answers = module._answers
+    answers = module._run_command
     monkeypatch.setattr(dg.RetryPolicy, "calculate_delay", lambda *_: 0)
 
     for problems, trained in ((["one byte differs"], set()), ([], {"model"})):
@@ -184,7 +184,7 @@ def test_no_model_is_trained_on_a_dataset_that_is_not_as_written(module, site, m
             found = answers(command, *arguments, **how)
             return [{**found[0], "problems": problems}] if command == "verify" else found
 
-        monkeypatch.setattr(module, "_answers", answer)
+        monkeypatch.setattr(module, "_run_command", answer)
         with dg.DagsterInstance.ephemeral() as instance:
             job = module.defs.resolve_job_def("nightly")
             done = job.execute_in_process(instance=instance, raise_on_error=False)

@@ -3,9 +3,9 @@
 from collections.abc import Iterator
 
 import pytest
-from object_gateway import gateway
+from object_gateway import gateway, served
 
-__all__ = ["gateway"]
+__all__ = ["gateway", "served"]
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -3,13 +3,12 @@
 import os
 import shutil
 import tempfile
-import uuid
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from object_gateway import in_environment
+from object_gateway import in_environment, open_bucket
 from storage_server import OVERWRITING, READ_ONLY, object_store
 from stored_files import manifest, table
 from synthetic_store import add_run, commit_run, lanes, segments
@@ -29,15 +28,9 @@ RUN = "north"
 def root(request, tmp_path, monkeypatch):
     """Where a store is to be."""
     if request.param == "directory":
-        yield tmp_path / "store"
-    elif request.param == "gateway":
-        in_environment(monkeypatch, request.getfixturevalue("gateway"), tmp_path / "cache")
-        yield f"s3://tests/{uuid.uuid4().hex}/a store"
-    else:
-        (tmp_path / "served" / "tests").mkdir(parents=True)
-        with object_store(tmp_path / "served") as (environment, _):
-            in_environment(monkeypatch, environment, tmp_path / "cache")
-            yield "s3://tests/a store"
+        return tmp_path / "store"
+    url = open_bucket(request.param, request, monkeypatch, tmp_path)
+    return f"{url}/a store"
 
 
 def put(store: Store, length_m: float = 10.0, **how: object) -> None:

@@ -5,7 +5,7 @@ from pathlib import Path
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tcpipe.pipeline.log_sources import LogSource, group_alike, select_shard
+from tcpipe.pipeline.log_sources import LogSource, group_possible_duplicates, select_shard
 
 PLACES = st.lists(st.text("ab/0_", min_size=1, max_size=12), unique=True, max_size=30)
 
@@ -31,7 +31,7 @@ def test_what_is_the_same_is_always_alike(tmp_path_factory, contents):
     for number, data in enumerate(contents):
         (path := folder / f"{number}.mcap").write_bytes(data)
         found.append(LogSource((path,), ((len(data), 0),)))
-    groups = group_alike(found)
+    groups = group_possible_duplicates(found)
     assert sorted(at for group in groups for at in group) == list(range(len(contents)))
     for at, data in enumerate(contents):
         (group,) = (group for group in groups if at in group)

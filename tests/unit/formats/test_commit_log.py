@@ -6,7 +6,7 @@ import sys
 from dataclasses import replace
 
 import pytest
-from object_gateway import in_environment
+from object_gateway import in_environment, open_bucket
 from storage_server import object_store
 
 from tcpipe.errors import StoreError
@@ -37,12 +37,9 @@ STAMP = Stamp(Process("lab", "m", "b", "n", 1, "2"), "2026-11-24T00:00:00.000+00
 @pytest.fixture(params=["directory", "bucket"])
 def place(request, tmp_path, monkeypatch):
     if request.param == "directory":
-        yield Place(tmp_path / "store")
-        return
-    (tmp_path / "served" / "tests").mkdir(parents=True)
-    with object_store(tmp_path / "served") as (environment, _):
-        in_environment(monkeypatch, environment, tmp_path / "cache")
-        yield Place("s3://tests/store")
+        return Place(tmp_path / "store")
+    url = open_bucket(request.param, request, monkeypatch, tmp_path)
+    return Place(f"{url}/store")
 
 
 def saw(number):

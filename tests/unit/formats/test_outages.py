@@ -5,8 +5,6 @@ import time
 from pathlib import Path
 
 import pytest
-from object_gateway import in_environment
-from storage_server import object_store
 from wheel_drives import START_NS, drive_at
 
 from tcpipe.cli.output import show_progress
@@ -19,14 +17,6 @@ from tcpipe.recipe import Recipe
 from tcpipe.store import Store
 
 LIBRARY = ("Generic", "reqwest", "Error performing", "retries", "HTTP error")
-
-
-@pytest.fixture
-def served(tmp_path, monkeypatch):
-    (tmp_path / "served" / "tests").mkdir(parents=True)
-    with object_store(tmp_path / "served") as (environment, fetched):
-        in_environment(monkeypatch, environment, tmp_path / "cache")
-        yield fetched
 
 
 def test_the_first_request_fails_within_seconds_and_says_what_to_check(served, monkeypatch):

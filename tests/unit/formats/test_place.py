@@ -3,12 +3,11 @@
 import hashlib
 import pickle
 import time
-import uuid
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
-from object_gateway import in_environment
+from object_gateway import in_environment, open_bucket
 from storage_server import FORBIDDEN, READ_ONLY, SKEWED, object_store
 
 from tcpipe.errors import StoreError
@@ -21,15 +20,9 @@ NAMES = ("a.json", "drives of May/ü ñ #1?.json", "runs/100%/track.parquet", "r
 @pytest.fixture(params=["directory", "bucket", "gateway"])
 def place(request, tmp_path, monkeypatch):
     if request.param == "directory":
-        yield open_place(tmp_path / "place")
-    elif request.param == "gateway":
-        in_environment(monkeypatch, request.getfixturevalue("gateway"), tmp_path / "cache")
-        yield open_place(f"s3://tests/{uuid.uuid4().hex}/below this")
-    else:
-        (tmp_path / "served" / "tests").mkdir(parents=True)
-        with object_store(tmp_path / "served") as (environment, _):
-            in_environment(monkeypatch, environment, tmp_path / "cache")
-            yield open_place("s3://tests/below this/")
+        return open_place(tmp_path / "place")
+    url = open_bucket(request.param, request, monkeypatch, tmp_path)
+    return open_place(f"{url}/below this/")
 
 
 def _names(entries: list[Entry]) -> list[str]:
@@ -102,15 +95,9 @@ def test_no_name_leads_outside(place: Place, name: str) -> None:
         place.put(name, b"")
 
 
-@pytest.fixture
-def served(tmp_path, monkeypatch):
-    (tmp_path / "served" / READ_ONLY).mkdir(parents=True)
-    with object_store(tmp_path / "served") as (environment, _):
-        in_environment(monkeypatch, environment, tmp_path / "cache")
-        yield tmp_path / "served"
-
-
-def test_a_bucket_that_cannot_be_used_is_one_line(served: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.usefixtures("served")
+def test_a_bucket_that_cannot_be_used_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "served" / READ_ONLY).mkdir()
     with pytest.raises(StoreError, match=r"^s3://nowhere/x: it cannot be read \(there is no such bucket\)$"):
         open_place("s3://nowhere/x").check()
     with pytest.raises(StoreError, match="requires credentials; set AWS_ACCESS_KEY_ID"):
@@ -152,8 +139,8 @@ def test_what_is_written_counts_also_where_the_answer_is_lost(tmp_path: Path, mo
             assert (place.read(name), fetched.lost) == (b"data", 0)
 
 
-def test_a_copy_that_is_not_what_it_should_be_is_no_copy(served: Path) -> None:
-    (served / "tests").mkdir()
+@pytest.mark.usefixtures("served")
+def test_a_copy_that_is_not_what_it_should_be_is_no_copy() -> None:
     place = open_place("s3://tests")
     place.put("a", b"damaged")
     for _ in range(2):
@@ -161,8 +148,8 @@ def test_a_copy_that_is_not_what_it_should_be_is_no_copy(served: Path) -> None:
             place.local("a", Checksum(7, hashlib.sha256(b"content").hexdigest()))
 
 
-def test_the_cache_is_bounded(served: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    (served / "tests").mkdir()
+@pytest.mark.usefixtures("served")
+def test_the_cache_is_bounded(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("TCPIPE_CACHE_BYTES", "2500")
     monkeypatch.setattr("tcpipe.formats.cache._IN_USE_S", -1.0)
     place = open_place("s3://tests")
@@ -173,8 +160,8 @@ def test_the_cache_is_bounded(served: Path, monkeypatch: pytest.MonkeyPatch, tmp
     assert sum(path.is_file() for path in (tmp_path / "cache").rglob("*")) == 2
 
 
-def test_a_cache_that_cannot_be_is_named_with_what_names_another(served: Path, tmp_path: Path) -> None:
-    (served / "tests").mkdir()
+@pytest.mark.usefixtures("served")
+def test_a_cache_that_cannot_be_is_named_with_what_names_another(tmp_path: Path) -> None:
     place = open_place("s3://tests")
     place.put("a", b"content")
     (tmp_path / "cache").touch()

@@ -8,8 +8,7 @@ import time
 from dataclasses import replace
 
 import pytest
-from object_gateway import in_environment
-from storage_server import object_store
+from object_gateway import open_bucket
 from wheel_drives import START_NS, drive_at
 
 from tcpipe.formats.place import Place
@@ -62,19 +61,13 @@ def read_runs(root):
     return {entry.name: place.read(entry.name) for entry in place.entries()}
 
 
-@pytest.fixture(params=["directory", "served", "gateway"])
+@pytest.fixture(params=["directory", "bucket", "gateway"])
 def root(request, tmp_path, monkeypatch):
     """Where a store is to be."""
     if request.param == "directory":
-        yield tmp_path / "store"
-    elif request.param == "gateway":
-        in_environment(monkeypatch, request.getfixturevalue("gateway"), tmp_path / "cache")
-        yield f"s3://tests/{tmp_path.name}/store"
-    else:
-        (tmp_path / "served" / "tests").mkdir(parents=True)
-        with object_store(tmp_path / "served") as (environment, _):
-            in_environment(monkeypatch, environment, tmp_path / "cache")
-            yield "s3://tests/store"
+        return tmp_path / "store"
+    url = open_bucket(request.param, request, monkeypatch, tmp_path)
+    return f"{url}/store"
 
 
 def test_an_array_with_late_and_killed_tasks_makes_the_store_of_one_call(root, drives, tmp_path):

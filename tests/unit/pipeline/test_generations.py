@@ -6,8 +6,7 @@ from datetime import datetime
 
 import obstore
 import pytest
-from object_gateway import in_environment
-from storage_server import object_store
+from object_gateway import open_bucket
 
 from tcpipe.errors import UsageError
 from tcpipe.formats.bucket_directories import GENERATIONS, find_newest
@@ -20,22 +19,11 @@ from tcpipe.pipeline.generations import write_generation
 CARD = "c.json"
 
 
-@pytest.fixture
-def served(tmp_path, monkeypatch):
-    """A bucket ``tests`` on this machine, and what was asked of it so far."""
-    (tmp_path / "served" / "tests").mkdir(parents=True)
-    with object_store(tmp_path / "served") as (environment, fetched):
-        in_environment(monkeypatch, environment, tmp_path / "cache")
-        yield fetched
-
-
 @pytest.fixture(params=["served", "gateway"])
 def place(request, tmp_path, monkeypatch):
     """An empty place in a bucket."""
-    environment = request.getfixturevalue(request.param)
-    if request.param == "gateway":
-        in_environment(monkeypatch, environment, tmp_path / "cache")
-    return Place(f"s3://tests/{uuid.uuid4().hex}/a b")
+    url = open_bucket(request.param, request, monkeypatch, tmp_path)
+    return Place(f"{url}/{uuid.uuid4().hex}/a b")
 
 
 def write(place, text, card=CARD, more=()):

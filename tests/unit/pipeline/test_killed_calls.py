@@ -12,8 +12,7 @@ from types import SimpleNamespace
 
 import pytest
 from click.testing import CliRunner
-from object_gateway import in_environment
-from storage_server import object_store
+from object_gateway import open_bucket
 from wheel_drives import START_NS, drive_at
 
 from tcpipe.cli import cli
@@ -38,12 +37,9 @@ NIGHT_S = 86_400
 def root(request, tmp_path, monkeypatch):
     """Where a store is to be."""
     if request.param == "directory":
-        yield tmp_path / "store"
-        return
-    (tmp_path / "served" / "tests").mkdir(parents=True)
-    with object_store(tmp_path / "served") as (environment, _):
-        in_environment(monkeypatch, environment, tmp_path / "cache")
-        yield "s3://tests/store"
+        return tmp_path / "store"
+    url = open_bucket(request.param, request, monkeypatch, tmp_path)
+    return f"{url}/store"
 
 
 @pytest.fixture(scope="module")
