@@ -110,16 +110,21 @@ def _find_scale(facts: FuseFacts) -> list[Finding]:
     return [make_finding("odometry-scale-unobservable", subject, names=names, scale_std_fraction=std)]
 
 
+_MOTION = {GNSS, WHEELS, VISUAL}
+"""Sensors of which one is needed: without any there is no track."""
+
+
 def _find_rejections(facts: FuseFacts) -> list[Finding]:
     most = read_threshold("measurements-rejected", "max_rejected_fraction")
     findings = []
     for role, count in facts.measurements.items():
         rejected = facts.rejected[role]
         if rejected > most * count:
+            is_alone = not _MOTION.intersection(facts.sensors).difference({role})
             finding = make_finding(
                 "measurements-rejected",
                 Subject("role", role),
-                remedies=exclude_role(role),
+                remedies=() if is_alone else exclude_role(role),
                 rejected_fraction=rejected / count,
                 rejected_count=rejected,
                 measurement_count=count,

@@ -135,7 +135,7 @@ def _describe_no_runs(store: Store, found: Ingestions) -> list[str]:
     if found.finished:
         head = (
             f"{len({run.run_id for run in found.finished})} runs in the store, none ingested with this recipe; ingest them with it "
-            "(tcpipe ingest LOG), or give the recipe they were ingested with (--recipe FILE)"
+            "(tcpipe ingest LOG --recipe FILE), or give the recipe they were ingested with (--recipe FILE)"
         )
     elif found.outdated:
         versions = ", ".join(sorted({str(head.data_model_version) for head in found.outdated.values()}))

@@ -80,6 +80,12 @@ def test_rejections_are_a_finding_beyond_a_tenth(rejected, said):
         assert finding.remedies[0].recipe == {"read.topics": {"gnss": []}}
 
 
+def test_the_only_sensor_of_motion_is_not_proposed_to_be_excluded():
+    counts = {"measurements": {"wheel_odometry": 10}, "rejected": {"wheel_odometry": 2}}
+    (finding,) = warned(FusionInputs(None), stretch(sensors=("imu", "wheel_odometry"), **counts))
+    assert (finding.code, finding.remedies) == ("measurements-rejected", ())
+
+
 @pytest.mark.parametrize(("common", "said"), [(None, []), (0.02, []), (0.03, [0.03])])
 def test_a_scale_that_nothing_shows_is_a_finding_beyond_two_hundredths(common, said):
     found = warned(FusionInputs(PLACE), stretch(common_scale_std=common), stretch(common_scale_std=0.01))
