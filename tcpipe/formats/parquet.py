@@ -341,6 +341,14 @@ def move_to_file(array: NDArray[N], directory: Path) -> NDArray[N]:
     return mapped
 
 
+def move_rows_to_file(array: NDArray[N], rows: NDArray[np.int64], directory: Path) -> NDArray[N]:
+    """Return rows of an array as `make_mapped_array` gives them."""
+    mapped = make_mapped_array(directory, (len(rows), *array.shape[1:]), array.dtype)
+    if mapped.size:
+        np.take(array, rows, axis=0, out=mapped, mode="clip")  # "raise" would make a copy
+    return mapped
+
+
 def write_table_bytes(table: pa.Table) -> bytes:
     """Return a table as bytes, schema and all; `read_table_bytes` is the way back."""
     sink = pa.BufferOutputStream()

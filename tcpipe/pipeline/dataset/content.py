@@ -197,6 +197,7 @@ class SampleTable:
     def take(self, rows: NDArray[np.int64]) -> pa.Table:
         """Return rows of the samples table (schema SAMPLES, and the added columns behind it)."""
         at = self.patch[rows]
+        assigned = self.assigned.select(at)
         rows_of_segments = pa.array(self.sampled.kept[at])
         segments = self.segments.take(rows_of_segments)
         columns: dict[str, Any] = {
@@ -210,8 +211,8 @@ class SampleTable:
             columns |= {column.name: pa.nulls(len(at), column.dtype) for column in of_terrain}
         table = SAMPLES.table(
             sample_id=segments.column("segment_id"),
-            split=self.assigned.split[at].tolist(),
-            fold=pa.array(self.assigned.fold[at], pa.int8(), mask=self.assigned.fold[at] == NO_FOLD),
+            split=assigned.split.tolist(),
+            fold=pa.array(assigned.fold, pa.int8(), mask=assigned.fold == NO_FOLD),
             map=[self.map_names[index] for index in self.sampled.map_index[at]],
             **columns,
         )
@@ -235,12 +236,15 @@ class SampleTable:
 
     def centres_xy_m(self) -> NDArray[np.float64]:
         """Return the centre of every footprint in the first map's plane [m], shape (N, 2)."""
-        centres: NDArray[np.float64] = self.sampled.footprint_xy_m[self.patch].mean(axis=1)
+        centres = np.empty((len(self), 2))
+        for first in range(0, len(self), _ROWS):
+            corners = self.sampled.footprint_xy_m[self.patch[first : first + _ROWS]]
+            centres[first : first + _ROWS] = corners.mean(axis=1)
         return centres
 
     def splits(self) -> NDArray[np.str_]:
         """Return the split of every sample, shape (N,)."""
-        return self.assigned.split[self.patch]
+        return self.assigned.select(self.patch).split
 
     def slots(self) -> NDArray[np.int64]:
         """Return the slot of every sample's pixels in the spool, shape (N,)."""
@@ -288,15 +292,16 @@ def gather_content(directory: Path, inputs: Inputs, options: BuildOptions, worke
     assigned, result = draw_splits(
         segments, sampled, sources[0].grid, options.regions, recipe, earlier=options.earlier, tags=tags
     )
-    assigned = Assignment(move_to_file(assigned.split, directory), move_to_file(assigned.fold, directory))
-    split = assigned.split
     arc_m = to_floats(segments, "arc_length_m")[sampled.kept]
-    unused_m = {Loss.SPLIT_BUFFER: arc_m[split == "buffer"].sum(), Loss.SPLIT_EXCLUDED: arc_m[split == EXCLUDED].sum()}
+    unused_m = {
+        loss: arc_m[assigned.is_in(name)].sum()
+        for loss, name in ((Loss.SPLIT_BUFFER, "buffer"), (Loss.SPLIT_EXCLUDED, EXCLUDED))
+    }
     registered = [register_runs(inputs.runs, source, recipe) for source in sources]
     shifted = [finding for _, findings in registered for finding in findings]
-    in_use = sampled.kept[(split != "buffer") & (split != EXCLUDED)]
+    in_use = sampled.kept[~assigned.is_in("buffer", EXCLUDED)]
     removal, biased = find_removed_by_ground(inputs.runs, segments, in_use, sources, recipe)
-    kept = np.flatnonzero(split != EXCLUDED)
+    kept = np.flatnonzero(~assigned.is_in(EXCLUDED))
     order = move_to_file(kept[np.argsort(ranks[sampled.kept[kept]], kind="stable")], directory)
     added, covariates, incomplete = make_added_columns(
         segments, sampled.kept[order], inputs.sources, inputs.covariates, recipe.covariates, layers=tuple(spool.layers)

@@ -23,7 +23,7 @@ from tcpipe.formats.bucket_directories import FetchedShards
 from tcpipe.formats.dataset_files import LayerPixels
 from tcpipe.formats.json_files import parse_typed_json, to_compact_json
 from tcpipe.formats.maps.map_files import MapFile, open_map
-from tcpipe.formats.parquet import make_mapped_array, move_to_file
+from tcpipe.formats.parquet import make_mapped_array, move_rows_to_file, move_to_file
 from tcpipe.formats.place import Place
 from tcpipe.progress import Meter
 from tcpipe.recipe import SampleConfig
@@ -219,13 +219,12 @@ def sample_all_segments(
                     columns[name][kept] = values
     finally:
         _held.clear()
-    kept = np.flatnonzero(lost_by == 0)
-    for name in columns:
-        columns[name] = move_to_file(columns[name][kept], directory)
+    kept = move_to_file(np.flatnonzero(lost_by == 0), directory)
+    columns = {name: move_rows_to_file(values, kept, directory) for name, values in columns.items()}
     every = dict.fromkeys(finding for index in sorted(findings) for finding in findings[index])
     placing = {name: columns.pop(name) for name in _PLACING}
     sampled = Sampled(kept=kept, patches=Patches({}, **columns), lost_by=lost_by, findings=tuple(every), **placing)
-    return sampled, move_to_file(slots[kept], directory), replace(spool, counts=tuple(counts))
+    return sampled, move_rows_to_file(slots, kept, directory), replace(spool, counts=tuple(counts))
 
 
 def _as_bytes(sampled: Sampled) -> bytes:
