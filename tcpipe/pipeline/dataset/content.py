@@ -46,6 +46,7 @@ from tcpipe.formats.parquet import (
     map_table,
     move_to_file,
     read_table_bytes,
+    take_rows,
     write_pieces,
     write_table_bytes,
 )
@@ -198,8 +199,8 @@ class SampleTable:
         """Return rows of the samples table (schema SAMPLES, and the added columns behind it)."""
         at = self.patch[rows]
         assigned = self.assigned.select(at)
-        rows_of_segments = pa.array(self.sampled.kept[at])
-        segments = self.segments.take(rows_of_segments)
+        rows_of_segments = self.sampled.kept[at]
+        segments = take_rows(self.segments, rows_of_segments)
         columns: dict[str, Any] = {
             name: segments.column(name) for name in SAMPLES.names() if name in segments.column_names
         }
@@ -217,7 +218,8 @@ class SampleTable:
             **columns,
         )
         for field in self.added.schema:
-            table = table.append_column(field, self.added.column(field.name).take(rows_of_segments))
+            added = take_rows(self.added.select([field.name]), rows_of_segments)
+            table = table.append_column(field, added.column(0))
         return add_geo_metadata(table if self.redaction is None else self.redaction.table(table), "Point", centres)
 
     def pieces(self, rows: int) -> Iterator[pa.Table]:
@@ -227,11 +229,11 @@ class SampleTable:
 
     def ids(self, first: int, last: int) -> list[str]:
         """Return the ids of rows ``first:last``."""
-        rows = pa.array(self.sampled.kept[self.patch[first:last]])
-        ids: list[str] = self.segments.column("segment_id").take(rows).to_pylist()
+        names = take_rows(self.segments.select(["segment_id", "run_id"]), self.sampled.kept[self.patch[first:last]])
+        ids: list[str] = names.column("segment_id").to_pylist()
         if self.redaction is None:
             return ids
-        runs = self.segments.column("run_id").take(rows).to_pylist()
+        runs = names.column("run_id").to_pylist()
         return [self.redaction.segment_id(name, run_id) for name, run_id in zip(ids, runs, strict=True)]
 
     def centres_xy_m(self) -> NDArray[np.float64]:

@@ -23,7 +23,7 @@ from tcpipe.formats.bucket_directories import FetchedShards
 from tcpipe.formats.dataset_files import LayerPixels
 from tcpipe.formats.json_files import parse_typed_json, to_compact_json
 from tcpipe.formats.maps.map_files import MapFile, open_map
-from tcpipe.formats.parquet import make_mapped_array, move_rows_to_file, move_to_file
+from tcpipe.formats.parquet import make_mapped_array, move_rows_to_file, move_to_file, take_rows
 from tcpipe.formats.place import Place
 from tcpipe.progress import Meter
 from tcpipe.recipe import SampleConfig
@@ -172,7 +172,7 @@ class _Batches(Sequence[_Batch]):
     def __getitem__(self, index: int) -> _Batch:  # type: ignore[override]  # nobody asks for slices
         """Return one batch."""
         rows = self.rows[index]
-        segments = self.whole.segments.take(pa.array(rows))
+        segments = take_rows(self.whole.segments, rows)
         return replace(self.whole, number=index, ranks=self.whole.ranks[rows], segments=segments)
 
 

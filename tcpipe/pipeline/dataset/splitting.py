@@ -15,6 +15,7 @@ from pyproj import CRS
 from tcpipe.errors import DatasetError
 from tcpipe.formats.dataset_card import KeptSplit, SplitResult
 from tcpipe.formats.geojson import PolygonGeometry
+from tcpipe.formats.parquet import take_rows
 from tcpipe.recipe import Recipe
 from tcpipe.recipe.suggestions import format_recipe_key
 from tcpipe.splits.assignment import EXCLUDED, NO_FOLD, Assignment, assign_splits, hash_ranks
@@ -51,11 +52,11 @@ def draw_splits(
     starts_ns = to_integers(segments, "start_ns")
     run, run_names = _number_runs(segments, starts_ns)
     run, starts_ns = run[sampled.kept], starts_ns[sampled.kept]
-    ids, rows = segments.column("segment_id"), sampled.kept
-    kept = None if earlier is None else _read_earlier_assignment(ids.take(pa.array(rows)), earlier)
+    ids, rows = segments.select(["segment_id"]), sampled.kept
+    kept = None if earlier is None else _read_earlier_assignment(take_rows(ids, rows).column(0), earlier)
     ranks = np.empty(len(rows), np.uint64)
     for first in range(0, len(rows), _ROWS):
-        names = ids.take(pa.array(rows[first : first + _ROWS])).to_pylist()
+        names = take_rows(ids, rows[first : first + _ROWS]).column(0).to_pylist()
         ranks[first : first + _ROWS] = hash_ranks(names, seed=rules.seed, purpose="test")
     assigned = assign_splits(
         ranks,
