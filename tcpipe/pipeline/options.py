@@ -98,7 +98,7 @@ class AddMapOptions:
 
     name: str = required(Option(is_argument=True))
     _: KW_ONLY
-    height: Files = required(_raster("Height raster, metres."))
+    height: Files | None = option(None, _raster("Height raster, metres; required unless --stac gives one."))
     ortho: Files | None = option(None, _raster("Orthophoto, grey or RGB."))
     terrain: Files | None = option(
         None, _raster("Terrain classes: one integer band, or GeoJSON polygons with a property 'class'.")
@@ -123,6 +123,23 @@ class AddMapOptions:
     """None: as the raster names its values."""
     ortho_bands: Literal["grey", "rgb"] = option(
         "grey", Option("rgb also keeps red, green and blue as layers.", (), ("grey", "rgb"))
+    )
+    stac: str | None = option(
+        None,
+        Option(
+            "Catalogue of open data to take height and orthophoto from: its name (swisstopo), its URL, or a TOML file on it.",
+            metavar="NAME|URL|FILE",
+        ),
+    )
+    collections: Sequence[str] = option(
+        (),
+        Option("Collection of the catalogue; repeatable (default: all that are known).", metavar="ID", repeatable=True),
+    )
+    around: Sequence[str] = option(
+        (), Option("Run whose track the map is to cover, with --stac; repeatable.", (), "run", "RUN", repeatable=True)
+    )
+    margin_m: float = option(
+        50.0, Option("Ground around the track that is taken, with --stac.", ("--margin",), Range(1.0, 5000.0), "M")
     )
     crs: str | None = option(
         None, Option("Projected, metric CRS of the map (default: the height's, or its UTM zone).", metavar="EPSG:n")
