@@ -65,6 +65,8 @@ class HttpsClient:
                         )
                     return self._read(reply, url, most), reply.headers
             except (OSError, HTTPException) as error:
+                if isinstance(error, HTTPError):
+                    error.close()
                 busy = not isinstance(error, HTTPError) or error.code in _TRY_AGAIN
                 if (
                     pause_s is None
@@ -99,7 +101,11 @@ class _CheckedRedirects(HTTPRedirectHandler):
     def redirect_request(  # noqa: PLR0917  urllib's signature
         self, req: Request, fp: IO[bytes], code: int, msg: str, headers: HTTPMessage, newurl: str
     ) -> Request | None:
-        self._client.check_url(newurl)
+        try:
+            self._client.check_url(newurl)
+        except MapError:
+            fp.close()
+            raise
         return super().redirect_request(req, fp, code, msg, headers, newurl)
 
 

@@ -12,7 +12,7 @@ import re
 import shutil
 import tempfile
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +23,7 @@ from pyproj import CRS
 from rasterio.enums import ColorInterp, MaskFlags
 from rasterio.errors import RasterioError
 from rasterio.windows import Window
+from shapely.affinity import affine_transform
 
 from tcpipe.errors import MapError
 from tcpipe.formats.cache import fetch_cached
@@ -48,8 +49,7 @@ class RemoteFile:
         self._client, self.url, self._have = client, url, set[int]()
         self.size, self.version = 0, ""
         self.error: MapError | None = None
-        self._local = tempfile.TemporaryFile()  # noqa: SIM115  closed by `open_window`
-        self._fetch_blocks(0, 0)
+        self._local = tempfile.TemporaryFile()  # noqa: SIM115  closed by `close`
 
     def close(self) -> None:
         """Remove what was fetched."""
@@ -65,7 +65,7 @@ class RemoteFile:
         missing = enumerate(sorted(wanted - self._have))
         for _, run in itertools.groupby(missing, key=lambda pair: (pair[1] - pair[0], pair[0] // _MOST_BLOCKS)):
             blocks = [block for _, block in run]
-            self._fetch_blocks(blocks[0], blocks[-1])
+            self.fetch_blocks(blocks[0], blocks[-1])
 
     def read(self, offset: int, count: int) -> bytes:
         """Return bytes for GDAL; none after an error, which GDAL could not pass on."""
@@ -77,7 +77,8 @@ class RemoteFile:
         self._local.seek(offset)
         return self._local.read(count)
 
-    def _fetch_blocks(self, first: int, last: int) -> None:
+    def fetch_blocks(self, first: int, last: int) -> None:
+        """Fetch blocks; the first ones tell size and version of the file, which later ones must have, too."""
         span = first * _BLOCK_BYTES, (last + 1) * _BLOCK_BYTES - 1
         data, headers = self._client.get(self.url, span=span, most=span[1] + 1 - span[0])
         found = re.fullmatch(rf"bytes {span[0]}-(\d{{1,15}})/(\d{{1,15}})", headers["Content-Range"] or "")
@@ -155,22 +156,21 @@ def open_window(client: HttpsClient, url: str, area: Any, *, crs: str | None) ->
     ------
     MapError : the raster cannot be read by ranges, is none, is damaged, is elsewhere than the catalogue says, or the window is too large.
     """
-    remote = RemoteFile(client, url)
 
-    def open_handle(path: str, _: str = "rb") -> _Handle:
+    def open_handle(path: str, mode: str = "rb") -> _Handle:  # noqa: ARG001  rasterio names it
         if path != _NAME:
             raise FileNotFoundError(path)  # nothing lies beside it
         return _Handle(remote)
 
-    try:
-        with rasterio.Env(**GDAL_CONFIG), rasterio.open(_NAME, driver="GTiff", opener=open_handle) as dataset:
-            check_layout(dataset, url, "download it and write it again: gdal_translate in.tif out.tif")
-            window = _find_window(dataset, url, area, crs)
-            yield None if window is None else RemoteWindow(remote, dataset, window)
-    except RasterioError as error:
-        raise remote.error or MapError(f"{url}: not a GeoTIFF, or damaged: {describe_error(error)}") from None
-    finally:
-        remote.close()
+    with closing(RemoteFile(client, url)) as remote:
+        remote.fetch_blocks(0, 0)
+        try:
+            with rasterio.Env(**GDAL_CONFIG), rasterio.open(_NAME, driver="GTiff", opener=open_handle) as dataset:
+                check_layout(dataset, url, "download it and write it again: gdal_translate in.tif out.tif")
+                window = _find_window(dataset, url, area, crs)
+                yield None if window is None else RemoteWindow(remote, dataset, window)
+        except RasterioError as error:
+            raise remote.error or MapError(f"{url}: not a GeoTIFF, or damaged: {describe_error(error)}") from None
 
 
 def _find_window(dataset: Any, url: str, area: Any, said: str | None) -> Window | None:
@@ -187,7 +187,8 @@ def _find_window(dataset: Any, url: str, area: Any, said: str | None) -> Window 
         raise MapError(
             f"{url}: its CRS is {crs.name!r}, the catalogue says {said}, which is elsewhere; tell the provider, and give other rasters"
         )
-    pixels = shapely.transform(placed, lambda xy: np.stack(~dataset.transform @ tuple(xy.T), axis=-1))
+    inverse = ~dataset.transform
+    pixels = affine_transform(placed, (inverse.a, inverse.b, inverse.d, inverse.e, inverse.c, inverse.f))
     on_raster = shapely.intersection(pixels, shapely.box(0, 0, dataset.width, dataset.height))
     if not on_raster.area:
         return None
@@ -218,10 +219,16 @@ def _iterate_blocks(dataset: Any, window: Window) -> Iterator[tuple[int, int]]:
             yield int(block[0]), int(block[1])
 
 
+def _move(of: Any, window: Window) -> rasterio.Affine:
+    """Return an affine for the pixels of a window."""
+    col, row = window.col_off, window.row_off
+    return rasterio.Affine(of.a, of.b, of.a * col + of.b * row + of.c, of.d, of.e, of.d * col + of.e * row + of.f)
+
+
 def _copy_pixels(dataset: Any, window: Window, path: Path) -> None:
     """Write a window as a GeoTIFF of the same pixels, with what the raster says of them, some rows at a time."""
     profile = {"width": window.width, "height": window.height, "count": dataset.count, "dtype": dataset.dtypes[0]}
-    profile |= {"crs": dataset.crs, "transform": dataset.window_transform(window), "nodata": dataset.nodata}
+    profile |= {"crs": dataset.crs, "transform": _move(dataset.transform, window), "nodata": dataset.nodata}
     profile |= {
         "tiled": True,
         "blockxsize": 256,
