@@ -77,7 +77,9 @@ class _Handler(BaseHTTPRequestHandler):
         else:
             self.send_response(200)
         if fault != "unversioned":
-            self.send_header("ETag", f'"{len(server.requests) if fault == "changing" else sha256(content).hexdigest()[:16]}"')
+            self.send_header(
+                "ETag", f'"{len(server.requests) if fault == "changing" else sha256(content).hexdigest()[:16]}"'
+            )
         body = content[first : last + 1]
         self.send_header("Content-Length", str(len(body)))
         self.end_headers()
